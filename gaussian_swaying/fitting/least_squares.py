@@ -163,7 +163,7 @@ def iterate(
     Args:
         residuals: Computes residuals.
         rescale: Standard deviations of the first variant's residuals.
-        progress: Where to start.
+        progress: The state to start from.
         tolerance: Smallest step worth another iteration, as a share of the ranges.
         least_gain: Smallest share of the cost worth another iteration.
 

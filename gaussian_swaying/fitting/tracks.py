@@ -47,7 +47,7 @@ class Tracks:
 
     Attributes:
         index: Their places among the moving Gaussians of the scene, shape (T,).
-        position: Where each was seen [pixels], float64, shape (F, T, 2).
+        position: Position of each in the picture [pixels], float64, shape (F, T, 2).
         seen: Whether the track is still valid, bool, shape (F, T).
     """
 

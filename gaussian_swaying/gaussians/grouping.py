@@ -124,7 +124,7 @@ def joined(count: int, pairs: Tensor) -> Tensor:
     """The connected part that each of ``count`` things is in, from pairs of them that are connected.
 
     Args:
-        count: How many things.
+        count: Number of things.
         pairs: Their numbers, shape (2, K).
 
     Returns:

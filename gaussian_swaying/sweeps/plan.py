@@ -139,7 +139,7 @@ def parse_run(parser: ArgumentParser, config: str, frames: int, run: Mapping[str
 
     Args:
         parser: From :meth:`Simulation.parser`.
-        config: What all runs share, as YAML.
+        config: Configuration that all runs share, as YAML.
         frames: Frames, unless ``run`` has others.
         run: The value of every axis.
 

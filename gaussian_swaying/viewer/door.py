@@ -36,7 +36,7 @@ class Door:
     websocket of viser asks without it.
 
     Args:
-        host: Where the server listens.
+        host: Address at which the server listens.
         names: Names of this computer that a browser may ask for, besides those that it has.
 
     Attributes:

@@ -24,7 +24,7 @@ class Pull(Force):
         share: Strength with which each particle is pulled, from 0 to 1, shape (P,).
         mass: Mass of each particle [kg], shape (P,).
         offset: From the mean of the pulled particles to each particle [m], shape (P, 3).
-        target: Where its mean should be [m], shape (3,).
+        target: Place to which their mean is pulled [m], shape (3,).
         frame: Transform between the scene and metres.
     """
 

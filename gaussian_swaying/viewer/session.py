@@ -93,7 +93,7 @@ class Session:
 
     Args:
         parser: From :meth:`Simulation.parser`.
-        settings: What it parsed.
+        settings: Settings from it.
         simulation: The simulation of these settings, if it is made already.
 
     Attributes:

@@ -70,7 +70,7 @@ class Rows:
         inverse_mass: Inverse mass of the nodes [1/kg], shape (G,).
         place: The rows that have a weight on each node, node after node, shape (27 A + 27,).
         share: Those weights, shape (27 A + 27,).
-        start: Where those of each node begin, shape (G,).
+        start: Index of the first of each node, shape (G,).
     """
 
     node: Tensor
@@ -170,7 +170,7 @@ def resolve(
         held: The constraints that act; those that are not ``valid`` do nothing.
         dt: Substep [s].
         dx: Grid spacing [m].
-        iterations: How often the impulses are improved, at most.
+        iterations: Largest number of iterations.
         tolerance: Stop if no constraint is violated by more than this within the substep [m]; the host waits. None to
             make all iterations.
 

@@ -56,7 +56,7 @@ class Solids:
 
     Args:
         parts: The solids, each with the number of its boundary.
-        device: Where the tables are.
+        device: Device of the tables.
         steps: For how many substeps there is room for poses.
     """
 
@@ -125,7 +125,7 @@ class Solids:
         Args:
             time: Time of the first [s], scalar float64 tensor on the device.
             dt: Substep [s], as ``time``.
-            steps: How many.
+            steps: Number of substeps.
         """
         if self.moving:
             count = len(self.parts)

@@ -32,14 +32,14 @@ class _Run:
     """Data of one rollout that its backward pass needs.
 
     Attributes:
-        state: Where it starts.
+        state: The state at its start.
         dt: Substep [s].
         steps: Number of substeps.
         every: Substeps of a segment.
         forces: The force, if any.
         watch: See ``MPMSolver.rollout``.
         starts: Displacement and velocity of the active nodes at the start of each segment, shape (nodes, 2, 3).
-        kicks: How long forces act in the first substep of each segment [s].
+        kicks: Time for which forces act in the first substep of each segment [s].
         end: The state at its end, without gradient.
     """
 
