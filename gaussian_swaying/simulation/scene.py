@@ -460,7 +460,7 @@ def _arm(arm: Tensor, dtype: torch.dtype) -> Tensor | None:
 
 
 def _pieces(cloud: GaussianCloud, simulated: Tensor, spacing: float | None, hole: float) -> Subdivision | None:
-    """Extra points on large simulated Gaussians, no farther apart than a spacing [scene units].
+    """Return extra points on large simulated Gaussians, no farther apart than a spacing [scene units].
 
     Only those farther than ``hole`` from all Gaussians [scene units]; None if there are none.
     """

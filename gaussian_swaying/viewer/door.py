@@ -1,4 +1,4 @@
-"""Who may open the live page: the name that is asked for, the website that asks, and the token of the link."""
+"""Access to the live page: checks of the requested host name, of the website that asks, and of the token."""
 
 from __future__ import annotations
 

@@ -66,7 +66,7 @@ def make_server(host: str, port: int, door: Door, incoming: Incoming) -> viser.V
 
 @contextmanager
 def checked_by(door: Door, incoming: Incoming) -> Iterator[None]:
-    """Servers that are started meanwhile take requests and messages only after these checks."""
+    """Within the block, make new servers check requests and messages first."""
     import websockets.asyncio.server as websockets
 
     serve = websockets.serve
@@ -194,7 +194,7 @@ class Screen:
         return self._notice[0] if time.monotonic() < self._notice[1] else None
 
     def redraw(self) -> None:
-        """Draw again, as something else than the simulation has changed."""
+        """Draw again, after a change of something else than the simulation."""
         self._version += 1
 
     def look_from_start(self) -> None:
