@@ -145,7 +145,7 @@ class Replayed:
         """The results of the function, in tensors of their own.
 
         Args:
-            key: What the function depends on besides its inputs.
+            key: Identifies all else that the function depends on, besides its inputs.
             function: Takes the inputs and returns tensors; it must not make the host wait.
             inputs: All on one device; if that is no GPU, nothing is recorded.
 

@@ -22,7 +22,7 @@ def check_regular(path: str | os.PathLike[str], what: str = "the file", largest:
 
     Args:
         path: The path.
-        what: What the file should be, for the message.
+        what: Name of the kind of file, for the message.
         largest: Largest allowed size [bytes].
 
     Raises:
@@ -81,7 +81,7 @@ def check_archive(path: str | os.PathLike[str], what: str) -> Path:
 
     Args:
         path: The path.
-        what: What the file should be, for the message.
+        what: Name of the kind of file, for the message.
 
     Raises:
         FileNotFoundError: If the path does not exist.
@@ -105,7 +105,7 @@ def read_arrays(
 
     Args:
         path: The file.
-        what: What the file should be, for the message, for example "the reference".
+        what: Name of the kind of file, for the message, for example "the reference".
         needed: Names of the required arrays.
         optional: Names of optional arrays.
 

@@ -51,7 +51,7 @@ class PlyHeader:
     Attributes:
         order: ``<`` or ``>`` for binary numbers, empty for text.
         elements: Its elements, in the order of the file.
-        start: Where the data begin [bytes].
+        start: Offset of the data in the file [bytes].
     """
 
     order: str

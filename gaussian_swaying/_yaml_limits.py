@@ -135,7 +135,7 @@ def read_fields(path: str | os.PathLike[str], what: str, fields: Sequence[str]) 
 
     Args:
         path: The file.
-        what: What the file should be, for the message, for example "the sweep file".
+        what: Name of the kind of file, for the message, for example "the sweep file".
         fields: Names that it may have.
 
     Returns:

@@ -57,7 +57,7 @@ class CarriedField(WindEffect):
         table: Velocities at the corners of its cells, along its own axes, shape (X, Y, Z, 3), float32.
         spacing: Sides of a cell [m].
         origin: A point in scene units; in Python [m], z up, from the object's centre.
-        anchor: Where that point is in the field at time zero, from its first corner, along its axes [m].
+        anchor: Position of that point in the field at time zero, from its first corner, along its axes [m].
         wraps: Whether it repeats along each axis; if not, its outermost values go on outside.
         scale: Factor of the velocities.
         tilted: See :func:`box_axes`.

@@ -72,7 +72,7 @@ def packed(wind: WindField, device: torch.device, before: Packed | None = None) 
 
     Args:
         wind: The wind.
-        device: Where the numbers are.
+        device: Device of the numbers.
         before: The earlier result, if any: only numbers of effects that have changed since are written, in place if
             they fit.
     """

@@ -85,7 +85,7 @@ class RecordedWind(WindEffect):
     Args:
         path: A .npz or .nc file, see :func:`~gaussian_swaying.aero.wind_files.read_grid`; places in m and velocities in
             m/s, z up.
-        origin: Where x = y = z = 0 of the file is, in scene units.
+        origin: The point x = y = z = 0 of the file, in scene units.
         start: Time of the file at time zero of the run [s]; its first time if null.
         repeat: Whether it starts again after its last time, which is then followed by the first as by any other; if
             not, the last field stays.

@@ -42,7 +42,7 @@ def turbulence_box(
         spectrum: ``von_karman`` or ``kaimal``.
         gamma: Mann's shear; 0 for isotropic turbulence. Only with ``von_karman``.
         seed: Of the noise, which is drawn on the CPU, so that it is the same on every device.
-        device: Where the transform is computed.
+        device: Device on which the transform is computed.
 
     Returns:
         Velocity per standard deviation, shape (*cells, 3), float32.

@@ -238,8 +238,8 @@ class WindField(nn.Module):
         interpolation: Between entries of the schedule: ``step`` (constant until the next) or ``linear``.
         modulations: Sway and gusts, applied in order.
         seed: Seed of the gusts.
-        effects: What differs from place to place, applied in order after the modulations: a profile, turbulence,
-            obstacles, shelter. See docs/wind.md.
+        effects: Effects, which make the wind differ from place to place, applied in order after the modulations: a
+            profile, turbulence, obstacles, shelter. See docs/wind.md.
 
     Example:
         >>> wind = WindField(flow=[2.0, 0.0, 0.0], modulations=[UniformGust(delta=0.0)])

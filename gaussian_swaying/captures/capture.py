@@ -61,7 +61,7 @@ class Capture:
     """A captured scene, without pixels in memory.
 
     Attributes:
-        path: Where it was read from.
+        path: The folder or file that it was read from.
         views: Its views, sorted by name.
         center: Mean position of the training cameras [scene units], float32, shape (3,).
         extent: 1.1 times the largest distance of a training camera from ``center`` [scene units]. Learning rates and

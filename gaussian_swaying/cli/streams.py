@@ -19,7 +19,7 @@ class SafeStream:
         stream: The stream to write to.
 
     Attributes:
-        error: Why writing failed; None if it did not.
+        error: The first error of writing; None if there was none.
     """
 
     def __init__(self, stream: TextIO) -> None:

@@ -38,7 +38,7 @@ class CommonHelp(Action):
 
 
 def common_help(parser: ArgumentParser) -> str:
-    """The help on the options of ``COMMON``, in the words of the help on all of them.
+    """Return the help on the options of ``COMMON``, with the texts of the full help.
 
     Args:
         parser: From :func:`~gaussian_swaying.config.parser.build_parser`.

@@ -146,7 +146,7 @@ def _groups(schema: type) -> dict[str, type]:
 def import_forces(files: Sequence[str | os.PathLike[str]]) -> None:
     """Import the classes of ``forces`` in configuration files, so that the parameters that they register are known.
 
-    What cannot be read or imported is left to the parser, which says what is wrong.
+    Files that cannot be read and modules that cannot be imported are left to the parser, which names the error.
 
     Args:
         files: YAML files.

@@ -293,7 +293,7 @@ def evaluate(
         options: Further arguments of :func:`compare_run`.
 
     Returns:
-        What :func:`compare_run` returns.
+        The result of :func:`compare_run`.
 
     Raises:
         ValueError: As :func:`compare_run`, or if the folder cannot be made; nothing is written then.

@@ -194,7 +194,7 @@ def scales_of(blocks: Sequence[Block], floors: Mapping[str, float], member: int 
 
 
 def _patch_of(points: Tensor) -> Tensor:
-    """Square of each point (T, 3) in a grid over the two longest directions of all, shape (T,)."""
+    """Return the index of each point's square (T,), in a grid over the two longest directions of all points (T, 3)."""
     if len(points) < 3:
         return torch.zeros(len(points), dtype=torch.long)
     centred = (points - points.mean(0)).double()

@@ -52,10 +52,9 @@ OURS = (PROGRESS, VALUES, RESULT, SCENE, PICTURES)
 HORIZONS = (0.25, 0.5)
 """Shares of the fitted frames that the first stage takes, one after the other, and all frames if no matches follow.
 
-Chaos grows with time: in a flapping flag, a change of Young's modulus by a hundredth makes pixels of difference within
-two
-seconds, and over the whole video the cost has local minima far from the global one. So the first horizon is the
-shortest time that determines the unknowns, and its solution must be exact before time is added."""
+Chaos grows with time: in a flapping flag, a change of Young's modulus by a hundredth makes pixels of difference
+within two seconds, and over the whole video the cost has local minima far from the global one. So the first horizon is
+the shortest time that determines the unknowns, and its solution must be exact before time is added."""
 MATCHED = (0.5, 0.5, 0.75, 1.0, 1.0)
 """Shares of the fitted frames that are used, one for each time that Gaussians are matched again."""
 SEARCHED = 0.5
@@ -205,9 +204,9 @@ class Fit:
         return found
 
     def search(self) -> list[float]:
-        """The best place of a coarse search: Sobol's sequence over the ranges, then draws around the best place.
+        """Return the best values of a coarse search: Sobol's sequence over the ranges, then draws around the best.
 
-        Coefficients and damping stay in the middle of their ranges: simulations of like stiffness are one batch.
+        Coefficients and damping stay in the middle of their ranges. Simulations of similar stiffness are one batch.
         """
         unknowns, plan = self.plan.unknowns, self.plan
         begin = [0.5 if u.start is None else u.share(u.start) for u in unknowns]

@@ -37,7 +37,7 @@ def directions(matrix: Tensor, unknowns: Sequence[Unknown], place: Tensor) -> li
     Args:
         matrix: J^T W J in shares of the ranges, shape (U, U).
         unknowns: The unknowns.
-        place: Where the sensitivities were taken, shares of the ranges, shape (U,).
+        place: Values at which the sensitivities were computed, as shares of the ranges, shape (U,).
     """
     values, vectors = torch.linalg.eigh(matrix)
     found = []

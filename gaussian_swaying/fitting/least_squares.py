@@ -38,7 +38,7 @@ Rescale = Callable[[Sequence[Block]], dict[str, float]]
 
 @dataclass(frozen=True, eq=False)
 class Normal:
-    """Residuals and their sensitivities at a point, as sums.
+    """Normal equations: sums over the residuals and their sensitivities at a point.
 
     Attributes:
         cost: Mean of Huber's function over all residuals, each in standard deviations.
@@ -78,7 +78,7 @@ class Progress:
         place: Values of the unknowns, as shares of their ranges, shape (U,).
         damping: Damping of the last accepted step.
         iteration: Iterations done.
-        normal: The sums at ``place``; None if they are to be computed.
+        normal: The normal equations at ``place``; None if they are to be computed.
         scales: Standard deviations of each kind of residual there.
         done: The reason why it ended; empty if it did not.
     """
@@ -102,12 +102,12 @@ def huber(blocks: Sequence[Block], scales: Mapping[str, float]) -> Tensor:
 
 
 def normal_equations(blocks: Sequence[Block], scales: Mapping[str, float], steps: Tensor) -> Normal:
-    """Sums of the residuals of the first variant and of their sensitivities, from the differences of the others.
+    """Normal equations, from the residuals of the first variant and the differences of the others.
 
     Args:
         blocks: Residuals of 1 + U variants; variant 1 + u differs from the first in unknown u.
         scales: Standard deviation of each kind.
-        steps: By how much of its range, shape (U,).
+        steps: The difference in each unknown, as a share of its range, shape (U,).
     """
     unknowns, gradient, matrix, count = len(steps), 0.0, 0.0, 0
     clusters = sum(int(block.cluster.max()) + 1 if len(block.cluster) else 0 for block in blocks)
@@ -149,7 +149,7 @@ def sensitivities(residuals: Residuals, place: Tensor) -> tuple[list[Block], Ten
 
 
 def linearised(residuals: Residuals, rescale: Rescale, place: Tensor) -> tuple[Normal, dict[str, float], list[Block]]:
-    """The sums at a place, the standard deviations of its residuals, and the residuals."""
+    """Return the normal equations at a place, the standard deviations of its residuals, and the residuals."""
     blocks, steps = sensitivities(residuals, place)
     scales = rescale(blocks)
     return normal_equations(blocks, scales, steps), scales, blocks
@@ -163,7 +163,7 @@ def iterate(
     Args:
         residuals: Computes residuals.
         rescale: Standard deviations of the first variant's residuals.
-        progress: Where to start.
+        progress: The state to start from.
         tolerance: Smallest step worth another iteration, as a share of the ranges.
         least_gain: Smallest share of the cost worth another iteration.
 
@@ -196,7 +196,7 @@ def iterate(
 
 
 def step_from(normal: Normal, place: Tensor, damping: float = 0.0) -> Tensor:
-    """The place after a damped step that stays in the ranges; an unknown at its end that would leave it is kept."""
+    """Return the values after a damped step; an unknown at an end of its range that would leave it is kept."""
     free = torch.ones_like(place, dtype=torch.bool)
     for _ in range(len(place) + 1):
         matrix = normal.matrix[free][:, free]

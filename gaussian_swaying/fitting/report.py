@@ -154,7 +154,7 @@ def predictions(
         simulation: Draws the Gaussians.
         videos: The videos.
         times: Times of ``moved`` [s].
-        fitted: How many of them were fitted.
+        fitted: Number of them that were fitted.
         moved: All Gaussians at each of the times.
     """
     chosen = {k for part in (range(1, fitted), range(fitted, len(times))) for k in _spread(part)}

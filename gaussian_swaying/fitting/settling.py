@@ -25,8 +25,8 @@ def unsettled(normal: Normal, place: Tensor, unknowns: Sequence[Unknown], ended:
     detected.
 
     Args:
-        normal: The sums at the end.
-        place: The end, shares of the ranges, shape (U,).
+        normal: The normal equations at the end.
+        place: The values at the end, as shares of the ranges, shape (U,).
         unknowns: The unknowns.
         ended: The reason why the last iterations ended, see :class:`~gaussian_swaying.fitting.least_squares.Progress`;
             empty if their number ran out.

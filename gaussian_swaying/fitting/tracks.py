@@ -27,7 +27,7 @@ LEVELS = 3
 BACK = 0.5
 """Largest distance between a point and the one found by following it back [pixels]."""
 _DRAWN = 1e-3
-"""Least sum of the weights of a Gaussian that a picture shows [pixels]."""
+"""Least sum of the weights of a Gaussian in a picture with which it counts as visible [pixels]."""
 QUALITY = 0.02
 """Least texture of a point, as a share of the best one: smallest eigenvalue of the structure tensor."""
 EDGE = 4.0
@@ -46,8 +46,8 @@ class Tracks:
     """Gaussians that were followed in the video of one camera.
 
     Attributes:
-        index: Their places among the moving Gaussians of the scene, shape (T,).
-        position: Where each was seen [pixels], float64, shape (F, T, 2).
+        index: Their indices among the moving Gaussians of the scene, shape (T,).
+        position: Position of each in the picture [pixels], float64, shape (F, T, 2).
         seen: Whether the track is still valid, bool, shape (F, T).
     """
 
@@ -202,7 +202,7 @@ def follow(images: Any, start: Any) -> tuple[Any, Any]:
 
 
 def _chosen(simulation: Simulation, video: Footage, grey: Any, most: int) -> tuple[Tensor, Tensor]:
-    """Gaussians that are seen at rest and have texture around them, no two within a few pixels; and their pixels."""
+    """Return Gaussians that are visible at rest and have texture around them, a few pixels apart; and their pixels."""
     import numpy as np
 
     scene, painter, camera = simulation.scene, simulation.painter, video.cameras[0]

@@ -55,7 +55,7 @@ def density_grid(
         spacing: Side of a cell h [m].
         resolution: Number of cells along x, y and z.
         max_radius: Longest reach of a kernel [cells].
-        chunk: How many values are computed at once; it does not change a bit of the result.
+        chunk: Number of values computed at once; the result does not depend on it.
         advance: Called with the number of Gaussians just processed.
 
     Returns:
@@ -307,7 +307,7 @@ class InteriorFilling:
             bowl the share is 0.8, so the bowl counts as solid there; 0.9 leaves it empty, but then the surface must
             have no holes.
         particles_per_cell: Points in each cell of the solid without a Gaussian: 1, 8 or 27.
-        jitter: How far points are moved at random from their regular positions, from 0 to 1 times their distance.
+        jitter: Largest random shift of points from their regular positions, from 0 to 1 times their distance.
         max_radius: Longest reach of a Gaussian [cells].
         seed: Seed of the jitter.
     """
@@ -355,7 +355,7 @@ class InteriorFilling:
             opacities: Opacities from 0 to 1, shape (N,).
             spacing: Side of a cell [m], used if the object has none.
             progress: Show a progress bar if it takes more than a second.
-            chunk: How many values are computed at once; the result does not depend on it.
+            chunk: Number of values computed at once; the result does not depend on it.
 
         Returns:
             Points, volumes, and which Gaussians are on the surface.
@@ -433,7 +433,7 @@ def solid_elements(field: Tensor, side: int, chunk: int = _CHUNK) -> Tensor:
     Args:
         field: Depth below the surface [cells], shape (nx, ny, nz).
         side: Elements along the side of a cell.
-        chunk: How many are checked at once.
+        chunk: Number of elements checked at once.
 
     Returns:
         One number for each, z fastest, ascending, shape (K,).

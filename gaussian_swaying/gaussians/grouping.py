@@ -121,10 +121,10 @@ def loose_points(points: Tensor, side: float) -> Tensor:
 
 
 def joined(count: int, pairs: Tensor) -> Tensor:
-    """The connected part that each of ``count`` things is in, from pairs of them that are connected.
+    """Connected components: the component of each of ``count`` items, from the pairs that are connected.
 
     Args:
-        count: How many things.
+        count: Number of items.
         pairs: Their numbers, shape (2, K).
 
     Returns:

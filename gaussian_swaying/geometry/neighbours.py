@@ -19,8 +19,8 @@ def nearest_neighbours(points: Tensor, count: int, queries: Tensor | None = None
 
     Args:
         points: Points to find, shape (N, 3).
-        count: How many to find for each query, at most N (N - 1 without ``queries``).
-        queries: Where to search from, shape (M, 3); None for the points themselves, where no point is its own
+        count: Number of neighbours to find for each query, at most N (N - 1 without ``queries``).
+        queries: Points to search from, shape (M, 3); None for the points themselves, where no point is its own
             neighbour.
 
     Returns:

@@ -48,7 +48,7 @@ class Body:
 
     Attributes:
         laws: The laws of the material, bound to its particles.
-        held: What each boundary holds; None for one that holds no particles.
+        held: The particles that each boundary holds; None for one that holds none.
     """
 
     def __init__(self, points: MaterialPoints, boundaries: Sequence[Boundary], surface: Surface | None = None) -> None:

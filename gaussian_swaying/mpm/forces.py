@@ -119,7 +119,7 @@ class Force(Recordable, nn.Module, ABC):
         Args:
             time: Start of the first substep [s], scalar float64 tensor.
             dt: Substep [s].
-            steps: How many.
+            steps: Number of substeps.
 
         Returns:
             A function of the state at the start of a substep and of its number.

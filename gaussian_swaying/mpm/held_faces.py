@@ -50,7 +50,7 @@ def extents(points: Tensor, mass: Tensor, centre: Tensor, radius: float) -> Tens
         points: Positions [m], shape (P, 3).
         mass: Masses [kg], shape (P,).
         centre: Places, shape (N, 3).
-        radius: How far to look [m].
+        radius: Radius of the search [m].
 
     Returns:
         The sides, ascending [m], shape (N, 3).
@@ -76,7 +76,7 @@ def thickness(points: Tensor, mass: Tensor, places: Tensor, dx: float) -> tuple[
     Args:
         points: Positions of all particles [m], shape (P, 3).
         mass: Their masses [kg], shape (P,).
-        places: Where to look, shape (N, 3).
+        places: The places [m], shape (N, 3).
         dx: Grid spacing [m].
 
     Returns:

@@ -243,6 +243,6 @@ def independent_rows(product: Tensor, rank: Sequence[Tensor], least: float | Ten
 
 
 def ranks(rows: Rows) -> list[Tensor]:
-    """The groups of :func:`independent_rows`: those released last come first, and values before slopes."""
+    """Return the groups for :func:`independent_rows`: rows released last come first, and values before slopes."""
     times = sorted(set(rows.release.tolist()), reverse=True)
     return [(rows.release == time) & (rows.slope == slope) for time in times for slope in (False, True)]

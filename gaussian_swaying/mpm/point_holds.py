@@ -77,7 +77,7 @@ class PointHolds:
 
     Args:
         body: The material and its boundaries.
-        kinds: What each of the boundaries holds (``Boundary.hold_kind``).
+        kinds: Kind of each boundary (``Boundary.hold_kind``).
         faces: Those that clamp a region, which is held on its face.
         still: Nodes that they hold themselves, bool, shape (..., G).
         first: First node of the cell of each particle, over all scenes, shape (N,).
@@ -96,7 +96,7 @@ class PointHolds:
             the value of a row of its own, and zero for a slope, but for rows that reach nodes which a clamp holds.
         affected: Nodes that a row moves, over all scenes, shape (A,).
         entry: The rows of all scenes that move each of them, shape (phases, A, most rows of a node).
-        push: How much they move it: M^-1 C^T, same shape.
+        push: Entries of M^-1 C^T for these rows and nodes, same shape.
 
     Raises:
         ValueError: If there are too many rows, or a place has no material around it.

@@ -42,9 +42,9 @@ def rollout(
 
     Args:
         substep: Advances a state by one substep; called with the state and the number of the substep.
-        state: Where to start.
+        state: The state to start from.
         steps: Number of substeps.
-        checkpoint: How many states apart are kept for the backward pass; 0 for all.
+        checkpoint: Keep every so many-th state for the backward pass; 0 for all.
         watch: Called after each substep.
 
     Returns:
@@ -75,7 +75,7 @@ def recompute(advance: Advance, state: MPMState) -> MPMState:
 
     Args:
         advance: Computes the later state; must give the same result each time.
-        state: Where to start.
+        state: The state to start from.
 
     Returns:
         ``advance(state)``.

@@ -58,9 +58,9 @@ class MPMSolver(nn.Module):
         deterministic: On a GPU, sum in a fixed order, so that repeated runs give the same bits; slower. On a CPU the
             order is always fixed. Gradients on a GPU are not covered.
         boundaries: Boundary conditions, applied in order, impulses first.
-        transfer: How substeps are computed. ``torch`` is the reference and works on any device and with all gradients;
-            ``triton`` runs a whole substep in two kernels on a CUDA device, in float32, with gradients in ``total`` by
-            the first state, stiffness, mass, wind and coefficients; ``auto`` uses triton where possible.
+        transfer: Code that computes substeps. ``torch`` is the reference and works on any device and with all
+            gradients; ``triton`` runs a whole substep in two kernels on a CUDA device, in float32, with gradients in
+            ``total`` by the first state, stiffness, mass, wind and coefficients; ``auto`` uses triton where possible.
 
     Example:
         >>> points = MaterialPoints.create(torch.rand(100, 3), volume=1e-3, density=100.0, youngs_modulus=1e4,
@@ -367,8 +367,8 @@ class MPMSolver(nn.Module):
             dt: Substep [s].
             forces: Forces on the particles, see :meth:`rollout`.
             force: A force on each particle that is already known [N], shape (..., P, 3); it is added to ``forces``.
-            drag: How much that force decreases per unit of velocity gained in the substep [kg/s], shape (..., P); drag
-                that is passed this way is stable for particles of any mass (see ``AeroForce.resistance``).
+            drag: Decrease of that force per unit of velocity gained in the substep [kg/s], shape (..., P); drag that is
+                passed this way is stable for particles of any mass (see ``AeroForce.resistance``).
 
         Returns:
             The state ``dt`` later.

@@ -35,7 +35,7 @@ class Stencil:
         node_count: Nodes G of one scene.
         order: Permutation that sorts the joined entries of the three layers, for sums that are the same in every run,
             or None.
-        start: Where the entries of each node begin in that order, shape (all nodes + 1,), or None.
+        start: Index of the first entry of each node in that order, shape (all nodes + 1,), or None.
         matrices: ``basis`` as a sparse matrix from all nodes to the rows of all particles, and its transpose, for a
             stencil that is used many times, or None.
     """

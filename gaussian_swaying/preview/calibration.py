@@ -77,7 +77,7 @@ class Calibration:
 
     Attributes:
         setting: The values, to two digits.
-        motion: How the scene moved with them.
+        motion: Motion of the scene with them.
         runs: Number of runs.
         reason: The reason, in words.
     """

@@ -80,7 +80,7 @@ def estimate_cost(simulation: Simulation, frames: int, startup_seconds: float = 
         simulation: The run.
         frames: Number of frames of the run.
         startup_seconds: Time to prepare the run [s], if known.
-        growth: How many times the substeps at rest a frame takes on average, if known.
+        growth: Mean number of substeps of a frame over the number at rest, if known.
 
     Returns:
         The estimate.
@@ -193,7 +193,7 @@ def finest_within(
     Args:
         measure: Function that estimates the cost of the run for a grid spacing [m].
         seconds: Longest time of the run [s].
-        first: What it returned for one spacing.
+        first: Its result for one spacing.
         draft: The same scene on another grid; its frames and pictures do not count.
         finest: Smallest grid spacing [m].
         coarsest: Largest grid spacing [m].

@@ -35,7 +35,7 @@ class CapturedFrom:
         reason: The reason, in words.
         focus: The point nearest to all optical axes [scene units], float64, shape (3,); None if there is no common
             point.
-        reach: How far to the side of it the median camera sees [scene units].
+        reach: Distance to the side of it that the median camera sees [scene units].
     """
 
     path: str
@@ -76,7 +76,7 @@ class ShownObject:
         mask: Gaussians visible in at least 60 % of the photos that are not in or behind a backdrop, shape (N,).
         backdrops: Walls, floors and tables that were left out, with masks over all N Gaussians.
         focus: The point that the cameras look at [scene units], shape (3,).
-        reach: How far to the side of it they see [scene units].
+        reach: Distance to the side of it that they see [scene units].
     """
 
     mask: Tensor
@@ -208,7 +208,7 @@ def backdrops(points: Tensor, weight: Tensor, eyes: Tensor, reach: float, cell: 
         points: Centres of the Gaussians in the photos [scene units], shape (N, 3).
         weight: Their visible area, shape (N,).
         eyes: Positions of the cameras [scene units], shape (C, 3).
-        reach: How far photos reach to the side [scene units].
+        reach: Distance to the side that photos show [scene units].
         cell: Coordinates of the regions are rounded to a hundredth of it [scene units].
 
     Returns:

@@ -136,7 +136,7 @@ class Suggestion:
         camera_offset: Vector from the centre of the moving part to that of the whole, in multiples of the longest side
             of the moving part.
         camera_radius: Distance of a camera that shows the whole, in the same unit.
-        growth: How many times the substeps of a frame at rest a frame takes on average, from the trial runs.
+        growth: Mean number of substeps of a frame over the number at rest, from the trial runs.
     """
 
     up: UpGuess

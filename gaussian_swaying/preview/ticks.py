@@ -54,7 +54,7 @@ def draw_ticks(
     The edge is the rightmost of edges that are upright in the picture, and the lowest of others.
 
     Args:
-        draw: Where to draw.
+        draw: The picture to draw on.
         font: Font of the numbers.
         low: Lower corner [scene units].
         high: Upper corner [scene units].

@@ -94,7 +94,7 @@ class Recorder:
         trajectory: Write position (float32, metres, z up) and F (float16) of the simulated particles for each frame.
         checkpoint_every: Write the state for ``--resume`` every ``checkpoint_every`` frames; 0 for never.
         fps: Frames per second of the video; null for real time, 1 / frame_dt.
-        renders: What to draw for each frame: ``color``, ``depth``, ``normal``, ``force``, ``wind``.
+        renders: Pictures of each frame: ``color``, ``depth``, ``normal``, ``force``, ``wind``.
         depth_step: Depth of one step of the PNG in ``depth_raw`` [m].
         normal_axes: ``camera`` (x right, y up, z towards the camera) or ``world`` (simulation axes, z up).
         force_scale: End of the colour scale of ``force`` [Pa]; null for the largest force per area of the wind, without

@@ -101,7 +101,7 @@ def damaged(path: Path, why: str) -> ValueError:
 
 
 def tell_missing(files: Sequence[Path], film: str | None = None) -> list[str]:
-    """A sentence with the first of some missing files, if there are any, and the film made from them."""
+    """Return a sentence that names the first missing file, if any, and the film made from them."""
     if not files:
         return []
     what, many = ("it", f"{files[0]} is") if len(files) == 1 else ("them", f"{files[0]} and {len(files) - 1} more are")

@@ -104,7 +104,7 @@ class SplatOutput:
     Attributes:
         color: As :attr:`RenderOutput.color`, shape (H, W, 3).
         alpha: As :attr:`RenderOutput.alpha`, shape (H, W, 1).
-        screen: Where the Gaussians are on the screen.
+        screen: The Gaussians on the screen.
         channels: Further values, blended like the colours over zero, shape (H, W, E), or None.
     """
 

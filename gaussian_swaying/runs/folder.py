@@ -26,7 +26,7 @@ def claim_folder(folder: Path, ours: Iterable[str], remedy: str, in_use: Iterabl
     Args:
         folder: The folder.
         ours: Names in it that a run writes. The folder is refused if something else made one of them.
-        remedy: What the user can do, for the messages, such as "choose another with --output".
+        remedy: A remedy for the user, for the messages, such as "choose another with --output".
         in_use: Files and folders that the new run reads, which must not be moved.
 
     Returns:

@@ -293,7 +293,7 @@ def copies(template: Patches, axes: Tensor, size: Tensor, origin: Tensor, tint: 
         template: T patches.
         axes: Rotation of each copy, shape (M, 3, 3).
         size: Factor on its lengths, shape (M,).
-        origin: Where the template's origin goes [m], shape (M, 3).
+        origin: Position of each copy's origin [m], shape (M, 3).
         tint: Factor on its colours, shape (M, 3).
 
     Returns:

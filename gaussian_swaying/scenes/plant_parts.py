@@ -47,8 +47,8 @@ def leaf(
         width: Largest width [m].
         spacing: Distance between Gaussians [m]; a leaf has at least one Gaussian.
         taper: The exponents p and q.
-        droop: How far the tip hangs below the plane, as a share of the length.
-        fold: How far the rim rises above the midrib, as a share of the half width.
+        droop: Distance of the tip below the plane, as a share of the length.
+        fold: Height of the rim above the midrib, as a share of the half width.
         colour: RGB of the blade.
         vein: RGB of the midrib and the side veins.
         veins: Pairs of side veins to draw.

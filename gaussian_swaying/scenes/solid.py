@@ -65,7 +65,7 @@ class SolidScene(ProceduralScene):
         spacing: Distance between Gaussians [m], at most a quarter of the size.
         gaussians: ``throughout``, or ``shell`` for a hollow splat, as captures are.
         overlap: Standard deviation of a Gaussian as a share of the spacing.
-        jitter: How far points of the lattice are moved at random, from 0 to 1 times the spacing.
+        jitter: Largest random shift of points of the lattice, from 0 to 1 times the spacing.
         seed: Seed of the jitter.
     """
 

@@ -226,7 +226,7 @@ class Measurement:
         return self._found
 
     def _number(self, place: int) -> float:
-        """Of the given numbers the first or second, which may be a tensor."""
+        """Return the first or second of the given numbers, which may be a tensor."""
         value = self._given[place]
         if not isinstance(value, Tensor):
             return float(value)

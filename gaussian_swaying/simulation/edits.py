@@ -75,7 +75,7 @@ def edited_points(points: MaterialPoints, inside: Tensor, edit: Edit, flowed: bo
     Args:
         points: The material of one scene, shapes (P, ·).
         inside: Which points are edited, bool, shape (P,).
-        edit: What to change.
+        edit: The change.
         flowed: Whether the points have already moved. After plastic flow, the elastic and the total deformation differ
             for good. If no plastic law is left, one of the other laws is set to keep both, and the plastic law stays in
             the list without particles, because the kernels check the list.
@@ -226,7 +226,7 @@ class SceneEditor:
         """Apply an edit to the scene.
 
         Args:
-            edit: What to change.
+            edit: The change.
             flowed: See :func:`edited_points`.
 
         Returns:

@@ -103,7 +103,7 @@ class Parameter:
 
         Args:
             value: A number or tensor; three of them for a vector.
-            name: What to call it in messages, if not by its name.
+            name: Name of it in messages; its own if None.
 
         Raises:
             ValueError: If it is out of range.

@@ -126,7 +126,7 @@ class Run:
         self.simulation, self.painter, self.recorder = simulation, simulation.painter, simulation.recorder
         self.frames, self.splat, self.config = frames, splat, config
         self.log: list[dict[str, Any]] = []
-        self._lines: list[str] = []  # the log as a checkpoint holds it, which is written every frame
+        self._lines: list[str] = []  # the log as a checkpoint stores it, which is written every frame
         self.walls, self.peak = WallClock(simulation.device), PeakMemory(simulation.device)
         self._nodes: tuple[GridSpec, Tensor] | None = None
         self.force_end = self.recorder.force_scale or simulation.force_scale()

@@ -106,7 +106,7 @@ def sample_object(
         body_area: Areas that carry material [m²], shape (S,).
         area: Areas that feel the wind [m²], shape (S,).
         filling: Samples inside a solid, if there are any.
-        material: What the object is made of.
+        material: The material of the object.
         frame: Conversion from scene units to metres.
         dx: Grid spacing [m], for ``material.volume = "cell"``.
 

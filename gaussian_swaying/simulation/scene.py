@@ -49,9 +49,9 @@ class Scene:
         generator: A scene made in code.
         region: Part that is simulated, in scene units; the rest does not move and is rendered as well.
         opacity_threshold: Gaussians in the region below this opacity carry no mass and feel no wind.
-        faint: What happens to Gaussians below that opacity: ``carry`` (they follow their nearest simulated neighbour),
+        faint: Treatment of Gaussians below that opacity: ``carry`` (they follow their nearest simulated neighbour),
             ``static`` or ``drop``.
-        loose: What happens to specks that are not connected to the object, or only by a thin thread (see
+        loose: Treatment of specks that are not connected to the object, or only by a thin thread (see
             :func:`~gaussian_swaying.gaussians.grouping.loose_points`): ``simulate`` (like all others, so the wind blows
             them away) or ``carry`` (no mass, no wind; they follow their nearest simulated neighbour).
         up: Direction in the scene that points up, for example [0, -1, 0].
@@ -189,8 +189,8 @@ class SimulatedScene(nn.Module):
     Gaussians and of such points. Wind acts on patches: those of the simulated Gaussians and of their extra points.
 
     Args:
-        scene: Where the Gaussians come from.
-        material: What they are made of.
+        scene: The source of the Gaussians.
+        material: Their material.
         dx: Grid spacing [m].
         dtype: Precision of the simulation.
         cloud: The Gaussians of the scene, if they have been read already.
@@ -460,7 +460,7 @@ def _arm(arm: Tensor, dtype: torch.dtype) -> Tensor | None:
 
 
 def _pieces(cloud: GaussianCloud, simulated: Tensor, spacing: float | None, hole: float) -> Subdivision | None:
-    """Extra points on large simulated Gaussians, no farther apart than a spacing [scene units].
+    """Return extra points on large simulated Gaussians, no farther apart than a spacing [scene units].
 
     Only those farther than ``hole`` from all Gaussians [scene units]; None if there are none.
     """

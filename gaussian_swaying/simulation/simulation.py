@@ -65,14 +65,14 @@ class Simulation(Stepping):
     share a simulation take turns.
 
     Args:
-        scene: Where the Gaussians come from and which of them move. In Python also a file, Gaussians or a scene made in
-            code; these are simulated as a whole, with the defaults of a :class:`Scene`.
-        material: What the object is made of; :class:`Material` with its defaults if None.
+        scene: The source of the Gaussians, and the choice of those that move. In Python also a file, Gaussians or a
+            scene made in code; these are simulated as a whole, with the defaults of a :class:`Scene`.
+        material: The material of the object; :class:`Material` with its defaults if None.
         solver: Grid, formulation, gravity and boundaries; if None, a grid of 32 cells along the longest side.
         wind: Air velocity over time; in Python also one that varies in space, or three numbers [m/s]. Still air if
             None.
         aero: Force of the wind on patches; :class:`AeroForce` with its defaults if None.
-        contact: How the material touches itself; null if it does not. Obstacles are boundaries of the solver.
+        contact: Contact of the material with itself; null for none. Obstacles are boundaries of the solver.
         forces: Custom forces besides gravity and wind, each given by its class path.
         shader: Shading; null keeps the splat's colours.
         camera: Camera path; if null, an orbit camera on the side of the photos, if one of ``cameras`` is that of a
@@ -81,7 +81,7 @@ class Simulation(Stepping):
         edits: Changes to parts of the object. Each has a `region` (at rest, in scene units; null for everything that
             moves), a `time` [s] from which it applies, any of `E` [Pa], `nu`, `density` [kg/m³] and `law`, and a
             `color` (red, green, blue in [0, 1]) that keeps the fraction `detail` of the old brightness differences.
-        recorder: What :meth:`run` writes; :class:`Recorder` with its defaults if None.
+        recorder: Outputs of :meth:`run`; :class:`Recorder` with its defaults if None.
         normalisation: Read boundaries, and the regions of material and edits, in PhysGaussian's normalised space; null
             for scene units.
         background: Background colour in [0, 1].
@@ -349,7 +349,7 @@ class Simulation(Stepping):
             resume: Continue the run found in ``output`` after its last complete frame.
             settings: Additional entries for the summary.
             progress: Show a progress bar.
-            recorder: What to write from now on; the recorder of the constructor if None.
+            recorder: Outputs from now on; the recorder of the constructor if None.
 
         Returns:
             The summary, as in ``summary.json``.

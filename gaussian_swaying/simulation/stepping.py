@@ -195,7 +195,7 @@ class Stepping(nn.Module):
 
         Args:
             state: The current state.
-            edits: What to change, in this order.
+            edits: The changes, in this order.
 
         Returns:
             The state from which the run continues.
@@ -521,7 +521,10 @@ def _read(state: MPMState) -> list[Tensor]:
 
 
 def parts_of(simulation: Stepping) -> tuple[object, ...] | None:
-    """Return a key of all else that the needs depend on; None if changes cannot be detected, or on another device."""
+    """Return the key of all that the needs depend on besides the state; None if changes cannot be detected.
+
+    That is so for tensors of inference mode, and for tensors on another device than the simulation.
+    """
     wind = simulation.wind_force
     tensors = tensors_in([wind])
     if any(tensor.is_inference() or tensor.device != simulation.device for tensor in tensors):

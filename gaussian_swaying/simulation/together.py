@@ -41,7 +41,7 @@ def variant(first: Simulation, values: Mapping[str, Any], recorder: Recorder, co
         first: A simulation whose :meth:`~Simulation.start` was called; all its other parts are shared.
         values: Values of parameters that may differ within a batch, see
             :mod:`gaussian_swaying.simulation.parameters`.
-        recorder: What a run of it writes.
+        recorder: Outputs of a run of it.
         config: Its configuration as YAML.
 
     Raises:

@@ -106,7 +106,7 @@ def draw_wind(
         simulation: The simulation.
         state: The state.
         camera: The camera, on the device of the Gaussians.
-        picture: What the camera sees.
+        picture: Picture of the object from the camera.
         largest: End of the colour scale [m/s]; 1.5 times the mean flow if None.
 
     Returns:

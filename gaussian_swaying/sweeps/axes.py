@@ -140,7 +140,7 @@ def _draw(where: str, given: Mapping[str, Any]) -> Callable[[random.Random], Any
 
 
 def _tidy(value: float) -> float:
-    """Rounded to 12 digits, so that powers of another machine's C library give the same number."""
+    """Round to 12 digits, so that powers computed by another machine's C library give the same number."""
     return float(f"{value:.12g}")
 
 

@@ -73,7 +73,7 @@ def drive(
         jobs: The jobs.
         backend: Does them.
         ended: Called with the name and the result of each run, in the order in which they end.
-        retries: How often a failed job is tried again; three times as often if its process was killed.
+        retries: Number of times that a failed job is tried again; three times as often if its process was killed.
         tick: Called about once a second with the number of runs that are being done.
     """
     waiting, running = deque(jobs), 0

@@ -22,10 +22,10 @@ class Job:
     Args:
         folder: Folder of the sweep.
         names: Names of the runs.
-        config: What all runs share, as YAML.
+        config: Configuration that all runs share, as YAML.
         frames: Frames.
         runs: The value of every axis in each run.
-        device: Where to simulate.
+        device: Device of the simulation.
         attempt: 1 for the first time.
         resume: Continue from the checkpoint of an earlier attempt, if there is one; not if there are several runs.
         complete: Names of runs that are done already, and only simulated along with the others.

@@ -139,7 +139,7 @@ def parse_run(parser: ArgumentParser, config: str, frames: int, run: Mapping[str
 
     Args:
         parser: From :meth:`Simulation.parser`.
-        config: What all runs share, as YAML.
+        config: Configuration that all runs share, as YAML.
         frames: Frames, unless ``run`` has others.
         run: The value of every axis.
 
@@ -157,7 +157,7 @@ def parse_run(parser: ArgumentParser, config: str, frames: int, run: Mapping[str
 
 
 def _located(error: Exception, where: str) -> tuple[Any, ...]:
-    """Arguments of the same error with a message that begins with a place."""
+    """Return the arguments of the same error, with a message that begins with a location."""
     return (None, f"{where}{error}") if isinstance(error, ArgumentError) else (f"{where}{error}",)
 
 

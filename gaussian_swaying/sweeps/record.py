@@ -186,7 +186,7 @@ def result_of(summary: Mapping[str, Any], attempt: int, where: str = "") -> dict
 
     Args:
         summary: Its summary, as in ``summary.json``.
-        attempt: How often it was begun in this sweep.
+        attempt: Number of times that it was begun in this sweep.
         where: The machine that did it.
     """
     figures = {name: summary.get(name) for name in FIGURES}
@@ -210,7 +210,7 @@ def failure(status: str, reason: str, attempt: int) -> dict[str, Any]:
     Args:
         status: ``failed`` or ``diverged``.
         reason: One sentence.
-        attempt: How often it was begun.
+        attempt: Number of times that it was begun.
     """
     return {"status": status, "reason": reason, "attempts": attempt}
 

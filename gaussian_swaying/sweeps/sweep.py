@@ -83,7 +83,7 @@ def run_sweep(
         resume: Continue the sweep in the folder; complete runs are never done again.
         workers: Jobs at a time, each in a process; if None, ``per_gpu`` for each GPU, or one per core without one.
         threads: Threads of each; cores / workers if None, and 1 with ``ray``.
-        retries: How often a failed run is tried again; three times as often if its process was killed.
+        retries: Number of times that a failed run is tried again; three times as often if its process was killed.
         device: ``auto``, ``cpu`` or ``cuda``, for every run.
         picture: Frame of the contact sheet, ``last`` or ``middle``.
         explain: Makes a sentence of an error of a run; a function of a module.

@@ -93,7 +93,7 @@ def texts(parser: ArgumentParser, settings: Sequence[Namespace], names: Sequence
     Args:
         parser: From :meth:`Simulation.parser`.
         settings: Of each run.
-        names: What they differ in, as options.
+        names: Options in which they differ.
     """
     import yaml
 

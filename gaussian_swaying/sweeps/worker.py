@@ -64,7 +64,7 @@ def work(connection: Connection, threads: int, explain: Explain = first_line) ->
     """Do the jobs that arrive, and send the result of each; ends after a failure that may have left something behind.
 
     Args:
-        connection: Where jobs come from and results go to.
+        connection: Receives jobs and sends results.
         threads: Threads of torch.
         explain: Makes a sentence of an error.
     """

@@ -51,7 +51,7 @@ class CsvLog(Logger):
     """Lightning's values as rows of ``metrics.csv``, each with its ``step``. No file is written before the first row.
 
     Args:
-        folder: Where the file is.
+        folder: Folder of the file.
     """
 
     def __init__(self, folder: Path) -> None:

@@ -13,7 +13,7 @@ class TrainingDiverged(RuntimeError):  # noqa: N818
 
     Args:
         step: Number of images trained on before the one that failed.
-        what: What is not finite.
+        what: Name of the value that is not finite.
         checkpoint: Last checkpoint written before, if any.
     """
 

@@ -56,7 +56,7 @@ class SplatTrainer(lightning.LightningModule):
         loss_weights: Weights of the losses by name (``rgb``, ``anisotropy``, ``entropy``, ``size`` and further terms),
             in place of the paper's, see :class:`~gaussian_swaying.training.losses.TotalLoss`; 0 leaves one out.
         loss_terms: Further losses by name, or others in place of those four.
-        densification: How Gaussians are copied, split and removed.
+        densification: Strategy that copies, splits and removes Gaussians.
         rates: Learning rates.
         sh_degree: Highest degree of the spherical harmonics, 0 to 3.
         sh_every: Steps after which the degree in use rises by one; 0 for all from the start.

@@ -37,7 +37,7 @@ def random_stream(held: dict[str, Tensor], device: torch.device, seed: int) -> I
     Args:
         held: The state of the stream, by :func:`random_state`; updated at the end. Empty before its start.
         device: The device.
-        seed: Where the stream starts.
+        seed: Seed of the stream.
     """
     outside = random_state(device)
     if held:

@@ -28,7 +28,7 @@ def changed_settings(parser: ArgumentParser, settings: Namespace, values: Mappin
 
     Args:
         parser: From :meth:`Simulation.parser`.
-        settings: What it parsed.
+        settings: Settings from it.
         values: New values by the names of their fields, with dots, or of parameters.
 
     Raises:

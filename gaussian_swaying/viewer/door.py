@@ -1,4 +1,4 @@
-"""Who may open the live page: the name that is asked for, the website that asks, and the token of the link."""
+"""Access to the live page: checks of the requested host name, of the website that asks, and of the token."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ class Door:
     websocket of viser asks without it.
 
     Args:
-        host: Where the server listens.
+        host: Address at which the server listens.
         names: Names of this computer that a browser may ask for, besides those that it has.
 
     Attributes:

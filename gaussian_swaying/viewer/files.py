@@ -88,7 +88,7 @@ class Files:
         threading.Thread(target=self._read, args=(button, read), name="load", daemon=True).start()
 
     def _read(self, button: viser.GuiUploadButtonHandle, read: Callable[[bytes, Folder], Namespace]) -> None:
-        """Go on with an uploaded file; its name is never used."""
+        """Load an uploaded file; its name is never used."""
         folder = Folder()
         try:
             settings = read(button.value.content, folder)
@@ -111,7 +111,7 @@ class Files:
         return settings_of_splat(self.session.parser, path, self.session.simulation.device, tell=self.page.progress)
 
     def _configuration(self, content: bytes, folder: Folder) -> Namespace:
-        """The settings of a file; if it was saved here, it is for the splat that is there."""
+        """The settings in a configuration file; if its splat is not on this computer, they get the present one."""
         self.page.progress(0.1, "Reading the configuration")
         try:
             text = content.decode()

@@ -13,8 +13,8 @@ from gaussian_swaying.mpm.state import MPMState
 from gaussian_swaying.simulation.scene import SimulatedScene
 
 REACH = 0.06  # radius of what is grabbed, as a share of the longest side
-QUICK = 40.0  # 1/s: how quickly what is grabbed follows, if nothing holds it back
-STRONGEST = 400.0  # m/s²: most that it accelerates what it holds
+QUICK = 40.0  # 1/s: how quickly what is grabbed follows, if nothing else acts on it
+STRONGEST = 400.0  # m/s²: largest acceleration of what is grabbed
 
 
 class Pull(Force):
@@ -24,7 +24,7 @@ class Pull(Force):
         share: Strength with which each particle is pulled, from 0 to 1, shape (P,).
         mass: Mass of each particle [kg], shape (P,).
         offset: From the mean of the pulled particles to each particle [m], shape (P, 3).
-        target: Where its mean should be [m], shape (3,).
+        target: Place to which their mean is pulled [m], shape (3,).
         frame: Transform between the scene and metres.
     """
 

@@ -32,7 +32,7 @@ def settings_of_splat(
     Args:
         parser: From :meth:`Simulation.parser`.
         path: The splat.
-        device: Where it will be simulated.
+        device: Device of the simulation.
         further: Options that replace what is suggested.
         tell: Called with the share that is done, from 0 to 1, and the name of the next task.
 

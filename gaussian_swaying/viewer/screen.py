@@ -39,8 +39,8 @@ def make_server(host: str, port: int, door: Door, incoming: Incoming) -> viser.V
     Args:
         host: Address to listen on.
         port: Port; the next free one if it is taken.
-        door: Who may come in.
-        incoming: What a browser may send.
+        door: Checks who may open the page.
+        incoming: Checks the messages of browsers.
 
     Raises:
         ImportError: If viser is not installed.
@@ -66,7 +66,7 @@ def make_server(host: str, port: int, door: Door, incoming: Incoming) -> viser.V
 
 @contextmanager
 def checked_by(door: Door, incoming: Incoming) -> Iterator[None]:
-    """Servers that are started meanwhile take requests and messages only after these checks."""
+    """Within the block, make new servers check requests and messages first."""
     import websockets.asyncio.server as websockets
 
     serve = websockets.serve
@@ -97,7 +97,7 @@ class Screen:
         names: Names of this computer that a browser may ask for, besides those that it has.
 
     Attributes:
-        shown: What is drawn, one of :data:`.pictures.SHOWN`.
+        shown: The kind of picture, one of :data:`.pictures.SHOWN`.
         streaks: Whether streaks of air are drawn over it.
         recording: The video that is being recorded, or None.
         force_end: End of the colour scale of the force of the wind [Pa].
@@ -194,7 +194,7 @@ class Screen:
         return self._notice[0] if time.monotonic() < self._notice[1] else None
 
     def redraw(self) -> None:
-        """Draw again, as something else than the simulation has changed."""
+        """Draw again, after a change of something else than the simulation."""
         self._version += 1
 
     def look_from_start(self) -> None:

@@ -1,4 +1,4 @@
-"""A simulation that goes on in a thread of its own, and can be changed while it does."""
+"""A simulation that runs in its own thread, and can be changed meanwhile."""
 
 from __future__ import annotations
 
@@ -93,7 +93,7 @@ class Session:
 
     Args:
         parser: From :meth:`Simulation.parser`.
-        settings: What it parsed.
+        settings: Settings from it.
         simulation: The simulation of these settings, if it is made already.
 
     Attributes:
@@ -364,7 +364,7 @@ class Session:
             self._past.append(Past(before, list(values), now))
 
     def _apply(self, settings: Namespace, names: list[str]) -> None:
-        """Take settings of which some fields differ, and change the simulation with them."""
+        """Adopt settings in which some fields differ, and change the simulation accordingly."""
         if not self._broken:
             self.problem = None
         state = take(self.simulation, self.snapshot.state, self.parser, settings, names)

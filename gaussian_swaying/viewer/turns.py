@@ -1,4 +1,4 @@
-"""One thread in which the live page does what its browsers ask, one after another."""
+"""One thread in which the live page handles the requests of its browsers, one after another."""
 
 from __future__ import annotations
 

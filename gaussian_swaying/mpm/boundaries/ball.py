@@ -22,7 +22,7 @@ class BallObstacle(Obstacle):
         radius: Its radius, in scene units.
         friction: Coulomb coefficient.
         gap: Distance that the material keeps from it [m].
-        path: How it moves; None for an obstacle at rest.
+        path: Motion of the obstacle; None for one at rest.
         start: Time from which it acts [s].
         end: Time from which it no longer acts [s]; None for never.
     """

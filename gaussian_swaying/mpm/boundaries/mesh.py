@@ -24,10 +24,10 @@ class MeshObstacle(Obstacle):
     Args:
         mesh: A .ply or .obj file, in scene units and axes.
         cells: Cells of the grid along the longest side of the mesh.
-        center: Where the origin of the mesh lies, in scene units.
+        center: Position of the mesh's origin, in scene units.
         friction: Coulomb coefficient.
         gap: Distance that the material keeps from it [m].
-        path: How it moves; None for an obstacle at rest.
+        path: Motion of the obstacle; None for one at rest.
         start: Time from which it acts [s].
         end: Time from which it no longer acts [s]; None for never.
 

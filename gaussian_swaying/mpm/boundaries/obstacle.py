@@ -23,10 +23,10 @@ class Obstacle(Boundary):
     a cell wide.
 
     Args:
-        center: Where its own axes have their origin at rest, in scene units.
+        center: Origin of its own axes at rest, in scene units.
         friction: Coulomb coefficient.
         gap: Distance that the material keeps from it [m].
-        path: How it moves; None for an obstacle at rest.
+        path: Motion of the obstacle; None for one at rest.
         start: Time from which it acts [s].
         end: Time from which it no longer acts [s]; None for never.
     """

@@ -22,7 +22,7 @@ class StillGaussians(Obstacle):
     Args:
         cells: Cells of the grid along its longest side.
         level: Density of the surface, from 0 to 1.
-        margin: How far the grid reaches beyond the object at rest, in lengths of its longest side.
+        margin: Distance by which the grid reaches beyond the object at rest, in lengths of its longest side.
         friction: Coulomb coefficient.
         gap: Distance that the material keeps from it [m].
         start: Time from which it acts [s].

@@ -41,7 +41,7 @@ def close_pairs(place: Tensor, reach: float, rest: Tensor, apart: float) -> tupl
     low = place.amin(0)
     extent = float((place.amax(0) - low).amax())
     if not extent < float("inf"):
-        raise FloatingPointError("The position of a place of the surface is NaN or infinite.")
+        raise FloatingPointError("The position of a contact sample is NaN or infinite.")
     size = max(reach, extent / 2.0**19)  # so that float32 rounds a position by a small part of a cell, and keys fit
     cell = ((place - low) / size).long() + 1
     _, ny, nz = (cell.amax(0) + 2).tolist()
@@ -69,7 +69,7 @@ def close_pairs(place: Tensor, reach: float, rest: Tensor, apart: float) -> tupl
             found.append(torch.stack([order[a[far]], order[b[far]]]))
             if sum(part.shape[1] for part in found) > MOST_PAIRS:
                 raise ValueError(
-                    f"More than {MOST_PAIRS:,} pairs of places of the surface are closer than {reach:.3g} m: the "
+                    f"More than {MOST_PAIRS:,} pairs of contact samples are closer than {reach:.3g} m: the "
                     "material has collapsed; lower `contact.thickness`, or coarsen `solver.dx`."
                 )
             first = last

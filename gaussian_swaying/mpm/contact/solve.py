@@ -16,8 +16,8 @@ The impulses are found by Jacobi's iteration, all at once, with Nesterov's momen
 Nesterov's method to accelerate multibody dynamics with friction and contact"), so that a pile of n layers takes of
 order n iterations. The step of a constraint is one over the sum of the absolute values of its row in
 :math:`A = J M^{-1} J^T`, so the iteration cannot overshoot (Gershgorin): for a lone sample it is the mass that the
-sample really has, and for a whole area in contact the mass of the area. With :math:`c` constraints at each sample the sum
-is bounded by :math:`\sum_i |w_i| s_i / m_i`, :math:`s_i = \sum |w_i| c`, without forming A.
+sample really has, and for a whole area in contact the mass of the area. With :math:`c` constraints at each sample the
+sum is bounded by :math:`\sum_i |w_i| s_i / m_i`, :math:`s_i = \sum |w_i| c`, without forming A.
 
 Friction that sticks yields a little: with step :math:`\alpha` and friction :math:`j_t` it leaves the slip
 :math:`v_t = -c\,j_t / \alpha`, c = ``CREEP`` (Todorov 2014, "Convex and analytically-invertible dynamics with contacts
@@ -70,7 +70,7 @@ class Rows:
         inverse_mass: Inverse mass of the nodes [1/kg], shape (G,).
         place: The rows that have a weight on each node, node after node, shape (27 A + 27,).
         share: Those weights, shape (27 A + 27,).
-        start: Where those of each node begin, shape (G,).
+        start: Index of the first of each node, shape (G,).
     """
 
     node: Tensor
@@ -170,7 +170,7 @@ def resolve(
         held: The constraints that act; those that are not ``valid`` do nothing.
         dt: Substep [s].
         dx: Grid spacing [m].
-        iterations: How often the impulses are improved, at most.
+        iterations: Largest number of iterations.
         tolerance: Stop if no constraint is violated by more than this within the substep [m]; the host waits. None to
             make all iterations.
 

@@ -48,7 +48,7 @@ class Lists:
         second: Rows of the second.
         before: Positions of the material points when the lists were made [m], shape (P, 3).
         time: That time [s].
-        margin: How much closer two things may have come [m].
+        margin: Distance beyond contact up to which pairs are listed [m].
         fastest: Bound of the speed of the obstacles [m/s].
     """
 
@@ -86,7 +86,7 @@ class ContactStage:
     Args:
         surface: The contact samples.
         boundaries: The boundaries of the body; those that are obstacles act here.
-        kinds: What each acts on (``Boundary.hold_kind``).
+        kinds: Kind of each boundary (``Boundary.hold_kind``).
         grid: The nodes.
         inverse_mass: Their inverse mass [1/kg], 0 for a node without mass, shape (..., G).
         deterministic: Whether sums on a GPU have a fixed order.
@@ -116,7 +116,7 @@ class ContactStage:
         snap = torch.finfo(read.dtype).eps ** 0.5
         stencil = bspline_stencil(read, grid, False, snap)
         if not bool(stencil.inside.all()):
-            raise ValueError("A place of the surface lies outside the material: give places on the simulated points.")
+            raise ValueError("A contact sample lies outside the material: give samples on the simulated points.")
         basis = stencil.basis  # (C, 4, 27)
         arm = surface.place - surface.read
         self.node = stencil.node.reshape(-1, 27)
@@ -242,7 +242,7 @@ class ContactStage:
         Pairs are left out that are too far from each other to touch in this substep.
 
         Args:
-            lists: What may touch.
+            lists: The candidates.
             displacement: Of the nodes around the listed samples [m], shape (T, 3).
             moving: Velocity of the listed samples [m/s], shape (A + 1, 3).
             time: Time now [s].

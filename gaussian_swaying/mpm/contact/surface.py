@@ -51,8 +51,8 @@ class Surface:
         normal: Unit normals at rest, of either sign, shape (C, 3).
         radius: Radii of the discs [m], shape (C,).
         thickness: Distance that two surfaces keep [m], shape (C,).
-        read: Where in the material each is read [m], shape (C, 3): the sample itself, or one close to it if some of its
-            nodes have no mass.
+        read: Rest position at which the motion of each is interpolated [m], shape (C, 3): the sample itself, or one
+            close to it if some of its nodes have no mass.
         contact: Contact of the surface with itself; None if only obstacles count.
     """
 

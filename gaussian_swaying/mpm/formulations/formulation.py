@@ -59,7 +59,7 @@ class Formulation(ABC):
             such a body cannot tear, flow or leave its grid, and its velocity does not count in the Courant number.
         viscous_power: Power of the largest squared stretch with which the viscous stress stiffens.
         held: As in the body, with the parts that are constant on this grid.
-        kinds: What each boundary acts on: ``nodes``, points as ``hinge`` or ``clamp``, or ``surface``
+        kinds: Kind of each boundary: ``nodes``, points as ``hinge`` or ``clamp``, or ``surface``
             (``Boundary.hold_kind``).
         on_nodes: Whether each boundary acts on nodes, by its ``forward``; a clamp may do so besides its points.
         needs_position: Whether a boundary uses the positions of nodes.
@@ -297,7 +297,7 @@ def held_share(held: Held, stencil: Stencil, inverse_mass: Tensor, time: Tensor)
         held: The particles.
         stencil: Support of all particles.
         inverse_mass: Inverse mass of each node [1/kg], 0 for a node without mass, shape (..., G).
-        time: When [s], scalar float64 tensor.
+        time: The time [s], scalar float64 tensor.
     """
     return scatter(stencil, held.mass_at(time)[..., None, None])[..., 0] * inverse_mass
 

@@ -71,7 +71,7 @@ def _network_slope(a: Tensor, mu: Tensor, lam: Tensor) -> Tensor:
     least, shear, bulk = (part[..., None] for part in _network_parts(mu, lam))
     plane, space = _network_squares(a)
     pull, whole = _spring_pull(plane), _spring_pull(space)
-    others = pull.sum(-1, keepdim=True) - pull  # the two planes that hold an axis
+    others = pull.sum(-1, keepdim=True) - pull  # the two planes that contain an axis
     mean = 2 / 21 * (a - 1) + a * (8 / 105 * others + 3 / 35 * whole)
     return 15 * least * mean + 2 * shear * (a - 1) + bulk * (a.sum(-1, keepdim=True) - 3)
 

@@ -33,7 +33,7 @@ def keep_nodes(active, nodes, fields, history, first_step, step_offset, BLOCK: t
 
 @triton.jit(do_not_specialize=VARIES)
 def keep_rows(residual, rows, history, first_step, step_offset, BLOCK: tl.constexpr):
-    """Keep the velocities that held points had before they were stopped in the substep before."""
+    """Store the velocities that held points had in the previous substep, before they were stopped."""
     step = tl.load(first_step) + step_offset
     place = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
     mask = place < 4 * rows

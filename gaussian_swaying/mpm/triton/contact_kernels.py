@@ -59,7 +59,7 @@ def _place(
 
 @triton.jit
 def _over(d0, d1, d2, squared, at, mask):
-    """The height of the other above a disc times its normal, zero beside the disc, and whether it is above."""
+    """Return the height of the other above a disc times its normal (zero beside the disc), and whether it is above."""
     n0 = tl.load(at + 4, mask, 0.0)
     n1 = tl.load(at + 5, mask, 0.0)
     n2 = tl.load(at + 6, mask, 0.0)
@@ -72,7 +72,7 @@ def _over(d0, d1, d2, squared, at, mask):
 
 @triton.jit
 def _keep(data, other, slots, places, p, many, acts, q, n0, n1, n2, target):
-    """Write a constraint to the next slot of each place."""
+    """Write a constraint to the next slot of each sample."""
     at = many * places + p
     acts = acts & (many < slots)
     tl.store(other + at, q, acts)

@@ -24,7 +24,7 @@ within reach in it."""
 
 @triton.jit
 def meet(gate, programs):
-    """Wait until all programs are here, and see what they wrote.
+    """Barrier: wait until all programs arrive, and make their writes visible.
 
     Each adds one and the first one adds what is missing to 2^31, so that the sign changes when all have come.
     """

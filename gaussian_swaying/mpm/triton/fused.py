@@ -334,7 +334,7 @@ class Fused(ABC):
 
     @abstractmethod
     def _look_at(self) -> MPMState:
-        """The state of the particles in the buffers."""
+        """Return the state of the particles in the buffers."""
 
     @abstractmethod
     def _take_values(self, values: Tensor) -> None:
@@ -371,7 +371,7 @@ class Fused(ABC):
 
 @contextmanager
 def at_home(buffer: Tensor) -> Iterator[None]:
-    """Launch Triton on the device of a buffer, and create ordinary tensors, which can be written in any mode."""
+    """Within the block, launch Triton on the device of a buffer, and create tensors that can be written in any mode."""
     with torch.cuda.device_of(buffer), torch.inference_mode(False), torch.no_grad():
         yield
 
@@ -386,7 +386,7 @@ def check_indices(entries: int) -> None:
 
 
 def _nothing() -> None:
-    """The placeholder for a Fused in a copy."""
+    """Return None: the placeholder for a Fused in a copy."""
 
 
 def _made_from(body: Body) -> tuple[object, ...]:

@@ -48,10 +48,10 @@ _LAUNCH: dict[str, Any] = {"num_warps": 4, "maxnreg": 128}
 
 
 class FusedContact:
-    """Contact of a body with buffers that stay where they are, so that substeps can be recorded.
+    """Contact of a body with buffers at fixed addresses, so that substeps can be recorded.
 
-    The lists are made on the device when they are too old. If the room for them is too small, :meth:`fits` says so
-    after the rollout, and makes more.
+    The lists are made on the device when they are too old. If the buffers are too small, :meth:`fits` finds that after
+    the rollout, and enlarges them.
 
     Args:
         bound: The formulation, bound to its material, with a contact.
@@ -59,8 +59,8 @@ class FusedContact:
         active: The nodes that have mass, int32.
 
     Attributes:
-        room: Room for the candidates of each place.
-        slots: Room for the constraints of each place.
+        room: Number of entries for the candidates of each sample.
+        slots: Number of entries for the constraints of each sample.
     """
 
     def __init__(self, bound: Total, fields: Tensor, active: Tensor) -> None:
@@ -135,7 +135,7 @@ class FusedContact:
         self.margin.fill_(-1.0)
         if max(room, planes * slots) * places > MOST_ENTRIES:
             raise ValueError(
-                f"A place of the surface is close to {max(room, slots):,} others: the material has collapsed; lower "
+                f"A contact sample is close to {max(room, slots):,} others: the material has collapsed; lower "
                 "`contact.thickness`, or coarsen `solver.dx`."
             )
         self.room, self.slots = room, slots

@@ -24,7 +24,7 @@ from gaussian_swaying.mpm.triton.fused_contact import FusedContact
 # time per particle for a number of lanes per cell, relative to 32 lanes, on an H200
 _LANE_COST = {4: 1.5, 8: 1.0, 16: 1.0, 32: 1.0, 64: 0.85}
 
-# least number of pieces that `total` cuts its cells into: about the number of warps that an H200 holds
+# least number of pieces that `total` cuts its cells into: about the number of warps that an H200 runs at once
 _PROGRAMS = 2048
 
 # spilling registers is worth it, because more warps run at once

@@ -81,7 +81,7 @@ def half_space_distance(x, row):
 
 @triton.jit
 def _low(x, n):
-    """The node below a place along an axis of n nodes, and how far the place is beyond it; it is in the grid."""
+    """Return the node below a place along an axis of n nodes, within the grid, and the distance beyond it."""
     inside = tl.minimum(tl.maximum(x, 0.0), (n - 1).to(tl.float32))
     first = tl.maximum(tl.minimum(tl.floor(inside), (n - 2).to(tl.float32)), 0.0)
     return first.to(tl.int32), inside - first, x - inside
@@ -185,7 +185,7 @@ def stop_nodes(v, x, row, whole, pose, grids, mask, KIND: tl.constexpr, MOVES: t
 
 @triton.jit
 def _at(keys, count, time):
-    """Place and turn at a time, between the keys."""
+    """Return position and rotation at a time, interpolated between the keys."""
     last = 0
     for k in range(1, count):
         last += (tl.load(keys + k * KEY) <= time).to(tl.int32)
@@ -271,9 +271,9 @@ def obstacle_places(
     position, moving, thickness, gap, facing, drive, valid, within, places, row, whole, window, pose, grids, time, dt,
     slack, KIND: tl.constexpr, MOVES: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
-    """Constraints of all places with one obstacle in ``total``: gap, normal, velocity, and whether it acts.
+    """Constraints of all contact samples with one obstacle in ``total``: gap, normal, velocity, and whether it acts.
 
-    ``within`` becomes one if a place is closer than ``slack``, now or after a substep with its velocity ``moving``.
+    ``within`` becomes one if a sample is closer than ``slack``, now or after a substep with its velocity ``moving``.
     """
     k = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
     mask = k < places

@@ -52,12 +52,12 @@ def solids_of(boundaries: Sequence[nn.Module]) -> list[tuple[Solid, int]]:
 
 
 class Solids:
-    """Tables of solids, which stay where they are, as recorded graphs know their addresses.
+    """Tables of solids at fixed addresses, which recorded graphs contain.
 
     Args:
         parts: The solids, each with the number of its boundary.
-        device: Where the tables are.
-        steps: For how many substeps there is room for poses.
+        device: Device of the tables.
+        steps: Number of substeps for which there are poses.
     """
 
     def __init__(self, parts: Sequence[tuple[Solid, int]], device: torch.device, steps: int = MOST_STEPS) -> None:
@@ -125,7 +125,7 @@ class Solids:
         Args:
             time: Time of the first [s], scalar float64 tensor on the device.
             dt: Substep [s], as ``time``.
-            steps: How many.
+            steps: Number of substeps.
         """
         if self.moving:
             count = len(self.parts)

@@ -32,14 +32,14 @@ class _Run:
     """Data of one rollout that its backward pass needs.
 
     Attributes:
-        state: Where it starts.
+        state: The state at its start.
         dt: Substep [s].
         steps: Number of substeps.
         every: Substeps of a segment.
         forces: The force, if any.
         watch: See ``MPMSolver.rollout``.
         starts: Displacement and velocity of the active nodes at the start of each segment, shape (nodes, 2, 3).
-        kicks: How long forces act in the first substep of each segment [s].
+        kicks: Time for which forces act in the first substep of each segment [s].
         end: The state at its end, without gradient.
     """
 
@@ -249,7 +249,7 @@ class TotalAdjoint:
         fused.repeat(count, ("back", *key), back)
 
     def _make_room(self, every: int, loaded: bool) -> None:
-        """Buffers for a segment; recorded graphs know their addresses, so new ones are counted."""
+        """Make the buffers for a segment; recorded graphs contain their addresses, so new buffers are counted."""
         if len(self.history) < every + 1:
             self.rooms += 1
             self.history = torch.zeros(every + 1, self.nodes, 8, device=self.device)
@@ -288,7 +288,7 @@ class TotalAdjoint:
             )
 
     def _node_stages(self, offset: int, asked: _Pass) -> None:
-        """Back through displacement, held points, pins and the new velocity."""
+        """Backward pass through displacement, held points, pins and the new velocity."""
         fused = self.fused
         if fused.points is None:
             self._nodes(offset, asked, SUM=True, PUSH=True, FINISH=True)

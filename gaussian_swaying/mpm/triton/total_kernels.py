@@ -29,7 +29,7 @@ from gaussian_swaying.mpm.triton.shared import (
 
 @triton.jit
 def gather(field, node, sx, sy, f, wz, gz, inverse_dx, mask, BOTH: tl.constexpr):
-    """Columns 0 to 2 of rows of eight interpolated, their derivatives [component, axis], and (BOTH) columns 4 to 6."""
+    """Interpolate columns 0 to 2 of rows of eight, their derivatives [component, axis], and (BOTH) columns 4 to 6."""
     zero = wz[0] * 0
     u0, u1, u2, v0, v1, v2 = zero, zero, zero, zero, zero, zero
     g00, g01, g02, g10, g11, g12, g20, g21, g22 = zero, zero, zero, zero, zero, zero, zero, zero, zero
@@ -77,7 +77,7 @@ def gather(field, node, sx, sy, f, wz, gz, inverse_dx, mask, BOTH: tl.constexpr)
 
 @triton.jit
 def cells_of(cell_start, cell_node, cell_scene, cells, CELLS: tl.constexpr):
-    """The cells of a program: numbers, which are real, their particles from start to end, node, scene, most particles.
+    """Cells of a program: numbers, mask, first and last particle, node, scene, and the largest number of particles.
 
     Node and scene have a second axis for the lanes.
     """
@@ -241,7 +241,7 @@ def total_pieces(pieces_in, partial, first_piece, cells, pieces, WIDTH: tl.const
 
 @triton.jit
 def _end(node, k, mask, v0, v1, v2, inverse, held, taken, fields, dt, HELD: tl.constexpr, MOVE: tl.constexpr):
-    """Stop the held nodes and count what that takes, write the velocities, and move the nodes."""
+    """Stop the held nodes and sum the reaction impulses, write the velocities, and move the nodes."""
     if HELD:
         free = tl.load(held + k, mask, 0) == 0
         stopped = mask & (free == 0)

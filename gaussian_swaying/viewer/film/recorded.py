@@ -35,9 +35,10 @@ class Film:
     cells of the grid, from its first node.
 
     Attributes:
-        head: What the page needs besides: sizes, time between frames [s], grid, light, camera, title.
+        head: Further data for the page: sizes, time between frames [s], grid, light, camera, title.
         position: Centres at rest, float32, shape (N, 3).
-        place: Where each reads displacement and gradient [cells], float32, shape (N, 3); -1 for those that never move.
+        place: Position at which each takes displacement and gradient [cells], float32, shape (N, 3); -1 for those that
+            never move.
         scale: Logarithm of the standard deviations, float16, shape (N, 3).
         turn: Quaternions wxyz in steps of 1/32767, int16, shape (N, 4).
         facing: Unit normals in steps of 1/32767, and 32767 for Gaussians of a solid, int16, shape (N, 4).
