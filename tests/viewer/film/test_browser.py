@@ -1,5 +1,6 @@
 """A film in a real browser."""
 
+import base64
 import time
 
 import numpy as np
@@ -101,6 +102,28 @@ def test_the_film_is_the_run(show, film, run, make_flag):
     page.evaluate("film.pause()")
     assert page.told == []
     assert [url for url in page.asked if not url.startswith(("file:", "data:", "blob:"))] == []
+
+
+def test_gaussians_are_sorted_from_far_to_near(show, film):
+    """Equal depths keep their order; what is infinitely far or has a negative depth is not drawn."""
+    page = show(film)
+    depths = np.random.default_rng(0).uniform(90, 110, 100_000).astype(np.float32)
+    depths[::3] = depths[::3].round()
+    depths[::7] *= np.float32(1e-3)
+    depths[5:40:5] = [np.inf, 0.0, 3e38, 1e-40, -1.0, -np.inf, np.nan]
+    code = base64.b64encode(depths.tobytes()).decode()
+    told = page.evaluate(
+        """async (code) => {
+            const bytes = Uint8Array.from(atob(code), (letter) => letter.charCodeAt(0));
+            return Array.from(await film.order(new Float32Array(bytes.buffer)));
+        }""",
+        code,
+    )
+    with np.errstate(invalid="ignore"):
+        drawn = np.flatnonzero((depths >= 0) & (depths < np.inf))
+    assert told == drawn[np.argsort(-depths[drawn], kind="stable")].tolist()
+    assert len(told) == len(depths) - 4
+    assert page.evaluate("film.order([]).then((found) => found.length)") == 0
 
 
 @pytest.mark.slow(twin="test_the_film_is_the_run")

@@ -4,6 +4,7 @@ Covers: recording.nodes, viewer.film.page, viewer.film.recorded.
 """
 
 import base64
+import hashlib
 import json
 import re
 import shutil
@@ -20,7 +21,7 @@ from gaussian_swaying.mpm.transfer import bspline_weights
 from gaussian_swaying.recording.nodes import join_far, load_nodes, split_far
 from gaussian_swaying.recording.recorder import Recorder
 from gaussian_swaying.scenes.procedural import FlagScene
-from gaussian_swaying.viewer.film.page import pack, page, unpack
+from gaussian_swaying.viewer.film.page import PAGE, pack, page, unpack
 from gaussian_swaying.viewer.film.recorded import read_film
 
 FRAMES = 6
@@ -107,7 +108,7 @@ def test_nothing_is_lost_in_the_file(run, tmp_path, capsys):
     assert main(["--web", str(run)]) == 0
     told = capsys.readouterr().out
     text = (run / "film.html").read_text()
-    assert re.search(r"384 Gaussians, 6 frames of \d+ nodes\nwrote .*film\.html \(1\.\d MB\)\n", told)
+    assert re.search(r"384 Gaussians, 6 frames of \d+ nodes\nwrote .*film\.html \(0\.\d MB\)\n", told)
     parts = dict(re.findall(r'<script type="text/plain" id="film-(\w+)">([^<]+)</script>', text))
     blocks = {name: zlib.decompress(base64.b64decode(part)) for name, part in parts.items()}
     assert b"SparkRenderer" in blocks.pop("code")
@@ -129,6 +130,19 @@ def test_nothing_is_lost_in_the_file(run, tmp_path, capsys):
     again = page(film)
     assert again == text
     (run / "film.html").unlink()
+
+
+def test_the_program_is_built_from_its_sources(request):
+    """The first line of the built program names the checksum of the sources, and the licences those of the packages."""
+    player = request.config.rootpath / "tools/player"
+    names = ("build.js", "film.glsl.js", "film.js", "package-lock.json", "sorter.js")
+    checksum = hashlib.sha256(b"".join((player / name).read_bytes() for name in names)).hexdigest()
+    assert (PAGE / "film.min.js").read_text().startswith(f"// Made by tools/player from {checksum}\n")
+    packages = json.loads((player / "package-lock.json").read_text())["packages"]
+    wanted = json.loads((player / "package.json").read_text())["devDependencies"]
+    assert {name: packages[f"node_modules/{name}"]["version"] for name in wanted} == wanted
+    told = dict(re.findall(r"^---- (\S+) (\S+)$", (PAGE / "LICENSES.txt").read_text(), re.M))
+    assert told == {name: version for name, version in wanted.items() if name != "esbuild"}
 
 
 def test_other_light_is_told(make_flag, tmp_path, capsys):

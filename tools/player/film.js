@@ -3,10 +3,11 @@ import { dyno, SparkRenderer, SplatGenerator } from "@sparkjsdev/spark";
 import * as THREE from "three";
 import { OrbitControls } from "three/addons/controls/OrbitControls.js";
 import { FUNCTIONS, STATEMENTS } from "./film.glsl.js";
+import { makeSorter } from "./sorter.js";
 
 const WIDTH = 2048; // of the textures with a texel for each Gaussian or node
 
-// ---- the parts of the file, see pack.py
+// ---- the parts of the file, see gaussian_swaying/viewer/film/page.py
 
 function reader(bytes) {
   let at = 0;
@@ -179,6 +180,7 @@ export async function play(read) {
     enableLod: false,
     onDirty: () => wake(1),
   });
+  spark.sortWorker = makeSorter();
   const { gaussians, moved } = makeGaussians(head, splats, nodes);
   scene.add(spark, gaussians);
 
@@ -320,6 +322,14 @@ export async function play(read) {
     return out;
   }
 
+  // Indices of depths in the order in which they would be drawn.
+  async function order(depths) {
+    const readback = new Uint32Array(Float32Array.from(depths).buffer);
+    const call = { numSplats: depths.length, readback, ordering: new Uint32Array(depths.length) };
+    const { activeSplats, ordering } = await spark.sortWorker.call("sortSplats32", call);
+    return ordering.subarray(0, activeSplats);
+  }
+
   // Resolves once the Gaussians are sorted and nothing is left to draw.
   async function settled() {
     const rest = () => spark.activeSplats > 0 && state.left === 0 && !spark.sorting && !spark.sortDirty;
@@ -339,6 +349,7 @@ export async function play(read) {
       await settled();
     },
     positions,
+    order,
   };
 }
 

@@ -1,0 +1,40 @@
+// Writes film.min.js of the package: film.js with what it uses of Spark and three.js.
+import { build } from "esbuild";
+import { createHash } from "node:crypto";
+import { readFile } from "node:fs/promises";
+
+const SOURCES = ["build.js", "film.glsl.js", "film.js", "package-lock.json", "sorter.js"]; // a test compares their checksum
+
+// Spark's WebAssembly, in it and in its worker, reads files of splats, builds levels of detail and sorts. A film needs only
+// the sorting, which sorter.js does. Each pattern must match once, so that another Spark is not cut without a look at it.
+const CUTS = [
+  [/^const WASM = decode64\(.*\n/gm, ""],
+  [/^const WASM_MODULE = WebAssembly\.compile\(WASM\);$/gm, "const WASM_MODULE = Promise.resolve(null);"],
+  [/^const initialization = __wbg_init\([^]*?\n\);$/gm, "const initialization = Promise.resolve();"],
+  [/^const jsContent = .*$/gm, 'const jsContent = "";'],
+];
+
+async function cutSpark({ path }) {
+  let contents = await readFile(path, "utf8");
+  for (const [pattern, instead] of CUTS) {
+    const found = contents.match(pattern)?.length ?? 0;
+    if (found !== 1) throw new Error(`Expected ${pattern} once in ${path}, but found it ${found} times.`);
+    contents = contents.replace(pattern, instead);
+  }
+  return { contents };
+}
+
+const checksum = createHash("sha256");
+for (const name of SOURCES) checksum.update(await readFile(name));
+
+await build({
+  entryPoints: ["film.js"],
+  outfile: "../../gaussian_swaying/viewer/film/page/film.min.js",
+  bundle: true,
+  minify: true,
+  format: "iife",
+  banner: { js: `// Made by tools/player from ${checksum.digest("hex")}` },
+  legalComments: "eof", // the full licences are in LICENSES.txt, which stands in each film
+  logLevel: "info",
+  plugins: [{ name: "cut-spark", setup: (made) => made.onLoad({ filter: /spark\.module\.js$/ }, cutSpark) }],
+});
