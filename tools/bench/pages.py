@@ -20,9 +20,9 @@ from bench.tables import (  # noqa: F401  each registers its slots
     folds,
     goals,
     gradients,
-    live,
     long_flag,
     measured,
+    others,
     pareto,
     pareto_plot,
     peers,
@@ -34,10 +34,7 @@ from bench.tables import (  # noqa: F401  each registers its slots
     speed,
     speed_plot,
     surfaces,
-    sweeps,
     training,
-    web,
-    winds,
 )
 from gaussian_swaying._files import write_text
 

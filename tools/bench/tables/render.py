@@ -1,0 +1,262 @@
+"""The renderer: tables, values within sentences and goals, declared by templates that are filled from rows of records.
+
+A template is text with fields. ``{wall_s.writing:.1f}`` is a place within the row and a format; ``{bytes:.2f GiB}`` has
+a unit too, for which the number is scaled; ``{bytes:.2f (GiB)}`` is scaled likewise and leaves the unit to the heading.
+``{by or transfer or 'none'}`` is the first that is there. What is recorded as null is a dash; what is not recorded is
+an error. ``[[ of {all} Gaussians]]`` is left out if one of its fields is null or not there. Lists are told one by one.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from bench import slots
+from bench.tables.markdown import digits, grid, source, yes_no
+
+Row = dict[str, Any]
+Rows = str | Callable[[Any], Iterable[Row]]
+"""Rows of a record (or of a list of records): their place, where the rows of a table get their name as ``key``, or a
+function that makes them."""
+
+SCALES = {"%": 100, "mm": 1e3, "GiB": 2**-30, "MiB": 2**-20, "KB": 1e-3, "MB": 1e-6, "GB/s": 1e-9, "10⁶": 1e-6,
+          "min": 1 / 60}  # fmt: skip
+"""How numbers are scaled for a unit; for other units they are left as they are."""
+
+_FIELD = re.compile(r"{([^{}:]*)(?::([^{}]*))?}")
+_OPTIONAL = re.compile(r"\[\[(.*?)\]\]")
+_FORMAT = re.compile(r"(?P<form>\S*?)(?: (?P<shown>[^() ]+)| \((?P<hidden>[^() ]+)\))?")
+_COMPARED = {
+    "<=": lambda a, b: a <= b,
+    ">=": lambda a, b: a >= b,
+    "<": lambda a, b: a < b,
+    ">": lambda a, b: a > b,
+    "is": lambda a, b: a == b,
+    "not": lambda a, b: a != b,
+}
+
+
+def find(row: Mapping[str, Any], place: str) -> Any:
+    """What a row has at a place such as ``wall_s.writing or 'none'``; numbers and quoted words are themselves.
+
+    Raises:
+        KeyError: If it has nothing there.
+    """
+    *first, last = place.split(" or ")
+    for one in first:
+        try:
+            if (value := find(row, one)) is not None:
+                return value
+        except KeyError:
+            continue
+    if last[:1] == "'":
+        return last.strip("'")
+    if re.fullmatch(r"[-+.\d][-+.\de]*", last) and last not in row:
+        return float(last)
+    if last in row:
+        return row[last]
+    name, dot, rest = last.partition(".")
+    if not dot or not isinstance(row[name], Mapping):
+        raise KeyError(last)
+    return find(row[name], rest)
+
+
+def told(value: Any, form: str = "") -> str:
+    """A value in a format, with a unit; a dash for None, ``yes`` or ``no`` for a truth, a list one by one."""
+    if value is None or isinstance(value, bool):
+        return yes_no(value)
+    if isinstance(value, (list, tuple)):
+        return ", ".join(told(one, form) for one in value)
+    parts = _FORMAT.fullmatch(form)
+    assert parts is not None, form
+    unit = parts["shown"] or parts["hidden"]
+    value = value * SCALES[unit] if unit in SCALES else value
+    text = digits(value) if parts["form"] == "digits" else format(value, parts["form"])
+    return f"{text} {parts['shown']}" if parts["shown"] else text
+
+
+def fill(template: str, row: Mapping[str, Any]) -> str:
+    """A template filled from a row."""
+    kept = _OPTIONAL.sub(lambda part: part[1] * all(_is_there(row, place) for place, _ in _FIELD.findall(part[1])),
+                         template)  # fmt: skip
+    return _FIELD.sub(lambda field: told(find(row, field[1]), field[2] or ""), kept)
+
+
+def _is_there(row: Mapping[str, Any], place: str) -> bool:
+    return find(row, f"{place} or ''") != ""
+
+
+def holds(row: Mapping[str, Any], condition: str) -> bool | None:
+    """Whether a condition such as ``ratio <= 1.5 and wind is 'gusts'`` holds; None if something is recorded as null.
+
+    Of lists, whether it holds for each.
+    """
+    for part in condition.split(" and "):
+        left, name, right = part.rsplit(" ", 2)
+        value, limit = find(row, left), find(row, right)
+        if value is None or limit is None:
+            return None
+        if not all(_COMPARED[name](each, limit) for each in (value if isinstance(value, list) else [value])):
+            return False
+    return True
+
+
+def rows_of(record: Any, rows: Rows) -> list[Row]:
+    """The rows of a record; none where it has nothing."""
+    if callable(rows):
+        return list(rows(record))
+    found = find(record, rows) if _is_there(record, rows) else []
+    return [row | {"key": key} for key, row in found.items()] if isinstance(found, dict) else found
+
+
+def columns_of(columns: str) -> list[list[str]]:
+    """Headings and templates of columns in the form ``heading = template | heading = template``."""
+    return [[part.strip() for part in column.split("= ", 1)] for column in re.split(r"\s\|\s", columns)]
+
+
+def lines(rows: Iterable[Row], columns: str) -> list[str]:
+    """A table of rows in Markdown.
+
+    Each row fills the templates of the columns. A row that ``failed`` says so in its first cell that cannot be filled.
+    Headings are filled from the first row. Where one begins with a star, it is filled from each: rows that are equal in
+    the other columns become one, with a column for each of these headings.
+    """
+    rows = list(rows)
+    named = [(head if head[:1] == "*" or not rows else fill(head, rows[0]), cell) for head, cell in columns_of(columns)]
+    merged: dict[Any, Row] = {}
+    heads: dict[str, dict[str, None]] = {head: {} for head, _ in named}
+    for number, row in enumerate(rows):
+        cells, failed = {}, [f"failed: {row['failed']}".replace("\n", " ")] if "failed" in row else []
+        for head, template in named:
+            name = fill(head[1:], row) if head[:1] == "*" else head
+            heads[head][name] = None
+            try:
+                cells[name] = fill(template, row)
+            except KeyError:
+                if "failed" not in row:
+                    raise
+                cells[name] = failed.pop() if failed else "-"
+        plain = tuple(cells[head] for head, _ in named if head[:1] != "*")
+        merged.setdefault(plain if len(plain) < len(named) else number, {}).update(cells)
+    shown = [name for head, _ in named for name in (heads[head] or [head])]
+    return grid(shown, ([cells.get(name, "-") for name in shown] for cells in merged.values()))
+
+
+def table(
+    page: str,
+    name: str,
+    records: str,
+    rows: Rows | None = None,
+    columns: str = "",
+    *,
+    before: str = "",
+    after: str = "",
+    order: Sequence[str] = (),
+    together: bool = False,
+    each: bool = False,
+    empty: str | None = None,
+) -> None:
+    """Declare a table, which ``page`` must have once for each record.
+
+    Args:
+        page: The page.
+        name: Name of its slot.
+        records: Pattern of the records.
+        rows: Its rows; None for text alone.
+        columns: Its columns, see :func:`columns_of`; a template that begins with ``- `` makes a list instead.
+        before: Template of what stands before it; ``{source}`` is the device, the versions and the date.
+        after: Template of what stands after it.
+        order: Places by which the rows are sorted.
+        together: Whether it is one table of all records.
+        each: Whether the page has one slot, with a table for each record that has such rows.
+        empty: What stands there if there are no rows; None for a table without rows.
+    """
+
+    def one(record: Any) -> list[str]:
+        found = [] if rows is None else rows_of(record, rows)
+        found = sorted(found, key=lambda row: [find(row, place) for place in order])
+        if rows is not None and not found and (each or empty is not None):
+            return []
+        about = record | {"source": source(record)} if "{source}" in before else record
+        body = (
+            [fill(columns, row) for row in found] if columns[:2] == "- " else lines(found, columns) if columns else []
+        )
+        parts = (
+            [fill(before, about).split("\n")] * bool(before) + [body] + [fill(after, about).split("\n")] * bool(after)
+        )
+        return [line for part in parts if part for line in ("", *part)][1:]
+
+    def make(record: Any) -> list[str]:
+        blocks = [one(single) for single in record] if each else [one(record)]
+        return [line for block in blocks if block for line in ("", *block)][1:] or ([empty] if empty else [])
+
+    slots.table(page, name, records, together or each)(make)
+
+
+def value(name: str, records: str, template: str, rows: Callable[..., Row] | None = None) -> None:
+    """Declare a value within a sentence.
+
+    Args:
+        name: Name of its slot.
+        records: Pattern of the records.
+        template: Its template; ``$1`` and so on are the further words of the slot.
+        rows: Function of the record that makes the row; None for the record itself.
+    """
+
+    def make(record: Any, *words: str) -> str:
+        own = template
+        for number, word in enumerate(words, 1):
+            own = own.replace(f"${number}", word)
+        return fill(own, rows(record) if rows else record)
+
+    slots.SLOTS[name] = slots.Slot(name, None, records, False, make, len(set(re.findall(r"\$\d", template))))
+
+
+@dataclass(frozen=True)
+class Goal:
+    """A goal for each of some rows.
+
+    Attributes:
+        goal: Template that says what is wanted; ``{limit}`` is the last number of the condition.
+        measured: Template of what was measured.
+        reached: Condition.
+        rows: The rows; those that lack what the goal needs have none.
+        where: Condition of the rows that have the goal.
+        more: Templates of further cells, by name.
+        always: Whether a row that lacks what it needs has the goal too, not measured.
+    """
+
+    goal: str
+    measured: str
+    reached: str
+    rows: Rows = "rows"
+    where: str = ""
+    more: Mapping[str, str] | None = None
+    always: bool = False
+
+    def of(self, record: Any) -> Iterable[Row]:
+        """Its rows of a table, with ``goal``, ``measured`` and ``reached``."""
+        for row in rows_of(record, self.rows):
+            limits = [find(row, part) for part in self.reached.split()[-1:] if self.always or _is_there(row, part)]
+            about = row | {"limit": limits[-1] if limits else None}
+            try:
+                if not self.where or holds(row, self.where):
+                    measured, reached = fill(self.measured, about), holds(row, self.reached)
+                    yield self._cells(about) | {"measured": measured, "reached": reached}
+            except KeyError:
+                if self.always:
+                    yield self._cells(about) | {"measured": "-", "reached": None}
+
+    def _cells(self, row: Row) -> Row:
+        return {name: fill(text, row) for name, text in (("goal", self.goal), *(self.more or {}).items())}
+
+
+GOAL = "goal = {goal} | measured = {measured} | reached = {reached}"
+WANTED = "goal = {goal} | wanted = {wanted} | measured = {measured} | reached = {reached}"
+
+
+def judged(goals: Sequence[Goal]) -> Callable[[Any], list[Row]]:
+    """The rows of a table of goals."""
+    return lambda record: [row for goal in goals for row in goal.of(record)]
