@@ -21,8 +21,8 @@ Rows = str | Callable[[Any], Iterable[Row]]
 """Rows of a record (or of a list of records): their place, where the rows of a table get their name as ``key``, or a
 function that makes them."""
 
-SCALES = {"%": 100, "mm": 1e3, "GiB": 2**-30, "MiB": 2**-20, "KB": 1e-3, "MB": 1e-6, "GB/s": 1e-9, "10⁶": 1e-6,
-          "min": 1 / 60}  # fmt: skip
+SCALES = {"%": 100, "mm": 1e3, "min": 1 / 60, "GiB": 2**-30, "MiB": 2**-20,
+          "KB": 1e-3, "MB": 1e-6, "10⁶": 1e-6, "GB": 1e-9, "GB/s": 1e-9}  # fmt: skip
 """How numbers are scaled for a unit; for other units they are left as they are."""
 
 _FIELD = re.compile(r"{([^{}:]*)(?::([^{}]*))?}")
@@ -39,7 +39,7 @@ _COMPARED = {
 
 
 def find(row: Mapping[str, Any], place: str) -> Any:
-    """What a row has at a place such as ``wall_s.writing or 'none'``; numbers and quoted words are themselves.
+    """What a row has at a place such as ``wall_s.writing or 'none'``; numbers, truths and quoted words are themselves.
 
     Raises:
         KeyError: If it has nothing there.
@@ -53,6 +53,8 @@ def find(row: Mapping[str, Any], place: str) -> Any:
             continue
     if last[:1] == "'":
         return last.strip("'")
+    if last in ("True", "False"):
+        return last == "True"
     if re.fullmatch(r"[-+.\d][-+.\de]*", last) and last not in row:
         return float(last)
     if last in row:
@@ -67,6 +69,8 @@ def told(value: Any, form: str = "") -> str:
     """A value in a format, with a unit; a dash for None, ``yes`` or ``no`` for a truth, a list one by one."""
     if value is None or isinstance(value, bool):
         return yes_no(value)
+    if isinstance(value, str):
+        return value
     if isinstance(value, (list, tuple)):
         return ", ".join(told(one, form) for one in value)
     parts = _FORMAT.fullmatch(form)
@@ -123,25 +127,25 @@ def lines(rows: Iterable[Row], columns: str) -> list[str]:
     Headings are filled from the first row. Where one begins with a star, it is filled from each: rows that are equal in
     the other columns become one, with a column for each of these headings.
     """
-    rows = list(rows)
-    named = [(head if head[:1] == "*" or not rows else fill(head, rows[0]), cell) for head, cell in columns_of(columns)]
-    merged: dict[Any, Row] = {}
-    heads: dict[str, dict[str, None]] = {head: {} for head, _ in named}
+    rows, named = list(rows), columns_of(columns)
+    merged: dict[Any, dict[Any, str]] = {}
+    heads: list[dict[str, None]] = [{} for _ in named]
     for number, row in enumerate(rows):
         cells, failed = {}, [f"failed: {row['failed']}".replace("\n", " ")] if "failed" in row else []
-        for head, template in named:
-            name = fill(head[1:], row) if head[:1] == "*" else head
-            heads[head][name] = None
+        for place, (head, template) in enumerate(named):
+            name = fill(head[1:], row) if head[:1] == "*" else ""
+            heads[place][name] = None
             try:
-                cells[name] = fill(template, row)
+                cells[place, name] = fill(template, row)
             except KeyError:
                 if "failed" not in row:
                     raise
-                cells[name] = failed.pop() if failed else "-"
-        plain = tuple(cells[head] for head, _ in named if head[:1] != "*")
+                cells[place, name] = failed.pop() if failed else "-"
+        plain = tuple(text for (_, name), text in cells.items() if not name)
         merged.setdefault(plain if len(plain) < len(named) else number, {}).update(cells)
-    shown = [name for head, _ in named for name in (heads[head] or [head])]
-    return grid(shown, ([cells.get(name, "-") for name in shown] for cells in merged.values()))
+    shown = [(place, name) for place, names in enumerate(heads) for name in names or [""]]
+    told = [name or (fill(named[place][0], rows[0]) if rows else named[place][0]) for place, name in shown]
+    return grid(told, ([cells.get(key, "-") for key in shown] for cells in merged.values()))
 
 
 def table(
@@ -225,7 +229,8 @@ class Goal:
         rows: The rows; those that lack what the goal needs have none.
         where: Condition of the rows that have the goal.
         more: Templates of further cells, by name.
-        always: Whether a row that lacks what it needs has the goal too, not measured.
+        stretch: Condition of a further goal.
+        always: Whether a row that lacks what it needs has the goal too: missed if it failed, or not measured.
     """
 
     goal: str
@@ -234,20 +239,23 @@ class Goal:
     rows: Rows = "rows"
     where: str = ""
     more: Mapping[str, str] | None = None
+    stretch: str = ""
     always: bool = False
 
     def of(self, record: Any) -> Iterable[Row]:
-        """Its rows of a table, with ``goal``, ``measured`` and ``reached``."""
+        """Its rows of a table, with ``goal``, ``measured``, ``reached`` and ``stretched``."""
         for row in rows_of(record, self.rows):
             limits = [find(row, part) for part in self.reached.split()[-1:] if self.always or _is_there(row, part)]
             about = row | {"limit": limits[-1] if limits else None}
             try:
                 if not self.where or holds(row, self.where):
-                    measured, reached = fill(self.measured, about), holds(row, self.reached)
-                    yield self._cells(about) | {"measured": measured, "reached": reached}
+                    cells = {"measured": fill(self.measured, about), "reached": holds(row, self.reached)}
+                    yield self._cells(about) | cells | {"stretched": holds(row, self.stretch) if self.stretch else None}
             except KeyError:
                 if self.always:
-                    yield self._cells(about) | {"measured": "-", "reached": None}
+                    missed = False if "failed" in row else None
+                    cells = {"measured": row.get("failed", "-"), "reached": missed}
+                    yield self._cells(about) | cells | {"stretched": missed if self.stretch else None}
 
     def _cells(self, row: Row) -> Row:
         return {name: fill(text, row) for name, text in (("goal", self.goal), *(self.more or {}).items())}
