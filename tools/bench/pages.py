@@ -18,7 +18,6 @@ from bench.tables import (  # noqa: F401  each registers its slots
     contact,
     fit,
     flags,
-    folds,
     goals,
     gradients,
     long_flag,

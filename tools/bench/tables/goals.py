@@ -105,7 +105,7 @@ AT_MOST = [
     ("device memory of a frame of 100,000 Gaussians", _speed("frame", "main or False is True"),
      "memory_bytes", "GiB", 0.3, 0.15),
 ]  # fmt: skip
-"""Of ``bench.py speed`` on an H200: what, its rows, the number, its unit, the most, and the most of the stretch goal."""
+"""Of ``bench.py speed`` on an H200: what, its rows, the number, its unit, the most, and that of the stretch goal."""
 GOALS += [
     Goal(f"one H200: {what} within {most:g} {unit}", f"{{{place}:.3g {unit}}}",
          f"{place} <= {most / SCALES.get(unit, 1)}", rows, "", {"stretch": f"{better:g} {unit}"},
