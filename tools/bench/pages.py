@@ -12,25 +12,20 @@ from bench.cases import gallery  # noqa: F401  registers its slots
 from bench.tables import (  # noqa: F401  each registers its slots
     accuracy,
     accuracy_plot,
-    area,
-    backward,
     benchmarks,
     contact,
     fit,
     flags,
     goals,
-    gradients,
-    long_flag,
     measured,
     others,
-    pareto,
     pareto_plot,
     pins,
-    points,
     soft,
     speed_plot,
     surfaces,
     training,
+    validation,
 )
 from gaussian_swaying._files import write_text
 

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from bench import slots
-from bench.tables.markdown import digits, grid, source, yes_no
+from bench.tables.markdown import digits, grid, measured, source, stack, yes_no
 
 Row = dict[str, Any]
 Rows = str | Callable[[Any], Iterable[Row]]
@@ -25,8 +25,9 @@ SCALES = {"%": 100, "mm": 1e3, "min": 1 / 60, "GiB": 2**-30, "MiB": 2**-20,
           "KB": 1e-3, "MB": 1e-6, "10⁶": 1e-6, "GB": 1e-9, "GB/s": 1e-9}  # fmt: skip
 """How numbers are scaled for a unit; for other units they are left as they are."""
 
+_ABOUT: dict[str, Callable[[Row], str]] = {"source": source, "stack": stack, "dates": measured}
 _FIELD = re.compile(r"{([^{}:]*)(?::([^{}]*))?}")
-_OPTIONAL = re.compile(r"\[\[(.*?)\]\]")
+_OPTIONAL = re.compile(r"\[\[(.*?)\]\]", re.DOTALL)
 _FORMAT = re.compile(r"(?P<form>\S*?)(?: (?P<shown>[^() ]+)| \((?P<hidden>[^() ]+)\))?")
 _COMPARED = {
     "<=": lambda a, b: a <= b,
@@ -66,9 +67,9 @@ def find(row: Mapping[str, Any], place: str) -> Any:
 
 
 def told(value: Any, form: str = "") -> str:
-    """A value in a format, with a unit; a dash for None, ``yes`` or ``no`` for a truth, a list one by one."""
+    """A value in a format, with a unit; a dash for None, ``yes`` or ``no`` for a truth, each of a list."""
     if value is None or isinstance(value, bool):
-        return yes_no(value)
+        return f"**{yes_no(value)}**" if value is False and form == "bold" else yes_no(value)
     if isinstance(value, str):
         return value
     if isinstance(value, (list, tuple)):
@@ -117,7 +118,7 @@ def rows_of(record: Any, rows: Rows) -> list[Row]:
 
 def columns_of(columns: str) -> list[list[str]]:
     """Headings and templates of columns in the form ``heading = template | heading = template``."""
-    return [[part.strip() for part in column.split("= ", 1)] for column in re.split(r"\s\|\s", columns)]
+    return [[part.strip() for part in re.split(r"=\s", column, maxsplit=1)] for column in re.split(r"\s\|\s", columns)]
 
 
 def lines(rows: Iterable[Row], columns: str) -> list[str]:
@@ -155,7 +156,7 @@ def table(
     rows: Rows | None = None,
     columns: str = "",
     *,
-    before: str = "",
+    before: str | Callable[[Any], str] = "",
     after: str = "",
     order: Sequence[str] = (),
     together: bool = False,
@@ -170,7 +171,8 @@ def table(
         records: Pattern of the records.
         rows: Its rows; None for text alone.
         columns: Its columns, see :func:`columns_of`; a template that begins with ``- `` makes a list instead.
-        before: Template of what stands before it; ``{source}`` is the device, the versions and the date.
+        before: Template of what stands before it, or a function that makes it; ``{source}`` is the device, the versions
+            and the dates, ``{stack}`` the versions and ``{dates}`` the dates.
         after: Template of what stands after it.
         order: Places by which the rows are sorted.
         together: Whether it is one table of all records.
@@ -183,13 +185,12 @@ def table(
         found = sorted(found, key=lambda row: [find(row, place) for place in order])
         if rows is not None and not found and (each or empty is not None):
             return []
-        about = record | {"source": source(record)} if "{source}" in before else record
-        body = (
-            [fill(columns, row) for row in found] if columns[:2] == "- " else lines(found, columns) if columns else []
-        )
-        parts = (
-            [fill(before, about).split("\n")] * bool(before) + [body] + [fill(after, about).split("\n")] * bool(after)
-        )
+        first = before(record) if callable(before) else before
+        about = ({} if together else record) | {
+            name: make(record) for name, make in _ABOUT.items() if f"{{{name}}}" in first
+        }
+        body = [fill(columns, row) for row in found] if columns[:2] == "- " else lines(found, columns) * bool(columns)
+        parts = [fill(first, about)] * bool(first), body, [fill(after, about)] * bool(after)
         return [line for part in parts if part for line in ("", *part)][1:]
 
     def make(record: Any) -> list[str]:
@@ -250,7 +251,8 @@ class Goal:
             try:
                 if not self.where or holds(row, self.where):
                     cells = {"measured": fill(self.measured, about), "reached": holds(row, self.reached)}
-                    yield self._cells(about) | cells | {"stretched": holds(row, self.stretch) if self.stretch else None}
+                    stretched = holds(row, self.stretch) if self.stretch else None
+                    yield self._cells(about) | cells | {"stretched": stretched}
             except KeyError:
                 if self.always:
                     missed = False if "failed" in row else None
@@ -262,6 +264,8 @@ class Goal:
 
 
 GOAL = "goal = {goal} | measured = {measured} | reached = {reached}"
+BECAUSE = """goal = {goal} | wanted = {wanted} | where this comes from = {why} | measured = {measured} |
+    reached = {reached:bold}"""
 WANTED = "goal = {goal} | wanted = {wanted} | measured = {measured} | reached = {reached}"
 
 
