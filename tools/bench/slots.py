@@ -61,8 +61,8 @@ SLOTS: dict[str, Slot] = {}
 """All slots, by name."""
 
 
-def table(page: str, name: str, records: str, together: bool = False) -> Callable[[Any], Any]:
-    """Register a function that makes lines: a slot that ``page`` must have, once for each record."""
+def table(page: str | None, name: str, records: str, together: bool = False) -> Callable[[Any], Any]:
+    """Register a function that makes lines: a slot that ``page`` must have (if it is one), once for each record."""
 
     def register(make: Callable[..., list[str]]) -> Callable[..., list[str]]:
         SLOTS[name] = Slot(name, page, records, together, make)

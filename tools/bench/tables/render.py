@@ -9,7 +9,7 @@ an error. ``[[ of {all} Gaussians]]`` is left out if one of its fields is null o
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -60,10 +60,11 @@ def find(row: Mapping[str, Any], place: str) -> Any:
         return float(last)
     if last in row:
         return row[last]
-    name, dot, rest = last.partition(".")
-    if not dot or not isinstance(row[name], Mapping):
-        raise KeyError(last)
-    return find(row[name], rest)
+    names = last.split(".")
+    for count in range(1, len(names)):  # a name may have dots itself
+        if isinstance(inner := row.get(".".join(names[:count])), Mapping):
+            return find(inner, ".".join(names[count:]))
+    raise KeyError(last)
 
 
 def told(value: Any, form: str = "") -> str:
@@ -126,7 +127,8 @@ def lines(rows: Iterable[Row], columns: str) -> list[str]:
 
     Each row fills the templates of the columns. A row that ``failed`` says so in its first cell that cannot be filled.
     Headings are filled from the first row. Where one begins with a star, it is filled from each: rows that are equal in
-    the other columns become one, with a column for each of these headings.
+    the other columns become one, with a column for each of these headings. A row that cannot fill such a heading has
+    no cell there.
     """
     rows, named = list(rows), columns_of(columns)
     merged: dict[Any, dict[Any, str]] = {}
@@ -134,7 +136,10 @@ def lines(rows: Iterable[Row], columns: str) -> list[str]:
     for number, row in enumerate(rows):
         cells, failed = {}, [f"failed: {row['failed']}".replace("\n", " ")] if "failed" in row else []
         for place, (head, template) in enumerate(named):
-            name = fill(head[1:], row) if head[:1] == "*" else ""
+            try:
+                name = fill(head[1:], row) if head[:1] == "*" else ""
+            except KeyError:
+                continue
             heads[place][name] = None
             try:
                 cells[place, name] = fill(template, row)
@@ -150,7 +155,7 @@ def lines(rows: Iterable[Row], columns: str) -> list[str]:
 
 
 def table(
-    page: str,
+    page: str | None,
     name: str,
     records: str,
     rows: Rows | None = None,
@@ -166,7 +171,7 @@ def table(
     """Declare a table, which ``page`` must have once for each record.
 
     Args:
-        page: The page.
+        page: The page; None if no page must have it.
         name: Name of its slot.
         records: Pattern of the records.
         rows: Its rows; None for text alone.
@@ -200,7 +205,9 @@ def table(
     slots.table(page, name, records, together or each)(make)
 
 
-def value(name: str, records: str, template: str, rows: Callable[..., Row] | None = None) -> None:
+def value(
+    name: str, records: str, template: str, rows: Callable[[Any], Row] | None = None, together: bool = False
+) -> None:
     """Declare a value within a sentence.
 
     Args:
@@ -208,6 +215,7 @@ def value(name: str, records: str, template: str, rows: Callable[..., Row] | Non
         records: Pattern of the records.
         template: Its template; ``$1`` and so on are the further words of the slot.
         rows: Function of the record that makes the row; None for the record itself.
+        together: Whether it is about all records.
     """
 
     def make(record: Any, *words: str) -> str:
@@ -216,7 +224,7 @@ def value(name: str, records: str, template: str, rows: Callable[..., Row] | Non
             own = own.replace(f"${number}", word)
         return fill(own, rows(record) if rows else record)
 
-    slots.SLOTS[name] = slots.Slot(name, None, records, False, make, len(set(re.findall(r"\$\d", template))))
+    slots.SLOTS[name] = slots.Slot(name, None, records, together, make, len(set(re.findall(r"\$\d", template))))
 
 
 @dataclass(frozen=True)
@@ -243,11 +251,11 @@ class Goal:
     stretch: str = ""
     always: bool = False
 
-    def of(self, record: Any) -> Iterable[Row]:
-        """Its rows of a table, with ``goal``, ``measured``, ``reached`` and ``stretched``."""
-        for row in rows_of(record, self.rows):
-            limits = [find(row, part) for part in self.reached.split()[-1:] if self.always or _is_there(row, part)]
-            about = row | {"limit": limits[-1] if limits else None}
+    def of(self, rows: Iterable[Row]) -> Iterator[Row]:
+        """For each row, one of a table of goals, with ``goal``, ``measured``, ``reached`` and ``stretched``."""
+        for row in rows:
+            most = self.reached.rsplit(" ", 1)[1]
+            about = row | {"limit": find(row, most) if _is_there(row, most) else None}
             try:
                 if not self.where or holds(row, self.where):
                     cells = {"measured": fill(self.measured, about), "reached": holds(row, self.reached)}
@@ -269,6 +277,8 @@ BECAUSE = """goal = {goal} | wanted = {wanted} | where this comes from = {why} |
 WANTED = "goal = {goal} | wanted = {wanted} | measured = {measured} | reached = {reached}"
 
 
-def judged(goals: Sequence[Goal]) -> Callable[[Any], list[Row]]:
-    """The rows of a table of goals."""
-    return lambda record: [row for goal in goals for row in goal.of(record)]
+def judged(goals: Sequence[Goal], rows: Rows | None = None) -> Callable[[Any], list[Row]]:
+    """The rows of a table of goals, goal by goal; with ``rows``, which all of them are about, row by row."""
+    if rows is None:
+        return lambda record: [row for goal in goals for row in goal.of(rows_of(record, goal.rows))]
+    return lambda record: [row for one in rows_of(record, rows) for goal in goals for row in goal.of([one])]

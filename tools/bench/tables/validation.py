@@ -254,7 +254,8 @@ def _configured(result: Row) -> Iterator[Row]:
 
 table(PAGE, "points.rows", "points_*", _ways, """
     scene = {scene} | points = {title} | number = {points:,}[[ of {of:,} Gaussians]] |
-    mean distance = {error or '-':.2f %} | at the end = {error_last or '-':.2f %} | ms a frame = {ms_per_frame:.1f} | substeps = {substeps:,}
+    mean distance = {error or '-':.2f %} | at the end = {error_last or '-':.2f %} | ms a frame = {ms_per_frame:.1f} |
+    substeps = {substeps:,}
     """, before="{source}")  # fmt: skip
 POINT_GOALS = [
     Goal("{scene}", "{error_told} ({title})", "error <= 0.01", _configured,
