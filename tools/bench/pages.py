@@ -20,7 +20,6 @@ from bench.tables import (  # noqa: F401  each registers its slots
     measured,
     others,
     pareto_plot,
-    soft,
     speed_plot,
     surfaces,
     training,
