@@ -21,7 +21,6 @@ from bench.tables import (  # noqa: F401  each registers its slots
     others,
     pareto_plot,
     speed_plot,
-    surfaces,
     training,
     validation,
 )

@@ -24,7 +24,7 @@ SHARP = 28.0
 _BLANK = dict.fromkeys(("direction_error_deg", "material.E_error", "psnr_predicted_db", "psnr_rest_db", "seconds",
                         "processor_s", "sharp"), "")  # fmt: skip
 """What a row need not have."""
-_FOUND = """ = {name} | speed = {speed_error:+.2f %} | direction = [[{direction_error_deg:.2f}°]] |
+_FOUND = """ = {name} | speed = {speed_error:+.2f %} | direction = {direction_error_deg:.2f °} |
     E = {material.E_error:+.2f %} | predicted frames = {psnr_predicted_db:.1f dB} | time = {seconds:.0f s}"""
 _NONE = "Not measured yet."
 
@@ -83,7 +83,7 @@ def _biases(result: Row) -> Iterator[Row]:
 
 table(PAGE, "fit.bias", "fit_*", _biases, """
     case and grid = {name} | distance = {told} | speed = {speed_error:+.2f %} |
-    azimuth = [[{azimuth_error_deg:+.2f}°]] | E = {material.E_error:+.2f %} | points = {points:,}
+    azimuth = {azimuth_error_deg:+.2f °} | E = {material.E_error:+.2f %} | points = {points:,}
     """, before="{source}", each=True, empty=_NONE)  # fmt: skip
 
 

@@ -80,7 +80,7 @@ def told(value: Any, form: str = "") -> str:
     unit = parts["shown"] or parts["hidden"]
     value = value * SCALES[unit] if unit in SCALES else value
     text = digits(value) if parts["form"] == "digits" else format(value, parts["form"])
-    return f"{text} {parts['shown']}" if parts["shown"] else text
+    return text + (" " * (unit != "°") + unit if parts["shown"] else "")
 
 
 def fill(template: str, row: Mapping[str, Any]) -> str:
