@@ -97,14 +97,15 @@ def _is_there(row: Mapping[str, Any], place: str) -> bool:
 def holds(row: Mapping[str, Any], condition: str) -> bool | None:
     """Whether a condition such as ``ratio <= 1.5 and wind is 'gusts'`` holds; None if something is recorded as null.
 
-    Of lists, whether it holds for each.
+    Of lists, whether it holds for each; ``|error| <= 0.1`` is about a size.
     """
     for part in condition.split(" and "):
         left, name, right = part.rsplit(" ", 2)
-        value, limit = find(row, left), find(row, right)
+        value, limit = find(row, left.strip("|")), find(row, right)
         if value is None or limit is None:
             return None
-        if not all(_COMPARED[name](each, limit) for each in (value if isinstance(value, list) else [value])):
+        each = value if isinstance(value, list) else [value]
+        if not all(_COMPARED[name](abs(one) if left[0] == "|" else one, limit) for one in each):
             return False
     return True
 
