@@ -8,7 +8,6 @@ from fnmatch import fnmatch
 from pathlib import Path
 
 from bench import record, slots, stamps
-from bench.cases import gallery  # noqa: F401  registers its slots
 from bench.tables import (  # noqa: F401  each registers its slots
     accuracy,
     accuracy_plot,

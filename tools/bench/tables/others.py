@@ -1,11 +1,14 @@
-"""Tables of live.md, many.md, web.md and wind.md."""
+"""Tables of gallery.md, live.md, many.md, web.md and wind.md."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator
 from typing import Any
 
-from bench.tables.render import GOAL, WANTED, Goal, Row, judged, table
+from bench import slots
+from bench.cases import gallery
+from bench.tables.markdown import stack
+from bench.tables.render import GOAL, WANTED, Goal, Row, fill, judged, lines, table, value
 
 LIVE = {("flag", "cpu"): 10.0, ("guitar", "cpu"): 5.0, ("large flag", "cuda"): 25.0}
 """Pictures a second that are wanted on two cores, and on an H200."""
@@ -140,3 +143,41 @@ table("many.md", "sweeps.training", "sweeps_*", _training, """
     the fox, 1080 x 1920 pixels = {what} | steps = {steps} | seconds = {seconds:.1f} | PSNR [dB] = {psnr_db:.2f} |
     Gaussians = {gaussians:,}
     """, together=True, empty="Not recorded yet.")  # fmt: skip
+
+
+def _scenes(result: Row) -> Iterator[Row]:
+    """The scenes in their order, marked if their configuration has changed since."""
+    for name, title in gallery.SCENES.items():
+        if (row := result["scenes"].get(name)) is None:
+            continue
+        title += " \\*" * ("failed" not in row and not gallery.of_today(name, row))
+        more = {"title": title, "ok": gallery.whole(row)}
+        if "failed" not in row:
+            wall = sum(row["wall_s"].get(part, 0.0) for part in ("simulation", "shading", "rendering"))
+            more |= {
+                "frame_ms": 1e3 * wall / max(row["frames"], 1),
+                "each": row["substeps"] / max(row["frames"] - 1, 1),
+            }
+        yield row | more
+
+
+_SCENE = """
+    scene = {title}[[, preset `{preset}`]] | particles = {particles:,} | formulation = `{formulation}` |
+    frames = {frames} | substeps per frame = {each:.0f} | time per frame [ms] = {frame_ms:.1f} |
+    whole process [s] = {process_s:.0f} | host memory [GiB] = {peak_memory_bytes.host:.2f (GiB)} |
+    device memory [GiB] = {peak_memory_bytes.device:.2f (GiB)} | displacement / size = {displacement_share:.1f %} |
+    OK = {ok}
+    """
+_OLD = "\\* Recorded before a configuration file of this scene changed, or before records noted their files."
+
+
+@slots.table("gallery.md", "gallery.scenes", "gallery_*")
+def scenes(result: Row) -> list[str]:
+    """Time, memory and motion of each scene of a record."""
+    rows = list(_scenes(result))
+    old = ["", _OLD] if any(row["title"].endswith("*") for row in rows) else []
+    return [fill("{device}; {stack}; seed {seed}.", result | {"stack": stack(result)}), "", *lines(rows, _SCENE), *old]
+
+
+value("gallery.least", "gallery_*", "{limit:g %}", lambda _: {"limit": gallery.LEAST}, together=True)
+value("gallery.most", "gallery_*", "{limit:g %}", lambda _: {"limit": gallery.MOST}, together=True)
