@@ -3,9 +3,10 @@
 import pytest
 import yaml
 from bench.cases import web
-from bench.tables.web import films
 
 from gaussian_swaying.simulation.simulation import Simulation
+
+from .conftest import shown
 
 
 @pytest.mark.usefixtures("chromium")
@@ -20,5 +21,7 @@ def test_size_error_and_speed_of_a_film(tmp_path):
     assert 0 < row["error"] < 1e-3
     assert row["pictures_per_s"] > 0
     assert row["bytes"] > 1e6
-    table = films({"films": {row["title"]: row}, "device": "a CPU", "versions": {"torch": "2", "gsplat": "1"}})
+    table = shown(
+        "web.films", {"films": {row["title"]: row}, "device": "a CPU", "versions": {"torch": "2", "gsplat": "1"}}
+    )
     assert any(line.startswith("| Flag in the wind | 96 | ") for line in table)

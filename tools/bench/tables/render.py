@@ -150,7 +150,8 @@ def lines(rows: Iterable[Row], columns: str) -> list[str]:
                 cells[place, name] = failed.pop() if failed else "-"
         plain = tuple(text for (_, name), text in cells.items() if not name)
         merged.setdefault(plain if len(plain) < len(named) else number, {}).update(cells)
-    shown = [(place, name) for place, names in enumerate(heads) for name in names or [""]]
+    pivots = [head[:1] == "*" for head, _ in named]
+    shown = [(place, name) for place, names in enumerate(heads) for name in names or [""] * (not pivots[place])]
     told = [name or (fill(named[place][0], rows[0]) if rows else named[place][0]) for place, name in shown]
     return grid(told, ([cells.get(key, "-") for key in shown] for cells in merged.values()))
 
@@ -195,7 +196,8 @@ def table(
         about = ({} if together else record) | {
             name: make(record) for name, make in _ABOUT.items() if f"{{{name}}}" in first
         }
-        body = [fill(columns, row) for row in found] if columns[:2] == "- " else lines(found, columns) * bool(columns)
+        listed = columns[:2] == "- " or rows is None
+        body = [fill(columns, row) for row in found] if listed else lines(found, columns)
         parts = [fill(first, about)] * bool(first), body, [fill(after, about)] * bool(after)
         return [line for part in parts if part for line in ("", *part)][1:]
 
