@@ -20,7 +20,7 @@ from typing import Any
 import yaml
 
 from bench.cases.trained import GENTLE, filled, last_psnr, tilts
-from bench.record import ROOT
+from bench.record import ROOT, chosen
 from bench.tables.figure import save_figure
 from gaussian_swaying.evaluation.compare import compare_run
 
@@ -407,9 +407,7 @@ def open_dataset(dataset: Path, patterns: Sequence[Flag], result: Row) -> None:
 
 def measure(options: argparse.Namespace, result: Row, save: Callable[[Row], None]) -> None:
     """Fill ``result["rows"]``, saving it after each run; existing rows that are not selected are kept."""
-    names = options.rows.split(",")
-    if unknown := set(names) - set(VARIANTS):
-        raise SystemExit(f"--rows takes {', '.join(VARIANTS)}, not {', '.join(sorted(unknown))}")
+    names = chosen("--rows", options.rows, VARIANTS)
     patterns = flags_named(options.patterns)
     if options.splats != "made" and (other := [p for p in patterns if p not in PATTERNS]):
         raise SystemExit(f"{other[0]} has no photos to train a splat from: add `--splats made`")

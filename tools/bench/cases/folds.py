@@ -18,7 +18,7 @@ import torch
 
 from bench.cases import flags, pins
 from bench.problems.contacts import crossings, sheet_triangles
-from bench.record import ROOT
+from bench.record import ROOT, chosen
 from gaussian_swaying.evaluation.compare import compare_run
 from gaussian_swaying.recording.trajectory import load_trajectory
 
@@ -165,9 +165,7 @@ def add_arguments(command: argparse.ArgumentParser) -> None:
 
 def measure(options: argparse.Namespace, result: Row, save: Callable[[Row], None]) -> None:
     """Fill ``result``, saving it after each run; existing rows that are not selected are kept."""
-    names = [name for name in options.rows.split(",") if name]
-    if unknown := set(names) - set(ROWS):
-        raise SystemExit(f"--rows takes {', '.join(ROWS)}, not {', '.join(sorted(unknown))}")
+    names = chosen("--rows", options.rows, ROWS)
     dataset = Path(options.dataset)
     known = describe(dataset)
     if not known["references"]:

@@ -16,7 +16,7 @@ from typing import Any
 import yaml
 
 from bench.cases.flags import what_failed
-from bench.record import ROOT
+from bench.record import ROOT, chosen
 
 CONFIGS = ROOT / "configs" / "sim"
 Row = dict[str, Any]
@@ -138,9 +138,7 @@ def add_arguments(command: argparse.ArgumentParser) -> None:
 
 def measure(options: argparse.Namespace, result: Row, save: Callable[[Row], None]) -> None:
     """Fill ``result["scenes"]``, saving it after each."""
-    names = options.scenes.split(",")
-    if unknown := set(names) - set(SCENES):
-        raise SystemExit(f"--scenes takes {', '.join(SCENES)}, not {', '.join(sorted(unknown))}")
+    names = chosen("--scenes", options.scenes, SCENES)
     for name in names:
         row = run_scene(name, options, Path(options.pictures))
         result.setdefault("scenes", {})[name] = row
