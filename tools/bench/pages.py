@@ -10,7 +10,6 @@ from pathlib import Path
 from bench import record, slots, stamps
 from bench.tables import (  # noqa: F401  each registers its slots
     accuracy,
-    accuracy_plot,
     benchmarks,
     contact,
     fit,
@@ -18,17 +17,16 @@ from bench.tables import (  # noqa: F401  each registers its slots
     goals,
     measured,
     others,
-    pareto_plot,
-    speed_plot,
+    plots,
     training,
     validation,
 )
 from gaussian_swaying._files import write_text
 
 PLOTS: dict[str, Callable[[list[record.Row], Path], None]] = {
-    "accuracy_*": accuracy_plot.draw,
-    "pareto_*": pareto_plot.draw,
-    "speed_*": speed_plot.draw,
+    "accuracy_*": plots.accuracy,
+    "pareto_*": plots.pareto,
+    "speed_*": plots.speed,
 }
 """Functions that draw into the folder of the pictures, by the records that they need."""
 

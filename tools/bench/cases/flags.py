@@ -21,7 +21,7 @@ import yaml
 
 from bench.cases.trained import GENTLE, filled, last_psnr, tilts
 from bench.record import ROOT, chosen
-from bench.tables.figure import save_figure
+from bench.tables.plots import save_figure
 from gaussian_swaying.evaluation.compare import compare_run
 
 sys.path.append(str(ROOT / "tools" / "datasets"))  # scripts that import each other from their own folder
