@@ -10,6 +10,8 @@ from bench import record, stamps
 from bench.tables import measured
 from bench.tables.markdown import source
 
+from .conftest import shown
+
 RESULTS = Path(__file__).parents[2] / "docs" / "results"
 
 
@@ -108,7 +110,7 @@ def test_rows_older_than_their_code_are_marked(tmp_path, clock):
     (tmp_path / record.AGES).write_text(json.dumps(ages))
     found = record.read(tmp_path)["winds_cpu"]
     assert "1 of 2 rows [before the last change](benchmarks.md#when-it-was-measured) of aero, geometry" in source(found)
-    told = measured.rows([found])[2:]
+    told = shown("measured.rows", [found])[2:]
     assert told[0].startswith("| winds_cpu | ours: 1 | 2026-11-22 10:00:00 | commit  | clean | torch 2 | mpm, geometry")
     assert told[1].startswith("| winds_cpu | particle: 1 | 2026-11-23 10:00:00 |")
     assert told[1].endswith("| torch 2 | - |")
