@@ -5,18 +5,15 @@ from __future__ import annotations
 import argparse
 import hashlib
 import json
-import subprocess
-import sys
 import tempfile
-import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
 import yaml
 
-from bench.cases.flags import what_failed
 from bench.record import ROOT, chosen
+from bench.simulate import simulate
 
 CONFIGS = ROOT / "configs" / "sim"
 Row = dict[str, Any]
@@ -108,23 +105,17 @@ def run_scene(name: str, options: argparse.Namespace, pictures: Path) -> Row:
     """Run a scene as a user would, and return its summary."""
     with tempfile.TemporaryDirectory() as folder:
         output = Path(folder) / "out"
-        command = [sys.executable, str(ROOT / "tools" / "sim.py"), *arguments(name, options.preset)]
-        command += ["--device", options.device, "--output", str(output), "--recorder.video=false"]
-        command += [f"--frames={options.frames}"] if options.frames else []
-        command += options.more.split() if options.more else []
-        begin = time.perf_counter()
-        done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True)
-        seconds = time.perf_counter() - begin
-        if not (output / "summary.json").exists():
-            return {"failed": what_failed(done.stderr)}
-        summary = json.loads((output / "summary.json").read_text())
+        asked = [*arguments(name, options.preset), "--recorder.video=false", *(options.more or "").split()]
+        summary = simulate(asked, output, options.device, options.frames)
+        if "failed" in summary:
+            return summary
         summary.pop("per_frame")
         folders = [folder for folder in (output / "frames", output / "wind") if folder.is_dir()]
         strip(folders, pictures / f"gallery_{name}.png")
     moved = summary["displacement_mean_max_m"]
     share = None if moved is None else moved / summary["size_m"]
     noted = {"preset": options.preset, "configuration": fingerprint(name, options.preset)}
-    return summary | noted | {"process_s": seconds, "displacement_share": share}
+    return summary | noted | {"displacement_share": share}
 
 
 def add_arguments(command: argparse.ArgumentParser) -> None:

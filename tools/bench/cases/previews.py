@@ -13,8 +13,8 @@ from pathlib import Path
 from typing import Any
 
 from bench.cases import gallery
-from bench.cases.flags import what_failed
 from bench.record import ROOT, chosen
+from bench.simulate import what_failed
 
 Row = dict[str, Any]
 
