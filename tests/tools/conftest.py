@@ -19,6 +19,19 @@ def bench():
     return lambda *arguments: main("bench.py", [str(argument) for argument in arguments])
 
 
+def shown(slot: str, record: object, *words: str) -> list[str] | str:
+    """What a slot shows of a record (or of a list of all that it is about): the lines of a table, or a text."""
+    from bench import pages, slots
+
+    assert pages
+    return slots.SLOTS[slot].make(record, *words)
+
+
+def cells(slot: str, record: object) -> list[list[str]]:
+    """The cells of each row of the table of a slot."""
+    return [line[2:-2].split(" | ") for line in shown(slot, record) if line.startswith("| ")][1:]
+
+
 @contextmanager
 def dataset_tool(name: str) -> Iterator[object]:
     """A program of tools/datasets with the modules beside it, which are forgotten afterwards."""

@@ -4,10 +4,11 @@ import argparse
 import json
 
 from bench.cases import area as case
-from bench.tables import area as tables
 
 from gaussian_swaying.gaussians.ply import write_ply
 from gaussian_swaying.scenes.procedural import FlagScene
+
+from .conftest import cells, shown
 
 BALLS = "open ball of leaves, leaf area index 1", "dense ball of leaves, leaf area index 4"
 
@@ -22,10 +23,10 @@ def test_areas_are_recorded_and_shown(tmp_path):
     assert record["bodies"]["flag"]["open"] > 0.99
     assert 0.9 < record["bodies"]["two shells, 0.2 m apart"]["open"] < 1.1
     assert record["timed"]["gaussians"] == 500
-    lines = tables.bodies(record)
+    lines = shown("area.bodies", record)
     assert any(line.startswith("| flag | 6,144 | 0.96 (as `coverage` finds) | 1.000 | 1.000 |") for line in lines)
-    assert tables.capture(record, "flag", "hull") == "1.5"
-    assert tables.capture(record, "flag", "open") == "1.0"
+    assert shown("area.capture", record, "flag", "hull") == "1.5"
+    assert shown("area.capture", record, "flag", "open") == "1.0"
 
 
 def test_missed_goals_are_said_to_be_missed():
@@ -38,17 +39,6 @@ def test_missed_goals_are_said_to_be_missed():
     found[BALLS[1]] = row | {"open": 0.9}
     timed = {"gaussians": 150_000.0, "open_s": 2.5, "open_cpu_s": 2.4, "coverage_s": 4.0}
     result = {"bodies": found, "timed": timed, "device": "a CPU", "versions": {"torch": "2"}}
-    lines = [line for line in tables.goals(result) if line.startswith("| ")][1:]
-    assert [line.split(" | ")[-1].strip(" |") for line in lines] == [
-        "no",
-        "yes",
-        "yes",
-        "yes",
-        "yes",
-        "yes",
-        "no",
-        "yes",
-        "no",
-        "no",
-    ]
-    assert "-10.0 % at worst (two shells)" in lines[0]
+    found = cells("area.goals", result)
+    assert [row[-1] for row in found] == ["no", "yes", "yes", "yes", "yes", "yes", "no", "yes", "no", "no"]
+    assert "-10.0 % at worst (two shells)" in found[0][2]

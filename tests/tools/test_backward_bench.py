@@ -5,7 +5,8 @@ import json
 import pytest
 import torch
 from bench.cases import backward
-from bench.tables import backward as tables
+
+from .conftest import cells, shown
 
 
 def test_backward_is_measured_and_shown(bench, tmp_path, monkeypatch):
@@ -17,23 +18,21 @@ def test_backward_is_measured_and_shown(bench, tmp_path, monkeypatch):
     assert [row["steps"] for row in found["memory"]] == [20, 1]
     for row in found["agreement"]:
         assert max(row["torch"].values()) < 1e-2
-    shown = "\n".join([*tables.rows(found), *tables.memory(found), *tables.agreement(found)])
-    assert "| 64 | hinge | springs | torch |" in shown
-    assert "failed" not in shown
+    told = [line for part in ("rows", "memory", "agreement") for line in shown(f"backward.{part}", found)]
+    assert any("| 64 | hinge | springs | torch |" in line for line in told)
+    assert not any("failed" in line for line in told)
 
 
 def test_goals_say_what_was_reached():
     time = {"median_ms": 0.1}
     row = {"points": 99_856, "pin": "hinge", "law": "springs", "by": "kernels", "plain": time, "ratio": 4.5}
     memory = {"points": 99_856, "steps": 2000, "by": "kernels", "checkpoint": 0, "memory_bytes": 2**30}
-    found = tables.goals({"rows": [row, row | {"by": "torch"}, row | {"points": 10_000}], "memory": [memory]})
-    assert len(found) == 4
-    assert found[2].endswith("| at most 4 forward | 4.5 | no |")
-    assert found[3].endswith("| 1.00 GiB | yes |")
-    shown = tables.rows(
-        {"device": "a", "versions": {}, "rows": [{**row, "transfer": "auto", "failed": "out of memory"}]}
-    )
-    assert "failed: out of memory" in shown[-1]
+    others = [row | {"by": "torch"}, row | {"points": 10_000}]
+    found = cells("backward.goals", {"rows": [row, *others], "memory": [memory]})
+    assert [one[1:] for one in found] == [["at most 4 forward", "4.5", "no"], ["at most 2 GiB", "1.00 GiB", "yes"]]
+    failed = {"device": "a", "versions": {}, "rows": [{"points": 9, "pin": None, "law": "springs", "transfer": "auto"}]}
+    failed["rows"][0]["failed"] = "out of memory"
+    assert cells("backward.rows", failed) == [["9", "no", "springs", "auto", "failed: out of memory", "-", "-", "-"]]
 
 
 def test_unknowns_of_the_sheet_move_it():

@@ -8,7 +8,8 @@ import pytest
 import torch
 from bench.cases import contact
 from bench.problems.contacts import crossings, sheet_triangles
-from bench.tables import contact as tables
+
+from .conftest import shown
 
 CPU = torch.device("cpu")
 
@@ -39,18 +40,18 @@ def test_rows_are_recorded_and_shown(monkeypatch):
     assert (row["crossings"], row["closer_than_half"]) == (0, 0.0)
     contact.measure(options, result, lambda now: None)
     assert len(result["rows"]) == len(contact.CASES)  # measured again, not twice
-    assert tables.cost(result)[-1].startswith("| 98 |")
-    assert "thicknesses" in tables.collisions(result)[-1]
+    assert shown("contact.cost", result)[-1].startswith("| 98 |")
+    assert "thicknesses" in shown("contact.collisions", result)[-1]
 
 
 def test_a_pile_rests_for_a_second():
     (row,) = contact.pile(1.0, CPU, layers=2, per_side=2)
     assert row["kinetic"] < 1e-4
     assert row["top"] == pytest.approx(1.0, abs=0.05)  # the ground lies half a thickness below the lower layer
-    shown = tables.pile({"device": "a CPU", "versions": {"torch": "2"}, "seed": 0, "pile": [row]})
-    assert shown[-1].startswith("| 1 | ")
-    assert shown[-1].endswith(" | +0.0e+00 | +0.0e+00 | +0.0000 | +0.00 | - |")
-    assert tables.pile({}) == ["Not recorded."]
+    told = shown("contact.pile", {"device": "a CPU", "versions": {"torch": "2"}, "seed": 0, "pile": [row]})
+    assert told[-1].startswith("| 1 | ")
+    assert told[-1].endswith(" | +0.0e+00 | +0.0e+00 | +0.0000 | +0.00 | - |")
+    assert shown("contact.pile", {}) == ["Not recorded."]
 
 
 def test_crossings_are_counted():

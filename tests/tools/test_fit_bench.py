@@ -11,10 +11,11 @@ import yaml
 from bench.cases import fit as case
 from bench.cases import fit_bias, fit_reference
 from bench.problems.films import write_video
-from bench.tables import fit as tables
 
 from gaussian_swaying.fitting.ensemble import Ensemble
 from gaussian_swaying.simulation.simulation import Simulation
+
+from .conftest import shown
 
 HEAD = {"device": "a CPU", "versions": {"torch": "2"}, "seed": 0}
 ROW = {
@@ -44,15 +45,16 @@ def test_the_settings_of_own_data_are_a_simulation(tmp_path):
 
 def test_missed_goals_are_said_to_be_missed():
     rows = {"two cameras": ROW, "one camera": ROW | {"speed_error": -0.02}, "pixels alone": ROW | {"speed_error": 0.9}}
-    lines = tables.own([HEAD | {"own": rows}])
+    lines = shown("fit.own", [HEAD | {"own": rows}])
     assert "| two cameras | +0.40 % | 0.50° | -0.80 % | 31.3 dB | 12 s | yes |" in lines
     assert "| one camera | -2.00 % | 0.50° | -0.80 % | 31.3 dB | 12 s | no |" in lines
-    told = tables.own([HEAD | {"own": {"two cameras": ROW | {"not_settled": "The values have not settled."}}}])
+    told = shown("fit.own", [HEAD | {"own": {"two cameras": ROW | {"not_settled": "The values have not settled."}}}])
     assert any(line.startswith("| two cameras (not settled) | +0.40 %") for line in told)
     lost = ROW | {"psnr_rest_db": 40.0, "psnr_fitted_db": 30.0}
-    assert any(line.startswith("| x (not followed) |") for line in tables.own([HEAD | {"own": {"x": lost}}]))
+    assert any(line.startswith("| x (not followed) |") for line in shown("fit.own", [HEAD | {"own": {"x": lost}}]))
     assert "| pixels alone | +90.00 % | 0.50° | -0.80 % | 31.3 dB | 12 s |  |" in lines
-    found = tables.blender(
+    found = shown(
+        "fit.blender",
         [
             HEAD
             | {
@@ -62,7 +64,7 @@ def test_missed_goals_are_said_to_be_missed():
                     "curtain, two cameras": {"refused": "The video cannot tell."},
                 }
             }
-        ]
+        ],
     )
     assert [line.split(" | ")[-1] for line in found if line.startswith(("| flag", "| curtain"))] == [
         "no |",
@@ -70,7 +72,7 @@ def test_missed_goals_are_said_to_be_missed():
         "no |",
     ]
     assert any("| 0.75 s; 50 cells; `solver.dx` 0.06 | no |" in line for line in found)
-    assert tables.blender([HEAD]) == ["Not measured yet."]
+    assert shown("fit.blender", [HEAD]) == ["Not measured yet."]
 
 
 def test_a_claim_about_all_cases_counts_them():
@@ -79,8 +81,8 @@ def test_a_claim_about_all_cases_counts_them():
     rows = {"a, two cameras": ROW, "b, two cameras": wrong, "b, one camera": wrong, "c, one camera": dull}
     rows |= {"a, tracks alone": wrong, "d, one camera": {"refused": "x"}}
     result = HEAD | {"blender": rows}
-    assert tables.within(result) == "3 of 5"
-    assert tables.sharp(result) == "3 of 5"
+    assert shown("fit.within", result) == "3 of 5"
+    assert shown("fit.sharp", result) == "3 of 5"
 
 
 def test_rows_of_a_case_of_blender():
@@ -101,7 +103,9 @@ def test_predicted_frames_are_compared_with_what_the_splat_reaches_at_rest():
         for k, (p, r) in enumerate([(28.5, 30.0), (27.0, 30.0), (26.5, 26.0)])
     }
     rows["flag 3, tracks alone"] = ROW | {"psnr_rest_db": 30.0}
-    found = [line.split(" | ") for line in tables.blender([HEAD | {"blender": rows}]) if line.startswith("| flag")]
+    found = [
+        line.split(" | ") for line in shown("fit.blender", [HEAD | {"blender": rows}]) if line.startswith("| flag")
+    ]
     assert [line[7] for line in found] == ["yes", "no", "yes", "yes"]
     assert found[3][-1] == " |" or found[3][-1] == "|"
 
@@ -114,14 +118,14 @@ def test_faults_of_the_model_are_shown_with_the_grid_that_has_them():
         "material.E_error": 0.0098,
         "points": 1800,
     }
-    found = tables.bias([HEAD | {"bias": {"flag, solver.dx 0.04, scene.generator.init_args.spacing 0.01": row}}])
+    found = shown("fit.bias", [HEAD | {"bias": {"flag, solver.dx 0.04, scene.generator.init_args.spacing 0.01": row}}])
     assert "| flag, `dx 0.04`, `spacing 0.01` | 2.17 pixels | +0.63 % | -0.00° | +0.98 % | 1,800 |" in found
-    lost = tables.bias([HEAD | {"bias": {"flag, solver.dx 0.01": row | {"rms_px": 320.0}}}])
+    lost = shown("fit.bias", [HEAD | {"bias": {"flag, solver.dx 0.01": row | {"rms_px": 320.0}}}])
     assert "| flag, `dx 0.01` | the simulation diverged |  |  |  | 1,800 |" in lost
-    assert tables.bias([HEAD]) == ["Not measured yet."]
+    assert shown("fit.bias", [HEAD]) == ["Not measured yet."]
     name = fit_bias.name_of("flag", {"solver.dx": 0.01, "solver.boundaries": [{}]}, 1.0)
     assert name == "flag, solver.dx 0.01, solver.boundaries, to 1 s"
-    told = tables.bias([HEAD | {"bias": {name: row}}])
+    told = shown("fit.bias", [HEAD | {"bias": {name: row}}])
     assert any(line.startswith("| flag, `dx 0.01`, `boundaries`, `to 1 s` | 2.17") for line in told)
 
 
@@ -165,13 +169,13 @@ def test_a_splat_that_moves_as_the_reference_shows_the_video(tmp_path):
     options.known = '{"solver.dx": 0.12}'
     fit_reference.measure(options, [folder], result, lambda found: None)
     assert list(result["reference"])[3:] == ["flag, simulated `dx` 0.12"]
-    lines = tables.reference([HEAD | {"reference": {"flag, cloth": own, "flag, uncertainty/coarser": coarser}}])
+    lines = shown("fit.reference", [HEAD | {"reference": {"flag, cloth": own, "flag, uncertainty/coarser": coarser}}])
     assert any(line.startswith("| predicted frames | cloth | coarser |") for line in lines)
     assert any(
         line == f"| flag | {own['psnr_predicted_db']:.1f} dB | {coarser['psnr_predicted_db']:.1f} dB |"
         for line in lines
     )
-    assert tables.reference([HEAD]) == ["Not measured yet."]
+    assert shown("fit.reference", [HEAD]) == ["Not measured yet."]
 
 
 def _case(tmp_path):

@@ -8,10 +8,12 @@ import numpy as np
 import pytest
 import torch
 from bench.cases import flags
-from bench.tables import flags as tables
+from bench.tables import flag_benchmark as tables
 from imageio.v3 import imread, imwrite
 
 from gaussian_swaying.simulation.simulation import Simulation
+
+from .conftest import cells, shown
 
 DRAG = {2: 0.8, 3: 1.28}
 PIXEL = imwrite("<bytes>", np.zeros((4, 6, 3), np.uint8), extension=".png")
@@ -61,7 +63,7 @@ def _leaves(settings):
 @pytest.mark.parametrize("pattern", ["light"])
 def test_rows_lead_from_ours_to_physgaussians_way_by_one_change_each(pattern, settings_of):
     """The last of them is PhysGaussian's way."""
-    way = [_leaves(settings_of(name, pattern)) for name in ("ours", *tables._WAY)]
+    way = [_leaves(settings_of(name, pattern)) for name in ("ours", *tables.WAY)]
     changes = [{key for key in {**old, **new} if new.get(key) != old.get(key)} for old, new in pairwise(way)]
     assert changes[:4] == [{"material.volume"}, {"scene.layers"}, {"material.law.class_path"}, {"scene.area"}]
     assert changes[4] == {"aero.C_F"}
@@ -86,7 +88,7 @@ def test_rows_are_scaled_to_the_mass_of_ours(pattern, settings_of):
                        for row in (name, "ours"))  # fmt: skip
         scaled, factor = flags.of_equal_mass(own, wanted)
         points, before = body(name, *scaled), body(name)
-        assert float(points.mass.sum() / ours.mass.sum()) == pytest.approx(1, abs=tables._SAME_MASS)
+        assert float(points.mass.sum() / ours.mass.sum()) == pytest.approx(1, abs=tables.SAME_MASS)
         assert float(before.mass.sum() / ours.mass.sum()) > 1.5
         stiffness = [(each.volume * each.youngs_modulus).sum() for each in (points, before)]
         assert float(stiffness[0] / stiffness[1]) == pytest.approx(factor, rel=1e-4)
@@ -147,7 +149,7 @@ def test_a_row_is_simulated_and_compared(tmp_path):
     assert row["mean"]["chamfer_m"] < 0.1  # the spacing
     assert row["chamfer_share"] == pytest.approx(row["mean"]["chamfer_m"] / 1.2)
     particle = flags.run_row(1, flags.VARIANTS["particle"], options, None, tmp_path / "particle_1")
-    assert particle["mass_kg"] == pytest.approx(row["mass_kg"], rel=tables._SAME_MASS)
+    assert particle["mass_kg"] == pytest.approx(row["mass_kg"], rel=tables.SAME_MASS)
     assert particle["volume_factor"] < 0.7
     assert "volume_factor" not in row
     options.more = "--solver.dx=nonsense"
@@ -187,10 +189,10 @@ def test_the_page_tells_what_was_and_what_was_not():
     result |= {"more": "--solver.dx=0.03", "note": "Other work ran beside these."}
     known = {"cells": 60, "quality": 16, "frames_compared": 250, "chamfer": 0.034}
     result["uncertainty"] = {"1": {"coarser": known, "hardly bending": known | {"chamfer": 0.082}}}
-    parts = [tables.device(result), tables.rows_table(result), tables.goal_table(result), tables.reference([result])]
-    text = "\n".join(line for part in parts for line in part)
+    told = [shown(f"flags.{part}", result) for part in ("device", "rows", "goals")]
+    text = "\n".join(line for part in (*told, shown("flags.reference", [result])) for line in part)
     ours = flags.VARIANTS["ours"].title
-    assert f"| {ours} | 2.13 % | 22.50 | stopped at frame 31 | 22.50 | -, - |" in text
+    assert f"| {ours} | 2.13 % | stopped at frame 31 | 22.50 | 22.50 | -, - |" in text
     assert f"| {flags.VARIANTS['particle'].title} | failed | - | - | - | -, - |" in text
     assert "`--solver.dx=0.03`" in text
     assert "Other work ran beside these." in text
@@ -198,11 +200,14 @@ def test_the_page_tells_what_was_and_what_was_not():
     assert "another flag: with a fiftieth of its bending stiffness (60 cells, 16 steps, 250 frames) 8.20 %" in text
     assert "(reference itself: 3.40 %)" in text
     result["uncertainty"]["1"]["half the cells"] = known | {"chamfer": 0.041}
-    assert tables.goals(result)[0][1] == "2.13 % (reference itself: 4.10 %)"  # the largest of all that are this flag
-    assert tables.reference_doubt([result]) == "4.10 %"
-    assert tables.costs(result)[2:] == [f"| {ours}, pattern {p} | 1,000 | 5,000 | 12.3 | 1.00 |" for p in (1, 3)]
-    assert tables.distance(result, "ours", "1") == "2.13 %"
-    assert tables.reference_distance([result], "hardly_bending", "1") == "8.20 %"
+    doubt = "2.13 % (reference itself: 4.10 %)"  # the largest of all that are this flag
+    assert cells("flags.goals", result)[0][1] == doubt
+    assert shown("flags.reference_doubt", [result]) == "4.10 %"
+    assert shown("flags.costs", result)[2:] == [
+        f"| {ours}, pattern {p} | 1,000 | 5,000 | 12.3 | 1.00 |" for p in (1, 3)
+    ]
+    assert shown("flags.distance", result, "ours", "1") == "2.13 %"
+    assert shown("flags.reference_distance", [result], "hardly_bending", "1") == "8.20 %"
 
 
 def test_the_page_quotes_the_paper():
@@ -211,9 +216,9 @@ def test_the_page_quotes_the_paper():
 
 def test_numbers_of_the_prose_are_those_of_the_reference():
     """The wind of pattern 2, (2.5, 0.5, 0) m/s, along a flag in the x-z plane: atan(0.2), and a degree over tan."""
-    assert tables.ripple([], "1") == "3 mm"
-    assert tables.incidence([], "2") == "11 degrees"
-    assert tables.per_degree([], "2") == "9 %"
+    assert shown("flags.ripple", [], "1") == "3 mm"
+    assert shown("flags.incidence", [], "2") == "11 degrees"
+    assert shown("flags.per_degree", [], "2") == "9 %"
 
 
 def test_goals_and_what_one_change_does():
@@ -225,25 +230,24 @@ def test_goals_and_what_one_change_does():
     rows = {"ours": {"3": ours}, "particle": {"3": row(0.1, 18.0, mass_kg=0.5)}, "no_surface": {"3": row(0.03, 18.0)}}
     rows |= {"no_shading": {"3": row(0.02, 23.0)}, "undamped": {"3": row(0.025, 22.0)}, "thin": {"3": row(0.018, 22.0)}}
     result = {"splats": "made in code", "rows": rows, "uncertainty": {"3": {"coarser": {"chamfer": 0.0067}}}}
-    found = {goal: (value, ok) for goal, value, ok in tables.goals(result)}
-    assert found == {
-        "pattern 3: Chamfer distance within 3 % of the longer side": ("2.00 % (reference itself: 0.67 %)", True),
-        "pattern 3: PhysGaussian's way has the mass of ours": ("1.000000 times", True),
-        "pattern 3: Chamfer distance 0.25 times that of PhysGaussian's way": ("0.20 times", True),
-        "pattern 3: PSNR +4.2 dB over PhysGaussian's way": ("+4.00 dB", False),
-        "pattern 3: Chamfer distance at least twice as large without surface modelling": ("1.50 times", False),
-        "pattern 3: lower PSNR without shading": ("+1.00 dB", False),
-    }
-    trained = tables.goals(result | {"splats": "trained, 7000 images"})
-    assert trained[0][0::2] == ("pattern 3: Chamfer distance within 1.2 % of the longer side", False)
-    assert [goal[2] for goal in trained[1:]] == [goal[1] for goal in list(found.values())[1:]]
-    lines = tables.pattern_lines(rows, 3)
+    found = cells("flags.goals", result)
+    assert found == [
+        ["pattern 3: Chamfer distance within 3 % of the longer side", "2.00 % (reference itself: 0.67 %)", "yes"],
+        ["pattern 3: PhysGaussian's way has the mass of ours", "1.000000 times", "yes"],
+        ["pattern 3: Chamfer distance 0.25 times that of PhysGaussian's way", "0.20 times", "yes"],
+        ["pattern 3: PSNR +4.2 dB over PhysGaussian's way", "+4.00 dB", "no"],
+        ["pattern 3: Chamfer distance at least twice as large without surface modelling", "1.50 times", "no"],
+        ["pattern 3: lower PSNR without shading", "+1.00 dB", "no"],
+    ]
+    trained = cells("flags.goals", result | {"splats": "trained, 7000 images"})
+    assert trained[0][0::2] == ["pattern 3: Chamfer distance within 1.2 % of the longer side", "no"]
+    assert trained[1:] == found[1:]
+    lines = shown("flags.changes", {"rows": rows})
     assert lines[0].endswith("0.50 %, 1.00 %, 3.00 %")
     assert "half the thickness, double E and density -0.20; no shading +0.00; without the" in lines[2]
     assert lines[2].endswith("damping +0.50")
-    assert tables.pattern_lines(rows, 1) == []
     rows["particle"]["3"]["mass_kg"] = 0.5001
-    assert tables.goals(result)[1][1:] == ("1.000200 times", False)
+    assert cells("flags.goals", result)[1][1:] == ["1.000200 times", "no"]
 
 
 def _share(share, mass=0.5):
@@ -253,9 +257,9 @@ def _share(share, mass=0.5):
 
 def test_a_row_of_another_mass_is_marked():
     rows = {"ours": {"1": _share(0.02)}, "particle": {"1": _share(0.03)}, "own_volumes": {"1": _share(0.04, 1.0)}}
-    shown = tables.rows_table({"rows": rows | {"thin": {"1": _share(0.01, 0.514)}}})
-    assert shown[0] == "|  | pattern 1: Chamfer | mass / mass of ours |"
-    assert [line.split(" | ")[1:] for line in shown[2:]] == [
+    told = shown("flags.rows", {"rows": rows | {"thin": {"1": _share(0.01, 0.514)}}})
+    assert told[0] == "|  | pattern 1: Chamfer | mass / mass of ours |"
+    assert [line.split(" | ")[1:] for line in told[2:]] == [
         ["2.00 %", "1.00 |"], ["3.00 %", "1.00 |"], ["4.00 % (2.00 times the mass)", "2.00 |"], ["1.00 %", "1.03 |"],
     ]  # fmt: skip
 
@@ -264,19 +268,19 @@ def test_rows_of_another_splat_are_not_compared_with_ours():
     """When ours was measured again with a splat trained anew and a row was not."""
     old, new = ({"training": {"seconds": seconds}} for seconds in (78.2, 80.1))
     rows = {"ours": {"1": _share(0.02) | new}, "linear": {"1": _share(0.03) | new}, "thin": {"1": _share(0.04) | old}}
-    (line,) = tables.pattern_lines(rows, 1)
+    (line,) = shown("flags.changes", {"rows": rows})
     assert line.endswith("pressure linear in the cloth's speed +1.00")
-    assert "| 4.00 % (another splat) |" in tables.rows_table({"rows": rows})[-1]
+    assert "| 4.00 % (another splat) |" in shown("flags.rows", {"rows": rows})[-1]
 
 
 def test_rows_that_were_dropped_are_named():
     result = {"rows": {"ours": {"2": _share(0.02)}}, "dropped": {"ours": {"2": _share(0.0162)}}}
     result["dropped"]["updated_04"] = {"2": _share(0.0149)}
-    assert tables.dropped(result)[2:] == [
+    assert shown("flags.dropped", result)[2:] == [
         "| dropped | flag | distance then | ours then |", "|---|---|---|---|",
         "| `updated`, dx = 0.04 m | pattern 2 | 1.49 % | 1.62 % |",
     ]  # fmt: skip
-    assert tables.dropped({"rows": {}}) == []
+    assert shown("flags.dropped", {"rows": {}}) == []
 
 
 def test_the_dropped_rows_of_the_record_are_on_the_page():
@@ -289,7 +293,7 @@ def test_the_dropped_rows_of_the_record_are_on_the_page():
 def test_what_each_change_on_the_way_adds():
     shares = {"ours": 0.01, "to_volume": 0.012, "to_layer": 0.05, "particle": 0.045, "own_volumes": 0.2}
     rows = {name: {"2": _share(share)} for name, share in shares.items()}
-    (line,) = tables.pattern_lines(rows, 2)
+    (line,) = shown("flags.changes", {"rows": rows})
     assert line == (
         "- pattern 2, what each further change adds [% of the longer side]: ours with volumes of grid cells +0.20; "
         "one layer +3.80; no shading: PhysGaussian's way -0.50"
@@ -301,15 +305,15 @@ def test_the_headline_is_the_mean_over_all_flags():
     trained = {"splats": "trained, 7000 images", "rows": {"ours": {"1": _share(0.02), "3": _share(0.01)}}}
     made = {"splats": "made in code", "rows": {"ours": {"1": _share(0.03)}}}
     more = {"splats": "made in code", "rows": {"ours": {"4": _share(0.01), "light": _share(0.02)}}}
-    assert tables.headline([trained]) == "**1.50 %** with splats trained on photos (mean of 2 flags)"
-    told = tables.headline([trained, made, more])
+    assert shown("flags.headline", [trained]) == "**1.50 %** with splats trained on photos (mean of 2 flags)"
+    told = shown("flags.headline", [trained, made, more])
     assert told.endswith(" and **1.50 %** with splats made in code (mean of 2 flags)")
     trained["rows"]["own_volumes"] = {"1": _share(0.3), "3": _share(0.3)}
     trained["rows"]["particle"] = {"1": _share(0.1)}
-    assert "PhysGaussian" not in tables.headline([trained])
+    assert "PhysGaussian" not in shown("flags.headline", [trained])
     trained["rows"]["particle"]["3"] = _share(0.2)
     way = "; PhysGaussian's way, with the same splats and mass, **15.00 %**"
-    assert tables.headline([trained]) == f"**1.50 %** with splats trained on photos (mean of 2 flags{way})"
+    assert shown("flags.headline", [trained]) == f"**1.50 %** with splats trained on photos (mean of 2 flags{way})"
 
 
 def test_splats_made_in_code_have_records_of_their_own(bench, tmp_path, monkeypatch):
@@ -323,7 +327,6 @@ def test_splats_made_in_code_have_records_of_their_own(bench, tmp_path, monkeypa
     assert record["rows"] == {name: {"curtain": {"status": "complete"}} for name in ("ours", "particle")}
     with pytest.raises(SystemExit, match="curtain has no photos to train a splat from: add `--splats made`"):
         bench(*given, "--results", tmp_path / "results")
-    assert tables.made([]) == ["Not recorded yet."]
 
 
 def test_a_training_that_is_there_is_kept_with_its_account(tmp_path, monkeypatch):

@@ -5,9 +5,10 @@ import json
 import numpy as np
 import pytest
 from bench.cases import flags, folds
-from bench.tables import folds as tables
 
 from gaussian_swaying.simulation.simulation import Simulation
+
+from .conftest import shown
 
 
 @pytest.mark.parametrize("name", ["free_04", "contact_04", "contact_015"])
@@ -85,11 +86,11 @@ def test_the_page_shows_who_is_how_far_from_whom():
         "apart": {"blender blender_contact": 0.02},
         "rows": {"contact_04": row, "free_04": {"failed": "x"}},
     }
-    lines = tables.rows_table(result)
+    lines = shown("folds.rows", result)
     assert lines[2] == "|  | Blender, no contact | Blender, contact | crossings |"
     assert "| ours, contact, dx = 0.04 m | - | 3.40 % | 0 |" in lines
     assert "| ours, no contact, dx = 0.04 m | failed | failed | - |" in lines
     assert "| Blender, contact | 2.00 % |  | 4 |" in lines
     assert lines[-1] == "| the reference itself, solved otherwise | 1.00 % | 1.50 % |  |"
-    assert tables.goals(result)[-1].endswith("| 3.40 %, 1.50 % + 2 % | yes |")
-    assert tables.references_table(result)[-1].endswith("| 80 | 32 | 250 | coarser (60 cells, 16 steps) 1.50 % |")
+    assert shown("folds.goals", result)[-1].endswith("| 3.40 %, 1.50 % + 2 % | yes |")
+    assert shown("folds.references", result)[-1].endswith("| 80 | 32 | 250 | coarser (60 cells, 16 steps) 1.50 % |")

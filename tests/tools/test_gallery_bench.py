@@ -5,6 +5,8 @@ from pathlib import Path
 import pytest
 from imageio.v3 import imread
 
+from .conftest import shown
+
 ROOT = Path(__file__).resolve().parents[2]
 
 
@@ -56,15 +58,15 @@ def test_whole_means_all_of_it(gallery):
     }
     row |= {"peak_memory_bytes": {"host": 2**30, "device": None}, "preset": "preview"}
     result = {"device": "CPU", "versions": {}, "seed": 0, "scenes": {"ficus": row, "sand": {"failed": "x"}}}
-    text = "\n".join(gallery.page([result]))
+    text = "\n".join(shown("gallery.scenes", result))
     assert "| Ficus \\*, preset" in text  # no word of its configuration
     assert "Recorded before" in text
     row["configuration"] = gallery.fingerprint("ficus", "preview")
     assert row["configuration"] != gallery.fingerprint("ficus", None)
-    text = "\n".join(gallery.page([result]))
+    text = "\n".join(shown("gallery.scenes", result))
     assert "Recorded before" not in text
-    shown = "| Ficus, preset `preview` | 1,000 | `total` | 250 | 10 | 10.0 | 4 | 1.00 | - | 10.0 % | yes |"
-    assert shown in text
+    line = "| Ficus, preset `preview` | 1,000 | `total` | 250 | 10 | 10.0 | 4 | 1.00 | - | 10.0 % | yes |"
+    assert line in text
     assert "| Sand | failed" in text
 
 

@@ -5,9 +5,10 @@ from dataclasses import replace
 
 import pytest
 from bench.cases import flags, pins
-from bench.tables import pins as tables
 
 from gaussian_swaying.simulation.simulation import Simulation
+
+from .conftest import cells, shown
 
 
 @pytest.mark.parametrize("name", [name for name, pin in pins.ROWS.items() if pin.kind == "nodes"])
@@ -98,8 +99,9 @@ def test_the_page_compares_pins():
     known = {"cells": 100, "quality": 256, "frames_compared": 50, "chamfer": 0.0014}
     result = {"device": "a GPU", "versions": {"torch": "2"}, "seed": 0, "rows": rows, "more": "--a=1", "note": "Quiet."}
     result["uncertainty"] = {"1": {"coarser": known}, "4": {"steps doubled": known}}
-    assert tables.device(result) == ["a GPU; torch 2; seed 0.", "Other options of `tools/sim.py`: `--a=1`.", "Quiet."]
-    table = tables.rows_table(result)
+    (device,) = shown("pins.device", result)
+    assert device == "a GPU; torch 2; seed 0.\nOther options of `tools/sim.py`: `--a=1`.\nQuiet."
+    table = shown("pins.rows", result)
     names = (
         "pattern 1 | pattern 2 | pattern 3 | pattern 4 (curtain) | pattern 5 (light, stiff) | curtain | light, stiff"
     )
@@ -107,23 +109,22 @@ def test_the_page_compares_pins():
     assert table[2] == "| nodes held, dx = 0.015 to 0.025 m | 2.66 % | 1.25 % | - | - | - | - | - |"
     assert table[3] == "| hinges, dx = 0.04 m | 2.50 % | 1.30 % | - | 1.49 % | failed | - | 2.10 % |"
     other = result | {"rows": {"nodes": {"2": rows["nodes"].pop("2")}}, "uncertainty": {"light": {"coarser": known}}}
-    goals = {goal.partition(" on ")[0]: (value, reached) for goal, value, reached in tables.goals([other, result])}
+    goals = {goal.partition(" on ")[0]: told for goal, *told in cells("pins.goals", [other, result])}
     nodes = "hinges at dx = 0.04 m no farther than held nodes"
-    assert goals[f"pattern 1: {nodes}"] == ("2.50 %, 2.66 % at 0.015 m", True)
-    assert goals[f"pattern 2: {nodes}"] == ("1.30 %, 1.25 % at 0.015 m", False)
-    assert goals[f"pattern 3: {nodes}"] == ("-", None)
+    assert goals[f"pattern 1: {nodes}"] == ["2.50 %, 2.66 % at 0.015 m", "yes"]
+    assert goals[f"pattern 2: {nodes}"] == ["1.30 %, 1.25 % at 0.015 m", "no"]
+    assert goals[f"pattern 3: {nodes}"] == ["-", "-"]
     within = "hinges at dx = 0.04 m within 1.5 % of the longer side"
-    assert goals[f"pattern 4 (curtain): {within}"] == ("1.49 % (reference itself: 0.14 %)", True)
-    assert goals[f"pattern 5 (light, stiff): {within}"] == ("-", None)
+    assert goals[f"pattern 4 (curtain): {within}"] == ["1.49 % (reference itself: 0.14 %)", "yes"]
+    assert goals[f"pattern 5 (light, stiff): {within}"] == ["-", "-"]
     within = within.replace("1.5 %", "2 %")  # of the longer side, for flags that nothing was tuned for
-    assert goals[f"curtain: {within}"] == ("-", None)
-    assert goals[f"light, stiff: {within}"] == ("2.10 % (reference itself: 0.14 %)", False)
-    assert "| - | - |" in tables.goal_table([result])[-2]
-    assert tables.costs(result)[2] == (
+    assert goals[f"curtain: {within}"] == ["-", "-"]
+    assert goals[f"light, stiff: {within}"] == ["2.10 % (reference itself: 0.14 %)", "no"]
+    assert shown("pins.costs", result)[2] == (
         "| nodes held, dx = 0.015 to 0.025 m | 1,000; 2.5 | - | - | - | - | - | - |"
     )  # fmt: skip
     # the paper's flags are told with the flag benchmark
-    assert tables.reference([result, other]) == [
+    assert shown("pins.reference", [result, other]) == [
         "- pattern 4: steps doubled (100 cells, 256 steps, 50 frames) 0.14 %",
         "- light: coarser (100 cells, 256 steps, 50 frames) 0.14 %",
     ]

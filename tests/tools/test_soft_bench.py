@@ -8,9 +8,10 @@ import numpy as np
 import pytest
 import yaml
 from bench.cases import soft as case
-from bench.tables import soft as tables
 
 from gaussian_swaying.simulation.simulation import Simulation
+
+from .conftest import shown
 
 HEAD = {"device": "a CPU", "versions": {"torch": "2"}, "seed": 0}
 TRUTH = {"flow": [2.0, 1.0, 0.0], "E": 2e4, "fit_until": 0.1, "C_D": 1.0, "speed": math.sqrt(5)}
@@ -65,12 +66,12 @@ def test_the_tables_say_what_differs():
         "reference": {"8 cells": row},
         "fits": {"two cameras": fit | {"seconds": 100.0, "until_s": 0.75, "known": {"solver.dx": 0.03}}},
     }
-    found = tables.soft_motion([record])
+    found = shown("fit.soft_motion", [record])
     assert "| ours, `solver.dx` 0.03; 1,480 points | 1.20 mm | 5.6 mm | +2.1 % | -1.5 % |" in found
     assert "| Newton, 8 cells | 1.20 mm | 5.6 mm | +2.1 % | -1.5 % |" in found
-    found = tables.soft([record])
+    found = shown("fit.soft", [record])
     assert (
         "| two cameras | +2.00 % | 0.40° | +3.00 % | 27.0 dB | 100 s | 60 s | 28.5 dB | 0.75 s; `solver.dx` 0.03 |"
         in found
     )
-    assert tables.soft([HEAD]) == tables.soft_motion([HEAD]) == ["Not measured yet."]
+    assert shown("fit.soft", [HEAD]) == shown("fit.soft_motion", [HEAD]) == ["Not measured yet."]

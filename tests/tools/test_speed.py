@@ -6,10 +6,11 @@ import pytest
 import torch
 from bench import scenes
 from bench.cases import speed
-from bench.tables import goals, speed_goals
 
 from gaussian_swaying.mpm.solver import MPMSolver
 from gaussian_swaying.mpm.state import GridSpec
+
+from .conftest import cells
 
 SPREAD = {"median_ms", "quartile_low_ms", "quartile_high_ms", "repeats"}
 ROLLOUT = SPREAD | {"formulation", "asked", "particles", "grid_nodes", "nodes", "substeps", "path", "graph_ms", "bytes"}
@@ -193,68 +194,62 @@ def test_the_error_is_that_of_the_end():
 
 def _recorded(factor):
     """A run on a GPU that needs so many times what the goals ask for."""
-    rows = [
-        {"formulation": name, "asked": asked, "median_ms": factor * limit}
-        for (name, asked), (limit, _) in speed_goals.SUBSTEP_GOALS.items()
-    ]
-    million = {name: speed_goals.SUBSTEP_GOALS[name, 10**6][0] for name in ("total", "updated")}
-    rows += [
-        {"formulation": name, "asked": 10_000_000, "median_ms": factor**2 * 11 * limit}
-        for name, limit in million.items()
-    ]
+    wanted = {("total", 10**5): 0.06, ("total", 10**6): 0.25, ("updated", 10**5): 0.09, ("updated", 10**6): 0.34}
+    wanted |= {(name, 10**7): factor * 11 * wanted[name, 10**6] for name in ("total", "updated")}
+    rows = [{"formulation": name, "asked": asked, "median_ms": factor * ms} for (name, asked), ms in wanted.items()]
     frame = {"main": True, "median_ms": factor * 5.0, "memory_bytes": int(factor * 0.3 * 2**30)}
     small = {"small": True, "median_ms": factor * 2.0}
-    cube = [
-        {"asked": 1_000_000, "turning": False, "walls": walls, "median_ms": factor * limit}
-        for walls, (limit, _) in speed_goals.CUBE_GOALS.items()
-    ]
+    cube = [{"asked": 1_000_000, "turning": False, "walls": walls, "median_ms": factor * ms}
+            for walls, ms in ((False, 0.32), (True, 0.35))]  # fmt: skip
     rates = {"ratio": 20 / factor, "share": 0.9 / factor}
     batch = [{"formulation": f, "gusts": g} | rates for f in ("total", "updated") for g in (False, True)]
     sand = [{"asked": 1_000_000, "median_ms": 0.6 * factor}]
     large = {"median_ms": factor * 8.0, "substep_ms": factor * 0.03}
     found = {"kind": "cuda", "substep": rows, "sand": sand, "batch": batch, "frame": [frame, small], "cube": cube}
-    return found | {"large": [large]}
+    return found | {"large": [large], "device": "NVIDIA H200", "copy": {}}
 
 
 @pytest.mark.parametrize(
-    ("factor", "reached", "stretched"), [(0.4, True, True), (0.99, True, False), (2, False, False)]
+    ("factor", "reached", "stretched"), [(0.4, "yes", "yes"), (0.99, "yes", "no"), (2, "no", "no")]
 )
 def test_goals_are_reached_or_not(factor, reached, stretched):
-    found = speed_goals.goals(_recorded(factor))
+    found = cells("goals.table", [_recorded(factor)])
     assert len(found) == 22
-    assert {goal[2] for goal in found} == {reached}
-    assert {goal[4] for goal in found} - {None} == {stretched}
-    lines = goals.goals([_recorded(factor) | {"copy": {}}])[2:]
-    assert len(lines) == 22
-    assert all(line.split(" | ")[2] == ("yes" if reached else "no") for line in lines)
-    assert all(line.count(" | ") == 4 for line in lines)
+    assert {row[2] for row in found} == {reached}
+    assert {row[4] for row in found} - {"-"} == {stretched}
+    assert sum(row[3] == "-" for row in found) == 4
 
 
 def test_goals_of_what_is_missing_or_failed():
-    assert {goal[1:3] for goal in speed_goals.goals({"kind": "cuda"})} == {("not measured", None)}
+    about = {"kind": "cuda", "device": "NVIDIA H200", "copy": {}}
+    assert {tuple(row[1:3]) for row in cells("goals.table", [about])} == {("-", "-")}
     failed = _recorded(0.5)
     for section in ("substep", "sand", "cube", "batch", "frame", "large"):
-        failed[section] = [row | {"failed": "out of memory"} for row in failed[section]]
-    assert {goal[1:3] for goal in speed_goals.goals(failed)} == {("out of memory", False)}
-    assert speed_goals.goals({"kind": "cpu"}) == []
+        failed[section] = [{k: v for k, v in row.items() if k in ("formulation", "asked", "gusts", "turning", "walls",
+                           "main", "small")} | {"failed": "out of memory"} for row in failed[section]]  # fmt: skip
+    assert {tuple(row[1:3]) for row in cells("goals.table", [failed])} == {("out of memory", "no")}
+    assert cells("goals.table", [about | {"kind": "cpu", "device": "a CPU"}]) == []
 
 
 def test_goals_of_the_other_runs():
     """The substep on a CPU, and the captured object on a GPU and on a CPU."""
-    slow = {"device": "a CPU", "substep": [{"particles": 19_881, "formulation": "updated", "median_ms": 41.0}]}
-    assert goals.goals([slow])[2].endswith("within 40 ms | 41.0 ms (`updated`) | no | - | - |")
+
+    def goals(device, **result):
+        return {name: told for name, *told in cells("goals.table", [{"device": device} | result])}
+
+    slow = goals("a CPU", substep=[{"particles": 19_881, "formulation": "updated", "median_ms": 41.0}])
+    assert list(slow.values()) == [["41.0 ms (`updated`)", "no", "-", "-"]]
     run = {"name": "guitar, 1920x1080", "frames": 250, "peak_memory_bytes": {"device": 10**8}, "without_files_s": 1.2}
     run |= {"lost_particles": 0, "stretch_min": 0.9, "stretch_max": 1.1, "process_wall_s": 7.0}
-    lines = goals.goals([{"device": "NVIDIA H200", "runs": [run]}])
-    assert [row.split(" | ", 1)[1] for row in lines if "whole process" in row] == ["7.0 s | yes | 6 s | no |"]
-    rows = [row for row in goals.goals([{"device": "NVIDIA H200", "runs": [run]}]) if "within 1.5 s" in row]
-    assert [row.split(" | ", 1)[1] for row in rows] == ["1.20 s, 0.09 GiB | yes | 1 s | no |"]
-    run |= {"name": "guitar, 960x540", "process_wall_s": 185.0}
-    rows = [row for row in goals.goals([{"device": "a CPU", "runs": [run]}]) if "within 180 s" in row]
-    assert [row.split(" | ", 1)[1] for row in rows] == ["185 s | no | 90 s | no |"]
+    found = goals("NVIDIA H200", runs=[run])
+    whole = "captured object over 250 frames: no particle lost, singular values of F within [0.5, 2]"
+    assert found.pop(whole) == ["[0.90, 1.10], 0 lost (GPU)", "yes", "-", "-"]
+    assert sorted(found.values()) == [["1.20 s, 0.09 GiB", "yes", "1 s", "no"], ["7.0 s", "yes", "6 s", "no"]]
+    found = goals("a CPU", runs=[run | {"name": "guitar, 960x540", "process_wall_s": 185.0}])
+    assert found.pop(whole)[1] == "yes"
+    assert list(found.values()) == [["185 s", "no", "90 s", "no"]]
 
 
 def test_goals_of_rollouts_are_not_those_of_a_single_substep():
     row = {"particles": 19_881, "formulation": "total", "median_ms": 1.0}
-    rollouts = {"device": "a CPU", "kind": "cpu", "copy": {}, "substep": [row]}
-    assert len(goals.goals([rollouts])) == 2
+    assert cells("goals.table", [{"device": "a CPU", "kind": "cpu", "copy": {}, "substep": [row]}]) == []

@@ -1,13 +1,16 @@
 """When, and from which code, each row of a record was measured."""
 
+import hashlib
 import json
 import subprocess
 from pathlib import Path
 
 import pytest
-from bench import history, record, stamps
+from bench import record, stamps
 from bench.tables import measured
 from bench.tables.markdown import source
+
+from .conftest import shown
 
 RESULTS = Path(__file__).parents[2] / "docs" / "results"
 
@@ -107,7 +110,7 @@ def test_rows_older_than_their_code_are_marked(tmp_path, clock):
     (tmp_path / record.AGES).write_text(json.dumps(ages))
     found = record.read(tmp_path)["winds_cpu"]
     assert "1 of 2 rows [before the last change](benchmarks.md#when-it-was-measured) of aero, geometry" in source(found)
-    told = measured.rows([found])[2:]
+    told = shown("measured.rows", [found])[2:]
     assert told[0].startswith("| winds_cpu | ours: 1 | 2026-11-22 10:00:00 | commit  | clean | torch 2 | mpm, geometry")
     assert told[1].startswith("| winds_cpu | particle: 1 | 2026-11-23 10:00:00 |")
     assert told[1].endswith("| torch 2 | - |")
@@ -119,35 +122,22 @@ def test_rows_of_lists_are_counted():
     assert measured.labels(result, places) == "bar (2); sand; fit"
 
 
-def test_stamps_from_the_history(tmp_path, monkeypatch):
-    """A row gets the commit in which it first appears, with the code of that commit, hashed as that in the folder."""
-
-    def git(*words):
-        subprocess.run(["git", "-c", "user.name=a", "-c", "user.email=a@b.c", *words], cwd=tmp_path, check=True,
-                       capture_output=True)  # fmt: skip
-
+def test_code_is_hashed_as_git_does(tmp_path, monkeypatch):
+    """By the names that it gives to contents, whatever ends a line; other files than Python's do not count."""
     monkeypatch.setattr(stamps, "ROOT", tmp_path)
-    monkeypatch.setattr(record, "ROOT", tmp_path)
-    code, results = tmp_path / "gaussian_swaying" / "mpm", tmp_path / "docs" / "results"
+    code = tmp_path / "gaussian_swaying" / "mpm"
     code.mkdir(parents=True)
-    results.mkdir(parents=True)
-    git("init")
     hashes = []
-    for number, rows in enumerate(([{"x": 1}], [{"x": 1}, {"x": 2}])):
-        (code / "a.py").write_text(f"A = {number}\n")
-        text = json.dumps({"versions": {"torch": str(number)}, "substep": rows})
-        (results / "substep_cpu.json").write_text(text)
-        git("add", "-A")
-        git("commit", "-m", "x")
+    for number, text in enumerate((b"A = 1\r\n", b"A = 1\n", b"A = 2\n")):
+        (code / "a.py").write_bytes(text)
+        (code / "a.txt").write_text(str(number))
         stamps.sources.cache_clear()
         hashes.append(stamps.sources("mpm"))
-    found = list(history.stamp("substep_cpu", json.loads(text)).values())
     stamps.sources.cache_clear()
-    history.sources.cache_clear()
-    assert [list(stamp["rows"]) for stamp in found] == [["substep/0"], ["substep/1"]]
-    assert [stamp["versions"] for stamp in found] == [{"torch": "0"}, {"torch": "1"}]
-    assert [stamp["sources"]["mpm"] for stamp in found] == hashes
-    assert hashes[0] != hashes[1]
+    blob = subprocess.run(["git", "hash-object", "--stdin"], input=b"A = 2\n", capture_output=True, check=True).stdout
+    said = f"gaussian_swaying/mpm/a.py {blob.decode().strip()}"
+    assert hashes[0] == hashes[1]
+    assert hashes[2] == hashlib.sha256(said.encode()).hexdigest()[:16]
 
 
 def test_what_is_known_without_a_history(monkeypatch):

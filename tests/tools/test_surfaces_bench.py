@@ -8,12 +8,13 @@ import numpy as np
 import pytest
 import torch
 from bench.cases import surfaces, trained
-from bench.tables.surfaces import goal_table, limits_table, rows_table
 
 from gaussian_swaying.captures.generated_capture import GeneratedCapture
 from gaussian_swaying.gaussians.ply import write_ply
 from gaussian_swaying.geometry.rotations import quat_to_rotation, rotation_to_quat
 from gaussian_swaying.scenes.procedural import FlagScene
+
+from .conftest import shown
 
 
 @pytest.fixture
@@ -74,15 +75,15 @@ def _result():
 
 def test_tables():
     result = _result()
-    assert goal_table(result)[-2] == "| tilt over 40 cm at most 0.1° | 0.08°, 0.08° | yes |"
-    assert goal_table(result)[-1].endswith("| 1.50 %, 1.50 % | yes |")
+    assert shown("surfaces.goals", result)[-2] == "| tilt over 40 cm at most 0.1° | 0.08°, 0.08° | yes |"
+    assert shown("surfaces.goals", result)[-1].endswith("| 1.50 %, 1.50 % | yes |")
     result["rows"]["views"]["1"]["chamfer"] = {"smallest_axis": 0.03, "neighbours": 0.021}
-    assert goal_table(result)[-1].endswith("| no |")
+    assert shown("surfaces.goals", result)[-1].endswith("| no |")
     result["rows"]["paper"] = {"0": _row(34.2, 100.0), "1": _row(34.5, 130.0)}
-    assert goal_table(result)[-2] == "| PSNR at most 0.2 dB lower | 0.10 dB, 0.40 dB | no |"
-    assert goal_table(result)[-1] == "| training at most 1.6 times as long | 2.00 times, 1.54 times | no |"
-    assert "| 0.60, 0.60 | 0.40, 0.40 | 0.08, 0.08 | 1.00, 1.00 |" in rows_table(result)[-1]
-    assert limits_table(result)[-1] == "| all of the views (175) | 71 | 0.0010 | 0.010 | 0.0010 |"
+    assert shown("surfaces.goals", result)[-2] == "| PSNR at most 0.2 dB lower | 0.10 dB, 0.40 dB | no |"
+    assert shown("surfaces.goals", result)[-1] == "| training at most 1.6 times as long | 2.00 times, 1.54 times | no |"
+    assert "| 0.60, 0.60 | 0.40, 0.40 | 0.08, 0.08 | 1.00, 1.00 |" in shown("surfaces.rows", result)[-1]
+    assert shown("surfaces.limits", result)[-1] == "| all of the views (175) | 71 | 0.0010 | 0.010 | 0.0010 |"
 
 
 def test_ways_are_compared_at_the_same_time(tmp_path, monkeypatch):
@@ -106,4 +107,4 @@ def test_ways_are_compared_at_the_same_time(tmp_path, monkeypatch):
     for way in ("paper", "gentle"):
         assert result["rows"][way]["0"]["chamfer"] == {"smallest_axis": 0.03, "neighbours": 0.015}
     result["rows"]["views"] = {"0": _row(30.0, 400.0)}
-    assert "| 1.50 % | yes |" in goal_table(result)[-1]
+    assert "| 1.50 % | yes |" in shown("surfaces.goals", result)[-1]

@@ -5,10 +5,11 @@ import json
 
 import pytest
 from bench.cases import sweeps
-from bench.tables import sweeps as tables
 from PIL import Image
 
 from gaussian_swaying.sweeps.plan import make_plan, read_sweep
+
+from .conftest import cells, shown
 
 
 def test_the_small_flags_have_4096_points_each(tmp_path):
@@ -68,16 +69,15 @@ def test_tables():
     ended = {"seconds": 9.5, "killed": 5, "complete": 40, "attempts": 45}
     workers = {"runs": 40, "workers": 2, "equal": True, "undisturbed": ended | {"killed": 0}, "disturbed": ended}
     cpu = {"device": "a CPU", "versions": {"torch": "2"}, "seed": 0, "workers": workers}
-    reached = [reached for _, _, reached in tables.goals([cpu, RECORD])]
-    assert reached == [True, True, True, False, True]
-    assert [value for _, value, _ in tables.goals([cpu])] == ["40 complete, 5 killed, tables equal", *["-"] * 4]
-    assert "| 256 flags, 1000 frames, 2 GPUs | 4,096 | 52.0 | 30.0 | 5,500 | 1.00 |" in tables.gpus_table([RECORD])
-    assert tables.workers_table([cpu])[-1] == "| disturbed | 5 | 40 | 45 | 10 |"
-    assert tables.training_table([RECORD])[-1] == "| 7,000 images, 2 GPUs | 3500 | 50.0 | 28.95 | 90 |"
-    assert tables.gpus_table([cpu]) == tables.training_table([cpu]) == ["Not recorded yet."]
+    assert [row[2] for row in cells("sweeps.goals", [cpu, RECORD])] == ["yes", "yes", "yes", "no", "yes"]
+    assert [row[1] for row in cells("sweeps.goals", [cpu])] == ["40 complete, 5 killed, tables equal", *["-"] * 4]
+    assert "| 256 flags, 1000 frames, 2 GPUs | 4,096 | 52.0 | 30.0 | 5,500 | 1.00 |" in shown("sweeps.gpus", [RECORD])
+    assert shown("sweeps.workers", [cpu])[-1] == "| disturbed | 5 | 40 | 45 | 10 |"
+    assert shown("sweeps.training", [RECORD])[-1] == "| 7,000 images, 2 GPUs | 3500 | 50.0 | 28.95 | 90 |"
+    assert shown("sweeps.gpus", [cpu]) == shown("sweeps.training", [cpu]) == ["Not recorded yet."]
     failed = {"gpus": RECORD["gpus"] | {"rows": {"1": {"failed": "no memory"}}}}
-    assert "failed" in tables.gpus_table([failed])[2]
-    assert "1.60 times" in tables.goal_table([RECORD])[-2]
+    assert "failed" in shown("sweeps.gpus", [failed])[2]
+    assert "1.60 times" in shown("sweeps.goals", [RECORD])[-2]
 
 
 @pytest.mark.slow(twin="test_killed_workers_change_nothing")

@@ -3,7 +3,8 @@
 from pathlib import Path
 
 from bench.cases import training
-from bench.tables import training as tables
+
+from .conftest import cells, shown
 
 DOCS = Path(__file__).resolve().parents[2] / "docs"
 
@@ -22,20 +23,21 @@ def test_goals_are_judged_from_the_medians():
         "bare": [_row(), _row(seconds=44.0), _row(seconds=39.0, psnr_db=25.2)],
         "lightning": [_row(seconds=42.0, psnr_db=24.95), _row(seconds=41.0, psnr_db=24.8), _row(seconds=60.0)],
     }
-    found = {goal: (value, reached) for goal, value, reached in tables.goals(_result(pair=pair))}
-    assert found["capture: test PSNR at most 0.1 dB below the bare loop"] == ("-0.05 dB", True)
-    assert found["capture: at most 1.05 times as long as the bare loop"] == ("1.05 times", True)
-    assert found["capture: faster than the bare loop"] == ("1.05 times", False)
-    assert found["capture: GPU memory within 1 GiB"] == ("0.50 GiB", True)
+
+    def goals():
+        return [row[1:] for row in cells("training.goals", _result(pair=pair, variants=variants))]
+
+    variants = {}
+    assert goals() == [["-0.05 dB", "yes"], ["1.05 times", "yes"], ["1.05 times", "no"], ["0.50 GiB", "yes"]]
     pair["lightning"] = [_row(seconds=44.1, psnr_db=24.89, memory_bytes=2**31)]
-    assert [reached for _, _, reached in tables.goals(_result(pair=pair))] == [False, False, False, False]
-    variants = {"mcmc": _row(psnr_db=25.4), "absgrad": {"failed": "x"}, "surface": _row(psnr_db=24.0)}
-    best = tables.goals(_result(pair=pair, variants=variants))[4]
-    assert best[1:] == ("+0.40 dB (MCMC, 300,000 Gaussians)", True)
+    assert [reached for _, reached in goals()] == ["no", "no", "no", "no"]
+    variants |= {"mcmc": _row(psnr_db=25.4), "absgrad": {"failed": "x"}, "surface": _row(psnr_db=24.0)}
+    best = ["+0.40 dB (MCMC, 300,000 Gaussians)", "yes"]
+    assert goals()[4] == best
     variants["degree_1"] = _row(psnr_db=29.0, runs_per_device=2)  # under other conditions
-    assert tables.goals(_result(pair=pair, variants=variants))[4][1:] == best[1:]
+    assert goals()[4] == best
     pair["bare"].append(_row(psnr_db=24.5))  # the runs of the bare loop differ by more than that
-    assert not tables.goals(_result(pair=pair, variants=variants))[4][2]
+    assert goals()[4][1] == "no"
 
 
 def test_the_page_shows_every_row_that_did_not_fail():
@@ -51,20 +53,20 @@ def test_the_page_shows_every_row_that_did_not_fail():
     pair = {"bare": [_row(psnr_db=24.0), _row(psnr_db=24.4)], "lightning": []}
     variants = {"surface": {"failed": "x"}, "degree_1": _row(psnr_db=24.1), "mcmc": _row()}
     result = _result(flag=flag, pair=pair, variants=variants)
-    assert tables.spread(result, "bare") == "0.40 dB"
-    assert tables.gains(result) == ["- +0.80 dB MCMC, 300,000 Gaussians", "- -0.10 dB harmonics of degree 1"]
-    text = "\n".join(tables.flag(result))
+    assert shown("training.spread", result, "bare") == "0.40 dB"
+    assert shown("training.gains", result) == ["- +0.80 dB MCMC, 300,000 Gaussians", "- -0.10 dB harmonics of degree 1"]
+    text = "\n".join(shown("training.flag", result))
     assert (
         "| + size (all) | 90.0 % | 80.0 % | 70.0 % | 4.0, 9.0 | 1.00, 2.00 | 2.00 | 1.10 | 25.00 | 1,000 | 40 |" in text
     )
     assert "photometric only" not in text
-    assert "| all surface losses, paper's weights | failed |" in "\n".join(tables.capture(result))
-    assert "| flag, all losses: PSNR of at least 35 dB | 25.0 dB | no |" in tables.goal_table(result)
+    assert "| all surface losses, paper's weights | failed: x |" in "\n".join(shown("training.capture", result))
+    assert "| flag, all losses: PSNR of at least 35 dB | 25.0 dB | no |" in shown("training.goals", result)
 
 
 def test_the_recipe_for_a_cpu_is_a_row_of_its_page():
     row = {"photos": 43, "width": 90, "height": 160, "steps": 1000, "gaussians": 12345, "psnr_db": 26.04, "ssim": 0.814}
-    lines = tables.photos(_result(photos={"photos_cpu": row | {"processor_s": 270.0, "threads": 1}}))
+    lines = shown("training.photos", _result(photos={"photos_cpu": row | {"processor_s": 270.0, "threads": 1}}))
     assert lines[-1] == "| 43 | 90 x 160 | 1,000 | 12,345 | 26.0 | 0.81 | 4.5 | 1 |"
 
 

@@ -5,9 +5,10 @@ from functools import partial
 
 import pytest
 from bench.cases import winds
-from bench.tables import winds as tables
 
 from gaussian_swaying.mpm.state import GridSpec
+
+from .conftest import cells, shown
 
 
 def test_a_small_record_and_its_tables(bench, tmp_path, monkeypatch):
@@ -24,9 +25,9 @@ def test_a_small_record_and_its_tables(bench, tmp_path, monkeypatch):
     assert all(row["ratio"] > 0 and row["path"] == "torch" for row in found["rows"])
     assert found["box"]["cells"] == [16, 8, 8]
     assert [row["obstacle"] for row in found["obstacles"]] == list(winds.OBSTACLES)
-    assert len(tables.obstacles(found)) == 4 + len(winds.OBSTACLES)
-    assert len(tables.rows(found)) == 4 + len(winds.KINDS)
-    assert "at most 1.3 times" in tables.goals(found)[2]
+    assert len(shown("winds.obstacles", found)) == 4 + len(winds.OBSTACLES)
+    assert len(shown("winds.rows", found)) == 4 + len(winds.KINDS)
+    assert "at most 1.3 times" in shown("winds.goals", found)[2]
     bench(
         "winds",
         "--device",
@@ -51,5 +52,4 @@ def test_a_small_record_and_its_tables(bench, tmp_path, monkeypatch):
 def test_a_missed_goal_says_no():
     row = {"particles": 100_000, "formulation": "total", "wind": "turbulence", "ratio": 1.2, "median_ms": 0.05}
     result = {"device": "NVIDIA H200", "rows": [row], "box": {"cells": [4, 4, 4], "isotropic_s": 0.1, "sheared_s": 0.3}}
-    goals = tables.goals(result)[2:]
-    assert [line.rstrip(" |").rsplit("| ", 1)[1] for line in goals] == ["no", "yes", "no"]
+    assert [row[-1] for row in cells("winds.goals", result)] == ["no", "yes", "no"]

@@ -8,43 +8,25 @@ from fnmatch import fnmatch
 from pathlib import Path
 
 from bench import record, slots, stamps
-from bench.cases import gallery  # noqa: F401  registers its slots
 from bench.tables import (  # noqa: F401  each registers its slots
     accuracy,
-    accuracy_plot,
-    area,
-    backward,
+    benchmarks,
     contact,
     fit,
-    flags,
-    folds,
+    flag_benchmark,
     goals,
-    gradients,
-    live,
-    long_flag,
     measured,
-    pareto,
-    pareto_plot,
-    peers,
-    pins,
-    points,
-    previews,
-    runs,
-    soft,
-    speed,
-    speed_plot,
-    surfaces,
-    sweeps,
+    others,
+    plots,
     training,
-    web,
-    winds,
+    validation,
 )
 from gaussian_swaying._files import write_text
 
 PLOTS: dict[str, Callable[[list[record.Row], Path], None]] = {
-    "accuracy_*": accuracy_plot.draw,
-    "pareto_*": pareto_plot.draw,
-    "speed_*": speed_plot.draw,
+    "accuracy_*": plots.accuracy,
+    "pareto_*": plots.pareto,
+    "speed_*": plots.speed,
 }
 """Functions that draw into the folder of the pictures, by the records that they need."""
 

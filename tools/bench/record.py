@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 import copy
 import json
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from pathlib import Path
 from typing import Any
 
@@ -27,6 +27,14 @@ def start(device: str) -> tuple[torch.device, Row]:
         device = "cuda" if torch.cuda.is_available() else "cpu"
     found = torch.device(device)
     return found, {"device": describe_device(found), "versions": versions(), "seed": 0}
+
+
+def chosen(option: str, given: str | None, known: Collection[str]) -> list[str]:
+    """The names in a list separated by commas, all of them for None; exits if one is unknown."""
+    names = list(known) if given is None else [name for name in given.split(",") if name]
+    if unknown := set(names) - set(known):
+        raise SystemExit(f"{option} takes {', '.join(known)}, not {', '.join(sorted(unknown))}")
+    return names
 
 
 def write(folder: Path, name: str, result: Row, quiet: bool = False) -> None:

@@ -46,6 +46,7 @@ class Slot:
         records: Pattern (for ``fnmatch``) of the records that it is made from.
         together: Whether it is made from all of these records together; its words then name no record.
         make: Function of the record (or the list of all) and of the words that follow; returns text or lines.
+        words: How many words follow.
     """
 
     name: str
@@ -53,14 +54,15 @@ class Slot:
     records: str
     together: bool
     make: Callable[..., Any]
+    words: int = 0
 
 
 SLOTS: dict[str, Slot] = {}
 """All slots, by name."""
 
 
-def table(page: str, name: str, records: str, together: bool = False) -> Callable[[Any], Any]:
-    """Register a function that makes lines: a slot that ``page`` must have, once for each record."""
+def table(page: str | None, name: str, records: str, together: bool = False) -> Callable[[Any], Any]:
+    """Register a function that makes lines: a slot that ``page`` must have (if it is one), once for each record."""
 
     def register(make: Callable[..., list[str]]) -> Callable[..., list[str]]:
         SLOTS[name] = Slot(name, page, records, together, make)
@@ -73,7 +75,8 @@ def value(name: str, records: str, together: bool = False) -> Callable[[Any], An
     """Register a function that makes a few words: an optional slot within a sentence."""
 
     def register(make: Callable[..., str]) -> Callable[..., str]:
-        SLOTS[name] = Slot(name, None, records, together, make)
+        words = len(inspect.signature(make).parameters) - 1
+        SLOTS[name] = Slot(name, None, records, together, make, words)
         return make
 
     return register
@@ -170,7 +173,6 @@ def _made(words: str, records: Records) -> Any:
         if rest[0] not in records:
             raise ValueError(f"there is no {rest[0]}.json among the results")
         source = records[rest.pop(0)]
-    count = len(inspect.signature(slot.make).parameters) - 1
-    if len(rest) != count:
-        raise ValueError(f"it takes {count} more words, not {len(rest)}")
+    if len(rest) != slot.words:
+        raise ValueError(f"it takes {slot.words} more words, not {len(rest)}")
     return slot.make(source, *rest)

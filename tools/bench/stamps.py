@@ -85,19 +85,13 @@ def parts_of(name: str) -> tuple[str, ...]:
 
 @cache
 def sources(part: str) -> str:
-    """A hash of the Python files of a part of the package or of a folder, as :func:`of_blobs` makes it."""
-    files = sorted((ROOT / part if "/" in part else ROOT / PACKAGE / part).rglob("*.py"))
-    blobs = []
-    for path in files:
+    """A hash of the Python files of a part of the package or of a folder: their paths, and git's names of them."""
+    lines = []
+    for path in (ROOT / part if "/" in part else ROOT / PACKAGE / part).rglob("*.py"):
         data = path.read_bytes().replace(b"\r\n", b"\n")
-        blobs.append((hashlib.sha1(b"blob %d\0" % len(data) + data).hexdigest(), path.relative_to(ROOT).as_posix()))
-    return of_blobs(blobs)
-
-
-def of_blobs(blobs: list[tuple[str, str]]) -> str:
-    """A hash of the names that git gives to the contents of files, and of their paths."""
-    lines = sorted(f"{path} {blob}" for blob, path in blobs if path.endswith(".py"))
-    return hashlib.sha256("\n".join(lines).encode()).hexdigest()[:16]
+        name = hashlib.sha1(b"blob %d\0" % len(data) + data).hexdigest()
+        lines.append(f"{path.relative_to(ROOT).as_posix()} {name}")
+    return hashlib.sha256("\n".join(sorted(lines)).encode()).hexdigest()[:16]
 
 
 def _git(*arguments: str) -> str | None:

@@ -20,8 +20,9 @@ from typing import Any
 import yaml
 
 from bench.cases.trained import GENTLE, filled, last_psnr, tilts
-from bench.record import ROOT
-from bench.tables.figure import save_figure
+from bench.record import ROOT, chosen
+from bench.simulate import simulate, what_failed
+from bench.tables.plots import save_figure
 from gaussian_swaying.evaluation.compare import compare_run
 
 sys.path.append(str(ROOT / "tools" / "datasets"))  # scripts that import each other from their own folder
@@ -246,13 +247,6 @@ def turn_to_reference(splat: Path, cloth: Path, target: Path) -> None:
     write_ply(target, replace(cloud, quats=turned.to(cloud.quats), normals=None))
 
 
-def what_failed(told: str) -> str:
-    """The line of a process's last output that names the error."""
-    lines = [line for line in told.strip().splitlines() if line.strip()]
-    named = [line for line in lines if "rror:" in line]
-    return (named or lines or ["no message"])[-1]
-
-
 def run_row(
     pattern: Flag,
     variant: Variant,
@@ -265,40 +259,27 @@ def run_row(
     dataset = Path(options.dataset)
     reference = dataset / folder_of(pattern)
     more = options.more.split() if options.more else []
-    command = [sys.executable, str(ROOT / "tools" / "sim.py")]
-    command += (own := sim_arguments(pattern, variant, dataset, splat) + more)
+    arguments = own = sim_arguments(pattern, variant, dataset, splat) + more
     matched: Row = {}
     if variant.matched:
         ours = sim_arguments(pattern, VARIANTS["ours"], dataset, splat) + more
         scaled, matched["volume_factor"] = of_equal_mass(own, ours)
-        command += scaled
-    command += ["--device", options.device, "--output", str(output)]
-    command += [f"--frames={options.frames}"] if options.frames else []
+        arguments = own + scaled
     if not pictures or len(list((reference / "video" / "frames").glob("*.png"))) != 250:  # they may not be finished yet
         bare = output.parent / f"surface_{pattern}"
         bare.mkdir(parents=True, exist_ok=True)
         with contextlib.suppress(FileExistsError):  # another row made it
             (bare / "cloth.npz").symlink_to((reference / "cloth.npz").resolve())
         reference = bare
-        command += ["--recorder.images=false", "--recorder.video=false"]
-    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True)
-    if done.returncode not in (0, 3) or not (output / "summary.json").exists():
-        return {"failed": what_failed(done.stderr)}
-    summary = json.loads((output / "summary.json").read_text())
-    row: Row = {
-        "status": summary["status"],
-        "reason": summary["reason"],
-        "particles": summary["particles"],
-        "frames": summary["frames"],
-        "substeps": summary["substeps"],
-        "ms_per_frame": 1e3 * sum(summary["wall_s"].get(k, 0.0) for k in ("simulation", "shading", "rendering")),
-        "device_memory_bytes": summary["peak_memory_bytes"]["device"],
-        "torn_particles": summary["torn_particles"],
-        "stretch_max": summary["stretch_max"],
-        "mass_kg": summary["mass_kg"],
-        **matched,
-    }
-    row["ms_per_frame"] /= max(summary["frames"], 1)
+        arguments = [*arguments, "--recorder.images=false", "--recorder.video=false"]
+    summary = simulate(arguments, output, options.device, options.frames)
+    if "failed" in summary:
+        return summary
+    row: Row = {key: summary[key] for key in ("status", "reason", "particles", "frames", "substeps")}
+    drawn = sum(summary["wall_s"].get(part, 0.0) for part in ("simulation", "shading", "rendering"))
+    row["ms_per_frame"] = 1e3 * drawn / max(summary["frames"], 1)
+    row["device_memory_bytes"] = summary["peak_memory_bytes"]["device"]
+    row |= {key: summary[key] for key in ("torn_particles", "stretch_max", "mass_kg")} | matched
     on = "cuda" if summary["peak_memory_bytes"]["device"] is not None else "cpu"  # the device of the run
     frames = options.frames or summary["frames"]
     found = compare_run(output, reference, frames=frames, points=options.points, device=on)
@@ -407,9 +388,7 @@ def open_dataset(dataset: Path, patterns: Sequence[Flag], result: Row) -> None:
 
 def measure(options: argparse.Namespace, result: Row, save: Callable[[Row], None]) -> None:
     """Fill ``result["rows"]``, saving it after each run; existing rows that are not selected are kept."""
-    names = options.rows.split(",")
-    if unknown := set(names) - set(VARIANTS):
-        raise SystemExit(f"--rows takes {', '.join(VARIANTS)}, not {', '.join(sorted(unknown))}")
+    names = chosen("--rows", options.rows, VARIANTS)
     patterns = flags_named(options.patterns)
     if options.splats != "made" and (other := [p for p in patterns if p not in PATTERNS]):
         raise SystemExit(f"{other[0]} has no photos to train a splat from: add `--splats made`")

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import argparse
 import json
-import subprocess
-import sys
 import tempfile
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -18,7 +16,8 @@ import torch
 
 from bench.cases import flags, pins
 from bench.problems.contacts import crossings, sheet_triangles
-from bench.record import ROOT
+from bench.record import chosen
+from bench.simulate import simulate
 from gaussian_swaying.evaluation.compare import compare_run
 from gaussian_swaying.recording.trajectory import load_trajectory
 
@@ -96,13 +95,10 @@ def reference_frames(path: Path) -> int:
 
 def run_row(fold: Fold, dataset: Path, options: argparse.Namespace, output: Path) -> Row:
     """Simulate a row and compare it with each reference."""
-    command = [sys.executable, str(ROOT / "tools" / "sim.py"), *arguments(fold), "--device", options.device]
-    command += ["--output", str(output), "--recorder.images=false", "--recorder.video=false"]
-    command += [f"--frames={options.frames}"] if options.frames else []
-    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True)
-    if done.returncode not in (0, 3) or not (output / "summary.json").exists():
-        return {"failed": flags.what_failed(done.stderr)}
-    summary = json.loads((output / "summary.json").read_text())
+    bare = ["--recorder.images=false", "--recorder.video=false"]
+    summary = simulate([*arguments(fold), *bare], output, options.device, options.frames)
+    if "failed" in summary:
+        return summary
     frames = summary["frames"]
     row: Row = {key: summary[key] for key in ("status", "particles", "frames", "substeps", "torn_particles")}
     row["ms_per_frame"] = 1e3 * summary["wall_s"].get("simulation", 0.0) / max(frames, 1)
@@ -165,9 +161,7 @@ def add_arguments(command: argparse.ArgumentParser) -> None:
 
 def measure(options: argparse.Namespace, result: Row, save: Callable[[Row], None]) -> None:
     """Fill ``result``, saving it after each run; existing rows that are not selected are kept."""
-    names = [name for name in options.rows.split(",") if name]
-    if unknown := set(names) - set(ROWS):
-        raise SystemExit(f"--rows takes {', '.join(ROWS)}, not {', '.join(sorted(unknown))}")
+    names = chosen("--rows", options.rows, ROWS)
     dataset = Path(options.dataset)
     known = describe(dataset)
     if not known["references"]:

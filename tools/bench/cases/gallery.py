@@ -5,19 +5,15 @@ from __future__ import annotations
 import argparse
 import hashlib
 import json
-import subprocess
-import sys
 import tempfile
-import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
 import yaml
 
-from bench.cases.flags import what_failed
-from bench.record import ROOT
-from bench.slots import table, value
+from bench.record import ROOT, chosen
+from bench.simulate import simulate
 
 CONFIGS = ROOT / "configs" / "sim"
 Row = dict[str, Any]
@@ -109,23 +105,17 @@ def run_scene(name: str, options: argparse.Namespace, pictures: Path) -> Row:
     """Run a scene as a user would, and return its summary."""
     with tempfile.TemporaryDirectory() as folder:
         output = Path(folder) / "out"
-        command = [sys.executable, str(ROOT / "tools" / "sim.py"), *arguments(name, options.preset)]
-        command += ["--device", options.device, "--output", str(output), "--recorder.video=false"]
-        command += [f"--frames={options.frames}"] if options.frames else []
-        command += options.more.split() if options.more else []
-        begin = time.perf_counter()
-        done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True)
-        seconds = time.perf_counter() - begin
-        if not (output / "summary.json").exists():
-            return {"failed": what_failed(done.stderr)}
-        summary = json.loads((output / "summary.json").read_text())
+        asked = [*arguments(name, options.preset), "--recorder.video=false", *(options.more or "").split()]
+        summary = simulate(asked, output, options.device, options.frames)
+        if "failed" in summary:
+            return summary
         summary.pop("per_frame")
         folders = [folder for folder in (output / "frames", output / "wind") if folder.is_dir()]
         strip(folders, pictures / f"gallery_{name}.png")
     moved = summary["displacement_mean_max_m"]
     share = None if moved is None else moved / summary["size_m"]
     noted = {"preset": options.preset, "configuration": fingerprint(name, options.preset)}
-    return summary | noted | {"process_s": seconds, "displacement_share": share}
+    return summary | noted | {"displacement_share": share}
 
 
 def add_arguments(command: argparse.ArgumentParser) -> None:
@@ -139,9 +129,7 @@ def add_arguments(command: argparse.ArgumentParser) -> None:
 
 def measure(options: argparse.Namespace, result: Row, save: Callable[[Row], None]) -> None:
     """Fill ``result["scenes"]``, saving it after each."""
-    names = options.scenes.split(",")
-    if unknown := set(names) - set(SCENES):
-        raise SystemExit(f"--scenes takes {', '.join(SCENES)}, not {', '.join(sorted(unknown))}")
+    names = chosen("--scenes", options.scenes, SCENES)
     for name in names:
         row = run_scene(name, options, Path(options.pictures))
         result.setdefault("scenes", {})[name] = row
@@ -157,62 +145,6 @@ def whole(row: Row) -> bool:
     return bool(complete and share is not None and LEAST <= share <= MOST)
 
 
-@value("gallery.least", "gallery_*", together=True)
-def least(_: list[Row]) -> str:
-    """The least mean displacement that counts as visible motion."""
-    return f"{100 * LEAST:g} %"
-
-
-@value("gallery.most", "gallery_*", together=True)
-def most(_: list[Row]) -> str:
-    """The largest mean displacement of an object that stays in place."""
-    return f"{100 * MOST:g} %"
-
-
 def of_today(name: str, row: Row) -> bool:
     """Whether a run was recorded with the present configuration files."""
     return bool(row.get("configuration") == fingerprint(name, row.get("preset")))
-
-
-def page(recorded: list[Row]) -> list[str]:
-    """Time, memory and motion of each scene, one table per record."""
-    lines = []
-    for result in recorded:
-        stack = ", ".join(f"{k} {v}" for k, v in result["versions"].items())
-        lines += [f"{result['device']}; {stack}; seed {result['seed']}.", ""]
-        lines += [
-            "| scene | particles | formulation | frames | substeps per frame | time per frame [ms] | "
-            "whole process [s] | host memory [GiB] | device memory [GiB] | displacement / size | OK |",
-            "|" + "---|" * 11,
-        ]
-        for name, title in SCENES.items():
-            if name not in result["scenes"]:
-                continue
-            row = result["scenes"][name]
-            if "failed" in row:
-                lines.append(f"| {title} | failed | " + "| " * 8 + "| no |")
-                continue
-            wall = sum(row["wall_s"].get(k, 0.0) for k in ("simulation", "shading", "rendering"))
-            memory = row["peak_memory_bytes"]
-            on_device = "-" if memory["device"] is None else f"{memory['device'] / 2**30:.2f}"
-            moved = row["displacement_share"]
-            shown = title + ("" if of_today(name, row) else " \\*")
-            lines.append(
-                f"| {shown}{', preset `' + row['preset'] + '`' if row['preset'] else ''} | {row['particles']:,} | "
-                f"`{row['formulation']}` | {row['frames']} | {row['substeps'] / max(row['frames'] - 1, 1):.0f} | "
-                f"{1e3 * wall / max(row['frames'], 1):.1f} | {row['process_s']:.0f} | {memory['host'] / 2**30:.2f} | "
-                f"{on_device} | {'-' if moved is None else f'{100 * moved:.1f} %'} | {'yes' if whole(row) else 'no'} |"
-            )
-        lines += [""]
-        if any("failed" not in row and not of_today(name, row) for name, row in result["scenes"].items()):
-            lines += [
-                "\\* Recorded before a configuration file of this scene changed, or before records noted their files.",
-                "",
-            ]
-    return lines
-
-
-@table("gallery.md", "gallery.scenes", "gallery_*")
-def scenes(result: Row) -> list[str]:
-    """The table of one record."""
-    return page([result])

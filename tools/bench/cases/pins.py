@@ -14,6 +14,7 @@ import yaml
 
 from bench.cases import flags
 from bench.cases.flags import REFERENCES, Flag, Variant
+from bench.record import chosen
 
 Row = dict[str, Any]
 
@@ -90,9 +91,7 @@ def add_arguments(command: argparse.ArgumentParser) -> None:
 
 def measure(options: argparse.Namespace, result: Row, save: Callable[[Row], None]) -> None:
     """Fill ``result["rows"]``, saving it after each run; existing rows that are not selected are kept."""
-    names = options.rows.split(",")
-    if unknown := set(names) - set(ROWS):
-        raise SystemExit(f"--rows takes {', '.join(ROWS)}, not {', '.join(sorted(unknown))}")
+    names = chosen("--rows", options.rows, ROWS)
     patterns = flags.flags_named(options.patterns)
     flags.open_dataset(Path(options.dataset), patterns, result)
     result |= {"more": options.more or ""} | ({"note": options.note} if options.note else {})

@@ -13,8 +13,8 @@ from pathlib import Path
 from typing import Any
 
 from bench.cases import gallery
-from bench.cases.flags import what_failed
-from bench.record import ROOT
+from bench.record import ROOT, chosen
+from bench.simulate import what_failed
 
 Row = dict[str, Any]
 
@@ -85,9 +85,7 @@ def add_arguments(command: argparse.ArgumentParser) -> None:
 
 def measure(options: argparse.Namespace, result: Row, save: Callable[[Row], None]) -> None:
     """Fill ``result["previews"]``, saving it after each."""
-    names = [name for name in options.scenes.split(",") if name]
-    if unknown := set(names) - set(gallery.SCENES):
-        raise SystemExit(f"--scenes takes {', '.join(gallery.SCENES)}, not {', '.join(sorted(unknown))}")
+    names = chosen("--scenes", options.scenes, gallery.SCENES)
     rows = result.setdefault("previews", {})
     for name in names:
         files = gallery.arguments(name, options.preset)

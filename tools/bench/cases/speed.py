@@ -385,9 +385,7 @@ def run(options: argparse.Namespace) -> None:
         raise SystemExit("--quick measures nothing worth keeping: choose another folder with --results")
     name = f"speed_{device.type}"
     path = folder / f"{name}.json"
-    only = options.only.split(",") if options.only else None
-    if unknown := set(only or []) - set(SECTIONS):
-        raise SystemExit(f"--only takes {', '.join(SECTIONS)}, not {', '.join(sorted(unknown))}")
+    only = record.chosen("--only", options.only, SECTIONS) if options.only else None
     if only and path.exists():
         kept = json.loads(path.read_text())
         if kept["device"] == result["device"]:

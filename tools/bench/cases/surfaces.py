@@ -20,7 +20,7 @@ import torch
 from bench.cases.flags import VARIANTS, run_row
 from bench.cases.trained import GENTLE, NORMALS, filled, last_psnr, tilts, two_views
 from bench.problems.capture_limits import surface_limits
-from bench.record import ROOT
+from bench.record import ROOT, chosen
 from gaussian_swaying.captures.capture import read_capture
 
 Row = dict[str, Any]
@@ -83,9 +83,7 @@ def add_arguments(command: argparse.ArgumentParser) -> None:
 
 def measure(options: argparse.Namespace, result: Row, save: Callable[[Row], None]) -> None:
     """Train in every way, and compare normals and motion with the reference."""
-    ways = options.ways.split(",")
-    if unknown := set(ways) - set(WAYS):
-        raise SystemExit(f"--ways takes {', '.join(WAYS)}, not {', '.join(sorted(unknown))}")
+    ways = chosen("--ways", options.ways, WAYS)
     reference = Path(options.dataset) / f"pattern{options.pattern}"
     photos = reference / "train"
     result |= {"pattern": options.pattern, "steps": options.train_steps, "at_once": options.at_once}
@@ -96,25 +94,21 @@ def measure(options: argparse.Namespace, result: Row, save: Callable[[Row], None
     with tempfile.TemporaryDirectory() as scratch:
         home = Path(options.splats or scratch)
         home.mkdir(parents=True, exist_ok=True)
-        waiting = [(way, seed) for seed in range(options.seeds) for way in ways]
-        running: dict[tuple[str, int], tuple[subprocess.Popen[bytes], float]] = {}
-        while waiting or running:
-            while waiting and len(running) < options.at_once:
-                job = waiting.pop(0)
-                target = home / f"{job[0]}_{job[1]}"
-                if not (target / "point_cloud.ply").exists():
-                    command = train_command(photos.resolve(), *job, options.train_steps, target)
-                    with (home / f"{target.name}.log").open("w") as log:
-                        running[job] = (
-                            subprocess.Popen(command, cwd=ROOT, stdout=log, stderr=log),
-                            time.perf_counter(),
-                        )
-            time.sleep(0.1)
-            for job in [job for job, (process, _) in running.items() if process.poll() is not None]:
-                process, began = running.pop(job)
-                if process.returncode:
-                    raise SystemExit((home / f"{job[0]}_{job[1]}.log").read_text()[-2000:])
+        jobs = [(way, seed) for seed in range(options.seeds) for way in ways]
+
+        def train(job: tuple[str, int]) -> None:
+            target = home / f"{job[0]}_{job[1]}"
+            if not (target / "point_cloud.ply").exists():
+                command, log = train_command(photos.resolve(), *job, options.train_steps, target), f"{target}.log"
+                began = time.perf_counter()
+                with Path(log).open("w") as told:
+                    done = subprocess.run(command, cwd=ROOT, stdout=told, stderr=told)
+                if done.returncode:
+                    raise SystemExit(Path(log).read_text()[-2000:])
                 rows.setdefault(job[0], {}).setdefault(str(job[1]), {})["seconds"] = time.perf_counter() - began
+
+        with ThreadPoolExecutor(options.at_once) as pool:
+            list(pool.map(train, jobs))
         lock = threading.Lock()
 
         def look(job: tuple[str, int]) -> None:
@@ -134,4 +128,4 @@ def measure(options: argparse.Namespace, result: Row, save: Callable[[Row], None
                 save(result)
 
         with ThreadPoolExecutor(options.at_once) as pool:
-            list(pool.map(look, [(way, seed) for way in ways for seed in range(options.seeds)]))
+            list(pool.map(look, sorted(jobs, key=lambda job: ways.index(job[0]))))

@@ -21,6 +21,7 @@ from torch import Tensor
 from torchmetrics.functional.image import peak_signal_noise_ratio, structural_similarity_index_measure
 
 from bench.problems.surface_quality import surface_quality
+from bench.record import chosen
 from gaussian_swaying.cli.train import make_cli
 from gaussian_swaying.gaussians.model import GaussianSurfaceModel
 from gaussian_swaying.rendering.factory import make_renderer
@@ -377,9 +378,7 @@ def add_arguments(command: argparse.ArgumentParser) -> None:
 
 def measure(options: argparse.Namespace, result: Row, save: Callable[[Row], None]) -> None:
     """Fill ``result``, saving it after each run."""
-    wanted = options.only.split(",")
-    if unknown := set(wanted) - set(SECTIONS):
-        raise SystemExit(f"--only takes {', '.join(SECTIONS)}, not {', '.join(sorted(unknown))}")
+    wanted = chosen("--only", options.only, SECTIONS)
     if {"pair", "variants", "photos"} & set(wanted) and not options.capture:
         raise SystemExit("the capture is missing: pass its folder with --capture, or skip it with --only flag")
 

@@ -15,6 +15,7 @@ from typing import Any
 import torch
 
 from bench.clock import Clock, guarded
+from bench.record import chosen
 from bench.scenes import CUBE, sheet, waves, wind_load
 from gaussian_swaying.aero.carried import Turbulence
 from gaussian_swaying.aero.effects import LogProfile, WindEffect
@@ -172,9 +173,7 @@ def measure(options: argparse.Namespace, result: Row, save: Callable[[Row], None
     """Fill ``result``, saving it after each table; rows of other sizes and formulations are kept."""
     device = torch.device(options.device)
     kind = device.type
-    only = options.only.split(",") if options.only else ["box", *PARTS]
-    if unknown := set(only) - {"box", *PARTS}:
-        raise SystemExit(f"--only takes box, {', '.join(PARTS)}, not {', '.join(sorted(unknown))}")
+    only = chosen("--only", options.only, ["box", *PARTS])
     if "box" in only:
         result["box"] = measure_box(device)
     for count in COUNTS[kind] if options.counts is None else map(int, options.counts.split(",")):

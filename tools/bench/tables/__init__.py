@@ -1,1 +1,1 @@
-"""Tables, values and plots made from the recorded JSON; each file has the name of the case that records its data."""
+"""Tables, values and goals of the pages, declared for the renderer, and plots; most files have the name of a page."""

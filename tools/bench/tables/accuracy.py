@@ -1,312 +1,183 @@
-"""Tables and findings of ``bench.py accuracy``."""
+"""Tables and values of ``bench.py accuracy``, from the rows of all its records."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Iterator
+from functools import partial
 from typing import Any
 
 from bench.cases.accuracy import SINGLE, VARIANTS
-from bench.slots import table, value
-from bench.tables.accuracy_goals import GOALS
-from bench.tables.markdown import grid, measured, stack
-from bench.tables.rows import Row, order, own_order, select
+from bench.tables.accuracy_goals import goal_rows, mobilised
+from bench.tables.markdown import measured, stack
+from bench.tables.render import BECAUSE, Row, Rows, table, value
+from bench.tables.rows import all_rows, order, own_order, select
 
 PAGE = "validation.md"
+Results = list[Row]
 
 
-def _value(value: Any) -> str:
-    return "-" if value is None else f"{value:.3g}" if isinstance(value, (int, float)) else str(value)
+def _table(name: str, rows: Rows, columns: str, **more: Any) -> None:
+    table(PAGE, f"accuracy.{name}", "accuracy_*", rows, columns, together=True, **more)
 
 
-def rows_table(name: str) -> Callable[[Callable[[list[Row]], list[str]]], Any]:
-    """Register a table of the rows of all records."""
-
-    def register(make: Callable[[list[Row]], list[str]]) -> Any:
-        def of_results(results: list[Row]) -> list[str]:
-            return make([row for result in results for row in result["rows"]])
-
-        table(PAGE, name, "accuracy_*", together=True)(of_results)
-        return make
-
-    return register
+def _of(results: Results, problem: str, **parameters: Any) -> list[Row]:
+    return select(all_rows(results), problem, **parameters)
 
 
-@table(PAGE, "accuracy.devices", "accuracy_*", together=True)
-def devices(results: list[Row]) -> list[str]:
-    """Which problems were measured where."""
-    lines = []
+def _problems(results: Results) -> Iterator[Row]:
     for result in results:
-        problems = ", ".join(sorted({row["problem"] for row in result["rows"]}))
-        lines.append(f"- {problems}: {result['device']}; {stack(result)}.{measured(result)}")
-    return lines
+        names = ", ".join(sorted({row["problem"] for row in result["rows"]}))
+        yield {"names": names, "told": f"{result['device']}; {stack(result)}.{measured(result)}"}
 
 
-@rows_table("accuracy.goals")
-def goals(rows: list[Row]) -> list[str]:
-    """The goals, and the measurements that failed."""
-    found = [(goal, goal.judge(rows)) for goal in GOALS]
-    told = [[goal.name, goal.wanted, goal.why, one[0], "yes" if one[1] else "**no**"] for goal, one in found if one]
-    lines = grid(["goal", "wanted", "where this comes from", "measured", "reached"], told)
-    failed = [row for row in rows if "failed" in row["result"]]
-    told = [f"- failed: {row['problem']} {row['parameters']}: {row['result']['failed']}" for row in failed]
-    return [*lines, "", *told] if told else lines
+_table("devices", _problems, "- {names}: {told}")
+_table("goals", goal_rows, BECAUSE)
 
 
-def _convergence(rows: list[Row], problem: str, columns: dict[str, str], **parameters: Any) -> list[str]:
-    """Error against cells for each variant, with the order of the last halving, and further columns."""
-    shown = []
+def _orders(results: Results, problem: str, **parameters: Any) -> Iterator[Row]:
+    """The rows of each variant by cells, with the order of the last halving."""
     for variant in (*VARIANTS, *SINGLE):
-        found = sorted(select(rows, problem, variant=variant, **parameters), key=lambda r: r["parameters"]["cells"])
-        for k, row in enumerate(found):
-            observed = f"{order(found[k - 1], row):.2f}" if k and row["result"]["error"] > 0 else ""
-            extra = [_value(row["result"].get(name)) for name in columns]
-            shown.append(
-                [f"`{variant}`", str(row["parameters"]["cells"]), f"{row['result']['error']:.2e}", observed, *extra]
-            )
-    return grid(["variant", "cells", "relative error", "order", *columns.values()], shown)
+        found = _of(results, problem, variant=variant, **parameters)
+        for row, before in _by_cells(found):
+            yield row | {"order": "" if before is None or row["result"]["error"] <= 0 else order(before, row)}
 
 
-_LOSS = {"loss": "amplitude lost per period"}
-_SHIFT = {"end_shift": "apparent outward shift of the pin [cells]"}
-
-CONVERGENCE: dict[str, tuple[str, dict[str, str], dict[str, str]]] = {
-    "accuracy.free_bar": ("vibrating bar", _LOSS, {"ends": "free"}),
-    "accuracy.pinned_bar": ("vibrating bar", _LOSS | _SHIFT, {"ends": "fixed-free"}),
-    "accuracy.unconfined_bar": ("unconfined bar", _SHIFT, {}),
-    "accuracy.hanging_bar": ("hanging bar", {}, {"clamp": "mirror"}),
-    "accuracy.hanging_pinned_bar": ("hanging bar", _SHIFT, {"clamp": "pin"}),
-    "accuracy.bar_at_points": ("bar held at points", _LOSS | _SHIFT, {}),
-    "accuracy.hanging_bar_at_points": ("hanging bar held at points", _SHIFT, {}),
-    "accuracy.vortex": ("vortex", {}, {}),
-}
-"""Slots of the tables of convergence: problem, further columns, and parameters."""
-
-for _name, (_problem, _columns, _parameters) in CONVERGENCE.items():
-    rows_table(_name)(lambda rows, p=_problem, c=_columns, q=_parameters: _convergence(rows, p, c, **q))
+def _by_cells(rows: list[Row]) -> Iterator[tuple[Row, Row | None]]:
+    """Each row, in ascending number of cells, and the one before."""
+    found = sorted(rows, key=lambda row: row["parameters"]["cells"])
+    return zip(found, [None, *found], strict=False)
 
 
-@rows_table("accuracy.free_block")
-def free_block(rows: list[Row]) -> list[str]:
-    """Energy and momenta of the free block."""
-    names = {
-        "kept": "final / initial energy",
-        "error": "largest change",
-        "growth": "largest rise of any single state",
-        "linear": "change of linear momentum",
-        "angular": "change of angular momentum",
-        "substeps": "substeps",
-    }
-    return grid(
-        ["variant", *names.values()],
-        [
-            [f"`{row['parameters']['variant']}`", *(_value(row["result"].get(n)) for n in names)]
-            for row in select(rows, "free block")
-        ],
-    )
+_LOSS = "amplitude lost per period = {result.loss:.3g}"
+_SHIFT = "apparent outward shift of the pin [cells] = {result.end_shift:.3g}"
+for _name, _problem, _more, _parameters in (
+    ("free_bar", "vibrating bar", (_LOSS,), {"ends": "free"}),
+    ("pinned_bar", "vibrating bar", (_LOSS, _SHIFT), {"ends": "fixed-free"}),
+    ("unconfined_bar", "unconfined bar", (_SHIFT,), {}),
+    ("hanging_bar", "hanging bar", (), {"clamp": "mirror"}),
+    ("hanging_pinned_bar", "hanging bar", (_SHIFT,), {"clamp": "pin"}),
+    ("bar_at_points", "bar held at points", (_LOSS, _SHIFT), {}),
+    ("hanging_bar_at_points", "hanging bar held at points", (_SHIFT,), {}),
+    ("vortex", "vortex", (), {}),
+):
+    _convergence = ("variant = `{parameters.variant}` | cells = {parameters.cells} | "
+                    "relative error = {result.error:.2e} | order = {order:.2f}")  # fmt: skip
+    _table(_name, partial(_orders, problem=_problem, **_parameters), " | ".join([_convergence, *_more]))
+
+_table("free_block", partial(_of, problem="free block"), """
+    variant = `{parameters.variant}` | final / initial energy = {result.kept:.3g} |
+    largest change = {result.error:.3g} | largest rise of any single state = {result.growth:.3g} |
+    change of linear momentum = {result.linear:.3g} | change of angular momentum = {result.angular:.3g} |
+    substeps = {result.substeps:.3g}
+    """)  # fmt: skip
 
 
-@rows_table("accuracy.hinged_strip")
-def hinged_strip(rows: list[Row]) -> list[str]:
-    """The sag of a strip on hinges, and of strips that are held in other ways."""
-    shown = []
+def _strips(results: Results) -> Iterator[Row]:
     for hold in ("hinge", "clamp", "nodes"):
-        found = sorted(select(rows, "hinged strip", hold=hold), key=lambda row: row["parameters"]["cells"])
-        for k, row in enumerate(found):
-            observed = f"{order(found[k - 1], row):.2f}" if k and hold == "hinge" else ""
-            result = row["result"]
-            numbers = [f"{result['error']:.2e}", observed, f"{result['slope']:.4f}", _value(result["moment"])]
-            shown.append([f"`{hold}`", str(row["parameters"]["cells"]), *numbers])
-    names = ["slope at the end / exact", "error of the moment in the last cell / moment in the middle"]
-    return grid(["kind of the pins", "cells", "error of the sag", "order", *names], shown)
+        for row, before in _by_cells(_of(results, "hinged strip", hold=hold)):
+            yield row | {"order": order(before, row) if before and hold == "hinge" else ""}
 
 
-@rows_table("accuracy.hinged_plate")
-def hinged_plate(rows: list[Row]) -> list[str]:
-    """The angle at which a plate hangs in the wind."""
-    return grid(
-        ["variant", "law", "k", "angle [deg]", "exact [deg]", "error [deg]"],
-        [
-            [
-                f"`{row['parameters']['variant']}`",
-                f"`{row['parameters']['law']}`",
-                str(row["parameters"]["k"]),
-                *(f"{row['result'][n]:.2f}" for n in ("angle", "exact", "error")),
-            ]
-            for row in select(rows, "hinged plate")
-        ],
-    )
+_table("hinged_strip", _strips, """
+    kind of the pins = `{parameters.hold}` | cells = {parameters.cells} | error of the sag = {result.error:.2e} |
+    order = {order:.2f} | slope at the end / exact = {result.slope:.4f} |
+    error of the moment in the last cell / moment in the middle = {result.moment:.3g}
+    """)  # fmt: skip
+_table("hinged_plate", partial(_of, problem="hinged plate"), """
+    variant = `{parameters.variant}` | law = `{parameters.law}` | k = {parameters.k} |
+    angle [deg] = {result.angle:.2f} | exact [deg] = {result.exact:.2f} | error [deg] = {result.error:.2f}
+    """)  # fmt: skip
+_table("surface_drag", partial(_of, problem="surface drag"), """
+    surface = {parameters.shape} | Gaussians = {parameters.count} | overlap = {parameters.overlap} |
+    *areas `{parameters.area}`, law `{parameters.law}` = {result.share:.3f}
+    """, order=[f"parameters.{name}" for name in ("shape", "count", "overlap", "area", "law")])  # fmt: skip
+_table("cantilever", partial(_of, problem="cantilever"), """
+    variant = `{parameters.variant}` | b = {parameters.b} | cells through the thickness = {parameters.cells} |
+    drop / L = {result.drop:.3g} | error of the drop = {result.error:.3g} | part from shear = {result.shear:.3g} |
+    part from quadrature = {result.quadrature:.3g} | unexplained part = {result.unexplained:.3g} |
+    error of the shortening = {result.shortening_error:.3g}
+    """)  # fmt: skip
+_table("held_cantilever", partial(_of, problem="held cantilever"), """
+    thickness [cells] = {parameters.thickness:g} |
+    *held depth {parameters.depth:g} = {result.lowest:.3f} to {result.highest:.3f}
+    """, order=["parameters.thickness", "parameters.depth"])  # fmt: skip
 
 
-@rows_table("accuracy.surface_drag")
-def surface_drag(rows: list[Row]) -> list[str]:
-    """Drag on surfaces made of Gaussians, as a share of the exact drag."""
-    places: dict[tuple[Any, ...], dict[str, str]] = {}
-    for row in select(rows, "surface drag"):
-        p = row["parameters"]
-        place = places.setdefault((p["shape"], p["count"], p["overlap"]), {})
-        place[f"{p['area']}, {p['law']}"] = f"{row['result']['share']:.3f}"
-    names = [f"{area}, {law}" for area in ("coverage", "paper") for law in ("paper", "projected")]
-    header = [
-        "surface",
-        "Gaussians",
-        "overlap",
-        *(f"areas `{n.split(', ')[0]}`, law `{n.split(', ')[1]}`" for n in names),
-    ]
-    return grid(header, [[*map(str, key), *(place.get(n, "-") for n in names)] for key, place in places.items()])
-
-
-@rows_table("accuracy.cantilever")
-def cantilever(rows: list[Row]) -> list[str]:
-    """Drop of a cantilever, and the sources of its error."""
-    names = {
-        "drop": "drop / L",
-        "error": "error of the drop",
-        "shear": "part from shear",
-        "quadrature": "part from quadrature",
-        "unexplained": "unexplained part",
-        "shortening_error": "error of the shortening",
-    }
-    return grid(
-        ["variant", "b", "cells through the thickness", *names.values()],
-        [
-            [
-                f"`{row['parameters']['variant']}`",
-                str(row["parameters"]["b"]),
-                str(row["parameters"]["cells"]),
-                *(_value(row["result"].get(n)) for n in names),
-            ]
-            for row in select(rows, "cantilever")
-        ],
-    )
-
-
-@rows_table("accuracy.held_cantilever")
-def held_cantilever(rows: list[Row]) -> list[str]:
-    """Frequencies of cantilevers held in a region, over that of a clamped beam, by thickness and depth."""
-    found = select(rows, "held cantilever")
-    depths = sorted({row["parameters"]["depth"] for row in found})
-    lines = []
-    for thickness in sorted({row["parameters"]["thickness"] for row in found}):
-        own = select(found, "held cantilever", thickness=thickness)
-        cells = {row["parameters"]["depth"]: row["result"] for row in own}
-        told = [f"{r['lowest']:.3f} to {r['highest']:.3f}" if (r := cells.get(depth)) else "-" for depth in depths]
-        lines.append([f"{thickness:g}", *told])
-    return grid(["thickness [cells]", *(f"held depth {depth:g}" for depth in depths)], lines)
-
-
-@rows_table("accuracy.clamped_end")
-def clamped_end(rows: list[Row]) -> list[str]:
-    """Frequency of a clamped beam over that of Timoshenko's, by cells through its thickness."""
-    found = select(rows, "clamped end")
-    lines = []
+def _ends(results: Results) -> Iterator[Row]:
+    found = _of(results, "clamped end")
     for k, row in enumerate(found):
-        observed = f"{own_order(found[k - 2 : k + 1]):.2f}" if k > 1 else ""
-        lines.append([str(row["parameters"]["cells"]), f"{row['result']['ratio']:.5f}", observed])
-    return grid(["cells through the thickness", "frequency over Timoshenko's", "order of the last three"], lines)
+        yield row | {"order": own_order(found[k - 2 : k + 1]) if k > 1 else ""}
 
 
-def _mobilised(degrees: float) -> float:
-    """Strength of the cone, fitted to an angle in triaxial compression, where one principal stress is the mean."""
-    sine = math.sin(math.radians(degrees))
-    return 6 * sine / (math.sqrt(3) * (3 - sine))
+_table("clamped_end", _ends, """
+    cells through the thickness = {parameters.cells} | frequency over Timoshenko's = {result.ratio:.5f} |
+    order of the last three = {order:.2f}
+    """)  # fmt: skip
 
 
-@rows_table("accuracy.sand_angles")
-def sand_angles(rows: list[Row]) -> list[str]:
+def _angles(results: Results) -> Iterator[Row]:
     """Friction angles of the sand law, for an element and for a layer."""
-    strength = _mobilised(30.0)
-    exact = {"shear": math.degrees(math.atan(strength)), "plane": math.degrees(math.asin(strength))}
-    shown = []
-    for result in (row["result"] for row in select(rows, "sand element")):
-        shown += [
-            ["simple shear", f"{result['shear_deg']:.1f}", f"{exact['shear']:.1f}"],
-            ["triaxial compression", f"{result['triaxial_deg']:.1f}", "30.0"],
-            ["plane strain", f"{result['plane_strain_deg']:.1f}", f"{exact['plane']:.1f}"],
-        ]
-    for result in (row["result"] for row in select(rows, "sand slope")):
-        angles = [f"{result['friction_deg']:.2f}", f"{result['exact']:.2f}"]
-        shown += [["a layer that slides down an incline, from its acceleration", *angles]]
-        shown += [["a layer on an incline: steepest on which it stands", f"{result['stands']:.0f}", "-"]]
-        shown += [["a layer on an incline: least steep on which it flows", f"{result['flows']:.0f}", "-"]]
-    return grid(["test, phi = 30 degrees", "angle [deg]", "theory [deg]"], shown)
+    tests = {"shear": "simple shear", "triaxial": "triaxial compression", "plane_strain": "plane strain"}
+    for result in (row["result"] for row in _of(results, "sand element")):
+        for name, theory in mobilised().items():
+            yield {"test": tests[name], "angle": result[f"{name}_deg"], "theory": theory}
+    slides = "a layer that slides down an incline, from its acceleration"
+    for result in (row["result"] for row in _of(results, "sand slope")):
+        yield {"test": slides, "angle": result["friction_deg"], "theory": result["exact"]}
+        steepest, least = ("a layer on an incline: steepest on which it stands",
+                           "a layer on an incline: least steep on which it flows")  # fmt: skip
+        yield {"test": steepest, "angle": result["stands"], "theory": None}
+        yield {"test": least, "angle": result["flows"], "theory": None}
 
 
-@value("accuracy.plane_strain_angle", "accuracy_*", together=True)
-def plane_strain_angle(results: list[Row]) -> str:
-    """Friction angle of the law in plane strain [degrees]."""
-    row = select([row for result in results for row in result["rows"]], "sand element")[0]
-    return f"{row['result']['plane_strain_deg']:.0f}"
+_table("sand_angles", _angles, """
+    test, with phi of 30 degrees = {test} | angle [deg] = {angle:.4g} | theory [deg] = {theory:.4g}
+    """)  # fmt: skip
 
 
-@value("accuracy.band", "accuracy_*", together=True)
-def band(results: list[Row]) -> str:
-    """The largest ratio between Lube's and Lajeunesse's run-outs, over the round columns."""
-    rows = select([row for result in results for row in result["rows"]], "sand column", planar=False)
-    pairs = [sorted((row["result"]["lube"], row["result"]["lajeunesse"])) for row in rows]
-    return f"{max(high / low for low, high in pairs):.1f}"
+def _columns(results: Results) -> Iterator[Row]:
+    for row in _of(results, "sand column"):
+        kind = "round" if row["parameters"].get("planar") is False else "planar"
+        yield row | {"kind": kind, "corrected": row["parameters"].get("volume_correction", True)}
 
 
-@rows_table("accuracy.sand_columns")
-def sand_columns(rows: list[Row]) -> list[str]:
-    """Run-out of collapsing columns of sand."""
-    names = {
-        "runout": "run-out",
-        "lube": "Lube",
-        "lajeunesse": "Lajeunesse",
-        "height": "height / L0",
-        "slope_deg": "slope [deg]",
-        "volume_ratio": "final / initial volume",
-        "particles": "particles",
-    }
-    return grid(
-        ["column", "a", "cells", "volume correction", *names.values()],
-        [
-            [
-                "round" if row["parameters"].get("planar") is False else "planar",
-                str(row["parameters"]["aspect"]),
-                str(row["parameters"]["cells"]),
-                "no" if row["parameters"].get("volume_correction") is False else "yes",
-                *(_value(row["result"].get(n)) for n in names),
-            ]
-            for row in select(rows, "sand column")
-        ],
-    )
+_table("sand_columns", _columns, """
+    column = {kind} | a = {parameters.aspect} | cells = {parameters.cells} | volume correction = {corrected} |
+    run-out = {result.runout:.3g} | Lube = {result.lube:.3g} | Lajeunesse = {result.lajeunesse or '-':.3g} |
+    height / L0 = {result.height:.3g} | slope [deg] = {result.slope_deg:.3g} |
+    final / initial volume = {result.volume_ratio:.3g} | particles = {result.particles:.3g}
+    """)  # fmt: skip
 
 
-@rows_table("accuracy.sand_exponents")
-def sand_exponents(rows: list[Row]) -> list[str]:
-    """The exponent of the run-out in the aspect ratio, from the finest grid that has all aspects."""
-    lines = []
-    for planar in (True, False):
-        own = [row for row in select(rows, "sand column") if row["parameters"].get("planar", True) == planar]
-        own = [row for row in own if row["parameters"].get("volume_correction", True)]
+def _exponents(results: Results) -> Iterator[Row]:
+    """The exponent of the run-out in the aspect ratio, from the finest grid that has both aspects."""
+    for kind in ("planar", "round"):
+        own = [row for row in _columns(results) if row["kind"] == kind and row["corrected"]]
+        own.sort(key=lambda row: row["parameters"]["cells"])
+        finest = {row["parameters"]["aspect"]: row["result"] for row in own}
         for low, high in ((0.5, 1.0), (1.0, 2.0), (1.0, 3.0)):
-            finest: dict[float, Row] = {}
-            for row in sorted(own, key=lambda r: r["parameters"]["cells"]):
-                finest[row["parameters"]["aspect"]] = row
             if low in finest and high in finest:
-                values = [finest[a]["result"] for a in (low, high)]
-                found, lube = (math.log(values[1][n] / values[0][n]) / math.log(high / low) for n in ("runout", "lube"))
-                kind = "planar" if planar else "round"
-                lines.append(f"- {kind}, a from {low} to {high}: run-out as a^{found:.2f}; Lube's fit a^{lube:.2f}.")
-    return lines
+                ratios = {name: math.log(finest[high][name] / finest[low][name]) for name in ("runout", "lube")}
+                exponents = {name: ratio / math.log(high / low) for name, ratio in ratios.items()}
+                yield {"kind": kind, "low": low, "high": high} | exponents
 
 
-@rows_table("accuracy.soft_flag")
-def soft_flag(rows: list[Row]) -> list[str]:
-    """Whether the softest of the paper's flags keeps all its particles and does not tear."""
-    return grid(
-        ["dx [m]", "density [kg/m³]", "substeps", "torn", "singular values of F", "seconds"],
-        [
-            [
-                str(row["parameters"]["dx"]),
-                str(row["parameters"]["density"]),
-                f"{row['result']['substeps']:,.0f}",
-                f"{row['result']['torn']:.0f}",
-                f"[{row['result']['stretch_min']:.2f}, {row['result']['stretch_max']:.2f}]",
-                f"{row['result']['wall_s']:.0f}",
-            ]
-            for row in select(rows, "soft flag")
-        ],
-    )
+_table("sand_exponents", _exponents,
+       "- {kind}, a from {low} to {high}: run-out as a^{runout:.2f}; Lube's fit a^{lube:.2f}.")  # fmt: skip
+_table("soft_flag", partial(_of, problem="soft flag"), """
+    dx [m] = {parameters.dx} | density [kg/m³] = {parameters.density} | substeps = {result.substeps:,.0f} |
+    torn = {result.torn:.0f} | singular values of F = [{result.stretch_min:.2f}, {result.stretch_max:.2f}] |
+    seconds = {result.wall_s:.0f}
+    """)  # fmt: skip
+
+
+def _band(results: Results) -> Row:
+    """The largest ratio between Lube's and Lajeunesse's run-outs, over the round columns."""
+    found = (row["result"] for row in _of(results, "sand column", planar=False))
+    return {"most": max(max(one["lube"] / one["lajeunesse"], one["lajeunesse"] / one["lube"]) for one in found)}
+
+
+value("accuracy.band", "accuracy_*", "{most:.1f}", _band, together=True)
+value("accuracy.plane_strain_angle", "accuracy_*", "{result.plane_strain_deg:.0f}",
+      lambda results: _of(results, "sand element")[0], together=True)  # fmt: skip

@@ -3,99 +3,90 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable
-from dataclasses import dataclass
+from collections.abc import Iterator
+from functools import partial
 from typing import Any
 
-from bench.tables.rows import Row, order, own_order, select
+from bench.tables.render import Goal, Row, Rows
+from bench.tables.rows import all_rows, order, own_order, select
 
-Finding = tuple[str, str, bool]
-"""What was measured (a variant, for example), the value, and whether it reaches the goal."""
-
-
-@dataclass(frozen=True)
-class Goal:
-    """One goal.
-
-    Attributes:
-        name: The problem and the number.
-        wanted: The goal.
-        why: Where its number comes from.
-        find: Function of all rows that gives what was measured; nothing if its rows are missing.
-    """
-
-    name: str
-    wanted: str
-    why: str
-    find: Callable[[list[Row]], Iterable[Finding]]
-
-    def judge(self, rows: list[Row]) -> tuple[str, bool] | None:
-        """All that was measured, with what misses the goal in bold, and whether all of it reaches the goal."""
-        found = list(self.find(rows))
-        told = [f"{what} {text if reached else f'**{text}**'}".strip() for what, text, reached in found]
-        return (", ".join(told), all(reached for *_, reached in found)) if found else None
-
-
+Recorded = list[Row]
 GOALS: list[Goal] = []
+"""Of all rows; a goal is reached if all that it is about reach it."""
 
 
-def goal(name: str, wanted: str, why: str) -> Callable[..., Any]:
-    """Register a goal by the function that finds what was measured."""
-
-    def register(find: Callable[[list[Row]], Iterable[Finding]]) -> Any:
-        GOALS.append(Goal(name, wanted, why, find))
-        return find
-
-    return register
+def _goal(name: str, wanted: str, why: str, rows: Rows, what: str, measured: str, reached: str) -> None:
+    """Add a goal; ``what`` names each of its rows."""
+    GOALS.append(Goal(name, measured, reached, rows, more={"wanted": wanted, "why": why, "what": what}))
 
 
-def _by(rows: list[Row], name: str = "variant") -> dict[Any, list[Row]]:
+def judge(goal: Goal, rows: Recorded) -> Row | None:
+    """The goal with all that was measured, in bold what misses it; None if its rows are missing."""
+    if not (found := list(goal.of(goal.rows(rows)))):  # type: ignore[operator]
+        return None
+    told = (f"{one['what']} {one['measured'] if one['reached'] else '**' + one['measured'] + '**'}" for one in found)
+    return found[0] | {"measured": ", ".join(map(str.strip, told)), "reached": all(one["reached"] for one in found)}
+
+
+def goal_rows(results: list[Row]) -> Iterator[Row]:
+    """The goals of all records, and the measurements that failed."""
+    rows = all_rows(results)
+    yield from (found for goal in GOALS if (found := judge(goal, rows)))
+    for row in (row for row in rows if "failed" in row["result"]):
+        what = f"failed: {row['problem']} {row['parameters']}"
+        yield {"goal": what, "wanted": "-", "why": "-", "measured": row["result"]["failed"], "reached": False}
+
+
+def _by(rows: Recorded, name: str = "variant") -> dict[Any, Recorded]:
     """Rows by a parameter, in ascending number of cells."""
-    found: dict[Any, list[Row]] = {}
+    found: dict[Any, Recorded] = {}
     for row in sorted(rows, key=lambda row: row["parameters"].get("cells", 0)):
         found.setdefault(row["parameters"].get(name), []).append(row)
     return found
 
 
-def _percent(value: float, limit: float) -> tuple[str, bool]:
-    return f"{100 * value:.3g} %", abs(value) <= limit
+def _each(rows: Recorded, problem: str, **parameters: Any) -> Iterator[Row]:
+    """The parameters and results of each row, by variant."""
+    for found in _by(select(rows, problem, **parameters)).values():
+        yield from (row["parameters"] | row["result"] for row in found)
 
 
+def _finest(rows: Recorded, problem: str, **parameters: Any) -> Iterator[Row]:
+    """Each variant on its finest grid, with the order between its two finest ones."""
+    for found in _by(select(rows, problem, **parameters)).values():
+        orders = {"order": order(found[-2], found[-1])} if len(found) > 1 else {}
+        yield found[-1]["parameters"] | found[-1]["result"] | orders
+
+
+def _worst(rows: Recorded, problem: str, name: str = "variant") -> Iterator[Row]:
+    """The row with the largest error, of each variant or other parameter."""
+    for found in _by(select(rows, problem), name).values():
+        row = max(found, key=lambda row: abs(row["result"]["error"]))
+        yield row["parameters"] | row["result"]
+
+
+VARIANT, ERROR = "`{variant}`", "{error:.3g %}"
 SECOND = "quadratic splines blur a field by terms of dx²; a tenth less, for the grids are not infinitely fine"
+BEAM = "chosen: a plane body is not Timoshenko's beam (its clamped end is stiffer by the corners' share)"
+BLUR = "the variance of a quadratic spline is dx² / 4, so it blurs a wave by (k dx)² / 8; twice that"
 
 
 def _orders(name: str, problem: str, **parameters: Any) -> None:
-    """The order between the two finest grids, of each variant."""
-
-    @goal(f"{name}, observed order in dx", "at least 1.8", SECOND)
-    def _(rows: list[Row]) -> Iterable[Finding]:
-        for variant, found in _by(select(rows, problem, **parameters)).items():
-            if len(found) > 1:
-                observed = order(found[-2], found[-1])
-                yield f"`{variant}`", f"{observed:.2f}", observed >= 1.8
+    rows = partial(_finest, problem=problem, **parameters)
+    _goal(f"{name}, observed order in dx", "at least 1.8", SECOND, rows, VARIANT, "{order:.2f}", "order >= 1.8")
 
 
 def _errors(name: str, problem: str, cells: int, limit: float, why: str, **parameters: Any) -> None:
-    """The error on one grid, of each variant."""
-
-    @goal(name, f"within {100 * limit:g} %", why)
-    def _(rows: list[Row]) -> Iterable[Finding]:
-        for variant, (row,) in _by(select(rows, problem, cells=cells, **parameters)).items():
-            yield f"`{variant}`", *_percent(row["result"]["error"], limit)
+    rows = partial(_each, problem=problem, cells=cells, **parameters)
+    _goal(name, f"within {100 * limit:g} %", why, rows, VARIANT, ERROR, f"|error| <= {limit}")
 
 
 def _shifts(name: str, problem: str, **parameters: Any) -> None:
-    """Where a pin of whole nodes seems to be, on the finest grid, of each variant."""
-
-    @goal(f"{name}, held by nodes: where the wall seems to be", "within 0.5 cells", "the nearest node holds it")
-    def _(rows: list[Row]) -> Iterable[Finding]:
-        for variant, found in _by(select(rows, problem, **parameters)).items():
-            shift = found[-1]["result"]["end_shift"]
-            yield f"`{variant}`", f"{shift:+.2f}", abs(shift) <= 0.5
+    rows = partial(_finest, problem=problem, **parameters)
+    _goal(f"{name}, held by nodes: where the wall seems to be", "within 0.5 cells", "the nearest node holds it",
+          rows, VARIANT, "{end_shift:+.2f}", "|end_shift| <= 0.5")  # fmt: skip
 
 
-BEAM = "chosen: a plane body is not Timoshenko's beam (its clamped end is stiffer by the corners' share)"
-BLUR = "the variance of a quadratic spline is dx² / 4, so it blurs a wave by (k dx)² / 8; twice that"
 _errors("confined bar with free ends, frequency at 64 cells", "vibrating bar", 64, 0.0006, BLUR, ends="free")
 _orders("confined bar with free ends", "vibrating bar", ends="free")
 _errors("fixed-free bar held at points of its wall, frequency at 64 cells", "bar held at points", 64, 0.00015, BLUR)
@@ -106,191 +97,154 @@ _orders("bar hanging under its own weight", "hanging bar", clamp="mirror")
 _shifts("bar hanging under its own weight", "hanging bar", clamp="pin")
 _orders("bar hanging from points of its wall", "hanging bar held at points")
 _orders("large-rotation vortex", "vortex")
-
-for _problem, _where in (("hanging bar", "under its own weight"), ("hanging bar held at points", "from points")):
-    _errors(
-        f"bar hanging {_where}, tip at 32 cells", _problem, 32, 0.00025, "the same blur: 1 / (8 cells²); twice that",
-        **({"clamp": "mirror"} if _problem == "hanging bar" else {}),
-    )  # fmt: skip
-
-
-@goal("strip on hinges under a side load, sag at 16 cells", "within 0.4 %", "second order: 1 / cells²")
-def _(rows: list[Row]) -> Iterable[Finding]:
-    for row in select(rows, "hinged strip", hold="hinge", cells=16):
-        yield "", *_percent(row["result"]["error"], 0.004)
+_TIP = "the same blur: 1 / (8 cells²); twice that"
+_errors("bar hanging under its own weight, tip at 32 cells", "hanging bar", 32, 0.00025, _TIP, clamp="mirror")
+_errors("bar hanging from points, tip at 32 cells", "hanging bar held at points", 32, 0.00025, _TIP)
+_goal("strip on hinges under a side load, sag at 16 cells", "within 0.4 %", "second order: 1 / cells²",
+      partial(_each, problem="hinged strip", hold="hinge", cells=16), "", ERROR, "|error| <= 0.004")  # fmt: skip
 
 
-@goal(
-    "the same strip on clamps and on held nodes, sag as a multiple of that of a clamped strip, finest grid",
-    "clamps within 1 / cells² of 1, nodes between (1 -+ 1 / cells)⁴",
-    "clamps are of second order; held nodes put each end wrong by half a cell, and the sag grows as L⁴",
-)
-def _(rows: list[Row]) -> Iterable[Finding]:
+def _strips(rows: Recorded) -> Iterator[Row]:
+    """Sags of strips on clamps and on held nodes, as a multiple of that of a clamped strip."""
     for hold in ("clamp", "nodes"):
-        if found := _by(select(rows, "hinged strip", hold=hold), "hold").get(hold):
-            cells, share = found[-1]["parameters"]["cells"], 5 * (1 - found[-1]["result"]["error"])
-            low, high = (1 - 1 / cells) ** 4, (1 + 1 / cells) ** 4
-            reached = abs(share - 1) <= 1 / cells**2 if hold == "clamp" else low <= share <= high
-            yield f"`{hold}`", f"{share:.3f}", reached
+        for row in _finest(rows, "hinged strip", hold=hold):
+            share, cell = 5 * (1 - row["error"]), 1 / row["cells"]
+            low, high = (1 - cell**2, 1 + cell**2) if hold == "clamp" else ((1 - cell) ** 4, (1 + cell) ** 4)
+            yield row | {"share": share, "low": low, "high": high}
 
 
-@goal(
-    "cantilever, drop, b = 1, by cells through the thickness",
-    "within 4 %",
-    "the shear that the elastica lacks (0.8 %) and the quadrature of three cells (2.8 %)",
-)
-def _(rows: list[Row]) -> Iterable[Finding]:
-    for variant, found in _by(select(rows, "cantilever", b=1.0)).items():
-        for row in found:
-            yield f"`{variant}` at {row['parameters']['cells']}", *_percent(row["result"]["error"], 0.04)
+_goal("the same strip on clamps and on held nodes, sag as a multiple of that of a clamped strip, finest grid",
+      "clamps within 1 / cells² of 1, nodes between (1 -+ 1 / cells)⁴",
+      "clamps are of second order; held nodes put each end wrong by half a cell, and the sag grows as L⁴",
+      _strips, "`{hold}`", "{share:.3f}", "share >= low and share <= high")  # fmt: skip
+_goal("cantilever, drop, b = 1, by cells through the thickness", "within 4 %",
+      "the shear that the elastica lacks (0.8 %) and the quadrature of three cells (2.8 %)",
+      partial(_each, problem="cantilever", b=1.0), "`{variant}` at {cells}", ERROR, "|error| <= 0.04")  # fmt: skip
 
 
-@goal(
-    "cantilever, part of the drop that neither shear nor quadrature explains",
-    "within the square of the part from quadrature",
-    "the next term of the quadrature's error",
-)
-def _(rows: list[Row]) -> Iterable[Finding]:
-    for variant, found in _by(select(rows, "cantilever")).items():
-        for row in found:
-            p, result = row["parameters"], row["result"]
-            name = f"`{variant}` at {p['cells']}" + (f", b = {p['b']:g}" if p["b"] != 1 else "")
-            yield name, *_percent(result["unexplained"], result["quadrature"] ** 2)
+def _unexplained(rows: Recorded) -> Iterator[Row]:
+    for row in _each(rows, "cantilever"):
+        yield row | {"square": row["quadrature"] ** 2, "other": None if row["b"] == 1 else row["b"]}
 
 
-@goal(
-    "cantilevers of 0.3 to 8 cells, held in a region of 0.34 to 3.3 cells, at four places and two angles: frequency",
-    "within 3 % of a clamped beam's",
-    "second order: the blur of a bending mode is (k dx)² / 8, below 1 %, and a sheet needs some points more on a slant",
-)
-def _(rows: list[Row]) -> Iterable[Finding]:
-    for thickness, found in _by(select(rows, "held cantilever"), "thickness").items():
-        worst = max(found, key=lambda row: row["result"]["error"])
-        yield f"{thickness:g}:", *_percent(worst["result"]["ratio"] - 1, 0.03)
+_goal("cantilever, part of the drop that neither shear nor quadrature explains",
+      "within the square of the part from quadrature", "the next term of the quadrature's error", _unexplained,
+      "`{variant}` at {cells}[[, b = {other:g}]]", "{unexplained:.3g %}", "|unexplained| <= square")  # fmt: skip
 
 
-@goal("cantilever clamped in a region, observed order in dx toward its own limit", "at least 1.8", SECOND)
-def _(rows: list[Row]) -> Iterable[Finding]:
-    for variant, found in _by(select(rows, "clamped end")).items():
+def _held(rows: Recorded) -> Iterator[Row]:
+    return (row | {"off": row["ratio"] - 1} for row in _worst(rows, "held cantilever", "thickness"))
+
+
+_goal("cantilevers of 0.3 to 8 cells, held in a region of 0.34 to 3.3 cells, at four places and two angles: frequency",
+      "within 3 % of a clamped beam's", "second order: the blur of a bending mode is (k dx)² / 8, below 1 %, and a "
+      "sheet needs some points more on a slant", _held, "{thickness:g}:", "{off:.3g %}", "|off| <= 0.03")  # fmt: skip
+
+
+def _ends(rows: Recorded) -> Iterator[Row]:
+    for found in _by(select(rows, "clamped end")).values():
         if len(found) > 2:
-            observed = own_order(found[-3:])
-            yield f"`{variant}`", f"{observed:.2f}", observed >= 1.8
+            yield found[-1]["parameters"] | {"order": own_order(found[-3:])}
 
 
+_goal("cantilever clamped in a region, observed order in dx toward its own limit", "at least 1.8", SECOND, _ends,
+      VARIANT, "{order:.2f}", "order >= 1.8")  # fmt: skip
 _errors("cantilever clamped in a region, frequency at 8 cells", "clamped end", 8, 0.005, BEAM)
+_goal("free elastic block, energy averaged over a period, at the end (`total` after 100 periods, the others after 20)",
+      "change below 0.1 %",
+      "symplectic steps keep the energy but for terms of the square of the substep; nothing in the problem takes any",
+      partial(_each, problem="free block"), VARIANT, ERROR, "|error| <= 0.001")  # fmt: skip
 
 
-@goal(
-    "free elastic block, energy averaged over a period, at the end (`total` after 100 periods, the others after 20)",
-    "change below 0.1 %",
-    "symplectic steps keep the energy but for terms of the square of the substep; nothing in the problem takes any",
-)
-def _(rows: list[Row]) -> Iterable[Finding]:
-    for row in select(rows, "free block"):
-        yield f"`{row['parameters']['variant']}`", *_percent(row["result"]["error"], 0.001)
+def _momenta(rows: Recorded) -> Iterator[Row]:
+    for row in _each(rows, "free block"):
+        yield row | {"change": max(row["linear"], row["angular"]), "rounding": 2.2e-16 * row["substeps"]}
 
 
-@goal(
-    "free elastic block, change of linear and angular momentum",
-    "at most a rounding (2.2e-16) for each substep",
-    "the transfers keep both exactly",
-)
-def _(rows: list[Row]) -> Iterable[Finding]:
-    for row in select(rows, "free block"):
-        change = max(row["result"]["linear"], row["result"]["angular"])
-        yield f"`{row['parameters']['variant']}`", f"{change:.1e}", change <= 2.2e-16 * row["result"]["substeps"]
+_goal("free elastic block, change of linear and angular momentum", "at most a rounding (2.2e-16) for each substep",
+      "the transfers keep both exactly", _momenta, VARIANT, "{change:.1e}", "change <= rounding")  # fmt: skip
 
 
-@goal(
-    "hinged plate, both laws",
-    "within 1 degree",
-    "chosen: the direction of a wind is hardly known better",
-)
-def _(rows: list[Row]) -> Iterable[Finding]:
-    for variant, found in _by(select(rows, "hinged plate")).items():
-        worst = max(abs(row["result"]["error"]) for row in found)
-        yield f"`{variant}`", f"{worst:.2f} degrees at worst", worst <= 1
+def _plates(rows: Recorded) -> Iterator[Row]:
+    return (row | {"worst": abs(row["error"])} for row in _worst(rows, "hinged plate"))
 
 
-@goal(
-    "drag on a plate and a sphere, for any set of Gaussians, by area",
-    "within 2.5 %",
-    "flat patches on a sphere: (spacing / radius)², which is 4 pi / 500 with 500 Gaussians",
-)
-def _(rows: list[Row]) -> Iterable[Finding]:
-    for area, found in _by(select(rows, "surface drag"), "area").items():
-        yield f"`{area}`", *_percent(max((row["result"]["error"] for row in found), key=abs), 0.025)
+_goal("hinged plate, both laws", "within 1 degree", "chosen: the direction of a wind is hardly known better", _plates,
+      VARIANT, "{worst:.2f} degrees at worst", "worst <= 1")  # fmt: skip
+_goal("drag on a plate and a sphere, for any set of Gaussians, by area", "within 2.5 %",
+      "flat patches on a sphere: (spacing / radius)², which is 4 pi / 500 with 500 Gaussians",
+      partial(_worst, problem="surface drag", name="area"), "`{area}`", ERROR, "|error| <= 0.025")  # fmt: skip
 
 
-@goal(
-    "sand element, friction angles",
-    "within 0.06 degrees",
-    "the return to the cone is exact; the theory is that of small strains, and here the pressure is E / 1000",
-)
-def _(rows: list[Row]) -> Iterable[Finding]:
-    strength = 6 * 0.5 / (math.sqrt(3) * (3 - 0.5))  # of the cone through 30 degrees in triaxial compression
-    exact = {"shear": math.degrees(math.atan(strength)), "triaxial": 30.0}
-    exact["plane_strain"] = math.degrees(math.asin(strength))
-    for row in select(rows, "sand element"):
-        for name, angle in exact.items():
-            off = row["result"][f"{name}_deg"] - angle
-            yield name.replace("_", " "), f"{off:+.4f}", abs(off) <= 0.06
+def mobilised() -> dict[str, float]:
+    """Friction angles [degrees] of the cone through 30 degrees in triaxial compression."""
+    strength = 6 * 0.5 / (math.sqrt(3) * (3 - 0.5))
+    shear, plane = math.degrees(math.atan(strength)), math.degrees(math.asin(strength))
+    return {"shear": shear, "triaxial": 30.0, "plane_strain": plane}
 
 
-@goal(
-    "sand on an incline, angle of friction from its acceleration, and the inclines between which it begins to flow",
-    "within 0.5 degrees of theory, and theory between them",
-    "half a step of the inclines tried",
-)
-def _(rows: list[Row]) -> Iterable[Finding]:
-    for row in select(rows, "sand slope"):
-        result = row["result"]
-        off = result["friction_deg"] - result["exact"]
-        yield "", f"{off:+.2f} degrees", abs(off) <= 0.5
-        told = f"stands at {result['stands']}, flows at {result['flows']}"
-        yield "", told, result["stands"] <= result["exact"] <= result["flows"]
+def _elements(rows: Recorded) -> Iterator[Row]:
+    for row in _each(rows, "sand element"):
+        for name, angle in mobilised().items():
+            yield {"name": name.replace("_", " "), "off": row[f"{name}_deg"] - angle}
 
 
-@goal(
-    "collapsing column of sand, run-out as a multiple of Lube's, finest grids",
-    "within the factor between Lube's and Lajeunesse's round columns, either way",
-    "the scatter of published experiments",
-)
-def _(rows: list[Row]) -> Iterable[Finding]:
-    every = select(rows, "sand column")
-    pairs = [sorted((row["result"]["lube"], row["result"]["lajeunesse"]))
-             for row in every if row["parameters"].get("planar") is False]  # fmt: skip
+_goal("sand element, friction angles", "within 0.06 degrees",
+      "the return to the cone is exact; the theory is that of small strains, and here the pressure is E / 1000",
+      _elements, "{name}", "{off:+.4f}", "|off| <= 0.06")  # fmt: skip
+
+
+def _slopes(rows: Recorded) -> Iterator[Row]:
+    for row in _each(rows, "sand slope"):
+        off = row["friction_deg"] - row["exact"]
+        told = f"{off:+.2f} degrees, stands at {row['stands']}, flows at {row['flows']}"
+        yield row | {"off": off, "told": told}
+
+
+_goal("sand on an incline, angle of friction from its acceleration, and the inclines between which it begins to flow",
+      "within 0.5 degrees of theory, and theory between them", "half a step of the inclines tried", _slopes, "",
+      "{told}", "|off| <= 0.5 and stands <= exact and exact <= flows")  # fmt: skip
+
+
+def _columns(rows: Recorded) -> Iterator[Row]:
+    """The finest grid of each column, and the scatter between Lube's and Lajeunesse's round ones."""
+    every = list(_each(rows, "sand column"))
+    pairs = [sorted((row["lube"], row["lajeunesse"])) for row in every if row.get("planar") is False]
     scatter = max((high / low for low, high in pairs), default=None)
     finest: dict[tuple[str, float], Row] = {}
-    for row in sorted(every, key=lambda row: row["parameters"]["cells"]):
-        p = row["parameters"]
-        kind = "round" if p.get("planar") is False else "planar"
-        finest[kind + ("" if p.get("volume_correction", True) else " without correction"), p["aspect"]] = row
-    for (kind, aspect), row in sorted(finest.items()) if scatter else ():
-        share = row["result"]["runout"] / row["result"]["lube"]
-        yield f"{kind}, a = {aspect:g}:", f"{share:.2f}", 1 / scatter <= share <= scatter
+    for row in sorted(every, key=lambda row: row["cells"]):
+        kind = "round" if row.get("planar") is False else "planar"
+        finest[kind + " without correction" * (not row.get("volume_correction", True)), row["aspect"]] = row
+    for (kind, _), row in sorted(finest.items(), key=lambda one: one[0]) if scatter else ():
+        yield row | {"kind": kind, "share": row["runout"] / row["lube"], "low": 1 / scatter, "high": scatter}
 
 
+_goal("collapsing column of sand, run-out as a multiple of Lube's, finest grids",
+      "within the factor between Lube's and Lajeunesse's round columns, either way",
+      "the scatter of published experiments", _columns, "{kind}, a = {aspect:g}:", "{share:.2f}",
+      "share >= low and share <= high")  # fmt: skip
 SOFT = "soft flag, E = 3e3 Pa, 250 frames"
 
 
-@goal(f"{SOFT}, density 20 to 50, dx 0.08 to 0.01", "no particle torn or lost", "`total` keeps every neighbour")
-def _(rows: list[Row]) -> Iterable[Finding]:
-    if found := select(rows, "soft flag"):
-        torn = sum(row["result"]["torn"] + row["result"]["lost"] for row in found)
-        low, high = (f(row["result"][n] for row in found) for f, n in ((min, "stretch_min"), (max, "stretch_max")))
-        yield "", f"{torn:.0f} torn or lost, singular values of F in [{low:.2f}, {high:.2f}]", torn == 0 and low > 0
+def _soft(rows: Recorded) -> Iterator[Row]:
+    if found := list(_each(rows, "soft flag")):
+        low, high = (f(row[n] for row in found) for f, n in ((min, "stretch_min"), (max, "stretch_max")))
+        yield {"torn": sum(row["torn"] + row["lost"] for row in found), "low": low, "high": high}
 
 
-@goal(
-    f"{SOFT}, change of the largest stretch by the last halving of dx, as a share of the change by the one before",
-    "at most 0.5",
-    "first order: each halving changes it by half as much",
-)
-def _(rows: list[Row]) -> Iterable[Finding]:
+_goal(f"{SOFT}, density 20 to 50, dx 0.08 to 0.01", "no particle torn or lost", "`total` keeps every neighbour",
+      _soft, "", "{torn:.0f} torn or lost, singular values of F in [{low:.2f}, {high:.2f}]",
+      "torn is 0 and low > 0")  # fmt: skip
+
+
+def _halvings(rows: Recorded) -> Iterator[Row]:
     for density, found in _by(select(rows, "soft flag"), "density").items():
         sizes = sorted(found, key=lambda row: -row["parameters"]["dx"])[-3:]
         if len(sizes) == 3:
             first, second, third = (row["result"]["stretch_max"] for row in sizes)
-            share = (third - second) / (second - first)
-            yield f"{density:g} kg/m³:", f"{share:.2f}", abs(share) <= 0.5
+            yield {"density": density, "share": (third - second) / (second - first)}
+
+
+_goal(f"{SOFT}, change of the largest stretch by the last halving of dx, as a share of the change by the one before",
+      "at most 0.5", "first order: each halving changes it by half as much", _halvings, "{density:g} kg/m³:",
+      "{share:.2f}", "|share| <= 0.5")  # fmt: skip

@@ -1,69 +1,110 @@
-"""Tables of ``bench.py contact``."""
+"""Tables of contact.md: ``bench.py contact``, and ``bench.py folds``, a flag that folds onto itself."""
 
 from __future__ import annotations
 
-from typing import Any
+from collections.abc import Iterator
 
 from bench.cases.contact import CASES
-from bench.slots import table
-from bench.tables.markdown import grid, source
+from bench.cases.folds import REFERENCES, ROWS
+from bench.tables.render import GOAL, Goal, Row, fill, judged, table
 
-Row = dict[str, Any]
 PAGE = "contact.md"
 
 
-@table(PAGE, "contact.cost", "contact_*")
-def cost(result: Row) -> list[str]:
-    """Time of a substep without contact, with it but nothing near, and with everything in contact."""
-    head = ["points", *(f"{case} [ms]" for case in CASES), "pairs listed for all", "a fifth / off", "all / off"]
-    lines = []
+def _costs(result: Row) -> Iterator[Row]:
+    """The cases of each size that has all of them, by their names."""
     for points in sorted({row["wanted"] for row in result["rows"]}):
         of = {row["case"]: row for row in result["rows"] if row["wanted"] == points}
-        if set(of) != set(CASES):
-            continue
-        times = [of[case]["median_ms"] for case in CASES]
-        shown = [f"{time:.3g}" for time in times]
-        ratios = [f"{time / times[0]:.2f}" for time in times[-2:]]
-        lines.append([f"{of['off']['points']:,}", *shown, f"{of[CASES[-1]]['pairs']:,}", *ratios])
-    return [source(result), "", *grid(head, lines)]
+        if set(of) == set(CASES):
+            off, most = of["off"], of[CASES[-1]]
+            ratios = {case: of[case]["median_ms"] / off["median_ms"] for case in CASES}
+            yield {"points": off["points"], "of": of, "pairs": most["pairs"], "ratio": ratios}
 
 
-@table(PAGE, "contact.collisions", "contact_*")
-def collisions(result: Row) -> list[str]:
-    """How close two sheets come that collide."""
-    head = ["speed [m/s]", "pairs of all frames", "closest", "closer than half", "crossings", "momentum lost"]
-    lines = [
-        [
-            f"{row['speed_m_s']:g}",
-            f"{row['pairs']:,}",
-            f"{row['closest']:.2f} thicknesses",
-            f"{100 * row['closer_than_half']:.3f} %",
-            str(row["crossings"]),
-            f"{row['momentum_change']:.1e}",
-        ]
-        for row in result["collisions"]
-    ]
-    return [source(result), "", *grid(head, lines)]
+table(PAGE, "contact.cost", "contact_*", _costs, f"""
+    points = {{points:,}} | {" | ".join(f"{case} [ms] = {{of.{case}.median_ms:.3g}}" for case in CASES)} |
+    pairs listed for all = {{pairs:,}} | a fifth / off = {{ratio.{CASES[-2]}:.2f}} |
+    all / off = {{ratio.{CASES[-1]}:.2f}}
+    """, before="{source}")  # fmt: skip
+
+table(PAGE, "contact.collisions", "contact_*", "collisions", """
+    speed [m/s] = {speed_m_s:g} | pairs of all frames = {pairs:,} | closest = {closest:.2f} thicknesses |
+    closer than half = {closer_than_half:.3f %} | crossings = {crossings} | momentum lost = {momentum_change:.1e}
+    """, before="{source}")  # fmt: skip
 
 
-@table(PAGE, "contact.pile", "contact_cuda")
-def pile(result: Row) -> list[str]:
-    """How a pile rests: its first second, and every tenth."""
+def _pile(result: Row) -> Iterator[Row]:
+    """The first second, and every tenth, with the changes since the first."""
     rows = result.get("pile", [])
-    if not rows:
-        return ["Not recorded."]
-    first, lines = rows[0], []
-    for row in [first, *(row for row in rows if round(row["time"]) % 10 == 0)]:
-        lines.append(
-            [
-                f"{row['time']:.0f}",
-                f"{row['kinetic']:.1e}",
-                f"{row['elastic'] - first['elastic']:+.1e}",
-                f"{row['potential'] - first['potential']:+.1e}",
-                f"{row['top'] - first['top']:+.4f}",
-                f"{1e3 * (row['slid'] - first['slid']):+.2f}",
-                f"{row['rounds']:.1f}" if "rounds" in row else "-",
-            ]
-        )
-    head = ["time [s]", "motion", "bending", "height", "top layer [thicknesses]", "slid [mm]", "iterations"]
-    return [source(result), "", *grid(head, lines)]
+    for row in [*rows[:1], *(row for row in rows if round(row["time"]) % 10 == 0)]:
+        changes = {name: row[name] - rows[0][name] for name in ("elastic", "potential", "top", "slid")}
+        yield row | changes
+
+
+table(PAGE, "contact.pile", "contact_cuda", _pile, """
+    time [s] = {time:.0f} | motion = {kinetic:.1e} | bending = {elastic:+.1e} | height = {potential:+.1e} |
+    top layer [thicknesses] = {top:+.4f} | slid [mm] = {slid:+.2f (mm)} | iterations = {rounds or '-':.1f}
+    """, before="{source}", empty="Not recorded.")  # fmt: skip
+
+
+def _doubt(known: Row) -> float | None:
+    """The largest distance of a reference from itself, solved otherwise."""
+    return max((row["chamfer"] for row in known.get("uncertainty", {}).values()), default=None)
+
+
+def _folds(result: Row) -> Iterator[Row]:
+    """What is how far from each reference: our rows, the references, and each solved otherwise."""
+    known = result["references"]
+    names = [name for name in REFERENCES if name in known]
+
+    def line(title: str, near: Row, crossings: object) -> Iterator[Row]:
+        row = {"title": title, "crossings": crossings}
+        yield from (row | {"to": REFERENCES[name], "near": near.get(name)} for name in names)
+
+    for name, fold in ROWS.items():
+        if row := result.get("rows", {}).get(name):
+            broken = "failed" in row or row["status"] != "complete"
+            near = {other: "failed" if broken else row["to"].get(other, {}).get("chamfer_share") for other in names}
+            yield from line(fold.title(), near, None if broken or not row["crossings"] else sum(row["crossings"]))
+    for name in names:
+        near = {
+            other: result["apart"].get(f"{name} {other}", result["apart"].get(f"{other} {name}")) for other in names
+        }
+        count = known[name]["crossings"]
+        yield from line(REFERENCES[name], near | {name: ""}, sum(count) if count else None)
+    yield from line("the reference itself, solved otherwise", {name: _doubt(known[name]) for name in names}, "")
+
+
+table(PAGE, "folds.rows", "folds_*", _folds, " = {title} | *{to} = {near:.2f %} | crossings = {crossings}",
+      before="{source}")  # fmt: skip
+
+
+def _references(result: Row) -> Iterator[Row]:
+    for name, row in result["references"].items():
+        ways = [one | {"key": key} for key, one in row.get("uncertainty", {}).items()]
+        told = "; ".join(fill("{key} ({cells} cells, {quality} steps) {chamfer:.2f %}", way) for way in ways)
+        yield row | {"title": REFERENCES[name], "ways": told}
+
+
+table(PAGE, "folds.references", "folds_*", _references, """
+    reference = {title} | cells along the flag = {cells} | steps per frame = {quality} | frames = {frames} |
+    solved otherwise = {ways}
+    """)  # fmt: skip
+
+
+def _near(result: Row) -> Iterator[Row]:
+    """Each row beside the reference with the same contact; the limit is two per cent above what that is in doubt."""
+    for name, fold in ROWS.items():
+        other = "blender_contact" if fold.contact else "blender"
+        doubt = _doubt(result["references"].get(other, {}))
+        near = result.get("rows", {}).get(name, {}).get("to", {}).get(other, {}).get("chamfer_share")
+        if near is not None and doubt is not None:
+            told = {"title": fold.title(), "other": REFERENCES[other], "near": near, "doubt": doubt}
+            yield told | {"above": 0.02, "most": doubt + 0.02}
+
+
+FOLD_GOALS = [
+    Goal("{title}: within {above:g %} above the uncertainty of {other}", "{near:.2f %}, {doubt:.2f %} + {above:g %}",
+         "near <= most", _near),
+]  # fmt: skip
+table(PAGE, "folds.goals", "folds_*", judged(FOLD_GOALS), GOAL, empty="This record has none of our flags.")

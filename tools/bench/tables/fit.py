@@ -1,15 +1,15 @@
-"""Tables of ``bench.py fit``: what was found from videos, and how far it is from the truth."""
+"""Tables of fit.md: ``bench.py fit``, what was found from videos, and ``bench.py soft``, the same of a soft body."""
 
 from __future__ import annotations
 
 import math
-from typing import Any
+from collections.abc import Iterator
+from functools import partial
 
-from bench.slots import table, value
-from bench.tables.markdown import grid, source, yes_no
+from bench.tables.render import Row, fill, table, value
 from gaussian_swaying.fitting.report import ASTRAY
 
-Row = dict[str, Any]
+PAGE = "fit.md"
 
 OWN = (0.01, 1.0, 0.01)
 TWO, ONE = (0.05, 3.0, 0.10), (0.10, 6.0, 0.20)
@@ -18,158 +18,100 @@ ABLATIONS = ("tracks alone", "pixels alone", "without patches")
 """Rows that have no goal."""
 LOST = 100.0
 """Distance [pixels] above which a simulation with the true values does not show the same motion at all."""
-
-HEAD = ["", "speed", "direction", "E", "predicted frames", "time"]
 SHARP = 28.0
 """Least PSNR of the predicted frames [dB], unless the splat at rest has less."""
 
-
-@table("fit.md", "fit.own", "fit_*", together=True)
-def own(results: list[Row]) -> list[str]:
-    """Fits of videos that this package made, on each device."""
-    lines: list[str] = []
-    for result in results:
-        if rows := result.get("own", {}):
-            found = [
-                [_named(n, row), *cells(row), "" if n in ABLATIONS else _reached(row, OWN)] for n, row in rows.items()
-            ]
-            one = next(row for row in rows.values() if "points" in row)
-            width, height = one["size"]
-            told = f"{one['points']:,} points, videos of {width} x {height}, {one['until_s']:.3g} s fitted."
-            table_ = grid([*HEAD, "within 1 % and 1 degree"], found)
-            lines += ["", source(result), "", told, "", *table_]
-    return lines[1:] or ["Not measured yet."]
+_BLANK = dict.fromkeys(("direction_error_deg", "material.E_error", "psnr_predicted_db", "psnr_rest_db", "seconds",
+                        "processor_s", "sharp"), "")  # fmt: skip
+"""What a row need not have."""
+_FOUND = """ = {name} | speed = {speed_error:+.2f %} | direction = {direction_error_deg:.2f °} |
+    E = {material.E_error:+.2f %} | predicted frames = {psnr_predicted_db:.1f dB} | time = {seconds:.0f s}"""
+_NONE = "Not measured yet."
 
 
-@table("fit.md", "fit.blender", "fit_*", together=True)
-def blender(results: list[Row]) -> list[str]:
-    """Fits of videos of Blender's cloth, on each device."""
-    lines: list[str] = []
-    for result in results:
-        if rows := result.get("blender", {}):
-            found = []
-            for name, row in sorted(rows.items()):
-                free = name.split(", ")[-1] in ABLATIONS
-                goal = _reached(row, ONE if "one camera" in name else TWO)
-                sharp = ["", ""] if "refused" in row else [_decibels(row.get("psnr_rest_db")), _sharp(row)]
-                found.append([_named(name, row), *cells(row), *sharp, _base(row), "" if free else goal])
-            head = [
-                *HEAD,
-                "splat at rest",
-                "28 dB, or as at rest",
-                "fitted; mesh; changes of scene.yaml",
-                "goal reached",
-            ]
-            lines += ["", source(result), "", *grid(head, found)]
-    return lines[1:] or ["Not measured yet."]
+def _rows(result: Row, part: str) -> Iterator[Row]:
+    """What each fit found, whether it reaches the goals of its kind, and whether its frames are sharp."""
+    for name, row in result.get(part, {}).items():
+        lost = row.get("psnr_rest_db", 0.0) - row.get("psnr_fitted_db", math.inf) > ASTRAY
+        named = name + " (not settled)" * bool(row.get("not_settled")) + " (not followed)" * lost
+        base = [fill("{until_s:.3g} s", row)] if "until_s" in row else []
+        base += [f"{row['cells']} cells"] if row.get("cells") else []
+        base += [", ".join(f"`{key}` {value}" for key, value in row.get("known", {}).items())]
+        told = {"key": name, "name": named, "base": "; ".join(filter(None, base))}
+        if "refused" in row:
+            more = {"speed_error": "refused", "reached": False, "sharp": ""}
+        else:
+            limits = OWN if part == "own" else ONE if "one camera" in name else TWO
+            errors = row["speed_error"], row["direction_error_deg"], row.get("material.E_error", 0.0)
+            reached = all(abs(error) <= limit for error, limit in zip(errors, limits, strict=True))
+            more = {"reached": reached, "sharp": row["psnr_predicted_db"] >= min(SHARP, row.get("psnr_rest_db", SHARP))}
+        yield _BLANK | row | told | more | ({"reached": ""} if name.split(", ")[-1] in ABLATIONS else {})
 
 
-@value("fit.within", "fit_*")
-def within(result: Row) -> str:
-    """How many fits of Blender's cloth are within the goals of speed, direction and E."""
-    reached = [_reached(row, ONE if "one camera" in name else TWO) for name, row in _with_goals(result).items()]
-    return f"{reached.count('yes')} of {len(reached)}"
+def _data(result: Row) -> str:
+    """The source, and the data of the first fit that was not refused."""
+    one = next(row for row in result["own"].values() if "points" in row)
+    told = "{points:,} points, videos of {size.0} x {size.1}, {until_s:.3g} s fitted."
+    return "{source}\n\n" + fill(told, one | {"size": dict(zip("01", one["size"], strict=True))})
 
 
-@value("fit.sharp", "fit_*")
-def sharp(result: Row) -> str:
-    """How many of them predict frames as sharp as wanted."""
-    reached = ["no" if "refused" in row else _sharp(row) for row in _with_goals(result).values()]
-    return f"{reached.count('yes')} of {len(reached)}"
+def _counted(result: Row) -> Row:
+    """How many fits of Blender's cloth have goals, reach them, and predict frames as sharp as wanted."""
+    rows = [row for row in _rows(result, "blender") if row["reached"] != ""]
+    return {"all": len(rows)} | {name: sum(row[name] is True for row in rows) for name in ("reached", "sharp")}
 
 
-def _with_goals(result: Row) -> Row:
-    rows = result.get("blender", {})
-    return {name: row for name, row in rows.items() if name.split(", ")[-1] not in ABLATIONS}
+table(PAGE, "fit.own", "fit_*", partial(_rows, part="own"), f"{_FOUND} | within 1 % and 1 degree = {{reached}}",
+      before=_data, each=True, empty=_NONE)  # fmt: skip
+table(PAGE, "fit.blender", "fit_*", partial(_rows, part="blender"), f"""
+    {_FOUND} | splat at rest = {{psnr_rest_db:.1f dB}} | 28 dB, or as at rest = {{sharp}} |
+    fitted; mesh; changes of scene.yaml = {{base}} | goal reached = {{reached}}
+    """, before="{source}", order=["key"], each=True, empty=_NONE)  # fmt: skip
+value("fit.within", "fit_*", "{reached:g} of {all}", _counted)
+value("fit.sharp", "fit_*", "{sharp:g} of {all}", _counted)
 
 
-@table("fit.md", "fit.bias", "fit_*", together=True)
-def bias(results: list[Row]) -> list[str]:
-    """How far faults of the model alone move the values, on each device."""
-    lines: list[str] = []
-    for result in results:
-        if rows := result.get("bias", {}):
-            found = [[_options(name), *_moved(row), f"{row['points']:,}"] for name, row in rows.items()]
-            head = ["case and grid", "distance", "speed", "azimuth", "E", "points"]
-            lines += ["", source(result), "", *grid(head, found)]
-    return lines[1:] or ["Not measured yet."]
+def _biases(result: Row) -> Iterator[Row]:
+    """How far faults of the model alone move the values; options are named by their last word."""
+    for name, row in result.get("bias", {}).items():
+        case, *options = name.split(", ")
+        short = (f"`{option.split('.', option.split(' ')[0].count('.'))[-1]}`" for option in options)
+        blank = {"speed_error": "", "azimuth_error_deg": "", "material.E_error": ""}
+        lost = {"told": "the simulation diverged"} | blank if row["rms_px"] > LOST else {}
+        yield {"told": fill("{rms_px:.2f} pixels", row)} | row | lost | {"name": ", ".join([case, *short])}
 
 
-@table("fit.md", "fit.reference", "fit_*", together=True)
-def reference(results: list[Row]) -> list[str]:
+table(PAGE, "fit.bias", "fit_*", _biases, """
+    case and grid = {name} | distance = {told} | speed = {speed_error:+.2f %} |
+    azimuth = {azimuth_error_deg:+.2f °} | E = {material.E_error:+.2f %} | points = {points:,}
+    """, before="{source}", each=True, empty=_NONE)  # fmt: skip
+
+
+def _unfitted(result: Row) -> Iterator[Row]:
     """What a splat predicts that is not fitted: moved as the reference, or simulated with the true values."""
-    lines: list[str] = []
-    for result in results:
-        if rows := result.get("reference", {}):
-            cases, motions = (list(dict.fromkeys(n.split(", ", 1)[k] for n in sorted(rows))) for k in (0, 1))
-            found = [
-                [case, *(_decibels(rows.get(f"{case}, {m}", {}).get("psnr_predicted_db")) for m in motions)]
-                for case in cases
-            ]
-            head = ["predicted frames", *(m.removeprefix("uncertainty/") for m in motions)]
-            lines += ["", source(result), "", *grid(head, found)]
-    return lines[1:] or ["Not measured yet."]
+    for name, row in sorted(result.get("reference", {}).items()):
+        case, motion = name.split(", ", 1)
+        yield row | {"case": case, "motion": motion.removeprefix("uncertainty/")}
 
 
-def _options(name: str) -> str:
-    """The case, and its options by their last word."""
-    case, *options = name.split(", ")
-    return ", ".join([case, *(f"`{option.split('.', option.split(' ')[0].count('.'))[-1]}`" for option in options)])
+table(PAGE, "fit.reference", "fit_*", _unfitted, """
+    predicted frames = {case} | *{motion} = {psnr_predicted_db:.1f dB}
+    """, before="{source}", each=True, empty=_NONE)  # fmt: skip
 
 
-def _moved(row: Row) -> list[str]:
-    if row["rms_px"] > LOST:
-        return ["the simulation diverged", "", "", ""]
-    return [
-        f"{row['rms_px']:.2f} pixels",
-        f"{100 * row['speed_error']:+.2f} %",
-        f"{row['azimuth_error_deg']:+.2f}°",
-        f"{100 * row['material.E_error']:+.2f} %",
-    ]
+def _motions(result: Row) -> Iterator[Row]:
+    """Motions at the true values beside Newton's, and Newton's on other meshes."""
+    for part, title in (("motion", "ours, {key}; {points:,} points"), ("reference", "Newton, {key}")):
+        for name, row in result.get(part, {}).items():
+            changes = {key: row[key] - 1 for key in ("swing", "deflection")}
+            yield row | changes | {"name": fill(title, row | {"key": name})}
 
 
-def _named(name: str, row: Row) -> str:
-    """The name of a row, and whether its fit has not settled or does not follow the video."""
-    lost = row.get("psnr_rest_db", 0.0) - row.get("psnr_fitted_db", math.inf) > ASTRAY
-    return name + " (not settled)" * bool(row.get("not_settled")) + " (not followed)" * lost
-
-
-def cells(row: Row) -> list[str]:
-    """What a fit found: errors of speed, direction and E, predicted frames, and the time it took."""
-    if "refused" in row:
-        return ["refused", "", "", "", ""]
-    stiffness = row.get("material.E_error")
-    return [
-        f"{100 * row['speed_error']:+.2f} %",
-        f"{row['direction_error_deg']:.2f}°",
-        "" if stiffness is None else f"{100 * stiffness:+.2f} %",
-        _decibels(row["psnr_predicted_db"]),
-        f"{row['seconds']:.0f} s",
-    ]
-
-
-def _decibels(psnr: float | None) -> str:
-    return "" if psnr is None else f"{psnr:.1f} dB"
-
-
-def _sharp(row: Row) -> str:
-    """Whether the predicted frames are as sharp as wanted."""
-    return yes_no(row["psnr_predicted_db"] >= min(SHARP, row.get("psnr_rest_db", SHARP)))
-
-
-def _base(row: Row) -> str:
-    """How much of the video was fitted, the mesh of the reference, and what was changed in the case's configuration."""
-    cells = f"; {row['cells']} cells" if row.get("cells") else ""
-    known = ", ".join(f"`{name}` {value}" for name, value in row.get("known", {}).items())
-    return (f"{row['until_s']:.3g} s" if "until_s" in row else "") + cells + (f"; {known}" if known else "")
-
-
-def _reached(row: Row, goal: tuple[float, float, float]) -> str:
-    if "refused" in row:
-        return "no"
-    speed, angle, stiffness = goal
-    return yes_no(
-        abs(row["speed_error"]) <= speed
-        and row["direction_error_deg"] <= angle
-        and abs(row.get("material.E_error", 0.0)) <= stiffness
-    )
+table(PAGE, "fit.soft_motion", "soft_*", _motions, """
+    = {name} | mean distance = {mean_m:.2f mm} | largest distance = {largest_m:.1f mm} |
+    first swing = {swing:+.1f %} | deflection later = {deflection:+.1f %}
+    """, before="{source}", each=True, empty=_NONE)  # fmt: skip
+table(PAGE, "fit.soft", "soft_*", partial(_rows, part="fits"), f"""
+    {_FOUND} | of the processor = {{processor_s:.0f s}} | splat at rest = {{psnr_rest_db:.1f dB}} |
+    fitted; changes of scene.yaml = {{base}}
+    """, before="{source}", each=True, empty=_NONE)  # fmt: skip

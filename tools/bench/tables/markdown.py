@@ -46,3 +46,10 @@ def yes_no(reached: bool | None) -> str:
 def gib(size: float | None, digits: int = 2) -> str:
     """Bytes as GiB; a dash for None."""
     return "-" if size is None else f"{size / 2**30:.{digits}f}"
+
+
+def digits(value: float | None) -> str:
+    """Three digits, without exponents; a dash for None."""
+    if value is None:
+        return "-"
+    return f"{value:,.0f}" if abs(value) >= 100 else f"{value:.3g}"

@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 from collections import Counter
-from typing import Any
+from collections.abc import Iterator
 
 from bench import stamps
-from bench.slots import value
-from bench.tables.markdown import grid
+from bench.tables.markdown import stack
+from bench.tables.render import Row, table
 
-Row = dict[str, Any]
 _NAMES = ("problem", "solver", "name", "scene", "case", "wind", "obstacle", "variant", "formulation", "dx_m")
 
 
@@ -28,16 +27,19 @@ def labels(result: Row, places: dict[str, str]) -> str:
     return ". ".join(told)
 
 
-@value("measured.rows", "*", together=True)  # optional: a folder of a few results has no page for them
-def rows(results: list[Row]) -> list[str]:
+def _stamps(results: list[Row]) -> Iterator[Row]:
     """Every stamp of every record, with its rows."""
-    head = ["record", "rows", "date (UTC)", "commit", "tree", "versions", "changed since"]
-    shown = []
     for result in results:
         for stamp in sorted(result.get("measured", {}).values(), key=lambda one: str(one["date"])):
             tree = {True: "clean", False: "changed", None: "not recorded"}[stamp["clean"]]
             commit = f"recorded in {stamp['commit'][:7]}" if stamp.get("from_history") else str(stamp["commit"])[:7]
-            made = ", ".join(f"{name} {version}" for name, version in stamp["versions"].items()) or "not recorded"
-            shown.append([stamp["record"], labels(result, stamp["rows"]), stamp["date"] or "not recorded",
-                          commit, tree, made, ", ".join(stamp["older"]) or "-"])  # fmt: skip
-    return grid(head, shown)
+            made = stack(stamp) or "not recorded"
+            yield stamp | {"rows": labels(result, stamp["rows"]), "tree": tree, "commit": commit, "made": made,
+                           "changed": stamp["older"] or None}  # fmt: skip
+
+
+# no page must have it: a folder of a few results has no page for them
+table(None, "measured.rows", "*", _stamps, """
+    record = {record} | rows = {rows} | date (UTC) = {date or 'not recorded'} | commit = {commit} | tree = {tree} |
+    versions = {made} | changed since = {changed}
+    """, together=True)  # fmt: skip

@@ -8,6 +8,11 @@ from typing import Any
 Row = dict[str, Any]
 
 
+def all_rows(results: list[Row]) -> list[Row]:
+    """The rows of all records."""
+    return [row for result in results for row in result["rows"]]
+
+
 def order(coarse: Row, fine: Row) -> float:
     """Observed order of convergence in dx between two rows of the same problem."""
     ratio = fine["parameters"]["cells"] / coarse["parameters"]["cells"]
