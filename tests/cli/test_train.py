@@ -189,6 +189,7 @@ def _stop_at(monkeypatch, step, error):
     monkeypatch.setattr(SplatTrainer, "_train_on", stop)
 
 
+@pytest.mark.slow(gate=["divergence", "SIGTERM"])
 @pytest.mark.usefixtures("_interrupts")
 @pytest.mark.parametrize(
     ("error", "code", "words"),
@@ -301,6 +302,7 @@ class _Fuse:
         return open, (str(self.path), "w")
 
 
+@pytest.mark.slow(gate=[".ckpt-fit", "-validate"])
 @pytest.mark.parametrize("command", ["fit", "validate", "test"])
 @pytest.mark.parametrize("suffix", [".ckpt", ""])
 def test_a_checkpoint_executes_no_code(command, suffix, capture, tmp_path, capsys):

@@ -82,6 +82,7 @@ def _own_places(holds, phase=0, scene=0):
 # ---- what is held
 
 
+@pytest.mark.slow(gate=["3-clamp-dtype0-1e-14", "3-hinge-dtype1-2e-07", "1-hinge-dtype0-1e-14", "1-clamp-dtype1-2e-07"])
 @pytest.mark.parametrize(("dtype", "most"), [(torch.float64, 1e-14), (torch.float32, 2e-7)])
 @pytest.mark.parametrize("kind", ["hinge", "clamp"])
 @pytest.mark.parametrize("layers", [1, 3])
