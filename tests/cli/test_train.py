@@ -405,6 +405,7 @@ def test_bad_settings(options, words, capture, tmp_path, capsys):
     assert error.count("\n") == 1
 
 
+@pytest.mark.slow(twin="test_bad_settings")
 def test_the_tool_as_a_program(tmp_path):
     environment = {**os.environ, "PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1"}
     command = [sys.executable, str(ROOT / "tools/train.py"), "fit", "--config", str(QUICK), "--trainer.max_steps=many"]

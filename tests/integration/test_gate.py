@@ -27,16 +27,18 @@ def test_what_is_slow_has_a_twin_in_the_gate(request):
         ([("whole", {"twin": "sample"}), ("sample", None)], []),
         ([("whole", {"twin": "sample"}), ("sample", {})], ["whole", "sample"]),
         ([("whole", {"twin": "sample"})], ["whole"]),
+        ([("whole", {}), ("whole", None, "elsewhere.py")], ["whole"]),
+        ([("whole", {"twin": "sample"}), ("sample", None, "elsewhere.py")], []),
     ],
 )
 def test_a_twin_runs_in_the_gate(given, alone):
     """On a GPU slow tests of the interpreter are quick, so a test that needs one is no twin."""
 
-    def item(name, mark):
+    def item(name, mark, path="here.py"):
         name, _, parameters = name.removesuffix("]").partition("[")
         marks = {"gpu": mark} if mark == "gpu" else {} if mark is None else {"slow": SimpleNamespace(kwargs=mark)}
         more = {"callspec": SimpleNamespace(id=parameters)} if parameters else {}
-        return SimpleNamespace(originalname=name, get_closest_marker=marks.get, **more)
+        return SimpleNamespace(path=path, originalname=name, get_closest_marker=marks.get, **more)
 
     assert without_a_twin([item(*each) for each in given]) == alone
 
