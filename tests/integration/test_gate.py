@@ -12,7 +12,8 @@ PACKAGE = TESTS.parent / "gaussian_swaying"
 
 
 def test_what_is_slow_has_a_twin_in_the_gate(request):
-    """Of the tests that were collected together with this one."""
+    if not any(TESTS.is_relative_to(Path(given.partition("::")[0]).resolve()) for given in request.config.args):
+        pytest.skip("needs all tests")  # twins may be in other files
     assert without_a_twin([item for item in request.session.items if isinstance(item, pytest.Function)]) == []
 
 
