@@ -407,7 +407,7 @@ def test_supports_take_the_momentum_of_the_forces(formulation):
     assert float(states[-1].impulse[0, 2]) < 0
 
 
-@pytest.mark.slow(gate=["hinge"])
+@pytest.mark.slow(twin="test_held_points_stay_where_they_are")
 @pytest.mark.parametrize("kind", ["hinge", "clamp", "nodes"])
 def test_two_pins_carry_weight_and_wind_at_rest(kind):
     points = _sheet(width=12, shift=(0.03, 0, 0))  # symmetric on the grid
