@@ -115,6 +115,7 @@ def test_the_kernels_blow_as_torch_does(kernel_device, formulation, name):
     assert float((bare.velocity - expected.velocity).abs().max()) > 1e-2 * float(expected.velocity.abs().max())
 
 
+@pytest.mark.slow(gate=["interpreted-updated"])
 @pytest.mark.parametrize("formulation", ["total", "updated"])
 def test_the_kernels_blow_on_groups_of_patches_and_batches(kernel_device, formulation):
     for options in ({"groups": True}, {"batch": (2,)}):

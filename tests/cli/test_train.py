@@ -189,6 +189,7 @@ def _stop_at(monkeypatch, step, error):
     monkeypatch.setattr(SplatTrainer, "_train_on", stop)
 
 
+@pytest.mark.slow(gate=["divergence", "SIGTERM"])
 @pytest.mark.usefixtures("_interrupts")
 @pytest.mark.parametrize(
     ("error", "code", "words"),
@@ -301,6 +302,7 @@ class _Fuse:
         return open, (str(self.path), "w")
 
 
+@pytest.mark.slow(gate=[".ckpt-fit", "-validate"])
 @pytest.mark.parametrize("command", ["fit", "validate", "test"])
 @pytest.mark.parametrize("suffix", [".ckpt", ""])
 def test_a_checkpoint_executes_no_code(command, suffix, capture, tmp_path, capsys):
@@ -403,6 +405,7 @@ def test_bad_settings(options, words, capture, tmp_path, capsys):
     assert error.count("\n") == 1
 
 
+@pytest.mark.slow(twin="test_bad_settings")
 def test_the_tool_as_a_program(tmp_path):
     environment = {**os.environ, "PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1"}
     command = [sys.executable, str(ROOT / "tools/train.py"), "fit", "--config", str(QUICK), "--trainer.max_steps=many"]

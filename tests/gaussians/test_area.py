@@ -44,7 +44,7 @@ def test_sum_is_the_area_of_a_plane_with_borders(kind, side, overlap):
     assert _sum_on_plane(_plane(kind, side), overlap) == pytest.approx(1, abs=0.03)
 
 
-@pytest.mark.slow(gate=["regular"])
+@pytest.mark.slow(twin="test_sum_is_the_area_of_a_plane_with_borders")
 @pytest.mark.parametrize("kind", ["regular", "random"])
 def test_sum_at_a_hundred_thousand(kind):
     assert _sum_on_plane(_plane(kind, 316)) == pytest.approx(1, abs=0.01)
@@ -83,6 +83,7 @@ def test_sum_scales_and_moves_with_the_scene():
     assert total / scale**2 == pytest.approx(_sum_on_plane(points), rel=2e-3)
 
 
+@pytest.mark.slow(gate=["1-regular", "-1-random"])
 @pytest.mark.parametrize("kind", ["regular", "random"])
 @pytest.mark.parametrize("sign", [1, -1])
 def test_shell_counts_each_sheet_from_one_spacing_apart(kind, sign):

@@ -34,6 +34,7 @@ CLOSED = {
 }
 
 
+@pytest.mark.slow(gate=["sphere", "translucent sphere", "two shells", "clutter inside", "three opaque layers"])
 @pytest.mark.parametrize("name", CLOSED)
 def test_sum_is_the_area_of_the_outer_skin(name):
     """Within 5 %: coverage itself is 1 % off here, and light along 24 lines in columns of 6 patches a few more."""
@@ -42,6 +43,7 @@ def test_sum_is_the_area_of_the_outer_skin(name):
     assert float((weight * areas).sum()) == pytest.approx(body.area, rel=0.05)
 
 
+@pytest.mark.slow(gate=["2.0-0.9"])
 @pytest.mark.parametrize(("thickness", "opacity"), [(2.0, 0.9), (5.0, 0.5), (5.0, None)])
 def test_haze_shares_one_skin(thickness, opacity):
     """Tilts of 0.3 and sizes and opacities that vary: 7 %, as what sticks out of the haze is lit from more sides."""
@@ -79,6 +81,7 @@ def test_free_sheets_keep_their_area(opacity):
     assert float(weight.min()) > 0.99
 
 
+@pytest.mark.slow(gate=["50-0.96"])
 @pytest.mark.parametrize(("leaves", "least"), [(50, 0.96), (150, 0.9)])
 def test_leaves_that_shade_each_other_keep_most_of_their_area(leaves, least):
     """A leaf that is reached through a gap counts fully; some leaves are hidden between others from all sides."""

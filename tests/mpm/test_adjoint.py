@@ -306,6 +306,7 @@ def _compare(device, law, tolerance=3e-4, left_out=(), **settings):
         pytest.fail(f"above {tolerance:.0e} of the largest value: " + ", ".join(rows))
 
 
+@pytest.mark.slow(gate=["interpreted-corotated", "interpreted-hencky"])
 @pytest.mark.parametrize("name", LAWS)
 def test_gradients_of_a_rollout(name, kernel_device):
     """A sheet in wind, by everything that a fit may seek, in segments of two substeps and a shorter last one."""
@@ -317,6 +318,7 @@ def test_gradients_with_viscosity_and_two_laws(kernel_device):
     _compare(kernel_device, [FixedCorotated(), NeoHookean()], stiffness_damping=2e-3)
 
 
+@pytest.mark.slow(gate=["interpreted-clamp", "interpreted-nodes"])
 @pytest.mark.parametrize("kind", ["nodes", "hinge", "clamp"])
 def test_gradients_with_pins(kind, kernel_device):
     """Held nodes, points and slopes; the gradient by the density goes through what held points weigh, too."""

@@ -208,6 +208,7 @@ def test_damping_in_proportion_to_frequency(formulation):
 # ---- the substep
 
 
+@pytest.mark.slow(gate=["1.0"])
 @pytest.mark.parametrize("ratio", [0.05, 1.0, 30.0])
 def test_damped_limit_is_sharp_for_one_particle(ratio):
     """As without damping: the limit is sharp in the mode v_i = grad(w_i) / w_i near a plane where a weight vanishes."""

@@ -137,6 +137,7 @@ def test_what_flows_is_refused_by_total(law):
         MPMSolver(0.1, "total").init_state(points)
 
 
+@pytest.mark.slow(gate=["cpu-Snow", "cpu-Fluid", "cpu-Metal"])
 @pytest.mark.parametrize("law", PLASTIC, ids=PLASTIC_NAMES)
 def test_what_flows_forgets_its_shape(law, device):
     """A block pulled and sheared beyond yield: the elastic part stays small, the total deformation grows."""

@@ -115,6 +115,7 @@ def test_points_of_the_wall_hold_where_they_are(shift):
     assert both["error"] < 0.01
 
 
+@pytest.mark.slow(twin="test_points_of_the_wall_hold_where_they_are")
 def test_hanging_bar_stretches_as_it_should():
     """Strain up to 0.3: the tip within 1 % at 32 cells, and second order."""
     runs = [hanging_bar(cells, TOTAL) for cells in (8, 16, 32)]

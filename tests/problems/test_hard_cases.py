@@ -340,6 +340,7 @@ LAWS = {
 }
 
 
+@pytest.mark.slow(gate=["elastic-total", "soft elastic-total", "neo-Hookean-updated", "fluid-updated", "snow-updated"])
 @pytest.mark.parametrize(
     ("law", "formulation"),
     [(name, f) for name in LAWS for f in FORMULATIONS if f == "updated" or "elastic" in name or "Hookean" in name],

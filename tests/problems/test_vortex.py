@@ -45,6 +45,7 @@ def test_points_fill_the_annulus():
     assert float(volume.max() / volume.min()) < 1.05
 
 
+@pytest.mark.slow(twin="test_vortex_in_updated_is_second_order_too")
 def test_vortex_in_total_is_second_order():
     """A turn of 1 rad and a shear of more than 4, at the time of the largest turn."""
     coarse, fine = (vortex(n, _fixed(Settings(), n), TURN) for n in (16, 24))

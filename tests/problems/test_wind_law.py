@@ -134,6 +134,7 @@ def test_a_hinged_plate_in_the_updated_formulation(law, k):
     assert abs(found["slip"]) < 0.01
 
 
+@pytest.mark.slow(twin="test_a_hinged_plate_comes_to_rest_at_the_angle_of_its_law")
 def test_the_paper_law_lifts_a_hinged_plate_to_the_horizontal_and_no_further():
     """k > 1 has no equilibrium below 90 degrees; there the normal turns along the flow, and the force with it."""
     found = hinged_plate(2.0, "paper", cells=4)
@@ -349,6 +350,7 @@ def test_a_flat_flag_edge_on_to_a_steady_wind_stays_flat(formulation):
     assert float(state.velocity[:, 0].abs().max()) > 1e-3
 
 
+@pytest.mark.slow(twin="test_a_flat_flag_edge_on_to_a_steady_wind_stays_flat")
 def test_the_least_disturbance_of_a_limp_flag_edge_on_grows():
     """Pressure follows the slope, -q C w_x, and couples the bending modes as in panel flutter: D w_xxxx + q C w_x = 0.
 

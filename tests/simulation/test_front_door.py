@@ -54,6 +54,7 @@ def _flag(**changes):
 # ---- Python
 
 
+@pytest.mark.slow(gate=["three lines", "sequence", "by hand", "wind", "forces", "batches", "gradient"])
 @pytest.mark.parametrize(
     ("example", "output"),
     EXAMPLES,

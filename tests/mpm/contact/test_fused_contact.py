@@ -50,6 +50,7 @@ def test_the_kernels_do_what_torch_does(sheet, scene, device, iterations):
     torch.testing.assert_close(taken[1], taken[0], rtol=0, atol=1e-4 * float(taken[0].abs().max()) + 1e-6)
 
 
+@pytest.mark.slow(twin="test_nodes_are_stopped_as_in_torch")
 def test_obstacles_alone_do_what_they_do_in_torch(sheet, scene, device):
     """One that the sheet falls onto, one that it does not reach, and one for a short time; there are no pairs."""
     points = sheet(5, 5, dtype=torch.float32).map(lambda t: t.to(device))
@@ -80,6 +81,7 @@ def test_obstacles_alone_do_what_they_do_in_torch(sheet, scene, device):
     assert float(taken[1][1].abs().max()) == 0.0
 
 
+@pytest.mark.slow(twin="test_the_lists_do_not_change_the_result")
 def test_many_substeps_use_the_lists_again(sheet, scene, device, monkeypatch):
     """A sheet that falls onto another is stopped as in torch, with lists that serve several substeps."""
     points, _, _ = _collision(sheet, device)

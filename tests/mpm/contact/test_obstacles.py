@@ -73,7 +73,7 @@ def test_what_an_obstacle_takes_is_what_the_body_loses(formulation):
     torch.testing.assert_close(momentum, weight * state.time - state.impulse[0], rtol=0, atol=1e-10)
 
 
-@pytest.mark.slow(gate=["total-block"])
+@pytest.mark.slow(twin="test_what_an_obstacle_takes_is_what_the_body_loses")
 @pytest.mark.parametrize("shape", ["ground", "block", "capsule"])
 @pytest.mark.parametrize("formulation", FORMULATIONS)
 def test_a_moving_obstacle_moves_what_lies_on_it(formulation, shape):

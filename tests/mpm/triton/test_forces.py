@@ -210,6 +210,10 @@ FORCES = {
 }
 
 
+@pytest.mark.slow(
+    gate=[f"{one}-interpreted-('wind and custom', 2.0)" for one in FORMULATIONS]
+    + [f"{one}-interpreted-('custom, wind, wind', None)" for one in FORMULATIONS]
+)
 @pytest.mark.parametrize(
     ("kernel_device", "case"),
     on_each(

@@ -37,6 +37,7 @@ def test_column_collapses_and_comes_to_rest():
     assert weak["runout"] > 1.2 * tall["runout"]
 
 
+@pytest.mark.slow(twin="test_taller_and_weaker_columns_spread_further")
 def test_round_column_spreads():
     found = column_collapse(1.0, Settings(mls=True), cells=3, planar=False, duration=3.0)
     assert found["lost"] == 0
