@@ -186,7 +186,7 @@ def test_edits_from_a_configuration(tmp_path, capsys):
     assert _code([*options(edit), "--frames", "3", "--resume", "--output", str(out)]) == 0
     assert parse_foam().edits[0].law.class_path.endswith("Foam")
     for change, words in (
-        ({"density": -1.0}, ["`edits.density` to be positive"]),
+        ({"density": -1.0}, ["`edits.density` to be above 0"]),
         ({"colour": [1.0, 1.0, 1.0]}, ["edits", "colour"]),
         ({"law": {"class_path": "Sand"}}, ["Sand", "solver.formulation"]),
         ({"region": {"class_path": "Sphere", "init_args": {"center": [9, 9, 9], "radius": 1.0}}}, ["no simulated"]),

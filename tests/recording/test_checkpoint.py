@@ -16,6 +16,7 @@ import pytest
 import torch
 
 from gaussian_swaying.gaussians.ply import write_ply
+from gaussian_swaying.mpm.laws.snow import Snow
 from gaussian_swaying.mpm.solver import MPMSolver
 from gaussian_swaying.recording.checkpoint import log_lines, read_checkpoint, write_checkpoint
 from gaussian_swaying.recording.recorder import Recorder
@@ -285,7 +286,6 @@ def test_a_splat_that_was_exchanged(make_cloud, make_simulation, tmp_path):
 @pytest.mark.parametrize("formulation", ["total"], indirect=True)
 def test_edits_that_bring_an_internal_variable(make_simulation, tmp_path, formulation):
     """A law that flows from the second frame on: the state has then what it had not at the start."""
-    from gaussian_swaying.mpm.laws.snow import Snow
     from gaussian_swaying.simulation.edits import Edit
 
     def make():
@@ -338,16 +338,15 @@ def test_a_seal(tmp_path):
 
 
 @pytest.mark.parametrize("formulation", ["total", "updated"])
-@pytest.mark.parametrize("law", [None, "Snow"])
+@pytest.mark.parametrize("law", [None, Snow])
 def test_states_that_the_kernels_made_are_whole(formulation, law, make_simulation, tmp_path):
     """On a GPU, or here in Triton's interpreter: nothing in them is refused."""
     pytest.importorskip("triton")
-    import gaussian_swaying
     from gaussian_swaying.simulation.scene import Material
 
     if law and formulation == "total":
         pytest.skip("what flows needs `updated`")
-    material = Material(E=300.0, density=30.0, law=getattr(gaussian_swaying, law)() if law else None)
+    material = Material(E=300.0, density=30.0, law=law and law())
     simulation = make_simulation(formulation=formulation, transfer="triton", material=material, frame_dt=0.01)
     recorder = Recorder(images=False, video=False)
     simulation.run(tmp_path / "run", 2, progress=False, recorder=recorder)

@@ -117,7 +117,7 @@ def test_runs_are_spread_over_the_gpus(tmp_path, monkeypatch):
 
         def __init__(self, command, env, **_):
             seen.append(env["CUDA_VISIBLE_DEVICES"])
-            (tmp_path / command[5]).write_text("{}")
+            (tmp_path / command[6]).write_text("{}")
 
         def poll(self):
             return 0

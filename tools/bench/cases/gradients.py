@@ -22,8 +22,9 @@ def run(options: argparse.Namespace) -> None:
     result["memory"] = []
     for formulation in ("total", "updated"):
         for steps, checkpoint in ROLLOUTS:
-            command = [sys.executable, str(Path(__file__).with_name("gradient_memory.py")), formulation]
-            done = subprocess.run([*command, str(steps), str(checkpoint)], check=True, capture_output=True, text=True)
+            command = [sys.executable, "-m", "bench.cases.gradient_memory", formulation]
+            words = [*command, str(steps), str(checkpoint)]
+            done = subprocess.run(words, check=True, capture_output=True, text=True, cwd=record.ROOT / "tools")
             result["memory"].append(json.loads(done.stdout))
             print(result["memory"][-1], flush=True)
     with tempfile.TemporaryDirectory() as scratch:

@@ -337,9 +337,10 @@ def run_apart(
             name, path, steps, picture = waiting.pop(0)
             busy = [gpu for _, _, _, gpu in running.values()]
             gpu = min(range(gpus), key=busy.count)
-            environment = os.environ | ({"CUDA_VISIBLE_DEVICES": _visible(gpu)} if gpus > 1 else {})
+            environment = os.environ | {"PYTHONPATH": os.pathsep.join([str(ROOT / "tools"), *sys.path])}
+            environment |= {"CUDA_VISIBLE_DEVICES": _visible(gpu)} if gpus > 1 else {}
             target = folder / f"{name.replace(':', '_')}.json"
-            command = [sys.executable, __file__, name, path, str(steps), str(target)]
+            command = [sys.executable, "-m", "bench.cases.training", name, path, str(steps), str(target)]
             command += [] if picture is None else ["--picture", str(picture)]
             log = target.with_suffix(".log").open("w")
             process = subprocess.Popen(command, cwd=ROOT, env=environment, stdout=log, stderr=subprocess.STDOUT)
