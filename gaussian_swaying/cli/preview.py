@@ -33,12 +33,12 @@ from gaussian_swaying.preview.cost import (
     finest_within,
     scaled_seconds,
 )
-from gaussian_swaying.preview.doubts import doubts
 from gaussian_swaying.preview.photos import captured_from
 from gaussian_swaying.preview.picture import preview_picture
 from gaussian_swaying.preview.report import (
     area_line,
     cost_lines,
+    doubts,
     quality_lines,
     run_lines,
     splat_lines,

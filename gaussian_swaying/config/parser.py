@@ -2,27 +2,28 @@
 
 from __future__ import annotations
 
+import dataclasses
+import hashlib
 import importlib
 import inspect
 import json
 import os
 import sys
 import tempfile
-from argparse import SUPPRESS, Action, ArgumentError
+from argparse import SUPPRESS, Action, ArgumentError, _ArgumentGroup
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from types import UnionType
 from typing import TYPE_CHECKING, Any, get_args, get_type_hints
+
+from torch import Tensor, nn
 
 from gaussian_swaying import _program as program
 from gaussian_swaying._checks import check_frames
 from gaussian_swaying._yaml_limits import check_config_files, limit_yaml
 from gaussian_swaying.aero.obstacles import CylinderObstacle, EllipsoidObstacle, SphereObstacle
 from gaussian_swaying.captures.capture_camera import CaptureCamera
-from gaussian_swaying.config.common_help import CommonHelp
-from gaussian_swaying.config.description import describe
-from gaussian_swaying.interop.physgaussian.convert import convert, read_config
-from gaussian_swaying.interop.physgaussian.yaml_file import to_yaml
+from gaussian_swaying.interop.physgaussian.convert import convert, read_config, to_yaml
 from gaussian_swaying.rendering.cameras.keyframes import KeyframedCamera
 
 if TYPE_CHECKING:
@@ -240,3 +241,93 @@ def option(name: str, value: Any) -> str:
         '--wind.flow=[4, 0, 0]'
     """
     return f"--{name}={value if isinstance(value, str) else json.dumps(value)}"
+
+
+def describe(value: Any) -> Any:
+    """Class and values of an argument, down to numbers and text.
+
+    Args:
+        value: A number, text, tensor, list, mapping, dataclass, module or any other object with public attributes.
+
+    Returns:
+        Plain data for YAML; a tensor becomes its shape and a checksum. Equal values give equal data, in every process.
+    """
+    if value is None or isinstance(value, bool | int | float | str):
+        return value
+    if isinstance(value, os.PathLike):
+        return os.fspath(value)
+    if isinstance(value, Tensor):
+        held = value.detach().cpu().contiguous()
+        return {"shape": list(held.shape), "sha256": hashlib.sha256(held.numpy().tobytes()).hexdigest()}
+    if isinstance(value, Mapping):
+        return {str(name): describe(part) for name, part in value.items()}
+    if isinstance(value, list | tuple):
+        return [describe(part) for part in value]
+    if isinstance(value, type) or not (hasattr(value, "__dict__") or dataclasses.is_dataclass(value)):
+        return getattr(value, "__qualname__", repr(value))
+    return {"class": f"{type(value).__module__}.{type(value).__qualname__}", **_parts(value)}
+
+
+def _parts(value: Any) -> dict[str, Any]:
+    """The public attributes of an object, and the tensors and parts of a module."""
+    if dataclasses.is_dataclass(value):
+        parts = {field.name: getattr(value, field.name) for field in dataclasses.fields(value)}
+    else:
+        parts = {name: part for name, part in vars(value).items() if not name.startswith("_") and name != "training"}
+    if isinstance(value, nn.Module):
+        parts |= dict(value.named_parameters(recurse=False)) | dict(value.named_buffers(recurse=False))
+        parts |= dict(value.named_children())
+    return {name: describe(part) for name, part in sorted(parts.items())}
+
+
+COMMON = {
+    "The run": ("config", "preset", "output", "frames", "resume", "device"),
+    "The object": ("scene.ply", "scene.up", "scene.longest_side", "scene.region"),
+    "Its material, and where it is held": (
+        "material.E", "material.density", "material.thickness", "solver.dx", "solver.boundaries"
+    ),
+    "The wind": ("wind.flow", "wind.modulations"),
+    "The pictures": ("camera", "recorder.renders", "recorder.ply_every"),
+}  # fmt: skip
+"""The options that ``--help`` shows, by what they are about."""
+
+_MORE = (
+    "Every field of the configuration is an option, such as --camera.init_args.width 1920. --help-all lists all "
+    "fields, --camera.help OrbitCamera those of a class, and --print_config prints the configuration that results."
+)
+
+
+class CommonHelp(Action):
+    """Prints the help on the common options, and ends the program."""
+
+    def __init__(self, option_strings: list[str], dest: str, **options: Any) -> None:
+        super().__init__(option_strings, dest=SUPPRESS, default=SUPPRESS, nargs=0, help=options["help"])
+
+    def __call__(self, parser: Any, namespace: Any, values: Any, option_string: str | None = None) -> None:
+        """Print and exit."""
+        print(common_help(parser), end="")
+        parser.exit()
+
+
+def common_help(parser: ArgumentParser) -> str:
+    """Return the help on the options of ``COMMON``, with the texts of the full help.
+
+    Args:
+        parser: From :func:`~gaussian_swaying.config.parser.build_parser`.
+    """
+    known = {action.dest: action for action in parser._actions}
+    helps = _ArgumentGroup(parser, "Help")
+    helps._group_actions = [
+        action for action in parser._actions if action.option_strings[-1] in ("--help", "--help-all")
+    ]
+    groups = [helps]
+    for title, names in COMMON.items():
+        groups.append(_ArgumentGroup(parser, title))
+        groups[-1]._group_actions = [known[name] for name in names]
+    whole: Any = parser  # its groups are exchanged meanwhile
+    before = whole._action_groups, whole.usage, whole.epilog
+    try:
+        whole._action_groups, whole.usage, whole.epilog = groups, "%(prog)s --config FILE [options]", _MORE
+        return parser.format_help()
+    finally:
+        whole._action_groups, whole.usage, whole.epilog = before

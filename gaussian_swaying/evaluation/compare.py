@@ -7,10 +7,12 @@ import math
 import os
 import re
 import sys
-from collections.abc import Sequence
+from collections import deque
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import suppress
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 import torch
@@ -25,7 +27,6 @@ from gaussian_swaying._provenance import describe_device, versions
 from gaussian_swaying.captures.images import image_size, read_image
 from gaussian_swaying.evaluation.comparison_picture import comparison_picture
 from gaussian_swaying.evaluation.reference import Cloth, frame_files, read_cloth, surface_points
-from gaussian_swaying.evaluation.threads import in_threads
 from gaussian_swaying.geometry.frame import SimFrame
 from gaussian_swaying.geometry.rotations import rotation_from_z
 from gaussian_swaying.metrics.nearest import nearest_distances
@@ -489,4 +490,37 @@ def _line(cells: Sequence[str], widths: Sequence[int]) -> str:
     return f"| {cells[0]:<{widths[0]}} | {cells[1]:>{widths[1]}} | {cells[2]:>{widths[2]}} |"
 
 
-__all__ = ["compare_run", "evaluate", "picture_errors", "table"]
+T = TypeVar("T")
+
+AHEAD = 2  # frames that each thread may be ahead
+
+
+def in_threads(work: Callable[[int], T], count: int, device: torch.device) -> Iterator[T]:
+    """``work(0)`` to ``work(count - 1)`` in order, computed by threads: one for each core, at most eight.
+
+    Reading and writing pictures takes longer than comparing them. On a CPU each thread computes with one core.
+    """
+    workers = max(1, min(8, os.cpu_count() or 1))
+    threads = torch.get_num_threads()
+    waiting: deque[Future[T]] = deque()
+
+    def one(number: int) -> T:
+        with torch.inference_mode():  # it is set per thread
+            return work(number)
+
+    pool = ThreadPoolExecutor(workers, "compare")
+    try:
+        if device.type == "cpu":
+            torch.set_num_threads(1)
+        for number in range(count):
+            waiting.append(pool.submit(one, number))
+            if len(waiting) > AHEAD * workers:
+                yield waiting.popleft().result()
+        while waiting:
+            yield waiting.popleft().result()
+    finally:
+        pool.shutdown(cancel_futures=True)
+        torch.set_num_threads(threads)
+
+
+__all__ = ["compare_run", "evaluate", "in_threads", "picture_errors", "table"]

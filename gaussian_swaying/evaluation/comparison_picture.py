@@ -11,7 +11,7 @@ from einops import rearrange
 from torch import Tensor
 
 from gaussian_swaying.captures.images import average_down
-from gaussian_swaying.rendering.colormap import colormap
+from gaussian_swaying.rendering.passes import colormap
 
 ERROR_SCALE = 0.25  # absolute error at the bright end of the error map
 PANEL_WIDTH = 640  # pixels; wider pictures are averaged down by a whole number in the video

@@ -36,10 +36,10 @@ from gaussian_swaying.fitting.least_squares import (
     iterate,
     normal_equations,
     sensitivities,
+    unsettled,
 )
 from gaussian_swaying.fitting.plan import Plan, parse_base, read_unknown
 from gaussian_swaying.fitting.report import Result, predictions, write_results
-from gaussian_swaying.fitting.settling import unsettled
 from gaussian_swaying.fitting.tracks import Tracks, match, opencv, track
 from gaussian_swaying.fitting.unknowns import check_unknowns
 from gaussian_swaying.fitting.videos import Footage, frame_times, read_videos

@@ -34,9 +34,8 @@ from gaussian_swaying.recording.resume import (
     check_shards,
 )
 from gaussian_swaying.recording.trajectory import pack_trajectory
-from gaussian_swaying.recording.usd_film import pack_usd, write_usd_frame
 from gaussian_swaying.recording.video import VideoEncoder, encode_video
-from gaussian_swaying.recording.writer import FrameWriter, HostCopy
+from gaussian_swaying.recording.writer import FrameWriter, HostCopy, pack_usd, write_usd_frame
 from gaussian_swaying.rendering.passes import PASSES
 from gaussian_swaying.runs.folder import MARKER, check_names, claim_folder, hold_folder, mark
 from gaussian_swaying.runs.lock import FolderLock

@@ -10,8 +10,7 @@ from torch import Tensor
 from gaussian_swaying.aero.wind import WindField
 from gaussian_swaying.mpm.state import MPMState
 from gaussian_swaying.rendering.cameras.camera import Camera, project
-from gaussian_swaying.rendering.colormap import colormap
-from gaussian_swaying.rendering.passes import mean_depth
+from gaussian_swaying.rendering.passes import colormap, mean_depth
 from gaussian_swaying.rendering.protocol import RenderOutput
 from gaussian_swaying.simulation.stepping import Stepping
 

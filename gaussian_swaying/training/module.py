@@ -29,11 +29,10 @@ from gaussian_swaying.training.densification import PARAMETERS, DefaultDensifica
 from gaussian_swaying.training.finite import PendingLoss, TrainingDiverged, finite_cloud
 from gaussian_swaying.training.initial import gaussians_from_file
 from gaussian_swaying.training.losses import LossInputs, LossTerm, OtherView, TotalLoss
-from gaussian_swaying.training.optimizers import OPTIMIZERS, make_optimizer, step_all
+from gaussian_swaying.training.optimizers import OPTIMIZERS, LearningRates, make_optimizer, means_rate, step_all
 from gaussian_swaying.training.panels import lpips_metric, panel, picture_metrics, write_panel
 from gaussian_swaying.training.parallel import check_alike, seen_by_any, share_gradients, steps_of
 from gaussian_swaying.training.random_stream import mixed_seed, random_stream
-from gaussian_swaying.training.rates import LearningRates, means_rate
 from gaussian_swaying.training.strategy import count_steps
 from gaussian_swaying.training.surface_losses import SurfaceTerm as SurfaceTerm  # so that a YAML finds its terms
 

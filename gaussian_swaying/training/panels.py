@@ -15,7 +15,7 @@ from gaussian_swaying._checks import check_choice
 from gaussian_swaying.gaussians.model import GaussianSurfaceModel
 from gaussian_swaying.metrics.ssim import SSIM_TAPS
 from gaussian_swaying.rendering.cameras.camera import Camera
-from gaussian_swaying.rendering.colormap import colormap
+from gaussian_swaying.rendering.passes import colormap
 from gaussian_swaying.rendering.protocol import Renderer
 
 # the files that torchvision would download

@@ -9,13 +9,12 @@ from typing import Any
 import numpy as np
 import torch
 
+from gaussian_swaying.rendering.passes import colormap
 from gaussian_swaying.simulation.parameters import parameter, present, value_of
 from gaussian_swaying.simulation.wind_picture import speed_scale
 from gaussian_swaying.viewer.files import Files
 from gaussian_swaying.viewer.gusts import Gusts
 from gaussian_swaying.viewer.holding import Holding
-from gaussian_swaying.viewer.legends import legend
-from gaussian_swaying.viewer.materials import in_pascal, like
 from gaussian_swaying.viewer.panel import Panel
 from gaussian_swaying.viewer.pictures import SHOWN
 from gaussian_swaying.viewer.screen import Screen
@@ -341,3 +340,50 @@ def from_angles(speed: float, azimuth: float, elevation: float) -> list[float]:
     """The vector of :func:`to_angles`."""
     a, e = math.radians(azimuth), math.radians(elevation)
     return [speed * math.cos(e) * math.cos(a), speed * math.cos(e) * math.sin(a), speed * math.sin(e)]
+
+
+def legend(name: str, unit: str, largest: float) -> str:
+    """A colour scale from zero to a largest value, as HTML.
+
+    Args:
+        name: Name of the quantity.
+        unit: Its unit.
+        largest: End of the scale.
+    """
+    colours = (255 * colormap(torch.linspace(0, 1, 9, dtype=torch.float64))).round().int().tolist()
+    stops = ", ".join(f"rgb({r},{g},{b})" for r, g, b in colours)
+    return (
+        f'<div style="padding: 0 0.8em 0.6em; font-size: 0.8em">{name} [{unit}]'
+        f'<div style="height: 0.9em; border-radius: 2px; background: linear-gradient(to right, {stops})"></div>'
+        '<div style="display: flex; justify-content: space-between">'
+        f"<span>0</span><span>{0.5 * largest:.3g}</span><span>{largest:.3g} and more</span></div></div>"
+    )
+
+
+# From, in Pa, to the next one. Gels and muscle at rest: Levental, Georges & Janmey 2007, "Soft biological materials and
+# their impact on cell function"; foam, rubber, cork, leather and plastics: Ashby 2011, "Materials Selection in
+# Mechanical Design", chart of modulus and density. The limits are rounded to powers of ten.
+MATERIALS = (
+    (0.0, "soft jelly"),
+    (1e3, "jelly"),
+    (1e4, "muscle at rest"),
+    (1e5, "soft foam"),
+    (1e6, "rubber"),
+    (1e7, "cork"),
+    (1e8, "leather"),
+    (1e9, "hard plastic"),
+    (1e10, "metal or stone"),
+)
+
+_UNITS = ((1e9, "GPa"), (1e6, "MPa"), (1e3, "kPa"), (0.0, "Pa"))
+
+
+def like(stiffness: float) -> str:
+    """The material whose Young's modulus [Pa] is nearest, in words."""
+    return next(name for least, name in reversed(MATERIALS) if stiffness >= least)
+
+
+def in_pascal(stiffness: float) -> str:
+    """A modulus [Pa] with three digits and a unit, such as ``9 kPa``."""
+    size, unit = next((size, unit) for size, unit in _UNITS if stiffness >= size)
+    return f"{stiffness / (size or 1.0):.3g} {unit}"

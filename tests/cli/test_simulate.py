@@ -1,6 +1,6 @@
 """The command line: what it accepts, and the one sentence it answers bad input with.
 
-Covers: config.common_help, config.parser.
+Covers: config.parser, config.parser.
 """
 
 import json

@@ -1,6 +1,6 @@
 """Comparing folders whose differences are known.
 
-Covers: evaluation.threads.
+Covers: evaluation.compare.
 """
 
 import json

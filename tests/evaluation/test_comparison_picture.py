@@ -4,7 +4,7 @@ import numpy as np
 import torch
 
 from gaussian_swaying.evaluation.comparison_picture import ERROR_SCALE, PANEL_WIDTH, comparison_picture
-from gaussian_swaying.rendering.colormap import colormap
+from gaussian_swaying.rendering.passes import colormap
 
 
 def test_the_picture_shows_reference_run_and_error():

@@ -12,10 +12,17 @@ import torch
 
 from gaussian_swaying.fitting.evidence import Block
 from gaussian_swaying.fitting.fit import Fit, run_fit
-from gaussian_swaying.fitting.least_squares import NO_STEP, Progress, expected_gain, iterate, linearised, step_from
+from gaussian_swaying.fitting.least_squares import (
+    NO_STEP,
+    Progress,
+    expected_gain,
+    iterate,
+    linearised,
+    step_from,
+    unsettled,
+)
 from gaussian_swaying.fitting.plan import Plan, read_unknown
 from gaussian_swaying.fitting.report import Result, Shown
-from gaussian_swaying.fitting.settling import unsettled
 from gaussian_swaying.fitting.unknowns import Unknown
 
 UNKNOWNS = [Unknown("wind.speed", 1.0, 10.0, "log"), Unknown("material.E", 1e3, 1e5, "log")]

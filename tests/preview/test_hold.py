@@ -1,6 +1,6 @@
 """Whether things stand or hang, on stand-ins made of a few tubes, balls and plates: surfaces only, z up.
 
-Covers: preview.doubts.
+Covers: preview.report.
 """
 
 import argparse
@@ -13,8 +13,8 @@ import torch
 
 from gaussian_swaying.cli.preview import _joined, build_options
 from gaussian_swaying.gaussians.cloud import GaussianCloud
-from gaussian_swaying.preview.doubts import doubts, preview_command
 from gaussian_swaying.preview.hold import guess_hold, hanging_cord
+from gaussian_swaying.preview.report import doubts, preview_command
 from gaussian_swaying.preview.suggest import CELLS, suggest, visible_weight
 from gaussian_swaying.scenes.procedural import FlagScene
 

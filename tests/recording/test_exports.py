@@ -1,6 +1,6 @@
 """Formats in which a run leaves its Gaussians.
 
-Covers: recording.usd_film.
+Covers: recording.writer.
 """
 
 from dataclasses import replace

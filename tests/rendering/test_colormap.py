@@ -2,7 +2,7 @@
 
 import torch
 
-from gaussian_swaying.rendering.colormap import colormap
+from gaussian_swaying.rendering.passes import colormap
 
 
 def test_the_ramp_gets_lighter():

@@ -6,8 +6,8 @@ import pytest
 import torch
 
 from gaussian_swaying.rendering.cameras.camera import look_at_camera
-from gaussian_swaying.rendering.colormap import colormap
 from gaussian_swaying.rendering.passes import (
+    colormap,
     depth_colors,
     depth_steps,
     facing,

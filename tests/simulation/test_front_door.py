@@ -1,6 +1,6 @@
 """Simulation as users meet it in Python and in a YAML: short forms, frames, what is given twice, custom forces.
 
-Covers: _turns, config.description, simulation.defaults, simulation.material, simulation.run.
+Covers: _turns, config.parser, simulation.defaults, simulation.material, simulation.run.
 """
 
 import copy

@@ -13,8 +13,7 @@ from gaussian_swaying.aero.wind import WindField
 from gaussian_swaying.recording.layout import frame_folder, video_file
 from gaussian_swaying.recording.recorder import Recorder
 from gaussian_swaying.rendering.cameras.camera_path import LookAtCamera, OrbitCamera
-from gaussian_swaying.rendering.colormap import colormap
-from gaussian_swaying.rendering.passes import mean_depth
+from gaussian_swaying.rendering.passes import colormap, mean_depth
 from gaussian_swaying.rendering.shading import DiffuseShader
 from gaussian_swaying.simulation.edits import Edit
 

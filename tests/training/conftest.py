@@ -9,7 +9,7 @@ from gaussian_swaying.gaussians.model import GaussianSurfaceModel
 from gaussian_swaying.rendering.cameras.camera import look_at_camera
 from gaussian_swaying.rendering.torch_renderer import TorchRenderer
 from gaussian_swaying.scenes.procedural import FlagScene
-from gaussian_swaying.training.data.order import EndlessShuffle
+from gaussian_swaying.training.data.datamodule import EndlessShuffle
 from gaussian_swaying.training.initial import gaussians_from_points
 
 

@@ -1,6 +1,6 @@
 """Trainings that learn, stop when something is not finite, and continue exactly.
 
-Covers: training.finite, training.rates.
+Covers: training.finite, training.optimizers.
 """
 
 import math
@@ -22,7 +22,7 @@ from gaussian_swaying.training.finite import TrainingDiverged
 from gaussian_swaying.training.initial import gaussians_from_points
 from gaussian_swaying.training.losses import LossTerm, MeanOpacityLoss, MeanScaleLoss
 from gaussian_swaying.training.module import SplatTrainer
-from gaussian_swaying.training.rates import LearningRates, means_rate
+from gaussian_swaying.training.optimizers import LearningRates, means_rate
 
 
 def _often():

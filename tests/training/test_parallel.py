@@ -1,6 +1,6 @@
 """Training on several devices: the images are shared, the gradients averaged, and there is one splat.
 
-Covers: training.data.order, training.strategy.
+Covers: training.data.datamodule, training.strategy.
 """
 
 import csv
@@ -18,7 +18,7 @@ from torch import distributed, multiprocessing
 from torch.utils.data import DataLoader
 
 from gaussian_swaying.gaussians.ply import read_ply
-from gaussian_swaying.training.data.order import EndlessShuffle
+from gaussian_swaying.training.data.datamodule import EndlessShuffle
 from gaussian_swaying.training.densification import PARAMETERS, DefaultDensification
 from gaussian_swaying.training.module import SplatTrainer
 from gaussian_swaying.training.parallel import check_alike, scaled_adam, seen_by_any, share_gradients, steps_of

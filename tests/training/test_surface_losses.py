@@ -1,6 +1,6 @@
 """Losses of the surface on views whose surface is known.
 
-Covers: captures.neighbours.
+Covers: captures.capture.
 """
 
 import math
@@ -10,8 +10,8 @@ import pytest
 import torch
 from lightning.pytorch.loggers import Logger
 
+from gaussian_swaying.captures.capture import neighbouring_views
 from gaussian_swaying.captures.generated_capture import GeneratedCapture
-from gaussian_swaying.captures.neighbours import neighbouring_views
 from gaussian_swaying.rendering.cameras.camera import look_at_camera
 from gaussian_swaying.rendering.planes import SurfaceMaps, pixel_rays
 from gaussian_swaying.training.losses import LossInputs, OtherView, TotalLoss

@@ -10,8 +10,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from gaussian_swaying.interop.physgaussian.fields import Fields, Notes
-from gaussian_swaying.interop.physgaussian.parts import box, box_about, part
+from gaussian_swaying.interop.physgaussian.fields import Fields, Notes, box, box_about, part
 from gaussian_swaying.interop.physgaussian.space import CENTER, tidy
 
 FOREVER = 999.0

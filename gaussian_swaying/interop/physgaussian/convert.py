@@ -5,9 +5,10 @@
 
 from __future__ import annotations
 
+import json
 import math
 import os
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from typing import Any
 
 import torch
@@ -16,12 +17,9 @@ from torch import Tensor
 from gaussian_swaying._checks import check_frames, check_vector
 from gaussian_swaying._inputs import read_json
 from gaussian_swaying.interop.physgaussian.boundaries import Turned, boundary_settings
-from gaussian_swaying.interop.physgaussian.camera_settings import camera_settings
-from gaussian_swaying.interop.physgaussian.fields import Fields, Notes
-from gaussian_swaying.interop.physgaussian.filling import filling_settings
+from gaussian_swaying.interop.physgaussian.fields import Fields, Notes, box, part
 from gaussian_swaying.interop.physgaussian.materials import material_settings
-from gaussian_swaying.interop.physgaussian.parts import box
-from gaussian_swaying.interop.physgaussian.space import heading, rotation_matrix, tidy, up_direction
+from gaussian_swaying.interop.physgaussian.space import CENTER, heading, rotation_matrix, tidy, up_direction
 
 
 def read_config(path: str | os.PathLike[str]) -> dict[str, Any]:
@@ -139,4 +137,104 @@ def _damping(take: Fields, substep: float, notes: Notes) -> float:
     return 0.0 if factor >= 1 else -math.log(factor) / substep
 
 
-__all__ = ["convert", "read_config"]
+_FILLING_NOTES = {
+    "density_threshold": "has another definition here, so `scene.filling.threshold` keeps its default.",
+    "search_threshold": "is not needed: cells are enclosed by the vote of 26 rays (`scene.filling.votes`).",
+    "search_exclude_direction": "is not supported: rays go in all directions, and an open side is outvoted.",
+    "ray_cast_direction": "is not supported: all rays count crossings, not one.",
+    "max_particles_num": "is not supported: the number of points follows from the volume.",
+    "boundary": "is not supported: everything enclosed is filled, within `scene.region`.",
+    "smooth": "is not supported: the density is blurred by half a cell.",
+    "visualize": "is not supported: filled points are never drawn.",
+}
+
+
+def filling_settings(fields: Any, n_grid: int, grid_lim: float, notes: Notes) -> dict[str, Any]:
+    """``scene.filling``: another method for the same purpose, on a grid with the same spacing."""
+    take = Fields(fields, "particle_filling")
+    spacing = grid_lim / take.whole("n_grid", 4 * n_grid)
+    wanted = take.whole("max_partciels_per_cell", 1)
+    count = next((n for n in (1, 8) if wanted <= n), 27)
+    if count != wanted:
+        notes.add(f"`particle_filling.max_partciels_per_cell` {wanted} becomes {count}, as a cell has 1, 8 or 27.")
+    for name, sentence in _FILLING_NOTES.items():
+        value = take.get(name, None)
+        if value is not None and value is not False:
+            notes.add(f"`particle_filling.{name}` {sentence}")
+    take.finish()
+    return {"spacing": spacing, "particles_per_cell": count}
+
+
+def camera_settings(take: Fields, cameras: str | None, notes: Notes) -> dict[str, Any]:
+    """``camera``: a camera of the model, the moving camera, or our orbit camera if the file of cameras is missing."""
+    viewpoint = list(take.vector("mpm_space_viewpoint_center", CENTER))
+    up = list(take.vector("mpm_space_vertical_upward_axis", (0.0, 0.0, 1.0)))
+    index = take.whole("default_camera_index", 0, least=-1)
+    names = ("init_azimuthm", "init_elevation", "init_radius")
+    start = {name: take.get(name, None) for name in names}
+    deltas = {name: take.get(name, None) for name in ("delta_a", "delta_e", "delta_r")}
+    moves = take.flag("move_camera", False)
+    if take.flag("show_hint", False):
+        notes.add("`show_hint` has no effect: PhysGaussian prints the camera's angles and stops.")
+    orbit = "gaussian_swaying.interop.physgaussian.camera.PhysGaussianCamera"
+    if index >= 0 and cameras is None:
+        notes.add(
+            f"`default_camera_index` {index} is a camera of the 3DGS model, whose cameras.json was not given, so it is "
+            f"an orbit here; --camera {orbit} --camera.cameras PATH --camera.index {index} uses the model's."
+        )
+        return part("OrbitCamera", width=960, height=540)
+    if index >= 0:
+        return part(orbit, cameras=cameras, index=index)
+    wanted = [*start, *deltas] if moves else list(start)
+    for name in wanted:
+        if (start | deltas)[name] is None:
+            raise ValueError(f"The key `{name}` is missing, but `default_camera_index` -1 needs it.")
+        take.number(name)
+    if cameras is None:
+        notes.add(
+            "`default_camera_index` -1: PhysGaussian takes lens and size of the picture from the model's cameras.json; "
+            "here they are those of `camera`."
+        )
+    change = [float(d) for d in deltas.values()] if moves else [0.0] * 3
+    return part(
+        orbit,
+        cameras=cameras,
+        azimuth=float(start["init_azimuthm"]),
+        elevation=float(start["init_elevation"]),
+        radius=float(start["init_radius"]),
+        delta_azimuth=change[0],
+        delta_elevation=change[1],
+        delta_radius=change[2],
+        viewpoint=viewpoint,
+        up=up,
+    )
+
+
+def to_yaml(settings: Mapping[str, Any], notes: Iterable[str] = (), source: str | None = None) -> str:
+    """Settings as a YAML file for ``--config``, with the notes as comments at the top.
+
+    Args:
+        settings: From :func:`convert`.
+        notes: From :func:`convert`.
+        source: Name of the file that was converted.
+
+    Returns:
+        The text.
+    """
+    import textwrap
+
+    import yaml
+
+    head = [f"PhysGaussian's {source or 'configuration'}, converted. Give the splat with --scene.ply PATH.", *notes]
+    width = {"width": 118, "break_long_words": False, "break_on_hyphens": False}
+    lines = [
+        line
+        for text in head
+        for line in textwrap.wrap(text, initial_indent="# ", subsequent_indent="#   ", **width)  # type: ignore[arg-type]
+    ]
+    plain = json.loads(json.dumps(settings))  # copies, since YAML would write repeated parts as references
+    body = yaml.safe_dump(plain, sort_keys=False, default_flow_style=None, width=120)
+    return "\n".join(lines) + "\n" + body
+
+
+__all__ = ["camera_settings", "convert", "filling_settings", "read_config", "to_yaml"]

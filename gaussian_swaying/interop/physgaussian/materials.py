@@ -6,8 +6,7 @@ import math
 from collections.abc import Mapping
 from typing import Any
 
-from gaussian_swaying.interop.physgaussian.fields import Fields, Notes
-from gaussian_swaying.interop.physgaussian.parts import box_about, part
+from gaussian_swaying.interop.physgaussian.fields import Fields, Notes, box_about, part
 
 _YIELD = math.sqrt(1.5)  # from a bound on |dev tau| to the yield stress in uniaxial tension
 

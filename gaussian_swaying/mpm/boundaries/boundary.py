@@ -21,7 +21,7 @@ from torch import Tensor, nn
 
 from gaussian_swaying._graphs import Recordable
 from gaussian_swaying.geometry.frame import SimFrame
-from gaussian_swaying.geometry.regions import RegionInFrame
+from gaussian_swaying.geometry.regions import Region, RegionInFrame, whereabouts
 
 BY_BODY = "by body"
 """The kind of a pin that becomes a hinge for a sheet, and a clamp for anything else."""
@@ -157,3 +157,30 @@ def refuse_points(boundary: Boundary, what: str, instead: str) -> ValueError:
         f"{what} of the {type(boundary).__name__} needs particles that keep their neighbours, which the updated "
         f"formulation does not have: set {instead}, or `solver.formulation` to total."
     )
+
+
+class ParticleBoundary(Boundary):
+    """Base class of the conditions that act on the particles of a region, wherever they go."""
+
+    def __init__(self, region: Region, start: float = 0.0, end: float | None = None) -> None:
+        super().__init__(start, end)
+        self.region = region
+
+    def in_frame(self, frame: SimFrame) -> Boundary:
+        """The condition with its region evaluated in metres."""
+        return self.copy_in(frame)
+
+    def particle_mask(self, rest_position: Tensor) -> Tensor:
+        """Particles inside the region at rest; ValueError if there are none."""
+        mask = self.region.contains(rest_position)
+        if not bool(mask.any()):
+            region, points, rotation = self.region, rest_position, torch.eye(3)
+            if isinstance(region, RegionInFrame):
+                points, rotation = region.frame.point_to_scene(points), region.frame.rotation
+                region = region.region
+            between, hint = whereabouts(region, points, rotation)
+            raise ValueError(
+                f"The region {region!r} of the {type(self).__name__} holds no particle: the simulated particles lie "
+                f"{between}; {hint or 'move or enlarge `region`'}."
+            )
+        return mask

@@ -10,8 +10,7 @@ from torch import Tensor
 
 from gaussian_swaying._checks import check_vector
 from gaussian_swaying.geometry.regions import Region
-from gaussian_swaying.mpm.boundaries.boundary import Nodes
-from gaussian_swaying.mpm.boundaries.particle_boundary import ParticleBoundary
+from gaussian_swaying.mpm.boundaries.boundary import Nodes, ParticleBoundary
 
 
 class Impulse(ParticleBoundary):

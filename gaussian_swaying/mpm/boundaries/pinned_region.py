@@ -7,8 +7,7 @@ from torch import Tensor
 
 from gaussian_swaying._checks import check_choice
 from gaussian_swaying.geometry.regions import Region
-from gaussian_swaying.mpm.boundaries.boundary import BY_BODY, Nodes, refuse_points
-from gaussian_swaying.mpm.boundaries.particle_boundary import ParticleBoundary
+from gaussian_swaying.mpm.boundaries.boundary import BY_BODY, Nodes, ParticleBoundary, refuse_points
 
 KINDS = ("hinge", "clamp", "nodes")
 

@@ -1,8 +1,8 @@
 """PhysGaussian's configurations against what its code does with them.
 
 Covers: cli.convert, interop.physgaussian.boundaries, interop.physgaussian.camera,
-interop.physgaussian.camera_settings, interop.physgaussian.fields, interop.physgaussian.filling,
-interop.physgaussian.materials, interop.physgaussian.parts, interop.physgaussian.space, interop.physgaussian.yaml_file,
+interop.physgaussian.convert, interop.physgaussian.fields, interop.physgaussian.convert,
+interop.physgaussian.materials, interop.physgaussian.fields, interop.physgaussian.space, interop.physgaussian.convert,
 simulation.normalisation.
 """
 
@@ -22,9 +22,8 @@ from gaussian_swaying.gaussians.cloud import GaussianCloud
 from gaussian_swaying.gaussians.ply import write_ply
 from gaussian_swaying.geometry.regions import Box
 from gaussian_swaying.interop.physgaussian.camera import PhysGaussianCamera, read_model_camera
-from gaussian_swaying.interop.physgaussian.convert import convert
+from gaussian_swaying.interop.physgaussian.convert import convert, to_yaml
 from gaussian_swaying.interop.physgaussian.space import heading, rotation_matrix
-from gaussian_swaying.interop.physgaussian.yaml_file import to_yaml
 from gaussian_swaying.mpm.boundaries.enclosing_box import EnclosingBox
 from gaussian_swaying.mpm.boundaries.handle import Handle
 from gaussian_swaying.mpm.boundaries.pinned_region import PinnedRegion

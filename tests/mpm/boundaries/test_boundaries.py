@@ -1,7 +1,7 @@
 """Each boundary acts only where and when it should.
 
 Covers: mpm.boundaries.ball, mpm.boundaries.block, mpm.boundaries.boundary, mpm.boundaries.capsule,
-mpm.boundaries.half_space, mpm.boundaries.mesh, mpm.boundaries.particle_boundary, mpm.boundaries.pinned_points,
+mpm.boundaries.half_space, mpm.boundaries.mesh, mpm.boundaries.boundary, mpm.boundaries.pinned_points,
 mpm.boundaries.still_gaussians.
 """
 

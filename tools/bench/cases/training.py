@@ -25,12 +25,11 @@ from bench.record import chosen
 from gaussian_swaying.cli.train import make_cli
 from gaussian_swaying.gaussians.model import GaussianSurfaceModel
 from gaussian_swaying.rendering.factory import make_renderer
-from gaussian_swaying.training.data.datamodule import CaptureDataModule, TrainingImage
+from gaussian_swaying.training.data.datamodule import CaptureDataModule, EndlessShuffle, TrainingImage
 from gaussian_swaying.training.data.generated_datamodule import GeneratedDataModule
-from gaussian_swaying.training.data.order import EndlessShuffle
 from gaussian_swaying.training.losses import photometric_loss
+from gaussian_swaying.training.optimizers import LearningRates, means_rate
 from gaussian_swaying.training.panels import panel
-from gaussian_swaying.training.rates import LearningRates, means_rate
 
 ROOT = Path(__file__).resolve().parents[3]
 Row = dict[str, Any]

@@ -67,7 +67,7 @@ def _worst(rows: Recorded, problem: str, name: str = "variant") -> Iterator[Row]
 
 VARIANT, ERROR = "`{variant}`", "{error:.3g %}"
 SECOND = "quadratic splines blur a field by terms of dx²; a tenth less, for the grids are not infinitely fine"
-BEAM = "chosen: a plane body is not Timoshenko's beam (its clamped end is stiffer by the corners' share)"
+BEAM = "chosen: beam theory is not exact for a plane body"
 BLUR = "the variance of a quadratic spline is dx² / 4, so it blurs a wave by (k dx)² / 8; twice that"
 
 
