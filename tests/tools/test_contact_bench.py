@@ -44,6 +44,7 @@ def test_rows_are_recorded_and_shown(monkeypatch):
     assert "thicknesses" in shown("contact.collisions", result)[-1]
 
 
+@pytest.mark.slow(twin="test_a_pile_at_rest_stays_at_rest")
 def test_a_pile_rests_for_a_second():
     (row,) = contact.pile(1.0, CPU, layers=2, per_side=2)
     assert row["kinetic"] < 1e-4

@@ -127,7 +127,7 @@ def test_gaussians_turned_to_the_reference(tmp_path):
     assert torch.equal(turned.means, cloud.means)
 
 
-def test_a_row_is_simulated_and_compared(tmp_path):
+def test_a_row_of_a_flag_is_simulated_and_compared(tmp_path):
     """A flag in still air that cannot fall, against one at rest: what is left is the spacing of the points."""
     u, v = np.meshgrid(np.linspace(0, 1, 25), np.linspace(0, 1, 17), indexing="ij")
     x, z = 1.2 * u.ravel(), 0.8 * v.ravel()

@@ -59,6 +59,7 @@ def test_references_are_described_and_compared_over_the_frames_that_both_have(tm
         folds.measure(options, {}, lambda now: None)
 
 
+@pytest.mark.slow(twin="test_a_row_of_a_flag_is_simulated_and_compared")
 def test_a_row_is_simulated_and_compared(tmp_path):
     """Two frames of a coarse flag."""
     _reference(tmp_path / "set" / "blender", 2, 0.0)

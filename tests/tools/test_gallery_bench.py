@@ -27,6 +27,7 @@ def test_each_scene_has_its_files(gallery):
     assert order == ["sim/sand", "preview/sand", "variants/sand_to_foam"]
 
 
+@pytest.mark.slow(twin="test_a_row_of_a_flag_is_simulated_and_compared")
 def test_a_scene_is_run_and_pictured(gallery, tmp_path):
     options = type("Options", (), {})()
     options.preset, options.device, options.frames = "preview", "cpu", 3

@@ -69,6 +69,7 @@ def _pages(bench, results):
     return (results.parent / "benchmarks.md").read_text()
 
 
+@pytest.mark.slow(twin="test_only_keeps_the_other_sections")
 def test_everything_is_measured_and_shown(bench, tmp_path):
     results = tmp_path / "docs/results"
     found = _speed(bench, results)
