@@ -294,6 +294,12 @@ def in_settings(settings: Namespace, name: str, value: Any) -> None:
         settings[name] = value
 
 
+def all_in_settings(settings: Namespace, values: Mapping[str, Any]) -> None:
+    """Set several parameters as :func:`in_settings` does; the speed of the wind first, as still air has no angles."""
+    for name in sorted(values, key=lambda name: name != POLAR[0]):
+        in_settings(settings, name, values[name])
+
+
 def of_settings(settings: Namespace, name: str) -> Any:
     """The value of a parameter in parsed settings, as :func:`in_settings` sets it.
 
@@ -559,6 +565,7 @@ __all__ = [
     "POLAR",
     "Parameter",
     "Setup",
+    "all_in_settings",
     "find",
     "flow_of",
     "forget",

@@ -14,7 +14,7 @@ from gaussian_swaying._inputs import check_regular
 from gaussian_swaying._yaml_limits import check_config_files, read_fields
 from gaussian_swaying.config.parser import check_settings, config_text, option, parse_text
 from gaussian_swaying.runs.seal import sha256
-from gaussian_swaying.simulation.parameters import in_settings
+from gaussian_swaying.simulation.parameters import POLAR, all_in_settings
 from gaussian_swaying.simulation.simulation import Simulation
 from gaussian_swaying.sweeps.axes import read_axis, runs_of
 
@@ -147,11 +147,11 @@ def parse_run(parser: ArgumentParser, config: str, frames: int, run: Mapping[str
         ArgumentError: If a value is not accepted.
         ValueError: If the settings do not fit together.
     """
-    own = {name: value for name, value in run.items() if name.startswith("forces.")}  # no options, but parameters
+    # parameters that are no options
+    own = {n: v for n, v in run.items() if n in POLAR or n.startswith(("forces.", "wind.modulations."))}
     options = [option(name, value) for name, value in {"frames": frames, **run}.items() if name not in own]
     settings = parse_text(parser, config, options)
-    for name, value in own.items():
-        in_settings(settings, name, value)
+    all_in_settings(settings, own)
     check_settings(Simulation, settings)
     return settings
 

@@ -19,10 +19,14 @@ if TYPE_CHECKING:
     from jsonargparse import ArgumentParser, Namespace
 
 
+OPTIONS = [name for name in parameters.names() if name not in parameters.POLAR and "*" not in name]
+"""Parameters that are options of ``sim``."""
+
+
 def shares_rollout(name: str) -> bool:
     """True if runs that differ only in this axis can share a rollout, as they have the same material points."""
     known = find(name)
-    return known is not None and known.batched and known.same_points and known.name in parameters.names()
+    return known is not None and known.batched and known.same_points and name in OPTIONS
 
 
 def grouped(runs: Sequence[Mapping[str, Any]], size: int) -> list[list[int]]:

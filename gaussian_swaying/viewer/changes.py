@@ -11,7 +11,7 @@ import yaml
 
 from gaussian_swaying.mpm.formulations.total import Total
 from gaussian_swaying.mpm.state import MPMState
-from gaussian_swaying.simulation.parameters import POLAR, find, in_settings, of_settings, parameter
+from gaussian_swaying.simulation.parameters import POLAR, all_in_settings, find, of_settings, parameter
 from gaussian_swaying.simulation.simulation import Simulation
 
 if TYPE_CHECKING:
@@ -35,8 +35,9 @@ def changed_settings(parser: ArgumentParser, settings: Namespace, values: Mappin
         ArgumentError: If a value has the wrong type.
         ValueError: If there is no such field, or a value is out of range.
     """
-    direct = {name for name in values if find(name) is not None or name.startswith(SHADER)}
-    further = {name: value for name, value in values.items() if name not in direct}
+    numbers = {name: value for name, value in values.items() if find(name) is not None}
+    shader = {name: value for name, value in values.items() if name.startswith(SHADER)}
+    further = {name: value for name, value in values.items() if name not in numbers and name not in shader}
     if further.get("wind.schedule", "") is None and settings.wind.schedule is None:
         del further["wind.schedule"]  # nothing changes
     if further:
@@ -52,11 +53,9 @@ def changed_settings(parser: ArgumentParser, settings: Namespace, values: Mappin
         settings = parser.parse_object(data)
     else:
         settings = copy.deepcopy(settings)
-    for name in direct:
-        if name.startswith(SHADER):
-            settings[name] = values[name]
-        else:
-            in_settings(settings, name, values[name])
+    for name, value in shader.items():
+        settings[name] = value
+    all_in_settings(settings, numbers)
     return settings
 
 

@@ -267,6 +267,24 @@ def test_a_number_of_a_users_force_is_swept(breath, parser, tmp_path):
         make_plan(read_sweep(tmp_path / "sweep.yaml"), parser)
 
 
+@pytest.mark.parametrize("backwards", [False, True])
+def test_parameters_that_are_no_options_are_swept_too(backwards, config, parser, tmp_path):
+    """Of still air the angles wait for the speed."""
+    still = CONFIG | {"wind": CONFIG["wind"] | {"flow": [0.0, 0.0, 0.0]}}
+    (tmp_path / "still.yaml").write_text(yaml.safe_dump(still))
+    axes = {"wind.speed": [2.0, 3.0], "wind.azimuth": [90.0], "wind.modulations.0.period": [1.5]}
+    axes = dict(reversed(axes.items())) if backwards else axes
+    (tmp_path / "sweep.yaml").write_text(json.dumps({"base": str(tmp_path / "still.yaml"), "axes": axes}))
+    plan = make_plan(read_sweep(tmp_path / "sweep.yaml"), parser)
+    found = [parse_run(parser, plan.config, 2, run) for run in plan.runs]
+    _close([list(one.wind.flow) for one in found], [[0.0, 2.0, 0.0], [0.0, 3.0, 0.0]])
+    assert [one.wind.modulations[0].init_args.period for one in found] == [1.5, 1.5]
+    assert len(grouped(plan.runs, 8)) == 2
+    settings = parser.parse_args(["--config", str(tmp_path / "still.yaml"), "--device=cpu"])
+    changed = changed_settings(parser, settings, {"wind.azimuth": 90.0, "wind.speed": 2.0})
+    _close(changed.wind.flow, [0.0, 2.0, 0.0])
+
+
 def test_the_documentation_lists_them():
     told = (Path(__file__).parents[2] / "docs" / "python.md").read_text()
     kinds = {"vector": "three numbers", "whole": "a whole number"}
