@@ -41,8 +41,8 @@ from .rendering.shading import PhongShader as PhongShader
 from .simulation.diagnostics import SimulationDiverged as SimulationDiverged
 from .simulation.edits import Edit as Edit
 from .simulation.frame import Frame as Frame
+from .simulation.material import Material as Material
 from .simulation.parameters import register as register
-from .simulation.scene import Material as Material
 from .simulation.scene import Scene as Scene
 from .simulation.simulation import Simulation as Simulation
 from .training.data.datamodule import CaptureDataModule as CaptureDataModule

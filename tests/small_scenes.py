@@ -13,7 +13,9 @@ from gaussian_swaying.mpm.boundaries.pinned_region import PinnedRegion
 from gaussian_swaying.mpm.solver import MPMSolver
 from gaussian_swaying.rendering.cameras.camera_path import OrbitCamera
 from gaussian_swaying.scenes.procedural import FlagScene, ProceduralScene
-from gaussian_swaying.simulation.scene import Material, Scene, SimulatedScene
+from gaussian_swaying.simulation.material import Material
+from gaussian_swaying.simulation.scene import Scene
+from gaussian_swaying.simulation.simulated_scene import SimulatedScene
 from gaussian_swaying.simulation.simulation import Simulation
 
 

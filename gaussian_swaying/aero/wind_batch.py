@@ -44,17 +44,9 @@ class WindBatch(Recordable, nn.Module):
         super().__init__()
         if not winds:
             raise ValueError("Expected at least one of `winds`.")
-        kinds = [type(part) for part in winds[0].modulations]
-        for wind in winds:
-            same = type(wind) is WindField and [type(part) for part in wind.modulations] == kinds
-            if not same or wind.interpolation != winds[0].interpolation or not wind.uniform:
-                raise ValueError(
-                    "Expected `winds` to be uniform, with the same `interpolation` and modulations of the same kinds: "
-                    "leave out `effects`, or simulate the scenes one by one."
-                )
-        unknown = [kind.__name__ for kind in kinds if kind not in NUMBERS]
-        if unknown:
-            raise ValueError(f"The modulation {unknown[0]} cannot be computed for several winds at once.")
+        why = why_apart(winds)
+        if why is not None:
+            raise ValueError(why)
         self.linear = winds[0].interpolation == "linear"
         longest = max(len(wind.times) for wind in winds)
         self.register_buffer("times", torch.stack([_longer(wind.times, longest, math.inf) for wind in winds]))
@@ -95,6 +87,21 @@ class WindBatch(Recordable, nn.Module):
         return flow.transpose(0, 1)
 
 
+def why_apart(winds: Sequence[nn.Module]) -> str | None:
+    """Return a sentence on why winds cannot be computed together; None if they can."""
+    first = winds[0]
+    kinds = [type(part) for part in first.modulations] if isinstance(first, WindField) else []
+    for wind in winds:
+        same = type(wind) is WindField and [type(part) for part in wind.modulations] == kinds
+        if not same or wind.interpolation != first.interpolation or not wind.uniform:
+            return (
+                "Expected `winds` to be uniform, with the same `interpolation` and modulations of the same kinds: "
+                "leave out `effects`, or simulate the scenes one by one."
+            )
+    unknown = [kind.__name__ for kind in kinds if kind not in NUMBERS]
+    return f"The modulation {unknown[0]} cannot be computed for several winds at once." if unknown else None
+
+
 def _longer(values: Tensor, count: int, fill: float | None = None) -> Tensor:
     """Values with more rows at the end: copies of the last one, or of ``fill``."""
     row = values[-1:] if fill is None else torch.full_like(values[-1:], fill)
@@ -117,4 +124,4 @@ def _joined(parts: list[Modulation], device: torch.device) -> nn.Module:
     return joined
 
 
-__all__ = ["WindBatch"]
+__all__ = ["WindBatch", "why_apart"]

@@ -20,7 +20,7 @@ from gaussian_swaying.aero.wind import SpatialWind, WindField
 from gaussian_swaying.aero.wind_batch import WindBatch
 from gaussian_swaying.geometry.patches import compiles, deform_patch
 from gaussian_swaying.mpm.forces import MOST_STEPS, Force, ForceTwin, Given
-from gaussian_swaying.mpm.state import MPMState
+from gaussian_swaying.mpm.state import State
 
 Wind = WindField | SpatialWind
 
@@ -192,7 +192,7 @@ class WindForce(Force):
         parts = [_air(wind, time, place) for wind, place in zip(self._fields, position, strict=True)]
         return torch.stack([part.to(position).expand_as(position[0]) for part in parts])
 
-    def samples(self, state: MPMState, dt: float, steps: int) -> Tensor:
+    def samples(self, state: State, dt: float, steps: int) -> Tensor:
         """Air velocity [m/s] at the particles of a state, at ``steps`` times, ``dt`` [s] apart, starting at its time.
 
         Returns:
@@ -202,7 +202,7 @@ class WindForce(Force):
             return self.winds(state.time, dt, steps)
         return torch.stack([self.air(state.time + k * dt, state.position) for k in range(steps)])
 
-    def force(self, state: MPMState, wind: Tensor) -> tuple[Tensor, Tensor | None]:
+    def force(self, state: State, wind: Tensor) -> tuple[Tensor, Tensor | None]:
         """Force on every particle [N] (..., P, 3), and the resistance of a semi-implicit drag [kg/s] (..., P) or None.
 
         Args:
@@ -220,7 +220,7 @@ class WindForce(Force):
         area = capped_area(area, self.area, self.aero.max_area_ratio)
         return self.aero(wind, state.velocity, normal, area), self.aero.resistance(wind, state.velocity, area)
 
-    def forward(self, state: MPMState) -> tuple[Tensor, Tensor | None]:
+    def forward(self, state: State) -> tuple[Tensor, Tensor | None]:
         """:meth:`force` in the wind of ``state.time``."""
         return self.force(state, self.air(state.time, state.position))
 
@@ -230,7 +230,7 @@ class WindForce(Force):
             return []
         return [effect for effect in wind.effects if isinstance(effect, Shelter)]
 
-    def foreseen(self, state: MPMState) -> WindForce:
+    def foreseen(self, state: State) -> WindForce:
         """The same force as it will be in the frame that starts with a state; this one does not change.
 
         Shelters of the result have tables of their own, as this one may be in use on another stream.
@@ -253,7 +253,7 @@ class WindForce(Force):
         """The tensors that :meth:`refresh` writes."""
         return tensors_in(self._shelters())
 
-    def refresh(self, state: MPMState) -> None:
+    def refresh(self, state: State) -> None:
         """Update each :class:`~gaussian_swaying.aero.shelter.Shelter` from the body's present shape; once in a frame.
 
         Args:
@@ -273,7 +273,7 @@ class WindForce(Force):
             for shelter in shelters:
                 shelter.refresh(state.position, area, axes)
 
-    def during(self, time: Tensor, dt: float, steps: int) -> Callable[[MPMState, int], Given]:
+    def during(self, time: Tensor, dt: float, steps: int) -> Callable[[State, int], Given]:
         """See ``Force.during``: a uniform wind is computed for all substeps at once."""
         if self.uniform:
             winds = self.winds(time, dt, steps)

@@ -9,11 +9,12 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from gaussian_swaying.fitting.ensemble import RETRIES, Ensemble, SubstepTooLongError, Values
 from gaussian_swaying.fitting.tracks import Tracks
+from gaussian_swaying.fitting.variants import Values, states_of
 from gaussian_swaying.fitting.videos import Footage
-from gaussian_swaying.mpm.state import MPMState
+from gaussian_swaying.mpm.state import State
 from gaussian_swaying.rendering.cameras.camera import project
+from gaussian_swaying.simulation.diagnostics import SimulationDiverged
 from gaussian_swaying.simulation.simulation import Simulation
 
 PATCHES = 4
@@ -59,7 +60,7 @@ class Evidence(ABC):
         return None
 
     @abstractmethod
-    def residuals(self, simulation: Simulation, states: Sequence[MPMState], frame: int) -> tuple[Tensor, Tensor]:
+    def residuals(self, simulation: Simulation, states: Sequence[State], frame: int) -> tuple[Tensor, Tensor]:
         """Differences in a frame, shape (B, R, D), and their clusters, shape (R,)."""
 
 
@@ -77,7 +78,7 @@ class TrackEvidence(Evidence):
         self._rest = scene.model.means.detach()[scene.moving[index]]
         self._cluster = _patch_of(self._rest.cpu())
 
-    def residuals(self, simulation: Simulation, states: Sequence[MPMState], frame: int) -> tuple[Tensor, Tensor]:
+    def residuals(self, simulation: Simulation, states: Sequence[State], frame: int) -> tuple[Tensor, Tensor]:
         """See the base class; D is 2."""
         seen = self.tracks.seen[frame]
         wanted = self.tracks.position[frame, seen]
@@ -105,7 +106,7 @@ class PictureEvidence(Evidence):
         self.kind, self.masks = "silhouettes" if masks else "pixels", masks
         self.factor = max(1, round(video.size[0] / width))
 
-    def residuals(self, simulation: Simulation, states: Sequence[MPMState], frame: int) -> tuple[Tensor, Tensor]:
+    def residuals(self, simulation: Simulation, states: Sequence[State], frame: int) -> tuple[Tensor, Tensor]:
         """See the base class; D is 1 for silhouettes and 3 for colours."""
         painter = simulation.painter
         camera = self.video.cameras[frame].to(painter.device)
@@ -132,7 +133,7 @@ class PictureEvidence(Evidence):
 
 
 def compare(
-    ensemble: Ensemble,
+    simulation: Simulation,
     evidence: Sequence[Evidence],
     values: Sequence[Values],
     times: Sequence[float],
@@ -141,39 +142,33 @@ def compare(
     """Simulate variants and compare each with the videos.
 
     Args:
-        ensemble: The simulation.
+        simulation: The base.
         evidence: The comparisons to make.
         values: The values of each variant.
         times: Times of the frames to compare [s], ascending.
-        careful: Take the same substeps for all, and repeat with shorter ones if the material stiffens. If not, each
-            variant takes its own, and may end in NaN.
+        careful: Take the same substeps for all. If not, or if one of them diverges, each variant takes its own, and may
+            end in NaN.
 
     Returns:
         One block for each kind, joined over cameras and times; clusters of different kinds and, for pictures, cameras
         differ.
     """
-    for _ in range(RETRIES if careful else 1):
-        try:
-            return _compare(ensemble, evidence, values, times, careful)
-        except SubstepTooLongError:
-            continue
-    return _compare(ensemble, evidence, values, times, False)
-
-
-def _compare(
-    ensemble: Ensemble, evidence: Sequence[Evidence], values: Sequence[Values], times: Sequence[float], careful: bool
-) -> list[Block]:
     parts: dict[str, list[tuple[Tensor, Tensor]]] = {}
-    for time, states in zip(times, ensemble.run(values, times, careful, alike=careful), strict=True):
-        if time <= 0:  # at rest all variants are alike
-            continue
-        for place, part in enumerate(evidence):
-            frame = part.frame_at(time)
-            if frame is None:
+    try:
+        for time, states in zip(times, states_of(simulation, values, times, alike=careful), strict=True):
+            if time <= 0:  # at rest all variants are alike
                 continue
-            found, cluster = part.residuals(ensemble.simulation, states, frame)
-            shift = 0 if part.kind == "tracks" else place * PATCHES**2
-            parts.setdefault(part.kind, []).append((found, cluster + shift))
+            for place, part in enumerate(evidence):
+                frame = part.frame_at(time)
+                if frame is None:
+                    continue
+                found, cluster = part.residuals(simulation, states, frame)
+                shift = 0 if part.kind == "tracks" else place * PATCHES**2
+                parts.setdefault(part.kind, []).append((found, cluster + shift))
+    except SimulationDiverged:
+        if not careful:
+            raise
+        return compare(simulation, evidence, values, times, careful=False)
     return [
         Block(kind, torch.cat([found for found, _ in own], 1), torch.cat([cluster for _, cluster in own]))
         for kind, own in parts.items()

@@ -17,7 +17,6 @@ from torch import Tensor
 
 from gaussian_swaying._files import write_json
 from gaussian_swaying._inputs import read_json
-from gaussian_swaying.fitting.ensemble import SAFETY, Ensemble
 from gaussian_swaying.fitting.evidence import (
     Block,
     Evidence,
@@ -42,8 +41,9 @@ from gaussian_swaying.fitting.plan import Plan, parse_base, read_unknown
 from gaussian_swaying.fitting.report import Result, predictions, write_results
 from gaussian_swaying.fitting.tracks import Tracks, match, opencv, track
 from gaussian_swaying.fitting.unknowns import check_unknowns
+from gaussian_swaying.fitting.variants import check_variants, states_of
 from gaussian_swaying.fitting.videos import Footage, frame_times, read_videos
-from gaussian_swaying.mpm.state import MPMState
+from gaussian_swaying.mpm.state import State
 from gaussian_swaying.runs.folder import MARKER, claim_folder, hold_folder
 from gaussian_swaying.simulation.simulation import Simulation
 
@@ -82,7 +82,6 @@ class Course:
         damping: See :class:`~gaussian_swaying.fitting.least_squares.Progress`.
         iteration: Iterations done in this step.
         ended: The reason why the iterations of this step ended; empty if they did not.
-        stiffening: See :class:`~gaussian_swaying.fitting.ensemble.Ensemble`.
         history: One row for each iteration.
         directions: The principal directions of the sensitivities.
         seconds: Time spent.
@@ -94,7 +93,6 @@ class Course:
     damping: float = START
     iteration: int = 0
     ended: str = ""
-    stiffening: float = SAFETY
     history: list[dict[str, Any]] = field(default_factory=list)
     directions: list[dict[str, Any]] = field(default_factory=list)
     seconds: float = 0.0
@@ -131,7 +129,7 @@ class Fit:
             raise ValueError(
                 "The videos have no silhouettes: give `mask_path` or transparent images, or add tracks to `stages`."
             )
-        self.ensemble = Ensemble(simulation)
+        check_variants(simulation)
         self._tracks: list[Tracks] | None = None
 
     # ---- what is compared
@@ -163,7 +161,7 @@ class Fit:
         return found
 
     def _matches(self, place: Sequence[float]) -> list[Evidence]:
-        states: list[list[MPMState]] = [[] for _ in self.videos]
+        states: list[list[State]] = [[] for _ in self.videos]
         probes = [TrackEvidence(self.simulation, video, _NOTHING) for video in self.videos]
         for moment, found in zip(self.fitted, self._run(torch.tensor([list(place)]), self.fitted), strict=True):
             for own, probe in zip(states, probes, strict=True):
@@ -173,7 +171,7 @@ class Fit:
         return [TrackEvidence(self.simulation, v, own) for v, own in zip(self.videos, tracks, strict=True)]
 
     def _run(self, places: Tensor, times: Sequence[float]) -> Any:
-        return self.ensemble.run([self.values(place) for place in places], times, careful=False)
+        return states_of(self.simulation, [self.values(place) for place in places], times, alike=False)
 
     def values(self, place: Tensor | Sequence[float]) -> dict[str, float]:
         """Values of the unknowns at a place, given as shares of the ranges."""
@@ -183,7 +181,7 @@ class Fit:
         """The residuals of some evidence up to a horizon, as a function of places (B, U)."""
 
         def at(places: Tensor) -> list[Block]:
-            return compare(self.ensemble, evidence, [self.values(place) for place in places], times)
+            return compare(self.simulation, evidence, [self.values(place) for place in places], times)
 
         return at
 
@@ -231,7 +229,7 @@ class Fit:
         return [float(share) for share in places[int(costs.argmin())]]
 
     def _coarse(self, places: Tensor, evidence: Sequence[Evidence], times: Sequence[float]) -> Tensor:
-        blocks = compare(self.ensemble, evidence, [self.values(p) for p in places], times, careful=False)
+        blocks = compare(self.simulation, evidence, [self.values(p) for p in places], times, careful=False)
         width = max(video.size[0] for video in self.videos)
         scales = {b.kind: COARSE[b.kind] * (width if b.kind in ("tracks", "matches") else 1) for b in blocks}
         return huber(blocks, scales)
@@ -246,7 +244,7 @@ class Fit:
         Raises:
             ValueError: If the video cannot tell the unknowns apart.
         """
-        clock, self.ensemble.stiffening = time.monotonic() - course.seconds, course.stiffening
+        clock = time.monotonic() - course.seconds
         if course.step < 0:
             course.place = self.search()
             self.say(f"search: {self._shown(course.place)}")
@@ -269,7 +267,6 @@ class Fit:
                 close = (TOLERANCE, LEAST_GAIN) if last else (ROUGH * TOLERANCE, ROUGH * LEAST_GAIN)
                 iterate(residuals, lambda blocks: scales_of(blocks, floors), progress, *close)  # noqa: B023
                 course.place, course.damping = progress.place.tolist(), progress.damping
-                course.stiffening = self.ensemble.stiffening
                 course.iteration, course.ended = progress.iteration, progress.done
                 course.seconds = time.monotonic() - clock
                 row = {"stage": stage, "horizon_s": times[-1], "iteration": progress.iteration, "cost": _cost(progress)}

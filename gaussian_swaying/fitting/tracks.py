@@ -15,7 +15,7 @@ from torch import Tensor
 
 from gaussian_swaying.fitting.videos import Footage
 from gaussian_swaying.gaussians.model import DeformedGaussians
-from gaussian_swaying.mpm.state import MPMState
+from gaussian_swaying.mpm.state import State
 from gaussian_swaying.rendering.cameras.camera import Camera, project
 from gaussian_swaying.rendering.protocol import RenderOutput
 from gaussian_swaying.simulation.painter import Painter
@@ -72,7 +72,7 @@ def track(simulation: Simulation, video: Footage, most: int = 400) -> Tracks:
     return Tracks(chosen, torch.from_numpy(position), torch.from_numpy(seen))
 
 
-def match(simulation: Simulation, video: Footage, states: Sequence[MPMState], most: int = 400) -> Tracks:
+def match(simulation: Simulation, video: Footage, states: Sequence[State], most: int = 400) -> Tracks:
     """Find the Gaussians of a simulation in the video: match each rendered frame with the frame of the camera.
 
     Nothing drifts, as every frame is matched anew, and a Gaussian that comes into sight again is found again. The

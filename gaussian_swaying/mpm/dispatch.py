@@ -42,16 +42,6 @@ class LawDispatch:
         """Names of the laws with a return map."""
         return [type(law).__name__ for law, _ in self._groups if law.plastic]
 
-    def elastic_particles(self) -> Tensor | None:
-        """Particles whose law has no return map, bool, shape (P,) over all scenes; None if all of them."""
-        if not self.plastic:
-            return None
-        mask = torch.zeros(self.mu.numel(), dtype=torch.bool, device=self.mu.device)
-        for law, index in self._groups:
-            if not law.plastic and index is not None:
-                mask[index] = True
-        return mask
-
     def initial_internal(self) -> Tensor | None:
         """The internal variables at rest, shape (..., P), or None if no law has one."""
         if all(law.internal is None for law, _ in self._groups):

@@ -12,7 +12,7 @@ from torch import Tensor, nn
 from gaussian_swaying._checks import check_like, check_shape
 from gaussian_swaying._graphs import Recordable, tensors_in
 from gaussian_swaying.geometry.frame import SimFrame
-from gaussian_swaying.mpm.state import MPMState
+from gaussian_swaying.mpm.state import State
 
 MOST_STEPS = 256
 """Largest number of substeps for which a :class:`ForceTwin` computes its vectors at once."""
@@ -24,7 +24,7 @@ TWIN_VALUES, TWIN_NUMBERS, TWIN_VECTOR = 4, 8, 16
 Given = Tensor | tuple[Tensor, Tensor | None]
 """A force [N], shape (..., P, 3), alone or with its resistance [kg/s], shape (..., P)."""
 
-ForceFunction = Callable[[MPMState], Given]
+ForceFunction = Callable[[State], Given]
 
 
 @dataclass(frozen=True)
@@ -92,7 +92,7 @@ class Force(Recordable, nn.Module, ABC):
     """
 
     @abstractmethod
-    def forward(self, state: MPMState) -> Given:
+    def forward(self, state: State) -> Given:
         """The force at the start of a substep.
 
         Args:
@@ -113,7 +113,7 @@ class Force(Recordable, nn.Module, ABC):
         """
         return self
 
-    def during(self, time: Tensor, dt: float, steps: int) -> Callable[[MPMState, int], Given]:
+    def during(self, time: Tensor, dt: float, steps: int) -> Callable[[State, int], Given]:
         """The force in each of several substeps; what depends only on time can be computed here, for all at once.
 
         Args:
@@ -147,7 +147,7 @@ class FunctionForce(Force):
         super().__init__()
         self.function = function
 
-    def forward(self, state: MPMState) -> Given:
+    def forward(self, state: State) -> Given:
         """The result of the function."""
         return self.function(state)
 
@@ -174,7 +174,7 @@ def as_forces(forces: Forces | None) -> tuple[Force, ...]:
     return tuple(force if isinstance(force, Force) else FunctionForce(force) for force in several)
 
 
-def split(found: Given, force: Force, state: MPMState) -> tuple[Tensor, Tensor | None]:
+def split(found: Given, force: Force, state: State) -> tuple[Tensor, Tensor | None]:
     """Split the result of a force into the force and its resistance or None, in the dtype of the state.
 
     Raises:

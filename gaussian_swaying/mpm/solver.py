@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 from collections.abc import Callable, Sequence
 from itertools import pairwise
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import torch
 from torch import Tensor, nn
@@ -17,10 +18,13 @@ from gaussian_swaying.mpm.boundaries.boundary import Boundary
 from gaussian_swaying.mpm.contact.surface import Surface
 from gaussian_swaying.mpm.damping import damped_substep
 from gaussian_swaying.mpm.dispatch import LawDispatch
+from gaussian_swaying.mpm.followers import Followers, GridFollowers
 from gaussian_swaying.mpm.forces import Force, Forces, added, as_forces, divide, split, tensors_of
 from gaussian_swaying.mpm.formulations import FORMULATIONS
 from gaussian_swaying.mpm.formulations.formulation import Formulation, Settings
+from gaussian_swaying.mpm.formulations.total import Total
 from gaussian_swaying.mpm.guard import check_begin, check_end, check_load, check_rest
+from gaussian_swaying.mpm.protocol import Solver, WatchFunction
 from gaussian_swaying.mpm.recompute import rollout
 from gaussian_swaying.mpm.state import MaterialPoints, MPMState
 from gaussian_swaying.mpm.timestep import check_pace, fixed_substeps, look_marks, substeps_per_frame, work_done
@@ -28,11 +32,10 @@ from gaussian_swaying.mpm.timestep import check_pace, fixed_substeps, look_marks
 if TYPE_CHECKING:
     from gaussian_swaying.mpm.triton.fused import Adjoint, Fused
 
-WatchFunction = Callable[[int], None]
 TRANSFERS = ("auto", "torch", "triton")
 
 
-class MPMSolver(nn.Module):
+class MPMSolver(Solver):
     """Material point method in two formulations over one set of transfers.
 
     ``total`` (total Lagrangian MPM; de Vaucorbeil, Nguyen & Hutchinson 2020): stencils at the rest positions, computed
@@ -142,7 +145,7 @@ class MPMSolver(nn.Module):
         return self.settings.deterministic
 
     @property
-    def neighbours_fixed(self) -> bool:
+    def neighbours_fixed(self) -> bool:  # type: ignore[override]
         """True if particles keep their neighbours from the rest state: they cannot tear, flow or leave the grid."""
         return FORMULATIONS[self.formulation].neighbours_fixed
 
@@ -164,6 +167,69 @@ class MPMSolver(nn.Module):
     def laws(self) -> LawDispatch:
         """The laws of the material given to :meth:`init_state`, bound to its particles."""
         return self.bound.body.laws
+
+    @property
+    def identity(self) -> Formulation:
+        """The formulation bound to the material; another material, device or precision makes another one."""
+        return self.bound
+
+    def prepare(self) -> None:
+        """Make the kernels, if they are used; their errors are raised here."""
+        self.fused()
+
+    def like(self, settings: Settings) -> MPMSolver:
+        """A solver with the same boundaries and other numbers, without a material.
+
+        Args:
+            settings: The numbers.
+        """
+        return MPMSolver(
+            **dataclasses.asdict(settings),
+            formulation=self.formulation,
+            cfl=self.cfl,
+            substep=self.substep,
+            boundaries=self._conditions(),
+            transfer=self.transfer,
+        )
+
+    def followers(self, place: Tensor, arm: Tensor | None) -> Followers | None:
+        """In ``total`` places are read from the nodes, each with its own stencil."""
+        return GridFollowers(place, arm) if self.neighbours_fixed else None
+
+    def continued(self, other: Solver, state: MPMState, start: MPMState) -> MPMState | None:
+        """The motion of another solver as a state of this one, such as the same body with other pins.
+
+        Args:
+            other: The solver that made ``state``.
+            state: Its state now.
+            start: The state at rest of this solver.
+
+        Returns:
+            The state; None if one of them is not ``total``, the grids differ, or a node has mass that had none, as it
+            did not move.
+        """
+        if not isinstance(other, MPMSolver):
+            return None
+        before, after = other.bound, self.bound
+        if not (isinstance(before, Total) and isinstance(after, Total)) or state.grid != start.grid:
+            return None
+        if bool(((after.node_inverse_mass > 0) & (before.node_inverse_mass == 0)).any()):
+            return None
+        assert state.node_displacement is not None
+        assert state.node_velocity is not None
+        moved = start.replace(time=state.time, substep=state.substep, work=state.work)
+        return after.read_particles(moved, state.node_displacement, state.node_velocity)
+
+    def domain(self, state: MPMState) -> tuple[list[float], list[float]]:
+        """Lower and upper corner of the grid [m]."""
+        grid = state.grid
+        low = [first * grid.dx for first in grid.offset]
+        return low, [first + (n - 1) * grid.dx for first, n in zip(low, grid.resolution, strict=True)]
+
+    def describe(self, state: MPMState) -> dict[str, Any]:
+        """Formulation and grid, for the summary of a run."""
+        grid = {"dx_m": self.dx, "resolution": list(state.grid.resolution)}
+        return {"formulation": self.formulation, "grid": grid}
 
     def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> MPMSolver:
         super()._apply(fn, recurse)
@@ -281,7 +347,7 @@ class MPMSolver(nn.Module):
         if velocity is None:
             velocity = torch.zeros_like(points.position)
         check_rest(points, velocity)
-        self._framed = None if frame is None else tuple(b.in_frame(frame) for b in self._conditions())
+        self._framed = None if frame is None else tuple(self.framed(frame))
         self._bound = None
         self.to(points.position.device)  # the solver moves to the device of its material
         self._bind(points, surface)
@@ -507,8 +573,8 @@ class MPMSolver(nn.Module):
             check_end(self.bound, state, end, dt, steps, acting)
         return end, torch.stack(seen).amax()
 
-    def energies(self, state: MPMState) -> dict[str, Tensor]:
-        """Kinetic, elastic and gravitational energy [J], each of shape (...) over the batch."""
+    def elastic_energy(self, state: MPMState) -> Tensor:
+        """Elastic energy [J], shape (...) over the batch; in a kernel if there is one."""
         points, laws = self.points, self.laws
         density = None
         wanted = torch.is_grad_enabled() and (state.F_elastic.requires_grad or laws.mu.requires_grad)
@@ -518,11 +584,15 @@ class MPMSolver(nn.Module):
             density = elastic_energy(self.bound.body, state.F_elastic)
         if density is None:
             density = laws.energy(state.F_elastic, state.internal)
+        return (points.volume * density).sum(-1)
+
+    def energies(self, state: MPMState) -> dict[str, Tensor]:
+        """Kinetic, elastic and gravitational energy [J], each of shape (...) over the batch."""
         height = (state.position * self.bound.gravity.to(state.position)).sum(-1)
         return {
             "kinetic": self.bound.kinetic(state),
-            "elastic": (points.volume * density).sum(-1),
-            "potential": -(points.mass * height).sum(-1),
+            "elastic": self.elastic_energy(state),
+            "potential": -(self.points.mass * height).sum(-1),
         }
 
     def momenta(self, state: MPMState) -> dict[str, Tensor]:

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import torch
 from torch import Tensor
@@ -14,6 +14,9 @@ from torch import Tensor
 from gaussian_swaying._checks import check_finite, check_shape
 from gaussian_swaying.mpm.laws.fixed_corotated import FixedCorotated
 from gaussian_swaying.mpm.laws.law import ConstitutiveLaw
+
+if TYPE_CHECKING:
+    from typing_extensions import Self
 
 
 @dataclass(frozen=True, slots=True)
@@ -218,6 +221,14 @@ class MaterialPoints:
         """Number of points P of one scene."""
         return self.position.shape[-2]
 
+    @property
+    def elastic(self) -> Tensor | None:
+        """The points whose law has no return map, bool, shape (..., P); None if all of them."""
+        if not any(law.plastic for law in self.laws):
+            return None
+        each = torch.tensor([not law.plastic for law in self.laws], device=self.position.device)
+        return each[:1].expand(self.mass.shape) if self.law_index is None else each[self.law_index]
+
     def map(self, function: Callable[[Tensor], Tensor]) -> MaterialPoints:
         """Apply a function to every tensor (``.detach``, indexing); law indices stay integers."""
         moved = {name: function(getattr(self, name)) for name in ("position", *_FIELDS)}
@@ -225,27 +236,22 @@ class MaterialPoints:
         return MaterialPoints(**moved, laws=self.laws, law_index=index)
 
 
-@dataclass(frozen=True, slots=True)
-class MPMState:
-    """Everything that changes in a run. ``step`` takes a state and returns a new one; nothing is changed in place.
+@dataclass(frozen=True, slots=True, kw_only=True)
+class State:
+    """Everything that changes in a run, of any solver. A step returns a new one; nothing is changed in place.
 
-    In the ``total`` formulation the nodal fields are the state and the particle fields are interpolated from them; in
-    the ``updated`` formulation the nodal fields are None.
+    A solver that needs more has a subclass with more fields.
 
     Attributes:
-        position: Particle position [m], shape (..., P, 3).
-        velocity: Particle velocity [m/s], shape (..., P, 3).
-        affine: Velocity gradient [1/s], shape (..., P, 3, 3): APIC's affine velocity in ``updated``, the rate of F in
-            ``total``.
+        position: Position of the material points [m], shape (..., P, 3).
+        velocity: Their velocity [m/s], shape (..., P, 3).
         F_elastic: Elastic deformation gradient, drives the stress, shape (..., P, 3, 3).
-        F_total: Total deformation gradient, drives covariances and normals, shape (..., P, 3, 3).
-        lost: Particles that left the grid since the run began, shape (..., P), bool.
+        F_total: Total deformation gradient, drives covariances and normals, shape (..., P, 3, 3); the same tensor as
+            ``F_elastic`` where nothing flows.
+        lost: Points that left the domain of the solver since the run began, shape (..., P), bool.
         time: Simulated time [s], scalar float64 tensor.
-        grid: The nodes in use.
-        node_displacement: Nodal displacement [m], shape (..., G, 3), or None.
-        node_velocity: Nodal velocity [m/s], shape (..., G, 3), or None.
-        internal: The internal variable of each particle's plastic law (see its class), shape (..., P), or None if no
-            law has one.
+        internal: The internal variable of each point's plastic law (see its class), shape (..., P), or None if no law
+            has one.
         substep: Length of the last substep [s]; 0 at the start.
         work: Work of the external forces since the start [J], shape (...) over the batch, float64.
         impulse: Reaction impulse: momentum that each boundary took from the body since the start [N s], in their order,
@@ -254,56 +260,81 @@ class MPMState:
 
     position: Tensor
     velocity: Tensor
-    affine: Tensor
     F_elastic: Tensor
     F_total: Tensor
     lost: Tensor
     time: Tensor
-    grid: GridSpec
-    node_displacement: Tensor | None = None
-    node_velocity: Tensor | None = None
     internal: Tensor | None = None
     substep: float = 0.0
     work: Tensor = field(default_factory=lambda: torch.zeros((), dtype=torch.float64))
     impulse: Tensor = field(default_factory=lambda: torch.zeros(0, 3, dtype=torch.float64))
 
-    def replace(self, **changes: Any) -> MPMState:
+    def replace(self, **changes: Any) -> Self:
         """A copy with some fields changed."""
         return dataclasses.replace(self, **changes)
 
-    def scene(self, index: int) -> MPMState:
+    def fields(self) -> dict[str, Any]:
+        """The fields by name."""
+        return {f.name: getattr(self, f.name) for f in dataclasses.fields(self)}
+
+    def scene(self, index: int) -> Self:
         """One scene of a batch; its tensors are views."""
-        fields = {f.name: getattr(self, f.name) for f in dataclasses.fields(self)}
-        own = {k: v[index] for k, v in fields.items() if isinstance(v, Tensor) and k != "time"}
+        own = {k: v[index] for k, v in self.fields().items() if isinstance(v, Tensor) and k != "time"}
         if self.F_total is self.F_elastic:
             own["F_total"] = own["F_elastic"]
         return self.replace(**own)
 
     def tensors(self) -> list[Tensor]:
         """The fields that may require a gradient."""
-        fields = [self.position, self.velocity, self.affine, self.F_elastic, self.F_total, self.internal]
-        return [t for t in (*fields, self.node_displacement, self.node_velocity) if t is not None]
+        without = ("lost", "time", "work", "impulse")
+        return [v for k, v in self.fields().items() if isinstance(v, Tensor) and k not in without]
 
     def state_dict(self) -> dict[str, Any]:
         """The state as plain tensors and numbers, for ``torch.save``."""
-        result = {f.name: getattr(self, f.name) for f in dataclasses.fields(self)}
-        result["grid"] = dataclasses.asdict(self.grid)
-        if self.F_total is self.F_elastic:
-            result["F_total"] = None
-        return result
+        return self.fields() | ({"F_total": None} if self.F_total is self.F_elastic else {})
 
     @classmethod
-    def from_state_dict(cls, values: dict[str, Any], device: torch.device | str = "cpu") -> MPMState:
+    def from_state_dict(cls, values: Mapping[str, Any], device: torch.device | str = "cpu") -> Self:
         """Rebuild a state saved by :meth:`state_dict`."""
         moved: dict[str, Any] = {k: v.to(device) if isinstance(v, Tensor) else v for k, v in values.items()}
-        grid = moved["grid"]
-        moved["grid"] = GridSpec(float(grid["dx"]), tuple(grid["offset"]), tuple(grid["resolution"]))
         if moved["F_total"] is None:
             moved["F_total"] = moved["F_elastic"]
         return cls(**moved)
 
 
-def support_force(before: MPMState, after: MPMState) -> Tensor:
+@dataclass(frozen=True, slots=True, kw_only=True)
+class MPMState(State):
+    """The state of an :class:`~gaussian_swaying.mpm.solver.MPMSolver`.
+
+    In the ``total`` formulation the nodal fields are the state and the particle fields are interpolated from them; in
+    the ``updated`` formulation the nodal fields are None.
+
+    Attributes:
+        affine: Velocity gradient [1/s], shape (..., P, 3, 3): APIC's affine velocity in ``updated``, the rate of F in
+            ``total``.
+        grid: The nodes in use.
+        node_displacement: Nodal displacement [m], shape (..., G, 3), or None.
+        node_velocity: Nodal velocity [m/s], shape (..., G, 3), or None.
+    """
+
+    affine: Tensor
+    grid: GridSpec
+    node_displacement: Tensor | None = None
+    node_velocity: Tensor | None = None
+
+    def state_dict(self) -> dict[str, Any]:
+        """See :meth:`State.state_dict`; the grid as a dictionary."""
+        return super(MPMState, self).state_dict() | {"grid": dataclasses.asdict(self.grid)}
+
+    @classmethod
+    def from_state_dict(cls, values: Mapping[str, Any], device: torch.device | str = "cpu") -> Self:
+        """See :meth:`State.from_state_dict`."""
+        grid = values["grid"]
+        known = GridSpec(float(grid["dx"]), tuple(grid["offset"]), tuple(grid["resolution"]))
+        return super(MPMState, cls).from_state_dict({**values, "grid": known}, device)
+
+
+def support_force(before: State, after: State) -> Tensor:
     """The mean force that the body exerted on each boundary between two states: on a pin, the force on its support.
 
     Args:

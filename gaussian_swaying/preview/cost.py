@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from gaussian_swaying._provenance import describe_device
-from gaussian_swaying.mpm.state import MPMState
+from gaussian_swaying.mpm.state import State
 from gaussian_swaying.mpm.timestep import wave_speed
 from gaussian_swaying.recording.writer import WORKERS
 from gaussian_swaying.simulation.diagnostics import SimulationDiverged
@@ -100,7 +100,7 @@ def estimate_cost(simulation: Simulation, frames: int, startup_seconds: float = 
         device=describe_device(simulation.device),
         particles=solver.points.count,
         dx=solver.dx,
-        grid=tuple(state.grid.resolution),
+        grid=tuple(solver.describe(state).get("grid", {}).get("resolution", ())),
         frames=frames,
         wave_speed=float(wave_speed(solver.points).amax()),
         stable_substep=solver.stable_substep(),
@@ -113,7 +113,7 @@ def estimate_cost(simulation: Simulation, frames: int, startup_seconds: float = 
     )
 
 
-def _timed_frames(simulation: Simulation, state: MPMState, at_rest: int) -> tuple[float, list[float], list[int]]:
+def _timed_frames(simulation: Simulation, state: State, at_rest: int) -> tuple[float, list[float], list[int]]:
     """Time to load the kernels [s]; and of some frames the time for a substep [s] and their numbers of substeps."""
     solver, warm_up = simulation.solver, 0.0
     each: list[float] = []
@@ -127,14 +127,14 @@ def _timed_frames(simulation: Simulation, state: MPMState, at_rest: int) -> tupl
             state, _ = simulation.advance(state)
         else:
             dt = simulation.frame_dt / at_rest
-            solver.rollout(state, dt, 1, simulation.forces, check=False)
-            trial = _seconds(simulation, lambda: solver.rollout(state, dt, 1, simulation.forces, check=False))
+
+            def substep() -> None:
+                solver.watched_rollout(state, dt, 1, simulation.forces, looks=1)
+
+            substep()
+            trial = _seconds(simulation, substep)
             if trial * at_rest > 0.4 * BUDGET:  # a frame would take too long
-                several = [
-                    _seconds(simulation, lambda: solver.rollout(state, dt, 1, simulation.forces, check=False))
-                    for _ in range(SUBSTEPS)
-                ]
-                return 0.0, several, [at_rest]
+                return 0.0, [_seconds(simulation, substep) for _ in range(SUBSTEPS)], [at_rest]
         begin = Stopwatch()
         while len(each) < MOST_FRAMES and (begin.wall < BUDGET or len(each) < 2):
             frame = Stopwatch()
@@ -147,7 +147,7 @@ def _timed_frames(simulation: Simulation, state: MPMState, at_rest: int) -> tupl
     return warm_up, each, taken
 
 
-def _picture_seconds(simulation: Simulation, state: MPMState, frame: float) -> float:
+def _picture_seconds(simulation: Simulation, state: State, frame: float) -> float:
     """Time that the pictures of a frame add to the ``frame`` seconds without [s].
 
     Further threads and ffmpeg write the files and the video. If there are more than two cores, they use the others, and
@@ -237,13 +237,13 @@ def _rounded_up(value: float) -> float:
     return float(f"{math.ceil(value / unit - 1e-6) * unit:.2g}")
 
 
-def _drag_substeps(simulation: Simulation, state: MPMState, frames: int) -> int:
+def _drag_substeps(simulation: Simulation, state: State, frames: int) -> int:
     """Substeps per frame needed for explicit drag at rest, on average over the wind of the run."""
-    if simulation.idle or simulation.aero.drag_step == "semi_implicit":
+    if simulation.stepper.idle or simulation.aero.drag_step == "semi_implicit":
         return 1
-    winds = simulation.wind_force.samples(state, simulation.frame_dt, frames)
+    winds = simulation.stepper.wind_force.samples(state, simulation.frame_dt, frames)
     speed = torch.linalg.vector_norm(winds, dim=-1).reshape(frames, -1).amax(1)
-    area, mass = simulation.wind_force.area, simulation.solver.points.mass
+    area, mass = simulation.stepper.wind_force.area, simulation.solver.points.mass
     rates = [
         float(simulation.aero.rate(one.to(mass).expand_as(mass), area, mass).amax()) for one in speed.sort().values
     ]

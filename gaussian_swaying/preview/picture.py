@@ -293,7 +293,7 @@ def _draw_wind(draw: ImageDraw, simulation: Simulation, camera: Camera) -> None:
 
 def mean_flow(simulation: Simulation) -> Tensor:
     """Flow without modulations [m/s], z up, shape (3,), float64; for a schedule its strongest entry."""
-    flows = simulation.flows().detach().cpu().double().reshape(-1, 3)
+    flows = simulation.stepper.flows().detach().cpu().double().reshape(-1, 3)
     return flows[int(flows.norm(dim=-1).argmax())]
 
 

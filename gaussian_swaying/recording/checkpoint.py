@@ -15,7 +15,6 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from gaussian_swaying.mpm.state import MPMState
 from gaussian_swaying.runs.seal import load_sealed, save_sealed
 
 _FIELDS = {"frame": int, "state": dict, "log": list, "config": str, "wall_s": dict}
@@ -86,7 +85,7 @@ def unreadable(path: Path, error: Exception) -> ValueError:
 
 
 def check_state(
-    checkpoint: dict[str, Any], start: MPMState, frame_dt: float, max_nodes: int, edited: bool, entries: Collection[str]
+    checkpoint: dict[str, Any], start: Any, frame_dt: float, max_nodes: int, edited: bool, entries: Collection[str]
 ) -> None:
     """Raise ValueError with the reason unless a run can continue from a checkpoint.
 
@@ -102,7 +101,7 @@ def check_state(
     _require(frame >= 0, "its `frame` is negative")
     wanted = start.state_dict()
     _require(set(state) == set(wanted), f"the fields of its state are not {', '.join(wanted)}")
-    nodes = _check_grid(state["grid"], start, max_nodes)
+    nodes = _check_grid(state["grid"], start, max_nodes) if "grid" in wanted else 0
     for name, like in wanted.items():
         if name in ("grid", "substep"):
             continue
@@ -132,7 +131,7 @@ def check_state(
     _require(known, "its `wall_s` has values that are not seconds")
 
 
-def _check_grid(grid: Any, start: MPMState, max_nodes: int) -> int:
+def _check_grid(grid: Any, start: Any, max_nodes: int) -> int:
     """Number of nodes of a stored grid; ValueError if it is not a valid grid."""
     fields = {"dx", "offset", "resolution"}
     _require(

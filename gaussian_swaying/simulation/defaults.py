@@ -21,6 +21,7 @@ from gaussian_swaying.mpm.boundaries.pinned_points import PinnedPoints
 from gaussian_swaying.mpm.boundaries.pinned_region import PinnedRegion
 from gaussian_swaying.mpm.contact.surface import Contact
 from gaussian_swaying.mpm.forces import Force
+from gaussian_swaying.mpm.protocol import Solver
 from gaussian_swaying.mpm.solver import MPMSolver
 from gaussian_swaying.recording.recorder import Recorder
 from gaussian_swaying.rendering.cameras.camera import azimuth_beside
@@ -29,15 +30,19 @@ from gaussian_swaying.rendering.shading import Shader
 from gaussian_swaying.scenes.procedural import GivenScene, ProceduralScene
 from gaussian_swaying.simulation.edits import Edit
 from gaussian_swaying.simulation.extent import suggest_spacing
+from gaussian_swaying.simulation.material import Material
 from gaussian_swaying.simulation.normalisation import Normalisation
-from gaussian_swaying.simulation.scene import Material, Scene, SimulatedScene
+from gaussian_swaying.simulation.scene import Scene
+from gaussian_swaying.simulation.simulated_scene import SimulatedScene
 
 if TYPE_CHECKING:
     SceneLike = Scene | ProceduralScene | GaussianCloud | str | os.PathLike[str]
     WindLike = WindField | SpatialWind | VectorLike
     DeviceLike = torch.device | str
+    SolverLike = Solver
 else:  # what a YAML file can contain: the annotations of the constructor are its schema
     SceneLike, WindLike, DeviceLike = Scene, WindField, Literal["auto", "cpu", "cuda"]
+    SolverLike = MPMSolver
 
 HoldLike = Region | PinnedRegion | PinnedPoints
 CELLS = 32
@@ -83,7 +88,7 @@ def as_scene(source: SceneLike, up: Sequence[float] | None = None) -> Scene:
     return Scene(ply=source, up=direction)
 
 
-def as_solver(solver: MPMSolver | None, hold: HoldLike | None, scene: Scene, cloud: GaussianCloud) -> MPMSolver:
+def as_solver(solver: Solver | None, hold: HoldLike | None, scene: Scene, cloud: GaussianCloud) -> Solver:
     """Return the given solver, or make one whose grid suits the size of the scene.
 
     A held object then has no gravity, as in the starters of the preview: its captured shape is already in balance with
@@ -163,7 +168,7 @@ def check_types(given: Mapping[str, Any]) -> None:
 _KINDS: dict[str, tuple[type, ...]] = {
     "scene": (Scene, ProceduralScene, GaussianCloud, str, os.PathLike),
     "material": (Material,),
-    "solver": (MPMSolver,),
+    "solver": (Solver,),
     "contact": (Contact,),
     "aero": (AeroForce,),
     "forces": (list, tuple),

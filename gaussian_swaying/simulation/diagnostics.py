@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import copy
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import asdict, dataclass, field
 from functools import cached_property
 from typing import Any
@@ -15,8 +15,8 @@ from torch import Tensor
 from gaussian_swaying._graphs import RECORDED, Replayed
 from gaussian_swaying.geometry.linalg import determinant, matmul3, symmetric_eigenvalues
 from gaussian_swaying.geometry.neighbours import nearest_neighbours
-from gaussian_swaying.mpm.solver import MPMSolver
-from gaussian_swaying.mpm.state import MPMState, support_force
+from gaussian_swaying.mpm.protocol import Solver
+from gaussian_swaying.mpm.state import State, support_force
 from gaussian_swaying.simulation.health import particle_of_extremes
 
 _PARTICLES = ("moved_particle", "compressed_particle", "stretched_particle")
@@ -126,7 +126,7 @@ class TearingGauge:
         count: Number of neighbours watched for each particle, among those within two cells at rest.
     """
 
-    def __init__(self, solver: MPMSolver, count: int = 4) -> None:
+    def __init__(self, solver: Solver, count: int = 4) -> None:
         position = solver.points.position.detach()
         flat = position.reshape(-1, *position.shape[-2:])
         self.reach = 2 * solver.dx
@@ -139,7 +139,7 @@ class TearingGauge:
             self.neighbour = torch.where(distance <= self.reach, index, own)
         scene = torch.arange(len(flat), device=position.device)[:, None, None]
         self.neighbour = (self.neighbour + position.shape[-2] * scene).reshape(-1)  # over the particles of all scenes
-        self.elastic = solver.laws.elastic_particles()
+        self.elastic = solver.points.elastic
 
     def __call__(self, position: Tensor) -> Tensor:
         """Return a mask (scenes, P) of the particles torn from a neighbour, from positions (..., P, 3) [m]."""
@@ -150,7 +150,7 @@ class TearingGauge:
         return torn if self.elastic is None else torn & self.elastic.reshape(torn.shape)
 
 
-def check_spacing(solver: MPMSolver) -> None:
+def check_spacing(solver: Solver) -> None:
     """Raise ValueError if most particles are isolated on the grid, so that no law could keep them together.
 
     Args:
@@ -173,14 +173,14 @@ def check_spacing(solver: MPMSolver) -> None:
 
 
 def diagnose(
-    solver: MPMSolver,
-    state: MPMState,
+    solver: Solver,
+    state: State,
     substeps: int,
     cfl: Tensor | float,
     wind_work: Tensor | float = 0.0,
     tearing: TearingGauge | None = None,
     check: bool = False,
-    before: MPMState | None = None,
+    before: State | None = None,
 ) -> FrameDiagnostics:
     """Measure the health of a state (one GPU synchronisation).
 
@@ -206,7 +206,7 @@ def diagnose(
 class Measurement:
     """Results of :func:`measure` on the device, which the host has not waited for yet."""
 
-    def __init__(self, solver: MPMSolver, substeps: int, parts: dict[str, Tensor], given: list[Tensor | float]) -> None:
+    def __init__(self, solver: Solver, substeps: int, parts: dict[str, Tensor], given: list[Tensor | float]) -> None:
         self._solver, self._substeps, self._given = solver, substeps, given
         self._sizes = {name: len(part) for name, part in parts.items()}
         self.values = torch.cat(list(parts.values()))
@@ -270,13 +270,13 @@ class Measurement:
 
 
 def measure(
-    solver: MPMSolver,
-    state: MPMState,
+    solver: Solver,
+    state: State,
     substeps: int,
     cfl: Tensor | float,
     wind_work: Tensor | float = 0.0,
     tearing: TearingGauge | None = None,
-    before: MPMState | None = None,
+    before: State | None = None,
     more: Tensor | None = None,
 ) -> Measurement:
     """Start the measurements of :func:`diagnose`, with the same arguments, without waiting for the device.
@@ -331,26 +331,32 @@ class SceneMeasurement(Measurement):
         if check:
             _raise_if_bad(self._solver, found["verdict"], found["time"][0])
         scenes = int(found["scenes"][0])
-        shared: dict[str, Any] = {"time": found["time"][0], "substeps": self._substeps, "cfl": self.cfl, "torn": 0}
+        shared: dict[str, Any] = {"time": found["time"][0], "substeps": self._substeps, "cfl": self.cfl}
 
         def one(scene: int) -> dict[str, Any]:
             row = found["each"][scene::scenes]
             own: dict[str, Any] = dict(zip(_OF_SCENE, row[: len(_OF_SCENE)], strict=True))
-            own |= {name: int(own[name]) for name in ("lost", *_PARTICLES)}
+            own |= {name: int(own[name]) for name in ("lost", "torn", *_PARTICLES)}
             return shared | own | {"support": tuple(zip(*[iter(row[len(_OF_SCENE) :])] * 3, strict=True))}
 
         return SceneDiagnostics(**one(0), make=lambda: tuple(FrameDiagnostics(**one(k)) for k in range(scenes)))
 
 
 _OF_SCENE = tuple(
-    name for name in FrameDiagnostics.__dataclass_fields__ if name not in ("time", "substeps", "cfl", "torn", "support")
+    name for name in FrameDiagnostics.__dataclass_fields__ if name not in ("time", "substeps", "cfl", "support")
 )
 
 
 def measure_scenes(
-    solver: MPMSolver, state: MPMState, substeps: int, cfl: Tensor | float, before: MPMState, more: Tensor | None = None
+    solver: Solver,
+    state: State,
+    substeps: int,
+    cfl: Tensor | float,
+    before: State,
+    tearing: TearingGauge | None = None,
+    more: Tensor | None = None,
 ) -> SceneMeasurement:
-    """As :func:`measure`, for each scene of a batch of shape (B,); torn particles are not counted."""
+    """As :func:`measure`, for each scene of a batch of shape (B,)."""
     moved = torch.linalg.vector_norm(state.position - solver.points.position, dim=-1)
     energies, momenta = solver.energies(state), solver.momenta(state)
     J = determinant(state.F_total)
@@ -362,6 +368,7 @@ def measure_scenes(
         **{f"momentum_{axis}": momenta["linear"][..., k] for k, axis in enumerate("xyz")},
         **{f"angular_momentum_{axis}": momenta["angular"][..., k] for k, axis in enumerate("xyz")},
         "lost": state.lost.sum(-1),
+        "torn": J.new_zeros(len(moved)) if tearing is None else tearing(state.position).sum(-1),
         "J_min": J.amin(-1),
         "J_max": J.amax(-1),
         "stretch_min": squares[..., -1].amin(-1).clamp(min=0).sqrt(),
@@ -399,13 +406,13 @@ class Gauge:
 
     def __call__(
         self,
-        solver: MPMSolver,
-        state: MPMState,
+        solver: Solver,
+        state: State,
         substeps: int,
         cfl: Tensor,
         work: Tensor,
-        before: MPMState,
-        more: Callable[[MPMState], Tensor],
+        before: State,
+        more: Callable[[State], Tensor],
         same: tuple[object, ...] | None,
     ) -> Measurement:
         """As :func:`measure`, without counting torn particles.
@@ -425,45 +432,39 @@ class Gauge:
         if not (small and fixed) or same is None or torch.is_grad_enabled():
             return measure(solver, state, substeps, cfl, work, None, before, more(state))
 
+        names = [name for name, value in state.fields().items() if isinstance(value, Tensor) and name not in _UNREAD]
+
         def values(its_cfl: Tensor, its_work: Tensor, impulse: Tensor, began: Tensor, *fields: Tensor) -> list[Tensor]:
-            end = _with_fields(state, fields)
+            found = dict(zip(names, fields, strict=True))
+            end = state.replace(**found, F_elastic=found["F_total"])
             start = end.replace(impulse=impulse, time=began)
             self._made = measure(solver, end, substeps, its_cfl, its_work, None, start, more(end))
             return [self._made.values]
 
-        key = (solver.bound, state.grid, *same)
-        (found,) = self.replayed(key, values, cfl, work, before.impulse, before.time, *_fields(state))
+        given = [getattr(state, name) for name in names]
+        key = (solver.identity, *same)
+        (found,) = self.replayed(key, values, cfl, work, before.impulse, before.time, *given)
         assert self._made is not None
         return self._made.again(substeps, found)
 
 
-def _fields(state: MPMState) -> list[Tensor]:
-    """Return the fields that :func:`measure` reads of a state whose two deformation gradients are the same tensor."""
-    found = [state.position, state.velocity, state.F_total, state.lost, state.time, state.impulse]
-    return [*found, *(t for t in (state.node_displacement, state.node_velocity, state.internal) if t is not None)]
+_UNREAD = ("F_elastic", "affine", "work")
+"""Fields of a state that a recording of :func:`measure` does not read; ``F_elastic`` is the same as ``F_total``."""
 
 
-def _with_fields(state: MPMState, fields: Sequence[Tensor]) -> MPMState:
-    """A state with other tensors in the order of :func:`_fields`."""
-    names = ["position", "velocity", "F_total", "lost", "time", "impulse"]
-    names += [name for name in ("node_displacement", "node_velocity", "internal") if getattr(state, name) is not None]
-    found = dict(zip(names, fields, strict=True))
-    return state.replace(**found, F_elastic=found["F_total"])
-
-
-def _supports(before: MPMState, after: MPMState) -> Tensor:
+def _supports(before: State, after: State) -> Tensor:
     """Force on each boundary [N], summed over the scenes, float64, shape (3 * boundaries,)."""
     force = support_force(before, after)
     return force.reshape(force.shape[:-2].numel(), *force.shape[-2:]).sum(0).reshape(-1)
 
 
-def _outran(before: MPMState, after: MPMState) -> Tensor:
+def _outran(before: State, after: State) -> Tensor:
     """Return 1 if a particle with a finite position left the grid between two states, else 0; float64, shape (1,)."""
     new = after.lost & ~before.lost & torch.isfinite(after.position).all(-1)
     return new.any().double().reshape(1)
 
 
-def check_state(solver: MPMSolver, state: MPMState) -> None:
+def check_state(solver: Solver, state: State) -> None:
     """Raise SimulationDiverged if a particle is NaN, infinite, outside the grid or extremely far away.
 
     Args:
@@ -482,7 +483,7 @@ FARTHEST = 1000  # a run ends when a particle is so many sizes of the object awa
 _FAR, _LOST, _NOT_FINITE = 1, 2, 3  # what is wrong with a particle; the last is the worst
 
 
-def _verdict(solver: MPMSolver, state: MPMState, moved: Tensor) -> Tensor:
+def _verdict(solver: Solver, state: State, moved: Tensor) -> Tensor:
     """Problem of the first bad particle (0 for none), its index, number of lost particles, size of the object [m].
 
     ``moved`` is how far each particle is from rest [m], shape (..., P). Four float64 values.
@@ -498,7 +499,7 @@ def _verdict(solver: MPMSolver, state: MPMState, moved: Tensor) -> Tensor:
     return torch.cat([found.double(), size[None].double()])
 
 
-def _raise_if_bad(solver: MPMSolver, verdict: list[float], time: float) -> None:
+def _raise_if_bad(solver: Solver, verdict: list[float], time: float) -> None:
     """Raise SimulationDiverged if the values of :func:`_verdict` name a particle."""
     wrong, particle, lost = (int(value) for value in verdict[:3])
     if wrong == 0:

@@ -6,6 +6,7 @@ import copy
 import dataclasses
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 from torch import Tensor, nn
@@ -14,9 +15,9 @@ from gaussian_swaying._checks import check_plain, check_positive, check_vector
 from gaussian_swaying.gaussians.harmonics import SH_DC
 from gaussian_swaying.geometry.regions import Region, whereabouts
 from gaussian_swaying.mpm.laws.law import ConstitutiveLaw
-from gaussian_swaying.mpm.state import MaterialPoints
+from gaussian_swaying.mpm.state import MaterialPoints, State
 from gaussian_swaying.simulation.parameters import parameter
-from gaussian_swaying.simulation.scene import SimulatedScene
+from gaussian_swaying.simulation.stepper import Stepper
 
 LUMINANCE = (0.2126, 0.7152, 0.0722)  # ITU-R BT.709
 
@@ -135,24 +136,82 @@ def recolored(sh: Tensor, inside: Tensor, color: Sequence[float], detail: float 
 
 
 class SceneEditor:
-    """Applies edits to a scene, in order of their times, and can undo them.
+    """Applies edits to the scene of a stepper, in order of their times, and can undo them.
 
     Args:
-        scene: The scene, which is changed.
+        stepper: The stepper; its scene and material are changed.
         edits: The edits. Those with the same time are applied in the given order, so that later entries win.
 
     Raises:
         ValueError: If the region of an edit contains nothing that it could change.
     """
 
-    def __init__(self, scene: SimulatedScene, edits: Sequence[Edit] = ()) -> None:
-        self.scene = scene
+    def __init__(self, stepper: Stepper, edits: Sequence[Edit] = ()) -> None:
+        self.stepper, self.scene = stepper, stepper.scene
         self.edits = sorted(edits, key=lambda edit: edit.time)
         self.applied = 0
         self.version = 0  # counts the changes of colour
         self._loaded: tuple[MaterialPoints, Tensor, Tensor] | None = None
         for edit in self.edits:
             self.reach(edit)
+
+    # ---- with the stepper
+
+    def start(self) -> State:
+        """The state at rest at time zero, with the edits of that time applied.
+
+        Raises:
+            ValueError: As ``Stepper.start``, now or after one of the edits.
+        """
+        self.reset()
+        for later in (moment for moment in self.times if moment > 0):  # refuse impossible edits now
+            self._apply_all(self.due(0.0))
+            self._apply_all(self.due(later), flowed=True)
+            self._pass_on()
+            self.stepper.rehearse()
+        self.reset()
+        self._apply_all(self.due(0.0))
+        self._pass_on()
+        return self.stepper.start()
+
+    def edit(self, state: State, edits: Sequence[Edit]) -> State:
+        """Apply edits now, whatever their time; if one is not possible, nothing changes.
+
+        Args:
+            state: The state now.
+            edits: The changes, in this order.
+
+        Returns:
+            The state from which the run continues.
+        """
+        before = self.snapshot()
+        try:
+            return self._pass_on(state, self._apply_all(edits, flowed=True))
+        except Exception:
+            self.restore(before)
+            self._pass_on()
+            self.stepper.bind()
+            raise
+
+    def edit_due(self, state: State, resumed: bool = False) -> State:
+        """Apply the edits up to the time of a state; a resumed state contains them already."""
+        if not self.edits:  # the host need not wait for the time
+            return state
+        edits = self.due(float(state.time) + 1e-3 * self.stepper.frame_dt)
+        edited = self._pass_on(state, self._apply_all(edits, flowed=True))
+        return state if resumed else edited
+
+    def _apply_all(self, edits: Sequence[Edit], flowed: bool = False) -> Tensor | None:
+        """Change the scene; returns which particles (P,) got another law, None if the material is the same."""
+        changed = [self.apply(edit, flowed) for edit in edits]
+        changed = [part for part, edit in zip(changed, edits, strict=True) if edit.of_material]
+        return torch.stack(changed).any(0) if changed else None
+
+    def _pass_on(self, state: State | None = None, changed: Tensor | None = None) -> Any:
+        """Give the material of the scene to the stepper; ``changed`` as from :meth:`_apply_all`."""
+        return self.stepper.take(dataclasses.replace(self.stepper.setup, points=self.scene.points), state, changed)
+
+    # ---- the scene
 
     def snapshot(self) -> tuple[MaterialPoints, nn.Parameter, nn.Parameter, int]:
         """The scene as it is now, for :meth:`restore`."""

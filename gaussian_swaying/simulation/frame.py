@@ -3,30 +3,20 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import Protocol
 
-from gaussian_swaying._turns import Turn
+import torch
+
 from gaussian_swaying.gaussians.export import export_cloud
 from gaussian_swaying.gaussians.model import DeformedGaussians
-from gaussian_swaying.mpm.state import MPMState
+from gaussian_swaying.mpm.state import State
 from gaussian_swaying.rendering.protocol import RenderOutput
 from gaussian_swaying.simulation.diagnostics import FrameDiagnostics
 from gaussian_swaying.simulation.edits import SceneEditor
 from gaussian_swaying.simulation.painter import Painter
-
-
-class Moving(Protocol):
-    """The attributes of a simulation that its frames use."""
-
-    frame_dt: float
-    painter: Painter
-    editor: SceneEditor
-
-    @property
-    def turn(self) -> Turn:
-        """The lock of the thread that steps or draws."""
+from gaussian_swaying.simulation.stepper import Launched
 
 
 @dataclass(frozen=True, eq=False)
@@ -34,15 +24,17 @@ class Frame:
     """A frame of a simulation.
 
     Attributes:
-        simulation: The simulation that made it.
-        index: Its number; 0 is the frame at rest.
+        painter: Draws the scene.
+        editor: Has changed it.
+        index: Number of the frame; 0 is the frame at rest.
         state: The state at its end.
         health: Energies, momenta, stretch and other measurements.
     """
 
-    simulation: Moving
+    painter: Painter
+    editor: SceneEditor
     index: int
-    state: MPMState
+    state: State
     health: FrameDiagnostics
     _version: int = field(repr=False, default=0)
 
@@ -54,9 +46,9 @@ class Frame:
     @cached_property
     def gaussians(self) -> DeformedGaussians:
         """All Gaussians in scene units: means, covariances, normals, and colours as the camera sees them."""
-        painter = self.simulation.painter
-        with self.simulation.turn:
-            if self.simulation.editor.version != self._version:
+        painter = self.painter
+        with painter.turn:
+            if self.editor.version != self._version:
                 raise RuntimeError(
                     f"An edit has changed the colours since frame {self.index}: read `gaussians` or `render()` of a "
                     "frame before the next one."
@@ -72,7 +64,7 @@ class Frame:
         Returns:
             Colour, opacity and depth.
         """
-        painter, gaussians = self.simulation.painter, self.gaussians
+        painter, gaussians = self.painter, self.gaussians
         if camera and camera not in painter.cameras:
             known = ", ".join(painter.cameras) or "none"
             raise ValueError(f"There is no camera {camera!r} in `cameras` ({known}): leave it out for the main one.")
@@ -94,5 +86,67 @@ class Frame:
             ValueError: If the ending or the format is unknown, or no Gaussian is finite.
             ImportError: If the format is USD and usd-core is not installed.
         """
-        place, fps = self.simulation.painter.scene.frame, 1 / self.simulation.frame_dt
+        place, fps = self.painter.scene.frame, 1 / self.editor.stepper.frame_dt
         export_cloud(path, self.gaussians, format, fps, place.metres_per_unit, place.rotation)
+
+
+def frames_from(
+    painter: Painter,
+    editor: SceneEditor,
+    state: State,
+    first: int,
+    count: int,
+    drawn: torch.cuda.Stream | None = None,
+) -> Iterator[Frame]:
+    """The frames of a simulation from number ``first`` up to ``count``, with its edits.
+
+    Args:
+        painter: Draws the scene.
+        editor: Changes it, and has its stepper.
+        state: The state at rest if ``first`` is 0, otherwise the state of the frame before.
+        first: Number of the first frame.
+        count: Number of frames of the whole run.
+        drawn: A stream on which the frames are drawn and recorded. The next frame is then simulated at the same time,
+            so that the GPU does not wait for the host, and what is assigned between two frames applies from the next
+            but one on.
+
+    Raises:
+        RuntimeError: If the stepper is started again before the last frame.
+    """
+    return _frames(editor.stepper.starts, painter, editor, state, first, count, drawn)
+
+
+def _frames(
+    started: int,
+    painter: Painter,
+    editor: SceneEditor,
+    state: State,
+    first: int,
+    count: int,
+    drawn: torch.cuda.Stream | None,
+) -> Iterator[Frame]:
+    stepper = editor.stepper
+    launched: Launched | None = None
+    for index in range(first, count):
+        with stepper.turn:
+            if stepper.starts != started:
+                raise RuntimeError(
+                    "This simulation was started again, so the earlier loop over its frames cannot go on: finish "
+                    "one loop before the next, or make a Simulation for each."
+                )
+            if index == 0:
+                health = stepper.at_rest(state)
+            else:
+                if launched is None and stepper.progress is not None:
+                    stepper.progress.begin(index)
+                state, health = stepper.advance(state) if launched is None else launched.finish()
+                if drawn is not None:  # the frame before may still be drawn from memory that is now free
+                    torch.cuda.current_stream(stepper.device).wait_stream(drawn)
+                state = editor.edit_due(state)
+            if drawn is not None and index + 1 < count:
+                drawn.wait_stream(torch.cuda.current_stream(stepper.device))
+                if stepper.progress is not None:
+                    stepper.progress.begin(index + 1)
+                launched = stepper.launch(state)
+            frame = Frame(painter, editor, index, state, health, editor.version)
+        yield frame

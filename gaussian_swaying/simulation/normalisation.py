@@ -22,10 +22,11 @@ from gaussian_swaying.geometry.regions import RegionInFrame
 from gaussian_swaying.interop.physgaussian.camera import PhysGaussianCamera
 from gaussian_swaying.interop.physgaussian.space import CENTER, rotation_matrix
 from gaussian_swaying.mpm.boundaries.boundary import Boundary
-from gaussian_swaying.mpm.solver import MPMSolver
+from gaussian_swaying.mpm.protocol import Solver
 from gaussian_swaying.rendering.cameras.camera_path import CameraPath
 from gaussian_swaying.simulation.edits import Edit
-from gaussian_swaying.simulation.scene import Material, Scene
+from gaussian_swaying.simulation.material import Material
+from gaussian_swaying.simulation.scene import Scene
 
 
 @dataclass
@@ -81,7 +82,7 @@ class Normalisation:
         self,
         scene: Scene,
         material: Material,
-        solver: MPMSolver,
+        solver: Solver,
         camera: CameraPath | None = None,
         cameras: Mapping[str, CameraPath] | None = None,
         edits: Sequence[Edit] = (),
@@ -142,7 +143,7 @@ class Placed(NamedTuple):
 
     scene: Scene
     material: Material
-    solver: MPMSolver
+    solver: Solver
     camera: CameraPath | None
     cameras: dict[str, CameraPath]
     edits: list[Edit]

@@ -12,7 +12,7 @@ from torch import Tensor, nn
 from gaussian_swaying._graphs import RECORDED, Replayed, fingerprint
 from gaussian_swaying._turns import Turn, in_turn
 from gaussian_swaying.gaussians.model import DeformedGaussians
-from gaussian_swaying.mpm.state import MPMState
+from gaussian_swaying.mpm.state import State
 from gaussian_swaying.recording.layout import check_camera_name
 from gaussian_swaying.rendering import passes
 from gaussian_swaying.rendering.cameras.camera import Camera
@@ -20,8 +20,7 @@ from gaussian_swaying.rendering.cameras.camera_path import CameraPath, OrbitCame
 from gaussian_swaying.rendering.factory import make_renderer
 from gaussian_swaying.rendering.protocol import Renderer, RenderOutput
 from gaussian_swaying.rendering.shading import Shader
-from gaussian_swaying.simulation.followers import GridFollowers
-from gaussian_swaying.simulation.scene import SimulatedScene
+from gaussian_swaying.simulation.simulated_scene import SimulatedScene
 
 MAX_PIXELS = 1 << 26  # per picture: twice as many as 8K
 
@@ -132,18 +131,18 @@ class Painter(nn.Module):
                 )
 
     @in_turn
-    def deformed(self, state: MPMState) -> DeformedGaussians:
+    def deformed(self, state: State) -> DeformedGaussians:
         """The Gaussians of a state, in scene units, with the rotations that their colours need."""
-        scene, turned = self.scene, self.scene.model.view_dependent
-        given = state.node_displacement
-        if given is None or not isinstance(scene.follow, GridFollowers) or len(scene.model.means) > RECORDED:
+        scene, turned, follow = self.scene, self.scene.model.view_dependent, self.scene.follow
+        if len(scene.model.means) > RECORDED:
             return scene.deformed(state, rotations=turned)
 
-        def moved(displacement: Tensor) -> list[Tensor]:
-            found = scene.deformed(state.replace(node_displacement=displacement), rotations=turned)
+        def moved(*fields: Tensor) -> list[Tensor]:
+            found = scene.deformed(state.replace(**dict(zip(follow.reads, fields, strict=True))), rotations=turned)
             return [found.means, found.covariances, found.normals, *([found.rotations] if turned else [])]
 
-        found = self._moved((fingerprint([scene]), state.grid), moved, given)
+        given = [getattr(state, name) for name in follow.reads]
+        found = self._moved((fingerprint([scene]), follow.layout(state)), moved, *given)
         parts: dict[str, Any] = dict(zip(("means", "covariances", "normals", "rotations"), found, strict=False))
         return replace(scene.rest(), **parts)
 
@@ -184,7 +183,7 @@ class Painter(nn.Module):
         return self.renderer(gaussians.means, gaussians.covariances, opacity, colours, camera, self.background)
 
     @in_turn
-    def render(self, state: MPMState, frame: int, name: str = "") -> RenderOutput:
+    def render(self, state: State, frame: int, name: str = "") -> RenderOutput:
         """The picture of a state from the camera of a frame.
 
         Args:

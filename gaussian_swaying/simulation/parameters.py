@@ -24,10 +24,9 @@ from gaussian_swaying._checks import check_choice, check_vector, number_of, requ
 from gaussian_swaying.aero.force import AeroForce
 from gaussian_swaying.aero.wind import SpatialWind, WindField
 from gaussian_swaying.mpm.forces import Force
-from gaussian_swaying.mpm.formulations.formulation import Settings
 from gaussian_swaying.mpm.state import MaterialPoints
 from gaussian_swaying.simulation.material import Material
-from gaussian_swaying.simulation.scene import SimulatedScene
+from gaussian_swaying.simulation.simulated_scene import SimulatedScene
 
 if TYPE_CHECKING:
     from jsonargparse import Namespace
@@ -58,7 +57,7 @@ class Setup:
     wind: WindField | SpatialWind
     aero: AeroForce
     forces: tuple[Force, ...]
-    solver: Settings
+    solver: Any
 
 
 Read = Callable[[Setup], Any]
@@ -476,6 +475,12 @@ def _write_aero(setup: Setup, values: Mapping[str, Any]) -> Setup:
     return replace(setup, aero=_changed(setup.aero, **{name[5:]: value for name, value in values.items()}))
 
 
+def _of_solver(setup: Setup, name: str) -> Any:
+    if not hasattr(setup.solver, name):
+        raise ValueError(f"This solver has no `{name}`.")
+    return getattr(setup.solver, name)
+
+
 def _write_solver(setup: Setup, values: Mapping[str, Any]) -> Setup:
     changes: dict[str, Any] = {name[7:]: value for name, value in values.items()}
     if "gravity" in changes:
@@ -553,12 +558,16 @@ for _name, _low in (("C_D", 0.0), ("C_F", 0.0), ("C_L", -math.inf)):
         read=lambda setup, name=_name: number_of(getattr(setup.aero, name)),  # type: ignore[misc]
     )  # fmt: skip
 register(
-    "solver.gravity", unit="m/s²", kind="vector", read=lambda setup: list(setup.solver.gravity), write=_write_solver
+    "solver.gravity",
+    unit="m/s²",
+    kind="vector",
+    read=lambda setup: list(_of_solver(setup, "gravity")),
+    write=_write_solver,
 )
 for _name, _unit in (("damping", "1/s"), ("stiffness_damping", "s")):
     register(
         f"solver.{_name}", unit=_unit, low=0.0, scale="log", write=_write_solver,
-        read=lambda setup, name=_name: getattr(setup.solver, name),  # type: ignore[misc]
+        read=lambda setup, name=_name: _of_solver(setup, name),  # type: ignore[misc]
     )  # fmt: skip
 
 __all__ = [

@@ -14,60 +14,36 @@ from torch import Tensor
 from gaussian_swaying._checks import check_positive
 from gaussian_swaying._provenance import describe_device, versions
 from gaussian_swaying.gaussians.model import DeformedGaussians
-from gaussian_swaying.mpm.state import GridSpec, MPMState
+from gaussian_swaying.mpm.state import State
 from gaussian_swaying.recording.checkpoint import check_state, log_lines, unreadable
-from gaussian_swaying.recording.recorder import frame_folder
+from gaussian_swaying.recording.recorder import Recorder, frame_folder
 from gaussian_swaying.rendering import passes
 from gaussian_swaying.runs import signals
 from gaussian_swaying.runs.seal import sha256
 from gaussian_swaying.simulation.diagnostics import SimulationDiverged, entry_names
+from gaussian_swaying.simulation.edits import SceneEditor
+from gaussian_swaying.simulation.frame import frames_from
 from gaussian_swaying.simulation.health import advice, extremes
 from gaussian_swaying.simulation.meters import PeakMemory, WallClock
+from gaussian_swaying.simulation.painter import Painter
 from gaussian_swaying.simulation.progress import RunProgress
-from gaussian_swaying.simulation.stepping import Stepping
+from gaussian_swaying.simulation.simulated_scene import SimulatedScene
+from gaussian_swaying.simulation.stepper import Stepper
 from gaussian_swaying.simulation.wind_picture import draw_wind
 
 MAX_LOOKS = 2_000  # largest number of frames whose cameras are checked before a run
 
 
-@torch.inference_mode()
-def run(
-    simulation: Stepping, output: Path, frames: int, resume: bool, settings: dict[str, Any], progress: bool
-) -> dict[str, Any]:
-    """See :meth:`~gaussian_swaying.simulation.simulation.Simulation.run`."""
-    check_positive("frames", frames)
-    recorder = simulation.recorder
-    for look in range(min(frames, MAX_LOOKS)):  # all of them, unless there are very many
-        simulation.painter.check_camera(look * (frames - 1) // max(min(frames, MAX_LOOKS) - 1, 1))
-    state = simulation.start()  # errors are raised before anything is written
-    splat = splat_checksum(simulation)
-
-    def check(checkpoint: dict[str, Any]) -> None:
-        _check_checkpoint(simulation, checkpoint, state, output, frames, splat)
-
-    simulation.resumable = None
-    fps, cameras = 1 / simulation.frame_dt, tuple(simulation.painter.cameras)
-    config = simulation.config  # once: a large splat takes a while to describe
-    checkpoint = recorder.open(output, config, resume, fps, cameras, check)
-    try:
-        return Run(simulation, frames, splat, config).go(state, checkpoint, settings, progress)
-    finally:
-        if recorder.checkpoint_frame is not None:
-            simulation.resumable = (recorder.folder / "checkpoint.pt", recorder.checkpoint_frame)
-        recorder.release()
-
-
-def splat_checksum(simulation: Stepping) -> str | None:
+def splat_checksum(scene: SimulatedScene) -> str | None:
     """Checksum of the splat's file, to distinguish it from another file with the same name."""
-    path = simulation.scene.source
-    return None if path is None else sha256(Path(path))
+    return None if scene.source is None else sha256(Path(scene.source))
 
 
 def _check_checkpoint(
-    simulation: Stepping, checkpoint: dict[str, Any], start: MPMState, output: Path, frames: int, splat: str | None
+    editor: SceneEditor, checkpoint: dict[str, Any], start: State, output: Path, frames: int, splat: str | None
 ) -> None:
     """Raise ValueError unless the run can continue from a checkpoint as if it had never stopped."""
-    scene, held = simulation.scene, checkpoint["state"].get("position")
+    stepper, scene, held = editor.stepper, editor.scene, checkpoint["state"].get("position")
     if checkpoint.get("splat") != splat:
         raise ValueError(
             f"The splat {scene.source} has changed since the run in {output} began: restore the old file, or "
@@ -84,17 +60,17 @@ def _check_checkpoint(
             f"The trajectory in {output} is of {tracked} places, but the scene has {scene.tracked}: "
             "resume with the same splat, or start again without --resume."
         )
-    followed = None if start.node_displacement is None else len(scene.follow.nodes(start.grid))
+    followed = _count(scene.follow.nodes(start))
     nodes = checkpoint.get("nodes", "unknown")
     if type(nodes) is not type(followed) or nodes != followed:
         raise ValueError(
             f"The Gaussians in {output} follow {nodes} nodes, but those of the scene follow {followed}: resume with "
             "the same splat, or start again without --resume."
         )
-    most_nodes, edited = simulation.solver.max_nodes, bool(simulation.editor.edits)
+    most_nodes = getattr(stepper.solver.settings, "max_nodes", 0)
     try:
         entries = entry_names(start.impulse.shape[-2])
-        check_state(checkpoint, start, simulation.frame_dt, most_nodes, edited, entries)
+        check_state(checkpoint, start, stepper.frame_dt, most_nodes, bool(editor.edits), entries)
     except (ValueError, TypeError, KeyError, RuntimeError) as error:
         raise unreadable(output / "checkpoint.pt", error) from error
     if checkpoint["frame"] >= frames:
@@ -104,52 +80,96 @@ def _check_checkpoint(
         )
 
 
-def run_health(simulation: Stepping, log: Sequence[Mapping[str, Any]]) -> tuple[dict[str, Any], list[str]]:
+def run_health(stepper: Stepper, log: Sequence[Mapping[str, Any]]) -> tuple[dict[str, Any], list[str]]:
     """Find what moved and stretched most in a run, with sentences on what to change; none if all is well.
 
     Args:
-        simulation: The simulation.
+        stepper: The stepper of the run.
         log: Diagnostics of its frames.
     """
-    scene, points = simulation.scene, simulation.solver.points
+    scene, points = stepper.scene, stepper.setup.points
     where = scene.frame.point_to_scene(points.position.double().cpu())
-    elastic = simulation.solver.laws.elastic_particles()
+    elastic = points.elastic
     size = scene.size * scene.frame.metres_per_unit
     found = extremes(log, where, size, None if elastic is None else elastic.cpu())
     return found, advice(found, float(points.youngs_modulus.amax()), scene.filled == 0)
 
 
 class Run:
-    """Data that a run carries from frame to frame besides the state."""
+    """A run: simulate, draw and record.
 
-    def __init__(self, simulation: Stepping, frames: int, splat: str | None = None, config: str = "") -> None:
-        self.simulation, self.painter, self.recorder = simulation, simulation.painter, simulation.recorder
-        self.frames, self.splat, self.config = frames, splat, config
+    Args:
+        painter: Draws the scene.
+        editor: Changes the scene, and has its stepper.
+        recorder: The outputs.
+        frames: Number of frames; the first is the state at rest.
+        config: The resume key.
+
+    Attributes:
+        files: What was written.
+        log: Diagnostics of the frames.
+    """
+
+    def __init__(
+        self, painter: Painter, editor: SceneEditor, recorder: Recorder, frames: int, config: str = ""
+    ) -> None:
+        self.painter, self.editor, self.recorder, self.frames, self.config = painter, editor, recorder, frames, config
+        self.stepper, self.scene = editor.stepper, painter.scene
+        self.files: list[Path] = []
         self.log: list[dict[str, Any]] = []
         self._lines: list[str] = []  # the log as a checkpoint stores it, which is written every frame
-        self.walls, self.peak = WallClock(simulation.device), PeakMemory(simulation.device)
-        self._nodes: tuple[GridSpec, Tensor] | None = None
-        self.force_end = self.recorder.force_scale or simulation.force_scale()
+        self.walls, self.peak = WallClock(painter.device), PeakMemory(painter.device)
+        self.splat = splat_checksum(self.scene)
+        self.force_end = recorder.force_scale or self.stepper.force_scale()
+
+    @torch.inference_mode()
+    def whole(self, output: Path, resume: bool, settings: dict[str, Any], progress: bool) -> dict[str, Any]:
+        """Run from rest, or from a checkpoint, to the end; see ``Simulation.run``.
+
+        Args:
+            output: Folder of the results.
+            resume: Continue the run found there.
+            settings: Further entries of the summary.
+            progress: Show a progress bar.
+
+        Returns:
+            The summary.
+        """
+        frames, recorder, painter = self.frames, self.recorder, self.painter
+        check_positive("frames", frames)
+        for look in range(min(frames, MAX_LOOKS)):  # all of them, unless there are very many
+            painter.check_camera(look * (frames - 1) // max(min(frames, MAX_LOOKS) - 1, 1))
+        state = self.editor.start()  # errors are raised before anything is written
+
+        def check(checkpoint: dict[str, Any]) -> None:
+            _check_checkpoint(self.editor, checkpoint, state, output, frames, self.splat)
+
+        fps, cameras = 1 / self.stepper.frame_dt, tuple(painter.cameras)
+        checkpoint = recorder.open(output, self.config, resume, fps, cameras, check)
+        try:
+            return self.go(state, checkpoint, settings, progress)
+        finally:
+            recorder.release()
 
     def go(
-        self, state: MPMState, checkpoint: dict[str, Any] | None, settings: dict[str, Any], progress: bool
+        self, state: State, checkpoint: dict[str, Any] | None, settings: dict[str, Any], progress: bool
     ) -> dict[str, Any]:
         """Run from a state at rest, or from a checkpoint, to the end; returns the summary."""
-        simulation, recorder, walls = self.simulation, self.recorder, self.walls
+        stepper, recorder, walls = self.stepper, self.recorder, self.walls
         first = 0
         if checkpoint is not None:
-            restored = MPMState.from_state_dict(checkpoint["state"], simulation.device)
-            state = simulation.edit_due(restored, resumed=True)
+            restored = type(state).from_state_dict(checkpoint["state"], stepper.device)
+            state = self.editor.edit_due(restored, resumed=True)
             first, self.log = checkpoint["frame"] + 1, checkpoint["log"]
             walls.seconds.update(checkpoint["wall_s"])
         status, reason, done = "complete", None, first
-        bar = simulation.progress = RunProgress(self.frames, first, progress)
+        bar = stepper.progress = RunProgress(self.frames, first, progress)
         try:
-            if simulation.device.type == "cuda" and first < self.frames:
+            if stepper.device.type == "cuda" and first < self.frames:
                 with walls("startup"):
                     self.warm_up(state, first)
             drawn = self.drawing_stream()
-            frames = simulation.frames_from(state, first, self.frames, drawn)
+            frames = frames_from(self.painter, self.editor, state, first, self.frames, drawn)
             for index in range(first, self.frames):
                 with walls("simulation"):
                     frame = next(frames)
@@ -176,16 +196,16 @@ class Run:
             with suppress(OSError):  # the terminal may be closed
                 bar.close()
                 if progress:
-                    for sentence in run_health(simulation, self.log[:done])[1]:
+                    for sentence in run_health(stepper, self.log[:done])[1]:
                         print(f"warning: {sentence}", file=sys.stderr)
-            simulation.progress = None
+            stepper.progress = None
             summary = self.close(status, reason, state, done, settings)
         summary["wall_s"] = walls.read(wait=True)
         recorder.write_summary(summary)
         return summary
 
     def close(
-        self, status: str, reason: str | None, state: MPMState, done: int, settings: dict[str, Any]
+        self, status: str, reason: str | None, state: State, done: int, settings: dict[str, Any]
     ) -> dict[str, Any]:
         """Write everything that is left.
 
@@ -202,26 +222,26 @@ class Run:
         Raises:
             OSError: If the run is complete and something could not be written.
         """
-        simulation, recorder = self.simulation, self.recorder
+        recorder = self.recorder
         summary: dict[str, Any] = {"status": status, "reason": reason}
         summary |= self.summary(state, self.log[:done]) | settings
         if recorder.images and "force" in recorder.renders:
             summary["force_scale_Pa"] = self.force_end
         # a run that was stopped early gets its video too, so that nothing recorded is lost
-        simulation.files = []
+        self.files = []
         try:
             with self.walls("writing"):
-                simulation.files = recorder.close(done, summary, release=False)
+                self.files = recorder.close(done, summary, release=False)
         except OSError as error:
             if status == "complete":
                 raise
             print(f"{error}", file=sys.stderr)  # the error that stopped the run matters more
         return summary
 
-    def warm_up(self, state: MPMState, frame: int) -> None:
+    def warm_up(self, state: State, frame: int) -> None:
         """Load and compile the kernels of a frame; its results are thrown away."""
         with suppress(SimulationDiverged):  # the real frame will report it
-            state, _ = self.simulation.advance(state)
+            state, _ = self.stepper.advance(state)
         if self.recorder.images:
             self.painter.render(state, frame)
 
@@ -230,13 +250,13 @@ class Run:
 
         Also None if the host calls a force of the user in every substep.
         """
-        simulation = self.simulation
-        forces = all(force.recordable for force in simulation.forces)
-        if simulation.device.type != "cuda" or simulation.solver.fused() is None or not forces:
+        stepper = self.stepper
+        forces = all(force.recordable for force in stepper.forces)
+        if stepper.device.type != "cuda" or not stepper.solver.has_kernels or not forces:
             return None
-        return torch.cuda.Stream(simulation.device)
+        return torch.cuda.Stream(stepper.device)
 
-    def keep(self, state: MPMState, frame: int) -> None:
+    def keep(self, state: State, frame: int) -> None:
         """Write a checkpoint, if one is due."""
         if self.recorder.checkpoint_every and (frame + 1) % self.recorder.checkpoint_every == 0:
             self.recorder.write_checkpoint(
@@ -247,8 +267,8 @@ class Run:
                     "config": self.config,
                     "wall_s": self.walls.read(),
                     "splat": self.splat,
-                    "tracked": self.simulation.scene.tracked,
-                    "nodes": None if state.node_displacement is None else len(self.nodes(state.grid)),
+                    "tracked": self.scene.tracked,
+                    "nodes": _count(self.scene.follow.nodes(state)),
                 }
             )
 
@@ -258,7 +278,7 @@ class Run:
         recorder = self.recorder
         return recorder.images or recorder.ply_every > 0 or recorder.trajectory or recorder.nodes
 
-    def record(self, state: MPMState, frame: int) -> None:
+    def record(self, state: State, frame: int) -> None:
         """Draw, export and record the requested outputs of a frame."""
         recorder, walls = self.recorder, self.walls
         exporting = recorder.ply_every > 0 and frame % recorder.ply_every == 0
@@ -270,21 +290,15 @@ class Run:
                 self.picture(state, gaussians, frame, name)
         with walls("writing"):
             if exporting:
-                recorder.write_splat(frame, gaussians.to_cloud(), self.simulation.scene.frame)
+                recorder.write_splat(frame, gaussians.to_cloud(), self.scene.frame)
             if recorder.trajectory:
-                recorder.write_trajectory(frame, *self.simulation.scene.surface(state))
-            if recorder.nodes and state.node_displacement is not None:
-                scene = self.simulation.scene
-                limit = scene.size * scene.frame.metres_per_unit / 2  # rounding to float16 is then 0.02 % of the size
-                recorder.write_nodes(frame, state.node_displacement[self.nodes(state.grid)], limit)
+                recorder.write_trajectory(frame, *self.scene.surface(state))
+            moved = self.scene.follow.nodal(state) if recorder.nodes else None
+            if moved is not None:
+                limit = self.scene.size * self.scene.frame.metres_per_unit / 2  # rounding to float16 is 0.02 % of it
+                recorder.write_nodes(frame, moved, limit)
 
-    def nodes(self, grid: GridSpec) -> Tensor:
-        """The nodes that the Gaussians follow, in a grid."""
-        if self._nodes is None or self._nodes[0] != grid:
-            self._nodes = (grid, self.simulation.scene.follow.nodes(grid))
-        return self._nodes[1]
-
-    def picture(self, state: MPMState, gaussians: DeformedGaussians, frame: int, name: str) -> None:
+    def picture(self, state: State, gaussians: DeformedGaussians, frame: int, name: str) -> None:
         """Draw the requested pictures of a frame from one camera and pass them to the recorder."""
         recorder, painter, walls = self.recorder, self.painter, self.walls
         with walls("shading"):
@@ -298,44 +312,43 @@ class Run:
             if "depth" in recorder.renders:
                 depth, (near, far) = passes.mean_depth(picture), painter.depth_range(frame, name)
                 images["depth"] = passes.depth_colors(depth, near, far)
-                steps = passes.depth_steps(depth, recorder.depth_step / self.simulation.scene.frame.metres_per_unit)
+                steps = passes.depth_steps(depth, recorder.depth_step / self.scene.frame.metres_per_unit)
             if "normal" in recorder.renders:
                 images["normal"] = painter.draw_normals(gaussians, camera, recorder.normal_axes)
             if "force" in recorder.renders:
-                pressure = self.simulation.wind_pressure(state)
+                pressure = self.stepper.wind_pressure(state)
                 images["force"] = painter.draw_pressure(pressure, gaussians, camera, self.force_end)
             if "wind" in recorder.renders:
-                images["wind"] = draw_wind(self.simulation, state, camera, picture)
+                images["wind"] = draw_wind(self.stepper, state, camera, picture)
         with walls("writing"):
             for render in recorder.renders:
                 recorder.write_image(frame, images[render], frame_folder(render, name))
             if "depth" in recorder.renders:
                 recorder.write_depth(frame, steps, frame_folder("depth", name))
 
-    def summary(self, state: MPMState, log: list[dict[str, Any]]) -> dict[str, Any]:
+    def summary(self, state: State, log: list[dict[str, Any]]) -> dict[str, Any]:
         """The summary of a run; docs/runs.md describes it."""
-        simulation, scene, solver = self.simulation, self.simulation.scene, self.simulation.solver
+        stepper, scene, points = self.stepper, self.scene, self.stepper.setup.points
         moved = [entry["displacement_mean"] for entry in log]
-        found, sentences = run_health(simulation, log)
+        found, sentences = run_health(stepper, log)
         energy = [{k: entry[k] for k in ("kinetic", "elastic", "potential")} for entry in log]
         return {
-            "device": describe_device(simulation.device),
+            "device": describe_device(stepper.device),
             "versions": versions(),
-            "seed": getattr(simulation.wind, "seed", None),
+            "seed": getattr(stepper.setup.wind, "seed", None),
             "splat_sha256": self.splat,
-            "particles": solver.points.count,
+            "particles": points.count,
             "gaussians": len(scene.model.means),
             "simulated_gaussians": len(scene.simulated),
             "loose_gaussians": scene.loose,
             "surface_particles": scene.on_surface,
             "recorded_surface": scene.on_surface if scene.track is None else scene.tracked,
             "filled_particles": scene.filled,
-            "mass_kg": float(solver.points.mass.sum()),
+            "mass_kg": float(points.mass.sum()),
             "patch_area_m2": float(scene.patches.area.sum()),
             "hull_area_m2": scene.hull_area(),
-            "formulation": solver.formulation,
+            **stepper.solver.describe(state),
             "dtype": str(state.position.dtype).removeprefix("torch."),
-            "grid": {"dx_m": solver.dx, "resolution": list(state.grid.resolution)},
             "frame": scene.frame.describe(),
             "sim_frame": {
                 "origin": scene.frame.origin.tolist(),
@@ -345,8 +358,8 @@ class Run:
             "size_m": scene.size * scene.frame.metres_per_unit,
             "frames": len(log),
             "frames_wanted": self.frames,
-            "frame_dt_s": simulation.frame_dt,
-            "edits": simulation.editor.applied,
+            "frame_dt_s": stepper.frame_dt,
+            "edits": self.editor.applied,
             "substeps": int(sum(entry["substeps"] for entry in log)),
             "simulated_s": float(state.time),
             "wall_s": self.walls.read(wait=True),
@@ -364,3 +377,8 @@ class Run:
             "warnings": sentences,
             "per_frame": log,
         }
+
+
+def _count(nodes: Tensor | None) -> int | None:
+    """Number of nodes, if there are any."""
+    return None if nodes is None else len(nodes)

@@ -2,20 +2,21 @@
 
 from __future__ import annotations
 
+import copy
 import os
 from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 import torch
-from torch import nn
 
 from gaussian_swaying._checks import check_choice, check_frames, check_positive, check_vector
-from gaussian_swaying._turns import in_turn
+from gaussian_swaying._turns import Turn, in_turn
 from gaussian_swaying.aero.force import AeroForce
+from gaussian_swaying.aero.wind import SpatialWind, WindField
 from gaussian_swaying.config.parser import (
     NOT_COMPARED,
-    PYTHON_ONLY,
     arguments_of,
     build_parser,
     check_settings,
@@ -27,8 +28,8 @@ from gaussian_swaying.geometry.regions import Region
 from gaussian_swaying.mpm.boundaries.obstacle import Obstacle
 from gaussian_swaying.mpm.contact.surface import Contact
 from gaussian_swaying.mpm.forces import Force, as_forces
-from gaussian_swaying.mpm.solver import MPMSolver
-from gaussian_swaying.mpm.state import MPMState
+from gaussian_swaying.mpm.protocol import Solver
+from gaussian_swaying.mpm.state import State
 from gaussian_swaying.recording.recorder import Recorder
 from gaussian_swaying.rendering.cameras.camera_path import CameraPath
 from gaussian_swaying.rendering.protocol import Renderer
@@ -37,6 +38,7 @@ from gaussian_swaying.simulation.defaults import (
     DeviceLike,
     HoldLike,
     SceneLike,
+    SolverLike,
     WindLike,
     as_camera,
     as_scene,
@@ -45,20 +47,23 @@ from gaussian_swaying.simulation.defaults import (
     check_types,
     resolve_device,
 )
+from gaussian_swaying.simulation.diagnostics import FrameDiagnostics
 from gaussian_swaying.simulation.edits import Edit, SceneEditor
-from gaussian_swaying.simulation.frame import Frame
+from gaussian_swaying.simulation.frame import Frame, frames_from
+from gaussian_swaying.simulation.material import Material
 from gaussian_swaying.simulation.normalisation import Normalisation
 from gaussian_swaying.simulation.painter import Painter
 from gaussian_swaying.simulation.parameters import Setup, with_values
-from gaussian_swaying.simulation.run import run
-from gaussian_swaying.simulation.scene import Material, SimulatedScene
-from gaussian_swaying.simulation.stepping import Stepping
+from gaussian_swaying.simulation.run import Run
+from gaussian_swaying.simulation.simulated_scene import SimulatedScene
+from gaussian_swaying.simulation.stepper import Stepper
 
 if TYPE_CHECKING:
     from jsonargparse import ArgumentParser, Namespace
+    from typing_extensions import Self
 
 
-class Simulation(Stepping):
+class Simulation:
     """A splat in the wind. The constructor is the schema of the YAML; every component also works on its own.
 
     Positions and regions are given in scene units and axes; velocities, gravity and light in metres, z up. Threads that
@@ -93,6 +98,9 @@ class Simulation(Stepping):
             ``PinnedRegion(region, kind="clamp")`` also holds the slope, ``PinnedPoints`` holds given places.
         renderer: Python only: draws the Gaussians; by default gsplat on CUDA and the torch renderer elsewhere.
 
+    Between frames ``wind``, ``aero``, ``custom_forces``, ``frame_dt`` and ``recorder`` may be assigned; :meth:`edit`
+    and :meth:`change` change the material, and ``painter`` the pictures. For other arguments make another simulation.
+
     Raises:
         ValueError: If a value is out of range, or given twice; the message names the field.
 
@@ -106,11 +114,16 @@ class Simulation(Stepping):
         [0.0, 0.04, 0.08]
     """
 
+    __slots__ = (
+        "__weakref__", "_changed", "_editor", "_given", "_painter", "_recorder", "_stepper", "_text", "files",
+        "frames_wanted", "resumable",
+    )  # fmt: skip
+
     def __init__(
         self,
         scene: SceneLike,
         material: Material | None = None,
-        solver: MPMSolver | None = None,
+        solver: SolverLike | None = None,
         wind: WindLike | None = None,
         aero: AeroForce | None = None,
         contact: Contact | None = None,
@@ -129,8 +142,7 @@ class Simulation(Stepping):
         hold: HoldLike | None = None,
         renderer: Renderer | None = None,
     ) -> None:
-        super().__init__()
-        given = {name: value for name, value in locals().items() if name not in ("self", "__class__", *NOT_COMPARED)}
+        given = {name: value for name, value in locals().items() if name not in ("self", *NOT_COMPARED)}
         check_positive("frame_dt", frame_dt)
         check_types(given | {"recorder": recorder})
         check_choice("dtype", dtype, ("float32", "float64"))
@@ -147,10 +159,9 @@ class Simulation(Stepping):
         apart = [
             part.region for part in (*solver.boundaries, *edits) if isinstance(getattr(part, "region", None), Region)
         ]
-        model = SimulatedScene(
-            settings, material, solver.dx, getattr(torch, dtype), cloud, solver.neighbours_fixed, apart
-        )
-        if contact is not None and not solver.neighbours_fixed:
+        fixed, kind = bool(solver.neighbours_fixed), getattr(torch, dtype)
+        model = SimulatedScene(settings, material, solver.dx, kind, cloud, fixed, apart, solver.followers)
+        if contact is not None and not fixed:
             raise ValueError(
                 "`contact` needs `solver.formulation: total`: leave it out, as in `updated` material meets on the grid."
             )
@@ -158,46 +169,132 @@ class Simulation(Stepping):
         model.take_contact(contact, obstacles)
         blowing = as_wind(wind, model.frame)
         camera = as_camera(camera, cameras, blowing, model)
-        self.painter = Painter(model, shader, camera, cameras, colour, frame_dt, renderer)
-        self.material = material
-        self.solver, self.aero, self.frame_dt = solver, aero or AeroForce(), float(frame_dt)
-        self.wind = blowing
-        self.custom_forces = nn.ModuleList(force.in_frame(model.frame) for force in as_forces(forces))
+        own = tuple(force.in_frame(model.frame) for force in as_forces(forces))
+        self._painter = Painter(model, shader, camera, cameras, colour, frame_dt, renderer)
+        setup = Setup(model, material, model.points, blowing, aero or AeroForce(), own, solver.settings)
+        self._stepper = Stepper(solver, setup, float(frame_dt), turn=self._painter.turn)
         self.to(target)
-        self.editor = SceneEditor(model, edits)
-        self.recorder = recorder or Recorder()
+        self._editor = SceneEditor(self._stepper, edits)
+        self._recorder = recorder or Recorder()
         self.frames_wanted = 250  # of a run; those of the file, if there is one
+        self.files: list[Path] = []  # what the last run wrote
+        self.resumable: tuple[Path, int] | None = None  # the checkpoint of the last run, and its frame
         self._text, self._changed, self._given = "", set(given), given
 
-    def __setattr__(self, name: str, value: Any) -> None:
-        """Of the arguments, only these can be assigned later: ``wind``, ``aero``, ``frame_dt`` and ``recorder``."""
-        if "_given" in self.__dict__ and name in (*self._given, *PYTHON_ONLY, "device"):
-            if name not in ("wind", "aero", "frame_dt"):
-                raise AttributeError(
-                    f"`{name}` is given when a simulation is made: make another Simulation. Between frames you can "
-                    "assign `wind`, `aero` and `frame_dt`, change the material with `edit`, and the pictures in "
-                    "`painter`."
-                )
-            check_types({name: value})
-            if name == "frame_dt":
-                check_positive(name, value)
-                value = float(value)
-            else:
-                value = (as_wind(value, self.scene.frame) if name == "wind" else value or AeroForce()).to(self.device)
-            self._note(**{name: value})
-        super().__setattr__(name, value)
+    # ---- parts
+
+    @property
+    def painter(self) -> Painter:
+        """Draws the scene."""
+        return self._painter
+
+    @property
+    def stepper(self) -> Stepper:
+        """Advances the state."""
+        return self._stepper
+
+    @property
+    def editor(self) -> SceneEditor:
+        """Applies the edits."""
+        return self._editor
+
+    @property
+    def scene(self) -> SimulatedScene:
+        """Gaussians, material points and patches."""
+        return self._painter.scene
+
+    @property
+    def solver(self) -> Solver:
+        """The solver."""
+        return self._stepper.solver
+
+    @property
+    def turn(self) -> Turn:
+        """The lock of the thread that steps or draws."""
+        return self._painter.turn
+
+    @property
+    def device(self) -> torch.device:
+        """Device of the components."""
+        return self._painter.device
+
+    def to(self, device: torch.device | str) -> Self:
+        """Move all components to a device; returns the simulation."""
+        setup, solver = self.setup, self.solver
+        for part in (self._painter, solver, setup.wind, setup.aero, *setup.forces):
+            part.to(device)
+        self._stepper.take(replace(setup, points=self.scene.points))
+        return self
 
     # ---- numbers that may change
 
     @property
     def setup(self) -> Setup:
-        """Return the present scene, material and drivers; see :mod:`gaussian_swaying.simulation.parameters`."""
-        forces = tuple(force for force in self.custom_forces if isinstance(force, Force))
-        points = self.scene.points
-        return Setup(self.scene, self.material, points, self.wind, self.aero, forces, self.solver.settings)
+        """The present scene, material and drivers; see :mod:`gaussian_swaying.simulation.parameters`."""
+        return self._stepper.setup
+
+    @property
+    def material(self) -> Material:
+        """The material, without edits."""
+        return self.setup.material
+
+    @property
+    def wind(self) -> WindField | SpatialWind:
+        """The wind; it may be assigned between two frames, also as three numbers [m/s]."""
+        return self.setup.wind
+
+    @wind.setter
+    def wind(self, wind: WindLike | None) -> None:
+        check_types({"wind": wind})
+        self.adopt(replace(self.setup, wind=as_wind(wind, self.scene.frame)))
+
+    @property
+    def aero(self) -> AeroForce:
+        """Force of the wind on patches; it may be assigned between two frames."""
+        return self.setup.aero
+
+    @aero.setter
+    def aero(self, aero: AeroForce | None) -> None:
+        check_types({"aero": aero})
+        self.adopt(replace(self.setup, aero=aero or AeroForce()))
+
+    @property
+    def custom_forces(self) -> tuple[Force, ...]:
+        """Forces besides gravity and wind; they may be assigned between two frames."""
+        return self.setup.forces
+
+    @custom_forces.setter
+    def custom_forces(self, forces: Sequence[Force]) -> None:
+        self.adopt(replace(self.setup, forces=tuple(as_forces(forces))))
+
+    @property
+    def forces(self) -> list[Force]:
+        """All forces besides gravity: the wind, unless it has no effect, and the custom forces."""
+        return self._stepper.forces
+
+    @property
+    def frame_dt(self) -> float:
+        """Time between frames [s]; it may be assigned between two frames."""
+        return self._stepper.frame_dt
+
+    @frame_dt.setter
+    def frame_dt(self, frame_dt: float) -> None:
+        check_positive("frame_dt", frame_dt)
+        self._stepper.frame_dt = float(frame_dt)
+        self._note(frame_dt=float(frame_dt))
+
+    @property
+    def recorder(self) -> Recorder:
+        """Outputs of :meth:`run`; it may be assigned."""
+        return self._recorder
+
+    @recorder.setter
+    def recorder(self, recorder: Recorder | None) -> None:
+        check_types({"recorder": recorder})
+        self._recorder = recorder or Recorder()
 
     @in_turn
-    def change(self, state: MPMState, values: Mapping[str, Any]) -> MPMState:
+    def change(self, state: State, values: Mapping[str, Any]) -> State:
         """Change numbers between two frames; they stay changed when the simulation starts again.
 
         Args:
@@ -217,9 +314,9 @@ class Simulation(Stepping):
         return changed
 
     @in_turn
-    def adopt(self, setup: Setup, state: MPMState | None = None) -> MPMState | None:
+    def adopt(self, setup: Setup, state: State | None = None) -> State | None:
         """As :meth:`change`, with a setup; without a state, before the simulation starts."""
-        before, editor = self.setup, self.editor
+        before, editor = self.setup, self._editor
         if setup.points is not before.points and editor.edits:
             raise ValueError("`edits` give the material of parts of the object: change it there, not everywhere.")
         try:
@@ -228,27 +325,40 @@ class Simulation(Stepping):
             self._adopt(before, state)
             raise
 
-    def _adopt(self, setup: Setup, state: MPMState | None) -> MPMState | None:
+    def _adopt(self, setup: Setup, state: State | None) -> State | None:
         before = self.setup
         with torch.inference_mode(False):
-            if setup.wind is not before.wind:
-                self.wind = setup.wind
-            if setup.aero is not before.aero:
-                self.aero = setup.aero
-            if any(a is not b for a, b in zip(setup.forces, before.forces, strict=True)):
-                self.custom_forces = nn.ModuleList(setup.forces).to(self.device)
-                self._note(forces=list(setup.forces))
+            for part in (setup.wind, setup.aero, *setup.forces):
+                part.to(self.device)
             if setup.points is not before.points:
                 self.scene.points = setup.points
-                self.editor.rebase(setup.points)
-                object.__setattr__(self, "material", setup.material)
-                self._note(material=setup.material)
-            if setup.solver is not before.solver:
-                self.solver.settings = setup.solver
-                self._note(solver=self.solver)
-        if state is None or (setup.points is before.points and setup.solver is before.solver):
-            return state
-        return self._take(state, torch.zeros_like(setup.points.mass, dtype=torch.bool))
+                self._editor.rebase(setup.points)
+            state = self._stepper.take(setup, state)
+        for name in ("wind", "aero", "forces", "material"):
+            if getattr(setup, name) is not getattr(before, name):
+                self._note(**{name: getattr(setup, name)})
+        if setup.solver is not before.solver:
+            self._note(solver=self.solver)
+        return state
+
+    def variant(self, values: Mapping[str, Any], recorder: Recorder | None = None, config: str = "") -> Simulation:
+        """Another simulation of the same scene with other numbers; it shares Gaussians, cameras and pins.
+
+        Args:
+            values: Values as for :meth:`change`.
+            recorder: Outputs of its runs.
+            config: Its configuration as YAML.
+
+        Raises:
+            ValueError: As :meth:`change`.
+        """
+        other, setup = copy.copy(self), with_values(self.setup, values)
+        solver = self.solver.like(setup.solver)
+        other._stepper = Stepper(solver, replace(setup, wind=setup.wind.to(self.device)), self.frame_dt, turn=self.turn)
+        other._editor = SceneEditor(other._stepper, self._editor.edits)
+        other._recorder, other.files, other._given = recorder or Recorder(), [], dict(self._given)
+        other.config = config
+        return other
 
     def _note(self, **given: Any) -> None:
         """Remember what has changed, so that a run with other values is not resumed."""
@@ -257,7 +367,7 @@ class Simulation(Stepping):
 
     @property
     def config(self) -> str:
-        """Return the resume key of a run as YAML: the configuration file, and the arguments given in Python."""
+        """The resume key of a run as YAML: the configuration file, and the arguments given in Python."""
         heading = "changed_in_python" if self._text else "made_in_python"
         return self._text + python_text(heading, {name: self._given[name] for name in self._changed})
 
@@ -310,13 +420,47 @@ class Simulation(Stepping):
     # ---- frames
 
     @in_turn
+    def start(self) -> State:
+        """The state at rest at time zero, with the edits of that time applied.
+
+        Raises:
+            ValueError: If a pin holds nothing, the grid is too large or a fixed substep is too long, now or after one
+                of the edits; if the material is so stiff that rounding shakes it.
+        """
+        return self._editor.start()
+
+    @in_turn
+    def advance(self, state: State) -> tuple[State, FrameDiagnostics]:
+        """Advance by one frame; see :meth:`Stepper.advance <gaussian_swaying.simulation.stepper.Stepper.advance>`."""
+        return self._stepper.advance(state)
+
+    @in_turn
+    def edit(self, state: State, *edits: Edit) -> State:
+        """Change material or colour now, between two frames; the time of the edits is ignored.
+
+        The solver is set up again for the new material, including its kernels and CUDA graphs. Positions, velocities
+        and deformations stay, so momentum changes with the mass and elastic energy with the stiffness.
+
+        Args:
+            state: The current state.
+            edits: The changes, in this order.
+
+        Returns:
+            The state from which the run continues.
+
+        Raises:
+            ValueError: If a region contains nothing, or a plastic law is used in the ``total`` formulation.
+        """
+        return self._editor.edit(state, edits)
+
+    @in_turn
     def frames(self, count: int) -> Iterator[Frame]:
         """Simulate from rest, frame by frame. Timed edits act between frames, as in :meth:`run`.
 
         Anything assigned between two frames, such as another ``wind``, applies from the next frame on.
 
         Args:
-            count: Number of frames, the first at rest.
+            count: Number of frames; the first is the state at rest.
 
         Returns:
             The frames. Read a frame before the next one: an edit changes the scene for all of them. One loop at a time,
@@ -327,7 +471,7 @@ class Simulation(Stepping):
             ValueError: As in :meth:`start`.
         """
         check_frames("count", count)
-        return self.frames_from(self.start(), 0, count)
+        return frames_from(self._painter, self._editor, self.start(), 0, count)
 
     # ---- the run
 
@@ -358,6 +502,12 @@ class Simulation(Stepping):
             SimulationDiverged: If the simulation diverges; everything recorded so far is saved first.
             ValueError: If the output cannot be written or resumed, or the camera lies inside the object.
         """
-        self.recorder = recorder or self.recorder
+        self._recorder = recorder or self._recorder
         count = self.frames_wanted if frames is None else check_frames("frames", frames)
-        return run(self, Path(output), count, resume, dict(settings or {}), progress)
+        run, self.resumable = Run(self._painter, self._editor, self._recorder, count, self.config), None
+        try:
+            return run.whole(Path(output), resume, dict(settings or {}), progress)
+        finally:
+            self.files, frame = run.files, self._recorder.checkpoint_frame
+            if frame is not None:
+                self.resumable = (self._recorder.folder / "checkpoint.pt", frame)

@@ -14,8 +14,8 @@ from gaussian_swaying.geometry.groups import sums
 from gaussian_swaying.geometry.neighbours import nearest_neighbours
 from gaussian_swaying.mpm.contact.pairs import close_pairs
 from gaussian_swaying.mpm.contact.surface import Contact, Surface
+from gaussian_swaying.mpm.followers import on_material
 from gaussian_swaying.mpm.state import MaterialPoints
-from gaussian_swaying.simulation.followers import on_material
 from gaussian_swaying.simulation.sampling import Samples
 
 PER_CELL = 2

@@ -8,11 +8,11 @@ import torch
 from torch import Tensor
 
 from gaussian_swaying.aero.wind import WindField
-from gaussian_swaying.mpm.state import MPMState
+from gaussian_swaying.mpm.state import State
 from gaussian_swaying.rendering.cameras.camera import Camera, project
 from gaussian_swaying.rendering.passes import colormap, mean_depth
 from gaussian_swaying.rendering.protocol import RenderOutput
-from gaussian_swaying.simulation.stepping import Stepping
+from gaussian_swaying.simulation.stepper import Stepper
 
 ACROSS = 26
 """Streaks along the longer side of the picture."""
@@ -21,7 +21,7 @@ STEPS = 12
 """Straight pieces of a streak."""
 
 
-def streaks(simulation: Stepping, state: MPMState, camera: Camera) -> tuple[Tensor, Tensor]:
+def streaks(stepper: Stepper, state: State, camera: Camera) -> tuple[Tensor, Tensor]:
     """Pieces of the lines along which the air flows at one moment, near a plane through the object.
 
     The plane contains the direction of the flow, and is upright or level, whichever the camera sees better. They start
@@ -29,20 +29,20 @@ def streaks(simulation: Stepping, state: MPMState, camera: Camera) -> tuple[Tens
     and are as long as the air flows in a fixed time: an eighth of the picture at the speed of the flow.
 
     Args:
-        simulation: The simulation.
+        stepper: The stepper of the simulation.
         state: The state.
         camera: The camera, in scene units.
 
     Returns:
         Places, scene units, shape (S, STEPS + 1, 3), and the speed at them [m/s], shape (S, STEPS + 1).
     """
-    scene, frame, wind = simulation.scene, simulation.scene.frame, simulation.wind
+    scene, frame, wind = stepper.scene, stepper.scene.frame, stepper.setup.wind
     device, double = state.position.device, torch.float64
     centre = frame.point_to_sim(scene.center.to(device).double()[None])[0]
     eye = frame.point_to_sim(camera.position.to(device).double()[None])[0]
     view = centre - eye
     distance = view.norm()
-    mean = wind.mean_flow(state.time) if isinstance(wind, WindField) else simulation.flows().double().mean(0)
+    mean = wind.mean_flow(state.time) if isinstance(wind, WindField) else stepper.flows().double().mean(0)
     carried = wind.carried(state.time) if isinstance(wind, WindField) else mean * state.time
     right, up = _plane(mean, view / distance)
     high = 1.15 * float(distance) * camera.height / float(camera.intrinsics[1, 1])
@@ -60,12 +60,12 @@ def streaks(simulation: Stepping, state: MPMState, camera: Camera) -> tuple[Tens
     seconds = 0.125 * wide / max(speed, 1e-6) if speed > 0 else 1.0
     places, speeds = [], []
     for _ in range(STEPS + 1):
-        air = simulation.wind_force.air(state.time, place.to(state.position.dtype))
+        air = stepper.wind_force.air(state.time, place.to(state.position.dtype))
         air = air.double().expand_as(place)
         places.append(place)
         speeds.append(torch.linalg.vector_norm(air, dim=-1))
         half = place + 0.5 * seconds / STEPS * air  # midpoint rule
-        middle = simulation.wind_force.air(state.time, half.to(state.position.dtype)).double().expand_as(place)
+        middle = stepper.wind_force.air(state.time, half.to(state.position.dtype)).double().expand_as(place)
         place = place + seconds / STEPS * middle
     points = torch.stack(places, 1)
     return frame.point_to_scene(points.reshape(-1, 3)).view_as(points), torch.stack(speeds, 1)
@@ -89,20 +89,20 @@ def _plane(flow: Tensor, ahead: Tensor) -> tuple[Tensor, Tensor]:
     )
 
 
-def speed_scale(simulation: Stepping) -> float:
+def speed_scale(stepper: Stepper) -> float:
     """End of the colour scale of streaks [m/s]: 1.5 times the mean flow; 0 in still air."""
-    return 1.5 * float(torch.linalg.vector_norm(simulation.flows(), dim=-1).amax())
+    return 1.5 * float(torch.linalg.vector_norm(stepper.flows(), dim=-1).amax())
 
 
 def draw_wind(
-    simulation: Stepping, state: MPMState, camera: Camera, picture: RenderOutput, largest: float | None = None
+    stepper: Stepper, state: State, camera: Camera, picture: RenderOutput, largest: float | None = None
 ) -> Tensor:
     """The picture of the object, paler, with streaks of air over it, from violet in still air to yellow.
 
     A streak is hidden where the object is in front of it, and fades towards its tail.
 
     Args:
-        simulation: The simulation.
+        stepper: The stepper of the simulation.
         state: The state.
         camera: The camera, on the device of the Gaussians.
         picture: Picture of the object from the camera.
@@ -113,8 +113,8 @@ def draw_wind(
     """
     from PIL import Image, ImageDraw
 
-    places, speeds = (part.cpu() for part in streaks(simulation, state, camera))
-    largest = largest or speed_scale(simulation) or float(speeds.amax()) or 1.0
+    places, speeds = (part.cpu() for part in streaks(stepper, state, camera))
+    largest = largest or speed_scale(stepper) or float(speeds.amax()) or 1.0
     pixel, depth = project(places.reshape(-1, 3), camera)
     pixel, depth = pixel.view(*speeds.shape, 2), depth.view_as(speeds)
     seen = mean_depth(picture).to(depth)

@@ -8,9 +8,9 @@ from typing import TYPE_CHECKING, Any
 
 from gaussian_swaying.config.parser import config_text
 from gaussian_swaying.simulation import parameters
+from gaussian_swaying.simulation.batch import run_batch
 from gaussian_swaying.simulation.parameters import find, in_settings
 from gaussian_swaying.simulation.simulation import Simulation
-from gaussian_swaying.simulation.together import Together, variant
 from gaussian_swaying.sweeps.job import Job, unlocked
 from gaussian_swaying.sweeps.plan import parse_run
 from gaussian_swaying.sweeps.record import RUNS
@@ -62,15 +62,15 @@ def run_together(job: Job, parser: ArgumentParser) -> dict[str, dict[str, Any]]:
     Raises:
         ValueError: If they cannot be done together.
     """
-    together, frames = make_together(job, parser)
+    members, frames = members_of(job, parser)
     folders = [None if name in job.complete else job.folder / RUNS / name for name in job.names]
     extras = [{"sweep": {"run": n, "settings": r}} for n, r in zip(job.names, job.runs, strict=True)]
-    summaries = unlocked(lambda: together.record(folders, frames, extras))
+    summaries = unlocked(lambda: run_batch(members, folders, frames, extras))
     return {name: found for name, found in zip(job.names, summaries, strict=True) if found is not None}
 
 
-def make_together(job: Job, parser: ArgumentParser) -> tuple[Together, int]:
-    """The simulation of all runs of a job, and how many frames they have."""
+def members_of(job: Job, parser: ArgumentParser) -> tuple[list[Simulation], int]:
+    """The simulations of all runs of a job, and how many frames they have."""
     settings = [parse_run(parser, job.config, job.frames, job.runs[0])]
     settings[0].device = job.device
     changes: list[dict[str, Any]] = [{}]
@@ -84,8 +84,8 @@ def make_together(job: Job, parser: ArgumentParser) -> tuple[Together, int]:
     written = texts(parser, settings, [name for name in job.runs[0] if shares_rollout(name)])
     members = [first]
     for one, own, text in zip(settings[1:], changes[1:], written[1:], strict=True):
-        members.append(variant(first, own, parser.instantiate(one).recorder, text))
-    return Together(members), settings[0].frames
+        members.append(first.variant(own, parser.instantiate(one).recorder, text))
+    return members, settings[0].frames
 
 
 def texts(parser: ArgumentParser, settings: Sequence[Namespace], names: Sequence[str]) -> list[str]:
@@ -116,4 +116,4 @@ def texts(parser: ArgumentParser, settings: Sequence[Namespace], names: Sequence
     return found
 
 
-__all__ = ["grouped", "make_together", "run_together", "shares_rollout", "texts"]
+__all__ = ["grouped", "members_of", "run_together", "shares_rollout", "texts"]

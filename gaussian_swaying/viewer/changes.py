@@ -9,8 +9,7 @@ from typing import TYPE_CHECKING, Any
 import torch
 import yaml
 
-from gaussian_swaying.mpm.formulations.total import Total
-from gaussian_swaying.mpm.state import MPMState
+from gaussian_swaying.mpm.state import State
 from gaussian_swaying.simulation.parameters import POLAR, all_in_settings, find, of_settings, parameter
 from gaussian_swaying.simulation.simulation import Simulation
 
@@ -60,8 +59,8 @@ def changed_settings(parser: ArgumentParser, settings: Namespace, values: Mappin
 
 
 def take(
-    simulation: Simulation, state: MPMState, parser: ArgumentParser, settings: Namespace, names: Sequence[str]
-) -> MPMState | None:
+    simulation: Simulation, state: State, parser: ArgumentParser, settings: Namespace, names: Sequence[str]
+) -> State | None:
     """Change a simulation between two steps.
 
     Parameters, the wind, aerodynamic coefficients, shading, background and length of a frame change in motion; the
@@ -107,26 +106,3 @@ def take(
     if "frame_dt" in heads:
         simulation.frame_dt = float(settings.frame_dt)
     return state
-
-
-def carry_over(old: Simulation, state: MPMState, new: Simulation, start: MPMState) -> MPMState | None:
-    """The motion of a simulation as a state of another with the same nodes, such as the same one with other pins.
-
-    Args:
-        old: The simulation.
-        state: Its state.
-        new: The other simulation.
-        start: Its state at rest.
-
-    Returns:
-        The state; None if the formulation is not ``total``, or if a node has mass that had none, as it did not move.
-    """
-    before, after = old.solver.bound, new.solver.bound
-    if not (isinstance(before, Total) and isinstance(after, Total)) or state.grid != start.grid:
-        return None
-    if bool(((after.node_inverse_mass > 0) & (before.node_inverse_mass == 0)).any()):
-        return None
-    assert state.node_displacement is not None
-    assert state.node_velocity is not None
-    moved = start.replace(time=state.time, substep=state.substep, work=state.work)
-    return after.read_particles(moved, state.node_displacement, state.node_velocity)

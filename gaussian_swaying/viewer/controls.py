@@ -34,7 +34,7 @@ class Controls(Panel):
 
     def __init__(self, page: Screen) -> None:
         super().__init__(page)
-        page.force_end = page.session.simulation.force_scale()
+        page.force_end = page.session.simulation.stepper.force_scale()
         self._drawn_for: Any = None  # the simulation whose handles are drawn
         self._shader: dict[str, Any] | None = None  # the last one, while shading is off
         self._settings: Any = None  # those that the panel shows
@@ -197,7 +197,7 @@ class Controls(Panel):
         """Adapt to another scene: remove what belongs to the old one, and show the new values."""
         self.holding.forget_box()
         self._dx = float(self.session.settings.solver.dx)
-        self.page.force_end = self.session.simulation.force_scale()
+        self.page.force_end = self.session.simulation.stepper.force_scale()
         self.show_values()
         self.page.look_from_start()
 
@@ -207,7 +207,7 @@ class Controls(Panel):
         if self.shown.value == "wind force":
             parts.append(legend("Force of the wind", "Pa", self.page.force_end))
         if self.streaks.value:
-            parts.append(legend("Speed of the air", "m/s", speed_scale(simulation)))
+            parts.append(legend("Speed of the air", "m/s", speed_scale(simulation.stepper)))
         self.legends.content, self.legends.visible = "".join(parts), bool(parts)
 
     # ---- what they do
@@ -225,7 +225,7 @@ class Controls(Panel):
         self.pause.label = "Go on" if self.session.paused else "Pause"
 
     def _flow(self) -> list[float]:
-        return [float(x) for x in self.session.simulation.flows()[0].tolist()]
+        return [float(x) for x in self.session.simulation.stepper.flows()[0].tolist()]
 
     def _blow(self) -> None:
         flow = from_angles(self.wind_speed.value, self.azimuth.value, self.elevation.value)
@@ -269,10 +269,8 @@ class Controls(Panel):
         )  # fmt: skip
         self.on(self._tip.on_update, self._tip_moved)
         self._draw_arrow(self._flow())
-        grid = self.session.snapshot.state.grid
-        low = np.array(grid.offset) * grid.dx
-        size = (np.array(grid.resolution) - 1) * grid.dx
-        corners = torch.tensor(low + size * np.array(CORNERS), dtype=torch.float64)
+        low, high = map(np.array, self.session.simulation.solver.domain(self.session.snapshot.state))
+        corners = torch.tensor(low + (high - low) * np.array(CORNERS), dtype=torch.float64)
         lines = scene.frame.point_to_scene(corners).cpu().numpy()[np.array(EDGES)]
         server.add_line_segments("/grid", lines, (120, 120, 120), thickness=1.5, visible=self.box.value)
 

@@ -118,9 +118,9 @@ class Holding:
     def places(self) -> np.ndarray:
         """Places at rest of the material points that pins and handles hold [scene units], shape (N, 3)."""
         with self.session.lock:  # a change binds the solver anew
-            scene, body = self.session.simulation.scene, self.session.simulation.solver.bound.body
+            scene, solver = self.session.simulation.scene, self.session.simulation.solver
         held = torch.zeros(scene.points.count, dtype=torch.bool, device=scene.points.position.device)
-        for boundary in body.boundaries:
+        for boundary in solver.framed(scene.frame):
             if isinstance(boundary, PinnedRegion):
                 held |= boundary.particle_mask(scene.points.position)
         return scene.frame.point_to_scene(scene.points.position[held].double()).cpu().numpy()

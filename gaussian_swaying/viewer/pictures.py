@@ -64,13 +64,15 @@ def draw(
     if shown == "normals":
         picture = painter.draw_normals(gaussians, camera, "world", smooth=True)
     elif shown == "wind force":
-        picture = painter.draw_pressure(simulation.wind_pressure(state), gaussians, camera, force_end, smooth=True)
+        picture = painter.draw_pressure(
+            simulation.stepper.wind_pressure(state), gaussians, camera, force_end, smooth=True
+        )
     else:
         seen = painter.draw(gaussians, painter.colors(gaussians, camera), camera)
         picture = seen.color
     if streaks:
         seen = seen or painter.draw(gaussians, torch.zeros_like(gaussians.means), camera)  # for its depth
-        picture = draw_wind(simulation, state, camera, replace(seen, color=picture))
+        picture = draw_wind(simulation.stepper, state, camera, replace(seen, color=picture))
     return (picture.clamp(0, 1) * 255 + 0.5).to(torch.uint8).cpu().numpy()
 
 

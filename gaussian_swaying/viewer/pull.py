@@ -9,8 +9,8 @@ from torch import Tensor
 
 from gaussian_swaying.geometry.frame import SimFrame
 from gaussian_swaying.mpm.forces import Force
-from gaussian_swaying.mpm.state import MPMState
-from gaussian_swaying.simulation.scene import SimulatedScene
+from gaussian_swaying.mpm.state import State
+from gaussian_swaying.simulation.simulated_scene import SimulatedScene
 
 REACH = 0.06  # radius of what is grabbed, as a share of the longest side
 QUICK = 40.0  # 1/s: how quickly what is grabbed follows, if nothing else acts on it
@@ -41,7 +41,7 @@ class Pull(Force):
         self._frame = frame
 
     @classmethod
-    def at(cls, scene: SimulatedScene, state: MPMState, place: Sequence[float]) -> Pull:
+    def at(cls, scene: SimulatedScene, state: State, place: Sequence[float]) -> Pull:
         """Make a pull on the particles around a place.
 
         Args:
@@ -64,7 +64,7 @@ class Pull(Force):
         target = self._frame.point_to_sim(torch.tensor(list(place), dtype=torch.float64))
         self.target.copy_(target.to(self.target))
 
-    def forward(self, state: MPMState) -> tuple[Tensor, Tensor]:
+    def forward(self, state: State) -> tuple[Tensor, Tensor]:
         """Force [N], shape (P, 3), and resistance [kg/s], shape (P,)."""
         away = self.target + self.offset - state.position
         pull = QUICK**2 * away

@@ -13,10 +13,10 @@ from typing import TYPE_CHECKING, Any
 import torch
 
 from gaussian_swaying.config.parser import config_text
-from gaussian_swaying.mpm.state import MPMState
-from gaussian_swaying.simulation.diagnostics import FrameDiagnostics, SimulationDiverged, diagnose
+from gaussian_swaying.mpm.state import State
+from gaussian_swaying.simulation.diagnostics import FrameDiagnostics, SimulationDiverged
 from gaussian_swaying.simulation.simulation import Simulation
-from gaussian_swaying.viewer.changes import carry_over, changed_settings, take
+from gaussian_swaying.viewer.changes import changed_settings, take
 from gaussian_swaying.viewer.pull import Pull
 
 if TYPE_CHECKING:
@@ -42,7 +42,7 @@ class Snapshot:
     """
 
     simulation: Simulation
-    state: MPMState
+    state: State
     health: FrameDiagnostics
     number: int
 
@@ -304,7 +304,7 @@ class Session:
         if simulation.editor.edits:
             try:
                 with self.lock:
-                    state = simulation.edit_due(state)
+                    state = simulation.editor.edit_due(state)
             except Exception as error:
                 self._broken, self.problem = True, _sentence(error)
                 return
@@ -338,18 +338,18 @@ class Session:
         with self._wake:
             self.speed, self._anchor = max(float(speed), 1e-3), None
 
-    def _publish(self, state: MPMState, health: FrameDiagnostics) -> None:
+    def _publish(self, state: State, health: FrameDiagnostics) -> None:
         self._number += 1
         self.snapshot = Snapshot(self.simulation, state, health, self._number)
         with self._wake:
             self._wake.notify_all()
 
-    def _begin(self, state: MPMState) -> None:
+    def _begin(self, state: State) -> None:
         """Go on from a state at rest."""
         self._let_go()
         self._broken, self.problem, self._anchor = False, None, None
         self._steps.clear()
-        self._publish(state, diagnose(self.simulation.solver, state, 0, 0.0))
+        self._publish(state, self.simulation.stepper.at_rest(state))
 
     def _reset(self) -> None:
         self._begin(self.simulation.start())
@@ -395,7 +395,9 @@ class Session:
         """Make the simulation anew; unless ``fresh``, it goes on from where it is if its nodes stay the same."""
         simulation = Simulation.from_settings(self.parser, settings)
         start = simulation.start()
-        state = None if self._broken or fresh else carry_over(self.simulation, self.snapshot.state, simulation, start)
+        state = None  # goes on only between solvers that can
+        if not (self._broken or fresh):
+            state = simulation.solver.continued(self.simulation.solver, self.snapshot.state, start)
         self.simulation, self.settings = simulation, settings
         if state is None:
             self._begin(start)
@@ -406,12 +408,12 @@ class Session:
     def _grab(self, place: Sequence[float]) -> None:
         self._let_go()
         self._pull = Pull.at(self.simulation.scene, self.snapshot.state, place)
-        self.simulation.custom_forces.append(self._pull)
+        self.simulation.custom_forces = (*self.simulation.custom_forces, self._pull)
 
     def _let_go(self) -> None:
         if self._pull is not None:
-            kept = [force for force in self.simulation.custom_forces if force is not self._pull]
-            self.simulation.custom_forces = torch.nn.ModuleList(kept)
+            forces = self.simulation.custom_forces
+            self.simulation.custom_forces = tuple(force for force in forces if force is not self._pull)
             self._pull = None
 
 

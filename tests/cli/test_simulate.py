@@ -20,6 +20,7 @@ from gaussian_swaying.config.parser import config_text
 from gaussian_swaying.gaussians.ply import write_ply
 from gaussian_swaying.scenes.procedural import FlagScene
 from gaussian_swaying.simulation.simulation import Simulation
+from gaussian_swaying.simulation.stepper import Stepper
 
 ROOT = Path(__file__).parents[2]
 FLAG = ROOT / "configs/sim/flag.yaml"
@@ -499,7 +500,7 @@ def test_ctrl_c(tmp_path, capsys, monkeypatch):
     def stop(self, state):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(Simulation, "advance", stop)
+    monkeypatch.setattr(Stepper, "advance", stop)
     assert main([*SMALL, "--output", str(tmp_path / "run")]) == 130
     assert "--resume" in capsys.readouterr().err
     assert (tmp_path / "run" / "frames" / "00000.png").exists()

@@ -6,7 +6,7 @@ from types import SimpleNamespace
 import pytest
 import torch
 
-from gaussian_swaying.fitting.ensemble import Ensemble
+from gaussian_swaying.fitting import evidence
 from gaussian_swaying.fitting.evidence import PATCHES, Block, Evidence, PictureEvidence, compare, scales_of
 from gaussian_swaying.fitting.fit import Fit
 from gaussian_swaying.fitting.plan import Plan, read_unknown
@@ -17,7 +17,7 @@ from gaussian_swaying.fitting.videos import read_videos
 def test_pictures_at_the_truth_and_away_from_it(own, simulation, masks):
     (left, _) = read_videos(own / "video")
     evidence = PictureEvidence(left, masks, width=50)
-    (block,) = compare(Ensemble(simulation), [evidence], [{}, {"wind.speed": 8.0}], left.times[:5])
+    (block,) = compare(simulation, [evidence], [{}, {"wind.speed": 8.0}], left.times[:5])
     assert block.kind == ("silhouettes" if masks else "pixels")
     assert block.values.shape == (2, 4 * 30 * 50, 1 if masks else 3)  # not the frame at rest
     assert block.cluster.shape == (4 * 30 * 50,)
@@ -43,7 +43,7 @@ def test_silhouettes_need_masks(own, simulation):
         Fit(simulation, videos, plan)
 
 
-def test_tracks_share_their_clusters_over_cameras_and_pictures_do_not():
+def test_tracks_share_their_clusters_over_cameras_and_pictures_do_not(monkeypatch):
     """A track's error is that of a place of the object, whoever sees it; a patch of a picture is a camera's own."""
 
     class Given(Evidence):
@@ -56,16 +56,13 @@ def test_tracks_share_their_clusters_over_cameras_and_pictures_do_not():
         def residuals(self, simulation, states, frame):
             return torch.zeros(len(states), PATCHES**2, 1), torch.arange(PATCHES**2)
 
-    def run(values, times, *_, **__):
-        return [[None] * len(values) for _ in times]
-
-    ensemble = SimpleNamespace(simulation=None, run=run)
-    evidence = [Given(kind) for kind in ("pixels", "tracks", "pixels", "tracks", "pixels")]
-    found = {block.kind: block for block in compare(ensemble, evidence, [{}, {}], (0.0, 0.5, 1.0))}
+    monkeypatch.setattr(evidence, "states_of", lambda _, values, times, **__: [[None] * len(values) for _ in times])
+    parts = [Given(kind) for kind in ("pixels", "tracks", "pixels", "tracks", "pixels")]
+    found = {block.kind: block for block in compare(None, parts, [{}, {}], (0.0, 0.5, 1.0))}
     patches = set(range(PATCHES**2))
     assert found["tracks"].values.shape == (2, 2 * 2 * len(patches), 1)  # two cameras at two times after the start
     assert set(found["tracks"].cluster.tolist()) == patches
     own = found["pixels"].cluster.reshape(2, 3, -1)  # times, cameras
     assert torch.equal(own[0], own[1])
     assert len(own.unique()) == 3 * len(patches)
-    assert 0 <= int(own.min()) < int(own.max()) < len(evidence) * len(patches)
+    assert 0 <= int(own.min()) < int(own.max()) < len(parts) * len(patches)

@@ -7,9 +7,9 @@ import pytest
 import torch
 import yaml
 
-from gaussian_swaying.fitting.ensemble import Ensemble
 from gaussian_swaying.fitting.evidence import TrackEvidence
 from gaussian_swaying.fitting.tracks import _inside, drawn_beside, match, track
+from gaussian_swaying.fitting.variants import states_of
 from gaussian_swaying.fitting.videos import Footage, read_videos
 from gaussian_swaying.rendering.cameras.camera import look_at_camera, project
 from gaussian_swaying.rendering.protocol import RenderOutput
@@ -52,9 +52,9 @@ def test_a_point_that_vanishes_is_lost():
 def test_matches_do_not_drift(own, simulation):
     """Against the truth: tracks go astray by a pixel or so, matches from a nearby simulation by a part of that."""
     videos = read_videos(own / "video")
-    ensemble, times = Ensemble(simulation), list(videos[0].times)
-    truth = [states[0] for states in ensemble.run([{}], times)]
-    near = [states[0] for states in ensemble.run([{"wind.speed": 4.7, "material.E": 1.2e4}], times)]
+    times = list(videos[0].times)
+    truth = [states[0] for states in states_of(simulation, [{}], times)]
+    near = [states[0] for states in states_of(simulation, [{"wind.speed": 4.7, "material.E": 1.2e4}], times)]
     for video in videos:
         tracks, matches = track(simulation, video), match(simulation, video, near)
         off = {}
@@ -75,7 +75,7 @@ def test_a_shift_that_is_there_at_rest_is_taken_off_matches(own, simulation):
         intrinsics[:2, 2] += torch.tensor([0.6, -0.4])
         turned.append(replace(camera, intrinsics=intrinsics))
     times = video.times[:5]
-    states = [found[0] for found in Ensemble(simulation).run([{}], times)]
+    states = [found[0] for found in states_of(simulation, [{}], times)]
     video = replace(video, cameras=tuple(turned))
     evidence = TrackEvidence(simulation, video, match(simulation, video, states))
     for k in range(len(times)):  # the simulation is the truth
@@ -144,7 +144,7 @@ def test_matches_are_not_shifted_where_the_print_of_a_splat_is(real, tmp_path):
     drawn = [painter.draw(gaussians, painter.colors(gaussians, view), view).color.detach() for view in views]
     own = [(255 * picture.clamp(0, 1)).round().to(torch.uint8) for picture in drawn]
     images = [_photographed(view) for view in views] if real else own
-    rest = next(iter(Ensemble(simulation).run([{}], [0.0])))[0]
+    rest = next(iter(states_of(simulation, [{}], [0.0])))[0]
     found = match(simulation, Footage("moved", (0.0, 0.1), tuple(views), torch.stack(images)), [rest, rest])
     means = simulation.scene.model.means.detach()[simulation.scene.moving[found.index]]
     for k, view in enumerate(views):

@@ -101,12 +101,12 @@ def test_a_killed_run_continues_bit_for_bit(whole, tmp_path):
     code = (
         "import sys, time\n"
         "from gaussian_swaying.cli import simulate\n"
-        "from gaussian_swaying.simulation import simulation\n"
-        "advance = simulation.Simulation.advance\n"
+        "from gaussian_swaying.simulation import stepper\n"
+        "advance = stepper.Stepper.advance\n"
         "def slow(self, state):\n"
         "    time.sleep(60 if float(state.time) > 0.1 else 0)\n"
         "    return advance(self, state)\n"
-        "simulation.Simulation.advance = slow\n"
+        "stepper.Stepper.advance = slow\n"
         "sys.exit(simulate.main(sys.argv[1:]))\n"
     )
     process = subprocess.Popen(
@@ -144,15 +144,15 @@ def test_a_run_that_is_told_to_end(name, whole, tmp_path, capsys):
     code = (
         "import pathlib, signal, sys, time\n"
         "from gaussian_swaying.cli import simulate\n"
-        "from gaussian_swaying.simulation import simulation\n"
+        "from gaussian_swaying.simulation import stepper\n"
         f"signal.signal(signal.{name}, signal.SIG_DFL)\n"
-        "advance = simulation.Simulation.advance\n"
+        "advance = stepper.Stepper.advance\n"
         "def slow(self, state):\n"
         "    if float(state.time) > 0.1:\n"
         f"        pathlib.Path({str(slow)!r}).touch()\n"
         "        while True: time.sleep(0.05)\n"
         "    return advance(self, state)\n"
-        "simulation.Simulation.advance = slow\n"
+        "stepper.Stepper.advance = slow\n"
         "sys.exit(simulate.main(sys.argv[1:]))\n"
     )
     pipes = {"stdout": subprocess.DEVNULL, "stderr": subprocess.PIPE, "text": True}

@@ -20,7 +20,7 @@ from gaussian_swaying.preview.calibration import (
     measure_motion,
 )
 from gaussian_swaying.scenes.procedural import FlagScene
-from gaussian_swaying.simulation.scene import Material
+from gaussian_swaying.simulation.material import Material
 
 START = Setting(5e5, 0.01)
 

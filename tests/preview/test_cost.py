@@ -13,7 +13,7 @@ from gaussian_swaying.preview import cost as cost_module
 from gaussian_swaying.preview.cost import Cost, estimate_cost, finest_within, scaled_seconds
 from gaussian_swaying.scenes.procedural import FlagScene
 from gaussian_swaying.scenes.vase import VaseScene
-from gaussian_swaying.simulation.scene import Material
+from gaussian_swaying.simulation.material import Material
 from gaussian_swaying.simulation.simulation import Simulation
 
 FRAMES = 101

@@ -43,8 +43,8 @@ from gaussian_swaying.preview.suggest import (
 )
 from gaussian_swaying.preview.up import CONVENTION, floor_mask, guess_up
 from gaussian_swaying.scenes.procedural import FlagScene
+from gaussian_swaying.simulation.body import SPECK
 from gaussian_swaying.simulation.extent import suggest_spacing
-from gaussian_swaying.simulation.scene import SPECK
 from gaussian_swaying.simulation.simulation import Simulation
 
 AXES = {"+x": [1, 0, 0], "-x": [-1, 0, 0], "+y": [0, 1, 0], "-y": [0, -1, 0], "+z": [0, 0, 1], "-z": [0, 0, -1]}

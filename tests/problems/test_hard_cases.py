@@ -41,7 +41,8 @@ from gaussian_swaying.mpm.state import MaterialPoints, MPMState
 from gaussian_swaying.rendering.cameras.camera_path import OrbitCamera
 from gaussian_swaying.scenes.procedural import FlagScene, ProceduralScene
 from gaussian_swaying.simulation.diagnostics import SimulationDiverged, check_state, diagnose
-from gaussian_swaying.simulation.scene import Material, Scene
+from gaussian_swaying.simulation.material import Material
+from gaussian_swaying.simulation.scene import Scene
 from gaussian_swaying.simulation.simulation import Simulation
 
 FORMULATIONS = ["total", "updated"]
@@ -154,7 +155,7 @@ def _add(log, simulation, state, health):
     logged. Forces that are not linear change the last one, and the first two by as much the other way. Its largest
     value so far is the ``slack`` of the log [J]. What a plane, a transfer or plastic flow takes is lost for good.
     """
-    solver, dt = simulation.solver, state.substep or simulation.frame_dt / simulation.substeps(state)
+    solver, dt = simulation.solver, state.substep or simulation.frame_dt / simulation.stepper.substeps(state)
     points, F = solver.points, state.F_elastic
     rate = state.affine if solver.neighbours_fixed else matmul3(state.affine, F)
     stress = solver.laws.pk1(F, state.internal)
@@ -497,7 +498,7 @@ def test_a_storm_on_a_sheet_of_twenty_grams(drag_step, formulation):
     simulation = _flag(WindField([30.0, 95.0, 0.0]), formulation, material, aero, width=0.4, frame_dt=0.01)
     if drag_step == "explicit":
         rate = 1.225 * 1.3 * 99.6 / 0.02
-        assert simulation.substeps(simulation.start()) >= 0.01 * rate / 2
+        assert simulation.stepper.substeps(simulation.start()) >= 0.01 * rate / 2
     _, log = _advance(simulation, 4)
     work = sum(health.wind_work for health in log)
     assert work > 0

@@ -22,7 +22,7 @@ from gaussian_swaying.recording.checkpoint import log_lines, read_checkpoint, wr
 from gaussian_swaying.recording.recorder import Recorder
 from gaussian_swaying.runs.seal import check_seal, seal
 from gaussian_swaying.simulation.diagnostics import entry_names
-from gaussian_swaying.simulation.stepping import Stepping
+from gaussian_swaying.simulation.stepper import Stepper
 
 CONFIG = "material:\n  E: 3000.0\nwind:\n  flow:\n  - 6.0\n  - 1.5\n  - 0.0\n"
 
@@ -188,14 +188,14 @@ def _broken_fields(file):
 @pytest.fixture
 def _one_start(monkeypatch):
     """The state at rest is the same for all that are refused, and making it takes most of the time."""
-    start, made = Stepping.start, {}
+    start, made = Stepper.start, {}
 
     def once(self):
         if self not in made:
             made[self] = start(self)
         return made[self]
 
-    monkeypatch.setattr(Stepping, "start", once)
+    monkeypatch.setattr(Stepper, "start", once)
 
 
 @pytest.mark.usefixtures("_one_start")
@@ -342,7 +342,7 @@ def test_a_seal(tmp_path):
 def test_states_that_the_kernels_made_are_whole(formulation, law, make_simulation, tmp_path):
     """On a GPU, or here in Triton's interpreter: nothing in them is refused."""
     pytest.importorskip("triton")
-    from gaussian_swaying.simulation.scene import Material
+    from gaussian_swaying.simulation.material import Material
 
     if law and formulation == "total":
         pytest.skip("what flows needs `updated`")

@@ -540,7 +540,7 @@ def test_kernels_are_loaded_without_a_trace(make_simulation, tmp_path):
     for load in (False, True):
         simulation = make_simulation(wind=WindField([6.0, 1.5, 0.0], seed=7))
         if load:
-            Run(simulation, 3).warm_up(simulation.start(), 0)
+            Run(simulation.painter, simulation.editor, simulation.recorder, 3).warm_up(simulation.start(), 0)
         runs.append(_run(simulation, tmp_path / str(load), 3))
     assert runs[0]["per_frame"] == runs[1]["per_frame"]
     for name in ("00000", "00002"):
@@ -592,7 +592,7 @@ def test_the_summary(make_simulation, tmp_path):
 
 
 def _fail_at(simulation, monkeypatch, frame, error):
-    advance, done = simulation.advance, []
+    advance, done = simulation.stepper.advance, []
 
     def fail(state):
         if len(done) == frame - 1:
@@ -600,7 +600,7 @@ def _fail_at(simulation, monkeypatch, frame, error):
         done.append(1)
         return advance(state)
 
-    monkeypatch.setattr(simulation, "advance", fail)
+    monkeypatch.setattr(simulation.stepper, "advance", fail)
 
 
 @pytest.mark.parametrize(

@@ -19,7 +19,7 @@ from gaussian_swaying.mpm.state import MaterialPoints
 from gaussian_swaying.recording.recorder import Recorder
 from gaussian_swaying.recording.trajectory import load_trajectory
 from gaussian_swaying.simulation.edits import Edit, edited_points, recolored
-from gaussian_swaying.simulation.scene import Material, MaterialRegion
+from gaussian_swaying.simulation.material import Material, MaterialRegion
 
 FREE_HALF = [0.55, None, None], [None, None, None]
 WHITE = [0.95, 0.95, 0.95]
@@ -30,7 +30,7 @@ def _free_half():
 
 
 def _with(simulation, *edits):
-    simulation.editor.__init__(simulation.scene, edits)
+    simulation.editor.__init__(simulation.stepper, edits)
     return simulation
 
 
@@ -39,7 +39,7 @@ def _frames(simulation, frames):
     states.append(state)
     for _ in range(frames):
         state, _ = simulation.advance(state)
-        state = simulation.edit_due(state)
+        state = simulation.editor.edit_due(state)
         states.append(state)
     return states
 

@@ -8,8 +8,8 @@ import torch
 from gaussian_swaying.mpm.laws.sand import Sand
 from gaussian_swaying.recording.recorder import Recorder
 from gaussian_swaying.simulation.health import advice, extremes, particle_of_extremes
+from gaussian_swaying.simulation.material import Material
 from gaussian_swaying.simulation.run import run_health
-from gaussian_swaying.simulation.scene import Material
 
 WHERE = torch.tensor([[0.0, 0, 0], [1.0, 2, 3], [4.0, 5, 6]])
 
@@ -91,7 +91,7 @@ def test_what_flows_is_not_reproached_with_its_stretch(make_simulation, make_clo
     with torch.inference_mode():
         simulation.start()
     log = [entry(0.1, low=(0.01, 0), high=(9.0, 1))]
-    found, said = run_health(simulation, log)
+    found, said = run_health(simulation.stepper, log)
     assert said == []
     assert found["stretched"] is None
     assert found["moved"]["value"] == 0.1

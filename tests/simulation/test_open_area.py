@@ -21,7 +21,9 @@ from gaussian_swaying.preview.report import run_lines
 from gaussian_swaying.preview.starter import draft_yaml, starter_yaml
 from gaussian_swaying.preview.suggest import suggest
 from gaussian_swaying.scenes.procedural import FlagScene
-from gaussian_swaying.simulation.scene import Material, Scene, SimulatedScene
+from gaussian_swaying.simulation.material import Material
+from gaussian_swaying.simulation.scene import Scene
+from gaussian_swaying.simulation.simulated_scene import SimulatedScene
 from gaussian_swaying.simulation.simulation import Simulation
 
 CONFIGS = Path(__file__).resolve().parents[2] / "configs" / "sim"

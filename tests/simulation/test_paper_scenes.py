@@ -55,7 +55,7 @@ def test_the_presets_of_winds_with_a_shape_move(name):
     state, health = simulation.advance(simulation.start())
     assert simulation.solver.bound.held
     assert 0 < health.displacement_mean < 0.1
-    air = simulation.wind_force.air(state.time, state.position)
+    air = simulation.stepper.wind_force.air(state.time, state.position)
     assert float(air[:, 0].std()) > 0.05 * float(air[:, 0].mean().abs())
 
 

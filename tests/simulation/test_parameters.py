@@ -11,10 +11,10 @@ import pytest
 import torch
 import yaml
 
-from gaussian_swaying.fitting.ensemble import Ensemble
 from gaussian_swaying.fitting.plan import read_plan
 from gaussian_swaying.fitting.report import scene_text
 from gaussian_swaying.fitting.unknowns import Unknown, check_unknowns
+from gaussian_swaying.fitting.variants import states_of
 from gaussian_swaying.mpm.forces import Force
 from gaussian_swaying.simulation import parameters
 from gaussian_swaying.simulation.parameters import (
@@ -244,9 +244,8 @@ def test_a_number_of_a_users_force_is_sought(breath, parser, tmp_path):
     settings = parser.parse_args(["--config", str(breath), "--device=cpu"])
     simulation = Simulation.from_settings(parser, settings)
     check_unknowns(simulation, plan.unknowns)
-    ensemble = Ensemble(simulation)
     values = [{"forces.Breath.strength": 0.0}, {"forces.Breath.strength": 5.0}, {"wind.speed": 5.0}]
-    weak, strong, same = [state.position for state in list(ensemble.run(values, [0.0, 0.08]))[-1]]
+    weak, strong, same = [state.position for state in list(states_of(simulation, values, [0.0, 0.08]))[-1]]
     assert float((strong - weak)[:, 2].mean()) > 1e-3
     assert float((same - weak).abs().max()) > 0  # 0.1 by default
     text = scene_text({"forces.Breath.strength": 2.5}, parser, settings, simulation)

@@ -1,6 +1,6 @@
 """``scene.points: grid``: as many points as the grid can use, and all Gaussians follow its nodes.
 
-Covers: simulation.followers_triton.
+Covers: mpm.followers_triton.
 """
 
 import dataclasses
@@ -26,8 +26,10 @@ from gaussian_swaying.scenes.procedural import FlagScene
 from gaussian_swaying.scenes.solid import SolidScene
 from gaussian_swaying.simulation.diagnostics import measure
 from gaussian_swaying.simulation.edits import Edit
+from gaussian_swaying.simulation.material import Material, MaterialRegion
 from gaussian_swaying.simulation.sampling import matched_points
-from gaussian_swaying.simulation.scene import Material, MaterialRegion, Scene, SimulatedScene
+from gaussian_swaying.simulation.scene import Scene
+from gaussian_swaying.simulation.simulated_scene import SimulatedScene
 
 HALF = Box([0.0451, None, None], [None] * 3)
 
@@ -253,7 +255,7 @@ def test_the_force_is_known_for_every_gaussian(make_simulation):
     found = {}
     for points in ("gaussian", "grid"):
         simulation = make_simulation(cloud=fine_flag(), dx=0.15, scene={"points": points})
-        found[points] = simulation.wind_pressure(simulation.start())
+        found[points] = simulation.stepper.wind_pressure(simulation.start())
     torch.testing.assert_close(found["grid"], found["gaussian"])
     assert float(found["grid"].amin()) > 0
 
@@ -282,7 +284,7 @@ def test_the_default_is_the_grid_where_it_is_possible(make_simulation):
 )
 def test_the_kernel_of_followers_is_their_definition(up, kernel_device, make_scene):
     """With arms (of faint ones), rotations and the limit of the stretch, and without."""
-    kernels = pytest.importorskip("gaussian_swaying.simulation.followers_triton")
+    kernels = pytest.importorskip("gaussian_swaying.mpm.followers_triton")
     for region, stretch in ((None, 1.05), (HALF, None)):
         scene = make_scene(
             fine_flag(0.04), dx=0.15, points="grid", up=up, metres_per_unit=0.5, region=region, max_stretch=stretch
@@ -366,7 +368,7 @@ def test_recorded_measurements_are_those_of_the_frame(make_simulation):
             expected = measure(simulation.solver, end, steps, found.cfl, found.wind_work, None, state).read()
             assert found.as_dict() == pytest.approx(expected.as_dict(), rel=1e-6)
             state = end
-    assert simulation._gauge.replayed.recorded
+    assert simulation.stepper._gauge.replayed.recorded
 
 
 @pytest.mark.parametrize("law", ["paper", "projected"])

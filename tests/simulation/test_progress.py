@@ -1,6 +1,6 @@
 """What a run shows: frames, progress within one that is slow, and why it is.
 
-Covers: simulation.painter, simulation.stepping.
+Covers: simulation.painter, simulation.stepper.
 """
 
 from pathlib import Path
@@ -12,7 +12,7 @@ from gaussian_swaying.cli.simulate import main
 from gaussian_swaying.mpm.solver import MPMSolver
 from gaussian_swaying.mpm.state import MaterialPoints
 from gaussian_swaying.simulation import progress as progress_module
-from gaussian_swaying.simulation import stepping
+from gaussian_swaying.simulation import stepper
 from gaussian_swaying.simulation.painter import Painter
 from gaussian_swaying.simulation.progress import RunProgress
 from gaussian_swaying.simulation.run import MAX_LOOKS
@@ -133,7 +133,7 @@ def test_substeps_without_end_are_refused(arguments, words, tmp_path, capsys):
 
 
 def test_a_frame_that_gets_too_many_substeps_ends_the_run(tmp_path, capsys, monkeypatch):
-    monkeypatch.setattr(stepping, "MAX_SUBSTEPS", 20)
+    monkeypatch.setattr(stepper, "MAX_SUBSTEPS", 20)
     assert main([*SMALL, "--wind.flow", "[300, 0, 0]", "--output", str(tmp_path / "run")]) == 2
     said = capsys.readouterr().err
     assert "substeps, more than the limit of 20" in said
@@ -148,7 +148,7 @@ def test_the_cameras_of_as_many_frames_as_there_may_be(tmp_path, monkeypatch):
     def stop(self):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(stepping.Stepping, "start", stop)
+    monkeypatch.setattr(stepper.Stepper, "start", stop)
     assert main([*SMALL, "--frames", "10000000", "--output", str(tmp_path / "run")]) == 130
     assert len(seen) == MAX_LOOKS
     assert (seen[0], seen[-1]) == (0, 9_999_999)

@@ -102,9 +102,9 @@ def test_the_force_is_that_of_the_wind(make_simulation):
     aero = AeroForce(C_D=0.5, C_F=0.0, C_L=0.0)
     simulation = make_simulation(wind=WindField([0.0, 4.0, 0.0]), aero=aero)
     state = simulation.start()
-    pressure = simulation.wind_pressure(state)
+    pressure = simulation.stepper.wind_pressure(state)
     torch.testing.assert_close(pressure, torch.full_like(pressure, 0.5 * 1.225 * 16 * 0.5))
-    assert simulation.force_scale() == pytest.approx(float(pressure[0]))
+    assert simulation.stepper.force_scale() == pytest.approx(float(pressure[0]))
     camera = simulation.painter.camera_at(0)
     picture = simulation.painter.draw_pressure(pressure, simulation.scene.rest(), camera, 2 * float(pressure[0]))
     covered = picture.any(-1)
@@ -112,8 +112,8 @@ def test_the_force_is_that_of_the_wind(make_simulation):
     expected = colormap(torch.tensor(0.5)).expand_as(picture[covered])
     torch.testing.assert_close(picture[covered], expected, rtol=0, atol=1e-5)
     moving = state.replace(velocity=torch.tensor([0.0, 4.0, 0.0]).expand_as(state.velocity))
-    assert float(simulation.wind_pressure(moving).abs().max()) < 1e-6
-    assert not make_simulation(aero=AeroForce(air_density=0.0)).wind_pressure(state).any()
+    assert float(simulation.stepper.wind_pressure(moving).abs().max()) < 1e-6
+    assert not make_simulation(aero=AeroForce(air_density=0.0)).stepper.wind_pressure(state).any()
 
 
 def test_values_reach_every_gaussian_that_moves(make_cloud, make_scene):

@@ -1,4 +1,7 @@
-"""Which Gaussians move, what they weigh, and how they follow the material."""
+"""The Gaussians that move, their weight, and how they follow the material.
+
+Covers: simulation.body, simulation.simulated_scene.
+"""
 
 import dataclasses
 import math
@@ -17,8 +20,10 @@ from gaussian_swaying.mpm.laws.sand import Sand
 from gaussian_swaying.mpm.solver import MPMSolver
 from gaussian_swaying.scenes.procedural import FlagScene, ProceduralScene
 from gaussian_swaying.simulation.edits import Edit
+from gaussian_swaying.simulation.material import Material, MaterialRegion
 from gaussian_swaying.simulation.sampling import cell_volume
-from gaussian_swaying.simulation.scene import Material, MaterialRegion, Scene, SimulatedScene
+from gaussian_swaying.simulation.scene import Scene
+from gaussian_swaying.simulation.simulated_scene import SimulatedScene
 
 LEFT = Box([None, None, None], [0.5, None, None])
 UPS = [[0.0, 0.0, 1.0], [0.0, -1.0, 0.0], [0.3, -0.7, 0.2]]

@@ -1,6 +1,6 @@
 """Frames from components: substeps, wind, cameras, colours and pictures.
 
-Covers: .
+Covers: simulation.frame.
 """
 
 import copy
@@ -28,9 +28,10 @@ from gaussian_swaying.rendering.protocol import finite_gaussians
 from gaussian_swaying.rendering.shading import DiffuseShader, PhongShader
 from gaussian_swaying.rendering.torch_renderer import render_torch
 from gaussian_swaying.scenes.procedural import FlagScene
-from gaussian_swaying.simulation import scene as scene_module
+from gaussian_swaying.simulation import simulated_scene as scene_module
 from gaussian_swaying.simulation.diagnostics import SimulationDiverged, diagnose
-from gaussian_swaying.simulation.scene import Material, Scene
+from gaussian_swaying.simulation.material import Material
+from gaussian_swaying.simulation.scene import Scene
 from gaussian_swaying.simulation.simulation import Simulation
 
 
@@ -144,13 +145,13 @@ def test_a_frame_whose_substep_was_too_long_is_done_again(make_simulation, monke
     state = simulation.start()
     _, expected = _advance(make_simulation(wind=WindField()), 1)
     tries = []
-    roll, number = simulation._roll, simulation.solver.cfl_number
+    roll, number = simulation.stepper.roll, simulation.solver.cfl_number
 
-    def record(start, steps):
+    def record(start, steps, margin):
         tries.append((start, steps))
-        return roll(start, steps)
+        return roll(start, steps, margin)
 
-    monkeypatch.setattr(simulation, "_roll", record)
+    monkeypatch.setattr(simulation.stepper, "roll", record)
     monkeypatch.setattr(
         simulation.solver, "cfl_number", lambda s, dt: torch.tensor(2.0) if len(tries) == 1 else number(s, dt)
     )
@@ -239,15 +240,15 @@ def test_a_frame_of_endless_substeps_is_a_divergence(make_simulation):
 
 def test_a_particle_that_becomes_nan_is_a_divergence(make_simulation, monkeypatch):
     simulation = make_simulation(wind=WindField())
-    state, roll = simulation.start(), simulation._roll
+    state, roll = simulation.start(), simulation.stepper.roll
 
-    def poison(start, steps):
-        end, *more = roll(start, steps)
+    def poison(start, steps, margin):
+        end, *more = roll(start, steps, margin)
         velocity = end.velocity.clone()
         velocity[7] = math.nan
         return end.replace(velocity=velocity), *more
 
-    monkeypatch.setattr(simulation, "_roll", poison)
+    monkeypatch.setattr(simulation.stepper, "roll", poison)
     with pytest.raises(SimulationDiverged, match=r"particle 7: .*NaN"):
         simulation.advance(state)
 

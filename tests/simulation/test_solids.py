@@ -19,8 +19,10 @@ from gaussian_swaying.recording.recorder import Recorder
 from gaussian_swaying.rendering.cameras.camera_path import OrbitCamera
 from gaussian_swaying.scenes.procedural import FlagScene
 from gaussian_swaying.scenes.solid import SolidScene
+from gaussian_swaying.simulation.material import Material, MaterialRegion
 from gaussian_swaying.simulation.sampling import cell_volume
-from gaussian_swaying.simulation.scene import Material, MaterialRegion, Scene, SimulatedScene
+from gaussian_swaying.simulation.scene import Scene
+from gaussian_swaying.simulation.simulated_scene import SimulatedScene
 from gaussian_swaying.simulation.simulation import Simulation
 
 ROOT = Path(__file__).parents[2]
@@ -87,7 +89,7 @@ def test_filled_points_feel_no_wind():
         state = simulation.start()
         turned = torch.eye(3) + 0.1 * torch.tensor([[0.0, 1.0, 0.0], [-1.0, 0.0, 2.0], [0.0, 0.5, 0.3]])
         state = state.replace(F_total=turned.expand_as(state.F_total))
-        forces.append(simulation.wind_force(state)[0])
+        forces.append(simulation.stepper.wind_force(state)[0])
     torch.testing.assert_close(forces[0][:count], forces[1])
     assert not bool(forces[0][count:].any())
     assert float(forces[1].norm(dim=-1).min()) > 0

@@ -1,6 +1,6 @@
 """Winds with effects in a simulation: places in scene units, shelter in every frame, resuming, and the YAML.
 
-Covers: simulation.stepping.
+Covers: simulation.stepper.
 """
 
 import warnings
@@ -15,7 +15,7 @@ from gaussian_swaying.aero.shelter import Shelter
 from gaussian_swaying.aero.wind import WindField
 from gaussian_swaying.recording.recorder import Recorder
 from gaussian_swaying.simulation.simulation import Simulation
-from gaussian_swaying.simulation.stepping import parts_of
+from gaussian_swaying.simulation.stepper import parts_of
 
 
 def _wind():
@@ -100,16 +100,16 @@ def test_the_next_frame_is_foreseen_in_its_own_shelter(make_simulation):
     simulation = make_simulation()
     simulation.wind = _wind()
     state, _ = simulation.advance(simulation.start())
-    shelter, parts = simulation.wind.effects[2], parts_of(simulation)
+    shelter, parts = simulation.wind.effects[2], parts_of(simulation.stepper)
     before = shelter.table.clone()
-    foreseen = simulation.wind_force.foreseen(state).samples(state, 0.01, 5)
+    foreseen = simulation.stepper.wind_force.foreseen(state).samples(state, 0.01, 5)
     assert torch.equal(shelter.table, before)
-    simulation.wind_force.refresh(state)
+    simulation.stepper.wind_force.refresh(state)
     assert not torch.equal(shelter.table, before)
-    assert torch.equal(simulation.wind_force.samples(state, 0.01, 5), foreseen)
-    assert parts_of(simulation) == parts
+    assert torch.equal(simulation.stepper.wind_force.samples(state, 0.01, 5), foreseen)
+    assert parts_of(simulation.stepper) == parts
     simulation.wind.effects[1].table.mul_(2.0)
-    assert parts_of(simulation) != parts
+    assert parts_of(simulation.stepper) != parts
 
 
 @pytest.mark.gpu
@@ -117,7 +117,7 @@ def test_the_next_frame_is_foreseen_in_its_own_shelter(make_simulation):
 def test_the_host_waits_once_in_a_frame(make_simulation, uniform):
     simulation = make_simulation(wind=WindField([4.0, 1.0, 0.0]) if uniform else _wind()).to("cuda")
     state = simulation.start()  # only now is the solver bound to its kernels
-    assert simulation.foresees
+    assert simulation.stepper.foresees
     for _ in range(3):
         state, _ = simulation.advance(state)
     torch.cuda.set_sync_debug_mode("warn")

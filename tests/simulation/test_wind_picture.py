@@ -17,7 +17,7 @@ def test_streaks_follow_the_wind(make_simulation):
     simulation.wind = WindField([3.0, 0.0, 4.0])
     state = simulation.start()
     camera = simulation.painter.camera_at(0)
-    places, speeds = streaks(simulation, state, camera)
+    places, speeds = streaks(simulation.stepper, state, camera)
     assert places.shape[1:] == (STEPS + 1, 3)
     torch.testing.assert_close(speeds, torch.full_like(speeds, 5.0))
     way = places[:, -1] - places[:, 0]
@@ -26,7 +26,7 @@ def test_streaks_follow_the_wind(make_simulation):
     )
     torch.testing.assert_close(way.norm(dim=-1), way.norm(dim=-1)[:1].expand(len(way)))
     short = 0.02 * float(way[0].norm()) / 5.0
-    moved, _ = streaks(simulation, state.replace(time=state.time + short), camera)
+    moved, _ = streaks(simulation.stepper, state.replace(time=state.time + short), camera)
     drift = moved[:, 0] - places[:, 0]
     kept = drift.norm(dim=-1) < 10 * short * 5.0  # the others came in again at the other side
     assert float(kept.float().mean()) > 0.9
@@ -41,7 +41,7 @@ def test_streaks_fill_the_picture_and_are_an_eighth_of_it_long(make_simulation, 
     state, centre = simulation.start(), simulation.scene.center.double()
     eye = centre - distance * torch.tensor([0.0, 1.0, 0.0])
     camera = look_at_camera(eye.tolist(), centre.tolist(), (0.0, 0.0, 1.0), angle, 160, height, dtype=torch.float64)
-    places, _ = streaks(simulation, state, camera)
+    places, _ = streaks(simulation.stepper, state, camera)
     pixel, depth = project(places.reshape(-1, 3), camera)
     torch.testing.assert_close(depth, torch.full_like(depth, distance), rtol=1e-5, atol=0)  # air in float32
     pixel = pixel.view(len(places), -1, 2)
@@ -56,12 +56,12 @@ def test_the_object_hides_what_is_behind_it(make_simulation):
     simulation = make_simulation()
     state = simulation.start()
     camera, picture = simulation.painter.camera_at(0), simulation.painter.render(state, 0)
-    found = draw_wind(simulation, state, camera, picture)
+    found = draw_wind(simulation.stepper, state, camera, picture)
     pale = 0.75 * picture.color.clamp(0, 1) + 0.25
     assert found.shape == picture.color.shape
     assert float((found - pale).abs().amax(-1).gt(0.05).float().mean()) > 0.02
     simulation.wind = WindField([0.0, 0.0, 0.0])
-    still = draw_wind(simulation, state, camera, picture)
+    still = draw_wind(simulation.stepper, state, camera, picture)
     assert bool(torch.isfinite(still).all())
 
 

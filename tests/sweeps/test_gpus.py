@@ -7,10 +7,11 @@ import pytest
 import torch
 
 from gaussian_swaying.cli.sweep import main
+from gaussian_swaying.simulation.batch import batch_of
 from gaussian_swaying.simulation.simulation import Simulation
 from gaussian_swaying.sweeps.job import Job
 from gaussian_swaying.sweeps.plan import make_plan, read_sweep
-from gaussian_swaying.sweeps.together import make_together
+from gaussian_swaying.sweeps.together import members_of
 
 pytestmark = pytest.mark.gpu
 
@@ -25,15 +26,14 @@ def test_together_is_as_alone(tmp_path, sweep_file):
     settings = {"solver.substep": 2e-3, "frames": 5}
     plan = make_plan(read_sweep(sweep_file(tmp_path / "tiny.yaml", settings=settings)))
     job = Job(tmp_path, tuple(plan.names), plan.config, plan.frames, tuple(plan.runs), "cuda")
-    together, _ = make_together(job, Simulation.parser())
+    members, _ = members_of(job, Simulation.parser())
+    together = batch_of(members)
     state = together.start()
     assert together.solver.fused() is not None
     for _ in range(4):
         state, health = together.advance(state)
-    for number, member in enumerate(together.members):
-        alone = member.start() if number == 0 else member.solver.init_state(
-            member.solver.points, frame=member.scene.frame
-        )  # fmt: skip
+    for number, member in enumerate(members):
+        alone = member.start()
         for _ in range(4):
             alone, own = member.advance(alone)
         moved = float((alone.position - member.solver.points.position).abs().amax())
@@ -48,7 +48,8 @@ def test_together_foresees(tmp_path, sweep_file):
     """Without a fixed substep the host waits once in a frame."""
     plan = make_plan(read_sweep(sweep_file(tmp_path / "tiny.yaml")))
     job = Job(tmp_path, tuple(plan.names), plan.config, plan.frames, tuple(plan.runs), "cuda")
-    together, _ = make_together(job, Simulation.parser())
+    members, _ = members_of(job, Simulation.parser())
+    together = batch_of(members)
     state, _ = together.advance(together.start())
     assert together.foresees
     assert together.outlook is not None

@@ -1,6 +1,6 @@
 """Runs that are simulated together: as if each were alone, and done one by one where that fails.
 
-Covers: simulation.together.
+Covers: simulation.batch.
 """
 
 import csv
@@ -17,11 +17,12 @@ import torch
 
 from gaussian_swaying.cli.sweep import main
 from gaussian_swaying.config.parser import config_text
+from gaussian_swaying.simulation.batch import batch_of
 from gaussian_swaying.simulation.parameters import in_settings
 from gaussian_swaying.simulation.simulation import Simulation
 from gaussian_swaying.sweeps.job import Job
 from gaussian_swaying.sweeps.plan import make_plan, parse_run, read_sweep
-from gaussian_swaying.sweeps.together import grouped, make_together, texts
+from gaussian_swaying.sweeps.together import grouped, members_of, texts
 
 FIXED = {"solver.substep": 2e-3, "frames": 5}
 OPTIONS = ("--workers", "2", "--device", "cpu")
@@ -74,7 +75,7 @@ def test_together_as_alone(tmp_path, sweep_file):
 def test_the_state_of_a_scene(tmp_path, sweep_file):
     plan = make_plan(read_sweep(sweep_file(tmp_path / "tiny.yaml", settings=FIXED)))
     job = Job(tmp_path, tuple(plan.names), plan.config, plan.frames, tuple(plan.runs), "cpu")
-    together, _ = make_together(job, Simulation.parser())
+    together = batch_of(members_of(job, Simulation.parser())[0])
     state = together.start()
     assert state.position.shape[0] == 8
     end, health = together.advance(state)
@@ -125,7 +126,7 @@ def test_what_cannot_be_together_is_done_alone(tmp_path, sweep_file):
     settings = {"frames": 2, "edits": [{"time": 0.04, "E": 5e3}]}
     file, folder = sweep_file(tmp_path / "edits.yaml", {"wind.seed": [1, 2]}, 1, settings), tmp_path / "out"
     assert main([str(file), "--output", str(folder), *OPTIONS, "--together", "2"]) == 0
-    assert "cannot be simulated together" in (folder / "logs/00000.txt").read_text()
+    assert "cannot be simulated as a batch" in (folder / "logs/00000.txt").read_text()
 
 
 def test_a_killed_job_of_several_runs(tmp_path, sweep_file):

@@ -12,7 +12,7 @@ from bench.cases import fit as case
 from bench.cases import fit_bias, fit_reference
 from bench.problems.films import write_video
 
-from gaussian_swaying.fitting.ensemble import Ensemble
+from gaussian_swaying.fitting.variants import states_of
 from gaussian_swaying.simulation.simulation import Simulation
 
 from .conftest import shown
@@ -200,7 +200,7 @@ def _write_cloth(path, simulation, values):
     times = [k / 24 for k in range(5)]
     scene = simulation.scene
     rest = scene.model.means.detach()[scene.moving]
-    states = Ensemble(simulation).run([values], times)
+    states = states_of(simulation, [values], times)
     shapes = [rest + scene.frame.displacement_to_scene(scene.follow.motion(own)[0]) for (own,) in states]
     x, z = (rest[:, k].double().round(decimals=4) for k in (0, 2))
     columns, rows = x.unique(), z.unique()

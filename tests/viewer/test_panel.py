@@ -123,7 +123,7 @@ def test_wind_force_and_streaks_have_legends(page, client, until):
     assert not controls.legends.visible
     client.set(controls.shown, "wind force")
     until(lambda: controls.legends.visible)
-    assert legend("Force of the wind", "Pa", page.session.simulation.force_scale()) == controls.legends.content
+    assert legend("Force of the wind", "Pa", page.session.simulation.stepper.force_scale()) == controls.legends.content
     client.set(controls.shown, "colour")
     client.set(controls.streaks, True)
     until(lambda: "Speed of the air [m/s]" in controls.legends.content and "Force" not in controls.legends.content)

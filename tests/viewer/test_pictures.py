@@ -57,7 +57,7 @@ def test_streaks_of_air_are_those_of_the_render(session, shown):
         simulation, state = session.snapshot.simulation, session.snapshot.state
         with torch.inference_mode():
             rendered = simulation.painter.render(state, 0)
-            wanted = draw_wind(simulation, state, camera, rendered)
+            wanted = draw_wind(simulation.stepper, state, camera, rendered)
         found = draw(session.snapshot, camera_of(wxyz, eye, fov, camera.width, camera.height), streaks=True)
         apart = np.abs(found.astype(float) - 255 * wanted.clamp(0, 1).numpy()).max(-1)
         assert (apart > 2.0).mean() < 1e-3  # the camera in float32: the ends of a few streaks

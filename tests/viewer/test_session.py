@@ -303,7 +303,7 @@ def test_slow_motion_is_slower(session, monkeypatch, speed, step, expected):
 
     clock = SimpleNamespace(perf_counter=lambda: now[0], monotonic=lambda: now[0])
     monkeypatch.setattr("gaussian_swaying.viewer.session.time", clock)
-    monkeypatch.setattr(session.simulation, "advance", takes_time)
+    monkeypatch.setattr(session.simulation.stepper, "advance", takes_time)
     monkeypatch.setattr(session._wake, "wait_for", waits)
     session.pace(speed)
     while now[0] < 1.5 * WINDOW:  # the first steps, before which nothing was waited for, are forgotten

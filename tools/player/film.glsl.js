@@ -1,4 +1,4 @@
-// How a Gaussian follows the nodes; the definition is that of GridFollowers in simulation/followers.py.
+// How a Gaussian follows the nodes; the definition is that of GridFollowers in mpm/followers.py.
 
 export const FUNCTIONS = `
   ivec2 filmTexel(int index) {

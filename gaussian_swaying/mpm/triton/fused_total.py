@@ -337,7 +337,17 @@ class FusedTotal(Fused):
         self._read_into(position, velocity, affine, F, self.schedule, False, False)
         lost = self._room("lost", *shape[:-1], dtype=torch.bool)
         nodes = self.displacement[:, :3].reshape(self.shapes["displacement"])
-        return MPMState(position, velocity, affine, F, F, lost, self.time, self.grid, nodes)
+        return MPMState(
+            position=position,
+            velocity=velocity,
+            affine=affine,
+            F_elastic=F,
+            F_total=F,
+            lost=lost,
+            time=self.time,
+            grid=self.grid,
+            node_displacement=nodes,
+        )
 
 
 def _padded(shape: torch.Size) -> int:

@@ -15,15 +15,15 @@ from torch import Tensor
 from gaussian_swaying.config.parser import parse_file
 from gaussian_swaying.gaussians.harmonics import sh_to_color
 from gaussian_swaying.geometry.covariances import covariance_to_quat_scale
+from gaussian_swaying.mpm.followers import follower_stencil
 from gaussian_swaying.mpm.state import GridSpec
 from gaussian_swaying.mpm.transfer import gather
 from gaussian_swaying.recording.nodes import load_nodes
 from gaussian_swaying.rendering.shading import DiffuseShader
 from gaussian_swaying.runs.seal import sha256
 from gaussian_swaying.simulation.diagnostics import FARTHEST
-from gaussian_swaying.simulation.followers import follower_stencil
 from gaussian_swaying.simulation.painter import Painter
-from gaussian_swaying.simulation.scene import SimulatedScene
+from gaussian_swaying.simulation.simulated_scene import SimulatedScene
 from gaussian_swaying.simulation.simulation import Simulation
 
 
@@ -75,8 +75,10 @@ def read_film(run: Path) -> Film:
     summary = _summary(run)
     simulation, name = _rebuild(run, summary)
     displacement = load_nodes(run / "nodes.npz")
-    grid, scene = simulation.start().grid, simulation.scene
-    nodes = scene.follow.nodes(grid)
+    start: Any = simulation.start()
+    grid, scene = start.grid, simulation.scene
+    nodes = scene.follow.nodes(start)
+    assert nodes is not None  # the run is of `total`
     if displacement.shape[1] != len(nodes):
         raise ValueError(
             f"{run / 'nodes.npz'} has {displacement.shape[1]:,} nodes, but the scene of {run / 'config.yaml'} has "
@@ -199,7 +201,7 @@ def in_cells(places: Tensor, grid: GridSpec) -> Tensor:
     """Places [m] in cells of the grid, from its first node, shape (N, 3), float64.
 
     Those that lie on a border between stencils but for rounding are moved onto it, as in
-    :func:`~gaussian_swaying.simulation.followers.follower_stencil`.
+    :func:`~gaussian_swaying.mpm.followers.follower_stencil`.
     """
     cells = places / grid.dx
     border = cells.floor() + 0.5

@@ -19,9 +19,9 @@ import torch
 from torch import Tensor
 
 from bench.record import ROOT
-from gaussian_swaying.fitting.ensemble import Ensemble
 from gaussian_swaying.fitting.plan import Plan, parse_base
 from gaussian_swaying.fitting.report import predictions
+from gaussian_swaying.fitting.variants import states_of
 from gaussian_swaying.fitting.videos import frame_times, read_videos
 from gaussian_swaying.gaussians.model import DeformedGaussians
 from gaussian_swaying.simulation.simulation import Simulation
@@ -58,7 +58,7 @@ def measure(options: argparse.Namespace, folders: Sequence[Path], result: Row, s
 
 def simulated(simulation: Simulation, truth: Row, times: Sequence[float]) -> Iterator[DeformedGaussians]:
     """The Gaussians of a simulation with the true values, at each time."""
-    for (state,) in Ensemble(simulation).run([true_values(truth)], times, careful=False):
+    for (state,) in states_of(simulation, [true_values(truth)], times, alike=False):
         yield simulation.painter.deformed(state)
 
 

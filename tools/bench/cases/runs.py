@@ -22,6 +22,7 @@ from bench.scenes import CUBE, sheet
 from gaussian_swaying.geometry.frame import SimFrame
 from gaussian_swaying.mpm.solver import MPMSolver
 from gaussian_swaying.recording.trajectory import load_trajectory
+from gaussian_swaying.simulation.frame import frames_from
 from gaussian_swaying.simulation.simulation import Simulation
 
 FLAG = record.ROOT / "configs" / "sim" / "flag.yaml"
@@ -78,7 +79,7 @@ def without_files(arguments: list[str], device: torch.device) -> float:
     state = simulation.start()
     clock = Clock(device)
     begin = time.perf_counter()
-    for frame in simulation.frames_from(state, 0, settings.frames, drawn):
+    for frame in frames_from(simulation.painter, simulation.editor, state, 0, settings.frames, drawn):
         with torch.cuda.stream(drawn):
             simulation.painter.render(frame.state, frame.index)
     clock.wait()

@@ -23,6 +23,7 @@ from gaussian_swaying.aero.wind_force import WindForce
 from gaussian_swaying.mpm.boundaries.enclosing_box import EnclosingBox
 from gaussian_swaying.mpm.solver import MPMSolver
 from gaussian_swaying.mpm.state import MaterialPoints, MPMState
+from gaussian_swaying.simulation.frame import frames_from
 from gaussian_swaying.simulation.simulation import Simulation
 
 Row = dict[str, Any]
@@ -279,7 +280,7 @@ def bench_frame(plan: Plan, dx: float | None, device: torch.device, spacing: flo
     warm, count = plan.frames
     samples, substeps = [], []
     begin = time.perf_counter()
-    for frame in simulation.frames_from(state, 0, 1 + warm + count, drawn):
+    for frame in frames_from(simulation.painter, simulation.editor, state, 0, 1 + warm + count, drawn):
         with torch.cuda.stream(drawn):
             painter.render(frame.state, frame.index)
         now = time.perf_counter()

@@ -5,8 +5,8 @@ Covers: .
 
 import torch
 
+from gaussian_swaying.mpm.followers import on_material
 from gaussian_swaying.mpm.state import MaterialPoints
-from gaussian_swaying.simulation.followers import on_material
 
 
 def test_places_without_all_their_nodes_are_read_at_a_material_point():

@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from gaussian_swaying.fitting.ensemble import Ensemble
+from gaussian_swaying.fitting.variants import states_of
 from gaussian_swaying.simulation.simulation import Simulation
 
 VALUES = [{}, {"wind.speed": 7.0}, {"material.E": 5e3}, {"aero.C_D": 0.4}]
@@ -15,8 +15,7 @@ def test_a_batch_in_the_kernels_moves_as_in_torch(own):
     times = [0.0, 1 / 24, 4 / 24]
     found = {}
     for device in ("cpu", "cuda"):
-        ensemble = Ensemble(Simulation.from_yaml(own / "base.yaml", device=device))
-        found[device] = list(ensemble.run(VALUES, times))[-1]
+        found[device] = list(states_of(Simulation.from_yaml(own / "base.yaml", device=device), VALUES, times))[-1]
     for slow, fast in zip(found["cpu"], found["cuda"], strict=True):
         moved = float(slow.position.sub(fast.position.cpu()).norm(dim=-1).max())
         assert moved < 1e-3

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from typing import Any, ClassVar
 
 import torch
 from torch import Tensor, nn
 
 from gaussian_swaying.geometry.frame import SimFrame
 from gaussian_swaying.geometry.patches import compiles
-from gaussian_swaying.mpm.state import GridSpec, MaterialPoints, MPMState, bounding_grid
+from gaussian_swaying.mpm.state import GridSpec, MaterialPoints, MPMState, State, bounding_grid
 from gaussian_swaying.mpm.transfer import Stencil, bspline_stencil, gather, scatter
 
 
@@ -21,12 +22,16 @@ class Followers(nn.Module, ABC):
             with the material. None if they are the same.
     """
 
+    reads: ClassVar[tuple[str, ...]]
+    """The fields of a state that the motion depends on."""
+
     def __init__(self, arm: Tensor | None) -> None:
         super().__init__()
         self.register_buffer("arm", arm, persistent=False)
+        self._nodes: tuple[GridSpec, Tensor] | None = None
         self.arm: Tensor | None
 
-    def motion(self, state: MPMState) -> tuple[Tensor, Tensor]:
+    def motion(self, state: Any) -> tuple[Tensor, Tensor]:
         """Displacement [m], shape (M, 3), and deformation gradient, shape (M, 3, 3), in a state of one scene."""
         move, F = self._read(state)
         if self.arm is not None:
@@ -43,19 +48,49 @@ class Followers(nn.Module, ABC):
     def some(self, index: Tensor) -> Followers:
         """Some of them, by their numbers (K,)."""
 
-    def nodes(self, grid: GridSpec) -> Tensor:
-        """The nodes of a grid that the stencils of the places reach: flat indices in rising order, shape (N,).
+    def nodes(self, state: Any) -> Tensor | None:
+        """The nodes that the stencils of the places reach: flat indices in rising order, shape (N,).
 
-        Their order is the same in every grid that contains them.
+        None if the state has no nodes. Their order is the same in every grid that contains them.
         """
-        return follower_stencil(self.places, grid).node.unique()
+        if getattr(state, "node_displacement", None) is None:
+            return None
+        if self._nodes is None or self._nodes[0] != state.grid:
+            self._nodes = (state.grid, follower_stencil(self.places, state.grid).node.unique())
+        return self._nodes[1]
+
+    def nodal(self, state: Any) -> Tensor | None:
+        """Displacement of :meth:`nodes` [m], shape (N, 3); None without nodes."""
+        nodes = self.nodes(state)
+        return None if nodes is None else _nodal(state.node_displacement)[nodes]
+
+    def layout(self, state: Any) -> object:
+        """The key of a recording of :meth:`motion`, besides the fields that it reads."""
+        return None
+
+    def drawn(
+        self,
+        state: Any,
+        frame: SimFrame,
+        means: Tensor,
+        covariances: Tensor,
+        normals: Tensor,
+        rotations: bool,
+        max_stretch: float | None,
+        solid: Tensor | None,
+    ) -> tuple[Tensor, Tensor, Tensor, Tensor | None] | None:
+        """Means, covariances, normals and rotations in scene units, in one kernel; None where it cannot run.
+
+        The definition is :meth:`motion` with :func:`~gaussian_swaying.geometry.patches.deform_all`.
+        """
+        return None
 
     @abstractmethod
-    def velocity(self, state: MPMState) -> Tensor:
+    def velocity(self, state: Any) -> Tensor:
         """Velocity of the places that are read [m/s], shape (M, 3)."""
 
     @abstractmethod
-    def _read(self, state: MPMState) -> tuple[Tensor, Tensor]:
+    def _read(self, state: Any) -> tuple[Tensor, Tensor]:
         """Displacement and deformation gradient of the places that are read."""
 
 
@@ -67,6 +102,8 @@ class PointFollowers(Followers):
         arm: See :class:`Followers`.
         rest: Rest positions of the points [m], shape (P, 3).
     """
+
+    reads = ("position", "F_total")
 
     def __init__(self, source: Tensor, arm: Tensor | None, rest: Tensor) -> None:
         super().__init__(arm)
@@ -84,10 +121,10 @@ class PointFollowers(Followers):
         """Some of them."""
         return PointFollowers(self.source[index], None if self.arm is None else self.arm[index], self.rest)
 
-    def _read(self, state: MPMState) -> tuple[Tensor, Tensor]:
+    def _read(self, state: State) -> tuple[Tensor, Tensor]:
         return (state.position - self.rest)[self.source], state.F_total[self.source]
 
-    def velocity(self, state: MPMState) -> Tensor:
+    def velocity(self, state: State) -> Tensor:
         """Velocity of the points [m/s], shape (M, 3)."""
         return state.velocity[self.source]
 
@@ -99,6 +136,8 @@ class GridFollowers(Followers):
         place: Rest positions that are read [m], shape (M, 3).
         arm: See :class:`Followers`.
     """
+
+    reads = ("node_displacement",)
 
     def __init__(self, place: Tensor, arm: Tensor | None) -> None:
         super().__init__(arm)
@@ -124,6 +163,10 @@ class GridFollowers(Followers):
             self._known = known
         return known[2]
 
+    def layout(self, state: MPMState) -> object:
+        """The grid."""
+        return state.grid
+
     def _read(self, state: MPMState) -> tuple[Tensor, Tensor]:
         rows = gather(_nodal(state.node_displacement), self.stencil(state.grid))
         return rows[..., 0, :], rows[..., 1:4, :].mT + torch.eye(3, dtype=rows.dtype, device=rows.device)
@@ -139,18 +182,14 @@ class GridFollowers(Followers):
         max_stretch: float | None,
         solid: Tensor | None,
     ) -> tuple[Tensor, Tensor, Tensor, Tensor | None] | None:
-        """Means, covariances, normals and rotations in scene units, in one kernel; None where it cannot run.
-
-        The definition is :meth:`~Followers.motion` with :func:`~gaussian_swaying.geometry.patches.deform_all`. The
-        kernel runs on a GPU in float32, without gradients.
-        """
+        """See :meth:`Followers.drawn`; the kernel runs on a GPU in float32, without gradients."""
         displacement = _nodal(state.node_displacement)
         given = (displacement, means, covariances, normals, self.place)
         wanted = torch.is_grad_enabled() and any(tensor.requires_grad for tensor in given)
         single = all(tensor.dtype == torch.float32 for tensor in given)
         if not displacement.is_cuda or not single or wanted or not compiles():
             return None
-        from gaussian_swaying.simulation.followers_triton import follow
+        from gaussian_swaying.mpm.followers_triton import follow
 
         _, ny, nz = state.grid.resolution
         return follow(

@@ -1,0 +1,114 @@
+"""Variants of a simulation that differ in a few values, advanced side by side as batches."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+
+import torch
+
+from gaussian_swaying.mpm.state import MaterialPoints, State
+from gaussian_swaying.simulation.diagnostics import SimulationDiverged
+from gaussian_swaying.simulation.parameters import Setup, parameter, with_values
+from gaussian_swaying.simulation.simulation import Simulation
+from gaussian_swaying.simulation.stepper import Stepper, why_not_batched
+
+Values = Mapping[str, float]
+
+
+@dataclass
+class _Group:
+    """Variants that differ only in parameters that may differ within a batch."""
+
+    members: list[int]
+    stepper: Stepper
+    state: State
+    diverged: bool = False
+
+
+def check_variants(simulation: Simulation) -> None:
+    """Raise ValueError if a simulation has parts that cannot be a batch: timed edits, contact, shelter."""
+    why = why_not_batched(simulation.setup)
+    if simulation.editor.edits:
+        why = "`edits` change its material; put it into `material`"
+    if why is not None:
+        raise ValueError(f"The base cannot be fitted through: {why}.")
+
+
+@torch.no_grad()
+def states_of(
+    simulation: Simulation, values: Sequence[Values], times: Sequence[float], alike: bool = True
+) -> Iterator[list[State]]:
+    """The states of all variants at each time, in the order of ``values``.
+
+    Variants that differ only in parameters that may differ within a batch are one batch; others are further batches.
+
+    Args:
+        simulation: The base. Its motion starts from rest at time zero.
+        values: For each variant the values that replace those of the base.
+        times: Times [s], ascending, from 0 on.
+        alike: Take the same substeps for all, those of the stiffest, so that differences come from the values alone. If
+            not, variants that need more substeps are batches of their own, and a variant may end in NaN.
+
+    Raises:
+        SimulationDiverged: If a variant diverges, with ``alike``.
+    """
+    setups = [with_values(simulation.setup, own) for own in values]
+    groups = _groups(simulation, values, setups, alike)
+    now = 0.0
+    for time in times:
+        if time > now:
+            _advance(groups, time - now, alike)
+            now = time
+        found = [(member, group.state.scene(k)) for group in groups for k, member in enumerate(group.members)]
+        yield [state for _, state in sorted(found, key=lambda pair: pair[0])]
+
+
+def _groups(simulation: Simulation, values: Sequence[Values], setups: Sequence[Setup], alike: bool) -> list[_Group]:
+    shared: dict[tuple[object, ...], list[int]] = {}
+    for number, (own, setup) in enumerate(zip(values, setups, strict=True)):
+        apart = [(name, value) for name, value in sorted(own.items()) if not parameter(name).batched]
+        shared.setdefault((*apart, 0 if alike else _stiffness_class(setup.points)), []).append(number)
+    found = []
+    for members in shared.values():
+        part = [setups[k] for k in members]
+        solver = simulation.solver.like(part[0].solver)
+        solver.substep = None  # a stiffer variant may need a shorter one
+        stepper = Stepper(solver, part, simulation.frame_dt, lenient=not alike)
+        found.append(_Group(members, stepper, stepper.bind()))
+    return found
+
+
+def _advance(groups: Sequence[_Group], time: float, alike: bool) -> None:
+    """Advance all groups by some time [s]."""
+    for group in groups:
+        group.stepper.frame_dt = time
+    if not alike:
+        for group in groups:
+            try:
+                if not group.diverged:
+                    group.state, _ = group.stepper.advance(group.state)
+            except SimulationDiverged:
+                lost = {name: torch.nan * getattr(group.state, name) for name in ("position", "velocity", "F_total")}
+                group.state, group.diverged = group.state.replace(**lost), True
+        return
+    steps = max(group.stepper.substeps(group.state) for group in groups)
+    while True:
+        launched = [group.stepper.launch(group.state, steps) for group in groups]
+        ends = [one.finish()[0] for one in launched]
+        most = max(one.steps for one in launched)
+        if all(one.steps == most for one in launched):
+            break
+        steps = most
+    for group, end in zip(groups, ends, strict=True):
+        group.state = end
+
+
+def _stiffness_class(points: MaterialPoints) -> int:
+    """A number that is equal for materials whose fastest waves differ by less than a fifth or so."""
+    squared = (points.youngs_modulus * points.volume / points.mass).amax()
+    return round(2 * math.log2(float(squared)))
+
+
+__all__ = ["Values", "check_variants", "states_of"]

@@ -1,0 +1,179 @@
+"""The body of a scene: what a solver takes, made from the Gaussians that move."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor
+
+from gaussian_swaying.aero.patches import Patches
+from gaussian_swaying.gaussians.area import coverage_area, patch_area
+from gaussian_swaying.gaussians.cloud import GaussianCloud
+from gaussian_swaying.gaussians.filling import Filling
+from gaussian_swaying.gaussians.grouping import loose_points
+from gaussian_swaying.gaussians.openness import openness
+from gaussian_swaying.gaussians.subdivision import Subdivision, subdivide
+from gaussian_swaying.geometry.covariances import covariance
+from gaussian_swaying.geometry.frame import SimFrame
+from gaussian_swaying.geometry.neighbours import nearest_neighbours
+from gaussian_swaying.geometry.regions import Region
+from gaussian_swaying.mpm.state import MaterialPoints
+from gaussian_swaying.simulation.material import Material, with_gradients
+from gaussian_swaying.simulation.sampling import Samples, grouped, sample_object, shared_wind
+from gaussian_swaying.simulation.scene import Scene
+
+HOLE = 0.6
+"""Distance from all Gaussians [cells] at which ``points: grid`` puts extra points on large ones by itself."""
+
+SPECK = 1 / 2.2
+"""Side of the cubes by which ``scene.loose`` finds specks [cells]."""
+
+
+@dataclass(frozen=True, eq=False)
+class Body:
+    """Material points and patches, and the samples of the object that they stand for.
+
+    Attributes:
+        points: The material.
+        patches: What feels the wind.
+        on_surface: Number of points on the surface, without those at the faces of a sheet.
+        samples: Samples of the object: first one for each Gaussian, then extra ones, then those inside a solid.
+        surface_samples: Number of those that are not inside.
+        owner: The material point of each sample, shape (N,).
+    """
+
+    points: MaterialPoints
+    patches: Patches
+    on_surface: int
+    samples: Samples
+    surface_samples: int
+    owner: Tensor
+
+
+def body_of(
+    part: GaussianCloud,
+    normals: Tensor,
+    scene: Scene,
+    material: Material,
+    frame: SimFrame,
+    dx: float,
+    dtype: torch.dtype,
+    by_grid: bool,
+    apart: Sequence[Region],
+) -> Body:
+    """Turn Gaussians into what a solver takes: samples, their areas and material, groups, patches.
+
+    Args:
+        part: The simulated Gaussians.
+        normals: Their unit normals, shape (N, 3).
+        scene: How they are sampled.
+        material: Their material.
+        frame: Conversion from scene units to metres.
+        dx: Length that the solver resolves [m].
+        dtype: Precision of the simulation.
+        by_grid: Whether samples are grouped.
+        apart: Regions whose borders no group crosses, in scene units.
+
+    Returns:
+        The body.
+
+    Raises:
+        ValueError: If a region of the material contains nothing.
+    """
+    position = frame.point_to_sim(part.means.double())
+    source = torch.arange(len(position))  # the Gaussian of each sample of the surface
+    filling = None
+    if scene.filling is not None:
+        shape = frame.covariance_to_sim(covariance(part.quats, part.scales).double())
+        filling = scene.filling.fill(position, shape, torch.sigmoid(part.opacities), 0.5 * dx)
+        filling = within_region(filling, scene.region, frame)
+    pieces = _pieces(part, scene, frame.metres_per_unit, dx, by_grid)
+    if pieces is not None:
+        position = torch.cat([position, frame.point_to_sim(pieces.means.double())])
+        source = torch.cat([source, pieces.parent])
+    outer = torch.ones(len(source), dtype=torch.bool) if filling is None else filling.on_surface
+    areas, kind = part.means.new_zeros(len(source)), scene.area_kind
+    # inner points take no area from the surface
+    for group, mode in ((outer, kind), (~outer, "coverage" if kind == "open" else kind)):
+        areas[group] = _areas(part, normals, source, pieces, group, mode)
+    body_area = frame.area_to_sim(areas).double()
+    area = body_area if scene.wind_on == "all" else torch.where(outer, body_area, 0)
+    facing = frame.direction_to_sim(normals[source].double())
+    samples, laws = sample_object(position, facing, body_area, area, filling, material, frame, dx)
+    chosen, owner, feels = samples, torch.arange(len(samples.position)), samples.area > 0
+    patches = samples.normal[feels], samples.area[feels], owner[feels]
+    if by_grid:
+        chosen, owner, parent = grouped(samples, dx, scene.points_per_cell, apart, frame, dtype)
+        patches = shared_wind(samples, owner, parent)
+    points = with_gradients(chosen.points(scene.layers, laws, dtype), material)
+    felt = Patches(patches[0].to(dtype), patches[1].to(dtype), patches[2], points.count)
+    return Body(points, felt, int(chosen.surface.sum()), samples, len(source), owner)
+
+
+def specks_of(
+    cloud: GaussianCloud, simulated: Tensor, scene: Scene, frame: SimFrame, dx: float, by_grid: bool
+) -> Tensor:
+    """The simulated Gaussians that are not connected to the object, if ``scene.loose`` carries them.
+
+    Args:
+        cloud: All Gaussians.
+        simulated: Indices of those that are simulated, shape (N,).
+        scene: How they are sampled.
+        frame: Conversion from scene units to metres.
+        dx: Length that the solver resolves [m].
+        by_grid: Whether samples are grouped.
+
+    Returns:
+        Their indices, shape (M,).
+    """
+    if scene.loose != "carry":
+        return simulated[:0]
+    part = cloud.select(simulated)
+    pieces = _pieces(part, scene, frame.metres_per_unit, dx, by_grid)
+    where = part.means if pieces is None else torch.cat([part.means, pieces.means.to(part.means)])
+    return simulated[loose_points(where, SPECK * dx / frame.metres_per_unit)[: len(part.means)]]
+
+
+def _pieces(part: GaussianCloud, scene: Scene, unit: float, dx: float, by_grid: bool) -> Subdivision | None:
+    """Return extra points on large Gaussians, no farther apart than ``scene.particle_spacing``; None if there are none.
+
+    Groups by themselves get those that fill holes, far from all Gaussians.
+    """
+    spacing, hole = scene.particle_spacing, 0.0
+    if spacing is None and by_grid and scene.filling is None:
+        spacing, hole = dx / scene.points_per_cell, HOLE * dx / unit
+    if spacing is None:
+        return None
+    spacing = spacing / unit
+    found = subdivide(part.means, part.quats, part.scales, torch.sigmoid(part.opacities), spacing)
+    if hole > 0 and len(found.means):
+        far = nearest_neighbours(part.means.double(), 1, found.means.double())[0][:, 0] > hole
+        own = torch.arange(len(far))[far]
+        of_all = torch.cat([torch.arange(len(part.means)), len(part.means) + own])
+        found = Subdivision(found.parent[far], found.means[far], found.log_scales[of_all], found.opacity[of_all])
+    return found if len(found.means) else None
+
+
+def _areas(
+    cloud: GaussianCloud, normals: Tensor, source: Tensor, pieces: Subdivision | None, group: Tensor, mode: str
+) -> Tensor:
+    """Areas [scene units^2] of a group of points, shared within it; each point belongs to a Gaussian of the cloud."""
+    if mode == "paper":
+        shares = torch.bincount(source, minlength=len(cloud.means)).to(cloud.means)
+        return (patch_area(cloud.scales) / shares.clamp_min(1))[source[group]]
+    means, log_scales, opacity = cloud.means, cloud.scales, torch.sigmoid(cloud.opacities)
+    if pieces is not None:
+        means, log_scales, opacity = torch.cat([means, pieces.means]), pieces.log_scales, pieces.opacity
+    shape = means[group], normals[source[group]], log_scales[group]
+    found = coverage_area(*shape, opacity[group])
+    if mode == "open":
+        return found * openness(*shape, found, opacity[group])
+    return found.mean().expand(len(found)) if mode == "equal" and len(found) else found
+
+
+def within_region(filling: Filling, region: Region, frame: SimFrame) -> Filling:
+    """A filling without the points outside a region given in scene units."""
+    inside = region.contains(frame.point_to_scene(filling.position))
+    return replace(filling, position=filling.position[inside], volume=filling.volume[inside])

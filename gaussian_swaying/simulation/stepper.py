@@ -1,0 +1,556 @@
+"""From one state to the next, frame by frame: of one scene, or of several of equal shape in one rollout."""
+
+from __future__ import annotations
+
+import math
+import weakref
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from typing import NoReturn
+
+import torch
+from torch import Tensor
+
+from gaussian_swaying._graphs import fingerprint, tensors_in
+from gaussian_swaying._turns import Turn, in_turn
+from gaussian_swaying.aero.patches import Patches
+from gaussian_swaying.aero.shelter import Shelter
+from gaussian_swaying.aero.wind import WindField
+from gaussian_swaying.aero.wind_batch import WindBatch, why_apart
+from gaussian_swaying.aero.wind_force import WindForce
+from gaussian_swaying.geometry.patches import deform_patch
+from gaussian_swaying.mpm.forces import Force
+from gaussian_swaying.mpm.protocol import Solver
+from gaussian_swaying.mpm.state import MaterialPoints, State
+from gaussian_swaying.mpm.timestep import MAX_CFL, rounding_speed
+from gaussian_swaying.simulation.diagnostics import (
+    FrameDiagnostics,
+    Gauge,
+    Measurement,
+    SimulationDiverged,
+    TearingGauge,
+    check_spacing,
+    measure,
+    measure_scenes,
+)
+from gaussian_swaying.simulation.parameters import Setup
+from gaussian_swaying.simulation.progress import RunProgress
+from gaussian_swaying.simulation.simulated_scene import SimulatedScene
+
+CFL_SAMPLES = 8  # checks per frame, as material may stiffen and soften again within it
+MAX_WIND = 1e6  # m/s; anything above is a mistake and would overflow positions
+MAX_GROWTH = 1000  # a frame that takes this many times the substeps of the first ends the run
+MAX_SUBSTEPS = 1_000_000  # per frame: hours on a CPU, and minutes on the fastest GPU
+MAX_RETRIES = 4  # of a frame
+CFL_LIMIT = 0.5  # an adaptive frame that exceeds it is repeated with shorter substeps
+
+ROUNDING_SHARE = 0.5
+"""Share of the driving speed that the bound of :func:`rounding_speed` may reach in a second; rounding itself reaches a
+tenth of its bound or so."""
+
+
+class Stepper:
+    """Advances a state by frames, with as many substeps as it needs: of one scene, or of several as a batch.
+
+    A frame whose substep was too long, as the material stiffened, is repeated with shorter ones; one whose particles
+    outran the grid of ``updated`` with a larger grid. The scenes of a batch have the same Gaussians, coefficients of
+    the wind's force and custom forces; winds and materials may differ. All take the substeps of the fastest.
+
+    Args:
+        solver: The solver.
+        setups: Scene, material and drivers; or those of each scene of a batch.
+        frame_dt: Length of a frame [s].
+        turn: Lock of the thread that steps; its own if None.
+        lenient: Whether a scene of a batch may diverge: it then ends in NaN, and the others go on.
+
+    Attributes:
+        setups: The setups now; :meth:`take` changes them.
+        starts: How often it was started.
+        progress: Shows how far a frame is, if there is one.
+        most_substeps: A frame that needs more ends the run.
+
+    Raises:
+        ValueError: If the setups cannot be a batch, see :func:`why_not_batched`.
+    """
+
+    def __init__(
+        self,
+        solver: Solver,
+        setups: Setup | Sequence[Setup],
+        frame_dt: float,
+        *,
+        turn: Turn | None = None,
+        lenient: bool = False,
+    ) -> None:
+        self.batched = not isinstance(setups, Setup)
+        self.setups = (setups,) if isinstance(setups, Setup) else tuple(setups)
+        reasons = [why for setup in self.setups if self.batched and (why := why_not_batched(setup)) is not None]
+        if reasons:
+            raise ValueError(f"These cannot be simulated as a batch: {reasons[0]}.")
+        self.solver, self.frame_dt, self.lenient, self.turn = solver, frame_dt, lenient, turn or Turn()
+        self.most_substeps, self.starts = MAX_SUBSTEPS, 0
+        self.outlook: Outlook | None = None  # on the next frame
+        self.progress: RunProgress | None = None  # of the current run
+        self._steps = 1  # of the last frame
+        self._wind_force: tuple[tuple[object, ...], WindForce] | None = None
+        self._idle: tuple[tuple[object, ...], bool] | None = None
+        self._tearing: TearingGauge | None = None
+        self._gauge = Gauge()
+
+    # ---- what acts
+
+    @property
+    def setup(self) -> Setup:
+        """Scene, material and drivers; those of the first scene of a batch."""
+        return self.setups[0]
+
+    @property
+    def scene(self) -> SimulatedScene:
+        """Gaussians, material points and patches."""
+        return self.setup.scene
+
+    @property
+    def device(self) -> torch.device:
+        """Device of the scene."""
+        return self.scene.identity.device
+
+    @property
+    def wind_force(self) -> WindForce:
+        """The wind on the patches of the scene, or of all scenes."""
+        first = self.setup
+        parts = (first.aero, first.scene.patches, *(setup.wind for setup in self.setups))
+        if self._wind_force is None or any(a is not b for a, b in zip(self._wind_force[0], parts, strict=True)):
+            with torch.inference_mode(False), torch.no_grad():  # it outlives the call
+                alone = WindForce(first.aero, first.wind, first.scene.patches)
+                self._wind_force = parts, _wind_on(self.setups, alone) if self.batched else alone
+        return self._wind_force[1]
+
+    @property
+    def idle(self) -> bool:
+        """True if the wind has no effect; computed again only if a coefficient changed, as it makes the host wait."""
+        aero = self.setup.aero
+        key = (aero, aero.air_density, *(0 if c.is_inference() else c._version for c in (aero.C_D, aero.C_F, aero.C_L)))
+        if self._idle is None or self._idle[0] != key:
+            self._idle = (key, aero.idle)
+        return self._idle[1]
+
+    @property
+    def forces(self) -> list[Force]:
+        """The forces on the particles besides gravity: the wind, unless it has no effect, and the custom forces."""
+        custom = list(self.setup.forces)
+        return custom if self.idle else [self.wind_force, *custom]
+
+    def flows(self) -> Tensor:
+        """Flows of the wind without gusts [m/s], shape (K, 3); those of a spatial wind are at the particles."""
+        winds = [setup.wind for setup in self.setups]
+        flows = [wind.flows for wind in winds if isinstance(wind, WindField)]
+        if len(flows) == len(winds):
+            return torch.cat(flows)
+        position = self.setup.points.position
+        position = position.expand(len(winds), *position.shape) if self.batched else position
+        air = self.wind_force.air(torch.zeros((), dtype=torch.float64, device=position.device), position)
+        return air.reshape(-1, 3)
+
+    @in_turn
+    def wind_pressure(self, state: State) -> Tensor:
+        """Force of the wind per area of the Gaussians as they are now [Pa], shape (N,); 0 for those without wind."""
+        scene = self.scene
+        if self.idle:
+            return scene.on_gaussians(torch.zeros_like(scene.in_wind, dtype=state.position.dtype))
+        move, F = scene.follow.motion(state)
+        normal, area = deform_patch(F, scene.rest_facing.to(F), F.new_ones(len(F)))
+        place = scene.frame.point_to_sim(scene.model.means[scene.moving].double()).to(move) + move
+        wind = self.wind_force.air(state.time, place)
+        force = self.setup.aero(wind, scene.follow.velocity(state), normal, torch.ones_like(area))
+        return scene.on_gaussians(torch.where(scene.in_wind, torch.linalg.vector_norm(force, dim=-1), 0.0))
+
+    def force_scale(self) -> float:
+        """Force per area [Pa] that the wind's flow, without gusts, can exert on a patch at rest; 1 in still air."""
+        aero = self.setup.aero
+        speed = float(torch.linalg.vector_norm(self.flows().detach(), dim=-1).amax())
+        coefficients = float(torch.stack([aero.C_D, aero.C_F, aero.C_L]).detach().abs().sum())
+        return 0.5 * aero.air_density * speed**2 * coefficients or 1.0
+
+    # ---- at rest
+
+    @in_turn
+    def start(self) -> State:
+        """The state at rest at time zero.
+
+        Raises:
+            ValueError: If a pin holds nothing, the grid is too large or a fixed substep is too long; if the material is
+                so stiff that rounding shakes it.
+        """
+        self.starts += 1
+        state = self.bind()
+        self._idle = None  # coefficients may have changed
+        check_spacing(self.solver)
+        self.solver.prepare()
+        at_rest = self.solver.substeps(state, self.frame_dt)
+        if at_rest > MAX_SUBSTEPS:
+            remedy = "soften it (`material.E`, `material.nu`), raise its density or `solver.dx`, or shorten `frame_dt`"
+            if self.solver.substep is not None:
+                remedy = "raise `solver.substep`, set it to null for the longest that is stable, or shorten `frame_dt`"
+            raise ValueError(
+                f"A frame of {self.frame_dt:g} s would take {at_rest:,} substeps with this material and grid, more "
+                f"than the limit of {MAX_SUBSTEPS:,}: {remedy}."
+            )
+        self._check_rounding(state, self.frame_dt / at_rest)
+        self.most_substeps = min(MAX_GROWTH * at_rest, MAX_SUBSTEPS)
+        self._tearing = None if self.solver.neighbours_fixed else TearingGauge(self.solver)
+        return state
+
+    def rehearse(self) -> None:
+        """Raise the errors that a start with the present setup would raise."""
+        rehearsed = self.bind()
+        self.solver.prepare()
+        self.solver.substeps(rehearsed, self.frame_dt)
+
+    def bind(self) -> State:
+        """Bind the solver to the material; returns the state at rest."""
+        scene, points = self.scene, self.setup.points
+        if self.batched:
+            points = MaterialPoints.stack([setup.points for setup in self.setups])
+        state: State = self.solver.init_state(points, frame=scene.frame, surface=scene.surface_places)
+        return state
+
+    def _check_rounding(self, state: State, dt: float) -> None:
+        """Raise ValueError if rounding moves the material at rest nearly as fast as wind and gravity do."""
+        drive = math.hypot(*self.solver.gravity)  # for a second
+        if not self.idle:
+            drive = max(drive, float(torch.linalg.vector_norm(self.flows().detach(), dim=-1).amax()))
+        speed, dtype = float(self.solver.cells_per_second(state)) * self.solver.dx, state.position.dtype
+        shaken = rounding_speed(speed, dt, 1.0 / dt, self.solver.dx, dtype)
+        if drive > 0 and shaken > ROUNDING_SHARE * drive:
+            raise ValueError(
+                f"Rounding to {str(dtype).removeprefix('torch.')} may shake this stiff material by {shaken:.2g} m/s "
+                f"within a second, more than {ROUNDING_SHARE:g} of what drives it (wind, or gravity for a second, of "
+                f"{drive:.2g} m/s): lower `material.E` or `material.nu`, or set `dtype` to float64."
+            )
+
+    # ---- other values
+
+    @in_turn
+    def take(self, setup: Setup, state: State | None = None, changed: Tensor | None = None) -> State | None:
+        """Go on with another material, wind or forces; the solver is bound again only if its part has changed.
+
+        Args:
+            setup: The new setup, of the one scene.
+            state: The state now; None before the start.
+            changed: Particles that got another law, bool, shape (P,); their internal variable starts anew.
+
+        Returns:
+            The state from which the run continues.
+        """
+        before, self.setups = self.setup, (setup,)
+        if setup.solver is not before.solver:
+            self.solver.settings = setup.solver
+        if state is None or (setup.points is before.points and setup.solver is before.solver):
+            return state
+        start = self.bind().internal
+        if start is not None and state.internal is not None and changed is not None:
+            start = torch.where(changed, start, state.internal)
+        elif start is not None and state.internal is not None:
+            start = state.internal
+        state = state.replace(internal=start)
+        self.solver.prepare()
+        steps = min(MAX_GROWTH * self.solver.substeps(state, self.frame_dt), MAX_SUBSTEPS)
+        self.most_substeps = max(self.most_substeps, steps)
+        if self._tearing is not None:
+            elastic = self.solver.points.elastic
+            if elastic is not None:  # particles that flowed apart before are not torn
+                self._tearing.elastic = elastic if self._tearing.elastic is None else elastic & self._tearing.elastic
+        return state
+
+    # ---- a frame
+
+    @in_turn
+    def advance(self, state: State) -> tuple[State, FrameDiagnostics]:
+        """Advance by one frame.
+
+        Args:
+            state: The state at the start of the frame.
+
+        Returns:
+            The state at its end, and its diagnostics; those of a batch have one for each scene in ``each``.
+
+        Raises:
+            SimulationDiverged: If the simulation diverges in the frame.
+        """
+        return self.launch(state).finish()
+
+    @in_turn
+    def launch(self, state: State, steps: int | None = None) -> Launched:
+        """Pass a frame to the device; ``launch(state).finish()`` is :meth:`advance`, and the host can work between.
+
+        Args:
+            state: The state at the start of the frame.
+            steps: Number of substeps, as several batches that are compared take; those that it needs if None.
+
+        Returns:
+            The frame. An error of it is raised by its ``finish``.
+        """
+        if not self.idle:
+            self.wind_force.refresh(state)
+        return Launched(self, state, steps)
+
+    def at_rest(self, state: State) -> FrameDiagnostics:
+        """Measurements of a state before its first frame."""
+        if self.batched:
+            return measure_scenes(self.solver, state, 0, 0.0, state).read()
+        return measure(self.solver, state, 0, 0.0).read()
+
+    def measured(
+        self,
+        end: State,
+        steps: int,
+        courant: Tensor,
+        state: State,
+        parts: tuple[object, ...] | None,
+    ) -> Measurement:
+        """Start the measurements of a frame from ``state`` to ``end``, and of what the next one needs.
+
+        Args:
+            end: The state at its end.
+            steps: Its substeps.
+            courant: Its largest Courant number.
+            state: The state at its start.
+            parts: From :func:`parts_of`.
+        """
+        idle, ahead = self.idle, self._tearing is None and self.foresees
+
+        def needs(at: State) -> Tensor:
+            return needs_of(self, at, None if idle else self._winds(self.wind_force.foreseen(at), at))
+
+        if self.batched:
+            return measure_scenes(self.solver, end, steps, courant, state, self._tearing, needs(end) if ahead else None)
+        work = (end.work - state.work).sum()
+        if not ahead:
+            return measure(self.solver, end, steps, courant, work, self._tearing, state)
+        same = None if parts is None else (idle, self.frame_dt, parts)
+        return self._gauge(self.solver, end, steps, courant, work, state, needs, same)
+
+    def give_up(self, state: State, cause: str, remedy: str | None = None) -> NoReturn:
+        """Raise SimulationDiverged, naming the particle with the largest deformation."""
+        particle = int(state.F_elastic.square().sum((-1, -2)).reshape(-1).argmax())
+        if remedy is None:
+            field = "solver.cfl" if self.solver.substep is None else "solver.substep"
+            remedy = f"lower `{field}`, or weaken the wind or the boundary that drives it"
+        raise SimulationDiverged(float(state.time), particle, cause, remedy)
+
+    @property
+    def foresees(self) -> bool:
+        """True if the needs of the next frame are measured at the end of a frame, so that the host waits once."""
+        simple = self.solver.substep is None and self.solver.stiffness_damping == 0
+        return simple and self.solver.has_kernels and self.wind_force.recordable
+
+    @in_turn
+    def substeps(self, state: State, parts: tuple[object, ...] | None = None) -> int:
+        """Return the number of substeps of the next frame, from waves in the material and drag on light patches.
+
+        Args:
+            state: The state at its start.
+            parts: From :func:`parts_of`; with it, what is known is not measured.
+        """
+        if self.outlook is not None and self.outlook.holds(state, parts):
+            cells, rate, blowing = self.outlook.needs
+        else:
+            winds = None if self.idle else self._winds(self.wind_force, state)
+            cells, rate, blowing = needs_of(self, state, winds).tolist()
+        if self.lenient and not all(map(math.isfinite, (cells, rate, blowing))):
+            return self._steps  # of the frame before, as one of the scenes has diverged
+        steps = self.solver.substeps(state, self.frame_dt, cells)
+        if not (math.isfinite(rate) and blowing < MAX_WIND):
+            cause = f"the wind of {blowing:.3g} m/s, or its drag, is NaN or infinite or beyond {MAX_WIND:g} m/s"
+            self.give_up(state, cause, "check the flow and the modulations of the wind")
+        explicit = self.setup.aero.drag_step != "semi_implicit"
+        self._steps = max(steps, int(rate * self.frame_dt) + 1) if explicit else steps
+        return self._steps
+
+    def _winds(self, force: WindForce, state: State) -> Tensor:
+        """Velocities of the air in the frame that starts with a state [m/s], shape (5, ...)."""
+        return force.samples(state, self.frame_dt / 4, 5)
+
+    def roll(self, state: State, steps: int, margin: int = 0) -> tuple[State, Tensor]:
+        """The state a frame later, and the largest Courant number on the way; nothing is checked.
+
+        Args:
+            state: The state now.
+            steps: Number of substeps.
+            margin: Extra cells around the grid of ``updated``.
+        """
+        progress, fitted = self.progress, self.solver.fit_grid(state, self.frame_dt, margin)
+        watch = None if progress is None else lambda done: progress.substep(done, steps)
+        # the end of a frame is checked with its measurements, as each check makes the host wait
+        return self.solver.watched_rollout(
+            fitted, self.frame_dt / steps, steps, self.forces, CFL_SAMPLES, watch, check=False
+        )
+
+
+class Launched:
+    """A frame whose work is passed to the device; the host waits for it in :meth:`finish`, once.
+
+    Args:
+        stepper: The stepper.
+        before: The state at the start of the frame.
+        steps: Number of substeps; those that it needs if None.
+    """
+
+    def __init__(self, stepper: Stepper, before: State, steps: int | None = None) -> None:
+        self._stepper, self._before = stepper, before
+        self._error: Exception | None = None
+        try:
+            with self._explained():
+                self._parts = parts_of(stepper)
+                self.steps = stepper.substeps(before, self._parts) if steps is None else steps
+                self._end, self._measurement = self._launch(0)
+        except Exception as error:  # `finish` raises it
+            self._error = error
+
+    def finish(self) -> tuple[State, FrameDiagnostics]:
+        """Wait, and repeat the frame where its substep was too long or its grid too small.
+
+        Returns:
+            The state at the end of the frame, and its diagnostics.
+
+        Raises:
+            SimulationDiverged: If the simulation diverged in the frame.
+        """
+        if self._error is not None:
+            raise self._error
+        stepper, solver, margin = self._stepper, self._stepper.solver, 0
+        with stepper.turn, self._explained():
+            for retry in range(MAX_RETRIES + 1):
+                cfl, outrun = self._measurement.cfl, self._measurement.outran
+                too_long = solver.substep is None and not cfl <= max(CFL_LIMIT, 1.25 * solver.cfl)
+                too_long = too_long and (math.isfinite(cfl) or not stepper.lenient)
+                if retry == MAX_RETRIES or not (outrun or too_long):
+                    break
+                if outrun:
+                    margin = 4 * max(margin, 4)
+                if too_long:
+                    growth = cfl / solver.cfl if math.isfinite(cfl) else 4.0
+                    self.steps = int(self.steps * min(growth * 1.1, 4.0)) + 1
+                self._end, self._measurement = self._launch(margin)
+        found = self._measurement.read(check=not stepper.lenient)
+        if not (cfl <= MAX_CFL or stepper.lenient):
+            cause = f"the Courant number of the frame is {cfl:.3g}, and above {MAX_CFL:g} no substep is stable"
+            stepper.give_up(self._end, cause)
+        if self._measurement.more:
+            stepper.outlook = Outlook(self._end, self._measurement.more, self._parts)
+        return self._end, found
+
+    def _launch(self, margin: int) -> tuple[State, Measurement]:
+        stepper, before, steps = self._stepper, self._before, self.steps
+        if steps > stepper.most_substeps:
+            cause = f"a frame would take {steps:,} substeps, more than the limit of {stepper.most_substeps:,}"
+            stepper.give_up(before, cause, "weaken the wind or the boundary that drives the particle")
+        end, courant = stepper.roll(before, steps, margin)
+        return end, stepper.measured(end, steps, courant, before, self._parts)
+
+    @contextmanager
+    def _explained(self) -> Iterator[None]:
+        """Turn errors of this package into SimulationDiverged.
+
+        They are: a fixed substep that became too long, a grid that grew beyond its limit, a position that is NaN.
+        """
+        try:
+            yield
+        except (FloatingPointError, ValueError) as error:
+            if not _raised_here(error):  # by a custom wind, force or boundary
+                raise
+            self._stepper.give_up(self._before, str(error).rstrip("."))
+
+
+class Outlook:
+    """The numbers that decide how many substeps the next frame takes, read with the measurements of this one.
+
+    Args:
+        state: The state at the end of the frame.
+        needs: The numbers of :func:`needs_of`.
+        parts: The result of :func:`parts_of` when they were measured.
+    """
+
+    def __init__(self, state: State, needs: list[float], parts: tuple[object, ...] | None) -> None:
+        self.needs, self._parts = needs, parts
+        self._read = [weakref.ref(tensor) for tensor in _read(state)]
+
+    def holds(self, state: State, parts: tuple[object, ...] | None) -> bool:
+        """True if the frame starts from this state and nothing changed since; ``parts`` is the result of now."""
+        same = all(known() is tensor for known, tensor in zip(self._read, _read(state), strict=False))
+        return same and self._parts is not None and self._parts == parts
+
+
+def _read(state: State) -> list[Tensor]:
+    """Return the fields of a state that the needs depend on."""
+    found = (state.F_elastic, state.internal, state.velocity, state.time)
+    return [tensor for tensor in found if tensor is not None]
+
+
+def parts_of(stepper: Stepper) -> tuple[object, ...] | None:
+    """Return the key of all that the needs depend on besides the state; None if changes cannot be detected.
+
+    That is so for tensors of inference mode, and for tensors on another device than the simulation.
+    """
+    wind = stepper.wind_force
+    tensors = tensors_in([wind])
+    if any(tensor.is_inference() or tensor.device != stepper.device for tensor in tensors):
+        return None
+    made = {id(tensor) for tensor in wind.refreshed()}  # from the state, in every frame
+    versions = tuple(tensor._version for tensor in tensors if id(tensor) not in made)
+    return (stepper.solver.identity, fingerprint([wind]), versions)
+
+
+def needs_of(stepper: Stepper, state: State, winds: Tensor | None) -> Tensor:
+    """Cells that the fastest wave crosses per second; rate of the drag [1/s] and speed of the wind [m/s]; float64.
+
+    Args:
+        stepper: The stepper.
+        state: The state at the start of a frame.
+        winds: Air velocities during the frame [m/s], shape (K, ...), from ``WindForce.samples``; None if the wind has
+            no effect.
+    """
+    cells = stepper.solver.cells_per_second(state).double()
+    if winds is None:
+        return torch.stack([cells, *cells.new_zeros(2)])
+    wind = torch.linalg.vector_norm(winds, dim=-1).amax().to(state.velocity.dtype)
+    speed = wind + torch.linalg.vector_norm(state.velocity, dim=-1)
+    fastest = stepper.setup.aero.rate(speed, stepper.wind_force.area, stepper.solver.points.mass).amax()
+    return torch.stack([cells, fastest.double(), wind.double()])
+
+
+def why_not_batched(setup: Setup) -> str | None:
+    """Return the reason why a scene cannot be one of a batch; None if it can."""
+    wind = setup.wind
+    if isinstance(wind, WindField) and any(isinstance(effect, Shelter) for effect in wind.effects):
+        return "the wind has a Shelter, which depends on the motion of one scene; remove it from `wind.effects`"
+    if setup.scene.surface_places is not None:
+        return "the object touches itself or an obstacle; set `contact` to null, and remove the obstacles"
+    return None
+
+
+def _wind_on(setups: Sequence[Setup], one: WindForce) -> WindForce:
+    """The winds of a batch on the patches of its scenes, computed together where they can be; ``one`` is the first."""
+    first, winds = setups[0], [setup.wind for setup in setups]
+    if one.sums is None and why_apart(winds) is None:
+        joined = WindBatch([wind for wind in winds if isinstance(wind, WindField)])
+        return WindForce(first.aero, joined, one.normal, one.area)
+    return WindForce(first.aero, winds, _repeated(first.scene.patches, len(winds)))
+
+
+def _repeated(patches: Patches, count: int) -> Patches:
+    """The patches of several scenes, one after the other."""
+    shift = patches.count * torch.arange(count, device=patches.point.device)
+    point = (patches.point + shift[:, None]).reshape(-1)
+    return Patches(patches.normal.repeat(count, 1), patches.area.repeat(count), point, patches.count * count)
+
+
+def _raised_here(error: BaseException) -> bool:
+    """True if an error was raised by this package, and not by code that it called."""
+    place = error.__traceback__
+    while place is not None and place.tb_next is not None:
+        place = place.tb_next
+    return place is not None and str(place.tb_frame.f_globals.get("__name__")).startswith("gaussian_swaying.")
+
+
+__all__ = ["Launched", "Outlook", "Stepper", "needs_of", "parts_of", "why_not_batched"]
