@@ -16,6 +16,7 @@ from gaussian_swaying.aero.lookup import trilinear
 from gaussian_swaying.aero.spectra import SPECTRA, resolved_share
 from gaussian_swaying.aero.turbulence_box import sheared_variances, turbulence_box
 from gaussian_swaying.geometry.frame import SimFrame
+from gaussian_swaying.mpm.twins import Numbers, Twin
 
 
 def box_axes(flow: Tensor, sides: Sequence[float], tilted: bool) -> Tensor:
@@ -133,6 +134,27 @@ class CarriedField(WindEffect):
         strength = self.strength(moment.flow)
         return velocity.to(found) + (strength.to(found) if isinstance(strength, Tensor) else strength) * found
 
+    def twin(self) -> Twin:
+        """See :class:`~gaussian_swaying.mpm.twins.Twin`."""
+        from gaussian_swaying.aero.effects_triton import carried_field
+
+        def now(moment: Moment) -> Tensor:
+            place, strength = self.offset(moment.carried), self.strength(moment.flow)
+            return torch.cat([place, torch.zeros_like(place[:, :1]) + strength], dim=-1)
+
+        def numbers() -> Tensor:
+            sizes = self.sides.new_tensor(self.table.shape[:3])
+            return torch.cat([(self.axes / self.step[:, None]).reshape(-1), self.axes.T.reshape(-1), sizes])
+
+        return Twin(
+            carried_field,
+            options=tuple(map(bool, self.wraps)),
+            numbers=Numbers(21, numbers),
+            per_substep=Numbers(4, now),
+            table=Numbers(self.table.numel(), lambda: self.table),
+            sources=(self,),
+        )
+
 
 class Turbulence(CarriedField):
     """Turbulence in space and time: a box without divergence that the mean wind carries along.
@@ -161,6 +183,7 @@ class Turbulence(CarriedField):
     """
 
     recordable = True
+    twin = CarriedField.twin
 
     def __init__(
         self,

@@ -14,16 +14,17 @@ from torch import Tensor, nn
 from gaussian_swaying._checks import check_positive, check_vector
 from gaussian_swaying._graphs import Recordable
 from gaussian_swaying.geometry.frame import SimFrame
+from gaussian_swaying.mpm.twins import Numbers, Twin, Twinned
 
 
 @dataclass(frozen=True)
 class Moment:
-    """The wind at one time, as the effects get it.
+    """The wind at one time, as the effects get it; their twins get n times at once.
 
     Attributes:
-        time: The time [s], scalar float64 tensor.
-        flow: Flow without modulations and effects [m/s], shape (3,), float64.
-        carried: Displacement of the air by that flow since time zero [m], shape (3,), float64.
+        time: The time [s], scalar float64 tensor; of a twin, shape (n,).
+        flow: Flow without modulations and effects [m/s], shape (3,), float64; of a twin, (n, 3).
+        carried: Displacement of the air by that flow since time zero [m]; likewise.
     """
 
     time: Tensor
@@ -31,12 +32,13 @@ class Moment:
     carried: Tensor
 
 
-class WindEffect(Recordable, nn.Module, ABC):
+class WindEffect(Recordable, Twinned, nn.Module, ABC):
     """Base of effects, which change the wind from place to place.
 
     A subclass has a ``forward``, and sets ``recordable = True`` if that can be recorded in a CUDA graph (see
-    ``Force``). Places are in metres, z up, from the centre of the object at rest; in a configuration they are in scene
-    units, and :meth:`in_frame` converts them.
+    ``Force``). If all effects of a wind have a ``twin`` (:mod:`~gaussian_swaying.mpm.twins`), kernels compute it.
+    Places are in metres, z up, from the centre of the object at rest; in a configuration they are in scene units, and
+    :meth:`in_frame` converts them.
     """
 
     @abstractmethod
@@ -125,6 +127,13 @@ class LogProfile(Profile):
         """See :class:`Profile`."""
         return (above.clamp(min=self.roughness) / self.roughness).log() / math.log(self.height / self.roughness)
 
+    def twin(self) -> Twin:
+        """See :class:`~gaussian_swaying.mpm.twins.Twin`."""
+        from gaussian_swaying.aero.effects_triton import log_profile
+
+        scale = 1 / math.log(self.height / self.roughness)
+        return Twin(log_profile, numbers=Numbers(3, lambda: [self.ground[2], self.roughness, scale]), sources=(self,))
+
 
 class PowerProfile(Profile):
     r"""The power law :math:`u(z) = u(h) (z / h)^a`, zero below the ground.
@@ -148,3 +157,10 @@ class PowerProfile(Profile):
     def factor(self, above: Tensor) -> Tensor:
         """See :class:`Profile`."""
         return (above.clamp(min=0.0) / self.height).pow(self.exponent)
+
+    def twin(self) -> Twin:
+        """See :class:`~gaussian_swaying.mpm.twins.Twin`."""
+        from gaussian_swaying.aero.effects_triton import power_profile
+
+        numbers = Numbers(3, lambda: [self.ground[2], 1 / self.height, self.exponent])
+        return Twin(power_profile, numbers=numbers, sources=(self,))

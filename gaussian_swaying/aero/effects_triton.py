@@ -1,18 +1,9 @@
-"""Effects of the wind as Triton functions, for the fused substep.
-
-The references are in ``aero.effects``, ``carried``, ``shelter`` and ``obstacles``; ``aero.effects_twin`` says what they
-read.
-"""
+"""Effects of the wind as Triton functions; the references are in ``aero.effects``, ``carried`` and ``shelter``."""
 
 import triton
 import triton.language as tl
 
-from gaussian_swaying.aero.force_triton import force_on_group, force_on_patch
-from gaussian_swaying.aero.obstacles_triton import past_cylinder, past_ellipsoid, past_sphere
-
-HEADER = tl.constexpr(32)  # numbers of an effect
-LOG, POWER, CARRIED, SHELTER = tl.constexpr(0), tl.constexpr(1), tl.constexpr(2), tl.constexpr(3)
-SPHERE, CYLINDER = tl.constexpr(4), tl.constexpr(5)
+from gaussian_swaying.geometry.linalg_triton import chosen, matvec
 
 
 @triton.jit
@@ -38,19 +29,16 @@ def _corners(x, n, WRAPS: tl.constexpr):
 
 
 @triton.jit
-def _look_up(table, head, place, X: tl.constexpr, Y: tl.constexpr, Z: tl.constexpr, WIDTH: tl.constexpr):
-    """Three values (or one and two zeros, for a WIDTH of one) of a table; ``head`` contains its three sizes.
+def _look_up(table, sizes, place, X: tl.constexpr, Y: tl.constexpr, Z: tl.constexpr, WIDTH: tl.constexpr):
+    """Three values (or one and two zeros, for a WIDTH of one) of a table.
 
     X, Y, Z: whether it repeats along each axis.
     """
-    nx = tl.load(head)
-    ny = tl.load(head + 1)
-    nz = tl.load(head + 2)
-    x0, x1, fx = _corners(place[0], nx, X)
-    y0, y1, fy = _corners(place[1], ny, Y)
-    z0, z1, fz = _corners(place[2], nz, Z)
-    my = ny.to(tl.int32)
-    mz = nz.to(tl.int32)
+    x0, x1, fx = _corners(place[0], sizes[0], X)
+    y0, y1, fy = _corners(place[1], sizes[1], Y)
+    z0, z1, fz = _corners(place[2], sizes[2], Z)
+    my = sizes[1].to(tl.int32)
+    mz = sizes[2].to(tl.int32)
     zero = fx * 0
     a, b, c = zero, zero, zero
     for i in tl.static_range(2):
@@ -80,72 +68,39 @@ def _look_up(table, head, place, X: tl.constexpr, Y: tl.constexpr, Z: tl.constex
 
 
 @triton.jit
-def _turned(head, x):
-    """A matrix of nine numbers times a vector."""
-    return (
-        tl.load(head) * x[0] + tl.load(head + 1) * x[1] + tl.load(head + 2) * x[2],
-        tl.load(head + 3) * x[0] + tl.load(head + 4) * x[1] + tl.load(head + 5) * x[2],
-        tl.load(head + 6) * x[0] + tl.load(head + 7) * x[1] + tl.load(head + 8) * x[2],
-    )
+def log_profile(v, x, numbers, now, table, OPTIONS: tl.constexpr):
+    """``LogProfile``; ``numbers``: height of the ground, roughness, one over the logarithm."""
+    above = tl.maximum(x[2] - numbers[0], numbers[1])
+    factor = tl.log(above / numbers[1]) * numbers[2]
+    return v[0] * factor, v[1] * factor, v[2] * factor
 
 
 @triton.jit
-def shaped_wind(position, vector, space, OPTIONS: tl.constexpr):
-    """Velocity of the air at some places: twin of ``WindField.shaped``.
+def power_profile(v, x, numbers, now, table, OPTIONS: tl.constexpr):
+    """``PowerProfile``; ``numbers``: height of the ground, one over the height, exponent."""
+    above = (x[2] - numbers[0]) * numbers[1]
+    factor = tl.exp(numbers[2] * tl.log(tl.where(above > 0, above, 1.0)))
+    factor = tl.where(above > 0, factor, 0.0)
+    return v[0] * factor, v[1] * factor, v[2] * factor
 
-    ``vector``: velocity without effects (3), place of the object's centre in a carried field [cells] (3), its strength,
-    the mean flow (3), and the phases of the vortex streets (one each).
 
-    ``OPTIONS`` after four others: number of effects, and five for each: its kind, where its table starts in ``space``,
-    and whether that repeats along each axis; of an obstacle, whether it has a wake, and where in ``vector`` its street
-    is, or 0.
+@triton.jit
+def carried_field(v, x, numbers, now, table, OPTIONS: tl.constexpr):
+    """``CarriedField``; ``numbers``: from places to cells (9), from its axes (9), its sizes (3).
+
+    ``now``: place of the object's centre [cells] (3), strength. ``OPTIONS``: whether it repeats along each axis.
     """
-    zero = position[0] * 0
-    v = (tl.load(vector) + zero, tl.load(vector + 1) + zero, tl.load(vector + 2) + zero)
-    EFFECTS: tl.constexpr = OPTIONS[4]
-    for m in tl.static_range(EFFECTS):
-        head = space + HEADER * m
-        if OPTIONS[5 + 5 * m] == LOG:
-            above = tl.maximum(position[2] - tl.load(head), tl.load(head + 1))
-            factor = tl.log(above / tl.load(head + 1)) * tl.load(head + 2)
-            v = (v[0] * factor, v[1] * factor, v[2] * factor)
-        elif OPTIONS[5 + 5 * m] == POWER:
-            above = (position[2] - tl.load(head)) * tl.load(head + 1)
-            factor = tl.exp(tl.load(head + 2) * tl.log(tl.where(above > 0, above, 1.0)))
-            factor = tl.where(above > 0, factor, 0.0)
-            v = (v[0] * factor, v[1] * factor, v[2] * factor)
-        elif OPTIONS[5 + 5 * m] == CARRIED:
-            p = _turned(head, position)
-            p = (p[0] + tl.load(vector + 3), p[1] + tl.load(vector + 4), p[2] + tl.load(vector + 5))
-            found = _look_up(
-                space + OPTIONS[6 + 5 * m], head + 18, p, OPTIONS[7 + 5 * m], OPTIONS[8 + 5 * m], OPTIONS[9 + 5 * m], 3
-            )
-            strength = tl.load(vector + 6)
-            found = _turned(head + 9, found)
-            v = (v[0] + strength * found[0], v[1] + strength * found[1], v[2] + strength * found[2])
-        elif OPTIONS[5 + 5 * m] == SPHERE:
-            v = past_sphere(v, position, head, vector, OPTIONS[7 + 5 * m])
-        elif OPTIONS[5 + 5 * m] == CYLINDER:
-            v = past_cylinder(v, position, head, vector, OPTIONS[7 + 5 * m], OPTIONS[8 + 5 * m])
-        elif OPTIONS[5 + 5 * m] == SHELTER:
-            p = _turned(head, position)
-            p = (p[0] + tl.load(head + 9), p[1] + tl.load(head + 10), p[2] + tl.load(head + 11))
-            factor, _b, _c = _look_up(space + OPTIONS[6 + 5 * m], head + 18, p, False, False, False, 1)
-            v = (v[0] * factor, v[1] * factor, v[2] * factor)
-        else:
-            v = past_ellipsoid(v, position, head, vector, OPTIONS[7 + 5 * m])
-    return v
+    p = matvec(numbers, x)
+    p = (p[0] + now[0], p[1] + now[1], p[2] + now[2])
+    found = _look_up(table, chosen(numbers, 18, 3), p, OPTIONS[0], OPTIONS[1], OPTIONS[2], 3)
+    found = matvec(chosen(numbers, 9, 9), found)
+    return v[0] + now[3] * found[0], v[1] + now[3] * found[1], v[2] + now[3] * found[2]
 
 
 @triton.jit
-def shaped_wind_force(F, velocity, position, patch, vector, numbers, space, OPTIONS: tl.constexpr):
-    """As ``force_triton.wind_force``, in a wind with effects."""
-    air = shaped_wind(position, vector, space, OPTIONS)
-    return force_on_patch(F, velocity, patch, air, numbers, OPTIONS)
-
-
-@triton.jit
-def shaped_wind_on_groups(F, velocity, position, place, vector, numbers, space, OPTIONS: tl.constexpr):
-    """As ``force_triton.wind_on_groups``, in a wind with effects."""
-    air = shaped_wind(position, vector, space, OPTIONS)
-    return force_on_group(F, velocity, place, air, numbers, OPTIONS)
+def sheltered(v, x, numbers, now, table, OPTIONS: tl.constexpr):
+    """``Shelter``; ``numbers``: from places to cells (9), shift (3), sizes (3)."""
+    p = matvec(numbers, x)
+    p = (p[0] + numbers[9], p[1] + numbers[10], p[2] + numbers[11])
+    factor, _b, _c = _look_up(table, chosen(numbers, 12, 3), p, False, False, False, 1)
+    return v[0] * factor, v[1] * factor, v[2] * factor

@@ -88,8 +88,8 @@ def force_adjoint(
 
 
 @triton.jit
-def wind_force_adjoint(F, velocity, patch, wind, numbers, a, OPTIONS: tl.constexpr):
-    """Gradients of a . f of ``force_triton.wind_force`` by F, by the velocity, by the wind and by the coefficients."""
+def wind_force_adjoint(F, velocity, patch, numbers, air, table, a, OPTIONS: tl.constexpr):
+    """Gradients of a . f of ``force_triton.wind_force`` by F, velocity, wind and coefficients; without effects."""
     rest = (patch[0], patch[1], patch[2])
     vector, det = area_vector(F, rest)
     size = tl.sqrt(dot3(vector, vector))
@@ -100,16 +100,12 @@ def wind_force_adjoint(F, velocity, patch, wind, numbers, a, OPTIONS: tl.constex
         tl.where(flat, rest[1], vector[1] * scale),
         tl.where(flat, rest[2], vector[2] * scale),
     )
-    widest = tl.load(numbers + 4)
-    air = (tl.load(wind), tl.load(wind + 1), tl.load(wind + 2))
+    drag, friction, lift, half_density, widest = numbers
     relative = (air[0] - velocity[0], air[1] - velocity[1], air[2] - velocity[2])
-    drag = tl.load(numbers)
-    friction = tl.load(numbers + 1)
-    lift = tl.load(numbers + 2)
     by_r, by_air, by_n, parts, whole = force_adjoint(
         relative, air, n, a, drag, friction, lift, OPTIONS[0], OPTIONS[1], OPTIONS[2]
     )
-    half = tl.load(numbers + 3) * patch[3]
+    half = half_density * patch[3]
     area = half * tl.minimum(size, widest)
     # the unit normal and the area both come from the area vector
     growth = tl.where(size < widest, half * whole, 0.0) * tl.where(det < 0, -1.0, 1.0)
@@ -129,32 +125,27 @@ def wind_force_adjoint(F, velocity, patch, wind, numbers, a, OPTIONS: tl.constex
 
 
 @triton.jit
-def wind_on_groups_adjoint(F, velocity, place, wind, numbers, a, OPTIONS: tl.constexpr):
+def wind_on_groups_adjoint(F, velocity, place, numbers, air, table, a, OPTIONS: tl.constexpr):
     """As :func:`wind_force_adjoint`, for ``force_triton.wind_on_groups`` without a unit tangent.
 
     The names are those of ``aero.patches.grouped_force``; the sum over the sides that the patches show is constant.
     """
-    first = 8 + 4 * place[0].to(tl.int32)
+    first = 4 * place[0].to(tl.int32)
     count = place[1].to(tl.int32)
     real = count > 0
-    air = (tl.load(wind), tl.load(wind + 1), tl.load(wind + 2))
     r = (air[0] - velocity[0], air[1] - velocity[1], air[2] - velocity[2])
-    drag = tl.load(numbers)
-    friction = tl.load(numbers + 1)
-    lift = tl.load(numbers + 2)
-    half = tl.load(numbers + 3)
-    widest = tl.load(numbers + 4)
+    drag, friction, lift, half, widest = numbers
     speed = tl.sqrt(dot3(r, r))
     inverse = 1.0 / tl.maximum(speed, 1e-30)
     square = speed * speed
     c = cofactor(F)
     w = matvec(transpose(c), r)
-    t0 = tl.load(numbers + first, real, 0.0)
-    t1 = tl.load(numbers + first + 1, real, 0.0)
-    t2 = tl.load(numbers + first + 2, real, 0.0)
-    t3 = tl.load(numbers + first + 3, real, 0.0)
-    t4 = tl.load(numbers + first + 4, real, 0.0)
-    t5 = tl.load(numbers + first + 5, real, 0.0)
+    t0 = tl.load(table + first, real, 0.0)
+    t1 = tl.load(table + first + 1, real, 0.0)
+    t2 = tl.load(table + first + 2, real, 0.0)
+    t3 = tl.load(table + first + 3, real, 0.0)
+    t4 = tl.load(table + first + 4, real, 0.0)
+    t5 = tl.load(table + first + 5, real, 0.0)
     tensor = (t0, t1, t2, t1, t3, t4, t2, t4, t5)
     rest = t0 + t3 + t5
     zero = rest * 0
@@ -162,10 +153,10 @@ def wind_on_groups_adjoint(F, velocity, place, wind, numbers, a, OPTIONS: tl.con
     u = (zero, zero, zero)
     for k in range(0, tl.max(count), 4):  # four rows at once
         row = first + 8 + 4 * k
-        b0 = load3(numbers, 1, row, k < count)
-        b1 = load3(numbers, 1, row + 4, k + 1 < count)
-        b2 = load3(numbers, 1, row + 8, k + 2 < count)
-        b3 = load3(numbers, 1, row + 12, k + 3 < count)
+        b0 = load3(table, 1, row, k < count)
+        b1 = load3(table, 1, row + 4, k + 1 < count)
+        b2 = load3(table, 1, row + 8, k + 2 < count)
+        b3 = load3(table, 1, row + 12, k + 3 < count)
         s, u = add_direction(s, u, b0, w, k < count, False)
         s, u = add_direction(s, u, b1, w, k + 1 < count, False)
         s, u = add_direction(s, u, b2, w, k + 2 < count, False)

@@ -3,7 +3,7 @@
 import triton
 import triton.language as tl
 
-from gaussian_swaying.geometry.linalg_triton import cofactor, cross3, dot3, load3, matvec, transpose
+from gaussian_swaying.geometry.linalg_triton import chosen, cofactor, cross3, dot3, load3, matvec, read, transpose
 from gaussian_swaying.geometry.patches_triton import deform_patch
 
 
@@ -49,24 +49,31 @@ def aero_force(
 
 
 @triton.jit
-def wind_force(F, velocity, patch, wind, numbers, OPTIONS: tl.constexpr):
-    """Triton twin of ``WindForce``: force on patches (normal and area at rest) and their resistance [kg/s].
-
-    ``numbers``: C_D, C_F, C_L, half the density of the air, largest ratio of areas. ``OPTIONS``: place of the law in
-    ``force.LAWS``, lift in the plane of flow and normal, unit tangent, semi-implicit drag.
-    """
-    return force_on_patch(F, velocity, patch, (tl.load(wind), tl.load(wind + 1), tl.load(wind + 2)), numbers, OPTIONS)
+def shaped_wind(position, now, table, EFFECTS: tl.constexpr):
+    """``WindField.shaped``: the wind with its effects, of which ``now`` has the velocity without them first."""
+    v = (now[0], now[1], now[2])
+    if len(EFFECTS.functions) > 0:
+        zero = position[0] * 0
+        v = (v[0] + zero, v[1] + zero, v[2] + zero)
+    for m in tl.static_range(len(EFFECTS.functions)):
+        numbers = read(table, EFFECTS.numbers[m][0], EFFECTS.numbers[m][1])
+        own = chosen(now, 3 + EFFECTS.per_substep[m][0], EFFECTS.per_substep[m][1])
+        v = EFFECTS.functions[m](v, position, numbers, own, table + EFFECTS.tables[m], EFFECTS.options[m])
+    return v
 
 
 @triton.jit
-def force_on_patch(F, velocity, patch, air, numbers, OPTIONS: tl.constexpr):
-    """As :func:`wind_force`, with the velocity of the air as three numbers."""
-    normal, area = deform_patch(F, (patch[0], patch[1], patch[2]), patch[3], tl.load(numbers + 4))
+def wind_force(F, velocity, position, patch, numbers, now, table, OPTIONS: tl.constexpr):
+    """``WindForce`` on patches (normal and area at rest): force and resistance [kg/s].
+
+    ``numbers``: C_D, C_F, C_L, half the density of the air, largest ratio of areas. ``now``: velocity without effects,
+    and the numbers of each effect. ``OPTIONS``: place of the law in ``force.LAWS``, lift in the plane of flow and
+    normal, unit tangent, semi-implicit drag, effects.
+    """
+    air = shaped_wind(position, now, table, OPTIONS[4])
+    normal, area = deform_patch(F, (patch[0], patch[1], patch[2]), patch[3], numbers[4])
     relative = (air[0] - velocity[0], air[1] - velocity[1], air[2] - velocity[2])
-    drag = tl.load(numbers)
-    friction = tl.load(numbers + 1)
-    lift = tl.load(numbers + 2)
-    half_density = tl.load(numbers + 3)
+    drag, friction, lift, half_density = numbers[0], numbers[1], numbers[2], numbers[3]
     force, speed, blow = aero_force(
         relative, air, normal, area, drag, friction, lift, half_density, OPTIONS[0], OPTIONS[1], OPTIONS[2]
     )
@@ -96,37 +103,28 @@ def add_direction(s, u, b, w, known, UNIT: tl.constexpr):
 
 
 @triton.jit
-def wind_on_groups(F, velocity, place, wind, numbers, OPTIONS: tl.constexpr):
-    """Triton twin of ``WindForce`` on groups of patches; the reference is ``aero.patches.grouped_force``.
+def wind_on_groups(F, velocity, position, place, numbers, now, table, OPTIONS: tl.constexpr):
+    """``WindForce`` on groups of patches; the reference is ``aero.patches.grouped_force``.
 
-    ``place``: first row in the table of ``PatchSums`` and number of vectors there. ``numbers`` and ``OPTIONS`` as in
-    :func:`wind_force`, and the table after eight numbers.
+    ``place``: first row in the table of ``PatchSums``, which follows that of the effects, and number of vectors there.
+    The rest is as in :func:`wind_force`.
     """
-    return force_on_group(F, velocity, place, (tl.load(wind), tl.load(wind + 1), tl.load(wind + 2)), numbers, OPTIONS)
-
-
-@triton.jit
-def force_on_group(F, velocity, place, air, numbers, OPTIONS: tl.constexpr):
-    """As :func:`wind_on_groups`, with the velocity of the air as three numbers."""
-    first = 8 + 4 * place[0].to(tl.int32)
+    air = shaped_wind(position, now, table, OPTIONS[4])
+    first = OPTIONS[4].size + 4 * place[0].to(tl.int32)
     count = place[1].to(tl.int32)
     real = count > 0
     relative = (air[0] - velocity[0], air[1] - velocity[1], air[2] - velocity[2])
-    drag = tl.load(numbers)
-    friction = tl.load(numbers + 1)
-    lift = tl.load(numbers + 2)
-    half_density = tl.load(numbers + 3)
-    widest = tl.load(numbers + 4)
+    drag, friction, lift, half_density, widest = numbers
     speed = tl.sqrt(dot3(relative, relative))
     blow = tl.sqrt(dot3(air, air)) if OPTIONS[0] == 2 else speed
     c = cofactor(F)
     w = matvec(transpose(c), relative)
-    t0 = tl.load(numbers + first, real, 0.0)
-    t1 = tl.load(numbers + first + 1, real, 0.0)
-    t2 = tl.load(numbers + first + 2, real, 0.0)
-    t3 = tl.load(numbers + first + 3, real, 0.0)
-    t4 = tl.load(numbers + first + 4, real, 0.0)
-    t5 = tl.load(numbers + first + 5, real, 0.0)
+    t0 = tl.load(table + first, real, 0.0)
+    t1 = tl.load(table + first + 1, real, 0.0)
+    t2 = tl.load(table + first + 2, real, 0.0)
+    t3 = tl.load(table + first + 3, real, 0.0)
+    t4 = tl.load(table + first + 4, real, 0.0)
+    t5 = tl.load(table + first + 5, real, 0.0)
     tensor = (t0, t1, t2, t1, t3, t4, t2, t4, t5)
     rest = t0 + t3 + t5
     r0 = matvec(tensor, (c[0], c[1], c[2]))
@@ -143,10 +141,10 @@ def force_on_group(F, velocity, place, air, numbers, OPTIONS: tl.constexpr):
     u = (zero, zero, zero)
     for k in range(0, tl.max(count), 4):  # four rows at once
         row = first + 8 + 4 * k
-        b0 = load3(numbers, 1, row, k < count)
-        b1 = load3(numbers, 1, row + 4, k + 1 < count)
-        b2 = load3(numbers, 1, row + 8, k + 2 < count)
-        b3 = load3(numbers, 1, row + 12, k + 3 < count)
+        b0 = load3(table, 1, row, k < count)
+        b1 = load3(table, 1, row + 4, k + 1 < count)
+        b2 = load3(table, 1, row + 8, k + 2 < count)
+        b3 = load3(table, 1, row + 12, k + 3 < count)
         s, u = add_direction(s, u, b0, w, k < count, OPTIONS[2])
         s, u = add_direction(s, u, b1, w, k + 1 < count, OPTIONS[2])
         s, u = add_direction(s, u, b2, w, k + 2 < count, OPTIONS[2])

@@ -15,12 +15,15 @@ from gaussian_swaying.aero.effects import Moment, WindEffect, placed
 from gaussian_swaying.aero.obstacle_flow import (
     cylinder_flow,
     ellipsoid_flow,
+    ellipsoid_strength,
     plane_wake,
     round_wake,
     sphere_flow,
     vortex_street,
+    wake_start,
 )
 from gaussian_swaying.geometry.frame import SimFrame
+from gaussian_swaying.mpm.twins import Numbers, Twin
 
 AnyObstacle = TypeVar("AnyObstacle", bound="Obstacle")
 
@@ -98,6 +101,19 @@ class SphereObstacle(Obstacle):
         """See :class:`Obstacle`."""
         return sphere_flow(velocity, place, self.radius)
 
+    def twin(self) -> Twin:
+        """See :class:`~gaussian_swaying.mpm.twins.Twin`."""
+        from gaussian_swaying.aero.obstacles_triton import past_sphere
+
+        numbers = (self.radius, self.drag, wake_start(self.drag))
+        return Twin(
+            past_sphere,
+            options=(self.drag > 0,),
+            numbers=Numbers(6, lambda: torch.cat([self.middle, self.middle.new_tensor(numbers)])),
+            per_substep=Numbers(3, lambda moment: moment.flow),
+            sources=(self,),
+        )
+
     def wake(self, place: Tensor, moment: Moment) -> tuple[Tensor, Tensor | None]:
         """See :class:`Obstacle`."""
         direction, _ = _direction(moment, place)
@@ -146,6 +162,22 @@ class CylinderObstacle(Obstacle):
     def around(self, velocity: Tensor, place: Tensor) -> Tensor:
         """See :class:`Obstacle`."""
         return cylinder_flow(velocity, place, self.axis.to(place.dtype), self.radius)
+
+    def twin(self) -> Twin:
+        """See :class:`~gaussian_swaying.mpm.twins.Twin`."""
+        from gaussian_swaying.aero.obstacles_triton import past_cylinder
+
+        def now(moment: Moment) -> Tensor:
+            return torch.cat([moment.flow, self.turns(moment.flow, moment.carried)[..., None]], dim=-1)
+
+        wake, numbers = self.drag > 0, (self.radius, self.drag, self.strouhal)
+        return Twin(
+            past_cylinder,
+            options=(wake, wake and self.street),
+            numbers=Numbers(9, lambda: torch.cat([self.middle, self.axis, self.middle.new_tensor(numbers)])),
+            per_substep=Numbers(4, now),
+            sources=(self,),
+        )
 
     def wake(self, place: Tensor, moment: Moment) -> tuple[Tensor, Tensor | None]:
         """See :class:`Obstacle`."""
@@ -218,6 +250,25 @@ class EllipsoidObstacle(Obstacle):
         """See :class:`Obstacle`."""
         axes = self.axes.to(place.dtype)
         return ellipsoid_flow(velocity @ axes.T, place @ axes.T, self.radii) @ axes
+
+    def twin(self) -> Twin:
+        """See :class:`~gaussian_swaying.mpm.twins.Twin`."""
+        from gaussian_swaying.aero.obstacles_triton import past_ellipsoid
+
+        def numbers() -> Tensor:
+            radii = tuple(map(float, self.radii))
+            size = max(radii)
+            shape = [*(radius / size for radius in radii), *ellipsoid_strength(radii)]
+            rest = self.middle.new_tensor([size, self.drag, wake_start(self.drag), *shape])
+            return torch.cat([self.middle, self.axes.reshape(-1), rest])
+
+        return Twin(
+            past_ellipsoid,
+            options=(self.drag > 0,),
+            numbers=Numbers(21, numbers),
+            per_substep=Numbers(3, lambda moment: moment.flow),
+            sources=(self,),
+        )
 
     def wake(self, place: Tensor, moment: Moment) -> tuple[Tensor, Tensor | None]:
         """See :class:`Obstacle`: the Gaussian is as wide, and as high, as the body is across the flow."""

@@ -1,14 +1,13 @@
 """Flow round bodies in the wind as Triton functions, for the fused substep.
 
-The references are ``aero.obstacle_flow`` and ``aero.obstacles``; ``aero.effects_twin`` says what they read. They
-compute in float32.
+The references are ``aero.obstacle_flow`` and ``aero.obstacles``. They compute in float32.
 """
 
 import triton
 import triton.language as tl
 
 from gaussian_swaying.aero import obstacle_flow
-from gaussian_swaying.geometry.linalg_triton import cross3, dot3, read3
+from gaussian_swaying.geometry.linalg_triton import chosen, cross3, dot3
 
 PI = tl.constexpr(3.141592653589793)
 STREET_SPEED = tl.constexpr(obstacle_flow.STREET_SPEED)
@@ -84,11 +83,13 @@ def vortex_street(behind, aside, width, turns, strouhal):
 
 
 @triton.jit
-def past_sphere(v, x, head, vector, WAKE: tl.constexpr):
-    """As ``SphereObstacle``; ``head``: middle (3), radius, drag, start of the wake."""
-    middle = read3(head)
-    radius = tl.load(head + 3)
-    p = (x[0] - middle[0], x[1] - middle[1], x[2] - middle[2])
+def past_sphere(v, x, numbers, now, table, OPTIONS: tl.constexpr):
+    """``SphereObstacle``; ``numbers``: middle (3), radius, drag, start of the wake; ``now``: the mean flow.
+
+    ``OPTIONS``: whether it has a wake.
+    """
+    radius = numbers[3]
+    p = (x[0] - numbers[0], x[1] - numbers[1], x[2] - numbers[2])
     square = dot3(p, p)
     outside = square >= radius * radius
     away = tl.maximum(square, radius * radius)
@@ -98,24 +99,23 @@ def past_sphere(v, x, head, vector, WAKE: tl.constexpr):
         v[0] + share * (v[0] - along * p[0]), v[1] + share * (v[1] - along * p[1]), v[2] + share * (v[2] - along * p[2])
     )  # fmt: skip
     v = _only(outside, v)
-    if WAKE:
-        direction, _speed = _direction(read3(vector + 7))
+    if OPTIONS[0]:
+        direction, _speed = _direction(now)
         behind = dot3(p, direction)
         aside = tl.sqrt(tl.maximum(square - behind * behind, 0.0))
-        v = _scaled(v, 1 - round_wake(behind, aside, 2 * radius, tl.load(head + 4), tl.load(head + 5)))
+        v = _scaled(v, 1 - round_wake(behind, aside, 2 * radius, numbers[4], numbers[5]))
     return v
 
 
 @triton.jit
-def past_cylinder(v, x, head, vector, WAKE: tl.constexpr, STREET: tl.constexpr):
-    """As ``CylinderObstacle``; ``head``: middle (3), radius, drag, axis (3), Strouhal number.
+def past_cylinder(v, x, numbers, now, table, OPTIONS: tl.constexpr):
+    """``CylinderObstacle``; ``numbers``: middle (3), axis (3), radius, drag, Strouhal number.
 
-    ``STREET`` is the index in ``vector`` of the phase of its vortex street, 0 without a street.
+    ``now``: the mean flow, and the phase of the vortex street. ``OPTIONS``: whether it has a wake, and a street.
     """
-    middle = read3(head)
-    radius = tl.load(head + 3)
-    axis = read3(head + 5)
-    p = (x[0] - middle[0], x[1] - middle[1], x[2] - middle[2])
+    radius = numbers[6]
+    axis = (numbers[3], numbers[4], numbers[5])
+    p = (x[0] - numbers[0], x[1] - numbers[1], x[2] - numbers[2])
     height = dot3(p, axis)
     away = (p[0] - height * axis[0], p[1] - height * axis[1], p[2] - height * axis[2])
     rising = dot3(v, axis)
@@ -131,17 +131,16 @@ def past_cylinder(v, x, head, vector, WAKE: tl.constexpr, STREET: tl.constexpr):
         v[2] + share * (across[2] - along * away[2]),
     )
     v = _only(outside, v)
-    if WAKE:
-        flow = read3(vector + 7)
-        rising = dot3(flow, axis)
-        flow = (flow[0] - rising * axis[0], flow[1] - rising * axis[1], flow[2] - rising * axis[2])
+    if OPTIONS[0]:
+        rising = dot3(now, axis)
+        flow = (now[0] - rising * axis[0], now[1] - rising * axis[1], now[2] - rising * axis[2])
         direction, speed = _direction(flow)
         left = cross3(axis, direction)
         behind = dot3(p, direction)
         aside = dot3(p, left)
-        v = _scaled(v, 1 - plane_wake(behind, aside, 2 * radius, tl.load(head + 4)))
-        if STREET > 0:
-            a, b = vortex_street(behind, aside, 2 * radius, tl.load(vector + STREET), tl.load(head + 8))
+        v = _scaled(v, 1 - plane_wake(behind, aside, 2 * radius, numbers[7]))
+        if OPTIONS[1]:
+            a, b = vortex_street(behind, aside, 2 * radius, now[3], numbers[8])
             swirls = behind * behind + aside * aside >= radius * radius
             a = tl.where(swirls, a, 0.0) * speed
             b = tl.where(swirls, b, 0.0) * speed
@@ -184,19 +183,18 @@ def _over(x, a, root):
 
 
 @triton.jit
-def past_ellipsoid(v, x, head, vector, WAKE: tl.constexpr):
-    """As ``EllipsoidObstacle``.
+def past_ellipsoid(v, x, numbers, now, table, OPTIONS: tl.constexpr):
+    """``EllipsoidObstacle``; ``now``: the mean flow; ``OPTIONS``: whether it has a wake.
 
-    ``head``: middle (3), size (its longest half axis), drag, start of the wake, axes (9), the half axes per ``size``
+    ``numbers``: middle (3), axes (9), size (its longest half axis), drag, start of the wake, the half axes per size
     (3), and ``ellipsoid_strength`` along each axis (3).
     """
-    middle = read3(head)
-    size = tl.load(head + 3)
-    first = read3(head + 6)
-    second = read3(head + 9)
-    third = read3(head + 12)
-    r = read3(head + 15)
-    p = (x[0] - middle[0], x[1] - middle[1], x[2] - middle[2])
+    first = chosen(numbers, 3, 3)
+    second = chosen(numbers, 6, 3)
+    third = chosen(numbers, 9, 3)
+    size = numbers[12]
+    r = chosen(numbers, 15, 3)
+    p = (x[0] - numbers[0], x[1] - numbers[1], x[2] - numbers[2])
     q = (dot3(first, p) / size, dot3(second, p) / size, dot3(third, p) / size)
     w = (dot3(first, v), dot3(second, v), dot3(third, v))
     a = (r[0] * r[0], r[1] * r[1], r[2] * r[2])
@@ -211,7 +209,7 @@ def past_ellipsoid(v, x, head, vector, WAKE: tl.constexpr):
     n = _over(q, a, root)
     volume = r[0] * r[1] * r[2]
     third_of = 2 / 3 * volume
-    strong = (tl.load(head + 18) * w[0], tl.load(head + 19) * w[1], tl.load(head + 20) * w[2])
+    strong = (numbers[18] * w[0], numbers[19] * w[1], numbers[20] * w[2])
     along = strong[0] * q[0] / s[0] + strong[1] * q[1] / s[1] + strong[2] * q[2] / s[2]
     steep = -2 * volume / tl.sqrt(s[0] * s[1] * s[2]) * along / dot3(n, n)
     w = (
@@ -225,8 +223,8 @@ def past_ellipsoid(v, x, head, vector, WAKE: tl.constexpr):
         first[1] * w[0] + second[1] * w[1] + third[1] * w[2],
         first[2] * w[0] + second[2] * w[1] + third[2] * w[2],
     )
-    if WAKE:
-        direction, _speed = _direction(read3(vector + 7))
+    if OPTIONS[0]:
+        direction, _speed = _direction(now)
         flat = tl.maximum(tl.sqrt(direction[0] * direction[0] + direction[1] * direction[1]), 1e-12)
         side = (-direction[1] / flat, direction[0] / flat, 0.0)
         up = cross3(direction, side)
@@ -237,7 +235,7 @@ def past_ellipsoid(v, x, head, vector, WAKE: tl.constexpr):
         above = dot3(p, up) * (mean / tl.maximum(high, 1e-12))
         behind = dot3(p, direction) / mean
         aside = tl.sqrt(left * left + above * above) / mean
-        v = _scaled(v, 1 - round_wake(behind, aside, 1.0, tl.load(head + 4), tl.load(head + 5)))
+        v = _scaled(v, 1 - round_wake(behind, aside, 1.0, numbers[13], numbers[14]))
     return v
 
 

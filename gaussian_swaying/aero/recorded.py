@@ -38,6 +38,7 @@ class FrozenWind(CarriedField):
     """
 
     recordable = True
+    twin = CarriedField.twin
 
     def __init__(
         self, path: str | os.PathLike[str], origin: Sequence[float] = (0.0, 0.0, 0.0), scale: float = 1.0

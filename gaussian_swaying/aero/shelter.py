@@ -11,6 +11,7 @@ from gaussian_swaying._checks import check_positive
 from gaussian_swaying.aero.effects import Moment, WindEffect
 from gaussian_swaying.aero.lookup import trilinear
 from gaussian_swaying.geometry.frame import SimFrame
+from gaussian_swaying.mpm.twins import Numbers, Twin
 
 
 def extinction(density: Tensor, spacing: Tensor) -> Tensor:
@@ -133,3 +134,13 @@ class Shelter(WindEffect):
         """Multiply the velocity by the share that is left."""
         place = position @ self.turn.to(position.dtype).T + self.shift.to(position.dtype)
         return velocity * trilinear(self.table[..., None], place)
+
+    def twin(self) -> Twin:
+        """See :class:`~gaussian_swaying.mpm.twins.Twin`."""
+        from gaussian_swaying.aero.effects_triton import sheltered
+
+        def numbers() -> Tensor:
+            return torch.cat([self.turn.reshape(-1), self.shift, self.shift.new_full((3,), self.cells)])
+
+        table = Numbers(self.table.numel(), lambda: self.table)
+        return Twin(sheltered, numbers=Numbers(15, numbers), table=table, sources=(self,))

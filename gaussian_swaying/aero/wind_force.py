@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from copy import copy
+from functools import partial
 from typing import Any
 
 import torch
@@ -12,15 +13,15 @@ from torch import Tensor, nn
 from gaussian_swaying._checks import check_shape
 from gaussian_swaying._graphs import fingerprint, record, tensors_in
 from gaussian_swaying.aero.effects import Moment
-from gaussian_swaying.aero.effects_twin import Packed, has_twin, packed, vectors
 from gaussian_swaying.aero.force import LAWS, AeroForce, capped_area
 from gaussian_swaying.aero.patches import Patches, PatchSums
 from gaussian_swaying.aero.shelter import Shelter, wind_axes
 from gaussian_swaying.aero.wind import SpatialWind, WindField
 from gaussian_swaying.aero.wind_batch import WindBatch
 from gaussian_swaying.geometry.patches import compiles, deform_patch
-from gaussian_swaying.mpm.forces import MOST_STEPS, Force, ForceTwin, Given
+from gaussian_swaying.mpm.forces import MOST_STEPS, Force, Given
 from gaussian_swaying.mpm.state import State
+from gaussian_swaying.mpm.twins import Numbers, Twin
 
 Wind = WindField | SpatialWind
 
@@ -92,12 +93,11 @@ class WindForce(Force):
                 )
         self._key: tuple[tuple[object, ...], ...] = ()
         self._graph: torch.cuda.CUDAGraph | None = None
-        self._space: Packed | None = None
 
     def __getstate__(self) -> dict[str, object]:
         """The state without the CUDA graph, which cannot be copied."""
         kept = {name: value for name, value in vars(self).items() if name not in ("_now", "_dt", "_table")}
-        return kept | {"_key": (), "_graph": None, "_space": None}
+        return kept | {"_key": (), "_graph": None}
 
     @property
     def wind(self) -> nn.Module | tuple[nn.Module, ...]:
@@ -286,73 +286,65 @@ class WindForce(Force):
         blown = _blow(wind, times)
         return lambda state, k: self.force(state, wind.shaped(blown[k], state.position, moments[k]))
 
-    @property
-    def has_twin(self) -> bool:
-        """True if the kernels can compute the force: they know all effects, and the lists are not too long."""
-        wind = self._fields[0]
-        known = self.uniform or (self._shared and isinstance(wind, WindField) and has_twin(wind))
-        return known and (self.sums is None or self.sums.rows < 2**24)  # rows are counted in float32
-
-    def twin(self) -> ForceTwin:
-        """See ``Force.twin``."""
-        from gaussian_swaying.aero.effects_triton import shaped_wind_force, shaped_wind_on_groups
+    def twin(self) -> Twin | None:
+        """See :class:`~gaussian_swaying.mpm.twins.Twin`; None if an effect has none, or the lists are too long."""
+        wind, aero, sums = self._fields[0], self.aero, self.sums
+        if sums is not None and sums.rows >= 2**24:  # rows are counted in float32
+            return None
+        parts: tuple[Twin, ...] = ()
+        if not self.uniform:
+            if not (self._shared and type(wind) is WindField):
+                return None
+            found = [effect.twin() for effect in wind.effects]  # type: ignore[operator]
+            parts = tuple(part for part in found if part is not None)
+            if len(parts) < len(found):
+                return None
         from gaussian_swaying.aero.force_adjoint_triton import wind_force_adjoint, wind_on_groups_adjoint
         from gaussian_swaying.aero.force_triton import wind_force, wind_on_groups
-
-        aero = self.aero
-        implicit = aero.drag_step == "semi_implicit"
-        smooth = self.uniform and not implicit
-        law, lift = LAWS.index(aero.law), aero.lift_direction == "lift"
-        options: tuple[Any, ...] = (law, lift, aero.unit_tangent, implicit)
-        functions, space = (wind_force, wind_on_groups), None
-        if not self.uniform:
-            kinds, space, _ = self._packed()
-            functions, options = (shaped_wind_force, shaped_wind_on_groups), (*options, *kinds)
 
         def numbers() -> Tensor:
             half, widest = (torch.full_like(aero.C_D, v) for v in (0.5 * aero.air_density, aero.max_area_ratio))
             return torch.stack([aero.C_D, aero.C_F, aero.C_L, half, widest])
 
-        sums = self.sums
+        implicit = aero.drag_step == "semi_implicit"
+        smooth = self.uniform and not implicit
+        width = 3 + sum(part.per_substep.count for part in parts)
+        patches: dict[str, Any] = {
+            "function": wind_force,
+            "per_point": Numbers(
+                4, lambda: torch.cat([self.normal.expand(*self.area.shape, 3), self.area[..., None]], dim=-1)
+            ),
+            "sources": (self.normal, self.area),
+            "adjoint": wind_force_adjoint if smooth else None,
+        }
         if sums is not None:
-            return ForceTwin(
-                function=functions[1],
-                options=options,
-                implicit=implicit,
-                sources=(sums.tensor, sums.vector),
-                values=lambda: sums.lists().reshape(*self.area.shape, 2),
-                numbers=numbers,
-                vectors=self.winds if self.uniform else self._vectors,
-                table=sums.table,
-                space=space,
-                adjoint=wind_on_groups_adjoint if smooth and not aero.unit_tangent else None,
-            )
-        return ForceTwin(
-            function=functions[0],
-            options=options,
+            patches = {
+                "function": wind_on_groups,
+                "per_point": Numbers(2, lambda: sums.lists().reshape(*self.area.shape, 2)),
+                "table": Numbers(4 * sums.rows, sums.table),
+                "sources": (sums.tensor, sums.vector),
+                "adjoint": wind_on_groups_adjoint if smooth and not aero.unit_tangent else None,
+            }
+        return Twin(
+            options=(LAWS.index(aero.law), aero.lift_direction == "lift", aero.unit_tangent, implicit),
+            numbers=Numbers(5, numbers),
+            per_substep=Numbers(width, partial(self._with_effects, parts) if parts else self.winds),
             implicit=implicit,
-            sources=(self.normal, self.area),
-            values=lambda: torch.cat([self.normal.expand(*self.area.shape, 3), self.area[..., None]], dim=-1),
-            numbers=numbers,
-            vectors=self.winds if self.uniform else self._vectors,
-            space=space,
-            adjoint=wind_force_adjoint if smooth else None,
+            parts=parts,
+            **patches,
         )
 
-    def _packed(self) -> Packed:
-        """Return the data of the effects for the kernels; what changed is written again, in place where possible."""
-        wind = self._fields[0]
-        assert isinstance(wind, WindField)
-        with torch.inference_mode(False), torch.no_grad():
-            self._space = packed(wind, self.area.device, self._space)
-        return self._space
-
-    def _vectors(self, time: Tensor, dt: float | Tensor, steps: int) -> Tensor:
-        """As :meth:`winds`, for a wind with effects; shape (steps, 7)."""
+    def _with_effects(self, parts: Sequence[Twin], time: Tensor, dt: float | Tensor, steps: int) -> Tensor:
+        """As :meth:`winds`, and the numbers of the twins of the effects at these times, shape (steps, n)."""
         wind = self._fields[0]
         assert isinstance(wind, WindField)
         times = time + torch.arange(steps, dtype=torch.float64, device=time.device) * dt
-        return vectors(wind, _blow(wind, times), times)
+        asked = [part.per_substep for part in parts if part.per_substep.count]
+        rows = [_blow(wind, times)]
+        if asked:
+            moment = Moment(times, wind.mean_flow(times), wind.carried(times))
+            rows += [torch.as_tensor(numbers.take(moment)) for numbers in asked]
+        return torch.cat(rows, dim=-1)
 
 
 def _air(wind: nn.Module, time: Tensor, position: Tensor) -> Tensor:

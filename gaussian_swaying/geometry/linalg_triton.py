@@ -51,6 +51,24 @@ def read3(pointer):
 
 
 @triton.jit
+def read(pointer, FIRST: tl.constexpr, COUNT: tl.constexpr):
+    """COUNT numbers in a row from number FIRST on, as a tuple."""
+    found = ()
+    for k in tl.static_range(COUNT):
+        found = found + (tl.load(pointer + FIRST + k),)
+    return found
+
+
+@triton.jit
+def chosen(values, FIRST: tl.constexpr, COUNT: tl.constexpr):
+    """COUNT values of a tuple from number FIRST on."""
+    found = ()
+    for k in tl.static_range(COUNT):
+        found = found + (values[FIRST + k],)
+    return found
+
+
+@triton.jit
 def read9(pointer):
     """Nine numbers in a row, the same for all particles."""
     return (

@@ -1,11 +1,11 @@
-"""Forces on material points: the base class, sums of forces, and Triton twins for the fused substep."""
+"""Forces on material points: the base class, and sums of forces."""
 
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
-from typing import Any
+from itertools import compress
+from operator import not_
 
 from torch import Tensor, nn
 
@@ -13,13 +13,10 @@ from gaussian_swaying._checks import check_like, check_shape
 from gaussian_swaying._graphs import Recordable, tensors_in
 from gaussian_swaying.geometry.frame import SimFrame
 from gaussian_swaying.mpm.state import State
+from gaussian_swaying.mpm.twins import Twinned
 
 MOST_STEPS = 256
-"""Largest number of substeps for which a :class:`ForceTwin` computes its vectors at once."""
-
-TWIN_VALUES, TWIN_NUMBERS, TWIN_VECTOR = 4, 8, 16
-"""Largest number of values per particle, of shared numbers before the table, and of those per substep and scene, in a
-:class:`ForceTwin`."""
+"""Largest number of substeps for which the numbers of a twin are taken at once."""
 
 Given = Tensor | tuple[Tensor, Tensor | None]
 """A force [N], shape (..., P, 3), alone or with its resistance [kg/s], shape (..., P)."""
@@ -27,54 +24,12 @@ Given = Tensor | tuple[Tensor, Tensor | None]
 ForceFunction = Callable[[State], Given]
 
 
-@dataclass(frozen=True)
-class ForceTwin:
-    """A force as a Triton function that the particle kernels call; the force in torch is its reference.
-
-    Attributes:
-        function: A ``@triton.jit`` function ``(F, velocity, values, vector, numbers, OPTIONS)`` that returns the force
-            (three numbers) and the resistance of some particles. ``F`` is the total deformation gradient in nine parts,
-            ``velocity`` has three, ``values`` four; ``vector`` and ``numbers`` are pointers. The force must be zero
-            where all values are zero.
-        options: Constants that the function is compiled for.
-        implicit: Whether there is a resistance, so that the force acts at the velocity at the end of the substep; if
-            not, the function returns a resistance of zero.
-        sources: The tensors that the values are computed from: ``values`` is called again when one of them is replaced
-            or changed in place.
-        values: Returns up to four numbers for each particle, shape (..., P, n).
-        numbers: Returns up to eight numbers, shape (n,); called for every rollout. If the force is ``recordable``, it
-            and ``vectors`` may be recorded in a CUDA graph.
-        table: Returns more numbers, shape (m,), float32, which follow eight places after the first of ``numbers``, such
-            as lists that the values point to; called when ``values`` is. None for none.
-        vectors: ``vectors(time, dt, steps)`` returns what depends only on time: a vector for the start of each of
-            ``steps`` (at most 256) substeps of ``dt`` from ``time`` on, both scalar float64 tensors; shape (steps, 3),
-            or (steps, B, 1, 3) for a batch of scenes. Up to sixteen numbers may take the place of the three.
-        space: Numbers that the force reads depending on the place, float32, shape (n,), which stay at the same address
-            and may change between rollouts. The function then has two more arguments: ``(F, velocity, position, values,
-            vector, numbers, space, OPTIONS)``. None for a force that does not depend on the place.
-        adjoint: A ``@triton.jit`` function ``(F, velocity, values, vector, numbers, a, OPTIONS)`` that returns the
-            gradients of a . force, with three numbers a: by F (nine), by the velocity (three), by the first three of
-            the vector and by the first three of the numbers. No other input of the force may require a gradient then.
-            None for a force whose gradients need torch.
-    """
-
-    function: Any
-    options: tuple[bool | int | float, ...]
-    implicit: bool
-    sources: tuple[Tensor, ...]
-    values: Callable[[], Tensor]
-    numbers: Callable[[], Tensor]
-    vectors: Callable[[Tensor, Tensor, int], Tensor]
-    table: Callable[[], Tensor] | None = None
-    space: Tensor | None = None
-    adjoint: Any = None
-
-
-class Force(Recordable, nn.Module, ABC):
+class Force(Recordable, Twinned, nn.Module, ABC):
     """Base class of all forces: computes the force on every particle from the state, in torch.
 
     A custom force is a subclass with a ``forward``. It may have numbers, tensors (``register_buffer``) and parameters;
-    they receive gradients. Move it to the device of the material, like any module.
+    they receive gradients. Move it to the device of the material, like any module. With a ``twin``, it is computed
+    inside the kernels of the substep (:mod:`~gaussian_swaying.mpm.twins`).
 
     Attributes:
         recordable: Whether ``forward`` may be recorded in a CUDA graph with the substep: it must depend only on the
@@ -125,15 +80,6 @@ class Force(Recordable, nn.Module, ABC):
             A function of the state at the start of a substep and of its number.
         """
         return lambda state, k: self(state)
-
-    @property
-    def has_twin(self) -> bool:
-        """True if there is a :meth:`twin`."""
-        return False
-
-    def twin(self) -> ForceTwin:
-        """The Triton twin of this force, for the fused substep; only if ``has_twin``."""
-        raise NotImplementedError(f"The force {type(self).__name__} has no Triton twin.")
 
 
 class FunctionForce(Force):
@@ -213,12 +159,10 @@ def tensors_of(forces: Sequence[Force]) -> list[Tensor]:
     return tensors_in(forces)
 
 
-def divide(forces: Sequence[Force]) -> tuple[Force | None, tuple[Force, ...]]:
-    """The first force that has a twin, and the others, which run in torch."""
-    for k, force in enumerate(forces):
-        if force.has_twin:
-            return force, (*forces[:k], *forces[k + 1 :])
-    return None, tuple(forces)
+def divide(forces: Sequence[Force]) -> tuple[tuple[Force, ...], tuple[Force, ...]]:
+    """The forces that have a twin, and the others, which run in torch."""
+    twinned = [force.twin() is not None for force in forces]
+    return tuple(compress(forces, twinned)), tuple(compress(forces, map(not_, twinned)))
 
 
-__all__ = ["Force", "ForceFunction", "ForceTwin", "Forces", "FunctionForce", "as_forces"]
+__all__ = ["Force", "ForceFunction", "Forces", "FunctionForce", "as_forces"]

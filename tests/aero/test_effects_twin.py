@@ -1,6 +1,6 @@
 """A wind with effects in the kernels against the same wind in torch; in Triton's interpreter without a GPU.
 
-Covers: aero.effects, aero.effects_triton, aero.obstacles_triton, aero.wind_triton.
+Covers: aero.effects, aero.effects_triton, aero.obstacles_triton, aero.wind_triton, mpm.twins.
 """
 
 import numpy as np
@@ -8,7 +8,6 @@ import pytest
 import torch
 from torch.utils._python_dispatch import TorchDispatchMode
 
-from gaussian_swaying.aero import effects_twin
 from gaussian_swaying.aero.carried import CarriedField, Turbulence
 from gaussian_swaying.aero.effects import LogProfile, PowerProfile
 from gaussian_swaying.aero.force import AeroForce
@@ -20,6 +19,7 @@ from gaussian_swaying.aero.wind import FlowKey, UniformGust, WindField
 from gaussian_swaying.aero.wind_force import WindForce
 from gaussian_swaying.mpm.solver import MPMSolver
 from gaussian_swaying.mpm.state import MaterialPoints
+from gaussian_swaying.mpm.twins import Composed, Tables
 
 DX, DT = 0.1, 1e-3
 TOLERANCE = 2e-5
@@ -33,7 +33,7 @@ def _field(wraps):
     )
 
 
-OBSTACLES = ("sphere", "cylinder", "ellipsoid", "wall", "several")
+OBSTACLES = ("sphere", "cylinder", "ellipsoid", "wall", "several", "crowded")
 MIDDLE = [0.1, 0.15, 0.1]
 GUSTS = [UniformGust(0.5, interval=2 * DT)]
 TURNING = [FlowKey(0.0, [4.0, 1.0, 0.5]), FlowKey(3 * DT, [-2.0, 3.0, 0.0])]
@@ -54,6 +54,11 @@ def _wind(name):
         "cylinder": [CylinderObstacle(MIDDLE, 0.05, axis=[0.0, 1.0, 1.0])],
         "ellipsoid": [EllipsoidObstacle(MIDDLE, [0.03, 0.08, 0.05], turn=20.0, drag=0.0)],
         "wall": [EllipsoidObstacle(MIDDLE, [0.01, 0.1, 0.05])],
+        "crowded": [
+            *[CylinderObstacle([0.1 * k, 0.3, 0.1], 0.01) for k in range(7)],
+            _field((True,) * 3),
+            _field((True, False, True)),
+        ],
         "several": [
             LogProfile(**low, roughness=0.02),
             CylinderObstacle([0.02, 0.1, 0.1], 0.02, street=False),
@@ -105,7 +110,7 @@ WINDS = ("log", "power", "turbulence", "all", "sheltered", "half", "held", *OBST
 )
 def test_the_kernels_blow_as_torch_does(kernel_device, formulation, name):
     solver, state, load = _bodies(kernel_device, formulation, _wind(name))
-    assert load.has_twin
+    assert load.twin() is not None
     reference, _, _ = _bodies(kernel_device, formulation, _wind(name), transfer="torch")
     load.refresh(state)
     found, expected = solver.rollout(state, DT, 6, load), reference.rollout(state, DT, 6, load)
@@ -121,7 +126,7 @@ def test_the_kernels_blow_on_groups_of_patches_and_batches(kernel_device, formul
     for options in ({"groups": True}, {"batch": (2,)}):
         solver, state, load = _bodies(kernel_device, formulation, _wind("all"), **options, drag_step="semi_implicit")
         reference, _, _ = _bodies(kernel_device, formulation, _wind("all"), transfer="torch", **options)
-        assert load.has_twin
+        assert load.twin() is not None
         assert (load.sums is not None) == ("groups" in options)
         _same(solver.rollout(state, DT, 4, load), reference.rollout(state, DT, 4, load))
 
@@ -130,16 +135,16 @@ def test_a_changed_effect_is_read_again_at_the_same_address(kernel_device):
     """A table changed in place, another flow, and rollouts that are replayed from graphs on a GPU."""
     solver, state, load = _bodies(kernel_device, "total", _wind("half"))
     reference, _, _ = _bodies(kernel_device, "total", _wind("half"), transfer="torch")
-    ends = []
+    ends, where = [], None
     for change in range(4):
         if change == 2:
             load.wind.effects[1].table.mul_(-3.0)
         if change == 3:
             load.wind.flows = load.wind.flows.flip(0)
-        where = load.twin().space.data_ptr()
         ends.append(solver.rollout(state, DT, 5, load))
         _same(ends[-1], reference.rollout(state, DT, 5, load))
-        assert load.twin().space.data_ptr() == where
+        where = where or solver.fused().tables.buffer.data_ptr()
+        assert solver.fused().tables.buffer.data_ptr() == where
     torch.testing.assert_close(ends[0].position, ends[1].position, rtol=0, atol=1e-6)
     for one, other in ((1, 2), (2, 3)):
         assert float((ends[one].velocity - ends[other].velocity).abs().max()) > 1e-3
@@ -148,19 +153,26 @@ def test_a_changed_effect_is_read_again_at_the_same_address(kernel_device):
 def test_only_what_has_changed_is_written_again(kernel_device, monkeypatch):
     """A shelter is refreshed in every frame; the turbulence before it has fifty megabytes in its full size."""
     _, state, load = _bodies(kernel_device, "total", _wind("sheltered"))
-    load.twin()
-    written, write = [], effects_twin._write
-    monkeypatch.setattr(effects_twin, "_write", lambda effect, *to: written.append(effect) or write(effect, *to))
-    load.twin()
-    assert written == []
+    written, tables = [], Tables(torch.device(kernel_device))
+    plain = torch.Tensor.copy_
+    monkeypatch.setattr(torch.Tensor, "copy_", lambda to, what: written.append(to.numel()) or plain(to, what))
+
+    def take():
+        written.clear()
+        tables.take([load.twin()], Composed([load.twin()]))
+        return list(written)
+
+    turbulence, shelter = [21, 8 * 6 * 4 * 3], [15, 8**3]
+    assert take() == [*turbulence, *shelter]
+    assert take() == []
     load.refresh(state)
-    load.twin()
-    assert written == [load.wind.effects[1]]
+    assert take() == shelter
     load.wind.effects[0].table.mul_(2.0)
-    space = load.twin().space.clone()
-    assert written == list(load.wind.effects)[::-1]
-    load._space = None
-    assert torch.equal(load.twin().space, space)
+    assert take() == turbulence
+    buffer = tables.buffer.clone()
+    tables = Tables(torch.device(kernel_device))
+    assert take() == [*turbulence, *shelter]
+    assert torch.equal(tables.buffer, buffer)
 
 
 def test_the_last_place_of_a_table_that_repeats(kernel_device):
@@ -185,7 +197,7 @@ def test_winds_at_later_times(kernel_device, name, tmp_path):
     wind = _recorded(tmp_path) if name == "recorded" else _wind(name)
     solver, state, load = _bodies(kernel_device, "total", wind)
     reference, _, _ = _bodies(kernel_device, "total", wind, transfer="torch")
-    assert load.has_twin == (name != "recorded")
+    assert (load.twin() is not None) == (name != "recorded")
     assert load.recordable
     for _ in range(3):
         found, expected = solver.rollout(state, DT, 3, load), reference.rollout(state, DT, 3, load)
@@ -225,11 +237,18 @@ def test_the_host_reads_nothing_of_a_shelter():
 
 
 def test_what_the_kernels_do_not_know_runs_in_torch():
+    """A subclass does not inherit the twin, nor does a wind have one without those of all effects."""
+    pytest.importorskip("triton", reason="needs triton, which is available on Linux only")
+
     class Doubled(LogProfile):
         def factor(self, above):
             return 2 * super().factor(above)
 
-    poles = [CylinderObstacle([0.1 * k, 0.0, 0.0], 0.01) for k in range(7)]
-    for effects in ([Doubled()], [_field((True,) * 3), _field((True,) * 3)], poles):
+    class Same(LogProfile):
+        twin = LogProfile.twin
+
+    assert Doubled().twin() is None
+    assert Same().twin().function is LogProfile().twin().function
+    for effects in ([Doubled()], [Same(), Doubled(), SphereObstacle(MIDDLE, 0.05)]):
         wind = WindField([1.0, 0.0, 0.0], effects=effects)
-        assert not _bodies("cpu", "total", wind, transfer="torch")[2].has_twin
+        assert _bodies("cpu", "total", wind, transfer="torch")[2].twin() is None

@@ -50,7 +50,7 @@ def test_a_force_in_many_winds():
     assert torch.equal(batch.winds(now, 1e-3, 6), listed.winds(now, 1e-3, 6))
     assert batch.uniform
     assert batch.recordable
-    assert batch.has_twin
+    assert batch.twin() is not None
 
 
 def test_what_cannot_be_computed_together():

@@ -242,7 +242,7 @@ def test_a_wind_with_effects_is_asked_where_the_particles_are(batch):
     wind = [shaped, GUSTS] if batch else shaped
     _, state, load = _setting(batch=batch, wind=wind)
     assert not load.uniform
-    assert not load.has_twin or not batch
+    assert load.twin() is None or not batch
     assert load.recordable
     found = load.air(state.time, state.position)
     own = shaped.at(state.time, state.position[0] if batch else state.position)

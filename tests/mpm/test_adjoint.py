@@ -20,7 +20,7 @@ from gaussian_swaying.aero.force_adjoint_triton import wind_force_adjoint, wind_
 from gaussian_swaying.aero.patches import Patches, PatchSums
 from gaussian_swaying.aero.wind import SineSway, WindField
 from gaussian_swaying.aero.wind_force import WindForce
-from gaussian_swaying.geometry.linalg_triton import load3, load9, store3, store9
+from gaussian_swaying.geometry.linalg_triton import load3, load9, read, read3, store3, store9
 from gaussian_swaying.geometry.patches import deform_patch
 from gaussian_swaying.geometry.regions import Box
 from gaussian_swaying.mpm.boundaries.ball import BallObstacle
@@ -95,14 +95,15 @@ def _viscous(F_in, L_in, Q_in, by_F, by_rate, scalars, mu, lam, time, count, BLO
 
 @triton.jit
 def _wind(
-    F_in, v_in, patch_in, wind, numbers, a_in, by_F, by_v, parts, count,
+    F_in, v_in, patch_in, wind, numbers, a_in, table, by_F, by_v, parts, count,
     OPTIONS: tl.constexpr, FUNCTION: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
     k = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
     mask = k < count
     F, v, n = load9(F_in, 1, 9 * k, mask), load3(v_in, 1, 3 * k, mask), load3(patch_in, 1, 4 * k, mask)
     patch = (n[0], n[1], n[2], tl.load(patch_in + 4 * k + 3, mask, 0.0))
-    one, two, by_wind, by_numbers = FUNCTION(F, v, patch, wind, numbers, load3(a_in, 1, 3 * k, mask), OPTIONS)
+    a = load3(a_in, 1, 3 * k, mask)
+    one, two, by_wind, by_numbers = FUNCTION(F, v, patch, read(numbers, 0, 5), read3(wind), table, a, OPTIONS)
     store9(by_F, 1, 9 * k, one, mask)
     store3(by_v, 1, 3 * k, two, mask)
     store3(parts, 1, 6 * k, by_wind, mask)
@@ -182,7 +183,7 @@ def test_derivative_of_the_wind(law, side, unit, kernel_device):
     expected = torch.autograd.grad((force * a).sum(), leaves)
     numbers = torch.tensor([0.6, 0.4, 0.2, 0.5 * 1.225, 1.5], dtype=WIDE)
     patch = torch.cat([normal, area[:, None]], 1)
-    given = [t.detach().to(kernel_device, dtype).contiguous() for t in (F, v, patch, wind, numbers, a)]
+    given = [t.detach().to(kernel_device, dtype).contiguous() for t in (F, v, patch, wind, numbers, a, numbers)]
     options = (WIND_LAWS.index(law), side == "lift", unit, False)
     _check_wind(given, options, wind_force_adjoint, expected, tolerance)
 
@@ -214,10 +215,9 @@ def test_derivative_of_the_wind_on_groups(law, side, kernel_device):
     force, _ = aero.on_groups(wind, v, F, sums)
     a = _random(4, count, 3)
     expected = torch.autograd.grad((force * a).sum(), [F, v, wind, aero.C_D, aero.C_F, aero.C_L])
-    numbers = torch.tensor([0.6, 0.4, 0.2, 0.5 * 1.225, 1.2, 0.0, 0.0, 0.0], dtype=WIDE)
-    numbers = torch.cat([numbers, sums.table()])
+    numbers = torch.tensor([0.6, 0.4, 0.2, 0.5 * 1.225, 1.2], dtype=WIDE)
     place = torch.nn.functional.pad(sums.lists(), (0, 2))
-    given = [t.detach().to(kernel_device, dtype).contiguous() for t in (F, v, place, wind, numbers, a)]
+    given = [t.detach().to(kernel_device, dtype).contiguous() for t in (F, v, place, wind, numbers, a, sums.table())]
     _check_wind(
         given, (WIND_LAWS.index(law), side == "lift", False, False), wind_on_groups_adjoint, expected, tolerance
     )

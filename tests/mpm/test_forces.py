@@ -13,9 +13,10 @@ import torch
 from gaussian_swaying.aero.force import AeroForce
 from gaussian_swaying.aero.wind import SpatialWind, WindField
 from gaussian_swaying.aero.wind_force import WindForce
-from gaussian_swaying.mpm.forces import Force, ForceTwin, FunctionForce, as_forces, divide
+from gaussian_swaying.mpm.forces import Force, FunctionForce, as_forces, divide
 from gaussian_swaying.mpm.solver import MPMSolver
 from gaussian_swaying.mpm.state import MaterialPoints
+from gaussian_swaying.mpm.twins import Twin
 
 ROOT = Path(__file__).resolve().parents[2]
 PAGE = (ROOT / "docs" / "forces.md").read_text()
@@ -196,15 +197,14 @@ def test_a_force_says_for_itself_whether_it_can_be_recorded():
     assert isinstance(as_forces(_push)[0], FunctionForce)
 
 
-def test_the_first_force_with_a_twin_is_fused():
+def test_all_forces_with_a_twin_are_fused():
+    pytest.importorskip("triton")
     *_, wind = _setting()
     spring, other = Spring(), WindForce(wind.aero, wind.wind, wind.normal, 2 * wind.area)
-    assert divide([spring, wind, other]) == (wind, (spring, other))
-    assert divide([spring]) == (None, (spring,))
-    with pytest.raises(NotImplementedError, match="Spring has no Triton twin"):
-        spring.twin()
-    pytest.importorskip("triton")
-    assert isinstance(wind.twin(), ForceTwin)
+    assert divide([spring, wind, other]) == ((wind, other), (spring,))
+    assert divide([spring]) == ((), (spring,))
+    assert spring.twin() is None
+    assert isinstance(wind.twin(), Twin)
 
 
 # ---- wind that depends on the place
@@ -236,7 +236,7 @@ def test_a_wind_may_depend_on_the_place(formulation):
         solver.rollout(start, DT, 3, same).velocity, solver.rollout(start, DT, 3, wind).velocity, rtol=0, atol=1e-13
     )
     shear = WindForce(wind.aero, Shear(), wind.normal, wind.area)
-    assert not shear.has_twin
+    assert shear.twin() is None
     assert shear.recordable
     assert not same.recordable
     state = start

@@ -12,10 +12,10 @@ each in four columns of eight. Rows of ``history``: displacement and velocity at
 import triton
 import triton.language as tl
 
-from gaussian_swaying.geometry.linalg_triton import axpy9, load3, scale9
+from gaussian_swaying.geometry.linalg_triton import axpy9, scale9
 from gaussian_swaying.mpm.laws.triton.body import pk1_adjoint
 from gaussian_swaying.mpm.triton.damping import kelvin_voigt_adjoint
-from gaussian_swaying.mpm.triton.shared import VARIES, axis_weights, node_weight, vector_of
+from gaussian_swaying.mpm.triton.shared import VARIES, axis_weights, node_weight, twin_data
 from gaussian_swaying.mpm.triton.total_kernels import cells_of, gather, law_row, load_particles, motion
 
 
@@ -55,14 +55,16 @@ def particles_adjoint(
     fields, force_bar, partial, found, shares,
     vectors, scenes, numbers, first_step, step_offset, last,
     sx, sy, inverse_dx, viscous_time,
-    LAWS: tl.constexpr, MULTI: tl.constexpr, ADJOINT: tl.constexpr, OPTIONS: tl.constexpr, VISCOUS: tl.constexpr,
-    MATERIAL: tl.constexpr, SHARES: tl.constexpr, WIDTH: tl.constexpr, CELLS: tl.constexpr, LANES: tl.constexpr,
+    LAWS: tl.constexpr, MULTI: tl.constexpr, FORCES: tl.constexpr, VISCOUS: tl.constexpr, MATERIAL: tl.constexpr,
+    SHARES: tl.constexpr, WIDTH: tl.constexpr, CELLS: tl.constexpr, LANES: tl.constexpr,
 ):  # fmt: skip
     """Gradients by the nodal displacements (columns 0 to 2 of ``partial``) and velocities (4 to 6), summed by cells.
 
     With MATERIAL the gradients by mu, lambda and volume are added to the three rows of ``found``; with SHARES those by
-    the vector and the numbers of the force are written to a row of eight for each substep and cell.
+    the numbers of the substep and of the force, of which there is at most one, are written to a row of eight for each
+    substep and cell.
     """
+    LOADED: tl.constexpr = len(FORCES.functions) > 0
     step = tl.load(last) - tl.load(first_step) - step_offset
     cell, real, start, end, node, scene, longest = cells_of(cell_start, cell_node, cell_scene, cells, CELLS)
     lane = tl.arange(0, LANES)[None, :]
@@ -72,7 +74,7 @@ def particles_adjoint(
         mask = index < end[:, None]
         f, volume, mu, lam = load_particles(fraction, material, count, index, mask)
         wz, gz = axis_weights(f[2], inverse_dx)
-        _u, F, v, rate = motion(fields, node, sx, sy, f, wz, gz, inverse_dx, known, VISCOUS, ADJOINT is not None)
+        _u, F, v, rate = motion(fields, node, sx, sy, f, wz, gz, inverse_dx, known, VISCOUS, LOADED)
         a, Q, _v = gather(force_bar, node, sx, sy, f, wz, gz, inverse_dx, known, False)
         row = law_row(law, law_table, index, mask, MULTI)
         by_F, by_mu, by_lam = pk1_adjoint(F, Q, mu, lam, row, LAWS)
@@ -90,11 +92,11 @@ def particles_adjoint(
             to = found + 2 * count + index
             tl.store(to, tl.load(to, mask, 0.0) - mu * by_mu - lam * by_lam, mask)
         by_F = scale9(-volume, by_F)
-        if ADJOINT is not None:
-            first = load3(values, count, index, mask)
-            value = (first[0], first[1], first[2], tl.load(values + 3 * count + index, mask, 0.0))
-            vector = vector_of(vectors, scenes, step, scene)
-            more, by_v, by_vector, by_numbers = ADJOINT(F, v, value, vector, numbers, a, OPTIONS)
+        if LOADED:
+            point, own, now = twin_data(0, FORCES, index, mask, scene, values, count, vectors, scenes, step, numbers)
+            more, by_v, by_vector, by_numbers = FORCES.adjoints[0](
+                F, v, point, own, now, numbers + FORCES.tables[0], a, FORCES.options[0]
+            )
             by_F = axpy9(1.0, by_F, 1.0, more)
             if SHARES:
                 to = shares + (step.to(tl.int64) * cells + cell) * 8
@@ -115,7 +117,7 @@ def particles_adjoint(
                     b0 = by_rate[0] * ax + by_rate[1] * ay
                     b1 = by_rate[3] * ax + by_rate[4] * ay
                     b2 = by_rate[6] * ax + by_rate[7] * ay
-                    if ADJOINT is not None:
+                    if LOADED:
                         b0 += by_v[0] * w
                         b1 += by_v[1] * w
                         b2 += by_v[2] * w
@@ -129,7 +131,7 @@ def particles_adjoint(
                         _add(out + 4, tl.sum(wz[k] * b0 + gw * by_rate[2], 1), real, chunk)
                         _add(out + 5, tl.sum(wz[k] * b1 + gw * by_rate[5], 1), real, chunk)
                         _add(out + 6, tl.sum(wz[k] * b2 + gw * by_rate[8], 1), real, chunk)
-                    elif ADJOINT is not None:
+                    elif LOADED:
                         ww = wz[k] * w
                         _add(out + 4, tl.sum(ww * by_v[0], 1), real, chunk)
                         _add(out + 5, tl.sum(ww * by_v[1], 1), real, chunk)

@@ -19,23 +19,14 @@ from torch import Tensor
 
 from gaussian_swaying._graphs import Repeater, fingerprint
 from gaussian_swaying.mpm.body import Body
-from gaussian_swaying.mpm.forces import (
-    MOST_STEPS,
-    TWIN_NUMBERS,
-    TWIN_VECTOR,
-    Force,
-    ForceTwin,
-    added,
-    divide,
-    split,
-    tensors_of,
-)
+from gaussian_swaying.mpm.forces import MOST_STEPS, Force, added, divide, split, tensors_of
 from gaussian_swaying.mpm.formulations.formulation import Formulation
 from gaussian_swaying.mpm.laws.triton.body import BodyLaws
 from gaussian_swaying.mpm.laws.triton.twin import shared, twin_of
 from gaussian_swaying.mpm.state import MPMState
 from gaussian_swaying.mpm.timestep import kick_time
 from gaussian_swaying.mpm.triton.shared import SCHEDULE
+from gaussian_swaying.mpm.twins import Composed, Tables, Twin, Watched
 
 MAX_STEPS = MOST_STEPS
 """Number of substeps whose schedule fits in the buffers; longer rollouts are run in parts."""
@@ -108,9 +99,12 @@ class Fused(ABC):
             self.law = points.law_index.reshape(-1).int()
         self.first_step = torch.zeros(1, dtype=torch.int32, device=self.device)
         self.schedule = torch.zeros(MAX_STEPS + 2, SCHEDULE, device=self.device)
-        self.vectors = torch.zeros(MAX_STEPS, self.scenes, TWIN_VECTOR, device=self.device)
-        self.numbers = torch.zeros(TWIN_NUMBERS, device=self.device)
-        self.space = self.numbers
+        self.forces = Composed(())
+        """The forces of the current rollout that the kernels compute."""
+        self.vectors = torch.zeros(0, device=self.device)
+        """Their numbers of each substep and scene."""
+        self.tables = Tables(self.device)
+        self._watched = Watched()
         self.load = torch.zeros(8, self.count, device=self.device)
         self.force_in = torch.zeros(0, 4, device=self.device)
         self.wave = shared(points.laws, "wave")
@@ -122,7 +116,6 @@ class Fused(ABC):
         self.time = torch.zeros((), dtype=torch.float64, device=self.device)
         self.dt = torch.zeros((), dtype=torch.float64, device=self.device)
         self.gravity = [float(g) for g in bound.settings.gravity]
-        self._values_of: list[tuple[Tensor, int | None]] = []
         self.asked: tuple[Force, ...] = ()
         """The forces of the current rollout that are computed in torch, in every substep."""
         self._resist: tuple[object, bool] = ((), False)
@@ -183,7 +176,7 @@ class Fused(ABC):
             state: The state now.
             dt: Substep [s].
             steps: Number of substeps.
-            forces: Forces; all but the first one with a twin must be recordable.
+            forces: Forces; those without a twin must be recordable.
             force: Force [N], shape (..., P, 3), or None; only without ``forces``.
             drag: Its resistance [kg/s], shape (..., P), or None.
             looks: Numbers of the substeps after which the wave speed is measured, if ``watches``.
@@ -195,8 +188,8 @@ class Fused(ABC):
         with at_home(self.speed):
             self.speed.zero_()
             fused, self.asked = divide(forces)
-            twin = None if fused is None else fused.twin()
-            options = self.options_for(twin)
+            twins = [twin for force in fused if (twin := force.twin()) is not None]
+            options = self.options_for(twins)
             options["FORCE"] = len(self.asked) > 0 or force is not None or drag is not None
             options["IMPLICIT"] = options["IMPLICIT"] or drag is not None or self._resists(state)
             if options["FORCE"]:
@@ -208,37 +201,50 @@ class Fused(ABC):
                 part = min(steps - first, MAX_STEPS)
                 marks = [look - first for look in looks if first < look <= first + part]
                 before = state.work
-                state = self._advance(state, dt, part, fused, twin, options, marks)
+                state = self._advance(state, dt, part, fused, twins, options, marks)
                 if force is None and not forces:  # the work of a drag alone is not counted
                     state = state.replace(work=before)
                 if watch is not None:
                     watch(first + part)
             return state, self.speed[0] / self.settings.dx
 
-    def options_for(self, twin: ForceTwin | None) -> dict[str, Any]:
-        """Constants of the kernels of a substep with the twin of a force alone, whose values are copied."""
-        self.space = self.numbers
-        if twin is not None:
-            self._take_values_of(twin)
-            self.space = self.numbers if twin.space is None else twin.space
+    def options_for(self, twins: Sequence[Twin]) -> dict[str, Any]:
+        """Constants of the kernels of a substep with some forces alone, whose numbers are copied if they changed."""
+        before, self.forces = self.forces, Composed(twins)
+        check_indices(self.forces.size)
+        self.tables.take(twins, self.forces)
+        room = MAX_STEPS * self.scenes * self.forces.width
+        if twins and len(self.vectors) < room:
+            self.vectors = torch.zeros(room, device=self.device)
+        if self._watched.changed([source for twin in twins for source in twin.sources]) or self.forces != before:
+            batch = self.body.points.mass.shape
+            values = [twin.per_point.take() for twin in twins if twin.per_point.count]
+            if values:
+                rows = [value.expand(*batch, value.shape[-1]).flatten(0, -2) for value in values]
+                self._take_values(torch.cat(rows, dim=-1))
         return {
             "LAWS": self.laws,
             "MULTI": len(self.law_table) > 1,
             "VISCOUS": self.settings.stiffness_damping > 0,
-            "TWIN": None if twin is None else twin.function,
-            "OPTIONS": None if twin is None else twin.options,
-            "SPACE": twin is not None and twin.space is not None,
+            "FORCES": self.forces,
             "FORCE": False,
-            "IMPLICIT": twin is not None and twin.implicit,
+            "IMPLICIT": any(twin.implicit for twin in twins),
         }
+
+    def write_substeps(self, force: int, rows: Tensor) -> None:
+        """Write the numbers of a force for some substeps, shape (steps, n) or (steps, scenes, 1, n), to the buffer."""
+        steps, width = len(rows), self.forces.width
+        first, count = self.forces.per_substep[force]
+        to = self.vectors[: steps * self.scenes * width].view(steps, self.scenes, width)
+        to[..., first : first + count].copy_(rows.reshape(steps, -1, count).expand(-1, self.scenes, -1))
 
     def _advance(
         self,
         state: MPMState,
         dt: float,
         steps: int,
-        force: Force | None,
-        twin: ForceTwin | None,
+        forces: Sequence[Force],
+        twins: Sequence[Twin],
         options: dict[str, Any],
         looks: list[int],
     ) -> MPMState:
@@ -246,21 +252,20 @@ class Fused(ABC):
         self.schedule[: steps + 2].copy_(self.table(kick_time(state, dt), dt, steps), non_blocking=True)
         self.time.copy_(state.time)
         self.dt.fill_(dt)
-        loaded = twin is not None or options["FORCE"]
+        loaded = len(twins) > 0 or options["FORCE"]
 
         def begin(count: int) -> None:
             """Write the buffers that the substeps read besides the state and the schedule."""
             self.first_step.zero_()
-            if twin is not None:
-                numbers = twin.numbers()
-                self.numbers[: len(numbers)].copy_(numbers)
-                vectors = twin.vectors(self.time, self.dt, count)
-                width = vectors.shape[-1]
-                self.vectors[:count, :, :width].copy_(vectors.reshape(count, -1, width).expand(-1, self.scenes, -1))
+            for k, (twin, (first, many)) in enumerate(zip(twins, self.forces.numbers, strict=True)):
+                if many:
+                    self.tables.buffer[first : first + many].copy_(torch.as_tensor(twin.numbers.take()))
+                if twin.per_substep.count:
+                    self.write_substeps(k, twin.per_substep.take(self.time, self.dt, count))
             if loaded:
                 self.load.zero_()
 
-        part = Part(steps, options, looks, loaded, begin, self._key_of(force))
+        part = Part(steps, options, looks, loaded, begin, self._key_of(forces))
         changes = self._run(state, part)
         changes["impulse"] = state.impulse + changes["impulse"]
         if loaded:
@@ -275,27 +280,15 @@ class Fused(ABC):
         table[:2] = torch.tensor([[0.0, dt, 1.0, kick if steps == 1 else dt], [kick, dt, first, 0.0]])
         return table
 
-    def _key_of(self, force: Force | None) -> tuple[object, ...] | None:
-        """Return the key of the recorded vectors and numbers of a force; None if they cannot be recorded."""
-        if force is None:
-            return ()
-        here = all(tensor.device == self.device for tensor in tensors_of([force]))
-        return (force, fingerprint([force])) if force.recordable and here else None
+    def _key_of(self, forces: Sequence[Force]) -> tuple[object, ...] | None:
+        """Return the key of the recorded numbers of forces with twins; None if they cannot be recorded."""
+        here = all(tensor.device == self.device for tensor in tensors_of(forces))
+        recordable = here and all(force.recordable for force in forces)
+        return (*forces, self.forces, fingerprint(forces)) if recordable else None
 
-    def _take_values_of(self, twin: ForceTwin) -> None:
-        """Copy the particle values of a twin to the buffers, if they have changed."""
-        sources = [(t, None if t.is_inference() else t._version) for t in twin.sources]
-        known = zip(self._values_of, sources, strict=False)
-        if not self._values_of or any(a is not b or v is None or v != w for (a, v), (b, w) in known):
-            self._values_of = sources
-            values = twin.values()
-            self._take_values(values.expand(*self.body.points.mass.shape, values.shape[-1]).flatten(0, -2))
-            if twin.table is not None:
-                table = twin.table()
-                if len(self.numbers) < TWIN_NUMBERS + len(table):  # recorded graphs know its address, see `repeat`
-                    check_indices(TWIN_NUMBERS + len(table))
-                    self.numbers = torch.zeros(TWIN_NUMBERS + len(table), device=self.device)
-                self.numbers[TWIN_NUMBERS : TWIN_NUMBERS + len(table)].copy_(table)
+    def places(self) -> tuple[int, int]:
+        """Return the addresses of the numbers of forces, which recorded graphs contain."""
+        return self.tables.buffer.data_ptr(), self.vectors.data_ptr()
 
     # ---- forces in torch
 
@@ -338,7 +331,7 @@ class Fused(ABC):
 
     @abstractmethod
     def _take_values(self, values: Tensor) -> None:
-        """Copy the values of a twin, shape (N, n), to the buffers."""
+        """Copy the numbers of each particle for the forces, shape (N, n), to the buffers."""
 
     @abstractmethod
     def _run(self, state: MPMState, part: Part) -> dict[str, Any]:
@@ -365,8 +358,7 @@ class Fused(ABC):
                 body(offset)
             self.first_step.add_(count)
 
-        places = (self.numbers.data_ptr(), self.space.data_ptr())
-        self.repeater.run(steps, (key, places, self._asked_key()), several, self.recordable)
+        self.repeater.run(steps, (key, self.places(), self._asked_key()), several, self.recordable)
 
 
 @contextmanager

@@ -12,7 +12,6 @@ from torch import Tensor
 from gaussian_swaying._graphs import RECORDED
 from gaussian_swaying.mpm.boundaries.pinned_points import PinnedPoints
 from gaussian_swaying.mpm.boundaries.pinned_region import PinnedRegion
-from gaussian_swaying.mpm.forces import TWIN_VALUES
 from gaussian_swaying.mpm.formulations.formulation import Formulation
 from gaussian_swaying.mpm.formulations.total import Total
 from gaussian_swaying.mpm.point_holds import DenseHolds
@@ -59,7 +58,7 @@ class FusedTotal(Fused):
         rows = [points.volume, body.laws.mu, body.laws.lam, points.mass]
         self.material = torch.stack([row.reshape(-1) for row in rows])[:, order].contiguous()
         self.law = self.law[order].contiguous()
-        self.values = torch.zeros(TWIN_VALUES, self.count, device=self.device)
+        self.values = torch.zeros(0, self.count, device=self.device)
         self.rest = points.position.contiguous()
         inverse = bound.node_inverse_mass.reshape(-1)
         active = (inverse > 0).nonzero()[:, 0]
@@ -134,6 +133,8 @@ class FusedTotal(Fused):
         self.first_piece = torch.cat([first, first.new_tensor([self.pieces])]).int()
 
     def _take_values(self, values: Tensor) -> None:
+        if len(self.values) < values.shape[1]:
+            self.values = torch.zeros(values.shape[1], self.count, device=self.device)
         self.values[: values.shape[1]].copy_(values[self.order.long()].T)
 
     def sums(self, rows: int, width: int, use: str = "") -> Tensor:
@@ -169,12 +170,12 @@ class FusedTotal(Fused):
             self.touching.take()
 
         def begin(_: int) -> None:
-            part.begin(len(self.vectors))
+            part.begin(len(self.schedule) - 2)
             more = [] if self.touching is None or not self.touching.walls else [self.touching.pressed_sum]
             for buffer in (self.taken, self.impulse, *more, *([] if self.points is None else [self.residual])):
                 buffer.zero_()
 
-        key = (part.loaded, self.numbers.data_ptr(), part.key)
+        key = (part.loaded, self.places(), part.key)
         self.repeater.run(1, ("begin", *key), begin, part.key is not None)
         same = (*options.values(), *(() if self.touching is None else self.touching.key))
         done = 0
@@ -210,7 +211,7 @@ class FusedTotal(Fused):
             self.fraction, self.material, self.law, self.law_table, self.values, self.force_in, self.load, self.order,
             self.count, self.piece_start, self.piece_node, self.piece_scene, self.pieces,
             self.fields, partial,
-            self.schedule, self.vectors, self.scenes, self.numbers, self.space, self.first_step, offset,
+            self.schedule, self.vectors, self.scenes, self.tables.buffer, self.first_step, offset,
             ny * nz, nz, *self.grid.offset, self.grid.node_count, self.grid.dx, 1 / self.grid.dx,
             self.settings.stiffness_damping,
             **options, POSITION=self.position, WIDTH=width, CELLS=per_program, LANES=self.lanes, num_warps=1,

@@ -34,11 +34,10 @@ class FusedUpdated(Fused):
         self.bound = bound
         self.plastic = len(self.laws.flows) > 0
         self.internal = laws.initial_internal() is not None
-        check_indices(44 * self.count)
-        self.moving = torch.zeros(44 if self.plastic else 35, self.count, device=self.device)
-        self.constants = torch.zeros(self.count, 9, device=self.device)
         rows = [points.mass, points.volume, laws.mu, laws.lam, self.law]
-        self.constants[:, :5] = torch.stack([row.reshape(-1).float() for row in rows], dim=1)
+        self.constants = torch.stack([row.reshape(-1).float() for row in rows], dim=1)
+        self.moving = torch.zeros(0, self.count, device=self.device)
+        self._take_values(self.constants[:, :0])
         self.scene = torch.arange(self.count, device=self.device) // max(self.particles, 1)
         self.order = torch.arange(self.count, dtype=torch.int32, device=self.device)
         self.momentum = torch.zeros(0, 4, device=self.device)
@@ -52,13 +51,18 @@ class FusedUpdated(Fused):
         self.crossing = 1e-3  # how many cells a particle enters in a substep; measured by the rollouts
         self._measured = torch.zeros(1, pin_memory=self.device.type == "cuda")
         self._copied: torch.cuda.Event | None = None
-        self.spare = (torch.zeros(0, device=self.device),) * 3  # for a sort: rows, order, work
         self.filled = torch.zeros(0, dtype=torch.int32, device=self.device)
         self.place = torch.zeros(2, self.count, dtype=torch.int32, device=self.device)  # cell, rank in it
         self.grid = GridSpec(bound.settings.dx, (0, 0, 0), (0, 0, 0))
 
     def _take_values(self, values: Tensor) -> None:
-        self.constants[:, 5 : 5 + values.shape[1]] = values
+        self.constants = torch.cat([self.constants[:, :5], values.float()], dim=1)
+        rows = (40 if self.plastic else 31) + values.shape[1]
+        if rows > len(self.moving):
+            check_indices(rows * self.count)
+            self.moving = torch.zeros(rows, self.count, device=self.device)
+            self.spare = (self.moving[:0],) * 3  # for a sort: rows, order, work
+            self.repeater.forget()
 
     def _take_grid(self, grid: GridSpec, width: int) -> None:
         """Allocate buffers for a grid, and drop the graphs of another one."""
@@ -171,7 +175,8 @@ class FusedUpdated(Fused):
             self.order, state.position.contiguous(), state.velocity.contiguous(), state.affine.contiguous(),
             state.F_elastic.contiguous(), state.F_total.contiguous(), state.lost.contiguous(),
             state.internal.contiguous() if state.internal is not None else self.load, self.constants, self.moving,
-            self.count, PLASTIC=self.plastic, INTERNAL=internal, BLOCK=block, num_warps=4,
+            self.count, PLASTIC=self.plastic, INTERNAL=internal, VALUES=self.constants.shape[1] - 5, BLOCK=block,
+            num_warps=4,
         )  # fmt: skip
 
     def _several(self, steps: int, options: dict[str, Any]) -> None:
@@ -199,7 +204,7 @@ class FusedUpdated(Fused):
         grid, settings = self.grid, self.settings
         kernels.updated_particles[(-(-self.count // 32),)](
             self.moving, self.order, self.load, self.count,
-            self.momentum, self.velocity, self.schedule, self.vectors, self.scenes, self.numbers, self.space,
+            self.momentum, self.velocity, self.schedule, self.vectors, self.scenes, self.tables.buffer,
             self.first_step, offset, self.law_table, self.force_in, *grid.offset, *grid.resolution, grid.dx,
             1 / grid.dx, settings.stiffness_damping, self.particles,
             **options, PLASTIC=self.plastic, MLS=settings.mls, WIDTH=self.momentum.shape[1], GATHER=gather,

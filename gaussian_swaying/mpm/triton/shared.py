@@ -8,16 +8,13 @@ stay loops in Triton's intermediate code: if they are unrolled, its passes take 
 import triton
 import triton.language as tl
 
-from gaussian_swaying.geometry.linalg_triton import largest, largest_eigenvalue, load3, matmul, transpose
-from gaussian_swaying.mpm.forces import TWIN_VECTOR
+from gaussian_swaying.geometry.linalg_triton import largest, largest_eigenvalue, load3, matmul, read, transpose
 
 SCHEDULE = 4
 """Columns of the schedule, a row per substep: how long forces act [s], the substep [s], the decay of velocities.
 
 Row 0 has a last column: how long forces act in the last substep.
 """
-
-VECTOR = tl.constexpr(TWIN_VECTOR)
 
 # Numbers that differ between bodies and between grids, and are not specialised. Otherwise Triton would compile a kernel
 # again whenever one of them becomes one or a multiple of 16, in the middle of a run, even while a graph is recorded.
@@ -45,25 +42,41 @@ def axis_weights(f, inverse_dx):
 
 
 @triton.jit
-def vector_of(vectors, scenes, step, scene):
-    """Return the pointer to the vector of a ``forces.ForceTwin`` for a substep and a scene."""
-    return vectors + (step * scenes + scene) * VECTOR
+def _columns(values, count, index, mask, FIRST: tl.constexpr, COUNT: tl.constexpr):
+    """COUNT values of some particles from row FIRST on, as a tuple."""
+    found = ()
+    for k in tl.static_range(COUNT):
+        found = found + (tl.load(values + (FIRST + k) * count + index, mask, 0.0),)
+    return found
 
 
 @triton.jit
-def twin_force(
-    TWIN: tl.constexpr, OPTIONS: tl.constexpr, SPACE: tl.constexpr, F, velocity, position, index, mask, scene, values,
-    count, vectors, scenes, step, numbers, space,
+def twin_data(
+    k: tl.constexpr, FORCES: tl.constexpr, index, mask, scene, values, count, vectors, scenes, step, numbers
 ):  # fmt: skip
-    """Force of a ``forces.ForceTwin`` on some particles [N] and their resistance [kg/s]; with SPACE, by their place."""
-    first = load3(values, count, index, mask)
-    last = tl.load(values + 3 * count + index, mask, 0.0)
-    vector = vector_of(vectors, scenes, step, scene)
-    value = (first[0], first[1], first[2], last)
-    if SPACE:
-        force, resistance = TWIN(F, velocity, position, value, vector, numbers, space, OPTIONS)
-    else:
-        force, resistance = TWIN(F, velocity, value, vector, numbers, OPTIONS)
+    """The numbers that the device function of force k gets: of its points, of all, and of the substep."""
+    point = _columns(values, count, index, mask, FORCES.per_point[k][0], FORCES.per_point[k][1])
+    row = vectors + (step * scenes + scene) * FORCES.width
+    own = read(numbers, FORCES.numbers[k][0], FORCES.numbers[k][1])
+    return point, own, read(row, FORCES.per_substep[k][0], FORCES.per_substep[k][1])
+
+
+@triton.jit
+def twin_forces(
+    FORCES: tl.constexpr, F, velocity, position, index, mask, scene, values, count, vectors, scenes, step, numbers
+):  # fmt: skip
+    """Sum of the forces with twins on some particles [N] and of their resistances [kg/s]; FORCES: ``Composed``."""
+    for k in tl.static_range(len(FORCES.functions)):
+        point, own, now = twin_data(k, FORCES, index, mask, scene, values, count, vectors, scenes, step, numbers)
+        more, drag = FORCES.functions[k](
+            F, velocity, position, point, own, now, numbers + FORCES.tables[k], FORCES.options[k]
+        )
+        if k == 0:
+            force = more
+            resistance = drag
+        else:
+            force = (force[0] + more[0], force[1] + more[1], force[2] + more[2])
+            resistance += drag
     return force, resistance
 
 

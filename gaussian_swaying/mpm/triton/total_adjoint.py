@@ -15,7 +15,7 @@ import torch
 import triton
 from torch import Tensor
 
-from gaussian_swaying.mpm.forces import Force, ForceTwin, tensors_of
+from gaussian_swaying.mpm.forces import Force, tensors_of
 from gaussian_swaying.mpm.formulations.formulation import Formulation
 from gaussian_swaying.mpm.state import MPMState
 from gaussian_swaying.mpm.timestep import kick_time
@@ -23,6 +23,7 @@ from gaussian_swaying.mpm.transfer import Stencil, gather, scatter
 from gaussian_swaying.mpm.triton import adjoint_kernels as kernels
 from gaussian_swaying.mpm.triton.fused import MAX_STEPS, Adjoint, at_home
 from gaussian_swaying.mpm.triton.fused_total import REGISTERS, FusedTotal
+from gaussian_swaying.mpm.twins import Twin
 
 Watch = Callable[[int], None] | None
 
@@ -59,14 +60,12 @@ class _Pass:
     """The gradients that the kernels of one backward pass compute, and the buffers in which they sum.
 
     Attributes:
-        twin: The force, if any.
         options: Of the kernels of the forward pass.
         flags: Which gradients are wanted: MATERIAL, SHARES, MASS and WEIGHTS.
         partial: Sums of the cells, with 27 rows per cell.
         width: Columns of ``partial``; eight if there are gradients by nodal velocities.
     """
 
-    twin: ForceTwin | None
     options: dict[str, Any]
     flags: dict[str, bool]
     partial: Tensor
@@ -141,8 +140,9 @@ class TotalAdjoint:
         run = _Run(state, dt, steps, segment(steps, checkpoint, self.nodes), tuple(forces), watch)
         vectors = numbers = None
         if forces:
-            twin = forces[0].twin()
-            vectors, numbers = twin.vectors(state.time, torch.full_like(state.time, dt), steps), twin.numbers()
+            twin = _twin(forces[0])
+            vectors = twin.per_substep.take(state.time, torch.full_like(state.time, dt), steps)
+            numbers = torch.as_tensor(twin.numbers.take())
         laws, points, holds = bound.body.laws, bound.body.points, bound.point_holds
         displacement, velocity = _Rollout.apply(
             self, run, state.node_displacement, state.node_velocity, laws.mu, laws.lam, points.volume,
@@ -188,23 +188,23 @@ class TotalAdjoint:
     ) -> dict[str, Tensor]:
         """Gradients by the inputs of :class:`_Rollout`, by name, from those by the nodal fields at the end."""
         fused, nodes = self.fused, self.nodes
-        twin = run.forces[0].twin() if run.forces else None
+        loaded = len(run.forces) > 0
         fused.asked = ()
-        options = fused.options_for(twin)
+        options = fused.options_for([_twin(force) for force in run.forces])
         if numbers is not None:
-            fused.numbers[: len(numbers)].copy_(numbers)
-        self._make_room(run.every, twin is not None)
+            fused.tables.buffer[: len(numbers)].copy_(numbers)
+        self._make_room(run.every, loaded)
         self.bars.zero_()
         self.bars.view(nodes, 2, 4)[:, 0, :3] = displacement.reshape(-1, 3)[self.active].float()
         self.bars.view(nodes, 2, 4)[:, 1, :3] = velocity.reshape(-1, 3)[self.active].float()
-        width = 8 if twin is not None or options["VISCOUS"] else 4
+        width = 8 if loaded or options["VISCOUS"] else 4
         partial = self.sums(width)
         for buffer in (self.force_bar, self.mass_bar, self.found, partial, fused.fields):
             buffer.zero_()
         material = any(needs[name] for name in ("mu", "lam", "volume"))
-        shares = twin is not None and (needs["vectors"] or needs["numbers"])
+        shares = loaded and (needs["vectors"] or needs["numbers"])
         flags = {"MATERIAL": material, "SHARES": shares, "MASS": needs["inverse_mass"], "WEIGHTS": needs["weight"]}
-        asked = _Pass(twin, options, flags, partial, width)
+        asked = _Pass(options, flags, partial, width)
         if fused.points is not None:
             self.weight_bar.zero_()
         vector_bars: list[Tensor] = []
@@ -213,9 +213,7 @@ class TotalAdjoint:
             first = n * run.every
             count = min(run.every, run.steps - first)
             if vectors is not None:
-                own = vectors[first : first + count]
-                own = own.reshape(count, -1, own.shape[-1]).expand(-1, fused.scenes, -1)
-                fused.vectors[:count, :, : own.shape[-1]].copy_(own)
+                fused.write_substeps(0, vectors[first : first + count])
             fused.schedule[: count + 2].copy_(fused.table(run.kicks[n], run.dt, count), non_blocking=True)
             self._segment(run.starts[n], count, asked)
             if shares:
@@ -318,7 +316,7 @@ class TotalAdjoint:
         )  # fmt: skip
 
     def _particles(self, offset: int, asked: _Pass) -> None:
-        fused, twin, options, flags = self.fused, asked.twin, asked.options, asked.flags
+        fused, options, flags = self.fused, asked.options, asked.flags
         per_program = max(1, 32 // fused.lanes)
         _, ny, nz = fused.grid.resolution
         cut = fused.pieces > fused.cells
@@ -327,12 +325,11 @@ class TotalAdjoint:
             fused.fraction, fused.material, fused.law, fused.law_table, fused.values, fused.count,
             fused.piece_start, fused.piece_node, fused.piece_scene, fused.pieces,
             fused.fields, self.force_bar, to, self.found, self.shares,
-            fused.vectors, fused.scenes, fused.numbers, fused.first_step, offset, self.last,
+            fused.vectors, fused.scenes, fused.tables.buffer, fused.first_step, offset, self.last,
             ny * nz, nz, 1 / fused.grid.dx, fused.settings.stiffness_damping,
-            LAWS=fused.laws, MULTI=options["MULTI"], ADJOINT=None if twin is None else twin.adjoint,
-            OPTIONS=options["OPTIONS"], VISCOUS=options["VISCOUS"], MATERIAL=flags["MATERIAL"],
-            SHARES=flags["SHARES"], WIDTH=asked.width, CELLS=per_program, LANES=fused.lanes, num_warps=1,
-            **REGISTERS.get(fused.lanes, {}),
+            LAWS=fused.laws, MULTI=options["MULTI"], FORCES=options["FORCES"], VISCOUS=options["VISCOUS"],
+            MATERIAL=flags["MATERIAL"], SHARES=flags["SHARES"], WIDTH=asked.width, CELLS=per_program, LANES=fused.lanes,
+            num_warps=1, **REGISTERS.get(fused.lanes, {}),
         )  # fmt: skip
         if cut:
             fused.join_pieces(to, asked.partial, asked.width)
@@ -443,9 +440,9 @@ def why_not(fused: FusedTotal, state: MPMState, forces: Sequence[Force]) -> str 
         return "boundaries other than pins that hold all the time, and contact, have no backward kernels"
     if any(derivative is None for derivative in fused.laws.adjoints):
         return "a law has no backward kernel (`LawTwin.adjoint`)"
-    if len(forces) > 1 or any(not force.has_twin for force in forces):
-        return "only one force with a Triton twin has a backward kernel"
     twin = forces[0].twin() if forces else None
+    if len(forces) > 1 or (forces and twin is None):
+        return "only one force with a Triton twin has a backward kernel"
     if twin is not None and twin.adjoint is None:
         return f"this {type(forces[0]).__name__} has no backward kernel"
     free = [points.mass, points.volume, points.youngs_modulus, points.poisson_ratio]
@@ -460,6 +457,13 @@ def why_not(fused: FusedTotal, state: MPMState, forces: Sequence[Force]) -> str 
     if any(t.requires_grad for t in state.tensors()):
         return "particle fields require gradients, but the nodal ones do not"
     return None
+
+
+def _twin(force: Force) -> Twin:
+    """The twin of a force that has one."""
+    twin = force.twin()
+    assert twin is not None
+    return twin
 
 
 def _own(tensor: Tensor, nodal: tuple[Tensor | None, ...]) -> bool:

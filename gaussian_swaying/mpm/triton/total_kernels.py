@@ -22,7 +22,7 @@ from gaussian_swaying.mpm.triton.shared import (
     axis_weights,
     keep_largest,
     node_weight,
-    twin_force,
+    twin_forces,
     wave_speed,
 )
 
@@ -132,18 +132,17 @@ def total_particles(
     fraction, material, law, law_table, values, force_in, load, order, count,
     cell_start, cell_node, cell_scene, cells,
     fields, partial,
-    schedule, vectors, scenes, numbers, space, first_step, step_offset,
+    schedule, vectors, scenes, numbers, first_step, step_offset,
     sx, sy, ox, oy, oz, scene_size, dx, inverse_dx, viscous_time,
-    LAWS: tl.constexpr, MULTI: tl.constexpr, TWIN: tl.constexpr, OPTIONS: tl.constexpr, SPACE: tl.constexpr,
-    FORCE: tl.constexpr, IMPLICIT: tl.constexpr, VISCOUS: tl.constexpr, POSITION: tl.constexpr, WIDTH: tl.constexpr,
-    CELLS: tl.constexpr, LANES: tl.constexpr,
+    LAWS: tl.constexpr, MULTI: tl.constexpr, FORCES: tl.constexpr, FORCE: tl.constexpr, IMPLICIT: tl.constexpr,
+    VISCOUS: tl.constexpr, POSITION: tl.constexpr, WIDTH: tl.constexpr, CELLS: tl.constexpr, LANES: tl.constexpr,
 ):  # fmt: skip
     """``total``: forces of the particles of some cells, summed into 27 rows of ``partial`` per cell.
 
     Lanes without a particle have no volume, values of a twin or mass, so they add nothing. The first step of a rollout
     takes the previous substep from row 0 of the schedule.
     """
-    LOADED: tl.constexpr = (TWIN is not None) or FORCE
+    LOADED: tl.constexpr = (len(FORCES.functions) > 0) or FORCE
     step = tl.load(first_step) + step_offset
     kick = tl.load(schedule + (step + 1) * 4)
     before = tl.load(schedule + step * 4)
@@ -164,19 +163,17 @@ def total_particles(
         zero = volume * 0
         value = (zero, zero, zero)
         resistance = zero
-        if TWIN is not None:
-            at = u
-            if SPACE:
-                within = node - scene * scene_size
-                bx = within // sx
-                by = (within - bx * sx) // sy
-                at = (
-                    (bx + ox + f[0]) * dx + u[0],
-                    (by + oy + f[1]) * dx + u[1],
-                    (within - bx * sx - by * sy + oz + f[2]) * dx + u[2],
-                )
-            value, resistance = twin_force(
-                TWIN, OPTIONS, SPACE, F, v, at, index, mask, scene, values, count, vectors, scenes, step, numbers, space
+        if len(FORCES.functions) > 0:
+            within = node - scene * scene_size
+            bx = within // sx
+            by = (within - bx * sx) // sy
+            at = (
+                (bx + ox + f[0]) * dx + u[0],
+                (by + oy + f[1]) * dx + u[1],
+                (within - bx * sx - by * sy + oz + f[2]) * dx + u[2],
+            )
+            value, resistance = twin_forces(
+                FORCES, F, v, at, index, mask, scene, values, count, vectors, scenes, step, numbers
             )
         if FORCE:
             where = tl.load(order + index, mask, 0)

@@ -22,7 +22,7 @@ from gaussian_swaying.mpm.triton.shared import (
     axis_weights,
     keep_largest,
     node_weight,
-    twin_force,
+    twin_forces,
     wave_speed,
 )
 
@@ -115,18 +115,18 @@ def _locate(x, dx, o, n):
 @triton.jit(do_not_specialize=VARIES)
 def updated_particles(
     moving, order, load, count,
-    momentum, velocity, schedule, vectors, scenes, numbers, space, first_step, step_offset, law_table, force_in,
+    momentum, velocity, schedule, vectors, scenes, numbers, first_step, step_offset, law_table, force_in,
     ox, oy, oz, nx, ny, nz, dx, inverse_dx, viscous_time, scene_size,
-    LAWS: tl.constexpr, PLASTIC: tl.constexpr, MULTI: tl.constexpr, TWIN: tl.constexpr, OPTIONS: tl.constexpr,
-    SPACE: tl.constexpr, FORCE: tl.constexpr, IMPLICIT: tl.constexpr, VISCOUS: tl.constexpr, MLS: tl.constexpr,
-    WIDTH: tl.constexpr, GATHER: tl.constexpr, SCATTER: tl.constexpr,
+    LAWS: tl.constexpr, PLASTIC: tl.constexpr, MULTI: tl.constexpr, FORCES: tl.constexpr, FORCE: tl.constexpr,
+    IMPLICIT: tl.constexpr, VISCOUS: tl.constexpr, MLS: tl.constexpr, WIDTH: tl.constexpr, GATHER: tl.constexpr,
+    SCATTER: tl.constexpr,
 ):  # fmt: skip
     """``updated``: the end of substep ``step`` - 1 (GATHER) and the start of substep ``step`` (SCATTER).
 
     Rows of ``moving``: position 0, F 3, velocity 12, affine 15, lost 24, internal 25, mass 26, volume 27, mu 28,
-    lam 29, law 30, the four values of a twin 31, and total F 35 where a law is plastic.
+    lam 29, law 30, total F 31 where a law is plastic, and then the numbers that forces have for each point.
     """
-    LOADED: tl.constexpr = (TWIN is not None) or FORCE
+    LOADED: tl.constexpr = (len(FORCES.functions) > 0) or FORCE
     step = tl.load(first_step) + step_offset
     kick = tl.load(schedule + (step + 1) * 4)
     before = tl.load(schedule + step * 4)
@@ -147,7 +147,7 @@ def updated_particles(
     sy = nz
     sx = ny * nz
     if PLASTIC:
-        F_total = load9(moving + 35 * count, count, index, mask)
+        F_total = load9(moving + 31 * count, count, index, mask)
     else:
         F_total = F
     stress = F
@@ -181,7 +181,7 @@ def updated_particles(
         store9(moving + 3 * count, count, index, F, mask)
         store3(moving + 12 * count, count, index, v, mask)
         if PLASTIC:
-            store9(moving + 35 * count, count, index, F_total, mask)
+            store9(moving + 31 * count, count, index, F_total, mask)
             tl.store(moving + 25 * count + index, internal, mask)
     else:
         v = load3(moving + 12 * count, count, index, mask)
@@ -191,11 +191,11 @@ def updated_particles(
     force = (zero, zero, zero)
     resistance = zero
     if SCATTER:
-        if TWIN is not None:
-            force, resistance = twin_force(
-                TWIN, OPTIONS, SPACE, F_total, v, x, index, mask, scene, moving + 31 * count, count, vectors, scenes,
-                step, numbers, space,
-            )  # fmt: skip
+        if len(FORCES.functions) > 0:
+            values = moving + (40 if PLASTIC else 31) * count
+            force, resistance = twin_forces(
+                FORCES, F_total, v, x, index, mask, scene, values, count, vectors, scenes, step, numbers
+            )
         if FORCE:
             force, resistance = add_given(force, resistance, force_in, where, mask)
     if LOADED:
@@ -355,9 +355,9 @@ def updated_nodes(
 @triton.jit(do_not_specialize=VARIES)
 def updated_load(
     order, position, velocity, affine, F_elastic, F_total, lost, internal, constants, moving, count,
-    PLASTIC: tl.constexpr, INTERNAL: tl.constexpr, BLOCK: tl.constexpr,
+    PLASTIC: tl.constexpr, INTERNAL: tl.constexpr, VALUES: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
-    """``updated``: particle fields, and the ``constants`` (P, 9) of rows 26 to 34, into the rows of ``moving``."""
+    """``updated``: particle fields, and ``constants`` (P, 5 + VALUES), the other rows, into the rows of ``moving``."""
     index = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
     mask = index < count
     where = tl.load(order + index, mask, 0)
@@ -368,9 +368,14 @@ def updated_load(
     tl.store(moving + 24 * count + index, tl.load(lost + where, mask, 0).to(tl.float32), mask)
     if INTERNAL:
         tl.store(moving + 25 * count + index, tl.load(internal + where, mask, 0.0), mask)
-    store9(moving + 26 * count, count, index, load9(constants, 1, where * 9, mask), mask)
+    first = constants + where * (5 + VALUES)
+    for row in tl.static_range(5):
+        tl.store(moving + (26 + row) * count + index, tl.load(first + row, mask, 0.0), mask)
+    for row in tl.static_range(VALUES):
+        to = moving + ((40 if PLASTIC else 31) + row) * count
+        tl.store(to + index, tl.load(first + 5 + row, mask, 0.0), mask)
     if PLASTIC:
-        store9(moving + 35 * count, count, index, load9(F_total, 1, where * 9, mask), mask)
+        store9(moving + 31 * count, count, index, load9(F_total, 1, where * 9, mask), mask)
 
 
 @triton.jit(do_not_specialize=VARIES)
@@ -428,7 +433,7 @@ def updated_read(
     if INTERNAL:
         tl.store(internal + where, tl.load(moving + 25 * count + index, mask, 0.0), mask)
     if PLASTIC:
-        store9(F_total, 1, where * 9, load9(moving + 35 * count, count, index, mask), mask)
+        store9(F_total, 1, where * 9, load9(moving + 31 * count, count, index, mask), mask)
 
 
 @triton.jit(do_not_specialize=VARIES)

@@ -12,8 +12,9 @@ from gaussian_swaying.aero.wind import SpatialWind, WindField
 from gaussian_swaying.aero.wind_force import WindForce
 from gaussian_swaying.mpm.boundaries.pinned_region import PinnedRegion
 from gaussian_swaying.mpm.boundaries.plane import Plane
-from gaussian_swaying.mpm.forces import Force, ForceTwin
+from gaussian_swaying.mpm.forces import Force
 from gaussian_swaying.mpm.laws.sand import Sand
+from gaussian_swaying.mpm.twins import Numbers, Twin
 
 from .bodies import (
     DT,
@@ -306,24 +307,22 @@ def test_a_wind_that_depends_on_the_place(kernel_device, formulation):
 if fused is not None:
 
     @triton.jit
-    def _toward(F, velocity, values, vector, numbers, OPTIONS: tl.constexpr):
+    def _toward(F, velocity, position, point, numbers, now, table, OPTIONS: tl.constexpr):
         """Pulls along a vector by a share of each particle; has a resistance if compiled with it."""
-        scale = values[0] * tl.load(numbers) * F[0]
-        resistance = values[0] * 0
+        scale = point[0] * numbers[0] * F[0] * tl.load(table + 1)
+        resistance = point[0] * 0
         if OPTIONS[0]:
-            resistance = values[1]
+            resistance = point[1]
         force = (
-            scale * tl.load(vector) - resistance * velocity[0],
-            scale * tl.load(vector + 1) - resistance * velocity[1],
-            scale * tl.load(vector + 2) - resistance * velocity[2],
+            scale * now[0] - resistance * velocity[0],
+            scale * now[1] - resistance * velocity[1],
+            scale * now[2] - resistance * velocity[2],
         )
         return force, resistance
 
 
 class _Toward(Force):
     """A force outside the package with a twin."""
-
-    has_twin = True
 
     def __init__(self, points, resists):
         super().__init__()
@@ -341,15 +340,19 @@ class _Toward(Force):
         return force - self.share[..., 1:] * state.velocity, self.share[..., 1]
 
     def twin(self):
-        return ForceTwin(
-            function=_toward,
+        return Twin(
+            _toward,
             options=(self.resists,),
             implicit=self.resists,
             sources=(self.share,),
-            values=lambda: self.share,
-            numbers=lambda: torch.tensor([2.5], device=self.share.device),
-            vectors=lambda time, dt, steps: self.along(
-                time + dt * torch.arange(steps, dtype=torch.float64, device=time.device)
+            per_point=Numbers(2, lambda: self.share),
+            numbers=Numbers(1, lambda: torch.tensor([1.25], device=self.share.device)),
+            table=Numbers(2, lambda: [1.0, 2.0]),
+            per_substep=Numbers(
+                3,
+                lambda time, dt, steps: self.along(
+                    time + dt * torch.arange(steps, dtype=torch.float64, device=time.device)
+                ),
             ),
         )
 
@@ -358,13 +361,14 @@ class _Toward(Force):
 @pytest.mark.parametrize("resists", [False, True])
 @pytest.mark.parametrize("formulation", FORMULATIONS)
 def test_a_twin_from_outside(kernel_device, formulation, resists):
-    """It comes before a wind, so the wind runs in torch; and the kernels can be given another twin."""
+    """Alone, with winds before and after it, and without it again."""
     points = make_points(kernel_device, count=12)
     own = _Toward(points, resists)
 
     def run(solver, state):
         states = [solver.rollout(state, DT, 2, own)]
-        states.append(solver.rollout(states[-1], DT, 2, [own, make_load(points)]))
+        for forces in ([own, make_load(points)], [make_load(points, seed=8), own, own]):
+            states.append(solver.rollout(states[-1], DT, 2, forces))
         states.append(solver.rollout(states[-1], DT, 2, make_load(points)))
         own.share *= 2
         states.append(solver.rollout(states[-1], DT, 1, own))

@@ -132,7 +132,7 @@ def measure_winds(count: int, formulation: str, device: torch.device, steps: int
     rows = []
     for name, found in in_turns(runs, device, steps, rounds).items():
         solver, load = parts[name]
-        kernels = solver.fused() is not None and load.has_twin
+        kernels = solver.fused() is not None and load.twin() is not None
         row: Row = {"particles": points.count, "formulation": formulation, "wind": name, "substeps": steps}
         rows.append(row | found | {"path": "kernels" if kernels else "torch"})
     return rows

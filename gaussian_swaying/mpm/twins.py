@@ -1,0 +1,228 @@
+"""One way to declare a compiled twin: laws, forces, effects of the wind and boundaries return a :class:`Twin`.
+
+The torch methods of a component are its definition. A twin is the same in a device function: scalars in, scalars out.
+The kernel loads the numbers that the function gets, so the function itself only loads from its ``table``, as
+``tl.load(table + index)``. Vectors are tuples of three scalars, matrices of nine, row by row. ``OPTIONS`` are constants
+for which the function is compiled; the last of them is the twin's parts, a :class:`Composed`.
+
+- Force: ``(F, velocity, position, point, numbers, now, table, OPTIONS)`` returns the force (three numbers) and the
+  resistance, zero for none. ``F`` is the total deformation gradient. Both must be zero where all numbers of the point
+  are zero.
+- Effect of the wind: ``(velocity, position, numbers, now, table, OPTIONS)`` returns the changed velocity.
+- Boundary: ``(place, numbers, table, mask)`` returns the signed distance from a solid at rest and its normal; ``mask``
+  is for loads. Its first option is what it stops, in ``plane.KINDS``.
+- Law: several functions, see :class:`~gaussian_swaying.mpm.laws.triton.functions.LawFunctions`; they get ``numbers`` as
+  four scalars, padded with zeros.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+
+from gaussian_swaying._graphs import fingerprint, tensors_in
+
+
+@dataclass(frozen=True)
+class Numbers:
+    """The number of numbers, and a function that returns them as a tensor or a sequence."""
+
+    count: int
+    take: Callable[..., Any]
+
+
+NONE = Numbers(0, tuple)
+
+
+@dataclass(frozen=True)
+class Twin:
+    """A device function, and the numbers that it gets.
+
+    Attributes:
+        function: A ``@triton.jit`` function; its arguments are listed at the top of this file.
+        options: Constants that it is compiled for.
+        per_point: Numbers of each point, shape (..., P, count); forces only.
+        numbers: Numbers for all points. Those of a force are taken in every rollout, and may require a gradient.
+        per_substep: Numbers of each substep. Of a force, ``take(time, dt, steps)`` returns them at the start of
+            ``steps`` (at most 256) substeps of ``dt`` from ``time`` on, scalar float64 tensors; shape (steps, count),
+            or (steps, B, 1, count) for a batch of scenes. Of an effect, ``take(moment)`` returns them for a ``Moment``
+            of n times, shape (n, count). If the component is ``recordable``, both run in CUDA graphs, as do the
+            ``numbers`` of a force.
+        table: More numbers, of any count.
+        sources: Tensors and modules; ``per_point``, ``table`` and, except of a force, ``numbers`` are taken again when
+            one of them was replaced or written to.
+        implicit: Whether a force has a resistance, so that it acts at the velocity at the end of the substep.
+        adjoint: Of a force, a device function ``(F, velocity, point, numbers, now, table, a, OPTIONS)`` that returns
+            the gradients of a . force, with three numbers a: by F (nine), by the velocity (three), by the first three
+            numbers of the substep and by the first three of ``numbers``. No other input of the force may require a
+            gradient then. None for a force whose gradients need torch.
+        parts: Twins that the function calls, such as those of the effects of a wind.
+    """
+
+    function: Any
+    options: tuple[Any, ...] = ()
+    per_point: Numbers = NONE
+    numbers: Numbers = NONE
+    per_substep: Numbers = NONE
+    table: Numbers = NONE
+    sources: tuple[Tensor | nn.Module, ...] = ()
+    implicit: bool = False
+    adjoint: Any = None
+    parts: tuple[Twin, ...] = ()
+
+
+class Twinned:
+    """Base of components that may have a twin; a subclass does not inherit it, because it may compute something else.
+
+    A subclass that computes the same says ``twin = Base.twin``.
+    """
+
+    def __init_subclass__(cls, **settings: Any) -> None:
+        super().__init_subclass__(**settings)
+        if "twin" not in vars(cls):
+            cls.twin = Twinned.twin  # type: ignore[method-assign]
+
+    def twin(self) -> Twin | None:
+        """The compiled twin; None for a component that runs in torch only. It is cheap: numbers are taken later."""
+        return None
+
+
+class Composed:
+    """The device functions of several twins, and where each finds its numbers, as one constant of a compiled kernel.
+
+    Args:
+        twins: The twins.
+
+    Attributes:
+        functions: Their device functions.
+        adjoints: Those of the gradients, or None.
+        options: The options of each, and its parts.
+        per_point: First and number of the numbers of a point, for each twin; the others likewise.
+        numbers: Those of all points.
+        per_substep: Those of a substep.
+        tables: Where the table of each starts: that of its parts (``size`` entries), and then its own.
+        parts: The parts of each.
+        size: Length of all numbers and tables in one buffer, the numbers first.
+        width: Length of a row of the numbers of a substep, a multiple of 16.
+        cache_key: Changes with the source of the functions, for the caches of Triton.
+    """
+
+    def __init__(self, twins: Sequence[Twin]) -> None:
+        self.parts = tuple(Composed(twin.parts) for twin in twins)
+        self.functions = tuple(twin.function for twin in twins)
+        self.adjoints = tuple(twin.adjoint for twin in twins)
+        self.options = tuple((*twin.options, part) for twin, part in zip(twins, self.parts, strict=True))
+        self.per_point = _places(twin.per_point.count for twin in twins)
+        self.numbers = _places(twin.numbers.count for twin in twins)
+        self.per_substep = _places(twin.per_substep.count for twin in twins)
+        lengths = [part.size + twin.table.count for twin, part in zip(twins, self.parts, strict=True)]
+        start = end_of(self.numbers)
+        self.tables = tuple(start + first for first, _ in _places(lengths))
+        self.size: int = start + sum(lengths)
+        self.width = -(-max(end_of(self.per_substep), 1) // 16) * 16
+        functions = [device_key(function) for function in (*self.functions, *self.adjoints)]
+        layout = (self.options, self.per_point, self.numbers, self.per_substep, self.tables, self.size)
+        self.cache_key = hashlib.sha256(repr((functions, layout)).encode()).hexdigest()
+
+    def __repr__(self) -> str:
+        return f"Twins_{self.cache_key[:16]}"  # part of the names and keys of compiled functions
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, Composed) and self.cache_key == other.cache_key
+
+    def __hash__(self) -> int:
+        return hash(self.cache_key)
+
+
+def _places(counts: Any) -> tuple[tuple[int, int], ...]:
+    """First and number of some groups of numbers, one after the other."""
+    found, first = [], 0
+    for count in counts:
+        found.append((first, count))
+        first += count
+    return tuple(found)
+
+
+def end_of(places: Sequence[tuple[int, int]]) -> int:
+    """The end of the last of some groups of numbers."""
+    return sum(places[-1]) if places else 0
+
+
+def device_key(function: Any) -> str:
+    """A key that identifies a device function; in the interpreter, which caches nothing, its name."""
+    return str(getattr(function, "cache_key", "")) + repr(function)
+
+
+class Watched:
+    """Tells whether tensors or modules were replaced or written to since it was asked last."""
+
+    def __init__(self) -> None:
+        self._key: object = None
+        self._held: object = ()  # so that no new object gets the id of an old one
+
+    def changed(self, sources: Sequence[Tensor | nn.Module]) -> bool:
+        """True the first time, if there is a change, and if changes cannot be detected (inference tensors)."""
+        modules = [source for source in sources if isinstance(source, nn.Module)]
+        tensors = [source for source in sources if isinstance(source, Tensor)] + tensors_in(modules)
+        key = None
+        if not any(tensor.is_inference() for tensor in tensors):
+            ids = tuple(map(id, (*modules, *tensors)))
+            key = (ids, fingerprint(modules), tuple(tensor._version for tensor in tensors))
+        new = key is None or key != self._key
+        self._key, self._held = key, (modules, tensors)
+        return new
+
+
+class Tables:
+    """Numbers and tables of twins in one buffer; those of a twin are written again only if its sources have changed.
+
+    Args:
+        device: Device of the buffer.
+
+    Attributes:
+        buffer: The numbers and tables, float32, at the places that :class:`Composed` says. Its address changes if it
+            must grow.
+    """
+
+    def __init__(self, device: torch.device) -> None:
+        self.buffer = torch.zeros(1, device=device)
+        self._layout: Composed | None = None
+        self._watched: list[Watched] = []
+
+    def take(self, twins: Sequence[Twin], layout: Composed, numbers: bool = False) -> None:
+        """Bring the buffer up to date.
+
+        Args:
+            twins: The twins.
+            layout: The same twins, composed.
+            numbers: Whether to take the ``numbers`` of these twins, too; those of their parts are always taken.
+        """
+        if layout.size > len(self.buffer):
+            self.buffer = torch.zeros(layout.size, device=self.buffer.device)
+        pieces = list(_pieces(twins, layout, 0, numbers))
+        if layout != self._layout:
+            self._layout, self._watched = layout, [Watched() for _ in pieces]
+        for watched, (sources, entries) in zip(self._watched, pieces, strict=True):
+            if entries and watched.changed(sources):
+                for first, values in entries:
+                    found = torch.as_tensor(values.take())
+                    self.buffer[first : first + values.count].copy_(found.reshape(-1))
+
+
+def _pieces(
+    twins: Sequence[Twin], layout: Composed, start: int, numbers: bool
+) -> Iterator[tuple[tuple[Tensor | nn.Module, ...], list[tuple[int, Numbers]]]]:
+    """Yield what each twin reads from a buffer: its sources, and the place of its numbers and of its table."""
+    for twin, part, (first, _), table in zip(twins, layout.parts, layout.numbers, layout.tables, strict=True):
+        yield from _pieces(twin.parts, part, start + table, True)
+        entries = [(start + first, twin.numbers)] if numbers else []
+        entries += [(start + table + part.size, twin.table)]
+        yield twin.sources, [(place, values) for place, values in entries if values.count]
+
+
+__all__ = ["Numbers", "Twin"]
