@@ -312,7 +312,7 @@ class MPMSolver(Solver):
 
     def _fused_for(self, state: MPMState, forces: Sequence[Force]) -> Fused | None:
         """As :meth:`fused`, for rollouts with forces; also None if the host has to call a force in every substep."""
-        if not all(force.recordable for force in divide(forces)[1]):
+        if self._fused_obstacle is not None or not all(force.recordable for force in divide(forces)[1]):
             return None
         asking = [*state.tensors(), *tensors_of(forces)] if torch.is_grad_enabled() else []
         return self.fused(*asking)

@@ -9,8 +9,9 @@ for which the function is compiled; the last of them is the twin's parts, a :cla
   resistance, zero for none. ``F`` is the total deformation gradient. Both must be zero where all numbers of the point
   are zero.
 - Effect of the wind: ``(velocity, position, numbers, now, table, OPTIONS)`` returns the changed velocity.
-- Boundary: ``(place, numbers, table, mask)`` returns the signed distance from a solid at rest and its normal; ``mask``
-  is for loads. Its first option is what it stops, in ``plane.KINDS``.
+- Boundary: a solid. ``(place, numbers, table, mask, OPTIONS)`` returns the signed distance from it, at rest, and its
+  normal at places from its centre; ``mask`` is for loads. Motion, gap, friction and time window are those of every
+  ``Obstacle`` or ``Plane``.
 - Law: several functions, see :class:`~gaussian_swaying.mpm.laws.triton.functions.LawFunctions`; they get ``numbers`` as
   four scalars, padded with zeros.
 """

@@ -1,6 +1,6 @@
 """Obstacles in the kernels against torch; on a CPU in Triton's interpreter.
 
-Covers: mpm.triton.obstacle_kernels, mpm.triton.obstacles.
+Covers: geometry.distance_triton, mpm.triton.obstacle_kernels, mpm.triton.obstacles.
 """
 
 from pathlib import Path
@@ -63,11 +63,10 @@ def _ask_kernel(obstacle, place, time, device):
     gap, valid = (torch.full((count,), -7.0, device=device) for _ in range(2))
     facing, drive = (torch.zeros(count, 3, device=device) for _ in range(2))
     within = torch.zeros((), dtype=torch.int32, device=device)
-    row, whole, window, pose, grids = solids.of(0)
     kernels.obstacle_places[(-(-count // 32),)](
         place, torch.zeros(count, 4, device=device), torch.full_like(gap, 0.02), gap, facing, drive, valid, within,
-        count, row, whole, window, pose, grids, time, torch.full_like(time, DT), 0.01,
-        KIND=solids.kinds[0], MOVES=solids.moves[0], BLOCK=32,
+        count, solids.rows, solids.windows, solids.poses, solids.tables.buffer, time, torch.full_like(time, DT), 0.01,
+        SOLIDS=solids.twins, MOVES=solids.moves[0], BLOCK=32,
     )  # fmt: skip
     return gap, facing, drive, valid, int(within)
 

@@ -12,6 +12,7 @@ from gaussian_swaying.geometry.distance import ball_distance
 from gaussian_swaying.geometry.frame import SimFrame
 from gaussian_swaying.geometry.keyed_path import KeyedPath
 from gaussian_swaying.mpm.boundaries.obstacle import Obstacle
+from gaussian_swaying.mpm.twins import Numbers, Twin
 
 
 class BallObstacle(Obstacle):
@@ -49,3 +50,9 @@ class BallObstacle(Obstacle):
     def distance(self, place: Tensor) -> tuple[Tensor, Tensor]:
         """See :func:`~gaussian_swaying.geometry.distance.ball_distance`."""
         return ball_distance(place, self.radius.to(place))
+
+    def twin(self) -> Twin:
+        """See :class:`~gaussian_swaying.mpm.twins.Twin`."""
+        from gaussian_swaying.geometry.distance_triton import ball_distance
+
+        return Twin(ball_distance, numbers=Numbers(1, lambda: self.radius), sources=(self,))

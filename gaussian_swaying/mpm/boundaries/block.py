@@ -12,6 +12,7 @@ from gaussian_swaying.geometry.distance import box_distance
 from gaussian_swaying.geometry.frame import SimFrame
 from gaussian_swaying.geometry.keyed_path import KeyedPath, rotation_of
 from gaussian_swaying.mpm.boundaries.obstacle import Obstacle
+from gaussian_swaying.mpm.twins import Numbers, Twin
 
 
 class BoxObstacle(Obstacle):
@@ -61,3 +62,10 @@ class BoxObstacle(Obstacle):
         axes = self.axes.to(place)  # its columns are the sides of the box
         distance, normal = box_distance(place @ axes, self.half_sides.to(place))
         return distance, normal @ axes.T
+
+    def twin(self) -> Twin:
+        """See :class:`~gaussian_swaying.mpm.twins.Twin`."""
+        from gaussian_swaying.geometry.distance_triton import box_distance
+
+        numbers = Numbers(12, lambda: torch.cat([self.half_sides, self.axes.reshape(-1)]))
+        return Twin(box_distance, numbers=numbers, sources=(self,))

@@ -22,6 +22,7 @@ from torch import Tensor, nn
 from gaussian_swaying._graphs import Recordable
 from gaussian_swaying.geometry.frame import SimFrame
 from gaussian_swaying.geometry.regions import Region, RegionInFrame, whereabouts
+from gaussian_swaying.mpm.twins import Twinned
 
 BY_BODY = "by body"
 """The kind of a pin that becomes a hinge for a sheet, and a clamp for anything else."""
@@ -60,7 +61,7 @@ class Nodes:
         return self.share > self.threshold
 
 
-class Boundary(Recordable, nn.Module, ABC):
+class Boundary(Recordable, Twinned, nn.Module, ABC):
     """Base class of all boundary conditions.
 
     Args:

@@ -12,6 +12,7 @@ from gaussian_swaying.geometry.distance import capsule_distance
 from gaussian_swaying.geometry.frame import SimFrame
 from gaussian_swaying.geometry.keyed_path import KeyedPath
 from gaussian_swaying.mpm.boundaries.obstacle import Obstacle
+from gaussian_swaying.mpm.twins import Numbers, Twin
 
 
 class CapsuleObstacle(Obstacle):
@@ -57,3 +58,14 @@ class CapsuleObstacle(Obstacle):
     def distance(self, place: Tensor) -> tuple[Tensor, Tensor]:
         """See :func:`~gaussian_swaying.geometry.distance.capsule_distance`."""
         return capsule_distance(place, self.half_axis.to(place), self.radius.to(place))
+
+    def twin(self) -> Twin:
+        """See :class:`~gaussian_swaying.mpm.twins.Twin`."""
+        from gaussian_swaying.geometry.distance_triton import capsule_distance
+
+        def numbers() -> Tensor:
+            squared = self.half_axis.square().sum()
+            inverse = torch.where(squared > 0, 1 / squared, 0.0)
+            return torch.cat([self.radius[None], self.half_axis, inverse[None]])
+
+        return Twin(capsule_distance, numbers=Numbers(5, numbers), sources=(self,))

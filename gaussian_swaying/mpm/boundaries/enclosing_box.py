@@ -11,6 +11,7 @@ from gaussian_swaying._checks import check_vector
 from gaussian_swaying.geometry.frame import SimFrame
 from gaussian_swaying.mpm.boundaries.boundary import Boundary, Nodes
 from gaussian_swaying.mpm.boundaries.plane import Plane
+from gaussian_swaying.mpm.twins import Twin
 
 
 class EnclosingBox(Boundary):
@@ -60,3 +61,7 @@ class EnclosingBox(Boundary):
         for plane in self.planes:
             velocity = plane(velocity, nodes)
         return velocity
+
+    def twin(self) -> Twin:
+        """Nothing but that of each plane."""
+        return Twin(None, parts=tuple(plane.twin() for plane in self.planes))  # type: ignore[operator]

@@ -11,6 +11,7 @@ from gaussian_swaying._checks import check_vector
 from gaussian_swaying.geometry.frame import SimFrame
 from gaussian_swaying.geometry.keyed_path import KeyedPath
 from gaussian_swaying.mpm.boundaries.obstacle import Obstacle
+from gaussian_swaying.mpm.twins import Numbers, Twin
 
 
 class HalfSpaceObstacle(Obstacle):
@@ -51,3 +52,9 @@ class HalfSpaceObstacle(Obstacle):
         """Distance along the normal."""
         normal = self.normal.to(place)
         return (place * normal).sum(-1), normal.expand_as(place)
+
+    def twin(self) -> Twin:
+        """See :class:`~gaussian_swaying.mpm.twins.Twin`."""
+        from gaussian_swaying.geometry.distance_triton import half_space_distance
+
+        return Twin(half_space_distance, numbers=Numbers(3, lambda: self.normal), sources=(self,))

@@ -10,6 +10,7 @@ from torch import Tensor
 from gaussian_swaying._checks import check_choice, check_positive, check_vector
 from gaussian_swaying.geometry.frame import SimFrame
 from gaussian_swaying.mpm.boundaries.boundary import Boundary, Nodes
+from gaussian_swaying.mpm.twins import Numbers, Twin
 
 KINDS = ("sticky", "slip", "separate")
 
@@ -88,3 +89,9 @@ class Plane(Boundary):
         behind = ((nodes.position - self.point.to(velocity)) * normal).sum(-1) <= 0
         stopped = plane_velocity(velocity, normal, self.kind, self.friction)
         return torch.where((behind & self.active(nodes.time))[..., None], stopped, velocity)
+
+    def twin(self) -> Twin:
+        """See :class:`~gaussian_swaying.mpm.twins.Twin`."""
+        from gaussian_swaying.geometry.distance_triton import half_space_distance
+
+        return Twin(half_space_distance, numbers=Numbers(3, lambda: self.normal), sources=(self,))

@@ -11,6 +11,7 @@ from gaussian_swaying._checks import check_positive
 from gaussian_swaying.geometry.distance import DistanceGrid, grid_distance
 from gaussian_swaying.geometry.frame import SimFrame
 from gaussian_swaying.mpm.boundaries.obstacle import Obstacle
+from gaussian_swaying.mpm.twins import Numbers, Twin
 
 
 class StillGaussians(Obstacle):
@@ -66,3 +67,17 @@ class StillGaussians(Obstacle):
                 "The StillGaussians have no Gaussians: give them to a Simulation, which knows the scene."
             )
         return grid_distance(place, self.values, self.corner, self.spacing)
+
+    def twin(self) -> Twin | None:
+        """See :class:`~gaussian_swaying.mpm.twins.Twin`."""
+        from gaussian_swaying.geometry.distance_triton import grid_distance
+
+        if self.spacing == 0:
+            return None
+
+        def numbers() -> Tensor:
+            sizes = self.corner.new_tensor([self.spacing, *self.values.shape])
+            return torch.cat([self.corner, torch.eye(3).to(self.corner).reshape(-1), sizes])
+
+        table = Numbers(self.values.numel(), lambda: self.values)
+        return Twin(grid_distance, numbers=Numbers(16, numbers), table=table, sources=(self,))

@@ -14,7 +14,6 @@ from gaussian_swaying.mpm.triton import contact_list_kernels as list_kernels
 from gaussian_swaying.mpm.triton import obstacle_kernels
 from gaussian_swaying.mpm.triton.fused import INTERPRETED, MAX_INDEX
 from gaussian_swaying.mpm.triton.obstacles import Solids
-from gaussian_swaying.mpm.triton.obstacles import known as is_known
 
 if TYPE_CHECKING:
     from gaussian_swaying.mpm.formulations.total import Total
@@ -109,10 +108,11 @@ class FusedContact:
         self.marked = self._zeros(len(fields), **whole)
         self.within = self.status[int(list_kernels.WITHIN.value)]
         self.friction = torch.tensor([float(b.friction) for _, b in stage.obstacles] or [0.0], device=self.device)
-        touched = [obstacle for _, obstacle in stage.obstacles if is_known(obstacle)]
-        self.solids = Solids([(obstacle, 0) for obstacle in touched], self.device, steps=1)
-        self.numbers = [touched.index(o) if is_known(o) else None for _, o in stage.obstacles]
-        """For each obstacle, its index among the solids; None for one that runs in torch."""
+        self.solids = [
+            None if obstacle.twin() is None else Solids([(obstacle, 0)], self.device, steps=1)
+            for _, obstacle in stage.obstacles
+        ]
+        """For each obstacle its tables; None for one that runs in torch."""
         self.programs = self._programs()
         self._take_room(*((ROOM, SLOTS) if stage.contact is not None else (1, walls)))
 
@@ -179,7 +179,9 @@ class FusedContact:
 
     def take(self) -> None:
         """Bring the tables of the obstacles up to date before a rollout; not recorded."""
-        self.solids.take()
+        for solid in self.solids:
+            if solid is not None:
+                solid.take()
 
     def add_taken(self, taken: Tensor) -> None:
         """Add what each boundary took since ``pressed_sum`` was zero [N s], to (scenes, B, 3), float64."""
@@ -223,14 +225,14 @@ class FusedContact:
                 *where, self.places, self.position, self.moving, self.status, *strides,
                 ARMS=self.arms, BLOCK=BLOCK, num_warps=8,
             )  # fmt: skip
-            self.solids.prepare(time, dt, 1)
-            for k, (number, (_, obstacle)) in enumerate(zip(self.numbers, stage.obstacles, strict=True)):
-                if number is not None:
+            for k, (solid, (_, obstacle)) in enumerate(zip(self.solids, stage.obstacles, strict=True)):
+                if solid is not None:
+                    solid.prepare(time, dt, 1)
                     obstacle_kernels.obstacle_places[(-(-self.places // BLOCK),)](
                         self.position, self.moving, self.thickness, self.wall_gap[k], self.wall_normal[k],
-                        self.wall_drive[k], self.wall_valid[k], self.within, self.places, *self.solids.of(number),
-                        time, dt, SLACK * dx, KIND=self.solids.kinds[number], MOVES=self.solids.moves[number],
-                        BLOCK=BLOCK, num_warps=4,
+                        self.wall_drive[k], self.wall_valid[k], self.within, self.places, solid.rows, solid.windows,
+                        solid.poses, solid.tables.buffer, time, dt, SLACK * dx, SOLIDS=solid.twins,
+                        MOVES=solid.moves[0], BLOCK=BLOCK, num_warps=4,
                     )  # fmt: skip
                     continue
                 gap, normal, drive = obstacle.touch(self.position, time, dt)

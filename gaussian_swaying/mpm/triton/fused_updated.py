@@ -217,10 +217,11 @@ class FusedUpdated(Fused):
         acting, (_, ny, nz), solids = self._acting, self.grid.resolution, self.solids
         kernels.updated_nodes[(-(-nodes // block),)](
             self.momentum, self.velocity, self.inverse_mass, nodes, self.schedule, self.first_step, offset,
-            *self.gravity, solids.rows, solids.whole, solids.windows, solids.poses, solids.grids, self.clock,
+            *self.gravity, solids.rows, solids.windows, solids.poses, solids.tables.buffer, self.clock,
             self.impulse, *self.grid.offset, ny, nz, self.grid.dx,
             IMPLICIT=options["IMPLICIT"], WIDTH=self.momentum.shape[1], KEEP=acting,
-            SOLIDS=solids.options, MOVING=solids.moving, COUNT=len(solids.parts), BLOCK=block, num_warps=4,
+            SOLIDS=solids.twins, KINDS=solids.kinds, MOVES=solids.moves, MOVING=any(solids.moves), BLOCK=block,
+            num_warps=4,
         )  # fmt: skip
         if acting:
             self._constrain()

@@ -1,160 +1,41 @@
 """Planes and obstacles as Triton functions; the references are in :mod:`~gaussian_swaying.mpm.boundaries`.
 
-:class:`~gaussian_swaying.mpm.triton.obstacles.Solids` makes what they read. Each solid has :data:`NUMBERS` numbers:
-
-- a plane: point (3), normal (3), kind (in ``plane.KINDS``), friction, number of its boundary;
-- others: six unused, gap, friction, number of the boundary, and the shape: of a ball its radius; of a capsule its
-  radius, half of its axis (3) and one over the square of that; of a box half of its sides (3) and its axes (9); of a
-  half space its normal (3); of a grid of distances its first node (3), its axes (9) and its spacing;
-
-and :data:`WHOLE` whole numbers: where its grid starts, the nodes of that along each axis, where its keys start, how
-many there are, and two unused. A key has :data:`KEY` numbers: time, place (3), and turn (3). The pose of a substep has
-:data:`POSE`: place of the centre (3), rotation (9), and the velocity of what is at an offset from the centre: a matrix
-(9) and the velocity of the centre (3).
+:class:`~gaussian_swaying.mpm.triton.obstacles.Solids` makes what they read: the numbers and tables of the twins; for
+each solid a row of :data:`ROW` numbers, gap, friction and the number of its boundary; its time window; and, if it
+moves, keys. A key has :data:`KEY` numbers: time, place (3), and turn (3). The pose of a substep has :data:`POSE`: place of the
+centre (3), rotation (9), and the velocity of what is at an offset from the centre: a matrix (9) and the velocity of the
+centre (3).
 """
 
 import triton
 import triton.language as tl
 
-from gaussian_swaying.geometry.linalg_triton import dot3, matmul, matvec, read3, read9, transpose
+from gaussian_swaying.geometry.linalg_triton import dot3, matmul, matvec, read, transpose
 from gaussian_swaying.mpm.triton.shared import VARIES
 
-NUMBERS, WHOLE, KEY, POSE = tl.constexpr(24), tl.constexpr(8), tl.constexpr(7), tl.constexpr(24)
-PLANE, BALL, CAPSULE, BOX, HALF_SPACE = (tl.constexpr(k) for k in range(5))
-GRID = tl.constexpr(5)
-LEAST = tl.constexpr(1.0842022e-19)
-"""Length of a vector without a direction: the square root of the smallest normal number, as in the reference."""
+ROW, KEY, POSE = tl.constexpr(4), tl.constexpr(7), tl.constexpr(24)
 
 
 @triton.jit
-def _outwards(x):
-    """Length and direction of a vector; z for one without a direction."""
-    length = tl.sqrt(dot3(x, x))
-    some = length > LEAST
-    scale = 1 / tl.where(some, length, 1.0)
-    return length, (
-        tl.where(some, x[0] * scale, 0.0), tl.where(some, x[1] * scale, 0.0), tl.where(some, x[2] * scale, 1.0)
-    )  # fmt: skip
-
-
-@triton.jit
-def ball_distance(x, row):
-    """As ``geometry.distance.ball_distance``."""
-    length, direction = _outwards(x)
-    return length - tl.load(row + 9), direction
-
-
-@triton.jit
-def capsule_distance(x, row):
-    """As ``geometry.distance.capsule_distance``."""
-    half = read3(row + 10)
-    along = dot3(x, half) * tl.load(row + 13)
-    along = tl.minimum(tl.maximum(along, -1.0), 1.0)
-    return ball_distance((x[0] - along * half[0], x[1] - along * half[1], x[2] - along * half[2]), row)
-
-
-@triton.jit
-def box_distance(x, row):
-    """As ``geometry.distance.box_distance``, along the axes of the box."""
-    axes = read9(row + 12)
-    x = matvec(transpose(axes), x)
-    b = (tl.abs(x[0]) - tl.load(row + 9), tl.abs(x[1]) - tl.load(row + 10), tl.abs(x[2]) - tl.load(row + 11))
-    outside, away = _outwards((tl.maximum(b[0], 0.0), tl.maximum(b[1], 0.0), tl.maximum(b[2], 0.0)))
-    deepest = tl.maximum(tl.maximum(b[0], b[1]), b[2])
-    within = deepest <= 0
-    first = b[0] == deepest
-    second = (b[1] == deepest) & (b[0] != deepest)
-    n0 = tl.where(within, tl.where(first, 1.0, 0.0), away[0])
-    n1 = tl.where(within, tl.where(second, 1.0, 0.0), away[1])
-    n2 = tl.where(within, tl.where(first | second, 0.0, 1.0), away[2])
-    n = (tl.where(x[0] < 0, -n0, n0), tl.where(x[1] < 0, -n1, n1), tl.where(x[2] < 0, -n2, n2))
-    return tl.where(within, deepest, outside), matvec(axes, n)
-
-
-@triton.jit
-def half_space_distance(x, row):
-    """As ``HalfSpaceObstacle.distance``."""
-    n = read3(row + 9)
-    zero = x[0] * 0
-    return dot3(x, n), (n[0] + zero, n[1] + zero, n[2] + zero)
-
-
-@triton.jit
-def _low(x, n):
-    """Return the node below a place along an axis of n nodes, within the grid, and the distance beyond it."""
-    inside = tl.minimum(tl.maximum(x, 0.0), (n - 1).to(tl.float32))
-    first = tl.maximum(tl.minimum(tl.floor(inside), (n - 2).to(tl.float32)), 0.0)
-    return first.to(tl.int32), inside - first, x - inside
-
-
-@triton.jit
-def grid_distance(x, row, whole, grids, mask):
-    """As ``geometry.distance.grid_distance``, along the axes of the grid."""
-    axes = read9(row + 12)
-    corner = read3(row + 9)
-    spacing = tl.load(row + 21)
-    values = grids + tl.load(whole)
-    ny = tl.load(whole + 2)
-    nz = tl.load(whole + 3)
-    x = matvec(transpose(axes), x)
-    x0, f0, o0 = _low((x[0] - corner[0]) / spacing, tl.load(whole + 1))
-    x1, f1, o1 = _low((x[1] - corner[1]) / spacing, ny)
-    x2, f2, o2 = _low((x[2] - corner[2]) / spacing, nz)
-    zero = f0 * 0
-    distance, s0, s1, s2 = zero, zero, zero, zero
-    for i in tl.static_range(2):
-        for j in tl.static_range(2):
-            line = values + ((x0 + i) * ny + x1 + j) * nz + x2
-            low = tl.load(line, mask, 0.0)
-            high = tl.load(line + 1, mask, 0.0)
-            if i == 0:
-                w0 = 1 - f0
-            else:
-                w0 = f0
-            if j == 0:
-                w1 = 1 - f1
-            else:
-                w1 = f1
-            between = low + f2 * (high - low)
-            distance += w0 * w1 * between
-            s0 += (2 * i - 1) * w1 * between
-            s1 += (2 * j - 1) * w0 * between
-            s2 += w0 * w1 * (high - low)
-    far, away = _outwards((o0 * spacing, o1 * spacing, o2 * spacing))
-    _length, n = _outwards((s0, s1, s2))
-    out = far > 0
-    n = (tl.where(out, away[0], n[0]), tl.where(out, away[1], n[1]), tl.where(out, away[2], n[2]))
-    return distance + far, matvec(axes, n)
-
-
-@triton.jit
-def touch(x, row, whole, pose, grids, mask, KIND: tl.constexpr, MOVES: tl.constexpr):
-    """Distance from an obstacle less its gap, its normal, and its velocity at places x: twin of ``Obstacle.touch``."""
+def touch(x, row, pose, numbers, mask, SOLIDS: tl.constexpr, w: tl.constexpr, MOVES: tl.constexpr):
+    """Distance from solid w less its gap, its normal, and its velocity at places x: twin of ``Obstacle.touch``."""
     x = (x[0] - tl.load(pose), x[1] - tl.load(pose + 1), x[2] - tl.load(pose + 2))
     own = x
     if MOVES:
-        own = matvec(transpose(read9(pose + 3)), x)
-    if KIND == BALL:
-        distance, normal = ball_distance(own, row)
-    elif KIND == CAPSULE:
-        distance, normal = capsule_distance(own, row)
-    elif KIND == BOX:
-        distance, normal = box_distance(own, row)
-    elif KIND == HALF_SPACE:
-        distance, normal = half_space_distance(own, row)
-    else:
-        distance, normal = grid_distance(own, row, whole, grids, mask)
+        own = matvec(transpose(read(pose, 3, 9)), x)
+    shape = read(numbers, SOLIDS.numbers[w][0], SOLIDS.numbers[w][1])
+    distance, normal = SOLIDS.functions[w](own, shape, numbers + SOLIDS.tables[w], mask, SOLIDS.options[w])
     zero = x[0] * 0
     drive = (zero, zero, zero)
     if MOVES:
-        normal = matvec(read9(pose + 3), normal)
-        drive = matvec(read9(pose + 12), x)
+        normal = matvec(read(pose, 3, 9), normal)
+        drive = matvec(read(pose, 12, 9), x)
         drive = (drive[0] + tl.load(pose + 21), drive[1] + tl.load(pose + 22), drive[2] + tl.load(pose + 23))
-    return distance - tl.load(row + 6), normal, drive
+    return distance - tl.load(row), normal, drive
 
 
 @triton.jit
-def stopped(v, n, kind, friction):
+def stopped(v, n, kind: tl.constexpr, friction):
     """Velocity in contact with a plane, as :func:`boundaries.plane.plane_velocity`; ``kind`` in ``plane.KINDS``."""
     along = dot3(v, n)
     removed = tl.where(kind == 2, tl.minimum(along, 0.0), along)
@@ -167,20 +48,18 @@ def stopped(v, n, kind, friction):
 
 
 @triton.jit
-def stop_nodes(v, x, row, whole, pose, grids, mask, KIND: tl.constexpr, MOVES: tl.constexpr):
-    """Velocity of nodes at x in contact with a solid, and which of them are."""
-    friction = tl.load(row + 7)
-    if KIND == PLANE:
-        p = read3(row)
-        n = read3(row + 3)
-        held = stopped(v, n, tl.load(row + 6), friction)
-        behind = ((x[0] - p[0]) * n[0] + (x[1] - p[1]) * n[1] + (x[2] - p[2]) * n[2]) <= 0
-    else:
-        distance, n, own = touch(x, row, whole, pose, grids, mask, KIND, MOVES)
-        behind = distance <= 0
-        held = stopped((v[0] - own[0], v[1] - own[1], v[2] - own[2]), n, 2, friction)
+def stop_nodes(
+    v, x, row, pose, numbers, mask, SOLIDS: tl.constexpr, w: tl.constexpr, KIND: tl.constexpr, MOVES: tl.constexpr
+):  # fmt: skip
+    """Velocity of nodes at x in contact with solid w, and which of them are; KIND in ``plane.KINDS``."""
+    friction = tl.load(row + 1)
+    distance, n, own = touch(x, row, pose, numbers, mask, SOLIDS, w, MOVES)
+    if MOVES:
+        held = stopped((v[0] - own[0], v[1] - own[1], v[2] - own[2]), n, KIND, friction)
         held = (held[0] + own[0], held[1] + own[1], held[2] + own[2])
-    return held, behind
+    else:
+        held = stopped(v, n, KIND, friction)
+    return held, distance <= 0
 
 
 @triton.jit
@@ -230,13 +109,13 @@ def _store9(to, m):
 
 
 @triton.jit(do_not_specialize=("solids",))
-def obstacle_poses(keys, whole, time, dt, poses, solids):
+def obstacle_poses(keys, spans, time, dt, poses, solids):
     """Pose of each solid in each substep from ``time`` on: the second axis is the solids, the first the substeps."""
     step = tl.program_id(0)
     m = tl.program_id(1)
-    count = tl.load(whole + m * WHOLE + 5)
+    count = tl.load(spans + m * 2 + 1)
     if count > 0:
-        mine = keys + tl.load(whole + m * WHOLE + 4) * KEY
+        mine = keys + tl.load(spans + m * 2) * KEY
         h = tl.load(dt)
         now = tl.load(time) + step * h
         here, turn = _at(mine, count, now)
@@ -268,10 +147,10 @@ def acts(window, now):
 
 @triton.jit(do_not_specialize=VARIES)
 def obstacle_places(
-    position, moving, thickness, gap, facing, drive, valid, within, places, row, whole, window, pose, grids, time, dt,
-    slack, KIND: tl.constexpr, MOVES: tl.constexpr, BLOCK: tl.constexpr,
+    position, moving, thickness, gap, facing, drive, valid, within, places, row, window, pose, numbers, time, dt, slack,
+    SOLIDS: tl.constexpr, MOVES: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
-    """Constraints of all contact samples with one obstacle in ``total``: gap, normal, velocity, and whether it acts.
+    """Constraints of all contact samples with the first obstacle in ``total``: gap, normal, velocity, and if it acts.
 
     ``within`` becomes one if a sample is closer than ``slack``, now or after a substep with its velocity ``moving``.
     """
@@ -279,7 +158,7 @@ def obstacle_places(
     mask = k < places
     at = position + k * 3
     x = (tl.load(at, mask, 0.0), tl.load(at + 1, mask, 0.0), tl.load(at + 2, mask, 0.0))
-    distance, normal, own = touch(x, row, whole, pose, grids, mask, KIND, MOVES)
+    distance, normal, own = touch(x, row, pose, numbers, mask, SOLIDS, 0, MOVES)
     distance -= 0.5 * tl.load(thickness + k, mask, 0.0)
     on = tl.where(acts(window, tl.load(time)), 1.0, 0.0) + tl.zeros_like(distance)
     v = moving + k * 4

@@ -14,7 +14,8 @@ import triton.language as tl
 from gaussian_swaying.geometry.linalg_triton import axpy9, load3, load9, matmul, scale9, store3, store9, transpose
 from gaussian_swaying.mpm.laws.triton.body import ROW, kirchhoff
 from gaussian_swaying.mpm.triton.damping import kelvin_voigt_pk1
-from gaussian_swaying.mpm.triton.obstacle_kernels import NUMBERS, POSE, WHOLE, acts, stop_nodes
+from gaussian_swaying.mpm.triton.obstacle_kernels import POSE, acts, stop_nodes
+from gaussian_swaying.mpm.triton.obstacle_kernels import ROW as SOLID_ROW
 from gaussian_swaying.mpm.triton.shared import (
     VARIES,
     account,
@@ -291,15 +292,15 @@ def updated_particles(
 @triton.jit(do_not_specialize=VARIES)
 def updated_nodes(
     momentum, velocity, inverse_mass, nodes, schedule, first_step, step_offset,
-    gravity_x, gravity_y, gravity_z, solids, whole, windows, poses, grids, clock, impulse, ox, oy, oz, ny, nz, dx,
-    IMPLICIT: tl.constexpr, WIDTH: tl.constexpr, KEEP: tl.constexpr, SOLIDS: tl.constexpr, MOVING: tl.constexpr,
-    COUNT: tl.constexpr, BLOCK: tl.constexpr,
+    gravity_x, gravity_y, gravity_z, solids, windows, poses, numbers, clock, impulse, ox, oy, oz, ny, nz, dx,
+    IMPLICIT: tl.constexpr, WIDTH: tl.constexpr, KEEP: tl.constexpr, SOLIDS: tl.constexpr, KINDS: tl.constexpr,
+    MOVES: tl.constexpr, MOVING: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
     """``updated``: nodal velocities from momenta and masses, which are set back to zero; KEEP for boundaries.
 
-    SOLIDS has twice the kind of each solid, plus one if it moves. All COUNT of them are applied here, in order; see
-    :mod:`~gaussian_swaying.mpm.triton.obstacle_kernels`. With MOVING there are poses for every substep. ``clock`` has
-    the time at step 0 and the substep [s], float64; ``impulse`` (B, 3) collects the reaction impulses.
+    All SOLIDS are applied here, in order; see :mod:`~gaussian_swaying.mpm.triton.obstacle_kernels`. KINDS and MOVES say
+    of each how it stops and whether it moves. With MOVING there are poses for every substep. ``clock`` has the time at
+    step 0 and the substep [s], float64; ``impulse`` (B, 3) collects the reaction impulses.
     """
     step = tl.load(first_step) + step_offset
     kick = tl.load(schedule + (step + 1) * 4)
@@ -321,6 +322,7 @@ def updated_nodes(
         (tl.load(row + 1, mask, 0.0) * share + push * gravity_y) * decay,
         (tl.load(row + 2, mask, 0.0) * share + push * gravity_z) * decay,
     )
+    COUNT: tl.constexpr = len(SOLIDS.functions)
     if COUNT > 0:
         now = tl.load(clock) + step * tl.load(clock + 1)
         pose = poses
@@ -333,13 +335,12 @@ def updated_nodes(
         )
         for w in tl.static_range(COUNT):
             held, behind = stop_nodes(
-                v, x, solids + w * NUMBERS, whole + w * WHOLE, pose + w * POSE, grids, some & mask, SOLIDS[w] // 2,
-                SOLIDS[w] % 2,
-            )  # fmt: skip
+                v, x, solids + w * SOLID_ROW, pose + w * POSE, numbers, some & mask, SOLIDS, w, KINDS[w], MOVES[w]
+            )
             hit = tl.where(acts(windows + 2 * w, now), behind & some & mask, False)
             u = (tl.where(hit, held[0], v[0]), tl.where(hit, held[1], v[1]), tl.where(hit, held[2], v[2]))
             if tl.sum(hit.to(tl.int32)) > 0:  # few blocks touch a solid
-                to = impulse + 3 * tl.load(solids + w * NUMBERS + 8).to(tl.int32)
+                to = impulse + 3 * tl.load(solids + w * SOLID_ROW + 2).to(tl.int32)
                 for c in tl.static_range(3):
                     tl.atomic_add(to + c, tl.sum((mass * (v[c] - u[c])).to(tl.float64)), sem="relaxed")
             v = u

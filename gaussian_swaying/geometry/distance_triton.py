@@ -1,0 +1,115 @@
+"""Signed distances and their gradients as Triton functions.
+
+The definitions are in :mod:`~gaussian_swaying.geometry.distance`. They are the device functions of boundaries, see
+``mpm.twins``.
+"""
+
+import triton
+import triton.language as tl
+
+from gaussian_swaying.geometry.linalg_triton import chosen, dot3, matvec, transpose
+
+LEAST = tl.constexpr(1.0842022e-19)
+"""Length of a vector without a direction: the square root of the smallest normal number, as in the reference."""
+
+
+@triton.jit
+def _outwards(x):
+    """Length and direction of a vector; z for one without a direction."""
+    length = tl.sqrt(dot3(x, x))
+    some = length > LEAST
+    scale = 1 / tl.where(some, length, 1.0)
+    return length, (
+        tl.where(some, x[0] * scale, 0.0), tl.where(some, x[1] * scale, 0.0), tl.where(some, x[2] * scale, 1.0)
+    )  # fmt: skip
+
+
+@triton.jit
+def ball_distance(x, numbers, table, mask, OPTIONS: tl.constexpr):
+    """``distance.ball_distance``; ``numbers``: radius."""
+    length, direction = _outwards(x)
+    return length - numbers[0], direction
+
+
+@triton.jit
+def capsule_distance(x, numbers, table, mask, OPTIONS: tl.constexpr):
+    """``distance.capsule_distance``; ``numbers``: radius, half of the axis (3), one over the square of that."""
+    half = (numbers[1], numbers[2], numbers[3])
+    along = dot3(x, half) * numbers[4]
+    along = tl.minimum(tl.maximum(along, -1.0), 1.0)
+    x = (x[0] - along * half[0], x[1] - along * half[1], x[2] - along * half[2])
+    return ball_distance(x, numbers, table, mask, OPTIONS)
+
+
+@triton.jit
+def box_distance(x, numbers, table, mask, OPTIONS: tl.constexpr):
+    """``distance.box_distance``; ``numbers``: half of the sides (3), axes in columns (9)."""
+    axes = chosen(numbers, 3, 9)
+    x = matvec(transpose(axes), x)
+    b = (tl.abs(x[0]) - numbers[0], tl.abs(x[1]) - numbers[1], tl.abs(x[2]) - numbers[2])
+    outside, away = _outwards((tl.maximum(b[0], 0.0), tl.maximum(b[1], 0.0), tl.maximum(b[2], 0.0)))
+    deepest = tl.maximum(tl.maximum(b[0], b[1]), b[2])
+    within = deepest <= 0
+    first = b[0] == deepest
+    second = (b[1] == deepest) & (b[0] != deepest)
+    n0 = tl.where(within, tl.where(first, 1.0, 0.0), away[0])
+    n1 = tl.where(within, tl.where(second, 1.0, 0.0), away[1])
+    n2 = tl.where(within, tl.where(first | second, 0.0, 1.0), away[2])
+    n = (tl.where(x[0] < 0, -n0, n0), tl.where(x[1] < 0, -n1, n1), tl.where(x[2] < 0, -n2, n2))
+    return tl.where(within, deepest, outside), matvec(axes, n)
+
+
+@triton.jit
+def half_space_distance(x, numbers, table, mask, OPTIONS: tl.constexpr):
+    """The distance from a plane through the origin; ``numbers``: its normal."""
+    zero = x[0] * 0
+    return dot3(x, numbers), (numbers[0] + zero, numbers[1] + zero, numbers[2] + zero)
+
+
+@triton.jit
+def _low(x, n):
+    """Return the node below a place along an axis of n nodes, within the grid, and the distance beyond it."""
+    inside = tl.minimum(tl.maximum(x, 0.0), (n - 1).to(tl.float32))
+    first = tl.maximum(tl.minimum(tl.floor(inside), (n - 2).to(tl.float32)), 0.0)
+    return first.to(tl.int32), inside - first, x - inside
+
+
+@triton.jit
+def grid_distance(x, numbers, table, mask, OPTIONS: tl.constexpr):
+    """``distance.grid_distance``; ``numbers``: first node (3), axes in columns (9), spacing, nodes along each axis (3).
+
+    ``table``: the distances.
+    """
+    axes = chosen(numbers, 3, 9)
+    spacing = numbers[12]
+    ny = numbers[14].to(tl.int32)
+    nz = numbers[15].to(tl.int32)
+    x = matvec(transpose(axes), x)
+    x0, f0, o0 = _low((x[0] - numbers[0]) / spacing, numbers[13].to(tl.int32))
+    x1, f1, o1 = _low((x[1] - numbers[1]) / spacing, ny)
+    x2, f2, o2 = _low((x[2] - numbers[2]) / spacing, nz)
+    zero = f0 * 0
+    distance, s0, s1, s2 = zero, zero, zero, zero
+    for i in tl.static_range(2):
+        for j in tl.static_range(2):
+            line = ((x0 + i) * ny + x1 + j) * nz + x2
+            low = tl.load(table + line, mask, 0.0)
+            high = tl.load(table + line + 1, mask, 0.0)
+            if i == 0:
+                w0 = 1 - f0
+            else:
+                w0 = f0
+            if j == 0:
+                w1 = 1 - f1
+            else:
+                w1 = f1
+            between = low + f2 * (high - low)
+            distance += w0 * w1 * between
+            s0 += (2 * i - 1) * w1 * between
+            s1 += (2 * j - 1) * w0 * between
+            s2 += w0 * w1 * (high - low)
+    far, away = _outwards((o0 * spacing, o1 * spacing, o2 * spacing))
+    _length, n = _outwards((s0, s1, s2))
+    out = far > 0
+    n = (tl.where(out, away[0], n[0]), tl.where(out, away[1], n[1]), tl.where(out, away[2], n[2]))
+    return distance + far, matvec(axes, n)
