@@ -6,10 +6,10 @@ import pytest
 import torch
 
 from gaussian_swaying.mpm.laws.fixed_corotated import FixedCorotated, fixed_corotated_energy, fixed_corotated_pk1
-from gaussian_swaying.mpm.laws.fluid import FLUID_LIMIT, Fluid, fluid_energy, fluid_pk1, fluid_pressure
+from gaussian_swaying.mpm.laws.fluid import Fluid, fluid_energy, fluid_pk1, fluid_pressure
 from gaussian_swaying.mpm.laws.hencky import StVKHencky, stvk_hencky_energy
 from gaussian_swaying.mpm.laws.neo_hookean import NeoHookean, neo_hookean_energy, neo_hookean_pk1
-from gaussian_swaying.mpm.laws.shared import LOG_LIMIT, continued_log, lame_parameters
+from gaussian_swaying.mpm.laws.shared import FLUID_LIMIT, LOG_LIMIT, continued_log, lame_parameters
 from gaussian_swaying.mpm.laws.snow import Snow, snow_lame
 from gaussian_swaying.mpm.laws.spring_network import SpringNetwork, spring_network_energy, spring_network_pk1
 

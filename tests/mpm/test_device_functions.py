@@ -5,7 +5,7 @@ in the interpreter.
 
 Covers: geometry.linalg_triton, mpm.laws.triton.body, mpm.laws.triton.fixed_corotated, mpm.laws.triton.fluid,
 mpm.laws.triton.foam, mpm.laws.triton.hencky, mpm.laws.triton.metal, mpm.laws.triton.neo_hookean, mpm.laws.triton.sand,
-mpm.laws.triton.shared, mpm.laws.triton.snow, mpm.laws.triton.spring_network, mpm.laws.triton.twin.
+mpm.laws.triton.shared, mpm.laws.triton.snow, mpm.laws.triton.spring_network, mpm.laws.triton.functions.
 """
 
 import math
@@ -32,8 +32,9 @@ from gaussian_swaying.mpm.laws.sand import Sand
 from gaussian_swaying.mpm.laws.snow import Snow
 from gaussian_swaying.mpm.laws.spring_network import SpringNetwork
 from gaussian_swaying.mpm.laws.triton.body import BodyLaws, kirchhoff, pk1
-from gaussian_swaying.mpm.laws.triton.twin import LawTwin, shared, twin_of
+from gaussian_swaying.mpm.laws.triton.functions import LawFunctions, functions_of, shared
 from gaussian_swaying.mpm.triton import fused
+from gaussian_swaying.mpm.twins import Numbers, Twin
 
 MU, LAM, DT = 4e3, 6e3, 1e-3
 
@@ -272,7 +273,7 @@ def test_wave_modulus_and_energy(kernel_device, law, ratio):
     mu, lam = LAME[ratio]
     F = _strained(kernel_device)
     wave, energy = F.new_empty(len(F)), F.new_empty(len(F))
-    _launch(_scalars, len(F), F, wave, energy, mu, lam, WAVE=twin_of(law).wave, ENERGY=twin_of(law).energy)
+    _launch(_scalars, len(F), F, wave, energy, mu, lam, WAVE=functions_of(law).wave, ENERGY=functions_of(law).energy)
     wide = F.double()
     parameters = [torch.full_like(wide[:, 0, 0], value) for value in (mu, lam)]
     values = linalg.svd3(wide)[1]
@@ -297,7 +298,7 @@ def test_what_is_not_finite_has_no_modulus(kernel_device, law):
     F.view(18, 9)[range(9), range(9)] = math.nan
     F.view(18, 9)[range(9, 18), range(9)] = math.inf
     wave, energy = F.new_zeros(len(F)), F.new_zeros(len(F))
-    _launch(_scalars, len(F), F, wave, energy, MU, LAM, WAVE=twin_of(law).wave, ENERGY=twin_of(law).energy)
+    _launch(_scalars, len(F), F, wave, energy, MU, LAM, WAVE=functions_of(law).wave, ENERGY=functions_of(law).energy)
     assert not bool(torch.isfinite(wave).any())
 
 
@@ -321,10 +322,10 @@ class OwnLaw(NeoHookean):
 
 def test_every_twin_of_the_package_is_compared():
     """Each law is in the list of this file, which the tests above use."""
-    assert {type(law) for law in LAWS} == {law for law in laws.LAWS.values() if law.twin is not None}
+    assert {type(law) for law in LAWS} == set(laws.LAWS.values())
     for law in LAWS:
-        assert (twin_of(law).flow is not None) == law.plastic
-    assert twin_of(OwnLaw()) is None
+        assert (functions_of(law).flow is not None) == law.plastic
+    assert functions_of(OwnLaw()) is None
 
 
 def test_what_a_body_asks_of_a_kernel():
@@ -349,25 +350,14 @@ def test_a_twin_needs_a_stress():
     function = object()
     for given in ({}, {"flow": function}, {"kirchhoff": function}, {"pk1": function}):
         with pytest.raises(ValueError, match="give `principal`, or `kirchhoff` and"):
-            LawTwin(**given)
-    LawTwin(kirchhoff=function, flow=function)
-
-
-@pytest.mark.parametrize("name", ["no_such_module", "gaussian_swaying.mpm.laws.shared"])
-def test_a_twin_that_is_not_there(name):
-    class Lost(Sand):
-        twin = name
-
-    with pytest.raises(ValueError, match=f"`twin` of Lost to be a module that holds a `TWIN`.*'{name}' is not"):
-        twin_of(Lost())
+            LawFunctions(**given)
+    LawFunctions(kirchhoff=function, flow=function)
 
 
 def test_a_table_row_has_room_for_four_numbers():
     class Many(Sand):
-        twin = Sand.twin
+        def twin(self):
+            return Twin(functions_of(Sand()), numbers=Numbers(5, lambda: (1.0, 2.0, 3.0, 4.0, 5.0)))
 
-        def coefficients(self):
-            return (1.0, 2.0, 3.0, 4.0, 5.0)
-
-    with pytest.raises(ValueError, match="at most four `coefficients` of Many, but got 5"):
+    with pytest.raises(ValueError, match="at most four `numbers` of Many, but got 5"):
         BodyLaws([Many()])

@@ -8,6 +8,7 @@ from torch import Tensor
 
 from gaussian_swaying.geometry.linalg import cofactor, determinant, matmul3, polar_rotation, symmetric_eigenvalues
 from gaussian_swaying.mpm.laws.law import ConstitutiveLaw
+from gaussian_swaying.mpm.twins import Twin
 
 
 def fixed_corotated_energy(F: Tensor, mu: Tensor, lam: Tensor) -> Tensor:
@@ -70,8 +71,6 @@ def fixed_corotated_moduli(F: Tensor, mu: Tensor, lam: Tensor) -> tuple[Tensor, 
 class FixedCorotated(ConstitutiveLaw):
     """Elastic solid that stays defined when crushed or inverted: foliage, cloth, rubber at moderate strain."""
 
-    twin = "gaussian_swaying.mpm.laws.triton.fixed_corotated"
-
     def energy(self, F: Tensor, mu: Tensor, lam: Tensor, internal: Tensor | None = None) -> Tensor:
         """See :func:`fixed_corotated_energy`."""
         return fixed_corotated_energy(F, mu, lam)
@@ -83,3 +82,9 @@ class FixedCorotated(ConstitutiveLaw):
     def moduli(self, F: Tensor, mu: Tensor, lam: Tensor, internal: Tensor | None = None) -> tuple[Tensor, Tensor]:
         """See :func:`fixed_corotated_moduli`."""
         return fixed_corotated_moduli(F, mu, lam)
+
+    def twin(self) -> Twin:
+        """See :class:`~gaussian_swaying.mpm.twins.Twin`."""
+        from gaussian_swaying.mpm.laws.triton.fixed_corotated import FUNCTIONS
+
+        return Twin(FUNCTIONS)

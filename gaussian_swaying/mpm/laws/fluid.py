@@ -7,10 +7,8 @@ from torch import Tensor
 
 from gaussian_swaying.geometry.linalg import cofactor, determinant
 from gaussian_swaying.mpm.laws.law import PlasticLaw
-from gaussian_swaying.mpm.laws.shared import LOG_LIMIT, volumetric_moduli
-
-FLUID_LIMIT = 0.5
-"""Volume ratio below which the pressure of a fluid is continued by its tangent."""
+from gaussian_swaying.mpm.laws.shared import FLUID_LIMIT, LOG_LIMIT, volumetric_moduli
+from gaussian_swaying.mpm.twins import Numbers, Twin
 
 
 def bulk_modulus(mu: Tensor, lam: Tensor) -> Tensor:
@@ -109,17 +107,17 @@ class Fluid(PlasticLaw):
         gamma: Exponent of the density in the pressure, above 1; 7 for water.
     """
 
-    twin = "gaussian_swaying.mpm.laws.triton.fluid"
-
     def __init__(self, gamma: float = 7.0) -> None:
         super().__init__()
         if not 1 < gamma < float("inf"):
             raise ValueError(f"Expected `gamma` to be finite and above 1, but got {gamma}; use 7 for water.")
         self.gamma = float(gamma)
 
-    def coefficients(self) -> tuple[float, ...]:
-        """The numbers of this law that are passed to its twin."""
-        return (self.gamma,)
+    def twin(self) -> Twin:
+        """See :class:`~gaussian_swaying.mpm.twins.Twin`."""
+        from gaussian_swaying.mpm.laws.triton.fluid import FUNCTIONS
+
+        return Twin(FUNCTIONS, numbers=Numbers(1, lambda: (self.gamma,)))
 
     def energy(self, F: Tensor, mu: Tensor, lam: Tensor, internal: Tensor | None = None) -> Tensor:
         """See :func:`fluid_energy`."""

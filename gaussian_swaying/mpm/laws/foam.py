@@ -9,6 +9,7 @@ from gaussian_swaying._checks import check_positive
 from gaussian_swaying.mpm.laws.hencky import StVKHencky
 from gaussian_swaying.mpm.laws.law import PlasticLaw
 from gaussian_swaying.mpm.laws.shared import ROOT, continued_log, split_strain, stretch_of_log
+from gaussian_swaying.mpm.twins import Numbers, Twin
 
 
 def viscoplastic(
@@ -55,17 +56,17 @@ class Foam(PlasticLaw, StVKHencky):
         viscosity: Viscosity of the overstress [Pa s]; zero for flow without delay.
     """
 
-    twin = "gaussian_swaying.mpm.laws.triton.foam"
-
     def __init__(self, yield_stress: float, viscosity: float) -> None:
         super().__init__()
         check_positive("yield_stress", yield_stress, allow_zero=True)
         check_positive("viscosity", viscosity, allow_zero=True)
         self.yield_stress, self.viscosity = float(yield_stress), float(viscosity)
 
-    def coefficients(self) -> tuple[float, ...]:
-        """The numbers of this law that are passed to its twin."""
-        return (self.yield_stress, self.viscosity)
+    def twin(self) -> Twin:
+        """See :class:`~gaussian_swaying.mpm.twins.Twin`."""
+        from gaussian_swaying.mpm.laws.triton.foam import FUNCTIONS
+
+        return Twin(FUNCTIONS, numbers=Numbers(2, lambda: (self.yield_stress, self.viscosity)))
 
     def flow(
         self, stretch: Tensor, mu: Tensor, lam: Tensor, internal: Tensor | None, dt: float | Tensor

@@ -8,6 +8,7 @@ from torch import Tensor
 from gaussian_swaying.geometry.linalg import from_principal, spectrum
 from gaussian_swaying.mpm.laws.law import ConstitutiveLaw
 from gaussian_swaying.mpm.laws.shared import LOG_LIMIT, continued_log, log_slope, spectral_moduli
+from gaussian_swaying.mpm.twins import Twin
 
 
 def stvk_hencky_energy(F: Tensor, mu: Tensor, lam: Tensor) -> Tensor:
@@ -81,8 +82,6 @@ class StVKHencky(ConstitutiveLaw):
     It softens in tension beyond a stretch of about e, so do not use it for rubber.
     """
 
-    twin = "gaussian_swaying.mpm.laws.triton.hencky"
-
     def energy(self, F: Tensor, mu: Tensor, lam: Tensor, internal: Tensor | None = None) -> Tensor:
         """See :func:`stvk_hencky_energy`."""
         return stvk_hencky_energy(F, mu, lam)
@@ -94,3 +93,9 @@ class StVKHencky(ConstitutiveLaw):
     def moduli(self, F: Tensor, mu: Tensor, lam: Tensor, internal: Tensor | None = None) -> tuple[Tensor, Tensor]:
         """See :func:`stvk_hencky_moduli`."""
         return stvk_hencky_moduli(F, mu, lam)
+
+    def twin(self) -> Twin:
+        """See :class:`~gaussian_swaying.mpm.twins.Twin`."""
+        from gaussian_swaying.mpm.laws.triton.hencky import FUNCTIONS
+
+        return Twin(FUNCTIONS)

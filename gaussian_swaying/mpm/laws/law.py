@@ -3,42 +3,30 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from typing import Any
 
 import torch
 from torch import Tensor, nn
 
 from gaussian_swaying.geometry.linalg import from_principal, matmul3, spectrum
+from gaussian_swaying.mpm.twins import Twinned
 
 
-class ConstitutiveLaw(nn.Module, ABC):
+class ConstitutiveLaw(Twinned, nn.Module, ABC):
     """Base class of all laws.
 
     A law is a subclass with :meth:`energy`, :meth:`pk1` and :meth:`moduli`; a plastic law is a subclass of
     :class:`PlasticLaw` with ``flow``. That is all that the torch substep needs. To run in the Triton kernels too, a law
-    names its ``twin``. Elastic stiffness belongs to the particles (Lamé parameters); all other parameters of a law are
+    has a ``twin`` (:mod:`~gaussian_swaying.mpm.twins`). Elastic stiffness belongs to the particles (Lamé parameters); all other parameters of a law are
     arguments of its constructor.
 
     Attributes:
         plastic: Whether there is a return map. The deformation gradient is then only the elastic part of the
             deformation since rest, which needs the ``updated`` formulation.
         internal: Initial value of the one internal variable of each particle, or None if there is none.
-        twin: Module with the law's device functions, a :class:`~gaussian_swaying.mpm.laws.triton.twin.LawTwin` named
-            ``TWIN``, which is imported only if kernels run; None for a law that runs in torch only. A subclass does not
-            inherit it, because it may change the law.
     """
 
     plastic: bool = False
     internal: float | None = None
-    twin: str | None = None
-
-    def __init_subclass__(cls, **settings: Any) -> None:
-        super().__init_subclass__(**settings)
-        cls.twin = vars(cls).get("twin")
-
-    def coefficients(self) -> tuple[float, ...]:
-        """The numbers of this law that are passed to its twin, at most four."""
-        return ()
 
     @abstractmethod
     def energy(self, F: Tensor, mu: Tensor, lam: Tensor, internal: Tensor | None = None) -> Tensor:

@@ -8,6 +8,7 @@ from gaussian_swaying._checks import check_positive
 from gaussian_swaying.mpm.laws.hencky import StVKHencky
 from gaussian_swaying.mpm.laws.law import PlasticLaw
 from gaussian_swaying.mpm.laws.shared import von_mises
+from gaussian_swaying.mpm.twins import Numbers, Twin
 
 
 class Metal(PlasticLaw, StVKHencky):
@@ -18,7 +19,6 @@ class Metal(PlasticLaw, StVKHencky):
         hardening: Increase of the yield stress with the accumulated plastic strain [Pa].
     """
 
-    twin = "gaussian_swaying.mpm.laws.triton.metal"
     internal = 0.0
 
     def __init__(self, yield_stress: float, hardening: float = 0.0) -> None:
@@ -31,9 +31,11 @@ class Metal(PlasticLaw, StVKHencky):
         check_positive("hardening", hardening, allow_zero=True)
         self.yield_stress, self.hardening = float(yield_stress), float(hardening)
 
-    def coefficients(self) -> tuple[float, ...]:
-        """The numbers of this law that are passed to its twin."""
-        return (self.yield_stress, self.hardening, 0.0)
+    def twin(self) -> Twin:
+        """See :class:`~gaussian_swaying.mpm.twins.Twin`."""
+        from gaussian_swaying.mpm.laws.triton.metal import FUNCTIONS
+
+        return Twin(FUNCTIONS, numbers=Numbers(3, lambda: (self.yield_stress, self.hardening, 0.0)))
 
     def flow(
         self, stretch: Tensor, mu: Tensor, lam: Tensor, internal: Tensor | None, dt: float | Tensor

@@ -8,6 +8,7 @@ from torch import Tensor
 from gaussian_swaying.geometry.linalg import cofactor, determinant
 from gaussian_swaying.mpm.laws.law import ConstitutiveLaw
 from gaussian_swaying.mpm.laws.shared import LOG_LIMIT, continued_log, log_slope, volumetric_moduli
+from gaussian_swaying.mpm.twins import Twin
 
 
 def neo_hookean_energy(F: Tensor, mu: Tensor, lam: Tensor) -> Tensor:
@@ -57,8 +58,6 @@ def neo_hookean_moduli(F: Tensor, mu: Tensor, lam: Tensor) -> tuple[Tensor, Tens
 class NeoHookean(ConstitutiveLaw):
     """Elastic solid that resists crushing without limit. It is the cheapest law: it needs no polar decomposition."""
 
-    twin = "gaussian_swaying.mpm.laws.triton.neo_hookean"
-
     def energy(self, F: Tensor, mu: Tensor, lam: Tensor, internal: Tensor | None = None) -> Tensor:
         """See :func:`neo_hookean_energy`."""
         return neo_hookean_energy(F, mu, lam)
@@ -70,3 +69,9 @@ class NeoHookean(ConstitutiveLaw):
     def moduli(self, F: Tensor, mu: Tensor, lam: Tensor, internal: Tensor | None = None) -> tuple[Tensor, Tensor]:
         """See :func:`neo_hookean_moduli`."""
         return neo_hookean_moduli(F, mu, lam)
+
+    def twin(self) -> Twin:
+        """See :class:`~gaussian_swaying.mpm.twins.Twin`."""
+        from gaussian_swaying.mpm.laws.triton.neo_hookean import FUNCTIONS
+
+        return Twin(FUNCTIONS)

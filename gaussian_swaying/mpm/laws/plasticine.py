@@ -8,6 +8,7 @@ from gaussian_swaying._checks import check_positive
 from gaussian_swaying.mpm.laws.hencky import StVKHencky
 from gaussian_swaying.mpm.laws.law import PlasticLaw
 from gaussian_swaying.mpm.laws.shared import von_mises
+from gaussian_swaying.mpm.twins import Numbers, Twin
 
 
 class Plasticine(PlasticLaw, StVKHencky):
@@ -19,7 +20,6 @@ class Plasticine(PlasticLaw, StVKHencky):
         residual: Lowest yield stress [Pa].
     """
 
-    twin = "gaussian_swaying.mpm.laws.triton.metal"
     internal = 0.0
 
     def __init__(self, yield_stress: float, softening: float, residual: float = 0.0) -> None:
@@ -33,9 +33,11 @@ class Plasticine(PlasticLaw, StVKHencky):
             )
         self.yield_stress, self.softening, self.residual = float(yield_stress), float(softening), float(residual)
 
-    def coefficients(self) -> tuple[float, ...]:
-        """The numbers of this law that are passed to its twin."""
-        return (self.yield_stress, -self.softening, self.residual)
+    def twin(self) -> Twin:
+        """See :class:`~gaussian_swaying.mpm.twins.Twin`."""
+        from gaussian_swaying.mpm.laws.triton.metal import FUNCTIONS
+
+        return Twin(FUNCTIONS, numbers=Numbers(3, lambda: (self.yield_stress, -self.softening, self.residual)))
 
     def flow(
         self, stretch: Tensor, mu: Tensor, lam: Tensor, internal: Tensor | None, dt: float | Tensor

@@ -10,6 +10,7 @@ from torch import Tensor
 from gaussian_swaying.mpm.laws.hencky import StVKHencky
 from gaussian_swaying.mpm.laws.law import PlasticLaw
 from gaussian_swaying.mpm.laws.shared import ROOT, continued_log, split_strain, stretch_of_log
+from gaussian_swaying.mpm.twins import Numbers, Twin
 
 
 def cone_slope(friction_angle: float) -> float:
@@ -75,8 +76,6 @@ class Sand(PlasticLaw, StVKHencky):
             again.
     """
 
-    twin = "gaussian_swaying.mpm.laws.triton.sand"
-
     def __init__(self, friction_angle: float = 30.0, volume_correction: bool = False) -> None:
         super().__init__()
         if not 0 < friction_angle < 90:
@@ -86,9 +85,12 @@ class Sand(PlasticLaw, StVKHencky):
         self.friction_angle = float(friction_angle)
         self.internal = 0.0 if volume_correction else None
 
-    def coefficients(self) -> tuple[float, ...]:
-        """The numbers of this law that are passed to its twin."""
-        return (cone_slope(self.friction_angle), 0.0 if self.internal is None else 1.0)
+    def twin(self) -> Twin:
+        """See :class:`~gaussian_swaying.mpm.twins.Twin`."""
+        from gaussian_swaying.mpm.laws.triton.sand import FUNCTIONS
+
+        numbers = (cone_slope(self.friction_angle), 0.0 if self.internal is None else 1.0)
+        return Twin(FUNCTIONS, numbers=Numbers(2, lambda: numbers))
 
     def flow(
         self, stretch: Tensor, mu: Tensor, lam: Tensor, internal: Tensor | None, dt: float | Tensor

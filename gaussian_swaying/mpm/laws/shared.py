@@ -30,6 +30,12 @@ LOG_LIMIT = 0.05
 ROOT = math.sqrt(2 / 3)
 """Norm of the deviator of a unit stress in uniaxial tension."""
 
+FLUID_LIMIT = 0.5
+"""Volume ratio below which the pressure of a fluid is continued by its tangent."""
+
+SNOW_RANGE = (0.6, 20.0)
+"""Plastic volume ratios between which snow hardens or softens."""
+
 
 def continued_log(x: Tensor) -> Tensor:
     """Logarithm, below 0.05 continued by its tangent: it and its gradient are defined for every number."""

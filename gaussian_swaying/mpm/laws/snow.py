@@ -11,9 +11,8 @@ from gaussian_swaying.mpm.laws.fixed_corotated import (
     fixed_corotated_pk1,
 )
 from gaussian_swaying.mpm.laws.law import PlasticLaw
-
-SNOW_RANGE = (0.6, 20.0)
-"""Plastic volume ratios between which snow hardens or softens."""
+from gaussian_swaying.mpm.laws.shared import SNOW_RANGE
+from gaussian_swaying.mpm.twins import Numbers, Twin
 
 
 def snow_lame(mu: Tensor, lam: Tensor, plastic_volume: Tensor, hardening: float) -> tuple[Tensor, Tensor]:
@@ -75,7 +74,6 @@ class Snow(PlasticLaw):
         hardening: Exponent of the stiffness in the plastic volume ratio.
     """
 
-    twin = "gaussian_swaying.mpm.laws.triton.snow"
     internal = 1.0
 
     def __init__(
@@ -91,9 +89,13 @@ class Snow(PlasticLaw):
         self.critical_compression, self.critical_stretch = float(critical_compression), float(critical_stretch)
         self.hardening = float(hardening)
 
-    def coefficients(self) -> tuple[float, ...]:
-        """The numbers of this law that are passed to its twin."""
-        return (self.critical_compression, self.critical_stretch, self.hardening)
+    def twin(self) -> Twin:
+        """See :class:`~gaussian_swaying.mpm.twins.Twin`."""
+        from gaussian_swaying.mpm.laws.triton.snow import FUNCTIONS
+
+        return Twin(
+            FUNCTIONS, numbers=Numbers(3, lambda: (self.critical_compression, self.critical_stretch, self.hardening))
+        )
 
     def _lame(self, mu: Tensor, lam: Tensor, internal: Tensor | None) -> tuple[Tensor, Tensor]:
         return (mu, lam) if internal is None else snow_lame(mu, lam, internal, self.hardening)

@@ -8,6 +8,7 @@ from torch import Tensor
 from gaussian_swaying.geometry.linalg import from_principal, spectrum
 from gaussian_swaying.mpm.laws.law import ConstitutiveLaw
 from gaussian_swaying.mpm.laws.shared import LOG_LIMIT, spectral_moduli
+from gaussian_swaying.mpm.twins import Twin
 
 
 def spring_network_energy(F: Tensor, mu: Tensor, lam: Tensor) -> Tensor:
@@ -117,8 +118,6 @@ class SpringNetwork(ConstitutiveLaw):
     1.2.
     """
 
-    twin = "gaussian_swaying.mpm.laws.triton.spring_network"
-
     def energy(self, F: Tensor, mu: Tensor, lam: Tensor, internal: Tensor | None = None) -> Tensor:
         """See :func:`spring_network_energy`."""
         return spring_network_energy(F, mu, lam)
@@ -130,3 +129,9 @@ class SpringNetwork(ConstitutiveLaw):
     def moduli(self, F: Tensor, mu: Tensor, lam: Tensor, internal: Tensor | None = None) -> tuple[Tensor, Tensor]:
         """See :func:`spring_network_moduli`."""
         return spring_network_moduli(F, mu, lam)
+
+    def twin(self) -> Twin:
+        """See :class:`~gaussian_swaying.mpm.twins.Twin`."""
+        from gaussian_swaying.mpm.laws.triton.spring_network import FUNCTIONS
+
+        return Twin(FUNCTIONS)

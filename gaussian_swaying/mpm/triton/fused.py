@@ -22,7 +22,7 @@ from gaussian_swaying.mpm.body import Body
 from gaussian_swaying.mpm.forces import MOST_STEPS, Force, added, divide, split, tensors_of
 from gaussian_swaying.mpm.formulations.formulation import Formulation
 from gaussian_swaying.mpm.laws.triton.body import BodyLaws
-from gaussian_swaying.mpm.laws.triton.twin import shared, twin_of
+from gaussian_swaying.mpm.laws.triton.functions import shared
 from gaussian_swaying.mpm.state import MPMState
 from gaussian_swaying.mpm.timestep import kick_time
 from gaussian_swaying.mpm.triton.shared import SCHEDULE
@@ -138,7 +138,7 @@ class Fused(ABC):
         if bound.settings.deterministic and not cls.fixed_order:
             return f"its sums have no fixed order in the {bound.name} formulation, but `deterministic` is set"
         for law in points.laws:
-            if twin_of(law) is None:
+            if law.twin() is None:
                 return f"the law {type(law).__name__} has no Triton twin"
         return None
 

@@ -7,7 +7,7 @@ from torch import Tensor
 
 from gaussian_swaying.mpm.body import Body
 from gaussian_swaying.mpm.formulations.formulation import Formulation
-from gaussian_swaying.mpm.laws.triton.twin import shared
+from gaussian_swaying.mpm.laws.triton.functions import shared
 from gaussian_swaying.mpm.state import MPMState
 from gaussian_swaying.mpm.triton import measure_kernels as kernels
 

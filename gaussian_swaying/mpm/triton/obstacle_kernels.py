@@ -2,9 +2,9 @@
 
 :class:`~gaussian_swaying.mpm.triton.obstacles.Solids` makes what they read: the numbers and tables of the twins; for
 each solid a row of :data:`ROW` numbers, gap, friction and the number of its boundary; its time window; and, if it
-moves, keys. A key has :data:`KEY` numbers: time, place (3), and turn (3). The pose of a substep has :data:`POSE`: place of the
-centre (3), rotation (9), and the velocity of what is at an offset from the centre: a matrix (9) and the velocity of the
-centre (3).
+moves, keys. A key has :data:`KEY` numbers: time, place (3), and turn (3). The pose of a substep has :data:`POSE`: place
+of the centre (3), rotation (9), and the velocity of what is at an offset from the centre: a matrix (9) and the velocity
+of the centre (3).
 """
 
 import triton

@@ -439,7 +439,7 @@ def why_not(fused: FusedTotal, state: MPMState, forces: Sequence[Force]) -> str 
     if not fused.plain or fused.touching is not None:
         return "boundaries other than pins that hold all the time, and contact, have no backward kernels"
     if any(derivative is None for derivative in fused.laws.adjoints):
-        return "a law has no backward kernel (`LawTwin.adjoint`)"
+        return "a law has no backward kernel (`LawFunctions.adjoint`)"
     twin = forces[0].twin() if forces else None
     if len(forces) > 1 or (forces and twin is None):
         return "only one force with a Triton twin has a backward kernel"

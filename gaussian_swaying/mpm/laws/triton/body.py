@@ -15,7 +15,8 @@ import triton.language as tl
 
 from gaussian_swaying.geometry.linalg_triton import scaled_product, svd3, where3, where9
 from gaussian_swaying.mpm.laws.law import ConstitutiveLaw
-from gaussian_swaying.mpm.laws.triton.twin import twin_of
+from gaussian_swaying.mpm.laws.triton.functions import LawFunctions
+from gaussian_swaying.mpm.twins import Twin, device_key
 
 ROW = tl.constexpr(6)  # columns of the table: which stress, which flow (-1 for none), four numbers
 
@@ -41,7 +42,8 @@ class BodyLaws:
     """
 
     def __init__(self, laws: Sequence[ConstitutiveLaw]) -> None:
-        twins = [twin for law in laws if (twin := twin_of(law)) is not None]
+        given = [twin for law in laws if (twin := law.twin()) is not None]
+        twins: list[LawFunctions] = [twin.function for twin in given]
         self.spectral = any(twin.flow or not twin.kirchhoff for twin in twins)
         chosen = [
             (twin.principal,) if self.spectral and twin.principal else (twin.kirchhoff, twin.pk1) for twin in twins
@@ -55,11 +57,11 @@ class BodyLaws:
         self.flows = _once(twin.flow for twin in twins if twin.flow)
         self.all_flow = all(twin.flow for twin in twins)
         self.table = [
-            [float(order.index(stress)), float(self.flows.index(twin.flow) if twin.flow else -1), *_padded(law)]
-            for law, twin, stress in zip(laws, twins, chosen, strict=True)
+            [float(order.index(stress)), float(self.flows.index(twin.flow) if twin.flow else -1), *_padded(law, whole)]
+            for law, whole, twin, stress in zip(laws, given, twins, chosen, strict=True)
         ]
         functions = [self.principals, self.matrices, self.elastic, self.flows, self.adjoints]
-        source = [[_key(function) for function in part] for part in functions]
+        source = [[device_key(function) for function in part] for part in functions]
         self.cache_key = hashlib.sha256(repr((source, self.spectral, self.all_flow)).encode()).hexdigest()
 
     def __repr__(self) -> str:
@@ -71,17 +73,12 @@ def _once(functions: Any) -> tuple[Any, ...]:
     return tuple(dict.fromkeys(functions))
 
 
-def _padded(law: ConstitutiveLaw) -> list[float]:
+def _padded(law: ConstitutiveLaw, twin: Twin) -> list[float]:
     """The four numbers of a law."""
-    values = [float(value) for value in law.coefficients()]
+    values = [float(value) for value in twin.numbers.take()]
     if len(values) > 4:
-        raise ValueError(f"Expected at most four `coefficients` of {type(law).__name__}, but got {len(values)}.")
+        raise ValueError(f"Expected at most four `numbers` of {type(law).__name__}, but got {len(values)}.")
     return values + [0.0] * (4 - len(values))
-
-
-def _key(function: Any) -> str:
-    """A key that identifies a device function; in the interpreter, which caches nothing, its name."""
-    return getattr(function, "cache_key", "") + repr(function)
 
 
 @triton.jit

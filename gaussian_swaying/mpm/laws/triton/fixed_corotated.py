@@ -16,7 +16,7 @@ from gaussian_swaying.geometry.linalg_triton import (
     square9,
     transpose,
 )
-from gaussian_swaying.mpm.laws.triton.twin import LawTwin
+from gaussian_swaying.mpm.laws.triton.functions import LawFunctions
 
 
 @triton.jit
@@ -78,4 +78,4 @@ def adjoint(F, Q, mu, lam):
     return axpy9(1.0, bend, lam * change, cofactor_change(F, Q)), by_mu, change * growth
 
 
-TWIN = LawTwin(principal=principal, pk1=pk1, kirchhoff=kirchhoff, energy=energy, wave=wave, adjoint=adjoint)
+FUNCTIONS = LawFunctions(principal=principal, pk1=pk1, kirchhoff=kirchhoff, energy=energy, wave=wave, adjoint=adjoint)

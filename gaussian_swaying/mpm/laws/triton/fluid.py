@@ -4,9 +4,9 @@ import triton
 import triton.language as tl
 
 from gaussian_swaying.geometry.linalg_triton import cofactor
-from gaussian_swaying.mpm.laws.fluid import FLUID_LIMIT
+from gaussian_swaying.mpm.laws.shared import FLUID_LIMIT
+from gaussian_swaying.mpm.laws.triton.functions import LawFunctions
 from gaussian_swaying.mpm.laws.triton.shared import LOG_FLOOR
-from gaussian_swaying.mpm.laws.triton.twin import LawTwin
 
 FLUID_FLOOR = tl.constexpr(FLUID_LIMIT)
 
@@ -33,4 +33,4 @@ def flow(a, mu, lam, internal, p, dt):
     return (root, root, root), internal
 
 
-TWIN = LawTwin(kirchhoff=kirchhoff, flow=flow)
+FUNCTIONS = LawFunctions(kirchhoff=kirchhoff, flow=flow)

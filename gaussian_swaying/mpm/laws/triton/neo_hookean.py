@@ -4,8 +4,8 @@ import triton
 import triton.language as tl
 
 from gaussian_swaying.geometry.linalg_triton import axpy9, cofactor, cofactor_change, dot9, matmul, transpose
+from gaussian_swaying.mpm.laws.triton.functions import LawFunctions
 from gaussian_swaying.mpm.laws.triton.shared import LOG_FLOOR, log
-from gaussian_swaying.mpm.laws.triton.twin import LawTwin
 
 
 @triton.jit
@@ -37,4 +37,4 @@ def adjoint(F, Q, mu, lam):
     return axpy9(1.0, change, pressure, cofactor_change(F, Q)), by_mu, volume * slope * growth
 
 
-TWIN = LawTwin(pk1=pk1, kirchhoff=kirchhoff, adjoint=adjoint)
+FUNCTIONS = LawFunctions(pk1=pk1, kirchhoff=kirchhoff, adjoint=adjoint)

@@ -4,9 +4,9 @@ import triton
 import triton.language as tl
 
 from gaussian_swaying.geometry.linalg_triton import where3
+from gaussian_swaying.mpm.laws.triton.functions import LawFunctions
 from gaussian_swaying.mpm.laws.triton.hencky import energy, principal, wave
 from gaussian_swaying.mpm.laws.triton.shared import drawn_back, log, split_strain
-from gaussian_swaying.mpm.laws.triton.twin import LawTwin
 
 
 @triton.jit
@@ -30,4 +30,4 @@ def flow(a, mu, lam, internal, p, dt):
     return new, internal + corrected * change
 
 
-TWIN = LawTwin(principal=principal, flow=flow, energy=energy, wave=wave)
+FUNCTIONS = LawFunctions(principal=principal, flow=flow, energy=energy, wave=wave)

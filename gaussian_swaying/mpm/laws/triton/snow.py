@@ -4,9 +4,9 @@ import triton
 import triton.language as tl
 
 from gaussian_swaying.geometry.linalg_triton import clamp
-from gaussian_swaying.mpm.laws.snow import SNOW_RANGE
+from gaussian_swaying.mpm.laws.shared import SNOW_RANGE
 from gaussian_swaying.mpm.laws.triton.fixed_corotated import corotated_stress
-from gaussian_swaying.mpm.laws.triton.twin import LawTwin
+from gaussian_swaying.mpm.laws.triton.functions import LawFunctions
 
 SNOW_LOW = tl.constexpr(SNOW_RANGE[0])
 SNOW_HIGH = tl.constexpr(SNOW_RANGE[1])
@@ -29,4 +29,4 @@ def flow(a, mu, lam, internal, p, dt):
     return kept, clamp(internal * lost, SNOW_LOW, SNOW_HIGH)
 
 
-TWIN = LawTwin(principal=principal, flow=flow)
+FUNCTIONS = LawFunctions(principal=principal, flow=flow)

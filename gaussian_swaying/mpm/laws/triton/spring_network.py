@@ -4,6 +4,7 @@ import triton
 import triton.language as tl
 
 from gaussian_swaying.geometry.linalg_triton import dot3, svd3
+from gaussian_swaying.mpm.laws.triton.functions import LawFunctions
 from gaussian_swaying.mpm.laws.triton.shared import (
     EPSILON,
     LOG_FLOOR,
@@ -12,7 +13,6 @@ from gaussian_swaying.mpm.laws.triton.shared import (
     spectral_modulus,
     to_principal,
 )
-from gaussian_swaying.mpm.laws.triton.twin import LawTwin
 
 
 @triton.jit
@@ -171,4 +171,4 @@ def adjoint(F, Q, mu, lam):
     return change, shear + share * network, bulk + (1 - share) * network
 
 
-TWIN = LawTwin(principal=principal, energy=energy, wave=wave, adjoint=adjoint)
+FUNCTIONS = LawFunctions(principal=principal, energy=energy, wave=wave, adjoint=adjoint)

@@ -1,21 +1,20 @@
-"""The device functions that a law provides for the kernels, and how to find them."""
+"""The device functions that a law provides for the kernels."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass
-from importlib import import_module
 from typing import Any
 
 from gaussian_swaying.mpm.laws.law import ConstitutiveLaw
 
 
 @dataclass(frozen=True)
-class LawTwin:
-    """Device functions of a law: Triton functions of one particle per lane, or None if the law has none.
+class LawFunctions:
+    """Device functions of a law, the ``function`` of its twin; None if the law has none.
 
     A matrix is a tuple of nine values, row by row; stretches and principal stresses are tuples of three; ``p`` are the
-    four numbers of ``ConstitutiveLaw.coefficients``, padded with zeros.
+    at most four numbers of the twin, padded with zeros.
 
     Attributes:
         principal: ``(a, mu, lam, internal, p)``: principal first Piola-Kirchhoff stresses from the principal stretches.
@@ -50,24 +49,13 @@ class LawTwin:
             )
 
 
-def twin_of(law: ConstitutiveLaw) -> LawTwin | None:
-    """The twin of a law, or None for one that runs in torch only.
-
-    Raises:
-        ValueError: If the module that the law names cannot be imported or has no ``TWIN``.
-    """
-    if law.twin is None:
-        return None
-    try:
-        return import_module(law.twin).TWIN
-    except (ImportError, AttributeError) as error:
-        raise ValueError(
-            f"Expected `twin` of {type(law).__name__} to be a module that holds a `TWIN`, or None for a law that runs "
-            f"in torch only, but {law.twin!r} is not: {error}."
-        ) from error
+def functions_of(law: ConstitutiveLaw) -> LawFunctions | None:
+    """The device functions of a law, or None for one that runs in torch only."""
+    twin = law.twin()
+    return None if twin is None else twin.function
 
 
 def shared(laws: Iterable[ConstitutiveLaw], name: str) -> Any:
     """The ``energy`` or ``wave`` that all laws of a body have in common, or None."""
-    found = {getattr(twin_of(law), name, None) for law in laws}
+    found = {getattr(functions_of(law), name, None) for law in laws}
     return found.pop() if len(found) == 1 else None
