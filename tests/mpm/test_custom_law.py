@@ -1,4 +1,4 @@
-"""A custom law, from outside the package: one file, named by its class path in a YAML, and a twin for the kernels."""
+"""A custom law, from outside the package: examples/custom_law.py, named by its class path in a YAML, and its twin."""
 
 import importlib
 import sys
@@ -17,86 +17,13 @@ from gaussian_swaying.recording.trajectory import load_trajectory
 
 ROOT = Path(__file__).parents[2]
 
-LAW = '''
-"""Saint Venant and Kirchhoff: Hooke's law in the Green strain."""
-
-import torch
-
-from gaussian_swaying import ConstitutiveLaw
-from gaussian_swaying.geometry.linalg import matmul3
-from gaussian_swaying.mpm.twins import Numbers, Twin
-
-
-class Saint(ConstitutiveLaw):
-    """Hooke's law in the Green strain, times a factor."""
-
-    def __init__(self, factor: float = 1.0) -> None:
-        super().__init__()
-        self.factor = factor
-
-    def twin(self):
-        from saint_twin import FUNCTIONS
-
-        return Twin(FUNCTIONS, numbers=Numbers(1, lambda: [self.factor]))
-
-    def _strain(self, F):
-        return 0.5 * (matmul3(F.mT, F) - torch.eye(3, dtype=F.dtype, device=F.device))
-
-    def energy(self, F, mu, lam, internal=None):
-        E = self._strain(F)
-        trace = E.diagonal(dim1=-2, dim2=-1).sum(-1)
-        return self.factor * (mu * E.square().sum((-1, -2)) + 0.5 * lam * trace.square())
-
-    def pk1(self, F, mu, lam, internal=None):
-        E = self._strain(F)
-        trace = (lam * E.diagonal(dim1=-2, dim2=-1).sum(-1))[..., None, None]
-        eye = torch.eye(3, dtype=F.dtype, device=F.device)
-        return self.factor * matmul3(F, 2 * mu[..., None, None] * E + trace * eye)
-
-    def moduli(self, F, mu, lam, internal=None):
-        size = F.square().sum((-1, -2)).clamp(min=3)
-        return self.factor * (2 * mu + lam) * size, self.factor * (2 * mu + 3 * lam) * size
-'''
-
-TWIN = """
-import triton
-import triton.language as tl
-
-from gaussian_swaying.mpm.laws.triton.functions import LawFunctions
-from gaussian_swaying.geometry.linalg_triton import matmul, transpose
-
-
-@triton.jit
-def pk1(F, mu, lam, internal, p):
-    C = matmul(transpose(F), F)
-    pressure = 0.5 * lam * (C[0] + C[4] + C[8] - 3)
-    s = p[0]
-    stress = (
-        s * (mu * (C[0] - 1) + pressure), s * mu * C[1], s * mu * C[2], s * mu * C[3],
-        s * (mu * (C[4] - 1) + pressure), s * mu * C[5], s * mu * C[6], s * mu * C[7],
-        s * (mu * (C[8] - 1) + pressure),
-    )
-    return matmul(F, stress)
-
-
-@triton.jit
-def kirchhoff(F, mu, lam, internal, p):
-    return matmul(pk1(F, mu, lam, internal, p), transpose(F))
-
-
-FUNCTIONS = LawFunctions(pk1=pk1, kirchhoff=kirchhoff)
-"""
-
 
 @pytest.fixture
-def saint(tmp_path, monkeypatch):
-    """The modules of a user's folder, and the law."""
-    (tmp_path / "saint_law.py").write_text(LAW)
-    (tmp_path / "saint_twin.py").write_text(TWIN)
-    monkeypatch.syspath_prepend(str(tmp_path))
-    yield importlib.import_module("saint_law").Saint
-    for name in ("saint_law", "saint_twin"):
-        sys.modules.pop(name, None)
+def saint(monkeypatch):
+    """The law of the example."""
+    monkeypatch.syspath_prepend(str(ROOT / "examples"))
+    yield importlib.import_module("custom_law").SaintVenant
+    sys.modules.pop("custom_law", None)
 
 
 def _run(folder, law):
@@ -118,10 +45,10 @@ def _run(folder, law):
 
 
 def test_a_custom_law_runs_from_a_yaml(tmp_path, saint):
-    assert "Saint" not in LAWS
-    written, moved = _run(tmp_path / "one", {"class_path": "saint_law.Saint", "init_args": {"factor": 2.0}})
-    assert written == {"class_path": "saint_law.Saint", "init_args": {"factor": 2.0}}
-    soft = _run(tmp_path / "soft", {"class_path": "saint_law.Saint"})[1]
+    assert "SaintVenant" not in LAWS
+    written, moved = _run(tmp_path / "one", {"class_path": "custom_law.SaintVenant", "init_args": {"factor": 2.0}})
+    assert written == {"class_path": "custom_law.SaintVenant", "init_args": {"factor": 2.0}}
+    soft = _run(tmp_path / "soft", {"class_path": "custom_law.SaintVenant"})[1]
     corotated = _run(tmp_path / "corotated", {"class_path": "FixedCorotated"})[1]
     assert float((moved[1] - moved[0]).abs().max()) > 1e-3
     assert float((moved[1] - soft[1]).abs().max()) > 1e-6
@@ -157,3 +84,24 @@ def test_a_law_without_a_twin_runs_in_torch(saint):
 
     assert Stiffer().twin() is None
     assert saint().twin() is not None
+
+
+@pytest.mark.parametrize("triton", ["there", None])
+def test_the_example_ends_in_a_check(saint, triton, monkeypatch, capsys):
+    """Its twin against torch; without Triton its stress against its energy."""
+    module = sys.modules["custom_law"]
+    if triton is None:
+        monkeypatch.setattr(module, "triton", None)
+        assert saint().twin() is None
+    assert module.main() < (2e-5 if module.triton else 1e-12)
+    assert ("kernels and torch" in capsys.readouterr().out) == (module.triton is not None)
+
+
+def test_a_wrong_stress_is_found(saint):
+    class Wrong(saint):
+        def pk1(self, F, mu, lam, internal=None):
+            return 1.01 * super().pk1(F, mu, lam)
+
+    error = sys.modules["custom_law"].stress_error
+    assert error(saint(1.5)) < 1e-12
+    assert 0.005 < error(Wrong(1.5)) < 0.02

@@ -16,8 +16,8 @@ class ConstitutiveLaw(Twinned, nn.Module, ABC):
 
     A law is a subclass with :meth:`energy`, :meth:`pk1` and :meth:`moduli`; a plastic law is a subclass of
     :class:`PlasticLaw` with ``flow``. That is all that the torch substep needs. To run in the Triton kernels too, a law
-    has a ``twin`` (:mod:`~gaussian_swaying.mpm.twins`). Elastic stiffness belongs to the particles (Lamé parameters); all other parameters of a law are
-    arguments of its constructor.
+    has a ``twin`` (:mod:`~gaussian_swaying.mpm.twins`). Elastic stiffness belongs to the particles (Lamé parameters);
+    all other parameters of a law are arguments of its constructor.
 
     Attributes:
         plastic: Whether there is a return map. The deformation gradient is then only the elastic part of the

@@ -93,9 +93,8 @@ class Snow(PlasticLaw):
         """See :class:`~gaussian_swaying.mpm.twins.Twin`."""
         from gaussian_swaying.mpm.laws.triton.snow import FUNCTIONS
 
-        return Twin(
-            FUNCTIONS, numbers=Numbers(3, lambda: (self.critical_compression, self.critical_stretch, self.hardening))
-        )
+        numbers = (self.critical_compression, self.critical_stretch, self.hardening)
+        return Twin(FUNCTIONS, numbers=Numbers(3, lambda: numbers))
 
     def _lame(self, mu: Tensor, lam: Tensor, internal: Tensor | None) -> tuple[Tensor, Tensor]:
         return (mu, lam) if internal is None else snow_lame(mu, lam, internal, self.hardening)
