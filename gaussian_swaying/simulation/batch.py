@@ -10,7 +10,7 @@ from typing import Any
 
 import torch
 
-from gaussian_swaying.simulation.diagnostics import FrameDiagnostics, SceneDiagnostics, SimulationDiverged
+from gaussian_swaying.simulation.diagnostics import SimulationDiverged, measure
 from gaussian_swaying.simulation.run import Run
 from gaussian_swaying.simulation.simulation import Simulation
 from gaussian_swaying.simulation.stepper import Stepper
@@ -69,16 +69,16 @@ def run_batch(
                 batch.advance(state)
         startup = (time.perf_counter() - begin) / len(members)
         begin = time.perf_counter()
-        health: FrameDiagnostics = batch.at_rest(state)
+        each = measure(batch.solver, state, 0, 0.0).each()
         for frame in range(frames):
             launched = batch.launch(state) if frame + 1 < frames else None
-            assert isinstance(health, SceneDiagnostics)
             for index, run in runs.items():
                 if run.recording:
                     run.record(state.scene(index), frame)
-                run.log.append(health.each[index].as_dict())
+                run.log.append(each[index].as_dict())
             if launched is not None:
-                state, health = launched.finish()
+                state, _ = launched.finish()
+                each = launched.each
         for recorder in opened:
             recorder.wait()
         seconds = (time.perf_counter() - begin) / len(members)

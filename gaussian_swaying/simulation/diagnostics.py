@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import copy
 import math
-from collections.abc import Callable
-from dataclasses import asdict, dataclass, field
-from functools import cached_property
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass, replace
 from typing import Any
 
 import torch
@@ -17,7 +16,6 @@ from gaussian_swaying.geometry.linalg import determinant, matmul3, symmetric_eig
 from gaussian_swaying.geometry.neighbours import nearest_neighbours
 from gaussian_swaying.mpm.protocol import Solver
 from gaussian_swaying.mpm.state import State, support_force
-from gaussian_swaying.simulation.health import particle_of_extremes
 
 _PARTICLES = ("moved_particle", "compressed_particle", "stretched_particle")
 _SAMPLE = 4096  # particles whose nearest neighbour is searched
@@ -41,7 +39,7 @@ class SimulationDiverged(RuntimeError):  # noqa: N818  (it ends a run the way St
 
 @dataclass(frozen=True)
 class FrameDiagnostics:
-    """Health of the state at the end of a frame, summed over the scenes of a batch.
+    """Health of the state at the end of a frame; of a batch sums and extremes over its scenes.
 
     Attributes:
         time: Simulated time [s].
@@ -177,7 +175,6 @@ def diagnose(
     state: State,
     substeps: int,
     cfl: Tensor | float,
-    wind_work: Tensor | float = 0.0,
     tearing: TearingGauge | None = None,
     check: bool = False,
     before: State | None = None,
@@ -186,13 +183,13 @@ def diagnose(
 
     Args:
         solver: The solver that made the state.
-        state: The state at the end of the frame.
+        state: The state at the end of the frame, of one scene or of a batch of shape (B,).
         substeps: Substeps of the frame.
         cfl: Largest Courant number of the frame.
-        wind_work: Work of the wind during the frame [J].
         tearing: Counts torn particles; none are counted without it.
         check: Also run :func:`check_state`, within the same synchronisation.
-        before: The state at the start of the frame, for the forces on supports; they are zero without it.
+        before: The state at the start of the frame, for the work of the wind and the forces on supports; they are zero
+            without it.
 
     Returns:
         The measurements.
@@ -200,14 +197,14 @@ def diagnose(
     Raises:
         SimulationDiverged: With ``check``, naming time, particle, cause and remedy.
     """
-    return measure(solver, state, substeps, cfl, wind_work, tearing, before).read(check)
+    return measure(solver, state, substeps, cfl, tearing, before).read(check)
 
 
 class Measurement:
     """Results of :func:`measure` on the device, which the host has not waited for yet."""
 
-    def __init__(self, solver: Solver, substeps: int, parts: dict[str, Tensor], given: list[Tensor | float]) -> None:
-        self._solver, self._substeps, self._given = solver, substeps, given
+    def __init__(self, solver: Solver, substeps: int, scenes: int, parts: dict[str, Tensor]) -> None:
+        self._solver, self._substeps, self._scenes = solver, substeps, scenes
         self._sizes = {name: len(part) for name, part in parts.items()}
         self.values = torch.cat(list(parts.values()))
         self._found: dict[str, list[Any]] = {}
@@ -225,17 +222,10 @@ class Measurement:
             self._found = {name: [next(values) for _ in range(size)] for name, size in self._sizes.items()}
         return self._found
 
-    def _number(self, place: int) -> float:
-        """Return the first or second of the given numbers, which may be a tensor."""
-        value = self._given[place]
-        if not isinstance(value, Tensor):
-            return float(value)
-        return float(self._wait()["given"][sum(isinstance(before, Tensor) for before in self._given[:place])])
-
     @property
     def cfl(self) -> float:
         """Largest Courant number of the frame."""
-        return self._number(0)
+        return float(self._wait()["cfl"][0])
 
     @property
     def outran(self) -> bool:
@@ -252,21 +242,38 @@ class Measurement:
         found = self._wait()
         if check:
             _raise_if_bad(self._solver, found["verdict"], found["time"][0])
-        axes = [f"{kind}momentum_{axis}" for kind in ("", "angular_") for axis in "xyz"]
-        return FrameDiagnostics(
-            time=found["time"][0],
-            substeps=self._substeps,
-            cfl=self.cfl,
-            **dict(zip(("kinetic", "elastic", "potential"), found["energy"], strict=True)),
-            wind_work=self._number(1),
-            **dict(zip(axes, found["momentum"], strict=True)),
-            lost=int(found["counts"][0]),
-            torn=int(sum(found["counts"][1:])),
-            **dict(zip(("J_min", "J_max", "displacement_mean", "displacement_max"), found["extremes"], strict=True)),
-            **dict(zip(("stretch_min", "stretch_max"), found["stretch"], strict=True)),
-            **{name: int(value) for name, value in zip(_PARTICLES, found["particles"], strict=True)},
-            support=tuple(zip(*[iter(found["support"])] * 3, strict=True)),
-        )
+        return self._scene(0) if self._scenes == 1 else _joined([self._scene(k) for k in range(self._scenes)])
+
+    def each(self) -> tuple[FrameDiagnostics, ...]:
+        """The measurements of each scene; substeps and Courant number are those of all."""
+        self._wait()
+        return tuple(self._scene(k) for k in range(self._scenes))
+
+    def _scene(self, scene: int) -> FrameDiagnostics:
+        found = self._found
+        row = found["each"][scene :: self._scenes]
+        own: dict[str, Any] = dict(zip(_OF_SCENE, row[: len(_OF_SCENE)], strict=True))
+        own |= {name: int(own[name]) for name in ("lost", "torn", *_PARTICLES)}
+        own["support"] = tuple(zip(*[iter(row[len(_OF_SCENE) :])] * 3, strict=True))
+        return FrameDiagnostics(time=found["time"][0], substeps=self._substeps, cfl=self.cfl, **own)
+
+
+_OF_SCENE = tuple(
+    name for name in FrameDiagnostics.__dataclass_fields__ if name not in ("time", "substeps", "cfl", "support")
+)
+_EXTREMES: dict[str, Callable[..., Any]] = {"J_min": min, "J_max": max, "stretch_min": min, "stretch_max": max}
+_EXTREMES |= {"displacement_max": max, "displacement_mean": lambda values: sum(values) / len(values)}
+
+
+def _joined(scenes: Sequence[FrameDiagnostics]) -> FrameDiagnostics:
+    """The measurements of a batch: sums, extremes, and the mean of mean displacements; particles of the first scene."""
+    first, found = scenes[0], {}
+    for name in _OF_SCENE:
+        values = [getattr(scene, name) for scene in scenes]
+        found[name] = values[0] if name in _PARTICLES else _EXTREMES.get(name, sum)(values)
+    forces = zip(*(scene.support for scene in scenes), strict=True)
+    found["support"] = tuple((sum(f[0] for f in of), sum(f[1] for f in of), sum(f[2] for f in of)) for of in forces)
+    return replace(first, **found)
 
 
 def measure(
@@ -274,7 +281,6 @@ def measure(
     state: State,
     substeps: int,
     cfl: Tensor | float,
-    wind_work: Tensor | float = 0.0,
     tearing: TearingGauge | None = None,
     before: State | None = None,
     more: Tensor | None = None,
@@ -283,80 +289,7 @@ def measure(
 
     ``more`` are further numbers to read with them, float64, shape (n,).
     """
-    moved = torch.linalg.vector_norm(state.position - solver.points.position, dim=-1)
-    energies, momenta = solver.energies(state), solver.momenta(state)
-    energy = torch.stack([energies[name] for name in ("kinetic", "elastic", "potential")]).double()
-    momentum = torch.stack([momenta[name] for name in ("linear", "angular")]).double()
-    counts = [state.lost.sum()] + ([] if tearing is None else [tearing(state.position).sum()])
-    extremes = torch.stack([*torch.aminmax(determinant(state.F_total)), moved.mean(), moved.amax()])
-    F = state.F_total.double()
-    squares = symmetric_eigenvalues(matmul3(F.mT, F))
-    stretch = torch.stack(torch.aminmax(squares)).clamp(min=0).sqrt()
-    given = [value.to(state.time).reshape(1) for value in (cfl, wind_work) if isinstance(value, Tensor)]
-    parts = {
-        "time": state.time[None],
-        "energy": energy.reshape(3, -1).sum(-1),
-        "momentum": momentum.reshape(2, -1, 3).sum(1).reshape(-1),
-        "counts": torch.stack(counts).double(),
-        "extremes": extremes.double(),
-        "stretch": stretch,
-        "particles": particle_of_extremes(moved, squares).double(),
-        "given": torch.cat(given) if given else stretch[:0],
-        "support": _supports(state if before is None else before, state),
-        "verdict": _verdict(solver, state, moved),
-        "outran": _outran(state if before is None else before, state),
-        "more": stretch[:0] if more is None else more,
-    }
-    return Measurement(solver, substeps, parts, [cfl, wind_work])
-
-
-@dataclass(frozen=True)
-class SceneDiagnostics(FrameDiagnostics):
-    """Diagnostics of the first scene of a batch; ``make`` computes those of all scenes when they are needed."""
-
-    make: Callable[[], tuple[FrameDiagnostics, ...]] = field(default=tuple, repr=False, compare=False)
-
-    @cached_property
-    def each(self) -> tuple[FrameDiagnostics, ...]:
-        """The diagnostics of each scene; substeps and Courant number are those of all."""
-        return self.make()
-
-
-class SceneMeasurement(Measurement):
-    """As :class:`Measurement`, for each scene of a batch."""
-
-    def read(self, check: bool = False) -> SceneDiagnostics:
-        """Wait for the measurements (one GPU synchronisation); see :func:`diagnose`."""
-        found = self._wait()
-        if check:
-            _raise_if_bad(self._solver, found["verdict"], found["time"][0])
-        scenes = int(found["scenes"][0])
-        shared: dict[str, Any] = {"time": found["time"][0], "substeps": self._substeps, "cfl": self.cfl}
-
-        def one(scene: int) -> dict[str, Any]:
-            row = found["each"][scene::scenes]
-            own: dict[str, Any] = dict(zip(_OF_SCENE, row[: len(_OF_SCENE)], strict=True))
-            own |= {name: int(own[name]) for name in ("lost", "torn", *_PARTICLES)}
-            return shared | own | {"support": tuple(zip(*[iter(row[len(_OF_SCENE) :])] * 3, strict=True))}
-
-        return SceneDiagnostics(**one(0), make=lambda: tuple(FrameDiagnostics(**one(k)) for k in range(scenes)))
-
-
-_OF_SCENE = tuple(
-    name for name in FrameDiagnostics.__dataclass_fields__ if name not in ("time", "substeps", "cfl", "support")
-)
-
-
-def measure_scenes(
-    solver: Solver,
-    state: State,
-    substeps: int,
-    cfl: Tensor | float,
-    before: State,
-    tearing: TearingGauge | None = None,
-    more: Tensor | None = None,
-) -> SceneMeasurement:
-    """As :func:`measure`, for each scene of a batch of shape (B,)."""
+    start = state if before is None else before
     moved = torch.linalg.vector_norm(state.position - solver.points.position, dim=-1)
     energies, momenta = solver.energies(state), solver.momenta(state)
     J = determinant(state.F_total)
@@ -364,11 +297,11 @@ def measure_scenes(
     squares = symmetric_eigenvalues(matmul3(F.mT, F))
     columns = {
         **energies,
-        "wind_work": state.work - before.work,
+        "wind_work": state.work - start.work,
         **{f"momentum_{axis}": momenta["linear"][..., k] for k, axis in enumerate("xyz")},
         **{f"angular_momentum_{axis}": momenta["angular"][..., k] for k, axis in enumerate("xyz")},
         "lost": state.lost.sum(-1),
-        "torn": J.new_zeros(len(moved)) if tearing is None else tearing(state.position).sum(-1),
+        "torn": torch.zeros_like(moved[..., 0]) if tearing is None else tearing(state.position).sum(-1),
         "J_min": J.amin(-1),
         "J_max": J.amax(-1),
         "stretch_min": squares[..., -1].amin(-1).clamp(min=0).sqrt(),
@@ -379,18 +312,20 @@ def measure_scenes(
         "compressed_particle": squares[..., -1].argmin(-1),
         "stretched_particle": squares[..., 0].argmax(-1),
     }
-    support = support_force(before, state).flatten(-2)
-    each = [columns[name].double() for name in _OF_SCENE] + list(support.double().unbind(-1))
+    scenes = moved.shape[:-1].numel()
+    support = support_force(start, state)
+    support = support.double().reshape(scenes, 3 * support.shape[-2])
+    each = [columns[name].double().reshape(-1) for name in _OF_SCENE]
+    courant = cfl if isinstance(cfl, Tensor) else torch.full_like(state.time, cfl)
     parts = {
         "time": state.time[None],
-        "each": torch.cat(each),
-        "scenes": torch.full_like(state.time[None], len(moved)),
-        "given": state.time[None][:0] if not isinstance(cfl, Tensor) else cfl.to(state.time).reshape(1),
+        "cfl": courant.to(state.time).reshape(1),
+        "each": torch.cat([*each, support.mT.reshape(-1)]),
         "verdict": _verdict(solver, state, moved),
-        "outran": _outran(before, state),
+        "outran": _outran(start, state),
         "more": state.time[None][:0] if more is None else more,
     }
-    return SceneMeasurement(solver, substeps, parts, [cfl])
+    return Measurement(solver, substeps, scenes, parts)
 
 
 class Gauge:
@@ -410,7 +345,6 @@ class Gauge:
         state: State,
         substeps: int,
         cfl: Tensor,
-        work: Tensor,
         before: State,
         more: Callable[[State], Tensor],
         same: tuple[object, ...] | None,
@@ -422,7 +356,6 @@ class Gauge:
             state: The state at the end of the frame.
             substeps: Substeps of the frame.
             cfl: Largest Courant number of the frame.
-            work: Work of the wind during the frame [J].
             before: The state at the start of the frame.
             more: Function of the state that computes further numbers.
             same: Key of all else that ``more`` depends on; another key makes another recording. None to record nothing.
@@ -430,32 +363,26 @@ class Gauge:
         small = state.position.is_cuda and state.position.shape[:-1].numel() <= RECORDED
         fixed = solver.neighbours_fixed and state.F_elastic is state.F_total
         if not (small and fixed) or same is None or torch.is_grad_enabled():
-            return measure(solver, state, substeps, cfl, work, None, before, more(state))
+            return measure(solver, state, substeps, cfl, None, before, more(state))
 
         names = [name for name, value in state.fields().items() if isinstance(value, Tensor) and name not in _UNREAD]
 
-        def values(its_cfl: Tensor, its_work: Tensor, impulse: Tensor, began: Tensor, *fields: Tensor) -> list[Tensor]:
+        def values(its_cfl: Tensor, work: Tensor, impulse: Tensor, began: Tensor, *fields: Tensor) -> list[Tensor]:
             found = dict(zip(names, fields, strict=True))
             end = state.replace(**found, F_elastic=found["F_total"])
-            start = end.replace(impulse=impulse, time=began)
-            self._made = measure(solver, end, substeps, its_cfl, its_work, None, start, more(end))
+            start = end.replace(work=work, impulse=impulse, time=began)
+            self._made = measure(solver, end, substeps, its_cfl, None, start, more(end))
             return [self._made.values]
 
         given = [getattr(state, name) for name in names]
         key = (solver.identity, *same)
-        (found,) = self.replayed(key, values, cfl, work, before.impulse, before.time, *given)
+        (found,) = self.replayed(key, values, cfl, before.work, before.impulse, before.time, *given)
         assert self._made is not None
         return self._made.again(substeps, found)
 
 
-_UNREAD = ("F_elastic", "affine", "work")
+_UNREAD = ("F_elastic", "affine")
 """Fields of a state that a recording of :func:`measure` does not read; ``F_elastic`` is the same as ``F_total``."""
-
-
-def _supports(before: State, after: State) -> Tensor:
-    """Force on each boundary [N], summed over the scenes, float64, shape (3 * boundaries,)."""
-    force = support_force(before, after)
-    return force.reshape(force.shape[:-2].numel(), *force.shape[-2:]).sum(0).reshape(-1)
 
 
 def _outran(before: State, after: State) -> Tensor:

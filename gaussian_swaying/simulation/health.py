@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-import torch
 from torch import Tensor
 
 SOUND = (0.5, 2.0)  # range of stretch within which the object keeps its intended shape
@@ -92,14 +91,3 @@ def _place(entry: Mapping[str, Any]) -> str:
 
 def _digits(value: float) -> str:
     return f"{value:.2g}" if value < 100 else f"{value:.0f}"
-
-
-def particle_of_extremes(moved: Tensor, eigenvalues: Tensor) -> Tensor:
-    """Indices of the particles that moved, were compressed and were stretched most, int64, shape (3,).
-
-    Args:
-        moved: Distances from rest, shape (..., P).
-        eigenvalues: Squares of the stretches, largest first, shape (..., P, 3).
-    """
-    flat = eigenvalues.reshape(-1, 3)
-    return torch.stack([moved.reshape(-1).argmax(), flat[:, -1].argmin(), flat[:, 0].argmax()])

@@ -31,7 +31,6 @@ from gaussian_swaying.simulation.diagnostics import (
     TearingGauge,
     check_spacing,
     measure,
-    measure_scenes,
 )
 from gaussian_swaying.simulation.parameters import Setup
 from gaussian_swaying.simulation.progress import RunProgress
@@ -272,7 +271,7 @@ class Stepper:
             state: The state at the start of the frame.
 
         Returns:
-            The state at its end, and its diagnostics; those of a batch have one for each scene in ``each``.
+            The state at its end, and its diagnostics.
 
         Raises:
             SimulationDiverged: If the simulation diverges in the frame.
@@ -293,12 +292,6 @@ class Stepper:
         if not self.idle:
             self.wind_force.refresh(state)
         return Launched(self, state, steps)
-
-    def at_rest(self, state: State) -> FrameDiagnostics:
-        """Measurements of a state before its first frame."""
-        if self.batched:
-            return measure_scenes(self.solver, state, 0, 0.0, state).read()
-        return measure(self.solver, state, 0, 0.0).read()
 
     def measured(
         self,
@@ -322,13 +315,10 @@ class Stepper:
         def needs(at: State) -> Tensor:
             return needs_of(self, at, None if idle else self._winds(self.wind_force.foreseen(at), at))
 
-        if self.batched:
-            return measure_scenes(self.solver, end, steps, courant, state, self._tearing, needs(end) if ahead else None)
-        work = (end.work - state.work).sum()
         if not ahead:
-            return measure(self.solver, end, steps, courant, work, self._tearing, state)
+            return measure(self.solver, end, steps, courant, self._tearing, state)
         same = None if parts is None else (idle, self.frame_dt, parts)
-        return self._gauge(self.solver, end, steps, courant, work, state, needs, same)
+        return self._gauge(self.solver, end, steps, courant, state, needs, same)
 
     def give_up(self, state: State, cause: str, remedy: str | None = None) -> NoReturn:
         """Raise SimulationDiverged, naming the particle with the largest deformation."""
@@ -411,7 +401,7 @@ class Launched:
         """Wait, and repeat the frame where its substep was too long or its grid too small.
 
         Returns:
-            The state at the end of the frame, and its diagnostics.
+            The state at the end of the frame, and its diagnostics; those of the scenes of a batch are in :attr:`each`.
 
         Raises:
             SimulationDiverged: If the simulation diverged in the frame.
@@ -439,6 +429,11 @@ class Launched:
         if self._measurement.more:
             stepper.outlook = Outlook(self._end, self._measurement.more, self._parts)
         return self._end, found
+
+    @property
+    def each(self) -> tuple[FrameDiagnostics, ...]:
+        """The diagnostics of each scene of a batch, when it is finished."""
+        return self._measurement.each()
 
     def _launch(self, margin: int) -> tuple[State, Measurement]:
         stepper, before, steps = self._stepper, self._before, self.steps

@@ -94,11 +94,12 @@ def test_a_batch_moves_as_each_alone(simulation):
     ends = [(member, member.start()) for member in (simulation, variant)]
     for _ in range(2):
         steps = batch.substeps(state)
-        state, health = batch.launch(state, steps).finish()
+        frame = batch.launch(state, steps)
+        state, _ = frame.finish()
         ends = [(member, member.stepper.launch(end, steps).finish()[0]) for member, end in ends]
     for k, (member, end) in enumerate(ends):
         torch.testing.assert_close(state.scene(k).position, end.position, atol=1e-6, rtol=0)
-        assert health.each[k].kinetic == pytest.approx(float(member.solver.energies(end)["kinetic"]), rel=1e-4)
+        assert frame.each[k].kinetic == pytest.approx(float(member.solver.energies(end)["kinetic"]), rel=1e-4)
 
 
 def test_the_live_page_moves_it(simulation, tmp_path):

@@ -20,7 +20,7 @@ from gaussian_swaying.simulation.diagnostics import (
     check_state,
     diagnose,
     entry_names,
-    measure_scenes,
+    measure,
 )
 
 
@@ -40,6 +40,7 @@ def test_numbers_of_a_known_state():
     velocity = torch.tensor([0.0, 0.0, 2.0], dtype=torch.float64).expand(30, 3)
     lost = torch.zeros(30, dtype=torch.bool)
     lost[[3, 7]] = True
+    start = state
     state = state.replace(
         position=state.position + shift,
         velocity=velocity,
@@ -47,8 +48,9 @@ def test_numbers_of_a_known_state():
         F_elastic=F,
         lost=lost,
         time=torch.tensor(0.6, dtype=torch.float64),
+        work=torch.tensor(3.5, dtype=torch.float64),
     )
-    health = diagnose(solver, state, 12, solver.cfl_number(state, 1e-3), wind_work=torch.tensor(3.5))
+    health = diagnose(solver, state, 12, solver.cfl_number(state, 1e-3), before=start)
     assert health.time == pytest.approx(0.6)
     assert health.wind_work == 3.5
     assert (health.momentum_x, health.momentum_y, health.momentum_z) == (0.0, 0.0, pytest.approx(30 * 2.0 * 2.0))
@@ -91,8 +93,11 @@ def test_extremes_are_those_of_single_particles():
     solver, state = _solver()
     F = state.F_total.clone()
     F[4, 0, 0], F[9, 1, 1] = 3.0, -0.5
-    health = diagnose(solver, state.replace(F_total=F), 1, 1e-3)
+    position = state.position.clone()
+    position[7] += 0.1
+    health = diagnose(solver, state.replace(F_total=F, position=position), 1, 1e-3)
     assert (health.J_min, health.J_max) == (pytest.approx(-0.5), pytest.approx(3.0))
+    assert (health.moved_particle, health.compressed_particle, health.stretched_particle) == (7, 9, 4)
 
 
 def _row(spacing=0.1, count=6, law=None):
@@ -201,12 +206,10 @@ def test_one_bad_component_is_enough(name, dtype):
 def test_a_measurement_can_check_as_well():
     solver, state = _solver()
     gauge = TearingGauge(solver)
-    known = diagnose(solver, state, 3, 0.25, 1.5, gauge)
-    assert diagnose(solver, state, 3, 0.25, 1.5, gauge, check=True) == known
-    tensors = torch.tensor(0.25), torch.tensor(1.5, dtype=torch.float64)
-    assert diagnose(solver, state, 3, tensors[0], tensors[1], gauge) == known
-    assert diagnose(solver, state, 3, 0.25, tensors[1], gauge, check=True) == known
-    assert (known.cfl, known.wind_work) == (0.25, 1.5)
+    known = diagnose(solver, state, 3, 0.25, gauge)
+    assert diagnose(solver, state, 3, 0.25, gauge, check=True) == known
+    assert diagnose(solver, state, 3, torch.tensor(0.25), gauge) == known
+    assert known.cfl == 0.25
     bad = state.replace(velocity=state.velocity * math.nan, time=torch.tensor(0.25, dtype=torch.float64))
     diagnose(solver, bad, 3, 0.25)
     messages = []
@@ -259,12 +262,12 @@ def test_a_frame_is_measured_in_one_transfer(formulation):
     solver = MPMSolver(dx=0.2, formulation=formulation)
     state = solver.init_state(points)
     gauge, work = TearingGauge(solver), torch.zeros((), dtype=torch.float64, device="cuda")
-    diagnose(solver, state, 1, work, work, gauge, check=True)
+    diagnose(solver, state, 1, work, gauge, check=True)
     torch.cuda.set_sync_debug_mode("warn")
     try:
         with warnings.catch_warnings(record=True) as waits:
             warnings.simplefilter("always")
-            diagnose(solver, state, 1, work, work, gauge, check=True)
+            diagnose(solver, state, 1, work, gauge, check=True)
     finally:
         torch.cuda.set_sync_debug_mode("default")
     assert len([wait for wait in waits if "synchroniz" in str(wait.message)]) == 1
@@ -301,10 +304,10 @@ def test_numbers_of_a_batch_are_those_of_its_scenes():
         )
         return measured(solver, state, before)
 
-    found = numbers(slice(None), lambda *of: measure_scenes(of[0], of[1], 7, 0.1, of[2]).read()).each
+    found = numbers(slice(None), lambda *of: measure(of[0], of[1], 7, 0.1, before=of[2]).each())
     assert len(found) == 2
     for k in range(2):
-        expected = numbers(k, lambda *of, k=k: diagnose(of[0], of[1], 7, 0.1, wind_work=work[k], before=of[2]))
+        expected = numbers(k, lambda *of, k=k: diagnose(of[0], of[1], 7, 0.1, before=of[2]))
         for name in FrameDiagnostics.__dataclass_fields__:
             one, other = getattr(found[k], name), getattr(expected, name)
             if name == "support":

@@ -7,7 +7,7 @@ import torch
 
 from gaussian_swaying.mpm.laws.sand import Sand
 from gaussian_swaying.recording.recorder import Recorder
-from gaussian_swaying.simulation.health import advice, extremes, particle_of_extremes
+from gaussian_swaying.simulation.health import advice, extremes
 from gaussian_swaying.simulation.material import Material
 from gaussian_swaying.simulation.run import run_health
 
@@ -59,11 +59,6 @@ def test_remedy_grows_with_the_trouble():
     mild, bad = (advice(extremes([entry(0.1, low=(low, 0))], WHERE, 1.0, None), 1e5)[-1] for low in (0.49, 0.01))
     assert "3e+05 Pa" in mild
     assert "4e+05 Pa" in bad
-
-
-def test_indices_of_extremes():
-    squares = torch.tensor([[4.0, 1.0, 0.5], [9.0, 1.0, 0.9], [1.0, 1.0, 0.1]])
-    assert particle_of_extremes(torch.tensor([0.1, 0.2, 0.3]), squares).tolist() == [2, 2, 1]
 
 
 def test_a_run_that_folds_says_so_and_keeps_it(make_simulation, tmp_path, capsys):

@@ -365,7 +365,7 @@ def test_recorded_measurements_are_those_of_the_frame(make_simulation):
                 state = simulation.edit(state, Edit(density=50.0))
             end, found = simulation.advance(state)
             steps = found.substeps
-            expected = measure(simulation.solver, end, steps, found.cfl, found.wind_work, None, state).read()
+            expected = measure(simulation.solver, end, steps, found.cfl, None, state).read()
             assert found.as_dict() == pytest.approx(expected.as_dict(), rel=1e-6)
             state = end
     assert simulation.stepper._gauge.replayed.recorded

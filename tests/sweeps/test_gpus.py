@@ -31,14 +31,15 @@ def test_together_is_as_alone(tmp_path, sweep_file):
     state = together.start()
     assert together.solver.fused() is not None
     for _ in range(4):
-        state, health = together.advance(state)
+        frame = together.launch(state)
+        state, _ = frame.finish()
     for number, member in enumerate(members):
         alone = member.start()
         for _ in range(4):
             alone, own = member.advance(alone)
         moved = float((alone.position - member.solver.points.position).abs().amax())
         assert float((state.scene(number).position - alone.position).abs().amax()) < 1e-4 * moved
-        shared = health.each[number]
+        shared = frame.each[number]
         assert shared.substeps == own.substeps
         assert shared.wind_work == pytest.approx(own.wind_work, rel=1e-3, abs=1e-6)
         assert np.allclose(shared.support, own.support, rtol=1e-3, atol=1e-5)

@@ -78,14 +78,15 @@ def test_the_state_of_a_scene(tmp_path, sweep_file):
     together = batch_of(members_of(job, Simulation.parser())[0])
     state = together.start()
     assert state.position.shape[0] == 8
-    end, health = together.advance(state)
+    frame = together.launch(state)
+    end, _ = frame.finish()
     one = end.scene(3)
     assert torch.equal(one.position, end.position[3])
     assert one.F_total is one.F_elastic
-    assert len(health.each) == 8
-    assert len({entry.wind_work for entry in health.each}) == 8
+    assert len(frame.each) == 8
+    assert len({entry.wind_work for entry in frame.each}) == 8
     moved = torch.linalg.vector_norm(one.position - together.solver.points.position[3], dim=-1)
-    assert health.each[3].displacement_max == pytest.approx(float(moved.amax()))
+    assert frame.each[3].displacement_max == pytest.approx(float(moved.amax()))
 
 
 def test_the_configurations_of_a_group_are_those_that_the_parser_writes(tmp_path, sweep_file, monkeypatch):
