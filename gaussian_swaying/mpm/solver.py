@@ -6,7 +6,7 @@ import dataclasses
 import math
 from collections.abc import Callable, Sequence
 from itertools import pairwise
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import torch
 from torch import Tensor, nn
@@ -29,8 +29,8 @@ from gaussian_swaying.mpm.recompute import rollout
 from gaussian_swaying.mpm.state import MaterialPoints, MPMState
 from gaussian_swaying.mpm.timestep import check_pace, fixed_substeps, look_marks, substeps_per_frame, work_done
 
-if TYPE_CHECKING:
-    from gaussian_swaying.mpm.triton.fused import Adjoint, Fused
+Fused = Any
+"""A ``mpm.triton.fused.Fused``; not imported even for its type, as the parser resolves types and Triton takes 0.1 s."""
 
 TRANSFERS = ("auto", "torch", "triton")
 
@@ -104,7 +104,7 @@ class MPMSolver(Solver):
         # the same in metres; in a tuple, because these copies do not belong to the module's state
         self._framed: tuple[Boundary, ...] | None = None
         self._bound: Formulation | None = None
-        self._fused: Fused | None = None
+        self._fused: Fused = None
         self._fused_obstacle: str | None = None
 
     # ---- settings
@@ -268,7 +268,7 @@ class MPMSolver(Solver):
         """True if the Triton substep is used where no gradient is needed."""
         return self._bound is not None and self._fused_obstacle is None
 
-    def fused(self, *tensors: Tensor | None) -> Fused | None:
+    def fused(self, *tensors: Tensor | None) -> Fused:
         """The Triton substep of this material; None if the torch substep is used.
 
         Args:
@@ -299,7 +299,7 @@ class MPMSolver(Solver):
                 self._fused = TWINS[self.bound.name](self.bound)
         return self._fused
 
-    def _adjoint_for(self, state: MPMState, forces: Sequence[Force]) -> Adjoint | None:
+    def _adjoint_for(self, state: MPMState, forces: Sequence[Force]) -> Any:
         """The backward pass in kernels, if a gradient through a rollout is wanted and they can compute it."""
         if self._fused_obstacle is not None or not torch.is_grad_enabled():
             return None
@@ -310,7 +310,7 @@ class MPMSolver(Solver):
             raise ValueError(f"`transfer: triton` has no gradients here, because {why}: set it to auto or torch.")
         return adjoint
 
-    def _fused_for(self, state: MPMState, forces: Sequence[Force]) -> Fused | None:
+    def _fused_for(self, state: MPMState, forces: Sequence[Force]) -> Fused:
         """As :meth:`fused`, for rollouts with forces; also None if the host has to call a force in every substep."""
         if self._fused_obstacle is not None or not all(force.recordable for force in divide(forces)[1]):
             return None
