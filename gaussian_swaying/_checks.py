@@ -111,6 +111,16 @@ def check_poisson_ratio(name: str, value: float) -> None:
         )
 
 
+def first_line(error: BaseException) -> str:
+    """The first line of an error's message, or the name of its kind."""
+    return next(iter(str(error).strip().splitlines()), type(error).__name__)
+
+
+def one_line(error: BaseException) -> str:
+    """The whole message of an error in one line, or the name of its kind."""
+    return " ".join(str(error).split()) or type(error).__name__
+
+
 def check_finite(name: str, tensor: Tensor) -> None:
     """Raise ValueError if a value is NaN or infinite; only with ``GAUSSIAN_SWAYING_CHECKS=1``."""
     if VALUE_CHECKS and not bool(torch.isfinite(tensor).all()):

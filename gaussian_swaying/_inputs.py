@@ -134,6 +134,3 @@ def _whole(digits: str) -> int:
     if len(digits) > LONGEST_NUMBER:
         raise _LongNumberError(f"a whole number of {len(digits)} digits ({digits[:8]}...)")
     return int(digits)
-
-
-__all__ = ["check_archive", "check_regular", "read_arrays", "read_json"]

@@ -162,6 +162,3 @@ def _check_size(path: Path, header: PlyHeader) -> None:
 
 def _broken(path: Path, what: str) -> ValueError:
     return ValueError(f"{path} has a broken .ply header ({what}); export the file again.")
-
-
-__all__ = ["PlyElement", "PlyHeader", "read_element", "read_header"]

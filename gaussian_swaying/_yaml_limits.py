@@ -165,6 +165,3 @@ def _text(path: Path) -> str:
         return path.read_text(encoding="utf-8")
     except UnicodeDecodeError as error:
         raise ValueError(f"{path} is not UTF-8 text ({error.reason}): save it as UTF-8.") from error
-
-
-__all__ = ["check_config_files", "check_yaml", "limit_yaml", "read_fields"]

@@ -13,6 +13,7 @@ from itertools import pairwise
 
 import torch
 
+from gaussian_swaying._checks import first_line
 from gaussian_swaying.cli.streams import SafeStream, safe_streams
 from gaussian_swaying.runs.signals import exit_code
 
@@ -99,7 +100,7 @@ def _code(
         found = sentence(error, memory, expected, arguments)
         if found is None:
             print(
-                f"error: {type(error).__name__}: {_first_line(error)} This is a bug in gaussian_swaying: please report "
+                f"error: {type(error).__name__}: {first_line(error)} This is a bug in gaussian_swaying: please report "
                 "it with the traceback that GAUSSIAN_SWAYING_DEBUG=1 shows.",
                 file=sys.stderr,
             )
@@ -141,7 +142,7 @@ def sentence(
         expected: Further exceptions whose message is meant for users.
         arguments: Command line, for messages.
     """
-    text = _first_line(error)
+    text = first_line(error)
     if isinstance(error, MemoryError | torch.OutOfMemoryError) or (
         isinstance(error, RuntimeError | ValueError) and _MEMORY.search(text)
     ):
@@ -186,11 +187,6 @@ def parser_sentence(message: str, arguments: Sequence[str] = ()) -> str:
     return " ".join(kept)
 
 
-def _first_line(error: BaseException) -> str:
-    lines = str(error).strip().splitlines()
-    return lines[0] if lines else type(error).__name__
-
-
 def _asked_for(text: str) -> str:
     """Return the requested amount of memory in words, from an error message; empty if it does not say."""
     found = re.search(r"allocate (\d+) bytes", text)
@@ -210,6 +206,3 @@ def _of_the_system(error: OSError) -> str:
     if isinstance(error, FileNotFoundError):
         return f"{where} does not exist: check the path."
     return f"{where} cannot be used ({error.strerror}): check the path and its permissions."
-
-
-__all__ = ["parser_sentence", "run_command", "sentence"]

@@ -17,7 +17,7 @@ from gaussian_swaying.cli.shipped import with_shipped
 from gaussian_swaying.cli.suggestions import guessing
 from gaussian_swaying.simulation.defaults import resolve_device
 from gaussian_swaying.simulation.simulation import Simulation
-from gaussian_swaying.viewer.page import Page
+from gaussian_swaying.viewer.controls import Page
 from gaussian_swaying.viewer.scenes import settings_of_splat
 from gaussian_swaying.viewer.session import Session, share_cores
 

@@ -106,6 +106,3 @@ def safe_streams() -> Iterator[tuple[SafeStream, SafeStream]]:
         for stream, was in zip(opened, before, strict=True):
             if was is None:
                 stream.close()
-
-
-__all__ = ["SafeStream", "encodable", "safe_streams"]

@@ -83,6 +83,3 @@ def _arguments(class_path: str) -> dict[str, str]:
     except (ImportError, AttributeError, TypeError, ValueError):
         return {}
     return {parameter: parameter for parameter in parameters}
-
-
-__all__ = ["did_you_mean", "guessing"]

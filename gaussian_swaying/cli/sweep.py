@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from gaussian_swaying import _program as program
+from gaussian_swaying._checks import first_line
 from gaussian_swaying.cli.continuing import command
 from gaussian_swaying.cli.errors import run_command, sentence
 from gaussian_swaying.cli.shipped import with_shipped
@@ -114,8 +115,7 @@ def explain(error: BaseException) -> str:
     found = sentence(error, MEMORY)
     if found is not None:
         return found
-    lines = str(error).strip().splitlines()
-    return f"{type(error).__name__}: {lines[0] if lines else ''} This is a bug; its traceback is in the folder logs."
+    return f"{type(error).__name__}: {first_line(error)} This is a bug; its traceback is in the folder logs."
 
 
 def sweep(options: argparse.Namespace, begun: list[Path], arguments: Sequence[str]) -> int:

@@ -521,6 +521,3 @@ def in_threads(work: Callable[[int], T], count: int, device: torch.device) -> It
     finally:
         pool.shutdown(cancel_futures=True)
         torch.set_num_threads(threads)
-
-
-__all__ = ["compare_run", "evaluate", "in_threads", "picture_errors", "table"]

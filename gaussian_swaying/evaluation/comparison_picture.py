@@ -63,6 +63,3 @@ def comparison_picture(
     picture.paste(Image.fromarray(bytes_of[3]), (bar, (band - len(ramp)) // 2))
     draw.text((bar - pad // 2, middle), "0", (235, 235, 235), font, anchor="rm")
     return np.asarray(picture)
-
-
-__all__ = ["comparison_picture"]

@@ -103,6 +103,3 @@ def frame_files(folder: Path) -> list[Path]:
         if int(after.stem) != int(before.stem) + 1:
             raise ValueError(f"Frames are missing or duplicated between {before} and {after.name}: make them again.")
     return files
-
-
-__all__ = ["Cloth", "frame_files", "read_cloth", "surface_points"]

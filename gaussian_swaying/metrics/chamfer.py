@@ -131,6 +131,3 @@ class ChamferDistance(Metric):
     def compute(self) -> Tensor:
         """The mean over all frames so far [m], or [m²] if ``squared``; NaN without frames."""
         return self.total / self.count
-
-
-__all__ = ["ChamferDistance", "chamfer_distance"]

@@ -269,6 +269,3 @@ def _load_network(path: Path) -> tuple[str, Any]:
     for parameter in network.parameters():
         parameter.requires_grad_(False)
     return hashlib.sha256(content).hexdigest(), network
-
-
-__all__ = ["FrechetVideoDistance", "cut_clips", "frechet_distance"]

@@ -93,6 +93,3 @@ def _by_slabs(source: Tensor, target: Tensor, pairs: int) -> Tensor:
             found = _by_chunks(some, target[min(first, begin) : max(last, end)], pairs)[0]
         nearest[group] = found
     return nearest
-
-
-__all__ = ["nearest_distances"]

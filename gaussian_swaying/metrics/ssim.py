@@ -77,6 +77,3 @@ def check_pictures(image: Tensor, target: Tensor) -> None:
     check_shape("image", image, "H", "W", "C")
     if image.shape != target.shape:
         raise ValueError(f"Expected `target` of shape {tuple(image.shape)}, but got {tuple(target.shape)}.")
-
-
-__all__ = ["PADDINGS", "SSIM_TAPS", "check_pictures", "ssim_map"]

@@ -235,6 +235,3 @@ def pack_usd(shards: Path, target: Path, wanted: Iterable[int], fps: float) -> N
             film.add(index, read_usd_frame(target, index))
     film.save(target)
     shutil.rmtree(shards)
-
-
-__all__ = ["QUEUE_LIMIT", "WORKERS", "FrameWriter", "HostCopy"]

@@ -71,6 +71,3 @@ def _release(lock: FileLock, place: list[Path], owner: int) -> None:
     with suppress(OSError):
         (place[0] / LOCK).unlink()
     lock.release()
-
-
-__all__ = ["LOCK", "FolderLock", "FolderLocked"]

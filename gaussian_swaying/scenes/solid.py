@@ -149,6 +149,3 @@ def _quat_from_z(normals: Tensor) -> Tensor:
     quats = torch.stack([1 + z, -y, x, torch.zeros_like(x)], dim=-1)
     flip = torch.tensor([0.0, 1.0, 0.0, 0.0], dtype=normals.dtype)
     return torch.nn.functional.normalize(torch.where(z[:, None] < -1 + 1e-9, flip, quats), dim=-1)
-
-
-__all__ = ["SolidScene", "ball_distance", "box_distance", "figure_distance", "torus_distance"]

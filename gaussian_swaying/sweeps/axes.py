@@ -183,6 +183,3 @@ def _one_of(where: str, given: Mapping[str, Any], name: str, known: tuple[str, .
     if value not in known:
         raise ValueError(f"Expected `{where}.{name}` to be one of {', '.join(known)}, but got {value!r}.")
     return str(value)
-
-
-__all__ = ["Axis", "read_axis", "runs_of"]

@@ -117,6 +117,3 @@ def lost(job: Job, reason: str) -> Outcome:
         for name, result in written.items()
     }
     return Outcome(results, killed=True)
-
-
-__all__ = ["Backend", "Outcome", "drive", "lost"]

@@ -95,6 +95,3 @@ def _fitted(text: str, draw: Any, font: Any) -> str:
     while text and draw.textlength(text, font) > WIDTH - 6:
         text = text[:-2].rstrip("…") + "…" if len(text) > 2 else ""
     return text
-
-
-__all__ = ["write_contact_sheets"]

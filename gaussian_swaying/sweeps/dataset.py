@@ -121,6 +121,3 @@ def _read_frames(place: Path) -> Tensor:
 def _check_recorded(path: Path, wanted: str, setting: str) -> None:
     if not path.exists():
         raise ValueError(f"{path} does not exist: leave out `{wanted}`, or sweep with {setting}.")
-
-
-__all__ = ["SweepDataset"]

@@ -66,6 +66,3 @@ def unlocked(work: Callable[[], T]) -> T:
             if time.monotonic() - begin > LOCKED_S:
                 raise
             time.sleep(0.5)
-
-
-__all__ = ["Job", "unlocked"]

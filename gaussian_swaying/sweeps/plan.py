@@ -200,6 +200,3 @@ def _whole(file: Path, name: str, value: Any) -> int:
     if isinstance(value, bool) or not isinstance(value, int):
         raise ValueError(f"Expected `{name}` in {file} to be a whole number, but got {value!r}: set it.")
     return value
-
-
-__all__ = ["Plan", "Sweep", "make_plan", "parse_run", "read_sweep"]

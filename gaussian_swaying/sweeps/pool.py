@@ -13,9 +13,10 @@ from multiprocessing import get_context, resource_tracker
 from multiprocessing.connection import Connection
 from multiprocessing.context import SpawnProcess
 
+from gaussian_swaying._checks import first_line
 from gaussian_swaying.sweeps.backend import PACKED, Outcome, lost
 from gaussian_swaying.sweeps.job import Job
-from gaussian_swaying.sweeps.worker import Explain, first_line, work
+from gaussian_swaying.sweeps.worker import Explain, work
 
 PATIENCE_S = 300.0  # how long a worker may take to write what it has when the sweep is stopped
 
@@ -189,6 +190,3 @@ def _dismiss(worker: _Worker) -> None:
     if worker.process.is_alive():
         worker.process.kill()
         worker.process.join()
-
-
-__all__ = ["Pool", "variables"]

@@ -12,10 +12,11 @@ from typing import TYPE_CHECKING, Any
 
 import torch
 
+from gaussian_swaying._checks import first_line
 from gaussian_swaying.simulation.simulation import Simulation
 from gaussian_swaying.sweeps.backend import PACKED, Outcome, lost
 from gaussian_swaying.sweeps.job import Job
-from gaussian_swaying.sweeps.worker import WHERE, Done, Explain, do, first_line
+from gaussian_swaying.sweeps.worker import WHERE, Done, Explain, do
 
 if TYPE_CHECKING:
     from jsonargparse import ArgumentParser
@@ -149,6 +150,3 @@ def _task(job: Job, threads: int, explain: Explain, folder: str, path: list[str]
     if not done.ready:  # Ray would give it another job: it ends once the result is on its way
         threading.Timer(1.0, os._exit, (0,)).start()
     return done
-
-
-__all__ = ["LOCAL", "RayBackend", "check_ray"]

@@ -290,15 +290,3 @@ def _typed(values: list[Any]) -> list[Any]:
 
 def _cell(value: Any) -> Any:
     return value if value is None or isinstance(value, str) else json.dumps(value)
-
-
-__all__ = [
-    "check_parquet",
-    "failure",
-    "open_folder",
-    "read_record",
-    "read_result",
-    "result_of",
-    "write_parquet",
-    "write_tables",
-]

@@ -13,7 +13,7 @@ from typing import Any
 import torch
 from tqdm import tqdm
 
-from gaussian_swaying._checks import check_choice
+from gaussian_swaying._checks import check_choice, first_line
 from gaussian_swaying._files import write_json
 from gaussian_swaying.runs.lock import FolderLock, FolderLocked
 from gaussian_swaying.sweeps.backend import Backend, drive
@@ -31,7 +31,7 @@ from gaussian_swaying.sweeps.record import (
     write_tables,
 )
 from gaussian_swaying.sweeps.together import grouped
-from gaussian_swaying.sweeps.worker import Explain, first_line
+from gaussian_swaying.sweeps.worker import Explain
 
 TABLE_EVERY_S = 5.0
 
@@ -260,6 +260,3 @@ class _Keeper:
             if result is not None and name not in self.unwritten:
                 self.results[name] = result
         self.write()
-
-
-__all__ = ["cores", "run_sweep"]

@@ -114,6 +114,3 @@ def texts(parser: ArgumentParser, settings: Sequence[Namespace], names: Sequence
             content[group][field] = one[group][field]
         found.append(written(content))
     return found
-
-
-__all__ = ["grouped", "members_of", "run_together", "shares_rollout", "texts"]

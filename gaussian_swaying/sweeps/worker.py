@@ -19,6 +19,7 @@ from typing import TYPE_CHECKING, Any
 
 import torch
 
+from gaussian_swaying._checks import first_line
 from gaussian_swaying._files import write_json
 from gaussian_swaying.runs.lock import FolderLocked
 from gaussian_swaying.runs.signals import stop_signals
@@ -52,12 +53,6 @@ class Done:
     results: dict[str, dict[str, Any]]
     ready: bool
     share: float | None = None
-
-
-def first_line(error: BaseException) -> str:
-    """The first line of an error's message, or the name of the error."""
-    lines = str(error).strip().splitlines()
-    return lines[0] if lines else type(error).__name__
 
 
 def work(connection: Connection, threads: int, explain: Explain = first_line) -> None:
@@ -157,6 +152,3 @@ def _run(job: Job, parser: ArgumentParser) -> dict[str, dict[str, Any]]:
         return simulation.run(folder, settings.frames, False, extra, progress=False)
 
     return {name: unlocked(once)}
-
-
-__all__ = ["Done", "Explain", "do", "first_line", "work"]

@@ -1,10 +1,10 @@
-"""The controls of the live page, and their effect on the session."""
+"""The page of a live wind tunnel: its controls, and their effect on the session."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
@@ -15,9 +15,12 @@ from gaussian_swaying.simulation.wind_picture import speed_scale
 from gaussian_swaying.viewer.files import Files
 from gaussian_swaying.viewer.gusts import Gusts
 from gaussian_swaying.viewer.holding import Holding
-from gaussian_swaying.viewer.panel import Panel
 from gaussian_swaying.viewer.pictures import SHOWN
-from gaussian_swaying.viewer.screen import Screen
+from gaussian_swaying.viewer.screen import Panel, Screen
+from gaussian_swaying.viewer.session import Session
+
+if TYPE_CHECKING:
+    import viser
 
 MOST_SPEED = 30.0  # m/s
 ARROW = 0.06  # length of the arrow of a wind of 1 m/s, in longest sides
@@ -309,6 +312,31 @@ class Controls(Panel):
         self.azimuth.value = round(azimuth, 1)  # type: ignore[misc]
         self.elevation.value = round(elevation, 1)  # type: ignore[misc]
         self._blow()
+
+
+class Page(Screen):
+    """A screen with controls.
+
+    Attributes:
+        controls: The panel, from :meth:`show` on.
+    """
+
+    controls: Controls
+
+    def show(self, session: Session) -> Page:
+        """Show a session, and the controls; returns the page."""
+        self.session = session
+        self.controls = Controls(self)
+        super().show(session)
+        return self
+
+    def stop_recording(self, client: viser.ClientHandle | None) -> None:
+        """Stop the video that is being recorded, and send it to a browser."""
+        self.controls.files.stop_recording(client)
+
+    def tell_figures(self) -> None:
+        """Write the figures in the corner; the controls follow the session."""
+        self.controls.tell()
 
 
 def log_place(stiffness: float) -> float:

@@ -10,10 +10,11 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from gaussian_swaying._checks import one_line
 from gaussian_swaying.config.parser import parse_text
 from gaussian_swaying.viewer.film_strip import FilmStrip
-from gaussian_swaying.viewer.panel import Panel
 from gaussian_swaying.viewer.scenes import settings_of_splat
+from gaussian_swaying.viewer.screen import Panel
 
 if TYPE_CHECKING:
     import viser
@@ -95,7 +96,7 @@ class Files:
             self.page.progress(0.8, "Making the simulation")
             self.session.load(settings, partial(self._there, folder), self._ended)
         except Exception as error:
-            self.page.tell(" ".join(str(error).split()))
+            self.page.tell(one_line(error))
             self._ended()
             folder.cleanup()
         finally:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from typing import Any
 
-from gaussian_swaying.viewer.panel import Panel
+from gaussian_swaying.viewer.screen import Panel
 
 KINDS = {"Sway": "SineSway", "Gusts": "UniformGust", "Noise": "GaussianGust"}
 FIELDS: dict[str, tuple[str, float, float, float]] = {  # label, least, most, step

@@ -9,8 +9,8 @@ import torch
 import yaml
 
 from gaussian_swaying.mpm.boundaries.pinned_region import PinnedRegion
-from gaussian_swaying.viewer.panel import Panel
 from gaussian_swaying.viewer.pictures import under_cursor
+from gaussian_swaying.viewer.screen import Panel
 
 if TYPE_CHECKING:
     import viser

@@ -9,7 +9,7 @@ import threading
 import time
 import warnings
 from collections import deque
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, redirect_stdout, suppress
 from functools import partial
 from typing import TYPE_CHECKING, Any
@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import torch
 
+from gaussian_swaying._checks import one_line
 from gaussian_swaying.viewer.door import ANY, Door, check_address
 from gaussian_swaying.viewer.film_strip import FilmStrip
 from gaussian_swaying.viewer.incoming import Incoming
@@ -135,7 +136,7 @@ class Screen:
         self._text = self.server.gui.add_markdown("")
         self._bar = self.server.gui.add_progress_bar(0.0, animated=True)
         self.progress(0.0, "Loading the scene")
-        self.turns = Turns(self._keep_telling, 0.4, self._failed)
+        self.turns = Turns(self._keep_telling, 0.4, lambda error: self.tell(one_line(error)))
         self.server.on_client_connect(self._connected)
         self.server.on_client_disconnect(self._disconnected)
 
@@ -223,9 +224,6 @@ class Screen:
         now = time.perf_counter()
         return max((sum(now - t < 2.0 for t in list(times)) / 2.0 for times in self._drawn.values()), default=0.0)
 
-    def _failed(self, error: Exception) -> None:
-        self.tell(" ".join(str(error).split()) or type(error).__name__)
-
     # ---- browsers
 
     def _connected(self, client: viser.ClientHandle) -> None:
@@ -262,7 +260,7 @@ class Screen:
             try:
                 self._send(client, snapshot, size)
             except Exception as error:  # one picture; the page goes on
-                self.tell(f"A picture could not be drawn: {' '.join(str(error).split())}")
+                self.tell(f"A picture could not be drawn: {one_line(error)}")
                 gone.wait(0.5)
             left = 1 / MOST_PER_SECOND - (time.perf_counter() - began)
             if left > 0:
@@ -304,3 +302,24 @@ class Screen:
             return
         with suppress(Exception):  # the figures of a moment, while a scene is replaced
             self.tell_figures()
+
+
+class Panel:
+    """The panel of a page.
+
+    Args:
+        page: The page.
+    """
+
+    def __init__(self, page: Screen) -> None:
+        self.page, self.session, self.server = page, page.session, page.server
+
+    def on(self, subscribe: Callable[[Any], Any], what: Callable[..., None], tell_event: bool = False) -> None:
+        """Call a function in its turn when a browser uses a control; not when the program sets its value."""
+        key = object()
+
+        async def asked(event: Any) -> None:  # awaited, and not in one of viser's threads, so that the order stays
+            if event.client is not None:
+                self.page.turns.ask(key, partial(what, event) if tell_event else what)
+
+        subscribe(asked)

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 import torch
 
+from gaussian_swaying._checks import one_line
 from gaussian_swaying.config.parser import config_text
 from gaussian_swaying.mpm.state import State
 from gaussian_swaying.simulation.diagnostics import FrameDiagnostics, SimulationDiverged, diagnose
@@ -286,7 +287,7 @@ class Session:
             with self.lock:
                 what()
         except Exception as error:
-            self.problem = _sentence(error)
+            self.problem = one_line(error)
             self.revision += 1
 
     def _advance(self, single: bool) -> None:
@@ -299,14 +300,14 @@ class Session:
             self._broken, self.problem = True, str(error)
             return
         except Exception as error:  # out of memory, a kernel that fails: the page goes on
-            self._broken, self.problem = True, _sentence(error)
+            self._broken, self.problem = True, one_line(error)
             return
         if simulation.editor.edits:
             try:
                 with self.lock:
                     state = simulation.editor.edit_due(state)
             except Exception as error:
-                self._broken, self.problem = True, _sentence(error)
+                self._broken, self.problem = True, one_line(error)
                 return
         self._publish(state, health)
         took, wanted = time.perf_counter() - began, float(self.settings.frame_dt)
@@ -415,8 +416,3 @@ class Session:
             forces = self.simulation.custom_forces
             self.simulation.custom_forces = tuple(force for force in forces if force is not self._pull)
             self._pull = None
-
-
-def _sentence(error: BaseException) -> str:
-    """An error in one line."""
-    return " ".join(str(error).split()) or type(error).__name__

@@ -118,7 +118,7 @@ def connect(until):
 def page(parser, settings):
     """A page with a small flag, and its session, which runs."""
     pytest.importorskip("viser", reason="needs the extra [viewer]")
-    from gaussian_swaying.viewer.page import Page
+    from gaussian_swaying.viewer.controls import Page
 
     session = Session(parser, settings)
     made = Page(port=8400, largest=320).show(session)

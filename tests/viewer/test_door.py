@@ -13,8 +13,8 @@ import urllib.request
 import pytest
 
 pytest.importorskip("viser", reason="needs the extra [viewer]")
+from gaussian_swaying.viewer.controls import Page
 from gaussian_swaying.viewer.door import Door, check_address
-from gaussian_swaying.viewer.page import Page
 from gaussian_swaying.viewer.session import Session
 
 

@@ -1,6 +1,6 @@
 """The live page, in a real browser where there is one.
 
-Covers: viewer.holding, viewer.screen.
+Covers: viewer.controls, viewer.holding, viewer.screen.
 """
 
 import threading
@@ -19,7 +19,7 @@ from gaussian_swaying.viewer.session import Session
 
 pytest.importorskip("viser", reason="needs the extra [viewer]")
 from gaussian_swaying.viewer import screen
-from gaussian_swaying.viewer.page import Page
+from gaussian_swaying.viewer.controls import Page
 from gaussian_swaying.viewer.pictures import camera_of, draw
 
 

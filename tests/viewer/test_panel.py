@@ -1,6 +1,6 @@
 """The panel of the live page: what its controls show and do, asked by a client and read from the session.
 
-Covers: viewer.files, viewer.gusts, viewer.controls, viewer.controls.
+Covers: viewer.controls, viewer.files, viewer.gusts.
 """
 
 import math
@@ -12,9 +12,8 @@ pytest.importorskip("viser", reason="needs the extra [viewer]")
 from gaussian_swaying.gaussians.ply import write_ply
 from gaussian_swaying.scenes.procedural import FlagScene
 from gaussian_swaying.viewer import session as session_module
-from gaussian_swaying.viewer.controls import MATERIALS, in_pascal, legend, like
+from gaussian_swaying.viewer.controls import MATERIALS, Page, in_pascal, legend, like
 from gaussian_swaying.viewer.gusts import KINDS
-from gaussian_swaying.viewer.page import Page
 from gaussian_swaying.viewer.session import Session
 
 

@@ -209,6 +209,3 @@ def _release(take: Fields, notes: Notes) -> dict[str, Any]:
         first=ends[0],
         last=ends[1],
     )
-
-
-__all__ = ["FOREVER", "PADDING", "RESET_SUBSTEPS", "Turned", "boundary_settings"]

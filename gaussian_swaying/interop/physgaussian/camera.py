@@ -140,6 +140,3 @@ def read_model_camera(path: str | os.PathLike[str], index: int, near: float = 0.
             "and height."
         ) from error
     return Camera(torch.linalg.inv(pose), torch.tensor(rows, dtype=torch.float64), width, height, near)
-
-
-__all__ = ["PhysGaussianCamera", "read_model_camera"]

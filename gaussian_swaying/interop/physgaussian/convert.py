@@ -235,6 +235,3 @@ def to_yaml(settings: Mapping[str, Any], notes: Iterable[str] = (), source: str 
     plain = json.loads(json.dumps(settings))  # copies, since YAML would write repeated parts as references
     body = yaml.safe_dump(plain, sort_keys=False, default_flow_style=None, width=120)
     return "\n".join(lines) + "\n" + body
-
-
-__all__ = ["camera_settings", "convert", "filling_settings", "read_config", "to_yaml"]

@@ -110,6 +110,3 @@ def box_about(point: Sequence[float], size: Sequence[float]) -> dict[str, Any]:
     """A box around a point, given half of its sides."""
     pairs = list(zip(point, size, strict=True))
     return box([p - s for p, s in pairs], [p + s for p, s in pairs])
-
-
-__all__ = ["Fields", "Notes", "box", "box_about", "part"]

@@ -117,6 +117,3 @@ def _poisson_ratio(take: Fields, *default: float) -> float:
             f"Expected `nu` to be from 0 to below 0.5, but got {nu}: at 0.5 the stress is infinite, use 0.49."
         )
     return nu
-
-
-__all__ = ["material_settings"]

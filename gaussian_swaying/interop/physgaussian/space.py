@@ -61,6 +61,3 @@ def up_direction(rotation: Tensor) -> list[float]:
 def heading(rotation: Tensor) -> Tensor:
     """Turned axes to the axes of the simulation, which differ by a rotation about z; shape (3, 3), float64."""
     return rotation_from_z(up_direction(rotation)).T @ rotation.T
-
-
-__all__ = ["CENTER", "heading", "rotation_matrix", "tidy", "up_direction"]

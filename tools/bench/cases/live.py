@@ -13,7 +13,7 @@ import numpy as np
 
 from bench import record
 from gaussian_swaying.simulation.simulation import Simulation
-from gaussian_swaying.viewer.page import Page
+from gaussian_swaying.viewer.controls import Page
 from gaussian_swaying.viewer.session import Session, share_cores
 
 if TYPE_CHECKING:
