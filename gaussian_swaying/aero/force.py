@@ -9,9 +9,72 @@ import torch
 from torch import Tensor, nn
 
 from gaussian_swaying._checks import Number, check_choice, check_plain, check_positive, check_shape, number_of
-from gaussian_swaying.aero.patches import PatchSums, grouped_force
+from gaussian_swaying.aero.patches import PatchSums
+from gaussian_swaying.geometry.groups import sums
+from gaussian_swaying.geometry.linalg import cofactor
 
 LAWS = ("paper", "projected", "linear")
+
+
+Product = tuple[Tensor | float, Tensor | float]
+"""A vector as a product of two factors, which multiply a coefficient one after the other."""
+
+
+def drag_speed(wind: Tensor, speed: Tensor, law: str) -> Tensor:
+    """Speed that the drag is proportional to, besides that of the flow along a patch: that of the wind if ``linear``.
+
+    Args:
+        wind: Air velocity [m/s], broadcastable to (..., P, 3).
+        speed: Relative speed [m/s], shape (..., P).
+        law: One of :data:`LAWS`.
+    """
+    return torch.linalg.vector_norm(wind, dim=-1).expand_as(speed) if law == "linear" else speed
+
+
+def wind_terms(
+    wind: Tensor,
+    relative: Tensor,
+    facing: Product,
+    across: Product,
+    tangent: Product,
+    *,
+    drag: Tensor | float,
+    friction: Tensor | float,
+    lift: Tensor | float,
+    law: str,
+    lift_direction: str,
+    unit_tangent: bool,
+) -> Tensor:
+    r"""Drag, friction and lift per half density: the law of the force, of one patch or of a sum over patches.
+
+    Each term is :math:`v_r^2` times that of :func:`aero_force`, without ever dividing by :math:`v_r`.
+
+    Args:
+        wind: Air velocity u [m/s], broadcastable to (..., P, 3).
+        relative: Relative wind [m/s], shape (..., P, 3).
+        facing: Area vector s on the side that meets the flow; per area for one patch, (..., P, 3).
+        across: The part of the flow through the patch, :math:`A\, (\mathbf{v}_r \cdot \mathbf{n})\, \mathbf{n}`.
+        tangent: The part along it, and what it is divided by; with a unit tangent, area times direction.
+        drag: C_D.
+        friction: C_F.
+        lift: C_L.
+        law: See :func:`aero_force`; the other options, too.
+        lift_direction: See there.
+        unit_tangent: See there.
+
+    Returns:
+        Shape (..., P, 3).
+    """
+    speed = torch.linalg.vector_norm(relative, dim=-1, keepdim=True)
+    if law == "paper":
+        pressure = drag * (speed * speed * facing[0]) * facing[1]
+    else:
+        pressure = drag * (drag_speed(wind, speed[..., 0], law)[..., None] * across[0]) * across[1]
+    rub = friction * speed.square() if unit_tangent else friction * speed
+    shear = rub * tangent[0] / tangent[1]
+    side = torch.linalg.cross(relative, facing[0] * facing[1], dim=-1)
+    lifting = lift * (speed * side if lift_direction == "side" else torch.linalg.cross(side, relative, dim=-1))
+    return pressure + shear + lifting
 
 
 def aero_force(
@@ -72,27 +135,89 @@ def aero_force(
     check_shape("wind", wind, 3)
     wind = wind.to(velocity.dtype)
     relative = wind - velocity
-    speed = torch.linalg.vector_norm(relative, dim=-1, keepdim=True)
     along = (relative * normal).sum(-1, keepdim=True)
     sign = torch.where(along < 0, -1.0, 1.0)
     oriented = sign * normal
-    incidence = sign * along
     tangent = relative - along * normal
-    # each term below is v_r² times the bracket of the equation, without ever dividing by v_r
-    if law == "paper":
-        pressure = drag * (speed * speed) * oriented
-    else:
-        blow = torch.linalg.vector_norm(wind, dim=-1, keepdim=True) if law == "linear" else speed
-        pressure = drag * (blow * incidence) * oriented
+    size = _length(tangent) if unit_tangent else 1.0
+    terms = wind_terms(
+        wind, relative, (1.0, oriented), (sign * along, oriented), (tangent, size), drag=drag, friction=friction,
+        lift=lift, law=law, lift_direction=lift_direction, unit_tangent=unit_tangent,
+    )  # fmt: skip
+    return (0.5 * air_density) * area[..., None] * terms
+
+
+def grouped_force(
+    wind: Tensor,
+    velocity: Tensor,
+    deformation_gradient: Tensor,
+    patches: PatchSums,
+    *,
+    drag: Tensor | float,
+    friction: Tensor | float,
+    lift: Tensor | float,
+    air_density: float = 1.225,
+    law: str = "paper",
+    lift_direction: str = "side",
+    unit_tangent: bool = False,
+    max_area_ratio: float = math.inf,
+) -> tuple[Tensor, Tensor]:
+    r"""Force on the patches of each point, see :mod:`~gaussian_swaying.aero.patches`, and their area now.
+
+    Args:
+        wind: Air velocity [m/s], broadcastable to (P, 3).
+        velocity: Velocity of the points [m/s], shape (P, 3).
+        deformation_gradient: Total deformation gradient of the points, shape (P, 3, 3).
+        patches: The sums over the patches.
+        drag: C_D.
+        friction: C_F.
+        lift: C_L.
+        air_density: Density of the air [kg/m³].
+        law: As in :func:`aero_force`.
+        lift_direction: As there.
+        unit_tangent: As there.
+        max_area_ratio: Largest ratio of the area to that at rest (see
+            :func:`capped_area`).
+
+    Returns:
+        Force [N], shape (P, 3), and area [m²], shape (P,).
+    """
+    wind = wind.to(velocity.dtype)
+    relative = wind - velocity
+    cof = cofactor(deformation_gradient)
+    pulled = (cof * relative[..., None]).sum(-2)  # w
+    turned = (cof[..., :, :, None] * patches.tensor[..., None, :, :]).sum(-2)  # cof(F) A N N^T
+    rest = patches.area
+    grown = ((turned * cof).sum((-2, -1)) / rest.clamp(min=torch.finfo(rest.dtype).tiny)).clamp(min=0)
+    growth = grown.clamp(min=torch.finfo(rest.dtype).tiny).sqrt()
+    across = (turned * pulled[..., None, :]).sum(-1) / growth[..., None]  # T v_r
+    dots = (patches.vector * pulled[patches.point]).sum(-1, keepdim=True)
+    sign = torch.where(dots < 0, -1.0, 1.0)
+    signed = sums(sign * patches.vector, patches.point, len(relative))
+    facing = (cof * signed[..., None, :]).sum(-1)  # s
+    area = growth * rest
+    tangent = area[..., None] * relative - across
     if unit_tangent:
-        size = torch.linalg.vector_norm(tangent, dim=-1, keepdim=True)
-        shear = friction * speed.square() * tangent / size.clamp(min=torch.finfo(size.dtype).tiny)
-    else:
-        shear = friction * speed * tangent
-    across = torch.linalg.cross(relative, oriented, dim=-1)
-    sideways = lift_direction == "side"
-    lifting = lift * (speed * across if sideways else torch.linalg.cross(across, relative, dim=-1))
-    return (0.5 * air_density) * area[..., None] * (pressure + shear + lifting)
+        length = torch.linalg.vector_norm(patches.vector, dim=-1, keepdim=True)
+        unit = patches.vector / length
+        along = dots / length
+        flat = pulled[patches.point] - along * unit
+        flat = length * flat / _length(flat)
+        tangent = (cof * sums(flat, patches.point, len(relative))[..., None, :]).sum(-1)
+    terms = wind_terms(
+        wind, relative, (facing, 1.0), (across, 1.0), (tangent, 1.0), drag=drag, friction=friction, lift=lift, law=law,
+        lift_direction=lift_direction, unit_tangent=unit_tangent,
+    )  # fmt: skip
+    scale = 0.5 * air_density * (rest > 0).to(rest)
+    if max_area_ratio < math.inf:
+        cap = (max_area_ratio / growth).clamp(max=1.0)
+        scale, area = scale * cap, area * cap
+    return scale[..., None] * terms, area
+
+
+def _length(x: Tensor) -> Tensor:
+    """Length of vectors (..., 3), at least the smallest normal number, shape (..., 1)."""
+    return torch.linalg.vector_norm(x, dim=-1, keepdim=True).clamp(min=torch.finfo(x.dtype).tiny)
 
 
 def drag_rate(speed: Tensor, area: Tensor, mass: Tensor, coefficient: Tensor | float, air_density: float) -> Tensor:
@@ -234,7 +359,7 @@ class AeroForce(nn.Module):
             return None
         wind = wind.to(velocity.dtype)
         speed = torch.linalg.vector_norm(wind - velocity, dim=-1)
-        blow = torch.linalg.vector_norm(wind, dim=-1) if self.law == "linear" else speed
+        blow = drag_speed(wind, speed, self.law)
         drag, rest = (c.to(speed.dtype) for c in (self.C_D, self.C_F + self.C_L.abs()))
         return 0.5 * self.air_density * area * (drag * blow + rest * speed)
 
@@ -255,7 +380,7 @@ class AeroForce(nn.Module):
     def on_groups(
         self, wind: Tensor, velocity: Tensor, deformation_gradient: Tensor, patches: PatchSums
     ) -> tuple[Tensor, Tensor]:
-        """The result of :func:`~gaussian_swaying.aero.patches.grouped_force` with the numbers of this component."""
+        """The result of :func:`grouped_force` with the numbers of this component."""
         return grouped_force(
             wind, velocity, deformation_gradient, patches, **self._numbers, max_area_ratio=self.max_area_ratio
         )

@@ -15,76 +15,63 @@ from gaussian_swaying.geometry.linalg_triton import (
     matmul,
     matvec,
     outer3,
+    scale3,
     transpose,
 )
 from gaussian_swaying.geometry.patches_triton import area_vector
 
 
 @triton.jit
-def force_adjoint(
-    r, air, n, a, drag, friction, lift, LAW: tl.constexpr, LIFT: tl.constexpr, UNIT: tl.constexpr
+def wind_terms_adjoint(
+    air, r, facing, across, tangent, a, drag, friction, lift,
+    LAW: tl.constexpr, LIFT: tl.constexpr, UNIT: tl.constexpr,
 ):  # fmt: skip
-    """Gradients of a . f by relative wind, by wind alone, normal and coefficients, and a . f.
-
-    f is per half density and area.
-    """
+    """Gradients of a . f of ``force_triton.wind_terms`` by its first five arguments and by drag, friction and lift."""
     speed = tl.sqrt(dot3(r, r))
     inverse = 1.0 / tl.maximum(speed, 1e-30)
     square = speed * speed
-    along = dot3(r, n)
-    sign = tl.where(along < 0, -1.0, 1.0)
-    g = dot3(a, n)
-    # drag
-    by_air = (square * 0, square * 0, square * 0)
-    if LAW == 2:
-        blow = tl.sqrt(dot3(air, air))
-        pressure = blow * along * g
-        by_r = (drag * g * blow * n[0], drag * g * blow * n[1], drag * g * blow * n[2])
-        by_n = axpy3(drag * g * blow, r, drag * blow * along, a)
-        push = drag * g * along / tl.maximum(blow, 1e-30)
-        by_air = (push * air[0], push * air[1], push * air[2])
-    elif LAW == 1:
-        pressure = speed * along * g
-        by_r = axpy3(drag * g * along * inverse, r, drag * g * speed, n)
-        by_n = axpy3(drag * g * speed, r, drag * speed * along, a)
+    af = dot3(a, facing)
+    at = dot3(a, tangent)
+    zero = square * 0
+    by_air = (zero, zero, zero)
+    by_facing = (zero, zero, zero)
+    by_across = (zero, zero, zero)
+    if LAW == 0:
+        pressure = square * af
+        by_r = scale3(2 * drag * af, r)
+        by_facing = scale3(drag * square, a)
     else:
-        pressure = square * sign * g
-        by_r = (2 * drag * sign * g * r[0], 2 * drag * sign * g * r[1], 2 * drag * sign * g * r[2])
-        by_n = (drag * square * sign * a[0], drag * square * sign * a[1], drag * square * sign * a[2])
-    # friction
-    t = axpy3(1.0, r, -along, n)
+        ac = dot3(a, across)
+        if LAW == 2:
+            blow = tl.sqrt(dot3(air, air))
+            by_r = by_air
+            by_air = scale3(drag * ac / tl.maximum(blow, 1e-30), air)
+        else:
+            blow = speed
+            by_r = scale3(drag * ac * inverse, r)
+        pressure = blow * ac
+        by_across = scale3(drag * blow, a)
     if UNIT:
-        size = tl.maximum(tl.sqrt(dot3(t, t)), 1e-18)  # finite where there is no tangent
-        b = (t[0] / size, t[1] / size, t[2] / size)
-        shear = dot3(a, b)
-        w = ((a[0] - shear * b[0]) / size, (a[1] - shear * b[1]) / size, (a[2] - shear * b[2]) / size)
-        wn = dot3(w, n)
-        more = axpy3(2 * shear, r, square, axpy3(1.0, w, -wn, n))
-        turn = axpy3(-square * wn, r, -square * along, w)
-        shear = square * shear
+        shear = square * at
+        by_r = axpy3(1.0, by_r, 2 * friction * at, r)
+        by_tangent = scale3(friction * square, a)
     else:
-        shear = dot3(a, t)
-        more = axpy3(shear * inverse, r, speed, axpy3(1.0, a, -g, n))
-        turn = axpy3(-speed * g, r, -speed * along, a)
-        shear = speed * shear
-    by_r = axpy3(1.0, by_r, friction, more)
-    by_n = axpy3(1.0, by_n, friction, turn)
-    # lift
+        shear = speed * at
+        by_r = axpy3(1.0, by_r, friction * at * inverse, r)
+        by_tangent = scale3(friction * speed, a)
     if LIFT:
         ar = dot3(a, r)
-        side = sign * (square * g - along * ar)
-        more = axpy3(1.0, axpy3(2 * g, r, -along, a), -ar, n)
-        turn = axpy3(square, a, -ar, r)
+        rf = dot3(r, facing)
+        side = square * af - ar * rf
+        by_r = axpy3(1.0, by_r, lift, axpy3(1.0, axpy3(2 * af, r, -rf, a), -ar, facing))
+        by_facing = axpy3(1.0, by_facing, lift, axpy3(square, a, -ar, r))
     else:
-        across = cross3(n, a)
-        product = dot3(r, across)
-        side = sign * speed * product
-        more = axpy3(product * inverse, r, speed, across)
-        turn = cross3(a, r)
-        turn = (speed * turn[0], speed * turn[1], speed * turn[2])
-    by_r = axpy3(1.0, by_r, sign * lift, more)
-    by_n = axpy3(1.0, by_n, sign * lift, turn)
-    return by_r, by_air, by_n, (pressure, shear, side), drag * pressure + friction * shear + lift * side
+        turn = cross3(facing, a)
+        product = dot3(r, turn)
+        side = speed * product
+        by_r = axpy3(1.0, by_r, lift, axpy3(product * inverse, r, speed, turn))
+        by_facing = axpy3(1.0, by_facing, lift * speed, cross3(a, r))
+    return by_air, by_r, by_facing, by_across, by_tangent, (pressure, shear, side)
 
 
 @triton.jit
@@ -102,9 +89,23 @@ def wind_force_adjoint(F, velocity, patch, numbers, air, table, a, OPTIONS: tl.c
     )
     drag, friction, lift, half_density, widest = numbers
     relative = (air[0] - velocity[0], air[1] - velocity[1], air[2] - velocity[2])
-    by_r, by_air, by_n, parts, whole = force_adjoint(
-        relative, air, n, a, drag, friction, lift, OPTIONS[0], OPTIONS[1], OPTIONS[2]
-    )
+    along = dot3(relative, n)
+    sign = tl.where(along < 0, -1.0, 1.0)
+    tangent = axpy3(1.0, relative, -along, n)
+    if OPTIONS[2]:
+        length = tl.maximum(tl.sqrt(dot3(tangent, tangent)), 1e-18)  # finite where there is no tangent
+        tangent = scale3(1 / length, tangent)
+    by_air, by_r, by_facing, by_across, by_tangent, parts = wind_terms_adjoint(
+        air, relative, scale3(sign, n), scale3(along, n), tangent, a, drag, friction, lift,
+        OPTIONS[0], OPTIONS[1], OPTIONS[2],
+    )  # fmt: skip
+    if OPTIONS[2]:
+        by_tangent = scale3(1 / length, axpy3(1.0, by_tangent, -dot3(by_tangent, tangent), tangent))
+    by_across = axpy3(1.0, by_across, -1.0, by_tangent)
+    through = dot3(by_across, n)
+    by_r = axpy3(1.0, axpy3(1.0, by_r, 1.0, by_tangent), through, n)
+    by_n = axpy3(1.0, axpy3(sign, by_facing, along, by_across), through, relative)
+    whole = drag * parts[0] + friction * parts[1] + lift * parts[2]
     half = half_density * patch[3]
     area = half * tl.minimum(size, widest)
     # the unit normal and the area both come from the area vector
@@ -121,23 +122,20 @@ def wind_force_adjoint(F, velocity, patch, numbers, air, table, a, OPTIONS: tl.c
     if OPTIONS[0] == 2:
         by_wind = axpy3(1.0, by_wind, area, by_air)
     by_F = cofactor_change(F, outer3(v, rest))
-    return by_F, by_velocity, by_wind, (area * parts[0], area * parts[1], area * parts[2])
+    return by_F, by_velocity, by_wind, scale3(area, parts)
 
 
 @triton.jit
 def wind_on_groups_adjoint(F, velocity, place, numbers, air, table, a, OPTIONS: tl.constexpr):
     """As :func:`wind_force_adjoint`, for ``force_triton.wind_on_groups`` without a unit tangent.
 
-    The names are those of ``aero.patches.grouped_force``; the sum over the sides that the patches show is constant.
+    The names are those of ``aero.force.grouped_force``; the sum over the sides that the patches show is constant.
     """
     first = 4 * place[0].to(tl.int32)
     count = place[1].to(tl.int32)
     real = count > 0
     r = (air[0] - velocity[0], air[1] - velocity[1], air[2] - velocity[2])
     drag, friction, lift, half, widest = numbers
-    speed = tl.sqrt(dot3(r, r))
-    inverse = 1.0 / tl.maximum(speed, 1e-30)
-    square = speed * speed
     c = cofactor(F)
     w = matvec(transpose(c), r)
     t0 = tl.load(table + first, real, 0.0)
@@ -173,44 +171,14 @@ def wind_on_groups_adjoint(F, velocity, place, numbers, air, table, a, OPTIONS: 
     across = (across[0] / growth, across[1] / growth, across[2] / growth)
     facing = matvec(c, s)
     area = growth * rest
-    ar = dot3(a, r)
-    ac = dot3(a, across)
-    af = dot3(a, facing)
-    rub = area * ar - ac
-    shear = speed * rub
-    by_r = axpy3(friction * rub * inverse, r, friction * speed * area, a)
-    by_area = friction * speed * ar
-    to_across = -friction * speed
-    by_air = (zero, zero, zero)
-    if OPTIONS[0] == 2:
-        blow = tl.sqrt(dot3(air, air))
-        pressure = blow * ac
-        push = drag * ac / tl.maximum(blow, 1e-30)
-        by_air = (push * air[0], push * air[1], push * air[2])
-        to_across += drag * blow
-        by_facing = (zero, zero, zero)
-    elif OPTIONS[0] == 1:
-        pressure = speed * ac
-        by_r = axpy3(1.0, by_r, drag * ac * inverse, r)
-        to_across += drag * speed
-        by_facing = (zero, zero, zero)
-    else:
-        pressure = square * af
-        by_r = axpy3(1.0, by_r, 2 * drag * af, r)
-        by_facing = (drag * square * a[0], drag * square * a[1], drag * square * a[2])
-    if OPTIONS[1]:
-        rf = dot3(r, facing)
-        side = square * af - ar * rf
-        by_r = axpy3(1.0, by_r, lift, axpy3(1.0, axpy3(2 * af, r, -rf, a), -ar, facing))
-        by_facing = axpy3(1.0, by_facing, lift, axpy3(square, a, -ar, r))
-    else:
-        turn = cross3(facing, a)
-        product = dot3(r, turn)
-        side = speed * product
-        by_r = axpy3(1.0, by_r, lift, axpy3(product * inverse, r, speed, turn))
-        by_facing = axpy3(1.0, by_facing, lift * speed, cross3(a, r))
-    by_across = (to_across * a[0], to_across * a[1], to_across * a[2])
-    total = drag * pressure + friction * shear + lift * side
+    tangent = axpy3(area, r, -1.0, across)
+    by_air, by_r, by_facing, by_across, by_tangent, parts = wind_terms_adjoint(
+        air, r, facing, across, tangent, a, drag, friction, lift, OPTIONS[0], OPTIONS[1], False
+    )
+    by_r = axpy3(1.0, by_r, area, by_tangent)
+    by_across = axpy3(1.0, by_across, -1.0, by_tangent)
+    by_area = dot3(by_tangent, r)
+    total = drag * parts[0] + friction * parts[1] + lift * parts[2]
     cap = tl.minimum(widest / growth, 1.0)
     by_growth = by_area * rest - dot3(by_across, across) / growth - tl.where(growth > widest, total / growth, 0.0)
     scaled = (by_across[0] / growth, by_across[1] / growth, by_across[2] / growth)
@@ -227,4 +195,4 @@ def wind_on_groups_adjoint(F, velocity, place, numbers, air, table, a, OPTIONS: 
     by_velocity = (-by_wind[0], -by_wind[1], -by_wind[2])
     if OPTIONS[0] == 2:
         by_wind = axpy3(1.0, by_wind, scale, by_air)
-    return cofactor_change(F, by_c), by_velocity, by_wind, (scale * pressure, scale * shear, scale * side)
+    return cofactor_change(F, by_c), by_velocity, by_wind, scale3(scale, parts)

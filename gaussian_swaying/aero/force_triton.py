@@ -3,49 +3,49 @@
 import triton
 import triton.language as tl
 
-from gaussian_swaying.geometry.linalg_triton import chosen, cofactor, cross3, dot3, load3, matvec, read, transpose
+from gaussian_swaying.geometry.linalg_triton import (
+    axpy3,
+    chosen,
+    cofactor,
+    cross3,
+    dot3,
+    load3,
+    matvec,
+    read,
+    scale3,
+    transpose,
+)
 from gaussian_swaying.geometry.patches_triton import deform_patch
 
 
 @triton.jit
-def aero_force(
-    relative, air, n, area, drag, friction, lift, half_density,
+def wind_terms(
+    air, relative, facing, across, tangent, drag, friction, lift,
     LAW: tl.constexpr, LIFT: tl.constexpr, UNIT: tl.constexpr,
 ):  # fmt: skip
-    """Force on a patch in a relative wind, the relative speed, and the speed that the drag is proportional to."""
+    """``force.wind_terms``: force per half density, and the resistance per half density and area."""
     speed = tl.sqrt(dot3(relative, relative))
     blow = tl.sqrt(dot3(air, air)) if LAW == 2 else speed
-    along = dot3(relative, n)
-    sign = tl.where(along < 0, -1.0, 1.0)
-    tx = relative[0] - along * n[0]
-    ty = relative[1] - along * n[1]
-    tz = relative[2] - along * n[2]
+    pressed = across
+    pressure = drag * blow
     if LAW == 0:
-        pressure = drag * speed * speed * sign
-    else:
-        pressure = drag * blow * along  # sign times sign is one
+        pressed = facing
+        pressure = drag * speed * speed
     shear = friction * speed
     if UNIT:
-        # normalise first: in a wind along the normal the tangent is zero, and the other order would overflow
-        size = tl.maximum(tl.sqrt(tx * tx + ty * ty + tz * tz), 1.2e-38)
-        tx = tx / size
-        ty = ty / size
-        tz = tz / size
         shear = shear * speed
-    across = cross3(relative, n)
+    side = cross3(relative, facing)
+    lifting = lift
     if LIFT:
-        side = cross3(across, relative)
-        lifting = lift * sign
+        side = cross3(side, relative)
     else:
-        side = across
-        lifting = lift * speed * sign
-    scale = half_density * area
+        lifting = lift * speed
     force = (
-        scale * (pressure * n[0] + shear * tx + lifting * side[0]),
-        scale * (pressure * n[1] + shear * ty + lifting * side[1]),
-        scale * (pressure * n[2] + shear * tz + lifting * side[2]),
+        pressure * pressed[0] + shear * tangent[0] + lifting * side[0],
+        pressure * pressed[1] + shear * tangent[1] + lifting * side[1],
+        pressure * pressed[2] + shear * tangent[2] + lifting * side[2],
     )
-    return force, speed, blow
+    return force, drag * blow + (friction + tl.abs(lift)) * speed
 
 
 @triton.jit
@@ -73,15 +73,22 @@ def wind_force(F, velocity, position, patch, numbers, now, table, OPTIONS: tl.co
     air = shaped_wind(position, now, table, OPTIONS[4])
     normal, area = deform_patch(F, (patch[0], patch[1], patch[2]), patch[3], numbers[4])
     relative = (air[0] - velocity[0], air[1] - velocity[1], air[2] - velocity[2])
-    drag, friction, lift, half_density = numbers[0], numbers[1], numbers[2], numbers[3]
-    force, speed, blow = aero_force(
-        relative, air, normal, area, drag, friction, lift, half_density, OPTIONS[0], OPTIONS[1], OPTIONS[2]
-    )
+    along = dot3(relative, normal)
+    sign = tl.where(along < 0, -1.0, 1.0)
+    tangent = axpy3(1.0, relative, -along, normal)
+    if OPTIONS[2]:
+        # normalise first: in a wind along the normal the tangent is zero, and the other order would overflow
+        size = tl.maximum(tl.sqrt(dot3(tangent, tangent)), 1.2e-38)
+        tangent = (tangent[0] / size, tangent[1] / size, tangent[2] / size)
+    force, yielding = wind_terms(
+        air, relative, scale3(sign, normal), scale3(along, normal), tangent, numbers[0], numbers[1], numbers[2],
+        OPTIONS[0], OPTIONS[1], OPTIONS[2],
+    )  # fmt: skip
+    scale = numbers[3] * area
+    resistance = area * 0
     if OPTIONS[3]:
-        resistance = half_density * area * (drag * blow + (friction + tl.abs(lift)) * speed)
-    else:
-        resistance = area * 0
-    return force, resistance
+        resistance = scale * yielding
+    return scale3(scale, force), resistance
 
 
 @triton.jit
@@ -104,7 +111,7 @@ def add_direction(s, u, b, w, known, UNIT: tl.constexpr):
 
 @triton.jit
 def wind_on_groups(F, velocity, position, place, numbers, now, table, OPTIONS: tl.constexpr):
-    """``WindForce`` on groups of patches; the reference is ``aero.patches.grouped_force``.
+    """``WindForce`` on groups of patches; the reference is ``aero.force.grouped_force``.
 
     ``place``: first row in the table of ``PatchSums``, which follows that of the effects, and number of vectors there.
     The rest is as in :func:`wind_force`.
@@ -115,8 +122,6 @@ def wind_on_groups(F, velocity, position, place, numbers, now, table, OPTIONS: t
     real = count > 0
     relative = (air[0] - velocity[0], air[1] - velocity[1], air[2] - velocity[2])
     drag, friction, lift, half_density, widest = numbers
-    speed = tl.sqrt(dot3(relative, relative))
-    blow = tl.sqrt(dot3(air, air)) if OPTIONS[0] == 2 else speed
     c = cofactor(F)
     w = matvec(transpose(c), relative)
     t0 = tl.load(table + first, real, 0.0)
@@ -151,37 +156,15 @@ def wind_on_groups(F, velocity, position, place, numbers, now, table, OPTIONS: t
         s, u = add_direction(s, u, b3, w, k + 3 < count, OPTIONS[2])
     facing = matvec(c, s)
     area = growth * rest
-    if OPTIONS[0] == 0:
-        square = drag * speed * speed
-        pressure = (square * facing[0], square * facing[1], square * facing[2])
-    else:
-        pressure = (drag * blow * across[0], drag * blow * across[1], drag * blow * across[2])
     if OPTIONS[2]:
         tangent = matvec(c, u)
-        square = friction * speed * speed
-        shear = (square * tangent[0], square * tangent[1], square * tangent[2])
     else:
-        rub = friction * speed
-        shear = (
-            rub * (area * relative[0] - across[0]),
-            rub * (area * relative[1] - across[1]),
-            rub * (area * relative[2] - across[2]),
-        )
-    side = cross3(relative, facing)
-    if OPTIONS[1]:
-        side = cross3(side, relative)
-        lifting = lift + zero
-    else:
-        lifting = lift * speed
-    cap = tl.minimum(widest / growth, 1.0)
-    scale = tl.where(real, half_density * cap, 0.0)
-    force = (
-        scale * (pressure[0] + shear[0] + lifting * side[0]),
-        scale * (pressure[1] + shear[1] + lifting * side[1]),
-        scale * (pressure[2] + shear[2] + lifting * side[2]),
+        tangent = axpy3(area, relative, -1.0, across)
+    force, yielding = wind_terms(
+        air, relative, facing, across, tangent, drag, friction, lift, OPTIONS[0], OPTIONS[1], OPTIONS[2]
     )
+    scale = tl.where(real, half_density * tl.minimum(widest / growth, 1.0), 0.0)
+    resistance = zero
     if OPTIONS[3]:
-        resistance = scale * area * (drag * blow + (friction + tl.abs(lift)) * speed)
-    else:
-        resistance = zero
-    return force, resistance
+        resistance = scale * area * yielding
+    return scale3(scale, force), resistance

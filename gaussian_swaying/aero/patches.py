@@ -18,14 +18,11 @@ of the area :math:`\kappa` stands for that of each patch.
 
 from __future__ import annotations
 
-import math
-
 import torch
 from torch import Tensor, nn
 
 from gaussian_swaying._checks import check_shape
 from gaussian_swaying.geometry.groups import equal_rows, sums
-from gaussian_swaying.geometry.linalg import cofactor
 
 MOST = 243
 """Most directions that are kept for the patches of one point; similar ones are joined until there are no more."""
@@ -167,78 +164,3 @@ def joined_directions(
     size = sums(area, group)
     owner = torch.zeros(len(size), dtype=torch.long).index_put((group,), point)
     return torch.nn.functional.normalize(total, dim=-1) * size[:, None], owner
-
-
-def grouped_force(
-    wind: Tensor,
-    velocity: Tensor,
-    deformation_gradient: Tensor,
-    patches: PatchSums,
-    *,
-    drag: Tensor | float,
-    friction: Tensor | float,
-    lift: Tensor | float,
-    air_density: float = 1.225,
-    law: str = "paper",
-    lift_direction: str = "side",
-    unit_tangent: bool = False,
-    max_area_ratio: float = math.inf,
-) -> tuple[Tensor, Tensor]:
-    r"""Force on the patches of each point, see the top of this file, and their area now.
-
-    Args:
-        wind: Air velocity [m/s], broadcastable to (P, 3).
-        velocity: Velocity of the points [m/s], shape (P, 3).
-        deformation_gradient: Total deformation gradient of the points, shape (P, 3, 3).
-        patches: The sums over the patches.
-        drag: C_D.
-        friction: C_F.
-        lift: C_L.
-        air_density: Density of the air [kg/m³].
-        law: As in :func:`~gaussian_swaying.aero.force.aero_force`.
-        lift_direction: As there.
-        unit_tangent: As there.
-        max_area_ratio: Largest ratio of the area to that at rest (see
-            :func:`~gaussian_swaying.aero.force.capped_area`).
-
-    Returns:
-        Force [N], shape (P, 3), and area [m²], shape (P,).
-    """
-    wind = wind.to(velocity.dtype)
-    relative = wind - velocity
-    speed = torch.linalg.vector_norm(relative, dim=-1, keepdim=True)
-    cof = cofactor(deformation_gradient)
-    pulled = (cof * relative[..., None]).sum(-2)  # w
-    turned = (cof[..., :, :, None] * patches.tensor[..., None, :, :]).sum(-2)  # cof(F) A N N^T
-    rest = patches.area
-    grown = ((turned * cof).sum((-2, -1)) / rest.clamp(min=torch.finfo(rest.dtype).tiny)).clamp(min=0)
-    growth = grown.clamp(min=torch.finfo(rest.dtype).tiny).sqrt()
-    across = (turned * pulled[..., None, :]).sum(-1) / growth[..., None]  # T v_r
-    dots = (patches.vector * pulled[patches.point]).sum(-1, keepdim=True)
-    sign = torch.where(dots < 0, -1.0, 1.0)
-    signed = sums(sign * patches.vector, patches.point, len(relative))
-    facing = (cof * signed[..., None, :]).sum(-1)  # s
-    area = growth * rest
-    if law == "paper":
-        pressure = drag * (speed * speed * facing)
-    else:
-        blow = torch.linalg.vector_norm(wind, dim=-1, keepdim=True) if law == "linear" else speed
-        pressure = drag * (blow * across)
-    if unit_tangent:
-        size = torch.linalg.vector_norm(patches.vector, dim=-1, keepdim=True)
-        unit = patches.vector / size
-        along = dots / size
-        tangent = pulled[patches.point] - along * unit
-        length = torch.linalg.vector_norm(tangent, dim=-1, keepdim=True)
-        tangent = size * tangent / length.clamp(min=torch.finfo(size.dtype).tiny)
-        tangents = (cof * sums(tangent, patches.point, len(relative))[..., None, :]).sum(-1)
-        shear = friction * speed.square() * tangents
-    else:
-        shear = friction * speed * (area[..., None] * relative - across)
-    side = torch.linalg.cross(relative, facing, dim=-1)
-    lifting = lift * (speed * side if lift_direction == "side" else torch.linalg.cross(side, relative, dim=-1))
-    scale = 0.5 * air_density * (rest > 0).to(rest)
-    if max_area_ratio < math.inf:
-        cap = (max_area_ratio / growth).clamp(max=1.0)
-        scale, area = scale * cap, area * cap
-    return scale[..., None] * (pressure + shear + lifting), area

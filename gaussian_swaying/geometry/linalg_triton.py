@@ -189,6 +189,12 @@ def square9(a):
 
 
 @triton.jit
+def scale3(s, a):
+    """S a."""
+    return s * a[0], s * a[1], s * a[2]
+
+
+@triton.jit
 def scale9(s, a):
     """S A."""
     return (s * a[0], s * a[1], s * a[2], s * a[3], s * a[4], s * a[5], s * a[6], s * a[7], s * a[8])

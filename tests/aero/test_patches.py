@@ -5,8 +5,8 @@ import math
 import pytest
 import torch
 
-from gaussian_swaying.aero.force import AeroForce, aero_force, capped_area
-from gaussian_swaying.aero.patches import MOST, Patches, PatchSums, grouped_force
+from gaussian_swaying.aero.force import AeroForce, aero_force, capped_area, grouped_force
+from gaussian_swaying.aero.patches import MOST, Patches, PatchSums
 from gaussian_swaying.aero.wind import WindField
 from gaussian_swaying.aero.wind_force import WindForce
 from gaussian_swaying.geometry.patches import deform_patch
