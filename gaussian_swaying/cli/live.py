@@ -12,9 +12,8 @@ from typing import TYPE_CHECKING
 
 from gaussian_swaying import _program as program
 from gaussian_swaying._yaml_limits import check_config_files
-from gaussian_swaying.cli.errors import run_command
+from gaussian_swaying.cli.errors import guessing, run_command
 from gaussian_swaying.cli.shipped import with_shipped
-from gaussian_swaying.cli.suggestions import guessing
 from gaussian_swaying.simulation.defaults import resolve_device
 from gaussian_swaying.simulation.simulation import Simulation
 from gaussian_swaying.viewer.controls import Page

@@ -15,12 +15,10 @@ from typing import Any
 from gaussian_swaying import _program as program
 from gaussian_swaying._checks import check_positive
 from gaussian_swaying._yaml_limits import check_config_files
-from gaussian_swaying.cli.errors import parser_sentence, run_command
+from gaussian_swaying.cli.errors import guessing, parser_sentence, run_command
 from gaussian_swaying.cli.shipped import with_shipped
-from gaussian_swaying.cli.suggestions import guessing
 from gaussian_swaying.config.parser import parse_text
 from gaussian_swaying.gaussians.compact import read_gaussians
-from gaussian_swaying.preview.as_data import cost_dict, run_dict, suggestion_dict
 from gaussian_swaying.preview.calibration import (
     SWAY,
     calibrated_suggestion,
@@ -37,11 +35,14 @@ from gaussian_swaying.preview.photos import captured_from
 from gaussian_swaying.preview.picture import preview_picture
 from gaussian_swaying.preview.report import (
     area_line,
+    cost_dict,
     cost_lines,
     doubts,
     quality_lines,
+    run_dict,
     run_lines,
     splat_lines,
+    suggestion_dict,
     suggestion_lines,
     video_length,
 )

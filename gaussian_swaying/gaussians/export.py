@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import re
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from importlib import import_module
 from pathlib import Path
 from typing import Any
@@ -105,7 +105,8 @@ def export_cloud(
     if format == "ply":
         write_ply(path, kept)
         return
-    _replace(path, lambda temporary: temporary.write_bytes(_gsplat_bytes(path, kept, format)))
+    with atomic(path) as temporary:
+        temporary.write_bytes(_gsplat_bytes(path, kept, format))
 
 
 def format_of(path: str | os.PathLike[str]) -> str:
@@ -175,12 +176,6 @@ def _kept(path: Path, cloud: GaussianCloud) -> GaussianCloud:
             stacklevel=3,
         )
     return kept
-
-
-def _replace(path: Path, write: Callable[[Path], Any]) -> None:
-    """Write under a temporary name with the same ending, then rename."""
-    with atomic(path) as temporary:
-        write(temporary)
 
 
 def _gsplat_bytes(path: Path, cloud: GaussianCloud, format: str) -> bytes:
@@ -347,8 +342,8 @@ class UsdFilm:
 
     def save(self, path: str | os.PathLike[str]) -> None:
         """Write the film, whole or not at all."""
-        path = Path(path)
-        _replace(path, lambda temporary: self._stage.GetRootLayer().Export(str(temporary)))
+        with atomic(Path(path)) as temporary:
+            self._stage.GetRootLayer().Export(str(temporary))
 
     def _create(self, arrays: dict[str, np.ndarray]) -> None:
         Sdf, UsdGeom = _pxr("Sdf"), _pxr("UsdGeom")

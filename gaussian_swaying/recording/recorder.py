@@ -19,7 +19,7 @@ import torch
 from torch import Tensor
 
 from gaussian_swaying._checks import check_choice, check_positive
-from gaussian_swaying._files import atomic, remove_temporaries, write_json, write_table
+from gaussian_swaying._files import atomic, remove_temporaries, write_json, write_table, write_text
 from gaussian_swaying.gaussians.cloud import GaussianCloud
 from gaussian_swaying.gaussians.export import SUFFIXES, export_cloud
 from gaussian_swaying.geometry.frame import SimFrame
@@ -220,8 +220,7 @@ class Recorder:
             try:
                 self._make_folders()
                 if config and not (path / "config.yaml").exists():
-                    with atomic(path / "config.yaml") as temporary:
-                        temporary.write_text(config)
+                    write_text(path / "config.yaml", config)
             except OSError as error:
                 raise ValueError(
                     f"The output folder {path} cannot be written ({error.strerror or error}): choose another with "

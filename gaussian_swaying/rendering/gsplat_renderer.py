@@ -1,6 +1,7 @@
 """Renderer on top of the CUDA rasterizer of gsplat."""
 
 import sys
+import warnings
 from functools import cache
 from pathlib import Path
 
@@ -15,9 +16,11 @@ from gaussian_swaying.rendering.protocol import (
     RenderOutput,
     ScreenGaussians,
     SplatOutput,
+    SplatRenderer,
     check_gaussians,
     finite_gaussians,
 )
+from gaussian_swaying.rendering.torch_renderer import TorchRenderer
 
 
 def gsplat_works() -> bool:
@@ -313,3 +316,24 @@ class GsplatRenderer(nn.Module):
         if channels is None:
             return SplatOutput(pixels[0], alpha[0], screen)
         return SplatOutput(pixels[0, ..., :3], alpha[0], screen, pixels[0, ..., 3:])
+
+
+def make_renderer(device: torch.device | str, packed: bool = False) -> SplatRenderer:
+    """Return the renderer for a device: gsplat with CUDA, the torch renderer otherwise.
+
+    If gsplat cannot compile its kernels (no ``nvcc``), the torch renderer draws on the GPU, with a warning.
+
+    Args:
+        device: The device.
+        packed: See :class:`GsplatRenderer`.
+    """
+    if torch.device(device).type != "cuda" or not torch.cuda.is_available():
+        return TorchRenderer()
+    if gsplat_works():
+        return GsplatRenderer(packed=packed)
+    warnings.warn(
+        "gsplat cannot compile its CUDA kernels here (it needs nvcc of torch's CUDA version): drawing with the slower "
+        "torch renderer instead.",
+        stacklevel=2,
+    )
+    return TorchRenderer()

@@ -17,7 +17,7 @@ from gaussian_swaying.recording.layout import check_camera_name
 from gaussian_swaying.rendering import passes
 from gaussian_swaying.rendering.cameras.camera import Camera
 from gaussian_swaying.rendering.cameras.camera_path import CameraPath, OrbitCamera
-from gaussian_swaying.rendering.factory import make_renderer
+from gaussian_swaying.rendering.gsplat_renderer import make_renderer
 from gaussian_swaying.rendering.protocol import Renderer, RenderOutput
 from gaussian_swaying.rendering.shading import Shader
 from gaussian_swaying.simulation.simulated_scene import SimulatedScene

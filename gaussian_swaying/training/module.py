@@ -19,7 +19,7 @@ from torchmetrics.functional.image import peak_signal_noise_ratio
 from gaussian_swaying._checks import check_choice, check_positive, check_vector
 from gaussian_swaying.gaussians.model import GaussianSurfaceModel
 from gaussian_swaying.rendering.cameras.camera import Camera
-from gaussian_swaying.rendering.factory import make_renderer
+from gaussian_swaying.rendering.gsplat_renderer import make_renderer
 from gaussian_swaying.rendering.planes import SurfaceMaps, plane_channels, surface_maps
 from gaussian_swaying.rendering.protocol import SplatOutput, SplatRenderer
 from gaussian_swaying.training.checkpoints import check_settings, newest_checkpoint, stored_gaussians
@@ -75,7 +75,7 @@ class SplatTrainer(lightning.LightningModule):
         lpips: Backbone of the LPIPS metric, used only if its weights are on disk; null for none.
 
     Attributes:
-        renderer: The renderer; None for that of :func:`~gaussian_swaying.rendering.factory.make_renderer`.
+        renderer: The renderer; None for that of :func:`~gaussian_swaying.rendering.gsplat_renderer.make_renderer`.
 
     Raises:
         ValueError: If a value is out of range.

@@ -1,6 +1,6 @@
 """One place turns errors into a sentence and an exit code, and no stream stops a command.
 
-Covers: cli.streams, cli.suggestions.
+Covers: cli.streams.
 """
 
 import errno
@@ -16,9 +16,8 @@ import numpy as np
 import pytest
 import torch
 
-from gaussian_swaying.cli.errors import run_command, sentence
+from gaussian_swaying.cli.errors import guessing, run_command, sentence
 from gaussian_swaying.cli.streams import SafeStream
-from gaussian_swaying.cli.suggestions import guessing
 from gaussian_swaying.simulation.simulation import Simulation
 
 ROOT = Path(__file__).parents[2]

@@ -10,8 +10,13 @@ import torch
 from filelock import FileLock
 
 from gaussian_swaying.rendering.cameras.camera import look_at_camera
-from gaussian_swaying.rendering.factory import make_renderer
-from gaussian_swaying.rendering.gsplat_renderer import GsplatRenderer, load_kernels, rasterize_splat, render_gsplat
+from gaussian_swaying.rendering.gsplat_renderer import (
+    GsplatRenderer,
+    load_kernels,
+    make_renderer,
+    rasterize_splat,
+    render_gsplat,
+)
 from gaussian_swaying.rendering.torch_renderer import TorchRenderer, render_torch
 
 

@@ -1,6 +1,6 @@
 """The torch renderer against a loop over pixels and Gaussians written from the equations.
 
-Covers: rendering.factory, rendering.protocol.
+Covers: rendering.protocol.
 """
 
 import math
@@ -11,7 +11,7 @@ import torch
 from gaussian_swaying.gaussians.harmonics import sh_to_color
 from gaussian_swaying.geometry import covariances
 from gaussian_swaying.rendering.cameras.camera import Camera, look_at_camera
-from gaussian_swaying.rendering.factory import make_renderer
+from gaussian_swaying.rendering.gsplat_renderer import make_renderer
 from gaussian_swaying.rendering.protocol import finite_gaussians
 from gaussian_swaying.rendering.torch_renderer import TorchRenderer, project_gaussians, render_torch
 

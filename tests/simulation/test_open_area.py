@@ -1,6 +1,6 @@
 """``scene.area: open``: what wind and mass of a capture are, and how it is turned off.
 
-Covers: preview.as_data, preview.report.
+Covers: preview.report.
 """
 
 import math
@@ -16,8 +16,7 @@ from gaussian_swaying.gaussians.compact import read_gaussians
 from gaussian_swaying.gaussians.filling import InteriorFilling
 from gaussian_swaying.gaussians.ply import write_ply
 from gaussian_swaying.geometry.rotations import rotation_to_quat
-from gaussian_swaying.preview.as_data import run_dict
-from gaussian_swaying.preview.report import run_lines
+from gaussian_swaying.preview.report import run_dict, run_lines
 from gaussian_swaying.preview.starter import draft_yaml, starter_yaml
 from gaussian_swaying.preview.suggest import suggest
 from gaussian_swaying.scenes.procedural import FlagScene

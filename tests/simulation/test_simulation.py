@@ -22,8 +22,7 @@ from gaussian_swaying.geometry.regions import Box
 from gaussian_swaying.mpm.solver import MPMSolver
 from gaussian_swaying.rendering.cameras.camera import orbit_camera
 from gaussian_swaying.rendering.cameras.camera_path import LookAtCamera, OrbitCamera
-from gaussian_swaying.rendering.factory import make_renderer
-from gaussian_swaying.rendering.gsplat_renderer import GsplatRenderer
+from gaussian_swaying.rendering.gsplat_renderer import GsplatRenderer, make_renderer
 from gaussian_swaying.rendering.protocol import finite_gaussians
 from gaussian_swaying.rendering.shading import DiffuseShader, PhongShader
 from gaussian_swaying.rendering.torch_renderer import render_torch

@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from gaussian_swaying._files import atomic
+from gaussian_swaying._files import write_text
 from gaussian_swaying.recording.nodes import join_far, split_at
 from gaussian_swaying.viewer.film.recorded import Film, read_film
 
@@ -38,8 +38,7 @@ def write_film(run: Path, target: Path) -> Film:
         raise ValueError(f"Expected the name of a film to end in .html, but got {target}.")
     film = read_film(run)
     text = page(film)
-    with atomic(target) as temporary:
-        temporary.write_text(text, encoding="utf-8")
+    write_text(target, text)
     return film
 
 

@@ -24,7 +24,7 @@ from bench.problems.surface_quality import surface_quality
 from bench.record import chosen
 from gaussian_swaying.cli.train import make_cli
 from gaussian_swaying.gaussians.model import GaussianSurfaceModel
-from gaussian_swaying.rendering.factory import make_renderer
+from gaussian_swaying.rendering.gsplat_renderer import make_renderer
 from gaussian_swaying.training.data.datamodule import CaptureDataModule, EndlessShuffle, TrainingImage
 from gaussian_swaying.training.data.generated_datamodule import GeneratedDataModule
 from gaussian_swaying.training.losses import photometric_loss
