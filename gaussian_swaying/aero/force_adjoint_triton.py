@@ -3,7 +3,7 @@
 import triton
 import triton.language as tl
 
-from gaussian_swaying.aero.force_triton import add_direction
+from gaussian_swaying.aero.force_triton import sums_over_patches
 from gaussian_swaying.geometry.linalg_triton import (
     axpy3,
     axpy9,
@@ -11,7 +11,6 @@ from gaussian_swaying.geometry.linalg_triton import (
     cofactor_change,
     cross3,
     dot3,
-    load3,
     matmul,
     matvec,
     outer3,
@@ -138,27 +137,7 @@ def wind_on_groups_adjoint(F, velocity, place, numbers, air, table, a, OPTIONS: 
     drag, friction, lift, half, widest = numbers
     c = cofactor(F)
     w = matvec(transpose(c), r)
-    t0 = tl.load(table + first, real, 0.0)
-    t1 = tl.load(table + first + 1, real, 0.0)
-    t2 = tl.load(table + first + 2, real, 0.0)
-    t3 = tl.load(table + first + 3, real, 0.0)
-    t4 = tl.load(table + first + 4, real, 0.0)
-    t5 = tl.load(table + first + 5, real, 0.0)
-    tensor = (t0, t1, t2, t1, t3, t4, t2, t4, t5)
-    rest = t0 + t3 + t5
-    zero = rest * 0
-    s = (zero, zero, zero)
-    u = (zero, zero, zero)
-    for k in range(0, tl.max(count), 4):  # four rows at once
-        row = first + 8 + 4 * k
-        b0 = load3(table, 1, row, k < count)
-        b1 = load3(table, 1, row + 4, k + 1 < count)
-        b2 = load3(table, 1, row + 8, k + 2 < count)
-        b3 = load3(table, 1, row + 12, k + 3 < count)
-        s, u = add_direction(s, u, b0, w, k < count, False)
-        s, u = add_direction(s, u, b1, w, k + 1 < count, False)
-        s, u = add_direction(s, u, b2, w, k + 2 < count, False)
-        s, u = add_direction(s, u, b3, w, k + 3 < count, False)
+    tensor, rest, s, _u = sums_over_patches(table, first, count, w, False)
     turned = matmul(c, tensor)
     # a lane without patches gets an area, whose force is multiplied by zero
     whole = tl.where(real, rest, 1.0)

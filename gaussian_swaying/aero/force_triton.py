@@ -110,6 +110,34 @@ def add_direction(s, u, b, w, known, UNIT: tl.constexpr):
 
 
 @triton.jit
+def sums_over_patches(table, first, count, w, UNIT: tl.constexpr):
+    """The rows of ``PatchSums`` of each point: tensor and its trace, and the sums of :func:`add_direction`."""
+    real = count > 0
+    t0 = tl.load(table + first, real, 0.0)
+    t1 = tl.load(table + first + 1, real, 0.0)
+    t2 = tl.load(table + first + 2, real, 0.0)
+    t3 = tl.load(table + first + 3, real, 0.0)
+    t4 = tl.load(table + first + 4, real, 0.0)
+    t5 = tl.load(table + first + 5, real, 0.0)
+    tensor = (t0, t1, t2, t1, t3, t4, t2, t4, t5)
+    rest = t0 + t3 + t5
+    zero = rest * 0
+    s = (zero, zero, zero)
+    u = (zero, zero, zero)
+    for k in range(0, tl.max(count), 4):  # four rows at once
+        row = first + 8 + 4 * k
+        b0 = load3(table, 1, row, k < count)
+        b1 = load3(table, 1, row + 4, k + 1 < count)
+        b2 = load3(table, 1, row + 8, k + 2 < count)
+        b3 = load3(table, 1, row + 12, k + 3 < count)
+        s, u = add_direction(s, u, b0, w, k < count, UNIT)
+        s, u = add_direction(s, u, b1, w, k + 1 < count, UNIT)
+        s, u = add_direction(s, u, b2, w, k + 2 < count, UNIT)
+        s, u = add_direction(s, u, b3, w, k + 3 < count, UNIT)
+    return tensor, rest, s, u
+
+
+@triton.jit
 def wind_on_groups(F, velocity, position, place, numbers, now, table, OPTIONS: tl.constexpr):
     """``WindForce`` on groups of patches; the reference is ``aero.force.grouped_force``.
 
@@ -124,14 +152,7 @@ def wind_on_groups(F, velocity, position, place, numbers, now, table, OPTIONS: t
     drag, friction, lift, half_density, widest = numbers
     c = cofactor(F)
     w = matvec(transpose(c), relative)
-    t0 = tl.load(table + first, real, 0.0)
-    t1 = tl.load(table + first + 1, real, 0.0)
-    t2 = tl.load(table + first + 2, real, 0.0)
-    t3 = tl.load(table + first + 3, real, 0.0)
-    t4 = tl.load(table + first + 4, real, 0.0)
-    t5 = tl.load(table + first + 5, real, 0.0)
-    tensor = (t0, t1, t2, t1, t3, t4, t2, t4, t5)
-    rest = t0 + t3 + t5
+    tensor, rest, s, u = sums_over_patches(table, first, count, w, OPTIONS[2])
     r0 = matvec(tensor, (c[0], c[1], c[2]))
     r1 = matvec(tensor, (c[3], c[4], c[5]))
     r2 = matvec(tensor, (c[6], c[7], c[8]))
@@ -141,19 +162,6 @@ def wind_on_groups(F, velocity, position, place, numbers, now, table, OPTIONS: t
     growth = tl.sqrt(tl.maximum(grown / tl.maximum(rest, 1.2e-38), 1.2e-38))
     across = matvec(c, matvec(tensor, w))
     across = (across[0] / growth, across[1] / growth, across[2] / growth)
-    zero = rest * 0
-    s = (zero, zero, zero)
-    u = (zero, zero, zero)
-    for k in range(0, tl.max(count), 4):  # four rows at once
-        row = first + 8 + 4 * k
-        b0 = load3(table, 1, row, k < count)
-        b1 = load3(table, 1, row + 4, k + 1 < count)
-        b2 = load3(table, 1, row + 8, k + 2 < count)
-        b3 = load3(table, 1, row + 12, k + 3 < count)
-        s, u = add_direction(s, u, b0, w, k < count, OPTIONS[2])
-        s, u = add_direction(s, u, b1, w, k + 1 < count, OPTIONS[2])
-        s, u = add_direction(s, u, b2, w, k + 2 < count, OPTIONS[2])
-        s, u = add_direction(s, u, b3, w, k + 3 < count, OPTIONS[2])
     facing = matvec(c, s)
     area = growth * rest
     if OPTIONS[2]:
@@ -164,7 +172,7 @@ def wind_on_groups(F, velocity, position, place, numbers, now, table, OPTIONS: t
         air, relative, facing, across, tangent, drag, friction, lift, OPTIONS[0], OPTIONS[1], OPTIONS[2]
     )
     scale = tl.where(real, half_density * tl.minimum(widest / growth, 1.0), 0.0)
-    resistance = zero
+    resistance = scale * 0
     if OPTIONS[3]:
         resistance = scale * area * yielding
     return scale3(scale, force), resistance

@@ -7,7 +7,7 @@ import triton
 import triton.language as tl
 
 from gaussian_swaying.aero import obstacle_flow
-from gaussian_swaying.geometry.linalg_triton import chosen, cross3, dot3
+from gaussian_swaying.geometry.linalg_triton import chosen, cross3, dot3, scale3
 
 PI = tl.constexpr(3.141592653589793)
 STREET_SPEED = tl.constexpr(obstacle_flow.STREET_SPEED)
@@ -25,11 +25,6 @@ def _direction(flow):
     speed = tl.sqrt(dot3(flow, flow))
     scale = 1 / tl.maximum(speed, 1e-12)
     return (flow[0] * scale, flow[1] * scale, flow[2] * scale), speed
-
-
-@triton.jit
-def _scaled(v, factor):
-    return v[0] * factor, v[1] * factor, v[2] * factor
 
 
 @triton.jit
@@ -103,7 +98,7 @@ def past_sphere(v, x, numbers, now, table, OPTIONS: tl.constexpr):
         direction, _speed = _direction(now)
         behind = dot3(p, direction)
         aside = tl.sqrt(tl.maximum(square - behind * behind, 0.0))
-        v = _scaled(v, 1 - round_wake(behind, aside, 2 * radius, numbers[4], numbers[5]))
+        v = scale3(1 - round_wake(behind, aside, 2 * radius, numbers[4], numbers[5]), v)
     return v
 
 
@@ -138,7 +133,7 @@ def past_cylinder(v, x, numbers, now, table, OPTIONS: tl.constexpr):
         left = cross3(axis, direction)
         behind = dot3(p, direction)
         aside = dot3(p, left)
-        v = _scaled(v, 1 - plane_wake(behind, aside, 2 * radius, numbers[7]))
+        v = scale3(1 - plane_wake(behind, aside, 2 * radius, numbers[7]), v)
         if OPTIONS[1]:
             a, b = vortex_street(behind, aside, 2 * radius, now[3], numbers[8])
             swirls = behind * behind + aside * aside >= radius * radius
@@ -235,7 +230,7 @@ def past_ellipsoid(v, x, numbers, now, table, OPTIONS: tl.constexpr):
         above = dot3(p, up) * (mean / tl.maximum(high, 1e-12))
         behind = dot3(p, direction) / mean
         aside = tl.sqrt(left * left + above * above) / mean
-        v = _scaled(v, 1 - round_wake(behind, aside, 1.0, numbers[13], numbers[14]))
+        v = scale3(1 - round_wake(behind, aside, 1.0, numbers[13], numbers[14]), v)
     return v
 
 

@@ -45,12 +45,6 @@ def load9(pointer, stride, index, mask):
 
 
 @triton.jit
-def read3(pointer):
-    """Three numbers in a row, the same for all particles."""
-    return tl.load(pointer), tl.load(pointer + 1), tl.load(pointer + 2)
-
-
-@triton.jit
 def read(pointer, FIRST: tl.constexpr, COUNT: tl.constexpr):
     """COUNT numbers in a row from number FIRST on, as a tuple."""
     found = ()
@@ -66,16 +60,6 @@ def chosen(values, FIRST: tl.constexpr, COUNT: tl.constexpr):
     for k in tl.static_range(COUNT):
         found = found + (values[FIRST + k],)
     return found
-
-
-@triton.jit
-def read9(pointer):
-    """Nine numbers in a row, the same for all particles."""
-    return (
-        tl.load(pointer), tl.load(pointer + 1), tl.load(pointer + 2),
-        tl.load(pointer + 3), tl.load(pointer + 4), tl.load(pointer + 5),
-        tl.load(pointer + 6), tl.load(pointer + 7), tl.load(pointer + 8),
-    )  # fmt: skip
 
 
 @triton.jit

@@ -20,7 +20,7 @@ from gaussian_swaying.aero.force_adjoint_triton import wind_force_adjoint, wind_
 from gaussian_swaying.aero.patches import Patches, PatchSums
 from gaussian_swaying.aero.wind import SineSway, WindField
 from gaussian_swaying.aero.wind_force import WindForce
-from gaussian_swaying.geometry.linalg_triton import load3, load9, read, read3, store3, store9
+from gaussian_swaying.geometry.linalg_triton import load3, load9, read, store3, store9
 from gaussian_swaying.geometry.patches import deform_patch
 from gaussian_swaying.geometry.regions import Box
 from gaussian_swaying.mpm.boundaries.ball import BallObstacle
@@ -103,7 +103,7 @@ def _wind(
     F, v, n = load9(F_in, 1, 9 * k, mask), load3(v_in, 1, 3 * k, mask), load3(patch_in, 1, 4 * k, mask)
     patch = (n[0], n[1], n[2], tl.load(patch_in + 4 * k + 3, mask, 0.0))
     a = load3(a_in, 1, 3 * k, mask)
-    one, two, by_wind, by_numbers = FUNCTION(F, v, patch, read(numbers, 0, 5), read3(wind), table, a, OPTIONS)
+    one, two, by_wind, by_numbers = FUNCTION(F, v, patch, read(numbers, 0, 5), read(wind, 0, 3), table, a, OPTIONS)
     store9(by_F, 1, 9 * k, one, mask)
     store3(by_v, 1, 3 * k, two, mask)
     store3(parts, 1, 6 * k, by_wind, mask)

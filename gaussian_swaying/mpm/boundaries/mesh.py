@@ -12,8 +12,8 @@ from gaussian_swaying.geometry.distance import grid_distance
 from gaussian_swaying.geometry.frame import SimFrame
 from gaussian_swaying.geometry.keyed_path import KeyedPath
 from gaussian_swaying.geometry.meshes import mesh_distance, read_mesh
-from gaussian_swaying.mpm.boundaries.obstacle import Obstacle
-from gaussian_swaying.mpm.twins import Numbers, Twin
+from gaussian_swaying.mpm.boundaries.obstacle import Obstacle, grid_twin
+from gaussian_swaying.mpm.twins import Twin
 
 
 class MeshObstacle(Obstacle):
@@ -77,11 +77,4 @@ class MeshObstacle(Obstacle):
 
     def twin(self) -> Twin:
         """See :class:`~gaussian_swaying.mpm.twins.Twin`."""
-        from gaussian_swaying.geometry.distance_triton import grid_distance
-
-        def numbers() -> Tensor:
-            sizes = self.corner.new_tensor([self.spacing, *self.values.shape])
-            return torch.cat([self.corner, self.axes.reshape(-1), sizes])
-
-        table = Numbers(self.values.numel(), lambda: self.values)
-        return Twin(grid_distance, numbers=Numbers(16, numbers), table=table, sources=(self,))
+        return grid_twin(self, self.values, self.corner, self.axes, self.spacing)

@@ -13,6 +13,7 @@ from gaussian_swaying.geometry.frame import SimFrame
 from gaussian_swaying.geometry.keyed_path import KeyedPath, between, fastest, rotation_of
 from gaussian_swaying.mpm.boundaries.boundary import Boundary, Nodes
 from gaussian_swaying.mpm.boundaries.plane import plane_velocity
+from gaussian_swaying.mpm.twins import Numbers, Twin
 
 
 class Obstacle(Boundary):
@@ -121,3 +122,14 @@ class Obstacle(Boundary):
         distance, normal, own = self.touch(nodes.position, nodes.time, nodes.dt)
         stopped = own + plane_velocity(velocity - own, normal, "separate", self.friction)
         return torch.where(((distance <= 0) & self.active(nodes.time))[..., None], stopped, velocity)
+
+
+def grid_twin(obstacle: Obstacle, values: Tensor, corner: Tensor, axes: Tensor, spacing: float) -> Twin:
+    """The twin of an obstacle whose distances [m] are on a grid, shape (X, Y, Z); its axes are columns."""
+    from gaussian_swaying.geometry.distance_triton import grid_distance
+
+    def numbers() -> Tensor:
+        return torch.cat([corner, axes.to(corner).reshape(-1), corner.new_tensor([spacing, *values.shape])])
+
+    table = Numbers(values.numel(), lambda: values)
+    return Twin(grid_distance, numbers=Numbers(16, numbers), table=table, sources=(obstacle,))

@@ -10,8 +10,8 @@ from torch import Tensor
 from gaussian_swaying._checks import check_positive
 from gaussian_swaying.geometry.distance import DistanceGrid, grid_distance
 from gaussian_swaying.geometry.frame import SimFrame
-from gaussian_swaying.mpm.boundaries.obstacle import Obstacle
-from gaussian_swaying.mpm.twins import Numbers, Twin
+from gaussian_swaying.mpm.boundaries.obstacle import Obstacle, grid_twin
+from gaussian_swaying.mpm.twins import Twin
 
 
 class StillGaussians(Obstacle):
@@ -70,14 +70,6 @@ class StillGaussians(Obstacle):
 
     def twin(self) -> Twin | None:
         """See :class:`~gaussian_swaying.mpm.twins.Twin`."""
-        from gaussian_swaying.geometry.distance_triton import grid_distance
-
         if self.spacing == 0:
             return None
-
-        def numbers() -> Tensor:
-            sizes = self.corner.new_tensor([self.spacing, *self.values.shape])
-            return torch.cat([self.corner, torch.eye(3).to(self.corner).reshape(-1), sizes])
-
-        table = Numbers(self.values.numel(), lambda: self.values)
-        return Twin(grid_distance, numbers=Numbers(16, numbers), table=table, sources=(self,))
+        return grid_twin(self, self.values, self.corner, torch.eye(3), self.spacing)
