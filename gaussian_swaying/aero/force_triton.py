@@ -49,6 +49,15 @@ def wind_terms(
 
 
 @triton.jit
+def _changed_wind(m: tl.constexpr, EFFECTS: tl.constexpr, v, position, now, table):
+    """A wind changed by effect m."""
+    OPTIONS: tl.constexpr = EFFECTS.options[m]
+    numbers = read(table, EFFECTS.numbers[m][0], EFFECTS.numbers[m][1])
+    own = chosen(now, 3 + EFFECTS.per_substep[m][0], EFFECTS.per_substep[m][1])
+    return EFFECTS.functions[m](v, position, numbers, own, table + EFFECTS.tables[m], OPTIONS)
+
+
+@triton.jit
 def shaped_wind(position, now, table, EFFECTS: tl.constexpr):
     """``WindField.shaped``: the wind with its effects, of which ``now`` has the velocity without them first."""
     v = (now[0], now[1], now[2])
@@ -56,9 +65,7 @@ def shaped_wind(position, now, table, EFFECTS: tl.constexpr):
         zero = position[0] * 0
         v = (v[0] + zero, v[1] + zero, v[2] + zero)
     for m in tl.static_range(len(EFFECTS.functions)):
-        numbers = read(table, EFFECTS.numbers[m][0], EFFECTS.numbers[m][1])
-        own = chosen(now, 3 + EFFECTS.per_substep[m][0], EFFECTS.per_substep[m][1])
-        v = EFFECTS.functions[m](v, position, numbers, own, table + EFFECTS.tables[m], EFFECTS.options[m])
+        v = _changed_wind(m, EFFECTS, v, position, now, table)
     return v
 
 
@@ -70,7 +77,8 @@ def wind_force(F, velocity, position, patch, numbers, now, table, OPTIONS: tl.co
     and the numbers of each effect. ``OPTIONS``: place of the law in ``force.LAWS``, lift in the plane of flow and
     normal, unit tangent, semi-implicit drag, effects.
     """
-    air = shaped_wind(position, now, table, OPTIONS[4])
+    EFFECTS: tl.constexpr = OPTIONS[4]
+    air = shaped_wind(position, now, table, EFFECTS)
     normal, area = deform_patch(F, (patch[0], patch[1], patch[2]), patch[3], numbers[4])
     relative = (air[0] - velocity[0], air[1] - velocity[1], air[2] - velocity[2])
     along = dot3(relative, normal)
@@ -144,8 +152,9 @@ def wind_on_groups(F, velocity, position, place, numbers, now, table, OPTIONS: t
     ``place``: first row in the table of ``PatchSums``, which follows that of the effects, and number of vectors there.
     The rest is as in :func:`wind_force`.
     """
-    air = shaped_wind(position, now, table, OPTIONS[4])
-    first = OPTIONS[4].size + 4 * place[0].to(tl.int32)
+    EFFECTS: tl.constexpr = OPTIONS[4]
+    air = shaped_wind(position, now, table, EFFECTS)
+    first = EFFECTS.size + 4 * place[0].to(tl.int32)
     count = place[1].to(tl.int32)
     real = count > 0
     relative = (air[0] - velocity[0], air[1] - velocity[1], air[2] - velocity[2])

@@ -24,7 +24,8 @@ def touch(x, row, pose, numbers, mask, SOLIDS: tl.constexpr, w: tl.constexpr, MO
     if MOVES:
         own = matvec(transpose(read(pose, 3, 9)), x)
     shape = read(numbers, SOLIDS.numbers[w][0], SOLIDS.numbers[w][1])
-    distance, normal = SOLIDS.functions[w](own, shape, numbers + SOLIDS.tables[w], mask, SOLIDS.options[w])
+    OPTIONS: tl.constexpr = SOLIDS.options[w]
+    distance, normal = SOLIDS.functions[w](own, shape, numbers + SOLIDS.tables[w], mask, OPTIONS)
     zero = x[0] * 0
     drive = (zero, zero, zero)
     if MOVES:

@@ -62,14 +62,24 @@ def twin_data(
 
 
 @triton.jit
+def _twin_force(
+    k: tl.constexpr, FORCES: tl.constexpr, F, velocity, position, index, mask, scene, values, count, vectors, scenes,
+    step, numbers
+):  # fmt: skip
+    """Force k on some particles [N] and its resistance [kg/s]."""
+    OPTIONS: tl.constexpr = FORCES.options[k]  # Triton 3.6 passes a tuple of numbers only as a named constant
+    point, own, now = twin_data(k, FORCES, index, mask, scene, values, count, vectors, scenes, step, numbers)
+    return FORCES.functions[k](F, velocity, position, point, own, now, numbers + FORCES.tables[k], OPTIONS)
+
+
+@triton.jit
 def twin_forces(
     FORCES: tl.constexpr, F, velocity, position, index, mask, scene, values, count, vectors, scenes, step, numbers
 ):  # fmt: skip
     """Sum of the forces with twins on some particles [N] and of their resistances [kg/s]; FORCES: ``Composed``."""
     for k in tl.static_range(len(FORCES.functions)):
-        point, own, now = twin_data(k, FORCES, index, mask, scene, values, count, vectors, scenes, step, numbers)
-        more, drag = FORCES.functions[k](
-            F, velocity, position, point, own, now, numbers + FORCES.tables[k], FORCES.options[k]
+        more, drag = _twin_force(
+            k, FORCES, F, velocity, position, index, mask, scene, values, count, vectors, scenes, step, numbers
         )
         if k == 0:
             force = more
