@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -13,6 +12,7 @@ from torch import Tensor
 from gaussian_swaying._checks import check_shape
 from gaussian_swaying._inputs import check_regular
 from gaussian_swaying._ply_table import read_header
+from gaussian_swaying.geometry.meshes import fans, parse_obj, ply_polygons
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -101,15 +101,13 @@ def read_ply_points(path: Path) -> tuple[PointCloud, Tensor | None]:
         colors = np.stack([np.asarray(table[name], dtype=np.float32) for name in ("red", "green", "blue")], -1)
         colors /= 255 if table["red"].dtype.kind in "ui" else 1
     _check_points(path, points, colors)
-    triangles: list[list[int]] = []
-    if "face" in ply and ply["face"].count:
-        element = ply["face"]
-        lists = [item.name for item in element.properties if item.name in ("vertex_indices", "vertex_index")]
-        if not lists:
-            raise ValueError(f"{path} has faces without `vertex_indices`: export the mesh again.")
-        triangles = _triangles(element.data[lists[0]])
-    faces = torch.tensor(triangles, dtype=torch.int64) if triangles else None
-    return PointCloud(torch.from_numpy(points), torch.from_numpy(np.ascontiguousarray(colors))), faces
+    try:
+        faces = fans(ply_polygons(ply))
+    except ValueError as error:
+        raise ValueError(f"{path} cannot be read ({error}): export the mesh again.") from error
+    return PointCloud(torch.from_numpy(points), torch.from_numpy(np.ascontiguousarray(colors))), faces if len(
+        faces
+    ) else None
 
 
 def read_obj_mesh(path: Path) -> tuple[PointCloud, Tensor]:
@@ -124,38 +122,20 @@ def read_obj_mesh(path: Path) -> tuple[PointCloud, Tensor]:
     Raises:
         ValueError: If the file cannot be read or has no usable mesh.
     """
-    vertices: list[list[float]] = []
-    colors: list[list[float]] = []
-    polygons: list[list[int]] = []
     try:
-        for line in check_regular(path, "the mesh").read_text(encoding="utf-8", errors="replace").splitlines():
-            words = line.split()
-            if words[:1] == ["v"]:
-                numbers = [float(word) for word in words[1:]]
-                vertices.append(numbers[:3])
-                colors.append(numbers[3:6] if len(numbers) >= 6 else [0.5, 0.5, 0.5])
-            elif words[:1] == ["f"]:
-                corners = [int(word.split("/")[0]) for word in words[1:]]
-                polygons.append([item - 1 if item > 0 else len(vertices) + item for item in corners])
-        points = np.array(vertices, dtype=np.float32).reshape(len(vertices), 3)
+        text = check_regular(path, "the mesh").read_text(encoding="utf-8", errors="replace")
+        vertices, polygons = parse_obj(text)
+        points = np.array([row[:3] for row in vertices], dtype=np.float32).reshape(-1, 3)
     except OSError as error:
         raise ValueError(f"Cannot read the mesh {path} ({error.strerror}): check the path.") from error
     except ValueError as error:
         raise ValueError(f"{path} is not a Wavefront .obj ({error}): export the mesh again.") from error
+    colors = [row[3:6] if len(row) >= 6 else [0.5, 0.5, 0.5] for row in vertices]
     _check_points(path, points, np.array(colors, dtype=np.float32))
-    faces = torch.tensor(_triangles(polygons), dtype=torch.int64).reshape(-1, 3)
+    faces = fans(polygons)
     if len(faces) == 0 or int(faces.min()) < 0 or int(faces.max()) >= len(points):
         raise ValueError(f"{path} has no faces, or faces of vertices that do not exist: export the mesh again.")
     return PointCloud(torch.from_numpy(points), torch.tensor(colors)), faces
-
-
-def _triangles(polygons: object) -> list[list[int]]:
-    """Fans of triangles."""
-    result: list[list[int]] = []
-    for polygon in polygons:  # type: ignore[attr-defined]
-        first, *rest = (int(item) for item in polygon)
-        result += [[first, b, c] for b, c in itertools.pairwise(rest)]
-    return result
 
 
 def _check_points(path: Path, points: np.ndarray, colors: np.ndarray) -> None:

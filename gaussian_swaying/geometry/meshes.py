@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -52,7 +54,7 @@ def read_mesh(path: str | os.PathLike[str]) -> tuple[Tensor, Tensor]:
         read_header(file)  # its sentences name the file
     try:
         vertices, polygons = readers[file.suffix.lower()](file)
-        triangles = torch.tensor([(p[0], p[k], p[k + 1]) for p in polygons for k in range(1, len(p) - 1)]).long()
+        triangles = fans(polygons)
     except Exception as error:  # plyfile and numbers that are too large raise many kinds of errors
         told = str(error).strip() or type(error).__name__
         raise ValueError(
@@ -86,31 +88,50 @@ def _read_ply(file: Path) -> tuple[Tensor, list[list[int]]]:
     if "vertex" not in data:
         raise ValueError("it has no element `vertex`")
     vertex = data["vertex"]
-    vertices = torch.stack([torch.tensor(vertex[axis].astype("float64")) for axis in "xyz"], dim=-1)
-    if "face" not in data:
-        return vertices, []
+    return torch.stack([torch.tensor(vertex[axis].astype("float64")) for axis in "xyz"], dim=-1), ply_polygons(data)
+
+
+def ply_polygons(data: Any) -> list[list[int]]:
+    """The faces of a .ply that plyfile has read, as indices of vertices; ValueError if they have none."""
+    if "face" not in data or not data["face"].count:
+        return []
     face = data["face"]
     name = next((p.name for p in face.properties if p.name in ("vertex_indices", "vertex_index")), None)
     if name is None:
         raise ValueError("its faces have no `vertex_indices`")
-    return vertices, [[int(k) for k in polygon] for polygon in face[name]]
+    return [[int(k) for k in polygon] for polygon in face[name]]
 
 
 def _read_obj(file: Path) -> tuple[Tensor, list[list[int]]]:
+    vertices, polygons = parse_obj(file.read_text())
+    return torch.tensor([row[:3] for row in vertices], dtype=torch.float64).reshape(-1, 3), polygons
+
+
+def parse_obj(text: str) -> tuple[list[list[float]], list[list[int]]]:
+    """The numbers of each vertex of a Wavefront .obj, with its colour if it has one, and polygons as their indices.
+
+    Raises:
+        ValueError: If a line is damaged; the message gives its number.
+    """
     vertices: list[list[float]] = []
     polygons: list[list[int]] = []
-    for number, line in enumerate(file.read_text().splitlines(), start=1):
+    for number, line in enumerate(text.splitlines(), start=1):
         words = line.split()
         if words[:1] == ["v"]:
             if len(words) < 4:
                 raise ValueError(f"line {number} has a vertex of fewer than three numbers")
-            vertices.append([float(word) for word in words[1:4]])
+            vertices.append([float(word) for word in words[1:]])
         elif words[:1] == ["f"]:
             numbers = [int(word.split("/")[0]) for word in words[1:]]
             if 0 in numbers:
                 raise ValueError(f"line {number} has a face with the vertex 0, but they count from 1")
             polygons.append([k - 1 if k > 0 else len(vertices) + k for k in numbers])
-    return torch.tensor(vertices, dtype=torch.float64).reshape(-1, 3), polygons
+    return vertices, polygons
+
+
+def fans(polygons: Sequence[Sequence[int]]) -> Tensor:
+    """The triangles (T, 3) into which polygons are cut from their first vertex."""
+    return torch.tensor([(p[0], p[k], p[k + 1]) for p in polygons for k in range(1, len(p) - 1)]).long().reshape(-1, 3)
 
 
 def mesh_distance(vertices: Tensor, faces: Tensor, cells: int = 48) -> DistanceGrid:
