@@ -94,6 +94,12 @@ def check_positive(name: str, value: float, *, allow_zero: bool = False) -> None
         raise ValueError(f"Expected `{name}` to {wanted} and finite, but got {value}.")
 
 
+def check_whole(name: str, value: Any, least: int) -> None:
+    """Raise ValueError unless ``value`` is a whole number of at least ``least``."""
+    if isinstance(value, bool) or not isinstance(value, int) or value < least:
+        raise ValueError(f"Expected `{name}` to be a whole number of at least {least}, but got {value!r}.")
+
+
 def check_frames(name: str, count: Any) -> int:
     """Return a number of frames, or raise an error that names the field."""
     if isinstance(count, bool) or not isinstance(count, int) or not 1 <= count <= MOST_FRAMES:

@@ -12,7 +12,7 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from gaussian_swaying._checks import check_choice, check_positive
+from gaussian_swaying._checks import check_choice, check_positive, check_whole
 from gaussian_swaying.captures.colmap import colmap_model, read_colmap
 from gaussian_swaying.captures.images import PosedImage, check_image_size, image_size, load_image
 from gaussian_swaying.captures.lens import Lens
@@ -117,8 +117,8 @@ def read_capture(
     """
     root = Path(path)
     check_choice("format", format, FORMATS)
-    _check_count("downscale", downscale, 1)
-    _check_count("test_every", test_every, 0)
+    check_whole("downscale", downscale, 1)
+    check_whole("test_every", test_every, 0)
     if not root.exists():
         raise FileNotFoundError(f"{root} does not exist; check the path of the capture.")
     model = colmap_model(root) if format != "transforms" and root.is_dir() else None
@@ -207,11 +207,6 @@ def view_reach(cameras: Sequence[Camera], focus: Tensor) -> float:
         upward = 0.5 * camera.height / float(camera.intrinsics[1, 1])
         reach.append(distance * max(across, upward))
     return sorted(reach)[len(reach) // 2]
-
-
-def _check_count(name: str, value: int, least: int) -> None:
-    if isinstance(value, bool) or not isinstance(value, int) or value < least:
-        raise ValueError(f"Expected `{name}` to be a whole number of at least {least}, but got {value!r}.")
 
 
 def _splits(root: Path, posed: list[PosedImage], test_every: int) -> list[str]:

@@ -15,7 +15,7 @@ import torch.nn.functional as functional
 from einops import rearrange
 from torch import Tensor
 
-from gaussian_swaying._checks import check_positive
+from gaussian_swaying._checks import check_positive, check_whole
 from gaussian_swaying.rendering.cameras.camera import Camera, look_at_camera
 
 _STEPS = 24  # samples along a ray, to find the interval of the first crossing
@@ -96,8 +96,7 @@ class GeneratedCapture:
         seed: int = 0,
     ) -> None:
         for name, count in (("views", views), ("size", size), ("samples", samples)):
-            if isinstance(count, bool) or not isinstance(count, int) or count < 1:
-                raise ValueError(f"Expected `{name}` to be a positive whole number, but got {count!r}.")
+            check_whole(name, count, 1)
         for name, value in (("width", width), ("height", height), ("waves", waves), ("distance", distance)):
             check_positive(name, value)
         check_positive("ripple", ripple, allow_zero=True)

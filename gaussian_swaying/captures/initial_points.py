@@ -10,7 +10,7 @@ import torch
 from einops import rearrange
 from torch import Tensor
 
-from gaussian_swaying._checks import check_positive, check_vector
+from gaussian_swaying._checks import check_positive, check_vector, check_whole
 from gaussian_swaying.captures.capture import Capture, common_focus, view_reach
 from gaussian_swaying.captures.point_cloud import PointCloud, read_obj_mesh, read_ply_points, sample_mesh
 
@@ -47,8 +47,7 @@ def initial_points(
     Raises:
         ValueError: If the source does not exist or is not usable, or the cameras look at no common point.
     """
-    if isinstance(count, bool) or not isinstance(count, int) or count < 1:
-        raise ValueError(f"Expected `count` to be a positive whole number, but got {count!r}.")
+    check_whole("count", count, 1)
     if source == "capture" or (source == "auto" and capture.points is not None):
         if capture.points is None or capture.colors is None:
             raise ValueError(

@@ -8,6 +8,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from gaussian_swaying._checks import check_whole
 from gaussian_swaying._yaml_limits import check_config_files, read_fields
 from gaussian_swaying.config.parser import check_settings, import_forces, option
 from gaussian_swaying.fitting.unknowns import Unknown, default_scale
@@ -80,9 +81,7 @@ class Plan:
         if not 0 < self.fit_share <= 1:
             raise ValueError(f"Expected `fit_share` above 0 and at most 1, but got {self.fit_share}.")
         for name, least in (("search", 0), ("iterations", 1), ("tracks", 4), ("seed", 0)):
-            value = getattr(self, name)
-            if isinstance(value, bool) or not isinstance(value, int) or value < least:
-                raise ValueError(f"Expected `{name}` to be a whole number of at least {least}, but got {value!r}.")
+            check_whole(name, getattr(self, name), least)
         if not self.limit > 1:
             raise ValueError(f"Expected `limit` above 1, but got {self.limit}.")
 

@@ -27,10 +27,9 @@ from gaussian_swaying.recording.checkpoint import read_checkpoint, write_checkpo
 from gaussian_swaying.recording.layout import FILES, OURS, frame_folder, raw_folder, video_file
 from gaussian_swaying.recording.nodes import NODES, split_far
 from gaussian_swaying.recording.resume import (
+    check_arrays,
     check_frames,
-    check_nodes,
     check_pictures,
-    check_positions,
     check_shards,
 )
 from gaussian_swaying.recording.trajectory import pack_trajectory
@@ -264,9 +263,9 @@ class Recorder:
             told += check_pictures(path, place, frames, film)
         if self.trajectory:
             tracked = checkpoint.get("tracked")
-            told += check_positions(path, frames, tracked if isinstance(tracked, int) else None)
+            told += check_arrays(path, "trajectory", frames, tracked if isinstance(tracked, int) else None)
         if self.nodes and isinstance(checkpoint.get("nodes"), int):
-            told += check_nodes(path, frames, checkpoint["nodes"])
+            told += check_arrays(path, "nodes", frames, checkpoint["nodes"])
         if self.ply_every and self.export_format == "usd":
             told += check_shards(path, range(0, frames, self.ply_every))
         elif self.ply_every:

@@ -10,7 +10,7 @@ from pathlib import Path
 from gaussian_swaying._files import check_not_taken, kind_of
 from gaussian_swaying.gaussians.export import read_usd_frame
 from gaussian_swaying.recording.nodes import NODES
-from gaussian_swaying.recording.trajectory import check_trajectory
+from gaussian_swaying.recording.trajectory import TRAJECTORY, check_trajectory
 
 
 def check_pictures(folder: Path, place: str, frames: int, video: str | None = None) -> list[str]:
@@ -56,18 +56,12 @@ def check_frames(folder: Path, place: str, suffix: str, wanted: Iterable[int]) -
     return tell_missing([file for file in files if kind_of(file) is None])
 
 
-def check_positions(folder: Path, frames: int, particles: int | None) -> list[str]:
-    """Check the trajectory of the frames so far; ValueError if a file is damaged."""
-    held = check_trajectory(folder / "trajectory", folder / "trajectory.npz", frames, particles)
-    lost = sorted(set(range(frames)) - held)
-    return tell_missing([folder / "trajectory" / f"{index:05d}.npz" for index in lost], "trajectory.npz")
-
-
-def check_nodes(folder: Path, frames: int, nodes: int) -> list[str]:
-    """Check the displacements of the nodes of the frames so far; ValueError if a file is damaged."""
-    held = check_trajectory(folder / "nodes", folder / "nodes.npz", frames, nodes, NODES)
-    lost = sorted(set(range(frames)) - held)
-    return tell_missing([folder / "nodes" / f"{index:05d}.npz" for index in lost], "nodes.npz")
+def check_arrays(folder: Path, name: str, frames: int, rows: int | None) -> list[str]:
+    """Check the ``trajectory`` or the ``nodes`` of the frames so far; ValueError if a file is damaged."""
+    arrays = {"trajectory": TRAJECTORY, "nodes": NODES}[name]
+    complete = check_trajectory(folder / name, folder / f"{name}.npz", frames, rows, arrays)
+    lost = sorted(set(range(frames)) - complete)
+    return tell_missing([folder / name / f"{index:05d}.npz" for index in lost], f"{name}.npz")
 
 
 def check_shards(folder: Path, wanted: Iterable[int]) -> list[str]:
