@@ -264,6 +264,12 @@ class SceneEditor:
         if self._loaded is not None:
             self._loaded = (points, *self._loaded[1:])
 
+    @property
+    def unedited(self) -> tuple[MaterialPoints, Tensor, Tensor]:
+        """Material and colours (harmonics of degree 0, and of the others) without the edits."""
+        model = self.scene.model
+        return self._loaded or (self.scene.points, model.sh0.detach(), model.shN.detach())
+
     def reset(self) -> None:
         """Restore the scene as it was before its first edit."""
         self.applied = 0
@@ -294,7 +300,7 @@ class SceneEditor:
         particles, gaussians = self.reach(edit)
         model = self.scene.model
         if self._loaded is None:
-            self._loaded = (self.scene.points, model.sh0.detach(), model.shN.detach())
+            self._loaded = self.unedited
         with torch.inference_mode(False), torch.no_grad():
             if edit.of_material:
                 self.scene.points = edited_points(self.scene.points, particles, edit, flowed)

@@ -343,7 +343,7 @@ def flow_of(base: Sequence[float], values: Mapping[str, float]) -> list[float]:
 # ---- how they are set
 
 
-def _changed(module: M, **values: Any) -> M:
+def other_with(module: M, **values: Any) -> M:
     """A copy of a module with other attributes or buffers; its other parts are shared."""
     other = copy.copy(module)
     for part in ("_parameters", "_buffers", "_modules"):
@@ -354,7 +354,8 @@ def _changed(module: M, **values: Any) -> M:
             given = value.to(old) if isinstance(value, Tensor) else torch.full_like(old, value)
             other._buffers[name] = given.reshape(old.shape)
         elif name in other._parameters:
-            other._parameters[name] = nn.Parameter(torch.full_like(old, number_of(value)), old.requires_grad)
+            given = value.detach().to(old) if isinstance(value, Tensor) else torch.full_like(old, value)
+            other._parameters[name] = nn.Parameter(given.reshape(old.shape), old.requires_grad)
         else:
             setattr(other, name, value)
     return other
@@ -386,7 +387,7 @@ def _write_wind(setup: Setup, values: Mapping[str, Any]) -> Setup:
     if "wind.flow" in values:
         wind = wind.with_flow(values["wind.flow"])
     if "wind.seed" in values:
-        wind = _changed(wind, seed=values["wind.seed"])
+        wind = other_with(wind, seed=values["wind.seed"])
     return replace(setup, wind=wind)
 
 
@@ -396,12 +397,12 @@ def _write_modulation(setup: Setup, values: Mapping[str, Any]) -> Setup:
     for name, value in values.items():
         _of_modulation(name)(setup)  # it is there
         _, _, place, field = name.split(".")
-        parts[int(place)] = _changed(parts[int(place)], **{field: value})
+        parts[int(place)] = other_with(parts[int(place)], **{field: value})
     return replace(setup, wind=_with_parts(wind, modulations=nn.ModuleList(parts)))
 
 
 def _with_parts(module: M, **parts: nn.Module) -> M:
-    other = _changed(module)
+    other = other_with(module)
     other._modules.update(parts)
     return other
 
@@ -472,7 +473,7 @@ def _thickness(setup: Setup) -> float:
 
 
 def _write_aero(setup: Setup, values: Mapping[str, Any]) -> Setup:
-    return replace(setup, aero=_changed(setup.aero, **{name[5:]: value for name, value in values.items()}))
+    return replace(setup, aero=other_with(setup.aero, **{name[5:]: value for name, value in values.items()}))
 
 
 def _of_solver(setup: Setup, name: str) -> Any:
@@ -500,7 +501,7 @@ def _of_force(kind: str, attribute: str) -> tuple[Read, Write]:
     def write(setup: Setup, values: Mapping[str, Any]) -> Setup:
         read(setup)
         (value,) = values.values()
-        forces = tuple(_changed(f, **{attribute: value}) if type(f).__name__ == kind else f for f in setup.forces)
+        forces = tuple(other_with(f, **{attribute: value}) if type(f).__name__ == kind else f for f in setup.forces)
         return replace(setup, forces=forces)
 
     return read, write
@@ -581,6 +582,7 @@ __all__ = [
     "in_settings",
     "names",
     "of_settings",
+    "other_with",
     "parameter",
     "present",
     "register",

@@ -53,7 +53,7 @@ from gaussian_swaying.simulation.frame import Frame, frames_from
 from gaussian_swaying.simulation.material import Material
 from gaussian_swaying.simulation.normalisation import Normalisation
 from gaussian_swaying.simulation.painter import Painter
-from gaussian_swaying.simulation.parameters import Setup, with_values
+from gaussian_swaying.simulation.parameters import Setup, other_with, with_values
 from gaussian_swaying.simulation.run import Run
 from gaussian_swaying.simulation.simulated_scene import SimulatedScene
 from gaussian_swaying.simulation.stepper import Stepper
@@ -352,9 +352,13 @@ class Simulation:
         Raises:
             ValueError: As :meth:`change`.
         """
-        other, setup = copy.copy(self), with_values(self.setup, values)
+        points, sh0, shN = self._editor.unedited
+        other, setup = copy.copy(self), with_values(replace(self.setup, points=points), values)
         solver = self.solver.like(setup.solver)
-        other._stepper = Stepper(solver, replace(setup, wind=setup.wind.to(self.device)), self.frame_dt, turn=self.turn)
+        scene = other_with(self.scene, points=setup.points, model=other_with(self.scene.model, sh0=sh0, shN=shN))
+        other._painter = other_with(self._painter, scene=scene)
+        setup = replace(setup, scene=scene, wind=setup.wind.to(self.device))
+        other._stepper = Stepper(solver, setup, self.frame_dt, turn=self.turn)
         other._editor = SceneEditor(other._stepper, self._editor.edits)
         other._recorder, other.files, other._given = recorder or Recorder(), [], dict(self._given)
         other.config = config

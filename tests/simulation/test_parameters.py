@@ -15,8 +15,12 @@ from gaussian_swaying.fitting.plan import read_plan
 from gaussian_swaying.fitting.report import scene_text
 from gaussian_swaying.fitting.unknowns import Unknown, check_unknowns
 from gaussian_swaying.fitting.variants import states_of
+from gaussian_swaying.geometry.regions import Box
 from gaussian_swaying.mpm.forces import Force
+from gaussian_swaying.scenes.procedural import FlagScene
 from gaussian_swaying.simulation import parameters
+from gaussian_swaying.simulation.edits import Edit
+from gaussian_swaying.simulation.material import Material
 from gaussian_swaying.simulation.parameters import (
     find,
     in_settings,
@@ -292,3 +296,27 @@ def test_the_documentation_lists_them():
         found = kinds.get(known.kind, known.range_in_words)
         marks = " | ".join("yes" if mark else "" for mark in (known.batched, known.differentiable))
         assert f"| `{name}` | {known.unit} | {found} | {marks} |" in told
+
+
+def test_a_variant_is_a_simulation_of_its_own(tmp_path):
+    """As one that is made with these numbers, also after the first was started again, and with the same edits."""
+    edits = [Edit(region=Box([0.5, None, None], [None, None, None]), color=[1.0, 0.0, 0.0], detail=0.5)]
+
+    def made(**material):
+        return Simulation(
+            FlagScene(spacing=0.1), Material(**material), wind=[4, 0, 0], edits=edits, device="cpu",
+            hold=Box([None, None, None], [0.11, None, None]),
+        )  # fmt: skip
+
+    first, expected = made(E=1e4, density=50.0), made(E=3e4, density=80.0)
+    first.start()
+    other = first.variant({"material.E": 3e4, "material.density": 80.0}, config="frames: 3\n")
+    *_, end = other.frames(3)
+    *_, base = first.frames(3)
+    *_, wanted = expected.frames(3)
+    assert torch.equal(end.state.position, wanted.state.position)
+    assert not torch.equal(base.state.position, wanted.state.position)
+    assert torch.equal(other.scene.model.sh0, expected.scene.model.sh0)
+    assert torch.equal(first.scene.model.sh0, expected.scene.model.sh0)
+    assert other.painter.scene is other.scene is not first.scene
+    assert other.config == "frames: 3\n"
