@@ -14,16 +14,21 @@ from argparse import SUPPRESS, Action, ArgumentError, _ArgumentGroup
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from types import UnionType
-from typing import TYPE_CHECKING, Any, get_args, get_type_hints
+from typing import TYPE_CHECKING, Any, Optional, get_args, get_type_hints
 
 from torch import Tensor, nn
 
 from gaussian_swaying import _program as program
 from gaussian_swaying._checks import check_frames
 from gaussian_swaying._yaml_limits import check_config_files, limit_yaml
+from gaussian_swaying.aero.carried import Turbulence
 from gaussian_swaying.aero.obstacles import CylinderObstacle, EllipsoidObstacle, SphereObstacle
+from gaussian_swaying.aero.recorded import FrozenWind
+from gaussian_swaying.aero.shelter import Shelter
+from gaussian_swaying.aero.wind import SpatialWind
 from gaussian_swaying.captures.capture_camera import CaptureCamera
 from gaussian_swaying.interop.physgaussian.convert import convert, read_config, to_yaml
+from gaussian_swaying.mpm.protocol import Solver
 from gaussian_swaying.rendering.cameras.keyframes import KeyframedCamera
 
 if TYPE_CHECKING:
@@ -31,13 +36,15 @@ if TYPE_CHECKING:
 
 # imported so that a configuration can use their class names without the module
 CAMERA_PATHS = (CaptureCamera, KeyframedCamera)
-OBSTACLES = (CylinderObstacle, EllipsoidObstacle, SphereObstacle)
+EFFECTS = (CylinderObstacle, EllipsoidObstacle, FrozenWind, Shelter, SphereObstacle, Turbulence)
 # options that a configuration file cannot contain; settings that may change when a run is resumed
 COMMAND_LINE_ONLY = ("preset", "physgaussian")
 RUN_ONLY = ("config", "output", "device", "frames", "resume")
 # constructor arguments that a YAML file sets within a component instead; components that may be null
 PYTHON_ONLY = ("up", "hold", "renderer")
 NULLABLE = ("contact", "normalisation")
+# components of one's own, by class path, and the arguments that they replace
+CUSTOM: dict[str, tuple[type, str]] = {"custom_wind": (SpatialWind, "wind"), "custom_solver": (Solver, "solver")}
 # arguments that may change between a run and the one that resumes it
 NOT_COMPARED = ("device", "recorder", "renderer")
 
@@ -124,7 +131,32 @@ def build_parser(schema: type) -> ArgumentParser:
     for name, component in groups.items():
         parser.add_class_arguments(component, name)
     parser.add_class_arguments(schema, skip={*groups, *PYTHON_ONLY})
+    for name, (kind, replaced) in CUSTOM.items():
+        text = f"A {kind.__name__} of your own by its class path, in place of `{replaced}`; null for none."
+        parser.add_argument(f"--{name}", type=Optional[kind], default=None, help=text)  # noqa: UP045
     return parser
+
+
+def with_custom(parser: ArgumentParser, settings: Namespace, parts: Mapping[str, Any]) -> dict[str, Any]:
+    """Instantiated parts with components of one's own in the places of those that they replace.
+
+    Args:
+        parser: From :func:`build_parser`.
+        settings: The settings that it parsed.
+        parts: What it made of them.
+
+    Raises:
+        ValueError: If both are given.
+    """
+    found = dict(parts)
+    for name, (_, replaced) in CUSTOM.items():
+        own = found.pop(name, None)
+        if own is None:
+            continue
+        if settings[replaced] != parser.get_defaults()[replaced]:
+            raise ValueError(f"`{name}` replaces `{replaced}`: leave out one of them.")
+        found[replaced] = own
+    return found
 
 
 def arguments_of(schema: type) -> list[str]:
@@ -221,7 +253,7 @@ def check_settings(schema: type, settings: Namespace) -> None:
 def config_text(parser: ArgumentParser, settings: Namespace) -> str:
     """The settings that determine the result, as YAML."""
     kept = settings.clone()
-    for name in RUN_ONLY:
+    for name in (*RUN_ONLY, *(name for name in CUSTOM if kept.get(name) is None)):
         kept.pop(name, None)
     return str(parser.dump(kept, skip_validation=True))
 

@@ -23,6 +23,7 @@ from gaussian_swaying.config.parser import (
     config_text,
     parse_file,
     python_text,
+    with_custom,
 )
 from gaussian_swaying.geometry.regions import Region
 from gaussian_swaying.mpm.boundaries.obstacle import Obstacle
@@ -414,7 +415,8 @@ class Simulation:
             changes: As in :meth:`from_yaml`.
         """
         check_settings(cls, settings)
-        text, parts = config_text(parser, settings), parser.instantiate(settings)
+        text = config_text(parser, settings)
+        parts: Any = with_custom(parser, settings, parser.instantiate(settings))
         simulation = cls(**{name: parts.get(name) for name in arguments_of(cls)} | changes)
         simulation.config = text
         simulation._changed |= set(changes) - set(NOT_COMPARED)

@@ -13,6 +13,7 @@ import yaml
 
 from gaussian_swaying import Box, PinnedRegion, Simulation
 from gaussian_swaying.cli.evaluate import main as evaluate
+from gaussian_swaying.cli.main import main
 from gaussian_swaying.geometry.regions import Sphere
 from gaussian_swaying.mpm.followers import PointFollowers
 from gaussian_swaying.recording.trajectory import load_trajectory
@@ -20,6 +21,7 @@ from gaussian_swaying.simulation.batch import batch_of
 from gaussian_swaying.simulation.edits import Edit
 from gaussian_swaying.viewer.session import Session
 
+BOX = {"min": [None, None, None], "max": [0.11, None, None]}
 FILE = Path(__file__).parents[2] / "examples" / "mass_spring_cloth.py"
 
 
@@ -100,6 +102,53 @@ def test_a_batch_moves_as_each_alone(simulation):
     for k, (member, end) in enumerate(ends):
         torch.testing.assert_close(state.scene(k).position, end.position, atol=1e-6, rtol=0)
         assert frame.each[k].kinetic == pytest.approx(float(member.solver.energies(end)["kinetic"]), rel=1e-4)
+
+
+JET = """
+import torch
+from gaussian_swaying import SpatialWind
+
+
+class Jet(SpatialWind):
+    def __init__(self, speed: float = 3.0) -> None:
+        super().__init__()
+        self.speed = speed
+
+    def forward(self, time, position):
+        zero = torch.zeros_like(position[..., 2])
+        return torch.stack([zero, self.speed * torch.exp(-(position[..., 2] ** 2)), zero], dim=-1)
+"""
+
+
+def test_a_yaml_names_a_solver_and_a_wind(tmp_path, monkeypatch, capsys):
+    """With its class path; the configuration of the run has both, and either excludes the usual group."""
+    (tmp_path / "my_jet.py").write_text(JET)
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.syspath_prepend(FILE.parent)
+    pins = [{"class_path": "PinnedRegion", "init_args": {"region": {"class_path": "Box", "init_args": BOX}}}]
+    config = {
+        "scene": {"generator": {"class_path": "FlagScene", "init_args": {"spacing": 0.1}}},
+        "custom_wind": {"class_path": "my_jet.Jet", "init_args": {"speed": 5.0}},
+        "custom_solver": {
+            "class_path": "mass_spring_cloth.MassSpringCloth",
+            "init_args": {"dx": 0.2, "gravity": [0.0, 0.0, 0.0], "boundaries": pins},
+        },
+        "recorder": {"images": False, "video": False},
+    }
+    file, folder = tmp_path / "scene.yaml", tmp_path / "run"
+    file.write_text(yaml.safe_dump(config))
+    options = ["sim", "--config", str(file), "--frames", "3", "--device", "cpu"]
+    assert main([*options, "--output", str(folder)]) == 0
+    summary = json.loads((folder / "summary.json").read_text())
+    assert (summary["formulation"], summary["frames"]) == ("mass_spring", 3)
+    assert summary["wind_work_J"] > 0
+    kept = yaml.safe_load((folder / "config.yaml").read_text())
+    assert kept["custom_wind"]["init_args"] == {"speed": 5.0}
+    assert kept["custom_solver"]["init_args"]["dx"] == 0.2
+    capsys.readouterr()
+    assert main([*options, "--output", str(tmp_path / "other"), "--wind.flow", "[1, 0, 0]"]) == 2
+    assert "`custom_wind` replaces `wind`: leave out one of them." in capsys.readouterr().err
+    assert not (tmp_path / "other").exists()
 
 
 def test_the_live_page_moves_it(simulation, tmp_path):
