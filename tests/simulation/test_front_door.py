@@ -35,7 +35,7 @@ from gaussian_swaying import (
     load_trajectory,
     write_ply,
 )
-from gaussian_swaying.config.parser import PYTHON_ONLY, arguments_of
+from gaussian_swaying.config.parser import CUSTOM, PYTHON_ONLY, arguments_of
 from gaussian_swaying.mpm.laws.sand import Sand
 from gaussian_swaying.scenes import FlagScene
 from gaussian_swaying.simulation.normalisation import Normalisation
@@ -229,7 +229,7 @@ def test_the_constructor_is_the_schema():
     parser = Simulation.parser()
     options = {name.split(".")[0] for name in parser.get_defaults().keys(branches=True)}
     names = set(arguments_of(Simulation))
-    assert options - names == {"config", "output", "frames", "resume"}
+    assert options - names == {"config", "output", "frames", "resume", *CUSTOM}
     assert names - options == set()
     assert set(inspect.signature(Simulation).parameters) - names == set(PYTHON_ONLY)
 
