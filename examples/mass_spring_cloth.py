@@ -148,7 +148,11 @@ class MassSpringCloth(Solver):
 def flag(solver: Solver) -> Simulation:
     """A flag that is held along one side."""
     return Simulation(
-        FlagScene(spacing=0.05), Material(E=3e4, density=30.0, thickness=0.01), solver, [1.0, 2.5, 0.0], AeroForce()
+        FlagScene(spacing=0.05),
+        Material(E=3e4, density=30.0, thickness=0.01),
+        solver=solver,
+        wind=[1.0, 2.5, 0.0],
+        aero=AeroForce(),
     )
 
 

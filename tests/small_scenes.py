@@ -88,9 +88,9 @@ def make_simulation():
         return Simulation(
             Scene(generator=source, **{"points": "gaussian", **(scene or {})}),
             material or Material(E=3e3, density=30.0),
-            MPMSolver(**solver),
-            wind or WindField([6.0, 1.5, 0.0]),
-            aero,
+            solver=MPMSolver(**solver),
+            wind=wind or WindField([6.0, 1.5, 0.0]),
+            aero=aero,
             shader=shader,
             camera=camera or OrbitCamera(width=32, height=18, azimuth=-70.0, radius=1.9),
             background=background,

@@ -284,6 +284,7 @@ class AeroForce(nn.Module):
         self,
         C_D: Number = 0.5,
         C_F: Number = 0.4,
+        *,
         C_L: Number = 0.01,
         air_density: float = 1.225,
         law: str = "paper",

@@ -251,6 +251,7 @@ class WindField(nn.Module):
         self,
         flow: VectorLike = (0.0, 0.0, 0.0),
         schedule: list[FlowKey] | str | None = None,
+        *,
         interpolation: str = "step",
         modulations: Sequence[Modulation] = (),
         seed: int = 0,

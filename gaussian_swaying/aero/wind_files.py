@@ -93,7 +93,7 @@ def read_bts(path: str | os.PathLike[str]) -> TurbSimWind:
 
 
 def read_grid(path: str | os.PathLike[str]) -> GridWind:
-    """Read a wind on a regular grid: .npz, or .nc with netCDF4 or scipy.
+    """Read a wind on a regular grid: .npz, or .nc with netCDF4, or scipy where that is not installed.
 
     A .npz has ``x``, ``y``, ``z`` [m] and ``velocity`` [m/s] of shape (X, Y, Z, 3), or ``time`` [s] as well and
     (T, X, Y, Z, 3). A .nc has coordinates with these names, of any order, and one variable with an axis ``uvw`` (as
@@ -176,13 +176,11 @@ def _read_netcdf(path: Path) -> tuple[dict[str, np.ndarray], np.ndarray]:
     try:
         import netCDF4
     except ImportError:
-        try:
-            from scipy.io import netcdf_file
-        except ImportError:
-            raise ValueError(f"Reading {path} needs netCDF4: install gaussian-swaying[netcdf].") from None
+        from scipy.io import netcdf_file
+
         try:
             file: Any = netcdf_file(path, "r", mmap=False)
-        except (TypeError, ValueError, OSError) as error:
+        except (TypeError, ValueError, OSError, IndexError) as error:
             raise ValueError(
                 f"{path} cannot be read with scipy ({error}): install gaussian-swaying[netcdf] for files in HDF5."
             ) from error

@@ -86,6 +86,7 @@ class Capture:
 def read_capture(
     path: str | os.PathLike[str],
     format: str = "auto",
+    *,
     downscale: int = 1,
     test_every: int = 8,
     images: str = "images",

@@ -62,6 +62,7 @@ def cleaned(cloud: GaussianCloud) -> GaussianCloud:
 def export_cloud(
     path: str | os.PathLike[str],
     cloud: GaussianCloud | DeformedGaussians,
+    *,
     format: str | None = None,
     fps: float = 25.0,
     metres_per_unit: float = 1.0,
@@ -151,7 +152,9 @@ def convert(
     if not target.parent.is_dir():
         raise FileNotFoundError(f"{target} cannot be written because {target.parent} is not a folder; create it first.")
     if not source.is_dir():
-        export_cloud(target, read_gaussians(source), format, fps, metres_per_unit, rotation)
+        export_cloud(
+            target, read_gaussians(source), format=format, fps=fps, metres_per_unit=metres_per_unit, rotation=rotation
+        )
         return
     files = sorted(source.glob("*.ply"))
     if format != "usd" or not files:

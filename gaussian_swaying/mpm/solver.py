@@ -79,6 +79,7 @@ class MPMSolver(Solver):
         self,
         dx: float = 0.02,
         formulation: str = "total",
+        *,
         gravity: Sequence[float] = (0.0, 0.0, -9.8),
         damping: float = 0.0,
         stiffness_damping: float = 0.0,

@@ -109,6 +109,7 @@ class Recorder:
         self,
         images: bool = True,
         video: bool = True,
+        *,
         ply_every: int = 0,
         trajectory: bool = True,
         checkpoint_every: int = 1,
@@ -388,7 +389,7 @@ class Recorder:
         if self.export_format == "usd":
             self.write_ply(index, lambda path: write_usd_frame(path, cloud, frame))
         else:
-            self.write_ply(index, lambda path: export_cloud(path, cloud, self.export_format))
+            self.write_ply(index, lambda path: export_cloud(path, cloud, format=self.export_format))
 
     def write_checkpoint(self, checkpoint: dict[str, Any]) -> None:
         """Write the checkpoint for a resumed run.

@@ -202,6 +202,7 @@ class DiffuseShader(Shader):
         self,
         light: Sequence[float] = (0.0, 0.0, 1.0),
         two_sided: bool = False,
+        *,
         ambient: float = 0.0,
         relative: bool = False,
     ) -> None:
@@ -260,6 +261,7 @@ class PhongShader(Shader):
         self,
         light: Sequence[float] = (0.0, 0.0, 1.0),
         k_a: float = 0.3,
+        *,
         k_d: float = 0.7,
         k_s: float = 0.2,
         shininess: float = 32.0,

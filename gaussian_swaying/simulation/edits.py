@@ -5,7 +5,7 @@ from __future__ import annotations
 import copy
 import dataclasses
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import KW_ONLY, dataclass
 from typing import Any
 
 import torch
@@ -44,6 +44,7 @@ class Edit:
 
     region: Region | None = None
     time: float = 0.0
+    _: KW_ONLY
     E: float | None = None
     nu: float | None = None
     density: float | None = None

@@ -87,7 +87,9 @@ class Frame:
             ImportError: If the format is USD and usd-core is not installed.
         """
         place, fps = self.painter.scene.frame, 1 / self.editor.stepper.frame_dt
-        export_cloud(path, self.gaussians, format, fps, place.metres_per_unit, place.rotation)
+        export_cloud(
+            path, self.gaussians, format=format, fps=fps, metres_per_unit=place.metres_per_unit, rotation=place.rotation
+        )
 
 
 def frames_from(

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import KW_ONLY, dataclass, field, replace
 
 from torch import Tensor
 
@@ -62,6 +62,7 @@ class Material:
 
     E: Number = 1e5
     nu: Number = 0.3
+    _: KW_ONLY
     density: Number = 200.0
     thickness: float = 0.01
     volume: str = "patch"

@@ -69,6 +69,7 @@ class Scene:
         self,
         ply: str | os.PathLike[str] | None = None,
         generator: ProceduralScene | None = None,
+        *,
         region: Region | None = None,
         opacity_threshold: float = 0.1,
         faint: str = "carry",

@@ -124,6 +124,7 @@ class Simulation:
         self,
         scene: SceneLike,
         material: Material | None = None,
+        *,
         solver: SolverLike | None = None,
         wind: WindLike | None = None,
         aero: AeroForce | None = None,

@@ -109,7 +109,7 @@ def test_linear_law():
 
 def test_linear_drag_rate_and_resistance():
     """A patch faster than the wind is slowed; the rate bounds the slope, and the resistance is all of it."""
-    aero = AeroForce(0.7, 0.0, 0.0, air_density=RHO, law="linear", drag_step="semi_implicit")
+    aero = AeroForce(0.7, 0.0, C_L=0.0, air_density=RHO, law="linear", drag_step="semi_implicit")
     wind, area = _vector(3, 0, 0), torch.tensor([0.2]).double()
     velocity = torch.tensor([[5.0, 0.0, 0.0]], dtype=torch.float64, requires_grad=True)
     force = aero(wind, velocity, _vector(1, 0, 0)[None], area)

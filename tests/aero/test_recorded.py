@@ -163,10 +163,10 @@ def test_netcdf(tmp_path, engine, monkeypatch):
         read_grid(write(tmp_path / "km.nc", "km"))
 
 
-def test_without_a_reader_netcdf_names_the_extra(tmp_path, monkeypatch):
-    for name in ("netCDF4", "scipy.io"):
-        monkeypatch.setitem(__import__("sys").modules, name, None)
-    (tmp_path / "w.nc").write_bytes(b"CDF")
+@pytest.mark.parametrize("content", [b"CDF", b"CDF\x01", b"\x89HDF\r\n\x1a\n"])
+def test_without_netcdf4_a_file_that_scipy_cannot_read_names_the_extra(tmp_path, monkeypatch, content):
+    monkeypatch.setitem(__import__("sys").modules, "netCDF4", None)
+    (tmp_path / "w.nc").write_bytes(content)
     with pytest.raises(ValueError, match=r"install gaussian-swaying\[netcdf\]"):
         read_grid(tmp_path / "w.nc")
 

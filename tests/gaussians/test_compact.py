@@ -44,7 +44,7 @@ def _turned(a, b):
 def test_splat(tmp_path):
     """Centres and sizes exactly; colours, opacities and quaternions to the 8 bits that are cut off, not rounded."""
     cloud = _cloud()
-    export_cloud(tmp_path / "a.splat", cloud, "splat")
+    export_cloud(tmp_path / "a.splat", cloud, format="splat")
     found = _in_order(read_splat(tmp_path / "a.splat"), cloud)
     assert torch.equal(found.means, cloud.means)
     torch.testing.assert_close(found.scales, cloud.scales)
@@ -60,7 +60,7 @@ def test_splat(tmp_path):
 def test_compressed_ply(degree, tmp_path):
     """Within a step of each chunk's range, harmonics of every degree in their place."""
     cloud = _cloud(degree=degree)
-    export_cloud(tmp_path / "a.compressed.ply", cloud, "compressed_ply")
+    export_cloud(tmp_path / "a.compressed.ply", cloud, format="compressed_ply")
     found = _in_order(read_compressed_ply(tmp_path / "a.compressed.ply"), cloud)
     assert found.sh.shape == cloud.sh.shape
     torch.testing.assert_close(found.means, cloud.means, rtol=0, atol=4 / 1023)
@@ -76,9 +76,9 @@ def test_any_format_by_name_and_content(tmp_path):
     """What a scene takes: a compressed file is known by its header, whatever its name."""
     cloud = _cloud()
     write_ply(tmp_path / "a.ply", cloud)
-    export_cloud(tmp_path / "b.compressed.ply", cloud, "compressed_ply")
+    export_cloud(tmp_path / "b.compressed.ply", cloud, format="compressed_ply")
     (tmp_path / "b.compressed.ply").rename(tmp_path / "b.ply")
-    export_cloud(tmp_path / "c.splat", cloud, "splat")
+    export_cloud(tmp_path / "c.splat", cloud, format="splat")
     for name in ("a.ply", "b.ply", "c.splat"):
         assert len(Scene(ply=tmp_path / name).cloud()) == len(cloud)
     assert torch.equal(read_gaussians(tmp_path / "a.ply").means, cloud.means)
@@ -104,7 +104,7 @@ def test_files_of_other_programs(tmp_path):
 
 
 def _compressed(path, change):
-    export_cloud(path, _cloud(degree=1), "compressed_ply")
+    export_cloud(path, _cloud(degree=1), format="compressed_ply")
     ply = PlyData.read(str(path))
     elements = {element.name: element.data.copy() for element in ply.elements}
     change(elements)
@@ -149,7 +149,7 @@ def test_bad_splat(tmp_path):
         path.write_bytes(data)
         with pytest.raises(ValueError, match=f"has {len(data)} bytes, but a .splat file holds 32 for each Gaussian"):
             read_gaussians(path)
-    export_cloud(path, _cloud(), "splat")
+    export_cloud(path, _cloud(), format="splat")
     rows = np.fromfile(path, dtype="u1").reshape(-1, 32)
     for place, value, message in (
         (slice(0, 4), np.frombuffer(np.float32(np.nan).tobytes(), "u1"), "means of 1 of 300 Gaussians are NaN"),

@@ -82,7 +82,7 @@ def read_compressed(path):
 def test_splat_files_hold_the_gaussians(tmp_path):
     """Colours, opacities and quaternions to their 8 bits, which gsplat cuts off rather than rounds."""
     cloud = _cloud()
-    export_cloud(tmp_path / "a.splat", cloud, "splat")
+    export_cloud(tmp_path / "a.splat", cloud, format="splat")
     found = read_splat(tmp_path / "a.splat")
     order = _match(found["means"], cloud.means)
     assert torch.equal(found["means"][order], cloud.means)
@@ -98,7 +98,7 @@ def test_compressed_files_hold_the_gaussians(degree, tmp_path):
     """Within a step of each chunk's range; faint Gaussians are gone, and without harmonics so is their element."""
     cloud = _cloud(degree=degree)
     cloud.opacities[7] = -8.0
-    export_cloud(tmp_path / "a.compressed.ply", cloud, "compressed_ply")
+    export_cloud(tmp_path / "a.compressed.ply", cloud, format="compressed_ply")
     found = read_compressed(tmp_path / "a.compressed.ply")
     assert found["elements"] == (["chunk", "vertex", "sh"] if degree else ["chunk", "vertex"])
     kept = torch.arange(300) != 7
@@ -121,7 +121,7 @@ def test_one_bad_value_does_not_empty_the_file(tmp_path):
     for format, read in (("splat", read_splat), ("compressed_ply", read_compressed), ("ply", None)):
         path = tmp_path / f"a{SUFFIXES[format]}"
         with pytest.warns(UserWarning, match="left out 5 of 300 Gaussians that are not finite"):
-            export_cloud(path, cloud, format)
+            export_cloud(path, cloud, format=format)
         if read is None:
             assert torch.equal(read_ply(path).means, cloud.means[kept])
         else:
@@ -138,7 +138,7 @@ def test_equal_values_in_a_chunk_are_kept(tmp_path):
     cloud.means[:, 2], cloud.sh[:], cloud.scales[:] = 0.25, 1.0, -3.0
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        export_cloud(tmp_path / "a.compressed.ply", cloud, "compressed_ply")
+        export_cloud(tmp_path / "a.compressed.ply", cloud, format="compressed_ply")
     found = read_compressed(tmp_path / "a.compressed.ply")
     assert bool((found["means"][:, 2] == 0.25).all())
     torch.testing.assert_close(found["colors"], torch.full((300, 3), SH_DC + 0.5))
@@ -148,15 +148,15 @@ def test_equal_values_in_a_chunk_are_kept(tmp_path):
 def test_what_cannot_be_written_leaves_nothing(tmp_path):
     cloud = _cloud(3)
     with pytest.raises(ValueError, match="`format` to be one of ply, compressed_ply, splat, usd, but got 'obj'"):
-        export_cloud(tmp_path / "a.obj", cloud, "obj")
+        export_cloud(tmp_path / "a.obj", cloud, format="obj")
     with pytest.raises(FileNotFoundError, match="is not a folder"):
-        export_cloud(tmp_path / "no" / "a.splat", cloud, "splat")
+        export_cloud(tmp_path / "no" / "a.splat", cloud, format="splat")
     cloud.opacities[:] = -9.0
     with pytest.raises(ValueError, match="all Gaussians are fainter than 1/255"):
-        export_cloud(tmp_path / "a.compressed.ply", cloud, "compressed_ply")
+        export_cloud(tmp_path / "a.compressed.ply", cloud, format="compressed_ply")
     cloud.opacities[:] = math.nan
     with pytest.raises(ValueError, match="none of its 3 Gaussians is finite"):
-        export_cloud(tmp_path / "a.splat", cloud, "splat")
+        export_cloud(tmp_path / "a.splat", cloud, format="splat")
     assert list(tmp_path.iterdir()) == []
 
 
@@ -240,7 +240,7 @@ def test_bad_films(tmp_path):
     (tmp_path / "b.usda").write_text("no usd")
     with pytest.raises(ValueError, match="cannot be read as a USD file"):
         read_usd_frame(tmp_path / "b.usda", 0)
-    export_cloud(tmp_path / "one.usdc", _cloud(4), "usd")
+    export_cloud(tmp_path / "one.usdc", _cloud(4), format="usd")
     assert sorted(path.name for path in tmp_path.iterdir()) == ["b.usda", "one.usdc"]
 
 
@@ -250,7 +250,7 @@ def test_usd_without_its_library_is_one_sentence(tmp_path, monkeypatch):
     for name in ("pxr", "pxr.Usd"):
         monkeypatch.setitem(sys.modules, name, None)
     with pytest.raises(ImportError, match=r"USD files need usd-core: run pip install 'gaussian-swaying\[usd\]'"):
-        export_cloud(tmp_path / "a.usdc", _cloud(4), "usd")
+        export_cloud(tmp_path / "a.usdc", _cloud(4), format="usd")
 
 
 # ---- files to files

@@ -167,7 +167,7 @@ def test_derivative_of_the_viscous_stress(kernel_device):
 def test_derivative_of_the_wind(law, side, unit, kernel_device):
     """By F, velocity, wind and coefficients, with a cap on the area, in all variants of the law."""
     dtype, tolerance = _tolerance(kernel_device, 1e-11, 1e-4)
-    aero = AeroForce(0.6, 0.4, 0.2, law=law, lift_direction=side, unit_tangent=unit, max_area_ratio=1.5)
+    aero = AeroForce(0.6, 0.4, C_L=0.2, law=law, lift_direction=side, unit_tangent=unit, max_area_ratio=1.5)
     for coefficient in (aero.C_D, aero.C_F, aero.C_L):
         coefficient.requires_grad_()
     F = _deformed(80).requires_grad_()
@@ -205,7 +205,7 @@ def _check_wind(given, options, function, expected, tolerance):
 def test_derivative_of_the_wind_on_groups(law, side, kernel_device):
     """Points with no, one and several patches."""
     dtype, tolerance = _tolerance(kernel_device, 1e-11, 1e-4)
-    aero = AeroForce(0.6, 0.4, 0.2, law=law, lift_direction=side, max_area_ratio=1.2)
+    aero = AeroForce(0.6, 0.4, C_L=0.2, law=law, lift_direction=side, max_area_ratio=1.2)
     for coefficient in (aero.C_D, aero.C_F, aero.C_L):
         coefficient.requires_grad_()
     F = _deformed(60).requires_grad_()
@@ -270,7 +270,7 @@ def _gradients(device, dtype, transfer, law, *, steps=4, checkpoint=2, batch=(),
     forces = []
     if wind:
         field = WindField([2.0, 5.0, 1.0], modulations=[SineSway()]).to(device)
-        aero = AeroForce(0.6, 0.4, 0.2).to(device)
+        aero = AeroForce(0.6, 0.4, C_L=0.2).to(device)
         leaves = {"flow": field.flows, "C_D": aero.C_D, "C_F": aero.C_F, "C_L": aero.C_L}
         values |= {name: leaf.requires_grad_() for name, leaf in leaves.items()}
         normal = torch.nn.functional.normalize(_random(3, *place.shape), dim=-1).to(device, dtype)

@@ -69,7 +69,7 @@ def _sheet():
 
 
 def _move(points, region, gravity, formulation, dx, seconds):
-    solver = MPMSolver(dx, formulation, gravity, cfl=0.3, boundaries=[PinnedRegion(region)])
+    solver = MPMSolver(dx, formulation, gravity=gravity, cfl=0.3, boundaries=[PinnedRegion(region)])
     state = solver.init_state(points)
     for _ in range(round(seconds / 0.02)):
         steps = solver.substeps(state, 0.02)
@@ -107,7 +107,7 @@ def test_every_elastic_law_vibrates_alike_at_small_strain(law, formulation, devi
         points = points.map(lambda t: t.to(device))
         velocity = torch.zeros_like(points.position)
         velocity[:, 2] = 0.02 * torch.cos(torch.pi * points.position[:, 2] / 0.4)
-        solver = MPMSolver(0.1, formulation, (0, 0, 0))
+        solver = MPMSolver(0.1, formulation, gravity=(0, 0, 0))
         state = solver.init_state(points, velocity)
         ends.append(solver.rollout(state, solver.stable_substep() / 2, 40).position - points.position)
     moved = float(ends[0].abs().max())
@@ -124,7 +124,7 @@ def test_an_elastic_law_is_its_own_at_large_strain(law, formulation):
         points = _points((0.2, 0.2, 0.4), 0.05, kind)
         velocity = torch.zeros_like(points.position)
         velocity[:, 2] = 12.0 * (points.position[:, 2] - 0.2)
-        solver = MPMSolver(0.1, formulation, (0, 0, 0))
+        solver = MPMSolver(0.1, formulation, gravity=(0, 0, 0))
         ends.append(solver.rollout(solver.init_state(points, velocity), 5e-4, 60).position)
     assert float((ends[0] - ends[1]).abs().max()) > 5e-4
 
@@ -143,7 +143,7 @@ def test_what_flows_forgets_its_shape(law, device):
     """A block pulled and sheared beyond yield: the elastic part stays small, the total deformation grows."""
     points = _points((0.3, 0.3, 0.3), 0.05, law).map(lambda t: t.to(device))
     rate = torch.tensor([[3.0, 9.0, 0.0], [0.0, -3.0, 0.0], [0.0, 0.0, -1.5]], dtype=torch.float64, device=device)
-    solver = MPMSolver(0.1, "updated", (0, 0, 0))
+    solver = MPMSolver(0.1, "updated", gravity=(0, 0, 0))
     state = solver.init_state(points, (points.position - 0.15) @ rate.T)
     state = state.replace(affine=rate.expand_as(state.affine))
     state = solver.rollout(solver.fit_grid(state, 0.1), 5e-4, 100)
@@ -168,13 +168,13 @@ def test_several_laws_in_one_run():
         parts.append(part)
     velocities = [3.0 * (p.position - p.position.mean(0)) * p.position.new_tensor([1, -1, 0]) for p in parts]
     for part, velocity in zip(parts, velocities, strict=True):
-        solver = MPMSolver(0.1, "updated", (0, 0, 0))
+        solver = MPMSolver(0.1, "updated", gravity=(0, 0, 0))
         ends.append(solver.rollout(solver.init_state(part, velocity), 5e-4, 60))
     joined = MaterialPoints.join(parts)
     # in a mixed order
     order = torch.randperm(joined.count, generator=torch.Generator().manual_seed(1))
     mixed = joined.map(lambda t: t[order])
-    solver = MPMSolver(0.1, "updated", (0, 0, 0))
+    solver = MPMSolver(0.1, "updated", gravity=(0, 0, 0))
     end = solver.rollout(solver.init_state(mixed, torch.cat(velocities)[order]), 5e-4, 60)
     for name in ("position", "F_elastic", "F_total"):
         alone = torch.cat([getattr(e, name) for e in ends])[order]

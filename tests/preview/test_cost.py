@@ -115,7 +115,7 @@ def flag(device):
     return Simulation(
         FlagScene(spacing=0.02),
         Material(E=6e3, density=30.0, thickness=0.01),
-        MPMSolver(dx=0.05, boundaries=[pole], damping=0.2),
+        solver=MPMSolver(dx=0.05, boundaries=[pole], damping=0.2),
         wind=[5.0, 1.0, 0.0],
         device=device,
     )
@@ -127,7 +127,7 @@ def vase(device):
     return Simulation(
         VaseScene(spacing=0.025),
         Material(E=1e5, density=400.0, thickness=0.006),
-        MPMSolver(dx=0.04, boundaries=[foot], damping=1.0, gravity=(0.0, 0.0, 0.0)),
+        solver=MPMSolver(dx=0.04, boundaries=[foot], damping=1.0, gravity=(0.0, 0.0, 0.0)),
         wind=[3.0, 0.0, 0.0],
         device=device,
     )

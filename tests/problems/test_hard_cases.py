@@ -119,7 +119,9 @@ def _flag(wind, formulation, material=None, aero=None, width=0.8, spacing=0.1, d
     solver = {"gravity": (0.0, 0.0, 0.0), "boundaries": [pole], "cfl": CFL, **solver}
     solver = MPMSolver(dx=dx, formulation=formulation, **solver)
     material = material or Material(E=1e4, density=40.0)
-    return Simulation(Scene(generator=source), material, solver, wind, aero, **(TINY | {"frame_dt": frame_dt}))
+    return Simulation(
+        Scene(generator=source), material, solver=solver, wind=wind, aero=aero, **(TINY | {"frame_dt": frame_dt})
+    )
 
 
 def _throw(simulation, velocity):
@@ -790,8 +792,8 @@ def test_gaussians_of_extreme_shape(scales):
     simulation = Simulation(
         Scene(generator=source, points="gaussian"),
         material,
-        solver,
-        WindField([2.0, 1.0, 0.0]),
+        solver=solver,
+        wind=WindField([2.0, 1.0, 0.0]),
         camera=camera,
         device="cpu",
     )
@@ -872,7 +874,9 @@ def _long_flag(damping):
     pole = PinnedRegion(Box([None, None, None], [0.11, None, None]))
     solver = MPMSolver(dx=0.2, formulation="total", boundaries=[pole], damping=damping)
     wind = WindField([6.0, 1.5, 0.0], modulations=[SineSway(), UniformGust(0.3), GaussianGust(0.3)], seed=3)
-    simulation = Simulation(scene, Material(E=1e4, density=40.0), solver, wind, **(TINY | {"frame_dt": frame_dt}))
+    simulation = Simulation(
+        scene, Material(E=1e4, density=40.0), solver=solver, wind=wind, **(TINY | {"frame_dt": frame_dt})
+    )
     state, visible, began = simulation.start(), [], time.perf_counter()
     log = [diagnose(solver, state, 0, 0.0)]
     for _ in range(round(minutes * 60 / frame_dt)):

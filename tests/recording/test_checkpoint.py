@@ -268,7 +268,9 @@ def test_a_splat_that_was_exchanged(make_cloud, make_simulation, tmp_path):
 
     def go(frames, resume):
         camera = OrbitCamera(width=8, height=8)
-        simulation = Simulation(Scene(ply=str(file)), None, MPMSolver(dx=0.25), like.wind, camera=camera, device="cpu")
+        simulation = Simulation(
+            Scene(ply=str(file)), None, solver=MPMSolver(dx=0.25), wind=like.wind, camera=camera, device="cpu"
+        )
         simulation.run(folder, frames, resume=resume, progress=False, recorder=Recorder(images=False, video=False))
 
     cloud = make_cloud()

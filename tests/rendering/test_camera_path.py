@@ -13,7 +13,16 @@ from gaussian_swaying.rendering.cameras.camera_path import LookAtCamera, OrbitCa
 
 
 def test_orbit_path_scales_with_the_object_and_turns_with_time():
-    path = OrbitCamera(64, 48, 30.0, 10.0, 20.0, 3.0, degrees_per_second=40.0, target_offset=(0.0, 0.5, 0.0))
+    path = OrbitCamera(
+        64,
+        48,
+        fov_y=30.0,
+        azimuth=10.0,
+        elevation=20.0,
+        radius=3.0,
+        degrees_per_second=40.0,
+        target_offset=(0.0, 0.5, 0.0),
+    )
     center, up = torch.tensor([1.0, 2.0, 3.0], dtype=torch.float64), torch.tensor([0.0, 0.0, 1.0])
     camera = path(7, 2.0, center, up, 0.2)
     expected = orbit_camera((1.0, 2.1, 3.0), (0, 0, 1), 0.6, 90.0, 20.0, 30.0, 64, 48, dtype=torch.float64)
@@ -25,9 +34,13 @@ def test_orbit_path_scales_with_the_object_and_turns_with_time():
 
 def test_look_at_path_takes_the_up_direction_of_the_scene_by_default(project):
     center, scene_up = torch.zeros(3), torch.tensor([0.0, -1.0, 0.0])
-    camera = LookAtCamera((0, 0, -2), (0, 0, 0), None, 64, 48, 30.0)(0, 0.0, center, scene_up, 1.0)
+    camera = LookAtCamera((0, 0, -2), (0, 0, 0), up=None, width=64, height=48, fov_y=30.0)(
+        0, 0.0, center, scene_up, 1.0
+    )
     assert project(camera, (0, -0.1, 0))[0][1] < 24
-    camera = LookAtCamera((0, 0, -2), (0, 0, 0), (0, 1, 0), 64, 48, 30.0)(0, 0.0, center, scene_up, 1.0)
+    camera = LookAtCamera((0, 0, -2), (0, 0, 0), up=(0, 1, 0), width=64, height=48, fov_y=30.0)(
+        0, 0.0, center, scene_up, 1.0
+    )
     assert project(camera, (0, -0.1, 0))[0][1] > 24
 
 
@@ -57,7 +70,7 @@ def test_bad_look_at_and_transforms_arguments():
     with pytest.raises(ValueError, match="`eye` and `target`"):
         LookAtCamera((0, 0, 0), (0, 0, 0))
     with pytest.raises(ValueError, match="`up`"):
-        LookAtCamera((0, 0, 1), (0, 0, 0), (0, 0, 0))
+        LookAtCamera((0, 0, 1), (0, 0, 0), up=(0, 0, 0))
     with pytest.raises(ValueError, match="`frame`"):
         TransformsCamera("transforms.json", -1)
     with pytest.raises(TypeError, match="`width`"):

@@ -63,7 +63,7 @@ def test_angles_are_those_of_the_orbit():
     path = KeyframedCamera(keys, width=32, height=18)
     start = OrbitCamera(32, 18, azimuth=-90.0, elevation=10.0, radius=2.0)(0, 0.0, CENTER, UP, 1.5)
     torch.testing.assert_close(path(0, 0.0, CENTER, UP, 1.5).world_to_camera, start.world_to_camera)
-    half = OrbitCamera(32, 18, 35.0, azimuth=90.0, elevation=10.0, radius=2.0)(0, 0.0, CENTER, UP, 1.5)
+    half = OrbitCamera(32, 18, fov_y=35.0, azimuth=90.0, elevation=10.0, radius=2.0)(0, 0.0, CENTER, UP, 1.5)
     camera = path(25, 1.0, CENTER, UP, 1.5)
     torch.testing.assert_close(camera.world_to_camera, half.world_to_camera)
     torch.testing.assert_close(camera.intrinsics, half.intrinsics)

@@ -66,7 +66,9 @@ def test_relative_leaves_the_rest_picture_unchanged(two_sided):
         assert (shader(color, _random_normals(), normal, view) - color).abs().max() > 0.1
 
 
-@pytest.mark.parametrize("shader", [DiffuseShader((0, 1, 1), True, 0.2), PhongShader((0, 1, 1), two_sided=True)])
+@pytest.mark.parametrize(
+    "shader", [DiffuseShader((0, 1, 1), True, ambient=0.2), PhongShader((0, 1, 1), two_sided=True)]
+)
 def test_two_sided_does_not_see_the_sign_of_the_normal(shader):
     normal, color, view = _random_normals(), torch.rand(50, 3, dtype=torch.float64), _random_normals()
     torch.testing.assert_close(shader(color, normal, None, view), shader(color, -normal, None, view))
@@ -86,7 +88,7 @@ def test_phong_closed_form(dtype):
 
 def test_phong_relative_subtracts_the_rest_highlight():
     color, normal, light = _case(torch.float64)
-    shader = PhongShader((0, 0, 3), 0.2, 0.6, 0.5, 4.0, relative=True)
+    shader = PhongShader((0, 0, 3), 0.2, k_d=0.6, k_s=0.5, shininess=4.0, relative=True)
     shaded = shader(color, normal, light, light)  # at rest: normal, light and eye coincide, highlight 1
     cosine = math.cos(math.radians(30.0))
     expected = color * (0.2 + 0.6 * cosine) / 0.8 + 0.5 * (math.cos(math.radians(60.0)) ** 4 - 1.0)
@@ -106,7 +108,10 @@ def test_gradients():
     color.requires_grad_()
     normal.requires_grad_()
     rest = _random_normals(5)
-    for shader in (DiffuseShader((1, 1, 1), True, 0.3, True), PhongShader((1, 1, 1), shininess=3.0, relative=True)):
+    for shader in (
+        DiffuseShader((1, 1, 1), True, ambient=0.3, relative=True),
+        PhongShader((1, 1, 1), shininess=3.0, relative=True),
+    ):
         assert torch.autograd.gradcheck(lambda c, n, shader=shader: shader(c, n, rest, view), (color, normal))
 
 

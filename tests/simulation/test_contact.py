@@ -29,7 +29,9 @@ def _ball(contact=None, boundaries=None, **more):
     )
     given = [BallObstacle([0, 0, 0.35], 0.3)] if boundaries is None else boundaries
     solver = MPMSolver(dx=0.06, boundaries=given, **more)
-    return Simulation(scene, Material(E=5e3, density=50.0, thickness=0.02), solver, contact=contact, device="cpu")
+    return Simulation(
+        scene, Material(E=5e3, density=50.0, thickness=0.02), solver=solver, contact=contact, device="cpu"
+    )
 
 
 def test_a_cloth_falls_onto_a_ball_and_stays_outside():
@@ -101,7 +103,7 @@ def test_surfaces_that_start_too_close_are_warned_of(gap, warned):
     scene = Scene(generator=_two_sheets(gap), metres_per_unit=1.0)
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
-        Simulation(scene, Material(thickness=0.02), MPMSolver(dx=0.04), contact=Contact(), device="cpu")
+        Simulation(scene, Material(thickness=0.02), solver=MPMSolver(dx=0.04), contact=Contact(), device="cpu")
     assert any("start closer than 0.02 m" in str(w.message) for w in caught) == warned
 
 

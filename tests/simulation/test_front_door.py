@@ -194,7 +194,7 @@ def test_the_grid_is_that_of_the_solver_everywhere():
     counts = []
     for dx in (0.1, 0.2):
         solver = MPMSolver(dx=dx, boundaries=[PinnedRegion(POLE)])
-        simulation = Simulation(scene, Material(volume="cell"), solver, device="cpu")
+        simulation = Simulation(scene, Material(volume="cell"), solver=solver, device="cpu")
         counts.append(simulation.scene.points.count)
         cell = torch.unique(torch.floor(simulation.scene.points.position / dx).long(), dim=0)
         assert float(simulation.scene.points.volume.sum()) == pytest.approx(len(cell) * dx**3, rel=1e-5)
@@ -590,7 +590,7 @@ def test_a_normalisation_leaves_the_components_as_they_are():
     solver = MPMSolver(dx=0.1, boundaries=[PinnedRegion(Box([None, None, None], [0.6, None, None]))])
     given = vars(scene).copy(), dataclasses.asdict(material), list(solver.boundaries)
     for _ in range(2):
-        Simulation(scene, material, solver, normalisation=Normalisation(scale=1.0), device="cpu").start()
+        Simulation(scene, material, solver=solver, normalisation=Normalisation(scale=1.0), device="cpu").start()
         assert (vars(scene), dataclasses.asdict(material), list(solver.boundaries)) == given
     with pytest.raises(ValueError, match="`hold` cannot be combined with `normalisation`"):
         Simulation(FlagScene(spacing=0.1), hold=POLE, normalisation=Normalisation(), device="cpu")

@@ -117,7 +117,9 @@ def test_a_solver_can_serve_two_simulations(make_simulation):
     given = list(one.solver.boundaries)
     one.start()
     source = Scene(generator=FlagScene(spacing=0.1))
-    two = Simulation(source, Material(E=3e3, density=30.0), one.solver, one.wind, one.aero, device="cpu")
+    two = Simulation(
+        source, Material(E=3e3, density=30.0), solver=one.solver, wind=one.wind, aero=one.aero, device="cpu"
+    )
     two.start()
     assert list(two.solver.boundaries) == given
 
@@ -397,7 +399,7 @@ def test_the_first_picture_is_that_of_the_splat(flag_ply, make_simulation):
     camera = LookAtCamera(eye=[7.0, -2.0, -5.0], target=[7.0, -1.7, 2.0], up=[0.0, 1.0, 0.0], width=64, height=36)
     background = (0.2, 0.3, 0.4)
     simulation = Simulation(
-        scene, Material(), MPMSolver(dx=0.1), [5, 0, 0], camera=camera, background=background, device="cpu"
+        scene, Material(), solver=MPMSolver(dx=0.1), wind=[5, 0, 0], camera=camera, background=background, device="cpu"
     )
     picture = simulation.painter.render(simulation.start(), 0)
     model = GaussianSurfaceModel.from_cloud(read_ply(flag_ply), requires_grad=False)

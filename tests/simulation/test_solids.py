@@ -50,8 +50,8 @@ def _simulation(material=None, solver=None, **scene):
     return Simulation(
         Scene(**settings),
         material or Material(density=200.0),
-        MPMSolver(dx=DX, boundaries=[PinnedRegion(Box([None] * 3, [None, None, -0.24]))], **(solver or {})),
-        WindField([6.0, 0.0, 0.0]),
+        solver=MPMSolver(dx=DX, boundaries=[PinnedRegion(Box([None] * 3, [None, None, -0.24]))], **(solver or {})),
+        wind=WindField([6.0, 0.0, 0.0]),
         camera=OrbitCamera(width=32, height=18, radius=2.0),
         device="cpu",
     )

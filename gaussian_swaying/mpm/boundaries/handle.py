@@ -46,7 +46,7 @@ class Handle(PinnedRegion):
         start: float = 0.0,
         end: float | None = None,
     ) -> None:
-        super().__init__(region, kind, held_share, start, end)
+        super().__init__(region, kind, held_share=held_share, start=start, end=end)
         turn = check_vector("angular_velocity", angular_velocity)
         self.rate = math.sqrt(sum(c * c for c in turn))
         for name, value in (

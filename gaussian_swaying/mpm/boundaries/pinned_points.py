@@ -34,7 +34,7 @@ class PinnedPoints(Boundary):
     recordable = True
 
     def __init__(
-        self, at: Sequence[Sequence[float]], kind: str = "hinge", start: float = 0.0, end: float | None = None
+        self, at: Sequence[Sequence[float]], kind: str = "hinge", *, start: float = 0.0, end: float | None = None
     ) -> None:
         super().__init__(start, end)
         check_choice("kind", kind, KINDS)

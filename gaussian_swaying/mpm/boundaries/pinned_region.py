@@ -44,6 +44,7 @@ class PinnedRegion(ParticleBoundary):
         self,
         region: Region,
         kind: str | None = None,
+        *,
         held_share: float = 0.07,
         start: float = 0.0,
         end: float | None = None,

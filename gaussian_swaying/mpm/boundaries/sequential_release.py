@@ -41,7 +41,7 @@ class SequentialRelease(PinnedRegion):
         first: Sequence[float] | None = None,
         last: Sequence[float] | None = None,
     ) -> None:
-        super().__init__(region, kind, held_share, start, end)
+        super().__init__(region, kind, held_share=held_share, start=start, end=end)
         if not math.isfinite(self.end):
             raise ValueError(f"Expected `end` of the SequentialRelease to be a finite time, but got {end}.")
         if not any(check_vector("direction", direction)):

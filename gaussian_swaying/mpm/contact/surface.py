@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import KW_ONLY, dataclass
 
 import torch
 from torch import Tensor
@@ -30,6 +30,7 @@ class Contact:
 
     thickness: float | None = None
     friction: float = 0.3
+    _: KW_ONLY
     iterations: int = 100
 
     def __post_init__(self) -> None:

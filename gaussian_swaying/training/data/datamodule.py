@@ -147,6 +147,7 @@ class CaptureDataModule(LightningDataModule):
         self,
         path: str | os.PathLike[str],
         format: Literal["auto", "colmap", "transforms"] = "auto",
+        *,
         downscale: int = 1,
         test_every: int = 8,
         images: str = "images",
@@ -187,7 +188,9 @@ class CaptureDataModule(LightningDataModule):
     def capture(self) -> Capture:
         """The capture, read at the first access."""
         if self._capture is None:
-            self._capture = read_capture(self.path, self.format, self.downscale, self.test_every, self.images)
+            self._capture = read_capture(
+                self.path, self.format, downscale=self.downscale, test_every=self.test_every, images=self.images
+            )
         return self._capture
 
     @property
