@@ -13,7 +13,7 @@ import yaml
 
 from gaussian_swaying import Box, PinnedRegion, Simulation
 from gaussian_swaying.cli.evaluate import main as evaluate
-from gaussian_swaying.cli.main import main
+from gaussian_swaying.cli.simulate import main
 from gaussian_swaying.geometry.regions import Sphere
 from gaussian_swaying.mpm.followers import PointFollowers
 from gaussian_swaying.recording.trajectory import load_trajectory
@@ -137,7 +137,7 @@ def test_a_yaml_names_a_solver_and_a_wind(tmp_path, monkeypatch, capsys):
     }
     file, folder = tmp_path / "scene.yaml", tmp_path / "run"
     file.write_text(yaml.safe_dump(config))
-    options = ["sim", "--config", str(file), "--frames", "3", "--device", "cpu"]
+    options = ["--config", str(file), "--frames", "3", "--device", "cpu"]
     assert main([*options, "--output", str(folder)]) == 0
     summary = json.loads((folder / "summary.json").read_text())
     assert (summary["formulation"], summary["frames"]) == ("mass_spring", 3)
