@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from typing import Any
+from typing import Any, Literal
 
 import torch
 from torch import Tensor, nn
@@ -287,10 +287,10 @@ class AeroForce(nn.Module):
         *,
         C_L: Number = 0.01,
         air_density: float = 1.225,
-        law: str = "paper",
-        lift_direction: str = "side",
+        law: Literal["paper", "projected", "linear"] = "paper",
+        lift_direction: Literal["side", "lift"] = "side",
         unit_tangent: bool = False,
-        drag_step: str = "explicit",
+        drag_step: Literal["explicit", "semi_implicit"] = "explicit",
         max_area_ratio: float | None = None,
     ) -> None:
         super().__init__()

@@ -12,6 +12,7 @@ from collections.abc import Sequence
 from copy import copy
 from dataclasses import dataclass
 from itertools import pairwise
+from typing import Literal
 
 import torch
 from torch import Tensor, nn
@@ -252,7 +253,7 @@ class WindField(nn.Module):
         flow: VectorLike = (0.0, 0.0, 0.0),
         schedule: list[FlowKey] | str | None = None,
         *,
-        interpolation: str = "step",
+        interpolation: Literal["step", "linear"] = "step",
         modulations: Sequence[Modulation] = (),
         seed: int = 0,
         effects: Sequence[WindEffect] = (),

@@ -189,7 +189,10 @@ def parser_sentence(message: str, arguments: Sequence[str] = ()) -> str:
         files = [b for a, b in pairwise(arguments) if a == "--config"]
         files += [a.removeprefix("--config=") for a in arguments if a.startswith("--config=")]
         kept[0] = f"{', '.join(files)} is not valid YAML{kept[0].removeprefix('Problems parsing config')}"
-    return " ".join(kept)
+    return _CHOICES.sub(lambda found: f"Expected one of {found[1].replace(chr(39), '')}", " ".join(kept))
+
+
+_CHOICES = re.compile(r"Expected a typing\.Literal\[([^\]]*)\]")
 
 
 def _asked_for(text: str) -> str:

@@ -6,7 +6,7 @@ import dataclasses
 import math
 from collections.abc import Callable, Sequence
 from itertools import pairwise
-from typing import Any
+from typing import Any, Literal
 
 import torch
 from torch import Tensor, nn
@@ -78,7 +78,7 @@ class MPMSolver(Solver):
     def __init__(
         self,
         dx: float = 0.02,
-        formulation: str = "total",
+        formulation: Literal["total", "updated"] = "total",
         *,
         gravity: Sequence[float] = (0.0, 0.0, -9.8),
         damping: float = 0.0,
@@ -89,7 +89,7 @@ class MPMSolver(Solver):
         mls: bool = False,
         deterministic: bool = False,
         boundaries: Sequence[Boundary] = (),
-        transfer: str = "auto",
+        transfer: Literal["auto", "torch", "triton"] = "auto",
     ) -> None:
         super().__init__()
         check_choice("transfer", transfer, TRANSFERS)
@@ -99,7 +99,9 @@ class MPMSolver(Solver):
             check_positive("substep", substep)
         gravity = check_vector("gravity", gravity)
         self.settings = Settings(dx, gravity, damping, stiffness_damping, max_nodes, mls, deterministic)
-        self.formulation, self.cfl, self.substep, self.transfer = formulation, float(cfl), substep, transfer
+        self.formulation: Literal["total", "updated"] = formulation
+        self.transfer: Literal["auto", "torch", "triton"] = transfer
+        self.cfl, self.substep = float(cfl), substep
         FORMULATIONS[formulation].check_settings(self.settings)
         self.boundaries = nn.ModuleList(boundaries)
         # the same in metres; in a tuple, because these copies do not belong to the module's state

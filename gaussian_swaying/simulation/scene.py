@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from typing import Literal
 
 from gaussian_swaying._checks import check_choice, check_positive, check_vector
 from gaussian_swaying.gaussians.cloud import GaussianCloud
@@ -72,20 +73,20 @@ class Scene:
         *,
         region: Region | None = None,
         opacity_threshold: float = 0.1,
-        faint: str = "carry",
+        faint: Literal["carry", "static", "drop"] = "carry",
         up: list[float] = [0.0, 0.0, 1.0],  # noqa: B006  (never changed; the schema of the config shows it)
         longest_side: float | None = None,
         metres_per_unit: float | None = None,
-        area: str | None = None,
+        area: Literal["coverage", "open", "paper", "equal"] | None = None,
         filling: InteriorFilling | None = None,
-        wind_on: str = "surface",
+        wind_on: Literal["surface", "all"] = "surface",
         max_stretch: float | None = 2.0,
         layers: int = 1,
         particle_spacing: float | None = None,
-        points: str | None = None,
+        points: Literal["gaussian", "grid"] | None = None,
         points_per_cell: int = 2,
-        loose: str = "simulate",
-        normals: str = "smallest_axis",
+        loose: Literal["simulate", "carry"] = "simulate",
+        normals: Literal["smallest_axis", "neighbours"] = "smallest_axis",
     ) -> None:
         if points is not None:
             check_choice("scene.points", points, ("gaussian", "grid"))

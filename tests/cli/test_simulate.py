@@ -427,7 +427,7 @@ GUST = '[{"class_path": "SineSway", "init_args": {"amplitud": 1.0}}]'
         (["--scene.up", "[0, 0, 0]"], ["`scene.up`", "[0, -1, 0]"]),
         (["--scene.longest_side", "1.0"], ["longest_side", "metres_per_unit", "not both"]),
         (["--solver.dx", "0"], ["`dx`"]),
-        (["--solver.formulation", "totl"], ["`formulation`", "total, updated"]),
+        (["--solver.formulation", "totl"], ["solver.formulation", "Expected one of total, updated"]),
         (["--solver.substep", "1.0"], ["`substep` of 1 s", "stable one of 0.0", "lower it"]),
         (["--solver.max_nodes", "10"], ["`max_nodes`", "coarsen `dx`"]),
         (["--camera", INSIDE], ["camera", "inside the object", "move it out"]),
