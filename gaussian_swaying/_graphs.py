@@ -11,6 +11,8 @@ from typing import Any
 import torch
 from torch import nn
 
+from gaussian_swaying.kernels.language import INTERPRETED
+
 RECORDED = 200_000
 """Most particles or Gaussians for which the kernels of their fields are recorded: CUDA graphs keep their memory."""
 
@@ -186,10 +188,12 @@ class Repeater:
 
     def __init__(self, device: torch.device, kept: int = 4) -> None:
         self.device, self.kept = device, kept
-        self._graphs: dict[Hashable, dict[int, torch.cuda.CUDAGraph]] = {}
+        self._graphs: dict[Hashable, dict[int, Any]] = {}
         self._stream: torch.cuda.Stream | None = None
 
-    def run(self, times: int, key: Hashable, several: Callable[[int], None], recordable: bool = True) -> None:
+    def run(
+        self, times: int, key: Hashable, several: Callable[[int], None], recordable: bool = True, launches: bool = False
+    ) -> None:
         """Run the work ``times`` times.
 
         The first time a key is used, the work runs without recording, so that all its kernels are compiled. After that
@@ -200,12 +204,17 @@ class Repeater:
             key: Identifies the work.
             several: ``several(n)`` runs it n times.
             recordable: Whether it may be recorded.
+            launches: Whether it consists of launches of kernels, and of calls by ``kernels.launch.call``; only then is
+                it recorded on a CPU.
 
         Raises:
             RuntimeError: If it was declared recordable but is not.
             torch.OutOfMemoryError: If there is no memory left to record it.
         """
         if times == 0:  # nothing runs, so nothing is compiled
+            return
+        if self.device.type == "cpu" and launches and not INTERPRETED:
+            self._run_on_cpu(times, key, several)
             return
         if self.device.type != "cuda" or not recordable or key not in self._graphs:
             self.forget(key)
@@ -222,6 +231,23 @@ class Repeater:
                     graphs[size] = self._recorded(several, size)
                 graphs[size].replay()
                 times -= size
+
+    def _run_on_cpu(self, times: int, key: Hashable, several: Callable[[int], None]) -> None:
+        """As :meth:`run`; the launches of the first time are kept, and run again without Python in between."""
+        from gaussian_swaying.kernels.cpu import recording
+
+        while key not in self._graphs and len(self._graphs) >= self.kept:
+            self.forget(next(iter(self._graphs)))
+        self._graphs[key] = graphs = self._graphs.pop(key, {})
+        for size in (4 * self.SIZES[0], *self.SIZES):
+            while times >= size:
+                times -= size
+                if size not in graphs:
+                    with recording() as made:
+                        several(size)
+                    graphs[size] = made
+                else:
+                    graphs[size].replay()
 
     def _recorded(self, several: Callable[[int], None], size: int) -> torch.cuda.CUDAGraph:
         if self._stream is None:

@@ -1,9 +1,7 @@
 """Effects of the wind as Triton functions; the references are in ``aero.effects``, ``carried`` and ``shelter``."""
 
-import triton
-import triton.language as tl
-
 from gaussian_swaying.geometry.linalg_triton import chosen, matvec
+from gaussian_swaying.kernels.language import tl, triton
 
 
 @triton.jit

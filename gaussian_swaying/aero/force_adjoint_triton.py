@@ -1,8 +1,5 @@
 """Gradients of the force of the wind as a Triton function; the reference is torch's autograd of ``aero.wind_force``."""
 
-import triton
-import triton.language as tl
-
 from gaussian_swaying.aero.force_triton import sums_over_patches
 from gaussian_swaying.geometry.linalg_triton import (
     axpy3,
@@ -18,6 +15,7 @@ from gaussian_swaying.geometry.linalg_triton import (
     transpose,
 )
 from gaussian_swaying.geometry.patches_triton import area_vector
+from gaussian_swaying.kernels.language import tl, triton
 
 
 @triton.jit

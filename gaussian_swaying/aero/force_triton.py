@@ -1,8 +1,5 @@
 """The force of the wind as a Triton function, for the fused substep. The reference is ``aero.wind_force``."""
 
-import triton
-import triton.language as tl
-
 from gaussian_swaying.geometry.linalg_triton import (
     axpy3,
     chosen,
@@ -16,6 +13,7 @@ from gaussian_swaying.geometry.linalg_triton import (
     transpose,
 )
 from gaussian_swaying.geometry.patches_triton import deform_patch
+from gaussian_swaying.kernels.language import tl, triton
 
 
 @triton.jit

@@ -3,11 +3,9 @@
 The references are ``aero.obstacle_flow`` and ``aero.obstacles``. They compute in float32.
 """
 
-import triton
-import triton.language as tl
-
 from gaussian_swaying.aero import obstacle_flow
 from gaussian_swaying.geometry.linalg_triton import chosen, cross3, dot3, scale3
+from gaussian_swaying.kernels.language import tl, triton
 
 PI = tl.constexpr(3.141592653589793)
 STREET_SPEED = tl.constexpr(obstacle_flow.STREET_SPEED)

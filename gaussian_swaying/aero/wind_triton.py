@@ -8,11 +8,11 @@ from __future__ import annotations
 from weakref import WeakKeyDictionary
 
 import torch
-import triton
-import triton.language as tl
 from torch import Tensor, nn
 
 from gaussian_swaying.aero.wind import GaussianGust, SineSway, UniformGust, WindField, stream_start
+from gaussian_swaying.kernels.language import tl, triton
+from gaussian_swaying.kernels.launch import launch
 
 SWAY, UNIFORM, GAUSSIAN = 0, 1, 2
 BLOCK = 64
@@ -126,7 +126,7 @@ def blow(wind: nn.Module, times: Tensor) -> Tensor | None:
     _, numbers, starts = _numbers[wind]
     out = times.new_empty(len(times), 3)
     with torch.cuda.device_of(times):
-        _blow[(triton.cdiv(len(times), BLOCK),)](
+        launch(_blow, (triton.cdiv(len(times), BLOCK),))(
             times.contiguous(), wind.times, wind.flows.contiguous(), numbers, starts, out, len(times),
             len(wind.times) - 1, KINDS=tuple(row[0] for row in known), MODULATIONS=len(known),
             LINEAR=wind.interpolation == "linear" and len(wind.times) > 1, BLOCK=BLOCK, num_warps=2,

@@ -4,10 +4,8 @@ The definitions are in :mod:`~gaussian_swaying.geometry.distance`. They are the 
 ``mpm.twins``.
 """
 
-import triton
-import triton.language as tl
-
 from gaussian_swaying.geometry.linalg_triton import chosen, dot3, matvec, transpose
+from gaussian_swaying.kernels.language import tl, triton
 
 LEAST = tl.constexpr(1.0842022e-19)
 """Length of a vector without a direction: the square root of the smallest normal number, as in the reference."""

@@ -5,8 +5,7 @@ The definitions are in :mod:`~gaussian_swaying.geometry.linalg`.
 A matrix is a tuple of nine values, row by row; a vector one of three.
 """
 
-import triton
-import triton.language as tl
+from gaussian_swaying.kernels.language import tl, triton
 
 TINY = tl.constexpr(1e-30)
 

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import torch
-import triton
-import triton.language as tl
 from torch import Tensor
 
 from gaussian_swaying.geometry.linalg_triton import (
@@ -21,6 +19,8 @@ from gaussian_swaying.geometry.linalg_triton import (
     where3,
     where9,
 )
+from gaussian_swaying.kernels.language import tl, triton
+from gaussian_swaying.kernels.launch import launch
 
 BLOCK = 128
 
@@ -118,7 +118,7 @@ def deform_all(
     keeps = F if solid is None or not limit else solid.contiguous().view(torch.uint8)
     if count > 0:
         with torch.cuda.device_of(F):
-            _deform[(triton.cdiv(count, BLOCK),)](
+            launch(_deform, (triton.cdiv(count, BLOCK),))(
                 F, covariance, normal, keeps, *made, float(max_stretch or 1) ** 2, count,
                 TURN=rotations, LIMIT=limit, BLOCK=BLOCK,
             )  # fmt: skip

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import torch
-import triton
-import triton.language as tl
 from torch import Tensor
 
 from gaussian_swaying.geometry.linalg_triton import load3, load9, matmul, store3, transpose
 from gaussian_swaying.geometry.patches_triton import deform_and_store
+from gaussian_swaying.kernels.language import tl, triton
+from gaussian_swaying.kernels.launch import launch
 from gaussian_swaying.mpm.transfer import Stencil
 from gaussian_swaying.mpm.triton.shared import VARIES, axis_weights
 from gaussian_swaying.mpm.triton.total_kernels import gather
@@ -102,7 +102,7 @@ def follow(
     keeps = fields if solid is None or not limit else solid.contiguous().view(torch.uint8)
     if count > 0:
         with torch.cuda.device_of(fields):
-            _follow[(triton.cdiv(count, BLOCK),)](
+            launch(_follow, (triton.cdiv(count, BLOCK),))(
                 fields, stencil.first, fraction.contiguous(), fields if arm is None else arm.contiguous(),
                 axes.contiguous(), *given, keeps, *made, turns,
                 float(max_stretch or 1) ** 2, per_metre, count, *strides, 1 / dx,

@@ -21,7 +21,7 @@ _PARTICLES = ("moved_particle", "compressed_particle", "stretched_particle")
 _SAMPLE = 4096  # particles whose nearest neighbour is searched
 
 
-class SimulationDiverged(RuntimeError):  # noqa: N818  (it ends a run the way StopIteration ends a loop)
+class SimulationDiverged(RuntimeError):
     """The simulation diverged: its numbers no longer mean anything.
 
     Attributes:

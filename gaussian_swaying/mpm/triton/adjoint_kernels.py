@@ -9,10 +9,8 @@ number of substeps that it has done. Rows of ``bars``, one per active node: grad
 each in four columns of eight. Rows of ``history``: displacement and velocity at the start of each substep, likewise.
 """
 
-import triton
-import triton.language as tl
-
 from gaussian_swaying.geometry.linalg_triton import axpy9, scale9
+from gaussian_swaying.kernels.language import tl, triton
 from gaussian_swaying.mpm.laws.triton.body import pk1_adjoint
 from gaussian_swaying.mpm.triton.damping import kelvin_voigt_adjoint
 from gaussian_swaying.mpm.triton.shared import VARIES, axis_weights, node_weight, twin_data

@@ -5,10 +5,8 @@ number of iterations is not fixed when it is recorded. Each contact sample has i
 both of its samples; the sums at samples and nodes have the same order in every run.
 """
 
-import triton
-import triton.language as tl
-
 from gaussian_swaying.geometry.linalg_triton import load3
+from gaussian_swaying.kernels.language import tl, triton
 from gaussian_swaying.mpm.contact.solve import CREEP
 from gaussian_swaying.mpm.triton.contact_list_kernels import (
     ACTING,

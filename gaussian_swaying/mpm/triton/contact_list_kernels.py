@@ -5,10 +5,8 @@ Samples are sorted by the cells of a grid that is stored as a hash table, and ea
 and lists have the same order in every run: the counts are atomic, but each cell is sorted afterwards.
 """
 
-import triton
-import triton.language as tl
-
 from gaussian_swaying.geometry.linalg_triton import load3
+from gaussian_swaying.kernels.language import tl, triton
 from gaussian_swaying.mpm.triton.shared import VARIES, axis_weights, node_weight
 
 CHANGES = (*VARIES, "places", "room", "slots", "touched_nodes", "last", "chunk", "iterations")

@@ -1,9 +1,7 @@
 """Stiffness-proportional damping as a Triton function; the reference is :mod:`~gaussian_swaying.mpm.damping`."""
 
-import triton
-import triton.language as tl  # noqa: F401  (Triton's interpreter needs it)
-
 from gaussian_swaying.geometry.linalg_triton import axpy9, matmul, scale9, transpose
+from gaussian_swaying.kernels.language import tl, triton
 
 
 @triton.jit

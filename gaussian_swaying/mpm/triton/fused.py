@@ -7,7 +7,6 @@ reference. Each formulation has a subclass of :class:`Fused`.
 from __future__ import annotations
 
 import math
-import os
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
@@ -18,6 +17,8 @@ import torch
 from torch import Tensor
 
 from gaussian_swaying._graphs import Repeater, fingerprint
+from gaussian_swaying.kernels.language import INTERPRETED
+from gaussian_swaying.kernels.launch import call, compiles
 from gaussian_swaying.mpm.body import Body
 from gaussian_swaying.mpm.forces import MOST_STEPS, Force, added, divide, split, tensors_of
 from gaussian_swaying.mpm.formulations.formulation import Formulation
@@ -33,8 +34,6 @@ MAX_STEPS = MOST_STEPS
 
 MAX_INDEX = 2**31
 """Number of entries of a buffer that the kernels can address, with 32-bit indices."""
-
-INTERPRETED = os.environ.get("TRITON_INTERPRET") == "1"
 
 
 @dataclass(frozen=True)
@@ -131,8 +130,9 @@ class Fused(ABC):
             interpret: Whether Triton's interpreter, if it is on, may run them on a CPU.
         """
         points = bound.body.points
-        if not (points.position.is_cuda or (INTERPRETED and interpret)):
-            return "it needs a CUDA device"
+        device = points.position.device.type
+        if not compiles(device) or (INTERPRETED and not interpret):
+            return "it needs a CUDA device" if device != "cpu" else "llvmlite is not installed"
         if points.position.dtype != torch.float32:
             return f"it computes in float32, but the material is {points.position.dtype}".replace("torch.", "")
         if bound.settings.deterministic and not cls.fixed_order:
@@ -150,6 +150,11 @@ class Fused(ABC):
     def recordable(self) -> bool:
         """True if substeps can be recorded in a CUDA graph."""
         return all(boundary.recordable for boundary in self.body.boundaries)
+
+    @property
+    @abstractmethod
+    def launches(self) -> bool:
+        """True if a substep without forces in torch consists of launches alone."""
 
     def holds(self) -> bool:
         """True if buffers and graphs are still valid: nothing that they were made from was replaced."""
@@ -356,9 +361,10 @@ class Fused(ABC):
         def several(count: int) -> None:
             for offset in range(count):
                 body(offset)
-            self.first_step.add_(count)
+            call(lambda: self.first_step.add_(count), self.device)
 
-        self.repeater.run(steps, (key, self.places(), self._asked_key()), several, self.recordable)
+        whole = (key, self.places(), self._asked_key())
+        self.repeater.run(steps, whole, several, self.recordable, self.launches and not self.asked)
 
 
 @contextmanager

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any
 import torch
 from torch import Tensor
 
+from gaussian_swaying.kernels.launch import launch
 from gaussian_swaying.mpm.contact.solve import PUSH, PUSH_CELLS, SLACK
 from gaussian_swaying.mpm.contact.stage import TOLERANCE, ContactStage
 from gaussian_swaying.mpm.triton import contact_kernels as kernels
@@ -207,28 +208,28 @@ class FusedContact:
         strides = (ny * nz, nz, 1 / dx)
         now = (schedule, first_step, offset, *strides)
         where = (self.fields, self.base, self.fraction, self.arm, self.rest)
-        launch: dict[str, Any] = {"ARMS": self.arms, "BLOCK": BLOCK, "TALL": TALL, **_LAUNCH}
+        options: dict[str, Any] = {"ARMS": self.arms, "BLOCK": BLOCK, "TALL": TALL, **_LAUNCH}
         if self.programs > 1:
-            launch["launch_cooperative_grid"] = True
+            options["launch_cooperative_grid"] = True
         if pairs:
             chunk = -(-(self.last + 1) // self.programs)
-            list_kernels.contact_lists[(self.programs,)](
+            launch(list_kernels.contact_lists, (self.programs,))(
                 self.active, self.carries, self.before, len(self.active), *where, self.places,
                 self.now, self.counts, self.start, self.rank, self.item, self.ordered, self.sorted, self.candidates,
                 self.near, self.room, self.many, self.impulse, self.entry_start, self.entry_place, self.reached,
                 len(self.touched), self.peak, self.sums, self.gate, self.status, self.margin, *now, stage.reach,
                 stage.apart, SLACK * dx, LEAST_MARGIN * dx, AHEAD, self.last, -(-chunk // BLOCK) * BLOCK,
-                WIDE=WIDE_SEARCH, **launch,
+                WIDE=WIDE_SEARCH, **options,
             )  # fmt: skip
         if walls:
-            list_kernels.contact_positions[(-(-self.places // BLOCK),)](
+            launch(list_kernels.contact_positions, (-(-self.places // BLOCK),))(
                 *where, self.places, self.position, self.moving, self.status, *strides,
                 ARMS=self.arms, BLOCK=BLOCK, num_warps=8,
             )  # fmt: skip
             for k, (solid, (_, obstacle)) in enumerate(zip(self.solids, stage.obstacles, strict=True)):
                 if solid is not None:
                     solid.prepare(time, dt, 1)
-                    obstacle_kernels.obstacle_places[(-(-self.places // BLOCK),)](
+                    launch(obstacle_kernels.obstacle_places, (-(-self.places // BLOCK),))(
                         self.position, self.moving, self.thickness, self.wall_gap[k], self.wall_normal[k],
                         self.wall_drive[k], self.wall_valid[k], self.within, self.places, solid.rows, solid.windows,
                         solid.poses, solid.tables.buffer, time, dt, SLACK * dx, SOLIDS=solid.twins,
@@ -241,14 +242,14 @@ class FusedContact:
                 self.wall_drive[k].copy_(drive)
                 self.wall_valid[k].copy_(obstacle.active(time).expand(self.places))
                 self.within.fill_(1)
-        kernels.contact_solve[(self.programs,)](
+        launch(kernels.contact_solve, (self.programs,))(
             *where, self.facing, self.radius, self.thickness, self.places, self.candidates, self.near, self.room,
             self.wall_gap, self.wall_normal, self.wall_drive, self.wall_valid, self.friction, self.pressed,
             self.pressed_sum, self.row, self.moving, self.many, self.other, self.data, self.slots, self.impulse,
             self.touched, self.entry_start, self.entry_place, self.entry_weight, self.reached, self.marked, self.total,
             len(self.touched), self.peak, self.gate, self.status, *now, stage.reach, SLACK * dx, PUSH,
             PUSH_CELLS * dx, TOLERANCE * dx, 0.0 if stage.contact is None else stage.contact.friction,
-            stage.iterations, PAIRS=pairs, WALLS=walls, WIDE=WIDE, **launch,
+            stage.iterations, PAIRS=pairs, WALLS=walls, WIDE=WIDE, **options,
         )  # fmt: skip
 
 

@@ -6,10 +6,11 @@ import math
 from typing import Any
 
 import torch
-import triton
 from torch import Tensor
 
 from gaussian_swaying._graphs import RECORDED
+from gaussian_swaying.kernels.language import triton
+from gaussian_swaying.kernels.launch import call, lanes, launch
 from gaussian_swaying.mpm.boundaries.pinned_points import PinnedPoints
 from gaussian_swaying.mpm.boundaries.pinned_region import PinnedRegion
 from gaussian_swaying.mpm.formulations.formulation import Formulation
@@ -73,7 +74,7 @@ class FusedTotal(Fused):
         )
         self.fields = torch.zeros(len(inverse), 8, device=self.device)
         self.displacement, self.velocity = self.fields[:, :4], self.fields[:, 4:]
-        self.lanes = _lanes(sizes)
+        self.lanes = lanes(self.device, _lanes(sizes))
         self._cut(sizes)
         nodes = (*points.position.shape[:-2], grid.node_count, 3)
         vector, matrix = points.position.shape, torch.Size((*points.position.shape, 3))
@@ -97,6 +98,11 @@ class FusedTotal(Fused):
         self._partial: dict[tuple[int, int, str], Tensor] = {}
         width = 8 if self.position else 4
         check_indices(max(8 * len(inverse), 27 * (self.pieces + 1) * width, 27 * len(active)))
+
+    @property
+    def launches(self) -> bool:
+        """True if the kernels apply all boundaries."""
+        return self.plain and (self.touching is None or None not in self.touching.solids)
 
     def _take_pins(self) -> None:
         """Collect the nodes and points that pins without a time window hold."""
@@ -145,8 +151,9 @@ class FusedTotal(Fused):
 
     def join_pieces(self, pieces: Tensor, cells: Tensor, width: int) -> None:
         """Add the sums of the pieces of each cell."""
-        kernels.total_pieces[(-(-self.cells // 8), 27)](
-            pieces, cells, self.first_piece, self.cells, self.pieces, WIDTH=width, BLOCK=8, num_warps=1
+        block = lanes(self.device, 8, 1)
+        launch(kernels.total_pieces, (-(-self.cells // block), 27))(
+            pieces, cells, self.first_piece, self.cells, self.pieces, WIDTH=width, BLOCK=block, num_warps=1
         )
 
     def _run(self, state: MPMState, part: Part) -> dict[str, Any]:
@@ -183,7 +190,7 @@ class FusedTotal(Fused):
             self.repeat(mark - done, same, lambda offset: self.substep(offset, options))
             done = mark
             if mark in part.looks:
-                self.repeater.run(1, "look", lambda _: self._look())
+                self.repeater.run(1, "look", lambda _: self._look(), launches=True)
         if self.count > RECORDED:
             found = torch.empty(self.room, device=self.device)
             self._read(found, part)
@@ -193,8 +200,8 @@ class FusedTotal(Fused):
 
     def _look(self) -> None:
         _, ny, nz = self.grid.resolution
-        block = 128
-        kernels.total_look[(-(-self.count // block),)](
+        block = lanes(self.device, 128)
+        launch(kernels.total_look, (-(-self.count // block),))(
             self.fraction, self.material, self.count, self.particle_cell, self.cell_node, self.fields, self.speed,
             ny * nz, nz, 1 / self.grid.dx, WAVE=self.wave, BLOCK=block, num_warps=4,
         )  # fmt: skip
@@ -206,8 +213,8 @@ class FusedTotal(Fused):
         width = 8 if self.position else 4
         partial = self.sums(self.pieces, width)
         _, ny, nz = self.grid.resolution
-        per_program = max(1, 32 // self.lanes)
-        kernels.total_particles[(-(-self.pieces // per_program),)](
+        per_program = lanes(self.device, max(1, 32 // self.lanes), 1)
+        launch(kernels.total_particles, (-(-self.pieces // per_program),))(
             self.fraction, self.material, self.law, self.law_table, self.values, self.force_in, self.load, self.order,
             self.count, self.piece_start, self.piece_node, self.piece_scene, self.pieces,
             self.fields, partial,
@@ -220,10 +227,10 @@ class FusedTotal(Fused):
         if self.pieces > self.cells:
             pieces, partial = partial, self.sums(self.cells, width)
             self.join_pieces(pieces, partial, width)
-        block = 64
+        block = lanes(self.device, 64, 1)
         nodes, held = len(self.active), self.plain and any(self.bound.on_nodes)
         moves = self.plain and self.touching is None
-        kernels.total_nodes[(-(-nodes // block),)](
+        launch(kernels.total_nodes, (-(-nodes // block),))(
             self.active, self.source, len(self.source), self.inverse_mass, self.held, nodes, partial,
             self.fields, self.shift, self.schedule, self.first_step, offset, *self.gravity, self.taken,
             IMPLICIT=options["IMPLICIT"], POSITION=self.position, WIDTH=width,
@@ -233,7 +240,7 @@ class FusedTotal(Fused):
         if self.touching is not None:
             self.touching.apply(self.schedule, self.first_step, offset, self.time, self.dt)
         if self.plain and not moves:
-            kernels.total_end[(-(-nodes // block),)](
+            launch(kernels.total_end, (-(-nodes // block),))(
                 self.active, self.inverse_mass, self.held, nodes, self.fields, self.schedule, self.first_step, offset,
                 self.taken, HELD=held, BLOCK=block, num_warps=4,
             )  # fmt: skip
@@ -242,18 +249,18 @@ class FusedTotal(Fused):
         if not self.plain:
             self._constrain()
         if not self.plain or self.asked or (self.touching is not None and self.touching.walls):
-            self.time.add_(self.dt)
+            call(lambda: self.time.add_(self.dt), self.device)
 
     def _hold_points(self, points: DenseHolds, offset: int) -> None:
         """Stop the held points: their velocities, then those of the nodes around them."""
-        rows, block = points.node.shape[1], 4
-        kernels.total_rows[(-(-rows // block),)](
+        rows, block = points.node.shape[1], lanes(self.device, 4, 1)
+        launch(kernels.total_rows, (-(-rows // block),))(
             points.node, points.weight, rows, self.fields, self.residual, BLOCK=block, num_warps=1
         )
-        nodes, block = len(points.affected), 8
-        kernels.total_hold[(-(-nodes // block),)](
+        nodes, block = len(points.affected), lanes(self.device, 8, 1)
+        launch(kernels.total_hold, (-(-nodes // block),))(
             points.affected, points.scene, points.push, self.residual, nodes, points.push.shape[1], self.fields,
-            self.schedule, self.first_step, offset, BLOCK=block, ROWS=64, num_warps=2,
+            self.schedule, self.first_step, offset, BLOCK=block, ROWS=lanes(self.device, 64), num_warps=2,
         )  # fmt: skip
 
     def _impulse(self) -> Tensor:
@@ -323,8 +330,8 @@ class FusedTotal(Fused):
     ) -> None:
         """Compute the particle fields from the nodes, and complete the work of forces that acted for ``kick``."""
         _, ny, nz = self.grid.resolution
-        block = 128
-        kernels.total_read[(-(-self.count // block),)](
+        block = lanes(self.device, 128)
+        launch(kernels.total_read, (-(-self.count // block),))(
             self.fraction, self.load, self.order, self.rest, self.count, self.particle_cell, self.cell_node,
             self.fields, kick, position, velocity, affine, F,
             ny * nz, nz, 1 / self.grid.dx,

@@ -8,6 +8,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from gaussian_swaying.kernels.launch import call, lanes, launch
 from gaussian_swaying.mpm.body import Held
 from gaussian_swaying.mpm.formulations.formulation import Formulation
 from gaussian_swaying.mpm.state import GridSpec, MPMState
@@ -63,6 +64,11 @@ class FusedUpdated(Fused):
             self.moving = torch.zeros(rows, self.count, device=self.device)
             self.spare = (self.moving[:0],) * 3  # for a sort: rows, order, work
             self.repeater.forget()
+
+    @property
+    def launches(self) -> bool:
+        """True if no boundary acts in torch."""
+        return not self._acting
 
     def _take_grid(self, grid: GridSpec, width: int) -> None:
         """Allocate buffers for a grid, and drop the graphs of another one."""
@@ -136,7 +142,7 @@ class FusedUpdated(Fused):
 
     def _sort(self) -> None:
         """Sort the rows of the particles by cell: count those of each cell, and move each to its place."""
-        grid, block = self.grid, 128
+        grid, block = self.grid, lanes(self.device, 128)
         nx, ny, nz = grid.resolution
         cells = self.scenes * (nx + 1) * (ny + 1) * (nz + 1)
         if len(self.filled) < cells:
@@ -145,11 +151,11 @@ class FusedUpdated(Fused):
             self.spare = torch.zeros_like(self.moving), torch.zeros_like(self.order), torch.zeros_like(self.load[0])
         filled, (cell, rank) = self.filled[:cells].zero_(), self.place
         programs = (-(-self.count // block),)
-        kernels.updated_count[programs](
+        launch(kernels.updated_count, programs)(
             self.moving, self.order, self.count, *grid.offset, *grid.resolution, grid.dx, self.particles, filled, cell,
             rank, BLOCK=block, num_warps=4,
         )  # fmt: skip
-        kernels.updated_sort[programs](
+        launch(kernels.updated_sort, programs)(
             self.moving, self.order, self.load[0], self.count, cell, rank, filled.cumsum(0, dtype=torch.int32),
             *self.spare, ROWS=len(self.moving), BLOCK=block, num_warps=4,
         )  # fmt: skip
@@ -168,10 +174,10 @@ class FusedUpdated(Fused):
         if self.scenes > 1:
             key = key + self.scene * ((nx + 1) * (ny + 1) * (nz + 1))
         self.order.copy_(torch.argsort(key))
-        block = 128
+        block = lanes(self.device, 128)
         programs = (-(-self.count // block),)
         internal = state.internal is not None
-        kernels.updated_load[programs](
+        launch(kernels.updated_load, programs)(
             self.order, state.position.contiguous(), state.velocity.contiguous(), state.affine.contiguous(),
             state.F_elastic.contiguous(), state.F_total.contiguous(), state.lost.contiguous(),
             state.internal.contiguous() if state.internal is not None else self.load, self.constants, self.moving,
@@ -185,8 +191,8 @@ class FusedUpdated(Fused):
         self.repeat(steps, key, lambda offset: self.substep(offset, options))
 
     def _look(self) -> None:
-        block = 128
-        kernels.updated_look[(-(-self.count // block),)](
+        block = lanes(self.device, 128)
+        launch(kernels.updated_look, (-(-self.count // block),))(
             self.moving, self.count, self.speed, WAVE=self.wave, BLOCK=block, num_warps=4
         )
 
@@ -202,7 +208,7 @@ class FusedUpdated(Fused):
 
     def _particles(self, offset: int, options: dict[str, Any], gather: bool, scatter: bool) -> None:
         grid, settings = self.grid, self.settings
-        kernels.updated_particles[(-(-self.count // 32),)](
+        launch(kernels.updated_particles, (-(-self.count // 32),))(
             self.moving, self.order, self.load, self.count,
             self.momentum, self.velocity, self.schedule, self.vectors, self.scenes, self.tables.buffer,
             self.first_step, offset, self.law_table, self.force_in, *grid.offset, *grid.resolution, grid.dx,
@@ -213,9 +219,9 @@ class FusedUpdated(Fused):
 
     def _nodes(self, offset: int, options: dict[str, Any]) -> None:
         nodes = self.grid.node_count * self.scenes
-        block = 256
+        block = lanes(self.device, 256)
         acting, (_, ny, nz), solids = self._acting, self.grid.resolution, self.solids
-        kernels.updated_nodes[(-(-nodes // block),)](
+        launch(kernels.updated_nodes, (-(-nodes // block),))(
             self.momentum, self.velocity, self.inverse_mass, nodes, self.schedule, self.first_step, offset,
             *self.gravity, solids.rows, solids.windows, solids.poses, solids.tables.buffer, self.clock,
             self.impulse, *self.grid.offset, ny, nz, self.grid.dx,
@@ -226,7 +232,7 @@ class FusedUpdated(Fused):
         if acting:
             self._constrain()
         if acting or self.asked:
-            self.time.add_(self.dt)
+            call(lambda: self.time.add_(self.dt), self.device)
 
     def _constrain(self) -> None:
         """Boundary conditions on the velocities of the nodes."""
@@ -248,8 +254,8 @@ class FusedUpdated(Fused):
         grid, mass = self.grid, held.mass_at(self.time)
         nodes = grid.node_count * self.scenes
         weight = self.weight[:nodes].zero_()
-        block = 128
-        kernels.pin_mass[(-(-self.count // block),)](
+        block = lanes(self.device, 128)
+        launch(kernels.pin_mass, (-(-self.count // block),))(
             self.moving, self.order, mass.contiguous(), weight, self.count, *grid.offset, *grid.resolution, grid.dx,
             self.particles, BLOCK=block, num_warps=4,
         )  # fmt: skip
@@ -275,8 +281,8 @@ class FusedUpdated(Fused):
         internal: Tensor | None,
     ) -> dict[str, Any]:
         """The rows of the particles as fields of the state."""
-        block = 128
-        kernels.updated_read[(-(-self.count // block),)](
+        block = lanes(self.device, 128)
+        launch(kernels.updated_read, (-(-self.count // block),))(
             self.order, self.moving, self.count, position, velocity, affine, F, F_total, lost,
             self.load if internal is None else internal,
             PLASTIC=self.plastic, INTERNAL=internal is not None, BLOCK=block, num_warps=4,

@@ -1,9 +1,7 @@
 """Kernels that measure a state: energy and wave speed."""
 
-import triton
-import triton.language as tl
-
 from gaussian_swaying.geometry.linalg_triton import load3, load9
+from gaussian_swaying.kernels.language import tl, triton
 from gaussian_swaying.mpm.triton.shared import VARIES, keep_largest, wave_speed
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from gaussian_swaying.kernels.launch import lanes, launch
 from gaussian_swaying.mpm.body import Body
 from gaussian_swaying.mpm.formulations.formulation import Formulation
 from gaussian_swaying.mpm.laws.triton.functions import shared
@@ -19,10 +20,10 @@ def largest_speed(bound: Formulation, state: MPMState) -> Tensor | None:
     if wave is None:
         return None
     out = torch.zeros(1, device=points.position.device)
-    count, block = points.mass.numel(), 128
+    count, block = points.mass.numel(), lanes(out.device, 128)
     density = points.mass / points.volume
     with torch.cuda.device_of(out):
-        kernels.largest_speed[(-(-count // block),)](
+        launch(kernels.largest_speed, (-(-count // block),))(
             state.F_elastic.contiguous(), density.contiguous(), laws.mu.contiguous(), laws.lam.contiguous(),
             state.velocity.contiguous(), out, count, WAVE=wave, SPATIAL=spatial, BLOCK=block, num_warps=4,
         )  # fmt: skip
@@ -35,9 +36,9 @@ def elastic_energy(body: Body, F: Tensor) -> Tensor | None:
     if energy is None:
         return None
     out = torch.empty(F.shape[:-2], device=F.device)
-    block = 128
+    block = lanes(out.device, 128)
     with torch.cuda.device_of(out):
-        kernels.elastic_energy[(-(-out.numel() // block),)](
+        launch(kernels.elastic_energy, (-(-out.numel() // block),))(
             F.contiguous(), body.laws.mu.contiguous(), body.laws.lam.contiguous(), out, out.numel(), ENERGY=energy,
             BLOCK=block, num_warps=4,
         )  # fmt: skip

@@ -7,10 +7,8 @@ of the centre (3), rotation (9), and the velocity of what is at an offset from t
 of the centre (3).
 """
 
-import triton
-import triton.language as tl
-
 from gaussian_swaying.geometry.linalg_triton import dot3, matmul, matvec, read, transpose
+from gaussian_swaying.kernels.language import tl, triton
 from gaussian_swaying.mpm.triton.shared import VARIES
 
 ROW, KEY, POSE = tl.constexpr(4), tl.constexpr(7), tl.constexpr(24)

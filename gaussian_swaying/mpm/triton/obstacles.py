@@ -7,6 +7,7 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
+from gaussian_swaying.kernels.launch import launch
 from gaussian_swaying.mpm.boundaries.boundary import Boundary
 from gaussian_swaying.mpm.boundaries.obstacle import Obstacle
 from gaussian_swaying.mpm.boundaries.plane import KINDS, Plane
@@ -88,4 +89,6 @@ class Solids:
         """
         if any(self.moves):
             count = len(self.parts)
-            kernels.obstacle_poses[(steps, count)](self.keys, self.spans, time, dt, self.poses, count, num_warps=1)
+            launch(kernels.obstacle_poses, (steps, count))(
+                self.keys, self.spans, time, dt, self.poses, count, num_warps=1
+            )

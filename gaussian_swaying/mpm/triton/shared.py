@@ -5,10 +5,8 @@ of :mod:`~gaussian_swaying.mpm.formulations`; the kernels follow them and are te
 stay loops in Triton's intermediate code: if they are unrolled, its passes take minutes.
 """
 
-import triton
-import triton.language as tl
-
 from gaussian_swaying.geometry.linalg_triton import largest, largest_eigenvalue, load3, matmul, read, transpose
+from gaussian_swaying.kernels.language import tl, triton
 
 SCHEDULE = 4
 """Columns of the schedule, a row per substep: how long forces act [s], the substep [s], the decay of velocities.

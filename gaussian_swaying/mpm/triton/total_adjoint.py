@@ -12,9 +12,10 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import torch
-import triton
 from torch import Tensor
 
+from gaussian_swaying.kernels.language import triton
+from gaussian_swaying.kernels.launch import launch
 from gaussian_swaying.mpm.forces import Force, tensors_of
 from gaussian_swaying.mpm.formulations.formulation import Formulation
 from gaussian_swaying.mpm.state import MPMState
@@ -276,12 +277,12 @@ class TotalAdjoint:
 
     def _keep(self, offset: int, asked: _Pass) -> None:
         fused, block = self.fused, 512
-        kernels.keep_nodes[(triton.cdiv(8 * self.nodes, block),)](
+        launch(kernels.keep_nodes, (triton.cdiv(8 * self.nodes, block),))(
             fused.active, self.nodes, fused.fields, self.history, fused.first_step, offset, BLOCK=block, num_warps=4
         )
         if asked.flags["WEIGHTS"]:
             rows = len(self.residual)
-            kernels.keep_rows[(triton.cdiv(4 * rows, block),)](
+            launch(kernels.keep_rows, (triton.cdiv(4 * rows, block),))(
                 fused.residual, rows, self.row_history, fused.first_step, offset, BLOCK=block, num_warps=4
             )
 
@@ -293,12 +294,12 @@ class TotalAdjoint:
             return
         self._nodes(offset, asked, SUM=True, PUSH=True, FINISH=False)
         nodes, rows = len(self.affected), self.push.shape[0]
-        kernels.rows_adjoint[(len(self.residual),)](
+        launch(kernels.rows_adjoint, (len(self.residual),))(
             self.affected, self.scene, self.push, self.bars, self.residual, nodes, rows,
             BLOCK=min(1024, triton.next_power_of_2(nodes)), num_warps=4,
         )  # fmt: skip
         block = 8
-        kernels.hold_adjoint[(triton.cdiv(nodes, block),)](
+        launch(kernels.hold_adjoint, (triton.cdiv(nodes, block),))(
             self.affected, self.scene, self.weight, self.residual, nodes, rows, self.bars,
             self.weight_bar, self.multipliers, len(self.residual), fused.inverse_mass, self.history, self.nodes,
             fused.first_step, offset, self.last, WEIGHTS=asked.flags["WEIGHTS"], BLOCK=block, ROWS=64, num_warps=2,
@@ -307,7 +308,7 @@ class TotalAdjoint:
 
     def _nodes(self, offset: int, asked: _Pass, **stages: bool) -> None:
         fused, block = self.fused, 64
-        kernels.nodes_adjoint[(triton.cdiv(self.nodes, block),)](
+        launch(kernels.nodes_adjoint, (triton.cdiv(self.nodes, block),))(
             fused.active, fused.source, len(fused.source), fused.inverse_mass, fused.held, self.nodes, asked.partial,
             fused.fields, self.force_bar, self.history, self.bars, self.mass_bar,
             fused.schedule, fused.first_step, offset, self.last, *fused.gravity,
@@ -321,7 +322,7 @@ class TotalAdjoint:
         _, ny, nz = fused.grid.resolution
         cut = fused.pieces > fused.cells
         to = fused.sums(fused.pieces, asked.width, "adjoint pieces") if cut else asked.partial
-        kernels.particles_adjoint[(triton.cdiv(fused.pieces, per_program),)](
+        launch(kernels.particles_adjoint, (triton.cdiv(fused.pieces, per_program),))(
             fused.fraction, fused.material, fused.law, fused.law_table, fused.values, fused.count,
             fused.piece_start, fused.piece_node, fused.piece_scene, fused.pieces,
             fused.fields, self.force_bar, to, self.found, self.shares,

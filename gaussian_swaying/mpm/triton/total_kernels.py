@@ -9,10 +9,8 @@ Rows of node arrays: displacement and velocity, each in four columns of eight, a
 columns, or eight if boundaries need positions.
 """
 
-import triton
-import triton.language as tl
-
 from gaussian_swaying.geometry.linalg_triton import axpy9, load3, scale9
+from gaussian_swaying.kernels.language import tl, triton
 from gaussian_swaying.mpm.laws.triton.body import ROW, pk1
 from gaussian_swaying.mpm.triton.damping import kelvin_voigt_pk1
 from gaussian_swaying.mpm.triton.shared import (

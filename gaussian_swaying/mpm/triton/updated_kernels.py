@@ -8,10 +8,8 @@ Rows of node arrays: velocity, or momentum and mass, in four columns. The sums a
 drag.
 """
 
-import triton
-import triton.language as tl
-
 from gaussian_swaying.geometry.linalg_triton import axpy9, load3, load9, matmul, scale9, store3, store9, transpose
+from gaussian_swaying.kernels.language import tl, triton
 from gaussian_swaying.mpm.laws.triton.body import ROW, kirchhoff
 from gaussian_swaying.mpm.triton.damping import kelvin_voigt_pk1
 from gaussian_swaying.mpm.triton.obstacle_kernels import POSE, acts, stop_nodes

@@ -10,10 +10,8 @@ import hashlib
 from collections.abc import Sequence
 from typing import Any
 
-import triton
-import triton.language as tl
-
 from gaussian_swaying.geometry.linalg_triton import scaled_product, svd3, where3, where9
+from gaussian_swaying.kernels.language import tl, triton
 from gaussian_swaying.mpm.laws.law import ConstitutiveLaw
 from gaussian_swaying.mpm.laws.triton.functions import LawFunctions
 from gaussian_swaying.mpm.twins import Twin, device_key

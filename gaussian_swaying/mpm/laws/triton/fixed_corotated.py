@@ -1,8 +1,5 @@
 """Fixed corotated elasticity."""
 
-import triton
-import triton.language as tl  # noqa: F401  (Triton's interpreter looks for it)
-
 from gaussian_swaying.geometry.linalg_triton import (
     axpy9,
     cofactor,
@@ -16,6 +13,7 @@ from gaussian_swaying.geometry.linalg_triton import (
     square9,
     transpose,
 )
+from gaussian_swaying.kernels.language import tl, triton
 from gaussian_swaying.mpm.laws.triton.functions import LawFunctions
 
 

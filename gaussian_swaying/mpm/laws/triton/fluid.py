@@ -1,9 +1,7 @@
 """A weakly compressible fluid."""
 
-import triton
-import triton.language as tl
-
 from gaussian_swaying.geometry.linalg_triton import cofactor
+from gaussian_swaying.kernels.language import tl, triton
 from gaussian_swaying.mpm.laws.shared import FLUID_LIMIT
 from gaussian_swaying.mpm.laws.triton.functions import LawFunctions
 from gaussian_swaying.mpm.laws.triton.shared import LOG_FLOOR

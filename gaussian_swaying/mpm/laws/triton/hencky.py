@@ -1,9 +1,7 @@
 """Hencky elasticity, the base of the plastic solids."""
 
-import triton
-import triton.language as tl
-
 from gaussian_swaying.geometry.linalg_triton import dot3, svd3
+from gaussian_swaying.kernels.language import tl, triton
 from gaussian_swaying.mpm.laws.triton.functions import LawFunctions
 from gaussian_swaying.mpm.laws.triton.shared import (
     EPSILON,

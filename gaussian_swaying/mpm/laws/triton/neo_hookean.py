@@ -1,9 +1,7 @@
 """Neo-Hookean elasticity."""
 
-import triton
-import triton.language as tl
-
 from gaussian_swaying.geometry.linalg_triton import axpy9, cofactor, cofactor_change, dot9, matmul, transpose
+from gaussian_swaying.kernels.language import tl, triton
 from gaussian_swaying.mpm.laws.triton.functions import LawFunctions
 from gaussian_swaying.mpm.laws.triton.shared import LOG_FLOOR, log
 

@@ -1,9 +1,7 @@
 """Dry sand."""
 
-import triton
-import triton.language as tl
-
 from gaussian_swaying.geometry.linalg_triton import where3
+from gaussian_swaying.kernels.language import tl, triton
 from gaussian_swaying.mpm.laws.triton.functions import LawFunctions
 from gaussian_swaying.mpm.laws.triton.hencky import energy, principal, wave
 from gaussian_swaying.mpm.laws.triton.shared import drawn_back, log, split_strain

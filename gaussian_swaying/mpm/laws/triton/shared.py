@@ -2,10 +2,8 @@
 
 import math
 
-import triton
-import triton.language as tl
-
 from gaussian_swaying.geometry.linalg_triton import dot3, largest, largest_eigenvalue, matmul, transpose
+from gaussian_swaying.kernels.language import tl, triton
 from gaussian_swaying.mpm.laws.shared import LOG_LIMIT
 from gaussian_swaying.mpm.laws.shared import ROOT as _ROOT
 

@@ -1,9 +1,7 @@
 """Snow."""
 
-import triton
-import triton.language as tl
-
 from gaussian_swaying.geometry.linalg_triton import clamp
+from gaussian_swaying.kernels.language import tl, triton
 from gaussian_swaying.mpm.laws.shared import SNOW_RANGE
 from gaussian_swaying.mpm.laws.triton.fixed_corotated import corotated_stress
 from gaussian_swaying.mpm.laws.triton.functions import LawFunctions

@@ -1,0 +1,395 @@
+"""Compiles kernels for this processor, keeps them on disk, and runs their programs in threads.
+
+A launch runs all programs of a kernel; the threads take equal shares of them and wait for each other at its end, so a
+launch sees what the one before has written. A program does not depend on the others unless it says so by an atomic
+operation, so the results do not depend on the number of threads.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import hashlib
+import os
+import threading
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from functools import cache, lru_cache
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from gaussian_swaying._files import atomic
+
+_KINDS = {
+    torch.float32: "*f32", torch.float64: "*f64", torch.int32: "*i32", torch.int64: "*i64", torch.int8: "*i8",
+    torch.uint8: "*i8", torch.bool: "*i1",
+}  # fmt: skip
+
+_ROW = 6
+"""Entries of a launch in a recording: address of the kernel, of its arguments, number of its programs, number of shares
+into which they are cut, shares that a thread has taken, and shares that are done."""
+
+# Runs the launches of a recording in one of several threads. Each takes the next share of a launch until there is none,
+# and waits until all shares are done; a thread that the system lets wait delays the others by its one share at most.
+_RUN = """
+define void @run(ptr %rows, i64 %launches, ptr %pause) {
+start:
+  br label %launch
+launch:
+  %k = phi i64 [0, %start], [%following, %done]
+  %more = icmp slt i64 %k, %launches
+  br i1 %more, label %read, label %end
+read:
+  %at = mul i64 %k, 6
+  %row = getelementptr i64, ptr %rows, i64 %at
+  %arguments.at = getelementptr i64, ptr %row, i64 1
+  %programs.at = getelementptr i64, ptr %row, i64 2
+  %shares.at = getelementptr i64, ptr %row, i64 3
+  %taken.at = getelementptr i64, ptr %row, i64 4
+  %done.at = getelementptr i64, ptr %row, i64 5
+  %kernel = load ptr, ptr %row
+  %arguments = load ptr, ptr %arguments.at
+  %programs = load i64, ptr %programs.at
+  %shares = load i64, ptr %shares.at
+  br label %take
+take:
+  %share = atomicrmw add ptr %taken.at, i64 1 acq_rel
+  %left = icmp slt i64 %share, %shares
+  br i1 %left, label %work, label %wait
+work:
+  %next = add i64 %share, 1
+  %a = mul i64 %programs, %share
+  %first = sdiv i64 %a, %shares
+  %b = mul i64 %programs, %next
+  %last = sdiv i64 %b, %shares
+  call void %kernel(ptr %arguments, i64 %first, i64 %last)
+  %before = atomicrmw add ptr %done.at, i64 1 acq_rel
+  br label %take
+wait:
+  %spins = phi i64 [1, %take], [%spun, %again]
+  %finished = load atomic i64, ptr %done.at acquire, align 8
+  %all = icmp sge i64 %finished, %shares
+  br i1 %all, label %done, label %rest
+rest:
+  %spun = add i64 %spins, 1
+  %few = and i64 %spun, 255
+  %long = icmp eq i64 %few, 0
+  br i1 %long, label %yield, label %again
+yield:
+  %ignored = call i32 %pause()
+  br label %again
+again:
+  br label %wait
+done:
+  %following = add i64 %k, 1
+  br label %launch
+end:
+  ret void
+}
+"""
+
+
+@cache
+def _llvm() -> Any:
+    """The LLVM binding with the code generator of this processor."""
+    import llvmlite.binding as llvm
+
+    llvm.initialize_native_target()
+    llvm.initialize_native_asmprinter()
+    return llvm
+
+
+@cache
+def _machine() -> Any:
+    llvm = _llvm()
+    return llvm.Target.from_default_triple().create_target_machine(
+        cpu=llvm.get_host_cpu_name(), features=_features(), opt=3, reloc="pic", codemodel="default"
+    )
+
+
+@cache
+def _features() -> str:
+    return _llvm().get_host_cpu_features().flatten()
+
+
+@cache
+def _linker() -> Any:
+    return _llvm().create_lljit_compiler()
+
+
+@cache
+def _folder() -> Path:
+    """Folder of the compiled kernels: ``GAUSSIAN_SWAYING_CACHE``, or ``gaussian_swaying`` where caches are kept."""
+    given = os.environ.get("GAUSSIAN_SWAYING_CACHE")
+    base = os.environ.get("XDG_CACHE_HOME") or os.environ.get("LOCALAPPDATA") or Path.home() / ".cache"
+    return Path(given) if given else Path(base) / "gaussian_swaying"
+
+
+def _compiled(text: str) -> bytes:
+    """An object file from LLVM's text."""
+    llvm = _llvm()
+    module = llvm.parse_assembly(text)
+    module.verify()
+    options = llvm.create_pipeline_tuning_options(speed_level=3)
+    options.loop_vectorization = options.slp_vectorization = False  # blocks are vectors already
+    builder = llvm.create_pass_builder(_machine(), options)
+    builder.getModulePassManager().run(module, builder)
+    return _machine().emit_object(module)
+
+
+def _linked(code: bytes, symbol: str) -> tuple[int, Any]:
+    """The address of a function of an object file, and what keeps it in memory."""
+    llvm = _llvm()
+    name = f"kernel{len(_LINKED)}"
+    library = llvm.JITLibraryBuilder().add_object_img(code).add_current_process().export_symbol(symbol)
+    tracker = library.link(_linker(), name)
+    _LINKED.append(tracker)
+    return tracker[symbol], tracker
+
+
+_LINKED: list[Any] = []
+_COMPILED: dict[Any, int] = {}
+_COMPILING = threading.RLock()
+_said = False
+
+
+def _address(kernel: Any, constants: dict[str, Any], kinds: dict[str, str], real: str) -> int:
+    """The address of a compiled kernel: from memory, from disk, or compiled now."""
+    key = (kernel, tuple(constants.items()), tuple(kinds.values()), real)
+    address = _COMPILED.get(key)
+    if address is None:
+        with _COMPILING:
+            address = _COMPILED.get(key)
+            if address is None:
+                address = _COMPILED[key] = _found_or_compiled(kernel, constants, kinds, real)
+    return address
+
+
+def _found_or_compiled(kernel: Any, constants: dict[str, Any], kinds: dict[str, str], real: str) -> int:
+    from llvmlite import __version__
+
+    parts = (
+        _sources(), device_source(kernel), repr(sorted(constants.items(), key=lambda pair: pair[0])), kinds, real,
+        __version__, _llvm().llvm_version_info, _llvm().get_host_cpu_name(), _features(),
+    )  # fmt: skip
+    path = _folder() / f"{kernel.fn.__name__}_{hashlib.sha256(repr(parts).encode()).hexdigest()[:32]}.o"
+    try:
+        code = path.read_bytes()
+    except OSError:
+        from gaussian_swaying.kernels.translator import translate
+
+        _say()
+        code = _compiled(str(translate(kernel, constants, kinds, real)))
+        try:
+            path.parent.mkdir(parents=True, exist_ok=True)
+            with atomic(path) as temporary:
+                temporary.write_bytes(code)
+        except OSError:  # a read-only home folder: it is compiled again next time
+            pass
+    return _linked(code, "kernel")[0]
+
+
+def _say() -> None:
+    """Say once in a process that kernels are compiled."""
+    global _said
+    if not _said and os.environ.get("PYTEST_CURRENT_TEST") is None:
+        _said = True
+        print("Compiling the kernels of this simulation for the CPU, once; this takes some seconds.", flush=True)
+
+
+@cache
+def _sources() -> str:
+    """Changes with the source of the package's kernels, and of what translates them."""
+    root, digest = Path(__file__).parent.parent, hashlib.sha256()
+    for path in sorted([*root.rglob("*.py")]):
+        text = path.read_bytes()
+        if path.parent.name == "kernels" or b"kernels.language import" in text:
+            digest.update(text)
+    return digest.hexdigest()
+
+
+def device_source(function: Any) -> str:
+    """A key that changes with the source of a kernel or of a device function."""
+    return str(getattr(function, "cache_key", "")) + f"{function.fn.__module__}.{function.fn.__qualname__}"
+
+
+# ---- threads
+
+
+class _Crew:
+    """Threads that run a recording together with the thread that calls; they sleep in between."""
+
+    def __init__(self, threads: int) -> None:
+        address, _ = _linked(_compiled(_RUN), "run")
+        self._run = ctypes.CFUNCTYPE(None, ctypes.c_int64, ctypes.c_int64, ctypes.c_int64)(address)
+        self.threads = threads
+        self._begin = [threading.Semaphore(0) for _ in range(threads - 1)]
+        self._done = threading.Semaphore(0)
+        self._job = (0, 0, 0)
+        for k in range(threads - 1):
+            threading.Thread(target=self._work, args=(k,), daemon=True, name=f"kernels-{k + 1}").start()
+
+    def _work(self, k: int) -> None:
+        while True:
+            self._begin[k].acquire()
+            self._run(*self._job)
+            self._done.release()
+
+    def run(self, rows: Any, launches: int) -> None:
+        """Run the launches of a table."""
+        for k in range(launches):
+            rows[_ROW * k + 3] = 1 if self.threads == 1 else min(rows[_ROW * k + 2], _SHARES * self.threads)
+            rows[_ROW * k + 4] = rows[_ROW * k + 5] = 0
+        self._job = ctypes.addressof(rows), launches, _pause()
+        for semaphore in self._begin:
+            semaphore.release()
+        self._run(*self._job)
+        for _ in self._begin:
+            self._done.acquire()
+
+
+_SHARES = 4
+"""Shares of a launch for each thread."""
+
+
+@cache
+def _pause() -> int:
+    """The address of the function that lets other threads run."""
+    if os.name == "nt":
+        return ctypes.cast(ctypes.windll.kernel32.SwitchToThread, ctypes.c_void_p).value or 0  # type: ignore[attr-defined]
+    return ctypes.cast(ctypes.CDLL(None).sched_yield, ctypes.c_void_p).value or 0
+
+
+@lru_cache(maxsize=8)
+def _crew(threads: int, process: int) -> _Crew:
+    return _Crew(threads)
+
+
+_RUNNING = threading.Lock()
+
+
+def threads() -> int:
+    """Number of threads that run kernels: that of torch."""
+    return torch.get_num_threads()
+
+
+def _run_rows(rows: Any, launches: int) -> None:
+    with _RUNNING:
+        _crew(threads(), os.getpid()).run(rows, launches)
+
+
+# ---- launches
+
+
+class Recording:
+    """Launches, and functions between them, that can be run again; their tensors must stay where they are."""
+
+    def __init__(self) -> None:
+        self._parts: list[list[tuple[int, Any, int]] | Callable[[], object]] = []
+        self._held: list[Any] = []  # tensors and arguments that the launches refer to
+        self._rows: dict[int, Any] = {}
+
+    def add(self, address: int, arguments: Any, programs: int, tensors: Sequence[Tensor]) -> None:
+        """Append a launch."""
+        if not self._parts or not isinstance(self._parts[-1], list):
+            self._parts.append([])
+        self._parts[-1].append((address, arguments, programs))  # type: ignore[union-attr]
+        self._held.append((arguments, tensors))
+
+    def call(self, change: Callable[[], object]) -> None:
+        """Append a function."""
+        self._parts.append(change)
+
+    def replay(self) -> None:
+        """Run everything in order."""
+        for k, part in enumerate(self._parts):
+            if not isinstance(part, list):
+                part()
+                continue
+            if k not in self._rows:
+                words = [word for address, arguments, programs in part
+                         for word in (address, ctypes.addressof(arguments), programs, 0, 0, 0)]  # fmt: skip
+                self._rows[k] = (ctypes.c_int64 * len(words))(*words)
+            _run_rows(self._rows[k], len(part))
+
+    def reset(self) -> None:
+        """Give up the tensors."""
+        self._parts, self._held, self._rows = [], [], {}
+
+
+class _Current(threading.local):
+    recording: Recording | None = None
+
+
+_current = _Current()
+
+
+@contextmanager
+def recording() -> Iterator[Recording]:
+    """Within the block, launches of this thread and functions passed to :func:`call` are recorded while they run."""
+    outer, made = _current.recording, Recording()
+    _current.recording = made
+    try:
+        yield made
+    finally:
+        _current.recording = outer
+
+
+def call(change: Callable[[], object]) -> None:
+    """Call a function between launches, and note it if they are recorded."""
+    change()
+    if _current.recording is not None:
+        _current.recording.call(change)
+
+
+@lru_cache(maxsize=512)
+def _parameters(kernel: Any) -> tuple[tuple[str, ...], frozenset[str]]:
+    from gaussian_swaying.kernels.translator import _source
+
+    _, names, _, constant = _source(kernel)
+    return tuple(names), frozenset(constant)
+
+
+_GPU_ONLY = ("num_warps", "maxnreg", "launch_cooperative_grid", "num_stages")
+
+
+def launch(kernel: Any, grid: Sequence[int], *given: Any, **named: Any) -> None:
+    """Run the programs of a kernel on the CPU, or record them.
+
+    Args:
+        kernel: The kernel.
+        grid: Number of programs along each of up to three axes.
+        given: Its first arguments: contiguous tensors, numbers, constants.
+        named: Its other arguments; those that only a GPU needs are ignored.
+    """
+    names, constant = _parameters(kernel)
+    values = dict(zip(names, given, strict=False)) | {k: v for k, v in named.items() if k not in _GPU_ONLY}
+    constants = {name: value for name, value in values.items() if name in constant}
+    passed = {name: values[name] for name in names if name in values and name not in constant}
+    kinds, words, tensors = {}, [], []
+    real = "f32"
+    for name, value in passed.items():
+        if isinstance(value, Tensor):
+            kinds[name] = _KINDS[value.dtype]
+            words.append(value.data_ptr())
+            tensors.append(value)
+        elif isinstance(value, float):
+            kinds[name] = "f"
+            words.append(ctypes.c_int64.from_buffer(ctypes.c_double(value)).value)
+        else:
+            kinds[name] = "i" if -(2**31) <= value < 2**31 else "l"
+            words.append(int(value))
+    axes = (*grid, 1, 1)[:3]
+    programs = axes[0] * axes[1] * axes[2]
+    if programs == 0:
+        return
+    arguments = (ctypes.c_int64 * (3 + len(words)))(*axes, *words)
+    address = _address(kernel, constants, kinds, real)
+    if _current.recording is not None:
+        _current.recording.add(address, arguments, programs, tensors)
+    _run_rows((ctypes.c_int64 * _ROW)(address, ctypes.addressof(arguments), programs, 0, 0, 0), 1)
+
+
+__all__ = ["Recording", "call", "device_source", "launch", "recording", "threads"]

@@ -1,0 +1,99 @@
+"""Triton and its language for the kernel files; a stand-in that only declares where no GPU would run it.
+
+On a machine without a GPU, kernels are compiled by :mod:`~gaussian_swaying.kernels.translator`, which reads their
+source, so Triton need not be installed. Its interpreter (``TRITON_INTERPRET=1``) needs the real one.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import importlib.util
+import inspect
+import os
+from collections.abc import Callable
+from functools import cached_property
+from typing import Any
+
+import torch
+
+INTERPRETED = os.environ.get("TRITON_INTERPRET") == "1"
+"""Whether Triton's interpreter runs the kernels."""
+
+
+class Constant:
+    """As ``tl.constexpr``: a number that kernels use by its name."""
+
+    def __init__(self, value: Any) -> None:
+        self.value = value
+
+
+class Name:
+    """A name of the language, such as ``load`` or ``PropagateNan.ALL``, which only the translator understands."""
+
+    def __init__(self, name: str) -> None:
+        self.name = name
+
+    def __getattr__(self, name: str) -> Name:
+        if name.startswith("__"):
+            raise AttributeError(name)
+        return Name(f"{self.name}.{name}")
+
+
+class Function:
+    """A kernel or a device function: its Python function is its source."""
+
+    def __init__(self, fn: Callable[..., Any]) -> None:
+        self.fn = fn
+        self.__name__, self.__doc__, self.__module__ = fn.__name__, fn.__doc__, fn.__module__
+
+    @cached_property
+    def cache_key(self) -> str:
+        """Changes with the source."""
+        return hashlib.sha256(inspect.getsource(self.fn).encode()).hexdigest()
+
+    def __repr__(self) -> str:
+        return f"{self.__module__}.{self.__name__}"
+
+
+class Language:
+    """As ``triton.language``."""
+
+    constexpr = Constant
+
+    def __getattr__(self, name: str) -> Name:
+        if name.startswith("__"):
+            raise AttributeError(name)
+        return Name(name)
+
+
+class Compiler:
+    """As ``triton``, as far as kernel files and those that launch them need it."""
+
+    language = Language()
+
+    @staticmethod
+    def jit(fn: Callable[..., Any] | None = None, **_: Any) -> Any:
+        """Declare a kernel or a device function."""
+        return Function if fn is None else Function(fn)
+
+    @staticmethod
+    def cdiv(x: int, y: int) -> int:
+        """X / y, rounded up."""
+        return -(-x // y)
+
+    @staticmethod
+    def next_power_of_2(n: int) -> int:
+        """The smallest power of two that is not less than n."""
+        return 1 << max(n - 1, 0).bit_length()
+
+
+triton: Any
+tl: Any
+if (torch.cuda.is_available() or INTERPRETED) and importlib.util.find_spec("triton") is not None:
+    import triton  # type: ignore[no-redef]
+    import triton.language as tl  # type: ignore[no-redef]
+else:
+    triton = Compiler()
+    tl = triton.language
+
+__all__ = ["INTERPRETED", "Constant", "Function", "Language", "Name", "tl", "triton"]

@@ -1,0 +1,693 @@
+"""Translates kernels in Triton's language to LLVM, for a CPU.
+
+A kernel is read as Python source and carried out once, with blocks of numbers whose values are not known
+(:mod:`~gaussian_swaying.kernels.blocks`) and constants that are: constant conditions are decided, functions are
+expanded where they are called, short loops are unrolled. What is left are LLVM instructions. The language is the part
+of Triton that the kernels of this package use, with one addition: no block may have two axes that are longer than one.
+"""
+
+from __future__ import annotations
+
+import ast
+import builtins
+import inspect
+import textwrap
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import Any
+
+from llvmlite import ir
+
+from gaussian_swaying.kernels.blocks import ADDRESS, TYPES, Block, Emitter, Pointer, TranslationError, Value, is_number
+from gaussian_swaying.kernels.language import Name, tl
+
+UNROLLED = 4
+"""Longest loop of a constant length that is unrolled; the language's ``static_range`` always is."""
+
+_SIGNS = {
+    ast.Add: "+", ast.Sub: "-", ast.Mult: "*", ast.Div: "/", ast.FloorDiv: "//", ast.Mod: "%", ast.BitAnd: "&",
+    ast.BitOr: "|", ast.BitXor: "^", ast.LShift: "<<", ast.RShift: ">>",
+}  # fmt: skip
+_COMPARES = {ast.Lt: "<", ast.LtE: "<=", ast.Gt: ">", ast.GtE: ">=", ast.Eq: "==", ast.NotEq: "!="}
+_PYTHON = {"len": len, "float": float, "int": int, "min": min, "max": max, "bool": bool, "abs": abs}
+
+
+@dataclass
+class _Returned:
+    """The value that a function returns."""
+
+    value: Value
+
+
+class _Loop:
+    """A ``range`` of a loop that is not unrolled."""
+
+    def __init__(self, start: Value, end: Value, step: Value) -> None:
+        self.start, self.end, self.step = start, end, step
+
+
+Scope = dict[str, Value]
+
+
+def translate(kernel: Any, constants: dict[str, Any], arguments: dict[str, str], real: str) -> ir.Module:
+    """Return an LLVM module with a function ``kernel(arguments, first program, last program + 1)``.
+
+    ``arguments`` points to rows of eight bytes: the grid of programs (three integers), and the arguments: addresses,
+    integers and doubles.
+
+    Args:
+        kernel: The kernel.
+        constants: Its constant arguments.
+        arguments: The kinds of the others, in order: ``i`` and ``f`` for a number, ``*`` and a type for a pointer.
+        real: Type of floating point numbers: f32 or f64.
+
+    Raises:
+        TranslationError: If the kernel uses something that the translator does not know, with its line.
+    """
+    return _Translator(real).kernel(kernel, constants, arguments)
+
+
+class _Translator(Emitter):
+    def kernel(self, kernel: Any, constants: dict[str, Any], arguments: dict[str, str]) -> ir.Module:
+        number = TYPES["i64"]
+        kind = ir.FunctionType(ir.VoidType(), [ADDRESS, number, number])
+        function = ir.Function(self.module, kind, "kernel")
+        entry = function.append_basic_block("entry")
+        self.entry = ir.IRBuilder(entry)
+        start = function.append_basic_block("start")
+        self.builder = ir.IRBuilder(start)
+        rows, first, last = function.args
+        self._grid = [Block(self._slot(rows, k, number), "i64") for k in range(3)]
+        scope: Scope = {name: _plain(value) for name, value in constants.items()}
+        for k, (name, what) in enumerate(arguments.items()):
+            scope[name] = self._argument(rows, 3 + k, what)
+        before = self.builder.block
+        head = function.append_basic_block("program")
+        body = function.append_basic_block("body")
+        end = function.append_basic_block("end")
+        self.builder.branch(head)
+        self.builder.position_at_end(head)
+        program = self.builder.phi(number)
+        program.add_incoming(first, before)
+        self.builder.cbranch(self.builder.icmp_signed("<", program, last), body, end)
+        self.builder.position_at_end(body)
+        self._program = self._ids(program)
+        self._call(kernel, (), scope)
+        following = self.builder.add(program, number(1))
+        program.add_incoming(following, self.builder.block)
+        self.builder.branch(head)
+        self.builder.position_at_end(end)
+        self.builder.ret_void()
+        self.entry.branch(start)
+        return self.module
+
+    def _slot(self, rows: Any, k: int, kind: ir.Type) -> Any:
+        place = self.builder.gep(rows, [TYPES["i64"](k)], source_etype=TYPES["i64"])
+        return self.builder.load(place, typ=kind)
+
+    def _argument(self, rows: Any, k: int, what: str) -> Value:
+        if what[0] == "*":
+            return Pointer(self._slot(rows, k, ADDRESS), what[1:], self.constant(0, "i32"))
+        if what == "f":
+            return self.convert(Block(self._slot(rows, k, TYPES["f64"]), "f64"), self.real)
+        return self.convert(Block(self._slot(rows, k, TYPES["i64"]), "i64"), "i32" if what == "i" else "i64")
+
+    def _ids(self, program: Any) -> list[Block]:
+        """The three numbers of a program from its number in the grid; the first one changes fastest."""
+        b, (x, y, _) = self.builder, self._grid
+        rest = b.sdiv(program, x.value)
+        places = [b.srem(program, x.value), b.srem(rest, y.value), b.sdiv(rest, y.value)]
+        return [self.convert(Block(place, "i64"), "i32") for place in places]
+
+    # ---- functions
+
+    def _call(self, function: Any, arguments: tuple[Value, ...], named: Scope) -> Value:
+        """Carry out a function of the language."""
+        tree, names, defaults, constant = _source(function)
+        scope: Scope = dict(zip(names, arguments, strict=False))
+        for name, value in named.items():
+            if name not in names or name in scope:
+                raise TranslationError(f"{function.fn.__name__} has no argument {name}, or it is given twice")
+            scope[name] = value
+        for name in names:
+            if name not in scope:
+                if name not in defaults:
+                    raise TranslationError(f"{function.fn.__name__} needs the argument {name}")
+                scope[name] = defaults[name]
+            if name in constant and isinstance(scope[name], Block):
+                raise TranslationError(f"{name} of {function.fn.__name__} is no constant")
+        outer, self._globals = getattr(self, "_globals", None), function.fn.__globals__
+        try:
+            found = self._run(tree.body, scope)
+        except TranslationError as error:
+            if not getattr(error, "placed", False):
+                error.placed = True  # type: ignore[attr-defined]
+                line = tree.lineno + getattr(self, "_line", 1) - 1
+                error.args = (f"{function.fn.__module__}.{function.fn.__name__}, near line {line}: {error}",)
+            raise
+        finally:
+            self._globals = outer
+        return None if found is None else found.value
+
+    # ---- statements
+
+    def _run(self, body: list[ast.stmt], scope: Scope) -> _Returned | None:
+        for statement in body:
+            self._line = statement.lineno
+            found = self._statement(statement, scope)
+            if found is not None:
+                return found
+        return None
+
+    def _statement(self, node: ast.stmt, scope: Scope) -> _Returned | None:
+        match node:
+            case ast.Assign(targets=[target], value=value):
+                self._assign(target, self._eval(value, scope), scope)
+            case ast.AnnAssign(target=target, value=value) if value is not None:
+                self._assign(target, self._eval(value, scope), scope)
+            case ast.AugAssign(target=ast.Name(id=name), op=op, value=value):
+                scope[name] = self._binary(op, self._lookup(name, scope), self._eval(value, scope))
+            case ast.Expr(value=ast.Constant()) | ast.Pass():
+                pass
+            case ast.Expr(value=value):
+                self._eval(value, scope)
+            case ast.Return(value=value):
+                return _Returned(None if value is None else self._eval(value, scope))
+            case ast.If():
+                return self._if(node, scope)
+            case ast.For():
+                return self._for(node, scope)
+            case ast.While():
+                self._while(node, scope)
+            case _:
+                raise TranslationError(f"cannot translate `{ast.unparse(node)}`")
+        return None
+
+    def _assign(self, target: ast.expr, value: Value, scope: Scope) -> None:
+        match target:
+            case ast.Name(id=name):
+                scope[name] = value
+            case ast.Tuple(elts=parts):
+                if not isinstance(value, tuple) or len(value) != len(parts):
+                    raise TranslationError(f"cannot unpack {value!r} into {len(parts)} names")
+                for part, one in zip(parts, value, strict=True):
+                    self._assign(part, one, scope)
+            case _:
+                raise TranslationError(f"cannot assign to `{ast.unparse(target)}`")
+
+    def _if(self, node: ast.If, scope: Scope) -> _Returned | None:
+        condition = self._eval(node.test, scope)
+        if not isinstance(condition, Block):
+            return self._run(node.body if condition else node.orelse, scope)
+        b, function = self.builder, self.builder.function
+        if condition.lanes != 1:
+            raise TranslationError("a condition must be one number")
+        names = _assigned(node.body) | _assigned(node.orelse)
+        yes, no, after = (function.append_basic_block() for _ in range(3))
+        b.cbranch(self.convert(condition, "i1").value, yes, no)
+        ends: list[tuple[Scope, Any]] = []
+        for block, body in ((yes, node.body), (no, node.orelse)):
+            b.position_at_end(block)
+            inner = dict(scope)
+            if self._run(body, inner) is not None:
+                raise TranslationError("cannot return under a condition that is not constant")
+            ends.append((inner, b.block))
+        (first, here), (second, there) = ends
+        pairs = {name: (first[name], second[name]) for name in sorted(names) if name in first and name in second}
+        kinds = {name: self._join(*pair) for name, pair in pairs.items()}
+        values = []
+        for side, block in enumerate((here, there)):
+            b.position_at_end(block)
+            values.append({name: self._fit(pair[side], kinds[name]) for name, pair in pairs.items()})
+            b.branch(after)
+        b.position_at_end(after)
+        for name in scope.keys() & names:
+            if name not in pairs:
+                del scope[name]
+        for name in pairs:
+            scope[name] = self._phi(kinds[name], (values[0][name], here), (values[1][name], there))
+        return None
+
+    def _for(self, node: ast.For, scope: Scope) -> _Returned | None:
+        if not isinstance(node.target, ast.Name):
+            raise TranslationError("a loop has one variable")
+        values = self._eval(node.iter, scope)
+        if not isinstance(values, _Loop):
+            for value in values:
+                scope[node.target.id] = value
+                found = self._run(node.body, scope)
+                if found is not None:
+                    return found
+            return None
+        b = self.builder
+        start, end, step = self.matched(values.start, values.end, values.step)
+        kind = start.kind
+        place = self.entry.alloca(TYPES[kind])
+        b.store(start.value, place)
+
+        def more() -> Block:
+            return self.compare("<", Block(b.load(place, typ=TYPES[kind]), kind), end)
+
+        def body(inner: Scope) -> None:
+            now = Block(b.load(place, typ=TYPES[kind]), kind)
+            inner[node.target.id] = now  # type: ignore[attr-defined]
+            if self._run(node.body, inner) is not None:
+                raise TranslationError("cannot return from a loop")
+            b.store(b.add(now.value, step.value), place)
+
+        self._repeat(_assigned(node.body), more, body, scope)
+        return None
+
+    def _while(self, node: ast.While, scope: Scope) -> None:
+        inner_scope = scope
+
+        def body(inner: Scope) -> None:
+            if self._run(node.body, inner) is not None:
+                raise TranslationError("cannot return from a loop")
+
+        self._repeat(_assigned(node.body), lambda: self._truth(node.test, inner_scope), body, scope)
+
+    def _truth(self, test: ast.expr, scope: Scope) -> Block:
+        return self.convert(self.block(self._eval(test, scope)), "i1")
+
+    def _repeat(self, names: set[str], more: Callable[[], Block], body: Callable[[Scope], None], scope: Scope) -> None:
+        """A loop; what it changes is kept in memory, which LLVM turns into registers."""
+        kinds = self._kinds_in_loop(sorted(names & scope.keys()), body, scope)
+        places = {}
+        for name, kind in kinds.items():
+            places[name] = self._places(kind)
+            self._keep(places[name], self._fit(scope[name], kind))
+        b, function = self.builder, self.builder.function
+        head, inside, after = (function.append_basic_block() for _ in range(3))
+        b.branch(head)
+        b.position_at_end(head)
+        for name, kind in kinds.items():
+            scope[name] = self._kept(places[name], kind)
+        b.cbranch(more().value, inside, after)
+        b.position_at_end(inside)
+        inner = dict(scope)
+        body(inner)
+        for name, kind in kinds.items():
+            self._keep(places[name], self._fit(inner[name], kind))
+        b.branch(head)
+        b.position_at_end(after)
+        for name, kind in kinds.items():
+            scope[name] = self._kept(places[name], kind)
+
+    def _kinds_in_loop(self, names: list[str], body: Callable[[Scope], None], scope: Scope) -> dict[str, Any]:
+        """The types of variables that a loop changes: the body is carried out for them once, in vain."""
+        kinds = {name: self._join(scope[name], scope[name]) for name in names}
+        builder, entry, dummies = self.builder, self.entry, self._dummy
+        here = builder.block
+        for _ in range(2):
+            scratch = ir.Function(ir.Module(), ir.FunctionType(ir.VoidType(), []), "scratch")
+            builder.position_at_end(scratch.append_basic_block())
+            self.entry, self._dummy = ir.IRBuilder(scratch.append_basic_block()), {}
+            inner = dict(scope)
+            for name, kind in kinds.items():
+                inner[name] = self._fit(scope[name], kind, lose=True)
+            body(inner)
+            joined = {name: self._join(self._fit(scope[name], kinds[name]), inner[name]) for name in names}
+            builder.position_at_end(here)
+            self.entry, self._dummy = entry, dummies
+            if joined == kinds:
+                break
+            kinds = joined
+        return {name: kind for name, kind in kinds.items() if not isinstance(kind, _Same)}
+
+    # ---- values that depend on the way
+
+    def _join(self, x: Value, y: Value) -> Any:
+        """The type of a variable that is x on one way and y on another: a nest of (kind, shape) or pointers."""
+        if isinstance(x, tuple) and isinstance(y, tuple) and len(x) == len(y):
+            return tuple(self._join(a, b) for a, b in zip(x, y, strict=True))
+        if isinstance(x, Pointer) and isinstance(y, Pointer) and x.base is y.base:
+            return _Address(x.base, x.kind, self._join(x.offset, y.offset))
+        if isinstance(x, (Block, bool, int, float)) and isinstance(y, (Block, bool, int, float)):
+            a, b = self.matched(x, y)
+            return _Kind(a.kind, a.shape)
+        if x is y or (type(x) is type(y) and x == y):
+            return _Same(x)
+        raise TranslationError(f"a variable is {x!r} on one way and {y!r} on another")
+
+    def _fit(self, value: Value, kind: Any, lose: bool = False) -> Value:
+        """A value as the type that :meth:`_join` returned."""
+        if isinstance(kind, tuple):
+            return tuple(self._fit(part, own, lose) for part, own in zip(value, kind, strict=True))
+        if isinstance(kind, _Address):
+            return Pointer(kind.base, kind.kind, self._fit(value.offset, kind.offset, lose))
+        if isinstance(kind, _Same):
+            return kind.value
+        block = self.splat(self.convert(self.block(value), kind.kind), kind.shape)
+        return Block(block.value, block.kind, block.shape)
+
+    def _leaves(self, value: Value) -> Iterator[Block]:
+        if isinstance(value, tuple):
+            for part in value:
+                yield from self._leaves(part)
+        elif isinstance(value, Pointer):
+            yield value.offset
+        elif isinstance(value, Block):
+            yield value
+
+    def _made(self, kind: Any, values: Iterator[Any]) -> Value:
+        """A value of a type from LLVM values, in the order of :meth:`_leaves`."""
+        if isinstance(kind, tuple):
+            return tuple(self._made(part, values) for part in kind)
+        if isinstance(kind, _Address):
+            return Pointer(kind.base, kind.kind, self._made(kind.offset, values))
+        if isinstance(kind, _Same):
+            return kind.value
+        return Block(next(values), kind.kind, kind.shape)
+
+    def _phi(self, kind: Any, *ways: tuple[Value, Any]) -> Value:
+        columns = zip(*([leaf.value for leaf in self._leaves(value)] for value, _ in ways), strict=True)
+        made = []
+        for column in columns:
+            phi = self.builder.phi(column[0].type)
+            for value, (_, block) in zip(column, ways, strict=True):
+                phi.add_incoming(value, block)
+            made.append(phi)
+        return self._made(kind, iter(made))
+
+    def _places(self, kind: Any) -> list[Any]:
+        """Memory for a value of a type."""
+        if isinstance(kind, tuple):
+            return [place for part in kind for place in self._places(part)]
+        if isinstance(kind, _Address):
+            return self._places(kind.offset)
+        if isinstance(kind, _Same):
+            return []
+        to = self.type_of(kind.kind, _lanes(kind.shape))
+        return [(self.entry.alloca(to), to)]
+
+    def _keep(self, places: list[Any], value: Value) -> None:
+        for (place, _), leaf in zip(places, self._leaves(value), strict=True):
+            self.builder.store(leaf.value, place)
+
+    def _kept(self, places: list[Any], kind: Any) -> Value:
+        return self._made(kind, iter([self.builder.load(place, typ=to) for place, to in places]))
+
+    # ---- expressions
+
+    def _lookup(self, name: str, scope: Scope) -> Value:
+        if name in scope:
+            return scope[name]
+        if self._globals is not None and name in self._globals:
+            return _plain(self._globals[name])
+        if name in _PYTHON or name in ("range", "tuple"):
+            return getattr(builtins, name)
+        raise TranslationError(f"`{name}` is not known here")
+
+    def _eval(self, node: ast.expr, scope: Scope) -> Value:
+        match node:
+            case ast.Constant(value=value):
+                return value
+            case ast.Name(id=name):
+                return self._lookup(name, scope)
+            case ast.Tuple(elts=parts):
+                return tuple(self._eval(part, scope) for part in parts)
+            case ast.List(elts=parts):
+                return tuple(self._eval(part, scope) for part in parts)
+            case ast.BinOp(left=left, op=op, right=right):
+                return self._binary(op, self._eval(left, scope), self._eval(right, scope))
+            case ast.UnaryOp(op=op, operand=operand):
+                return self._one(op, self._eval(operand, scope))
+            case ast.Compare(left=left, ops=[op], comparators=[right]):
+                return self._compare(op, self._eval(left, scope), self._eval(right, scope))
+            case ast.BoolOp(op=op, values=values):
+                return self._logic(op, values, scope)
+            case ast.IfExp(test=test, body=body, orelse=orelse):
+                condition = self._eval(test, scope)
+                if isinstance(condition, Block):
+                    return self.where(condition, self._eval(body, scope), self._eval(orelse, scope))
+                return self._eval(body if condition else orelse, scope)
+            case ast.Attribute(value=owner, attr=attr):
+                return self._attribute(self._eval(owner, scope), attr)
+            case ast.Subscript(value=owner, slice=index):
+                return self._item(self._eval(owner, scope), index, scope)
+            case ast.Call(func=func, args=args, keywords=keywords):
+                named = {word.arg: self._eval(word.value, scope) for word in keywords if word.arg is not None}
+                return self._invoke(self._eval(func, scope), tuple(self._eval(arg, scope) for arg in args), named)
+        raise TranslationError(f"cannot translate `{ast.unparse(node)}`")
+
+    def _binary(self, op: ast.operator, x: Value, y: Value) -> Value:
+        if isinstance(x, tuple) and isinstance(y, tuple) and isinstance(op, ast.Add):
+            return x + y
+        sign = _SIGNS.get(type(op))
+        if sign is None:
+            if isinstance(op, ast.Pow) and is_number(x) and is_number(y):
+                return x**y
+            raise TranslationError(f"no operation {type(op).__name__}")
+        if is_number(x) and is_number(y):
+            return {
+                "+": lambda: x + y, "-": lambda: x - y, "*": lambda: x * y, "/": lambda: x / y, "//": lambda: x // y,
+                "%": lambda: x % y, "&": lambda: x & y, "|": lambda: x | y, "^": lambda: x ^ y, "<<": lambda: x << y,
+                ">>": lambda: x >> y,
+            }[sign]()  # fmt: skip
+        return self.arithmetic(sign, x, y)
+
+    def _one(self, op: ast.unaryop, x: Value) -> Value:
+        if isinstance(op, ast.Not):
+            return self.compare("==", self.convert(x, "i1"), self.constant(0, "i1")) if isinstance(x, Block) else not x
+        if is_number(x):
+            return -x if isinstance(op, ast.USub) else ~x if isinstance(op, ast.Invert) else +x
+        if isinstance(op, ast.USub):
+            return Block(self.builder.fneg(x.value), x.kind, x.shape) if x.floating else self.arithmetic("-", 0, x)
+        if isinstance(op, ast.Invert):
+            return self.arithmetic("^", x, True if x.kind == "i1" else -1)
+        return x
+
+    def _compare(self, op: ast.cmpop, x: Value, y: Value) -> Value:
+        if isinstance(op, (ast.Is, ast.IsNot)):
+            return (x is y) == isinstance(op, ast.Is)
+        sign = _COMPARES[type(op)]
+        if isinstance(x, Block) or isinstance(y, Block):
+            return self.compare(sign, x, y)
+        return {
+            "<": lambda: x < y, "<=": lambda: x <= y, ">": lambda: x > y, ">=": lambda: x >= y, "==": lambda: x == y,
+            "!=": lambda: x != y,
+        }[sign]()  # fmt: skip
+
+    def _logic(self, op: ast.boolop, values: list[ast.expr], scope: Scope) -> Value:
+        """``and`` and ``or``; after a constant that decides, the rest is not looked at."""
+        stops = isinstance(op, ast.Or)
+        made: Value = not stops
+        for value in values:
+            one = self._eval(value, scope)
+            if isinstance(one, Block):
+                one = self.convert(one, "i1")
+                made = self.arithmetic("|" if stops else "&", made, one)
+            elif bool(one) == stops:
+                return one
+        return made
+
+    def _attribute(self, owner: Value, attr: str) -> Value:
+        if owner is tl:
+            return Name(attr)
+        if isinstance(owner, Name):
+            return Name(f"{owner.name}.{attr}")
+        if isinstance(owner, Block):
+            if attr == "to":
+                return lambda kind: self._to(owner, kind)
+            if attr == "dtype":
+                return Name({"f32": "float32", "f64": "float64", "i32": "int32", "i64": "int64"}[owner.kind])
+            raise TranslationError(f"a block has no `{attr}`")
+        return _plain(getattr(owner, attr))
+
+    def _item(self, owner: Value, index: ast.expr, scope: Scope) -> Value:
+        if isinstance(owner, Block):
+            parts = index.elts if isinstance(index, ast.Tuple) else [index]
+            shape, sizes = [], iter(owner.shape)
+            for part in parts:
+                new = isinstance(part, ast.Constant) and part.value is None
+                shape.append(1 if new else next(sizes))
+            made = Block(owner.value, owner.kind, (*shape, *sizes), owner.first, owner.stride)
+            self.common_shape(made.shape)
+            return made
+        key = self._eval(index, scope)
+        if isinstance(key, Block):
+            raise TranslationError("the place in a tuple must be constant")
+        return _plain(owner[key])
+
+    def _to(self, block: Block, kind: Value) -> Block:
+        return self.convert(block, self._kind(kind))
+
+    def _kind(self, kind: Value) -> str:
+        name = kind.name if isinstance(kind, Name) else str(kind)
+        kinds = {"float32": self.real, "float64": "f64", "int32": "i32", "int64": "i64", "int1": "i1", "int8": "i8",
+                 "uint8": "i8"}  # fmt: skip
+        if name not in kinds:
+            raise TranslationError(f"no type {name}")
+        return kinds[name]
+
+    def _invoke(self, function: Any, arguments: tuple[Value, ...], named: Scope) -> Value:
+        if isinstance(function, Name):
+            made = getattr(self, f"_tl_{function.name}", None)
+            if made is None:
+                raise TranslationError(f"`tl.{function.name}` is not translated")
+            return made(*arguments, **named)
+        if hasattr(function, "fn"):
+            return self._call(function, arguments, named)
+        if function is range:
+            return self._range(*arguments)
+        if getattr(function, "__name__", "") == "<lambda>" or function in _PYTHON.values():
+            return function(*arguments)
+        raise TranslationError(f"cannot call {function!r}")
+
+    def _range(self, *limits: Value) -> Value:
+        start, end, step = (0, *limits, 1) if len(limits) == 1 else (*limits, 1)[:3]
+        if all(is_number(limit) for limit in (start, end, step)) and len(range(start, end, step)) <= UNROLLED:
+            return range(start, end, step)
+        return _Loop(start, end, step)
+
+    # ---- the language
+
+    def _tl_static_range(self, *limits: int) -> range:
+        return range(*limits)
+
+    def _tl_load(self, pointer: Pointer, mask: Value = None, other: Value = None, **_: Value) -> Block:
+        return self.load(pointer, mask, other)
+
+    def _tl_store(self, pointer: Pointer, value: Value, mask: Value = None, **_: Value) -> None:
+        self.store(pointer, value, mask)
+
+    def _tl_atomic_add(self, pointer: Pointer, value: Value, mask: Value = None, **_: Value) -> Block:
+        return self.atomic("add", pointer, value, mask)
+
+    def _tl_atomic_max(self, pointer: Pointer, value: Value, mask: Value = None, **_: Value) -> Block:
+        return self.atomic("max", pointer, value, mask)
+
+    def _tl_debug_barrier(self) -> None:
+        """The lanes of a program need not wait for each other here."""
+
+    def _tl_program_id(self, axis: int) -> Block:
+        return self._program[axis]
+
+    def _tl_num_programs(self, axis: int) -> Block:
+        return self.convert(self._grid[axis], "i32")
+
+    def _tl_arange(self, start: int, end: int) -> Block:
+        return self.arange(start, end)
+
+    def _tl_zeros(self, shape: tuple[int, ...], dtype: Value) -> Block:
+        return self.constant(0, self._kind(dtype), tuple(shape))
+
+    def _tl_full(self, shape: tuple[int, ...], value: Value, dtype: Value) -> Block:
+        return self.splat(self.convert(self.block(value), self._kind(dtype)), tuple(shape))
+
+    def _tl_zeros_like(self, x: Block) -> Block:
+        return self.constant(0, x.kind, x.shape)
+
+    def _tl_where(self, condition: Value, x: Value, y: Value) -> Value:
+        return self.where(condition, x, y)
+
+    def _tl_maximum(self, x: Value, y: Value, propagate_nan: Value = None) -> Value:
+        return max(x, y) if is_number(x) and is_number(y) else self.extreme("max", x, y, _all(propagate_nan))
+
+    def _tl_minimum(self, x: Value, y: Value, propagate_nan: Value = None) -> Value:
+        return min(x, y) if is_number(x) and is_number(y) else self.extreme("min", x, y, _all(propagate_nan))
+
+    def _tl_abs(self, x: Value) -> Value:
+        return abs(x) if is_number(x) else self.absolute(x)
+
+    def _tl_sqrt(self, x: Value) -> Block:
+        return self.unary("sqrt", x)
+
+    def _tl_exp(self, x: Value) -> Block:
+        return self.unary("exp", x)
+
+    def _tl_log(self, x: Value) -> Block:
+        return self.unary("log", x)
+
+    def _tl_sin(self, x: Value) -> Block:
+        return self.unary("sin", x)
+
+    def _tl_cos(self, x: Value) -> Block:
+        return self.unary("cos", x)
+
+    def _tl_floor(self, x: Value) -> Block:
+        return self.unary("floor", x)
+
+    def _tl_div_rn(self, x: Value, y: Value) -> Block:
+        a, b = self.matched(x, y)
+        return Block(self.builder.fdiv(a.value, b.value), a.kind, a.shape)
+
+    def _tl_sum(self, x: Block, axis: int | None = None) -> Block:
+        return self.reduce("sum", x, axis)
+
+    def _tl_max(self, x: Block, axis: int | None = None) -> Block:
+        return self.reduce("max", x, axis)
+
+    def _tl_min(self, x: Block, axis: int | None = None) -> Block:
+        return self.reduce("min", x, axis)
+
+    def _tl_cumsum(self, x: Block, axis: int = 0) -> Block:
+        return self.running_sum(x) if x.shape[axis] == x.lanes else x
+
+
+@dataclass(frozen=True)
+class _Kind:
+    kind: str
+    shape: tuple[int, ...]
+
+
+@dataclass(frozen=True, eq=False)
+class _Address:
+    base: Any
+    kind: str
+    offset: Any
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, _Address) and self.base is other.base and self.offset == other.offset
+
+
+@dataclass(frozen=True)
+class _Same:
+    value: Any
+
+
+def _lanes(shape: tuple[int, ...]) -> int:
+    lanes = 1
+    for size in shape:
+        lanes *= size
+    return lanes
+
+
+def _all(propagate: Value) -> bool:
+    """Whether NaN is passed on."""
+    name = propagate.name if isinstance(propagate, Name) else str(propagate)
+    return name.endswith("ALL")
+
+
+def _plain(value: Any) -> Any:
+    """A constant of the language as what it stands for."""
+    while type(value).__name__ in ("Constant", "constexpr") and hasattr(value, "value"):
+        value = value.value
+    return value
+
+
+def _assigned(body: list[ast.stmt]) -> set[str]:
+    """The names that statements assign."""
+    found = set()
+    for statement in body:
+        for node in ast.walk(statement):
+            if isinstance(node, ast.Name) and isinstance(node.ctx, ast.Store):
+                found.add(node.id)
+    return found
+
+
+@lru_cache(maxsize=1024)
+def _source(function: Any) -> tuple[ast.FunctionDef, list[str], dict[str, Any], set[str]]:
+    """The tree of a function, its arguments, their defaults, and which are constants."""
+    source = textwrap.dedent(inspect.getsource(function.fn))
+    tree = next(node for node in ast.parse(source).body if isinstance(node, ast.FunctionDef))
+    names = [argument.arg for argument in tree.args.args]
+    marked = {a.arg for a in tree.args.args if a.annotation is not None and "constexpr" in ast.unparse(a.annotation)}
+    given = inspect.signature(function.fn).parameters
+    defaults = {name: _plain(p.default) for name, p in given.items() if p.default is not inspect.Parameter.empty}
+    return tree, names, defaults, marked
+
+
+__all__ = ["TranslationError", "translate"]
