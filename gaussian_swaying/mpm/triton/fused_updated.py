@@ -8,13 +8,19 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from gaussian_swaying.kernels.launch import call, lanes, launch
+from gaussian_swaying.kernels.launch import LANES, call, lanes, launch
 from gaussian_swaying.mpm.body import Held
 from gaussian_swaying.mpm.formulations.formulation import Formulation
 from gaussian_swaying.mpm.state import GridSpec, MPMState
 from gaussian_swaying.mpm.triton import updated_kernels as kernels
 from gaussian_swaying.mpm.triton.fused import Fused, Part, check_indices
 from gaussian_swaying.mpm.triton.obstacles import Solids, solids_of
+
+SHARES = 16
+"""Shares of the particles that are added to grids of their own on a CPU; the sums depend on it."""
+
+CHUNK = 1024
+"""Nodes on which a program sums the grids of the shares."""
 
 LEAST, MOST = 4, 64
 """Fewest and most substeps between two sorts of the particles by cell."""
@@ -31,6 +37,8 @@ class FusedUpdated(Fused):
 
     def __init__(self, bound: Formulation) -> None:
         super().__init__(bound)
+        self.atomic = lanes(self.device, 32) == 32
+        """Whether particles are added to the grid atomically; else in a fixed order."""
         points, laws = bound.body.points, bound.body.laws
         self.bound = bound
         self.plastic = len(self.laws.flows) > 0
@@ -55,6 +63,12 @@ class FusedUpdated(Fused):
         self.filled = torch.zeros(0, dtype=torch.int32, device=self.device)
         self.place = torch.zeros(2, self.count, dtype=torch.int32, device=self.device)  # cell, rank in it
         self.grid = GridSpec(bound.settings.dx, (0, 0, 0), (0, 0, 0))
+        rows = 0 if self.atomic else self.count
+        self.parts = torch.zeros(rows, kernels.PART.value, device=self.device)
+        self.part_node = torch.zeros(rows, dtype=torch.int32, device=self.device)
+        self.windows = torch.zeros(0, device=self.device)
+        self.ranges = torch.zeros(SHARES, 2, dtype=torch.int32, device=self.device)
+        self.pressed = torch.zeros(0, dtype=torch.float64, device=self.device)
 
     def _take_values(self, values: Tensor) -> None:
         self.constants = torch.cat([self.constants[:, :5], values.float()], dim=1)
@@ -64,6 +78,11 @@ class FusedUpdated(Fused):
             self.moving = torch.zeros(rows, self.count, device=self.device)
             self.spare = (self.moving[:0],) * 3  # for a sort: rows, order, work
             self.repeater.forget()
+
+    @property
+    def node_block(self) -> int:
+        """Nodes of a program."""
+        return lanes(self.device, 256)
 
     @property
     def launches(self) -> bool:
@@ -82,6 +101,11 @@ class FusedUpdated(Fused):
                 self.momentum = torch.zeros(room, width, device=self.device)
                 self.velocity = torch.zeros(room, 4, device=self.device)
                 self.inverse_mass, self.weight = (torch.zeros(held, device=self.device) for _ in range(2))
+                self.windows = torch.empty(0 if self.atomic else SHARES * room * width, device=self.device)
+                programs = -(-room // self.node_block) if self.solids.parts else 0
+                self.pressed = torch.zeros(programs, *self.impulse.reshape(-1, 3).shape, dtype=torch.float64).to(
+                    self.device
+                )
         if grid != self.grid:
             self.repeater.forget()  # they read the node positions
             self.grid, self.node_position = grid, None
@@ -93,6 +117,7 @@ class FusedUpdated(Fused):
         part.begin(steps)
         self._take_grid(state.grid, 8 if options["IMPLICIT"] else 4)
         self.impulse.zero_()
+        self.pressed.zero_()
         self.clock.copy_(torch.stack([self.time, self.dt]))
         self.solids.take()
         self.solids.prepare(self.time, self.dt, steps)
@@ -113,6 +138,8 @@ class FusedUpdated(Fused):
                 self._look()
             done = mark
         self._measure_crossing()
+        if self.solids.parts:
+            self.impulse.add_(self.pressed.sum(0).view_as(self.impulse))
         return {**self._read(state), "impulse": self.impulse, **({"work": self._work()} if part.loaded else {})}
 
     def _sorted_for(self) -> int:
@@ -142,6 +169,12 @@ class FusedUpdated(Fused):
 
     def _sort(self) -> None:
         """Sort the rows of the particles by cell: count those of each cell, and move each to its place."""
+        if not self.atomic:
+            order = torch.argsort(self._keys(self.moving[:3].T), stable=True)
+            self.moving.copy_(self.moving[:, order])
+            self.order.copy_(self.order[order])
+            self.load[0].copy_(self.load[0, order])
+            return
         grid, block = self.grid, lanes(self.device, 128)
         nx, ny, nz = grid.resolution
         cells = self.scenes * (nx + 1) * (ny + 1) * (nz + 1)
@@ -163,17 +196,20 @@ class FusedUpdated(Fused):
         self.load[0].copy_(work)  # of a batch, it follows its particle; the forces are zero here
         self.spare, self.moving, self.order = (self.moving, self.order, work), rows, order
 
+    def _keys(self, position: Tensor, given: bool = False) -> Tensor:
+        """Numbers of the cells of particles at (N, 3), in the order of the buffers or as ``given``."""
+        (ox, oy, oz), (nx, ny, nz) = self.grid.offset, self.grid.resolution
+        x, y, z = (position / self.grid.dx - 0.5).floor_().int().unbind(-1)
+        key = ((x - ox).clamp(0, nx) * (ny + 1) + (y - oy).clamp(0, ny)) * (nz + 1) + (z - oz).clamp(0, nz)
+        if self.scenes > 1:
+            scene = self.scene if given else self.scene[self.order]
+            key = key + scene * ((nx + 1) * (ny + 1) * (nz + 1))
+        return key
+
     def _load(self, state: MPMState) -> None:
         """Sort the particles by cell and copy their fields to the buffers."""
         self.momentum.zero_()  # an interrupted part may have left values
-        grid = state.grid
-        place = (state.position.reshape(-1, 3) / grid.dx - 0.5).floor_().int()
-        (ox, oy, oz), (nx, ny, nz) = grid.offset, grid.resolution
-        x, y, z = place.unbind(-1)
-        key = ((x - ox).clamp(0, nx) * (ny + 1) + (y - oy).clamp(0, ny)) * (nz + 1) + (z - oz).clamp(0, nz)
-        if self.scenes > 1:
-            key = key + self.scene * ((nx + 1) * (ny + 1) * (nz + 1))
-        self.order.copy_(torch.argsort(key))
+        self.order.copy_(torch.argsort(self._keys(state.position.reshape(-1, 3), given=True), stable=not self.atomic))
         block = lanes(self.device, 128)
         programs = (-(-self.count // block),)
         internal = state.internal is not None
@@ -208,23 +244,43 @@ class FusedUpdated(Fused):
 
     def _particles(self, offset: int, options: dict[str, Any], gather: bool, scatter: bool) -> None:
         grid, settings = self.grid, self.settings
-        launch(kernels.updated_particles, (-(-self.count // 32),))(
+        block = lanes(self.device, 32)
+        launch(kernels.updated_particles, (-(-self.count // block),))(
             self.moving, self.order, self.load, self.count,
             self.momentum, self.velocity, self.schedule, self.vectors, self.scenes, self.tables.buffer,
             self.first_step, offset, self.law_table, self.force_in, *grid.offset, *grid.resolution, grid.dx,
-            1 / grid.dx, settings.stiffness_damping, self.particles,
+            1 / grid.dx, settings.stiffness_damping, self.particles, self.parts, self.part_node,
             **options, PLASTIC=self.plastic, MLS=settings.mls, WIDTH=self.momentum.shape[1], GATHER=gather,
-            SCATTER=scatter, num_warps=1,
+            SCATTER=scatter, ATOMIC=self.atomic, BLOCK=block, num_warps=1,
         )  # fmt: skip
+        if scatter and not self.atomic:
+            self._scatter(options["IMPLICIT"])
+
+    def _scatter(self, implicit: bool) -> None:
+        """Add the particles to the grid in a fixed order, whatever the number of threads."""
+        nodes, width, dx, mls = (
+            self.grid.node_count * self.scenes,
+            self.momentum.shape[1],
+            self.grid.dx,
+            self.settings.mls,
+        )
+        _, ny, nz = self.grid.resolution
+        launch(kernels.updated_scatter, (SHARES,))(
+            self.parts, self.part_node, self.windows, self.ranges, self.count, nodes, SHARES, ny * nz, nz, dx, 1 / dx,
+            MLS=mls, IMPLICIT=implicit, WIDTH=width, BLOCK=LANES,
+        )  # fmt: skip
+        launch(kernels.updated_join, (-(-nodes // CHUNK),))(
+            self.windows, self.ranges, self.momentum, nodes, SHARES, CHUNK=CHUNK, WIDTH=width, BLOCK=LANES
+        )
 
     def _nodes(self, offset: int, options: dict[str, Any]) -> None:
         nodes = self.grid.node_count * self.scenes
-        block = lanes(self.device, 256)
+        block = self.node_block
         acting, (_, ny, nz), solids = self._acting, self.grid.resolution, self.solids
         launch(kernels.updated_nodes, (-(-nodes // block),))(
             self.momentum, self.velocity, self.inverse_mass, nodes, self.schedule, self.first_step, offset,
             *self.gravity, solids.rows, solids.windows, solids.poses, solids.tables.buffer, self.clock,
-            self.impulse, *self.grid.offset, ny, nz, self.grid.dx,
+            self.pressed, len(self.impulse.reshape(-1, 3)), *self.grid.offset, ny, nz, self.grid.dx,
             IMPLICIT=options["IMPLICIT"], WIDTH=self.momentum.shape[1], KEEP=acting,
             SOLIDS=solids.twins, KINDS=solids.kinds, MOVES=solids.moves, MOVING=any(solids.moves), BLOCK=block,
             num_warps=4,
@@ -255,7 +311,7 @@ class FusedUpdated(Fused):
         nodes = grid.node_count * self.scenes
         weight = self.weight[:nodes].zero_()
         block = lanes(self.device, 128)
-        launch(kernels.pin_mass, (-(-self.count // block),))(
+        launch(kernels.pin_mass, (-(-self.count // block) if self.atomic else 1,))(
             self.moving, self.order, mass.contiguous(), weight, self.count, *grid.offset, *grid.resolution, grid.dx,
             self.particles, BLOCK=block, num_warps=4,
         )  # fmt: skip

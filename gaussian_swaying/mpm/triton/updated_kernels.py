@@ -25,6 +25,9 @@ from gaussian_swaying.mpm.triton.shared import (
     wave_speed,
 )
 
+PART = tl.constexpr(32)
+"""Numbers that a particle adds to the grid, on a CPU."""
+
 
 @triton.jit
 def _gather_affine(field, node, sx, sy, f, wz, gz, mz, inverse_dx, dx, mask, SLOPES: tl.constexpr):
@@ -115,12 +118,15 @@ def _locate(x, dx, o, n):
 def updated_particles(
     moving, order, load, count,
     momentum, velocity, schedule, vectors, scenes, numbers, first_step, step_offset, law_table, force_in,
-    ox, oy, oz, nx, ny, nz, dx, inverse_dx, viscous_time, scene_size,
+    ox, oy, oz, nx, ny, nz, dx, inverse_dx, viscous_time, scene_size, parts, part_node,
     LAWS: tl.constexpr, PLASTIC: tl.constexpr, MULTI: tl.constexpr, FORCES: tl.constexpr, FORCE: tl.constexpr,
     IMPLICIT: tl.constexpr, VISCOUS: tl.constexpr, MLS: tl.constexpr, WIDTH: tl.constexpr, GATHER: tl.constexpr,
-    SCATTER: tl.constexpr,
+    SCATTER: tl.constexpr, ATOMIC: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
     """``updated``: the end of substep ``step`` - 1 (GATHER) and the start of substep ``step`` (SCATTER).
+
+    Without ATOMIC what each particle adds to the grid goes to a row of ``parts`` (see :func:`updated_scatter`), and
+    its node to ``part_node``. With it, BLOCK is 32.
 
     Rows of ``moving``: position 0, F 3, velocity 12, affine 15, lost 24, internal 25, mass 26, volume 27, mu 28,
     lam 29, law 30, total F 31 where a law is plastic, and then the numbers that forces have for each point.
@@ -130,7 +136,7 @@ def updated_particles(
     kick = tl.load(schedule + (step + 1) * 4)
     before = tl.load(schedule + step * 4)
     dt = tl.load(schedule + step * 4 + 1)
-    index = tl.program_id(0) * 32 + tl.arange(0, 32)  # one warp, for its shuffles
+    index = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)  # one warp, for its shuffles
     mask = index < count
     x = load3(moving, count, index, mask)
     F = load9(moving + 3 * count, count, index, mask)
@@ -228,69 +234,169 @@ def updated_particles(
         else:
             moment = scale9(mass, C)
             slope = scale9(pull, stress)
-        # neighbours in the order that share a cell form a segment
-        lane = tl.arange(0, 32)
-        following = tl.gather(node, tl.minimum(lane + 1, 31), 0)
-        last = ((node != following) | (lane == 31)) & (node >= 0)
-        l1 = tl.maximum(lane - 1, 0)
-        l2 = tl.maximum(lane - 2, 0)
-        l4 = tl.maximum(lane - 4, 0)
-        l8 = tl.maximum(lane - 8, 0)
-        l16 = tl.maximum(lane - 16, 0)
-        head = (node != tl.gather(node, l1, 0)) | (lane == 0)
-        first = tl.associative_scan(tl.where(head, lane, 0), 0, _larger)
-        s1 = lane - 1 >= first
-        s2 = lane - 2 >= first
-        s4 = lane - 4 >= first
-        s8 = lane - 8 >= first
-        s16 = lane - 16 >= first
-        for i in range(3):
-            wx, gx = node_weight(fx, i, inverse_dx)
-            rx = (i - fx) * dx
-            for j in range(3):
-                wy, gy = node_weight(fy, j, inverse_dx)
-                ry = (j - fy) * dx
-                w = wx * wy
-                c0 = (value[0] + moment[0] * rx + moment[1] * ry) * w
-                c1 = (value[1] + moment[3] * rx + moment[4] * ry) * w
-                c2 = (value[2] + moment[6] * rx + moment[7] * ry) * w
-                if not MLS:
-                    gw = gx * wy
-                    wg = wx * gy
-                    c0 += slope[0] * gw + slope[1] * wg
-                    c1 += slope[3] * gw + slope[4] * wg
-                    c2 += slope[6] * gw + slope[7] * wg
-                for k in tl.static_range(3):
-                    wr = wz[k] * w * ((k - fz) * dx)
-                    a0 = wz[k] * c0 + wr * moment[2]
-                    a1 = wz[k] * c1 + wr * moment[5]
-                    a2 = wz[k] * c2 + wr * moment[8]
-                    a3 = wz[k] * (w * mass)
+        if ATOMIC:
+            # neighbours in the order that share a cell form a segment
+            lane = tl.arange(0, 32)
+            following = tl.gather(node, tl.minimum(lane + 1, 31), 0)
+            last = ((node != following) | (lane == 31)) & (node >= 0)
+            l1 = tl.maximum(lane - 1, 0)
+            l2 = tl.maximum(lane - 2, 0)
+            l4 = tl.maximum(lane - 4, 0)
+            l8 = tl.maximum(lane - 8, 0)
+            l16 = tl.maximum(lane - 16, 0)
+            head = (node != tl.gather(node, l1, 0)) | (lane == 0)
+            first = tl.associative_scan(tl.where(head, lane, 0), 0, _larger)
+            s1 = lane - 1 >= first
+            s2 = lane - 2 >= first
+            s4 = lane - 4 >= first
+            s8 = lane - 8 >= first
+            s16 = lane - 16 >= first
+            for i in range(3):
+                wx, gx = node_weight(fx, i, inverse_dx)
+                rx = (i - fx) * dx
+                for j in range(3):
+                    wy, gy = node_weight(fy, j, inverse_dx)
+                    ry = (j - fy) * dx
+                    w = wx * wy
+                    c0 = (value[0] + moment[0] * rx + moment[1] * ry) * w
+                    c1 = (value[1] + moment[3] * rx + moment[4] * ry) * w
+                    c2 = (value[2] + moment[6] * rx + moment[7] * ry) * w
                     if not MLS:
-                        sw = gz[k] * w
-                        a0 += sw * slope[2]
-                        a1 += sw * slope[5]
-                        a2 += sw * slope[8]
-                    a0 = _sum_segments(a0, l1, l2, l4, l8, l16, s1, s2, s4, s8, s16)
-                    a1 = _sum_segments(a1, l1, l2, l4, l8, l16, s1, s2, s4, s8, s16)
-                    a2 = _sum_segments(a2, l1, l2, l4, l8, l16, s1, s2, s4, s8, s16)
-                    a3 = _sum_segments(a3, l1, l2, l4, l8, l16, s1, s2, s4, s8, s16)
-                    row = momentum + (node + i * sx + j * sy + k) * WIDTH
-                    tl.atomic_add(row, a0, last, sem="relaxed")
-                    tl.atomic_add(row + 1, a1, last, sem="relaxed")
-                    tl.atomic_add(row + 2, a2, last, sem="relaxed")
-                    tl.atomic_add(row + 3, a3, last, sem="relaxed")
-                    if IMPLICIT:
-                        a4 = _sum_segments(wz[k] * (w * resistance), l1, l2, l4, l8, l16, s1, s2, s4, s8, s16)
-                        tl.atomic_add(row + 4, a4, last, sem="relaxed")
+                        gw = gx * wy
+                        wg = wx * gy
+                        c0 += slope[0] * gw + slope[1] * wg
+                        c1 += slope[3] * gw + slope[4] * wg
+                        c2 += slope[6] * gw + slope[7] * wg
+                    for k in tl.static_range(3):
+                        wr = wz[k] * w * ((k - fz) * dx)
+                        a0 = wz[k] * c0 + wr * moment[2]
+                        a1 = wz[k] * c1 + wr * moment[5]
+                        a2 = wz[k] * c2 + wr * moment[8]
+                        a3 = wz[k] * (w * mass)
+                        if not MLS:
+                            sw = gz[k] * w
+                            a0 += sw * slope[2]
+                            a1 += sw * slope[5]
+                            a2 += sw * slope[8]
+                        a0 = _sum_segments(a0, l1, l2, l4, l8, l16, s1, s2, s4, s8, s16)
+                        a1 = _sum_segments(a1, l1, l2, l4, l8, l16, s1, s2, s4, s8, s16)
+                        a2 = _sum_segments(a2, l1, l2, l4, l8, l16, s1, s2, s4, s8, s16)
+                        a3 = _sum_segments(a3, l1, l2, l4, l8, l16, s1, s2, s4, s8, s16)
+                        row = momentum + (node + i * sx + j * sy + k) * WIDTH
+                        tl.atomic_add(row, a0, last, sem="relaxed")
+                        tl.atomic_add(row + 1, a1, last, sem="relaxed")
+                        tl.atomic_add(row + 2, a2, last, sem="relaxed")
+                        tl.atomic_add(row + 3, a3, last, sem="relaxed")
+                        if IMPLICIT:
+                            a4 = _sum_segments(wz[k] * (w * resistance), l1, l2, l4, l8, l16, s1, s2, s4, s8, s16)
+                            tl.atomic_add(row + 4, a4, last, sem="relaxed")
+        else:
+            tl.store(part_node + index, node, mask)
+            row = parts + index * PART
+            for c in tl.static_range(4):
+                tl.store(row + c, value[c], mask)
+            for c in tl.static_range(3):
+                for axis in tl.static_range(3):
+                    tl.store(row + 4 + 4 * axis + c, moment[3 * c + axis], mask)
+                    tl.store(row + 16 + 4 * axis + c, slope[3 * c + axis], mask)
+            tl.store(row + 28, resistance, mask)
+            tl.store(row + 29, fx, mask)
+            tl.store(row + 30, fy, mask)
+            tl.store(row + 31, fz, mask)
     else:
         store9(moving + 15 * count, count, index, C, mask)
 
 
 @triton.jit(do_not_specialize=VARIES)
+def updated_scatter(
+    parts, part_node, windows, ranges, count, nodes, shares, sx, sy, dx, inverse_dx,
+    MLS: tl.constexpr, IMPLICIT: tl.constexpr, WIDTH: tl.constexpr, BLOCK: tl.constexpr,
+):  # fmt: skip
+    """``updated``, on a CPU: the sums of a share of the particles, in their order, on a grid of the share's own.
+
+    A row of ``parts``: momentum and mass (4), three columns of the factor of w (x_i - x_p) and three of that of the
+    gradient of w, each filled up to four; resistance, and the place of the particle in its cell (3). ``ranges`` become
+    the first and the last node that a share adds to; only those are set to zero before.
+    """
+    share = tl.program_id(0)
+    begin = share * count // shares
+    end = (share + 1) * count // shares
+    lane = tl.arange(0, BLOCK)
+    low = tl.full([BLOCK], 2147483647, tl.int32)
+    high = tl.full([BLOCK], -1, tl.int32)
+    for first in range(begin, end, BLOCK):
+        node = tl.load(part_node + first + lane, first + lane < end, -1)
+        low = tl.where(node >= 0, tl.minimum(low, node), low)
+        high = tl.maximum(high, node)
+    start = tl.min(low)
+    stop = tl.max(high) + 2 * (sx + sy + 1)
+    if tl.max(high) < 0:
+        start = 0
+        stop = -1
+    tl.store(ranges + 2 * share, start)
+    tl.store(ranges + 2 * share + 1, stop)
+    window = windows + share.to(tl.int64) * nodes * WIDTH
+    for first in range(start * WIDTH, (stop + 1) * WIDTH, BLOCK):
+        tl.store(window + first + lane, tl.zeros([BLOCK], tl.float32), first + lane < (stop + 1) * WIDTH)
+    column = tl.arange(0, 4)
+    for p in range(begin, end):
+        node = tl.load(part_node + p)
+        if node >= 0:
+            row = parts + p * PART
+            value = tl.load(row + column)
+            m0 = tl.load(row + 4 + column)
+            m1 = tl.load(row + 8 + column)
+            m2 = tl.load(row + 12 + column)
+            fx = tl.load(row + 29)
+            fy = tl.load(row + 30)
+            fz = tl.load(row + 31)
+            wz, gz = axis_weights(fz, inverse_dx)
+            if not MLS:
+                s0 = tl.load(row + 16 + column)
+                s1 = tl.load(row + 20 + column)
+                s2 = tl.load(row + 24 + column)
+            if IMPLICIT:
+                resistance = tl.load(row + 28)
+            for i in range(3):
+                wx, gx = node_weight(fx, i, inverse_dx)
+                for j in range(3):
+                    wy, gy = node_weight(fy, j, inverse_dx)
+                    w = wx * wy
+                    c = w * (value + ((i - fx) * dx) * m0 + ((j - fy) * dx) * m1)
+                    if not MLS:
+                        c += (gx * wy) * s0 + (wx * gy) * s1
+                    for k in tl.static_range(3):
+                        a = wz[k] * c + (wz[k] * w * ((k - fz) * dx)) * m2
+                        if not MLS:
+                            a += (gz[k] * w) * s2
+                        to = window + (node + i * sx + j * sy + k) * WIDTH
+                        tl.store(to + column, tl.load(to + column) + a)
+                        if IMPLICIT:
+                            tl.store(to + 4, tl.load(to + 4) + wz[k] * w * resistance)
+
+
+@triton.jit(do_not_specialize=VARIES)
+def updated_join(
+    windows, ranges, momentum, nodes, shares, CHUNK: tl.constexpr, WIDTH: tl.constexpr, BLOCK: tl.constexpr
+):
+    """``updated``, on a CPU: the sums of all shares, in order, on some nodes."""
+    first = tl.program_id(0) * CHUNK
+    last = tl.minimum(first + CHUNK, nodes) - 1
+    lane = tl.arange(0, BLOCK)
+    for share in range(0, shares):
+        low = tl.maximum(tl.load(ranges + 2 * share), first) * WIDTH
+        high = (tl.minimum(tl.load(ranges + 2 * share + 1), last) + 1) * WIDTH
+        window = windows + share.to(tl.int64) * nodes * WIDTH
+        for begin in range(low, high, BLOCK):
+            at = begin + lane
+            mask = at < high
+            tl.store(momentum + at, tl.load(momentum + at, mask, 0.0) + tl.load(window + at, mask, 0.0), mask)
+
+
+@triton.jit(do_not_specialize=VARIES)
 def updated_nodes(
     momentum, velocity, inverse_mass, nodes, schedule, first_step, step_offset,
-    gravity_x, gravity_y, gravity_z, solids, windows, poses, numbers, clock, impulse, ox, oy, oz, ny, nz, dx,
+    gravity_x, gravity_y, gravity_z, solids, windows, poses, numbers, clock, impulse, boundaries, ox, oy, oz, ny, nz, dx,
     IMPLICIT: tl.constexpr, WIDTH: tl.constexpr, KEEP: tl.constexpr, SOLIDS: tl.constexpr, KINDS: tl.constexpr,
     MOVES: tl.constexpr, MOVING: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
@@ -298,7 +404,7 @@ def updated_nodes(
 
     All SOLIDS are applied here, in order; see :mod:`~gaussian_swaying.mpm.triton.obstacle_kernels`. KINDS and MOVES say
     of each how it stops and whether it moves. With MOVING there are poses for every substep. ``clock`` has the time at
-    step 0 and the substep [s], float64; ``impulse`` (B, 3) collects the reaction impulses.
+    step 0 and the substep [s], float64; ``impulse`` (programs, B, 3) collects the reaction impulses, float64.
     """
     step = tl.load(first_step) + step_offset
     kick = tl.load(schedule + (step + 1) * 4)
@@ -338,9 +444,9 @@ def updated_nodes(
             hit = tl.where(acts(windows + 2 * w, now), behind & some & mask, False)
             u = (tl.where(hit, held[0], v[0]), tl.where(hit, held[1], v[1]), tl.where(hit, held[2], v[2]))
             if tl.sum(hit.to(tl.int32)) > 0:  # few blocks touch a solid
-                to = impulse + 3 * tl.load(solids + w * SOLID_ROW + 2).to(tl.int32)
+                to = impulse + 3 * (tl.program_id(0) * boundaries + tl.load(solids + w * SOLID_ROW + 2).to(tl.int32))
                 for c in tl.static_range(3):
-                    tl.atomic_add(to + c, tl.sum((mass * (v[c] - u[c])).to(tl.float64)), sem="relaxed")
+                    tl.store(to + c, tl.load(to + c) + tl.sum((mass * (v[c] - u[c])).to(tl.float64)))
             v = u
     store3(velocity, 1, k * 4, v, mask)
     if KEEP:
@@ -437,24 +543,25 @@ def updated_read(
 
 @triton.jit(do_not_specialize=VARIES)
 def pin_mass(moving, order, pinned, weight, count, ox, oy, oz, nx, ny, nz, dx, scene_size, BLOCK: tl.constexpr):
-    """``updated``: mass of the particles of a boundary at each node."""
-    index = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
-    mask = index < count
-    where = tl.load(order + index, mask, 0)
-    mass = tl.load(pinned + where, mask, 0.0)
-    bx, fx, okx = _locate(tl.load(moving + index, mask, 0.0), dx, ox, nx)
-    by, fy, oky = _locate(tl.load(moving + count + index, mask, 0.0), dx, oy, ny)
-    bz, fz, okz = _locate(tl.load(moving + 2 * count + index, mask, 0.0), dx, oz, nz)
-    inside = mask & okx & oky & okz & (mass > 0)
-    node = tl.where(inside, (bx * ny + by) * nz + bz, 0) + (where // scene_size) * (nx * ny * nz)
-    wz, _gz = axis_weights(fz, 1.0)
-    for i in range(3):
-        wx, _gx = node_weight(fx, i, 1.0)
-        for j in range(3):
-            wy, _gy = node_weight(fy, j, 1.0)
-            row = weight + node + (i * ny + j) * nz
-            for k in tl.static_range(3):
-                tl.atomic_add(row + k, mass * (wx * wy * wz[k]), inside, sem="relaxed")
+    """``updated``: mass of the particles of a boundary at each node; one program alone adds in a fixed order."""
+    for begin in range(tl.program_id(0) * BLOCK, count, tl.num_programs(0) * BLOCK):
+        index = begin + tl.arange(0, BLOCK)
+        mask = index < count
+        where = tl.load(order + index, mask, 0)
+        mass = tl.load(pinned + where, mask, 0.0)
+        bx, fx, okx = _locate(tl.load(moving + index, mask, 0.0), dx, ox, nx)
+        by, fy, oky = _locate(tl.load(moving + count + index, mask, 0.0), dx, oy, ny)
+        bz, fz, okz = _locate(tl.load(moving + 2 * count + index, mask, 0.0), dx, oz, nz)
+        inside = mask & okx & oky & okz & (mass > 0)
+        node = tl.where(inside, (bx * ny + by) * nz + bz, 0) + (where // scene_size) * (nx * ny * nz)
+        wz, _gz = axis_weights(fz, 1.0)
+        for i in range(3):
+            wx, _gx = node_weight(fx, i, 1.0)
+            for j in range(3):
+                wy, _gy = node_weight(fy, j, 1.0)
+                row = weight + node + (i * ny + j) * nz
+                for k in tl.static_range(3):
+                    tl.atomic_add(row + k, mass * (wx * wy * wz[k]), inside, sem="relaxed")
 
 
 @triton.jit(do_not_specialize=VARIES)
