@@ -16,7 +16,6 @@ import torch
 from quick_interpreter import quicken
 
 
-
 def pytest_collection_modifyitems(config, items):
     """Skip `gpu` tests without CUDA, unless GS_REQUIRE_GPU=1 asks for them; leave `slow` ones to the nightly run.
 

@@ -89,11 +89,14 @@ class Compiler:
 
 triton: Any
 tl: Any
-if (torch.cuda.is_available() or INTERPRETED) and importlib.util.find_spec("triton") is not None:
+ON_GPU = (torch.cuda.is_available() or INTERPRETED) and importlib.util.find_spec("triton") is not None
+"""Whether kernels are Triton's: there is a GPU, or its interpreter stands for one."""
+
+if ON_GPU:
     import triton  # type: ignore[no-redef]
     import triton.language as tl  # type: ignore[no-redef]
 else:
     triton = Compiler()
     tl = triton.language
 
-__all__ = ["INTERPRETED", "Constant", "Function", "Language", "Name", "tl", "triton"]
+__all__ = ["INTERPRETED", "ON_GPU", "Constant", "Function", "Language", "Name", "tl", "triton"]

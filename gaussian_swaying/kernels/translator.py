@@ -20,7 +20,7 @@ from typing import Any
 from llvmlite import ir
 
 from gaussian_swaying.kernels.blocks import ADDRESS, TYPES, Block, Emitter, Pointer, TranslationError, Value, is_number
-from gaussian_swaying.kernels.language import Name, tl
+from gaussian_swaying.kernels.language import Language, Name
 
 UNROLLED = 4
 """Longest loop of a constant length that is unrolled; the language's ``static_range`` always is."""
@@ -484,7 +484,7 @@ class _Translator(Emitter):
         return made
 
     def _attribute(self, owner: Value, attr: str) -> Value:
-        if owner is tl:
+        if isinstance(owner, Language) or getattr(owner, "__name__", "") == "triton.language":
             return Name(attr)
         if isinstance(owner, Name):
             return Name(f"{owner.name}.{attr}")
@@ -493,10 +493,14 @@ class _Translator(Emitter):
                 return lambda kind: self._to(owner, kind)
             if attr == "dtype":
                 return Name({"f32": "float32", "f64": "float64", "i32": "int32", "i64": "int64"}[owner.kind])
+            if attr == "shape":
+                return owner.shape
             raise TranslationError(f"a block has no `{attr}`")
         return _plain(getattr(owner, attr))
 
     def _item(self, owner: Value, index: ast.expr, scope: Scope) -> Value:
+        if isinstance(owner, Pointer):
+            return Pointer(owner.base, owner.kind, self._item(owner.offset, index, scope))
         if isinstance(owner, Block):
             parts = index.elts if isinstance(index, ast.Tuple) else [index]
             shape, sizes = [], iter(owner.shape)

@@ -313,7 +313,8 @@ def _count_nodes(
 
     Nodes far from all constraints are not summed: they are not marked, or without obstacles have no pairs around them.
     """
-    entry = tl.arange(0, 32)[None, :]
+    ENTRIES: tl.constexpr = 32 if TALL > 1 else 1  # at a time
+    entry = tl.arange(0, ENTRIES)[None, :]
     for first in range(tl.program_id(0) * TALL, nodes, programs * TALL):
         n = first + tl.arange(0, TALL)
         mask = n < nodes
@@ -326,8 +327,8 @@ def _count_nodes(
             tl.store(marked + node, tl.zeros([TALL], tl.int32), mask)
         else:
             length = tl.where(tl.load(reached + n, mask, 0) > 0, length, 0)
-        found = tl.zeros([TALL, 32], tl.float32)
-        for k in range(0, tl.max(length), 32):
+        found = tl.zeros([TALL, ENTRIES], tl.float32)
+        for k in range(0, tl.max(length), ENTRIES):
             real = (k + entry) < length[:, None]
             e = begin[:, None] + k + entry
             count = tl.load(many + tl.load(entry_place + e, real, 0), real, 0)
@@ -341,15 +342,16 @@ def _push_nodes(
     TALL: tl.constexpr,
 ):  # fmt: skip
     """Give the impulses of the samples to the nodes."""
-    entry = tl.arange(0, 32)[None, :]
+    ENTRIES: tl.constexpr = 32 if TALL > 1 else 1  # at a time
+    entry = tl.arange(0, ENTRIES)[None, :]
     for first in range(tl.program_id(0) * TALL, nodes, programs * TALL):
         n = first + tl.arange(0, TALL)
         node = tl.load(touched + n, n < nodes, 0)
         mask = (n < nodes) & (tl.load(total + node, n < nodes, 0.0) > 0)
         begin = tl.load(entry_start + n, mask, 0)
         length = tl.load(entry_start + n + 1, mask, 0) - begin
-        found = tl.zeros([TALL, 32, 4], tl.float32)
-        for k in range(0, tl.max(length), 32):
+        found = tl.zeros([TALL, ENTRIES, 4], tl.float32)
+        for k in range(0, tl.max(length), ENTRIES):
             real = (k + entry) < length[:, None]
             e = begin[:, None] + k + entry
             at = impulse + tl.load(entry_place + e, real, 0) * 8

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 import torch
 from torch import Tensor
 
-from gaussian_swaying.kernels.launch import launch
+from gaussian_swaying.kernels.launch import lanes, launch
 from gaussian_swaying.mpm.contact.solve import PUSH, PUSH_CELLS, SLACK
 from gaussian_swaying.mpm.contact.stage import TOLERANCE, ContactStage
 from gaussian_swaying.mpm.triton import contact_kernels as kernels
@@ -208,7 +208,10 @@ class FusedContact:
         strides = (ny * nz, nz, 1 / dx)
         now = (schedule, first_step, offset, *strides)
         where = (self.fields, self.base, self.fraction, self.arm, self.rest)
-        options: dict[str, Any] = {"ARMS": self.arms, "BLOCK": BLOCK, "TALL": TALL, **_LAUNCH}
+        block, one = lanes(self.device, BLOCK, 1), lanes(self.device, BLOCK)
+        options: dict[str, Any] = {
+            "ARMS": self.arms, "BLOCK": block, "TALL": lanes(self.device, TALL, 1), **_LAUNCH
+        }  # fmt: skip
         if self.programs > 1:
             options["launch_cooperative_grid"] = True
         if pairs:
@@ -218,22 +221,22 @@ class FusedContact:
                 self.now, self.counts, self.start, self.rank, self.item, self.ordered, self.sorted, self.candidates,
                 self.near, self.room, self.many, self.impulse, self.entry_start, self.entry_place, self.reached,
                 len(self.touched), self.peak, self.sums, self.gate, self.status, self.margin, *now, stage.reach,
-                stage.apart, SLACK * dx, LEAST_MARGIN * dx, AHEAD, self.last, -(-chunk // BLOCK) * BLOCK,
-                WIDE=WIDE_SEARCH, **options,
+                stage.apart, SLACK * dx, LEAST_MARGIN * dx, AHEAD, self.last, -(-chunk // block) * block,
+                WIDE=lanes(self.device, WIDE_SEARCH), **options,
             )  # fmt: skip
         if walls:
-            launch(list_kernels.contact_positions, (-(-self.places // BLOCK),))(
+            launch(list_kernels.contact_positions, (-(-self.places // block),))(
                 *where, self.places, self.position, self.moving, self.status, *strides,
-                ARMS=self.arms, BLOCK=BLOCK, num_warps=8,
+                ARMS=self.arms, BLOCK=block, num_warps=8,
             )  # fmt: skip
             for k, (solid, (_, obstacle)) in enumerate(zip(self.solids, stage.obstacles, strict=True)):
                 if solid is not None:
                     solid.prepare(time, dt, 1)
-                    launch(obstacle_kernels.obstacle_places, (-(-self.places // BLOCK),))(
+                    launch(obstacle_kernels.obstacle_places, (-(-self.places // one),))(
                         self.position, self.moving, self.thickness, self.wall_gap[k], self.wall_normal[k],
                         self.wall_drive[k], self.wall_valid[k], self.within, self.places, solid.rows, solid.windows,
                         solid.poses, solid.tables.buffer, time, dt, SLACK * dx, SOLIDS=solid.twins,
-                        MOVES=solid.moves[0], BLOCK=BLOCK, num_warps=4,
+                        MOVES=solid.moves[0], BLOCK=one, num_warps=4,
                     )  # fmt: skip
                     continue
                 gap, normal, drive = obstacle.touch(self.position, time, dt)

@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 
 from gaussian_swaying.kernels.language import triton
-from gaussian_swaying.kernels.launch import launch
+from gaussian_swaying.kernels.launch import lanes, launch
 from gaussian_swaying.mpm.forces import Force, tensors_of
 from gaussian_swaying.mpm.formulations.formulation import Formulation
 from gaussian_swaying.mpm.state import MPMState
@@ -276,7 +276,7 @@ class TotalAdjoint:
         self.multipliers[:count].copy_(found.reshape(count, -1, 4))
 
     def _keep(self, offset: int, asked: _Pass) -> None:
-        fused, block = self.fused, 512
+        fused, block = self.fused, lanes(self.fused.device, 512)
         launch(kernels.keep_nodes, (triton.cdiv(8 * self.nodes, block),))(
             fused.active, self.nodes, fused.fields, self.history, fused.first_step, offset, BLOCK=block, num_warps=4
         )
@@ -296,18 +296,18 @@ class TotalAdjoint:
         nodes, rows = len(self.affected), self.push.shape[0]
         launch(kernels.rows_adjoint, (len(self.residual),))(
             self.affected, self.scene, self.push, self.bars, self.residual, nodes, rows,
-            BLOCK=min(1024, triton.next_power_of_2(nodes)), num_warps=4,
+            BLOCK=lanes(fused.device, min(1024, triton.next_power_of_2(nodes))), num_warps=4,
         )  # fmt: skip
-        block = 8
+        block = lanes(fused.device, 8, 1)
         launch(kernels.hold_adjoint, (triton.cdiv(nodes, block),))(
             self.affected, self.scene, self.weight, self.residual, nodes, rows, self.bars,
             self.weight_bar, self.multipliers, len(self.residual), fused.inverse_mass, self.history, self.nodes,
-            fused.first_step, offset, self.last, WEIGHTS=asked.flags["WEIGHTS"], BLOCK=block, ROWS=64, num_warps=2,
+            fused.first_step, offset, self.last, WEIGHTS=asked.flags["WEIGHTS"], BLOCK=block, ROWS=lanes(fused.device, 64), num_warps=2,
         )  # fmt: skip
         self._nodes(offset, asked, SUM=False, PUSH=False, FINISH=True)
 
     def _nodes(self, offset: int, asked: _Pass, **stages: bool) -> None:
-        fused, block = self.fused, 64
+        fused, block = self.fused, lanes(self.fused.device, 64, 1)
         launch(kernels.nodes_adjoint, (triton.cdiv(self.nodes, block),))(
             fused.active, fused.source, len(fused.source), fused.inverse_mass, fused.held, self.nodes, asked.partial,
             fused.fields, self.force_bar, self.history, self.bars, self.mass_bar,
@@ -318,7 +318,7 @@ class TotalAdjoint:
 
     def _particles(self, offset: int, asked: _Pass) -> None:
         fused, options, flags = self.fused, asked.options, asked.flags
-        per_program = max(1, 32 // fused.lanes)
+        per_program = lanes(fused.device, max(1, 32 // fused.lanes), 1)
         _, ny, nz = fused.grid.resolution
         cut = fused.pieces > fused.cells
         to = fused.sums(fused.pieces, asked.width, "adjoint pieces") if cut else asked.partial
