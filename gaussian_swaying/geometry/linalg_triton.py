@@ -5,9 +5,12 @@ The definitions are in :mod:`~gaussian_swaying.geometry.linalg`.
 A matrix is a tuple of nine values, row by row; a vector one of three.
 """
 
-from gaussian_swaying.kernels.language import tl, triton
+from gaussian_swaying.kernels.language import ON_GPU, tl, triton
 
 TINY = tl.constexpr(1e-30)
+GPU = tl.constexpr(ON_GPU)
+SETTLED = tl.constexpr(1e-8)
+"""Square of the change of a rotation after which the next one is below float32's epsilon."""
 
 
 @triton.jit
@@ -226,17 +229,31 @@ def scaled_product(u, d, v):
 
 
 @triton.jit
+def _polar_step(x):
+    """A step of Newton's iteration with Higham's scaling."""
+    cof = cofactor(x)
+    det = x[0] * cof[0] + x[1] * cof[1] + x[2] * cof[2]
+    size = tl.maximum(tl.abs(det), 1e-9)
+    inverse = 1.0 / tl.where(det < 0, -size, size)
+    ratio = square9(cof) * inverse * inverse / tl.maximum(square9(x), 1e-9)
+    zeta = tl.sqrt(tl.sqrt(tl.maximum(ratio, 1e-37)))
+    return axpy9(0.5 * zeta, x, 0.5 * inverse / zeta, cof)
+
+
+@triton.jit
 def polar_rotation(F):
     """The nearest rotation, as ``linalg.polar_rotation``."""
     x = F
-    for _ in range(5):
-        cof = cofactor(x)
-        det = x[0] * cof[0] + x[1] * cof[1] + x[2] * cof[2]
-        size = tl.maximum(tl.abs(det), 1e-9)
-        inverse = 1.0 / tl.where(det < 0, -size, size)
-        ratio = square9(cof) * inverse * inverse / tl.maximum(square9(x), 1e-9)
-        zeta = tl.sqrt(tl.sqrt(tl.maximum(ratio, 1e-37)))
-        x = axpy9(0.5 * zeta, x, 0.5 * inverse / zeta, cof)
+    if GPU:
+        for _ in range(5):
+            x = _polar_step(x)
+    else:
+        k = 0
+        while k < 5:
+            last = x
+            x = _polar_step(x)
+            change = axpy9(1.0, x, -1.0, last)
+            k = tl.where(tl.max(square9(change)) > SETTLED, k + 1, 5)  # the next change is about the square of this one
     cof = cofactor(x)
     reflected = x[0] * cof[0] + x[1] * cof[1] + x[2] * cof[2] < 0
     if tl.max(reflected.to(tl.int32)) > 0:

@@ -95,6 +95,8 @@ class FusedTotal(Fused):
         self._take_pins()
         self.touching = None if bound.contact is None else FusedContact(bound, self.fields, self.active)
         self.shift = torch.zeros(len(inverse) if self.position else 0, 4, device=self.device)
+        self.alone = torch.arange(len(active), dtype=torch.int32, device=self.device)
+        self.joined = torch.zeros(len(active) if lanes(self.device, 0) else 0, 8, device=self.device)
         self._partial: dict[tuple[int, int, str], Tensor] = {}
         width = 8 if self.position else 4
         check_indices(max(8 * len(inverse), 27 * (self.pieces + 1) * width, 27 * len(active)))
@@ -128,7 +130,8 @@ class FusedTotal(Fused):
 
     def _cut(self, sizes: Tensor) -> None:
         """Cut crowded cells into pieces: otherwise a body of few cells has too few programs to fill a GPU."""
-        most = self.lanes * max(1, -(-self.count // (self.lanes * _PROGRAMS)))
+        programs = lanes(self.device, _PROGRAMS, 1)
+        most = self.lanes * max(1, -(-self.count // (self.lanes * programs)))
         counts = -(-sizes // most)
         first = counts.cumsum(0) - counts
         cell = torch.repeat_interleave(torch.arange(self.cells, device=self.device), counts)
@@ -227,15 +230,19 @@ class FusedTotal(Fused):
         if self.pieces > self.cells:
             pieces, partial = partial, self.sums(self.cells, width)
             self.join_pieces(pieces, partial, width)
-        block = lanes(self.device, 64, 1)
-        nodes, held = len(self.active), self.plain and any(self.bound.on_nodes)
+        nodes, block = len(self.active), lanes(self.device, 64, 1)
+        source, sources = self.source, len(self.source)
+        if block == 1:
+            launch(kernels.total_join, (nodes,))(source, sources, nodes, partial, self.joined, WIDTH=width)
+            source, sources, partial = self.alone, 1, self.joined
+        held = self.plain and any(self.bound.on_nodes)
         moves = self.plain and self.touching is None
         launch(kernels.total_nodes, (-(-nodes // block),))(
-            self.active, self.source, len(self.source), self.inverse_mass, self.held, nodes, partial,
+            self.active, source, sources, self.inverse_mass, self.held, nodes, partial,
             self.fields, self.shift, self.schedule, self.first_step, offset, *self.gravity, self.taken,
             IMPLICIT=options["IMPLICIT"], POSITION=self.position, WIDTH=width,
             HELD=moves and held, MOVE=moves, BLOCK=block,
-            SOURCES=triton.next_power_of_2(len(self.source)), num_warps=4,
+            SOURCES=triton.next_power_of_2(sources), num_warps=4,
         )  # fmt: skip
         if self.touching is not None:
             self.touching.apply(self.schedule, self.first_step, offset, self.time, self.dt)

@@ -234,6 +234,17 @@ def total_pieces(pieces_in, partial, first_piece, cells, pieces, WIDTH: tl.const
     tl.store(partial + out[:, None] + column, total, mask[:, None])
 
 
+@triton.jit(do_not_specialize=VARIES)
+def total_join(source, sources, nodes, partial, joined, WIDTH: tl.constexpr):
+    """``total``, on a CPU: the sums of the cells around a node, so that ``total_nodes`` has one source."""
+    k = tl.program_id(0)
+    column = tl.arange(0, WIDTH)
+    total = tl.zeros([WIDTH], tl.float32)
+    for o in range(0, sources):
+        total += tl.load(partial + tl.load(source + o * nodes + k) * WIDTH + column)
+    tl.store(joined + k * WIDTH + column, total)
+
+
 @triton.jit
 def _end(node, k, mask, v0, v1, v2, inverse, held, taken, fields, dt, HELD: tl.constexpr, MOVE: tl.constexpr):
     """Stop the held nodes and sum the reaction impulses, write the velocities, and move the nodes."""
