@@ -9,8 +9,6 @@ from gaussian_swaying.kernels.language import ON_GPU, tl, triton
 
 TINY = tl.constexpr(1e-30)
 GPU = tl.constexpr(ON_GPU)
-SETTLED = tl.constexpr(1e-8)
-"""Square of the change of a rotation after which the next one is below float32's epsilon."""
 
 
 @triton.jit
@@ -248,12 +246,13 @@ def polar_rotation(F):
         for _ in range(5):
             x = _polar_step(x)
     else:
+        settled = 1e-16 if x[0].dtype == tl.float64 else 1e-8  # then the next change is below epsilon
         k = 0
         while k < 5:
             last = x
             x = _polar_step(x)
             change = axpy9(1.0, x, -1.0, last)
-            k = tl.where(tl.max(square9(change)) > SETTLED, k + 1, 5)  # the next change is about the square of this one
+            k = tl.where(tl.max(square9(change)) > settled, k + 1, 5)  # changes square
     cof = cofactor(x)
     reflected = x[0] * cof[0] + x[1] * cof[1] + x[2] * cof[2] < 0
     if tl.max(reflected.to(tl.int32)) > 0:

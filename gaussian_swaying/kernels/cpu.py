@@ -358,6 +358,8 @@ _GPU_ONLY = ("num_warps", "maxnreg", "launch_cooperative_grid", "num_stages")
 def launch(kernel: Any, grid: Sequence[int], *given: Any, **named: Any) -> None:
     """Run the programs of a kernel on the CPU, or record them.
 
+    Its real numbers are of double precision if it gets tensors of them and none of single precision.
+
     Args:
         kernel: The kernel.
         grid: Number of programs along each of up to three axes.
@@ -369,7 +371,8 @@ def launch(kernel: Any, grid: Sequence[int], *given: Any, **named: Any) -> None:
     constants = {name: value for name, value in values.items() if name in constant}
     passed = {name: values[name] for name in names if name in values and name not in constant}
     kinds, words, tensors = {}, [], []
-    real = "f32"
+    types = {value.dtype for value in passed.values() if isinstance(value, Tensor)}
+    real = "f64" if torch.float64 in types and torch.float32 not in types else "f32"
     for name, value in passed.items():
         if isinstance(value, Tensor):
             kinds[name] = _KINDS[value.dtype]

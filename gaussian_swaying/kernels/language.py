@@ -33,6 +33,12 @@ class Name:
     def __init__(self, name: str) -> None:
         self.name = name
 
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, Name) and self.name == other.name
+
+    def __hash__(self) -> int:
+        return hash(self.name)
+
     def __getattr__(self, name: str) -> Name:
         if name.startswith("__"):
             raise AttributeError(name)

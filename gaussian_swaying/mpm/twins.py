@@ -184,14 +184,15 @@ class Tables:
 
     Args:
         device: Device of the buffer.
+        dtype: Its type.
 
     Attributes:
-        buffer: The numbers and tables, float32, at the places that :class:`Composed` says. Its address changes if it
+        buffer: The numbers and tables, at the places that :class:`Composed` says. Its address changes if it
             must grow.
     """
 
-    def __init__(self, device: torch.device) -> None:
-        self.buffer = torch.zeros(1, device=device)
+    def __init__(self, device: torch.device, dtype: torch.dtype = torch.float32) -> None:
+        self.buffer = torch.zeros(1, dtype=dtype, device=device)
         self._layout: Composed | None = None
         self._watched: list[Watched] = []
 
@@ -204,7 +205,7 @@ class Tables:
             numbers: Whether to take the ``numbers`` of these twins, too; those of their parts are always taken.
         """
         if layout.size > len(self.buffer):
-            self.buffer = torch.zeros(layout.size, device=self.buffer.device)
+            self.buffer = self.buffer.new_zeros(layout.size)
         pieces = list(_pieces(twins, layout, 0, numbers))
         if layout != self._layout:
             self._layout, self._watched = layout, [Watched() for _ in pieces]

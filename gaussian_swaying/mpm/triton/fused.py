@@ -92,24 +92,26 @@ class Fused(ABC):
         self.count = points.mass.numel()
         self.scenes = self.count // max(self.particles, 1)
         self.laws = BodyLaws(points.laws)
-        self.law_table = torch.tensor(self.laws.table, device=self.device)
+        self.like: dict[str, Any] = {"dtype": points.position.dtype, "device": self.device}
+        """Options of buffers of real numbers."""
+        self.law_table = torch.tensor(self.laws.table, **self.like)
         self.law = torch.zeros(self.count, dtype=torch.int32, device=self.device)
         if points.law_index is not None:
             self.law = points.law_index.reshape(-1).int()
         self.first_step = torch.zeros(1, dtype=torch.int32, device=self.device)
-        self.schedule = torch.zeros(MAX_STEPS + 2, SCHEDULE, device=self.device)
+        self.schedule = torch.zeros(MAX_STEPS + 2, SCHEDULE, **self.like)
         self.forces = Composed(())
         """The forces of the current rollout that the kernels compute."""
-        self.vectors = torch.zeros(0, device=self.device)
+        self.vectors = torch.zeros(0, **self.like)
         """Their numbers of each substep and scene."""
-        self.tables = Tables(self.device)
+        self.tables = Tables(self.device, points.position.dtype)
         self._watched = Watched()
-        self.load = torch.zeros(8, self.count, device=self.device)
-        self.force_in = torch.zeros(0, 4, device=self.device)
+        self.load = torch.zeros(8, self.count, **self.like)
+        self.force_in = torch.zeros(0, 4, **self.like)
         self.wave = shared(points.laws, "wave")
         self.watches = self.wave is not None
         """True if rollouts can measure the wave speed."""
-        self.speed = torch.zeros(1, device=self.device)
+        self.speed = torch.zeros(1, **self.like)
         self.impulse = bound.no_impulse()
         """Reaction impulse: momentum that each boundary took in the current part of the rollout, shape (..., B, 3)."""
         self.time = torch.zeros((), dtype=torch.float64, device=self.device)
@@ -133,7 +135,7 @@ class Fused(ABC):
         device = points.position.device.type
         if not compiles(device) or (INTERPRETED and not interpret):
             return "it needs a CUDA device" if device != "cpu" else "llvmlite is not installed"
-        if points.position.dtype != torch.float32:
+        if points.position.dtype != torch.float32 and device == "cuda":
             return f"it computes in float32, but the material is {points.position.dtype}".replace("torch.", "")
         if bound.settings.deterministic and device == "cuda" and not cls.fixed_order:
             return f"its sums have no fixed order in the {bound.name} formulation, but `deterministic` is set"
@@ -199,7 +201,7 @@ class Fused(ABC):
             options["IMPLICIT"] = options["IMPLICIT"] or drag is not None or self._resists(state)
             if options["FORCE"]:
                 if len(self.force_in) < self.count:  # needed for the first time
-                    self.force_in = torch.zeros(self.count, 4, device=self.device)
+                    self.force_in = torch.zeros(self.count, 4, **self.like)
                 self.force_in.zero_()
                 self._fill(force, drag)
             for first in range(0, steps, MAX_STEPS):
@@ -220,7 +222,7 @@ class Fused(ABC):
         self.tables.take(twins, self.forces)
         room = MAX_STEPS * self.scenes * self.forces.width
         if twins and len(self.vectors) < room:
-            self.vectors = torch.zeros(room, device=self.device)
+            self.vectors = torch.zeros(room, **self.like)
         if self._watched.changed([source for twin in twins for source in twin.sources]) or self.forces != before:
             batch = self.body.points.mass.shape
             values = [twin.per_point.take() for twin in twins if twin.per_point.count]
@@ -280,9 +282,10 @@ class Fused(ABC):
     def table(self, kick: float, dt: float, steps: int) -> Tensor:
         """The schedule on the host, which can be copied without making it wait."""
         first, other = (math.exp(-self.settings.damping * time) for time in (kick, dt))
-        table = torch.empty(steps + 2, SCHEDULE, pin_memory=self.device.type == "cuda")
-        table[2:] = torch.tensor([dt, dt, other, 0.0])
-        table[:2] = torch.tensor([[0.0, dt, 1.0, kick if steps == 1 else dt], [kick, dt, first, 0.0]])
+        real = self.like["dtype"]
+        table = torch.empty(steps + 2, SCHEDULE, dtype=real, pin_memory=self.device.type == "cuda")
+        table[2:] = torch.tensor([dt, dt, other, 0.0], dtype=real)
+        table[:2] = torch.tensor([[0.0, dt, 1.0, kick if steps == 1 else dt], [kick, dt, first, 0.0]], dtype=real)
         return table
 
     def _key_of(self, forces: Sequence[Force]) -> tuple[object, ...] | None:
@@ -324,10 +327,10 @@ class Fused(ABC):
         """Compute the forces in torch from the particles in the buffers, and fill the force buffer."""
         self._fill(*self._ask(self._look_at()))
 
-    def _room(self, name: str, *shape: int, dtype: torch.dtype = torch.float32) -> Tensor:
+    def _room(self, name: str, *shape: int, dtype: torch.dtype | None = None) -> Tensor:
         """A buffer for a particle field. Its address stays the same, because graphs write to it and read from it."""
         if name not in self._seen:
-            self._seen[name] = torch.zeros(shape, dtype=dtype, device=self.device)
+            self._seen[name] = torch.zeros(shape, dtype=dtype or self.like["dtype"], device=self.device)
         return self._seen[name]
 
     @abstractmethod

@@ -101,24 +101,24 @@ class FusedContact:
         most = int(list_kernels.MOST_PROGRAMS.value)
         self.peak, self.sums = self._zeros(4, most), self._zeros(most, **whole)
         self.gate, self.status = self._zeros(1, **whole), self._zeros(8, **whole)
-        self.margin = torch.full((1,), -1.0, device=self.device)
+        self.margin = torch.full((1,), -1.0, dtype=fields.dtype, device=self.device)
         self.wall_gap, self.wall_valid = self._zeros(max(walls, 1), many), self._zeros(max(walls, 1), many)
         self.wall_normal, self.wall_drive = self._zeros(max(walls, 1), many, 3), self._zeros(max(walls, 1), many, 3)
         self.pressed = self._zeros(max(walls, 1), many, 3)
         self.pressed_sum = self._zeros(max(walls, 1), many, 3, dtype=torch.float64)
         self.marked = self._zeros(len(fields), **whole)
         self.within = self.status[int(list_kernels.WITHIN.value)]
-        self.friction = torch.tensor([float(b.friction) for _, b in stage.obstacles] or [0.0], device=self.device)
+        self.friction = fields.new_tensor([float(b.friction) for _, b in stage.obstacles] or [0.0])
         self.solids = [
-            None if obstacle.twin() is None else Solids([(obstacle, 0)], self.device, steps=1)
+            None if obstacle.twin() is None else Solids([(obstacle, 0)], fields, steps=1)
             for _, obstacle in stage.obstacles
         ]
         """For each obstacle its tables; None for one that runs in torch."""
         self.programs = self._programs()
         self._take_room(*((ROOM, SLOTS) if stage.contact is not None else (1, walls)))
 
-    def _zeros(self, *shape: int, dtype: torch.dtype = torch.float32) -> Tensor:
-        return torch.zeros(shape, dtype=dtype, device=self.device)
+    def _zeros(self, *shape: int, dtype: torch.dtype | None = None) -> Tensor:
+        return torch.zeros(shape, dtype=dtype or self.fields.dtype, device=self.device)
 
     def _programs(self) -> int:
         """Programs that meet: one in the interpreter, which runs them one after the other."""

@@ -59,7 +59,7 @@ class FusedTotal(Fused):
         rows = [points.volume, body.laws.mu, body.laws.lam, points.mass]
         self.material = torch.stack([row.reshape(-1) for row in rows])[:, order].contiguous()
         self.law = self.law[order].contiguous()
-        self.values = torch.zeros(0, self.count, device=self.device)
+        self.values = torch.zeros(0, self.count, **self.like)
         self.rest = points.position.contiguous()
         inverse = bound.node_inverse_mass.reshape(-1)
         active = (inverse > 0).nonzero()[:, 0]
@@ -72,7 +72,7 @@ class FusedTotal(Fused):
         self.source = _sources(
             torch.stack([torch.where(b >= 0, place[b.clamp(min=0)], self.cells) for b in below]), self.cells
         )
-        self.fields = torch.zeros(len(inverse), 8, device=self.device)
+        self.fields = torch.zeros(len(inverse), 8, **self.like)
         self.displacement, self.velocity = self.fields[:, :4], self.fields[:, 4:]
         self.lanes = lanes(self.device, _lanes(sizes))
         self._cut(sizes)
@@ -82,7 +82,7 @@ class FusedTotal(Fused):
         self.shapes |= {"displacement": torch.Size(nodes), "node_velocity": torch.Size(nodes)}
         self.room = sum(map(_padded, self.shapes.values()))
         """Entries of a buffer for all fields of a state."""
-        self.found = torch.zeros(self.room if self.count <= RECORDED else 0, device=self.device)
+        self.found = torch.zeros(self.room if self.count <= RECORDED else 0, **self.like)
         self.taken_and_done = torch.zeros(self.impulse.numel() + self.scenes, dtype=torch.float64, device=self.device)
         pins = (PinnedRegion, PinnedPoints)
         self.plain = all(
@@ -94,9 +94,9 @@ class FusedTotal(Fused):
         self.lattice = grid.node_positions(self.rest) if bound.needs_lattice else None
         self._take_pins()
         self.touching = None if bound.contact is None else FusedContact(bound, self.fields, self.active)
-        self.shift = torch.zeros(len(inverse) if self.position else 0, 4, device=self.device)
+        self.shift = torch.zeros(len(inverse) if self.position else 0, 4, **self.like)
         self.alone = torch.arange(len(active), dtype=torch.int32, device=self.device)
-        self.joined = torch.zeros(len(active) if lanes(self.device, 0) else 0, 8, device=self.device)
+        self.joined = torch.zeros(len(active) if lanes(self.device, 0) else 0, 8, **self.like)
         self._partial: dict[tuple[int, int, str], Tensor] = {}
         width = 8 if self.position else 4
         check_indices(max(8 * len(inverse), 27 * (self.pieces + 1) * width, 27 * len(active)))
@@ -119,14 +119,14 @@ class FusedTotal(Fused):
         owner = owner[active]
         self.held = (owner >= 0).to(torch.int8)
         # momentum taken from each held node, and a row of zeros
-        self.taken = torch.zeros(len(active) + 1, 4, device=self.device)
+        self.taken = torch.zeros(len(active) + 1, 4, **self.like)
         scene = active // self.grid.node_count
         self.own_nodes = [_by_scene((owner == k).nonzero()[:, 0], scene, self.scenes) for k in range(len(bound.held))]
         self.points: DenseHolds | None = None
         if self.plain and bound.point_holds is not None:
             self.points = bound.point_holds.dense()
             check_indices(self.points.push.numel())
-            self.residual = torch.zeros(2, self.points.node.shape[1], 4, device=self.device)  # now, and its sum
+            self.residual = torch.zeros(2, self.points.node.shape[1], 4, **self.like)  # now, and its sum
 
     def _cut(self, sizes: Tensor) -> None:
         """Cut crowded cells into pieces: otherwise a body of few cells has too few programs to fill a GPU."""
@@ -143,13 +143,13 @@ class FusedTotal(Fused):
 
     def _take_values(self, values: Tensor) -> None:
         if len(self.values) < values.shape[1]:
-            self.values = torch.zeros(values.shape[1], self.count, device=self.device)
+            self.values = torch.zeros(values.shape[1], self.count, **self.like)
         self.values[: values.shape[1]].copy_(values[self.order.long()].T)
 
     def sums(self, rows: int, width: int, use: str = "") -> Tensor:
         """Buffer for the sums of each cell or piece of a cell, with a row of zeros at the end."""
         if (rows, width, use) not in self._partial:
-            self._partial[rows, width, use] = torch.zeros(27, rows + 1, width, device=self.device)
+            self._partial[rows, width, use] = torch.zeros(27, rows + 1, width, **self.like)
         return self._partial[rows, width, use]
 
     def join_pieces(self, pieces: Tensor, cells: Tensor, width: int) -> None:
@@ -195,7 +195,7 @@ class FusedTotal(Fused):
             if mark in part.looks:
                 self.repeater.run(1, "look", lambda _: self._look(), launches=True)
         if self.count > RECORDED:
-            found = torch.empty(self.room, device=self.device)
+            found = torch.empty(self.room, **self.like)
             self._read(found, part)
             return self._fields(found, self.taken_and_done.clone(), part)
         self.repeater.run(1, ("read", part.loaded, options["IMPLICIT"]), lambda _: self._read(self.found, part))
@@ -297,7 +297,7 @@ class FusedTotal(Fused):
         velocity, taken = bound.hold(velocity, displacement, position, lattice, self.time, self.dt)
         self.impulse.add_(taken)
         self.velocity[:, :3].copy_(velocity.reshape(-1, 3))
-        self.displacement.addcmul_(self.velocity, self.dt.float())
+        self.displacement.addcmul_(self.velocity, self.dt.to(self.velocity.dtype))
 
     def _read(self, found: Tensor, part: Part) -> None:
         """Write all fields of the state into ``found``; also the reaction impulses and the work of the load."""

@@ -44,17 +44,17 @@ class FusedUpdated(Fused):
         self.plastic = len(self.laws.flows) > 0
         self.internal = laws.initial_internal() is not None
         rows = [points.mass, points.volume, laws.mu, laws.lam, self.law]
-        self.constants = torch.stack([row.reshape(-1).float() for row in rows], dim=1)
-        self.moving = torch.zeros(0, self.count, device=self.device)
+        self.constants = torch.stack([row.reshape(-1).to(**self.like) for row in rows], dim=1)
+        self.moving = torch.zeros(0, self.count, **self.like)
         self._take_values(self.constants[:, :0])
         self.scene = torch.arange(self.count, device=self.device) // max(self.particles, 1)
         self.order = torch.arange(self.count, dtype=torch.int32, device=self.device)
-        self.momentum = torch.zeros(0, 4, device=self.device)
-        self.velocity = torch.zeros(0, 4, device=self.device)
-        self.inverse_mass = torch.zeros(0, device=self.device)
-        self.weight = torch.zeros(0, device=self.device)
+        self.momentum = torch.zeros(0, 4, **self.like)
+        self.velocity = torch.zeros(0, 4, **self.like)
+        self.inverse_mass = torch.zeros(0, **self.like)
+        self.weight = torch.zeros(0, **self.like)
         self.node_position: Tensor | None = None
-        self.solids = Solids(solids_of(bound.body.boundaries) if self.scenes == 1 else [], self.device)
+        self.solids = Solids(solids_of(bound.body.boundaries) if self.scenes == 1 else [], self.law_table)
         self.clock = torch.zeros(2, dtype=torch.float64, device=self.device)  # time at step 0, substep [s]
         self.crowd = crowd_of(points.position, bound.settings.dx)
         self.crossing = 1e-3  # how many cells a particle enters in a substep; measured by the rollouts
@@ -64,18 +64,18 @@ class FusedUpdated(Fused):
         self.place = torch.zeros(2, self.count, dtype=torch.int32, device=self.device)  # cell, rank in it
         self.grid = GridSpec(bound.settings.dx, (0, 0, 0), (0, 0, 0))
         rows = 0 if self.atomic else self.count
-        self.parts = torch.zeros(rows, kernels.PART.value, device=self.device)
+        self.parts = torch.zeros(rows, kernels.PART.value, **self.like)
         self.part_node = torch.zeros(rows, dtype=torch.int32, device=self.device)
-        self.windows = torch.zeros(0, device=self.device)
+        self.windows = torch.zeros(0, **self.like)
         self.ranges = torch.zeros(SHARES, 2, dtype=torch.int32, device=self.device)
         self.pressed = torch.zeros(0, dtype=torch.float64, device=self.device)
 
     def _take_values(self, values: Tensor) -> None:
-        self.constants = torch.cat([self.constants[:, :5], values.float()], dim=1)
+        self.constants = torch.cat([self.constants[:, :5], values.to(**self.like)], dim=1)
         rows = (40 if self.plastic else 31) + values.shape[1]
         if rows > len(self.moving):
             check_indices(rows * self.count)
-            self.moving = torch.zeros(rows, self.count, device=self.device)
+            self.moving = torch.zeros(rows, self.count, **self.like)
             self.spare = (self.moving[:0],) * 3  # for a sort: rows, order, work
             self.repeater.forget()
 
@@ -98,10 +98,10 @@ class FusedUpdated(Fused):
             held = room if self._acting else 0
             self.repeater.forget()  # free their memory before allocating more
             with torch.inference_mode(False):  # they can be written inside and outside inference mode
-                self.momentum = torch.zeros(room, width, device=self.device)
-                self.velocity = torch.zeros(room, 4, device=self.device)
-                self.inverse_mass, self.weight = (torch.zeros(held, device=self.device) for _ in range(2))
-                self.windows = torch.empty(0 if self.atomic else SHARES * room * width, device=self.device)
+                self.momentum = torch.zeros(room, width, **self.like)
+                self.velocity = torch.zeros(room, 4, **self.like)
+                self.inverse_mass, self.weight = (torch.zeros(held, **self.like) for _ in range(2))
+                self.windows = torch.empty(0 if self.atomic else SHARES * room * width, **self.like)
                 programs = -(-room // self.node_block) if self.solids.parts else 0
                 self.pressed = torch.zeros(programs, *self.impulse.reshape(-1, 3).shape, dtype=torch.float64).to(
                     self.device
@@ -150,7 +150,7 @@ class FusedUpdated(Fused):
 
     def _measure_crossing(self) -> None:
         """Measure how many cells a particle enters in a substep, on average, without waiting."""
-        moved = self.moving[12:15].abs().mean() * 3 * self.dt.float() / self.settings.dx
+        moved = self.moving[12:15].abs().mean() * 3 * self.dt.to(self.moving.dtype) / self.settings.dx
         self._measured.copy_(moved.nan_to_num(0.0, 0.0)[None], non_blocking=True)
         if self.device.type == "cuda":
             self._copied = torch.cuda.Event()
@@ -319,11 +319,11 @@ class FusedUpdated(Fused):
         return (weight * self.inverse_mass[:nodes]).reshape(shape)
 
     def _read(self, state: MPMState) -> dict[str, Any]:
-        position, velocity = (torch.empty(state.position.shape, device=self.device) for _ in range(2))
-        affine, F = (torch.empty(state.F_elastic.shape, device=self.device) for _ in range(2))
+        position, velocity = (torch.empty(state.position.shape, **self.like) for _ in range(2))
+        affine, F = (torch.empty(state.F_elastic.shape, **self.like) for _ in range(2))
         F_total = torch.empty_like(F) if self.plastic else F
         lost = torch.empty(state.lost.shape, dtype=torch.bool, device=self.device)
-        internal = None if state.internal is None else torch.empty(state.internal.shape, device=self.device)
+        internal = None if state.internal is None else torch.empty(state.internal.shape, **self.like)
         return self._read_into(position, velocity, affine, F, F_total, lost, internal)
 
     def _read_into(

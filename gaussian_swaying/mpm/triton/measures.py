@@ -19,7 +19,7 @@ def largest_speed(bound: Formulation, state: MPMState) -> Tensor | None:
     wave = shared(points.laws, "wave")
     if wave is None:
         return None
-    out = torch.zeros(1, device=points.position.device)
+    out = points.position.new_zeros(1)
     count, block = points.mass.numel(), lanes(out.device, 128)
     density = points.mass / points.volume
     with torch.cuda.device_of(out):
@@ -35,7 +35,7 @@ def elastic_energy(body: Body, F: Tensor) -> Tensor | None:
     energy = shared(body.points.laws, "energy")
     if energy is None:
         return None
-    out = torch.empty(F.shape[:-2], device=F.device)
+    out = F.new_empty(F.shape[:-2])
     block = lanes(out.device, 128)
     with torch.cuda.device_of(out):
         launch(kernels.elastic_energy, (-(-out.numel() // block),))(

@@ -43,16 +43,16 @@ class Solids:
         moves: For each, whether it moves.
     """
 
-    def __init__(self, parts: Sequence[tuple[Solid, int]], device: torch.device, steps: int = MOST_STEPS) -> None:
-        self.parts, self.device = list(parts), device
+    def __init__(self, parts: Sequence[tuple[Solid, int]], like: Tensor, steps: int = MOST_STEPS) -> None:
+        self.parts, device = list(parts), like.device
         count, found = len(self.parts), [part.twin() for part, _ in self.parts]
         self._twins = [twin for twin in found if twin is not None]
-        self.twins, self.tables = Composed(self._twins), Tables(device)
+        self.twins, self.tables = Composed(self._twins), Tables(device, like.dtype)
         self.kinds = tuple(KINDS.index(part.kind if isinstance(part, Plane) else "separate") for part, _ in self.parts)
         self.moves = tuple(isinstance(part, Obstacle) and not part.still for part, _ in self.parts)
-        self.rows = torch.zeros(count, kernels.ROW.value, device=device)
+        self.rows = like.new_zeros(count, kernels.ROW.value)
         self.windows = torch.zeros(count, 2, dtype=torch.float64, device=device)
-        self.poses = torch.zeros(steps if any(self.moves) else min(count, 1), count, kernels.POSE.value, device=device)
+        self.poses = like.new_zeros(steps if any(self.moves) else min(count, 1), count, kernels.POSE.value)
         spans, keys = [], 0
         for (part, _), moves in zip(self.parts, self.moves, strict=True):
             many = len(part.times) if isinstance(part, Obstacle) and moves else 0

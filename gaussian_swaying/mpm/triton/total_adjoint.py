@@ -91,7 +91,7 @@ class TotalAdjoint:
         self.nodes, self.active = nodes, fused.active.long()
 
         def zeros(*shape: int) -> Tensor:
-            return torch.zeros(*shape, device=self.device)
+            return torch.zeros(*shape, **self.fused.like)
 
         self.force_bar = torch.zeros_like(fused.fields)
         self.bars = zeros(nodes, 8)
@@ -119,13 +119,13 @@ class TotalAdjoint:
             0, points.affected.long()[massive], torch.arange(len(massive), dtype=torch.int32, device=self.device)
         )
         row = (torch.arange(points.node.shape[1], device=self.device) % rows).expand_as(points.node)
-        weight = torch.zeros(len(massive) + 1, rows, device=self.device)
+        weight = torch.zeros(len(massive) + 1, rows, **self.fused.like)
         weight.index_put_((where[points.node.long()].long(), row), points.weight, accumulate=True)
         self.weight = weight[:-1].contiguous()
         self.weight_bar = torch.zeros_like(self.weight)
         self.entry = (where[points.node.long()].long(), row)
-        self.residual = torch.zeros(points.node.shape[1], 4, device=self.device)
-        self.multipliers = self.row_history = torch.zeros(0, len(self.residual), 4, device=self.device)
+        self.residual = torch.zeros(points.node.shape[1], 4, **self.fused.like)
+        self.multipliers = self.row_history = torch.zeros(0, len(self.residual), 4, **self.fused.like)
 
     # ---- forward
 
@@ -196,8 +196,8 @@ class TotalAdjoint:
             fused.tables.buffer[: len(numbers)].copy_(numbers)
         self._make_room(run.every, loaded)
         self.bars.zero_()
-        self.bars.view(nodes, 2, 4)[:, 0, :3] = displacement.reshape(-1, 3)[self.active].float()
-        self.bars.view(nodes, 2, 4)[:, 1, :3] = velocity.reshape(-1, 3)[self.active].float()
+        self.bars.view(nodes, 2, 4)[:, 0, :3] = displacement.reshape(-1, 3)[self.active]
+        self.bars.view(nodes, 2, 4)[:, 1, :3] = velocity.reshape(-1, 3)[self.active]
         width = 8 if loaded or options["VISCOUS"] else 4
         partial = self.sums(width)
         for buffer in (self.force_bar, self.mass_bar, self.found, partial, fused.fields):
@@ -251,15 +251,15 @@ class TotalAdjoint:
         """Make the buffers for a segment; recorded graphs contain their addresses, so new buffers are counted."""
         if len(self.history) < every + 1:
             self.rooms += 1
-            self.history = torch.zeros(every + 1, self.nodes, 8, device=self.device)
+            self.history = torch.zeros(every + 1, self.nodes, 8, **self.fused.like)
             if self.fused.points is not None:
                 rows = len(self.residual)
                 self.row_history, self.multipliers = (
-                    torch.zeros(every + 1, rows, 4, device=self.device) for _ in range(2)
+                    torch.zeros(every + 1, rows, 4, **self.fused.like) for _ in range(2)
                 )
         if loaded and len(self.shares) < every:
             self.rooms += 1
-            self.shares = torch.zeros(every, self.fused.pieces, 8, device=self.device)
+            self.shares = torch.zeros(every, self.fused.pieces, 8, **self.fused.like)
 
     def sums(self, width: int) -> Tensor:
         """The buffer that nodes sum over; that of the pieces, if cells are cut, is one of ``FusedTotal``."""
@@ -373,7 +373,7 @@ class TotalAdjoint:
         for name, row in zip(("mu", "lam", "volume"), sorted_back, strict=True):
             result[name] = row.reshape(batch)
         inverse = bound.node_inverse_mass
-        mass = torch.zeros(inverse.numel(), device=self.device).index_copy(0, self.active, self.mass_bar)
+        mass = torch.zeros(inverse.numel(), **self.fused.like).index_copy(0, self.active, self.mass_bar)
         result["inverse_mass"] = mass.reshape(inverse.shape)
         if fused.points is not None and bound.point_holds is not None:
             padded = torch.nn.functional.pad(self.weight_bar, (0, 0, 0, 1))
