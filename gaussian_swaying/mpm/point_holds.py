@@ -57,10 +57,10 @@ class DenseHolds:
 
     Attributes:
         node: Nodes of the rows over all scenes, int32, shape (27, R).
-        weight: Their weights, float32, shape (27, R).
+        weight: Their weights, shape (27, R).
         affected: Nodes that a row moves, over all scenes, int32, shape (A,).
         scene: The scene of each of them, int32, shape (A,).
-        push: M^-1 C^T (C M^-1 C^T)^-1 of each of them, float32, shape (A, K).
+        push: M^-1 C^T (C M^-1 C^T)^-1 of each of them, shape (A, K).
         share: Momentum that each boundary takes for the velocity of a row, float64, shape (scenes, B, K).
     """
 
@@ -228,9 +228,9 @@ class PointHolds:
         self.taken_by = holds.to(device)
         self.affected, self.entry, self.push = affected.to(device), (entry // 27).to(device), push.to(device)
 
-    def dense(self) -> DenseHolds:
+    def dense(self, dtype: torch.dtype) -> DenseHolds:
         """The same for the kernels, if the same points are at rest all the time."""
-        weight, node = self.weight[0].reshape(-1, 27).float(), self.node[0].reshape(-1, 27)
+        weight, node = self.weight[0].reshape(-1, 27).to(dtype), self.node[0].reshape(-1, 27)
         inverse = self.whitening[0].mT @ self.whitening[0]
         padded = torch.cat([inverse.flatten(0, 1), inverse.new_zeros(1, self.rows)])
         push = (self.push[0][..., None] * padded[self.entry[0]]).sum(1)
@@ -239,7 +239,7 @@ class PointHolds:
             weight=weight.T.contiguous(),
             affected=self.affected.int(),
             scene=(self.affected // self.nodes).int(),
-            push=push.float().contiguous(),
+            push=push.to(dtype).contiguous(),
             share=self.taken_by[0] @ inverse,
         )
 

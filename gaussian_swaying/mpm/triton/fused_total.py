@@ -124,7 +124,7 @@ class FusedTotal(Fused):
         self.own_nodes = [_by_scene((owner == k).nonzero()[:, 0], scene, self.scenes) for k in range(len(bound.held))]
         self.points: DenseHolds | None = None
         if self.plain and bound.point_holds is not None:
-            self.points = bound.point_holds.dense()
+            self.points = bound.point_holds.dense(self.like["dtype"])
             check_indices(self.points.push.numel())
             self.residual = torch.zeros(2, self.points.node.shape[1], 4, **self.like)  # now, and its sum
 
