@@ -1,23 +1,15 @@
 """The example that finds wind and stiffness from a motion."""
 
-import importlib.util
 import json
-import sys
-from pathlib import Path
 
 import pytest
 
-TOOL = Path(__file__).parents[2] / "tools/fit_flag.py"
+from .conftest import tool_of
 
 
 @pytest.fixture(scope="module")
 def tool():
-    spec = importlib.util.spec_from_file_location("fit_flag", TOOL)
-    module = importlib.util.module_from_spec(spec)
-    sys.modules["fit_flag"] = module  # dataclasses look their module up
-    spec.loader.exec_module(module)
-    yield module
-    del sys.modules["fit_flag"]
+    return tool_of("fit_flag.py")
 
 
 def test_a_few_iterations_lead_towards_the_truth(tool):
