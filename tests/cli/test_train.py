@@ -141,6 +141,18 @@ def test_a_resumed_run_is_the_same_bit_for_bit(capture, tmp_path):
         assert torch.equal(getattr(resumed.model.splat, name), getattr(straight.splat, name)), name
 
 
+def test_on_several_devices_numbers_still_count_images(capture, tmp_path):
+    """Of which a step of Lightning takes one on each; the configuration that is kept is the one that was given."""
+    numbers = {"trainer.max_steps": 21, "trainer.val_check_interval": 8, "checkpoint.every_n_train_steps": 10}
+    cli = make_cli(_arguments(capture, tmp_path, **numbers, **{"trainer.devices": 2}), run=False)
+    assert cli.trainer.world_size == 2
+    assert (cli.trainer.max_steps, cli.trainer.val_check_interval) == (11, 4)
+    assert "'every_n_train_steps': 5" in cli.trainer.checkpoint_callback.state_key
+    cli.run_folder.save_config(tmp_path)
+    kept = yaml.safe_load((tmp_path / "config.yaml").read_text())
+    assert {name: kept[name.split(".")[0]][name.split(".")[1]] for name in numbers} == numbers
+
+
 def test_the_last_image_is_in_a_checkpoint(capture, tmp_path):
     """13 images with a checkpoint every 10."""
     main(["fit", *_arguments(capture, tmp_path, **{"trainer.max_steps": 13, "checkpoint.save_top_k": 1})])
@@ -179,14 +191,14 @@ def _interrupts():
 
 
 def _stop_at(monkeypatch, step, error):
-    train = SplatTrainer._train_on
+    train = SplatTrainer.training_step
 
-    def stop(self, batch, now):
-        if now == step:
+    def stop(self, batch):
+        if self.global_step == step:
             raise error
-        return train(self, batch, now)
+        return train(self, batch)
 
-    monkeypatch.setattr(SplatTrainer, "_train_on", stop)
+    monkeypatch.setattr(SplatTrainer, "training_step", stop)
 
 
 @pytest.mark.slow(gate=["divergence", "SIGTERM"])

@@ -54,9 +54,7 @@ def test_import_is_light_and_every_module_imports_without_the_heavy_libraries():
     if importlib.util.find_spec("triton") is None:  # comes with CUDA builds of torch
         modules = [m for m in modules if not m.endswith("_triton") and ".triton" not in m]
     lightning_classes = {"training.data.datamodule", "training.data.generated_datamodule", "cli.train"}
-    lightning_classes |= {
-        f"training.{name}" for name in ("checkpoints", "counting", "csv_log", "module", "run_folder", "strategy")
-    }
+    lightning_classes |= {f"training.{name}" for name in ("checkpoints", "csv_log", "module", "run_folder", "strategy")}
     lightning_classes |= {"metrics.chamfer", "metrics.frechet_video"}
     modules = [m for m in modules if m.removeprefix("gaussian_swaying.") not in lightning_classes]
     assert len(modules) > 25

@@ -68,7 +68,6 @@ FOX_VARIANTS: dict[str, tuple[str, list[str]]] = {
         [*_DENSE, "--model.densification.stop=4000", "--model.sh_every=500"],
     ),
     "degree_1": ("harmonics of degree 1", [*_PLAIN, "--model.sh_degree=1"]),
-    "hooks_1": ("Lightning's hooks after every image", [*_PLAIN, "--model.hooks_every=1"]),
     "selective": ("gsplat's selective Adam", [*_PLAIN, "--model.optimizer=selective_adam"]),
     "packed": ("gsplat's packed projection", [*_PLAIN, "--model.packed=true"]),
     "passes": ("densification every 200 images", [*_DENSE, "--model.densification.every=200"]),
