@@ -183,6 +183,3 @@ def _beside(file: Path, name: str) -> str | None:
 
 def _is_number(value: Any) -> bool:
     return isinstance(value, int | float) and not isinstance(value, bool)
-
-
-__all__ = ["STAGES", "Plan", "parse_base", "read_plan", "read_unknown"]

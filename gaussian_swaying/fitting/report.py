@@ -262,6 +262,3 @@ def _psnr(squares: Sequence[float]) -> float:
         return math.nan
     mean = sum(squares) / len(squares)
     return -10 * math.log10(mean) if mean > 0 else math.inf
-
-
-__all__ = ["Result", "Shown", "predictions", "scene_text", "write_results"]

@@ -274,6 +274,3 @@ def opencv() -> Any:
             name="cv2",
         ) from error
     return cv2
-
-
-__all__ = ["Tracks", "drawn_beside", "follow", "match", "opencv", "track"]

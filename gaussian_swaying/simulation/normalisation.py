@@ -147,6 +147,3 @@ class Placed(NamedTuple):
     camera: CameraPath | None
     cameras: dict[str, CameraPath]
     edits: list[Edit]
-
-
-__all__ = ["Normalisation"]

@@ -570,23 +570,3 @@ for _name, _unit in (("damping", "1/s"), ("stiffness_damping", "s")):
         f"solver.{_name}", unit=_unit, low=0.0, scale="log", write=_write_solver,
         read=lambda setup, name=_name: _of_solver(setup, name),  # type: ignore[misc]
     )  # fmt: skip
-
-__all__ = [
-    "POLAR",
-    "Parameter",
-    "Setup",
-    "all_in_settings",
-    "find",
-    "flow_of",
-    "forget",
-    "in_settings",
-    "names",
-    "of_settings",
-    "other_with",
-    "parameter",
-    "present",
-    "register",
-    "thicker",
-    "value_of",
-    "with_values",
-]

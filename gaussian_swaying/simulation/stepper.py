@@ -546,6 +546,3 @@ def _raised_here(error: BaseException) -> bool:
     while place is not None and place.tb_next is not None:
         place = place.tb_next
     return place is not None and str(place.tb_frame.f_globals.get("__name__")).startswith("gaussian_swaying.")
-
-
-__all__ = ["Launched", "Outlook", "Stepper", "needs_of", "parts_of", "why_not_batched"]

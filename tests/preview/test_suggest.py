@@ -436,3 +436,8 @@ def test_only_cloth_and_what_falls_has_weight():
         assert found.youngs_modulus == SHELL_E
         assert gravity(found) == weight
         assert math.hypot(*found.flow) == pytest.approx(6, abs=0.01)
+
+
+def test_a_stray_point_far_away_does_not_join_the_parts():
+    points = torch.tensor([[0.0, 0, 0], [0.01, 0, 0], [1.0, 0, 0], [-1e5, 0, 0]])
+    assert connected_parts(points, 0.02).tolist() == [1, 1, 2, 0]
