@@ -116,8 +116,7 @@ def write_ply(path: str | os.PathLike[str], cloud: GaussianCloud) -> None:
     path = Path(path)
     if len(cloud) == 0:
         raise ValueError(f"{path} was not written because the cloud holds zero Gaussians; select at least one.")
-    if not path.parent.is_dir():
-        raise FileNotFoundError(f"{path} cannot be written because {path.parent} is not a folder; create it first.")
+    check_folder(path)
     normals = smallest_axis_normal(cloud.quats, cloud.scales) if cloud.normals is None else cloud.normals
     count, rest_count = len(cloud), 3 * (cloud.sh.shape[1] - 1)
     parts = [cloud.means, normals, cloud.sh[:, 0], rearrange(cloud.sh[:, 1:], "n k c -> n (c k)")]
@@ -128,6 +127,12 @@ def write_ply(path: str | os.PathLike[str], cloud: GaussianCloud) -> None:
     rows = table.astype("<f4", copy=False).view([(name, "<f4") for name in names]).reshape(count)
     with atomic(path) as temporary:
         PlyData([PlyElement.describe(rows, "vertex")], byte_order="<").write(str(temporary))
+
+
+def check_folder(path: Path) -> None:
+    """Raise FileNotFoundError if the folder of a file that is to be written does not exist."""
+    if not path.parent.is_dir():
+        raise FileNotFoundError(f"{path} cannot be written because {path.parent} is not a folder; create it first.")
 
 
 def check_places(path: Path, means: np.ndarray) -> None:

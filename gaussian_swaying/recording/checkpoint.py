@@ -15,14 +15,9 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from gaussian_swaying.runs.seal import load_sealed, save_sealed
+from gaussian_swaying.runs.seal import load_sealed
 
 _FIELDS = {"frame": int, "state": dict, "log": list, "config": str, "wall_s": dict}
-
-
-def write_checkpoint(path: Path, checkpoint: dict[str, Any]) -> None:
-    """Write a checkpoint with its checksum, whole or not at all."""
-    save_sealed(path, checkpoint)
 
 
 def log_lines(log: Sequence[Mapping[str, float]], known: list[str]) -> list[str]:

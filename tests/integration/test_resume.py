@@ -13,8 +13,9 @@ import pytest
 import torch
 
 from gaussian_swaying.cli.simulate import main
-from gaussian_swaying.recording.checkpoint import read_checkpoint, write_checkpoint
+from gaussian_swaying.recording.checkpoint import read_checkpoint
 from gaussian_swaying.recording.trajectory import load_trajectory
+from gaussian_swaying.runs.seal import save_sealed
 from gaussian_swaying.simulation.diagnostics import SimulationDiverged
 from gaussian_swaying.simulation.run import Run
 
@@ -329,7 +330,7 @@ def test_another_splat_under_the_same_name_is_refused(stopped, capsys):
     checkpoint = torch.load(file, weights_only=True)
     for name in ("position", "velocity", "affine", "F_elastic", "lost"):
         checkpoint["state"][name] = checkpoint["state"][name][:50]
-    write_checkpoint(file, checkpoint)
+    save_sealed(file, checkpoint)
     check_refused(_arguments(stopped, "--resume"), stopped, capsys, "holds 50 particles", "has 96")
 
 
