@@ -1,7 +1,8 @@
-"""Device, versions and memory of a run, recorded with its numbers."""
+"""Device, cores, versions and memory of a run, recorded with its numbers."""
 
 from __future__ import annotations
 
+import os
 import platform
 import sys
 from functools import cache
@@ -16,6 +17,11 @@ def describe_device(device: torch.device) -> str:
     if device.type == "cuda":
         return torch.cuda.get_device_name(device)
     return f"{platform.machine()} CPU, {torch.get_num_threads()} threads"
+
+
+def cores() -> int:
+    """Processor cores that this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 def peak_memory() -> int | None:

@@ -15,6 +15,7 @@ from tqdm import tqdm
 
 from gaussian_swaying._checks import check_choice, first_line
 from gaussian_swaying._files import write_json
+from gaussian_swaying._provenance import cores
 from gaussian_swaying.runs.lock import FolderLock, FolderLocked
 from gaussian_swaying.sweeps.backend import Backend, drive
 from gaussian_swaying.sweeps.contact_sheet import PICTURES, write_contact_sheets
@@ -34,11 +35,6 @@ from gaussian_swaying.sweeps.together import grouped
 from gaussian_swaying.sweeps.worker import Explain
 
 TABLE_EVERY_S = 5.0
-
-
-def cores() -> int:
-    """Processor cores that this process may use."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 def gpus_for(device: str) -> list[str]:
