@@ -1,4 +1,4 @@
-"""Errors of a command as one sentence and an exit code, with suggestions for misspelt options."""
+"""The end of a command: errors as one sentence and an exit code, suggestions for misspelt options, how to continue."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ import errno
 import inspect
 import os
 import re
+import shlex
 import sys
 import warnings
 from argparse import ArgumentError, ArgumentParser
@@ -14,10 +15,12 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from importlib import import_module
 from itertools import pairwise
+from pathlib import Path
 from typing import Any
 
 import torch
 
+from gaussian_swaying import _program as program
 from gaussian_swaying._checks import first_line
 from gaussian_swaying.cli.streams import SafeStream, safe_streams
 from gaussian_swaying.runs.signals import exit_code
@@ -284,3 +287,40 @@ def _arguments(class_path: str) -> dict[str, str]:
     except (ImportError, AttributeError, TypeError, ValueError):
         return {}
     return {parameter: parameter for parameter in parameters}
+
+
+# ---- how to continue
+
+
+def command(arguments: Sequence[str], *more: str, without: str | None = None) -> str:
+    """The command line of this program with additional arguments, ready to paste into a shell.
+
+    Args:
+        arguments: The arguments with which it was started.
+        more: Arguments to add at the end, unless they are already there.
+        without: An option to remove with its value, because ``more`` sets it again.
+    """
+    kept, skip = [], False
+    for argument in arguments:
+        if skip or (without and argument.startswith(f"{without}=")):
+            skip = False
+        elif argument == without:
+            skip = True
+        else:
+            kept.append(argument)
+    return shlex.join([*program.this(), *kept, *(argument for argument in more if argument not in kept)])
+
+
+def how_to_resume(checkpoint: Path, frame: int, arguments: Sequence[str], diverged: bool = False) -> str:
+    """A sentence that names the checkpoint of a simulation, and the command that continues it.
+
+    Args:
+        checkpoint: The file.
+        frame: Its frame.
+        arguments: Command line of the run.
+        diverged: Whether the run diverged, so that the same settings would diverge again.
+    """
+    held = f"{checkpoint} contains the run up to frame {frame}"
+    if diverged:
+        return f"{held}; continuing from it would diverge again, so change the settings and start without --resume."
+    return f"{held}; to continue:\n  {command(arguments, '--resume')}"

@@ -25,8 +25,7 @@ import gaussian_swaying.training.losses  # noqa: F401
 from gaussian_swaying import _program as program
 from gaussian_swaying._files import atomic
 from gaussian_swaying._yaml_limits import check_config_files, limit_yaml
-from gaussian_swaying.cli.continuing import command
-from gaussian_swaying.cli.errors import guessing, run_command
+from gaussian_swaying.cli.errors import command, guessing, run_command
 from gaussian_swaying.cli.shipped import with_shipped
 from gaussian_swaying.runs.signals import stop_signals
 from gaussian_swaying.training.checkpoints import SealedCheckpoints, read_training_checkpoint

@@ -14,8 +14,7 @@ from multiprocessing.connection import Connection
 from multiprocessing.context import SpawnProcess
 
 from gaussian_swaying._checks import first_line
-from gaussian_swaying.sweeps.backend import PACKED, Outcome, lost
-from gaussian_swaying.sweeps.job import Job
+from gaussian_swaying.sweeps.backend import PACKED, Job, Outcome, lost
 from gaussian_swaying.sweeps.worker import Explain, work
 
 PATIENCE_S = 300.0  # how long a worker may take to write what it has when the sweep is stopped

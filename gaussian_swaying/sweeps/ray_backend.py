@@ -14,8 +14,7 @@ import torch
 
 from gaussian_swaying._checks import first_line
 from gaussian_swaying.simulation.simulation import Simulation
-from gaussian_swaying.sweeps.backend import PACKED, Outcome, lost
-from gaussian_swaying.sweeps.job import Job
+from gaussian_swaying.sweeps.backend import PACKED, Job, Outcome, lost
 from gaussian_swaying.sweeps.worker import WHERE, Done, Explain, do
 
 if TYPE_CHECKING:

@@ -17,9 +17,8 @@ from gaussian_swaying._checks import check_choice, first_line
 from gaussian_swaying._files import write_json
 from gaussian_swaying._provenance import cores
 from gaussian_swaying.runs.lock import FolderLock, FolderLocked
-from gaussian_swaying.sweeps.backend import Backend, drive
+from gaussian_swaying.sweeps.backend import Backend, Job, drive
 from gaussian_swaying.sweeps.contact_sheet import PICTURES, write_contact_sheets
-from gaussian_swaying.sweeps.job import Job
 from gaussian_swaying.sweeps.plan import Plan
 from gaussian_swaying.sweeps.pool import Pool
 from gaussian_swaying.sweeps.ray_backend import LOCAL, RayBackend, check_ray

@@ -11,7 +11,7 @@ from gaussian_swaying.simulation import parameters
 from gaussian_swaying.simulation.batch import run_batch
 from gaussian_swaying.simulation.parameters import find, in_settings
 from gaussian_swaying.simulation.simulation import Simulation
-from gaussian_swaying.sweeps.job import Job, unlocked
+from gaussian_swaying.sweeps.backend import Job, unlocked
 from gaussian_swaying.sweeps.plan import parse_run
 from gaussian_swaying.sweeps.record import RUNS
 

@@ -1,6 +1,6 @@
 """The installed program, and configurations by name.
 
-Covers: _program, cli.continuing, cli.shipped.
+Covers: _program, cli.shipped.
 """
 
 import sys
@@ -11,7 +11,7 @@ import yaml
 import gaussian_swaying
 from gaussian_swaying import _program as program
 from gaussian_swaying.cli import shipped
-from gaussian_swaying.cli.continuing import command
+from gaussian_swaying.cli.errors import command
 from gaussian_swaying.cli.main import COMMANDS, main
 from gaussian_swaying.cli.simulate import main as simulate
 from gaussian_swaying.cli.train import make_cli

@@ -1,6 +1,6 @@
 """What a run leaves on disk, and what it leaves when something breaks.
 
-Covers: _provenance, recording.trajectory, simulation.meters.
+Covers: _provenance, recording.trajectory.
 """
 
 import csv

@@ -1,6 +1,6 @@
 """Whole sweeps with worker processes: disturbed ones end as undisturbed ones, and failures stop nothing.
 
-Covers: sweeps.contact_sheet, sweeps.job, sweeps.worker.
+Covers: sweeps.contact_sheet, sweeps.worker.
 """
 
 import csv
@@ -23,7 +23,7 @@ from gaussian_swaying.cli.sweep import explain, main
 from gaussian_swaying.runs.lock import FolderLock
 from gaussian_swaying.simulation.simulation import Simulation
 from gaussian_swaying.sweeps import worker
-from gaussian_swaying.sweeps.job import Job
+from gaussian_swaying.sweeps.backend import Job
 from gaussian_swaying.sweeps.worker import do
 
 PROGRAM = "import sys; from gaussian_swaying.cli.main import main; sys.exit(main())"

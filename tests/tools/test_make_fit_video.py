@@ -1,4 +1,4 @@
-"""``tools/make_fit_video.py``: what it writes can be read by a fit."""
+"""``tools/datasets/make_fit_video.py``: what it writes can be read by a fit."""
 
 import pytest
 
@@ -8,7 +8,7 @@ from .conftest import ROOT, tool_of
 
 
 def test_the_shipped_flag_makes_a_video(tmp_path):
-    tool = tool_of("make_fit_video.py")
+    tool = tool_of("datasets/make_fit_video.py")
     config = str(ROOT / "configs/sim/printed_flag.yaml")
     assert tool.main(["--config", config, "--output", str(tmp_path / "video"), "--frames", "3", "--device", "cpu"]) == 0
     left, right = read_videos(tmp_path / "video")

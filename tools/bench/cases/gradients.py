@@ -1,4 +1,4 @@
-"""What ``bench.py gradients`` measures: the memory of gradients through long rollouts, and tools/fit_flag.py."""
+"""What ``bench.py gradients`` measures: the memory of gradients through long rollouts, and examples/fit_flag.py."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ def _memory(*words: object) -> Row:
 def _fit() -> Row:
     with tempfile.TemporaryDirectory() as scratch:
         path = Path(scratch) / "fit.json"
-        subprocess.run([sys.executable, str(ROOT / "tools" / "fit_flag.py"), "--json", str(path)], check=False)
+        subprocess.run([sys.executable, str(ROOT / "examples" / "fit_flag.py"), "--json", str(path)], check=False)
         return json.loads(path.read_text())
 
 
