@@ -130,7 +130,7 @@ def convert(
     metres_per_unit: float = 1.0,
     rotation: Tensor | None = None,
 ) -> None:
-    """Write a splat, or the .ply sequence of a run, in the format that the target's name stands for.
+    """Write a splat, or the .ply sequence of a run, in the format given by the ending of the target's name.
 
     Args:
         source: A file that :func:`~gaussian_swaying.gaussians.compact.read_gaussians` reads; for USD also a folder of

@@ -362,7 +362,7 @@ class Stepper:
         return force.samples(state, self.frame_dt / 4, 5)
 
     def roll(self, state: State, steps: int, margin: int = 0) -> tuple[State, Tensor]:
-        """The state a frame later, and the largest Courant number on the way; nothing is checked.
+        """Advance by one frame without checks; returns the state and the largest Courant number of the frame.
 
         Args:
             state: The state now.

@@ -1,4 +1,4 @@
-"""Jobs of a sweep, the protocol of what does them (a pool of processes or Ray), and the loop that keeps it busy."""
+"""Jobs of a sweep, the protocol of backends (a pool of processes, or Ray), and the loop that keeps a backend busy."""
 
 from __future__ import annotations
 

@@ -93,7 +93,7 @@ class SweepDataset(Dataset[dict[str, Any]]):
 
 
 def _numbers(value: Any) -> list[float]:
-    """The numbers of a value, lists joined; none if there is anything else in it."""
+    """The numbers in a value, nested lists flattened; empty if it contains anything else."""
     if isinstance(value, Real):
         return [float(value)]
     parts = [_numbers(item) for item in value] if isinstance(value, list) else []

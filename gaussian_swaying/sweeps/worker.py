@@ -121,7 +121,7 @@ def _failed(job: Job, status: str, reason: str, ready: bool) -> Done:
 
 
 def _where() -> str:
-    """This machine, as the table of times names it."""
+    """Name of this machine in ``times.csv``."""
     return os.environ.get(WHERE) or platform.node()
 
 
