@@ -158,7 +158,7 @@ def _reach(opacity: Tensor) -> Tensor:
 
 
 def _lattice(out: Tensor) -> tuple[Tensor, Tensor]:
-    """All integer triples between minus and plus each row of (N, 3): the row of each triple, (L,), and the triples, (L, 3)."""
+    """All integer triples between minus and plus a row, for each row of (N, 3): its row (L,), and the triple (L, 3)."""
     sizes = 2 * out + 1
     length = sizes.prod(-1)
     row = torch.repeat_interleave(torch.arange(len(out)), length)

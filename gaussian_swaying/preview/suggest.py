@@ -417,7 +417,7 @@ def _padded(points: Tensor, margin: float) -> tuple[list[float], list[float]]:
 
 
 def _without(low: list[float], high: list[float], points: Tensor, ground: Tensor) -> tuple[list[float], list[float]]:
-    """The box, with the face at the floor moved back to the object if the box extends into the floor."""
+    """The box, with a face that extends into the floor moved back to between floor and object."""
     for axis in range(3):
         first, last = float(points[:, axis].amin()), float(points[:, axis].amax())
         floor_low, floor_high = float(ground[:, axis].amin()), float(ground[:, axis].amax())

@@ -462,7 +462,7 @@ def thicker(setup: Setup, ratio: Any) -> Setup:
 
 
 def _thickness(setup: Setup) -> float:
-    """The thickness; ValueError unless the object is a sheet of one layer, which needs no other points to be thicker."""
+    """The thickness; ValueError unless the object is a sheet of one layer, whose points stay if it gets thicker."""
     scene, material = setup.scene, setup.material
     if material.volume != "patch" or scene.filled or setup.points.count != scene.on_surface + scene.filled:
         raise ValueError(

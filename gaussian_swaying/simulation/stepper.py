@@ -301,7 +301,7 @@ class Stepper:
         state: State,
         parts: tuple[object, ...] | None,
     ) -> Measurement:
-        """Start the measurements of a frame from ``state`` to ``end``, and of what the next one needs.
+        """Start measuring the frame from ``state`` to ``end``, and what the next frame needs.
 
         Args:
             end: The state at its end.

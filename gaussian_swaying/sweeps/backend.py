@@ -122,7 +122,7 @@ def drive(
     retries: int = 1,
     tick: Callable[[int], None] = lambda running: None,
 ) -> None:
-    """Do jobs. A failed one is tried again; one that fails too often never stops the rest.
+    """Run jobs: a failed one is tried again, and one that fails too often does not stop the rest.
 
     A job of several runs that fails is done again run by run. If this is interrupted (Ctrl-C, or an exception of a
     callback), the runs are ended in order.

@@ -253,7 +253,7 @@ def check_parquet() -> None:
 def write_parquet(
     folder: Path, names: Sequence[str], runs: Sequence[Mapping[str, Any]], results: Mapping[str, Any]
 ) -> None:
-    """Write ``sweep.parquet``: the rows and columns of ``sweep.csv``, with numbers and lists of numbers as such.
+    """Write ``sweep.parquet``: the rows and columns of ``sweep.csv``, with typed numbers and lists of numbers.
 
     Args:
         folder: Folder of the sweep.

@@ -178,7 +178,7 @@ def _finish(folder: Path, plan: Plan, results: dict[str, dict[str, Any]], pictur
 
 
 def _finish_parts(folder: Path, plan: Plan, picture: str, parquet: bool) -> None:
-    """Write the tables and contact sheets once all parts have ended; if two end at the same time, only one writes."""
+    """Write the tables and contact sheets once all parts have ended; if two end at once, only one writes."""
     results = {name: result for name in plan.names if (result := read_result(folder, name)) is not None}
     if len(results) < len(plan.names):
         return
