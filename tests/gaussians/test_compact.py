@@ -126,7 +126,7 @@ def _without(table, name):
         (lambda e: e.update(vertex=_without(e["vertex"], "packed_scale")), "no property `packed_scale`"),
         (lambda e: e.update(chunk=_without(e["chunk"], "max_y")), "no property `max_y` in its chunks"),
         (lambda e: e.update(sh=e["sh"][:7]), "the element `sh` does not hold 9, 24 or 45"),
-        (lambda e: e["chunk"]["min_x"].fill(np.nan), "means of 300 of 300 Gaussians are NaN"),
+        (lambda e: e["chunk"]["min_x"].fill(np.nan), "`means` is NaN or infinite for 300 of 300 Gaussians"),
         (lambda e: e["chunk"]["min_x"].fill(-9e37), "beyond ±1e+12 for"),
         (lambda e: e["chunk"]["max_scale_z"].fill(1e5), "gives a size of zero or infinity"),
         (lambda e: e.update(vertex=e["vertex"][:0]), "zero Gaussians"),
@@ -152,7 +152,7 @@ def test_bad_splat(tmp_path):
     export_cloud(path, _cloud(), format="splat")
     rows = np.fromfile(path, dtype="u1").reshape(-1, 32)
     for place, value, message in (
-        (slice(0, 4), np.frombuffer(np.float32(np.nan).tobytes(), "u1"), "means of 1 of 300 Gaussians are NaN"),
+        (slice(0, 4), np.frombuffer(np.float32(np.nan).tobytes(), "u1"), "`means` is NaN or infinite for 1 of 300 Gaussians"),
         (slice(4, 8), np.frombuffer(np.float32(1e38).tobytes(), "u1"), "beyond ±1e[+]12 for 1 of 300"),
         (slice(12, 24), 0, "gives a size of zero or infinity for 1 of 300"),
         (slice(28, 32), 128, "is zero for 1 of 300"),
