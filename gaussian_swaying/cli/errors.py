@@ -66,9 +66,34 @@ def run_command(
         keep their traceback.
     """
     arguments = sys.argv[1:] if arguments is None else arguments
+
+    def tell(text: str, error: BaseException) -> None:
+        for line in (text, advice and advice(error)):
+            if line:
+                print(line, file=sys.stderr)
+
+    def outcome() -> int:
+        try:
+            with warnings.catch_warnings():
+                warnings.showwarning = _once(set())
+                return command() or OK
+        except KeyboardInterrupt as stop:
+            tell(stopped, stop)
+            return exit_code(stop)
+        except Exception as error:
+            if os.environ.get("GAUSSIAN_SWAYING_DEBUG") == "1":
+                raise
+            for_users = sentence(error, memory, expected, arguments)
+            bug = (
+                f"{type(error).__name__}: {first_line(error)} This is a bug in gaussian_swaying: please report it with "
+                "the traceback that GAUSSIAN_SWAYING_DEBUG=1 shows."
+            )
+            tell(f"error: {for_users or bug}", error)
+            return BUG if for_users is None else BAD_INPUT
+
     with safe_streams() as (output, _):
         try:
-            code = _code(command, stopped, memory, expected, arguments, advice)
+            code = outcome()
         except SystemExit:  # --help and the like
             if not _was_written(output):
                 raise SystemExit(BAD_INPUT) from None
@@ -84,44 +109,6 @@ def _was_written(output: SafeStream) -> bool:
         return True
     print(f"error: Standard output could not be written ({os.strerror(number)}).", file=sys.stderr)
     return False
-
-
-def _code(
-    command: Callable[[], int | None],
-    stopped: str,
-    memory: str,
-    expected: tuple[type[BaseException], ...],
-    arguments: Sequence[str],
-    advice: Callable[[BaseException], str | None] | None,
-) -> int:
-    try:
-        with warnings.catch_warnings():
-            warnings.showwarning = _once(set())
-            return command() or OK
-    except KeyboardInterrupt as stop:
-        print(stopped, file=sys.stderr)
-        _advise(advice, stop)
-        return exit_code(stop)
-    except Exception as error:
-        if os.environ.get("GAUSSIAN_SWAYING_DEBUG") == "1":
-            raise
-        found = sentence(error, memory, expected, arguments)
-        if found is None:
-            print(
-                f"error: {type(error).__name__}: {first_line(error)} This is a bug in gaussian_swaying: please report "
-                "it with the traceback that GAUSSIAN_SWAYING_DEBUG=1 shows.",
-                file=sys.stderr,
-            )
-        else:
-            print(f"error: {found}", file=sys.stderr)
-        _advise(advice, error)
-        return BUG if found is None else BAD_INPUT
-
-
-def _advise(advice: Callable[[BaseException], str | None] | None, error: BaseException) -> None:
-    text = None if advice is None else advice(error)
-    if text is not None:
-        print(text, file=sys.stderr)
 
 
 def _once(shown: set[str]) -> Callable[..., None]:
