@@ -152,7 +152,7 @@ def test_bad_splat(tmp_path):
     export_cloud(path, _cloud(), format="splat")
     rows = np.fromfile(path, dtype="u1").reshape(-1, 32)
     for place, value, message in (
-        (slice(0, 4), np.frombuffer(np.float32(np.nan).tobytes(), "u1"), "`means` is NaN or infinite for 1 of 300 Gaussians"),
+        (slice(0, 4), np.frombuffer(np.float32(np.nan).tobytes(), "u1"), "`means` is NaN or infinite for 1 of 300"),
         (slice(4, 8), np.frombuffer(np.float32(1e38).tobytes(), "u1"), "beyond ±1e[+]12 for 1 of 300"),
         (slice(12, 24), 0, "gives a size of zero or infinity for 1 of 300"),
         (slice(28, 32), 128, "is zero for 1 of 300"),
