@@ -149,9 +149,9 @@ class CaptureCamera(CameraPath):
             return self.view
         view = str(self.view).removeprefix("./")
         for short in (lambda name: name, lambda name: Path(name).name, lambda name: Path(name).stem):
-            found = [k for k, name in enumerate(names) if short(name) == view]
-            if len(found) == 1:
-                return found[0]
+            matches = [k for k, name in enumerate(names) if short(name) == view]
+            if len(matches) == 1:
+                return matches[0]
         raise ValueError(
             f"`{self.path}` has no view `{view}`, or several: set `view` to one of {len(names)} names such as "
             f"{names[0]}."

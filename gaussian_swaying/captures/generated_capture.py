@@ -252,8 +252,8 @@ class GeneratedCapture:
         hit = torch.zeros(len(rays), dtype=torch.bool)
         depth, x, z = (torch.zeros(len(rays)) for _ in range(3))
         for chunk in inside.split(1 << 17):
-            found, t = self._first_crossing(eye, rays[chunk], enter[chunk], leave[chunk])
-            met = chunk[found]
+            crosses, t = self._first_crossing(eye, rays[chunk], enter[chunk], leave[chunk])
+            met = chunk[crosses]
             place = eye + t[:, None] * rays[met]
             hit[met], depth[met], x[met], z[met] = True, t, place[:, 0], place[:, 2]
         shape = v.shape
@@ -268,8 +268,8 @@ class GeneratedCapture:
 
         values = above(enter + torch.linspace(0, 1, _STEPS + 1)[:, None] * (leave - enter), rays)
         change = (values[:-1] > 0) != (values[1:] > 0)
-        found, first = change.any(0), change.int().argmax(0)
-        rays, enter, width, first = rays[found], enter[found], ((leave - enter) / _STEPS)[found], first[found]
+        crosses, first = change.any(0), change.int().argmax(0)
+        rays, enter, width, first = rays[crosses], enter[crosses], ((leave - enter) / _STEPS)[crosses], first[crosses]
         left = enter + first * width
         right = left + width
         side = above(left, rays) > 0
@@ -277,7 +277,7 @@ class GeneratedCapture:
             middle = 0.5 * (left + right)
             before = (above(middle, rays) > 0) == side
             left, right = torch.where(before, middle, left), torch.where(before, right, middle)
-        return found, 0.5 * (left + right)
+        return crosses, 0.5 * (left + right)
 
     # ---- files
 

@@ -187,11 +187,11 @@ _CHOICES = re.compile(r"Expected a typing\.Literal\[([^\]]*)\]")
 
 def _asked_for(text: str) -> str:
     """Return the requested amount of memory in words, from an error message; empty if it does not say."""
-    found = re.search(r"allocate (\d+) bytes", text)
-    if found:
-        return f"{int(found[1]) / 2**30:,.3g} GiB were requested"
-    found = re.search(r"allocate ([\d.]+ [KMGT]iB)", text)
-    return f"{found[1]} were requested" if found else ""
+    amount = re.search(r"allocate (\d+) bytes", text)
+    if amount:
+        return f"{int(amount[1]) / 2**30:,.3g} GiB were requested"
+    amount = re.search(r"allocate ([\d.]+ [KMGT]iB)", text)
+    return f"{amount[1]} were requested" if amount else ""
 
 
 def _of_the_system(error: OSError) -> str:
@@ -236,14 +236,14 @@ def did_you_mean(message: str, parser: ArgumentParser) -> str:
         parser: The parser, for the names of its options.
     """
     for pattern in _UNKNOWN:
-        found = pattern.search(message)
-        if found is None:
+        unknown = pattern.search(message)
+        if unknown is None:
             continue
-        parts, name = found.groupdict(), found["name"].lstrip("-").replace("-", "_")
+        parts, name = unknown.groupdict(), unknown["name"].lstrip("-").replace("-", "_")
         if parts.get("path"):
             near, prefix = _nearest(name, _arguments(parts["path"])), ""
         else:
-            group, prefix = parts.get("group"), "--" if found["name"].startswith("--") else ""
+            group, prefix = parts.get("group"), "--" if unknown["name"].startswith("--") else ""
             near = _nearest(f"{group}.{name}" if group else name, _options(parser))
         return "" if near in (None, name) else f" (did you mean {prefix}{near}?)"
     return ""

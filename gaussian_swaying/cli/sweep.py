@@ -109,9 +109,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 def explain(error: BaseException) -> str:
     """One sentence about an error of a run."""
-    found = sentence(error, MEMORY)
-    if found is not None:
-        return found
+    told = sentence(error, MEMORY)
+    if told is not None:
+        return told
     return f"{type(error).__name__}: {first_line(error)} This is a bug; its traceback is in the folder logs."
 
 

@@ -48,8 +48,8 @@ def picture_errors(image: Tensor, target: Tensor) -> dict[str, float]:
     Raises:
         ValueError: If the shapes differ or the pictures are smaller than the window of SSIM, 11 pixels.
     """
-    found = {name: float(value) for name, value in _errors(image, target).items()}
-    return {"psnr_db": _psnr(found["mse"]), **found}
+    errors = {name: float(value) for name, value in _errors(image, target).items()}
+    return {"psnr_db": _psnr(errors["mse"]), **errors}
 
 
 def _errors(image: Tensor, target: Tensor) -> dict[str, Tensor]:
@@ -268,8 +268,8 @@ def table(result: dict[str, Any]) -> str:
             "FVD: " + ", ".join(f"{name} {value}" for name, value in result["fvd"].items() if name != "fvd") + "."
         ]
     lines += [f"Not compared: {reason}." for reason in result["skipped"]]
-    found = ", ".join(f"{name} {number}" for name, number in result["versions"].items())
-    lines += [f"Computed on {result['device']}; {found}."]
+    software = ", ".join(f"{name} {number}" for name, number in result["versions"].items())
+    lines += [f"Computed on {result['device']}; {software}."]
     return "\n".join(lines) + "\n"
 
 

@@ -393,9 +393,9 @@ def read_usd_frame(path: str | os.PathLike[str], frame: int) -> dict[str, np.nda
     try:
         stage = usd.Stage.Open(str(path))
         prim = stage.GetPrimAtPath(_PRIM)
-        found = {name: prim.GetAttribute(_ATTRIBUTES.get(name, name)).Get(frame) for name in _ARRAYS}
+        attributes = {name: prim.GetAttribute(_ATTRIBUTES.get(name, name)).Get(frame) for name in _ARRAYS}
         normals = prim.GetAttribute("normals") or geom.PrimvarsAPI(prim).GetPrimvar("normals").GetAttr()
-        arrays = {name: np.array(value, dtype=np.float32) for name, value in found.items()}
+        arrays = {name: np.array(value, dtype=np.float32) for name, value in attributes.items()}
         arrays["normals"] = np.array(normals.Get(frame), dtype=np.float32)
     except Exception as error:  # errors of USD, and those for missing attributes
         raise ValueError(f"{path} cannot be read as a USD file of Gaussians: export it again.") from error

@@ -149,8 +149,8 @@ class GaussianSurfaceModel(nn.Module):
         if mode == "paper":
             return patch_area(self.scales)
         normals, opacity = self.normals(), self.opacity()
-        found = coverage_area(self.means, normals, self.scales, opacity, neighbours)
-        return found * openness(self.means, normals, self.scales, found, opacity) if mode == "open" else found
+        area = coverage_area(self.means, normals, self.scales, opacity, neighbours)
+        return area * openness(self.means, normals, self.scales, area, opacity) if mode == "open" else area
 
     def opacity(self) -> Tensor:
         """Opacities from 0 to 1, shape (N,)."""

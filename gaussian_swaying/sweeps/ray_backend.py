@@ -76,10 +76,10 @@ class RayBackend:
 
     def free(self) -> bool:
         """See ``Backend.free``; a cluster may grow and shrink."""
-        found = self._ray.cluster_resources()
-        room = int(found.get("CPU", 1) // self.threads)
+        resources = self._ray.cluster_resources()
+        room = int(resources.get("CPU", 1) // self.threads)
         if self.on_gpu:
-            room = int(found.get("GPU", 1) * self.per_gpu)
+            room = int(resources.get("GPU", 1) * self.per_gpu)
         return len(self._running) < max(1, min(room, self.workers or room))
 
     def submit(self, job: Job) -> None:

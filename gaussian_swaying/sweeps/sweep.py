@@ -121,9 +121,9 @@ def run_sweep(
         if part is not None:
             groups = groups[part[0] - 1 :: part[1]]
         mine = [name for group in groups for name in group]
-        found = {name: result for name in mine if (result := read_result(folder, name)) is not None}
-        keeper = _Keeper(folder, plan, mine, found, progress, part is None)
-        jobs = _jobs(folder, plan, groups, found, device)
+        earlier = {name: result for name in mine if (result := read_result(folder, name)) is not None}
+        keeper = _Keeper(folder, plan, mine, earlier, progress, part is None)
+        jobs = _jobs(folder, plan, groups, earlier, device)
         try:
             if jobs:
                 backend = _backend(ray, workers, threads, explain, device, per_gpu, len(jobs))
@@ -139,12 +139,12 @@ def run_sweep(
         lock.release()
 
 
-def _jobs(folder: Path, plan: Plan, groups: list[list[str]], found: dict[str, Any], device: str) -> list[Job]:
+def _jobs(folder: Path, plan: Plan, groups: list[list[str]], earlier: dict[str, Any], device: str) -> list[Job]:
     """A job for each group with something left to do."""
     runs = dict(zip(plan.names, plan.runs, strict=True))
     jobs = []
     for names in groups:
-        complete = frozenset(name for name in names if name in found and found[name]["status"] == "complete")
+        complete = frozenset(name for name in names if name in earlier and earlier[name]["status"] == "complete")
         if len(complete) < len(names):
             own = tuple(dict(runs[name]) for name in names)
             jobs.append(Job(folder, tuple(names), plan.config, plan.frames, own, device, complete=complete))

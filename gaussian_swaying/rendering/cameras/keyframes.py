@@ -46,15 +46,15 @@ def interpolate_keys(
     k = bisect_right(times, time) - 1
     span = times[k + 1] - times[k]
     s = (time - times[k]) / span
-    found = []
+    between = []
     for d, (start, end) in enumerate(zip(values[k], values[k + 1], strict=True)):
         if interpolation == "linear":
-            found.append(start + s * (end - start))
+            between.append(start + s * (end - start))
             continue
         before, after = (_slope(times, [row[d] for row in values], at) for at in (k, k + 1))
         ease = s * s * (3 - 2 * s)
-        found.append(start + ease * (end - start) + span * s * (1 - s) * ((1 - s) * before - s * after))
-    return found
+        between.append(start + ease * (end - start) + span * s * (1 - s) * ((1 - s) * before - s * after))
+    return between
 
 
 def _slope(times: Sequence[float], values: Sequence[float], k: int) -> float:
@@ -176,11 +176,11 @@ _ANGLES = ("azimuth", "elevation", "radius")
 
 def _filled(values: list[Any], first: Any) -> list[Any]:
     """Each value, or the last one given before it, or ``first``."""
-    found = []
+    filled = []
     for value in values:
         first = first if value is None else value
-        found.append(first)
-    return found
+        filled.append(first)
+    return filled
 
 
 def _carried_on(name: str, values: list[Any]) -> list[Any]:
