@@ -143,7 +143,7 @@ class Parameter:
 _KNOWN: dict[str, Parameter] = {}
 
 
-def register(name: str, read: Read | None = None, write: Write | None = None, **settings: Any) -> Parameter:
+def register(name: str, read: Read | None = None, *, write: Write | None = None, **settings: Any) -> Parameter:
     """Add a parameter.
 
     Args:
@@ -507,11 +507,11 @@ def _density(setup: Setup) -> float:
 
 _SIZE: dict[str, Any] = {"low": 0.0, "scale": "log"}
 _MATERIAL: dict[str, Any] = {"open": True, "batched": True, "differentiable": True}
-register("wind.flow", _steady_flow, _write_wind, unit="m/s", kind="vector", batched=True, differentiable=True)
-register("wind.seed", lambda setup: _uniform_wind(setup).seed, _write_wind, kind="whole", batched=True)
-register("wind.speed", lambda setup: _polar(setup)[0], _write_polar, unit="m/s", batched=True, **_SIZE)
-register("wind.azimuth", lambda setup: _polar(setup)[1], _write_polar, unit="degrees", batched=True)
-register("wind.elevation", lambda setup: _polar(setup)[2], _write_polar, unit="degrees", batched=True)
+register("wind.flow", _steady_flow, write=_write_wind, unit="m/s", kind="vector", batched=True, differentiable=True)
+register("wind.seed", lambda setup: _uniform_wind(setup).seed, write=_write_wind, kind="whole", batched=True)
+register("wind.speed", lambda setup: _polar(setup)[0], write=_write_polar, unit="m/s", batched=True, **_SIZE)
+register("wind.azimuth", lambda setup: _polar(setup)[1], write=_write_polar, unit="degrees", batched=True)
+register("wind.elevation", lambda setup: _polar(setup)[2], write=_write_polar, unit="degrees", batched=True)
 for _name, _rest in {
     "amplitude": _SIZE,
     "delta": _SIZE,
@@ -521,15 +521,16 @@ for _name, _rest in {
     "phase": {"unit": "rad"},
 }.items():
     _reader = _of_modulation(f"wind.modulations.0.{_name}")
-    register(f"wind.modulations.*.{_name}", _reader, _write_modulation, batched=True, **_rest)
-register("material.E", _mean("youngs_modulus"), _write_material, unit="Pa", **_SIZE, **_MATERIAL)
-register("material.nu", _mean("poisson_ratio"), _write_material, low=-1.0, high=0.5, **_MATERIAL)
-register("material.density", _density, _write_material, unit="kg/m³", **_SIZE, **_MATERIAL)
-register(
-    "material.thickness", _thickness, _write_material, unit="m", open=True, batched=True, same_points=False, **_SIZE
-)
+    register(f"wind.modulations.*.{_name}", _reader, write=_write_modulation, batched=True, **_rest)
+register("material.E", _mean("youngs_modulus"), write=_write_material, unit="Pa", **_SIZE, **_MATERIAL)
+register("material.nu", _mean("poisson_ratio"), write=_write_material, low=-1.0, high=0.5, **_MATERIAL)
+register("material.density", _density, write=_write_material, unit="kg/m³", **_SIZE, **_MATERIAL)
+_ONE_LAYER: dict[str, Any] = {"open": True, "batched": True, "same_points": False}
+register("material.thickness", _thickness, write=_write_material, unit="m", **_SIZE, **_ONE_LAYER)
 for _name, _low in (("C_D", 0.0), ("C_F", 0.0), ("C_L", -math.inf)):
-    register(f"aero.{_name}", _of_aero(_name), _write_aero, low=_low, scale="log", differentiable=True)
-register("solver.gravity", lambda setup: list(_of_solver("gravity")(setup)), _write_solver, unit="m/s²", kind="vector")
+    register(f"aero.{_name}", _of_aero(_name), write=_write_aero, low=_low, scale="log", differentiable=True)
+register(
+    "solver.gravity", lambda setup: list(_of_solver("gravity")(setup)), write=_write_solver, unit="m/s²", kind="vector"
+)
 for _name, _unit in (("damping", "1/s"), ("stiffness_damping", "s")):
-    register(f"solver.{_name}", _of_solver(_name), _write_solver, unit=_unit, **_SIZE)
+    register(f"solver.{_name}", _of_solver(_name), write=_write_solver, unit=_unit, **_SIZE)
