@@ -14,6 +14,7 @@ import traceback
 
 import pytest
 import torch
+from shared import contents
 
 from gaussian_swaying.gaussians.ply import write_ply
 from gaussian_swaying.mpm.laws.snow import Snow
@@ -56,17 +57,13 @@ def run(make_simulation, tmp_path, formulation):
     return folder, resume
 
 
-def _contents(folder):
-    return {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()}
-
-
 def _refused(resume, folder, case):
     """The sentence of a refusal; the folder is as it was before."""
-    before = _contents(folder)
+    before = contents(folder)
     try:
         resume()
     except ValueError as error:
-        assert _contents(folder) == before, case
+        assert contents(folder) == before, case
         message = str(error)
         assert "\n" not in message, case
         assert message.endswith("start again without --resume."), (case, message)

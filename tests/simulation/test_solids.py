@@ -17,7 +17,7 @@ from gaussian_swaying.mpm.boundaries.pinned_region import PinnedRegion
 from gaussian_swaying.mpm.solver import MPMSolver
 from gaussian_swaying.recording.recorder import Recorder
 from gaussian_swaying.rendering.cameras.camera_path import OrbitCamera
-from gaussian_swaying.scenes.procedural import FlagScene
+from gaussian_swaying.scenes.procedural import FlagScene, GivenScene
 from gaussian_swaying.scenes.solid import SolidScene
 from gaussian_swaying.simulation.material import Material, MaterialRegion
 from gaussian_swaying.simulation.sampling import cell_volume
@@ -137,11 +137,7 @@ def test_carried_gaussians_follow_gaussians():
     opacities[::10] = -6.0
     faint = dataclasses.replace(cloud, opacities=opacities)
 
-    class Given(SolidScene):
-        def generate(self):
-            return faint
-
-    simulation = _simulation(generator=Given())
+    simulation = _simulation(generator=GivenScene(faint))
     scene, state = simulation.scene, simulation.start()
     assert len(scene.carried) > 0
     moved = torch.cat([state.position[: len(scene.simulated)] + 0.2, state.position[len(scene.simulated) :]])

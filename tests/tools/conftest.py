@@ -4,8 +4,6 @@ import importlib
 import importlib.util
 import json
 import sys
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
@@ -56,14 +54,24 @@ def tool_of(path):
     return module
 
 
-@contextmanager
-def dataset_tool(name: str) -> Iterator[object]:
-    """A program of tools/datasets with the modules beside it, which are forgotten afterwards."""
+@pytest.fixture(scope="module")
+def tool(request):
+    """The program ``TOOL`` of tools/datasets with the modules beside it, which are forgotten afterwards."""
     folder = ROOT / "tools" / "datasets"
     sys.path.insert(0, str(folder))
     try:
-        yield importlib.import_module(name)
+        yield importlib.import_module(request.module.TOOL)
     finally:
         sys.path.remove(str(folder))
         for path in folder.glob("*.py"):
             sys.modules.pop(path.stem, None)
+
+
+def beside(name):
+    """A fixture: one of the modules beside the tool."""
+
+    @pytest.fixture(scope="module")
+    def module(tool):
+        return sys.modules[name]
+
+    return module

@@ -12,6 +12,7 @@ from bench.cases import flags
 from bench.cases.trained import filled
 from bench.tables import flag_benchmark as tables
 from imageio.v3 import imread, imwrite
+from small_scenes import plain_cloud
 
 from gaussian_swaying.simulation.simulation import Simulation
 
@@ -106,16 +107,12 @@ def test_pictures_have_the_size_of_the_reference(tmp_path):
 
 def test_gaussians_turned_to_the_reference(tmp_path):
     """Normals are those of the nearest vertex, the normal's own axis is the one that was turned, sizes stay."""
-    from gaussian_swaying.gaussians.cloud import GaussianCloud
     from gaussian_swaying.gaussians.ply import read_ply, write_ply
     from gaussian_swaying.geometry.patches import smallest_axis_normal
 
     generator = torch.Generator().manual_seed(0)
     quats = torch.randn(50, 4, generator=generator)
-    cloud = GaussianCloud(
-        torch.rand(50, 3, generator=generator), quats, torch.tensor([[-4.0, -3.0, -9.0]]).repeat(50, 1),
-        torch.zeros(50), torch.zeros(50, 1, 3),
-    )  # fmt: skip
+    cloud = plain_cloud(torch.rand(50, 3, generator=generator), torch.tensor([-4.0, -3.0, -9.0]), quats, 0.0)
     write_ply(tmp_path / "own.ply", cloud)
     vertices = np.array([[[0.0, 0.5, 0.5], [1.0, 0.5, 0.5]]])
     normals = np.array([[0.0, -1.0, 0.0], [0.6, 0.0, 0.8]])
