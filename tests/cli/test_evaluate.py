@@ -1,10 +1,7 @@
 """tools/eval.py on a run of tools/sim.py, and the one sentence it answers bad input with."""
 
 import json
-import os
 import shutil
-import subprocess
-import sys
 from pathlib import Path
 
 import numpy as np
@@ -109,25 +106,3 @@ def test_bad_input_is_one_sentence(folders, tmp_path, capsys, arguments, words):
     names = {"RUN": str(folders[0]), "REFERENCE": str(folders[1])}
     arguments = [names.get(argument, argument) for argument in arguments]
     refused(main, [*arguments, "--output", str(tmp_path / "a/out")], capsys, *words, folder=tmp_path)
-
-
-def test_as_a_program(folders):
-    done = subprocess.run(
-        [
-            sys.executable,
-            str(ROOT / "tools/eval.py"),
-            *map(str, folders),
-            "--device",
-            "cpu",
-            "--points",
-            "50",
-            "--no-video",
-        ],
-        capture_output=True,
-        text=True,
-        env=os.environ | {"OMP_NUM_THREADS": "1"},
-        check=False,
-    )
-    assert done.returncode == 0, done.stderr
-    assert "PSNR" in done.stdout
-    assert (folders[0] / "eval/eval.json").exists()

@@ -3,7 +3,9 @@
 Covers: _program, cli.shipped.
 """
 
+import runpy
 import sys
+from pathlib import Path
 
 import pytest
 import yaml
@@ -16,6 +18,8 @@ from gaussian_swaying.cli.errors import command
 from gaussian_swaying.cli.main import COMMANDS, main
 from gaussian_swaying.cli.simulate import main as simulate
 from gaussian_swaying.cli.train import make_cli
+
+ROOT = Path(__file__).parents[2]
 
 
 def test_what_there_is(capsys):
@@ -34,6 +38,16 @@ def test_each_command_has_its_own_help(name, capsys):
         main([name, "--help"])
     assert left.value.code in (0, None)
     assert f"gaussian-swaying {name}" in " ".join(capsys.readouterr().out.split())
+
+
+@pytest.mark.parametrize("name", ["sim", "preview", "eval", "export", "train"])
+def test_each_tool_is_a_program(name, monkeypatch, capsys):
+    """In this process; test_simulate.py starts one in its own."""
+    monkeypatch.setattr(sys, "argv", [f"tools/{name}.py", "--help"])
+    with pytest.raises(SystemExit) as left:
+        runpy.run_path(str(ROOT / "tools" / f"{name}.py"), run_name="__main__")
+    assert left.value.code in (0, None)
+    assert capsys.readouterr().out.startswith(f"usage: {name}.py")
 
 
 def test_commands_that_are_printed_can_be_pasted(monkeypatch):

@@ -7,8 +7,6 @@ import dataclasses
 import json
 import math
 import struct
-import subprocess
-import sys
 from pathlib import Path
 
 import pytest
@@ -323,14 +321,6 @@ def test_weak_guesses_print_their_commands(splat, tmp_path, capsys):
         assert f"{again} {end} --height 96 --device cpu" in report
     assert preview(splat, tmp_path / "out", "--up", "+z", "--hold", "-x") == 0
     assert "weak guess" not in capsys.readouterr().out
-
-
-def test_script_answers_help():
-    done = subprocess.run(
-        [sys.executable, str(ROOT / "tools/preview.py"), "--help"], capture_output=True, text=True, check=False
-    )
-    assert done.returncode == 0
-    assert "--up" in done.stdout
 
 
 @pytest.mark.usefixtures("untried")

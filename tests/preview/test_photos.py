@@ -5,6 +5,7 @@ import math
 
 import pytest
 import torch
+from shared import refused
 from small_scenes import plain_cloud
 
 from gaussian_swaying.captures.capture_camera import photo_azimuth
@@ -199,11 +200,8 @@ def test_cameras_that_look_elsewhere_are_refused(tmp_path, capsys):
         (side, "do not look at a common point"),
         (tmp_path / "no", "no"),
     ):
-        assert main([str(splat), "--capture", str(folder), "--output", str(tmp_path / "out"), "--device", "cpu"]) == 2
-        error = capsys.readouterr().err
-        assert words in error
-        assert error.count("\n") == 1
-        assert not (tmp_path / "out").exists()
+        arguments = [str(splat), "--capture", str(folder), "--output", str(tmp_path / "out"), "--device", "cpu"]
+        refused(main, arguments, capsys, words, folder=tmp_path)
     view = captured_from(side)
     assert view.focus is None
     with pytest.raises(ValueError, match="set `--region`"):
