@@ -390,7 +390,7 @@ GUST = '[{"class_path": "SineSway", "init_args": {"amplitud": 1.0}}]'
         (["--material.density", "0"], ["`material.density`"]),
         (["--material.density", "-1"], ["`material.density`"]),
         (["--material.thickness", "-0.01"], ["`material.thickness`"]),
-        (["--material.volume", "cube"], ["`material.volume`", "patch, cell"]),
+        (["--material.volume", "cube"], ['"material.volume": Expected one of patch, cell']),
         (["--wind.flow", "[1.0, 2.0]"], ["`flow`", "3 numbers"]),
         (["--scene.up", "[0, 0, 0]"], ["`scene.up`", "[0, -1, 0]"]),
         (["--scene.longest_side", "1.0"], ["longest_side", "metres_per_unit", "not both"]),
