@@ -68,10 +68,10 @@ class Line:
             return False
         painter = snapshot.simulation.painter
         look = (painter.shader, painter.background)
-        key, message = scene(snapshot)
+        key, made = scene(snapshot)
         if self._scene is None or key != self._scene:
             self._scene, self._look, self._state = key, look, ()
-            self._put(message)
+            self._put(made)
             return True
         if any(known is not now for known, now in zip(self._look, look, strict=True)):
             self._look = look

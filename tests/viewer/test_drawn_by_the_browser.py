@@ -10,6 +10,8 @@ import torch
 pytest.importorskip("viser", reason="needs the extra [viewer]")
 from gaussian_swaying.viewer.film.page import PAGE
 
+from .conftest import FLAGS
+
 
 @pytest.fixture(scope="module")
 def blank(browser):
@@ -33,10 +35,10 @@ def open_window(browser, page):
         window.on("pageerror", lambda error: window.problems.append(str(error)))
         if before:
             window.add_init_script(before)
+        window.add_init_script("addEventListener('DOMContentLoaded', () => (wind.patience = 1e9))")
         window.goto(page.url)
         if wait:
-            window.evaluate("wind.patience = 1e9")
-            window.wait_for_function("wind.on && wind.drawing.sorted")
+            window.wait_for_function("wind.on && wind.drawing.ready")
         return window
 
     yield open_window
@@ -259,29 +261,28 @@ def test_light_and_scene_follow_the_session(page, open_window, until):
     until(lambda: _picture(window)[-1, 0].tolist() == [255, 0, 0])
     session.change({"solver.dx": 0.09})
     cell = "Math.abs(wind.scene?.cell * wind.scene?.metre ** -1 - 0.09) < 1e-6"
-    window.wait_for_function(f"wind.on && {cell} && wind.drawing.sorted")
+    window.wait_for_function(f"wind.on && {cell} && wind.drawing.ready")
     until(lambda: _picture(window).std() > 20)
     assert window.problems == []
 
 
-NO_SECOND = """
-    const get = HTMLCanvasElement.prototype.getContext;
-    let asked = 0;
-    HTMLCanvasElement.prototype.getContext = function (kind, ...rest) {
-        return kind === "webgl2" && asked++ === 0 ? null : get.call(this, kind, ...rest);
+SMALL_TEXTURES = """
+    const ask = WebGL2RenderingContext.prototype.getParameter;
+    WebGL2RenderingContext.prototype.getParameter = function (name) {
+        return name === WebGL2RenderingContext.MAX_ARRAY_TEXTURE_LAYERS ? 2 : ask.call(this, name);
     };
 """
 
 
-@pytest.mark.parametrize("way", ["no WebGL2", "slow"])
+@pytest.mark.parametrize("way", ["small textures", "slow"])
 def test_a_browser_that_cannot_draw_gets_pictures(page, open_window, until, way):
     if way == "slow":
         window = open_window()
         window.evaluate("Object.assign(wind, { slow: 1e9, patience: 0.5 })")
-        window.wait_for_function("wind.failed !== null && !wind.on")
+        window.wait_for_function("wind.failed?.startsWith('this browser draws slowly') && !wind.on")
     else:
-        window = open_window(NO_SECOND, wait=False)
-        window.wait_for_function("wind.failed === 'this browser has no WebGL2'")
+        window = open_window(SMALL_TEXTURES, wait=False)
+        window.wait_for_function("wind.failed === 'the scene is too large for the textures of this browser'")
     until(lambda: len(page.server.get_clients()) == 1)
     (sent,) = page._drawn.values()
     count = len(sent)
@@ -290,3 +291,13 @@ def test_a_browser_that_cannot_draw_gets_pictures(page, open_window, until, way)
     before = _picture(window)
     until(lambda: np.abs(_picture(window) - before).max() > 20)
     assert window.problems == []
+
+
+def test_without_webgl_the_page_says_what_it_needs(page, chromium, browser):
+    started = browser.browser_type.launch(
+        executable_path=chromium, args=[*FLAGS[:2], "--disable-gpu", "--disable-3d-apis"]
+    )
+    window = started.new_page()
+    window.goto(page.url)
+    window.get_by_text("This page needs WebGL2").wait_for(timeout=60_000)
+    started.close()

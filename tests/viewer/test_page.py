@@ -153,7 +153,8 @@ def test_two_browsers_see_the_same_scene_and_closing_one_ends_nothing(page, wind
     other = second.new_page()
     other.goto(page.url)
     until(lambda: len(page.server.get_clients()) == 2, 240)
-    until(lambda: sum(line is not None and line.draws for line in page.streams._lines.values()) == 2, 240)
+    page.by_browser = False
+    until(lambda: sum(len(times) > 3 for times in page._drawn.values()) == 2, 240)
     second.close()
     until(lambda: len(page.server.get_clients()) == 1)
     number = page.session.snapshot.number

@@ -53,7 +53,9 @@ class Stage {
     this.drawn = []; // when, of the last seconds [s]
     this.count = 0; // pictures that were drawn
     this.size = 0; // index in SIZES
-    this.since = null; // when it began to draw without a pause [s]
+    this.asked = false; // whether the last tick drew
+    this.lately = { time: 0, pictures: 0 }; // time that pictures took [s], for the size
+    this.long = { time: 0, pictures: 0 }; // the same, until the server is asked to draw
   }
 
   // ---- the server
@@ -116,7 +118,6 @@ class Stage {
     this.motion = head.motion;
     this.playback.add(readState(head, rest), performance.now() / 1000, head.ended);
     this.stale = true;
-    if (!this.on) this.since = null;
     this.on = true;
     this.canvas.style.visibility = "visible";
   }
@@ -160,9 +161,9 @@ class Stage {
   }
 
   tick(milliseconds) {
-    if (!this.on || !this.above) return;
-    const now = milliseconds / 1000;
     const { playback, drawing } = this;
+    if (!this.on || !this.above || playback.newest === null) return; // another scene has no state yet
+    const now = milliseconds / 1000;
     const before = playback.shown;
     playback.advance(now);
     if (this.stale || playback.shown !== before) {
@@ -177,33 +178,33 @@ class Stage {
     this.resize(still ? 1 : SIZES[this.size]);
     this.look();
     if (!drawing.ready) drawing.wake(1);
-    if (this.left === 0) {
-      this.since = null;
-      return;
-    }
+    this.adapt(now, still);
+    if (this.left === 0) return;
     this.left--;
     drawing.render(this.camera);
     this.count++;
     this.drawn.push(now);
     while (now - this.drawn[0] > 2) this.drawn.shift();
-    if (!still) this.adapt(now);
-    else this.since = null;
   }
 
   // Fewer pixels if pictures take long; after all, those of the server.
-  adapt(now) {
-    this.since ??= { size: now, all: now, count: 0, total: 0 };
-    const { since } = this;
-    since.count++;
-    since.total++;
-    if (now - since.size > 1) {
-      const rate = since.count / (now - since.size);
-      if (rate < 20 && this.size < SIZES.length - 1) this.size++;
-      Object.assign(since, { size: now, count: 0 });
+  adapt(now, still) {
+    const took = now - (this.drawn[this.drawn.length - 1] ?? now); // since the last picture
+    const busy = this.left > 0 && this.asked && !still && !document.hidden;
+    this.asked = this.left > 0;
+    if (!busy || took === 0) return;
+    for (const sum of [this.lately, this.long]) {
+      sum.time += took;
+      sum.pictures++;
     }
-    if (now - since.all > this.patience) {
-      if (since.total / (now - since.all) < this.slow) this.fail("this browser draws slowly, mostly for lack of a graphics card");
-      Object.assign(since, { all: now, total: 0 });
+    if (this.lately.time > 1) {
+      if (this.lately.pictures / this.lately.time < 20 && this.size < SIZES.length - 1) this.size++;
+      this.lately = { time: 0, pictures: 0 };
+    }
+    if (this.long.time > this.patience) {
+      const slow = this.long.pictures / this.long.time < this.slow;
+      if (slow) this.fail("this browser draws slowly, mostly for lack of a graphics card");
+      this.long = { time: 0, pictures: 0 };
     }
   }
 
@@ -232,12 +233,24 @@ class Stage {
   }
 }
 
+// Without WebGL2, viser shows neither pictures nor controls.
+function tellWhatLacks(stage) {
+  stage.failed = "this browser has no WebGL2";
+  const message = document.createElement("p");
+  message.textContent =
+    "This page needs WebGL2, which this browser lacks or has switched off: switch on hardware acceleration in its " +
+    "settings, or open the page in another browser. Without a graphics card, start Chromium with --enable-unsafe-swiftshader.";
+  Object.assign(message.style, { position: "fixed", inset: "40% 0 auto", zIndex: 1000, margin: "auto", maxWidth: "36em" });
+  Object.assign(message.style, { padding: "1em", font: "16px/1.5 system-ui, sans-serif", color: "#222", background: "#fff" });
+  addEventListener("DOMContentLoaded", () => document.body.append(message));
+}
+
 // Called before viser's program starts, to see its pictures and its camera: three.js announces each of its renderers.
 export function watch() {
   const stage = new Stage();
   window.wind = stage;
   const tested = document.createElement("canvas").getContext("webgl2");
-  if (!tested) return void (stage.failed = "this browser has no WebGL2");
+  if (!tested) return tellWhatLacks(stage);
   tested.getExtension("WEBGL_lose_context")?.loseContext();
   window.__THREE_DEVTOOLS__ ??= new EventTarget();
   window.__THREE_DEVTOOLS__.addEventListener("observe", ({ detail: renderer }) => {

@@ -71,8 +71,9 @@ def _watch(page: Page, seconds: float) -> Row:
         browser = driver.chromium.launch(executable_path=chromium, args=FLAGS)
         window = browser.new_page(viewport={"width": WINDOW[0], "height": WINDOW[1]})
         window.set_default_timeout(300_000)
+        # it would ask the server for pictures
+        window.add_init_script("addEventListener('DOMContentLoaded', () => (wind.patience = 1e9))")
         window.goto(page.url)
-        window.evaluate("wind.patience = 1e9")  # it would ask the server for pictures
         window.wait_for_function("wind.on && wind.drawing.ready")
         time.sleep(WARM)
         window.evaluate("wind.count = 0; wind.first = wind.playback.shown")
