@@ -5,8 +5,8 @@ they run only when the environment variable ``GAUSSIAN_SWAYING_CHECKS`` is 1 (th
 """
 
 import os
-from collections.abc import Iterable, Sequence
-from typing import TYPE_CHECKING, Any
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from typing import TYPE_CHECKING, Any, Literal, get_args, get_origin, get_type_hints
 
 import torch
 from torch import Tensor
@@ -84,6 +84,20 @@ def check_choice(name: str, value: str, choices: tuple[str, ...]) -> None:
     """Raise ValueError unless ``value`` is one of ``choices``."""
     if value not in choices:
         raise ValueError(f"Expected `{name}` to be one of {', '.join(choices)}, but got {value!r}.")
+
+
+def check_literals(function: Callable[..., Any], values: Mapping[str, Any], where: str = "") -> None:
+    """Raise ValueError if an argument is none of the choices that its type, a ``Literal``, lists.
+
+    Args:
+        function: The function, or the ``__init__`` of a class.
+        values: Its arguments by name; others are ignored.
+        where: Begins the names in the message, for example ``scene.``.
+    """
+    for name, kind in get_type_hints(function).items():
+        for part in (kind, *get_args(kind)):
+            if get_origin(part) is Literal and not (values[name] is None and type(None) in get_args(kind)):
+                check_choice(f"{where}{name}", values[name], get_args(part))
 
 
 def check_positive(name: str, value: float, *, allow_zero: bool = False) -> None:

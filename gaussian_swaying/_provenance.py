@@ -1,7 +1,8 @@
-"""Device, versions and memory of a run, recorded with its numbers."""
+"""Device, cores, versions and memory of a run, recorded with its numbers."""
 
 from __future__ import annotations
 
+import os
 import platform
 import sys
 from functools import cache
@@ -18,14 +19,20 @@ def describe_device(device: torch.device) -> str:
     return f"{platform.machine()} CPU, {torch.get_num_threads()} threads"
 
 
-def peak_memory() -> int | None:
-    """Largest memory of the process so far [bytes]; None on Windows, which does not report it."""
+def cores() -> int:
+    """Processor cores that this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+def peak_memory(device: torch.device) -> dict[str, int | None]:
+    """Largest memory so far [bytes]: ``host`` of the process (None on Windows), ``device`` of torch's allocator."""
+    on_device = torch.cuda.max_memory_allocated(device) if device.type == "cuda" else None
     try:
         import resource
     except ImportError:
-        return None
+        return {"host": None, "device": on_device}
     unit = 1 if sys.platform == "darwin" else 1024
-    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * unit
+    return {"host": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * unit, "device": on_device}
 
 
 def versions() -> dict[str, str]:

@@ -12,21 +12,11 @@ from gaussian_swaying.geometry.regions import Box
 from gaussian_swaying.mpm.boundaries.pinned_region import PinnedRegion
 from gaussian_swaying.mpm.solver import MPMSolver
 from gaussian_swaying.rendering.cameras.camera_path import OrbitCamera
-from gaussian_swaying.scenes.procedural import FlagScene, ProceduralScene
+from gaussian_swaying.scenes.procedural import FlagScene, GivenScene
 from gaussian_swaying.simulation.material import Material
 from gaussian_swaying.simulation.scene import Scene
 from gaussian_swaying.simulation.simulated_scene import SimulatedScene
 from gaussian_swaying.simulation.simulation import Simulation
-
-
-class CloudScene(ProceduralScene):
-    """A given splat as a scene."""
-
-    def __init__(self, cloud):
-        self.cloud = cloud
-
-    def generate(self):
-        return self.cloud
 
 
 def _make_cloud(count=40, degree=1, opacity=0.9, seed=0, offset=0.0):
@@ -44,6 +34,41 @@ def _make_cloud(count=40, degree=1, opacity=0.9, seed=0, offset=0.0):
     )
 
 
+def plain_cloud(means, log_scales=-4.0, quats=(1.0, 0.0, 0.0, 0.0), logit=3.0):
+    """Grey Gaussians at places (N, 3); sizes, rotations and opacities are one for all or each its own."""
+    count = len(means)
+    return GaussianCloud(
+        means=means.float(),
+        quats=torch.as_tensor(quats).expand(count, 4),
+        scales=torch.as_tensor(log_scales).expand(count, 3),
+        opacities=torch.as_tensor(logit).expand(count),
+        sh=torch.zeros(count, 1, 3),
+    )
+
+
+def varied_cloud(count=300, degree=1, seed=0, normals=False):
+    """Gaussians of all colours, sizes, opacities and rotations."""
+    draw = torch.Generator().manual_seed(seed)
+
+    def random(*shape):
+        return torch.rand(*shape, generator=draw)
+
+    return GaussianCloud(
+        means=4 * random(count, 3) - 1,
+        quats=random(count, 4) - 0.5,
+        scales=-4 + 2 * random(count, 3),
+        opacities=6 * random(count) - 2,
+        sh=0.8 * (random(count, (degree + 1) ** 2, 3) - 0.5),
+        normals=torch.nn.functional.normalize(random(count, 3) - 0.5, dim=-1) if normals else None,
+    )
+
+
+def together(*clouds):
+    """Several splats as one."""
+    names = ("means", "quats", "scales", "opacities", "sh")
+    return GaussianCloud(*(torch.cat([getattr(cloud, name) for cloud in clouds]) for name in names))
+
+
 @pytest.fixture
 def make_cloud():
     """A random splat in the unit cube."""
@@ -57,7 +82,7 @@ def make_scene():
     def make(cloud=None, material=None, dx=0.25, dtype=torch.float32, **settings):
         cloud = _make_cloud() if cloud is None else cloud
         settings = {"points": "gaussian", **settings}
-        return SimulatedScene(Scene(generator=CloudScene(cloud), **settings), material or Material(), dx, dtype)
+        return SimulatedScene(Scene(generator=GivenScene(cloud), **settings), material or Material(), dx, dtype)
 
     return make
 
@@ -81,7 +106,7 @@ def make_simulation():
         parts=None,
         **solver,
     ):
-        source = FlagScene(spacing=0.1) if cloud is None else CloudScene(cloud)
+        source = FlagScene(spacing=0.1) if cloud is None else GivenScene(cloud)
         solver = {"dx": 0.2, **solver}
         if pinned:
             solver["boundaries"] = [PinnedRegion(Box([None, None, None], [0.11, None, None]))]

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import sys
 
-import gaussian_swaying.cli  # noqa: F401  (sets up threads, before torch is imported)
 from gaussian_swaying.cli.preview import main
 
 if __name__ == "__main__":

@@ -2,7 +2,6 @@
 
 import sys
 
-import gaussian_swaying.cli  # noqa: F401  (sets up threads, before torch is imported)
 from gaussian_swaying.cli.train import main
 
 if __name__ == "__main__":

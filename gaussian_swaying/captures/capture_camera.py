@@ -3,19 +3,20 @@
 from __future__ import annotations
 
 import math
+from dataclasses import KW_ONLY, dataclass
 from itertools import pairwise
 from pathlib import Path
 
 import torch
 from torch import Tensor
 
-from gaussian_swaying._checks import check_choice, check_positive
+from gaussian_swaying._checks import check_literals, check_positive
 from gaussian_swaying.captures.colmap import colmap_model, read_colmap_views
 from gaussian_swaying.captures.transforms import transforms_files
 from gaussian_swaying.geometry.rotations import quat_to_rotation, rotation_to_quat
-from gaussian_swaying.rendering.cameras.camera import Camera, check_pixels, resized_intrinsics
-from gaussian_swaying.rendering.cameras.camera_path import CameraPath
-from gaussian_swaying.rendering.cameras.keyframes import INTERPOLATIONS, interpolate_keys
+from gaussian_swaying.rendering.cameras.camera import Camera, resized_intrinsics
+from gaussian_swaying.rendering.cameras.camera_path import CameraPath, check_picture
+from gaussian_swaying.rendering.cameras.keyframes import Interpolation, interpolate_keys
 from gaussian_swaying.rendering.cameras.transforms_json import camera_of_transforms, load_transforms
 
 
@@ -61,6 +62,7 @@ def read_views(
     return sorted(views, key=lambda view: view[0])
 
 
+@dataclass(eq=False)
 class CaptureCamera(CameraPath):
     """Cameras of a ``transforms.json`` or a COLMAP model: one of them, or a path through all, sorted by name.
 
@@ -84,23 +86,19 @@ class CaptureCamera(CameraPath):
 
     captured = True
 
-    def __init__(
-        self,
-        path: str | Path,
-        view: int | str | None = None,
-        seconds_per_view: float = 0.5,
-        interpolation: str = "smooth",
-        width: int | None = None,
-        height: int | None = None,
-        near: float = 0.01,
-    ) -> None:
-        check_positive("seconds_per_view", seconds_per_view)
-        check_choice("interpolation", interpolation, INTERPOLATIONS)
-        check_positive("near", near)
-        self.path, self.view, self.seconds_per_view = path, view, float(seconds_per_view)
-        self.interpolation, self.near = interpolation, float(near)
-        self.width = None if width is None else check_pixels("width", width)
-        self.height = None if height is None else check_pixels("height", height)
+    path: str | Path
+    view: int | str | None = None
+    _: KW_ONLY
+    seconds_per_view: float = 0.5
+    interpolation: Interpolation = "smooth"
+    width: int | None = None
+    height: int | None = None
+    near: float = 0.01
+
+    def __post_init__(self) -> None:
+        check_positive("seconds_per_view", self.seconds_per_view)
+        check_literals(type(self).__init__, vars(self))
+        check_picture(self)
         self._cameras: list[Camera] = []
         self._rows: list[list[float]] = []
 
@@ -151,9 +149,9 @@ class CaptureCamera(CameraPath):
             return self.view
         view = str(self.view).removeprefix("./")
         for short in (lambda name: name, lambda name: Path(name).name, lambda name: Path(name).stem):
-            found = [k for k, name in enumerate(names) if short(name) == view]
-            if len(found) == 1:
-                return found[0]
+            matches = [k for k, name in enumerate(names) if short(name) == view]
+            if len(matches) == 1:
+                return matches[0]
         raise ValueError(
             f"`{self.path}` has no view `{view}`, or several: set `view` to one of {len(names)} names such as "
             f"{names[0]}."

@@ -16,7 +16,7 @@ from einops import rearrange
 from torch import Tensor
 
 from gaussian_swaying._checks import check_positive, check_whole
-from gaussian_swaying.rendering.cameras.camera import Camera, look_at_camera
+from gaussian_swaying.rendering.cameras.camera import Camera, check_fov, look_at_camera
 
 _STEPS = 24  # samples along a ray, to find the interval of the first crossing
 _LIGHT = (0.4, -0.8, 0.45)
@@ -58,6 +58,7 @@ class TrueView:
     normals: Tensor
 
 
+@dataclass(eq=False)
 class GeneratedCapture:
     """Photographs of a rippled, patterned flag from all around, with its true normals and area.
 
@@ -82,32 +83,26 @@ class GeneratedCapture:
         ValueError: If a number is out of range.
     """
 
-    def __init__(
-        self,
-        views: int = 60,
-        size: int = 400,
-        width: float = 1.2,
-        height: float = 0.8,
-        ripple: float = 0.08,
-        waves: float = 1.5,
-        distance: float = 2.2,
-        fov: float = 40.0,
-        samples: int = 2,
-        seed: int = 0,
-    ) -> None:
-        for name, count in (("views", views), ("size", size), ("samples", samples)):
-            check_whole(name, count, 1)
-        for name, value in (("width", width), ("height", height), ("waves", waves), ("distance", distance)):
-            check_positive(name, value)
-        check_positive("ripple", ripple, allow_zero=True)
-        if not 0.0 < fov < 180.0:
-            raise ValueError(f"Expected `fov` to be between 0 and 180 degrees (both excluded), but got {fov}.")
-        if distance <= math.hypot(0.5 * width, ripple, 0.5 * height):
-            raise ValueError(f"Expected `distance` to keep the cameras outside the flag, but got {distance} m.")
-        self.views, self.size, self.samples, self.seed = views, size, samples, seed
-        self.width, self.height, self.ripple, self.waves = float(width), float(height), float(ripple), float(waves)
-        self.distance, self.fov = float(distance), float(fov)
-        generator = torch.Generator().manual_seed(seed)
+    views: int = 60
+    size: int = 400
+    width: float = 1.2
+    height: float = 0.8
+    ripple: float = 0.08
+    waves: float = 1.5
+    distance: float = 2.2
+    fov: float = 40.0
+    samples: int = 2
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        for name in ("views", "size", "samples"):
+            check_whole(name, getattr(self, name), 1)
+        for name in ("width", "height", "waves", "distance", "ripple"):
+            check_positive(name, getattr(self, name), allow_zero=name == "ripple")
+        check_fov("fov", self.fov)
+        if self.distance <= math.hypot(0.5 * self.width, self.ripple, 0.5 * self.height):
+            raise ValueError(f"Expected `distance` to keep the cameras outside the flag, but got {self.distance} m.")
+        generator = torch.Generator().manual_seed(self.seed)
         self._phase = 2 * math.pi * float(torch.rand((), generator=generator))
         self._turn = 2 * math.pi * float(torch.rand((), generator=generator))
         self._waves = (torch.rand(6, 3, generator=generator) * torch.tensor([40.0, 40.0, 2 * math.pi])).tolist()
@@ -257,8 +252,8 @@ class GeneratedCapture:
         hit = torch.zeros(len(rays), dtype=torch.bool)
         depth, x, z = (torch.zeros(len(rays)) for _ in range(3))
         for chunk in inside.split(1 << 17):
-            found, t = self._first_crossing(eye, rays[chunk], enter[chunk], leave[chunk])
-            met = chunk[found]
+            crosses, t = self._first_crossing(eye, rays[chunk], enter[chunk], leave[chunk])
+            met = chunk[crosses]
             place = eye + t[:, None] * rays[met]
             hit[met], depth[met], x[met], z[met] = True, t, place[:, 0], place[:, 2]
         shape = v.shape
@@ -273,8 +268,8 @@ class GeneratedCapture:
 
         values = above(enter + torch.linspace(0, 1, _STEPS + 1)[:, None] * (leave - enter), rays)
         change = (values[:-1] > 0) != (values[1:] > 0)
-        found, first = change.any(0), change.int().argmax(0)
-        rays, enter, width, first = rays[found], enter[found], ((leave - enter) / _STEPS)[found], first[found]
+        crosses, first = change.any(0), change.int().argmax(0)
+        rays, enter, width, first = rays[crosses], enter[crosses], ((leave - enter) / _STEPS)[crosses], first[crosses]
         left = enter + first * width
         right = left + width
         side = above(left, rays) > 0
@@ -282,7 +277,7 @@ class GeneratedCapture:
             middle = 0.5 * (left + right)
             before = (above(middle, rays) > 0) == side
             left, right = torch.where(before, middle, left), torch.where(before, right, middle)
-        return found, 0.5 * (left + right)
+        return crosses, 0.5 * (left + right)
 
     # ---- files
 

@@ -148,10 +148,10 @@ def consistent_points(capture: Capture, count: int, seed: int = 0, half_side: fl
         column = ((scale[:, 0] * camera.intrinsics[0, 0] + camera.intrinsics[0, 2]) * (_WIDTH / camera.width)).floor()
         row = ((scale[:, 1] * camera.intrinsics[1, 1] + camera.intrinsics[1, 2]) * (height / camera.height)).floor()
         inside = (depth > camera.near) & (column >= 0) & (column < _WIDTH) & (row >= 0) & (row < height)
-        found = photo[:, row[inside].long(), column[inside].long()].T
+        color = photo[:, row[inside].long(), column[inside].long()].T
         seen[inside] += 1
-        total[inside] += found
-        squares[inside] += found.square().sum(-1)
+        total[inside] += color
+        squares[inside] += color.square().sum(-1)
     mean = total / seen.clamp_min(1)[:, None]
     spread = squares / seen.clamp_min(1) - mean.square().sum(-1)
     spread[(seen < 3) | ~clear] = math.inf

@@ -29,7 +29,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def write(options: argparse.Namespace) -> None:
-    """Convert, write or print, and report the file and everything whose meaning differs."""
+    """Convert, write or print the YAML, and report its file and every setting whose meaning differs."""
     settings, notes = convert(read_config(options.config), options.cameras, options.sticky_planes)
     text = to_yaml(settings, notes, options.config.name)
     if options.output is None:

@@ -1,4 +1,4 @@
-"""Errors of a command as one sentence and an exit code, with suggestions for misspelt options."""
+"""The end of a command: errors as one sentence and an exit code, suggestions for misspelt options, how to continue."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ import errno
 import inspect
 import os
 import re
+import shlex
 import sys
 import warnings
 from argparse import ArgumentError, ArgumentParser
@@ -14,10 +15,12 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from importlib import import_module
 from itertools import pairwise
+from pathlib import Path
 from typing import Any
 
 import torch
 
+from gaussian_swaying import _program as program
 from gaussian_swaying._checks import first_line
 from gaussian_swaying.cli.streams import SafeStream, safe_streams
 from gaussian_swaying.runs.signals import exit_code
@@ -63,9 +66,34 @@ def run_command(
         keep their traceback.
     """
     arguments = sys.argv[1:] if arguments is None else arguments
+
+    def tell(text: str, error: BaseException) -> None:
+        for line in (text, advice and advice(error)):
+            if line:
+                print(line, file=sys.stderr)
+
+    def outcome() -> int:
+        try:
+            with warnings.catch_warnings():
+                warnings.showwarning = _once(set())
+                return command() or OK
+        except KeyboardInterrupt as stop:
+            tell(stopped, stop)
+            return exit_code(stop)
+        except Exception as error:
+            if os.environ.get("GAUSSIAN_SWAYING_DEBUG") == "1":
+                raise
+            for_users = sentence(error, memory, expected, arguments)
+            bug = (
+                f"{type(error).__name__}: {first_line(error)} This is a bug in gaussian_swaying: please report it with "
+                "the traceback that GAUSSIAN_SWAYING_DEBUG=1 shows."
+            )
+            tell(f"error: {for_users or bug}", error)
+            return BUG if for_users is None else BAD_INPUT
+
     with safe_streams() as (output, _):
         try:
-            code = _code(command, stopped, memory, expected, arguments, advice)
+            code = outcome()
         except SystemExit:  # --help and the like
             if not _was_written(output):
                 raise SystemExit(BAD_INPUT) from None
@@ -81,44 +109,6 @@ def _was_written(output: SafeStream) -> bool:
         return True
     print(f"error: Standard output could not be written ({os.strerror(number)}).", file=sys.stderr)
     return False
-
-
-def _code(
-    command: Callable[[], int | None],
-    stopped: str,
-    memory: str,
-    expected: tuple[type[BaseException], ...],
-    arguments: Sequence[str],
-    advice: Callable[[BaseException], str | None] | None,
-) -> int:
-    try:
-        with warnings.catch_warnings():
-            warnings.showwarning = _once(set())
-            return command() or OK
-    except KeyboardInterrupt as stop:
-        print(stopped, file=sys.stderr)
-        _advise(advice, stop)
-        return exit_code(stop)
-    except Exception as error:
-        if os.environ.get("GAUSSIAN_SWAYING_DEBUG") == "1":
-            raise
-        found = sentence(error, memory, expected, arguments)
-        if found is None:
-            print(
-                f"error: {type(error).__name__}: {first_line(error)} This is a bug in gaussian_swaying: please report "
-                "it with the traceback that GAUSSIAN_SWAYING_DEBUG=1 shows.",
-                file=sys.stderr,
-            )
-        else:
-            print(f"error: {found}", file=sys.stderr)
-        _advise(advice, error)
-        return BUG if found is None else BAD_INPUT
-
-
-def _advise(advice: Callable[[BaseException], str | None] | None, error: BaseException) -> None:
-    text = None if advice is None else advice(error)
-    if text is not None:
-        print(text, file=sys.stderr)
 
 
 def _once(shown: set[str]) -> Callable[..., None]:
@@ -197,11 +187,11 @@ _CHOICES = re.compile(r"Expected a typing\.Literal\[([^\]]*)\]")
 
 def _asked_for(text: str) -> str:
     """Return the requested amount of memory in words, from an error message; empty if it does not say."""
-    found = re.search(r"allocate (\d+) bytes", text)
-    if found:
-        return f"{int(found[1]) / 2**30:,.3g} GiB were requested"
-    found = re.search(r"allocate ([\d.]+ [KMGT]iB)", text)
-    return f"{found[1]} were requested" if found else ""
+    amount = re.search(r"allocate (\d+) bytes", text)
+    if amount:
+        return f"{int(amount[1]) / 2**30:,.3g} GiB were requested"
+    amount = re.search(r"allocate ([\d.]+ [KMGT]iB)", text)
+    return f"{amount[1]} were requested" if amount else ""
 
 
 def _of_the_system(error: OSError) -> str:
@@ -246,14 +236,14 @@ def did_you_mean(message: str, parser: ArgumentParser) -> str:
         parser: The parser, for the names of its options.
     """
     for pattern in _UNKNOWN:
-        found = pattern.search(message)
-        if found is None:
+        unknown = pattern.search(message)
+        if unknown is None:
             continue
-        parts, name = found.groupdict(), found["name"].lstrip("-").replace("-", "_")
+        parts, name = unknown.groupdict(), unknown["name"].lstrip("-").replace("-", "_")
         if parts.get("path"):
             near, prefix = _nearest(name, _arguments(parts["path"])), ""
         else:
-            group, prefix = parts.get("group"), "--" if found["name"].startswith("--") else ""
+            group, prefix = parts.get("group"), "--" if unknown["name"].startswith("--") else ""
             near = _nearest(f"{group}.{name}" if group else name, _options(parser))
         return "" if near in (None, name) else f" (did you mean {prefix}{near}?)"
     return ""
@@ -284,3 +274,40 @@ def _arguments(class_path: str) -> dict[str, str]:
     except (ImportError, AttributeError, TypeError, ValueError):
         return {}
     return {parameter: parameter for parameter in parameters}
+
+
+# ---- how to continue
+
+
+def command(arguments: Sequence[str], *more: str, without: str | None = None) -> str:
+    """The command line of this program with additional arguments, ready to paste into a shell.
+
+    Args:
+        arguments: The arguments with which it was started.
+        more: Arguments to add at the end, unless they are already there.
+        without: An option to remove with its value, because ``more`` sets it again.
+    """
+    kept, skip = [], False
+    for argument in arguments:
+        if skip or (without and argument.startswith(f"{without}=")):
+            skip = False
+        elif argument == without:
+            skip = True
+        else:
+            kept.append(argument)
+    return shlex.join([*program.this(), *kept, *(argument for argument in more if argument not in kept)])
+
+
+def how_to_resume(checkpoint: Path, frame: int, arguments: Sequence[str], diverged: bool = False) -> str:
+    """A sentence that names the checkpoint of a simulation, and the command that continues it.
+
+    Args:
+        checkpoint: The file.
+        frame: Its frame.
+        arguments: Command line of the run.
+        diverged: Whether the run diverged, so that the same settings would diverge again.
+    """
+    held = f"{checkpoint} contains the run up to frame {frame}"
+    if diverged:
+        return f"{held}; continuing from it would diverge again, so change the settings and start without --resume."
+    return f"{held}; to continue:\n  {command(arguments, '--resume')}"

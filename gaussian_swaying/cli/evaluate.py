@@ -73,14 +73,10 @@ def compare(options: argparse.Namespace) -> None:
         options.reference,
         output,
         video=not options.no_video,
-        reference_offset=options.reference_offset,
-        frames=options.frames,
-        side=options.side,
-        points=options.points,
-        seed=options.seed,
         device=device,
         fvd=network,
         progress=sys.stderr.isatty(),
+        **{name: getattr(options, name) for name in ("reference_offset", "frames", "side", "points", "seed")},
     )
     print(table(result), end="")
     for name in ("eval.json", "eval.md", "comparison.mp4"):

@@ -8,8 +8,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from gaussian_swaying import _program as program
-from gaussian_swaying.cli.continuing import command
-from gaussian_swaying.cli.errors import guessing, run_command
+from gaussian_swaying.cli.errors import command, guessing, run_command
 from gaussian_swaying.cli.shipped import with_shipped
 from gaussian_swaying.runs.signals import stop_signals
 from gaussian_swaying.simulation.simulation import Simulation

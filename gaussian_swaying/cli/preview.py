@@ -123,55 +123,55 @@ def preview_scene(options: argparse.Namespace, folder: Path) -> Preview:
     region = None if options.region is None else (options.region[:3], options.region[3:])
     capture = None if options.capture is None else captured_from(options.capture)
     quality = options.quality or "normal"
-    found = suggest(cloud, up, options.hold, region, options.longest_side, options.wind, capture, quality)
+    suggestion = suggest(cloud, up, options.hold, region, options.longest_side, options.wind, capture, quality)
     begin = Stopwatch()
-    draft, settings = _pipeline(["--device", options.device], draft_yaml(found, options.scene))
+    draft, settings = _pipeline(["--device", options.device], draft_yaml(suggestion, options.scene))
     startup = LOADED + begin.quiet
     if settings.scene.ply != str(Path(options.scene).resolve()):
         raise ValueError(f"The path {options.scene!r} has another meaning in YAML: rename the file, without a colon.")
-    found = calibrated_suggestion(found, draft, options.sway)
-    costs = {"draft": estimate_cost(draft, settings.frames, startup, found.growth)}
+    suggestion = calibrated_suggestion(suggestion, draft, options.sway)
+    costs = {"draft": estimate_cost(draft, settings.frames, startup, suggestion.growth)}
     made: dict[float, Simulation] = {}  # the starter with several grids
 
     def measure(dx: float) -> Cost:
-        text = starter_yaml(replace(found, dx=dx), options.scene, options.frames)
+        text = starter_yaml(replace(suggestion, dx=dx), options.scene, options.frames)
         made[dx] = _pipeline(["--device", options.device], text)[0]
-        return estimate_cost(made[dx], options.frames, startup, found.growth)
+        return estimate_cost(made[dx], options.frames, startup, suggestion.growth)
 
-    costs["starter"] = measure(found.dx)
-    grids = {name: at_quality(found, name).dx for name in QUALITIES}
+    costs["starter"] = measure(suggestion.dx)
+    grids = {name: at_quality(suggestion, name).dx for name in QUALITIES}
     if options.minutes is not None:
-        wish, finest = 60 * options.minutes, finest_spacing(found)
+        wish, finest = 60 * options.minutes, finest_spacing(suggestion)
         costs["starter"] = finest_within(measure, wish, costs["starter"], costs["draft"], finest, grids["draft"])
-        found = replace(found, dx=costs["starter"].dx, quality=f"--minutes {options.minutes:g}")
-    simulation = made[found.dx]
+        suggestion = replace(suggestion, dx=costs["starter"].dx, quality=f"--minutes {options.minutes:g}")
+    simulation = made[suggestion.dx]
     texts = {
-        "draft": draft_yaml(found, options.scene),
-        "starter": starter_yaml(found, options.scene, options.frames),
+        "draft": draft_yaml(suggestion, options.scene),
+        "starter": starter_yaml(suggestion, options.scene, options.frames),
     }
     others = {
         name: scaled_seconds(costs["starter"], costs["draft"], dx)
         for name, dx in grids.items()
-        if name != found.quality
+        if name != suggestion.quality
     }
     data: dict[str, Any] = {
         "splat": str(options.scene),
         "bounds": bounds(cloud.means),
         "gaussians": gaussian_statistics(cloud),
-        "suggestion": suggestion_dict(found),
+        "suggestion": suggestion_dict(suggestion),
         "run": run_dict(simulation),
         "cost": cost_dict(costs["starter"]),
         "draft_cost": cost_dict(costs["draft"]),
         "qualities": {name: {"dx_m": grids[name], "total_seconds": time} for name, time in others.items()},
     }
-    report = [*splat_lines(options.scene, cloud, data), *suggestion_lines(found, simulation.scene.further)]
+    report = [*splat_lines(options.scene, cloud, data), *suggestion_lines(suggestion, simulation.scene.further)]
     report.append(area_line(data["run"]))
     if simulation.scene.loose:
         specks = f"{simulation.scene.loose:,} specks hang on nothing or by a thread"
         report.append(f"  note: {specks}; they follow their nearest neighbours (scene.loose: carry)")
-    report += [f"  {line}" for line in doubts(found, options, build_options().parse_args([]))]
+    report += [f"  {line}" for line in doubts(suggestion, options, build_options().parse_args([]))]
     report += cost_lines(costs["starter"])
-    report += quality_lines(found, costs["starter"], options.minutes, grids, others)
+    report += quality_lines(suggestion, costs["starter"], options.minutes, grids, others)
     output, stem = Path("outputs"), splat_name(options.scene)
     report.append("")
     for name, what, where in (
@@ -181,7 +181,7 @@ def preview_scene(options: argparse.Namespace, folder: Path) -> Preview:
         pictures = f"{video_length(texts[name])}, {duration(costs[name].total_seconds)} here"
         report.append(f"{what} ({pictures}):")
         report.append(f"  {shlex.join(program.words('sim'))} --config {folder / name}.yaml --output {where}")
-    return Preview("\n".join(report), data, preview_picture(simulation, options.height, whole=found.whole), texts)
+    return Preview("\n".join(report), data, preview_picture(simulation, options.height, whole=suggestion.whole), texts)
 
 
 def preview_config(options: argparse.Namespace) -> Preview:
@@ -291,7 +291,7 @@ def _preview(options: argparse.Namespace) -> None:
     if not 64 <= options.height <= 4320:
         raise ValueError(f"Expected `--height` from 64 to 4320 pixels, but got {options.height}.")
     folder = Path(options.output or Path("outputs/preview") / splat_name(options.scene or options.config[-1]))
-    found = preview_scene(options, folder) if options.config is None else preview_config(options)
-    print(found.report)
-    for path in write(found, folder):
+    preview = preview_scene(options, folder) if options.config is None else preview_config(options)
+    print(preview.report)
+    for path in write(preview, folder):
         print(f"wrote {path}")

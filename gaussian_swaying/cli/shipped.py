@@ -13,8 +13,8 @@ import gaussian_swaying
 def folder() -> Path | None:
     """The folder of the configurations: in the installed package, or beside it in a checkout; None if missing."""
     package = Path(gaussian_swaying.__file__).parent
-    found = [path for path in (package / "configs", package.parent / "configs") if (path / "sim").is_dir()]
-    return found[0] if found else None
+    places = [path for path in (package / "configs", package.parent / "configs") if (path / "sim").is_dir()]
+    return places[0] if places else None
 
 
 def names(kind: str) -> list[str]:
@@ -33,16 +33,16 @@ def with_shipped(arguments: Sequence[str], kind: str) -> list[str]:
     Raises:
         ValueError: If a name is neither a file nor a shipped configuration.
     """
-    found: list[str] = []
+    words: list[str] = []
     for argument in arguments:
         option, equals, value = argument.partition("=")
-        if found and found[-1] == "--config" and not argument.startswith("-"):
-            found.append(_file(argument, kind))
+        if words and words[-1] == "--config" and not argument.startswith("-"):
+            words.append(_file(argument, kind))
         elif option == "--config" and equals:
-            found.append(f"--config={_file(value, kind)}")
+            words.append(f"--config={_file(value, kind)}")
         else:
-            found.append(argument)
-    return found
+            words.append(argument)
+    return words
 
 
 def _file(given: str, kind: str) -> str:

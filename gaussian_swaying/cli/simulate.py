@@ -8,8 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from gaussian_swaying._yaml_limits import check_config_files
-from gaussian_swaying.cli.continuing import how_to_resume
-from gaussian_swaying.cli.errors import guessing, run_command
+from gaussian_swaying.cli.errors import guessing, how_to_resume, run_command
 from gaussian_swaying.cli.shipped import with_shipped
 from gaussian_swaying.runs.signals import stop_signals
 from gaussian_swaying.simulation.diagnostics import SimulationDiverged

@@ -7,12 +7,10 @@ import sys
 from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
 from gaussian_swaying import _program as program
 from gaussian_swaying._checks import first_line
-from gaussian_swaying.cli.continuing import command
-from gaussian_swaying.cli.errors import guessing, run_command, sentence
+from gaussian_swaying.cli.errors import command, guessing, run_command, sentence
 from gaussian_swaying.cli.shipped import with_shipped
 from gaussian_swaying.runs.signals import stop_signals
 from gaussian_swaying.simulation.simulation import Simulation
@@ -111,9 +109,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 def explain(error: BaseException) -> str:
     """One sentence about an error of a run."""
-    found = sentence(error, MEMORY)
-    if found is not None:
-        return found
+    told = sentence(error, MEMORY)
+    if told is not None:
+        return told
     return f"{type(error).__name__}: {first_line(error)} This is a bug; its traceback is in the folder logs."
 
 
@@ -121,7 +119,7 @@ def sweep(options: argparse.Namespace, begun: list[Path], arguments: Sequence[st
     """Do the runs that are missing, and report; the folder is put into ``begun`` once it is the sweep's."""
     from gaussian_swaying.sweeps.plan import make_plan, read_sweep
     from gaussian_swaying.sweeps.record import PARQUET, TABLE
-    from gaussian_swaying.sweeps.shards import SHARDS
+    from gaussian_swaying.sweeps.shards import SHARDS, write_shards
     from gaussian_swaying.sweeps.sweep import run_sweep
 
     if options.shards is not None and (options.shards < 1 or options.part is not None):
@@ -140,24 +138,24 @@ def sweep(options: argparse.Namespace, begun: list[Path], arguments: Sequence[st
         results = run_sweep(
             plan,
             folder,
-            resume=options.resume,
-            workers=options.workers,
-            threads=options.threads,
-            retries=options.retries,
-            device=options.device,
-            picture=options.picture,
             explain=explain,
             started=lambda: begun.append(folder),
-            together=options.together,
-            per_gpu=options.per_gpu,
-            ray=options.ray,
-            part=options.part,
-            parquet=options.parquet,
+            **{
+                name: value
+                for name, value in vars(options).items()
+                if name not in ("sweep", "output", "shards", "list")
+            },
         )
     counts = Counter(result["status"] for result in results.values())
     print(f"{len(results)} runs: {', '.join(f'{count} {status}' for status, count in sorted(counts.items()))}")
     tables = [folder / name for name in (TABLE, PARQUET) if (folder / name).exists()]  # the last part writes them
-    shards = [folder / SHARDS] if _write_shards(folder, options.shards, results) else []
+    complete = [name for name, result in results.items() if result["status"] == "complete"]
+    shards = []
+    if options.shards is not None and complete:
+        place = folder / "runs" / complete[0]  # with all that was recorded
+        frames, positions = (place / "frames").is_dir(), (place / "trajectory.npz").exists()
+        write_shards(folder, options.shards, frames=frames, positions=positions)
+        shards = [folder / SHARDS]
     for file in (folder / "runs", *tables, *sorted(folder.glob("contact_sheet*.png")), *shards):
         print(f"wrote {file}")
     failed = [name for name, result in sorted(results.items()) if result["status"] != "complete"]
@@ -168,15 +166,3 @@ def sweep(options: argparse.Namespace, begun: list[Path], arguments: Sequence[st
             file=sys.stderr,
         )
     return 2 if failed else 0
-
-
-def _write_shards(folder: Path, count: int | None, results: dict[str, dict[str, Any]]) -> bool:
-    """Write the shards with all that was recorded, if they are wanted and there is a complete run."""
-    from gaussian_swaying.sweeps.shards import write_shards
-
-    complete = [name for name, result in results.items() if result["status"] == "complete"]
-    if count is None or not complete:
-        return False
-    place = folder / "runs" / complete[0]
-    write_shards(folder, count, frames=(place / "frames").is_dir(), positions=(place / "trajectory.npz").exists())
-    return True

@@ -10,6 +10,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+from jsonargparse import Namespace
 from lightning.pytorch import LightningDataModule, Trainer
 from lightning.pytorch.callbacks import ModelCheckpoint, ProgressBar, TQDMProgressBar
 from lightning.pytorch.cli import LightningArgumentParser, LightningCLI
@@ -24,14 +25,14 @@ import gaussian_swaying.training.losses
 from gaussian_swaying import _program as program
 from gaussian_swaying._files import atomic
 from gaussian_swaying._yaml_limits import check_config_files, limit_yaml
-from gaussian_swaying.cli.continuing import command
-from gaussian_swaying.cli.errors import guessing, run_command
+from gaussian_swaying.cli.errors import command, guessing, run_command
 from gaussian_swaying.cli.shipped import with_shipped
 from gaussian_swaying.runs.signals import stop_signals
 from gaussian_swaying.training.checkpoints import SealedCheckpoints, read_training_checkpoint
 from gaussian_swaying.training.csv_log import CsvLog
 from gaussian_swaying.training.finite import TrainingDiverged
 from gaussian_swaying.training.module import SplatTrainer
+from gaussian_swaying.training.parallel import steps_of
 from gaussian_swaying.training.quiet import silence_advertisements, silence_warnings
 from gaussian_swaying.training.run_folder import RunFolder
 from gaussian_swaying.training.strategy import SplatParallel
@@ -55,6 +56,11 @@ def default_loggers(folder: Path) -> list[Logger]:
     if any(importlib.util.find_spec(name) is not None for name in ("tensorboard", "tensorboardX")):
         loggers.append(TensorBoardLogger(folder, name="", version="tensorboard"))
     return loggers
+
+
+def _may_be_several(trainer: Namespace) -> bool:
+    """True if the settings of a trainer ask for more than one device."""
+    return trainer.get("devices") not in (None, 1, "1") or trainer.get("num_nodes") not in (None, 1)
 
 
 class TrainCLI(LightningCLI):
@@ -81,9 +87,31 @@ class TrainCLI(LightningCLI):
             }
         )
 
+    def before_instantiate_classes(self) -> None:
+        """Turn numbers of images into numbers of Lightning's steps, each of which takes an image on every device."""
+        self.asked = self.config.clone()
+        settings = self._chosen(self.config)
+        trainer, checkpoint = settings["trainer"], settings.get("checkpoint")
+        if not _may_be_several(trainer):
+            return
+        machines = {name: trainer[name] for name in ("accelerator", "devices", "num_nodes")}
+        devices = Trainer(**machines, logger=False, enable_checkpointing=False, enable_progress_bar=False).world_size
+        for part, name in (
+            (trainer, "max_steps"),
+            (trainer, "val_check_interval"),
+            (checkpoint, "every_n_train_steps"),
+        ):
+            if part is not None and isinstance(part[name], int) and part[name] > 0:
+                part[name] = steps_of(part[name], devices)
+
+    def _chosen(self, config: Namespace) -> Namespace:
+        """The part of a configuration that belongs to the subcommand."""
+        part: Namespace = config.get(str(self.subcommand), config)
+        return part
+
     def instantiate_trainer(self, **kwargs: Any) -> Trainer:
         """Make the trainer, with loggers and a folder of checkpoints inside its folder."""
-        settings = self._get(self.config_init, "trainer", default={})
+        settings = self._chosen(self.config_init)["trainer"]
         root = Path(settings["default_root_dir"])
         evaluating = self.subcommand not in (None, "fit")
         self.run_folder.root, self.run_folder.keep = root, self.subcommand == "fit"
@@ -91,7 +119,7 @@ class TrainCLI(LightningCLI):
         if settings.get("logger") in (None, True):
             kwargs["logger"] = default_loggers(root) if evaluating else False
             self.run_folder.loggers = lambda: default_loggers(root)
-        checkpoint = self._get(self.config_init, "checkpoint")
+        checkpoint = self._chosen(self.config_init).get("checkpoint")
         if checkpoint is not None and checkpoint.dirpath is None:
             checkpoint.dirpath = str(root / "checkpoints")
         callbacks = [*(settings.get("callbacks") or []), self.run_folder]
@@ -103,7 +131,7 @@ class TrainCLI(LightningCLI):
         plugins = list(plugins) if isinstance(plugins, (list, tuple)) else [plugins]
         if not any(isinstance(plugin, CheckpointIO) for plugin in plugins):
             kwargs["plugins"] = [*plugins, SealedCheckpoints()]
-        if settings.get("devices") not in (None, 1, "1") or settings.get("num_nodes") not in (None, 1):
+        if _may_be_several(settings):
             if settings.get("strategy") in (None, "auto", "ddp"):
                 kwargs["strategy"] = SplatParallel()
             kwargs["use_distributed_sampler"] = False  # the data know which images are whose
@@ -111,7 +139,7 @@ class TrainCLI(LightningCLI):
 
     def _save_config(self, folder: Path) -> None:
         """Write the whole configuration, for the record."""
-        config = self.config.get(str(self.subcommand), self.config)
+        config = self._chosen(self.asked)
         folder.mkdir(parents=True, exist_ok=True)
         with atomic(folder / "config.yaml") as temporary:
             self._parser(self.subcommand).save(config, temporary, skip_unset=False, overwrite=True, multifile=False)
@@ -133,11 +161,10 @@ class TrainCLI(LightningCLI):
                 f"`trainer.max_steps` is {self.trainer.max_steps * self.trainer.world_size}: raise it."
             )
         try:
-            checkpoint = self._get(self.config_init, "checkpoint")
+            checkpoint = self._chosen(self.config_init).get("checkpoint")
             if checkpoint is None or checkpoint.dirpath is None:
                 return
-            kept: Any = self.trainer.checkpoint_callback
-            if getattr(kept, "_last_global_step_saved", None) != self.trainer.global_step:
+            if self.model.saved_step != self.trainer.global_step:
                 self.trainer.save_checkpoint(Path(checkpoint.dirpath) / f"step_{self.trainer.global_step:06d}.ckpt")
         finally:
             self.run_folder.release()

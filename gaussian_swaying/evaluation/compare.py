@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import json
 import math
 import os
-import re
 import sys
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
@@ -21,14 +19,13 @@ from torch import Tensor
 from tqdm import tqdm
 
 from gaussian_swaying._checks import check_positive, check_shape
-from gaussian_swaying._files import write_json, write_text
+from gaussian_swaying._files import without_nan, write_json, write_text
 from gaussian_swaying._inputs import check_archive, read_json
 from gaussian_swaying._provenance import describe_device, versions
 from gaussian_swaying.captures.images import image_size, read_image
 from gaussian_swaying.evaluation.comparison_picture import comparison_picture
 from gaussian_swaying.evaluation.reference import Cloth, frame_files, read_cloth, surface_points
 from gaussian_swaying.geometry.frame import SimFrame
-from gaussian_swaying.geometry.rotations import rotation_from_z
 from gaussian_swaying.metrics.nearest import nearest_distances
 from gaussian_swaying.metrics.ssim import SSIM_TAPS, ssim_map
 from gaussian_swaying.recording.trajectory import load_trajectory
@@ -51,8 +48,8 @@ def picture_errors(image: Tensor, target: Tensor) -> dict[str, float]:
     Raises:
         ValueError: If the shapes differ or the pictures are smaller than the window of SSIM, 11 pixels.
     """
-    found = {name: float(value) for name, value in _errors(image, target).items()}
-    return {"psnr_db": _psnr(found["mse"]), **found}
+    errors = {name: float(value) for name, value in _errors(image, target).items()}
+    return {"psnr_db": _psnr(errors["mse"]), **errors}
 
 
 def _errors(image: Tensor, target: Tensor) -> dict[str, Tensor]:
@@ -226,7 +223,7 @@ def compare_run(
     if surface is not None and cloth is not None:
         side = side if side is not None else cloth.side
         result |= surface.about() | {"side_m": side, "chamfer_share": mean["chamfer_m"] / side if side else None}
-    return dict(_finite(result | {"per_frame": rows}))
+    return dict(without_nan(result | {"per_frame": rows}))
 
 
 def table(result: dict[str, Any]) -> str:
@@ -271,8 +268,8 @@ def table(result: dict[str, Any]) -> str:
             "FVD: " + ", ".join(f"{name} {value}" for name, value in result["fvd"].items() if name != "fvd") + "."
         ]
     lines += [f"Not compared: {reason}." for reason in result["skipped"]]
-    found = ", ".join(f"{name} {number}" for name, number in result["versions"].items())
-    lines += [f"Computed on {result['device']}; {found}."]
+    software = ", ".join(f"{name} {number}" for name, number in result["versions"].items())
+    lines += [f"Computed on {result['device']}; {software}."]
     return "\n".join(lines) + "\n"
 
 
@@ -339,7 +336,10 @@ class _Surface:
     ) -> None:
         self.trajectory, self.cloth = run / "trajectory.npz", cloth
         self.points, self.seed, self.device = points, seed, device
-        self.frame = _sim_frame(run, summary)
+        try:
+            self.frame = SimFrame.from_summary(summary)
+        except ValueError as error:
+            raise ValueError(f"The summary.json of {run} cannot be used: {error}.") from error
         recorded = len(load_trajectory(self.trajectory, 0)[0])
         names = ("recorded_surface", "surface_particles", "simulated_gaussians")
         surface = next((summary[name] for name in names if summary.get(name)), None)
@@ -393,20 +393,6 @@ def _read_summary(run: Path) -> dict[str, Any]:
         raise ValueError(
             f"The run {run} has no readable summary.json: give the folder of a finished simulation."
         ) from error
-
-
-def _sim_frame(run: Path, summary: dict[str, Any]) -> SimFrame:
-    """The frame of the simulation, from the numbers of the summary or else from its line of text."""
-    if "sim_frame" in summary:
-        try:
-            return SimFrame.from_summary(summary)
-        except ValueError as error:
-            raise ValueError(f"The summary.json of {run} cannot be used: {error}.") from error
-    line = re.fullmatch(r"1 scene unit = (\S+) m; origin (\[.*\]); up (\[.*\]) .*", str(summary.get("frame")))
-    if line is None:
-        raise ValueError(f"The summary.json of {run} has no usable `frame`: run it again.")
-    origin = torch.tensor(json.loads(line[2]), dtype=torch.float64)
-    return SimFrame(origin, rotation_from_z(json.loads(line[3])).T, float(line[1]))
 
 
 def _trajectory_length(path: Path) -> int:
@@ -471,15 +457,6 @@ def _read_frame(path: Path, device: torch.device) -> Tensor:
     if pixels.shape[-1] != 3:
         raise ValueError(f"The picture {path} has transparent pixels: render it over its background.")
     return pixels.to(device).float() / 255
-
-
-def _finite(value: Any) -> Any:
-    """The same with None for numbers that JSON does not have."""
-    if isinstance(value, dict):
-        return {key: _finite(item) for key, item in value.items()}
-    if isinstance(value, list):
-        return [_finite(item) for item in value]
-    return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
 def _number(value: float | None, form: str) -> str:

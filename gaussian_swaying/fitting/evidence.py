@@ -198,6 +198,3 @@ def _patch_of(points: Tensor) -> Tensor:
     low, high = flat.amin(0), flat.amax(0)
     cell = ((flat - low) / (high - low).clamp(min=1e-12) * PATCHES).long().clamp(0, PATCHES - 1)
     return cell[:, 0] * PATCHES + cell[:, 1]
-
-
-__all__ = ["Block", "Evidence", "PictureEvidence", "TrackEvidence", "compare", "scales_of"]

@@ -445,6 +445,3 @@ def _read_course(folder: Path, described: Mapping[str, Any]) -> Course:
             f"The fit in {folder} has another `{changed[0] if changed else 'plan'}`: leave out --resume to begin again."
         )
     return Course(**kept["course"])
-
-
-__all__ = ["Course", "Fit", "fit", "run_fit"]

@@ -99,6 +99,3 @@ def changes(step: Sequence[float], unknowns: Sequence[Unknown], place: Tensor) -
         amount = f"{abs(change) / own:.0%}" if u.scale == "log" and own else f"{abs(change):.2g} {u.unit}".strip()
         words.append(f"{verb} {u.name} by {amount}")
     return " and ".join(words) if len(words) < 3 else ", ".join(words[:-1]) + " and " + words[-1]
-
-
-__all__ = ["Direction", "changes", "check_apart", "condition", "directions"]

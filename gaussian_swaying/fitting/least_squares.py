@@ -248,17 +248,3 @@ def unsettled(normal: Normal, place: Tensor, unknowns: Sequence[Unknown], ended:
     remedy = _BEGIN if ended else "raise `iterations` and continue with --resume"
     told = f"{changes(step.tolist(), unknowns, place)}, to lower the cost by {gain:.2g} of itself"
     return f"The values have not settled: {why}, but the sensitivities ask for {told}: {remedy}."
-
-
-__all__ = [
-    "Normal",
-    "Progress",
-    "expected_gain",
-    "huber",
-    "iterate",
-    "linearised",
-    "normal_equations",
-    "sensitivities",
-    "step_from",
-    "unsettled",
-]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -20,22 +20,6 @@ if TYPE_CHECKING:
 STAGES = ("tracks", "silhouettes", "matches", "pixels")
 """Stages of a fit, in this order: tracks from frame to frame; silhouettes; Gaussians matched from rendered frames to
 frames of the video, three rounds; colours."""
-
-_FIELDS = (
-    "base",
-    "videos",
-    "known",
-    "unknowns",
-    "stages",
-    "fit_share",
-    "until",
-    "search",
-    "iterations",
-    "tracks",
-    "limit",
-    "seed",
-    "cameras",
-)
 
 
 @dataclass(frozen=True)
@@ -99,7 +83,8 @@ def read_plan(path: str | os.PathLike[str], find: Callable[[str], str] = str) ->
         ValueError: If the file is invalid; the message names the entry and the remedy.
     """
     file = Path(path)
-    given = read_fields(file, "the fit file", _FIELDS)
+    names = [entry.name for entry in fields(Plan)]
+    given = read_fields(file, "the fit file", names)
     sought = given.get("unknowns")
     if not isinstance(sought, dict) or not sought:
         raise ValueError(
@@ -111,7 +96,7 @@ def read_plan(path: str | os.PathLike[str], find: Callable[[str], str] = str) ->
         raise ValueError(
             f"Expected `known` in {file} to have options of `sim` as names (material.E), but got {known!r:.60}."
         )
-    settings = {name: given[name] for name in _FIELDS[4:] if given.get(name) is not None}
+    settings = {name: given[name] for name in names[4:] if given.get(name) is not None}
     for name in ("stages", "cameras"):
         if name in settings:
             settings[name] = _names(file, name, settings[name])
@@ -183,6 +168,3 @@ def _beside(file: Path, name: str) -> str | None:
 
 def _is_number(value: Any) -> bool:
     return isinstance(value, int | float) and not isinstance(value, bool)
-
-
-__all__ = ["STAGES", "Plan", "parse_base", "read_plan", "read_unknown"]

@@ -251,7 +251,7 @@ def _labelled(shown: Shown) -> Any:
 
 
 def _spread(places: range) -> list[int]:
-    """Up to :data:`SHOWN` of some numbers, evenly spread, with the last."""
+    """Up to :data:`SHOWN` of the given numbers, evenly spaced and including the last."""
     count = min(SHOWN, len(places))
     return [places[(k + 1) * len(places) // count - 1] for k in range(count)]
 
@@ -262,6 +262,3 @@ def _psnr(squares: Sequence[float]) -> float:
         return math.nan
     mean = sum(squares) / len(squares)
     return -10 * math.log10(mean) if mean > 0 else math.inf
-
-
-__all__ = ["Result", "Shown", "predictions", "scene_text", "write_results"]

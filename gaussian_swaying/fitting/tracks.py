@@ -248,7 +248,7 @@ def _inside(pixel: Tensor, picture: RenderOutput, there: Tensor) -> Tensor:
 
 
 def _windows(places: Tensor, width: int, height: int) -> tuple[Tensor, Tensor]:
-    """Columns and rows of the pixels in the window around each place (T, 2), shape (T, W²); none beyond the picture."""
+    """Columns and rows of the pixels in the window around each place (T, 2), clamped to the picture; shape (T, W²)."""
     reach = torch.arange(WINDOW) - WINDOW // 2
     beside = torch.cartesian_prod(reach, reach)
     column, row = (places.long()[:, None] + beside).unbind(-1)
@@ -274,6 +274,3 @@ def opencv() -> Any:
             name="cv2",
         ) from error
     return cv2
-
-
-__all__ = ["Tracks", "drawn_beside", "follow", "match", "opencv", "track"]

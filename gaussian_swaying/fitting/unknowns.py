@@ -94,6 +94,3 @@ def check_unknowns(simulation: Simulation, unknowns: Sequence[Unknown]) -> None:
         if names.count(name) > 1:
             raise ValueError(f"`{name}` is in `unknowns` twice: remove one.")
     with_values(simulation.setup, {unknown.name: unknown.value(0.5) for unknown in unknowns})
-
-
-__all__ = ["Unknown", "check_unknowns", "default_scale"]

@@ -109,6 +109,3 @@ def _stiffness_class(points: MaterialPoints) -> int:
     """A number that is equal for materials whose fastest waves differ by less than a fifth or so."""
     squared = (points.youngs_modulus * points.volume / points.mass).amax()
     return round(2 * math.log2(float(squared)))
-
-
-__all__ = ["Values", "check_variants", "states_of"]

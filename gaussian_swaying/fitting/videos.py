@@ -266,6 +266,3 @@ def _next(film: Any, path: Path) -> Any:
         raise ValueError(
             f"The video {path} cannot be read ({str(error).splitlines()[0]}): convert it to mp4."
         ) from error
-
-
-__all__ = ["Footage", "frame_times", "read_videos"]

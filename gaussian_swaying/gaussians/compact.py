@@ -14,7 +14,7 @@ from gaussian_swaying._inputs import check_regular
 from gaussian_swaying._ply_table import read_element, read_header
 from gaussian_swaying.gaussians.cloud import GaussianCloud
 from gaussian_swaying.gaussians.harmonics import SH_DC
-from gaussian_swaying.gaussians.ply import check_places, check_sizes_and_rotations, read_binary_header, read_ply
+from gaussian_swaying.gaussians.ply import check_places, check_sizes_and_rotations, read_binary_header, read_ply, reject
 
 CHUNK = 256  # number of Gaussians with a common range of values in a compressed .ply
 _SPLAT = np.dtype([("means", "<f4", 3), ("sizes", "<f4", 3), ("rgba", "u1", 4), ("quats", "u1", 4)])
@@ -184,12 +184,9 @@ def _cloud(
     with np.errstate(over="ignore"):
         columns = {name: np.ascontiguousarray(value, dtype=np.float32) for name, value in columns.items()}
     for name, value in columns.items():
-        bad = ~np.isfinite(value).reshape(len(value), -1).all(-1)
-        if name != "scales" and bad.any():
-            raise ValueError(
-                f"{path}: {name} of {int(bad.sum())} of {len(bad)} Gaussians are NaN or infinite, first at index "
-                f"{int(bad.argmax())}; remove them or export the scene again."
-            )
+        if name != "scales":
+            bad = ~np.isfinite(value).reshape(len(value), -1).all(-1)
+            reject(path, bad, f"property `{name}` is NaN or infinite", "remove them or export the scene again")
     check_places(path, columns["means"])
     check_sizes_and_rotations(path, columns["scales"], columns["quats"])
     return GaussianCloud(**{name: torch.from_numpy(value) for name, value in columns.items()})

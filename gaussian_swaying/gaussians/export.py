@@ -5,10 +5,11 @@ from __future__ import annotations
 import os
 import re
 import warnings
-from collections.abc import Sequence
+from collections.abc import Iterable
+from dataclasses import replace
 from importlib import import_module
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import torch
@@ -20,11 +21,12 @@ from gaussian_swaying.gaussians.cloud import GaussianCloud
 from gaussian_swaying.gaussians.compact import read_gaussians
 from gaussian_swaying.gaussians.harmonics import sh_to_color
 from gaussian_swaying.gaussians.model import DeformedGaussians
-from gaussian_swaying.gaussians.ply import write_ply
+from gaussian_swaying.gaussians.ply import check_folder, write_ply
 from gaussian_swaying.geometry.patches import smallest_axis_normal
 from gaussian_swaying.geometry.rotations import quat_to_rotation
 
-SUFFIXES = {"ply": ".ply", "compressed_ply": ".compressed.ply", "splat": ".splat", "usd": ".usdc"}
+Format = Literal["ply", "compressed_ply", "splat", "usd"]
+SUFFIXES: dict[str, str] = {"ply": ".ply", "compressed_ply": ".compressed.ply", "splat": ".splat", "usd": ".usdc"}
 """Formats, and the endings of their file names."""
 LARGEST_LOGIT = 16.0  # its sigmoid is 1 - 1.1e-7, the largest opacity below 1 in float32
 LARGEST_LOG_SCALE = 20.0  # the compressed format has no larger numbers
@@ -49,13 +51,11 @@ def cleaned(cloud: GaussianCloud) -> GaussianCloud:
     good &= torch.isfinite(length) & (length > 0)
     good &= ~cloud.scales.isnan().any(-1) & ~cloud.opacities.isnan()
     kept = cloud if bool(good.all()) else cloud.select(good)
-    return GaussianCloud(
-        means=kept.means,
+    return replace(
+        kept,
         quats=torch.nn.functional.normalize(kept.quats, dim=-1),
         scales=kept.scales.clamp(-LARGEST_LOG_SCALE, LARGEST_LOG_SCALE),
         opacities=kept.opacities.clamp(-LARGEST_LOGIT, LARGEST_LOGIT),
-        sh=kept.sh,
-        normals=kept.normals,
     )
 
 
@@ -96,18 +96,15 @@ def export_cloud(
     format = format_of(path) if format is None else format
     check_choice("format", format, tuple(SUFFIXES))
     path = Path(path)
-    if not path.parent.is_dir():
-        raise FileNotFoundError(f"{path} cannot be written because {path.parent} is not a folder; create it first.")
-    cloud = cloud.to_cloud() if isinstance(cloud, DeformedGaussians) else cloud
+    check_folder(path)
+    kept = _kept(path, cloud.to_cloud() if isinstance(cloud, DeformedGaussians) else cloud)
     if format == "usd":
-        write_usd(path, [cloud], fps, metres_per_unit=metres_per_unit, rotation=rotation)
-        return
-    kept = _kept(path, cloud)
-    if format == "ply":
+        write_usd(path, [kept], fps, metres_per_unit=metres_per_unit, rotation=rotation)
+    elif format == "ply":
         write_ply(path, kept)
-        return
-    with atomic(path) as temporary:
-        temporary.write_bytes(_gsplat_bytes(path, kept, format))
+    else:
+        with atomic(path) as temporary:
+            temporary.write_bytes(_gsplat_bytes(path, kept, format))
 
 
 def format_of(path: str | os.PathLike[str]) -> str:
@@ -133,7 +130,7 @@ def convert(
     metres_per_unit: float = 1.0,
     rotation: Tensor | None = None,
 ) -> None:
-    """Write a splat, or the .ply sequence of a run, in the format that the target's name stands for.
+    """Write a splat, or the .ply sequence of a run, in the format given by the ending of the target's name.
 
     Args:
         source: A file that :func:`~gaussian_swaying.gaussians.compact.read_gaussians` reads; for USD also a folder of
@@ -149,21 +146,15 @@ def convert(
     """
     source, target = Path(source), Path(target)
     format = format_of(target)
-    if not target.parent.is_dir():
-        raise FileNotFoundError(f"{target} cannot be written because {target.parent} is not a folder; create it first.")
+    check_folder(target)
     if not source.is_dir():
-        export_cloud(
-            target, read_gaussians(source), format=format, fps=fps, metres_per_unit=metres_per_unit, rotation=rotation
-        )
-        return
+        place: dict[str, Any] = {"fps": fps, "metres_per_unit": metres_per_unit, "rotation": rotation}
+        return export_cloud(target, read_gaussians(source), format=format, **place)
     files = sorted(source.glob("*.ply"))
     if format != "usd" or not files:
         what = "contains no .ply" if not files else f"is a folder of {len(files)} frames, which only USD supports"
         raise ValueError(f"{source} {what}: give one .ply, or a folder of them and a target that ends in .usdc.")
-    film = UsdFilm(fps, metres_per_unit, rotation)
-    for frame, file in enumerate(files):
-        film.add(frame, usd_arrays(read_gaussians(file)))
-    film.save(target)
+    write_usd(target, map(read_gaussians, files), fps, metres_per_unit=metres_per_unit, rotation=rotation)
 
 
 def _kept(path: Path, cloud: GaussianCloud) -> GaussianCloud:
@@ -210,7 +201,7 @@ def _gsplat_bytes(path: Path, cloud: GaussianCloud, format: str) -> bytes:
 
 def write_usd(
     path: str | os.PathLike[str],
-    clouds: Sequence[GaussianCloud],
+    clouds: Iterable[GaussianCloud],
     fps: float = 25.0,
     start: int = 0,
     metres_per_unit: float = 1.0,
@@ -225,7 +216,7 @@ def write_usd(
 
     Args:
         path: File to write; an existing one is replaced.
-        clouds: One for each frame, all of the same size.
+        clouds: One for each frame, all of the same size; read one by one.
         fps: Frames per second.
         start: Number of the first frame.
         metres_per_unit: Length of a scene unit [m].
@@ -233,19 +224,15 @@ def write_usd(
 
     Raises:
         ImportError: If usd-core is not installed.
-        ValueError: If there is no frame or no finite Gaussian, or the frames differ in size.
+        ValueError: If there is no frame, or the frames differ in size.
     """
     check_positive("fps", fps)
     check_positive("metres_per_unit", metres_per_unit)
-    path = Path(path)
-    if not clouds:
+    film, frame = UsdFilm(fps, metres_per_unit, rotation), None
+    for frame, cloud in enumerate(clouds, start):
+        film.add(frame, usd_arrays(cloud))
+    if frame is None:
         raise ValueError(f"{path} was not written because there are no frames; give at least one cloud.")
-    if len({len(cloud) for cloud in clouds}) > 1:
-        raise ValueError(f"{path} was not written because its frames differ in their number of Gaussians.")
-    film = UsdFilm(fps, metres_per_unit, rotation)
-    for index, cloud in enumerate(clouds):
-        kept = _kept(path, cloud) if len(clouds) == 1 else cloud
-        film.add(start + index, usd_arrays(kept))
     film.save(path)
 
 
@@ -406,9 +393,9 @@ def read_usd_frame(path: str | os.PathLike[str], frame: int) -> dict[str, np.nda
     try:
         stage = usd.Stage.Open(str(path))
         prim = stage.GetPrimAtPath(_PRIM)
-        found = {name: prim.GetAttribute(_ATTRIBUTES.get(name, name)).Get(frame) for name in _ARRAYS}
+        attributes = {name: prim.GetAttribute(_ATTRIBUTES.get(name, name)).Get(frame) for name in _ARRAYS}
         normals = prim.GetAttribute("normals") or geom.PrimvarsAPI(prim).GetPrimvar("normals").GetAttr()
-        arrays = {name: np.array(value, dtype=np.float32) for name, value in found.items()}
+        arrays = {name: np.array(value, dtype=np.float32) for name, value in attributes.items()}
         arrays["normals"] = np.array(normals.Get(frame), dtype=np.float32)
     except Exception as error:  # errors of USD, and those for missing attributes
         raise ValueError(f"{path} cannot be read as a USD file of Gaussians: export it again.") from error

@@ -171,22 +171,10 @@ def open_air(air: Tensor) -> Tensor:
     Returns:
         Booleans, shape (nx, ny, nz): air without closed cavities.
     """
-    air = torch.nn.functional.pad(air, (1,) * 6, value=True)
-    reached = torch.zeros_like(air)
-    for axis in range(3):
-        reached.select(axis, 0).fill_(True)
-        reached.select(axis, -1).fill_(True)
-    before = -1
-    while before != (before := int(reached.sum())):
-        for axis in range(3):  # if one cell of a straight run of air is reached, all of it is
-            flat, mark = air.movedim(axis, -1), reached.movedim(axis, -1)
-            starts = flat.clone()
-            starts[..., 1:] &= ~flat[..., :-1]
-            run = starts.reshape(-1).cumsum(0).sub_(1).clamp_min_(0)
-            hit = torch.zeros(int(starts.sum()), dtype=torch.bool)
-            hit[run[(mark & flat).reshape(-1)]] = True
-            reached = (hit[run].reshape(flat.shape) & flat).movedim(-1, axis).contiguous()
-    return reached[1:-1, 1:-1, 1:-1]
+    from scipy.ndimage import label
+
+    number = torch.from_numpy(label(torch.nn.functional.pad(air, (1,) * 6, value=True).numpy())[0])
+    return (number == number[0, 0, 0])[1:-1, 1:-1, 1:-1]
 
 
 def depth_below(mask: Tensor, width: float) -> Tensor:

@@ -130,15 +130,8 @@ def joined(count: int, pairs: Tensor) -> Tensor:
     Returns:
         Numbers from 0 on, shape (count,).
     """
-    one, other = pairs
-    label = torch.arange(count)
-    while True:  # the smaller number spreads, by halving of paths
-        smaller = torch.minimum(label[one], label[other])
-        new = label.clone()
-        for end in (one, other, label[one], label[other]):
-            new.scatter_reduce_(0, end, smaller, "amin")
-        new = new[new]
-        if new.equal(label):
-            break
-        label = new
-    return label.unique(return_inverse=True)[1]
+    from scipy.sparse import coo_matrix
+    from scipy.sparse.csgraph import connected_components
+
+    graph = coo_matrix((torch.ones(pairs.shape[1]), pairs.numpy()), (count, count))
+    return torch.from_numpy(connected_components(graph, directed=False)[1]).long()

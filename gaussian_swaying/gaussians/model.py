@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor, nn
@@ -51,14 +51,8 @@ class DeformedGaussians:
         check_shape("means", self.means, None, 3, batches=False)
         rest = self.model.to_cloud()
         quats, scales = covariance_to_quat_scale(self.covariances)
-        return GaussianCloud(
-            means=self.means.detach(),
-            quats=quats,
-            scales=scales,
-            opacities=rest.opacities,
-            sh=rotate_sh(rest.sh, self.rotations),
-            normals=self.normals.detach(),
-        )
+        sh, normals = rotate_sh(rest.sh, self.rotations), self.normals.detach()
+        return replace(rest, means=self.means.detach(), quats=quats, scales=scales, sh=sh, normals=normals)
 
 
 class GaussianSurfaceModel(nn.Module):
@@ -155,8 +149,8 @@ class GaussianSurfaceModel(nn.Module):
         if mode == "paper":
             return patch_area(self.scales)
         normals, opacity = self.normals(), self.opacity()
-        found = coverage_area(self.means, normals, self.scales, opacity, neighbours)
-        return found * openness(self.means, normals, self.scales, found, opacity) if mode == "open" else found
+        area = coverage_area(self.means, normals, self.scales, opacity, neighbours)
+        return area * openness(self.means, normals, self.scales, area, opacity) if mode == "open" else area
 
     def opacity(self) -> Tensor:
         """Opacities from 0 to 1, shape (N,)."""

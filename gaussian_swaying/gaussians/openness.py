@@ -185,7 +185,7 @@ def _keys(place: Tensor, facing: Tensor, number: int) -> Tensor:
 def _split(
     key: Tensor, at: Tensor, passed: Tensor, sheet: Tensor, skin: Tensor
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Return optical depths around places in their columns: in front of the sheet, in it, behind it, and in the skin.
+    """Optical depths of columns: in front of the sheet of a patch, in the sheet, behind it, and in the skin around it.
 
     Args:
         key: Column and depth of all parts, ascending, shape (M,).

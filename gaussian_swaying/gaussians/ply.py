@@ -74,7 +74,7 @@ def read_ply(path: str | os.PathLike[str]) -> GaussianCloud:
                 table[:, index] = data[field]
         for index, field in enumerate(fields):
             bad = ~np.isfinite(table[:, index])
-            _reject(path, bad, f"property `{field}` is NaN or infinite", "remove them or train again")
+            reject(path, bad, f"property `{field}` is NaN or infinite", "remove them or train again")
         return table
 
     opacities = _read_opacities(path, data)
@@ -116,8 +116,7 @@ def write_ply(path: str | os.PathLike[str], cloud: GaussianCloud) -> None:
     path = Path(path)
     if len(cloud) == 0:
         raise ValueError(f"{path} was not written because the cloud holds zero Gaussians; select at least one.")
-    if not path.parent.is_dir():
-        raise FileNotFoundError(f"{path} cannot be written because {path.parent} is not a folder; create it first.")
+    check_folder(path)
     normals = smallest_axis_normal(cloud.quats, cloud.scales) if cloud.normals is None else cloud.normals
     count, rest_count = len(cloud), 3 * (cloud.sh.shape[1] - 1)
     parts = [cloud.means, normals, cloud.sh[:, 0], rearrange(cloud.sh[:, 1:], "n k c -> n (c k)")]
@@ -130,17 +129,23 @@ def write_ply(path: str | os.PathLike[str], cloud: GaussianCloud) -> None:
         PlyData([PlyElement.describe(rows, "vertex")], byte_order="<").write(str(temporary))
 
 
+def check_folder(path: Path) -> None:
+    """Raise FileNotFoundError if the folder of a file that is to be written does not exist."""
+    if not path.parent.is_dir():
+        raise FileNotFoundError(f"{path} cannot be written because {path.parent} is not a folder; create it first.")
+
+
 def check_places(path: Path, means: np.ndarray) -> None:
     """Raise ValueError if a finite centre (N, 3) is too far away to compute with."""
     far = (np.abs(means) > FARTHEST).any(axis=1)
-    _reject(path, far, f"property `x`, `y` or `z` is beyond ±{FARTHEST:g}", "remove them or train again")
+    reject(path, far, f"property `x`, `y` or `z` is beyond ±{FARTHEST:g}", "remove them or train again")
 
 
 def check_sizes_and_rotations(path: Path, scales: np.ndarray, quats: np.ndarray) -> None:
     """Raise ValueError if the logarithm of a size (N, 3) is out of range, or a quaternion (N, 4) is zero."""
     with np.errstate(over="ignore", under="ignore"):
         size = np.exp(scales)
-    _reject(
+    reject(
         path,
         ((size == 0) | ~np.isfinite(size)).any(axis=1),
         "property `scale_0`, `scale_1` or `scale_2` (a logarithm) gives a size of zero or infinity",
@@ -148,7 +153,7 @@ def check_sizes_and_rotations(path: Path, scales: np.ndarray, quats: np.ndarray)
     )
     with np.errstate(under="ignore"):
         zero_quats = np.square(quats).sum(axis=1) == 0
-    _reject(path, zero_quats, "the quaternion `rot_0` to `rot_3` is zero", "remove them or store 1 0 0 0")
+    reject(path, zero_quats, "the quaternion `rot_0` to `rot_3` is zero", "remove them or store 1 0 0 0")
 
 
 def read_binary_header(path: Path) -> PlyHeader:
@@ -178,13 +183,13 @@ def _read_opacities(path: Path, data: np.ndarray) -> np.ndarray:
     """Opacity logits (N,); infinite ones, for opacities of exactly 0 or 1, are made finite."""
     with np.errstate(over="ignore"):
         logits = np.array(data["opacity"], dtype=np.float32)
-    _reject(path, np.isnan(logits), "property `opacity` is NaN", "remove them or train again")
+    reject(path, np.isnan(logits), "property `opacity` is NaN", "remove them or train again")
     infinite = np.isinf(logits)
     logits[infinite] = np.copysign(np.float32(OPAQUE_LOGIT), logits[infinite])
     return logits
 
 
-def _reject(path: Path, bad: np.ndarray, what: str, remedy: str) -> None:
+def reject(path: Path, bad: np.ndarray, what: str, remedy: str) -> None:
     """Raise ValueError if any Gaussian of the mask (N,) is bad."""
     if bad.any():
         raise ValueError(

@@ -158,7 +158,7 @@ def _reach(opacity: Tensor) -> Tensor:
 
 
 def _lattice(out: Tensor) -> tuple[Tensor, Tensor]:
-    """For each row of (N, 3) all integers from minus to plus its entries: the row, (L,), and the integers, (L, 3)."""
+    """All integer triples between minus and plus a row, for each row of (N, 3): its row (L,), and the triple (L, 3)."""
     sizes = 2 * out + 1
     length = sizes.prod(-1)
     row = torch.repeat_interleave(torch.arange(len(out)), length)

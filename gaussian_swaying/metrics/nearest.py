@@ -1,4 +1,4 @@
-"""Distances between point sets, in chunks, so that memory does not grow with the product of their sizes."""
+"""Distances between point sets, by a tree or in chunks: memory does not grow with the product of their sizes."""
 
 from __future__ import annotations
 
@@ -9,22 +9,21 @@ from gaussian_swaying._checks import check_positive, check_shape
 
 _PAIRS = 2**20  # on a CPU a chunk of distances should fit in the cache
 _PAIRS_CUDA = 2**24
-_SLABS_FROM = 2**22  # number of pairs from which slabs are faster, on a CPU
-_GROUP = 128  # points that share a slab
 
 
 @torch.no_grad()
 def nearest_distances(source: Tensor, target: Tensor, pairs: int | None = None) -> tuple[Tensor, Tensor]:
     """Distance of every point to the nearest one of the other set, both ways.
 
-    Exact on any device: a GPU looks at all pairs, a CPU only at those that can be nearest. Distances are computed from
+    Exact on any device: a GPU looks at all pairs, a CPU searches a tree. Distances are computed from
     differences of coordinates, not from expanded squares, so they stay precise far from the origin. There is no
     gradient.
 
     Args:
         source: Points [m], shape (P, D).
         target: Points [m], shape (Q, D).
-        pairs: Largest number of distances in memory at a time, but at least Q; the default suits the device.
+        pairs: Largest number of distances in memory at a time, where all pairs are looked at, but at least Q; the
+            default suits the device.
 
     Returns:
         Distances from ``source`` to ``target`` [m], shape (P,), and from ``target`` to ``source`` [m], shape (Q,).
@@ -40,9 +39,8 @@ def nearest_distances(source: Tensor, target: Tensor, pairs: int | None = None) 
     for name, points in (("source", source), ("target", target)):
         if len(points) == 0:
             raise ValueError(f"Expected `{name}` to hold at least one point, but it is empty.")
-    many = not source.is_cuda and len(source) * len(target) > _SLABS_FROM
-    if many and bool(torch.isfinite(source).all()) and bool(torch.isfinite(target).all()):
-        return _by_slabs(source, target, pairs), _by_slabs(target, source, pairs)
+    if not source.is_cuda and bool(torch.isfinite(source).all()) and bool(torch.isfinite(target).all()):
+        return _by_tree(source, target), _by_tree(target, source)
     return _by_chunks(source, target, pairs)
 
 
@@ -60,7 +58,7 @@ def _by_chunks(source: Tensor, target: Tensor, pairs: int) -> tuple[Tensor, Tens
 
 
 def _distances(source: Tensor, target: Tensor) -> Tensor:
-    """Distances of all pairs, shape (P, Q)."""
+    """Distances of all pairs, shape (..., P, Q)."""
     if not source.is_cuda:
         return torch.cdist(source, target, compute_mode="donot_use_mm_for_euclid_dist")
     squares = source.new_zeros(len(source), len(target))  # cdist takes a block of threads for each pair there
@@ -70,26 +68,10 @@ def _distances(source: Tensor, target: Tensor) -> Tensor:
     return squares.sqrt_()
 
 
-def _by_slabs(source: Tensor, target: Tensor, pairs: int) -> Tensor:
-    """Distances to the target, shape (P,); a group of sources looks only at targets that are near along one axis.
+def _by_tree(source: Tensor, target: Tensor) -> Tensor:
+    """Distances to the target, shape (P,), by scipy's KD-tree."""
+    from scipy.spatial import cKDTree
 
-    A few targets around the group give a bound on the nearest distances, and so the slab that contains all nearest
-    targets.
-    """
-    axis = int((target.amax(0) - target.amin(0)).argmax())
-    target = target[target[:, axis].argsort()]
-    order = source[:, axis].argsort()
-    heights = target[:, axis].contiguous()
-    nearest = source.new_empty(len(source))
-    for group in order.split(_GROUP):
-        some = source[group]
-        ends = some[[0, -1], axis]
-        begin, end = torch.searchsorted(heights, ends).tolist()
-        begin, end = max(0, begin - _GROUP), end + _GROUP
-        found = _by_chunks(some, target[begin:end], pairs)[0]
-        reach = 1.0001 * float(found.max())  # more than rounding
-        first, last = torch.searchsorted(heights, ends + torch.tensor([-reach, reach]).to(ends)).tolist()
-        if first < begin or last > end:
-            found = _by_chunks(some, target[min(first, begin) : max(last, end)], pairs)[0]
-        nearest[group] = found
-    return nearest
+    two = range(1, min(2, len(target)) + 1)  # the tree computes in double precision, so two may be equally near here
+    index = torch.from_numpy(cKDTree(target.numpy()).query(source.numpy(), two)[1])
+    return _distances(source[:, None], target[index]).amin((1, 2))

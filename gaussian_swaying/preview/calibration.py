@@ -257,18 +257,18 @@ def measure_motion(
     return motion
 
 
-def calibrated_suggestion(found: Suggestion, draft: Simulation, sway: float) -> Suggestion:
+def calibrated_suggestion(suggestion: Suggestion, draft: Simulation, sway: float) -> Suggestion:
     """The suggestion with stiffness, thickness and wind from short runs of its draft; the draft is changed too."""
-    if found.pin is None or not any(found.flow):
-        return found
-    start, wanted = Setting(found.youngs_modulus, found.thickness), None if found.sheet else sway
-    best = calibrate(lambda tried: measure_motion(draft, tried, start, wanted), start, found.longest_side, wanted)
+    if suggestion.pin is None or not any(suggestion.flow):
+        return suggestion
+    start, wanted = Setting(suggestion.youngs_modulus, suggestion.thickness), None if suggestion.sheet else sway
+    best = calibrate(lambda tried: measure_motion(draft, tried, start, wanted), start, suggestion.longest_side, wanted)
     apply_setting(draft, best.setting, start)
     return replace(
-        found,
+        suggestion,
         youngs_modulus=best.setting.E,
         thickness=best.setting.thickness,
-        flow=tuple(round(c * best.setting.wind, 2) for c in found.flow),
+        flow=tuple(round(c * best.setting.wind, 2) for c in suggestion.flow),
         stiffness_reason=best.reason,
         growth=best.motion.growth,
     )

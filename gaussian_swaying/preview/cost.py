@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import os
 import statistics
 import time
 from collections.abc import Callable
@@ -12,7 +11,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from gaussian_swaying._provenance import describe_device
+from gaussian_swaying._provenance import cores, describe_device
 from gaussian_swaying.mpm.state import State
 from gaussian_swaying.mpm.timestep import wave_speed
 from gaussian_swaying.recording.writer import WORKERS
@@ -158,13 +157,8 @@ def _picture_seconds(simulation: Simulation, state: State, frame: float) -> floa
     image = painter.render(state, 0).color
     draw = count * min(_seconds(simulation, lambda: painter.render(state, 0)) for _ in range(2))
     write = count * min(_seconds(simulation, lambda: _encode(image)) for _ in range(2))
-    cores = _cores()
-    return draw + write if cores <= 2 else max(draw, write / min(WORKERS, cores - 1) - frame)
-
-
-def _cores() -> int:
-    """Cores that this process may use."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    free = cores()
+    return draw + write if free <= 2 else max(draw, write / min(WORKERS, free - 1) - frame)
 
 
 def scaled_seconds(cost: Cost, other: Cost, dx: float) -> float:

@@ -43,31 +43,31 @@ def splat_lines(name: str, cloud: GaussianCloud, data: dict[str, Any]) -> list[s
     ]
 
 
-def suggestion_lines(found: Suggestion, further: int) -> list[str]:
+def suggestion_lines(guess: Suggestion, further: int) -> list[str]:
     """The guesses, and the number of points that fill holes."""
     region = "all of space"
-    if found.region.box is not None:
-        region = json.dumps(dict(zip(("min", "max"), found.region.box, strict=True)))
-    count = int(found.region.simulated.sum())
+    if guess.region.box is not None:
+        region = json.dumps(dict(zip(("min", "max"), guess.region.box, strict=True)))
+    count = int(guess.region.simulated.sum())
     lines = [
-        f"up              {_numbers(found.up.direction)}, {_why(found.up.confidence, '; '.join(found.up.reasons))}",
-        f"region          {region}: {found.region.reason}",
-        f"opacity         {found.region.opacity_threshold:g} and above is simulated: {count:,} particles",
-        f"held            at the {found.hold.end}, {_why(found.hold.confidence, found.hold.reason)}"
-        if found.pin is not None
+        f"up              {_numbers(guess.up.direction)}, {_why(guess.up.confidence, '; '.join(guess.up.reasons))}",
+        f"region          {region}: {guess.region.reason}",
+        f"opacity         {guess.region.opacity_threshold:g} and above is simulated: {count:,} particles",
+        f"held            at the {guess.hold.end}, {_why(guess.hold.confidence, guess.hold.reason)}"
+        if guess.pin is not None
         else "held            nowhere: it will fall",
     ]
-    if found.pin is not None:
-        lines.append(f"  pin           {_short(region_dict(found.pin))}")
+    if guess.pin is not None:
+        lines.append(f"  pin           {_short(region_dict(guess.pin))}")
     lines += [
-        f"size            {_numbers(found.size)} m along the axes with z up; 1 scene unit = "
-        f"{found.metres_per_unit:.4g} m, assuming a longest side of {found.longest_side:g} m",
-        f"grid            quality {found.quality}: dx = {found.dx:g} m, {found.longest_side / found.dx:.0f} cells "
-        f"along the longest side, {found.dx / max(found.spacing, 1e-30):.1f} times the particle spacing of "
-        f"{found.spacing:.3g} m",
+        f"size            {_numbers(guess.size)} m along the axes with z up; 1 scene unit = "
+        f"{guess.metres_per_unit:.4g} m, assuming a longest side of {guess.longest_side:g} m",
+        f"grid            quality {guess.quality}: dx = {guess.dx:g} m, {guess.longest_side / guess.dx:.0f} cells "
+        f"along the longest side, {guess.dx / max(guess.spacing, 1e-30):.1f} times the particle spacing of "
+        f"{guess.spacing:.3g} m",
         "further points  " + (f"{further:,} where Gaussians are sparse for this grid" if further else "none needed"),
-        f"material        {_material(found)}",
-        f"wind            {wind_words(found.flow, found.up.direction)}",
+        f"material        {_material(guess)}",
+        f"wind            {wind_words(guess.flow, guess.up.direction)}",
     ]
     return ["", "guesses (each can be set instead, see --help)", *(f"  {line}" for line in lines)]
 
@@ -114,19 +114,19 @@ def cost_lines(cost: Cost) -> list[str]:
 
 
 def quality_lines(
-    found: Suggestion, cost: Cost, minutes: float | None, grids: dict[str, float], others: dict[str, float]
+    guess: Suggestion, cost: Cost, minutes: float | None, grids: dict[str, float], others: dict[str, float]
 ) -> list[str]:
     """Return lines of text: the reason for the grid of the starter, and the cost of the other qualities.
 
     Args:
-        found: The guesses, with the chosen grid.
+        guess: The guesses, with the chosen grid.
         cost: The cost of the starter.
         minutes: The wanted time [minutes], if there is one.
         grids: Grid spacings of the qualities [m].
         others: Times of a run with the other ones [s], from scaling.
     """
-    cells = found.longest_side / found.dx
-    chosen = f"  quality         {found.quality}: {cells:.0f} cells along the longest side"
+    cells = guess.longest_side / guess.dx
+    chosen = f"  quality         {guess.quality}: {cells:.0f} cells along the longest side"
     lines = [chosen]
     if minutes is not None:
         wish = duration(60 * minutes)
@@ -137,12 +137,12 @@ def quality_lines(
             )
         else:
             why = f"the finest grid that takes at most {wish}"
-            if found.dx <= finest_spacing(found):
-                limited = found.dx > 1.02 * found.longest_side / MOST_CELLS
+            if guess.dx <= finest_spacing(guess):
+                limited = guess.dx > 1.02 * guess.longest_side / MOST_CELLS
                 why = "the finest for Gaussians so far apart" if limited else "the finest that a preview chooses"
             lines[0] = f"{chosen}, {why}"
     for name, seconds in others.items():
-        if grids[name] == found.dx:
+        if grids[name] == guess.dx:
             lines.append(f"    {name:<13} the same grid")
         else:
             lines.append(f"    {name:<13} about {duration(seconds)} with dx = {grids[name]:g} m (--quality {name})")
@@ -162,9 +162,9 @@ def _numbers(values: Sequence[float]) -> str:
     return "[" + ", ".join(f"{value + 0.0:.3g}" for value in values) + "]"
 
 
-def _material(found: Suggestion) -> str:
-    what = "cloth" if found.sheet else "rubber"
-    return f"{what}, E = {found.youngs_modulus:.1e} Pa, {found.thickness:.2g} m thick: {found.stiffness_reason}"
+def _material(guess: Suggestion) -> str:
+    what = "cloth" if guess.sheet else "rubber"
+    return f"{what}, E = {guess.youngs_modulus:.1e} Pa, {guess.thickness:.2g} m thick: {guess.stiffness_reason}"
 
 
 def _why(confidence: str, reason: str) -> str:
@@ -196,11 +196,11 @@ def preview_command(options: argparse.Namespace, defaults: argparse.Namespace, *
     return shlex.join(words)
 
 
-def doubts(found: Suggestion, options: argparse.Namespace, defaults: argparse.Namespace) -> list[str]:
+def doubts(guess: Suggestion, options: argparse.Namespace, defaults: argparse.Namespace) -> list[str]:
     """Warnings about weak guesses, each with the command for the guess and the one for the next best.
 
     Args:
-        found: The guesses.
+        guess: The guesses.
         options: Options of the preview.
         defaults: Their defaults.
 
@@ -208,15 +208,15 @@ def doubts(found: Suggestion, options: argparse.Namespace, defaults: argparse.Na
         Lines of text; none if all guesses are good.
     """
     lines: list[str] = []
-    if found.up.confidence == "low":
+    if guess.up.confidence == "low":
         lines.append("warning: the up axis is a weak guess; check the picture, and set it:")
-        for name, words in zip(found.up.options, ("as guessed", "the next best"), strict=False):
+        for name, words in zip(guess.up.options, ("as guessed", "the next best"), strict=False):
             lines.append(f"  {preview_command(options, defaults, up=name.split())}   # {words}")
-    if found.hold.confidence == "low":
+    if guess.hold.confidence == "low":
         lines.append(
-            f"warning: that it is held at the {found.hold.end} is a weak guess; check the picture, and set it:"
+            f"warning: that it is held at the {guess.hold.end} is a weak guess; check the picture, and set it:"
         )
-        for name, words in zip(found.hold.options, ("as guessed", "the next best"), strict=False):
+        for name, words in zip(guess.hold.options, ("as guessed", "the next best"), strict=False):
             lines.append(f"  {preview_command(options, defaults, hold=name)}   # {words}")
     return lines
 
@@ -224,37 +224,37 @@ def doubts(found: Suggestion, options: argparse.Namespace, defaults: argparse.Na
 # ---- as plain numbers, for preview.json
 
 
-def suggestion_dict(found: Suggestion) -> dict[str, Any]:
+def suggestion_dict(guess: Suggestion) -> dict[str, Any]:
     """A suggestion without its masks."""
-    region = found.region.region()
+    region = guess.region.region()
     return {
         "up": {
-            "direction": list(found.up.direction),
-            "confidence": found.up.confidence,
-            "scores": found.up.scores,
-            "reasons": found.up.reasons,
-            "floor_gaussians": int(found.up.ground.sum()),
+            "direction": list(guess.up.direction),
+            "confidence": guess.up.confidence,
+            "scores": guess.up.scores,
+            "reasons": guess.up.reasons,
+            "floor_gaussians": int(guess.up.ground.sum()),
         },
         "region": {
             "region": None if region is None else region_dict(region),
-            "simulated": int(found.region.simulated.sum()),
-            "opacity_threshold": found.region.opacity_threshold,
-            "specks": found.region.specks,
-            "reason": found.region.reason,
+            "simulated": int(guess.region.simulated.sum()),
+            "opacity_threshold": guess.region.opacity_threshold,
+            "specks": guess.region.specks,
+            "reason": guess.region.reason,
         },
-        "hold": asdict(found.hold) | {"region": None if found.pin is None else region_dict(found.pin)},
-        "longest_side_m": found.longest_side,
-        "metres_per_unit": found.metres_per_unit,
-        "size_m": list(found.size),
-        "spacing_m": found.spacing,
-        "dx_m": found.dx,
-        "quality": found.quality,
-        "sheet": found.sheet,
-        "azimuth": found.azimuth,
-        "flow": list(found.flow),
-        "youngs_modulus_Pa": found.youngs_modulus,
-        "thickness_m": found.thickness,
-        "stiffness_reason": found.stiffness_reason,
+        "hold": asdict(guess.hold) | {"region": None if guess.pin is None else region_dict(guess.pin)},
+        "longest_side_m": guess.longest_side,
+        "metres_per_unit": guess.metres_per_unit,
+        "size_m": list(guess.size),
+        "spacing_m": guess.spacing,
+        "dx_m": guess.dx,
+        "quality": guess.quality,
+        "sheet": guess.sheet,
+        "azimuth": guess.azimuth,
+        "flow": list(guess.flow),
+        "youngs_modulus_Pa": guess.youngs_modulus,
+        "thickness_m": guess.thickness,
+        "stiffness_reason": guess.stiffness_reason,
     }
 
 

@@ -40,7 +40,7 @@ def splat_name(path: str | Path) -> str:
     return next((name for name in folders if name and not name.startswith(passed)), file.stem)
 
 
-def write(found: Preview, folder: Path) -> list[Path]:
+def write(preview: Preview, folder: Path) -> list[Path]:
     """Write preview.json, preview.png and, if there are suggestions, draft.yaml and starter.yaml.
 
     An existing configuration that differs is kept as ``starter.1.yaml``, ``starter.2.yaml``, ..., since it may have
@@ -53,9 +53,9 @@ def write(found: Preview, folder: Path) -> list[Path]:
 
     folder.mkdir(parents=True, exist_ok=True)
     files = [folder / "preview.json", folder / "preview.png"]
-    files[0].write_text(json.dumps(found.data, indent=1) + "\n", encoding="utf-8")
-    iio.imwrite(files[1], found.picture)
-    for name, text in found.configurations.items():
+    files[0].write_text(json.dumps(preview.data, indent=1) + "\n", encoding="utf-8")
+    iio.imwrite(files[1], preview.picture)
+    for name, text in preview.configurations.items():
         path = folder / f"{name}.yaml"
         if path.exists() and path.read_text(encoding="utf-8") != text:
             number = 1

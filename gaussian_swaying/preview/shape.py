@@ -9,6 +9,7 @@ from torch import Tensor
 
 from gaussian_swaying._checks import check_positive, check_shape
 from gaussian_swaying.gaussians.grouping import joined
+from gaussian_swaying.geometry.groups import equal_rows
 
 SHEET = 0.1  # smallest over middle standard deviation of the centres of a sheet
 FEWEST = 16  # smallest number of Gaussians in an object
@@ -102,14 +103,10 @@ def connected_parts(points: Tensor, cell: float) -> Tensor:
     """
     check_shape("points", points, None, 3)
     check_positive("cell", cell)
-    low = points.amin(0).double()
-    index = ((points.double() - low) / cell).floor().long().clamp(max=2**20 - 4) + 1
-    key, of_point = ((index[:, 0] << 42) | (index[:, 1] << 21) | index[:, 2]).unique(return_inverse=True)
-    pairs = []
-    for x, y, z in torch.cartesian_prod(*(torch.arange(-1, 2),) * 3).tolist():
-        wanted = key + (x << 42) + (y << 21) + z
-        if (x, y, z) > (0, 0, 0):  # the other half of the neighbours gives the same pairs
-            at = torch.searchsorted(key, wanted).clamp(max=len(key) - 1)
-            found = (key[at] == wanted).nonzero()[:, 0]
-            pairs.append(torch.stack([found, at[found]]))
-    return joined(len(key), torch.cat(pairs, 1))[of_point]
+    from scipy.spatial import cKDTree
+
+    index = ((points.double() - points.amin(0).double()) / cell).floor()
+    of_point = equal_rows(index)
+    cells = index.new_empty(int(of_point.max()) + 1, 3).index_copy(0, of_point, index)
+    touching = cKDTree(cells.numpy()).query_pairs(1.5, p=math.inf, output_type="ndarray")
+    return joined(len(cells), torch.from_numpy(touching.T))[of_point]

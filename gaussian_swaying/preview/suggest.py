@@ -245,7 +245,7 @@ def suggest(
     outside = upward.ground if shown is None else upward.ground | ~shown.mask
     whole = whole_box(means, opacity, chosen.simulated, outside, dx / frame.metres_per_unit)
     offset, radius = orbit_frame(whole, (points.amin(0).tolist(), points.amax(0).tolist()))
-    found = Suggestion(
+    suggestion = Suggestion(
         up=upward,
         region=chosen,
         hold=held,
@@ -266,18 +266,18 @@ def suggest(
         camera_offset=offset,
         camera_radius=radius,
     )
-    return at_quality(found, quality)
+    return at_quality(suggestion, quality)
 
 
-def at_quality(found: Suggestion, quality: str) -> Suggestion:
+def at_quality(suggestion: Suggestion, quality: str) -> Suggestion:
     """The same suggestion with the grid of another quality, one of ``QUALITIES``."""
-    spacing = suggest_spacing(found.longest_side, found.spacing, QUALITIES[quality])
-    return replace(found, dx=spacing, quality=quality)
+    spacing = suggest_spacing(suggestion.longest_side, suggestion.spacing, QUALITIES[quality])
+    return replace(suggestion, dx=spacing, quality=quality)
 
 
-def finest_spacing(found: Suggestion) -> float:
+def finest_spacing(suggestion: Suggestion) -> float:
     """The finest grid spacing [m] that a time may choose: ``MOST_CELLS``, and at least twice the particle spacing."""
-    return suggest_spacing(found.longest_side, found.spacing, MOST_CELLS)
+    return suggest_spacing(suggestion.longest_side, suggestion.spacing, MOST_CELLS)
 
 
 def _across_picture(azimuth: float, speed: float) -> tuple[float, ...]:
@@ -417,7 +417,7 @@ def _padded(points: Tensor, margin: float) -> tuple[list[float], list[float]]:
 
 
 def _without(low: list[float], high: list[float], points: Tensor, ground: Tensor) -> tuple[list[float], list[float]]:
-    """The box, with the face at the floor moved back to the object if the box extends into the floor."""
+    """The box, with a face that extends into the floor moved back to between floor and object."""
     for axis in range(3):
         first, last = float(points[:, axis].amin()), float(points[:, axis].amax())
         floor_low, floor_high = float(ground[:, axis].amin()), float(ground[:, axis].amax())

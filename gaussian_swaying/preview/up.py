@@ -111,7 +111,7 @@ def floor_mask(points: Tensor, normals: Tensor, weight: Tensor, up: Sequence[flo
 
 
 def _floor_score(points: Tensor, floor: Tensor, up: Sequence[float]) -> float:
-    """3 for a floor with something at least 0.3 times as tall as the floor is wide; less for flat things."""
+    """Score of a floor: 3 if what stands on it is at least 0.3 times as tall as the floor is wide, less if flatter."""
     axis = torch.tensor(up, dtype=torch.float64)
     rest = points[~floor].double() @ axis
     width = min(quantile(c, 0.98) - quantile(c, 0.02) for c in (points[floor].double() @ a for a in plane_axes(axis)))

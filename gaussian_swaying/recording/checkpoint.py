@@ -15,14 +15,9 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from gaussian_swaying.runs.seal import load_sealed, save_sealed
+from gaussian_swaying.runs.seal import load_sealed
 
 _FIELDS = {"frame": int, "state": dict, "log": list, "config": str, "wall_s": dict}
-
-
-def write_checkpoint(path: Path, checkpoint: dict[str, Any]) -> None:
-    """Write a checkpoint with its checksum, whole or not at all."""
-    save_sealed(path, checkpoint)
 
 
 def log_lines(log: Sequence[Mapping[str, float]], known: list[str]) -> list[str]:
@@ -114,8 +109,8 @@ def check_state(
             like = start.position[..., 0]
         _require(isinstance(value, Tensor) and isinstance(like, Tensor), f"its `{name}` has another type")
         shape = (*like.shape[:-2], nodes, 3) if name.startswith("node_") else tuple(like.shape)
-        found = (tuple(value.shape), value.dtype)
-        _require(found == (shape, like.dtype), f"its `{name}` is {_kind(*found)} and not {_kind(shape, like.dtype)}")
+        actual = (tuple(value.shape), value.dtype)
+        _require(actual == (shape, like.dtype), f"its `{name}` is {_kind(*actual)} and not {_kind(shape, like.dtype)}")
         _require(bool(torch.isfinite(value).all()), f"its `{name}` is NaN or infinite")
     _require(_is_number(state["substep"]) and state["substep"] >= 0, "its `substep` is not a duration")
     _require(
@@ -182,5 +177,5 @@ def first_change(old: str, new: str) -> str:
 
 def _flat(value: Any, name: str = "") -> dict[str, Any]:
     items = value.items() if isinstance(value, dict) else enumerate(value) if isinstance(value, list) else ()
-    found = {k: v for key, item in items for k, v in _flat(item, f"{name}.{key}" if name else str(key)).items()}
-    return found or {name: value}
+    flat = {k: v for key, item in items for k, v in _flat(item, f"{name}.{key}" if name else str(key)).items()}
+    return flat or {name: value}

@@ -35,7 +35,7 @@ def frame_folder(render: str = "color", camera: str = "") -> str:
 
 
 def raw_folder(place: str) -> str:
-    """Folder of the numbers that are shown as colours in the folder ``place``."""
+    """Folder of the raw values that the folder ``place`` shows as colours."""
     return f"{place}_raw"
 
 

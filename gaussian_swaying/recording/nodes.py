@@ -67,16 +67,16 @@ def load_nodes(path: str | os.PathLike[str]) -> Tensor:
             raise ValueError(f"{path} lacks frames: run the simulation again, without --resume.")
         try:
             frames = [_joined(arrays[f"displacement_{k:05d}"], arrays[f"far_{k:05d}"]) for k in range(count)]
-            found = torch.from_numpy(np.stack(frames))
+            displacement = torch.from_numpy(np.stack(frames))
         except (IndexError, ValueError) as error:
             raise ValueError(f"{path} is damaged ({error}): run the simulation again, without --resume.") from error
-    bad = (~torch.isfinite(found)).flatten(1).any(1).nonzero()
+    bad = (~torch.isfinite(displacement)).flatten(1).any(1).nonzero()
     if len(bad):
         raise ValueError(
             f"{path} is damaged (frame {int(bad[0])} has a displacement that is NaN or infinite): run the simulation "
             "again, without --resume."
         )
-    return found
+    return displacement
 
 
 def _joined(near: np.ndarray, far: np.ndarray) -> np.ndarray:

@@ -10,20 +10,21 @@ import os
 import sys
 from collections.abc import Callable, Sequence
 from contextlib import suppress
+from dataclasses import KW_ONLY, dataclass
 from importlib.util import find_spec
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from gaussian_swaying._checks import check_choice, check_positive
+from gaussian_swaying._checks import check_choice, check_literals, check_positive
 from gaussian_swaying._files import atomic, remove_temporaries, write_json, write_table, write_text
 from gaussian_swaying.gaussians.cloud import GaussianCloud
-from gaussian_swaying.gaussians.export import SUFFIXES, export_cloud
+from gaussian_swaying.gaussians.export import SUFFIXES, Format, export_cloud
 from gaussian_swaying.geometry.frame import SimFrame
-from gaussian_swaying.recording.checkpoint import read_checkpoint, write_checkpoint
+from gaussian_swaying.recording.checkpoint import read_checkpoint
 from gaussian_swaying.recording.layout import FILES, OURS, frame_folder, raw_folder, video_file
 from gaussian_swaying.recording.nodes import NODES, split_far
 from gaussian_swaying.recording.resume import (
@@ -38,8 +39,7 @@ from gaussian_swaying.recording.writer import FrameWriter, HostCopy, pack_usd, w
 from gaussian_swaying.rendering.passes import PASSES
 from gaussian_swaying.runs.folder import MARKER, check_names, claim_folder, hold_folder, mark
 from gaussian_swaying.runs.lock import FolderLock
-
-NORMAL_AXES = ("camera", "world")
+from gaussian_swaying.runs.seal import save_sealed
 
 
 class _Film:
@@ -62,6 +62,7 @@ def _write_png(path: Path, pixels: np.ndarray) -> None:
         iio.imwrite(temporary, pixels, compress_level=3)
 
 
+@dataclass(eq=False)
 class Recorder:
     """Writes frames, trajectory, checkpoint, summary and video of a run to one folder.
 
@@ -105,26 +106,26 @@ class Recorder:
             have nothing to write.
     """
 
-    def __init__(
-        self,
-        images: bool = True,
-        video: bool = True,
-        *,
-        ply_every: int = 0,
-        trajectory: bool = True,
-        checkpoint_every: int = 1,
-        fps: float | None = None,
-        renders: Sequence[str] = ("color",),
-        depth_step: float = 0.001,
-        normal_axes: str = "camera",
-        force_scale: float | None = None,
-        export_format: str = "ply",
-        nodes: bool = True,
-    ) -> None:
-        for name, value in (("ply_every", ply_every), ("checkpoint_every", checkpoint_every)):
-            check_positive(f"recorder.{name}", value, allow_zero=True)
-        if fps is not None:
-            check_positive("recorder.fps", fps)
+    images: bool = True
+    video: bool = True
+    _: KW_ONLY
+    ply_every: int = 0
+    trajectory: bool = True
+    checkpoint_every: int = 1
+    fps: float | None = None
+    renders: Sequence[str] = ("color",)
+    depth_step: float = 0.001
+    normal_axes: Literal["camera", "world"] = "camera"
+    force_scale: float | None = None
+    export_format: Format = "ply"
+    nodes: bool = True
+
+    def __post_init__(self) -> None:
+        check_literals(type(self).__init__, vars(self), "recorder.")
+        for name in ("ply_every", "checkpoint_every", "fps", "depth_step", "force_scale"):
+            if (value := getattr(self, name)) is not None:
+                check_positive(f"recorder.{name}", value, allow_zero=name.endswith("every"))
+        renders = self.renders
         if isinstance(renders, str) or not renders or len(set(renders)) < len(renders):
             raise ValueError(
                 f"Expected `recorder.renders` to be a list of different ones of {', '.join(PASSES)}, but got "
@@ -132,23 +133,14 @@ class Recorder:
             )
         for render in renders:
             check_choice("recorder.renders", render, PASSES)
-        check_positive("recorder.depth_step", depth_step)
-        check_choice("recorder.normal_axes", normal_axes, NORMAL_AXES)
-        if force_scale is not None:
-            check_positive("recorder.force_scale", force_scale)
-        check_choice("recorder.export_format", export_format, tuple(SUFFIXES))
-        if export_format == "usd" and ply_every and find_spec("pxr") is None:
+        if self.export_format == "usd" and self.ply_every and find_spec("pxr") is None:
             raise ValueError(
                 "The USD file needs usd-core: install gaussian-swaying[usd], or set another `recorder.export_format`."
             )
-        if video and not images:
+        if self.video and not self.images:
             raise ValueError("The video is made from the images: set `recorder.images` to true or `video` to false.")
-        self.images, self.video, self.trajectory, self.nodes = images, video, trajectory, nodes
-        self.ply_every, self.checkpoint_every, self.fps = int(ply_every), int(checkpoint_every), fps
         self._folder: Path | None = None
         self._writer = FrameWriter()
-        self.renders, self.depth_step, self.normal_axes = tuple(renders), float(depth_step), normal_axes
-        self.force_scale, self.export_format = force_scale, export_format
         self._films: dict[str, _Film] = {}  # by the folder of their frames
         self._lock: FolderLock | None = None
         self.checkpoint_frame: int | None = None
@@ -399,7 +391,7 @@ class Recorder:
         path, copy = self.folder / "checkpoint.pt", HostCopy(checkpoint)
 
         def write() -> None:
-            write_checkpoint(path, copy.get())
+            save_sealed(path, copy.get())
             self.checkpoint_frame = checkpoint["frame"]
 
         self._submit(path, write, after_all=True)

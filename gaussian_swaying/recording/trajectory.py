@@ -79,7 +79,7 @@ def check_trajectory(
     Raises:
         ValueError: If a file is damaged or not a regular file.
     """
-    found: dict[str, set[int]] = {name: set() for name in arrays}
+    frames_of: dict[str, set[int]] = {name: set() for name in arrays}
     for source in _sources(shards, target):
         check_not_taken(source)
         try:
@@ -94,13 +94,13 @@ def check_trajectory(
                         while stream.read(1 << 20):  # up to the end, where its checksum is compared
                             pass
                     if int(name[2]) < frames:
-                        found[name[1]].add(int(name[2]))
+                        frames_of[name[1]].add(int(name[2]))
         except Exception as error:
             why = re.sub(r"\s+", " ", str(error)).rstrip(".") or type(error).__name__
             raise ValueError(
                 f"{source} is damaged ({why}): remove it to go on without its frames, or start again without --resume."
             ) from error
-    return set.intersection(*found.values())
+    return set.intersection(*frames_of.values())
 
 
 def _check_array(stream: IO[bytes], sizes: tuple[int, ...], kind: type, particles: int | None) -> None:

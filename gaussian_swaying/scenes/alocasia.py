@@ -3,17 +3,18 @@
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 
 import torch
 
-from gaussian_swaying._checks import check_positive
 from gaussian_swaying.gaussians.cloud import GaussianCloud
-from gaussian_swaying.scenes.patches import Patches, check_spacing, facing, join, to_cloud, tube
+from gaussian_swaying.scenes.patches import Patches, facing, join, to_cloud, tube
 from gaussian_swaying.scenes.plant_parts import Draw, bezier, leaf, pot
 from gaussian_swaying.scenes.procedural import ProceduralScene
 from gaussian_swaying.scenes.stage import cast, floor
 
 
+@dataclass(eq=False)
 class AlocasiaScene(ProceduralScene):
     """An alocasia (elephant's ear) about 1.1 m tall, in a pot on a floor at z = 0, z up; the soil is at 0.20 m.
 
@@ -25,10 +26,12 @@ class AlocasiaScene(ProceduralScene):
         seed: Seed of the growth.
     """
 
-    def __init__(self, spacing: float = 0.005, leaves: int = 8, seed: int = 0) -> None:
-        self.spacing = check_spacing(spacing, 0.2)
-        check_positive("generator.leaves", leaves)
-        self.leaves, self.seed = int(leaves), int(seed)
+    spacing: float = 0.005
+    leaves: int = 8
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        self.check("leaves", coarsest=0.2)
 
     def generate(self) -> GaussianCloud:
         """Make the plant."""

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+from typing import Literal
+
 import torch
 from torch import Tensor
 
-from gaussian_swaying._checks import check_choice, check_positive
 from gaussian_swaying.gaussians.cloud import GaussianCloud
 from gaussian_swaying.scenes.patches import Patches, box, ellipsoid, join, sheet, steps, to_cloud, tube
 from gaussian_swaying.scenes.procedural import ProceduralScene
@@ -21,6 +23,7 @@ RED, BLUE, WHITE, WOOD, STEEL = (
 GROUND = (0.52, 0.54, 0.55)
 
 
+@dataclass(eq=False)
 class ClothScene(ProceduralScene):
     """A cloth above a ball or a table or under a ball, or two flags in metres. The floor is z = 0.
 
@@ -34,11 +37,12 @@ class ClothScene(ProceduralScene):
         spacing: Distance between Gaussians [m].
     """
 
-    def __init__(self, setting: str = "ball", side: float = 1.2, spacing: float = 0.0125) -> None:
-        check_choice("generator.setting", setting, ("ball", "table", "drop", "flags"))
-        check_positive("generator.side", side)
-        check_positive("generator.spacing", spacing)
-        self.setting, self.side, self.spacing = setting, float(side), float(spacing)
+    setting: Literal["ball", "table", "drop", "flags"] = "ball"
+    side: float = 1.2
+    spacing: float = 0.0125
+
+    def __post_init__(self) -> None:
+        self.check("side")
 
     def generate(self) -> GaussianCloud:
         """Make the splat."""

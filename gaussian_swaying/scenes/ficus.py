@@ -3,17 +3,18 @@
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 
 import torch
 
-from gaussian_swaying._checks import check_positive
 from gaussian_swaying.gaussians.cloud import GaussianCloud
-from gaussian_swaying.scenes.patches import check_spacing, copies, facing, join, to_cloud, tube
+from gaussian_swaying.scenes.patches import copies, facing, join, to_cloud, tube
 from gaussian_swaying.scenes.plant_parts import Draw, bezier, leaf, pot, tints
 from gaussian_swaying.scenes.procedural import ProceduralScene
 from gaussian_swaying.scenes.stage import cast, floor
 
 
+@dataclass(eq=False)
 class FicusScene(ProceduralScene):
     """A ficus tree 2 m tall, z up, in a pot on a floor at z = 0; the soil is at z = 0.30 m.
 
@@ -26,10 +27,12 @@ class FicusScene(ProceduralScene):
         seed: Seed of the growth.
     """
 
-    def __init__(self, spacing: float = 0.008, leaves: int = 2400, seed: int = 0) -> None:
-        self.spacing = check_spacing(spacing, 0.2)
-        check_positive("generator.leaves", leaves)
-        self.leaves, self.seed = int(leaves), int(seed)
+    spacing: float = 0.008
+    leaves: int = 2400
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        self.check("leaves", coarsest=0.2)
 
     def generate(self) -> GaussianCloud:
         """Make the tree."""

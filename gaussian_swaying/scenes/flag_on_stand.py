@@ -3,18 +3,19 @@
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
+from typing import Literal
 
 import torch
 
-from gaussian_swaying._checks import check_choice
 from gaussian_swaying.gaussians.cloud import GaussianCloud
-from gaussian_swaying.gaussians.model import GaussianSurfaceModel
 from gaussian_swaying.scenes.patches import Patches, ellipsoid, join, to_cloud, tube
-from gaussian_swaying.scenes.procedural import FlagScene, ProceduralScene
+from gaussian_swaying.scenes.procedural import FlagScene, ProceduralScene, both
 
 METAL, GOLD, CLOTH, ROPE = (0.62, 0.64, 0.67), (0.90, 0.68, 0.22), (0.86, 0.86, 0.84), (0.72, 0.60, 0.42)
 
 
+@dataclass(eq=False)
 class FlagOnStandScene(ProceduralScene):
     """A :class:`~gaussian_swaying.scenes.procedural.FlagScene` with a stand, so that its pins are visible.
 
@@ -25,24 +26,22 @@ class FlagOnStandScene(ProceduralScene):
         width: Length of the flag along x [m].
         height: Length along z [m].
         spacing: Distance between Gaussians of the flag [m]; on the stand at most 2 cm.
-        pattern: ``stripes`` or ``white``.
+        pattern: Of the flag, as there.
         yaw: Angle by which flag and stand are turned about the pole side, counter-clockwise seen from above [degrees].
         stand: ``pole`` along the left edge, ``posts`` with clips at all corners but the lower left, ``rod`` along the
             top edge, on ropes, or ``none``.
     """
 
-    def __init__(
-        self,
-        width: float = 1.2,
-        height: float = 0.8,
-        spacing: float = 0.0125,
-        pattern: str = "stripes",
-        yaw: float = 0.0,
-        stand: str = "pole",
-    ) -> None:
-        check_choice("generator.stand", stand, ("pole", "posts", "rod", "none"))
-        self.flag = FlagScene(width, height, spacing, pattern=pattern, yaw=yaw)
-        self.stand = stand
+    width: float = 1.2
+    height: float = 0.8
+    spacing: float = 0.0125
+    pattern: Literal["stripes", "white", "printed"] = "stripes"
+    yaw: float = 0.0
+    stand: Literal["pole", "posts", "rod", "none"] = "pole"
+
+    def __post_init__(self) -> None:
+        self.check()
+        self.flag = FlagScene(self.width, self.height, self.spacing, pattern=self.pattern, yaw=self.yaw)
 
     def generate(self) -> GaussianCloud:
         """Make both; the flag comes first."""
@@ -56,10 +55,7 @@ class FlagOnStandScene(ProceduralScene):
         )
         parts = {"pole": self._pole, "posts": self._posts, "rod": self._rod}[self.stand]()
         stand = to_cloud(join(parts).mapped(matrix), two_sided=False)
-        normals = GaussianSurfaceModel.from_cloud(flag, requires_grad=False).normals()
-        assert stand.normals is not None
-        both = {name: torch.cat([getattr(flag, name), getattr(stand, name)]) for name in _FIELDS}
-        return GaussianCloud(**both, normals=torch.cat([normals, stand.normals]))
+        return both(flag, stand)
 
     @property
     def _step(self) -> float:
@@ -105,6 +101,3 @@ class FlagOnStandScene(ProceduralScene):
         for x in (0.12 * width, 0.88 * width):
             parts.append(self._bar((x, 0.0, level), (x, 0.0, level + self.flag.height), 0.007, ROPE))
         return parts
-
-
-_FIELDS = ("means", "quats", "scales", "opacities", "sh")

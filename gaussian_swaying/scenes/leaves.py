@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import torch
 from torch import Tensor
 
 from gaussian_swaying.gaussians.cloud import GaussianCloud
-from gaussian_swaying.scenes.patches import Patches, check_spacing, copies, facing, join, to_cloud, tube
+from gaussian_swaying.scenes.patches import Patches, copies, facing, join, to_cloud, tube
 from gaussian_swaying.scenes.plant_parts import Draw, leaf, tints
 from gaussian_swaying.scenes.procedural import ProceduralScene
 
@@ -20,6 +22,7 @@ WOOD = (
 )
 
 
+@dataclass(eq=False)
 class LeavesScene(ProceduralScene):
     """A leafy branch about 1.8 m long in the x-z plane, z up. Left of x = -0.9 m it continues without leaves.
 
@@ -31,11 +34,14 @@ class LeavesScene(ProceduralScene):
         seed: Seed of the growth.
     """
 
-    def __init__(self, spacing: float = 0.006, leaves: int = 150, seed: int = 0) -> None:
-        self.spacing = check_spacing(spacing, 0.2)
-        if leaves < len(WOOD):
-            raise ValueError(f"Expected `generator.leaves` of at least {len(WOOD)}, one a twig, but got {leaves}.")
-        self.leaves, self.seed = int(leaves), int(seed)
+    spacing: float = 0.006
+    leaves: int = 150
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        self.check(coarsest=0.2)
+        if self.leaves < len(WOOD):
+            raise ValueError(f"Expected `generator.leaves` of at least {len(WOOD)}, one a twig, but got {self.leaves}.")
 
     def generate(self) -> GaussianCloud:
         """Make the branch."""

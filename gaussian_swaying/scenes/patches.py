@@ -15,8 +15,8 @@ from torch import Tensor
 
 from gaussian_swaying._checks import check_positive, check_shape
 from gaussian_swaying.gaussians.cloud import GaussianCloud
-from gaussian_swaying.gaussians.harmonics import SH_DC
 from gaussian_swaying.geometry.covariances import covariance_to_quat_scale
+from gaussian_swaying.scenes.procedural import painted_cloud
 
 LIGHT = (-0.4, -0.7, 0.6)  # direction towards the light that is baked into the colours
 
@@ -104,14 +104,7 @@ def to_cloud(
     covariance = overlap**2 * (edges @ edges.mT + (thin**2)[:, None, None] * normal[:, :, None] * normal[:, None, :])
     quats, scales = covariance_to_quat_scale(covariance)
     colour = baked(patches, ambient, two_sided).clamp(0, 1)
-    return GaussianCloud(
-        means=patches.center.float(),
-        quats=quats.float(),
-        scales=scales.float(),
-        opacities=torch.full((len(patches),), math.log(opacity / (1 - opacity))),
-        sh=((colour - 0.5) / SH_DC).float()[:, None, :],
-        normals=normal.float(),
-    )
+    return painted_cloud(patches.center, quats, scales, colour, opacity, normal)
 
 
 def _coloured(center: Tensor, across: Tensor, along: Tensor, colour: Sequence[float]) -> Patches:
@@ -319,11 +312,3 @@ def facing(direction: Tensor, up: Tensor) -> Tensor:
     y = torch.nn.functional.normalize(direction, dim=-1)
     x = torch.nn.functional.normalize(torch.linalg.cross(y, up), dim=-1)
     return torch.stack([x, y, torch.linalg.cross(x, y)], dim=-1)
-
-
-def check_spacing(spacing: float, limit: float) -> float:
-    """Return the spacing of a scene [m] if it is positive and resolves the scene, or raise a ValueError."""
-    check_positive("generator.spacing", spacing)
-    if spacing > limit:
-        raise ValueError(f"Expected `generator.spacing` of at most {limit} m, but got {spacing} m.")
-    return float(spacing)

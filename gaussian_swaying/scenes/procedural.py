@@ -4,12 +4,16 @@ from __future__ import annotations
 
 import math
 from abc import ABC, abstractmethod
+from dataclasses import dataclass, fields, replace
+from typing import Literal
 
 import torch
+from torch import Tensor
 
-from gaussian_swaying._checks import check_choice, check_positive
+from gaussian_swaying._checks import check_literals, check_positive
 from gaussian_swaying.gaussians.cloud import GaussianCloud
 from gaussian_swaying.gaussians.harmonics import SH_DC
+from gaussian_swaying.geometry.patches import smallest_axis_normal
 from gaussian_swaying.scenes.printed_cloth import printed_colours
 
 _MOST = 50_000_000  # Gaussians, about 100 GB
@@ -22,7 +26,45 @@ class ProceduralScene(ABC):
     def generate(self) -> GaussianCloud:
         """Make the splat; the same arguments give the same splat."""
 
+    def check(self, *positive: str, coarsest: float = math.inf) -> None:
+        """Raise ValueError unless choices are those of their types, and ``spacing`` and the named numbers positive.
 
+        Args:
+            positive: Names of the numbers.
+            coarsest: Largest spacing that resolves the scene [m].
+        """
+        given = vars(self)
+        check_literals(type(self).__init__, given, "generator.")
+        for name in ("spacing", *positive):
+            check_positive(f"generator.{name}", given[name])
+        if given["spacing"] > coarsest:
+            raise ValueError(f"Expected `generator.spacing` of at most {coarsest} m, but got {given['spacing']} m.")
+
+
+def painted_cloud(
+    means: Tensor, quats: Tensor, scales: Tensor, colours: Tensor, opacity: float, normals: Tensor | None = None
+) -> GaussianCloud:
+    """Gaussians with one colour each, from 0 to 1, and one opacity for all; the rest as in a GaussianCloud."""
+    return GaussianCloud(
+        means=means.float(),
+        quats=quats.float(),
+        scales=scales.float().contiguous(),
+        opacities=torch.full((len(means),), math.log(opacity / (1 - opacity))),
+        sh=((colours - 0.5) / SH_DC).float()[:, None, :],
+        normals=None if normals is None else normals.float(),
+    )
+
+
+def both(first: GaussianCloud, second: GaussianCloud) -> GaussianCloud:
+    """Two splats as one, with the normals of both."""
+    parts = [
+        replace(part, normals=smallest_axis_normal(part.quats, part.scales)) if part.normals is None else part
+        for part in (first, second)
+    ]
+    return GaussianCloud(**{f.name: torch.cat([getattr(part, f.name) for part in parts]) for f in fields(first)})
+
+
+@dataclass(eq=False)
 class GivenScene(ProceduralScene):
     """Gaussians that are there already, for Python: a YAML names a file.
 
@@ -30,14 +72,14 @@ class GivenScene(ProceduralScene):
         cloud: The Gaussians.
     """
 
-    def __init__(self, cloud: GaussianCloud) -> None:
-        self.cloud = cloud
+    cloud: GaussianCloud
 
     def generate(self) -> GaussianCloud:
         """The Gaussians, as they are."""
         return self.cloud
 
 
+@dataclass(eq=False)
 class FlagScene(ProceduralScene):
     """A rectangular flag in the x-z plane with its pole side at x = 0 and its lower edge at z = 0, in metres.
 
@@ -55,32 +97,25 @@ class FlagScene(ProceduralScene):
         yaw: Angle by which the flag is turned about its pole side, counter-clockwise seen from above [degrees].
     """
 
-    def __init__(
-        self,
-        width: float = 1.2,
-        height: float = 0.8,
-        spacing: float = 0.0125,
-        overlap: float = 0.6,
-        ripple: float = 0.003,
-        pattern: str = "stripes",
-        yaw: float = 0.0,
-    ) -> None:
-        for name, value in (("width", width), ("height", height), ("spacing", spacing), ("overlap", overlap)):
-            check_positive(f"generator.{name}", value)
-        check_positive("generator.ripple", ripple, allow_zero=True)
-        check_choice("generator.pattern", pattern, ("stripes", "white", "printed"))
-        if spacing > min(width, height):
-            raise ValueError(f"Expected `generator.spacing` below the flag's sides, but got {spacing} m.")
-        count = width / spacing * height / spacing
-        if not count <= _MOST:
+    width: float = 1.2
+    height: float = 0.8
+    spacing: float = 0.0125
+    overlap: float = 0.6
+    ripple: float = 0.003
+    pattern: Literal["stripes", "white", "printed"] = "stripes"
+    yaw: float = 0.0
+
+    def __post_init__(self) -> None:
+        self.check("width", "height", "overlap")
+        check_positive("generator.ripple", self.ripple, allow_zero=True)
+        if self.spacing > min(self.width, self.height):
+            raise ValueError(f"Expected `generator.spacing` below the flag's sides, but got {self.spacing} m.")
+        if not self.width / self.spacing * self.height / self.spacing <= _MOST:
             raise ValueError(
-                f"Expected `generator.spacing` that makes at most {_MOST:,} Gaussians, but got {spacing} m."
+                f"Expected `generator.spacing` that makes at most {_MOST:,} Gaussians, but got {self.spacing} m."
             )
-        self.width, self.height, self.spacing = float(width), float(height), float(spacing)
-        self.overlap, self.ripple, self.pattern = float(overlap), float(ripple), pattern
-        if not math.isfinite(yaw):
-            raise ValueError(f"Expected `generator.yaw` to be a finite angle in degrees, but got {yaw}.")
-        self.yaw = float(yaw)
+        if not math.isfinite(self.yaw):
+            raise ValueError(f"Expected `generator.yaw` to be a finite angle in degrees, but got {self.yaw}.")
 
     def generate(self) -> GaussianCloud:
         """Make the flag."""
@@ -101,16 +136,9 @@ class FlagScene(ProceduralScene):
         quats = math.sqrt(0.5) * torch.stack([cosine, -cosine, -sine, sine], dim=-1)
         sigma = self.overlap * h
         scales = torch.tensor([sigma, sigma, 0.1 * sigma], dtype=torch.float64).log().expand(len(x), 3)
-        return GaussianCloud(
-            means=means.float(),
-            quats=quats.float(),
-            scales=scales.float().contiguous(),
-            opacities=torch.full((len(x),), math.log(0.99 / 0.01)),
-            sh=((self._colours(x, z) - 0.5) / SH_DC).float()[:, None, :],
-            normals=None,
-        )
+        return painted_cloud(means, quats, scales, self._colours(x, z), 0.99)
 
-    def _colours(self, x: torch.Tensor, z: torch.Tensor) -> torch.Tensor:
+    def _colours(self, x: Tensor, z: Tensor) -> Tensor:
         if self.pattern == "white":
             return torch.full((len(x), 3), 0.9, dtype=torch.float64)
         if self.pattern == "printed":

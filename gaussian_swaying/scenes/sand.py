@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
 from gaussian_swaying.gaussians.cloud import GaussianCloud
-from gaussian_swaying.scenes.patches import Patches, check_spacing, join, to_cloud
+from gaussian_swaying.scenes.patches import Patches, join, to_cloud
 from gaussian_swaying.scenes.plant_parts import Draw
 from gaussian_swaying.scenes.procedural import ProceduralScene
 from gaussian_swaying.scenes.stage import floor
@@ -31,6 +32,7 @@ MOUNDS = (
 OPEN = 3  # layers of grains that the wind reaches: they share the area of the surface
 
 
+@dataclass(eq=False)
 class SandScene(ProceduralScene):
     """A bear of sand lying on a beach, 2.3 m from head to foot, z up, the bear on z = 0.
 
@@ -46,11 +48,15 @@ class SandScene(ProceduralScene):
         seed: Seed of the jitter.
     """
 
-    def __init__(self, spacing: float = 0.013, slope: float = 28.0, interior: bool = True, seed: int = 0) -> None:
-        self.spacing = check_spacing(spacing, 0.2)
-        if not 0 < slope < 60:
-            raise ValueError(f"Expected `generator.slope` between 0 and 60 degrees, but got {slope}.")
-        self.slope, self.interior, self.seed = float(slope), bool(interior), int(seed)
+    spacing: float = 0.013
+    slope: float = 28.0
+    interior: bool = True
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        self.check(coarsest=0.2)
+        if not 0 < self.slope < 60:
+            raise ValueError(f"Expected `generator.slope` between 0 and 60 degrees, but got {self.slope}.")
 
     def height(self, x: Tensor, y: Tensor) -> Tensor:
         """Height of the surface over the beach [m], zero outside the bear; x and y of the same shape."""

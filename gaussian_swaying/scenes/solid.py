@@ -2,16 +2,15 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Literal
 
 import torch
 from torch import Tensor
 
-from gaussian_swaying._checks import check_choice, check_positive
 from gaussian_swaying.gaussians.cloud import GaussianCloud
-from gaussian_swaying.gaussians.harmonics import SH_DC
-from gaussian_swaying.scenes.procedural import ProceduralScene
+from gaussian_swaying.scenes.procedural import ProceduralScene, painted_cloud
 
 # balls (x, y, z, radius) of the figure, for a height of 1: body, head, muzzle, ears, arms, legs; it looks along -y
 FIGURE = (
@@ -53,6 +52,7 @@ def figure_distance(points: Tensor, height: float) -> Tensor:
     return torch.maximum(-blend * torch.logsumexp(-each / blend, dim=-1), -points[..., 2])
 
 
+@dataclass(eq=False)
 class SolidScene(ProceduralScene):
     """A solid body with flat Gaussians on its surface, their shortest axes along the true normals, z up.
 
@@ -69,26 +69,22 @@ class SolidScene(ProceduralScene):
         seed: Seed of the jitter.
     """
 
-    def __init__(
-        self,
-        shape: str = "figure",
-        size: float = 1.0,
-        spacing: float = 0.02,
-        gaussians: str = "throughout",
-        overlap: float = 0.6,
-        jitter: float = 0.3,
-        seed: int = 0,
-    ) -> None:
-        check_choice("generator.shape", shape, ("figure", "ball", "box", "torus"))
-        check_choice("generator.gaussians", gaussians, ("throughout", "shell"))
-        for name, value in (("size", size), ("spacing", spacing), ("overlap", overlap)):
-            check_positive(f"generator.{name}", value)
-        if spacing > 0.25 * size:
-            raise ValueError(f"Expected `generator.spacing` to be at most a quarter of the size, but got {spacing} m.")
-        if not 0 <= jitter <= 1:
-            raise ValueError(f"Expected `generator.jitter` to be from 0 to 1, but got {jitter}.")
-        self.shape, self.size, self.spacing, self.gaussians = shape, float(size), float(spacing), gaussians
-        self.overlap, self.jitter, self.seed = float(overlap), float(jitter), int(seed)
+    shape: Literal["figure", "ball", "box", "torus"] = "figure"
+    size: float = 1.0
+    spacing: float = 0.02
+    gaussians: Literal["throughout", "shell"] = "throughout"
+    overlap: float = 0.6
+    jitter: float = 0.3
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        self.check("size", "overlap")
+        if self.spacing > 0.25 * self.size:
+            raise ValueError(
+                f"Expected `generator.spacing` to be at most a quarter of the size, but got {self.spacing} m."
+            )
+        if not 0 <= self.jitter <= 1:
+            raise ValueError(f"Expected `generator.jitter` to be from 0 to 1, but got {self.jitter}.")
 
     @property
     def distance(self) -> Callable[[Tensor], Tensor]:
@@ -123,14 +119,7 @@ class SolidScene(ProceduralScene):
         scales = torch.tensor([sigma, sigma, 0.1 * sigma], dtype=torch.float64).log().expand(len(means), 3)
         shade = 1 + 0.06 * torch.randn(len(means), 1, generator=draw, dtype=torch.float64)
         colours = torch.tensor([0.86, 0.70, 0.46], dtype=torch.float64) * shade
-        return GaussianCloud(
-            means=means.float(),
-            quats=_quat_from_z(normals).float(),
-            scales=scales.float().contiguous(),
-            opacities=torch.full((len(means),), math.log(0.99 / 0.01)),
-            sh=((colours - 0.5) / SH_DC).float()[:, None, :],
-            normals=normals.float(),
-        )
+        return painted_cloud(means, _quat_from_z(normals), scales, colours, 0.99, normals)
 
     def normal(self, points: Tensor) -> Tensor:
         """Unit gradient of the distance at points (N, 3), by central differences; +z where it is zero."""

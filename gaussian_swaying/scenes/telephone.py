@@ -3,15 +3,14 @@
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 
 import torch
 
-from gaussian_swaying._checks import check_positive
 from gaussian_swaying.gaussians.cloud import GaussianCloud
 from gaussian_swaying.scenes.patches import (
     Patches,
     box,
-    check_spacing,
     frames_along,
     join,
     resample,
@@ -27,6 +26,7 @@ from gaussian_swaying.scenes.procedural import ProceduralScene
 RED, CREAM, DARK = (0.72, 0.10, 0.09), (0.90, 0.87, 0.80), (0.13, 0.13, 0.14)
 
 
+@dataclass(eq=False)
 class TelephoneScene(ProceduralScene):
     """A red telephone on a tiled wall, z up, seen from -y. The handset is off the hook and hangs on a coiled cord.
 
@@ -38,10 +38,11 @@ class TelephoneScene(ProceduralScene):
         turns: Turns of the coil.
     """
 
-    def __init__(self, spacing: float = 0.004, turns: int = 16) -> None:
-        self.spacing = check_spacing(spacing, 0.2)
-        check_positive("generator.turns", turns)
-        self.turns = int(turns)
+    spacing: float = 0.004
+    turns: int = 16
+
+    def __post_init__(self) -> None:
+        self.check("turns", coarsest=0.2)
 
     def generate(self) -> GaussianCloud:
         """Make the telephone."""

@@ -3,15 +3,14 @@
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
-from gaussian_swaying._checks import check_positive
 from gaussian_swaying.gaussians.cloud import GaussianCloud
 from gaussian_swaying.scenes.patches import (
     Patches,
-    check_spacing,
     copies,
     ellipsoid,
     facing,
@@ -28,6 +27,7 @@ from gaussian_swaying.scenes.procedural import ProceduralScene
 PETALS = ((0.93, 0.42, 0.52), (0.97, 0.80, 0.30), (0.95, 0.93, 0.90), (0.72, 0.36, 0.70))
 
 
+@dataclass(eq=False)
 class VaseScene(ProceduralScene):
     """A vase 0.30 m tall with a bunch of flowers, on a round chequered cloth, z up, the table top at z = 0.
 
@@ -40,10 +40,12 @@ class VaseScene(ProceduralScene):
         seed: Seed of the bunch.
     """
 
-    def __init__(self, spacing: float = 0.004, flowers: int = 15, seed: int = 0) -> None:
-        self.spacing = check_spacing(spacing, 0.2)
-        check_positive("generator.flowers", flowers)
-        self.flowers, self.seed = int(flowers), int(seed)
+    spacing: float = 0.004
+    flowers: int = 15
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        self.check("flowers", coarsest=0.2)
 
     def generate(self) -> GaussianCloud:
         """Make the vase."""

@@ -2,40 +2,20 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import torch
 
-from gaussian_swaying._checks import check_positive
 from gaussian_swaying.gaussians.cloud import GaussianCloud
-from gaussian_swaying.gaussians.model import GaussianSurfaceModel
 from gaussian_swaying.scenes.ficus import FicusScene
 from gaussian_swaying.scenes.flag_on_stand import METAL, FlagOnStandScene
-from gaussian_swaying.scenes.patches import (
-    Patches,
-    box,
-    check_spacing,
-    copies,
-    disc,
-    facing,
-    join,
-    to_cloud,
-    tube,
-)
+from gaussian_swaying.scenes.patches import Patches, box, copies, disc, facing, join, to_cloud, tube
 from gaussian_swaying.scenes.plant_parts import Draw, bezier, leaf, tints
-from gaussian_swaying.scenes.procedural import ProceduralScene
+from gaussian_swaying.scenes.procedural import ProceduralScene, both
 from gaussian_swaying.scenes.stage import cast, floor
 
 
-def _joined(first: GaussianCloud, second: GaussianCloud) -> GaussianCloud:
-    """Two splats as one, with the normals of both."""
-    normals = []
-    for part in (first, second):
-        own = part.normals
-        normals.append(GaussianSurfaceModel.from_cloud(part, requires_grad=False).normals() if own is None else own)
-    names = ("means", "quats", "scales", "opacities", "sh")
-    both = {name: torch.cat([getattr(first, name), getattr(second, name)]) for name in names}
-    return GaussianCloud(**both, normals=torch.cat(normals))
-
-
+@dataclass(eq=False)
 class FlagBehindPoleScene(ProceduralScene):
     """A :class:`FlagOnStandScene` on a thin pole, and a thick pole upwind of it, at negative x.
 
@@ -49,28 +29,28 @@ class FlagBehindPoleScene(ProceduralScene):
         distance: Distance of its axis from the edge of the flag [m].
     """
 
-    def __init__(
-        self,
-        width: float = 1.2,
-        height: float = 0.8,
-        spacing: float = 0.0125,
-        radius: float = 0.09,
-        distance: float = 0.45,
-    ) -> None:
-        check_positive("generator.radius", radius)
-        if not distance > radius + 0.05:
-            raise ValueError(f"Expected `generator.distance` of more than {radius + 0.05:g} m, but got {distance} m.")
-        self.flag = FlagOnStandScene(width, height, spacing)
-        self.height, self.radius, self.distance = float(height), float(radius), float(distance)
+    width: float = 1.2
+    height: float = 0.8
+    spacing: float = 0.0125
+    radius: float = 0.09
+    distance: float = 0.45
+
+    def __post_init__(self) -> None:
+        self.check("radius")
+        least = self.radius + 0.05
+        if not self.distance > least:
+            raise ValueError(f"Expected `generator.distance` of more than {least:g} m, but got {self.distance} m.")
+        self.flag = FlagOnStandScene(self.width, self.height, self.spacing)
 
     def generate(self) -> GaussianCloud:
         """Make all; the flag comes first."""
         ends = [[-self.distance, 0.0, -2.0 * self.height], [-self.distance, 0.0, 1.45 * self.height]]
         pole = tube(ends, [self.radius] * 2, min(0.02, 0.4 * self.radius), METAL)
         top = disc((-self.distance, 0.0, 1.45 * self.height), self.radius, 0.02, METAL)
-        return _joined(self.flag.generate(), to_cloud(join([pole, top]), two_sided=False))
+        return both(self.flag.generate(), to_cloud(join([pole, top]), two_sided=False))
 
 
+@dataclass(eq=False)
 class PlantRowScene(ProceduralScene):
     """A row of leafy plants along x on a floor at z = 0, z up.
 
@@ -83,11 +63,13 @@ class PlantRowScene(ProceduralScene):
         seed: Seed of the growth.
     """
 
-    def __init__(self, count: int = 5, spacing: float = 0.012, leaves: int = 60, seed: int = 0) -> None:
-        self.spacing = check_spacing(spacing, 0.1)
-        check_positive("generator.count", count)
-        check_positive("generator.leaves", leaves)
-        self.count, self.leaves, self.seed = int(count), int(leaves), int(seed)
+    count: int = 5
+    spacing: float = 0.012
+    leaves: int = 60
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        self.check("count", "leaves", coarsest=0.1)
 
     def generate(self) -> GaussianCloud:
         """Make the row."""
@@ -115,6 +97,7 @@ class PlantRowScene(ProceduralScene):
         return [green, copies(blade, facing(way, up), size, spot, tints(draw, self.leaves))]
 
 
+@dataclass(eq=False)
 class FicusBehindWallScene(ProceduralScene):
     """A :class:`FicusScene`, and a garden wall upwind of it, at negative x, on its floor at z = 0.
 
@@ -127,19 +110,16 @@ class FicusBehindWallScene(ProceduralScene):
         seed: Seed of the growth.
     """
 
-    def __init__(
-        self,
-        spacing: float = 0.008,
-        leaves: int = 2400,
-        distance: float = 1.5,
-        height: float = 1.3,
-        length: float = 2.4,
-        seed: int = 0,
-    ) -> None:
-        for name, value in (("distance", distance), ("height", height), ("length", length)):
-            check_positive(f"generator.{name}", value)
-        self.tree = FicusScene(spacing, leaves, seed)
-        self.distance, self.height, self.length = float(distance), float(height), float(length)
+    spacing: float = 0.008
+    leaves: int = 2400
+    distance: float = 1.5
+    height: float = 1.3
+    length: float = 2.4
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        self.check("distance", "height", "length")
+        self.tree = FicusScene(self.spacing, self.leaves, self.seed)
 
     def generate(self) -> GaussianCloud:
         """Make both; the tree comes first."""
@@ -150,4 +130,4 @@ class FicusBehindWallScene(ProceduralScene):
         course = torch.floor(z / 0.13)  # rows of stones, each shifted by a half
         joint = (z / 0.13 - course < 0.22) | ((y / 0.3 + 0.5 * course) % 1 < 0.1)
         wall = wall.painted((0.80, 0.76, 0.70), joint)
-        return _joined(self.tree.generate(), to_cloud(wall, two_sided=False))
+        return both(self.tree.generate(), to_cloud(wall, two_sided=False))

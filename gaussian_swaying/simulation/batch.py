@@ -92,6 +92,3 @@ def run_batch(
     finally:
         for recorder in opened:
             recorder.release()
-
-
-__all__ = ["batch_of", "run_batch"]

@@ -109,7 +109,7 @@ def _support_names(boundaries: int) -> list[str]:
 
 
 def entry_names(boundaries: int) -> list[str]:
-    """The names of ``FrameDiagnostics.as_dict`` with so many boundaries."""
+    """The names of the entries of ``FrameDiagnostics.as_dict`` for a number of boundaries."""
     return [name for name in FrameDiagnostics.__dataclass_fields__ if name != "support"] + _support_names(boundaries)
 
 

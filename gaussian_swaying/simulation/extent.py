@@ -71,6 +71,3 @@ def suggest_spacing(longest_side: float, spacing: float, cells: int) -> float:
     """
     check_positive("longest_side", longest_side)
     return float(f"{max(longest_side / cells, 2 * spacing):.2g}")
-
-
-__all__ = ["check_extent", "suggest_spacing"]

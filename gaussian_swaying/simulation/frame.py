@@ -115,40 +115,32 @@ def frames_from(
     Raises:
         RuntimeError: If the stepper is started again before the last frame.
     """
-    return _frames(editor.stepper.starts, painter, editor, state, first, count, drawn)
+    stepper, started = editor.stepper, editor.stepper.starts
 
+    def frames(state: State) -> Iterator[Frame]:
+        launched: Launched | None = None
+        for index in range(first, count):
+            with stepper.turn:
+                if stepper.starts != started:
+                    raise RuntimeError(
+                        "This simulation was started again, so the earlier loop over its frames cannot go on: finish "
+                        "one loop before the next, or make a Simulation for each."
+                    )
+                if index == 0:
+                    health = diagnose(stepper.solver, state, 0, 0.0)
+                else:
+                    if launched is None and stepper.progress is not None:
+                        stepper.progress.begin(index)
+                    state, health = stepper.advance(state) if launched is None else launched.finish()
+                    if drawn is not None:  # the frame before may still be drawn from memory that is now free
+                        torch.cuda.current_stream(stepper.device).wait_stream(drawn)
+                    state = editor.edit_due(state)
+                if drawn is not None and index + 1 < count:
+                    drawn.wait_stream(torch.cuda.current_stream(stepper.device))
+                    if stepper.progress is not None:
+                        stepper.progress.begin(index + 1)
+                    launched = stepper.launch(state)
+                frame = Frame(painter, editor, index, state, health, editor.version)
+            yield frame
 
-def _frames(
-    started: int,
-    painter: Painter,
-    editor: SceneEditor,
-    state: State,
-    first: int,
-    count: int,
-    drawn: torch.cuda.Stream | None,
-) -> Iterator[Frame]:
-    stepper = editor.stepper
-    launched: Launched | None = None
-    for index in range(first, count):
-        with stepper.turn:
-            if stepper.starts != started:
-                raise RuntimeError(
-                    "This simulation was started again, so the earlier loop over its frames cannot go on: finish "
-                    "one loop before the next, or make a Simulation for each."
-                )
-            if index == 0:
-                health = diagnose(stepper.solver, state, 0, 0.0)
-            else:
-                if launched is None and stepper.progress is not None:
-                    stepper.progress.begin(index)
-                state, health = stepper.advance(state) if launched is None else launched.finish()
-                if drawn is not None:  # the frame before may still be drawn from memory that is now free
-                    torch.cuda.current_stream(stepper.device).wait_stream(drawn)
-                state = editor.edit_due(state)
-            if drawn is not None and index + 1 < count:
-                drawn.wait_stream(torch.cuda.current_stream(stepper.device))
-                if stepper.progress is not None:
-                    stepper.progress.begin(index + 1)
-                launched = stepper.launch(state)
-            frame = Frame(painter, editor, index, state, health, editor.version)
-        yield frame
+    return frames(state)

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import KW_ONLY, dataclass, field, replace
+from typing import Literal
 
 from torch import Tensor
 
 from gaussian_swaying._checks import (
     Number,
-    check_choice,
+    check_literals,
     check_plain,
     check_poisson_ratio,
     check_positive,
@@ -65,12 +66,12 @@ class Material:
     _: KW_ONLY
     density: Number = 200.0
     thickness: float = 0.01
-    volume: str = "patch"
+    volume: Literal["patch", "cell"] = "patch"
     law: ConstitutiveLaw | None = None
     regions: list[MaterialRegion] = field(default_factory=list)
 
     def __post_init__(self) -> None:
-        check_choice("material.volume", self.volume, ("patch", "cell"))
+        check_literals(type(self).__init__, vars(self), "material.")
         for name in DIFFERENTIABLE:
             value = getattr(self, name)
             if isinstance(value, Tensor) and value.numel() != 1:

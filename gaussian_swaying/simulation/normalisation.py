@@ -9,7 +9,6 @@ import copy
 import dataclasses
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import NamedTuple
 
 import torch
 from torch import Tensor, nn
@@ -87,7 +86,7 @@ class Normalisation:
         cameras: Mapping[str, CameraPath] | None = None,
         edits: Sequence[Edit] = (),
         cloud: GaussianCloud | None = None,
-    ) -> Placed:
+    ) -> tuple[Scene, Material, Solver, CameraPath | None, dict[str, CameraPath], list[Edit]]:
         """Components in scene units, from those in the normalised space, which stay as they are.
 
         Args:
@@ -100,7 +99,7 @@ class Normalisation:
             cloud: The Gaussians of the scene, if they have been read already.
 
         Returns:
-            Copies, the scene with ``metres_per_unit`` set.
+            Copies of the first six arguments, the scene with ``metres_per_unit`` set.
 
         Raises:
             ValueError: If the scene already has a scale, or nothing is simulated.
@@ -120,14 +119,10 @@ class Normalisation:
         regions = [dataclasses.replace(e, region=RegionInFrame(e.region, frame)) for e in material.regions]
         conditions = [b.in_frame(frame) for b in solver.boundaries if isinstance(b, Boundary)]
         solver._modules = solver._modules | {"boundaries": nn.ModuleList(conditions)}  # of the copy alone
-        return Placed(
-            scene,
-            dataclasses.replace(material, regions=regions),
-            solver,
-            None if camera is None else _seen(camera, frame),
-            {name: _seen(path, frame) for name, path in (cameras or {}).items()},
-            [dataclasses.replace(e, region=e.region and RegionInFrame(e.region, frame)) for e in edits],
-        )
+        material, first = dataclasses.replace(material, regions=regions), camera and _seen(camera, frame)
+        further = {name: _seen(path, frame) for name, path in (cameras or {}).items()}
+        changes = [dataclasses.replace(e, region=e.region and RegionInFrame(e.region, frame)) for e in edits]
+        return scene, material, solver, first, further, changes
 
 
 def _seen(camera: CameraPath, frame: SimFrame) -> CameraPath:
@@ -136,17 +131,3 @@ def _seen(camera: CameraPath, frame: SimFrame) -> CameraPath:
         camera = copy.copy(camera)
         camera.frame = frame
     return camera
-
-
-class Placed(NamedTuple):
-    """The result of :meth:`Normalisation.place`: arguments of a simulation."""
-
-    scene: Scene
-    material: Material
-    solver: Solver
-    camera: CameraPath | None
-    cameras: dict[str, CameraPath]
-    edits: list[Edit]
-
-
-__all__ = ["Normalisation"]

@@ -14,13 +14,13 @@ from __future__ import annotations
 import copy
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import KW_ONLY, dataclass, replace
 from typing import TYPE_CHECKING, Any, Literal, TypeVar
 
 import torch
 from torch import Tensor, nn
 
-from gaussian_swaying._checks import check_choice, check_vector, number_of, requires_grad
+from gaussian_swaying._checks import check_literals, check_vector, number_of, requires_grad
 from gaussian_swaying.aero.force import AeroForce
 from gaussian_swaying.aero.wind import SpatialWind, WindField
 from gaussian_swaying.mpm.forces import Force
@@ -70,6 +70,9 @@ class Parameter:
 
     Attributes:
         name: The option of ``sim``, or a name of its own such as ``wind.speed``.
+        read: Gives its value; ValueError if a setup has none.
+        write: Gives a setup with other values of all parameters that have this function; ValueError if it has no place
+            for them.
         unit: Its unit; empty for a pure number.
         low: Smallest value.
         high: Largest value.
@@ -79,23 +82,24 @@ class Parameter:
         batched: Whether simulations that differ in it are steps of one rollout.
         same_points: Whether all objects take it without other points, patches or contact.
         differentiable: Whether it keeps the gradient of a tensor.
-        read: Gives its value; ValueError if a setup has none.
-        write: Gives a setup with other values of all parameters that have this function; ValueError if it has no place
-            for them.
     """
 
     name: str
-    unit: str
-    low: float
-    high: float
-    open: bool
-    scale: Literal["linear", "log"]
-    kind: Literal["number", "whole", "vector"]
-    batched: bool
-    same_points: bool
-    differentiable: bool
     read: Read
     write: Write
+    _: KW_ONLY
+    unit: str = ""
+    low: float = -math.inf
+    high: float = math.inf
+    open: bool = False
+    scale: Literal["linear", "log"] = "linear"
+    kind: Literal["number", "whole", "vector"] = "number"
+    batched: bool = False
+    same_points: bool = True
+    differentiable: bool = False
+
+    def __post_init__(self) -> None:
+        check_literals(type(self).__init__, vars(self))
 
     def check(self, value: Any, name: str | None = None) -> Any:
         """A value as plain numbers, or as the tensor that it is if a gradient is required.
@@ -139,37 +143,15 @@ class Parameter:
 _KNOWN: dict[str, Parameter] = {}
 
 
-def register(
-    name: str,
-    *,
-    unit: str = "",
-    low: float = -math.inf,
-    high: float = math.inf,
-    open: bool = False,
-    scale: Literal["linear", "log"] = "linear",
-    kind: Literal["number", "whole", "vector"] = "number",
-    batched: bool = False,
-    same_points: bool = True,
-    differentiable: bool = False,
-    read: Read | None = None,
-    write: Write | None = None,
-) -> Parameter:
-    """Add a parameter, see :class:`Parameter`.
+def register(name: str, read: Read | None = None, *, write: Write | None = None, **settings: Any) -> Parameter:
+    """Add a parameter.
 
     Args:
         name: ``forces.CLASS.ATTRIBUTE`` for a number of a force of that class; any other name needs ``read`` and
             ``write``.
-        unit: Its unit.
-        low: Smallest value.
-        high: Largest value.
-        open: Whether the range is open.
-        scale: ``log`` or ``linear``.
-        kind: ``number``, ``whole`` or ``vector``.
-        batched: Whether simulations that differ in it share a rollout.
-        same_points: Whether all objects take it without other points.
-        differentiable: Whether it keeps a gradient.
         read: Gives its value; found by the name for a force.
         write: Changes it; found by the name for a force.
+        settings: Further attributes of :class:`Parameter`: unit, range, scale, kind, and how it may be used.
 
     Returns:
         The parameter.
@@ -177,7 +159,6 @@ def register(
     Raises:
         ValueError: If the name is taken, or says nothing about how to change it.
     """
-    check_choice("scale", scale, ("linear", "log"))
     if name in _KNOWN:
         raise ValueError(f"The parameter `{name}` is registered already: choose another name.")
     parts = name.split(".")
@@ -185,11 +166,8 @@ def register(
         read, write = _of_force(parts[1], parts[2])
     if read is None or write is None:
         raise ValueError(f"Expected `{name}` to be forces.CLASS.ATTRIBUTE, or to come with `read` and `write`.")
-    found = Parameter(
-        name, unit, low, high, open, scale, kind, batched, same_points, differentiable, read, write
-    )  # fmt: skip
-    _KNOWN[name] = found
-    return found
+    _KNOWN[name] = Parameter(name, read, write, **settings)
+    return _KNOWN[name]
 
 
 def forget(name: str) -> None:
@@ -462,7 +440,7 @@ def thicker(setup: Setup, ratio: Any) -> Setup:
 
 
 def _thickness(setup: Setup) -> float:
-    """The thickness, of a sheet that can be made thicker without other points."""
+    """The thickness; ValueError unless the object is a sheet of one layer, whose points stay if it gets thicker."""
     scene, material = setup.scene, setup.material
     if material.volume != "patch" or scene.filled or setup.points.count != scene.on_surface + scene.filled:
         raise ValueError(
@@ -476,10 +454,17 @@ def _write_aero(setup: Setup, values: Mapping[str, Any]) -> Setup:
     return replace(setup, aero=other_with(setup.aero, **{name[5:]: value for name, value in values.items()}))
 
 
-def _of_solver(setup: Setup, name: str) -> Any:
-    if not hasattr(setup.solver, name):
-        raise ValueError(f"This solver has no `{name}`.")
-    return getattr(setup.solver, name)
+def _of_aero(name: str) -> Read:
+    return lambda setup: number_of(getattr(setup.aero, name))
+
+
+def _of_solver(name: str) -> Read:
+    def read(setup: Setup) -> Any:
+        if not hasattr(setup.solver, name):
+            raise ValueError(f"This solver has no `{name}`.")
+        return getattr(setup.solver, name)
+
+    return read
 
 
 def _write_solver(setup: Setup, values: Mapping[str, Any]) -> Setup:
@@ -511,82 +496,41 @@ def _mean(field: str) -> Read:
     return lambda setup: float(getattr(setup.points, field).detach().double().mean())
 
 
-register(
-    "wind.flow",
-    unit="m/s",
-    kind="vector",
-    batched=True,
-    differentiable=True,
-    read=lambda setup: _steady(setup, "wind.flow").flows[0].tolist(),
-    write=_write_wind,
-)
-register(
-    "wind.seed", kind="whole", batched=True, read=lambda setup: _uniform_wind(setup).seed, write=_write_wind
-)  # fmt: skip
-_WIND = {"batched": True, "write": _write_polar}
-register("wind.speed", unit="m/s", low=0.0, scale="log", read=lambda setup: _polar(setup)[0], **_WIND)  # type: ignore[arg-type]
-register("wind.azimuth", unit="degrees", read=lambda setup: _polar(setup)[1], **_WIND)  # type: ignore[arg-type]
-register("wind.elevation", unit="degrees", read=lambda setup: _polar(setup)[2], **_WIND)  # type: ignore[arg-type]
-for _name, _unit, _open, _scale in (
-    ("amplitude", "", False, "log"),
-    ("delta", "", False, "log"),
-    ("std", "m/s", False, "log"),
-    ("period", "s", True, "log"),
-    ("interval", "s", True, "log"),
-    ("phase", "rad", False, "linear"),
-):
-    _place = f"wind.modulations.*.{_name}"
-    _low = -math.inf if _name == "phase" else 0.0
-    register(
-        _place, unit=_unit, low=_low, open=_open, scale=_scale, batched=True,  # type: ignore[arg-type]
-        read=_of_modulation(_place.replace("*", "0")), write=_write_modulation,
-    )  # fmt: skip
-_MATERIAL = {"batched": True, "differentiable": True, "write": _write_material}
-register("material.E", unit="Pa", low=0.0, open=True, scale="log", read=_mean("youngs_modulus"), **_MATERIAL)  # type: ignore[arg-type]
-register("material.nu", low=-1.0, high=0.5, open=True, read=_mean("poisson_ratio"), **_MATERIAL)  # type: ignore[arg-type]
-register(
-    "material.density", unit="kg/m³", low=0.0, open=True, scale="log",
-    read=lambda setup: float((setup.points.mass.double().sum() / setup.points.volume.double().sum()).detach()),
-    **_MATERIAL,  # type: ignore[arg-type]
-)  # fmt: skip
-register(
-    "material.thickness", unit="m", low=0.0, open=True, scale="log", batched=True, same_points=False,
-    read=_thickness, write=_write_material,
-)  # fmt: skip
+def _steady_flow(setup: Setup) -> list[float]:
+    flow: list[float] = _steady(setup, "wind.flow").flows[0].tolist()
+    return flow
+
+
+def _density(setup: Setup) -> float:
+    return float((setup.points.mass.double().sum() / setup.points.volume.double().sum()).detach())
+
+
+_SIZE: dict[str, Any] = {"low": 0.0, "scale": "log"}
+_MATERIAL: dict[str, Any] = {"open": True, "batched": True, "differentiable": True}
+register("wind.flow", _steady_flow, write=_write_wind, unit="m/s", kind="vector", batched=True, differentiable=True)
+register("wind.seed", lambda setup: _uniform_wind(setup).seed, write=_write_wind, kind="whole", batched=True)
+register("wind.speed", lambda setup: _polar(setup)[0], write=_write_polar, unit="m/s", batched=True, **_SIZE)
+register("wind.azimuth", lambda setup: _polar(setup)[1], write=_write_polar, unit="degrees", batched=True)
+register("wind.elevation", lambda setup: _polar(setup)[2], write=_write_polar, unit="degrees", batched=True)
+for _name, _rest in {
+    "amplitude": _SIZE,
+    "delta": _SIZE,
+    "std": {"unit": "m/s", **_SIZE},
+    "period": {"unit": "s", "open": True, **_SIZE},
+    "interval": {"unit": "s", "open": True, **_SIZE},
+    "phase": {"unit": "rad"},
+}.items():
+    _reader = _of_modulation(f"wind.modulations.0.{_name}")
+    register(f"wind.modulations.*.{_name}", _reader, write=_write_modulation, batched=True, **_rest)
+register("material.E", _mean("youngs_modulus"), write=_write_material, unit="Pa", **_SIZE, **_MATERIAL)
+register("material.nu", _mean("poisson_ratio"), write=_write_material, low=-1.0, high=0.5, **_MATERIAL)
+register("material.density", _density, write=_write_material, unit="kg/m³", **_SIZE, **_MATERIAL)
+_ONE_LAYER: dict[str, Any] = {"open": True, "batched": True, "same_points": False}
+register("material.thickness", _thickness, write=_write_material, unit="m", **_SIZE, **_ONE_LAYER)
 for _name, _low in (("C_D", 0.0), ("C_F", 0.0), ("C_L", -math.inf)):
-    register(
-        f"aero.{_name}", low=_low, scale="log", differentiable=True, write=_write_aero,
-        read=lambda setup, name=_name: number_of(getattr(setup.aero, name)),  # type: ignore[misc]
-    )  # fmt: skip
+    register(f"aero.{_name}", _of_aero(_name), write=_write_aero, low=_low, scale="log", differentiable=True)
 register(
-    "solver.gravity",
-    unit="m/s²",
-    kind="vector",
-    read=lambda setup: list(_of_solver(setup, "gravity")),
-    write=_write_solver,
+    "solver.gravity", lambda setup: list(_of_solver("gravity")(setup)), write=_write_solver, unit="m/s²", kind="vector"
 )
 for _name, _unit in (("damping", "1/s"), ("stiffness_damping", "s")):
-    register(
-        f"solver.{_name}", unit=_unit, low=0.0, scale="log", write=_write_solver,
-        read=lambda setup, name=_name: _of_solver(setup, name),  # type: ignore[misc]
-    )  # fmt: skip
-
-__all__ = [
-    "POLAR",
-    "Parameter",
-    "Setup",
-    "all_in_settings",
-    "find",
-    "flow_of",
-    "forget",
-    "in_settings",
-    "names",
-    "of_settings",
-    "other_with",
-    "parameter",
-    "present",
-    "register",
-    "thicker",
-    "value_of",
-    "with_values",
-]
+    register(f"solver.{_name}", _of_solver(_name), write=_write_solver, unit=_unit, **_SIZE)

@@ -99,6 +99,3 @@ def duration(seconds: float) -> str:
         if seconds < limit:
             return f"{seconds / size:.2g} {unit}" if seconds / size < 10 else f"{seconds / size:.0f} {unit}"
     return f"{seconds / 86400:,.0f} days"
-
-
-__all__ = ["RunProgress", "duration"]

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Mapping, Sequence
-from contextlib import suppress
+import time
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +13,7 @@ import torch
 from torch import Tensor
 
 from gaussian_swaying._checks import check_positive
-from gaussian_swaying._provenance import describe_device, versions
+from gaussian_swaying._provenance import describe_device, peak_memory, versions
 from gaussian_swaying.gaussians.model import DeformedGaussians
 from gaussian_swaying.mpm.state import State
 from gaussian_swaying.recording.checkpoint import check_state, log_lines, unreadable
@@ -24,7 +25,6 @@ from gaussian_swaying.simulation.diagnostics import SimulationDiverged, entry_na
 from gaussian_swaying.simulation.edits import SceneEditor
 from gaussian_swaying.simulation.frame import frames_from
 from gaussian_swaying.simulation.health import advice, extremes
-from gaussian_swaying.simulation.meters import PeakMemory, WallClock
 from gaussian_swaying.simulation.painter import Painter
 from gaussian_swaying.simulation.progress import RunProgress
 from gaussian_swaying.simulation.simulated_scene import SimulatedScene
@@ -95,6 +95,49 @@ def run_health(stepper: Stepper, log: Sequence[Mapping[str, Any]]) -> tuple[dict
     return found, advice(found, float(points.youngs_modulus.amax()), scene.filled == 0)
 
 
+class WallClock:
+    """Seconds spent in each part of the run.
+
+    Startup: on a GPU, a first frame that is thrown away, which loads and compiles the kernels. Simulation, shading and
+        rendering: from start to end; on a GPU this is measured on its stream, so that the host need not wait, and as
+        a frame is drawn while the next one is simulated, the parts may add up to more than the whole. Writing: the time
+        that the main thread spends in the recorder, not the time of the recorder's own threads.
+    """
+
+    def __init__(self, device: torch.device) -> None:
+        self.device = device
+        self.seconds = {"simulation": 0.0, "shading": 0.0, "rendering": 0.0, "writing": 0.0}
+        self._events: list[tuple[str, torch.cuda.Event, torch.cuda.Event]] = []
+
+    @contextmanager
+    def __call__(self, part: str) -> Iterator[None]:
+        """Add the time of the block to a part."""
+        if self.device.type == "cuda" and part != "writing":
+            stream = torch.cuda.current_stream(self.device)
+            start, end = torch.cuda.Event(enable_timing=True), torch.cuda.Event(enable_timing=True)
+            start.record(stream)
+            try:
+                yield
+            finally:
+                end.record(stream)
+                self._events.append((part, start, end))
+            return
+        begin = time.perf_counter()
+        try:
+            yield
+        finally:
+            self.seconds[part] += time.perf_counter() - begin
+
+    def read(self, wait: bool = False) -> dict[str, float]:
+        """The time of each part [s]; with ``wait`` also that of GPU work that is not finished yet."""
+        if wait and self._events:
+            self._events[-1][2].synchronize()
+        while self._events and self._events[0][2].query():
+            part, start, end = self._events.pop(0)
+            self.seconds[part] = self.seconds.get(part, 0.0) + start.elapsed_time(end) / 1000
+        return dict(self.seconds)
+
+
 class Run:
     """A run: simulate, draw and record.
 
@@ -118,7 +161,9 @@ class Run:
         self.files: list[Path] = []
         self.log: list[dict[str, Any]] = []
         self._lines: list[str] = []  # the log as a checkpoint stores it, which is written every frame
-        self.walls, self.peak = WallClock(painter.device), PeakMemory(painter.device)
+        self.walls = WallClock(painter.device)
+        if painter.device.type == "cuda":
+            torch.cuda.reset_peak_memory_stats(painter.device)
         self.splat = splat_checksum(self.scene)
         self.force_end = recorder.force_scale or self.stepper.force_scale()
 
@@ -363,7 +408,7 @@ class Run:
             "substeps": int(sum(entry["substeps"] for entry in log)),
             "simulated_s": float(state.time),
             "wall_s": self.walls.read(wait=True),
-            "peak_memory_bytes": self.peak.read(),
+            "peak_memory_bytes": peak_memory(stepper.device),
             "energy_start_J": energy[0] if energy else None,
             "energy_end_J": energy[-1] if energy else None,
             "largest_cfl": max((entry["cfl"] for entry in log), default=None),

@@ -166,7 +166,7 @@ def cell_volume(position: Tensor, dx: float) -> Tensor:
 def grouped(
     samples: Samples, dx: float, per_cell: int, apart: Sequence[Region], frame: SimFrame, dtype: torch.dtype
 ) -> tuple[Samples, Tensor, Tensor]:
-    """Samples for a grid: one or a few for each group, which keep its mass, centre of mass and volume.
+    """Samples for a grid: for each group one or a few that keep its mass, centre of mass and volume.
 
     A group never mixes materials, laws, the surface and the inside, samples that feel wind and samples that do not, or
     the two sides of the border of a region in ``apart``.

@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 from typing import Literal
 
-from gaussian_swaying._checks import check_choice, check_positive, check_vector
+from gaussian_swaying._checks import check_literals, check_positive, check_vector
 from gaussian_swaying.gaussians.cloud import GaussianCloud
 from gaussian_swaying.gaussians.compact import read_gaussians
 from gaussian_swaying.gaussians.filling import InteriorFilling
@@ -88,18 +88,11 @@ class Scene:
         loose: Literal["simulate", "carry"] = "simulate",
         normals: Literal["smallest_axis", "neighbours"] = "smallest_axis",
     ) -> None:
-        if points is not None:
-            check_choice("scene.points", points, ("gaussian", "grid"))
+        check_literals(Scene.__init__, locals(), "scene.")
         if points_per_cell not in range(1, 9):
             raise ValueError(
                 f"Expected `scene.points_per_cell` to be a whole number from 1 to 8, but got {points_per_cell}."
             )
-        check_choice("scene.faint", faint, ("carry", "static", "drop"))
-        check_choice("scene.loose", loose, ("simulate", "carry"))
-        check_choice("scene.wind_on", wind_on, ("surface", "all"))
-        check_choice("scene.normals", normals, ("smallest_axis", "neighbours"))
-        if area is not None:
-            check_choice("scene.area", area, ("coverage", "open", "paper", "equal"))
         if area == "open" and wind_on == "all":
             raise ValueError(
                 'Expected `scene.wind_on` surface with `scene.area` "open": areas behind the surface feel no wind.'

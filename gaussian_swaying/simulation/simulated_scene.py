@@ -179,7 +179,7 @@ class SimulatedScene(nn.Module):
         return self
 
     def take_contact(self, contact: Contact | None, obstacles: Sequence[Obstacle]) -> None:
-        """Make the contact samples, and give obstacles of Gaussians those that stand still.
+        """Make the contact samples, and pass the static Gaussians to obstacles made of them.
 
         Args:
             contact: Contact of the surface with itself; None for none.

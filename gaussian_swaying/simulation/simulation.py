@@ -156,8 +156,8 @@ class Simulation:
         if normalisation is not None:
             if hold is not None:
                 raise ValueError("`hold` cannot be combined with `normalisation`: give a solver with the pins.")
-            placed = normalisation.place(settings, material, solver, camera, cameras, edits, cloud)
-            settings, material, solver, camera, cameras, edits = placed
+            parts = settings, material, solver, camera, cameras, edits
+            settings, material, solver, camera, cameras, edits = normalisation.place(*parts, cloud)
         apart = [
             part.region for part in (*solver.boundaries, *edits) if isinstance(getattr(part, "region", None), Region)
         ]

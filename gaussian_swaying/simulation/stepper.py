@@ -301,7 +301,7 @@ class Stepper:
         state: State,
         parts: tuple[object, ...] | None,
     ) -> Measurement:
-        """Start the measurements of a frame from ``state`` to ``end``, and of what the next one needs.
+        """Start measuring the frame from ``state`` to ``end``, and what the next frame needs.
 
         Args:
             end: The state at its end.
@@ -362,7 +362,7 @@ class Stepper:
         return force.samples(state, self.frame_dt / 4, 5)
 
     def roll(self, state: State, steps: int, margin: int = 0) -> tuple[State, Tensor]:
-        """The state a frame later, and the largest Courant number on the way; nothing is checked.
+        """Advance by one frame without checks; returns the state and the largest Courant number of the frame.
 
         Args:
             state: The state now.
@@ -546,6 +546,3 @@ def _raised_here(error: BaseException) -> bool:
     while place is not None and place.tb_next is not None:
         place = place.tb_next
     return place is not None and str(place.tb_frame.f_globals.get("__name__")).startswith("gaussian_swaying.")
-
-
-__all__ = ["Launched", "Outlook", "Stepper", "needs_of", "parts_of", "why_not_batched"]

@@ -88,7 +88,7 @@ def runs_of(axes: list[Axis], draws: int = 1, seed: int = 0) -> list[dict[str, A
         raise ValueError(f"The axes make {count:,} runs, more than the limit of {MOST_RUNS:,}: give fewer values.")
     choices = [range(draws) if axis.draw is not None else axis.values for axis in axes]
     fixed = [choice for choice, axis in zip(choices, axes, strict=True) if axis.draw is None]
-    found = []
+    runs = []
     for number, (*values, _) in enumerate(itertools.product(*fixed, range(draws))):
         left = iter(values)
         run = {}
@@ -97,8 +97,8 @@ def runs_of(axes: list[Axis], draws: int = 1, seed: int = 0) -> list[dict[str, A
                 run[axis.name] = next(left)
             else:
                 run[axis.name] = axis.draw(random.Random(f"{seed}/{axis.name}/{number}"))
-        found.append(run)
-    return found
+        runs.append(run)
+    return runs
 
 
 def _range(where: str, given: Mapping[str, Any]) -> tuple[float, ...]:

@@ -1,18 +1,76 @@
-"""Backends that do the jobs of a sweep: a pool of processes or Ray, one protocol, and the loop that keeps it busy."""
+"""Jobs of a sweep, the protocol of backends (a pool of processes, or Ray), and the loop that keeps a backend busy."""
 
 from __future__ import annotations
 
+import time
 from collections import deque
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
-from typing import Any, Protocol
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any, Protocol, TypeVar
 
-from gaussian_swaying.sweeps.job import Job
+from gaussian_swaying.runs.lock import FolderLocked
 from gaussian_swaying.sweeps.record import failure, read_result
 
 POLL_S = 1.0
 KILLED = 3  # times as many retries for a job whose process was killed, as the reason may be outside of it
+LOCKED_S = 60.0  # how long to wait for a folder: the worker of a driver that was killed ends at its frame
 PACKED = 0.9  # share of a GPU's memory that is given away, as runs differ
+
+T = TypeVar("T")
+
+
+@dataclass(frozen=True)
+class Job:
+    """A run to do, or several of equal shape that are simulated together.
+
+    Args:
+        folder: Folder of the sweep.
+        names: Names of the runs.
+        config: Configuration that all runs share, as YAML.
+        frames: Frames.
+        runs: The value of every axis in each run.
+        device: Device of the simulation.
+        attempt: 1 for the first time.
+        resume: Continue from the checkpoint of an earlier attempt, if there is one; not if there are several runs.
+        complete: Names of runs that are done already, and only simulated along with the others.
+    """
+
+    folder: Path
+    names: tuple[str, ...]
+    config: str
+    frames: int
+    runs: tuple[dict[str, Any], ...]
+    device: str = "auto"
+    attempt: int = 1
+    resume: bool = True
+    complete: frozenset[str] = frozenset()
+
+    @property
+    def wanted(self) -> tuple[str, ...]:
+        """Names of the runs without the complete ones."""
+        return tuple(name for name in self.names if name not in self.complete)
+
+    def again(self, resume: bool) -> Job:
+        """The next attempt."""
+        return replace(self, attempt=self.attempt + 1, resume=resume)
+
+    def apart(self) -> list[Job]:
+        """A job for each run that is not complete."""
+        pairs = zip(self.names, self.runs, strict=True)
+        return [replace(self, names=(n,), runs=(r,), attempt=1) for n, r in pairs if n not in self.complete]
+
+
+def unlocked(work: Callable[[], T]) -> T:
+    """Do what needs a folder, once it is free."""
+    begin = time.monotonic()
+    while True:
+        try:
+            return work()
+        except FolderLocked:
+            if time.monotonic() - begin > LOCKED_S:
+                raise
+            time.sleep(0.5)
 
 
 @dataclass(frozen=True)
@@ -64,7 +122,7 @@ def drive(
     retries: int = 1,
     tick: Callable[[int], None] = lambda running: None,
 ) -> None:
-    """Do jobs. A failed one is tried again; one that fails too often never stops the rest.
+    """Run jobs: a failed one is tried again, and one that fails too often does not stop the rest.
 
     A job of several runs that fails is done again run by run. If this is interrupted (Ctrl-C, or an exception of a
     callback), the runs are ended in order.

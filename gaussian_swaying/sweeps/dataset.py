@@ -49,8 +49,8 @@ class SweepDataset(Dataset[dict[str, Any]]):
     ) -> None:
         self.folder, self.frames, self.positions, self.nodes = Path(folder), frames, positions, nodes
         runs = {f"{number:05d}": run for number, run in enumerate(read_record(self.folder)["runs"])}
-        found = {name: read_result(self.folder, name) for name in runs}
-        results = {name: result for name, result in found.items() if result and result["status"] == "complete"}
+        ended = {name: read_result(self.folder, name) for name in runs}
+        results = {name: result for name, result in ended.items() if result and result["status"] == "complete"}
         if not results:
             raise ValueError(f"No run of the sweep in {folder} is complete: finish it with --resume.")
         self.runs = list(results)
@@ -93,7 +93,7 @@ class SweepDataset(Dataset[dict[str, Any]]):
 
 
 def _numbers(value: Any) -> list[float]:
-    """The numbers of a value, lists joined; none if there is anything else in it."""
+    """The numbers in a value, nested lists flattened; empty if it contains anything else."""
     if isinstance(value, Real):
         return [float(value)]
     parts = [_numbers(item) for item in value] if isinstance(value, list) else []

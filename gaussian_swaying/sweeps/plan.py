@@ -130,8 +130,8 @@ def make_plan(sweep: Sweep, parser: ArgumentParser | None = None) -> Plan:
             shown = ", ".join(f"{name}: {value}" for name, value in sweep.runs[number].items())
             raise type(error)(*_located(error, f"Run {number:05d} ({shown}): ")) from error
         splats.add(settings.scene.ply)
-    found = {path: sha256(check_regular(path, "the splat")) for path in sorted(filter(None, splats))}
-    return Plan(config, shared.frames, tuple(sweep.runs), found)
+    checksums = {path: sha256(check_regular(path, "the splat")) for path in sorted(filter(None, splats))}
+    return Plan(config, shared.frames, tuple(sweep.runs), checksums)
 
 
 def parse_run(parser: ArgumentParser, config: str, frames: int, run: Mapping[str, Any]) -> Namespace:
@@ -168,13 +168,13 @@ def _telling(runs: Sequence[Mapping[str, Any]]) -> list[int]:
     """
     many = {name: len({json.dumps(run[name]) for run in runs}) == len(runs) > 100 for name in runs[0]}
     seen: set[tuple[str, str]] = set()
-    found = []
+    numbers = []
     for number, run in enumerate(runs):
         new = {(name, "" if many[name] else json.dumps(value)) for name, value in run.items()} - seen
         if new:
             seen |= new
-            found.append(number)
-    return found
+            numbers.append(number)
+    return numbers
 
 
 def _options(file: Path, field_: str, given: Any) -> dict[str, Any]:

@@ -14,8 +14,7 @@ from multiprocessing.connection import Connection
 from multiprocessing.context import SpawnProcess
 
 from gaussian_swaying._checks import first_line
-from gaussian_swaying.sweeps.backend import PACKED, Outcome, lost
-from gaussian_swaying.sweeps.job import Job
+from gaussian_swaying.sweeps.backend import PACKED, Job, Outcome, lost
 from gaussian_swaying.sweeps.worker import Explain, work
 
 PATIENCE_S = 300.0  # how long a worker may take to write what it has when the sweep is stopped
@@ -69,7 +68,7 @@ class Pool:
         """See ``Backend.wait``."""
         busy = [worker for worker in self._workers if worker.job is not None]
         ready = connections.wait([worker.connection for worker in busy], seconds)
-        found = []
+        ended = []
         for worker in (worker for worker in busy if worker.connection in ready):
             job, worker.job = worker.job, None
             assert job is not None
@@ -77,8 +76,8 @@ class Pool:
             if not again:
                 _dismiss(worker)
                 self._workers.remove(worker)
-            found.append((job, outcome))
-        return found
+            ended.append((job, outcome))
+        return ended
 
     def pack(self, share: float) -> None:
         """See ``Backend.pack``: as many processes to a GPU as fit into its memory, by the largest job so far."""
@@ -141,8 +140,8 @@ def variables(place: int, threads: int, gpus: Sequence[str]) -> dict[str, str]:
         >>> [variables(place, 2, ["0", "3"])["CUDA_VISIBLE_DEVICES"] for place in range(3)]
         ['0', '3', '0']
     """
-    found = {"OMP_NUM_THREADS": str(threads), "GOMP_SPINCOUNT": os.environ.get("GOMP_SPINCOUNT", "3000")}
-    return found | ({"CUDA_VISIBLE_DEVICES": gpus[place % len(gpus)]} if gpus else {})
+    environment = {"OMP_NUM_THREADS": str(threads), "GOMP_SPINCOUNT": os.environ.get("GOMP_SPINCOUNT", "3000")}
+    return environment | ({"CUDA_VISIBLE_DEVICES": gpus[place % len(gpus)]} if gpus else {})
 
 
 @contextmanager

@@ -14,8 +14,7 @@ import torch
 
 from gaussian_swaying._checks import first_line
 from gaussian_swaying.simulation.simulation import Simulation
-from gaussian_swaying.sweeps.backend import PACKED, Outcome, lost
-from gaussian_swaying.sweeps.job import Job
+from gaussian_swaying.sweeps.backend import PACKED, Job, Outcome, lost
 from gaussian_swaying.sweeps.worker import WHERE, Done, Explain, do
 
 if TYPE_CHECKING:
@@ -77,10 +76,10 @@ class RayBackend:
 
     def free(self) -> bool:
         """See ``Backend.free``; a cluster may grow and shrink."""
-        found = self._ray.cluster_resources()
-        room = int(found.get("CPU", 1) // self.threads)
+        resources = self._ray.cluster_resources()
+        room = int(resources.get("CPU", 1) // self.threads)
         if self.on_gpu:
-            room = int(found.get("GPU", 1) * self.per_gpu)
+            room = int(resources.get("GPU", 1) * self.per_gpu)
         return len(self._running) < max(1, min(room, self.workers or room))
 
     def submit(self, job: Job) -> None:

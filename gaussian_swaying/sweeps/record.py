@@ -253,7 +253,7 @@ def check_parquet() -> None:
 def write_parquet(
     folder: Path, names: Sequence[str], runs: Sequence[Mapping[str, Any]], results: Mapping[str, Any]
 ) -> None:
-    """Write ``sweep.parquet``: the rows and columns of ``sweep.csv``, with numbers and lists of numbers as such.
+    """Write ``sweep.parquet``: the rows and columns of ``sweep.csv``, with typed numbers and lists of numbers.
 
     Args:
         folder: Folder of the sweep.
@@ -264,11 +264,11 @@ def write_parquet(
     import pyarrow
     import pyarrow.parquet
 
-    found = [results.get(name) or {"status": "missing"} for name in names]
+    ordered = [results.get(name) or {"status": "missing"} for name in names]
     columns: dict[str, list[Any]] = {"run": list(names)}
-    columns |= {name: [result.get(name) for result in found] for name in ("status", "reason")}
+    columns |= {name: [result.get(name) for result in ordered] for name in ("status", "reason")}
     columns |= {axis: _typed([run[axis] for run in runs]) for axis in runs[0]}
-    columns |= {name: _typed([(result.get("figures") or {}).get(name) for result in found]) for name in SUMMARY}
+    columns |= {name: _typed([(result.get("figures") or {}).get(name) for result in ordered]) for name in SUMMARY}
     text = pyarrow.schema([(name, pyarrow.string()) for name in ("status", "reason")])
     kinds = {name: text.field(name).type for name in text.names}
     arrays = {name: pyarrow.array(values, kinds.get(name)) for name, values in columns.items()}

@@ -15,10 +15,10 @@ from tqdm import tqdm
 
 from gaussian_swaying._checks import check_choice, first_line
 from gaussian_swaying._files import write_json
+from gaussian_swaying._provenance import cores
 from gaussian_swaying.runs.lock import FolderLock, FolderLocked
-from gaussian_swaying.sweeps.backend import Backend, drive
+from gaussian_swaying.sweeps.backend import Backend, Job, drive
 from gaussian_swaying.sweeps.contact_sheet import PICTURES, write_contact_sheets
-from gaussian_swaying.sweeps.job import Job
 from gaussian_swaying.sweeps.plan import Plan
 from gaussian_swaying.sweeps.pool import Pool
 from gaussian_swaying.sweeps.ray_backend import LOCAL, RayBackend, check_ray
@@ -34,11 +34,6 @@ from gaussian_swaying.sweeps.together import grouped
 from gaussian_swaying.sweeps.worker import Explain
 
 TABLE_EVERY_S = 5.0
-
-
-def cores() -> int:
-    """Processor cores that this process may use."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 def gpus_for(device: str) -> list[str]:
@@ -126,9 +121,9 @@ def run_sweep(
         if part is not None:
             groups = groups[part[0] - 1 :: part[1]]
         mine = [name for group in groups for name in group]
-        found = {name: result for name in mine if (result := read_result(folder, name)) is not None}
-        keeper = _Keeper(folder, plan, mine, found, progress, part is None)
-        jobs = _jobs(folder, plan, groups, found, device)
+        earlier = {name: result for name in mine if (result := read_result(folder, name)) is not None}
+        keeper = _Keeper(folder, plan, mine, earlier, progress, part is None)
+        jobs = _jobs(folder, plan, groups, earlier, device)
         try:
             if jobs:
                 backend = _backend(ray, workers, threads, explain, device, per_gpu, len(jobs))
@@ -144,12 +139,12 @@ def run_sweep(
         lock.release()
 
 
-def _jobs(folder: Path, plan: Plan, groups: list[list[str]], found: dict[str, Any], device: str) -> list[Job]:
+def _jobs(folder: Path, plan: Plan, groups: list[list[str]], earlier: dict[str, Any], device: str) -> list[Job]:
     """A job for each group with something left to do."""
     runs = dict(zip(plan.names, plan.runs, strict=True))
     jobs = []
     for names in groups:
-        complete = frozenset(name for name in names if name in found and found[name]["status"] == "complete")
+        complete = frozenset(name for name in names if name in earlier and earlier[name]["status"] == "complete")
         if len(complete) < len(names):
             own = tuple(dict(runs[name]) for name in names)
             jobs.append(Job(folder, tuple(names), plan.config, plan.frames, own, device, complete=complete))
@@ -183,7 +178,7 @@ def _finish(folder: Path, plan: Plan, results: dict[str, dict[str, Any]], pictur
 
 
 def _finish_parts(folder: Path, plan: Plan, picture: str, parquet: bool) -> None:
-    """Write the tables and the contact sheet, if all parts have ended; of two that end together, one does."""
+    """Write the tables and contact sheets once all parts have ended; if two end at once, only one writes."""
     results = {name: result for name in plan.names if (result := read_result(folder, name)) is not None}
     if len(results) < len(plan.names):
         return

@@ -11,7 +11,7 @@ from gaussian_swaying.simulation import parameters
 from gaussian_swaying.simulation.batch import run_batch
 from gaussian_swaying.simulation.parameters import find, in_settings
 from gaussian_swaying.simulation.simulation import Simulation
-from gaussian_swaying.sweeps.job import Job, unlocked
+from gaussian_swaying.sweeps.backend import Job, unlocked
 from gaussian_swaying.sweeps.plan import parse_run
 from gaussian_swaying.sweeps.record import RUNS
 
@@ -66,7 +66,7 @@ def run_together(job: Job, parser: ArgumentParser) -> dict[str, dict[str, Any]]:
     folders = [None if name in job.complete else job.folder / RUNS / name for name in job.names]
     extras = [{"sweep": {"run": n, "settings": r}} for n, r in zip(job.names, job.runs, strict=True)]
     summaries = unlocked(lambda: run_batch(members, folders, frames, extras))
-    return {name: found for name, found in zip(job.names, summaries, strict=True) if found is not None}
+    return {name: summary for name, summary in zip(job.names, summaries, strict=True) if summary is not None}
 
 
 def members_of(job: Job, parser: ArgumentParser) -> tuple[list[Simulation], int]:
@@ -108,9 +108,9 @@ def texts(parser: ArgumentParser, settings: Sequence[Namespace], names: Sequence
     content = yaml.safe_load(first)
     if written(content) != first:  # another version of the parser writes it in another way
         return [config_text(parser, one) for one in settings]
-    found = []
+    configs = []
     for one in settings:
         for group, field in (name.split(".") for name in names):
             content[group][field] = one[group][field]
-        found.append(written(content))
-    return found
+        configs.append(written(content))
+    return configs

@@ -25,7 +25,7 @@ from gaussian_swaying.runs.lock import FolderLocked
 from gaussian_swaying.runs.signals import stop_signals
 from gaussian_swaying.simulation.diagnostics import SimulationDiverged
 from gaussian_swaying.simulation.simulation import Simulation
-from gaussian_swaying.sweeps.job import Job, unlocked
+from gaussian_swaying.sweeps.backend import Job, unlocked
 from gaussian_swaying.sweeps.plan import parse_run
 from gaussian_swaying.sweeps.record import LOGS, RUNS, failure, result_file, result_of
 from gaussian_swaying.sweeps.together import run_together
@@ -121,7 +121,7 @@ def _failed(job: Job, status: str, reason: str, ready: bool) -> Done:
 
 
 def _where() -> str:
-    """This machine, as the table of times names it."""
+    """Name of this machine in ``times.csv``."""
     return os.environ.get(WHERE) or platform.node()
 
 

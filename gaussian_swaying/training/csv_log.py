@@ -50,6 +50,8 @@ def append_row(path: Path, row: dict[str, Any]) -> None:
 class CsvLog(Logger):
     """Lightning's values as rows of ``metrics.csv``, each with its ``step``. No file is written before the first row.
 
+    Lightning's ``CSVLogger`` deletes a log that is in its folder, so a resumed run would lose its rows.
+
     Args:
         folder: Folder of the file.
     """

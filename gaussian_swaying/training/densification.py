@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import math
 from abc import ABC, abstractmethod
-from collections.abc import Mapping
 from functools import cache
+from types import SimpleNamespace
 from typing import Any
 
 import torch
@@ -18,7 +18,7 @@ from gaussian_swaying.rendering.protocol import ScreenGaussians
 from gaussian_swaying.training.parallel import steps_of, sum_over_devices, this_device
 
 PARAMETERS = ("means", "scales", "quats", "opacities", "sh0", "shN")
-"""Parameters of a :class:`GaussianSurfaceModel`; training uses one optimiser for each."""
+"""Parameters of a :class:`GaussianSurfaceModel`; those of an optimiser come in this order."""
 
 _SUMS = ("grad2d", "count")  # of gsplat's state, over the images since the last change
 
@@ -32,10 +32,10 @@ def _check_steps(**values: int) -> None:
 
 
 class Densification(ABC):
-    """Keeps parameters, optimisers and the state of a strategy consistent when Gaussians are added or removed.
+    """Keeps parameters, optimiser and the state of a strategy consistent when Gaussians are added or removed.
 
-    Order of calls: :meth:`attach` once, then for each image :meth:`before_backward`, the backward pass, the steps of
-    the optimisers, and :meth:`after_step`. Steps count images from 0.
+    Order of calls: :meth:`attach` once, then for each image :meth:`before_backward`, the backward pass, the step of
+    the optimiser, and :meth:`after_step`. Steps count images from 0.
     """
 
     absgrad: bool = False
@@ -43,7 +43,7 @@ class Densification(ABC):
 
     def __init__(self) -> None:
         self._model: GaussianSurfaceModel | None = None
-        self._optimizers: dict[str, torch.optim.Optimizer] = {}
+        self._optimizers: dict[str, Any] = {}
         self._strategy: Any = None
         self._state: dict[str, Any] = {}
         self._restored: dict[str, Any] | None = None
@@ -56,32 +56,37 @@ class Densification(ABC):
     def attach(
         self,
         model: GaussianSurfaceModel,
-        optimizers: Mapping[str, torch.optim.Optimizer],
+        optimizer: torch.optim.Optimizer,
         scene_scale: float,
         devices: int = 1,
     ) -> None:
-        """Use a model and its optimisers from now on.
+        """Use a model and its optimiser from now on.
 
         Args:
             model: The model; its parameters are replaced when the number of Gaussians changes.
-            optimizers: One for each of :data:`PARAMETERS`, with only that parameter.
+            optimizer: Its optimiser, with a group for each of :data:`PARAMETERS`, in this order.
             scene_scale: Extent of the scene [scene units]; size thresholds are shares of it.
             devices: Number of devices that train together. A step takes so many images; the numbers of steps that the
                 densification was given count images.
 
         Raises:
-            ValueError: If an optimiser is missing or has another parameter, ``scene_scale`` is not positive, or the
-                strategy does not run on the model's device.
+            ValueError: If the optimiser has other groups, ``scene_scale`` is not positive, or the strategy does not run
+                on the model's device.
         """
         check_positive("scene_scale", scene_scale)
-        for name in PARAMETERS:
-            groups = optimizers[name].param_groups if name in optimizers else []
-            held = [id(item) for group in groups for item in group["params"]]
-            if held != [id(getattr(model, name))]:
-                raise ValueError(f"Expected an optimiser with only `{name}` for the densification.")
+        groups = optimizer.param_groups
+        if [[id(item) for item in group["params"]] for group in groups] != [
+            [id(getattr(model, n))] for n in PARAMETERS
+        ]:
+            raise ValueError(f"Expected an optimiser with one group for each of {', '.join(PARAMETERS)} of the model.")
         device, self.devices = model.means.device, devices
         self._strategy = self.make_strategy(device)
-        self._model, self._optimizers = model, {name: optimizers[name] for name in PARAMETERS}
+        self._model = model
+        # to gsplat's strategies each group looks like an optimiser of one parameter
+        self._optimizers = {
+            name: SimpleNamespace(param_groups=[group], state=optimizer.state)
+            for name, group in zip(PARAMETERS, groups, strict=True)
+        }
         self._state = self._initial_state(scene_scale)
         if self._restored is not None:
             moved = {k: v.to(device) if isinstance(v, Tensor) else v for k, v in self._restored.items()}
@@ -99,7 +104,7 @@ class Densification(ABC):
             screen.means2d.retain_grad()
 
     def after_step(self, step: int, screen: ScreenGaussians) -> None:
-        """Change the Gaussians as the strategy decides, after the steps of the optimisers."""
+        """Change the Gaussians as the strategy decides, after the step of the optimiser."""
         assert self._model is not None, "attach comes first"
         parameters = {name: getattr(self._model, name) for name in PARAMETERS}
         self._advance(parameters, step, screen)

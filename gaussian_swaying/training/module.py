@@ -6,13 +6,12 @@ import math
 import os
 import time
 import warnings
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Literal
 
 import lightning
 import torch
-from lightning.pytorch.utilities.types import STEP_OUTPUT
 from torch import Tensor
 from torchmetrics.functional.image import peak_signal_noise_ratio
 
@@ -23,28 +22,25 @@ from gaussian_swaying.rendering.gsplat_renderer import make_renderer
 from gaussian_swaying.rendering.planes import SurfaceMaps, plane_channels, surface_maps
 from gaussian_swaying.rendering.protocol import SplatOutput, SplatRenderer
 from gaussian_swaying.training.checkpoints import check_settings, newest_checkpoint, stored_gaussians
-from gaussian_swaying.training.counting import count_further_image, images_until_hooks, inner_hooks_used, number_batch
-from gaussian_swaying.training.data.datamodule import TrainingImage
 from gaussian_swaying.training.densification import PARAMETERS, DefaultDensification, Densification
 from gaussian_swaying.training.finite import PendingLoss, TrainingDiverged, finite_cloud
 from gaussian_swaying.training.initial import gaussians_from_file
 from gaussian_swaying.training.losses import LossInputs, LossTerm, OtherView, TotalLoss
-from gaussian_swaying.training.optimizers import OPTIMIZERS, LearningRates, make_optimizer, means_rate, step_all
+from gaussian_swaying.training.optimizers import OPTIMIZERS, GaussianAdam, LearningRates, means_rate
 from gaussian_swaying.training.panels import lpips_metric, panel, picture_metrics, write_panel
 from gaussian_swaying.training.parallel import check_alike, seen_by_any, share_gradients, steps_of
 from gaussian_swaying.training.random_stream import mixed_seed, random_stream
-from gaussian_swaying.training.strategy import count_steps
+from gaussian_swaying.training.strategy import check_strategy
 from gaussian_swaying.training.surface_losses import SurfaceTerm as SurfaceTerm  # so that a YAML finds its terms
 
 
 class SplatTrainer(lightning.LightningModule):
     """Trains a :class:`~gaussian_swaying.gaussians.model.GaussianSurfaceModel` on photos with known cameras.
 
-    A step is one image, also for ``trainer.max_steps``: six optimisers step for it, of which Lightning counts one. On
-    several devices (``trainer.devices``) a step takes one image on each, and everything that is given in steps still
-    counts images, see :mod:`~gaussian_swaying.training.parallel`. Lightning's callbacks are called after several
-    images, see ``hooks_every``. Random numbers come from a separate stream, which starts from the seed and is stored in
-    checkpoints. So nothing else changes them, and a resumed run continues exactly.
+    A step is one image. On several devices a step of Lightning takes one image on each, see
+    :mod:`~gaussian_swaying.training.parallel`: then the trainer's ``max_steps`` and intervals count its steps, and all
+    that is given here in steps still counts images. Random numbers come from a separate stream, which starts from the
+    seed and is stored in checkpoints. So nothing else changes them, and a resumed run continues exactly.
 
     Batches have items ``image`` (H, W, 3), ``alpha`` (H, W, 1) or None, ``camera`` and ``name``. If there is an alpha,
     the colours of the image are not premultiplied. Losses that compare two views also need the item ``index``, and
@@ -66,9 +62,7 @@ class SplatTrainer(lightning.LightningModule):
         seed: Seed of backgrounds and new Gaussians.
         panels: Number of validation images written as panels of photo, render, normals and area.
         log_every: Steps between logged values.
-        hooks_every: Images between calls of Lightning's callbacks, which also come where a checkpoint, a validation or
-            the end is due. The result does not depend on it.
-        optimizer: See :func:`~gaussian_swaying.training.optimizers.make_optimizer`; ``selective_adam`` needs CUDA.
+        optimizer: See :class:`~gaussian_swaying.training.optimizers.GaussianAdam`; ``selective_adam`` needs CUDA.
         packed: Keep values of the Gaussians in the picture alone: less memory on a GPU, one more wait.
         output: Folder of the panels and the final ``point_cloud.ply``; ``trainer.default_root_dir`` by default.
         init_ply: Splat with the initial Gaussians.
@@ -76,6 +70,7 @@ class SplatTrainer(lightning.LightningModule):
 
     Attributes:
         renderer: The renderer; None for that of :func:`~gaussian_swaying.rendering.gsplat_renderer.make_renderer`.
+        saved_step: Lightning's number of steps when the last checkpoint was written; None before.
 
     Raises:
         ValueError: If a value is out of range.
@@ -96,7 +91,6 @@ class SplatTrainer(lightning.LightningModule):
         seed: int = 0,
         panels: int = 3,
         log_every: int = 50,
-        hooks_every: int = 10,
         optimizer: Literal["adam", "selective_adam"] = "adam",
         packed: bool = False,
         output: str | None = None,
@@ -109,9 +103,8 @@ class SplatTrainer(lightning.LightningModule):
         for name, value in (("sh_every", sh_every), ("panels", panels), ("seed", seed)):
             check_positive(name, value, allow_zero=True)
         check_positive("log_every", log_every)
-        check_positive("hooks_every", hooks_every)
         check_choice("optimizer", optimizer, OPTIMIZERS)
-        self.hooks_every, self.optimizer, self.packed = int(hooks_every), optimizer, packed
+        self.optimizer, self.packed = optimizer, packed
         if scene_scale is not None:
             check_positive("scene_scale", scene_scale)
         self.automatic_optimization = False
@@ -134,9 +127,10 @@ class SplatTrainer(lightning.LightningModule):
         self._lpips_net = lpips
         self._lpips: list[Any] = []  # in a list, so that its weights are not stored in checkpoints
         self.renderer = None
+        self.saved_step: int | None = None
         self._made: dict[str, SplatRenderer] = {}  # by kind of device: Lightning moves the model after a fit
         self._pending: PendingLoss | None = None
-        self._inner_hooks = True  # whether callbacks want to be called within a step
+        self._fitting = False
         self._seen = 0  # number of images that the checkpoint was trained on
         self._begun = 0  # [ns] start of the training
         self._random: dict[str, Tensor] = {}  # state of the generators between two steps, by kind of device
@@ -155,6 +149,7 @@ class SplatTrainer(lightning.LightningModule):
     def setup(self, stage: str) -> None:
         """Make the initial Gaussians, unless they come from a checkpoint."""
         datamodule: Any = getattr(self.trainer, "datamodule", None)
+        self._fitting = stage == "fit"
         if self.scene_scale is None:
             self.scene_scale = float(getattr(datamodule, "scene_scale", 1.0))
             check_positive("scene_scale", self.scene_scale)
@@ -169,39 +164,32 @@ class SplatTrainer(lightning.LightningModule):
         # normals of a file cannot follow splits
         self.model.reference_normals = None
 
-    def configure_optimizers(self) -> list[torch.optim.Optimizer]:
-        """One optimiser for each parameter, in the order of :data:`PARAMETERS`."""
+    def configure_optimizers(self) -> GaussianAdam:
+        """The optimiser, with a group for each of :data:`PARAMETERS`."""
         assert self.scene_scale is not None
         rates = vars(self.rates) | {"means": self.rates.means * self.scene_scale}
-        return [
-            make_optimizer(getattr(self.splat, name), rates[name], self.optimizer, self.devices) for name in PARAMETERS
-        ]
+        parameters = [getattr(self.splat, name) for name in PARAMETERS]
+        return GaussianAdam(parameters, [rates[name] for name in PARAMETERS], self.optimizer, self.devices)
 
     def on_fit_start(self) -> None:
         """Refuse settings that would silently train wrongly."""
         self._begun = time.time_ns()
-        count_steps(self.trainer)
+        check_strategy(self.trainer)
         if self.trainer.precision not in ("32-true", "32"):
             raise ValueError(
                 f"Expected `trainer.precision` to be 32-true, but got {self.trainer.precision}: splats need float32."
             )
 
     def on_train_start(self) -> None:
-        """Attach the Gaussians and their optimisers to the densification, after a checkpoint has been read."""
+        """Attach the Gaussians and their optimiser to the densification, after a checkpoint has been read."""
         assert self.scene_scale is not None
-        optimizers = dict(zip(PARAMETERS, self._raw_optimizers(), strict=True))
-        self.densification.attach(self.splat, optimizers, self.scene_scale, self.devices)
+        self.densification.attach(self.splat, self.trainer.optimizers[0], self.scene_scale, self.devices)
         check_alike([getattr(self.splat, name) for name in PARAMETERS])
-        self._inner_hooks = inner_hooks_used(self.trainer, self)
 
     @property
     def devices(self) -> int:
         """Number of devices that train together; a step takes so many images."""
         return self.trainer.world_size
-
-    def _raw_optimizers(self) -> list[torch.optim.Optimizer]:
-        found = self.optimizers(use_pl_optimizer=False)
-        return found if isinstance(found, list) else [found]
 
     # ---- a step
 
@@ -248,35 +236,18 @@ class SplatTrainer(lightning.LightningModule):
             self._made[device.type] = make_renderer(device, self.packed)
         return self._made[device.type]
 
-    def training_step(self, dataloader_iter: Iterator[tuple[Any, int, int]]) -> STEP_OUTPUT:
-        """Train on the images until Lightning's hooks are due, see ``hooks_every``.
-
-        Each image: picture, losses, gradients, six optimisers, densification.
-        """
-        loss: STEP_OUTPUT = None
+    def training_step(self, batch: Mapping[str, Any]) -> Tensor:
+        """Train on an image: picture, losses, gradients, step of the optimiser, densification."""
         with random_stream(self._random, self.device, self.seed):
-            for number in range(images_until_hooks(self.trainer, self.hooks_every)):
-                if number and getattr(dataloader_iter, "done", False):
-                    break
-                batch = self._on_device(next(dataloader_iter)[0])
-                if number:
-                    count_further_image(self.trainer)
-                loss = self._train_on(batch, self.global_step)
-            number_batch(self.trainer, dataloader_iter)
-        return loss
-
-    def _on_device(self, batch: Any) -> Any:
-        if isinstance(batch, TrainingImage):
-            return batch.to(self.device, non_blocking=True)
-        return self.trainer.strategy.batch_to_device(batch)
+            return self._train_on(batch, self.global_step)
 
     def _train_on(self, batch: Mapping[str, Any], step: int) -> Tensor:
-        optimizers = self._raw_optimizers()
+        optimizer: Any = self.optimizers()  # Lightning's wrapper, whose step counts
         assert self.scene_scale is not None
         steps, images = int(self.trainer.max_steps), step * self.devices  # images before this step
         if self.devices > 1:  # other backgrounds on each device
             torch.manual_seed(mixed_seed(self.seed, step, 1 + self.global_rank))
-        optimizers[0].param_groups[0]["lr"] = means_rate(self.rates, self.scene_scale, step, steps, self.devices)
+        optimizer.param_groups[0]["lr"] = means_rate(self.rates, self.scene_scale, step, steps, self.devices)
         target, alpha, background = self._target(batch, train=True)
         needs = self.loss.needs(images)
         output = self.render(
@@ -303,10 +274,7 @@ class SplatTrainer(lightning.LightningModule):
         if not loss.requires_grad:  # no Gaussian in the picture, and the loss depends only on the picture
             loss = loss + 0.0 * splat.means.sum()
         self.densification.before_backward(step, output.screen)
-        if self._inner_hooks:
-            self.manual_backward(loss)
-        else:
-            loss.backward()
+        self.manual_backward(loss)
         mean = loss.detach()
         if self.devices > 1:
             mean = share_gradients([getattr(splat, name) for name in PARAMETERS], loss)
@@ -316,9 +284,11 @@ class SplatTrainer(lightning.LightningModule):
         self._pending.send(images, mean)
         if self.device.type != "cuda":
             self._check_pending()
-        self._step(optimizers, output)
-        for name in PARAMETERS:
-            getattr(splat, name).grad = None
+        if self.optimizer == "adam":
+            optimizer.step()
+        else:
+            optimizer.step(seen=seen_by_any(output.screen.seen(len(splat))))
+        splat.zero_grad()
         self.densification.after_step(step, output.screen)
         if len(splat) == 0:
             raise ValueError(
@@ -328,17 +298,6 @@ class SplatTrainer(lightning.LightningModule):
         if step % steps_of(self.log_every, self.devices) == 0 or step + 1 == steps:
             self._log_step(loss.detach(), terms, output.color.detach(), target)
         return loss.detach()
-
-    def _step(self, optimizers: list[torch.optim.Optimizer], output: SplatOutput) -> None:
-        """Step all optimisers; Lightning counts one."""
-        if self._inner_hooks and self.optimizer == "adam":
-            self.optimizers()[0].step()  # type: ignore[index]  # calls the hooks and counts
-            step_all(optimizers[1:])
-            return
-        counted = self.trainer.fit_loop.epoch_loop.manual_optimization.optim_step_progress
-        counted.increment_ready()
-        step_all(optimizers, seen_by_any(output.screen.seen(len(self.splat))) if self.optimizer != "adam" else None)
-        counted.increment_completed()
 
     def _surface(self, output: SplatOutput, camera: Camera) -> tuple[Camera, SurfaceMaps]:
         assert output.channels is not None
@@ -381,7 +340,7 @@ class SplatTrainer(lightning.LightningModule):
         self.log("psnr", psnr, prog_bar=True, logger=False, batch_size=1)
         self.log("gaussians", float(len(self.splat)), prog_bar=True, logger=False, batch_size=1)
         values: dict[str, Any] = {"loss": loss, "psnr": psnr, "gaussians": len(self.splat)} | dict(terms)
-        values["rate_means"] = self._raw_optimizers()[0].param_groups[0]["lr"]
+        values["rate_means"] = self.trainer.optimizers[0].param_groups[0]["lr"]
         for logger in self.trainer.loggers:  # not self.log, which would write them again at every step
             logger.log_metrics({f"train/{name}": float(value) for name, value in values.items()}, self.global_step)
 
@@ -406,6 +365,7 @@ class SplatTrainer(lightning.LightningModule):
             if not bool(torch.isfinite(getattr(self.splat, name)).all()):
                 raise TrainingDiverged(self.global_step * self.devices, f"a value of `{name}`", self.last_checkpoint())
         check_alike([getattr(self.splat, name) for name in PARAMETERS])
+        self.saved_step = self.global_step
         checkpoint["splat_training"] = {
             "devices": self.devices,
             "densification": self.densification.state_dict(),
@@ -422,8 +382,12 @@ class SplatTrainer(lightning.LightningModule):
         stored = checkpoint.get("splat_training")
         if stored is None:
             raise ValueError("The checkpoint has no Gaussians: it was not written by this package.")
-        fitting = self._trainer is not None and self.trainer.state.fn == "fit"
-        check_settings(stored, self.sh_degree, self.devices if fitting else None)
+        check_settings(stored, self.sh_degree, self.devices if self._fitting else None)
+        if self._fitting and len(checkpoint["optimizer_states"]) != 1:
+            raise ValueError(
+                "The checkpoint is from an earlier version, with an optimiser for each parameter, so it cannot be "
+                "continued: start a new run, from its splat with `init_ply`."
+            )
         device = self.device if self.model is None else self.model.means.device
         cloud = stored_gaussians(checkpoint["state_dict"])
         self.model = GaussianSurfaceModel.from_cloud(cloud).to(device)
@@ -467,9 +431,8 @@ class SplatTrainer(lightning.LightningModule):
 
     def _evaluate(self, batch: Mapping[str, Any], batch_idx: int, stage: str) -> None:
         target, _, background = self._target(batch, train=False)
-        fitting = self.trainer.state.fn == "fit"
-        images = self.global_step * self.devices if fitting else self._seen
-        degree = self.active_degree(max(images - 1, 0)) if fitting else self._degree_reached()
+        images = self.global_step * self.devices if self._fitting else self._seen
+        degree = self.active_degree(max(images - 1, 0)) if self._fitting else self._degree_reached()
         image = self.render(batch["camera"], background, degree).color.clamp(0.0, 1.0)
         lpips = self._lpips[0].to(self.device) if self._lpips else None
         for name, value in picture_metrics(image, target, lpips).items():

@@ -1,9 +1,9 @@
-"""The optimisers of the Gaussians, and their steps without the detours of ``Optimizer.step``."""
+"""The optimiser of the Gaussians, whose step leaves out the detours of torch's."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -15,81 +15,80 @@ from gaussian_swaying.training.densification import PARAMETERS
 from gaussian_swaying.training.parallel import scaled_adam
 
 OPTIMIZERS = ("adam", "selective_adam")
-"""Kinds of :func:`make_optimizer`."""
+"""Kinds of :class:`GaussianAdam`."""
 
 
-def make_optimizer(parameter: Tensor, rate: float, kind: str = "adam", devices: int = 1) -> torch.optim.Optimizer:
-    """An optimiser of one parameter of the Gaussians.
+class GaussianAdam(torch.optim.Adam):
+    """One Adam for all parameters of the Gaussians, in groups in the order of :data:`PARAMETERS`.
 
     Args:
-        parameter: The parameter, shape (N, ...).
-        rate: Its learning rate.
+        parameters: The parameters, shape (N, ...) each.
+        rates: Their learning rates.
         kind: ``adam``, or ``selective_adam``: gsplat's Adam of the Gaussians in the picture alone (Mallick et al. 2024,
             "Taming 3DGS"); CUDA only. It does not correct the bias of the first steps.
         devices: Number of devices that train together, see
             :func:`~gaussian_swaying.training.parallel.scaled_adam`.
 
     Raises:
-        ValueError: If ``kind`` does not run on the parameter's device.
+        ValueError: If ``kind`` does not run on the device of the parameters.
     """
-    on_gpu = parameter.device.type == "cuda"
-    options = scaled_adam(rate, devices)
-    if kind == "adam":
-        return torch.optim.Adam([parameter], fused=on_gpu, **options)
-    if not on_gpu:
-        raise ValueError(f"`optimizer` {kind} needs CUDA, but the Gaussians are on {parameter.device}: use adam there.")
-    from gsplat import SelectiveAdam
 
-    made: torch.optim.Optimizer = SelectiveAdam([parameter], eps=options["eps"], betas=options["betas"])
-    made.param_groups[0]["lr"] = options["lr"]
-    return made
+    def __init__(
+        self, parameters: Sequence[Tensor], rates: Sequence[float], kind: str = "adam", devices: int = 1
+    ) -> None:
+        device = parameters[0].device
+        if kind != "adam" and device.type != "cuda":
+            raise ValueError(f"`optimizer` {kind} needs CUDA, but the Gaussians are on {device}: use adam there.")
+        self.selective = kind != "adam"
+        groups = [{"params": [p]} | scaled_adam(rate, devices) for p, rate in zip(parameters, rates, strict=True)]
+        super().__init__(groups, fused=device.type == "cuda" and not self.selective)
 
+    @torch.no_grad()
+    def step(self, closure: Callable[[], Any] | None = None, seen: Tensor | None = None) -> Any:
+        """Step every parameter that has a gradient.
 
-def step_all(optimizers: Sequence[torch.optim.Optimizer], seen: Tensor | None = None) -> None:
-    """Step optimisers with one parameter each.
+        From the second step on, torch's fused kernel is called as ``Adam.step`` would; all else that it does takes the
+        host longer than the kernel takes the GPU.
 
-    Fused Adams are stepped by torch's kernel, as ``step`` would; all else that ``step`` does takes the host longer than
-    the kernel takes the GPU.
+        Args:
+            closure: Called first, as Lightning wants it.
+            seen: Which Gaussians were in the picture, bool (N,), for ``selective_adam``.
 
-    Args:
-        optimizers: The optimisers, from :func:`make_optimizer`.
-        seen: Which Gaussians were in the picture, bool (N,), for ``selective_adam``.
-    """
-    fused: list[tuple[dict[str, Any], Tensor, Tensor, dict[str, Tensor]]] = []
-    one: Any
-    for one in optimizers:
-        group = one.param_groups[0]
-        parameter = group["params"][0]
-        state = one.state.get(parameter)
-        if parameter.grad is None:
-            continue
-        if type(one) is not torch.optim.Adam:
-            one.step(visibility=seen)
-        elif group["fused"] and state:
-            fused.append((group, parameter, parameter.grad, state))
+        Returns:
+            The result of ``closure``.
+        """
+        result = None
+        if closure is not None:
+            with torch.enable_grad():
+                result = closure()
+        groups = [group for group in self.param_groups if group["params"][0].grad is not None]
+        if self.selective:
+            from gsplat import SelectiveAdam
+
+            SelectiveAdam.step(self, seen)
+        elif not groups or not all(group["fused"] and self.state.get(group["params"][0]) for group in groups):
+            super().step()
         else:
-            one.step()
-    if not fused:
-        return
-    with torch.no_grad():
-        torch._foreach_add_([state["step"] for *_, state in fused], 1.0)
-        for group, parameter, gradient, state in fused:
-            beta1, beta2 = group["betas"]
-            torch._fused_adam_(
-                [parameter],
-                [gradient],
-                [state["exp_avg"]],
-                [state["exp_avg_sq"]],
-                [],
-                [state["step"]],
-                lr=group["lr"],
-                beta1=beta1,
-                beta2=beta2,
-                weight_decay=group["weight_decay"],
-                eps=group["eps"],
-                amsgrad=False,
-                maximize=group["maximize"],
-            )
+            states = [self.state[group["params"][0]] for group in groups]
+            torch._foreach_add_([state["step"] for state in states], 1.0)
+            for group, state in zip(groups, states, strict=True):
+                beta1, beta2 = group["betas"]
+                torch._fused_adam_(
+                    group["params"],
+                    [group["params"][0].grad],
+                    [state["exp_avg"]],
+                    [state["exp_avg_sq"]],
+                    [],
+                    [state["step"]],
+                    lr=group["lr"],
+                    beta1=beta1,
+                    beta2=beta2,
+                    weight_decay=group["weight_decay"],
+                    eps=group["eps"],
+                    amsgrad=False,
+                    maximize=group["maximize"],
+                )
+        return result
 
 
 @dataclass(frozen=True)

@@ -12,9 +12,6 @@ _WARNINGS = (
     "Checkpoint directory .* exists and is not empty",  # it is moved aside, or it belongs to the run that is resumed
     # the order of images follows from the step
     "(?s)You're resuming from a checkpoint that ended before the epoch ended",
-    # a step trains on several images, and all of Lightning's counters are kept (counting.py)
-    "Found `dataloader_iter` argument in the `training_step`",
-    "You are using the `dataloader_iter` step flavor",
     "LightningCLI's args parameter is intended",
 )
 

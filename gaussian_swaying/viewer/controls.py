@@ -127,6 +127,9 @@ class Controls(Panel):
     def _picture(self) -> None:
         gui = self.server.gui
         self.shown = gui.add_dropdown("Show", SHOWN, initial_value=SHOWN[0])
+        self.by_browser = gui.add_checkbox(
+            "Drawn by the browser", True, hint="Off: pictures from the server, whose colours depend on the view"
+        )
         self.light = gui.add_slider("Light from [deg]", -180.0, 180.0, 1.0, 0.0)
         self.shading = gui.add_checkbox("Shading", True)
         self.streaks = gui.add_checkbox("Streaks of air", False, hint="Coloured by speed, near a plane along the wind")
@@ -134,7 +137,7 @@ class Controls(Panel):
         self.box = gui.add_checkbox("Box of the grid", False)
         self.pins = gui.add_checkbox("What is held", False, hint="Points that pins and handles hold, at rest")
         changed: dict[Callable[[], None], tuple[Any, ...]] = {
-            self._show: (self.shown, self.streaks),
+            self._show: (self.shown, self.by_browser, self.streaks),
             self._shade: (self.light, self.shading),
             self.draw_handles: (self.arrow, self.box, self.pins),
         }
@@ -237,6 +240,7 @@ class Controls(Panel):
 
     def _show(self) -> None:
         self.page.shown, self.page.streaks = self.shown.value, self.streaks.value
+        self.page.by_browser = self.by_browser.value
         self.page.redraw()
         self._show_legends()
 

@@ -1,4 +1,4 @@
-"""Pictures of a session, drawn here and sent to every browser behind the camera of viser."""
+"""A session as browsers see it: drawn by them from its states, or drawn here and sent as pictures."""
 
 from __future__ import annotations
 
@@ -12,29 +12,33 @@ from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, redirect_stdout, suppress
 from functools import partial
+from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
 
 from gaussian_swaying._checks import one_line
+from gaussian_swaying.geometry.rotations import quat_to_rotation
 from gaussian_swaying.viewer.door import ANY, Door, check_address
 from gaussian_swaying.viewer.film_strip import FilmStrip
 from gaussian_swaying.viewer.incoming import Incoming
 from gaussian_swaying.viewer.pictures import PictureSize, camera_of, draw, enlarged
 from gaussian_swaying.viewer.session import Session, Snapshot
+from gaussian_swaying.viewer.states import drawable
+from gaussian_swaying.viewer.streams import Streams, with_program
 from gaussian_swaying.viewer.turns import Turns
 
 if TYPE_CHECKING:
     import viser
 
-MOST_PER_SECOND = 30  # pictures for a browser
+MOST_PER_SECOND = 30  # pictures or states for a browser
 JPEG_QUALITY = 75
 FAR = 100.0  # longest sides of the object that a handle may be away from it
 BACK = 1.35  # the first view is from farther away than that of the configuration, as the controls cover a part of it
 
 
-def make_server(host: str, port: int, door: Door, incoming: Incoming) -> viser.ViserServer:
+def make_server(host: str, port: int, door: Door, incoming: Incoming, streams: Streams) -> viser.ViserServer:
     """A viser server that opens no tunnel to the internet, whoever asks.
 
     Args:
@@ -42,6 +46,7 @@ def make_server(host: str, port: int, door: Door, incoming: Incoming) -> viser.V
         port: Port; the next free one if it is taken.
         door: Checks who may open the page.
         incoming: Checks the messages of browsers.
+        streams: Has the connections of those that draw themselves.
 
     Raises:
         ImportError: If viser is not installed.
@@ -60,14 +65,17 @@ def make_server(host: str, port: int, door: Door, incoming: Incoming) -> viser.V
     # a picture may be drawn while its browser goes away
     warnings.filterwarnings("ignore", message="Queued a .* on a closed connection", category=UserWarning)
     warnings.filterwarnings("ignore", message=r"\[viser\] .* does not match annotation", category=UserWarning)
-    with redirect_stdout(io.StringIO()), checked_by(door, incoming):  # its banner; the caller tells the address
+    with (
+        redirect_stdout(io.StringIO()),
+        checked_by(door, incoming, streams),
+    ):  # its banner; the caller tells the address
         incoming.server = Server(host=host, port=port, label="Wind tunnel", verbose=False)
     return incoming.server
 
 
 @contextmanager
-def checked_by(door: Door, incoming: Incoming) -> Iterator[None]:
-    """Within the block, make new servers check requests and messages first."""
+def checked_by(door: Door, incoming: Incoming, streams: Streams) -> Iterator[None]:
+    """Within the block, make new servers check requests and messages first, and serve the states, too."""
     import websockets.asyncio.server as websockets
 
     serve = websockets.serve
@@ -75,8 +83,10 @@ def checked_by(door: Door, incoming: Incoming) -> Iterator[None]:
     logger.addFilter(lambda record: "handshake" not in record.getMessage())  # what is no HTTP is no error of ours
 
     def checked(handler: Any, *arguments: Any, process_request: Any = None, **options: Any) -> Any:
-        process = partial(door.answer, process_request)
-        return serve(incoming.guarded(handler), *arguments, process_request=process, logger=logger, **options)
+        process = partial(door.answer, with_program(process_request))
+        return serve(
+            streams.beside(incoming.guarded(handler)), *arguments, process_request=process, logger=logger, **options
+        )
 
     websockets.serve = checked  # type: ignore[assignment, misc]
     try:
@@ -85,11 +95,29 @@ def checked_by(door: Door, incoming: Incoming) -> Iterator[None]:
         websockets.serve = serve  # type: ignore[misc]
 
 
+def turn_of(up: Sequence[float], otherwise: torch.Tensor) -> torch.Tensor:
+    """The rotation from the scene to the axes of viser's camera, which have y up, shape (3, 3), float64.
+
+    Args:
+        up: Up in the scene.
+        otherwise: Returned if viser keeps what it had.
+    """
+    import viser
+
+    told: Any = SimpleNamespace(messages=[])
+    told._queue_scene_message = told.messages.append
+    viser.SceneApi.set_up_direction(told, tuple(up))  # type: ignore[arg-type]
+    if not told.messages:
+        return otherwise
+    return quat_to_rotation(torch.tensor(told.messages[0].wxyz, dtype=torch.float64))
+
+
 class Screen:
     """A page without controls: it says how far a scene is loaded, and serves its session from :meth:`show` on.
 
-    The simulation never waits for a browser. Each browser has a thread that draws the newest snapshot from its camera;
-    a slow one gets fewer pictures, as viser replaces a picture that is not sent yet.
+    The simulation never waits for a browser. Each browser has a thread that sends it the newest state, to be drawn
+    there, and leaves states out for a slow one. If the browser cannot draw, or shows what it cannot draw, the thread
+    draws the newest snapshot from its camera; viser replaces a picture that is not sent yet.
 
     Args:
         host: Address to listen on.
@@ -100,6 +128,7 @@ class Screen:
     Attributes:
         shown: The kind of picture, one of :data:`.pictures.SHOWN`.
         streaks: Whether streaks of air are drawn over it.
+        by_browser: Whether browsers draw, where they can.
         recording: The video that is being recorded, or None.
         force_end: End of the colour scale of the force of the wind [Pa].
         drawn_size: Width and height at which the last picture was drawn [pixels].
@@ -116,6 +145,7 @@ class Screen:
         self.session: Session
         self.shown = "colour"
         self.streaks = False
+        self.by_browser = True
         self.force_end = 1.0
         self.recording: FilmStrip | None = None
         self.drawn_size = (0, 0)
@@ -128,8 +158,9 @@ class Screen:
         self._drawing = threading.Lock()  # of many browsers one waits for the session, which gets its turn so
         self._notice = ("", 0.0)
         self._version = 0  # of what is drawn besides snapshot and camera
-        self.door, self.incoming = Door(host, names), Incoming(self.tell)
-        self.server = make_server(host, port, self.door, self.incoming)
+        self._turn = torch.eye(3, dtype=torch.float64)  # from the scene to the axes of viser's camera
+        self.door, self.incoming, self.streams = Door(host, names), Incoming(self.tell), Streams()
+        self.server = make_server(host, port, self.door, self.incoming, self.streams)
         self.server.gui.configure_theme(
             control_layout="floating", control_width="medium", show_logo=False, show_share_button=False
         )
@@ -206,6 +237,7 @@ class Screen:
         self.incoming.reach = float(scene.center.abs().amax()) + FAR * scene.size
         up = scene.frame.rotation[2].tolist()
         self.server.scene.set_up_direction(tuple(up))
+        self._turn = turn_of(up, self._turn)
         first = self.server.initial_camera
         eye, forward = camera.position.double(), camera.world_to_camera[2, :3].double()
         distance = float((scene.center.to(eye) - eye).norm())
@@ -220,9 +252,10 @@ class Screen:
                 client.camera.position, client.camera.look_at = first.position, first.look_at
 
     def pictures_per_second(self) -> float:
-        """Pictures that the fastest browser gets."""
+        """Pictures that the fastest browser draws or gets."""
         now = time.perf_counter()
-        return max((sum(now - t < 2.0 for t in list(times)) / 2.0 for times in self._drawn.values()), default=0.0)
+        sent = max((sum(now - t < 2.0 for t in list(times)) / 2.0 for times in self._drawn.values()), default=0.0)
+        return max(sent, self.streams.rate())
 
     # ---- browsers
 
@@ -245,26 +278,68 @@ class Screen:
         while not self._shown.wait(0.1):
             if gone.is_set() or self._closed.is_set():
                 return
+        key = self.streams.expect()
+        try:
+            self._keep_sending(client, gone, key)
+        finally:
+            self.streams.forget(key)
+
+    def _keep_sending(self, client: viser.ClientHandle, gone: threading.Event, key: str) -> None:
+        """Send a browser states or pictures until it is gone.
+
+        Args:
+            client: The browser.
+            gone: Set once it is gone.
+            key: With which it may open a connection for states.
+        """
+        from viser._messages import RunJavascriptMessage
+
+        join = RunJavascriptMessage(f"window.wind?.join({key!r})")
+        client.gui._websock_interface.queue_message(join)
         on_cpu = self.session.simulation.device.type == "cpu"
         size = PictureSize(0.14 if on_cpu else 0.05, self.largest, 2 if on_cpu else 0)
         seen: tuple[Any, ...] = ()
-        number = -1
+        number, pictured = -1, False
         while not (gone.is_set() or self._closed.is_set()):
             began = time.perf_counter()
             snapshot = self.session.wait(number, 0.02)
+            line, still = self.streams.line(key), self.session.paused or self.session.broken
+            drawn_there = line is not None and self._drawn_there(client, snapshot)
             camera = client.camera
-            now = (snapshot.number, self._version, self.shown, self.session.paused, camera.update_timestamp)
-            if now == seen:
+            now = (snapshot.number, self._version, self.shown, still, drawn_there or camera.update_timestamp)
+            if now == seen and not drawn_there:
                 continue
-            seen, number = now, snapshot.number
             try:
-                self._send(client, snapshot, size)
+                if drawn_there:
+                    assert line is not None
+                    if not line.free:
+                        gone.wait(0.005)
+                        continue
+                    with self.session.lock:
+                        sent = line.send(snapshot, still, lambda shown: self.streams.scene(shown, self._turn))
+                    if pictured and line.draws:
+                        client.scene.set_background_image(None)
+                        pictured = False
+                    number = snapshot.number
+                    if not sent:
+                        continue
+                else:
+                    seen, number, pictured = now, snapshot.number, True
+                    self._send(client, snapshot, size)
+                    if line is not None:
+                        line.stop()
             except Exception as error:  # one picture; the page goes on
                 self.tell(f"A picture could not be drawn: {one_line(error)}")
                 gone.wait(0.5)
             left = 1 / MOST_PER_SECOND - (time.perf_counter() - began)
             if left > 0:
                 gone.wait(left)
+
+    def _drawn_there(self, client: viser.ClientHandle, snapshot: Snapshot) -> bool:
+        """True if a browser draws a snapshot itself, provided that it can."""
+        recorded = self.recording is not None and self.recorder == client.client_id
+        plain = self.by_browser and self.shown == "colour" and not self.streaks
+        return plain and not recorded and drawable(snapshot)
 
     def _send(self, client: viser.ClientHandle, snapshot: Snapshot, size: PictureSize) -> None:
         pose, began = client.camera, time.perf_counter()

@@ -40,12 +40,14 @@ class Snapshot:
         state: Its state.
         health: Measurements at the end of the last step.
         number: Counts the snapshots of a session.
+        motion: Counts the motions of a session: another one begins at rest.
     """
 
     simulation: Simulation
     state: State
     health: FrameDiagnostics
     number: int
+    motion: int = 0
 
 
 @dataclass(frozen=True)
@@ -119,7 +121,7 @@ class Session:
         self._steps: deque[tuple[float, float]] = deque()  # when, and simulated time, of the last steps
         self._anchor: tuple[float, float] | None = None
         self._pull: Pull | None = None
-        self._number = 0
+        self._number = self._motion = 0
         self._first = settings  # those that `restore` goes back to
         self._past: deque[Past] = deque(maxlen=MOST_UNDONE)
         self.simulation = simulation or Simulation.from_settings(parser, settings)
@@ -341,7 +343,7 @@ class Session:
 
     def _publish(self, state: State, health: FrameDiagnostics) -> None:
         self._number += 1
-        self.snapshot = Snapshot(self.simulation, state, health, self._number)
+        self.snapshot = Snapshot(self.simulation, state, health, self._number, self._motion)
         with self._wake:
             self._wake.notify_all()
 
@@ -350,6 +352,7 @@ class Session:
         self._let_go()
         self._broken, self.problem, self._anchor = False, None, None
         self._steps.clear()
+        self._motion += 1
         self._publish(state, diagnose(self.simulation.solver, state, 0, 0.0))
 
     def _reset(self) -> None:

@@ -53,36 +53,6 @@ def test_same_seed_same_wind_on_any_device(device):
     assert float((other - reference).abs().max()) > 0.1
 
 
-@pytest.mark.parametrize("gust", [GaussianGust(0.3), UniformGust(0.3)], ids=["gaussian", "uniform"])
-def test_gusts_do_not_depend_on_the_substep(gust):
-    """Drawn per substep, the impulse of white noise fades with the root of the step; at fixed times it does not."""
-    wind = WindField([1.0, 0.0, 0.0], modulations=[gust])
-    impulses = []
-    for steps in (40, 400, 4000):
-        dt = 4.0 / steps
-        times = torch.arange(steps, dtype=torch.float64) * dt
-        impulses.append((wind(times) - torch.tensor([1.0, 0, 0]).double()).sum(0) * dt)
-    torch.testing.assert_close(impulses[1], impulses[2], rtol=0, atol=1e-9)
-    assert float(impulses[2].abs().max()) > 1e-3
-
-
-def test_gaussian_gust_statistics():
-    wind = WindField([2.0, -1.0, 0.5], modulations=[GaussianGust(std=0.3, interval=0.04)])
-    samples = wind((torch.arange(COUNT, dtype=torch.float64) + 0.5) * 0.04)
-    torch.testing.assert_close(samples.mean(0), torch.tensor([2.0, -1.0, 0.5]).double(), rtol=0, atol=0.3 * FIVE)
-    torch.testing.assert_close(samples.std(0), torch.full((3,), 0.3).double(), rtol=0, atol=0.3 * FIVE)
-
-
-def test_uniform_gust_scales_all_components_together():
-    wind = WindField([2.0, -1.0, 0.0], modulations=[UniformGust(delta=0.25)])
-    samples = wind((torch.arange(COUNT, dtype=torch.float64) + 0.5) * 0.04)
-    factor = samples[:, 0] / 2
-    torch.testing.assert_close(samples[:, 1], -factor)
-    assert 0.75 <= float(factor.min()) < 0.7505
-    assert 1.2495 < float(factor.max()) <= 1.25
-    assert float(samples[:, 2].abs().max()) == 0.0
-
-
 def test_sample_holds_for_its_interval_whatever_the_rounding():
     wind = WindField([1.0, 0, 0], modulations=[GaussianGust(interval=0.04)])
     frames = torch.arange(1, 500, dtype=torch.float64)

@@ -1,46 +1,31 @@
 """The command line of the converter."""
 
-import importlib.util
 import json
 import sys
-from pathlib import Path
 
 import pytest
+from shared import refused
 
+from gaussian_swaying.cli.export import main
 from gaussian_swaying.gaussians.ply import read_ply, write_ply
 from gaussian_swaying.scenes.procedural import FlagScene
-
-ROOT = Path(__file__).parents[2]
-
-
-def _main():
-    specification = importlib.util.spec_from_file_location("export_tool", ROOT / "tools/export.py")
-    module = importlib.util.module_from_spec(specification)
-    specification.loader.exec_module(module)
-    return module.main
 
 
 def test_a_file_and_a_sentence(tmp_path, capsys):
     write_ply(tmp_path / "flag.ply", FlagScene(spacing=0.1).generate())
     target = tmp_path / "flag.splat"
-    assert _main()([str(tmp_path / "flag.ply"), str(target)]) == 0
+    assert main([str(tmp_path / "flag.ply"), str(target)]) == 0
     assert target.stat().st_size == 96 * 32
     assert capsys.readouterr().out == f"wrote {target}\n"
-    assert _main()([str(tmp_path / "none.ply"), str(target)]) == 2
-    error = capsys.readouterr().err
-    assert error.startswith("error: ")
-    assert "none.ply does not exist" in error
-    assert error.count("\n") == 1
+    refused(main, [str(tmp_path / "none.ply"), str(target)], capsys, "none.ply does not exist")
 
 
 def test_usd_without_its_library_is_not_called_a_bug(tmp_path, capsys, monkeypatch):
     for name in ("pxr", "pxr.Usd"):
         monkeypatch.setitem(sys.modules, name, None)
     write_ply(tmp_path / "flag.ply", FlagScene(spacing=0.1).generate())
-    assert _main()([str(tmp_path / "flag.ply"), str(tmp_path / "a.usdc")]) == 2
     sentence = "error: USD files need usd-core: run pip install 'gaussian-swaying[usd]', or choose another format.\n"
-    assert capsys.readouterr().err == sentence
-    assert not (tmp_path / "a.usdc").exists()
+    refused(main, [str(tmp_path / "flag.ply"), str(tmp_path / "a.usdc")], capsys, sentence, folder=tmp_path)
 
 
 def _run(folder, **changes):
@@ -67,10 +52,10 @@ def _declared(path):
 def test_usd_takes_the_frame_of_the_run(tmp_path, capsys):
     pytest.importorskip("pxr")
     run = _run(tmp_path / "run")
-    assert _main()([str(run / "ply"), str(tmp_path / "film.usdc")]) == 0
+    assert main([str(run / "ply"), str(tmp_path / "film.usdc")]) == 0
     assert _declared(tmp_path / "film.usdc") == (10.0, 0.5, [0.0, -1.0, 0.0])
     assert "1 scene unit = 0.5 m (from summary.json of the run)" in capsys.readouterr().out
-    assert _main()([str(run / "ply/00001.ply"), str(tmp_path / "one.usdc")]) == 0
+    assert main([str(run / "ply/00001.ply"), str(tmp_path / "one.usdc")]) == 0
     assert _declared(tmp_path / "one.usdc") == (10.0, 0.5, [0.0, -1.0, 0.0])
 
 
@@ -78,13 +63,13 @@ def test_usd_as_given(tmp_path, capsys):
     pytest.importorskip("pxr")
     run = _run(tmp_path / "run")
     options = ["--up", "0", "2", "0", "--metres-per-unit", "3", "--fps", "5"]
-    assert _main()([str(run / "ply"), str(tmp_path / "film.usdc"), *options]) == 0
+    assert main([str(run / "ply"), str(tmp_path / "film.usdc"), *options]) == 0
     assert _declared(tmp_path / "film.usdc") == (5.0, 3.0, [0.0, 1.0, 0.0])
-    assert _main()([str(run / "ply"), str(tmp_path / "film.usdc"), "--metres-per-unit", "3"]) == 0
+    assert main([str(run / "ply"), str(tmp_path / "film.usdc"), "--metres-per-unit", "3"]) == 0
     assert _declared(tmp_path / "film.usdc") == (10.0, 3.0, [0.0, -1.0, 0.0])
     write_ply(tmp_path / "flag.ply", FlagScene(spacing=0.1).generate())
     capsys.readouterr()
-    assert _main()([str(tmp_path / "flag.ply"), str(tmp_path / "flag.usdc")]) == 0
+    assert main([str(tmp_path / "flag.ply"), str(tmp_path / "flag.usdc")]) == 0
     assert _declared(tmp_path / "flag.usdc") == (25.0, 1.0, [0.0, 0.0, 1.0])
     assert "(by default)" in capsys.readouterr().out
 
@@ -101,24 +86,18 @@ def test_usd_as_given(tmp_path, capsys):
 def test_bad_options(options, message, tmp_path, capsys):
     run = _run(tmp_path / "run")
     target = tmp_path / options[0]
-    assert _main()([str(run / "ply/00000.ply"), str(target), *options[1:]]) == 2
-    error = capsys.readouterr().err
-    assert message in error
-    assert error.count("\n") == 1
-    assert not target.exists()
+    refused(main, [str(run / "ply/00000.ply"), str(target), *options[1:]], capsys, message, folder=tmp_path)
 
 
 @pytest.mark.parametrize("changes", [{"sim_frame": None}, {"sim_frame": {"origin": [0]}}, {"frame_dt_s": 0}])
 def test_damaged_summary(changes, tmp_path, capsys):
     run = _run(tmp_path / "run", **changes)
-    assert _main()([str(run / "ply"), str(tmp_path / "film.usdc")]) == 2
-    error = capsys.readouterr().err
-    assert "summary.json cannot be used" in error
-    assert "set --up, --metres-per-unit and --fps instead" in error
+    words = "summary.json cannot be used", "set --up, --metres-per-unit and --fps instead"
+    refused(main, [str(run / "ply"), str(tmp_path / "film.usdc")], capsys, *words)
 
 
 def test_files_of_viewers_are_read_again(tmp_path):
     write_ply(tmp_path / "flag.ply", FlagScene(spacing=0.1).generate())
     for source, target in (("flag.ply", "a.compressed.ply"), ("a.compressed.ply", "b.splat"), ("b.splat", "c.ply")):
-        assert _main()([str(tmp_path / source), str(tmp_path / target)]) == 0
+        assert main([str(tmp_path / source), str(tmp_path / target)]) == 0
     assert len(read_ply(tmp_path / "c.ply")) == 96

@@ -5,6 +5,7 @@ Covers: fitting.plan.
 
 import pytest
 import yaml
+from shared import refused
 
 from gaussian_swaying.cli import shipped
 from gaussian_swaying.cli.fit import main
@@ -35,12 +36,7 @@ def _file(path, **fields):
 def test_bad_input(fields, words, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     file = _file(tmp_path / "fit.yaml", **fields)
-    assert main(["--config", file]) == 2
-    error = capsys.readouterr().err
-    assert error.startswith("error: ")
-    assert error.count("\n") == 1, error
-    assert words in error
-    assert [path.name for path in tmp_path.iterdir()] == ["fit.yaml"]
+    refused(main, ["--config", file], capsys, words, folder=tmp_path)
 
 
 @pytest.mark.parametrize("stage", ["tracks", "matches"])
@@ -48,10 +44,7 @@ def test_without_opencv(stage, tmp_path, monkeypatch, capsys):
     """Before the videos are read; the other stages need no extra."""
     monkeypatch.setitem(__import__("sys").modules, "cv2", None)
     for stages, words in (([stage], "pip install 'gaussian-swaying[fit]'"), (["pixels"], "video does not exist")):
-        assert main(["--config", _file(tmp_path / "fit.yaml", stages=stages)]) == 2
-        error = capsys.readouterr().err
-        assert error.count("\n") == 1, error
-        assert words in error
+        refused(main, ["--config", _file(tmp_path / "fit.yaml", stages=stages)], capsys, words)
 
 
 def test_the_shipped_fit_is_a_plan():

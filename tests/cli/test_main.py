@@ -1,20 +1,25 @@
 """The installed program, and configurations by name.
 
-Covers: _program, cli.continuing, cli.shipped.
+Covers: _program, cli.shipped.
 """
 
+import runpy
 import sys
+from pathlib import Path
 
 import pytest
 import yaml
+from shared import refused
 
 import gaussian_swaying
 from gaussian_swaying import _program as program
 from gaussian_swaying.cli import shipped
-from gaussian_swaying.cli.continuing import command
+from gaussian_swaying.cli.errors import command
 from gaussian_swaying.cli.main import COMMANDS, main
 from gaussian_swaying.cli.simulate import main as simulate
 from gaussian_swaying.cli.train import make_cli
+
+ROOT = Path(__file__).parents[2]
 
 
 def test_what_there_is(capsys):
@@ -24,10 +29,7 @@ def test_what_there_is(capsys):
         assert f"\n  {name} " in out
     assert main(["--version"]) == 0
     assert capsys.readouterr().out == f"gaussian-swaying {gaussian_swaying.__version__}\n"
-    assert main(["exprot"]) == 2
-    error = capsys.readouterr().err
-    assert error.startswith("error: There is no command 'exprot' (did you mean export?)")
-    assert error.count("\n") == 1
+    refused(main, ["exprot"], capsys, "error: There is no command 'exprot' (did you mean export?)")
 
 
 @pytest.mark.parametrize("name", list(COMMANDS))
@@ -36,6 +38,16 @@ def test_each_command_has_its_own_help(name, capsys):
         main([name, "--help"])
     assert left.value.code in (0, None)
     assert f"gaussian-swaying {name}" in " ".join(capsys.readouterr().out.split())
+
+
+@pytest.mark.parametrize("name", ["sim", "preview", "eval", "export", "train"])
+def test_each_tool_is_a_program(name, monkeypatch, capsys):
+    """In this process; test_simulate.py starts one in its own."""
+    monkeypatch.setattr(sys, "argv", [f"tools/{name}.py", "--help"])
+    with pytest.raises(SystemExit) as left:
+        runpy.run_path(str(ROOT / "tools" / f"{name}.py"), run_name="__main__")
+    assert left.value.code in (0, None)
+    assert capsys.readouterr().out.startswith(f"usage: {name}.py")
 
 
 def test_commands_that_are_printed_can_be_pasted(monkeypatch):
@@ -49,25 +61,14 @@ def test_commands_that_are_printed_can_be_pasted(monkeypatch):
 
 def test_a_configuration_by_name(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
-    small = [
-        "--scene.generator.init_args.spacing",
-        "0.05",
-        "--solver.dx",
-        "0.1",
-        "--solver.boundaries=[]",
-        "--camera.init_args.width",
-        "32",
-    ]
-    small += ["--camera.init_args.height", "18", "--recorder.video=false", "--frames", "2", "--device", "cpu"]
+    small = ["--scene.generator.init_args.spacing=0.05", "--solver.dx=0.1", "--solver.boundaries=[]", "--frames=2"]
+    small += ["--camera.init_args.width=32", "--camera.init_args.height=18", "--recorder.video=false", "--device=cpu"]
     assert main(["sim", "--config", "flag", *small]) == 0
     assert "wrote outputs/flag/summary.json" in capsys.readouterr().out
     kept = yaml.safe_load((tmp_path / "outputs/flag/config.yaml").read_text())
     assert kept["wind"]["flow"] == [6.0, 1.5, 0.0]
-    assert simulate(["--config=flga", *small]) == 2
-    error = capsys.readouterr().err
-    assert "no file and no configuration 'flga' (did you mean flag" in error
-    assert "ficus" in error
-    assert error.count("\n") == 1
+    words = "no file and no configuration 'flga' (did you mean flag", "ficus"
+    refused(simulate, ["--config=flga", *small], capsys, *words)
 
 
 def test_a_file_comes_before_a_name(tmp_path, monkeypatch):

@@ -2,6 +2,7 @@
 
 import pytest
 import yaml
+from shared import refused
 
 from gaussian_swaying.cli import shipped
 from gaussian_swaying.cli.main import main as program
@@ -14,15 +15,7 @@ def _file(path, **fields):
 
 
 def _refused(arguments, folder, capsys, *words):
-    before = sorted(folder.rglob("*"))
-    capsys.readouterr()
-    assert main(arguments) == 2
-    error = capsys.readouterr().err
-    assert error.startswith("error: ")
-    assert error.count("\n") == 1, error
-    for word in words:
-        assert word in error, error
-    assert sorted(folder.rglob("*")) == before
+    refused(main, arguments, capsys, *words, folder=folder)
 
 
 def test_the_list_of_runs(tmp_path, monkeypatch, capsys):

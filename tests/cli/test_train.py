@@ -19,6 +19,7 @@ import pytest
 import torch
 import yaml
 from lightning.pytorch.utilities.rank_zero import rank_zero_info, rank_zero_warn
+from shared import contents
 
 from gaussian_swaying.captures.generated_capture import GeneratedCapture
 from gaussian_swaying.cli.errors import parser_sentence
@@ -141,6 +142,18 @@ def test_a_resumed_run_is_the_same_bit_for_bit(capture, tmp_path):
         assert torch.equal(getattr(resumed.model.splat, name), getattr(straight.splat, name)), name
 
 
+def test_on_several_devices_numbers_still_count_images(capture, tmp_path):
+    """Of which a step of Lightning takes one on each; the configuration that is kept is the one that was given."""
+    numbers = {"trainer.max_steps": 21, "trainer.val_check_interval": 8, "checkpoint.every_n_train_steps": 10}
+    cli = make_cli(_arguments(capture, tmp_path, **numbers, **{"trainer.devices": 2}), run=False)
+    assert cli.trainer.world_size == 2
+    assert (cli.trainer.max_steps, cli.trainer.val_check_interval) == (11, 4)
+    assert "'every_n_train_steps': 5" in cli.trainer.checkpoint_callback.state_key
+    cli.run_folder.save_config(tmp_path)
+    kept = yaml.safe_load((tmp_path / "config.yaml").read_text())
+    assert {name: kept[name.split(".")[0]][name.split(".")[1]] for name in numbers} == numbers
+
+
 def test_the_last_image_is_in_a_checkpoint(capture, tmp_path):
     """13 images with a checkpoint every 10."""
     main(["fit", *_arguments(capture, tmp_path, **{"trainer.max_steps": 13, "checkpoint.save_top_k": 1})])
@@ -166,10 +179,6 @@ def _rows(folder):
         return list(csv.DictReader(file))
 
 
-def _contents(folder):
-    return {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()}
-
-
 @pytest.fixture
 def _interrupts():
     """Lightning ignores Ctrl-C once it has heard it, to the end of the process."""
@@ -179,14 +188,14 @@ def _interrupts():
 
 
 def _stop_at(monkeypatch, step, error):
-    train = SplatTrainer._train_on
+    train = SplatTrainer.training_step
 
-    def stop(self, batch, now):
-        if now == step:
+    def stop(self, batch):
+        if self.global_step == step:
             raise error
-        return train(self, batch, now)
+        return train(self, batch)
 
-    monkeypatch.setattr(SplatTrainer, "_train_on", stop)
+    monkeypatch.setattr(SplatTrainer, "training_step", stop)
 
 
 @pytest.mark.slow(gate=["divergence", "SIGTERM"])
@@ -228,7 +237,7 @@ def test_a_refused_training_changes_nothing(capture, tmp_path, capsys):
     few = {"trainer.max_steps": 3, "checkpoint.every_n_train_steps": 2}
     assert main(["fit", *_arguments(capture, folder, **few)]) == 0
     assert not [path for path in folder.rglob(".*")]
-    before = _contents(tmp_path)
+    before = contents(tmp_path)
     assert {"metrics.csv", "config.yaml", "point_cloud.ply", "step_000003.ckpt"} <= {path.name for path in before}
     broken = tmp_path / "broken.ckpt"
     shutil.copytree(capture, tmp_path / "cut")
@@ -239,7 +248,7 @@ def test_a_refused_training_changes_nothing(capture, tmp_path, capsys):
     content[len(content) // 2] ^= 1
     broken.write_bytes(content)
     data = {"class_path": "CaptureDataModule", "init_args": {"path": str(tmp_path / "cut"), "workers": 1}}
-    before = _contents(tmp_path)
+    before = contents(tmp_path)
     for options, words in (
         ({"data.init_args.path": "nowhere"}, "nowhere does not exist"),
         ({"data": json.dumps(data)}, ""),
@@ -253,12 +262,12 @@ def test_a_refused_training_changes_nothing(capture, tmp_path, capsys):
         assert words in said, said
         assert "error: " in said
         assert "to continue" not in said
-        assert _contents(tmp_path) == before, options
+        assert contents(tmp_path) == before, options
     lock = FolderLock(folder)
     assert main(["fit", *_arguments(capture, folder, **few)]) == 2
     assert f"process {os.getpid()} on this host" in capsys.readouterr().err
     lock.release()
-    assert _contents(tmp_path) == before
+    assert contents(tmp_path) == before
     # looking at it adds to its log
     rows = _rows(folder)
     capsys.readouterr()
@@ -273,11 +282,11 @@ def test_a_refused_training_changes_nothing(capture, tmp_path, capsys):
 def test_a_second_training_moves_the_first_aside(capture, tmp_path, capsys):
     folder, steps = tmp_path / "run", {"trainer.max_steps": 2}
     assert main(["fit", *_arguments(capture, folder, **steps)]) == 0
-    first = _contents(folder)
+    first = contents(folder)
     assert main(["fit", *_arguments(capture, folder, **steps)]) == 0
     assert f"An earlier run in {folder} was moved to {tmp_path / 'run.1'}." in capsys.readouterr().out
     assert {path.name: content for path, content in first.items()} == {
-        path.name: content for path, content in _contents(tmp_path / "run.1").items()
+        path.name: content for path, content in contents(tmp_path / "run.1").items()
     }
     # its checkpoint from elsewhere is read, and it stays where it is
     old = tmp_path / "run.1/checkpoints/step_000002.ckpt"

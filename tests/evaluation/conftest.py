@@ -47,8 +47,8 @@ def make_run(tmp_path):
             arrays[f"position_{i:05d}"] = (at - scale * np.array(ORIGIN)).astype(np.float32)
             arrays[f"F_{i:05d}"] = np.tile(np.eye(3, dtype=np.float16), (particles, 1, 1))
         np.savez(folder / "trajectory.npz", **arrays)
-        line = f"1 scene unit = {scale:g} m; origin {list(ORIGIN)}; up [0.0, 0.0, 1.0] (scene units)"
-        told = {"status": "complete", "frame": line, "frame_dt_s": 0.04, "frames": frames} | summary
+        place = {"origin": list(ORIGIN), "rotation": np.eye(3).tolist(), "metres_per_unit": scale}
+        told = {"status": "complete", "sim_frame": place, "frame_dt_s": 0.04, "frames": frames} | summary
         (folder / "summary.json").write_text(json.dumps(told))
         return folder
 

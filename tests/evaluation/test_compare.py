@@ -123,7 +123,7 @@ def test_scene_units_that_are_not_metres(make_run, make_reference):
     assert found["mean"]["chamfer_m"] < 0.02
 
 
-def test_the_frame_in_numbers_goes_before_the_line(make_run, make_reference):
+def test_a_turned_frame(make_run, make_reference):
     """Turned axes: the particles are where the rotation puts them back."""
     turn = [[0.0, 1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, 1.0]]
     exact = {"origin": [1.0, 2.0, 3.0], "rotation": turn, "metres_per_unit": 1.0}
@@ -135,14 +135,13 @@ def test_the_frame_in_numbers_goes_before_the_line(make_run, make_reference):
     assert found["mean"]["chamfer_m"] < 0.02
 
 
-def test_the_line_for_people_is_understood(make_run, make_reference):
-    """It is the one that a run writes."""
-    points = torch.tensor([[0.0, 1.5, 2.5], [2.0, 2.5, 3.5]])
-    line = SimFrame.fit(points, metres_per_unit=1.0).describe()
-    found = compare_run(make_run(frame=line), make_reference(), points=POINTS)
+def test_the_frame_that_a_run_writes_is_understood(make_run, make_reference):
+    frame = SimFrame.fit(torch.tensor([[0.0, 1.5, 2.5], [2.0, 2.5, 3.5]]), metres_per_unit=1.0)
+    place = {"origin": frame.origin.tolist(), "rotation": frame.rotation.tolist(), "metres_per_unit": 1.0}
+    found = compare_run(make_run(sim_frame=place), make_reference(), points=POINTS)
     assert found["mean"]["chamfer_m"] < 0.02
-    with pytest.raises(ValueError, match="has no usable `frame`"):
-        compare_run(make_run("other", frame="somewhere"), make_reference("another"))
+    with pytest.raises(ValueError, match="has no `sim_frame`: run the simulation again"):
+        compare_run(make_run("other", sim_frame=None), make_reference("another"))
 
 
 def test_offsets(make_run, make_reference):

@@ -4,15 +4,12 @@ import math
 
 import pytest
 import torch
+from shared import unit
 
 from gaussian_swaying.gaussians.area import coverage_area, patch_area
 from gaussian_swaying.geometry.rotations import quat_to_rotation
 
 UP = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)
-
-
-def _unit(*shape, device="cpu", dtype=torch.float64):
-    return torch.nn.functional.normalize(torch.randn(*shape, device=device, dtype=dtype), dim=-1)
 
 
 def _plane(kind, side):
@@ -69,14 +66,14 @@ def test_sum_is_the_area_of_a_sphere(kind, count, overlap):
         radius = (1 - z * z).sqrt()
         points = torch.stack([radius * angle.cos(), radius * angle.sin(), z], dim=-1)
     else:
-        points = _unit(count, 3)
+        points = unit(count, 3)
     total = float(coverage_area(points, points, _discs(count, 4 * math.pi, overlap)).sum())
     assert total == pytest.approx(4 * math.pi, rel=0.03)
 
 
 def test_sum_scales_and_moves_with_the_scene():
     points, scale = _plane("random", 40), 250.0
-    rotation = quat_to_rotation(_unit(4))
+    rotation = quat_to_rotation(unit(4))
     moved = scale * points @ rotation.T + 1e3
     normals = (rotation @ UP).expand(len(points), 3)
     total = float(coverage_area(moved, normals, _discs(len(points), scale**2, 0.5)).sum())
@@ -152,7 +149,7 @@ def test_wild_input_stays_finite_and_positive():
     line = torch.stack([torch.linspace(0, 1, 300), torch.zeros(300), torch.zeros(300)], dim=-1)
     means = torch.cat([torch.rand(2000, 3), cluster, line, torch.full((60, 3), 0.5), torch.tensor([[1e6, 0, 0]])])
     scales = -4 + 2 * torch.randn(len(means), 3)
-    areas = coverage_area(means, _unit(len(means), 3, dtype=torch.float32), scales, torch.rand(len(means)))
+    areas = coverage_area(means, unit(len(means), 3, dtype=torch.float32), scales, torch.rand(len(means)))
     assert torch.isfinite(areas).all()
     assert (areas > 0).all()
     assert coverage_area(torch.zeros(0, 3), torch.zeros(0, 3), torch.zeros(0, 3)).shape == (0,)

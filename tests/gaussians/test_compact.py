@@ -4,28 +4,13 @@ import numpy as np
 import pytest
 import torch
 from plyfile import PlyData, PlyElement
+from small_scenes import varied_cloud
 
-from gaussian_swaying.gaussians.cloud import GaussianCloud
 from gaussian_swaying.gaussians.compact import read_compressed_ply, read_gaussians, read_splat
 from gaussian_swaying.gaussians.export import export_cloud
 from gaussian_swaying.gaussians.harmonics import SH_DC
 from gaussian_swaying.gaussians.ply import write_ply
 from gaussian_swaying.simulation.scene import Scene
-
-
-def _cloud(count=300, degree=0, seed=0):
-    generator = torch.Generator().manual_seed(seed)
-
-    def random(*shape):
-        return torch.rand(*shape, generator=generator)
-
-    return GaussianCloud(
-        means=4 * random(count, 3) - 1,
-        quats=random(count, 4) - 0.5,
-        scales=-4 + 2 * random(count, 3),
-        opacities=6 * random(count) - 2,
-        sh=0.8 * (random(count, (degree + 1) ** 2, 3) - 0.5),
-    )
 
 
 def _in_order(found, expected):
@@ -43,7 +28,7 @@ def _turned(a, b):
 
 def test_splat(tmp_path):
     """Centres and sizes exactly; colours, opacities and quaternions to the 8 bits that are cut off, not rounded."""
-    cloud = _cloud()
+    cloud = varied_cloud(degree=0)
     export_cloud(tmp_path / "a.splat", cloud, format="splat")
     found = _in_order(read_splat(tmp_path / "a.splat"), cloud)
     assert torch.equal(found.means, cloud.means)
@@ -58,9 +43,13 @@ def test_splat(tmp_path):
 
 @pytest.mark.parametrize("degree", [0, 1, 2, 3])
 def test_compressed_ply(degree, tmp_path):
-    """Within a step of each chunk's range, harmonics of every degree in their place."""
-    cloud = _cloud(degree=degree)
-    export_cloud(tmp_path / "a.compressed.ply", cloud, format="compressed_ply")
+    """Within a step of each chunk's range, harmonics of every degree in their place; what is faint is gone."""
+    faint = varied_cloud(degree=degree)
+    faint.opacities[7] = -8.0
+    export_cloud(tmp_path / "a.compressed.ply", faint, format="compressed_ply")
+    elements = [element.name for element in PlyData.read(str(tmp_path / "a.compressed.ply")).elements]
+    assert elements == (["chunk", "vertex", "sh"] if degree else ["chunk", "vertex"])
+    cloud = faint.select(torch.arange(300) != 7)
     found = _in_order(read_compressed_ply(tmp_path / "a.compressed.ply"), cloud)
     assert found.sh.shape == cloud.sh.shape
     torch.testing.assert_close(found.means, cloud.means, rtol=0, atol=4 / 1023)
@@ -74,7 +63,7 @@ def test_compressed_ply(degree, tmp_path):
 
 def test_any_format_by_name_and_content(tmp_path):
     """What a scene takes: a compressed file is known by its header, whatever its name."""
-    cloud = _cloud()
+    cloud = varied_cloud(degree=0)
     write_ply(tmp_path / "a.ply", cloud)
     export_cloud(tmp_path / "b.compressed.ply", cloud, format="compressed_ply")
     (tmp_path / "b.compressed.ply").rename(tmp_path / "b.ply")
@@ -104,7 +93,7 @@ def test_files_of_other_programs(tmp_path):
 
 
 def _compressed(path, change):
-    export_cloud(path, _cloud(degree=1), format="compressed_ply")
+    export_cloud(path, varied_cloud(degree=1), format="compressed_ply")
     ply = PlyData.read(str(path))
     elements = {element.name: element.data.copy() for element in ply.elements}
     change(elements)
@@ -126,7 +115,7 @@ def _without(table, name):
         (lambda e: e.update(vertex=_without(e["vertex"], "packed_scale")), "no property `packed_scale`"),
         (lambda e: e.update(chunk=_without(e["chunk"], "max_y")), "no property `max_y` in its chunks"),
         (lambda e: e.update(sh=e["sh"][:7]), "the element `sh` does not hold 9, 24 or 45"),
-        (lambda e: e["chunk"]["min_x"].fill(np.nan), "means of 300 of 300 Gaussians are NaN"),
+        (lambda e: e["chunk"]["min_x"].fill(np.nan), "`means` is NaN or infinite for 300 of 300 Gaussians"),
         (lambda e: e["chunk"]["min_x"].fill(-9e37), "beyond ±1e+12 for"),
         (lambda e: e["chunk"]["max_scale_z"].fill(1e5), "gives a size of zero or infinity"),
         (lambda e: e.update(vertex=e["vertex"][:0]), "zero Gaussians"),
@@ -149,10 +138,10 @@ def test_bad_splat(tmp_path):
         path.write_bytes(data)
         with pytest.raises(ValueError, match=f"has {len(data)} bytes, but a .splat file holds 32 for each Gaussian"):
             read_gaussians(path)
-    export_cloud(path, _cloud(), format="splat")
+    export_cloud(path, varied_cloud(degree=0), format="splat")
     rows = np.fromfile(path, dtype="u1").reshape(-1, 32)
     for place, value, message in (
-        (slice(0, 4), np.frombuffer(np.float32(np.nan).tobytes(), "u1"), "means of 1 of 300 Gaussians are NaN"),
+        (slice(0, 4), np.frombuffer(np.float32(np.nan).tobytes(), "u1"), "`means` is NaN or infinite for 1 of 300"),
         (slice(4, 8), np.frombuffer(np.float32(1e38).tobytes(), "u1"), "beyond ±1e[+]12 for 1 of 300"),
         (slice(12, 24), 0, "gives a size of zero or infinity for 1 of 300"),
         (slice(28, 32), 128, "is zero for 1 of 300"),

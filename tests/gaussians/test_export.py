@@ -1,4 +1,4 @@
-"""Files for viewers: what a reader of each format finds in them."""
+"""Files for viewers: what is left out of them, films, and names; test_compact.py reads what gsplat wrote."""
 
 import math
 import warnings
@@ -6,8 +6,10 @@ import warnings
 import numpy as np
 import pytest
 import torch
+from small_scenes import varied_cloud
 
 from gaussian_swaying.gaussians.cloud import GaussianCloud
+from gaussian_swaying.gaussians.compact import read_gaussians
 from gaussian_swaying.gaussians.export import (
     SUFFIXES,
     UsdFilm,
@@ -19,114 +21,25 @@ from gaussian_swaying.gaussians.export import (
     usd_arrays,
     write_usd,
 )
-from gaussian_swaying.gaussians.ply import read_ply, write_ply
+from gaussian_swaying.gaussians.ply import write_ply
 from gaussian_swaying.geometry.rotations import quat_to_rotation
-
-SH_DC = 0.28209479177387814
-
-
-def _cloud(count=300, degree=1, seed=0):
-    generator = torch.Generator().manual_seed(seed)
-
-    def random(*shape):
-        return torch.rand(*shape, generator=generator)
-
-    return GaussianCloud(
-        means=4 * random(count, 3) - 1,
-        quats=random(count, 4) - 0.5,
-        scales=-4 + 2 * random(count, 3),
-        opacities=6 * random(count) - 2,
-        sh=0.8 * (random(count, (degree + 1) ** 2, 3) - 0.5),
-    )
-
-
-def _match(found, expected):
-    """Index of the found centre nearest to each expected one, as two formats sort."""
-    distance = torch.cdist(expected, found)
-    assert torch.unique(distance.argmin(1)).numel() == len(expected)
-    return distance.argmin(1)
-
-
-def read_splat(path):
-    """antimatter15's format: centre and size in float32, colour and opacity in 8 bits, quaternion in 8 bits."""
-    rows = np.fromfile(path, dtype=[("means", "<f4", 3), ("scales", "<f4", 3), ("rgba", "u1", 4), ("quats", "u1", 4)])
-    return {name: torch.from_numpy(rows[name].astype(np.float32)) for name in rows.dtype.names}
-
-
-def read_compressed(path):
-    """PlayCanvas' format: chunks of 256 with their ranges, 11, 10 and 11 bits for centres and sizes."""
-    from plyfile import PlyData
-
-    ply = PlyData.read(str(path))
-    chunk, vertex = ply["chunk"].data, ply["vertex"].data
-    of = np.arange(len(vertex)) // 256
-
-    def unpack(name, low, high):
-        packed = vertex[name].astype(np.int64)
-        share = np.stack([(packed >> 21) / 2047, ((packed >> 11) & 1023) / 1023, (packed & 2047) / 2047], -1)
-        lows, highs = (np.stack([chunk[f"{end}_{axis}"][of] for axis in low], -1) for end in ("min", "max"))
-        return torch.from_numpy(lows + share * (highs - lows)).float()
-
-    color = vertex["packed_color"].astype(np.int64)
-    share = np.stack([(color >> shift & 255) / 255 for shift in (24, 16, 8)], -1)
-    lows, highs = (np.stack([chunk[f"{end}_{c}"][of] for c in "rgb"], -1) for end in ("min", "max"))
-    return {
-        "means": unpack("packed_position", "xyz", None),
-        "scales": unpack("packed_scale", ("scale_x", "scale_y", "scale_z"), None),
-        "colors": torch.from_numpy(lows + share * (highs - lows)).float(),
-        "opacity": torch.from_numpy((color & 255) / 255).float(),
-        "elements": [element.name for element in ply.elements],
-    }
-
-
-def test_splat_files_hold_the_gaussians(tmp_path):
-    """Colours, opacities and quaternions to their 8 bits, which gsplat cuts off rather than rounds."""
-    cloud = _cloud()
-    export_cloud(tmp_path / "a.splat", cloud, format="splat")
-    found = read_splat(tmp_path / "a.splat")
-    order = _match(found["means"], cloud.means)
-    assert torch.equal(found["means"][order], cloud.means)
-    torch.testing.assert_close(found["scales"][order], cloud.scales.exp())
-    rgba = torch.cat([cloud.sh[:, 0] * SH_DC + 0.5, cloud.opacities.sigmoid()[:, None]], 1)
-    torch.testing.assert_close(found["rgba"][order] / 255, rgba, rtol=0, atol=1.01 / 255)
-    quats = torch.nn.functional.normalize(cloud.quats, dim=-1)
-    torch.testing.assert_close((found["quats"][order] - 128) / 128, quats, rtol=0, atol=1.01 / 128)
-
-
-@pytest.mark.parametrize("degree", [0, 1])
-def test_compressed_files_hold_the_gaussians(degree, tmp_path):
-    """Within a step of each chunk's range; faint Gaussians are gone, and without harmonics so is their element."""
-    cloud = _cloud(degree=degree)
-    cloud.opacities[7] = -8.0
-    export_cloud(tmp_path / "a.compressed.ply", cloud, format="compressed_ply")
-    found = read_compressed(tmp_path / "a.compressed.ply")
-    assert found["elements"] == (["chunk", "vertex", "sh"] if degree else ["chunk", "vertex"])
-    kept = torch.arange(300) != 7
-    order = _match(found["means"], cloud.means[kept])
-    assert len(found["means"]) == 299
-    torch.testing.assert_close(found["means"][order], cloud.means[kept], rtol=0, atol=4 / 1023)
-    torch.testing.assert_close(found["scales"][order], cloud.scales[kept], rtol=0, atol=2 / 1023)
-    torch.testing.assert_close(found["colors"][order], cloud.sh[kept, 0] * SH_DC + 0.5, rtol=0, atol=1 / 255)
-    torch.testing.assert_close(found["opacity"][order], cloud.opacities[kept].sigmoid(), rtol=0, atol=1 / 255)
 
 
 def test_one_bad_value_does_not_empty_the_file(tmp_path):
     """gsplat writes nothing at all for one NaN or infinite opacity."""
-    cloud = _cloud()
+    cloud = varied_cloud()
     cloud.opacities[3], cloud.opacities[4], cloud.opacities[5] = math.nan, math.inf, -math.inf
     cloud.means[6, 1], cloud.sh[7, 1, 0], cloud.quats[8] = math.inf, math.nan, 0.0
     cloud.scales[9, 0], cloud.scales[10, 0] = math.nan, -math.inf
     gone = [3, 6, 7, 8, 9]
     kept = torch.tensor([k for k in range(300) if k not in gone])
-    for format, read in (("splat", read_splat), ("compressed_ply", read_compressed), ("ply", None)):
+    for format in ("splat", "compressed_ply", "ply"):
         path = tmp_path / f"a{SUFFIXES[format]}"
         with pytest.warns(UserWarning, match="left out 5 of 300 Gaussians that are not finite"):
             export_cloud(path, cloud, format=format)
-        if read is None:
-            assert torch.equal(read_ply(path).means, cloud.means[kept])
-        else:
-            count = len(kept) - (1 if format == "compressed_ply" else 0)  # the fifth is clear, and so left out there
-            assert len(read(path)["means"]) == count
+        count = len(kept) - (1 if format == "compressed_ply" else 0)  # the fifth is clear, and so left out there
+        assert len(read_gaussians(path)) == count
+    assert torch.equal(read_gaussians(path).means, cloud.means[kept])
     clean = cleaned(cloud)
     assert clean.opacities[clean.opacities.argmax()] == 16.0
     assert float(clean.scales.min()) == -20.0
@@ -134,19 +47,19 @@ def test_one_bad_value_does_not_empty_the_file(tmp_path):
 
 def test_equal_values_in_a_chunk_are_kept(tmp_path):
     """gsplat divides by the range of a chunk, which is zero for a flat white sheet."""
-    cloud = _cloud(degree=0)
+    cloud = varied_cloud(degree=0)
     cloud.means[:, 2], cloud.sh[:], cloud.scales[:] = 0.25, 1.0, -3.0
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         export_cloud(tmp_path / "a.compressed.ply", cloud, format="compressed_ply")
-    found = read_compressed(tmp_path / "a.compressed.ply")
-    assert bool((found["means"][:, 2] == 0.25).all())
-    torch.testing.assert_close(found["colors"], torch.full((300, 3), SH_DC + 0.5))
-    torch.testing.assert_close(found["scales"], torch.full((300, 3), -3.0))
+    found = read_gaussians(tmp_path / "a.compressed.ply")
+    assert bool((found.means[:, 2] == 0.25).all())
+    torch.testing.assert_close(found.sh, cloud.sh)
+    torch.testing.assert_close(found.scales, cloud.scales)
 
 
 def test_what_cannot_be_written_leaves_nothing(tmp_path):
-    cloud = _cloud(3)
+    cloud = varied_cloud(3)
     with pytest.raises(ValueError, match="`format` to be one of ply, compressed_ply, splat, usd, but got 'obj'"):
         export_cloud(tmp_path / "a.obj", cloud, format="obj")
     with pytest.raises(FileNotFoundError, match="is not a folder"):
@@ -178,7 +91,7 @@ def test_usd_round_trip(schema, tmp_path, monkeypatch):
         monkeypatch.delattr(UsdVol, "ParticleField3DGaussianSplat", raising=False)
     elif not hasattr(UsdVol, "ParticleField3DGaussianSplat"):
         pytest.skip("this usd-core has no schema of splats")
-    cloud = _cloud(20)
+    cloud = varied_cloud(20)
     white = GaussianCloud(cloud.means, cloud.quats, cloud.scales, cloud.opacities, torch.ones_like(cloud.sh))
     clouds = [_moved(cloud, 0.0), _moved(cloud, 0.1), _moved(cloud, 0.4), _moved(white, 0.5, turn=True)]
     path = tmp_path / "film.usdc"
@@ -212,7 +125,7 @@ def test_usd_round_trip(schema, tmp_path, monkeypatch):
 
 def test_usd_keeps_the_place_of_a_gaussian_that_is_not_finite(tmp_path):
     pytest.importorskip("pxr")
-    cloud = _cloud(5)
+    cloud = varied_cloud(5)
     bad = _moved(cloud, 0.0)
     bad.means[2, 0], bad.quats[3] = math.nan, 0.0
     write_usd(tmp_path / "film.usda", [cloud, bad])
@@ -226,21 +139,21 @@ def test_bad_films(tmp_path):
     pytest.importorskip("pxr")
     with pytest.raises(ValueError, match="there are no frames"):
         write_usd(tmp_path / "a.usdc", [])
-    with pytest.raises(ValueError, match="frames differ in their number"):
-        write_usd(tmp_path / "a.usdc", [_cloud(4), _cloud(5)])
+    with pytest.raises(ValueError, match="Frame 1 has another number"):
+        write_usd(tmp_path / "a.usdc", [varied_cloud(4), varied_cloud(5)])
     film = UsdFilm(25.0)
-    film.add(0, usd_arrays(_cloud(4)))
-    film.add(5, usd_arrays(_moved(_cloud(4), 1.0)))  # frames in between are on the way
+    film.add(0, usd_arrays(varied_cloud(4)))
+    film.add(5, usd_arrays(_moved(varied_cloud(4), 1.0)))  # frames in between are on the way
     film.save(tmp_path / "sparse.usdc")
     between = read_usd_frame(tmp_path / "sparse.usdc", 1)["positions"]
-    np.testing.assert_allclose(between, _cloud(4).means.numpy() + 0.2, atol=1e-6)
+    np.testing.assert_allclose(between, varied_cloud(4).means.numpy() + 0.2, atol=1e-6)
     (tmp_path / "sparse.usdc").unlink()
     with pytest.raises(ValueError, match="Frame 6 has another number of Gaussians than frame 0"):
-        film.add(6, usd_arrays(_cloud(5)))
+        film.add(6, usd_arrays(varied_cloud(5)))
     (tmp_path / "b.usda").write_text("no usd")
     with pytest.raises(ValueError, match="cannot be read as a USD file"):
         read_usd_frame(tmp_path / "b.usda", 0)
-    export_cloud(tmp_path / "one.usdc", _cloud(4), format="usd")
+    export_cloud(tmp_path / "one.usdc", varied_cloud(4), format="usd")
     assert sorted(path.name for path in tmp_path.iterdir()) == ["b.usda", "one.usdc"]
 
 
@@ -250,7 +163,7 @@ def test_usd_without_its_library_is_one_sentence(tmp_path, monkeypatch):
     for name in ("pxr", "pxr.Usd"):
         monkeypatch.setitem(sys.modules, name, None)
     with pytest.raises(ImportError, match=r"USD files need usd-core: run pip install 'gaussian-swaying\[usd\]'"):
-        export_cloud(tmp_path / "a.usdc", _cloud(4), format="usd")
+        export_cloud(tmp_path / "a.usdc", varied_cloud(4), format="usd")
 
 
 # ---- files to files
@@ -264,10 +177,10 @@ def test_the_name_says_the_format(tmp_path):
 
 
 def test_files_are_converted(tmp_path):
-    cloud = _cloud(20)
+    cloud = varied_cloud(20)
     write_ply(tmp_path / "a.ply", cloud)
     convert(tmp_path / "a.ply", tmp_path / "a.splat")
-    assert len(read_splat(tmp_path / "a.splat")["means"]) == 20
+    assert len(read_gaussians(tmp_path / "a.splat")) == 20
     frames = tmp_path / "ply"
     frames.mkdir()
     with pytest.raises(ValueError, match=r"contains no \.ply"):
@@ -282,7 +195,7 @@ def test_files_are_converted(tmp_path):
 
 def test_a_sequence_becomes_a_film(tmp_path):
     pytest.importorskip("pxr")
-    cloud = _cloud(20)
+    cloud = varied_cloud(20)
     for k in range(3):
         write_ply(tmp_path / f"{k:05d}.ply", _moved(cloud, 0.1 * k))
     convert(tmp_path, tmp_path / "film.usdc", fps=10.0)

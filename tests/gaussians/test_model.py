@@ -2,9 +2,10 @@
 
 import pytest
 import torch
+from shared import gradients
+from small_scenes import varied_cloud
 
 from gaussian_swaying.gaussians.area import coverage_area, patch_area
-from gaussian_swaying.gaussians.cloud import GaussianCloud
 from gaussian_swaying.gaussians.harmonics import sh_to_color
 from gaussian_swaying.gaussians.model import GaussianSurfaceModel
 from gaussian_swaying.gaussians.ply import read_ply
@@ -14,39 +15,14 @@ from gaussian_swaying.geometry.covariances import (
 from gaussian_swaying.geometry.patches import deform_normal, smallest_axis_normal
 
 
-def _unit(*shape, device="cpu", dtype=torch.float64):
-    return torch.nn.functional.normalize(torch.randn(*shape, device=device, dtype=dtype), dim=-1)
-
-
-def _gradients(count, device="cpu", dtype=torch.float64):
-    """Deformation gradients of both orientations, none of them near singular."""
-    f = torch.eye(3, dtype=torch.float64) + 0.3 * torch.randn(count, 3, 3, dtype=torch.float64)
-    f = f[torch.linalg.det(f).abs() > 0.2]
-    assert len(f) > 4
-    f[0] = torch.diag(torch.tensor([1.0, -1.0, 1.0]))
-    return f.to(device, dtype)
-
-
-def _cloud(count=6, degree=2, normals=False, device="cpu", dtype=torch.float32):
-    cloud = GaussianCloud(
-        means=torch.randn(count, 3),
-        quats=torch.randn(count, 4),
-        scales=torch.randn(count, 3) - 3,
-        opacities=torch.randn(count),
-        sh=torch.randn(count, (degree + 1) ** 2, 3),
-        normals=_unit(count, 3, dtype=torch.float32) if normals else None,
-    )
-    return cloud.to(device, dtype)
-
-
 def test_model_holds_storage_form_parameters(device, dtype):
-    model = GaussianSurfaceModel.from_cloud(_cloud(device=device, dtype=dtype))
+    model = GaussianSurfaceModel.from_cloud(varied_cloud(6, 2).to(device, dtype))
     shapes = {name: tuple(parameter.shape) for name, parameter in model.named_parameters()}
     assert shapes == {"means": (6, 3), "quats": (6, 4), "scales": (6, 3), "opacities": (6,), "sh0": (6, 1, 3)} | {
         "shN": (6, 8, 3)
     }
     assert all(parameter.requires_grad for parameter in model.parameters())
-    fixed = GaussianSurfaceModel.from_cloud(_cloud(device=device, dtype=dtype), requires_grad=False)
+    fixed = GaussianSurfaceModel.from_cloud(varied_cloud(6, 2).to(device, dtype), requires_grad=False)
     assert not any(parameter.requires_grad for parameter in fixed.parameters())
     assert len(model) == 6
 
@@ -54,7 +30,7 @@ def test_model_holds_storage_form_parameters(device, dtype):
 @pytest.mark.parametrize("degree", [0, 3])
 @pytest.mark.parametrize("normals", [False, True])
 def test_model_round_trip_through_a_file(tmp_path, degree, normals):
-    cloud = _cloud(degree=degree, normals=normals)
+    cloud = varied_cloud(6, degree, normals=normals)
     GaussianSurfaceModel.from_cloud(cloud).save_ply(tmp_path / "a.ply")
     model = GaussianSurfaceModel.from_ply(tmp_path / "a.ply", requires_grad=False)
     back = model.to_cloud()
@@ -66,7 +42,7 @@ def test_model_round_trip_through_a_file(tmp_path, degree, normals):
 
 
 def test_model_leaves_its_cloud_alone():
-    cloud = _cloud(normals=True)
+    cloud = varied_cloud(6, 2, normals=True)
     before = cloud.means.clone()
     model = GaussianSurfaceModel.from_cloud(cloud)
     with torch.no_grad():
@@ -75,18 +51,18 @@ def test_model_leaves_its_cloud_alone():
 
 
 def test_model_normals_take_the_side_of_the_file():
-    cloud = _cloud(200, normals=True)
+    cloud = varied_cloud(200, 2, normals=True)
     normals = GaussianSurfaceModel.from_cloud(cloud).normals()
     axis = smallest_axis_normal(cloud.quats, cloud.scales)
     assert ((normals * cloud.normals).sum(-1) >= 0).all()
     torch.testing.assert_close((normals * axis).sum(-1).abs(), torch.ones(200))
     assert not torch.equal(normals, axis)
-    plain = GaussianSurfaceModel.from_cloud(_cloud())
+    plain = GaussianSurfaceModel.from_cloud(varied_cloud(6, 2))
     assert torch.equal(plain.normals(), smallest_axis_normal(plain.quats, plain.scales))
 
 
 def test_model_methods_agree_with_the_functions(device, dtype):
-    cloud = _cloud(40, device=device, dtype=dtype)
+    cloud = varied_cloud(40, 2).to(device, dtype)
     model = GaussianSurfaceModel.from_cloud(cloud)
     directions = torch.randn(40, 3, device=device, dtype=dtype)
     torch.testing.assert_close(model.covariance(), covariance(cloud.quats, cloud.scales))
@@ -101,8 +77,8 @@ def test_model_methods_agree_with_the_functions(device, dtype):
 
 
 def test_model_deforms_a_batch(device, dtype):
-    model = GaussianSurfaceModel.from_cloud(_cloud(device=device, dtype=dtype))
-    f = _gradients(100, device, dtype)[:12].unflatten(0, (2, 6))
+    model = GaussianSurfaceModel.from_cloud(varied_cloud(6, 2).to(device, dtype))
+    f = gradients(100, device, dtype)[:12].unflatten(0, (2, 6))
     position = torch.randn(2, 6, 3, device=device, dtype=dtype)
     deformed = model.deformed(position, f)
     assert deformed.means is position
@@ -115,9 +91,9 @@ def test_model_deforms_a_batch(device, dtype):
 
 
 def test_model_state_dict_round_trip():
-    cloud = _cloud(normals=True)
+    cloud = varied_cloud(6, 2, normals=True)
     state = GaussianSurfaceModel.from_cloud(cloud).state_dict()
-    other = GaussianSurfaceModel.from_cloud(_cloud(normals=True))
+    other = GaussianSurfaceModel.from_cloud(varied_cloud(6, 2, seed=1, normals=True))
     other.load_state_dict(state)
     assert torch.equal(other.sh, cloud.sh)
     assert torch.equal(other.to_cloud().normals, cloud.normals)

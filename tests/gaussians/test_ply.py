@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 import torch
 from plyfile import PlyData, PlyElement
+from small_scenes import varied_cloud
 
 from gaussian_swaying.gaussians.cloud import GaussianCloud
 from gaussian_swaying.gaussians.ply import read_ply, write_ply
@@ -18,17 +19,6 @@ from gaussian_swaying.geometry.patches import smallest_axis_normal
 
 REST = {0: 0, 1: 9, 2: 24, 3: 45}
 FIELDS = ("means", "quats", "scales", "opacities", "sh")
-
-
-def _cloud(count=7, degree=3, normals=False):
-    return GaussianCloud(
-        means=torch.randn(count, 3),
-        quats=torch.randn(count, 4),
-        scales=torch.randn(count, 3) - 4,
-        opacities=torch.randn(count),
-        sh=torch.randn(count, (degree + 1) ** 2, 3),
-        normals=torch.nn.functional.normalize(torch.randn(count, 3), dim=-1) if normals else None,
-    )
 
 
 def _columns(degree=0, count=5, normals=True):
@@ -57,7 +47,7 @@ def _assert_equal(actual, expected, fields=FIELDS):
 @pytest.mark.parametrize("degree", [0, 1, 2, 3])
 @pytest.mark.parametrize("normals", [False, True])
 def test_round_trip_is_exact(tmp_path, degree, normals):
-    cloud = _cloud(degree=degree, normals=normals)
+    cloud = varied_cloud(7, degree=degree, normals=normals)
     write_ply(tmp_path / "a.ply", cloud)
     with warnings.catch_warnings():
         warnings.simplefilter("error")
@@ -72,7 +62,7 @@ def test_round_trip_is_exact(tmp_path, degree, normals):
 
 def test_written_order_and_channels(tmp_path):
     """The order of Kerbl et al.'s save_ply, with f_rest by channel: all of red, then green, then blue."""
-    cloud = _cloud(degree=1)
+    cloud = varied_cloud(7, degree=1)
     write_ply(tmp_path / "a.ply", cloud)
     ply = PlyData.read(str(tmp_path / "a.ply"))
     vertex = ply["vertex"]
@@ -88,14 +78,14 @@ def test_written_order_and_channels(tmp_path):
 
 
 def test_write_casts_and_detaches(tmp_path):
-    cloud = _cloud().to(torch.float64)
+    cloud = varied_cloud(7, 3).to(torch.float64)
     cloud.means.requires_grad_()
     write_ply(str(tmp_path / "a.ply"), cloud)
     _assert_equal(read_ply(str(tmp_path / "a.ply")), cloud.to(torch.float32))
 
 
 def test_failed_write_keeps_the_old_file(tmp_path, monkeypatch):
-    write_ply(tmp_path / "a.ply", _cloud(3))
+    write_ply(tmp_path / "a.ply", varied_cloud(3, 3))
     old = (tmp_path / "a.ply").read_bytes()
 
     def fail(self, stream):
@@ -105,7 +95,7 @@ def test_failed_write_keeps_the_old_file(tmp_path, monkeypatch):
 
     monkeypatch.setattr(PlyData, "write", fail)
     with pytest.raises(OSError, match="disk full"):
-        write_ply(tmp_path / "a.ply", _cloud(4))
+        write_ply(tmp_path / "a.ply", varied_cloud(4, 3))
     assert (tmp_path / "a.ply").read_bytes() == old
     assert [path.name for path in tmp_path.iterdir()] == ["a.ply"]
 
@@ -170,19 +160,31 @@ def test_directory(tmp_path):
     _assert_rejected(tmp_path, "is a directory; give the .ply file inside it")
 
 
-@pytest.mark.parametrize("content", [b"", b"solid x\n", b"plywood"])
-def test_not_a_ply(tmp_path, content):
+@pytest.mark.parametrize(
+    ("content", "words"),
+    [
+        (b"", "is not a .ply file; export the scene as .ply"),
+        (b"solid x\n", "is not a .ply file"),
+        (b"plywood", "is not a .ply file"),
+        (b"ply\nformat binary_little_endian 1.0\nelement vertex many\nend_header\n", "broken .ply header"),
+    ],
+)
+def test_not_a_ply(tmp_path, content, words):
     (tmp_path / "bad.ply").write_bytes(content)
-    _assert_rejected(tmp_path / "bad.ply", "is not a .ply file", "export the scene as .ply")
+    _assert_rejected(tmp_path / "bad.ply", *words.split("; "))
 
 
-def test_broken_header(tmp_path):
-    (tmp_path / "bad.ply").write_bytes(b"ply\nformat binary_little_endian 1.0\nelement vertex many\nend_header\n")
-    _assert_rejected(tmp_path / "bad.ply", "broken .ply header", "export the file again")
-
-
-def test_ascii(tmp_path):
-    _assert_rejected(_write(tmp_path / "bad.ply", _columns(), text=True), "ASCII", "export as binary")
+@pytest.mark.parametrize(
+    ("columns", "options", "words"),
+    [
+        (_columns(), {"text": True}, ["ASCII", "export as binary"]),
+        (_columns(), {"name": "face"}, ["no element `vertex` (elements: face)", "export it from a 3DGS tool"]),
+        (_columns(count=0), {}, ["zero Gaussians", "export the scene again"]),
+        ({"packed_position": np.zeros(3, "u4")}, {}, ["compressed .ply", "export it as an uncompressed 3DGS .ply"]),
+    ],
+)
+def test_not_a_scene(tmp_path, columns, options, words):
+    _assert_rejected(_write(tmp_path / "bad.ply", columns, **options), *words)
 
 
 def test_truncated(tmp_path):
@@ -191,21 +193,11 @@ def test_truncated(tmp_path):
     _assert_rejected(path, "is truncated", "copy or export the file again")
 
 
-def test_no_vertex_element(tmp_path):
-    path = _write(tmp_path / "bad.ply", _columns(), name="face")
-    _assert_rejected(path, "no element `vertex` (elements: face)", "export it from a 3DGS tool")
-
-
 @pytest.mark.parametrize("name", ["x", "f_dc_1", "opacity", "scale_2", "rot_3"])
 def test_missing_property(tmp_path, name):
     columns = _columns()
     del columns[name]
     _assert_rejected(_write(tmp_path / "bad.ply", columns), f"no property `{name}`", "export it from a 3DGS tool")
-
-
-def test_compressed(tmp_path):
-    path = _write(tmp_path / "bad.ply", {"packed_position": np.zeros(3, "u4")})
-    _assert_rejected(path, "compressed .ply", "export it as an uncompressed 3DGS .ply")
 
 
 def test_list_property(tmp_path):
@@ -229,68 +221,42 @@ def test_gap_in_the_coefficients(tmp_path):
     _assert_rejected(_write(tmp_path / "bad.ply", columns), "no property `f_rest_4`", "export it again")
 
 
-def test_zero_gaussians(tmp_path):
-    _assert_rejected(_write(tmp_path / "bad.ply", _columns(count=0)), "zero Gaussians", "export the scene again")
+FAR = "`x`, `y` or `z` is beyond ±1e+12 for 2 of 5 Gaussians, first at index 1"  # their squares overflow
+SIZE = "gives a size of zero or infinity for 1 of 5 Gaussians, first at index 1"
+BAD = [
+    *(
+        (name, [2, 4], value, f"`{name}` is NaN or infinite for 2 of 5 Gaussians, first at index 2", "remove them")
+        for name in ("z", "nx", "f_dc_2", "f_rest_7", "scale_1", "rot_2")
+        for value in (np.nan, np.inf, -np.inf)
+    ),
+    ("opacity", [3], np.nan, "property `opacity` is NaN for 1 of 5 Gaussians, first at index 3", "remove them"),
+    ("y", [1], 1e300, "property `y` is NaN or infinite for 1 of 5", "remove them"),
+    ("x", [1, 3], 9e37, FAR, "remove them"),
+    ("z", [1, 3], -1e13, FAR, "remove them"),
+    ("scale_1", [1], -200.0, SIZE, "logarithm"),
+    ("scale_1", [1], 100.0, SIZE, "logarithm"),
+    ("rot_0 rot_1 rot_2 rot_3", [2], 0.0, "is zero for 1 of 5 Gaussians, first at index 2", "store 1 0 0 0"),
+]
 
 
-@pytest.mark.parametrize("name", ["z", "nx", "f_dc_2", "f_rest_7", "scale_1", "rot_2"])
-@pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
-def test_non_finite_value(tmp_path, name, value):
-    columns = _columns(1)
-    columns[name][[2, 4]] = value
-    path = _write(tmp_path / "bad.ply", columns)
-    _assert_rejected(
-        path, f"property `{name}` is NaN or infinite for 2 of 5 Gaussians, first at index 2", "remove them"
-    )
-
-
-def test_nan_opacity(tmp_path):
-    columns = _columns()
-    columns["opacity"][3] = np.nan
-    path = _write(tmp_path / "bad.ply", columns)
-    _assert_rejected(path, "property `opacity` is NaN for 1 of 5 Gaussians, first at index 3", "remove them")
-
-
-def test_double_beyond_float32(tmp_path):
-    columns = {name: value.astype("f8") for name, value in _columns().items()}
-    columns["y"][1] = 1e300
-    _assert_rejected(_write(tmp_path / "bad.ply", columns), "property `y` is NaN or infinite for 1 of 5")
-
-
-@pytest.mark.parametrize("value", [9e37, 1e13])
-def test_two_outliers(tmp_path, value):
-    """Their squares overflow, and a grid cannot count its cells: the preview ended in an error of linear algebra."""
-    columns = _columns()
-    columns["x"][1], columns["z"][3] = value, -value
-    path = _write(tmp_path / "bad.ply", columns)
-    _assert_rejected(path, "`x`, `y` or `z` is beyond ±1e+12 for 2 of 5 Gaussians, first at index 1", "remove them")
-
-
-@pytest.mark.parametrize("value", [-200.0, 100.0])
-def test_absurd_scale(tmp_path, value):
-    columns = _columns()
-    columns["scale_1"][1] = value
-    path = _write(tmp_path / "bad.ply", columns)
-    _assert_rejected(path, "`scale_1`", "size of zero or infinity for 1 of 5 Gaussians, first at index 1", "logarithm")
-
-
-def test_zero_quaternion(tmp_path):
-    columns = _columns()
-    for name in ("rot_0", "rot_1", "rot_2", "rot_3"):
-        columns[name][2] = 0
-    path = _write(tmp_path / "bad.ply", columns)
-    _assert_rejected(path, "`rot_0` to `rot_3` is zero for 1 of 5 Gaussians, first at index 2", "store 1 0 0 0")
+@pytest.mark.parametrize(("names", "places", "value", "words", "remedy"), BAD)
+def test_bad_values(tmp_path, names, places, value, words, remedy):
+    """Of doubles, one of which is beyond float32."""
+    columns = {name: column.astype("f8") for name, column in _columns(1).items()}
+    for name in names.split():
+        columns[name][places] = value
+    _assert_rejected(_write(tmp_path / "bad.ply", columns), words, remedy)
 
 
 def test_write_needs_gaussians_and_a_folder(tmp_path):
     with pytest.raises(ValueError, match=r"a\.ply was not written because the cloud holds zero Gaussians"):
-        write_ply(tmp_path / "a.ply", _cloud(0))
+        write_ply(tmp_path / "a.ply", varied_cloud(0, 3))
     with pytest.raises(FileNotFoundError, match=r"a\.ply cannot be written because .*none is not a folder; create it"):
-        write_ply(tmp_path / "none" / "a.ply", _cloud())
+        write_ply(tmp_path / "none" / "a.ply", varied_cloud(7, 3))
 
 
 def test_cloud_selects_and_moves(device, dtype):
-    cloud = _cloud(normals=True).to(device, dtype)
+    cloud = varied_cloud(7, 3, normals=True).to(device, dtype)
     mask = torch.tensor([True, False, True, False, False, False, True], device=device)
     picked = cloud.select(mask)
     assert len(cloud) == 7
@@ -299,7 +265,7 @@ def test_cloud_selects_and_moves(device, dtype):
         tensor = getattr(picked, field)
         assert (tensor.dtype, tensor.device.type) == (dtype, device.type)
         torch.testing.assert_close(tensor, getattr(cloud, field)[[0, 2, 6]])
-    assert _cloud().select(torch.tensor([1])).normals is None
+    assert varied_cloud(7, 3).select(torch.tensor([1])).normals is None
     with pytest.raises(ValueError, match="Expected `mask` of shape"):
         cloud.select(mask[:3])
 
@@ -317,14 +283,14 @@ def test_cloud_selects_and_moves(device, dtype):
     ],
 )
 def test_cloud_rejects_wrong_shape(field, shape):
-    cloud = _cloud()
+    cloud = varied_cloud(7, 3)
     tensors = {name: getattr(cloud, name) for name in FIELDS} | {field: torch.zeros(shape)}
     with pytest.raises(ValueError, match=rf"Expected `{field}` (of shape|to have)"):
         GaussianCloud(**tensors)
 
 
 def test_cloud_rejects_other_degrees():
-    cloud = _cloud()
+    cloud = varied_cloud(7, 3)
     with pytest.raises(ValueError, match="Expected `sh` to have 1, 4, 9 or 16 coefficients, but got 5"):
         GaussianCloud(cloud.means, cloud.quats, cloud.scales, cloud.opacities, torch.zeros(7, 5, 3))
 
@@ -386,7 +352,7 @@ def test_only_the_element_of_the_gaussians_is_read(tmp_path):
 
 def test_a_file_that_is_longer_than_its_header_says_is_warned_of(tmp_path):
     """As where a line of the header was lost, and every number is another's."""
-    write_ply(tmp_path / "flag.ply", _cloud())
+    write_ply(tmp_path / "flag.ply", varied_cloud(7, 3))
     with (tmp_path / "flag.ply").open("ab") as file:
         file.write(bytes(28))
     with pytest.warns(UserWarning, match="28 bytes follow that its header does not mention"):

@@ -2,6 +2,7 @@
 
 import pytest
 import torch
+from shared import gradients, unit
 
 from gaussian_swaying.geometry.covariances import (
     covariance,
@@ -12,19 +13,6 @@ from gaussian_swaying.geometry.covariances import (
 )
 from gaussian_swaying.geometry.linalg import polar_rotation
 from gaussian_swaying.geometry.rotations import quat_to_rotation
-
-
-def _unit(*shape, device="cpu", dtype=torch.float64):
-    return torch.nn.functional.normalize(torch.randn(*shape, device=device, dtype=dtype), dim=-1)
-
-
-def _gradients(count, device="cpu", dtype=torch.float64):
-    """Deformation gradients of both orientations, none of them near singular."""
-    f = torch.eye(3, dtype=torch.float64) + 0.3 * torch.randn(count, 3, 3, dtype=torch.float64)
-    f = f[torch.linalg.det(f).abs() > 0.2]
-    assert len(f) > 4
-    f[0] = torch.diag(torch.tensor([1.0, -1.0, 1.0]))
-    return f.to(device, dtype)
 
 
 def test_covariance_has_the_axes_and_scales(device, dtype):
@@ -39,7 +27,7 @@ def test_covariance_to_quat_scale_round_trip(device, dtype):
         torch.randn(50, 4, device=device, dtype=dtype),
         torch.randn(50, 3, device=device, dtype=dtype) - 3,
     )
-    a = deform_covariance(_gradients(1000, device, dtype)[:50], covariance(quats, log_scales))
+    a = deform_covariance(gradients(1000, device, dtype)[:50], covariance(quats, log_scales))
     q, s = covariance_to_quat_scale(a)
     assert (q.dtype, s.dtype) == (dtype, dtype)
     torch.testing.assert_close(torch.linalg.det(quat_to_rotation(q)), torch.ones(50, device=device, dtype=dtype))
@@ -60,14 +48,14 @@ def test_covariance_to_quat_scale_of_singular_and_equal_axes():
 
 def test_covariance_to_quat_scale_signs_follow_the_matrix():
     """A small change of the matrix may not flip an axis: frames of an animation would flicker."""
-    a = covariance(_unit(100, 4), torch.tensor([0.0, -1.0, -2.0], dtype=torch.float64).expand(100, 3))
+    a = covariance(unit(100, 4), torch.tensor([0.0, -1.0, -2.0], dtype=torch.float64).expand(100, 3))
     q0, _ = covariance_to_quat_scale(a)
     q1, _ = covariance_to_quat_scale(a + 1e-9 * torch.eye(3, dtype=torch.float64))
     torch.testing.assert_close(q1, q0, rtol=0, atol=1e-6)
 
 
 def test_deformed_covariance_is_that_of_mapped_samples(device, dtype):
-    f, scales = _gradients(20, device, dtype)[:5], torch.randn(5, 3, device=device, dtype=dtype)
+    f, scales = gradients(20, device, dtype)[:5], torch.randn(5, 3, device=device, dtype=dtype)
     quats = torch.randn(5, 4, device=device, dtype=dtype)
     axes = quat_to_rotation(quats) * scales.exp()[:, None]
     mapped = f @ axes
@@ -128,8 +116,8 @@ def test_a_solid_beyond_the_limit_goes_back_to_its_own_shape(device, dtype):
 
 
 def test_gradcheck(device):
-    f = _gradients(20, device)[:4].requires_grad_()
-    a = covariance(_unit(4, 4, device=device), torch.randn(4, 3, device=device, dtype=torch.float64)).requires_grad_()
+    f = gradients(20, device)[:4].requires_grad_()
+    a = covariance(unit(4, 4, device=device), torch.randn(4, 3, device=device, dtype=torch.float64)).requires_grad_()
     assert torch.autograd.gradcheck(deform_covariance, (f, a))
 
 

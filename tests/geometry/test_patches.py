@@ -7,6 +7,7 @@ import os
 
 import pytest
 import torch
+from shared import gradients, unit
 
 from gaussian_swaying.geometry import patches
 from gaussian_swaying.geometry.covariances import deform_covariance
@@ -15,19 +16,6 @@ from gaussian_swaying.geometry.patches import deform_all, deform_normal, deform_
 from gaussian_swaying.geometry.rotations import quat_to_rotation
 
 UP = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)
-
-
-def _unit(*shape, device="cpu", dtype=torch.float64):
-    return torch.nn.functional.normalize(torch.randn(*shape, device=device, dtype=dtype), dim=-1)
-
-
-def _gradients(count, device="cpu", dtype=torch.float64):
-    """Deformation gradients of both orientations, none of them near singular."""
-    f = torch.eye(3, dtype=torch.float64) + 0.3 * torch.randn(count, 3, 3, dtype=torch.float64)
-    f = f[torch.linalg.det(f).abs() > 0.2]
-    assert len(f) > 4
-    f[0] = torch.diag(torch.tensor([1.0, -1.0, 1.0]))
-    return f.to(device, dtype)
 
 
 def test_deformed_normal_and_area_match_a_mapped_plane():
@@ -55,8 +43,8 @@ def test_deformed_normal_and_area_match_a_mapped_plane():
 
 def test_deformed_normal_matches_the_inverse(device, dtype):
     """Reflections included: the sign is that of F^-T N."""
-    f = _gradients(40, device, dtype)
-    normal = _unit(len(f), 3, device=device, dtype=dtype)
+    f = gradients(40, device, dtype)
+    normal = unit(len(f), 3, device=device, dtype=dtype)
     expected = (torch.linalg.inv(f).mT @ normal[..., None]).squeeze(-1)
     assert (torch.linalg.det(f) < 0).any()
     torch.testing.assert_close(
@@ -64,7 +52,7 @@ def test_deformed_normal_matches_the_inverse(device, dtype):
     )
 
 
-def test_deformed_normal_of_singular_gradients(device, dtype):
+def test_deformed_normal_of_singulargradients(device, dtype):
     up = UP.to(device, dtype)
     flat = torch.diag(torch.tensor([2.0, 3.0, 0.0], device=device, dtype=dtype))  # the plane keeps its normal
     line = torch.diag(torch.tensor([2.0, 0.0, 1.0], device=device, dtype=dtype))  # the plane becomes a line
@@ -80,13 +68,13 @@ def test_deformed_normal_of_singular_gradients(device, dtype):
 
 def test_everything_at_once_is_each_by_itself(device, dtype):
     """On a GPU in one kernel, if triton is there: turned over, flattened and undeformed patches included."""
-    f = _gradients(60, device, dtype)
+    f = gradients(60, device, dtype)
     f[1] = torch.diag(torch.tensor([2.0, 3.0, 0.0]))
     f[2] = 1e-12 * torch.eye(3)
     f[3] = torch.eye(3)
     f = f.mT.contiguous().mT  # any strides
     factor = torch.randn(len(f), 3, 3, device=device, dtype=dtype)
-    rest, normal = factor @ factor.mT, _unit(len(f), 3, device=device, dtype=dtype)
+    rest, normal = factor @ factor.mT, unit(len(f), 3, device=device, dtype=dtype)
     normal[1] = UP.to(normal)
     covariances, normals, rotations = deform_all(f, rest, normal)
     torch.testing.assert_close(covariances, deform_covariance(f, rest))
@@ -114,7 +102,7 @@ def test_the_kernel_keeps_to_the_limit_as_torch_does(device):
     factor = torch.randn(count, 3, 3)
     rest = factor @ factor.mT
     rest[22] = 0.0
-    normal, solid = _unit(count, 3, dtype=torch.float32), torch.arange(count) % 2 == 0
+    normal, solid = unit(count, 3, dtype=torch.float32), torch.arange(count) % 2 == 0
     given = [part.to(device) for part in (f, rest, normal)]
     for rotations in (True, False):
         made = kernels.deform_all(*given, rotations, 1.5, solid.to(device))
@@ -148,7 +136,7 @@ def test_the_kernel_is_the_one_that_is_asked(monkeypatch):
 
 
 def test_smallest_axis(device, dtype):
-    quats = _unit(3, 4, device=device, dtype=dtype)
+    quats = unit(3, 4, device=device, dtype=dtype)
     log_scales = torch.tensor([[-9.0, 0, 1], [0, -9, 1], [1, 0, -9]], device=device, dtype=dtype)
     rotation = quat_to_rotation(quats)
     expected = torch.stack([rotation[0, :, 0], rotation[1, :, 1], rotation[2, :, 2]])
@@ -156,8 +144,8 @@ def test_smallest_axis(device, dtype):
 
 
 def test_gradcheck(device):
-    f = _gradients(20, device)[:4].requires_grad_()
-    normal = _unit(4, 3, device=device).requires_grad_()
+    f = gradients(20, device)[:4].requires_grad_()
+    normal = unit(4, 3, device=device).requires_grad_()
     area = torch.rand(4, device=device, dtype=torch.float64, requires_grad=True)
     assert torch.autograd.gradcheck(deform_normal, (f, normal))
     assert torch.autograd.gradcheck(deform_patch, (f, normal, area))

@@ -2,12 +2,9 @@
 
 import pytest
 import torch
+from shared import unit
 
 from gaussian_swaying.geometry.rotations import quat_to_rotation, rotation_to_quat
-
-
-def _unit(*shape, device="cpu", dtype=torch.float64):
-    return torch.nn.functional.normalize(torch.randn(*shape, device=device, dtype=dtype), dim=-1)
 
 
 def test_quaternion_rotates_as_hamilton_product(device, dtype):
@@ -20,7 +17,7 @@ def test_quaternion_rotates_as_hamilton_product(device, dtype):
 
 def test_rotation_to_quat_inverts(device, dtype):
     """Half turns about each axis included, where the formula from the trace divides by zero."""
-    quats = torch.cat([torch.eye(4, dtype=torch.float64), _unit(200, 4)]).to(device, dtype)
+    quats = torch.cat([torch.eye(4, dtype=torch.float64), unit(200, 4)]).to(device, dtype)
     quats = torch.where(quats[:, :1] < 0, -quats, quats)
     back = rotation_to_quat(quat_to_rotation(quats))
     assert (back[:, 0] >= 0).all()

@@ -54,9 +54,7 @@ def test_import_is_light_and_every_module_imports_without_the_heavy_libraries():
     if importlib.util.find_spec("triton") is None:  # comes with CUDA builds of torch
         modules = [m for m in modules if not m.endswith("_triton") and ".triton" not in m]
     lightning_classes = {"training.data.datamodule", "training.data.generated_datamodule", "cli.train"}
-    lightning_classes |= {
-        f"training.{name}" for name in ("checkpoints", "counting", "csv_log", "module", "run_folder", "strategy")
-    }
+    lightning_classes |= {f"training.{name}" for name in ("checkpoints", "csv_log", "module", "run_folder", "strategy")}
     lightning_classes |= {"metrics.chamfer", "metrics.frechet_video"}
     modules = [m for m in modules if m.removeprefix("gaussian_swaying.") not in lightning_classes]
     assert len(modules) > 25
@@ -88,7 +86,7 @@ def test_gpu_tests_skip_without_a_gpu_and_fail_if_one_is_required():
 
 def test_pages_are_skipped_without_a_browser_and_fail_where_ci_is_set(tmp_path):
     """A gate that cannot try the pages says so."""
-    command = ["-m", "pytest", "-q", "-p", "no:cacheprovider", "tests/tools/test_web_bench.py"]
+    command = ["-m", "pytest", "-q", "-p", "no:cacheprovider", "tests/tools/test_drawn_bench.py"]
     skipped = _python(*command, CI="", PATH=str(tmp_path))
     assert (skipped.returncode, "1 skipped" in skipped.stdout) == (0, True), skipped.stdout
     failed = _python(*command, CI="true", PATH=str(tmp_path))

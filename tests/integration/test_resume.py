@@ -11,10 +11,12 @@ from pathlib import Path
 import imageio.v3 as iio
 import pytest
 import torch
+from shared import refused
 
 from gaussian_swaying.cli.simulate import main
-from gaussian_swaying.recording.checkpoint import read_checkpoint, write_checkpoint
+from gaussian_swaying.recording.checkpoint import read_checkpoint
 from gaussian_swaying.recording.trajectory import load_trajectory
+from gaussian_swaying.runs.seal import save_sealed
 from gaussian_swaying.simulation.diagnostics import SimulationDiverged
 from gaussian_swaying.simulation.run import Run
 
@@ -167,7 +169,14 @@ def test_a_run_that_is_told_to_end(name, whole, tmp_path, capsys):
                 break
             time.sleep(0.05)
         for more in ([], ["--resume"]):
-            check_refused(_arguments(folder, *more), tmp_path, capsys, f"process {process.pid} on this host", "stop it")
+            refused(
+                main,
+                _arguments(folder, *more),
+                capsys,
+                f"process {process.pid} on this host",
+                "stop it",
+                folder=tmp_path,
+            )
         process.send_signal(getattr(signal, name))
         error = process.communicate(timeout=120)[1]
         assert process.returncode == 128 + getattr(signal, name)
@@ -254,23 +263,6 @@ def stopped(tmp_path, monkeypatch):
     return tmp_path / "run"
 
 
-def _contents(folder):
-    return {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()}
-
-
-def check_refused(arguments, folder, capsys, *words):
-    """Exit code 2, one sentence with the words, and nothing changed."""
-    before = _contents(folder)
-    capsys.readouterr()
-    assert main(arguments) == 2
-    error = capsys.readouterr().err
-    assert error.count("\n") == 1
-    assert "Traceback" not in error
-    for word in words:
-        assert word in error
-    assert _contents(folder) == before
-
-
 @pytest.mark.parametrize(
     ("change", "words"),
     [
@@ -281,9 +273,8 @@ def check_refused(arguments, folder, capsys, *words):
     ],
 )
 def test_another_configuration_is_refused_by_name(change, words, stopped, capsys):
-    check_refused(
-        _arguments(stopped, "--resume", *change), stopped, capsys, "configuration differs", "--resume", *words
-    )
+    arguments = _arguments(stopped, "--resume", *change)
+    refused(main, arguments, capsys, "configuration differs", "--resume", *words, folder=stopped)
 
 
 def test_the_end_of_a_run_names_its_checkpoint(tmp_path, monkeypatch, capsys):
@@ -307,7 +298,9 @@ def test_the_end_of_a_run_names_its_checkpoint(tmp_path, monkeypatch, capsys):
 
 
 def test_nothing_to_resume(tmp_path, capsys):
-    check_refused(_arguments(tmp_path / "none", "--resume"), tmp_path, capsys, "nothing to resume", "checkpoint.pt")
+    refused(
+        main, _arguments(tmp_path / "none", "--resume"), capsys, "nothing to resume", "checkpoint.pt", folder=tmp_path
+    )
     assert not (tmp_path / "none").exists()
 
 
@@ -320,7 +313,7 @@ def test_a_damaged_checkpoint_is_refused(damage, stopped, capsys):
     else:
         file.write_bytes({"truncated": content[: len(content) // 2], "empty": b"", "text": b"hello"}[damage])
     words = ("checkpoint.pt cannot be read", "without --resume")
-    check_refused(_arguments(stopped, "--resume"), stopped, capsys, *words)
+    refused(main, _arguments(stopped, "--resume"), capsys, *words, folder=stopped)
 
 
 def test_another_splat_under_the_same_name_is_refused(stopped, capsys):
@@ -329,12 +322,12 @@ def test_another_splat_under_the_same_name_is_refused(stopped, capsys):
     checkpoint = torch.load(file, weights_only=True)
     for name in ("position", "velocity", "affine", "F_elastic", "lost"):
         checkpoint["state"][name] = checkpoint["state"][name][:50]
-    write_checkpoint(file, checkpoint)
-    check_refused(_arguments(stopped, "--resume"), stopped, capsys, "holds 50 particles", "has 96")
+    save_sealed(file, checkpoint)
+    refused(main, _arguments(stopped, "--resume"), capsys, "holds 50 particles", "has 96", folder=stopped)
 
 
 def test_a_refused_run_does_not_move_the_earlier_one(stopped, capsys):
-    check_refused(_arguments(stopped, "--wind.flow", "[1, 2]"), stopped, capsys, "flow")
+    refused(main, _arguments(stopped, "--wind.flow", "[1, 2]"), capsys, "flow", folder=stopped)
     assert [path.name for path in stopped.parent.iterdir()] == [stopped.name]
 
 

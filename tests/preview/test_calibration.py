@@ -4,8 +4,8 @@ import math
 
 import pytest
 import torch
+from small_scenes import plain_cloud
 
-from gaussian_swaying.gaussians.cloud import GaussianCloud
 from gaussian_swaying.gaussians.ply import write_ply
 from gaussian_swaying.preview.calibration import (
     CLOSE,
@@ -119,9 +119,7 @@ def _patches(means, outward, size):
     angle = normal[:, 2].clamp(-1, 1).acos() / 2
     axis = torch.nn.functional.normalize(torch.stack([-normal[:, 1], normal[:, 0], 0 * angle], -1) + 1e-9, dim=-1)
     quats = torch.cat([angle.cos()[:, None], angle.sin()[:, None] * axis], -1)
-    count = len(means)
-    scales = torch.tensor([size, size, 0.1 * size]).log().expand(count, 3)
-    return GaussianCloud(means, quats, scales, torch.full((count,), 3.0), torch.zeros(count, 1, 3))
+    return plain_cloud(means, torch.tensor([size, size, 0.1 * size]).log(), quats)
 
 
 def post(upside_down=False):

@@ -92,7 +92,7 @@ def test_files_are_written_beside_the_simulation_where_there_are_cores(monkeypat
     monkeypatch.setattr(cost_module, "WORKERS", 2)
     found = {}
     for cores in (2, 4):
-        monkeypatch.setattr(cost_module, "_cores", lambda cores=cores: cores)
+        monkeypatch.setattr(cost_module, "cores", lambda cores=cores: cores)
         found[cores] = cost_module._picture_seconds(simulation, state, 0.5)
     assert found == {2: 1 + 4, 4: 4 / 2 - 0.5}
 

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 import torch
 from PIL import Image, ImageDraw, ImageFont
+from small_scenes import plain_cloud, together
 
-from gaussian_swaying.gaussians.cloud import GaussianCloud
 from gaussian_swaying.gaussians.ply import write_ply
 from gaussian_swaying.geometry.regions import Box
 from gaussian_swaying.preview.framing import RADIUS, orbit_frame, whole_box
@@ -27,17 +27,6 @@ def column(count=3000, side=0.3, height=2.0):
     """A square column on the origin, z up."""
     points = torch.rand(count, 3, generator=torch.Generator().manual_seed(0))
     return (points - torch.tensor([0.5, 0.5, 0.0])) * torch.tensor([side, side, height])
-
-
-def cloud_of(means):
-    count = len(means)
-    return GaussianCloud(
-        means,
-        torch.tensor([1.0, 0, 0, 0]).expand(count, 4),
-        torch.full((count, 3), -4.0),
-        torch.full((count,), 2.0),
-        torch.zeros(count, 1, 3),
-    )
 
 
 # ---- ticks
@@ -109,7 +98,7 @@ def test_whole_object_has_what_does_not_move_and_no_floor_nor_specks():
 
 
 def test_camera_of_the_starter_shows_all_of_it(tmp_path):
-    cloud = cloud_of(column())
+    cloud = plain_cloud(column())
     path = tmp_path / "column.ply"
     write_ply(path, cloud)
     for region, below in ((None, 0.0), (([-1.0, -1.0, 1.1], [1.0, 1.0, 3.0]), 0.2)):
@@ -144,15 +133,7 @@ def test_floor_is_not_framed(make_simulation):
     side = torch.arange(-3, 3.01, 0.1)
     x, y = torch.meshgrid(side, side, indexing="ij")
     floor = torch.stack([x.reshape(-1), y.reshape(-1), torch.full((x.numel(),), -0.1)], -1)
-    count = len(floor)
-    scales = torch.tensor([0.08, 0.08, 0.001]).log().expand(count, 3)
-    cloud = GaussianCloud(
-        torch.cat([flag.means, floor]),
-        torch.cat([flag.quats, torch.tensor([1.0, 0, 0, 0]).expand(count, 4)]),
-        torch.cat([flag.scales, scales]),
-        torch.cat([flag.opacities, torch.full((count,), 3.0)]),
-        torch.cat([flag.sh, torch.zeros(count, *flag.sh.shape[1:])]),
-    )
+    cloud = together(flag, plain_cloud(floor, torch.tensor([0.08, 0.08, 0.001]).log()))
     simulation = make_simulation(cloud=cloud, scene={"region": Box([None, None, 0.0], [None, None, None])})
     low, high = _whole(simulation, classify(simulation))
     assert low == pytest.approx(flag.means.amin(0).tolist(), abs=1e-5)

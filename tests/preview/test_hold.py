@@ -10,9 +10,9 @@ import shlex
 
 import pytest
 import torch
+from small_scenes import plain_cloud, together
 
 from gaussian_swaying.cli.preview import _joined, build_options
-from gaussian_swaying.gaussians.cloud import GaussianCloud
 from gaussian_swaying.preview.hold import guess_hold, hanging_cord
 from gaussian_swaying.preview.report import doubts, preview_command
 from gaussian_swaying.preview.suggest import CELLS, suggest, visible_weight
@@ -53,14 +53,9 @@ def block(low, high, count=1500, seed=0):
     return low + unit * (high - low)
 
 
-def splat(*parts, size=0.02, move=(0.0, 0.0, 0.0)):
+def splat(*parts, move=(0.0, 0.0, 0.0)):
     """Points as round, opaque Gaussians."""
-    means = torch.cat(parts) + torch.tensor(move)
-    count = len(means)
-    quats = torch.tensor([1.0, 0, 0, 0]).expand(count, 4)
-    return GaussianCloud(
-        means, quats, torch.full((count, 3), math.log(size)), torch.full((count,), 2.0), torch.zeros(count, 1, 3)
-    )
+    return plain_cloud(torch.cat(parts) + torch.tensor(move), math.log(0.02), logit=2.0)
 
 
 def man():
@@ -116,21 +111,13 @@ def ground(low=-0.06, half=1.0, step=0.05):
     side = torch.arange(-half, half + step / 2, step)
     x, y = torch.meshgrid(side, side, indexing="ij")
     means = torch.stack([x.reshape(-1), y.reshape(-1), torch.full((x.numel(),), low)], -1)
-    cloud = splat(means)
-    scales = torch.tensor([0.6 * step, 0.6 * step, 0.002]).log().expand(len(means), 3)
-    return GaussianCloud(cloud.means, cloud.quats, scales, cloud.opacities, cloud.sh)
-
-
-def together(*clouds):
-    """Several splats as one."""
-    names = ("means", "quats", "scales", "opacities", "sh")
-    return GaussianCloud(*(torch.cat([getattr(cloud, name) for cloud in clouds]) for name in names))
+    return plain_cloud(means, torch.tensor([0.6 * step, 0.6 * step, 0.002]).log(), logit=2.0)
 
 
 def flag(move=(0.0, 0.0, 0.0)):
     """The generated flag, its pole at x = 0."""
     cloud = FlagScene(spacing=0.05).generate()
-    return GaussianCloud(cloud.means + torch.tensor(move), cloud.quats, cloud.scales, cloud.opacities, cloud.sh)
+    return dataclasses.replace(cloud, means=cloud.means + torch.tensor(move))
 
 
 AWAY = (3.0, 4.0, 5.0)

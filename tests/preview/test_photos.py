@@ -5,10 +5,11 @@ import math
 
 import pytest
 import torch
+from shared import refused
+from small_scenes import plain_cloud
 
 from gaussian_swaying.captures.capture_camera import photo_azimuth
 from gaussian_swaying.cli.preview import main
-from gaussian_swaying.gaussians.cloud import GaussianCloud
 from gaussian_swaying.gaussians.ply import write_ply
 from gaussian_swaying.geometry.rotations import rotation_to_quat
 from gaussian_swaying.preview.photos import (
@@ -64,17 +65,6 @@ def write_capture(folder, made):
     return folder
 
 
-def cloud_of(means, size=0.03):
-    count = len(means)
-    return GaussianCloud(
-        means.float(),
-        torch.tensor([1.0, 0, 0, 0]).expand(count, 4),
-        torch.full((count, 3), math.log(size)),
-        torch.full((count,), 3.0),
-        torch.zeros(count, 1, 3),
-    )
-
-
 def uniform(low, high, count, seed=0):
     draw = torch.Generator().manual_seed(seed)
     low, high = torch.tensor(low), torch.tensor(high)
@@ -119,7 +109,7 @@ def test_up_of_photos_that_were_held_askew():
 
 def test_up_of_photos_beats_the_shape(tmp_path):
     """A sheet in the plane x-z: convention and shape say y down, the cameras say z up."""
-    flag = cloud_of(uniform([0.0, -0.002, 0.0], [1.6, 0.002, 0.7], 1500))
+    flag = plain_cloud(uniform([0.0, -0.002, 0.0], [1.6, 0.002, 0.7], 1500))
     view = captured_from(write_capture(tmp_path / "a", cameras(ring(), (0.8, 0.0, 0.35))))
     found = suggest(flag, capture=view)
     assert found.up.direction == (0, 0, 1)
@@ -144,20 +134,20 @@ def test_wall_and_room_are_left_out(tmp_path):
     trophy, everything = room()
     view = captured_from(write_capture(tmp_path / "a", cameras(ring(14, 3.0, 0.5, -50, 50), (0.2, 0.0, 0.0))))
     assert view.focus.tolist() == pytest.approx([0.2, 0, 0], abs=1e-4)
-    found = suggest(cloud_of(everything), capture=view)
+    found = suggest(plain_cloud(everything), capture=view)
     simulated = found.region.simulated
     inside = simulated[: len(trophy)]
     assert float(inside.double().mean()) > 0.85  # what is nearest to the wall is taken for it
     assert int(simulated[len(trophy) :].sum()) < 0.05 * len(trophy)
     region = found.region.region()
-    assert torch.equal(region.contains(cloud_of(everything).means), simulated)  # the YAML picks what is said
+    assert torch.equal(region.contains(plain_cloud(everything).means), simulated)  # the YAML picks what is said
     assert (found.hold.end, found.hold.confidence) == ("side", "medium")
     assert found.hold.direction[0] < -0.98
     held = found.pin.contains(everything) & simulated
     assert 0 < float(everything[held][:, 0].max()) < 0.3
     assert abs(found.azimuth) < 10  # seen from where the photos were taken, not through the wall
     assert found.flow[1] == pytest.approx(6.0, abs=0.5)
-    alone = suggest(cloud_of(everything))  # without cameras it takes in the room
+    alone = suggest(plain_cloud(everything))  # without cameras it takes in the room
     assert int(alone.region.simulated.sum()) > 2 * int(simulated.sum())
 
 
@@ -169,7 +159,7 @@ def test_floor_under_what_photos_show_holds_it(tmp_path):
     floor = uniform([-4.0, -4.0, -0.05], [4.0, 4.0, 0.0], 9000, 1)
     means = torch.cat([plant, floor]).double() @ TILT.T
     view = captured_from(write_capture(tmp_path / "a", cameras(ring(16, 3.0, 1.5), (0.0, 0.0, 0.4), turn=TILT)))
-    found = suggest(cloud_of(means), capture=view)
+    found = suggest(plain_cloud(means), capture=view)
     assert list(found.up.direction) == pytest.approx((TILT @ torch.tensor([0.0, 0, 1]).double()).tolist(), abs=1e-5)
     assert float(found.up.ground[len(plant) :].double().mean()) > 0.95
     assert float(found.region.simulated[: len(plant)].double().mean()) > 0.85
@@ -202,7 +192,7 @@ def test_what_is_no_backdrop():
 def test_cameras_that_look_elsewhere_are_refused(tmp_path, capsys):
     _, everything = room()
     splat = tmp_path / "room.ply"
-    write_ply(splat, cloud_of(everything))
+    write_ply(splat, plain_cloud(everything))
     away = write_capture(tmp_path / "away", cameras(ring(9, 2.0), (0.0, 0.0, 900.0)))
     side = write_capture(tmp_path / "side", cameras([(float(k), 0.0, 0.0) for k in range(3)], (1e7, 0.0, 0.0)))
     for folder, words in (
@@ -210,11 +200,8 @@ def test_cameras_that_look_elsewhere_are_refused(tmp_path, capsys):
         (side, "do not look at a common point"),
         (tmp_path / "no", "no"),
     ):
-        assert main([str(splat), "--capture", str(folder), "--output", str(tmp_path / "out"), "--device", "cpu"]) == 2
-        error = capsys.readouterr().err
-        assert words in error
-        assert error.count("\n") == 1
-        assert not (tmp_path / "out").exists()
+        arguments = [str(splat), "--capture", str(folder), "--output", str(tmp_path / "out"), "--device", "cpu"]
+        refused(main, arguments, capsys, words, folder=tmp_path)
     view = captured_from(side)
     assert view.focus is None
     with pytest.raises(ValueError, match="set `--region`"):

@@ -11,6 +11,7 @@ from pathlib import Path
 import pytest
 import torch
 import yaml
+from small_scenes import plain_cloud, together
 
 from gaussian_swaying.gaussians.cloud import GaussianCloud
 from gaussian_swaying.gaussians.grouping import LOOSE
@@ -48,6 +49,8 @@ from gaussian_swaying.simulation.extent import suggest_spacing
 from gaussian_swaying.simulation.simulation import Simulation
 
 AXES = {"+x": [1, 0, 0], "-x": [-1, 0, 0], "+y": [0, 1, 0], "-y": [0, -1, 0], "+z": [0, 0, 1], "-z": [0, 0, -1]}
+VISIBLE = math.log(9.0)
+"""Logit of an opacity of 0.9."""
 FLOOR, TRUNK, CROWN = slice(0, 1681), slice(1681, 1981), slice(1981, 2781)
 
 
@@ -76,13 +79,6 @@ def turned(cloud, name):
     return GaussianCloud(cloud.means @ rotation.T, quats, cloud.scales, cloud.opacities, cloud.sh)
 
 
-def splat(means, log_scales, quats=None, opacity=0.9):
-    count = len(means)
-    flat = torch.tensor([1.0, 0, 0, 0]).expand(count, 4) if quats is None else quats
-    logit = math.log(opacity / (1 - opacity))
-    return GaussianCloud(means, flat, log_scales, torch.full((count,), logit), torch.zeros(count, 1, 3))
-
-
 def tree(floor=True, offset=5.0):
     """A floor of 2 x 2, a trunk of 0.1 x 0.1 x 0.8 on it, a crown of radius 0.35 at 1.1; z up, off the origin."""
     side = torch.linspace(-1, 1, 41)
@@ -94,7 +90,7 @@ def tree(floor=True, offset=5.0):
     crown = 0.35 * ball * torch.rand(800, 1, generator=draw) ** (1 / 3) + torch.tensor([0, 0, 1.1])
     scales = torch.tensor([0.03, 0.03, 0.003]).log()
     quats = torch.cat([torch.tensor([[1.0, 0, 0, 0]]).expand(1681, 4), torch.randn(1100, 4, generator=draw)])
-    cloud = splat(torch.cat([ground, trunk, crown]) + offset, scales.expand(2781, 3), quats)
+    cloud = plain_cloud(torch.cat([ground, trunk, crown]) + offset, scales, quats, VISIBLE)
     return cloud if floor else cloud.select(torch.arange(1681, 2781))
 
 
@@ -194,7 +190,7 @@ def test_floor_tells_up_whatever_the_axes(name):
 
 
 def test_without_a_floor_convention_decides_and_says_so():
-    ball = splat(torch.randn(500, 3) + 9, torch.zeros(500, 3) - 4)
+    ball = plain_cloud(torch.randn(500, 3) + 9)
     found = up_of(ball)
     assert found.confidence == "low"
     assert found.scores["+z"] == found.scores["-y"] == max(found.scores.values())
@@ -203,7 +199,7 @@ def test_without_a_floor_convention_decides_and_says_so():
 
 def test_origin_at_the_lower_end_and_longest_side_are_evidence():
     column = torch.rand(2000, 3) * torch.tensor([1.0, 4.0, 1.0]) + torch.tensor([3.0, -4.0, 3.0])  # y from -4 to 0
-    found = up_of(splat(column, torch.full((2000, 3), -4.0)))
+    found = up_of(plain_cloud(column))
     assert found.direction == (0, -1, 0)
     # 0.75 for y down, 1 for the origin, 1.5 for a side four times the next, 0.5 for a base, which the top is too
     assert found.scores["-y"] == pytest.approx(3.75)
@@ -214,7 +210,7 @@ def test_a_base_tells_which_end_is_down():
     """A cone, off the origin: it does not stand on its tip."""
     height = torch.rand(3000, 1, generator=torch.Generator().manual_seed(0)).sqrt()
     cone = torch.cat([0.6 * height * (torch.rand(3000, 2) - 0.5), 1 - height], -1) + 5
-    found = up_of(splat(cone, torch.full((3000, 3), -4.0)))
+    found = up_of(plain_cloud(cone))
     assert found.scores["+z"] - found.scores["-z"] == pytest.approx(0.75 + 1 + 0.5)
     assert any("base" in reason for reason in found.reasons)
 
@@ -238,9 +234,8 @@ def test_what_is_no_floor(change):
 def test_region_leaves_out_floor_and_specks():
     cloud = tree()
     specks = torch.tensor([[0.3, 0.3, 0.3], [-0.3, -0.3, 0.35], [0.8, 0.8, 2.5]]) + 5.0  # two in the box, one above
-    extra = splat(specks.repeat_interleave(4, 0) + 0.002 * torch.randn(12, 3), torch.full((12, 3), -5.0))
-    both = GaussianCloud(*(torch.cat([getattr(c, n) for c in (cloud, extra)]) for n in
-                           ("means", "quats", "scales", "opacities", "sh")))  # fmt: skip
+    extra = plain_cloud(specks.repeat_interleave(4, 0) + 0.002 * torch.randn(12, 3), -5.0, logit=VISIBLE)
+    both = together(cloud, extra)
     found = suggest(both)
     assert found.up.direction == (0, 0, 1)
     assert found.hold.end == "bottom"
@@ -267,7 +262,7 @@ def test_too_little_above_the_floor_is_refused():
     with pytest.raises(ValueError, match=r"box of `--region` contains 0 Gaussians.*splat spans"):
         given_region(cloud.means, torch.ones(1700), torch.ones(1700), [90, 90, 90], [91, 91, 91])
     with pytest.raises(ValueError, match="are at one point"):
-        suggest(splat(torch.ones(50, 3), torch.zeros(50, 3)))
+        suggest(plain_cloud(torch.ones(50, 3)))
 
 
 def test_threshold_keeps_the_visible_area():
@@ -371,9 +366,8 @@ def test_specks_beyond_the_boxes_follow_their_neighbours(make_scene):
     angle = torch.arange(10.0) * 0.6
     centre = torch.stack([0.3 * angle.cos(), 0.3 * angle.sin(), 0.2 + 0.045 * torch.arange(10.0)], -1) + 5.0
     means = centre.repeat_interleave(3, 0) + 0.002 * torch.randn(30, 3, generator=draw)
-    base, extra = tree(), splat(means, torch.full((30, 3), -5.0))
-    names = ("means", "quats", "scales", "opacities", "sh")
-    both = GaussianCloud(*(torch.cat([getattr(c, n) for c in (base, extra)]) for n in names))
+    base = tree()
+    both = together(base, plain_cloud(means, -5.0, logit=VISIBLE))
     points, weight = both.means, visible_weight(both)
     ground = floor_mask(points, smallest_axis_normal(both.quats, both.scales), weight, (0, 0, 1))
     found = suggest_region(points, both.opacities.sigmoid(), weight, ground, 0.05)
@@ -436,3 +430,8 @@ def test_only_cloth_and_what_falls_has_weight():
         assert found.youngs_modulus == SHELL_E
         assert gravity(found) == weight
         assert math.hypot(*found.flow) == pytest.approx(6, abs=0.01)
+
+
+def test_a_stray_point_far_away_does_not_join_the_parts():
+    points = torch.tensor([[0.0, 0, 0], [0.01, 0, 0], [1.0, 0, 0], [-1e5, 0, 0]])
+    assert connected_parts(points, 0.02).tolist() == [1, 1, 2, 0]

@@ -15,11 +15,11 @@ from pathlib import Path
 
 import pytest
 import torch
+from small_scenes import plain_cloud
 
 from gaussian_swaying._provenance import describe_device, versions
 from gaussian_swaying.aero.force import AeroForce
 from gaussian_swaying.aero.wind import FlowKey, GaussianGust, Modulation, SineSway, UniformGust, WindField
-from gaussian_swaying.gaussians.cloud import GaussianCloud
 from gaussian_swaying.geometry.linalg import determinant, matmul3, singular_values
 from gaussian_swaying.geometry.regions import Box, Everything
 from gaussian_swaying.mpm.boundaries.enclosing_box import EnclosingBox
@@ -39,7 +39,7 @@ from gaussian_swaying.mpm.laws.snow import Snow
 from gaussian_swaying.mpm.solver import MPMSolver
 from gaussian_swaying.mpm.state import MaterialPoints, MPMState
 from gaussian_swaying.rendering.cameras.camera_path import OrbitCamera
-from gaussian_swaying.scenes.procedural import FlagScene, ProceduralScene
+from gaussian_swaying.scenes.procedural import FlagScene, GivenScene
 from gaussian_swaying.simulation.diagnostics import SimulationDiverged, check_state, diagnose
 from gaussian_swaying.simulation.material import Material
 from gaussian_swaying.simulation.scene import Scene
@@ -52,23 +52,6 @@ CFL = 0.2
 # A plane stops the lattice nodes at or behind it, the first of them up to a cell behind; a particle half a cell behind
 # that one has no moving node left in its support (`total`: nodes act at the centre of their mass, within that support).
 REACH = 1.5
-
-
-class _Cloud(ProceduralScene):
-    """Round Gaussians at given places."""
-
-    def __init__(self, position, scales=(0.02, 0.02, 0.02)):
-        count = len(position)
-        self.cloud = GaussianCloud(
-            position.float(),
-            torch.tensor([1.0, 0.0, 0.0, 0.0]).repeat(count, 1),
-            torch.tensor(scales).log().repeat(count, 1),
-            torch.full((count,), 4.0),
-            torch.zeros(count, 1, 3),
-        )
-
-    def generate(self):
-        return self.cloud
 
 
 class _Broken(Modulation):
@@ -100,7 +83,7 @@ def _simulation(points, boundaries=(), wind=None, aero=None, dx=0.1, frame_dt=0.
     """A simulation around given material; it recentres, so that places are those of the scene."""
     solver = MPMSolver(dx=dx, gravity=gravity, boundaries=boundaries, **({"cfl": CFL} | solver))
     simulation = Simulation(
-        Scene(generator=_Cloud(points.position)),
+        Scene(generator=GivenScene(plain_cloud(points.position))),
         solver=solver,
         wind=wind,
         aero=aero or AeroForce(C_D=0.0, C_F=0.0, C_L=0.0),
@@ -785,7 +768,7 @@ def test_a_huge_fixed_substep_is_refused(formulation):
 @pytest.mark.parametrize("scales", [(1.0, 1e-3, 1e-3), (1.0, 1.0, 1e-3), (1e-8, 1e-8, 1e-8), (0.05, 0.05, 1e-8)])
 def test_gaussians_of_extreme_shape(scales):
     """1000:1 and 1e-8: positive finite mass, a finite picture, and needles as long after a free flight as before."""
-    source = _Cloud(_lattice(4, 1, 4, spacing=0.1), scales)
+    source = GivenScene(plain_cloud(_lattice(4, 1, 4, spacing=0.1), torch.tensor(scales).log(), logit=4.0))
     solver = MPMSolver(dx=0.2, formulation="total", gravity=UP, cfl=CFL)
     camera = OrbitCamera(width=32, height=18, azimuth=-70.0, radius=2.0)
     material = Material(E=1e4, density=50.0)

@@ -5,9 +5,9 @@ import math
 import pytest
 import torch
 from bench.problems.surface_quality import surface_quality
+from small_scenes import plain_cloud
 
 from gaussian_swaying.captures.generated_capture import GeneratedCapture
-from gaussian_swaying.gaussians.cloud import GaussianCloud
 from gaussian_swaying.gaussians.model import GaussianSurfaceModel
 
 
@@ -18,14 +18,10 @@ def _model(tilt=0.0, lift=0.0, ratio=1.0, sigma=0.006, opacities=None):
     gx, gz = (grid.reshape(-1) for grid in torch.meshgrid(x, z, indexing="ij"))
     count = len(gx)
     half = 0.5 * (0.5 * math.pi + tilt)  # a quarter turn about x takes the disc's z to the flag's y
+    means, quats = torch.stack([gx, torch.full((count,), lift), gz], -1), [math.cos(half), math.sin(half), 0.0, 0.0]
+    scales = torch.tensor([ratio * sigma, sigma, 0.1 * sigma]).log()
     return GaussianSurfaceModel.from_cloud(
-        GaussianCloud(
-            means=torch.stack([gx, torch.full((count,), lift), gz], -1),
-            quats=torch.tensor([math.cos(half), math.sin(half), 0.0, 0.0]).repeat(count, 1),
-            scales=torch.tensor([ratio * sigma, sigma, 0.1 * sigma]).log().repeat(count, 1),
-            opacities=torch.full((count,), 3.0) if opacities is None else opacities(count),
-            sh=torch.zeros(count, 1, 3),
-        )
+        plain_cloud(means, scales, quats, 3.0 if opacities is None else opacities(count))
     )
 
 

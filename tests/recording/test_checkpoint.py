@@ -14,13 +14,14 @@ import traceback
 
 import pytest
 import torch
+from shared import contents
 
 from gaussian_swaying.gaussians.ply import write_ply
 from gaussian_swaying.mpm.laws.snow import Snow
 from gaussian_swaying.mpm.solver import MPMSolver
-from gaussian_swaying.recording.checkpoint import log_lines, read_checkpoint, write_checkpoint
+from gaussian_swaying.recording.checkpoint import log_lines, read_checkpoint
 from gaussian_swaying.recording.recorder import Recorder
-from gaussian_swaying.runs.seal import check_seal, seal
+from gaussian_swaying.runs.seal import check_seal, save_sealed, seal
 from gaussian_swaying.simulation.diagnostics import entry_names
 from gaussian_swaying.simulation.stepper import Stepper
 
@@ -56,17 +57,13 @@ def run(make_simulation, tmp_path, formulation):
     return folder, resume
 
 
-def _contents(folder):
-    return {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()}
-
-
 def _refused(resume, folder, case):
     """The sentence of a refusal; the folder is as it was before."""
-    before = _contents(folder)
+    before = contents(folder)
     try:
         resume()
     except ValueError as error:
-        assert _contents(folder) == before, case
+        assert contents(folder) == before, case
         message = str(error)
         assert "\n" not in message, case
         assert message.endswith("start again without --resume."), (case, message)
@@ -213,12 +210,12 @@ def test_forty_bits_and_more_than_a_hundred_other_damages(run):
     file.write_bytes(content)
     broken = list(_broken_fields(file))
     for case, checkpoint in broken:
-        write_checkpoint(file, _with_lines(checkpoint))
+        save_sealed(file, _with_lines(checkpoint))
         _refused(resume, folder, case)
     assert len(broken) > 300
     held = torch.load(io.BytesIO(content), weights_only=True)
     for junk in (*JUNK, "[1", {"cfl": 0.1}):  # instead of a line
-        write_checkpoint(file, held | {"log": [held["log"][0], junk]})
+        save_sealed(file, held | {"log": [held["log"][0], junk]})
         _refused(resume, folder, f"log[1] = {junk!r}")
     file.write_bytes(content)
     assert resume()["status"] == "complete"
@@ -228,7 +225,7 @@ def test_a_checkpoint_executes_no_code(tmp_path, run):
     folder, resume = run
     held = read_checkpoint(folder / "checkpoint.pt")
     held["wall_s"]["fuse"] = Fuse(tmp_path / "burnt")
-    write_checkpoint(folder / "checkpoint.pt", _with_lines(held))
+    save_sealed(folder / "checkpoint.pt", _with_lines(held))
     sentence = _refused(resume, folder, "a fuse")
     assert "cannot be read as a checkpoint (it holds more than tensors, numbers and text, which is never" in sentence
     assert not (tmp_path / "burnt").exists()
@@ -243,7 +240,7 @@ def test_no_advice_to_execute_the_code_in_a_file(tmp_path, bare):
         file.write_bytes(pickle.dumps(held))
         seal(file)
     else:
-        write_checkpoint(file, held)
+        save_sealed(file, held)
     with pytest.raises(ValueError, match="more than tensors, numbers and text") as caught:
         read_checkpoint(file)
     assert "weights_only" not in "".join(traceback.format_exception(caught.value, limit=0))
@@ -254,7 +251,7 @@ def test_a_configuration_that_is_no_yaml(run):
     folder, resume = run
     held = read_checkpoint(folder / "checkpoint.pt")
     for text in ("{", "a: [" * 5000, "x: !!python/object/apply:os.getcwd []"):
-        write_checkpoint(folder / "checkpoint.pt", _with_lines(held | {"config": text}))
+        save_sealed(folder / "checkpoint.pt", _with_lines(held | {"config": text}))
         assert "`config` is not valid YAML" in _refused(resume, folder, text[:20])
 
 
@@ -299,7 +296,7 @@ def test_edits_that_bring_an_internal_variable(make_simulation, tmp_path, formul
     assert held["state"]["internal"] is not None
     make().run(tmp_path / "run", 4, resume=True, progress=False, recorder=recorder)
     held["state"]["internal"] = torch.full_like(held["state"]["internal"], torch.nan)
-    write_checkpoint(tmp_path / "run" / "checkpoint.pt", _with_lines(held | {"frame": 2}))
+    save_sealed(tmp_path / "run" / "checkpoint.pt", _with_lines(held | {"frame": 2}))
     with pytest.raises(ValueError, match="its `internal` is NaN"):
         make().run(tmp_path / "run", 4, resume=True, progress=False, recorder=recorder)
 

@@ -1,6 +1,6 @@
 """What a run leaves on disk, and what it leaves when something breaks.
 
-Covers: _provenance, recording.trajectory, simulation.meters.
+Covers: _provenance, recording.trajectory.
 """
 
 import csv
@@ -254,6 +254,19 @@ def _before_imwrite(monkeypatch, action):
     monkeypatch.setattr(iio, "imwrite", wrapped)
 
 
+def _full_disk(monkeypatch):
+    """The disk is full for the PNG of frame 1, once the event has been set."""
+    fail = threading.Event()
+
+    def disk_full(frame):
+        if frame == 1:
+            assert fail.wait(LONG)
+            raise OSError(28, "No space left on device")
+
+    _before_imwrite(monkeypatch, disk_full)
+    return fail
+
+
 def test_the_video_is_in_order_though_the_pngs_are_not(tmp_path, monkeypatch):
     """Frame 0 is compressed after frame 4; the video is encoded while the run goes on, and not a second time."""
     later, finished = threading.Event(), []
@@ -306,14 +319,7 @@ def test_what_is_changed_after_the_call_is_written_as_it_was(tmp_path, monkeypat
 
 def test_a_frame_that_cannot_be_written_is_in_no_checkpoint(tmp_path, monkeypatch):
     """What came before it is kept, with its video; nothing is half-written; the error comes once, in one sentence."""
-    fail = threading.Event()
-
-    def disk_full(frame):
-        if frame == 1:
-            assert fail.wait(LONG)
-            raise OSError(28, "No space left on device")
-
-    _before_imwrite(monkeypatch, disk_full)
+    fail = _full_disk(monkeypatch)
     recorder = Recorder()
     recorder.open(tmp_path / "run")
     for k in range(2):
@@ -334,14 +340,7 @@ def test_a_frame_that_cannot_be_written_is_in_no_checkpoint(tmp_path, monkeypatc
 
 
 def test_close_tells_what_nobody_asked_about_before(tmp_path, monkeypatch):
-    fail = threading.Event()
-
-    def disk_full(frame):
-        if frame == 1:
-            assert fail.wait(LONG)
-            raise OSError(28, "No space left on device")
-
-    _before_imwrite(monkeypatch, disk_full)
+    fail = _full_disk(monkeypatch)
     recorder = Recorder(trajectory=False)
     recorder.open(tmp_path / "run")
     for k in range(2):

@@ -9,6 +9,7 @@ import socket
 import imageio.v3 as iio
 import numpy as np
 import pytest
+from shared import contents
 
 from gaussian_swaying._files import kind_of, remove_temporaries, temporary_name, write_json
 from gaussian_swaying.recording.recorder import Recorder
@@ -34,15 +35,11 @@ def run(make_simulation, tmp_path):
     return folder, resume
 
 
-def _contents(folder):
-    return {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()}
-
-
 def _refused(resume, folder, case=""):
-    before = _contents(folder)
+    before = contents(folder)
     with pytest.raises(ValueError, match=r"^[^\n]*(start again without --resume|move it away)\.$") as caught:
         resume()
-    assert _contents(folder) == before, case
+    assert contents(folder) == before, case
     return str(caught.value)
 
 

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from gaussian_swaying.cli.continuing import command, how_to_resume
+from gaussian_swaying.cli.errors import command, how_to_resume
 from gaussian_swaying.runs.signals import StoppedBySignal, exit_code, reason, stop_signals
 
 pytestmark = pytest.mark.skipif(os.name == "nt", reason="sends signals to itself")

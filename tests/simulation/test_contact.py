@@ -3,12 +3,13 @@
 Covers: scenes.cloths, simulation.touching, viewer.changes.
 """
 
+import dataclasses
 import warnings
 
 import pytest
 import torch
+from small_scenes import together
 
-from gaussian_swaying.gaussians.cloud import GaussianCloud
 from gaussian_swaying.geometry.regions import Box
 from gaussian_swaying.mpm.boundaries.ball import BallObstacle
 from gaussian_swaying.mpm.boundaries.still_gaussians import StillGaussians
@@ -91,11 +92,8 @@ def test_gaussians_that_stand_still_need_a_scene():
 def _two_sheets(gap):
     """Two level sheets above each other."""
     one = FlagScene(0.4, 0.4, 0.02, ripple=0.0).generate()
-    shift = torch.tensor([0.0, gap, 0.0])
-    fields = ("means", "quats", "scales", "opacities", "sh")
-    both = {name: torch.cat([getattr(one, name)] * 2) for name in fields}
-    both["means"] = torch.cat([one.means, one.means + shift])
-    return GivenScene(GaussianCloud(**both))
+    other = dataclasses.replace(one, means=one.means + torch.tensor([0.0, gap, 0.0]))
+    return GivenScene(together(one, other))
 
 
 @pytest.mark.parametrize(("gap", "warned"), [(0.012, True), (0.05, False)])

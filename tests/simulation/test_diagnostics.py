@@ -138,21 +138,6 @@ def test_a_healthy_state_passes():
     check_state(solver, state.replace(position=state.position + 100.0))
 
 
-@pytest.mark.parametrize("name", ["position", "velocity", "F_elastic"])
-@pytest.mark.parametrize("value", [math.nan, math.inf])
-def test_a_particle_that_is_not_finite_is_named(name, value):
-    solver, state = _solver()
-    field = getattr(state, name).clone()
-    field[17] = value
-    field[21] = value
-    state = state.replace(**{name: field}, time=torch.tensor(0.25, dtype=torch.float64))
-    with pytest.raises(
-        SimulationDiverged, match=r"t = 0\.25 s, particle 17: .*NaN.*Remedy: lower `solver\.cfl`"
-    ) as info:
-        check_state(solver, state)
-    assert (info.value.particle, info.value.time) == (17, 0.25)
-
-
 def test_the_remedy_of_a_fixed_substep_gives_the_stable_one():
     solver, state = _solver(substep=1e-3)
     with pytest.raises(
@@ -193,14 +178,17 @@ def test_what_is_worst_is_named_first():
 
 @pytest.mark.parametrize("name", ["position", "velocity", "F_elastic"])
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-def test_one_bad_component_is_enough(name, dtype):
+def test_one_bad_component_is_enough_and_the_first_particle_is_named(name, dtype):
     solver, state = _solver()
     for column in range(9 if name == "F_elastic" else 3):
         for value in (math.nan, math.inf, -math.inf):
             field = getattr(state, name).to(dtype).clone()
-            field[11].view(-1)[column] = value
-            with pytest.raises(SimulationDiverged, match=r"particle 11: .*NaN"):
-                check_state(solver, state.replace(**{name: field}))
+            field.flatten(1)[[17, 21], column] = value
+            bad = state.replace(**{name: field}, time=torch.tensor(0.25, dtype=torch.float64))
+            words = r"t = 0\.25 s, particle 17: .*NaN.*Remedy: lower `solver\.cfl`"
+            with pytest.raises(SimulationDiverged, match=words) as info:
+                check_state(solver, bad)
+            assert (info.value.particle, info.value.time) == (17, 0.25)
 
 
 def test_a_measurement_can_check_as_well():

@@ -4,8 +4,8 @@ import dataclasses
 
 import pytest
 import torch
+from small_scenes import together
 
-from gaussian_swaying.gaussians.cloud import GaussianCloud
 from gaussian_swaying.mpm.solver import MPMSolver
 from gaussian_swaying.scenes.procedural import FlagScene
 
@@ -19,8 +19,7 @@ def speckled():
     own = flag.select(torch.tensor([300] * 6 + [420] * 6))
     jitter = 0.01 * torch.rand(12, 3, generator=torch.Generator().manual_seed(0))
     specks = dataclasses.replace(own, means=own.means + jitter - torch.tensor([0.0, 0.4, 0.0]))
-    names = ("means", "quats", "scales", "opacities", "sh")
-    return GaussianCloud(*(torch.cat([getattr(flag, n), getattr(specks, n)]) for n in names))
+    return together(flag, specks)
 
 
 @pytest.mark.parametrize("points", POINTS)
@@ -81,12 +80,10 @@ def test_what_further_points_join_is_not_loose(make_scene):
     filled = make_scene(few, dx=0.06, particle_spacing=0.025, loose="carry")
     assert filled.loose == 0
     assert filled.on_surface > len(filled.simulated)
-    names = ("means", "quats", "scales", "opacities", "sh")
     alone = few.select(torch.tensor([30]))
     speck = dataclasses.replace(alone, means=torch.tensor([[0.6, -0.7, 0.4]]), scales=alone.scales - 1.1)
     assert make_scene(speck, dx=0.06, particle_spacing=0.025).on_surface > 1
-    both = GaussianCloud(*(torch.cat([getattr(few, n), getattr(speck, n)]) for n in names))
-    scene = make_scene(both, dx=0.06, particle_spacing=0.025, loose="carry")
+    scene = make_scene(together(few, speck), dx=0.06, particle_spacing=0.025, loose="carry")
     assert scene.loose == 1
     assert scene.points.count == filled.points.count  # its further points are gone with it
 

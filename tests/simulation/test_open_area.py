@@ -10,8 +10,8 @@ import pytest
 import torch
 import yaml
 from bench.problems.bodies import cluttered_sphere
+from small_scenes import plain_cloud
 
-from gaussian_swaying.gaussians.cloud import GaussianCloud
 from gaussian_swaying.gaussians.compact import read_gaussians
 from gaussian_swaying.gaussians.filling import InteriorFilling
 from gaussian_swaying.gaussians.ply import write_ply
@@ -35,14 +35,8 @@ def capture(tmp_path_factory):
     helper = torch.nn.functional.one_hot(body.normals.abs().argmin(-1), 3).double()
     first = torch.nn.functional.normalize(torch.linalg.cross(helper, body.normals), dim=-1)
     axes = torch.stack([first, torch.linalg.cross(body.normals, first), body.normals], dim=-1)
-    cloud = GaussianCloud(
-        means=body.means.float(),
-        quats=rotation_to_quat(axes).float(),
-        scales=body.log_scales.float(),
-        opacities=torch.logit(body.opacity).float(),
-        sh=torch.zeros(len(body.means), 1, 3),
-        normals=None,
-    )
+    opacity = torch.logit(body.opacity).float()
+    cloud = plain_cloud(body.means, body.log_scales.float(), rotation_to_quat(axes).float(), opacity)
     path = tmp_path_factory.mktemp("capture") / "sphere.ply"
     write_ply(path, cloud)
     return path

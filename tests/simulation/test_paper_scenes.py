@@ -83,6 +83,8 @@ def test_what_flows_has_a_limit_on_its_area_and_all_have_one_on_what_is_drawn(na
     flows = law is not None and law.class_path.endswith("Sand")
     assert settings.aero.max_area_ratio == (1.0 if flows else None)
     assert settings.scene.max_stretch == (1.3 if name == "sand" else 2.0)  # grains that scatter
+    assert settings.solver.boundaries
+    assert settings.recorder.video
 
 
 def test_the_wind_of_the_vase_turns():

@@ -22,7 +22,7 @@ from gaussian_swaying.preview.picture import classify
 from gaussian_swaying.recording.recorder import Recorder
 from gaussian_swaying.recording.trajectory import load_trajectory
 from gaussian_swaying.scenes.leaves import LeavesScene
-from gaussian_swaying.scenes.procedural import FlagScene
+from gaussian_swaying.scenes.procedural import FlagScene, GivenScene
 from gaussian_swaying.scenes.solid import SolidScene
 from gaussian_swaying.simulation.diagnostics import measure
 from gaussian_swaying.simulation.edits import Edit
@@ -165,20 +165,12 @@ def test_no_gaussian_follows_a_node_without_mass(make_cloud):
     cloud = make_cloud(3000)
     cloud = dataclasses.replace(cloud, scales=cloud.scales - 4 * torch.rand(3000, 1))
     dx = 0.11
-    scene = SimulatedScene(Scene(generator=Given(cloud), points="grid"), Material(), dx)
+    scene = SimulatedScene(Scene(generator=GivenScene(cloud), points="grid"), Material(), dx)
     solver = MPMSolver(dx=dx)
     state = solver.init_state(scene.points)
     shift = torch.where(solver.bound.node_mass[:, None] > 0, torch.tensor([0.3, -0.2, 0.1]), 0.0)
     moved = scene.deformed(state.replace(node_displacement=shift)).means - scene.rest().means
     torch.testing.assert_close(moved, torch.tensor([0.3, -0.2, 0.1]).expand_as(moved), rtol=0, atol=1e-5)
-
-
-class Given(FlagScene):
-    def __init__(self, cloud):
-        self.cloud = cloud
-
-    def generate(self):
-        return self.cloud
 
 
 def test_it_moves_as_with_all_points(make_simulation):
@@ -341,7 +333,7 @@ def test_a_coarse_splat_keeps_its_gaussians(make_scene):
 def test_a_single_gaussian():
     one = FlagScene(spacing=0.5).generate().select(torch.tensor([0]))
     cloud = GaussianCloud(one.means, one.quats, one.scales - 3, one.opacities, one.sh)
-    scene = SimulatedScene(Scene(generator=Given(cloud)), Material(), 0.5)
+    scene = SimulatedScene(Scene(generator=GivenScene(cloud)), Material(), 0.5)
     assert scene.points.count == 1
     assert torch.equal(scene.points.position.double(), scene.frame.point_to_sim(cloud.means.double()).float().double())
 

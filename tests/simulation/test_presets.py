@@ -3,6 +3,7 @@
 from pathlib import Path
 
 import pytest
+from shared import refused
 
 from gaussian_swaying.cli.simulate import main
 from gaussian_swaying.simulation.simulation import Simulation
@@ -37,5 +38,4 @@ def test_options_after_a_preset_override_it():
     ],
 )
 def test_a_preset_that_is_not_there(arguments, words, capsys):
-    assert main(arguments) == 2
-    assert words in capsys.readouterr().err
+    refused(main, arguments, capsys, words)

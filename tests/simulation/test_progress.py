@@ -7,6 +7,7 @@ from pathlib import Path
 
 import pytest
 import torch
+from shared import refused
 
 from gaussian_swaying.cli.simulate import main
 from gaussian_swaying.mpm.solver import MPMSolver
@@ -121,15 +122,18 @@ def test_watching_changes_no_bit(formulation, looks):
         (["--material.E", "1e30"], ["substeps", "`material.E`"]),
         (["--frame_dt", "1e9"], ["substeps", "`frame_dt`"]),
         (["--material.density", "1e-30"], ["substeps"]),
+        (
+            ["--camera.init_args.width", "60000", "--camera.init_args.height", "60000"],
+            ["60,000 x 60,000 pixels is too"],
+        ),
+        (["--scene.generator.init_args.spacing", "1e-9"], ["`generator.spacing` that makes at most"]),
+        (["--background", "[255, 255, 255]"], ["`background` within [0, 1]"]),
+        (["--background", "[-0.1, 0, 0]"], ["`background` within [0, 1]"]),
     ],
 )
-def test_substeps_without_end_are_refused(arguments, words, tmp_path, capsys):
-    assert main([*SMALL, *arguments, "--output", str(tmp_path / "run")]) == 2
-    said = capsys.readouterr().err
-    assert said.count("\n") == 1
-    for word in words:
-        assert word in said, said
-    assert not (tmp_path / "run").exists()
+def test_what_has_no_end_or_place_is_refused(arguments, words, tmp_path, capsys):
+    """Substeps without end, pictures and scenes for which there is no memory, colours beyond white."""
+    refused(main, [*SMALL, *arguments, "--output", str(tmp_path / "run")], capsys, *words, folder=tmp_path)
 
 
 def test_a_frame_that_gets_too_many_substeps_ends_the_run(tmp_path, capsys, monkeypatch):
@@ -155,21 +159,3 @@ def test_the_cameras_of_as_many_frames_as_there_may_be(tmp_path, monkeypatch):
     seen.clear()
     assert main([*SMALL, "--frames", "7", "--output", str(tmp_path / "run")]) == 130
     assert seen == list(range(7))
-
-
-def test_a_picture_that_is_too_large_is_refused(tmp_path, capsys):
-    size = ["--camera.init_args.width", "60000", "--camera.init_args.height", "60000"]
-    assert main([*SMALL, *size, "--output", str(tmp_path / "run")]) == 2
-    assert "60,000 x 60,000 pixels is too large" in capsys.readouterr().err
-    assert not (tmp_path / "run").exists()
-
-
-def test_a_flag_of_more_gaussians_than_there_is_memory(capsys):
-    assert main([*SMALL, "--scene.generator.init_args.spacing", "1e-9"]) == 2
-    assert "`generator.spacing` that makes at most" in capsys.readouterr().err
-
-
-@pytest.mark.parametrize("color", ["[255, 255, 255]", "[-0.1, 0, 0]"])
-def test_a_background_beyond_white_is_refused(color, tmp_path, capsys):
-    assert main([*SMALL, "--background", color, "--output", str(tmp_path / "run")]) == 2
-    assert "`background` within [0, 1]" in capsys.readouterr().err

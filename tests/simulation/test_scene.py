@@ -8,8 +8,8 @@ import math
 
 import pytest
 import torch
+from small_scenes import together
 
-from gaussian_swaying.gaussians.cloud import GaussianCloud
 from gaussian_swaying.gaussians.filling import InteriorFilling
 from gaussian_swaying.geometry.linalg import polar_rotation
 from gaussian_swaying.geometry.regions import Box
@@ -18,7 +18,7 @@ from gaussian_swaying.mpm.boundaries.pinned_region import PinnedRegion
 from gaussian_swaying.mpm.laws.neo_hookean import NeoHookean
 from gaussian_swaying.mpm.laws.sand import Sand
 from gaussian_swaying.mpm.solver import MPMSolver
-from gaussian_swaying.scenes.procedural import FlagScene, ProceduralScene
+from gaussian_swaying.scenes.procedural import FlagScene
 from gaussian_swaying.simulation.edits import Edit
 from gaussian_swaying.simulation.material import Material, MaterialRegion
 from gaussian_swaying.simulation.sampling import cell_volume
@@ -27,16 +27,6 @@ from gaussian_swaying.simulation.simulated_scene import SimulatedScene
 
 LEFT = Box([None, None, None], [0.5, None, None])
 UPS = [[0.0, 0.0, 1.0], [0.0, -1.0, 0.0], [0.3, -0.7, 0.2]]
-
-
-class _Given(ProceduralScene):
-    """A splat as a scene."""
-
-    def __init__(self, cloud):
-        self.cloud = cloud
-
-    def generate(self):
-        return self.cloud
 
 
 def _rest_state(scene):
@@ -243,9 +233,7 @@ def test_faint_gaussians_take_no_area(make_cloud, make_scene):
     """The surface belongs to those that carry it, so its weight does not depend on what is filtered out."""
     flag = FlagScene(spacing=0.1, ripple=0.0).generate()
     haze = dataclasses.replace(flag, means=flag.means + 0.01, opacities=torch.full((96,), -5.0))
-    names = ("means", "quats", "scales", "opacities", "sh")
-    both = GaussianCloud(*(torch.cat([getattr(flag, name), getattr(haze, name)]) for name in names))
-    torch.testing.assert_close(make_scene(both).patches.area, make_scene(flag).patches.area)
+    torch.testing.assert_close(make_scene(together(flag, haze)).patches.area, make_scene(flag).patches.area)
 
 
 def test_each_part_has_the_law_it_was_given(make_cloud, make_scene):
@@ -386,18 +374,17 @@ def _sheet_with_a_hole():
     edge = dataclasses.replace(edge, scales=edge.scales - 0.5)  # they end near the rim of the sheet
     wide = one.scales + math.log(8) * (one.scales > one.scales.min())
     large = dataclasses.replace(one, means=torch.tensor([[0.5, 0.0, 0.5]]), scales=wide)
-    fields = [f.name for f in dataclasses.fields(cloud) if getattr(cloud, f.name) is not None]
-    return dataclasses.replace(cloud, **{n: torch.cat([getattr(edge, n), getattr(large, n)]) for n in fields})
+    return together(edge, large)
 
 
-def test_large_gaussians_get_further_points():
+def test_large_gaussians_get_further_points(make_scene):
     """They follow the Gaussians, have normals, areas and material of their own place, and are not drawn."""
     cloud = _sheet_with_a_hole()
     count = len(cloud)
     lower = MaterialRegion(region=Box([None, None, None], [None, None, 0.49]), density=1000.0)
     material = Material(density=100.0, thickness=0.02, regions=[lower])
-    plain = SimulatedScene(Scene(points="gaussian", generator=_Given(cloud)), material, 0.1)
-    full = SimulatedScene(Scene(points="gaussian", generator=_Given(cloud), particle_spacing=0.05), material, 0.1)
+    plain = make_scene(cloud, material, 0.1)
+    full = make_scene(cloud, material, 0.1, particle_spacing=0.05)
     assert plain.on_surface == plain.points.count == count
     assert full.on_surface == full.points.count > count + 50
     assert torch.equal(full.points.position[:count], plain.points.position)
@@ -411,48 +398,30 @@ def test_large_gaussians_get_further_points():
     state = _rest_state(full)
     moved = full.deformed(state.replace(position=state.position + 0.25))
     torch.testing.assert_close(moved.means, cloud.means + 0.25)
-    layered = SimulatedScene(
-        Scene(points="gaussian", generator=_Given(cloud), particle_spacing=0.05, layers=3), material, 0.1
-    )
+    layered = make_scene(cloud, material, 0.1, particle_spacing=0.05, layers=3)
     assert layered.on_surface == full.points.count
     assert layered.points.count == 3 * full.points.count
 
 
-def test_further_points_in_the_paper_s_areas():
+def test_further_points_in_the_paper_s_areas(make_scene):
     """Each Gaussian keeps pi s1 s2, shared among its points."""
     cloud = _sheet_with_a_hole()
-    plain, full = (
-        SimulatedScene(
-            Scene(points="gaussian", generator=_Given(cloud), area="paper", particle_spacing=s), Material(), 0.1
-        )
-        for s in (None, 0.05)
-    )
+    plain, full = (make_scene(cloud, dx=0.1, area="paper", particle_spacing=s) for s in (None, 0.05))
     torch.testing.assert_close(full.patches.area.sum(), plain.patches.area.sum())
     assert full.points.count > plain.points.count
 
 
-def test_spacing_of_the_particles_is_in_metres():
+def test_spacing_of_the_particles_is_in_metres(make_scene):
     cloud = _sheet_with_a_hole()
-    one, half = (
-        SimulatedScene(
-            Scene(points="gaussian", generator=_Given(cloud), particle_spacing=s, metres_per_unit=m), Material(), 0.1
-        )
-        for s, m in ((0.05, 1.0), (0.1, 2.0))
-    )
+    one, half = (make_scene(cloud, dx=0.1, particle_spacing=s, metres_per_unit=m) for s, m in ((0.05, 1.0), (0.1, 2.0)))
     assert one.points.count == half.points.count
-    with pytest.raises(ValueError, match="particle_spacing"):
-        Scene(points="gaussian", generator=_Given(cloud), particle_spacing=0.0)
-    with pytest.raises(ValueError, match="particle_spacing"):
-        Scene(points="gaussian", generator=_Given(cloud), particle_spacing=0.05, filling=InteriorFilling())
 
 
-def test_three_layers_are_a_plate(make_cloud):
+def test_three_layers_are_a_plate(make_cloud, make_scene):
     """The mass of one, and its moment about the middle plane: that of a plate of this thickness, h² / 12."""
     cloud = make_cloud()
     material = Material(thickness=0.03)
-    one, three = (
-        SimulatedScene(Scene(points="gaussian", generator=_Given(cloud), layers=n), material, 0.25) for n in (1, 3)
-    )
+    one, three = (make_scene(cloud, material, layers=n) for n in (1, 3))
     count = one.points.count
     assert three.points.count == 3 * count
     torch.testing.assert_close(three.points.mass.sum(), one.points.mass.sum())
@@ -470,11 +439,13 @@ def test_three_layers_are_a_plate(make_cloud):
     [
         ({"layers": 2}, "`scene.layers` to be 1 or 3"),
         ({"layers": 3, "filling": InteriorFilling()}, "`scene.filling`"),
+        ({"particle_spacing": 0.0}, "particle_spacing"),
+        ({"particle_spacing": 0.05, "filling": InteriorFilling()}, "particle_spacing"),
     ],
 )
-def test_layers_that_do_not_fit(make_cloud, scene, words):
+def test_points_that_do_not_fit(make_scene, scene, words):
     with pytest.raises(ValueError, match=words):
-        SimulatedScene(Scene(points="gaussian", generator=_Given(make_cloud()), **scene), Material(), 0.25)
+        make_scene(**scene)
 
 
 def test_layers_share_the_volume_of_a_cell(make_scene):

@@ -9,8 +9,7 @@ from concurrent.futures import ProcessPoolExecutor
 import pytest
 
 from gaussian_swaying.cli.sweep import main
-from gaussian_swaying.sweeps.backend import Outcome, drive
-from gaussian_swaying.sweeps.job import Job
+from gaussian_swaying.sweeps.backend import Job, Outcome, drive
 from gaussian_swaying.sweeps.pool import Pool
 
 

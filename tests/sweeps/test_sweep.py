@@ -1,6 +1,6 @@
 """Whole sweeps with worker processes: disturbed ones end as undisturbed ones, and failures stop nothing.
 
-Covers: sweeps.contact_sheet, sweeps.job, sweeps.worker.
+Covers: sweeps.contact_sheet, sweeps.worker.
 """
 
 import csv
@@ -18,12 +18,13 @@ from contextlib import suppress
 import numpy as np
 import pytest
 from PIL import Image
+from shared import refused
 
 from gaussian_swaying.cli.sweep import explain, main
 from gaussian_swaying.runs.lock import FolderLock
 from gaussian_swaying.simulation.simulation import Simulation
 from gaussian_swaying.sweeps import worker
-from gaussian_swaying.sweeps.job import Job
+from gaussian_swaying.sweeps.backend import Job
 from gaussian_swaying.sweeps.worker import do
 
 PROGRAM = "import sys; from gaussian_swaying.cli.main import main; sys.exit(main())"
@@ -281,44 +282,38 @@ def test_a_run_whose_process_is_killed_too_often_is_recorded(undisturbed, tmp_pa
 # ---- refused
 
 
-def _refused(arguments, capsys, *words):
-    capsys.readouterr()
-    assert main([str(argument) for argument in arguments]) == 2
-    error = capsys.readouterr().err
-    assert error.startswith("error: ")
-    assert error.count("\n") == 1, error
-    for word in words:
-        assert word in error, error
+def _refuse(arguments, capsys, *words):
+    refused(main, [str(argument) for argument in arguments], capsys, *words)
 
 
 def test_other_settings_are_refused(undisturbed, tmp_path, sweep_file, capsys):
     before = {path: path.stat().st_mtime_ns for path in undisturbed.rglob("*")}
     same = sweep_file(tmp_path / "same.yaml")
-    _refused([same, "--output", undisturbed], capsys, "holds a sweep already", "--resume", "--output")
+    _refuse([same, "--output", undisturbed], capsys, "holds a sweep already", "--resume", "--output")
     other = sweep_file(tmp_path / "other.yaml", settings={"material.density": 40.0})
-    _refused([other, "--output", undisturbed, "--resume"], capsys, "other settings", "material.density", "30.0", "40.0")
+    _refuse([other, "--output", undisturbed, "--resume"], capsys, "other settings", "material.density", "30.0", "40.0")
     seed = sweep_file(tmp_path / "seed.yaml", seed=1)
-    _refused([seed, "--output", undisturbed, "--resume"], capsys, "other settings", "wind.seed")
+    _refuse([seed, "--output", undisturbed, "--resume"], capsys, "other settings", "wind.seed")
     more = sweep_file(tmp_path / "more.yaml", draws=3)
-    _refused([more, "--output", undisturbed, "--resume"], capsys, "8 runs", "12")
+    _refuse([more, "--output", undisturbed, "--resume"], capsys, "8 runs", "12")
     assert {path: path.stat().st_mtime_ns for path in undisturbed.rglob("*")} == before
 
 
 def test_folders_of_others_are_refused(tmp_path, sweep_file, capsys):
     file = sweep_file(tmp_path / "tiny.yaml")
-    _refused([file, "--output", tmp_path / "none", "--resume"], capsys, "nothing to resume", "leave out --resume")
+    _refuse([file, "--output", tmp_path / "none", "--resume"], capsys, "nothing to resume", "leave out --resume")
     assert not (tmp_path / "none").exists()
     (tmp_path / "mine/runs").mkdir(parents=True)
-    _refused([file, "--output", tmp_path / "mine"], capsys, "contains runs of something else", "--output")
+    _refuse([file, "--output", tmp_path / "mine"], capsys, "contains runs of something else", "--output")
     assert [path.name for path in (tmp_path / "mine").iterdir()] == ["runs"]
     (tmp_path / "text").write_text("")
-    _refused([file, "--output", tmp_path / "text"], capsys, "cannot be written", "--output")
+    _refuse([file, "--output", tmp_path / "text"], capsys, "cannot be written", "--output")
 
 
 def test_one_sweep_at_a_time(undisturbed, tmp_path, sweep_file, capsys):
     lock = FolderLock(undisturbed)
     try:
-        _refused([sweep_file(tmp_path / "tiny.yaml"), "--output", undisturbed, "--resume"], capsys, "Another run")
+        _refuse([sweep_file(tmp_path / "tiny.yaml"), "--output", undisturbed, "--resume"], capsys, "Another run")
     finally:
         lock.release()
 

@@ -1,6 +1,5 @@
 """``bench.py fit``: errors against the truth, and tables that say what is reached and what is missed."""
 
-import argparse
 import json
 import math
 
@@ -9,15 +8,14 @@ import pytest
 import torch
 import yaml
 from bench.cases import fit as case
-from bench.cases import fit_bias, fit_reference
+from bench.cases import fit_bias
 from bench.problems.films import write_video
 
 from gaussian_swaying.fitting.variants import states_of
 from gaussian_swaying.simulation.simulation import Simulation
 
-from .conftest import shown
+from .conftest import HEAD, cells, measure, shown
 
-HEAD = {"device": "a CPU", "versions": {"torch": "2"}, "seed": 0}
 ROW = {
     "speed_error": 0.004,
     "direction_error_deg": 0.5,
@@ -43,36 +41,23 @@ def test_the_settings_of_own_data_are_a_simulation(tmp_path):
     assert simulation.wind.flows[0].tolist() == case.TRUTH["flow"]
 
 
-def test_missed_goals_are_said_to_be_missed():
+def test_missed_goals_and_what_was_not_found_are_told():
+    lost, wild = ROW | {"psnr_rest_db": 40.0, "psnr_fitted_db": 30.0}, ROW | {"speed_error": 0.07}
     rows = {"two cameras": ROW, "one camera": ROW | {"speed_error": -0.02}, "pixels alone": ROW | {"speed_error": 0.9}}
-    lines = shown("fit.own", [HEAD | {"own": rows}])
-    assert "| two cameras | +0.40 % | 0.50° | -0.80 % | 31.3 dB | 12 s | yes |" in lines
-    assert "| one camera | -2.00 % | 0.50° | -0.80 % | 31.3 dB | 12 s | no |" in lines
-    told = shown("fit.own", [HEAD | {"own": {"two cameras": ROW | {"not_settled": "The values have not settled."}}}])
-    assert any(line.startswith("| two cameras (not settled) | +0.40 %") for line in told)
-    lost = ROW | {"psnr_rest_db": 40.0, "psnr_fitted_db": 30.0}
-    assert any(line.startswith("| x (not followed) |") for line in shown("fit.own", [HEAD | {"own": {"x": lost}}]))
-    assert "| pixels alone | +90.00 % | 0.50° | -0.80 % | 31.3 dB | 12 s |  |" in lines
-    found = shown(
-        "fit.blender",
-        [
-            HEAD
-            | {
-                "blender": {
-                    "flag, two cameras": ROW | {"speed_error": 0.07, "known": {"solver.dx": 0.06}, "cells": 50},
-                    "flag, one camera": ROW | {"speed_error": 0.07},
-                    "curtain, two cameras": {"refused": "The video cannot tell."},
-                }
-            }
-        ],
-    )
-    assert [line.split(" | ")[-1] for line in found if line.startswith(("| flag", "| curtain"))] == [
-        "no |",
-        "yes |",
-        "no |",
-    ]
-    assert any("| 0.75 s; 50 cells; `solver.dx` 0.06 | no |" in line for line in found)
-    assert shown("fit.blender", [HEAD]) == ["Not measured yet."]
+    rows |= {"x": lost, "y": ROW | {"not_settled": "The values have not settled."}}
+    found = cells("fit.own", [HEAD | {"own": rows}])
+    assert found[0] == ["two cameras", "+0.40 %", "0.50°", "-0.80 %", "31.3 dB", "12 s", "yes"]
+    assert [(row[0], row[-1]) for row in found[1:]] == [
+        ("one camera", "no"), ("pixels alone", ""), ("x (not followed)", "yes"), ("y (not settled)", "yes"),
+    ]  # fmt: skip
+    rows = {"flag, two cameras": wild | {"known": {"solver.dx": 0.06}, "cells": 50}, "flag, one camera": wild}
+    rows["curtain, two cameras"] = {"refused": "The video cannot tell."}
+    found = {row[0]: row[-2:] for row in cells("fit.blender", [HEAD | {"blender": rows}])}
+    assert found["flag, two cameras"] == ["0.75 s; 50 cells; `solver.dx` 0.06", "no"]
+    assert found["flag, one camera"][1] == "yes"
+    assert found["curtain, two cameras"][1] == "no"
+    for slot in ("fit.blender", "fit.bias", "fit.reference", "fit.soft", "fit.soft_motion"):
+        assert shown(slot, [HEAD]) == ["Not measured yet."]
 
 
 def test_a_claim_about_all_cases_counts_them():
@@ -103,30 +88,21 @@ def test_predicted_frames_are_compared_with_what_the_splat_reaches_at_rest():
         for k, (p, r) in enumerate([(28.5, 30.0), (27.0, 30.0), (26.5, 26.0)])
     }
     rows["flag 3, tracks alone"] = ROW | {"psnr_rest_db": 30.0}
-    found = [
-        line.split(" | ") for line in shown("fit.blender", [HEAD | {"blender": rows}]) if line.startswith("| flag")
-    ]
-    assert [line[7] for line in found] == ["yes", "no", "yes", "yes"]
-    assert found[3][-1] == " |" or found[3][-1] == "|"
+    found = cells("fit.blender", [HEAD | {"blender": rows}])
+    assert [row[7] for row in found] == ["yes", "no", "yes", "yes"]
+    assert found[3][-1] == ""
 
 
 def test_faults_of_the_model_are_shown_with_the_grid_that_has_them():
-    row = {
-        "rms_px": 2.166,
-        "speed_error": 0.0063,
-        "azimuth_error_deg": -0.002,
-        "material.E_error": 0.0098,
-        "points": 1800,
-    }
-    found = shown("fit.bias", [HEAD | {"bias": {"flag, solver.dx 0.04, scene.generator.init_args.spacing 0.01": row}}])
-    assert "| flag, `dx 0.04`, `spacing 0.01` | 2.17 pixels | +0.63 % | -0.00° | +0.98 % | 1,800 |" in found
-    lost = shown("fit.bias", [HEAD | {"bias": {"flag, solver.dx 0.01": row | {"rms_px": 320.0}}}])
-    assert "| flag, `dx 0.01` | the simulation diverged |  |  |  | 1,800 |" in lost
-    assert shown("fit.bias", [HEAD]) == ["Not measured yet."]
+    row = dict.fromkeys(("speed_error", "azimuth_error_deg", "material.E_error"), 0.0063) | {"points": 1800}
     name = fit_bias.name_of("flag", {"solver.dx": 0.01, "solver.boundaries": [{}]}, 1.0)
     assert name == "flag, solver.dx 0.01, solver.boundaries, to 1 s"
-    told = shown("fit.bias", [HEAD | {"bias": {name: row}}])
-    assert any(line.startswith("| flag, `dx 0.01`, `boundaries`, `to 1 s` | 2.17") for line in told)
+    assert fit_bias.name_of("flag", {}, None, "same.npz") == "flag, beside same.npz"
+    rows = {name: row | {"rms_px": 2.166}, "flag, solver.dx 0.01": row | {"rms_px": 320.0}}
+    assert cells("fit.bias", [HEAD | {"bias": rows}]) == [
+        ["flag, `dx 0.01`, `boundaries`, `to 1 s`", "2.17 pixels", "+0.63 %", "+0.01°", "+0.63 %", "1,800"],
+        ["flag, `dx 0.01`", "the simulation diverged", "", "", "", "1,800"],
+    ]
 
 
 def test_a_bias_is_the_step_that_undoes_the_difference(tmp_path):
@@ -144,7 +120,6 @@ def test_a_bias_is_the_step_that_undoes_the_difference(tmp_path):
     _write_cloth(folder / "same.npz", simulation, {})
     same = fit_bias.bias(folder, {}, 4 / 24, "cpu", "same.npz")
     assert same["azimuth_error_deg"] == pytest.approx(0.0, abs=0.01)
-    assert fit_bias.name_of("flag", {}, None, "same.npz") == "flag, beside same.npz"
 
 
 def test_a_splat_that_moves_as_the_reference_shows_the_video(tmp_path):
@@ -153,29 +128,22 @@ def test_a_splat_that_moves_as_the_reference_shows_the_video(tmp_path):
     _write_cloth(folder / "cloth.npz", simulation, {})
     (folder / "uncertainty").mkdir()
     _write_cloth(folder / "uncertainty/coarser.npz", simulation, {"wind.azimuth": truth["azimuth"] + 15})
-    result, saved = {}, []
-    options = argparse.Namespace(device="cpu", law="paper", known="{}")
-    fit_reference.measure(options, [folder], result, lambda found: saved.append(len(found["reference"])))
+    given = ("fit", "--data", folder.parent, "--reference", "--law", "paper")
+    result, saved = measure(*given)
     assert list(result["reference"]) == [
         "flag, cloth",
         "flag, uncertainty/coarser",
         "flag, simulated as in `scene.yaml`",
     ]
-    assert saved == [1, 2, 3]
+    assert [len(now["reference"]) for now in saved[1:4]] == [1, 2, 3]
     own, coarser, simulated = result["reference"].values()
     assert own["psnr_predicted_db"] > 35
     assert simulated["psnr_predicted_db"] > own["psnr_predicted_db"]
     assert coarser["psnr_predicted_db"] < own["psnr_predicted_db"] - 3
-    options.known = '{"solver.dx": 0.12}'
-    fit_reference.measure(options, [folder], result, lambda found: None)
+    measure(*given, "--known", '{"solver.dx": 0.12}', result=result)
     assert list(result["reference"])[3:] == ["flag, simulated `dx` 0.12"]
-    lines = shown("fit.reference", [HEAD | {"reference": {"flag, cloth": own, "flag, uncertainty/coarser": coarser}}])
-    assert any(line.startswith("| predicted frames | cloth | coarser |") for line in lines)
-    assert any(
-        line == f"| flag | {own['psnr_predicted_db']:.1f} dB | {coarser['psnr_predicted_db']:.1f} dB |"
-        for line in lines
-    )
-    assert shown("fit.reference", [HEAD]) == ["Not measured yet."]
+    (told,) = cells("fit.reference", [HEAD | {"reference": {"flag, cloth": own, "flag, uncertainty/coarser": coarser}}])
+    assert told == ["flag", *(f"{row['psnr_predicted_db']:.1f} dB" for row in (own, coarser))]
 
 
 def _case(tmp_path):

@@ -3,17 +3,20 @@
 import json
 from itertools import pairwise
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 import torch
 from bench.cases import flags
+from bench.cases.trained import filled
 from bench.tables import flag_benchmark as tables
 from imageio.v3 import imread, imwrite
+from small_scenes import plain_cloud
 
 from gaussian_swaying.simulation.simulation import Simulation
 
-from .conftest import cells, shown
+from .conftest import HEAD, cells, measure, shown
 
 DRAG = {2: 0.8, 3: 1.28}
 PIXEL = imwrite("<bytes>", np.zeros((4, 6, 3), np.uint8), extension=".png")
@@ -104,16 +107,12 @@ def test_pictures_have_the_size_of_the_reference(tmp_path):
 
 def test_gaussians_turned_to_the_reference(tmp_path):
     """Normals are those of the nearest vertex, the normal's own axis is the one that was turned, sizes stay."""
-    from gaussian_swaying.gaussians.cloud import GaussianCloud
     from gaussian_swaying.gaussians.ply import read_ply, write_ply
     from gaussian_swaying.geometry.patches import smallest_axis_normal
 
     generator = torch.Generator().manual_seed(0)
     quats = torch.randn(50, 4, generator=generator)
-    cloud = GaussianCloud(
-        torch.rand(50, 3, generator=generator), quats, torch.tensor([[-4.0, -3.0, -9.0]]).repeat(50, 1),
-        torch.zeros(50), torch.zeros(50, 1, 3),
-    )  # fmt: skip
+    cloud = plain_cloud(torch.rand(50, 3, generator=generator), torch.tensor([-4.0, -3.0, -9.0]), quats, 0.0)
     write_ply(tmp_path / "own.ply", cloud)
     vertices = np.array([[[0.0, 0.5, 0.5], [1.0, 0.5, 0.5]]])
     normals = np.array([[0.0, -1.0, 0.0], [0.6, 0.0, 0.8]])
@@ -138,14 +137,12 @@ def test_a_row_of_a_flag_is_simulated_and_compared(tmp_path):
     folder.mkdir(parents=True)
     settings = {"width": 1.2, "height": 0.8}
     np.savez(folder / "cloth.npz", positions=np.repeat(rest[None], 2, 0), faces=faces, settings=json.dumps(settings))
-    options = type("Options", (), {})()
-    options.dataset, options.device, options.frames, options.points = tmp_path / "data", "cpu", 2, 500
+    options = SimpleNamespace(dataset=tmp_path / "data", device="cpu", frames=2, points=500)
     options.more = "--scene.generator.init_args.spacing=0.1 --solver.dx=0.2 --solver.gravity=[0,0,0] "
     options.more += "--solver.boundaries=[] --scene.particle_spacing=null"
     ours = flags.VARIANTS["ours"]
     row = flags.run_row(1, ours, options, None, tmp_path / "ours_1")
-    assert row["status"] == "complete"
-    assert row["frames"] == 2
+    assert (row["status"], row["frames"]) == ("complete", 2)
     assert row["mean"]["chamfer_m"] < 0.1  # the spacing
     assert row["chamfer_share"] == pytest.approx(row["mean"]["chamfer_m"] / 1.2)
     particle = flags.run_row(1, flags.VARIANTS["particle"], options, None, tmp_path / "particle_1")
@@ -178,36 +175,28 @@ def test_a_figure_needs_all_pictures(tmp_path):
     assert imread(target).shape[1] > 1000
 
 
-def test_the_page_tells_what_was_and_what_was_not():
-    mean = {"psnr_db": 22.5, "chamfer_m": 0.0213 * 1.2}
-    row = {"status": "complete", "frames": 250, "torn_particles": 0, "chamfer_share": 0.0213, "mean": mean}
-    row["chamfer_per_frame_m"] = [0.012, 0.012, 0.024, 0.024, 0.048, 0.048]
-    row |= {"particles": 1000, "substeps": 5000, "ms_per_frame": 12.3, "device_memory_bytes": 2**30}
-    stopped = row | {"status": "diverged", "frames": 31}
-    result = {"device": "a GPU", "versions": {"torch": "2"}, "seed": 0, "splats": "made in code"}
-    result["rows"] = {"ours": {"1": row, "3": stopped}, "particle": {"1": {"failed": "x"}}}
-    result |= {"more": "--solver.dx=0.03", "note": "Other work ran beside these."}
+def _share(share, mass=0.5, **more):
+    return {"status": "complete", "chamfer_share": share, "torn_particles": 0, "mass_kg": mass,
+            "mean": {"chamfer_m": share}} | more  # fmt: skip
+
+
+def test_the_page_tells_what_was_not_and_how_far_the_reference_is_from_itself():
+    stopped = _share(0.0213, status="diverged", frames=31)
+    rows = {"ours": {"1": _share(0.0213), "3": stopped}, "particle": {"1": {"failed": "x"}}}
     known = {"cells": 60, "quality": 16, "frames_compared": 250, "chamfer": 0.034}
-    result["uncertainty"] = {"1": {"coarser": known, "hardly bending": known | {"chamfer": 0.082}}}
-    told = [shown(f"flags.{part}", result) for part in ("device", "rows", "goals")]
-    text = "\n".join(line for part in (*told, shown("flags.reference", [result])) for line in part)
-    ours = flags.VARIANTS["ours"].title
-    assert f"| {ours} | 2.13 % | stopped at frame 31 | 22.50 | 22.50 | -, - |" in text
-    assert f"| {flags.VARIANTS['particle'].title} | failed | - | - | - | -, - |" in text
-    assert "`--solver.dx=0.03`" in text
-    assert "Other work ran beside these." in text
-    assert "coarser (60 cells, 16 steps, 250 frames) 3.40 %" in text
-    assert "another flag: with a fiftieth of its bending stiffness (60 cells, 16 steps, 250 frames) 8.20 %" in text
-    assert "(reference itself: 3.40 %)" in text
-    result["uncertainty"]["1"]["half the cells"] = known | {"chamfer": 0.041}
-    doubt = "2.13 % (reference itself: 4.10 %)"  # the largest of all that are this flag
-    assert cells("flags.goals", result)[0][1] == doubt
+    ways = {"coarser": known, "hardly bending": known | {"chamfer": 0.082}, "half": known | {"chamfer": 0.041}}
+    result = HEAD | {"splats": "made in code", "rows": rows, "uncertainty": {"1": ways}}
+    result |= {"more": "--solver.dx=0.03", "note": "Other work ran beside these."}
+    assert [row[1:3] for row in cells("flags.rows", result)] == [["2.13 %", "stopped at frame 31"], ["failed", "-"]]
+    told = "\n".join(shown("flags.device", result))
+    assert "`--solver.dx=0.03`" in told
+    assert "Other work ran beside these." in told
+    told = "\n".join(shown("flags.reference", [result]))
+    assert "coarser (60 cells, 16 steps, 250 frames) 3.40 %" in told
+    assert "another flag: with a fiftieth of its bending stiffness (60 cells, 16 steps, 250 frames) 8.20 %" in told
+    # the largest of all that are this flag
+    assert cells("flags.goals", result)[0][1] == "2.13 % (reference itself: 4.10 %)"
     assert shown("flags.reference_doubt", [result]) == "4.10 %"
-    assert shown("flags.costs", result)[2:] == [
-        f"| {ours}, pattern {p} | 1,000 | 5,000 | 12.3 | 1.00 |" for p in (1, 3)
-    ]
-    assert shown("flags.distance", result, "ours", "1") == "2.13 %"
-    assert shown("flags.reference_distance", [result], "hardly_bending", "1") == "8.20 %"
 
 
 def test_the_page_quotes_the_paper():
@@ -221,83 +210,48 @@ def test_numbers_of_the_prose_are_those_of_the_reference():
     assert shown("flags.per_degree", [], "2") == "9 %"
 
 
-def test_goals_and_what_one_change_does():
+def test_goals_and_what_changes_do():
     def row(share, psnr, **more):
-        return {"status": "complete", "chamfer_share": share, "mean": {"psnr_db": psnr, "chamfer_m": 2 * share}} | more
+        return _share(share) | {"mean": {"psnr_db": psnr, "chamfer_m": 2 * share}} | more
 
     ours = row(0.02, 22.0, chamfer_per_frame_m=[0.01, 0.02, 0.06])
-    ours["mass_kg"] = 0.5
-    rows = {"ours": {"3": ours}, "particle": {"3": row(0.1, 18.0, mass_kg=0.5)}, "no_surface": {"3": row(0.03, 18.0)}}
+    rows = {"ours": {"3": ours}, "particle": {"3": row(0.1, 18.0)}, "no_surface": {"3": row(0.03, 18.0)}}
     rows |= {"no_shading": {"3": row(0.02, 23.0)}, "undamped": {"3": row(0.025, 22.0)}, "thin": {"3": row(0.018, 22.0)}}
-    result = {"splats": "made in code", "rows": rows, "uncertainty": {"3": {"coarser": {"chamfer": 0.0067}}}}
+    rows |= {"to_volume": {"3": row(0.022, 22.0)}, "to_layer": {"3": row(0.06, 22.0)}, "own_volumes": {"3": row(1, 1)}}
+    result = {"splats": "made in code", "rows": rows}
     found = cells("flags.goals", result)
-    assert found == [
-        ["pattern 3: Chamfer distance within 3 % of the longer side", "2.00 % (reference itself: 0.67 %)", "yes"],
-        ["pattern 3: PhysGaussian's way has the mass of ours", "1.000000 times", "yes"],
-        ["pattern 3: Chamfer distance 0.25 times that of PhysGaussian's way", "0.20 times", "yes"],
-        ["pattern 3: PSNR +4.2 dB over PhysGaussian's way", "+4.00 dB", "no"],
-        ["pattern 3: Chamfer distance at least twice as large without surface modelling", "1.50 times", "no"],
-        ["pattern 3: lower PSNR without shading", "+1.00 dB", "no"],
-    ]
+    assert [row[1:] for row in found] == [
+        ["2.00 %", "yes"], ["1.000000 times", "yes"], ["0.20 times", "yes"], ["+4.00 dB", "no"], ["1.50 times", "no"],
+        ["+1.00 dB", "no"],
+    ]  # fmt: skip
     trained = cells("flags.goals", result | {"splats": "trained, 7000 images"})
     assert trained[0][0::2] == ["pattern 3: Chamfer distance within 1.2 % of the longer side", "no"]
     assert trained[1:] == found[1:]
-    lines = shown("flags.changes", {"rows": rows})
-    assert lines[0].endswith("0.50 %, 1.00 %, 3.00 %")
-    assert "half the thickness, double E and density -0.20; no shading +0.00; without the" in lines[2]
-    assert lines[2].endswith("damping +0.50")
+    thirds, way, single = shown("flags.changes", {"rows": rows})
+    assert thirds.endswith("0.50 %, 1.00 %, 3.00 %")
+    told = "ours with volumes of grid cells +0.20; one layer +3.80; no shading: PhysGaussian's way +4.00"
+    assert way == f"- pattern 3, what each further change adds [% of the longer side]: {told}"
+    assert "half the thickness, double E and density -0.20; no shading +0.00; without the" in single
+    assert single.endswith("damping +0.50")
     rows["particle"]["3"]["mass_kg"] = 0.5001
     assert cells("flags.goals", result)[1][1:] == ["1.000200 times", "no"]
 
 
-def _share(share, mass=0.5):
-    return {"status": "complete", "chamfer_share": share, "torn_particles": 0, "mass_kg": mass,
-            "mean": {"chamfer_m": share}}  # fmt: skip
-
-
-def test_a_row_of_another_mass_is_marked():
-    rows = {"ours": {"1": _share(0.02)}, "particle": {"1": _share(0.03)}, "own_volumes": {"1": _share(0.04, 1.0)}}
-    told = shown("flags.rows", {"rows": rows | {"thin": {"1": _share(0.01, 0.514)}}})
-    assert told[0] == "|  | pattern 1: Chamfer | mass / mass of ours |"
-    assert [line.split(" | ")[1:] for line in told[2:]] == [
-        ["2.00 %", "1.00 |"], ["3.00 %", "1.00 |"], ["4.00 % (2.00 times the mass)", "2.00 |"], ["1.00 %", "1.03 |"],
-    ]  # fmt: skip
-
-
-def test_rows_of_another_splat_are_not_compared_with_ours():
-    """When ours was measured again with a splat trained anew and a row was not."""
+def test_rows_of_another_mass_or_splat_are_marked_and_those_that_were_dropped_named():
+    """A splat is another one when ours was measured again with a splat trained anew and the row was not."""
     old, new = ({"training": {"seconds": seconds}} for seconds in (78.2, 80.1))
-    rows = {"ours": {"1": _share(0.02) | new}, "linear": {"1": _share(0.03) | new}, "thin": {"1": _share(0.04) | old}}
+    rows = {"ours": {"1": _share(0.02) | new}, "own_volumes": {"1": _share(0.04, 1.0) | new}}
+    rows |= {"linear": {"1": _share(0.03) | new}, "thin": {"1": _share(0.01, 0.514) | old}}
+    told = [row[1:] for row in cells("flags.rows", {"rows": rows})]
+    assert told == [["2.00 %", "1.00"], ["4.00 % (2.00 times the mass)", "2.00"], ["3.00 %", "1.00"],
+                    ["1.00 % (another splat)", "1.03"]]  # fmt: skip
     (line,) = shown("flags.changes", {"rows": rows})
     assert line.endswith("pressure linear in the cloth's speed +1.00")
-    assert "| 4.00 % (another splat) |" in shown("flags.rows", {"rows": rows})[-1]
-
-
-def test_rows_that_were_dropped_are_named():
-    result = {"rows": {"ours": {"2": _share(0.02)}}, "dropped": {"ours": {"2": _share(0.0162)}}}
-    result["dropped"]["updated_04"] = {"2": _share(0.0149)}
-    assert shown("flags.dropped", result)[2:] == [
-        "| dropped | flag | distance then | ours then |", "|---|---|---|---|",
-        "| `updated`, dx = 0.04 m | pattern 2 | 1.49 % | 1.62 % |",
-    ]  # fmt: skip
+    dropped = {"ours": {"2": _share(0.0162)}, "updated_04": {"2": _share(0.0149)}}
+    assert cells("flags.dropped", {"dropped": dropped}) == [["`updated`, dx = 0.04 m", "pattern 2", "1.49 %", "1.62 %"]]
     assert shown("flags.dropped", {"rows": {}}) == []
-
-
-def test_the_dropped_rows_of_the_record_are_on_the_page():
-    """The ten rows that commit 211bfec left out."""
     kept = json.loads((ROOT / "docs/results/flags_made_cpu.json").read_text())["dropped"]
-    assert sum(len(row) for name, row in kept.items() if name != "ours") == 10
-    assert "| `updated`, dx = 0.04 m | pattern 2 | 1.49 % | 1.62 % |" in (ROOT / "docs/flag_benchmark.md").read_text()
-
-
-def test_what_each_change_on_the_way_adds():
-    shares = {"ours": 0.01, "to_volume": 0.012, "to_layer": 0.05, "particle": 0.045, "own_volumes": 0.2}
-    rows = {name: {"2": _share(share)} for name, share in shares.items()}
-    (line,) = shown("flags.changes", {"rows": rows})
-    assert line == (
-        "- pattern 2, what each further change adds [% of the longer side]: ours with volumes of grid cells +0.20; "
-        "one layer +3.80; no shading: PhysGaussian's way -0.50"
-    )
+    assert sum(len(row) for name, row in kept.items() if name != "ours") == 10  # those that commit 211bfec left out
 
 
 def test_the_headline_is_the_mean_over_all_flags():
@@ -305,15 +259,14 @@ def test_the_headline_is_the_mean_over_all_flags():
     trained = {"splats": "trained, 7000 images", "rows": {"ours": {"1": _share(0.02), "3": _share(0.01)}}}
     made = {"splats": "made in code", "rows": {"ours": {"1": _share(0.03)}}}
     more = {"splats": "made in code", "rows": {"ours": {"4": _share(0.01), "light": _share(0.02)}}}
-    assert shown("flags.headline", [trained]) == "**1.50 %** with splats trained on photos (mean of 2 flags)"
     told = shown("flags.headline", [trained, made, more])
-    assert told.endswith(" and **1.50 %** with splats made in code (mean of 2 flags)")
-    trained["rows"]["own_volumes"] = {"1": _share(0.3), "3": _share(0.3)}
-    trained["rows"]["particle"] = {"1": _share(0.1)}
-    assert "PhysGaussian" not in shown("flags.headline", [trained])
+    own, in_code = "**1.50 %** with splats trained on photos (mean of 2 flags", "**1.50 %** with splats made in code"
+    assert told == f"{own}) and {in_code} (mean of 2 flags)"
+    trained["rows"] |= {"own_volumes": {"1": _share(0.3), "3": _share(0.3)}, "particle": {"1": _share(0.1)}}
+    assert shown("flags.headline", [trained]) == f"{own})"
     trained["rows"]["particle"]["3"] = _share(0.2)
     way = "; PhysGaussian's way, with the same splats and mass, **15.00 %**"
-    assert shown("flags.headline", [trained]) == f"**1.50 %** with splats trained on photos (mean of 2 flags{way})"
+    assert shown("flags.headline", [trained]) == f"{own}{way})"
 
 
 def test_splats_made_in_code_have_records_of_their_own(bench, tmp_path, monkeypatch):
@@ -350,7 +303,7 @@ def test_a_training_that_is_there_is_kept_with_its_account(tmp_path, monkeypatch
 
 def test_rows_with_trainings_at_the_same_time(tmp_path, monkeypatch):
     """Each splat is trained once; a training that fails leaves its row, and no other."""
-    trained, simulated, saved = [], [], []
+    trained, simulated = [], []
 
     def train(pattern, variant, dataset, target, steps):
         trained.append((pattern, target.name))
@@ -371,11 +324,10 @@ def test_rows_with_trainings_at_the_same_time(tmp_path, monkeypatch):
     for pattern in (1, 2):
         (tmp_path / f"pattern{pattern}").mkdir()
         (tmp_path / f"pattern{pattern}" / "cloth.npz").write_bytes(b"")
-    given = {"rows": "ours,neighbours,two_views", "patterns": "1,2", "splats": str(tmp_path / "splats")}
-    given |= {"more": None, "note": "Quiet."}
-    given |= {"dataset": str(tmp_path), "train_steps": 7, "at_once": 3, "sims_at_once": 2, "pictures": str(tmp_path)}
-    result = {"rows": {"membrane": {"1": {"status": "complete"}}}}
-    flags.measure(flags.argparse.Namespace(**given), result, lambda now: saved.append(len(now["rows"])))
+    given = {"--rows": "ours,neighbours,two_views", "--patterns": "1,2", "--splats": tmp_path / "splats"}
+    given |= {"--note": "Quiet.", "--dataset": tmp_path, "--train_steps": 7, "--at_once": 3, "--sims_at_once": 2}
+    words = [word for pair in given.items() for word in pair]
+    result, saved = measure("flags", *words, result={"rows": {"membrane": {"1": {"status": "complete"}}}})
     assert sorted(trained) == [(1, "all_losses"), (1, "two_views"), (2, "all_losses"), (2, "two_views")]
     assert sorted(simulated) == [1, 1, 2, 2]
     rows = result["rows"]
@@ -385,7 +337,7 @@ def test_rows_with_trainings_at_the_same_time(tmp_path, monkeypatch):
     assert rows["ours"]["1"]["tilt"] == {"gaussians": 3}
     assert "tilt" not in rows["neighbours"]["1"]
     assert rows["neighbours"]["2"]["training"] == {"seconds": 1.0, "steps": 7, "at_once": 3}
-    assert len(saved) == 6
+    assert len(saved) == 8
 
 
 def test_two_view_options_parse_for_any_number_of_images(tmp_path, monkeypatch):
@@ -393,7 +345,7 @@ def test_two_view_options_parse_for_any_number_of_images(tmp_path, monkeypatch):
 
     monkeypatch.chdir(tmp_path)
     given = [f"--config={ROOT}/configs/train/default.yaml", f"--config={ROOT}/configs/bench/train.yaml"]
-    cli = make_cli([*given, *flags.filled(flags.GENTLE, 100), "--trainer.accelerator=cpu"], run=False)
+    cli = make_cli([*given, *filled(flags.GENTLE, 100), "--trainer.accelerator=cpu"], run=False)
     for name in ("geometric", "photometric"):
         term = cli.model.loss.terms[name]
         assert (term.start, term.stop, term.every) == (50, 100, 2)

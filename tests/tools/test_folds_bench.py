@@ -1,6 +1,7 @@
 """The comparison of folds: command lines, references of different lengths, crossings, and its tables."""
 
 import json
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -8,7 +9,7 @@ from bench.cases import flags, folds
 
 from gaussian_swaying.simulation.simulation import Simulation
 
-from .conftest import shown
+from .conftest import HEAD, cells, measure
 
 
 @pytest.mark.parametrize("name", ["free_04", "contact_04", "contact_015"])
@@ -51,20 +52,16 @@ def test_references_are_described_and_compared_over_the_frames_that_both_have(tm
     assert found["references"]["blender"]["uncertainty"]["coarser"]["chamfer"] == 0.01
     # frames 0 and 25: 0.6 m up, of which the surfaces, which overlap, see a part
     assert 0.01 < found["apart"]["blender newton"] < 0.25
-    options = type("Options", (), {"rows": "free_04", "dataset": str(tmp_path / "nothing")})()
     with pytest.raises(SystemExit, match="has none of blender"):
-        folds.measure(options, {}, lambda now: None)
-    options.rows = "glue"
-    with pytest.raises(SystemExit, match=r"--rows takes free_04, .* not glue"):
-        folds.measure(options, {}, lambda now: None)
+        measure("folds", "--dataset", tmp_path / "nothing", "--rows", "free_04")
 
 
 @pytest.mark.slow(twin="test_a_row_of_a_flag_is_simulated_and_compared")
 def test_a_row_is_simulated_and_compared(tmp_path):
     """Two frames of a coarse flag."""
     _reference(tmp_path / "set" / "blender", 2, 0.0)
-    options = type("Options", (), {"device": "cpu", "frames": 2, "points": 500})()
-    row = folds.run_row(folds.Fold(True, 0.1), tmp_path / "set", options, tmp_path / "run")
+    options = SimpleNamespace(device="cpu", frames=2, points=500)
+    row = folds._compared(folds.Fold(True, 0.1), tmp_path / "set", options, tmp_path / "run")
     assert row["status"] == "complete"
     assert row["to"]["blender"]["frames"] == 2
     assert row["to"]["blender"]["chamfer_share"] < 0.02
@@ -79,19 +76,15 @@ def test_the_page_shows_who_is_how_far_from_whom():
         }  # fmt: skip
 
     row = {"status": "complete", "crossings": [0, 0], "to": {"blender_contact": {"chamfer_share": 0.034}}}
-    result = {
-        "device": "a CPU",
-        "versions": {"torch": "2"},
-        "seed": 0,
+    result = HEAD | {
         "references": {"blender": reference(0.01), "blender_contact": reference(0.015)},
         "apart": {"blender blender_contact": 0.02},
         "rows": {"contact_04": row, "free_04": {"failed": "x"}},
     }
-    lines = shown("folds.rows", result)
-    assert lines[2] == "|  | Blender, no contact | Blender, contact | crossings |"
-    assert "| ours, contact, dx = 0.04 m | - | 3.40 % | 0 |" in lines
-    assert "| ours, no contact, dx = 0.04 m | failed | failed | - |" in lines
-    assert "| Blender, contact | 2.00 % |  | 4 |" in lines
-    assert lines[-1] == "| the reference itself, solved otherwise | 1.00 % | 1.50 % |  |"
-    assert shown("folds.goals", result)[-1].endswith("| 3.40 %, 1.50 % + 2 % | yes |")
-    assert shown("folds.references", result)[-1].endswith("| 80 | 32 | 250 | coarser (60 cells, 16 steps) 1.50 % |")
+    rows = {row[0]: row[1:] for row in cells("folds.rows", result)}
+    assert rows["ours, contact, dx = 0.04 m"] == ["-", "3.40 %", "0"]
+    assert rows["ours, no contact, dx = 0.04 m"] == ["failed", "failed", "-"]
+    assert rows["Blender, contact"] == ["2.00 %", "", "4"]
+    assert rows["the reference itself, solved otherwise"] == ["1.00 %", "1.50 %", ""]
+    assert cells("folds.goals", result)[0][1:] == ["3.40 %, 1.50 % + 2 %", "yes"]
+    assert cells("folds.references", result)[-1][1:] == ["80", "32", "250", "coarser (60 cells, 16 steps) 1.50 %"]

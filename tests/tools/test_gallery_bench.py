@@ -1,23 +1,16 @@
 """The gallery: each scene has its files, a run is pictured, and the page says what was lost."""
 
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
+from bench.cases import gallery
 from imageio.v3 import imread
 
-from .conftest import shown
-
-ROOT = Path(__file__).resolve().parents[2]
+from .conftest import HEAD, ROOT, cells, shown
 
 
-@pytest.fixture
-def gallery():
-    from bench.cases import gallery
-
-    return gallery
-
-
-def test_each_scene_has_its_files(gallery):
+def test_each_scene_has_its_files():
     for name in gallery.SCENES:
         files = [Path(part) for part in gallery.arguments(name, "preview") if part != "--config"]
         assert all(file.is_file() for file in files), files
@@ -28,11 +21,10 @@ def test_each_scene_has_its_files(gallery):
 
 
 @pytest.mark.slow(twin="test_a_row_of_a_flag_is_simulated_and_compared")
-def test_a_scene_is_run_and_pictured(gallery, tmp_path):
-    options = type("Options", (), {})()
-    options.preset, options.device, options.frames = "preview", "cpu", 3
-    options.more = "--scene.generator.init_args.spacing=0.05 --solver.dx=0.1 --camera.width=64 --camera.height=36"
-    row = gallery.run_scene("flag2", options, tmp_path)
+def test_a_scene_is_run_and_pictured(tmp_path):
+    more = "--scene.generator.init_args.spacing=0.05 --solver.dx=0.1 --camera.width=64 --camera.height=36"
+    options = SimpleNamespace(preset=None, device="cpu", frames=3, more=more, pictures=tmp_path)
+    row = gallery.run_scene("flag2", options)
     assert row["frames"] == 3
     assert row["displacement_share"] == pytest.approx(row["displacement_mean_max_m"] / row["size_m"])
     assert gallery.of_today("flag2", row)
@@ -41,37 +33,30 @@ def test_a_scene_is_run_and_pictured(gallery, tmp_path):
     assert picture.shape[1] == 5 * 360
     assert picture.max() > 100
     options.more = "--solver.dx=nonsense"
-    assert "solver.dx" in gallery.run_scene("flag2", options, tmp_path)["failed"]
+    assert "solver.dx" in gallery.run_scene("flag2", options)["failed"]
 
 
-def test_whole_means_all_of_it(gallery):
+def test_whole_means_all_of_it():
     row = {"status": "complete", "frames": 250, "frames_wanted": 250, "lost_particles": 0, "displacement_share": 0.1}
     assert gallery.whole(row)
     changes = {"status": "diverged"}, {"frames": 249}, {"lost_particles": 1}, {"displacement_share": 0.009}
     for change in (*changes, {"displacement_share": 0.51}, {"displacement_share": None}):
         assert not gallery.whole(row | change)
-    row |= {
-        "particles": 1000,
-        "formulation": "total",
-        "substeps": 2490,
-        "wall_s": {"simulation": 2.5},
-        "process_s": 4.0,
-    }
-    row |= {"peak_memory_bytes": {"host": 2**30, "device": None}, "preset": "preview"}
-    result = {"device": "CPU", "versions": {}, "seed": 0, "scenes": {"ficus": row, "sand": {"failed": "x"}}}
-    text = "\n".join(shown("gallery.scenes", result))
-    assert "| Ficus \\*, preset" in text  # no word of its configuration
-    assert "Recorded before" in text
+    row |= {"particles": 1000, "formulation": "total", "substeps": 2490, "wall_s": {"simulation": 2.5}}
+    row |= {"peak_memory_bytes": {"host": 2**30, "device": None}, "preset": "preview", "process_s": 4.0}
+    result = HEAD | {"scenes": {"ficus": row, "sand": {"failed": "x"}}}
+    assert cells("gallery.scenes", result)[0][0] == "Ficus \\*, preset `preview`"  # no word of its configuration
+    assert "Recorded before" in shown("gallery.scenes", result)[-1]
     row["configuration"] = gallery.fingerprint("ficus", "preview")
     assert row["configuration"] != gallery.fingerprint("ficus", None)
-    text = "\n".join(shown("gallery.scenes", result))
-    assert "Recorded before" not in text
-    line = "| Ficus, preset `preview` | 1,000 | `total` | 250 | 10 | 10.0 | 4 | 1.00 | - | 10.0 % | yes |"
-    assert line in text
-    assert "| Sand | failed" in text
+    whole, failed = cells("gallery.scenes", result)
+    assert "Recorded before" not in shown("gallery.scenes", result)[-1]
+    assert whole[:6] == ["Ficus, preset `preview`", "1,000", "`total`", "250", "10", "10.0"]
+    assert whole[6:] == ["4", "1.00", "-", "10.0 %", "yes"]
+    assert failed[:2] == ["Sand", "failed: x"]
 
 
-def test_the_page_shows_each_scene(gallery):
+def test_the_page_shows_each_scene():
     text = (ROOT / "docs/gallery.md").read_text()
     for name, title in gallery.SCENES.items():
         after = text.split(f"### {title}\n", 1)[1]

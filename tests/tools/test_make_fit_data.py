@@ -16,24 +16,11 @@ from gaussian_swaying.captures.capture import read_capture
 from gaussian_swaying.captures.capture_camera import read_views
 from gaussian_swaying.scenes.procedural import FlagScene
 
-from .conftest import dataset_tool
+from .conftest import beside
 
-
-@pytest.fixture(scope="module")
-def tool():
-    """tools/datasets/make_fit_data.py with the modules beside it."""
-    with dataset_tool("make_fit_data") as found:
-        yield found
-
-
-@pytest.fixture(scope="module")
-def cases(tool):
-    return sys.modules["fit_cases"]
-
-
-@pytest.fixture(scope="module")
-def videos(tool):
-    return sys.modules["fit_video"]
+TOOL = "make_fit_data"
+cases = beside("fit_cases")
+videos = beside("fit_video")
 
 
 def _swing(pattern, frames=5):

@@ -1,19 +1,14 @@
-"""``tools/make_fit_video.py``: what it writes can be read by a fit."""
-
-import importlib.util
-from pathlib import Path
+"""``tools/datasets/make_fit_video.py``: what it writes can be read by a fit."""
 
 import pytest
 
 from gaussian_swaying.fitting.videos import read_videos
 
-ROOT = Path(__file__).parents[2]
+from .conftest import ROOT, tool_of
 
 
 def test_the_shipped_flag_makes_a_video(tmp_path):
-    spec = importlib.util.spec_from_file_location("make_fit_video", ROOT / "tools/make_fit_video.py")
-    tool = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(tool)
+    tool = tool_of("datasets/make_fit_video.py")
     config = str(ROOT / "configs/sim/printed_flag.yaml")
     assert tool.main(["--config", config, "--output", str(tmp_path / "video"), "--frames", "3", "--device", "cpu"]) == 0
     left, right = read_videos(tmp_path / "video")

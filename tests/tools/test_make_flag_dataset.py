@@ -16,39 +16,14 @@ import torch
 from gaussian_swaying.captures.capture import read_capture
 from gaussian_swaying.rendering.cameras.camera_path import TransformsCamera
 
-from .conftest import dataset_tool
+from .conftest import beside
 
-
-@pytest.fixture(scope="module")
-def tool():
-    """tools/datasets/make_flag_dataset.py with the modules beside it."""
-    with dataset_tool("make_flag_dataset") as found:
-        yield found
-
-
-@pytest.fixture(scope="module")
-def reference(tool):
-    return sys.modules["flag_reference"]
-
-
-@pytest.fixture(scope="module")
-def flag_pictures(tool):
-    return sys.modules["flag_pictures"]
-
-
-@pytest.fixture(scope="module")
-def flag_motion(tool):
-    return sys.modules["flag_motion"]
-
-
-@pytest.fixture(scope="module")
-def flag_difference(tool):
-    return sys.modules["flag_difference"]
-
-
-@pytest.fixture(scope="module")
-def cloth(tool):
-    return sys.modules["blender_cloth"]
+TOOL = "make_flag_dataset"
+reference = beside("flag_reference")
+flag_pictures = beside("flag_pictures")
+flag_motion = beside("flag_motion")
+flag_difference = beside("flag_difference")
+cloth = beside("blender_cloth")
 
 
 # ---- physics

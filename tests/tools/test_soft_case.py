@@ -13,24 +13,11 @@ from gaussian_swaying import Simulation
 from gaussian_swaying.fitting.plan import read_plan
 from gaussian_swaying.gaussians.ply import write_ply
 
-from .conftest import dataset_tool
+from .conftest import beside
 
-
-@pytest.fixture(scope="module")
-def tool():
-    """tools/datasets/make_fit_data.py with the modules beside it."""
-    with dataset_tool("make_fit_data") as found:
-        yield found
-
-
-@pytest.fixture(scope="module")
-def soft(tool):
-    return sys.modules["soft_case"]
-
-
-@pytest.fixture(scope="module")
-def newton(tool):
-    return sys.modules["newton_soft"]
+TOOL = "make_fit_data"
+soft = beside("soft_case")
+newton = beside("newton_soft")
 
 
 # ---- the force of the air

@@ -10,45 +10,19 @@ from bench.cases import speed
 from gaussian_swaying.mpm.solver import MPMSolver
 from gaussian_swaying.mpm.state import GridSpec
 
-from .conftest import cells
+from .conftest import HEAD, cells, shown
 
 SPREAD = {"median_ms", "quartile_low_ms", "quartile_high_ms", "repeats"}
-ROLLOUT = SPREAD | {"formulation", "asked", "particles", "grid_nodes", "nodes", "substeps", "path", "graph_ms", "bytes"}
-ROLLOUT |= {"bytes_per_s", "share", "share_graph", "memory_bytes", "error", "torch"}
-BATCH = {
-    "formulation",
-    "gusts",
-    "scenes",
-    "particles",
-    "substeps",
-    "together",
-    "apart",
-    "large",
-    "together_per_s",
-    "apart_per_s",
-    "large_per_s",
+ROLLOUT = "formulation asked particles grid_nodes nodes substeps path graph_ms bytes bytes_per_s share share_graph"
+BATCH = "formulation gusts scenes particles substeps together apart large together_per_s apart_per_s large_per_s ratio"
+FRAME = "dx_m main simulation_ms shading_ms rendering_ms particles width height points substeps substep_ms renderer"
+KEYS = {
+    "substep": SPREAD | {*ROLLOUT.split(), "memory_bytes", "error", "torch"},
+    "batch": {*BATCH.split(), "share", "difference"},
+    "cube": SPREAD | {"asked", "turning", "walls", "particles", "substeps", "grid_nodes"},
+    "frame": SPREAD | {*FRAME.split(), "memory_bytes", "build_memory_bytes"},
 }
-BATCH |= {"ratio", "share", "difference"}
-CUBE = SPREAD | {"asked", "turning", "walls", "particles", "substeps", "grid_nodes"}
-FRAME = SPREAD | {"dx_m", "main", "simulation_ms", "shading_ms", "rendering_ms", "particles", "width", "height"}
-FRAME |= {"points", "substeps", "substep_ms", "renderer", "memory_bytes", "build_memory_bytes"}
-
-
-PAGE = """# Benchmarks
-
-<!-- begin: speed.device speed_cpu -->
-<!-- end -->
-<!-- begin: speed.substeps speed_cpu -->
-<!-- end -->
-<!-- begin: speed.batches speed_cpu -->
-<!-- end -->
-<!-- begin: speed.frames speed_cpu -->
-<!-- end -->
-<!-- begin: speed.fewest_numbers -->
-<!-- end -->
-<!-- begin: goals.table -->
-<!-- end -->
-"""
+KEYS["sand"] = KEYS["substep"]
 
 
 @pytest.fixture(autouse=True)
@@ -62,13 +36,6 @@ def _speed(bench, results, *arguments):
     return json.loads((results / "speed_cpu.json").read_text())
 
 
-def _pages(bench, results):
-    """The page that shows what was recorded."""
-    (results.parent / "benchmarks.md").write_text(PAGE)
-    bench("pages", "--results", results)
-    return (results.parent / "benchmarks.md").read_text()
-
-
 @pytest.mark.slow(twin="test_only_keeps_the_other_sections")
 def test_everything_is_measured_and_shown(bench, tmp_path):
     results = tmp_path / "docs/results"
@@ -76,12 +43,11 @@ def test_everything_is_measured_and_shown(bench, tmp_path):
     assert found["device"].endswith("threads")
     assert found["versions"]["torch"]
     assert (found["seed"], found["kind"], found["quick"], found["dt_s"]) == (0, "cpu", True, 1e-4)
-    assert "partial" not in found
+    assert found["partial"] is False
     assert found["copy"]["bytes_per_s"] > 0
-    for section, keys in (("substep", ROLLOUT), ("sand", ROLLOUT), ("batch", BATCH), ("cube", CUBE), ("frame", FRAME)):
+    for section, keys in KEYS.items():
         assert found[section]
-        for row in found[section]:
-            assert set(row) == keys
+        assert all(set(row) == keys for row in found[section])
     assert [(r["formulation"], r["asked"]) for r in found["substep"]] == [
         (name, count) for count in (64, 400) for name in ("total", "updated")
     ]
@@ -98,15 +64,16 @@ def test_everything_is_measured_and_shown(bench, tmp_path):
     (frame,) = found["frame"]
     assert (frame["particles"], frame["width"], frame["height"], frame["main"]) == (1536, 64, 36, True)
 
-    text = _pages(bench, results)
+    parts = {name: shown(f"speed.{name}", found) for name in ("device", "substeps", "batches", "frames")}
+    text = "\n".join(line for lines in parts.values() for line in lines)
     assert text.count("| `total`, sheet in wind, ") == 2
     assert "| `updated`, block of sand, 64 particles, 4 substeps |" in text
     assert "| 2 of 64 particles, `updated`, gusts, 4 substeps |" in text
     assert "| dx = 0.1 m, 1,536 Gaussians, 64x36 |" in text
-    assert "| `updated`, a particle | 16 | 12 |" in text
     assert "Recorded with `--quick`" in text
-    assert (tmp_path / "docs/pictures/speed_cpu.png").stat().st_size > 10_000
     assert "failed" not in text
+    bench("pages", "--results", results)
+    assert (tmp_path / "docs/pictures/speed_cpu.png").stat().st_size > 10_000
 
 
 def test_a_run_that_is_killed_keeps_what_it_has(bench, monkeypatch, tmp_path):
@@ -120,7 +87,7 @@ def test_a_run_that_is_killed_keeps_what_it_has(bench, monkeypatch, tmp_path):
     assert found["partial"] is True
     assert len(found["sand"]) == 1
     assert found["frame"] == []
-    assert "The run was stopped early" in _pages(bench, tmp_path / "d/r")
+    assert "The run was stopped early: the tables below are incomplete." in shown("speed.device", found)
 
 
 def test_a_case_without_memory_is_recorded_and_the_others_are_measured(bench, monkeypatch, tmp_path):
@@ -131,8 +98,7 @@ def test_a_case_without_memory_is_recorded_and_the_others_are_measured(bench, mo
     found = _speed(bench, tmp_path / "d/r", "--only", "sand,batch")
     assert found["sand"] == [{"formulation": "updated", "asked": 64, "failed": "out of memory"}]
     assert all("ratio" in row for row in found["batch"])
-    text = _pages(bench, tmp_path / "d/r")
-    assert "| `updated`, block of sand, 64 particles | failed: out of memory |" in text
+    assert cells("speed.substeps", found)[0][:2] == ["`updated`, block of sand, 64 particles", "failed: out of memory"]
 
 
 def test_an_error_that_cannot_be_measured_does_not_cost_the_time(bench, monkeypatch, tmp_path):
@@ -222,7 +188,7 @@ def test_goals_are_reached_or_not(factor, reached, stretched):
 
 
 def test_goals_of_what_is_missing_or_failed():
-    about = {"kind": "cuda", "device": "NVIDIA H200", "copy": {}}
+    about = HEAD | {"kind": "cuda", "device": "NVIDIA H200", "copy": {}}
     assert {tuple(row[1:3]) for row in cells("goals.table", [about])} == {("-", "-")}
     failed = _recorded(0.5)
     for section in ("substep", "sand", "cube", "batch", "frame", "large"):

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import pytest
 from bench import record, stamps
+from bench.case import Case
 from bench.tables import measured
 from bench.tables.markdown import source
 
@@ -58,11 +59,15 @@ def test_rows_kept_from_before_keep_their_stamps(tmp_path, clock):
         tmp_path, "accuracy_cpu", {"rows": [{"problem": "bar", "x": 1}, {"problem": "sand", "x": 2}]}, quiet=True
     )
     clock("tuesday", "b")
-    result = {}
-    record.keep_rows(result, tmp_path, "accuracy_cpu", lambda row: row["problem"] == "sand")
-    result["rows"].append({"problem": "bar", "x": 1})  # measured anew, with the same result
-    for _ in range(2):  # as of commands that write after each row
-        record.write(tmp_path, "accuracy_cpu", result, quiet=True)
+
+    def anew(result, save):
+        def rows(options, found):
+            found["rows"] = [row for row in found["rows"] if row["problem"] == "sand"]
+            yield ("rows", {"problem": "bar"}), {"x": 1}.copy  # the same result
+
+        Case("", rows).measure(None, result, save)
+
+    record.go_on(tmp_path, "accuracy_cpu", {"device": "another"}, anew, keeps="any")
     found = record.read(tmp_path)["accuracy_cpu"]
     assert stamps.stamp_of(found) == {"rows/0": "monday", "rows/1": "tuesday"}
     assert found["measured"]["monday"]["sources"]["mpm"] == "mpm a"
@@ -72,24 +77,23 @@ def test_rows_kept_from_before_keep_their_stamps(tmp_path, clock):
 
 def test_rows_of_a_table_keep_their_stamps_too(tmp_path, clock):
     """Those of a row that another process measured meanwhile, too; rows without a stamp get none of today's."""
-    options = type("Options", (), {"results": str(tmp_path)})()
     before = {"device": "a", "rows": {"ours": {"1": {"x": 1}, "2": {"x": 2}}, "particle": {"1": {"x": 5}}}}
     (tmp_path / "flags_cpu.json").write_text(json.dumps(before))
     clock("monday")
 
-    def one(_, result, save):
+    def one(result, save):
         result["rows"]["ours"]["1"] = {"x": 3}
         save(result)
 
-    record.go_on(options, "flags_cpu", {"device": "a"}, one)
+    record.go_on(tmp_path, "flags_cpu", {"device": "a"}, one)
     clock("tuesday")
 
-    def two(_, result, save):
-        record.go_on(options, "flags_cpu", {"device": "a"}, one)
+    def two(result, save):
+        record.go_on(tmp_path, "flags_cpu", {"device": "a"}, one)
         result["rows"]["ours"]["2"] = {"x": 4}
         save(result)
 
-    record.go_on(options, "flags_cpu", {"device": "a"}, two)
+    record.go_on(tmp_path, "flags_cpu", {"device": "a"}, two)
     found = json.loads((tmp_path / "flags_cpu.json").read_text())
     assert stamps.stamp_of(found) == {"rows/ours/1": "monday", "rows/ours/2": "tuesday", "rows/particle/1": "unknown"}
     assert found["measured"]["unknown"]["date"] is None

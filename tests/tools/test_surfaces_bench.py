@@ -14,7 +14,7 @@ from gaussian_swaying.gaussians.ply import write_ply
 from gaussian_swaying.geometry.rotations import quat_to_rotation, rotation_to_quat
 from gaussian_swaying.scenes.procedural import FlagScene
 
-from .conftest import shown
+from .conftest import HEAD, cells, measure, shown
 
 
 @pytest.fixture
@@ -53,10 +53,11 @@ def test_what_cameras_allow(tmp_path):
 
 
 def test_terms_begin_half_way_through():
-    command = surfaces.train_command(Path("photos"), "views", 1, 7000, Path("out"))
+    command = trained.train_command(Path("photos"), surfaces.WAYS["views"][1], 7000, Path("out"), seed=1)
     assert "--model.loss_terms.photometric.init_args.start=3500" in command
     assert "--data.init_args.seed=1" in command
-    assert not any("loss_terms" in part for part in surfaces.train_command(Path("p"), "paper", 0, 10, Path("o")))
+    plain = trained.train_command(Path("p"), surfaces.WAYS["paper"][1], 10, Path("o"))
+    assert not any("loss_terms" in part or "seed" in part for part in plain)
 
 
 def _row(psnr, seconds):
@@ -65,25 +66,16 @@ def _row(psnr, seconds):
     return row | {"chamfer": {"smallest_axis": 0.03, "neighbours": 0.015}, "psnr_db": psnr, "seconds": seconds}
 
 
-def _result():
-    limit = {"all_views": 175, "views": 71.0, "height": 1e-6, "height_common": 1e-5, "tilt_deg": 0.001}
-    return {
-        "device": "NVIDIA H200", "versions": {"torch": "2"}, "pattern": 2, "steps": 7000, "at_once": 4,
-        "rows": {"views": {"0": _row(34.1, 200.0), "1": _row(34.1, 200.0)}}, "limits": {"all of the views": limit},
-    }  # fmt: skip
-
-
 def test_tables():
-    result = _result()
-    assert shown("surfaces.goals", result)[-2] == "| tilt over 40 cm at most 0.1° | 0.08°, 0.08° | yes |"
-    assert shown("surfaces.goals", result)[-1].endswith("| 1.50 %, 1.50 % | yes |")
-    result["rows"]["views"]["1"]["chamfer"] = {"smallest_axis": 0.03, "neighbours": 0.021}
-    assert shown("surfaces.goals", result)[-1].endswith("| no |")
-    result["rows"]["paper"] = {"0": _row(34.2, 100.0), "1": _row(34.5, 130.0)}
-    assert shown("surfaces.goals", result)[-2] == "| PSNR at most 0.2 dB lower | 0.10 dB, 0.40 dB | no |"
-    assert shown("surfaces.goals", result)[-1] == "| training at most 1.6 times as long | 2.00 times, 1.54 times | no |"
-    assert "| 0.60, 0.60 | 0.40, 0.40 | 0.08, 0.08 | 1.00, 1.00 |" in shown("surfaces.rows", result)[-1]
-    assert shown("surfaces.limits", result)[-1] == "| all of the views (175) | 71 | 0.0010 | 0.010 | 0.0010 |"
+    rows = {"views": {"0": _row(34.1, 200.0), "1": _row(34.1, 200.0)}}
+    result = HEAD | {"pattern": 2, "steps": 7000, "at_once": 4, "rows": rows}
+    goals = [["tilt over 40 cm at most 0.1°", "0.08°, 0.08°", "yes"], ["1.50 %, 1.50 %", "yes"]]
+    assert [goals[0], cells("surfaces.goals", result)[1][1:]] == [cells("surfaces.goals", result)[0], goals[1]]
+    rows["views"]["1"]["chamfer"] = {"smallest_axis": 0.03, "neighbours": 0.021}
+    rows["paper"] = {"0": _row(34.2, 100.0), "1": _row(34.5, 130.0)}
+    found = [row[1:] for row in cells("surfaces.goals", result)]
+    assert found[1:] == [["1.50 %, 2.10 %", "no"], ["0.10 dB, 0.40 dB", "no"], ["2.00 times, 1.54 times", "no"]]
+    assert cells("surfaces.rows", result)[-1][2:6] == ["0.60, 0.60", "0.40, 0.40", "0.08, 0.08", "1.00, 1.00"]
 
 
 def test_ways_are_compared_at_the_same_time(tmp_path, monkeypatch):
@@ -99,11 +91,9 @@ def test_ways_are_compared_at_the_same_time(tmp_path, monkeypatch):
         return {"chamfer_share": 0.03 if options.more.endswith("smallest_axis") else 0.015}
 
     monkeypatch.setattr(surfaces, "run_row", run_row)
-    given = {"ways": "paper,gentle", "seeds": 1, "dataset": str(tmp_path), "pattern": 2, "train_steps": 7, "at_once": 2}
-    given |= {"splats": str(tmp_path), "more": "--frames=2"}
-    saved, result = [], {"device": "NVIDIA H200", "versions": {"torch": "2"}}
-    surfaces.measure(surfaces.argparse.Namespace(**given), result, lambda now: saved.append(len(now["rows"])))
-    assert saved == [1, 2]
+    words = ("--ways", "paper,gentle", "--seeds", 1, "--at_once", 2, "--splats", tmp_path, "--more=--frames=2")
+    result, saved = measure("surfaces", "--dataset", tmp_path, *words, result=dict(HEAD))
+    assert [len(now["rows"]) for now in saved[1:3]] == [1, 2]
     for way in ("paper", "gentle"):
         assert result["rows"][way]["0"]["chamfer"] == {"smallest_axis": 0.03, "neighbours": 0.015}
     result["rows"]["views"] = {"0": _row(30.0, 400.0)}

@@ -1,4 +1,4 @@
-"""The strategies of gsplat on a model, its optimisers and their state."""
+"""The strategies of gsplat on a model, its optimiser and their state."""
 
 import pytest
 import torch
@@ -19,12 +19,16 @@ def _model(count=6, opacity=0.5):
     return GaussianSurfaceModel.from_cloud(gaussians_from_points(points, torch.rand(count, 3), 1, opacity, 1e-3))
 
 
-def _optimizers(model):
-    optimizers = {name: torch.optim.Adam([getattr(model, name)], lr=1e-3) for name in PARAMETERS}
-    for name, optimizer in optimizers.items():
+def _optimizer(model):
+    optimizer = torch.optim.Adam([{"params": [getattr(model, name)]} for name in PARAMETERS], lr=1e-3)
+    for name in PARAMETERS:
         getattr(model, name).grad = torch.ones_like(getattr(model, name))
-        optimizer.step()
-    return optimizers
+    optimizer.step()
+    return optimizer
+
+
+def _group(optimizer, name):
+    return optimizer.param_groups[PARAMETERS.index(name)]
 
 
 def _screen(gradient, index):
@@ -40,10 +44,10 @@ def test_copies_splits_and_removes():
     with torch.no_grad():
         model.scales[3] = 0.0
         model.opacities[5] = -9.0
-    optimizers = _optimizers(model)
+    optimizer = _optimizer(model)
     moved = model.means.detach().clone()
     densification = DefaultDensification(start=0, every=2, grow_grad2d=0.5, grow_scale3d=0.1, prune_scale3d=10.0)
-    densification.attach(model, optimizers, 1.0)
+    densification.attach(model, optimizer, 1.0)
     densification.after_step(1, _screen([2.0, 2.0, 0.1], [1, 3, 4]))
     assert len(model) == 6
     assert densification.state_dict()["count"].tolist() == [0, 1, 0, 1, 1, 0]
@@ -55,8 +59,8 @@ def test_copies_splits_and_removes():
     assert float(model.scales.detach().max()) == pytest.approx(-torch.tensor(1.6).log().item(), abs=2e-3)
     for name in PARAMETERS:
         parameter = getattr(model, name)
-        assert optimizers[name].param_groups[0]["params"][0] is parameter
-        assert optimizers[name].state[parameter]["exp_avg"].shape == parameter.shape
+        assert _group(optimizer, name)["params"][0] is parameter
+        assert optimizer.state[parameter]["exp_avg"].shape == parameter.shape
         assert dict(model.named_parameters())[name] is parameter
     assert densification.state_dict()["grad2d"].eq(0).all()
     assert len(densification.state_dict()["grad2d"]) == 7
@@ -66,7 +70,7 @@ def test_all_gaussians_at_once():
     """The layout of a picture that lists every Gaussian, drawn or not."""
     model = _model()
     densification = DefaultDensification(start=0, every=100)
-    densification.attach(model, _optimizers(model), 1.0)
+    densification.attach(model, _optimizer(model), 1.0)
     means2d = torch.zeros(1, 6, 2, requires_grad=True) * 1.0
     means2d.retain_grad()
     means2d.grad = torch.ones(1, 6, 2)
@@ -79,20 +83,20 @@ def test_opacities_are_reset_only_if_asked_for():
     for reset in (False, True):
         model = _model()
         densification = DefaultDensification(reset_every=4, reset_opacity=reset)
-        densification.attach(model, _optimizers(model), 1.0)
+        densification.attach(model, _optimizer(model), 1.0)
         densification.after_step(4, _screen([0.0], [0]))
         assert float(model.opacity().detach().max()) == pytest.approx(0.01 if reset else 0.5, rel=0.01)
 
 
 def test_state_goes_through_a_dictionary():
     model = _model()
-    optimizers = _optimizers(model)
+    optimizer = _optimizer(model)
     one = DefaultDensification(start=0, every=100)
-    one.attach(model, optimizers, 1.0)
+    one.attach(model, optimizer, 1.0)
     one.after_step(1, _screen([2.0], [3]))
     two = DefaultDensification(start=0, every=100)
     two.load_state_dict(one.state_dict())
-    two.attach(model, optimizers, 1.0)
+    two.attach(model, optimizer, 1.0)
     for densification in (one, two):
         densification.after_step(2, _screen([1.0], [3]))
     assert torch.equal(one.state_dict()["grad2d"], two.state_dict()["grad2d"])
@@ -101,7 +105,7 @@ def test_state_goes_through_a_dictionary():
 def test_after_the_last_step_nothing_is_kept():
     model = _model()
     densification = DefaultDensification(stop=5)
-    densification.attach(model, _optimizers(model), 1.0)
+    densification.attach(model, _optimizer(model), 1.0)
     screen = _screen([2.0], [3])
     densification.before_backward(5, screen)
     densification.after_step(5, screen)
@@ -111,7 +115,7 @@ def test_after_the_last_step_nothing_is_kept():
 def test_no_densification():
     model = _model()
     densification = NoDensification()
-    densification.attach(model, _optimizers(model), 1.0)
+    densification.attach(model, _optimizer(model), 1.0)
     densification.after_step(600, _screen([9.0], [0]))
     assert len(model) == 6
     assert densification.state_dict() == {}
@@ -120,16 +124,16 @@ def test_no_densification():
 def test_what_needs_cuda_says_so():
     model = _model()
     with pytest.raises(ValueError, match=r"MCMCDensification needs CUDA.*use DefaultDensification"):
-        MCMCDensification().attach(model, _optimizers(model), 1.0)
+        MCMCDensification().attach(model, _optimizer(model), 1.0)
     with pytest.raises(ValueError, match=r"`densification.absgrad` needs CUDA"):
-        DefaultDensification(absgrad=True).attach(model, _optimizers(model), 1.0)
+        DefaultDensification(absgrad=True).attach(model, _optimizer(model), 1.0)
 
 
 @pytest.mark.gpu
 def test_mcmc_adds_up_to_its_cap():
     model = _model(100).cuda()
     densification = MCMCDensification(cap=103, start=0, every=1)
-    densification.attach(model, _optimizers(model), 1.0)
+    densification.attach(model, _optimizer(model), 1.0)
     for step in (1, 2):
         densification.after_step(step, ScreenGaussians(torch.zeros(1, 100, 2), torch.zeros(1, 100, 2), None, 2, 2))
     assert len(model) == 103
@@ -137,12 +141,13 @@ def test_mcmc_adds_up_to_its_cap():
 
 def test_foreign_optimizers_are_refused():
     model = _model()
-    optimizers = _optimizers(model)
-    with pytest.raises(ValueError, match="optimiser with only `means`"):
-        DefaultDensification().attach(_model(), optimizers, 1.0)
-    del optimizers["shN"]
-    with pytest.raises(ValueError, match="optimiser with only `shN`"):
-        DefaultDensification().attach(model, optimizers, 1.0)
+    optimizer = _optimizer(model)
+    one_group = torch.optim.Adam([getattr(model, name) for name in PARAMETERS])
+    short = _optimizer(model)
+    del short.param_groups[-1]
+    for foreign, other in ((optimizer, _model()), (one_group, model), (short, model)):
+        with pytest.raises(ValueError, match="one group for each of means, scales, quats, opacities, sh0, shN of the"):
+            DefaultDensification().attach(other, foreign, 1.0)
 
 
 @pytest.mark.parametrize("options", [{"every": 0}, {"start": -1}, {"prune_opacity": 0.7}, {"stop": 2.5}])
@@ -162,11 +167,11 @@ def test_large_ones_are_split_once():
         model.scales[1] = torch.tensor([0.3, 0.1, 1e-3]).log()
         model.means.mul_(2.0)  # apart
         model.opacities[0] = 30.0  # opaque to the last bit
-    optimizers = _optimizers(model)
+    optimizer = _optimizer(model)
     opacities = model.opacities.detach().clone()
-    momenta = {name: optimizers[name].state[getattr(model, name)]["exp_avg"].clone() for name in PARAMETERS}
+    momenta = {name: optimizer.state[getattr(model, name)]["exp_avg"].clone() for name in PARAMETERS}
     densification = DefaultDensification(start=0, stop=5, split_at=7, split_size=0.05)
-    densification.attach(model, optimizers, 1.0)
+    densification.attach(model, optimizer, 1.0)
     for step in (5, 6):
         densification.after_step(step, _screen([0.0], [0]))
     assert len(model) == 3
@@ -182,16 +187,17 @@ def test_large_ones_are_split_once():
     assert torch.equal(model.sh0.detach()[3:], model.sh0.detach()[1:2].expand(count - 3, 1, 3))
     for name in PARAMETERS:
         parameter = getattr(model, name)
-        assert optimizers[name].param_groups[0]["params"][0] is parameter
+        assert _group(optimizer, name)["params"][0] is parameter
         assert dict(model.named_parameters())[name] is parameter
-        state = optimizers[name].state[parameter]["exp_avg"]
+        state = optimizer.state[parameter]["exp_avg"]
         assert state.shape == parameter.shape
         assert torch.equal(state[:3], momenta[name])
         assert not bool(state[3:].any())
-        before = parameter.detach().clone()
+    before = {name: getattr(model, name).detach().clone() for name in PARAMETERS}
+    for parameter in model.parameters():
         parameter.grad = torch.ones_like(parameter)
-        optimizers[name].step()
-        assert torch.equal(parameter.detach(), before) == (name == "quats")  # rotations are held
+    optimizer.step()
+    assert [name for name in PARAMETERS if torch.equal(getattr(model, name), before[name])] == ["quats"]  # held
     with torch.no_grad():
         model.scales.add_(1.0)
     densification.after_step(8, _screen([0.0], [0]))

@@ -60,10 +60,11 @@ def test_a_training_learns(data, make_trainer, tmp_path):
 def _state(module):
     """Everything that decides how a training goes on."""
     result = {name: getattr(module.splat, name).detach() for name in PARAMETERS}
-    for name, optimizer in zip(PARAMETERS, module.trainer.optimizers, strict=True):
-        for values in optimizer.state.values():
-            result |= {f"{name}.{key}": value for key, value in values.items()}
-        result[f"{name}.lr"] = torch.tensor(optimizer.param_groups[0]["lr"])
+    (optimizer,) = module.trainer.optimizers
+    for name, group in zip(PARAMETERS, optimizer.param_groups, strict=True):
+        (parameter,) = group["params"]
+        result |= {f"{name}.{key}": value for key, value in optimizer.state[parameter].items()}
+        result[f"{name}.lr"] = torch.tensor(group["lr"])
     state = module.densification.state_dict()
     return result | {key: value for key, value in state.items() if isinstance(value, torch.Tensor)}
 
@@ -89,6 +90,69 @@ def test_a_resumed_training_is_the_same_bit_for_bit(data, make_trainer, tmp_path
     assert len(expected) > 20
     for name, value in expected.items():
         assert torch.equal(result[name], value), name
+
+
+def test_a_checkpoint_with_six_optimizers_is_refused(data, make_trainer, tmp_path):
+    """Those of an earlier version; their splat can still be looked at."""
+    path = tmp_path / "step=2.ckpt"
+    trainer = make_trainer(2, enable_checkpointing=True, callbacks=[_checkpoints(tmp_path, every=2)])
+    trainer.fit(_module(), data)
+    old = torch.load(path, weights_only=True)
+    torch.save(old | {"optimizer_states": old["optimizer_states"] * 6}, path)
+    make_trainer(3).validate(_module(), data, ckpt_path=path, weights_only=False, verbose=False)
+    with pytest.raises(ValueError, match=r"is from an earlier version.*start a new run, from its splat"):
+        make_trainer(3).fit(_module(), data, ckpt_path=path, weights_only=False)
+
+
+class _Heard(lightning.Callback):
+    """What the hooks of a callback are told."""
+
+    def __init__(self):
+        self.ends, self.validations, self.inner = [], [], []
+
+    def on_train_batch_end(self, trainer, module, outputs, batch, batch_idx):
+        self.ends.append((trainer.global_step, batch_idx, batch["name"]))
+
+    def on_validation_start(self, trainer, module):
+        self.validations.append(trainer.global_step)
+
+    def on_before_backward(self, *_):
+        self.inner.append("before backward")
+
+    def on_after_backward(self, *_):
+        self.inner.append("after backward")
+
+    def on_before_optimizer_step(self, *_):
+        self.inner.append("before step")
+
+
+def test_lightning_counts_images(data, make_trainer, tmp_path):
+    """Its hooks come for each, checkpoints and validations at their numbers, also in a run that goes on."""
+    heard = _Heard()
+    on = {"enable_checkpointing": True, "limit_val_batches": 1.0, "val_check_interval": 12, "num_sanity_val_steps": 0}
+    trainer = make_trainer(33, callbacks=[heard, _checkpoints(tmp_path, every=15)], **on)
+    trainer.fit(_module(panels=0), data)
+    assert trainer.global_step == 33
+    assert [end[:2] for end in heard.ends] == [(step, step - 1) for step in range(1, 34)]
+    assert heard.inner == ["before backward", "after backward", "before step"] * 33
+    assert heard.validations == [12, 24]
+    assert sorted(path.name for path in tmp_path.glob("*.ckpt")) == ["step=15.ckpt", "step=30.ckpt"]
+    again = _Heard()
+    trainer = make_trainer(33, callbacks=[again], **(on | {"enable_checkpointing": False}))
+    trainer.fit(_module(panels=0), data, ckpt_path=tmp_path / "step=15.ckpt", weights_only=False)
+    assert again.ends == heard.ends[15:]
+    assert again.validations == [24]
+
+
+def test_data_that_end(data, make_trainer):
+    """A loader of six views, of which an epoch takes up to four."""
+    data.train_dataloader = lambda: torch.utils.data.DataLoader(data.train, batch_size=None)
+    for options, epoch in (({}, 6), ({"limit_train_batches": 4}, 4)):
+        heard = _Heard()
+        trainer = make_trainer(14, callbacks=[heard], **options)
+        trainer.fit(_module(), data)
+        assert [end[0] for end in heard.ends] == list(range(1, 15))
+        assert [end[2] for end in heard.ends] == [f"{index % epoch:03d}" for index in range(14)]
 
 
 class _StopAt(lightning.Callback):
@@ -148,7 +212,7 @@ def test_gaussians_that_are_not_finite_are_not_kept(data, make_trainer, tmp_path
                 module.splat.quats.data[3] = math.nan
 
     only_rgb = {"anisotropy": 0, "entropy": 0, "size": 0}
-    module = _module(loss_weights=only_rgb, densification=NoDensification(), hooks_every=1)
+    module = _module(loss_weights=only_rgb, densification=NoDensification())
     callbacks = [Spoils(), _checkpoints(tmp_path, every=3)]
     with pytest.raises(TrainingDiverged, match=r"step 6: a value of `.*step=3\.ckpt"):
         make_trainer(20, enable_checkpointing=True, callbacks=callbacks).fit(module, data)

@@ -108,6 +108,7 @@ def test_controls_change_the_wind_and_say_what_is_wrong(page, window, until):
 def test_streaks_of_air_are_drawn_where_they_are_wanted(page, window, until, monkeypatch):
     """What a picture with them looks like is tested in test_pictures.py."""
     drawn = []
+    page.by_browser = False
     monkeypatch.setattr(screen, "draw", lambda *args: drawn.append(args[4]) or draw(*args))
     window.get_by_text("Picture", exact=True).click()
     box = window.get_by_text("Streaks of air").locator("xpath=ancestor::*[.//input][1]").locator("input").last
@@ -152,6 +153,7 @@ def test_two_browsers_see_the_same_scene_and_closing_one_ends_nothing(page, wind
     other = second.new_page()
     other.goto(page.url)
     until(lambda: len(page.server.get_clients()) == 2, 240)
+    page.by_browser = False
     until(lambda: sum(len(times) > 3 for times in page._drawn.values()) == 2, 240)
     second.close()
     until(lambda: len(page.server.get_clients()) == 1)

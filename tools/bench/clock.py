@@ -6,6 +6,7 @@ import gc
 import statistics
 import time
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import torch
@@ -93,6 +94,11 @@ def guarded(function: Callable[[], Row]) -> Row:
         return {"failed": "out of memory" if full else f"{type(error).__name__}: {error}"}
     finally:
         clear()
+
+
+def safely(function: Callable[..., Row], *arguments: Any, **options: Any) -> Callable[[], Row]:
+    """A guarded call for later."""
+    return partial(guarded, partial(function, *arguments, **options))
 
 
 class Peak:

@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-import argparse
 import copy
 import json
-from collections.abc import Callable, Collection
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -27,14 +26,6 @@ def start(device: str) -> tuple[torch.device, Row]:
         device = "cuda" if torch.cuda.is_available() else "cpu"
     found = torch.device(device)
     return found, {"device": describe_device(found), "versions": versions(), "seed": 0}
-
-
-def chosen(option: str, given: str | None, known: Collection[str]) -> list[str]:
-    """The names in a list separated by commas, all of them for None; exits if one is unknown."""
-    names = list(known) if given is None else [name for name in given.split(",") if name]
-    if unknown := set(names) - set(known):
-        raise SystemExit(f"{option} takes {', '.join(known)}, not {', '.join(sorted(unknown))}")
-    return names
 
 
 def write(folder: Path, name: str, result: Row, quiet: bool = False) -> None:
@@ -65,38 +56,39 @@ def read(folder: Path) -> dict[str, Row]:
     return found
 
 
-def keep_rows(result: Row, folder: Path, name: str, keep: Callable[[Row], bool]) -> None:
-    """Begin the rows of a record with those of an earlier one that are to be kept, which keep their stamps."""
-    path = folder / f"{name}.json"
-    old = json.loads(path.read_text()) if path.exists() else {"rows": []}
-    result["rows"] = [row for row in old["rows"] if keep(row)]
-    result["measured"] = stamps.kept(old, {"rows": result["rows"]})
-
-
-def go_on(options: argparse.Namespace, name: str, result: Row, measure: Callable[..., None]) -> None:
-    """Add to an earlier record of the same device, and write after each part.
+def go_on(folder: Path, name: str, result: Row, measure: Callable[..., None], keeps: str = "device") -> None:
+    """Add to an earlier record, and write after each part.
 
     What another process has added to the record or measured anew meanwhile is kept.
+
+    Args:
+        folder: Folder of the records.
+        name: Name of the record.
+        result: Its head.
+        measure: Function of the record so far, which it adds to, and of a function that writes what it is given.
+        keeps: Whose earlier record is added to: that of the same ``device``, of ``any``, or of ``none``.
     """
-    folder = Path(options.results)
     path = folder / f"{name}.json"
-    before: Row = {}
-    if path.exists():
-        kept = json.loads(path.read_text())
-        if kept["device"] == result["device"]:
-            result, before = kept | result, kept
-    before = copy.deepcopy(before)
+
+    def there() -> Row:
+        found = json.loads(path.read_text()) if path.exists() else {}
+        same = found.get("device") == result["device"] or keeps == "any"
+        return found if same else {}
+
+    before = {} if keeps == "none" else there()
+    result, before, fresh = before | result, copy.deepcopy(before), keeps == "none"
 
     def save(now: Row) -> None:
+        nonlocal before, fresh
         folder.mkdir(parents=True, exist_ok=True)
         with FileLock(path.with_suffix(".lock")):
-            there = json.loads(path.read_text()) if path.exists() else {}
-            same = there.get("device") == now["device"]
-            new = merged(there, changed(before, now)) if same else dict(now)
-            new["measured"] = stamps.kept(there, new) if same else {}
+            old = {} if fresh else there()
+            new = merged(old, changed(before, now))
+            new["measured"] = stamps.kept(old, new)
             write(folder, name, new, quiet=True)
+            before, fresh = copy.deepcopy(now), False
 
-    measure(options, result, save)
+    measure(result, save)
     path.with_suffix(".lock").unlink(missing_ok=True)
     print(f"wrote {path}")
 

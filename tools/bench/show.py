@@ -6,6 +6,7 @@ import argparse
 from pathlib import Path
 
 from bench import films, record
+from bench.case import option
 
 
 def film(options: argparse.Namespace) -> None:
@@ -32,20 +33,16 @@ def pictures(options: argparse.Namespace) -> None:
     print(f"wrote {target}")
 
 
-def add_pictures_arguments(command: argparse.ArgumentParser) -> None:
-    """Options of ``bench.py pictures``."""
-    command.add_argument("--run", required=True, help="output folder of a run")
-    command.add_argument("--name", required=True, help="name of the picture")
-    command.add_argument("--frames_shown", default="0,20,40,60", help="frame numbers")
-    command.add_argument(
-        "--columns", default="0,1", help="left and right end of the part to keep, as shares of the width"
-    )
-
-
-def add_film_arguments(command: argparse.ArgumentParser) -> None:
-    """Options of ``bench.py film``."""
-    command.add_argument("--runs", required=True, help="output folders of runs, separated by commas")
-    command.add_argument("--name", default="swaying", help="name of the picture")
-    command.add_argument("--frames_shown", default="0:75:2", help="first frame, end (exclusive), step")
-    command.add_argument("--size", default="320x320", help="size of each panel [pixels]")
-    command.add_argument("--quality", type=int, default=60, help="quality of the compression, 0 to 100")
+PICTURES = (
+    option("--run", "output folder of a run", required=True),
+    option("--name", "name of the picture", required=True),
+    option("--frames_shown", "frame numbers", default="0,20,40,60"),
+    option("--columns", "left and right end of the part to keep, as shares of the width", default="0,1"),
+)
+FILM = (
+    option("--runs", "output folders of runs, separated by commas", required=True),
+    option("--name", "name of the picture", default="swaying"),
+    option("--frames_shown", "first frame, end (exclusive), step", default="0:75:2"),
+    option("--size", "size of each panel [pixels]", default="320x320"),
+    option("--quality", "quality of the compression, 0 to 100", type=int, default=60),
+)

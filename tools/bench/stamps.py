@@ -32,6 +32,7 @@ PARTS: dict[str, tuple[str, ...]] = {
     "area": ("gaussians", "geometry"),
     "backward": _SOLVER,
     "contact": _SIMULATION,
+    "drawn": (*_DRAWN, "viewer"),
     "fit": (*_DRAWN, "fitting"),
     "flags": (*_DRAWN, "evaluation", "training"),
     "folds": (*_SIMULATION, "evaluation"),

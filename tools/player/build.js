@@ -1,9 +1,10 @@
-// Writes film.min.js of the package: film.js with what it uses of Spark and three.js.
+// Writes film.min.js of the package: the programs of films and of the live page, with what they use of Spark and three.js.
 import { build } from "esbuild";
 import { createHash } from "node:crypto";
 import { readFile } from "node:fs/promises";
 
-const SOURCES = ["build.js", "film.glsl.js", "film.js", "package-lock.json", "sorter.js"]; // a test compares their checksum
+const OWN = ["build.js", "film.glsl.js", "film.js", "gaussians.js", "live.js", "main.js", "playback.js", "sorter.js"];
+const SOURCES = [...OWN, "package-lock.json"]; // a test compares their checksum
 
 // Spark's WebAssembly, in it and in its worker, reads files of splats, builds levels of detail and sorts. A film needs only
 // the sorting, which sorter.js does. Each pattern must match once, so that another Spark is not cut without a look at it.
@@ -28,7 +29,7 @@ const checksum = createHash("sha256");
 for (const name of SOURCES) checksum.update(await readFile(name));
 
 await build({
-  entryPoints: ["film.js"],
+  entryPoints: ["main.js"],
   outfile: "../../gaussian_swaying/viewer/film/page/film.min.js",
   bundle: true,
   minify: true,

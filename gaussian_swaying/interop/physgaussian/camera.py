@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-import dataclasses
 import math
 import os
 from collections.abc import Sequence
+from dataclasses import KW_ONLY, dataclass, replace
 
 import torch
 from torch import Tensor
@@ -14,10 +14,11 @@ from gaussian_swaying._checks import check_positive, check_vector
 from gaussian_swaying._inputs import read_json
 from gaussian_swaying.geometry.frame import SimFrame
 from gaussian_swaying.rendering.cameras.camera import Camera, look_at_camera
-from gaussian_swaying.rendering.cameras.camera_path import CameraPath
+from gaussian_swaying.rendering.cameras.camera_path import PinholePath
 
 
-class PhysGaussianCamera(CameraPath):
+@dataclass(eq=False)
+class PhysGaussianCamera(PinholePath):
     """Camera of a PhysGaussian configuration: a camera of the model, or one on a sphere that looks at a point.
 
     Azimuth is defined as in PhysGaussian: from the horizontal part of (1, 1, 1), or of (0.72, 0.37, -0.67) if (1, 1, 1)
@@ -44,43 +45,35 @@ class PhysGaussianCamera(CameraPath):
         ValueError: If a number is out of range; at the first frame, if the file is bad.
     """
 
-    def __init__(
-        self,
-        cameras: str | os.PathLike[str] | None = None,
-        index: int = -1,
-        azimuth: float = 0.0,
-        elevation: float = 0.0,
-        radius: float = 2.0,
-        delta_azimuth: float = 0.0,
-        delta_elevation: float = 0.0,
-        delta_radius: float = 0.0,
-        viewpoint: Sequence[float] = (1.0, 1.0, 1.0),
-        up: Sequence[float] = (0.0, 0.0, 1.0),
-        width: int = 960,
-        height: int = 540,
-        fov_y: float = 40.0,
-        near: float = 0.01,
-    ) -> None:
-        check_positive("radius", radius)
-        if index >= 0 and cameras is None:
-            raise ValueError(f"Camera {index} is a camera of the model: set `cameras` to its `cameras.json`.")
-        self.cameras, self.index, self.radius = cameras, int(index), float(radius)
-        self.azimuth, self.elevation = float(azimuth), float(elevation)
-        self.delta = (float(delta_azimuth), float(delta_elevation), float(delta_radius))
-        self.viewpoint, self.up = check_vector("viewpoint", viewpoint), check_vector("up", up)
+    cameras: str | os.PathLike[str] | None = None
+    index: int = -1
+    _: KW_ONLY
+    azimuth: float = 0.0
+    elevation: float = 0.0
+    radius: float = 2.0
+    delta_azimuth: float = 0.0
+    delta_elevation: float = 0.0
+    delta_radius: float = 0.0
+    viewpoint: Sequence[float] = (1.0, 1.0, 1.0)
+    up: Sequence[float] = (0.0, 0.0, 1.0)
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        check_positive("radius", self.radius)
+        if self.index >= 0 and self.cameras is None:
+            raise ValueError(f"Camera {self.index} is a camera of the model: set `cameras` to its `cameras.json`.")
+        self.viewpoint, self.up = check_vector("viewpoint", self.viewpoint), check_vector("up", self.up)
         if not any(self.up):
             raise ValueError("Expected `up` to be a direction, but got zero.")
-        check_positive("near", near)
-        self.width, self.height, self.fov_y, self.near = width, height, float(fov_y), float(near)
         self.frame: SimFrame | None = None
         self._model: Camera | None = None
 
     def eye(self, frame: int) -> tuple[Tensor, Tensor, Tensor]:
         """Position, target and up of the sphere's camera in a frame: scene units, shape (3,), float64."""
         moved = max(frame - 1, 0)  # the first frame here is at rest, and PhysGaussian does not draw it
-        azimuth = math.radians(self.azimuth + moved * self.delta[0])
-        elevation = math.radians(self.elevation + moved * self.delta[1])
-        radius = self.radius + moved * self.delta[2]
+        azimuth = math.radians(self.azimuth + moved * self.delta_azimuth)
+        elevation = math.radians(self.elevation + moved * self.delta_elevation)
+        radius = self.radius + moved * self.delta_radius
         check_positive("radius", radius)
         target, up = (torch.tensor(v, dtype=torch.float64) for v in (self.viewpoint, self.up))
         if self.frame is not None:
@@ -104,7 +97,7 @@ class PhysGaussianCamera(CameraPath):
         width, height = (self.width, self.height) if self._model is None else (self._model.width, self._model.height)
         camera = look_at_camera(*self.eye(frame), self.fov_y, width, height, self.near, dtype=torch.float64)
         if self._model is not None:
-            camera = dataclasses.replace(camera, intrinsics=self._model.intrinsics)
+            camera = replace(camera, intrinsics=self._model.intrinsics)
         return camera.to(center.device, center.dtype)
 
 

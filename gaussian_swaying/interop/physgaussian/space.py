@@ -54,7 +54,7 @@ def tidy(vector: Tensor) -> list[float]:
 
 
 def up_direction(rotation: Tensor) -> list[float]:
-    """``scene.up`` so that the z-up frame has the z axis of the turned axes, from the rotation of the scene (3, 3)."""
+    """The ``scene.up`` with which z up is the z axis of the turned axes, from the rotation of the scene (3, 3)."""
     return tidy(rotation[2])
 
 

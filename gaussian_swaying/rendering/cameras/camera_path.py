@@ -1,12 +1,16 @@
 """Camera paths that a configuration can name. They give the camera of each frame of a run."""
 
+from __future__ import annotations
+
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
+from dataclasses import KW_ONLY, dataclass
 from pathlib import Path
+from typing import Any
 
 from torch import Tensor
 
-from gaussian_swaying._checks import check_positive, check_vector
+from gaussian_swaying._checks import check_positive, check_vector, check_whole
 from gaussian_swaying.rendering.cameras.camera import (
     Camera,
     check_direction,
@@ -46,7 +50,44 @@ class CameraPath(ABC):
         """
 
 
-class OrbitCamera(CameraPath):
+def check_picture(camera: CameraPath) -> None:
+    """Raise TypeError or ValueError unless size, field of view and near plane of a path's pictures are valid."""
+    given = vars(camera)
+    for name in ("width", "height"):
+        if given[name] is not None:  # that of the capture
+            check_pixels(name, given[name])
+    if "fov_y" in given:
+        check_fov("fov_y", given["fov_y"])
+    check_positive("near", given["near"])
+
+
+@dataclass(eq=False, kw_only=True)
+class PinholePath(CameraPath):
+    """Base class of the paths of a pinhole camera that is not that of a capture.
+
+    Args:
+        width: Image width [pixels].
+        height: Image height [pixels].
+        fov_y: Vertical field of view [degrees].
+        near: Near plane [scene units].
+    """
+
+    width: int = 960
+    height: int = 540
+    fov_y: float = 40.0
+    near: float = 0.01
+
+    def __post_init__(self) -> None:
+        check_picture(self)
+
+    def picture(self, like: Tensor, fov_y: float | None = None) -> dict[str, Any]:
+        """Lens, size, device and type (those of a tensor) for :func:`look_at_camera` and :func:`orbit_camera`."""
+        lens = {"fov_y_degrees": fov_y or self.fov_y, "width": self.width, "height": self.height, "near": self.near}
+        return {**lens, "device": like.device, "dtype": like.dtype}
+
+
+@dataclass(eq=False)
+class OrbitCamera(PinholePath):
     """Camera on a sphere around the object that looks at it and may move around the up direction.
 
     See :func:`orbit_camera` for the definition of azimuth and elevation.
@@ -68,29 +109,22 @@ class OrbitCamera(CameraPath):
         ValueError: If a number is out of range.
     """
 
-    def __init__(
-        self,
-        width: int = 960,
-        height: int = 540,
-        *,
-        fov_y: float = 40.0,
-        azimuth: float = -60.0,
-        elevation: float = 15.0,
-        radius: float = 2.0,
-        degrees_per_second: float = 0.0,
-        target_offset: Sequence[float] = (0.0, 0.0, 0.0),
-        near: float = 0.01,
-    ) -> None:
-        self.width, self.height = check_pixels("width", width), check_pixels("height", height)
-        self.fov_y = check_fov("fov_y", fov_y)
-        self.azimuth = check_vector("azimuth", [azimuth], 1)[0]
-        self.elevation = check_elevation("elevation", elevation)
-        check_positive("radius", radius)
-        self.radius = float(radius)
-        self.degrees_per_second = check_vector("degrees_per_second", [degrees_per_second], 1)[0]
-        self.target_offset = check_vector("target_offset", target_offset)
-        check_positive("near", near)
-        self.near = float(near)
+    width: int = 960
+    height: int = 540
+    _: KW_ONLY
+    azimuth: float = -60.0
+    elevation: float = 15.0
+    radius: float = 2.0
+    degrees_per_second: float = 0.0
+    target_offset: Sequence[float] = (0.0, 0.0, 0.0)
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        for name in ("azimuth", "degrees_per_second"):
+            check_vector(name, [getattr(self, name)], 1)
+        check_elevation("elevation", self.elevation)
+        check_positive("radius", self.radius)
+        self.target_offset = check_vector("target_offset", self.target_offset)
 
     @property
     def still(self) -> bool:  # type: ignore[override]
@@ -100,22 +134,13 @@ class OrbitCamera(CameraPath):
     def __call__(self, frame: int, time: float, center: Tensor, up: Tensor, size: float) -> Camera:
         """Camera of a frame, see :meth:`CameraPath.__call__`."""
         check_positive("size", size)
-        return orbit_camera(
-            [c + size * o for c, o in zip(check_vector("center", center), self.target_offset, strict=True)],
-            up,
-            size * self.radius,
-            self.azimuth + self.degrees_per_second * time,
-            self.elevation,
-            self.fov_y,
-            self.width,
-            self.height,
-            self.near,
-            device=center.device,
-            dtype=center.dtype,
-        )
+        target = [c + size * o for c, o in zip(check_vector("center", center), self.target_offset, strict=True)]
+        azimuth = self.azimuth + self.degrees_per_second * time
+        return orbit_camera(target, up, size * self.radius, azimuth, self.elevation, **self.picture(center))
 
 
-class LookAtCamera(CameraPath):
+@dataclass(eq=False)
+class LookAtCamera(PinholePath):
     """Fixed camera at a given point.
 
     Args:
@@ -133,42 +158,24 @@ class LookAtCamera(CameraPath):
     """
 
     still = True
+    eye: Sequence[float]
+    target: Sequence[float]
+    _: KW_ONLY
+    up: Sequence[float] | None = None
 
-    def __init__(
-        self,
-        eye: Sequence[float],
-        target: Sequence[float],
-        *,
-        up: Sequence[float] | None = None,
-        width: int = 960,
-        height: int = 540,
-        fov_y: float = 40.0,
-        near: float = 0.01,
-    ) -> None:
-        self.eye, self.target = check_vector("eye", eye), check_vector("target", target)
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        self.eye, self.target = check_vector("eye", self.eye), check_vector("target", self.target)
         if self.eye == self.target:
             raise ValueError(f"Expected `eye` and `target` to differ, but both are {list(self.eye)}.")
-        self.up = None if up is None else check_direction("up", up)
-        self.width, self.height = check_pixels("width", width), check_pixels("height", height)
-        self.fov_y = check_fov("fov_y", fov_y)
-        check_positive("near", near)
-        self.near = float(near)
+        self.up = None if self.up is None else check_direction("up", self.up)
 
     def __call__(self, frame: int, time: float, center: Tensor, up: Tensor, size: float) -> Camera:
         """Camera of a frame, see :meth:`CameraPath.__call__`."""
-        return look_at_camera(
-            self.eye,
-            self.target,
-            up if self.up is None else self.up,
-            self.fov_y,
-            self.width,
-            self.height,
-            self.near,
-            device=center.device,
-            dtype=center.dtype,
-        )
+        return look_at_camera(self.eye, self.target, up if self.up is None else self.up, **self.picture(center))
 
 
+@dataclass(eq=False)
 class TransformsCamera(CameraPath):
     """Captured camera of a ``transforms.json``; the file is read at the first frame.
 
@@ -187,23 +194,16 @@ class TransformsCamera(CameraPath):
     captured = True
     still = True
 
-    def __init__(
-        self,
-        path: str | Path,
-        frame: int = 0,
-        width: int | None = None,
-        height: int | None = None,
-        near: float = 0.01,
-    ) -> None:
-        if isinstance(frame, bool) or not isinstance(frame, int):
-            raise TypeError(f"Expected `frame` to be a whole number, but got {frame!r}.")
-        if frame < 0:
-            raise ValueError(f"Expected `frame` not to be negative, but got {frame}.")
-        self.path, self.frame = path, frame
-        self.width = None if width is None else check_pixels("width", width)
-        self.height = None if height is None else check_pixels("height", height)
-        check_positive("near", near)
-        self.near = float(near)
+    path: str | Path
+    frame: int = 0
+    _: KW_ONLY
+    width: int | None = None
+    height: int | None = None
+    near: float = 0.01
+
+    def __post_init__(self) -> None:
+        check_whole("frame", self.frame, 0)
+        check_picture(self)
         self._camera: Camera | None = None
 
     def __call__(self, frame: int, time: float, center: Tensor, up: Tensor, size: float) -> Camera:

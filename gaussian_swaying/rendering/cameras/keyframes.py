@@ -4,24 +4,17 @@ from __future__ import annotations
 
 from bisect import bisect_right
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import KW_ONLY, dataclass
 from itertools import pairwise
-from typing import Any
+from typing import Any, Literal
 
 from torch import Tensor
 
-from gaussian_swaying._checks import check_choice, check_positive, check_vector
-from gaussian_swaying.rendering.cameras.camera import (
-    Camera,
-    check_elevation,
-    check_fov,
-    check_pixels,
-    look_at_camera,
-    orbit_camera,
-)
-from gaussian_swaying.rendering.cameras.camera_path import CameraPath
+from gaussian_swaying._checks import check_literals, check_positive, check_vector
+from gaussian_swaying.rendering.cameras.camera import Camera, check_elevation, check_fov, look_at_camera, orbit_camera
+from gaussian_swaying.rendering.cameras.camera_path import PinholePath
 
-INTERPOLATIONS = ("smooth", "linear")
+Interpolation = Literal["smooth", "linear"]
 
 
 def interpolate_keys(
@@ -53,15 +46,15 @@ def interpolate_keys(
     k = bisect_right(times, time) - 1
     span = times[k + 1] - times[k]
     s = (time - times[k]) / span
-    found = []
+    between = []
     for d, (start, end) in enumerate(zip(values[k], values[k + 1], strict=True)):
         if interpolation == "linear":
-            found.append(start + s * (end - start))
+            between.append(start + s * (end - start))
             continue
         before, after = (_slope(times, [row[d] for row in values], at) for at in (k, k + 1))
         ease = s * s * (3 - 2 * s)
-        found.append(start + ease * (end - start) + span * s * (1 - s) * ((1 - s) * before - s * after))
-    return found
+        between.append(start + ease * (end - start) + span * s * (1 - s) * ((1 - s) * before - s * after))
+    return between
 
 
 def _slope(times: Sequence[float], values: Sequence[float], k: int) -> float:
@@ -99,7 +92,8 @@ class CameraKey:
     fov_y: float | None = None
 
 
-class KeyframedCamera(CameraPath):
+@dataclass(eq=False)
+class KeyframedCamera(PinholePath):
     """Camera that moves through keys: from eye to eye, or on a sphere about its target.
 
     Args:
@@ -125,17 +119,15 @@ class KeyframedCamera(CameraPath):
         tensor([1.9700, 0.0000, 0.3470])
     """
 
-    def __init__(
-        self,
-        keys: list[CameraKey],
-        interpolation: str = "smooth",
-        up: Sequence[float] | None = None,
-        width: int = 960,
-        height: int = 540,
-        fov_y: float = 40.0,
-        near: float = 0.01,
-    ) -> None:
-        check_choice("interpolation", interpolation, INTERPOLATIONS)
+    keys: list[CameraKey]
+    interpolation: Interpolation = "smooth"
+    _: KW_ONLY
+    up: Sequence[float] | None = None
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        check_literals(type(self).__init__, vars(self))
+        keys = self.keys
         if not keys:
             raise ValueError("Expected `keys` to hold at least one key with a time and a position.")
         self.times = [check_vector("keys.time", [key.time], 1)[0] for key in keys]
@@ -160,12 +152,8 @@ class KeyframedCamera(CameraPath):
             self.places = [list(check_vector("keys.eye", eye)) for eye in eyes]
         targets = _filled([key.target for key in keys], None)
         self.targets = [None if target is None else check_vector("keys.target", target) for target in targets]
-        self.fovs = [[check_fov("keys.fov_y", value)] for value in _filled([key.fov_y for key in keys], fov_y)]
-        self.interpolation = interpolation
-        self.up = None if up is None else check_vector("up", up)
-        self.width, self.height = check_pixels("width", width), check_pixels("height", height)
-        check_positive("near", near)
-        self.near = float(near)
+        self.fovs = [[check_fov("keys.fov_y", value)] for value in _filled([key.fov_y for key in keys], self.fov_y)]
+        self.up = None if self.up is None else check_vector("up", self.up)
 
     def __call__(self, frame: int, time: float, center: Tensor, up: Tensor, size: float) -> Camera:
         """Camera of a frame, see :meth:`CameraPath.__call__`."""
@@ -176,14 +164,11 @@ class KeyframedCamera(CameraPath):
             interpolate_keys(self.times, values, time, self.interpolation)
             for values in (self.places, targets, self.fovs)
         )
-        picture = (fov, self.width, self.height, self.near)
+        picture = self.picture(center, fov)
         if self.orbits:
             azimuth, elevation, radius = place
-            return orbit_camera(
-                target, up, size * radius, azimuth, elevation, *picture, device=center.device, dtype=center.dtype
-            )
-        seen_up = up if self.up is None else self.up
-        return look_at_camera(place, target, seen_up, *picture, device=center.device, dtype=center.dtype)
+            return orbit_camera(target, up, size * radius, azimuth, elevation, **picture)
+        return look_at_camera(place, target, up if self.up is None else self.up, **picture)
 
 
 _ANGLES = ("azimuth", "elevation", "radius")
@@ -191,11 +176,11 @@ _ANGLES = ("azimuth", "elevation", "radius")
 
 def _filled(values: list[Any], first: Any) -> list[Any]:
     """Each value, or the last one given before it, or ``first``."""
-    found = []
+    filled = []
     for value in values:
         first = first if value is None else value
-        found.append(first)
-    return found
+        filled.append(first)
+    return filled
 
 
 def _carried_on(name: str, values: list[Any]) -> list[Any]:

@@ -73,11 +73,15 @@ def pack(film: Film) -> dict[str, bytes]:
     counts = np.array([len(rows) for rows in far], np.uint32)
     return {
         "head": json.dumps(film.head).encode(),
-        "splats": b"".join(_planes(getattr(film, name)) for name in SPLATS),
-        "nodes": _planes(film.nodes),
+        **pack_still(film),
         "frames": _planes(frames),
         "far": _planes(counts) + _planes(np.concatenate(far)),
     }
+
+
+def pack_still(film: Film) -> dict[str, bytes]:
+    """The blocks of :func:`pack` that are the same in all frames."""
+    return {"splats": b"".join(_planes(getattr(film, name)) for name in SPLATS), "nodes": _planes(film.nodes)}
 
 
 def _split(displacement: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -86,7 +86,7 @@ def read_film(run: Path) -> Film:
         )
     with torch.inference_mode():
         _check_near(run / "nodes.npz", scene, grid, nodes, displacement)
-        return _film(simulation, grid, nodes, displacement, name)
+        return film_of(simulation, grid, nodes, displacement, name)
 
 
 def _check_near(path: Path, scene: SimulatedScene, grid: GridSpec, nodes: Tensor, displacement: Tensor) -> None:
@@ -148,23 +148,30 @@ def _rebuild(run: Path, summary: dict[str, Any]) -> tuple[Simulation, str]:
     return Simulation.from_settings(parser, settings, device="cpu"), made if splat is None else Path(splat).stem
 
 
-def _film(simulation: Simulation, grid: GridSpec, nodes: Tensor, displacement: Tensor, name: str) -> Film:
+def film_of(simulation: Simulation, grid: GridSpec, nodes: Tensor, displacement: Tensor, name: str) -> Film:
+    """The film of a simulation whose nodes move.
+
+    Args:
+        simulation: The simulation.
+        grid: Its grid.
+        nodes: Flat indices of the nodes in the grid, rising, shape (M,).
+        displacement: Their displacements [m], float32, shape (K, M, 3).
+        name: What it shows.
+    """
     scene, painter = simulation.scene, simulation.painter
+    device = scene.model.means.device
     size, count = scene.size * scene.frame.metres_per_unit, len(scene.model.means)
     position = scene.frame.point_to_sim(scene.model.means.double()) / size
     turn, scale = covariance_to_quat_scale(scene.frame.covariance_to_sim(scene.rest_covariances.double()) / size**2)
-    place = torch.full((count, 3), -1.0)
+    place = torch.full((count, 3), -1.0, device=device)
     place[scene.moving] = in_cells(scene.follow.places, grid).float()
-    facing = torch.zeros(count, 4)
+    facing = torch.zeros(count, 4, device=device)
     facing[scene.moving, :3] = scene.rest_facing.float()
     facing[scene.moving, 3] = scene.solid().float()
-    color = sh_to_color(scene.model.sh[:, :1], torch.ones(count, 3))
+    color = sh_to_color(scene.model.sh[:, :1], torch.ones(count, 3, device=device))
     color = torch.cat([color, scene.model.opacity()[:, None]], dim=-1)
-    shader, light, notes = painter.shader, None, []
-    if isinstance(shader, DiffuseShader):
-        light = {"light": shader.light.tolist(), "two_sided": shader.two_sided, "ambient": shader.ambient}
-        light["relative"] = shader.relative
-    elif shader is not None:
+    shader, notes = painter.shader, []
+    if shader is not None and not isinstance(shader, DiffuseShader):
         notes.append(f"the film has no {type(shader).__name__}: the Gaussians keep the colours of the splat.")
     if scene.model.view_dependent:
         notes.append("colours that depend on the direction of view are the same from all sides.")
@@ -178,23 +185,31 @@ def _film(simulation: Simulation, grid: GridSpec, nodes: Tensor, displacement: T
         "corner": [first * grid.dx / size for first in grid.offset],
         "resolution": list(grid.resolution),
         "max_stretch": scene.max_stretch,
-        "shader": light,
-        "background": painter.background.tolist(),
+        **look_of(painter),
         "camera": _camera(painter, scene, size),
         "title": f"{name[:1].upper()}{name[1:]} in the wind",
     }
     return Film(
         head,
-        position.float().numpy(),
-        place.numpy(),
-        scale.half().numpy(),
+        position.float().numpy(force=True),
+        place.numpy(force=True),
+        scale.half().numpy(force=True),
         _steps(turn),
         _steps(facing),
-        (color.clamp(0, 1) * 255).round().to(torch.uint8).numpy(),
-        nodes.numpy().astype(np.uint32),
-        displacement.numpy(),
+        (color.clamp(0, 1) * 255).round().to(torch.uint8).numpy(force=True),
+        nodes.numpy(force=True).astype(np.uint32),
+        displacement.numpy(force=True),
         tuple(notes),
     )
+
+
+def look_of(painter: Painter) -> dict[str, Any]:
+    """Light and background for the page; the light is None without a :class:`DiffuseShader`."""
+    shader, light = painter.shader, None
+    if isinstance(shader, DiffuseShader):
+        light = {"light": shader.light.tolist(), "two_sided": shader.two_sided, "ambient": shader.ambient}
+        light["relative"] = shader.relative
+    return {"shader": light, "background": painter.background.tolist()}
 
 
 def in_cells(places: Tensor, grid: GridSpec) -> Tensor:
@@ -206,12 +221,12 @@ def in_cells(places: Tensor, grid: GridSpec) -> Tensor:
     cells = places / grid.dx
     border = cells.floor() + 0.5
     close = (cells - border).abs() < torch.finfo(places.dtype).eps ** 0.5
-    return torch.where(close, border, cells).double() - torch.tensor(grid.offset)
+    return torch.where(close, border, cells).double() - torch.tensor(grid.offset, device=places.device)
 
 
 def _steps(values: Tensor) -> np.ndarray:
     """Numbers from -1 to 1 in steps of 1/32767."""
-    found: np.ndarray = (values.double().clamp(-1, 1) * 32767).round().to(torch.int16).numpy()
+    found: np.ndarray = (values.double().clamp(-1, 1) * 32767).round().to(torch.int16).numpy(force=True)
     return found
 
 

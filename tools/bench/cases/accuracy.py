@@ -3,26 +3,25 @@
 from __future__ import annotations
 
 import argparse
-import json
 import multiprocessing
 import os
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import replace
-from pathlib import Path
+from functools import partial
 from typing import Any
 
 import torch
 
-from bench import record
+from bench.case import Case, Measurement, option
+from bench.clock import guarded
 from bench.problems import bars, beams, flags, plates, strips, surfaces, vortex
 from bench.problems.granular.angles import plane_strain_angle, shear_angle, triaxial_angle
 from bench.problems.granular.columns import column_collapse
 from bench.problems.granular.layers import angle_of_repose
 from bench.problems.settings import Settings
+from bench.record import Row
 from gaussian_swaying.mpm.laws.sand import Sand
-
-Row = dict[str, Any]
 
 VARIANTS = {
     "total": Settings(),
@@ -30,18 +29,8 @@ VARIANTS = {
     "MLS": Settings(formulation="updated", mls=True),
 }
 SINGLE = {"total, float32": Settings(dtype=torch.float32)}
-
-
-def _bar_at_points(cells: int, settings: Settings) -> dict[str, float]:
-    return bars.vibrating_bar(cells, settings, ends="fixed-free", hold="points")
-
-
-def _hanging_at_points(cells: int, settings: Settings) -> dict[str, float]:
-    return bars.hanging_bar(cells, settings, clamp="points")
-
-
-def _plate(k: float, law: str, settings: Settings) -> dict[str, float]:
-    return plates.hinged_plate(k, law, settings)
+BAR_AT_POINTS = partial(bars.vibrating_bar, ends="fixed-free", hold="points")
+HANGING_AT_POINTS = partial(bars.hanging_bar, clamp="points")
 
 
 def _surface(settings: Settings, **options: Any) -> dict[str, float]:
@@ -97,24 +86,17 @@ def cases(device: str, thorough: bool) -> Iterable[tuple[str, Row, Callable[[], 
             for ends in ("free", "fixed-free"):
                 yield case("vibrating bar", bars.vibrating_bar, variant, cells=cells, ends=ends)
     for cells in (8, 16, 32):
-        yield case(
-            "unconfined bar",
-            bars.vibrating_bar,
-            "total",
-            cells=cells,
-            ends="fixed-free",
-            confined=False,
-            poisson_ratio=0.0,
-        )
+        options = {"ends": "fixed-free", "confined": False, "poisson_ratio": 0.0}
+        yield case("unconfined bar", bars.vibrating_bar, "total", cells=cells, **options)
     for variant in everyone:
         for clamp in ("mirror", "pin"):
             for cells in (8, 16, 32):
                 yield case("hanging bar", bars.hanging_bar, variant, cells=cells, clamp=clamp)
     for variant in ("total", "total, float32"):
         for cells in (8, 16, 32, 64):
-            yield case("bar held at points", _bar_at_points, variant, cells=cells)
+            yield case("bar held at points", BAR_AT_POINTS, variant, cells=cells)
         for cells in (8, 16, 32):
-            yield case("hanging bar held at points", _hanging_at_points, variant, cells=cells)
+            yield case("hanging bar held at points", HANGING_AT_POINTS, variant, cells=cells)
     for hold in ("hinge", "clamp", "nodes"):
         for cells in (8, 16, 32):
             yield case("hinged strip", strips.hinged_strip, "total", cells=cells, hold=hold)
@@ -136,7 +118,7 @@ def cases(device: str, thorough: bool) -> Iterable[tuple[str, Row, Callable[[], 
     for variant in ("total", "updated"):
         for law, ks in (("paper", (0.25, 0.5, 0.75)), ("projected", (0.25, 0.5, 1.0, 2.0))):
             for k in ks:
-                yield case("hinged plate", _plate, variant, k=k, law=law)
+                yield case("hinged plate", plates.hinged_plate, variant, k=k, law=law)
     for shape in ("plate", "sphere"):
         for law in ("paper", "projected"):
             for count, overlap in ((500, 0.5), (2000, 0.3), (2000, 1.0), (6000, 0.5)):
@@ -161,44 +143,27 @@ def cases(device: str, thorough: bool) -> Iterable[tuple[str, Row, Callable[[], 
 
 def _soft_flag(dx: float, density: float, settings: Settings) -> dict[str, float]:
     """Run 250 frames of the softest of the paper's flags."""
-    result, _ = flags.flag(
-        dx,
-        settings,
-        frames=250,
-        spacing=dx / 2,
-        youngs_modulus=3e3,
-        density=density,
-        wind=(2.5, 0.5, 0.0),
-    )
-    return result
+    body = {"spacing": dx / 2, "youngs_modulus": 3e3, "density": density}
+    return flags.flag(dx, settings, frames=250, wind=(2.5, 0.5, 0.0), **body)[0]
 
 
-def measure(device: str, thorough: bool, only: str | None = None) -> list[Row]:
-    """Run all cases; a case that fails is recorded with its message."""
-    rows = []
-    for name, parameters, function in cases(device, thorough):
-        if only and only not in name:
-            continue
-        try:
-            result: Row = dict(function())
-        except Exception as error:
-            result = {"failed": f"{type(error).__name__}: {error}"}
-        rows.append({"problem": name, "parameters": parameters, "result": result})
-        print(json.dumps(rows[-1]), flush=True)
-    return rows
+def rows(options: argparse.Namespace, result: Row) -> Iterator[Measurement]:
+    """All cases, or those whose problem has ``only`` in its name; a case that fails is recorded with its message."""
+    only = options.only or ""
+    result["rows"] = [row for row in result.get("rows", []) if only and only not in row["problem"]]
+    for name, parameters, function in cases(options.device, options.thorough):
+        if only in name:
+            place = {"problem": name, "parameters": parameters}
+            yield ("rows", place), lambda function=function: {"result": guarded(function)}
 
 
-def add_arguments(command: argparse.ArgumentParser) -> None:
-    """Options of ``bench.py accuracy``."""
-    command.add_argument("--only", help="only the problems whose name contains this")
-    command.add_argument("--thorough", action="store_true", help="finer grids and full 3D; for a GPU")
-
-
-def run(options: argparse.Namespace) -> None:
-    """Measure errors against exact solutions and experiments."""
-    device, result = record.start(options.device)
-    folder, name = Path(options.results), f"accuracy_{device.type}"
-    only = options.only
-    record.keep_rows(result, folder, name, lambda row: bool(only) and only not in row["problem"])
-    result["rows"] += measure(device.type, options.thorough, only)
-    record.write(folder, name, result)
+CASE = Case(
+    "Measure errors against exact solutions and experiments.",
+    rows,
+    (
+        option("--only", "only the problems whose name contains this"),
+        option("--thorough", "finer grids and full 3D; for a GPU", action="store_true"),
+    ),
+    page="validation.md",
+    keeps="any",
+)

@@ -4,16 +4,15 @@ from __future__ import annotations
 
 import argparse
 import dataclasses
-from collections.abc import Callable
+from collections.abc import Iterator
 from functools import partial
-from pathlib import Path
-from typing import Any
 
 import torch
 from torch import Tensor
 
-from bench import record
-from bench.clock import Clock, Peak, clear, guarded, spread
+from bench.case import Case, Measurement, option
+from bench.clock import Clock, Peak, clear, safely, spread, timed
+from bench.record import Row
 from bench.scenes import sheet, waves, wind_load
 from gaussian_swaying.aero.wind import UniformGust, WindField
 from gaussian_swaying.geometry.regions import Box
@@ -24,8 +23,6 @@ from gaussian_swaying.mpm.laws.law import ConstitutiveLaw
 from gaussian_swaying.mpm.laws.spring_network import SpringNetwork
 from gaussian_swaying.mpm.solver import MPMSolver
 from gaussian_swaying.mpm.state import MPMState
-
-Row = dict[str, Any]
 
 PER_CELL = 2.2
 LONG = 2000
@@ -97,7 +94,9 @@ def cost(
     points: int, device: torch.device, steps: int, repeats: int, pin: str | None, law: str, transfer: str = "auto"
 ) -> Row:
     """Milliseconds of a substep without a gradient, with one, and backward."""
-    plain = _plain(Sheet(points, device, pin, law, transfer, wanted=False), device, repeats, steps)
+    still = Sheet(points, device, pin, law, transfer, wanted=False)
+    with torch.no_grad():
+        plain = timed(partial(still.run, steps), device, repeats, 2, 1 / steps)
     clear()
     case = Sheet(points, device, pin, law, transfer)
     forward, backward = [], []
@@ -115,20 +114,6 @@ def cost(
     row = {"points": case.points, "nodes": case.nodes, "steps": steps, "pin": pin, "law": law, "by": case.by}
     row |= {"plain": plain, "forward": spread(forward), "backward": spread(backward)}
     return row | {"ratio": row["backward"]["median_ms"] / plain["median_ms"]}
-
-
-@torch.no_grad()
-def _plain(case: Sheet, device: torch.device, repeats: int, steps: int) -> dict[str, float]:
-    """Milliseconds of a substep without a gradient."""
-    samples = []
-    for n in range(repeats + 2):
-        clock = Clock(device)
-        clock.mark()
-        case.run(steps)
-        clock.mark()
-        if n >= 2:
-            samples.append(clock.read()[0] / steps)
-    return spread(samples)
 
 
 def memory(points: int, device: torch.device, steps: int, transfer: str, checkpoint: int) -> Row:
@@ -155,44 +140,42 @@ def agreement(points: int, device: torch.device, steps: int, pin: str | None) ->
     return row
 
 
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Add the options of the command."""
-    parser.add_argument("--points", type=int, nargs="+", default=[10_000, 100_000, 1_000_000])
-    parser.add_argument("--steps", type=int, default=480)
-    parser.add_argument("--repeats", type=int, default=7)
-    parser.add_argument("--long", type=int, default=LONG)
-
-
-def run(options: argparse.Namespace) -> None:
-    """Measure, and write after each row."""
-    folder = Path(options.results)
-    device, result = record.start(options.device)
+def rows(options: argparse.Namespace, result: Row) -> Iterator[Measurement]:
+    """Times, most memory and agreement with torch; what fails says why."""
     result |= {"rows": [], "memory": [], "agreement": []}
-    middle = sorted(options.points)[len(options.points) // 2]
+    device, middle = torch.device(options.device), sorted(options.points)[len(options.points) // 2]
 
-    def keep(kind: str, measure: Callable[[], Row], **known: Any) -> None:
-        result[kind].append(known | guarded(measure))
-        print(result[kind][-1], flush=True)
-        record.write(folder, f"backward_{device.type}", result, quiet=True)
+    def row(
+        points: int, pin: str | None, law: str = "fixed corotated", transfer: str = "auto", few: bool = False
+    ) -> Measurement:
+        known = {"points": points, "pin": pin, "law": law, "transfer": transfer}
+        steps, repeats = (20, 2) if few else (options.steps, options.repeats)
+        return ("rows", known), safely(cost, points, device, steps, repeats, pin, law, transfer)
 
-    def row(points: int, pin: str | None, law: str = "fixed corotated") -> None:
-        known = {"points": points, "pin": pin, "law": law, "transfer": "auto"}
-        keep("rows", partial(cost, points, device, options.steps, options.repeats, pin, law), **known)
-
-    row(middle, "hinge")
+    yield row(middle, "hinge")
     for transfer, steps, checkpoint in (("auto", options.long, 0), ("torch", max(options.long // 20, 1), 10)):
         known = {"points": middle, "steps": steps, "transfer": transfer, "checkpoint": checkpoint}
-        keep("memory", partial(memory, middle, device, steps, transfer, checkpoint), **known)
+        yield ("memory", known), safely(memory, middle, device, steps, transfer, checkpoint)
     for pin in ("hinge", "nodes"):
         checked = min(middle, 10_000)
-        keep("agreement", partial(agreement, checked, device, 60, pin), points=checked, pin=pin)
+        known = {"points": checked, "pin": pin}
+        yield ("agreement", known), safely(agreement, checked, device, 60, pin)
     if device.type == "cuda":
-        known = {"points": middle, "pin": "hinge", "law": "fixed corotated", "transfer": "torch"}
-        keep("rows", partial(cost, middle, device, 20, 2, "hinge", "fixed corotated", "torch"), **known)
-    for pin in (None, "nodes"):
-        row(middle, pin)
-    row(middle, "hinge", "springs")
-    for points in options.points:
-        if points != middle:
-            row(points, "hinge")
-    record.write(folder, f"backward_{device.type}", result)
+        yield row(middle, "hinge", transfer="torch", few=True)
+    yield from (row(middle, pin) for pin in (None, "nodes"))
+    yield row(middle, "hinge", "springs")
+    yield from (row(points, "hinge") for points in options.points if points != middle)
+
+
+CASE = Case(
+    "Measure the gradient through substeps of total: time, memory and agreement with torch.",
+    rows,
+    (
+        option("--points", "of the sheets", type=int, nargs="+", default=[10_000, 100_000, 1_000_000]),
+        option("--steps", "substeps of a timed rollout", type=int, default=480),
+        option("--repeats", "timed rollouts", type=int, default=7),
+        option("--long", "substeps of the rollout whose memory is measured", type=int, default=LONG),
+    ),
+    page="validation.md",
+    keeps="none",
+)

@@ -3,24 +3,22 @@
 from __future__ import annotations
 
 import argparse
-import json
 import time
-from collections.abc import Callable
+from collections.abc import Iterator
 from functools import partial
 from itertools import pairwise
-from typing import Any
 
 import torch
 from torch import Tensor
 
+from bench.case import Case, Measurement, numbers, option
 from bench.clock import spread, timed
 from bench.problems.contacts import crossings, gaps, sheet_triangles
+from bench.record import Row
 from gaussian_swaying.mpm.boundaries.half_space import HalfSpaceObstacle
 from gaussian_swaying.mpm.contact.surface import Contact, Surface
 from gaussian_swaying.mpm.solver import MPMSolver
 from gaussian_swaying.mpm.state import MaterialPoints, MPMState
-
-Row = dict[str, Any]
 
 WIDTH, THICKNESS, PER_CELL = 0.9, 0.005, 2.2
 STEPS = 24
@@ -30,16 +28,21 @@ CASES = ("off", "nothing near", "a fifth in contact", "all in contact")
 """Two sheets without contact; with contact, but far from each other; lying on each other by a fifth; and wholly."""
 
 
+def level(place: Tensor, spacing: float, thickness: float, E: float = 2e4) -> tuple[MaterialPoints, Tensor]:
+    """Points of level sheets, and their normals."""
+    made = MaterialPoints.create(
+        place, volume=spacing**2 * thickness, density=100.0, youngs_modulus=E, poisson_ratio=0.3
+    )
+    return made, place.new_tensor([0.0, 0.0, 1.0]).expand(made.count, 3)
+
+
 def sheets(points: int, device: torch.device) -> tuple[MaterialPoints, Tensor]:
     """Two level sheets of half the points each, and their normals; at rest they are 0.5 m apart."""
     side = round((points / 2) ** 0.5)
     spacing = WIDTH / side
     axis = (torch.arange(side, device=device, dtype=torch.float32) + 0.5) * spacing
     place = torch.cartesian_prod(axis, axis, torch.tensor([0.0, 0.5], device=device))
-    place = place[place[:, 2].argsort(stable=True)]
-    material = {"density": 100.0, "youngs_modulus": 5e3, "poisson_ratio": 0.3}
-    made = MaterialPoints.create(place.contiguous(), volume=spacing**2 * THICKNESS, **material)
-    return made, torch.tensor([0.0, 0.0, 1.0], device=device).expand(made.count, 3)
+    return level(place[place[:, 2].argsort(stable=True)].contiguous(), spacing, THICKNESS, 5e3)
 
 
 def prepare(points: int, case: str, device: torch.device) -> tuple[MPMSolver, MPMState, float]:
@@ -61,6 +64,7 @@ def prepare(points: int, case: str, device: torch.device) -> tuple[MPMSolver, MP
     return solver, state, solver.stable_substep() * 0.4
 
 
+@torch.inference_mode()
 def cost(points: int, case: str, device: torch.device, repeats: int) -> Row:
     """Milliseconds of a substep (on a CPU those of the processor), and the pairs that are listed."""
     solver, state, dt = prepare(points, case, device)
@@ -87,6 +91,7 @@ def listed(solver: MPMSolver) -> int:
     return 0 if stage.lists is None else len(stage.lists.first)
 
 
+@torch.inference_mode()
 def collision(speed: float, device: torch.device, points: int = 900, frames: int = 30) -> Row:
     """A small sheet that flies onto a larger one: the gaps of all frames, and what crosses."""
     side = round(points**0.5)
@@ -96,12 +101,9 @@ def collision(speed: float, device: torch.device, points: int = 900, frames: int
     low = torch.cartesian_prod(axis, axis, torch.zeros(1, device=device))
     high = torch.cartesian_prod(few + 0.13 * WIDTH, few + 0.11 * WIDTH, torch.full((1,), 5 * spacing, device=device))
     thickness = 0.5 * spacing
-    made = MaterialPoints.create(
-        torch.cat([low, high]), volume=spacing**2 * thickness, density=100.0, youngs_modulus=2e4, poisson_ratio=0.3
-    )
+    made, normal = level(torch.cat([low, high]), spacing, thickness)
     velocity = torch.zeros_like(made.position)
     velocity[len(low) :] = speed * torch.tensor([0.3, 0.0, -1.0], device=device)
-    normal = torch.tensor([0.0, 0.0, 1.0], device=device).expand(made.count, 3)
     solver = MPMSolver(dx=PER_CELL * spacing, gravity=(0.0, 0.0, 0.0))
     state = solver.init_state(made, velocity, surface=Surface.of_points(made, normal, spacing, thickness, Contact()))
     momentum = solver.momenta(state)["linear"].double()
@@ -126,6 +128,7 @@ def collision(speed: float, device: torch.device, points: int = 900, frames: int
     }
 
 
+@torch.inference_mode()
 def pile(seconds: float, device: torch.device, layers: int = 8, per_side: int = 5) -> list[Row]:
     """Layers that lie on each other and on the ground, shifted by some millimetres: what moves, each second.
 
@@ -136,14 +139,7 @@ def pile(seconds: float, device: torch.device, layers: int = 8, per_side: int = 
     axis = torch.arange(per_side, device=device, dtype=torch.float32) * spacing
     low = [torch.tensor([0.003 * (k % 3), 0.002 * (k % 2), 0.2 * k], device=device) for k in range(layers)]
     flat = torch.cartesian_prod(axis, axis, torch.zeros(1, device=device))
-    made = MaterialPoints.create(
-        torch.cat([flat + corner for corner in low]),
-        volume=spacing**2 * thickness,
-        density=100.0,
-        youngs_modulus=2e4,
-        poisson_ratio=0.3,
-    )
-    normal = torch.tensor([0.0, 0.0, 1.0], device=device).expand(made.count, 3)
+    made, normal = level(torch.cat([flat + corner for corner in low]), spacing, thickness)
     ground = HalfSpaceObstacle([0.0, 0.0, -0.5 * thickness], [0.0, 0.0, 1.0])
     solver = MPMSolver(dx=2.2 * spacing, gravity=(0.0, 0.0, -9.8), boundaries=[ground], stiffness_damping=1e-3)
     state = solver.init_state(made, surface=Surface.of_points(made, normal, spacing, thickness, Contact()))
@@ -168,40 +164,26 @@ def pile(seconds: float, device: torch.device, layers: int = 8, per_side: int = 
     return rows
 
 
-def add_arguments(command: argparse.ArgumentParser) -> None:
-    """Options of ``bench.py contact``."""
-    command.add_argument("--points", help="separated by commas (default: 10000,100000 and, on a GPU, 1000000)")
-    command.add_argument("--repeats", type=int, default=5, help="timed rollouts of each case (default: %(default)s)")
-    command.add_argument("--speeds", default="2,50", help="of the collisions [m/s] (default: %(default)s)")
-    command.add_argument(
-        "--pile", type=float, default=0.0, help="seconds that eight layers rest (default: %(default)g)"
-    )
-
-
-def measure(options: argparse.Namespace, result: Row, save: Callable[[Row], None]) -> None:
-    """Fill ``result``, saving it after each row; rows of other sizes and speeds are kept."""
+def rows(options: argparse.Namespace, result: Row) -> Iterator[Measurement]:
+    """The cost of each case, the collisions, and the pile."""
     device = torch.device(options.device)
-    rows = result.setdefault("rows", [])
-    sizes = options.points
-    if sizes is None:
-        sizes = "10000,100000,1000000" if device.type == "cuda" else "10000,100000"
-    for points in map(int, filter(None, sizes.split(","))):
+    for points in options.points or [10_000, 100_000, 1_000_000][: 3 if device.type == "cuda" else 2]:
         for case in CASES:
-            begin = time.perf_counter()
-            with torch.inference_mode():
-                row = cost(points, case, device, options.repeats) | {"wanted": points}
-            rows[:] = [one for one in rows if (one["wanted"], one["case"]) != (points, case)] + [row]
-            print(json.dumps(row), f"{time.perf_counter() - begin:.0f} s", flush=True)
-            save(result)
-    collisions = result.setdefault("collisions", [])
-    for speed in map(float, filter(None, options.speeds.split(","))):
-        with torch.inference_mode():
-            row = collision(speed, device)
-        collisions[:] = [one for one in collisions if one["speed_m_s"] != speed] + [row]
-        print(json.dumps(row), flush=True)
-        save(result)
-    if options.pile:
-        with torch.inference_mode():
-            result["pile"] = pile(options.pile, device)
-        print(json.dumps(result["pile"][-1]), flush=True)
-        save(result)
+            yield ("rows", {"wanted": points, "case": case}), partial(cost, points, case, device, options.repeats)
+    for speed in options.speeds:
+        yield ("collisions", {"speed_m_s": speed}), partial(collision, speed, device)
+    for row in pile(options.pile, device) if options.pile else ():
+        yield ("pile", {"time": row["time"]}), row.copy
+
+
+CASE = Case(
+    "Measure what contact costs, and how close surfaces come.",
+    rows,
+    (
+        numbers("--points", "of both sheets; 10000,100000 and, on a GPU, 1000000 if left out"),
+        option("--repeats", "timed rollouts of each case (default: %(default)s)", type=int, default=5),
+        numbers("--speeds", "of the collisions [m/s]", float, "2,50"),
+        option("--pile", "seconds that eight layers rest (default: %(default)g)", type=float, default=0.0),
+    ),
+    page="contact.md",
+)

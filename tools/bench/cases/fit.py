@@ -7,21 +7,23 @@ import json
 import math
 import tempfile
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import yaml
 
+from bench.case import UNTIL, Case, Measurement, option
 from bench.cases import fit_bias, fit_reference
+from bench.cases.fit_reference import plan_of
 from bench.problems.films import write_video
+from bench.record import Row
 from gaussian_swaying.fitting.fit import run_fit
 from gaussian_swaying.fitting.plan import Plan, read_unknown
 from gaussian_swaying.simulation.parameters import flow_of
 from gaussian_swaying.simulation.simulation import Simulation
-
-Row = dict[str, Any]
 
 TRUTH = {"flow": [4.0, 3.0, 0.5], "material.E": 1e4, "material.density": 25.0, "aero.C_D": 0.1}
 SOUGHT = {"wind.speed": [2, 12], "wind.azimuth": [-20, 100], "wind.elevation": [-30, 30], "material.E": [2e3, 5e4]}
@@ -49,52 +51,18 @@ ROWS: dict[str, dict[str, Any]] = {
 }
 
 
-def add_arguments(command: argparse.ArgumentParser) -> None:
-    """Options of ``bench.py fit``."""
-    command.add_argument("--row", action="append", choices=list(ROWS), help="only this one; repeatable")
-    command.add_argument("--data", type=Path, help="folder of tools/datasets/make_fit_data.py: Blender's cloth instead")
-    command.add_argument("--case", action="append", help="only this case of --data; repeatable")
-    command.add_argument("--law", default="linear", help="force law for --data: linear, as in the data, or projected")
-    command.add_argument(
-        "--known", default="{}", help="options of sim for --data, as JSON, such as a coarser solver.dx"
-    )
-    command.add_argument(
-        "--bias",
-        action="append",
-        help="no fit of --data: how far faults of the model move the values, with these options of sim, as JSON; "
-        "repeatable",
-    )
-    command.add_argument(
-        "--motion", default=fit_reference.OWN, help="the motion that --bias compares with, a file in the case's folder"
-    )
-    command.add_argument(
-        "--reference",
-        action="store_true",
-        help="no fit of --data: the frames that a splat predicts which moves as the reference, as its variants, and "
-        "simulated with the true values",
-    )
-    command.add_argument("--search", type=int, help="simulations of the coarse search")
-    command.add_argument(
-        "--until", type=float, help="fit the frames up to this time [s]; half of the video if left out"
-    )
-
-
-def measure(options: argparse.Namespace, result: Row, save: Callable[[Row], None]) -> None:
-    """Fill ``own``, ``blender``, ``bias`` or ``reference`` of the result, saving it after each row."""
+def rows(options: argparse.Namespace, result: Row) -> Iterator[Measurement]:
+    """Fits of our own videos or of Blender's, or what ``--bias`` or ``--reference`` ask for instead."""
     if options.bias:
-        fit_bias.measure(options, _cases(options), result, save)
-        return
-    if options.reference:
-        fit_reference.measure(options, _cases(options), result, save)
-        return
-    with tempfile.TemporaryDirectory() as scratch:
-        if options.data is None:
-            _own(options, result, save, Path(scratch))
-        else:
-            _blender(options, result, save, Path(scratch))
+        yield from fit_bias.rows(options, _cases(options))
+    elif options.reference:
+        yield from fit_reference.rows(options, _cases(options))
+    else:
+        with tempfile.TemporaryDirectory() as scratch:
+            yield from (_own if options.data is None else _blender)(options, Path(scratch))
 
 
-def _own(options: argparse.Namespace, result: Row, save: Callable[[Row], None], scratch: Path) -> None:
+def _own(options: argparse.Namespace, scratch: Path) -> Iterator[Measurement]:
     size = SIZES[options.device]
     base = scratch / "base.yaml"
     base.write_text(yaml.safe_dump(_settings(size)), encoding="utf-8")
@@ -103,19 +71,13 @@ def _own(options: argparse.Namespace, result: Row, save: Callable[[Row], None], 
     cameras = {name: painter.camera_at(0, name) for name in painter.cameras}
     write_video(simulation, scratch / "video", cameras, size["frames"], size["noise"])
     until = options.until or (2.0 if options.device == "cuda" else 0.5 * (size["frames"] - 1) / 24)
-    rows = result.setdefault("own", {})
+    about = {"points": simulation.scene.points.count, "size": list(size["size"]), "until_s": until}
     for name in options.row or ROWS:
         given = {"unknowns": SOUGHT} | ROWS[name]
         sought = [read_unknown(key, entry) for key, entry in given.pop("unknowns").items()]
         plan = Plan([str(base)], [str(scratch / "video")], sought, until=until, search=options.search or size["search"])
-        rows[name] = fit_row(replace(plan, **given), scratch / name, options.device, TRUTH) | {
-            "points": simulation.scene.points.count,
-            "size": list(size["size"]),
-            "until_s": until,
-            "noise": size["noise"],
-        }
-        print(f"{name}: {rows[name]}", flush=True)
-        save(result)
+        more = about | {"noise": size["noise"]}
+        yield ("own", name), partial(fit_row, replace(plan, **given), scratch / name, options.device, TRUTH, more)
 
 
 def _settings(size: Mapping[str, Any]) -> Row:
@@ -144,30 +106,17 @@ def _settings(size: Mapping[str, Any]) -> Row:
     }
 
 
-def _blender(options: argparse.Namespace, result: Row, save: Callable[[Row], None], scratch: Path) -> None:
-    rows = result.setdefault("blender", {})
+def _blender(options: argparse.Namespace, scratch: Path) -> Iterator[Measurement]:
     for folder in _cases(options):
-        truth = json.loads((folder / "truth.json").read_text())
-        given = yaml.safe_load((folder / "fit.yaml").read_text())
-        sought = [read_unknown(key, entry) for key, entry in given["unknowns"].items()]
-        wanted = {"flow": truth["flow"], "material.E": truth["E"]}
         known = {"aero.law": options.law, **json.loads(options.known)}
-        plan = Plan(
-            [str(folder / "scene.yaml")],
-            [str(folder)],
-            sought,
-            known=known,
-            until=options.until or truth["fit_until"],
-            search=options.search or 48,
-        )
+        plan, truth = plan_of(folder, known, options.until, options.search or 48)
+        wanted = {"flow": truth["flow"], "material.E": truth["E"]}
+        more = {"known": known, "until_s": plan.until, "cells": truth.get("cells")}
         for name, change in blender_rows(known, truth).items():
-            if name not in (options.row or ("two cameras", "one camera")):
-                continue
-            key = f"{folder.name}, {name}"
-            found = fit_row(replace(plan, **change), scratch / key, options.device, wanted)
-            rows[key] = found | {"known": known, "until_s": plan.until, "cells": truth.get("cells")}
-            print(f"{key}: {rows[key]}", flush=True)
-            save(result)
+            if name in (options.row or ("two cameras", "one camera")):
+                key = f"{folder.name}, {name}"
+                work = partial(fit_row, replace(plan, **change), scratch / key, options.device, wanted, more)
+                yield ("blender", key), work
 
 
 def _cases(options: argparse.Namespace) -> list[Path]:
@@ -192,13 +141,13 @@ def blender_rows(known: Mapping[str, Any], truth: Mapping[str, Any]) -> dict[str
     }
 
 
-def fit_row(plan: Plan, folder: Path, device: str, truth: Mapping[str, Any]) -> Row:
-    """A fit, and how far it is from the truth."""
+def fit_row(plan: Plan, folder: Path, device: str, truth: Mapping[str, Any], more: Mapping[str, Any]) -> Row:
+    """A fit, how far it is from the truth, and ``more``."""
     begin = time.process_time()
     try:
         result = run_fit(plan, folder, device=device)
     except ValueError as error:
-        return {"refused": str(error)}
+        return {"refused": str(error), **more}
     flow = flow_of(truth["flow"], result.values)
     return {
         "values": result.values,
@@ -213,6 +162,7 @@ def fit_row(plan: Plan, folder: Path, device: str, truth: Mapping[str, Any]) -> 
         "processor_s": time.process_time() - begin,
         "not_determined": result.vague,
         "not_settled": result.unsettled,
+        **more,
     }
 
 
@@ -223,4 +173,23 @@ def errors(flow: list[float], truth: list[float]) -> dict[str, float]:
     return {"speed_error": speed / true - 1, "direction_error_deg": math.degrees(math.acos(max(-1.0, min(1.0, along))))}
 
 
-__all__ = ["ROWS", "blender_rows", "errors", "fit_row", "measure"]
+CASE = Case(
+    "Find wind and material from videos, and compare with the truth.",
+    rows,
+    (
+        option("--row", "only this one; repeatable", action="append", choices=list(ROWS)),
+        option("--data", "folder of tools/datasets/make_fit_data.py: Blender's cloth instead", type=Path),
+        option("--case", "only this case of --data; repeatable", action="append"),
+        option("--law", "force law for --data: linear, as in the data, or projected", default="linear"),
+        option("--known", "options of sim for --data, as JSON, such as a coarser solver.dx", default="{}"),
+        option("--bias", "no fit of --data: how far faults of the model move the values, with these options of sim, as "
+               "JSON; repeatable", action="append"),
+        option("--motion", "the motion that --bias compares with, a file in the case's folder",
+               default=fit_reference.OWN),
+        option("--reference", "no fit of --data: the frames that a splat predicts which moves as the reference, as its "
+               "variants, and simulated with the true values", action="store_true"),
+        option("--search", "simulations of the coarse search", type=int),
+        UNTIL,
+    ),
+    page="fit.md",
+)  # fmt: skip

@@ -9,40 +9,34 @@ from __future__ import annotations
 import argparse
 import json
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Iterator, Sequence
+from functools import partial
 from pathlib import Path
-from typing import Any
 
 import torch
-import yaml
 
-from bench.cases.fit_reference import OWN, read_motion, true_values
+from bench.case import Measurement
+from bench.cases.fit_reference import OWN, plan_of, read_motion, simulation_of, true_values
+from bench.record import Row
 from gaussian_swaying.fitting.evidence import Evidence, TrackEvidence, scales_of
 from gaussian_swaying.fitting.fit import Fit
 from gaussian_swaying.fitting.least_squares import normal_equations, sensitivities, step_from
-from gaussian_swaying.fitting.plan import Plan, parse_base, read_unknown
 from gaussian_swaying.fitting.tracks import Tracks
 from gaussian_swaying.fitting.videos import read_videos
 from gaussian_swaying.rendering.cameras.camera import project
-from gaussian_swaying.simulation.simulation import Simulation
 
-Row = dict[str, Any]
 ALONG = (20, 14)
 """Places on the cloth that are compared, along its width and height."""
 
 
-def measure(options: argparse.Namespace, folders: Sequence[Path], result: Row, save: Callable[[Row], None]) -> None:
-    """Fill ``result["bias"]``: a row for each case and each ``--bias``."""
-    rows = result.setdefault("bias", {})
+def rows(options: argparse.Namespace, folders: Sequence[Path]) -> Iterator[Measurement]:
+    """A row for each case and each ``--bias``."""
     for folder in folders:
         for text in options.bias:
-            begin = time.process_time()
-            changed = {"aero.law": options.law, **json.loads(options.known), **json.loads(text)}
-            row = bias(folder, changed, options.until, options.device, options.motion)
-            key = name_of(folder.name, json.loads(text), options.until, options.motion)
-            rows[key] = row | {"known": changed, "processor_s": time.process_time() - begin}
-            print(f"{key}: {rows[key]}", flush=True)
-            save(result)
+            given = json.loads(text)
+            changed = {"aero.law": options.law, **json.loads(options.known), **given}
+            key = name_of(folder.name, given, options.until, options.motion)
+            yield ("bias", key), partial(bias, folder, changed, options.until, options.device, options.motion)
 
 
 def name_of(case: str, options: Row, until: float | None, motion: str = OWN) -> str:
@@ -62,14 +56,10 @@ def bias(folder: Path, changed: Row, until: float | None, device: str, motion: s
         device: ``cpu`` or ``cuda``.
         motion: The motion to compare with, a file in the folder.
     """
-    truth = json.loads((folder / "truth.json").read_text())
-    given = yaml.safe_load((folder / "fit.yaml").read_text())
-    sought = [read_unknown(name, entry) for name, entry in given["unknowns"].items()]
-    plan = Plan([str(folder / "scene.yaml")], [str(folder)], sought, known=changed, until=until or truth["fit_until"])
-    parser = Simulation.parser()
-    settings = parse_base(plan, parser)
-    settings.device, settings.camera, settings.cameras = device, None, None
-    fit = Fit(Simulation.from_settings(parser, settings), read_videos(str(folder)), plan)
+    begin = time.process_time()
+    plan, truth = plan_of(folder, changed, until)
+    sought = plan.unknowns
+    fit = Fit(simulation_of(plan, device), read_videos(str(folder)), plan)
     evidence = _true_tracks(fit, folder / motion)
     true = true_values(truth)
     place = torch.tensor([u.share(true[u.name]) for u in sought], dtype=torch.float64)
@@ -83,6 +73,8 @@ def bias(folder: Path, changed: Row, until: float | None, device: str, motion: s
         "rms_px": float(torch.cat([b.values[0] for b in blocks]).square().sum(-1).mean().sqrt()),
         "points": fit.simulation.scene.points.count,
         "until_s": plan.until,
+        "known": changed,
+        "processor_s": time.process_time() - begin,
     }
 
 
@@ -106,6 +98,3 @@ def _true_tracks(fit: Fit, motion: Path) -> list[Evidence]:
         seen = torch.ones(len(frames), len(index), dtype=torch.bool)
         found.append(TrackEvidence(fit.simulation, video, Tracks(index, position, seen)))
     return found
-
-
-__all__ = ["bias", "measure"]

@@ -11,49 +11,72 @@ import argparse
 import json
 import sys
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import torch
+import yaml
 from torch import Tensor
 
-from bench.record import ROOT
-from gaussian_swaying.fitting.plan import Plan, parse_base
+from bench.case import Measurement
+from bench.record import ROOT, Row
+from gaussian_swaying.fitting.plan import Plan, parse_base, read_unknown
 from gaussian_swaying.fitting.report import predictions
 from gaussian_swaying.fitting.variants import states_of
 from gaussian_swaying.fitting.videos import frame_times, read_videos
 from gaussian_swaying.gaussians.model import DeformedGaussians
 from gaussian_swaying.simulation.simulation import Simulation
 
-Row = dict[str, Any]
 OWN = "cloth.npz"
 """The motion that a case shows."""
 BESIDE = 0.01
 """Distance on the cloth over which its tangents are taken [m]."""
 
 
-def measure(options: argparse.Namespace, folders: Sequence[Path], result: Row, save: Callable[[Row], None]) -> None:
-    """Fill ``result["reference"]``: a row for each case and motion, and for the options of ``known``."""
-    rows, known = result.setdefault("reference", {}), json.loads(options.known)
+def rows(options: argparse.Namespace, folders: Sequence[Path]) -> Iterator[Measurement]:
+    """A row for each case and motion, and for the options of ``known``."""
+    known = json.loads(options.known)
     for folder in folders:
-        truth, videos = json.loads((folder / "truth.json").read_text()), read_videos(str(folder))
-        simulation, times = _simulation(folder, {"aero.law": options.law, **known}, options.device), frame_times(videos)
+        plan, truth = plan_of(folder, {"aero.law": options.law, **known})
+        simulation, videos = simulation_of(plan, options.device), read_videos(str(folder))
+        times = frame_times(videos)
         fitted = sum(moment <= truth["fit_until"] + 1e-6 for moment in times)
         files = [] if known else [folder / OWN, *sorted((folder / "uncertainty").glob("*.npz"))]
         motions = {str(path.relative_to(folder).with_suffix("")): moved(simulation, path) for path in files}
         ours = ", ".join(f"`{name.split('.')[-1]}` {value}" for name, value in known.items()) or "as in `scene.yaml`"
         motions[f"simulated {ours}"] = simulated(simulation, truth, times)
         for name, motion in motions.items():
-            begin = time.process_time()
-            shown = predictions(simulation, videos, times, fitted, motion)
-            rows[f"{folder.name}, {name}"] = {
-                "psnr_fitted_db": min(one.fitted for one in shown),
-                "psnr_predicted_db": min(one.predicted for one in shown),
-                "processor_s": time.process_time() - begin,
-            }
-            print(f"{folder.name}, {name}: {rows[f'{folder.name}, {name}']}", flush=True)
-            save(result)
+            work = partial(_sharpness, simulation, videos, times, fitted, motion)
+            yield ("reference", f"{folder.name}, {name}"), work
+
+
+def _sharpness(*shown: Any) -> Row:
+    begin = time.process_time()
+    found = predictions(*shown)
+    return {
+        "psnr_fitted_db": min(one.fitted for one in found),
+        "psnr_predicted_db": min(one.predicted for one in found),
+        "processor_s": time.process_time() - begin,
+    }
+
+
+def plan_of(folder: Path, known: Row, until: float | None = None, search: int = 48) -> tuple[Plan, Row]:
+    """The plan of a case of ``make_fit_data.py``, with other options of ``sim``, and the truth."""
+    truth = json.loads((folder / "truth.json").read_text())
+    given = yaml.safe_load((folder / "fit.yaml").read_text())
+    sought = [read_unknown(name, entry) for name, entry in given["unknowns"].items()]
+    base, data = [str(folder / "scene.yaml")], [str(folder)]
+    return Plan(base, data, sought, known=known, until=until or truth["fit_until"], search=search), truth
+
+
+def simulation_of(plan: Plan, device: str) -> Simulation:
+    """The simulation of a plan, without cameras of its own."""
+    parser = Simulation.parser()
+    settings = parse_base(plan, parser)
+    settings.device, settings.camera, settings.cameras = device, None, None
+    return Simulation.from_settings(parser, settings)
 
 
 def simulated(simulation: Simulation, truth: Row, times: Sequence[float]) -> Iterator[DeformedGaussians]:
@@ -94,13 +117,3 @@ def read_motion(path: Path) -> Any:
     from flag_motion import read_cloth
 
     return read_cloth(path)
-
-
-def _simulation(folder: Path, known: Row, device: str) -> Simulation:
-    parser = Simulation.parser()
-    settings = parse_base(Plan([str(folder / "scene.yaml")], [str(folder)], [], known=known), parser)
-    settings.device, settings.camera, settings.cameras = device, None, None
-    return Simulation.from_settings(parser, settings)
-
-
-__all__ = ["OWN", "measure", "moved", "read_motion", "simulated", "true_values"]

@@ -10,17 +10,17 @@ import sys
 import tempfile
 import threading
 import time
-from collections.abc import Callable, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
-from functools import cache
+from functools import cache, partial
 from pathlib import Path
 from typing import Any
 
 import yaml
 
-from bench.cases.trained import GENTLE, filled, last_psnr, tilts
-from bench.record import ROOT, chosen
+from bench.case import DATASET, FRAMES, MORE, NOTE, PICTURES, POINTS, Case, Measurement, at_once, names, option
+from bench.cases.trained import GENTLE, last_psnr, tilts, train_command
+from bench.record import ROOT, Row
 from bench.simulate import simulate, what_failed
 from bench.tables.plots import save_figure
 from gaussian_swaying.evaluation.compare import compare_run
@@ -33,7 +33,6 @@ from flag_reference import PATTERNS as NUMBERED
 from flag_reference import FlagPattern
 
 BENCH = ROOT / "configs" / "bench"
-Row = dict[str, Any]
 Flag = int | str  # the number of a pattern, or the name of a file in configs/flags
 
 REFERENCES: dict[Flag, FlagPattern] = {
@@ -211,12 +210,7 @@ def train(pattern: Flag, variant: Variant, dataset: Path, target: Path, steps: i
     account = target / "training.json"
     if (target / "point_cloud.ply").exists():
         return json.loads(account.read_text()) if account.exists() else {"kept": True}
-    command = [sys.executable, str(ROOT / "tools" / "train.py"), "fit"]
-    command += [f"--config={ROOT}/configs/train/default.yaml", f"--config={BENCH}/train.yaml"]
-    command += [f"--trainer.max_steps={steps}", f"--trainer.val_check_interval={steps}"]
-    command += [f"--checkpoint.every_n_train_steps={steps}", "--trainer.enable_progress_bar=false"]
-    command += [f"--data.init_args.path={dataset / folder_of(pattern) / 'train'}"]
-    command += [f"--trainer.default_root_dir={target}", *filled(variant.training, steps)]
+    command = train_command(dataset / folder_of(pattern) / "train", variant.training, steps, target)
     begin = time.perf_counter()
     with (target.parent / f"{target.name}.log").open("w") as log:
         subprocess.run(command, check=True, cwd=ROOT, stdout=log, stderr=subprocess.STDOUT)
@@ -258,7 +252,7 @@ def run_row(
     """Simulate a row into the folder ``output`` and compare it with the reference, with ``pictures`` if it has all."""
     dataset = Path(options.dataset)
     reference = dataset / folder_of(pattern)
-    more = options.more.split() if options.more else []
+    more = options.more.split()
     arguments = own = sim_arguments(pattern, variant, dataset, splat) + more
     matched: Row = {}
     if variant.matched:
@@ -331,44 +325,19 @@ def figure(reference: Path, runs: dict[str, Path], target: Path) -> bool:
     return True
 
 
-def add_arguments(command: argparse.ArgumentParser) -> None:
-    """Options of ``bench.py flags``."""
-    command.add_argument("--dataset", required=True, help="folder that tools/datasets/make_flag_dataset.py wrote")
-    command.add_argument("--rows", default=",".join(VARIANTS), help="separated by commas")
-    command.add_argument("--patterns", default="1,2,3", help="separated by commas")
-    command.add_argument("--splats", default="outputs/flags", help="folder of the trained splats; `made` for splats "
-                         "made in code, without training")  # fmt: skip
-    command.add_argument("--train_steps", type=int, default=7000, help="images of a training run")
-    command.add_argument("--at_once", type=int, default=1, help="training runs at the same time")
-    command.add_argument("--sims_at_once", type=int, default=1, help="simulations at the same time; their times then "
-                         "mean little")  # fmt: skip
-    command.add_argument("--frames", type=int, help="only the first frames")
-    command.add_argument("--points", type=int, default=10_000, help="points on the reference's surface")
-    command.add_argument("--pictures", default=str(ROOT / "docs" / "pictures"), help="folder of the figures")
-    command.add_argument("--more", help='other options of tools/sim.py: --more="--frames=25"')
-    command.add_argument("--note", help="a sentence for the page about how the rows were measured")
-
-
 def splat_folder(options: argparse.Namespace, name: str, pattern: Flag) -> Path:
     """Folder of the splat of a row; rows without a training of their own share one."""
     return Path(options.splats) / folder_of(pattern) / (name if VARIANTS[name].training else "all_losses")
 
 
-def train_all(jobs: list[tuple[str, Flag]], options: argparse.Namespace) -> dict[Path, Row]:
-    """Train the splats that rows need, several at the same time, and return their accounts by folder."""
-    wanted = {splat_folder(options, name, pattern): (name, pattern) for name, pattern in jobs}
-
-    def one(item: tuple[Path, tuple[str, Flag]]) -> tuple[Path, Row]:
-        target, (name, pattern) = item
-        target.parent.mkdir(parents=True, exist_ok=True)
-        try:
-            row = train(pattern, VARIANTS[name], Path(options.dataset), target, options.train_steps)
-        except subprocess.CalledProcessError:
-            row = {"failed": what_failed((target.parent / f"{target.name}.log").read_text())}
-        return target, row | ({"at_once": options.at_once} if options.at_once > 1 else {})
-
-    with ThreadPoolExecutor(options.at_once) as pool:
-        return dict(pool.map(one, wanted.items()))
+def _train(options: argparse.Namespace, target: Path, name: str, pattern: Flag) -> Row:
+    """The account of the training of a splat, or why it failed."""
+    target.parent.mkdir(parents=True, exist_ok=True)
+    try:
+        row = train(pattern, VARIANTS[name], Path(options.dataset), target, options.train_steps)
+    except subprocess.CalledProcessError:
+        row = {"failed": what_failed((target.parent / f"{target.name}.log").read_text())}
+    return row | ({"at_once": options.at_once} if options.at_once > 1 else {})
 
 
 def open_dataset(dataset: Path, patterns: Sequence[Flag], result: Row) -> None:
@@ -386,55 +355,68 @@ def open_dataset(dataset: Path, patterns: Sequence[Flag], result: Row) -> None:
             result.setdefault("uncertainty", {})[str(pattern)] = kept
 
 
-def measure(options: argparse.Namespace, result: Row, save: Callable[[Row], None]) -> None:
-    """Fill ``result["rows"]``, saving it after each run; existing rows that are not selected are kept."""
-    names = chosen("--rows", options.rows, VARIANTS)
-    patterns = flags_named(options.patterns)
-    if options.splats != "made" and (other := [p for p in patterns if p not in PATTERNS]):
+def _row(options: argparse.Namespace, name: str, pattern: Flag, trained: dict[str, Row], scratch: Path) -> Row:
+    """Simulate and compare a row, with its splat if splats are trained."""
+    variant, splat, row = VARIANTS[name], None, dict[str, Any]()
+    if options.splats != "made":
+        target = splat_folder(options, name, pattern)
+        row["training"] = trained[str(target)]
+        splat = target / "point_cloud.ply"
+        cloth = Path(options.dataset) / folder_of(pattern) / "cloth.npz"
+        if splat.exists() and variant.true_normals:
+            own, splat = splat, scratch / f"{name}_{pattern}.ply"
+            turn_to_reference(own, cloth, splat)
+        if splat.exists() and (variant.training or name == "ours"):
+            row["tilt"] = tilts(splat, cloth)
+    if splat is not None and not splat.exists():
+        row["failed"] = row["training"].get("failed", "no splat")
+    else:
+        row |= run_row(pattern, variant, options, splat, scratch / f"{name}_{pattern}")
+    return row | ({"sims_at_once": options.sims_at_once} if options.sims_at_once > 1 else {})
+
+
+def rows(options: argparse.Namespace, result: Row) -> Iterator[Measurement]:
+    """Train the splats that the rows need, simulate and compare all rows, and draw the figures."""
+    patterns, made = flags_named(options.patterns), options.splats == "made"
+    if not made and (other := [p for p in patterns if p not in PATTERNS]):
         raise SystemExit(f"{other[0]} has no photos to train a splat from: add `--splats made`")
     open_dataset(Path(options.dataset), patterns, result)
-    result["splats"] = "made in code" if options.splats == "made" else f"trained, {options.train_steps} images"
-    result |= {"more": options.more or ""} | ({"note": options.note} if options.note else {})
-    rows = result.setdefault("rows", {})
-    made = options.splats == "made"
-    jobs = [(name, p) for name in names for p in patterns if p in VARIANTS[name].patterns]
+    result["splats"] = "made in code" if made else f"trained, {options.train_steps} images"
+    result |= {"more": options.more} | ({"note": options.note} if options.note else {})
+    jobs = [(name, p) for name in options.rows for p in patterns if p in VARIANTS[name].patterns]
     if made:  # there is nothing to train, and the normals are right
         jobs = [job for job in jobs if not VARIANTS[job[0]].training and not VARIANTS[job[0]].true_normals]
-    trained = {} if made else train_all(jobs, options)
-    lock = threading.Lock()
-    with tempfile.TemporaryDirectory() as scratch:
-
-        def simulate(job: tuple[str, Flag]) -> None:
-            name, pattern = job
-            variant, splat = VARIANTS[name], None
-            row: Row = {}
-            if not made:
-                target = splat_folder(options, name, pattern)
-                row["training"] = trained[target]
-                splat = target / "point_cloud.ply"
-                cloth = Path(options.dataset) / folder_of(pattern) / "cloth.npz"
-                if splat.exists() and variant.true_normals:
-                    own, splat = splat, Path(scratch) / f"{name}_{pattern}.ply"
-                    turn_to_reference(own, cloth, splat)
-                if splat.exists() and (variant.training or name == "ours"):
-                    row["tilt"] = tilts(splat, cloth)
-            if splat is not None and not splat.exists():
-                row["failed"] = row["training"].get("failed", "no splat")
-            else:
-                row |= run_row(pattern, variant, options, splat, Path(scratch) / f"{name}_{pattern}")
-            if options.sims_at_once > 1:
-                row["sims_at_once"] = options.sims_at_once
-            with lock:
-                rows.setdefault(name, {})[str(pattern)] = row
-                shown = {k: v for k, v in row.items() if k != "chamfer_per_frame_m"}
-                print(f"pattern {pattern}, {name}: {json.dumps(shown)}", flush=True)
-                save(result)
-
-        with ThreadPoolExecutor(options.sims_at_once) as pool:
-            list(pool.map(simulate, jobs))
+    splats = {} if made else {splat_folder(options, *job): job for job in jobs}
+    trainings = (((str(target),), partial(_train, options, target, *job)) for target, job in splats.items())
+    trained = {place[0]: work() for place, work in at_once(options.at_once, trainings)}
+    with tempfile.TemporaryDirectory() as folder:
+        scratch = Path(folder)
+        works = ((("rows", name, str(p)), partial(_row, options, name, p, trained, scratch)) for name, p in jobs)
+        yield from at_once(options.sims_at_once, works)
         for pattern in patterns:
-            runs = {n: Path(scratch) / f"{n}_{pattern}" for n in names if (Path(scratch) / f"{n}_{pattern}").is_dir()}
+            runs = {n: scratch / f"{n}_{pattern}" for n in options.rows if (scratch / f"{n}_{pattern}").is_dir()}
             target = Path(options.pictures) / f"flags_{folder_of(pattern)}.png"
             if figure(Path(options.dataset) / folder_of(pattern), runs, target):
-                result.setdefault("figures", {})[str(pattern)] = {"file": target.name, "way": "particle"}
-                save(result)
+                yield ("figures", str(pattern)), {"file": target.name, "way": "particle"}.copy
+
+
+CASE = Case(
+    "Train, simulate and compare the flags of the paper with Blender's cloth.",
+    rows,
+    (
+        DATASET,
+        names("--rows", VARIANTS),
+        option("--patterns", "separated by commas", default="1,2,3"),
+        option("--splats", "folder of the trained splats; `made` for splats made in code, without training",
+               default="outputs/flags"),
+        option("--train_steps", "images of a training run", type=int, default=7000),
+        option("--at_once", "training runs at the same time", type=int, default=1),
+        option("--sims_at_once", "simulations at the same time; their times then mean little", type=int, default=1),
+        FRAMES,
+        POINTS,
+        PICTURES,
+        MORE,
+        NOTE,
+    ),
+    name=lambda options: "flags_made" if options.splats == "made" else "flags",
+)  # fmt: skip

@@ -5,23 +5,22 @@ from __future__ import annotations
 import argparse
 import json
 import tempfile
-from collections.abc import Callable
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
+from functools import partial
 from itertools import combinations
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import torch
 
+from bench.case import FRAMES, POINTS, Case, Measurement, names, option
 from bench.cases import flags, pins
 from bench.problems.contacts import crossings, sheet_triangles
-from bench.record import chosen
+from bench.record import Row
 from bench.simulate import simulate
 from gaussian_swaying.evaluation.compare import compare_run
 from gaussian_swaying.recording.trajectory import load_trajectory
-
-Row = dict[str, Any]
 
 PATTERN = 1
 DISTANCE = 0.005
@@ -93,8 +92,13 @@ def reference_frames(path: Path) -> int:
         return len(found["positions"])
 
 
-def run_row(fold: Fold, dataset: Path, options: argparse.Namespace, output: Path) -> Row:
+def run_row(fold: Fold, options: argparse.Namespace) -> Row:
     """Simulate a row and compare it with each reference."""
+    with tempfile.TemporaryDirectory() as scratch:
+        return _compared(fold, Path(options.dataset), options, Path(scratch) / "run")
+
+
+def _compared(fold: Fold, dataset: Path, options: argparse.Namespace, output: Path) -> Row:
     bare = ["--recorder.images=false", "--recorder.video=false"]
     summary = simulate([*arguments(fold), *bare], output, options.device, options.frames)
     if "failed" in summary:
@@ -150,27 +154,25 @@ def describe(dataset: Path) -> Row:
     return {"distance_m": DISTANCE, "references": known, "apart": apart}
 
 
-def add_arguments(command: argparse.ArgumentParser) -> None:
-    """Options of ``bench.py folds``."""
-    command.add_argument("--dataset", required=True, help=f"folder with the references {', '.join(REFERENCES)}, each "
-                         "written by tools/datasets/make_flag_dataset.py")  # fmt: skip
-    command.add_argument("--rows", default="free_04,contact_04", help="separated by commas (default: %(default)s)")
-    command.add_argument("--frames", type=int, help="only the first frames")
-    command.add_argument("--points", type=int, default=10_000, help="points on a reference's surface")
-
-
-def measure(options: argparse.Namespace, result: Row, save: Callable[[Row], None]) -> None:
-    """Fill ``result``, saving it after each run; existing rows that are not selected are kept."""
-    names = chosen("--rows", options.rows, ROWS)
-    dataset = Path(options.dataset)
-    known = describe(dataset)
+def rows(options: argparse.Namespace, result: Row) -> Iterator[Measurement]:
+    """Describe the references, and compare each row with them."""
+    known = describe(Path(options.dataset))
     if not known["references"]:
-        raise SystemExit(f"{dataset} has none of {', '.join(REFERENCES)}: see docs/contact.md for how they are made")
+        told = "see docs/contact.md for how they are made"
+        raise SystemExit(f"{options.dataset} has none of {', '.join(REFERENCES)}: {told}")
     result.update(known)
-    save(result)
-    rows = result.setdefault("rows", {})
-    for name in names:
-        with tempfile.TemporaryDirectory() as scratch:
-            rows[name] = run_row(ROWS[name], dataset, options, Path(scratch) / "run")
-        print(f"{name}: {json.dumps(rows[name])}", flush=True)
-        save(result)
+    yield from ((("rows", name), partial(run_row, ROWS[name], options)) for name in options.rows)
+
+
+CASE = Case(
+    "Compare a flag that folds onto itself with other cloth solvers, with and without contact.",
+    rows,
+    (
+        option("--dataset", f"folder with the references {', '.join(REFERENCES)}, each written by "
+               "tools/datasets/make_flag_dataset.py", required=True),
+        names("--rows", ROWS, default=("free_04", "contact_04")),
+        FRAMES,
+        POINTS,
+    ),
+    page="contact.md",
+)  # fmt: skip

@@ -6,17 +6,18 @@ import argparse
 import hashlib
 import json
 import tempfile
-from collections.abc import Callable, Sequence
+from collections.abc import Iterator, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import yaml
 
-from bench.record import ROOT, chosen
+from bench.case import FRAMES, MORE, PICTURES, Case, Measurement, names, option
+from bench.record import ROOT, Row
 from bench.simulate import simulate
 
 CONFIGS = ROOT / "configs" / "sim"
-Row = dict[str, Any]
 
 SCENES = {
     "ficus": "Ficus",
@@ -101,41 +102,32 @@ def strip(folders: Sequence[Path], target: Path) -> None:
     imwrite(target, np.concatenate(rows))
 
 
-def run_scene(name: str, options: argparse.Namespace, pictures: Path) -> Row:
+def run_scene(name: str, options: argparse.Namespace) -> Row:
     """Run a scene as a user would, and return its summary."""
     with tempfile.TemporaryDirectory() as folder:
         output = Path(folder) / "out"
-        asked = [*arguments(name, options.preset), "--recorder.video=false", *(options.more or "").split()]
+        preset = preset_of(options)
+        asked = [*arguments(name, preset), "--recorder.video=false", *options.more.split()]
         summary = simulate(asked, output, options.device, options.frames)
         if "failed" in summary:
             return summary
         summary.pop("per_frame")
         folders = [folder for folder in (output / "frames", output / "wind") if folder.is_dir()]
-        strip(folders, pictures / f"gallery_{name}.png")
+        strip(folders, Path(options.pictures) / f"gallery_{name}.png")
     moved = summary["displacement_mean_max_m"]
     share = None if moved is None else moved / summary["size_m"]
-    noted = {"preset": options.preset, "configuration": fingerprint(name, options.preset)}
+    noted = {"preset": preset, "configuration": fingerprint(name, preset)}
     return summary | noted | {"displacement_share": share}
 
 
-def add_arguments(command: argparse.ArgumentParser) -> None:
-    """Options of ``bench.py gallery``."""
-    command.add_argument("--scenes", default=",".join(SCENES), help="separated by commas")
-    command.add_argument("--preset", help="folder of overlays below configs/sim; `preview` by default on a CPU")
-    command.add_argument("--frames", type=int, help="only the first frames")
-    command.add_argument("--pictures", default=str(ROOT / "docs" / "pictures"), help="folder of the strips")
-    command.add_argument("--more", help="other options of tools/sim.py, in quotes")
+def preset_of(options: argparse.Namespace) -> str | None:
+    """The preset that is asked for, or the default of the device."""
+    return options.preset or ("preview" if options.device == "cpu" else None)
 
 
-def measure(options: argparse.Namespace, result: Row, save: Callable[[Row], None]) -> None:
-    """Fill ``result["scenes"]``, saving it after each."""
-    names = chosen("--scenes", options.scenes, SCENES)
-    for name in names:
-        row = run_scene(name, options, Path(options.pictures))
-        result.setdefault("scenes", {})[name] = row
-        shown = ("status", "frames", "particles", "substeps", "process_s", "displacement_share", "lost_particles")
-        print(f"{name}: {json.dumps({key: row.get(key) for key in shown} if 'failed' not in row else row)}", flush=True)
-        save(result)
+def rows(options: argparse.Namespace, _: Row) -> Iterator[Measurement]:
+    """Each scene."""
+    yield from ((("scenes", name), partial(run_scene, name, options)) for name in options.scenes)
 
 
 def whole(row: Row) -> bool:
@@ -148,3 +140,11 @@ def whole(row: Row) -> bool:
 def of_today(name: str, row: Row) -> bool:
     """Whether a run was recorded with the present configuration files."""
     return bool(row.get("configuration") == fingerprint(name, row.get("preset")))
+
+
+PRESET = option("--preset", "folder of overlays below configs/sim; `preview` by default on a CPU")
+CASE = Case(
+    "Run the paper's scenes and make pictures of them.",
+    rows,
+    (names("--scenes", SCENES), PRESET, FRAMES, PICTURES, MORE),
+)

@@ -6,12 +6,15 @@ import argparse
 import io
 import statistics
 import time
+from collections.abc import Iterator
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from bench import record
+from bench.case import Case, Measurement, option
+from bench.record import ROOT, Row
 from gaussian_swaying.simulation.simulation import Simulation
 from gaussian_swaying.viewer.controls import Page
 from gaussian_swaying.viewer.session import Session, share_cores
@@ -19,14 +22,13 @@ from gaussian_swaying.viewer.session import Session, share_cores
 if TYPE_CHECKING:
     from bench.page_client import PageClient
 
-Row = dict[str, Any]
 SIZES = {"cpu": (640, 360), "cuda": (1920, 1080)}
 WARM = 8.0  # s until steps and pictures have found their size
 CHANGES = 7  # of the background, for the latency
 PATIENCE = 10.0  # s
 
 
-def watch(name: str, arguments: list[str], device: str, seconds: float) -> Row:
+def watch(arguments: list[str], device: str, seconds: float) -> Row:
     """A page, and one client on the same machine."""
     from bench.page_client import PageClient  # needs the extra [viewer]
 
@@ -53,7 +55,6 @@ def watch(name: str, arguments: list[str], device: str, seconds: float) -> Row:
     session.close()
     scene = session.simulation.scene
     return {
-        "name": name,
         "gaussians": len(scene.model.means),
         "points": scene.points.count,
         "window": [width, height],
@@ -99,22 +100,27 @@ def pixels_of(jpeg: bytes) -> np.ndarray:
     return np.asarray(Image.open(io.BytesIO(jpeg)).convert("RGB"))
 
 
-def add_arguments(command: argparse.ArgumentParser) -> None:
-    """Options of ``bench.py live``."""
-    command.add_argument("--ply", help="a captured object for configs/sim/hanging_object.yaml")
-    command.add_argument("--seconds", type=float, default=20.0, help="for how long each scene is watched")
-
-
-def live(options: argparse.Namespace) -> None:
-    """Measure the default flag, on a GPU one of 100,000 Gaussians too, and a captured object."""
-    device, result = record.start(options.device)
-    configs = record.ROOT / "configs" / "sim"
-    scenes = [("flag", ["--config", str(configs / "flag.yaml")])]
-    if device.type == "cuda":
-        large = ["--solver.dx=0.0125", "--scene.generator.init_args.spacing=0.0031"]
-        scenes.append(("large flag", [*scenes[0][1], *large]))
+def rows(options: argparse.Namespace, result: Row) -> Iterator[Measurement]:
+    """The default flag, on a GPU one of 100,000 Gaussians too, and a captured object."""
+    result["rows"] = []
+    configs = ROOT / "configs" / "sim"
+    flag = ["--config", str(configs / "flag.yaml")]
+    scenes = {"flag": flag}
+    if options.device == "cuda":
+        scenes["large flag"] = [*flag, "--solver.dx=0.0125", "--scene.generator.init_args.spacing=0.0031"]
     if options.ply:
-        hanging = ["--config", str(configs / "hanging_object.yaml"), "--scene.ply", options.ply]
-        scenes.append((Path(options.ply).stem, hanging))
-    result["rows"] = [watch(name, arguments, device.type, options.seconds) for name, arguments in scenes]
-    record.write(Path(options.results), f"live_{device.type}", result)
+        scenes[Path(options.ply).stem] = ["--config", str(configs / "hanging_object.yaml"), "--scene.ply", options.ply]
+    for name, arguments in scenes.items():
+        yield ("rows", {"name": name}), partial(watch, arguments, options.device, options.seconds)
+
+
+CASE = Case(
+    "Measure the pictures a second of the live page.",
+    rows,
+    (
+        option("--ply", "a captured object for configs/sim/hanging_object.yaml"),
+        option("--seconds", "for how long each scene is watched", type=float, default=20.0),
+    ),
+    page="live.md",
+    keeps="none",
+)

@@ -3,21 +3,19 @@
 from __future__ import annotations
 
 import argparse
-import json
 import math
 from collections.abc import Iterator
 from dataclasses import replace
-from pathlib import Path
-from typing import Any
+from functools import partial
 
 import torch
 from torch import Tensor
 
-from bench import record
+from bench.case import Case, Measurement, names
+from bench.clock import guarded
 from bench.problems import bars, beams, flags, plates
 from bench.problems.settings import Settings
-
-Row = dict[str, Any]
+from bench.record import Row
 
 # per problem: sizes from coarse to fine, their unit, and the fixed substep [s]: PhysGaussian's for the flag, and about
 # what the finest grid needs for the others
@@ -42,23 +40,15 @@ def settings_of(problem: str, device: str) -> Iterator[tuple[Row, Settings]]:
         for variant, (formulation, mls) in FORMULATIONS.items():
             base = Settings(formulation=formulation, mls=mls, dtype=torch.float32, device=device)
             coarse = size in sizes[:2]
+            about: Row = {"size": size, "variant": variant, "dtype": "float32", "cfl": 0.4, "substep": None}
             for cfl in CFLS:
                 if problem in ("cantilever", "hinged plate") and cfl < 0.4 and not (coarse and device == "cpu"):
                     continue  # tens of thousands of substeps, for an error that hardly depends on the substep
-                yield (
-                    {"size": size, "variant": variant, "dtype": "float32", "cfl": cfl, "substep": None},
-                    replace(base, cfl=cfl),
-                )
+                yield about | {"cfl": cfl}, replace(base, cfl=cfl)
             if device == "cpu" or coarse or problem in ("bar", "flag"):
-                yield (
-                    {"size": size, "variant": variant, "dtype": "float64", "cfl": 0.4, "substep": None},
-                    replace(base, dtype=torch.float64),
-                )
+                yield about | {"dtype": "float64"}, replace(base, dtype=torch.float64)
             if fixed and variant == "total":
-                yield (
-                    {"size": size, "variant": variant, "dtype": "float32", "cfl": None, "substep": fixed},
-                    replace(base, substep=fixed),
-                )
+                yield about | {"cfl": None, "substep": fixed}, replace(base, substep=fixed)
 
 
 def run_problem(problem: str, size: float, settings: Settings, reference: Tensor | None) -> dict[str, float]:
@@ -74,31 +64,29 @@ def run_problem(problem: str, size: float, settings: Settings, reference: Tensor
     return result | {"error": flags.distance(series, reference)}
 
 
-def measure(device: str, only: list[str] | None = None) -> list[Row]:
-    """Sweep the problems; a run that fails is recorded with its message and an infinite error."""
-    rows = []
-    for problem in only or PROBLEMS:
+def _measured(problem: str, size: float, settings: Settings, reference: Tensor | None) -> Row:
+    result = run_problem(problem, size, settings, reference)
+    error = abs(result["error"])
+    row = {"error": error if math.isfinite(error) else None, "substeps": result["substeps"]}
+    row["wall_per_simulated_s"] = result["wall_s"] / result["simulated_s"]
+    return row | {k: result[k] for k in ("torn", "lost") if k in result}
+
+
+def rows(options: argparse.Namespace, result: Row) -> Iterator[Measurement]:
+    """Sweep the problems; a run that fails is recorded with its message and without an error."""
+    device, wanted = options.device, options.only
+    result["kind"], result["threads"] = device, torch.get_num_threads()
+    result["rows"] = [row for row in result.get("rows", []) if row["problem"] not in wanted]
+    for problem in wanted:
         reference = None
         if problem == "flag":
             exact = Settings(cfl=REFERENCE_CFL, device=device)
             _, reference = flags.flag(REFERENCE_DX, exact, **FLAG)  # type: ignore[arg-type]
-        first = True
-        for parameters, settings in settings_of(problem, device):
-            if first:  # warm up
+        for number, (parameters, settings) in enumerate(settings_of(problem, device)):
+            if number == 0:  # warm up
                 run_problem(problem, parameters["size"], settings, reference)
-                first = False
-            row: Row = {"problem": problem} | parameters
-            try:
-                result = run_problem(problem, parameters["size"], settings, reference)
-                row |= {"error": abs(result["error"]), "substeps": result["substeps"]}
-                row["wall_per_simulated_s"] = result["wall_s"] / result["simulated_s"]
-                row["error"] = row["error"] if math.isfinite(row["error"]) else None
-                row |= {k: result[k] for k in ("torn", "lost") if k in result}
-            except Exception as error:
-                row |= {"error": None, "failed": f"{type(error).__name__}: {error}"}
-            rows.append(row)
-            print(json.dumps(row), flush=True)
-    return rows
+            work = partial(_measured, problem, parameters["size"], settings, reference)
+            yield ("rows", {"problem": problem} | parameters), lambda work=work: {"error": None} | guarded(work)
 
 
 def front(rows: list[Row]) -> list[Row]:
@@ -131,17 +119,10 @@ def on_front(row: Row, rows: list[Row], noise: float = 0.1) -> bool:
     )
 
 
-def add_arguments(command: argparse.ArgumentParser) -> None:
-    """Options of ``bench.py pareto``."""
-    command.add_argument("--only", help="only the problems with these names, separated by commas")
-
-
-def run(options: argparse.Namespace) -> None:
-    """Measure speed against error over the settings of the solver."""
-    device, result = record.start(options.device)
-    result["kind"], result["threads"] = device.type, torch.get_num_threads()
-    folder, name = Path(options.results), f"pareto_{device.type}"
-    wanted = options.only.split(",") if options.only else None
-    record.keep_rows(result, folder, name, lambda row: bool(wanted) and row["problem"] not in wanted)
-    result["rows"] += measure(device.type, wanted)
-    record.write(folder, name, result)
+CASE = Case(
+    "Measure speed against error over the settings of the solver.",
+    rows,
+    (names("--only", PROBLEMS),),
+    page="validation.md",
+    keeps="any",
+)

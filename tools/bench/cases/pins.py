@@ -3,20 +3,18 @@
 from __future__ import annotations
 
 import argparse
-import json
 import tempfile
-from collections.abc import Callable
+from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
-from typing import Any
 
 import yaml
 
+from bench.case import DATASET, FRAMES, MORE, NOTE, POINTS, Case, Measurement, names, option
 from bench.cases import flags
 from bench.cases.flags import REFERENCES, Flag, Variant
-from bench.record import chosen
-
-Row = dict[str, Any]
+from bench.record import Row
 
 PATTERNS: tuple[Flag, ...] = tuple(REFERENCES)
 """The paper's three flags, two that leave their held edge at an angle, and two that nothing was tuned for."""
@@ -78,31 +76,32 @@ def variant(pin: Pin, pattern: Flag) -> Variant:
     return Variant(pin.title(), options=options)
 
 
-def add_arguments(command: argparse.ArgumentParser) -> None:
-    """Options of ``bench.py pins``."""
-    command.add_argument("--dataset", required=True, help="folder that tools/datasets/make_flag_dataset.py wrote")
-    command.add_argument("--rows", default=",".join(ROWS), help="separated by commas (default: %(default)s)")
-    command.add_argument("--patterns", default=",".join(map(str, PATTERNS)), help="separated by commas")
-    command.add_argument("--frames", type=int, help="only the first frames")
-    command.add_argument("--points", type=int, default=10_000, help="points on the reference's surface")
-    command.add_argument("--more", help='other options of tools/sim.py: --more="--frames=25"')
-    command.add_argument("--note", help="a sentence for the page about how the rows were measured")
+def _row(name: str, pattern: Flag, options: argparse.Namespace) -> Row:
+    pin = ROWS[name]
+    with tempfile.TemporaryDirectory() as scratch:
+        found = flags.run_row(pattern, variant(pin, pattern), options, None, Path(scratch) / "run", pictures=False)
+    return found | {"dx_m": grid_spacing(pin, pattern)}
 
 
-def measure(options: argparse.Namespace, result: Row, save: Callable[[Row], None]) -> None:
-    """Fill ``result["rows"]``, saving it after each run; existing rows that are not selected are kept."""
-    names = chosen("--rows", options.rows, ROWS)
+def rows(options: argparse.Namespace, result: Row) -> Iterator[Measurement]:
+    """Each way to hold each flag."""
     patterns = flags.flags_named(options.patterns)
     flags.open_dataset(Path(options.dataset), patterns, result)
-    result |= {"more": options.more or ""} | ({"note": options.note} if options.note else {})
-    rows = result.setdefault("rows", {})
-    for name in names:
-        for pattern in patterns:
-            with tempfile.TemporaryDirectory() as scratch:
-                row = flags.run_row(
-                    pattern, variant(ROWS[name], pattern), options, None, Path(scratch) / "run", pictures=False
-                )
-            rows.setdefault(name, {})[str(pattern)] = row | {"dx_m": grid_spacing(ROWS[name], pattern)}
-            shown = {k: v for k, v in row.items() if k != "chamfer_per_frame_m"}
-            print(f"pattern {pattern}, {name}: {json.dumps(shown)}", flush=True)
-            save(result)
+    result |= {"more": options.more} | ({"note": options.note} if options.note else {})
+    for name in options.rows:
+        yield from ((("rows", name, str(pattern)), partial(_row, name, pattern, options)) for pattern in patterns)
+
+
+CASE = Case(
+    "Compare ways to hold an edge on flags made in code, with Blender's cloth.",
+    rows,
+    (
+        DATASET,
+        names("--rows", ROWS),
+        option("--patterns", "separated by commas", default=",".join(map(str, PATTERNS))),
+        FRAMES,
+        POINTS,
+        MORE,
+        NOTE,
+    ),
+)

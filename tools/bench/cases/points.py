@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import argparse
-import json
 import statistics
 import tempfile
 import time
 from collections.abc import Iterator
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -15,12 +15,10 @@ import torch
 import yaml
 from torch import Tensor
 
-from bench import record
-from bench.record import ROOT
+from bench.case import Case, Measurement, names, option
+from bench.record import ROOT, Row
 from gaussian_swaying.simulation.diagnostics import SimulationDiverged
 from gaussian_swaying.simulation.simulation import Simulation
-
-Row = dict[str, Any]
 
 SCENES = ("guitar", "ficus", "alocasia", "telephone")
 WAYS: dict[str, dict[str, Any]] = {
@@ -65,53 +63,45 @@ def motion(simulation: Simulation, frames: int, row: Row) -> Iterator[Tensor]:
 
 
 @torch.inference_mode()
-def measure(scene: str, frames: int, device: str, ply: str | None) -> list[Row]:
-    """All ways of one scene, each compared with one point to a Gaussian."""
-    rows: list[Row] = []
-    first: list[Tensor] = []
+def run(scene: str, way: str, frames: int, device: str, ply: str | None, first: list[Tensor]) -> Row:
+    """One way of a scene, compared with one point to a Gaussian, whose motion goes into ``first``."""
+    row: Row = {"frames": frames}
     with tempfile.TemporaryDirectory() as folder:
-        for way in WAYS:
-            path = Path(folder) / "scene.yaml"
-            path.write_text(yaml.safe_dump(configuration(scene, way, ply)))
-            row: Row = {"scene": scene, "way": way, "frames": frames}
-            simulation = Simulation.from_yaml(path, device=device)
-            row["dx_m"] = simulation.solver.dx
-            try:
-                if way == "gaussian":
-                    first = [moved.cpu() for moved in motion(simulation, frames, row)]
-                    means = [float(moved.norm(dim=-1).mean()) for moved in first]
-                    largest = max(means)
-                    row["largest_mean_displacement_m"] = largest
-                else:
-                    apart = [
-                        float((moved.cpu() - other).norm(dim=-1).mean())
-                        for moved, other in zip(motion(simulation, frames, row), first, strict=True)
-                    ]
-                    row["error"] = statistics.mean(apart) / largest
-                    row["error_last"] = apart[-1] / largest
-                    row["error_largest"] = max(apart) / largest
-            except SimulationDiverged as error:
-                row["failed"] = str(error)
-            rows.append(row)
-            print(json.dumps(row), flush=True)
-    return rows
+        path = Path(folder) / "scene.yaml"
+        path.write_text(yaml.safe_dump(configuration(scene, way, ply)))
+        simulation = Simulation.from_yaml(path, device=device)
+    row["dx_m"] = simulation.solver.dx
+    try:
+        moved = [place.cpu() for place in motion(simulation, frames, row)]
+    except SimulationDiverged as error:
+        return row | {"failed": str(error)}
+    if way == "gaussian":
+        first += moved
+    largest = max(float(place.norm(dim=-1).mean()) for place in first)
+    if way == "gaussian":
+        return row | {"largest_mean_displacement_m": largest}
+    apart = [float((one - other).norm(dim=-1).mean()) / largest for one, other in zip(moved, first, strict=True)]
+    return row | {"error": statistics.mean(apart), "error_last": apart[-1], "error_largest": max(apart)}
 
 
-def add_arguments(command: argparse.ArgumentParser) -> None:
-    """Options of ``bench.py points``."""
-    command.add_argument("--ply", help="a captured guitar, for the scene `guitar`; without it that scene is left out")
-    command.add_argument("--frames", type=int, default=250, help="frames of each run")
-    command.add_argument("--only", help="only these scenes, separated by commas")
-
-
-def run(options: argparse.Namespace) -> None:
-    """Measure error and time against the points of a cell."""
-    device, result = record.start(options.device)
-    wanted = options.only.split(",") if options.only else list(SCENES)
-    folder, name = Path(options.results), f"points_{device.type}"
-    record.keep_rows(result, folder, name, lambda row: row["scene"] not in wanted)
+def rows(options: argparse.Namespace, result: Row) -> Iterator[Measurement]:
+    """All ways of each scene."""
+    wanted = [scene for scene in options.only if scene != "guitar" or options.ply]
+    result["rows"] = [row for row in result.get("rows", []) if row["scene"] not in wanted]
     for scene in wanted:
-        if scene == "guitar" and options.ply is None:
-            continue
-        result["rows"] += measure(scene, options.frames, str(device), options.ply)
-        record.write(folder, name, result, quiet=True)
+        first: list[Tensor] = []
+        for way in WAYS:
+            work = partial(run, scene, way, options.frames, options.device, options.ply, first)
+            yield ("rows", {"scene": scene, "way": way}), work
+
+
+CASE = Case(
+    "Measure error and time against the points of a cell.",
+    rows,
+    (
+        option("--ply", "a captured guitar, for the scene `guitar`; without it that scene is left out"),
+        option("--frames", "frames of each run", type=int, default=250),
+        names("--only", SCENES),
+    ),
+    keeps="any",
+)

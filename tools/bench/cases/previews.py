@@ -8,15 +8,14 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable
+from collections.abc import Iterator
+from functools import partial
 from pathlib import Path
-from typing import Any
 
+from bench.case import FRAMES, Case, Measurement, names, option
 from bench.cases import gallery
-from bench.record import ROOT, chosen
+from bench.record import ROOT, Row
 from bench.simulate import what_failed
-
-Row = dict[str, Any]
 
 
 def announced_and_taken(name: str, previewed: list[str], ran: list[str], device: str, frames: int | None = None) -> Row:
@@ -74,41 +73,29 @@ def _tool(name: str, options: list[str]) -> subprocess.CompletedProcess[str]:
     return subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
 
 
-def add_arguments(command: argparse.ArgumentParser) -> None:
-    """Options of ``bench.py previews``."""
-    command.add_argument("--scenes", default=",".join(gallery.SCENES), help="separated by commas; may be empty")
-    command.add_argument("--preset", help="folder of overlays below configs/sim; `preview` by default on a CPU")
-    command.add_argument("--ply", action="append", default=[], help="a splat whose draft and starter are run too")
-    command.add_argument("--quality", default="normal", help="of the starter of --ply: draft, normal, fine")
-    command.add_argument("--frames", type=int, help="only the first frames")
+def _scene(name: str, options: argparse.Namespace) -> Row:
+    preset = gallery.preset_of(options)
+    files = gallery.arguments(name, preset)
+    return announced_and_taken(name, files, files, options.device, options.frames) | {"preset": preset}
 
 
-def measure(options: argparse.Namespace, result: Row, save: Callable[[Row], None]) -> None:
-    """Fill ``result["previews"]``, saving it after each."""
-    names = chosen("--scenes", options.scenes, gallery.SCENES)
-    rows = result.setdefault("previews", {})
-    for name in names:
-        files = gallery.arguments(name, options.preset)
-        rows[name] = announced_and_taken(name, files, files, options.device, options.frames)
-        rows[name]["preset"] = options.preset
-        _show(name, rows[name])
-        save(result)
+def rows(options: argparse.Namespace, _: Row) -> Iterator[Measurement]:
+    """The scenes, and the draft and the starter of each splat."""
+    yield from ((("previews", name), partial(_scene, name, options)) for name in options.scenes)
     for ply in options.ply:
-        name = f"{Path(ply).stem}, {options.quality}"
-        previewed = [ply, "--quality", options.quality]
-        rows[name] = announced_and_taken(name, previewed, [], options.device, options.frames)
-        _show(name, rows[name])
-        save(result)
+        name, previewed = f"{Path(ply).stem}, {options.quality}", [ply, "--quality", options.quality]
+        work = partial(announced_and_taken, name, previewed, [], options.device, options.frames)
+        yield ("previews", name), work
 
 
-def _show(name: str, row: Row) -> None:
-    if "failed" in row:
-        print(f"{name}: {row['failed']}", flush=True)
-    for kind in ("run", "draft", "starter"):
-        if kind in row:
-            found = row[kind]
-            print(
-                f"{name}, {kind}: announced {found['announced_s']:.1f} s, took {found['process_s']:.1f} s, "
-                f"ratio {found['ratio']:.2f}",
-                flush=True,
-            )
+CASE = Case(
+    "Compare the times that previews announce with those of runs.",
+    rows,
+    (
+        names("--scenes", gallery.SCENES),
+        gallery.PRESET,
+        option("--ply", "a splat whose draft and starter are run too", action="append", default=[]),
+        option("--quality", "of the starter of --ply: draft, normal, fine", default="normal"),
+        FRAMES,
+    ),
+)

@@ -10,14 +10,17 @@ import subprocess
 import sys
 import tempfile
 import time
+from collections.abc import Iterator
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
 
-from bench import record
+from bench.case import MORE, Case, Measurement, option
 from bench.clock import Clock, timed
+from bench.record import ROOT, Row
 from bench.scenes import CUBE, sheet
 from gaussian_swaying.geometry.frame import SimFrame
 from gaussian_swaying.mpm.solver import MPMSolver
@@ -25,7 +28,7 @@ from gaussian_swaying.recording.trajectory import load_trajectory
 from gaussian_swaying.simulation.frame import frames_from
 from gaussian_swaying.simulation.simulation import Simulation
 
-FLAG = record.ROOT / "configs" / "sim" / "flag.yaml"
+FLAG = ROOT / "configs" / "sim" / "flag.yaml"
 COARSE = ("--solver.dx=0.1", "--scene.generator.init_args.spacing=0.0095", "--recorder.trajectory=true")
 
 
@@ -45,21 +48,24 @@ def bench_substep(
     return {"particles": points.count, "formulation": name, "nodes": nodes} | result
 
 
-def run_sim(name: str, arguments: list[str], device: torch.device) -> dict[str, Any]:
+def _tool(name: str, *arguments: str, **environment: str) -> float:
+    """Seconds that a program of the folder tools takes."""
+    begin = time.perf_counter()
+    command = [sys.executable, str(ROOT / "tools" / f"{name}.py"), *arguments]
+    subprocess.run(command, check=True, cwd=ROOT, env=os.environ | environment, stdout=subprocess.DEVNULL)
+    return time.perf_counter() - begin
+
+
+def run_sim(name: str, arguments: list[str], device: torch.device) -> Row:
     """Run tools/sim.py as a user would, in its own process, and return its summary.
 
     On a GPU it runs twice: with an empty cache of Triton, and with the kernels that the first run has compiled.
     """
     walls = []
     with tempfile.TemporaryDirectory() as folder:
-        command = [sys.executable, str(record.ROOT / "tools" / "sim.py"), *arguments, "--device", device.type]
         caches = {"TRITON_CACHE_DIR": f"{folder}/triton"} if device.type == "cuda" else {}
         for _ in range(1 + len(caches)):
-            begin = time.perf_counter()
-            subprocess.run(
-                [*command, "--output", f"{folder}/out"], check=True, cwd=record.ROOT, env=os.environ | caches
-            )
-            walls.append(time.perf_counter() - begin)
+            walls.append(_tool("sim", *arguments, "--device", device.type, "--output", f"{folder}/out", **caches))
         summary = json.loads((Path(folder) / "out" / "summary.json").read_text())
     summary.pop("per_frame")
     named = [Path(a).name if a.endswith(".ply") else a for a in arguments]
@@ -90,16 +96,12 @@ def comparison(device: torch.device, frames: int) -> dict[str, Any]:
     """The time of tools/eval.py, in its own process: a flag against its own pictures and a surface beside it."""
     with tempfile.TemporaryDirectory() as folder:
         run, reference = Path(folder) / "run", Path(folder) / "reference"
-        command = [sys.executable, str(record.ROOT / "tools" / "sim.py"), "--config", str(FLAG), *COARSE]
-        command += [f"--frames={frames}", "--device", device.type, "--output", str(run)]
-        subprocess.run(command, check=True, cwd=record.ROOT)
+        on = ("--device", device.type)
+        _tool("sim", "--config", str(FLAG), *COARSE, f"--frames={frames}", *on, "--output", str(run))
         shutil.copytree(run / "frames", reference / "frames")
         positions, faces = surface_beside(run, frames)
         np.savez(reference / "cloth.npz", positions=positions, faces=faces, side=1.0)
-        begin = time.perf_counter()
-        command = [sys.executable, str(record.ROOT / "tools" / "eval.py"), str(run), str(reference), "--no-video"]
-        subprocess.run([*command, "--device", device.type], check=True, cwd=record.ROOT, stdout=subprocess.DEVNULL)
-        wall = time.perf_counter() - begin
+        wall = _tool("eval", str(run), str(reference), "--no-video", *on)
         summary = json.loads((run / "summary.json").read_text())
         found = json.loads((run / "eval" / "eval.json").read_text())
     known = {"frames": frames, "particles": summary["recorded_surface"], "picture": found["size"]}
@@ -134,41 +136,49 @@ def round_trip_psnr(config: str, ply: str, device: torch.device) -> float:
     return float("inf") if error == 0 else -10 * float(torch.log10(torch.tensor(error)))
 
 
-def substep(options: argparse.Namespace) -> None:
-    """Measure one elastic substep."""
-    device, result = record.start(options.device)
-    counts = [20_000, 100_000] if device.type == "cpu" else [20_000, 100_000, 1_000_000]
+def _substeps(options: argparse.Namespace, result: Row) -> Iterator[Measurement]:
+    """Each size in each formulation."""
+    result["substep"] = []
+    device = torch.device(options.device)
     variants: list[dict[str, Any]] = [{"formulation": "total"}, {"formulation": "updated"}]
     variants += [{"formulation": "updated", "mls": True}]
     if device.type == "cuda":
         variants += [{"formulation": name, "deterministic": True} for name in ("total", "updated")]
-    result["substep"] = [bench_substep(device, n, **variant) for n in counts for variant in variants]
-    record.write(Path(options.results), f"substep_{device.type}", result)
+    for count in [20_000, 100_000, 1_000_000][: 3 if device.type == "cuda" else 2]:
+        for variant in variants:
+            yield ("substep", {"asked": count} | variant), partial(bench_substep, device, count, **variant)
 
 
-def add_arguments(command: argparse.ArgumentParser) -> None:
-    """Options of ``bench.py sim``."""
-    command.add_argument("--ply", help="a captured object for configs/sim/hanging_object.yaml")
-    command.add_argument("--frames", type=int, help="frames of the captured object; default: all")
-    command.add_argument("--compared", type=int, default=250, help="frames of the comparison with a reference")
-    command.add_argument("--more", help='other options of tools/sim.py: --more="--frames=25"')
-
-
-def sim(options: argparse.Namespace) -> None:
-    """Measure whole runs: the default flag and a captured object."""
-    device, result = record.start(options.device)
-    configs = record.ROOT / "configs" / "sim"
-    more = options.more.split() if options.more else []
-    result["runs"] = [run_sim("flag, 75 frames at 480x270", ["--config", str(configs / "flag.yaml"), *more], device)]
+def _runs(options: argparse.Namespace, result: Row) -> Iterator[Measurement]:
+    """The default flag, a captured object, and a comparison with a reference."""
+    result["runs"] = []
+    device, more = torch.device(options.device), options.more.split()
+    name = "flag, 75 frames at 480x270"
+    yield ("runs", {"name": name}), partial(run_sim, name, ["--config", str(FLAG), *more], device)
     if options.ply:
-        hanging = ["--config", str(configs / "hanging_object.yaml"), "--scene.ply", options.ply]
-        size = (
-            ["--camera.init_args.width", "1920", "--camera.init_args.height", "1080"] if device.type == "cuda" else []
+        config = str(ROOT / "configs" / "sim" / "hanging_object.yaml")
+        asked = ["--config", config, "--scene.ply", options.ply]
+        large = ["--camera.init_args.width", "1920", "--camera.init_args.height", "1080"]
+        asked += large if device.type == "cuda" else []
+        asked += [*(["--frames", str(options.frames)] if options.frames else []), *more]
+        name = f"{Path(options.ply).stem}, {'1920x1080' if device.type == 'cuda' else '960x540'}"
+        yield (
+            ("runs", {"name": name}),
+            lambda: run_sim(name, asked, device) | {"without_files_s": without_files(asked, device)},
         )
-        frames = ["--frames", str(options.frames)] if options.frames else []
-        name = f"{Path(options.ply).stem}, {'1920x1080' if size else '960x540'}"
-        result["runs"].append(run_sim(name, [*hanging, *size, *frames, *more], device))
-        result["runs"][-1]["without_files_s"] = without_files([*hanging, *size, *frames, *more], device)
-        result["round_trip_psnr_db"] = round_trip_psnr(hanging[1], options.ply, device)
-    result["comparison"] = comparison(device, options.compared)
-    record.write(Path(options.results), f"sim_{device.type}", result)
+        result["round_trip_psnr_db"] = round_trip_psnr(config, options.ply, device)
+    yield ("comparison",), partial(comparison, device, options.compared)
+
+
+SUBSTEP = Case("Measure one elastic substep.", _substeps, keeps="none")
+SIM = Case(
+    "Measure whole runs: the default flag and a captured object.",
+    _runs,
+    (
+        option("--ply", "a captured object for configs/sim/hanging_object.yaml"),
+        option("--frames", "frames of the captured object; default: all", type=int),
+        option("--compared", "frames of the comparison with a reference", type=int, default=250),
+        MORE,
+    ),
+    keeps="none",
+)

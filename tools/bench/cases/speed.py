@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 import argparse
-import json
 import math
 import statistics
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Any
@@ -15,8 +14,10 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from bench import record, stamps
-from bench.clock import Clock, Peak, clear, copy_bandwidth, guarded, spread, timed
+from bench import record
+from bench.case import Case, Measurement, chosen, numbers, option
+from bench.clock import Clock, Peak, clear, copy_bandwidth, guarded, safely, spread, timed
+from bench.record import Row
 from bench.scenes import CUBE, block, cube, fewest_bytes, nodes_in_reach, sheet, spin, waves, wind, wind_load
 from gaussian_swaying.aero.wind_batch import WindBatch
 from gaussian_swaying.aero.wind_force import WindForce
@@ -25,8 +26,6 @@ from gaussian_swaying.mpm.solver import MPMSolver
 from gaussian_swaying.mpm.state import MaterialPoints, MPMState
 from gaussian_swaying.simulation.frame import frames_from
 from gaussian_swaying.simulation.simulation import Simulation
-
-Row = dict[str, Any]
 
 CONFIG = record.ROOT / "configs" / "sim" / "flag.yaml"
 DT = 1e-4  # s
@@ -112,24 +111,15 @@ PLANS = {
 }
 
 
-def plan_for(kind: str, counts: str | None = None, quick: bool = False) -> Plan:
-    """The plan for a kind of device; with other counts (``"5000,20000"``), or small enough for a test."""
+def plan_for(kind: str, counts: list[int] | None = None, quick: bool = False) -> Plan:
+    """The plan for a kind of device; with other counts, or small enough for a test."""
     plan = PLANS[kind]
     if quick:
         plan = replace(plan, counts=(64, 400), exact_limit=64, sand=64, scenes=2, side=8, steps=(4, 8))
         plan = replace(plan, torch_steps=2, warm=2, repeats=(2, 2), copy_bytes=2**20)
-        plan = replace(
-            plan,
-            frames=(1, 2),
-            picture=(64, 36),
-            spacing=0.025,
-            dx=(0.1,),
-            cubes=(1000,),
-            cube_steps=4,
-            small=False,
-            large=None,
-        )
-    return plan if counts is None else replace(plan, counts=tuple(int(n) for n in counts.split(",")))
+        plan = replace(plan, frames=(1, 2), picture=(64, 36), spacing=0.025, dx=(0.1,), cubes=(1000,), cube_steps=4)
+        plan = replace(plan, small=False, large=None)
+    return plan if counts is None else replace(plan, counts=tuple(counts))
 
 
 def _double(state: MPMState) -> MPMState:
@@ -156,6 +146,7 @@ def error_of(end: MPMState, solver: MPMSolver, start: MPMState, steps: int, load
     return found
 
 
+@torch.inference_mode()
 def bench_rollout(plan: Plan, asked: int, formulation: str, device: torch.device, copy: float, sand: bool) -> Row:
     """Time, bytes, memory and error of substeps: a sheet in wind, or a block of sand without wind."""
     peak = Peak(device)
@@ -198,6 +189,7 @@ def _torch_path(plan: Plan, solver: MPMSolver, state: MPMState, load: WindForce 
     return timed(lambda: solver.rollout(state, DT, few, load), device, 3, 2, 1 / few) | {"substeps": few}
 
 
+@torch.inference_mode()
 def bench_batch(plan: Plan, formulation: str, gusts: bool, device: torch.device) -> Row:
     """Flags in different winds: all in one rollout, one rollout after another, and one flag with as many particles."""
     steps = plan.steps[0]
@@ -240,6 +232,7 @@ def bench_batch(plan: Plan, formulation: str, gusts: bool, device: torch.device)
     return row
 
 
+@torch.inference_mode()
 def bench_cube(plan: Plan, asked: int, walls: bool, turning: bool, device: torch.device) -> Row:
     """Substeps of an elastic cube in `updated`, from rest or turning, with or without an enclosing box."""
     points = cube(asked, device)
@@ -257,6 +250,7 @@ def bench_cube(plan: Plan, asked: int, walls: bool, turning: bool, device: torch
     return row | {"particles": points.count, "substeps": steps, "grid_nodes": state.grid.node_count}
 
 
+@torch.inference_mode()
 def bench_frame(plan: Plan, dx: float | None, device: torch.device, spacing: float | None = None) -> Row:
     """Frames of configs/sim/flag.yaml: from the state of one frame to the picture of the next, on the device.
 
@@ -311,87 +305,54 @@ def bench_frame(plan: Plan, dx: float | None, device: torch.device, spacing: flo
     return row | {"memory_bytes": peak.read(), "build_memory_bytes": build_memory, "dx_m": simulation.solver.dx}
 
 
-@torch.inference_mode()
-def measure(
-    plan: Plan, device: torch.device, result: Row, save: Callable[[Row], None], only: list[str] | None = None
-) -> None:
-    """Fill ``result`` with the wanted sections and save it after each case; its key ``partial`` goes at the end.
-
-    Args:
-        plan: How much to measure.
-        device: Where to measure.
-        result: The record so far; sections that are not wanted stay as they are.
-        save: Writes the result.
-        only: Which of ``SECTIONS``; all if None.
-    """
-    begin = time.perf_counter()
-    wanted = [name for name in SECTIONS if only is None or name in only]
-    result |= {"partial": True, "dt_s": DT, "seconds": 0.0} | {name: [] for name in wanted}
-    result["copy"] = copy_bandwidth(plan.copy_bytes, device)
-    clear()
-    copy = result["copy"]["bytes_per_s"]
-    print(f"copy: {copy / 1e9:.1f} GB/s", flush=True)
-    save(result)
-
-    def case(section: str, known: Row, function: Callable[[], Row]) -> None:
-        row = known | guarded(function)
-        result[section].append(row)
-        result["seconds"] = time.perf_counter() - begin
-        save(result)
-        print(f"{result['seconds']:.0f} s, {section}: {json.dumps(row)}", flush=True)
-
-    if "substep" in wanted:
-        for asked in plan.counts:
-            for name in FORMULATIONS:
-                known = {"formulation": name, "asked": asked}
-                case("substep", known, lambda a=asked, f=name: bench_rollout(plan, a, f, device, copy, sand=False))
-    if "sand" in wanted:
-        known = {"formulation": "updated", "asked": plan.sand}
-        case("sand", known, lambda: bench_rollout(plan, plan.sand, "updated", device, copy, sand=True))
-    if "cube" in wanted:
-        for asked in plan.cubes:
-            for turning in (False, True):
-                for walls in (False, True):
-                    known = {"asked": asked, "turning": turning, "walls": walls}
-                    case("cube", known, lambda a=asked, w=walls, t=turning: bench_cube(plan, a, w, t, device))
-    if "batch" in wanted:
-        for name in FORMULATIONS:
-            for gusts in (False, True):
-                known = {"formulation": name, "gusts": gusts}
-                case("batch", known, lambda f=name, g=gusts: bench_batch(plan, f, g, device))
-    if "frame" in wanted:
-        for dx in plan.dx:
-            case("frame", {"dx_m": dx, "main": dx == plan.dx[0]}, lambda dx=dx: bench_frame(plan, dx, device))
-        if plan.small:
-            case("frame", {"small": True}, lambda: bench_frame(plan, None, device))
-    if "large" in wanted and plan.large is not None:
-        case("large", {"dx_m": plan.dx[0]}, lambda: bench_frame(plan, plan.dx[0], device, plan.large))
-    del result["partial"]
-    save(result)
-
-
-def add_arguments(command: argparse.ArgumentParser) -> None:
-    """Options of ``bench.py speed``."""
-    command.add_argument("--counts", help="particles of the sheets, separated by commas")
-    command.add_argument("--only", help=f"some of {', '.join(SECTIONS)}, separated by commas")
-    command.add_argument("--quick", action="store_true", help="tiny counts, only to see that it runs")
-
-
-def run(options: argparse.Namespace) -> None:
-    """Measure rollouts of many sizes, sand, batches and frames, with memory and error."""
-    device, result = record.start(options.device)
-    result["kind"], result["threads"], result["quick"] = device.type, torch.get_num_threads(), options.quick
-    folder = Path(options.results)
-    if options.quick and folder.resolve() == record.RESULTS:
+def rows(options: argparse.Namespace, result: Row) -> Iterator[Measurement]:
+    """The wanted sections; the others stay as they are, and ``partial`` says whether all was measured."""
+    if options.quick and Path(options.results).resolve() == record.RESULTS:
         raise SystemExit("--quick measures nothing worth keeping: choose another folder with --results")
-    name = f"speed_{device.type}"
-    path = folder / f"{name}.json"
-    only = record.chosen("--only", options.only, SECTIONS) if options.only else None
-    if only and path.exists():
-        kept = json.loads(path.read_text())
-        if kept["device"] == result["device"]:
-            result |= {section: kept[section] for section in SECTIONS if section in kept and section not in only}
-            result["measured"] = stamps.kept(kept, result)
+    begin, device = time.perf_counter(), torch.device(options.device)
+    wanted = SECTIONS if options.only is None else chosen("--only", SECTIONS, options.only)
     plan = plan_for(device.type, options.counts, options.quick)
-    measure(plan, device, result, lambda now: record.write(folder, name, now, quiet=True), only)
-    print(f"wrote {path}")
+    result |= {"kind": device.type, "threads": torch.get_num_threads(), "quick": options.quick}
+    result |= {"partial": True, "dt_s": DT, "seconds": 0.0} | {name: [] for name in wanted}
+    yield ("copy",), lambda: copy_bandwidth(plan.copy_bytes, device)
+    clear()
+    for section, known, work in _sections(plan, device, result["copy"]["bytes_per_s"]):
+        if section in wanted:
+            yield (section, known), work
+            result["seconds"] = time.perf_counter() - begin
+    result["partial"] = False
+
+
+def _sections(plan: Plan, device: torch.device, copy: float) -> Iterator[tuple[str, Row, Callable[[], Row]]]:
+    """Each case of each section: what it is known by, and its measurement."""
+    for asked in plan.counts:
+        for name in FORMULATIONS:
+            work = safely(bench_rollout, plan, asked, name, device, copy, sand=False)
+            yield "substep", {"formulation": name, "asked": asked}, work
+    work = safely(bench_rollout, plan, plan.sand, "updated", device, copy, sand=True)
+    yield "sand", {"formulation": "updated", "asked": plan.sand}, work
+    for asked in plan.cubes:
+        for turning in (False, True):
+            for walls in (False, True):
+                known = {"asked": asked, "turning": turning, "walls": walls}
+                yield "cube", known, safely(bench_cube, plan, asked, walls, turning, device)
+    for name in FORMULATIONS:
+        for gusts in (False, True):
+            yield "batch", {"formulation": name, "gusts": gusts}, safely(bench_batch, plan, name, gusts, device)
+    for dx in plan.dx:
+        yield "frame", {"dx_m": dx, "main": dx == plan.dx[0]}, safely(bench_frame, plan, dx, device)
+    if plan.small:
+        yield "frame", {"small": True}, safely(bench_frame, plan, None, device)
+    if plan.large is not None:
+        yield "large", {"dx_m": plan.dx[0]}, safely(bench_frame, plan, plan.dx[0], device, plan.large)
+
+
+CASE = Case(
+    "Measure rollouts of many sizes, sand, batches and frames, with memory and error.",
+    rows,
+    (
+        numbers("--counts", "particles of the sheets"),
+        option("--only", f"some of {', '.join(SECTIONS)}, separated by commas"),
+        option("--quick", "tiny counts, only to see that it runs", action="store_true"),
+    ),
+)

@@ -3,27 +3,23 @@
 from __future__ import annotations
 
 import argparse
-import json
 import math
 import subprocess
-import sys
 import tempfile
-import threading
 import time
-from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Iterator
+from functools import partial
 from pathlib import Path
-from typing import Any
 
 import torch
 
+from bench.case import DATASET, MORE, Case, Measurement, at_once, names, option
 from bench.cases.flags import VARIANTS, run_row
-from bench.cases.trained import GENTLE, NORMALS, filled, last_psnr, tilts, two_views
+from bench.cases.trained import GENTLE, NORMALS, last_psnr, tilts, train_command, two_views
 from bench.problems.capture_limits import surface_limits
-from bench.record import ROOT, chosen
+from bench.record import ROOT, Row
 from gaussian_swaying.captures.capture import read_capture
 
-Row = dict[str, Any]
 WAYS: dict[str, tuple[str, tuple[str, ...]]] = {
     "paper": ("the paper's losses", ()),
     "views": ("+ two views: `configs/train/surface.yaml`", two_views()),
@@ -57,75 +53,66 @@ def limits(photos: Path) -> Row:
     }
 
 
-def train_command(photos: Path, way: str, seed: int, steps: int, target: Path) -> list[str]:
-    """Command line of tools/train.py."""
-    return [
-        *(sys.executable, str(ROOT / "tools" / "train.py"), "fit"),
-        *(f"--config={ROOT}/configs/train/default.yaml", f"--config={ROOT}/configs/bench/train.yaml"),
-        *(f"--trainer.max_steps={steps}", f"--trainer.val_check_interval={steps}", f"--model.seed={seed}"),
-        *(f"--checkpoint.every_n_train_steps={steps}", "--trainer.enable_progress_bar=false"),
-        *(f"--data.init_args.path={photos}", f"--data.init_args.seed={seed}"),
-        *(f"--trainer.default_root_dir={target}", *filled(WAYS[way][1], steps)),
-    ]
+def _train(photos: Path, way: str, seed: int, steps: int, target: Path) -> Row:
+    """Train a splat, unless it exists, and return the seconds that it took."""
+    if (target / "point_cloud.ply").exists():
+        return {}
+    command, log = train_command(photos.resolve(), WAYS[way][1], steps, target, seed), Path(f"{target}.log")
+    begin = time.perf_counter()
+    with log.open("w") as told:
+        done = subprocess.run(command, cwd=ROOT, stdout=told, stderr=told)
+    if done.returncode:
+        raise SystemExit(log.read_text()[-2000:])
+    return {"seconds": time.perf_counter() - begin}
 
 
-def add_arguments(command: argparse.ArgumentParser) -> None:
-    """Options of ``bench.py surfaces``."""
-    command.add_argument("--dataset", required=True, help="folder that tools/datasets/make_flag_dataset.py wrote")
-    command.add_argument("--pattern", type=int, default=2, help="which flag")
-    command.add_argument("--ways", default=",".join(WAYS), help="separated by commas")
-    command.add_argument("--seeds", type=int, default=2, help="training runs of each")
-    command.add_argument("--train_steps", type=int, default=7000, help="images of a training run")
-    command.add_argument("--at_once", type=int, default=4, help="training runs, and then simulations, at the same time")
-    command.add_argument("--splats", help="folder of the trained splats; those that exist are not trained again")
-    command.add_argument("--more", help="other options of tools/sim.py")
+def _look(options: argparse.Namespace, run: Path, reference: Path, scratch: Path) -> Row:
+    """Normals of a trained splat, and its motion with each kind of normals, beside the reference."""
+    splat = run / "point_cloud.ply"
+    found: Row = {"tilt": tilts(splat, reference / "cloth.npz"), "psnr_db": last_psnr(run), "chamfer": {}}
+    for normals in NORMALS:
+        asked = argparse.Namespace(**vars(options) | {"frames": None, "points": 10_000})
+        asked.more = f"{options.more} --scene.normals={normals}".strip()
+        output = scratch / f"run_{run.name}_{normals}"
+        row = run_row(options.pattern, VARIANTS["ours"], asked, splat.resolve(), output, pictures=False)
+        found["chamfer"][normals] = row.get("chamfer_share", math.nan)
+    return found
 
 
-def measure(options: argparse.Namespace, result: Row, save: Callable[[Row], None]) -> None:
+def rows(options: argparse.Namespace, result: Row) -> Iterator[Measurement]:
     """Train in every way, and compare normals and motion with the reference."""
-    ways = chosen("--ways", options.ways, WAYS)
     reference = Path(options.dataset) / f"pattern{options.pattern}"
     photos = reference / "train"
     result |= {"pattern": options.pattern, "steps": options.train_steps, "at_once": options.at_once}
-    result["more"] = options.more or ""
-    result["limits"] = limits(photos)
-    rows = result.setdefault("rows", {})
-    options.frames, options.points = None, 10_000
+    result |= {"more": options.more, "limits": limits(photos)}
+    before = result.setdefault("rows", {})
     with tempfile.TemporaryDirectory() as scratch:
         home = Path(options.splats or scratch)
         home.mkdir(parents=True, exist_ok=True)
-        jobs = [(way, seed) for seed in range(options.seeds) for way in ways]
+        runs = {(way, str(seed)): home / f"{way}_{seed}" for way in options.ways for seed in range(options.seeds)}
+        trainings = ((place, partial(_train, photos, place[0], int(place[1]), options.train_steps, run))
+                     for place, run in runs.items())  # fmt: skip
+        took = {place: work() for place, work in at_once(options.at_once, trainings)}
 
-        def train(job: tuple[str, int]) -> None:
-            target = home / f"{job[0]}_{job[1]}"
-            if not (target / "point_cloud.ply").exists():
-                command, log = train_command(photos.resolve(), *job, options.train_steps, target), f"{target}.log"
-                began = time.perf_counter()
-                with Path(log).open("w") as told:
-                    done = subprocess.run(command, cwd=ROOT, stdout=told, stderr=told)
-                if done.returncode:
-                    raise SystemExit(Path(log).read_text()[-2000:])
-                rows.setdefault(job[0], {}).setdefault(str(job[1]), {})["seconds"] = time.perf_counter() - began
+        def look(way: str, seed: str) -> Row:
+            known = before.get(way, {}).get(seed, {}) | took[way, seed]
+            return known | _look(options, runs[way, seed], reference, Path(scratch))
 
-        with ThreadPoolExecutor(options.at_once) as pool:
-            list(pool.map(train, jobs))
-        lock = threading.Lock()
+        yield from at_once(options.at_once, ((("rows", *place), partial(look, *place)) for place in runs))
 
-        def look(job: tuple[str, int]) -> None:
-            way, seed = job
-            run = home / f"{way}_{seed}"
-            splat = run / "point_cloud.ply"
-            found: Row = {"tilt": tilts(splat, reference / "cloth.npz"), "psnr_db": last_psnr(run), "chamfer": {}}
-            for normals in NORMALS:
-                asked = argparse.Namespace(**vars(options))
-                asked.more = " ".join([options.more or "", f"--scene.normals={normals}"]).strip()
-                output = Path(scratch) / f"run_{way}_{seed}_{normals}"
-                row = run_row(options.pattern, VARIANTS["ours"], asked, splat.resolve(), output, pictures=False)
-                found["chamfer"][normals] = row.get("chamfer_share", math.nan)
-            with lock:
-                rows.setdefault(way, {}).setdefault(str(seed), {}).update(found)
-                print(f"{way}, seed {seed}: {json.dumps(rows[way][str(seed)])}", flush=True)
-                save(result)
 
-        with ThreadPoolExecutor(options.at_once) as pool:
-            list(pool.map(look, sorted(jobs, key=lambda job: ways.index(job[0]))))
+CASE = Case(
+    "Measure how trained normals are tilted, by which losses, and what it does to a flag.",
+    rows,
+    (
+        DATASET,
+        option("--pattern", "which flag", type=int, default=2),
+        names("--ways", WAYS),
+        option("--seeds", "training runs of each", type=int, default=2),
+        option("--train_steps", "images of a training run", type=int, default=7000),
+        option("--at_once", "training runs, and then simulations, at the same time", type=int, default=4),
+        option("--splats", "folder of the trained splats; those that exist are not trained again"),
+        MORE,
+    ),
+    page="training.md",
+)

@@ -13,8 +13,9 @@ import sys
 import tempfile
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Iterator
 from contextlib import suppress
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -22,16 +23,16 @@ import torch
 import yaml
 from lightning.pytorch.callbacks import Callback
 
+from bench.case import Case, Measurement, option
 from bench.cases.training import evaluate
-from bench.clock import guarded
+from bench.clock import safely
 from bench.problems.small_sweep import AXES, SETTINGS
+from bench.record import ROOT, Row
 from gaussian_swaying.captures.transforms import find_image
 from gaussian_swaying.gaussians.model import GaussianSurfaceModel
 from gaussian_swaying.simulation.simulation import Simulation
 from gaussian_swaying.training.data.datamodule import CaptureDataModule
 
-ROOT = Path(__file__).resolve().parents[3]
-Row = dict[str, Any]
 SECTIONS = ("workers", "gpus", "training")
 LOCK = ".gaussian_swaying.lock"
 
@@ -44,40 +45,23 @@ _QUIET = {
 }
 
 
-def add_arguments(command: argparse.ArgumentParser) -> None:
-    """Options of ``bench.py sweeps``."""
-    command.add_argument("--only", nargs="+", choices=SECTIONS, help="what to measure; on a CPU only `workers`")
-    command.add_argument("--flags", type=int, default=256, help="small flags of the section `gpus`")
-    command.add_argument("--frames", type=int, default=1000, help="frames of each of them")
-    command.add_argument("--gpus", type=int, nargs="+", default=[1, 2], help="numbers of GPUs")
-    command.add_argument("--capture", help="folder of the fox, for the section `training`")
-    command.add_argument("--train_steps", type=int, default=7000, help="images of a training")
-
-
-def measure(options: argparse.Namespace, result: Row, save: Callable[[Row], None]) -> None:
-    """Fill the wanted sections of a record, and save it after each part."""
+def rows(options: argparse.Namespace, result: Row) -> Iterator[Measurement]:
+    """The wanted sections."""
     wanted = options.only or (["workers"] if options.device == "cpu" else ["gpus", "training"])
     with tempfile.TemporaryDirectory() as scratch:
         place = Path(scratch)
         if "workers" in wanted:
-            result["workers"] = disturbed_sweep(place)
-            save(result)
+            yield ("workers",), partial(disturbed_sweep, place)
         if "gpus" in wanted:
-            section = result["gpus"] = {"flags": options.flags, "frames": options.frames, "rows": {}}
+            result["gpus"] = {"flags": options.flags, "frames": options.frames, "rows": {}}
             for count in options.gpus:
-                section["rows"][str(count)] = guarded(lambda n=count: many_flags(place, options, n))
-                print(json.dumps(section["rows"][str(count)]), flush=True)
-                save(result)
-            section["sheet"] = guarded(lambda: one_sheet(options))
-            print(json.dumps(section["sheet"]), flush=True)
-            save(result)
+                yield ("gpus", "rows", str(count)), safely(many_flags, place, options, count)
+            yield ("gpus", "sheet"), safely(one_sheet, options)
         if "training" in wanted and options.capture:
-            section = result["training"] = {"images": options.train_steps, "rows": {}}
+            result["training"] = {"images": options.train_steps, "rows": {}}
             capture = enlarged(Path(options.capture), place / "fox", 2)
             for count in options.gpus:
-                section["rows"][str(count)] = guarded(lambda n=count: train(place, capture, options, n))
-                print(json.dumps(section["rows"][str(count)]), flush=True)
-                save(result)
+                yield ("training", "rows", str(count)), safely(train, place, capture, options, count)
 
 
 def _command(*words: str, gpus: int | None = None) -> subprocess.Popen[str]:
@@ -284,3 +268,18 @@ def train(place: Path, capture: Path, options: argparse.Namespace, gpus: int) ->
     with torch.no_grad():
         row: Row = evaluate(model, [held[index] for index in range(len(held))])
     return json.loads(watch.read_text()) | row | {"gaussians": len(model), "plys": 1}
+
+
+CASE = Case(
+    "Measure disturbed sweeps, many small flags and training, on one and several GPUs.",
+    rows,
+    (
+        option("--only", "what to measure; on a CPU only `workers`", nargs="+", choices=SECTIONS),
+        option("--flags", "small flags of the section `gpus`", type=int, default=256),
+        option("--frames", "frames of each of them", type=int, default=1000),
+        option("--gpus", "numbers of GPUs", type=int, nargs="+", default=[1, 2]),
+        option("--capture", "folder of the fox, for the section `training`"),
+        option("--train_steps", "images of a training", type=int, default=7000),
+    ),
+    page="many.md",
+)

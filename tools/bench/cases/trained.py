@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import csv
+import sys
 from collections.abc import Iterable
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import torch
 
-from bench.record import ROOT
+from bench.record import ROOT, Row
 from gaussian_swaying.gaussians.area import patch_area
 from gaussian_swaying.gaussians.compact import read_gaussians
 from gaussian_swaying.gaussians.model import GaussianSurfaceModel
@@ -18,7 +18,6 @@ from gaussian_swaying.geometry.neighbours import nearest_neighbours
 from gaussian_swaying.geometry.surface_normals import neighbour_normals
 from gaussian_swaying.metrics.patch_normals import patch_normal_error
 
-Row = dict[str, Any]
 SIZES = (0.1, 0.2, 0.4)
 """Sides of the patches [m]."""
 
@@ -53,6 +52,17 @@ GENTLE = two_views(fade=1500, every=2, contrast=0.03)
 def filled(options: Iterable[str], steps: int) -> list[str]:
     """Options with ``{steps}`` and ``{half}`` replaced by the images of the training run, and half of them."""
     return [option.replace("{steps}", str(steps)).replace("{half}", str(steps // 2)) for option in options]
+
+
+def train_command(photos: Path, options: Iterable[str], steps: int, target: Path, seed: int | None = None) -> list[str]:
+    """Command line of tools/train.py for the splat of a flag."""
+    command = [sys.executable, str(ROOT / "tools" / "train.py"), "fit"]
+    command += [f"--config={ROOT}/configs/train/default.yaml", f"--config={ROOT}/configs/bench/train.yaml"]
+    command += [f"--trainer.max_steps={steps}", f"--trainer.val_check_interval={steps}"]
+    command += [f"--checkpoint.every_n_train_steps={steps}", "--trainer.enable_progress_bar=false"]
+    command += [] if seed is None else [f"--model.seed={seed}", f"--data.init_args.seed={seed}"]
+    command += [f"--data.init_args.path={photos}", f"--trainer.default_root_dir={target}"]
+    return [*command, *filled(options, steps)]
 
 
 def last_psnr(run: Path) -> float | None:

@@ -6,11 +6,13 @@ import argparse
 import itertools
 import json
 import os
+import queue
 import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -20,8 +22,10 @@ from einops import rearrange
 from torch import Tensor
 from torchmetrics.functional.image import peak_signal_noise_ratio, structural_similarity_index_measure
 
+from bench.case import PICTURES, Case, Measurement, at_once, names, option
+from bench.clock import Clock
 from bench.problems.surface_quality import surface_quality
-from bench.record import chosen
+from bench.record import ROOT, Row
 from gaussian_swaying.cli.train import make_cli
 from gaussian_swaying.gaussians.model import GaussianSurfaceModel
 from gaussian_swaying.rendering.gsplat_renderer import make_renderer
@@ -30,9 +34,6 @@ from gaussian_swaying.training.data.generated_datamodule import GeneratedDataMod
 from gaussian_swaying.training.losses import photometric_loss
 from gaussian_swaying.training.optimizers import LearningRates, means_rate
 from gaussian_swaying.training.panels import panel
-
-ROOT = Path(__file__).resolve().parents[3]
-Row = dict[str, Any]
 
 SECTIONS = ("pair", "variants", "flag", "photos")
 """What ``bench.py train`` measures; ``photos`` is the recipe for a CPU, which is measured there alone."""
@@ -47,39 +48,30 @@ def _weights(**weights: float) -> list[str]:
     return [f"--model.loss_weights.{name}={weight}" for name, weight in weights.items()]
 
 
+_PLAIN = _weights(**_NO_SURFACE)
+_DENSE = [*_PLAIN, *_DEFAULT]
+
 FOX_VARIANTS: dict[str, tuple[str, list[str]]] = {
     "surface": ("all surface losses, paper's weights", []),
-    "consistent": ("initial points from photo-consistency", [*_weights(**_NO_SURFACE), *_CONSISTENT]),
-    "mcmc": ("MCMC, 300,000 Gaussians", [*_weights(**_NO_SURFACE), *_MCMC]),
+    "consistent": ("initial points from photo-consistency", [*_PLAIN, *_CONSISTENT]),
+    "mcmc": ("MCMC, 300,000 Gaussians", [*_PLAIN, *_MCMC]),
     "mcmc_consistent": (
         "MCMC, 300,000 Gaussians, points from photo-consistency",
-        [*_weights(**_NO_SURFACE), *_MCMC, *_CONSISTENT],
+        [*_PLAIN, *_MCMC, *_CONSISTENT],
     ),
     "absgrad": (
         "absolute gradients, threshold 0.0008",
-        [
-            *_weights(**_NO_SURFACE),
-            *_DEFAULT,
-            "--model.densification.absgrad=true",
-            "--model.densification.grow_grad2d=0.0008",
-        ],
+        [*_DENSE, "--model.densification.absgrad=true", "--model.densification.grow_grad2d=0.0008"],
     ),
     "schedule": (
         "densification until step 4,000, one more harmonic degree every 500",
-        [*_weights(**_NO_SURFACE), *_DEFAULT, "--model.densification.stop=4000", "--model.sh_every=500"],
+        [*_DENSE, "--model.densification.stop=4000", "--model.sh_every=500"],
     ),
-    "degree_1": ("harmonics of degree 1", [*_weights(**_NO_SURFACE), "--model.sh_degree=1"]),
-    "hooks_1": ("Lightning's hooks after every image", [*_weights(**_NO_SURFACE), "--model.hooks_every=1"]),
-    "selective": ("gsplat's selective Adam", [*_weights(**_NO_SURFACE), "--model.optimizer=selective_adam"]),
-    "packed": ("gsplat's packed projection", [*_weights(**_NO_SURFACE), "--model.packed=true"]),
-    "passes": (
-        "densification every 200 images",
-        [*_weights(**_NO_SURFACE), *_DEFAULT, "--model.densification.every=200"],
-    ),
-    "settled": (
-        "densification until step 4,000",
-        [*_weights(**_NO_SURFACE), *_DEFAULT, "--model.densification.stop=4000"],
-    ),
+    "degree_1": ("harmonics of degree 1", [*_PLAIN, "--model.sh_degree=1"]),
+    "selective": ("gsplat's selective Adam", [*_PLAIN, "--model.optimizer=selective_adam"]),
+    "packed": ("gsplat's packed projection", [*_PLAIN, "--model.packed=true"]),
+    "passes": ("densification every 200 images", [*_DENSE, "--model.densification.every=200"]),
+    "settled": ("densification until step 4,000", [*_DENSE, "--model.densification.stop=4000"]),
 }
 """Variants of the schedule of the bare loop on the fox: name to description and command line."""
 
@@ -109,21 +101,10 @@ def _arguments(config: str, more: list[str], steps: int, folder: Path) -> list[s
     ]
 
 
-class _Clock:
-    """Seconds between two points, after waiting for the GPU."""
-
-    def __init__(self) -> None:
-        self.wait()
-        self.begin = time.perf_counter()
-
-    @staticmethod
-    def wait() -> None:
-        if torch.cuda.is_available():
-            torch.cuda.synchronize()
-
-    def seconds(self) -> float:
-        self.wait()
-        return time.perf_counter() - self.begin
+def _seconds(clock: Clock) -> float:
+    """Seconds since the first mark, after waiting for the device."""
+    clock.mark()
+    return 1e-3 * sum(clock.read())
 
 
 @torch.no_grad()
@@ -165,8 +146,8 @@ def bare_loop(config: str, more: list[str], steps: int, device: torch.device) ->
     rates = LearningRates()
     scene_scale = data.scene_scale
     start = GaussianSurfaceModel.from_cloud(data.initial_cloud(3)).to(device)
-    names = ("means", "scales", "quats", "opacities", "sh0", "shN")
-    parameters = torch.nn.ParameterDict({name: torch.nn.Parameter(getattr(start, name).detach()) for name in names})
+    parts = ("means", "scales", "quats", "opacities", "sh0", "shN")
+    parameters = torch.nn.ParameterDict({name: torch.nn.Parameter(getattr(start, name).detach()) for name in parts})
     fused = device.type == "cuda"
     optimizers = {
         name: torch.optim.Adam(
@@ -175,7 +156,7 @@ def bare_loop(config: str, more: list[str], steps: int, device: torch.device) ->
             eps=1e-15,
             fused=fused,
         )
-        for name in names
+        for name in parts
     }
     views = [view.to(device) for view in (data.train_dataloader().dataset[i] for i in range(_count(data)))]
     photos = [view.image for view in views]
@@ -185,7 +166,8 @@ def bare_loop(config: str, more: list[str], steps: int, device: torch.device) ->
     state = strategy.initialize_state(scene_scale=scene_scale)
     if fused:
         torch.cuda.reset_peak_memory_stats()
-    clock = _Clock()
+    clock = Clock(device)
+    clock.mark()
     for step, index in enumerate(itertools.islice(EndlessShuffle(len(views), data.seed), steps)):
         optimizers["means"].param_groups[0]["lr"] = means_rate(rates, scene_scale, step, steps)
         degree = min(step // 1000, 3)
@@ -210,11 +192,10 @@ def bare_loop(config: str, more: list[str], steps: int, device: torch.device) ->
             optimizer.step()
             optimizer.zero_grad(set_to_none=True)
         strategy.step_post_backward(parameters, optimizers, state, step, info, packed=False)
-    seconds = clock.seconds()
-    model = start
-    for name in names:
-        setattr(model, name, parameters[name])
-    return _finish(model, data, seconds, steps)
+    seconds = _seconds(clock)
+    for name in parts:
+        setattr(start, name, parameters[name])
+    return _finish(start, data, seconds, steps)
 
 
 def _count(data: CaptureDataModule) -> int:
@@ -230,25 +211,24 @@ def lightning_run(
     class Timer(Callback):
         """Seconds from the first image to the last; it comes before the checkpoints in the list of callbacks."""
 
-        clock: _Clock
         seconds = 0.0
 
         def on_train_start(self, *_: Any) -> None:
             if torch.cuda.is_available():
                 torch.cuda.reset_peak_memory_stats()
-            self.clock = _Clock()
+            clock.wait()
+            clock.mark()
 
         def on_train_batch_end(self, trainer: Any, *_: Any) -> None:
             if trainer.global_step == steps:
-                self.seconds = self.clock.seconds()
+                self.seconds = _seconds(clock)
 
-    cli = make_cli(_arguments(config, more, steps, folder), run=False)
-    timer = Timer()
+    device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
+    cli, clock, timer = make_cli(_arguments(config, more, steps, folder), run=False), Clock(device), Timer()
     trainer: Any = cli.trainer
     trainer.callbacks.insert(0, timer)
     trainer.fit(cli.model, cli.datamodule)
-    with_files = timer.clock.seconds()
-    device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
+    with_files = _seconds(clock)
     model = cli.model.to(device).splat
     data: Any = cli.datamodule
     row = _finish(model, data, timer.seconds, steps) | {"seconds_with_files": with_files}
@@ -321,98 +301,83 @@ def _visible(gpu: int) -> str:
     return listed.split(",")[gpu] if listed else str(gpu)
 
 
-def run_apart(
-    jobs: list[tuple[str, str, int, Path | None]], folder: Path, at_once: int, done: Callable[[str, Row], None]
-) -> None:
-    """Do several runs in separate processes, and call ``done`` when each ends.
+Job = tuple[str, str, int, Path | None]  # the name of a run, its photos, its images, and its picture
+
+
+def run_apart(section: str, jobs: list[Job], folder: Path, most: int) -> Iterator[Measurement]:
+    """Several runs in processes of their own, at most so many at a time.
 
     The runs are spread over the GPUs. Several runs on one GPU slow each other down.
     """
     gpus = max(torch.cuda.device_count(), 1)
-    waiting = list(jobs)
-    running: dict[str, tuple[subprocess.Popen[bytes], Path, Any, int]] = {}
-    while waiting or running:
-        while waiting and len(running) < at_once:
-            name, path, steps, picture = waiting.pop(0)
-            busy = [gpu for _, _, _, gpu in running.values()]
-            gpu = min(range(gpus), key=busy.count)
-            environment = os.environ | {"PYTHONPATH": os.pathsep.join([str(ROOT / "tools"), *sys.path])}
-            environment |= {"CUDA_VISIBLE_DEVICES": _visible(gpu)} if gpus > 1 else {}
-            target = folder / f"{name.replace(':', '_')}.json"
-            command = [sys.executable, "-m", "bench.cases.training", name, path, str(steps), str(target)]
-            command += [] if picture is None else ["--picture", str(picture)]
-            log = target.with_suffix(".log").open("w")
-            process = subprocess.Popen(command, cwd=ROOT, env=environment, stdout=log, stderr=subprocess.STDOUT)
-            running[name] = (process, target, log, gpu)
-        time.sleep(0.2)
-        for name in [name for name, (process, _, _, _) in running.items() if process.poll() is not None]:
-            process, target, log, _ = running.pop(name)
-            log.close()
-            if process.returncode == 0:
-                on_one = -(-min(at_once, len(jobs)) // gpus)
-                row = json.loads(target.read_text()) | {"runs_per_device": on_one}
-            else:
-                row = {"failed": target.with_suffix(".log").read_text()[-400:]}
-            print(f"{name}: {json.dumps(row)}", flush=True)
-            done(name, row)
+    on_one = -(-min(most, len(jobs)) // gpus)
+    free: queue.SimpleQueue[int] = queue.SimpleQueue()  # a GPU for each run that may go on at once
+    for number in range(most):
+        free.put(number % gpus)
+
+    def work(name: str, path: str, steps: int, picture: Path | None) -> Row:
+        gpu = free.get()
+        environment = os.environ | {"PYTHONPATH": os.pathsep.join([str(ROOT / "tools"), *sys.path])}
+        environment |= {"CUDA_VISIBLE_DEVICES": _visible(gpu)} if gpus > 1 else {}
+        target = folder / f"{name.replace(':', '_')}.json"
+        command = [sys.executable, "-m", "bench.cases.training", name, path, str(steps), str(target)]
+        command += [] if picture is None else ["--picture", str(picture)]
+        log = target.with_suffix(".log")
+        with log.open("w") as told:
+            done = subprocess.run(command, cwd=ROOT, env=environment, stdout=told, stderr=subprocess.STDOUT)
+        free.put(gpu)
+        if done.returncode:
+            return {"failed": log.read_text()[-400:]}
+        return json.loads(target.read_text()) | {"runs_per_device": on_one}
+
+    yield from at_once(most, (((section, job[0]), partial(work, *job)) for job in jobs))
 
 
-def add_arguments(command: argparse.ArgumentParser) -> None:
-    """Options of ``bench.py train``."""
-    command.add_argument("--capture", help="folder of photos for configs/train/fox.yaml")
-    command.add_argument("--flag", default="outputs/captures/flag_800", help="folder of the generated flag's photos")
-    command.add_argument(
-        "--only", default="pair,variants,flag", help=f"some of {', '.join(SECTIONS)}, separated by commas"
-    )
-    command.add_argument("--views", help="picture of the held-out photos beside what `photos` drew, not in the docs")
-    command.add_argument(
-        "--variants", default=",".join(FOX_VARIANTS), help="variants of the capture, separated by commas"
-    )
-    command.add_argument("--rows", default=",".join(FLAG_ROWS), help="rows of the flag, separated by commas")
-    command.add_argument("--steps", type=int, default=7000, help="images of a training run on the capture")
-    command.add_argument("--flag_steps", type=int, default=30_000, help="images of a training run on the flag")
-    command.add_argument("--repeats", type=int, default=2, help="runs of the bare loop and of Lightning, alternating")
-    command.add_argument("--at_once", type=int, default=4, help="variants and rows trained at the same time")
-    command.add_argument("--pictures", default=str(ROOT / "docs" / "pictures"), help="folder of the flag's pictures")
-
-
-def measure(options: argparse.Namespace, result: Row, save: Callable[[Row], None]) -> None:
-    """Fill ``result``, saving it after each run."""
-    wanted = chosen("--only", options.only, SECTIONS)
-    if {"pair", "variants", "photos"} & set(wanted) and not options.capture:
+def rows(options: argparse.Namespace, result: Row) -> Iterator[Measurement]:
+    """The wanted sections."""
+    wanted, capture = options.only, options.capture
+    if {"pair", "variants", "photos"} & set(wanted) and not capture:
         raise SystemExit("the capture is missing: pass its folder with --capture, or skip it with --only flag")
-
-    def keep(section: str) -> Callable[[str, Row], None]:
-        def done(name: str, row: Row) -> None:
-            result.setdefault(section, {})[name] = row
-            save(result)
-
-        return done
-
     with tempfile.TemporaryDirectory() as scratch:
-        folder = Path(scratch)
+        folder, pictures = Path(scratch), Path(options.pictures)
         if "photos" in wanted:
-            row = photos_run(options.capture, folder / "photos", options.views and Path(options.views))
-            keep("photos")("photos_cpu", row)
+            views = options.views and Path(options.views)
+            yield ("photos", "photos_cpu"), partial(photos_run, capture, folder / "photos", views)
         if "pair" in wanted:
-            run("bare", options.capture, 60, folder / "warm")  # loads the kernels
-            run("lightning", options.capture, 60, folder / "warm")
-            result["pair"] = {"bare": [], "lightning": []}
+            pair = ("bare", "lightning")
+            for name in pair:
+                run(name, capture, 60, folder / "warm")  # loads the kernels
+            result["pair"] = {name: [] for name in pair}
             for turn in range(options.repeats):
-                for name in ("bare", "lightning"):
-                    row = run(name, options.capture, options.steps, folder / f"{name}_{turn}")
-                    print(f"{name}: {json.dumps(row)}", flush=True)
-                    result["pair"][name].append(row)
-                    save(result)
+                for name in pair:
+                    work = partial(run, name, capture, options.steps, folder / f"{name}_{turn}")
+                    yield ("pair", name, {"turn": turn}), work
         if "flag" in wanted:
-            jobs: list[Any] = [
-                (f"flag:{name}", options.flag, options.flag_steps, Path(options.pictures) / f"training_flag_{name}.png")
-                for name in options.rows.split(",")
-            ]
-            run_apart(jobs, folder, options.at_once, keep("flag"))
+            seen = {name: pictures / f"training_flag_{name}.png" for name in options.rows}
+            flags: list[Job] = [(f"flag:{name}", options.flag, options.flag_steps, seen[name]) for name in seen]
+            yield from run_apart("flag", flags, folder, options.at_once)
         if "variants" in wanted:
-            jobs = [(name, options.capture, options.steps, None) for name in options.variants.split(",")]
-            run_apart(jobs, folder, options.at_once, keep("variants"))
+            variants: list[Job] = [(name, capture, options.steps, None) for name in options.variants]
+            yield from run_apart("variants", variants, folder, options.at_once)
+
+
+CASE = Case(
+    "Measure training: a bare gsplat loop and Lightning, and the effect of the surface losses.",
+    rows,
+    (
+        option("--capture", "folder of photos for configs/train/fox.yaml"),
+        option("--flag", "folder of the generated flag's photos", default="outputs/captures/flag_800"),
+        names("--only", SECTIONS, default=("pair", "variants", "flag")),
+        option("--views", "picture of the held-out photos beside what `photos` drew, not in the docs"),
+        names("--variants", FOX_VARIANTS, "variants of the capture"),
+        names("--rows", FLAG_ROWS, "rows of the flag"),
+        option("--steps", "images of a training run on the capture", type=int, default=7000),
+        option("--flag_steps", "images of a training run on the flag", type=int, default=30_000),
+        option("--repeats", "runs of the bare loop and of Lightning, alternating", type=int, default=2),
+        option("--at_once", "variants and rows trained at the same time", type=int, default=4),
+        PICTURES,
+    ),
+)
 
 
 def main() -> None:

@@ -6,38 +6,28 @@ import argparse
 import shutil
 import tempfile
 import time
-from collections.abc import Callable
+from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
 
 import torch
 
+from bench.case import Case, Measurement, option
+from bench.record import Row
 from gaussian_swaying.mpm.state import MPMState
 from gaussian_swaying.recording.checkpoint import read_checkpoint
 from gaussian_swaying.simulation.simulation import Simulation
 from gaussian_swaying.viewer.film.page import write_film
-
-Row = dict[str, Any]
 
 WINDOW = (1440, 900)  # pixels
 FLAGS = ["--no-sandbox", "--disable-quic", "--no-first-run", "--disable-background-networking", "--disable-sync"]
 FLAGS += ["--disable-component-update", "--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"]
 
 
-def add_arguments(command: argparse.ArgumentParser) -> None:
-    """Options of ``bench.py web``."""
-    command.add_argument("--run", action="append", default=[], help="folder of a finished run of `total`; repeatable")
-    command.add_argument("--seconds", type=float, default=20.0, help="for which a film plays while it is timed")
-
-
-def measure(options: argparse.Namespace, result: Row, save: Callable[[Row], None]) -> None:
-    """Fill ``result["films"]``, saving it after each."""
-    films = result.setdefault("films", {})
+def rows(options: argparse.Namespace, _: Row) -> Iterator[Measurement]:
+    """The film of each run."""
     for name in options.run:
         row = film_of(Path(name), options.seconds)
-        films[row["title"]] = row
-        save(result)
-        print(f"{row['title']}: {row['bytes'] / 1e6:.1f} MB, {row['pictures_per_s']:.1f} pictures a second")
+        yield ("films", row["title"]), row.copy
 
 
 def film_of(run: Path, seconds: float) -> Row:
@@ -98,3 +88,14 @@ def _last_centres(run: Path) -> torch.Tensor:
     state = MPMState.from_state_dict(read_checkpoint(run / "checkpoint.pt")["state"])
     means = scene.deformed(state).means.double()
     return scene.frame.point_to_sim(means) / (scene.size * scene.frame.metres_per_unit)
+
+
+CASE = Case(
+    "Measure films for the web: size, error, and speed in headless Chromium.",
+    rows,
+    (
+        option("--run", "folder of a finished run of `total`; repeatable", action="append", default=[]),
+        option("--seconds", "for which a film plays while it is timed", type=float, default=20.0),
+    ),
+    page="web.md",
+)

@@ -3,19 +3,18 @@
 from __future__ import annotations
 
 import argparse
-import json
 import statistics
 import tempfile
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 import torch
 
+from bench.case import Case, Measurement, names, numbers
 from bench.clock import Clock, guarded
-from bench.record import chosen
+from bench.record import Row
 from bench.scenes import CUBE, sheet, waves, wind_load
 from gaussian_swaying.aero.carried import Turbulence
 from gaussian_swaying.aero.effects import LogProfile, WindEffect
@@ -28,8 +27,6 @@ from gaussian_swaying.mpm.boundaries.ball import BallObstacle
 from gaussian_swaying.mpm.boundaries.boundary import Boundary
 from gaussian_swaying.mpm.boundaries.mesh import MeshObstacle
 from gaussian_swaying.mpm.solver import MPMSolver
-
-Row = dict[str, Any]
 
 DT = 1e-4  # s
 BOX = (256, 128, 128)
@@ -94,6 +91,7 @@ def in_turns(runs: dict[str, Callable[[], object]], device: torch.device, steps:
     }
 
 
+@torch.no_grad()
 def measure_obstacles(count: int, formulation: str, device: torch.device, steps: int, rounds: int) -> list[Row]:
     """Substeps of a sheet that lies on each of :data:`OBSTACLES`."""
     points = sheet(count, device)
@@ -113,6 +111,7 @@ def measure_obstacles(count: int, formulation: str, device: torch.device, steps:
     return rows
 
 
+@torch.no_grad()
 def measure_winds(count: int, formulation: str, device: torch.device, steps: int, rounds: int) -> list[Row]:
     """Substeps of a sheet in each wind."""
     points = sheet(count, device)
@@ -138,6 +137,7 @@ def measure_winds(count: int, formulation: str, device: torch.device, steps: int
     return rows
 
 
+@torch.no_grad()
 def measure_box(device: torch.device, rounds: int = 7) -> Row:
     """Time to make a box, isotropic and with shear, after one that is not counted."""
     row: Row = {"cells": list(BOX)}
@@ -161,31 +161,32 @@ PARTS: dict[str, tuple[str, Callable[..., list[Row]]]] = {
 """Tables of the record: what their rows differ by, and what measures them."""
 
 
-def add_arguments(command: argparse.ArgumentParser) -> None:
-    """Options of ``bench.py winds``."""
-    command.add_argument("--counts", help="particles, separated by commas")
-    command.add_argument("--formulations", default="total,updated", help="separated by commas")
-    command.add_argument("--only", help=f"of box, {', '.join(PARTS)}, separated by commas (default: all)")
-
-
-@torch.no_grad()
-def measure(options: argparse.Namespace, result: Row, save: Callable[[Row], None]) -> None:
-    """Fill ``result``, saving it after each table; rows of other sizes and formulations are kept."""
+def rows(options: argparse.Namespace, result: Row) -> Iterator[Measurement]:
+    """The box, and each table for each size and formulation."""
     device = torch.device(options.device)
     kind = device.type
-    only = chosen("--only", options.only, ["box", *PARTS])
-    if "box" in only:
-        result["box"] = measure_box(device)
-    for count in COUNTS[kind] if options.counts is None else map(int, options.counts.split(",")):
-        for formulation in options.formulations.split(","):
+    if "box" in options.only:
+        yield ("box",), partial(measure_box, device)
+    for count in options.counts or COUNTS[kind]:
+        for formulation in options.formulations:
             for key, (what, take) in PARTS.items():
-                if key not in only:
-                    continue
-                made = {"particles": sheet(count, device).count, "formulation": formulation}
-                work = partial(take, count, formulation, device, STEPS[kind], ROUNDS[kind])
-                found = guarded(lambda work=work: {"rows": work()})
-                failed = made | {what: "-", "failed": found.get("failed")}
-                kept = [row for row in result.get(key, []) if made.items() - row.items()]
-                result[key] = kept + found.get("rows", [failed])
-                print(json.dumps(result[key][-1]), flush=True)
-                save(result)
+                if key in options.only:
+                    known = {"particles": sheet(count, device).count, "formulation": formulation}
+                    work = partial(take, count, formulation, device, STEPS[kind], ROUNDS[kind])
+                    found = guarded(lambda work=work: {"rows": work()})
+                    failed = {what: "-", "failed": found.get("failed")}
+                    result[key] = [row for row in result.get(key, []) if known.items() - row.items()]
+                    for row in found.get("rows", [failed]):
+                        yield (key, known | {what: row[what]}), row.copy
+
+
+CASE = Case(
+    "Measure substeps in winds that differ from place to place, and a box of turbulence.",
+    rows,
+    (
+        numbers("--counts", "particles"),
+        names("--formulations", ("total", "updated")),
+        names("--only", ("box", *PARTS)),
+    ),
+    page="wind.md",
+)

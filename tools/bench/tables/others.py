@@ -34,6 +34,14 @@ table("live.md", "live.rates", "live_*", _rates, """
     a control shows after [ms] = {latency_ms:.0f}
     """, before="{source}\n\nReceived by one client on the same machine, without a browser.")  # fmt: skip
 
+table("live.md", "drawn.scenes", "drawn_*", "scenes", """
+    scene = {key} | Gaussians = {gaussians:,} | nodes = {nodes:,} | scene, once [MB] = {scene_bytes:.1f (MB)} |
+    KB a state = {state_bytes:.0f (KB)} | KB a picture = {jpeg_bytes:.0f (KB)} |
+    server, a state [ms] = {state_ms:.2g} | server, a picture [ms] = {jpeg_ms:.3g} |
+    pictures a second without a graphics card = {pictures_per_s:.1f} | steps a second meanwhile = {steps_per_s:.1f} |
+    at pixels = {picture}
+    """, before="{source}")  # fmt: skip
+
 table("web.md", "web.films", "web_*", "films", """
     film = {key} | Gaussians = {gaussians:,} | nodes = {nodes:,} | frames = {frames:,} | file [MB] = {bytes:.1f (MB)} |
     largest error [% of the size] = {error:.4f (%)} | pictures a second = {pictures_per_s:.1f}

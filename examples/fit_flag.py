@@ -1,7 +1,7 @@
 """Find the speed of a wind and the stiffness of a flag from the motion of the flag alone.
 
-``python tools/fit_flag.py``                     about a minute on one CPU core; exit code 1 if the error is over 2 %
-``python tools/fit_flag.py --json result.json``  also writes the result
+``python examples/fit_flag.py``                     about a minute on one CPU core; exit code 1 if the error is over 2 %
+``python examples/fit_flag.py --json result.json``  also writes the result
 
 A small flag, held at its pole side, is released in a steady wind of known direction. The positions of its particles
 are recorded at some frames, with noise like that of a camera. The fit then starts from wrong guesses of both numbers

@@ -1,6 +1,6 @@
 """Make a video for ``gaussian-swaying fit`` from a configuration of ``sim``: what its ``cameras`` see, with noise.
 
-``python tools/make_fit_video.py --config configs/sim/printed_flag.yaml --output videos/printed_flag``
+``python tools/datasets/make_fit_video.py --config configs/sim/printed_flag.yaml --output videos/printed_flag``
 
 The answer is then known, so one can see what a fit finds. It is an easier case than a real video: the model is right.
 """
@@ -11,9 +11,11 @@ import argparse
 import sys
 from pathlib import Path
 
-from bench.problems.films import write_video
-
 from gaussian_swaying.simulation.simulation import Simulation
+
+sys.path.insert(0, str(Path(__file__).parents[1]))
+
+from bench.problems.films import write_video
 
 
 def main(arguments: list[str] | None = None) -> int:

@@ -7,14 +7,13 @@ from pathlib import Path
 
 import pytest
 
-TOOL = Path(__file__).parents[2] / "tools/fit_flag.py"
+TOOL = Path(__file__).parents[2] / "examples/fit_flag.py"
 
 
 @pytest.fixture(scope="module")
 def tool():
     spec = importlib.util.spec_from_file_location("fit_flag", TOOL)
-    module = importlib.util.module_from_spec(spec)
-    sys.modules["fit_flag"] = module  # dataclasses look their module up
+    module = sys.modules["fit_flag"] = importlib.util.module_from_spec(spec)  # dataclasses look their module up
     spec.loader.exec_module(module)
     yield module
     del sys.modules["fit_flag"]

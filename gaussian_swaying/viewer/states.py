@@ -1,0 +1,97 @@
+"""Messages for a browser that draws a session itself: the Gaussians once, then the displaced nodes of each state.
+
+A message is the length of its head (uint32, little-endian), the head in JSON, and the bytes that the head describes.
+"""
+
+from __future__ import annotations
+
+import json
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from gaussian_swaying.recording.nodes import split_far
+from gaussian_swaying.rendering.shading import DiffuseShader
+from gaussian_swaying.simulation.painter import Painter
+from gaussian_swaying.simulation.simulated_scene import SimulatedScene
+from gaussian_swaying.viewer.film.page import pack_still
+from gaussian_swaying.viewer.film.recorded import film_of, look_of
+from gaussian_swaying.viewer.session import Snapshot
+
+
+def drawable(snapshot: Snapshot) -> bool:
+    """True if a browser can draw a snapshot: the Gaussians follow nodes, and the light is one that it knows."""
+    shader = snapshot.simulation.painter.shader
+    has_nodes = snapshot.simulation.scene.follow.nodes(snapshot.state) is not None
+    return has_nodes and (shader is None or isinstance(shader, DiffuseShader))
+
+
+@torch.inference_mode()
+def scene_message(snapshot: Snapshot, turn: Tensor) -> bytes:
+    """The Gaussians at rest and the nodes that move them, as in a film.
+
+    Args:
+        snapshot: A snapshot of the scene; see :func:`drawable`.
+        turn: Rotation from the scene to the axes of the browser's camera, shape (3, 3), float64.
+    """
+    simulation, state = snapshot.simulation, snapshot.state
+    nodes = simulation.scene.follow.nodes(state)
+    assert nodes is not None
+    film = film_of(simulation, getattr(state, "grid"), nodes, torch.zeros(0, len(nodes), 3), "scene")  # noqa: B009
+    blocks = pack_still(film)
+    world = film_from(simulation.scene, turn)
+    head = {"kind": "scene", "head": film.head, "splats": len(blocks["splats"]), "world": world.T.flatten().tolist()}
+    return message(head, blocks["splats"], blocks["nodes"])
+
+
+def film_from(scene: SimulatedScene, turn: Tensor) -> Tensor:
+    """The transformation of places from the axes of the browser's camera to a film, shape (4, 4), float64.
+
+    A film has the object's longest side as its unit, z up and the object's centre as its origin.
+    """
+    corners = torch.cat([torch.zeros(1, 3), torch.eye(3)]).double().to(scene.center.device)
+    size = scene.size * scene.frame.metres_per_unit
+    places = scene.frame.point_to_sim(corners @ turn.to(corners)).cpu() / size
+    found = torch.eye(4, dtype=torch.float64)
+    found[:3, 3] = places[0]
+    found[:3, :3] = (places[1:] - places[0]).T
+    return found
+
+
+def look_message(painter: Painter) -> bytes:
+    """Light and background, where they have changed since the scene."""
+    return message({"kind": "look", **look_of(painter)})
+
+
+@torch.inference_mode()
+def state_message(snapshot: Snapshot, ended: bool) -> bytes:
+    """The displacement of the nodes of a state: 6 bytes each, and 16 more for one that moved far.
+
+    Args:
+        snapshot: The snapshot.
+        ended: Whether no other state follows for now.
+    """
+    simulation, state = snapshot.simulation, snapshot.state
+    scene = simulation.scene
+    moved = scene.follow.nodal(state)
+    assert moved is not None
+    near, far = split_far(moved.float().numpy(force=True), 0.5 * scene.size * scene.frame.metres_per_unit)
+    head = {
+        "kind": "state",
+        "motion": snapshot.motion,
+        "time": snapshot.health.time,
+        "nodes": len(near),
+        "ended": ended,
+    }
+    return message(head, near.astype("<f2").tobytes(), far.astype("<i4").tobytes())
+
+
+def message(head: dict[str, Any], *blocks: bytes) -> bytes:
+    """A message with its head and its bytes."""
+    text = json.dumps(head).encode()
+    return b"".join([len(text).to_bytes(4, "little"), text, *blocks])
+
+
+OFF = message({"kind": "off"})
+"""Says that the server draws from now on."""

@@ -1,0 +1,218 @@
+"""Connections to the browsers that draw a session themselves, and the program with which they do."""
+
+from __future__ import annotations
+
+import asyncio
+import gzip
+import http
+import math
+import secrets
+import struct
+import threading
+import time
+from collections.abc import Callable
+from functools import lru_cache
+from typing import Any
+
+from torch import Tensor
+
+from gaussian_swaying._graphs import fingerprint
+from gaussian_swaying.viewer.film.page import PAGE
+from gaussian_swaying.viewer.session import Snapshot
+from gaussian_swaying.viewer.states import OFF, look_message, scene_message, state_message
+
+STATES, PROGRAM = "/states", "/player.js"  # paths
+TAGS = f'<script src="{PROGRAM}"></script><script>watchWind();</script>'
+AHEAD = 2  # messages that a browser may have before it confirms the first
+RECENT = 2.0  # s
+ANSWER = struct.Struct("<If")  # messages that a browser has taken in, and the pictures that it draws a second
+
+
+class Line:
+    """A connection to one browser."""
+
+    def __init__(self, connection: Any, loop: asyncio.AbstractEventLoop) -> None:
+        self._connection, self._loop = connection, loop
+        self._sent = self._taken = 0
+        self._first: int | None = None  # number of the message with the first state, since the browser draws
+        self._scene: tuple[Any, ...] | None = None  # what it knows
+        self._look: tuple[Any, ...] = ()
+        self._state: tuple[Any, ...] = ()
+        self._rate = (0.0, 0.0)  # pictures a second, and when the browser said so [s]
+
+    @property
+    def free(self) -> bool:
+        """True if the browser can take another message."""
+        return self._sent - self._taken < AHEAD
+
+    @property
+    def draws(self) -> bool:
+        """True once the browser draws."""
+        return self._first is not None and self._taken >= self._first
+
+    @property
+    def rate(self) -> float:
+        """Pictures that the browser draws a second, as it said within the last seconds."""
+        rate, said = self._rate
+        return rate if self.draws and time.monotonic() - said < RECENT else 0.0
+
+    def send(self, snapshot: Snapshot, ended: bool, scene: Callable[[Snapshot], tuple[tuple[Any, ...], bytes]]) -> bool:
+        """Send what the browser lacks of a snapshot; False if it lacks nothing, or has to take in more before.
+
+        Args:
+            snapshot: The snapshot.
+            ended: Whether no other follows for now.
+            scene: Gives the key and the message of its scene.
+        """
+        if not self.free:
+            return False
+        painter = snapshot.simulation.painter
+        look = (painter.shader, painter.background)
+        key, made = scene(snapshot)
+        if self._scene is None or key != self._scene:
+            self._scene, self._look, self._state = key, look, ()
+            self._put(made)
+            return True
+        if any(known is not now for known, now in zip(self._look, look, strict=True)):
+            self._look = look
+            self._put(look_message(painter))
+            return True
+        if self._state == (snapshot.number, ended):
+            return False
+        self._state = (snapshot.number, ended)
+        self._put(state_message(snapshot, ended))
+        if self._first is None:
+            self._first = self._sent
+        return True
+
+    def stop(self) -> None:
+        """Tell the browser that the server draws from now on."""
+        if self._first is not None:
+            self._first = self._scene = None
+            self._put(OFF)
+
+    def take(self, raw: Any) -> bool:
+        """Take an answer of the browser; False if it is none."""
+        if not isinstance(raw, bytes) or len(raw) != ANSWER.size:
+            return False
+        taken, rate = ANSWER.unpack(raw)
+        if not (self._taken < taken <= self._sent and math.isfinite(rate) and 0 <= rate <= 1000):
+            return False
+        self._taken, self._rate = taken, (rate, time.monotonic())
+        return True
+
+    def _put(self, data: bytes) -> None:
+        self._sent += 1
+        asyncio.run_coroutine_threadsafe(self._connection.send(data), self._loop)
+
+
+class Streams:
+    """The connections of all browsers that draw.
+
+    A browser that viser knows gets a key, with which its program opens a connection of its own.
+    """
+
+    def __init__(self) -> None:
+        self._lines: dict[str, Line | None] = {}
+        self._known: tuple[tuple[Any, ...], bytes] | None = None  # the scene that was asked for last
+        self._making = threading.Lock()
+
+    def expect(self) -> str:
+        """A key for another browser."""
+        key = secrets.token_urlsafe(16)
+        self._lines[key] = None
+        return key
+
+    def forget(self, key: str) -> None:
+        """End what belongs to a key."""
+        self._lines.pop(key, None)
+
+    def line(self, key: str) -> Line | None:
+        """The connection that was opened with a key, or None."""
+        return self._lines.get(key)
+
+    def rate(self) -> float:
+        """Pictures a second of the browser that draws most."""
+        return max((line.rate for line in list(self._lines.values()) if line is not None), default=0.0)
+
+    def scene(self, snapshot: Snapshot, turn: Tensor) -> tuple[tuple[Any, ...], bytes]:
+        """Key and message of the scene of a snapshot; the same for all browsers. See :func:`.states.scene_message`."""
+        key = (snapshot.simulation, fingerprint([snapshot.simulation.scene]))
+        with self._making:
+            if self._known is None or self._known[0] != key:
+                self._known = (key, scene_message(snapshot, turn))
+            return self._known
+
+    def beside(self, handler: Callable[[Any], Any]) -> Callable[[Any], Any]:
+        """The handler of all connections: those for states, and those of viser, which gets ``handler``."""
+
+        async def handle(connection: Any) -> None:
+            asked, _, query = connection.request.path.partition("?")
+            if asked != STATES:
+                await handler(connection)
+                return
+            key = query.removeprefix("key=")
+            if key in self._lines:
+                await self._serve(key, connection)
+            else:
+                await connection.close(1008, "unknown key")
+
+        return handle
+
+    async def _serve(self, key: str, connection: Any) -> None:
+        """Listen to a browser until it is gone, or sends what it cannot have sent."""
+        from websockets.exceptions import ConnectionClosed
+
+        connection.protocol.max_message_size = ANSWER.size
+        line = self._lines[key] = Line(connection, asyncio.get_running_loop())
+        try:
+            while key in self._lines and line.take(await connection.recv()):
+                pass
+            await connection.close(1008, "not an answer")
+        except ConnectionClosed:
+            pass
+        finally:
+            if self._lines.get(key) is line:
+                self._lines[key] = None
+
+
+def with_program(process_request: Callable[[Any, Any], Any]) -> Callable[[Any, Any], Any]:
+    """Answers as those of viser, with the program in its page."""
+
+    def process(connection: Any, request: Any) -> Any:
+        asked = request.path.partition("?")[0]
+        if asked == PROGRAM and request.headers.get("Upgrade") != "websocket":
+            zipped = "gzip" in request.headers.get("Accept-Encoding", "")
+            response = connection.respond(http.HTTPStatus.OK, "")
+            return _filled(response, _program(zipped), "application/javascript", zipped)
+        response = process_request(connection, request)
+        if response is not None and response.headers.get("Content-Type", "").startswith("text/html"):
+            zipped = response.headers.get("Content-Encoding") == "gzip"
+            _filled(response, _with_tags(response.body, zipped), "text/html; charset=utf-8", zipped)
+        return response
+
+    return process
+
+
+def _filled(response: Any, body: bytes, kind: str, zipped: bool) -> Any:
+    """An answer with another content."""
+    response.body = body
+    for name in ("Content-Type", "Content-Length", "Content-Encoding"):
+        if name in response.headers:
+            del response.headers[name]
+    response.headers["Content-Type"] = kind
+    response.headers["Content-Length"] = str(len(body))
+    response.headers["Content-Encoding"] = "gzip" if zipped else "identity"
+    return response
+
+
+@lru_cache
+def _program(zipped: bool) -> bytes:
+    code = (PAGE / "film.min.js").read_bytes()
+    return gzip.compress(code) if zipped else code
+
+
+@lru_cache(2)
+def _with_tags(body: bytes, zipped: bool) -> bytes:
+    text = (gzip.decompress(body) if zipped else body).replace(b"<head>", b"<head>" + TAGS.encode(), 1)
+    return gzip.compress(text) if zipped else text

@@ -1,0 +1,39 @@
+"""What tests of several rooms share: draws, the files of a folder, and how a command refuses."""
+
+import torch
+
+
+def unit(*shape, device="cpu", dtype=torch.float64):
+    """Random unit vectors or quaternions."""
+    return torch.nn.functional.normalize(torch.randn(*shape, device=device, dtype=dtype), dim=-1)
+
+
+def gradients(count, device="cpu", dtype=torch.float64):
+    """Deformation gradients of both orientations, none of them near singular."""
+    f = torch.eye(3, dtype=torch.float64) + 0.3 * torch.randn(count, 3, 3, dtype=torch.float64)
+    f = f[torch.linalg.det(f).abs() > 0.2]
+    assert len(f) > 4
+    f[0] = torch.diag(torch.tensor([1.0, -1.0, 1.0]))
+    return f.to(device, dtype)
+
+
+def contents(folder):
+    """The bytes of each file of a folder, None for what is none."""
+    return {path: path.read_bytes() if path.is_file() else None for path in folder.rglob("*")}
+
+
+def refused(main, arguments, capsys, *words, folder=None):
+    """A command ends with code 2 and one sentence that has the words, and changes nothing in a folder."""
+    capsys.readouterr()
+    before = folder and contents(folder)
+    try:
+        code = main(arguments)
+    except SystemExit as stop:
+        code = stop.code
+    error = capsys.readouterr().err
+    assert (code, error.count("\n")) == (2, 1), error
+    assert error.startswith("error: ")
+    assert "Traceback" not in error
+    for word in words:
+        assert word in error, error
+    assert (folder and contents(folder)) == before

@@ -1,0 +1,303 @@
+"""The live page draws in a real browser, from the states that it gets."""
+
+import io
+import time
+
+import numpy as np
+import pytest
+import torch
+
+pytest.importorskip("viser", reason="needs the extra [viewer]")
+from gaussian_swaying.viewer.film.page import PAGE
+
+from .conftest import FLAGS
+
+
+@pytest.fixture(scope="module")
+def blank(browser):
+    """A page with the program, and nothing to draw."""
+    page = browser.new_page()
+    page.add_script_tag(path=PAGE / "film.min.js")
+    yield page
+    page.close()
+
+
+@pytest.fixture
+def open_window(browser, page):
+    """Opens the live page; what it logs is in ``problems``."""
+    opened = []
+
+    def open_window(before="", wait=True):
+        window = browser.new_page(viewport={"width": 640, "height": 480})
+        opened.append(window)
+        window.set_default_timeout(90_000)  # a browser that draws without a GPU is slow on a busy machine
+        window.problems = []
+        window.on("pageerror", lambda error: window.problems.append(str(error)))
+        if before:
+            window.add_init_script(before)
+        window.add_init_script("addEventListener('DOMContentLoaded', () => (wind.patience = 1e9))")
+        window.goto(page.url)
+        if wait:
+            window.wait_for_function("wind.on && wind.drawing.ready")
+        return window
+
+    yield open_window
+    for window in opened:
+        window.close()
+
+
+PLAY = """([arrivals, until, ended]) => {
+    // states (arrival, time), and pictures at 60 a second: clock, shown time, newest time, and the state in between
+    const playback = new Playback(), seen = [];
+    let next = 0;
+    for (let now = 0; now < until; now += 1 / 60) {
+        for (; next < arrivals.length && arrivals[next][0] <= now; next++)
+            playback.add({ time: arrivals[next][1] }, arrivals[next][0], ended && next === arrivals.length - 1);
+        const shown = playback.advance(now);
+        if (shown === null) continue;
+        const [from, to, weight] = playback.between();
+        seen.push([now, shown, playback.newest, from.time + weight * (to.time - from.time), playback.states.length]);
+    }
+    return seen;
+}"""
+
+
+def _play(blank, arrivals, seconds, ended=False):
+    """Clock, shown time, newest time, mixed time of the pictures, each an array; always in order and never ahead."""
+    now, shown, newest, mixed, states = np.array(blank.evaluate(PLAY, [arrivals, seconds, ended])).T
+    assert (shown <= newest).all()
+    assert (np.diff(shown) >= 0).all()
+    assert np.abs(shown - mixed).max() < 1e-9
+    assert states.max() <= 64
+    return now, shown, newest
+
+
+def test_motion_is_smooth_between_states(blank):
+    """25 states a second: all pictures differ, by what passed, and lag behind by less than two states."""
+    arrivals = [[0.04 * k, 0.04 * k] for k in range(100)]
+    now, shown, newest = _play(blank, arrivals, 4)
+    late = now > 1
+    assert np.diff(shown[late]) == pytest.approx(1 / 60, rel=0.02)
+    assert (newest - shown)[late].max() < 0.08
+
+
+def test_a_slow_simulation_is_shown_slowly_and_smoothly(blank):
+    """Four states a second of 5 ms each: 60 pictures a second, none of which stands still."""
+    arrivals = [[0.25 * k, 0.005 * k] for k in range(40)]
+    now, shown, _ = _play(blank, arrivals, 10)
+    steps = np.diff(shown[now > 2])
+    assert steps.min() > 0.7 * 0.02 / 60
+    assert steps.max() < 1.3 * 0.02 / 60
+
+
+def test_states_that_come_irregularly_are_shown_evenly(blank):
+    rng = np.random.default_rng(1)
+    arrivals = [[0.04 * k + 0.03 * float(rng.random()), 0.04 * k] for k in range(250)]
+    now, shown, _ = _play(blank, arrivals, 10)
+    steps = np.diff(shown[now > 2])
+    assert steps.min() > 0.5 / 60
+    assert steps.max() < 1.6 / 60
+
+
+def test_a_simulation_that_stalls_is_waited_for(blank):
+    arrivals = [[0.04 * k + (1.5 if k >= 50 else 0), 0.04 * k] for k in range(150)]
+    now, shown, newest = _play(blank, arrivals, 7.4)
+    stalled = (now > 2.5) & (now < 3.4)
+    assert (shown == newest)[stalled].all()
+    assert (newest - shown)[-1] < 0.3
+
+
+def test_a_pause_shows_the_last_state(blank):
+    arrivals = [[0.04 * k, 0.04 * k] for k in range(50)]
+    _, shown, newest = _play(blank, arrivals, 2.5, ended=True)
+    assert shown[-1] == newest[-1] == pytest.approx(1.96)
+
+
+def test_after_a_pause_it_goes_on_at_its_speed(blank):
+    """The pause says nothing about how fast the simulation runs."""
+    told = blank.evaluate("""() => {
+        const playback = new Playback();
+        const run = (begin, first, count) => {
+            for (let k = 0; k < count; k++) {
+                playback.add({ time: 0.04 * (first + k) }, begin + 0.04 * k, k === count - 1);
+                playback.advance(begin + 0.04 * k + 0.02);
+            }
+        };
+        run(0, 0, 50);
+        playback.advance(9.99);
+        const end = playback.shown;
+        run(10, 50, 4);
+        return [end, playback.speed, playback.shown];
+    }""")
+    assert told[0] == pytest.approx(1.96)
+    assert told[1] == pytest.approx(1.0)
+    assert 1.96 < told[2] <= 2.12
+
+
+def test_a_reset_forgets_what_was_there(blank):
+    told = blank.evaluate("""() => {
+        const playback = new Playback();
+        for (let k = 0; k < 20; k++) playback.add({ time: 0.04 * k }, 0.04 * k), playback.advance(0.04 * k);
+        const before = playback.shown;
+        playback.add({ time: 0 }, 1);
+        return [before, playback.advance(1.01), playback.states.length];
+    }""")
+    assert told[0] > 0.5
+    assert told[1:] == [0, 1]
+
+
+def test_what_was_missed_while_the_window_was_hidden_is_skipped(blank):
+    told = blank.evaluate("""() => {
+        const playback = new Playback();
+        let now = 0;
+        for (let k = 0; k < 500; k++) {
+            playback.add({ time: 0.04 * k }, (now = 0.04 * k));
+            if (now < 2 || now > 15) playback.advance(now);
+        }
+        return [playback.shown, playback.newest, playback.states.length];
+    }""")
+    assert told[1] - told[0] < 0.2
+    assert told[2] < 10
+
+
+def test_a_state_with_the_same_time_replaces_the_last(blank):
+    """As after a change of the material while paused."""
+    told = blank.evaluate("""() => {
+        const playback = new Playback();
+        playback.add({ time: 0.04, name: "old" }, 0, true);
+        playback.add({ time: 0.04, name: "new" }, 5, true);
+        playback.advance(6);
+        return playback.between()[0].name;
+    }""")
+    assert told == "new"
+
+
+def _centres(window):
+    window.wait_for_function("wind.left === 0 && wind.drawing.sorted")
+    return torch.tensor(window.evaluate("Array.from(wind.positions())"), dtype=torch.float64).reshape(-1, 3)
+
+
+def _picture(window):
+    import imageio.v3 as iio
+
+    clip = {"x": 0, "y": 200, "width": 300, "height": 280}  # beside the controls and below what viser tells
+    return iio.imread(io.BytesIO(window.screenshot(clip=clip)))[..., :3].astype(float)
+
+
+def test_the_canvas_shows_the_state_as_the_server_draws_it(page, open_window, until):
+    """Centres from the GPU, and the picture, of a paused flag, from another side than at first."""
+    session, window = page.session, open_window()
+    until(lambda: session.snapshot.health.time > 0.2)
+    session.pause()
+    with page.server.atomic():
+        for client in page.server.get_clients().values():
+            client.camera.position = client.camera.position + np.array([0.3, 0.1, 0.2])
+    time.sleep(1.0)
+    window.wait_for_function(f"wind.playback.shown === {session.snapshot.health.time}")
+    snapshot = session.snapshot
+    scene = snapshot.simulation.scene
+    size = scene.size * scene.frame.metres_per_unit
+    expected = scene.frame.point_to_sim(scene.deformed(snapshot.state).means.double()) / size
+    assert float((_centres(window) - expected).norm(dim=-1).max()) < 1e-3  # of the object's size
+    assert float((expected - scene.frame.point_to_sim(scene.rest().means.double()) / size).abs().max()) > 0.02
+    there = _picture(window)
+    assert there.std() > 20
+    page.largest = 1000
+    page.by_browser = False
+    page.redraw()
+    window.wait_for_function("!wind.on")
+    until(lambda: 10 * np.log10(255**2 / np.mean((_picture(window) - there) ** 2)) > 28)
+    page.by_browser = True
+    page.redraw()
+    window.wait_for_function("wind.on && wind.left === 0 && wind.drawing.sorted")
+    until(lambda: np.abs(_picture(window) - there).max() < 3)
+    assert window.problems == []
+
+
+def test_pictures_change_between_states_and_never_show_the_future(page, open_window, until):
+    """The simulation gives few states a second; the time that is shown rises from picture to picture."""
+    session, window = page.session, open_window()
+    session.pace(0.02)
+    until(lambda: session.rates().real_time < 0.05)
+    window.evaluate("""() => {
+        window.seen = [];
+        const look = () => {
+            const { playback } = wind;
+            if (wind.on) seen.push([playback.shown, playback.newest, wind.motion]);
+            requestAnimationFrame(look);
+        };
+        look();
+    }""")
+    window.wait_for_function("new Set(seen.map((each) => each[1])).size > 6")
+    drawn = window.evaluate("""async () => {
+        // two pictures with the same newest state
+        const read = async () => {
+            await new Promise((resolve) => requestAnimationFrame(resolve));
+            const { canvas } = wind.above;
+            return [wind.playback.newest, wind.playback.shown, wind.together(canvas).toDataURL()];
+        };
+        for (;;) {
+            const first = await read();
+            await new Promise((resolve) => setTimeout(resolve, 100));
+            const second = await read();
+            if (first[0] === second[0] && first[1] < second[1]) return first[2] !== second[2];
+        }
+    }""")
+    assert drawn
+    session.reset()
+    window.wait_for_function("seen[seen.length - 1][2] > seen[0][2] && wind.playback.newest > 0")
+    shown, newest, motion = np.array(window.evaluate("seen")).T
+    assert (shown <= newest).all()
+    begun = np.diff(motion) > 0
+    assert begun.sum() == 1
+    assert (np.diff(shown)[~begun] >= 0).all()
+    assert len(np.unique(shown)) > 2 * len(np.unique(newest))
+    assert window.problems == []
+
+
+def test_light_and_scene_follow_the_session(page, open_window, until):
+    session, window = page.session, open_window()
+    session.change({"background": [1.0, 0.0, 0.0]})
+    until(lambda: _picture(window)[-1, 0].tolist() == [255, 0, 0])
+    session.change({"solver.dx": 0.09})
+    cell = "Math.abs(wind.scene?.cell * wind.scene?.metre ** -1 - 0.09) < 1e-6"
+    window.wait_for_function(f"wind.on && {cell} && wind.drawing.ready")
+    until(lambda: _picture(window).std() > 20)
+    assert window.problems == []
+
+
+SMALL_TEXTURES = """
+    const ask = WebGL2RenderingContext.prototype.getParameter;
+    WebGL2RenderingContext.prototype.getParameter = function (name) {
+        return name === WebGL2RenderingContext.MAX_ARRAY_TEXTURE_LAYERS ? 2 : ask.call(this, name);
+    };
+"""
+
+
+@pytest.mark.parametrize("way", ["small textures", "slow"])
+def test_a_browser_that_cannot_draw_gets_pictures(page, open_window, until, way):
+    if way == "slow":
+        window = open_window()
+        window.evaluate("Object.assign(wind, { slow: 1e9, patience: 0.5 })")
+        window.wait_for_function("wind.failed?.startsWith('this browser draws slowly') && !wind.on")
+    else:
+        window = open_window(SMALL_TEXTURES, wait=False)
+        window.wait_for_function("wind.failed === 'the scene is too large for the textures of this browser'")
+    until(lambda: len(page.server.get_clients()) == 1)
+    (sent,) = page._drawn.values()
+    count = len(sent)
+    until(lambda: len(sent) > count + 3)
+    until(lambda: _picture(window).std() > 20)
+    before = _picture(window)
+    until(lambda: np.abs(_picture(window) - before).max() > 20)
+    assert window.problems == []
+
+
+def test_without_webgl_the_page_says_what_it_needs(page, chromium, browser):
+    started = browser.browser_type.launch(
+        executable_path=chromium, args=[*FLAGS[:2], "--disable-gpu", "--disable-3d-apis"]
+    )
+    window = started.new_page()
+    window.goto(page.url)
+    window.get_by_text("This page needs WebGL2").wait_for(timeout=60_000)
+    started.close()

@@ -1,0 +1,99 @@
+"""The messages with which a browser draws a session."""
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import torch
+
+from gaussian_swaying.gaussians.ply import write_ply
+from gaussian_swaying.recording.nodes import join_far
+from gaussian_swaying.scenes.procedural import FlagScene
+from gaussian_swaying.viewer.film.page import pack_still
+from gaussian_swaying.viewer.film.recorded import film_of
+from gaussian_swaying.viewer.session import Session
+from gaussian_swaying.viewer.states import drawable, film_from, message, scene_message, state_message
+
+
+def read(raw):
+    """Head and bytes of a message."""
+    size = int.from_bytes(raw[:4], "little")
+    return json.loads(raw[4 : 4 + size]), raw[4 + size :]
+
+
+def nodal(raw):
+    """The displacement in the message of a state, as the page reads it."""
+    head, rest = read(raw)
+    near = np.frombuffer(rest[: 6 * head["nodes"]], "<f2").reshape(-1, 3)
+    return join_far(near, np.frombuffer(rest[6 * head["nodes"] :], "<i4").reshape(-1, 4))
+
+
+def test_a_state_is_the_displacement_of_the_nodes(session, until):
+    session.start()
+    until(lambda: session.snapshot.health.time > 0.1)
+    session.pause()
+    snapshot = session.wait(-1, 0)
+    scene, moved = snapshot.simulation.scene, snapshot.simulation.scene.follow.nodal(snapshot.state).numpy()
+    raw = state_message(snapshot, True)
+    head, _ = read(raw)
+    assert head == {
+        "kind": "state",
+        "motion": 1,
+        "time": snapshot.health.time,
+        "nodes": len(moved),
+        "ended": True,
+    }
+    size = scene.size * scene.frame.metres_per_unit
+    assert np.abs(nodal(raw) - moved).max() <= 2**-12 * size
+    assert np.abs(moved).max() > 0.01 * size
+    assert 6 * len(moved) < len(raw) < 6 * len(moved) + 16 * len(moved) // 20 + 200
+
+
+def test_a_scene_is_a_film_without_frames(session):
+    snapshot = session.snapshot
+    simulation, state = snapshot.simulation, snapshot.state
+    nodes = simulation.scene.follow.nodes(state)
+    film = film_of(simulation, state.grid, nodes, torch.zeros(0, len(nodes), 3), "scene")
+    head, rest = read(scene_message(snapshot, torch.eye(3).double()))
+    blocks = pack_still(film)
+    assert head["head"] == film.head
+    assert rest[: head["splats"]] == blocks["splats"]
+    assert rest[head["splats"] :] == blocks["nodes"]
+
+
+def test_the_camera_finds_the_gaussians_in_any_scene(parser, settings, tmp_path):
+    """Places in the axes of the browser's camera are those of the film: of a scene in other units, with another up."""
+    splat = tmp_path / "flag.ply"
+    cloud = FlagScene(width=0.6, height=0.6, spacing=0.05).generate()
+    turned = torch.tensor([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])
+    write_ply(splat, replace(cloud, means=7 * cloud.means @ turned.T + 3))
+    given = ["--scene.generator=null", f"--scene.ply={splat}", "--scene.up=[0,-1,0]", "--scene.metres_per_unit=0.25"]
+    given = [*given, "--solver.boundaries=[]", "--solver.dx=0.2", "--device=cpu"]
+    session = Session(parser, parser.parse_args(given))
+    snapshot = session.snapshot
+    simulation = snapshot.simulation
+    nodes = simulation.scene.follow.nodes(snapshot.state)
+    film = film_of(simulation, snapshot.state.grid, nodes, torch.zeros(0, len(nodes), 3), "scene")
+    turn = torch.tensor([[0.0, 0, -1], [0, -1, 0], [-1, 0, 0]], dtype=torch.float64)
+    world = film_from(simulation.scene, turn)
+    seen = simulation.scene.model.means.double() @ turn.T
+    assert torch.allclose(seen @ world[:3, :3].T + world[:3, 3], torch.from_numpy(film.position).double(), atol=1e-5)
+    head, _ = read(scene_message(snapshot, turn))
+    assert np.allclose(np.array(head["world"]).reshape(4, 4).T, world.numpy(), atol=1e-12)  # three.js has columns
+
+
+def test_what_a_browser_cannot_draw_is_drawn_here(parser, settings, session):
+    assert drawable(session.snapshot)
+    light = {"light": [0.0, -1.0, 0.0]}
+    session.settings.shader = None
+    for shader, good in (("PhongShader", False), ("DiffuseShader", True)):
+        session._change({"shader": {"class_path": shader, "init_args": light}})
+        assert drawable(session.snapshot) is good
+    session._change({"shader": None})
+    assert drawable(session.snapshot)
+    session._change({"solver.formulation": "updated"})
+    assert not drawable(session.snapshot)
+
+
+def test_a_message_has_a_head_and_bytes():
+    assert read(message({"kind": "ü"}, b"ab", b"c")) == ({"kind": "ü"}, b"abc")

@@ -1,0 +1,214 @@
+"""Connections of browsers that draw themselves: who gets one, what is sent, and what they may answer."""
+
+import gzip
+import json
+import struct
+import time
+import urllib.error
+import urllib.request
+
+import pytest
+
+pytest.importorskip("viser", reason="needs the extra [viewer]")
+from websockets.exceptions import ConnectionClosed
+from websockets.sync.client import connect as connect_socket
+
+from gaussian_swaying.viewer.streams import ANSWER
+
+
+class Drawer:
+    """A browser that draws, without a browser: it confirms what it gets."""
+
+    def __init__(self, page, key, **options):
+        address = f"{page.url.split('/?')[0].replace('http', 'ws')}/states?key={key}"
+        self.socket = connect_socket(address, max_size=None, close_timeout=1, ping_interval=None, **options)
+        self.count = 0
+
+    def get(self, timeout=20):
+        """The head of the next message."""
+        raw = self.socket.recv(timeout=timeout)
+        self.count += 1
+        return json.loads(raw[4 : 4 + int.from_bytes(raw[:4], "little")])
+
+    def answer(self, rate=30.0):
+        self.socket.send(ANSWER.pack(self.count, rate))
+
+    def wait(self, kind, seconds=30, **wanted):
+        """Take messages in until one of a kind comes, with these values."""
+        end = time.monotonic() + seconds
+        while time.monotonic() < end:
+            head = self.get()
+            self.answer()
+            if head["kind"] == kind and wanted.items() <= head.items():
+                return head
+        raise AssertionError(f"there was no {kind}")
+
+
+@pytest.fixture
+def drawer(page, connect, until):
+    """One, of a browser that viser knows."""
+    known = connect(page)
+    until(lambda: len(page.streams._lines) == 1)
+    made = Drawer(page, next(iter(page.streams._lines)))
+    made.known = known
+    yield made
+    made.socket.close()
+
+
+def _closed(socket):
+    """Code with which the server closes a connection."""
+    try:
+        while True:
+            socket.recv(timeout=20)
+    except ConnectionClosed as error:
+        return error.rcvd.code
+
+
+def test_the_scene_comes_once_and_then_states_that_rise(page, drawer):
+    assert drawer.get()["kind"] == "scene"
+    drawer.answer()
+    times = []
+    while len(times) < 6:
+        head = drawer.get()
+        drawer.answer()
+        assert head["kind"] == "state"
+        times.append(head["time"])
+    assert times == sorted(set(times))
+
+
+def test_who_confirms_nothing_gets_no_more(page, drawer, until):
+    """Nothing piles up; what comes after the answer is new."""
+    assert [drawer.get()["kind"] for _ in range(2)] == ["scene", "state"]
+    until(lambda: page.session.snapshot.health.time > 0.15)
+    with pytest.raises(TimeoutError):
+        drawer.socket.recv(timeout=0.3)
+    drawer.answer()
+    assert drawer.get()["time"] > 0.1
+
+
+def test_a_browser_that_draws_gets_no_pictures(page, drawer, until):
+    """Until it shows what it cannot draw, or what it shows is recorded."""
+    client = next(iter(page.server.get_clients().values()))
+    drawer.wait("state")
+    until(lambda: drawer.wait("state") and page.streams.rate() == 30)
+    assert page.pictures_per_second() == 30
+
+    def pictures():
+        before = len(page._drawn[client.client_id])
+        end = time.monotonic() + 0.6
+        while time.monotonic() < end:
+            try:
+                drawer.get(0.1)
+            except TimeoutError:
+                continue
+            drawer.answer()
+        return len(page._drawn[client.client_id]) - before
+
+    assert pictures() == 0
+    for begin, end in (
+        (lambda: setattr(page, "shown", "normals"), lambda: setattr(page, "shown", "colour")),
+        (lambda: setattr(page, "streaks", True), lambda: setattr(page, "streaks", False)),
+        (lambda: setattr(page, "by_browser", False), lambda: setattr(page, "by_browser", True)),
+    ):
+        begin()
+        page.redraw()
+        drawer.wait("off")
+        until(lambda: pictures() > 0)
+        end()
+        page.redraw()
+        drawer.wait("scene")
+        drawer.wait("state")
+    assert pictures() == 0
+
+
+def test_changes_come_as_what_they_are(page, drawer):
+    """Light alone; another motion after a reset; the end of a pause; another scene."""
+    session = page.session
+    first = drawer.wait("state")
+    session.change({"background": [0.0, 0.0, 1.0]})
+    assert drawer.wait("look")["background"] == [0.0, 0.0, 1.0]
+    session.reset()
+    again = drawer.wait("state", motion=first["motion"] + 1)
+    assert again["time"] < 0.2
+    session.pause()
+    paused = drawer.wait("state", ended=True)
+    session.change({"solver.dx": 0.09})
+    assert drawer.wait("scene")["head"]["cell"] < 0.1
+    last = drawer.wait("state", ended=True)
+    assert (last["time"], last["motion"]) == (0.0, paused["motion"] + 1)
+
+
+@pytest.mark.parametrize(
+    "answer",
+    [
+        "text",
+        b"",
+        b"\0" * (ANSWER.size - 1),
+        ANSWER.pack(0, 30.0),
+        ANSWER.pack(99, 30.0),
+        ANSWER.pack(1, float("nan")),
+        ANSWER.pack(1, -1.0),
+        ANSWER.pack(1, 1e9),
+    ],
+)
+def test_what_is_no_answer_ends_the_connection(page, drawer, answer):
+    drawer.get()
+    drawer.socket.send(answer)
+    assert _closed(drawer.socket) == 1008
+
+
+def test_a_large_message_is_not_read(page, drawer):
+    drawer.get()
+    drawer.socket.send(b"\0" * 1_000_000)
+    assert _closed(drawer.socket) == 1009
+
+
+def test_only_a_browser_that_viser_knows_gets_states(page, drawer, until):
+    for key in ("", "guess", "%00", "[//["):
+        assert _closed(Drawer(page, key).socket) == 1008
+    assert drawer.wait("state")
+    drawer.known.close()
+    until(lambda: not page.streams._lines)
+    with pytest.raises(ConnectionClosed):
+        drawer.wait("another one")
+
+
+def test_another_connection_with_the_key_takes_over(page, drawer):
+    drawer.wait("state")
+    other = Drawer(page, next(iter(page.streams._lines)))
+    assert other.wait("state")
+    other.socket.close()
+
+
+def test_states_are_for_pages_of_this_program_only(page, drawer):
+    with pytest.raises(Exception, match="403"):
+        Drawer(page, next(iter(page.streams._lines)), origin="https://evil.example")
+
+
+@pytest.mark.parametrize("zipped", [False, True])
+def test_the_page_starts_the_program(page, zipped):
+    def ask(path):
+        headers = {"Accept-Encoding": "gzip"} if zipped else {}
+        answer = urllib.request.urlopen(urllib.request.Request(page.url + path, headers=headers), timeout=10)
+        body = answer.read()
+        assert int(answer.headers["Content-Length"]) == len(body)
+        assert (answer.headers["Content-Encoding"] == "gzip") is zipped
+        assert answer.headers["X-Frame-Options"] == "DENY"
+        return answer.headers["Content-Type"], (gzip.decompress(body) if zipped else body).decode()
+
+    kind, text = ask("/")
+    assert kind.startswith("text/html")
+    assert text.index('<script src="/player.js">') < text.index("<script", text.index("watchWind"))
+    kind, program = ask("/player.js?x=1")
+    assert kind == "application/javascript"
+    assert program.startswith("// Made by tools/player")
+    with pytest.raises(urllib.error.HTTPError, match="403"):
+        urllib.request.urlopen(
+            urllib.request.Request(page.url + "/player.js", headers={"Host": "evil.example"}), timeout=10
+        )
+
+
+def test_an_answer_has_eight_bytes():
+    """As the page writes them: a count and a float32, little-endian."""
+    assert ANSWER.size == 8
+    assert ANSWER.unpack(struct.pack("<I", 7) + struct.pack("<f", 1.5)) == (7, 1.5)
