@@ -12,8 +12,8 @@ import torch
 from torch import Tensor, nn
 
 from gaussian_swaying._checks import check_positive, check_vector
-from gaussian_swaying._graphs import Recordable
 from gaussian_swaying.geometry.frame import SimFrame
+from gaussian_swaying.kernels.graphs import Recordable
 from gaussian_swaying.mpm.twins import Numbers, Twin, Twinned
 
 

@@ -26,11 +26,11 @@ from gaussian_swaying._checks import (
     number_of,
     requires_grad,
 )
-from gaussian_swaying._graphs import Recordable
 from gaussian_swaying.aero.effects import Moment, WindEffect
 from gaussian_swaying.aero.lookup import picked
 from gaussian_swaying.aero.wind_files import read_anemometer
 from gaussian_swaying.geometry.frame import SimFrame
+from gaussian_swaying.kernels.graphs import Recordable
 
 
 def _signed(value: int) -> int:

@@ -9,8 +9,8 @@ from copy import copy
 import torch
 from torch import Tensor, nn
 
-from gaussian_swaying._graphs import Recordable
 from gaussian_swaying.aero.wind import GaussianGust, Modulation, SineSway, UniformGust, WindField
+from gaussian_swaying.kernels.graphs import Recordable
 
 NUMBERS: dict[type[Modulation], dict[str, bool]] = {
     SineSway: {"amplitude": False, "period": False, "phase": False},

@@ -11,7 +11,6 @@ import torch
 from torch import Tensor, nn
 
 from gaussian_swaying._checks import check_shape
-from gaussian_swaying._graphs import fingerprint, record, tensors_in
 from gaussian_swaying.aero.effects import Moment
 from gaussian_swaying.aero.force import LAWS, AeroForce, capped_area
 from gaussian_swaying.aero.patches import Patches, PatchSums
@@ -19,6 +18,7 @@ from gaussian_swaying.aero.shelter import Shelter, wind_axes
 from gaussian_swaying.aero.wind import SpatialWind, WindField
 from gaussian_swaying.aero.wind_batch import WindBatch
 from gaussian_swaying.geometry.patches import compiles, deform_patch
+from gaussian_swaying.kernels.graphs import fingerprint, record, tensors_in
 from gaussian_swaying.mpm.forces import MOST_STEPS, Force, Given
 from gaussian_swaying.mpm.state import State
 from gaussian_swaying.mpm.twins import Numbers, Twin

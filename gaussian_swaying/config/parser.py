@@ -133,7 +133,7 @@ def build_parser(schema: type) -> ArgumentParser:
     parser.add_class_arguments(schema, skip={*groups, *PYTHON_ONLY})
     for name, (kind, replaced) in CUSTOM.items():
         text = f"A {kind.__name__} of your own by its class path, in place of `{replaced}`; null for none."
-        parser.add_argument(f"--{name}", type=Optional[kind], default=None, help=text)
+        parser.add_argument(f"--{name}", type=Optional[kind], default=None, help=text)  # noqa: UP045
     return parser
 
 

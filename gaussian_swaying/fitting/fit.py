@@ -265,7 +265,7 @@ class Fit:
             floors = {part.kind: part.floor for part in evidence}
             while not progress.done and progress.iteration < self.plan.iterations:
                 close = (TOLERANCE, LEAST_GAIN) if last else (ROUGH * TOLERANCE, ROUGH * LEAST_GAIN)
-                iterate(residuals, lambda blocks: scales_of(blocks, floors), progress, *close)
+                iterate(residuals, lambda blocks: scales_of(blocks, floors), progress, *close)  # noqa: B023
                 course.place, course.damping = progress.place.tolist(), progress.damping
                 course.iteration, course.ended = progress.iteration, progress.done
                 course.seconds = time.monotonic() - clock

@@ -242,10 +242,10 @@ class Emitter:
             a, b = (self.convert(block, self.real) for block in (a, b))
         builder = self.builder
         if a.floating:
-            made = {"+": builder.fadd, "-": builder.fsub, "*": builder.fmul, "/": builder.fdiv}
-            if sign not in made:
+            signs = {"+": builder.fadd, "-": builder.fsub, "*": builder.fmul, "/": builder.fdiv}
+            if sign not in signs:
                 raise TranslationError(f"floating point numbers have no `{sign}`")
-            return Block(made[sign](a.value, b.value, flags=FAST), a.kind, a.shape)
+            return Block(signs[sign](a.value, b.value, flags=FAST), a.kind, a.shape)
         whole = {
             "+": builder.add, "-": builder.sub, "*": builder.mul, "//": builder.sdiv, "%": builder.srem,
             "&": builder.and_, "|": builder.or_, "^": builder.xor, "<<": builder.shl, ">>": builder.ashr,

@@ -32,8 +32,8 @@ def lanes(device: torch.device, gpu: int, cpu: int = LANES) -> int:
 def launch(kernel: Any, grid: Sequence[int]) -> Callable[..., None]:
     """Return a function that runs the programs of a kernel, or records them if launches are being recorded.
 
-    It takes the arguments of the kernel, of which tensors are contiguous and on one device, and options of Triton, which
-    a CPU does not need.
+    It takes the arguments of the kernel, of which tensors are contiguous and on one device, and options of Triton,
+    which a CPU does not need.
 
     Args:
         kernel: The kernel.

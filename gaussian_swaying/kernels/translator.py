@@ -325,7 +325,7 @@ class _Translator(Emitter):
         if isinstance(x, Pointer) and isinstance(y, Pointer) and x.base is y.base:
             return _Address(x.base, x.kind, self._join(x.offset, y.offset))
         if isinstance(x, (Block, bool, int, float)) and isinstance(y, (Block, bool, int, float)):
-            a, b = self.matched(x, y)
+            a, _ = self.matched(x, y)
             return _Kind(a.kind, a.shape)
         if x is y or (type(x) is type(y) and x == y):
             return _Same(x)

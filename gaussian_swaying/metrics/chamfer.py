@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import torch
 from torch import Tensor
-from torchmetrics import Metric
+from torchmetrics import Metric  # noqa: TID253 - a class of torchmetrics, imported when it is used
 
 from gaussian_swaying._checks import check_choice, check_shape
 from gaussian_swaying.metrics.nearest import nearest_distances

@@ -18,7 +18,7 @@ import torch
 import torch.nn.functional as functional
 from einops import rearrange
 from torch import Tensor
-from torchmetrics import Metric
+from torchmetrics import Metric  # noqa: TID253 - a class of torchmetrics, imported when it is used
 
 from gaussian_swaying._checks import check_positive, check_shape
 

@@ -10,8 +10,8 @@ from operator import not_
 from torch import Tensor, nn
 
 from gaussian_swaying._checks import check_like, check_shape
-from gaussian_swaying._graphs import Recordable, tensors_in
 from gaussian_swaying.geometry.frame import SimFrame
+from gaussian_swaying.kernels.graphs import Recordable, tensors_in
 from gaussian_swaying.mpm.state import State
 from gaussian_swaying.mpm.twins import Twinned
 

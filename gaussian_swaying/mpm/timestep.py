@@ -11,8 +11,8 @@ import math
 import torch
 from torch import Tensor
 
-from gaussian_swaying._graphs import Repeater
 from gaussian_swaying.geometry.linalg import symmetric_eigenvalues
+from gaussian_swaying.kernels.graphs import Repeater
 from gaussian_swaying.mpm.dispatch import LawDispatch
 from gaussian_swaying.mpm.laws.shared import lame_parameters
 from gaussian_swaying.mpm.state import MaterialPoints, MPMState

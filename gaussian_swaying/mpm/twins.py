@@ -26,7 +26,7 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from gaussian_swaying._graphs import fingerprint, tensors_in
+from gaussian_swaying.kernels.graphs import fingerprint, tensors_in
 
 
 @dataclass(frozen=True)

@@ -91,7 +91,7 @@ class VideoEncoder:
         command += ["-vf", "pad=ceil(iw/2)*2:ceil(ih/2)*2", "-pix_fmt", "yuv420p", "-crf", "18"]
         command += ["-movflags", "+faststart", str(self._temporary.resolve())]
         self._size = (height, width)
-        self._messages = tempfile.TemporaryFile()
+        self._messages = tempfile.TemporaryFile()  # noqa: SIM115 - unlike a pipe, never full
         # in a separate session, so that Ctrl-C does not end it before its last frame
         self._process = subprocess.Popen(command, stdin=subprocess.PIPE, stderr=self._messages, start_new_session=True)
         self._end = weakref.finalize(self, _end_process, self._process, self._messages, self._temporary)

@@ -12,7 +12,7 @@ import torch
 from torch import Tensor, nn
 
 from gaussian_swaying._checks import check_positive, check_shape, check_vector
-from gaussian_swaying._graphs import Recordable
+from gaussian_swaying.kernels.graphs import Recordable
 
 REST_FLOOR = 0.1
 """Relative shading clamps the factors of the moving and the rest normal to at least this before it divides them."""

@@ -16,7 +16,7 @@ from gaussian_swaying._files import check_not_taken
 LOCK = ".gaussian_swaying.lock"
 
 
-class FolderLocked(ValueError):
+class FolderLocked(ValueError):  # noqa: N818
     """Another run writes to the folder; the message says which one and what to do."""
 
 

@@ -11,9 +11,9 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from gaussian_swaying._graphs import RECORDED, Replayed
 from gaussian_swaying.geometry.linalg import determinant, matmul3, symmetric_eigenvalues
 from gaussian_swaying.geometry.neighbours import nearest_neighbours
+from gaussian_swaying.kernels.graphs import RECORDED, Replayed
 from gaussian_swaying.mpm.protocol import Solver
 from gaussian_swaying.mpm.state import State, support_force
 
@@ -21,7 +21,7 @@ _PARTICLES = ("moved_particle", "compressed_particle", "stretched_particle")
 _SAMPLE = 4096  # particles whose nearest neighbour is searched
 
 
-class SimulationDiverged(RuntimeError):
+class SimulationDiverged(RuntimeError):  # noqa: N818  (it ends a run the way StopIteration ends a loop)
     """The simulation diverged: its numbers no longer mean anything.
 
     Attributes:

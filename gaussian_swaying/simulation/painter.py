@@ -9,9 +9,9 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from gaussian_swaying._graphs import RECORDED, Replayed, fingerprint
 from gaussian_swaying._turns import Turn, in_turn
 from gaussian_swaying.gaussians.model import DeformedGaussians
+from gaussian_swaying.kernels.graphs import RECORDED, Replayed, fingerprint
 from gaussian_swaying.mpm.state import State
 from gaussian_swaying.recording.layout import check_camera_name
 from gaussian_swaying.rendering import passes

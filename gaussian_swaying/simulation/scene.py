@@ -74,7 +74,7 @@ class Scene:
         region: Region | None = None,
         opacity_threshold: float = 0.1,
         faint: Literal["carry", "static", "drop"] = "carry",
-        up: list[float] = [0.0, 0.0, 1.0],
+        up: list[float] = [0.0, 0.0, 1.0],  # noqa: B006  (never changed; the schema of the config shows it)
         longest_side: float | None = None,
         metres_per_unit: float | None = None,
         area: Literal["coverage", "open", "paper", "equal"] | None = None,

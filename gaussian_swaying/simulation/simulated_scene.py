@@ -171,7 +171,7 @@ class SimulatedScene(nn.Module):
         self.rest_facing: Tensor
         self.identity: Tensor
 
-    def _apply(self, fn, recurse: bool = True) -> SimulatedScene:  # type: ignore[no-untyped-def]
+    def _apply(self, fn, recurse: bool = True) -> SimulatedScene:  # type: ignore[no-untyped-def] # noqa: ANN001
         super()._apply(fn, recurse)
         self.points = self.points.map(fn)
         if self.surface_places is not None:

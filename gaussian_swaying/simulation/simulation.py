@@ -129,14 +129,14 @@ class Simulation:
         wind: WindLike | None = None,
         aero: AeroForce | None = None,
         contact: Contact | None = None,
-        forces: list[Force] = [],
+        forces: list[Force] = [],  # noqa: B006  (never changed; the schema of the config shows it)
         shader: Shader | None = None,
         camera: CameraPath | None = None,
         cameras: dict[str, CameraPath] | None = None,
-        edits: list[Edit] = [],
+        edits: list[Edit] = [],  # noqa: B006
         recorder: Recorder | None = None,
         normalisation: Normalisation | None = None,
-        background: list[float] = [0.0, 0.0, 0.0],
+        background: list[float] = [0.0, 0.0, 0.0],  # noqa: B006
         frame_dt: float = 0.04,
         dtype: Literal["float32", "float64"] = "float32",
         device: DeviceLike = "auto",

@@ -11,7 +11,6 @@ from typing import NoReturn
 import torch
 from torch import Tensor
 
-from gaussian_swaying._graphs import fingerprint, tensors_in
 from gaussian_swaying._turns import Turn, in_turn
 from gaussian_swaying.aero.patches import Patches
 from gaussian_swaying.aero.shelter import Shelter
@@ -19,6 +18,7 @@ from gaussian_swaying.aero.wind import WindField
 from gaussian_swaying.aero.wind_batch import WindBatch, why_apart
 from gaussian_swaying.aero.wind_force import WindForce
 from gaussian_swaying.geometry.patches import deform_patch
+from gaussian_swaying.kernels.graphs import fingerprint, tensors_in
 from gaussian_swaying.mpm.forces import Force
 from gaussian_swaying.mpm.protocol import Solver
 from gaussian_swaying.mpm.state import MaterialPoints, State

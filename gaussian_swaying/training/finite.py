@@ -8,7 +8,7 @@ from torch import Tensor
 from gaussian_swaying.gaussians.cloud import GaussianCloud
 
 
-class TrainingDiverged(RuntimeError):
+class TrainingDiverged(RuntimeError):  # noqa: N818
     """A loss or a Gaussian is no longer finite; the message names the step and the last good checkpoint.
 
     Args:

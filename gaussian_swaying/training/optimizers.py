@@ -111,7 +111,7 @@ class LearningRates:
     quats: float = 1e-3
     opacities: float = 5e-2
     sh0: float = 2.5e-3
-    shN: float = 2.5e-3 / 20
+    shN: float = 2.5e-3 / 20  # noqa: N815
 
     def __post_init__(self) -> None:
         for name in (*PARAMETERS, "means_final"):

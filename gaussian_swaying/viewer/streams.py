@@ -16,7 +16,7 @@ from typing import Any
 
 from torch import Tensor
 
-from gaussian_swaying._graphs import fingerprint
+from gaussian_swaying.kernels.graphs import fingerprint
 from gaussian_swaying.viewer.film.page import PAGE
 from gaussian_swaying.viewer.session import Snapshot
 from gaussian_swaying.viewer.states import OFF, look_message, scene_message, state_message

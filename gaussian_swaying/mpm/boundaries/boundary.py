@@ -19,9 +19,9 @@ from typing import TypeVar
 import torch
 from torch import Tensor, nn
 
-from gaussian_swaying._graphs import Recordable
 from gaussian_swaying.geometry.frame import SimFrame
 from gaussian_swaying.geometry.regions import Region, RegionInFrame, whereabouts
+from gaussian_swaying.kernels.graphs import Recordable
 from gaussian_swaying.mpm.twins import Twinned
 
 BY_BODY = "by body"

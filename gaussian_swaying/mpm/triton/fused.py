@@ -16,7 +16,7 @@ from typing import Any, ClassVar, Protocol
 import torch
 from torch import Tensor
 
-from gaussian_swaying._graphs import Repeater, fingerprint
+from gaussian_swaying.kernels.graphs import Repeater, fingerprint
 from gaussian_swaying.kernels.language import INTERPRETED
 from gaussian_swaying.kernels.launch import call, compiles
 from gaussian_swaying.mpm.body import Body

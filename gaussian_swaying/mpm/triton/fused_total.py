@@ -8,7 +8,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from gaussian_swaying._graphs import RECORDED
+from gaussian_swaying.kernels.graphs import RECORDED
 from gaussian_swaying.kernels.language import triton
 from gaussian_swaying.kernels.launch import call, lanes, launch
 from gaussian_swaying.mpm.boundaries.pinned_points import PinnedPoints

@@ -63,9 +63,9 @@ class FusedUpdated(Fused):
         self.filled = torch.zeros(0, dtype=torch.int32, device=self.device)
         self.place = torch.zeros(2, self.count, dtype=torch.int32, device=self.device)  # cell, rank in it
         self.grid = GridSpec(bound.settings.dx, (0, 0, 0), (0, 0, 0))
-        rows = 0 if self.atomic else self.count
-        self.parts = torch.zeros(rows, kernels.PART.value, **self.like)
-        self.part_node = torch.zeros(rows, dtype=torch.int32, device=self.device)
+        many = 0 if self.atomic else self.count
+        self.parts = torch.zeros(many, kernels.PART.value, **self.like)
+        self.part_node = torch.zeros(many, dtype=torch.int32, device=self.device)
         self.windows = torch.zeros(0, **self.like)
         self.ranges = torch.zeros(SHARES, 2, dtype=torch.int32, device=self.device)
         self.pressed = torch.zeros(0, dtype=torch.float64, device=self.device)

@@ -302,7 +302,8 @@ class TotalAdjoint:
         launch(kernels.hold_adjoint, (triton.cdiv(nodes, block),))(
             self.affected, self.scene, self.weight, self.residual, nodes, rows, self.bars,
             self.weight_bar, self.multipliers, len(self.residual), fused.inverse_mass, self.history, self.nodes,
-            fused.first_step, offset, self.last, WEIGHTS=asked.flags["WEIGHTS"], BLOCK=block, ROWS=lanes(fused.device, 64), num_warps=2,
+            fused.first_step, offset, self.last, WEIGHTS=asked.flags["WEIGHTS"], BLOCK=block,
+            ROWS=lanes(fused.device, 64), num_warps=2,
         )  # fmt: skip
         self._nodes(offset, asked, SUM=False, PUSH=False, FINISH=True)
 

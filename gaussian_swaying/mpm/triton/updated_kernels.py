@@ -396,7 +396,8 @@ def updated_join(
 @triton.jit(do_not_specialize=VARIES)
 def updated_nodes(
     momentum, velocity, inverse_mass, nodes, schedule, first_step, step_offset,
-    gravity_x, gravity_y, gravity_z, solids, windows, poses, numbers, clock, impulse, boundaries, ox, oy, oz, ny, nz, dx,
+    gravity_x, gravity_y, gravity_z, solids, windows, poses, numbers, clock, impulse, boundaries,
+    ox, oy, oz, ny, nz, dx,
     IMPLICIT: tl.constexpr, WIDTH: tl.constexpr, KEEP: tl.constexpr, SOLIDS: tl.constexpr, KINDS: tl.constexpr,
     MOVES: tl.constexpr, MOVING: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip

@@ -10,7 +10,7 @@ import weakref
 import pytest
 import torch
 
-from gaussian_swaying import _graphs
+from gaussian_swaying.kernels import graphs
 from gaussian_swaying.aero.wind import FlowKey, GaussianGust, SineSway, WindField
 from gaussian_swaying.geometry.regions import Box
 from gaussian_swaying.mpm.boundaries.enclosing_box import EnclosingBox
@@ -221,14 +221,14 @@ def test_a_replayed_rollout_follows_what_changes(kernel_device, graphs, monkeypa
     points = make_points(kernel_device, count=12)
     load, other = make_load(points), make_load(points, seed=7)
     if graphs == "played":
-        monkeypatch.setattr(_graphs, "record", lambda device, work, pool, stream: _Played(work))
+        monkeypatch.setattr(graphs, "record", lambda device, work, pool, stream: _Played(work))
         monkeypatch.setattr(torch.cuda, "Stream", lambda device: None)
         monkeypatch.setattr(torch.cuda, "synchronize", lambda device: None)
         monkeypatch.setattr(torch.cuda, "empty_cache", lambda: None)
 
     def run(solver, state):
         if graphs == "played" and solver.transfer == "triton":
-            solver.fused().repeater = _graphs.Repeater(torch.device("cuda"), kept=8)
+            solver.fused().repeater = graphs.Repeater(torch.device("cuda"), kept=8)
         states = [solver.rollout(state, DT, 2, load) for _ in range(3)]
         load.area *= 2
         load.aero.C_D += 1.0
@@ -329,7 +329,7 @@ def test_graphs_go_with_their_grid(kernel_device, monkeypatch):
         return graph
 
     for place, name, value in (
-        (_graphs, "record", record),
+        (graphs, "record", record),
         (torch.cuda, "Stream", lambda device: None),
         (torch.cuda, "synchronize", lambda device: None),
         (torch.cuda, "empty_cache", lambda: None),
@@ -341,7 +341,7 @@ def test_graphs_go_with_their_grid(kernel_device, monkeypatch):
         monkeypatch.setattr(place, name, value)
     points, solver = make_points(kernel_device, count=4), make_solver("triton")
     state = solver.init_state(points)
-    solver.fused().repeater = _graphs.Repeater(torch.device("cuda"))
+    solver.fused().repeater = graphs.Repeater(torch.device("cuda"))
     for k in range(100):  # some of one size, some that need other buffers
         grid = GridSpec(DX, (-2, -2, -2 - k % 3), (8, 8, 8 + k))
         for recorded in (0, 3, 3):

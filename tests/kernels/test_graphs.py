@@ -7,9 +7,9 @@ import pytest
 import torch
 from torch import nn
 
-from gaussian_swaying._graphs import Repeater, Replayed, fingerprint, tensors_in
 from gaussian_swaying.aero.wind import GaussianGust, Modulation, SineSway, UniformGust, WindField
 from gaussian_swaying.geometry.regions import Box, Everything, Not, Union
+from gaussian_swaying.kernels.graphs import Repeater, Replayed, fingerprint, tensors_in
 from gaussian_swaying.mpm.boundaries import BOUNDARIES
 from gaussian_swaying.mpm.boundaries.boundary import Boundary
 from gaussian_swaying.mpm.boundaries.pinned_region import PinnedRegion
