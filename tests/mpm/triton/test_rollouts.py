@@ -10,9 +10,9 @@ import weakref
 import pytest
 import torch
 
-from gaussian_swaying.kernels import graphs
 from gaussian_swaying.aero.wind import FlowKey, GaussianGust, SineSway, WindField
 from gaussian_swaying.geometry.regions import Box
+from gaussian_swaying.kernels import graphs
 from gaussian_swaying.mpm.boundaries.enclosing_box import EnclosingBox
 from gaussian_swaying.mpm.boundaries.handle import Handle
 from gaussian_swaying.mpm.boundaries.pinned_region import PinnedRegion
