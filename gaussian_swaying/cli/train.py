@@ -18,6 +18,10 @@ from lightning.pytorch.loggers import Logger, TensorBoardLogger
 from lightning.pytorch.plugins.io import CheckpointIO
 from lightning.pytorch.utilities.exceptions import MisconfigurationException
 
+import gaussian_swaying.training.data.datamodule
+import gaussian_swaying.training.data.generated_datamodule
+import gaussian_swaying.training.densification
+import gaussian_swaying.training.losses  # noqa: F401
 from gaussian_swaying import _program as program
 from gaussian_swaying._files import atomic
 from gaussian_swaying._yaml_limits import check_config_files, limit_yaml
