@@ -276,7 +276,7 @@ def test_the_default_is_the_grid_where_it_is_possible(make_simulation):
 @pytest.mark.parametrize(
     ("kernel_device", "up"),
     [
-        ("interpreted", [0.0, -1.0, 0.2]),
+        ("cpu", [0.0, -1.0, 0.2]),
         pytest.param("cuda", [0.0, -1.0, 0.2], marks=pytest.mark.gpu),
         pytest.param("cuda", [0.0, 0.0, 1.0], marks=pytest.mark.gpu),
     ],

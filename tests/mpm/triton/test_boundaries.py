@@ -65,15 +65,15 @@ BOUNDARIES = {
 
 
 @pytest.mark.slow(
-    gate=[f"updated-interpreted-{name}" for name in ("handle", "knock and release", "walls", "box", "two pins")]
-    + [f"total-interpreted-{name}" for name in ("hinge", "hinged handle", "plane", "box", "two pins")]
+    gate=[f"updated-cpu-{name}" for name in ("handle", "knock and release", "walls", "box", "two pins")]
+    + [f"total-cpu-{name}" for name in ("hinge", "hinged handle", "plane", "box", "two pins")]
 )
 @pytest.mark.parametrize(
     ("kernel_device", "name"),
     [
         *(pytest.param("cuda", name, marks=pytest.mark.gpu) for name in BOUNDARIES),
         *(
-            ("interpreted", name)
+            ("cpu", name)
             for name in ("two pins", "hinge", "handle", "hinged handle", "knock and release", "plane", "box", "walls")
         ),
     ],
