@@ -115,7 +115,7 @@ def deform_all(
     F, covariance, normal = (tensor.detach().contiguous() for tensor in given)
     made = [torch.empty_like(F), torch.empty_like(normal), torch.empty_like(F) if rotations else F]
     limit = max_stretch is not None and solid is not None
-    keeps = F if solid is None or not limit else solid.contiguous().view(torch.uint8)
+    keeps = F if solid is None or not limit else solid.contiguous().view(torch.int8)
     if count > 0:
         with torch.cuda.device_of(F):
             launch(_deform, (triton.cdiv(count, BLOCK),))(

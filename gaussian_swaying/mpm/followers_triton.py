@@ -99,7 +99,7 @@ def follow(
     made = [torch.empty_like(tensor) for tensor in given]
     turns = torch.empty_like(given[1]) if rotations else given[1]
     limit = max_stretch is not None and solid is not None
-    keeps = fields if solid is None or not limit else solid.contiguous().view(torch.uint8)
+    keeps = fields if solid is None or not limit else solid.contiguous().view(torch.int8)
     if count > 0:
         with torch.cuda.device_of(fields):
             launch(_follow, (triton.cdiv(count, BLOCK),))(

@@ -559,12 +559,6 @@ def test_tensors_of_truth(block):
     assert not bool(out[2 * block + 2 :].any())
 
 
-def test_bytes_beyond_127(block):
-    """Of a tensor of unsigned bytes."""
-    given = torch.tensor([0, 127, 128, 255] * 3, dtype=torch.uint8)
-    _same(_applied(_to_int32, given, given, torch.int32, block), given.int())
-
-
 # ---- atomic operations
 
 
