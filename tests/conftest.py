@@ -18,7 +18,7 @@ import torch
 def pytest_collection_modifyitems(config, items):
     """Skip `gpu` tests without CUDA, unless GS_REQUIRE_GPU=1 asks for them; leave `slow` ones to the nightly run.
 
-    What is slow in the interpreter is quick on a GPU: `gpu` tests run there whether they are `slow` or not.
+    `gpu` tests run there whether they are `slow` or not.
     """
     require_gpu = os.environ.get("GS_REQUIRE_GPU") == "1"
     marks = config.getoption("-m") or ""

@@ -1,4 +1,4 @@
-"""A wind with effects in the kernels against the same wind in torch; in Triton's interpreter without a GPU.
+"""A wind with effects in the kernels against the same wind in torch.
 
 Covers: aero.effects, aero.effects_triton, aero.obstacles_triton, aero.wind_triton, mpm.twins.
 """

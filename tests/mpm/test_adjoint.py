@@ -147,14 +147,15 @@ def test_derivative_of_a_stress(name, kernel_device):
 def test_derivative_of_the_viscous_stress(kernel_device):
     """By F, its rate, mu and lambda."""
     dtype, tolerance = _tolerance(kernel_device, 1e-13, 1e-5)
+    time = 2.0**-9  # numbers are passed in float32
     F, rate, Q = (_random(seed, 50, 3, 3).requires_grad_() for seed in range(3))
     mu, lam = (torch.full((50,), value, dtype=WIDE, requires_grad=True) for value in (4e3, 6e3))
-    stress = kelvin_voigt_pk1(F, rate, mu, lam, 2e-3)
+    stress = kelvin_voigt_pk1(F, rate, mu, lam, time)
     expected = torch.autograd.grad((stress * Q).sum(), [F, rate, mu, lam])
     given = [t.detach().to(kernel_device, dtype) for t in (F, rate, Q)]
     found = [torch.empty_like(given[0]) for _ in range(2)]
     scalars = torch.empty(50, 2, device=kernel_device, dtype=dtype)
-    launch(_viscous, (1,))(*given, *found, scalars, 4e3, 6e3, 2e-3, 50, BLOCK=64)
+    launch(_viscous, (1,))(*given, *found, scalars, 4e3, 6e3, time, 50, BLOCK=64)
     for value, wanted in zip((*found, scalars[:, 0], scalars[:, 1]), expected, strict=True):
         _close(value.cpu(), wanted, tolerance)
 

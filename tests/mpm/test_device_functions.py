@@ -29,7 +29,6 @@ from gaussian_swaying.mpm.laws.snow import Snow
 from gaussian_swaying.mpm.laws.spring_network import SpringNetwork
 from gaussian_swaying.mpm.laws.triton.body import BodyLaws, kirchhoff, pk1
 from gaussian_swaying.mpm.laws.triton.functions import LawFunctions, functions_of, shared
-from gaussian_swaying.mpm.triton import fused
 from gaussian_swaying.mpm.twins import Numbers, Twin
 
 MU, LAM, DT = 4e3, 6e3, 1e-3
@@ -338,8 +337,7 @@ def test_what_a_body_asks_of_a_kernel():
     assert flowing.all_flow
     keys = {repr(body) for body in (direct, mixed, flowing, BodyLaws([Sand()]), BodyLaws([FixedCorotated()]))}
     assert len(keys) == 5
-    if not fused.INTERPRETED:
-        assert repr(BodyLaws([Fluid(3.0)])) == repr(BodyLaws([Fluid()]))
+    assert repr(BodyLaws([Fluid(3.0)])) == repr(BodyLaws([Fluid()]))
 
 
 def test_a_twin_needs_a_stress():

@@ -198,7 +198,6 @@ def test_a_force_says_for_itself_whether_it_can_be_recorded():
 
 
 def test_all_forces_with_a_twin_are_fused():
-    pytest.importorskip("triton")
     *_, wind = _setting()
     spring, other = Spring(), WindForce(wind.aero, wind.wind, wind.normal, 2 * wind.area)
     assert divide([spring, wind, other]) == ((wind, other), (spring,))

@@ -10,10 +10,12 @@ from gaussian_swaying.aero.force import AeroForce
 from gaussian_swaying.aero.patches import Patches
 from gaussian_swaying.aero.wind import SpatialWind, WindField
 from gaussian_swaying.aero.wind_force import WindForce
+from gaussian_swaying.kernels.language import tl, triton
 from gaussian_swaying.mpm.boundaries.pinned_region import PinnedRegion
 from gaussian_swaying.mpm.boundaries.plane import Plane
 from gaussian_swaying.mpm.forces import Force
 from gaussian_swaying.mpm.laws.sand import Sand
+from gaussian_swaying.mpm.triton import fused, fused_updated
 from gaussian_swaying.mpm.twins import Numbers, Twin
 
 from .bodies import (
@@ -34,14 +36,6 @@ from .bodies import (
     run_in_wind,
     set_going,
 )
-
-try:
-    import triton
-    import triton.language as tl
-
-    from gaussian_swaying.mpm.triton import fused, fused_updated
-except ImportError:
-    fused = None
 
 
 @pytest.mark.parametrize(
@@ -304,21 +298,19 @@ def test_a_wind_that_depends_on_the_place(kernel_device, formulation):
     check_agreement(run_both(points, lambda solver, state: solver.rollout(state, DT, 2, shear), formulation))
 
 
-if fused is not None:
-
-    @triton.jit
-    def _toward(F, velocity, position, point, numbers, now, table, OPTIONS: tl.constexpr):
-        """Pulls along a vector by a share of each particle; has a resistance if compiled with it."""
-        scale = point[0] * numbers[0] * F[0] * tl.load(table + 1)
-        resistance = point[0] * 0
-        if OPTIONS[0]:
-            resistance = point[1]
-        force = (
-            scale * now[0] - resistance * velocity[0],
-            scale * now[1] - resistance * velocity[1],
-            scale * now[2] - resistance * velocity[2],
-        )
-        return force, resistance
+@triton.jit
+def _toward(F, velocity, position, point, numbers, now, table, OPTIONS: tl.constexpr):
+    """Pulls along a vector by a share of each particle; has a resistance if compiled with it."""
+    scale = point[0] * numbers[0] * F[0] * tl.load(table + 1)
+    resistance = point[0] * 0
+    if OPTIONS[0]:
+        resistance = point[1]
+    force = (
+        scale * now[0] - resistance * velocity[0],
+        scale * now[1] - resistance * velocity[1],
+        scale * now[2] - resistance * velocity[2],
+    )
+    return force, resistance
 
 
 class _Toward(Force):

@@ -20,6 +20,7 @@ from gaussian_swaying.mpm.boundaries.plane import Plane
 from gaussian_swaying.mpm.boundaries.velocity_box import VelocityBox
 from gaussian_swaying.mpm.solver import MPMSolver
 from gaussian_swaying.mpm.state import GridSpec
+from gaussian_swaying.mpm.triton import fused, fused_total, fused_updated
 from gaussian_swaying.simulation.diagnostics import SimulationDiverged, check_state
 
 from .bodies import (
@@ -42,11 +43,6 @@ from .bodies import (
     run_in_wind,
     set_going,
 )
-
-try:
-    from gaussian_swaying.mpm.triton import fused, fused_total, fused_updated
-except ImportError:
-    fused = None
 
 
 @pytest.mark.parametrize(
