@@ -7,6 +7,7 @@ import pytest
 
 ROOT = Path(__file__).resolve().parents[2] / "gaussian_swaying"
 FLOORS = (
+    "kernels",
     "geometry",
     "gaussians metrics mpm runs",
     "aero rendering scenes",
