@@ -385,7 +385,7 @@ def test_a_number_takes_the_type_of_the_block(block):
     """So 0.1 is one of float64 beside such a block, and 2^40 no integer of 32 bits."""
     x = torch.arange(9)
     _same(_applied(_beside_a_float, x.double(), x, torch.float64, block), x.double() + 0.1)
-    _same(_applied(_beside_a_float, x.int(), x, torch.float64, block), (x.float() + 0.1).double())
+    _same(_applied(_beside_a_float, x.int(), x, torch.float32, block), x.float() + 0.1)
     _same(_applied(_beside_a_large_integer, x.int(), x, torch.int64, block), x + 2**40)
     third = x.double() / 3
     _same(_applied(_mixed, x.int(), third, torch.float64, block), x * third)

@@ -55,7 +55,7 @@ SHAPES = {
 
 def _ask_kernel(obstacle, place, time, device):
     """Gap, normal, velocity, whether it counts and whether one is within 1 cm, at places in the kernel of ``total``."""
-    solids = Solids([(obstacle.to(device), 0)], device, steps=1)
+    solids = Solids([(obstacle.to(device), 0)], place, steps=1)
     solids.take()
     solids.prepare(time, torch.full_like(time, DT), 1)
     count = len(place)
