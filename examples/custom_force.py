@@ -1,26 +1,19 @@
 """A force of your own: air that circles a vertical axis in gusts, in torch and inside the compiled kernels.
 
-``python examples/custom_force.py`` compares the two; on a CPU, set ``TRITON_INTERPRET=1``. Without Triton it checks the
-circulation. A YAML names the force as
+``python examples/custom_force.py`` compares the two, and checks the circulation. A YAML names the force as
 ``forces: [{class_path: custom_force.PointVortex, init_args: {center: [0.1, 0.1], circulation: 3.0}}]``.
 """
 
 import math
-import os
 from collections.abc import Sequence
 
 import torch
 from torch import Tensor
 
 from gaussian_swaying import Force, MaterialPoints, MPMSolver
+from gaussian_swaying.kernels.language import tl, triton
 from gaussian_swaying.mpm.state import State
 from gaussian_swaying.mpm.twins import Numbers, Twin
-
-try:
-    import triton
-    import triton.language as tl
-except ImportError:  # then it runs in torch
-    triton = None
 
 
 class PointVortex(Force):
@@ -59,8 +52,6 @@ class PointVortex(Force):
 
     def twin(self) -> Twin | None:
         """The same for the kernels: one number per point (zero where there is none), three for all, one per substep."""
-        if triton is None:
-            return None
 
         def turns(time: Tensor, dt: Tensor, steps: int) -> Tensor:
             return self.turn(time + dt * torch.arange(steps, dtype=torch.float64, device=time.device))[:, None]
@@ -75,16 +66,14 @@ class PointVortex(Force):
         )
 
 
-if triton is not None:
-
-    @triton.jit
-    def circling_air(F, velocity, position, point, numbers, now, table, OPTIONS: tl.constexpr):  # noqa: ANN001, ANN201
-        """As ``PointVortex.forward``."""
-        x = position[0] - numbers[0]
-        y = position[1] - numbers[1]
-        turn = now[0] / (x * x + y * y + numbers[2])
-        drag = point[0]
-        return (drag * (-turn * y - velocity[0]), drag * (turn * x - velocity[1]), -drag * velocity[2]), drag
+@triton.jit
+def circling_air(F, velocity, position, point, numbers, now, table, OPTIONS: tl.constexpr):  # noqa: ANN001, ANN201
+    """As ``PointVortex.forward``."""
+    x = position[0] - numbers[0]
+    y = position[1] - numbers[1]
+    turn = now[0] / (x * x + y * y + numbers[2])
+    drag = point[0]
+    return (drag * (-turn * y - velocity[0]), drag * (turn * x - velocity[1]), -drag * velocity[2]), drag
 
 
 def circulation_error(vortex: PointVortex, radius: float = 0.1) -> float:
@@ -100,12 +89,9 @@ def circulation_error(vortex: PointVortex, radius: float = 0.1) -> float:
 
 
 def main() -> float:
-    """Largest difference between kernels and torch after some substeps, per largest velocity; or the error in torch."""
+    """Largest difference between kernels and torch after some substeps, per largest velocity."""
+    print(f"error of the circulation: {circulation_error(PointVortex([0.1, 0.1], 30.0)):.1e}")
     device = "cuda" if torch.cuda.is_available() else "cpu"
-    if triton is None or (device == "cpu" and os.environ.get("TRITON_INTERPRET") != "1"):
-        error = circulation_error(PointVortex([0.1, 0.1], 30.0))
-        print(f"error of the circulation: {error:.1e}")
-        return error
     place = 0.06 + 0.18 * torch.rand(40, 3, generator=torch.Generator().manual_seed(0)).to(device)
     points = MaterialPoints.create(place, volume=1e-4, density=50.0, youngs_modulus=1e4, poisson_ratio=0.3)
     ends = []

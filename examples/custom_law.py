@@ -1,27 +1,18 @@
 """A law of your own: Saint Venant and Kirchhoff's, in torch and inside the compiled kernels.
 
-``python examples/custom_law.py`` compares the two; on a CPU, set ``TRITON_INTERPRET=1``. Without Triton it compares
-the stress with the energy. A YAML names the law as
+``python examples/custom_law.py`` compares the two, and the stress with the energy. A YAML names the law as
 ``material: {law: {class_path: custom_law.SaintVenant, init_args: {factor: 2.0}}}``.
 """
-
-import os
 
 import torch
 from torch import Tensor
 
 from gaussian_swaying import ConstitutiveLaw, MaterialPoints, MPMSolver
 from gaussian_swaying.geometry.linalg import matmul3
+from gaussian_swaying.geometry.linalg_triton import matmul, transpose
+from gaussian_swaying.kernels.language import triton
+from gaussian_swaying.mpm.laws.triton.functions import LawFunctions
 from gaussian_swaying.mpm.twins import Numbers, Twin
-
-try:
-    import triton
-    import triton.language as tl  # noqa: F401  (Triton's interpreter looks for it)
-
-    from gaussian_swaying.geometry.linalg_triton import matmul, transpose
-    from gaussian_swaying.mpm.laws.triton.functions import LawFunctions
-except ImportError:  # then it runs in torch
-    triton = None
 
 
 class SaintVenant(ConstitutiveLaw):
@@ -55,30 +46,27 @@ class SaintVenant(ConstitutiveLaw):
 
     def twin(self) -> Twin | None:
         """The same for the kernels, with one number."""
-        if triton is None:
-            return None
         return Twin(LawFunctions(pk1=pk1, kirchhoff=kirchhoff), numbers=Numbers(1, lambda: [self.factor]))
 
 
-if triton is not None:
+@triton.jit
+def pk1(F, mu, lam, internal, p):  # noqa: ANN001, ANN201
+    """As ``SaintVenant.pk1``."""
+    C = matmul(transpose(F), F)
+    pressure = 0.5 * lam * (C[0] + C[4] + C[8] - 3)
+    s = p[0]
+    stress = (
+        s * (mu * (C[0] - 1) + pressure), s * mu * C[1], s * mu * C[2], s * mu * C[3],
+        s * (mu * (C[4] - 1) + pressure), s * mu * C[5], s * mu * C[6], s * mu * C[7],
+        s * (mu * (C[8] - 1) + pressure),
+    )  # fmt: skip
+    return matmul(F, stress)
 
-    @triton.jit
-    def pk1(F, mu, lam, internal, p):  # noqa: ANN001, ANN201
-        """As ``SaintVenant.pk1``."""
-        C = matmul(transpose(F), F)
-        pressure = 0.5 * lam * (C[0] + C[4] + C[8] - 3)
-        s = p[0]
-        stress = (
-            s * (mu * (C[0] - 1) + pressure), s * mu * C[1], s * mu * C[2], s * mu * C[3],
-            s * (mu * (C[4] - 1) + pressure), s * mu * C[5], s * mu * C[6], s * mu * C[7],
-            s * (mu * (C[8] - 1) + pressure),
-        )  # fmt: skip
-        return matmul(F, stress)
 
-    @triton.jit
-    def kirchhoff(F, mu, lam, internal, p):  # noqa: ANN001, ANN201
-        """P F^T."""
-        return matmul(pk1(F, mu, lam, internal, p), transpose(F))
+@triton.jit
+def kirchhoff(F, mu, lam, internal, p):  # noqa: ANN001, ANN201
+    """P F^T."""
+    return matmul(pk1(F, mu, lam, internal, p), transpose(F))
 
 
 def stress_error(law: SaintVenant) -> float:
@@ -90,12 +78,9 @@ def stress_error(law: SaintVenant) -> float:
 
 
 def main() -> float:
-    """Largest difference between kernels and torch after some substeps, per largest F; or the error in torch."""
+    """Largest difference between kernels and torch after some substeps, per largest F."""
+    print(f"error of the stress: {stress_error(SaintVenant(1.5)):.1e}")
     device = "cuda" if torch.cuda.is_available() else "cpu"
-    if triton is None or (device == "cpu" and os.environ.get("TRITON_INTERPRET") != "1"):
-        error = stress_error(SaintVenant(1.5))
-        print(f"error of the stress: {error:.1e}")
-        return error
     draw = torch.Generator().manual_seed(0)
     place, velocity = 0.06 + 0.18 * torch.rand(40, 3, generator=draw), torch.randn(40, 3, generator=draw)
     points = MaterialPoints.create(

@@ -13,13 +13,12 @@ os.environ.setdefault("GOMP_SPINCOUNT", "3000")  # as tools/sim.py, and for the 
 import nightly
 import pytest
 import torch
-from quick_interpreter import quicken
 
 
 def pytest_collection_modifyitems(config, items):
     """Skip `gpu` tests without CUDA, unless GS_REQUIRE_GPU=1 asks for them; leave `slow` ones to the nightly run.
 
-    What is slow in the interpreter is quick on a GPU: `gpu` tests run there whether they are `slow` or not.
+    `gpu` tests run there whether they are `slow` or not.
     """
     require_gpu = os.environ.get("GS_REQUIRE_GPU") == "1"
     marks = config.getoption("-m") or ""
@@ -47,31 +46,10 @@ def device(request):
     return torch.device(request.param)
 
 
-@pytest.fixture(scope="session", autouse=True)
-def as_triton_interprets():
-    """Makes the interpreter quick in all tests; calls a function with the interpreter as Triton has it."""
-    with pytest.MonkeyPatch.context() as changes:
-        quicken(changes)
-
-        def plainly(function):
-            changes.undo()
-            try:
-                return function()
-            finally:
-                quicken(changes)
-
-        yield plainly
-
-
-@pytest.fixture(params=["interpreted", pytest.param("cuda", marks=pytest.mark.gpu)])
+@pytest.fixture(params=["cpu", pytest.param("cuda", marks=pytest.mark.gpu)])
 def kernel_device(request):
-    """Where Triton's kernels run: in its interpreter on a CPU, or compiled on a GPU."""
-    pytest.importorskip("triton", reason="needs triton, which is available on Linux only")
-    if request.param == "cuda":
-        return torch.device("cuda")
-    if torch.cuda.is_available() and os.environ.get("TRITON_INTERPRET") == "1":
-        pytest.skip("on this machine the kernels are compiled")
-    return torch.device("cpu")
+    """Where kernels run: compiled by LLVM on a CPU, or by Triton on a GPU."""
+    return torch.device(request.param)
 
 
 @pytest.fixture(params=[torch.float32, torch.float64], ids=["float32", "float64"])

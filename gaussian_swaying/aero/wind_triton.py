@@ -12,7 +12,7 @@ from torch import Tensor, nn
 
 from gaussian_swaying.aero.wind import GaussianGust, SineSway, UniformGust, WindField, stream_start
 from gaussian_swaying.kernels.language import tl, triton
-from gaussian_swaying.kernels.launch import launch
+from gaussian_swaying.kernels.launch import lanes, launch
 
 SWAY, UNIFORM, GAUSSIAN = 0, 1, 2
 BLOCK = 64
@@ -124,12 +124,12 @@ def blow(wind: nn.Module, times: Tensor) -> Tensor | None:
             starts = torch.tensor([stream_start(wind.seed, stream) for stream in range(max(len(known), 1))])
             _numbers[wind] = key, numbers.to(times.device), starts.to(times.device)
     _, numbers, starts = _numbers[wind]
-    out = times.new_empty(len(times), 3)
+    out, block = times.new_empty(len(times), 3), lanes(times.device, BLOCK)
     with torch.cuda.device_of(times):
-        launch(_blow, (triton.cdiv(len(times), BLOCK),))(
+        launch(_blow, (triton.cdiv(len(times), block),))(
             times.contiguous(), wind.times, wind.flows.contiguous(), numbers, starts, out, len(times),
             len(wind.times) - 1, KINDS=tuple(row[0] for row in known), MODULATIONS=len(known),
-            LINEAR=wind.interpolation == "linear" and len(wind.times) > 1, BLOCK=BLOCK, num_warps=2,
+            LINEAR=wind.interpolation == "linear" and len(wind.times) > 1, BLOCK=block, num_warps=2,
         )  # fmt: skip
     return out
 

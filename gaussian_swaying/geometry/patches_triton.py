@@ -20,7 +20,7 @@ from gaussian_swaying.geometry.linalg_triton import (
     where9,
 )
 from gaussian_swaying.kernels.language import tl, triton
-from gaussian_swaying.kernels.launch import launch
+from gaussian_swaying.kernels.launch import lanes, launch
 
 BLOCK = 128
 
@@ -115,11 +115,12 @@ def deform_all(
     F, covariance, normal = (tensor.detach().contiguous() for tensor in given)
     made = [torch.empty_like(F), torch.empty_like(normal), torch.empty_like(F) if rotations else F]
     limit = max_stretch is not None and solid is not None
-    keeps = F if solid is None or not limit else solid.contiguous().view(torch.uint8)
+    keeps = F if solid is None or not limit else solid.contiguous().view(torch.int8)
+    block = lanes(F.device, BLOCK)
     if count > 0:
         with torch.cuda.device_of(F):
-            launch(_deform, (triton.cdiv(count, BLOCK),))(
+            launch(_deform, (triton.cdiv(count, block),))(
                 F, covariance, normal, keeps, *made, float(max_stretch or 1) ** 2, count,
-                TURN=rotations, LIMIT=limit, BLOCK=BLOCK,
+                TURN=rotations, LIMIT=limit, BLOCK=block,
             )  # fmt: skip
     return made[0], made[1], made[2] if rotations else None

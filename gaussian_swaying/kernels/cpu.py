@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import ctypes
 import hashlib
+import itertools
 import os
 import threading
 from collections.abc import Callable, Iterator, Sequence
@@ -24,7 +25,7 @@ from gaussian_swaying._files import atomic
 
 _KINDS = {
     torch.float32: "*f32", torch.float64: "*f64", torch.int32: "*i32", torch.int64: "*i64", torch.int8: "*i8",
-    torch.uint8: "*i8", torch.bool: "*i1",
+    torch.bool: "*i1",
 }  # fmt: skip
 
 _ROW = 6
@@ -142,7 +143,7 @@ def _compiled(text: str) -> bytes:
 def _linked(code: bytes, symbol: str) -> tuple[int, Any]:
     """The address of a function of an object file, and what keeps it in memory."""
     llvm = _llvm()
-    name = f"kernel{len(_LINKED)}"
+    name = f"kernel{next(_NAMES)}"  # never one that was tried before
     library = llvm.JITLibraryBuilder().add_object_img(code).add_current_process().export_symbol(symbol)
     tracker = library.link(_linker(), name)
     _LINKED.append(tracker)
@@ -150,6 +151,7 @@ def _linked(code: bytes, symbol: str) -> tuple[int, Any]:
 
 
 _LINKED: list[Any] = []
+_NAMES = itertools.count()
 _COMPILED: dict[Any, int] = {}
 _COMPILING = threading.RLock()
 _said = False
@@ -170,24 +172,26 @@ def _address(kernel: Any, constants: dict[str, Any], kinds: dict[str, str], real
 def _found_or_compiled(kernel: Any, constants: dict[str, Any], kinds: dict[str, str], real: str) -> int:
     from llvmlite import __version__
 
+    options = sorted((name, str(getattr(value, "cache_key", "")), repr(value)) for name, value in constants.items())
     parts = (
-        _sources(), device_source(kernel), repr(sorted(constants.items(), key=lambda pair: pair[0])), kinds, real,
+        _sources(), device_source(kernel), options, kinds, real,
         __version__, _llvm().llvm_version_info, _llvm().get_host_cpu_name(), _features(),
     )  # fmt: skip
     path = _folder() / f"{kernel.fn.__name__}_{hashlib.sha256(repr(parts).encode()).hexdigest()[:32]}.o"
     try:
-        code = path.read_bytes()
-    except OSError:
-        from gaussian_swaying.kernels.translator import translate
+        return _linked(path.read_bytes(), "kernel")[0]
+    except (OSError, RuntimeError):  # it is not there, or broken
+        pass
+    from gaussian_swaying.kernels.translator import translate
 
-        _say()
-        code = _compiled(str(translate(kernel, constants, kinds, real)))
-        try:
-            path.parent.mkdir(parents=True, exist_ok=True)
-            with atomic(path) as temporary:
-                temporary.write_bytes(code)
-        except OSError:  # a read-only home folder: it is compiled again next time
-            pass
+    _say()
+    code = _compiled(str(translate(kernel, constants, kinds, real)))
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with atomic(path) as temporary:
+            temporary.write_bytes(code)
+    except OSError:  # a read-only home folder: it is compiled again next time
+        pass
     return _linked(code, "kernel")[0]
 
 

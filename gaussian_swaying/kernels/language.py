@@ -12,6 +12,7 @@ import inspect
 import os
 from collections.abc import Callable
 from functools import cached_property
+from types import ModuleType
 from typing import Any
 
 import torch
@@ -54,11 +55,28 @@ class Function:
 
     @cached_property
     def cache_key(self) -> str:
-        """Changes with the source."""
-        return hashlib.sha256(inspect.getsource(self.fn).encode()).hexdigest()
+        """Changes with the source of the function and of those that it calls, and with the constants that it names."""
+        found: dict[str, str] = {}
+        _note(self, found)
+        return hashlib.sha256(repr(sorted(found.items())).encode()).hexdigest()
 
     def __repr__(self) -> str:
         return f"{self.__module__}.{self.__name__}"
+
+
+def _note(function: Function, found: dict[str, str]) -> None:
+    """Add the source of a function, of those that it calls, and the constants of their modules, by name."""
+    found[repr(function)] = inspect.getsource(function.fn)
+    names = function.fn.__code__.co_names
+    homes = [function.fn.__globals__]
+    homes += [vars(value) for name in names if isinstance(value := homes[0].get(name), ModuleType)]
+    for home in homes:
+        for name in names:
+            value = home.get(name)
+            if isinstance(value, Function) and repr(value) not in found:
+                _note(value, found)
+            elif isinstance(value, (Constant, bool, int, float, str, tuple)):
+                found[f"{function!r} {name}"] = repr(getattr(value, "value", value))
 
 
 class Language:

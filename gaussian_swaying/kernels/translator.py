@@ -137,17 +137,17 @@ class _Translator(Emitter):
                 scope[name] = defaults[name]
             if name in constant and isinstance(scope[name], Block):
                 raise TranslationError(f"{name} of {function.fn.__name__} is no constant")
-        outer, self._globals = getattr(self, "_globals", None), function.fn.__globals__
+        outer = getattr(self, "_globals", None), getattr(self, "_line", 1)
+        self._globals = function.fn.__globals__
         try:
             found = self._run(tree.body, scope)
         except TranslationError as error:
             if not getattr(error, "placed", False):
                 error.placed = True  # type: ignore[attr-defined]
-                line = tree.lineno + getattr(self, "_line", 1) - 1
-                error.args = (f"{function.fn.__module__}.{function.fn.__name__}, near line {line}: {error}",)
+                error.args = (f"{function.fn.__module__}.{function.fn.__name__}, near line {self._line}: {error}",)
             raise
         finally:
-            self._globals = outer
+            self._globals, self._line = outer
         return None if found is None else found.value
 
     # ---- statements
@@ -685,8 +685,9 @@ def _assigned(body: list[ast.stmt]) -> set[str]:
 @lru_cache(maxsize=1024)
 def _source(function: Any) -> tuple[ast.FunctionDef, list[str], dict[str, Any], set[str]]:
     """The tree of a function, its arguments, their defaults, and which are constants."""
-    source = textwrap.dedent(inspect.getsource(function.fn))
-    tree = next(node for node in ast.parse(source).body if isinstance(node, ast.FunctionDef))
+    lines, first = inspect.getsourcelines(function.fn)
+    source = ast.parse(textwrap.dedent("".join(lines)))
+    tree = next(node for node in ast.increment_lineno(source, first - 1).body if isinstance(node, ast.FunctionDef))
     names = [argument.arg for argument in tree.args.args]
     marked = {a.arg for a in tree.args.args if a.annotation is not None and "constexpr" in ast.unparse(a.annotation)}
     given = inspect.signature(function.fn).parameters

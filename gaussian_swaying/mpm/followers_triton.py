@@ -8,7 +8,7 @@ from torch import Tensor
 from gaussian_swaying.geometry.linalg_triton import load3, load9, matmul, store3, transpose
 from gaussian_swaying.geometry.patches_triton import deform_and_store
 from gaussian_swaying.kernels.language import tl, triton
-from gaussian_swaying.kernels.launch import launch
+from gaussian_swaying.kernels.launch import lanes, launch
 from gaussian_swaying.mpm.transfer import Stencil
 from gaussian_swaying.mpm.triton.shared import VARIES, axis_weights
 from gaussian_swaying.mpm.triton.total_kernels import gather
@@ -99,13 +99,14 @@ def follow(
     made = [torch.empty_like(tensor) for tensor in given]
     turns = torch.empty_like(given[1]) if rotations else given[1]
     limit = max_stretch is not None and solid is not None
-    keeps = fields if solid is None or not limit else solid.contiguous().view(torch.uint8)
+    keeps = fields if solid is None or not limit else solid.contiguous().view(torch.int8)
+    block = lanes(fields.device, BLOCK)
     if count > 0:
         with torch.cuda.device_of(fields):
-            launch(_follow, (triton.cdiv(count, BLOCK),))(
+            launch(_follow, (triton.cdiv(count, block),))(
                 fields, stencil.first, fraction.contiguous(), fields if arm is None else arm.contiguous(),
                 axes.contiguous(), *given, keeps, *made, turns,
                 float(max_stretch or 1) ** 2, per_metre, count, *strides, 1 / dx,
-                ARM=arm is not None, TURN=rotations, LIMIT=limit, BLOCK=BLOCK,
+                ARM=arm is not None, TURN=rotations, LIMIT=limit, BLOCK=block,
             )  # fmt: skip
     return made[0], made[1], made[2], turns if rotations else None

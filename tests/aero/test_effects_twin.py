@@ -1,4 +1,4 @@
-"""A wind with effects in the kernels against the same wind in torch; in Triton's interpreter without a GPU.
+"""A wind with effects in the kernels against the same wind in torch.
 
 Covers: aero.effects, aero.effects_triton, aero.obstacles_triton, aero.wind_triton, mpm.twins.
 """
@@ -102,8 +102,8 @@ WINDS = ("log", "power", "turbulence", "all", "sheltered", "half", "held", *OBST
 @pytest.mark.parametrize(
     ("kernel_device", "formulation", "name"),
     [
-        *(("interpreted", "total", name) for name in WINDS),
-        *(("interpreted", "updated", name) for name in ("all", "sheltered", "several")),  # the same function blows
+        *(("cpu", "total", name) for name in WINDS),
+        *(("cpu", "updated", name) for name in ("all", "sheltered", "several")),  # the same function blows
         *(pytest.param("cuda", way, name, marks=pytest.mark.gpu) for way in ("total", "updated") for name in WINDS),
     ],
     indirect=["kernel_device"],
@@ -120,7 +120,7 @@ def test_the_kernels_blow_as_torch_does(kernel_device, formulation, name):
     assert float((bare.velocity - expected.velocity).abs().max()) > 1e-2 * float(expected.velocity.abs().max())
 
 
-@pytest.mark.slow(gate=["interpreted-updated"])
+@pytest.mark.slow(gate=["cpu-updated"])
 @pytest.mark.parametrize("formulation", ["total", "updated"])
 def test_the_kernels_blow_on_groups_of_patches_and_batches(kernel_device, formulation):
     for options in ({"groups": True}, {"batch": (2,)}):

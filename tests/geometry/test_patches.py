@@ -3,13 +3,11 @@
 Covers: geometry.patches_triton.
 """
 
-import os
-
 import pytest
 import torch
 from shared import gradients, unit
 
-from gaussian_swaying.geometry import patches
+from gaussian_swaying.geometry import patches, patches_triton
 from gaussian_swaying.geometry.covariances import deform_covariance
 from gaussian_swaying.geometry.linalg import polar_rotation
 from gaussian_swaying.geometry.patches import deform_all, deform_normal, deform_patch, smallest_axis_normal
@@ -90,10 +88,7 @@ def test_everything_at_once_is_each_by_itself(device, dtype):
 
 
 def test_the_kernel_keeps_to_the_limit_as_torch_does(device):
-    """In the interpreter too: far beyond the limit, a little, below, flat, empty, solids and grains."""
-    kernels = pytest.importorskip("gaussian_swaying.geometry.patches_triton")
-    if device.type == "cpu" and os.environ.get("TRITON_INTERPRET") != "1":
-        pytest.skip("on this machine the kernels are compiled")
+    """Far beyond the limit, a little, below, flat, empty, solids and grains."""
     count = 40
     f = torch.eye(3).repeat(count, 1, 1) + 0.2 * torch.randn(count, 3, 3)
     f[:20, 0, 1] += torch.logspace(-1, 2, 20)
@@ -105,11 +100,11 @@ def test_the_kernel_keeps_to_the_limit_as_torch_does(device):
     normal, solid = unit(count, 3, dtype=torch.float32), torch.arange(count) % 2 == 0
     given = [part.to(device) for part in (f, rest, normal)]
     for rotations in (True, False):
-        made = kernels.deform_all(*given, rotations, 1.5, solid.to(device))
+        made = patches_triton.deform_all(*given, rotations, 1.5, solid.to(device))
         drawn, _, turns = deform_all(*(part.double() for part in given), rotations, 1.5, solid.to(device))
         torch.testing.assert_close(made[0].double(), drawn, rtol=1e-4, atol=1e-4)
         assert (made[2] is None) == (turns is None)
-    free = kernels.deform_all(*given, False)[0]
+    free = patches_triton.deform_all(*given, False)[0]
     torch.testing.assert_close(free, deform_covariance(*given[:2]))
     changed = (free != made[0]).any(-1).any(-1)
     assert 5 < int(changed.sum()) < 35

@@ -33,7 +33,7 @@ def test_what_is_slow_has_a_twin_in_the_gate(request):
     ],
 )
 def test_a_twin_runs_in_the_gate(given, alone):
-    """On a GPU slow tests of the interpreter are quick, so a test that needs one is no twin."""
+    """A test that needs a GPU runs nowhere else, so it is no twin."""
 
     def item(name, mark, path="here.py"):
         name, _, parameters = name.removesuffix("]").partition("[")

@@ -1,7 +1,6 @@
 """What a user of the package as a whole relies on: names, light imports, the rule for GPU tests, shipped files."""
 
 import ast
-import importlib.util
 import os
 import re
 import subprocess
@@ -51,8 +50,6 @@ def test_import_is_light_and_every_module_imports_without_the_heavy_libraries():
         ".".join(path.relative_to(ROOT).with_suffix("").parts).removesuffix(".__init__")
         for path in sorted((ROOT / "gaussian_swaying").rglob("*.py"))
     ]
-    if importlib.util.find_spec("triton") is None:  # comes with CUDA builds of torch
-        modules = [m for m in modules if not m.endswith("_triton") and ".triton" not in m]
     lightning_classes = {"training.data.datamodule", "training.data.generated_datamodule", "cli.train"}
     lightning_classes |= {f"training.{name}" for name in ("checkpoints", "csv_log", "module", "run_folder", "strategy")}
     lightning_classes |= {"metrics.chamfer", "metrics.frechet_video"}

@@ -9,11 +9,6 @@ import dataclasses
 import pytest
 import torch
 
-pytest.importorskip("triton", reason="needs triton, which is available on Linux only")
-
-import triton
-import triton.language as tl
-
 from gaussian_swaying.aero.force import LAWS as WIND_LAWS
 from gaussian_swaying.aero.force import AeroForce
 from gaussian_swaying.aero.force_adjoint_triton import wind_force_adjoint, wind_on_groups_adjoint
@@ -23,6 +18,8 @@ from gaussian_swaying.aero.wind_force import WindForce
 from gaussian_swaying.geometry.linalg_triton import load3, load9, read, store3, store9
 from gaussian_swaying.geometry.patches import deform_patch
 from gaussian_swaying.geometry.regions import Box
+from gaussian_swaying.kernels.language import tl, triton
+from gaussian_swaying.kernels.launch import lanes, launch
 from gaussian_swaying.mpm.boundaries.ball import BallObstacle
 from gaussian_swaying.mpm.boundaries.pinned_points import PinnedPoints
 from gaussian_swaying.mpm.boundaries.pinned_region import PinnedRegion
@@ -67,7 +64,7 @@ def _close(found, expected, tolerance, name=""):
     assert error <= tolerance, f"{name}: {error:.1e} of the largest value"
 
 
-# ---- one function at a time, in float64 where the kernels are interpreted
+# ---- one function at a time, in float64 on a CPU
 
 
 @triton.jit
@@ -140,7 +137,8 @@ def test_derivative_of_a_stress(name, kernel_device):
     row = torch.tensor(laws.table, device=kernel_device, dtype=torch.float32)
     given = [t.detach().to(kernel_device, dtype).contiguous() for t in (F, Q, mu, lam)]
     change, scalars = torch.empty_like(given[0]), torch.empty(len(F), 2, device=kernel_device, dtype=dtype)
-    _law[(triton.cdiv(len(F), 64),)](*given, row, change, scalars, len(F), LAWS=laws, BLOCK=64)
+    block = lanes(kernel_device, 64)
+    launch(_law, (triton.cdiv(len(F), block),))(*given, row, change, scalars, len(F), LAWS=laws, BLOCK=block)
     _close(change.cpu(), expected[0], tolerance, "F")
     _close(scalars[:, 0].cpu(), expected[1], tolerance, "mu")
     _close(scalars[:, 1].cpu(), expected[2], tolerance, "lambda")
@@ -149,14 +147,15 @@ def test_derivative_of_a_stress(name, kernel_device):
 def test_derivative_of_the_viscous_stress(kernel_device):
     """By F, its rate, mu and lambda."""
     dtype, tolerance = _tolerance(kernel_device, 1e-13, 1e-5)
+    time = 2.0**-9  # numbers are passed in float32
     F, rate, Q = (_random(seed, 50, 3, 3).requires_grad_() for seed in range(3))
     mu, lam = (torch.full((50,), value, dtype=WIDE, requires_grad=True) for value in (4e3, 6e3))
-    stress = kelvin_voigt_pk1(F, rate, mu, lam, 2e-3)
+    stress = kelvin_voigt_pk1(F, rate, mu, lam, time)
     expected = torch.autograd.grad((stress * Q).sum(), [F, rate, mu, lam])
     given = [t.detach().to(kernel_device, dtype) for t in (F, rate, Q)]
     found = [torch.empty_like(given[0]) for _ in range(2)]
     scalars = torch.empty(50, 2, device=kernel_device, dtype=dtype)
-    _viscous[(1,)](*given, *found, scalars, 4e3, 6e3, 2e-3, 50, BLOCK=64)
+    launch(_viscous, (1,))(*given, *found, scalars, 4e3, 6e3, time, 50, BLOCK=64)
     for value, wanted in zip((*found, scalars[:, 0], scalars[:, 1]), expected, strict=True):
         _close(value.cpu(), wanted, tolerance)
 
@@ -192,7 +191,10 @@ def _check_wind(given, options, function, expected, tolerance):
     """The gradients of a . f by F, velocity, wind and coefficients."""
     count = len(given[0])
     by_F, by_v, parts = (torch.empty_like(given[0]), torch.empty_like(given[1]), given[1].new_empty(count, 6))
-    _wind[(triton.cdiv(count, 64),)](*given, by_F, by_v, parts, count, OPTIONS=options, FUNCTION=function, BLOCK=64)
+    block = lanes(by_F.device, 64)
+    launch(_wind, (triton.cdiv(count, block),))(
+        *given, by_F, by_v, parts, count, OPTIONS=options, FUNCTION=function, BLOCK=block
+    )
     _close(by_F.cpu(), expected[0], tolerance, "F")
     _close(by_v.cpu(), expected[1], tolerance, "velocity")
     sums = parts.cpu().double().sum(0)
@@ -306,7 +308,7 @@ def _compare(device, law, tolerance=3e-4, left_out=(), **settings):
         pytest.fail(f"above {tolerance:.0e} of the largest value: " + ", ".join(rows))
 
 
-@pytest.mark.slow(gate=["interpreted-corotated", "interpreted-hencky"])
+@pytest.mark.slow(gate=["cpu-corotated", "cpu-hencky"])
 @pytest.mark.parametrize("name", LAWS)
 def test_gradients_of_a_rollout(name, kernel_device):
     """A sheet in wind, by everything that a fit may seek, in segments of two substeps and a shorter last one."""
@@ -318,7 +320,7 @@ def test_gradients_with_viscosity_and_two_laws(kernel_device):
     _compare(kernel_device, [FixedCorotated(), NeoHookean()], stiffness_damping=2e-3)
 
 
-@pytest.mark.slow(gate=["interpreted-clamp", "interpreted-nodes"])
+@pytest.mark.slow(gate=["cpu-clamp", "cpu-nodes"])
 @pytest.mark.parametrize("kind", ["nodes", "hinge", "clamp"])
 def test_gradients_with_pins(kind, kernel_device):
     """Held nodes, points and slopes; the gradient by the density goes through what held points weigh, too."""

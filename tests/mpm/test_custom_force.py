@@ -18,14 +18,12 @@ def module(monkeypatch):
     sys.modules.pop("custom_force", None)
 
 
-@pytest.mark.parametrize("triton", ["there", None])
-def test_the_example_ends_in_a_check(module, triton, monkeypatch, capsys):
-    """Its twin against torch; without Triton its circulation."""
-    if triton is None:
-        monkeypatch.setattr(module, "triton", None)
-        assert module.PointVortex([0.0, 0.0], 1.0).twin() is None
-    assert module.main() < 2e-5
-    assert ("kernels and torch" in capsys.readouterr().out) == (module.triton is not None)
+def test_the_example_ends_in_a_check(module, capsys):
+    """Its twin against torch, and its circulation."""
+    assert 0 < module.main() < 2e-5
+    error, found = capsys.readouterr().out.splitlines()
+    assert float(error.removeprefix("error of the circulation: ")) < 2e-5
+    assert found.startswith("kernels and torch differ by ")
 
 
 def test_a_wrong_force_is_found(module):

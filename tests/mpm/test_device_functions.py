@@ -1,7 +1,6 @@
 """The decompositions and materials of the kernels, one function at a time, against float64.
 
-A test of many matrices at once (also singular, inverted, tiny, with repeated stretches) costs almost nothing here, even
-in the interpreter.
+A test of many matrices at once (also singular, inverted, tiny, with repeated stretches) costs almost nothing here.
 
 Covers: geometry.linalg_triton, mpm.laws.triton.body, mpm.laws.triton.fixed_corotated, mpm.laws.triton.fluid,
 mpm.laws.triton.foam, mpm.laws.triton.hencky, mpm.laws.triton.metal, mpm.laws.triton.neo_hookean, mpm.laws.triton.sand,
@@ -13,13 +12,10 @@ import math
 import pytest
 import torch
 
-pytest.importorskip("triton", reason="needs triton, which is available on Linux only")
-
-import triton
-import triton.language as tl
-
 from gaussian_swaying.geometry import linalg
 from gaussian_swaying.geometry.linalg_triton import polar_rotation, svd3
+from gaussian_swaying.kernels.language import tl, triton
+from gaussian_swaying.kernels.launch import lanes, launch
 from gaussian_swaying.mpm import laws
 from gaussian_swaying.mpm.laws.fixed_corotated import FixedCorotated
 from gaussian_swaying.mpm.laws.fluid import Fluid
@@ -33,7 +29,6 @@ from gaussian_swaying.mpm.laws.snow import Snow
 from gaussian_swaying.mpm.laws.spring_network import SpringNetwork
 from gaussian_swaying.mpm.laws.triton.body import BodyLaws, kirchhoff, pk1
 from gaussian_swaying.mpm.laws.triton.functions import LawFunctions, functions_of, shared
-from gaussian_swaying.mpm.triton import fused
 from gaussian_swaying.mpm.twins import Numbers, Twin
 
 MU, LAM, DT = 4e3, 6e3, 1e-3
@@ -128,8 +123,8 @@ def _matrices(device, unique=False):
 
 
 def _launch(kernel, count, *arguments, **options):
-    block = 128 if arguments[0].is_cuda else 2048  # the interpreter is quick with long vectors
-    kernel[(-(-count // block),)](*arguments, count, **options, BLOCK=block)
+    block = lanes(arguments[0].device, 128)
+    launch(kernel, (-(-count // block),))(*arguments, count, **options, BLOCK=block)
 
 
 def _decomposed(F):
@@ -342,8 +337,7 @@ def test_what_a_body_asks_of_a_kernel():
     assert flowing.all_flow
     keys = {repr(body) for body in (direct, mixed, flowing, BodyLaws([Sand()]), BodyLaws([FixedCorotated()]))}
     assert len(keys) == 5
-    if not fused.INTERPRETED:
-        assert repr(BodyLaws([Fluid(3.0)])) == repr(BodyLaws([Fluid()]))
+    assert repr(BodyLaws([Fluid(3.0)])) == repr(BodyLaws([Fluid()]))
 
 
 def test_a_twin_needs_a_stress():

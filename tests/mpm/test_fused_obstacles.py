@@ -1,4 +1,4 @@
-"""Obstacles in the kernels against torch; on a CPU in Triton's interpreter.
+"""Obstacles in the kernels against torch.
 
 Covers: geometry.distance_triton, mpm.triton.obstacle_kernels, mpm.triton.obstacles.
 """
@@ -12,6 +12,7 @@ from gaussian_swaying.geometry.distance import DistanceGrid
 from gaussian_swaying.geometry.frame import SimFrame
 from gaussian_swaying.geometry.keyed_path import KeyedPath
 from gaussian_swaying.geometry.rotations import rotation_from_z
+from gaussian_swaying.kernels.launch import lanes, launch
 from gaussian_swaying.mpm.boundaries.ball import BallObstacle
 from gaussian_swaying.mpm.boundaries.block import BoxObstacle
 from gaussian_swaying.mpm.boundaries.capsule import CapsuleObstacle
@@ -21,8 +22,6 @@ from gaussian_swaying.mpm.boundaries.plane import Plane
 from gaussian_swaying.mpm.boundaries.still_gaussians import StillGaussians
 from gaussian_swaying.mpm.solver import MPMSolver
 from gaussian_swaying.mpm.state import MaterialPoints
-
-pytest.importorskip("triton", reason="needs triton, which is available on Linux only")
 from gaussian_swaying.mpm.triton import obstacle_kernels as kernels
 from gaussian_swaying.mpm.triton.obstacles import Solids
 
@@ -56,17 +55,18 @@ SHAPES = {
 
 def _ask_kernel(obstacle, place, time, device):
     """Gap, normal, velocity, whether it counts and whether one is within 1 cm, at places in the kernel of ``total``."""
-    solids = Solids([(obstacle.to(device), 0)], device, steps=1)
+    solids = Solids([(obstacle.to(device), 0)], place, steps=1)
     solids.take()
     solids.prepare(time, torch.full_like(time, DT), 1)
     count = len(place)
     gap, valid = (torch.full((count,), -7.0, device=device) for _ in range(2))
     facing, drive = (torch.zeros(count, 3, device=device) for _ in range(2))
     within = torch.zeros((), dtype=torch.int32, device=device)
-    kernels.obstacle_places[(-(-count // 32),)](
+    block = lanes(torch.device(device), 32)
+    launch(kernels.obstacle_places, (-(-count // block),))(
         place, torch.zeros(count, 4, device=device), torch.full_like(gap, 0.02), gap, facing, drive, valid, within,
         count, solids.rows, solids.windows, solids.poses, solids.tables.buffer, time, torch.full_like(time, DT), 0.01,
-        SOLIDS=solids.twins, MOVES=solids.moves[0], BLOCK=32,
+        SOLIDS=solids.twins, MOVES=solids.moves[0], BLOCK=block,
     )  # fmt: skip
     return gap, facing, drive, valid, int(within)
 

@@ -76,7 +76,6 @@ def test_a_law_is_one_file():
 
 
 def test_no_file_of_device_functions_is_unused():
-    pytest.importorskip("triton", reason="needs triton, which is available on Linux only")
     names = {found.name for found in iter_modules([f"{path}/triton" for path in laws.__path__])}
     found = [
         import_module(f"gaussian_swaying.mpm.laws.triton.{name}").FUNCTIONS

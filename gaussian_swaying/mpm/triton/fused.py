@@ -354,17 +354,23 @@ class Fused(ABC):
         work = self.load[0].reshape(self.scenes, self.particles).sum(1, dtype=torch.float64)
         return work.reshape(self.body.points.mass.shape[:-1])
 
+    def pass_time(self) -> None:
+        """Move the time of the substep on."""
+        time, dt = self.time, self.dt
+        call(lambda: time.add_(dt), self.device)
+
     def repeat(self, steps: int, key: Any, body: Callable[[int], None]) -> None:
         """Run ``body(offset)``, one substep, for each offset, from graphs if there are any.
 
         The first time a key is seen, the substeps run without a graph, which compiles what is not yet compiled; the
         second time, they are recorded.
         """
+        first = self.first_step  # what is recorded must not hold this object, which holds the recordings
 
         def several(count: int) -> None:
             for offset in range(count):
                 body(offset)
-            call(lambda: self.first_step.add_(count), self.device)
+            call(lambda: first.add_(count), self.device)
 
         whole = (key, self.places(), self._asked_key())
         self.repeater.run(steps, whole, several, self.recordable, self.launches and not self.asked)

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from gaussian_swaying.kernels.graphs import RECORDED
 from gaussian_swaying.kernels.language import triton
-from gaussian_swaying.kernels.launch import call, lanes, launch
+from gaussian_swaying.kernels.launch import lanes, launch
 from gaussian_swaying.mpm.boundaries.pinned_points import PinnedPoints
 from gaussian_swaying.mpm.boundaries.pinned_region import PinnedRegion
 from gaussian_swaying.mpm.formulations.formulation import Formulation
@@ -256,7 +256,7 @@ class FusedTotal(Fused):
         if not self.plain:
             self._constrain()
         if not self.plain or self.asked or (self.touching is not None and self.touching.walls):
-            call(lambda: self.time.add_(self.dt), self.device)
+            self.pass_time()
 
     def _hold_points(self, points: DenseHolds, offset: int) -> None:
         """Stop the held points: their velocities, then those of the nodes around them."""

@@ -8,7 +8,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from gaussian_swaying.kernels.launch import LANES, call, lanes, launch
+from gaussian_swaying.kernels.launch import LANES, lanes, launch
 from gaussian_swaying.mpm.body import Held
 from gaussian_swaying.mpm.formulations.formulation import Formulation
 from gaussian_swaying.mpm.state import GridSpec, MPMState
@@ -288,7 +288,7 @@ class FusedUpdated(Fused):
         if acting:
             self._constrain()
         if acting or self.asked:
-            call(lambda: self.time.add_(self.dt), self.device)
+            self.pass_time()
 
     def _constrain(self) -> None:
         """Boundary conditions on the velocities of the nodes."""

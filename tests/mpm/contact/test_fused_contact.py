@@ -1,4 +1,4 @@
-"""Contact in the Triton substep against torch; on a CPU in Triton's interpreter.
+"""Contact in the Triton substep against torch.
 
 Covers: mpm.triton.contact_kernels, mpm.triton.contact_list_kernels, mpm.triton.fused_contact.
 """

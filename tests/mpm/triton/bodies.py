@@ -1,8 +1,6 @@
 """Small bodies for the fused substep against the torch substep, which is the reference.
 
-Without a GPU the kernels run in Triton's interpreter, one operation after the other in numpy: slow, so the bodies are
-small there. On a GPU, compiling takes most of the time, so bodies share their options, and some cases run only in the
-interpreter.
+Compiling takes most of the time, so bodies share their options, and some cases run only on a CPU.
 """
 
 import math
@@ -54,10 +52,10 @@ PLASTIC = {
 }
 
 
-def on_each(*everywhere, interpreted=()):
-    """Cases for ``kernel_device``; some of them run only if nothing is compiled."""
+def on_each(*everywhere, cpu=()):
+    """Cases for ``kernel_device``; some of them run only on a CPU, where compiling is quick."""
     gpu = [pytest.param("cuda", case, marks=pytest.mark.gpu) for case in everywhere]
-    return [pytest.param("interpreted", case) for case in (*everywhere, *interpreted)] + gpu
+    return [pytest.param("cpu", case) for case in (*everywhere, *cpu)] + gpu
 
 
 def noise(seed, *shape):

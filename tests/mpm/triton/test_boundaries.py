@@ -18,6 +18,7 @@ from gaussian_swaying.mpm.boundaries.pinned_region import PinnedRegion
 from gaussian_swaying.mpm.boundaries.plane import Plane
 from gaussian_swaying.mpm.boundaries.sequential_release import SequentialRelease
 from gaussian_swaying.mpm.boundaries.velocity_box import VelocityBox
+from gaussian_swaying.mpm.triton import fused_updated
 
 from .bodies import (
     DT,
@@ -34,11 +35,6 @@ from .bodies import (
     run_in_wind,
     set_going,
 )
-
-try:
-    from gaussian_swaying.mpm.triton import fused, fused_updated
-except ImportError:
-    fused = None
 
 WINDOW = {"start": 0.5 * DT, "end": 1.5 * DT}
 BOUNDARIES = {
@@ -65,15 +61,15 @@ BOUNDARIES = {
 
 
 @pytest.mark.slow(
-    gate=[f"updated-interpreted-{name}" for name in ("handle", "knock and release", "walls", "box", "two pins")]
-    + [f"total-interpreted-{name}" for name in ("hinge", "hinged handle", "plane", "box", "two pins")]
+    gate=[f"updated-cpu-{name}" for name in ("handle", "knock and release", "walls", "box", "two pins")]
+    + [f"total-cpu-{name}" for name in ("hinge", "hinged handle", "plane", "box", "two pins")]
 )
 @pytest.mark.parametrize(
     ("kernel_device", "name"),
     [
         *(pytest.param("cuda", name, marks=pytest.mark.gpu) for name in BOUNDARIES),
         *(
-            ("interpreted", name)
+            ("cpu", name)
             for name in ("two pins", "hinge", "handle", "hinged handle", "knock and release", "plane", "box", "walls")
         ),
     ],

@@ -10,10 +10,12 @@ from gaussian_swaying.aero.force import AeroForce
 from gaussian_swaying.aero.patches import Patches
 from gaussian_swaying.aero.wind import SpatialWind, WindField
 from gaussian_swaying.aero.wind_force import WindForce
+from gaussian_swaying.kernels.language import tl, triton
 from gaussian_swaying.mpm.boundaries.pinned_region import PinnedRegion
 from gaussian_swaying.mpm.boundaries.plane import Plane
 from gaussian_swaying.mpm.forces import Force
 from gaussian_swaying.mpm.laws.sand import Sand
+from gaussian_swaying.mpm.triton import fused, fused_updated
 from gaussian_swaying.mpm.twins import Numbers, Twin
 
 from .bodies import (
@@ -35,14 +37,6 @@ from .bodies import (
     set_going,
 )
 
-try:
-    import triton
-    import triton.language as tl
-
-    from gaussian_swaying.mpm.triton import fused, fused_updated
-except ImportError:
-    fused = None
-
 
 @pytest.mark.parametrize(
     ("kernel_device", "settings"),
@@ -51,7 +45,7 @@ except ImportError:
         {"law": "projected", "lift_direction": "lift", "unit_tangent": True},
         {"max_area_ratio": 0.9},
         {"law": "linear", "drag_step": "semi_implicit"},
-        interpreted=[{"law": "projected"}, {"law": "linear"}, {"lift_direction": "lift"}, {"unit_tangent": True}],
+        cpu=[{"law": "projected"}, {"law": "linear"}, {"lift_direction": "lift"}, {"unit_tangent": True}],
     ),
     indirect=["kernel_device"],
     ids=lambda value: value if isinstance(value, str) else ", ".join(map(str, value.values())),
@@ -67,7 +61,7 @@ def test_every_kind_of_wind(kernel_device, formulation, settings):
         {"drag_step": "semi_implicit", "max_area_ratio": 0.9},
         {"law": "projected", "lift_direction": "lift", "unit_tangent": True},
         {"law": "linear", "drag_step": "semi_implicit"},
-        interpreted=[{"law": "projected"}],
+        cpu=[{"law": "projected"}],
     ),
     indirect=["kernel_device"],
     ids=lambda value: value if isinstance(value, str) else ", ".join(map(str, value.values())),
@@ -107,7 +101,7 @@ def test_the_cap_on_the_area_acts(kernel_device, formulation):
     assert gained[2:] == pytest.approx(gained[:3], rel=1e-5)
 
 
-@pytest.mark.parametrize("kernel_device", ["interpreted"], indirect=True)
+@pytest.mark.parametrize("kernel_device", ["cpu"], indirect=True)
 def test_patches_without_flow_and_flat_ones(kernel_device):
     """Air that moves with the patch, and a patch that is pressed to nothing."""
 
@@ -212,15 +206,15 @@ FORCES = {
 
 
 @pytest.mark.slow(
-    gate=[f"{one}-interpreted-('wind and custom', 2.0)" for one in FORMULATIONS]
-    + [f"{one}-interpreted-('custom, wind, wind', None)" for one in FORMULATIONS]
+    gate=[f"{one}-cpu-('wind and custom', 2.0)" for one in FORMULATIONS]
+    + [f"{one}-cpu-('custom, wind, wind', None)" for one in FORMULATIONS]
 )
 @pytest.mark.parametrize(
     ("kernel_device", "case"),
     on_each(
         ("wind and custom", 2.0),
         ("custom, wind, wind", None),
-        interpreted=[("custom", 2.0), ("semi-implicit wind and custom", None)],
+        cpu=[("custom", 2.0), ("semi-implicit wind and custom", None)],
     ),
     indirect=["kernel_device"],
     ids=str,
@@ -270,7 +264,7 @@ def test_forces_in_torch_with_boundaries_looks_and_flow(kernel_device, case):
     assert float(found[1][1]) == pytest.approx(float(found[0][1]), rel=2 * TOLERANCE)
 
 
-@pytest.mark.parametrize("kernel_device", ["interpreted"], indirect=True)
+@pytest.mark.parametrize("kernel_device", ["cpu"], indirect=True)
 @pytest.mark.parametrize("formulation", FORMULATIONS)
 def test_a_force_that_cannot_be_recorded_is_asked_by_the_host(kernel_device, formulation):
     """The other forces then run in torch as well."""
@@ -304,21 +298,19 @@ def test_a_wind_that_depends_on_the_place(kernel_device, formulation):
     check_agreement(run_both(points, lambda solver, state: solver.rollout(state, DT, 2, shear), formulation))
 
 
-if fused is not None:
-
-    @triton.jit
-    def _toward(F, velocity, position, point, numbers, now, table, OPTIONS: tl.constexpr):
-        """Pulls along a vector by a share of each particle; has a resistance if compiled with it."""
-        scale = point[0] * numbers[0] * F[0] * tl.load(table + 1)
-        resistance = point[0] * 0
-        if OPTIONS[0]:
-            resistance = point[1]
-        force = (
-            scale * now[0] - resistance * velocity[0],
-            scale * now[1] - resistance * velocity[1],
-            scale * now[2] - resistance * velocity[2],
-        )
-        return force, resistance
+@triton.jit
+def _toward(F, velocity, position, point, numbers, now, table, OPTIONS: tl.constexpr):
+    """Pulls along a vector by a share of each particle; has a resistance if compiled with it."""
+    scale = point[0] * numbers[0] * F[0] * tl.load(table + 1)
+    resistance = point[0] * 0
+    if OPTIONS[0]:
+        resistance = point[1]
+    force = (
+        scale * now[0] - resistance * velocity[0],
+        scale * now[1] - resistance * velocity[1],
+        scale * now[2] - resistance * velocity[2],
+    )
+    return force, resistance
 
 
 class _Toward(Force):
@@ -357,7 +349,7 @@ class _Toward(Force):
         )
 
 
-@pytest.mark.slow(gate=["interpreted-total-False", "interpreted-updated-True"])
+@pytest.mark.slow(gate=["cpu-total-False", "cpu-updated-True"])
 @pytest.mark.parametrize("resists", [False, True])
 @pytest.mark.parametrize("formulation", FORMULATIONS)
 def test_a_twin_from_outside(kernel_device, formulation, resists):

@@ -33,7 +33,7 @@ def test_elastic_laws_in_total(kernel_device, law):
 
 @pytest.mark.parametrize(
     ("kernel_device", "law"),
-    on_each("corotated", interpreted=["neo-hookean", "hencky", "sand", "sand that swells", "snow", "fluid"]),
+    on_each("corotated", cpu=["neo-hookean", "hencky", "sand", "sand that swells", "snow", "fluid"]),
     indirect=["kernel_device"],
 )
 def test_laws_in_updated(kernel_device, law):
@@ -47,7 +47,7 @@ def test_laws_in_updated(kernel_device, law):
 
 @pytest.mark.parametrize(
     ("kernel_device", "names"),
-    on_each([*ELASTIC, *PLASTIC], interpreted=[[*ELASTIC], ["neo-hookean", "fluid", "snow"]]),
+    on_each([*ELASTIC, *PLASTIC], cpu=[[*ELASTIC], ["neo-hookean", "fluid", "snow"]]),
     indirect=["kernel_device"],
     ids=lambda value: value if isinstance(value, str) else f"{len(value)} laws",
 )
@@ -60,7 +60,7 @@ def test_several_laws_in_updated(kernel_device, names):
 
 @pytest.mark.parametrize(
     ("kernel_device", "names"),
-    on_each([*ELASTIC], interpreted=[["corotated", "neo-hookean"], ["neo-hookean", "hencky"]]),
+    on_each([*ELASTIC], cpu=[["corotated", "neo-hookean"], ["neo-hookean", "hencky"]]),
     indirect=["kernel_device"],
     ids=lambda value: value if isinstance(value, str) else f"{len(value)} laws",
 )

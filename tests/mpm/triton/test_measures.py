@@ -8,12 +8,9 @@ import math
 import pytest
 import torch
 
-from .bodies import DT, ELASTIC, FORMULATIONS, PLASTIC, make_points, make_solver, noise, set_going
+from gaussian_swaying.mpm.triton import measures
 
-try:
-    from gaussian_swaying.mpm.triton import measures
-except ImportError:
-    measures = None
+from .bodies import DT, ELASTIC, FORMULATIONS, PLASTIC, make_points, make_solver, noise, set_going
 
 
 @pytest.mark.parametrize("formulation", FORMULATIONS)

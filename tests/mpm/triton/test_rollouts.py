@@ -20,6 +20,7 @@ from gaussian_swaying.mpm.boundaries.plane import Plane
 from gaussian_swaying.mpm.boundaries.velocity_box import VelocityBox
 from gaussian_swaying.mpm.solver import MPMSolver
 from gaussian_swaying.mpm.state import GridSpec
+from gaussian_swaying.mpm.triton import fused, fused_total, fused_updated
 from gaussian_swaying.simulation.diagnostics import SimulationDiverged, check_state
 
 from .bodies import (
@@ -43,15 +44,10 @@ from .bodies import (
     set_going,
 )
 
-try:
-    from gaussian_swaying.mpm.triton import fused, fused_total, fused_updated
-except ImportError:
-    fused = None
-
 
 @pytest.mark.parametrize(
     ("kernel_device", "case"),
-    on_each(("total", False), ("updated", True), interpreted=[("updated", False)]),
+    on_each(("total", False), ("updated", True), cpu=[("updated", False)]),
     indirect=["kernel_device"],
     ids=str,
 )
@@ -62,7 +58,7 @@ def test_gravity_damping_and_viscosity(kernel_device, case):
     check_agreement(run_in_wind(make_points(kernel_device), formulation, steps=2, mls=mls, **options))
 
 
-@pytest.mark.parametrize("kernel_device", ["interpreted"], indirect=True)
+@pytest.mark.parametrize("kernel_device", ["cpu"], indirect=True)
 def test_mls(kernel_device):
     check_agreement(run_in_wind(make_points(kernel_device), "updated", mls=True))
 
@@ -109,13 +105,13 @@ def test_rollouts_in_parts(kernel_device, formulation, monkeypatch):
     check_agreement(ends)
 
 
-@pytest.mark.slow(gate=["interpreted-corotated, total", "interpreted-sand, updated"])
+@pytest.mark.slow(gate=["cpu-corotated, total", "cpu-sand, updated"])
 @pytest.mark.parametrize(
     ("kernel_device", "case"),
     on_each(
         *((law, formulation) for law in ("corotated", "springs") for formulation in FORMULATIONS),
         ("sand", "updated"),
-        interpreted=[("hencky", "total"), ("metal", "updated")],
+        cpu=[("hencky", "total"), ("metal", "updated")],
     ),
     indirect=["kernel_device"],
     ids=lambda value: value if isinstance(value, str) else ", ".join(value),
@@ -179,7 +175,7 @@ REPLAYED = {
 }
 
 
-@pytest.mark.slow(gate=["interpreted-a hinge", "interpreted-no wind"])
+@pytest.mark.slow(gate=["cpu-a hinge", "cpu-no wind"])
 @pytest.mark.parametrize("case", REPLAYED)
 def test_replayed_rollouts_give_the_same_bits(kernel_device, case, monkeypatch):
     """On a GPU nothing is recorded at first; results stay as they are when another rollout follows."""
@@ -209,7 +205,7 @@ def test_replayed_rollouts_give_the_same_bits(kernel_device, case, monkeypatch):
         assert torch.equal(getattr(again, name), value), name
 
 
-@pytest.mark.slow(gate=["interpreted-played"])
+@pytest.mark.slow(gate=["cpu-played"])
 @pytest.mark.parametrize("graphs", ["as on the device", "played"])
 def test_a_replayed_rollout_follows_what_changes(kernel_device, graphs, monkeypatch):
     """Numbers of the wind and patches that change in place, and a force that is another one.
@@ -318,7 +314,7 @@ class _Played:
         del self.replay
 
 
-@pytest.mark.parametrize("kernel_device", ["interpreted"], indirect=True)
+@pytest.mark.parametrize("kernel_device", ["cpu"], indirect=True)
 def test_graphs_go_with_their_grid(kernel_device, monkeypatch):
     """Over a hundred grids, with substeps that only count themselves."""
     alive, substeps = weakref.WeakSet(), []
@@ -422,9 +418,7 @@ BROKEN = [("position", math.nan), ("position", math.inf), ("position", 1e30), ("
 BROKEN += [("velocity", -math.inf), ("velocity", 1e12), ("velocity", 1e30)]
 
 
-@pytest.mark.slow(
-    gate=["interpreted-torch-velocity-nan", "interpreted-triton-velocity-nan", "interpreted-triton-position-1e+30"]
-)
+@pytest.mark.slow(gate=["cpu-torch-velocity-nan", "cpu-triton-velocity-nan", "cpu-triton-position-1e+30"])
 @pytest.mark.parametrize(("name", "value"), BROKEN)
 @pytest.mark.parametrize("transfer", ["torch", "triton"])
 def test_a_broken_particle_is_reported_and_breaks_nothing_else(kernel_device, transfer, name, value):

@@ -1,0 +1,34 @@
+"""The kernels with the blocks of a GPU, in Triton's interpreter: on a machine without a GPU nothing else runs those.
+
+A block of a GPU has many lanes and several axes, sums the particles of a cell across lanes and adds to the grid
+atomically; on a CPU, kernels are compiled for blocks of one axis. The interpreter is slow, so one process runs a few
+tests of other files in it.
+"""
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+import torch
+
+ROOT = Path(__file__).parents[2]
+TESTS = [
+    "mpm/triton/test_fused_total.py::test_cells_of_any_size[2048-cpu-('total', [1, 3, 0, 64, 65, 130])]",
+    "mpm/triton/test_fused_total.py::test_cells_of_any_size[1-cpu-('updated', [3, 0, 64])]",
+    "mpm/triton/test_fused_total.py::test_crowded_cells_are_cut_only_where_there_are_few[cpu]",
+    "mpm/triton/test_boundaries.py::test_points_that_are_held[cpu-nodes, hinge and clamp]",
+    "mpm/contact/test_fused_contact.py::test_the_kernels_do_what_torch_does[cpu-4]",
+    "mpm/test_adjoint.py::test_gradients_with_pins_of_both_kinds[cpu]",
+]
+
+
+@pytest.mark.skipif(torch.cuda.is_available(), reason="the GPU runs the kernels")
+def test_the_blocks_of_a_gpu_do_what_torch_does():
+    pytest.importorskip("triton", reason="needs triton, which is available on Linux only")
+    command = [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", *(f"tests/{test}" for test in TESTS)]
+    given = {**os.environ, "TRITON_INTERPRET": "1"}
+    made = subprocess.run(command, cwd=ROOT, env=given, capture_output=True, text=True, check=False)
+    assert f"{len(TESTS)} passed" in made.stdout, made.stdout + made.stderr
+    assert made.returncode == 0
