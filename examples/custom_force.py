@@ -95,7 +95,7 @@ def main() -> float:
     place = 0.06 + 0.18 * torch.rand(40, 3, generator=torch.Generator().manual_seed(0)).to(device)
     points = MaterialPoints.create(place, volume=1e-4, density=50.0, youngs_modulus=1e4, poisson_ratio=0.3)
     ends = []
-    for transfer in ("torch", "triton"):
+    for transfer in ("torch", "kernels"):
         solver = MPMSolver(dx=0.1, transfer=transfer)
         vortices = [PointVortex([0.1, 0.1], 30.0).to(device), PointVortex([0.2, 0.1], -20.0).to(device)]
         with torch.no_grad():

@@ -87,7 +87,7 @@ def main() -> float:
         place.to(device), volume=1e-4, density=50.0, youngs_modulus=1e4, poisson_ratio=0.3, law=SaintVenant(1.5)
     )
     ends = []
-    for transfer in ("torch", "triton"):
+    for transfer in ("torch", "kernels"):
         solver = MPMSolver(dx=0.1, transfer=transfer)
         with torch.no_grad():
             ends.append(solver.rollout(solver.init_state(points, velocity.to(device)), 1e-3, 5).F_total)

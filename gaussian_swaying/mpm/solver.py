@@ -32,7 +32,7 @@ from gaussian_swaying.mpm.timestep import check_pace, fixed_substeps, look_marks
 Fused = Any
 """A ``mpm.triton.fused.Fused``; not imported even for its type, as the parser resolves types and Triton takes 0.1 s."""
 
-TRANSFERS = ("auto", "torch", "triton")
+TRANSFERS = ("auto", "torch", "kernels")
 
 
 class MPMSolver(Solver):
@@ -62,8 +62,9 @@ class MPMSolver(Solver):
             order is always fixed. Gradients on a GPU are not covered.
         boundaries: Boundary conditions, applied in order, impulses first.
         transfer: Code that computes substeps. ``torch`` is the reference and works on any device and with all
-            gradients; ``triton`` runs a whole substep in two kernels on a CUDA device, in float32, with gradients in
-            ``total`` by the first state, stiffness, mass, wind and coefficients; ``auto`` uses triton where possible.
+            gradients; ``kernels`` runs a whole substep in a few compiled kernels, in float32 on a CUDA device and in
+            both precisions on a CPU, with gradients in ``total`` by the first state, stiffness, mass, wind and
+            coefficients; ``auto`` uses the kernels where possible.
 
     Example:
         >>> points = MaterialPoints.create(torch.rand(100, 3), volume=1e-3, density=100.0, youngs_modulus=1e4,
@@ -89,7 +90,7 @@ class MPMSolver(Solver):
         mls: bool = False,
         deterministic: bool = False,
         boundaries: Sequence[Boundary] = (),
-        transfer: Literal["auto", "torch", "triton"] = "auto",
+        transfer: Literal["auto", "torch", "kernels"] = "auto",
     ) -> None:
         super().__init__()
         check_choice("transfer", transfer, TRANSFERS)
@@ -100,7 +101,7 @@ class MPMSolver(Solver):
         gravity = check_vector("gravity", gravity)
         self.settings = Settings(dx, gravity, damping, stiffness_damping, max_nodes, mls, deterministic)
         self.formulation: Literal["total", "updated"] = formulation
-        self.transfer: Literal["auto", "torch", "triton"] = transfer
+        self.transfer: Literal["auto", "torch", "kernels"] = transfer
         self.cfl, self.substep = float(cfl), substep
         FORMULATIONS[formulation].check_settings(self.settings)
         self.boundaries = nn.ModuleList(boundaries)
@@ -253,38 +254,38 @@ class MPMSolver(Solver):
         self._bound = bound
 
     def _why_not_kernels(self, bound: Formulation) -> str | None:
-        """Return the reason why no kernels are used, if so; ValueError if none can be, but ``transfer`` is triton."""
+        """Return the reason why no kernels are used, if so; ValueError if none can be, but ``transfer`` is kernels."""
         if self.transfer == "torch":
             return "`transfer` is torch"
         try:
             from gaussian_swaying.mpm.triton.twins import why_not_kernels
 
-            obstacle = why_not_kernels(bound, interpret=self.transfer == "triton")
+            obstacle = why_not_kernels(bound, interpret=self.transfer == "kernels")
         except ImportError as error:
-            obstacle = f"Triton cannot be imported ({error})"
-        if self.transfer == "triton" and obstacle is not None:
-            raise ValueError(f"`transfer: triton` cannot be used, because {obstacle}: set it to auto or torch.")
+            obstacle = f"the kernels cannot be imported ({error})"
+        if self.transfer == "kernels" and obstacle is not None:
+            raise ValueError(f"`transfer: kernels` cannot be used, because {obstacle}: set it to auto or torch.")
         return obstacle
 
     @property
     def has_kernels(self) -> bool:
-        """True if the Triton substep is used where no gradient is needed."""
+        """True if the substep of the kernels is used where no gradient is needed."""
         return self._bound is not None and self._fused_obstacle is None
 
     def fused(self, *tensors: Tensor | None) -> Fused:
-        """The Triton substep of this material; None if the torch substep is used.
+        """The compiled substep of this material; None if the torch substep is used.
 
         Args:
             tensors: Inputs of the substep; if one of them requires a gradient, the torch substep is used.
 
         Raises:
-            ValueError: If ``transfer`` is triton and a gradient is required.
+            ValueError: If ``transfer`` is kernels and a gradient is required.
         """
         if self._fused_obstacle is not None:
             return None
         if self._wanted(*tensors):
-            if self.transfer == "triton":
-                raise ValueError("`transfer: triton` has no gradients here: set it to auto or torch.")
+            if self.transfer == "kernels":
+                raise ValueError("`transfer: kernels` has no gradients here: set it to auto or torch.")
             return None
         return self._kernels()
 
@@ -309,8 +310,8 @@ class MPMSolver(Solver):
         if not self._wanted(*state.tensors(), *tensors_of(forces)):
             return None
         adjoint, why = self._kernels().adjoint(state, forces)
-        if adjoint is None and self.transfer == "triton":
-            raise ValueError(f"`transfer: triton` has no gradients here, because {why}: set it to auto or torch.")
+        if adjoint is None and self.transfer == "kernels":
+            raise ValueError(f"`transfer: kernels` has no gradients here, because {why}: set it to auto or torch.")
         return adjoint
 
     def _fused_for(self, state: MPMState, forces: Sequence[Force]) -> Fused:
@@ -478,8 +479,8 @@ class MPMSolver(Solver):
     ) -> MPMState:
         """Advance by several substeps.
 
-        With the Triton kernels, substeps and forces are replayed from CUDA graphs: the first force that has a Triton
-        twin runs inside the kernels, the others run in torch. If one of these others is not ``recordable`` (plain
+        With the kernels, substeps and forces are replayed from recordings: forces that have a twin run inside the
+        kernels, the others run in torch. If one of these others is not ``recordable`` (plain
         functions are not), the host runs the substeps one by one and calls every force.
 
         Args:

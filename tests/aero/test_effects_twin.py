@@ -71,7 +71,7 @@ def _wind(name):
     return WindField(schedule=TURNING, interpolation="linear", modulations=GUSTS, effects=effects[name])
 
 
-def _bodies(device, formulation, wind, batch=(), groups=False, transfer="triton", **aero):
+def _bodies(device, formulation, wind, batch=(), groups=False, transfer="kernels", **aero):
     draw = torch.Generator().manual_seed(0)
     position = 0.06 + 0.18 * torch.rand(*batch, 24, 3, generator=draw)
     normal = torch.nn.functional.normalize(torch.randn(*batch, 24, 3, generator=draw), dim=-1).to(device)

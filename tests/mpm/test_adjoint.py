@@ -296,7 +296,7 @@ def _compare(device, law, tolerance=3e-4, left_out=(), **settings):
     A failure names the errors of all gradients, with those of torch's autograd in float32 beside them.
     """
     expected = _gradients(torch.device("cpu"), WIDE, "torch", law, **settings)
-    found = _gradients(device, torch.float32, "triton", law, **settings)
+    found = _gradients(device, torch.float32, "kernels", law, **settings)
     assert found.keys() == expected.keys()
     names = [name for name in expected if name not in left_out]
     for name in names:
@@ -362,7 +362,7 @@ def test_gradients_where_cells_are_cut(kernel_device, monkeypatch):
 
 def _refused(solver, state, forces=(), match=""):
     """The kernels say why they do not compute a gradient."""
-    with pytest.raises(ValueError, match=f"`transfer: triton` has no gradients here, because .*{match}"):
+    with pytest.raises(ValueError, match=f"`transfer: kernels` has no gradients here, because .*{match}"):
         solver.rollout(state, DT, 1, list(forces))
 
 
@@ -370,7 +370,7 @@ def _free(device, **settings):
     """A solver of a sheet and its first state, whose nodal velocity requires a gradient."""
     place = _place().to(device, torch.float32)
     points = MaterialPoints.create(place, volume=1e-4, density=80.0, youngs_modulus=1e4, poisson_ratio=0.3)
-    solver = MPMSolver(dx=DX, transfer="triton", **settings)
+    solver = MPMSolver(dx=DX, transfer="kernels", **settings)
     state = solver.init_state(points)
     return solver, state.replace(node_velocity=state.node_velocity.clone().requires_grad_())
 

@@ -67,7 +67,7 @@ def test_its_twin_runs_in_the_kernels(kernel_device, case, saint):
         position, volume=1e-4, density=100.0, youngs_modulus=1e4, poisson_ratio=0.3, law=laws, law_index=index
     )
     ends = []
-    for transfer in ("torch", "triton"):
+    for transfer in ("torch", "kernels"):
         solver = MPMSolver(0.1, formulation="total" if case == "total" else "updated", transfer=transfer)
         with torch.no_grad():
             state = solver.init_state(points, torch.randn(12, 3, generator=generator.manual_seed(1)).to(kernel_device))

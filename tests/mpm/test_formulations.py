@@ -323,7 +323,7 @@ def test_a_formulation_without_kernels_says_so(monkeypatch):
     monkeypatch.setitem(known.FORMULATIONS, "loose", Loose)
     points = _points((0.2, 0.2, 0.2), 0.05)
     with pytest.raises(ValueError, match="because the loose formulation has no kernels: set it to auto or torch"):
-        MPMSolver(0.1, "loose", transfer="triton").init_state(points)
+        MPMSolver(0.1, "loose", transfer="kernels").init_state(points)
 
 
 @pytest.mark.parametrize("formulation", FORMULATIONS)

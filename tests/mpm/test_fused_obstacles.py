@@ -98,7 +98,7 @@ def _bodies(device, boundaries):
     points = MaterialPoints.create(position, volume=1e-4, density=50.0, youngs_modulus=1e4, poisson_ratio=0.3)
     velocity = torch.randn(12, 3, generator=draw).to(device)
     ends = []
-    for transfer in ("torch", "triton"):
+    for transfer in ("torch", "kernels"):
         solver = MPMSolver(dx=0.1, formulation="updated", transfer=transfer, boundaries=boundaries())
         solver = solver.to(device)
         state = solver.init_state(points, velocity)

@@ -345,7 +345,7 @@ def test_states_that_the_kernels_made_are_whole(formulation, law, make_simulatio
     if law and formulation == "total":
         pytest.skip("what flows needs `updated`")
     material = Material(E=300.0, density=30.0, law=law and law())
-    simulation = make_simulation(formulation=formulation, transfer="triton", material=material, frame_dt=0.01)
+    simulation = make_simulation(formulation=formulation, transfer="kernels", material=material, frame_dt=0.01)
     recorder = Recorder(images=False, video=False)
     simulation.run(tmp_path / "run", 2, progress=False, recorder=recorder)
     assert simulation.run(tmp_path / "run", 3, resume=True, progress=False, recorder=recorder)["frames"] == 3

@@ -220,7 +220,7 @@ def test_the_kernels_take_an_edit(formulation, make_cloud, make_simulation):
         material, law = Material(E=1e4, density=1000.0, thickness=0.2), None
     shear = torch.tensor([[0.0, 0.0, 0.0], [20.0, 0.0, 0.0], [0.0, 0.0, 0.0]])  # 1/s
     ends = []
-    for transfer in ("torch", "triton"):
+    for transfer in ("torch", "kernels"):
         simulation = make_simulation(
             make_cloud(24, degree=0),
             material=material,
@@ -239,7 +239,7 @@ def test_the_kernels_take_an_edit(formulation, make_cloud, make_simulation):
             state, _ = simulation.advance(state)
             state = simulation.edit(state, edit)
         state, _ = simulation.advance(state)
-        assert (simulation.solver.fused() is not None) == (transfer == "triton")
+        assert (simulation.solver.fused() is not None) == (transfer == "kernels")
         ends.append(state)
     for name in ("position", "velocity", "F_elastic", "F_total"):
         one, two = (getattr(end, name) for end in ends)

@@ -35,9 +35,9 @@ def test_the_kernels_do_what_torch_does(sheet, scene, device, iterations):
     """Four substeps of free flight and four of collision; round-off grows in it, but not to a thousandth of it."""
     points, velocity, boundaries = _collision(sheet, device)
     ends, taken = [], []
-    for transfer in ("torch", "triton"):
+    for transfer in ("torch", "kernels"):
         solver, state = scene(points, Contact(iterations=iterations), boundaries, velocity=velocity, transfer=transfer)
-        assert solver.has_kernels == (transfer == "triton")
+        assert solver.has_kernels == (transfer == "kernels")
         state = solver.rollout(state, DT, 4)
         middle = state.velocity.clone()
         state = solver.rollout(state, DT, 4)
@@ -62,9 +62,9 @@ def test_obstacles_alone_do_what_they_do_in_torch(sheet, scene, device):
         BallObstacle([0.0, 0.0, -0.06], 0.05, start=3 * DT, end=5 * DT),
     ]
     ends, taken = [], []
-    for transfer in ("torch", "triton"):
+    for transfer in ("torch", "kernels"):
         solver, state = scene(points, None, boundaries, velocity=velocity, transfer=transfer)
-        if transfer == "triton":
+        if transfer == "kernels":
             early = solver.rollout(state, DT / 8, 2)
             assert solver.fused().touching.rounds == 0
             assert float(early.impulse.abs().max()) == 0.0
@@ -89,7 +89,7 @@ def test_many_substeps_use_the_lists_again(sheet, scene, device, monkeypatch):
     velocity = torch.zeros_like(points.position)
     velocity[25:, 2] = -10.0
     ends = []
-    for transfer in ("torch", "triton"):
+    for transfer in ("torch", "kernels"):
         solver, state = scene(
             points, Contact(iterations=4), velocity=velocity, transfer=transfer, gravity=(0.0, 0.0, 0.0)
         )
@@ -104,7 +104,7 @@ def test_the_lists_are_those_of_close_pairs(sheet, scene, device):
     """Sheets that lie across each other in many cells of the grid: both sides of all pairs, in a fixed order."""
     low = sheet(9, 9, dtype=torch.float32)
     points = MaterialPoints.join([low, sheet(9, 9, (0.0, 0.0, 0.4), dtype=torch.float32)]).map(lambda t: t.to(device))
-    solver, state = scene(points, Contact(iterations=1), transfer="triton", gravity=(0.0, 0.0, 0.0))
+    solver, state = scene(points, Contact(iterations=1), transfer="kernels", gravity=(0.0, 0.0, 0.0))
     moved = torch.zeros_like(state.node_displacement)
     upper = state.grid.node_positions(moved)[:, 2] > 0.2
     moved[upper] = torch.tensor([0.013, -0.007, 0.01 - 0.4], device=device)
@@ -130,7 +130,7 @@ def test_nodes_without_weight_do_not_widen_the_lists(sheet, scene, device):
     points = MaterialPoints.join([low, sheet(3, 3, (0.023, 0.017, 2.501 * dx), dtype=torch.float32)])
     points = points.map(lambda t: t.to(device))
     ends = []
-    for transfer in ("torch", "triton"):
+    for transfer in ("torch", "kernels"):
         solver, state = scene(points, Contact(iterations=4), transfer=transfer, gravity=(0.0, 0.0, 0.0))
         mass = solver.bound.node_mass
         light = (mass > 0) & (mass < 1e-5 * mass.amax())
@@ -152,7 +152,7 @@ def test_lists_that_do_not_fit_get_more_room(sheet, scene, device, monkeypatch):
         monkeypatch.setattr(fused_contact, "ROOM", room)
         monkeypatch.setattr(fused_contact, "SLOTS", slots)
         # torch makes the masses of the nodes, on a GPU in no fixed order unless told to
-        settings = {"transfer": "triton", "deterministic": True}
+        settings = {"transfer": "kernels", "deterministic": True}
         solver, state = scene(points, Contact(iterations=2), velocity=velocity, **settings)
         ends.append(solver.rollout(state, 4 * DT, 2))
         rooms.append((solver.fused().touching.room, solver.fused().touching.slots))
@@ -168,7 +168,7 @@ def test_material_that_has_collapsed_is_refused(sheet, scene, device, monkeypatc
     """More candidates than any buffer holds: a sentence, not wrong lists, and another rollout is possible."""
     monkeypatch.setattr(fused_contact, "ROOM", 2)
     points, velocity, _ = _collision(sheet, device)
-    solver, state = scene(points, Contact(iterations=1), velocity=velocity, transfer="triton")
+    solver, state = scene(points, Contact(iterations=1), velocity=velocity, transfer="kernels")
     monkeypatch.setattr(fused_contact, "MOST_ENTRIES", 1000 * points.count)
     solver.fused()
     monkeypatch.setattr(fused_contact, "MOST_ENTRIES", 100)
@@ -188,7 +188,7 @@ def test_graphs_do_what_single_substeps_do(sheet, scene):
     device = torch.device("cuda")
     points, velocity, boundaries = _collision(sheet, device)
     ends = []
-    for transfer in ("torch", "triton"):
+    for transfer in ("torch", "kernels"):
         solver, state = scene(points, Contact(), boundaries, velocity=0.1 * velocity, transfer=transfer)
         for _ in range(4):
             state = solver.rollout(state, DT / 4, 80)

@@ -116,7 +116,7 @@ def make_solver(transfer, formulation="updated", **options):
 def run_both(points, run, formulation="updated", start=set_going, **options):
     """The results of a function of solver and state with the torch substep and with the fused one."""
     found = []
-    for transfer in ("torch", "triton"):
+    for transfer in ("torch", "kernels"):
         solver = make_solver(transfer, formulation, **options)
         with torch.no_grad():
             found.append(run(solver, start(solver, points)))

@@ -109,7 +109,7 @@ def test_planes_and_boxes_are_a_part_of_the_kernel_of_the_nodes(kernel_device):
     """Of one scene in `updated`, if nothing else acts; in torch an enclosing box takes as long as the substep."""
     points = make_points(kernel_device, count=12)
     with_walls, with_pin, batch = (
-        make_solver("triton", "updated", boundaries=BOUNDARIES[name]()) for name in ("walls", "pin and plane", "walls")
+        make_solver("kernels", "updated", boundaries=BOUNDARIES[name]()) for name in ("walls", "pin and plane", "walls")
     )
     for solver in (with_walls, with_pin):
         solver.init_state(points)
@@ -122,7 +122,7 @@ def test_planes_and_boxes_are_a_part_of_the_kernel_of_the_nodes(kernel_device):
 def test_a_plane_that_is_moved_in_place(kernel_device):
     """Between two rollouts, and without another buffer."""
     points, ends = make_points(kernel_device, count=12), []
-    for transfer in ("torch", "triton"):
+    for transfer in ("torch", "kernels"):
         plane = Plane([0.0, 0.0, -1.0], [0.0, 0.0, 1.0], "sticky")
         solver = make_solver(transfer, "updated", boundaries=[plane])
         state = solver.rollout(set_going(solver, points), DT, 1)
@@ -151,7 +151,7 @@ def test_a_fast_body_is_sorted_more_often_from_the_second_rollout_on(kernel_devi
     points = make_points(kernel_device, count=48)
     found = []
     for speed in (0.01, 10.0):
-        solver = make_solver("triton", "updated", gravity=(0.0, 0.0, 0.0))
+        solver = make_solver("kernels", "updated", gravity=(0.0, 0.0, 0.0))
         state = solver.init_state(points, torch.full_like(points.position, speed))
         for _ in range(2):
             state = solver.rollout(state, 1e-3, 2)
@@ -181,7 +181,7 @@ def test_held_points_stay_where_they_are_and_give_the_same_bits():
     ends = []
     for _ in range(2):
         solver = make_solver(
-            "triton", "total", deterministic=True, boundaries=[PinnedRegion(LEFT), PinnedRegion(TOP, "clamp")]
+            "kernels", "total", deterministic=True, boundaries=[PinnedRegion(LEFT), PinnedRegion(TOP, "clamp")]
         )
         ends.append(solver.rollout(set_going(solver, points, strain=0.02), 2e-4, 4000, make_load(points)))
     for name in ("position", "velocity", "node_velocity", "impulse"):

@@ -90,7 +90,7 @@ def test_the_cap_on_the_area_acts(kernel_device, formulation):
     """It is also read again in each rollout: a recorded graph stores the address that it reads, not the value."""
     points = make_points(kernel_device)
     free, capped = make_load(points), make_load(points, max_area_ratio=0.5)
-    solver = make_solver("triton", formulation)
+    solver = make_solver("kernels", formulation)
     start = set_going(solver, points)
     ends = [solver.rollout(start, DT, 1, load) for load in (free, capped, free, capped, free)]
     for k in (2, 3, 4):
@@ -229,7 +229,7 @@ def test_forces_in_torch_among_the_kernels(kernel_device, formulation, case, mon
     pull = _Pull(kernel_device, resistance)
 
     def run(solver, state):
-        monkeypatch.setattr(solver, "_step", None if solver.transfer == "triton" else solver._step)
+        monkeypatch.setattr(solver, "_step", None if solver.transfer == "kernels" else solver._step)
         forces = FORCES[name](points, pull)
         states = [solver.rollout(state, DT, 1, forces)]
         states.append(solver.rollout(states[-1], 0.7 * DT, 4, forces))
@@ -377,7 +377,7 @@ def test_forces_in_torch_are_replayed_from_graphs(formulation):
     pytest.importorskip("triton")
     points = make_points(torch.device("cuda"), count=60)
     pulls = [_Pull("cuda", 1.0) for _ in range(2)]
-    solvers = [make_solver(transfer, formulation) for transfer in ("torch", "triton")]
+    solvers = [make_solver(transfer, formulation) for transfer in ("torch", "kernels")]
     state = set_going(solvers[0], points, strain=0.02)
     set_going(solvers[1], points)
     load = make_load(points)

@@ -37,7 +37,7 @@ from .bodies import (
 @pytest.mark.parametrize("formulation", FORMULATIONS)
 def test_one_solver_within_inference_mode_and_without(kernel_device, formulation):
     points = make_points(kernel_device, count=12)
-    solvers = [make_solver(transfer, formulation) for transfer in ("torch", "triton")]
+    solvers = [make_solver(transfer, formulation) for transfer in ("torch", "kernels")]
     load = make_load(points)
     with torch.inference_mode():
         ends = [solver.rollout(set_going(solver, points), DT, 1, load) for solver in solvers]
@@ -47,7 +47,7 @@ def test_one_solver_within_inference_mode_and_without(kernel_device, formulation
 def test_nothing_is_recorded_that_has_not_run(kernel_device):
     """A single substep of ``updated`` uses no kernel that ends one and starts another; recording would compile it."""
     points = make_points(kernel_device, count=12)
-    solver = make_solver("triton")
+    solver = make_solver("kernels")
     state = solver.rollout(set_going(solver, points), DT, 1)
     assert not solver.fused().repeater._graphs
     solver.rollout(state, DT, 2)
@@ -58,7 +58,7 @@ def test_nothing_is_recorded_that_has_not_run(kernel_device):
 def test_patches_that_change_in_place(kernel_device, formulation):
     points = make_points(kernel_device, count=12)
     load = make_load(points)
-    solvers = [make_solver(transfer, formulation) for transfer in ("torch", "triton")]
+    solvers = [make_solver(transfer, formulation) for transfer in ("torch", "kernels")]
     states = [set_going(solver, points) for solver in solvers]
     check_agreement([solver.rollout(state, DT, 1, load) for solver, state in zip(solvers, states, strict=True)])
     load.area.mul_(3.0)
@@ -70,7 +70,7 @@ def test_boundaries_that_change(kernel_device, formulation):
     """A different window, a different buffer and a different object in it, without ``init_state``."""
     points = make_points(kernel_device, count=12)
     ends = []
-    for transfer in ("torch", "triton"):
+    for transfer in ("torch", "kernels"):
         pin, plane = PinnedRegion(LEFT), Plane([0.0, 0.0, 0.13], [0.0, 0.0, 1.0], "sticky")
         box = VelocityBox(Box([0.0, 0.0, 0.2], [1.0] * 3), [0.0, 1.0, 0.0])
         solver = make_solver(transfer, formulation, boundaries=[pin, plane, box])
@@ -89,7 +89,7 @@ def test_boundaries_that_change(kernel_device, formulation):
 
 def test_laws_that_change(kernel_device):
     ends = []
-    for transfer in ("torch", "triton"):
+    for transfer in ("torch", "kernels"):
         law = Metal(5e2, 1e3)
         points, solver = make_points(kernel_device, law, count=12), make_solver(transfer)
         state = set_going(solver, points)
@@ -102,7 +102,7 @@ def test_laws_that_change(kernel_device):
 def test_a_pin_that_opens(kernel_device):
     """A single pin is applied in the kernels themselves, as long as it has no window."""
     ends = []
-    for transfer in ("torch", "triton"):
+    for transfer in ("torch", "kernels"):
         pin = PinnedRegion(LEFT)
         solver, points = make_solver(transfer, "total", boundaries=[pin]), make_points(kernel_device, count=12)
         state = solver.rollout(set_going(solver, points), DT, 1)
@@ -115,7 +115,7 @@ def test_a_pin_that_opens(kernel_device):
 def test_buffers_end_with_their_solver(kernel_device, formulation):
     """Immediately: a GPU may need their memory for the next one before Python collects cycles. Also if recorded."""
     points = make_points(kernel_device, count=12)
-    solver = make_solver("triton", formulation, boundaries=[Plane([0, 0, 0.0], [0.0, 0, 1.0])])
+    solver = make_solver("kernels", formulation, boundaries=[Plane([0, 0, 0.0], [0.0, 0, 1.0])])
     solver.rollout(set_going(solver, points), DT, 2)
     buffer = weakref.ref(solver.fused().load)
     gc.disable()
@@ -130,7 +130,7 @@ def test_buffers_end_with_their_solver(kernel_device, formulation):
 def test_what_is_too_large_for_the_indices_is_refused(kernel_device, formulation, monkeypatch):
     points = make_points(kernel_device, count=12)
     monkeypatch.setattr(fused, "MAX_INDEX", 700)
-    solver = make_solver("triton", formulation)
+    solver = make_solver("kernels", formulation)
     state = solver.init_state(points)
     with pytest.raises(ValueError, match=r"set `solver\.transfer` to torch"):
         solver.rollout(state, DT, 1)
@@ -156,7 +156,7 @@ def test_gradients_are_left_to_torch_or_to_their_kernels(kernel_device, formulat
     knock.impulse.requires_grad_()
     pushed = make_solver("auto", formulation, boundaries=[knock])
     assert pushed.rollout(set_going(pushed, points), DT, 1).position.requires_grad
-    only = make_solver("triton", formulation)
+    only = make_solver("kernels", formulation)
     only.init_state(points)
     attempts = [
         lambda: only.step(state, DT, force=velocity),
@@ -169,7 +169,7 @@ def test_gradients_are_left_to_torch_or_to_their_kernels(kernel_device, formulat
     else:
         attempts += [lambda: only.rollout(start, DT, 2, load), lambda: only.step(start, DT)]
     for attempt in attempts:
-        with pytest.raises(ValueError, match="`transfer: triton` has no gradients here"):
+        with pytest.raises(ValueError, match="`transfer: kernels` has no gradients here"):
             attempt()
     with torch.no_grad():
         assert not only.rollout(start, DT, 1, load).position.requires_grad
@@ -198,7 +198,7 @@ def test_what_the_kernels_cannot_do(kernel_device, change, reason):
     assert bool(torch.isfinite(solver.step(state, DT).position).all())
     assert reason in solver._fused_obstacle
     with pytest.raises(ValueError, match=reason):
-        MPMSolver(dx=DX, transfer="triton", **options).init_state(points)
+        MPMSolver(dx=DX, transfer="kernels", **options).init_state(points)
 
 
 def test_sums_without_a_fixed_order_are_not_deterministic(kernel_device):
@@ -207,7 +207,7 @@ def test_sums_without_a_fixed_order_are_not_deterministic(kernel_device):
     solver = MPMSolver(dx=DX, formulation="updated", deterministic=True)
     solver.init_state(points)
     assert (solver.fused() is None) == (kernel_device.type == "cuda")
-    solver = MPMSolver(dx=DX, formulation="updated", deterministic=True, transfer="triton")
+    solver = MPMSolver(dx=DX, formulation="updated", deterministic=True, transfer="kernels")
     if kernel_device.type == "cuda":
         with pytest.raises(ValueError, match="sums have no fixed order"):
             solver.init_state(points)
@@ -234,7 +234,7 @@ def test_torch_means_torch(kernel_device):
 
 
 def test_another_material_needs_other_buffers(kernel_device):
-    solver = make_solver("triton", "total")
+    solver = make_solver("kernels", "total")
     solver.init_state(make_points(kernel_device))
     first = solver.fused()
     assert solver.fused() is first
@@ -254,7 +254,7 @@ def test_without_a_compiler_torch_computes(monkeypatch):
     solver.init_state(make_points("cpu"))
     assert solver.fused() is None
     with pytest.raises(ValueError, match="llvmlite is not installed"):
-        MPMSolver(dx=DX, transfer="triton").init_state(make_points("cpu"))
+        MPMSolver(dx=DX, transfer="kernels").init_state(make_points("cpu"))
 
 
 class _Waiting(Boundary):
@@ -270,7 +270,7 @@ def test_a_condition_that_waits_is_asked_each_time(formulation):
     pytest.importorskip("triton")
     points = make_points(torch.device("cuda"))
     ends = []
-    for transfer in ("torch", "triton"):
+    for transfer in ("torch", "kernels"):
         solver = MPMSolver(dx=DX, formulation=formulation, transfer=transfer, boundaries=[_Waiting()])
         state = set_going(solver, points)
         for _ in range(3):

@@ -74,7 +74,7 @@ def test_crowded_cells_are_cut_only_where_there_are_few(kernel_device, monkeypat
     cut = {2048: 7 + 1, 3: 3 + 1} if lanes(kernel_device, 64) == 64 else {2048: 2, 3: 2}
     for programs, pieces in (cut | {1: 2}).items():
         monkeypatch.setattr(fused_total, "_PROGRAMS", programs)
-        solver = MPMSolver(DX, formulation="total", transfer="triton")
+        solver = MPMSolver(DX, formulation="total", transfer="kernels")
         solver.init_state(make_body((place * DX).to(kernel_device)))
         assert solver.fused().pieces == pieces
 
@@ -147,7 +147,7 @@ def test_a_batch_is_each_scene_by_itself(kernel_device, formulation):
     whole = set_going(solver, points)
     for k, wind in enumerate(winds):
         alone = points.map(lambda value, k=k: value[k])
-        solver = make_solver("triton", formulation)
+        solver = make_solver("kernels", formulation)
         state = solver.init_state(alone)
         fields = {name: None if getattr(whole, name) is None else getattr(whole, name)[k] for name in FIELDS}
         if formulation == "total":

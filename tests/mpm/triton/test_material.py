@@ -95,7 +95,7 @@ def test_crushed_and_inverted_particles(kernel_device, formulation):
 def test_momentum(kernel_device, formulation):
     """Linear and angular momentum of a free body, to float32; angular momentum about a point within the body."""
     points = make_points(kernel_device)
-    solver = make_solver("triton", formulation, gravity=(0, 0, 0), damping=0.0)
+    solver = make_solver("kernels", formulation, gravity=(0, 0, 0), damping=0.0)
     state = set_going(solver, points)
     if formulation == "updated":  # a spin that belongs to the stretch of the nodes, as after any substep
         state = solver.rollout(state, DT, 1)
@@ -116,7 +116,7 @@ def test_the_work_is_what_the_energy_grows_by(kernel_device, drag_step):
     """In a body that is too soft to store any; the energies are computed separately from the work."""
     points = make_points(kernel_device)
     points = dataclasses.replace(points, youngs_modulus=torch.full_like(points.mass, 1e-6))
-    solver = make_solver("triton", "total", gravity=(0, 0, 0), damping=0.0)
+    solver = make_solver("kernels", "total", gravity=(0, 0, 0), damping=0.0)
     state = set_going(solver, points)
     end = solver.rollout(state, DT, 2, make_load(points, drag_step=drag_step))
     growth = solver.energies(end)["kinetic"] - solver.energies(state)["kinetic"]
@@ -131,7 +131,7 @@ def test_total_gives_the_same_bits_twice():
     points = make_points("cuda", count=2000)
     ends = []
     for _ in range(2):
-        solver = make_solver("triton", "total", deterministic=True)
+        solver = make_solver("kernels", "total", deterministic=True)
         ends.append(solver.rollout(set_going(solver, points), DT, 40, make_load(points)))
     for name in ("position", "velocity", "F_elastic", "node_velocity", "work"):
         assert torch.equal(getattr(ends[0], name), getattr(ends[1], name))

@@ -23,7 +23,7 @@ def test_courant_number(kernel_device, formulation, law):
     stretches = torch.tensor([[2.0, 2.0, 1.0], [2.0, 1.0, 1.0], [0.5, 2.0, 2.0], [3.0, 3.0, 3.0], [1.0, 0.0, 0.0]])
     double = torch.linalg.qr(noise(30, 48, 3, 3))[0]
     double = double @ stretches[torch.arange(48) % 5].diag_embed() @ double.mT
-    solver = make_solver("triton", formulation)
+    solver = make_solver("kernels", formulation)
     solver.init_state(points)
     exact = make_solver("torch", formulation)
     exact.init_state(points.map(torch.Tensor.double))
@@ -60,7 +60,7 @@ def _bound(solver, points):
 def test_elastic_energy(kernel_device, law):
     """For a batch, against float64, and from the kernel."""
     points = make_points(kernel_device, (ELASTIC | PLASTIC)[law], batch=(2,))
-    solver = make_solver("triton")
+    solver = make_solver("kernels")
     state = set_going(solver, points)
     exact = make_solver("torch")
     wide = set_going(exact, points.map(torch.Tensor.double))
@@ -75,7 +75,7 @@ def test_elastic_energy(kernel_device, law):
 @pytest.mark.parametrize("law", ["corotated", "springs", "hencky"])
 def test_courant_number_of_what_is_broken_is_not_finite(kernel_device, law):
     points = make_points(kernel_device, ELASTIC[law])
-    solver = _bound(make_solver("triton"), points)
+    solver = _bound(make_solver("kernels"), points)
     state = set_going(solver, points)
     state.F_elastic[3, 1, 1] = math.nan
     assert not math.isfinite(float(solver.cfl_number(state, DT)))

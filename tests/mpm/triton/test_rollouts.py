@@ -123,7 +123,7 @@ def test_looks_on_the_way(kernel_device, case, monkeypatch):
     points = make_points(kernel_device, (ELASTIC | PLASTIC)[law])
 
     def run(solver, state):
-        if solver.transfer == "triton":
+        if solver.transfer == "kernels":
             assert solver.bound.longest_substep > DT  # of the material at rest, in torch, once
             monkeypatch.setattr(solver.laws, "moduli", None)  # the measured values stay in the kernels
         return solver.watched_rollout(state, DT, 3, make_load(points), 3)
@@ -183,7 +183,7 @@ def test_replayed_rollouts_give_the_same_bits(kernel_device, case, monkeypatch):
     monkeypatch.setattr(fused_total, "_PROGRAMS", 1 if case == "nodes, crowded cells" else 2048)
     given = REPLAYED[case]
     points = make_points(kernel_device, count=given.get("count", 12), batch=given.get("batch", ()))
-    solver = make_solver("triton", "total", boundaries=given["boundaries"]())
+    solver = make_solver("kernels", "total", boundaries=given["boundaries"]())
     wind = [_gusty(), WIND] if "batch" in given else _gusty()
     forces = [make_load(points, wind)] if given.get("wind", True) else []
     start = set_going(solver, points, strain=0.05)
@@ -223,7 +223,7 @@ def test_a_replayed_rollout_follows_what_changes(kernel_device, graphs, monkeypa
         monkeypatch.setattr(torch.cuda, "empty_cache", lambda: None)
 
     def run(solver, state):
-        if graphs == "played" and solver.transfer == "triton":
+        if graphs == "played" and solver.transfer == "kernels":
             solver.fused().repeater = graphs.Repeater(torch.device("cuda"), kept=8)
         states = [solver.rollout(state, DT, 2, load) for _ in range(3)]
         load.area *= 2
@@ -259,7 +259,7 @@ def test_nothing_is_left_of_former_rollouts(kernel_device, formulation, boundary
     turning = Handle(LEFT, [0.5, 0.0, 0.2], [0.0, 9.0, 3.0], [0.1, 0.1, 0.1], start=1e-4, end=2.5e-4 * count)
     solvers = [
         make_solver(transfer, formulation, boundaries=[] if boundary is None else [turning])
-        for transfer in ("torch", "triton")
+        for transfer in ("torch", "kernels")
     ]
     state = set_going(solvers[0], points, strain=0.02)
     set_going(solvers[1], points)
@@ -286,7 +286,7 @@ def test_a_grid_that_comes_back(kernel_device):
     points = make_points(kernel_device)
     count = 4 if kernel_device.type == "cuda" else 1
     boundaries = [Plane([0.0, 0.0, 0.13], [0.0, 0.0, 1.0])]
-    solvers = [make_solver(transfer, boundaries=boundaries) for transfer in ("torch", "triton")]
+    solvers = [make_solver(transfer, boundaries=boundaries) for transfer in ("torch", "kernels")]
     state = set_going(solvers[0], points)
     set_going(solvers[1], points)
     load = make_load(points)
@@ -335,7 +335,7 @@ def test_graphs_go_with_their_grid(kernel_device, monkeypatch):
         (fused_updated.FusedUpdated, "_read", lambda self, state: {}),
     ):
         monkeypatch.setattr(place, name, value)
-    points, solver = make_points(kernel_device, count=4), make_solver("triton")
+    points, solver = make_points(kernel_device, count=4), make_solver("kernels")
     state = solver.init_state(points)
     solver.fused().repeater = graphs.Repeater(torch.device("cuda"))
     for k in range(100):  # some of one size, some that need other buffers
@@ -366,7 +366,7 @@ def test_grids_that_grow_take_the_memory_of_the_largest():
     planes = [Plane([0.0, 0.0, -0.2], [0.0, 0.0, 1.0]), EnclosingBox([-9.0] * 3, [9.0] * 3), far]
 
     def most_reserved(sizes):
-        solver = MPMSolver(dx=0.02, formulation="updated", transfer="triton", boundaries=planes)
+        solver = MPMSolver(dx=0.02, formulation="updated", transfer="kernels", boundaries=planes)
         state, most = solver.init_state(points), 0
         for size in sizes:
             state = state.replace(grid=GridSpec(0.02, (-20, -20, -20), (size, size, size)))
@@ -393,7 +393,7 @@ def test_a_cloud_that_flies_away_is_followed_in_bounded_memory(flight):
     pytest.importorskip("triton")
     points = _cloud(500)
     solver = MPMSolver(
-        dx=0.02, formulation="updated", transfer="triton", gravity=(0, 0, 0),
+        dx=0.02, formulation="updated", transfer="kernels", gravity=(0, 0, 0),
         boundaries=[Plane([0.0, 0.0, -99.0], [0.0, 0.0, 1.0])],
     )  # fmt: skip
     centre = points.position.mean(0)
@@ -420,7 +420,7 @@ BROKEN += [("velocity", -math.inf), ("velocity", 1e12), ("velocity", 1e30)]
 
 @pytest.mark.slow(gate=["cpu-torch-velocity-nan", "cpu-triton-velocity-nan", "cpu-triton-position-1e+30"])
 @pytest.mark.parametrize(("name", "value"), BROKEN)
-@pytest.mark.parametrize("transfer", ["torch", "triton"])
+@pytest.mark.parametrize("transfer", ["torch", "kernels"])
 def test_a_broken_particle_is_reported_and_breaks_nothing_else(kernel_device, transfer, name, value):
     """Also within recorded substeps, and the device stays usable."""
     points, steps = make_points(kernel_device), 9 if kernel_device.type == "cuda" else 2
