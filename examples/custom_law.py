@@ -10,7 +10,7 @@ from torch import Tensor
 from gaussian_swaying import ConstitutiveLaw, MaterialPoints, MPMSolver
 from gaussian_swaying.geometry.linalg import matmul3
 from gaussian_swaying.geometry.linalg_triton import matmul, transpose
-from gaussian_swaying.kernels.language import triton
+from gaussian_swaying.kernels.language import tl, triton  # noqa: F401  (Triton's interpreter looks for tl)
 from gaussian_swaying.mpm.laws.triton.functions import LawFunctions
 from gaussian_swaying.mpm.twins import Numbers, Twin
 

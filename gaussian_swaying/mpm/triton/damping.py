@@ -1,7 +1,7 @@
 """Stiffness-proportional damping as a Triton function; the reference is :mod:`~gaussian_swaying.mpm.damping`."""
 
 from gaussian_swaying.geometry.linalg_triton import axpy9, matmul, scale9, transpose
-from gaussian_swaying.kernels.language import triton
+from gaussian_swaying.kernels.language import tl, triton  # noqa: F401  (Triton's interpreter looks for tl)
 
 
 @triton.jit

@@ -13,7 +13,7 @@ from gaussian_swaying.geometry.linalg_triton import (
     square9,
     transpose,
 )
-from gaussian_swaying.kernels.language import triton
+from gaussian_swaying.kernels.language import tl, triton  # noqa: F401  (Triton's interpreter looks for tl)
 from gaussian_swaying.mpm.laws.triton.functions import LawFunctions
 
 
