@@ -65,6 +65,13 @@ def require_bpy() -> Any:
     return bpy
 
 
+def edges(triangles: np.ndarray) -> np.ndarray:
+    """Each edge of triangles (T, 3) once, int64, shape (E, 2)."""
+    first, second = np.sort(np.concatenate([triangles[:, [k, (k + 1) % 3]] for k in range(3)]), axis=1).T
+    count = int(triangles.max()) + 1
+    return np.stack(np.divmod(np.unique(first.astype(np.int64) * count + second), count), axis=-1)
+
+
 @dataclass(frozen=True)
 class Grid:
     """A rectangular cloth as a mesh in the x-z plane, in which every vertex represents the same share of the cloth.
@@ -124,9 +131,7 @@ class Grid:
     @property
     def spring(self) -> float:
         """Mean length of the springs [m], by which Blender divides every stiffness."""
-        flat, triangles = self.flat(), self.triangles()
-        sides = np.concatenate([triangles[:, [k, (k + 1) % 3]] for k in range(3)])
-        ends = np.unique(np.sort(sides, axis=1), axis=0)
+        flat, ends = self.flat(), edges(self.triangles())
         return float(np.linalg.norm(flat[ends[:, 0]] - flat[ends[:, 1]], axis=1).mean())
 
     @property

@@ -12,7 +12,7 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
-from blender_cloth import LATTICE, ClothMaterial, ClothRun, Grid
+from blender_cloth import LATTICE, ClothMaterial, ClothRun, Grid, edges
 
 CONTACT_STIFFNESS = 50.0
 """Stiffness of a contact between a vertex and a triangle, or two edges, once they are closer than the distance that the
@@ -46,12 +46,6 @@ def require_newton() -> tuple[Any, Any]:
 def settings() -> dict[str, Any]:
     """What a motion depends on besides the flag."""
     return {"solver": "newton", "newton.iterations": ITERATIONS, "newton.contact_stiffness": CONTACT_STIFFNESS}
-
-
-def edges(triangles: np.ndarray) -> np.ndarray:
-    """Each edge of triangles (T, 3) once, int64, shape (E, 2)."""
-    sides = np.concatenate([triangles[:, [k, (k + 1) % 3]] for k in range(3)])
-    return np.unique(np.sort(sides, axis=1), axis=0)
 
 
 def solve_cloth(

@@ -108,7 +108,7 @@ def convert(
     notes.add(
         "PhysGaussian has no wind: the coefficients of `aero` are zero; for wind set `wind.flow` and C_D, C_F and C_L."
     )
-    return settings, notes.sentences
+    return settings, notes
 
 
 def _gravity(take: Fields, turn: Tensor) -> list[float]:

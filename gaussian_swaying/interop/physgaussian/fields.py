@@ -9,16 +9,13 @@ from typing import Any
 from gaussian_swaying._checks import check_positive, check_vector
 
 
-class Notes:
+class Notes(list[str]):
     """Sentences on differences, each once."""
-
-    def __init__(self) -> None:
-        self.sentences: list[str] = []
 
     def add(self, sentence: str) -> None:
         """Add a sentence."""
-        if sentence not in self.sentences:
-            self.sentences.append(sentence)
+        if sentence not in self:
+            self.append(sentence)
 
 
 class Fields:
