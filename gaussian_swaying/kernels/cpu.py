@@ -104,10 +104,15 @@ def _llvm() -> Any:
 
 @cache
 def _machine() -> Any:
+    """The code generator of this processor.
+
+    On x86-64 addresses are absolute and have 64 bits: the parts of an object may lie farther apart in memory than the
+    32 bits that code would have for them otherwise, and then LLVM would end the process.
+    """
     llvm = _llvm()
-    return llvm.Target.from_default_triple().create_target_machine(
-        cpu=llvm.get_host_cpu_name(), features=_features(), opt=3, reloc="pic", codemodel="default"
-    )
+    target = llvm.Target.from_default_triple()
+    far = {"reloc": "static", "codemodel": "large"} if target.name == "x86-64" else {"codemodel": "jitdefault"}
+    return target.create_target_machine(cpu=llvm.get_host_cpu_name(), features=_features(), opt=3, **far)
 
 
 @cache
