@@ -8,26 +8,19 @@ are those of the definition in float64 to float32's rounding of the sums.
 from __future__ import annotations
 
 import math
+from collections.abc import Iterable
 
 import torch
 from torch import Tensor
 
 from gaussian_swaying.geometry.linalg_triton import load3, load9
-from gaussian_swaying.kernels.language import tl, triton
-from gaussian_swaying.kernels.launch import LANES, launch
+from gaussian_swaying.kernels.language import INTERPRETED, tl, triton
+from gaussian_swaying.kernels.launch import LANES, compiles, launch
 from gaussian_swaying.rendering.cameras.camera import Camera
+from gaussian_swaying.rendering.protocol import MAX_ALPHA, MIN_ALPHA, MIN_TRANSMITTANCE, SLACK, RenderOutput
 
-MIN_ALPHA = 1.0 / 255.0
-"""A Gaussian is skipped at pixels where its alpha is smaller."""
-MAX_ALPHA = 0.999
-"""Upper bound of alpha, so that the transmittance stays positive."""
-MIN_TRANSMITTANCE = 1e-4
-"""A pixel stops before the Gaussian that would lower its transmittance to this value or below."""
-SLACK = 0.01
-"""Added to pixel extents [pixels] because of round-off; the exact test is on alpha."""
-
-TILE = 16
-"""Width and height of a tile [pixels]; a row of it is a vector."""
+WIDTH, HEIGHT = 8, 16
+"""Size of a tile [pixels]; a row of it is a vector."""
 CHUNKS = 16
 """Parts of the Gaussians, from front to back, that are listed at the same time."""
 ROW = 16
@@ -36,10 +29,13 @@ FALLOFF, CURVATURE, PEAK, VALUES, FIRST, LAST = (tl.constexpr(k) for k in (6, 7,
 STATE = 5
 """Numbers of a pixel: transmittance (negative once it is full), three colours, depth."""
 
+MOST_PAIRS = 1 << 28
+"""Most pairs of a tile and a Gaussian that are listed: 1 GiB."""
+
 _MIN, _MAX, _STOP, _SLACK = (tl.constexpr(x) for x in (MIN_ALPHA, MAX_ALPHA, MIN_TRANSMITTANCE, SLACK))
 _LOG_MIN = tl.constexpr(math.log(MIN_ALPHA))
 _INFINITE = tl.constexpr(math.inf)
-_SIDE, _ROW, _STATE = (tl.constexpr(x) for x in (TILE, ROW, STATE))
+_WIDTH, _HEIGHT, _ROW, _STATE = (tl.constexpr(x) for x in (WIDTH, HEIGHT, ROW, STATE))
 _LOOK = tl.constexpr(32)  # Gaussians between two looks whether a tile is full
 
 
@@ -111,10 +107,14 @@ def project(
     across = fx / depth
     along = fy / depth
     row_x = (
-        across * (right[0] - x_hat * ahead[0]), across * (right[1] - x_hat * ahead[1]), across * (right[2] - x_hat * ahead[2])
+        across * (right[0] - x_hat * ahead[0]),
+        across * (right[1] - x_hat * ahead[1]),
+        across * (right[2] - x_hat * ahead[2]),
     )
     row_y = (
-        along * (down[0] - y_hat * ahead[0]), along * (down[1] - y_hat * ahead[1]), along * (down[2] - y_hat * ahead[2])
+        along * (down[0] - y_hat * ahead[0]),
+        along * (down[1] - y_hat * ahead[1]),
+        along * (down[2] - y_hat * ahead[2]),
     )
     sigma_x = (_times((C[0], C[1], C[2]), row_x), _times((C[3], C[4], C[5]), row_x), _times((C[6], C[7], C[8]), row_x))
     sigma_y = (_times((C[0], C[1], C[2]), row_y), _times((C[3], C[4], C[5]), row_y), _times((C[6], C[7], C[8]), row_y))
@@ -136,10 +136,10 @@ def project(
     keep = keep & (left <= last_x) & (top <= last_y)
     tl.store(depths + index, tl.where(keep, z, _INFINITE), mask)
     box = boxes + 4 * index
-    tl.store(box, tl.where(keep, left.to(tl.int32) // _SIDE, 0), mask)
-    tl.store(box + 1, tl.where(keep, last_x.to(tl.int32) // _SIDE, -1), mask)
-    tl.store(box + 2, tl.where(keep, top.to(tl.int32) // _SIDE, 0), mask)
-    tl.store(box + 3, tl.where(keep, last_y.to(tl.int32) // _SIDE, -1), mask)
+    tl.store(box, tl.where(keep, left.to(tl.int32) // _WIDTH, 0), mask)
+    tl.store(box + 1, tl.where(keep, last_x.to(tl.int32) // _WIDTH, -1), mask)
+    tl.store(box + 2, tl.where(keep, top.to(tl.int32) // _HEIGHT, 0), mask)
+    tl.store(box + 3, tl.where(keep, last_y.to(tl.int32) // _HEIGHT, -1), mask)
     to = wide + index * (_ROW // 2)
     tl.store(to, mean_x, keep)
     tl.store(to + 1, mean_y, keep)
@@ -196,16 +196,16 @@ def blend(
     program.
     """
     lane = tl.arange(0, LANE)
-    pixels = states + tl.program_id(0) * (_SIDE * _SIDE * _STATE)
+    pixels = states + tl.program_id(0) * (_HEIGHT * _WIDTH * _STATE)
     for tile in range(tl.program_id(0), tiles, tl.num_programs(0)):
-        x0 = (tile % across) * _SIDE
-        y0 = (tile // across) * _SIDE
+        x0 = (tile % across) * _WIDTH
+        y0 = (tile // across) * _HEIGHT
         inside = x0 + lane < width
-        for k in range(0, _SIDE):
-            state = pixels + k * (_SIDE * _STATE)
+        for k in range(0, _HEIGHT):
+            state = pixels + k * (_WIDTH * _STATE)
             tl.store(state + lane, tl.where(inside & (y0 + k < height), 1.0, -1.0))
             for c in tl.static_range(1, _STATE):
-                tl.store(state + c * _SIDE + lane, tl.zeros([LANE], tl.float32))
+                tl.store(state + c * _WIDTH + lane, tl.zeros([LANE], tl.float32))
         pair = tl.load(bounds + tile)
         end = tl.load(bounds + tile + 1)
         while pair < end:
@@ -227,12 +227,12 @@ def blend(
                 blue = tl.load(row + VALUES + 2)
                 z = tl.load(row + VALUES + 3)
                 first = tl.maximum(tl.load(row + FIRST).to(tl.int32) - y0, 0)
-                last = tl.minimum(tl.load(row + LAST).to(tl.int32) - y0, _SIDE - 1)
+                last = tl.minimum(tl.load(row + LAST).to(tl.int32) - y0, _HEIGHT - 1)
                 for k in range(first, last + 1):
                     rise = dy + k.to(tl.float32)
                     u = lane.to(tl.float32) - (middle + slant * k.to(tl.float32))
                     exponent = (highest - falloff * rise * rise) - curvature * u * u
-                    state = pixels + k * (_SIDE * _STATE)
+                    state = pixels + k * (_WIDTH * _STATE)
                     T = tl.load(state + lane)
                     near = (exponent > _LOG_MIN / 8 - 1e-4) & (T > 0)
                     if tl.sum(near.to(tl.int32)) > 0:
@@ -242,24 +242,36 @@ def blend(
                         go = seen & (left > _STOP)
                         weight = tl.where(go, T * opaque, 0.0)
                         tl.store(state + lane, tl.where(go, left, tl.where(seen, -T, T)))
-                        to = state + _SIDE + lane
+                        to = state + _WIDTH + lane
                         tl.store(to, tl.load(to) + weight * red)
-                        tl.store(to + _SIDE, tl.load(to + _SIDE) + weight * green)
-                        tl.store(to + 2 * _SIDE, tl.load(to + 2 * _SIDE) + weight * blue)
-                        tl.store(to + 3 * _SIDE, tl.load(to + 3 * _SIDE) + weight * z)
+                        tl.store(to + _WIDTH, tl.load(to + _WIDTH) + weight * green)
+                        tl.store(to + 2 * _WIDTH, tl.load(to + 2 * _WIDTH) + weight * blue)
+                        tl.store(to + 3 * _WIDTH, tl.load(to + 3 * _WIDTH) + weight * z)
             most = tl.full([LANE], -1.0, tl.float32)
-            for k in range(0, _SIDE):
-                most = tl.maximum(most, tl.load(pixels + k * (_SIDE * _STATE) + lane))
+            for k in range(0, _HEIGHT):
+                most = tl.maximum(most, tl.load(pixels + k * (_WIDTH * _STATE) + lane))
             pair = tl.where(tl.max(most) > 0, stop, end)
-        for k in range(0, tl.minimum(_SIDE, height - y0)):
-            state = pixels + k * (_SIDE * _STATE)
+        for k in range(0, tl.minimum(_HEIGHT, height - y0)):
+            state = pixels + k * (_WIDTH * _STATE)
             at = (y0 + k) * width + x0 + lane
             rest = tl.abs(tl.load(state + lane))
             tl.store(alpha + at, 1 - rest, inside)
-            tl.store(depth + at, tl.load(state + 4 * _SIDE + lane), inside)
+            tl.store(depth + at, tl.load(state + 4 * _WIDTH + lane), inside)
             for c in tl.static_range(3):
-                value = tl.load(state + (c + 1) * _SIDE + lane) + rest * tl.load(background + c)
+                value = tl.load(state + (c + 1) * _WIDTH + lane) + rest * tl.load(background + c)
                 tl.store(color + 3 * at + c, value, inside)
+
+
+def runs(tensors: Iterable[Tensor]) -> bool:
+    """Whether :func:`render` can draw from some tensors: float32 on a CPU, and none wants a gradient."""
+    if INTERPRETED or not compiles("cpu"):
+        return False
+    return all(
+        tensor.device.type == "cpu"
+        and tensor.dtype == torch.float32
+        and not (tensor.requires_grad and torch.is_grad_enabled())
+        for tensor in tensors
+    )
 
 
 def render(
@@ -270,8 +282,8 @@ def render(
     camera: Camera,
     background: Tensor | None,
     eps2d: float,
-) -> tuple[Tensor, Tensor, Tensor]:
-    """Colour (H, W, 3), opacity (H, W, 1) and accumulated depth (H, W, 1) as ``render_torch``; float32 on a CPU.
+) -> RenderOutput | None:
+    """Draw Gaussians as ``render_torch``, from float32 on a CPU, without gradients.
 
     The same bits for any number of threads.
 
@@ -283,10 +295,13 @@ def render(
         camera: The camera, in any precision.
         background: Colour behind the Gaussians, shape (3,); black when None.
         eps2d: Added to the diagonal of the projected covariances [pixels^2].
+
+    Returns:
+        The picture; None if there are more than :data:`MOST_PAIRS`.
     """
     count, width, height = len(means), camera.width, camera.height
-    across = triton.cdiv(width, TILE)
-    tiles = across * triton.cdiv(height, TILE)
+    across = triton.cdiv(width, WIDTH)
+    tiles = across * triton.cdiv(height, HEIGHT)
     given = [tensor.detach().contiguous() for tensor in (means, covariances, opacities, colors)]
     view = [camera.world_to_camera.reshape(-1), camera.intrinsics.reshape(-1)]
     numbers = torch.cat([*(part.detach().cpu().double() for part in view), torch.tensor([camera.near, eps2d]).double()])
@@ -303,16 +318,18 @@ def render(
     ends = counts.mT.flatten().cumsum(0)  # tile by tile, and within each from front to back
     starts = (ends.view(tiles, CHUNKS) - counts.mT).mT.contiguous()
     bounds = torch.cat([starts[0], ends[-1:]])
+    if int(bounds[-1]) > MOST_PAIRS:
+        return None
     pairs = torch.empty(int(bounds[-1]), dtype=torch.int32)
     launch(list_pairs, (CHUNKS,))(order, boxes, starts, pairs, count, across, tiles)
     programs = min(tiles, 256)
-    states = torch.empty(programs, TILE, STATE, TILE)
+    states = torch.empty(programs, HEIGHT, STATE, WIDTH)
     behind = torch.zeros(3) if background is None else background.detach().to("cpu", torch.float32).contiguous()
     color, alpha, depth = (torch.empty(height, width, n) for n in (3, 1, 1))
     launch(blend, (programs,))(
-        bounds, pairs, lines, rows, states, behind, color, alpha, depth, across, tiles, width, height, LANE=TILE
+        bounds, pairs, lines, rows, states, behind, color, alpha, depth, across, tiles, width, height, LANE=WIDTH
     )
-    return color, alpha, depth
+    return RenderOutput(color, alpha, depth)
 
 
-__all__ = ["render"]
+__all__ = ["render", "runs"]
