@@ -16,7 +16,7 @@ from torch.nn import functional
 from gaussian_swaying._checks import check_positive
 from gaussian_swaying.gaussians.harmonics import sh_to_color
 from gaussian_swaying.geometry.covariances import covariance
-from gaussian_swaying.rendering import raster_kernels
+from gaussian_swaying.rendering import raster
 from gaussian_swaying.rendering.cameras.camera import Camera
 from gaussian_swaying.rendering.protocol import (
     MAX_ALPHA,
@@ -306,7 +306,7 @@ class TorchRenderer(nn.Module):
     """Renderer for any device, see :func:`render_torch`.
 
     On a CPU, pictures in float32 without gradients are drawn by compiled kernels
-    (:mod:`~gaussian_swaying.rendering.raster_kernels`), if llvmlite is installed.
+    (:mod:`~gaussian_swaying.rendering.raster`), if llvmlite is installed.
 
     Args:
         eps2d: Added to the diagonal of the projected covariances [pixels^2].
@@ -339,8 +339,8 @@ class TorchRenderer(nn.Module):
         wanted = [
             t for t in (background, camera.world_to_camera, camera.intrinsics) if t is not None and t.requires_grad
         ]
-        if raster_kernels.runs(given) and not (wanted and torch.is_grad_enabled()):
-            picture = raster_kernels.render(*given, camera, background, self.eps2d)
+        if raster.runs(given) and not (wanted and torch.is_grad_enabled()):
+            picture = raster.render(*given, camera, background, self.eps2d)
             if picture is not None:
                 return picture
         return render_torch(means, covariances, opacities, colors, camera, background, self.eps2d, self.max_pairs)

@@ -1,4 +1,7 @@
-"""The renderer in kernels against the torch renderer in float64, which is its definition."""
+"""The renderer in kernels against the torch renderer in float64, which is its definition.
+
+Covers: rendering.raster.
+"""
 
 import math
 
@@ -6,13 +9,11 @@ import pytest
 import torch
 
 from gaussian_swaying.kernels.launch import compiles
-from gaussian_swaying.rendering import raster_kernels, torch_renderer
+from gaussian_swaying.rendering import raster, torch_renderer
 from gaussian_swaying.rendering.cameras.camera import Camera, look_at_camera
 from gaussian_swaying.rendering.torch_renderer import TorchRenderer, render_torch
 
-pytestmark = pytest.mark.skipif(
-    not compiles("cpu") or raster_kernels.INTERPRETED, reason="needs kernels compiled for the CPU"
-)
+pytestmark = pytest.mark.skipif(not compiles("cpu") or raster.INTERPRETED, reason="needs kernels compiled for the CPU")
 BACKGROUND = torch.tensor([0.9, 0.1, 0.4])
 
 
@@ -35,7 +36,7 @@ def _scene(count=300, seed=3, size=0.08):
 
 def _agree(scene, camera, background=BACKGROUND, eps2d=0.3):
     """Compare with the definition, where a threshold may fall on either side of a number close to it."""
-    made = raster_kernels.render(*scene, camera, background, eps2d)
+    made = raster.render(*scene, camera, background, eps2d)
     double = [part.double() for part in scene]
     pictures = []
     for change in (0.0, 1e-5, -1e-5):
@@ -97,7 +98,7 @@ def test_gaussians_that_are_not_drawn():
     extra[0][3] = torch.tensor([90.0, 0.0, 0.0])
     extra[0][4, 1], extra[1][5, 0, 2], extra[2][6], extra[3][7, 2] = math.nan, math.inf, math.nan, -math.inf
     extra[2][8] = 0.0
-    made = raster_kernels.render(*map(torch.cat, zip(extra, scene, strict=True)), _camera(), BACKGROUND, 0.3)
+    made = raster.render(*map(torch.cat, zip(extra, scene, strict=True)), _camera(), BACKGROUND, 0.3)
     for name in ("color", "alpha", "depth"):
         assert torch.equal(getattr(made, name), getattr(expected, name))
 
@@ -106,7 +107,7 @@ def test_gaussians_that_are_not_drawn():
 def test_empty_pictures(case):
     scene = _scene(count=0 if case == "none" else 50)
     scene[0].add_(torch.tensor([0.0, -90.0, 0.0] if case == "behind" else [900.0, 0.0, 0.0]))
-    made = raster_kernels.render(*scene, _camera(), BACKGROUND, 0.3)
+    made = raster.render(*scene, _camera(), BACKGROUND, 0.3)
     assert made.color.eq(BACKGROUND).all()
     assert made.alpha.eq(0).all()
     assert made.depth.eq(0).all()
@@ -117,7 +118,7 @@ def test_near_and_far_gaussians_in_order():
     camera = Camera(torch.eye(4), torch.tensor([[20.0, 0, 8], [0, 20, 8], [0, 0, 1]]), 16, 16)
     means = torch.tensor([[0.0, 0, 3.0], [0, 0, 2.0], [0, 0, 2.0], [0, 0, 2.0000002]])
     colors = torch.tensor([[1.0, 0, 0], [0, 1, 0], [0, 0, 1], [1, 1, 1]])
-    made = raster_kernels.render(means, 4 * torch.eye(3).expand(4, 3, 3), torch.ones(4), colors, camera, None, 0.3)
+    made = raster.render(means, 4 * torch.eye(3).expand(4, 3, 3), torch.ones(4), colors, camera, None, 0.3)
     assert float(made.color[8, 8, 1]) > 0.99
     assert float(made.color[8, 8, 0]) < 1e-3
 
@@ -125,7 +126,7 @@ def test_near_and_far_gaussians_in_order():
 def test_blur_and_background():
     scene, camera = _scene(), _camera()
     made = _agree(scene, camera, eps2d=2.0)
-    black = raster_kernels.render(*scene, camera, None, 2.0)
+    black = raster.render(*scene, camera, None, 2.0)
     torch.testing.assert_close(made.color, black.color + (1 - black.alpha) * BACKGROUND, rtol=0, atol=1e-6)
 
 
@@ -142,7 +143,7 @@ def test_the_same_bits_for_any_number_of_threads():
     try:
         for threads in (1, 2, 3):
             torch.set_num_threads(threads)
-            made.append(raster_kernels.render(*scene, camera, BACKGROUND, 0.3))
+            made.append(raster.render(*scene, camera, BACKGROUND, 0.3))
     finally:
         torch.set_num_threads(before)
     for name in ("color", "alpha", "depth"):
@@ -153,13 +154,13 @@ def test_the_same_bits_for_any_number_of_threads():
 @pytest.fixture
 def drawn(monkeypatch):
     """Counts the pictures that the kernels draw."""
-    calls, render = [], raster_kernels.render
+    calls, render = [], raster.render
 
     def counted(*given):
         calls.append(render(*given))
         return calls[-1]
 
-    monkeypatch.setattr(raster_kernels, "render", counted)
+    monkeypatch.setattr(raster, "render", counted)
     return calls
 
 
@@ -191,13 +192,13 @@ def test_gradients_and_float64_are_those_of_torch(drawn):
 
 
 def test_without_a_compiler_torch_draws(drawn, monkeypatch):
-    monkeypatch.setattr(raster_kernels, "compiles", lambda device: False)
+    monkeypatch.setattr(raster, "compiles", lambda device: False)
     TorchRenderer()(*_scene(), _camera())
     assert drawn == []
 
 
 def test_too_many_pairs_are_left_to_torch(drawn, monkeypatch):
-    monkeypatch.setattr(raster_kernels, "MOST_PAIRS", 100)
+    monkeypatch.setattr(raster, "MOST_PAIRS", 100)
     scene, camera = _scene(), _camera()
     made = TorchRenderer()(*scene, camera)
     assert drawn == [None]
