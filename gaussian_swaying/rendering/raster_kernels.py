@@ -160,7 +160,7 @@ def count_pairs(order, boxes, counts, count, across, tiles):
 
 @triton.jit
 def list_pairs(order, boxes, starts, pairs, count, across, tiles):
-    """As :func:`count_pairs`: the Gaussians of each tile, from where ``starts`` (chunks, tiles) says, which moves on."""
+    """As :func:`count_pairs`: the Gaussians of each tile, from where ``starts`` (chunks, tiles) says; it moves on."""
     chunk = tl.program_id(0)
     chunks = tl.num_programs(0)
     own = starts + chunk * tiles
