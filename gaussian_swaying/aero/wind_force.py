@@ -356,7 +356,7 @@ def _air(wind: nn.Module, time: Tensor, position: Tensor) -> Tensor:
 def _blow(wind: nn.Module, times: Tensor) -> Tensor:
     """Velocity of a uniform wind at times (n,) [s], on their device; in one kernel where possible. Shape (n, 3)."""
     differentiated = torch.is_grad_enabled() and any(tensor.requires_grad for tensor in (times, *tensors_in([wind])))
-    if times.is_cuda and not differentiated and compiles():
+    if times.is_cuda and not differentiated and compiles(times.device):
         from gaussian_swaying.aero.wind_triton import blow
 
         found = blow(wind, times)

@@ -15,6 +15,8 @@ from gaussian_swaying._checks import check_shape
 from gaussian_swaying.geometry.covariances import deform_covariance, limit_deformed
 from gaussian_swaying.geometry.linalg import cofactor, determinant, polar_rotation
 from gaussian_swaying.geometry.rotations import quat_to_rotation
+from gaussian_swaying.kernels import launch
+from gaussian_swaying.kernels.language import INTERPRETED
 
 
 def smallest_axis_normal(quats: Tensor, log_scales: Tensor) -> Tensor:
@@ -105,7 +107,7 @@ def deform_all(
     max_stretch: float | None = None,
     solid: Tensor | None = None,
 ) -> tuple[Tensor, Tensor, Tensor | None]:
-    """Covariances, normals and rotations after a deformation; on a GPU in one kernel if triton is installed.
+    """Covariances, normals and rotations after a deformation; in one kernel where it can be compiled.
 
     Args:
         deformation_gradient: Total deformation gradient F, shape (N, 3, 3).
@@ -128,10 +130,9 @@ def deform_all(
     tensors = (deformation_gradient, covariances, normals)
     single = all(tensor.dtype == torch.float32 for tensor in tensors)
     wanted = torch.is_grad_enabled() and any(tensor.requires_grad for tensor in tensors)
-    if deformation_gradient.device.type == "cuda" and single and not wanted:
-        kernels = _kernels()
-        if kernels is not None:
-            return kernels.deform_all(*tensors, rotations, max_stretch, solid)
+    if single and not wanted and compiles(deformation_gradient.device):
+        kernels = importlib.import_module("gaussian_swaying.geometry.patches_triton")
+        return kernels.deform_all(*tensors, rotations, max_stretch, solid)
     drawn = deform_covariance(deformation_gradient, covariances)
     turns = polar_rotation(deformation_gradient) if rotations else None
     if max_stretch is not None and solid is not None:
@@ -139,9 +140,11 @@ def deform_all(
     return drawn, deform_normal(deformation_gradient, normals), turns
 
 
-def compiles() -> bool:
-    """True if kernels can be compiled on this machine's GPU."""
-    return _kernels() is not None
+def compiles(device: torch.device) -> bool:
+    """Whether kernels of patches can be compiled for a device."""
+    if device.type == "cuda":
+        return _kernels() is not None
+    return not INTERPRETED and launch.compiles(device.type)
 
 
 @functools.cache

@@ -19,6 +19,7 @@ from typing import Any
 
 from llvmlite import ir
 
+from gaussian_swaying.kernels import elementary
 from gaussian_swaying.kernels.blocks import ADDRESS, TYPES, Block, Emitter, Pointer, TranslationError, Value, is_number
 from gaussian_swaying.kernels.language import Language, Name
 
@@ -600,10 +601,16 @@ class _Translator(Emitter):
         return self.unary("sqrt", x)
 
     def _tl_exp(self, x: Value) -> Block:
-        return self.unary("exp", x)
+        return self._function("exp", x)
 
     def _tl_log(self, x: Value) -> Block:
-        return self.unary("log", x)
+        return self._function("log", x)
+
+    def _function(self, name: str, x: Value) -> Block:
+        block = self.block(x)
+        if block.kind != "f32":
+            return self.unary(name, block)
+        return (elementary.exp if name == "exp" else elementary.log)(self, block)
 
     def _tl_sin(self, x: Value) -> Block:
         return self.unary("sin", x)

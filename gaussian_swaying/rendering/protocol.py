@@ -10,6 +10,15 @@ from torch import Tensor
 from gaussian_swaying._checks import check_shape
 from gaussian_swaying.rendering.cameras.camera import Camera
 
+MIN_ALPHA = 1.0 / 255.0
+"""A Gaussian is skipped at pixels where its alpha is smaller."""
+MAX_ALPHA = 0.999
+"""Upper bound of alpha, so that the transmittance stays positive."""
+MIN_TRANSMITTANCE = 1e-4
+"""A pixel stops before the Gaussian that would lower its transmittance to this value or below."""
+SLACK = 0.01
+"""Added to pixel extents [pixels] because of round-off; the exact test is on alpha."""
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RenderOutput:

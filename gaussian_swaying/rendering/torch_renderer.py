@@ -1,4 +1,4 @@
-"""Renderer in plain torch, for any device; the reference on machines without CUDA.
+"""Renderer in plain torch, for any device; the definition of those in kernels.
 
 Elliptical weighted averaging (Zwicker et al. 2001, "EWA volume splatting") with front-to-back compositing (Kerbl et
 al. 2023, arXiv 2308.04079), in the conventions of ``gsplat.rasterization(rasterize_mode="classic")``.
@@ -16,23 +16,19 @@ from torch.nn import functional
 from gaussian_swaying._checks import check_positive
 from gaussian_swaying.gaussians.harmonics import sh_to_color
 from gaussian_swaying.geometry.covariances import covariance
+from gaussian_swaying.rendering import raster
 from gaussian_swaying.rendering.cameras.camera import Camera
 from gaussian_swaying.rendering.protocol import (
+    MAX_ALPHA,
+    MIN_ALPHA,
+    MIN_TRANSMITTANCE,
+    SLACK,
     RenderOutput,
     ScreenGaussians,
     SplatOutput,
     check_gaussians,
     finite_gaussians,
 )
-
-MIN_ALPHA = 1.0 / 255.0
-"""A Gaussian is skipped at pixels where its alpha is smaller."""
-MAX_ALPHA = 0.999
-"""Upper bound of alpha, so that the transmittance stays positive."""
-MIN_TRANSMITTANCE = 1e-4
-"""A pixel stops before the Gaussian that would lower its transmittance to this value or below."""
-_SLACK = 0.01
-"""Added to pixel extents [pixels] because of round-off; the exact test is on alpha."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -121,7 +117,7 @@ def project_gaussians(
 def _extent(covariances2d: Tensor, log_opacities: Tensor) -> Tensor:
     """Half width and height [pixels] of the ellipse where alpha reaches 1/255, shape (V, 2)."""
     reach = 2.0 * (log_opacities - math.log(MIN_ALPHA)).clamp_min(0.0)
-    return (reach[:, None] * covariances2d[:, [0, 2]]).sqrt() + _SLACK
+    return (reach[:, None] * covariances2d[:, [0, 2]]).sqrt() + SLACK
 
 
 def _blocks(counts: Tensor, limit: int) -> tuple[Tensor, list[tuple[int, int]]]:
@@ -186,7 +182,7 @@ def _row_spans(projected: ProjectedGaussians, width: int, height: int, limit: in
         middle = mean_x + slope * dy - 0.5
         peak = projected.log_opacities.index_select(0, gaussian) - falloff * dy * dy
         with torch.no_grad():
-            half = ((peak - math.log(MIN_ALPHA)).clamp_min(0.0) / curvature).sqrt() + _SLACK
+            half = ((peak - math.log(MIN_ALPHA)).clamp_min(0.0) / curvature).sqrt() + SLACK
             left = (middle - half).ceil().clamp(0, width)
             count = ((middle + half).floor().clamp(-1, width - 1) - left + 1).clamp_min(0).long()
         yield _Spans(gaussian.int(), (row * width + left.long()).int(), count, left - middle, peak, curvature)
@@ -309,10 +305,13 @@ def render_torch(
 class TorchRenderer(nn.Module):
     """Renderer for any device, see :func:`render_torch`.
 
+    On a CPU, pictures in float32 without gradients are drawn by compiled kernels
+    (:mod:`~gaussian_swaying.rendering.raster`), if llvmlite is installed.
+
     Args:
         eps2d: Added to the diagonal of the projected covariances [pixels^2].
         max_pairs: Approximate number of pairs of a Gaussian and a pixel in memory at a time; bounds the memory and does
-            not change the picture beyond round-off.
+            not change the picture beyond round-off. The kernels do not need it.
 
     Raises:
         ValueError: If ``eps2d`` is negative or ``max_pairs`` is not positive.
@@ -334,6 +333,16 @@ class TorchRenderer(nn.Module):
         background: Tensor | None = None,
     ) -> RenderOutput:
         """Render one picture, see :class:`~gaussian_swaying.rendering.protocol.Renderer`."""
+        check_gaussians(means, covariances, opacities, colors, background)
+        given = (means, covariances, opacities, colors)
+        # the kernels read the others in any precision
+        wanted = [
+            t for t in (background, camera.world_to_camera, camera.intrinsics) if t is not None and t.requires_grad
+        ]
+        if raster.runs(given) and not (wanted and torch.is_grad_enabled()):
+            picture = raster.render(*given, camera, background, self.eps2d)
+            if picture is not None:
+                return picture
         return render_torch(means, covariances, opacities, colors, camera, background, self.eps2d, self.max_pairs)
 
     def render_splat(
