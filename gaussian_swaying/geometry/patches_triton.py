@@ -108,7 +108,7 @@ def deform_all(
     max_stretch: float | None = None,
     solid: Tensor | None = None,
 ) -> tuple[Tensor, Tensor, Tensor | None]:
-    """See ``patches.deform_all``; float32 on a GPU, without gradient."""
+    """See ``patches.deform_all``; float32, without gradient."""
     shape = deformation_gradient.shape[:-2]
     count = shape.numel()
     given = [deformation_gradient, covariances.expand(*shape, 3, 3), normals.expand(*shape, 3)]

@@ -7,11 +7,12 @@ import pytest
 import torch
 from shared import gradients, unit
 
-from gaussian_swaying.geometry import patches, patches_triton
+from gaussian_swaying.geometry import patches_triton
 from gaussian_swaying.geometry.covariances import deform_covariance
 from gaussian_swaying.geometry.linalg import polar_rotation
 from gaussian_swaying.geometry.patches import deform_all, deform_normal, deform_patch, smallest_axis_normal
 from gaussian_swaying.geometry.rotations import quat_to_rotation
+from gaussian_swaying.kernels.language import INTERPRETED
 
 UP = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)
 
@@ -110,16 +111,13 @@ def test_the_kernel_keeps_to_the_limit_as_torch_does(device):
     assert 5 < int(changed.sum()) < 35
 
 
-@pytest.mark.gpu
-def test_the_kernel_is_the_one_that_is_asked(monkeypatch):
+@pytest.mark.skipif(INTERPRETED, reason="the interpreter replaces nothing")
+def test_the_kernel_is_the_one_that_is_asked(device, monkeypatch):
     """Not with a gradient, nor in float64."""
-    pytest.importorskip("triton")
-    kernels, calls = patches._kernels(), []
-    assert kernels is not None
-    deform = kernels.deform_all
-    monkeypatch.setattr(kernels, "deform_all", lambda *a: calls.append(1) or deform(*a))
-    f = torch.eye(3, device="cuda").expand(4, 3, 3)
-    normal = torch.eye(3, device="cuda")[:1].expand(4, 3)
+    calls, deform = [], patches_triton.deform_all
+    monkeypatch.setattr(patches_triton, "deform_all", lambda *a: calls.append(1) or deform(*a))
+    f = torch.eye(3, device=device).expand(4, 3, 3)
+    normal = torch.eye(3, device=device)[:1].expand(4, 3)
     deform_all(f.double(), f.double(), normal.double())
     deform_all(f.clone().requires_grad_(), f, normal)
     assert calls == []
