@@ -258,7 +258,7 @@ def test_simulations_of_the_same_gaussians_compute_their_areas_once(make_cloud, 
     compute = body.coverage_area
     monkeypatch.setattr(body, "coverage_area", lambda *given: asked.append(1) or compute(*given))
     body._last.clear()
-    first, second = make_scene(cloud, E=1e5), make_scene(cloud, E=2e5)
+    first, second = (make_scene(cloud, Material(E=E)) for E in (1e5, 2e5))
     assert len(asked) == 1
     assert torch.equal(first.patches.area, second.patches.area)
     first.patches.area.zero_()
