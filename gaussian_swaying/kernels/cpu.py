@@ -155,7 +155,8 @@ _LINKED: list[Any] = []
 _NAMES = itertools.count()
 _COMPILED: dict[Any, int] = {}
 _COMPILING = threading.RLock()
-_spent = [0, 0.0]
+_spent = [0, 0.0, 0.0]
+"""Kernels compiled, and the wall-clock and processor time that it took [s]."""
 
 
 def _address(kernel: Any, constants: dict[str, Any], kinds: dict[str, str], real: str) -> int:
@@ -185,10 +186,11 @@ def _found_or_compiled(kernel: Any, constants: dict[str, Any], kinds: dict[str, 
         pass
     from gaussian_swaying.kernels.translator import translate
 
-    began = time.perf_counter()
+    began, busy = time.perf_counter(), time.process_time()
     code = _compiled(str(translate(kernel, constants, kinds, real)))
     _spent[0] += 1
     _spent[1] += time.perf_counter() - began
+    _spent[2] += time.process_time() - busy
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         with atomic(path) as temporary:
@@ -198,14 +200,14 @@ def _found_or_compiled(kernel: Any, constants: dict[str, Any], kinds: dict[str, 
     return _linked(code, "kernel")[0]
 
 
-def compiled() -> tuple[int, float]:
-    """Number of kernels that this process has compiled for the CPU, and how long it took [s]."""
-    return int(_spent[0]), _spent[1]
+def compiled() -> tuple[int, float, float]:
+    """Number of kernels that this process has compiled for the CPU; wall-clock and processor time that it took [s]."""
+    return int(_spent[0]), _spent[1], _spent[2]
 
 
 def compiled_sentence(before: int) -> str | None:
     """A sentence about the kernels compiled after the first ``before``; None if there were none."""
-    count, seconds = compiled()
+    count, seconds, _ = compiled()
     if count <= before:
         return None
     kernels = "1 kernel" if count == 1 else f"{count} kernels"

@@ -282,21 +282,18 @@ class Stopwatch:
     """Time since it was created [s], without that to compile kernels for a CPU: the next run finds them."""
 
     def __init__(self) -> None:
-        self._wall, self._cpu, self._compiled = time.perf_counter(), time.process_time(), compiled()[1]
+        _, wall, busy = compiled()
+        self._wall, self._cpu = time.perf_counter() - wall, time.process_time() - busy
 
     @property
     def wall(self) -> float:
         """Wall-clock time."""
-        return time.perf_counter() - self._wall - self._spent
+        return time.perf_counter() - compiled()[1] - self._wall
 
     @property
     def quiet(self) -> float:
         """The smaller of wall-clock and processor time, to exclude the time used by other programs."""
-        return min(self.wall, time.process_time() - self._cpu - self._spent)
-
-    @property
-    def _spent(self) -> float:
-        return compiled()[1] - self._compiled
+        return min(self.wall, time.process_time() - compiled()[2] - self._cpu)
 
     def on(self, device: torch.device) -> float:
         """Time for work on a device: on a GPU until it is finished, else :attr:`quiet`."""

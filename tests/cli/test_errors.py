@@ -113,7 +113,7 @@ def test_kernels_that_were_compiled_are_told_once_on_standard_error(tmp_path, mo
     assert compiles("cpu")
     monkeypatch.setenv("GAUSSIAN_SWAYING_CACHE", str(tmp_path))
     monkeypatch.setattr(cpu, "_COMPILED", {})
-    monkeypatch.setattr(cpu, "_spent", [0, 0.0])
+    monkeypatch.setattr(cpu, "_spent", [0, 0.0, 0.0])
     cpu._folder.cache_clear()
 
     def command():
