@@ -355,8 +355,11 @@ def _air(wind: nn.Module, time: Tensor, position: Tensor) -> Tensor:
 
 
 def _blow(wind: nn.Module, times: Tensor) -> Tensor:
-    """Velocity of a uniform wind at times (n,) [s], on their device; in one kernel where possible. Shape (n, 3)."""
-    if replaces((times, *tensors_in([wind])), dtype=None):
+    """Velocity of a uniform wind at times (n,) [s], on their device; on a GPU in one kernel. Shape (n, 3).
+
+    A CPU saves little by it, and a batch of winds has the bits of each wind.
+    """
+    if times.is_cuda and replaces((times, *tensors_in([wind])), dtype=None):
         from gaussian_swaying.aero.wind_triton import blow
 
         found = blow(wind, times)
