@@ -17,8 +17,9 @@ from gaussian_swaying.aero.patches import Patches, PatchSums
 from gaussian_swaying.aero.shelter import Shelter, wind_axes
 from gaussian_swaying.aero.wind import SpatialWind, WindField
 from gaussian_swaying.aero.wind_batch import WindBatch
-from gaussian_swaying.geometry.patches import compiles, deform_patch
+from gaussian_swaying.geometry.patches import deform_patch
 from gaussian_swaying.kernels.graphs import fingerprint, record, tensors_in
+from gaussian_swaying.kernels.launch import replaces
 from gaussian_swaying.mpm.forces import MOST_STEPS, Force, Given
 from gaussian_swaying.mpm.state import State
 from gaussian_swaying.mpm.twins import Numbers, Twin
@@ -354,9 +355,11 @@ def _air(wind: nn.Module, time: Tensor, position: Tensor) -> Tensor:
 
 
 def _blow(wind: nn.Module, times: Tensor) -> Tensor:
-    """Velocity of a uniform wind at times (n,) [s], on their device; in one kernel where possible. Shape (n, 3)."""
-    differentiated = torch.is_grad_enabled() and any(tensor.requires_grad for tensor in (times, *tensors_in([wind])))
-    if times.is_cuda and not differentiated and compiles(times.device):
+    """Velocity of a uniform wind at times (n,) [s], on their device; on a GPU in one kernel. Shape (n, 3).
+
+    A CPU saves little by it, and a batch of winds has the bits of each wind.
+    """
+    if times.is_cuda and replaces((times, *tensors_in([wind])), dtype=None):
         from gaussian_swaying.aero.wind_triton import blow
 
         found = blow(wind, times)

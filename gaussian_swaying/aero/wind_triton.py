@@ -15,7 +15,6 @@ from gaussian_swaying.kernels.language import tl, triton
 from gaussian_swaying.kernels.launch import lanes, launch
 
 SWAY, UNIFORM, GAUSSIAN = 0, 1, 2
-BLOCK = 64
 
 _numbers: WeakKeyDictionary[nn.Module, tuple[tuple[object, ...], Tensor, Tensor]] = WeakKeyDictionary()
 """For each wind: the key that its numbers were made from, and the numbers that the kernel reads, on the device."""
@@ -124,7 +123,7 @@ def blow(wind: nn.Module, times: Tensor) -> Tensor | None:
             starts = torch.tensor([stream_start(wind.seed, stream) for stream in range(max(len(known), 1))])
             _numbers[wind] = key, numbers.to(times.device), starts.to(times.device)
     _, numbers, starts = _numbers[wind]
-    out, block = times.new_empty(len(times), 3), lanes(times.device, BLOCK)
+    out, block = times.new_empty(len(times), 3), lanes(times.device, 64)
     with torch.cuda.device_of(times):
         launch(_blow, (triton.cdiv(len(times), block),))(
             times.contiguous(), wind.times, wind.flows.contiguous(), numbers, starts, out, len(times),

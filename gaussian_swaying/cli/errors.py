@@ -23,6 +23,7 @@ import torch
 from gaussian_swaying import _program as program
 from gaussian_swaying._checks import first_line
 from gaussian_swaying.cli.streams import SafeStream, safe_streams
+from gaussian_swaying.kernels.cpu import compiled, compiled_sentence
 from gaussian_swaying.runs.signals import exit_code
 
 OK, BUG, BAD_INPUT = 0, 1, 2
@@ -50,7 +51,8 @@ def run_command(
 ) -> int:
     """Run a command, and turn exceptions into a sentence on standard error and an exit code.
 
-    If standard output or error is closed, full or cannot show a character, the command still runs.
+    If standard output or error is closed, full or cannot show a character, the command still runs. Standard error says
+    at the end how long it took to compile kernels, if there were any.
 
     Args:
         command: Does the work and gives an exit code; None is 0.
@@ -73,10 +75,15 @@ def run_command(
                 print(line, file=sys.stderr)
 
     def outcome() -> int:
+        known = compiled()[0]
         try:
             with warnings.catch_warnings():
                 warnings.showwarning = _once(set())
-                return command() or OK
+                code = command() or OK
+            told = compiled_sentence(known)
+            if told is not None:
+                print(f"note: {told}", file=sys.stderr)
+            return code
         except KeyboardInterrupt as stop:
             tell(stopped, stop)
             return exit_code(stop)

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import difflib
+import gc
 import sys
 from collections.abc import Sequence
 from importlib import import_module
+from types import ModuleType
 
 import gaussian_swaying
 from gaussian_swaying import _program as program
@@ -50,5 +52,17 @@ def main(arguments: Sequence[str] | None = None) -> int:
         print(f"error: There is no command {given[0]!r}{hint}: use one of {', '.join(COMMANDS)}.", file=sys.stderr)
         return 2
     program.called(given[0])
-    code: int = import_module(COMMANDS[given[0]][0]).main(given[1:])
+    code: int = _imported(COMMANDS[given[0]][0]).main(given[1:])
     return code
+
+
+def _imported(name: str) -> ModuleType:
+    """A module; while it is imported, and later within it, Python looks for no garbage, which would take 0.3 s."""
+    if name not in sys.modules:
+        gc.disable()
+        try:
+            import_module(name)
+            gc.freeze()
+        finally:
+            gc.enable()
+    return sys.modules[name]

@@ -10,6 +10,7 @@ from torch import Tensor
 from gaussian_swaying._checks import check_shape
 from gaussian_swaying.geometry.groups import equal_rows
 from gaussian_swaying.geometry.neighbours import nearest_neighbours
+from gaussian_swaying.kernels.launch import replaces
 
 _RAYS = 32  # number of directions in which the cell of a patch is measured
 _SLAB = 0.75  # half thickness of one sheet, in neighbour spacings
@@ -113,7 +114,7 @@ def coverage_area(
             rows = slice(start, start + _CHUNK)
             offset = site[index[rows]] - site[rows, None]
             parts = offset, distance[rows], normal[rows], disc[rows], disc[index[rows]]
-            cell[rows], same[rows] = _cell_area(*parts, start)
+            cell[rows], same[rows] = _cells(*parts, start)
         for start in range(0, len(site), 8192):
             rows = slice(start, start + 8192)
             # g of every candidate at this site, the site's own Gaussians first
@@ -129,6 +130,37 @@ def coverage_area(
     load_of_site = torch.zeros(len(site), dtype=torch.float64).index_add_(0, owner, load)
     areas = share[owner] * load / load_of_site[owner]
     return areas.to(means).clamp_min(torch.finfo(means.dtype).tiny)
+
+
+def _rays(phase: int, count: int) -> Tensor:
+    """Directions in which cells are measured (B, rays, 2); each cell rotates them by another angle."""
+    turn = torch.arange(phase, phase + count, dtype=torch.float64) * 0.6180339887498949 % 1  # errors average out
+    angle = (turn[:, None] + torch.arange(_RAYS)) * (2 * math.pi / _RAYS)
+    return torch.stack([angle.cos(), angle.sin()], dim=-1)
+
+
+def _open_cosine(neighbours: Tensor) -> Tensor:
+    """Cosine of the angle within which an open direction has no neighbour, from the number of neighbours.
+
+    With m random neighbours that angle is empty by chance with probability _FALSE_EDGE. It is 60 degrees for m = 16,
+    less than the 90 degrees at a straight edge.
+    """
+    half_angle = math.pi * (1 - _FALSE_EDGE ** (1 / neighbours.clamp_min(1)))
+    return half_angle.clamp(math.radians(50), math.radians(85)).cos()
+
+
+def _cells(
+    offset: Tensor, distance: Tensor, normal: Tensor, disc: Tensor, discs: Tensor, phase: int
+) -> tuple[Tensor, Tensor]:
+    """As :func:`_cell_area`, in a kernel where it can be compiled."""
+    if not replaces((offset,), torch.float64):
+        return _cell_area(offset, distance, normal, disc, discs, phase)
+    from gaussian_swaying.gaussians.area_triton import cells
+
+    neighbours = offset.shape[1]
+    cluster = _CLUSTER * math.sqrt(math.pi / neighbours)
+    ray, open_cosine = _rays(phase, len(offset)), _open_cosine(torch.arange(neighbours + 1, dtype=torch.float64))
+    return cells(offset, distance, normal, disc, discs, ray, open_cosine, cluster, _SLAB, _SPIKE, _REACH)
 
 
 def _cell_area(
@@ -151,10 +183,7 @@ def _cell_area(
     stacked = same & (squared <= 1e-12 * spacing[:, None].square())
     same &= ~stacked
 
-    # Each cell rotates its rays by another angle, so that the errors of the quadrature average out.
-    turn = torch.arange(phase, phase + len(offset), dtype=torch.float64) * 0.6180339887498949 % 1
-    angle = (turn[:, None] + torch.arange(_RAYS)) * (2 * math.pi / _RAYS)
-    ray = torch.stack([angle.cos(), angle.sin()], dim=-1)
+    ray = _rays(phase, len(offset))
     along = ray @ flat.mT  # (B, rays, k)
     facing = same[:, None] & (along > 0)
     reach = torch.where(facing, 0.5 * squared[:, None] / along, torch.inf).amin(-1)
@@ -163,12 +192,7 @@ def _cell_area(
     found = same.sum(-1, keepdim=True)
     local_size = ((disc[:, None] + (same * discs).sum(-1, keepdim=True)) / (math.pi * (1 + found))).sqrt()
     limit = torch.minimum(_SPIKE * spacing[:, None], _REACH * local_size)
-    # A direction is open if no neighbour is within a certain angle of it. With m random neighbours that angle is empty
-    # by chance with probability _FALSE_EDGE. It is 60 degrees for m = 16, less than the 90 degrees at a straight edge.
-    half_angle = (math.pi * (1 - _FALSE_EDGE ** (1 / (same & ~repeat).sum(-1, keepdim=True).clamp_min(1)))).clamp(
-        math.radians(50), math.radians(85)
-    )
-    open_cosine = half_angle.cos()
+    open_cosine = _open_cosine((same & ~repeat).sum(-1, keepdim=True))
     # At a border: up to three straight edges, each as far out as the cell extends on the other side.
     for _ in range(3):
         widest = cosine.argmin(-1, keepdim=True)

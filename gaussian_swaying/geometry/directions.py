@@ -57,8 +57,8 @@ def hull_area(points: Tensor) -> float:
         return 0.0
     places = points.detach().cpu().double()
     half = spread_lines(_SUPPORTS // 2)
-    ends = [torch.stack([(places @ part.mT).argmax(0), (places @ part.mT).argmin(0)]) for part in half.split(50)]
-    outer = places[torch.cat(ends, dim=1).unique()]
+    heights = (part @ places.mT for part in half.split(50))
+    outer = places[torch.cat([end for h in heights for end in (h.argmax(1), h.argmin(1))]).unique()]
     outer = outer - outer.mean(0)
     lines = spread_lines(100)
     first, second = axes_across(lines)

@@ -2,12 +2,6 @@
 
 from __future__ import annotations
 
-import functools
-import importlib
-import importlib.util
-import warnings
-from types import ModuleType
-
 import torch
 from torch import Tensor
 
@@ -15,8 +9,7 @@ from gaussian_swaying._checks import check_shape
 from gaussian_swaying.geometry.covariances import deform_covariance, limit_deformed
 from gaussian_swaying.geometry.linalg import cofactor, determinant, polar_rotation
 from gaussian_swaying.geometry.rotations import quat_to_rotation
-from gaussian_swaying.kernels import launch
-from gaussian_swaying.kernels.language import INTERPRETED
+from gaussian_swaying.kernels.launch import replaces
 
 
 def smallest_axis_normal(quats: Tensor, log_scales: Tensor) -> Tensor:
@@ -107,7 +100,7 @@ def deform_all(
     max_stretch: float | None = None,
     solid: Tensor | None = None,
 ) -> tuple[Tensor, Tensor, Tensor | None]:
-    """Covariances, normals and rotations after a deformation; in one kernel where it can be compiled.
+    """Covariances, normals and rotations after a deformation; in float32 without gradients in one kernel.
 
     Args:
         deformation_gradient: Total deformation gradient F, shape (N, 3, 3).
@@ -128,38 +121,12 @@ def deform_all(
     check_shape("covariances", covariances, 3, 3)
     check_shape("normals", normals, 3)
     tensors = (deformation_gradient, covariances, normals)
-    single = all(tensor.dtype == torch.float32 for tensor in tensors)
-    wanted = torch.is_grad_enabled() and any(tensor.requires_grad for tensor in tensors)
-    if single and not wanted and compiles(deformation_gradient.device):
-        kernels = importlib.import_module("gaussian_swaying.geometry.patches_triton")
-        return kernels.deform_all(*tensors, rotations, max_stretch, solid)
+    if replaces(tensors):
+        from gaussian_swaying.geometry import patches_triton
+
+        return patches_triton.deform_all(*tensors, rotations, max_stretch, solid)
     drawn = deform_covariance(deformation_gradient, covariances)
     turns = polar_rotation(deformation_gradient) if rotations else None
     if max_stretch is not None and solid is not None:
         drawn = limit_deformed(deformation_gradient, drawn, covariances, max_stretch, solid, turns)
     return drawn, deform_normal(deformation_gradient, normals), turns
-
-
-def compiles(device: torch.device) -> bool:
-    """Whether kernels of patches can be compiled for a device."""
-    if device.type == "cuda":
-        return _kernels() is not None
-    return not INTERPRETED and launch.compiles(device.type)
-
-
-@functools.cache
-def _kernels() -> ModuleType | None:
-    """The kernels, if triton is installed and finds a compiler; tested on one patch."""
-    if importlib.util.find_spec("triton") is None:
-        return None
-    try:
-        kernels = importlib.import_module("gaussian_swaying.geometry.patches_triton")
-        matrix = torch.zeros(1, 3, 3, device="cuda")
-        solid = torch.ones(1, dtype=torch.bool, device="cuda")
-        for rotations in (False, True):
-            for limit in (None, 2.0):
-                kernels.deform_all(matrix, matrix, matrix[:, 0], rotations, limit, solid)
-    except Exception as error:  # for any error the torch functions give the same result
-        warnings.warn(f"triton cannot compile its kernels here ({error}): drawing takes longer.", stacklevel=2)
-        return None
-    return kernels

@@ -12,6 +12,7 @@ import hashlib
 import itertools
 import os
 import threading
+import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from functools import cache, lru_cache
@@ -159,7 +160,8 @@ _LINKED: list[Any] = []
 _NAMES = itertools.count()
 _COMPILED: dict[Any, int] = {}
 _COMPILING = threading.RLock()
-_said = False
+_spent = [0, 0.0, 0.0]
+"""Kernels compiled, and the wall-clock and processor time that it took [s]."""
 
 
 def _address(kernel: Any, constants: dict[str, Any], kinds: dict[str, str], real: str) -> int:
@@ -189,8 +191,11 @@ def _found_or_compiled(kernel: Any, constants: dict[str, Any], kinds: dict[str, 
         pass
     from gaussian_swaying.kernels.translator import translate
 
-    _say()
+    began, busy = time.perf_counter(), time.process_time()
     code = _compiled(str(translate(kernel, constants, kinds, real)))
+    _spent[0] += 1
+    _spent[1] += time.perf_counter() - began
+    _spent[2] += time.process_time() - busy
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         with atomic(path) as temporary:
@@ -200,12 +205,18 @@ def _found_or_compiled(kernel: Any, constants: dict[str, Any], kinds: dict[str, 
     return _linked(code, "kernel")[0]
 
 
-def _say() -> None:
-    """Say once in a process that kernels are compiled."""
-    global _said
-    if not _said and os.environ.get("PYTEST_CURRENT_TEST") is None:
-        _said = True
-        print("Compiling the kernels of this simulation for the CPU, once; this takes some seconds.", flush=True)
+def compiled() -> tuple[int, float, float]:
+    """Number of kernels that this process has compiled for the CPU; wall-clock and processor time that it took [s]."""
+    return int(_spent[0]), _spent[1], _spent[2]
+
+
+def compiled_sentence(before: int) -> str | None:
+    """A sentence about the kernels compiled after the first ``before``; None if there were none."""
+    count, seconds, _ = compiled()
+    if count <= before:
+        return None
+    kernels = "1 kernel" if count == 1 else f"{count} kernels"
+    return f"Compiled {kernels} for this CPU in {seconds:.1f} s, once (kept in {_folder()})."
 
 
 @cache
@@ -404,4 +415,13 @@ def launch(kernel: Any, grid: Sequence[int], *given: Any, **named: Any) -> None:
     _run_rows((ctypes.c_int64 * _ROW)(address, ctypes.addressof(arguments), programs, 0, 0, 0), 1)
 
 
-__all__ = ["Recording", "call", "device_source", "launch", "recording", "threads"]
+__all__ = [
+    "Recording",
+    "call",
+    "compiled",
+    "compiled_sentence",
+    "device_source",
+    "launch",
+    "recording",
+    "threads",
+]

@@ -3,25 +3,57 @@
 from __future__ import annotations
 
 import importlib.util
-from collections.abc import Callable, Sequence
+import warnings
+from collections.abc import Callable, Iterable, Sequence
 from functools import cache
 from typing import Any
 
 import torch
 from torch import Tensor
 
-from gaussian_swaying.kernels.language import INTERPRETED, Compiler, triton
+from gaussian_swaying.kernels.language import INTERPRETED, Compiler, tl, triton
 
 LANES = 8
 """Lanes of a program on a CPU."""
 
 
+@triton.jit
+def _trial(out: Any) -> None:
+    tl.store(out, 1.0)
+
+
 @cache
 def compiles(device: str) -> bool:
-    """Whether kernels can be compiled for a kind of device, ``cuda`` or ``cpu``."""
-    if device == "cuda":
-        return triton is not Compiler and not isinstance(triton, Compiler)
-    return device == "cpu" and (INTERPRETED or importlib.util.find_spec("llvmlite") is not None)
+    """Whether kernels can be compiled for a kind of device, ``cuda`` or ``cpu``; tried once, on a small one."""
+    if device == "cpu" and INTERPRETED:
+        return True
+    compiler = (
+        not isinstance(triton, Compiler) if device == "cuda" else importlib.util.find_spec("llvmlite") is not None
+    )
+    if device not in ("cuda", "cpu") or not compiler:
+        return False
+    try:
+        launch(_trial, (1,))(torch.empty(1, device=device))
+    except Exception as error:  # for any error the torch functions give the same result
+        warnings.warn(f"Kernels cannot be compiled for {device} ({error}): everything takes longer.", stacklevel=2)
+        return False
+    return True
+
+
+def replaces(given: Iterable[Tensor], dtype: torch.dtype | None = torch.float32) -> bool:
+    """Whether a kernel without gradients may replace torch functions: it compiles, and none of the tensors forbids it.
+
+    Triton's interpreter replaces nothing, as it takes far longer.
+
+    Args:
+        given: All tensors that the result depends on, on one device.
+        dtype: The only type that the kernel takes; None for any.
+    """
+    known = list(given)
+    if any(dtype is not None and tensor.dtype != dtype for tensor in known) or INTERPRETED:
+        return False
+    wanted = torch.is_grad_enabled() and any(tensor.requires_grad for tensor in known)
+    return not wanted and compiles(known[0].device.type)
 
 
 def lanes(device: torch.device, gpu: int, cpu: int = LANES) -> int:
@@ -62,4 +94,4 @@ def call(change: Callable[[], object], device: torch.device) -> None:
     cpu.call(change)
 
 
-__all__ = ["LANES", "call", "compiles", "lanes", "launch"]
+__all__ = ["LANES", "call", "compiles", "lanes", "launch", "replaces"]

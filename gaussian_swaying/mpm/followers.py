@@ -9,7 +9,7 @@ import torch
 from torch import Tensor, nn
 
 from gaussian_swaying.geometry.frame import SimFrame
-from gaussian_swaying.geometry.patches import compiles
+from gaussian_swaying.kernels.launch import replaces
 from gaussian_swaying.mpm.state import GridSpec, MaterialPoints, MPMState, State, bounding_grid
 from gaussian_swaying.mpm.transfer import Stencil, bspline_stencil, gather, scatter
 
@@ -184,10 +184,7 @@ class GridFollowers(Followers):
     ) -> tuple[Tensor, Tensor, Tensor, Tensor | None] | None:
         """See :meth:`Followers.drawn`; the kernel runs in float32, without gradients."""
         displacement = _nodal(state.node_displacement)
-        given = (displacement, means, covariances, normals, self.place)
-        wanted = torch.is_grad_enabled() and any(tensor.requires_grad for tensor in given)
-        single = all(tensor.dtype == torch.float32 for tensor in given)
-        if not single or wanted or not compiles(displacement.device):
+        if not replaces((displacement, means, covariances, normals, self.place)):
             return None
         from gaussian_swaying.mpm.followers_triton import follow
 

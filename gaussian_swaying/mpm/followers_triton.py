@@ -13,8 +13,6 @@ from gaussian_swaying.mpm.transfer import Stencil
 from gaussian_swaying.mpm.triton.shared import VARIES, axis_weights
 from gaussian_swaying.mpm.triton.total_kernels import gather
 
-BLOCK = 128
-
 
 @triton.jit(do_not_specialize=VARIES)
 def _follow(
@@ -100,7 +98,7 @@ def follow(
     turns = torch.empty_like(given[1]) if rotations else given[1]
     limit = max_stretch is not None and solid is not None
     keeps = fields if solid is None or not limit else solid.contiguous().view(torch.int8)
-    block = lanes(fields.device, BLOCK)
+    block = lanes(fields.device, 128)
     if count > 0:
         with torch.cuda.device_of(fields):
             launch(_follow, (triton.cdiv(count, block),))(

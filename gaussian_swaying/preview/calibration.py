@@ -232,7 +232,8 @@ def measure_motion(
     side = scene.size * scene.frame.metres_per_unit
     limit = math.inf if sway is None else STOP * sway
     motion, threads = Motion(0.0, 1.0, 1.0), torch.get_num_threads()
-    torch.set_num_threads(1)  # for a few hundred particles more threads would only wait for each other
+    if not simulation.solver.has_kernels:
+        torch.set_num_threads(1)  # for a few hundred particles torch's threads would only wait for each other
     try:
         state, taken = simulation.start(), []
         for _ in range(max(1, round(seconds / simulation.frame_dt))):

@@ -12,6 +12,7 @@ import torch
 from torch import Tensor
 
 from gaussian_swaying._provenance import cores, describe_device
+from gaussian_swaying.kernels.cpu import compiled
 from gaussian_swaying.mpm.state import State
 from gaussian_swaying.mpm.timestep import wave_speed
 from gaussian_swaying.recording.writer import WORKERS
@@ -20,6 +21,7 @@ from gaussian_swaying.simulation.simulation import Simulation
 
 BUDGET = 2.5  # s; for the frames that are timed
 MOST_FRAMES = 9  # timed at most
+TRIAL = 0.02  # s; substeps are timed together until they take so long
 SUBSTEPS = 5  # timed where a frame takes longer than the budget
 WARM_UP = 3.0  # s; kernels of a run are loaded and recorded in 2 to 3 s; compiling is done only once on a machine
 
@@ -114,7 +116,7 @@ def estimate_cost(simulation: Simulation, frames: int, startup_seconds: float = 
 
 def _timed_frames(simulation: Simulation, state: State, at_rest: int) -> tuple[float, list[float], list[int]]:
     """Time to load the kernels [s]; and of some frames the time for a substep [s] and their numbers of substeps."""
-    solver, warm_up = simulation.solver, 0.0
+    warm_up = 0.0
     each: list[float] = []
     taken: list[int] = []
     begin = Stopwatch()
@@ -125,15 +127,9 @@ def _timed_frames(simulation: Simulation, state: State, at_rest: int) -> tuple[f
             warm_up = min(begin.wall, WARM_UP)
             state, _ = simulation.advance(state)
         else:
-            dt = simulation.frame_dt / at_rest
-
-            def substep() -> None:
-                solver.watched_rollout(state, dt, 1, simulation.forces, looks=1)
-
-            substep()
-            trial = _seconds(simulation, substep)
-            if trial * at_rest > 0.4 * BUDGET:  # a frame would take too long
-                return 0.0, [_seconds(simulation, substep) for _ in range(SUBSTEPS)], [at_rest]
+            substep, each_trial = _trial(simulation, state, at_rest)
+            if each_trial * at_rest > 0.4 * BUDGET:  # a frame would take too long
+                return 0.0, [substep() for _ in range(SUBSTEPS)], [at_rest]
         begin = Stopwatch()
         while len(each) < MOST_FRAMES and (begin.wall < BUDGET or len(each) < 2):
             frame = Stopwatch()
@@ -144,6 +140,28 @@ def _timed_frames(simulation: Simulation, state: State, at_rest: int) -> tuple[f
         if not each:
             return warm_up, [begin.on(simulation.device) / at_rest], [at_rest]
     return warm_up, each, taken
+
+
+def _trial(simulation: Simulation, state: State, at_rest: int) -> tuple[Callable[[], float], float]:
+    """A function that times a substep [s], and its first result.
+
+    A rollout of one substep would measure what a rollout takes besides: there are as many as take some time, but no
+    more than in a frame.
+    """
+    dt, steps = simulation.frame_dt / at_rest, 1
+
+    def rollout() -> None:
+        simulation.solver.watched_rollout(state, dt, steps, simulation.forces, looks=1)
+
+    def seconds() -> float:
+        return _seconds(simulation, rollout) / steps
+
+    while True:
+        rollout()  # compiles and records what is not yet compiled
+        found = seconds()
+        if steps == at_rest or found * steps > TRIAL:
+            return seconds, found
+        steps = min(8 * steps, at_rest)
 
 
 def _picture_seconds(simulation: Simulation, state: State, frame: float) -> float:
@@ -261,20 +279,21 @@ def _seconds(simulation: Simulation, work: Callable[[], object]) -> float:
 
 
 class Stopwatch:
-    """Time since it was created [s]."""
+    """Time since it was created [s], without that to compile kernels for a CPU: the next run finds them."""
 
     def __init__(self) -> None:
-        self._wall, self._cpu = time.perf_counter(), time.process_time()
+        _, wall, busy = compiled()
+        self._wall, self._cpu = time.perf_counter() - wall, time.process_time() - busy
 
     @property
     def wall(self) -> float:
         """Wall-clock time."""
-        return time.perf_counter() - self._wall
+        return time.perf_counter() - compiled()[1] - self._wall
 
     @property
     def quiet(self) -> float:
         """The smaller of wall-clock and processor time, to exclude the time used by other programs."""
-        return min(self.wall, time.process_time() - self._cpu)
+        return min(self.wall, time.process_time() - compiled()[2] - self._cpu)
 
     def on(self, device: torch.device) -> float:
         """Time for work on a device: on a GPU until it is finished, else :attr:`quiet`."""

@@ -166,11 +166,34 @@ def _areas(
     means, log_scales, opacity = cloud.means, cloud.scales, torch.sigmoid(cloud.opacities)
     if pieces is not None:
         means, log_scales, opacity = torch.cat([means, pieces.means]), pieces.log_scales, pieces.opacity
-    shape = means[group], normals[source[group]], log_scales[group]
-    found = coverage_area(*shape, opacity[group])
-    if mode == "open":
-        return found * openness(*shape, found, opacity[group])
+    shape = means[group], normals[source[group]], log_scales[group], opacity[group]
+    found = _shared_areas(*shape, open_only=mode == "open")
     return found.mean().expand(len(found)) if mode == "equal" and len(found) else found
+
+
+_last: list[Tensor] = []
+"""Arguments and result of the last areas."""
+
+
+def _shared_areas(*shape: Tensor, open_only: bool) -> Tensor:
+    """Areas of overlapping patches (N,), computed on the CPU; if only the material or the grid has changed, the last.
+
+    The simulations of a preview, a sweep or a fit have the same Gaussians.
+
+    Args:
+        shape: Means, normals, logarithms of scales, and opacities.
+        open_only: Whether they are weighted with :func:`openness`.
+    """
+    means, normals, log_scales, opacity = shape
+    if len(means) == 0:
+        return means.new_zeros(0)
+    key = [torch.tensor(open_only), *(part.detach().cpu() for part in shape)]
+    if not (_last and all(a.dtype == b.dtype and torch.equal(a, b) for a, b in zip(_last, key, strict=False))):
+        found = coverage_area(means, normals, log_scales, opacity)
+        if open_only:
+            found = found * openness(means, normals, log_scales, found, opacity)
+        _last[:] = [*(part.clone() for part in key), found.cpu()]
+    return _last[-1].to(means, copy=True)
 
 
 def within_region(filling: Filling, region: Region, frame: SimFrame) -> Filling:

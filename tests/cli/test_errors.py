@@ -6,6 +6,7 @@ Covers: cli.streams.
 import errno
 import io
 import os
+import re
 import subprocess
 import sys
 import warnings
@@ -19,6 +20,10 @@ from shared import refused
 
 from gaussian_swaying.cli.errors import guessing, run_command, sentence
 from gaussian_swaying.cli.streams import SafeStream
+from gaussian_swaying.geometry.patches import deform_all
+from gaussian_swaying.kernels import cpu
+from gaussian_swaying.kernels.language import INTERPRETED
+from gaussian_swaying.kernels.launch import compiles
 from gaussian_swaying.simulation.simulation import Simulation
 
 ROOT = Path(__file__).parents[2]
@@ -100,6 +105,29 @@ def test_a_warning_is_one_line_and_said_once(capsys):
         warnings.simplefilter("always")
         assert run_command(command) == 0
     assert capsys.readouterr().err == "warning: the splat is odd\n"
+
+
+@pytest.mark.skipif(INTERPRETED, reason="nothing is compiled")
+def test_kernels_that_were_compiled_are_told_once_on_standard_error(tmp_path, monkeypatch, capsys):
+    """And not those of an earlier command."""
+    assert compiles("cpu")
+    monkeypatch.setenv("GAUSSIAN_SWAYING_CACHE", str(tmp_path))
+    monkeypatch.setattr(cpu, "_COMPILED", {})
+    monkeypatch.setattr(cpu, "_spent", [0, 0.0, 0.0])
+    cpu._folder.cache_clear()
+
+    def command():
+        deform_all(*torch.ones(2, 1, 3, 3), torch.ones(1, 3), rotations=False)
+
+    for _ in range(2):
+        assert run_command(command) == 0
+    told = capsys.readouterr()
+    cpu._folder.cache_clear()
+    assert told.out == ""
+    assert re.fullmatch(
+        rf"note: Compiled 1 kernel for this CPU in \d+\.\d s, once \(kept in {tmp_path}\)\.\n", told.err
+    )
+    assert [path.suffix for path in tmp_path.iterdir()] == [".o"]
 
 
 # ---- streams

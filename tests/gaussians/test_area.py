@@ -1,4 +1,7 @@
-"""Areas of patches: each alone by its formula, together against the true area of the surface."""
+"""Areas of patches: each alone by its formula, together against the true area of the surface.
+
+Covers: gaussians.area_triton.
+"""
 
 import math
 
@@ -6,8 +9,10 @@ import pytest
 import torch
 from shared import unit
 
+from gaussian_swaying.gaussians import area
 from gaussian_swaying.gaussians.area import coverage_area, patch_area
 from gaussian_swaying.geometry.rotations import quat_to_rotation
+from gaussian_swaying.kernels.launch import replaces
 
 UP = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)
 
@@ -153,6 +158,28 @@ def test_wild_input_stays_finite_and_positive():
     assert torch.isfinite(areas).all()
     assert (areas > 0).all()
     assert coverage_area(torch.zeros(0, 3), torch.zeros(0, 3), torch.zeros(0, 3)).shape == (0,)
+
+
+@pytest.mark.skipif(not replaces((torch.ones(0, dtype=torch.float64),), torch.float64), reason="nothing is compiled")
+@pytest.mark.parametrize("neighbours", [6, 24])
+def test_the_kernel_of_the_cells_is_their_definition(neighbours, monkeypatch):
+    """On a plane with borders, on several sheets, in clusters, on spikes, among stacked and lonely Gaussians."""
+    flat = torch.rand(300, 3, dtype=torch.float64) * torch.tensor([1.0, 0.6, 0.0], dtype=torch.float64)
+    cluster = flat[:40] + 1e-3 * torch.randn(40, 3, dtype=torch.float64)
+    above = flat[100:200] + torch.tensor([0.0, 0.0, 0.03], dtype=torch.float64)
+    stack = flat[200:210] + torch.tensor([0.0, 0.0, 1e-9], dtype=torch.float64)
+    means = torch.cat([flat, cluster, above, stack, 5 + 10 * torch.rand(7, 3, dtype=torch.float64)])
+    normals = torch.tensor([0.0, 0.0, 1.0]) + 0.2 * torch.randn(len(means), 3, dtype=torch.float64)
+    normals[-7:] = torch.eye(3)[torch.arange(7) % 3]
+    log_scales = torch.log(0.005 + 0.05 * torch.rand(len(means), 3, dtype=torch.float64))
+    opacity = torch.rand(len(means), dtype=torch.float64)
+    monkeypatch.setattr(area, "_CHUNK", 100)
+    found = coverage_area(means, normals, log_scales, opacity, neighbours)
+    asked = []
+    monkeypatch.setattr(area, "replaces", lambda *_: asked.append(1))
+    expected = coverage_area(means, normals, log_scales, opacity, neighbours)
+    torch.testing.assert_close(found, expected, rtol=3e-7, atol=0)  # torch divides by counts in float32
+    assert len(asked) == 5
 
 
 def test_same_input_same_areas_and_order_does_not_matter():

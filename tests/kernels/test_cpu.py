@@ -107,13 +107,17 @@ def own(tmp_path, monkeypatch):
 
 
 def test_a_second_process_compiles_nothing(folder, own, tmp_path, monkeypatch, capsys):
-    """The first one says that it does."""
-    monkeypatch.setattr(cpu, "_said", False)
-    monkeypatch.delenv("PYTEST_CURRENT_TEST")
+    """The first one can say what it did, but prints nothing."""
+    monkeypatch.setattr(cpu, "_spent", [0, 0.0, 0.0])
+    assert cpu.compiled_sentence(0) is None
     assert own() == 101.0
     _shifted()
-    said = "Compiling the kernels of this simulation for the CPU, once; this takes some seconds.\n"
-    assert capsys.readouterr().out == said  # once
+    count, seconds, busy = cpu.compiled()
+    assert count == len(list(folder.iterdir())) == 2
+    assert cpu.compiled_sentence(2) is None
+    assert cpu.compiled_sentence(1) == f"Compiled 2 kernels for this CPU in {seconds:.1f} s, once (kept in {folder})."
+    assert min(seconds, busy) > 0
+    assert capsys.readouterr() == ("", "")
     before = {path.name: path.stat().st_mtime_ns for path in folder.iterdir()}
     command = [sys.executable, "-c", f"import sys; sys.path.append({str(tmp_path)!r}); import own_kernel as own"]
     command[-1] += "; print(own.added())"

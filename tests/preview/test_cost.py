@@ -7,6 +7,8 @@ import pytest
 import torch
 
 from gaussian_swaying.geometry.regions import Box
+from gaussian_swaying.kernels import cpu
+from gaussian_swaying.kernels.language import INTERPRETED
 from gaussian_swaying.mpm.boundaries.pinned_region import PinnedRegion
 from gaussian_swaying.mpm.solver import MPMSolver
 from gaussian_swaying.preview import cost as cost_module
@@ -37,6 +39,31 @@ def cost(dx, power=2.0, picture=0.1):
         picture_seconds=picture,
         startup_seconds=5.0,
     )
+
+
+def test_a_trial_is_long_enough_to_time_substeps(monkeypatch, make_simulation):
+    """Whatever a rollout takes besides: here as much as 100 substeps. And it is no longer than a frame."""
+    simulation = make_simulation()
+    state, asked = simulation.start(), []
+    monkeypatch.setattr(MPMSolver, "watched_rollout", lambda self, state, dt, steps, forces, looks: asked.append(steps))
+    monkeypatch.setattr(cost_module, "_seconds", lambda simulation, work: work() or 1e-5 * (100 + asked[-1]))
+    _, found = cost_module._trial(simulation, state, 10_000)
+    assert found < 2e-5
+    assert max(asked) == 4096
+    assert cost_module._trial(simulation, state, 30)[1] == pytest.approx(130e-5 / 30)
+    assert asked[-1] == 30
+
+
+@pytest.mark.skipif(INTERPRETED, reason="nothing is compiled")
+def test_compiling_is_not_counted(monkeypatch):
+    """It is done once on a machine, and another run finds the kernels."""
+    watch = cost_module.Stopwatch()
+    time.sleep(0.2)
+    before = watch.wall, watch.quiet
+    count, wall, busy = cpu.compiled()
+    monkeypatch.setattr(cpu, "_spent", [count + 1, wall + 0.15, busy + 0.15])
+    assert watch.wall < before[0] - 0.1
+    assert watch.quiet < before[1]
 
 
 @pytest.mark.parametrize("power", [0.0, 1.0, 2.0, 3.0])

@@ -19,6 +19,7 @@ from gaussian_swaying.mpm.laws.neo_hookean import NeoHookean
 from gaussian_swaying.mpm.laws.sand import Sand
 from gaussian_swaying.mpm.solver import MPMSolver
 from gaussian_swaying.scenes.procedural import FlagScene
+from gaussian_swaying.simulation import body
 from gaussian_swaying.simulation.edits import Edit
 from gaussian_swaying.simulation.material import Material, MaterialRegion
 from gaussian_swaying.simulation.sampling import cell_volume
@@ -249,6 +250,23 @@ def test_each_part_has_the_law_it_was_given(make_cloud, make_scene):
     assert [type(law).__name__ for law in plain.laws] == ["FixedCorotated"]
     # moving the scene to another type keeps the integers
     assert make_scene(cloud, material).to(torch.float64).points.law_index.dtype == torch.long
+
+
+def test_simulations_of_the_same_gaussians_compute_their_areas_once(make_cloud, make_scene, monkeypatch):
+    """Whatever else differs; they are the same as on their own, and nobody changes those of another."""
+    asked, cloud = [], make_cloud()
+    compute = body.coverage_area
+    monkeypatch.setattr(body, "coverage_area", lambda *given: asked.append(1) or compute(*given))
+    body._last.clear()
+    first, second = (make_scene(cloud, Material(E=E)) for E in (1e5, 2e5))
+    assert len(asked) == 1
+    assert torch.equal(first.patches.area, second.patches.area)
+    first.patches.area.zero_()
+    assert bool((make_scene(cloud).patches.area > 0).all())
+    cloud.opacities[3] -= 1
+    make_scene(cloud)
+    make_scene(cloud, area="open")
+    assert len(asked) == 3
 
 
 def test_areas_as_in_the_paper(make_cloud, make_scene):
