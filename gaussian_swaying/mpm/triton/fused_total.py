@@ -279,7 +279,8 @@ class FusedTotal(Fused):
         if self.touching is not None:
             self.touching.add_taken(total)
         if self.points is not None:
-            total += self.points.share @ self.residual[1, :, :3].double().reshape(self.scenes, -1, 3)
+            held = self.residual[1, :, :3].double().reshape(self.scenes, 1, -1, 3)
+            total += (self.points.share[..., None] * held).sum(2)  # a product of matrices depends on threads
         return total.reshape(self.impulse.shape)
 
     def _constrain(self) -> None:
