@@ -381,7 +381,7 @@ def _sources(cell: Tensor, cells: int) -> Tensor:
         cells: Number of cells.
     """
     none = cell == cells
-    most = int((~none).sum(0).amax())
+    most = int((~none).sum(0).amax()) if none.shape[1] else 0  # material too light has no nodes
     first = none.byte().argsort(dim=0, stable=True)[:most]  # in the order of the places
     return (first * (cells + 1) + cell.gather(0, first)).int()
 
