@@ -18,7 +18,7 @@ LANES = 8
 
 @cache
 def compiles(device: str) -> bool:
-    """Whether kernels can be compiled for a kind of device, ``cuda`` or ``cpu``."""
+    """True if kernels can be compiled for a kind of device, ``cuda`` or ``cpu``."""
     if device == "cuda":
         return triton is not Compiler and not isinstance(triton, Compiler)
     return device == "cpu" and (INTERPRETED or importlib.util.find_spec("llvmlite") is not None)

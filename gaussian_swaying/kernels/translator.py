@@ -665,7 +665,7 @@ def _lanes(shape: tuple[int, ...]) -> int:
 
 
 def _all(propagate: Value) -> bool:
-    """Whether NaN is passed on."""
+    """True if NaN is passed on."""
     name = propagate.name if isinstance(propagate, Name) else str(propagate)
     return name.endswith("ALL")
 
