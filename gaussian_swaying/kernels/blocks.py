@@ -57,7 +57,7 @@ class Block:
 
     @property
     def floating(self) -> bool:
-        """Whether the numbers are floating point numbers."""
+        """True if the numbers are floating point numbers."""
         return self.kind[0] == "f"
 
 
@@ -81,7 +81,7 @@ Value = Any
 
 
 def is_number(value: Value) -> bool:
-    """Whether a value is a number that is known when the kernel is translated."""
+    """True if a value is a number that is known when the kernel is translated."""
     return isinstance(value, (bool, int, float))
 
 

@@ -18,7 +18,7 @@ from typing import Any
 import torch
 
 INTERPRETED = os.environ.get("TRITON_INTERPRET") == "1"
-"""Whether Triton's interpreter runs the kernels."""
+"""True if Triton's interpreter runs the kernels."""
 
 
 class Constant:
@@ -114,7 +114,7 @@ class Compiler:
 triton: Any
 tl: Any
 ON_GPU = (torch.cuda.is_available() or INTERPRETED) and importlib.util.find_spec("triton") is not None
-"""Whether kernels are Triton's: there is a GPU, or its interpreter stands for one."""
+"""True if kernels are Triton's: there is a GPU, or its interpreter stands for one."""
 
 if ON_GPU:
     import triton  # type: ignore[no-redef]

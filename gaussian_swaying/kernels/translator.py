@@ -70,6 +70,11 @@ def translate(kernel: Any, constants: dict[str, Any], arguments: dict[str, str],
 
 
 class _Translator(Emitter):
+    _globals: dict[str, Any] | None = None
+    """Names of the module of the function that is carried out."""
+    _line = 1
+    """Line of its statement."""
+
     def kernel(self, kernel: Any, constants: dict[str, Any], arguments: dict[str, str]) -> ir.Module:
         number = TYPES["i64"]
         kind = ir.FunctionType(ir.VoidType(), [ADDRESS, number, number])
@@ -138,7 +143,7 @@ class _Translator(Emitter):
                 scope[name] = defaults[name]
             if name in constant and isinstance(scope[name], Block):
                 raise TranslationError(f"{name} of {function.fn.__name__} is no constant")
-        outer = getattr(self, "_globals", None), getattr(self, "_line", 1)
+        outer = self._globals, self._line
         self._globals = function.fn.__globals__
         try:
             found = self._run(tree.body, scope)
@@ -667,7 +672,7 @@ def _lanes(shape: tuple[int, ...]) -> int:
 
 
 def _all(propagate: Value) -> bool:
-    """Whether NaN is passed on."""
+    """True if NaN is passed on."""
     name = propagate.name if isinstance(propagate, Name) else str(propagate)
     return name.endswith("ALL")
 

@@ -21,7 +21,8 @@ boundary starts there is a phase with its own rows.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 
 import torch
@@ -72,6 +73,17 @@ class DenseHolds:
     share: Tensor
 
 
+@contextmanager
+def _one_thread() -> Iterator[None]:
+    """Within the block torch uses one thread: products of matrices round in another way for each number of them."""
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(before)
+
+
 class PointHolds:
     """All points that the boundaries of a body hold, bound to its grid.
 
@@ -102,6 +114,7 @@ class PointHolds:
         ValueError: If there are too many rows, or a place has no material around it.
     """
 
+    @_one_thread()
     def __init__(
         self,
         body: Body,
@@ -228,6 +241,7 @@ class PointHolds:
         self.taken_by = holds.to(device)
         self.affected, self.entry, self.push = affected.to(device), (entry // 27).to(device), push.to(device)
 
+    @_one_thread()
     def dense(self, dtype: torch.dtype) -> DenseHolds:
         """The same for the kernels, if the same points are at rest all the time."""
         weight, node = self.weight[0].reshape(-1, 27).to(dtype), self.node[0].reshape(-1, 27)

@@ -272,7 +272,7 @@ def _memory(steps, checkpoint):
     """Bytes alive after the forward pass, at the peak and after the backward pass, and of one state."""
     values = _values()
     values["youngs_modulus"] = values["youngs_modulus"].clone().requires_grad_()
-    solver, state, force = _start(values, NeoHookean())
+    solver, state, force = _start(values, NeoHookean(), transfer="torch")  # kernels have buffers besides
     with _Held() as held:
         state = solver.rollout(state, 2e-3, steps, force, checkpoint)
         forward = held.now

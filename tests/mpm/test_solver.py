@@ -311,9 +311,16 @@ def test_a_grid_on_a_gpu_stays_while_it_serves():
 
 @pytest.mark.parametrize("formulation", FORMULATIONS)
 def test_watched_rollout_is_a_rollout_that_saw_the_largest_courant_number(formulation):
-    """A block that expands and contracts: its stiffness is largest on the way, not at the end."""
+    """A block that expands and contracts: its stiffness is largest on the way, not at the end. In torch to the bit.
+
+    The kernels of `updated` sort particles at the start of a rollout, so parts of one have other sums.
+    """
+    for transfer, tolerance in (("torch", 0.0), ("kernels", 1e-12)):
+        _watch(MPMSolver(dx=0.1, formulation=formulation, gravity=(0, 0, 0), transfer=transfer), tolerance)
+
+
+def _watch(solver, tolerance):
     points = _block()
-    solver = MPMSolver(dx=0.1, formulation=formulation, gravity=(0, 0, 0))
     centre = points.position.mean(0)
     start = solver.init_state(points, 40 * (points.position - centre))
     seen, state = [], start
@@ -321,8 +328,8 @@ def test_watched_rollout_is_a_rollout_that_saw_the_largest_courant_number(formul
         state = solver.rollout(state, 2e-4, 16)
         seen.append(float(solver.cfl_number(state, 2e-4)))
     end, largest = solver.watched_rollout(start, 2e-4, 160, looks=10)
-    assert torch.equal(end.position, state.position)
-    assert float(largest) == max(seen)
+    torch.testing.assert_close(end.position, state.position, rtol=0, atol=tolerance)
+    assert float(largest) == pytest.approx(max(seen), rel=tolerance, abs=0)
     assert max(seen) > 1.02 * max(seen[0], seen[-1])
 
 

@@ -10,6 +10,8 @@ import itertools
 import json
 import math
 import os
+import subprocess
+import sys
 import time
 from pathlib import Path
 
@@ -48,6 +50,8 @@ from gaussian_swaying.simulation.simulation import Simulation
 FORMULATIONS = ["total", "updated"]
 UP = (0.0, 0.0, -9.8)
 CFL = 0.2
+TRANSFER = os.environ.get("GAUSSIAN_SWAYING_HARD_CASES", "kernels")
+"""Who computes the substeps: kernels, or torch in the nightly run."""
 
 # A plane stops the lattice nodes at or behind it, the first of them up to a cell behind; a particle half a cell behind
 # that one has no moving node left in its support (`total`: nodes act at the centre of their mass, within that support).
@@ -81,7 +85,7 @@ TINY = {"camera": OrbitCamera(width=8, height=8), "device": "cpu"}
 
 def _simulation(points, boundaries=(), wind=None, aero=None, dx=0.1, frame_dt=0.01, gravity=(0, 0, 0), **solver):
     """A simulation around given material; it recentres, so that places are those of the scene."""
-    solver = MPMSolver(dx=dx, gravity=gravity, boundaries=boundaries, **({"cfl": CFL} | solver))
+    solver = MPMSolver(dx=dx, gravity=gravity, boundaries=boundaries, **({"cfl": CFL, "transfer": TRANSFER} | solver))
     simulation = Simulation(
         Scene(generator=GivenScene(plain_cloud(points.position))),
         solver=solver,
@@ -99,7 +103,7 @@ def _flag(wind, formulation, material=None, aero=None, width=0.8, spacing=0.1, d
     """A flag on its pole, without gravity unless given."""
     source = FlagScene(width=width, height=0.4, spacing=spacing)
     pole = PinnedRegion(Box([None, None, None], [1.1 * spacing, None, None]))
-    solver = {"gravity": (0.0, 0.0, 0.0), "boundaries": [pole], "cfl": CFL, **solver}
+    solver = {"gravity": (0.0, 0.0, 0.0), "boundaries": [pole], "cfl": CFL, "transfer": TRANSFER, **solver}
     solver = MPMSolver(dx=dx, formulation=formulation, **solver)
     material = material or Material(E=1e4, density=40.0)
     return Simulation(
@@ -861,6 +865,7 @@ def _long_flag(damping):
         scene, Material(E=1e4, density=40.0), solver=solver, wind=wind, **(TINY | {"frame_dt": frame_dt})
     )
     state, visible, began = simulation.start(), [], time.perf_counter()
+    scene = simulation.scene
     log = [diagnose(solver, state, 0, 0.0)]
     for _ in range(round(minutes * 60 / frame_dt)):
         state, health = simulation.advance(state)
@@ -946,3 +951,15 @@ def _record(name, key, values):
         path = Path(folder) / name
         known = json.loads(path.read_text()) if path.exists() else {}
         path.write_text(json.dumps(known | {key: values}, indent=2) + "\n")
+
+
+@pytest.mark.slow(twin="test_contrasts_within_one_body")
+@pytest.mark.skipif(TRANSFER == "torch", reason="this is that run")
+def test_the_hard_cases_hold_in_torch():
+    """All that are in the gate, once more without kernels."""
+    command = [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", __file__]
+    given = {**os.environ, "GAUSSIAN_SWAYING_HARD_CASES": "torch"}
+    made = subprocess.run(
+        command, cwd=Path(__file__).parents[2], env=given, capture_output=True, text=True, check=False
+    )
+    assert made.returncode == 0, made.stdout

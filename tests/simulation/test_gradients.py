@@ -14,13 +14,13 @@ ALL = Box([None, None, None], [None, None, None])
 DOUBLE = torch.float64
 
 
-def _simulation(values, edits=()):
+def _simulation(values, edits=(), transfer="auto"):
     """A flag in a wind that meets it obliquely, with a fixed number of substeps."""
     given = VALUES | values
     pin = PinnedRegion(Box([None, None, None], [0.11, None, None]))
     return Simulation(
         FlagScene(spacing=0.1),
-        solver=MPMSolver(dx=0.2, substep=4e-3, gravity=(0.0, 0.0, -1.0), boundaries=[pin]),
+        solver=MPMSolver(dx=0.2, substep=4e-3, gravity=(0.0, 0.0, -1.0), boundaries=[pin], transfer=transfer),
         wind=[1.0, given["wind"], 0.5],
         material=Material(**{name: given[name] for name in ("E", "nu", "density")}),
         aero=AeroForce(**{name: given[name] for name in ("C_D", "C_F", "C_L")}),
@@ -67,11 +67,16 @@ def test_a_gradient_is_that_of_central_differences(name, slopes):
 
 
 def test_tensors_change_no_bit():
-    plain = _end(_simulation({}))
-    with_gradients = _end(_simulation({name: _leaf(value) for name, value in VALUES.items()}))
+    """In torch; kernels without gradients round otherwise."""
+    leaves = {name: _leaf(value) for name, value in VALUES.items()}
+    plain = _end(_simulation({}, transfer="torch"))
+    with_gradients = _end(_simulation(leaves, transfer="torch"))
     assert with_gradients.position.requires_grad
     assert torch.equal(plain.position, with_gradients.position)
     assert torch.equal(plain.velocity, with_gradients.velocity)
+    plain, with_gradients = _end(_simulation({})), _end(_simulation(leaves))
+    torch.testing.assert_close(plain.position, with_gradients.position.detach(), rtol=1e-13, atol=1e-14)
+    torch.testing.assert_close(plain.velocity, with_gradients.velocity.detach(), rtol=1e-13, atol=1e-13)
 
 
 def test_a_rollout_in_parts_has_the_same_gradient():

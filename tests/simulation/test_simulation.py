@@ -91,10 +91,10 @@ def test_aerodynamics_are_asked_only_where_they_can_push(make_simulation, monkey
     monkeypatch.setattr(AeroForce, "forward", lambda self, *a: calls.append(1) or forward(self, *a))
     for aero in (AeroForce(C_D=0.0, C_F=0.0, C_L=0.0), AeroForce(air_density=0.0)):
         assert aero.idle
-        _, (health,) = _advance(make_simulation(aero=aero), 1)
+        _, (health,) = _advance(make_simulation(aero=aero, transfer="torch"), 1)
         assert calls == []
         assert health.kinetic > 0
-    _, (health,) = _advance(make_simulation(), 1)
+    _, (health,) = _advance(make_simulation(transfer="torch"), 1)
     assert len(calls) == health.substeps
 
 
@@ -146,16 +146,14 @@ def test_a_frame_whose_substep_was_too_long_is_done_again(make_simulation, monke
     state = simulation.start()
     _, expected = _advance(make_simulation(wind=WindField()), 1)
     tries = []
-    roll, number = simulation.stepper.roll, simulation.solver.cfl_number
+    roll = simulation.stepper.roll
 
     def record(start, steps, margin):
         tries.append((start, steps))
-        return roll(start, steps, margin)
+        end, courant = roll(start, steps, margin)
+        return end, torch.full_like(courant, 2.0) if len(tries) == 1 else courant
 
     monkeypatch.setattr(simulation.stepper, "roll", record)
-    monkeypatch.setattr(
-        simulation.solver, "cfl_number", lambda s, dt: torch.tensor(2.0) if len(tries) == 1 else number(s, dt)
-    )
     end, health = simulation.advance(state)
     steps = [n for _, n in tries]
     assert steps[0] < steps[1] <= 4 * steps[0] + 1

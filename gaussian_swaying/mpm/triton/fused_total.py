@@ -279,7 +279,8 @@ class FusedTotal(Fused):
         if self.touching is not None:
             self.touching.add_taken(total)
         if self.points is not None:
-            total += self.points.share @ self.residual[1, :, :3].double().reshape(self.scenes, -1, 3)
+            held = self.residual[1, :, :3].double().reshape(self.scenes, 1, -1, 3)
+            total += (self.points.share[..., None] * held).sum(2)  # a product of matrices depends on threads
         return total.reshape(self.impulse.shape)
 
     def _constrain(self) -> None:
@@ -380,7 +381,7 @@ def _sources(cell: Tensor, cells: int) -> Tensor:
         cells: Number of cells.
     """
     none = cell == cells
-    most = int((~none).sum(0).amax())
+    most = int((~none).sum(0).amax()) if none.shape[1] else 0  # material too light has no nodes
     first = none.byte().argsort(dim=0, stable=True)[:most]  # in the order of the places
     return (first * (cells + 1) + cell.gather(0, first)).int()
 

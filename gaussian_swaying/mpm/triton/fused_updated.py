@@ -38,7 +38,7 @@ class FusedUpdated(Fused):
     def __init__(self, bound: Formulation) -> None:
         super().__init__(bound)
         self.atomic = lanes(self.device, 32) == 32
-        """Whether particles are added to the grid atomically; else in a fixed order."""
+        """True if particles are added to the grid atomically; else in a fixed order."""
         points, laws = bound.body.points, bound.body.laws
         self.bound = bound
         self.plastic = len(self.laws.flows) > 0

@@ -21,8 +21,10 @@ def _block(low=(0.0, 0.0, 0.0), side=0.4, e=2e4, per_side=6):
     )
 
 
-def _run_for(formulation, boundaries, points, seconds, velocity=None, gravity=(0, 0, -9.8), dx=0.1, damping=0.0):
-    solver = MPMSolver(dx=dx, formulation=formulation, boundaries=boundaries, gravity=gravity, damping=damping)
+def _run_for(
+    formulation, boundaries, points, seconds, velocity=None, gravity=(0, 0, -9.8), dx=0.1, damping=0.0, transfer="auto"
+):
+    solver = MPMSolver(dx, formulation, boundaries=boundaries, gravity=gravity, damping=damping, transfer=transfer)
     state = solver.init_state(points, velocity)
     for _ in range(round(seconds / 0.02)):
         steps = solver.substeps(state, 0.02)
