@@ -6,6 +6,7 @@ A message is the length of its head (uint32, little-endian), the head in JSON, a
 from __future__ import annotations
 
 import json
+from contextlib import AbstractContextManager, nullcontext
 from typing import Any
 
 import torch
@@ -13,8 +14,8 @@ from torch import Tensor
 
 from gaussian_swaying.recording.nodes import split_far
 from gaussian_swaying.rendering.shading import DiffuseShader
-from gaussian_swaying.simulation.painter import Painter
 from gaussian_swaying.simulation.simulated_scene import SimulatedScene
+from gaussian_swaying.simulation.simulation import Simulation
 from gaussian_swaying.viewer.film.page import pack_still
 from gaussian_swaying.viewer.film.recorded import film_of, look_of
 from gaussian_swaying.viewer.session import Snapshot
@@ -23,7 +24,8 @@ from gaussian_swaying.viewer.session import Snapshot
 def drawable(snapshot: Snapshot) -> bool:
     """True if a browser can draw a snapshot: the Gaussians follow nodes, and the light is one that it knows."""
     shader = snapshot.simulation.painter.shader
-    has_nodes = snapshot.simulation.scene.follow.nodes(snapshot.state) is not None
+    with _turn(snapshot.simulation):
+        has_nodes = snapshot.simulation.scene.follow.nodes(snapshot.state) is not None
     return has_nodes and (shader is None or isinstance(shader, DiffuseShader))
 
 
@@ -36,11 +38,12 @@ def scene_message(snapshot: Snapshot, turn: Tensor) -> bytes:
         turn: Rotation from the scene to the axes of the browser's camera, shape (3, 3), float64.
     """
     simulation, state = snapshot.simulation, snapshot.state
-    nodes = simulation.scene.follow.nodes(state)
-    assert nodes is not None
-    film = film_of(simulation, getattr(state, "grid"), nodes, torch.zeros(0, len(nodes), 3), "scene")  # noqa: B009
+    with _turn(simulation):
+        nodes = simulation.scene.follow.nodes(state)
+        assert nodes is not None
+        film = film_of(simulation, getattr(state, "grid"), nodes, torch.zeros(0, len(nodes), 3), "scene")  # noqa: B009
+        world = film_from(simulation.scene, turn)
     blocks = pack_still(film)
-    world = film_from(simulation.scene, turn)
     head = {"kind": "scene", "head": film.head, "splats": len(blocks["splats"]), "world": world.T.flatten().tolist()}
     return message(head, blocks["splats"], blocks["nodes"])
 
@@ -59,9 +62,10 @@ def film_from(scene: SimulatedScene, turn: Tensor) -> Tensor:
     return found
 
 
-def look_message(painter: Painter) -> bytes:
+def look_message(simulation: Simulation) -> bytes:
     """Light and background, where they have changed since the scene."""
-    return message({"kind": "look", **look_of(painter)})
+    with _turn(simulation):
+        return message({"kind": "look", **look_of(simulation.painter)})
 
 
 @torch.inference_mode()
@@ -74,9 +78,11 @@ def state_message(snapshot: Snapshot, ended: bool) -> bytes:
     """
     simulation, state = snapshot.simulation, snapshot.state
     scene = simulation.scene
-    moved = scene.follow.nodal(state)
-    assert moved is not None
-    near, far = split_far(moved.float().numpy(force=True), 0.5 * scene.size * scene.frame.metres_per_unit)
+    with _turn(simulation):
+        moved = scene.follow.nodal(state)
+        assert moved is not None
+        values = moved.float().numpy(force=True)
+    near, far = split_far(values, 0.5 * scene.size * scene.frame.metres_per_unit)
     head = {
         "kind": "state",
         "motion": snapshot.motion,
@@ -85,6 +91,11 @@ def state_message(snapshot: Snapshot, ended: bool) -> bytes:
         "ended": ended,
     }
     return message(head, near.astype("<f2").tobytes(), far.astype("<i4").tobytes())
+
+
+def _turn(simulation: Simulation) -> AbstractContextManager[None]:
+    """On a GPU the turn of the thread that reads it, as another may record a graph; a CPU does not have to wait."""
+    return simulation.turn if simulation.device.type == "cuda" else nullcontext()
 
 
 def message(head: dict[str, Any], *blocks: bytes) -> bytes:

@@ -75,7 +75,7 @@ class Line:
             return True
         if any(known is not now for known, now in zip(self._look, look, strict=True)):
             self._look = look
-            self._put(look_message(painter))
+            self._put(look_message(snapshot.simulation))
             return True
         if self._state == (snapshot.number, ended):
             return False
@@ -101,6 +101,10 @@ class Line:
         self._taken, self._rate = taken, (rate, time.monotonic())
         return True
 
+    def close(self) -> None:
+        """End the connection."""
+        asyncio.run_coroutine_threadsafe(self._connection.close(), self._loop)
+
     def _put(self, data: bytes) -> None:
         self._sent += 1
         asyncio.run_coroutine_threadsafe(self._connection.send(data), self._loop)
@@ -125,7 +129,9 @@ class Streams:
 
     def forget(self, key: str) -> None:
         """End what belongs to a key."""
-        self._lines.pop(key, None)
+        line = self._lines.pop(key, None)
+        if line is not None:
+            line.close()
 
     def line(self, key: str) -> Line | None:
         """The connection that was opened with a key, or None."""
@@ -164,7 +170,10 @@ class Streams:
         from websockets.exceptions import ConnectionClosed
 
         connection.protocol.max_message_size = ANSWER.size
+        before = self._lines[key]
         line = self._lines[key] = Line(connection, asyncio.get_running_loop())
+        if before is not None:
+            before.close()
         try:
             while key in self._lines and line.take(await connection.recv()):
                 pass

@@ -113,6 +113,21 @@ def test_a_pause_shows_the_last_state(blank):
     assert shown[-1] == newest[-1] == pytest.approx(1.96)
 
 
+def test_a_step_while_paused_is_shown_soon(blank):
+    """Even if the simulation was so slow that the step would take minutes at its speed."""
+    shown = blank.evaluate("""() => {
+        const playback = new Playback();
+        for (let k = 0; k < 5; k++) playback.add({ time: 1e-4 * k }, k, k === 4), playback.advance(k);
+        playback.advance(6);
+        playback.add({ time: 0.04 }, 10, true);
+        const seen = [];
+        for (let now = 10; now < 11; now += 0.1) seen.push(playback.advance(now));
+        return seen;
+    }""")
+    assert shown[-1] == 0.04
+    assert (np.diff(shown) >= 0).all()
+
+
 def test_after_a_pause_it_goes_on_at_its_speed(blank):
     """The pause says nothing about how fast the simulation runs."""
     told = blank.evaluate("""() => {

@@ -12,7 +12,7 @@ from gaussian_swaying.scenes.procedural import FlagScene
 from gaussian_swaying.viewer.film.page import pack_still
 from gaussian_swaying.viewer.film.recorded import film_of
 from gaussian_swaying.viewer.session import Session
-from gaussian_swaying.viewer.states import drawable, film_from, message, scene_message, state_message
+from gaussian_swaying.viewer.states import drawable, film_from, look_message, message, scene_message, state_message
 
 
 def read(raw):
@@ -97,3 +97,18 @@ def test_what_a_browser_cannot_draw_is_drawn_here(parser, settings, session):
 
 def test_a_message_has_a_head_and_bytes():
     assert read(message({"kind": "ü"}, b"ab", b"c")) == ({"kind": "ü"}, b"abc")
+
+
+def test_a_gpu_is_read_in_turn(session, monkeypatch):
+    """Another thread may record a graph; on a CPU nobody waits."""
+    snapshot, taken = session.snapshot, []
+    monkeypatch.setattr(type(snapshot.simulation.turn), "__enter__", lambda turn: taken.append(turn))
+    monkeypatch.setattr(type(snapshot.simulation.turn), "__exit__", lambda turn, *error: None)
+    for device, turns in (("cpu", 1), ("cuda", 5)):  # one for the camera
+        monkeypatch.setattr(type(snapshot.simulation), "device", torch.device(device))
+        taken.clear()
+        assert drawable(snapshot)
+        state_message(snapshot, False)
+        look_message(snapshot.simulation)
+        scene_message(snapshot, torch.eye(3).double())
+        assert taken == [snapshot.simulation.turn] * turns

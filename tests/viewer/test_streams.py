@@ -176,6 +176,7 @@ def test_only_a_browser_that_viser_knows_gets_states(page, drawer, until):
 def test_another_connection_with_the_key_takes_over(page, drawer):
     drawer.wait("state")
     other = Drawer(page, next(iter(page.streams._lines)))
+    assert _closed(drawer.socket) == 1000
     assert other.wait("state")
     other.socket.close()
 

@@ -92,6 +92,7 @@ class Stage {
     console.info(`The server draws: ${why}.`);
     this.failed = why;
     this.hide();
+    this.drawing?.clear();
     this.socket?.close();
   }
 

@@ -3,6 +3,7 @@
 const KEPT = 64; // states that wait; older ones are left out
 const MEMORY = 1.5; // s of arrivals that the speed is measured from
 const FASTEST = 2; // simulated seconds per second
+const LAST = 0.5; // s in which the last state is reached before a pause
 const MOST_LATE = 1.0; // s that the picture may lag behind the newest state
 
 // The shown time lags behind the newest state by a little more than the states are apart, so that there is mostly a later
@@ -35,6 +36,7 @@ export class Playback {
     if (this.states.length > KEPT) this.states.splice(0, this.states.length - KEPT);
     this.shown = Math.max(this.shown ?? state.time, this.states[0].time);
     this.ended = ended;
+    this.rush = (this.newest - this.shown) / LAST;
   }
 
   arrived(time, now) {
@@ -59,7 +61,8 @@ export class Playback {
     this.last = now;
     if (!this.states.length) return null;
     let step = passed * this.speed;
-    if (!this.ended && this.arrivals.length > 1) {
+    if (this.ended) step = Math.max(step, passed * this.rush);
+    else if (this.arrivals.length > 1) {
       // where the simulation is by now, if it goes on as it did, less the delay
       const { delay } = this;
       const waited = now - this.arrivals[this.arrivals.length - 1][0];
