@@ -331,7 +331,7 @@ def measure(
 class Gauge:
     """:func:`measure` from a CUDA graph, where possible: some 150 small kernels take longer to start than to run.
 
-    That is on a GPU, for a solver whose grid does not move, and at most ``_graphs.RECORDED`` particles, as a graph
+    That is on a GPU, for a solver whose grid does not move, and at most ``RECORDED`` particles, as a graph
     keeps its memory.
     """
 
