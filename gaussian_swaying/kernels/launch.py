@@ -18,7 +18,7 @@ LANES = 8
 
 
 @triton.jit
-def _trial(out: Any) -> None:
+def _trial(out):  # type: ignore[no-untyped-def]  # noqa: ANN001, ANN202  (Triton reads the types)
     tl.store(out, 1.0)
 
 
