@@ -418,7 +418,7 @@ BROKEN = [("position", math.nan), ("position", math.inf), ("position", 1e30), ("
 BROKEN += [("velocity", -math.inf), ("velocity", 1e12), ("velocity", 1e30)]
 
 
-@pytest.mark.slow(gate=["cpu-torch-velocity-nan", "cpu-triton-velocity-nan", "cpu-triton-position-1e+30"])
+@pytest.mark.slow(gate=["cpu-torch-velocity-nan", "cpu-kernels-velocity-nan", "cpu-kernels-position-1e+30"])
 @pytest.mark.parametrize(("name", "value"), BROKEN)
 @pytest.mark.parametrize("transfer", ["torch", "kernels"])
 def test_a_broken_particle_is_reported_and_breaks_nothing_else(kernel_device, transfer, name, value):
