@@ -206,24 +206,24 @@ def test_replayed_rollouts_give_the_same_bits(kernel_device, case, monkeypatch):
 
 
 @pytest.mark.slow(gate=["cpu-played"])
-@pytest.mark.parametrize("graphs", ["as on the device", "played"])
-def test_a_replayed_rollout_follows_what_changes(kernel_device, graphs, monkeypatch):
+@pytest.mark.parametrize("kind", ["as on the device", "played"])
+def test_a_replayed_rollout_follows_what_changes(kernel_device, kind, monkeypatch):
     """Numbers of the wind and patches that change in place, and a force that is another one.
 
     A played graph runs what was recorded, with what the recording knew of its first rollout.
     """
-    if graphs == "played" and kernel_device.type == "cuda":
+    if kind == "played" and kernel_device.type == "cuda":
         pytest.skip("on this device graphs are real")
     points = make_points(kernel_device, count=12)
     load, other = make_load(points), make_load(points, seed=7)
-    if graphs == "played":
+    if kind == "played":
         monkeypatch.setattr(graphs, "record", lambda device, work, pool, stream: _Played(work))
         monkeypatch.setattr(torch.cuda, "Stream", lambda device: None)
         monkeypatch.setattr(torch.cuda, "synchronize", lambda device: None)
         monkeypatch.setattr(torch.cuda, "empty_cache", lambda: None)
 
     def run(solver, state):
-        if graphs == "played" and solver.transfer == "kernels":
+        if kind == "played" and solver.transfer == "kernels":
             solver.fused().repeater = graphs.Repeater(torch.device("cuda"), kept=8)
         states = [solver.rollout(state, DT, 2, load) for _ in range(3)]
         load.area *= 2
