@@ -24,7 +24,7 @@ def _trial(out):  # type: ignore[no-untyped-def]  # noqa: ANN001, ANN202  (Trito
 
 @cache
 def compiles(device: str) -> bool:
-    """Whether kernels can be compiled for a kind of device, ``cuda`` or ``cpu``; tried once, on a small one."""
+    """True if kernels can be compiled for a kind of device, ``cuda`` or ``cpu``; tried once, on a small one."""
     if device == "cpu" and INTERPRETED:
         return True
     compiler = (
@@ -41,7 +41,7 @@ def compiles(device: str) -> bool:
 
 
 def replaces(given: Iterable[Tensor], dtype: torch.dtype | None = torch.float32) -> bool:
-    """Whether a kernel without gradients may replace torch functions: it compiles, and none of the tensors forbids it.
+    """True if a kernel without gradients may replace torch functions: it compiles, and none of the tensors forbids it.
 
     Triton's interpreter replaces nothing, as it takes far longer.
 

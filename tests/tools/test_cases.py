@@ -195,10 +195,10 @@ def test_unknowns_of_the_sheet_move_it():
 def test_sheets_are_in_contact_as_their_names_say(case):
     solver, state, dt = contact.prepare(200, case, CPU)
     end = solver.rollout(state, dt, 3)
-    stage = solver.bound.contact
-    assert (stage is None) == (case == "off")
+    touching = solver.fused().touching
+    assert (touching is None) == (case == "off")
     if case != "off":
-        assert (len(stage.lists.first) > 0) == ("in contact" in case)
+        assert (touching.pairs > 0) == ("in contact" in case)
     upper = end.velocity[solver.points.count // 2 :, 2].mean()
     assert (abs(float(upper)) > 1e-6) == ("in contact" in case)
     if case == "all in contact":  # two equal sheets: each gets half the momentum
@@ -233,7 +233,7 @@ def test_other_winds_and_obstacles_are_kept(tiny):
     found = tiny("winds")
     assert [row["wind"] for row in found["rows"]] == list(winds.KINDS)
     assert found["rows"][0]["ratio"] == 1.0
-    assert all(row["ratio"] > 0 and row["path"] == "torch" for row in found["rows"])
+    assert all(row["ratio"] > 0 and row["path"] == "kernels" for row in found["rows"])
     assert found["box"]["cells"] == [16, 8, 8]
     again = tiny("winds", "--counts", "64", "--formulations", "total", "--only", "obstacles")
     assert (again["rows"], again["box"]) == (found["rows"], found["box"])

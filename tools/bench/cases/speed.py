@@ -168,7 +168,8 @@ def bench_rollout(plan: Plan, asked: int, formulation: str, device: torch.device
     slow = timed(lambda: solver.rollout(state, DT, longer, load), device, plan.repeats[1], 1)
     row["graph_ms"] = (slow["median_ms"] - steps * row["median_ms"]) / (longer - steps)
     row |= {"particles": points.count, "grid_nodes": state.grid.node_count, "substeps": steps}
-    row["path"] = "torch" if solver.fused() is None else "triton"
+    compiler = "triton" if solver.points.position.is_cuda else "kernels"
+    row["path"] = "torch" if solver.fused() is None else compiler
     row["nodes"] = nodes_in_reach(points.position, CUBE.dx)
     row["bytes"] = fewest_bytes(formulation, points.count, row["nodes"], wind=not sand, plastic=sand)
     row["bytes_per_s"] = row["bytes"] / (1e-3 * row["median_ms"])
