@@ -164,7 +164,7 @@ def session_of(parser: ArgumentParser, settings: Namespace, real_time: bool) -> 
 
 
 def _given(options: Sequence[str], name: str) -> bool:
-    """Whether an option is among those of the command line."""
+    """True if an option is among those of the command line."""
     return any(option.split("=")[0] == name for option in options)
 
 

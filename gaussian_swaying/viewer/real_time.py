@@ -103,7 +103,7 @@ def finest_in_real_time(
 
 
 def sentence(configured: float, chosen: float, configured_speed: float, speed: float) -> str:
-    """What was chosen, and how to get the configured grid.
+    """Says which grid was chosen, and how to get the configured one.
 
     Args:
         configured: Its spacing [m].

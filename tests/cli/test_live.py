@@ -21,6 +21,7 @@ from gaussian_swaying.preview.cost import Cost
 from gaussian_swaying.scenes.procedural import FlagScene
 from gaussian_swaying.simulation.simulation import Simulation
 from gaussian_swaying.viewer import real_time
+from gaussian_swaying.viewer.scenes import settings_of_splat
 
 
 @pytest.fixture(scope="module")
@@ -77,10 +78,12 @@ def test_a_configuration_and_a_shipped_one(parser, tmp_path):
 
 def test_a_splat_gets_what_the_preview_suggests(parser, tmp_path):
     path = tmp_path / "flag.ply"
-    write_ply(path, FlagScene(spacing=0.05).generate())
+    write_ply(path, FlagScene(spacing=0.025).generate())
     settings = live.settings_of(parser, str(path), ["--device=cpu", "--wind.flow=[1,2,3]"])
     assert settings.scene.ply == str(path)
     assert settings.wind.flow == [1, 2, 3]
+    quick = settings_of_splat(parser, path, torch.device("cpu"), quick=True)
+    assert (settings.solver.dx, quick.solver.dx) == (0.043, 0.062)  # a draft has 16 cells along its 1 m
     simulation = Simulation.from_settings(parser, settings)
     frames = list(simulation.frames(2))
     assert torch.isfinite(frames[-1].state.position).all()
