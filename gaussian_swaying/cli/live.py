@@ -17,6 +17,7 @@ from gaussian_swaying.cli.shipped import with_shipped
 from gaussian_swaying.simulation.defaults import resolve_device
 from gaussian_swaying.simulation.simulation import Simulation
 from gaussian_swaying.viewer.controls import Page
+from gaussian_swaying.viewer.real_time import in_real_time
 from gaussian_swaying.viewer.scenes import settings_of_splat
 from gaussian_swaying.viewer.session import Session, share_cores
 
@@ -45,6 +46,14 @@ def build_options() -> argparse.ArgumentParser:
         "can be given several times",
     )
     add("--port", type=int, default=8080, help="port of the page; the next free one if it is taken")
+    add(
+        "--grid",
+        default="real-time",
+        choices=("real-time", "configured"),
+        help="real-time: a short trial at the start chooses the finest grid, not finer than the configured one, that "
+        "this machine simulates in real time; configured: that of the configuration, as with --solver.dx (default: "
+        "real-time)",
+    )
     add("--pixels", type=int, default=1920, help="most pixels of the longer side of a picture")
     add("--no-browser", action="store_true", help="only print the address")
     return parser
@@ -116,19 +125,47 @@ def settings_of(
     """
     given = list(further)
     if scene is not None and Path(scene).suffix.lower() not in (".yaml", ".yml"):
-        if any(option.split("=")[0] == "--config" for option in given):
+        if _given(given, "--config"):
             raise ValueError("`SCENE` and `--config` both say what to show: give a splat with `--scene.ply`.")
         with guessing(parser):
             device = parser.parse_args([*given, "--scene.ply", scene]).device
         print(f"Looking at {scene} for a first configuration, which takes up to a minute.", flush=True)
         settings = settings_of_splat(parser, scene, resolve_device(device), given, tell)
     else:
-        config = scene or (None if any(option.split("=")[0] == "--config" for option in given) else "flag")
+        config = scene or (None if _given(given, "--config") else "flag")
         arguments = with_shipped([*(["--config", config] if config else []), *given], "sim")
         check_config_files(arguments)
         with guessing(parser):
             settings = parser.parse_args(arguments)
     return settings
+
+
+def session_of(parser: ArgumentParser, settings: Namespace, real_time: bool) -> Session:
+    """A session of a scene, not started yet.
+
+    Args:
+        parser: From :meth:`Simulation.parser`.
+        settings: The settings as they were configured.
+        real_time: Whether a trial chooses the grid; it then prints what it chose. A solver of one's own has no grid.
+
+    Raises:
+        ValueError: If the simulation cannot be made, or cannot start.
+    """
+    simulation = Simulation.from_settings(parser, settings)
+    if simulation.device.type == "cpu":
+        share_cores()
+    if not real_time or settings.custom_solver is not None:
+        return Session(parser, settings, simulation)
+    choice = in_real_time(parser, settings, simulation)
+    print(choice.sentence, flush=True)
+    session = Session(parser, choice.settings, choice.simulation)
+    session.configured_dx = float(settings.solver.dx)
+    return session
+
+
+def _given(options: Sequence[str], name: str) -> bool:
+    """True if an option is among those of the command line."""
+    return any(option.split("=")[0] == name for option in options)
 
 
 def _live(arguments: Sequence[str]) -> None:
@@ -144,9 +181,7 @@ def _live(arguments: Sequence[str]) -> None:
             webbrowser.open(page.url)
         settings = settings_of(parser, options.scene, further, page.progress)
         page.progress(0.8, "Making the simulation")
-        session = Session(parser, settings)
-        if session.simulation.device.type == "cpu":
-            share_cores()
+        session = session_of(parser, settings, options.grid == "real-time" and not _given(further, "--solver.dx"))
         page.show(session)
         session.start()
         while True:

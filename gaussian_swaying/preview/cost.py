@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import statistics
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from dataclasses import dataclass
 
 import torch
@@ -71,7 +71,14 @@ class Cost:
 
 
 @torch.inference_mode()
-def estimate_cost(simulation: Simulation, frames: int, startup_seconds: float = 0.0, growth: float = 1.0) -> Cost:
+def estimate_cost(
+    simulation: Simulation,
+    frames: int,
+    startup_seconds: float = 0.0,
+    growth: float = 1.0,
+    budget: float = BUDGET,
+    pictures: bool = True,
+) -> Cost:
     """Start a run, and measure its first frames and a picture.
 
     Nothing that a run does once is in the measured frames: on a GPU, kernels are compiled and graphs recorded in two
@@ -82,6 +89,8 @@ def estimate_cost(simulation: Simulation, frames: int, startup_seconds: float = 
         frames: Number of frames of the run.
         startup_seconds: Time to prepare the run [s], if known.
         growth: Mean number of substeps of a frame over the number at rest, if known.
+        budget: Time for the frames that are timed [s], about.
+        pictures: Whether pictures count, if the run makes some.
 
     Returns:
         The estimate.
@@ -93,10 +102,10 @@ def estimate_cost(simulation: Simulation, frames: int, startup_seconds: float = 
     solver = simulation.solver
     state = simulation.start()
     at_rest = solver.substeps(state, simulation.frame_dt)
-    warm_up, each, taken = _timed_frames(simulation, state, at_rest)
+    warm_up, each, taken = _timed_frames(simulation, state, at_rest, budget)
     steps = max(at_rest * growth, statistics.mean(taken), _drag_substeps(simulation, state, frames))
     seconds = statistics.median(each)
-    drawn = _picture_seconds(simulation, state, seconds * steps) if simulation.recorder.images else None
+    drawn = _picture_seconds(simulation, state, seconds * steps) if pictures and simulation.recorder.images else None
     return Cost(
         device=describe_device(simulation.device),
         particles=solver.points.count,
@@ -114,7 +123,9 @@ def estimate_cost(simulation: Simulation, frames: int, startup_seconds: float = 
     )
 
 
-def _timed_frames(simulation: Simulation, state: State, at_rest: int) -> tuple[float, list[float], list[int]]:
+def _timed_frames(
+    simulation: Simulation, state: State, at_rest: int, budget: float
+) -> tuple[float, list[float], list[int]]:
     """Time to load the kernels [s]; and of some frames the time for a substep [s] and their numbers of substeps."""
     warm_up = 0.0
     each: list[float] = []
@@ -128,10 +139,10 @@ def _timed_frames(simulation: Simulation, state: State, at_rest: int) -> tuple[f
             state, _ = simulation.advance(state)
         else:
             substep, each_trial = _trial(simulation, state, at_rest)
-            if each_trial * at_rest > 0.4 * BUDGET:  # a frame would take too long
+            if each_trial * at_rest > 0.4 * budget:  # a frame would take too long
                 return 0.0, [substep() for _ in range(SUBSTEPS)], [at_rest]
         begin = Stopwatch()
-        while len(each) < MOST_FRAMES and (begin.wall < BUDGET or len(each) < 2):
+        while len(each) < MOST_FRAMES and (begin.wall < budget or len(each) < 2):
             frame = Stopwatch()
             state, health = simulation.advance(state)
             each.append(frame.on(simulation.device) / health.substeps)
@@ -215,14 +226,7 @@ def finest_within(
     """
     tried = {first.dx: first}
     for _ in range(3):
-        nearest = min(tried.values(), key=lambda cost: abs(math.log(cost.total_seconds / seconds)))
-        others = [draft, *(cost for cost in tried.values() if cost is not nearest)]
-        other = min(others, key=lambda cost: _apart(cost.dx, nearest.dx))
-        low, high = finest, coarsest
-        for _ in range(30):  # the time falls as dx grows
-            middle = math.sqrt(low * high)
-            low, high = (middle, high) if scaled_seconds(nearest, other, middle) > seconds else (low, middle)
-        dx = min(_rounded_up(high), coarsest)
+        dx = predicted_spacing(tried.values(), draft, seconds, finest, coarsest)
         if dx in tried:
             break
         try:
@@ -235,6 +239,26 @@ def finest_within(
     if fitting:
         return min(fitting, key=lambda cost: cost.dx)
     return tried[coarsest] if coarsest in tried else measure(coarsest)
+
+
+def predicted_spacing(tried: Collection[Cost], draft: Cost, seconds: float, finest: float, coarsest: float) -> float:
+    """The finest grid spacing on which a run should take at most some time [m], rounded up to two digits.
+
+    Args:
+        tried: The run on some grids.
+        draft: The same scene on another grid, or one of ``tried``; its frames and pictures do not count.
+        seconds: Longest time of the run [s].
+        finest: Smallest grid spacing [m].
+        coarsest: Largest grid spacing [m]; the result if none is coarse enough.
+    """
+    nearest = min(tried, key=lambda cost: abs(math.log(cost.total_seconds / seconds)))
+    others = [draft, *(cost for cost in tried if cost is not nearest)]
+    other = min(others, key=lambda cost: _apart(cost.dx, nearest.dx))
+    low, high = finest, coarsest
+    for _ in range(30):  # the time falls as dx grows
+        middle = math.sqrt(low * high)
+        low, high = (middle, high) if scaled_seconds(nearest, other, middle) > seconds else (low, middle)
+    return min(_rounded_up(high), coarsest)
 
 
 def _apart(dx: float, from_dx: float) -> float:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -42,7 +42,7 @@ class Controls(Panel):
         self._shader: dict[str, Any] | None = None  # the last one, while shading is off
         self._settings: Any = None  # those that the panel shows
         self._revision = 0
-        self._dx = float(self.session.settings.solver.dx)
+        self._grids = self._spacings()
         gui = self.server.gui
         self.legends = gui.add_html("", visible=False)
         self._running()
@@ -100,13 +100,13 @@ class Controls(Panel):
         self.damping = gui.add_slider("Damping [1/s]", 0.0, 10.0, 0.1, 0.0)
         self.gravity = gui.add_slider("Gravity [m/s²]", 0.0, 20.0, 0.1, 0.0)
         self.grid = gui.add_dropdown(
-            "Grid", tuple(GRIDS), initial_value="normal", hint="A coarser grid is faster; starts again"
+            "Grid", tuple(self._grids), initial_value="normal", hint="A coarser grid is faster; starts again"
         )
         self.on(self.stiffness.on_update, lambda: self._stiffen(self.stiffness.value))
         self.on(self.stiffness_log.on_update, lambda: self._stiffen(10 ** self.stiffness_log.value[0]))
         self.on(self.damping.on_update, lambda: self._set("solver.damping", self.damping.value))
         self.on(self.gravity.on_update, lambda: self._set("solver.gravity", [0.0, 0.0, -self.gravity.value]))
-        self.on(self.grid.on_update, lambda: self._set("solver.dx", float(f"{self._dx * GRIDS[self.grid.value]:.6g}")))
+        self.on(self.grid.on_update, lambda: self._set("solver.dx", self._grids[self.grid.value]))
 
     def _forces(self) -> None:
         """A control for each number that a force of the user's registered."""
@@ -189,7 +189,7 @@ class Controls(Panel):
             (self.stiffness_log, (log_place(stiffness),)),
             (self.damping, min(float(settings.solver.damping), 10.0)),
             (self.gravity, min(max(-float(settings.solver.gravity[2]), 0.0), 20.0)),
-            (self.grid, nearest_grid(float(settings.solver.dx) / self._dx)),
+            (self.grid, nearest_grid(self._grids, float(settings.solver.dx))),
             (self.light, self._light_azimuth()),
             (self.shading, self.session.simulation.painter.shader is not None),
         ]
@@ -202,10 +202,18 @@ class Controls(Panel):
     def other_scene(self) -> None:
         """Adapt to another scene: remove what belongs to the old one, and show the new values."""
         self.holding.forget_box()
-        self._dx = float(self.session.settings.solver.dx)
+        self._grids = self._spacings()
+        self.grid.value = "normal"  # type: ignore[misc]  # which is in both lists
+        self.grid.options = tuple(self._grids)
         self.page.force_end = self.session.simulation.stepper.force_scale()
         self.show_values()
         self.page.look_from_start()
+
+    def _spacings(self) -> dict[str, float]:
+        """The grid spacings [m] to choose from, by name; `normal` is that of the start."""
+        dx, configured = float(self.session.settings.solver.dx), self.session.configured_dx
+        grids = {name: float(f"{dx * times:.6g}") for name, times in GRIDS.items()}
+        return grids if configured == dx else grids | {"configured": configured}
 
     def _show_legends(self) -> None:
         simulation = self.session.simulation
@@ -348,9 +356,9 @@ def log_place(stiffness: float) -> float:
     return round(min(max(math.log10(stiffness), float(LEAST_LOG)), float(MOST_LOG)), 2)
 
 
-def nearest_grid(ratio: float) -> str:
-    """The name of the grid whose cells are so many times those of the configuration."""
-    return min(GRIDS, key=lambda name: abs(GRIDS[name] - ratio))
+def nearest_grid(grids: Mapping[str, float], dx: float) -> str:
+    """The name of the grid whose spacing is nearest to ``dx`` [m]."""
+    return min(grids, key=lambda name: abs(grids[name] - dx))
 
 
 CORNERS = [[i, j, k] for i in (0, 1) for j in (0, 1) for k in (0, 1)]

@@ -109,7 +109,9 @@ class Files:
     def _splat(self, content: bytes, folder: Folder) -> Namespace:
         path = Path(folder.name) / "scene.ply"
         path.write_bytes(content)
-        return settings_of_splat(self.session.parser, path, self.session.simulation.device, tell=self.page.progress)
+        device = self.session.simulation.device
+        quick = device.type == "cpu"  # no trial looks for a grid
+        return settings_of_splat(self.session.parser, path, device, tell=self.page.progress, quick=quick)
 
     def _configuration(self, content: bytes, folder: Folder) -> Namespace:
         """The settings in a configuration file; if its splat is not on this computer, they get the present one."""

@@ -26,8 +26,9 @@ def settings_of_splat(
     device: torch.device,
     further: Sequence[str] = (),
     tell: Callable[[float, str], None] = lambda share, what: None,
+    quick: bool = False,
 ) -> Namespace:
-    """The settings that the preview suggests for a splat: its draft on a CPU, its starter on a GPU.
+    """The settings that the preview suggests for a splat.
 
     Args:
         parser: From :meth:`Simulation.parser`.
@@ -35,6 +36,7 @@ def settings_of_splat(
         device: Device of the simulation.
         further: Options that replace what is suggested.
         tell: Called with the share that is done, from 0 to 1, and the name of the next task.
+        quick: Whether they are those of its draft, with a coarser grid, in place of its starter's.
 
     Raises:
         ValueError: If the file is not a splat, or nothing in it can move.
@@ -44,11 +46,11 @@ def settings_of_splat(
     tell(0.05, "Reading the splat")
     gaussians = read_gaussians(file)
     tell(0.15, "Looking for a region, pins and a grid")
-    found = suggest(gaussians, quality="draft" if device.type == "cpu" else "normal")
+    found = suggest(gaussians, quality="draft" if quick else "normal")
     own = ["--device", device.type]
     tell(0.35, "Making a draft")
     draft = Simulation.from_settings(parser, parse_text(parser, draft_yaml(found, str(file)), own))
     tell(0.5, "Trying how stiff it is")
     found = calibrated_suggestion(found, draft, SWAY)
-    text = draft_yaml(found, str(file)) if device.type == "cpu" else starter_yaml(found, str(file))
+    text = draft_yaml(found, str(file)) if quick else starter_yaml(found, str(file))
     return parse_text(parser, text, [*own, *further])

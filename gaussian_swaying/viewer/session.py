@@ -105,6 +105,7 @@ class Session:
         revision: Counts how often the settings became others than those asked for: by :meth:`undo`, :meth:`restore`,
             another scene, or a change that was refused.
         speed: Simulated seconds per second that are wanted; 1 is real time.
+        configured_dx: Grid spacing of the configuration [m]; the session may begin with a coarser one.
         lock: Taken while the simulation is changed, and while it is drawn.
     """
 
@@ -123,6 +124,7 @@ class Session:
         self._pull: Pull | None = None
         self._number = self._motion = 0
         self._first = settings  # those that `restore` goes back to
+        self.configured_dx = float(settings.solver.dx)
         self._past: deque[Past] = deque(maxlen=MOST_UNDONE)
         self.simulation = simulation or Simulation.from_settings(parser, settings)
         self._begin(self.simulation.start())
@@ -170,6 +172,7 @@ class Session:
             try:
                 self._take_settings(settings, fresh=True)
                 self._first = settings
+                self.configured_dx = float(settings.solver.dx)
                 self._past.clear()
                 self.revision += 1
                 done()

@@ -9,6 +9,7 @@ import subprocess
 import sys
 import time
 import urllib.request
+from types import SimpleNamespace
 
 import pytest
 import torch
@@ -16,8 +17,11 @@ from shared import refused
 
 from gaussian_swaying.cli import live
 from gaussian_swaying.gaussians.ply import write_ply
+from gaussian_swaying.preview.cost import Cost
 from gaussian_swaying.scenes.procedural import FlagScene
 from gaussian_swaying.simulation.simulation import Simulation
+from gaussian_swaying.viewer import real_time
+from gaussian_swaying.viewer.scenes import settings_of_splat
 
 
 @pytest.fixture(scope="module")
@@ -74,10 +78,12 @@ def test_a_configuration_and_a_shipped_one(parser, tmp_path):
 
 def test_a_splat_gets_what_the_preview_suggests(parser, tmp_path):
     path = tmp_path / "flag.ply"
-    write_ply(path, FlagScene(spacing=0.05).generate())
+    write_ply(path, FlagScene(spacing=0.025).generate())
     settings = live.settings_of(parser, str(path), ["--device=cpu", "--wind.flow=[1,2,3]"])
     assert settings.scene.ply == str(path)
     assert settings.wind.flow == [1, 2, 3]
+    quick = settings_of_splat(parser, path, torch.device("cpu"), quick=True)
+    assert (settings.solver.dx, quick.solver.dx) == (0.043, 0.062)  # a draft has 16 cells along its 1 m
     simulation = Simulation.from_settings(parser, settings)
     frames = list(simulation.frames(2))
     assert torch.isfinite(frames[-1].state.position).all()
@@ -87,6 +93,77 @@ def test_bad_input_is_one_sentence(capsys, tmp_path):
     pytest.importorskip("viser")
     refused(live.main, [str(tmp_path / "none.ply"), "--device=cpu", "--no-browser"], capsys, "none.ply")
     refused(live.main, ["--solver.dxx=3", "--no-browser"], capsys, "dxx")
+
+
+class FakePage:
+    """A page whose user looks once and ends the command."""
+
+    def __init__(self, *arguments):
+        self.url, self.url_elsewhere = "http://127.0.0.1:8080", None
+        self.progress = lambda *arguments: None
+        self.close = lambda: None
+
+    def show(self, session):
+        FakePage.shown = session
+        raise KeyboardInterrupt
+
+
+@pytest.mark.parametrize(
+    ("options", "dx"), [([], 0.058), (["--grid", "configured"], 0.04), (["--solver.dx=0.06"], 0.06)]
+)
+def test_the_grid_is_chosen_for_real_time_unless_it_is_given(capsys, monkeypatch, tmp_path, options, dx):
+    """On a machine on which the configured 0.04 m runs at half real time. The file stays as it is."""
+    file = tmp_path / "mine.yaml"
+    file.write_text(
+        "scene: {generator: {class_path: FlagScene, init_args: {spacing: 0.04}}}\n"
+        "solver: {dx: 0.04}\nframe_dt: 0.04\ndevice: cpu\n"
+    )
+    before = file.read_bytes()
+    monkeypatch.setattr(live, "Page", FakePage)
+    monkeypatch.setattr(live, "share_cores", lambda: None)
+    monkeypatch.setattr(real_time, "estimate_cost", cubed)
+    assert live.main([str(file), "--no-browser", *options]) == 0
+    session = FakePage.shown
+    told = capsys.readouterr().out
+    assert session.settings.solver.dx == session.simulation.solver.dx == dx
+    if options:
+        assert "Chose" not in told
+        assert session.configured_dx == dx
+    else:
+        line = next(line for line in told.splitlines() if line.startswith("Chose a grid of"))
+        assert "instead of the configured 0.04 m (0.5 x): --grid configured" in line
+        assert session.configured_dx == 0.04
+    assert file.read_bytes() == before
+
+
+def cubed(simulation, frames, budget, pictures):
+    """Costs of a made-up machine, which grow as 1 / dx³."""
+    finer = 0.04 / simulation.solver.dx
+    return Cost(
+        device="",
+        particles=1,
+        dx=simulation.solver.dx,
+        grid=(1, 1, 1),
+        frames=frames,
+        wave_speed=1.0,
+        stable_substep=1.0,
+        substep=1.0,
+        substeps=1,
+        substep_seconds=1e-3 * finer**2,
+        simulation_seconds=(frames - 1) * simulation.frame_dt / 0.5 * finer**3,
+        picture_seconds=None,
+    )
+
+
+def test_a_solver_of_ones_own_gets_no_trial(parser, monkeypatch):
+    """It need not have a grid."""
+    settings = live.settings_of(parser, None, ["--solver.dx=0.2", "--device=cpu"])
+    simulation = Simulation.from_settings(parser, settings)
+    monkeypatch.setattr(live, "Simulation", SimpleNamespace(from_settings=lambda parser, settings: simulation))
+    monkeypatch.setattr(live, "share_cores", lambda: None)
+    monkeypatch.setattr(live, "in_real_time", None)
+    settings.custom_solver = object()
+    assert live.session_of(parser, settings, real_time=True).simulation is simulation
 
 
 def test_ctrl_c_ends_it_cleanly(tmp_path):

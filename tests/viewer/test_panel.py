@@ -186,6 +186,30 @@ def test_a_configuration_is_loaded(page, client, until):
     assert session.simulation is now
 
 
+def test_the_grid_of_the_start_is_refined_up_to_the_configured_one(parser, settings, connect, until):
+    """Which another scene forgets."""
+    session = Session(parser, settings)
+    session.configured_dx = 0.08
+    page = Page(port=8490, largest=320).show(session)
+    try:
+        session.start()
+        client, grid = connect(page), page.controls.grid
+        assert grid.options == ("coarse", "normal", "fine", "configured")
+        assert grid.value == "normal"
+        client.set(grid, "configured")
+        until(lambda: session.simulation.solver.dx == 0.08)
+        client.set(grid, "fine")
+        until(lambda: session.simulation.solver.dx == pytest.approx(0.07))
+        session.load(settings, lambda: page.turns.ask("loaded", page.controls.other_scene))
+        until(lambda: grid.options == ("coarse", "normal", "fine"))
+        assert session.simulation.solver.dx == session.configured_dx == 0.1
+        until(lambda: grid.value == "normal")
+        assert session.problem is None
+    finally:
+        page.close()
+        session.close()
+
+
 def test_configurations_are_not_loaded_where_others_can_open_the_page(parser, settings):
     session = Session(parser, settings)
     page = Page(host="0.0.0.0", port=8470).show(session)

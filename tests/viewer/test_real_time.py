@@ -1,0 +1,143 @@
+"""The grid on which the live page keeps up with real time, with made-up costs and with a flag."""
+
+from dataclasses import replace
+
+import pytest
+
+from gaussian_swaying.preview.cost import Cost
+from gaussian_swaying.simulation.simulation import Simulation
+from gaussian_swaying.viewer import real_time
+from gaussian_swaying.viewer.real_time import HEADROOM, finest_in_real_time, in_real_time, sentence
+
+CONFIGURED, COARSEST = 0.032, 0.075
+NOTHING = Cost(
+    device="",
+    particles=1,
+    dx=CONFIGURED,
+    grid=(1, 1, 1),
+    frames=51,
+    wave_speed=1.0,
+    stable_substep=1.0,
+    substep=1.0,
+    substeps=1,
+    substep_seconds=1.0,
+    simulation_seconds=1.0,
+    picture_seconds=None,
+)
+
+
+def machine(speed, power):
+    """Costs of 2 s of motion where the configured grid has a speed, which grows with a power of dx; what was tried."""
+    tried = []
+
+    def measure(dx):
+        tried.append(dx)
+        seconds, finer = 2.0 / speed, CONFIGURED / dx
+        return replace(
+            NOTHING, dx=dx, simulation_seconds=seconds * finer**power, substep_seconds=1e-3 * finer ** (power - 1)
+        )
+
+    return measure, tried
+
+
+@pytest.mark.parametrize("power", [1.0, 2.5, 3.0, 4.0])
+def test_the_finest_grid_in_real_time_is_found_by_few_trials(power):
+    """It grows finer with the speed of the machine, is never finer than configured, and never too coarse.
+
+    A trial aims at a little more than is needed, so the grid is up to a tenth coarser than it could be, or a quarter if
+    the time falls with dx itself.
+    """
+    before = COARSEST
+    for speed in (0.01, 0.05, 0.1, 0.2, 0.4, 0.7, 1.0, 1.2, 1.3, 5.0):
+        measure, tried = machine(speed, power)
+        first, found = finest_in_real_time(measure, 2.0, CONFIGURED, COARSEST)
+        reached = 2.0 / found.total_seconds
+        assert first.dx == CONFIGURED <= found.dx <= 1.1 * before
+        assert len(tried) <= 3
+        if 2.0 / machine(speed, power)[0](COARSEST).total_seconds < HEADROOM:
+            assert found.dx == COARSEST
+        else:
+            assert reached >= HEADROOM
+            finer = found.dx / (1.25 if power == 1 else 1.15)
+            assert found.dx == CONFIGURED or 2.0 / measure(finer).total_seconds < HEADROOM
+        before = found.dx
+    assert before == CONFIGURED
+
+
+def test_a_grid_that_is_fast_enough_is_kept_after_one_trial():
+    measure, tried = machine(1.3, 3.0)
+    finest_in_real_time(measure, 2.0, CONFIGURED, COARSEST)
+    assert tried == [CONFIGURED]
+
+
+def test_a_configured_grid_beyond_the_limit_is_kept():
+    measure, tried = machine(0.1, 3.0)
+    assert finest_in_real_time(measure, 2.0, CONFIGURED, 0.02)[1].dx == CONFIGURED
+    assert tried == [CONFIGURED]
+
+
+@pytest.mark.parametrize(("most", "found"), [(0.033, 0.032), (0.041, 0.04), (0.06, 0.055)])
+def test_a_grid_too_coarse_to_start_is_passed_over(most, found):
+    """Of those that could start, the finest that is fast enough, or the fastest."""
+    measure, _ = machine(0.4, 2.5)
+
+    def limited(dx):
+        if dx > most:
+            raise ValueError("a pin holds nothing")
+        return measure(dx)
+
+    assert finest_in_real_time(limited, 2.0, CONFIGURED, COARSEST)[1].dx == pytest.approx(found, abs=1e-4)
+
+
+def test_a_grid_that_cannot_be_configured_is_an_error():
+    def measure(dx):
+        raise ValueError("a pin holds nothing")
+
+    with pytest.raises(ValueError, match="a pin holds nothing"):
+        finest_in_real_time(measure, 2.0, CONFIGURED, COARSEST)
+
+
+def test_the_sentence_names_grid_speed_and_how_to_get_the_configured_one():
+    assert sentence(0.032, 0.05, 0.4, 1.337) == (
+        "Chose a grid of 0.05 m, predicted to run at 1.3 x real time here, instead of the configured 0.032 m "
+        "(0.4 x): --grid configured, or Grid on the page, takes that one."
+    )
+    assert "0.075 m, the fastest one found, predicted to run at 0.5 x" in sentence(0.032, 0.075, 0.1, 0.5)
+    assert sentence(0.1, 0.1, 2.0, 2.0) == (
+        "The configured grid of 0.1 m is kept, predicted to run at 2 x real time here."
+    )
+    assert sentence(0.1, 0.1, 0.5, 0.5).endswith("; no coarser one that shows the object was found.")
+
+
+def test_a_scene_gets_the_chosen_grid_and_its_settings_stay(parser, settings, monkeypatch):
+    """Whatever a trial takes at first does not count."""
+    settings.solver.dx = 0.05
+    asked = []
+
+    def estimate(simulation, frames, budget, pictures):
+        asked.append((simulation.solver.dx, frames, budget, pictures))
+        seconds = 2.0 / 0.7 * (0.05 / simulation.solver.dx) ** 3
+        return replace(NOTHING, dx=simulation.solver.dx, simulation_seconds=seconds, startup_seconds=9.0)
+
+    monkeypatch.setattr(real_time, "estimate_cost", estimate)
+    choice = in_real_time(parser, settings, Simulation.from_settings(parser, settings))
+    assert settings.solver.dx == 0.05
+    assert choice.settings.solver.dx == choice.simulation.solver.dx == 0.065
+    assert choice.sentence.startswith("Chose a grid of 0.065 m, predicted to run at 1.5 x")
+    assert asked[0] == (0.05, 51, real_time.BUDGET, False)
+
+
+def test_a_trial_of_a_flag_chooses_by_its_speed(parser, settings, monkeypatch):
+    """With real trials: any machine is faster than the first wish, and none reaches the second.
+
+    The flag is 1.2 m long, from the first Gaussian to the last a little less: at most 0.073 m, a sixteenth.
+    """
+    settings.solver.dx = 0.04
+    monkeypatch.setattr(real_time, "BUDGET", 0.05)
+    monkeypatch.setattr(real_time, "HEADROOM", 1e-6)
+    simulation = Simulation.from_settings(parser, settings)
+    kept = in_real_time(parser, settings, simulation)
+    assert kept.simulation is simulation
+    assert kept.settings is settings
+    monkeypatch.setattr(real_time, "HEADROOM", 1e6)
+    assert in_real_time(parser, settings, simulation).simulation.solver.dx == 0.073
