@@ -36,7 +36,7 @@ BRIEF = {
     "trainer.val_check_interval": 4,
     "trainer.enable_progress_bar": False,
     "checkpoint.every_n_train_steps": 4,
-    "data.init_args.capture.init_args.size": 32,
+    "data.init_args.capture.size": 32,
 }
 """A training of four photos."""
 
