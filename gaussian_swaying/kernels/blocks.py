@@ -356,10 +356,6 @@ class Emitter:
             self.entry.store(ir.Constant(stored, 0), self._dummy[kind])
         return self._dummy[kind]
 
-    def new_function(self) -> None:
-        """Forget what belongs to the function before."""
-        self._dummy = {}
-
     def load(self, pointer: Pointer, mask: Value = None, other: Value = None) -> Block:
         """The numbers at some addresses; ``other`` (or zero) where a mask is false."""
         kind = pointer.kind

@@ -1,4 +1,4 @@
-"""Recording CUDA graphs, and checking whether a recorded graph is still valid."""
+"""Recording launches, as CUDA graphs or lists for a CPU, and checking whether a recording is still valid."""
 
 from __future__ import annotations
 
@@ -174,13 +174,15 @@ class Replayed:
 
 
 class Repeater:
-    """Repeats pieces of work by replaying CUDA graphs of 16, 4 and 1 repetitions, which share one memory pool.
+    """Repeats pieces of work by replaying recordings of 16, 4 and 1 repetitions: CUDA graphs that share a memory pool.
+
+    On a CPU they are lists of launches (``cpu.Recording``), also of 64 repetitions.
 
     The pool belongs to the graphs in use. Once all of them are dropped, its memory is freed before the next graph is
     recorded.
 
     Args:
-        device: Device on which the work runs; without CUDA nothing is recorded.
+        device: Device on which the work runs.
         kept: Number of pieces of work whose graphs are kept; those that ran longest ago are dropped.
     """
 
@@ -196,8 +198,8 @@ class Repeater:
     ) -> None:
         """Run the work ``times`` times.
 
-        The first time a key is used, the work runs without recording, so that all its kernels are compiled. After that
-        it is recorded and replayed.
+        On a GPU the work runs without recording the first time a key is used, so that all its kernels are compiled.
+        After that it is recorded and replayed. On a CPU it is recorded while it runs for the first time.
 
         Args:
             times: Number of repetitions.

@@ -312,7 +312,7 @@ class _Translator(Emitter):
             self.entry, self._dummy = ir.IRBuilder(scratch.append_basic_block()), {}
             inner = dict(scope)
             for name, kind in kinds.items():
-                inner[name] = self._fit(scope[name], kind, lose=True)
+                inner[name] = self._fit(scope[name], kind)
             body(inner)
             joined = {name: self._join(self._fit(scope[name], kinds[name]), inner[name]) for name in names}
             builder.position_at_end(here)
@@ -337,12 +337,12 @@ class _Translator(Emitter):
             return _Same(x)
         raise TranslationError(f"a variable is {x!r} on one way and {y!r} on another")
 
-    def _fit(self, value: Value, kind: Any, lose: bool = False) -> Value:
+    def _fit(self, value: Value, kind: Any) -> Value:
         """A value as the type that :meth:`_join` returned."""
         if isinstance(kind, tuple):
-            return tuple(self._fit(part, own, lose) for part, own in zip(value, kind, strict=True))
+            return tuple(self._fit(part, own) for part, own in zip(value, kind, strict=True))
         if isinstance(kind, _Address):
-            return Pointer(kind.base, kind.kind, self._fit(value.offset, kind.offset, lose))
+            return Pointer(kind.base, kind.kind, self._fit(value.offset, kind.offset))
         if isinstance(kind, _Same):
             return kind.value
         block = self.splat(self.convert(self.block(value), kind.kind), kind.shape)

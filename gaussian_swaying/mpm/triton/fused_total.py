@@ -95,8 +95,9 @@ class FusedTotal(Fused):
         self._take_pins()
         self.touching = None if bound.contact is None else FusedContact(bound, self.fields, self.active)
         self.shift = torch.zeros(len(inverse) if self.position else 0, 4, **self.like)
-        self.alone = torch.arange(len(active), dtype=torch.int32, device=self.device)
+        # a CPU sums the cells around a node by a kernel of its own (`total_join`)
         self.joined = torch.zeros(len(active) if lanes(self.device, 0) else 0, 8, **self.like)
+        self.alone = torch.arange(len(self.joined), dtype=torch.int32, device=self.device)
         self._partial: dict[tuple[int, int, str], Tensor] = {}
         width = 8 if self.position else 4
         check_indices(max(8 * len(inverse), 27 * (self.pieces + 1) * width, 27 * len(active)))
