@@ -308,6 +308,22 @@ def test_a_browser_that_cannot_draw_gets_pictures(page, open_window, until, way)
     assert window.problems == []
 
 
+def test_a_scene_may_go_while_it_is_sorted(open_window):
+    """The sorting that has begun ends without an error when the server takes over."""
+    window = open_window()
+    window.evaluate("""async () => {
+        const { spark } = wind.drawing;
+        spark.readPause = 300; // ms between the beginning of a sorting and its reading of the depths
+        spark.sorting = false;
+        spark.sortDirty = true;
+        spark.driveSort();
+        wind.fail("of a test");
+        await new Promise((resolve) => setTimeout(resolve, 600));
+    }""")
+    assert window.evaluate("wind.drawing.spark") is None
+    assert window.problems == []
+
+
 def test_without_webgl_the_page_says_what_it_needs(page, chromium, browser):
     started = browser.browser_type.launch(
         executable_path=chromium, args=[*FLAGS[:2], "--disable-gpu", "--disable-3d-apis"]

@@ -164,6 +164,7 @@ export class Drawing {
   clear() {
     if (this.spark === null) return;
     this.scene.clear();
+    this.spark.readbackDepth = () => new Promise(() => {}); // a sort that has begun, or waits for its turn, ends here
     this.spark.dispose();
     for (const made of this.textures) made.dispose();
     this.spark = null;
