@@ -17,7 +17,19 @@ from importlib.metadata import entry_points
 from pathlib import Path
 from typing import Any
 
-EXTRAS = ["cv2", "viser", "pxr", "netCDF4", "ray", "pyarrow", "webdataset", "tensorboard", "matplotlib", "pytest"]
+EXTRAS = [
+    "cv2",
+    "viser",
+    "zstandard",
+    "pxr",
+    "netCDF4",
+    "ray",
+    "pyarrow",
+    "webdataset",
+    "tensorboard",
+    "matplotlib",
+    "pytest",
+]
 """Modules of the extras, and of the tests."""
 
 POLE = {"class_path": "Box", "init_args": {"min": [None, None, None], "max": [0.11, None, None]}}
@@ -112,6 +124,8 @@ def main() -> None:
     )
     tried.add("preview")
     works("export flag.ply flag.splat", "flag.splat")
+    works("export flag.ply flag.spz", "flag.spz")
+    needs("spz", "export flag.spz flag4.spz --spz-version=4")
     needs("usd", "export flag.ply flag.usdc")
     tried.add("export")
     Path("jelly.json").write_text(json.dumps(PHYSGAUSSIAN))

@@ -13,6 +13,8 @@ from gaussian_swaying import _program as program
 from gaussian_swaying._checks import check_positive
 from gaussian_swaying.cli.errors import run_command  # first, as it sets up threads
 from gaussian_swaying.gaussians.export import SUFFIXES, convert, format_of
+from gaussian_swaying.gaussians.formats import READABLE
+from gaussian_swaying.gaussians.spz import VERSIONS
 from gaussian_swaying.geometry.frame import SimFrame
 from gaussian_swaying.viewer.film.page import write_film
 
@@ -22,8 +24,7 @@ def build_options() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(prog=program.name("export"), description=__doc__)
     parser.add_argument(
         "source",
-        help="A .ply, compressed .ply or .splat, or a folder of .ply for an animated USD; with --web the folder of"
-        " a run.",
+        help=f"A {READABLE}, or a folder of .ply for an animated USD; with --web the folder of a run.",
     )
     parser.add_argument(
         "target",
@@ -48,6 +49,12 @@ def build_options() -> argparse.ArgumentParser:
         "--metres-per-unit",
         type=float,
         help="Length of a scene unit [m], for USD; default: that of the run that wrote the source, or 1.",
+    )
+    parser.add_argument(
+        "--spz-version",
+        type=int,
+        choices=VERSIONS,
+        help="Version of an .spz file; default: 3, which all programs read.",
     )
     return parser
 
@@ -105,13 +112,16 @@ def export(options: argparse.Namespace) -> None:
         return
     if options.target is None:
         raise ValueError(f"Expected a file to write, whose name ends in one of {', '.join(SUFFIXES.values())}.")
-    if format_of(options.target) != "usd":
+    format = format_of(options.target)
+    if format != "spz" and options.spz_version is not None:
+        raise ValueError("--spz-version is only for .spz files: leave it out.")
+    if format != "usd":
         if options.up is not None or options.metres_per_unit is not None:
             raise ValueError(
                 "--up and --metres-per-unit are only for USD files, as other formats have no up direction: leave them "
                 "out, or use a target that ends in .usdc."
             )
-        convert(options.source, options.target)
+        convert(options.source, options.target, spz_version=options.spz_version or 3)
     else:
         fps, frame, origin = usd_settings(options)
         convert(options.source, options.target, fps, frame.metres_per_unit, frame.rotation)
@@ -127,6 +137,7 @@ def export_web(options: argparse.Namespace) -> None:
         ValueError: If an option of the other formats is given, or the run cannot become a film.
     """
     given = {"--fps": options.fps, "--up": options.up, "--metres-per-unit": options.metres_per_unit}
+    given["--spz-version"] = options.spz_version
     for name, value in given.items():
         if value is not None:
             raise ValueError(f"{name} is not for --web, which takes it from the run: leave it out.")

@@ -18,7 +18,7 @@ from gaussian_swaying._yaml_limits import check_config_files
 from gaussian_swaying.cli.errors import guessing, parser_sentence, run_command
 from gaussian_swaying.cli.shipped import with_shipped
 from gaussian_swaying.config.parser import parse_text
-from gaussian_swaying.gaussians.compact import read_gaussians
+from gaussian_swaying.gaussians.formats import read_gaussians
 from gaussian_swaying.preview.calibration import (
     SWAY,
     calibrated_suggestion,

@@ -7,41 +7,18 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import torch
 from einops import rearrange
 
 from gaussian_swaying._inputs import check_regular
-from gaussian_swaying._ply_table import read_element, read_header
+from gaussian_swaying._ply_table import read_element
 from gaussian_swaying.gaussians.cloud import GaussianCloud
 from gaussian_swaying.gaussians.harmonics import SH_DC
-from gaussian_swaying.gaussians.ply import check_places, check_sizes_and_rotations, read_binary_header, read_ply, reject
+from gaussian_swaying.gaussians.packed import cloud_of, logits, with_largest
+from gaussian_swaying.gaussians.ply import read_binary_header
 
 CHUNK = 256  # number of Gaussians with a common range of values in a compressed .ply
 _SPLAT = np.dtype([("means", "<f4", 3), ("sizes", "<f4", 3), ("rgba", "u1", 4), ("quats", "u1", 4)])
 _PACKED = ("packed_position", "packed_rotation", "packed_scale", "packed_color")
-
-
-def read_gaussians(path: str | os.PathLike[str]) -> GaussianCloud:
-    """Read a splat in any supported format: 3DGS .ply, compressed .ply or .splat.
-
-    A file whose name ends in ``.splat`` is read by :func:`read_splat`, any other as a .ply. The content tells whether a
-    .ply is compressed.
-
-    Args:
-        path: File to read.
-
-    Returns:
-        The Gaussians as float32 tensors on the CPU.
-
-    Raises:
-        FileNotFoundError: If there is no such file.
-        ValueError: If the file cannot be used; the message names the file, the field and the remedy.
-    """
-    path = Path(path)
-    if path.suffix.lower() == ".splat":
-        return read_splat(path)
-    fields = {name for element in read_header(path).elements for name, _ in element.fields}
-    return read_compressed_ply(path) if "packed_position" in fields else read_ply(path)
 
 
 def read_splat(path: str | os.PathLike[str]) -> GaussianCloud:
@@ -69,7 +46,7 @@ def read_splat(path: str | os.PathLike[str]) -> GaussianCloud:
     with np.errstate(divide="ignore", invalid="ignore"):
         scales = np.log(rows["sizes"])
     quats = (rows["quats"].astype(np.float32) - 128) / 128
-    return _cloud(path, rows["means"], scales, quats, rows["rgba"] / np.float32(255))
+    return _colored(path, rows["means"], scales, quats, rows["rgba"] / np.float32(255))
 
 
 def read_compressed_ply(path: str | os.PathLike[str]) -> GaussianCloud:
@@ -127,7 +104,7 @@ def read_compressed_ply(path: str | os.PathLike[str]) -> GaussianCloud:
     if "min_r" in chunks.dtype.names:
         rgba[:, :3] = within(rgba[:, :3], ("r", "g", "b"))
     rest = _harmonics(path, read_element(path, header, "sh"), count) if "sh" in held else None
-    return _cloud(path, means, scales, _smallest_three(rotation), rgba, rest)
+    return _colored(path, means, scales, _quats(rotation), rgba, rest)
 
 
 def _three(packed: np.ndarray, bits: tuple[int, int, int]) -> np.ndarray:
@@ -139,14 +116,9 @@ def _three(packed: np.ndarray, bits: tuple[int, int, int]) -> np.ndarray:
     return np.stack(shares, -1)
 
 
-def _smallest_three(packed: np.ndarray) -> np.ndarray:
+def _quats(packed: np.ndarray) -> np.ndarray:
     """Unit quaternions wxyz from the place of the largest component (2 bits) and the others (10 bits each)."""
-    small = (_three(packed, (10, 10, 10)) - 0.5) * np.sqrt(2)
-    largest = np.sqrt(np.clip(1 - np.square(small).sum(-1), 0, None))
-    place = packed >> 30 & 3
-    at = np.array([[3, 0, 1, 2], [0, 3, 1, 2], [0, 1, 3, 2], [0, 1, 2, 3]])[place]  # 3 stands for the largest
-    quats: np.ndarray = np.take_along_axis(np.concatenate([small, largest[:, None]], -1), at, -1)
-    return quats
+    return with_largest((_three(packed, (10, 10, 10)) - 0.5) * np.sqrt(2), packed >> 30 & 3)
 
 
 def _harmonics(path: Path, rows: np.ndarray, count: int) -> np.ndarray:
@@ -162,7 +134,7 @@ def _harmonics(path: Path, rows: np.ndarray, count: int) -> np.ndarray:
     return rearrange(values, "n (c k) -> n k c", c=3)
 
 
-def _cloud(
+def _colored(
     path: Path,
     means: np.ndarray,
     scales: np.ndarray,
@@ -170,23 +142,7 @@ def _cloud(
     rgba: np.ndarray,
     rest: np.ndarray | None = None,
 ) -> GaussianCloud:
-    """A cloud from colours and opacities (N, 4) as displayed, from 0 to 1."""
-    half_a_step = 0.5 / 255
-    opacity = np.clip(rgba[:, 3].astype(np.float64), half_a_step, 1 - half_a_step)
+    """A cloud from colours and opacities (N, 4) as displayed, from 0 to 1 in steps of 1/255."""
     base = (rgba[:, None, :3] - 0.5) / SH_DC
-    columns: dict[str, Any] = {
-        "means": means,
-        "quats": quats,
-        "scales": scales,
-        "opacities": np.log(opacity / (1 - opacity)),
-        "sh": base if rest is None else np.concatenate([base, rest], 1),
-    }
-    with np.errstate(over="ignore"):
-        columns = {name: np.ascontiguousarray(value, dtype=np.float32) for name, value in columns.items()}
-    for name, value in columns.items():
-        if name != "scales":
-            bad = ~np.isfinite(value).reshape(len(value), -1).all(-1)
-            reject(path, bad, f"property `{name}` is NaN or infinite", "remove them or export the scene again")
-    check_places(path, columns["means"])
-    check_sizes_and_rotations(path, columns["scales"], columns["quats"])
-    return GaussianCloud(**{name: torch.from_numpy(value) for name, value in columns.items()})
+    sh = base if rest is None else np.concatenate([base, rest], 1)
+    return cloud_of(path, means=means, quats=quats, scales=scales, opacities=logits(rgba[:, 3], 255), sh=sh)

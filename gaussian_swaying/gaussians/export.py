@@ -1,4 +1,4 @@
-"""Gaussians for viewers and other programs: .ply, compressed .ply, .splat and animated USD."""
+"""Gaussians for viewers and other programs, in all formats: the one place that knows which is written how."""
 
 from __future__ import annotations
 
@@ -18,15 +18,22 @@ from torch import Tensor
 from gaussian_swaying._checks import check_choice, check_positive
 from gaussian_swaying._files import atomic
 from gaussian_swaying.gaussians.cloud import GaussianCloud
-from gaussian_swaying.gaussians.compact import read_gaussians
+from gaussian_swaying.gaussians.formats import read_gaussians
 from gaussian_swaying.gaussians.harmonics import sh_to_color
 from gaussian_swaying.gaussians.model import DeformedGaussians
 from gaussian_swaying.gaussians.ply import check_folder, write_ply
+from gaussian_swaying.gaussians.spz import encode_spz
 from gaussian_swaying.geometry.patches import smallest_axis_normal
 from gaussian_swaying.geometry.rotations import quat_to_rotation
 
-Format = Literal["ply", "compressed_ply", "splat", "usd"]
-SUFFIXES: dict[str, str] = {"ply": ".ply", "compressed_ply": ".compressed.ply", "splat": ".splat", "usd": ".usdc"}
+Format = Literal["ply", "compressed_ply", "splat", "spz", "usd"]
+SUFFIXES: dict[str, str] = {
+    "ply": ".ply",
+    "compressed_ply": ".compressed.ply",
+    "splat": ".splat",
+    "spz": ".spz",
+    "usd": ".usdc",
+}
 """Formats, and the endings of their file names."""
 LARGEST_LOGIT = 16.0  # its sigmoid is 1 - 1.1e-7, the largest opacity below 1 in float32
 LARGEST_LOG_SCALE = 20.0  # the compressed format has no larger numbers
@@ -67,6 +74,7 @@ def export_cloud(
     fps: float = 25.0,
     metres_per_unit: float = 1.0,
     rotation: Tensor | None = None,
+    spz_version: int = 3,
 ) -> None:
     """Write Gaussians in one of several formats; the file gets its name only when it is complete.
 
@@ -75,6 +83,7 @@ def export_cloud(
       with 8 bits each. Gaussians fainter than 1/255 are left out, their order changes, and there are no normals.
     - ``splat``: antimatter15's format, through gsplat: 32 bytes for each Gaussian. Colours are those of harmonics of
       degree 0; no normals.
+    - ``spz``: Niantic's format, see :func:`~gaussian_swaying.gaussians.spz.encode_spz`.
     - ``usd``: one frame, see :func:`write_usd`.
 
     Args:
@@ -84,11 +93,13 @@ def export_cloud(
         fps: Frames per second, for USD.
         metres_per_unit: Length of a scene unit [m], for USD.
         rotation: Rotation from scene directions to z up, shape (3, 3), for USD; the scene's z is up if None.
+        spz_version: Version of SPZ.
 
     Raises:
         FileNotFoundError: If the folder does not exist.
-        ValueError: If the format is none of these or the ending unknown, or no Gaussian is left.
-        ImportError: If the format is ``usd`` and usd-core is not installed.
+        ValueError: If the format is none of these or the ending unknown, no Gaussian is left, or the format cannot hold
+            one of them.
+        ImportError: If the format is ``usd`` and usd-core is not installed, or SPZ of version 4 and zstandard is not.
 
     Warns:
         UserWarning: If Gaussians were left out because they are not finite.
@@ -103,8 +114,9 @@ def export_cloud(
     elif format == "ply":
         write_ply(path, kept)
     else:
+        content = encode_spz(kept, spz_version) if format == "spz" else _gsplat_bytes(path, kept, format)
         with atomic(path) as temporary:
-            temporary.write_bytes(_gsplat_bytes(path, kept, format))
+            temporary.write_bytes(content)
 
 
 def format_of(path: str | os.PathLike[str]) -> str:
@@ -129,16 +141,18 @@ def convert(
     fps: float = 25.0,
     metres_per_unit: float = 1.0,
     rotation: Tensor | None = None,
+    spz_version: int = 3,
 ) -> None:
     """Write a splat, or the .ply sequence of a run, in the format given by the ending of the target's name.
 
     Args:
-        source: A file that :func:`~gaussian_swaying.gaussians.compact.read_gaussians` reads; for USD also a folder of
+        source: A file that :func:`~gaussian_swaying.gaussians.formats.read_gaussians` reads; for USD also a folder of
             .ply files, whose frames are sorted by name.
         target: File to write, see :func:`format_of`.
         fps: Frames per second of a folder.
         metres_per_unit: Length of a scene unit [m], written to USD files.
         rotation: Rotation from scene directions to z up, shape (3, 3), for USD; the scene's z is up if None.
+        spz_version: Version of SPZ.
 
     Raises:
         FileNotFoundError: If the source or the target's folder does not exist.
@@ -149,7 +163,7 @@ def convert(
     check_folder(target)
     if not source.is_dir():
         place: dict[str, Any] = {"fps": fps, "metres_per_unit": metres_per_unit, "rotation": rotation}
-        return export_cloud(target, read_gaussians(source), format=format, **place)
+        return export_cloud(target, read_gaussians(source), format=format, spz_version=spz_version, **place)
     files = sorted(source.glob("*.ply"))
     if format != "usd" or not files:
         what = "contains no .ply" if not files else f"is a folder of {len(files)} frames, which only USD supports"

@@ -11,7 +11,7 @@ from torch import Tensor, nn
 from gaussian_swaying._checks import check_choice, check_shape
 from gaussian_swaying.gaussians.area import coverage_area, patch_area
 from gaussian_swaying.gaussians.cloud import GaussianCloud
-from gaussian_swaying.gaussians.compact import read_gaussians
+from gaussian_swaying.gaussians.formats import read_gaussians
 from gaussian_swaying.gaussians.harmonics import rotate_sh, sh_to_color
 from gaussian_swaying.gaussians.openness import openness
 from gaussian_swaying.gaussians.ply import write_ply
@@ -89,7 +89,7 @@ class GaussianSurfaceModel(nn.Module):
 
     @classmethod
     def from_ply(cls, path: str | os.PathLike[str], requires_grad: bool = True) -> GaussianSurfaceModel:
-        """The model of a file that :func:`~gaussian_swaying.gaussians.compact.read_gaussians` reads."""
+        """The model of a file that :func:`~gaussian_swaying.gaussians.formats.read_gaussians` reads."""
         return cls(read_gaussians(path), requires_grad)
 
     def to_cloud(self) -> GaussianCloud:

@@ -7,8 +7,8 @@ from typing import Literal
 
 from gaussian_swaying._checks import check_literals, check_positive, check_vector
 from gaussian_swaying.gaussians.cloud import GaussianCloud
-from gaussian_swaying.gaussians.compact import read_gaussians
 from gaussian_swaying.gaussians.filling import InteriorFilling
+from gaussian_swaying.gaussians.formats import read_gaussians
 from gaussian_swaying.geometry.regions import Everything, Region
 from gaussian_swaying.scenes.procedural import ProceduralScene
 
@@ -17,7 +17,8 @@ class Scene:
     """The source of the Gaussians, and the choice of those that are simulated.
 
     Args:
-        ply: A 3DGS .ply, a compressed .ply or a .splat; takes precedence over ``generator``.
+        ply: A splat in any format that can be read (3DGS or compressed .ply, .splat, .spz); takes precedence over
+            ``generator``.
         generator: A scene made in code.
         region: Part that is simulated, in scene units; the rest does not move and is rendered as well.
         opacity_threshold: Gaussians in the region below this opacity carry no mass and feel no wind.

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from gaussian_swaying._checks import check_positive, check_shape
 from gaussian_swaying.gaussians.cloud import GaussianCloud
-from gaussian_swaying.gaussians.compact import read_gaussians
+from gaussian_swaying.gaussians.formats import read_gaussians
 from gaussian_swaying.gaussians.harmonics import SH_DC
 from gaussian_swaying.geometry.neighbours import nearest_neighbours
 
@@ -70,7 +70,7 @@ def gaussians_from_file(path: str | os.PathLike[str], sh_degree: int) -> Gaussia
     """The Gaussians of a splat, with harmonics of this degree: higher ones are left out, missing ones are zero.
 
     Args:
-        path: A file that :func:`~gaussian_swaying.gaussians.compact.read_gaussians` reads.
+        path: A file that :func:`~gaussian_swaying.gaussians.formats.read_gaussians` reads.
         sh_degree: The degree, 0 to 3.
     """
     cloud = read_gaussians(path)

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING
 
 from gaussian_swaying._checks import one_line
 from gaussian_swaying.config.parser import parse_text
+from gaussian_swaying.gaussians.formats import READABLE, READERS
 from gaussian_swaying.viewer.film_strip import FilmStrip
 from gaussian_swaying.viewer.scenes import settings_of_splat
 from gaussian_swaying.viewer.screen import Panel
@@ -47,7 +48,7 @@ class Files:
             disabled=elsewhere,  # a configuration can name files of this computer
             hint="Only on a page that other computers cannot open" if elsewhere else "Such as one that was saved here",
         )
-        self.load = gui.add_upload_button("Load a splat (.ply)", mime_type=".ply")
+        self.load = gui.add_upload_button("Load a splat", mime_type=",".join(READERS), hint=f"A {READABLE}")
         controls.on(self.record.on_click, self._toggle_recording, tell_event=True)
         controls.on(self.save.on_click, self._save, tell_event=True)
         controls.on(self.load.on_upload, lambda: self._load(self.load, self._splat))
@@ -84,15 +85,15 @@ class Files:
         if event.client is not None:
             event.client.send_file_download("live.yaml", text.encode(), save_immediately=True)
 
-    def _load(self, button: viser.GuiUploadButtonHandle, read: Callable[[bytes, Folder], Namespace]) -> None:
+    def _load(self, button: viser.GuiUploadButtonHandle, read: Callable[[bytes, str, Folder], Namespace]) -> None:
         self.load.disabled = self.load_settings.disabled = True
         threading.Thread(target=self._read, args=(button, read), name="load", daemon=True).start()
 
-    def _read(self, button: viser.GuiUploadButtonHandle, read: Callable[[bytes, Folder], Namespace]) -> None:
-        """Load an uploaded file; its name is never used."""
+    def _read(self, button: viser.GuiUploadButtonHandle, read: Callable[[bytes, str, Folder], Namespace]) -> None:
+        """Load an uploaded file; of its name, only the ending is used."""
         folder = Folder()
         try:
-            settings = read(button.value.content, folder)
+            settings = read(button.value.content, Path(button.value.name).suffix.lower(), folder)
             self.page.progress(0.8, "Making the simulation")
             self.session.load(settings, partial(self._there, folder), self._ended)
         except Exception as error:
@@ -106,14 +107,14 @@ class Files:
         self.page.progress(None)
         self.load.disabled, self.load_settings.disabled = False, self.page.door.token is not None
 
-    def _splat(self, content: bytes, folder: Folder) -> Namespace:
-        path = Path(folder.name) / "scene.ply"
+    def _splat(self, content: bytes, suffix: str, folder: Folder) -> Namespace:
+        path = Path(folder.name) / f"scene{suffix if suffix in READERS else '.ply'}"
         path.write_bytes(content)
         device = self.session.simulation.device
         quick = device.type == "cpu"  # no trial looks for a grid
         return settings_of_splat(self.session.parser, path, device, tell=self.page.progress, quick=quick)
 
-    def _configuration(self, content: bytes, folder: Folder) -> Namespace:
+    def _configuration(self, content: bytes, suffix: str, folder: Folder) -> Namespace:
         """The settings in a configuration file; if its splat is not on this computer, they get the present one."""
         self.page.progress(0.1, "Reading the configuration")
         try:

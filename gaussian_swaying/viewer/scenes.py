@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 import torch
 
 from gaussian_swaying.config.parser import parse_text
-from gaussian_swaying.gaussians.compact import read_gaussians
+from gaussian_swaying.gaussians.formats import read_gaussians
 from gaussian_swaying.preview.calibration import SWAY, calibrated_suggestion
 from gaussian_swaying.preview.starter import draft_yaml, starter_yaml
 from gaussian_swaying.preview.suggest import suggest

@@ -7,6 +7,7 @@ import pytest
 from shared import refused
 
 from gaussian_swaying.cli.export import main
+from gaussian_swaying.gaussians.formats import read_gaussians
 from gaussian_swaying.gaussians.ply import read_ply, write_ply
 from gaussian_swaying.scenes.procedural import FlagScene
 
@@ -101,3 +102,17 @@ def test_files_of_viewers_are_read_again(tmp_path):
     for source, target in (("flag.ply", "a.compressed.ply"), ("a.compressed.ply", "b.splat"), ("b.splat", "c.ply")):
         assert main([str(tmp_path / source), str(tmp_path / target)]) == 0
     assert len(read_ply(tmp_path / "c.ply")) == 96
+
+
+def test_the_version_of_spz(tmp_path, capsys):
+    pytest.importorskip("zstandard")
+    write_ply(tmp_path / "flag.ply", FlagScene(spacing=0.1).generate())
+    assert main([str(tmp_path / "flag.ply"), str(tmp_path / "3.spz")]) == 0
+    assert main([str(tmp_path / "3.spz"), str(tmp_path / "4.spz"), "--spz-version", "4"]) == 0
+    assert (tmp_path / "3.spz").read_bytes()[:2] == b"\x1f\x8b"
+    assert (tmp_path / "4.spz").read_bytes()[:8] == b"NGSP\x04\0\0\0"
+    assert len(read_gaussians(tmp_path / "4.spz")) == 96
+    capsys.readouterr()
+    given = [str(tmp_path / "3.spz"), str(tmp_path / "a.splat"), "--spz-version=4"]
+    refused(main, given, capsys, "--spz-version is only for .spz files: leave it out")
+    refused(main, ["run", "--web", "--spz-version=4"], capsys, "--spz-version is not for --web")

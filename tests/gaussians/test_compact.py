@@ -6,8 +6,9 @@ import torch
 from plyfile import PlyData, PlyElement
 from small_scenes import varied_cloud
 
-from gaussian_swaying.gaussians.compact import read_compressed_ply, read_gaussians, read_splat
+from gaussian_swaying.gaussians.compact import read_compressed_ply, read_splat
 from gaussian_swaying.gaussians.export import export_cloud
+from gaussian_swaying.gaussians.formats import read_gaussians
 from gaussian_swaying.gaussians.harmonics import SH_DC
 from gaussian_swaying.gaussians.ply import write_ply
 from gaussian_swaying.simulation.scene import Scene

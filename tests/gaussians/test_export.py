@@ -9,7 +9,6 @@ import torch
 from small_scenes import varied_cloud
 
 from gaussian_swaying.gaussians.cloud import GaussianCloud
-from gaussian_swaying.gaussians.compact import read_gaussians
 from gaussian_swaying.gaussians.export import (
     SUFFIXES,
     UsdFilm,
@@ -21,6 +20,7 @@ from gaussian_swaying.gaussians.export import (
     usd_arrays,
     write_usd,
 )
+from gaussian_swaying.gaussians.formats import read_gaussians
 from gaussian_swaying.gaussians.ply import write_ply
 from gaussian_swaying.geometry.rotations import quat_to_rotation
 
@@ -60,7 +60,7 @@ def test_equal_values_in_a_chunk_are_kept(tmp_path):
 
 def test_what_cannot_be_written_leaves_nothing(tmp_path):
     cloud = varied_cloud(3)
-    with pytest.raises(ValueError, match="`format` to be one of ply, compressed_ply, splat, usd, but got 'obj'"):
+    with pytest.raises(ValueError, match="`format` to be one of ply, compressed_ply, splat, spz, usd, but got 'obj'"):
         export_cloud(tmp_path / "a.obj", cloud, format="obj")
     with pytest.raises(FileNotFoundError, match="is not a folder"):
         export_cloud(tmp_path / "no" / "a.splat", cloud, format="splat")

@@ -5,7 +5,7 @@ import torch
 
 from gaussian_swaying import AeroForce, Box, Edit, Material, MPMSolver, PinnedRegion, Simulation, SineSway, WindField
 from gaussian_swaying.aero.wind import FlowKey
-from gaussian_swaying.gaussians.compact import read_gaussians
+from gaussian_swaying.gaussians.formats import read_gaussians
 from gaussian_swaying.scenes import FlagScene
 from gaussian_swaying.simulation.material import MaterialRegion
 

@@ -12,8 +12,8 @@ import yaml
 from bench.problems.bodies import cluttered_sphere
 from small_scenes import plain_cloud
 
-from gaussian_swaying.gaussians.compact import read_gaussians
 from gaussian_swaying.gaussians.filling import InteriorFilling
+from gaussian_swaying.gaussians.formats import read_gaussians
 from gaussian_swaying.gaussians.ply import write_ply
 from gaussian_swaying.geometry.rotations import rotation_to_quat
 from gaussian_swaying.preview.report import run_dict, run_lines

@@ -9,7 +9,7 @@ import pytest
 import yaml
 
 pytest.importorskip("viser", reason="needs the extra [viewer]")
-from gaussian_swaying.gaussians.ply import write_ply
+from gaussian_swaying.gaussians.export import export_cloud
 from gaussian_swaying.scenes.procedural import FlagScene
 from gaussian_swaying.viewer import session as session_module
 from gaussian_swaying.viewer.controls import MATERIALS, Page, in_pascal, legend, like
@@ -150,9 +150,9 @@ def test_the_button_says_that_a_video_counts_simulated_time(page, client, until)
     until(lambda: page.recording is None and "simulated time" in button.label)
 
 
-def _upload(client, button, content):
+def _upload(client, button, content, name="x"):
     client.send(
-        "FileTransferStartUpload", source_component_uuid=button._impl.uuid, transfer_uuid="one", filename="x",
+        "FileTransferStartUpload", source_component_uuid=button._impl.uuid, transfer_uuid="one", filename=name,
         mime_type="", part_count=1, size_bytes=len(content),
     )  # fmt: skip
     client.send(
@@ -238,20 +238,22 @@ def test_a_bar_shows_how_far_a_scene_is_loaded(parser, settings, connect, until)
         session.close()
 
 
-def test_a_splat_that_is_loaded_tells_how_far_it_is(page, client, until, tmp_path, monkeypatch):
-    path = tmp_path / "flag.ply"
-    write_ply(path, FlagScene(width=0.6, height=0.6, spacing=0.05).generate())
+@pytest.mark.parametrize("name", ["flag.ply", "flag.SPZ"])
+def test_a_splat_that_is_loaded_tells_how_far_it_is(name, page, client, until, tmp_path, monkeypatch):
+    """In any format; of the name, which a browser sends, only the ending is used."""
+    path = tmp_path / "flag"
+    export_cloud(path, FlagScene(width=0.6, height=0.6, spacing=0.05).generate(), format=name[5:].lower())
     told, before = [], page.session.simulation
     tell = page.progress
     monkeypatch.setattr(page, "progress", lambda share, what="": (told.append(share), tell(share, what)))
-    _upload(client, page.controls.files.load, path.read_bytes())
+    _upload(client, page.controls.files.load, path.read_bytes(), f"../../{name}")
     until(lambda: page.session.simulation is not before, 60)
     until(lambda: told[-1] is None)
     shares = [share for share in told if share is not None]
     assert shares == sorted(shares)
     assert len(shares) > 4
     until(lambda: page.controls.stiffness.value == page.session.settings.material.E)
-    assert "scene.ply" in page.session.yaml()
+    assert f"scene{name[4:].lower()}" in page.session.yaml()
 
 
 def test_what_diverges_is_told_with_its_remedies(page, client, until):

@@ -10,7 +10,7 @@ from pathlib import Path
 from bench.case import Case, Measurement, option
 from bench.problems.bodies import BODIES, area_shares, cluttered_sphere, of_cloud
 from bench.record import Row
-from gaussian_swaying.gaussians.compact import read_gaussians
+from gaussian_swaying.gaussians.formats import read_gaussians
 from gaussian_swaying.geometry.directions import hull_area
 
 REPEATS = 3

@@ -12,7 +12,7 @@ import torch
 
 from bench.record import ROOT, Row
 from gaussian_swaying.gaussians.area import patch_area
-from gaussian_swaying.gaussians.compact import read_gaussians
+from gaussian_swaying.gaussians.formats import read_gaussians
 from gaussian_swaying.gaussians.model import GaussianSurfaceModel
 from gaussian_swaying.geometry.neighbours import nearest_neighbours
 from gaussian_swaying.geometry.surface_normals import neighbour_normals

@@ -1,0 +1,279 @@
+"""Niantic's SPZ: 17 to 65 bytes for each Gaussian, compressed by gzip (versions 1 to 3) or Zstandard (version 4)."""
+
+from __future__ import annotations
+
+import gzip
+import os
+import struct
+import warnings
+import zlib
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from torch import Tensor
+
+from gaussian_swaying._inputs import check_regular, check_unpacked
+from gaussian_swaying.gaussians.cloud import GaussianCloud
+from gaussian_swaying.gaussians.packed import cloud_of, logits, smallest_three, with_largest
+
+VERSIONS = (1, 2, 3, 4)
+_MAGIC = b"NGSP"
+_HEAD = struct.Struct("<4sIIBBBB")  # magic, version, count, degree, fractional bits, flags, streams
+_TABLE = 32  # offset of the table of streams in a file of version 4 without extensions
+_ANTIALIASED, _EXTENDED = 1, 2  # flags
+_AXES = 0xADBE0003  # the extension SPZ_ADOBE_coordinate_system
+_COLOR_SCALE = 0.15  # wider than that of the harmonics, as colours may be beyond 0 and 1
+_BITS = (5, 4)  # of harmonics of band 1 and above, as Niantic's writer keeps by default
+
+
+def read_spz(path: str | os.PathLike[str]) -> GaussianCloud:
+    """Read an .spz file of version 1 to 4.
+
+    Sizes, opacities, colours and harmonics have 8 bits; centres are whole multiples of a power of two (half precision
+    in version 1). An opacity at the end of its range is moved inwards by half a step. The axes are those of the file:
+    y is up by Niantic's convention, but many converters leave the axes of a .ply. Harmonics of degree 4 are left out.
+
+    Args:
+        path: File to read.
+
+    Returns:
+        The Gaussians as float32 tensors on the CPU, without normals.
+
+    Raises:
+        FileNotFoundError: If there is no such file.
+        ValueError: If the file is truncated, announces more than it can hold, or holds unusable Gaussians.
+        ImportError: If it has version 4 and zstandard is not installed.
+
+    Warns:
+        UserWarning: If the splat was trained with antialiasing, or has harmonics of degree 4.
+    """
+    path = check_regular(path, "the .spz file")
+    data = path.read_bytes()
+    if data[:2] == b"\x1f\x8b":
+        head, parts, extensions = _unzipped(path, data)
+    elif data[:4] == _MAGIC:
+        head, parts, extensions = _streams(path, data)
+    else:
+        raise ValueError(f"{path} is not an .spz file (it starts neither as gzip nor with `NGSP`); export it again.")
+    _, version, count, degree, fraction, flags, _ = head
+    _check_axes(path, extensions)
+    if flags & _ANTIALIASED:
+        warnings.warn(
+            f"{path} was trained with antialiasing, without which it is drawn here: what is thin or far looks thicker.",
+            UserWarning,
+            stacklevel=2,
+        )
+    if degree == 4:
+        warnings.warn(f"{path}: ignored the harmonics of degree 4; those up to 3 are used.", UserWarning, stacklevel=2)
+    positions, alphas, colors, scales, rotations, rest = (np.frombuffer(part, dtype=np.uint8) for part in parts)
+    sh = ((colors / 255 - 0.5) / _COLOR_SCALE).reshape(count, 1, 3)
+    bands = (rest.reshape(count, -1, 3)[:, :15] - 128.0) / 128
+    return cloud_of(
+        path,
+        means=_half(positions) if version == 1 else _fixed(positions, fraction),
+        quats=_from_three(rotations) if version < 3 else _from_smallest(rotations),
+        scales=scales.reshape(count, 3) / 16 - 10,
+        opacities=logits(alphas / 255, 255),
+        sh=np.concatenate([sh, bands], axis=1),
+    )
+
+
+def encode_spz(cloud: GaussianCloud, version: int = 3) -> bytes:
+    """An .spz file.
+
+    Centres have 24 bits, as many of them behind the binary point as the largest coordinate allows, up to 24. Sizes lie
+    between 4.5e-5 and 380 scene units, in steps of 6 %. Harmonics have 5 bits in band 1 and 4 above.
+
+    Args:
+        cloud: The Gaussians, finite (see :func:`~gaussian_swaying.gaussians.export.cleaned`).
+        version: 3 is read by all programs; 4 is smaller and needs zstandard; 1 and 2 have coarser rotations, and 1
+            centres in half precision.
+
+    Returns:
+        The content of the file.
+
+    Raises:
+        ValueError: If the version is unknown, or a centre is beyond ±8e6 (±65504 in version 1).
+        ImportError: If the version is 4 and zstandard is not installed.
+    """
+    if version not in VERSIONS:
+        raise ValueError(f"Expected `spz_version` to be 1, 2, 3 or 4, but got {version}.")
+    compress = _zstandard().ZstdCompressor(level=12).compress if version == 4 else None
+    means, quats, scales, opacities, sh = (
+        _array(part) for part in (cloud.means, cloud.quats, cloud.scales, cloud.opacities, cloud.sh)
+    )
+    farthest = float(np.abs(means).max(initial=0.0))
+    if farthest >= (65504 if version == 1 else 2**23 - 1):
+        raise ValueError(
+            f"An .spz file holds centres up to ±8e6 (version 1: ±65504) but one is at {farthest:g}: remove what is far "
+            "away, or choose another format."
+        )
+    fraction = 24 if farthest == 0 else min(24, int(np.floor(np.log2((2**23 - 1) / farthest))))
+    parts = (
+        means.astype("<f2") if version == 1 else _int24(means * 2.0**fraction),
+        _byte(255 / (1 + np.exp(-opacities))),
+        _byte(sh[:, 0] * _COLOR_SCALE * 255 + 127.5),
+        _byte((scales + 10) * 16),
+        _to_three(quats) if version < 3 else _to_smallest(quats),
+        np.concatenate([_coarse(sh[:, 1:4], _BITS[0]), _coarse(sh[:, 4:], _BITS[1])], axis=1),
+    )
+    packed = [part.tobytes() for part in parts if part.size]
+    streams = len(packed) if version == 4 else 0
+    head = _HEAD.pack(_MAGIC, version, len(cloud), cloud.sh_degree, fraction, 0, streams)
+    if compress is None:
+        return gzip.compress(head + b"".join(packed), mtime=0)
+    small = [compress(part) for part in packed]
+    table = b"".join(struct.pack("<QQ", len(out), len(part)) for out, part in zip(small, packed, strict=True))
+    return head + struct.pack("<I12x", _TABLE) + table + b"".join(small)
+
+
+# ---- the container
+
+
+def _sizes(path: Path, data: bytes) -> tuple[tuple[Any, ...], list[int]]:
+    """The header, checked, and the size of each part [bytes]."""
+    if len(data) < _HEAD.size:
+        raise _truncated(path, _HEAD.size, len(data))
+    head = _HEAD.unpack_from(data)
+    magic, version, count, degree = head[:4]
+    if magic != _MAGIC or version not in VERSIONS:
+        raise ValueError(f"{path} is not an .spz file of version 1 to 4; export it as one of these.")
+    if count == 0:
+        raise ValueError(f"{path} holds zero Gaussians; export the scene again.")
+    if degree > 4:
+        raise ValueError(f"{path} has harmonics of degree {degree}, but they end at 4; export it again.")
+    check_unpacked(path, count * (56 + 12 * ((degree + 1) ** 2 - 1)), f"{count:,} Gaussians")
+    rows = (6 if version == 1 else 9, 1, 3, 3, 3 if version < 3 else 4, 3 * ((degree + 1) ** 2 - 1))
+    return head, [count * row for row in rows]
+
+
+def _unzipped(path: Path, data: bytes) -> tuple[tuple[Any, ...], list[bytes], bytes]:
+    """The header, the parts and the extensions of a file of version 1 to 3; decompresses only what it announces."""
+    stream = zlib.decompressobj(wbits=31)
+    try:
+        head, sizes = _sizes(path, stream.decompress(data, _HEAD.size))
+        body = stream.decompress(stream.unconsumed_tail, sum(sizes))
+        tail = stream.decompress(stream.unconsumed_tail, 1 << 12) if head[5] & _EXTENDED else b""
+    except zlib.error as error:
+        raise ValueError(f"{path} cannot be decompressed ({error}); copy or export it again.") from error
+    if len(body) < sum(sizes):
+        raise _truncated(path, sum(sizes), len(body))
+    ends = np.cumsum(sizes)
+    return head, [body[end - size : end] for size, end in zip(sizes, ends, strict=True)], tail
+
+
+def _streams(path: Path, data: bytes) -> tuple[tuple[Any, ...], list[bytes], bytes]:
+    """The header, the parts and the extensions of a file of version 4."""
+    head, sizes = _sizes(path, data)
+    if head[1] != 4:
+        raise ValueError(f"{path} is of version {head[1]}, but not compressed by gzip; export it again.")
+    zstandard = _zstandard(path)
+    wanted = [size for size in sizes if size]
+    if len(data) < _TABLE:
+        raise _truncated(path, _TABLE, len(data))
+    table = struct.unpack_from("<I", data, _HEAD.size)[0]
+    start = table + 16 * len(wanted)
+    if head[6] != len(wanted) or table < _TABLE or start > len(data):
+        raise ValueError(f"{path} has a broken table of {head[6]} streams at byte {table}; copy or export it again.")
+    parts = []
+    for index, size in enumerate(wanted):
+        length, announced = struct.unpack_from("<QQ", data, table + 16 * index)
+        if announced != size or start + length > len(data):
+            raise ValueError(f"{path}: stream {index} does not fit its table; copy or export it again.")
+        try:
+            part = zstandard.ZstdDecompressor().stream_reader(data[start : start + length]).read(size)
+        except zstandard.ZstdError as error:
+            raise ValueError(f"{path}: stream {index} cannot be decompressed ({error}); export it again.") from error
+        if len(part) < size:
+            raise _truncated(path, size, len(part))
+        parts.append(part)
+        start += length
+    extensions = data[_TABLE:table] if head[5] & _EXTENDED else b""
+    return head, [*parts, *([b""] * (len(sizes) - len(parts)))], extensions
+
+
+def _check_axes(path: Path, extensions: bytes) -> None:
+    """Raise ValueError if the extensions say that the axes are left-handed, which would mirror the scene."""
+    while len(extensions) >= 12:
+        kind, length, axes = struct.unpack_from("<III", extensions)
+        if kind == _AXES and 0 < axes <= 16 and ((axes - 1 & 7) ^ 3).bit_count() % 2:  # 4 stands for right, up, back
+            raise ValueError(f"{path} has left-handed axes (number {axes}); export it with others, such as RUB.")
+        extensions = extensions[8 + length :]
+
+
+def _truncated(path: Path, needed: int, found: int) -> ValueError:
+    return ValueError(f"{path} is truncated: {needed:,} bytes are announced, but {found:,} follow; copy it again.")
+
+
+def _zstandard(path: Path | None = None) -> Any:
+    """The module zstandard."""
+    try:
+        import zstandard
+    except ImportError as error:
+        what = "SPZ of version 4 needs" if path is None else f"{path} is of version 4 of SPZ and needs"
+        raise ImportError(
+            f"{what} zstandard: run pip install 'gaussian-swaying[spz]', or choose version 3.", name="zstandard"
+        ) from error
+    return zstandard
+
+
+# ---- numbers
+
+
+def _array(tensor: Tensor) -> np.ndarray:
+    array: np.ndarray = tensor.detach().cpu().double().numpy()
+    return array
+
+
+def _byte(values: np.ndarray) -> np.ndarray:
+    return np.clip(np.rint(values), 0, 255).astype(np.uint8)
+
+
+def _coarse(values: np.ndarray, bits: int) -> np.ndarray:
+    """Harmonics (N, K, 3) from -1 to 1 as bytes that are multiples of 2^(8 - bits), with 0 at 128."""
+    step = 1 << (8 - bits)
+    return np.clip(np.floor((np.rint(values * 128) + 128 + step // 2) / step) * step, 0, 255).astype(np.uint8)
+
+
+def _half(raw: np.ndarray) -> np.ndarray:
+    return raw.view("<f2").reshape(-1, 3).astype(np.float32)
+
+
+def _fixed(raw: np.ndarray, fraction: int) -> np.ndarray:
+    """Signed whole numbers of 24 bits, as multiples of 2^-fraction, shape (N, 3)."""
+    wide = np.zeros((len(raw) // 3, 4), dtype=np.uint8)
+    wide[:, 1:] = raw.reshape(-1, 3)
+    values: np.ndarray = (wide.view("<i4").reshape(-1, 3) >> 8) * 2.0**-fraction
+    return values
+
+
+def _int24(values: np.ndarray) -> np.ndarray:
+    whole = np.rint(values).astype("<i4")
+    return np.ascontiguousarray(whole).view(np.uint8).reshape(-1, 4)[:, :3]
+
+
+def _from_three(raw: np.ndarray) -> np.ndarray:
+    """Quaternions wxyz from bytes of x, y and z; w is not negative."""
+    xyz = raw.reshape(-1, 3) / 127.5 - 1
+    return np.concatenate([np.sqrt(np.clip(1 - np.square(xyz).sum(-1, keepdims=True), 0, None)), xyz], axis=1)
+
+
+def _to_three(quats: np.ndarray) -> np.ndarray:
+    unit = quats / np.linalg.norm(quats, axis=1, keepdims=True)
+    return _byte(unit[:, 1:] * np.where(unit[:, :1] < 0, -127.5, 127.5) + 127.5)
+
+
+def _from_smallest(raw: np.ndarray) -> np.ndarray:
+    """Quaternions wxyz: 2 bits for the place of the largest component of xyzw; a sign and 9 bits for each other."""
+    packed = raw.view("<u4")
+    fields = np.stack([packed >> shift & 1023 for shift in (20, 10, 0)], -1)
+    small = np.where(fields & 512, -1.0, 1.0) * (fields & 511) / (511 * np.sqrt(2))
+    return with_largest(small, packed >> 30)[:, [3, 0, 1, 2]]
+
+
+def _to_smallest(quats: np.ndarray) -> np.ndarray:
+    small, place = smallest_three(quats[:, [1, 2, 3, 0]])
+    fields = np.rint(np.abs(small) * 511 * np.sqrt(2)).astype(np.uint32) | np.where(small < 0, 512, 0).astype(np.uint32)
+    packed = place.astype(np.uint32) << 30 | fields[:, 0] << 20 | fields[:, 1] << 10 | fields[:, 2]
+    return packed.astype("<u4")

@@ -1,0 +1,243 @@
+"""SPZ of all versions: as it was within the bits of each field, as others write it, and what is refused.
+
+Covers: gaussians.packed, gaussians.formats.
+"""
+
+import gzip
+import math
+import struct
+import tracemalloc
+import warnings
+
+import numpy as np
+import pytest
+import torch
+from other_writers import FILES, assert_close, scene, turned
+from small_scenes import varied_cloud
+
+from gaussian_swaying.gaussians.export import convert, export_cloud
+from gaussian_swaying.gaussians.formats import read_gaussians
+from gaussian_swaying.gaussians.spz import encode_spz, read_spz
+from gaussian_swaying.simulation.scene import Scene
+
+# half a step of 8 bits each: the logarithm of the size, opacities, colours; harmonics are rounded once more, to 4 bits
+STEPS = {"scales": 1.01 / 32, "opacities": 0.501 / 255, "colors": 0.501 / 255 / 0.15, "sh": 8.51 / 128}
+# three components within half a step of 1 / (511 sqrt(2)); the fourth, at least 1/2, follows from them
+SMALLEST_THREE = 2 * 2 * 0.5 / (511 * 2**0.5) * 3**0.5
+needs_zstandard = pytest.importorskip("zstandard")  # of version 4
+
+
+@pytest.mark.parametrize("version", [1, 2, 3, 4])
+@pytest.mark.parametrize("degree", [0, 1, 2, 3])
+def test_round_trip(version, degree, tmp_path):
+    cloud = varied_cloud(degree=degree)
+    export_cloud(tmp_path / "a.spz", cloud, spz_version=version)
+    found = read_gaussians(tmp_path / "a.spz")
+    means = 2.0**-10 if version == 1 else 2.0**-21  # half precision and 24 bits, of numbers up to 3
+    # in version 1 and 2, w follows from bytes of x, y, z, however small it is
+    quats = 0.2 if version < 3 else SMALLEST_THREE
+    assert_close(found, cloud, means=means, quats=quats, **STEPS)
+    torch.testing.assert_close(found.sh[:, 1:4], cloud.sh[:, 1:4], rtol=0, atol=4.51 / 128)  # 5 bits
+    assert found.normals is None
+
+
+@pytest.mark.parametrize("version", [3, 4])
+def test_as_splat_transform_writes_it(version):
+    """It turns the axes of a .ply (y down) to y up, with 12 bits behind the point, and rounds as Niantic does."""
+    found = read_spz(FILES / f"scene_v{version}.spz")
+    half_turn = torch.diag(torch.tensor([1.0, -1.0, -1.0]))
+    assert_close(turned(found, half_turn), scene(), means=1.01 * 2.0**-13, quats=SMALLEST_THREE, **STEPS)
+    assert torch.equal(read_spz(FILES / "scene_v3.spz").sh, read_spz(FILES / "scene_v4.spz").sh)
+
+
+def test_the_same_bytes_as_the_official_writer(tmp_path):
+    """Everything but the centres, which have more bits here: the rest of a file is what Niantic's code makes of it."""
+    half_turn = torch.diag(torch.tensor([1.0, -1.0, -1.0]))
+    mine = gzip.decompress(encode_spz(turned(scene(), half_turn), 3))
+    theirs = gzip.decompress((FILES / "scene_v3.spz").read_bytes())
+    assert mine[:13] == theirs[:13]
+    assert len(mine) == len(theirs)
+    alphas, rotations, rest = 16 + 12 * 9, 16 + 12 * (9 + 7), 16 + 12 * (9 + 11)
+    assert mine[alphas:rotations] == theirs[alphas:rotations]
+    assert mine[rest:] == theirs[rest:]
+
+
+def test_by_hand(tmp_path):
+    """A file of version 1 and one of version 2, whose values follow from the description of the format."""
+    head = struct.pack("<4sIIBBBB", b"NGSP", 1, 1, 0, 12, 0, 0)
+    rest = bytes([51, 0, 255, 128, 160, 0, 255, 255, 128, 0])  # opacity, colour, sizes, rotation
+    (tmp_path / "1.spz").write_bytes(gzip.compress(head + np.float16([0.5, -2, 3]).tobytes() + rest))
+    (tmp_path / "2.spz").write_bytes(
+        gzip.compress(head.replace(b"P\x01", b"P\x02") + bytes([0, 8, 0, 0, 0xE0, 0xFF, 0, 0x30, 0]) + rest)
+    )
+    for name in ("1.spz", "2.spz"):
+        cloud = read_gaussians(tmp_path / name)
+        assert cloud.means.tolist() == [[0.5, -2.0, 3.0]]
+        torch.testing.assert_close(cloud.opacities.sigmoid(), torch.tensor([0.2]))
+        torch.testing.assert_close(cloud.sh, torch.tensor([[[-10.0, 10.0, (128 / 255 - 0.5) * 20]]]) / 3)
+        assert cloud.scales.tolist() == [[0.0, -10.0, 5.9375]]
+        torch.testing.assert_close(cloud.quats, torch.tensor([[0.0, 1.0, 1 / 255, -1.0]]))
+
+
+def test_far_away_and_tiny(tmp_path):
+    """The point moves for large scenes; sizes end at exp(-10); what does not fit is refused, and nothing is left."""
+    cloud = varied_cloud(20, degree=0)
+    cloud.means[3, 1], cloud.scales[5] = 1e5, -16.0
+    export_cloud(tmp_path / "a.spz", cloud)
+    found = read_gaussians(tmp_path / "a.spz")
+    torch.testing.assert_close(found.means, cloud.means, rtol=0, atol=2.0**-7)
+    assert found.scales[5].tolist() == [-10.0] * 3
+    with pytest.raises(ValueError, match=r"centres up to ±8e6 .* one is at 100000: remove"):
+        export_cloud(tmp_path / "b.spz", cloud, spz_version=1)
+    cloud.means[3, 1] = 1e7
+    with pytest.raises(ValueError, match=r"one is at 1e[+]07"):
+        export_cloud(tmp_path / "b.spz", cloud)
+    with pytest.raises(ValueError, match="`spz_version` to be 1, 2, 3 or 4, but got 5"):
+        export_cloud(tmp_path / "b.spz", cloud, spz_version=5)
+    assert [path.name for path in tmp_path.iterdir()] == ["a.spz"]
+
+
+def test_wherever_a_splat_is_expected(tmp_path):
+    convert(FILES / "scene.ply", tmp_path / "A.SPZ".lower())
+    assert len(Scene(ply=tmp_path / "a.spz").cloud()) == 12
+    (tmp_path / "a.spz").rename(tmp_path / "A.SPZ")
+    assert len(read_gaussians(tmp_path / "A.SPZ")) == 12
+
+
+def _body(change=lambda head: None, version=3, degree=0):
+    """A file of two Gaussians with a changed header, uncompressed."""
+    data = encode_spz(varied_cloud(2, degree=degree), version)
+    data = bytearray(data if version == 4 else gzip.decompress(data))
+    change(data)
+    return bytes(data)
+
+
+def _put(place, kind, value):
+    return lambda data: struct.pack_into(kind, data, place, value)
+
+
+def test_flags_and_extensions_are_told(tmp_path):
+    path = tmp_path / "a.spz"
+    path.write_bytes(gzip.compress(_body(_put(14, "B", 1))))
+    with pytest.warns(UserWarning, match="trained with antialiasing"):
+        read_gaussians(path)
+    axes = struct.Struct("<IIIIII")  # an extension that is not known, and that of the axes
+    for number, good in (
+        (6, True),
+        (4, True),
+        (0, True),
+        (8, False),
+        (3, False),
+        (12, True),
+        (16, False),
+        (9, True),
+        (10, False),
+    ):
+        extensions = axes.pack(7, 4, 0, 0xADBE0003, 4, number)
+        path.write_bytes(gzip.compress(_body(_put(14, "B", 2)) + extensions))
+        if good:
+            assert len(read_gaussians(path)) == 2
+        else:
+            with pytest.raises(ValueError, match=rf"left-handed axes \(number {number}\)"):
+                read_gaussians(path)
+    data = _body(_put(14, "B", 2), version=4)
+    struct.pack_into("<I", longer := bytearray(data), 16, 32 + axes.size)
+    path.write_bytes(longer[:32] + axes.pack(7, 4, 0, 0xADBE0003, 4, 8) + longer[32:])
+    with pytest.raises(ValueError, match="left-handed"):
+        read_gaussians(path)
+
+
+def test_harmonics_of_degree_4(tmp_path):
+    """What is above degree 3 is left out, with a warning."""
+    cloud = varied_cloud(2, degree=3)
+    data = bytearray(gzip.decompress(encode_spz(cloud)))
+    data[12] = 4
+    rest = np.frombuffer(bytes(data[-90:]), "u1").reshape(2, 45)
+    wider = np.concatenate([rest, np.full((2, 27), 7, "u1")], axis=1)
+    (tmp_path / "a.spz").write_bytes(gzip.compress(bytes(data[:-90]) + wider.tobytes()))
+    with pytest.warns(UserWarning, match="ignored the harmonics of degree 4"):
+        found = read_gaussians(tmp_path / "a.spz")
+    torch.testing.assert_close(found.sh, cloud.sh, rtol=0, atol=0.1)
+
+
+@pytest.mark.parametrize(
+    ("data", "message"),
+    [
+        (b"", "starts neither as gzip nor with `NGSP`"),
+        (b"ply\n", "starts neither as gzip nor with `NGSP`"),
+        (b"\x1f\x8b", "16 bytes are announced, but 0 follow"),
+        (b"\x1f\x8b" + bytes(40), "cannot be decompressed"),
+        (gzip.compress(b"NGSP"), "16 bytes are announced, but 4 follow"),
+        (gzip.compress(_body()[:-3]), "40 bytes are announced, but 37 follow"),
+        (gzip.compress(_body())[:-20], "truncated"),
+        (gzip.compress(bytes(60)), "not an .spz file of version 1 to 4"),
+        (gzip.compress(_body(_put(4, "<I", 9))), "not an .spz file of version 1 to 4"),
+        (gzip.compress(_body(_put(8, "<I", 0))), "zero Gaussians"),
+        (gzip.compress(_body(_put(8, "<I", 2**32 - 1))), "announces 4,294,967,295 Gaussians, far more than its"),
+        (gzip.compress(_body(_put(8, "<I", 2_000_000))), "40,000,000 bytes are announced, but 40 follow"),
+        (gzip.compress(_body(_put(12, "B", 5))), "harmonics of degree 5, but they end at 4"),
+        (_body(), "of version 3, but not compressed by gzip"),
+        (_body(version=4)[:20], "32 bytes are announced, but 20 follow"),
+        (_body(version=4)[:60], "broken table of 5 streams at byte 32"),
+        (_body(version=4)[:-4], "stream 4 does not fit its table"),
+        (_body(_put(15, "B", 6), version=4), "broken table of 6 streams"),
+        (_body(_put(16, "<I", 8), version=4), "broken table of 5 streams at byte 8"),
+        (_body(_put(16, "<I", 2**32 - 1), version=4), "broken table of 5 streams"),
+        (_body(_put(40, "<Q", 19), version=4), "stream 0 does not fit its table"),
+        (_body(_put(32, "<Q", 2**63), version=4), "stream 0 does not fit its table"),
+        (_body(_put(112, "<I", 0), version=4), "stream 0 cannot be decompressed"),
+        (_body(_put(8, "<I", 2**32 - 1), version=4), "announces 4,294,967,295 Gaussians"),
+    ],
+)
+def test_bad_files(data, message, tmp_path):
+    path = tmp_path / "bad.spz"
+    path.write_bytes(data)
+    with pytest.raises(ValueError, match=r"bad\.spz") as caught:
+        read_gaussians(path)
+    assert message in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+def test_no_more_is_decompressed_than_announced(tmp_path):
+    """A few bytes of gzip or Zstandard can stand for gigabytes."""
+    (tmp_path / "a.spz").write_bytes(gzip.compress(_body() + bytes(1 << 26)))
+    data = _body(version=4)
+    bomb = needs_zstandard.ZstdCompressor().compress(bytes(1 << 26))
+    struct.pack_into("<Q", longer := bytearray(data), 32, len(bomb))
+    old = struct.unpack_from("<Q", data, 32)[0]
+    (tmp_path / "b.spz").write_bytes(longer[:112] + bomb + longer[112 + old :])
+    for name in ("a.spz", "b.spz"):
+        tracemalloc.start()
+        assert len(read_gaussians(tmp_path / name)) == 2
+        assert tracemalloc.get_traced_memory()[1] < 1 << 22
+        tracemalloc.stop()
+
+
+def test_values_that_cannot_be_used(tmp_path):
+    """Half precision of version 1 can hold what is not a number; what a run leaves behind is left out on writing."""
+    data = bytearray(gzip.decompress(encode_spz(varied_cloud(2, degree=0), 1)))
+    data[16:18] = np.float16([np.nan]).tobytes()
+    (tmp_path / "a.spz").write_bytes(gzip.compress(bytes(data)))
+    with pytest.raises(ValueError, match=r"`means` is NaN or infinite for 1 of 2 Gaussians, first at index 0; remove"):
+        read_gaussians(tmp_path / "a.spz")
+    cloud = varied_cloud(20)
+    cloud.means[3, 0], cloud.sh[4, 0, 0], cloud.opacities[5] = math.nan, math.inf, math.inf
+    with pytest.warns(UserWarning, match="left out 2 of 20"):
+        export_cloud(tmp_path / "b.spz", cloud)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        found = read_gaussians(tmp_path / "b.spz")
+    assert len(found) == 18
+    assert float(found.opacities.max()) == pytest.approx(math.log(509), abs=1e-4)
+
+
+def test_without_zstandard_is_one_sentence(tmp_path, monkeypatch):
+    import sys
+
+    monkeypatch.setitem(sys.modules, "zstandard", None)
+    with pytest.raises(ImportError, match=r"zstandard: run pip install 'gaussian-swaying\[spz\]', or choose version 3"):
+        export_cloud(tmp_path / "a.spz", varied_cloud(4), spz_version=4)
+    with pytest.raises(ImportError, match=r"scene_v4\.spz is of version 4 of SPZ and needs zstandard: run pip"):
+        read_gaussians(FILES / "scene_v4.spz")
+    export_cloud(tmp_path / "b.spz", varied_cloud(4))
+    assert [path.name for path in tmp_path.iterdir()] == ["b.spz"]

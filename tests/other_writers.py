@@ -1,0 +1,47 @@
+"""One small scene in files that another program wrote, and how far two clouds may differ."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import torch
+
+from gaussian_swaying.gaussians.harmonics import rotate_sh
+from gaussian_swaying.gaussians.ply import read_ply
+from gaussian_swaying.geometry.rotations import quat_to_rotation, rotation_to_quat
+
+FILES = Path(__file__).parent / "gaussians" / "files"
+
+
+def scene():
+    """The Gaussians of all files there."""
+    return read_ply(FILES / "scene.ply")
+
+
+def turned(cloud, rotation):
+    """The cloud after a rotation (3, 3) about the origin."""
+    return replace(
+        cloud,
+        means=cloud.means @ rotation.T,
+        quats=rotation_to_quat(rotation @ quat_to_rotation(cloud.quats)),
+        sh=rotate_sh(cloud.sh, rotation),
+    )
+
+
+def angle(a, b):
+    """Largest angle between the axes of two clouds [radians]; half a turn about an axis changes no Gaussian."""
+    a, b = (quat_to_rotation(cloud.quats.double()) for cloud in (a, b))
+    return float(2 * rotation_to_quat(a.mT @ b).abs().amax(-1).clamp(max=1).acos().max())
+
+
+def assert_close(found, expected, *, means, scales, opacities, colors, sh, quats):
+    """Each field within a tolerance: opacities from 0 to 1, harmonics of degree 0 and above, an angle."""
+    assert found.sh.shape == expected.sh.shape
+    for name, a, b, atol in (
+        ("means", found.means, expected.means, means),
+        ("scales", found.scales, expected.scales, scales),
+        ("opacities", found.opacities.sigmoid(), expected.opacities.sigmoid(), opacities),
+        ("colors", found.sh[:, :1], expected.sh[:, :1], colors),
+        ("sh", found.sh[:, 1:], expected.sh[:, 1:], sh),
+    ):
+        torch.testing.assert_close(a, b, rtol=0, atol=atol, msg=lambda text, name=name: f"{name}: {text}")
+    assert angle(found, expected) < quats
