@@ -74,6 +74,8 @@ class _Translator(Emitter):
     """Names of the module of the function that is carried out."""
     _line = 1
     """Line of its statement."""
+    _leave: Any = None
+    """The block behind the kernel, where it may end now: outside of its loops and of the functions that it calls."""
 
     def kernel(self, kernel: Any, constants: dict[str, Any], arguments: dict[str, str]) -> ir.Module:
         number = TYPES["i64"]
@@ -88,20 +90,26 @@ class _Translator(Emitter):
         scope: Scope = {name: _plain(value) for name, value in constants.items()}
         for k, (name, what) in enumerate(arguments.items()):
             scope[name] = self._argument(rows, 3 + k, what)
+        begin = self._place(first)
         before = self.builder.block
         head = function.append_basic_block("program")
         body = function.append_basic_block("body")
         end = function.append_basic_block("end")
         self.builder.branch(head)
         self.builder.position_at_end(head)
-        program = self.builder.phi(number)
-        program.add_incoming(first, before)
+        program, *place = (self.builder.phi(number) for _ in range(4))
+        for phi, value in zip((program, *place), (first, *begin), strict=True):
+            phi.add_incoming(value, before)
         self.builder.cbranch(self.builder.icmp_signed("<", program, last), body, end)
         self.builder.position_at_end(body)
-        self._program = self._ids(program)
-        self._call(kernel, (), scope)
-        following = self.builder.add(program, number(1))
-        program.add_incoming(following, self.builder.block)
+        self._program = [self.convert(Block(each, "i64"), "i32") for each in place]
+        leave = function.append_basic_block("leave")
+        self._call(kernel, (), scope, leave)
+        self.builder.branch(leave)
+        self.builder.position_at_end(leave)
+        following = [self.builder.add(program, number(1)), *self._next(place)]
+        for phi, value in zip((program, *place), following, strict=True):
+            phi.add_incoming(value, self.builder.block)
         self.builder.branch(head)
         self.builder.position_at_end(end)
         self.builder.ret_void()
@@ -119,17 +127,26 @@ class _Translator(Emitter):
             return self.convert(Block(self._slot(rows, k, TYPES["f64"]), "f64"), self.real)
         return self.convert(Block(self._slot(rows, k, TYPES["i64"]), "i64"), "i32" if what == "i" else "i64")
 
-    def _ids(self, program: Any) -> list[Block]:
+    def _place(self, program: Any) -> list[Any]:
         """The three numbers of a program from its number in the grid; the first one changes fastest."""
         b, (x, y, _) = self.builder, self._grid
         rest = b.sdiv(program, x.value)
-        places = [b.srem(program, x.value), b.srem(rest, y.value), b.sdiv(rest, y.value)]
-        return [self.convert(Block(place, "i64"), "i32") for place in places]
+        return [b.srem(program, x.value), b.srem(rest, y.value), b.sdiv(rest, y.value)]
+
+    def _next(self, place: list[Any]) -> list[Any]:
+        """The three numbers of the next program."""
+        b, one, zero = self.builder, TYPES["i64"](1), TYPES["i64"](0)
+        full, following = None, []
+        for number, count in zip(place, self._grid, strict=True):
+            moved = b.add(number, one) if full is None else b.add(number, b.zext(full, TYPES["i64"]))
+            full = b.icmp_signed("==", moved, count.value)
+            following.append(b.select(full, zero, moved))
+        return following
 
     # ---- functions
 
-    def _call(self, function: Any, arguments: tuple[Value, ...], named: Scope) -> Value:
-        """Carry out a function of the language."""
+    def _call(self, function: Any, arguments: tuple[Value, ...], named: Scope, leave: Any = None) -> Value:
+        """Carry out a function of the language, which may branch to the block ``leave``."""
         tree, names, defaults, constant = _source(function)
         scope: Scope = dict(zip(names, arguments, strict=False))
         for name, value in named.items():
@@ -143,8 +160,8 @@ class _Translator(Emitter):
                 scope[name] = defaults[name]
             if name in constant and isinstance(scope[name], Block):
                 raise TranslationError(f"{name} of {function.fn.__name__} is no constant")
-        outer = self._globals, self._line
-        self._globals = function.fn.__globals__
+        outer = self._globals, self._line, self._leave
+        self._globals, self._leave = function.fn.__globals__, leave
         try:
             found = self._run(tree.body, scope)
         except TranslationError as error:
@@ -153,7 +170,7 @@ class _Translator(Emitter):
                 error.args = (f"{function.fn.__module__}.{function.fn.__name__}, near line {self._line}: {error}",)
             raise
         finally:
-            self._globals, self._line = outer
+            self._globals, self._line, self._leave = outer
         return None if found is None else found.value
 
     # ---- statements
@@ -216,9 +233,22 @@ class _Translator(Emitter):
         for block, body in ((yes, node.body), (no, node.orelse)):
             b.position_at_end(block)
             inner = dict(scope)
-            if self._run(body, inner) is not None:
+            found = self._run(body, inner)
+            if found is None:
+                ends.append((inner, b.block))
+            elif found.value is None and self._leave is not None:
+                b.branch(self._leave)
+            else:
                 raise TranslationError("cannot return under a condition that is not constant")
-            ends.append((inner, b.block))
+        if not ends:
+            b.position_at_end(after)
+            return _Returned(None)
+        if len(ends) == 1:
+            b.position_at_end(ends[0][1])
+            b.branch(after)
+            b.position_at_end(after)
+            scope |= ends[0][0]
+            return None
         (first, here), (second, there) = ends
         pairs = {name: (first[name], second[name]) for name in sorted(names) if name in first and name in second}
         kinds = {name: self._join(*pair) for name, pair in pairs.items()}
@@ -279,6 +309,7 @@ class _Translator(Emitter):
 
     def _repeat(self, names: set[str], more: Callable[[], Block], body: Callable[[Scope], None], scope: Scope) -> None:
         """A loop; what it changes is kept in memory, which LLVM turns into registers."""
+        leave, self._leave = self._leave, None
         kinds = self._kinds_in_loop(sorted(names & scope.keys()), body, scope)
         places = {}
         for name, kind in kinds.items():
@@ -298,6 +329,7 @@ class _Translator(Emitter):
             self._keep(places[name], self._fit(inner[name], kind))
         b.branch(head)
         b.position_at_end(after)
+        self._leave = leave
         for name, kind in kinds.items():
             scope[name] = self._kept(places[name], kind)
 

@@ -45,6 +45,34 @@ def test_a_branch_may_change_the_type_of_a_number():
 
 
 @triton.jit
+def _ends_early(x_in, out, KEEP: tl.constexpr):
+    k = tl.program_id(0)
+    x = tl.load(x_in + k)
+    if KEEP and x < 0:
+        x = -x
+        tl.store(out + k, x)
+        return
+    if x > 10:
+        x = 10.0
+    else:
+        x += 1
+        if x > 5:
+            if x > 7:
+                tl.store(out + k, 8)
+                return
+            else:
+                return
+    tl.store(out + k, x + 100)
+
+
+@pytest.mark.parametrize("keep", [True, False])
+def test_a_kernel_may_end_under_a_condition(keep):
+    x, out = torch.tensor([-3.0, 1.0, 20.0, 7.0, 6.0, 2.0]), torch.zeros(6)
+    launch(_ends_early, (6,))(x, out, KEEP=keep)
+    assert out.tolist() == [3.0 if keep else 98.0, 102.0, 110.0, 8.0, 0.0, 103.0]
+
+
+@triton.jit
 def _lanes_in_a_branch(x_in, out, n, BLOCK: tl.constexpr):
     lane = tl.arange(0, BLOCK)
     x = tl.zeros([BLOCK], tl.float32)
@@ -329,8 +357,15 @@ def _unknown_operation(out):
 @triton.jit
 def _returns_under_a_condition(out):
     if tl.load(out) > 0:
-        return
+        return 1
     tl.store(out, 1.0)
+
+
+@triton.jit
+def _returns_within_a_loop(out):
+    for _k in range(tl.load(out).to(tl.int32)):
+        if tl.load(out) > 1:
+            return
 
 
 @triton.jit
@@ -411,6 +446,7 @@ def _with(out):
         (_unknown_name, "`nowhere` is not known here"),
         (_unknown_operation, "no operation MatMult"),
         (_returns_under_a_condition, "cannot return under a condition that is not constant"),
+        (_returns_within_a_loop, "cannot return under a condition that is not constant"),
         (_returns_from_a_loop, "cannot return from a loop"),
         (_condition_of_lanes, "a condition must be one number"),
         (_unpacks, "cannot unpack .* into 2 names"),

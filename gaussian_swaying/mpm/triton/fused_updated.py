@@ -19,8 +19,11 @@ from gaussian_swaying.mpm.triton.obstacles import Solids, solids_of
 SHARES = 16
 """Shares of the particles that are added to grids of their own on a CPU; the sums depend on it."""
 
-CHUNK = 1024
-"""Nodes on which a program sums the grids of the shares."""
+SPAN = 8
+"""Nodes of a span: whether it is empty is noted, on a CPU."""
+
+CHUNK = 256
+"""Spans on which a program sums the grids of the shares."""
 
 LEAST, MOST = 4, 64
 """Fewest and most substeps between two sorts of the particles by cell."""
@@ -67,7 +70,7 @@ class FusedUpdated(Fused):
         self.parts = torch.zeros(many, kernels.PART.value, **self.like)
         self.part_node = torch.zeros(many, dtype=torch.int32, device=self.device)
         self.windows = torch.zeros(0, **self.like)
-        self.ranges = torch.zeros(SHARES, 2, dtype=torch.int32, device=self.device)
+        self.marks, self.occupied = (torch.zeros(0, dtype=torch.int8, device=self.device) for _ in range(2))
         self.pressed = torch.zeros(0, dtype=torch.float64, device=self.device)
 
     def _take_values(self, values: Tensor) -> None:
@@ -82,7 +85,7 @@ class FusedUpdated(Fused):
     @property
     def node_block(self) -> int:
         """Nodes of a program."""
-        return lanes(self.device, 256)
+        return lanes(self.device, 256, SPAN)
 
     @property
     def launches(self) -> bool:
@@ -101,7 +104,10 @@ class FusedUpdated(Fused):
                 self.momentum = torch.zeros(room, width, **self.like)
                 self.velocity = torch.zeros(room, 4, **self.like)
                 self.inverse_mass, self.weight = (torch.zeros(held, **self.like) for _ in range(2))
-                self.windows = torch.empty(0 if self.atomic else SHARES * room * width, **self.like)
+                spans = 0 if self.atomic else -(-room // SPAN)
+                self.windows = torch.empty(SHARES * spans * SPAN * width, **self.like)
+                self.marks = torch.zeros(spans * SHARES, dtype=torch.int8, device=self.device)
+                self.occupied = torch.zeros(spans, dtype=torch.int8, device=self.device)
                 programs = -(-room // self.node_block) if self.solids.parts else 0
                 self.pressed = torch.zeros(programs, *self.impulse.reshape(-1, 3).shape, dtype=torch.float64).to(
                     self.device
@@ -209,6 +215,7 @@ class FusedUpdated(Fused):
     def _load(self, state: MPMState) -> None:
         """Sort the particles by cell and copy their fields to the buffers."""
         self.momentum.zero_()  # an interrupted part may have left values
+        self.marks.zero_()
         self.order.copy_(torch.argsort(self._keys(state.position.reshape(-1, 3), given=True), stable=not self.atomic))
         block = lanes(self.device, 128)
         programs = (-(-self.count // block),)
@@ -258,32 +265,29 @@ class FusedUpdated(Fused):
 
     def _scatter(self, implicit: bool) -> None:
         """Add the particles to the grid in a fixed order, whatever the number of threads."""
-        nodes, width, dx, mls = (
-            self.grid.node_count * self.scenes,
-            self.momentum.shape[1],
-            self.grid.dx,
-            self.settings.mls,
-        )
+        nodes, width, dx = self.grid.node_count * self.scenes, self.momentum.shape[1], self.grid.dx
         _, ny, nz = self.grid.resolution
+        spans = -(-nodes // SPAN)
         launch(kernels.updated_scatter, (SHARES,))(
-            self.parts, self.part_node, self.windows, self.ranges, self.count, nodes, SHARES, ny * nz, nz, dx, 1 / dx,
-            MLS=mls, IMPLICIT=implicit, WIDTH=width, BLOCK=LANES,
+            self.parts, self.part_node, self.windows, self.marks, self.count, spans, ny * nz, nz, dx, 1 / dx,
+            SHARES=SHARES, SPAN=SPAN, MLS=self.settings.mls, IMPLICIT=implicit, WIDTH=width, BLOCK=LANES,
         )  # fmt: skip
-        launch(kernels.updated_join, (-(-nodes // CHUNK),))(
-            self.windows, self.ranges, self.momentum, nodes, SHARES, CHUNK=CHUNK, WIDTH=width, BLOCK=LANES
-        )
+        launch(kernels.updated_join, (-(-spans // CHUNK),))(
+            self.windows, self.marks, self.occupied, self.momentum, nodes, spans,
+            SHARES=SHARES, SPAN=SPAN, CHUNK=CHUNK, WIDTH=width,
+        )  # fmt: skip
 
     def _nodes(self, offset: int, options: dict[str, Any]) -> None:
         nodes = self.grid.node_count * self.scenes
         block = self.node_block
         acting, (_, ny, nz), solids = self._acting, self.grid.resolution, self.solids
         launch(kernels.updated_nodes, (-(-nodes // block),))(
-            self.momentum, self.velocity, self.inverse_mass, nodes, self.schedule, self.first_step, offset,
-            *self.gravity, solids.rows, solids.windows, solids.poses, solids.tables.buffer, self.clock,
+            self.momentum, self.velocity, self.inverse_mass, self.occupied, nodes, self.schedule, self.first_step,
+            offset, *self.gravity, solids.rows, solids.windows, solids.poses, solids.tables.buffer, self.clock,
             self.pressed, len(self.impulse.reshape(-1, 3)), *self.grid.offset, ny, nz, self.grid.dx,
             IMPLICIT=options["IMPLICIT"], WIDTH=self.momentum.shape[1], KEEP=acting,
-            SOLIDS=solids.twins, KINDS=solids.kinds, MOVES=solids.moves, MOVING=any(solids.moves), BLOCK=block,
-            num_warps=4,
+            SOLIDS=solids.twins, KINDS=solids.kinds, MOVES=solids.moves, MOVING=any(solids.moves),
+            SPARSE=not (self.atomic or acting), BLOCK=block, num_warps=4,
         )  # fmt: skip
         if acting:
             self._constrain()

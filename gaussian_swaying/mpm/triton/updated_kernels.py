@@ -309,39 +309,36 @@ def updated_particles(
 
 @triton.jit(do_not_specialize=VARIES)
 def updated_scatter(
-    parts, part_node, windows, ranges, count, nodes, shares, sx, sy, dx, inverse_dx,
-    MLS: tl.constexpr, IMPLICIT: tl.constexpr, WIDTH: tl.constexpr, BLOCK: tl.constexpr,
+    parts, part_node, windows, marks, count, spans, sx, sy, dx, inverse_dx,
+    SHARES: tl.constexpr, SPAN: tl.constexpr, MLS: tl.constexpr, IMPLICIT: tl.constexpr, WIDTH: tl.constexpr,
+    BLOCK: tl.constexpr,
 ):  # fmt: skip
     """``updated``, on a CPU: the sums of a share of the particles, in their order, on a grid of the share's own.
 
     A row of ``parts``: momentum and mass (4), three columns of the factor of w (x_i - x_p) and three of that of the
-    gradient of w, each filled up to four; resistance, and the place of the particle in its cell (3). ``ranges`` become
-    the first and the last node that a share adds to; only those are set to zero before.
+    gradient of w, each filled up to four; resistance, and the place of the particle in its cell (3). ``marks``
+    (spans, SHARES) become 1 where a share adds to one of the SPAN nodes of a span, which are then set to zero before.
     """
     share = tl.program_id(0)
-    begin = share * count // shares
-    end = (share + 1) * count // shares
+    begin = share * count // SHARES
+    end = (share + 1) * count // SHARES
     lane = tl.arange(0, BLOCK)
-    low = tl.full([BLOCK], 2147483647, tl.int32)
-    high = tl.full([BLOCK], -1, tl.int32)
-    for first in range(begin, end, BLOCK):
-        node = tl.load(part_node + first + lane, first + lane < end, -1)
-        low = tl.where(node >= 0, tl.minimum(low, node), low)
-        high = tl.maximum(high, node)
-    start = tl.min(low)
-    stop = tl.max(high) + 2 * (sx + sy + 1)
-    if tl.max(high) < 0:
-        start = 0
-        stop = -1
-    tl.store(ranges + 2 * share, start)
-    tl.store(ranges + 2 * share + 1, stop)
-    window = windows + share.to(tl.int64) * nodes * WIDTH
-    for first in range(start * WIDTH, (stop + 1) * WIDTH, BLOCK):
-        tl.store(window + first + lane, tl.zeros([BLOCK], tl.float32), first + lane < (stop + 1) * WIDTH)
+    window = windows + share.to(tl.int64) * spans * SPAN * WIDTH
     column = tl.arange(0, 4)
+    before = -1
     for p in range(begin, end):
         node = tl.load(part_node + p)
         if node >= 0:
+            if node != before:
+                for i in range(3):
+                    for j in range(3):
+                        for side in tl.static_range(2):
+                            span = (node + i * sx + j * sy + 2 * side) // SPAN
+                            if tl.load(marks + span * SHARES + share) == 0:
+                                tl.store(marks + span * SHARES + share, 1)
+                                for first in range(span * SPAN * WIDTH, (span + 1) * SPAN * WIDTH, BLOCK):
+                                    tl.store(window + first + lane, tl.zeros([BLOCK], tl.float32))
+            before = node
             row = parts + p * PART
             value = tl.load(row + column)
             m0 = tl.load(row + 4 + column)
@@ -377,36 +374,47 @@ def updated_scatter(
 
 @triton.jit(do_not_specialize=VARIES)
 def updated_join(
-    windows, ranges, momentum, nodes, shares, CHUNK: tl.constexpr, WIDTH: tl.constexpr, BLOCK: tl.constexpr
-):
-    """``updated``, on a CPU: the sums of all shares, in order, on some nodes."""
+    windows, marks, occupied, momentum, nodes, spans,
+    SHARES: tl.constexpr, SPAN: tl.constexpr, CHUNK: tl.constexpr, WIDTH: tl.constexpr,
+):  # fmt: skip
+    """``updated``, on a CPU: the sums of all shares, in order, on the nodes of CHUNK spans.
+
+    ``occupied`` (spans,) becomes 1 where there are any; ``marks`` are set back to zero.
+    """
     first = tl.program_id(0) * CHUNK
-    last = tl.minimum(first + CHUNK, nodes) - 1
-    lane = tl.arange(0, BLOCK)
-    for share in range(0, shares):
-        low = tl.maximum(tl.load(ranges + 2 * share), first) * WIDTH
-        high = (tl.minimum(tl.load(ranges + 2 * share + 1), last) + 1) * WIDTH
-        window = windows + share.to(tl.int64) * nodes * WIDTH
-        for begin in range(low, high, BLOCK):
-            at = begin + lane
-            mask = at < high
-            tl.store(momentum + at, tl.load(momentum + at, mask, 0.0) + tl.load(window + at, mask, 0.0), mask)
+    lane = tl.arange(0, SPAN * WIDTH)
+    every = tl.arange(0, SHARES)
+    for span in range(first, tl.minimum(first + CHUNK, spans)):
+        own = marks + span * SHARES
+        some = tl.max(tl.load(own + every))
+        tl.store(occupied + span, some)
+        if some > 0:
+            at = span * SPAN * WIDTH + lane
+            total = tl.zeros([SPAN * WIDTH], tl.float32)
+            for share in range(0, SHARES):
+                if tl.load(own + share) > 0:
+                    total += tl.load(windows + share.to(tl.int64) * spans * SPAN * WIDTH + at)
+            tl.store(momentum + at, total, at < nodes * WIDTH)
+            tl.store(own + every, tl.zeros([SHARES], tl.int8))
 
 
 @triton.jit(do_not_specialize=VARIES)
 def updated_nodes(
-    momentum, velocity, inverse_mass, nodes, schedule, first_step, step_offset,
+    momentum, velocity, inverse_mass, occupied, nodes, schedule, first_step, step_offset,
     gravity_x, gravity_y, gravity_z, solids, windows, poses, numbers, clock, impulse, boundaries,
     ox, oy, oz, ny, nz, dx,
     IMPLICIT: tl.constexpr, WIDTH: tl.constexpr, KEEP: tl.constexpr, SOLIDS: tl.constexpr, KINDS: tl.constexpr,
-    MOVES: tl.constexpr, MOVING: tl.constexpr, BLOCK: tl.constexpr,
+    MOVES: tl.constexpr, MOVING: tl.constexpr, SPARSE: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
-    """``updated``: nodal velocities from momenta and masses, which are set back to zero; KEEP for boundaries.
+    """``updated``: nodal velocities from momenta and masses, set back to zero unless SPARSE; KEEP for boundaries.
 
     All SOLIDS are applied here, in order; see :mod:`~gaussian_swaying.mpm.triton.obstacle_kernels`. KINDS and MOVES say
     of each how it stops and whether it moves. With MOVING there are poses for every substep. ``clock`` has the time at
     step 0 and the substep [s], float64; ``impulse`` (programs, B, 3) collects the reaction impulses, float64.
+    With SPARSE the velocities of programs that are not ``occupied`` stay as they are: no particle is near.
     """
+    if SPARSE and tl.load(occupied + tl.program_id(0)) == 0:
+        return
     step = tl.load(first_step) + step_offset
     kick = tl.load(schedule + (step + 1) * 4)
     decay = tl.load(schedule + (step + 1) * 4 + 2)
@@ -452,10 +460,11 @@ def updated_nodes(
     store3(velocity, 1, k * 4, v, mask)
     if KEEP:
         tl.store(inverse_mass + k, inverse, mask)
-    zero = mass * 0
-    used = mask & (mass != 0)
-    for c in tl.static_range(WIDTH):
-        tl.store(row + c, zero, used)
+    if not SPARSE:
+        zero = mass * 0
+        used = mask & (mass != 0)
+        for c in tl.static_range(WIDTH):
+            tl.store(row + c, zero, used)
 
 
 @triton.jit(do_not_specialize=VARIES)

@@ -54,6 +54,29 @@ def test_nothing_is_recorded_that_has_not_run(kernel_device):
     assert solver.fused().repeater._graphs
 
 
+def test_nodes_far_from_all_particles_cost_nothing(kernel_device):
+    """On a CPU ``updated`` leaves them alone, wherever the body goes, and reads none of them."""
+    if kernel_device.type == "cuda":
+        pytest.skip("a GPU visits all nodes")
+    points = make_points(kernel_device, count=12)
+    ends = []
+    for poison in (0.0, float("nan")):
+        solver = make_solver("kernels", "updated")
+        state = set_going(solver, points)
+        state = solver.rollout(state.replace(velocity=state.velocity + 3.0), DT, 1)
+        fused = solver.fused()
+        fused.velocity.fill_(poison)
+        begin = state.position
+        for _ in range(3):
+            state = solver.rollout(state, DT, 40)
+        ends.append(state)
+    left = fused.velocity[: state.grid.node_count, :3].isnan().any(-1)
+    assert 0.3 < left.float().mean() < 1
+    assert float((state.position - begin).abs().max()) > 2 * DX
+    for first, other in zip(*([end.position, end.velocity, end.affine] for end in ends), strict=True):
+        assert torch.equal(first, other)
+
+
 @pytest.mark.parametrize("formulation", FORMULATIONS)
 def test_patches_that_change_in_place(kernel_device, formulation):
     points = make_points(kernel_device, count=12)
