@@ -62,12 +62,28 @@ def read_json(path: str | os.PathLike[str], what: str, largest: int = LARGEST_JS
             contains a whole number of more than 32 digits.
     """
     try:
-        text = check_regular(path, f"the {what}", largest).read_text(encoding="utf-8")
-        return json.loads(text, parse_int=_whole)
+        content = check_regular(path, f"the {what}", largest).read_bytes()
     except FileNotFoundError as error:
         raise ValueError(f"Cannot read the {what} `{path}` (no such file): check the path.") from error
     except OSError as error:
         raise ValueError(f"Cannot read the {what} `{path}` ({error.strerror or error}): check the path.") from error
+    return parse_json(content, what, path)
+
+
+def parse_json(content: bytes, what: str, path: str | os.PathLike[str]) -> Any:
+    """Parse JSON from a file or a part of one.
+
+    Args:
+        content: The JSON.
+        what: Name of the file in the message.
+        path: The file, for the message.
+
+    Raises:
+        ValueError: If it is not UTF-8 or not JSON, is nested too deeply, or contains a whole number of more than 32
+            digits.
+    """
+    try:
+        return json.loads(content.decode(), parse_int=_whole)
     except (json.JSONDecodeError, UnicodeDecodeError) as error:
         raise ValueError(f"The {what} `{path}` is not valid JSON ({error}): export it again.") from error
     except RecursionError as error:

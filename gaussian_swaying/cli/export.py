@@ -43,12 +43,13 @@ def build_options() -> argparse.ArgumentParser:
         nargs=3,
         type=float,
         metavar=("X", "Y", "Z"),
-        help="Direction in the scene that points up, for USD; default: that of the run that wrote the source, or z.",
+        help="Direction in the scene that points up, for USD and glTF; default: that of the run that wrote the source,"
+        " or z.",
     )
     parser.add_argument(
         "--metres-per-unit",
         type=float,
-        help="Length of a scene unit [m], for USD; default: that of the run that wrote the source, or 1.",
+        help="Length of a scene unit [m], for USD and glTF; default: that of the run that wrote the source, or 1.",
     )
     parser.add_argument(
         "--spz-version",
@@ -67,8 +68,8 @@ def run_of(source: Path) -> Path | None:
     return None
 
 
-def usd_settings(options: argparse.Namespace) -> tuple[float, SimFrame, str]:
-    """Frames per second, frame and the source of both, for a USD file.
+def placement(options: argparse.Namespace) -> tuple[float, SimFrame, str]:
+    """Frames per second, frame and the source of both, for a USD or glTF file.
 
     Raises:
         ValueError: If an option is bad, or the summary of the run cannot be read.
@@ -115,15 +116,15 @@ def export(options: argparse.Namespace) -> None:
     format = format_of(options.target)
     if format != "spz" and options.spz_version is not None:
         raise ValueError("--spz-version is only for .spz files: leave it out.")
-    if format != "usd":
+    if format not in ("usd", "glb"):
         if options.up is not None or options.metres_per_unit is not None:
             raise ValueError(
-                "--up and --metres-per-unit are only for USD files, as other formats have no up direction: leave them "
-                "out, or use a target that ends in .usdc."
+                "--up and --metres-per-unit are only for USD and glTF, as other formats have no up direction: leave "
+                "them out, or use a target that ends in .usdc or .glb."
             )
         convert(options.source, options.target, spz_version=options.spz_version or 3)
     else:
-        fps, frame, origin = usd_settings(options)
+        fps, frame, origin = placement(options)
         convert(options.source, options.target, fps, frame.metres_per_unit, frame.rotation)
         up = [round(v, 3) + 0.0 for v in frame.rotation[2].tolist()]
         print(f"up {up}, 1 scene unit = {frame.metres_per_unit:.6g} m ({origin})")

@@ -19,6 +19,7 @@ from gaussian_swaying._checks import check_choice, check_positive
 from gaussian_swaying._files import atomic
 from gaussian_swaying.gaussians.cloud import GaussianCloud
 from gaussian_swaying.gaussians.formats import read_gaussians
+from gaussian_swaying.gaussians.gltf import encode_gltf
 from gaussian_swaying.gaussians.harmonics import sh_to_color
 from gaussian_swaying.gaussians.model import DeformedGaussians
 from gaussian_swaying.gaussians.ply import check_folder, write_ply
@@ -26,12 +27,13 @@ from gaussian_swaying.gaussians.spz import encode_spz
 from gaussian_swaying.geometry.patches import smallest_axis_normal
 from gaussian_swaying.geometry.rotations import quat_to_rotation
 
-Format = Literal["ply", "compressed_ply", "splat", "spz", "usd"]
+Format = Literal["ply", "compressed_ply", "splat", "spz", "glb", "usd"]
 SUFFIXES: dict[str, str] = {
     "ply": ".ply",
     "compressed_ply": ".compressed.ply",
     "splat": ".splat",
     "spz": ".spz",
+    "glb": ".glb",
     "usd": ".usdc",
 }
 """Formats, and the endings of their file names."""
@@ -84,6 +86,8 @@ def export_cloud(
     - ``splat``: antimatter15's format, through gsplat: 32 bytes for each Gaussian. Colours are those of harmonics of
       degree 0; no normals.
     - ``spz``: Niantic's format, see :func:`~gaussian_swaying.gaussians.spz.encode_spz`.
+    - ``glb``: glTF with ``KHR_gaussian_splatting``, in metres with y up, see
+      :func:`~gaussian_swaying.gaussians.gltf.encode_gltf`.
     - ``usd``: one frame, see :func:`write_usd`.
 
     Args:
@@ -91,8 +95,8 @@ def export_cloud(
         cloud: Gaussians to write, see :func:`cleaned`; also those of a frame of a simulation.
         format: One of the above; by default that of the name's ending, see :func:`format_of`.
         fps: Frames per second, for USD.
-        metres_per_unit: Length of a scene unit [m], for USD.
-        rotation: Rotation from scene directions to z up, shape (3, 3), for USD; the scene's z is up if None.
+        metres_per_unit: Length of a scene unit [m], for USD and glTF.
+        rotation: Rotation from scene directions to z up, shape (3, 3), for USD and glTF; the scene's z is up if None.
         spz_version: Version of SPZ.
 
     Raises:
@@ -114,7 +118,12 @@ def export_cloud(
     elif format == "ply":
         write_ply(path, kept)
     else:
-        content = encode_spz(kept, spz_version) if format == "spz" else _gsplat_bytes(path, kept, format)
+        if format == "spz":
+            content = encode_spz(kept, spz_version)
+        elif format == "glb":
+            content = encode_gltf(kept, rotation, metres_per_unit)
+        else:
+            content = _gsplat_bytes(path, kept, format)
         with atomic(path) as temporary:
             temporary.write_bytes(content)
 
@@ -150,8 +159,8 @@ def convert(
             .ply files, whose frames are sorted by name.
         target: File to write, see :func:`format_of`.
         fps: Frames per second of a folder.
-        metres_per_unit: Length of a scene unit [m], written to USD files.
-        rotation: Rotation from scene directions to z up, shape (3, 3), for USD; the scene's z is up if None.
+        metres_per_unit: Length of a scene unit [m], for USD and glTF.
+        rotation: Rotation from scene directions to z up, shape (3, 3), for USD and glTF; the scene's z is up if None.
         spz_version: Version of SPZ.
 
     Raises:

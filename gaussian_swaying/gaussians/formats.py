@@ -9,6 +9,7 @@ from pathlib import Path
 from gaussian_swaying._ply_table import read_header
 from gaussian_swaying.gaussians.cloud import GaussianCloud
 from gaussian_swaying.gaussians.compact import read_compressed_ply, read_splat
+from gaussian_swaying.gaussians.gltf import read_gltf
 from gaussian_swaying.gaussians.ply import read_ply
 from gaussian_swaying.gaussians.spz import read_spz
 
@@ -18,14 +19,20 @@ def _read_any_ply(path: Path) -> GaussianCloud:
     return read_compressed_ply(path) if "packed_position" in fields else read_ply(path)
 
 
-READERS: dict[str, Callable[[Path], GaussianCloud]] = {".ply": _read_any_ply, ".splat": read_splat, ".spz": read_spz}
+READERS: dict[str, Callable[[Path], GaussianCloud]] = {
+    ".ply": _read_any_ply,
+    ".splat": read_splat,
+    ".spz": read_spz,
+    ".glb": read_gltf,
+    ".gltf": read_gltf,
+}
 """Readers by the ending of a file's name."""
-READABLE = "3DGS or compressed .ply, .splat or .spz"
+READABLE = "3DGS or compressed .ply, .splat, .spz, or .glb or .gltf with KHR_gaussian_splatting"
 """The same, in words."""
 
 
 def read_gaussians(path: str | os.PathLike[str]) -> GaussianCloud:
-    """Read a splat in any supported format: 3DGS .ply, compressed .ply, .splat or .spz.
+    """Read a splat in any supported format: 3DGS .ply, compressed .ply, .splat, .spz or glTF.
 
     The ending of the name chooses the format; a file with any other ending is read as a .ply. The content tells whether
     a .ply is compressed.

@@ -74,12 +74,12 @@ class Frame:
         return painter.draw(gaussians, gaussians.colors, painter.camera_at(self.index, camera))
 
     def save(self, path: str | os.PathLike[str], format: str | None = None) -> None:
-        """Write the Gaussians of the frame as a splat, in scene units; USD in metres with z up.
+        """Write the Gaussians of the frame as a splat, in scene units; USD in metres with z up, glTF with y up.
 
         Args:
             path: File to write, such as 0001.ply; an existing one is replaced.
             format: As in :func:`~gaussian_swaying.gaussians.export.export_cloud`; by default that of the ending: .ply,
-                .compressed.ply, .splat, .spz, or .usdc, .usd and .usda.
+                .compressed.ply, .splat, .spz, .glb, or .usdc, .usd and .usda.
 
         Raises:
             FileNotFoundError: If the folder does not exist.

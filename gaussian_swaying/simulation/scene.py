@@ -17,7 +17,7 @@ class Scene:
     """The source of the Gaussians, and the choice of those that are simulated.
 
     Args:
-        ply: A splat in any format that can be read (3DGS or compressed .ply, .splat, .spz); takes precedence over
+        ply: A splat in any format that can be read (3DGS or compressed .ply, .splat, .spz, glTF); takes precedence over
             ``generator``.
         generator: A scene made in code.
         region: Part that is simulated, in scene units; the rest does not move and is rendered as well.

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 
 from gaussian_swaying._checks import one_line
 from gaussian_swaying.config.parser import parse_text
-from gaussian_swaying.gaussians.formats import READABLE, READERS
+from gaussian_swaying.gaussians.formats import READERS
 from gaussian_swaying.viewer.film_strip import FilmStrip
 from gaussian_swaying.viewer.scenes import settings_of_splat
 from gaussian_swaying.viewer.screen import Panel
@@ -23,6 +23,7 @@ if TYPE_CHECKING:
 
 
 Folder = tempfile.TemporaryDirectory[str]
+UPLOADS = [suffix for suffix in READERS if suffix != ".gltf"]  # which takes its data from other files
 RECORD = "Record a video (simulated time)"
 
 
@@ -48,7 +49,8 @@ class Files:
             disabled=elsewhere,  # a configuration can name files of this computer
             hint="Only on a page that other computers cannot open" if elsewhere else "Such as one that was saved here",
         )
-        self.load = gui.add_upload_button("Load a splat", mime_type=",".join(READERS), hint=f"A {READABLE}")
+        kinds = ",".join(UPLOADS)
+        self.load = gui.add_upload_button("Load a splat", mime_type=kinds, hint=f"One of {kinds}")
         controls.on(self.record.on_click, self._toggle_recording, tell_event=True)
         controls.on(self.save.on_click, self._save, tell_event=True)
         controls.on(self.load.on_upload, lambda: self._load(self.load, self._splat))
@@ -108,7 +110,7 @@ class Files:
         self.load.disabled, self.load_settings.disabled = False, self.page.door.token is not None
 
     def _splat(self, content: bytes, suffix: str, folder: Folder) -> Namespace:
-        path = Path(folder.name) / f"scene{suffix if suffix in READERS else '.ply'}"
+        path = Path(folder.name) / f"scene{suffix if suffix in UPLOADS else '.ply'}"
         path.write_bytes(content)
         device = self.session.simulation.device
         quick = device.type == "cpu"  # no trial looks for a grid

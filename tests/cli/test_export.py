@@ -4,6 +4,7 @@ import json
 import sys
 
 import pytest
+import torch
 from shared import refused
 
 from gaussian_swaying.cli.export import main
@@ -81,7 +82,7 @@ def test_usd_as_given(tmp_path, capsys):
         (["film.usdc", "--up", "0", "0", "0"], "zero"),
         (["film.usdc", "--metres-per-unit", "-1"], "`--metres-per-unit` to be positive"),
         (["film.usdc", "--fps", "nan"], "--fps"),
-        (["film.splat", "--up", "0", "0", "1"], "--up and --metres-per-unit are only for USD files"),
+        (["film.splat", "--up", "0", "0", "1"], "--up and --metres-per-unit are only for USD and glTF"),
     ],
 )
 def test_bad_options(options, message, tmp_path, capsys):
@@ -116,3 +117,14 @@ def test_the_version_of_spz(tmp_path, capsys):
     given = [str(tmp_path / "3.spz"), str(tmp_path / "a.splat"), "--spz-version=4"]
     refused(main, given, capsys, "--spz-version is only for .spz files: leave it out")
     refused(main, ["run", "--web", "--spz-version=4"], capsys, "--spz-version is not for --web")
+
+
+def test_gltf_takes_the_frame_of_the_run(tmp_path, capsys):
+    """y is up in the file, and -y is in the run; its units are half a metre."""
+    run = _run(tmp_path / "run")
+    assert main([str(run / "ply/00001.ply"), str(tmp_path / "one.glb")]) == 0
+    assert "1 scene unit = 0.5 m (from summary.json of the run)" in capsys.readouterr().out
+    flag, found = read_ply(run / "ply/00001.ply"), read_gaussians(tmp_path / "one.glb")
+    torch.testing.assert_close(found.means[:, 1], -0.5 * flag.means[:, 1])
+    assert main([str(tmp_path / "one.glb"), str(tmp_path / "two.glb"), "--up", "0", "1", "0"]) == 0
+    torch.testing.assert_close(read_gaussians(tmp_path / "two.glb").means[:, 1], found.means[:, 1])

@@ -60,7 +60,7 @@ def test_equal_values_in_a_chunk_are_kept(tmp_path):
 
 def test_what_cannot_be_written_leaves_nothing(tmp_path):
     cloud = varied_cloud(3)
-    with pytest.raises(ValueError, match="`format` to be one of ply, compressed_ply, splat, spz, usd, but got 'obj'"):
+    with pytest.raises(ValueError, match=f"`format` to be one of {', '.join(SUFFIXES)}, but got 'obj'"):
         export_cloud(tmp_path / "a.obj", cloud, format="obj")
     with pytest.raises(FileNotFoundError, match="is not a folder"):
         export_cloud(tmp_path / "no" / "a.splat", cloud, format="splat")

@@ -1,0 +1,395 @@
+"""Splats in glTF (.glb, .gltf) by the extension KHR_gaussian_splatting."""
+
+from __future__ import annotations
+
+import base64
+import binascii
+import json
+import os
+import struct
+import warnings
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+from urllib.parse import unquote
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from gaussian_swaying._inputs import LARGEST_JSON, check_regular, check_unpacked, parse_json, read_json
+from gaussian_swaying.gaussians.cloud import GaussianCloud
+from gaussian_swaying.gaussians.harmonics import SH_DC, rotate_sh
+from gaussian_swaying.gaussians.packed import cloud_of, logits
+from gaussian_swaying.gaussians.ply import reject
+from gaussian_swaying.geometry.covariances import covariance, covariance_to_quat_scale, deform_covariance
+from gaussian_swaying.geometry.rotations import quat_to_rotation, rotation_to_quat
+
+_EXTENSION = "KHR_gaussian_splatting"
+LARGEST = 1 << 32  # bytes of a .glb file
+_GLB = struct.Struct("<4sII")  # magic, version, length; then chunks of a length, a kind and data
+_CHUNK = struct.Struct("<I4s")
+_TYPES = {5120: np.int8, 5121: np.uint8, 5122: np.int16, 5123: np.uint16, 5125: np.uint32, 5126: np.float32}
+_FIELDS = ("means", "quats", "scales", "opacities", "sh")
+_WIDTHS = {"SCALAR": 1, "VEC3": 3, "VEC4": 4}
+_UPRIGHT = torch.tensor([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]], dtype=torch.float64)  # z up to y up
+_FLAT = 1e-7  # of the largest size: a size of zero, which is allowed, becomes this
+_STEPS = 1 << 22  # opacities in float32 end half of such a step before 0 and 1
+
+
+def read_gltf(path: str | os.PathLike[str]) -> GaussianCloud:
+    """Read the Gaussians of a .glb or .gltf file, with the transformations of its nodes applied: metres, y up.
+
+    All primitives of the scene that have the extension are read. Buffers may be in the file, or in files beside it.
+
+    Args:
+        path: File to read.
+
+    Returns:
+        The Gaussians as float32 tensors on the CPU, without normals.
+
+    Raises:
+        FileNotFoundError: If there is no such file.
+        ValueError: If the file is broken, holds no Gaussians, or stores them in a way that is not supported (another
+            kernel, a compression, a sheared or mirrored node); the message says which.
+
+    Warns:
+        UserWarning: If the colours are in linear light.
+    """
+    path = check_regular(path, "the glTF file")
+    document = _Document(path)
+    found = list(document.primitives())
+    if not found:
+        raise ValueError(f"{path} has no primitive with `{_EXTENSION}`; export it as Gaussian splats.")
+    degrees = [_degree(path, primitive["attributes"]) for primitive, _ in found]
+    counts = [document.count(primitive["attributes"]["POSITION"]) for primitive, _ in found]
+    width = (max(degrees) + 1) ** 2
+    check_unpacked(path, sum(counts) * (44 + 12 * width), f"{sum(counts):,} Gaussians")
+    if not sum(counts):
+        raise ValueError(f"{path} holds zero Gaussians; export the scene again.")
+    parts = [document.gaussians(*what, width) for what, count in zip(found, counts, strict=True) if count]
+    return GaussianCloud(*(torch.cat([getattr(part, name) for part in parts]) for name in _FIELDS))
+
+
+def encode_gltf(cloud: GaussianCloud, rotation: Tensor | None = None, metres_per_unit: float = 1.0) -> bytes:
+    """A .glb file in metres with y up.
+
+    Programs that do not know the extension show points in the colours of degree 0.
+
+    Args:
+        cloud: The Gaussians, finite (see :func:`~gaussian_swaying.gaussians.export.cleaned`).
+        rotation: Rotation from scene directions to z up, shape (3, 3); the scene's z is up if None.
+        metres_per_unit: Length of a scene unit [m].
+
+    Returns:
+        The content of the file.
+
+    Raises:
+        ValueError: If it would be 4 GB or larger.
+    """
+    turn = _UPRIGHT if rotation is None else _UPRIGHT @ rotation.to("cpu", torch.float64)
+    cloud = _moved(cloud.to("cpu", torch.float32), turn * metres_per_unit, torch.zeros(3, dtype=torch.float64))
+    opacity = cloud.opacities.sigmoid()
+    shown = (cloud.sh[:, 0] * SH_DC + 0.5).clamp(0, 1)
+    linear = torch.where(shown <= 0.04045, shown / 12.92, ((shown + 0.055) / 1.055) ** 2.4)
+    color = torch.cat([linear, opacity[:, None]], dim=1)
+    columns = {
+        "POSITION": cloud.means,
+        "COLOR_0": (color * 255).round().to(torch.uint8),
+        f"{_EXTENSION}:ROTATION": torch.nn.functional.normalize(cloud.quats, dim=-1)[:, [1, 2, 3, 0]],
+        f"{_EXTENSION}:SCALE": cloud.scales.exp(),
+        f"{_EXTENSION}:OPACITY": opacity,
+    } | {name: cloud.sh[:, index] for index, name in enumerate(_harmonics(cloud.sh_degree))}
+    accessors: list[dict[str, Any]] = []
+    views: list[dict[str, Any]] = []
+    data, start = list[bytes](), 0
+    for column in columns.values():
+        array = column.contiguous().detach().numpy()
+        whole = array.dtype == np.uint8
+        kind = "SCALAR" if array.ndim == 1 else f"VEC{array.shape[1]}"
+        accessors.append({"bufferView": len(views), "count": len(cloud), "type": kind})
+        accessors[-1] |= {"componentType": 5121, "normalized": True} if whole else {"componentType": 5126}
+        views.append({"buffer": 0, "byteOffset": start, "byteLength": array.nbytes, "target": 34962})
+        data.append(array.tobytes())
+        start += array.nbytes
+    accessors[0] |= {"min": cloud.means.amin(0).tolist(), "max": cloud.means.amax(0).tolist()}
+    extension = {"kernel": "ellipse", "colorSpace": "srgb_rec709_display"}
+    extension |= {"projection": "perspective", "sortingMethod": "cameraDistance"}
+    primitive: dict[str, Any] = {"attributes": {name: index for index, name in enumerate(columns)}, "mode": 0}
+    primitive["extensions"] = {_EXTENSION: extension}
+    document = {
+        "asset": {"version": "2.0", "generator": "gaussian_swaying"},
+        "extensionsUsed": [_EXTENSION],
+        "scene": 0,
+        "scenes": [{"nodes": [0]}],
+        "nodes": [{"mesh": 0}],
+        "meshes": [{"primitives": [primitive]}],
+        "accessors": accessors,
+        "bufferViews": views,
+        "buffers": [{"byteLength": start}],
+    }
+    text = json.dumps(document, separators=(",", ":")).encode()
+    text += b" " * (-len(text) % 4)
+    size = _GLB.size + 2 * _CHUNK.size + len(text) + start
+    if size >= LARGEST:
+        raise ValueError(
+            f"A .glb file holds less than 4 GB, but this one would take {size:,} bytes: choose spz or sog."
+        )
+    head = _GLB.pack(b"glTF", 2, size) + _CHUNK.pack(len(text), b"JSON") + text + _CHUNK.pack(start, b"BIN\0")
+    return head + b"".join(data)
+
+
+class _Document:
+    """A glTF document and its buffers; whatever is missing or wrong in it is a ValueError that names the file.
+
+    Args:
+        path: The file.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self._buffers: dict[int, np.ndarray] = {}
+        with path.open("rb") as stream:
+            binary = stream.read(4) == b"glTF"
+        self.root = self._chunks() if binary else read_json(path, "glTF file")
+        if not isinstance(self.root, dict):
+            raise self.broken("it is not a table of keys")
+
+    def broken(self, what: str) -> ValueError:
+        return ValueError(f"{self.path} is not a usable glTF file ({what}); export it again.")
+
+    def _chunks(self) -> Any:
+        """The JSON of a binary file, whose second chunk becomes the first buffer."""
+        size = self.path.stat().st_size
+        data = np.memmap(self.path, dtype=np.uint8, mode="r")
+        if size < _GLB.size + _CHUNK.size:
+            raise self.broken(f"it ends after {size} bytes")
+        _, version, length = _GLB.unpack(data[: _GLB.size].tobytes())
+        if version != 2 or length > size:
+            raise self.broken(f"version {version} with {length:,} bytes announced, of which there are {size:,}")
+        start, chunks = _GLB.size, dict[bytes, np.ndarray]()
+        while start + _CHUNK.size <= length:
+            count, kind = _CHUNK.unpack(data[start : start + _CHUNK.size].tobytes())
+            start += _CHUNK.size
+            if start + count > length:
+                raise self.broken(f"a part of {count:,} bytes is announced, but {length - start:,} follow")
+            chunks.setdefault(kind, data[start : start + count])
+            start += count
+        if len(chunks.get(b"JSON", ())) == 0 or len(chunks[b"JSON"]) > LARGEST_JSON:
+            raise self.broken("its JSON is missing or too large")
+        if b"BIN\0" in chunks:
+            self._buffers[0] = chunks[b"BIN\0"]
+        return parse_json(chunks[b"JSON"].tobytes(), "glTF file", self.path)
+
+    # ---- parts of the document
+
+    def item(self, kind: str, index: Any) -> dict[str, Any]:
+        """Entry of one of the lists of the document."""
+        entries = self.root.get(kind)
+        if not isinstance(entries, list) or type(index) is not int or not 0 <= index < len(entries):
+            raise self.broken(f"`{kind}` has no entry {str(index)[:20]}")
+        if not isinstance(entries[index], dict):
+            raise self.broken(f"`{kind}` {index} is no table of keys")
+        return entries[index]
+
+    def whole(self, holder: dict[str, Any], name: str, default: int | None = None) -> int:
+        """A whole number that is not negative."""
+        value = holder.get(name, default)
+        if type(value) is not int or value < 0:
+            raise self.broken(f"`{name}` is {str(value)[:20]}")
+        return value
+
+    def primitives(self) -> Iterator[tuple[dict[str, Any], np.ndarray]]:
+        """The primitives with Gaussians in the scene, and the transformation of each, shape (4, 4)."""
+        scenes, nodes = self.root.get("scenes"), self.root.get("nodes")
+        if scenes:
+            first = self.item("scenes", self.whole(self.root, "scene", 0)).get("nodes", [])
+        else:
+            listed = nodes if isinstance(nodes, list) else []
+            below = [self._list(self.item("nodes", index), "children") for index in range(len(listed))]
+            first = sorted(set(range(len(listed))) - {child for row in below for child in row if type(child) is int})
+        open_, seen = [(index, np.eye(4)) for index in reversed(first if isinstance(first, list) else [])], set()
+        while open_:
+            index, matrix = open_.pop()
+            node = self.item("nodes", index)
+            if index in seen:
+                raise self.broken(f"node {index} is there twice")
+            seen.add(index)
+            with np.errstate(over="ignore", invalid="ignore"):
+                matrix = matrix @ self._matrix(node)
+            open_ += [(child, matrix) for child in reversed(self._list(node, "children"))]
+            if "mesh" in node:
+                for primitive in self._list(self.item("meshes", node["mesh"]), "primitives"):
+                    extensions = primitive.get("extensions") if isinstance(primitive, dict) else None
+                    if isinstance(extensions, dict) and _EXTENSION in extensions:
+                        self._check_primitive(primitive, extensions[_EXTENSION])
+                        yield primitive, matrix
+
+    def _list(self, holder: dict[str, Any], name: str) -> list[Any]:
+        value = holder.get(name, [])
+        if not isinstance(value, list):
+            raise self.broken(f"`{name}` is no list")
+        return value
+
+    def _matrix(self, node: dict[str, Any]) -> np.ndarray:
+        """Transformation of a node within its parent, shape (4, 4)."""
+        defaults = {"translation": [0, 0, 0], "rotation": [0, 0, 0, 1], "scale": [1, 1, 1], "matrix": [*np.eye(4).flat]}
+        values = {}
+        for name, default in defaults.items():
+            try:
+                values[name] = np.array(node.get(name, default), dtype=np.float64)
+            except (ValueError, TypeError, OverflowError):
+                raise self.broken(f"`{name}` of a node is no list of numbers") from None
+            if values[name].shape != (len(default),) or not np.isfinite(values[name]).all():
+                raise self.broken(f"`{name}` of a node is not {len(default)} finite numbers")
+        if not values["rotation"].any():
+            raise self.broken("`rotation` of a node is zero")
+        turn = quat_to_rotation(torch.from_numpy(values["rotation"][[3, 0, 1, 2]])).numpy()
+        matrix = values["matrix"].reshape(4, 4).T.copy()
+        own = np.eye(4)
+        own[:3, :3], own[:3, 3] = turn * values["scale"], values["translation"]
+        with np.errstate(over="ignore", invalid="ignore"):
+            product: np.ndarray = matrix @ own
+        return product
+
+    def _check_primitive(self, primitive: dict[str, Any], kind: Any) -> None:
+        if not isinstance(kind, dict) or not isinstance(primitive.get("attributes"), dict):
+            raise self.broken(f"`{_EXTENSION}` or `attributes` of a primitive is no table of keys")
+        if kind.get("extensions"):
+            names = str(list(kind["extensions"]) if isinstance(kind["extensions"], dict) else kind["extensions"])[:80]
+            raise ValueError(f"{self.path} stores its Gaussians by the extensions {names}; export it without them.")
+        if kind.get("kernel", "ellipse") != "ellipse":
+            raise ValueError(f"{self.path} has Gaussians of the kernel {str(kind['kernel'])[:40]!r}; export `ellipse`.")
+        if kind.get("colorSpace") == "lin_rec709_display":
+            warnings.warn(
+                f"{self.path} has colours in linear light, which are shown as they are: it looks too dark.",
+                UserWarning,
+                stacklevel=4,
+            )
+
+    # ---- numbers
+
+    def count(self, index: Any) -> int:
+        """Number of rows of an accessor."""
+        return self.whole(self.item("accessors", index), "count")
+
+    def gaussians(self, primitive: dict[str, Any], matrix: np.ndarray, width: int) -> GaussianCloud:
+        """The Gaussians of a primitive, in the axes of the scene, with so many harmonics."""
+        names, path = primitive["attributes"], self.path
+        count = self.count(names["POSITION"])
+
+        def column(name: str, kind: str) -> np.ndarray:
+            if name not in names:
+                raise ValueError(f"{path} has no attribute `{name}`, so it is not a splat; export it again.")
+            return self._accessor(names[name], kind, count, name)[0]
+
+        opacity, steps = self._accessor(names.get(f"{_EXTENSION}:OPACITY"), "SCALAR", count, "OPACITY")
+        outside = ~(np.abs(opacity[:, 0] - 0.5) <= 0.501)  # and what is not a number
+        reject(path, outside, "attribute `OPACITY` is not from 0 to 1", "store the opacity itself, not its logit")
+        sizes = column(f"{_EXTENSION}:SCALE", "VEC3")
+        negative: np.ndarray = np.any(sizes < 0, axis=1)
+        reject(path, negative, "attribute `SCALE` is negative", "store the size itself, not its logarithm")
+        with np.errstate(divide="ignore", invalid="ignore"):
+            scales = np.log(np.maximum(sizes, _FLAT * sizes.max(axis=1, keepdims=True, initial=0.0)))
+        sh = np.zeros((count, width, 3), dtype=np.float32)
+        for place, name in enumerate(_harmonics(_degree(path, names))):
+            sh[:, place] = column(name, "VEC3")
+        cloud = cloud_of(
+            path,
+            means=column("POSITION", "VEC3"),
+            quats=column(f"{_EXTENSION}:ROTATION", "VEC4")[:, [3, 0, 1, 2]],
+            scales=scales,
+            opacities=logits(opacity[:, 0], steps),
+            sh=sh,
+        )
+        self._check_turn(matrix)
+        moved = _moved(cloud, *map(torch.from_numpy, (matrix[:3, :3].copy(), matrix[:3, 3].copy())))
+        return moved if moved is cloud else cloud_of(path, **{name: getattr(moved, name).numpy() for name in _FIELDS})
+
+    def _check_turn(self, matrix: np.ndarray) -> None:
+        """Raise ValueError unless a transformation is a rotation, a shift and positive scales along the axes."""
+        lengths = np.linalg.norm(matrix[:3, :3], axis=0)
+        if not (np.isfinite(matrix).all() and lengths.all()):
+            raise self.broken("the transformation of a node is singular or infinite")
+        turn = matrix[:3, :3] / lengths
+        if np.abs(turn.T @ turn - np.eye(3)).max() > 1e-3 or np.linalg.det(turn) < 0:
+            raise ValueError(f"{self.path} shears or mirrors its Gaussians by a node; apply that before the export.")
+
+    def _accessor(self, index: Any, kind: str, count: int, name: str) -> tuple[np.ndarray, int]:
+        """Numbers of an accessor as float32, shape (count, width), and the number of their steps from 0 to 1."""
+        accessor = self.item("accessors", index)
+        number = self.whole(accessor, "componentType")
+        if accessor.get("type") != kind or number not in _TYPES or self.count(index) != count:
+            raise self.broken(f"attribute `{name}` is not {count:,} of {kind}")
+        if "sparse" in accessor or "bufferView" not in accessor:
+            raise ValueError(f"{self.path}: attribute `{name}` is sparse; export the Gaussians without `sparse`.")
+        view = self.item("bufferViews", accessor["bufferView"])
+        buffer = self._buffer(self.whole(view, "buffer"))
+        dtype, width = np.dtype(_TYPES[number]).newbyteorder("<"), _WIDTHS[kind]
+        row = width * dtype.itemsize
+        stride = self.whole(view, "byteStride", row)
+        first, length = self.whole(view, "byteOffset", 0), self.whole(view, "byteLength")
+        inner = self.whole(accessor, "byteOffset", 0)
+        needed = inner + (stride * (count - 1) + row if count else 0)
+        if stride < row or needed > length or first + length > len(buffer):
+            raise self.broken(f"attribute `{name}` announces {count:,} rows, but its buffer has {len(buffer):,} bytes")
+        rows = np.ndarray((count, width), dtype, buffer, first + inner, (stride, dtype.itemsize))
+        values = rows.astype(np.float32)
+        if not accessor.get("normalized") or number == 5126:
+            return values, _STEPS
+        top = np.iinfo(dtype).max
+        return np.maximum(values / np.float32(top), -1), int(top)
+
+    def _buffer(self, index: int) -> np.ndarray:
+        """The bytes of a buffer: in the file itself, in a data URI, or in a file of the same folder."""
+        entry = self.item("buffers", index)
+        if index not in self._buffers:
+            uri = entry.get("uri")
+            if not isinstance(uri, str):
+                raise self.broken(f"buffer {index} has no data")
+            if uri.startswith("data:"):
+                try:
+                    data = base64.b64decode(uri.partition(",")[2], validate=True)
+                except binascii.Error:
+                    raise self.broken(f"buffer {index} is not in base64") from None
+                self._buffers[index] = np.frombuffer(data, dtype=np.uint8)
+            else:
+                name = unquote(uri)
+                if Path(name).name != name or name in ("", ".", ".."):
+                    raise ValueError(f"{self.path} takes its data from {name[:80]!r}; put that file beside it.")
+                beside = check_regular(self.path.with_name(name), "the buffer")
+                self._buffers[index] = np.fromfile(beside, dtype=np.uint8)
+        return self._buffers[index]
+
+
+def _harmonics(degree: int) -> list[str]:
+    """Names of the attributes with harmonics, in order."""
+    return [f"{_EXTENSION}:SH_DEGREE_{band}_COEF_{k}" for band in range(degree + 1) for k in range(2 * band + 1)]
+
+
+def _degree(path: Path, names: dict[str, Any]) -> int:
+    """Degree of the harmonics; ValueError if one is missing."""
+    if "POSITION" not in names:
+        raise ValueError(f"{path} has no attribute `POSITION`, so it is not a splat; export it again.")
+    degree = max((band for band in range(4) if any(f":SH_DEGREE_{band}_" in name for name in names)), default=0)
+    for name in _harmonics(degree):
+        if name not in names:
+            raise ValueError(f"{path} has no attribute `{name}`, but others up to degree {degree}; export it again.")
+    return degree
+
+
+def _moved(cloud: GaussianCloud, matrix: Tensor, shift: Tensor) -> GaussianCloud:
+    """Gaussians after x -> A x + b; A is a rotation times scales along the axes, in float64."""
+    if torch.equal(matrix, torch.eye(3).to(matrix)) and not shift.any():
+        return cloud
+    sizes = matrix.norm(dim=0)
+    turn = matrix / sizes
+    means = (cloud.means.double() @ matrix.T + shift).float()
+    if float(sizes.max() / sizes.min()) < 1 + 1e-6:
+        quats = rotation_to_quat(turn @ quat_to_rotation(cloud.quats.double()))
+        scales = cloud.scales + sizes.mean().log()
+    else:
+        still = covariance(cloud.quats.double(), cloud.scales.double())
+        quats, scales = covariance_to_quat_scale(deform_covariance(matrix, still))
+    sh = rotate_sh(cloud.sh.double(), turn)
+    return GaussianCloud(means, quats.float(), scales.float(), cloud.opacities, sh.float())

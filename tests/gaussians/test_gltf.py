@@ -1,0 +1,339 @@
+"""glTF with KHR_gaussian_splatting: as it was, as others write it, nodes and number types, and what is refused."""
+
+import base64
+import json
+import math
+import struct
+import tracemalloc
+
+import numpy as np
+import pytest
+import torch
+from other_writers import FILES, assert_close, scene, turned
+from small_scenes import varied_cloud
+
+from gaussian_swaying.gaussians.export import export_cloud
+from gaussian_swaying.gaussians.formats import read_gaussians
+from gaussian_swaying.gaussians.gltf import encode_gltf, read_gltf
+from gaussian_swaying.gaussians.harmonics import SH_DC
+from gaussian_swaying.geometry.covariances import covariance
+from gaussian_swaying.geometry.rotations import rotation_from_z
+
+CLOSE = {"means": 2e-6, "scales": 1e-5, "opacities": 1e-6, "colors": 1e-6, "sh": 1e-5, "quats": 1e-5}  # of float32
+Y_TO_Z = torch.tensor([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
+KHR = "KHR_gaussian_splatting"
+
+
+@pytest.mark.parametrize("degree", [0, 1, 2, 3])
+def test_round_trip(degree, tmp_path):
+    """What was up is y, in metres."""
+    cloud = varied_cloud(degree=degree)
+    up = torch.tensor([0.3, -0.9, 0.2])
+    turn = rotation_from_z(up).T
+    export_cloud(tmp_path / "a.glb", cloud, metres_per_unit=0.5, rotation=turn)
+    found = read_gaussians(tmp_path / "a.glb")
+    upright = turned(found, turn.T.float() @ Y_TO_Z)
+    back = upright.means * 2, upright.scales + math.log(2)
+    assert_close(type(found)(back[0], upright.quats, back[1], upright.opacities, upright.sh), cloud, **CLOSE)
+    heights = cloud.means @ torch.nn.functional.normalize(up, dim=0)
+    torch.testing.assert_close(found.means[:, 1], 0.5 * heights, rtol=0, atol=2e-6)
+    export_cloud(tmp_path / "b.glb", cloud)  # z is up
+    torch.testing.assert_close(read_gaussians(tmp_path / "b.glb").means[:, 1], cloud.means[:, 2])
+
+
+def test_as_splat_transform_writes_it():
+    """It turns a .ply, whose y points down, by half a turn about z."""
+    found = read_gltf(FILES / "scene.glb")
+    assert_close(turned(found, torch.diag(torch.tensor([-1.0, -1.0, 1.0]))), scene(), **CLOSE)
+
+
+def _parts(content):
+    """The JSON and the data of a .glb file."""
+    size = struct.unpack_from("<I", content, 12)[0]
+    return json.loads(content[20 : 20 + size]), content[28 + size :]
+
+
+def _written(path, document, data):
+    text = json.dumps(document).encode()
+    text += b" " * (-len(text) % 4)
+    head = struct.pack("<4sII", b"glTF", 2, 28 + len(text) + len(data)) + struct.pack("<I4s", len(text), b"JSON")
+    path.write_bytes(head + text + struct.pack("<I4s", len(data), b"BIN\0") + data)
+    return path
+
+
+def test_the_file_is_as_the_standard_wants_it():
+    """Bounds of the centres, alignment, unit quaternions, and points in linear light for other programs."""
+    cloud = varied_cloud(7, degree=1)
+    content = encode_gltf(cloud)
+    document, data = _parts(content)
+    assert struct.unpack_from("<4sII", content) == (b"glTF", 2, len(content))
+    assert len(content) % 4 == 0
+    assert document["buffers"] == [{"byteLength": len(data)}]
+    assert document["extensionsUsed"] == [KHR]
+    (primitive,) = document["meshes"][0]["primitives"]
+    assert primitive["mode"] == 0
+    assert primitive["extensions"][KHR]["kernel"] == "ellipse"
+    places = {name: document["bufferViews"][index] for name, index in primitive["attributes"].items()}
+    assert [accessor["bufferView"] for accessor in document["accessors"]] == list(range(len(places)))
+    assert all(view["byteOffset"] % 4 == 0 for view in places.values())
+
+    def column(name, dtype, width):
+        view = places[name]
+        return np.frombuffer(data[view["byteOffset"] :][: view["byteLength"]], dtype).reshape(7, width)
+
+    centres = column("POSITION", "<f4", 3)
+    assert document["accessors"][0]["min"] == centres.min(0).tolist()
+    assert document["accessors"][0]["max"] == centres.max(0).tolist()
+    np.testing.assert_allclose(np.linalg.norm(column(f"{KHR}:ROTATION", "<f4", 4), axis=1), 1, atol=1e-6)
+    shown = np.clip(cloud.sh[:, 0].numpy() * SH_DC + 0.5, 0, 1)
+    linear = np.where(shown <= 0.04045, shown / 12.92, ((shown + 0.055) / 1.055) ** 2.4)
+    np.testing.assert_allclose(column("COLOR_0", "u1", 4)[:, :3] / 255, linear, atol=0.501 / 255)
+
+
+def test_nodes_move_what_they_hold(tmp_path):
+    """Rotation, scale and shift of two nodes and of a matrix; a mesh in two places; stretching along an axis."""
+    cloud = varied_cloud(5, degree=2)
+    document, data = _parts(encode_gltf(cloud, rotation=Y_TO_Z))  # y is up already
+    quarter = [0.0, math.sqrt(0.5), 0.0, math.sqrt(0.5)]  # about y: z to x
+    document["nodes"] = [
+        {"children": [1], "rotation": quarter, "translation": [0, 0, 7]},
+        {"mesh": 0, "scale": [2, 2, 2], "translation": [1, 0, 0]},
+        {"mesh": 0, "matrix": [1, 0, 0, 0, 0, 3, 0, 0, 0, 0, 1, 0, 5, 0, 0, 1]},
+    ]
+    document["scenes"] = [{"nodes": []}, {"nodes": [0, 2]}]
+    document["scene"] = 1
+    found = read_gaussians(_written(tmp_path / "a.glb", document, data))
+    assert len(found) == 10
+    first, second = (found.select(torch.arange(5) + k) for k in (0, 5))
+    turn = torch.tensor([[0.0, 0.0, 1.0], [0.0, 1.0, 0.0], [-1.0, 0.0, 0.0]])
+    expected = turned(cloud, turn)
+    shift = torch.tensor([0.0, 0.0, 6.0])  # 7, and the shift of the inner node by 1 along x, which is -z now
+    expected = type(cloud)(
+        2 * expected.means + shift, expected.quats, expected.scales + math.log(2), expected.opacities, expected.sh
+    )
+    assert_close(first, expected, **CLOSE | {"means": 1e-5})
+    stretch = torch.diag(torch.tensor([1.0, 3.0, 1.0]))
+    torch.testing.assert_close(second.means, cloud.means @ stretch + torch.tensor([5.0, 0, 0]), rtol=0, atol=1e-5)
+    wide = stretch @ covariance(cloud.quats, cloud.scales) @ stretch
+    torch.testing.assert_close(covariance(second.quats, second.scales), wide, rtol=1e-4, atol=1e-6)
+    torch.testing.assert_close(second.sh, cloud.sh, rtol=0, atol=1e-5)
+    del document["scenes"], document["scene"]  # then all nodes that are nobody's children
+    assert len(read_gaussians(_written(tmp_path / "b.glb", document, data))) == 10
+
+
+def test_numbers_of_every_kind(tmp_path):
+    """Normalised whole numbers, interleaved, in a file beside the .gltf and in its text; two degrees together."""
+    rows = np.zeros(3, dtype=[("p", "<f4", 3), ("q", "<i2", 4), ("s", "u1", 3), ("o", "u1"), ("c", "<f4", 3)])
+    rows["p"], rows["q"][:, 3], rows["s"], rows["c"] = np.eye(3), 32767, [255, 51, 0], 0.25
+    rows["q"][1] = [-32768, 0, 0, 32767]
+    rows["o"] = [0, 51, 255]
+    accessors = [
+        {"bufferView": 0, "byteOffset": rows.dtype.fields[name][1], "componentType": kind, "count": 3, "type": width}
+        | ({"normalized": True} if kind != 5126 else {})
+        for name, kind, width in (
+            ("p", 5126, "VEC3"), ("q", 5122, "VEC4"), ("s", 5121, "VEC3"), ("o", 5121, "SCALAR"), ("c", 5126, "VEC3")
+        )
+    ]  # fmt: skip
+    names = ["POSITION", *(f"{KHR}:{name}" for name in ("ROTATION", "SCALE", "OPACITY", "SH_DEGREE_0_COEF_0"))]
+    attributes = {name: index for index, name in enumerate(names)}
+    higher = attributes | {f"{KHR}:SH_DEGREE_1_COEF_{k}": 4 for k in range(3)}
+    kind = {"extensions": {KHR: {"kernel": "ellipse", "colorSpace": "lin_rec709_display"}}}
+    document = {
+        "scenes": [{"nodes": [0]}],
+        "nodes": [{"mesh": 0}],
+        "meshes": [{"primitives": [{"attributes": {}}, *({"attributes": a} | kind for a in (attributes, higher))]}],
+        "accessors": accessors,
+        "bufferViews": [{"buffer": 0, "byteLength": rows.nbytes, "byteStride": rows.itemsize}],
+        "buffers": [{"byteLength": rows.nbytes, "uri": "my%20data.bin"}],
+    }
+    (tmp_path / "my data.bin").write_bytes(rows.tobytes())
+    (tmp_path / "a.gltf").write_text(json.dumps(document))
+    document["buffers"][0]["uri"] = "data:application/octet-stream;base64," + base64.b64encode(rows.tobytes()).decode()
+    (tmp_path / "b.gltf").write_text(json.dumps(document))
+    for name in ("a.gltf", "b.gltf"):
+        with pytest.warns(UserWarning, match="colours in linear light"):
+            cloud = read_gaussians(tmp_path / name)
+        assert cloud.sh.shape == (6, 4, 3)
+        assert cloud.sh[:3, 1:].abs().max() == 0
+        assert bool((cloud.sh[3:] == 0.25).all())
+        assert torch.equal(cloud.means[:3], torch.eye(3))
+        torch.testing.assert_close(cloud.quats[1], torch.tensor([1.0, -1.0, 0.0, 0.0]))
+        torch.testing.assert_close(cloud.scales[0], torch.tensor([0.0, math.log(0.2), math.log(1e-7)]))
+        torch.testing.assert_close(cloud.opacities[:3].sigmoid(), torch.tensor([0.5 / 255, 0.2, 1 - 0.5 / 255]))
+
+
+def _changed(change):
+    """A file of two Gaussians whose document was changed."""
+    document, data = _parts(encode_gltf(varied_cloud(2, degree=1)))
+    change(document, document["meshes"][0]["primitives"][0])
+    return document, data
+
+
+def _set(place, **values):
+    """Sets entries of a part of the document, such as `accessors 0`."""
+
+    def change(document, primitive):
+        part = document
+        for word in place.split():
+            part = part[int(word) if word.isdigit() else word]
+        part.update(values)
+
+    return change
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda d, p: d.clear(), "no primitive with `KHR_gaussian_splatting`"),
+        (lambda d, p: p.pop("extensions"), "no primitive with `KHR_gaussian_splatting`"),
+        (lambda d, p: p.update(extensions=7), "no primitive with `KHR_gaussian_splatting`"),
+        (lambda d, p: p.update(extensions={KHR: 7}), "of a primitive is no table of keys"),
+        (lambda d, p: p["extensions"][KHR].update(extensions={"KHR_spz": {}}), "by the extensions ['KHR_spz']"),
+        (lambda d, p: p["extensions"][KHR].update(extensions=7), "by the extensions 7"),
+        (lambda d, p: p["extensions"][KHR].update(kernel="box"), "of the kernel 'box'"),
+        (lambda d, p: p["attributes"].pop("POSITION"), "no attribute `POSITION`"),
+        (lambda d, p: p["attributes"].pop(f"{KHR}:SCALE"), f"no attribute `{KHR}:SCALE`"),
+        (lambda d, p: p["attributes"].pop(f"{KHR}:OPACITY"), "`accessors` has no entry None"),
+        (lambda d, p: p["attributes"].pop(f"{KHR}:SH_DEGREE_1_COEF_2"), "COEF_2`, but others up to degree 1"),
+        (lambda d, p: p["attributes"].update(POSITION=-1), "`accessors` has no entry -1"),
+        (lambda d, p: p["attributes"].update(POSITION=True), "`accessors` has no entry True"),
+        (lambda d, p: p.update(attributes=[]), "of a primitive is no table of keys"),
+        (_set("meshes 0", primitives={}), "`primitives` is no list"),
+        (_set("scenes 0", nodes=[0, 0]), "node 0 is there twice"),
+        (_set("scenes 0", nodes=[[]]), "`nodes` has no entry []"),
+        (_set("nodes 0", children=[0]), "node 0 is there twice"),
+        (_set("nodes 0", children=7), "`children` is no list"),
+        (_set("nodes 0", mesh=3), "`meshes` has no entry 3"),
+        (_set("nodes 0", rotation=[0, 0, 0, 0]), "`rotation` of a node is zero"),
+        (_set("nodes 0", scale=[1, 1]), "`scale` of a node is not 3 finite numbers"),
+        (_set("nodes 0", scale=["a", 1, 1]), "`scale` of a node is no list of numbers"),
+        (_set("nodes 0", scale=[1, 0, 1]), "singular or infinite"),
+        (_set("nodes 0", scale=[1, 1e300, 1e300], matrix=[1e300] * 16), "singular or infinite"),
+        (_set("nodes 0", scale=[1, -1, 1]), "shears or mirrors its Gaussians"),
+        (_set("nodes 0", matrix=[1, 0, 0, 0, 1, 1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1]), "shears or mirrors"),
+        (_set("nodes 0", scale=[1e20] * 3), "beyond ±1e+12"),
+        (_set("accessors 0", count=3), "attribute `OPACITY` is not 3 of SCALAR"),
+        (_set("accessors 0", count=2**31), "announces 2,147,483,648 Gaussians, far more"),
+        (_set("accessors 0", count=1.5), "`count` is 1.5"),
+        (_set("accessors 0", count=-1), "`count` is -1"),
+        (_set("accessors 0", type="VEC4"), "attribute `POSITION` is not 2 of VEC3"),
+        (_set("accessors 0", componentType=7), "attribute `POSITION` is not 2 of VEC3"),
+        (_set("accessors 0", sparse={}), "attribute `POSITION` is sparse"),
+        (_set("accessors 0", byteOffset=4), "announces 2 rows, but its buffer has"),
+        (_set("accessors 0", byteOffset=2**80), "announces 2 rows, but its buffer has"),
+        (_set("bufferViews 0", byteStride=4), "announces 2 rows, but its buffer has"),
+        (_set("bufferViews 0", byteStride=2**70), "announces 2 rows, but its buffer has"),
+        (_set("bufferViews 0", byteOffset=2**33), "announces 2 rows, but its buffer has"),
+        (_set("bufferViews 0", buffer=1), "`buffers` has no entry 1"),
+        (lambda d, p: d.update(accessors=[dict(a, count=0) for a in d["accessors"]]), "zero Gaussians"),
+    ],
+)
+def test_bad_documents(change, message, tmp_path):
+    path = _written(tmp_path / "bad.glb", *_changed(change))
+    with pytest.raises(ValueError, match=r"bad\.glb") as caught:
+        read_gaussians(path)
+    assert message in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+GOOD = encode_gltf(varied_cloud(2, degree=0))
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        (b"", "not valid JSON"),
+        (b"[]", "it is not a table of keys"),
+        (b"[" * 100_000, "nested too deeply"),
+        (b'{"scene": ' + b"9" * 50 + b"}", "a whole number of 50 digits"),
+        (b"\xff\xfe", "not valid JSON"),
+        (b"glTF", "it ends after 4 bytes"),
+        (GOOD[:100], "version 2 with"),
+        (GOOD[:4] + b"\1" + GOOD[5:], "version 1 with"),
+        (GOOD[:12] + b"\xff\xff\xff\xff" + GOOD[16:], "a part of 4,294,967,295 bytes is announced"),
+        (struct.pack("<4sII", b"glTF", 2, 20) + struct.pack("<I4s", 0, b"JSON"), "its JSON is missing"),
+        (struct.pack("<4sII", b"glTF", 2, 24) + struct.pack("<I4s", 4, b"JSON") + b"{...", "not valid JSON"),
+    ],
+)
+@pytest.mark.parametrize("name", ["bad.glb", "bad.gltf"])
+def test_bad_files(name, content, message, tmp_path):
+    (tmp_path / name).write_bytes(content)
+    with pytest.raises(ValueError, match=name.replace(".", r"\.")) as caught:
+        read_gaussians(tmp_path / name)
+    assert message in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("uri", "message"),
+    [
+        ("../secret.bin", "takes its data from '../secret.bin'; put that file beside it"),
+        ("%2e%2e/secret.bin", "takes its data from '../secret.bin'"),
+        ("/etc/hosts", "takes its data from '/etc/hosts'"),
+        ("https://example.org/a.bin", "takes its data from 'https://example.org/a.bin'"),
+        ("..", "takes its data from '..'"),
+        ("data:;base64,%%", "buffer 0 is not in base64"),
+        ("data:;base64,AAAA", "its buffer has 3 bytes"),
+        (None, "buffer 0 has no data"),
+    ],
+)
+def test_data_elsewhere(uri, message, tmp_path):
+    """Only files beside the document are read."""
+    (tmp_path / "secret.bin").write_bytes(bytes(1000))
+    (tmp_path / "in").mkdir()
+    path = tmp_path / "in" / "bad.gltf"
+    path.write_text(json.dumps(_changed(_set("buffers 0", uri=uri))[0]))
+    with pytest.raises(ValueError, match=r"bad\.gltf") as caught:
+        read_gaussians(path)
+    assert message in str(caught.value)
+
+
+def test_a_file_beside_it_that_is_missing(tmp_path):
+    (tmp_path / "a.gltf").write_text(json.dumps(_changed(_set("buffers 0", uri="none.bin"))[0]))
+    with pytest.raises(FileNotFoundError, match=r"none\.bin does not exist"):
+        read_gaussians(tmp_path / "a.gltf")
+
+
+def test_one_mesh_many_times(tmp_path):
+    """A few bytes of nodes can announce any number of Gaussians."""
+    document, data = _changed(lambda d, p: None)
+    document["nodes"] = [{"mesh": 0}] * 20
+    document["scenes"] = [{"nodes": list(range(20))}]
+    assert len(read_gaussians(_written(tmp_path / "a.glb", document, data))) == 40
+    count = 1_000_000
+    wide = {"bufferView": 0, "componentType": 5121, "count": count, "normalized": True}
+    document["accessors"] = [wide | {"type": a["type"]} for a in document["accessors"]]
+    document["bufferViews"] = [{"buffer": 0, "byteLength": 4 * count}]
+    tracemalloc.start()
+    with pytest.raises(ValueError, match="announces 20,000,000 Gaussians, far more"):
+        read_gaussians(_written(tmp_path / "b.glb", document, bytes(4 * count)))
+    assert tracemalloc.get_traced_memory()[1] < 1 << 25
+    tracemalloc.stop()
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "message"),
+    [
+        ("POSITION", math.nan, "`means` is NaN or infinite for 1 of 2"),
+        (f"{KHR}:SCALE", -3.0, "attribute `SCALE` is negative for 1 of 2 Gaussians, first at index 0; store the size"),
+        (f"{KHR}:SCALE", math.inf, "gives a size of zero or infinity"),
+        (f"{KHR}:OPACITY", 4.0, "attribute `OPACITY` is not from 0 to 1 for 1 of 2 Gaussians"),
+        (f"{KHR}:OPACITY", math.nan, "attribute `OPACITY` is not from 0 to 1"),
+        (f"{KHR}:SH_DEGREE_0_COEF_0", math.inf, "`sh` is NaN or infinite"),
+    ],
+)
+def test_bad_numbers(name, value, message, tmp_path):
+    document, data = _changed(lambda d, p: None)
+    place = document["meshes"][0]["primitives"][0]["attributes"][name]
+    data = bytearray(data)
+    struct.pack_into("<f", data, document["bufferViews"][place]["byteOffset"], value)
+    with pytest.raises(ValueError, match=r"bad\.glb") as caught:
+        read_gaussians(_written(tmp_path / "bad.glb", document, bytes(data)))
+    assert message in str(caught.value)
+
+
+def test_too_large_for_the_format(tmp_path, monkeypatch):
+    monkeypatch.setattr("gaussian_swaying.gaussians.gltf.LARGEST", 100)
+    with pytest.raises(ValueError, match=r"A \.glb file holds less than 4 GB, but this one would take"):
+        export_cloud(tmp_path / "a.glb", varied_cloud(2))
+    assert not list(tmp_path.iterdir())
