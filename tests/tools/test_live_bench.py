@@ -21,6 +21,26 @@ def test_the_table_names_the_goal_and_the_size_of_the_picture():
         assert told[3:7] == ["640x360", "170x96", "5.9", wanted]
 
 
+def test_the_table_of_states_names_both_grids():
+    row = {"name": "flag", "gaussians": 3750, "points": 3550, "dx_m": 0.047, "configured_dx_m": 0.032}
+    (told,) = cells("live.states", HEAD | {"rows": [row | {"states_per_s": 24.96, "states_real_time": 0.998}]})
+    assert told == ["flag", "3,750", "3,550", "0.047", "0.032", "25.0", "1.00"]
+
+
+def test_a_small_scene_is_watched(monkeypatch):
+    """The client gets states and then pictures, on the grid that ``live`` chooses."""
+    pytest.importorskip("viser", reason="needs the extra [viewer]")
+    monkeypatch.setattr(live, "WARM", 1.0)
+    monkeypatch.setattr(live, "CHANGES", 1)
+    small = ["--config", str(live.ROOT / "configs" / "sim" / "flag.yaml"), "--scene.generator.init_args.spacing=0.05"]
+    row = live.watch([*small, "--solver.dx=0.2"], "cpu", 2.0)
+    assert row["states_per_s"] > 0
+    assert row["pictures_per_s"] > 0
+    assert row["dx_m"] == row["configured_dx_m"] == 0.2
+    assert row["states_real_time"] > 0
+    assert row["problem"] is None
+
+
 def test_the_camera_of_the_client_looks_at_its_target():
     turn = live.camera_rotation([0.0, -3.0, 1.0], [0.0, 0.0, 1.0], [0.0, 0.0, 1.0])
     rotation = quat_to_rotation(torch.tensor(turn, dtype=torch.float64))

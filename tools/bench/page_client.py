@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import struct
 import time
 from collections.abc import Iterator
@@ -11,6 +12,9 @@ import msgspec
 import viser
 import zstandard
 from websockets.sync.client import connect
+
+from gaussian_swaying.viewer.controls import Page
+from gaussian_swaying.viewer.streams import ANSWER
 
 
 class PageClient:
@@ -57,6 +61,40 @@ class PageClient:
 
     def close(self) -> None:
         """Go away."""
+        self._socket.close()
+
+
+class StateClient:
+    """What a browser that draws itself takes in; it belongs to a :class:`PageClient` that is connected already.
+
+    Args:
+        page: The page.
+    """
+
+    def __init__(self, page: Page) -> None:
+        while not page.streams._lines:  # until the page has heard of the client
+            time.sleep(0.01)
+        key = next(iter(page.streams._lines))
+        self._socket = connect(f"{page.url.split('/?')[0].replace('http', 'ws')}/states?key={key}", max_size=None)
+        self._taken = 0
+
+    def states(self, seconds: float) -> int:
+        """Number of states that come in some seconds; each is confirmed, as a browser does that draws 60 pictures/s."""
+        end, count = time.perf_counter() + seconds, 0
+        while (left := end - time.perf_counter()) > 0:
+            try:
+                raw = self._socket.recv(timeout=left)
+            except TimeoutError:
+                break
+            assert isinstance(raw, bytes)
+            head = json.loads(raw[4 : 4 + int.from_bytes(raw[:4], "little")])
+            count += head["kind"] == "state"
+            self._taken += 1
+            self._socket.send(ANSWER.pack(self._taken, 60.0))
+        return count
+
+    def close(self) -> None:
+        """Leave drawing to the server."""
         self._socket.close()
 
 

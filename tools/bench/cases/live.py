@@ -1,4 +1,4 @@
-"""What ``bench.py live`` measures: pictures that a client of the live page receives, and how soon a control shows."""
+"""What ``bench.py live`` measures: states and pictures for a client of the live page, and how soon a control shows."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import argparse
 import io
 import statistics
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -15,9 +15,10 @@ import numpy as np
 
 from bench.case import Case, Measurement, option
 from bench.record import ROOT, Row
+from gaussian_swaying.cli.live import session_of
 from gaussian_swaying.simulation.simulation import Simulation
 from gaussian_swaying.viewer.controls import Page
-from gaussian_swaying.viewer.session import Session, share_cores
+from gaussian_swaying.viewer.session import Session
 
 if TYPE_CHECKING:
     from bench.page_client import PageClient
@@ -29,13 +30,12 @@ PATIENCE = 10.0  # s
 
 
 def watch(arguments: list[str], device: str, seconds: float) -> Row:
-    """A page, and one client on the same machine."""
-    from bench.page_client import PageClient  # needs the extra [viewer]
+    """A page as ``gaussian-swaying live`` makes it, and one client on the same machine: first it draws itself."""
+    from bench.page_client import PageClient, StateClient  # needs the extra [viewer]
 
     parser = Simulation.parser()
-    session = Session(parser, parser.parse_args([*arguments, "--device", device]))
-    if device == "cpu":
-        share_cores()
+    settings = parser.parse_args([*arguments, "--device", device])
+    session = session_of(parser, settings, real_time=True)
     page = Page(port=8700, largest=max(SIZES[device])).show(session)
     first = page.server.initial_camera
     wxyz = camera_rotation(first.position, first.look_at, session.simulation.scene.frame.rotation[2].tolist())
@@ -43,11 +43,13 @@ def watch(arguments: list[str], device: str, seconds: float) -> Row:
     width, height = SIZES[device]
     eye, target = ([float(x) for x in place] for place in (first.position, first.look_at))
     client = PageClient(page.server.get_port(), width, height, wxyz, eye, target)
+    drawing = StateClient(page)
+    drawing.states(WARM)
+    states, states_speed = _followed(session, lambda: drawing.states(seconds))
+    drawing.close()
     for _ in client.pictures(WARM):
         pass
-    began, simulated = time.perf_counter(), session.snapshot.health.time
-    received = [(at, len(jpeg)) for at, jpeg in client.pictures(seconds)]
-    real_time = (session.snapshot.health.time - simulated) / (time.perf_counter() - began)
+    received, real_time = _followed(session, lambda: [(at, len(jpeg)) for at, jpeg in client.pictures(seconds)])
     step = session.simulation.frame_dt
     waited = [latency(session, client, k) for k in range(CHANGES)]
     client.close()
@@ -57,6 +59,10 @@ def watch(arguments: list[str], device: str, seconds: float) -> Row:
     return {
         "gaussians": len(scene.model.means),
         "points": scene.points.count,
+        "dx_m": session.simulation.solver.dx,
+        "configured_dx_m": float(settings.solver.dx),
+        "states_per_s": states / seconds,
+        "states_real_time": states_speed,
         "window": [width, height],
         "seconds": seconds,
         "pictures_per_s": len(received) / seconds,
@@ -67,6 +73,13 @@ def watch(arguments: list[str], device: str, seconds: float) -> Row:
         "step_s": step,
         "problem": session.problem,
     }
+
+
+def _followed(session: Session, watch: Callable[[], Any]) -> tuple[Any, float]:
+    """What a client received, and the seconds simulated per second meanwhile."""
+    began, simulated = time.perf_counter(), session.snapshot.health.time
+    received = watch()
+    return received, (session.snapshot.health.time - simulated) / (time.perf_counter() - began)
 
 
 def latency(session: Session, client: PageClient, k: int) -> float:

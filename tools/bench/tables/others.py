@@ -34,6 +34,12 @@ table("live.md", "live.rates", "live_*", _rates, """
     a control shows after [ms] = {latency_ms:.0f}
     """, before="{source}\n\nReceived by one client on the same machine, without a browser.")  # fmt: skip
 
+table("live.md", "live.states", "live_cpu", "rows", """
+    scene = {name} | Gaussians = {gaussians:,} | points = {points:,} | grid [m] = {dx_m:.3g} |
+    configured [m] = {configured_dx_m:.3g} | states a second = {states_per_s:.1f} |
+    simulated seconds per second = {states_real_time:.2f}
+    """, before="{source}\n\nReceived by one client on the same machine, which draws nothing.")  # fmt: skip
+
 table("live.md", "drawn.scenes", "drawn_*", "scenes", """
     scene = {key} | Gaussians = {gaussians:,} | nodes = {nodes:,} | scene, once [MB] = {scene_bytes:.1f (MB)} |
     KB a state = {state_bytes:.0f (KB)} | KB a picture = {jpeg_bytes:.0f (KB)} |
