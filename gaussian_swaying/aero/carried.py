@@ -120,7 +120,7 @@ class CarriedField(WindEffect):
         It is reduced to the first period along the axes that repeat, so that float32 is precise enough.
         """
         place = self.anchor - (self.place + carried) @ self.axes.T
-        return torch.where(self.repeats, place.remainder(self.sides), place) / self.step
+        return torch.where(self.repeats.to(place.device), place.remainder(self.sides), place) / self.step
 
     def strength(self, flow: Tensor) -> Tensor | float:
         """Factor of the velocities in a mean flow [m/s], shape (..., 3); shape (..., 1), or one number."""
@@ -128,8 +128,8 @@ class CarriedField(WindEffect):
 
     def forward(self, velocity: Tensor, position: Tensor, moment: Moment) -> Tensor:
         """Add the velocity of the field."""
-        axes = self.axes.to(position.dtype)
-        place = position @ (axes / self.step[:, None].to(position.dtype)).T + self.offset(moment.carried).to(position)
+        axes = self.axes.to(position)
+        place = position @ (axes / self.step[:, None].to(position)).T + self.offset(moment.carried).to(position)
         found = trilinear(self.table, place, self.wraps) @ axes
         strength = self.strength(moment.flow)
         return velocity.to(found) + (strength.to(found) if isinstance(strength, Tensor) else strength) * found

@@ -133,7 +133,7 @@ def aero_force(
     check_shape("normal", normal, patches, 3)
     check_shape("area", area, patches)
     check_shape("wind", wind, 3)
-    wind = wind.to(velocity.dtype)
+    wind = wind.to(velocity)
     relative = wind - velocity
     along = (relative * normal).sum(-1, keepdim=True)
     sign = torch.where(along < 0, -1.0, 1.0)
@@ -182,7 +182,7 @@ def grouped_force(
     Returns:
         Force [N], shape (P, 3), and area [m²], shape (P,).
     """
-    wind = wind.to(velocity.dtype)
+    wind = wind.to(velocity)
     relative = wind - velocity
     cof = cofactor(deformation_gradient)
     pulled = (cof * relative[..., None]).sum(-2)  # w
@@ -358,7 +358,7 @@ class AeroForce(nn.Module):
         """
         if self.drag_step == "explicit":
             return None
-        wind = wind.to(velocity.dtype)
+        wind = wind.to(velocity)
         speed = torch.linalg.vector_norm(wind - velocity, dim=-1)
         blow = drag_speed(wind, speed, self.law)
         drag, rest = (c.to(speed.dtype) for c in (self.C_D, self.C_F + self.C_L.abs()))

@@ -9,6 +9,8 @@ from functools import lru_cache
 import torch
 from torch import Tensor
 
+from gaussian_swaying._devices import in_double
+
 STREET_SPEED = 0.86
 """Speed of the vortices of a street per speed of the flow (Roshko 1954, NACA report 1191)."""
 
@@ -123,7 +125,7 @@ def ellipsoid_flow(velocity: Tensor, place: Tensor, radii: Sequence[float]) -> T
         place: As in :func:`sphere_flow`; computed in float64.
         radii: Half axes a, b and c [m].
     """
-    given, place, velocity = place.dtype, place.double(), velocity.double()
+    given, place, velocity = place, in_double(place), in_double(velocity)
     size = max(radii)
     squares = torch.stack([torch.full_like(place[..., 0], (radius / size) ** 2) for radius in radii], dim=-1)
     x = place / size

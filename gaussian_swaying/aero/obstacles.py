@@ -54,8 +54,8 @@ class Obstacle(WindEffect):
 
     def forward(self, velocity: Tensor, position: Tensor, moment: Moment) -> Tensor:
         """See :class:`~gaussian_swaying.aero.effects.WindEffect`."""
-        place = position - self.middle.to(position.dtype)
-        found = self.around(velocity.to(position.dtype).expand_as(position), place)
+        place = position - self.middle.to(position)
+        found = self.around(velocity.to(position).expand_as(position), place)
         if self.drag == 0:
             return found
         missing, swirl = self.wake(place, moment)
@@ -73,7 +73,7 @@ class Obstacle(WindEffect):
 def _direction(moment: Moment, place: Tensor) -> tuple[Tensor, Tensor]:
     """Unit vector of the mean flow, zero in still air, and its speed, in the dtype of the places."""
     speed = torch.linalg.vector_norm(moment.flow)
-    return (moment.flow / speed.clamp(min=1e-12)).to(place.dtype), speed.to(place.dtype)
+    return (moment.flow / speed.clamp(min=1e-12)).to(place), speed.to(place)
 
 
 class SphereObstacle(Obstacle):
@@ -161,7 +161,7 @@ class CylinderObstacle(Obstacle):
 
     def around(self, velocity: Tensor, place: Tensor) -> Tensor:
         """See :class:`Obstacle`."""
-        return cylinder_flow(velocity, place, self.axis.to(place.dtype), self.radius)
+        return cylinder_flow(velocity, place, self.axis.to(place), self.radius)
 
     def twin(self) -> Twin:
         """See :class:`~gaussian_swaying.mpm.twins.Twin`."""
@@ -181,19 +181,19 @@ class CylinderObstacle(Obstacle):
 
     def wake(self, place: Tensor, moment: Moment) -> tuple[Tensor, Tensor | None]:
         """See :class:`Obstacle`."""
-        axis = self.axis.to(place.dtype)
+        axis = self.axis.to(place)
         across, speed = self._across(moment.flow)
-        direction = across.to(place.dtype)
+        direction = across.to(place)
         speed = speed[0]
         left = torch.linalg.cross(axis, direction)
         behind, aside, width = (place * direction).sum(-1), (place * left).sum(-1), 2 * self.radius
         missing = plane_wake(behind, aside, width, self.drag)
         if not self.street:
             return missing, None
-        turns = self.turns(moment.flow, moment.carried).to(place.dtype)
+        turns = self.turns(moment.flow, moment.carried).to(place)
         u, v = vortex_street(behind, aside, width, turns, self.strouhal).unbind(-1)
         outside = behind.square() + aside.square() >= self.radius**2
-        swirl = (u[..., None] * direction + v[..., None] * left) * speed.to(place.dtype)
+        swirl = (u[..., None] * direction + v[..., None] * left) * speed.to(place)
         return missing, torch.where(outside[..., None], swirl, 0.0)
 
     def _across(self, flow: Tensor) -> tuple[Tensor, Tensor]:
@@ -248,7 +248,7 @@ class EllipsoidObstacle(Obstacle):
 
     def around(self, velocity: Tensor, place: Tensor) -> Tensor:
         """See :class:`Obstacle`."""
-        axes = self.axes.to(place.dtype)
+        axes = self.axes.to(place)
         return ellipsoid_flow(velocity @ axes.T, place @ axes.T, self.radii) @ axes
 
     def twin(self) -> Twin:
@@ -276,7 +276,7 @@ class EllipsoidObstacle(Obstacle):
         side = torch.stack([-direction[1], direction[0], torch.zeros_like(direction[0])])
         side = side / torch.linalg.vector_norm(side).clamp(min=1e-12)
         up = torch.linalg.cross(direction, side)
-        scaled = torch.stack([axis * size for axis, size in zip(self.axes.to(place.dtype), self.radii, strict=True)])
+        scaled = torch.stack([axis * size for axis, size in zip(self.axes.to(place), self.radii, strict=True)])
         wide, high = (2 * torch.linalg.vector_norm(scaled @ part) for part in (side, up))
         mean = (wide * high).clamp(min=1e-12).sqrt()
         behind, left, above = ((place * part).sum(-1) for part in (direction, side, up))

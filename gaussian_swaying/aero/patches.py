@@ -79,7 +79,7 @@ class PatchSums(nn.Module):
     def __init__(self, patches: Patches, coarse: bool = False) -> None:
         super().__init__()
         with torch.no_grad():
-            normal, area, point = patches.normal.double().cpu(), patches.area.double().cpu(), patches.point.cpu()
+            normal, area, point = patches.normal.cpu().double(), patches.area.cpu().double(), patches.point.cpu()
             tensor = second_moments(normal, area, point, patches.count)
             vector, owner = joined_directions(normal, area, point, tensor, coarse)
         like = patches.area

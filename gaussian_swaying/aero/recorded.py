@@ -146,6 +146,6 @@ class RecordedWind(WindEffect):
         length = torch.where(after > key, end - begin, self.period - begin)
         share = ((now - begin) / length).clamp(0, 1).to(position)
         shift = (self.place + self.first) / self.step
-        place = position / self.step.to(position.dtype) - shift.to(position.dtype)
+        place = position / self.step.to(position) - shift.to(position)
         found = torch.lerp(trilinear(self.table, place, number=key), trilinear(self.table, place, number=after), share)
         return velocity.to(found) + self.scale * found

@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from gaussian_swaying._checks import check_positive
+from gaussian_swaying._devices import in_double
 from gaussian_swaying.aero.effects import Moment, WindEffect
 from gaussian_swaying.aero.lookup import trilinear
 from gaussian_swaying.geometry.frame import SimFrame
@@ -65,16 +66,16 @@ def deposited(place: Tensor, amount: Tensor, cells: int) -> Tensor:
     place = place.nan_to_num(0.0)
     low = place.floor().clamp(0, cells - 2)
     share = place - low
-    unit = amount.double().amax().clamp(min=1e-300) * 2.0**-40
-    found = torch.zeros(cells**3, dtype=torch.long, device=place.device)
+    unit = in_double(amount).amax().clamp(min=1e-300) * 2.0**-40
+    found = torch.zeros(cells**3, dtype=torch.long, device=unit.device)
     for corner in range(8):
         bits = [(corner >> axis) & 1 for axis in range(3)]
         weight, row = amount, torch.zeros_like(low[:, 0], dtype=torch.long)
         for axis, bit in enumerate(bits):
             weight = weight * (share[:, axis] if bit else 1 - share[:, axis])
             row = row * cells + low[:, axis].long() + bit
-        found = found.index_add(0, row, (weight.double() / unit).round().long())
-    return (found * unit).to(place.dtype).view(cells, cells, cells)
+        found = found.index_add(0, row.to(unit.device), (in_double(weight) / unit).round().long())
+    return (found * unit).to(place).view(cells, cells, cells)
 
 
 class Shelter(WindEffect):
@@ -120,19 +121,19 @@ class Shelter(WindEffect):
             drag_area: C_D A of each [m²], shape (P,).
             axes: Axes of the grid, the wind first, as rows, shape (3, 3).
         """
-        turned = position @ axes.to(position.dtype).T
+        turned = position @ axes.to(position).T
         low, high = turned.amin(0), turned.amax(0)
         side = ((high - low).amax() / (self.cells - 3)).clamp(min=1e-9)
         shift = 0.5 * (self.cells - 1) - 0.5 * (low + high) / side
-        amount = self.strength * drag_area.to(position.dtype) / side**3
+        amount = self.strength * drag_area.to(position) / side**3
         density = deposited(turned / side + shift, amount, self.cells)
         self.table.copy_(extinction(density, side))
-        self.turn.copy_(axes.double() / side)
-        self.shift.copy_(shift)
+        self.turn.copy_(in_double(axes) / in_double(side))
+        self.shift.copy_(in_double(shift))
 
     def forward(self, velocity: Tensor, position: Tensor, moment: Moment) -> Tensor:
         """Multiply the velocity by the share that is left."""
-        place = position @ self.turn.to(position.dtype).T + self.shift.to(position.dtype)
+        place = position @ self.turn.to(position).T + self.shift.to(position)
         return velocity * trilinear(self.table[..., None], place)
 
     def twin(self) -> Twin:

@@ -6,6 +6,7 @@ import torch
 from torch import Tensor
 
 from gaussian_swaying._checks import check_shape
+from gaussian_swaying._devices import in_double
 from gaussian_swaying.geometry.linalg import matmul3, polar_rotation
 from gaussian_swaying.geometry.rotations import quat_to_rotation, rotation_to_quat
 
@@ -45,13 +46,13 @@ def covariance_to_quat_scale(covariances: Tensor) -> tuple[Tensor, Tensor]:
         ValueError: If ``covariances`` has another shape.
     """
     check_shape("covariances", covariances, 3, 3)
-    values, axes = torch.linalg.eigh(covariances.double())
+    values, axes = torch.linalg.eigh(in_double(covariances))
     largest = axes.abs().argmax(-2, keepdim=True)
     axes = axes * torch.where(axes.gather(-2, largest) < 0, -1.0, 1.0)
     axes = torch.cat([axes[..., :2], torch.linalg.cross(axes[..., 0], axes[..., 1])[..., None]], dim=-1)
     floor = (values[..., -1:] * 1e-14).clamp_min(1e-60)
     log_scales = 0.5 * values.clamp_min(floor).log()
-    return rotation_to_quat(axes).to(covariances.dtype), log_scales.to(covariances.dtype)
+    return rotation_to_quat(axes).to(covariances), log_scales.to(covariances)
 
 
 def deform_covariance(deformation_gradient: Tensor, covariances: Tensor) -> Tensor:

@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from gaussian_swaying._checks import check_positive, check_shape
+from gaussian_swaying._devices import in_double
 from gaussian_swaying.geometry.rotations import rotation_from_z
 
 
@@ -107,13 +108,15 @@ class SimFrame:
 
     def point_to_sim(self, points: Tensor) -> Tensor:
         """Scene points (..., 3) to metres, z up. Computed in float64, so distant scenes keep their detail."""
-        origin, rotation, *_ = self._on(points.device)
-        return ((points.double() - origin) * self.metres_per_unit @ rotation.T).to(points.dtype)
+        place = in_double(points)
+        origin, rotation, *_ = self._on(place.device)
+        return ((place - origin) * self.metres_per_unit @ rotation.T).to(points)
 
     def point_to_scene(self, points: Tensor) -> Tensor:
         """Points in metres, z up (..., 3) to scene coordinates."""
-        origin, rotation, *_ = self._on(points.device)
-        return ((points.double() / self.metres_per_unit) @ rotation + origin).to(points.dtype)
+        place = in_double(points)
+        origin, rotation, *_ = self._on(place.device)
+        return ((place / self.metres_per_unit) @ rotation + origin).to(points)
 
     def displacement_to_scene(self, displacement: Tensor) -> Tensor:
         """Displacements in metres, z up (..., 3) to scene units and axes."""

@@ -9,6 +9,8 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from gaussian_swaying._devices import in_double
+
 
 def cofactor(matrix: Tensor) -> Tensor:
     r"""Cofactor matrix, :math:`\operatorname{cof} F = \det(F) F^{-T}`, defined for singular matrices too.
@@ -143,7 +145,7 @@ def symmetric_eigenvalues(matrix: Tensor) -> Tensor:
 
 def singular_values(matrix: Tensor) -> Tensor:
     """Singular values of 3x3 matrices (..., 3, 3), largest first, computed in float64; for diagnostics."""
-    double = matrix.double()
+    double = in_double(matrix)
     return symmetric_eigenvalues(double.mT @ double).clamp(min=0).sqrt()
 
 

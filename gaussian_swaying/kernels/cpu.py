@@ -105,20 +105,29 @@ def _llvm() -> Any:
 
 @cache
 def _machine() -> Any:
-    """The code generator of this processor.
-
-    On x86-64 addresses are absolute and have 64 bits: the parts of an object may lie farther apart in memory than the
-    32 bits that code would have for them otherwise, and then LLVM would end the process.
-    """
+    """The code generator of this processor."""
     llvm = _llvm()
-    target = llvm.Target.from_default_triple()
+    return _machine_for(llvm.get_default_triple(), llvm.get_host_cpu_name(), _features())
+
+
+def _machine_for(triple: str, processor: str, features: str = "") -> Any:
+    """The code generator of a processor.
+
+    Addresses in its code reach any place: the parts of an object may lie farther apart in memory than the 32 bits that
+    x86-64 has for them otherwise, and then LLVM would end the process. On arm64, LLVM does so for any code that it
+    links in memory.
+    """
+    target = _llvm().Target.from_triple(triple)
     far = {"reloc": "static", "codemodel": "large"} if target.name == "x86-64" else {"codemodel": "jitdefault"}
-    return target.create_target_machine(cpu=llvm.get_host_cpu_name(), features=_features(), opt=3, **far)
+    return target.create_target_machine(cpu=processor, features=features, opt=3, **far)
 
 
 @cache
 def _features() -> str:
-    return _llvm().get_host_cpu_features().flatten()
+    try:
+        return str(_llvm().get_host_cpu_features().flatten())
+    except RuntimeError:  # LLVM cannot tell: the name of the processor has to do
+        return ""
 
 
 @cache
@@ -134,16 +143,16 @@ def _folder() -> Path:
     return Path(given) if given else Path(base) / "gaussian_swaying"
 
 
-def _compiled(text: str) -> bytes:
-    """An object file from LLVM's text."""
-    llvm = _llvm()
+def _compiled(text: str, machine: Any = None) -> bytes:
+    """An object file from LLVM's text, for this processor if no other code generator is given."""
+    llvm, machine = _llvm(), machine or _machine()
     module = llvm.parse_assembly(text)
     module.verify()
     options = llvm.create_pipeline_tuning_options(speed_level=3)
     options.loop_vectorization = options.slp_vectorization = False  # blocks are vectors already
-    builder = llvm.create_pass_builder(_machine(), options)
+    builder = llvm.create_pass_builder(machine, options)
     builder.getModulePassManager().run(module, builder)
-    return _machine().emit_object(module)
+    return bytes(machine.emit_object(module))
 
 
 def _linked(code: bytes, symbol: str) -> tuple[int, Any]:

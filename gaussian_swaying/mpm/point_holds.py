@@ -28,6 +28,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from gaussian_swaying._devices import double_home
 from gaussian_swaying.mpm.body import Body
 from gaussian_swaying.mpm.boundaries.boundary import CLOCK, Boundary
 from gaussian_swaying.mpm.boundaries.pinned_points import PinnedPoints
@@ -128,7 +129,7 @@ class PointHolds:
         self.boundaries = boundaries = body.boundaries
         position = body.points.position
         self.moving = tuple(k for k, b in enumerate(boundaries) if kinds[k] in POINTS and b.moves)
-        device = position.device
+        device = double_home(position.device)
         count, nodes = position.shape[-2], grid.node_count
         points = position.reshape(-1, count, 3).cpu().double()
         cell = first.reshape(-1, count).cpu() - nodes * torch.arange(len(points))[:, None]
@@ -291,21 +292,22 @@ class PointHolds:
         now = time + CLOCK
         phase = (now >= self.starts).sum().reshape(1)
         node, weight, W = (self._at(field, phase) for field in (self.node, self.weight, self.whitening))
-        flat = velocity.reshape(-1, 3)
+        flat = velocity.reshape(-1, 3).to(self.weight.device)
 
         def read(field: Tensor) -> Tensor:
             return (weight[..., None] * field[node].double()).sum(-2)
 
         rate = read(flat)
         if self.moving:
-            rate = rate - self._targets(read(displacement.reshape(-1, 3)), phase, time, dt)
+            moved = read(displacement.reshape(-1, 3).to(self.weight.device))
+            rate = rate - self._targets(moved, phase, time, dt)
         active = self._at(self.release, phase) > now
         taken = W.mT @ torch.where(active[..., None], W @ rate, 0.0)
         entry, push = self._at(self.entry, phase), self._at(self.push, phase)
         pushed = (push[..., None] * torch.nn.functional.pad(taken.reshape(-1, 3), (0, 0, 0, 1))[entry]).sum(-2)
         own = flat.index_select(0, self.affected)
         flat = flat.index_copy(0, self.affected, own - pushed.to(own))
-        return flat.reshape(velocity.shape), self._at(self.taken_by, phase) @ taken.detach()
+        return flat.reshape(velocity.shape).to(velocity.device), self._at(self.taken_by, phase) @ taken.detach()
 
     def _targets(self, moved: Tensor, phase: Tensor, time: Tensor, dt: float | Tensor) -> Tensor:
         """Target velocity of each row, from how far it moved (scenes, K, 3)."""

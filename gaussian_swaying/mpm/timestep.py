@@ -184,7 +184,7 @@ def work_done(state: MPMState, after: MPMState, dt: float, force: Tensor, drag: 
     if drag is not None:
         force = force - drag[..., None] * (after.velocity - state.velocity)
     power = torch.linalg.vecdot(force, state.velocity + after.velocity).sum(-1)
-    return state.work + (0.5 * kick_time(state, dt)) * power
+    return state.work + ((0.5 * kick_time(state, dt)) * power).to(state.work.device)
 
 
 def cfl_number(dt: float | Tensor, dx: float, speed: Tensor, velocity: Tensor | None) -> Tensor:

@@ -60,7 +60,7 @@ class HostCopy:
     def _copy(self, value: Any) -> Any:
         if isinstance(value, Tensor):
             clone = value.detach().clone()  # with its strides, as the last bits of a product depend on them
-            return self._to_host(clone) if clone.is_cuda else clone
+            return self._to_host(clone) if clone.is_cuda else clone.cpu()
         if isinstance(value, dict):
             return {key: self._copy(item) for key, item in value.items()}
         if isinstance(value, (list, tuple)):

@@ -41,7 +41,7 @@ if TYPE_CHECKING:
     DeviceLike = torch.device | str
     SolverLike = Solver
 else:  # what a YAML file can contain: the annotations of the constructor are its schema
-    SceneLike, WindLike, DeviceLike = Scene, WindField, Literal["auto", "cpu", "cuda"]
+    SceneLike, WindLike, DeviceLike = Scene, WindField, Literal["auto", "cpu", "cuda", "mps"]
     SolverLike = MPMSolver
 
 HoldLike = Region | PinnedRegion | PinnedPoints
@@ -50,9 +50,15 @@ CELLS = 32
 
 
 def resolve_device(device: DeviceLike) -> torch.device:
-    """``auto``, ``cpu`` or ``cuda`` as a device; ValueError if CUDA is requested but not available."""
+    """The device of a name: ``auto`` (a CUDA GPU if there is one, else the CPU), ``cpu``, ``cuda`` or ``mps``.
+
+    Raises:
+        ValueError: If the machine does not have it.
+    """
     if isinstance(device, torch.device):
         return device
+    if device.startswith("mps") and not torch.backends.mps.is_available():
+        raise ValueError("`--device mps` needs a Mac with an Apple GPU, but found none: use --device auto or cpu.")
     if device != "auto" and not device.startswith("cuda"):
         return torch.device(device)
     if torch.cuda.is_available():

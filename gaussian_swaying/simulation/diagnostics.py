@@ -11,6 +11,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from gaussian_swaying._devices import in_double
 from gaussian_swaying.geometry.linalg import determinant, matmul3, symmetric_eigenvalues
 from gaussian_swaying.geometry.neighbours import nearest_neighbours
 from gaussian_swaying.kernels.graphs import RECORDED, Replayed
@@ -293,7 +294,7 @@ def measure(
     moved = torch.linalg.vector_norm(state.position - solver.points.position, dim=-1)
     energies, momenta = solver.energies(state), solver.momenta(state)
     J = determinant(state.F_total)
-    F = state.F_total.double()
+    F = in_double(state.F_total)
     squares = symmetric_eigenvalues(matmul3(F.mT, F))
     columns = {
         **energies,
@@ -314,8 +315,8 @@ def measure(
     }
     scenes = moved.shape[:-1].numel()
     support = support_force(start, state)
-    support = support.double().reshape(scenes, 3 * support.shape[-2])
-    each = [columns[name].double().reshape(-1) for name in _OF_SCENE]
+    support = in_double(support).reshape(scenes, 3 * support.shape[-2])
+    each = [in_double(columns[name]).reshape(-1) for name in _OF_SCENE]
     courant = cfl if isinstance(cfl, Tensor) else torch.full_like(state.time, cfl)
     parts = {
         "time": state.time[None],
@@ -388,7 +389,7 @@ _UNREAD = ("F_elastic", "affine")
 def _outran(before: State, after: State) -> Tensor:
     """Return 1 if a particle with a finite position left the grid between two states, else 0; float64, shape (1,)."""
     new = after.lost & ~before.lost & torch.isfinite(after.position).all(-1)
-    return new.any().double().reshape(1)
+    return in_double(new.any()).reshape(1)
 
 
 def check_state(solver: Solver, state: State) -> None:
@@ -423,7 +424,7 @@ def _verdict(solver: Solver, state: State, moved: Tensor) -> Tensor:
     wrong = torch.where(finite, wrong, _NOT_FINITE).reshape(-1)
     first = (wrong > 0).int().argmax(0, keepdim=True)
     found = torch.cat([wrong.index_select(0, first), first, state.lost.sum()[None]])
-    return torch.cat([found.double(), size[None].double()])
+    return torch.cat([in_double(found), in_double(size[None])])
 
 
 def _raise_if_bad(solver: Solver, verdict: list[float], time: float) -> None:

@@ -21,6 +21,7 @@ import torch
 from torch import Tensor, nn
 
 from gaussian_swaying._checks import check_literals, check_vector, number_of, requires_grad
+from gaussian_swaying._devices import in_double
 from gaussian_swaying.aero.force import AeroForce
 from gaussian_swaying.aero.wind import SpatialWind, WindField
 from gaussian_swaying.mpm.forces import Force
@@ -493,7 +494,7 @@ def _of_force(kind: str, attribute: str) -> tuple[Read, Write]:
 
 
 def _mean(field: str) -> Read:
-    return lambda setup: float(getattr(setup.points, field).detach().double().mean())
+    return lambda setup: float(in_double(getattr(setup.points, field).detach()).mean())
 
 
 def _steady_flow(setup: Setup) -> list[float]:
@@ -502,7 +503,7 @@ def _steady_flow(setup: Setup) -> list[float]:
 
 
 def _density(setup: Setup) -> float:
-    return float((setup.points.mass.double().sum() / setup.points.volume.double().sum()).detach())
+    return float((in_double(setup.points.mass).sum() / in_double(setup.points.volume).sum()).detach())
 
 
 _SIZE: dict[str, Any] = {"low": 0.0, "scale": "log"}

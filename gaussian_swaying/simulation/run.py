@@ -5,7 +5,7 @@ from __future__ import annotations
 import sys
 import time
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager, nullcontext, suppress
 from pathlib import Path
 from typing import Any
 
@@ -88,7 +88,7 @@ def run_health(stepper: Stepper, log: Sequence[Mapping[str, Any]]) -> tuple[dict
         log: Diagnostics of its frames.
     """
     scene, points = stepper.scene, stepper.setup.points
-    where = scene.frame.point_to_scene(points.position.double().cpu())
+    where = scene.frame.point_to_scene(points.position.cpu().double())
     elastic = points.elastic
     size = scene.size * scene.frame.metres_per_unit
     found = extremes(log, where, size, None if elastic is None else elastic.cpu())
@@ -219,7 +219,7 @@ class Run:
                 with walls("simulation"):
                     frame = next(frames)
                 state = frame.state
-                with torch.cuda.stream(drawn):  # nothing changes without one
+                with torch.cuda.stream(drawn) if drawn is not None else nullcontext():
                     self.record(state, index)
                     self.log.append(frame.health.as_dict())
                     with walls("writing"):

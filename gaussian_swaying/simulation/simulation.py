@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any, Literal
 import torch
 
 from gaussian_swaying._checks import check_choice, check_frames, check_positive, check_vector
+from gaussian_swaying._devices import double_home, move
 from gaussian_swaying._turns import Turn, in_turn
 from gaussian_swaying.aero.force import AeroForce
 from gaussian_swaying.aero.wind import SpatialWind, WindField
@@ -93,7 +94,8 @@ class Simulation:
         background: Background colour in [0, 1].
         frame_dt: Time between frames [s].
         dtype: Precision of the solver.
-        device: auto uses a CUDA GPU if there is one.
+        device: auto uses a CUDA GPU if there is one, else the CPU. ``mps`` (a Mac) runs torch's substeps and renderer,
+            in float32; the compiled kernels are on the CPU.
         up: Python only, if ``scene`` is not a :class:`Scene`: direction in the scene that points up.
         hold: Python only, if no solver is given: what is held in place. A region, or a pin with a kind of its own:
             ``PinnedRegion(region, kind="clamp")`` also holds the slope, ``PinnedPoints`` holds given places.
@@ -150,6 +152,10 @@ class Simulation:
         check_choice("dtype", dtype, ("float32", "float64"))
         colour = check_vector("background", background)
         target = resolve_device(device)
+        if dtype == "float64" and double_home(target) != target:
+            raise ValueError(
+                "`dtype: float64` needs a device with double precision, which mps is not: use `device: cpu`."
+            )
         settings, material = as_scene(scene, up), material or Material()
         cloud = settings.cloud()  # read once
         solver = as_solver(solver, hold, settings, cloud)
@@ -224,7 +230,7 @@ class Simulation:
         """Move all components to a device; returns the simulation."""
         setup, solver = self.setup, self.solver
         for part in (self._painter, solver, setup.wind, setup.aero, *setup.forces):
-            part.to(device)
+            move(part, device)
         self._stepper.take(replace(setup, points=self.scene.points))
         return self
 
@@ -331,7 +337,7 @@ class Simulation:
         before = self.setup
         with torch.inference_mode(False):
             for part in (setup.wind, setup.aero, *setup.forces):
-                part.to(self.device)
+                move(part, self.device)
             if setup.points is not before.points:
                 self.scene.points = setup.points
                 self._editor.rebase(setup.points)
@@ -359,7 +365,7 @@ class Simulation:
         solver = self.solver.like(setup.solver)
         scene = other_with(self.scene, points=setup.points, model=other_with(self.scene.model, sh0=sh0, shN=shN))
         other._painter = other_with(self._painter, scene=scene)
-        setup = replace(setup, scene=scene, wind=setup.wind.to(self.device))
+        setup = replace(setup, scene=scene, wind=move(setup.wind, self.device))
         other._stepper = Stepper(solver, setup, self.frame_dt, turn=self.turn)
         other._editor = SceneEditor(other._stepper, self._editor.edits)
         other._recorder, other.files, other._given = recorder or Recorder(), [], dict(self._given)

@@ -11,6 +11,7 @@ from typing import NoReturn
 import torch
 from torch import Tensor
 
+from gaussian_swaying._devices import double_home, in_double
 from gaussian_swaying._turns import Turn, in_turn
 from gaussian_swaying.aero.patches import Patches
 from gaussian_swaying.aero.shelter import Shelter
@@ -147,7 +148,7 @@ class Stepper:
             return torch.cat(flows)
         position = self.setup.points.position
         position = position.expand(len(winds), *position.shape) if self.batched else position
-        air = self.wind_force.air(torch.zeros((), dtype=torch.float64, device=position.device), position)
+        air = self.wind_force.air(torch.zeros((), dtype=torch.float64, device=double_home(position.device)), position)
         return air.reshape(-1, 3)
 
     @in_turn
@@ -158,7 +159,7 @@ class Stepper:
             return scene.on_gaussians(torch.zeros_like(scene.in_wind, dtype=state.position.dtype))
         move, F = scene.follow.motion(state)
         normal, area = deform_patch(F, scene.rest_facing.to(F), F.new_ones(len(F)))
-        place = scene.frame.point_to_sim(scene.model.means[scene.moving].double()).to(move) + move
+        place = scene.frame.point_to_sim(in_double(scene.model.means[scene.moving])).to(move) + move
         wind = self.wind_force.air(state.time, place)
         force = self.setup.aero(wind, scene.follow.velocity(state), normal, torch.ones_like(area))
         return scene.on_gaussians(torch.where(scene.in_wind, torch.linalg.vector_norm(force, dim=-1), 0.0))
@@ -505,13 +506,13 @@ def needs_of(stepper: Stepper, state: State, winds: Tensor | None) -> Tensor:
         winds: Air velocities during the frame [m/s], shape (K, ...), from ``WindForce.samples``; None if the wind has
             no effect.
     """
-    cells = stepper.solver.cells_per_second(state).double()
+    cells = in_double(stepper.solver.cells_per_second(state))
     if winds is None:
         return torch.stack([cells, *cells.new_zeros(2)])
     wind = torch.linalg.vector_norm(winds, dim=-1).amax().to(state.velocity.dtype)
     speed = wind + torch.linalg.vector_norm(state.velocity, dim=-1)
     fastest = stepper.setup.aero.rate(speed, stepper.wind_force.area, stepper.solver.points.mass).amax()
-    return torch.stack([cells, fastest.double(), wind.double()])
+    return torch.stack([cells, in_double(fastest), in_double(wind)])
 
 
 def why_not_batched(setup: Setup) -> str | None:

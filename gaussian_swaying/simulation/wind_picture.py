@@ -7,6 +7,7 @@ import math
 import torch
 from torch import Tensor
 
+from gaussian_swaying._devices import double_home, in_double
 from gaussian_swaying.aero.wind import WindField
 from gaussian_swaying.mpm.state import State
 from gaussian_swaying.rendering.cameras.camera import Camera, project
@@ -37,12 +38,12 @@ def streaks(stepper: Stepper, state: State, camera: Camera) -> tuple[Tensor, Ten
         Places, scene units, shape (S, STEPS + 1, 3), and the speed at them [m/s], shape (S, STEPS + 1).
     """
     scene, frame, wind = stepper.scene, stepper.scene.frame, stepper.setup.wind
-    device, double = state.position.device, torch.float64
+    device, double = double_home(state.position.device), torch.float64
     centre = frame.point_to_sim(scene.center.to(device).double()[None])[0]
     eye = frame.point_to_sim(camera.position.to(device).double()[None])[0]
     view = centre - eye
     distance = view.norm()
-    mean = wind.mean_flow(state.time) if isinstance(wind, WindField) else stepper.flows().double().mean(0)
+    mean = wind.mean_flow(state.time) if isinstance(wind, WindField) else in_double(stepper.flows()).mean(0)
     carried = wind.carried(state.time) if isinstance(wind, WindField) else mean * state.time
     right, up = _plane(mean, view / distance)
     high = 1.15 * float(distance) * camera.height / float(camera.intrinsics[1, 1])
@@ -60,12 +61,12 @@ def streaks(stepper: Stepper, state: State, camera: Camera) -> tuple[Tensor, Ten
     seconds = 0.125 * wide / max(speed, 1e-6) if speed > 0 else 1.0
     places, speeds = [], []
     for _ in range(STEPS + 1):
-        air = stepper.wind_force.air(state.time, place.to(state.position.dtype))
-        air = air.double().expand_as(place)
+        air = stepper.wind_force.air(state.time, place.to(state.position))
+        air = in_double(air).expand_as(place)
         places.append(place)
         speeds.append(torch.linalg.vector_norm(air, dim=-1))
         half = place + 0.5 * seconds / STEPS * air  # midpoint rule
-        middle = stepper.wind_force.air(state.time, half.to(state.position.dtype)).double().expand_as(place)
+        middle = in_double(stepper.wind_force.air(state.time, half.to(state.position))).expand_as(place)
         place = place + seconds / STEPS * middle
     points = torch.stack(places, 1)
     return frame.point_to_scene(points.reshape(-1, 3)).view_as(points), torch.stack(speeds, 1)

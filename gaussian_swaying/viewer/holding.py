@@ -8,6 +8,7 @@ import numpy as np
 import torch
 import yaml
 
+from gaussian_swaying._devices import in_double
 from gaussian_swaying.mpm.boundaries.pinned_region import PinnedRegion
 from gaussian_swaying.viewer.pictures import under_cursor
 from gaussian_swaying.viewer.screen import Panel
@@ -123,4 +124,4 @@ class Holding:
         for boundary in solver.framed(scene.frame):
             if isinstance(boundary, PinnedRegion):
                 held |= boundary.particle_mask(scene.points.position)
-        return scene.frame.point_to_scene(scene.points.position[held].double()).cpu().numpy()
+        return scene.frame.point_to_scene(in_double(scene.points.position[held])).cpu().numpy()

@@ -10,6 +10,7 @@ import numpy as np
 import torch
 from PIL import Image
 
+from gaussian_swaying._devices import double_home, in_double
 from gaussian_swaying.geometry.rotations import quat_to_rotation
 from gaussian_swaying.rendering.cameras.camera import Camera
 from gaussian_swaying.simulation.wind_picture import draw_wind
@@ -96,15 +97,17 @@ def under_cursor(snapshot: Snapshot, origin: Sequence[float], direction: Sequenc
         direction: Its direction, of any length.
     """
     scene = snapshot.simulation.scene
-    means = snapshot.simulation.painter.deformed(snapshot.state).means.double()
+    means = snapshot.simulation.painter.deformed(snapshot.state).means
+    seen = (scene.model.opacity() > 0.2).to(double_home(means.device))
+    means = in_double(means)
     start = torch.tensor(list(origin), dtype=torch.float64, device=means.device)
     along = torch.nn.functional.normalize(torch.tensor(list(direction), dtype=torch.float64), dim=0).to(means)
     depth = (means - start) @ along
     beside = torch.linalg.vector_norm(means - start - depth[:, None] * along, dim=-1)
-    seen = (scene.model.opacity() > 0.2) & (depth > 0)
+    seen &= depth > 0
     if not scene.all_move:
         moves = torch.zeros_like(seen)
-        moves[scene.moving] = True
+        moves[scene.moving.to(moves.device)] = True
         seen &= moves
     near = seen & (beside < 0.02 * scene.size)
     if not bool(near.any()):

@@ -19,6 +19,7 @@ import numpy as np
 import torch
 
 from gaussian_swaying._checks import one_line
+from gaussian_swaying._devices import in_double
 from gaussian_swaying.geometry.rotations import quat_to_rotation
 from gaussian_swaying.viewer.door import ANY, Door, check_address
 from gaussian_swaying.viewer.film_strip import FilmStrip
@@ -239,7 +240,7 @@ class Screen:
         self.server.scene.set_up_direction(tuple(up))
         self._turn = turn_of(up, self._turn)
         first = self.server.initial_camera
-        eye, forward = camera.position.double(), camera.world_to_camera[2, :3].double()
+        eye, forward = in_double(camera.position), in_double(camera.world_to_camera[2, :3])
         distance = float((scene.center.to(eye) - eye).norm())
         first.position = tuple((eye - (BACK - 1) * distance * forward).tolist())
         first.look_at = tuple((eye + distance * forward).tolist())

@@ -53,7 +53,7 @@ def film_from(scene: SimulatedScene, turn: Tensor) -> Tensor:
 
     A film has the object's longest side as its unit, z up and the object's centre as its origin.
     """
-    corners = torch.cat([torch.zeros(1, 3), torch.eye(3)]).double().to(scene.center.device)
+    corners = torch.cat([torch.zeros(1, 3), torch.eye(3)]).double()
     size = scene.size * scene.frame.metres_per_unit
     places = scene.frame.point_to_sim(corners @ turn.to(corners)).cpu() / size
     found = torch.eye(4, dtype=torch.float64)

@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from gaussian_swaying._checks import check_vector
+from gaussian_swaying._devices import in_double
 from gaussian_swaying.geometry.frame import SimFrame
 from gaussian_swaying.geometry.regions import Region
 from gaussian_swaying.mpm.boundaries.pinned_region import PinnedRegion
@@ -80,7 +81,9 @@ class SequentialRelease(PinnedRegion):
     def release_time(self, rest_position: Tensor) -> Tensor:
         """When the front passes each particle [s], shape (..., P), float64."""
         mask = self.region.contains(rest_position)
-        along = (rest_position.double() * self.direction.to(rest_position.device)).sum(-1)
+        place = in_double(rest_position)
+        mask = mask.to(place.device)
+        along = (place * self.direction.to(place.device)).sum(-1)
         if self.ends is None:
             low = along.where(mask, math.inf).amin(-1, keepdim=True)
             high = along.where(mask, -math.inf).amax(-1, keepdim=True)

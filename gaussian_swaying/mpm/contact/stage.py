@@ -10,6 +10,7 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
+from gaussian_swaying._devices import double_home, in_double
 from gaussian_swaying.mpm.boundaries.boundary import Boundary
 from gaussian_swaying.mpm.boundaries.obstacle import Obstacle
 from gaussian_swaying.mpm.contact.pairs import close_pairs
@@ -211,7 +212,7 @@ class ContactStage:
             float64.
         """
         lists = self.lists
-        taken = torch.zeros(self.scenes, self.count, 3, dtype=torch.float64, device=velocity.device)
+        taken = torch.zeros(self.scenes, self.count, 3, dtype=torch.float64, device=double_home(velocity.device))
         if lists is None or len(lists.place) == 0:
             return velocity, taken
         flat, rows = velocity.reshape(-1, 3), lists.rows
@@ -230,7 +231,8 @@ class ContactStage:
         if self.obstacles:
             with torch.no_grad(), in_fixed_order(self.deterministic and flat.is_cuda):
                 flat_owner = self.scene[lists.place[held.first]] * (self.count + 1) + owner  # the last one for pairs
-                sums = taken.new_zeros(self.scenes * (self.count + 1), 3).index_add_(0, flat_owner, -impulse.double())
+                sums = taken.new_zeros(self.scenes * (self.count + 1), 3)
+                sums.index_add_(0, flat_owner.to(sums.device), -in_double(impulse))
                 taken = sums.reshape(self.scenes, -1, 3)[:, :-1]
         return flat.reshape(velocity.shape), taken
 
@@ -255,7 +257,7 @@ class ContactStage:
         parts: list[tuple[Tensor, ...]] = []
         for (k, obstacle), near in zip(self.obstacles, lists.walls, strict=True):
             gap, normal, drive = obstacle.touch(position[near], time, dt)
-            valid = obstacle.active(time).expand(len(near))
+            valid = obstacle.active(time).to(near.device).expand(len(near))
             friction = gap.new_full((len(near),), obstacle.friction)
             owner = torch.full_like(near, k)
             parts.append(

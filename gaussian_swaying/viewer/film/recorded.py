@@ -12,6 +12,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from gaussian_swaying._devices import in_double
 from gaussian_swaying.config.parser import parse_file
 from gaussian_swaying.gaussians.harmonics import sh_to_color
 from gaussian_swaying.geometry.covariances import covariance_to_quat_scale
@@ -96,7 +97,7 @@ def _check_near(path: Path, scene: SimulatedScene, grid: GridSpec, nodes: Tensor
     moved farther than the farthest node, so only frames with such a node are looked at closely.
     """
     most = FARTHEST * scene.size * scene.frame.metres_per_unit
-    stencil = follower_stencil(scene.follow.places.double(), grid)
+    stencil = follower_stencil(in_double(scene.follow.places), grid)
     for k in (displacement.norm(dim=-1) > most).any(1).nonzero()[:, 0].tolist():
         field = torch.zeros(math.prod(grid.resolution), 3, dtype=torch.float64)
         field[nodes] = displacement[k].double()
@@ -161,10 +162,10 @@ def film_of(simulation: Simulation, grid: GridSpec, nodes: Tensor, displacement:
     scene, painter = simulation.scene, simulation.painter
     device = scene.model.means.device
     size, count = scene.size * scene.frame.metres_per_unit, len(scene.model.means)
-    position = scene.frame.point_to_sim(scene.model.means.double()) / size
-    turn, scale = covariance_to_quat_scale(scene.frame.covariance_to_sim(scene.rest_covariances.double()) / size**2)
+    position = scene.frame.point_to_sim(in_double(scene.model.means)) / size
+    turn, scale = covariance_to_quat_scale(scene.frame.covariance_to_sim(in_double(scene.rest_covariances)) / size**2)
     place = torch.full((count, 3), -1.0, device=device)
-    place[scene.moving] = in_cells(scene.follow.places, grid).float()
+    place[scene.moving] = in_cells(scene.follow.places, grid).float().to(device)
     facing = torch.zeros(count, 4, device=device)
     facing[scene.moving, :3] = scene.rest_facing.float()
     facing[scene.moving, 3] = scene.solid().float()
@@ -221,22 +222,23 @@ def in_cells(places: Tensor, grid: GridSpec) -> Tensor:
     cells = places / grid.dx
     border = cells.floor() + 0.5
     close = (cells - border).abs() < torch.finfo(places.dtype).eps ** 0.5
-    return torch.where(close, border, cells).double() - torch.tensor(grid.offset, device=places.device)
+    found = in_double(torch.where(close, border, cells))
+    return found - torch.tensor(grid.offset, device=found.device)
 
 
 def _steps(values: Tensor) -> np.ndarray:
     """Numbers from -1 to 1 in steps of 1/32767."""
-    found: np.ndarray = (values.double().clamp(-1, 1) * 32767).round().to(torch.int16).numpy(force=True)
+    found: np.ndarray = (in_double(values).clamp(-1, 1) * 32767).round().to(torch.int16).numpy(force=True)
     return found
 
 
 def _camera(painter: Painter, scene: SimulatedScene, size: float) -> dict[str, Any]:
     """The first camera of a run: eye, the point on its axis closest to the object, field of view [degrees]."""
     camera = painter.camera_at(0)
-    eye = scene.frame.point_to_sim(camera.position.double()) / size
-    axis = scene.frame.direction_to_sim(camera.world_to_camera[2, :3].double())
+    eye = scene.frame.point_to_sim(in_double(camera.position)) / size
+    axis = scene.frame.direction_to_sim(in_double(camera.world_to_camera[2, :3]))
     target = eye + axis * float((-eye * axis).sum().clamp_min(0.2))
-    field = 2 * torch.atan(camera.height / (2 * camera.intrinsics[1, 1].double()))
+    field = 2 * torch.atan(camera.height / (2 * in_double(camera.intrinsics[1, 1])))
     across = camera.width * camera.intrinsics[1, 1] / (camera.height * camera.intrinsics[0, 0])
     return {
         "eye": eye.tolist(),
