@@ -114,18 +114,19 @@ def check_archive(path: str | os.PathLike[str], what: str) -> Path:
     return path
 
 
-def check_unpacked(path: Path, needed: int, what: str) -> None:
+def check_unpacked(path: Path, needed: int, what: str, size: int | None = None) -> None:
     """Check what a compressed file announces before it is decompressed.
 
     Args:
         path: The file.
         needed: Memory that its content will take [bytes].
         what: The announced content, for the message, for example "8,000 Gaussians".
+        size: Size of all files that hold it [bytes]; that of the file if None.
 
     Raises:
         ValueError: If that is more than a gigabyte and a hundred times the size of the file.
     """
-    size = path.stat().st_size
+    size = path.stat().st_size if size is None else size
     if needed > (1 << 30) + 100 * size:
         raise ValueError(
             f"{path} announces {what}, far more than its {size:,} bytes can hold; copy or export it again."

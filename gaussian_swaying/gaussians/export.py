@@ -23,16 +23,18 @@ from gaussian_swaying.gaussians.gltf import encode_gltf
 from gaussian_swaying.gaussians.harmonics import sh_to_color
 from gaussian_swaying.gaussians.model import DeformedGaussians
 from gaussian_swaying.gaussians.ply import check_folder, write_ply
+from gaussian_swaying.gaussians.sog import encode_sog
 from gaussian_swaying.gaussians.spz import encode_spz
 from gaussian_swaying.geometry.patches import smallest_axis_normal
 from gaussian_swaying.geometry.rotations import quat_to_rotation
 
-Format = Literal["ply", "compressed_ply", "splat", "spz", "glb", "usd"]
+Format = Literal["ply", "compressed_ply", "splat", "spz", "sog", "glb", "usd"]
 SUFFIXES: dict[str, str] = {
     "ply": ".ply",
     "compressed_ply": ".compressed.ply",
     "splat": ".splat",
     "spz": ".spz",
+    "sog": ".sog",
     "glb": ".glb",
     "usd": ".usdc",
 }
@@ -86,6 +88,7 @@ def export_cloud(
     - ``splat``: antimatter15's format, through gsplat: 32 bytes for each Gaussian. Colours are those of harmonics of
       degree 0; no normals.
     - ``spz``: Niantic's format, see :func:`~gaussian_swaying.gaussians.spz.encode_spz`.
+    - ``sog``: PlayCanvas' format, see :func:`~gaussian_swaying.gaussians.sog.encode_sog`.
     - ``glb``: glTF with ``KHR_gaussian_splatting``, in metres with y up, see
       :func:`~gaussian_swaying.gaussians.gltf.encode_gltf`.
     - ``usd``: one frame, see :func:`write_usd`.
@@ -120,6 +123,8 @@ def export_cloud(
     else:
         if format == "spz":
             content = encode_spz(kept, spz_version)
+        elif format == "sog":
+            content = encode_sog(kept)
         elif format == "glb":
             content = encode_gltf(kept, rotation, metres_per_unit)
         else:

@@ -11,6 +11,7 @@ from gaussian_swaying.gaussians.cloud import GaussianCloud
 from gaussian_swaying.gaussians.compact import read_compressed_ply, read_splat
 from gaussian_swaying.gaussians.gltf import read_gltf
 from gaussian_swaying.gaussians.ply import read_ply
+from gaussian_swaying.gaussians.sog import read_sog
 from gaussian_swaying.gaussians.spz import read_spz
 
 
@@ -23,16 +24,18 @@ READERS: dict[str, Callable[[Path], GaussianCloud]] = {
     ".ply": _read_any_ply,
     ".splat": read_splat,
     ".spz": read_spz,
+    ".sog": read_sog,
+    ".json": read_sog,
     ".glb": read_gltf,
     ".gltf": read_gltf,
 }
 """Readers by the ending of a file's name."""
-READABLE = "3DGS or compressed .ply, .splat, .spz, or .glb or .gltf with KHR_gaussian_splatting"
+READABLE = "3DGS or compressed .ply, .splat, .spz, SOG (.sog, meta.json or lod-meta.json), .glb or .gltf"
 """The same, in words."""
 
 
 def read_gaussians(path: str | os.PathLike[str]) -> GaussianCloud:
-    """Read a splat in any supported format: 3DGS .ply, compressed .ply, .splat, .spz or glTF.
+    """Read a splat in any supported format: 3DGS .ply, compressed .ply, .splat, .spz, SOG or glTF.
 
     The ending of the name chooses the format; a file with any other ending is read as a .ply. The content tells whether
     a .ply is compressed.

@@ -20,7 +20,7 @@ from torch import Tensor
 from gaussian_swaying._inputs import LARGEST_JSON, check_regular, check_unpacked, parse_json, read_json
 from gaussian_swaying.gaussians.cloud import GaussianCloud
 from gaussian_swaying.gaussians.harmonics import SH_DC, rotate_sh
-from gaussian_swaying.gaussians.packed import cloud_of, logits
+from gaussian_swaying.gaussians.packed import FIELDS, cloud_of, joined, logits
 from gaussian_swaying.gaussians.ply import reject
 from gaussian_swaying.geometry.covariances import covariance, covariance_to_quat_scale, deform_covariance
 from gaussian_swaying.geometry.rotations import quat_to_rotation, rotation_to_quat
@@ -30,7 +30,6 @@ LARGEST = 1 << 32  # bytes of a .glb file
 _GLB = struct.Struct("<4sII")  # magic, version, length; then chunks of a length, a kind and data
 _CHUNK = struct.Struct("<I4s")
 _TYPES = {5120: np.int8, 5121: np.uint8, 5122: np.int16, 5123: np.uint16, 5125: np.uint32, 5126: np.float32}
-_FIELDS = ("means", "quats", "scales", "opacities", "sh")
 _WIDTHS = {"SCALAR": 1, "VEC3": 3, "VEC4": 4}
 _UPRIGHT = torch.tensor([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]], dtype=torch.float64)  # z up to y up
 _FLAT = 1e-7  # of the largest size: a size of zero, which is allowed, becomes this
@@ -68,7 +67,7 @@ def read_gltf(path: str | os.PathLike[str]) -> GaussianCloud:
     if not sum(counts):
         raise ValueError(f"{path} holds zero Gaussians; export the scene again.")
     parts = [document.gaussians(*what, width) for what, count in zip(found, counts, strict=True) if count]
-    return GaussianCloud(*(torch.cat([getattr(part, name) for part in parts]) for name in _FIELDS))
+    return joined(parts)
 
 
 def encode_gltf(cloud: GaussianCloud, rotation: Tensor | None = None, metres_per_unit: float = 1.0) -> bytes:
@@ -304,7 +303,7 @@ class _Document:
         )
         self._check_turn(matrix)
         moved = _moved(cloud, *map(torch.from_numpy, (matrix[:3, :3].copy(), matrix[:3, 3].copy())))
-        return moved if moved is cloud else cloud_of(path, **{name: getattr(moved, name).numpy() for name in _FIELDS})
+        return moved if moved is cloud else cloud_of(path, **{name: getattr(moved, name).numpy() for name in FIELDS})
 
     def _check_turn(self, matrix: np.ndarray) -> None:
         """Raise ValueError unless a transformation is a rotation, a shift and positive scales along the axes."""

@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
+import warnings
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
+from torch import Tensor
 
 from gaussian_swaying.gaussians.cloud import GaussianCloud
 from gaussian_swaying.gaussians.ply import check_places, check_sizes_and_rotations, reject
 
+FIELDS = ("means", "quats", "scales", "opacities", "sh")
 _OTHERS = np.array([[1, 2, 3], [0, 2, 3], [0, 1, 3], [0, 1, 2]])  # places of the small ones for each of the largest
 _PLACES = np.array([[3, 0, 1, 2], [0, 3, 1, 2], [0, 1, 3, 2], [0, 1, 2, 3]])  # where 3 stands for the largest
 
@@ -37,11 +41,31 @@ def with_largest(small: np.ndarray, place: np.ndarray) -> np.ndarray:
     return quats
 
 
+def double(tensor: Tensor) -> np.ndarray:
+    """A tensor as a float64 array."""
+    array: np.ndarray = tensor.detach().cpu().double().numpy()
+    return array
+
+
 def logits(opacities: np.ndarray, steps: int) -> np.ndarray:
     """Logits of opacities from 0 to 1 in so many steps; those at the ends move inwards by half a step."""
     inside = np.clip(opacities.astype(np.float64), 0.5 / steps, 1 - 0.5 / steps)
     values: np.ndarray = np.log(inside / (1 - inside))
     return values
+
+
+def warn_antialiased(path: Path) -> None:
+    """Warn that a splat was trained with antialiasing, called by what a reader calls."""
+    warnings.warn(
+        f"{path} was trained with antialiasing, without which it is drawn here: what is thin or far looks thicker.",
+        UserWarning,
+        stacklevel=3,
+    )
+
+
+def joined(clouds: Sequence[GaussianCloud]) -> GaussianCloud:
+    """Several clouds with the same degree of harmonics, and without normals, as one."""
+    return GaussianCloud(*(torch.cat([getattr(cloud, name) for cloud in clouds]) for name in FIELDS))
 
 
 def cloud_of(path: Path, **columns: np.ndarray) -> GaussianCloud:

@@ -11,11 +11,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from torch import Tensor
 
 from gaussian_swaying._inputs import check_regular, check_unpacked
 from gaussian_swaying.gaussians.cloud import GaussianCloud
-from gaussian_swaying.gaussians.packed import cloud_of, logits, smallest_three, with_largest
+from gaussian_swaying.gaussians.packed import cloud_of, double, logits, smallest_three, warn_antialiased, with_largest
 
 VERSIONS = (1, 2, 3, 4)
 _MAGIC = b"NGSP"
@@ -59,11 +58,7 @@ def read_spz(path: str | os.PathLike[str]) -> GaussianCloud:
     _, version, count, degree, fraction, flags, _ = head
     _check_axes(path, extensions)
     if flags & _ANTIALIASED:
-        warnings.warn(
-            f"{path} was trained with antialiasing, without which it is drawn here: what is thin or far looks thicker.",
-            UserWarning,
-            stacklevel=2,
-        )
+        warn_antialiased(path)
     if degree == 4:
         warnings.warn(f"{path}: ignored the harmonics of degree 4; those up to 3 are used.", UserWarning, stacklevel=2)
     positions, alphas, colors, scales, rotations, rest = (np.frombuffer(part, dtype=np.uint8) for part in parts)
@@ -101,7 +96,7 @@ def encode_spz(cloud: GaussianCloud, version: int = 3) -> bytes:
         raise ValueError(f"Expected `spz_version` to be 1, 2, 3 or 4, but got {version}.")
     compress = _zstandard().ZstdCompressor(level=12).compress if version == 4 else None
     means, quats, scales, opacities, sh = (
-        _array(part) for part in (cloud.means, cloud.quats, cloud.scales, cloud.opacities, cloud.sh)
+        double(part) for part in (cloud.means, cloud.quats, cloud.scales, cloud.opacities, cloud.sh)
     )
     farthest = float(np.abs(means).max(initial=0.0))
     if farthest >= (65504 if version == 1 else 2**23 - 1):
@@ -219,11 +214,6 @@ def _zstandard(path: Path | None = None) -> Any:
 
 
 # ---- numbers
-
-
-def _array(tensor: Tensor) -> np.ndarray:
-    array: np.ndarray = tensor.detach().cpu().double().numpy()
-    return array
 
 
 def _byte(values: np.ndarray) -> np.ndarray:

@@ -28,12 +28,12 @@ class Preview:
 
 
 def splat_name(path: str | Path) -> str:
-    """The name of a splat: that of its file, or of the folder of a ``point_cloud.ply``, as written by training.
+    """The name of a splat: that of its file, or of the folder of ``point_cloud.ply`` (training) or ``meta.json`` (SOG).
 
     Folders ``iteration_30000`` and ``point_cloud``, as 3DGS makes them, are skipped.
     """
     file = Path(path)
-    if file.stem != "point_cloud":
+    if file.stem not in ("point_cloud", "meta", "lod-meta"):
         return file.stem
     folders = [part.name for part in file.resolve().parents]
     passed = ("point_cloud", "iteration_")

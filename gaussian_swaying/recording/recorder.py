@@ -99,8 +99,8 @@ class Recorder:
         force_scale: End of the colour scale of ``force`` [Pa]; null for the largest force per area of the wind, without
             gusts, on a patch at rest; the value is in summary.json.
         export_format: Format of the Gaussians: ``ply`` (3DGS, with normals), ``compressed_ply`` (for SuperSplat),
-            ``splat``, ``spz``, ``glb`` (glTF, in metres with y up), or ``usd`` (all frames in one animation.usdc, in
-            metres; needs usd-core). See ``gaussian_swaying.gaussians.export``.
+            ``splat``, ``spz``, ``sog``, ``glb`` (glTF, in metres with y up), or ``usd`` (all frames in one
+            animation.usdc, in metres; needs usd-core). See ``gaussian_swaying.gaussians.export``.
         nodes: In ``total``, write the displacement (metres, z up; float16, or float32 where it is long) of the nodes
             that the Gaussians follow for each frame; ``gaussian-swaying export --web`` needs it. Runs of ``updated``
             have nothing to write.

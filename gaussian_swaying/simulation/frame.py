@@ -79,7 +79,7 @@ class Frame:
         Args:
             path: File to write, such as 0001.ply; an existing one is replaced.
             format: As in :func:`~gaussian_swaying.gaussians.export.export_cloud`; by default that of the ending: .ply,
-                .compressed.ply, .splat, .spz, .glb, or .usdc, .usd and .usda.
+                .compressed.ply, .splat, .spz, .sog, .glb, or .usdc, .usd and .usda.
 
         Raises:
             FileNotFoundError: If the folder does not exist.

@@ -17,8 +17,8 @@ class Scene:
     """The source of the Gaussians, and the choice of those that are simulated.
 
     Args:
-        ply: A splat in any format that can be read (3DGS or compressed .ply, .splat, .spz, glTF); takes precedence over
-            ``generator``.
+        ply: A splat in any format that can be read (3DGS or compressed .ply, .splat, .spz, SOG, glTF); takes precedence
+            over ``generator``.
         generator: A scene made in code.
         region: Part that is simulated, in scene units; the rest does not move and is rendered as well.
         opacity_threshold: Gaussians in the region below this opacity carry no mass and feel no wind.

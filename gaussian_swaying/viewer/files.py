@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
 
 Folder = tempfile.TemporaryDirectory[str]
-UPLOADS = [suffix for suffix in READERS if suffix != ".gltf"]  # which takes its data from other files
+UPLOADS = [suffix for suffix in READERS if suffix not in (".json", ".gltf")]  # with files beside them
 RECORD = "Record a video (simulated time)"
 
 

@@ -305,6 +305,7 @@ def test_a_point_cloud_is_called_after_its_training():
     assert splat_name("splats/guitar.ply") == "guitar"
     assert splat_name("outputs/train/fox/point_cloud.ply") == "fox"
     assert splat_name("/data/bonsai/point_cloud/iteration_30000/point_cloud.ply") == "bonsai"
+    assert [splat_name(f"/data/playbot/{name}.json") for name in ("meta", "lod-meta")] == ["playbot", "playbot"]
 
 
 @pytest.mark.usefixtures("untried")

@@ -1,0 +1,351 @@
+"""SOG: as it was within the bits of each field, as others write it, in every packaging, and what is refused."""
+
+import io
+import json
+import math
+import tracemalloc
+import zipfile
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from other_writers import FILES, assert_close, scene
+from PIL import Image
+from small_scenes import together, varied_cloud
+
+from gaussian_swaying.gaussians import sog
+from gaussian_swaying.gaussians.export import convert, export_cloud
+from gaussian_swaying.gaussians.formats import read_gaussians
+from gaussian_swaying.gaussians.sog import encode_sog, read_sog
+from gaussian_swaying.simulation.scene import Scene
+
+# a component has steps of sqrt(2) / 255, and three of them are off; the fourth, at least 1/2, follows from them
+STEP = 2**0.5 / 255
+QUATS = 2 * 2 * 0.5 * STEP * 3**0.5
+ROUNDED = {"opacities": 0.501 / 255, "quats": QUATS}
+CUT_OFF = {"opacities": 1.01 / 255, "quats": 2 * QUATS}  # where a writer does not round
+
+
+def _in_order(found, expected):
+    """The found Gaussians in the order of the expected ones."""
+    order = torch.cdist(expected.means.double(), found.means.double()).argmin(1)
+    assert order.unique().numel() == len(expected) == len(found)
+    return found.select(order)
+
+
+def _files(path):
+    with zipfile.ZipFile(path) as archive:
+        return {name: archive.read(name) for name in archive.namelist()}
+
+
+def _meta(path):
+    return json.loads(_files(path)["meta.json"])
+
+
+@pytest.mark.parametrize("degree", [0, 1, 2, 3])
+def test_round_trip(degree, tmp_path):
+    """Centres within half of 2^-16 of the logarithmic range, the rest on the nearest entry of a code book."""
+    cloud = varied_cloud(degree=degree)
+    export_cloud(tmp_path / "a.sog", cloud)
+    found = _in_order(read_gaussians(tmp_path / "a.sog"), cloud)
+    step = 2 * math.log(4) / 65535 * 4  # from -1 to 3; the logarithm is steepest at 3
+    widest = {"scales": 2 / 255, "colors": 0.8 / 255, "sh": 0.8 / 255}  # steps of an even code book
+    assert_close(found, cloud, means=0.5 * step, **widest, **ROUNDED)
+    meta = _meta(tmp_path / "a.sog")
+    assert meta["count"] == 300
+    for name, before, after in (("scales", cloud.scales, found.scales), ("sh0", cloud.sh[:, 0], found.sh[:, 0])):
+        book = torch.tensor(meta[name]["codebook"])
+        assert len(book) == 256
+        nearest = (before[..., None] - book).abs().amin(-1)
+        torch.testing.assert_close((before - after).abs(), nearest, rtol=0, atol=1e-6)
+    assert ("shN" in meta) == (degree > 0)
+
+
+def test_values_that_fit_into_a_code_book_are_exact(tmp_path):
+    """A flat white sheet of equal Gaussians: no range is empty for the writer."""
+    cloud = varied_cloud(20, degree=0)
+    cloud.means[:, 2], cloud.sh[:], cloud.scales[:] = 0.25, 1.0, -3.0
+    export_cloud(tmp_path / "a.sog", cloud)
+    found = read_gaussians(tmp_path / "a.sog")
+    torch.testing.assert_close(found.means[:, 2], torch.full((20,), 0.25))
+    assert bool((found.scales == -3).all())
+    assert bool((found.sh == 1).all())
+    one = cloud.select(torch.arange(1))
+    export_cloud(tmp_path / "b.sog", one)
+    assert_close(read_gaussians(tmp_path / "b.sog"), one, means=1e-6, scales=0, colors=0, sh=0, **ROUNDED)
+
+
+def test_as_splat_transform_writes_it():
+    """Axes are those of the .ply. It cuts values off, and its code books are for more Gaussians than these."""
+    found = _in_order(read_sog(FILES / "scene.sog"), scene())
+    assert_close(found, scene(), means=1.5e-4, scales=0.02, colors=0.01, sh=0.01, **CUT_OFF)
+
+
+def _unpacked(folder, files):
+    folder.mkdir(parents=True, exist_ok=True)
+    for name, content in files.items():
+        (folder / name).write_bytes(content)
+    return folder / "meta.json"
+
+
+def test_a_folder_is_what_a_bundle_holds(tmp_path):
+    path = _unpacked(tmp_path / "in", _files(FILES / "scene.sog"))
+    bundle, folder = read_sog(FILES / "scene.sog"), read_gaussians(path)
+    for name in ("means", "quats", "scales", "opacities", "sh"):
+        assert torch.equal(getattr(folder, name), getattr(bundle, name))
+    convert(path, tmp_path / "again.sog")
+    assert len(Scene(ply=tmp_path / "again.sog").cloud()) == 16
+
+
+def _streamed(folder, change=lambda meta: None):
+    """A streamed scene: two files for the finest level, of which a part is in no leaf, and one for the next."""
+    whole = varied_cloud(30, degree=1)
+    parts = {
+        "0_0": whole.select(torch.arange(20)),
+        "0_1": whole.select(torch.arange(20, 30)),
+        "1_0": varied_cloud(5, 1),
+    }
+    for name, cloud in parts.items():
+        (folder / name).mkdir(parents=True)
+        export_cloud(folder / name / "a.sog", cloud)
+        _unpacked(folder / name, _files(folder / name / "a.sog"))
+
+    def leaf(file, offset, count, **others):
+        return {"lods": {"0": {"file": file, "offset": offset, "count": count}, **others}}
+
+    meta = {
+        "lodLevels": 2,
+        "filenames": ["0_0/meta.json", "0_1/a.sog", "1_0/meta.json"],
+        "tree": {
+            "children": [
+                leaf(0, 0, 12, **{"1": {"file": 2, "offset": 0, "count": 5}}),
+                {"children": [leaf(1, 0, 10), leaf(0, 14, 6)]},
+            ]
+        },
+    }
+    change(meta)
+    (folder / "lod-meta.json").write_text(json.dumps(meta))
+    return folder / "lod-meta.json", parts
+
+
+def test_one_level_of_a_streamed_scene(tmp_path):
+    """The finest, unless told otherwise; ranges of the files in place of whole ones."""
+    path, parts = _streamed(tmp_path)
+    first = read_sog(tmp_path / "0_0" / "meta.json")
+    found = read_gaussians(path)
+    assert len(found) == 28
+    assert torch.equal(found.means[:12], first.means[:12])
+    assert torch.equal(found.means[12:18], first.means[14:])
+    assert torch.equal(found.sh[18:], read_sog(tmp_path / "0_1" / "a.sog").sh)
+    assert len(read_sog(path, level=1)) == len(parts["1_0"]) == 5
+    with pytest.raises(ValueError, match="has the levels 0 to 1, but level 2 was asked for"):
+        read_sog(path, level=2)
+    path.write_text(path.read_text().replace("{", '{"environment": "env/meta.json", ', 1))
+    with pytest.warns(UserWarning, match="left out its environment, 'env/meta.json'"):
+        assert len(read_gaussians(path)) == 28
+
+
+def _leaf(meta):
+    return meta["tree"]["children"][0]["lods"]["0"]
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda m: m.update(lodLevels="2"), "`lodLevels` or `filenames`"),
+        (lambda m: m.update(filenames=7), "`lodLevels` or `filenames`"),
+        (lambda m: m.pop("tree"), "a part of its `tree` is not"),
+        (lambda m: m["tree"].update(children=7), "a part of its `tree` is not"),
+        (lambda m: m["tree"].update(lods=[]), "a part of its `tree` is not"),
+        (lambda m: m["tree"].update(children=[]), "zero Gaussians at level 0"),
+        (lambda m: _leaf(m).update(file=3), "no range of Gaussians at level 0"),
+        (lambda m: _leaf(m).update(count=-1), "no range of Gaussians at level 0"),
+        (lambda m: _leaf(m).update(count=None), "no range of Gaussians at level 0"),
+        (lambda m: m["tree"].update(lods={"0": 7}), "no range of Gaussians at level 0"),
+        (lambda m: _leaf(m).update(count=15), "`tree` wants more Gaussians than"),
+        (lambda m: _leaf(m).update(offset=19), "`tree` wants Gaussian 30 of the 20 in"),
+        (lambda m: m.update(filenames=["../x/meta.json"] * 3), "names the file '../x/meta.json'; put all files"),
+        (lambda m: m.update(filenames=["/meta.json"] * 3), "names the file '/meta.json'"),
+        (lambda m: m.update(filenames=["http://a/b"] * 3), "names the file 'http://a/b'"),
+        (lambda m: m.update(filenames=["C:\\b"] * 3), "names the file"),
+        (lambda m: m.update(filenames=[7] * 3), "names the file '7'"),
+        (lambda m: m.update(filenames=["lod-meta.json"] * 3), "is SOG of version 1"),
+    ],
+)
+def test_bad_streams(change, message, tmp_path):
+    path, _ = _streamed(tmp_path, change)
+    with pytest.raises(ValueError, match=r"lod-meta\.json") as caught:
+        read_gaussians(path)
+    assert message in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+def _packed(path, files):
+    with zipfile.ZipFile(path, "w") as archive:
+        for name, content in files.items():
+            archive.writestr(name, content)
+    return path
+
+
+def _picture(width, height, value=0):
+    content = io.BytesIO()
+    Image.fromarray(np.full((height, width, 4), value, np.uint8)).save(content, "WEBP", lossless=True, exact=True)
+    return content.getvalue()
+
+
+def _set(place, value):
+    """Sets an entry of meta.json, such as `means mins`."""
+
+    def change(files):
+        meta = part = json.loads(files["meta.json"])
+        *path, last = place.split()
+        for word in path:
+            part = part[word]
+        part[last] = value
+        files["meta.json"] = json.dumps(meta).encode()
+
+    return change
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda f: f.pop("meta.json"), "it has no file `meta.json`"),
+        (lambda f: f.pop("quats.webp"), "it has no file `quats.webp`"),
+        (lambda f: f.update({"meta.json": b"{"}), "not valid JSON"),
+        (lambda f: f.update({"meta.json": b"[]"}), "is SOG of version unknown"),
+        (_set("version", 1), "is SOG of version 1, not 2; convert it"),
+        (_set("count", 0), "`count` is 0"),
+        (_set("count", 2.5), "`count` is 2.5"),
+        (_set("count", 10**9), "announces 1,000,000,000 Gaussians, far more than its"),
+        (_set("count", 40), "has 4 x 4 pixels, but holds 40 values"),
+        (_set("means files", ["means_l.webp"]), "`means` does not name 2 files"),
+        (_set("quats files", "quats.webp"), "`quats` does not name 1 files"),
+        (_set("sh0", None), "`sh0` does not name 1 files"),
+        (_set("means mins", [0, 0]), "`mins` is not a list of 3 to 3 finite numbers"),
+        (_set("means maxs", [0, 0, math.nan]), "`maxs` is not a list of 3 to 3 finite numbers"),
+        (_set("means maxs", [1e3, 0, 0]), "`means` is NaN or infinite for"),
+        (_set("means maxs", [30, 0, 0]), "beyond ±1e+12 for"),
+        (_set("scales codebook", [1.0]), "of a code book of 1"),
+        (_set("scales codebook", [1.0] * 257), "`codebook` is not a list of 1 to 256 finite numbers"),
+        (_set("scales codebook", [True] * 256), "`codebook` is not a list"),
+        (_set("scales codebook", [1e4] * 256), "gives a size of zero or infinity"),
+        (_set("shN bands", 4), "`shN` has 16 sets of 4 bands"),
+        (_set("shN count", 70000), "`shN` has 70000 sets of 3 bands"),
+        (_set("shN count", 3), "of 3"),
+        (_set("shN bands", 2), "960 x 1 pixels"),
+        (lambda f: f.update({"quats.webp": b"RIFF"}), "`quats.webp` is not a WebP picture"),
+        (lambda f: f.update({"quats.webp": f["quats.webp"][:60]}), "`quats.webp` is not a WebP picture"),
+        (lambda f: f.update({"quats.webp": _picture(4, 4)}), "a pixel of `quats` does not say"),
+        (lambda f: f.update({"quats.webp": _picture(600, 600)}), "has 600 x 600 pixels, but holds 16 values"),
+    ],
+)
+@pytest.mark.parametrize("kind", ["bad.sog", "meta.json"])
+def test_bad_files(kind, change, message, tmp_path):
+    files = _files(FILES / "scene.sog")
+    change(files)
+    if kind == "meta.json":
+        _unpacked(tmp_path, files)
+    else:
+        _packed(tmp_path / kind, files)
+    with pytest.raises((ValueError, FileNotFoundError)) as caught:
+        read_gaussians(tmp_path / kind)
+    told = str(caught.value)
+    if "no file" in message and kind == "meta.json":
+        assert "no such file" in told or "does not exist" in told
+    else:
+        assert kind in told
+        assert message in told
+    assert "\n" not in told
+
+
+def test_bad_bundles(tmp_path):
+    good = (FILES / "scene.sog").read_bytes()
+    for content in (b"", b"PK", good[:-30], good[: len(good) // 2], good.replace(b"RIFF", b"RAFF")):
+        (tmp_path / "bad.sog").write_bytes(content)
+        with pytest.raises(ValueError, match=r"bad\.sog is not a usable SOG file \(.*\); export it again"):
+            read_gaussians(tmp_path / "bad.sog")
+
+
+def test_nothing_swells(tmp_path):
+    """A bundle of a few kilobytes can hold gigabytes of zeros, and a small picture millions of pixels."""
+    with zipfile.ZipFile(tmp_path / "a.sog", "w", zipfile.ZIP_DEFLATED) as archive:
+        for name, content in _files(FILES / "scene.sog").items():
+            archive.writestr(name, content)
+        with archive.open("more", "w", force_zip64=True) as entry:
+            for _ in range(1300):
+                entry.write(bytes(1 << 20))
+    files = _files(FILES / "scene.sog") | {"sh0.webp": _picture(8000, 8000)}
+    _packed(tmp_path / "b.sog", files)
+    for name, message in (("a.sog", "announces 9 files, far more than its"), ("b.sog", "has 8000 x 8000 pixels")):
+        assert (tmp_path / name).stat().st_size < 1 << 21
+        tracemalloc.start()
+        with pytest.raises(ValueError, match=message):
+            read_gaussians(tmp_path / name)
+        assert tracemalloc.get_traced_memory()[1] < 1 << 23
+        tracemalloc.stop()
+
+
+def test_files_elsewhere_are_not_read(tmp_path):
+    path = _unpacked(tmp_path / "in", _files(FILES / "scene.sog"))
+    (tmp_path / "quats.webp").write_bytes((path.parent / "quats.webp").read_bytes())
+    path.write_text(path.read_text().replace("quats.webp", "../quats.webp"))
+    with pytest.raises(ValueError, match=r"names the file '\.\./quats\.webp'; put all files into its folder"):
+        read_gaussians(path)
+
+
+def test_the_mark_of_antialiasing(tmp_path):
+    files = _files(FILES / "scene.sog")
+    _set("model", "antialiased")(files)
+    with pytest.warns(UserWarning, match="trained with antialiasing"):
+        read_gaussians(_packed(tmp_path / "a.sog", files))
+
+
+def test_more_harmonics_than_a_file_can_hold(tmp_path, monkeypatch):
+    """Similar ones become one: close to their noise where there are patterns, and no more sets than allowed."""
+    monkeypatch.setattr(sog, "PALETTE", 1024)
+    draw = torch.Generator().manual_seed(1)
+    cloud = varied_cloud(4000, degree=2)
+    pattern = torch.randint(0, 300, (4000,), generator=draw)
+    clean = torch.randn(300, 9, 3, generator=draw)[pattern]
+    cloud = replace(cloud, sh=(clean + 0.01 * torch.randn(4000, 9, 3, generator=draw)).clone())
+    export_cloud(tmp_path / "a.sog", cloud)
+    assert 256 < _meta(tmp_path / "a.sog")["shN"]["count"] <= 1024
+    found = _in_order(read_gaussians(tmp_path / "a.sog"), cloud)
+    off = (found.sh - cloud.sh)[:, 1:].square().mean().sqrt()
+    assert float(off) < 0.05  # of harmonics that vary by 1
+    same = replace(cloud, sh=torch.ones_like(cloud.sh))
+    export_cloud(tmp_path / "b.sog", same)
+    torch.testing.assert_close(read_gaussians(tmp_path / "b.sog").sh, same.sh)
+
+
+def test_large_code_books_are_made_from_a_sample(monkeypatch):
+    monkeypatch.setattr(sog, "_SAMPLE", 1000)
+    values = np.random.default_rng(0).normal(size=(5000, 3))
+    book, near = sog._coded(values)
+    assert len(book) == 256
+    assert np.abs(np.array(book)[near] - values).mean() < 0.02
+    assert np.abs(np.array(book)[near] - values).max() < 0.5
+
+
+def test_sorted_along_a_curve():
+    """Neighbours in space are neighbours in the file; the Gaussians of two places do not mix."""
+    cloud = varied_cloud(50, degree=0)
+    far = replace(cloud, means=cloud.means + 100)
+    both = together(cloud, far).select(torch.randperm(100, generator=torch.Generator().manual_seed(0)))
+    order = sog._curve(both.means.double().numpy())
+    assert sorted(order) == list(range(100))
+    assert bool((both.means[torch.from_numpy(order)][:50] < 50).all())
+
+
+def test_too_many_for_a_picture(tmp_path, monkeypatch):
+    monkeypatch.setattr(sog, "LARGEST_SIDE", 8)
+    export_cloud(tmp_path / "a.sog", varied_cloud(64, degree=0))
+    with pytest.raises(ValueError, match=r"A \.sog file holds up to 64 Gaussians, but there are 65: choose spz"):
+        export_cloud(tmp_path / "b.sog", varied_cloud(65, degree=0))
+    assert [path.name for path in tmp_path.iterdir()] == ["a.sog"]
+
+
+def test_the_same_bytes_again():
+    assert encode_sog(scene()) == encode_sog(scene())
