@@ -11,6 +11,7 @@ from bench import record, slots, stamps
 from bench.tables import (  # noqa: F401  each registers its slots
     accuracy,
     benchmarks,
+    blender,
     contact,
     fit,
     flag_benchmark,
@@ -25,6 +26,7 @@ from gaussian_swaying._files import write_text
 
 PLOTS: dict[str, Callable[[list[record.Row], Path], None]] = {
     "accuracy_*": plots.accuracy,
+    "blender_*": blender.plot,
     "pareto_*": plots.pareto,
     "speed_*": plots.speed,
 }

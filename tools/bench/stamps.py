@@ -31,6 +31,7 @@ PARTS: dict[str, tuple[str, ...]] = {
     "accuracy": _PROBLEMS,
     "area": ("gaussians", "geometry"),
     "backward": _SOLVER,
+    "blender": _SIMULATION,
     "contact": _SIMULATION,
     "drawn": (*_DRAWN, "viewer"),
     "fit": (*_DRAWN, "fitting"),

@@ -11,7 +11,7 @@ from bench.cases.pareto import PROBLEMS, front, is_default, proven
 from bench.tables.rows import Row, all_rows, select
 
 
-def _subplots(*shape: int, **options: Any) -> tuple[Any, Any]:
+def subplots(*shape: int, **options: Any) -> tuple[Any, Any]:
     """A figure without a window, and its axes."""
     import matplotlib
 
@@ -19,6 +19,16 @@ def _subplots(*shape: int, **options: Any) -> tuple[Any, Any]:
     import matplotlib.pyplot as plt
 
     return plt.subplots(*shape, layout="constrained", **options)
+
+
+def plain_numbers(axis: Any) -> None:
+    """Numbers 1, 2, 5, 10 ... at logarithmic axes, without exponents."""
+    from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
+
+    for scale in (axis.xaxis, axis.yaxis):
+        scale.set_minor_formatter(NullFormatter())
+        scale.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
+        scale.set_major_formatter(FuncFormatter(lambda value, _: f"{value:.3g}"))
 
 
 def save_figure(figure: Any, path: Path) -> None:
@@ -40,7 +50,7 @@ def accuracy(results: list[Row], pictures: Path) -> None:
         "hanging bar (tip)": ("hanging bar", {"clamp": "mirror"}),
         "vortex (displacement)": ("vortex", {}),
     }
-    figure, axes = _subplots(1, 5, figsize=(16, 3.4))
+    figure, axes = subplots(1, 5, figsize=(16, 3.4))
     for axis, (title, (problem, parameters)) in zip(axes, panels.items(), strict=True):
         for variant, marker in zip((*VARIANTS, *SINGLE), "osd.", strict=True):
             found = sorted(select(rows, problem, variant=variant, **parameters), key=lambda r: r["parameters"]["cells"])
@@ -65,9 +75,7 @@ def pareto(results: list[Row], pictures: Path) -> None:
 
 
 def _pareto(rows: list[Row], path: Path) -> None:
-    from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
-
-    figure, axes = _subplots(2, 2, figsize=(11, 8))
+    figure, axes = subplots(2, 2, figsize=(11, 8))
     colors = {"total": "tab:blue", "updated": "tab:orange", "MLS": "tab:green"}
     for axis, (problem, (sizes, unit, _)) in zip(axes.flat, PROBLEMS.items(), strict=True):
         own = [row for row in rows if row["problem"] == problem and row["error"]]
@@ -90,10 +98,7 @@ def _pareto(rows: list[Row], path: Path) -> None:
         shown = ", ".join(str(size) for size in sizes)
         axis.set_title(f"{problem} ({unit}: {shown})", fontsize=9)
         axis.set_xlabel("seconds per simulated second (larger markers: finer grids)")
-        for scale in (axis.xaxis, axis.yaxis):
-            scale.set_minor_formatter(NullFormatter())
-            scale.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
-            scale.set_major_formatter(FuncFormatter(lambda value, _: f"{value:.3g}"))
+        plain_numbers(axis)
         axis.set_ylabel("error [degrees]" if problem == "hinged plate" else "relative error")
     for variant, color in colors.items():
         axes.flat[0].plot([], [], "o", color=color, label=f"{variant}, float32 (float64: square)")
@@ -115,7 +120,7 @@ def _speed(result: Row, path: Path) -> None:
     sheets = [row for row in result.get("substep", []) if "failed" not in row]
     sand = [row for row in result.get("sand", []) if "failed" not in row]
     with_memory = any(row["memory_bytes"] is not None for row in sheets + sand)
-    figure, grid = _subplots(1, 1 + with_memory, figsize=(6.5 + 5 * with_memory, 5.4), squeeze=False)
+    figure, grid = subplots(1, 1 + with_memory, figsize=(6.5 + 5 * with_memory, 5.4), squeeze=False)
     axes = grid[0]
 
     def draw(axis: Any, rows: list[Row], value: Callable[[Row], float | None], **style: Any) -> None:
