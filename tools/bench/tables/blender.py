@@ -65,7 +65,9 @@ def plot(results: list[Row], pictures: Path) -> None:
     (result,) = results
     rows = [row for row in result["rows"] if "failed" not in row]
     flags = sorted({row["flag"] for row in rows})
-    figure, axes = subplots(len(FINER), len(flags), figsize=(4 * len(flags), 6.6), sharex="col", squeeze=False)
+    figure, axes = subplots(
+        len(FINER), len(flags), figsize=(4.2 * len(flags), 7), sharex="col", sharey=True, squeeze=False
+    )
     for axis, (to, flag) in zip(axes.flat, product(FINER, flags), strict=True):
         for solver, name in SOLVERS.items():
             own = [row for row in rows if (row["flag"], row["solver"]) == (flag, solver)]
@@ -75,6 +77,9 @@ def plot(results: list[Row], pictures: Path) -> None:
             for time, distance, cells in marks:
                 place = {"xytext": (4, 4), "textcoords": "offset points", "fontsize": 8, "color": COLOURS[solver]}
                 axis.annotate(str(cells), (time, distance), **place)
+        between = 100 * result["references"][str(flag)]["chamfer"]
+        axis.axhline(between, color="gray", linestyle=":", label="from one reference to the other")
+        axis.margins(0.1)
         axis.set_title(f"flag {flag}, distance from {FINER[to]}", fontsize=10)
         axis.grid(True, which="major", linewidth=0.4, alpha=0.6)
         plain_numbers(axis)
@@ -82,7 +87,7 @@ def plot(results: list[Row], pictures: Path) -> None:
         axis.set_ylabel("distance [% of the longer side]")
     for axis in axes[-1]:
         axis.set_xlabel("seconds per simulated second")
-    axes[0, 0].legend(fontsize=9)
+    figure.legend(*axes[0, 0].get_legend_handles_labels(), loc="outside lower center", ncols=3, fontsize=9)
     figure.suptitle(
         "The numbers are cells along the longer side. Further left: faster; further down: closer.", fontsize=10
     )
