@@ -112,6 +112,9 @@ def test_both_are_solved_turn_by_turn_and_medians_recorded(solved, tmp_path):
     assert [line[1] for line in equal] == ["12", "12", "24", "24"]
     own = rows["ours", 12]["seconds"]
     assert equal[0][-4:-1] == [f"{row['seconds'] / own:.1f} times", "yes", "no"]
+    closest = json.loads(json.dumps(result))
+    closest["rows"] = [row for row in closest["rows"] if (row["solver"], row["cells"]) != ("ours", 24)]
+    assert cells("blender.equal", closest)[2][-4:] == ["no grid is as close", "no", "no", "-"]
     plot([result], tmp_path)
     assert (tmp_path / "blender.png").stat().st_size > 10_000
 

@@ -44,7 +44,9 @@ def _equal(result: Row) -> Iterator[Row]:
         for to in REFERENCES:
             ours = quickest(rows, row, to)
             found = {"row": row, "to": FINER[to], "near": row["to"][to]["chamfer"], "ours": ours}
-            if ours is not None:
+            if ours is None:
+                found["failed"] = "no grid is as close"
+            else:
                 found |= {name: row[name] / ours[name] for name in ("seconds", "process_s")}
                 found["nearer"] = ours["to"][to]["chamfer"]
             yield found
@@ -75,7 +77,8 @@ def plot(results: list[Row], pictures: Path) -> None:
             times, distances, _ = zip(*marks, strict=True)
             axis.loglog(times, distances, "o-", color=COLOURS[solver], label=name)
             for time, distance, cells in marks:
-                place = {"xytext": (4, 4), "textcoords": "offset points", "fontsize": 8, "color": COLOURS[solver]}
+                below = {"blender": 4, "ours": -11}[solver]
+                place = {"xytext": (4, below), "textcoords": "offset points", "fontsize": 8, "color": COLOURS[solver]}
                 axis.annotate(str(cells), (time, distance), **place)
         between = 100 * result["references"][str(flag)]["chamfer"]
         axis.axhline(between, color="gray", linestyle=":", label="from one reference to the other")
