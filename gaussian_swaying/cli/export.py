@@ -1,4 +1,4 @@
-"""Convert a splat for viewers: ``gaussian-swaying export scene.ply scene.splat``, or a run's ``ply`` folder to USD.
+"""Convert a splat for viewers: ``gaussian-swaying export scene.ply scene.splat``, or the ``ply`` folder of a run.
 
 With ``--web``, a recorded run becomes a film that a browser plays: ``gaussian-swaying export --web outputs/flag``.
 """
@@ -24,13 +24,15 @@ def build_options() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(prog=program.name("export"), description=__doc__)
     parser.add_argument(
         "source",
-        help=f"A {READABLE}, or a folder of .ply for an animated USD; with --web the folder of a run.",
+        help=f"A {READABLE}; or a folder of .ply for an animated USD or numbered files; with --web the folder of a"
+        " run.",
     )
     parser.add_argument(
         "target",
         nargs="?",
-        help=f"File to write; its name ends in one of {', '.join(SUFFIXES.values())}, or with --web in .html (default: "
-        "film.html in the folder of the run).",
+        help=f"File to write; its name ends in one of {', '.join(SUFFIXES.values())}, for a folder with # for the "
+        "digits of the frame, as in frame_####.spz; or with --web in .html (default: film.html in the folder of the "
+        "run).",
     )
     parser.add_argument(
         "--web",
@@ -55,7 +57,7 @@ def build_options() -> argparse.ArgumentParser:
         "--spz-version",
         type=int,
         choices=VERSIONS,
-        help="Version of an .spz file; default: 3, which all programs read.",
+        help="Version of an .spz file; default: 3, which most programs read.",
     )
     return parser
 

@@ -160,9 +160,10 @@ def convert(
     """Write a splat, or the .ply sequence of a run, in the format given by the ending of the target's name.
 
     Args:
-        source: A file that :func:`~gaussian_swaying.gaussians.formats.read_gaussians` reads; for USD also a folder of
-            .ply files, whose frames are sorted by name.
-        target: File to write, see :func:`format_of`.
+        source: A file that :func:`~gaussian_swaying.gaussians.formats.read_gaussians` reads, or a folder of .ply files,
+            whose frames are sorted by name.
+        target: File to write, see :func:`format_of`. For a folder it is USD, or its name has ``#`` in place of the
+            digits of the frame, counted from 0: ``frame_####.spz`` makes frame_0000.spz, frame_0001.spz, ...
         fps: Frames per second of a folder.
         metres_per_unit: Length of a scene unit [m], for USD and glTF.
         rotation: Rotation from scene directions to z up, shape (3, 3), for USD and glTF; the scene's z is up if None.
@@ -175,14 +176,22 @@ def convert(
     source, target = Path(source), Path(target)
     format = format_of(target)
     check_folder(target)
+    place: dict[str, Any] = {"fps": fps, "metres_per_unit": metres_per_unit, "rotation": rotation}
     if not source.is_dir():
-        place: dict[str, Any] = {"fps": fps, "metres_per_unit": metres_per_unit, "rotation": rotation}
         return export_cloud(target, read_gaussians(source), format=format, spz_version=spz_version, **place)
     files = sorted(source.glob("*.ply"))
-    if format != "usd" or not files:
-        what = "contains no .ply" if not files else f"is a folder of {len(files)} frames, which only USD supports"
-        raise ValueError(f"{source} {what}: give one .ply, or a folder of them and a target that ends in .usdc.")
-    write_usd(target, map(read_gaussians, files), fps, metres_per_unit=metres_per_unit, rotation=rotation)
+    if not files:
+        raise ValueError(f"{source} contains no .ply: give one .ply, or a folder of them.")
+    if format == "usd":
+        return write_usd(target, map(read_gaussians, files), **place)
+    if "#" not in target.name:
+        raise ValueError(
+            f"{source} is a folder of {len(files)} frames: give a target that ends in .usdc, or one with # for their "
+            f"numbers, such as frame_####{SUFFIXES[format]}."
+        )
+    for index, file in enumerate(files):
+        name = re.sub("#+", lambda digits: f"{index:0{len(digits[0])}d}", target.name)  # noqa: B023  # called at once
+        export_cloud(target.with_name(name), read_gaussians(file), format=format, spz_version=spz_version, **place)
 
 
 def _kept(path: Path, cloud: GaussianCloud) -> GaussianCloud:

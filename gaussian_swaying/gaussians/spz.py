@@ -82,8 +82,8 @@ def encode_spz(cloud: GaussianCloud, version: int = 3) -> bytes:
 
     Args:
         cloud: The Gaussians, finite (see :func:`~gaussian_swaying.gaussians.export.cleaned`).
-        version: 3 is read by all programs; 4 is smaller and needs zstandard; 1 and 2 have coarser rotations, and 1
-            centres in half precision.
+        version: 3 is read by most programs; 4 needs zstandard; 1 and 2 have coarser rotations, and 1 centres in half
+            precision.
 
     Returns:
         The content of the file.

@@ -187,10 +187,27 @@ def test_files_are_converted(tmp_path):
         convert(frames, tmp_path / "film.usdc")
     for k in range(3):
         write_ply(frames / f"{k:05d}.ply", _moved(cloud, 0.1 * k))
-    with pytest.raises(ValueError, match="folder of 3 frames, which only USD supports"):
+    with pytest.raises(ValueError, match=r"folder of 3 frames: give a target .* or one with # .* frame_####\.splat"):
         convert(frames, tmp_path / "b.splat")
     with pytest.raises(FileNotFoundError, match="is not a folder"):
         convert(tmp_path / "a.ply", tmp_path / "no" / "a.splat")
+
+
+def test_a_sequence_becomes_numbered_files(tmp_path):
+    """From 0, whatever the numbers were, with as many digits as there are places."""
+    cloud = varied_cloud(20, degree=0)
+    (tmp_path / "in").mkdir()
+    for k in range(12):
+        write_ply(tmp_path / "in" / f"{2 * k:05d}.ply", _moved(cloud, 0.1 * k))
+    wanted = {"point_cloud_#.ply": "point_cloud_11.ply", "frame####.compressed.ply": "frame0011.compressed.ply"}
+    wanted |= {"##.spz": "11.spz", "a_#.sog": "a_11.sog"}
+    for number, (name, last) in enumerate(wanted.items()):
+        out = tmp_path / str(number)
+        out.mkdir()
+        convert(tmp_path / "in", out / name)
+        assert len(list(out.iterdir())) == 12
+        found = read_gaussians(out / last)
+        torch.testing.assert_close(found.means.mean(0), cloud.means.mean(0) + 1.1, rtol=0, atol=1e-3)
 
 
 def test_a_sequence_becomes_a_film(tmp_path):
