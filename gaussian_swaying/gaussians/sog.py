@@ -9,7 +9,8 @@ import os
 import warnings
 import zipfile
 import zlib
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path, PurePosixPath
 from typing import Any
 
@@ -145,20 +146,28 @@ def _single(path: Path) -> GaussianCloud:
     if path.suffix.lower() == ".json":
         meta = read_json(path, "SOG file")
         return _decoded(path, meta, lambda name: check_regular(_inside(path, name), "the picture").read_bytes())
+    with _archive(path) as archive:
+        sizes = {entry.filename: entry.file_size for entry in archive.infolist()}
+    check_unpacked(path, sum(sizes.values()), f"{len(sizes)} files")
+
+    def read(name: str) -> bytes:
+        if name not in sizes:
+            raise _broken(path, f"it has no file `{name[:40]}`")
+        with _archive(path) as archive:
+            return archive.read(name)
+
+    if sizes.get("meta.json", 0) > LARGEST_JSON:
+        raise _broken(path, "its meta.json is too large")
+    return _decoded(path, parse_json(read("meta.json"), "SOG file", path), read)
+
+
+@contextmanager
+def _archive(path: Path) -> Iterator[zipfile.ZipFile]:
+    """The zip file of a bundle; whatever is wrong with it is a ValueError that names it."""
     try:
         with zipfile.ZipFile(path) as archive:
-            entries = {entry.filename: entry for entry in archive.infolist()}
-            check_unpacked(path, sum(entry.file_size for entry in entries.values()), f"{len(entries)} files")
-
-            def read(name: str) -> bytes:
-                if name not in entries:
-                    raise _broken(path, f"it has no file `{name[:40]}`")
-                return archive.read(entries[name])
-
-            if "meta.json" in entries and entries["meta.json"].file_size > LARGEST_JSON:
-                raise _broken(path, "its meta.json is too large")
-            return _decoded(path, parse_json(read("meta.json"), "SOG file", path), read)
-    except (zipfile.BadZipFile, zlib.error, EOFError, NotImplementedError, RuntimeError) as error:
+            yield archive
+    except (zipfile.BadZipFile, zlib.error, EOFError, OSError, RuntimeError, UnicodeDecodeError) as error:
         raise _broken(path, str(error)) from error
 
 

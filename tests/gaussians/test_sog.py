@@ -262,7 +262,11 @@ def test_bad_files(kind, change, message, tmp_path):
 
 def test_bad_bundles(tmp_path):
     good = (FILES / "scene.sog").read_bytes()
-    for content in (b"", b"PK", good[:-30], good[: len(good) // 2], good.replace(b"RIFF", b"RAFF")):
+    start = good.rindex(b"PK\5\6") + 16  # of the list of files, as the end of a zip file tells
+    moved = good[:start] + b"\xff\xff\0\0" + good[start + 4 :]
+    unnamed = good.replace(b"quats", b"qu\xffts")  # names are in UTF-8
+    broken = [good[:-30], good[: len(good) // 2], good.replace(b"RIFF", b"RAFF"), moved, unnamed]
+    for content in (b"", b"PK", *broken):
         (tmp_path / "bad.sog").write_bytes(content)
         with pytest.raises(ValueError, match=r"bad\.sog is not a usable SOG file \(.*\); export it again"):
             read_gaussians(tmp_path / "bad.sog")

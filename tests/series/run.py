@@ -1,6 +1,6 @@
 """Try thousands of malformed inputs, faults and extremes, and count how they end.
 
-    python tests/series/run.py                          # all 3,700, in two processes; about an hour
+    python tests/series/run.py                          # all 4,200, in two processes; about an hour
     python tests/series/run.py --series ply yaml --count 100 --seed 5
     python tests/series/run.py --series extreme --only 17   # one case, with what it said
 
@@ -28,12 +28,14 @@ import extreme_cases  # noqa: E402
 import fault_cases  # noqa: E402
 import ply_cases  # noqa: E402
 import run_folder_cases  # noqa: E402
+import splat_cases  # noqa: E402
 import yaml_cases  # noqa: E402
 from commands import commands  # noqa: E402
 from sandbox import GOOD, TIME, Case, Verdict, try_case  # noqa: E402
 
 SERIES: dict[str, tuple[Callable[[int, int], Iterator[Case]], int]] = {
     "ply": (ply_cases.cases, 1000),
+    "splat": (splat_cases.cases, 500),
     "yaml": (yaml_cases.cases, 900),
     "capture": (capture_cases.cases, 700),
     "folder": (run_folder_cases.cases, 400),
@@ -111,7 +113,7 @@ def main() -> int:
     """Try, print what went wrong and the counts; 1 if something did."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--series", nargs="+", choices=tuple(SERIES), default=tuple(SERIES))
-    parser.add_argument("--count", type=int, help="cases of each series; by default 3,700 in all")
+    parser.add_argument("--count", type=int, help="cases of each series; by default 4,200 in all")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--workers", type=int, default=2)
     parser.add_argument("--limit", type=float, default=TIME, help="time of the processor after which a case hangs [s]")

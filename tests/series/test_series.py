@@ -28,12 +28,12 @@ def counts(printed):
 def test_a_sample():
     """Some cases of each series but that of run folders: no traceback, no hang, no gigabytes."""
     code, printed, said = series(
-        "--series", "ply", "yaml", "capture", "fault", "extreme", "--count", "5", "--workers", "1"
+        "--series", "ply", "splat", "yaml", "capture", "fault", "extreme", "--count", "5", "--workers", "1"
     )
     assert code == 0, printed + said[-2000:]
     found = counts(printed)
-    assert found["all"]["cases"] == "25"
-    assert sum(int(found["all"][kind]) for kind in ("ran", "refused", "slow, but told")) == 25
+    assert found["all"]["cases"] == "30"
+    assert sum(int(found["all"][kind]) for kind in ("ran", "refused", "slow, but told")) == 30
     assert int(found["all"]["refused"]) > 5
 
 
@@ -87,4 +87,4 @@ def test_the_whole_series():
     code, printed, said = series()
     print(printed)
     assert code == 0, printed[-20_000:] + said[-2000:]
-    assert int(counts(printed)["all"]["cases"]) == 3700
+    assert int(counts(printed)["all"]["cases"]) == 4200
