@@ -41,9 +41,9 @@ def with_largest(small: np.ndarray, place: np.ndarray) -> np.ndarray:
     return quats
 
 
-def double(tensor: Tensor) -> np.ndarray:
-    """A tensor as a float64 array."""
-    array: np.ndarray = tensor.detach().cpu().double().numpy()
+def floats(tensor: Tensor) -> np.ndarray:
+    """A tensor as a float32 array."""
+    array: np.ndarray = tensor.detach().to("cpu", torch.float32).numpy()
     return array
 
 

@@ -22,7 +22,7 @@ from gaussian_swaying._inputs import LARGEST_JSON, check_regular, check_unpacked
 from gaussian_swaying.gaussians.cloud import GaussianCloud
 from gaussian_swaying.gaussians.packed import (
     cloud_of,
-    double,
+    floats,
     joined,
     logits,
     smallest_three,
@@ -85,10 +85,10 @@ def encode_sog(cloud: GaussianCloud) -> bytes:
     width = -(-int(np.ceil(np.sqrt(count))) // 4) * 4
     if width > LARGEST_SIDE:
         raise ValueError(f"A .sog file holds up to {LARGEST_SIDE**2:,} Gaussians, but there are {count:,}: choose spz.")
-    means = double(cloud.means)
+    means = floats(cloud.means).astype(np.float64)
     order = _curve(means)
     means, quats, scales, opacities, sh = (
-        part[order] for part in (means, *map(double, (cloud.quats, cloud.scales, cloud.opacities, cloud.sh)))
+        part[order] for part in (means, *map(floats, (cloud.quats, cloud.scales, cloud.opacities, cloud.sh)))
     )
     pictures: dict[str, bytes] = {}
 
@@ -299,7 +299,7 @@ def _looked_up(path: Path, entry: dict[str, Any], name: str, which: np.ndarray) 
     book = _numbers(path, entry, "codebook", 1, 256)
     if int(which.max()) >= len(book):
         raise _broken(path, f"a pixel of `{name}` wants number {int(which.max())} of a code book of {len(book)}")
-    found: np.ndarray = book[which]
+    found: np.ndarray = book.astype(np.float32)[which]
     return found
 
 

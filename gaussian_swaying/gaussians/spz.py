@@ -14,7 +14,7 @@ import numpy as np
 
 from gaussian_swaying._inputs import check_regular, check_unpacked
 from gaussian_swaying.gaussians.cloud import GaussianCloud
-from gaussian_swaying.gaussians.packed import cloud_of, double, logits, smallest_three, warn_antialiased, with_largest
+from gaussian_swaying.gaussians.packed import cloud_of, floats, logits, smallest_three, warn_antialiased, with_largest
 
 VERSIONS = (1, 2, 3, 4)
 _MAGIC = b"NGSP"
@@ -62,15 +62,17 @@ def read_spz(path: str | os.PathLike[str]) -> GaussianCloud:
     if degree == 4:
         warnings.warn(f"{path}: ignored the harmonics of degree 4; those up to 3 are used.", UserWarning, stacklevel=2)
     positions, alphas, colors, scales, rotations, rest = (np.frombuffer(part, dtype=np.uint8) for part in parts)
-    sh = ((colors / 255 - 0.5) / _COLOR_SCALE).reshape(count, 1, 3)
-    bands = (rest.reshape(count, -1, 3)[:, :15] - 128.0) / 128
+    sh = np.empty((count, (min(degree, 3) + 1) ** 2, 3), dtype=np.float32)
+    sh[:, 0] = ((colors / 255 - 0.5) / _COLOR_SCALE).reshape(count, 3)
+    sh[:, 1:] = rest.reshape(count, -1, 3)[:, :15]
+    sh[:, 1:] = (sh[:, 1:] - 128) / 128
     return cloud_of(
         path,
         means=_half(positions) if version == 1 else _fixed(positions, fraction),
         quats=_from_three(rotations) if version < 3 else _from_smallest(rotations),
         scales=scales.reshape(count, 3) / 16 - 10,
         opacities=logits(alphas / 255, 255),
-        sh=np.concatenate([sh, bands], axis=1),
+        sh=sh,
     )
 
 
@@ -96,7 +98,7 @@ def encode_spz(cloud: GaussianCloud, version: int = 3) -> bytes:
         raise ValueError(f"Expected `spz_version` to be 1, 2, 3 or 4, but got {version}.")
     compress = _zstandard().ZstdCompressor(level=12).compress if version == 4 else None
     means, quats, scales, opacities, sh = (
-        double(part) for part in (cloud.means, cloud.quats, cloud.scales, cloud.opacities, cloud.sh)
+        floats(part) for part in (cloud.means, cloud.quats, cloud.scales, cloud.opacities, cloud.sh)
     )
     farthest = float(np.abs(means).max(initial=0.0))
     if farthest >= (65504 if version == 1 else 2**23 - 1):
@@ -106,7 +108,7 @@ def encode_spz(cloud: GaussianCloud, version: int = 3) -> bytes:
         )
     fraction = 24 if farthest == 0 else min(24, int(np.floor(np.log2((2**23 - 1) / farthest))))
     parts = (
-        means.astype("<f2") if version == 1 else _int24(means * 2.0**fraction),
+        means.astype("<f2") if version == 1 else _int24(means * np.float64(2.0**fraction)),
         _byte(255 / (1 + np.exp(-opacities))),
         _byte(sh[:, 0] * _COLOR_SCALE * 255 + 127.5),
         _byte((scales + 10) * 16),
@@ -117,7 +119,7 @@ def encode_spz(cloud: GaussianCloud, version: int = 3) -> bytes:
     streams = len(packed) if version == 4 else 0
     head = _HEAD.pack(_MAGIC, version, len(cloud), cloud.sh_degree, fraction, 0, streams)
     if compress is None:
-        return gzip.compress(head + b"".join(packed), mtime=0)
+        return gzip.compress(head + b"".join(packed), compresslevel=6, mtime=0)
     small = [compress(part) for part in packed]
     table = b"".join(struct.pack("<QQ", len(out), len(part)) for out, part in zip(small, packed, strict=True))
     return head + struct.pack("<I12x", _TABLE) + table + b"".join(small)
