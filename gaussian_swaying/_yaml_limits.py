@@ -82,23 +82,31 @@ class _Part:
     entries: int = 0
 
 
-def limit_yaml() -> None:
-    """Make jsonargparse apply :func:`check_yaml` to files and to values from the command line."""
+def limit_yaml(change: Callable[[Any], Any] | None = None) -> None:
+    """Make jsonargparse apply :func:`check_yaml` to files and to values from the command line.
+
+    Args:
+        change: Returns what a configuration, or a value, stands for; None to leave it.
+    """
     from jsonargparse import get_loader, set_loader
 
     load = get_loader("yaml")
-    if not hasattr(load, "unlimited"):
-        set_loader("yaml", _Limited(load), exceptions=_exceptions())
+    if not isinstance(load, _Limited):
+        load = _Limited(load)
+        set_loader("yaml", load, exceptions=_exceptions())
+    load.change = change or load.change
 
 
 class _Limited:
-    """A loader that checks the text first."""
+    """A loader that checks the text first, and may change what it finds."""
 
     def __init__(self, load: Callable[[str], Any]) -> None:
         self.unlimited = load
+        self.change: Callable[[Any], Any] | None = None
 
     def __call__(self, text: str) -> Any:
-        return self.unlimited(check_yaml(text))
+        found = self.unlimited(check_yaml(text))
+        return found if self.change is None else self.change(found)
 
 
 def _exceptions() -> tuple[type[Exception], ...]:

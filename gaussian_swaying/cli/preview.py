@@ -17,6 +17,7 @@ from gaussian_swaying._checks import check_positive
 from gaussian_swaying._yaml_limits import check_config_files
 from gaussian_swaying.cli.errors import guessing, parser_sentence, run_command
 from gaussian_swaying.cli.shipped import with_shipped
+from gaussian_swaying.config.material_names import NAMES
 from gaussian_swaying.config.parser import parse_text
 from gaussian_swaying.gaussians.formats import read_gaussians
 from gaussian_swaying.preview.calibration import (
@@ -54,6 +55,7 @@ from gaussian_swaying.preview.suggest import (
     at_quality,
     finest_spacing,
     gaussian_statistics,
+    of_material,
     suggest,
 )
 from gaussian_swaying.simulation.progress import duration
@@ -95,6 +97,7 @@ def build_options() -> argparse.ArgumentParser:
         metavar="SHARE",
         help="largest displacement in that wind, as a share of the longest side; stiffness and thickness follow",
     )
+    add("--material", metavar="NAME", help=f"its real numbers, instead of softer ones: {NAMES}")
     add("--frames", type=int, default=250, help="frames of the configuration")
     add("--quality", metavar="Q", help=f"grid of the starter: {', '.join(QUALITIES)}; default: normal")
     add("--minutes", type=float, metavar="N", help="instead: the finest grid whose run takes at most this long here")
@@ -124,6 +127,8 @@ def preview_scene(options: argparse.Namespace, folder: Path) -> Preview:
     capture = None if options.capture is None else captured_from(options.capture)
     quality = options.quality or "normal"
     suggestion = suggest(cloud, up, options.hold, region, options.longest_side, options.wind, capture, quality)
+    if options.material is not None:
+        suggestion = of_material(suggestion, options.material)
     begin = Stopwatch()
     draft, settings = _pipeline(["--device", options.device], draft_yaml(suggestion, options.scene))
     startup = LOADED + begin.quiet

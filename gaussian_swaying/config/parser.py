@@ -12,6 +12,7 @@ import sys
 import tempfile
 from argparse import SUPPRESS, Action, ArgumentError, _ArgumentGroup
 from collections.abc import Mapping, Sequence
+from functools import cache
 from pathlib import Path
 from types import UnionType
 from typing import TYPE_CHECKING, Any, Optional, get_args, get_type_hints
@@ -27,6 +28,7 @@ from gaussian_swaying.aero.recorded import FrozenWind
 from gaussian_swaying.aero.shelter import Shelter
 from gaussian_swaying.aero.wind import SpatialWind
 from gaussian_swaying.captures.capture_camera import CaptureCamera
+from gaussian_swaying.config.material_names import NAMES, with_material_option, with_named_materials
 from gaussian_swaying.interop.physgaussian.convert import convert, read_config, to_yaml
 from gaussian_swaying.mpm.protocol import Solver
 from gaussian_swaying.rendering.cameras.keyframes import KeyframedCamera
@@ -93,10 +95,10 @@ def build_parser(schema: type) -> ArgumentParser:
     Args:
         schema: The class whose constructor defines the fields of a configuration.
     """
-    from jsonargparse import ActionYesNo, ArgumentParser
+    from jsonargparse import ActionYesNo
 
-    limit_yaml()
-    parser = ArgumentParser(
+    limit_yaml(with_named_materials)
+    parser = _parser_class()(
         prog=program.name("sim"),
         exit_on_error=False,
         add_help=False,
@@ -131,10 +133,27 @@ def build_parser(schema: type) -> ArgumentParser:
     for name, component in groups.items():
         parser.add_class_arguments(component, name)
     parser.add_class_arguments(schema, skip={*groups, *PYTHON_ONLY})
+    for action in parser._actions:
+        if action.dest == "material":
+            action.metavar, action.help = "NAME", f"Numbers of a known material ({NAMES}), or a YAML file with fields."
     for name, (kind, replaced) in CUSTOM.items():
         text = f"A {kind.__name__} of your own by its class path, in place of `{replaced}`; null for none."
         parser.add_argument(f"--{name}", type=Optional[kind], default=None, help=text)  # noqa: UP045
     return parser
+
+
+@cache
+def _parser_class() -> type[ArgumentParser]:
+    """A parser whose option ``--material`` also takes the name of a known material."""
+    from jsonargparse import ArgumentParser
+
+    class Parser(ArgumentParser):
+        def parse_args(  # type: ignore[override]
+            self, args: Sequence[str] | None = None, *more: Any, **options: Any
+        ) -> Any:
+            return super().parse_args(with_material_option(sys.argv[1:] if args is None else args), *more, **options)
+
+    return Parser
 
 
 def with_custom(parser: ArgumentParser, settings: Namespace, parts: Mapping[str, Any]) -> dict[str, Any]:
@@ -316,7 +335,7 @@ COMMON = {
     "The run": ("config", "preset", "output", "frames", "resume", "device"),
     "The object": ("scene.ply", "scene.up", "scene.longest_side", "scene.region"),
     "Its material, and where it is held": (
-        "material.E", "material.density", "material.thickness", "solver.dx", "solver.boundaries"
+        "material", "material.E", "material.density", "material.thickness", "solver.dx", "solver.boundaries"
     ),
     "The wind": ("wind.flow", "wind.modulations"),
     "The pictures": ("camera", "recorder.renders", "recorder.ply_every"),

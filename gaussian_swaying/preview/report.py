@@ -163,8 +163,9 @@ def _numbers(values: Sequence[float]) -> str:
 
 
 def _material(guess: Suggestion) -> str:
-    what = "cloth" if guess.sheet else "rubber"
-    return f"{what}, E = {guess.youngs_modulus:.1e} Pa, {guess.thickness:.2g} m thick: {guess.stiffness_reason}"
+    softer = "" if guess.real else " (softer than real)"
+    numbers = f"E = {guess.youngs_modulus:.1e} Pa, {guess.thickness:.2g} m thick"
+    return f"{guess.material}{softer}, {numbers}: {guess.stiffness_reason}"
 
 
 def _why(confidence: str, reason: str) -> str:
@@ -252,6 +253,7 @@ def suggestion_dict(guess: Suggestion) -> dict[str, Any]:
         "sheet": guess.sheet,
         "azimuth": guess.azimuth,
         "flow": list(guess.flow),
+        "material": guess.material,
         "youngs_modulus_Pa": guess.youngs_modulus,
         "thickness_m": guess.thickness,
         "stiffness_reason": guess.stiffness_reason,

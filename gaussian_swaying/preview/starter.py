@@ -11,6 +11,7 @@ from typing import Any
 
 from gaussian_swaying import _program as program
 from gaussian_swaying.geometry.regions import Box, Cylinder, Not, Region, Union
+from gaussian_swaying.mpm.materials import known_material
 from gaussian_swaying.preview.suggest import Suggestion, at_quality
 from gaussian_swaying.preview.up import wind_words
 
@@ -38,11 +39,16 @@ aero:
 
 
 def _material(s: Suggestion) -> str:
+    if s.real:
+        known = known_material(s.material)
+        numbers = f"{known.E:.2g} Pa, {known.density:g} kg/m^3, {known.thickness:g} m thick"
+        return f"material: {s.material:<22}# {numbers}; others: `gaussian-swaying preview --help`\n"
     density, why = (400.0, "lighter objects follow the gusts faster")
     if s.sheet:
         density, why = (30.0, "the paper's flags, whose E is 3e3 to 6e3")
     return f"""\
 material:
+  name: {s.material:<24}# a guess; `material: {s.material}` alone takes its real numbers, stiffer than those below
   # {s.stiffness_reason}
   E: {s.youngs_modulus:<27.1e}# Pa; a larger E bends less and needs more substeps
   nu: 0.3
@@ -112,8 +118,7 @@ def _yaml(suggestion: Suggestion, ply: str | Path, frames: int, size: tuple[int,
     why = "for cloth and objects without pins" if falls else "it was captured in balance with its weight"
     return f"""\
 {title}
-# Guessed from the splat; every number may be changed. A splat does not show its material: E and thickness are chosen
-# so that it sways visibly in this wind.
+# Guessed from the splat; every number may be changed.{_chosen(s)}
 #   {shlex.join(program.words("sim"))} --config THIS_FILE
 frames: {frames:<24}# {frames * 0.04:.3g} s at 25 frames a second
 frame_dt: 0.04                  # s
@@ -137,7 +142,7 @@ solver:
   dx: {s.dx:<26.6g}# m; quality {s.quality}: {s.longest_side / s.dx:.0f} cells along the longest side
   cfl: 0.4
   gravity: {gravity}     # m/s^2, z up; {why}
-  damping: {0.2 if s.sheet else 1.0:<21.3g}# 1/s; losses in air and material
+  damping: {_damping(s):<21.3g}# 1/s; losses in air and material
   boundaries:{boundaries}
 
 wind:
@@ -172,6 +177,18 @@ camera:
 recorder:
   trajectory: false             # positions of all particles in each frame
 """
+
+
+def _chosen(s: Suggestion) -> str:
+    """The end of the first comment: why the material has its numbers."""
+    if s.real:
+        return ""
+    return " A splat does not show its material: E and thickness are chosen\n# so that it sways visibly in this wind."
+
+
+def _damping(s: Suggestion) -> float:
+    """Decay rate of motion [1/s]."""
+    return known_material(s.material).damping if s.real else 0.2 if s.sheet else 1.0
 
 
 def _kind(s: Suggestion) -> str:

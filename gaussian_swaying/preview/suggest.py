@@ -17,11 +17,13 @@ from gaussian_swaying._checks import check_choice, check_positive
 from gaussian_swaying.captures.capture_camera import photo_azimuth
 from gaussian_swaying.gaussians.area import patch_area
 from gaussian_swaying.gaussians.cloud import GaussianCloud
+from gaussian_swaying.gaussians.harmonics import SH_DC
 from gaussian_swaying.gaussians.ply import OPAQUE_LOGIT
 from gaussian_swaying.geometry.frame import SimFrame
 from gaussian_swaying.geometry.neighbours import particle_spacing
 from gaussian_swaying.geometry.patches import smallest_axis_normal
 from gaussian_swaying.geometry.regions import Box, Not, Region, Union
+from gaussian_swaying.mpm.materials import known_material
 from gaussian_swaying.preview.framing import orbit_frame, whole_box
 from gaussian_swaying.preview.hold import HoldGuess, end_region, given_hold, guess_hold
 from gaussian_swaying.preview.photos import CapturedFrom, ShownObject, shown_object
@@ -128,6 +130,7 @@ class Suggestion:
         sheet: Whether the object is a thin sheet.
         azimuth: Azimuth of a camera that sees the broad side, or the side seen in photos [degrees].
         flow: Wind across the picture, or along a sheet from its held side [m/s], z up.
+        material: The known material that it is most like, by its shape and colour, or that was given.
         youngs_modulus: Young's modulus [Pa], a first guess;
             :mod:`~gaussian_swaying.preview.calibration` finds a better one.
         thickness: Thickness of the surface [m], also a first guess.
@@ -137,6 +140,7 @@ class Suggestion:
             of the moving part.
         camera_radius: Distance of a camera that shows the whole, in the same unit.
         growth: Mean number of substeps of a frame over the number at rest, from the trial runs.
+        real: Whether the numbers are those of the material; if not, they are such that it sways visibly.
     """
 
     up: UpGuess
@@ -152,6 +156,7 @@ class Suggestion:
     sheet: bool
     azimuth: float
     flow: tuple[float, ...]
+    material: str
     youngs_modulus: float
     thickness: float
     stiffness_reason: str
@@ -159,6 +164,7 @@ class Suggestion:
     camera_offset: tuple[float, ...]
     camera_radius: float
     growth: float = 1.0
+    real: bool = False
 
 
 def suggest(
@@ -259,6 +265,7 @@ def suggest(
         sheet=flat is not None,
         azimuth=round(azimuth + turn, 1),
         flow=tuple(round(c, 2) + 0.0 for c in flow),
+        material="cotton" if flat is not None else "leaf" if is_green(cloud, chosen.simulated, visible) else "rubber",
         youngs_modulus=SHELL_E if flat is None else CLOTH_E,
         thickness=SHELL_THICKNESS * longest_side if flat is None else CLOTH_THICKNESS,
         stiffness_reason="rubber, not tried" if flat is None else "the cloth of the paper's flags, not tried",
@@ -267,6 +274,32 @@ def suggest(
         camera_radius=radius,
     )
     return at_quality(suggestion, quality)
+
+
+def is_green(cloud: GaussianCloud, simulated: Tensor, weight: Tensor) -> bool:
+    """True if most of the visible area of the simulated Gaussians is greener than it is red or blue, by a tenth.
+
+    Args:
+        cloud: The splat.
+        simulated: The simulated Gaussians, shape (N,).
+        weight: Visible area of each of them.
+    """
+    red, green, blue = (0.5 + SH_DC * cloud.sh.detach()[simulated, 0].double()).clamp(0, 1).unbind(-1)
+    share = (weight * (green > 1.1 * red.maximum(blue))).sum() / weight.sum().clamp(min=1e-30)
+    return float(share) > 0.5
+
+
+def of_material(suggestion: Suggestion, name: str) -> Suggestion:
+    """The suggestion with the real numbers of a known material, which no trial run changes.
+
+    Raises:
+        ValueError: If there is no material of that name; the message lists the names.
+    """
+    known = known_material(name, "--material")
+    return replace(
+        suggestion, material=name, real=True, youngs_modulus=known.E, thickness=known.thickness,
+        stiffness_reason="its real numbers, as it was given",
+    )  # fmt: skip
 
 
 def at_quality(suggestion: Suggestion, quality: str) -> Suggestion:

@@ -40,9 +40,10 @@ if TYPE_CHECKING:
     WindLike = WindField | SpatialWind | VectorLike
     DeviceLike = torch.device | str
     SolverLike = Solver
+    MaterialLike = Material | str
 else:  # what a YAML file can contain: the annotations of the constructor are its schema
     SceneLike, WindLike, DeviceLike = Scene, WindField, Literal["auto", "cpu", "cuda", "mps"]
-    SolverLike = MPMSolver
+    SolverLike, MaterialLike = MPMSolver, Material
 
 HoldLike = Region | PinnedRegion | PinnedPoints
 CELLS = 32
@@ -94,11 +95,22 @@ def as_scene(source: SceneLike, up: Sequence[float] | None = None) -> Scene:
     return Scene(ply=source, up=direction)
 
 
-def as_solver(solver: Solver | None, hold: HoldLike | None, scene: Scene, cloud: GaussianCloud) -> Solver:
+def as_material(material: MaterialLike | None) -> Material:
+    """Return the given material, that of a name, or the default.
+
+    Raises:
+        ValueError: If there is no material of that name; the message lists the names.
+    """
+    return Material.named(material) if isinstance(material, str) else material or Material()
+
+
+def as_solver(
+    solver: Solver | None, hold: HoldLike | None, scene: Scene, cloud: GaussianCloud, damping: float = 0.0
+) -> Solver:
     """Return the given solver, or make one whose grid suits the size of the scene.
 
     A held object then has no gravity, as in the starters of the preview: its captured shape is already in balance with
-    its weight. An object that is not held falls.
+    its weight. An object that is not held falls. ``damping`` [1/s] is that of a solver that is made.
 
     Raises:
         ValueError: If ``hold`` is given together with a solver.
@@ -112,7 +124,7 @@ def as_solver(solver: Solver | None, hold: HoldLike | None, scene: Scene, cloud:
         side = float((means.amax(0) - means.amin(0)).amax()) * frame.metres_per_unit
         spacing = particle_spacing(means) * frame.metres_per_unit
         gravity = (0.0, 0.0, -9.8) if hold is None else (0.0, 0.0, 0.0)  # what is held was captured in balance
-        return MPMSolver(dx=suggest_spacing(side, spacing, CELLS), gravity=gravity, boundaries=pins)
+        return MPMSolver(dx=suggest_spacing(side, spacing, CELLS), gravity=gravity, boundaries=pins, damping=damping)
     if hold is not None:
         raise ValueError(
             "`hold` only works without a solver: add the pin to the `boundaries` of the solver, and leave out `hold`."
@@ -173,7 +185,7 @@ def check_types(given: Mapping[str, Any]) -> None:
 
 _KINDS: dict[str, tuple[type, ...]] = {
     "scene": (Scene, ProceduralScene, GaussianCloud, str, os.PathLike),
-    "material": (Material,),
+    "material": (Material, str),
     "solver": (Solver,),
     "contact": (Contact,),
     "aero": (AeroForce,),

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import KW_ONLY, dataclass, field, replace
-from typing import Literal
+from typing import Any, Literal
 
 from torch import Tensor
 
@@ -18,6 +18,7 @@ from gaussian_swaying._checks import (
 )
 from gaussian_swaying.geometry.regions import Region
 from gaussian_swaying.mpm.laws.law import ConstitutiveLaw
+from gaussian_swaying.mpm.materials import known_material
 from gaussian_swaying.mpm.state import MaterialPoints
 
 
@@ -94,6 +95,23 @@ class Material:
             if given["nu"] is not None:
                 check_plain("material.nu", given["nu"])
                 check_poisson_ratio("material.nu", given["nu"])
+
+    @classmethod
+    def named(cls, name: str, **own: Any) -> Material:
+        """The material of a name, with some fields of its own.
+
+        Args:
+            name: One of :data:`~gaussian_swaying.mpm.materials.MATERIALS`.
+            own: Fields that differ.
+
+        Raises:
+            ValueError: If there is no material of that name; the message lists the names.
+
+        Example:
+            >>> Material.named("cotton", thickness=0.001).density
+            430.0
+        """
+        return cls(**(known_material(name).numbers | own))
 
 
 DIFFERENTIABLE = ("E", "nu", "density")

@@ -30,6 +30,7 @@ from gaussian_swaying.geometry.regions import Region
 from gaussian_swaying.mpm.boundaries.obstacle import Obstacle
 from gaussian_swaying.mpm.contact.surface import Contact
 from gaussian_swaying.mpm.forces import Force, as_forces
+from gaussian_swaying.mpm.materials import known_material
 from gaussian_swaying.mpm.protocol import Solver
 from gaussian_swaying.mpm.state import State
 from gaussian_swaying.recording.recorder import Recorder
@@ -39,10 +40,12 @@ from gaussian_swaying.rendering.shading import Shader
 from gaussian_swaying.simulation.defaults import (
     DeviceLike,
     HoldLike,
+    MaterialLike,
     SceneLike,
     SolverLike,
     WindLike,
     as_camera,
+    as_material,
     as_scene,
     as_solver,
     as_wind,
@@ -74,7 +77,8 @@ class Simulation:
     Args:
         scene: The source of the Gaussians, and the choice of those that move. In Python also a file, Gaussians or a
             scene made in code; these are simulated as a whole, with the defaults of a :class:`Scene`.
-        material: The material of the object; :class:`Material` with its defaults if None.
+        material: The material of the object; :class:`Material` with its defaults if None. In Python also the name of
+            one of :data:`~gaussian_swaying.mpm.materials.MATERIALS`; a solver that is made then has its damping.
         solver: Grid, formulation, gravity and boundaries; if None, a grid of 32 cells along the longest side.
         wind: Air velocity over time; in Python also one that varies in space, or three numbers [m/s]. Still air if
             None.
@@ -125,7 +129,7 @@ class Simulation:
     def __init__(
         self,
         scene: SceneLike,
-        material: Material | None = None,
+        material: MaterialLike | None = None,
         *,
         solver: SolverLike | None = None,
         wind: WindLike | None = None,
@@ -156,9 +160,10 @@ class Simulation:
             raise ValueError(
                 "`dtype: float64` needs a device with double precision, which mps is not: use `device: cpu`."
             )
-        settings, material = as_scene(scene, up), material or Material()
+        damping = known_material(material).damping if isinstance(material, str) else 0.0
+        settings, material = as_scene(scene, up), as_material(material)
         cloud = settings.cloud()  # read once
-        solver = as_solver(solver, hold, settings, cloud)
+        solver = as_solver(solver, hold, settings, cloud, damping)
         if normalisation is not None:
             if hold is not None:
                 raise ValueError("`hold` cannot be combined with `normalisation`: give a solver with the pins.")

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import torch
 
+from gaussian_swaying.mpm.materials import MATERIALS, name_of
 from gaussian_swaying.rendering.passes import colormap
 from gaussian_swaying.simulation.parameters import parameter, present, value_of
 from gaussian_swaying.simulation.wind_picture import speed_scale
@@ -25,6 +26,7 @@ if TYPE_CHECKING:
 MOST_SPEED = 30.0  # m/s
 ARROW = 0.06  # length of the arrow of a wind of 1 m/s, in longest sides
 LEAST_LOG, MOST_LOG = 2, 8  # of the stiffness [Pa] on the slider
+OWN = "own numbers"  # of a material that is none of the known ones
 GRIDS = {"coarse": 1.5, "normal": 1.0, "fine": 0.7}
 
 
@@ -89,6 +91,11 @@ class Controls(Panel):
 
     def _material(self) -> None:
         gui = self.server.gui
+        self.known = gui.add_dropdown(
+            "Material", (OWN, *MATERIALS), initial_value=OWN, hint="The real numbers, which are stiff: slower motion"
+        )
+        self.kept = gui.add_markdown("", visible=False)
+        self.on(self.known.on_update, self._become)
         self.stiffness = gui.add_number(
             "Stiffness E [Pa]", 1e4, min=1.0, max=1e12, step=100.0, hint="Young's modulus; the slider is logarithmic"
         )
@@ -177,6 +184,7 @@ class Controls(Panel):
         settings = self._settings
         stiffness = float(settings.material.E)
         self.feels.content = f"{in_pascal(stiffness)}: like {like(stiffness)}"
+        self._show_known()
         self.gusts.show()
         if not everything:
             return
@@ -228,6 +236,28 @@ class Controls(Panel):
 
     def _set(self, name: str, value: Any) -> None:
         self.session.change({name: value})
+
+    def _become(self) -> None:
+        """Take what a known material has and may change in motion: all but the thickness."""
+        if self.known.value not in MATERIALS:
+            return
+        known = MATERIALS[self.known.value]
+        self.stiffness.value, self.stiffness_log.value = known.E, (log_place(known.E),)  # type: ignore[misc]
+        self.damping.value = known.damping  # type: ignore[misc]
+        changed = {f"material.{name}": value for name, value in known.numbers.items() if name != "thickness"}
+        self.session.change(changed | {"solver.damping": known.damping})
+
+    def _show_known(self) -> None:
+        """Show which known material the numbers are, and what of it cannot change in motion."""
+        material = self._settings.material
+        name = name_of(material.E, material.nu, material.density)
+        self.known.value = name or OWN  # type: ignore[misc]
+        thickness = 0.0 if name is None else MATERIALS[name].thickness
+        self.kept.visible = name is not None and thickness != material.thickness
+        self.kept.content = (
+            f"The thickness stays at {1e3 * material.thickness:.3g} mm, as it cannot change in motion; {name} has "
+            f"{1e3 * thickness:.3g} mm. Start with `--material {name}` for all of it."
+        )
 
     def _stiffen(self, stiffness: float) -> None:
         stiffness = float(f"{stiffness:.3g}")
@@ -401,7 +431,7 @@ def legend(name: str, unit: str, largest: float) -> str:
 # From, in Pa, to the next one. Gels and muscle at rest: Levental, Georges & Janmey 2007, "Soft biological materials and
 # their impact on cell function"; foam, rubber, cork, leather and plastics: Ashby 2011, "Materials Selection in
 # Mechanical Design", chart of modulus and density. The limits are rounded to powers of ten.
-MATERIALS = (
+FEELS = (
     (0.0, "soft jelly"),
     (1e3, "jelly"),
     (1e4, "muscle at rest"),
@@ -418,7 +448,7 @@ _UNITS = ((1e9, "GPa"), (1e6, "MPa"), (1e3, "kPa"), (0.0, "Pa"))
 
 def like(stiffness: float) -> str:
     """The material whose Young's modulus [Pa] is nearest, in words."""
-    return next(name for least, name in reversed(MATERIALS) if stiffness >= least)
+    return next(name for least, name in reversed(FEELS) if stiffness >= least)
 
 
 def in_pascal(stiffness: float) -> str:

@@ -107,6 +107,18 @@ def test_specks_are_noted_and_follow(splat, tmp_path, capsys):
         assert json.loads((run / "summary.json").read_text())["loose_gaussians"] == 4
 
 
+def test_a_material_may_be_given(splat, tmp_path, capsys):
+    """No trial run changes its real numbers."""
+    out = tmp_path / "out"
+    assert preview(splat, out, "--material", "rubber", "--frames", "2") == 0
+    assert "rubber, E = 2.0e+06 Pa, 0.002 m thick: its real numbers" in capsys.readouterr().out
+    assert json.loads((out / "preview.json").read_text())["suggestion"]["material"] == "rubber"
+    for name in ("draft", "starter"):
+        assert yaml.safe_load((out / f"{name}.yaml").read_text())["material"] == "rubber"
+    given = ["--output", str(tmp_path / "other"), "--material", "ruber"]
+    refused(main, [str(splat), *given], capsys, "`--material`", "rubber", "'ruber'", folder=tmp_path)
+
+
 @pytest.mark.slow(twin="test_a_share_is_reached_in_few_runs")
 def test_more_sway_is_softer(tmp_path):
     """A post of a few large patches, held at its foot."""

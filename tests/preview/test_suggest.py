@@ -13,6 +13,7 @@ import torch
 import yaml
 from small_scenes import plain_cloud, together
 
+from gaussian_swaying.config.parser import parse_text
 from gaussian_swaying.gaussians.cloud import GaussianCloud
 from gaussian_swaying.gaussians.grouping import LOOSE
 from gaussian_swaying.gaussians.ply import write_ply
@@ -20,6 +21,7 @@ from gaussian_swaying.geometry.neighbours import particle_spacing
 from gaussian_swaying.geometry.patches import smallest_axis_normal
 from gaussian_swaying.geometry.regions import Box, Cylinder
 from gaussian_swaying.geometry.rotations import quat_to_rotation
+from gaussian_swaying.mpm.materials import MATERIALS
 from gaussian_swaying.preview import calibration
 from gaussian_swaying.preview.hold import PIN_DEPTH, end_region
 from gaussian_swaying.preview.shape import SHEET, bounds, sheet_normal
@@ -37,12 +39,14 @@ from gaussian_swaying.preview.suggest import (
     finest_spacing,
     gaussian_statistics,
     given_region,
+    of_material,
     suggest,
     suggest_region,
     suggest_threshold,
     visible_weight,
 )
 from gaussian_swaying.preview.up import CONVENTION, floor_mask, guess_up
+from gaussian_swaying.scenes.leaves import LeavesScene
 from gaussian_swaying.scenes.procedural import FlagScene
 from gaussian_swaying.simulation.body import SPECK
 from gaussian_swaying.simulation.extent import suggest_spacing
@@ -430,6 +434,40 @@ def test_only_cloth_and_what_falls_has_weight():
         assert found.youngs_modulus == SHELL_E
         assert gravity(found) == weight
         assert math.hypot(*found.flow) == pytest.approx(6, abs=0.01)
+
+
+def test_the_material_is_guessed_by_shape_and_colour():
+    """And named in the starter, whose softer numbers win."""
+    leaves = LeavesScene().generate()
+    grey = tree()
+    green = dataclasses.replace(grey, sh=grey.sh + 0.5 * torch.tensor([-1.0, 1.0, -1.0]))
+    flag = FlagScene(spacing=0.05).generate()
+    for cloud, name in ((flag, "cotton"), (leaves, "leaf"), (green, "leaf"), (grey, "rubber")):
+        found = suggest(cloud)
+        assert found.material == name
+        text = starter_yaml(found, "it.ply")
+        material = yaml.safe_load(text)["material"]
+        assert material == {"name": name, "nu": 0.3} | {key: material[key] for key in ("E", "density", "thickness")}
+        assert material["E"] == found.youngs_modulus < MATERIALS[name].E
+        settings = parse_text(Simulation.parser(), text.replace("it.ply", "x.ply"))
+        assert (settings.material.E, settings.material.thickness) == (material["E"], found.thickness)
+        assert settings.solver.damping == (0.2 if name == "cotton" else 1.0)
+
+
+def test_a_given_material_has_its_real_numbers():
+    """The starter says no more than its name."""
+    found = of_material(suggest(FlagScene(spacing=0.05).generate()), "silk")
+    silk = MATERIALS["silk"]
+    assert (found.youngs_modulus, found.thickness) == (silk.E, silk.thickness)
+    assert calibration.calibrated_suggestion(found, None, 0.1) is found
+    text = starter_yaml(found, "it.ply")
+    assert yaml.safe_load(text)["material"] == "silk"
+    assert "sways visibly" not in text
+    settings = parse_text(Simulation.parser(), text)
+    assert {name: settings.material[name] for name in silk.numbers} == silk.numbers
+    assert settings.solver.damping == silk.damping
+    with pytest.raises(ValueError, match="`--material` to be one of cotton, silk"):
+        of_material(found, "slk")
 
 
 def test_a_stray_point_far_away_does_not_join_the_parts():

@@ -10,9 +10,10 @@ import yaml
 
 pytest.importorskip("viser", reason="needs the extra [viewer]")
 from gaussian_swaying.gaussians.export import export_cloud
+from gaussian_swaying.mpm.materials import MATERIALS
 from gaussian_swaying.scenes.procedural import FlagScene
 from gaussian_swaying.viewer import session as session_module
-from gaussian_swaying.viewer.controls import MATERIALS, Page, in_pascal, legend, like
+from gaussian_swaying.viewer.controls import FEELS, OWN, Page, in_pascal, legend, like
 from gaussian_swaying.viewer.gusts import KINDS
 from gaussian_swaying.viewer.session import Session
 
@@ -101,6 +102,33 @@ def test_stiffness_is_in_pascal_on_a_logarithmic_slider(page, client, until):
     until(lambda: session.settings.material.E == 3e4)
 
 
+def test_a_known_material_is_taken_but_for_its_thickness(page, client, until):
+    """In motion, and in one change that can be undone."""
+    session, controls = page.session, page.controls
+    rubber = MATERIALS["rubber"]
+    assert (controls.known.value, controls.kept.visible) == (OWN, False)
+    assert controls.known.options == (OWN, *MATERIALS)
+    before, thickness = session.simulation, session.settings.material.thickness
+    client.set(controls.known, "rubber")
+    until(lambda: session.settings.material.E == rubber.E)
+    material = session.settings.material
+    assert (material.nu, material.density, material.thickness) == (rubber.nu, rubber.density, thickness)
+    assert session.settings.solver.damping == controls.damping.value == rubber.damping
+    assert session.simulation is before
+    assert session.changes == 1
+    until(lambda: controls.kept.visible)
+    for words in (f"stays at {1e3 * thickness:g} mm", "rubber has 2 mm", "`--material rubber`"):
+        assert words in controls.kept.content
+    assert controls.stiffness.value == rubber.E
+    client.set(controls.stiffness, 3e4)
+    until(lambda: controls.known.value == OWN)
+    assert not controls.kept.visible
+    client.set(controls.undo, True)
+    until(lambda: controls.known.value == "rubber")
+    client.set(controls.known, OWN)
+    assert session.settings.material.E == rubber.E
+
+
 @pytest.mark.parametrize(
     ("stiffness", "name"),
     [(150.0, "soft jelly"), (3e4, "muscle at rest"), (2e6, "rubber"), (2e7, "cork"), (2e11, "metal or stone")],
@@ -110,10 +138,10 @@ def test_a_stiffness_has_a_name(stiffness, name):
 
 
 def test_the_table_of_materials_has_no_gap():
-    starts = [least for least, _ in MATERIALS]
+    starts = [least for least, _ in FEELS]
     assert starts == sorted(set(starts))
     assert starts[0] == 0
-    assert [like(least) for least, _ in MATERIALS] == [name for _, name in MATERIALS]
+    assert [like(least) for least, _ in FEELS] == [name for _, name in FEELS]
     assert [in_pascal(e) for e in (0.5, 999, 1e3, 2.5e6, 1e9)] == ["0.5 Pa", "999 Pa", "1 kPa", "2.5 MPa", "1 GPa"]
 
 
