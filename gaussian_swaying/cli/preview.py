@@ -97,7 +97,7 @@ def build_options() -> argparse.ArgumentParser:
         metavar="SHARE",
         help="largest displacement in that wind, as a share of the longest side; stiffness and thickness follow",
     )
-    add("--material", metavar="NAME", help=f"its real numbers, instead of softer ones: {NAMES}")
+    add("--material", metavar="NAME", help=f"its numbers, instead of softer ones: {NAMES}")
     add("--frames", type=int, default=250, help="frames of the configuration")
     add("--quality", metavar="Q", help=f"grid of the starter: {', '.join(QUALITIES)}; default: normal")
     add("--minutes", type=float, metavar="N", help="instead: the finest grid whose run takes at most this long here")

@@ -1,8 +1,8 @@
-"""Materials by name: numbers for cloth, leaves and wood, each with its source.
+"""Materials by name: numbers for cloth, leaves and wood, with what was read in a source and what is an estimate.
 
-They are those of the real material, at small strain and the same in all directions, which cloth, grass and wood are
-not. Real ones are much stiffer than what is usually simulated, and a wave may cross at most part of a cell in a
-substep: see :attr:`KnownMaterial.wave_speed`.
+They are of the size of the real material's, at small strain and the same in all directions, which cloth, grass and
+wood are not. Real ones are much stiffer than what is usually simulated, and a wave may cross at most part of a cell
+in a substep: see :attr:`KnownMaterial.wave_speed`.
 """
 
 from __future__ import annotations
@@ -22,9 +22,9 @@ class KnownMaterial:
         nu: Poisson's ratio.
         density: Density [kg/m³].
         thickness: Thickness of a sheet of it [m].
-        damping_ratio: Share of critical damping of its vibrations, without that of the air. For cloth a sixth of the
-            hysteresis of its bending, as gravity and tension bring cloth back rather than bending.
-        source: Where the numbers are from.
+        damping_ratio: Share of critical damping of its vibrations, without that of the air.
+        source: What was read in a source, and which; empty if nothing was.
+        estimated: What is our estimate, and where to compare it.
     """
 
     E: float
@@ -33,6 +33,7 @@ class KnownMaterial:
     thickness: float
     damping_ratio: float
     source: str
+    estimated: str
 
     @property
     def damping(self) -> float:
@@ -50,30 +51,46 @@ class KnownMaterial:
         return {name: getattr(self, name) for name in ("E", "nu", "density", "thickness")}
 
 
-_WOVEN = "stretch per mass of the woven fabrics of Wang, O'Brien & Ramamoorthi 2011"
+_WANG = "Wang, O'Brien & Ramamoorthi 2011"
+_WOVEN = f"stretch per mass as for cotton ({_WANG})"
 
 MATERIALS: dict[str, KnownMaterial] = {
-    "cotton": KnownMaterial(1.3e7, 0.3, 430.0, 0.0003, 0.02, "a woven fabric of Wang, O'Brien & Ramamoorthi 2011"),
-    "silk": KnownMaterial(1.6e7, 0.3, 520.0, 0.0001, 0.02, f"12 momme, which is 52 g/m²; {_WOVEN}"),
+    "cotton": KnownMaterial(
+        1.3e7, 0.3, 430.0, 0.0003, 0.02,
+        f"mass and stretch (4 kN/m) of a light woven fabric, of whatever fibre: {_WANG}",
+        "nu, thickness, damping",
+    ),
+    "silk": KnownMaterial(
+        1.6e7, 0.3, 520.0, 0.0001, 0.02, f"12 momme, which is 52 g/m²; {_WOVEN}", "nu, thickness, damping"
+    ),
     "denim": KnownMaterial(
         2.5e6, 0.3, 405.0, 0.0008, 0.02,
-        "11 oz denim of Wang, O'Brien & Ramamoorthi 2011; thickness: Journal of Textiles 2016, 4614168, table 5",
+        f"mass and stretch (2 kN/m) of a denim of 11 oz: {_WANG}; thickness: one of Journal of Textiles 2016, 4614168",
+        "nu, damping",
     ),
-    "canvas": KnownMaterial(1.8e7, 0.3, 565.0, 0.0006, 0.02, f"duck of 10 oz/yd², which is 339 g/m²; {_WOVEN}"),
-    "leather": KnownMaterial(1e8, 0.4, 930.0, 0.0012, 0.05, "Ashby 2011, soft end of the range; upholstery"),
-    "rubber": KnownMaterial(2e6, 0.45, 925.0, 0.002, 0.05, "Ashby 2011, natural rubber; nu lowered from 0.5"),
-    "paper": KnownMaterial(3.4e9, 0.3, 1067.0, 0.000075, 0.01, "flags of D'Adamo et al. 2024; damping: Ashby 2011"),
+    "canvas": KnownMaterial(
+        1.8e7, 0.3, 565.0, 0.0006, 0.02, f"duck of 10 oz/yd², which is 339 g/m²; {_WOVEN}", "nu, thickness, damping"
+    ),
+    "leather": KnownMaterial(1e8, 0.4, 930.0, 0.0012, 0.05, "", "all; for ranges see Ashby 2011"),
+    "rubber": KnownMaterial(2e6, 0.45, 925.0, 0.002, 0.05, "", "all; for ranges see Ashby 2011; nu is nearer to 0.5"),
+    "paper": KnownMaterial(
+        3.4e9, 0.3, 1067.0, 0.000075, 0.01,
+        "bending stiffness, density and thickness of flags in a wind tunnel: data of juandadamo/2024_flags",
+        "nu, damping",
+    ),
     "grass": KnownMaterial(
-        4.9e8, 0.3, 700.0, 0.00025, 0.05, "Vincent 1982 and 1991: 2 % of fibres carry 93 % of the stiffness"
+        4.9e8, 0.3, 700.0, 0.00025, 0.05,
+        "fibres, 2 % of a blade and more (Vincent 1991), carry 90 to 95 % of its stiffness (Vincent 1982)",
+        "all; E for fibres of 23 GPa",
     ),
-    "leaf": KnownMaterial(5e7, 0.3, 800.0, 0.00025, 0.05, "between epidermis and mesophyll of Onoda et al. 2015"),
+    "leaf": KnownMaterial(5e7, 0.3, 800.0, 0.00025, 0.05, "", "all; for measurements see Onoda et al. 2015"),
     "twig": KnownMaterial(
         2e9, 0.35, 900.0, 0.002, 0.05,
-        "branches of Cannell & Morgan 1987; damping: a tree in winter, Jackson et al. 2019",
+        "E within that of branches, 0.7 to 4.6 GPa: Cannell & Morgan 1987; damping of a tree in winter: data of "
+        "TobyDJackson/WindAndTrees_NaturalFrequencies",
+        "nu, density, thickness",
     ),
-    "wood": KnownMaterial(
-        1e10, 0.35, 500.0, 0.01, 0.005, "dry softwood along the grain, Ross 2010; damping: Ashby 2011"
-    ),
+    "wood": KnownMaterial(1e10, 0.35, 500.0, 0.01, 0.005, "", "all; dry softwood along the grain, see Ross 2010"),
 }  # fmt: skip
 """The known materials by name."""
 

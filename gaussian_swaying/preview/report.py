@@ -163,7 +163,7 @@ def _numbers(values: Sequence[float]) -> str:
 
 
 def _material(guess: Suggestion) -> str:
-    softer = "" if guess.real else " (softer than real)"
+    softer = "" if guess.real else " (softer than its table)"
     numbers = f"E = {guess.youngs_modulus:.1e} Pa, {guess.thickness:.2g} m thick"
     return f"{guess.material}{softer}, {numbers}: {guess.stiffness_reason}"
 

@@ -48,7 +48,7 @@ def _material(s: Suggestion) -> str:
         density, why = (30.0, "the paper's flags, whose E is 3e3 to 6e3")
     return f"""\
 material:
-  name: {s.material:<24}# a guess; `material: {s.material}` alone takes its real numbers, stiffer than those below
+  name: {s.material:<24}# a guess; `material: {s.material}` alone takes its own numbers, stiffer than those below
   # {s.stiffness_reason}
   E: {s.youngs_modulus:<27.1e}# Pa; a larger E bends less and needs more substeps
   nu: 0.3

@@ -290,7 +290,7 @@ def is_green(cloud: GaussianCloud, simulated: Tensor, weight: Tensor) -> bool:
 
 
 def of_material(suggestion: Suggestion, name: str) -> Suggestion:
-    """The suggestion with the real numbers of a known material, which no trial run changes.
+    """The suggestion with the numbers of a known material, which no trial run changes.
 
     Raises:
         ValueError: If there is no material of that name; the message lists the names.
@@ -298,7 +298,7 @@ def of_material(suggestion: Suggestion, name: str) -> Suggestion:
     known = known_material(name, "--material")
     return replace(
         suggestion, material=name, real=True, youngs_modulus=known.E, thickness=known.thickness,
-        stiffness_reason="its real numbers, as it was given",
+        stiffness_reason="its numbers, as it was given",
     )  # fmt: skip
 
 

@@ -92,7 +92,10 @@ class Controls(Panel):
     def _material(self) -> None:
         gui = self.server.gui
         self.known = gui.add_dropdown(
-            "Material", (OWN, *MATERIALS), initial_value=OWN, hint="The real numbers, which are stiff: slower motion"
+            "Material",
+            (OWN, *MATERIALS),
+            initial_value=OWN,
+            hint="Numbers of a known material; stiff ones take more substeps",
         )
         self.kept = gui.add_markdown("", visible=False)
         self.on(self.known.on_update, self._become)

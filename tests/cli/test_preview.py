@@ -108,10 +108,10 @@ def test_specks_are_noted_and_follow(splat, tmp_path, capsys):
 
 
 def test_a_material_may_be_given(splat, tmp_path, capsys):
-    """No trial run changes its real numbers."""
+    """No trial run changes its numbers."""
     out = tmp_path / "out"
     assert preview(splat, out, "--material", "rubber", "--frames", "2") == 0
-    assert "rubber, E = 2.0e+06 Pa, 0.002 m thick: its real numbers" in capsys.readouterr().out
+    assert "rubber, E = 2.0e+06 Pa, 0.002 m thick: its numbers, as it was given" in capsys.readouterr().out
     assert json.loads((out / "preview.json").read_text())["suggestion"]["material"] == "rubber"
     for name in ("draft", "starter"):
         assert yaml.safe_load((out / f"{name}.yaml").read_text())["material"] == "rubber"

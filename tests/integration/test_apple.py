@@ -14,9 +14,10 @@ from pretend_mps import pretended_mps
 from shared import refused
 
 from gaussian_swaying.aero.carried import Turbulence
-from gaussian_swaying.aero.effects import LogProfile
+from gaussian_swaying.aero.effects import LogProfile, PowerProfile
 from gaussian_swaying.aero.force import AeroForce
 from gaussian_swaying.aero.obstacles import CylinderObstacle, EllipsoidObstacle, SphereObstacle
+from gaussian_swaying.aero.recorded import FrozenWind, RecordedWind
 from gaussian_swaying.aero.shelter import Shelter
 from gaussian_swaying.aero.wind import FlowKey, GaussianGust, SineSway, UniformGust, WindField
 from gaussian_swaying.cli.simulate import main
@@ -30,6 +31,7 @@ from gaussian_swaying.mpm.boundaries.enclosing_box import EnclosingBox
 from gaussian_swaying.mpm.boundaries.half_space import HalfSpaceObstacle
 from gaussian_swaying.mpm.boundaries.handle import Handle
 from gaussian_swaying.mpm.boundaries.impulse import Impulse
+from gaussian_swaying.mpm.boundaries.mesh import MeshObstacle
 from gaussian_swaying.mpm.boundaries.pinned_points import PinnedPoints
 from gaussian_swaying.mpm.boundaries.pinned_region import PinnedRegion
 from gaussian_swaying.mpm.boundaries.plane import Plane
@@ -148,6 +150,23 @@ def test_a_simulation_asks_only_for_what_the_device_has(case):
     start, *_, frame = on_cpu.frames(3)
     assert float((frame.state.position - start.state.position).norm(dim=-1).max()) > 1e-4
     torch.testing.assert_close(found, frame.state.position, rtol=0, atol=2e-5)
+
+
+def test_a_wind_and_an_obstacle_from_files(tmp_path):
+    """A recorded wind, which changes with time, a frozen one, a profile and a mesh."""
+    axis = np.linspace(-2, 2, 4)
+    draw = np.random.default_rng(0)
+    grid = {"x": axis, "y": axis, "z": axis}
+    np.savez(tmp_path / "still.npz", **grid, velocity=draw.normal(size=(4, 4, 4, 3)))
+    np.savez(tmp_path / "wind.npz", **grid, time=np.arange(3.0), velocity=draw.normal(size=(3, 4, 4, 4, 3)))
+    (tmp_path / "mesh.obj").write_text("v 0 -1 -1\nv 1 -1 -1\nv 0 1 -1\nv 0 -1 0\nf 1 3 2\nf 1 2 4\nf 1 4 3\nf 2 3 4\n")
+    recorded, frozen = RecordedWind(tmp_path / "wind.npz"), FrozenWind(tmp_path / "still.npz")
+    wind = WindField([3, 0, 0], effects=[PowerProfile(height=1.0), recorded, frozen])
+    with pretended_mps() as mode:
+        solver = _grid(PinnedRegion(LEFT), MeshObstacle(str(tmp_path / "mesh.obj"), cells=8))
+        *_, frame = _simulation(wind=wind, solver=solver).frames(2)
+        assert frame.state.position.device.type == "mps"
+    assert sum(mode.seen.values()) > 1000
 
 
 @pytest.mark.slow(twin="test_a_run_is_recorded_and_continued")

@@ -454,7 +454,7 @@ def test_the_material_is_guessed_by_shape_and_colour():
         assert settings.solver.damping == (0.2 if name == "cotton" else 1.0)
 
 
-def test_a_given_material_has_its_real_numbers():
+def test_a_given_material_has_its_own_numbers():
     """The starter says no more than its name."""
     found = of_material(suggest(FlagScene(spacing=0.05).generate()), "silk")
     silk = MATERIALS["silk"]
