@@ -13,7 +13,6 @@ from gaussian_swaying.aero.force import AeroForce
 from gaussian_swaying.aero.wind import SpatialWind, WindField, flow_rows
 from gaussian_swaying.captures.capture_camera import CaptureCamera, photo_azimuth, read_views
 from gaussian_swaying.gaussians.cloud import GaussianCloud
-from gaussian_swaying.gaussians.selection import select_simulated
 from gaussian_swaying.geometry.frame import SimFrame
 from gaussian_swaying.geometry.neighbours import particle_spacing
 from gaussian_swaying.geometry.regions import Region
@@ -117,9 +116,7 @@ def as_solver(
     """
     if solver is None:
         pins = [PinnedRegion(hold) if isinstance(hold, Region) else hold] if hold is not None else []
-        opacity = torch.sigmoid(cloud.opacities)
-        chosen = select_simulated(cloud.means, opacity, scene.region, scene.opacity_threshold, scene.up)
-        means = cloud.means[chosen]
+        means = cloud.means[scene.select(cloud)]
         frame = SimFrame.fit(means, scene.up, scene.longest_side, scene.metres_per_unit)
         side = float((means.amax(0) - means.amin(0)).amax()) * frame.metres_per_unit
         spacing = particle_spacing(means) * frame.metres_per_unit

@@ -15,7 +15,6 @@ from torch import Tensor, nn
 
 from gaussian_swaying._checks import check_positive
 from gaussian_swaying.gaussians.cloud import GaussianCloud
-from gaussian_swaying.gaussians.selection import select_simulated
 from gaussian_swaying.geometry.frame import SimFrame
 from gaussian_swaying.geometry.regions import RegionInFrame
 from gaussian_swaying.interop.physgaussian.camera import PhysGaussianCamera
@@ -113,8 +112,7 @@ class Normalisation:
         turned = SimFrame(torch.zeros(3, dtype=torch.float64), self.rotation.T.contiguous(), 1.0)
         scene.region = RegionInFrame(scene.region, turned)
         cloud = scene.cloud() if cloud is None else cloud
-        chosen = select_simulated(cloud.means, torch.sigmoid(cloud.opacities), scene.region, scene.opacity_threshold)
-        frame = self.fit(cloud.means[chosen])
+        frame = self.fit(cloud.means[scene.select(cloud)])
         scene.metres_per_unit = 1 / frame.metres_per_unit
         regions = [dataclasses.replace(e, region=RegionInFrame(e.region, frame)) for e in material.regions]
         conditions = [b.in_frame(frame) for b in solver.boundaries if isinstance(b, Boundary)]

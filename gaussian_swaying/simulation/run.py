@@ -39,6 +39,11 @@ def splat_checksum(scene: SimulatedScene) -> str | None:
     return None if scene.source is None else sha256(Path(scene.source))
 
 
+def parts_checksum(scene: SimulatedScene) -> str | None:
+    """Checksum of the parts of a scene, as their file may have been painted over."""
+    return None if scene.parts is None else scene.parts.digest()
+
+
 def _check_checkpoint(
     editor: SceneEditor, checkpoint: dict[str, Any], start: State, output: Path, frames: int, splat: str | None
 ) -> None:
@@ -48,6 +53,11 @@ def _check_checkpoint(
         raise ValueError(
             f"The splat {scene.source} has changed since the run in {output} began: restore the old file, or "
             "start again without --resume."
+        )
+    if checkpoint.get("parts") != parts_checksum(scene):
+        raise ValueError(
+            f"The parts of the scene (`scene.parts`) have changed since the run in {output} began: restore the old "
+            "file, or start again without --resume."
         )
     if isinstance(held, Tensor) and held.ndim == 2 and len(held) != scene.points.count:
         raise ValueError(
@@ -312,6 +322,7 @@ class Run:
                     "config": self.config,
                     "wall_s": self.walls.read(),
                     "splat": self.splat,
+                    "parts": parts_checksum(self.scene),
                     "tracked": self.scene.tracked,
                     "nodes": _count(self.scene.follow.nodes(state)),
                 }

@@ -3,14 +3,24 @@
 from __future__ import annotations
 
 import os
-from typing import Literal
+from typing import TYPE_CHECKING, Literal
+
+import torch
+from torch import Tensor
 
 from gaussian_swaying._checks import check_literals, check_positive, check_vector
 from gaussian_swaying.gaussians.cloud import GaussianCloud
 from gaussian_swaying.gaussians.filling import InteriorFilling
 from gaussian_swaying.gaussians.formats import read_gaussians
+from gaussian_swaying.gaussians.parts import Parts
+from gaussian_swaying.gaussians.selection import select_simulated
 from gaussian_swaying.geometry.regions import Everything, Region
 from gaussian_swaying.scenes.procedural import ProceduralScene
+
+if TYPE_CHECKING:
+    PartsLike = str | os.PathLike[str] | Parts
+else:  # what a YAML file can contain
+    PartsLike = str | os.PathLike[str]
 
 
 class Scene:
@@ -21,6 +31,9 @@ class Scene:
             over ``generator``.
         generator: A scene made in code.
         region: Part that is simulated, in scene units; the rest does not move and is rendered as well.
+        parts: Which part each Gaussian belongs to, and whether a part is soft, held or still (``parts.npz``, see
+            :mod:`~gaussian_swaying.gaussians.parts`); in Python also :class:`~gaussian_swaying.gaussians.parts.Parts`.
+            Null for one soft part.
         opacity_threshold: Gaussians in the region below this opacity carry no mass and feel no wind.
         faint: Treatment of Gaussians below that opacity: ``carry`` (they follow their nearest simulated neighbour),
             ``static`` or ``drop``.
@@ -73,6 +86,7 @@ class Scene:
         generator: ProceduralScene | None = None,
         *,
         region: Region | None = None,
+        parts: PartsLike | None = None,
         opacity_threshold: float = 0.1,
         faint: Literal["carry", "static", "drop"] = "carry",
         up: list[float] = [0.0, 0.0, 1.0],  # noqa: B006  (never changed; the schema of the config shows it)
@@ -117,6 +131,7 @@ class Scene:
         if ply is None and generator is None:
             raise ValueError("The scene is empty: give `scene.ply` (a 3DGS .ply file) or `scene.generator`.")
         self.ply, self.generator, self.region = ply, generator, region or Everything()
+        self.parts = Parts.load(parts) if isinstance(parts, str | os.PathLike) else parts
         self.opacity_threshold, self.faint, self.up = float(opacity_threshold), faint, list(up)
         self.longest_side, self.metres_per_unit, self.area = longest_side, metres_per_unit, area
         self.filling, self.wind_on = filling, wind_on
@@ -137,3 +152,28 @@ class Scene:
             return read_gaussians(self.ply)
         assert self.generator is not None
         return self.generator.generate()
+
+    def select(self, cloud: GaussianCloud) -> Tensor:
+        """The Gaussians that are simulated: in the region, opaque enough, and in no part that is still.
+
+        Args:
+            cloud: All Gaussians.
+
+        Returns:
+            Booleans, shape (N,).
+
+        Raises:
+            ValueError: If there are none, or ``parts`` are those of another splat.
+        """
+        opacity = torch.sigmoid(cloud.opacities)
+        chosen = select_simulated(cloud.means, opacity, self.region, self.opacity_threshold, self.up)
+        if self.parts is None:
+            return chosen
+        self.parts.check_count(len(cloud.means))
+        left = chosen & ~self.parts.mask(role="still")
+        if not bool((left & ~self.parts.mask(role="held")).any()):
+            raise ValueError(
+                f"Nothing is left to move: all simulated Gaussians belong to parts of `scene.parts` that are still or "
+                f"held, {self.parts!r}. Make one of them soft, or change `scene.region`."
+            )
+        return left

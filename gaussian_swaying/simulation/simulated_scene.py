@@ -12,7 +12,6 @@ from torch import Tensor, nn
 from gaussian_swaying.gaussians.area import patch_area
 from gaussian_swaying.gaussians.cloud import GaussianCloud
 from gaussian_swaying.gaussians.model import DeformedGaussians, GaussianSurfaceModel
-from gaussian_swaying.gaussians.selection import select_simulated
 from gaussian_swaying.geometry.directions import hull_area
 from gaussian_swaying.geometry.frame import SimFrame
 from gaussian_swaying.geometry.neighbours import nearest_neighbours
@@ -35,7 +34,8 @@ class SimulatedScene(nn.Module):
     """Gaussians, material points and patches of one scene, and how the Gaussians follow the material.
 
     There are three kinds of Gaussians: simulated ones belong to the material, carried ones (faint or loose) follow the
-    nearest simulated one, and static ones do not move. With ``points: gaussian`` each simulated Gaussian is a material
+    nearest simulated one, and static ones do not move. Of the simulated ones, those of a part that is held stay in
+    place as well. With ``points: gaussian`` each simulated Gaussian is a material
     point, and the points that fill a solid, those at the faces of a sheet of three layers, and the extra points of
     large Gaussians (``particle_spacing``) come after them. With ``points: grid`` a material point is a group of
     Gaussians and of such points. Wind acts on patches: those of the simulated Gaussians and of their extra points.
@@ -62,13 +62,15 @@ class SimulatedScene(nn.Module):
         frame: Conversion from scene units to metres.
         bounds: Smallest and largest corner of the simulated part at rest [scene units].
         size: Its longest side [scene units].
-        moving: Indices of the Gaussians that move, first the simulated and then the carried ones, shape (M,).
+        moving: Indices of the Gaussians that move, first the simulated and then the carried ones, without parts that
+            are held, shape (M,).
         all_move: Whether ``moving`` is all Gaussians, in their order.
         rest_facing: Normals at rest of the Gaussians that move, in the z-up frame, shape (M, 3).
         further: Number of extra points on large Gaussians.
         tracked: Number of points that :meth:`surface` returns.
         surface_places: Contact samples, which touch obstacles and each other, or None.
         source: The .ply file; None for a scene made in code.
+        parts: The labels of its Gaussians, with roles and materials, or None.
     """
 
     def __init__(
@@ -84,18 +86,20 @@ class SimulatedScene(nn.Module):
     ) -> None:
         super().__init__()
         cloud = scene.cloud() if cloud is None else cloud
-        self.source = scene.ply
+        self.source, self.parts = scene.ply, scene.parts
         by_grid = scene.points == "grid" or (scene.points is None and fixed)
         if by_grid and not fixed:
             raise ValueError(
                 "`scene.points: grid` needs `solver.formulation: total`, where Gaussians can follow the nodes: set "
                 "`scene.points` to gaussian."
             )
-        opacity = torch.sigmoid(cloud.opacities)
-        chosen = select_simulated(cloud.means, opacity, scene.region, scene.opacity_threshold, scene.up)
-        faint = scene.region.contains(cloud.means) & ~chosen
+        chosen = scene.select(cloud)
+        still, held = torch.zeros_like(chosen), torch.zeros_like(chosen)
+        if scene.parts is not None:
+            still, held = scene.parts.mask(role="still"), scene.parts.mask(role="held")
+        faint = scene.region.contains(cloud.means) & ~chosen & ~still
         if scene.faint == "drop" and bool(faint.any()):
-            cloud, chosen, faint = cloud.select(~faint), chosen[~faint], faint[~faint]
+            cloud, chosen, held, faint = cloud.select(~faint), chosen[~faint], held[~faint], faint[~faint]
         self.model = GaussianSurfaceModel.from_cloud(cloud, requires_grad=False)
         simulated = chosen.nonzero()[:, 0]
         self.frame = SimFrame.fit(cloud.means[simulated], scene.up, scene.longest_side, scene.metres_per_unit)
@@ -130,11 +134,13 @@ class SimulatedScene(nn.Module):
         self.register_buffer("rest_covariances", self.model.covariance())
         self.register_buffer("rest_normals", normals)
         # computed once here, as every picture needs it
-        moving = torch.cat([simulated, carried])
-        self.all_move = bool(moving.equal(torch.arange(len(cloud.means))))
-        self.register_buffer("moving", moving, persistent=False)
         nearest = nearest_neighbours(part.means.double(), 1, cloud.means[carried].double())[1][:, 0]
         anchor = torch.cat([torch.arange(len(simulated)), nearest])  # the simulated Gaussian that is followed
+        moving = torch.cat([simulated, carried])
+        free = ~(held[simulated][anchor] | held[moving])  # what is held is drawn where it is, exactly
+        anchor, moving = anchor[free], moving[free]
+        self.all_move = bool(moving.equal(torch.arange(len(cloud.means))))
+        self.register_buffer("moving", moving, persistent=False)
         self.register_buffer("owner", body.owner[anchor], persistent=False)
         samples = body.surface_samples
         self.further = samples - len(simulated)
@@ -194,6 +200,7 @@ class SimulatedScene(nn.Module):
                 low, high = self._box(obstacle.margin)
                 still = torch.ones(len(self.model.means), dtype=torch.bool)
                 still[self.moving] = False
+                still[self.simulated] = False  # a part that is held belongs to the body
                 means = self.frame.point_to_sim(self.model.means.detach()[still].double())
                 shape = self.frame.covariance_to_sim(self.rest_covariances[still].double())
                 opacity = self.model.opacity().detach()[still]

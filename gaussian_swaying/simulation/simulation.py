@@ -55,6 +55,7 @@ from gaussian_swaying.simulation.defaults import (
 from gaussian_swaying.simulation.diagnostics import FrameDiagnostics
 from gaussian_swaying.simulation.edits import Edit, SceneEditor
 from gaussian_swaying.simulation.frame import Frame, frames_from
+from gaussian_swaying.simulation.labelled import with_parts
 from gaussian_swaying.simulation.material import Material
 from gaussian_swaying.simulation.normalisation import Normalisation
 from gaussian_swaying.simulation.painter import Painter
@@ -169,6 +170,7 @@ class Simulation:
                 raise ValueError("`hold` cannot be combined with `normalisation`: give a solver with the pins.")
             parts = settings, material, solver, camera, cameras, edits
             settings, material, solver, camera, cameras, edits = normalisation.place(*parts, cloud)
+        material, solver = with_parts(settings, cloud, material, solver)
         apart = [
             part.region for part in (*solver.boundaries, *edits) if isinstance(getattr(part, "region", None), Region)
         ]

@@ -1,0 +1,48 @@
+"""The parts of a splat in a simulation: materials of their own, and a pin for what is held."""
+
+from __future__ import annotations
+
+import copy
+import dataclasses
+
+from torch import nn
+
+from gaussian_swaying.gaussians.cloud import GaussianCloud
+from gaussian_swaying.gaussians.parts import NUMBERS, PartRegion
+from gaussian_swaying.mpm.boundaries.pinned_region import PinnedRegion
+from gaussian_swaying.mpm.protocol import Solver
+from gaussian_swaying.simulation.material import Material, MaterialRegion
+from gaussian_swaying.simulation.scene import Scene
+
+
+def with_parts(scene: Scene, cloud: GaussianCloud, material: Material, solver: Solver) -> tuple[Material, Solver]:
+    """Material and solver with what the parts of a scene add to them; both stay as they are if it has none.
+
+    Args:
+        scene: The scene, all in scene units.
+        cloud: Its Gaussians.
+        material: Its ``regions`` come after those of the parts, and win.
+        solver: Gets a pin for all parts that are held, which holds the nodes of the grid.
+
+    Returns:
+        Copies.
+    """
+    parts = scene.parts
+    if parts is None:
+        return material, solver
+    chosen = scene.select(cloud)
+    means, labels = cloud.means[chosen], parts.labels[chosen]
+    regions = [
+        MaterialRegion(PartRegion(part.name, means, labels == k), **{name: getattr(part, name) for name in NUMBERS})
+        for k, part in enumerate(parts.parts)
+        if part.has_material and bool((labels == k).any())
+    ]
+    held = parts.mask(role="held")[chosen]
+    if regions:
+        material = dataclasses.replace(material, regions=[*regions, *material.regions])
+    if bool(held.any()):
+        names = [part.name for k, part in enumerate(parts.parts) if part.role == "held" and bool((labels == k).any())]
+        pin = PinnedRegion(PartRegion(", ".join(names), means, held), "nodes")
+        solver = copy.copy(solver)
+        solver._modules = solver._modules | {"boundaries": nn.ModuleList([*solver.boundaries, pin])}  # of the copy
+    return material, solver

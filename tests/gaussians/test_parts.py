@@ -1,0 +1,98 @@
+"""Labels of a splat: the file, its refusals, and the region of a part."""
+
+import numpy as np
+import pytest
+import torch
+
+from gaussian_swaying.gaussians.parts import Part, PartRegion, Parts
+
+PARTS = [Part("pot", "still"), Part("soil", "held", E=2e6), Part("leaf", density=300.0, thickness=0.002, nu=0.4)]
+
+
+def test_the_file_keeps_labels_roles_and_materials(tmp_path):
+    parts = Parts([0, 2, 1, 2, 2], PARTS)
+    read = Parts.load(parts.save(tmp_path / "parts.npz"))
+    assert read.parts == parts.parts
+    assert torch.equal(read.labels, parts.labels)
+    assert np.load(tmp_path / "parts.npz")["labels"].dtype == np.uint8
+    assert read.mask("leaf").tolist() == [False, True, False, True, True]
+    assert read.mask(role="held").tolist() == [False, False, True, False, False]
+    assert repr(read) == "Parts(pot (still): 1, soil (held): 1, leaf (soft): 3)"
+
+
+def test_more_than_256_parts_take_two_bytes_each(tmp_path):
+    parts = Parts(torch.arange(300), [Part(f"leaf {k}") for k in range(300)])
+    path = parts.save(tmp_path / "parts.npz")
+    assert np.load(path)["labels"].dtype == np.uint16
+    assert torch.equal(Parts.load(path).labels, torch.arange(300))
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ((("a", "liquid"), {}), "role of the part 'a'"),
+        ((("a", "rigid"), {}), "rigid, which is not there yet"),
+        ((("", "soft"), {}), "has no name"),
+        ((("a", "still"), {"E": 1e5}), "still and has no material"),
+        ((("a",), {"density": -1.0}), "density of the part 'a'"),
+        ((("a",), {"nu": 0.5}), "nu of the part 'a'"),
+    ],
+)
+def test_a_part_that_makes_no_sense_is_refused(arguments, message):
+    with pytest.raises(ValueError, match=message):
+        Part(*arguments[0], **arguments[1])
+
+
+@pytest.mark.parametrize(
+    ("labels", "parts", "message"),
+    [
+        ([0, 3], PARTS, "labels from 0 to 2"),
+        ([-1, 0], PARTS, "labels from 0 to 2"),
+        ([0], [Part("a"), Part("a")], "the name 'a'"),
+        ([0], [], "Expected from 1 to"),
+    ],
+)
+def test_labels_that_do_not_fit_are_refused(labels, parts, message):
+    with pytest.raises(ValueError, match=message):
+        Parts(labels, parts)
+
+
+def test_an_unknown_part_is_refused():
+    with pytest.raises(ValueError, match="no part 'stem': use one of 'pot'"):
+        Parts([0], PARTS).mask("stem")
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"count": np.int64(4)}, "for 4 Gaussians, but has 3 labels"),
+        ({"labels": np.array([0.0, 1.0, 2.0])}, "array `labels` has a wrong shape or type"),
+        ({"labels": np.array([0, 1, 7])}, "labels from 0 to 2"),
+        ({"roles": np.array(["soft"])}, "array `roles`"),
+        ({"roles": np.array(["soft", "liquid", "soft"])}, "role of the part"),
+        ({"E": np.array([np.nan, -3.0, 1.0])}, "E of the part"),
+        ({"names": np.array([b"a", b"b", b"c"])}, "array `names`"),
+        ({"names": None}, "no array `names`"),
+    ],
+)
+def test_a_file_that_does_not_fit_together_is_refused(change, message, tmp_path):
+    path = Parts([0, 1, 2], PARTS).save(tmp_path / "parts.npz")
+    arrays = dict(np.load(path)) | change
+    np.savez(path, **{name: value for name, value in arrays.items() if value is not None})
+    with pytest.raises(ValueError, match=message) as error:
+        Parts.load(path)
+    assert str(path) in str(error.value)
+
+
+def test_a_missing_file_is_refused(tmp_path):
+    with pytest.raises(ValueError, match="does not exist"):
+        Parts.load(tmp_path / "none.npz")
+
+
+def test_the_region_of_a_part_is_what_is_nearest_to_it():
+    means = torch.tensor([[0.0, 0, 0], [1.0, 0, 0], [1.0, 0, 0]])
+    region = PartRegion("left", means, torch.tensor([True, False, True]))
+    assert region.contains(torch.tensor([[0.4, 0, 0], [0.6, 1, 0]]))[0]
+    assert region.contains(means).tolist() == [True, False, True]  # also where two are at one place
+    assert region.contains(torch.zeros(2, 3, 3)).shape == (2, 3)
+    assert repr(region) == "of the part 'left'"

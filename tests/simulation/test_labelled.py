@@ -1,0 +1,129 @@
+"""``scene.parts``: what is held and still stays, what is soft has its own material, and nothing tears."""
+
+import pytest
+import torch
+
+from gaussian_swaying.gaussians.parts import Part, Parts
+from gaussian_swaying.geometry.regions import Box
+from gaussian_swaying.mpm.solver import MPMSolver
+from gaussian_swaying.scenes.procedural import FlagScene, GivenScene
+from gaussian_swaying.simulation.edits import Edit
+from gaussian_swaying.simulation.material import Material, MaterialRegion
+from gaussian_swaying.simulation.scene import Scene
+from gaussian_swaying.simulation.simulation import Simulation
+
+CLOUD = FlagScene(spacing=0.04).generate()
+ROLES = [Part("wall", "still"), Part("pole", "held"), Part("cloth"), Part("hem", E=4e4, density=90.0, thickness=0.02)]
+
+
+def labels():
+    """Along the flag of 1.2 m: wall, pole, cloth, hem."""
+    return torch.bucketize(CLOUD.means[:, 0].contiguous(), torch.tensor([0.15, 0.35, 0.9]))
+
+
+def flag(parts=None, formulation="total", **settings):
+    scene = Scene(generator=GivenScene(CLOUD), parts=Parts(labels(), ROLES) if parts is None else parts)
+    settings.setdefault("material", Material(E=5e3, density=30.0, thickness=0.01))
+    solver = MPMSolver(dx=0.1, formulation=formulation, gravity=[0, 0, -9.8])
+    return Simulation(scene, solver=solver, wind=[2.0, 3.0, 0.0], device="cpu", **settings)
+
+
+@pytest.mark.parametrize("formulation", ["total", "updated"])
+def test_what_is_still_and_held_stays_and_the_rest_bends_there(formulation):
+    simulation = flag(formulation=formulation)
+    for frame in simulation.frames(9):
+        last = frame
+    moved = (last.gaussians.means - CLOUD.means).norm(dim=-1)
+    label = labels()
+    assert float(moved[label <= 1].max()) == 0.0
+    assert float(moved[label == 2].max()) > 0.05
+    assert float(moved[label == 3].min()) > 0.05
+    # neighbours of the pole bend instead of tearing off: no step from one column to the next
+    column = torch.unique((CLOUD.means[:, 0] / 0.02).round(), return_inverse=True)[1]
+    size = torch.stack([moved[column == k].amax() for k in range(int(column.max()) + 1)])
+    assert float(size.diff().abs().max()) < 1.5 * 0.04  # columns are 0.04 apart, and the flag falls by its weight
+    assert float(moved[(label == 2) & (CLOUD.means[:, 0] > 0.5)].min()) > 0.0  # what bends is next to it
+
+
+def test_the_held_part_is_in_the_simulation_and_the_still_one_is_not():
+    scene = flag().scene
+    label = labels()
+    assert set(label[scene.simulated].tolist()) == {1, 2, 3}
+    assert set(label[scene.moving].tolist()) == {2, 3}
+    alone = Simulation(Scene(generator=GivenScene(CLOUD.select(label > 0))), solver=MPMSolver(dx=0.1), device="cpu")
+    assert scene.points.count == pytest.approx(alone.scene.points.count, rel=0.2)
+
+
+def test_a_part_has_its_own_material_and_regions_win():
+    points = flag().scene.points
+    place = flag().scene.frame.point_to_scene(points.position)[:, 0]
+    x, label = CLOUD.means[:, 0], labels()
+    hem = place > 0.5 * (float(x[label == 2].max()) + float(x[label == 3].min()))
+    assert torch.equal(points.youngs_modulus, torch.where(hem, 4e4, 5e3))
+    assert torch.allclose(points.mass / points.volume, torch.where(hem, 90.0, 30.0))
+    assert float(points.volume[hem].mean()) == pytest.approx(2 * float(points.volume[~hem].mean()), rel=0.1)
+    end = MaterialRegion(Box([1.0, None, None], [None, None, None]), E=7e4)
+    points = flag(material=Material(E=5e3, density=30.0, regions=[end])).scene.points
+    assert set(points.youngs_modulus.tolist()) == {5e3, 4e4, 7e4}
+
+
+def test_one_soft_part_is_the_object_without_parts():
+    parts = Parts(torch.zeros(len(CLOUD.means)), [Part("all")])
+    hold = Box([None, None, None], [0.1, None, None])
+    one, other = (
+        Simulation(Scene(generator=GivenScene(CLOUD), parts=p), hold=hold, wind=[2.0, 3, 0], device="cpu")
+        for p in (parts, None)
+    )
+    assert torch.equal(list(one.frames(4))[-1].gaussians.means, list(other.frames(4))[-1].gaussians.means)
+
+
+def test_faint_gaussians_of_a_held_part_and_those_that_follow_it_stay():
+    cloud = FlagScene(spacing=0.04).generate()
+    cloud.opacities[::5] = -6.0
+    scene = Scene(generator=GivenScene(cloud), parts=Parts(labels(), ROLES))
+    simulation = Simulation(scene, solver=MPMSolver(dx=0.1), wind=[2.0, 3.0, 0.0], device="cpu")
+    last = list(simulation.frames(6))[-1]
+    moved = (last.gaussians.means - cloud.means).norm(dim=-1)
+    assert float(moved[labels() <= 1].max()) == 0.0
+    assert float(moved[labels() == 3].min()) > 0.0
+    dropped = Scene(generator=GivenScene(cloud), parts=Parts(labels(), ROLES), faint="drop")
+    simulation = Simulation(dropped, solver=MPMSolver(dx=0.1), wind=[2.0, 3.0, 0.0], device="cpu")
+    assert len(simulation.scene.model.means) == len(cloud.means) - int(((cloud.opacities < -5) & (labels() > 0)).sum())
+
+
+def test_edits_may_change_a_soft_part():
+    edit = Edit(Box([0.9, None, None], [None, None, None]), time=0.04, E=9e4)
+    last = list(flag(edits=[edit]).frames(4))[-1]
+    assert bool(torch.isfinite(last.gaussians.means).all())
+
+
+def test_parts_of_another_splat_are_refused():
+    with pytest.raises(ValueError, match="labels of 3 Gaussians, but the splat has 600"):
+        flag(Parts([0, 0, 0], [Part("all")]))
+
+
+def test_parts_that_leave_nothing_to_move_are_refused():
+    with pytest.raises(ValueError, match="Nothing is left to move"):
+        flag(Parts(labels(), [Part("a", "still"), Part("b", "held"), Part("c", "held"), Part("d", "still")]))
+
+
+def test_a_yaml_names_the_file_and_a_changed_one_is_not_resumed(tmp_path):
+    path = Parts(labels(), ROLES).save(tmp_path / "parts.npz")
+    config = tmp_path / "flag.yaml"
+    config.write_text(
+        f"""\
+frames: 4
+scene: {{generator: {{class_path: FlagScene, init_args: {{spacing: 0.04}}}}, parts: {path}}}
+solver: {{dx: 0.1}}
+wind: {{flow: [2.0, 3.0, 0.0]}}
+device: cpu
+recorder: {{images: false, video: false}}
+"""
+    )
+    run = tmp_path / "run"
+    simulation = Simulation.from_yaml(config)
+    assert simulation.scene.parts.parts == tuple(ROLES)
+    simulation.run(run, frames=2, progress=False)
+    Parts(labels().flip(0), ROLES).save(path)
+    with pytest.raises(ValueError, match=r"parts of the scene .* have changed"):
+        Simulation.from_yaml(config).run(run, frames=4, resume=True, progress=False)
