@@ -22,7 +22,7 @@ import os
 from collections.abc import Sequence
 from dataclasses import KW_ONLY, dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
@@ -86,7 +86,7 @@ class Part:
 
     @property
     def has_material(self) -> bool:
-        """Whether any of its numbers differs from that of the object."""
+        """True if any of its numbers differs from that of the object."""
         return any(getattr(self, name) is not None for name in NUMBERS)
 
 
@@ -159,7 +159,7 @@ class Parts:
     def save(self, path: str | os.PathLike[str]) -> Path:
         """Write the file; returns its path."""
         small = np.uint8 if len(self.parts) <= 1 << 8 else np.uint16
-        numbers = {
+        numbers: dict[str, Any] = {
             name: np.array([math.nan if getattr(p, name) is None else getattr(p, name) for p in self.parts], np.float64)
             for name in NUMBERS
         }

@@ -1,5 +1,9 @@
 """``scene.parts``: what is held and still stays, what is soft has its own material, and nothing tears."""
 
+import re
+from pathlib import Path
+
+import numpy as np
 import pytest
 import torch
 
@@ -127,3 +131,18 @@ recorder: {{images: false, video: false}}
     Parts(labels().flip(0), ROLES).save(path)
     with pytest.raises(ValueError, match=r"parts of the scene .* have changed"):
         Simulation.from_yaml(config).run(run, frames=4, resume=True, progress=False)
+
+
+def test_the_example_of_the_page_runs(tmp_path, monkeypatch):
+    page = (Path(__file__).parents[2] / "docs/parts.md").read_text(encoding="utf-8")
+    monkeypatch.chdir(tmp_path)
+    names: dict = {}
+    exec(compile(page.split("```python\n")[1].split("```")[0], "parts.md", "exec"), names)
+    assert len(list(names["simulation"].frames(2))) == 2
+    arrays = np.load(tmp_path / "parts.npz")
+    documented = {
+        name
+        for row in re.findall(r"^\| (`.*?) \| \w+.*?\(", page, re.MULTILINE)
+        for name in re.findall(r"`(\w+)`", row)
+    }
+    assert documented == set(arrays)
