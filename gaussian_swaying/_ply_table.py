@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import re
 import warnings
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -121,6 +122,25 @@ def read_element(path: str | os.PathLike[str], header: PlyHeader, name: str) -> 
     Raises:
         ValueError: If there is no such element, or if it or one before it contains lists.
     """
+    kinds, count, start = layout(path, header, name)
+    if count == 0:
+        return np.zeros(0, dtype=kinds)
+    return np.fromfile(path, dtype=kinds, count=count, offset=start)
+
+
+def element_parts(
+    path: str | os.PathLike[str], header: PlyHeader, name: str, rows: int = 1 << 16
+) -> Iterator[np.ndarray]:
+    """The same in parts of so many rows, one after the other; a large file is then never in memory as a whole."""
+    kinds, count, start = layout(path, header, name)
+    with Path(path).open("rb") as stream:
+        stream.seek(start)
+        for first in range(0, count, rows):
+            yield np.fromfile(stream, dtype=kinds, count=min(rows, count - first))
+
+
+def layout(path: str | os.PathLike[str], header: PlyHeader, name: str) -> tuple[np.dtype, int, int]:
+    """Type of a row of an element, number of rows, and offset in the file [bytes]."""
     start = header.start
     for element in header.elements:
         if element.lists:
@@ -130,9 +150,7 @@ def read_element(path: str | os.PathLike[str], header: PlyHeader, name: str) -> 
             )
         if element.name == name:
             kinds = np.dtype([(field, f"{header.order}{kind}") for field, kind in element.fields])
-            if element.count == 0 or kinds.itemsize == 0:
-                return np.zeros(element.count if kinds.itemsize else 0, dtype=kinds)
-            return np.fromfile(path, dtype=kinds, count=element.count, offset=start)
+            return kinds, element.count if kinds.itemsize else 0, start
         start += element.count * element.row
     found = ", ".join(element.name for element in header.elements) or "none"
     raise ValueError(f"{path} has no element `{name}` (elements: {found}); export it from a 3DGS tool.")

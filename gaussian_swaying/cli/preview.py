@@ -19,6 +19,7 @@ from gaussian_swaying.cli.errors import guessing, parser_sentence, run_command
 from gaussian_swaying.cli.shipped import with_shipped
 from gaussian_swaying.config.material_names import NAMES
 from gaussian_swaying.config.parser import parse_text
+from gaussian_swaying.gaussians.cloud import GaussianCloud
 from gaussian_swaying.gaussians.formats import read_gaussians
 from gaussian_swaying.preview.calibration import (
     SWAY,
@@ -31,14 +32,18 @@ from gaussian_swaying.preview.cost import (
     estimate_cost,
     finest_within,
     scaled_seconds,
+    with_whole,
 )
 from gaussian_swaying.preview.photos import captured_from
-from gaussian_swaying.preview.picture import preview_picture
+from gaussian_swaying.preview.picture import preview_picture, things_picture
+from gaussian_swaying.preview.place import Place, excerpt, survey
 from gaussian_swaying.preview.report import (
     area_line,
     cost_dict,
     cost_lines,
     doubts,
+    place_dict,
+    place_lines,
     quality_lines,
     run_dict,
     run_lines,
@@ -61,6 +66,7 @@ from gaussian_swaying.preview.suggest import (
 from gaussian_swaying.simulation.progress import duration
 from gaussian_swaying.simulation.simulation import Simulation
 
+LARGE = 1 << 28  # bytes of a file of which only the constant colours are read
 LOADED = time.process_time()  # s; for the interpreter and the imports so far, which a run needs too
 
 
@@ -88,6 +94,7 @@ def build_options() -> argparse.ArgumentParser:
     add("--up", nargs="+", metavar="UP", help="+x, -x, ... -z or 3 numbers, instead of a guess")
     add("--hold", metavar="END", help="end that is held: top, bottom, none, +x, -x, ... or -z, instead of a guess")
     add("--region", nargs=6, type=float, metavar="V", help="box to simulate: lower and upper corner [scene units]")
+    add("--move", metavar="N[,M]", help="things of a place that move, by their numbers; default: the likeliest one")
     add("--longest-side", type=float, default=1.0, metavar="M", help="length of the longest side of the object [m]")
     add("--wind", type=float, default=6.0, metavar="M/S", help="speed of the wind in the configuration [m/s]")
     add(
@@ -121,27 +128,41 @@ def preview_scene(options: argparse.Namespace, folder: Path) -> Preview:
         FileNotFoundError: If there is no such splat.
     """
     check_sway(options.sway)
-    cloud = read_gaussians(Path(options.scene).resolve())  # as in the YAML, so that it warns once
+    path = Path(options.scene).resolve()  # as in the YAML, so that it warns once
+    reading = Stopwatch()
+    cloud = read_gaussians(path, 0 if path.is_file() and path.stat().st_size > LARGE else None)
+    read = reading.quiet
     up = None if options.up is None else _up(options.up)
     region = None if options.region is None else (options.region[:3], options.region[3:])
     capture = None if options.capture is None else captured_from(options.capture)
     quality = options.quality or "normal"
-    suggestion = suggest(cloud, up, options.hold, region, options.longest_side, options.wind, capture, quality)
+    place = survey(cloud, up) if region is None and capture is None else None
+    chosen = _numbers(options.move, place)
+    part, found = cloud, None
+    if place is not None:
+        part, *guesses = excerpt(place, cloud, chosen)
+        found = (guesses[0], guesses[1])
+    suggestion = suggest(part, up, options.hold, region, options.longest_side, options.wind, capture, quality, found)
     if options.material is not None:
         suggestion = of_material(suggestion, options.material)
     begin = Stopwatch()
-    draft, settings = _pipeline(["--device", options.device], draft_yaml(suggestion, options.scene))
-    startup = LOADED + begin.quiet
+    draft, settings = _pipeline(["--device", options.device], draft_yaml(suggestion, options.scene), part)
+    startup = LOADED + read + begin.quiet
     if settings.scene.ply != str(Path(options.scene).resolve()):
         raise ValueError(f"The path {options.scene!r} has another meaning in YAML: rename the file, without a colon.")
     suggestion = calibrated_suggestion(suggestion, draft, options.sway)
-    costs = {"draft": estimate_cost(draft, settings.frames, startup, suggestion.growth)}
+
+    def cost_of(simulation: Simulation, frames: int) -> Cost:
+        cost = estimate_cost(simulation, frames, startup, suggestion.growth)
+        return cost if part is cloud else with_whole(cost, simulation, cloud)
+
+    costs = {"draft": cost_of(draft, settings.frames)}
     made: dict[float, Simulation] = {}  # the starter with several grids
 
     def measure(dx: float) -> Cost:
         text = starter_yaml(replace(suggestion, dx=dx), options.scene, options.frames)
-        made[dx] = _pipeline(["--device", options.device], text)[0]
-        return estimate_cost(made[dx], options.frames, startup, suggestion.growth)
+        made[dx] = _pipeline(["--device", options.device], text, part)[0]
+        return cost_of(made[dx], options.frames)
 
     costs["starter"] = measure(suggestion.dx)
     grids = {name: at_quality(suggestion, name).dx for name in QUALITIES}
@@ -169,7 +190,13 @@ def preview_scene(options: argparse.Namespace, folder: Path) -> Preview:
         "draft_cost": cost_dict(costs["draft"]),
         "qualities": {name: {"dx_m": grids[name], "total_seconds": time} for name, time in others.items()},
     }
-    report = [*splat_lines(options.scene, cloud, data), *suggestion_lines(suggestion, simulation.scene.further)]
+    report = splat_lines(options.scene, cloud, data)
+    things = None
+    if place is not None:
+        data["place"] = place_dict(place, chosen)
+        report += place_lines(place, chosen)
+        things = things_picture(cloud, place, chosen, simulation.device)
+    report += [*suggestion_lines(suggestion, simulation.scene.further)]
     report.append(area_line(data["run"]))
     if simulation.scene.loose:
         specks = f"{simulation.scene.loose:,} specks hang on nothing or by a thread"
@@ -186,7 +213,8 @@ def preview_scene(options: argparse.Namespace, folder: Path) -> Preview:
         pictures = f"{video_length(texts[name])}, {duration(costs[name].total_seconds)} here"
         report.append(f"{what} ({pictures}):")
         report.append(f"  {shlex.join(program.words('sim'))} --config {folder / name}.yaml --output {where}")
-    return Preview("\n".join(report), data, preview_picture(simulation, options.height, whole=suggestion.whole), texts)
+    picture = preview_picture(simulation, options.height, whole=suggestion.whole)
+    return Preview("\n".join(report), data, picture, texts, things)
 
 
 def preview_config(options: argparse.Namespace) -> Preview:
@@ -225,8 +253,22 @@ def preview_config(options: argparse.Namespace) -> Preview:
     return Preview("\n".join(report), data, preview_picture(simulation, options.height), {})
 
 
-def _pipeline(arguments: list[str], text: str | None = None) -> tuple[Simulation, Any]:
-    """The simulation of a configuration, given by options or as text, and its settings."""
+def _numbers(move: str | None, place: Place | None) -> list[int]:
+    """The things of a place that move."""
+    if move is None:
+        return [1]
+    if place is None:
+        raise ValueError("`--move` chooses things of a place, and this splat is one object: leave it out.")
+    try:
+        return [int(number) for number in move.split(",")]
+    except ValueError:
+        raise ValueError(f"Expected `--move` to be numbers of things, such as 1 or 1,3, but got {move!r}.") from None
+
+
+def _pipeline(
+    arguments: list[str], text: str | None = None, cloud: GaussianCloud | None = None
+) -> tuple[Simulation, Any]:
+    """The simulation of a configuration, given by options or as text, and its settings; of some Gaussians of it."""
     parser = Simulation.parser()
     check_config_files(arguments)
     try:
@@ -234,7 +276,7 @@ def _pipeline(arguments: list[str], text: str | None = None) -> tuple[Simulation
             settings = parser.parse_args(arguments) if text is None else parse_text(parser, text, arguments)
     except ArgumentError as error:
         raise ValueError(parser_sentence(str(error), arguments)) from error
-    return Simulation.from_settings(parser, settings), settings
+    return Simulation.from_settings(parser, settings, **({} if cloud is None else {"cloud": cloud})), settings
 
 
 def _up(values: Sequence[str]) -> list[float] | str:

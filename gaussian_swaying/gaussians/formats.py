@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 from gaussian_swaying._ply_table import read_header
@@ -15,9 +16,9 @@ from gaussian_swaying.gaussians.sog import read_sog
 from gaussian_swaying.gaussians.spz import read_spz
 
 
-def _read_any_ply(path: Path) -> GaussianCloud:
+def _read_any_ply(path: Path, sh_degree: int | None = None) -> GaussianCloud:
     fields = {name for element in read_header(path).elements for name, _ in element.fields}
-    return read_compressed_ply(path) if "packed_position" in fields else read_ply(path)
+    return read_compressed_ply(path) if "packed_position" in fields else read_ply(path, sh_degree)
 
 
 READERS: dict[str, Callable[[Path], GaussianCloud]] = {
@@ -34,7 +35,7 @@ READABLE = "3DGS or compressed .ply, .splat, .spz, SOG (.sog, meta.json or lod-m
 """The same, in words."""
 
 
-def read_gaussians(path: str | os.PathLike[str]) -> GaussianCloud:
+def read_gaussians(path: str | os.PathLike[str], sh_degree: int | None = None) -> GaussianCloud:
     """Read a splat in any supported format: 3DGS .ply, compressed .ply, .splat, .spz, SOG or glTF.
 
     The ending of the name chooses the format; a file with any other ending is read as a .ply. The content tells whether
@@ -42,6 +43,7 @@ def read_gaussians(path: str | os.PathLike[str]) -> GaussianCloud:
 
     Args:
         path: File to read.
+        sh_degree: Largest degree of spherical harmonics that is kept; None for all. A large .ply takes less memory so.
 
     Returns:
         The Gaussians as float32 tensors on the CPU.
@@ -52,4 +54,8 @@ def read_gaussians(path: str | os.PathLike[str]) -> GaussianCloud:
         ImportError: If a package is missing that the format needs; the message says how to install it.
     """
     path = Path(path)
-    return READERS.get(path.suffix.lower(), _read_any_ply)(path)
+    reader = READERS.get(path.suffix.lower(), _read_any_ply)
+    cloud = _read_any_ply(path, sh_degree) if reader is _read_any_ply else reader(path)
+    if sh_degree is not None and cloud.sh_degree > sh_degree:
+        cloud = replace(cloud, sh=cloud.sh[:, : (sh_degree + 1) ** 2].clone())
+    return cloud

@@ -62,17 +62,18 @@ class GaussianSurfaceModel(nn.Module):
     logarithms, ``opacities`` (N,) as logits, ``sh0`` (N, 1, 3) and ``shN`` (N, K - 1, 3).
 
     Args:
-        cloud: Gaussians to start from; their tensors are copied.
+        cloud: Gaussians to start from.
         requires_grad: Whether the parameters are trained.
+        copy: Whether the tensors of the cloud are copied; else they are shared.
     """
 
     reference_normals: Tensor | None
 
-    def __init__(self, cloud: GaussianCloud, requires_grad: bool = True) -> None:
+    def __init__(self, cloud: GaussianCloud, requires_grad: bool = True, copy: bool = True) -> None:
         super().__init__()
 
         def parameter(tensor: Tensor) -> nn.Parameter:
-            return nn.Parameter(tensor.detach().clone(), requires_grad=requires_grad)
+            return nn.Parameter(tensor.detach().clone() if copy else tensor.detach(), requires_grad=requires_grad)
 
         self.means = parameter(cloud.means)
         self.quats = parameter(cloud.quats)
@@ -83,9 +84,9 @@ class GaussianSurfaceModel(nn.Module):
         self.register_buffer("reference_normals", None if cloud.normals is None else cloud.normals.detach().clone())
 
     @classmethod
-    def from_cloud(cls, cloud: GaussianCloud, requires_grad: bool = True) -> GaussianSurfaceModel:
+    def from_cloud(cls, cloud: GaussianCloud, requires_grad: bool = True, copy: bool = True) -> GaussianSurfaceModel:
         """The model of given Gaussians."""
-        return cls(cloud, requires_grad)
+        return cls(cloud, requires_grad, copy)
 
     @classmethod
     def from_ply(cls, path: str | os.PathLike[str], requires_grad: bool = True) -> GaussianSurfaceModel:

@@ -12,7 +12,7 @@ import torch
 from einops import rearrange
 
 from gaussian_swaying._files import atomic
-from gaussian_swaying._ply_table import PlyHeader, read_element, read_header
+from gaussian_swaying._ply_table import PlyHeader, element_parts, layout, read_header
 from gaussian_swaying.gaussians.cloud import GaussianCloud
 from gaussian_swaying.geometry.patches import smallest_axis_normal
 
@@ -27,8 +27,8 @@ FARTHEST = 1e12
 OPAQUE_LOGIT = 16.0  # of an opacity of 1: its sigmoid is 1 - 1.1e-7, the largest opacity below 1 in float32
 
 
-def read_ply(path: str | os.PathLike[str]) -> GaussianCloud:
-    """Read a binary 3D Gaussian Splatting .ply file.
+def read_ply(path: str | os.PathLike[str], sh_degree: int | None = None) -> GaussianCloud:
+    """Read a binary 3D Gaussian Splatting .ply file, in parts: it is never in memory twice.
 
     The layout is that of Kerbl et al. 2023 ("3D Gaussian Splatting for Real-Time Radiance Field Rendering"). Properties
     may be in any order, in either byte order, with or without normals, and with spherical harmonics of degree 0 to 3.
@@ -37,6 +37,7 @@ def read_ply(path: str | os.PathLike[str]) -> GaussianCloud:
 
     Args:
         path: File to read.
+        sh_degree: Largest degree of spherical harmonics that is kept; None for all.
 
     Returns:
         The Gaussians as float32 tensors on the CPU.
@@ -49,8 +50,9 @@ def read_ply(path: str | os.PathLike[str]) -> GaussianCloud:
         UserWarning: Once, naming the properties that were ignored.
     """
     path = Path(path)
-    data = read_element(path, read_binary_header(path), "vertex")
-    names = data.dtype.names or ()
+    header = read_binary_header(path)
+    kinds, count, _ = layout(path, header, "vertex")
+    names = kinds.names or ()
     if "packed_position" in names:
         raise ValueError(
             f"{path} is a compressed .ply; read it with `read_gaussians`, or export it as an uncompressed 3DGS .ply."
@@ -64,35 +66,45 @@ def read_ply(path: str | os.PathLike[str]) -> GaussianCloud:
     ignored = [name for name in names if name not in known]
     if ignored:
         warnings.warn(f"{path}: ignored the properties {', '.join(ignored)}.", UserWarning, stacklevel=2)
-    if len(data) == 0:
+    if count == 0:
         raise ValueError(f"{path} holds zero Gaussians (element vertex 0); export the scene again.")
-
-    def columns(fields: tuple[str, ...]) -> np.ndarray:
-        table = np.empty((len(data), len(fields)), dtype=np.float32)
-        for index, field in enumerate(fields):
-            with np.errstate(over="ignore"):
-                table[:, index] = data[field]
-        for index, field in enumerate(fields):
-            bad = ~np.isfinite(table[:, index])
+    per_channel = len(rest) // 3
+    kept = per_channel if sh_degree is None else min(per_channel, (sh_degree + 1) ** 2 - 1)
+    places: dict[str, tuple[str, tuple[int, ...]]] = {"opacity": ("opacities", (0,))}
+    for table, fields in (("means", _MEANS), ("quats", _QUATS), ("scales", _SCALES), ("normals", _NORMALS)):
+        if table != "normals" or has_normals:
+            places |= {field: (table, (k,)) for k, field in enumerate(fields)}
+    places |= {field: ("sh", (0, k)) for k, field in enumerate(_DC)}
+    for channel in range(3):
+        for k in range(kept):
+            places[rest[channel * per_channel + k]] = ("sh", (1 + k, channel))
+    widths = {"opacities": (1,), "means": (3,), "quats": (4,), "scales": (3,), "sh": (1 + kept, 3), "normals": (3,)}
+    tables = {
+        table: np.empty((count, *widths[table]), dtype=np.float32)
+        for table in dict.fromkeys(t for t, _ in places.values())
+    }
+    first = 0
+    with np.errstate(over="ignore"):
+        for part in element_parts(path, header, "vertex"):
+            for field, (table, place) in places.items():
+                tables[table][(slice(first, first + len(part)), *place)] = part[field]
+            first += len(part)
+    opacities = _finite_opacities(path, tables["opacities"][:, 0])
+    for field, (table, place) in places.items():
+        if table != "opacities":
+            bad = ~np.isfinite(tables[table][(slice(None), *place)])
             reject(path, bad, f"property `{field}` is NaN or infinite", "remove them or train again")
-        return table
-
-    opacities = _read_opacities(path, data)
-    means, quats, scales = columns(_MEANS), columns(_QUATS), columns(_SCALES)
-    check_places(path, means)
-    check_sizes_and_rotations(path, scales, quats)
-    sh = columns(_DC)[:, None, :]
-    if rest:
-        sh = np.concatenate([sh, rearrange(columns(rest), "n (c k) -> n k c", c=3)], axis=1)
-    normals = columns(_NORMALS) if has_normals else None
+    check_places(path, tables["means"])
+    check_sizes_and_rotations(path, tables["scales"], tables["quats"])
+    normals = tables.get("normals")
     if normals is not None and not normals.any():
         normals = None
     return GaussianCloud(
-        means=torch.from_numpy(means),
-        quats=torch.from_numpy(quats),
-        scales=torch.from_numpy(scales),
+        means=torch.from_numpy(tables["means"]),
+        quats=torch.from_numpy(tables["quats"]),
+        scales=torch.from_numpy(tables["scales"]),
         opacities=torch.from_numpy(opacities),
-        sh=torch.from_numpy(np.ascontiguousarray(sh)),
+        sh=torch.from_numpy(tables["sh"]),
         normals=None if normals is None else torch.from_numpy(normals),
     )
 
@@ -179,14 +191,12 @@ def _rest_names(path: Path, names: tuple[str, ...]) -> tuple[str, ...]:
     return rest
 
 
-def _read_opacities(path: Path, data: np.ndarray) -> np.ndarray:
+def _finite_opacities(path: Path, logits: np.ndarray) -> np.ndarray:
     """Opacity logits (N,); infinite ones, for opacities of exactly 0 or 1, are made finite."""
-    with np.errstate(over="ignore"):
-        logits = np.array(data["opacity"], dtype=np.float32)
     reject(path, np.isnan(logits), "property `opacity` is NaN", "remove them or train again")
     infinite = np.isinf(logits)
     logits[infinite] = np.copysign(np.float32(OPAQUE_LOGIT), logits[infinite])
-    return logits
+    return np.ascontiguousarray(logits)
 
 
 def reject(path: Path, bad: np.ndarray, what: str, remedy: str) -> None:

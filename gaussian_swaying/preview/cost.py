@@ -6,12 +6,15 @@ import math
 import statistics
 import time
 from collections.abc import Callable, Collection
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
 
 from gaussian_swaying._provenance import cores, describe_device
+from gaussian_swaying.gaussians.cloud import GaussianCloud
+from gaussian_swaying.gaussians.harmonics import SH_DC
+from gaussian_swaying.geometry.covariances import covariance
 from gaussian_swaying.kernels.cpu import compiled
 from gaussian_swaying.mpm.state import State
 from gaussian_swaying.mpm.timestep import wave_speed
@@ -188,6 +191,37 @@ def _picture_seconds(simulation: Simulation, state: State, frame: float) -> floa
     write = count * min(_seconds(simulation, lambda: _encode(image)) for _ in range(2))
     free = cores()
     return draw + write if free <= 2 else max(draw, write / min(WORKERS, free - 1) - frame)
+
+
+@torch.inference_mode()
+def with_whole(cost: Cost, simulation: Simulation, cloud: GaussianCloud) -> Cost:
+    """The cost of a run that draws all Gaussians of a place, from its cost with those around what moves.
+
+    A picture of every third one tells how its time grows with their number; all at once would take more memory.
+
+    Args:
+        cost: The cost with some.
+        simulation: The run with some.
+        cloud: All Gaussians.
+    """
+    if cost.picture_seconds is None:
+        return cost
+    painter = simulation.painter
+    count = (1 + len(painter.cameras)) * len(simulation.recorder.renders)
+    camera, device = painter.camera_at(0), simulation.device
+    third = cloud.select(torch.arange(0, len(cloud), 3)).to(device)
+    shape, opacity = covariance(third.quats, third.scales), third.opacities.sigmoid()
+    colours = 0.5 + SH_DC * third.sh[:, 0]
+    some, model = painter.scene.rest(), painter.scene.model
+    few, own = model.opacity(), model.colors(some.means)
+
+    def seconds(*given: Tensor) -> float:
+        return min(_seconds(simulation, lambda: painter.renderer(*given, camera, painter.background)) for _ in range(2))
+
+    drawn = seconds(some.means, some.covariances, few, own), seconds(third.means, shape, opacity, colours)
+    numbers = len(some.means), len(third)
+    each = max(drawn[1] - drawn[0], 0.0) / max(numbers[1] - numbers[0], 1)
+    return replace(cost, picture_seconds=cost.picture_seconds + count * each * (len(cloud) - numbers[0]))
 
 
 def scaled_seconds(cost: Cost, other: Cost, dx: float) -> float:

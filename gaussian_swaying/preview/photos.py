@@ -14,7 +14,7 @@ from torch import Tensor
 from gaussian_swaying.captures.capture import common_focus, view_reach
 from gaussian_swaying.captures.capture_camera import read_views
 from gaussian_swaying.geometry.regions import Cylinder
-from gaussian_swaying.preview.shape import DIRECTIONS, FEWEST, bounds, plane_axes, quantile, rounded
+from gaussian_swaying.preview.shape import DIRECTIONS, FEWEST, bounds, largest_plane, plane_axes, quantile, rounded
 from gaussian_swaying.rendering.cameras.camera import Camera
 
 SEEN = 0.6  # share of the photos in which the object lies
@@ -222,7 +222,7 @@ def backdrops(points: Tensor, weight: Tensor, eyes: Tensor, reach: float, cell: 
     tried = torch.zeros_like(left)
     found: list[Backdrop] = []
     for _ in range(_MOST_PLANES):
-        plane = _largest_plane(where, weight, left & ~tried, half)
+        plane = largest_plane(where[left & ~tried], weight[left & ~tried], half)
         if plane is None:
             break
         normal, offset = plane
@@ -294,31 +294,3 @@ def shown_object(points: Tensor, opacity: Tensor, weight: Tensor, view: Captured
 
 def _wide(values: Tensor) -> float:
     return quantile(values, 0.95) - quantile(values, 0.05)
-
-
-def _largest_plane(points: Tensor, weight: Tensor, mask: Tensor, half: float) -> tuple[Tensor, float] | None:
-    """Normal and offset of the plane with the most weight within ``half`` of it; None for too few points."""
-    index = mask.nonzero()[:, 0]
-    if len(index) < FEWEST:
-        return None
-    index = index[:: max(1, len(index) // 4000)]
-    where, own = points[index], weight[index]
-    draw = torch.Generator().manual_seed(0)
-    corners = where[torch.multinomial(own + 1e-12 * own.sum() + 1e-300, 3 * 400, True, generator=draw)].reshape(
-        -1, 3, 3
-    )
-    normals = torch.linalg.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    length = normals.norm(dim=-1, keepdim=True)
-    normals = normals / length.clamp(min=1e-30)
-    offsets = (normals * corners[:, 0]).sum(-1)
-    inside = (where @ normals.T - offsets).abs() <= half
-    score = torch.where(length[:, 0] > 1e-12, (inside * own[:, None]).sum(0), 0.0)
-    normal, offset = normals[int(score.argmax())], float(offsets[int(score.argmax())])
-    for _ in range(3):
-        near = (where @ normal - offset).abs() <= half
-        share = own[near] / own[near].sum()
-        middle = (where[near] * share[:, None]).sum(0)
-        away = where[near] - middle
-        normal = torch.linalg.eigh((away * share[:, None]).T @ away)[1][:, 0]
-        offset = float(middle @ normal)
-    return normal, offset

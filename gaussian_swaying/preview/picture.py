@@ -12,12 +12,17 @@ import torch
 from torch import Tensor
 
 from gaussian_swaying.gaussians.area import patch_area
+from gaussian_swaying.gaussians.cloud import GaussianCloud
+from gaussian_swaying.gaussians.harmonics import SH_DC
+from gaussian_swaying.geometry.covariances import covariance
 from gaussian_swaying.geometry.regions import Box, Region
 from gaussian_swaying.mpm.boundaries.boundary import Boundary
 from gaussian_swaying.preview.framing import SOLID, nearby, whole_box
+from gaussian_swaying.preview.place import Place
 from gaussian_swaying.preview.ticks import draw_ticks
 from gaussian_swaying.preview.up import floor_mask, wind_words
 from gaussian_swaying.rendering.cameras.camera import Camera, orbit_camera, project
+from gaussian_swaying.rendering.gsplat_renderer import make_renderer
 from gaussian_swaying.simulation.simulation import Simulation
 
 if TYPE_CHECKING:
@@ -30,6 +35,8 @@ REGION = (30, 110, 220)
 WIND = (0, 140, 110)
 NORMAL = (250, 200, 40)
 UP = (40, 40, 40)
+THING = 300  # width and height of the picture of a thing [pixels]
+MOST_DRAWN = 200_000  # Gaussians of it
 
 
 @dataclass(frozen=True)
@@ -144,6 +151,53 @@ def preview_picture(
     draw = ImageDraw.Draw(page)
     font = ImageFont.load_default(size=14)
     _legend(draw, font, parts, simulation, height, 2 * height)
+    return np.asarray(page)
+
+
+@torch.no_grad()
+def things_picture(cloud: GaussianCloud, place: Place, chosen: Sequence[int], device: torch.device) -> np.ndarray:
+    """The things of a place, each with its number, on what is around it in grey.
+
+    Args:
+        cloud: The splat.
+        place: Its parts.
+        chosen: Numbers of those that will move; they have a frame.
+        device: Where to draw.
+
+    Returns:
+        8-bit RGB, shape (H, W, 3), up to four in a row.
+    """
+    from PIL import Image, ImageDraw, ImageFont
+
+    renderer, up = make_renderer(device), torch.tensor(place.up.direction, dtype=torch.float64)
+    across = min(4, len(place.things))
+    page = Image.new("RGB", (across * THING, -(-len(place.things) // across) * THING), (255, 255, 255))
+    font = ImageFont.load_default(size=18)
+    for k, thing in enumerate(place.things):
+        mine = torch.zeros(len(cloud), dtype=torch.bool)
+        mine[thing.members] = True
+        low, high = (torch.tensor(corner, dtype=torch.float64) for corner in (thing.low, thing.high))
+        margin = 0.3 * float((high - low).amax())
+        shown = ((cloud.means >= (low - margin).float()) & (cloud.means <= (high + margin).float())).all(-1)
+        shown &= ~place.far
+        index = shown.nonzero()[:, 0]
+        index = index[:: max(1, len(index) // MOST_DRAWN)]
+        part = cloud.select(index).to(device)
+        camera = orbit_camera(
+            (0.5 * (low + high)).tolist(), up, 1.5 * float((high - low).norm()), 30.0, 20.0, 40.0, THING, THING
+        ).to(device)
+        colours = (0.5 + SH_DC * part.sh[:, 0]).clamp(0, 1)
+        grey = 0.55 + 0.35 * colours.mean(-1, keepdim=True).expand_as(colours)
+        colours = torch.where(mine[index].to(device)[:, None], colours, grey)
+        plain = torch.full((3,), 0.96, device=device)
+        shape = covariance(part.quats, part.scales)
+        image = renderer(part.means, shape, part.opacities.sigmoid(), colours, camera, plain).color
+        picture = Image.fromarray((image.clamp(0, 1) * 255 + 0.5).to(torch.uint8).cpu().numpy())
+        draw = ImageDraw.Draw(picture)
+        if k + 1 in chosen:
+            draw.rectangle((1, 1, THING - 2, THING - 2), outline=REGION, width=3)
+        draw.text((10, 6), f"{k + 1}" + ("  moves" if k + 1 in chosen else ""), fill=UP, font=font)
+        page.paste(picture, (k % across * THING, k // across * THING))
     return np.asarray(page)
 
 

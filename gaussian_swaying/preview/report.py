@@ -14,6 +14,7 @@ from gaussian_swaying.gaussians.cloud import GaussianCloud
 from gaussian_swaying.gaussians.ply import OPAQUE_LOGIT
 from gaussian_swaying.preview.cost import Cost
 from gaussian_swaying.preview.picture import classify, conditions, mean_flow
+from gaussian_swaying.preview.place import Place
 from gaussian_swaying.preview.starter import region_dict
 from gaussian_swaying.preview.suggest import MOST_CELLS, Suggestion, finest_spacing
 from gaussian_swaying.preview.up import wind_words
@@ -41,6 +42,33 @@ def splat_lines(name: str, cloud: GaussianCloud, data: dict[str, Any]) -> list[s
         f"    S1 / side   {_numbers(own['size_share'])}   (of the longest side; haze is above 0.1)",
         *([note] if infinite else []),
     ]
+
+
+def place_lines(place: Place, chosen: Sequence[int]) -> list[str]:
+    """The parts of a capture of a place, and how other things are chosen."""
+    lines = [
+        "",
+        "a place: what stands on its ground may move, the likeliest first (things.png shows them)",
+        f"  ground          {int(place.up.ground.sum()):,} Gaussians; they stay, and so does what is not chosen",
+        f"  background      {int(place.far.sum()):,} far away, such as haze and sky",
+    ]
+    for number, thing in enumerate(place.things, start=1):
+        why = ", ".join(f"{reason} (+{value:g})" for reason, value in thing.reasons.items())
+        mark = "moves" if number in chosen else "     "
+        size = " x ".join(f"{side:.3g}" for side in thing.size)
+        lines.append(f"  {number} {mark}         {len(thing.members):,} Gaussians, {size} scene units; {why}")
+    lines.append("  other things: --move 2, or several as one object: --move 1,2")
+    return lines
+
+
+def place_dict(place: Place, chosen: Sequence[int]) -> dict[str, Any]:
+    """The same as plain numbers."""
+    things = [
+        {"gaussians": len(t.members), "min": t.low, "max": t.high, "score": t.score, "reasons": t.reasons}
+        for t in place.things
+    ]
+    ground, far = int(place.up.ground.sum()), int(place.far.sum())
+    return {"ground": ground, "background": far, "things": things, "moves": list(chosen)}
 
 
 def suggestion_lines(guess: Suggestion, further: int) -> list[str]:

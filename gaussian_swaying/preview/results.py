@@ -19,12 +19,14 @@ class Preview:
         data: The same as plain numbers, for preview.json.
         picture: 8-bit RGB, shape (H, W, 3).
         configurations: Their names and YAML, ``draft`` and ``starter``; none with ``--config``.
+        things: What may move in a capture of a place, 8-bit RGB, shape (H, W, 3); None for an object.
     """
 
     report: str
     data: dict[str, Any]
     picture: np.ndarray
     configurations: dict[str, str]
+    things: np.ndarray | None = None
 
 
 def splat_name(path: str | Path) -> str:
@@ -41,7 +43,7 @@ def splat_name(path: str | Path) -> str:
 
 
 def write(preview: Preview, folder: Path) -> list[Path]:
-    """Write preview.json, preview.png and, if there are suggestions, draft.yaml and starter.yaml.
+    """Write preview.json, preview.png and, where there are suggestions, things.png, draft.yaml and starter.yaml.
 
     An existing configuration that differs is kept as ``starter.1.yaml``, ``starter.2.yaml``, ..., since it may have
     been edited.
@@ -55,6 +57,9 @@ def write(preview: Preview, folder: Path) -> list[Path]:
     files = [folder / "preview.json", folder / "preview.png"]
     files[0].write_text(json.dumps(preview.data, indent=1) + "\n", encoding="utf-8")
     iio.imwrite(files[1], preview.picture)
+    if preview.things is not None:
+        files.append(folder / "things.png")
+        iio.imwrite(files[-1], preview.things)
     for name, text in preview.configurations.items():
         path = folder / f"{name}.yaml"
         if path.exists() and path.read_text(encoding="utf-8") != text:

@@ -58,6 +58,52 @@ def quantile(values: Tensor, share: float) -> float:
     return float(values.double().kthvalue(1 + round(share * (len(values) - 1))).values)
 
 
+def largest_plane(
+    points: Tensor, weight: Tensor, half: float, axis: Tensor | None = None
+) -> tuple[Tensor, float] | None:
+    """The plane with the most weight within a distance of it, the best of 400 through three points.
+
+    Args:
+        points: Shape (N, 3), float64.
+        weight: Shape (N,), float64.
+        half: The distance.
+        axis: Direction from which the normal is at most 45 degrees away; None for any.
+
+    Returns:
+        Unit normal, on the side of ``axis``, and offset; None for too few points, or no such plane.
+    """
+    if len(points) < FEWEST:
+        return None
+    step = max(1, len(points) // 4000)
+    where, own = points[::step], weight[::step]
+    draw = torch.Generator().manual_seed(0)
+    corners = where[torch.multinomial(own + 1e-12 * own.sum() + 1e-300, 3 * 400, True, generator=draw)].reshape(
+        -1, 3, 3
+    )
+    normals = torch.linalg.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    length = normals.norm(dim=-1, keepdim=True)
+    normals = normals / length.clamp(min=1e-30)
+    offsets = (normals * corners[:, 0]).sum(-1)
+    inside = (where @ normals.T - offsets).abs() <= half
+    fit = length[:, 0] > 1e-12
+    if axis is not None:
+        fit &= (normals @ axis).abs() > math.sqrt(0.5)
+    if not bool(fit.any()):
+        return None
+    score = torch.where(fit, (inside * own[:, None]).sum(0), -1.0)
+    normal, offset = normals[int(score.argmax())], float(offsets[int(score.argmax())])
+    for _ in range(3):
+        near = (where @ normal - offset).abs() <= half
+        share = own[near] / own[near].sum()
+        middle = (where[near] * share[:, None]).sum(0)
+        away = where[near] - middle
+        normal = torch.linalg.eigh((away * share[:, None]).T @ away)[1][:, 0]
+        offset = float(middle @ normal)
+    if axis is not None and float(normal @ axis) < 0:
+        normal, offset = -normal, -offset
+    return normal, offset
+
+
 def plane_axes(axis: Tensor) -> tuple[Tensor, Tensor]:
     """Two unit vectors perpendicular to another."""
     helper = torch.eye(3, dtype=torch.float64)[int(axis.abs().argmin())]

@@ -93,7 +93,7 @@ def gaussian_statistics(cloud: GaussianCloud) -> dict[str, object]:
         longest robust side. S1 >= S2 >= S3 are the standard deviations of a Gaussian.
     """
     opacity = cloud.opacities.sigmoid()
-    s1, s2, s3 = cloud.scales.double().exp().sort(-1, descending=True).values.unbind(-1)
+    s1, s2, s3 = cloud.scales.amax(-1), cloud.scales.median(-1).values, cloud.scales.amin(-1)  # logarithms
     corner = bounds(cloud.means)
     longest = max(b - a for a, b in zip(corner["robust_min"], corner["robust_max"], strict=True))
     return {
@@ -103,9 +103,9 @@ def gaussian_statistics(cloud: GaussianCloud) -> dict[str, object]:
         "opacity": _three(opacity),
         "opacity_0_or_1": int((cloud.opacities.abs() == OPAQUE_LOGIT).sum()),
         "opacity_below": {str(t): float((opacity < t).double().mean()) for t in THRESHOLDS if t > 0},
-        "S1_over_S2": _three(s1 / s2),
-        "S2_over_S3": _three(s2 / s3),
-        "size_share": _three(s1 / max(longest, 1e-30)),
+        "S1_over_S2": _three((s1.double() - s2).exp_()),
+        "S2_over_S3": _three((s2.double() - s3).exp_()),
+        "size_share": _three(s1.double().exp_() / max(longest, 1e-30)),
     }
 
 
@@ -176,6 +176,7 @@ def suggest(
     speed: float = 6.0,
     capture: CapturedFrom | None = None,
     quality: str = "normal",
+    found: tuple[UpGuess, RegionGuess] | None = None,
 ) -> Suggestion:
     """Guess a first configuration.
 
@@ -188,6 +189,8 @@ def suggest(
         speed: Speed of the wind [m/s].
         capture: The cameras of the splat's photos, which define the up direction and the object.
         quality: ``draft``, ``normal`` or ``fine``. Only the grid spacing depends on it.
+        found: The up direction and the simulated part, if they are known; ``up``, ``region`` and ``capture`` are then
+            not used for them.
 
     Returns:
         The suggestion.
@@ -202,8 +205,14 @@ def suggest(
         raise ValueError(f"The splat has {len(cloud)} Gaussians, too few for an object; at least {FEWEST} are needed.")
     means, opacity, weight = cloud.means.detach(), cloud.opacities.detach().sigmoid(), visible_weight(cloud)
     normals = smallest_axis_normal(cloud.quats, cloud.scales)
-    shown = None if capture is None or region is not None else shown_object(means, opacity, weight, capture)
-    if up is not None:
+    shown = (
+        None
+        if capture is None or region is not None or found is not None
+        else shown_object(means, opacity, weight, capture)
+    )
+    if found is not None:
+        upward = found[0]
+    elif up is not None:
         upward = given_up(up, means, normals, weight)
     elif capture is not None:
         upward = given_up(capture.up, means, normals, weight)
@@ -216,7 +225,9 @@ def suggest(
     side = max(b - a for a, b in zip(corner["robust_min"], corner["robust_max"], strict=True))
     if side <= 0:
         raise ValueError("All Gaussians of the splat are at one point: there is no object to simulate.")
-    if region is None:
+    if found is not None:
+        chosen = found[1]
+    elif region is None:
         cell = max(side / CELLS, 2 * particle_spacing(means if shown is None else means[shown.mask]))
         if shown is not None:  # the rest of a backdrop must not count as a part of the object
             cell = 0.5 * cell
@@ -366,12 +377,48 @@ def suggest_region(
     counted = weight[index].double() if shown is None else weight[index].double() * shown.nearness(points[index])
     area = torch.zeros(int(part.max()) + 1, dtype=torch.float64).index_add_(0, part, counted)
     main = int(area.argmax())
-    chosen = torch.zeros_like(solid)
+    words = [f"{int((part == main).sum()):,} Gaussians of opacity {threshold:g} and more form one connected part"]
+    if bool(ground.any()):
+        words.append(f"a floor of {int(ground.sum()):,} lies below it")
+    if shown is not None:
+        words.append("the cameras look at it")
+        if shown.backdrops:
+            words.append("everything in or behind a wall or floor is left out")
+    cuts = () if shown is None else tuple(backdrop.behind for backdrop in shown.backdrops)
+    return region_around(points, opacity, index, part, main, threshold, ground, cell, cuts, words)
+
+
+def region_around(
+    points: Tensor,
+    opacity: Tensor,
+    index: Tensor,
+    part: Tensor,
+    main: int,
+    threshold: float,
+    ground: Tensor,
+    cell: float,
+    cuts: tuple[Region, ...],
+    words: list[str],
+) -> RegionGuess:
+    """The box around a connected part, without the floor and specks in it.
+
+    Args:
+        points: Centres [scene units], shape (N, 3).
+        opacity: Opacities, shape (N,).
+        index: Those that may be simulated, shape (M,).
+        part: The connected part of each of them, shape (M,).
+        main: The part that is simulated.
+        threshold: Smallest simulated opacity.
+        ground: The floor, shape (N,).
+        cell: The box is half a cell larger [scene units].
+        cuts: Further regions that are left out.
+        words: Why it is this part.
+    """
+    chosen = torch.zeros(len(points), dtype=torch.bool)
     chosen[index[part == main]] = True
     low, high = _padded(points[chosen], 0.5 * cell)
     if bool(ground.any()):  # the box must not reach into the floor again
         low, high = _without(low, high, points[chosen], points[ground])
-    cuts = () if shown is None else tuple(backdrop.behind for backdrop in shown.backdrops)
     box: Region = Box(low, high)
     if cuts:
         box = Not(Union([Not(box), *cuts]))
@@ -389,13 +436,7 @@ def suggest_region(
     assert region is not None
     simulated = region.contains(points) & (opacity >= threshold)
     everything = bool(region.contains(points).all())
-    words = [f"{int(chosen.sum()):,} Gaussians of opacity {threshold:g} and more form one connected part"]
-    if bool(ground.any()):
-        words.append(f"a floor of {int(ground.sum()):,} lies below it")
-    if shown is not None:
-        words.append("the cameras look at it")
-        if shown.backdrops:
-            words.append("everything in or behind a wall or floor is left out")
+    words = list(words)
     if guess.specks:
         words.append(f"{guess.specks:,} float apart from it")
     words.append("the region is all of space" if everything else "the region is the box around it")

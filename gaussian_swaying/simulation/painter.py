@@ -10,6 +10,7 @@ import torch
 from torch import Tensor, nn
 
 from gaussian_swaying._turns import Turn, in_turn
+from gaussian_swaying.gaussians.harmonics import sh_to_color
 from gaussian_swaying.gaussians.model import DeformedGaussians
 from gaussian_swaying.kernels.graphs import RECORDED, Replayed, fingerprint
 from gaussian_swaying.mpm.state import State
@@ -65,6 +66,7 @@ class Painter(nn.Module):
         self.turn = Turn()
         """The lock of the thread that steps or draws the simulation."""
         self._moved, self._coloured = Replayed(), Replayed()
+        self._rest: tuple[Camera, object, Tensor, Tensor] | None = None  # of many Gaussians that do not move
         self._still: dict[str, tuple[tuple[object, ...], Camera]] = {}  # cameras of the last frame that do not move
 
     @property
@@ -148,29 +150,56 @@ class Painter(nn.Module):
 
     @in_turn
     def colors(self, gaussians: DeformedGaussians, camera: Camera) -> Tensor:
-        """Shaded colours, shape (N, 3): harmonics evaluated in the rest frame of each patch, times the shading."""
-        means, shader = gaussians.means, self.shader
-        given = [camera.position.to(means), means, gaussians.normals]
-        given += [gaussians.rotations] if self.scene.model.view_dependent else []
+        """Shaded colours, shape (N, 3): harmonics evaluated in the rest frame of each patch, times the shading.
+
+        Of many Gaussians, those that do not move are computed once for a camera.
+        """
+        means, shader, scene = gaussians.means, self.shader, self.scene
+        eye, index = camera.position.to(means), scene.moving
+        if len(means) > RECORDED and not scene.all_move:
+            still, harmonics = self._still_colours(camera, eye)
+            turned = gaussians.rotations[index] if scene.model.view_dependent else None
+            view, colours = _seen(harmonics, eye, means[index], turned)
+            return still.index_copy(0, index, self._shaded(colours, gaussians.normals[index], view))
+        given = [eye, means, gaussians.normals]
+        given += [gaussians.rotations] if scene.model.view_dependent else []
         if len(means) > RECORDED or not (shader is None or shader.recordable):
             return self._colors(*given)
-        key = fingerprint([self.scene, *([] if shader is None else [shader])])
+        key = fingerprint([scene, *([] if shader is None else [shader])])
         return self._coloured(key, lambda *known: [self._colors(*known)], *given)[0]
 
     def _colors(self, eye: Tensor, means: Tensor, normals: Tensor, rotations: Tensor | None = None) -> Tensor:
-        scene = self.scene
-        view = torch.nn.functional.normalize(means - eye, dim=-1)
-        at_rest = view if rotations is None else (view[..., None] * rotations).sum(-2)
-        colours = scene.model.colors(at_rest)
+        scene, index = self.scene, self.scene.moving
+        view, colours = _seen(scene.model.sh, eye, means, rotations)
+        if scene.all_move:
+            return self._shaded(colours, normals, view)
         if self.shader is None:
             return colours
-        index = scene.moving
-        parts = (colours, normals, view)
-        if not scene.all_move:
-            parts = (colours[index], normals[index], view[index])
-        normal, to_eye = (scene.frame.direction_to_sim(part) for part in (parts[1], -parts[2]))
-        shaded = self.shader(parts[0], normal, rest_normal=scene.rest_facing, view_direction=to_eye)
-        return shaded if scene.all_move else colours.index_copy(0, index, shaded)
+        return colours.index_copy(0, index, self._shaded(colours[index], normals[index], view[index]))
+
+    def _shaded(self, colours: Tensor, normals: Tensor, view: Tensor) -> Tensor:
+        """The colours of the Gaussians that move, with their shading."""
+        if self.shader is None:
+            return colours
+        scene = self.scene
+        normal, to_eye = (scene.frame.direction_to_sim(part) for part in (normals, -view))
+        return self.shader(colours, normal, rest_normal=scene.rest_facing, view_direction=to_eye)
+
+    def _still_colours(self, camera: Camera, eye: Tensor) -> tuple[Tensor, Tensor]:
+        """Colours (N, 3) of all Gaussians at rest, and the harmonics of those that move, for the last camera."""
+        model = self.scene.model
+        key = (fingerprint([self.scene]), model.sh0._version, model.shN._version)
+        if self._rest is None or self._rest[0] is not camera or self._rest[1] != key:
+            with torch.inference_mode(False), torch.no_grad():  # they outlive the call
+                way = torch.nn.functional.normalize(model.means - eye.clone(), dim=-1)
+                still = torch.cat([
+                    sh_to_color(torch.cat([model.sh0[k : k + RECORDED], model.shN[k : k + RECORDED]], 1),
+                                way[k : k + RECORDED])
+                    for k in range(0, len(way), RECORDED)
+                ])  # fmt: skip
+                index = self.scene.moving
+                self._rest = (camera, key, still, torch.cat([model.sh0[index], model.shN[index]], 1))
+        return self._rest[2:]
 
     def shade(self, gaussians: DeformedGaussians, camera: Camera) -> DeformedGaussians:
         """The same Gaussians with their colours as a camera sees them."""
@@ -243,3 +272,10 @@ class Painter(nn.Module):
         """Ends of the depth's colour scale [scene units]: one longest side before and behind the object's centre."""
         distance = float((self._camera(frame, name).position.to(self.scene.center) - self.scene.center).norm())
         return distance - self.scene.size, distance + self.scene.size
+
+
+def _seen(sh: Tensor, eye: Tensor, means: Tensor, rotations: Tensor | None) -> tuple[Tensor, Tensor]:
+    """Directions from the eye, and colours from there in the rest frame of each Gaussian, both (N, 3)."""
+    view = torch.nn.functional.normalize(means - eye, dim=-1)
+    at_rest = view if rotations is None else (view[..., None] * rotations).sum(-2)
+    return view, sh_to_color(sh, at_rest)

@@ -100,7 +100,7 @@ class SimulatedScene(nn.Module):
         faint = scene.region.contains(cloud.means) & ~chosen & ~still
         if scene.faint == "drop" and bool(faint.any()):
             cloud, chosen, held, faint = cloud.select(~faint), chosen[~faint], held[~faint], faint[~faint]
-        self.model = GaussianSurfaceModel.from_cloud(cloud, requires_grad=False)
+        self.model = GaussianSurfaceModel.from_cloud(cloud, requires_grad=False, copy=scene.ply is None)
         simulated = chosen.nonzero()[:, 0]
         self.frame = SimFrame.fit(cloud.means[simulated], scene.up, scene.longest_side, scene.metres_per_unit)
         means = cloud.means[simulated]

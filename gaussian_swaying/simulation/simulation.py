@@ -26,6 +26,7 @@ from gaussian_swaying.config.parser import (
     python_text,
     with_custom,
 )
+from gaussian_swaying.gaussians.cloud import GaussianCloud
 from gaussian_swaying.geometry.regions import Region
 from gaussian_swaying.mpm.boundaries.obstacle import Obstacle
 from gaussian_swaying.mpm.contact.surface import Contact
@@ -105,6 +106,7 @@ class Simulation:
         hold: Python only, if no solver is given: what is held in place. A region, or a pin with a kind of its own:
             ``PinnedRegion(region, kind="clamp")`` also holds the slope, ``PinnedPoints`` holds given places.
         renderer: Python only: draws the Gaussians; by default gsplat on CUDA and the torch renderer elsewhere.
+        cloud: Python only: the Gaussians of ``scene.ply`` if they have been read already, or a part of them.
 
     Between frames ``wind``, ``aero``, ``custom_forces``, ``frame_dt`` and ``recorder`` may be assigned; :meth:`edit`
     and :meth:`change` change the material, and ``painter`` the pictures. For other arguments make another simulation.
@@ -150,6 +152,7 @@ class Simulation:
         up: Sequence[float] | None = None,
         hold: HoldLike | None = None,
         renderer: Renderer | None = None,
+        cloud: GaussianCloud | None = None,
     ) -> None:
         given = {name: value for name, value in locals().items() if name not in ("self", *NOT_COMPARED)}
         check_positive("frame_dt", frame_dt)
@@ -163,7 +166,7 @@ class Simulation:
             )
         damping = known_material(material).damping if isinstance(material, str) else 0.0
         settings, material = as_scene(scene, up), as_material(material)
-        cloud = settings.cloud()  # read once
+        cloud = settings.cloud() if cloud is None else cloud  # read once
         solver = as_solver(solver, hold, settings, cloud, damping)
         if normalisation is not None:
             if hold is not None:

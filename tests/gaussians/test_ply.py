@@ -13,7 +13,10 @@ import torch
 from plyfile import PlyData, PlyElement
 from small_scenes import varied_cloud
 
+from gaussian_swaying._ply_table import element_parts, read_element, read_header
+from gaussian_swaying.gaussians import ply as ply_module
 from gaussian_swaying.gaussians.cloud import GaussianCloud
+from gaussian_swaying.gaussians.formats import read_gaussians
 from gaussian_swaying.gaussians.ply import read_ply, write_ply
 from gaussian_swaying.geometry.patches import smallest_axis_normal
 
@@ -58,6 +61,32 @@ def test_round_trip_is_exact(tmp_path, degree, normals):
     expected = cloud.normals if normals else smallest_axis_normal(cloud.quats, cloud.scales)
     torch.testing.assert_close(back.normals, expected, rtol=0, atol=0)
     assert [path.name for path in tmp_path.iterdir()] == ["a.ply"]
+
+
+@pytest.mark.parametrize("degree", [0, 1, 2, 3])
+@pytest.mark.parametrize("kept", [0, 1, 3])
+def test_harmonics_may_be_left_out(tmp_path, degree, kept):
+    cloud = varied_cloud(7, degree=degree)
+    write_ply(tmp_path / "a.ply", cloud)
+    back, all_of_it = read_ply(tmp_path / "a.ply", kept), read_ply(tmp_path / "a.ply")
+    assert back.sh_degree == min(degree, kept)
+    assert torch.equal(back.sh, all_of_it.sh[:, : back.sh.shape[1]])
+    assert torch.equal(back.quats, all_of_it.quats)
+    assert torch.equal(read_gaussians(tmp_path / "a.ply", kept).sh, back.sh)
+
+
+def test_a_file_is_read_in_parts(tmp_path, monkeypatch):
+    """Of any number of rows: the last one may be shorter."""
+    cloud = varied_cloud(7, degree=1)
+    write_ply(tmp_path / "a.ply", cloud)
+    header = read_header(tmp_path / "a.ply")
+    whole = read_element(tmp_path / "a.ply", header, "vertex")
+    parts = list(element_parts(tmp_path / "a.ply", header, "vertex", 3))
+    assert [len(part) for part in parts[:-1]] == [3] * (len(parts) - 1)
+    assert len(parts) > 1
+    assert np.array_equal(np.concatenate(parts), whole)
+    monkeypatch.setattr(ply_module, "element_parts", lambda *given: iter(parts))
+    assert torch.equal(read_ply(tmp_path / "a.ply").sh, cloud.sh)
 
 
 def test_written_order_and_channels(tmp_path):

@@ -7,6 +7,7 @@ import copy
 import dataclasses
 import json
 import math
+from dataclasses import replace
 
 import pytest
 import torch
@@ -29,6 +30,7 @@ from gaussian_swaying.rendering.torch_renderer import render_torch
 from gaussian_swaying.scenes.procedural import FlagScene
 from gaussian_swaying.simulation import simulated_scene as scene_module
 from gaussian_swaying.simulation.diagnostics import SimulationDiverged, diagnose
+from gaussian_swaying.simulation.edits import Edit
 from gaussian_swaying.simulation.material import Material
 from gaussian_swaying.simulation.scene import Scene
 from gaussian_swaying.simulation.simulation import Simulation
@@ -457,6 +459,32 @@ def test_a_picture_takes_few_operations(name, degree, make_cloud, make_simulatio
     with _Operations() as operations:
         finite_gaussians(gaussians.means, gaussians.covariances, simulation.scene.model.opacity(), colours)
     assert operations.count <= 4
+
+
+@pytest.mark.parametrize("shader", [None, DiffuseShader()], ids=["plain", "diffuse"])
+@pytest.mark.parametrize("degree", [0, 3])
+def test_many_still_gaussians_are_coloured_once(degree, shader, make_cloud, make_simulation, monkeypatch):
+    """As the others are coloured, with another camera and after an edit too."""
+    part = {"region": Box([None] * 3, [0.6, None, None])}
+    cloud = make_cloud(degree=degree)
+    simulation = make_simulation(cloud, pinned=False, shader=shader, scene=part)
+    painter, state = simulation.painter, simulation.start()
+    assert 0 < len(simulation.scene.moving) < len(cloud)
+    seen = []
+    near = painter.camera_at(0)
+    cameras = [near, replace(near, world_to_camera=near.world_to_camera + torch.eye(4)[2:3].T * torch.eye(4)[3] * 0.7)]
+    for _ in range(2):
+        gaussians = painter.deformed(state)
+        for camera in cameras:
+            expected = painter.colors(gaussians, camera)
+            with monkeypatch.context() as patch:
+                patch.setattr("gaussian_swaying.simulation.painter.RECORDED", 7)
+                for _ in range(2):
+                    torch.testing.assert_close(painter.colors(gaussians, camera), expected, rtol=0, atol=1e-6)
+                    assert painter._rest[0] is camera
+        seen.append(expected)
+        state = simulation.edit(simulation.advance(state)[0], Edit(color=[0.9, 0.1, 0.1]))
+    assert float((seen[0] - seen[1]).abs().max()) > 0.1  # the edit was seen
 
 
 def _on_gpu(simulation):

@@ -46,6 +46,7 @@ PARTS: dict[str, tuple[str, ...]] = {
     "pins": (*_SIMULATION, "evaluation"),
     "points": _SIMULATION,
     "previews": (*_SIMULATION, "preview"),
+    "places": (*_SIMULATION, "preview"),
     "sim": _DRAWN,
     "soft": (*_DRAWN, "fitting"),
     "speed": _DRAWN,

@@ -29,6 +29,23 @@ table(PAGE, "previews.rows", "previews_*", "previews", """
     substeps a frame, announced and taken = {run.announced_substeps:.0f}, {run.substeps:.0f}
     """, before="{source}")  # fmt: skip
 
+PREVIEW = {"cpu": 60.0, "cuda": 15.0}
+"""Goals: time of the preview of 3,000,000 Gaussians [s], on two cores, and with a GPU and 16 cores."""
+
+
+def _places(result: Row) -> Iterator[Row]:
+    wanted = PREVIEW["cpu" if "CPU" in result["device"] else "cuda"]
+    for row in result["places"].values():
+        yield row | {"wanted": wanted if row["gaussians"] == 3_000_000 else None}
+
+
+table(PAGE, "places.rows", "places_*", _places, """
+    Gaussians = {gaussians:,} | of the plant = {plant:,} | file [MB] = {file_bytes:.0f (MB)} |
+    preview [s] = {preview_s:.0f} | wanted = {wanted:g} | its memory [MB] = {preview_bytes:.0f (MB)} |
+    per file = {preview_share:.2f} | the plant comes first = {right_first} | draft [s] = {draft_s:.0f} |
+    announced [s] = {draft_announced_s:.0f} | its memory [MB] = {draft_bytes:.0f (MB)}
+    """, before="{source}")  # fmt: skip
+
 table(PAGE, "runs.substep", "substep_*", "substep", """
     elastic substep, sheet, no wind = `{formulation}`, {particles:,} particles | grid nodes = {nodes:,} |
     median [ms] = {median_ms:.2f} | quartiles [ms] = {quartile_low_ms:.2f} to {quartile_high_ms:.2f}

@@ -1,0 +1,171 @@
+"""What moves in a capture of a place: ground, background, things and their ranks, and the preview of one of them."""
+
+import json
+import math
+
+import pytest
+import torch
+import yaml
+from bench.places import place
+from shared import refused
+
+from gaussian_swaying.cli.preview import main
+from gaussian_swaying.gaussians.cloud import GaussianCloud
+from gaussian_swaying.gaussians.ply import write_ply
+from gaussian_swaying.geometry.rotations import quat_to_rotation
+from gaussian_swaying.preview.place import excerpt, survey
+from gaussian_swaying.preview.suggest import suggest
+from gaussian_swaying.scenes.alocasia import AlocasiaScene
+from gaussian_swaying.scenes.procedural import FlagScene
+from gaussian_swaying.simulation.simulation import Simulation
+
+COUNT = 40_000
+
+
+@pytest.fixture(scope="module")
+def garden():
+    """A place with y down, and which Gaussians are its plant."""
+    return place(COUNT, sh_degree=0)
+
+
+def _overlap(a, b):
+    return int((a & b).sum()) / int((a | b).sum())
+
+
+def _mask(members, count=COUNT):
+    return torch.zeros(count, dtype=torch.bool).index_fill(0, members, True)
+
+
+def _turned(cloud, quat):
+    """Turned about the origin by a quaternion; the Gaussians themselves keep their axes, except for flat ones."""
+    quat = torch.tensor(quat) / math.hypot(*quat)
+    w, x, y, z = quat
+    a, b, c, d = cloud.quats.unbind(-1)
+    quats = torch.stack(
+        [w * a - x * b - y * c - z * d, w * b + x * a + y * d - z * c, w * c - x * d + y * a + z * b,
+         w * d + x * c - y * b + z * a], -1)  # fmt: skip
+    return GaussianCloud(cloud.means @ quat_to_rotation(quat).T, quats, cloud.scales, cloud.opacities, cloud.sh)
+
+
+def test_the_parts_of_a_place(garden):
+    """The plant comes first; ground and haze are what they are; the hedge is no thing on its own."""
+    cloud, plant = garden
+    found = survey(cloud)
+    assert found.up.direction == (0.0, -1.0, 0.0)
+    assert found.up.confidence == "high"
+    assert _overlap(_mask(found.things[0].members), plant) > 0.97
+    assert len(found.things) == 2
+    assert found.things[0].score > found.things[1].score + 0.5
+    assert "on its own" not in found.things[1].reasons
+    height, away = -cloud.means[:, 1] / 0.4, cloud.means.norm(dim=-1) / 0.4
+    level = (height.abs() < 0.0125) & (cloud.means[:, [0, 2]].abs() < 0.4 * 3.9).all(-1) & ~plant
+    assert float(found.up.ground[level].double().mean()) > 0.99
+    assert float(found.up.ground[height > 0.05].double().mean()) == 0
+    assert torch.equal(found.far & (away > 11), found.far)
+    assert float(found.far[away > 15].double().mean()) == 1
+
+
+def test_a_place_that_is_tilted(garden):
+    """The ground's normal is up, and the region leaves the ground out although its box does not."""
+    cloud, plant = garden
+    turn = (1.0, 0.08, 0.0, -0.06)
+    cloud = _turned(cloud, turn)
+    found = survey(cloud)
+    up = quat_to_rotation(torch.tensor(turn) / math.hypot(*turn)) @ torch.tensor([0.0, -1.0, 0.0])
+    assert float(torch.tensor(found.up.direction) @ up) > math.cos(math.radians(0.5))
+    shown, upward, region = excerpt(found, cloud, [1])
+    inside = region.region().contains(cloud.means) & (cloud.opacities.sigmoid() >= region.opacity_threshold)
+    assert _overlap(inside, plant) > 0.95
+    assert int((inside & ~plant).sum()) < 5
+    assert not bool(region.simulated[upward.ground].any())
+    assert len(shown) < 0.3 * len(cloud)
+
+
+@pytest.mark.parametrize("up", ["-y", [0.0, -1.0, 0.0], "+y"])
+def test_a_given_direction_is_the_only_one_that_is_tried(garden, up):
+    """From below, the haze ends nowhere on a plane: there is no ground, and the splat is taken as one object."""
+    found = survey(garden[0], up)
+    if up == "+y":
+        assert found is None
+    else:
+        assert found.up.direction == (0.0, -1.0, 0.0)
+        assert found.up.confidence == "given"
+        assert len(found.things) == 2
+
+
+@pytest.mark.parametrize("scene", [AlocasiaScene(spacing=0.02), FlagScene(spacing=0.03)], ids=["plant", "flag"])
+def test_an_object_is_no_place(scene):
+    """Even on a floor of its own: there is a single thing, and nothing far away."""
+    assert survey(scene.generate()) is None
+
+
+def test_several_things_move_as_one_object(garden):
+    cloud, plant = garden
+    shown, upward, region = excerpt(survey(cloud), cloud, [1, 2])
+    inside = region.region().contains(cloud.means)
+    assert float(inside[plant].double().mean()) > 0.97
+    hedge = (cloud.means[:, 1] < -0.05) & (cloud.means.norm(dim=-1) > 1.5) & (cloud.means.norm(dim=-1) < 3)
+    assert float(inside[hedge].double().mean()) > 0.97
+    assert suggest(shown, found=(upward, region)).size[0] == pytest.approx(1.0, abs=0.01)
+
+
+@pytest.fixture
+def file(garden, tmp_path):
+    path = tmp_path / "garden.ply"
+    write_ply(path, garden[0])
+    return path
+
+
+def _preview(file, out, *options):
+    return main([str(file), "--output", str(out), "--device", "cpu", "--height", "96", "--frames", "2", *options])
+
+
+def test_the_preview_of_a_place(file, garden, tmp_path, capsys, monkeypatch):
+    """It lists what may move, draws it, and its starter simulates the same Gaussians of the whole file."""
+    monkeypatch.setattr("gaussian_swaying.preview.cost.MOST_FRAMES", 2)
+    monkeypatch.setattr("gaussian_swaying.cli.preview.calibrated_suggestion", lambda found, draft, sway: found)
+    out = tmp_path / "out"
+    assert _preview(file, out) == 0
+    told = capsys.readouterr().out
+    assert "1 moves" in told
+    assert "background" in told
+    data = json.loads((out / "preview.json").read_text())
+    assert data["place"]["moves"] == [1]
+    assert len(data["place"]["things"]) == 2
+    assert data["gaussians"]["count"] == COUNT
+    import imageio.v3 as iio
+
+    picture = iio.imread(out / "things.png").astype(int)
+    assert picture.shape == (300, 600, 3)
+    green = (picture[..., 1] > picture[..., 0] + 15) & (picture[..., 1] > picture[..., 2] + 15)
+    assert green[:, :300].sum() > 500
+    assert green[:, 300:].sum() > 500
+    simulation = Simulation.from_yaml(out / "starter.yaml", device="cpu")
+    chosen = _mask(simulation.scene.simulated)
+    assert _overlap(chosen, garden[1]) > 0.97
+    assert len(simulation.scene.model.means) == COUNT
+    region = yaml.safe_load((out / "starter.yaml").read_text())["scene"]["region"]
+    assert region["class_path"]
+
+
+def test_a_thing_is_chosen_by_its_number(file, tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr("gaussian_swaying.preview.cost.MOST_FRAMES", 2)
+    monkeypatch.setattr("gaussian_swaying.cli.preview.calibrated_suggestion", lambda found, draft, sway: found)
+    assert _preview(file, tmp_path / "out", "--move", "2") == 0
+    assert "2 moves" in capsys.readouterr().out
+    box = json.loads((tmp_path / "out" / "preview.json").read_text())["run"]
+    assert box["box_max"][0] - box["box_min"][0] == pytest.approx(4.0, abs=0.1)
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        (["--move", "5"], "`--move` to name things from 1 to 2"),
+        (["--move", "a"], "`--move` to be numbers of things"),
+        (["--move", "1", "--up", "+y"], "this splat is one object"),
+    ],
+)
+def test_bad_choices_are_refused(file, tmp_path, capsys, options, words):
+    folder = tmp_path / "here"
+    folder.mkdir()
+    refused(lambda given: _preview(file, folder / "out", *given), options, capsys, words, folder=folder)

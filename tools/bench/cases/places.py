@@ -1,0 +1,86 @@
+"""What ``bench.py places`` measures: the preview and the draft of captures of a place, with their memory."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Iterator
+from functools import partial
+from pathlib import Path
+
+from bench.case import Case, Measurement, numbers, option
+from bench.record import ROOT, Row
+from bench.simulate import what_failed
+
+
+def previewed(count: int, device: str, drafts: bool, keep: str | None = None) -> Row:
+    """A place of so many Gaussians: its preview, whether the plant comes first, and its draft.
+
+    Args:
+        count: Number of Gaussians.
+        device: ``cpu`` or ``cuda``.
+        drafts: Whether the draft is run too.
+        keep: Folder where the place and all results stay; a temporary one if None.
+    """
+    with tempfile.TemporaryDirectory() as temporary:
+        folder = Path(keep or temporary)
+        file, seen, out = (folder / f"{name}_{count}" for name in ("place", "preview", "draft"))
+        file = file.with_suffix(".ply")
+        # in a process of its own: the memory of this one would count as that of those which it starts
+        make = f"from bench.places import write; write({str(file)!r}, {count})"
+        subprocess.run([sys.executable, "-c", make], cwd=ROOT / "tools", check=True)
+        plant = json.loads(file.with_suffix(".json").read_text())
+        row: Row = {"gaussians": count, "plant": plant["gaussians"], "file_bytes": file.stat().st_size}
+        took = _tool("preview", [str(file), "--device", device, "--output", str(seen)])
+        if "failed" in took:
+            return row | took
+        row |= {"preview_s": took["seconds"], "preview_bytes": took["bytes"]}
+        row["preview_share"] = row["preview_bytes"] / row["file_bytes"]
+        data = json.loads((seen / "preview.json").read_text())
+        first = data["place"]["things"][0]
+        off = max(abs(a - b) for end in ("min", "max") for a, b in zip(first[end], plant[end], strict=True))
+        row["right_first"] = off < 0.02 and 0.9 < first["gaussians"] / plant["gaussians"] < 1.1
+        if drafts:
+            took = _tool("sim", ["--config", str(seen / "draft.yaml"), "--device", device, "--output", str(out)])
+            if "failed" in took:
+                return row | took
+            row |= {"draft_s": took["seconds"], "draft_bytes": took["bytes"]}
+            row["draft_announced_s"] = data["draft_cost"]["total_seconds"]
+    return row
+
+
+def _tool(name: str, options: list[str]) -> Row:
+    """Seconds and peak memory [bytes] of a program of the folder tools, or why it failed."""
+    command = [sys.executable, str(ROOT / "tools" / f"{name}.py"), *options]
+    begin = time.perf_counter()
+    with tempfile.TemporaryFile("w+") as told:
+        process = subprocess.Popen(command, cwd=ROOT, stdout=subprocess.DEVNULL, stderr=told, text=True)
+        _, status, used = os.wait4(process.pid, 0)
+        process.returncode = os.waitstatus_to_exitcode(status)
+        told.seek(0)
+        if process.returncode:
+            return {"failed": what_failed(told.read())}
+    return {"seconds": time.perf_counter() - begin, "bytes": 1024 * used.ru_maxrss}
+
+
+def rows(options: argparse.Namespace, _: Row) -> Iterator[Measurement]:
+    """One place of each size."""
+    for count in options.counts:
+        work = partial(previewed, count, options.device, count <= options.drafts, options.keep)
+        yield ("places", f"{count:,}"), work
+
+
+CASE = Case(
+    "Measure the preview and the draft of captures of a place.",
+    rows,
+    (
+        numbers("--counts", "Gaussians of the places", default="300000,1000000,3000000"),
+        option("--drafts", "most Gaussians of a place whose draft is run", type=int, default=3_000_000),
+        option("--keep", "folder where the places and all results stay"),
+    ),
+)
