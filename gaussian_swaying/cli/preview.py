@@ -138,10 +138,11 @@ def preview_scene(options: argparse.Namespace, folder: Path) -> Preview:
     quality = options.quality or "normal"
     place = survey(cloud, up) if region is None and capture is None else None
     chosen = _numbers(options.move, place)
-    part, found = cloud, None
+    part: GaussianCloud = cloud
+    found = None
     if place is not None:
-        part, *guesses = excerpt(place, cloud, chosen)
-        found = (guesses[0], guesses[1])
+        part, upward, around = excerpt(place, cloud, chosen)
+        found = upward, around
     suggestion = suggest(part, up, options.hold, region, options.longest_side, options.wind, capture, quality, found)
     if options.material is not None:
         suggestion = of_material(suggestion, options.material)

@@ -70,29 +70,25 @@ def read_ply(path: str | os.PathLike[str], sh_degree: int | None = None) -> Gaus
         raise ValueError(f"{path} holds zero Gaussians (element vertex 0); export the scene again.")
     per_channel = len(rest) // 3
     kept = per_channel if sh_degree is None else min(per_channel, (sh_degree + 1) ** 2 - 1)
-    places: dict[str, tuple[str, tuple[int, ...]]] = {"opacity": ("opacities", (0,))}
+    columns = {"opacity": ("opacities", 0)}  # of each property: a table, and a column of it
     for table, fields in (("means", _MEANS), ("quats", _QUATS), ("scales", _SCALES), ("normals", _NORMALS)):
         if table != "normals" or has_normals:
-            places |= {field: (table, (k,)) for k, field in enumerate(fields)}
-    places |= {field: ("sh", (0, k)) for k, field in enumerate(_DC)}
+            columns |= {field: (table, k) for k, field in enumerate(fields)}
+    columns |= {field: ("sh", k) for k, field in enumerate(_DC)}
     for channel in range(3):
-        for k in range(kept):
-            places[rest[channel * per_channel + k]] = ("sh", (1 + k, channel))
-    widths = {"opacities": (1,), "means": (3,), "quats": (4,), "scales": (3,), "sh": (1 + kept, 3), "normals": (3,)}
-    tables = {
-        table: np.empty((count, *widths[table]), dtype=np.float32)
-        for table in dict.fromkeys(t for t, _ in places.values())
-    }
+        columns |= {rest[channel * per_channel + k]: ("sh", 3 + 3 * k + channel) for k in range(kept)}
+    of_table = [table for table, _ in columns.values()]
+    tables = {name: np.empty((count, of_table.count(name)), dtype=np.float32) for name in dict.fromkeys(of_table)}
     first = 0
     with np.errstate(over="ignore"):
         for part in element_parts(path, header, "vertex"):
-            for field, (table, place) in places.items():
-                tables[table][(slice(first, first + len(part)), *place)] = part[field]
+            for field, (table, k) in columns.items():
+                tables[table][first : first + len(part), k] = part[field]
             first += len(part)
     opacities = _finite_opacities(path, tables["opacities"][:, 0])
-    for field, (table, place) in places.items():
+    for field, (table, k) in columns.items():
         if table != "opacities":
-            bad = ~np.isfinite(tables[table][(slice(None), *place)])
+            bad = ~np.isfinite(tables[table][:, k])
             reject(path, bad, f"property `{field}` is NaN or infinite", "remove them or train again")
     check_places(path, tables["means"])
     check_sizes_and_rotations(path, tables["scales"], tables["quats"])
@@ -104,7 +100,7 @@ def read_ply(path: str | os.PathLike[str], sh_degree: int | None = None) -> Gaus
         quats=torch.from_numpy(tables["quats"]),
         scales=torch.from_numpy(tables["scales"]),
         opacities=torch.from_numpy(opacities),
-        sh=torch.from_numpy(tables["sh"]),
+        sh=torch.from_numpy(tables["sh"].reshape(count, 1 + kept, 3)),
         normals=None if normals is None else torch.from_numpy(normals),
     )
 

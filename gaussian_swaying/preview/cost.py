@@ -215,8 +215,11 @@ def with_whole(cost: Cost, simulation: Simulation, cloud: GaussianCloud) -> Cost
     some, model = painter.scene.rest(), painter.scene.model
     few, own = model.opacity(), model.colors(some.means)
 
-    def seconds(*given: Tensor) -> float:
-        return min(_seconds(simulation, lambda: painter.renderer(*given, camera, painter.background)) for _ in range(2))
+    def seconds(means: Tensor, covariances: Tensor, opacity: Tensor, colours: Tensor) -> float:
+        def draw() -> None:
+            painter.renderer(means, covariances, opacity, colours, camera, painter.background)
+
+        return min(_seconds(simulation, draw) for _ in range(2))
 
     drawn = seconds(some.means, some.covariances, few, own), seconds(third.means, shape, opacity, colours)
     numbers = len(some.means), len(third)
