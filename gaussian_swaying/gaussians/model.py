@@ -69,7 +69,7 @@ class GaussianSurfaceModel(nn.Module):
 
     reference_normals: Tensor | None
 
-    def __init__(self, cloud: GaussianCloud, requires_grad: bool = True, copy: bool = True) -> None:
+    def __init__(self, cloud: GaussianCloud, requires_grad: bool = True, *, copy: bool = True) -> None:
         super().__init__()
 
         def parameter(tensor: Tensor) -> nn.Parameter:
@@ -84,9 +84,9 @@ class GaussianSurfaceModel(nn.Module):
         self.register_buffer("reference_normals", None if cloud.normals is None else cloud.normals.detach().clone())
 
     @classmethod
-    def from_cloud(cls, cloud: GaussianCloud, requires_grad: bool = True, copy: bool = True) -> GaussianSurfaceModel:
+    def from_cloud(cls, cloud: GaussianCloud, requires_grad: bool = True, *, copy: bool = True) -> GaussianSurfaceModel:
         """The model of given Gaussians."""
-        return cls(cloud, requires_grad, copy)
+        return cls(cloud, requires_grad, copy=copy)
 
     @classmethod
     def from_ply(cls, path: str | os.PathLike[str], requires_grad: bool = True) -> GaussianSurfaceModel:

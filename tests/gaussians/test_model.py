@@ -27,6 +27,15 @@ def test_model_holds_storage_form_parameters(device, dtype):
     assert len(model) == 6
 
 
+@pytest.mark.parametrize("copy", [True, False])
+def test_tensors_are_copied_or_shared(copy):
+    cloud = varied_cloud(6, 2)
+    model = GaussianSurfaceModel.from_cloud(cloud, requires_grad=False, copy=copy)
+    assert all(torch.equal(getattr(model, name), getattr(cloud, name)) for name in ("means", "quats", "opacities"))
+    shared = {name: getattr(model, name).data_ptr() == getattr(cloud, name).data_ptr() for name in ("means", "scales")}
+    assert shared == {"means": not copy, "scales": not copy}
+
+
 @pytest.mark.parametrize("degree", [0, 3])
 @pytest.mark.parametrize("normals", [False, True])
 def test_model_round_trip_through_a_file(tmp_path, degree, normals):

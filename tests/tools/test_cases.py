@@ -14,7 +14,7 @@ import torch
 import yaml
 from bench import record, slots, stamps
 from bench.case import Case, at_once, chosen, put
-from bench.cases import accuracy, backward, contact, previews, web, winds
+from bench.cases import accuracy, backward, contact, places, previews, web, winds
 from bench.command import CASES
 from bench.problems.contacts import crossings, sheet_triangles
 from bench.scenes import sheet
@@ -274,3 +274,14 @@ def test_size_error_and_speed_of_a_film(tmp_path):
     write_film(tmp_path / "run", tmp_path / "film.html")
     assert row["bytes"] == (tmp_path / "film.html").stat().st_size
     assert cells("web.films", HEAD | {"films": {row["title"]: row}})[0][:2] == ["Flag in the wind", "96"]
+
+
+def test_a_place_is_previewed_in_a_process_of_its_own():
+    """Its memory is that of the preview, without what made the place."""
+    row = places.previewed(20_000, "cpu", drafts=False)
+    assert row["right_first"]
+    assert row["plant"] > 500
+    assert row["preview_share"] == row["preview_bytes"] / row["file_bytes"]
+    assert 1e8 < row["preview_bytes"] < 2e9
+    assert "draft_s" not in row
+    assert "nothing.ply" in places._tool("preview", ["nothing.ply"])["failed"]
