@@ -7,9 +7,10 @@ import shlex
 import sys
 import time
 from argparse import ArgumentError
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 from gaussian_swaying import _program as program
@@ -36,7 +37,7 @@ from gaussian_swaying.preview.cost import (
 )
 from gaussian_swaying.preview.photos import captured_from
 from gaussian_swaying.preview.picture import preview_picture, things_picture
-from gaussian_swaying.preview.place import Place, excerpt, survey
+from gaussian_swaying.preview.place import Place, excerpt, near_things, survey
 from gaussian_swaying.preview.report import (
     area_line,
     cost_dict,
@@ -57,6 +58,7 @@ from gaussian_swaying.preview.shape import DIRECTIONS, bounds
 from gaussian_swaying.preview.starter import draft_yaml, starter_yaml
 from gaussian_swaying.preview.suggest import (
     QUALITIES,
+    Suggestion,
     at_quality,
     finest_spacing,
     gaussian_statistics,
@@ -147,7 +149,7 @@ def preview_scene(options: argparse.Namespace, folder: Path) -> Preview:
     if options.material is not None:
         suggestion = of_material(suggestion, options.material)
     begin = Stopwatch()
-    draft, settings = _pipeline(["--device", options.device], draft_yaml(suggestion, options.scene), part)
+    draft, settings = _tried(suggestion, lambda made: draft_yaml(made, options.scene), options.device, part)
     startup = LOADED + read + begin.quiet
     if settings.scene.ply != str(Path(options.scene).resolve()):
         raise ValueError(f"The path {options.scene!r} has another meaning in YAML: rename the file, without a colon.")
@@ -161,8 +163,10 @@ def preview_scene(options: argparse.Namespace, folder: Path) -> Preview:
     made: dict[float, Simulation] = {}  # the starter with several grids
 
     def measure(dx: float) -> Cost:
-        text = starter_yaml(replace(suggestion, dx=dx), options.scene, options.frames)
-        made[dx] = _pipeline(["--device", options.device], text, part)[0]
+        wanted = replace(suggestion, dx=dx)
+        made[dx] = _tried(wanted, lambda made: starter_yaml(made, options.scene, options.frames), options.device, part)[
+            0
+        ]
         return cost_of(made[dx], options.frames)
 
     costs["starter"] = measure(suggestion.dx)
@@ -172,6 +176,11 @@ def preview_scene(options: argparse.Namespace, folder: Path) -> Preview:
         costs["starter"] = finest_within(measure, wish, costs["starter"], costs["draft"], finest, grids["draft"])
         suggestion = replace(suggestion, dx=costs["starter"].dx, quality=f"--minutes {options.minutes:g}")
     simulation = made[suggestion.dx]
+    if suggestion.parts is not None:
+        parts = suggestion.parts
+        if place is not None:
+            parts = parts.within(near_things(place, cloud, chosen))
+        suggestion = replace(suggestion, parts=replace(parts, path=str((folder / "parts.npz").resolve())))
     texts = {
         "draft": draft_yaml(suggestion, options.scene),
         "starter": starter_yaml(suggestion, options.scene, options.frames),
@@ -215,7 +224,8 @@ def preview_scene(options: argparse.Namespace, folder: Path) -> Preview:
         report.append(f"{what} ({pictures}):")
         report.append(f"  {shlex.join(program.words('sim'))} --config {folder / name}.yaml --output {where}")
     picture = preview_picture(simulation, options.height, whole=suggestion.whole)
-    return Preview("\n".join(report), data, picture, texts, things)
+    labels = None if suggestion.parts is None else suggestion.parts.parts
+    return Preview("\n".join(report), data, picture, texts, things, labels)
 
 
 def preview_config(options: argparse.Namespace) -> Preview:
@@ -252,6 +262,17 @@ def preview_config(options: argparse.Namespace) -> Preview:
         *cost_lines(cost),
     ]
     return Preview("\n".join(report), data, preview_picture(simulation, options.height), {})
+
+
+def _tried(
+    suggestion: Suggestion, text: Callable[[Suggestion], str], device: str, cloud: GaussianCloud
+) -> tuple[Simulation, Any]:
+    """The simulation of the configuration of a suggestion for some Gaussians, and its settings; it leaves no file."""
+    with TemporaryDirectory() as scratch:
+        if suggestion.parts is not None:
+            path = suggestion.parts.parts.save(Path(scratch) / "parts.npz")
+            suggestion = replace(suggestion, parts=replace(suggestion.parts, path=str(path)))
+        return _pipeline(["--device", device], text(suggestion), cloud)
 
 
 def _numbers(move: str | None, place: Place | None) -> list[int]:

@@ -260,7 +260,7 @@ def measure_motion(
 
 def calibrated_suggestion(suggestion: Suggestion, draft: Simulation, sway: float) -> Suggestion:
     """The suggestion with stiffness, thickness and wind from short runs of its draft; the draft is changed too."""
-    if suggestion.real or suggestion.pin is None or not any(suggestion.flow):
+    if suggestion.real or not suggestion.fixed or not any(suggestion.flow):
         return suggestion
     start, wanted = Setting(suggestion.youngs_modulus, suggestion.thickness), None if suggestion.sheet else sway
     best = calibrate(lambda tried: measure_motion(draft, tried, start, wanted), start, suggestion.longest_side, wanted)

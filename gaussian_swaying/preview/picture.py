@@ -35,6 +35,7 @@ REGION = (30, 110, 220)
 WIND = (0, 140, 110)
 NORMAL = (250, 200, 40)
 UP = (40, 40, 40)
+SOFT = ((60, 70, 220), (0, 170, 60), (170, 60, 170), (220, 150, 0))  # of several soft parts, in turn
 THING = 300  # width and height of the picture of a thing [pixels]
 MOST_DRAWN = 200_000  # Gaussians of it
 
@@ -144,13 +145,13 @@ def preview_picture(
     for turn in (0.0, 90.0):
         camera = orbit_camera(center, frame.rotation[2], reach, azimuth - turn, elevation, 40.0, height, height)
         views.append(_view(simulation, parts, camera.to(simulation.device), normals, f"azimuth {azimuth - turn:.0f}°"))
-    legend = 108 if bool(parts.pushed.any()) else 84
-    page = Image.new("RGB", (2 * height, height + legend), (255, 255, 255))
+    entries = _entries(parts, simulation)
+    page = Image.new("RGB", (2 * height, height + 12 + 24 * -(-len(entries) // 2)), (255, 255, 255))
     for k, view in enumerate(views):
         page.paste(view, (k * height, 0))
     draw = ImageDraw.Draw(page)
     font = ImageFont.load_default(size=14)
-    _legend(draw, font, parts, simulation, height, 2 * height)
+    _legend(draw, font, entries, height, 2 * height)
     return np.asarray(page)
 
 
@@ -222,7 +223,7 @@ def _view(simulation: Simulation, parts: Parts, camera: Camera, normals: int, ti
     rest = scene.rest()
     view = torch.nn.functional.normalize(rest.means - camera.position.to(rest.means), dim=-1)
     colours = scene.model.colors(view).clamp(0, 1)
-    colours = _tinted(colours, parts)
+    colours = _tinted(colours, parts, _soft(simulation))
     plain = torch.full((3,), 0.96, device=colours.device)
     opacity = scene.model.opacity()
     image = simulation.painter.renderer(rest.means, rest.covariances, opacity, colours, camera, plain).color
@@ -248,8 +249,20 @@ def _view(simulation: Simulation, parts: Parts, camera: Camera, normals: int, ti
     return picture
 
 
-def _tinted(colours: Tensor, parts: Parts) -> Tensor:
-    """Colours with pinned and pushed Gaussians tinted and static ones grey and pale."""
+def _soft(simulation: Simulation) -> list[tuple[str, Tensor, tuple[int, ...]]]:
+    """Names, Gaussians and colours of the soft parts, if there are several."""
+    parts = simulation.scene.parts
+    soft = [] if parts is None else [part.name for part in parts.parts if part.role == "soft"]
+    if parts is None or len(soft) < 2:
+        return []
+    return [(name, parts.mask(name), SOFT[k % len(SOFT)]) for k, name in enumerate(soft)]
+
+
+def _tinted(colours: Tensor, parts: Parts, soft: Sequence[tuple[str, Tensor, tuple[int, ...]]] = ()) -> Tensor:
+    """Colours with soft parts, pinned and pushed Gaussians tinted and static ones grey and pale."""
+    for _, mask, tint in soft:
+        target = torch.tensor(tint, dtype=colours.dtype, device=colours.device) / 255
+        colours = torch.where(mask.to(colours.device)[:, None], 0.6 * colours + 0.4 * target, colours)
     still = (~(parts.simulated | parts.carried)).to(colours.device)
     grey = 0.5 + 0.4 * colours.mean(-1, keepdim=True).expand_as(colours)
     colours = torch.where(still[:, None], grey, colours)
@@ -368,10 +381,8 @@ def _draw_up(draw: ImageDraw, font: Any, base: Tensor, up: Tensor, camera: Camer
     draw.text((36, camera.height - 36), "up", fill=UP, font=font)
 
 
-def _legend(
-    draw: ImageDraw, font: FreeTypeFont | ImageFont, parts: Parts, simulation: Simulation, top: int, width: int
-) -> None:
-    """The meaning of the colours, below the views."""
+def _entries(parts: Parts, simulation: Simulation) -> list[tuple[tuple[int, ...], str]]:
+    """The colours of the views, and their meaning."""
     flow = mean_flow(simulation).tolist()
     entries = [
         (REGION, f"box of the {int(parts.simulated.sum()):,} simulated Gaussians [scene units]"),
@@ -383,6 +394,17 @@ def _legend(
     ]
     if bool(parts.pushed.any()):
         entries.append((PUSHED, f"pushed: {int(parts.pushed.sum()):,} Gaussians"))
+    return entries + [(tint, f"{name}: {int(mask.sum()):,} Gaussians, soft") for name, mask, tint in _soft(simulation)]
+
+
+def _legend(
+    draw: ImageDraw,
+    font: FreeTypeFont | ImageFont,
+    entries: Sequence[tuple[tuple[int, ...], str]],
+    top: int,
+    width: int,
+) -> None:
+    """The meaning of the colours, below the views."""
     for k, (colour, text) in enumerate(entries):
         x, y = 14 + (k % 2) * (width // 2), top + 12 + 24 * (k // 2)
         draw.rectangle([x, y + 2, x + 16, y + 14], fill=colour)

@@ -1,4 +1,4 @@
-"""What moves in a capture of a place: its ground, what is far away, and the things between, the likeliest first."""
+"""The parts of a capture of a place: its ground, what is far away, and the things between, the likeliest first."""
 
 from __future__ import annotations
 
@@ -163,7 +163,7 @@ def survey(cloud: GaussianCloud, up: Sequence[float] | str | None = None) -> Pla
 
 
 def excerpt(place: Place, cloud: GaussianCloud, chosen: Sequence[int]) -> tuple[GaussianCloud, UpGuess, RegionGuess]:
-    """What a configuration for some things needs: the Gaussians around them, the up direction, and the region.
+    """All that a configuration for some things needs: the Gaussians around them, the up direction, and the region.
 
     Args:
         place: The parts of the splat.
@@ -176,13 +176,7 @@ def excerpt(place: Place, cloud: GaussianCloud, chosen: Sequence[int]) -> tuple[
     Raises:
         ValueError: If there is no such thing.
     """
-    for number in chosen:
-        if not 1 <= number <= len(place.things):
-            raise ValueError(f"Expected `--move` to name things from 1 to {len(place.things)}, but got {number}.")
-    mine = torch.zeros(len(cloud), dtype=torch.bool)
-    for number in chosen:
-        mine[place.things[number - 1].members] = True
-    around = nearby(cloud.means, mine)
+    mine, around = _members(place, cloud, chosen), near_things(place, cloud, chosen)
     part = torch.full((len(cloud),), -1)
     part[place.solid] = place.part
     part[mine] = int(place.part.max()) + 1
@@ -197,6 +191,22 @@ def excerpt(place: Place, cloud: GaussianCloud, chosen: Sequence[int]) -> tuple[
          f"{int(mine.sum()):,} Gaussians of opacity {place.threshold:g} and more"],
     )  # fmt: skip
     return shown, upward, region
+
+
+def near_things(place: Place, cloud: GaussianCloud, chosen: Sequence[int]) -> Tensor:
+    """The Gaussians at most one longest side away from some things, bool, shape (N,), as :func:`excerpt` takes them."""
+    return nearby(cloud.means, _members(place, cloud, chosen))
+
+
+def _members(place: Place, cloud: GaussianCloud, chosen: Sequence[int]) -> Tensor:
+    """The Gaussians of some things, bool, shape (N,)."""
+    for number in chosen:
+        if not 1 <= number <= len(place.things):
+            raise ValueError(f"Expected `--move` to name things from 1 to {len(place.things)}, but got {number}.")
+    mine = torch.zeros(len(cloud), dtype=torch.bool)
+    for number in chosen:
+        mine[place.things[number - 1].members] = True
+    return mine
 
 
 def _things(

@@ -13,6 +13,7 @@ from gaussian_swaying import _program as program
 from gaussian_swaying.gaussians.cloud import GaussianCloud
 from gaussian_swaying.gaussians.ply import OPAQUE_LOGIT
 from gaussian_swaying.preview.cost import Cost
+from gaussian_swaying.preview.parts import PlantParts
 from gaussian_swaying.preview.picture import classify, conditions, mean_flow
 from gaussian_swaying.preview.place import Place
 from gaussian_swaying.preview.starter import region_dict
@@ -82,11 +83,13 @@ def suggestion_lines(guess: Suggestion, further: int) -> list[str]:
         f"region          {region}: {guess.region.reason}",
         f"opacity         {guess.region.opacity_threshold:g} and above is simulated: {count:,} particles",
         f"held            at the {guess.hold.end}, {_why(guess.hold.confidence, guess.hold.reason)}"
-        if guess.pin is not None
+        if guess.fixed
         else "held            nowhere: it will fall",
     ]
     if guess.pin is not None:
         lines.append(f"  pin           {_short(region_dict(guess.pin))}")
+    if guess.parts is not None:
+        lines.append(f"parts           {guess.parts.words()}; one object instead: --hold bottom")
     lines += [
         f"size            {_numbers(guess.size)} m along the axes with z up; 1 scene unit = "
         f"{guess.metres_per_unit:.4g} m, assuming a longest side of {guess.longest_side:g} m",
@@ -272,6 +275,7 @@ def suggestion_dict(guess: Suggestion) -> dict[str, Any]:
             "reason": guess.region.reason,
         },
         "hold": asdict(guess.hold) | {"region": None if guess.pin is None else region_dict(guess.pin)},
+        "parts": None if guess.parts is None else _parts_dict(guess.parts),
         "longest_side_m": guess.longest_side,
         "metres_per_unit": guess.metres_per_unit,
         "size_m": list(guess.size),
@@ -286,6 +290,15 @@ def suggestion_dict(guess: Suggestion) -> dict[str, Any]:
         "thickness_m": guess.thickness,
         "stiffness_reason": guess.stiffness_reason,
     }
+
+
+def _parts_dict(parts: PlantParts) -> dict[str, Any]:
+    """Parts as plain numbers."""
+    of_part = {
+        part.name: {"role": part.role, "gaussians": int(parts.parts.mask(part.name).sum())}
+        for part in parts.parts.parts
+    }
+    return {"parts": of_part, "reason": parts.reason}
 
 
 def run_dict(simulation: Simulation) -> dict[str, Any]:

@@ -9,6 +9,8 @@ from typing import Any
 
 import numpy as np
 
+from gaussian_swaying.gaussians.parts import Parts
+
 
 @dataclass(frozen=True)
 class Preview:
@@ -20,6 +22,7 @@ class Preview:
         picture: 8-bit RGB, shape (H, W, 3).
         configurations: Their names and YAML, ``draft`` and ``starter``; none with ``--config``.
         things: What may move in a capture of a place, 8-bit RGB, shape (H, W, 3); None for an object.
+        parts: The parts of the object; None if there is only one.
     """
 
     report: str
@@ -27,6 +30,7 @@ class Preview:
     picture: np.ndarray
     configurations: dict[str, str]
     things: np.ndarray | None = None
+    parts: Parts | None = None
 
 
 def splat_name(path: str | Path) -> str:
@@ -43,10 +47,10 @@ def splat_name(path: str | Path) -> str:
 
 
 def write(preview: Preview, folder: Path) -> list[Path]:
-    """Write preview.json, preview.png and, where there are suggestions, things.png, draft.yaml and starter.yaml.
+    """Write preview.json and preview.png, and if there are any, things.png, parts.npz, draft.yaml and starter.yaml.
 
     An existing configuration that differs is kept as ``starter.1.yaml``, ``starter.2.yaml``, ..., since it may have
-    been edited.
+    been edited; and so are parts.
 
     Returns:
         The files.
@@ -60,13 +64,31 @@ def write(preview: Preview, folder: Path) -> list[Path]:
     if preview.things is not None:
         files.append(folder / "things.png")
         iio.imwrite(files[-1], preview.things)
+    if preview.parts is not None:
+        path = folder / "parts.npz"
+        if path.exists() and not _same(path, preview.parts):
+            path.rename(_unused(folder, "parts", "npz"))
+        files.append(preview.parts.save(path))
     for name, text in preview.configurations.items():
         path = folder / f"{name}.yaml"
         if path.exists() and path.read_text(encoding="utf-8") != text:
-            number = 1
-            while (folder / f"{name}.{number}.yaml").exists():
-                number += 1
-            path.rename(folder / f"{name}.{number}.yaml")
+            path.rename(_unused(folder, name, "yaml"))
         path.write_text(text, encoding="utf-8")
         files.append(path)
     return files
+
+
+def _same(path: Path, parts: Parts) -> bool:
+    """Return whether a file has these parts."""
+    try:
+        return Parts.load(path).digest() == parts.digest()
+    except ValueError:
+        return False
+
+
+def _unused(folder: Path, name: str, suffix: str) -> Path:
+    """The first of ``name.1.suffix``, ``name.2.suffix``, ... that does not exist."""
+    number = 1
+    while (folder / f"{name}.{number}.{suffix}").exists():
+        number += 1
+    return folder / f"{name}.{number}.{suffix}"

@@ -113,7 +113,9 @@ def _yaml(suggestion: Suggestion, ply: str | Path, frames: int, size: tuple[int,
       init_args:
         kind: {_kind(s)}
         region: {json.dumps(region_dict(s.pin))}"""
-    falls = s.sheet or s.pin is None
+    if s.parts is not None:
+        boundaries = " []               # what is held is said by scene.parts"
+    falls = s.sheet or not s.fixed
     gravity = "[0.0, 0.0, -9.8]" if falls else "[0.0, 0.0, 0.0] "
     why = "for cloth and objects without pins" if falls else "it was captured in balance with its weight"
     return f"""\
@@ -127,7 +129,7 @@ background: [0.93, 0.94, 0.96]
 scene:
   ply: {path}
   up: {_padded(json.dumps([round(c, 6) for c in s.up.direction]), 26)}# scene axes; confidence: {s.up.confidence}
-  longest_side: {s.longest_side:<16.6g}# m; the real one, if you know it
+  longest_side: {s.longest_side:<16.6g}# m; the real one, if you know it{_parts(s)}
 {_comment(s.region.reason, 2)}
   region: {where}
   opacity_threshold: {s.region.opacity_threshold:<11.6g}# fainter Gaussians follow their neighbours and weigh nothing
@@ -198,6 +200,14 @@ def _kind(s: Suggestion) -> str:
     return (
         "nodes             # all of the grid in the region, which cannot turn; hinge: points, for the edge of a sheet"
     )
+
+
+def _parts(s: Suggestion) -> str:
+    """The line that names the file of the parts, if there are any."""
+    if s.parts is None:
+        return ""
+    path = json.dumps(s.parts.path, ensure_ascii=False)
+    return f", without what is still\n{_comment(s.parts.words(), 2)}\n  parts: {path}"
 
 
 def _padded(text: str, width: int) -> str:

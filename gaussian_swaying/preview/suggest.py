@@ -26,6 +26,7 @@ from gaussian_swaying.geometry.regions import Box, Not, Region, Union
 from gaussian_swaying.mpm.materials import known_material
 from gaussian_swaying.preview.framing import orbit_frame, whole_box
 from gaussian_swaying.preview.hold import HoldGuess, end_region, given_hold, guess_hold
+from gaussian_swaying.preview.parts import PlantParts, plant_parts
 from gaussian_swaying.preview.photos import CapturedFrom, ShownObject, shown_object
 from gaussian_swaying.preview.shape import (
     FEWEST,
@@ -120,8 +121,8 @@ class Suggestion:
         up: The up direction.
         region: The simulated part.
         hold: The end at which it is held.
-        pin: That end as a region, None if it is not held.
-        longest_side: Assumed length of the longest side of the object [m].
+        pin: That end as a region, None if it is not held, or by ``parts``.
+        longest_side: Assumed length of the longest side of the object, without what is still [m].
         metres_per_unit: Resulting length of a scene unit [m].
         size: Sides of the object along the z-up axes [m].
         spacing: Particle spacing [m], see :func:`particle_spacing`.
@@ -139,6 +140,7 @@ class Suggestion:
         camera_offset: Vector from the centre of the moving part to that of the whole, in multiples of the longest side
             of the moving part.
         camera_radius: Distance of a camera that shows the whole, in the same unit.
+        parts: The parts of a plant in a pot, None for any other object.
         growth: Mean number of substeps of a frame over the number at rest, from the trial runs.
         real: Whether the numbers are those of the material; if not, they are such that it sways visibly.
     """
@@ -163,8 +165,14 @@ class Suggestion:
     whole: tuple[list[float], list[float]]
     camera_offset: tuple[float, ...]
     camera_radius: float
+    parts: PlantParts | None = None
     growth: float = 1.0
     real: bool = False
+
+    @property
+    def fixed(self) -> bool:
+        """True if something holds the object."""
+        return self.pin is not None or self.parts is not None
 
 
 def suggest(
@@ -234,19 +242,35 @@ def suggest(
         chosen = suggest_region(means, opacity, weight, upward.ground, cell, shown)
     else:
         chosen = given_region(means, opacity, weight, *region)
+    plant = plant_parts(cloud, chosen.simulated, upward.direction, weight) if hold is None else None
+    frame = SimFrame.fit(means[chosen.simulated], upward.direction, longest_side)
+    if plant is not None:  # the length is that of the plant with its pot
+        if upward.confidence in ("low", "medium"):
+            why = [*upward.reasons, "a plant stands in a pot at the lower end"]
+            upward = replace(upward, confidence="high", reasons=why)
+        chosen = replace(chosen, simulated=chosen.simulated & ~plant.still)
+        frame = SimFrame.fit(means[chosen.simulated], upward.direction, None, frame.metres_per_unit)
     points, visible = means[chosen.simulated], weight[chosen.simulated]
-    frame = SimFrame.fit(points, upward.direction, longest_side)
     metres = frame.point_to_sim(points.double())
+    if plant is not None:
+        longest_side = float((metres.amax(0) - metres.amin(0)).amax())
     spacing = particle_spacing(points) * frame.metres_per_unit
     dx = suggest_spacing(longest_side, spacing, CELLS)
-    if hold is None:
+    if plant is not None:
+        down = tuple(0.0 - c for c in upward.direction)
+        held = HoldGuess("bottom", down, "medium", f"a plant in a pot: {plant.reason}")
+    elif hold is None:
         rest = means[~chosen.simulated & (opacity >= chosen.opacity_threshold)]
         eyes = None if capture is None else capture.eyes
         wall = None if shown is None else shown.wall(upward.direction)
         held = guess_hold(points, visible, upward.direction, dx / frame.metres_per_unit, rest, eyes, wall)
     else:
         held = given_hold(hold, upward.direction)
-    pin = None if held.end == "none" else end_region(points, held.direction, dx / frame.metres_per_unit)
+    pin = (
+        None
+        if held.end == "none" or plant is not None
+        else end_region(points, held.direction, dx / frame.metres_per_unit)
+    )
     azimuth, turn = broad_side(metres), 20.0  # the broad side, seen slightly from the side
     front = None if capture is None else photo_azimuth(capture.eyes, points.double().mean(0), frame.rotation)
     if front is not None:
@@ -260,6 +284,8 @@ def suggest(
     elif flat is not None:  # a curtain is moved by wind that hits its face
         flow = _across_picture(azimuth - 90, speed)
     outside = upward.ground if shown is None else upward.ground | ~shown.mask
+    if plant is not None:
+        outside = outside | plant.around
     whole = whole_box(means, opacity, chosen.simulated, outside, dx / frame.metres_per_unit)
     offset, radius = orbit_frame(whole, (points.amin(0).tolist(), points.amax(0).tolist()))
     suggestion = Suggestion(
@@ -283,6 +309,7 @@ def suggest(
         whole=whole,
         camera_offset=offset,
         camera_radius=radius,
+        parts=plant,
     )
     return at_quality(suggestion, quality)
 

@@ -141,7 +141,9 @@ def test_the_preview_of_a_place(file, garden, tmp_path, capsys, monkeypatch):
     assert green[:, :300].sum() > 500
     assert green[:, 300:].sum() > 500
     simulation = Simulation.from_yaml(out / "starter.yaml", device="cpu")
-    chosen = _mask(simulation.scene.simulated)
+    parts = simulation.scene.parts  # of the whole file, though only what is around the plant was looked at
+    assert not bool((_mask(simulation.scene.simulated) & parts.mask(role="still")).any())
+    chosen = _mask(simulation.scene.simulated) | parts.mask("pot")
     assert _overlap(chosen, garden[1]) > 0.97
     assert len(simulation.scene.model.means) == COUNT
     region = yaml.safe_load((out / "starter.yaml").read_text())["scene"]["region"]
