@@ -38,6 +38,7 @@ from .rendering.cameras.camera_path import LookAtCamera as LookAtCamera
 from .rendering.cameras.camera_path import OrbitCamera as OrbitCamera
 from .rendering.shading import DiffuseShader as DiffuseShader
 from .rendering.shading import PhongShader as PhongShader
+from .simulation.copies import Copy as Copy
 from .simulation.diagnostics import SimulationDiverged as SimulationDiverged
 from .simulation.edits import Edit as Edit
 from .simulation.frame import Frame as Frame

@@ -191,6 +191,8 @@ class SpatialWind(Recordable, nn.Module, ABC):
     ``recordable = True``.
     """
 
+    uniform: bool = False
+
     @abstractmethod
     def forward(self, time: Tensor, position: Tensor) -> Tensor:
         """Air velocity at given positions.

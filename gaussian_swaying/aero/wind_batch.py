@@ -39,6 +39,7 @@ class WindBatch(Recordable, nn.Module):
     """
 
     recordable = True
+    uniform = True
 
     def __init__(self, winds: Sequence[WindField]) -> None:
         super().__init__()

@@ -108,7 +108,7 @@ class WindForce(Force):
     @property
     def uniform(self) -> bool:
         """True if the wind is the same everywhere in a scene."""
-        return all(isinstance(w, WindBatch) or (isinstance(w, WindField) and w.uniform) for w in self._fields)
+        return all(bool(wind.uniform) for wind in self._fields)
 
     @property
     def recordable(self) -> bool:  # type: ignore[override]

@@ -151,6 +151,8 @@ def session_of(parser: ArgumentParser, settings: Namespace, real_time: bool) -> 
     Raises:
         ValueError: If the simulation cannot be made, or cannot start.
     """
+    if settings.copies:
+        raise ValueError("The live page shows one object: leave out `copies`, or record them with `sim`.")
     simulation = Simulation.from_settings(parser, settings)
     if simulation.device.type == "cpu":
         share_cores()

@@ -59,6 +59,8 @@ def _simulate(parser: ArgumentParser, arguments: Sequence[str], started: list[Si
     scene = simulation.scene
     by = f" by {scene.points.count:,} points" if scene.points.count != len(scene.simulated) else ""
     print(f"{len(scene.simulated):,} of {len(scene.model.means):,} Gaussians simulated{by} on {simulation.device}")
+    if simulation.stepper.copies is not None:
+        print(f"{len(simulation.stepper.copies)} copies of them")
     if scene.loose:
         print(f"{scene.loose:,} loose ones follow their neighbours")
     if scene.filled:

@@ -28,10 +28,12 @@ class _Group:
 
 
 def check_variants(simulation: Simulation) -> None:
-    """Raise ValueError if a simulation has parts that cannot be a batch: timed edits, contact, shelter."""
+    """Raise ValueError if a simulation has parts that cannot be a batch: timed edits, contact, shelter, copies."""
     why = why_not_batched(simulation.setup)
     if simulation.editor.edits:
         why = "`edits` change its material; put it into `material`"
+    if simulation.stepper.copies is not None:
+        why = "it has `copies`, and a video shows one object; remove them"
     if why is not None:
         raise ValueError(f"The base cannot be fitted through: {why}.")
 

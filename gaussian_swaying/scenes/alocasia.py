@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 import torch
 
+from gaussian_swaying._checks import check_positive
 from gaussian_swaying.gaussians.cloud import GaussianCloud
 from gaussian_swaying.scenes.patches import Patches, facing, join, to_cloud, tube
 from gaussian_swaying.scenes.plant_parts import Draw, bezier, leaf, pot
@@ -24,20 +25,26 @@ class AlocasiaScene(ProceduralScene):
         spacing: Distance between Gaussians [m].
         leaves: Number of leaves.
         seed: Seed of the growth.
+        clear_floor: Radius of a floor without shadows and with small Gaussians, where copies can stand [m]; 0 for the
+            floor of one plant.
     """
 
     spacing: float = 0.005
     leaves: int = 8
     seed: int = 0
+    clear_floor: float = 0.0
 
     def __post_init__(self) -> None:
         self.check("leaves", coarsest=0.2)
+        check_positive("generator.clear_floor", self.clear_floor, allow_zero=True)
 
     def generate(self) -> GaussianCloud:
         """Make the plant."""
         h, draw = self.spacing, Draw(self.seed)
         shade = (cast((0.0, 0.0, 0.8), 0.50, 0.22), cast((0.0, 0.0, 0.1), 0.22, 0.5), (0.0, 0.0, 0.19, 0.55))
-        ground = floor(max(2 * h, 0.02), (0.86, 0.82, 0.76), shade, fade=(0.9, 3.5))
+        flat = self.clear_floor
+        far = max(flat, 0.9), max(flat + 2.0, 3.5)
+        ground = floor(max(2 * h, 0.02), (0.86, 0.82, 0.76), () if flat else shade, flat=flat, fade=far)
         parts = [ground, pot(0.22, 0.13, 0.17, max(h, 0.01), (0.86, 0.84, 0.80))]
         up = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)
         for number in range(self.leaves):

@@ -26,6 +26,8 @@ def batch_of(members: Sequence[Simulation]) -> Stepper:
         ValueError: If they cannot be a batch.
     """
     first = members[0]
+    if any(member.stepper.copies is not None for member in members):
+        raise ValueError("These cannot be simulated as a batch: they have `copies`, which are one already.")
     if any(member.editor.edits for member in members):
         raise ValueError("These cannot be simulated as a batch: they have `edits`; put their material into `material`.")
     solver = first.solver.like(first.setup.solver)

@@ -27,6 +27,7 @@ from gaussian_swaying.rendering.cameras.camera import azimuth_beside
 from gaussian_swaying.rendering.cameras.camera_path import CameraPath, OrbitCamera
 from gaussian_swaying.rendering.shading import Shader
 from gaussian_swaying.scenes.procedural import GivenScene, ProceduralScene
+from gaussian_swaying.simulation.copies import Copy
 from gaussian_swaying.simulation.edits import Edit
 from gaussian_swaying.simulation.extent import suggest_spacing
 from gaussian_swaying.simulation.material import Material
@@ -191,8 +192,9 @@ _KINDS: dict[str, tuple[type, ...]] = {
     "camera": (CameraPath,),
     "cameras": (Mapping,),
     "edits": (list, tuple),
+    "copies": (list, tuple),
     "recorder": (Recorder,),
     "normalisation": (Normalisation,),
     "hold": (Region, PinnedRegion, PinnedPoints),
 }
-_LISTS: dict[str, type] = {"forces": Force, "edits": Edit}
+_LISTS: dict[str, type] = {"forces": Force, "edits": Edit, "copies": Copy}

@@ -83,9 +83,11 @@ class Frame:
 
         Raises:
             FileNotFoundError: If the folder does not exist.
-            ValueError: If the ending or the format is unknown, or no Gaussian is finite.
+            ValueError: If the ending or the format is unknown, no Gaussian is finite, or the simulation has copies.
             ImportError: If the format is USD and usd-core is not installed.
         """
+        if self.editor.stepper.copies is not None:
+            raise ValueError("`copies` cannot be written as a splat yet: write the object alone, without them.")
         place, fps = self.painter.scene.frame, 1 / self.editor.stepper.frame_dt
         export_cloud(
             path, self.gaussians, format=format, fps=fps, metres_per_unit=place.metres_per_unit, rotation=place.rotation

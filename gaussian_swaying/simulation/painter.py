@@ -75,6 +75,16 @@ class Painter(nn.Module):
         return self.background.device
 
     @property
+    def center(self) -> Tensor:
+        """Centre of what moves at rest, at which cameras look [scene units], shape (3,)."""
+        return self.scene.center
+
+    @property
+    def size(self) -> float:
+        """Longest side of what moves at rest [scene units]."""
+        return self.scene.size
+
+    @property
     def renderer(self) -> Renderer:
         """The renderer that draws the Gaussians."""
         if self._renderer is None:
@@ -106,8 +116,8 @@ class Painter(nn.Module):
 
     def _camera(self, frame: int, name: str = "") -> Camera:
         """The camera of a frame, in float64 on the host."""
-        scene, path = self.scene, self.cameras[name] if name else self.camera
-        return path(frame, frame * self.frame_dt, scene.center, scene.frame.rotation[2], scene.size)
+        path = self.cameras[name] if name else self.camera
+        return path(frame, frame * self.frame_dt, self.center, self.scene.frame.rotation[2], self.size)
 
     def check_camera(self, frame: int) -> None:
         """Raise ValueError if a camera of a frame lies inside the box of the object at rest, or has too many pixels.
@@ -125,12 +135,17 @@ class Painter(nn.Module):
             if path.captured:
                 continue
             eye = camera.position.to(low)
-            if bool(((eye > low) & (eye < high)).all()):
+            if self._hits(eye):
                 raise ValueError(
                     f"The camera at {[round(v, 3) for v in eye.tolist()]} lies inside the object, whose box reaches "
                     f"from {[round(v, 3) for v in low.tolist()]} to {[round(v, 3) for v in high.tolist()]} (scene "
                     f"units): move it out with `{field}.init_args.radius` or `eye`."
                 )
+
+    def _hits(self, eye: Tensor) -> bool:
+        """True if a point (3,) lies inside the box of the object at rest."""
+        low, high = self.scene.bounds
+        return bool(((eye > low) & (eye < high)).all())
 
     @in_turn
     def deformed(self, state: State) -> DeformedGaussians:
@@ -159,7 +174,7 @@ class Painter(nn.Module):
         if len(means) > RECORDED and not scene.all_move:
             still, harmonics = self._still_colours(camera, eye)
             turned = gaussians.rotations[index] if scene.model.view_dependent else None
-            view, colours = _seen(harmonics, eye, means[index], turned)
+            view, colours = seen_from(harmonics, eye, means[index], turned)
             return still.index_copy(0, index, self._shaded(colours, gaussians.normals[index], view))
         given = [eye, means, gaussians.normals]
         given += [gaussians.rotations] if scene.model.view_dependent else []
@@ -170,7 +185,7 @@ class Painter(nn.Module):
 
     def _colors(self, eye: Tensor, means: Tensor, normals: Tensor, rotations: Tensor | None = None) -> Tensor:
         scene, index = self.scene, self.scene.moving
-        view, colours = _seen(scene.model.sh, eye, means, rotations)
+        view, colours = seen_from(scene.model.sh, eye, means, rotations)
         if scene.all_move:
             return self._shaded(colours, normals, view)
         if self.shader is None:
@@ -208,8 +223,9 @@ class Painter(nn.Module):
     @in_turn
     def draw(self, gaussians: DeformedGaussians, colours: Tensor, camera: Camera) -> RenderOutput:
         """Draw Gaussians in scene units."""
-        opacity = self.scene.model.opacity()
-        return self.renderer(gaussians.means, gaussians.covariances, opacity, colours, camera, self.background)
+        return self.renderer(
+            gaussians.means, gaussians.covariances, self.opacity(), colours, camera, self.background
+        )
 
     @in_turn
     def render(self, state: State, frame: int, name: str = "") -> RenderOutput:
@@ -266,15 +282,19 @@ class Painter(nn.Module):
 
     def _draw(self, gaussians: DeformedGaussians, values: Tensor, camera: Camera) -> RenderOutput:
         """Blend any three values of each Gaussian."""
-        return self.renderer(gaussians.means, gaussians.covariances, self.scene.model.opacity(), values, camera)
+        return self.renderer(gaussians.means, gaussians.covariances, self.opacity(), values, camera)
+
+    def opacity(self) -> Tensor:
+        """Opacities of the Gaussians that are drawn, shape (N,)."""
+        return self.scene.model.opacity()
 
     def depth_range(self, frame: int, name: str) -> tuple[float, float]:
         """Ends of the depth's colour scale [scene units]: one longest side before and behind the object's centre."""
-        distance = float((self._camera(frame, name).position.to(self.scene.center) - self.scene.center).norm())
-        return distance - self.scene.size, distance + self.scene.size
+        distance = float((self._camera(frame, name).position.to(self.center) - self.center).norm())
+        return distance - self.size, distance + self.size
 
 
-def _seen(sh: Tensor, eye: Tensor, means: Tensor, rotations: Tensor | None) -> tuple[Tensor, Tensor]:
+def seen_from(sh: Tensor, eye: Tensor, means: Tensor, rotations: Tensor | None) -> tuple[Tensor, Tensor]:
     """Directions from the eye, and colours from there in the rest frame of each Gaussian, both (N, 3)."""
     view = torch.nn.functional.normalize(means - eye, dim=-1)
     at_rest = view if rotations is None else (view[..., None] * rotations).sum(-2)

@@ -21,6 +21,7 @@ from gaussian_swaying.recording.recorder import Recorder, frame_folder
 from gaussian_swaying.rendering import passes
 from gaussian_swaying.runs import signals
 from gaussian_swaying.runs.seal import sha256
+from gaussian_swaying.simulation.copies import check_recorder
 from gaussian_swaying.simulation.diagnostics import SimulationDiverged, entry_names
 from gaussian_swaying.simulation.edits import SceneEditor
 from gaussian_swaying.simulation.frame import frames_from
@@ -168,6 +169,8 @@ class Run:
     ) -> None:
         self.painter, self.editor, self.recorder, self.frames, self.config = painter, editor, recorder, frames, config
         self.stepper, self.scene = editor.stepper, painter.scene
+        if self.stepper.copies is not None:
+            check_recorder(recorder)
         self.files: list[Path] = []
         self.log: list[dict[str, Any]] = []
         self._lines: list[str] = []  # the log as a checkpoint stores it, which is written every frame
@@ -394,6 +397,7 @@ class Run:
             "seed": getattr(stepper.setup.wind, "seed", None),
             "splat_sha256": self.splat,
             "particles": points.count,
+            "copies": 1 if stepper.copies is None else len(stepper.copies),
             "gaussians": len(scene.model.means),
             "simulated_gaussians": len(scene.simulated),
             "loose_gaussians": scene.loose,

@@ -242,6 +242,14 @@ class SimulatedScene(nn.Module):
             All Gaussians, the static ones at rest.
         """
         rest, index = self.rest(), self.moving
+        parts: dict[str, Any] = self.moved(state, rotations)
+        if not self.all_move:
+            parts = {name: getattr(rest, name).index_copy(0, index, part) for name, part in parts.items()}
+        return replace(rest, **parts)
+
+    def moved(self, state: State, rotations: bool = True) -> dict[str, Any]:
+        """The Gaussians that move, in the order of ``moving``: the fields that :meth:`deformed` changes, by name."""
+        rest, index = self.rest(), self.moving
         own = rest.means, rest.covariances, rest.normals
         if not self.all_move:
             own = rest.means[index], rest.covariances[index], rest.normals[index]
@@ -253,11 +261,8 @@ class SimulatedScene(nn.Module):
             move, F = self.frame.displacement_to_scene(move.to(kind)), self.frame.gradient_to_scene(F.to(kind))
             moved = own[0] + move, *deform_all(F, *own[1:], rotations, self.max_stretch, solid)
         means, covariances, normals, turns = moved
-        parts: dict[str, Any] = {"means": means, "covariances": covariances, "normals": normals}
-        parts |= {} if turns is None else {"rotations": turns}
-        if not self.all_move:
-            parts = {name: getattr(rest, name).index_copy(0, index, part) for name, part in parts.items()}
-        return replace(rest, **parts)
+        parts = {"means": means, "covariances": covariances, "normals": normals}
+        return parts if turns is None else parts | {"rotations": turns}
 
     def surface(self, state: State) -> tuple[Tensor, Tensor]:
         """Position [m], shape (S, 3), and F, shape (S, 3, 3), of the points that a trajectory records.

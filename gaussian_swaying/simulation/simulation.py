@@ -38,6 +38,8 @@ from gaussian_swaying.recording.recorder import Recorder
 from gaussian_swaying.rendering.cameras.camera_path import CameraPath
 from gaussian_swaying.rendering.protocol import Renderer
 from gaussian_swaying.rendering.shading import Shader
+from gaussian_swaying.simulation.copies import Copy, copies_of
+from gaussian_swaying.simulation.copies_painter import CopiesPainter
 from gaussian_swaying.simulation.defaults import (
     DeviceLike,
     HoldLike,
@@ -98,6 +100,9 @@ class Simulation:
         normalisation: Read boundaries, and the regions of material and edits, in PhysGaussian's normalised space; null
             for scene units.
         background: Background colour in [0, 1].
+        copies: Copies of the object, each with a place, a turn and gusts of its own. They are simulated together,
+            without touching each other, and drawn from the one splat at these places and nowhere else. Empty for the
+            object alone. See docs/many.md.
         frame_dt: Time between frames [s].
         dtype: Precision of the solver.
         device: auto uses a CUDA GPU if there is one, else the CPU. ``mps`` (a Mac) runs torch's substeps and renderer,
@@ -146,6 +151,7 @@ class Simulation:
         recorder: Recorder | None = None,
         normalisation: Normalisation | None = None,
         background: list[float] = [0.0, 0.0, 0.0],  # noqa: B006
+        copies: list[Copy] = [],  # noqa: B006
         frame_dt: float = 0.04,
         dtype: Literal["float32", "float64"] = "float32",
         device: DeviceLike = "auto",
@@ -188,12 +194,14 @@ class Simulation:
         blowing = as_wind(wind, model.frame)
         camera = as_camera(camera, cameras, blowing, model)
         own = tuple(force.in_frame(model.frame) for force in as_forces(forces))
-        self._painter = Painter(model, shader, camera, cameras, colour, frame_dt, renderer)
         setup = Setup(model, material, model.points, blowing, aero or AeroForce(), own, solver.settings)
-        self._stepper = Stepper(solver, setup, float(frame_dt), turn=self._painter.turn)
+        placed = copies_of(copies, setup, solver) if copies else None
+        drawing = (shader, camera, cameras, colour, frame_dt, renderer)
+        self._painter = Painter(model, *drawing) if placed is None else CopiesPainter(model, placed, *drawing)
+        self._stepper = Stepper(solver, setup, float(frame_dt), turn=self._painter.turn, copies=placed)
         self.to(target)
         self._editor = SceneEditor(self._stepper, edits)
-        self._recorder = recorder or Recorder()
+        self._recorder = self._recorder_or(recorder)
         self.frames_wanted = 250  # of a run; those of the file, if there is one
         self.files: list[Path] = []  # what the last run wrote
         self.resumable: tuple[Path, int] | None = None  # the checkpoint of the last run, and its frame
@@ -309,7 +317,13 @@ class Simulation:
     @recorder.setter
     def recorder(self, recorder: Recorder | None) -> None:
         check_types({"recorder": recorder})
-        self._recorder = recorder or Recorder()
+        self._recorder = self._recorder_or(recorder)
+
+    def _recorder_or(self, recorder: Recorder | None) -> Recorder:
+        """A recorder, or one by default: with copies, of pictures."""
+        if recorder is None and self._stepper.copies is not None:
+            return Recorder(trajectory=False, nodes=False)
+        return recorder or Recorder()
 
     @in_turn
     def change(self, state: State, values: Mapping[str, Any]) -> State:
@@ -376,9 +390,9 @@ class Simulation:
         scene = other_with(self.scene, points=setup.points, model=other_with(self.scene.model, sh0=sh0, shN=shN))
         other._painter = other_with(self._painter, scene=scene)
         setup = replace(setup, scene=scene, wind=move(setup.wind, self.device))
-        other._stepper = Stepper(solver, setup, self.frame_dt, turn=self.turn)
+        other._stepper = Stepper(solver, setup, self.frame_dt, turn=self.turn, copies=self._stepper.copies)
         other._editor = SceneEditor(other._stepper, self._editor.edits)
-        other._recorder, other.files, other._given = recorder or Recorder(), [], dict(self._given)
+        other._recorder, other.files, other._given = self._recorder_or(recorder), [], dict(self._given)
         other.config = config
         return other
 

@@ -24,6 +24,7 @@ from gaussian_swaying.mpm.forces import Force
 from gaussian_swaying.mpm.protocol import Solver
 from gaussian_swaying.mpm.state import MaterialPoints, State
 from gaussian_swaying.mpm.timestep import MAX_CFL, rounding_speed
+from gaussian_swaying.simulation.copies import Copies
 from gaussian_swaying.simulation.diagnostics import (
     FrameDiagnostics,
     Gauge,
@@ -61,10 +62,12 @@ class Stepper:
         setups: Scene, material and drivers; or those of each scene of a batch.
         frame_dt: Length of a frame [s].
         turn: Lock of the thread that steps; its own if None.
+        copies: Copies of the one scene, which are then the scenes of a batch; None for the scene alone.
         lenient: Whether a scene of a batch may diverge: it then ends in NaN, and the others go on.
 
     Attributes:
-        setups: The setups now; :meth:`take` changes them.
+        setup: Scene, material and drivers; those of the first scene of a batch, without the places of copies.
+        setups: The setups of all scenes now; :meth:`take` changes them.
         starts: How often it was started.
         progress: Shows how far a frame is, if there is one.
         most_substeps: A frame that needs more ends the run.
@@ -80,10 +83,12 @@ class Stepper:
         frame_dt: float,
         *,
         turn: Turn | None = None,
+        copies: Copies | None = None,
         lenient: bool = False,
     ) -> None:
-        self.batched = not isinstance(setups, Setup)
-        self.setups = (setups,) if isinstance(setups, Setup) else tuple(setups)
+        self.batched, self.copies = copies is not None or not isinstance(setups, Setup), copies
+        self.setup = setups if isinstance(setups, Setup) else setups[0]
+        self.setups = self._spread(setups) if isinstance(setups, Setup) else tuple(setups)
         reasons = [why for setup in self.setups if self.batched and (why := why_not_batched(setup)) is not None]
         if reasons:
             raise ValueError(f"These cannot be simulated as a batch: {reasons[0]}.")
@@ -99,10 +104,9 @@ class Stepper:
 
     # ---- what acts
 
-    @property
-    def setup(self) -> Setup:
-        """Scene, material and drivers; those of the first scene of a batch."""
-        return self.setups[0]
+    def _spread(self, setup: Setup) -> tuple[Setup, ...]:
+        """The setups of the scenes that one setup stands for."""
+        return (setup,) if self.copies is None else self.copies.setups(setup)
 
     @property
     def scene(self) -> SimulatedScene:
@@ -117,7 +121,7 @@ class Stepper:
     @property
     def wind_force(self) -> WindForce:
         """The wind on the patches of the scene, or of all scenes."""
-        first = self.setup
+        first = self.setups[0]
         parts = (first.aero, first.scene.patches, *(setup.wind for setup in self.setups))
         if self._wind_force is None or any(a is not b for a, b in zip(self._wind_force[0], parts, strict=True)):
             with torch.inference_mode(False), torch.no_grad():  # it outlives the call
@@ -142,12 +146,12 @@ class Stepper:
 
     def flows(self) -> Tensor:
         """Flows of the wind without gusts [m/s], shape (K, 3); those of a spatial wind are at the particles."""
-        winds = [setup.wind for setup in self.setups]
+        winds = [setup.wind for setup in (self.setups if self.copies is None else [self.setup])]
         flows = [wind.flows for wind in winds if isinstance(wind, WindField)]
         if len(flows) == len(winds):
             return torch.cat(flows)
         position = self.setup.points.position
-        position = position.expand(len(winds), *position.shape) if self.batched else position
+        position = position.expand(len(self.setups), *position.shape) if self.batched else position
         air = self.wind_force.air(torch.zeros((), dtype=torch.float64, device=double_home(position.device)), position)
         return air.reshape(-1, 3)
 
@@ -242,7 +246,7 @@ class Stepper:
         Returns:
             The state from which the run continues.
         """
-        before, self.setups = self.setup, (setup,)
+        before, self.setup, self.setups = self.setup, setup, self._spread(setup)
         if setup.solver is not before.solver:
             self.solver.settings = setup.solver
         if state is None or (setup.points is before.points and setup.solver is before.solver):

@@ -246,3 +246,18 @@ def test_a_wall_stands_before_the_ficus():
     wall = cloud.means[len(tree) :]
     torch.testing.assert_close(wall.amin(0), torch.tensor([-1.6, -1.2, 0.0]), rtol=0, atol=0.06)
     torch.testing.assert_close(wall.amax(0), torch.tensor([-1.4, 1.2, 1.3]), rtol=0, atol=0.06)
+
+
+def test_a_clear_floor_is_fine_and_has_no_shadows():
+    """Small Gaussians of one colour but for its grain within the radius; without it the pot stands in a shadow."""
+    found = []
+    for radius in (0.0, 2.0):
+        cloud = AlocasiaScene(spacing=0.02, clear_floor=radius).generate()
+        flat, away = cloud.means[:, 2].abs() < 1e-6, cloud.means[:, :2].norm(dim=-1)
+        near, far = flat & (away > 0.2) & (away < 0.6), flat & (away > 1.5) & (away < 2.0)
+        found.append((float(cloud.sh[near, 0].std(0).max()), float(cloud.scales[far].amax(-1).exp().mean())))
+    (shaded, wide), (plain, small) = found
+    assert plain < 0.05 < 0.15 < shaded
+    assert small < 0.04 < 0.08 < wide
+    with pytest.raises(ValueError, match=r"`generator\.clear_floor` to not be negative"):
+        AlocasiaScene(clear_floor=-1.0)

@@ -1,0 +1,445 @@
+"""One object, many copies: each as a simulation of its own in its own wind, drawn from one splat.
+
+Covers: simulation.copies_painter.
+"""
+
+import math
+import re
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+import yaml
+from small_scenes import together
+from torch.utils._python_dispatch import TorchDispatchMode
+
+from gaussian_swaying.aero.shelter import Shelter
+from gaussian_swaying.aero.wind import FlowKey, GaussianGust, SpatialWind, UniformGust, WindField
+from gaussian_swaying.cli.live import session_of
+from gaussian_swaying.cli.simulate import main
+from gaussian_swaying.fitting.variants import check_variants
+from gaussian_swaying.gaussians.harmonics import rotate_sh, sh_to_color
+from gaussian_swaying.geometry.regions import Box
+from gaussian_swaying.mpm.boundaries.pinned_points import PinnedPoints
+from gaussian_swaying.mpm.boundaries.pinned_region import PinnedRegion
+from gaussian_swaying.mpm.contact.surface import Contact
+from gaussian_swaying.mpm.forces import Force
+from gaussian_swaying.mpm.solver import MPMSolver
+from gaussian_swaying.recording.recorder import Recorder
+from gaussian_swaying.rendering.cameras.camera_path import LookAtCamera, OrbitCamera
+from gaussian_swaying.rendering.shading import DiffuseShader
+from gaussian_swaying.scenes.procedural import FlagScene, GivenScene
+from gaussian_swaying.simulation.batch import batch_of
+from gaussian_swaying.simulation.copies import Copy
+from gaussian_swaying.simulation.edits import Edit
+from gaussian_swaying.simulation.material import Material
+from gaussian_swaying.simulation.scene import Scene
+from gaussian_swaying.simulation.simulation import Simulation
+
+POLE = Box([None, None, None], [0.11, None, None])
+AXIS = FlagScene(spacing=0.1).generate().means[0]  # the middle of the particles that POLE holds; only x and y count
+ROW = [Copy(), Copy([0.0, 1.5, 0.0], 90.0), Copy([0.5, 3.0, 0.2], 200.0, delay=0.1)]
+
+
+class Whirl(SpatialWind):
+    """Air that turns about a vertical axis through a place, faster farther away."""
+
+    def __init__(self, center=(0.0, 0.0)):
+        super().__init__()
+        self.center = center
+
+    def forward(self, time, position):
+        x, y = position[..., 0] - self.center[0], position[..., 1] - self.center[1]
+        return torch.stack([2.0 - y, 3.0 + x, 0.3 * torch.ones_like(x)], dim=-1)
+
+
+class Push(Force):
+    """A force of one's own."""
+
+    def forward(self, state):
+        return torch.ones_like(state.position), None
+
+
+def _coloured(degree=1):
+    """A flag of 96 Gaussians whose colours depend on the direction, and ten Gaussians far below that do not move."""
+    flag, draw = FlagScene(spacing=0.1).generate(), torch.Generator().manual_seed(0)
+    still = flag.select(torch.arange(96) < 10)
+    both = together(flag, replace(still, means=still.means - torch.tensor([0.0, 0.0, 5.0])))
+    more = 0.3 * (torch.rand(106, (degree + 1) ** 2 - 1, 3, generator=draw) - 0.5)
+    return replace(both, sh=torch.cat([both.sh, more], dim=1))
+
+
+def _simulation(copies=(), wind=None, cloud=None, solver=None, scene=None, **more):
+    solver = {"dx": 0.2, "boundaries": [PinnedRegion(POLE)], "gravity": (0.0, 0.0, 0.0)} | (solver or {})
+    scene = {"region": Box([None, None, -2.0], [None, None, None]), "points": "gaussian"} | (scene or {})
+    settings = {"camera": OrbitCamera(width=48, height=27, azimuth=-70.0, radius=1.9), "device": "cpu"}
+    return Simulation(
+        Scene(generator=GivenScene(_coloured() if cloud is None else cloud), **scene),
+        Material(E=3e3, density=30.0),
+        solver=MPMSolver(**solver),
+        wind=WindField([6.0, 1.5, 0.0]) if wind is None else wind,
+        copies=list(copies),
+        **(settings | more),
+    )
+
+
+def _end(simulation, frames=4):
+    """The last of some frames."""
+    return list(simulation.frames(frames))[-1]
+
+
+def _turn(degrees):
+    s, c = math.sin(math.radians(degrees)), math.cos(math.radians(degrees))
+    return torch.tensor([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]], dtype=torch.float64)
+
+
+def _gusty(seed=5):
+    return WindField([6.0, 1.5, 0.0], modulations=[UniformGust(0.5), GaussianGust(1.0)], seed=seed)
+
+
+# ---- motion
+
+
+@pytest.mark.parametrize("points", ["gaussian", "grid"])
+@pytest.mark.parametrize("formulation", ["total", "updated"])
+def test_a_copy_alone_is_the_object_to_the_bit(formulation, points):
+    if points == "grid" and formulation == "updated":
+        points = None
+    more = {"solver": {"formulation": formulation}, "scene": {"points": points}, "wind": _gusty()}
+    one, copy = (_end(_simulation(copies, **more)) for copies in ([], [Copy()]))
+    assert torch.equal(copy.state.position[0], one.state.position)
+    assert torch.equal(copy.render().color, one.render().color)
+    assert float((one.state.position - _simulation(**more).start().position).abs().max()) > 0.01
+
+
+def test_all_take_the_substeps_of_the_fastest():
+    """With the substep of a run of its own a copy is that run; otherwise they differ by the error of the time step."""
+    copies, wind = [Copy(), Copy([0.0, 2.0, 0.0], 90.0)], WindField([6.0, 0.0, 0.0])
+    fixed = {"solver": {"substep": 0.002}, "dtype": "float64"}
+    both = _end(_simulation(copies, wind, **fixed)).state.position
+    for own, flow in zip(both, ([6.0, 0.0, 0.0], [0.0, -6.0, 0.0]), strict=True):
+        alone = _end(_simulation([], WindField(flow), **fixed)).state.position
+        torch.testing.assert_close(own, alone, rtol=0, atol=1e-9)
+    assert float((both[0] - both[1]).abs().max()) > 0.01
+    free = _end(_simulation(copies, wind)).state.position
+    torch.testing.assert_close(free.double(), both, rtol=0, atol=0.01)
+
+
+@pytest.mark.parametrize("degrees", [37.0, 90.0, -120.0])
+def test_a_turned_copy_in_a_turned_wind_moves_alike(degrees):
+    """Turned with the wind, it sees the same wind, and everything that is drawn is turned about its foot."""
+    flow = torch.tensor([6.0, 1.5, 0.4], dtype=torch.float64)
+    one, other = (
+        _end(
+            _simulation(
+                [Copy([0.3, 0.2, 0.1], angle)],
+                WindField(_turn(angle) @ flow, modulations=[UniformGust(0.5)]),
+                dtype="float64",
+            )
+        )
+        for angle in (0.0, degrees)
+    )
+    torch.testing.assert_close(other.state.position, one.state.position, rtol=0, atol=1e-9)
+    A, shift = _turn(degrees).float(), torch.tensor([0.3, 0.2, 0.1])
+    a, b = one.gaussians, other.gaussians
+    torch.testing.assert_close(b.means[:10], a.means[:10])  # what does not move
+    moved = (a.means[10:] - AXIS - shift) @ A.T + AXIS + shift
+    torch.testing.assert_close(b.means[10:], moved, rtol=0, atol=1e-5)
+    torch.testing.assert_close(b.covariances[10:], A @ a.covariances[10:] @ A.T, rtol=0, atol=1e-6)
+    torch.testing.assert_close(b.normals[10:], a.normals[10:] @ A.T, rtol=0, atol=1e-5)
+
+
+def test_a_wind_that_varies_in_space_is_that_at_the_place():
+    """A copy 2 m away in a whirl moves as the object in a whirl that is 2 m away on the other side."""
+    fixed = {"solver": {"substep": 0.002}, "dtype": "float64"}
+    copies = _end(_simulation([Copy(), Copy([2.0, 0.0, 0.0])], Whirl(), **fixed)).state
+    alone = [_end(_simulation([], Whirl((-x, 0.0)), **fixed)).state for x in (0.0, 2.0)]
+    for k in (0, 1):
+        torch.testing.assert_close(copies.position[k], alone[k].position, rtol=0, atol=1e-12)
+    assert float((alone[0].position - alone[1].position).abs().max()) > 0.01
+
+
+def test_a_delay_is_the_same_wind_later():
+    """A moment of the schedule lies within a substep, so that rounding of times does not decide about one."""
+    keys = [FlowKey(0.0, [0.0, 0.0, 0.0]), FlowKey(0.041, [6.0, 1.5, 0.0])]
+    wind = WindField(schedule=keys, modulations=[UniformGust(0.5)], seed=2)
+    frames = list(_simulation([Copy(), Copy(delay=0.08)], wind, solver={"substep": 0.002}, dtype="float64").frames(7))
+    late = frames[6].state.position[1]
+    torch.testing.assert_close(late, frames[4].state.position[0], rtol=0, atol=1e-9)
+    assert float((late - frames[6].state.position[0]).abs().max()) > 0.01
+
+
+def test_each_has_gusts_of_its_own():
+    """Seeds are those of the wind and the next ones, unless they are given; with a delay those of the wind."""
+    copies = [Copy(), Copy(), Copy(seed=40), Copy(delay=0.5), Copy(delay=0.5, seed=7)]
+    simulation = _simulation(copies, _gusty(5))
+    assert [setup.wind.wind.seed for setup in simulation.stepper.setups] == [5, 6, 40, 5, 7]
+    state = _end(simulation).state
+    assert float((state.position[0] - state.position[1]).abs().max()) > 0.001
+
+
+def test_numbers_change_and_edits_act_on_all():
+    """As with one object: another wind, and a part that becomes stiff and red."""
+    simulation = _simulation(ROW, edits=[Edit(time=0.04, E=3e5, color=[1.0, 0.0, 0.0])])
+    frames = simulation.frames(4)
+    first = next(frames)
+    drawn = first.gaussians.colors
+    second = next(frames)
+    assert [setup.points.youngs_modulus[0] for setup in simulation.stepper.setups] == [3e5] * 3
+    red = second.gaussians.colors
+    torch.testing.assert_close(red[10:], torch.tensor([1.0, 0.0, 0.0]).expand(3 * 96, 3))
+    torch.testing.assert_close(red[:10], drawn[:10])
+    simulation.wind = [0.0, 0.0, 0.0]
+    assert all(float(setup.wind(torch.zeros(1)).abs().max()) == 0 for setup in simulation.stepper.setups)
+    other = _simulation(ROW)
+    state = other.change(other.start(), {"wind.speed": 1.0})
+    assert state.position.shape == (3, 96, 3)
+    assert float(other.stepper.setups[1].wind(torch.zeros(1)).norm()) == pytest.approx(1.0)
+
+
+# ---- places
+
+
+@pytest.mark.parametrize(
+    ("hold", "axis"),
+    [
+        (PinnedRegion(POLE, "nodes"), AXIS),
+        (PinnedPoints([[1.1, 0.0, 0.2], [1.1, 0.0, 0.6]]), torch.tensor([1.1, 0.0, 0.0])),
+        (None, torch.tensor([0.6, 0.0, 0.0])),
+    ],
+    ids=["region", "points", "free"],
+)
+def test_the_axis_of_a_turn(hold, axis):
+    """It goes through what the pins hold, or through the middle of an object that nothing holds."""
+    simulation = _simulation([Copy(), Copy(turn=180.0)], solver={"boundaries": [hold] if hold else []})
+    means = next(simulation.frames(1)).gaussians.means[10:].reshape(2, 96, 3)
+    torch.testing.assert_close((means[0] + means[1])[:, :2], (2 * axis[:2]).expand(96, 2), rtol=0, atol=0.02)
+    torch.testing.assert_close(means[0, :, 2], means[1, :, 2])
+
+
+def test_metres_and_the_up_direction_of_the_scene():
+    """The shift is in metres along the axes of the wind; a turn keeps the height, wherever up is in the splat."""
+    cloud = _coloured()
+    cloud = replace(cloud, means=cloud.means[:, [0, 2, 1]] * torch.tensor([1.0, -1.0, 1.0]))
+    scene = {"up": [0.0, -1.0, 0.0], "metres_per_unit": 0.5, "region": Box([None] * 3, [None, 2.0, None])}
+    solver = {"dx": 0.1, "boundaries": []}
+    simulation = _simulation([Copy([1.0, 2.0, 0.5]), Copy(turn=65.0)], cloud=cloud, scene=scene, solver=solver)
+    frame, means = simulation.scene.frame, next(simulation.frames(1)).gaussians.means[10:].reshape(2, 96, 3)
+    rest = simulation.scene.model.means[simulation.scene.moving]
+    moved = frame.point_to_sim(means[0].double()) - frame.point_to_sim(rest.double())
+    torch.testing.assert_close(moved, torch.tensor([1.0, 2.0, 0.5]).double().expand(96, 3), rtol=0, atol=1e-5)
+    torch.testing.assert_close(means[1, :, 1], rest[:, 1], rtol=0, atol=1e-6)
+    assert float((means[1] - rest).abs().max()) > 0.4
+
+
+# ---- pictures
+
+
+def test_what_does_not_move_is_drawn_once():
+    gaussians = next(_simulation(ROW).frames(1)).gaussians
+    rest = _coloured().means
+    assert gaussians.means.shape == (10 + 3 * 96, 3)
+    assert torch.equal(gaussians.means[:10], rest[96:])
+    assert torch.equal(gaussians.means[10:106], rest[:96])
+
+
+@pytest.mark.parametrize("shader", [None, DiffuseShader([0.3, -0.5, 0.8], two_sided=True, ambient=0.4, relative=True)])
+def test_harmonics_turn_with_the_copy(shader):
+    """Colours are those of harmonics that were turned, and light falls on them where they stand."""
+    simulation = _simulation([Copy(turn=90.0)], shader=shader)
+    frame = next(simulation.frames(1))
+    gaussians, painter, scene = frame.gaussians, simulation.painter, simulation.scene
+    view = gaussians.means - painter.camera_at(0).position
+    colours = sh_to_color(rotate_sh(scene.model.sh[:96], _turn(90.0).float()), view[10:])
+    if shader is not None:
+        normals = scene.model.normals()[:96]
+        colours = shader(colours, normals @ _turn(90.0).float().T, rest_normal=normals)
+    torch.testing.assert_close(gaussians.colors[10:], colours, rtol=0, atol=2e-5)
+    torch.testing.assert_close(gaussians.colors[:10], sh_to_color(scene.model.sh[96:], view[:10]))
+
+
+def test_a_picture_from_all_around_is_turned_with_the_copy():
+    """A camera that is turned as the copy is sees it as it sees the object unturned."""
+    flow, angle = torch.tensor([6.0, 1.5, 0.0], dtype=torch.float64), 90.0
+    pictures = []
+    for degrees in (0.0, angle):
+        eye = _turn(degrees) @ (torch.tensor([0.6, -3.0, 0.9]) - AXIS).double() + AXIS
+        target = _turn(degrees) @ (torch.tensor([0.6, 0.0, 0.4]) - AXIS).double() + AXIS
+        camera = LookAtCamera(eye=eye.tolist(), target=target.tolist(), width=48, height=27)
+        wind = WindField(_turn(degrees) @ flow)
+        pictures.append(_end(_simulation([Copy(turn=degrees)], wind, camera=camera)).render().color)
+    assert float(pictures[0].max()) > 0.3
+    torch.testing.assert_close(pictures[0], pictures[1], rtol=0, atol=2e-3)
+
+
+class _Largest(TorchDispatchMode):
+    """The largest tensor of harmonics that is made."""
+
+    def __init__(self, coefficients):
+        super().__init__()
+        self.coefficients, self.rows = coefficients, 0
+
+    def __torch_dispatch__(self, function, types, args=(), kwargs=None):
+        out = function(*args, **(kwargs or {}))
+        for tensor in out if isinstance(out, (list, tuple)) else [out]:
+            if isinstance(tensor, torch.Tensor) and tensor.shape[-2:] == (self.coefficients, 3):
+                self.rows = max(self.rows, tensor[..., 0, 0].numel())
+        return out
+
+
+def test_there_is_one_set_of_harmonics():
+    """Neither kept nor made for a picture is a second one for each copy."""
+    simulation = _simulation(ROW, cloud=_coloured(degree=3))
+    kept = {
+        id(t) for part in (simulation.painter, simulation.stepper.copies) for t in (*part.parameters(), *part.buffers())
+    }
+    alone = _simulation([], cloud=_coloured(degree=3))
+    assert sum(p.numel() for p in simulation.painter.parameters()) == sum(p.numel() for p in alone.painter.parameters())
+    assert len(kept) > 0
+    frame = _end(simulation, 2)
+    with _Largest(16) as largest:
+        frame.render()
+    assert 0 < largest.rows <= 106
+
+
+def test_the_camera_sees_all_of_them():
+    """Its target and distance are those of the row; between two copies it may stand, within one it may not."""
+    alone, row = _simulation([]), _simulation([Copy(), Copy([0.0, 4.0, 0.0])])
+    torch.testing.assert_close(row.painter.center - alone.painter.center, torch.tensor([0.0, 2.0, 0.0]).double())
+    assert row.painter.size == pytest.approx(4.0, abs=0.2)
+    assert alone.painter.size == _simulation([Copy()]).painter.size
+    row.painter.camera = LookAtCamera(eye=[0.5, 2.0, 0.4], target=[0.5, 4.0, 0.4], width=16, height=9)
+    row.painter.check_camera(0)
+    row.painter.camera = LookAtCamera(eye=[0.5, 4.0, 0.4], target=[0.5, 2.0, 0.4], width=16, height=9)
+    with pytest.raises(ValueError, match="lies inside the object"):
+        row.painter.check_camera(0)
+
+
+# ---- runs
+
+
+def test_a_run_and_one_that_was_resumed(tmp_path):
+    """Pictures, depth, normals and a film; a run that stopped goes on to the same end."""
+    recorder = Recorder(trajectory=False, nodes=False, renders=("color", "depth", "normal"))
+    whole = _simulation(ROW, _gusty()).run(tmp_path / "whole", 4, progress=False, recorder=recorder)
+    assert (whole["copies"], whole["particles"], whole["gaussians"]) == (3, 96, 106)
+    for name in ("frames/00003.png", "depth/00003.png", "normal/00003.png", "video.mp4"):
+        assert (tmp_path / "whole" / name).exists()
+    _simulation(ROW, _gusty()).run(tmp_path / "part", 2, progress=False)
+    rest = _simulation(ROW, _gusty()).run(tmp_path / "part", 4, resume=True, progress=False)
+    assert rest["per_frame"] == whole["per_frame"]
+    one, two = ((tmp_path / name / "frames/00003.png").read_bytes() for name in ("whole", "part"))
+    assert one == two
+    assert _simulation([]).run(tmp_path / "one", 1, progress=False)["copies"] == 1
+
+
+def test_from_a_configuration():
+    parser = Simulation.parser()
+    copies = [{"shift": [1, 0, 0], "turn": 90}, {"delay": 0.5}, {"turn": 0}]
+    flag = {"class_path": "gaussian_swaying.scenes.procedural.FlagScene", "init_args": {"spacing": 0.1}}
+    text = yaml.safe_dump({"scene": {"generator": flag}, "solver": {"dx": 0.2}, "device": "cpu", "copies": copies})
+    settings = parser.parse_string(text)
+    simulation = Simulation.from_settings(parser, settings)
+    assert simulation.stepper.copies.copies == (Copy([1.0, 0.0, 0.0], 90.0), Copy(delay=0.5), Copy())
+    stored = yaml.safe_load(simulation.config)
+    assert stored["copies"][0]["turn"] == 90
+    with pytest.raises(ValueError, match="live page shows one object: leave out `copies`"):
+        session_of(parser, settings, real_time=False)
+
+
+def test_the_command(tmp_path, capsys):
+    """It says how many there are."""
+    text = yaml.safe_dump({"copies": [{"shift": [0, 2, 0]}, {"turn": 0}], "recorder": {"trajectory": False, "nodes": False}})
+    (tmp_path / "copies.yaml").write_text(text)
+    flag = ["--scene.generator", "gaussian_swaying.scenes.FlagScene", "--scene.generator.spacing", "0.1"]
+    small = ["--frames", "2", "--device", "cpu", "--solver.dx", "0.2", "--output", str(tmp_path / "run")]
+    assert main(["--config", str(tmp_path / "copies.yaml"), *flag, *small]) == 0
+    assert "96 of 96 Gaussians simulated on cpu\n2 copies of them" in capsys.readouterr().out
+    assert (tmp_path / "run" / "frames" / "00001.png").exists()
+
+
+def test_the_example_of_the_page(capsys):
+    page = (Path(__file__).parents[2] / "docs" / "many.md").read_text()
+    example, output = re.search(
+        r"```python\n(from gaussian_swaying import Box, Copy.*?)```\n\n```text\n(.*?)```", page, re.S
+    ).groups()
+    exec(compile(example, "docs/many.md", "exec"), {})
+    assert capsys.readouterr().out == output
+
+
+@pytest.mark.gpu
+def test_on_a_gpu():
+    """The same motion and picture as on a CPU; kernels and graphs of the wind are used from the second frame on."""
+    frames = []
+    for device in ("cpu", "cuda"):
+        frames.append(_end(_simulation(ROW, _gusty(), device=device), 6))
+    one, two = (frame.state.position.cpu() for frame in frames)
+    torch.testing.assert_close(two, one, rtol=0, atol=1e-4)
+    one, two = (frame.render().color.cpu() for frame in frames)
+    torch.testing.assert_close(two, one, rtol=0, atol=0.03)
+
+
+# ---- what is refused
+
+
+@pytest.mark.parametrize(
+    ("changes", "words"),
+    [
+        ({"contact": Contact()}, "`copies` cannot touch anything yet: set `contact` to null"),
+        ({"forces": [Push()]}, "`copies` cannot have `forces` yet"),
+        ({"wind": WindField([1.0, 0.0, 0.0], effects=[Shelter()])}, "cannot have a Shelter yet.*`wind.effects`"),
+        ({"solver": {"gravity": (1.0, 0.0, -9.8)}}, "`solver.gravity` along z"),
+    ],
+    ids=["contact", "forces", "shelter", "gravity"],
+)
+def test_what_copies_cannot_have(changes, words):
+    with pytest.raises(ValueError, match=words):
+        _simulation(ROW, **changes)
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        ({"nodes": False}, "`copies` are recorded as pictures only: set `recorder.trajectory` to false or 0"),
+        ({}, "`recorder.trajectory` and `recorder.nodes`"),
+        ({"trajectory": False, "nodes": False, "ply_every": 2}, "`recorder.ply_every`"),
+        ({"trajectory": False, "nodes": False, "renders": ("color", "force", "wind")}, "no pictures of force and wind"),
+    ],
+)
+def test_what_is_not_recorded(options, words, tmp_path):
+    with pytest.raises(ValueError, match=words):
+        _simulation(ROW).run(tmp_path / "out", 1, progress=False, recorder=Recorder(**options))
+    assert not (tmp_path / "out").exists()
+
+
+def test_other_places_where_copies_are_refused(tmp_path):
+    simulation = _simulation(ROW)
+    with pytest.raises(ValueError, match="`copies` cannot be written as a splat yet"):
+        next(simulation.frames(1)).save(tmp_path / "a.ply")
+    with pytest.raises(ValueError, match="they have `copies`, which are one already"):
+        batch_of([simulation])
+    with pytest.raises(ValueError, match="it has `copies`, and a video shows one object; remove them"):
+        check_variants(simulation)
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize(
+    ("values", "words"),
+    [
+        ({"shift": [1.0, 2.0]}, r"copies\.shift"),
+        ({"turn": float("nan")}, r"copies\.turn"),
+        ({"delay": float("inf")}, r"copies\.delay"),
+        ({"seed": -1}, r"copies\.seed"),
+        ({"seed": 1.5}, r"copies\.seed"),
+    ],
+)
+def test_bad_values_are_named(values, words):
+    with pytest.raises((ValueError, TypeError), match=words):
+        Copy(**values)
+
+
+def test_copies_is_a_list_of_them():
+    with pytest.raises(TypeError, match="Expected `copies` to be a list of Copy, but it has"):
+        _simulation([{"turn": 90.0}])
+    assert _simulation([]).stepper.copies is None
