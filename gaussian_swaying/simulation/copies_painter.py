@@ -86,14 +86,15 @@ class CopiesPainter(Painter):
         """As those of a :class:`Painter`, shape (S + B (M + H), 3); of what is static they are computed once."""
         model, eye = self.scene.model, camera.position.to(gaussians.means)
         still, moving = self._still_colours(camera, eye)
-        harmonics = {True: moving, False: torch.cat([model.sh0[self.held], model.shN[self.held]], 1)}
-        groups = [len(moving), len(self.held)] * len(self.copies)
-        given = [gaussians.means, gaussians.normals, gaussians.rotations]
+        held = torch.cat([model.sh0[self.held], model.shN[self.held]], 1)
+        sizes = [len(self.still), *[len(moving), len(held)] * len(self.copies)]
+        given = gaussians.means, gaussians.normals, gaussians.rotations
+        _, *groups = zip(*(each.split(sizes) for each in given), strict=True)
         found = [still[self.still]]
-        for number, parts in enumerate(zip(*(each[len(self.still) :].split(groups) for each in given), strict=True)):
+        for number, (means, normals, rotations) in enumerate(groups):
             moves = number % 2 == 0
-            means, normals, rotations = parts
-            view, colours = seen_from(harmonics[moves], eye, means, rotations if model.view_dependent else None)
+            turned = rotations if model.view_dependent else None
+            view, colours = seen_from(moving if moves else held, eye, means, turned)
             found.append(self._shaded(colours, normals, view) if moves else colours)
         return torch.cat(found)
 

@@ -223,9 +223,7 @@ class Painter(nn.Module):
     @in_turn
     def draw(self, gaussians: DeformedGaussians, colours: Tensor, camera: Camera) -> RenderOutput:
         """Draw Gaussians in scene units."""
-        return self.renderer(
-            gaussians.means, gaussians.covariances, self.opacity(), colours, camera, self.background
-        )
+        return self.renderer(gaussians.means, gaussians.covariances, self.opacity(), colours, camera, self.background)
 
     @in_turn
     def render(self, state: State, frame: int, name: str = "") -> RenderOutput:

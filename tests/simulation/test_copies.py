@@ -20,6 +20,7 @@ from gaussian_swaying.cli.live import session_of
 from gaussian_swaying.cli.simulate import main
 from gaussian_swaying.fitting.variants import check_variants
 from gaussian_swaying.gaussians.harmonics import rotate_sh, sh_to_color
+from gaussian_swaying.gaussians.parts import Part, Parts
 from gaussian_swaying.geometry.regions import Box
 from gaussian_swaying.mpm.boundaries.pinned_points import PinnedPoints
 from gaussian_swaying.mpm.boundaries.pinned_region import PinnedRegion
@@ -244,6 +245,28 @@ def test_what_does_not_move_is_drawn_once():
     assert torch.equal(gaussians.means[10:106], rest[:96])
 
 
+def test_a_held_part_belongs_to_the_copy_and_a_still_one_does_not():
+    """A pot with its plant: drawn in each copy where it is held, which is what a copy turns about."""
+    labels = torch.bucketize(_coloured().means[:, 0].contiguous(), torch.tensor([0.25]))
+    labels[96:] = 2
+    parts = Parts(labels, [Part("pole", "held"), Part("cloth"), Part("floor", "still")])
+    more = {"scene": {"parts": parts, "region": None}, "solver": {"boundaries": []}}
+    one, copies = _end(_simulation([], **more)), _end(_simulation([Copy(), Copy([0.0, 2.0, 0.0], 180.0)], **more))
+    held, rest = labels == 0, _coloured().means
+    means, colours = (getattr(copies.gaussians, name)[10:].reshape(2, 96, 3) for name in ("means", "colors"))
+    assert torch.equal(copies.gaussians.means[:10], rest[96:])
+    order = torch.cat([(labels == 1).nonzero()[:, 0], held.nonzero()[:, 0]])
+    assert torch.equal(means[0, -int(held.sum()) :], rest[held])
+    torch.testing.assert_close(means[0], one.gaussians.means[order], rtol=0, atol=1e-3)
+    assert means[0, :72].sub(rest[labels == 1]).abs().max() > 0.01
+    middle = 0.5 * (rest[held].amin(0) + rest[held].amax(0))
+    turned = (rest[held] - middle) * torch.tensor([-1.0, -1.0, 1.0]) + middle + torch.tensor([0.0, 2.0, 0.0])
+    torch.testing.assert_close(means[1, -int(held.sum()) :], turned, rtol=0, atol=1e-5)
+    view = turned - _simulation([Copy(), Copy([0.0, 2.0, 0.0], 180.0)], **more).painter.camera_at(0).position
+    seen = sh_to_color(rotate_sh(_coloured().sh[held], _turn(180.0).float()), view)
+    torch.testing.assert_close(colours[1, -int(held.sum()) :], seen, rtol=0, atol=2e-5)
+
+
 @pytest.mark.parametrize("shader", [None, DiffuseShader([0.3, -0.5, 0.8], two_sided=True, ambient=0.4, relative=True)])
 def test_harmonics_turn_with_the_copy(shader):
     """Colours are those of harmonics that were turned, and light falls on them where they stand."""
@@ -350,7 +373,9 @@ def test_from_a_configuration():
 
 def test_the_command(tmp_path, capsys):
     """It says how many there are."""
-    text = yaml.safe_dump({"copies": [{"shift": [0, 2, 0]}, {"turn": 0}], "recorder": {"trajectory": False, "nodes": False}})
+    text = yaml.safe_dump(
+        {"copies": [{"shift": [0, 2, 0]}, {"turn": 0}], "recorder": {"trajectory": False, "nodes": False}}
+    )
     (tmp_path / "copies.yaml").write_text(text)
     flag = ["--scene.generator", "gaussian_swaying.scenes.FlagScene", "--scene.generator.spacing", "0.1"]
     small = ["--frames", "2", "--device", "cpu", "--solver.dx", "0.2", "--output", str(tmp_path / "run")]
