@@ -224,7 +224,10 @@ def with_whole(cost: Cost, simulation: Simulation, cloud: GaussianCloud) -> Cost
     drawn = seconds(some.means, some.covariances, few, own), seconds(third.means, shape, opacity, colours)
     numbers = len(some.means), len(third)
     each = max(drawn[1] - drawn[0], 0.0) / max(numbers[1] - numbers[0], 1)
-    return replace(cost, picture_seconds=cost.picture_seconds + count * each * (len(cloud) - numbers[0]))
+    # a frame has places, covariances, normals, rotations and colours of all
+    tables = (third.means, shape, third.means, shape, colours)
+    copied = min(_seconds(simulation, lambda: [table.clone() for table in tables]) for _ in range(2)) / len(third)
+    return replace(cost, picture_seconds=cost.picture_seconds + (count * each + copied) * (len(cloud) - numbers[0]))
 
 
 def scaled_seconds(cost: Cost, other: Cost, dx: float) -> float:

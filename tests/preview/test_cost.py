@@ -1,5 +1,6 @@
 """The estimate of a run's time: from one grid to another, the grid for a time, and against runs."""
 
+import dataclasses
 import statistics
 import time
 
@@ -12,7 +13,7 @@ from gaussian_swaying.kernels.language import INTERPRETED
 from gaussian_swaying.mpm.boundaries.pinned_region import PinnedRegion
 from gaussian_swaying.mpm.solver import MPMSolver
 from gaussian_swaying.preview import cost as cost_module
-from gaussian_swaying.preview.cost import Cost, estimate_cost, finest_within, scaled_seconds
+from gaussian_swaying.preview.cost import Cost, estimate_cost, finest_within, scaled_seconds, with_whole
 from gaussian_swaying.scenes.procedural import FlagScene
 from gaussian_swaying.scenes.vase import VaseScene
 from gaussian_swaying.simulation.material import Material
@@ -52,6 +53,26 @@ def test_a_trial_is_long_enough_to_time_substeps(monkeypatch, make_simulation):
     assert max(asked) == 4096
     assert cost_module._trial(simulation, state, 30)[1] == pytest.approx(130e-5 / 30)
     assert asked[-1] == 30
+
+
+def test_a_place_adds_what_its_other_gaussians_take(monkeypatch, make_simulation):
+    """In proportion to their number: here 1 ms to draw each, and 0.1 ms to copy it."""
+    simulation = make_simulation()
+    some = simulation.scene.model.to_cloud()
+    whole = some.select(torch.arange(10 * len(some)) % len(some))
+    drawn = []
+    simulation.painter.renderer = lambda means, *given: drawn.append(len(means))
+
+    def seconds(simulation, work):
+        drawn.clear()
+        work()
+        return 1e-3 * drawn[0] if drawn else 1e-4 * len(range(0, len(whole), 3))
+
+    monkeypatch.setattr(cost_module, "_seconds", seconds)
+    found = with_whole(cost(0.04), simulation, whole)
+    assert found.picture_seconds == pytest.approx(0.1 + 1.1e-3 * 9 * len(some))
+    assert found == dataclasses.replace(cost(0.04), picture_seconds=found.picture_seconds)
+    assert with_whole(cost(0.04, picture=None), simulation, whole).picture_seconds is None
 
 
 @pytest.mark.skipif(INTERPRETED, reason="nothing is compiled")
