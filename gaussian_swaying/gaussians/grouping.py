@@ -5,6 +5,8 @@ A grid carries no more information than its nodes, and captures have many more G
 
 from __future__ import annotations
 
+import math
+
 import torch
 from torch import Tensor
 
@@ -135,3 +137,27 @@ def joined(count: int, pairs: Tensor) -> Tensor:
 
     graph = coo_matrix((torch.ones(pairs.shape[1]), pairs.numpy()), (count, count))
     return torch.from_numpy(connected_components(graph, directed=False)[1]).long()
+
+
+def connected_parts(points: Tensor, cell: float) -> Tensor:
+    """The number of each point's connected part; points in the same or in touching cells are connected.
+
+    Args:
+        points: Shape (N, 3).
+        cell: Size of a cell.
+
+    Returns:
+        Numbers from 0, shape (N,).
+
+    Raises:
+        ValueError: If ``cell`` is not positive.
+    """
+    check_shape("points", points, None, 3)
+    check_positive("cell", cell)
+    from scipy.spatial import cKDTree
+
+    index = ((points.double() - points.amin(0).double()) / cell).floor()
+    of_point = equal_rows(index)
+    cells = index.new_empty(int(of_point.max()) + 1, 3).index_copy(0, of_point, index)
+    touching = cKDTree(cells.numpy()).query_pairs(1.5, p=math.inf, output_type="ndarray")
+    return joined(len(cells), torch.from_numpy(touching.T))[of_point]

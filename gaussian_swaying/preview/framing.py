@@ -7,7 +7,8 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from gaussian_swaying.preview.shape import connected_parts, quantile
+from gaussian_swaying.gaussians.grouping import connected_parts
+from gaussian_swaying.preview.shape import quantile
 
 RADIUS = 1.9  # distance of a camera in multiples of the longest side of the shown box
 SOLID = 0.1  # opacity

@@ -10,11 +10,12 @@ import torch
 from torch import Tensor
 
 from gaussian_swaying.gaussians.cloud import GaussianCloud
+from gaussian_swaying.gaussians.grouping import connected_parts
 from gaussian_swaying.gaussians.harmonics import SH_DC
 from gaussian_swaying.gaussians.parts import Part, Parts
 from gaussian_swaying.geometry.groups import equal_rows, sums
 from gaussian_swaying.geometry.neighbours import nearest_neighbours
-from gaussian_swaying.preview.shape import FEWEST, connected_parts, plane_axes, quantile
+from gaussian_swaying.preview.shape import FEWEST, plane_axes, quantile
 
 GREEN = 0.08  # how much greener than red and blue, as a share of the brightness
 SLICES, SECTORS = 40, 16  # of the height; of a slice

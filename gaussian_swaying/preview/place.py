@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from gaussian_swaying.gaussians.cloud import GaussianCloud
+from gaussian_swaying.gaussians.grouping import connected_parts
 from gaussian_swaying.gaussians.harmonics import SH_DC
 from gaussian_swaying.geometry.groups import equal_rows
 from gaussian_swaying.geometry.neighbours import particle_spacing
@@ -18,7 +19,6 @@ from gaussian_swaying.geometry.regions import Cylinder
 from gaussian_swaying.preview.framing import nearby
 from gaussian_swaying.preview.shape import (
     DIRECTIONS,
-    connected_parts,
     largest_plane,
     plane_axes,
     quantile,

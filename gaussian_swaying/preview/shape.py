@@ -1,4 +1,4 @@
-"""Measures of a cloud of points: bounds, quantiles, widths, the normal of a sheet, connected parts."""
+"""Measures of a cloud of points: bounds, quantiles, widths, the normal of a sheet."""
 
 from __future__ import annotations
 
@@ -7,9 +7,7 @@ import math
 import torch
 from torch import Tensor
 
-from gaussian_swaying._checks import check_positive, check_shape
-from gaussian_swaying.gaussians.grouping import joined
-from gaussian_swaying.geometry.groups import equal_rows
+from gaussian_swaying._checks import check_shape
 
 SHEET = 0.1  # smallest over middle standard deviation of the centres of a sheet
 FEWEST = 16  # smallest number of Gaussians in an object
@@ -132,27 +130,3 @@ def snapped(direction: Tensor) -> tuple[float, ...]:
 def rounded(value: float, cell: float) -> float:
     """A coordinate rounded to about a hundredth of a cell."""
     return round(value, max(0, 2 - math.floor(math.log10(cell))))
-
-
-def connected_parts(points: Tensor, cell: float) -> Tensor:
-    """The number of each point's connected part; points in the same or in touching cells are connected.
-
-    Args:
-        points: Shape (N, 3).
-        cell: Size of a cell.
-
-    Returns:
-        Numbers from 0, shape (N,).
-
-    Raises:
-        ValueError: If ``cell`` is not positive.
-    """
-    check_shape("points", points, None, 3)
-    check_positive("cell", cell)
-    from scipy.spatial import cKDTree
-
-    index = ((points.double() - points.amin(0).double()) / cell).floor()
-    of_point = equal_rows(index)
-    cells = index.new_empty(int(of_point.max()) + 1, 3).index_copy(0, of_point, index)
-    touching = cKDTree(cells.numpy()).query_pairs(1.5, p=math.inf, output_type="ndarray")
-    return joined(len(cells), torch.from_numpy(touching.T))[of_point]

@@ -17,6 +17,7 @@ from gaussian_swaying._checks import check_choice, check_positive
 from gaussian_swaying.captures.capture_camera import photo_azimuth
 from gaussian_swaying.gaussians.area import patch_area
 from gaussian_swaying.gaussians.cloud import GaussianCloud
+from gaussian_swaying.gaussians.grouping import connected_parts
 from gaussian_swaying.gaussians.harmonics import SH_DC
 from gaussian_swaying.gaussians.ply import OPAQUE_LOGIT
 from gaussian_swaying.geometry.frame import SimFrame
@@ -31,7 +32,6 @@ from gaussian_swaying.preview.photos import CapturedFrom, ShownObject, shown_obj
 from gaussian_swaying.preview.shape import (
     FEWEST,
     bounds,
-    connected_parts,
     quantile,
     rounded,
     sheet_normal,

@@ -15,7 +15,7 @@ from small_scenes import plain_cloud, together
 
 from gaussian_swaying.config.parser import parse_text
 from gaussian_swaying.gaussians.cloud import GaussianCloud
-from gaussian_swaying.gaussians.grouping import LOOSE
+from gaussian_swaying.gaussians.grouping import LOOSE, connected_parts
 from gaussian_swaying.gaussians.ply import write_ply
 from gaussian_swaying.geometry.neighbours import particle_spacing
 from gaussian_swaying.geometry.patches import smallest_axis_normal
@@ -35,7 +35,6 @@ from gaussian_swaying.preview.suggest import (
     QUALITIES,
     SHELL_E,
     broad_side,
-    connected_parts,
     finest_spacing,
     gaussian_statistics,
     given_region,

@@ -133,16 +133,16 @@ recorder: {{images: false, video: false}}
         Simulation.from_yaml(config).run(run, frames=4, resume=True, progress=False)
 
 
-def test_the_example_of_the_page_runs(tmp_path, monkeypatch):
+def test_the_examples_of_the_page_run(tmp_path, monkeypatch):
     page = (Path(__file__).parents[2] / "docs/parts.md").read_text(encoding="utf-8")
     monkeypatch.chdir(tmp_path)
-    names: dict = {}
-    exec(compile(page.split("```python\n")[1].split("```")[0], "parts.md", "exec"), names)
-    assert len(list(names["simulation"].frames(2))) == 2
-    arrays = np.load(tmp_path / "parts.npz")
-    documented = {
-        name
-        for row in re.findall(r"^\| (`.*?) \| \w+.*?\(", page, re.MULTILINE)
-        for name in re.findall(r"`(\w+)`", row)
-    }
-    assert documented == set(arrays)
+    first, second = ({}, {})
+    for names, block in zip((first, second), page.split("```python\n")[1:], strict=True):
+        exec(compile(block.split("```")[0], "parts.md", "exec"), names)
+    assert len(list(first["simulation"].frames(2))) == 2
+    assert [part.name for part in second["parts"].parts] == ["cloth", "pole", "hem"]
+    right = second["flag"].means[:, 0] > 0.9
+    assert torch.equal(second["parts"].mask("hem"), right)
+    described = page.split("## The file")[1].split("```")[0]
+    rows = re.findall(r"^\| (`.*?) \|", described, re.MULTILINE)
+    assert {name for row in rows for name in re.findall(r"`(\w+)`", row)} == set(np.load(tmp_path / "parts.npz"))

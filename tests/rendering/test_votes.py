@@ -1,0 +1,71 @@
+"""Labels of Gaussians from masks: the weights are those with which they are drawn."""
+
+from dataclasses import replace
+
+import pytest
+import torch
+from small_scenes import together, varied_cloud
+
+from gaussian_swaying.geometry.covariances import covariance
+from gaussian_swaying.rendering.cameras.camera import look_at_camera
+from gaussian_swaying.rendering.torch_renderer import TorchRenderer
+from gaussian_swaying.rendering.votes import label_weights, voted
+from gaussian_swaying.scenes.procedural import FlagScene
+
+
+def camera(eye=(0.0, -4.0, 0.3), at=(0.0, 0.0, 0.0), size=(48, 40)):
+    return look_at_camera(eye, at, (0, 0, 1), 50.0, *size, 0.1)
+
+
+def test_the_weights_are_those_of_the_picture():
+    """Of a Gaussian drawn white among black ones, the sum over the pixels of a label."""
+    cloud = varied_cloud(12)
+    view = camera(eye=(1.0, -5.0, 1.0), at=(1.0, 1.0, 1.0))
+    labels = torch.randint(-1, 5, (40, 48), generator=torch.Generator().manual_seed(0))
+    weights = label_weights(cloud, [(view, labels)], 5)
+    shape, opacity = covariance(cloud.quats, cloud.scales), torch.sigmoid(cloud.opacities)
+    for k in range(len(cloud)):
+        white = torch.zeros(12, 3).index_fill(0, torch.tensor([k]), 1.0)
+        drawn = TorchRenderer()(cloud.means, shape, opacity, white, view).color[..., 0].double()
+        expected = torch.stack([drawn[labels == c].sum() for c in range(5)])
+        assert torch.allclose(weights[k], expected, rtol=1e-3, atol=1e-4)
+    assert float(weights.sum()) > 10
+    both = label_weights(cloud, [(view, labels), (view, labels)], 5)
+    assert torch.allclose(both, 2 * weights)
+
+
+def test_masks_find_the_thing_in_front():
+    """Two flags, one behind the other: each mask shows what is visible of the first one."""
+    front = FlagScene(spacing=0.06).generate()
+    back = FlagScene(spacing=0.06).generate()
+    center = front.means.mean(0)
+    front = replace(front, means=front.means - center)
+    back = replace(back, means=1.4 * (back.means - center) + torch.tensor([0.2, 0.8, 0.1]))
+    cloud = together(front, back)
+    members = torch.arange(len(cloud)) < len(front)
+    views = []
+    for eye in ((0.0, -3.0, 0.3), (1.5, -2.5, 0.0), (0.5, 3.5, 0.5)):
+        view = camera(eye, size=(96, 80))
+        white = members[:, None].float().expand(-1, 3)
+        shape, opacity = covariance(cloud.quats, cloud.scales), torch.sigmoid(cloud.opacities)
+        views.append((view, TorchRenderer()(cloud.means, shape, opacity, white, view).color[..., 0] > 0.5))
+    label = voted(label_weights(cloud, views, 2))
+    seen = label >= 0
+    assert float(seen.double().mean()) > 0.9
+    assert float((label[seen] == members[seen].long()).double().mean()) > 0.97
+
+
+def test_unseen_gaussians_have_no_label_and_a_bias_needs_a_lead():
+    weights = torch.tensor([[0.0, 0.0], [2.0, 3.0], [1.0, 9.0], [5.0, 1.0]], dtype=torch.float64)
+    assert voted(weights).tolist() == [-1, 1, 1, 0]
+    assert voted(weights, bias=0.5).tolist() == [-1, 0, 1, 0]
+    with pytest.raises(ValueError, match="`bias`"):
+        voted(weights, bias=2.0)
+
+
+def test_labels_of_another_size_and_no_views_are_refused():
+    cloud = varied_cloud(3)
+    with pytest.raises(ValueError, match="40 rows and 48 columns"):
+        label_weights(cloud, [(camera(), torch.zeros(10, 10, dtype=torch.bool))], 2)
+    with pytest.raises(ValueError, match="no view"):
+        label_weights(cloud, [], 2)
