@@ -264,14 +264,19 @@ _OF_SCENE = tuple(
 )
 _EXTREMES: dict[str, Callable[..., Any]] = {"J_min": min, "J_max": max, "stretch_min": min, "stretch_max": max}
 _EXTREMES |= {"displacement_max": max, "displacement_mean": lambda values: sum(values) / len(values)}
+_WHOSE = dict(zip(_PARTICLES, ("displacement_max", "stretch_min", "stretch_max"), strict=True))
 
 
 def _joined(scenes: Sequence[FrameDiagnostics]) -> FrameDiagnostics:
-    """The measurements of a batch: sums, extremes, and the mean of mean displacements; particles of the first scene."""
+    """The measurements of a batch: sums, extremes with their particles, and the mean of mean displacements."""
     first, found = scenes[0], {}
     for name in _OF_SCENE:
         values = [getattr(scene, name) for scene in scenes]
-        found[name] = values[0] if name in _PARTICLES else _EXTREMES.get(name, sum)(values)
+        if name in _PARTICLES:
+            own = [getattr(scene, _WHOSE[name]) for scene in scenes]
+            found[name] = values[own.index(_EXTREMES[_WHOSE[name]](own))]
+        else:
+            found[name] = _EXTREMES.get(name, sum)(values)
     forces = zip(*(scene.support for scene in scenes), strict=True)
     found["support"] = tuple((sum(f[0] for f in of), sum(f[1] for f in of), sum(f[2] for f in of)) for of in forces)
     return replace(first, **found)
