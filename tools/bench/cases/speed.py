@@ -106,7 +106,7 @@ PLANS = {
         spacing=0.0125,
         dx=(0.025, 0.05, 0.0125),
         warm=1,
-        repeats=(3, 1),
+        repeats=(9, 3),
     ),
 }
 
