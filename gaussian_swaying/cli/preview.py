@@ -175,14 +175,18 @@ def preview_scene(options: argparse.Namespace, folder: Path) -> Preview:
         wish, finest = 60 * options.minutes, finest_spacing(suggestion)
         costs["starter"] = finest_within(measure, wish, costs["starter"], costs["draft"], finest, grids["draft"])
         suggestion = replace(suggestion, dx=costs["starter"].dx, quality=f"--minutes {options.minutes:g}")
-    simulation = made[suggestion.dx]
+    simulation, looked = made[suggestion.dx], suggestion
     if suggestion.parts is not None:
+        if suggestion.dx < grids["draft"]:  # stalks thinner than a cell: the grid of a draft makes them too stiff
+            suggestion = calibrated_suggestion(suggestion, simulation, options.sway)
+            costs["starter"] = cost_of(simulation, options.frames)
         parts = suggestion.parts
         if place is not None:
             parts = parts.within(near_things(place, cloud, chosen))
-        suggestion = replace(suggestion, parts=replace(parts, path=str((folder / "parts.npz").resolve())))
+        parts = replace(parts, path=str((folder / "parts.npz").resolve()))
+        suggestion, looked = replace(suggestion, parts=parts), replace(looked, parts=parts)
     texts = {
-        "draft": draft_yaml(suggestion, options.scene),
+        "draft": draft_yaml(looked, options.scene),
         "starter": starter_yaml(suggestion, options.scene, options.frames),
     }
     others = {

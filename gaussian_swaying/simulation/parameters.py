@@ -417,7 +417,9 @@ def _write_material(setup: Setup, values: Mapping[str, Any]) -> Setup:
 
     for name in values:
         if any(getattr(part, name[9:]) is not None for part in material.regions):
-            raise ValueError(f"`{name}` is to change, but `material.regions` gives it too: remove it there.")
+            raise ValueError(
+                f"`{name}` is to change, but `material.regions` or `scene.parts` gives it too: remove it there."
+            )
     if "material.thickness" in values:
         ratio = values["material.thickness"] / _thickness(setup)
         points = thicker(setup, ratio).points

@@ -83,7 +83,7 @@ def take(
     heads = {name.split(".")[0] for name in names if find(name) is None}
     if not heads <= {"wind", "aero", *PICTURE}:
         return None
-    if any(name.startswith("material.") for name in numbers) and (settings.material.regions or settings.edits):
+    if any(name.startswith("material.") for name in numbers) and (simulation.material.regions or settings.edits):
         return None  # each part has its own
     if not all(parameter(name).same_points for name in numbers):
         return None

@@ -15,6 +15,7 @@ from gaussian_swaying.simulation.edits import Edit
 from gaussian_swaying.simulation.material import Material, MaterialRegion
 from gaussian_swaying.simulation.scene import Scene
 from gaussian_swaying.simulation.simulation import Simulation
+from gaussian_swaying.viewer.changes import take
 
 CLOUD = FlagScene(spacing=0.04).generate()
 ROLES = [Part("wall", "still"), Part("pole", "held"), Part("cloth"), Part("hem", E=4e4, density=90.0, thickness=0.02)]
@@ -146,3 +147,23 @@ def test_the_examples_of_the_page_run(tmp_path, monkeypatch):
     described = page.split("## The file")[1].split("```")[0]
     rows = re.findall(r"^\| (`.*?) \|", described, re.MULTILINE)
     assert {name for row in rows for name in re.findall(r"`(\w+)`", row)} == set(np.load(tmp_path / "parts.npz"))
+
+
+def test_a_number_that_parts_give_is_not_changed_for_all():
+    simulation = flag()
+    with pytest.raises(ValueError, match=r"`material\.regions` or `scene\.parts` gives it too"):
+        simulation.change(simulation.start(), {"material.E": 1e5})
+    changed = simulation.change(simulation.start(), {"material.nu": 0.2})
+    assert changed is not None
+
+
+def test_the_live_page_makes_a_simulation_with_such_parts_anew(tmp_path):
+    path = Parts(labels(), ROLES).save(tmp_path / "parts.npz")
+    parser = Simulation.parser()
+    generator = '{"class_path": "FlagScene", "init_args": {"spacing": 0.04}}'
+    given = [f"--scene.generator={generator}", f"--scene.parts={path}", "--solver.dx=0.1", "--device=cpu"]
+    settings = parser.parse_args([*given, "--material.E=2e4"])
+    simulation = Simulation.from_settings(parser, settings)
+    state = simulation.start()
+    assert take(simulation, state, parser, settings, ["material.E"]) is None
+    assert set(Simulation.from_settings(parser, settings).scene.points.youngs_modulus.tolist()) == {2e4, 4e4}
