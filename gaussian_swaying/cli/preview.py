@@ -176,11 +176,11 @@ def preview_scene(options: argparse.Namespace, folder: Path) -> Preview:
         costs["starter"] = finest_within(measure, wish, costs["starter"], costs["draft"], finest, grids["draft"])
         suggestion = replace(suggestion, dx=costs["starter"].dx, quality=f"--minutes {options.minutes:g}")
     simulation, looked = made[suggestion.dx], suggestion
-    if suggestion.parts is not None:
+    parts = suggestion.parts
+    if parts is not None:
         if suggestion.dx < grids["draft"]:  # stalks thinner than a cell: the grid of a draft makes them too stiff
             suggestion = calibrated_suggestion(suggestion, simulation, options.sway)
             costs["starter"] = cost_of(simulation, options.frames)
-        parts = suggestion.parts
         if place is not None:
             parts = parts.within(near_things(place, cloud, chosen))
         parts = replace(parts, path=str((folder / "parts.npz").resolve()))
