@@ -106,8 +106,8 @@ class Painter(nn.Module):
         means, path = self.scene.model.means, self.cameras[name] if name else self.camera
         if not path.still:
             return self._camera(frame, name).to(means.device, means.dtype)
-        # its numbers may be changed between two frames, also within a list
-        numbers = [tuple(value) if isinstance(value, list) else value for value in vars(path).values()]
+        # its numbers may be changed between two frames, also within a list, an array or a tensor
+        numbers = [_fixed(value) for value in vars(path).values()]
         key = (path, *numbers, means.device, means.dtype)
         if self._still.get(name, ((), None))[0] != key:
             with torch.inference_mode(False):  # it outlives the call
@@ -201,20 +201,30 @@ class Painter(nn.Module):
         return self.shader(colours, normal, rest_normal=scene.rest_facing, view_direction=to_eye)
 
     def _still_colours(self, camera: Camera, eye: Tensor) -> tuple[Tensor, Tensor]:
-        """Colours (N, 3) of all Gaussians at rest, and the harmonics of those that move, for the last camera."""
+        """Colours (N, 3) of all Gaussians at rest, and the harmonics of those that move; kept for the last camera.
+
+        They are not kept where gradients are wanted, or where a change in place cannot be seen.
+        """
         model = self.scene.model
-        key = (fingerprint([self.scene]), model.sh0._version, model.shN._version)
+        parts = (model.means, model.sh0, model.shN, camera.world_to_camera)
+        if any(part.is_inference() or (part.requires_grad and torch.is_grad_enabled()) for part in parts):
+            return self._rest_colours(eye)
+        key = (fingerprint([self.scene]), *(part._version for part in parts))
         if self._rest is None or self._rest[0] is not camera or self._rest[1] != key:
             with torch.inference_mode(False), torch.no_grad():  # they outlive the call
-                way = torch.nn.functional.normalize(model.means - eye.clone(), dim=-1)
-                still = torch.cat([
-                    sh_to_color(torch.cat([model.sh0[k : k + RECORDED], model.shN[k : k + RECORDED]], 1),
-                                way[k : k + RECORDED])
-                    for k in range(0, len(way), RECORDED)
-                ])  # fmt: skip
-                index = self.scene.moving
-                self._rest = (camera, key, still, torch.cat([model.sh0[index], model.shN[index]], 1))
+                self._rest = (camera, key, *self._rest_colours(eye.clone()))
         return self._rest[2:]
+
+    def _rest_colours(self, eye: Tensor) -> tuple[Tensor, Tensor]:
+        """The same for an eye (3,), computed anew."""
+        model, index = self.scene.model, self.scene.moving
+        way = torch.nn.functional.normalize(model.means.detach() - eye, dim=-1)
+        still = torch.cat([
+            sh_to_color(torch.cat([model.sh0[k : k + RECORDED], model.shN[k : k + RECORDED]], 1),
+                        way[k : k + RECORDED])
+            for k in range(0, len(way), RECORDED)
+        ])  # fmt: skip
+        return still, torch.cat([model.sh0[index], model.shN[index]], 1)
 
     def shade(self, gaussians: DeformedGaussians, camera: Camera) -> DeformedGaussians:
         """The same Gaussians with their colours as a camera sees them."""
@@ -297,3 +307,9 @@ def seen_from(sh: Tensor, eye: Tensor, means: Tensor, rotations: Tensor | None) 
     view = torch.nn.functional.normalize(means - eye, dim=-1)
     at_rest = view if rotations is None else (view[..., None] * rotations).sum(-2)
     return view, sh_to_color(sh, at_rest)
+
+
+def _fixed(value: Any) -> object:
+    """An attribute of a camera path as it is now; vectors become tuples."""
+    value = value.tolist() if hasattr(value, "tolist") else value
+    return tuple(value) if isinstance(value, list) else value

@@ -179,6 +179,12 @@ def test_a_camera_that_does_not_move_is_made_once(make_simulation):
     painter.camera.eye[0] = 1.0
     assert float(painter.camera_at(1).position[0]) == pytest.approx(1.0)
     assert float(kept.position[0]) == pytest.approx(0.0, abs=1e-6)
+    for make in (torch.tensor, np.array):
+        for x in (2.0, 3.0):
+            painter.camera.eye = make([x, -3.0, 0.0])
+            assert float(painter.camera_at(1).position[0]) == pytest.approx(x)
+        painter.camera.eye[0] = 4.0
+        assert float(painter.camera_at(1).position[0]) == pytest.approx(4.0)
 
 
 def test_motion_and_colours_are_those_of_the_scene_in_every_frame(make_simulation, device):

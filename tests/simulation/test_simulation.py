@@ -487,6 +487,54 @@ def test_many_still_gaussians_are_coloured_once(degree, shader, make_cloud, make
     assert float((seen[0] - seen[1]).abs().max()) > 0.1  # the edit was seen
 
 
+@pytest.fixture
+def many_still(make_cloud, make_simulation, monkeypatch):
+    """A function that makes a run whose colours of what does not move are kept."""
+    monkeypatch.setattr("gaussian_swaying.simulation.painter.RECORDED", 7)
+    part = {"region": Box([None] * 3, [0.6, None, None])}
+    return lambda: make_simulation(make_cloud(degree=1), pinned=False, scene=part)
+
+
+@pytest.mark.parametrize("changed", ["means", "camera"])
+def test_kept_colours_follow_a_change_in_place(changed, many_still):
+    painter = many_still().painter
+    gaussians, camera = painter.scene.rest(), painter.camera_at(0)
+    camera = replace(camera, world_to_camera=camera.world_to_camera.clone())
+    before = painter.colors(gaussians, camera)
+    with torch.no_grad():
+        if changed == "means":
+            painter.scene.model.means[:, 2] += 3.0
+        else:
+            camera.world_to_camera[1, 3] += 3.0
+    after = painter.colors(painter.scene.rest(), camera)
+    painter._rest = None
+    assert torch.equal(after, painter.colors(painter.scene.rest(), camera))
+    assert not torch.allclose(before, after)
+
+
+def test_colours_of_a_run_that_was_made_in_inference_mode(many_still):
+    """Its tensors do not tell whether they were changed in place: nothing is kept."""
+    with torch.inference_mode():
+        painter = many_still().painter
+        inside = painter.colors(painter.scene.rest(), painter.camera_at(0))
+    model = painter.scene.model
+    with torch.inference_mode():
+        model.sh0.mul_(2.0)
+    outside = painter.colors(painter.scene.rest(), painter.camera_at(0))
+    assert float((outside - inside).abs().max()) > 0.01
+
+
+def test_harmonics_of_still_gaussians_have_gradients(many_still):
+    painter = many_still().painter
+    gaussians, camera, model = painter.scene.rest(), painter.camera_at(0), painter.scene.model
+    kept = painter.colors(gaussians, camera)
+    model.sh0.requires_grad_(True)
+    found = painter.colors(gaussians, camera)
+    found.sum().backward()
+    assert torch.equal(found, kept)
+    assert bool((model.sh0.grad != 0).any(-1).all())
+
+
 def _on_gpu(simulation):
     simulation.to("cuda")
     simulation.painter.renderer = make_renderer("cuda")
