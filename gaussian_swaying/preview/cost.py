@@ -223,7 +223,8 @@ def with_whole(cost: Cost, simulation: Simulation, cloud: GaussianCloud) -> Cost
 
     drawn = seconds(some.means, some.covariances, few, own), seconds(third.means, shape, opacity, colours)
     numbers = len(some.means), len(third)
-    each = max(drawn[1] - drawn[0], 0.0) / max(numbers[1] - numbers[0], 1)
+    more = numbers[1] - numbers[0]  # negative where more than a third is around what moves
+    each = max((drawn[1] - drawn[0]) / more, 0.0) if more else 0.0
     # a frame has places, covariances, normals, rotations and colours of all
     tables = (third.means, shape, third.means, shape, colours)
     copied = min(_seconds(simulation, lambda: [table.clone() for table in tables]) for _ in range(2)) / len(third)

@@ -55,11 +55,12 @@ def test_a_trial_is_long_enough_to_time_substeps(monkeypatch, make_simulation):
     assert asked[-1] == 30
 
 
-def test_a_place_adds_what_its_other_gaussians_take(monkeypatch, make_simulation):
-    """In proportion to their number: here 1 ms to draw each, and 0.1 ms to copy it."""
+@pytest.mark.parametrize("times", [10, 2])
+def test_a_place_adds_what_its_other_gaussians_take(times, monkeypatch, make_simulation):
+    """In proportion to their number: here 1 ms to draw each, and 0.1 ms to copy it. Half of all may move, too."""
     simulation = make_simulation()
     some = simulation.scene.model.to_cloud()
-    whole = some.select(torch.arange(10 * len(some)) % len(some))
+    whole = some.select(torch.arange(times * len(some)) % len(some))
     drawn = []
     simulation.painter.renderer = lambda means, *given: drawn.append(len(means))
 
@@ -70,7 +71,7 @@ def test_a_place_adds_what_its_other_gaussians_take(monkeypatch, make_simulation
 
     monkeypatch.setattr(cost_module, "_seconds", seconds)
     found = with_whole(cost(0.04), simulation, whole)
-    assert found.picture_seconds == pytest.approx(0.1 + 1.1e-3 * 9 * len(some))
+    assert found.picture_seconds == pytest.approx(0.1 + 1.1e-3 * (times - 1) * len(some))
     assert found == dataclasses.replace(cost(0.04), picture_seconds=found.picture_seconds)
     assert with_whole(cost(0.04, picture=None), simulation, whole).picture_seconds is None
 
