@@ -138,6 +138,9 @@ def preview_scene(options: argparse.Namespace, folder: Path) -> Preview:
     region = None if options.region is None else (options.region[:3], options.region[3:])
     capture = None if options.capture is None else captured_from(options.capture)
     quality = options.quality or "normal"
+    if options.move is not None and (region is not None or capture is not None):
+        one = "--region" if capture is None else "--capture"
+        raise ValueError(f"`--move` and `{one}` both choose what moves: leave out one of them.")
     place = survey(cloud, up) if region is None and capture is None else None
     chosen = _numbers(options.move, place)
     part: GaussianCloud = cloud
@@ -280,13 +283,13 @@ def _tried(
 
 
 def _numbers(move: str | None, place: Place | None) -> list[int]:
-    """The things of a place that move."""
+    """The things of a place that move, each once."""
     if move is None:
         return [1]
     if place is None:
         raise ValueError("`--move` chooses things of a place, and this splat is one object: leave it out.")
     try:
-        return [int(number) for number in move.split(",")]
+        return list(dict.fromkeys(int(number) for number in move.split(",")))
     except ValueError:
         raise ValueError(f"Expected `--move` to be numbers of things, such as 1 or 1,3, but got {move!r}.") from None
 
@@ -354,6 +357,8 @@ def _preview(options: argparse.Namespace) -> None:
         raise ValueError("`--capture` is for suggestions, and `--config` is shown unchanged: leave out one of them.")
     if options.quality is not None and options.minutes is not None:
         raise ValueError("`--quality` and `--minutes` both choose the grid of the starter: leave out one of them.")
+    if options.move is not None and options.config is not None:
+        raise ValueError("`--move` is for suggestions, and `--config` is shown unchanged: leave out one of them.")
     if options.config is not None and (options.quality is not None or options.minutes is not None):
         one = "--quality" if options.minutes is None else "--minutes"
         raise ValueError(f"`{one}` is for suggestions, and `--config` is shown unchanged: leave out one of them.")

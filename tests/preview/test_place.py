@@ -153,8 +153,10 @@ def test_the_preview_of_a_place(file, garden, tmp_path, capsys, monkeypatch):
 def test_a_thing_is_chosen_by_its_number(file, tmp_path, capsys, monkeypatch):
     monkeypatch.setattr("gaussian_swaying.preview.cost.MOST_FRAMES", 2)
     monkeypatch.setattr("gaussian_swaying.cli.preview.calibrated_suggestion", lambda found, draft, sway: found)
-    assert _preview(file, tmp_path / "out", "--move", "2") == 0
-    assert "2 moves" in capsys.readouterr().out
+    assert _preview(file, tmp_path / "out", "--move", "2, 2") == 0
+    told = capsys.readouterr().out
+    assert "2 moves" in told
+    assert "thing 2 of the place" in told
     box = json.loads((tmp_path / "out" / "preview.json").read_text())["run"]
     assert box["box_max"][0] - box["box_min"][0] == pytest.approx(4.0, abs=0.1)
 
@@ -165,6 +167,8 @@ def test_a_thing_is_chosen_by_its_number(file, tmp_path, capsys, monkeypatch):
         (["--move", "5"], "`--move` to name things from 1 to 2"),
         (["--move", "a"], "`--move` to be numbers of things"),
         (["--move", "1", "--up", "+y"], "this splat is one object"),
+        (["--move", "1", "--region", *"-1 -1 -1 1 1 1".split()], "`--move` and `--region` both choose what moves"),
+        (["--move", "1", "--config", "any.yaml"], "`--move` is for suggestions"),
     ],
 )
 def test_bad_choices_are_refused(file, tmp_path, capsys, options, words):
