@@ -145,7 +145,8 @@ def survey(cloud: GaussianCloud, up: Sequence[float] | str | None = None) -> Pla
     points = means[solid]
     cell = max(SPACINGS * particle_spacing(points), extent / CELLS)
     part = connected_parts(points, cell)
-    things = _things(cloud, solid, part, weight, middle, extent, cell)
+    axes = torch.stack([*plane_axes(normal), normal])
+    things = _things(cloud, solid, part, weight, middle, extent, cell, axes)
     alone = sum(len(thing.members) for thing in things[1:]) < 0.05 * int(solid.sum())
     if not things or ALONE not in things[0].reasons or (alone and int(far.sum()) < 0.01 * len(cloud)):
         return None
@@ -210,9 +211,17 @@ def _members(place: Place, cloud: GaussianCloud, chosen: Sequence[int]) -> Tenso
 
 
 def _things(
-    cloud: GaussianCloud, solid: Tensor, part: Tensor, weight: Tensor, middle: Tensor, extent: float, cell: float
+    cloud: GaussianCloud,
+    solid: Tensor,
+    part: Tensor,
+    weight: Tensor,
+    middle: Tensor,
+    extent: float,
+    cell: float,
+    axes: Tensor,
 ) -> list[Thing]:
-    """The connected parts that are large enough, with their scores."""
+    """The connected parts that are large enough, with their scores, for boxes along axes (3, 3) that stand upright."""
+    middle = axes @ middle.to(axes)
     index = solid.nonzero()[:, 0]
     count = part.bincount()
     red, green, blue = (0.5 + SH_DC * cloud.sh[:, 0, k] for k in range(3))
@@ -225,6 +234,8 @@ def _things(
             break
         members = index[order[int(start[number]) : int(start[number] + count[number])]]
         points = cloud.means[members].double()
+        ends = tuple(points.amin(0).tolist()), tuple(points.amax(0).tolist())
+        points = points @ axes.T
         low, high = points.amin(0), points.amax(0)
         side = float((high - low).amax()) / extent
         if side < SMALLEST:
@@ -244,7 +255,6 @@ def _things(
             "flat": 0.0 if sheet_normal(points) is None else 1.0,
         }
         reasons = {why: round(value, 2) for why, value in reasons.items() if value >= 0.05}
-        ends = (tuple(low.tolist()), tuple(high.tolist()))
         found.append(Thing(members, *ends, round(sum(reasons.values()), 2), reasons))
     return sorted(found, key=lambda thing: -thing.score)[:MOST]
 

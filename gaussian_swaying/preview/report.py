@@ -58,7 +58,8 @@ def place_lines(place: Place, chosen: Sequence[int]) -> list[str]:
         mark = "moves" if number in chosen else "     "
         size = " x ".join(f"{side:.3g}" for side in thing.size)
         lines.append(f"  {number} {mark}         {len(thing.members):,} Gaussians, {size} scene units; {why}")
-    lines.append("  other things: --move 2, or several as one object: --move 1,2")
+    if len(place.things) > 1:
+        lines.append("  other things: --move 2, or several as one object: --move 1,2")
     return lines
 
 

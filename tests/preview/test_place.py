@@ -2,6 +2,7 @@
 
 import json
 import math
+from dataclasses import replace
 
 import pytest
 import torch
@@ -14,6 +15,7 @@ from gaussian_swaying.gaussians.cloud import GaussianCloud
 from gaussian_swaying.gaussians.ply import write_ply
 from gaussian_swaying.geometry.rotations import quat_to_rotation
 from gaussian_swaying.preview.place import excerpt, survey
+from gaussian_swaying.preview.report import place_lines
 from gaussian_swaying.preview.suggest import suggest
 from gaussian_swaying.scenes.alocasia import AlocasiaScene
 from gaussian_swaying.scenes.procedural import FlagScene
@@ -79,6 +81,23 @@ def test_a_place_that_is_tilted(garden):
     assert int((inside & ~plant).sum()) < 5
     assert not bool(region.simulated[upward.ground].any())
     assert len(shown) < 0.3 * len(cloud)
+
+
+@pytest.mark.parametrize("turn", [(1.0, 0.2, 0.0, 0.1), (1.0, 0.3, 0.0, 0.0), (1.0, 0.0, 0.0, -0.35)])
+def test_the_scores_do_not_depend_on_the_tilt(garden, turn):
+    """Boxes along the axes of the file would make the hedge look thin."""
+    cloud, plant = garden
+    upright, tilted = survey(cloud), survey(_turned(cloud, turn))
+    assert tilted is not None
+    assert _overlap(_mask(tilted.things[0].members), plant) > 0.95
+    for before, after in zip(upright.things, tilted.things, strict=True):
+        assert after.score == pytest.approx(before.score, abs=0.3)
+
+
+def test_no_other_things_are_offered_where_there_are_none(garden):
+    found = survey(garden[0])
+    assert "--move" in "".join(place_lines(found, [1]))
+    assert "--move" not in "".join(place_lines(replace(found, things=found.things[:1]), [1]))
 
 
 @pytest.mark.parametrize("up", ["-y", [0.0, -1.0, 0.0], "+y"])
@@ -167,7 +186,7 @@ def test_a_thing_is_chosen_by_its_number(file, tmp_path, capsys, monkeypatch):
         (["--move", "5"], "`--move` to name things from 1 to 2"),
         (["--move", "a"], "`--move` to be numbers of things"),
         (["--move", "1", "--up", "+y"], "this splat is one object"),
-        (["--move", "1", "--region", *"-1 -1 -1 1 1 1".split()], "`--move` and `--region` both choose what moves"),
+        (["--move", "1", "--region", *["-1"] * 3, *["1"] * 3], "`--move` and `--region` both choose what moves"),
         (["--move", "1", "--config", "any.yaml"], "`--move` is for suggestions"),
     ],
 )
