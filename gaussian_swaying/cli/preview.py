@@ -132,7 +132,8 @@ def preview_scene(options: argparse.Namespace, folder: Path) -> Preview:
     check_sway(options.sway)
     path = Path(options.scene).resolve()  # as in the YAML, so that it warns once
     reading = Stopwatch()
-    cloud = read_gaussians(path, 0 if path.is_file() and path.stat().st_size > LARGE else None)
+    large = path.is_file() and path.stat().st_size > LARGE
+    cloud = read_gaussians(path, 0 if large else None)
     read = reading.quiet
     up = None if options.up is None else _up(options.up)
     region = None if options.region is None else (options.region[:3], options.region[3:])
@@ -200,7 +201,7 @@ def preview_scene(options: argparse.Namespace, folder: Path) -> Preview:
     data: dict[str, Any] = {
         "splat": str(options.scene),
         "bounds": bounds(cloud.means),
-        "gaussians": gaussian_statistics(cloud),
+        "gaussians": gaussian_statistics(cloud) | ({"sh_degree": None} if large else {}),
         "suggestion": suggestion_dict(suggestion),
         "run": run_dict(simulation),
         "cost": cost_dict(costs["starter"]),

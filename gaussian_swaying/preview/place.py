@@ -100,7 +100,7 @@ def survey(cloud: GaussianCloud, up: Sequence[float] | str | None = None) -> Pla
     - near the middle, around which photos are taken (up to 2);
     - as long as a tenth of the place, or longer (up to 1);
     - not as wide as half of the place, and not at its border (1);
-    - thin: it fills little of its box (up to 1);
+    - thin: it fills little of its box, which stands upright (up to 1);
     - green, as leaves are (up to 1);
     - flat, as a cloth is (1).
 

@@ -32,8 +32,9 @@ def splat_lines(name: str, cloud: GaussianCloud, data: dict[str, Any]) -> list[s
         f"  note: the opacity of {infinite:,} is exactly 0 or 1, an infinite logit, which is read as ±{OPAQUE_LOGIT:g}"
     )
     normals = "with normals" if own["normals"] else "without normals (the smallest axes are used)"
+    degree = "only constant colours were read" if own["sh_degree"] is None else f"SH degree {own['sh_degree']}"
     return [
-        f"{name}: {len(cloud):,} Gaussians, SH degree {own['sh_degree']}, {normals}",
+        f"{name}: {len(cloud):,} Gaussians, {degree}, {normals}",
         f"  bounds        {_numbers(corner['min'])} to {_numbers(corner['max'])} (scene units)",
         f"  without 1 %   {_numbers(corner['robust_min'])} to {_numbers(corner['robust_max'])}",
         "  5, 50 and 95 % of the Gaussians have at most",

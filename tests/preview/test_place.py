@@ -172,11 +172,16 @@ def test_the_preview_of_a_place(file, garden, tmp_path, capsys, monkeypatch):
 def test_a_thing_is_chosen_by_its_number(file, tmp_path, capsys, monkeypatch):
     monkeypatch.setattr("gaussian_swaying.preview.cost.MOST_FRAMES", 2)
     monkeypatch.setattr("gaussian_swaying.cli.preview.calibrated_suggestion", lambda found, draft, sway: found)
+    monkeypatch.setattr("gaussian_swaying.cli.preview.LARGE", 0)
     assert _preview(file, tmp_path / "out", "--move", "2, 2") == 0
     told = capsys.readouterr().out
+    assert "only constant colours were read" in told  # and not that the file has degree 0
+    assert "SH degree" not in told
     assert "2 moves" in told
     assert "thing 2 of the place" in told
-    box = json.loads((tmp_path / "out" / "preview.json").read_text())["run"]
+    data = json.loads((tmp_path / "out" / "preview.json").read_text())
+    assert data["gaussians"]["sh_degree"] is None
+    box = data["run"]
     assert box["box_max"][0] - box["box_min"][0] == pytest.approx(4.0, abs=0.1)
 
 
