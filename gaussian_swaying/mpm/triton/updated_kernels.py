@@ -413,8 +413,9 @@ def updated_nodes(
     step 0 and the substep [s], float64; ``impulse`` (programs, B, 3) collects the reaction impulses, float64.
     With SPARSE the velocities of programs that are not ``occupied`` stay as they are: no particle is near.
     """
-    if SPARSE and tl.load(occupied + tl.program_id(0)) == 0:
-        return
+    if SPARSE:  # noqa: SIM102  (Triton leaves out what is under a constant that is false)
+        if tl.load(occupied + tl.program_id(0)) == 0:
+            return
     step = tl.load(first_step) + step_offset
     kick = tl.load(schedule + (step + 1) * 4)
     decay = tl.load(schedule + (step + 1) * 4 + 2)

@@ -23,8 +23,17 @@ def _peers(rows: list[Row]) -> Iterator[Row]:
         yield {"case": case, "solver": solver, "times": "; ".join(fill("{points:,}: {ms:g}", row) for row in own)}
 
 
-table(PAGE, "previews.rows", "previews_*", "previews", """
-    run = {key}[[, `--preset {preset}`]] | frames = {run.frames} | announced [s] = {run.announced_s:.0f} |
+def _announced(result: Row) -> Iterator[Row]:
+    """Each run: that of a configuration, or the draft and the starter of a splat."""
+    for name, row in result["previews"].items():
+        for kind in ("run", "draft", "starter"):
+            if kind in row:
+                known = {"name": name if kind == "run" else f"{name}, {kind}"}
+                yield row | known | {"run": row[kind]}
+
+
+table(PAGE, "previews.rows", "previews_*", _announced, """
+    run = {name}[[, `--preset {preset}`]] | frames = {run.frames} | announced [s] = {run.announced_s:.0f} |
     taken [s] = {run.process_s:.0f} | announced / taken = {run.ratio:.2f} |
     substeps a frame, announced and taken = {run.announced_substeps:.0f}, {run.substeps:.0f}
     """, before="{source}")  # fmt: skip
