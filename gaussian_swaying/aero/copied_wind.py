@@ -23,6 +23,7 @@ class CopiedWind(SpatialWind):
         ValueError: If the wind has no seed but one is given.
 
     Example:
+        >>> import torch
         >>> turn = torch.tensor([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]], dtype=torch.float64)
         >>> CopiedWind(WindField([0.0, 2.0, 0.0]), turn, torch.zeros(3, dtype=torch.float64))(torch.zeros(1))
         tensor([[2., 0., 0.]], dtype=torch.float64)

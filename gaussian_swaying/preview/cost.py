@@ -197,7 +197,7 @@ def _picture_seconds(simulation: Simulation, state: State, frame: float) -> floa
 def with_whole(cost: Cost, simulation: Simulation, cloud: GaussianCloud) -> Cost:
     """The cost of a run that draws all Gaussians of a place, from its cost with those around what moves.
 
-    A picture of every third one tells how its time grows with their number; all at once would take more memory.
+    A picture of every fifth one tells how its time grows with their number; all at once would take more memory.
 
     Args:
         cost: The cost with some.
@@ -209,9 +209,9 @@ def with_whole(cost: Cost, simulation: Simulation, cloud: GaussianCloud) -> Cost
     painter = simulation.painter
     count = (1 + len(painter.cameras)) * len(simulation.recorder.renders)
     camera, device = painter.camera_at(0), simulation.device
-    third = cloud.select(torch.arange(0, len(cloud), 3)).to(device)
-    shape, opacity = covariance(third.quats, third.scales), third.opacities.sigmoid()
-    colours = 0.5 + SH_DC * third.sh[:, 0]
+    fifth = cloud.select(torch.arange(0, len(cloud), 5)).to(device)
+    shape, opacity = covariance(fifth.quats, fifth.scales), fifth.opacities.sigmoid()
+    colours = 0.5 + SH_DC * fifth.sh[:, 0]
     some, model = painter.scene.rest(), painter.scene.model
     few, own = model.opacity(), model.colors(some.means)
 
@@ -221,13 +221,13 @@ def with_whole(cost: Cost, simulation: Simulation, cloud: GaussianCloud) -> Cost
 
         return min(_seconds(simulation, draw) for _ in range(2))
 
-    drawn = seconds(some.means, some.covariances, few, own), seconds(third.means, shape, opacity, colours)
-    numbers = len(some.means), len(third)
-    more = numbers[1] - numbers[0]  # negative where more than a third is around what moves
+    drawn = seconds(some.means, some.covariances, few, own), seconds(fifth.means, shape, opacity, colours)
+    numbers = len(some.means), len(fifth)
+    more = numbers[1] - numbers[0]  # negative where more than a fifth is around what moves
     each = max((drawn[1] - drawn[0]) / more, 0.0) if more else 0.0
     # a frame has places, covariances, normals, rotations and colours of all
-    tables = (third.means, shape, third.means, shape, colours)
-    copied = min(_seconds(simulation, lambda: [table.clone() for table in tables]) for _ in range(2)) / len(third)
+    tables = (fifth.means, shape, fifth.means, shape, colours)
+    copied = min(_seconds(simulation, lambda: [table.clone() for table in tables]) for _ in range(2)) / len(fifth)
     return replace(cost, picture_seconds=cost.picture_seconds + (count * each + copied) * (len(cloud) - numbers[0]))
 
 

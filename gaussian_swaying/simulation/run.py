@@ -55,7 +55,7 @@ def _check_checkpoint(
             f"The splat {scene.source} has changed since the run in {output} began: restore the old file, or "
             "start again without --resume."
         )
-    if checkpoint.get("parts") != parts_checksum(scene):
+    if checkpoint.get("parts", "unknown") != parts_checksum(scene):
         raise ValueError(
             f"The parts of the scene (`scene.parts`) have changed since the run in {output} began: restore the old "
             "file, or start again without --resume."

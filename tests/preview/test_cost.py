@@ -67,7 +67,7 @@ def test_a_place_adds_what_its_other_gaussians_take(times, monkeypatch, make_sim
     def seconds(simulation, work):
         drawn.clear()
         work()
-        return 1e-3 * drawn[0] if drawn else 1e-4 * len(range(0, len(whole), 3))
+        return 1e-3 * drawn[0] if drawn else 1e-4 * len(range(0, len(whole), 5))
 
     monkeypatch.setattr(cost_module, "_seconds", seconds)
     found = with_whole(cost(0.04), simulation, whole)

@@ -4,11 +4,9 @@ from __future__ import annotations
 
 import argparse
 import json
-import os
 import subprocess
 import sys
 import tempfile
-import time
 from collections.abc import Iterator
 from functools import partial
 from pathlib import Path
@@ -54,18 +52,25 @@ def previewed(count: int, device: str, drafts: bool, keep: str | None = None) ->
     return row
 
 
+_MEASURED = """
+import json, resource, subprocess, sys, time
+begin = time.perf_counter()
+done = subprocess.run(sys.argv[1:], stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True)
+seconds, used = time.perf_counter() - begin, resource.getrusage(resource.RUSAGE_CHILDREN)
+print(json.dumps({"seconds": seconds, "bytes": 1024 * used.ru_maxrss, "code": done.returncode, "told": done.stderr}))
+"""
+"""Runs a command from a small process: the peak of a process begins with the memory of the one that starts it."""
+
+
 def _tool(name: str, options: list[str]) -> Row:
     """Seconds and peak memory [bytes] of a program of the folder tools, or why it failed."""
     command = [sys.executable, str(ROOT / "tools" / f"{name}.py"), *options]
-    begin = time.perf_counter()
-    with tempfile.TemporaryFile("w+") as told:
-        process = subprocess.Popen(command, cwd=ROOT, stdout=subprocess.DEVNULL, stderr=told, text=True)
-        _, status, used = os.wait4(process.pid, 0)
-        process.returncode = os.waitstatus_to_exitcode(status)
-        told.seek(0)
-        if process.returncode:
-            return {"failed": what_failed(told.read())}
-    return {"seconds": time.perf_counter() - begin, "bytes": 1024 * used.ru_maxrss}
+    done = subprocess.run(
+        [sys.executable, "-c", _MEASURED, *command], cwd=ROOT, capture_output=True, text=True, check=True
+    )
+    row: Row = json.loads(done.stdout)
+    told = row.pop("told")
+    return {"failed": what_failed(told)} if row.pop("code") else row
 
 
 def rows(options: argparse.Namespace, _: Row) -> Iterator[Measurement]:
