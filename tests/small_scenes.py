@@ -9,6 +9,7 @@ from gaussian_swaying.aero.wind import WindField
 from gaussian_swaying.gaussians.cloud import GaussianCloud
 from gaussian_swaying.gaussians.ply import write_ply
 from gaussian_swaying.geometry.regions import Box
+from gaussian_swaying.geometry.rotations import quat_to_rotation
 from gaussian_swaying.mpm.boundaries.pinned_region import PinnedRegion
 from gaussian_swaying.mpm.solver import MPMSolver
 from gaussian_swaying.rendering.cameras.camera_path import OrbitCamera
@@ -61,6 +62,16 @@ def varied_cloud(count=300, degree=1, seed=0, normals=False):
         sh=0.8 * (random(count, (degree + 1) ** 2, 3) - 0.5),
         normals=torch.nn.functional.normalize(random(count, 3) - 0.5, dim=-1) if normals else None,
     )
+
+
+def turned_cloud(cloud, quat):
+    """A splat turned about the origin by a unit quaternion wxyz; its harmonics stay."""
+    w, x, y, z = quat
+    a, b, c, d = cloud.quats.unbind(-1)
+    quats = torch.stack(
+        [w * a - x * b - y * c - z * d, w * b + x * a + y * d - z * c, w * c - x * d + y * a + z * b,
+         w * d + x * c - y * b + z * a], -1)  # fmt: skip
+    return GaussianCloud(cloud.means @ quat_to_rotation(quat).T, quats, cloud.scales, cloud.opacities, cloud.sh)
 
 
 def together(*clouds):

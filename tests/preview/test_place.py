@@ -9,9 +9,9 @@ import torch
 import yaml
 from bench.places import place
 from shared import refused
+from small_scenes import turned_cloud
 
 from gaussian_swaying.cli.preview import main
-from gaussian_swaying.gaussians.cloud import GaussianCloud
 from gaussian_swaying.gaussians.ply import write_ply
 from gaussian_swaying.geometry.rotations import quat_to_rotation
 from gaussian_swaying.preview.place import excerpt, survey
@@ -39,14 +39,8 @@ def _mask(members, count=COUNT):
 
 
 def _turned(cloud, quat):
-    """Turned about the origin by a quaternion; the Gaussians themselves keep their axes, except for flat ones."""
-    quat = torch.tensor(quat) / math.hypot(*quat)
-    w, x, y, z = quat
-    a, b, c, d = cloud.quats.unbind(-1)
-    quats = torch.stack(
-        [w * a - x * b - y * c - z * d, w * b + x * a + y * d - z * c, w * c - x * d + y * a + z * b,
-         w * d + x * c - y * b + z * a], -1)  # fmt: skip
-    return GaussianCloud(cloud.means @ quat_to_rotation(quat).T, quats, cloud.scales, cloud.opacities, cloud.sh)
+    """Turned about the origin by a quaternion of any length."""
+    return turned_cloud(cloud, torch.tensor(quat) / math.hypot(*quat))
 
 
 def test_the_parts_of_a_place(garden):

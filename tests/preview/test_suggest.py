@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 import torch
 import yaml
-from small_scenes import plain_cloud, together
+from small_scenes import plain_cloud, together, turned_cloud
 
 from gaussian_swaying.config.parser import parse_text
 from gaussian_swaying.gaussians.cloud import GaussianCloud
@@ -74,12 +74,7 @@ def turn_to(name):
 
 def turned(cloud, name):
     """A splat with z up turned so that an axis is up."""
-    rotation, (w, x, y, z) = turn_to(name)
-    a, b, c, d = cloud.quats.unbind(-1)
-    quats = torch.stack(
-        [w * a - x * b - y * c - z * d, w * b + x * a + y * d - z * c, w * c - x * d + y * a + z * b,
-         w * d + x * c - y * b + z * a], -1)  # fmt: skip
-    return GaussianCloud(cloud.means @ rotation.T, quats, cloud.scales, cloud.opacities, cloud.sh)
+    return turned_cloud(cloud, turn_to(name)[1])
 
 
 def tree(floor=True, offset=5.0):
