@@ -55,6 +55,11 @@ def until(condition, seconds=60.0):
         time.sleep(0.01)
 
 
+def pictures_since(page, began):
+    """Pictures that the server has drawn for its browsers from a time on; a page remembers its last 120 only."""
+    return sum(start > began for times in list(page._drawn.values()) for start in list(times))
+
+
 @pytest.fixture(name="until")
 def _until():
     return until

@@ -15,6 +15,8 @@ from websockets.sync.client import connect as connect_socket
 
 from gaussian_swaying.viewer.streams import ANSWER
 
+from .conftest import pictures_since
+
 
 class Drawer:
     """A browser that draws, without a browser: it confirms what it gets."""
@@ -88,13 +90,12 @@ def test_who_confirms_nothing_gets_no_more(page, drawer, until):
 
 def test_a_browser_that_draws_gets_no_pictures(page, drawer, until):
     """Until it shows what it cannot draw, or what it shows is recorded."""
-    client = next(iter(page.server.get_clients().values()))
     drawer.wait("state")
     until(lambda: drawer.wait("state") and page.streams.rate() == 30)
     assert page.pictures_per_second() == 30
 
     def pictures():
-        before = len(page._drawn[client.client_id])
+        began = time.perf_counter()
         end = time.monotonic() + 0.6
         while time.monotonic() < end:
             try:
@@ -102,7 +103,7 @@ def test_a_browser_that_draws_gets_no_pictures(page, drawer, until):
             except TimeoutError:
                 continue
             drawer.answer()
-        return len(page._drawn[client.client_id]) - before
+        return pictures_since(page, began)
 
     assert pictures() == 0
     for begin, end in (
