@@ -70,6 +70,12 @@ def run_of(source: Path) -> Path | None:
     return None
 
 
+def still_of(source: Path) -> Path | None:
+    """The file with what never moves, beside a folder of frames that a run wrote; None if there is none."""
+    file = source.parent / f"still{SUFFIXES.get(source.name)}"
+    return file if source.is_dir() and run_of(source) is not None and file.is_file() else None
+
+
 def placement(options: argparse.Namespace) -> tuple[float, SimFrame, str]:
     """Frames per second, frame and the source of both, for a USD or glTF file.
 
@@ -115,7 +121,7 @@ def export(options: argparse.Namespace) -> None:
         return
     if options.target is None:
         raise ValueError(f"Expected a file to write, whose name ends in one of {', '.join(SUFFIXES.values())}.")
-    format = format_of(options.target)
+    format, still = format_of(options.target), still_of(Path(options.source).resolve())
     if format != "spz" and options.spz_version is not None:
         raise ValueError("--spz-version is only for .spz files: leave it out.")
     if format not in ("usd", "glb"):
@@ -124,10 +130,10 @@ def export(options: argparse.Namespace) -> None:
                 "--up and --metres-per-unit are only for USD and glTF, as other formats have no up direction: leave "
                 "them out, or use a target that ends in .usdc or .glb."
             )
-        convert(options.source, options.target, spz_version=options.spz_version or 3)
+        convert(options.source, options.target, spz_version=options.spz_version or 3, still=still)
     else:
         fps, frame, origin = placement(options)
-        convert(options.source, options.target, fps, frame.metres_per_unit, frame.rotation)
+        convert(options.source, options.target, fps, frame.metres_per_unit, frame.rotation, still=still)
         up = [round(v, 3) + 0.0 for v in frame.rotation[2].tolist()]
         print(f"up {up}, 1 scene unit = {frame.metres_per_unit:.6g} m ({origin})")
     print(f"wrote {options.target}")

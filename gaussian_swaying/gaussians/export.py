@@ -6,7 +6,7 @@ import os
 import re
 import warnings
 from collections.abc import Iterable
-from dataclasses import replace
+from dataclasses import fields, replace
 from importlib import import_module
 from pathlib import Path
 from typing import Any, Literal
@@ -156,6 +156,7 @@ def convert(
     metres_per_unit: float = 1.0,
     rotation: Tensor | None = None,
     spz_version: int = 3,
+    still: str | os.PathLike[str] | None = None,
 ) -> None:
     """Write a splat, or the .ply sequence of a run, in the format given by the ending of the target's name.
 
@@ -168,6 +169,7 @@ def convert(
         metres_per_unit: Length of a scene unit [m], for USD and glTF.
         rotation: Rotation from scene directions to z up, shape (3, 3), for USD and glTF; the scene's z is up if None.
         spz_version: Version of SPZ.
+        still: A splat that every frame of a folder gets as well, before its own Gaussians: what never moves.
 
     Raises:
         FileNotFoundError: If the source or the target's folder does not exist.
@@ -182,8 +184,13 @@ def convert(
     files = sorted(source.glob("*.ply"))
     if not files:
         raise ValueError(f"{source} contains no .ply: give one .ply, or a folder of them.")
+    kept = None if still is None else read_gaussians(still)
+
+    def frame_of(file: Path) -> GaussianCloud:
+        return read_gaussians(file) if kept is None else joined(kept, read_gaussians(file))
+
     if format == "usd":
-        return write_usd(target, map(read_gaussians, files), **place)
+        return write_usd(target, map(frame_of, files), **place)
     if "#" not in target.name:
         raise ValueError(
             f"{source} is a folder of {len(files)} frames: give a target that ends in .usdc, or one with # for their "
@@ -191,7 +198,25 @@ def convert(
         )
     for index, file in enumerate(files):
         name = re.sub("#+", lambda digits: f"{index:0{len(digits[0])}d}", target.name)  # noqa: B023  # called at once
-        export_cloud(target.with_name(name), read_gaussians(file), format=format, spz_version=spz_version, **place)
+        export_cloud(target.with_name(name), frame_of(file), format=format, spz_version=spz_version, **place)
+
+
+def joined(first: GaussianCloud, second: GaussianCloud) -> GaussianCloud:
+    """The Gaussians of two splats of the same scene, one after the other.
+
+    Raises:
+        ValueError: If their harmonics are of different degrees, or only one has normals.
+    """
+    if first.sh_degree != second.sh_degree or (first.normals is None) != (second.normals is None):
+        raise ValueError(
+            "The file of what never moves and the frames do not belong together (harmonics of degree "
+            f"{first.sh_degree} and {second.sh_degree}): give the folder of a run as the run wrote it."
+        )
+    pairs = {field.name: (getattr(first, field.name), getattr(second, field.name)) for field in fields(GaussianCloud)}
+    whole: dict[str, Any] = {
+        name: None if one is None else torch.cat([one, other]) for name, (one, other) in pairs.items()
+    }
+    return GaussianCloud(**whole)
 
 
 def _kept(path: Path, cloud: GaussianCloud) -> GaussianCloud:

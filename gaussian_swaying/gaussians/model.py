@@ -30,6 +30,7 @@ class DeformedGaussians:
         rotations: Rotation of each Gaussian from rest, the polar factor of F, shape (..., N, 3, 3).
         colors: Colours as a camera sees them, shape (..., N, 3); None before they are shaded.
         model: The Gaussians at rest, which have the opacities and harmonics; None if they are not known.
+        moving: Indices of those that may have moved, shape (M,); None for all. The others are as in ``model``.
     """
 
     means: Tensor
@@ -38,21 +39,56 @@ class DeformedGaussians:
     rotations: Tensor
     colors: Tensor | None = None
     model: GaussianSurfaceModel | None = None
+    moving: Tensor | None = None
 
     @torch.no_grad()
     def to_cloud(self) -> GaussianCloud:
         """The Gaussians in storage form, detached, with harmonics rotated with the patches.
 
+        Those that have not moved keep the numbers of the splat.
+
         Raises:
             ValueError: If ``model`` is not known, or there are several scenes.
         """
+        model = self._known()
+        check_shape("means", self.means, None, 3, batches=False)
+        rest, index = model.to_cloud(), self.moving
+        if index is None:
+            moved = self._moved(self.covariances, rest.sh, self.rotations)
+        else:
+            own = self._moved(self.covariances[index], rest.sh[index], self.rotations[index])
+            moved = {name: getattr(rest, name).index_copy(0, index, part) for name, part in own.items()}
+        return replace(rest, means=self.means.detach(), normals=self.normals.detach(), **moved)
+
+    @torch.no_grad()
+    def part_to_cloud(self, moving: bool) -> GaussianCloud:
+        """The Gaussians of :meth:`to_cloud` that may have moved, in the order of ``moving``, or all others.
+
+        Args:
+            moving: Which of the two.
+
+        Raises:
+            ValueError: If ``model`` is not known, or there are several scenes.
+        """
+        model = self._known()
+        check_shape("means", self.means, None, 3, batches=False)
+        index = torch.arange(len(self.means), device=self.means.device) if self.moving is None else self.moving
+        if not moving:
+            still = torch.ones(len(self.means), dtype=torch.bool, device=self.means.device)
+            index = still.index_fill(0, index, False).nonzero()[:, 0]
+        rest = model.part_to_cloud(index)
+        changed = self._moved(self.covariances[index], rest.sh, self.rotations[index]) if moving else {}
+        return replace(rest, means=self.means.detach()[index], normals=self.normals.detach()[index], **changed)
+
+    def _known(self) -> GaussianSurfaceModel:
         if self.model is None:
             raise ValueError("These Gaussians have no opacities: set `model` to the GaussianSurfaceModel at rest.")
-        check_shape("means", self.means, None, 3, batches=False)
-        rest = self.model.to_cloud()
-        quats, scales = covariance_to_quat_scale(self.covariances)
-        sh, normals = rotate_sh(rest.sh, self.rotations), self.normals.detach()
-        return replace(rest, means=self.means.detach(), quats=quats, scales=scales, sh=sh, normals=normals)
+        return self.model
+
+    @staticmethod
+    def _moved(covariances: Tensor, sh: Tensor, rotations: Tensor) -> dict[str, Tensor]:
+        quats, scales = covariance_to_quat_scale(covariances)
+        return {"quats": quats, "scales": scales, "sh": rotate_sh(sh, rotations)}
 
 
 class GaussianSurfaceModel(nn.Module):
@@ -102,6 +138,18 @@ class GaussianSurfaceModel(nn.Module):
             opacities=self.opacities.detach(),
             sh=self.sh.detach(),
             normals=self.reference_normals,
+        )
+
+    def part_to_cloud(self, index: Tensor) -> GaussianCloud:
+        """The Gaussians with these indices (M,) in storage form, detached."""
+        normals = self.reference_normals
+        return GaussianCloud(
+            means=self.means.detach()[index],
+            quats=self.quats.detach()[index],
+            scales=self.scales.detach()[index],
+            opacities=self.opacities.detach()[index],
+            sh=torch.cat([self.sh0.detach()[index], self.shN.detach()[index]], dim=1),
+            normals=None if normals is None else normals[index],
         )
 
     def save_ply(self, path: str | os.PathLike[str]) -> None:

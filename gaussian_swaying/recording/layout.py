@@ -16,6 +16,7 @@ FILES = [
     "summary.json",
     "diagnostics.csv",
     "animation.usdc",
+    *(f"still{suffix}" for name, suffix in SUFFIXES.items() if name != "usd"),
 ]
 # names that a run writes; a folder that was not made by a run must not contain them
 OURS = [*FILES, "frames", "ply", "trajectory", "nodes", "video.mp4", "cameras", "depth", "depth_raw", "normal", "force"]

@@ -66,8 +66,8 @@ def _write_png(path: Path, pixels: np.ndarray) -> None:
 class Recorder:
     """Writes frames, trajectory, checkpoint, summary and video of a run to one folder.
 
-    Layout: ``frames/00000.png``, ``ply/00000.ply``, ``trajectory.npz`` (arrays ``position_00000`` and ``F_00000``),
-    ``nodes.npz`` (arrays ``displacement_00000`` and ``far_00000``), ``checkpoint.pt``, ``summary.json``,
+    Layout: ``frames/00000.png``, ``ply/00000.ply``, ``still.ply``, ``trajectory.npz`` (arrays ``position_00000`` and
+    ``F_00000``), ``nodes.npz`` (arrays ``displacement_00000`` and ``far_00000``), ``checkpoint.pt``, ``summary.json``,
     ``diagnostics.csv`` (a row per frame), ``config.yaml``, ``video.mp4``.
 
     Other renders have separate folders, ``depth``, ``normal``, ``force`` and ``wind``, and videos with these names.
@@ -101,6 +101,9 @@ class Recorder:
         export_format: Format of the Gaussians: ``ply`` (3DGS, with normals), ``compressed_ply`` (for SuperSplat),
             ``splat``, ``spz``, ``sog``, ``glb`` (glTF, in metres with y up), or ``usd`` (all frames in one
             animation.usdc, in metres; needs usd-core). See ``gaussian_swaying.gaussians.export``.
+        ply_still: Where the Gaussians that never move are written: ``once`` in one file beside the folder of the frames
+            (still.ply), which then have only what moves; in all ``frames``; or ``auto``, which is ``once`` if they are
+            more than half of the scene, no edit colours them during the run, and the format is not ``usd``.
         nodes: In ``total``, write the displacement (metres, z up; float16, or float32 where it is long) of the nodes
             that the Gaussians follow for each frame; ``gaussian-swaying export --web`` needs it. Runs of ``updated``
             have nothing to write.
@@ -119,6 +122,7 @@ class Recorder:
     force_scale: float | None = None
     export_format: Format = "ply"
     nodes: bool = True
+    ply_still: Literal["auto", "once", "frames"] = "auto"
 
     def __post_init__(self) -> None:
         check_literals(type(self).__init__, vars(self), "recorder.")
@@ -136,6 +140,11 @@ class Recorder:
         if self.export_format == "usd" and self.ply_every and find_spec("pxr") is None:
             raise ValueError(
                 "The USD file needs usd-core: install gaussian-swaying[usd], or set another `recorder.export_format`."
+            )
+        if self.export_format == "usd" and self.ply_every and self.ply_still == "once":
+            raise ValueError(
+                "A USD file has all Gaussians in every frame: set `recorder.ply_still` to auto, or another "
+                "`recorder.export_format`."
             )
         if self.video and not self.images:
             raise ValueError("The video is made from the images: set `recorder.images` to true or `video` to false.")
@@ -386,6 +395,24 @@ class Recorder:
             place: dict[str, Any] = {"metres_per_unit": frame.metres_per_unit, "rotation": frame.rotation}
             self.write_ply(index, lambda path: export_cloud(path, cloud, format=self.export_format, **place))
 
+    @property
+    def still_file(self) -> Path:
+        """The file of the Gaussians that never move."""
+        return self.folder / f"still{SUFFIXES[self.export_format]}"
+
+    def write_still(self, cloud: Callable[[], GaussianCloud], frame: SimFrame) -> None:
+        """Write the Gaussians that never move in the recorder's format, if the run does not have them yet.
+
+        Args:
+            cloud: Makes the Gaussians, in scene units.
+            frame: Scene units to metres with z up, for glTF.
+        """
+        path = self.still_file
+        if not path.exists():
+            place: dict[str, Any] = {"metres_per_unit": frame.metres_per_unit, "rotation": frame.rotation}
+            made, format = cloud().to("cpu"), self.export_format
+            self._submit(path, lambda: export_cloud(path, made, format=format, **place))
+
     def write_checkpoint(self, checkpoint: dict[str, Any]) -> None:
         """Write the checkpoint for a resumed run.
 
@@ -447,6 +474,7 @@ class Recorder:
                 pack_usd(self.folder / "usd", made[-1], wanted, self.fps or self._real_time_fps)
             elif self.ply_every and frames:
                 made.append(self.folder / self.export_format)
+                made += [self.still_file] if self.still_file.exists() else []
             moved = self.nodes and ((self.folder / "nodes").exists() or (self.folder / "nodes.npz").exists())
             for name, kept in (("trajectory", self.trajectory), ("nodes", moved)):
                 if kept and frames:

@@ -46,7 +46,13 @@ def parts_checksum(scene: SimulatedScene) -> str | None:
 
 
 def _check_checkpoint(
-    editor: SceneEditor, checkpoint: dict[str, Any], start: State, output: Path, frames: int, splat: str | None
+    editor: SceneEditor,
+    checkpoint: dict[str, Any],
+    start: State,
+    output: Path,
+    frames: int,
+    splat: str | None,
+    once: bool,
 ) -> None:
     """Raise ValueError unless the run can continue from a checkpoint as if it had never stopped."""
     stepper, scene, held = editor.stepper, editor.scene, checkpoint["state"].get("position")
@@ -70,6 +76,11 @@ def _check_checkpoint(
         raise ValueError(
             f"The trajectory in {output} is of {tracked} places, but the scene has {scene.tracked}: "
             "resume with the same splat, or start again without --resume."
+        )
+    if checkpoint.get("still_once") is not once:
+        raise ValueError(
+            f"The splat frames in {output} are {'with' if once else 'without'} what never moves: resume with the same "
+            "`recorder.ply_still`, or start again without --resume."
         )
     followed = _count(scene.follow.nodes(start))
     nodes = checkpoint.get("nodes", "unknown")
@@ -104,6 +115,25 @@ def run_health(stepper: Stepper, log: Sequence[Mapping[str, Any]]) -> tuple[dict
     size = scene.size * scene.frame.metres_per_unit
     found = extremes(log, where, size, None if elastic is None else elastic.cpu())
     return found, advice(found, float(points.youngs_modulus.amax()), scene.filled == 0)
+
+
+def written_once(recorder: Recorder, editor: SceneEditor) -> bool:
+    """True if the splat frames of a run are without the Gaussians that never move, see ``recorder.ply_still``.
+
+    Raises:
+        ValueError: If ``ply_still`` is ``once``, but none stands still, or an edit colours one during the run.
+    """
+    moving, count = editor.scene.moving, len(editor.scene.model.means)
+    still = torch.ones(count, dtype=torch.bool, device=moving.device).index_fill(0, moving, False)
+    painted = any(bool((editor.reach(edit)[1] & still).any()) for edit in editor.edits if edit.time > 0)
+    if recorder.ply_still == "once" and len(moving) == count:
+        raise ValueError("All Gaussians of the scene move: set `recorder.ply_still` to auto.")
+    if recorder.ply_still == "once" and painted:
+        raise ValueError(
+            "One of the `edits` colours Gaussians that never move, after the start: set `recorder.ply_still` to frames."
+        )
+    wanted = recorder.ply_still == "auto" and 2 * len(moving) < count and not painted
+    return recorder.ply_still == "once" or (wanted and recorder.export_format != "usd")
 
 
 class WallClock:
@@ -179,6 +209,7 @@ class Run:
             torch.cuda.reset_peak_memory_stats(painter.device)
         self.splat = splat_checksum(self.scene)
         self.force_end = recorder.force_scale or self.stepper.force_scale()
+        self.still_once = recorder.ply_every > 0 and written_once(recorder, editor)
 
     @torch.inference_mode()
     def whole(self, output: Path, resume: bool, settings: dict[str, Any], progress: bool) -> dict[str, Any]:
@@ -200,7 +231,7 @@ class Run:
         state = self.editor.start()  # errors are raised before anything is written
 
         def check(checkpoint: dict[str, Any]) -> None:
-            _check_checkpoint(self.editor, checkpoint, state, output, frames, self.splat)
+            _check_checkpoint(self.editor, checkpoint, state, output, frames, self.splat, self.still_once)
 
         fps, cameras = 1 / self.stepper.frame_dt, tuple(painter.cameras)
         checkpoint = recorder.open(output, self.config, resume, fps, cameras, check)
@@ -220,6 +251,8 @@ class Run:
             state = self.editor.edit_due(restored, resumed=True)
             first, self.log = checkpoint["frame"] + 1, checkpoint["log"]
             walls.seconds.update(checkpoint["wall_s"])
+        if self.still_once:
+            recorder.write_still(lambda: self.scene.rest().part_to_cloud(moving=False), self.scene.frame)
         status, reason, done = "complete", None, first
         bar = stepper.progress = RunProgress(self.frames, first, progress)
         try:
@@ -327,6 +360,7 @@ class Run:
                     "splat": self.splat,
                     "parts": parts_checksum(self.scene),
                     "tracked": self.scene.tracked,
+                    "still_once": self.still_once,
                     "nodes": _count(self.scene.follow.nodes(state)),
                 }
             )
@@ -349,7 +383,8 @@ class Run:
                 self.picture(state, gaussians, frame, name)
         with walls("writing"):
             if exporting:
-                recorder.write_splat(frame, gaussians.to_cloud(), self.scene.frame)
+                cloud = gaussians.part_to_cloud(moving=True) if self.still_once else gaussians.to_cloud()
+                recorder.write_splat(frame, cloud, self.scene.frame)
             if recorder.trajectory:
                 recorder.write_trajectory(frame, *self.scene.surface(state))
             moved = self.scene.follow.nodal(state) if recorder.nodes else None

@@ -226,7 +226,8 @@ class SimulatedScene(nn.Module):
         """The Gaussians at rest."""
         means = self.model.means.detach()
         eye = self.identity.expand(len(means), 3, 3)
-        return DeformedGaussians(means, self.rest_covariances, self.rest_normals, eye, model=self.model)
+        moving = None if self.all_move else self.moving
+        return DeformedGaussians(means, self.rest_covariances, self.rest_normals, eye, model=self.model, moving=moving)
 
     def deformed(self, state: State, rotations: bool = True) -> DeformedGaussians:
         """The Gaussians moved by the material: x, F A Fᵀ, F⁻ᵀN (paper, "Surface Formulation").

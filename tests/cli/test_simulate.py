@@ -177,7 +177,7 @@ def test_edits_from_a_configuration(tmp_path, capsys):
 def test_the_blocks_of_the_page_on_recording_are_configurations(tmp_path):
     """Each parses after the flag's, and makes its cameras, recorder and edits."""
     blocks = (ROOT / "docs/recording.md").read_text(encoding="utf-8").split("```yaml\n")[1:]
-    assert len(blocks) == 5
+    assert len(blocks) == 6
     parser = Simulation.parser()
     for block in blocks:
         (tmp_path / "block.yaml").write_text(block.split("```")[0])

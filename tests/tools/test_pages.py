@@ -20,6 +20,7 @@ NAMES = (
     "gallery.md",
     "live.md",
     "many.md",
+    "recording.md",
     "training.md",
     "validation.md",
     "web.md",

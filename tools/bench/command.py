@@ -15,7 +15,8 @@ _OWN = (
     "speed live accuracy pareto points backward gradients surfaces flags pins contact fit soft folds gallery previews"
 )
 _FILES = {
-    name: f"{name}.CASE" for name in (*_OWN.split(), "area", "blender", "places", "drawn", "web", "sweeps", "winds")
+    name: f"{name}.CASE"
+    for name in (*_OWN.split(), "area", "blender", "places", "frames", "drawn", "web", "sweeps", "winds")
 }
 _FILES |= {"substep": "runs.SUBSTEP", "sim": "runs.SIM", "train": "training.CASE"}
 

@@ -37,6 +37,7 @@ PARTS: dict[str, tuple[str, ...]] = {
     "fit": (*_DRAWN, "fitting"),
     "flags": (*_DRAWN, "evaluation", "training"),
     "folds": (*_SIMULATION, "evaluation"),
+    "frames": _SIMULATION,
     "gallery": _DRAWN,
     "gradients": _SIMULATION,
     "live": (*_DRAWN, "viewer"),

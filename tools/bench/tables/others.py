@@ -1,4 +1,4 @@
-"""Tables of gallery.md, live.md, many.md, web.md and wind.md."""
+"""Tables of gallery.md, live.md, many.md, recording.md, web.md and wind.md."""
 
 from __future__ import annotations
 
@@ -46,6 +46,12 @@ table("live.md", "drawn.scenes", "drawn_*", "scenes", """
     server, a state [ms] = {state_ms:.2g} | server, a picture [ms] = {jpeg_ms:.3g} |
     pictures a second without a graphics card = {pictures_per_s:.1f} | steps a second meanwhile = {steps_per_s:.1f} |
     at pixels = {picture}
+    """, before="{source}")  # fmt: skip
+
+table("recording.md", "frames.rows", "frames_*", "frames", """
+    `recorder.ply_still` = `{still}` | Gaussians = {gaussians:,} | that move = {moving:,} |
+    a frame [MB] = {frame_bytes:.1f (MB)} | a frame [s] = {frame_s:.2f} | once [MB] = {still_bytes:.1f (MB)} |
+    once [s] = {still_s:.1f}
     """, before="{source}")  # fmt: skip
 
 table("web.md", "web.films", "web_*", "films", """
