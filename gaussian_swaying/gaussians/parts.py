@@ -6,7 +6,7 @@
 ``count``        int64, ()                   N, so that the parts of another splat are noticed
 ``labels``       uint8, or uint16, (N,)      the part of each Gaussian, in the order of the splat
 ``names``        text, (P,)                  the names of the parts
-``roles``        text, (P,)                  ``soft``, ``held`` or ``still``
+``roles``        text, (P,)                  ``soft``, ``rigid``, ``held`` or ``still``
 ``E``            float64, (P,)               Young's modulus [Pa]; NaN for that of the object, here and below
 ``nu``           float64, (P,)               Poisson's ratio
 ``density``      float64, (P,)               density [kg/m³]
@@ -36,7 +36,7 @@ from gaussian_swaying.geometry.regions import Region
 if TYPE_CHECKING:
     from scipy.spatial import cKDTree
 
-ROLES = ("soft", "held", "still")
+ROLES = ("soft", "rigid", "held", "still")
 NUMBERS = ("E", "nu", "density", "thickness")
 MOST = 1 << 16  # parts of a file: labels are uint16
 
@@ -47,15 +47,16 @@ class Part:
 
     Args:
         name: Its name, which no other part has.
-        role: ``soft`` (it moves), ``held`` (it is simulated and drawn, but stays where it is, and what is attached to
-            it bends there) or ``still`` (it is drawn, and the simulation does not know it).
-        E: Young's modulus [Pa]; that of the object if None.
-        nu: Poisson's ratio; that of the object if None.
+        role: ``soft`` (it moves), ``rigid`` (it moves as one body, and what is attached to it bends there), ``held``
+            (it is simulated and drawn, but stays where it is, and what is attached to it bends there) or ``still`` (it
+            is drawn, and the simulation does not know it).
+        E: Young's modulus [Pa]; that of the object if None. A rigid part has none.
+        nu: Poisson's ratio; that of the object if None. A rigid part has none.
         density: Density [kg/m³]; that of the object if None.
         thickness: Thickness of the surface [m]; that of the object if None.
 
     Raises:
-        ValueError: If a value is out of range, or a part that is ``still`` has a material.
+        ValueError: If a value is out of range, a part that is ``still`` has a material, or a ``rigid`` one E or nu.
     """
 
     name: str
@@ -69,13 +70,13 @@ class Part:
     def __post_init__(self) -> None:
         if not self.name:
             raise ValueError("A part has no name: give it one.")
-        if self.role == "rigid":
-            raise ValueError(
-                f"The role of the part {self.name!r} is rigid, which is not there yet: make it soft, with a large `E`."
-            )
         check_choice(f"role of the part {self.name!r}", self.role, ROLES)
         if self.role == "still" and self.has_material:
             raise ValueError(f"The part {self.name!r} is still and has no material: remove its numbers, or its role.")
+        if self.role == "rigid" and (self.E is not None or self.nu is not None):
+            raise ValueError(
+                f"The part {self.name!r} is rigid and does not bend: remove its `E` and `nu`, or its role."
+            )
         for name in NUMBERS:
             value, what = getattr(self, name), f"{name} of the part {self.name!r}"
             if value is not None and name == "nu":

@@ -91,14 +91,3 @@ def between(times: Tensor, values: Tensor, time: Tensor) -> Tensor:
     start, end = times[last], times[last + 1]
     f = ((time - start) / (end - start)).clamp(0.0, 1.0)
     return (values[last] + f * (values[last + 1] - values[last]))[0]
-
-
-def rotation_of(turn: Tensor) -> Tensor:
-    """Rotation matrix (3, 3) of an axis times angle [rad], shape (3,): Rodrigues' formula."""
-    angle = torch.linalg.vector_norm(turn)
-    axis = turn / angle.clamp(min=torch.finfo(turn.dtype).tiny)
-    x, y, z = axis.unbind()
-    zero = torch.zeros_like(x)
-    cross = torch.stack([zero, -z, y, z, zero, -x, -y, x, zero]).reshape(3, 3)
-    eye = torch.eye(3, dtype=turn.dtype, device=turn.device)
-    return eye + torch.sin(angle) * cross + (1 - torch.cos(angle)) * (cross @ cross)

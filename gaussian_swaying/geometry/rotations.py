@@ -63,6 +63,27 @@ def rotation_to_quat(rotation: Tensor) -> Tensor:
     return torch.where(quats[..., :1] < 0, -quats, quats)
 
 
+def turn_of(turn: Tensor) -> Tensor:
+    """R - 1 for the rotation R by an axis times angle [rad], by Rodrigues' formula; small angles lose no digits.
+
+    Args:
+        turn: Axis times angle, shape (..., 3).
+
+    Returns:
+        Shape (..., 3, 3).
+    """
+    half = torch.linalg.vector_norm(turn, dim=-1)[..., None, None] / (2 * math.pi)
+    x, y, z = turn.unbind(-1)
+    zero = torch.zeros_like(x)
+    cross = torch.stack([zero, -z, y, z, zero, -x, -y, x, zero], dim=-1).unflatten(-1, (3, 3))
+    return torch.sinc(2 * half) * cross + 0.5 * torch.sinc(half) ** 2 * (cross @ cross)
+
+
+def rotation_of(turn: Tensor) -> Tensor:
+    """Rotation matrices (..., 3, 3) of an axis times angle [rad], shape (..., 3)."""
+    return torch.eye(3, dtype=turn.dtype, device=turn.device) + turn_of(turn)
+
+
 def rotation_from_z(up: Sequence[float] | Tensor) -> Tensor:
     """Minimal rotation that takes +z to ``up``; its transpose takes ``up`` to +z.
 

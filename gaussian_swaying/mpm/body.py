@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from gaussian_swaying.mpm.boundaries.boundary import CLOCK, Boundary
+from gaussian_swaying.mpm.boundaries.rigid_region import RigidRegion
 from gaussian_swaying.mpm.contact.surface import Surface
 from gaussian_swaying.mpm.dispatch import LawDispatch
 from gaussian_swaying.mpm.state import MaterialPoints
@@ -49,17 +50,28 @@ class Body:
     Attributes:
         laws: The laws of the material, bound to its particles.
         held: The particles that each boundary holds; None for one that holds none.
+        rigid: The places among the boundaries of those that make a part rigid.
     """
 
     def __init__(self, points: MaterialPoints, boundaries: Sequence[Boundary], surface: Surface | None = None) -> None:
         self.points, self.boundaries, self.surface = points, tuple(boundaries), surface
         self.laws = LawDispatch(points)
         self.held = tuple(_held(points, boundary) for boundary in self.boundaries)
+        self.rigid = [k for k, boundary in enumerate(self.boundaries) if isinstance(boundary, RigidRegion)]
 
     def soften(self, particles: Tensor, factor: float) -> None:
         """Multiply the stiffness of some particles, bool (..., P), with a factor; ``points`` stay as they are."""
         E = self.points.youngs_modulus
         self.laws = LawDispatch(replace(self.points, youngs_modulus=torch.where(particles, factor * E, E)))
+
+    def is_rigid(self) -> Tensor:
+        """The particles of rigid parts, bool, shape (..., P)."""
+        found = torch.zeros_like(self.points.mass, dtype=torch.bool)
+        for k in self.rigid:
+            held = self.held[k]
+            assert held is not None
+            found |= held.mass > 0
+        return found
 
     def mapped_surface(self, function: Callable[[Tensor], Tensor]) -> Surface | None:
         """The surface with a function applied to its tensors, if there is one."""

@@ -1,4 +1,4 @@
-"""The parts of a splat in a simulation: materials of their own, and a pin for what is held."""
+"""The parts of a splat in a simulation: materials of their own, bodies for what is rigid, a pin for what is held."""
 
 from __future__ import annotations
 
@@ -9,7 +9,9 @@ from torch import nn
 
 from gaussian_swaying.gaussians.cloud import GaussianCloud
 from gaussian_swaying.gaussians.parts import NUMBERS, PartRegion
+from gaussian_swaying.mpm.boundaries.boundary import Boundary
 from gaussian_swaying.mpm.boundaries.pinned_region import PinnedRegion
+from gaussian_swaying.mpm.boundaries.rigid_region import RigidRegion
 from gaussian_swaying.mpm.protocol import Solver
 from gaussian_swaying.simulation.material import Material, MaterialRegion
 from gaussian_swaying.simulation.scene import Scene
@@ -22,7 +24,7 @@ def with_parts(scene: Scene, cloud: GaussianCloud, material: Material, solver: S
         scene: The scene, all in scene units.
         cloud: Its Gaussians.
         material: Its ``regions`` come after those of the parts, and win.
-        solver: Gets a pin for all parts that are held, which holds the nodes of the grid.
+        solver: Gets a body for each part that is rigid, and a pin for all that are held, which holds nodes of the grid.
 
     Returns:
         Copies.
@@ -37,12 +39,18 @@ def with_parts(scene: Scene, cloud: GaussianCloud, material: Material, solver: S
         for k, part in enumerate(parts.parts)
         if part.has_material and bool((labels == k).any())
     ]
+    acting: list[Boundary] = [
+        RigidRegion(PartRegion(part.name, means, labels == k))
+        for k, part in enumerate(parts.parts)
+        if part.role == "rigid" and bool((labels == k).any())
+    ]
     held = parts.mask(role="held")[chosen]
     if regions:
         material = dataclasses.replace(material, regions=[*regions, *material.regions])
     if bool(held.any()):
         names = [part.name for k, part in enumerate(parts.parts) if part.role == "held" and bool((labels == k).any())]
-        pin = PinnedRegion(PartRegion(", ".join(names), means, held), "nodes")
+        acting.append(PinnedRegion(PartRegion(", ".join(names), means, held), "nodes"))
+    if acting:
         solver = copy.copy(solver)
-        solver._modules = solver._modules | {"boundaries": nn.ModuleList([*solver.boundaries, pin])}  # of the copy
+        solver._modules = solver._modules | {"boundaries": nn.ModuleList([*solver.boundaries, *acting])}  # of the copy
     return material, solver

@@ -31,7 +31,8 @@ def test_more_than_256_parts_take_two_bytes_each(tmp_path):
     ("arguments", "message"),
     [
         ((("a", "liquid"), {}), "role of the part 'a'"),
-        ((("a", "rigid"), {}), "rigid, which is not there yet"),
+        ((("a", "rigid"), {"E": 1e5}), "rigid and does not bend"),
+        ((("a", "rigid"), {"nu": 0.2}), "rigid and does not bend"),
         ((("", "soft"), {}), "has no name"),
         ((("a", "still"), {"E": 1e5}), "still and has no material"),
         ((("a",), {"density": -1.0}), "density of the part 'a'"),

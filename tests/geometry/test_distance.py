@@ -17,8 +17,9 @@ from gaussian_swaying.geometry.distance import (
     capsule_distance,
     grid_distance,
 )
-from gaussian_swaying.geometry.keyed_path import KeyedPath, between, rotation_of
+from gaussian_swaying.geometry.keyed_path import KeyedPath, between
 from gaussian_swaying.geometry.meshes import mesh_distance, read_mesh, triangle_distance
+from gaussian_swaying.geometry.rotations import rotation_of
 
 HALF = torch.tensor([0.3, 0.2, 0.5], dtype=torch.float64)
 SOLIDS = {

@@ -4,7 +4,7 @@ import pytest
 import torch
 from shared import unit
 
-from gaussian_swaying.geometry.rotations import quat_to_rotation, rotation_to_quat
+from gaussian_swaying.geometry.rotations import quat_to_rotation, rotation_of, rotation_to_quat, turn_of
 
 
 def test_quaternion_rotates_as_hamilton_product(device, dtype):
@@ -23,6 +23,17 @@ def test_rotation_to_quat_inverts(device, dtype):
     assert (back[:, 0] >= 0).all()
     torch.testing.assert_close(quat_to_rotation(back), quat_to_rotation(quats))
     torch.testing.assert_close(back[4:], quats[4:], rtol=0, atol=1e-5 if dtype == torch.float32 else 1e-13)
+
+
+def test_a_turn_is_the_exponential_of_its_cross_product():
+    """Of any size; a small one, and its derivative at zero, are exact."""
+    turn = torch.cat([4 * torch.randn(20, 3, dtype=torch.float64), torch.zeros(1, 3, dtype=torch.float64)])
+    x, y, z = turn.unbind(-1)
+    zero = torch.zeros_like(x)
+    cross = torch.stack([zero, -z, y, z, zero, -x, -y, x, zero], -1).reshape(-1, 3, 3)
+    torch.testing.assert_close(rotation_of(turn), torch.linalg.matrix_exp(cross), rtol=0, atol=1e-12)
+    torch.testing.assert_close(turn_of(1e-12 * turn), 1e-12 * cross, rtol=1e-9, atol=1e-22)
+    assert torch.autograd.gradcheck(turn_of, torch.zeros(1, 3, dtype=torch.float64, requires_grad=True))
 
 
 @pytest.mark.parametrize(

@@ -9,7 +9,9 @@ import torch
 
 from gaussian_swaying.gaussians.parts import Part, Parts
 from gaussian_swaying.geometry.regions import Box
+from gaussian_swaying.mpm.boundaries.rigid_region import RigidRegion
 from gaussian_swaying.mpm.solver import MPMSolver
+from gaussian_swaying.recording.recorder import Recorder
 from gaussian_swaying.scenes.procedural import FlagScene, GivenScene
 from gaussian_swaying.simulation.edits import Edit
 from gaussian_swaying.simulation.material import Material, MaterialRegion
@@ -48,6 +50,39 @@ def test_what_is_still_and_held_stays_and_the_rest_bends_there(formulation):
     size = torch.stack([moved[column == k].amax() for k in range(int(column.max()) + 1)])
     assert float(size.diff().abs().max()) < 1.5 * 0.04  # columns are 0.04 apart, and the flag falls by its weight
     assert float(moved[(label == 2) & (CLOUD.means[:, 0] > 0.5)].min()) > 0.0  # what bends is next to it
+
+
+@pytest.mark.parametrize("formulation", ["total", "updated"])
+def test_a_rigid_part_keeps_its_shape_and_the_cloth_between_bends(formulation):
+    roles = [Part("wall", "still"), Part("pole", "held"), Part("cloth"), Part("board", "rigid", density=200.0)]
+    simulation = flag(Parts(labels(), roles), formulation=formulation)
+    last = list(simulation.frames(12))[-1]
+    board, cloth = labels() == 3, labels() == 2
+    distance, found = (torch.pdist(means[board].double()) for means in (CLOUD.means, last.gaussians.means))
+    assert float((found - distance).abs().max()) < 1e-4
+    assert float((last.gaussians.means - CLOUD.means)[board].norm(dim=-1).min()) > 0.02
+    edge = torch.pdist(last.gaussians.means[cloth].double()) - torch.pdist(CLOUD.means[cloth].double())
+    assert float(edge.abs().max()) > 0.01
+    points = simulation.scene.points
+    assert float((points.mass / points.volume).amax()) == pytest.approx(200.0)
+
+
+def test_several_rigid_parts_move_each_in_its_way_and_a_run_goes_on(tmp_path):
+    label = torch.bucketize(CLOUD.means[:, 0].contiguous(), torch.tensor([0.15, 0.35, 0.55, 0.95]))
+    roles = [Part("pole", "held"), Part("cloth"), Part("one", "rigid"), Part("more"), Part("other", "rigid")]
+    parts = Parts(label, roles)
+    assert sum(isinstance(b, RigidRegion) for b in flag(parts).solver.boundaries) == 2
+
+    def run(name, frames, resume=False):
+        recorder = Recorder(images=False, video=False, trajectory=True)
+        flag(parts).run(tmp_path / name, frames, resume, progress=False, recorder=recorder)
+        return np.load(tmp_path / name / "trajectory.npz")
+
+    whole = run("whole", 6)
+    run("half", 3)
+    half = run("half", 6, resume=True)
+    for name in ("position_00005", "F_00005"):
+        assert np.array_equal(whole[name], half[name])
 
 
 def test_the_held_part_is_in_the_simulation_and_the_still_one_is_not():

@@ -10,7 +10,8 @@ from torch import Tensor
 from gaussian_swaying._checks import check_vector
 from gaussian_swaying.geometry.distance import box_distance
 from gaussian_swaying.geometry.frame import SimFrame
-from gaussian_swaying.geometry.keyed_path import KeyedPath, rotation_of
+from gaussian_swaying.geometry.keyed_path import KeyedPath
+from gaussian_swaying.geometry.rotations import rotation_of
 from gaussian_swaying.mpm.boundaries.obstacle import Obstacle
 from gaussian_swaying.mpm.twins import Numbers, Twin
 

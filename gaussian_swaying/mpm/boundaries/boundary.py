@@ -44,6 +44,8 @@ class Nodes:
         share: Share of each node's mass that belongs to the particles of the boundary, shape (..., G), if it has any.
         threshold: Share above which such a node is held.
         held_mass: Mass of those particles [kg], shape (...).
+        mass: Mass of the nodes [kg], shape (..., G).
+        fixed: Nodes that pins hold now, bool, shape (..., G); None if none does.
     """
 
     time: Tensor
@@ -53,6 +55,8 @@ class Nodes:
     share: Tensor | None = None
     threshold: float = 0.0
     held_mass: Tensor | None = None
+    mass: Tensor | None = None
+    fixed: Tensor | None = None
 
     @property
     def held(self) -> Tensor:

@@ -10,7 +10,8 @@ from torch import Tensor
 
 from gaussian_swaying._checks import check_positive
 from gaussian_swaying.geometry.frame import SimFrame
-from gaussian_swaying.geometry.keyed_path import KeyedPath, between, fastest, rotation_of
+from gaussian_swaying.geometry.keyed_path import KeyedPath, between, fastest
+from gaussian_swaying.geometry.rotations import rotation_of
 from gaussian_swaying.mpm.boundaries.boundary import Boundary, Nodes
 from gaussian_swaying.mpm.boundaries.plane import plane_velocity
 from gaussian_swaying.mpm.twins import Numbers, Twin

@@ -16,9 +16,11 @@ from gaussian_swaying._checks import check_positive
 from gaussian_swaying._devices import double_home, sum_in_double
 from gaussian_swaying.geometry.linalg import symmetric_eigenvalues
 from gaussian_swaying.mpm.body import Body, Held
-from gaussian_swaying.mpm.boundaries.boundary import Nodes
+from gaussian_swaying.mpm.boundaries.boundary import Boundary, Nodes
 from gaussian_swaying.mpm.boundaries.impulse import Impulse
 from gaussian_swaying.mpm.boundaries.obstacle import Obstacle
+from gaussian_swaying.mpm.boundaries.pinned_region import PinnedRegion
+from gaussian_swaying.mpm.boundaries.rigid_region import RigidRegion
 from gaussian_swaying.mpm.damping import damped_substep
 from gaussian_swaying.mpm.state import GridSpec, MPMState, bounding_grid
 from gaussian_swaying.mpm.timestep import MAX_CFL, cfl_number, stable_limit, wave_speed
@@ -215,20 +217,27 @@ class Formulation(ABC):
             The velocity, shape (..., G, 3), and the momentum that each boundary took from the body [N s], shape
             (..., B, 3), float64.
         """
-        taken = list(self.no_impulse().unbind(-2))
+        taken, fixed = list(self.no_impulse().unbind(-2)), None
         acting = [k for k, acts in enumerate(self.on_nodes) if acts]
-        # impulses come before conditions that hold nodes, in whatever order they were given
-        for k in sorted(acting, key=lambda k: not isinstance(self.body.boundaries[k], Impulse)):
+        # impulses come before conditions that hold nodes, and rigid parts after them, in whatever order they are given
+        for k in sorted(acting, key=lambda k: _turn(self.body.boundaries[k])):
             boundary, held, before = self.body.boundaries[k], self.held[k], velocity
             if held is None:
                 nodes = Nodes(time, dt, position, lattice)
             else:
                 share = share_of(held) if held.share is None else held.share
-                nodes = Nodes(time, dt, position, lattice, share, held.threshold, held.total)
+                nodes = Nodes(time, dt, position, lattice, share, held.threshold, held.total, mass, fixed)
             velocity = boundary(velocity, nodes)
+            if self.body.rigid and isinstance(boundary, PinnedRegion):
+                pinned = nodes.held & boundary.active(time)
+                fixed = pinned if fixed is None else fixed | pinned
             with torch.no_grad():
                 taken[k] = sum_in_double(mass[..., None] * (before - velocity), -2)
         return velocity, torch.stack(taken, dim=-2) if taken else self.no_impulse()
+
+    def in_shape(self, state: MPMState) -> MPMState:
+        """The state with the particles of rigid parts exactly where these are, without round-off; itself if none is."""
+        return state
 
     # ---- measures of a state
 
@@ -289,6 +298,11 @@ class Formulation(ABC):
         F = state.F_elastic.detach()
         squared = float(symmetric_eigenvalues(F.mT @ F)[..., 0].amax().clamp(min=1.0))
         return time * squared**self.viscous_power
+
+
+def _turn(boundary: Boundary) -> int:
+    """When a boundary acts among those of a substep."""
+    return 0 if isinstance(boundary, Impulse) else 2 if isinstance(boundary, RigidRegion) else 1
 
 
 def held_share(held: Held, stencil: Stencil, inverse_mass: Tensor, time: Tensor) -> Tensor:

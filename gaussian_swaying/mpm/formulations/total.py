@@ -4,12 +4,15 @@ from __future__ import annotations
 
 import math
 import warnings
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import partial
 
 import torch
 from torch import Tensor
 
+from gaussian_swaying._devices import in_double
+from gaussian_swaying.geometry.linalg import polar_rotation
+from gaussian_swaying.geometry.rigid import centre, fitted_gradient
 from gaussian_swaying.mpm.body import Body, Held
 from gaussian_swaying.mpm.boundaries.boundary import BY_BODY, Boundary
 from gaussian_swaying.mpm.boundaries.pinned_points import PinnedPoints
@@ -71,6 +74,8 @@ class Total(Formulation):
             held if held is None or not self.on_nodes[k] else self._on_nodes(k, held)
             for k, held in enumerate(body.held)
         )
+        self._bodies = [self._body(k) for k in self.body.rigid]
+        self._check_bodies()
         self._soften()
         self._windows = self._point_windows()
         self._point_holds = self._hold_points()
@@ -79,10 +84,13 @@ class Total(Formulation):
     def hold_kind(self, k: int) -> str:
         """Return what a boundary acts on; a pin without a kind holds a sheet by a hinge, and anything else by a clamp.
 
-        Warns if a hinge or a clamped place is to hold a part of several cells in thickness, which it cannot.
+        Next to a rigid part it holds nodes, as points cannot share nodes with one. Warns if a hinge or a clamped place
+        is to hold a part of several cells in thickness, which it cannot.
         """
         boundary, kind = self.body.boundaries[k], super().hold_kind(k)
         given = isinstance(boundary, PinnedPoints)
+        if kind == BY_BODY and self._next_to_rigid(k):
+            return "nodes"
         if kind == BY_BODY or (kind == "hinge" and not given) or (kind == "clamp" and given):
             thick, sheet = self._thickness(k)
             if kind == BY_BODY:
@@ -97,6 +105,25 @@ class Total(Formulation):
                     stacklevel=2,
                 )
         return kind
+
+    def _next_to_rigid(self, k: int) -> bool:
+        """True if a boundary holds particles that may share nodes with a rigid part."""
+        held = self.body.held[k]
+        if held is None or not self.body.rigid:
+            return False
+        from scipy.spatial import cKDTree
+
+        count = held.mass.shape[-1]
+        place, own, rigid = (
+            field.detach().reshape(-1, count, *field.shape[held.mass.ndim :]).cpu()
+            for field in (self.body.points.position, held.mass > 0, self.body.is_rigid())
+        )
+        reach = 3 * self.settings.dx
+        for where, pinned, part in zip(place.double(), own, rigid, strict=True):
+            near = cKDTree(where[part].numpy()).query(where[pinned].numpy(), p=math.inf, distance_upper_bound=reach)[0]
+            if len(near) and float(near.min()) < reach:
+                return True
+        return False
 
     def _thickness(self, k: int) -> tuple[float, bool]:
         """The largest thickness of the body where a boundary holds it [m], and whether all scenes are sheets there."""
@@ -160,7 +187,33 @@ class Total(Formulation):
             assert held.share is not None
             still |= held.share > held.threshold
         holds = PointHolds(self.body, self.kinds, faces, still, self.stencil.first, self.grid, self.node_inverse_mass)
-        return holds if holds.rows else None  # a clamp that holds everything has no face
+        if not holds.rows:
+            return None  # a clamp that holds everything has no face
+        if any(bool((body.mass.reshape(-1)[holds.affected] > 0).any()) for body in self._bodies):
+            raise ValueError(
+                "A pin holds points of a rigid part or next to it, which it cannot: set its `kind` to nodes, which "
+                "holds the whole part, or leave three cells of soft material between."
+            )
+        return holds
+
+    def _body(self, k: int) -> _RigidNodes:
+        """The nodes of a rigid part."""
+        held = self.held[k]
+        assert held is not None
+        assert held.share is not None
+        rest, mass = in_double(self.grid.node_positions(self.node_mass)), in_double(self.node_mass)
+        return _RigidNodes(held.mass > 0, rest, torch.where(held.share > held.threshold, mass, 0.0))
+
+    def _check_bodies(self) -> None:
+        """Raise ValueError if two rigid parts share nodes."""
+        for k, body in enumerate(self._bodies):
+            for other, before in enumerate(self._bodies[:k]):
+                if bool(((body.mass > 0) & (before.mass > 0)).any()):
+                    names = [repr(_region(self.body.boundaries[self.body.rigid[i]])) for i in (other, k)]
+                    raise ValueError(
+                        f"Two rigid parts touch, and would not hold each other: that {names[0]} and that {names[1]}; "
+                        "make them one part, or put soft material between."
+                    )
 
     def _contact(self) -> ContactStage | None:
         body, surface = self.body, self.body.surface
@@ -214,10 +267,13 @@ class Total(Formulation):
         assert displacement is not None
         assert state.node_velocity is not None
         points, laws, time = self.body.points, self.body.laws, self.settings.stiffness_damping
-        F = state.F_elastic
+        F, rate = state.F_elastic, state.affine
+        if self._bodies:  # at the border of a rigid part, the nodes strain its particles
+            raw = self.read_particles(state, displacement, state.node_velocity)
+            F, rate = raw.F_elastic, raw.affine
         stress = laws.pk1(F, None)
         if time > 0:
-            stress = stress + kelvin_voigt_pk1(F, state.affine, laws.mu, laws.lam, time)
+            stress = stress + kelvin_voigt_pk1(F, rate, laws.mu, laws.lam, time)
         stress = stress * points.volume[..., None, None]
         value = torch.zeros_like(state.position) if force is None else force
         node_force = scatter(self.stencil, torch.cat([value[..., None, :], -stress.mT], dim=-2))
@@ -242,7 +298,16 @@ class Total(Formulation):
         if pressed is not None:
             taken = taken + pressed
         state = state.replace(time=state.time + dt, substep=dt, impulse=state.impulse + taken)
-        return self.read_particles(state, displacement + dt * velocity, velocity)
+        return self.in_shape(self.read_particles(state, displacement + dt * velocity, velocity))
+
+    def in_shape(self, state: MPMState) -> MPMState:
+        """The state with nodes and particles of rigid parts exactly where these are.
+
+        Particles at the border of a part have a small share of nodes that are not of it.
+        """
+        for body in self._bodies:
+            state = body.in_shape(state, self.body.points.position)
+        return state
 
     def touch(self, velocity: Tensor, displacement: Tensor, time: Tensor, dt: float | Tensor) -> tuple[Tensor, Tensor]:
         """Apply the impulses of contact; return velocity and reaction impulse on each boundary, as :meth:`hold`."""
@@ -315,3 +380,44 @@ class Total(Formulation):
 
 def _always(boundary: Boundary) -> bool:
     return boundary.holds_from <= 0 and boundary.end == math.inf
+
+
+def _region(boundary: Boundary) -> object:
+    return vars(boundary).get("region")
+
+
+@dataclass(frozen=True)
+class _RigidNodes:
+    """A rigid part.
+
+    Attributes:
+        particles: Its particles, bool, shape (..., P).
+        rest: Nodes at rest [m], float64, shape (G, 3).
+        mass: Mass of its nodes [kg], zero for others, float64, shape (..., G).
+    """
+
+    particles: Tensor
+    rest: Tensor
+    mass: Tensor
+
+    def in_shape(self, state: MPMState, rest: Tensor) -> MPMState:
+        """The state with its nodes and particles in place; ``rest`` are the particles at rest, shape (..., P, 3)."""
+        assert state.node_displacement is not None
+        assert state.node_velocity is not None
+        displacement, velocity = in_double(state.node_displacement), in_double(state.node_velocity)
+        identity = torch.eye(3, dtype=self.rest.dtype, device=self.rest.device)
+        rotation = polar_rotation(identity + fitted_gradient(self.rest, displacement, self.mass))
+        rate = fitted_gradient(self.rest, velocity, self.mass)
+        middle, shift, speed = (centre(field, self.mass) for field in (self.rest, displacement, velocity))
+        arm, turn = in_double(rest) - middle, (rotation - identity).mT
+        own, whole = self.particles[..., None], self.particles[..., None, None]
+        F = torch.where(whole, rotation.to(rest)[..., None, :, :], state.F_elastic)
+        nodes = (shift + (self.rest - middle) @ turn).to(rest)
+        return state.replace(
+            position=torch.where(own, rest + (shift + arm @ turn).to(rest), state.position),
+            velocity=torch.where(own, (speed + arm @ rate.mT).to(rest), state.velocity),
+            affine=torch.where(whole, rate.to(rest)[..., None, :, :], state.affine),
+            F_elastic=F,
+            F_total=F,
+            node_displacement=torch.where((self.mass > 0)[..., None], nodes, state.node_displacement),
+        )

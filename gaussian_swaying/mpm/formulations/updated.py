@@ -8,7 +8,9 @@ from functools import partial
 import torch
 from torch import Tensor
 
-from gaussian_swaying.geometry.linalg import matmul3
+from gaussian_swaying._devices import in_double
+from gaussian_swaying.geometry.linalg import matmul3, polar_rotation
+from gaussian_swaying.geometry.rigid import centre
 from gaussian_swaying.mpm.body import Body
 from gaussian_swaying.mpm.damping import kelvin_voigt_pk1
 from gaussian_swaying.mpm.formulations.formulation import Formulation, Settings, held_share, not_finite, safe_inverse
@@ -116,7 +118,7 @@ class Updated(Formulation):
         if laws.plastic:
             F_total = matmul3(update, state.F_total)
             F, internal = laws.return_map(F, internal, dt)
-        return state.replace(
+        after = state.replace(
             position=state.position + dt * new_velocity,
             velocity=new_velocity,
             affine=affine,
@@ -128,6 +130,28 @@ class Updated(Formulation):
             substep=dt,
             impulse=state.impulse + taken,
         )
+        return self.in_shape(after)
+
+    def in_shape(self, state: MPMState) -> MPMState:
+        """The state with the particles of rigid parts exactly where these are: c + R (X - C), with R as their F."""
+        rest = in_double(self.body.points.position)
+        for k in self.body.rigid:
+            held = self.body.held[k]
+            assert held is not None
+            own, mass = (held.mass > 0)[..., None], in_double(held.mass)
+            whole, before = mass.sum(-1)[..., None, None], centre(rest, mass)
+            mean = (mass[..., None, None] * in_double(state.F_total)).sum(-3) / whole.clamp(min=1e-300)
+            rotation = polar_rotation(mean)
+            place = centre(in_double(state.position), mass) + (rest - before) @ rotation.mT
+            F = rotation.to(state.F_total)[..., None, :, :]
+            total = torch.where(own[..., None], F, state.F_total)
+            same = state.F_elastic is state.F_total
+            state = state.replace(
+                position=torch.where(own, place.to(state.position), state.position),
+                F_elastic=total if same else torch.where(own[..., None], F, state.F_elastic),
+                F_total=total,
+            )
+        return state
 
     def kinetic(self, state: MPMState) -> Tensor:
         """Energy of the particles; the affine part adds dx²/4 of its square (lumped APIC energy; Jiang et al. 2015)."""

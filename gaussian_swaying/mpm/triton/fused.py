@@ -86,7 +86,7 @@ class Fused(ABC):
 
     def __init__(self, bound: Formulation) -> None:
         body, points = bound.body, bound.body.points
-        self.body, self.settings = body, bound.settings
+        self.body, self.settings, self._in_shape = body, bound.settings, bound.in_shape
         self.device, self._made_from = points.position.device, _made_from(body)
         self.particles = points.count
         self.count = points.mass.numel()
@@ -277,7 +277,7 @@ class Fused(ABC):
         changes["impulse"] = state.impulse + changes["impulse"]
         if loaded:
             changes["work"] = state.work + changes["work"]
-        return state.replace(time=state.time + steps * dt, substep=dt, **changes)
+        return self._in_shape(state.replace(time=state.time + steps * dt, substep=dt, **changes))
 
     def table(self, kick: float, dt: float, steps: int) -> Tensor:
         """The schedule on the host, which can be copied without making it wait."""

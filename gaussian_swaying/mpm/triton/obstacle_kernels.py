@@ -86,7 +86,7 @@ def _at(keys, count, time):
 
 @triton.jit
 def _rotation(turn):
-    """As ``geometry.keyed_path.rotation_of``."""
+    """As ``geometry.rotations.rotation_of``."""
     angle = tl.sqrt(dot3(turn, turn))
     scale = 1 / tl.where(angle > 0, angle, 1.0)
     x = turn[0] * scale

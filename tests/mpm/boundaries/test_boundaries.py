@@ -32,6 +32,7 @@ from gaussian_swaying.mpm.boundaries.mesh import MeshObstacle
 from gaussian_swaying.mpm.boundaries.pinned_points import PinnedPoints
 from gaussian_swaying.mpm.boundaries.pinned_region import PinnedRegion
 from gaussian_swaying.mpm.boundaries.plane import Plane
+from gaussian_swaying.mpm.boundaries.rigid_region import RigidRegion
 from gaussian_swaying.mpm.boundaries.sequential_release import SequentialRelease
 from gaussian_swaying.mpm.boundaries.still_gaussians import StillGaussians
 from gaussian_swaying.mpm.boundaries.velocity_box import VelocityBox
@@ -56,6 +57,7 @@ CONDITIONS = {
     "block": lambda r: BoxObstacle([0.0, 0.1, 0.2], [0.3, 0.3, 0.4], [20, 0, 40], 0.3, path=MOVING, end=0.5),
     "ground": lambda r: HalfSpaceObstacle([0.1, 0.2, 0.2], [0.0, 0.3, 1.0], 0.3, path=MOVING, end=0.5),
     "mesh": lambda r: MeshObstacle(MESH, 12, [0.113, 0.207, 0.181], 0.3, path=MOVING, end=0.5),
+    "rigid": lambda r: RigidRegion(r),
     "velocity-travels": lambda r: VelocityBox(r, [0.1, 0.2, 0.3], end=0.5, travels=True),
 }
 
@@ -104,6 +106,7 @@ def _acting(name, device, dtype=torch.float64):
         share=torch.rand(200, generator=generator, dtype=torch.float64).to(device, dtype),
         threshold=0.5,
         held_mass=torch.tensor(0.7, device=device, dtype=dtype),
+        mass=torch.rand(200, generator=generator, dtype=torch.float64).to(device, dtype),
     )
     velocity = torch.randn(200, 3, generator=generator, dtype=torch.float64).to(device, dtype)
     return ACTING[name](Box([None, None, 0.23], [None] * 3)).in_frame(frame).to(device), velocity, nodes
@@ -283,7 +286,7 @@ def test_in_frame_leaves_the_original_alone(name, block):
         found = values(now)
         assert found.keys() == known.keys()
         assert all(torch.equal(known[key], found[key]) for key in known)
-    assert (moved.start, moved.end) == (0.0, 0.5)
+    assert (moved.start, moved.end) == (0.0, math.inf if name == "rigid" else 0.5)
     assert type(moved) is type(boundary)
     if hasattr(boundary, "region"):
         assert boundary.region is region
@@ -302,19 +305,20 @@ def test_conditions_can_be_copied_saved_and_narrowed(name, formulation, block, m
     region = Box([None, None, 0.23], [None] * 3)
     boundary = (CONDITIONS | POINTS)[name](region)
     run = {"dx": 0.1, "formulation": formulation}
-    known = march(MPMSolver(**run, boundaries=[boundary]), points, 2e-3, 6)[-1]
+    push = 0.3 * points.position.flip(-1) if name == "rigid" else None  # which free fall does not strain
+    known = march(MPMSolver(**run, boundaries=[boundary]), points, 2e-3, 6, push)[-1]
     twin = copy.deepcopy(boundary)
     for tensor in boundary.buffers():
         tensor.zero_()
-    assert torch.equal(march(MPMSolver(**run, boundaries=[twin]), points, 2e-3, 6)[-1].position, known.position)
+    assert torch.equal(march(MPMSolver(**run, boundaries=[twin]), points, 2e-3, 6, push)[-1].position, known.position)
     loaded = MPMSolver(**run, boundaries=[boundary])
     loaded.load_state_dict(MPMSolver(**run, boundaries=[twin]).state_dict())
-    assert torch.equal(march(loaded, points, 2e-3, 6)[-1].position, known.position)
-    assert float((known.position - march(MPMSolver(**run), points, 2e-3, 6)[-1].position).abs().max()) > 1e-5
+    assert torch.equal(march(loaded, points, 2e-3, 6, push)[-1].position, known.position)
+    assert float((known.position - march(MPMSolver(**run), points, 2e-3, 6, push)[-1].position).abs().max()) > 1e-5
 
     loaded.init_state(points)
     narrow = loaded.to(torch.float32)
-    end = march(narrow, points.map(lambda t: t.float()), 2e-3, 6)[-1]
+    end = march(narrow, points.map(lambda t: t.float()), 2e-3, 6, None if push is None else push.float())[-1]
     assert end.position.dtype == torch.float32
     torch.testing.assert_close(end.position.double(), known.position, rtol=0, atol=2e-6)
 

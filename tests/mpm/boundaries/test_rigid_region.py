@@ -1,0 +1,269 @@
+"""A rigid part keeps its shape and its momenta, moves what is attached to it, and is moved by it."""
+
+import math
+
+import numpy as np
+import pytest
+import torch
+from scipy.optimize import curve_fit
+
+from gaussian_swaying.geometry.regions import Box, Everything, Union
+from gaussian_swaying.mpm.boundaries.handle import Handle
+from gaussian_swaying.mpm.boundaries.pinned_points import PinnedPoints
+from gaussian_swaying.mpm.boundaries.pinned_region import PinnedRegion
+from gaussian_swaying.mpm.boundaries.rigid_region import RigidRegion
+from gaussian_swaying.mpm.solver import MPMSolver
+from gaussian_swaying.mpm.state import MaterialPoints
+
+FORMULATIONS = ["total", "updated"]
+TRANSFERS = ["torch", "kernels"]
+RIGHT = Box([0.2, None, None], [None] * 3)
+
+
+def bar(*boundaries, formulation="total", transfer="auto", dx=0.05, dtype=torch.float64, gravity=(0, 0, -9.8), **other):
+    """A bar of 0.4 m along x, and its solver."""
+    h = dx / 2
+    count = [round(length / h) for length in (0.4, 0.1, 0.1)]
+    place = torch.cartesian_prod(*[(torch.arange(n, dtype=torch.float64) + 0.5) * h for n in count])
+    points = MaterialPoints.create(
+        place.to(dtype), volume=h**3, density=300.0, youngs_modulus=2e4, poisson_ratio=0.3, **other
+    )
+    return points, MPMSolver(dx=dx, formulation=formulation, gravity=gravity, transfer=transfer, boundaries=boundaries)
+
+
+def advance(solver, state, seconds, frames=10):
+    for _ in range(frames):
+        state = solver.fit_grid(state, seconds / frames, 1)
+        count = solver.substeps(state, seconds / frames)
+        state = solver.rollout(state, seconds / frames / count, count)
+    return state
+
+
+def right(points):
+    return points.position[..., 0] > 0.2
+
+
+def strain(F):
+    return float((F.mT @ F - torch.eye(3, dtype=F.dtype)).abs().max())
+
+
+@pytest.mark.parametrize("transfer", TRANSFERS)
+@pytest.mark.parametrize("formulation", FORMULATIONS)
+def test_a_free_part_keeps_momenta_energy_and_shape(formulation, transfer):
+    """It turns about no axis of its own, so that the axis of its rotation moves: 1,000 substeps, 1.4 turns."""
+    points, solver = bar(RigidRegion(Everything()), formulation=formulation, transfer=transfer, gravity=(0, 0, 0))
+    arm = points.position - points.position.mean(0)
+    spin = torch.tensor([3.0, 8.0, 1.0], dtype=torch.float64).expand_as(arm)
+    velocity = torch.tensor([1.0, 0.5, 0.0], dtype=torch.float64) + torch.linalg.cross(spin, arm, dim=-1)
+    state = solver.rollout(solver.init_state(points, velocity, margin=2), 1e-3, 1)
+    momenta, energy = solver.momenta(state), solver.energies(state)["kinetic"]
+    distance, errors = torch.pdist(points.position), []
+    for _ in range(10):
+        state = solver.rollout(solver.fit_grid(state, 0.1), 1e-3, 100)
+        errors.append(float((torch.pdist(state.position) - distance).abs().max()))
+        assert strain(state.F_total) < 1e-12
+        assert float(torch.linalg.det(state.F_total).min()) > 0
+    assert max(errors) < 1e-13  # nor do they grow
+    for name, value in solver.momenta(state).items():
+        torch.testing.assert_close(value, momenta[name], rtol=1e-10, atol=1e-10)
+    assert float(solver.energies(state)["kinetic"] / energy) == pytest.approx(1.0, abs=1e-6)
+    assert float(solver.energies(state)["elastic"]) < 1e-12
+
+
+@pytest.mark.parametrize("formulation", FORMULATIONS)
+def test_single_precision_drifts_by_rounding_only(formulation):
+    points, solver = bar(RigidRegion(Everything()), formulation=formulation, gravity=(0, 0, 0), dtype=torch.float32)
+    arm = points.position - points.position.mean(0)
+    velocity = torch.linalg.cross(torch.tensor([3.0, 8.0, 1.0]).expand_as(arm), arm, dim=-1)
+    state = solver.rollout(solver.init_state(points, velocity, margin=8), 1e-3, 1)
+    before = solver.momenta(state)["angular"]
+    state = solver.rollout(state, 1e-3, 1000)
+    assert strain(state.F_total) < 1e-6
+    distance = torch.pdist(points.position.double())
+    assert float((torch.pdist(state.position.double()) - distance).abs().max()) < 1e-5
+    torch.testing.assert_close(solver.momenta(state)["angular"], before, rtol=1e-4, atol=1e-6)
+
+
+@pytest.mark.parametrize("formulation", FORMULATIONS)
+def test_half_of_a_bar_pulls_at_the_other(formulation):
+    """The rigid half keeps its shape, the soft half bends, both fly on with the momenta of both together."""
+    points, solver = bar(RigidRegion(RIGHT), formulation=formulation, gravity=(0, 0, 0))
+    own = right(points)
+    velocity = torch.where(own[:, None], torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64), 0.0)
+    state = solver.rollout(solver.init_state(points, velocity, margin=4), 1e-4, 1)
+    before = solver.momenta(state)
+    state = advance(solver, state, 0.2)
+    for name, value in solver.momenta(state).items():
+        torch.testing.assert_close(value, before[name], rtol=1e-9, atol=1e-10)
+    assert strain(state.F_total[own]) < 1e-12
+    assert strain(state.F_total[~own]) > 1e-3
+    assert float(state.velocity[~own, 2].mean()) > 0.2  # it is taken along
+    gap = (state.position[own, 0].min() - state.position[~own, 0].max()).abs()
+    assert float(gap) < 0.05  # and does not tear off
+
+
+@pytest.mark.parametrize("formulation", FORMULATIONS)
+def test_a_part_next_to_a_held_one_stays(formulation):
+    pin = PinnedRegion(Box([None] * 3, [0.1, None, None]), "nodes")
+    points, solver = bar(RigidRegion(Box([0.1, None, None], [0.3, None, None])), pin, formulation=formulation)
+    state = advance(solver, solver.init_state(points), 0.3)
+    moved = (state.position - points.position).norm(dim=-1)
+    assert float(moved[points.position[:, 0] < 0.3].max()) < 1e-7
+    assert float(moved[points.position[:, 0] > 0.3].max()) > 1e-3
+
+
+def test_a_pin_of_no_kind_holds_the_nodes_of_a_rigid_part():
+    points, solver = bar(PinnedRegion(Box([0.3, None, None], [None] * 3)), RigidRegion(RIGHT))
+    state = advance(solver, solver.init_state(points), 0.2)
+    assert solver.bound.kinds == ("nodes", "nodes")
+    assert float((state.position - points.position)[right(points)].abs().max()) < 1e-7
+    assert float((state.position - points.position)[~right(points)].norm(dim=-1).max()) > 1e-2
+
+
+@pytest.mark.parametrize("formulation", FORMULATIONS)
+def test_a_handle_leads_the_whole_part(formulation):
+    handle = Handle(Box([0.3, None, None], [None] * 3), angular_velocity=[0, 0, 2.0], pivot=[0.4, 0, 0], kind="nodes")
+    points, solver = bar(RigidRegion(RIGHT), handle, formulation=formulation, gravity=(0, 0, 0))
+    state = advance(solver, solver.init_state(points), 0.25)
+    s, c = math.sin(0.5), math.cos(0.5)
+    turn = torch.tensor([[c, -s, 0], [s, c, 0], [0, 0, 1.0]], dtype=torch.float64)
+    pivot = torch.tensor([0.4, 0, 0], dtype=torch.float64)
+    wanted = pivot + (points.position - pivot) @ turn.mT
+    torch.testing.assert_close(state.position[right(points)], wanted[right(points)], rtol=0, atol=1e-5)
+    torch.testing.assert_close(
+        state.F_total[right(points)], turn.expand(int(right(points).sum()), 3, 3), rtol=0, atol=1e-4
+    )
+
+
+@pytest.mark.parametrize("formulation", FORMULATIONS)
+def test_kernels_do_as_torch_does(formulation):
+    found = []
+    for transfer in TRANSFERS:
+        pin = PinnedRegion(Box([None] * 3, [0.1, None, None]), "nodes")
+        points, solver = bar(RigidRegion(RIGHT), pin, formulation=formulation, transfer=transfer)
+        found.append(advance(solver, solver.init_state(points), 0.1, 4))
+    for name in ("position", "velocity", "F_total", "impulse"):
+        torch.testing.assert_close(getattr(found[0], name), getattr(found[1], name), rtol=1e-9, atol=1e-9)
+
+
+def test_scenes_of_a_batch_do_not_know_each_other():
+    points, solver = bar(RigidRegion(RIGHT))
+    other = MaterialPoints.create(
+        points.position * torch.tensor([1.0, 0.8, 1.0]),
+        volume=2e-5,
+        density=200.0,
+        youngs_modulus=1e4,
+        poisson_ratio=0.2,
+    )
+    together = solver.like(solver.settings)
+    state = advance(together, together.init_state(MaterialPoints.stack([points, other])), 0.1, 3)
+    for k, alone in enumerate((points, other)):
+        single = solver.like(solver.settings)
+        begin = single.init_state(alone)
+        count = together.substeps(together.init_state(MaterialPoints.stack([points, other])), 0.1 / 3)
+        for _ in range(3):
+            begin = single.rollout(begin, 0.1 / 3 / count, count)
+        torch.testing.assert_close(state.position[k], begin.position, rtol=0, atol=1e-10)
+
+
+@pytest.mark.parametrize("formulation", FORMULATIONS)
+def test_it_has_gradients(formulation):
+    """Of the height of the body by the stiffness of what it hangs on, against a difference."""
+    pin = PinnedRegion(Box([None] * 3, [0.1, None, None]), "nodes")
+
+    def height(E):
+        points, solver = bar(RigidRegion(RIGHT), pin, formulation=formulation, dx=0.1)
+        points = points.map(lambda x: x)
+        object.__setattr__(points, "youngs_modulus", E.expand(points.mass.shape))
+        state = solver.init_state(points, margin=3)
+        return solver.rollout(state, 1e-3, 40).position[right(points), 2].mean()
+
+    E = torch.tensor(2e4, dtype=torch.float64, requires_grad=True)
+    (slope,) = torch.autograd.grad(height(E), E)
+    with torch.no_grad():
+        difference = (height(E + 20) - height(E - 20)) / 40
+    assert float(slope) == pytest.approx(float(difference), rel=1e-3)
+    assert float(slope) != 0
+
+
+def pendulum(dx):
+    """A box of 2 kg on a cord of 1 m, which is clamped in a wall: the period, and that of theory [s]."""
+    half, width, E, mass = 0.1, 0.03, 2e5, 2.0
+    count = round(3 / dx)
+    above, side = round(0.3 * count), round(6 * half / dx)
+    down = -(torch.arange(-above, count, dtype=torch.float64) + 0.5) / count
+    across = torch.tensor([-1.0, 1.0], dtype=torch.float64) * width / 2 / 3**0.5
+    inside = ((torch.arange(side, dtype=torch.float64) + 0.5) / side * 2 - 1) * half
+    cord, box = torch.cartesian_prod(across, across, down), torch.cartesian_prod(inside, inside, inside)
+    place = torch.cat([cord, box + torch.tensor([0, 0, -1 - half])])
+    sizes = [len(cord), len(box)]
+    volume = torch.repeat_interleave(torch.tensor([width**2 / count / 4, (2 * half / side) ** 3]), torch.tensor(sizes))
+    density = torch.repeat_interleave(torch.tensor([100.0, mass / (2 * half) ** 3]), torch.tensor(sizes))
+    points = MaterialPoints.create(
+        place, volume=volume.double(), density=density.double(), youngs_modulus=E, poisson_ratio=0.0
+    )
+    wall, body = Box([None, None, 0.0], [None] * 3), Box([None] * 3, [None, None, -1.0])
+    boundaries = [PinnedRegion(wall, "clamp"), RigidRegion(body)]
+    hanging = MPMSolver(dx=dx, damping=8.0, boundaries=boundaries, gravity=(0, 0, -9.81))
+    state = advance(hanging, hanging.init_state(points), 1.0)
+    solver = MPMSolver(dx=dx, boundaries=boundaries, gravity=(0, 0, -9.81))
+    solver.init_state(points)
+    node = state.grid.node_positions(place) + state.node_displacement
+    push = torch.zeros_like(node)
+    push[:, 0] = -0.3 * node[:, 2].clamp(max=0)
+    state = state.replace(node_velocity=push)
+    times, across, lengths = [], [], []
+    for _ in range(60):
+        state = advance(solver, state, 0.05, 1)
+        middle = state.position[len(cord) :].mean(0)
+        times.append(float(state.time))
+        across.append(float(middle[0]))
+        lengths.append(float(middle.norm()))
+    (_, rate, _), _ = curve_fit(
+        lambda t, a, w, p: a * np.cos(w * t + p), np.array(times), np.array(across), p0=[0.1, 3, 1.5]
+    )
+    # a double pendulum; the cord is clamped at both ends, as if it began the length sqrt(EI / T) farther in
+    bent = math.sqrt(E * width**4 / 12 / (mass * 9.81))
+    cord_length, arm = sum(lengths) / len(lengths) - half - 2 * bent, half + bent
+    inertia = mass * torch.tensor(
+        [[cord_length**2, cord_length * arm], [cord_length * arm, arm**2 + (2 * half) ** 2 / 6]], dtype=torch.float64
+    )
+    pull = mass * 9.81 * torch.diag(torch.tensor([cord_length, arm], dtype=torch.float64))
+    lowest = torch.linalg.eigvals(torch.linalg.solve(inertia, pull)).real.min()
+    return 2 * math.pi / abs(rate), 2 * math.pi / float(lowest) ** 0.5
+
+
+@pytest.mark.slow(gate=["0.1"])
+@pytest.mark.parametrize("dx", [0.1, 0.05])
+def test_a_box_on_a_cord_is_a_pendulum(dx):
+    found, theory = pendulum(dx)
+    assert found == pytest.approx(theory, rel=0.02)
+
+
+def test_what_cannot_be_is_refused():
+    points, solver = bar(RigidRegion(RIGHT), RigidRegion(Box([0.1, None, None], [0.2, None, None])))
+    with pytest.raises(ValueError, match="Two rigid parts touch"):
+        solver.init_state(points)
+    parts = Union([RIGHT, Box([0.1, None, None], [0.2, None, None])])
+    bar(RigidRegion(parts))[1].init_state(points)
+    for pin in (PinnedRegion(RIGHT, "hinge"), PinnedRegion(RIGHT, "clamp"), PinnedPoints([[0.35, 0.05, 0.05]])):
+        points, solver = bar(RigidRegion(RIGHT), pin)
+        with pytest.raises(ValueError, match="points of a rigid part"):
+            solver.init_state(points)
+    with pytest.raises(ValueError, match="holds no particle"):
+        bar(RigidRegion(Box([9.0] * 3, [10.0] * 3)))[1].init_state(points)
+    with pytest.raises(ValueError, match="`held_share` to lie in"):
+        RigidRegion(RIGHT, held_share=1.0)
+
+
+def test_a_part_that_becomes_rigid_on_the_way_takes_its_shape_again():
+    points, soft = bar(PinnedRegion(Box([None] * 3, [0.1, None, None]), "nodes"))
+    state = advance(soft, soft.init_state(points), 0.2)
+    assert strain(state.F_total[right(points)]) > 1e-3
+    _, rigid = bar(PinnedRegion(Box([None] * 3, [0.1, None, None]), "nodes"), RigidRegion(RIGHT))
+    after = rigid.continued(soft, state, rigid.init_state(points))
+    after = advance(rigid, after, 0.1)
+    assert strain(after.F_total[right(points)]) < 1e-12
+    distance = torch.pdist(points.position[right(points)])
+    found = torch.pdist(after.position[right(points)])
+    torch.testing.assert_close(found, distance, rtol=0, atol=1e-12)
