@@ -246,7 +246,7 @@ def test_what_cannot_be_is_refused():
         solver.init_state(points)
     parts = Union([RIGHT, Box([0.1, None, None], [0.2, None, None])])
     bar(RigidRegion(parts))[1].init_state(points)
-    for pin in (PinnedRegion(RIGHT, "hinge"), PinnedRegion(RIGHT, "clamp"), PinnedPoints([[0.35, 0.05, 0.05]])):
+    for pin in (PinnedRegion(Box([0.3, None, None], [None] * 3), "clamp"), PinnedPoints([[0.35, 0.05, 0.05]])):
         points, solver = bar(RigidRegion(RIGHT), pin)
         with pytest.raises(ValueError, match="points of a rigid part"):
             solver.init_state(points)
