@@ -4,23 +4,28 @@ The colour of a pixel is linear in the colours of the Gaussians, :math:`\sum_k w
 has in all pixels of a label, :math:`A_{kl} = \sum_{p:\, l_p = l} w_{kp}`, is a derivative, and one backward pass of a
 picture gives those of three labels. The label of a Gaussian is the one with the largest weight: the closed form of
 FlashSplat (arXiv 2409.08270), which needs no network and no iteration.
+
+Scribbles label a few pixels. The Gaussians that are seen there get their labels by the same weights, and the others by
+a graph cut (:mod:`~gaussian_swaying.gaussians.graph_cut`).
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 
 import torch
 from torch import Tensor
 
 from gaussian_swaying._checks import check_whole
 from gaussian_swaying.gaussians.cloud import GaussianCloud
+from gaussian_swaying.gaussians.graph_cut import spread_labels
 from gaussian_swaying.geometry.covariances import covariance
 from gaussian_swaying.rendering.cameras.camera import Camera
 from gaussian_swaying.rendering.gsplat_renderer import make_renderer
 from gaussian_swaying.rendering.protocol import Renderer
 
 SEEN = 1e-3  # weight [pixels] below which a Gaussian was not seen
+SCRIBBLED = 0.8  # share of the weight under a scribble that its Gaussians have, the heaviest first: not what is behind
 
 
 def label_weights(
@@ -85,3 +90,52 @@ def voted(weights: Tensor, bias: float = 0.0) -> Tensor:
     share = weights / sum_of.clamp(min=SEEN)
     share = torch.cat([share[:, :1] + bias, share[:, 1:]], -1)
     return torch.where(sum_of[:, 0] < SEEN, -1, share.argmax(-1))
+
+
+def scribbled(
+    cloud: GaussianCloud, views: Sequence[tuple[Camera, Tensor]], smooth: float = 1.0, renderer: Renderer | None = None
+) -> Tensor:
+    """The label of each Gaussian, from a few labelled pixels of one or more pictures.
+
+    Args:
+        cloud: The splat.
+        views: Cameras, and the label of each pixel as a whole number, shape (H, W) of the camera: 0 where nothing is
+            scribbled, and 1, 2, ... in a scribble. Each label is in at least one of the pictures.
+        smooth: What a border between labels costs beside differences of colour: above 1 for smoother borders.
+        renderer: As in :func:`label_weights`.
+
+    Returns:
+        Labels from 0 on, one less than in the pictures, int64, shape (N,). What no scribble is connected to has the
+        label whose scribbles have its colour.
+
+    Raises:
+        ValueError: If the labels of a view are not of the size of its picture, or there is no view; if there is no
+            scribble, a label is missing, or nothing of the splat is under it.
+    """
+    views = list(views)
+    for _, labels in views:
+        if labels.is_floating_point() or labels.dtype == torch.bool or int(labels.min()) < 0:
+            raise ValueError(
+                f"Expected scribbles of whole numbers from 0 on, 0 for pixels without one, but got {labels.dtype} "
+                f"from {float(labels.min()):g}."
+            )
+    count = max((int(labels.max()) for _, labels in views), default=0)
+    if views and count == 0:
+        raise ValueError("The pictures have no scribble: draw one of 1, 2, ... on at least two things.")
+    drawn = {int(label) for _, labels in views for label in labels.unique()}
+    for label in range(1, count + 1):
+        if label not in drawn:
+            raise ValueError(
+                f"The scribbles go up to {count}, but none is {label}: number them from 1 on without gaps."
+            )
+    weights = label_weights(cloud, views, count + 1, renderer)[:, 1:]
+    seeds = torch.full((len(cloud),), -1, device=weights.device)
+    best, lead = weights.max(-1)
+    for label in range(count):
+        own = ((lead == label) & (best > SEEN)).nonzero()[:, 0]
+        order = own[best[own].argsort(descending=True, stable=True)]
+        heavy = best[order].cumsum(0)
+        if len(order) == 0:
+            raise ValueError(f"Nothing of the splat is seen under the scribble {label + 1}: draw it on the object.")
+        seeds[order[heavy - best[order] < SCRIBBLED * heavy[-1]]] = label
+    return spread_labels(cloud, seeds, count, smooth)
