@@ -23,13 +23,14 @@ from gaussian_swaying.preview.ticks import draw_ticks
 from gaussian_swaying.preview.up import floor_mask, wind_words
 from gaussian_swaying.rendering.cameras.camera import Camera, orbit_camera, project
 from gaussian_swaying.rendering.gsplat_renderer import make_renderer
+from gaussian_swaying.rendering.tints import HELD, greyed, tinted
 from gaussian_swaying.simulation.simulation import Simulation
 
 if TYPE_CHECKING:
     from PIL.ImageDraw import ImageDraw
     from PIL.ImageFont import FreeTypeFont, ImageFont
 
-PINNED = (228, 60, 40)
+PINNED = HELD
 PUSHED = (160, 70, 200)
 REGION = (30, 110, 220)
 WIND = (0, 140, 110)
@@ -261,14 +262,11 @@ def _soft(simulation: Simulation) -> list[tuple[str, Tensor, tuple[int, ...]]]:
 def _tinted(colours: Tensor, parts: Parts, soft: Sequence[tuple[str, Tensor, tuple[int, ...]]] = ()) -> Tensor:
     """Colours with soft parts, pinned and pushed Gaussians tinted and static ones grey and pale."""
     for _, mask, tint in soft:
-        target = torch.tensor(tint, dtype=colours.dtype, device=colours.device) / 255
-        colours = torch.where(mask.to(colours.device)[:, None], 0.6 * colours + 0.4 * target, colours)
+        colours = torch.where(mask.to(colours.device)[:, None], tinted(colours, tint, 0.4), colours)
     still = (~(parts.simulated | parts.carried)).to(colours.device)
-    grey = 0.5 + 0.4 * colours.mean(-1, keepdim=True).expand_as(colours)
-    colours = torch.where(still[:, None], grey, colours)
+    colours = torch.where(still[:, None], greyed(colours), colours)
     for mask, tint in ((parts.pushed, PUSHED), (parts.pinned, PINNED)):
-        target = torch.tensor(tint, dtype=colours.dtype, device=colours.device) / 255
-        colours = torch.where(mask.to(colours.device)[:, None], 0.3 * colours + 0.7 * target, colours)
+        colours = torch.where(mask.to(colours.device)[:, None], tinted(colours, tint), colours)
     return colours
 
 
