@@ -1,4 +1,4 @@
-"""Which Gaussians a brush touches on the screen."""
+"""The Gaussians that a brush touches on the screen."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ class Seen:
 
 
 def seen(means: Tensor, covariances: Tensor, camera: Camera, picture: RenderOutput, slack: float = 0.0) -> Seen:
-    """Where Gaussians are on a screen, and which of them the drawn surface does not hide.
+    """Gaussians on a screen: their places, and which of them the drawn surface does not hide.
 
     A Gaussian is hidden if it lies behind the depth at the pixel of its centre, by more than a slack and two standard
     deviations of its own. These are taken along the line of sight, and across it times the slope of the depth, as the

@@ -69,6 +69,7 @@ class SimulatedScene(nn.Module):
         further: Number of extra points on large Gaussians.
         tracked: Number of points that :meth:`surface` returns.
         surface_places: Contact samples, which touch obstacles and each other, or None.
+        drawn: Which Gaussians of the source are here: all but those that ``faint: drop`` leaves out, bool.
         source: The .ply file; None for a scene made in code.
         parts: The labels of its Gaussians, with roles and materials, or None.
     """
@@ -98,6 +99,7 @@ class SimulatedScene(nn.Module):
         if scene.parts is not None:
             still, held = scene.parts.mask(role="still"), scene.parts.mask(role="held")
         faint = scene.region.contains(cloud.means) & ~chosen & ~still
+        self.drawn = ~faint if scene.faint == "drop" else torch.ones_like(faint)
         if scene.faint == "drop" and bool(faint.any()):
             cloud, chosen, held, faint = cloud.select(~faint), chosen[~faint], held[~faint], faint[~faint]
         self.model = GaussianSurfaceModel.from_cloud(cloud, requires_grad=False, copy=scene.ply is None)

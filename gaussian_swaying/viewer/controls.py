@@ -16,6 +16,7 @@ from gaussian_swaying.simulation.wind_picture import speed_scale
 from gaussian_swaying.viewer.files import Files
 from gaussian_swaying.viewer.gusts import Gusts
 from gaussian_swaying.viewer.holding import Holding
+from gaussian_swaying.viewer.painting import Painting
 from gaussian_swaying.viewer.pictures import SHOWN
 from gaussian_swaying.viewer.screen import Panel, Screen
 from gaussian_swaying.viewer.session import Session
@@ -55,10 +56,12 @@ class Controls(Panel):
         self._forces()
         with gui.add_folder("Pull and hold"):
             self.holding = Holding(self)
+        with gui.add_folder("Paint parts", expand_by_default=False):
+            self.painting = Painting(self)
         with gui.add_folder("Picture", expand_by_default=False):
             self._picture()
         with gui.add_folder("Files"):
-            self.files = Files(self, self.other_scene)
+            self.files = Files(self, self.other_scene, self.painting.as_saved)
         self.show_values()
 
     # ---- groups of controls
@@ -174,6 +177,7 @@ class Controls(Panel):
             lines.append(f"⚠️ {session.problem}{remedy}")
         self.page.write(lines)
         self.undo.disabled = session.changes == 0
+        self.pause.label = "Go on" if session.paused else "Pause"
         if session.simulation is not self._drawn_for:
             self.draw_handles()
         if session.settings is not self._settings or session.revision != self._revision:
@@ -213,6 +217,7 @@ class Controls(Panel):
     def other_scene(self) -> None:
         """Adapt to another scene: remove what belongs to the old one, and show the new values."""
         self.holding.forget_box()
+        self.painting.forget()
         self._grids = self._spacings()
         self.grid.value = "normal"  # type: ignore[misc]  # which is in both lists
         self.grid.options = tuple(self._grids)

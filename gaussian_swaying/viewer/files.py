@@ -33,10 +33,11 @@ class Files:
     Args:
         controls: The panel; a folder of it is open.
         loaded: Called when another scene is there.
+        as_saved: Changes the text of a configuration before it is saved.
     """
 
-    def __init__(self, controls: Panel, loaded: Callable[[], None]) -> None:
-        self._loaded, self.page, self.session = loaded, controls.page, controls.session
+    def __init__(self, controls: Panel, loaded: Callable[[], None], as_saved: Callable[[str], str]) -> None:
+        self._loaded, self._as_saved, self.page, self.session = loaded, as_saved, controls.page, controls.session
         self._upload: Folder | None = None  # where the splat lies that was loaded
         gui, elsewhere = controls.server.gui, self.page.door.token is not None
         self.record = gui.add_button(
@@ -81,7 +82,7 @@ class Files:
             client.send_file_download("wind.mp4", content, save_immediately=True)
 
     def _save(self, event: viser.GuiEvent) -> None:
-        text = self.session.yaml()
+        text = self._as_saved(self.session.yaml())
         if self._upload is not None and self._upload.name in text:  # it goes away with the program
             text = "# Give the splat that you loaded: --scene.ply PATH\n" + text.replace(self._upload.name + "/", "")
         if event.client is not None:

@@ -3,9 +3,13 @@
 from __future__ import annotations
 
 import asyncio
+import json
 import math
 from collections.abc import Callable
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
+
+import torch
 
 if TYPE_CHECKING:
     import viser
@@ -13,6 +17,9 @@ if TYPE_CHECKING:
 LARGEST_UPLOAD = 1 << 30  # bytes, of all files that are under way
 MOST_UPLOADS = 8  # at a time
 LEAST_PART = 64 << 10  # bytes; viser sends 512 KiB
+LARGEST_STROKE = 16 << 10  # bytes of a message about a brush
+MOST_CORNERS = 64  # of a path in it
+MOST_PIXELS = 32_768  # of a side of a browser's window
 
 
 class Incoming:
@@ -138,6 +145,62 @@ class Incoming:
             del under_way[message.transfer_uuid]
             return self._refuse(TOO_LARGE)
         return True
+
+
+@dataclass(frozen=True)
+class BrushMove:
+    """A message of a browser about its brush.
+
+    Attributes:
+        kind: ``stroke`` for a piece of a stroke, ``part`` for a double click.
+        first: Whether a stroke begins with this piece.
+        path: Corners of its path in the window [pixels].
+        size: Width and height of the window [pixels].
+        fov: Vertical field of view [rad].
+        near: Nearest depth that is drawn, in the units of the scene.
+        matrix: From the axes of the browser's camera, y up and z backwards, to those of its scene, row by row.
+    """
+
+    kind: str
+    first: bool
+    path: list[list[float]]
+    size: tuple[int, int]
+    fov: float
+    near: float
+    matrix: list[list[float]]
+
+
+def brush_move(raw: Any) -> BrushMove | None:
+    """The message of a browser about its brush, or None if its program cannot have sent it."""
+    if not isinstance(raw, str) or len(raw) > LARGEST_STROKE:
+        return None
+    try:
+        told = json.loads(raw)
+    except (ValueError, RecursionError):
+        return None
+    if not isinstance(told, dict) or set(told) != {"kind", "first", "path", "size", "fov", "near", "matrix"}:
+        return None
+    path, size, fov, near = told["path"], told["size"], told["fov"], told["near"]
+    if not (
+        told["kind"] in ("stroke", "part")
+        and isinstance(told["first"], bool)
+        and isinstance(path, list)
+        and 1 <= len(path) <= MOST_CORNERS
+        and all(_numbers(corner, 2) and max(map(abs, corner)) <= MOST_PIXELS for corner in path)
+        and _numbers(size, 2)
+        and all(1 <= side <= MOST_PIXELS for side in size)
+        and _numbers([fov, near], 2)
+        and 0 < fov < 180
+        and near > 0
+        and _numbers(told["matrix"], 16)
+    ):
+        return None
+    matrix = torch.tensor(told["matrix"], dtype=torch.float64).reshape(4, 4).T  # as WebGL has it
+    turn = matrix[:3, :3]
+    if not torch.allclose(turn @ turn.T, torch.eye(3, dtype=torch.float64), atol=1e-3) or torch.det(turn) < 0:
+        return None
+    width, height = (round(side) for side in size)
+    return BrushMove(told["kind"], told["first"], path, (width, height), math.radians(fov), near, matrix.tolist())
 
 
 TOO_LARGE = (

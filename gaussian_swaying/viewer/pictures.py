@@ -9,10 +9,12 @@ from dataclasses import replace
 import numpy as np
 import torch
 from PIL import Image
+from torch import Tensor
 
 from gaussian_swaying._devices import double_home, in_double
 from gaussian_swaying.geometry.rotations import quat_to_rotation
 from gaussian_swaying.rendering.cameras.camera import Camera
+from gaussian_swaying.rendering.tints import by_role
 from gaussian_swaying.simulation.wind_picture import draw_wind
 from gaussian_swaying.viewer.session import Snapshot
 
@@ -35,7 +37,11 @@ def camera_of(
         near: Nearest depth that is drawn [scene units].
     """
     rotation = quat_to_rotation(torch.tensor(list(wxyz), dtype=torch.float64))
-    eye = torch.tensor(list(position), dtype=torch.float64)
+    return pinhole(rotation, torch.tensor(list(position), dtype=torch.float64), fov, width, height, near)
+
+
+def pinhole(rotation: Tensor, eye: Tensor, fov: float, width: int, height: int, near: float = 0.01) -> Camera:
+    """As :func:`camera_of`, with the rotation as a matrix (3, 3) and the eye (3,), both float64."""
     view = torch.eye(4, dtype=torch.float64)
     view[:3, :3], view[:3, 3] = rotation.mT, -rotation.mT @ eye
     focal = 0.5 * height / math.tan(0.5 * fov)
@@ -45,7 +51,12 @@ def camera_of(
 
 @torch.inference_mode()
 def draw(
-    snapshot: Snapshot, camera: Camera, shown: str = "colour", force_end: float = 1.0, streaks: bool = False
+    snapshot: Snapshot,
+    camera: Camera,
+    shown: str = "colour",
+    force_end: float = 1.0,
+    streaks: bool = False,
+    roles: Tensor | None = None,
 ) -> np.ndarray:
     """The picture of a snapshot, uint8, shape (H, W, 3).
 
@@ -55,6 +66,7 @@ def draw(
         shown: One of :data:`SHOWN`.
         force_end: End of the colour scale of the wind force [Pa].
         streaks: Whether streaks of air are drawn over it, as in the render ``wind``.
+        roles: Roles whose tints the colours get, as in :func:`~gaussian_swaying.rendering.tints.by_role`, shape (N,).
     """
     simulation, state = snapshot.simulation, snapshot.state
     painter = simulation.painter
@@ -69,7 +81,10 @@ def draw(
             simulation.stepper.wind_pressure(state), gaussians, camera, force_end, smooth=True
         )
     else:
-        seen = painter.draw(gaussians, painter.colors(gaussians, camera), camera)
+        colours = painter.colors(gaussians, camera)
+        if roles is not None and len(roles) == len(colours):  # not those of a scene that was just replaced
+            colours = by_role(colours, roles)
+        seen = painter.draw(gaussians, colours, camera)
         picture = seen.color
     if streaks:
         seen = seen or painter.draw(gaussians, torch.zeros_like(gaussians.means), camera)  # for its depth

@@ -21,10 +21,12 @@ import torch
 from gaussian_swaying._checks import one_line
 from gaussian_swaying._devices import in_double
 from gaussian_swaying.geometry.rotations import quat_to_rotation
+from gaussian_swaying.rendering.cameras.camera import Camera
+from gaussian_swaying.viewer.brushes import Brushes
 from gaussian_swaying.viewer.door import ANY, Door, check_address
 from gaussian_swaying.viewer.film_strip import FilmStrip
-from gaussian_swaying.viewer.incoming import Incoming
-from gaussian_swaying.viewer.pictures import PictureSize, camera_of, draw, enlarged
+from gaussian_swaying.viewer.incoming import BrushMove, Incoming
+from gaussian_swaying.viewer.pictures import PictureSize, camera_of, draw, enlarged, pinhole
 from gaussian_swaying.viewer.session import Session, Snapshot
 from gaussian_swaying.viewer.states import drawable
 from gaussian_swaying.viewer.streams import Streams, with_program
@@ -130,6 +132,7 @@ class Screen:
         shown: The kind of picture, one of :data:`.pictures.SHOWN`.
         streaks: Whether streaks of air are drawn over it.
         by_browser: Whether browsers draw, where they can.
+        roles: Roles whose tints are shown (see :func:`.tints.by_role`), shape (N,), or None; redraw after a change.
         recording: The video that is being recorded, or None.
         force_end: End of the colour scale of the force of the wind [Pa].
         drawn_size: Width and height at which the last picture was drawn [pixels].
@@ -147,6 +150,7 @@ class Screen:
         self.shown = "colour"
         self.streaks = False
         self.by_browser = True
+        self.roles: torch.Tensor | None = None
         self.force_end = 1.0
         self.recording: FilmStrip | None = None
         self.drawn_size = (0, 0)
@@ -160,7 +164,8 @@ class Screen:
         self._notice = ("", 0.0)
         self._version = 0  # of what is drawn besides snapshot and camera
         self._turn = torch.eye(3, dtype=torch.float64)  # from the scene to the axes of viser's camera
-        self.door, self.incoming, self.streams = Door(host, names), Incoming(self.tell), Streams()
+        self.door, self.incoming, self.brushes = Door(host, names), Incoming(self.tell), Brushes()
+        self.streams = Streams(self.brushes)
         self.server = make_server(host, port, self.door, self.incoming, self.streams)
         self.server.gui.configure_theme(
             control_layout="floating", control_width="medium", show_logo=False, show_share_button=False
@@ -252,6 +257,13 @@ class Screen:
                 client.camera.up_direction = tuple(up)
                 client.camera.position, client.camera.look_at = first.position, first.look_at
 
+    def camera_of(self, move: BrushMove) -> Camera:
+        """The camera with which a browser saw what its brush did, in scene units."""
+        matrix = torch.tensor(move.matrix, dtype=torch.float64)
+        turn = self._turn.mT  # from the axes of viser's camera to the scene
+        rotation = turn @ matrix[:3, :3] @ torch.diag(torch.tensor([1.0, -1.0, -1.0], dtype=torch.float64))
+        return pinhole(rotation, turn @ matrix[:3, 3], move.fov, *move.size, move.near)
+
     def pictures_per_second(self) -> float:
         """Pictures that the fastest browser draws or gets."""
         now = time.perf_counter()
@@ -317,7 +329,8 @@ class Screen:
                         gone.wait(0.005)
                         continue
                     with self.session.lock:
-                        sent = line.send(snapshot, still, lambda shown: self.streams.scene(shown, self._turn))
+                        scene = partial(self.streams.scene, turn=self._turn)
+                        sent = line.send(snapshot, still, scene, self.roles)
                     if pictured and line.draws:
                         client.scene.set_background_image(None)
                         pictured = False
@@ -350,7 +363,7 @@ class Screen:
         camera = camera_of(pose.wxyz.tolist(), pose.position.tolist(), float(pose.fov), width, height, near)
         with self._drawing, self.session.lock:
             waited = time.perf_counter()
-            picture = draw(snapshot, camera, self.shown, self.force_end, self.streaks)
+            picture = draw(snapshot, camera, self.shown, self.force_end, self.streaks, self.roles)
         if not still:
             size.took(time.perf_counter() - waited)
         self.drawn_size = (width, height)

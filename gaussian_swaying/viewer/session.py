@@ -198,6 +198,10 @@ class Session:
         """Number of changes that can be undone."""
         return len(self._past)
 
+    def reachable(self) -> list[Namespace]:
+        """The settings now, and all to which :meth:`undo` and :meth:`restore` can go back."""
+        return [self.settings, self._first, *(past.settings for past in list(self._past))]
+
     def pause(self, paused: bool = True) -> None:
         """Pause, or go on."""
         with self._wake:

@@ -12,8 +12,10 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from gaussian_swaying.gaussians.harmonics import sh_to_color
 from gaussian_swaying.recording.nodes import split_far
 from gaussian_swaying.rendering.shading import DiffuseShader
+from gaussian_swaying.rendering.tints import by_role
 from gaussian_swaying.simulation.simulated_scene import SimulatedScene
 from gaussian_swaying.simulation.simulation import Simulation
 from gaussian_swaying.viewer.film.page import pack_still
@@ -66,6 +68,23 @@ def look_message(simulation: Simulation) -> bytes:
     """Light and background, where they have changed since the scene."""
     with _turn(simulation):
         return message({"kind": "look", **look_of(simulation.painter)})
+
+
+@torch.inference_mode()
+def colour_message(simulation: Simulation, index: Tensor, roles: Tensor) -> bytes:
+    """Other colours of some Gaussians: their indices (uint32), and red, green and blue of each (uint8).
+
+    Args:
+        simulation: The simulation.
+        index: The Gaussians, shape (M,).
+        roles: Their roles, see :func:`~gaussian_swaying.rendering.tints.by_role`, shape (M,).
+    """
+    with _turn(simulation):
+        sh = simulation.scene.model.sh0.detach()
+        sh = sh[index.to(sh.device)]
+        own = sh_to_color(sh, torch.ones(len(sh), 3, device=sh.device)).clamp(0, 1)
+        bytes_of = (by_role(own, roles) * 255).round().to(torch.uint8).numpy(force=True).tobytes()
+    return message({"kind": "colours", "count": len(index)}, index.numpy().astype("<u4").tobytes(), bytes_of)
 
 
 @torch.inference_mode()

@@ -14,12 +14,15 @@ from collections.abc import Callable
 from functools import lru_cache
 from typing import Any
 
+import torch
 from torch import Tensor
 
+from gaussian_swaying.gaussians.parts import ROLES
 from gaussian_swaying.kernels.graphs import fingerprint
+from gaussian_swaying.viewer.brushes import BRUSH, Brushes
 from gaussian_swaying.viewer.film.page import PAGE
 from gaussian_swaying.viewer.session import Snapshot
-from gaussian_swaying.viewer.states import OFF, look_message, scene_message, state_message
+from gaussian_swaying.viewer.states import OFF, colour_message, look_message, scene_message, state_message
 
 STATES, PROGRAM = "/states", "/player.js"  # paths
 TAGS = f'<script src="{PROGRAM}"></script><script>watchWind();</script>'
@@ -38,6 +41,7 @@ class Line:
         self._scene: tuple[Any, ...] | None = None  # what it knows
         self._look: tuple[Any, ...] = ()
         self._state: tuple[Any, ...] = ()
+        self._roles: Tensor | None = None  # whose tints it shows
         self._rate = (0.0, 0.0)  # pictures a second, and when the browser said so [s]
 
     @property
@@ -56,13 +60,21 @@ class Line:
         rate, said = self._rate
         return rate if self.draws and time.monotonic() - said < RECENT else 0.0
 
-    def send(self, snapshot: Snapshot, ended: bool, scene: Callable[[Snapshot], tuple[tuple[Any, ...], bytes]]) -> bool:
+    def send(
+        self,
+        snapshot: Snapshot,
+        ended: bool,
+        scene: Callable[[Snapshot], tuple[tuple[Any, ...], bytes]],
+        roles: Tensor | None = None,
+    ) -> bool:
         """Send what the browser lacks of a snapshot; False if it lacks nothing, or has to take in more before.
 
         Args:
             snapshot: The snapshot.
             ended: Whether no other follows for now.
             scene: Gives the key and the message of its scene.
+            roles: Roles whose tints are shown, see :func:`~gaussian_swaying.rendering.tints.by_role`, shape (N,); a
+                tensor is not changed once it was given.
         """
         if not self.free:
             return False
@@ -70,12 +82,14 @@ class Line:
         look = (painter.shader, painter.background)
         key, made = scene(snapshot)
         if self._scene is None or key != self._scene:
-            self._scene, self._look, self._state = key, look, ()
+            self._scene, self._look, self._state, self._roles = key, look, (), None
             self._put(made)
             return True
         if any(known is not now for known, now in zip(self._look, look, strict=True)):
             self._look = look
             self._put(look_message(snapshot.simulation))
+            return True
+        if self._tint(snapshot, roles):
             return True
         if self._state == (snapshot.number, ended):
             return False
@@ -84,6 +98,24 @@ class Line:
         if self._first is None:
             self._first = self._sent
         return True
+
+    def _tint(self, snapshot: Snapshot, roles: Tensor | None) -> bool:
+        """Send the colours of the Gaussians whose role is another one than the browser shows; False if there are none.
+
+        Nothing is tinted at first, as if all were soft.
+        """
+        if roles is self._roles:
+            return False
+        count = len(snapshot.simulation.scene.model.means)
+        if roles is not None and len(roles) != count:  # those of a scene that was just replaced
+            return False
+        soft = torch.full((count,), ROLES.index("soft"), dtype=torch.uint8)
+        known, now = (soft if each is None else each for each in (self._roles, roles))
+        self._roles = roles
+        changed = (known != now).nonzero()[:, 0]
+        if len(changed):
+            self._put(colour_message(snapshot.simulation, changed, now[changed]))
+        return len(changed) > 0
 
     def stop(self) -> None:
         """Tell the browser that the server draws from now on."""
@@ -113,10 +145,14 @@ class Line:
 class Streams:
     """The connections of all browsers that draw.
 
-    A browser that viser knows gets a key, with which its program opens a connection of its own.
+    A browser that viser knows gets a key, with which its program opens connections of its own.
+
+    Args:
+        brushes: Has those for strokes.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, brushes: Brushes) -> None:
+        self._brushes = brushes
         self._lines: dict[str, Line | None] = {}
         self._known: tuple[tuple[Any, ...], bytes] | None = None  # the scene that was asked for last
         self._making = threading.Lock()
@@ -132,6 +168,7 @@ class Streams:
         line = self._lines.pop(key, None)
         if line is not None:
             line.close()
+        self._brushes.forget(key)
 
     def line(self, key: str) -> Line | None:
         """The connection that was opened with a key, or None."""
@@ -150,16 +187,17 @@ class Streams:
             return self._known
 
     def beside(self, handler: Callable[[Any], Any]) -> Callable[[Any], Any]:
-        """The handler of all connections: those for states, and those of viser, which gets ``handler``."""
+        """The handler of all connections: those for states and strokes, and those of viser, which gets ``handler``."""
+        own = {STATES: self._serve, BRUSH: self._brushes.serve}
 
         async def handle(connection: Any) -> None:
             asked, _, query = connection.request.path.partition("?")
-            if asked != STATES:
+            if asked not in own:
                 await handler(connection)
                 return
             key = query.removeprefix("key=")
             if key in self._lines:
-                await self._serve(key, connection)
+                await own[asked](key, connection)
             else:
                 await connection.close(1008, "unknown key")
 

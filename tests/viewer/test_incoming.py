@@ -1,5 +1,7 @@
 """What a browser may send to the live page: hostile ones change nothing but values, and break nothing."""
 
+import json
+import math
 import threading
 import time
 
@@ -10,7 +12,14 @@ from viser._messages import FileTransferPart, FileTransferStartUpload
 
 from gaussian_swaying.viewer import incoming as incoming_module
 from gaussian_swaying.viewer import screen
-from gaussian_swaying.viewer.incoming import TOO_LARGE, Incoming, what_is_wrong
+from gaussian_swaying.viewer.incoming import (
+    LARGEST_STROKE,
+    MOST_CORNERS,
+    TOO_LARGE,
+    Incoming,
+    brush_move,
+    what_is_wrong,
+)
 from gaussian_swaying.viewer.pictures import draw
 
 
@@ -206,3 +215,39 @@ def test_what_is_held_is_drawn_between_changes(page):
         solver._bound = bound
     drawing.join()
     assert len(drawn[0]) > 0
+
+
+STROKE = {"kind": "stroke", "first": True, "path": [[3.0, 4.5]], "size": [640, 480.0], "fov": 40.0, "near": 0.01}
+STROKE |= {"matrix": [1, 0, 0, 0, 0, 0, -1, 0, 0, 1, 0, 0, 7, 8, 9, 1]}
+
+
+def test_a_stroke_is_read():
+    move = brush_move(json.dumps(STROKE))
+    assert (move.kind, move.first, move.path, move.size) == ("stroke", True, [[3.0, 4.5]], (640, 480))
+    assert move.fov == pytest.approx(math.radians(40))
+    assert [row[3] for row in move.matrix] == [7, 8, 9, 1]  # the columns come one after another
+    assert brush_move(json.dumps(STROKE | {"path": [[0, 0]] * MOST_CORNERS, "kind": "part"})).kind == "part"
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"kind": "erase"}, {"kind": None}, {"first": 1}, {"path": []}, {"path": "ab"}, {"path": [[1, 2, 3]]},
+        {"path": [[0, 0]] * (MOST_CORNERS + 1)}, {"path": [[math.nan, 0]]}, {"path": [[math.inf, 0]]},
+        {"path": [[1e6, 0]]}, {"path": [[True, 0]]}, {"path": [["1", 0]]}, {"size": [0, 480]}, {"size": [1e9, 480]},
+        {"size": [480]}, {"fov": 0}, {"fov": 180}, {"fov": math.nan}, {"near": 0}, {"near": "x"},
+        {"matrix": [1.0] * 15},
+        {"matrix": [1.0] * 16}, {"matrix": [0.0] * 16}, {"matrix": [math.nan] * 16}, {"role": "held"},
+        {"matrix": [-1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1]}, {"matrix": [[1, 0], [0, 1]] * 4},
+    ],
+)  # fmt: skip
+def test_a_stroke_that_cannot_be_is_dropped(change):
+    assert brush_move(json.dumps(STROKE)) is not None
+    assert brush_move(json.dumps(STROKE | change)) is None
+
+
+@pytest.mark.parametrize(
+    "raw", [b"{}", "", "{", "null", "[]", "[" * 9000, " " * (LARGEST_STROKE + 1), '{"kind": "part"}']
+)
+def test_what_is_no_stroke_is_dropped(raw):
+    assert brush_move(raw) is None

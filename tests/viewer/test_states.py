@@ -6,13 +6,23 @@ from dataclasses import replace
 import numpy as np
 import torch
 
+from gaussian_swaying.gaussians.parts import ROLES
 from gaussian_swaying.gaussians.ply import write_ply
 from gaussian_swaying.recording.nodes import join_far
+from gaussian_swaying.rendering.tints import by_role
 from gaussian_swaying.scenes.procedural import FlagScene
 from gaussian_swaying.viewer.film.page import pack_still
 from gaussian_swaying.viewer.film.recorded import film_of
 from gaussian_swaying.viewer.session import Session
-from gaussian_swaying.viewer.states import drawable, film_from, look_message, message, scene_message, state_message
+from gaussian_swaying.viewer.states import (
+    colour_message,
+    drawable,
+    film_from,
+    look_message,
+    message,
+    scene_message,
+    state_message,
+)
 
 
 def read(raw):
@@ -112,3 +122,20 @@ def test_a_gpu_is_read_in_turn(session, monkeypatch):
         look_message(snapshot.simulation)
         scene_message(snapshot, torch.eye(3).double())
         assert taken == [snapshot.simulation.turn] * turns
+
+
+def test_other_colours_are_those_of_the_film_with_the_tints_of_roles(session):
+    """What became soft again has the colour that the scene brought."""
+    snapshot = session.snapshot
+    simulation, state = snapshot.simulation, snapshot.state
+    nodes = simulation.scene.follow.nodes(state)
+    own = film_of(simulation, state.grid, nodes, torch.zeros(0, len(nodes), 3), "scene").color[:, :3]
+    index, roles = torch.tensor([7, 900, 3]), torch.tensor([ROLES.index(role) for role in ("soft", "held", "still")])
+    head, rest = read(colour_message(simulation, index, roles))
+    assert head == {"kind": "colours", "count": 3}
+    assert np.frombuffer(rest[:12], "<u4").tolist() == index.tolist()
+    colours = np.frombuffer(rest[12:], np.uint8).reshape(3, 3)
+    assert colours[0].tolist() == own[7].tolist()
+    expected = 255 * by_role(torch.tensor(own[index] / 255.0), roles).numpy()
+    assert np.abs(colours - expected).max() <= 1
+    assert np.abs(colours - own[index]).max(1).tolist()[1:] > [20, 20]

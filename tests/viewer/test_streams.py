@@ -8,11 +8,13 @@ import urllib.error
 import urllib.request
 
 import pytest
+import torch
 
 pytest.importorskip("viser", reason="needs the extra [viewer]")
 from websockets.exceptions import ConnectionClosed
 from websockets.sync.client import connect as connect_socket
 
+from gaussian_swaying.gaussians.parts import ROLES
 from gaussian_swaying.viewer.streams import ANSWER
 
 from .conftest import pictures_since
@@ -214,3 +216,30 @@ def test_an_answer_has_eight_bytes():
     """As the page writes them: a count and a float32, little-endian."""
     assert ANSWER.size == 8
     assert ANSWER.unpack(struct.pack("<I", 7) + struct.pack("<f", 1.5)) == (7, 1.5)
+
+
+def test_only_colours_that_changed_are_sent(page, drawer):
+    """Those of another scene's Gaussians are not; without roles all have their own colours again."""
+    page.session.pause()
+    drawer.wait("state", ended=True)
+    count = len(page.session.simulation.scene.model.means)
+    roles = torch.zeros(count, dtype=torch.uint8)
+    for changed, value in (
+        ([3, 5, 9], ROLES.index("held")),
+        ([5], ROLES.index("still")),
+        ([3, 9], ROLES.index("soft")),
+    ):
+        roles = roles.clone()
+        roles[changed] = value
+        page.roles = roles
+        assert drawer.wait("colours")["count"] == len(changed)
+    page.roles = torch.ones(count + 1, dtype=torch.uint8)
+    with pytest.raises(TimeoutError):
+        drawer.get(0.3)
+    page.roles = None
+    assert drawer.wait("colours")["count"] == 1
+    page.roles = roles
+    assert drawer.wait("colours")["count"] == 1
+    page.session.change({"solver.dx": 0.12})
+    drawer.wait("scene")
+    assert drawer.wait("colours")["count"] == 1  # which the new scene did not have

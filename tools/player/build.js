@@ -3,7 +3,7 @@ import { build } from "esbuild";
 import { createHash } from "node:crypto";
 import { readFile } from "node:fs/promises";
 
-const OWN = ["build.js", "film.glsl.js", "film.js", "gaussians.js", "live.js", "main.js", "playback.js", "sorter.js"];
+const OWN = "brush.js build.js film.glsl.js film.js gaussians.js live.js main.js playback.js sorter.js".split(" ");
 const SOURCES = [...OWN, "package-lock.json"]; // a test compares their checksum
 
 // Spark's WebAssembly, in it and in its worker, reads files of splats, builds levels of detail and sorts. A film needs only

@@ -119,7 +119,8 @@ function makeGaussians(head, splats, nodes) {
     return { covsplat: step.outputs.covsplat };
   });
   const textures = [rows, ...Object.values(own)];
-  return { gaussians: new SplatGenerator({ numSplats: count, covGenerator }), moved, inputs, textures };
+  const { color } = own;
+  return { gaussians: new SplatGenerator({ numSplats: count, covGenerator }), moved, color, inputs, textures };
 }
 
 // ---- the canvas
@@ -183,6 +184,14 @@ export class Drawing {
   move(fill) {
     fill(this.moved.image.data);
     this.moved.needsUpdate = true;
+    this.changed();
+  }
+
+  // Give some Gaussians other colours: their indices, and three bytes each.
+  recolour(indices, colours) {
+    const { data } = this.color.image;
+    indices.forEach((i, k) => data.set(colours.subarray(3 * k, 3 * k + 3), 4 * i));
+    this.color.needsUpdate = true;
     this.changed();
   }
 

@@ -1,5 +1,6 @@
 // The live page: draws the states of a running simulation on a canvas below that of viser. See docs/live.md.
 import * as THREE from "three";
+import { Brush } from "./brush.js";
 import { Drawing, halves, reader, readSplats } from "./gaussians.js";
 import { Playback } from "./playback.js";
 
@@ -45,6 +46,7 @@ class Stage {
     this.world = null; // from viser's world to that of the Gaussians
     this.drawing = null;
     this.socket = null;
+    this.brush = new Brush(this);
     this.failed = null; // why this browser does not draw
     Object.assign(this, { slow: SLOW, patience: PATIENCE });
     this.scene = this.motion = null;
@@ -62,6 +64,7 @@ class Stage {
 
   // Ask for the states; called by the server, with the key of this browser.
   join(key) {
+    if (key !== this.key) this.brush.join(key);
     this.key = key;
     this.socket?.close();
     if (this.failed) return;
@@ -106,6 +109,10 @@ class Stage {
   take(head, rest) {
     if (head.kind === "off") return this.hide();
     if (head.kind === "look") return this.drawing.light(head);
+    if (head.kind === "colours") {
+      const changed = new Uint32Array(rest.buffer, 0, head.count);
+      return this.drawing.recolour(changed, rest.subarray(changed.byteLength));
+    }
     if (head.kind === "scene") {
       this.drawing ??= new Drawing(this.canvas, (pictures) => (this.left = Math.max(this.left, pictures)));
       const nodes = reader(rest.subarray(head.splats))(Uint32Array, head.head.nodes);

@@ -135,7 +135,7 @@ def test_nothing_is_lost_in_the_file(run, tmp_path, capsys):
 def test_the_program_is_built_from_its_sources(request):
     """The first line of the built program names the checksum of the sources, and the licences those of the packages."""
     player = request.config.rootpath / "tools/player"
-    own = ("build", "film.glsl", "film", "gaussians", "live", "main", "playback", "sorter")
+    own = ("brush", "build", "film.glsl", "film", "gaussians", "live", "main", "playback", "sorter")
     names = [*(f"{name}.js" for name in own), "package-lock.json"]
     assert sorted(path.name for path in player.glob("*.js")) == sorted(names[:-1])
     checksum = hashlib.sha256(b"".join((player / name).read_bytes() for name in names)).hexdigest()
