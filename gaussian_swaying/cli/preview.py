@@ -182,7 +182,8 @@ def preview_scene(options: argparse.Namespace, folder: Path) -> Preview:
     simulation, looked = made[suggestion.dx], suggestion
     parts = suggestion.parts
     if parts is not None:
-        if suggestion.dx < grids["draft"]:  # stalks thinner than a cell: the grid of a draft makes them too stiff
+        # stalks thinner than a cell: the grid of a draft makes them too stiff
+        if suggestion.pin is None and suggestion.dx < grids["draft"]:
             suggestion = calibrated_suggestion(suggestion, simulation, options.sway)
             costs["starter"] = cost_of(simulation, options.frames)
         if place is not None:

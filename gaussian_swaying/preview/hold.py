@@ -46,6 +46,11 @@ class HoldGuess:
     scores: dict[str, float] = field(default_factory=dict)
     options: tuple[str, ...] = ()
 
+    @property
+    def option(self) -> str:
+        """The value of ``--hold`` for this end."""
+        return _option(self.end, self.direction)
+
 
 def guess_hold(
     points: Tensor,
@@ -172,6 +177,17 @@ def standing_base(points: Tensor, weight: Tensor, up: Tensor) -> str | None:
 def hanging_cord(points: Tensor, weight: Tensor, up: Tensor) -> str | None:
     """Describe the cord that an object would hang from, right above its centre; None if there is none.
 
+    See :func:`cord_heights`.
+    """
+    found = cord_heights(points, weight, up)
+    if found is None:
+        return None
+    return f"it would hang in balance from something {found[1] - found[0]:.2g} long, as thin as a cord"
+
+
+def cord_heights(points: Tensor, weight: Tensor, up: Tensor) -> tuple[float, float] | None:
+    """Lower and upper end of the cord that an object would hang from [scene units along up]; None if there is none.
+
     A cord is an upright stretch of at least 15 % of the length, at most 15 % from the top, that is thinner than 0.04 of
     the length and than a quarter of the widest part.
 
@@ -205,7 +221,7 @@ def hanging_cord(points: Tensor, weight: Tensor, up: Tensor) -> str | None:
         return None
     if not _above(points, weight, parts[start], up, 0.05 * length):
         return None
-    return f"it would hang in balance from something {(stop - start) / slices * length:.2g} long, as thin as a cord"
+    return high - stop / slices * length, high - start / slices * length
 
 
 def _above(points: Tensor, weight: Tensor, end: Tensor, up: Tensor, margin: float) -> bool:

@@ -21,7 +21,7 @@ GREEN = 0.08  # how much greener than red and blue, as a share of the brightness
 SLICES, SECTORS = 40, 16  # of the height; of a slice
 COVERED = 0.75  # share of the sectors of a slice in which a pot must be
 ROUND = 0.12  # standard deviation of its radius over the sectors, as a share of the radius
-POT = (0.05, 0.6)  # height of a pot, as a share of that of the object
+POT, SLENDER = (0.05, 0.6), 5.0  # height of a pot, as a share of that of the object; most radii, or it is a trunk
 PLANT, LEAFY = 0.1, 0.5  # share of the visible area that must be above the rim, and the share of it that must be green
 WALL, SAUCER = 0.88, 1.25  # radii from the axis between which the wall lies, as shares of the radius there
 OPENING, INSIDE = 0.7, 0.4  # part of the radius in which soil is looked for, and share of its cells that must have some
@@ -36,8 +36,8 @@ NAMES = ("pot", "soil", "stem", "leaf", "surroundings")
 
 
 @dataclass(frozen=True)
-class PlantParts:
-    """A plant in a pot.
+class FoundParts:
+    """The parts of an object.
 
     Attributes:
         parts: A label for each Gaussian of the splat.
@@ -56,7 +56,7 @@ class PlantParts:
 
     @property
     def around(self) -> Tensor:
-        """Those among them that are not of the plant or its pot, bool, shape (N,)."""
+        """Those among them that are not of the object, bool, shape (N,)."""
         there = NAMES[AROUND] in [part.name for part in self.parts.parts]
         return self.parts.mask(NAMES[AROUND]) if there else torch.zeros(len(self.parts), dtype=torch.bool)
 
@@ -66,7 +66,7 @@ class PlantParts:
         named = zip(self.parts.parts, count, strict=True)
         return ", ".join(f"{part.name} {part.role} ({number:,} Gaussians)" for part, number in named)
 
-    def within(self, of: Tensor) -> PlantParts:
+    def within(self, of: Tensor) -> FoundParts:
         """The same for a larger splat.
 
         Args:
@@ -99,7 +99,7 @@ class _Pot:
         )
 
 
-def plant_parts(cloud: GaussianCloud, simulated: Tensor, up: Sequence[float], weight: Tensor) -> PlantParts | None:
+def plant_parts(cloud: GaussianCloud, simulated: Tensor, up: Sequence[float], weight: Tensor) -> FoundParts | None:
     """Find pot, soil, stems and leaves of a plant that stands in a pot.
 
     A pot is round about the up axis, at the lower end, and not green. It ends where the round wall ends, and most of
@@ -156,8 +156,8 @@ def plant_parts(cloud: GaussianCloud, simulated: Tensor, up: Sequence[float], we
     plant = label == STEM
     if int(plant.sum()) < FEWEST:
         return None
-    label[plant] = torch.where(_stems(means[plant], green[plant], high - low), STEM, LEAF)
-    labels = _for_all(cloud.means.detach(), index, label, axis, high - low)
+    label[plant] = torch.where(woody(means[plant], green[plant], high - low), STEM, LEAF)
+    labels = labels_for_all(cloud.means.detach(), index, label, high - low, AROUND)
     count = torch.bincount(labels, minlength=len(NAMES))
     role = {POT_LABEL: "held" if level is None else "still", SOIL: "held", AROUND: "still"}
     used = [k for k in range(len(NAMES)) if int(count[k])]
@@ -166,7 +166,7 @@ def plant_parts(cloud: GaussianCloud, simulated: Tensor, up: Sequence[float], we
     parts = Parts(place[labels], [Part(NAMES[k], role.get(k, "soft")) for k in used])
     inside = "no soil is seen in it" if level is None else f"with soil at {level:.2f}"
     reason = f"a round wall up to {pot.rim:.2f} of the height, {inside}, and green above"
-    return PlantParts(parts, reason)
+    return FoundParts(parts, reason)
 
 
 def greenish(sh: Tensor) -> Tensor:
@@ -213,7 +213,8 @@ def _find_pot(across: Tensor, height: Tensor, weight: Tensor, green: Tensor) -> 
     wall = (pot.share(across, height) - 1).abs() < ROUND
     near = wall & ~green & (height > last - 1 / SLICES) & (height < last + 1.5 / SLICES)
     rim = quantile(height[near], 0.95) if int(near.sum()) >= FEWEST else last + 0.5 / SLICES
-    return _Pot(heights, centres, radii, rim) if POT[0] < rim < POT[1] else None
+    fits = POT[0] < rim < POT[1] and rim < SLENDER * float(np.median(radii))
+    return _Pot(heights, centres, radii, rim) if fits else None
 
 
 def _ring(points: Tensor, weight: Tensor) -> tuple[np.ndarray, float] | None:
@@ -277,7 +278,7 @@ def _most_frequent(points: Tensor, label: Tensor) -> Tensor:
     return votes.argmax(-1)
 
 
-def _stems(points: Tensor, green: Tensor, size: float) -> Tensor:
+def woody(points: Tensor, green: Tensor, size: float) -> Tensor:
     """True for stems, bool, shape (N,): not green, or, near by or farther around, longer than wide and not flat."""
     from scipy.spatial import cKDTree
 
@@ -304,11 +305,19 @@ def _stems(points: Tensor, green: Tensor, size: float) -> Tensor:
     return stem[of_point]
 
 
-def _for_all(means: Tensor, index: Tensor, label: Tensor, up: Tensor, size: float) -> Tensor:
-    """Labels of all Gaussians: faint ones near the object have that of their neighbour, the others are around it."""
-    labels = torch.full((len(means),), AROUND)
+def labels_for_all(means: Tensor, index: Tensor, label: Tensor, size: float, around: int) -> Tensor:
+    """Labels of all Gaussians: faint ones near the object have that of their neighbour, the others are around it.
+
+    Args:
+        means: Centres [scene units], shape (N, 3).
+        index: The Gaussians of the object, shape (M,).
+        label: Their labels, shape (M,).
+        size: Height of the object [scene units].
+        around: The label of what is around it.
+    """
+    labels = torch.full((len(means),), around)
     labels[index] = label
-    rest = (labels == AROUND).nonzero()[:, 0]
+    rest = (labels == around).nonzero()[:, 0]
     if len(rest):
         distance, near = nearest_neighbours(means[index].double(), 1, means[rest].double())
         close = distance[:, 0] < NEAR * size

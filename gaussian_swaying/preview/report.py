@@ -13,7 +13,7 @@ from gaussian_swaying import _program as program
 from gaussian_swaying.gaussians.cloud import GaussianCloud
 from gaussian_swaying.gaussians.ply import OPAQUE_LOGIT
 from gaussian_swaying.preview.cost import Cost
-from gaussian_swaying.preview.parts import PlantParts
+from gaussian_swaying.preview.parts import FoundParts
 from gaussian_swaying.preview.picture import classify, conditions, mean_flow
 from gaussian_swaying.preview.place import Place
 from gaussian_swaying.preview.starter import region_dict
@@ -91,7 +91,8 @@ def suggestion_lines(guess: Suggestion, further: int) -> list[str]:
     if guess.pin is not None:
         lines.append(f"  pin           {_short(region_dict(guess.pin))}")
     if guess.parts is not None:
-        lines.append(f"parts           {guess.parts.words()}; one object instead: --hold bottom")
+        lines.append(f"parts           {guess.parts.words()}; one object instead: --hold {guess.hold.option}")
+        lines.append(f"  why           {guess.parts.reason}")
     lines += [
         f"size            {_numbers(guess.size)} m along the axes with z up; 1 scene unit = "
         f"{guess.metres_per_unit:.4g} m, assuming a longest side of {guess.longest_side:g} m",
@@ -294,7 +295,7 @@ def suggestion_dict(guess: Suggestion) -> dict[str, Any]:
     }
 
 
-def _parts_dict(parts: PlantParts) -> dict[str, Any]:
+def _parts_dict(parts: FoundParts) -> dict[str, Any]:
     """Parts as plain numbers."""
     of_part = {
         part.name: {"role": part.role, "gaussians": int(parts.parts.mask(part.name).sum())}

@@ -113,7 +113,7 @@ def _yaml(suggestion: Suggestion, ply: str | Path, frames: int, size: tuple[int,
       init_args:
         kind: {_kind(s)}
         region: {json.dumps(region_dict(s.pin))}"""
-    if s.parts is not None:
+    elif s.parts is not None:
         boundaries = " []               # what is held is said by scene.parts"
     falls = s.sheet or not s.fixed
     gravity = "[0.0, 0.0, -9.8]" if falls else "[0.0, 0.0, 0.0] "

@@ -26,8 +26,8 @@ from gaussian_swaying.geometry.patches import smallest_axis_normal
 from gaussian_swaying.geometry.regions import Box, Not, Region, Union
 from gaussian_swaying.mpm.materials import known_material
 from gaussian_swaying.preview.framing import orbit_frame, whole_box
-from gaussian_swaying.preview.hold import HoldGuess, end_region, given_hold, guess_hold
-from gaussian_swaying.preview.parts import PlantParts, plant_parts
+from gaussian_swaying.preview.hold import PIN_DEPTH, HoldGuess, end_region, given_hold, guess_hold
+from gaussian_swaying.preview.parts import FoundParts, plant_parts
 from gaussian_swaying.preview.photos import CapturedFrom, ShownObject, shown_object
 from gaussian_swaying.preview.shape import (
     FEWEST,
@@ -36,6 +36,7 @@ from gaussian_swaying.preview.shape import (
     rounded,
     sheet_normal,
 )
+from gaussian_swaying.preview.supports import flag_on_pole, hanging_parts, standing_parts
 from gaussian_swaying.preview.up import UpGuess, given_up, guess_up
 from gaussian_swaying.simulation.extent import suggest_spacing
 
@@ -121,7 +122,7 @@ class Suggestion:
         up: The up direction.
         region: The simulated part.
         hold: The end at which it is held.
-        pin: That end as a region, None if it is not held, or by ``parts``.
+        pin: That end as a region, None if it is not held, or is a part of ``parts`` that is.
         longest_side: Assumed length of the longest side of the object, without what is still [m].
         metres_per_unit: Resulting length of a scene unit [m].
         size: Sides of the object along the z-up axes [m].
@@ -140,7 +141,8 @@ class Suggestion:
         camera_offset: Vector from the centre of the moving part to that of the whole, in multiples of the longest side
             of the moving part.
         camera_radius: Distance of a camera that shows the whole, in the same unit.
-        parts: The parts of a plant in a pot, None for any other object.
+        parts: The parts of the object, if they are sure: a plant in a pot, a flag on its pole, what hangs from a cord,
+            or a tree; else None.
         growth: Mean number of substeps of a frame over the number at rest, from the trial runs.
         real: Whether the numbers are those of the material; if not, they are such that it sways visibly.
     """
@@ -165,7 +167,7 @@ class Suggestion:
     whole: tuple[list[float], list[float]]
     camera_offset: tuple[float, ...]
     camera_radius: float
-    parts: PlantParts | None = None
+    parts: FoundParts | None = None
     growth: float = 1.0
     real: bool = False
 
@@ -243,22 +245,26 @@ def suggest(
     else:
         chosen = given_region(means, opacity, weight, *region)
     plant = plant_parts(cloud, chosen.simulated, upward.direction, weight) if hold is None else None
+    flag = flag_on_pole(cloud, chosen.simulated, upward.direction) if hold is None and plant is None else None
     frame = SimFrame.fit(means[chosen.simulated], upward.direction, longest_side)
-    if plant is not None:  # the length is that of the plant with its pot
-        if upward.confidence in ("low", "medium"):
-            why = [*upward.reasons, "a plant stands in a pot at the lower end"]
-            upward = replace(upward, confidence="high", reasons=why)
-        chosen = replace(chosen, simulated=chosen.simulated & ~plant.still)
+    if plant is not None and upward.confidence in ("low", "medium"):
+        why = [*upward.reasons, "a plant stands in a pot at the lower end"]
+        upward = replace(upward, confidence="high", reasons=why)
+    found_parts = plant if flag is None else flag.found
+    if found_parts is not None:  # the length is that of the whole, with pot or pole
+        chosen = replace(chosen, simulated=chosen.simulated & ~found_parts.still)
         frame = SimFrame.fit(means[chosen.simulated], upward.direction, None, frame.metres_per_unit)
     points, visible = means[chosen.simulated], weight[chosen.simulated]
     metres = frame.point_to_sim(points.double())
-    if plant is not None:
+    if found_parts is not None:
         longest_side = float((metres.amax(0) - metres.amin(0)).amax())
     spacing = particle_spacing(points) * frame.metres_per_unit
     dx = suggest_spacing(longest_side, spacing, CELLS)
     if plant is not None:
         down = tuple(0.0 - c for c in upward.direction)
         held = HoldGuess("bottom", down, "medium", f"a plant in a pot: {plant.reason}")
+    elif flag is not None:
+        held = HoldGuess("side", flag.side, "high", f"a flag on its pole: {flag.found.reason}")
     elif hold is None:
         rest = means[~chosen.simulated & (opacity >= chosen.opacity_threshold)]
         eyes = None if capture is None else capture.eyes
@@ -271,6 +277,14 @@ def suggest(
         if held.end == "none" or plant is not None
         else end_region(points, held.direction, dx / frame.metres_per_unit)
     )
+    if hold is None and found_parts is None and pin is not None and held.confidence in ("high", "medium"):
+        if held.end == "top":
+            ending = pin.contains(means) & chosen.simulated
+            found_parts = hanging_parts(cloud, chosen.simulated, upward.direction, weight, ending)
+        elif held.end == "bottom":
+            depth = max(PIN_DEPTH * float(metres[:, 2].amax() - metres[:, 2].amin()), 1.5 * dx) / frame.metres_per_unit
+            found_parts = standing_parts(cloud, chosen.simulated, upward.direction, weight, depth)
+        pin = pin if found_parts is None else None
     azimuth, turn = broad_side(metres), 20.0  # the broad side, seen slightly from the side
     front = None if capture is None else photo_azimuth(capture.eyes, points.double().mean(0), frame.rotation)
     if front is not None:
@@ -284,8 +298,8 @@ def suggest(
     elif flat is not None:  # a curtain is moved by wind that hits its face
         flow = _across_picture(azimuth - 90, speed)
     outside = upward.ground if shown is None else upward.ground | ~shown.mask
-    if plant is not None:
-        outside = outside | plant.around
+    if found_parts is not None:
+        outside = outside | found_parts.around
     whole = whole_box(means, opacity, chosen.simulated, outside, dx / frame.metres_per_unit)
     offset, radius = orbit_frame(whole, (points.amin(0).tolist(), points.amax(0).tolist()))
     suggestion = Suggestion(
@@ -309,7 +323,7 @@ def suggest(
         whole=whole,
         camera_offset=offset,
         camera_radius=radius,
-        parts=plant,
+        parts=found_parts,
     )
     return at_quality(suggestion, quality)
 

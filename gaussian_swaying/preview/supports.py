@@ -1,0 +1,174 @@
+"""The parts of things that fly from a pole, hang from a cord or stand on a trunk, by shape and colour."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from gaussian_swaying.gaussians.cloud import GaussianCloud
+from gaussian_swaying.gaussians.parts import Part, Parts
+from gaussian_swaying.preview.hold import cord_heights
+from gaussian_swaying.preview.parts import FoundParts, greenish, labels_for_all, woody
+from gaussian_swaying.preview.shape import FEWEST, plane_axes, quantile, sheet_normal
+
+SLICES = 40  # of the height
+SLIM = 0.04  # width of a pole, as a share of the height
+BARE = 0.08  # share of the slices in which a pole is to be seen alone
+CLOTH = 0.3  # width of a slice with cloth, as a share of the widest
+OUTSIDE = 0.02  # share of the Gaussians of a flag that may lie on the other side of its pole
+TRUNK, CROWN = 0.12, 0.5  # height of a bare trunk, as a share of that of the tree; green share of what is above
+NARROW = 0.35  # width of a trunk, as a share of that of the crown
+
+
+@dataclass(frozen=True)
+class OnPole:
+    """A flag and its pole.
+
+    Attributes:
+        found: The parts: the pole is still, the cloth is soft.
+        side: Unit vector from the cloth to its pole.
+    """
+
+    found: FoundParts
+    side: tuple[float, ...]
+
+
+def flag_on_pole(cloud: GaussianCloud, simulated: Tensor, up: Sequence[float]) -> OnPole | None:
+    """Find the pole of a flag: a slim upright part that is seen alone below or above a cloth, which is on one side.
+
+    Args:
+        cloud: The splat.
+        simulated: The Gaussians of the object, bool, shape (N,).
+        up: Up direction, a unit vector.
+
+    Returns:
+        The parts; None if it is not such a flag.
+    """
+    index = simulated.nonzero()[:, 0]
+    means = cloud.means.detach()[index].double()
+    normal, axis = sheet_normal(means), torch.tensor(list(up), dtype=torch.float64)
+    if normal is None or abs(float(torch.tensor(normal, dtype=torch.float64) @ axis)) > 0.3:
+        return None
+    aside = torch.linalg.cross(axis, torch.tensor(normal, dtype=torch.float64))
+    aside = aside / aside.norm()
+    height, along = means @ axis, means @ aside
+    low, high = float(height.amin()), float(height.amax())
+    limit = SLIM * (high - low)
+    which = ((height - low) / max(high - low, 1e-30) * SLICES).long().clamp(max=SLICES - 1)
+    slices = [along[which == k] for k in range(SLICES)]
+    if min(map(len, slices)) == 0:
+        return None
+    ends = [(quantile(own, 0.02), quantile(own, 0.98)) for own in slices]
+    slim = [k for k, (first, last) in enumerate(ends) if last - first < limit]
+    most = max(last - first for first, last in ends)
+    wide = [k for k, (first, last) in enumerate(ends) if last - first > CLOTH * most]
+    if len(slim) < BARE * SLICES or len(wide) < 3:
+        return None
+    middle = float(torch.tensor([0.5 * sum(ends[k]) for k in slim]).median())
+    if any(abs(0.5 * sum(ends[k]) - middle) > limit for k in slim):
+        return None  # it leans, or there are two
+    radius = max(quantile(torch.cat([(slices[k] - middle).abs() for k in slim]), 0.98), 1e-3 * (high - low))
+    beyond = [float(((sign * (along - middle)) > 3 * radius).double().mean()) for sign in (1.0, -1.0)]
+    if min(beyond) > OUTSIDE or max(beyond) < 10 * OUTSIDE:
+        return None
+    toward = 1.0 if beyond[0] > beyond[1] else -1.0
+    first, last = min(wide), max(wide)
+    if any(float(((slices[k] - middle).abs() < 1.5 * radius).double().sum()) == 0 for k in range(first, last + 1)):
+        return None  # the pole does not go through
+    beside = (which >= first) & (which <= last)
+    cloth = beside & (toward * (along - middle) > 1.4 * radius)
+    if int(cloth.sum()) < FEWEST or int((~cloth).sum()) < FEWEST:
+        return None
+    labels = labels_for_all(cloud.means.detach(), index, (~cloth).long(), high - low, 2)
+    parts = _parts(labels, [Part("cloth"), Part("pole", "still"), Part("surroundings", "still")])
+    share = len(slim) / SLICES
+    reason = f"a slim upright pole, alone over {share:.2f} of its height, with a sheet on one side of it"
+    return OnPole(FoundParts(parts, reason), tuple(float(-toward * c) + 0.0 for c in aside))
+
+
+def hanging_parts(
+    cloud: GaussianCloud, simulated: Tensor, up: Sequence[float], weight: Tensor, held: Tensor
+) -> FoundParts | None:
+    """Find the cord that an object hangs from.
+
+    Args:
+        cloud: The splat.
+        simulated: The Gaussians of the object, bool, shape (N,).
+        up: Up direction, a unit vector.
+        weight: Visible area of each Gaussian, shape (N,).
+        held: Its upper end, bool, shape (N,).
+
+    Returns:
+        The parts: what it hangs by is held, cord and body are soft; None if there is no cord.
+    """
+    index = simulated.nonzero()[:, 0]
+    axis, means = torch.tensor(list(up), dtype=torch.float64), cloud.means.detach()[index].double()
+    ends = cord_heights(means, weight[index].double(), axis)
+    if ends is None:
+        return None
+    height = means @ axis
+    label = torch.where(height > ends[0], 1, 2)
+    label[held[index]] = 0
+    size = float(height.amax() - height.amin())
+    labels = labels_for_all(cloud.means.detach(), index, label, size, 3)
+    parts = _parts(labels, [Part("hook", "held"), Part("cord"), Part("body"), Part("surroundings", "still")])
+    return FoundParts(parts, f"a cord {ends[1] - ends[0]:.2g} long, right above the middle of what hangs on it")
+
+
+def standing_parts(
+    cloud: GaussianCloud, simulated: Tensor, up: Sequence[float], weight: Tensor, depth: float
+) -> FoundParts | None:
+    """Find the trunk of a tree: narrow and not green, below a crown that is green.
+
+    Args:
+        cloud: The splat.
+        simulated: The Gaussians of the object, bool, shape (N,).
+        up: Up direction, a unit vector.
+        weight: Visible area of each Gaussian, shape (N,).
+        depth: How much of the trunk is its foot [scene units].
+
+    Returns:
+        The parts: the foot is held, wood and leaves are soft; None if there is no such trunk.
+    """
+    index = simulated.nonzero()[:, 0]
+    axis, means = torch.tensor(list(up), dtype=torch.float64), cloud.means.detach()[index].double()
+    height, visible = means @ axis, weight[index].double()
+    low, high = quantile(height, 0.002), quantile(height, 0.998)
+    if high <= low:
+        return None
+    share = (height - low) / (high - low)
+    green = greenish(cloud.sh.detach()[index])
+    which = (share * SLICES).long().clamp(0, SLICES - 1)
+    across = plane_axes(axis)
+    wide = [
+        max(quantile(means[own] @ a, 0.95) - quantile(means[own] @ a, 0.05) for a in across) if len(own) else 0.0
+        for own in ((which == k).nonzero()[:, 0] for k in range(SLICES))
+    ]
+    bare = next((k for k in range(SLICES) if not 0 < wide[k] < NARROW * max(wide)), SLICES)
+    if not TRUNK * SLICES <= bare < 0.7 * SLICES:
+        return None
+    trunk, crown = which < bare, which >= bare
+    brown, leafy = (
+        float((visible * of)[some].sum() / visible[some].sum()) for of, some in ((~green, trunk), (green, crown))
+    )
+    if brown < 0.8 or leafy < CROWN:
+        return None
+    label = torch.where(trunk | woody(means, green, high - low), 1, 2)
+    label[trunk & (height < quantile(height[trunk], 0.01) + depth)] = 0
+    if int((label == 2).sum()) < FEWEST:
+        return None
+    labels = labels_for_all(cloud.means.detach(), index, label, high - low, 3)
+    parts = _parts(labels, [Part("foot", "held"), Part("wood"), Part("leaf"), Part("surroundings", "still")])
+    return FoundParts(parts, f"a trunk, bare up to {bare / SLICES:.2f} of the height, and green above")
+
+
+def _parts(labels: Tensor, parts: list[Part]) -> Parts:
+    """The parts that have Gaussians."""
+    count = torch.bincount(labels, minlength=len(parts))
+    used = [k for k in range(len(parts)) if int(count[k])]
+    place = torch.zeros(len(parts), dtype=torch.long)
+    place[used] = torch.arange(len(used))
+    return Parts(place[labels], [parts[k] for k in used])

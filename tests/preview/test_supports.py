@@ -1,0 +1,176 @@
+"""Flags on their poles, what hangs from a cord, and trees: parts are proposed where they are sure."""
+
+import dataclasses
+
+import pytest
+import torch
+import yaml
+from small_scenes import plain_cloud, together
+
+from gaussian_swaying.gaussians.harmonics import SH_DC
+from gaussian_swaying.gaussians.ply import write_ply
+from gaussian_swaying.preview.starter import starter_yaml
+from gaussian_swaying.preview.suggest import suggest, visible_weight
+from gaussian_swaying.preview.supports import flag_on_pole, hanging_parts, standing_parts
+from gaussian_swaying.scenes.ficus import FicusScene
+from gaussian_swaying.scenes.flag_on_stand import FlagOnStandScene
+from gaussian_swaying.scenes.leaves import LeavesScene
+from gaussian_swaying.scenes.procedural import FlagScene
+from gaussian_swaying.scenes.solid import SolidScene
+from gaussian_swaying.scenes.telephone import TelephoneScene
+from gaussian_swaying.scenes.vase import VaseScene
+from gaussian_swaying.simulation.simulation import Simulation
+
+UP = (0.0, 0.0, 1.0)
+
+
+def all_of(cloud):
+    return torch.ones(len(cloud), dtype=torch.bool)
+
+
+def lamp(radius=0.006):
+    """A ball on a cord of 0.6 m under a plate."""
+    draw = torch.Generator().manual_seed(0)
+    angle, share = 6.2832 * torch.rand(600, generator=draw), torch.rand(600, generator=draw)
+    cord = torch.stack([radius * angle.cos(), radius * angle.sin(), 0.24 + 0.66 * share], -1)
+    plate = torch.stack([0.04 * angle.sin(), 0.04 * angle.cos() * share, 0.9 + 0.02 * share], -1)
+    ball = torch.nn.functional.normalize(torch.randn(1200, 3, generator=draw), dim=-1) * 0.12
+    ball[:, 2] += 0.12
+    return plain_cloud(torch.cat([cord, plate, ball]) + torch.tensor([3.0, 4.0, 5.0]), -4.0, logit=2.0)
+
+
+@pytest.fixture(scope="module")
+def tree():
+    """A tree without its pot, 1.6 m high, its lowest branches at a quarter of it."""
+    cloud = FicusScene(spacing=0.01).generate()
+    return cloud.select((cloud.means[:, :2].norm(dim=-1) < 0.9) & (cloud.means[:, 2] > 0.32))
+
+
+def coloured(cloud, color, where):
+    sh = cloud.sh.clone()
+    sh[where, 0] = (torch.tensor(color) - 0.5) / SH_DC
+    return dataclasses.replace(cloud, sh=sh)
+
+
+@pytest.mark.parametrize("yaw", [0.0, 30.0, 200.0])
+def test_a_flag_and_its_pole(yaw):
+    scene = FlagOnStandScene(spacing=0.025, yaw=yaw)
+    cloud, cloth = scene.generate(), len(FlagScene(spacing=0.025).generate())
+    found = flag_on_pole(cloud, all_of(cloud), UP)
+    assert [(part.name, part.role) for part in found.found.parts.parts] == [("cloth", "soft"), ("pole", "still")]
+    label = found.found.parts.labels
+    assert float((label[:cloth] == 0).double().mean()) > 0.95
+    assert float((label[cloth:] == 1).double().mean()) == 1.0
+    away = cloud.means[:cloth].mean(0) - cloud.means[cloth:].mean(0)
+    away[2] = 0.0
+    assert float(torch.tensor(found.side) @ (away / away.norm())) == pytest.approx(-1.0, abs=0.02)
+    assert "alone over 0.6" in found.found.reason
+
+
+def test_any_axis_may_be_up_and_the_pole_may_be_below_only():
+    cloud = FlagOnStandScene(spacing=0.025).generate()
+    cloud = cloud.select(cloud.means[:, 2] < 0.8)
+    x, y, z = cloud.means.unbind(-1)
+    turned = dataclasses.replace(cloud, means=torch.stack([x, -z, y], -1) * 7 + torch.tensor([3.0, -2.0, 1.0]))
+    found = flag_on_pole(turned, all_of(turned), (0.0, -1.0, 0.0))
+    assert found.side == pytest.approx((-1.0, 0.0, 0.0))
+
+
+def test_a_flag_without_its_pole_or_with_two_or_on_a_rod_has_no_parts():
+    for cloud in (
+        FlagScene().generate(),
+        *(FlagOnStandScene(stand=kind).generate() for kind in ("posts", "rod", "none")),
+    ):
+        assert flag_on_pole(cloud, all_of(cloud), UP) is None
+        assert suggest(cloud).parts is None
+
+
+def test_a_sign_on_both_sides_of_its_post_is_no_flag():
+    cloud = FlagOnStandScene(spacing=0.025).generate()
+    flag = cloud.select(cloud.means[:, 0] > -0.005)
+    mirror = dataclasses.replace(
+        flag, means=flag.means * torch.tensor([-1.0, 1.0, 1.0]) - torch.tensor([0.05, 0.0, 0.0])
+    )
+    both = together(cloud, mirror)
+    assert flag_on_pole(both, all_of(both), UP) is None
+
+
+def test_the_starter_moves_the_cloth_and_not_the_pole(tmp_path):
+    cloud = FlagOnStandScene(spacing=0.025).generate()
+    guess = suggest(cloud, up="+z", quality="draft")
+    assert guess.hold.end == "side"
+    assert guess.hold.confidence == "high"
+    assert guess.hold.option == "-x"
+    assert guess.pin is not None
+    assert guess.sheet
+    assert guess.longest_side == pytest.approx(1.2 * guess.metres_per_unit, rel=0.05)  # of the cloth
+    assert guess.metres_per_unit == pytest.approx(
+        1 / float((cloud.means.amax(0) - cloud.means.amin(0)).amax()), rel=1e-3
+    )
+    path = guess.parts.parts.save(tmp_path / "parts.npz")
+    guess = dataclasses.replace(guess, parts=dataclasses.replace(guess.parts, path=str(path)))
+    write_ply(tmp_path / "flag.ply", cloud)
+    (tmp_path / "starter.yaml").write_text(starter_yaml(guess, tmp_path / "flag.ply"))
+    assert (
+        yaml.safe_load((tmp_path / "starter.yaml").read_text())["solver"]["boundaries"][0]["class_path"]
+        == "PinnedRegion"
+    )
+    simulation = Simulation.from_yaml(tmp_path / "starter.yaml", device="cpu")
+    last = list(simulation.frames(5))[-1]
+    moved = (last.gaussians.means - simulation.scene.rest().means).norm(dim=-1)
+    parts = simulation.scene.parts
+    assert float(moved[parts.mask("pole")].max()) == 0.0
+    assert float(moved[parts.mask("cloth")].max()) > 0.01
+    edge = parts.mask("cloth") & (cloud.means[:, 0] < 0.02)
+    assert float(moved[edge].max()) < 0.2 * float(moved.max())
+    assert suggest(cloud, up="+z", hold="-x").parts is None
+
+
+def test_what_hangs_from_a_cord():
+    cloud = lamp()
+    guess = suggest(cloud, up="+z")
+    parts, height = guess.parts.parts, cloud.means[:, 2] - 5.0
+    assert [(part.name, part.role) for part in parts.parts] == [("hook", "held"), ("cord", "soft"), ("body", "soft")]
+    assert bool(parts.mask("hook")[height > 0.88].all())
+    assert bool(parts.mask("cord")[(height > 0.32) & (height < 0.8)].all())
+    assert bool(parts.mask("body")[height < 0.22].all())
+    assert guess.pin is None
+    assert guess.fixed
+    assert "a cord 0.6" in guess.parts.reason
+    thick = lamp(radius=0.1)
+    assert hanging_parts(thick, all_of(thick), UP, visible_weight(thick), all_of(thick)) is None
+
+
+def test_a_tree(tree):
+    guess = suggest(tree, up="+z")
+    parts, (x, y, z) = guess.parts.parts, tree.means.unbind(-1)
+    across = torch.hypot(x, y)
+    assert [(part.name, part.role) for part in parts.parts] == [("foot", "held"), ("wood", "soft"), ("leaf", "soft")]
+    assert bool(parts.mask("foot")[z < 0.38].all())
+    assert float(parts.mask("wood")[(across < 0.1) & (z > 0.48) & (z < 0.7)].double().mean()) > 0.99
+    assert float(parts.mask("leaf")[z > 1.5].double().mean()) > 0.9
+    assert guess.pin is None
+    assert guess.hold.end == "bottom"
+
+
+def test_a_trunk_is_no_pot_and_a_tree_must_be_green(tree):
+    """A trunk is round and brown below green leaves, as a pot is, but slender."""
+    assert suggest(tree, up="+z").parts.parts.parts[0].name == "foot"
+    dead = coloured(tree, (0.5, 0.4, 0.3), all_of(tree))
+    bush = coloured(tree, (0.2, 0.5, 0.2), all_of(tree))
+    for cloud in (dead, bush):
+        assert standing_parts(cloud, all_of(cloud), UP, visible_weight(cloud), 0.1) is None
+
+
+@pytest.mark.parametrize("scene", [VaseScene, TelephoneScene, SolidScene, LeavesScene, FlagScene])
+def test_other_objects_have_no_parts(scene):
+    assert suggest(scene().generate(), up="+z").parts is None
+
+
+def test_what_is_only_a_weak_guess_has_no_parts():
+    """The origin at the lower end of the lamp speaks for a thing that stands."""
+    cloud = lamp()
+    low = dataclasses.replace(cloud, means=cloud.means - torch.tensor([3.0, 4.0, 5.0]))
+    guess = suggest(low, up="+z")
+    assert guess.hold.confidence == "low"
+    assert guess.parts is None
