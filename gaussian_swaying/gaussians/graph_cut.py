@@ -128,7 +128,7 @@ def _edges(distance: Tensor, index: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def _likeness(pairs: Tensor, apart: Tensor, shade: Tensor, facing: Tensor) -> Tensor:
-    """How much alike two neighbours are, from 0 to 1, shape (E,)."""
+    """Likeness of two neighbours, from 0 to 1, shape (E,)."""
     a, b = pairs
     change = (shade[a] - shade[b]).square().sum(-1)
     sigma = max(float(change.sqrt().median()), LEAST_SIGMA)
@@ -138,7 +138,7 @@ def _likeness(pairs: Tensor, apart: Tensor, shade: Tensor, facing: Tensor) -> Te
 
 
 def _ways(pairs: Tensor, apart: Tensor, seed: Tensor, count: int) -> Tensor:
-    """What each label costs a node by the way from its seeds, from 0 to 1, shape (M, count)."""
+    """Costs of the labels of a node by the way from their seeds, from 0 to 1, shape (M, count)."""
     from scipy.sparse import coo_matrix
     from scipy.sparse.csgraph import dijkstra
 
@@ -156,7 +156,7 @@ def _ways(pairs: Tensor, apart: Tensor, seed: Tensor, count: int) -> Tensor:
 
 
 def _colour_costs(shade: Tensor, seed: Tensor, count: int) -> Tensor:
-    """What each label costs a node by its colour, from 0 to 1, shape (M, count)."""
+    """Costs of the labels of a node by its colour, from 0 to 1, shape (M, count)."""
     apart = []
     for label in range(count):
         own = shade[seed == label]
