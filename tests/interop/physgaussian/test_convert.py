@@ -20,6 +20,7 @@ from shared import refused
 from small_scenes import plain_cloud
 
 from gaussian_swaying.cli.simulate import main
+from gaussian_swaying.gaussians.parts import Part, Parts
 from gaussian_swaying.gaussians.ply import write_ply
 from gaussian_swaying.geometry.regions import Box
 from gaussian_swaying.interop.physgaussian.camera import PhysGaussianCamera, read_model_camera
@@ -37,6 +38,7 @@ from gaussian_swaying.mpm.laws.plasticine import Plasticine
 from gaussian_swaying.mpm.laws.sand import Sand
 from gaussian_swaying.mpm.laws.shared import lame_parameters
 from gaussian_swaying.mpm.laws.snow import Snow
+from gaussian_swaying.scenes.procedural import FlagScene
 from gaussian_swaying.simulation.normalisation import Normalisation
 from gaussian_swaying.simulation.simulation import Simulation
 
@@ -896,6 +898,31 @@ def test_cameras_of_the_model(tmp_path):
     path.write_text(json.dumps([{"position": [0, 0, 0]}]))
     with pytest.raises(ValueError, match="it needs position, rotation"):
         read_model_camera(path, 0)
+
+
+def test_parts_of_the_splat_work_with_a_converted_configuration(tmp_path):
+    """Boundaries are in the normalised space, parts are of Gaussians."""
+    cloud = FlagScene(spacing=0.06).generate()
+    label = torch.bucketize(cloud.means[:, 0].contiguous(), torch.tensor([0.2, 0.8]))
+    roles = [Part("pole", "held"), Part("cloth"), Part("board", "rigid", density=300.0)]
+    parts = Parts(label, roles).save(tmp_path / "parts.npz")
+    write_ply(tmp_path / "flag.ply", cloud)
+    config = {
+        "material": "jelly", "E": 1e4, "nu": 0.3, "density": 100.0, "g": [0, 0, -9.8], "n_grid": 30, "grid_lim": 2.0,
+        "rotation_degree": [20.0], "rotation_axis": [2], "scale": 1.0, "frame_dt": 0.02, "frame_num": 5,
+        "boundary_conditions": [{"type": "bounding_box"}],
+    }  # fmt: skip
+    settings, _ = convert(config)
+    settings["scene"] |= {"ply": str(tmp_path / "flag.ply"), "parts": str(parts)}
+    (tmp_path / "flag.yaml").write_text(yaml.safe_dump(settings))
+    simulation = Simulation.from_yaml(tmp_path / "flag.yaml", device="cpu")
+    last = list(simulation.frames(6))[-1].gaussians.means.double()
+    moved = (last - cloud.means).norm(dim=-1)
+    assert float(moved[label == 0].max()) == 0.0
+    assert float(moved[label == 1].max()) > 0.02
+    board = label == 2
+    assert float(moved[board].min()) > 0.01
+    torch.testing.assert_close(torch.pdist(last[board]), torch.pdist(cloud.means[board].double()), rtol=0, atol=1e-5)
 
 
 # ---- command lines
