@@ -110,6 +110,7 @@ def settings_of(
     parser: ArgumentParser,
     scene: str | None,
     further: Sequence[str],
+    folder: Path,
     tell: Callable[[float, str], None] = lambda share, what: None,
 ) -> Namespace:
     """The settings of the scene to show.
@@ -118,6 +119,7 @@ def settings_of(
         parser: From :meth:`Simulation.parser`.
         scene: A splat, a configuration, or None for the flag or the ``--config`` among the further options.
         further: Options of ``gaussian-swaying sim``.
+        folder: Gets a file with the parts of a splat, if it has any.
         tell: Called with the share that is done, from 0 to 1, and the name of the next task.
 
     Raises:
@@ -130,7 +132,7 @@ def settings_of(
         with guessing(parser):
             device = parser.parse_args([*given, "--scene.ply", scene]).device
         print(f"Looking at {scene} for a first configuration, which takes up to a minute.", flush=True)
-        settings = settings_of_splat(parser, scene, resolve_device(device), given, tell)
+        settings = settings_of_splat(parser, scene, resolve_device(device), folder, given, tell)
     else:
         config = scene or (None if _given(given, "--config") else "flag")
         arguments = with_shipped([*(["--config", config] if config else []), *given], "sim")
@@ -181,7 +183,7 @@ def _live(arguments: Sequence[str]) -> None:
             print(f"Other computers open {page.url_elsewhere}; whoever has the link can change the scene.", flush=True)
         if not options.no_browser:
             webbrowser.open(page.url)
-        settings = settings_of(parser, options.scene, further, page.progress)
+        settings = settings_of(parser, options.scene, further, page.scratch, page.progress)
         page.progress(0.8, "Making the simulation")
         session = session_of(parser, settings, options.grid == "real-time" and not _given(further, "--solver.dx"))
         page.show(session)

@@ -115,7 +115,7 @@ class Files:
         path.write_bytes(content)
         device = self.session.simulation.device
         quick = device.type == "cpu"  # no trial looks for a grid
-        return settings_of_splat(self.session.parser, path, device, tell=self.page.progress, quick=quick)
+        return settings_of_splat(self.session.parser, path, device, path.parent, tell=self.page.progress, quick=quick)
 
     def _configuration(self, content: bytes, suffix: str, folder: Folder) -> Namespace:
         """The settings in a configuration file; if its splat is not on this computer, they get the present one."""

@@ -74,7 +74,6 @@ class Painting:
         self._view: tuple[Any, Seen] | None = None  # of the last camera
         self._paints = False
         self._paused = False  # whether the session was, before
-        self._folder = tempfile.TemporaryDirectory()
         self._numbers = count(1)  # of the files that were applied
         gui = controls.server.gui
         gui.add_markdown(
@@ -95,6 +94,7 @@ class Painting:
         controls.on(self.apply.on_click, self._apply)
         controls.on(self.save.on_click, self._save, tell_event=True)
         self.page.brushes.take = self._came
+        self._show()
 
     # ---- on and off
 
@@ -151,7 +151,7 @@ class Painting:
             self.page.roles = strokes.roles if bool(scene.drawn.all()) else strokes.roles[scene.drawn]
         self.page.redraw()
         self.back.disabled = not on or strokes is None or len(strokes) == 0
-        self.apply.disabled = self.save.disabled = strokes is None
+        self.apply.disabled, self.save.disabled = strokes is None, strokes is None and scene.parts is None
         self.legend.visible = on
         if strokes is None or not on:
             return
@@ -252,8 +252,9 @@ class Painting:
         strokes, session = self._strokes, self.session
         if strokes is None:
             return
-        parts, path = strokes.parts(), Path(self._folder.name) / str(next(self._numbers)) / FILE
-        path.parent.mkdir()
+        painted = self.page.scratch / "painted"
+        parts, path = strokes.parts(), painted / str(next(self._numbers)) / FILE
+        path.parent.mkdir(parents=True)
         parts.save(path)
         changes: dict[str, Any] = {"scene.parts": str(path)}
         with session.lock:
@@ -267,20 +268,21 @@ class Painting:
         session.change(changes)
         with session.lock:  # so that none is being read
             kept = {str(known.scene.parts) for known in session.reachable()} | {str(path)}
-        for folder in Path(self._folder.name).iterdir():
+        for folder in painted.iterdir():
             if str(folder / FILE) not in kept:
                 shutil.rmtree(folder)
 
     def _save(self, event: viser.GuiEvent) -> None:
-        if self._strokes is not None and event.client is not None:
+        parts = self.session.simulation.scene.parts if self._strokes is None else self._strokes.parts()
+        if parts is not None and event.client is not None:
             with tempfile.TemporaryDirectory() as folder:
-                content = self._strokes.parts().save(Path(folder) / FILE).read_bytes()
+                content = parts.save(Path(folder) / FILE).read_bytes()
             event.client.send_file_download(FILE, content, save_immediately=True)
 
     def as_saved(self, text: str) -> str:
-        """A configuration that is saved from the page; parts that were painted lie beside it."""
+        """A configuration that is saved from the page; parts whose file goes away with the page lie beside it."""
         path = Path(str(self.session.settings.scene.parts))
-        if not path.is_relative_to(self._folder.name):
+        if not path.is_relative_to(self.page.scratch):
             return text
         return f"# Save the parts, too, and run it in their folder\n{text.replace(str(path), FILE)}"
 

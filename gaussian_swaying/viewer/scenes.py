@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -24,6 +25,7 @@ def settings_of_splat(
     parser: ArgumentParser,
     path: str | os.PathLike[str],
     device: torch.device,
+    folder: Path,
     further: Sequence[str] = (),
     tell: Callable[[float, str], None] = lambda share, what: None,
     quick: bool = False,
@@ -34,6 +36,7 @@ def settings_of_splat(
         parser: From :meth:`Simulation.parser`.
         path: The splat.
         device: Device of the simulation.
+        folder: Gets ``parts.npz``, which the settings name, if the splat has parts.
         further: Options that replace what is suggested.
         tell: Called with the share that is done, from 0 to 1, and the name of the next task.
         quick: Whether they are those of its draft, with a coarser grid, in place of its starter's.
@@ -47,6 +50,9 @@ def settings_of_splat(
     gaussians = read_gaussians(file)
     tell(0.15, "Looking for a region, pins and a grid")
     found = suggest(gaussians, quality="draft" if quick else "normal")
+    if found.parts is not None:
+        saved = found.parts.parts.save(folder / "parts.npz")
+        found = replace(found, parts=replace(found.parts, path=str(saved)))
     own = ["--device", device.type]
     tell(0.35, "Making a draft")
     draft = Simulation.from_settings(parser, parse_text(parser, draft_yaml(found, str(file)), own))

@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import logging
 import socket
+import tempfile
 import threading
 import time
 import warnings
@@ -12,6 +13,7 @@ from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, redirect_stdout, suppress
 from functools import partial
+from pathlib import Path
 from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any
 
@@ -135,6 +137,7 @@ class Screen:
         roles: Roles whose tints are shown (see :func:`.tints.by_role`), shape (N,), or None; redraw after a change.
         recording: The video that is being recorded, or None.
         force_end: End of the colour scale of the force of the wind [Pa].
+        scratch: A folder for files that go away with the page.
         drawn_size: Width and height at which the last picture was drawn [pixels].
     """
 
@@ -153,6 +156,8 @@ class Screen:
         self.roles: torch.Tensor | None = None
         self.force_end = 1.0
         self.recording: FilmStrip | None = None
+        self._scratch = tempfile.TemporaryDirectory()
+        self.scratch = Path(self._scratch.name)
         self.drawn_size = (0, 0)
         self.recorder: int | None = None  # the browser from whose camera is recorded
         self._closed = threading.Event()
@@ -221,6 +226,7 @@ class Screen:
         for thread in self._threads:
             thread.join(10.0)
         self.server.stop()
+        self._scratch.cleanup()
 
     def tell(self, notice: str, seconds: float = 15.0) -> None:
         """Show a sentence on the page for some time."""

@@ -18,9 +18,10 @@ from shared import refused
 from gaussian_swaying.cli import live
 from gaussian_swaying.gaussians.ply import write_ply
 from gaussian_swaying.preview.cost import Cost
+from gaussian_swaying.scenes.alocasia import AlocasiaScene
 from gaussian_swaying.scenes.procedural import FlagScene
 from gaussian_swaying.simulation.simulation import Simulation
-from gaussian_swaying.viewer import real_time
+from gaussian_swaying.viewer import real_time, scenes
 from gaussian_swaying.viewer.scenes import settings_of_splat
 
 
@@ -61,8 +62,8 @@ def test_pixels_are_limited(capsys, pixels):
     refused(live.main, ["--pixels", pixels, "--no-browser"], capsys, "from 16 to 8192")
 
 
-def test_without_a_scene_it_is_the_flag(parser):
-    settings = live.settings_of(parser, None, ["--solver.dx=0.2", "--device=cpu"])
+def test_without_a_scene_it_is_the_flag(parser, tmp_path):
+    settings = live.settings_of(parser, None, ["--solver.dx=0.2", "--device=cpu"], tmp_path)
     assert settings.scene.generator.class_path.endswith("FlagScene")
     assert settings.solver.dx == 0.2
 
@@ -70,23 +71,35 @@ def test_without_a_scene_it_is_the_flag(parser):
 def test_a_configuration_and_a_shipped_one(parser, tmp_path):
     file = tmp_path / "mine.yaml"
     file.write_text("scene: {generator: {class_path: FlagScene}}\nsolver: {dx: 0.3}\n")
-    assert live.settings_of(parser, str(file), []).solver.dx == 0.3
-    assert live.settings_of(parser, None, ["--config", str(file), "--solver.dx=0.4"]).solver.dx == 0.4
+    assert live.settings_of(parser, str(file), [], tmp_path).solver.dx == 0.3
+    assert live.settings_of(parser, None, ["--config", str(file), "--solver.dx=0.4"], tmp_path).solver.dx == 0.4
     with pytest.raises(ValueError, match="`SCENE` and `--config`"):
-        live.settings_of(parser, "my.ply", ["--config", str(file)])
+        live.settings_of(parser, "my.ply", ["--config", str(file)], tmp_path)
 
 
 def test_a_splat_gets_what_the_preview_suggests(parser, tmp_path):
     path = tmp_path / "flag.ply"
     write_ply(path, FlagScene(spacing=0.025).generate())
-    settings = live.settings_of(parser, str(path), ["--device=cpu", "--wind.flow=[1,2,3]"])
+    settings = live.settings_of(parser, str(path), ["--device=cpu", "--wind.flow=[1,2,3]"], tmp_path)
     assert settings.scene.ply == str(path)
     assert settings.wind.flow == [1, 2, 3]
-    quick = settings_of_splat(parser, path, torch.device("cpu"), quick=True)
+    quick = settings_of_splat(parser, path, torch.device("cpu"), tmp_path, quick=True)
     assert (settings.solver.dx, quick.solver.dx) == (0.043, 0.062)  # a draft has 16 cells along its 1 m
     simulation = Simulation.from_settings(parser, settings)
     frames = list(simulation.frames(2))
     assert torch.isfinite(frames[-1].state.position).all()
+
+
+def test_a_plant_in_a_pot_moves_in_it(parser, tmp_path, monkeypatch):
+    """Its parts are in a file that the settings name."""
+    path = tmp_path / "plant.ply"
+    write_ply(path, AlocasiaScene(spacing=0.005).generate())
+    monkeypatch.setattr(scenes, "calibrated_suggestion", lambda found, *given: found)  # which takes long
+    settings = settings_of_splat(parser, path, torch.device("cpu"), tmp_path, quick=True)
+    assert settings.scene.parts == str(tmp_path / "parts.npz")
+    scene = Simulation.from_settings(parser, settings).scene
+    assert [part.name for part in scene.parts.parts] == ["pot", "soil", "stem", "leaf", "surroundings"]
+    assert not scene.parts.mask(role="still")[scene.simulated].any()
 
 
 def test_bad_input_is_one_sentence(capsys, tmp_path):
@@ -101,6 +114,7 @@ class FakePage:
     def __init__(self, *arguments):
         self.url, self.url_elsewhere = "http://127.0.0.1:8080", None
         self.progress = lambda *arguments: None
+        self.scratch = None  # a configuration needs no folder
         self.close = lambda: None
 
     def show(self, session):
@@ -155,9 +169,9 @@ def cubed(simulation, frames, budget, pictures):
     )
 
 
-def test_a_solver_of_ones_own_gets_no_trial(parser, monkeypatch):
+def test_a_solver_of_ones_own_gets_no_trial(parser, monkeypatch, tmp_path):
     """It need not have a grid."""
-    settings = live.settings_of(parser, None, ["--solver.dx=0.2", "--device=cpu"])
+    settings = live.settings_of(parser, None, ["--solver.dx=0.2", "--device=cpu"], tmp_path)
     simulation = Simulation.from_settings(parser, settings)
     monkeypatch.setattr(live, "Simulation", SimpleNamespace(from_settings=lambda parser, settings: simulation))
     monkeypatch.setattr(live, "share_cores", lambda: None)

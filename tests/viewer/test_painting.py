@@ -4,7 +4,6 @@ Covers: viewer.brushes, viewer.painting.
 """
 
 import json
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -290,7 +289,7 @@ def test_files_of_parts_stay_while_a_change_can_be_undone(page, painter, until, 
         painting._apply()
         until(lambda before=before: session.simulation is not before)
         session._past.append(session._past.pop())
-    there = {str(path) for path in Path(painting._folder.name).glob("*/parts.npz")}
+    there = {str(path) for path in (page.scratch / "painted").glob("*/parts.npz")}
     assert {str(known.scene.parts) for known in session.reachable()} - {"None"} <= there
     assert len(there) <= 4
 
