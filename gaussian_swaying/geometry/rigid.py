@@ -3,8 +3,10 @@ r"""The motion of a rigid body, from the momentum of its points.
 A substep moves points by :math:`x' = x + \Delta t\, v`. With a velocity :math:`V + \omega \times r` the body would
 grow. So the velocity is that of the chord, :math:`v = V + (Q - 1)\, r / \Delta t` with a rotation Q, for which
 :math:`x' = c' + Q r` is the same body. Q follows from the angular momentum L: with :math:`J = \sum m\, r r^T`,
-:math:`\sum m\, r \times Q r = \Delta t\, L`. These are the equations of Moser & Veselov (1991), "Discrete versions of
-some classical integrable systems": momenta are conserved to round-off, and the energy does not drift.
+:math:`\sum m\, r \times Q r = \Delta t\, L`. For a turn :math:`\varphi`, whose rotation is
+:math:`1 + a [\varphi] + b [\varphi]^2` (Rodrigues), it is :math:`a I \varphi + b J \varphi \times \varphi = \Delta t L`
+with :math:`I = \operatorname{tr} J - J`. These are the equations of Moser & Veselov (1991), "Discrete versions of some
+classical integrable systems": momenta are conserved to round-off, and the energy does not drift.
 """
 
 from __future__ import annotations
@@ -13,7 +15,7 @@ import torch
 from torch import Tensor
 
 from gaussian_swaying.geometry.linalg import cofactor, determinant, matmul3
-from gaussian_swaying.geometry.rotations import turn_of
+from gaussian_swaying.geometry.rotations import rodrigues, turn_of
 
 ITERATIONS = 4  # each gains as many digits as the squared angle of a substep has
 
@@ -36,11 +38,14 @@ def rigid_velocity(place: Tensor, velocity: Tensor, mass: Tensor, dt: float | Te
     spin = _axial(_outer(velocity - mean, weight * arm)) * dt
     identity = torch.eye(3, dtype=mass.dtype, device=mass.device)
     trace = moment.diagonal(dim1=-2, dim2=-1).sum(-1)[..., None, None]
-    inverse = _inverse(trace * identity - moment)
-    turn = (inverse * spin[..., None, :]).sum(-1)
+    inertia = trace * identity - moment
+    inverse = _inverse(inertia)
+    first = (inverse @ spin[..., None])[..., 0]
+    turn = first
     for _ in range(ITERATIONS):
-        missing = spin - _axial(matmul3(turn_of(turn), moment))
-        turn = turn + (inverse * missing[..., None, :]).sum(-1)
+        sine, cosine = rodrigues(turn)
+        gyro = torch.linalg.cross((moment @ turn[..., None])[..., 0], turn, dim=-1)
+        turn = (first - cosine * (inverse @ gyro[..., None])[..., 0]) / sine
     return mean + matmul3(arm, turn_of(turn).mT) / dt
 
 

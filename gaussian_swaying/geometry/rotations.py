@@ -63,6 +63,15 @@ def rotation_to_quat(rotation: Tensor) -> Tensor:
     return torch.where(quats[..., :1] < 0, -quats, quats)
 
 
+def rodrigues(turn: Tensor) -> tuple[Tensor, Tensor]:
+    """The sine of an angle over it, and one less its cosine over its square, for an axis times angle [rad] (..., 3).
+
+    Shape (..., 1) each; both are exact for small angles.
+    """
+    half = torch.linalg.vector_norm(turn, dim=-1, keepdim=True) / (2 * math.pi)
+    return torch.sinc(2 * half), 0.5 * torch.sinc(half) ** 2
+
+
 def turn_of(turn: Tensor) -> Tensor:
     """R - 1 for the rotation R by an axis times angle [rad], by Rodrigues' formula; small angles lose no digits.
 
@@ -72,11 +81,11 @@ def turn_of(turn: Tensor) -> Tensor:
     Returns:
         Shape (..., 3, 3).
     """
-    half = torch.linalg.vector_norm(turn, dim=-1)[..., None, None] / (2 * math.pi)
+    sine, cosine = rodrigues(turn)
     x, y, z = turn.unbind(-1)
     zero = torch.zeros_like(x)
     cross = torch.stack([zero, -z, y, z, zero, -x, -y, x, zero], dim=-1).unflatten(-1, (3, 3))
-    return torch.sinc(2 * half) * cross + 0.5 * torch.sinc(half) ** 2 * (cross @ cross)
+    return sine[..., None] * cross + cosine[..., None] * (cross @ cross)
 
 
 def rotation_of(turn: Tensor) -> Tensor:

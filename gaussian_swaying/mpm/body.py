@@ -26,6 +26,7 @@ class Held:
             one.
         share: Their share of the mass of each node, shape (..., G), if it is constant, else None.
         threshold: Share above which a node is held.
+        nodes: The nodes that are held in any scene, shape (K,), if their share is constant, else None.
     """
 
     mass: Tensor
@@ -33,6 +34,7 @@ class Held:
     release: Tensor | None = None
     share: Tensor | None = None
     threshold: float = 0.0
+    nodes: Tensor | None = None
 
     def mass_at(self, time: Tensor) -> Tensor:
         """Mass of the particles that are held at a time [kg], zero elsewhere, shape (..., P)."""

@@ -245,6 +245,25 @@ def test_what_does_not_move_is_drawn_once():
     assert torch.equal(gaussians.means[10:106], rest[:96])
 
 
+@pytest.mark.parametrize("formulation", ["total", "updated"])
+def test_a_rigid_part_is_a_body_of_each_copy(formulation):
+    label = torch.bucketize(_coloured().means[:, 0].contiguous(), torch.tensor([0.25, 0.75]))
+    parts = Parts(label, [Part("pole", "held"), Part("cloth"), Part("board", "rigid", density=60.0)])
+    more = {
+        "scene": {"parts": parts},
+        "solver": {"boundaries": [], "formulation": formulation, "substep": 0.002},
+        "dtype": "float64",
+    }
+    one = _end(_simulation([], **more)).state.position
+    copies = _end(_simulation([Copy(), Copy([0.0, 2.0, 0.0], 60.0)], **more)).state.position
+    torch.testing.assert_close(copies[0], one, rtol=0, atol=1e-9)
+    rest = _simulation([], **more).start().position
+    board = rest[:, 0] > torch.quantile(rest[:, 0], 0.7)
+    for own in copies:
+        torch.testing.assert_close(torch.pdist(own[board]), torch.pdist(rest[board]), rtol=0, atol=1e-9)
+    assert float((copies[0] - copies[1]).abs().max()) > 0.01
+
+
 def test_a_held_part_belongs_to_the_copy_and_a_still_one_does_not():
     """A pot with its plant: drawn in each copy where it is held, which is what a copy turns about."""
     labels = torch.bucketize(_coloured().means[:, 0].contiguous(), torch.tensor([0.25]))

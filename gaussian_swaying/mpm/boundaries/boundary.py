@@ -46,6 +46,7 @@ class Nodes:
         held_mass: Mass of those particles [kg], shape (...).
         mass: Mass of the nodes [kg], shape (..., G).
         fixed: Nodes that pins hold now, bool, shape (..., G); None if none does.
+        index: Nodes among which those that are held are, shape (K,); None for all.
     """
 
     time: Tensor
@@ -57,6 +58,7 @@ class Nodes:
     held_mass: Tensor | None = None
     mass: Tensor | None = None
     fixed: Tensor | None = None
+    index: Tensor | None = None
 
     @property
     def held(self) -> Tensor:

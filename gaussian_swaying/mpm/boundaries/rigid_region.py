@@ -41,10 +41,17 @@ class RigidRegion(ParticleBoundary):
         """Give the nodes of the body the velocities of a rigid motion."""
         assert nodes.mass is not None
         assert nodes.lattice is not None
-        mass = torch.where(nodes.held, in_double(nodes.mass), 0.0)
+        index = nodes.index
+
+        def part(field: Tensor, dim: int) -> Tensor:
+            return field if index is None else field.index_select(dim, index)
+
+        held, own = part(nodes.held, -1), part(velocity, -2)
+        mass = torch.where(held, in_double(part(nodes.mass, -1)), 0.0)
         if nodes.fixed is not None:
-            fixed = nodes.fixed & nodes.held
+            fixed = part(nodes.fixed, -1) & held
             mass = mass * torch.where(fixed | ~fixed.any(-1, keepdim=True), 1.0, FREE)
         dt = nodes.dt if isinstance(nodes.dt, float) else nodes.dt.to(mass)
-        moved = rigid_velocity(in_double(nodes.lattice), in_double(velocity), mass, dt)
-        return torch.where(nodes.held[..., None], moved.to(velocity), velocity)
+        moved = rigid_velocity(in_double(part(nodes.lattice, -2)), in_double(own), mass, dt)
+        moved = torch.where(held[..., None], moved.to(velocity), own)
+        return moved if index is None else velocity.index_copy(-2, index, moved)

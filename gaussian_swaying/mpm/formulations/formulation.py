@@ -226,7 +226,8 @@ class Formulation(ABC):
                 nodes = Nodes(time, dt, position, lattice)
             else:
                 share = share_of(held) if held.share is None else held.share
-                nodes = Nodes(time, dt, position, lattice, share, held.threshold, held.total, mass, fixed)
+                known = held.threshold, held.total, mass, fixed, held.nodes
+                nodes = Nodes(time, dt, position, lattice, share, *known)
             velocity = boundary(velocity, nodes)
             if self.body.rigid and isinstance(boundary, PinnedRegion):
                 pinned = nodes.held & boundary.active(time)

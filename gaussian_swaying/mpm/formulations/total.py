@@ -244,7 +244,11 @@ class Total(Formulation):
                 f"{threshold:g} of the mass of any node; enlarge `region` of the {type(boundary).__name__} or lower "
                 "its `held_share`."
             )
-        return replace(held, share=share if held.release is None else None, threshold=threshold or 0.0)
+        if held.release is not None:
+            return replace(held, threshold=threshold or 0.0)
+        holds = share > (threshold or 0.0)
+        nodes = holds.reshape(-1, holds.shape[-1]).any(0).nonzero()[:, 0]
+        return replace(held, share=share, threshold=threshold or 0.0, nodes=nodes)
 
     def first_grid(self, margin: int) -> GridSpec:
         """The grid of the stencils."""
