@@ -8,6 +8,7 @@ import torch
 from scipy.optimize import curve_fit
 
 from gaussian_swaying.geometry.regions import Box, Everything, Union
+from gaussian_swaying.mpm.boundaries.half_space import HalfSpaceObstacle
 from gaussian_swaying.mpm.boundaries.handle import Handle
 from gaussian_swaying.mpm.boundaries.pinned_points import PinnedPoints
 from gaussian_swaying.mpm.boundaries.pinned_region import PinnedRegion
@@ -254,6 +255,17 @@ def test_what_cannot_be_is_refused():
         bar(RigidRegion(Box([9.0] * 3, [10.0] * 3)))[1].init_state(points)
     with pytest.raises(ValueError, match="`held_share` to lie in"):
         RigidRegion(RIGHT, held_share=1.0)
+
+
+def test_in_total_a_part_falls_on_the_ground_and_rests_there():
+    ground = HalfSpaceObstacle([0.0, 0.0, -0.03], [0.0, 0.0, 1.0], 0.5)
+    points, solver = bar(ground, RigidRegion(Everything()))
+    state = advance(solver, solver.init_state(points), 0.4)
+    before = state.position
+    state = advance(solver, state, 0.3)
+    assert float((state.position - before).abs().max()) < 2e-4
+    assert -0.045 < float(state.position[:, 2].min()) < -0.02
+    assert strain(state.F_total) < 1e-12
 
 
 def test_a_part_that_becomes_rigid_on_the_way_takes_its_shape_again():
