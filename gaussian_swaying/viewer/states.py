@@ -18,7 +18,7 @@ from gaussian_swaying.rendering.shading import DiffuseShader
 from gaussian_swaying.rendering.tints import by_role
 from gaussian_swaying.simulation.simulated_scene import SimulatedScene
 from gaussian_swaying.simulation.simulation import Simulation
-from gaussian_swaying.viewer.film.page import pack_still
+from gaussian_swaying.viewer.film.page import pack_splats
 from gaussian_swaying.viewer.film.recorded import film_of, look_of
 from gaussian_swaying.viewer.session import Snapshot
 
@@ -45,9 +45,11 @@ def scene_message(snapshot: Snapshot, turn: Tensor) -> bytes:
         assert nodes is not None
         film = film_of(simulation, getattr(state, "grid"), nodes, torch.zeros(0, len(nodes), 3), "scene")  # noqa: B009
         world = film_from(simulation.scene, turn)
-    blocks = pack_still(film)
-    head = {"kind": "scene", "head": film.head, "splats": len(blocks["splats"]), "world": world.T.flatten().tolist()}
-    return message(head, blocks["splats"], blocks["nodes"])
+    moving, still = pack_splats(film, moving=True), pack_splats(film, moving=False)
+    sizes = {"moving": len(moving), "still": len(still)}
+    head = {"kind": "scene", "head": film.head, **sizes, "world": world.T.flatten().tolist()}
+    rest = film.order.astype("<u4").tobytes(), film.nodes.astype("<u4").tobytes()
+    return message(head, moving, still, *rest)
 
 
 def film_from(scene: SimulatedScene, turn: Tensor) -> Tensor:

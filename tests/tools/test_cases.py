@@ -277,6 +277,20 @@ def test_size_error_and_speed_of_a_film(tmp_path):
     assert cells("web.films", HEAD | {"films": {row["title"]: row}})[0][:2] == ["Flag in the wind", "96"]
 
 
+@pytest.mark.usefixtures("chromium")
+def test_the_first_picture_of_a_place(monkeypatch):
+    monkeypatch.setattr(web, "FRAMES", 3)
+    monkeypatch.setattr(web, "REPEATS", 1)
+    monkeypatch.setattr(web, "WINDOW", (160, 90))
+    one, many = web.first_of(20_000, True), web.first_of(20_000, False)
+    for row in (one, many):
+        assert 0 < row["first_s"] < row["complete_s"]
+    assert one["moving"] == many["moving"] > 500
+    assert abs(one["bytes"] / many["bytes"] - 1) < 0.05
+    record = HEAD | {"films": {}, "first": {"one": one, "many": many}}
+    assert [row[0] for row in cells("web.first", record)] == ["one", "many"]
+
+
 def test_a_place_is_previewed_in_a_process_of_its_own():
     """Its memory is that of the preview, without what made the place."""
     row = places.previewed(20_000, "cpu", drafts=False)

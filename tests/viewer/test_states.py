@@ -11,7 +11,7 @@ from gaussian_swaying.gaussians.ply import write_ply
 from gaussian_swaying.recording.nodes import join_far
 from gaussian_swaying.rendering.tints import by_role
 from gaussian_swaying.scenes.procedural import FlagScene
-from gaussian_swaying.viewer.film.page import pack_still
+from gaussian_swaying.viewer.film.page import pack_splats
 from gaussian_swaying.viewer.film.recorded import film_of
 from gaussian_swaying.viewer.session import Session
 from gaussian_swaying.viewer.states import (
@@ -65,10 +65,10 @@ def test_a_scene_is_a_film_without_frames(session):
     nodes = simulation.scene.follow.nodes(state)
     film = film_of(simulation, state.grid, nodes, torch.zeros(0, len(nodes), 3), "scene")
     head, rest = read(scene_message(snapshot, torch.eye(3).double()))
-    blocks = pack_still(film)
+    moving, still = pack_splats(film, moving=True), pack_splats(film, moving=False)
     assert head["head"] == film.head
-    assert rest[: head["splats"]] == blocks["splats"]
-    assert rest[head["splats"] :] == blocks["nodes"]
+    assert (head["moving"], head["still"]) == (len(moving), len(still))
+    assert rest == moving + still + film.order.astype("<u4").tobytes() + film.nodes.astype("<u4").tobytes()
 
 
 def test_the_camera_finds_the_gaussians_in_any_scene(parser, settings, tmp_path):
@@ -86,7 +86,7 @@ def test_the_camera_finds_the_gaussians_in_any_scene(parser, settings, tmp_path)
     film = film_of(simulation, snapshot.state.grid, nodes, torch.zeros(0, len(nodes), 3), "scene")
     turn = torch.tensor([[0.0, 0, -1], [0, -1, 0], [-1, 0, 0]], dtype=torch.float64)
     world = film_from(simulation.scene, turn)
-    seen = simulation.scene.model.means.double() @ turn.T
+    seen = simulation.scene.model.means.double()[film.order] @ turn.T
     assert torch.allclose(seen @ world[:3, :3].T + world[:3, 3], torch.from_numpy(film.position).double(), atol=1e-5)
     head, _ = read(scene_message(snapshot, turn))
     assert np.allclose(np.array(head["world"]).reshape(4, 4).T, world.numpy(), atol=1e-12)  # three.js has columns
@@ -129,7 +129,8 @@ def test_other_colours_are_those_of_the_film_with_the_tints_of_roles(session):
     snapshot = session.snapshot
     simulation, state = snapshot.simulation, snapshot.state
     nodes = simulation.scene.follow.nodes(state)
-    own = film_of(simulation, state.grid, nodes, torch.zeros(0, len(nodes), 3), "scene").color[:, :3]
+    film = film_of(simulation, state.grid, nodes, torch.zeros(0, len(nodes), 3), "scene")
+    own = film.color[np.argsort(film.order), :3]
     index, roles = torch.tensor([7, 900, 3]), torch.tensor([ROLES.index(role) for role in ("soft", "held", "still")])
     head, rest = read(colour_message(simulation, index, roles))
     assert head == {"kind": "colours", "count": 3}

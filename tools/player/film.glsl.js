@@ -12,6 +12,18 @@ export const FUNCTIONS = `
     slope = vec3(f - 1.5, -2.0 * middle, f - 0.5);
   }
 
+  // The covariance of a quaternion wxyz and standard deviations.
+  mat3 filmCovariance(vec4 q, vec3 s) {
+    q /= length(q);
+    mat3 R = mat3(
+      1.0 - 2.0 * (q.z * q.z + q.w * q.w), 2.0 * (q.y * q.z + q.x * q.w), 2.0 * (q.y * q.w - q.x * q.z),
+      2.0 * (q.y * q.z - q.x * q.w), 1.0 - 2.0 * (q.y * q.y + q.w * q.w), 2.0 * (q.z * q.w + q.x * q.y),
+      2.0 * (q.y * q.w + q.x * q.z), 2.0 * (q.z * q.w - q.x * q.y), 1.0 - 2.0 * (q.y * q.y + q.z * q.z)
+    );
+    mat3 axes = mat3(R[0] * s.x, R[1] * s.y, R[2] * s.z);
+    return axes * transpose(axes);
+  }
+
   // A factor of the captured colour, as in rendering/shading.py: light, then (two-sided, ambient, relative, on).
   float filmLambert(vec3 normal, vec3 light, vec4 kind) {
     float cosine = dot(normal, light);
@@ -20,77 +32,92 @@ export const FUNCTIONS = `
   }
 `;
 
-export const STATEMENTS = ({ inputs: i, outputs: o }) => `
-  ivec2 texel = filmTexel(${i.index});
-  vec4 rest = texelFetch(${i.rest}, texel, 0);
-  vec3 place = texelFetch(${i.place}, texel, 0).xyz;
-  vec4 shapeA = texelFetch(${i.shapeA}, texel, 0);
-  vec4 shapeB = texelFetch(${i.shapeB}, texel, 0);
-  vec4 facing = texelFetch(${i.facing}, texel, 0);
-  vec3 color = texelFetch(${i.color}, texel, 0).rgb;
-  vec3 center = rest.xyz;
-  mat3 A = mat3(shapeA.x, shapeA.y, shapeA.z, shapeA.y, shapeA.w, shapeB.x, shapeA.z, shapeB.x, shapeB.y);
-
-  if (place.x >= 0.0) {
-    ivec3 base = ivec3(floor(place - 0.5));
-    vec3 f = place - vec3(base);
-    vec3 wx, wy, wz, sx, sy, sz;
-    filmWeights(f.x, wx, sx);
-    filmWeights(f.y, wy, sy);
-    filmWeights(f.z, wz, sz);
-    vec3 u = vec3(0.0);
-    mat3 G = mat3(0.0);
-    for (int a = 0; a < 3; ++a) {
-      for (int b = 0; b < 3; ++b) {
-        // nodes along z are neighbours in the recorded list
-        int row = int(texelFetch(${i.rows}, base.zyx + ivec3(0, b, a), 0).r);
-        vec3 q0 = texelFetch(${i.moved}, filmTexel(row), 0).xyz;
-        vec3 q1 = texelFetch(${i.moved}, filmTexel(row + 1), 0).xyz;
-        vec3 q2 = texelFetch(${i.moved}, filmTexel(row + 2), 0).xyz;
-        vec3 value = (wz.x * q0 + wz.y * q1 + wz.z * q2) * ${i.metre};
-        vec3 along = (sz.x * q0 + sz.y * q1 + sz.z * q2) * ${i.metre};
-        u += wx[a] * wy[b] * value;
-        G[0] += sx[a] * wy[b] * value;
-        G[1] += wx[a] * sy[b] * value;
-        G[2] += wx[a] * wy[b] * along;
-      }
-    }
-    mat3 F = mat3(1.0) + G / ${i.cell};
-    vec3 arm = center - (place * ${i.cell} + ${i.corner});
-    center += u + (F - mat3(1.0)) * arm;
-
-    mat3 own = A;
-    A = F * A * transpose(F);
-    float before = own[0][0] + own[1][1] + own[2][2];
-    float after = A[0][0] + A[1][1] + A[2][2];
-    float excess = ${i.limit} * before;
-    if (after - before > excess) {
-      // limit_stretch: back towards the own shape, turned with the material, or towards a ball
-      mat3 shape = mat3(before / 3.0);
-      if (facing.w > 0.5 && determinant(F) > 0.0) {
-        mat3 R = F;
-        for (int k = 0; k < 8; ++k) R = 0.5 * (R + transpose(inverse(R)));
-        shape = R * own * transpose(R);
-      }
-      float weight = excess / (after - before);
-      A = weight * A + (1.0 - weight) * shape;
-    }
-
-    if (${i.kind}.w > 0.5) {
-      vec3 n = cross(F[1], F[2]) * facing.x + cross(F[2], F[0]) * facing.y + cross(F[0], F[1]) * facing.z;
-      float size = length(n);
-      n = size > 0.0 ? n / size * (determinant(F) < 0.0 ? -1.0 : 1.0) : facing.xyz;
-      float factor = filmLambert(n, ${i.light}, ${i.kind});
-      if (${i.kind}.z > 0.5) {
-        factor = max(factor, 0.1) / max(filmLambert(facing.xyz, ${i.light}, ${i.kind}), 0.1);
-      }
-      color *= factor;
+// The motion of a Gaussian.
+const MOTION = (i) => `
+  vec3 place = uintBitsToFloat(texelFetch(${i.place}, texel, 0).xyz);
+  ivec3 base = ivec3(floor(place - 0.5));
+  vec3 f = place - vec3(base);
+  vec3 wx, wy, wz, sx, sy, sz;
+  filmWeights(f.x, wx, sx);
+  filmWeights(f.y, wy, sy);
+  filmWeights(f.z, wz, sz);
+  vec3 u = vec3(0.0);
+  mat3 G = mat3(0.0);
+  for (int a = 0; a < 3; ++a) {
+    for (int b = 0; b < 3; ++b) {
+      // nodes along z are neighbours in the recorded list
+      int row = int(texelFetch(${i.rows}, base.zyx + ivec3(0, b, a), 0).r);
+      vec3 q0 = texelFetch(${i.moved}, filmTexel(row), 0).xyz;
+      vec3 q1 = texelFetch(${i.moved}, filmTexel(row + 1), 0).xyz;
+      vec3 q2 = texelFetch(${i.moved}, filmTexel(row + 2), 0).xyz;
+      vec3 value = (wz.x * q0 + wz.y * q1 + wz.z * q2) * ${i.metre};
+      vec3 along = (sz.x * q0 + sz.y * q1 + sz.z * q2) * ${i.metre};
+      u += wx[a] * wy[b] * value;
+      G[0] += sx[a] * wy[b] * value;
+      G[1] += wx[a] * sy[b] * value;
+      G[2] += wx[a] * wy[b] * along;
     }
   }
+  mat3 F = mat3(1.0) + G / ${i.cell};
+  vec3 arm = center - (place * ${i.cell} + ${i.corner});
+  center += u + (F - mat3(1.0)) * arm;
 
+  mat3 own = A;
+  A = F * A * transpose(F);
+  float before = own[0][0] + own[1][1] + own[2][2];
+  float after = A[0][0] + A[1][1] + A[2][2];
+  float excess = ${i.limit} * before;
+  if (after - before > excess) {
+    // limit_stretch: back towards the own shape, turned with the material, or towards a ball
+    mat3 shape = mat3(before / 3.0);
+    if (facing.w > 0.5 && determinant(F) > 0.0) {
+      mat3 R = F;
+      for (int k = 0; k < 8; ++k) R = 0.5 * (R + transpose(inverse(R)));
+      shape = R * own * transpose(R);
+    }
+    float weight = excess / (after - before);
+    A = weight * A + (1.0 - weight) * shape;
+  }
+
+  vec3 n = cross(F[1], F[2]) * facing.x + cross(F[2], F[0]) * facing.y + cross(F[0], F[1]) * facing.z;
+  float size = length(n);
+  if (size > 0.0) normal = n / size * (determinant(F) < 0.0 ? -1.0 : 1.0);
+`;
+
+// The light on it.
+const LIGHT = (i) => `
+  if (${i.kind}.w > 0.5) {
+    float factor = filmLambert(normal, ${i.light}, ${i.kind});
+    if (${i.kind}.z > 0.5) {
+      factor = max(factor, 0.1) / max(filmLambert(facing.xyz, ${i.light}, ${i.kind}), 0.1);
+    }
+    color *= factor;
+  }
+`;
+
+// What is read of a Gaussian that may move.
+const FACING = (i) => `
+  uvec4 turned = texelFetch(${i.facing}, texel, 0);
+  vec4 facing = vec4(unpackSnorm2x16(turned.x), unpackSnorm2x16(turned.y));
+  vec3 normal = facing.xyz;
+`;
+
+// `grown` is how much larger all Gaussians would have to be to cover as much as when all have come. One that never moves has no light; one that is at rest has.
+export const statements = (kind) => ({ inputs: i, outputs: o }) => `
+  ivec2 texel = filmTexel(${i.index});
+  uvec4 rest = texelFetch(${i.rest}, texel, 0);
+  uvec4 sizes = texelFetch(${i.shape}, texel, 0);
+  vec3 center = uintBitsToFloat(rest.xyz);
+  vec4 rgba = vec4(uvec4(rest.w, rest.w >> 8, rest.w >> 16, rest.w >> 24) & 255u) / 255.0;
+  vec3 color = rgba.rgb;
+  mat3 A = filmCovariance(
+    vec4(unpackSnorm2x16(sizes.x), unpackSnorm2x16(sizes.y)),
+    max(1.0, ${i.grown} * float((sizes.w >> 16) & 255u) / 255.0) * exp(vec3(unpackHalf2x16(sizes.z), unpackHalf2x16(sizes.w).x))
+  );
+${kind === "still" ? "" : FACING(i)}${kind === "moving" ? MOTION(i) : ""}${kind === "still" ? "" : LIGHT(i)}
   ${o.covsplat}.center = center;
   ${o.covsplat}.flags = GSPLAT_FLAG_ACTIVE;
-  ${o.covsplat}.rgba = vec4(color, rest.w);
+  ${o.covsplat}.rgba = vec4(color, rgba.a);
   ${o.covsplat}.index = ${i.index};
   ${o.covsplat}.xxyyzz = vec3(A[0][0], A[1][1], A[2][2]);
   ${o.covsplat}.xyxzyz = vec3(A[0][1], A[0][2], A[1][2]);

@@ -1,15 +1,9 @@
 // A film of Gaussians: splats once, the displacement of grid nodes per frame. See docs/web.md.
 import * as THREE from "three";
 import { OrbitControls } from "three/addons/controls/OrbitControls.js";
-import { Drawing, halves, reader, readSplats } from "./gaussians.js";
+import { Drawing, halves, reader } from "./gaussians.js";
 
 // ---- the parts of the file, see gaussian_swaying/viewer/film/page.py
-
-function readFrames(bytes, frames, row) {
-  const all = reader(bytes)(Uint16Array, frames * row);
-  for (let i = row; i < all.length; i++) all[i] += all[i - row]; // differences to the frame before
-  return all;
-}
 
 // The few nodes of each frame that swing far: index and displacement.
 function readFar(bytes, frames) {
@@ -24,36 +18,69 @@ function readFar(bytes, frames) {
   });
 }
 
+// The displacements of a film, which come in parts of some frames.
+class Frames {
+  constructor({ frames, nodes }) {
+    this.row = 3 * nodes;
+    this.near = new Uint16Array(frames * this.row);
+    this.far = [];
+  }
+
+  get loaded() {
+    return this.far.length;
+  }
+
+  add(bytes, count) {
+    const begin = this.loaded * this.row;
+    const end = begin + count * this.row;
+    const size = 2 * (end - begin);
+    this.near.set(reader(bytes.subarray(0, size))(Uint16Array, end - begin), begin);
+    for (let i = Math.max(begin, this.row); i < end; i++) this.near[i] += this.near[i - this.row]; // differences to the frame before
+    this.far.push(...readFar(bytes.subarray(size), count));
+  }
+}
+
 // How far the moving Gaussians reach to the left and right of the first view, as a tangent.
-function reach(head, splats) {
+function reach(head, layer) {
   const eye = new THREE.Vector3(...head.camera.eye);
   const axis = new THREE.Vector3(...head.camera.target).sub(eye).normalize();
   const right = new THREE.Vector3().crossVectors(axis, new THREE.Vector3(0, 0, 1)).normalize();
   const ray = new THREE.Vector3();
   let most = 0;
-  for (let i = 0; i < 3 * head.count; i += 3) {
-    ray.fromArray(splats.position, i).sub(eye);
+  const places = new Float32Array(layer.textures.rest.image.data.buffer);
+  for (let i = 0; i < 4 * layer.loaded; i += 4) {
+    ray.fromArray(places, i).sub(eye);
     const depth = ray.dot(axis);
-    if (splats.place[i] >= 0 && depth > 0) most = Math.max(most, Math.abs(ray.dot(right)) / depth);
+    if (depth > 0) most = Math.max(most, Math.abs(ray.dot(right)) / depth);
   }
   return most;
 }
 
 // ---- the page
 
-export async function play(read) {
+const COARSE = 1 / 4; // of the window's pixels along each side, until all Gaussians have come
+
+// `read(name)` gives a part of the file once it is there; `tell(sentence)` is called if the file ends too early.
+export async function play(read, tell) {
   const head = JSON.parse(new TextDecoder().decode(await read("head")));
-  const splats = readSplats(await read("splats"), head.count);
   const nodes = reader(await read("nodes"))(Uint32Array, head.nodes);
-  const frames = readFrames(await read("frames"), head.frames, 3 * head.nodes);
-  const far = readFar(await read("far"), head.frames);
+  const frames = new Frames(head);
   const element = (name) => document.getElementById(name);
 
-  const state = { frame: -1, time: 0, playing: true, last: null, left: 3, drawn: 0 };
+  const state = { frame: -1, time: 0, playing: true, last: null, left: 3, drawn: 0, first: null, fence: null, whole: head.parts.length === head.start };
   const canvas = element("canvas");
   const drawing = new Drawing(canvas, (pictures) => wake(pictures));
   const { renderer } = drawing;
-  drawing.show(head, splats, nodes);
+  drawing.show(head, nodes);
+
+  async function take(index) {
+    const [kind, first, last] = head.parts[index];
+    const bytes = await read(`part-${index}`);
+    if (kind === "frames") frames.add(bytes, last - first);
+    else drawing.add(kind, bytes);
+  }
+
+  for (let index = 0; index < head.start; index++) await take(index);
 
   const camera = new THREE.PerspectiveCamera(head.camera.fov, 1, 0.01, 200);
   camera.up.set(0, 0, 1);
@@ -71,7 +98,7 @@ export async function play(read) {
   const loop = element("loop");
   slider.max = String(head.frames - 1);
 
-  const wanted = reach(head, splats) + 0.3 / camera.position.distanceTo(controls.target); // and room to swing
+  const wanted = reach(head, drawing.layers.moving) + 0.3 / camera.position.distanceTo(controls.target); // and room to swing
 
   function wake(pictures) {
     state.left = Math.max(state.left, pictures);
@@ -79,9 +106,9 @@ export async function play(read) {
 
   function show(frame) {
     if (frame === state.frame) return;
-    const row = 3 * head.nodes;
-    const from = frames.subarray(frame * row, (frame + 1) * row);
-    const { rows, values } = far[frame];
+    const { row } = frames;
+    const from = frames.near.subarray(frame * row, (frame + 1) * row);
+    const { rows, values } = frames.far[frame];
     drawing.move((data) => {
       for (let i = 0, at = 0; i < row; i += 3, at += 4) {
         data[at] = halves[from[i]];
@@ -96,7 +123,9 @@ export async function play(read) {
     element("clock").textContent = `${seconds(frame)} / ${seconds(head.frames - 1)} s`;
   }
 
-  function seek(frame) {
+  // Show a frame, or the last one that has come so far.
+  function seek(wanted) {
+    const frame = Math.min(wanted, frames.loaded - 1);
     state.time = frame * head.frame_dt;
     show(frame);
   }
@@ -111,7 +140,8 @@ export async function play(read) {
 
   function resize() {
     const [width, height] = [window.innerWidth, window.innerHeight];
-    renderer.setPixelRatio(Math.min(window.devicePixelRatio, 2));
+    drawing.rough(!state.whole);
+    renderer.setPixelRatio(Math.min(window.devicePixelRatio, 2) * (state.whole ? 1 : COARSE));
     renderer.setSize(width, height);
     const upright = Math.tan((head.camera.fov * Math.PI) / 360);
     const across = Math.min(upright * head.camera.aspect, wanted); // what a narrow window still shows
@@ -139,16 +169,17 @@ export async function play(read) {
   window.addEventListener("resize", resize);
 
   function tick(now) {
-    if (state.playing && drawing.ready) {
+    if (state.playing && state.first !== null) {
       const end = head.frames * head.frame_dt;
       state.time += state.last === null ? 0 : Math.min(now - state.last, 250) / 1000;
       state.last = now;
+      if (frames.loaded < head.frames) state.time = Math.min(state.time, (frames.loaded - 1) * head.frame_dt);
       if (state.time >= end && loop.getAttribute("aria-pressed") !== "true") {
         seek(head.frames - 1);
         setPlaying(false);
       } else {
         state.time %= end;
-        show(Math.min(Math.floor(state.time / head.frame_dt), head.frames - 1));
+        show(Math.min(Math.floor(state.time / head.frame_dt + 1e-6), frames.loaded - 1));
       }
     }
     controls.update();
@@ -158,12 +189,43 @@ export async function play(read) {
       drawing.render(camera);
       state.drawn++;
     }
+    timeFirst();
+  }
+
+  // When the graphics card had finished the first picture with Gaussians [s after the page was asked for].
+  function timeFirst() {
+    const gl = renderer.getContext();
+    if (state.first !== null || !drawing.ready) return;
+    if (state.fence === null) {
+      state.fence = gl.fenceSync(gl.SYNC_GPU_COMMANDS_COMPLETE, 0);
+      gl.flush();
+    } else if (gl.getSyncParameter(state.fence, gl.SYNC_STATUS) === gl.SIGNALED) state.first = performance.now() / 1000;
+  }
+
+  // The rest of the file after the first picture, with time for others in between.
+  async function takeRest() {
+    while (state.first === null && !document.hidden) await new Promise((resolve) => setTimeout(resolve, 4));
+    drawing.follow();
+    for (let index = head.start; index < head.parts.length; index++) {
+      await take(index);
+      await new Promise((resolve) => setTimeout(resolve));
+    }
+    state.whole = true;
+    resize();
   }
 
   resize();
   show(0);
+  drawing.begin(camera);
   setPlaying(true);
   renderer.setAnimationLoop(tick);
+  const complete = takeRest();
+  complete.catch((error) => {
+    console.info(error.message);
+    tell(error.message);
+    state.whole = true;
+    resize();
+  });
 
   // See Drawing.positions.
   async function positions() {
@@ -179,8 +241,9 @@ export async function play(read) {
     return ordering.subarray(0, activeSplats);
   }
 
-  // Resolves once the Gaussians are sorted and nothing is left to draw.
+  // Resolves once all Gaussians have come and are sorted, and nothing is left to draw.
   async function settled() {
+    await complete;
     const rest = () => state.left === 0 && drawing.sorted;
     for (let calm = 0; calm < 3; calm = rest() ? calm + 1 : 0)
       await new Promise((resolve) => requestAnimationFrame(resolve));
@@ -190,10 +253,13 @@ export async function play(read) {
     head,
     frame: () => state.frame,
     drawn: () => state.drawn,
+    first: () => state.first,
+    complete,
     pause: () => setPlaying(false),
     play: () => setPlaying(true),
     seek: async (frame) => {
       setPlaying(false);
+      await complete;
       seek(frame);
       await settled();
     },

@@ -1,7 +1,7 @@
 // Gaussians on a canvas that follow the nodes of a grid, as films and the live page draw them. See docs/web.md.
 import { dyno, SparkRenderer, SplatGenerator } from "@sparkjsdev/spark";
 import * as THREE from "three";
-import { FUNCTIONS, STATEMENTS } from "./film.glsl.js";
+import { FUNCTIONS, statements } from "./film.glsl.js";
 import { makeSorter } from "./sorter.js";
 
 const WIDTH = 2048; // of the textures with a texel for each Gaussian or node
@@ -22,25 +22,25 @@ export function reader(bytes) {
 // The numbers of float16, by their bits.
 export const halves = Float32Array.from({ length: 65536 }, (_, bits) => THREE.DataUtils.fromHalfFloat(bits));
 
-export function readSplats(bytes, count) {
-  const next = reader(bytes);
-  return {
-    position: next(Float32Array, 3 * count),
-    place: next(Float32Array, 3 * count),
-    scale: next(Uint16Array, 3 * count),
-    turn: next(Int16Array, 4 * count),
-    facing: next(Int16Array, 4 * count),
-    color: next(Uint8Array, 4 * count),
-  };
-}
+// Bytes of a Gaussian, in the texels of each of its textures, as RECORD in page.py lists them: position and colour; rotation,
+// size and growth; for those that move also their place in the grid, and their normal.
+const TEXELS = { still: { rest: 16, shape: 15 }, moving: { rest: 16, shape: 15, place: 12, facing: 8 } };
+const STEP = 16; // bytes of a texel
 
 // ---- textures
 
-function texture(Kind, count, type, fill) {
+// Whole numbers, four of 32 bits for each Gaussian.
+function texels(count) {
   const height = Math.max(1, Math.ceil(count / WIDTH));
-  const data = new Kind(WIDTH * height * 4);
-  for (let i = 0; i < count; i++) fill(data, 4 * i, i);
-  const made = new THREE.DataTexture(data, WIDTH, height, THREE.RGBAFormat, type);
+  const made = new THREE.DataTexture(new Uint32Array(4 * WIDTH * height), WIDTH, height, THREE.RGBAIntegerFormat, THREE.UnsignedIntType);
+  made.internalFormat = "RGBA32UI";
+  return made;
+}
+
+// Four numbers for each node.
+function floats(count) {
+  const height = Math.max(1, Math.ceil(count / WIDTH));
+  const made = new THREE.DataTexture(new Float32Array(4 * WIDTH * height), WIDTH, height, THREE.RGBAFormat, THREE.FloatType);
   made.needsUpdate = true;
   return made;
 }
@@ -57,70 +57,75 @@ function rowsTexture(nodes, [nx, ny, nz]) {
   return made;
 }
 
-// The covariance of Gaussian i, row by row: xx xy xz yy yz zz.
-function covariance(splats, i) {
-  const [w, x, y, z] = [0, 1, 2, 3].map((k) => splats.turn[4 * i + k] / 32767);
-  const s = [0, 1, 2].map((k) => Math.exp(2 * THREE.DataUtils.fromHalfFloat(splats.scale[3 * i + k])));
-  const n = 1 / (w * w + x * x + y * y + z * z);
-  const R = [
-    [1 - 2 * n * (y * y + z * z), 2 * n * (x * y - w * z), 2 * n * (x * z + w * y)],
-    [2 * n * (x * y + w * z), 1 - 2 * n * (x * x + z * z), 2 * n * (y * z - w * x)],
-    [2 * n * (x * z - w * y), 2 * n * (y * z + w * x), 1 - 2 * n * (x * x + y * y)],
-  ];
-  const term = (a, b) => R[a][0] * R[b][0] * s[0] + R[a][1] * R[b][1] * s[1] + R[a][2] * R[b][2] * s[2];
-  return [term(0, 0), term(0, 1), term(0, 2), term(1, 1), term(1, 2), term(2, 2)];
-}
-
 // ---- the Gaussians in the shader graph of Spark
 
-function makeGaussians(head, splats, nodes) {
-  const { count } = head;
-  const shapes = Array.from({ length: count }, (_, i) => covariance(splats, i));
-  const float = THREE.FloatType;
-  const moved = texture(Float32Array, nodes.length + 2, float, () => {});
-  const own = {
-    rest: texture(Float32Array, count, float, (out, at, i) => {
-      out.set(splats.position.subarray(3 * i, 3 * i + 3), at);
-      out[at + 3] = splats.color[4 * i + 3] / 255;
-    }),
-    place: texture(Float32Array, count, float, (out, at, i) => out.set(splats.place.subarray(3 * i, 3 * i + 3), at)),
-    shapeA: texture(Float32Array, count, float, (out, at, i) => out.set(shapes[i].slice(0, 4), at)),
-    shapeB: texture(Float32Array, count, float, (out, at, i) => out.set(shapes[i].slice(4), at)),
-    facing: texture(Float32Array, count, float, (out, at, i) => {
-      for (let k = 0; k < 4; k++) out[at + k] = splats.facing[4 * i + k] / 32767;
-    }),
-    color: texture(Uint8Array, count, THREE.UnsignedByteType, (out, at, i) =>
-      out.set(splats.color.subarray(4 * i, 4 * i + 4), at),
-    ),
-    moved,
-  };
-  const rows = rowsTexture(nodes, head.resolution);
-  const inputs = {
-    rows: new dyno.DynoUsampler2DArray({ value: rows }),
-    cell: new dyno.DynoFloat({ value: head.cell }),
-    metre: new dyno.DynoFloat({ value: head.metre }),
-    corner: new dyno.DynoVec3({ value: new THREE.Vector3(...head.corner) }),
-    limit: new dyno.DynoFloat({ value: head.max_stretch === null ? 1e30 : head.max_stretch ** 2 - 1 }),
-    light: new dyno.DynoVec3({ value: new THREE.Vector3() }),
-    kind: new dyno.DynoVec4({ value: new THREE.Vector4() }),
-  };
-  for (const name in own) inputs[name] = new dyno.DynoSampler2D({ value: own[name] });
-  const inTypes = { index: "int", rows: "usampler2DArray", cell: "float", metre: "float", corner: "vec3", limit: "float" };
-  Object.assign(inTypes, { light: "vec3", kind: "vec4" });
-  for (const name in own) inTypes[name] = "sampler2D";
-  const covGenerator = dyno.dynoBlock({ index: "int" }, { covsplat: dyno.CovSplat }, ({ index }) => {
-    const step = new dyno.Dyno({
-      inTypes,
-      outTypes: { covsplat: dyno.CovSplat },
-      globals: () => [dyno.defineGsplat, dyno.defineCovSplat, FUNCTIONS],
-      inputs: { index, ...inputs },
-      statements: STATEMENTS,
+// The Gaussians of one kind: all those that move, or all others. They come in parts, the first ones spread over the whole
+// scene. Until all are there, each is larger, so that they cover as much as all of them.
+class Layer {
+  constructor(kind, count, shared) {
+    this.kind = kind;
+    this.count = count;
+    this.loaded = 0;
+    this.textures = {};
+    this.inputs = { ...shared, grown: new dyno.DynoFloat({ value: 1 }) };
+    for (const name in TEXELS[kind]) {
+      this.textures[name] = texels(count);
+      this.inputs[name] = new dyno.DynoUsampler2D({ value: this.textures[name] });
+    }
+    this.group = new THREE.Group();
+    this.draw("still");
+  }
+
+  // Draw them as "moving", as "resting", which has a shorter shader, or as "still".
+  draw(as) {
+    const { grown, rest, shape } = this.inputs;
+    const inputs = as === "still" ? { grown, rest, shape } : this.inputs;
+    const inTypes = { index: "int" };
+    for (const name in inputs) inTypes[name] = inputs[name].type;
+    const covGenerator = dyno.dynoBlock({ index: "int" }, { covsplat: dyno.CovSplat }, ({ index }) => {
+      const step = new dyno.Dyno({
+        inTypes,
+        outTypes: { covsplat: dyno.CovSplat },
+        globals: () => [dyno.defineGsplat, dyno.defineCovSplat, FUNCTIONS],
+        inputs: { index, ...inputs },
+        statements: statements(as),
+      });
+      return { covsplat: step.outputs.covsplat };
     });
-    return { covsplat: step.outputs.covsplat };
-  });
-  const textures = [rows, ...Object.values(own)];
-  const { color } = own;
-  return { gaussians: new SplatGenerator({ numSplats: count, covGenerator }), moved, color, inputs, textures };
+    this.generator = new SplatGenerator({ numSplats: this.loaded, covGenerator });
+    this.group.clear();
+    this.group.add(this.generator);
+  }
+
+  // Add the next Gaussians, see pack_splats in page.py.
+  add(bytes) {
+    const sizes = TEXELS[this.kind];
+    const count = bytes.length / Object.values(sizes).reduce((sum, size) => sum + size);
+    let at = 0;
+    for (const name in sizes) {
+      const { image } = this.textures[name];
+      const out = new Uint8Array(image.data.buffer, STEP * this.loaded, STEP * count);
+      for (let k = 0; k < sizes[name]; k++) for (let i = k; i < out.length; i += STEP) out[i] = bytes[at++];
+      for (let row = Math.floor(this.loaded / WIDTH); row * WIDTH < this.loaded + count; row++)
+        this.textures[name].addUpdateRange(4 * WIDTH * row, 4 * WIDTH);
+      this.textures[name].needsUpdate = true;
+    }
+    this.loaded += count;
+    this.generator.numSplats = this.loaded;
+    this.inputs.grown.value = Math.sqrt(this.count / this.loaded);
+    this.generator.updateVersion();
+  }
+
+  // Red, green and blue of Gaussian i, as bytes.
+  recolour(i, colour) {
+    const { rest } = this.textures;
+    new Uint8Array(rest.image.data.buffer).set(colour, STEP * i + 12);
+    rest.needsUpdate = true;
+  }
+
+  dispose() {
+    for (const name in this.textures) this.textures[name].dispose();
+  }
 }
 
 // ---- the canvas
@@ -130,12 +135,13 @@ export class Drawing {
   constructor(canvas, wake) {
     this.wake = wake;
     this.renderer = new THREE.WebGLRenderer({ canvas, antialias: false });
+    this.renderer.debug.checkShaderErrors = false; // asking for them waits
     this.scene = new THREE.Scene();
     this.spark = null;
   }
 
-  // Draw these Gaussians from now on. Throws an Error if they are too many for this browser.
-  show(head, splats, nodes) {
+  // Draw other Gaussians from now on, once they are added. Throws an Error if they are too many for this browser.
+  show(head, nodes) {
     const { maxTextureSize } = this.renderer.capabilities;
     const layers = this.renderer.getContext().getParameter(WebGL2RenderingContext.MAX_ARRAY_TEXTURE_LAYERS);
     const height = Math.ceil(Math.max(head.count, nodes.length + 2) / WIDTH);
@@ -156,9 +162,48 @@ export class Drawing {
     });
     this.spark.sortWorker = makeSorter();
     this.count = head.count;
-    Object.assign(this, makeGaussians(head, splats, nodes));
+    this.moved = floats(nodes.length + 2);
+    this.rows = rowsTexture(nodes, head.resolution);
+    this.inputs = {
+      rows: new dyno.DynoUsampler2DArray({ value: this.rows }),
+      moved: new dyno.DynoSampler2D({ value: this.moved }),
+      cell: new dyno.DynoFloat({ value: head.cell }),
+      metre: new dyno.DynoFloat({ value: head.metre }),
+      corner: new dyno.DynoVec3({ value: new THREE.Vector3(...head.corner) }),
+      limit: new dyno.DynoFloat({ value: head.max_stretch === null ? 1e30 : head.max_stretch ** 2 - 1 }),
+      light: new dyno.DynoVec3({ value: new THREE.Vector3() }),
+      kind: new dyno.DynoVec4({ value: new THREE.Vector4() }),
+    };
+    this.layers = {
+      moving: new Layer("moving", head.moving, this.inputs),
+      still: new Layer("still", head.count - head.moving, {}),
+    };
     this.light(head);
-    this.scene.add(this.spark, this.gaussians);
+    this.scene.add(this.spark, this.layers.moving.group, this.layers.still.group);
+  }
+
+  // Add the next Gaussians that are "moving", or "still".
+  add(kind, bytes) {
+    if (bytes.length > 0) this.layers[kind].add(bytes);
+    this.wake(3);
+  }
+
+  // From now on they follow the nodes; until then all are at rest, so that the first picture needs no long shader.
+  follow() {
+    this.layers.moving.draw("moving");
+    this.changed();
+  }
+
+  // Compute and sort what has come, while the shaders of the picture are compiled; the next picture shows it.
+  begin(camera) {
+    camera.updateMatrixWorld();
+    this.spark.update({ scene: this.scene, camera });
+    this.render(camera);
+  }
+
+  // Leave out the faint rims of Gaussians, which cost most, or not.
+  rough(on) {
+    this.spark.maxStdDev = on ? Math.sqrt(6) : 3;
   }
 
   // Give up the Gaussians that are drawn.
@@ -167,7 +212,7 @@ export class Drawing {
     this.scene.clear();
     this.spark.readbackDepth = () => new Promise(() => {}); // a sort that has begun, or waits for its turn, ends here
     this.spark.dispose();
-    for (const made of this.textures) made.dispose();
+    for (const made of [this.rows, this.moved, this.layers.moving, this.layers.still]) made.dispose();
     this.spark = null;
   }
 
@@ -187,16 +232,19 @@ export class Drawing {
     this.changed();
   }
 
-  // Give some Gaussians other colours: their indices, and three bytes each.
-  recolour(indices, colours) {
-    const { data } = this.color.image;
-    indices.forEach((i, k) => data.set(colours.subarray(3 * k, 3 * k + 3), 4 * i));
-    this.color.needsUpdate = true;
+  // Give some Gaussians other colours: their places, those that move first, and three bytes each.
+  recolour(places, colours) {
+    const { moving, still } = this.layers;
+    places.forEach((place, k) => {
+      const [layer, i] = place < moving.count ? [moving, place] : [still, place - moving.count];
+      layer.recolour(i, colours.subarray(3 * k, 3 * k + 3));
+    });
+    still.generator.updateVersion();
     this.changed();
   }
 
   changed() {
-    this.gaussians.updateVersion();
+    this.layers.moving.generator.updateVersion();
     this.wake(3); // Spark draws what it computed for the picture before
   }
 
@@ -213,28 +261,32 @@ export class Drawing {
     this.renderer.render(this.scene, camera);
   }
 
-  // Centres of the Gaussians as the GPU computed them for the picture, in units of the object's size.
+  // Centres of the Gaussians as the GPU computed them for the picture, those that move first, in units of the object's size.
   positions() {
     const { renderer, count } = this;
     const gl = renderer.getContext();
-    const { target } = this.spark.display;
+    const { target, mapping } = this.spark.display;
     const layer = target.width * target.height;
     const made = renderer.properties.get(target.textures[0]).__webglTexture;
-    const out = new Float32Array(3 * count);
+    const all = new Float32Array(3 * layer * target.depth);
     const buffer = gl.createFramebuffer();
     gl.bindFramebuffer(gl.READ_FRAMEBUFFER, buffer);
-    for (let base = 0; base < count; base += layer) {
-      gl.framebufferTextureLayer(gl.READ_FRAMEBUFFER, gl.COLOR_ATTACHMENT0, made, 0, base / layer);
-      const height = Math.ceil(Math.min(layer, count - base) / target.width);
-      const words = new Uint32Array(4 * target.width * height);
-      gl.readPixels(0, 0, target.width, height, gl.RGBA_INTEGER, gl.UNSIGNED_INT, words);
+    for (let k = 0; k < target.depth; k++) {
+      gl.framebufferTextureLayer(gl.READ_FRAMEBUFFER, gl.COLOR_ATTACHMENT0, made, 0, k);
+      const words = new Uint32Array(4 * layer);
+      gl.readPixels(0, 0, target.width, target.height, gl.RGBA_INTEGER, gl.UNSIGNED_INT, words);
       const values = new Float32Array(words.buffer);
-      for (let i = 0; i < Math.min(layer, count - base); i++)
-        out.set(values.subarray(4 * i, 4 * i + 3), 3 * (base + i));
+      for (let i = 0; i < layer; i++) all.set(values.subarray(4 * i, 4 * i + 3), 3 * (k * layer + i));
     }
     gl.bindFramebuffer(gl.READ_FRAMEBUFFER, null);
     gl.deleteFramebuffer(buffer);
     renderer.resetState();
+    const out = new Float32Array(3 * count);
+    let at = 0;
+    for (const { base, count: own } of mapping) {
+      out.set(all.subarray(3 * base, 3 * (base + own)), at);
+      at += 3 * own;
+    }
     return out;
   }
 }

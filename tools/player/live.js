@@ -1,7 +1,7 @@
 // The live page: draws the states of a running simulation on a canvas below that of viser. See docs/live.md.
 import * as THREE from "three";
 import { Brush } from "./brush.js";
-import { Drawing, halves, reader, readSplats } from "./gaussians.js";
+import { Drawing, halves } from "./gaussians.js";
 import { Playback } from "./playback.js";
 
 const SLOW = 3; // pictures a second; a browser that draws fewer gets pictures from the server
@@ -111,12 +111,20 @@ class Stage {
     if (head.kind === "look") return this.drawing.light(head);
     if (head.kind === "colours") {
       const changed = new Uint32Array(rest.buffer, 0, head.count);
-      return this.drawing.recolour(changed, rest.subarray(changed.byteLength));
+      return this.drawing.recolour(changed.map((i) => this.place[i]), rest.subarray(changed.byteLength));
     }
     if (head.kind === "scene") {
       this.drawing ??= new Drawing(this.canvas, (pictures) => (this.left = Math.max(this.left, pictures)));
-      const nodes = reader(rest.subarray(head.splats))(Uint32Array, head.head.nodes);
-      this.drawing.show(head.head, readSplats(rest.subarray(0, head.splats), head.head.count), nodes);
+      const last = head.moving + head.still;
+      const [order, nodes] = [new Uint32Array(head.head.count), new Uint32Array(head.head.nodes)];
+      new Uint8Array(order.buffer).set(rest.subarray(last, last + order.byteLength));
+      new Uint8Array(nodes.buffer).set(rest.subarray(last + order.byteLength));
+      this.place = new Uint32Array(order.length); // of each Gaussian of the splat among those that are drawn
+      order.forEach((i, k) => (this.place[i] = k));
+      this.drawing.show(head.head, nodes);
+      this.drawing.add("moving", rest.subarray(0, head.moving));
+      this.drawing.add("still", rest.subarray(head.moving, last));
+      this.drawing.follow();
       this.world = new THREE.Matrix4().fromArray(head.world);
       this.scene = head.head;
       this.playback.clear();

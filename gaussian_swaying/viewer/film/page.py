@@ -7,6 +7,7 @@ import html
 import json
 import re
 import zlib
+from itertools import pairwise, zip_longest
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +18,23 @@ from gaussian_swaying.recording.nodes import join_far, split_at
 from gaussian_swaying.viewer.film.recorded import Film, read_film
 
 PAGE = Path(__file__).parent / "page"
-SPLATS = ("position", "place", "scale", "turn", "facing", "color")
+RECORD = {
+    "position": "<f4",
+    "color": "u1",
+    "turn": "<i2",
+    "scale": "<f2",
+    "growth": "u1",
+    "place": "<f4",
+    "facing": "<i2",
+}
+"""What is stored of a Gaussian, in this order; the last two only of those that move."""
+FIRST = {"moving": 1 << 11, "still": 1 << 12}
+"""Gaussians that move, and that do not, in the first picture."""
+KINDS = ("moving", "still")
+PART = 1 << 16
+"""Gaussians of a later part: whole rows of the player's textures, as in the first one."""
+GROUP = 32
+"""Frames of a part."""
 
 
 def write_film(run: Path, target: Path) -> Film:
@@ -46,8 +63,9 @@ def page(film: Film) -> str:
     """The whole page of a film."""
     blocks = {"code": (PAGE / "film.min.js").read_bytes(), **pack(film)}
     parts = [
-        f'<script type="text/plain" id="film-{name}">{base64.b64encode(zlib.compress(block, 9)).decode()}</script>'
+        f'<script type="text/plain" id="film-{name}" data-size="{len(text)}">{text}</script>'
         for name, block in blocks.items()
+        for text in [base64.b64encode(zlib.compress(block, 9)).decode()]
     ]
     red, green, blue = (round(255 * value) for value in film.head["background"])
     words = {
@@ -60,8 +78,27 @@ def page(film: Film) -> str:
     return re.sub(r"{{(\w+)}}", lambda slot: words[slot[1]], text)  # once: what is put in may have braces of its own
 
 
+def parts_of(head: dict[str, Any]) -> list[list[Any]]:
+    """The parts of the file, each as its kind and the first and last (excluded) of its Gaussians or frames.
+
+    The first parts, ``head["start"]`` of them, are enough for a first picture: some of all Gaussians, and some frames.
+    Then frames, Gaussians that move and others follow in turn, so that the film plays while it is read.
+    """
+
+    def cut(kind: str, count: int, first: int, later: int) -> list[list[Any]]:
+        ends = [0, *range(first, count, later), count] if count else [0]
+        return [[kind, begin, end] for begin, end in pairwise(ends)]
+
+    lists = [
+        cut("moving", head["moving"], FIRST["moving"], PART),
+        cut("still", head["count"] - head["moving"], FIRST["still"], PART),
+        cut("frames", head["frames"], GROUP, GROUP),
+    ]
+    return [part for turn in zip_longest(*lists) for part in turn if part is not None]
+
+
 def pack(film: Film) -> dict[str, bytes]:
-    """The blocks of data that the page unpacks.
+    """The blocks of data that the page unpacks, in the order in which it needs them.
 
     Bytes of the same weight stand together, and frames are differences to the frame before as whole numbers; both
     lose nothing, and the blocks compress to less.
@@ -71,17 +108,36 @@ def pack(film: Film) -> dict[str, bytes]:
     frames = bits.copy()
     frames[1:] -= bits[:-1]  # modulo 65536
     counts = np.array([len(rows) for rows in far], np.uint32)
-    return {
-        "head": json.dumps(film.head).encode(),
-        **pack_still(film),
-        "frames": _planes(frames),
-        "far": _planes(counts) + _planes(np.concatenate(far)),
-    }
+    parts = parts_of(film.head)
+    start = len({kind for kind, _, _ in parts})
+    blocks = {"head": json.dumps(film.head | {"parts": parts, "start": start}).encode(), "nodes": _planes(film.nodes)}
+    for index, (kind, first, last) in enumerate(parts):
+        if kind == "frames":
+            rows = np.concatenate(far[first:last])
+            block = _planes(frames[first:last]) + _planes(counts[first:last]) + _planes(rows)
+        else:
+            block = pack_splats(film, kind == "moving", first, last)
+        blocks[f"part-{index}"] = block
+    return blocks
 
 
-def pack_still(film: Film) -> dict[str, bytes]:
-    """The blocks of :func:`pack` that are the same in all frames."""
-    return {"splats": b"".join(_planes(getattr(film, name)) for name in SPLATS), "nodes": _planes(film.nodes)}
+def pack_splats(film: Film, moving: bool, first: int = 0, last: int | None = None) -> bytes:
+    """Some of the Gaussians of a film that move, or of the others, as the page reads them.
+
+    Args:
+        film: The film.
+        moving: Which of the two.
+        first: The first of them.
+        last: The last (excluded); all if None.
+    """
+    count = film.head["moving"]
+    base, names = (0, list(RECORD)) if moving else (count, list(RECORD)[:5])
+    end = (count if moving else len(film.position)) if last is None else base + last
+    if base + first >= end:
+        return b""
+    columns = [getattr(film, name)[base + first : end].astype(RECORD[name]) for name in names]
+    rows = np.concatenate([column.view(np.uint8).reshape(len(column), -1) for column in columns], axis=1)
+    return rows.T.tobytes()
 
 
 def _split(displacement: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -92,25 +148,37 @@ def _split(displacement: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def unpack(blocks: dict[str, bytes]) -> Film:
-    """The inverse of :func:`pack`."""
+    """The inverse of :func:`pack`; ``order`` is lost."""
     head = json.loads(blocks["head"])
-    count, at = head["count"], 0
-    found: dict[str, Any] = {}
-    kinds = {"position": "<f4", "place": "<f4", "scale": "<f2", "turn": "<i2", "facing": "<i2", "color": "u1"}
-    for name in SPLATS:
-        kind = np.dtype(kinds[name])
-        width = 4 if name in ("turn", "facing", "color") else 3
-        size = count * width * kind.itemsize
-        found[name] = _unplaned(blocks["splats"][at : at + size], kind).reshape(count, width)
-        at += size
-    frames = _unplaned(blocks["frames"], np.dtype("<u2")).reshape(head["frames"], head["nodes"], 3)
-    bits = np.cumsum(frames, axis=0, dtype=np.uint16)
+    parts, _ = head.pop("parts"), head.pop("start")
+    found: dict[str, list[np.ndarray]] = {name: [] for name in RECORD}
+    last, moved = np.zeros((head["nodes"], 3), np.uint16), []
+    for index, (kind, begin, end) in enumerate(parts):
+        block, count = blocks[f"part-{index}"], end - begin
+        if kind == "frames":
+            size = 2 * count * 3 * head["nodes"]
+            frames = _unplaned(block[:size], np.dtype("<u2")).reshape(count, head["nodes"], 3)
+            bits = np.cumsum(np.concatenate([last[None], frames]), axis=0, dtype=np.uint16)[1:]
+            counts = _unplaned(block[size : size + 4 * count], np.dtype("<u4"))
+            rows = _unplaned(block[size + 4 * count :], np.dtype("<i4")).reshape(-1, 4)
+            far = np.split(rows, np.cumsum(counts)[:-1])
+            moved += [join_far(near, own) for near, own in zip(bits.view(np.float16), far, strict=True)]
+            last = bits[-1]
+            continue
+        rows, at = np.frombuffer(block, np.uint8).reshape(-1, count).T, 0
+        for name in list(RECORD)[: 7 if kind == "moving" else 5]:
+            own = np.dtype(RECORD[name])
+            width = own.itemsize * {"turn": 4, "facing": 4, "color": 4, "growth": 1}.get(name, 3)
+            found[name].append(np.ascontiguousarray(rows[:, at : at + width]).view(own))
+            at += width
+    kinds = [kind for kind, _, _ in parts if kind != "frames"]
+    fields: dict[str, Any] = {}
+    for name, pieces in found.items():
+        owners = kinds if len(pieces) == len(kinds) else ["moving"] * len(pieces)
+        ordered = [piece for kind in KINDS for piece, owner in zip(pieces, owners, strict=True) if owner == kind]
+        fields[name] = np.concatenate(ordered)
     nodes = _unplaned(blocks["nodes"], np.dtype("<u4"))
-    size = 4 * head["frames"]
-    counts = _unplaned(blocks["far"][:size], np.dtype("<u4"))
-    far = np.split(_unplaned(blocks["far"][size:], np.dtype("<i4")).reshape(-1, 4), np.cumsum(counts)[:-1])
-    moved = [join_far(near, rows) for near, rows in zip(bits.view(np.float16), far, strict=True)]
-    return Film(head, **found, nodes=nodes, displacement=np.stack(moved))
+    return Film(head, **fields, order=np.arange(head["count"]), nodes=nodes, displacement=np.stack(moved))
 
 
 def _planes(values: np.ndarray) -> bytes:

@@ -20,6 +20,7 @@ from gaussian_swaying.mpm.followers import follower_stencil
 from gaussian_swaying.mpm.state import GridSpec
 from gaussian_swaying.mpm.transfer import gather
 from gaussian_swaying.recording.nodes import load_nodes
+from gaussian_swaying.rendering.cameras.camera import Camera
 from gaussian_swaying.rendering.shading import DiffuseShader
 from gaussian_swaying.runs.seal import sha256
 from gaussian_swaying.simulation.diagnostics import FARTHEST
@@ -32,18 +33,23 @@ from gaussian_swaying.simulation.simulation import Simulation
 class Film:
     """A film of N Gaussians and M nodes in K frames.
 
+    First come the L Gaussians that move, then the others. Any first part of either is spread over the whole scene, so
+    that some thousands show it already.
+
     The unit of length is the object's longest side at rest, with z up and the origin at its centre. A place is given in
     cells of the grid, from its first node.
 
     Attributes:
         head: Further data for the page: sizes, time between frames [s], grid, light, camera, title.
         position: Centres at rest, float32, shape (N, 3).
-        place: Position at which each takes displacement and gradient [cells], float32, shape (N, 3); -1 for those that
-            never move.
+        place: Position at which those that move take displacement and gradient [cells], float32, shape (L, 3).
         scale: Logarithm of the standard deviations, float16, shape (N, 3).
         turn: Quaternions wxyz in steps of 1/32767, int16, shape (N, 4).
-        facing: Unit normals in steps of 1/32767, and 32767 for Gaussians of a solid, int16, shape (N, 4).
+        facing: Unit normals of those that move in steps of 1/32767, and 32767 for Gaussians of a solid, int16, shape
+            (L, 4).
         color: Red, green, blue and opacity in steps of 1/255, uint8, shape (N, 4).
+        growth: How much each grows while others are missing (:func:`growth`), in steps of 1/255, uint8, shape (N, 1).
+        order: The index of each in the splat, int64, shape (N,); the file does not have it.
         nodes: Flat indices of the nodes in the grid, rising, uint32, shape (M,).
         displacement: Displacement of the nodes [m], float32, shape (K, M, 3); float16 is enough for most.
         notes: Sentences on what the film does not show as the run does.
@@ -56,6 +62,8 @@ class Film:
     turn: np.ndarray
     facing: np.ndarray
     color: np.ndarray
+    growth: np.ndarray
+    order: np.ndarray
     nodes: np.ndarray
     displacement: np.ndarray
     notes: tuple[str, ...] = ()
@@ -160,16 +168,15 @@ def film_of(simulation: Simulation, grid: GridSpec, nodes: Tensor, displacement:
         name: What it shows.
     """
     scene, painter = simulation.scene, simulation.painter
+    camera = painter.camera_at(0)
     device = scene.model.means.device
     size, count = scene.size * scene.frame.metres_per_unit, len(scene.model.means)
     position = scene.frame.point_to_sim(in_double(scene.model.means)) / size
     turn, scale = covariance_to_quat_scale(scene.frame.covariance_to_sim(in_double(scene.rest_covariances)) / size**2)
-    place = torch.full((count, 3), -1.0, device=device)
-    place[scene.moving] = in_cells(scene.follow.places, grid).float().to(device)
-    facing = torch.zeros(count, 4, device=device)
-    facing[scene.moving, :3] = scene.rest_facing.float()
-    facing[scene.moving, 3] = scene.solid().float()
-    color = sh_to_color(scene.model.sh[:, :1], torch.ones(count, 3, device=device))
+    moving, order = order_of(scene)
+    place = in_cells(scene.follow.places, grid).float().to(device)[moving]
+    facing = torch.cat([scene.rest_facing.float(), scene.solid().float()[:, None]], dim=1)[moving]
+    color = sh_to_color(scene.model.sh0, torch.ones(count, 3, device=device))
     color = torch.cat([color, scene.model.opacity()[:, None]], dim=-1)
     shader, notes = painter.shader, []
     if shader is not None and not isinstance(shader, DiffuseShader):
@@ -178,6 +185,7 @@ def film_of(simulation: Simulation, grid: GridSpec, nodes: Tensor, displacement:
         notes.append("colours that depend on the direction of view are the same from all sides.")
     head = {
         "count": count,
+        "moving": len(moving),
         "nodes": len(nodes),
         "frames": len(displacement),
         "frame_dt": simulation.frame_dt,
@@ -187,21 +195,92 @@ def film_of(simulation: Simulation, grid: GridSpec, nodes: Tensor, displacement:
         "resolution": list(grid.resolution),
         "max_stretch": scene.max_stretch,
         **look_of(painter),
-        "camera": _camera(painter, scene, size),
+        "camera": _camera(camera, scene, size),
         "title": f"{name[:1].upper()}{name[1:]} in the wind",
     }
     return Film(
         head,
-        position.float().numpy(force=True),
+        position[order].float().numpy(force=True),
         place.numpy(force=True),
-        scale.half().numpy(force=True),
-        _steps(turn),
+        scale[order].half().numpy(force=True),
+        _steps(turn[order]),
         _steps(facing),
-        (color.clamp(0, 1) * 255).round().to(torch.uint8).numpy(force=True),
+        (color[order].clamp(0, 1) * 255).round().to(torch.uint8).numpy(force=True),
+        (growth(scene, camera)[order, None] * 255).round().to(torch.uint8).numpy(force=True),
+        order.numpy(force=True),
         nodes.numpy(force=True).astype(np.uint32),
         displacement.numpy(force=True),
         tuple(notes),
     )
+
+
+def order_of(scene: SimulatedScene) -> tuple[Tensor, Tensor]:
+    """The order of the Gaussians in a film: those that move come first, and any first part of either is spread.
+
+    Returns:
+        The order of ``scene.moving``, as indices in it, shape (L,), and of all, as indices in the splat, shape (N,).
+    """
+    means, moving = scene.model.means.detach(), scene.moving
+    still = torch.ones(len(means), dtype=torch.bool, device=means.device).index_fill(0, moving, False).nonzero()[:, 0]
+    first = spread(means[moving])
+    return first, torch.cat([moving[first], still[spread(means[still])]])
+
+
+LAYERS = 2.0
+"""Optical depth that some of the Gaussians have to keep, so that little shines through: e^-2 is 14 %."""
+BLOCK = 16  # pixels
+
+
+def growth(scene: SimulatedScene, camera: Camera) -> Tensor:
+    """How much each Gaussian grows in a picture of a part of them, from 0 to 1, shape (N,).
+
+    Of N Gaussians, n cover as much as all if each is s = sqrt(N / n) times as large. Where many lie one behind the
+    other, as in haze or in a hedge, less is enough, and the picture is drawn much faster: each becomes max(1, s g)
+    times as large, where g is the root of :data:`LAYERS` per optical depth, and at most 1. The optical depth is the sum
+    of the integrals of what is centred in a block of pixels, per area of the block.
+
+    Args:
+        scene: The scene, at rest.
+        camera: The first view, on the device of the scene.
+    """
+    means, covariances = scene.model.means.detach(), scene.rest_covariances
+    seen = means @ camera.world_to_camera[:3, :3].T + camera.world_to_camera[:3, 3]
+    depth = seen[:, 2].clamp_min(camera.near)
+    fx, fy, (cx, cy) = camera.intrinsics[0, 0], camera.intrinsics[1, 1], camera.intrinsics[:2, 2]
+    x, y = ((fx * seen[:, 0] / depth + cx) // BLOCK).long(), ((fy * seen[:, 1] / depth + cy) // BLOCK).long()
+    across, along = camera.width // BLOCK + 1, camera.height // BLOCK + 1
+    inside = (seen[:, 2] > camera.near) & (x >= 0) & (x < across) & (y >= 0) & (y < along)
+    # the geometric mean of the areas along three axes is that of a projection, up to the direction
+    area = torch.linalg.det(covariances.double()).clamp_min(0).pow(1 / 3) * float(fx * fy) / depth.double() ** 2
+    mass = scene.model.opacity().detach().double() * 2 * math.pi * area
+    block = torch.where(inside, y * across + x, across * along)
+    total = torch.zeros(across * along + 1, dtype=torch.float64, device=means.device).index_add(0, block, mass)
+    found = (LAYERS * BLOCK**2 / total[block].clamp_min(1e-30)).sqrt().clamp_max(1.0)
+    return torch.where(inside, found, 1.0).float()
+
+
+def spread(position: Tensor) -> Tensor:
+    """An order of places (N, 3) in which the first ones are spread over all of them, as indices (N,).
+
+    Places are sorted along a Z-order curve and taken in the order of van der Corput's sequence: the second lies in the
+    middle, the third in the middle of the first half, and so on.
+    """
+    count = len(position)
+    if count < 2:
+        return torch.arange(count, device=position.device)
+    low, high = position.amin(0), position.amax(0)
+    cells = ((position - low) / (high - low).clamp_min(1e-30) * (2**20 - 1)).long()
+    code = torch.zeros_like(cells[:, 0])
+    for bit in range(20):
+        for axis in range(3):
+            code |= (cells[:, axis] >> bit & 1) << (3 * bit + axis)
+    curve = torch.argsort(code, stable=True)
+    bits = (count - 1).bit_length()
+    rank = torch.arange(1 << bits, device=position.device)
+    mirrored = torch.zeros_like(rank)
+    for bit in range(bits):
+        mirrored |= (rank >> bit & 1) << (bits - 1 - bit)
+    return curve[mirrored[mirrored < count]]
 
 
 def look_of(painter: Painter) -> dict[str, Any]:
@@ -232,9 +311,8 @@ def _steps(values: Tensor) -> np.ndarray:
     return found
 
 
-def _camera(painter: Painter, scene: SimulatedScene, size: float) -> dict[str, Any]:
+def _camera(camera: Camera, scene: SimulatedScene, size: float) -> dict[str, Any]:
     """The first camera of a run: eye, the point on its axis closest to the object, field of view [degrees]."""
-    camera = painter.camera_at(0)
     eye = scene.frame.point_to_sim(in_double(camera.position)) / size
     axis = scene.frame.direction_to_sim(in_double(camera.world_to_camera[2, :3]))
     target = eye + axis * float((-eye * axis).sum().clamp_min(0.2))

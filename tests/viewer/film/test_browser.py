@@ -7,7 +7,9 @@ import numpy as np
 import pytest
 import torch
 
+from gaussian_swaying.viewer.film import page as film_page
 from gaussian_swaying.viewer.film.page import write_film
+from gaussian_swaying.viewer.film.recorded import order_of
 
 SOFTWARE = ["--no-sandbox", "--disable-quic", "--no-first-run", "--disable-background-networking"]
 SOFTWARE += ["--disable-component-update", "--disable-sync"]
@@ -15,7 +17,8 @@ DRAWN = ["--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshad
 SHOWN = "!!window.film || !document.getElementById('message').textContent.startsWith('Loading')"
 
 
-STRETCHED = {"scene": {"max_stretch": 1.03}}  # many Gaussians are drawn at the limit
+LOW = {"class_path": "Box", "init_args": {"min": [None, None, 0.2], "max": [None] * 3}}
+STRETCHED = {"scene": {"max_stretch": 1.03, "region": LOW}}  # many are drawn at the limit, and a part stands still
 
 
 @pytest.fixture(scope="module")
@@ -88,7 +91,7 @@ def test_the_film_is_the_run(show, film, run, make_flag):
         values = page.evaluate("film.positions().then((found) => Array.from(found))")
         found = torch.tensor(values, dtype=torch.float64).reshape(-1, 3)
         expected = scene.frame.point_to_sim(scene.deformed(frame.state).means.double()) / size
-        assert float((found - expected).norm(dim=-1).max()) < 1e-3  # of the object's size
+        assert float((found - expected[order_of(scene)[1]]).norm(dim=-1).max()) < 1e-3  # of the object's size
         pictures[frame.index] = _picture(page)
         assert _psnr(pictures[frame.index], iio.imread(run / f"frames/{frame.index:05d}.png")) > 45
     assert np.abs(pictures[0] - pictures[5]).max() > 50
@@ -124,6 +127,51 @@ def test_gaussians_are_sorted_from_far_to_near(show, film):
     assert told == drawn[np.argsort(-depths[drawn], kind="stable")].tolist()
     assert len(told) == len(depths) - 4
     assert page.evaluate("film.order([]).then((found) => found.length)") == 0
+
+
+@pytest.fixture(scope="module")
+def large(run, tmp_path_factory):
+    """The same film as if it had many Gaussians and frames: in parts, of which the first are small."""
+    target = tmp_path_factory.mktemp("large") / "film.html"
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(film_page, "FIRST", {"moving": 100, "still": 100})
+        patch.setattr(film_page, "PART", 150)
+        patch.setattr(film_page, "GROUP", 2)
+        write_film(run, target)
+    return target
+
+
+def test_a_large_film_begins_with_some_of_its_gaussians_and_ends_as_the_same(show, film, large):
+    """It plays before all has come; afterwards the picture is that of the film in one part."""
+    page = show(large)
+    assert page.evaluate("film.head.parts.map(([kind]) => kind).join()") == (
+        "moving,still,frames,moving,frames,moving,frames"
+    )
+    page.evaluate("film.seek(4)")
+    assert page.evaluate("film.frame()") == 4
+    assert 0 < page.evaluate("film.first()") < 60
+    one = show(film)
+    one.evaluate("film.seek(4)")
+    assert np.array_equal(_picture(page), _picture(one))
+    assert page.told == []
+
+
+def test_a_film_that_is_cut_short_says_so(show, large, tmp_path):
+    """Within the parts that the first picture needs, and within the others, while what has come is shown."""
+    sentence = "The file of this film is cut short: copy it again, or export it again."
+    content = large.read_text()
+    ends = {name: content.index(f'id="film-{name}"') for name in ("code", "part-1", "part-4", "part-6")}
+    for k, (end, shown) in enumerate(
+        ((ends["code"] + 5000, False), (ends["part-1"] - 30, False), (ends["part-1"] + 300, False),
+         (ends["part-4"] - 3, True), (ends["part-6"] + 300, True))
+    ):  # fmt: skip
+        (tmp_path / f"{k}.html").write_text(content[:end])
+        page = show(tmp_path / f"{k}.html")
+        place = page.locator("#note" if shown else "#message")
+        place.filter(has_text=sentence).wait_for()
+        assert page.locator("#message").is_visible() is not shown
+        if shown:
+            page.wait_for_function("film.drawn() > 3")
 
 
 @pytest.mark.slow(twin="test_the_film_is_the_run")

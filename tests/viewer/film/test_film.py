@@ -9,20 +9,27 @@ import json
 import re
 import shutil
 import zlib
+from dataclasses import replace
 
 import numpy as np
 import pytest
 import torch
+from small_scenes import together
 
 from gaussian_swaying.cli.export import main
 from gaussian_swaying.gaussians.ply import write_ply
 from gaussian_swaying.geometry.covariances import covariance
 from gaussian_swaying.mpm.transfer import bspline_weights
-from gaussian_swaying.recording.nodes import join_far, load_nodes, split_far
+from gaussian_swaying.recording.nodes import join_far, load_nodes, split_at, split_far
 from gaussian_swaying.recording.recorder import Recorder
-from gaussian_swaying.scenes.procedural import FlagScene
+from gaussian_swaying.rendering.cameras.camera_path import OrbitCamera
+from gaussian_swaying.scenes.procedural import FlagScene, GivenScene
+from gaussian_swaying.simulation.material import Material
+from gaussian_swaying.simulation.scene import Scene
+from gaussian_swaying.simulation.simulation import Simulation
+from gaussian_swaying.viewer.film import page as film_page
 from gaussian_swaying.viewer.film.page import PAGE, pack, page, unpack
-from gaussian_swaying.viewer.film.recorded import read_film
+from gaussian_swaying.viewer.film.recorded import growth, read_film, spread
 
 FRAMES = 6
 
@@ -32,7 +39,8 @@ def moved(film, frame):
     head = film.head
     row = np.full(np.prod(head["resolution"]), -1)
     row[film.nodes] = np.arange(len(film.nodes))
-    place = torch.from_numpy(film.place).double()
+    count = len(film.position)
+    place = torch.cat([torch.from_numpy(film.place), torch.full((count - len(film.place), 3), -1.0)]).double()
     base = (place - 0.5).floor()
     w, slope = bspline_weights((place - base).T)
     u, gradient = torch.zeros(len(place), 3).double(), torch.zeros(len(place), 3, 3).double()
@@ -43,7 +51,7 @@ def moved(film, frame):
         at = row[np.maximum((x * ny + y) * nz + z, 0)]
         q = displacement[np.maximum(at, 0)]
         weights = w[0, i] * w[1, j] * w[2, k]
-        absent = (at < 0) & (film.place[:, 0] >= 0)
+        absent = (at < 0) & (place[:, 0].numpy() >= 0)
         assert not bool((weights[absent] > 1e-12).any()), "a node is missing"
         u += weights[:, None] * q
         along = (slope[0, i] * w[1, j] * w[2, k], w[0, i] * slope[1, j] * w[2, k], w[0, i] * w[1, j] * slope[2, k])
@@ -63,6 +71,7 @@ def check(simulation, film, frame, state):
     scene = simulation.scene
     size = scene.size * scene.frame.metres_per_unit
     drawn = scene.deformed(state)
+    drawn = replace(drawn, means=drawn.means[film.order], covariances=drawn.covariances[film.order])
     position, shape = moved(film, frame)
     expected = scene.frame.point_to_sim(drawn.means.double()) / size
     most = float(state.node_displacement.abs().max()) / size
@@ -98,7 +107,9 @@ def test_carried_static_and_plated_gaussians(make_flag, tmp_path):
     make = lambda: make_flag(scene={"region": region, "layers": 3, "up": [0.0, 0.6, 0.8], "longest_side": 0.5})  # noqa: E731
     make().run(tmp_path / "run", 4, progress=False)
     simulation, film = make(), read_film(tmp_path / "run")
-    assert 0 < (film.place[:, 0] < 0).sum() == len(film.place) - len(simulation.scene.moving)
+    assert 0 < len(film.place) == len(film.facing) == len(simulation.scene.moving) < len(film.position)
+    assert sorted(film.order[: len(film.place)]) == sorted(simulation.scene.moving.tolist())
+    assert sorted(film.order) == list(range(len(film.position)))
     for frame in simulation.frames(4):
         check(simulation, film, frame.index, frame.state)
 
@@ -109,12 +120,14 @@ def test_nothing_is_lost_in_the_file(run, tmp_path, capsys):
     told = capsys.readouterr().out
     text = (run / "film.html").read_text()
     assert re.search(r"384 Gaussians, 6 frames of \d+ nodes\nwrote .*film\.html \(0\.\d MB\)\n", told)
-    parts = dict(re.findall(r'<script type="text/plain" id="film-(\w+)">([^<]+)</script>', text))
+    found = re.findall(r'<script type="text/plain" id="film-([\w-]+)" data-size="(\d+)">([^<]+)</script>', text)
+    assert all(int(size) == len(part) for _, size, part in found)
+    parts = {name: part for name, _, part in found}
     blocks = {name: zlib.decompress(base64.b64decode(part)) for name, part in parts.items()}
     assert b"SparkRenderer" in blocks.pop("code")
     film, again = read_film(run), unpack(blocks)
     assert film.head == again.head
-    for name in ("position", "place", "scale", "turn", "facing", "color", "nodes", "displacement"):
+    for name in ("position", "place", "scale", "growth", "turn", "facing", "color", "nodes", "displacement"):
         one, other = getattr(film, name), getattr(again, name)
         assert one.dtype == other.dtype
         assert np.array_equal(one, other)
@@ -123,13 +136,61 @@ def test_nothing_is_lost_in_the_file(run, tmp_path, capsys):
         assert licence in text
     data = sum(len(block) for block in pack(film).values())
     head, rest = film.head, len(parts["code"]) + 16_384
-    raw = 50 * head["count"] + head["nodes"] * (4 + 6 * head["frames"]) + len(json.dumps(head))
-    raw += 4 * head["frames"] + len(blocks["far"]) - 4 * head["frames"]
+    far = sum(len(split_at(frame, (frame.astype("f2") != frame).any(1))[1]) for frame in film.displacement)
+    raw = 31 * head["count"] + 20 * head["moving"] + head["nodes"] * (4 + 6 * head["frames"])
+    raw += 4 * head["frames"] + 16 * far + len(blocks["head"])
     assert data == raw
     assert len(text) < rest + 4 / 3 * (1.001 * raw + 256)
     again = page(film)
     assert again == text
     (run / "film.html").unlink()
+
+
+def test_a_large_film_comes_in_parts(run, monkeypatch):
+    """Some of all Gaussians and some frames come first; nothing is lost, whatever the sizes of the parts."""
+    monkeypatch.setattr(film_page, "FIRST", {"moving": 30, "still": 20})
+    monkeypatch.setattr(film_page, "PART", 100)
+    monkeypatch.setattr(film_page, "GROUP", 4)
+    film = read_film(run)
+    film.head["moving"] = 250  # as if the others stood still
+    film = replace(film, place=film.place[:250], facing=film.facing[:250])
+    blocks = pack(film)
+    head = json.loads(blocks["head"])
+    assert head["start"] == 3
+    assert head["parts"][:5] == [
+        ["moving", 0, 30], ["still", 0, 20], ["frames", 0, 4], ["moving", 30, 130], ["still", 20, 120]
+    ]  # fmt: skip
+    assert list(blocks) == ["head", "nodes", *(f"part-{k}" for k in range(len(head["parts"])))]
+    again = unpack(blocks)
+    for name in ("position", "place", "scale", "growth", "turn", "facing", "color", "nodes", "displacement"):
+        assert np.array_equal(getattr(film, name), getattr(again, name)), name
+
+
+def test_what_comes_first_is_spread_over_all():
+    """Of places along a line any first part leaves no gap longer than four times the mean; none is missing."""
+    places = torch.rand(1000, 1, generator=torch.Generator().manual_seed(0)).sort(0)[0] * torch.tensor([1.0, 0.0, 0.0])
+    order = spread(places)
+    assert sorted(order.tolist()) == list(range(1000))
+    for count in (8, 30, 200, 999):
+        gaps = order[:count].sort()[0].diff()
+        assert int(gaps.max()) <= 4 * 1000 / count
+    assert spread(places[:1]).tolist() == [0]
+    assert spread(torch.zeros(5, 3)).sort()[0].tolist() == [0, 1, 2, 3, 4]
+
+
+def test_gaussians_grow_less_where_many_lie_behind_each_other(make_flag):
+    """A hundred times as many behind each other need a tenth of the growth."""
+    cloud = FlagScene(spacing=0.05).generate()
+    camera = OrbitCamera(width=640, height=360, azimuth=-90.0, radius=1.0)
+    found = []
+    for clouds in (4, 400):
+        scene = Scene(generator=GivenScene(together(*[cloud] * clouds)), points="gaussian")
+        simulation = Simulation(scene, Material(), camera=camera, device="cpu")
+        found.append(growth(simulation.scene, simulation.painter.camera_at(0))[: len(cloud)])
+    few, many = found
+    assert float(many.max()) < 1
+    assert torch.allclose(torch.where(few < 1, 10 * many, few), few, rtol=1e-5)
+    assert float((few < 1).float().mean()) > 0.2
 
 
 def test_the_program_is_built_from_its_sources(request):
@@ -290,7 +351,7 @@ def test_braces_in_a_name_are_text(run):
     film.head["title"] = "{{parts}} {{background}} <b>"
     text = page(film)
     assert "<title>{{parts}} {{background}} &lt;b&gt;</title>" in text
-    assert text.count('id="film-frames"') == 1
+    assert text.count('id="film-nodes"') == 1
 
 
 def test_a_splat_that_moved_or_changed_is_refused(make_flag, tmp_path, capsys):

@@ -59,6 +59,11 @@ table("web.md", "web.films", "web_*", "films", """
     largest error [% of the size] = {error:.4f (%)} | pictures a second = {pictures_per_s:.1f}
     """, before="{source}")  # fmt: skip
 
+table("web.md", "web.first", "web_*", lambda result: result.get("first", {}).values(), """
+    parts = {parts} | Gaussians = {gaussians:,} | that move = {moving:,} | frames = {frames} |
+    file [MB] = {bytes:.1f (MB)} | first picture [s] = {first_s:.1f} | all has come [s] = {complete_s:.1f}
+    """, before="{source}", empty="Not recorded yet.")  # fmt: skip
+
 _SHEET, _ORDER = "sheet = `{formulation}`, {particles:,} points", ("formulation", "particles")
 
 
