@@ -120,6 +120,7 @@ class Layer {
   recolour(i, colour) {
     const { rest } = this.textures;
     new Uint8Array(rest.image.data.buffer).set(colour, STEP * i + 12);
+    rest.addUpdateRange(4 * WIDTH * Math.floor(i / WIDTH), 4 * WIDTH);
     rest.needsUpdate = true;
   }
 
