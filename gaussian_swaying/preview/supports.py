@@ -21,6 +21,7 @@ CLOTH = 0.3  # width of a slice with cloth, as a share of the widest
 OUTSIDE = 0.02  # share of the Gaussians of a flag that may lie on the other side of its pole
 TRUNK, CROWN = 0.12, 0.5  # height of a bare trunk, as a share of that of the tree; green share of what is above
 NARROW = 0.35  # width of a trunk, as a share of that of the crown
+POST, SLENDER = 0.25, 0.08  # height of a post, as a share of that of the object, and its width, as a share of the same
 
 
 @dataclass(frozen=True)
@@ -121,7 +122,7 @@ def hanging_parts(
 def standing_parts(
     cloud: GaussianCloud, simulated: Tensor, up: Sequence[float], weight: Tensor, depth: float
 ) -> FoundParts | None:
-    """Find the trunk of a tree: narrow and not green, below a crown that is green.
+    """Find the trunk of a tree, narrow and not green, below a crown that is green; or the post of another thing.
 
     Args:
         cloud: The splat.
@@ -131,7 +132,7 @@ def standing_parts(
         depth: How much of the trunk is its foot [scene units].
 
     Returns:
-        The parts: the foot is held, wood and leaves are soft; None if there is no such trunk.
+        The parts: the foot is held, wood and leaves are soft, or post and head; None if there is no such trunk or post.
     """
     index = simulated.nonzero()[:, 0]
     axis, means = torch.tensor(list(up), dtype=torch.float64), cloud.means.detach()[index].double()
@@ -148,21 +149,26 @@ def standing_parts(
         for own in ((which == k).nonzero()[:, 0] for k in range(SLICES))
     ]
     bare = next((k for k in range(SLICES) if not 0 < wide[k] < NARROW * max(wide)), SLICES)
-    if not TRUNK * SLICES <= bare < 0.7 * SLICES:
+    if not TRUNK * SLICES <= bare < 0.85 * SLICES:
         return None
     trunk, crown = which < bare, which >= bare
     brown, leafy = (
         float((visible * of)[some].sum() / visible[some].sum()) for of, some in ((~green, trunk), (green, crown))
     )
-    if brown < 0.8 or leafy < CROWN:
+    tree = brown >= 0.8 and leafy >= CROWN
+    slim = max(wide[:bare]) < SLENDER * (high - low)
+    if not tree and (leafy >= CROWN or bare < POST * SLICES or not slim):
         return None
-    label = torch.where(trunk | woody(means, green, high - low), 1, 2)
+    label = torch.where(trunk | woody(means, green, high - low) if tree else trunk, 1, 2)
     label[trunk & (height < quantile(height[trunk], 0.01) + depth)] = 0
     if int((label == 2).sum()) < FEWEST:
         return None
     labels = labels_for_all(cloud.means.detach(), index, label, high - low, 3)
-    parts = _parts(labels, [Part("foot", "held"), Part("wood"), Part("leaf"), Part("surroundings", "still")])
-    return FoundParts(parts, f"a trunk, bare up to {bare / SLICES:.2f} of the height, and green above")
+    names = ("wood", "leaf") if tree else ("post", "head")
+    parts = _parts(labels, [Part("foot", "held"), *map(Part, names), Part("surroundings", "still")])
+    what = "a trunk, bare" if tree else "a post, slim"
+    above = "green" if tree else "something wider"
+    return FoundParts(parts, f"{what} up to {bare / SLICES:.2f} of the height, and {above} above")
 
 
 def _parts(labels: Tensor, parts: list[Part]) -> Parts:

@@ -153,6 +153,31 @@ def test_a_tree(tree):
     assert guess.hold.end == "bottom"
 
 
+def sign(width=0.03):
+    """A round plate of 0.6 m on a post of 1.5 m."""
+    draw = torch.Generator().manual_seed(0)
+    angle, share = 6.2832 * torch.rand(1500, generator=draw), torch.rand(1500, generator=draw)
+    post = torch.stack([width * angle.cos(), width * angle.sin(), 1.5 * share], -1)
+    plate = torch.stack(
+        [0.3 * share.sqrt() * angle.sin(), 0.02 * angle.cos(), 1.7 + 0.3 * share.sqrt() * angle.cos()], -1
+    )
+    return plain_cloud(torch.cat([post, plate]) + torch.tensor([3.0, 4.0, 0.0]), -4.0, logit=2.0)
+
+
+def test_a_sign_on_a_post():
+    cloud = sign()
+    guess = suggest(cloud, up="+z")
+    assert guess.hold.end == "bottom"
+    parts, z = guess.parts.parts, cloud.means[:, 2]
+    assert [(part.name, part.role) for part in parts.parts] == [("foot", "held"), ("post", "soft"), ("head", "soft")]
+    assert bool(parts.mask("foot")[z < 0.1].all())
+    assert bool(parts.mask("post")[(z > 0.3) & (z < 1.3)].all())
+    assert bool(parts.mask("head")[z > 1.6].all())
+    assert "a post, slim up to 0.7" in guess.parts.reason
+    thick = sign(width=0.1)
+    assert suggest(thick, up="+z").parts is None
+
+
 def test_a_trunk_is_no_pot_and_a_tree_must_be_green(tree):
     """A trunk is round and brown below green leaves, as a pot is, but slender."""
     assert suggest(tree, up="+z").parts.parts.parts[0].name == "foot"
