@@ -268,6 +268,22 @@ def test_in_total_a_part_falls_on_the_ground_and_rests_there():
     assert strain(state.F_total) < 1e-12
 
 
+def test_in_updated_parts_may_meet():
+    """Each keeps its shape; the grid between them passes momentum on."""
+    left = Box([None] * 3, [0.2, None, None])
+    points, solver = bar(RigidRegion(left), RigidRegion(RIGHT), formulation="updated", gravity=(0, 0, 0))
+    velocity = torch.where(right(points)[:, None], torch.tensor([-1.0, 0.0, 0.0], dtype=torch.float64), 0.0)
+    state = solver.init_state(points, velocity, margin=4)
+    before = solver.momenta(state)["linear"]
+    state = advance(solver, state, 0.1)
+    torch.testing.assert_close(solver.momenta(state)["linear"], before, rtol=1e-9, atol=1e-10)
+    assert float(state.velocity[~right(points), 0].max()) < -0.3  # it is pushed
+    for own in (right(points), ~right(points)):
+        torch.testing.assert_close(
+            torch.pdist(state.position[own]), torch.pdist(points.position[own]), rtol=0, atol=1e-12
+        )
+
+
 def test_a_part_that_becomes_rigid_on_the_way_takes_its_shape_again():
     points, soft = bar(PinnedRegion(Box([None] * 3, [0.1, None, None]), "nodes"))
     state = advance(soft, soft.init_state(points), 0.2)
