@@ -177,6 +177,8 @@ class Painting:
                     self._paint(key, move)
         finally:
             self._show()
+            if self._waiting:  # after an error
+                self.page.turns.ask("brush", self._take)
 
     def _paint(self, key: str, move: BrushMove) -> None:
         with self.session.lock:
