@@ -96,8 +96,9 @@ class Strokes:
 
     def _label(self, index: Tensor, labels: Tensor) -> None:
         self.labels[index] = labels
-        self.roles = self.roles.clone()
-        self.roles[index] = self._roles_of(labels)
+        roles = self.roles.clone()
+        roles[index] = self._roles_of(labels)
+        self.roles = roles
 
     def _roles_of(self, labels: Tensor) -> Tensor:
         return torch.tensor([ROLES.index(part.role) for part in self.known], dtype=torch.uint8)[labels]

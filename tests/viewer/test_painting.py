@@ -288,7 +288,6 @@ def test_files_of_parts_stay_while_a_change_can_be_undone(page, painter, until, 
         before = session.simulation
         painting._apply()
         until(lambda before=before: session.simulation is not before)
-        session._past.append(session._past.pop())
     there = {str(path) for path in (page.scratch / "painted").glob("*/parts.npz")}
     assert {str(known.scene.parts) for known in session.reachable()} - {"None"} <= there
     assert len(there) <= 4
