@@ -23,6 +23,7 @@ from gaussian_swaying.preview.ticks import draw_ticks
 from gaussian_swaying.preview.up import floor_mask, wind_words
 from gaussian_swaying.rendering.cameras.camera import Camera, orbit_camera, project
 from gaussian_swaying.rendering.gsplat_renderer import make_renderer
+from gaussian_swaying.rendering.thinning import DETAIL
 from gaussian_swaying.rendering.tints import HELD, greyed, tinted
 from gaussian_swaying.simulation.simulation import Simulation
 
@@ -171,7 +172,7 @@ def things_picture(cloud: GaussianCloud, place: Place, chosen: Sequence[int], de
     """
     from PIL import Image, ImageDraw, ImageFont
 
-    renderer, up = make_renderer(device), torch.tensor(place.up.direction, dtype=torch.float64)
+    renderer, up = make_renderer(device, detail=DETAIL), torch.tensor(place.up.direction, dtype=torch.float64)
     across = min(4, len(place.things))
     page = Image.new("RGB", (across * THING, -(-len(place.things) // across) * THING), (255, 255, 255))
     font = ImageFont.load_default(size=18)
@@ -227,7 +228,8 @@ def _view(simulation: Simulation, parts: Parts, camera: Camera, normals: int, ti
     colours = _tinted(colours, parts, _soft(simulation))
     plain = torch.full((3,), 0.96, device=colours.device)
     opacity = scene.model.opacity()
-    image = simulation.painter.renderer(rest.means, rest.covariances, opacity, colours, camera, plain).color
+    renderer = make_renderer(colours.device, detail=DETAIL)
+    image = renderer(rest.means, rest.covariances, opacity, colours, camera, plain).color
     pixels = (image.detach().clamp(0, 1) * 255 + 0.5).to(torch.uint8).cpu().numpy()
     picture = Image.fromarray(pixels)
     draw = ImageDraw.Draw(picture)

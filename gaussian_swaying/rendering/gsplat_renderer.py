@@ -318,7 +318,7 @@ class GsplatRenderer(nn.Module):
         return SplatOutput(pixels[0, ..., :3], alpha[0], screen, pixels[0, ..., 3:])
 
 
-def make_renderer(device: torch.device | str, packed: bool = False) -> SplatRenderer:
+def make_renderer(device: torch.device | str, packed: bool = False, detail: float = 0.0) -> SplatRenderer:
     """Return the renderer for a device: gsplat with CUDA, the torch renderer otherwise.
 
     If gsplat cannot compile its kernels (no ``nvcc``), the torch renderer draws on the GPU, with a warning.
@@ -326,9 +326,10 @@ def make_renderer(device: torch.device | str, packed: bool = False) -> SplatRend
     Args:
         device: The device.
         packed: See :class:`GsplatRenderer`.
+        detail: See :class:`~gaussian_swaying.rendering.torch_renderer.TorchRenderer`; gsplat draws all Gaussians.
     """
     if torch.device(device).type != "cuda" or not torch.cuda.is_available():
-        return TorchRenderer()
+        return TorchRenderer(detail=detail)
     if gsplat_works():
         return GsplatRenderer(packed=packed)
     warnings.warn(
@@ -336,4 +337,4 @@ def make_renderer(device: torch.device | str, packed: bool = False) -> SplatRend
         "torch renderer instead.",
         stacklevel=2,
     )
-    return TorchRenderer()
+    return TorchRenderer(detail=detail)

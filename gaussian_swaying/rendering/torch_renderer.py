@@ -30,6 +30,7 @@ from gaussian_swaying.rendering.protocol import (
     check_gaussians,
     finite_gaussians,
 )
+from gaussian_swaying.rendering.thinning import thinned
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -315,16 +316,19 @@ class TorchRenderer(nn.Module):
         eps2d: Added to the diagonal of the projected covariances [pixels^2].
         max_pairs: Approximate number of pairs of a Gaussian and a pixel in memory at a time; bounds the memory and does
             not change the picture beyond round-off. The kernels do not need it.
+        detail: Size [pixels] below which Gaussians are thinned, 0 for none
+            (:func:`~gaussian_swaying.rendering.thinning.thinned`). Training always draws all.
 
     Raises:
-        ValueError: If ``eps2d`` is negative or ``max_pairs`` is not positive.
+        ValueError: If ``eps2d`` or ``detail`` is negative or ``max_pairs`` is not positive.
     """
 
-    def __init__(self, eps2d: float = 0.3, max_pairs: int = 1 << 18) -> None:
+    def __init__(self, eps2d: float = 0.3, max_pairs: int = 1 << 18, detail: float = 0.0) -> None:
         super().__init__()
+        check_positive("detail", detail, allow_zero=True)
         check_positive("eps2d", eps2d, allow_zero=True)
         check_positive("max_pairs", max_pairs)
-        self.eps2d, self.max_pairs = float(eps2d), int(max_pairs)
+        self.eps2d, self.max_pairs, self.detail = float(eps2d), int(max_pairs), float(detail)
 
     def forward(
         self,
@@ -338,6 +342,8 @@ class TorchRenderer(nn.Module):
         """Render one picture, see :class:`~gaussian_swaying.rendering.protocol.Renderer`."""
         check_gaussians(means, covariances, opacities, colors, background)
         given = (means, covariances, opacities, colors)
+        if self.detail > 0:
+            given = thinned(*given, camera.to(means.device, means.dtype), self.detail, self.eps2d)
         # the kernels read the others in any precision
         wanted = [
             t for t in (background, camera.world_to_camera, camera.intrinsics) if t is not None and t.requires_grad
@@ -346,7 +352,7 @@ class TorchRenderer(nn.Module):
             picture = raster.render(*given, camera, background, self.eps2d)
             if picture is not None:
                 return picture
-        return render_torch(means, covariances, opacities, colors, camera, background, self.eps2d, self.max_pairs)
+        return render_torch(*given, camera, background, self.eps2d, self.max_pairs)
 
     def render_splat(
         self,

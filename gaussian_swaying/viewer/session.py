@@ -15,6 +15,8 @@ import torch
 from gaussian_swaying._checks import one_line
 from gaussian_swaying.config.parser import config_text
 from gaussian_swaying.mpm.state import State
+from gaussian_swaying.rendering.gsplat_renderer import make_renderer
+from gaussian_swaying.rendering.thinning import DETAIL
 from gaussian_swaying.simulation.diagnostics import FrameDiagnostics, SimulationDiverged, diagnose
 from gaussian_swaying.simulation.simulation import Simulation
 from gaussian_swaying.viewer.changes import changed_settings, take
@@ -126,7 +128,7 @@ class Session:
         self._first = settings  # those that `restore` goes back to
         self.configured_dx = float(settings.solver.dx)
         self._past: deque[Past] = deque(maxlen=MOST_UNDONE)
-        self.simulation = simulation or Simulation.from_settings(parser, settings)
+        self.simulation = _drawn_roughly(simulation or Simulation.from_settings(parser, settings))
         self._begin(self.simulation.start())
         self._thread = threading.Thread(target=self._loop, name="simulation", daemon=True)
 
@@ -404,7 +406,7 @@ class Session:
 
     def _take_settings(self, settings: Namespace, fresh: bool = False) -> None:
         """Make the simulation anew; unless ``fresh``, it goes on from where it is if its nodes stay the same."""
-        simulation = Simulation.from_settings(self.parser, settings)
+        simulation = _drawn_roughly(Simulation.from_settings(self.parser, settings))
         start = simulation.start()
         state = None  # goes on only between solvers that can
         if not (self._broken or fresh):
@@ -426,3 +428,9 @@ class Session:
             forces = self.simulation.custom_forces
             self.simulation.custom_forces = tuple(force for force in forces if force is not self._pull)
             self._pull = None
+
+
+def _drawn_roughly(simulation: Simulation) -> Simulation:
+    """A simulation of which a renderer on a CPU thins Gaussians that are much smaller than a pixel."""
+    simulation.painter.renderer = make_renderer(simulation.device, detail=DETAIL)
+    return simulation

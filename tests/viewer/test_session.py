@@ -13,6 +13,7 @@ import torch
 import yaml
 
 from gaussian_swaying.config.parser import config_text
+from gaussian_swaying.rendering.thinning import DETAIL
 from gaussian_swaying.simulation.simulation import Simulation
 from gaussian_swaying.viewer.pictures import draw
 from gaussian_swaying.viewer.session import WINDOW, Session
@@ -37,6 +38,16 @@ def test_it_goes_on_pauses_and_steps(session, until):
     session.pause(False)
     until(lambda: session.snapshot.number > now.number + 2)
     assert session.problem is None
+
+
+def test_gaussians_much_smaller_than_a_pixel_are_thinned(session):
+    """On a CPU, in the first simulation and in one made anew; a run draws all of them."""
+    before = session.simulation
+    session._change({"solver.dx": 0.3})
+    assert session.simulation is not before
+    for simulation in (before, session.simulation):
+        assert simulation.painter.renderer.detail == DETAIL
+    assert Simulation.from_settings(session.parser, session.settings, device="cpu").painter.renderer.detail == 0
 
 
 def test_reset_goes_back_to_rest(session, until):

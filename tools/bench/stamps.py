@@ -33,6 +33,7 @@ PARTS: dict[str, tuple[str, ...]] = {
     "backward": _SOLVER,
     "blender": _SIMULATION,
     "contact": _SIMULATION,
+    "detail": ("rendering", "geometry"),
     "drawn": (*_DRAWN, "viewer"),
     "fit": (*_DRAWN, "fitting"),
     "flags": (*_DRAWN, "evaluation", "training"),

@@ -54,6 +54,12 @@ table("recording.md", "frames.rows", "frames_*", "frames", """
     once [s] = {still_s:.1f}
     """, before="{source}")  # fmt: skip
 
+table("live.md", "detail.rows", "detail_*", "detail", """
+    scene = {scene} | Gaussians = {gaussians:,} | distance [sizes] = {distance:g} | width [pixels] = {width} |
+    covered [%] = {covered:.2g (%)} | drawn of all [%] = {kept:.0f (%)} | all [s] = {whole_s:.3f} |
+    some [s] = {some_s:.3f} | PSNR [dB] = {psnr_db or 'the same':.1f} | of a JPEG [dB] = {jpeg_db:.1f}
+    """, before="{source}", order=("scene", "gaussians", "distance"))  # fmt: skip
+
 table("web.md", "web.films", "web_*", "films", """
     film = {key} | Gaussians = {gaussians:,} | nodes = {nodes:,} | frames = {frames:,} | file [MB] = {bytes:.1f (MB)} |
     largest error [% of the size] = {error:.4f (%)} | pictures a second = {pictures_per_s:.1f}
