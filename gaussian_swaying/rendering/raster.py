@@ -53,8 +53,9 @@ def render(
     camera: Camera,
     background: Tensor | None,
     eps2d: float,
+    detail: float = 0.0,
 ) -> RenderOutput | None:
-    """Draw Gaussians as ``render_torch``, from float32 on a CPU, without gradients.
+    """Draw Gaussians as ``render_torch``, thinned if there is a detail, from float32 on a CPU, without gradients.
 
     The same bits for any number of threads.
 
@@ -66,6 +67,7 @@ def render(
         camera: The camera, in any precision.
         background: Colour behind the Gaussians, shape (3,); black when None.
         eps2d: Added to the diagonal of the projected covariances [pixels^2].
+        detail: Size below which Gaussians are thinned [pixels]; 0 for none.
 
     Returns:
         The picture; None if there are more than :data:`MOST_PAIRS`.
@@ -75,7 +77,9 @@ def render(
     tiles = across * triton.cdiv(height, HEIGHT)
     given = [tensor.detach().contiguous() for tensor in (means, covariances, opacities, colors)]
     view = [camera.world_to_camera.reshape(-1), camera.intrinsics.reshape(-1)]
-    numbers = torch.cat([*(part.detach().cpu().double() for part in view), torch.tensor([camera.near, eps2d]).double()])
+    numbers = torch.cat(
+        [*(part.detach().cpu().double() for part in view), torch.tensor([camera.near, eps2d, detail**2]).double()]
+    )
     rows = torch.empty(count, ROW // 2, dtype=torch.float64)
     depths, boxes = torch.empty(count, dtype=torch.float64), torch.empty(count, 4, dtype=torch.int32)
     lines = rows.view(torch.float32)

@@ -12,6 +12,7 @@ import math
 from gaussian_swaying.geometry.linalg_triton import load3, load9
 from gaussian_swaying.kernels.language import tl, triton
 from gaussian_swaying.rendering.protocol import MAX_ALPHA, MIN_ALPHA, MIN_TRANSMITTANCE, SLACK
+from gaussian_swaying.rendering.thinning import FEWEST, GOLDEN
 
 WIDTH, HEIGHT = 8, 16
 """Size of a tile [pixels]; a row of it is a vector."""
@@ -24,6 +25,7 @@ STATE = 5
 _MIN, _MAX, _STOP, _SLACK = (tl.constexpr(x) for x in (MIN_ALPHA, MAX_ALPHA, MIN_TRANSMITTANCE, SLACK))
 _LOG_MIN = tl.constexpr(math.log(MIN_ALPHA))
 _INFINITE = tl.constexpr(math.inf)
+_FEWEST, _GOLDEN = tl.constexpr(FEWEST), tl.constexpr(GOLDEN / 2**32)
 _WIDTH, _HEIGHT, _ROW, _STATE = (tl.constexpr(x) for x in (WIDTH, HEIGHT, ROW, STATE))
 _LOOK = tl.constexpr(32)  # Gaussians between two looks whether a tile is full
 
@@ -38,6 +40,14 @@ def _doubles(values):
     found = ()
     for k in tl.static_range(len(values)):
         found = found + (values[k].to(tl.float64),)
+    return found
+
+
+@triton.jit
+def _times_each(values, factor):
+    found = ()
+    for k in tl.static_range(len(values)):
+        found = found + (values[k] * factor,)
     return found
 
 
@@ -66,7 +76,8 @@ def project(
 ):
     """One Gaussian per lane: its row, its depth (infinite if it is not drawn), its box of tiles (first and last).
 
-    ``camera`` has its two matrices, near plane and blur, float64; ``wide`` are the rows as float64.
+    ``camera`` has its two matrices, near plane, blur and square of the detail, float64; ``wide`` are the rows as
+    float64.
     """
     index = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
     mask = index < count
@@ -88,6 +99,22 @@ def project(
     z = _times(ahead, x) + tl.load(camera + 11)
     keep = mask & (size < _INFINITE) & (z >= tl.load(camera + 25)) & (opacity >= _MIN)
     depth = tl.where(keep, z, 1.0)
+    # thinned: some of those smaller than the detail stand for all
+    blur = tl.load(camera + 26)
+    detail2 = tl.load(camera + 27)
+    square = zero
+    for k in tl.static_range(9):
+        square += C[k] * C[k]
+    focal = tl.maximum(fx, fy) / depth
+    size2 = tl.sqrt(tl.where(keep, square, 0.0)) * focal * focal
+    share = tl.where(detail2 + zero > 0, _clamp(size2 / tl.maximum(detail2 + zero, 1e-30), _FEWEST, 1.0), 1.0)
+    turns = index.to(tl.float64) * _GOLDEN
+    keep = keep & ((turns - tl.floor(turns) < share) | (share >= 1))
+    grown = (blur + size2 / share + 1e-30) / (blur + size2 + 1e-30)
+    power = (1 / (share * grown)).to(tl.float32)
+    covered = 1 - tl.exp(power * tl.log(tl.maximum(1 - tl.where(keep, opacity, 0.0), 1e-7)))
+    opacity = tl.where(share < 1, covered, opacity)
+    C = _times_each(C, 1 / share)
     x_ratio = (_times(right, x) + tl.load(camera + 3)) / depth
     y_ratio = (_times(down, x) + tl.load(camera + 7)) / depth
     wide_x, wide_y = width.to(tl.float64), height.to(tl.float64)

@@ -15,8 +15,6 @@ DETAIL = 1 / 3
 """Size [pixels] below which Gaussians are thinned in previews and on the live page."""
 FEWEST = 1 / 64
 """Smallest share that is kept."""
-WORTH = 0.75
-"""Largest share that is kept of all; with more, all are drawn, as leaving out the others would save little."""
 GOLDEN = 2654435769  # 2^32 by the golden ratio: its multiples, modulo 2^32, are spread evenly
 
 
@@ -29,7 +27,7 @@ def thinned(
     detail: float = DETAIL,
     eps2d: float = 0.3,
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    r"""Some of the Gaussians, which look like all of them; all, if that would not save a quarter.
+    r"""Some of the Gaussians, which look like all of them.
 
     The projected size s of a Gaussian is the root of the Frobenius norm of its covariance, times focal length per
     depth; no standard deviation of its projection is larger, but for the perspective at the border. Of those with s
@@ -60,9 +58,9 @@ def thinned(
     share = (size2 / detail**2).clamp(FEWEST, 1.0)
     place = (torch.arange(len(means), device=means.device) * GOLDEN % 2**32).to(share) / 2**32
     index = ((place < share) | ~(share < 1)).nonzero()[:, 0]  # what is not finite is left to the renderer
-    if len(index) > WORTH * len(means):
+    if len(index) == len(means):
         return means, covariances, opacities, colors
-    share, size2 = share[index], size2[index]
-    grown = (eps2d + size2 / share) / (eps2d + size2)
-    opacity = 1 - (1 - opacities[index]) ** (1 / (share * grown))
+    share, size2, opacity = share[index], size2[index], opacities[index]
+    grown = (eps2d + size2 / share + 1e-30) / (eps2d + size2 + 1e-30)
+    opacity = torch.where(share < 1, 1 - (1 - opacity).clamp_min(1e-7) ** (1 / (share * grown)), opacity)
     return means[index], covariances[index] / share[:, None, None], opacity, colors[index]

@@ -342,16 +342,16 @@ class TorchRenderer(nn.Module):
         """Render one picture, see :class:`~gaussian_swaying.rendering.protocol.Renderer`."""
         check_gaussians(means, covariances, opacities, colors, background)
         given = (means, covariances, opacities, colors)
-        if self.detail > 0:
-            given = thinned(*given, camera.to(means.device, means.dtype), self.detail, self.eps2d)
         # the kernels read the others in any precision
         wanted = [
             t for t in (background, camera.world_to_camera, camera.intrinsics) if t is not None and t.requires_grad
         ]
         if raster.runs(given) and not (wanted and torch.is_grad_enabled()):
-            picture = raster.render(*given, camera, background, self.eps2d)
+            picture = raster.render(*given, camera, background, self.eps2d, self.detail)
             if picture is not None:
                 return picture
+        if self.detail > 0:
+            given = thinned(*given, camera.to(means.device, means.dtype), self.detail, self.eps2d)
         return render_torch(*given, camera, background, self.eps2d, self.max_pairs)
 
     def render_splat(

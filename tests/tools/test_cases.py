@@ -45,7 +45,7 @@ TINY = {
     "contact": (["--points", "100", "--repeats", "1", "--speeds", "5"],
                 {"collision": partial(contact.collision, points=225, frames=10)},
                 {"rows": 4, "collisions": 1}, ["contact.cost", "contact.collisions"]),
-    "detail": (["--counts", "20000", "--distances", "2,40", "--width", "64"], {}, {"detail": 2}, ["detail.rows"]),
+    "detail": (["--counts", "20000", "--distances", "2,40", "--widths", "64"], {}, {"detail": 2}, ["detail.rows"]),
     "frames": (["--counts", "20000", "--frames", "2"], {}, {"frames": 2}, ["frames.rows"]),
     "pareto": (["--only", "bar"], {"PROBLEMS": {"bar": ((4,), "cells", 1e-2)}, "CFLS": (0.4,)}, {"rows": 7},
                ["pareto.device"]),

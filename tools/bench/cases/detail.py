@@ -48,9 +48,10 @@ def rows(options: argparse.Namespace, _: Row) -> Iterator[Measurement]:
 def _of(
     name: str, cloud: GaussianCloud, center: Tensor, size: float, options: argparse.Namespace
 ) -> Iterator[Measurement]:
-    for distance in options.distances:
-        key = {"scene": name, "gaussians": len(cloud), "distance": distance, "width": options.width}
-        yield ("detail", key), partial(seen, cloud, center, size, distance, options.width)
+    for width in options.widths:
+        for distance in options.distances:
+            key = {"scene": name, "gaussians": len(cloud), "width": width, "distance": distance}
+            yield ("detail", key), partial(seen, cloud, center, size, distance, width)
 
 
 @torch.inference_mode()
@@ -114,8 +115,8 @@ CASE = Case(
     (
         option("--ply", "a captured object, y down"),
         numbers("--counts", "Gaussians of the places", default="1000000,3000000"),
-        numbers("--distances", "of the camera, in sizes of the object", float, "1,2,4,8,16"),
-        option("--width", "of the pictures [pixels]", type=int, default=640),
+        numbers("--distances", "of the camera, in sizes of the object", float, "1,2,4,8"),
+        numbers("--widths", "of the pictures [pixels]", default="224,640"),
     ),
     page="live.md",
     device=False,

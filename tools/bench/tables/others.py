@@ -55,10 +55,10 @@ table("recording.md", "frames.rows", "frames_*", "frames", """
     """, before="{source}")  # fmt: skip
 
 table("live.md", "detail.rows", "detail_*", "detail", """
-    scene = {scene} | Gaussians = {gaussians:,} | distance [sizes] = {distance:g} | width [pixels] = {width} |
+    scene = {scene} | Gaussians = {gaussians:,} | width [pixels] = {width} | distance [sizes] = {distance:g} |
     covered [%] = {covered:.2g (%)} | drawn of all [%] = {kept:.0f (%)} | all [s] = {whole_s:.3f} |
-    some [s] = {some_s:.3f} | PSNR [dB] = {psnr_db or 'the same':.1f} | of a JPEG [dB] = {jpeg_db:.1f}
-    """, before="{source}", order=("scene", "gaussians", "distance"))  # fmt: skip
+    some [s] = {some_s:.3f} | PSNR [dB] = {psnr_db:.1f} | of a JPEG [dB] = {jpeg_db:.1f}
+    """, before="{source}", order=("scene", "gaussians", "width", "distance"))  # fmt: skip
 
 table("web.md", "web.films", "web_*", "films", """
     film = {key} | Gaussians = {gaussians:,} | nodes = {nodes:,} | frames = {frames:,} | file [MB] = {bytes:.1f (MB)} |
