@@ -56,7 +56,7 @@ table("recording.md", "frames.rows", "frames_*", "frames", """
 
 table("live.md", "detail.rows", "detail_*", "detail", """
     scene = {scene} | Gaussians = {gaussians:,} | width [pixels] = {width} | distance [sizes] = {distance:g} |
-    covered [%] = {covered:.2g (%)} | drawn of all [%] = {kept:.0f (%)} | all [s] = {whole_s:.3f} |
+    covered [%] = {covered:.1f (%)} | drawn of all [%] = {kept:.0f (%)} | all [s] = {whole_s:.3f} |
     some [s] = {some_s:.3f} | PSNR [dB] = {psnr_db:.1f} | of a JPEG [dB] = {jpeg_db:.1f}
     """, before="{source}", order=("scene", "gaussians", "width", "distance"))  # fmt: skip
 
