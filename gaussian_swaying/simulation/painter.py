@@ -95,6 +95,12 @@ class Painter(nn.Module):
     def renderer(self, renderer: Renderer) -> None:
         self._renderer = renderer
 
+    def __setattr__(self, name: str, value: Any) -> None:
+        if name == "renderer":  # a Module would become a part of this one without passing the setter
+            object.__setattr__(self, name, value)
+        else:
+            super().__setattr__(name, value)
+
     @in_turn
     def camera_at(self, frame: int, name: str = "") -> Camera:
         """The camera of a frame, on the device and in the precision of the Gaussians; one copy, without waiting for it.

@@ -15,6 +15,7 @@ from gaussian_swaying.recording.recorder import Recorder
 from gaussian_swaying.rendering.cameras.camera_path import LookAtCamera, OrbitCamera
 from gaussian_swaying.rendering.passes import colormap, mean_depth
 from gaussian_swaying.rendering.shading import DiffuseShader
+from gaussian_swaying.rendering.torch_renderer import TorchRenderer
 from gaussian_swaying.simulation.edits import Edit
 
 SIDE = OrbitCamera(width=24, height=20, azimuth=-90.0, elevation=0.1, radius=1.5)
@@ -222,3 +223,12 @@ def test_motion_and_colours_are_those_of_the_scene_in_every_frame(make_simulatio
     assert not torch.equal(kept[5][0], kept[6][0])
     if device.type == "cuda":
         assert painter._moved.recorded
+
+
+def test_a_renderer_can_be_exchanged(make_simulation):
+    """Also one that is a module, as a painter is."""
+    painter = make_simulation().painter
+    first, other = painter.renderer, TorchRenderer(eps2d=0.5)
+    painter.renderer = other
+    assert painter.renderer is other is not first
+    assert "renderer" not in dict(painter.named_children())

@@ -27,7 +27,7 @@ RECORD = {
     "place": "<f4",
     "facing": "<i2",
 }
-"""What is stored of a Gaussian, in this order; the last two only of those that move."""
+"""The numbers that are stored of a Gaussian, in this order; the last two only of those that move."""
 FIRST = {"moving": 1 << 11, "still": 1 << 12}
 """Gaussians that move, and that do not, in the first picture."""
 KINDS = ("moving", "still")

@@ -232,7 +232,7 @@ BLOCK = 16  # pixels
 
 
 def growth(scene: SimulatedScene, camera: Camera) -> Tensor:
-    """How much each Gaussian grows in a picture of a part of them, from 0 to 1, shape (N,).
+    """The growth of each Gaussian in a picture of a part of them, from 0 to 1, shape (N,).
 
     Of N Gaussians, n cover as much as all if each is s = sqrt(N / n) times as large. Where many lie one behind the
     other, as in haze or in a hedge, less is enough, and the picture is drawn much faster: each becomes max(1, s g)
