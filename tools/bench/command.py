@@ -16,7 +16,9 @@ _OWN = (
 )
 _FILES = {
     name: f"{name}.CASE"
-    for name in (*_OWN.split(), "area", "blender", "places", "frames", "detail", "drawn", "web", "sweeps", "winds")
+    for name in (
+        *_OWN.split(), "area", "blender", "places", "frames", "detail", "drawn", "refinement", "web", "sweeps", "winds"
+    )
 }
 _FILES |= {"substep": "runs.SUBSTEP", "sim": "runs.SIM", "train": "training.CASE"}
 

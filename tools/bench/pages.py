@@ -19,6 +19,7 @@ from bench.tables import (  # noqa: F401  each registers its slots
     measured,
     others,
     plots,
+    refinement,
     training,
     validation,
 )
@@ -28,6 +29,7 @@ PLOTS: dict[str, Callable[[list[record.Row], Path], None]] = {
     "accuracy_*": plots.accuracy,
     "blender_*": blender.plot,
     "pareto_*": plots.pareto,
+    "refinement_*": refinement.plot,
     "speed_*": plots.speed,
 }
 """Functions that draw into the folder of the pictures, by the records that they need."""

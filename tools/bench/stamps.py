@@ -49,6 +49,7 @@ PARTS: dict[str, tuple[str, ...]] = {
     "points": _SIMULATION,
     "previews": (*_SIMULATION, "preview"),
     "places": (*_SIMULATION, "preview"),
+    "refinement": _SIMULATION,
     "sim": _DRAWN,
     "soft": (*_DRAWN, "fitting"),
     "speed": _DRAWN,

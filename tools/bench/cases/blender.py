@@ -20,6 +20,7 @@ import yaml
 
 from bench.case import NOTE, Case, Measurement, numbers, option
 from bench.cases import flags, pins
+from bench.cases.flags import Flag
 from bench.clock import guarded
 from bench.record import ROOT, Row
 from bench.simulate import simulate, what_failed
@@ -45,7 +46,7 @@ class Run:
         frames: Frames, the first being the rest shape.
     """
 
-    pattern: int
+    pattern: Flag
     solver: str
     cells: int
     frames: int
@@ -173,7 +174,7 @@ def measured(run: Run, options: argparse.Namespace, known: dict[str, Cloth], row
     return dict(row)
 
 
-def turns(pattern: int, options: argparse.Namespace) -> list[Run]:
+def turns(pattern: Flag, options: argparse.Namespace) -> list[Run]:
     """The solutions of a flag from coarse to fine, Blender's and ours by turns."""
     sides = [[Run(pattern, name, cells, options.frames) for cells in asked]
              for name, asked in (("blender", options.blender_cells), ("ours", options.our_cells))]  # fmt: skip
@@ -182,7 +183,7 @@ def turns(pattern: int, options: argparse.Namespace) -> list[Run]:
 
 def rows(options: argparse.Namespace, result: Row) -> Iterator[Measurement]:
     """First what all are compared with, solved if it is not there; then, in rounds, both solve each flag."""
-    wanted, known, told = options.flags, dict[int, dict[str, Cloth]](), dict[Run, Row]()
+    wanted, known, told = options.flags, dict[Flag, dict[str, Cloth]](), dict[Run, Row]()
     result["versions"] = result["versions"] | {"bpy": version(options.blender)}
     result |= {"frames": options.frames, "rounds": options.rounds, "note": options.note}
     result["rows"] = [row for row in result.get("rows", []) if row["flag"] not in wanted]

@@ -37,7 +37,7 @@ Flag = int | str  # the number of a pattern, or the name of a file in configs/fl
 
 REFERENCES: dict[Flag, FlagPattern] = {
     **NUMBERED,
-    **{name: read_flag(ROOT / "configs" / "flags" / f"{name}.yaml") for name in ("curtain", "light")},
+    **{name: read_flag(ROOT / "configs" / "flags" / f"{name}.yaml") for name in ("curtain", "light", "pennant")},
 }
 """All flags with a reference: the numbered patterns, and those of configs/flags."""
 

@@ -1,0 +1,95 @@
+"""``bench.py refinement``: whether a finer grid is closer to Blender's cloth, on every flag that has a reference."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from functools import partial
+
+from bench.case import NOTE, Case, Measurement, numbers, option
+from bench.cases.blender import Run, apart, reference, version
+from bench.cases.flags import REFERENCES, Flag, flags_named
+from bench.clock import guarded
+from bench.record import Row
+
+from flag_motion import Cloth  # isort: skip  `flags` has added the folder of the data sets
+from flag_reference import FlagPattern  # isort: skip
+
+RIPPLE = 0.003
+"""Amplitude of the ripple of splats made in code [m], which a reference at rest may lack."""
+UNEVEN: Flag = "pennant"
+"""The flag that is also solved with that ripple."""
+
+
+@dataclass(frozen=True)
+class Rippled(Run):
+    """A flag that is flat in its reference, with :data:`RIPPLE`."""
+
+    def flag(self) -> FlagPattern:
+        """See :meth:`Run.flag`."""
+        return replace(super().flag(), ripple=RIPPLE)
+
+    def arguments(self) -> list[str]:
+        """See :meth:`Run.arguments`."""
+        return [*super().arguments(), f"--scene.generator.init_args.ripple={RIPPLE}"]
+
+
+def _distance(run: Run, options: argparse.Namespace, to: Cloth) -> Row:
+    """Solve a flag by ours, and compare it."""
+    positions, found = run.solve(options.blender)
+    per_second = run.flag().fps / (run.frames - 1)
+    return found | {"per_simulated_s": found["seconds"] * per_second} | apart(run.flag(), run.cloth(positions), to)
+
+
+def _itself(make: type[Run], pattern: Flag, options: argparse.Namespace) -> tuple[Cloth, Row]:
+    """The finer of two meshes of Blender's, and how far the other is from it."""
+    coarser, finer = (make(pattern, "blender", cells, options.frames) for cells in options.blender_cells)
+    known = reference(finer, options)
+    return known, apart(finer.flag(), reference(coarser, options), known) | {"cells": options.blender_cells}
+
+
+def rows(options: argparse.Namespace, result: Row) -> Iterator[Measurement]:
+    """Each flag on grids from coarse to fine; then the uneven one, on both sides and against the flat one."""
+    result["versions"] = result["versions"] | {"bpy": version(options.blender)}
+    result |= {"frames": options.frames, "note": options.note}
+    for pattern in options.flags:
+        flat, about = _itself(Run, pattern, options)
+        yield ("references", str(pattern)), about.copy
+        for cells in options.grids:
+            work = partial(_distance, Run(pattern, "ours", cells, options.frames), options, flat)
+            yield ("rows", {"flag": pattern, "cells": cells}), partial(guarded, work)
+        if pattern == UNEVEN:
+            uneven, about = _itself(Rippled, pattern, options)
+            about["to_flat"] = apart(REFERENCES[pattern], uneven, flat)
+            yield ("uneven", "reference"), about.copy
+            for cells in options.grids:
+                work = partial(_uneven, Rippled(pattern, "ours", cells, options.frames), options, uneven, flat)
+                yield ("uneven", str(cells)), partial(guarded, work)
+
+
+def _uneven(run: Run, options: argparse.Namespace, uneven: Cloth, flat: Cloth) -> Row:
+    """Solve a rippled flag by ours, and compare it with a rippled and with a flat reference."""
+    positions, found = run.solve(options.blender)
+    ours = run.cloth(positions)
+    return found | apart(run.flag(), ours, uneven) | {"to_flat": apart(run.flag(), ours, flat)}
+
+
+CASE = Case(
+    "Compare flags on finer and finer grids with Blender's cloth on a fine mesh.",
+    rows,
+    (
+        option("--blender", "a Python that has bpy; it may have an environment of its own", default=sys.executable),
+        option("--references", "folder of the motions to compare with; what it lacks is solved first",
+               default="outputs/blender"),
+        option("--flags", "separated by commas", type=flags_named, default=",".join(map(str, REFERENCES))),
+        numbers("--blender_cells", "cells along the longer side of the reference, and of a finer one",
+                default="120,160"),
+        numbers("--grids", "cells of our grids along the longer side", default="30,40,60,80"),
+        option("--frames", "frames, the first being the rest shape", type=int, default=125),
+        NOTE,
+    ),
+    page="flag_benchmark.md",
+    device=False,
+)  # fmt: skip

@@ -1,0 +1,83 @@
+"""Tables and the plot of ``bench.py refinement``: the distance of each flag from its reference, grid by grid."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+
+from bench.tables.plots import plain_numbers, save_figure, subplots
+from bench.tables.render import Goal, Row, judged, table
+
+PAGE = "flag_benchmark.md"
+
+
+def name_of(flag: int | str) -> str:
+    """A flag as the tables call it."""
+    return f"pattern {flag}" if isinstance(flag, int) else flag
+
+
+def _fronts(result: Row) -> Iterator[tuple[int | str, float, list[Row]]]:
+    """Of each flag that has rows: its name, how well the reference knows itself, and its rows from coarse to fine."""
+    rows = [row for row in result["rows"] if "failed" not in row]
+    for flag in sorted({row["flag"] for row in rows}, key=str):
+        own = sorted((row for row in rows if row["flag"] == flag), key=lambda row: row["cells"])
+        yield flag, result["references"][str(flag)]["chamfer"], own
+
+
+def _rows(result: Row) -> Iterator[Row]:
+    for flag, itself, own in _fronts(result):
+        for row in own:
+            yield {"flag": name_of(flag), "itself": itself, "cells": row["cells"], "chamfer": row["chamfer"]}
+
+
+table(PAGE, "refinement.rows", "refinement_*", _rows,
+      "flag = {flag} | *{cells} cells = {chamfer:.2f %} | reference against itself = {itself:.2f %}",
+      before="{source}\n\nThe first {frames} frames. Cells along the longer side.[[ {note}]]")  # fmt: skip
+
+
+def _worse(result: Row) -> Iterator[Row]:
+    """Of each flag, by how much its distance grows at most from a grid to a finer one, and its last distance."""
+    for flag, itself, own in _fronts(result):
+        distances = [row["chamfer"] for row in own]
+        grown = [fine - min(distances[:k]) for k, fine in enumerate(distances) if k]
+        last = {"cells": own[-1]["cells"], "last": distances[-1], "most": max(0.02, itself)}
+        yield {"flag": name_of(flag), "itself": itself, "grown": max(0.0, *grown)} | last
+
+
+table(PAGE, "refinement.goals", "refinement_*", judged([
+    Goal("{flag}: no grid is farther than a coarser one by more than the reference from itself",
+         "{grown:.2f %} (reference itself: {itself:.2f %})", "grown <= itself"),
+    Goal("{flag}: within 2 %, or the reference's own distance, on {cells} cells", "{last:.2f %}", "last <= most"),
+    ], _worse))  # fmt: skip
+
+
+def _uneven(result: Row) -> Iterator[Row]:
+    found = result.get("uneven", {})
+    for name, row in found.items():
+        if "failed" not in row:
+            by = "Blender's finer mesh" if name == "reference" else f"ours, {name} cells"
+            yield {"by": by, "chamfer": None if name == "reference" else row["chamfer"], "to_flat": row["to_flat"]}
+
+
+table(PAGE, "refinement.uneven", "refinement_*", _uneven, """
+    with the ripple = {by} | distance to the reference with the ripple = {chamfer:.2f %} |
+    distance to the flat reference = {to_flat.chamfer:.2f %}
+    """)  # fmt: skip
+
+
+def plot(results: list[Row], pictures: Path) -> None:
+    """Draw ``refinement.png`` of a record: distance against time, a line for each flag and a point for each grid."""
+    (result,) = results
+    figure, axis = subplots(figsize=(8, 5))
+    for number, (flag, itself, own) in enumerate(_fronts(result)):
+        colour = f"C{number}"
+        times, distances = [row["per_simulated_s"] for row in own], [100 * row["chamfer"] for row in own]
+        axis.loglog(times, distances, "o-", color=colour, label=f"{name_of(flag)} (reference: {100 * itself:.2f} %)")
+        axis.plot(times[-1], 100 * itself, "_", color=colour, markersize=14)
+    axis.set_xlabel("seconds per simulated second")
+    axis.set_ylabel("distance [% of the longer side]")
+    axis.set_title("Grids from coarse to fine; dashes: the reference against itself", fontsize=10)
+    axis.grid(True, which="major", linewidth=0.4, alpha=0.6)
+    plain_numbers(axis)
+    axis.legend(fontsize=8)
+    save_figure(figure, pictures / "refinement.png")
