@@ -13,7 +13,7 @@ from gaussian_swaying.aero.patches import PatchSums
 from gaussian_swaying.geometry.groups import sums
 from gaussian_swaying.geometry.linalg import cofactor
 
-LAWS = ("paper", "projected", "linear")
+LAWS = ("paper", "projected", "linear", "cross_flow")
 
 
 Product = tuple[Tensor | float, Tensor | float]
@@ -26,7 +26,7 @@ def drag_speed(wind: Tensor, speed: Tensor, law: str) -> Tensor:
     Args:
         wind: Air velocity [m/s], broadcastable to (..., P, 3).
         speed: Relative speed [m/s], shape (..., P).
-        law: One of :data:`LAWS`.
+        law: One of :data:`LAWS`; with ``cross_flow`` it is a bound.
     """
     return torch.linalg.vector_norm(wind, dim=-1).expand_as(speed) if law == "linear" else speed
 
@@ -36,6 +36,7 @@ def wind_terms(
     relative: Tensor,
     facing: Product,
     across: Product,
+    pressed: Tensor,
     tangent: Product,
     *,
     drag: Tensor | float,
@@ -54,6 +55,8 @@ def wind_terms(
         relative: Relative wind [m/s], shape (..., P, 3).
         facing: Area vector s on the side that meets the flow; per area for one patch, (..., P, 3).
         across: The part of the flow through the patch, :math:`A\, (\mathbf{v}_r \cdot \mathbf{n})\, \mathbf{n}`.
+        pressed: The same times the size of the flow through the patch,
+            :math:`A\, |\mathbf{v}_r \cdot \mathbf{n}| (\mathbf{v}_r \cdot \mathbf{n})\, \mathbf{n}`.
         tangent: The part along it, and what it is divided by; with a unit tangent, area times direction.
         drag: C_D.
         friction: C_F.
@@ -68,6 +71,8 @@ def wind_terms(
     speed = torch.linalg.vector_norm(relative, dim=-1, keepdim=True)
     if law == "paper":
         pressure = drag * (speed * speed * facing[0]) * facing[1]
+    elif law == "cross_flow":
+        pressure = drag * pressed
     else:
         pressure = drag * (drag_speed(wind, speed[..., 0], law)[..., None] * across[0]) * across[1]
     rub = friction * speed.square() if unit_tangent else friction * speed
@@ -115,7 +120,10 @@ def aero_force(
             ``projected`` multiplies the drag by n·d, as for a plate, so that it vanishes edge-on. ``linear`` is the
             drag of Blender's cloth, :math:`\tfrac12 \rho A C_D |\mathbf{u}| (\mathbf{v}_r \cdot \mathbf{n})\,
             \mathbf{n}`: that of ``projected`` on a patch at rest, but linear in the velocity of the patch. In still
-            air this drag is zero, however the patch moves. Friction and lift are those of the other laws.
+            air this drag is zero, however the patch moves. ``cross_flow`` is the drag of the flow along the normal
+            alone, :math:`\tfrac12 \rho A C_D |\mathbf{v}_r \cdot \mathbf{n}| (\mathbf{v}_r \cdot \mathbf{n})\,
+            \mathbf{n}` (the independence principle: Taylor 1952; Gosselin, de Langre & Machado-Almeida 2010, JFM 650,
+            319, for plates that bend). Friction and lift are those of the other laws.
         lift_direction: ``side`` is the paper's d x n, a force perpendicular to flow and normal; ``lift`` is (d x n) x
             d, in the plane of flow and normal.
         unit_tangent: Normalise d^t (a possible reading of the paper's hat) instead of using the projection itself.
@@ -141,8 +149,8 @@ def aero_force(
     tangent = relative - along * normal
     size = _length(tangent) if unit_tangent else 1.0
     terms = wind_terms(
-        wind, relative, (1.0, oriented), (sign * along, oriented), (tangent, size), drag=drag, friction=friction,
-        lift=lift, law=law, lift_direction=lift_direction, unit_tangent=unit_tangent,
+        wind, relative, (1.0, oriented), (sign * along, oriented), along * along * oriented, (tangent, size), drag=drag,
+        friction=friction, lift=lift, law=law, lift_direction=lift_direction, unit_tangent=unit_tangent,
     )  # fmt: skip
     return (0.5 * air_density) * area[..., None] * terms
 
@@ -196,6 +204,11 @@ def grouped_force(
     signed = sums(sign * patches.vector, patches.point, len(relative))
     facing = (cof * signed[..., None, :]).sum(-1)  # s
     area = growth * rest
+    pressed = torch.zeros_like(across)
+    if law == "cross_flow":
+        flow = dots * dots.abs() / patches.vector.square().sum(-1, keepdim=True)
+        pressed = (cof * sums(flow * patches.vector, patches.point, len(relative))[..., None, :]).sum(-1)
+        pressed = pressed / growth.square()[..., None]
     tangent = area[..., None] * relative - across
     if unit_tangent:
         length = torch.linalg.vector_norm(patches.vector, dim=-1, keepdim=True)
@@ -205,8 +218,8 @@ def grouped_force(
         flat = length * flat / _length(flat)
         tangent = (cof * sums(flat, patches.point, len(relative))[..., None, :]).sum(-1)
     terms = wind_terms(
-        wind, relative, (facing, 1.0), (across, 1.0), (tangent, 1.0), drag=drag, friction=friction, lift=lift, law=law,
-        lift_direction=lift_direction, unit_tangent=unit_tangent,
+        wind, relative, (facing, 1.0), (across, 1.0), pressed, (tangent, 1.0), drag=drag, friction=friction, lift=lift,
+        law=law, lift_direction=lift_direction, unit_tangent=unit_tangent,
     )  # fmt: skip
     scale = 0.5 * air_density * (rest > 0).to(rest)
     if max_area_ratio < math.inf:
@@ -265,7 +278,7 @@ class AeroForce(nn.Module):
         C_F: Friction coefficient.
         C_L: Lift coefficient.
         air_density: Density of the air [kg/m³].
-        law: ``paper``, ``projected`` or ``linear``.
+        law: ``paper``, ``projected``, ``linear`` or ``cross_flow``.
         lift_direction: ``side`` or ``lift``.
         unit_tangent: Normalise the tangential flow direction.
         drag_step: ``explicit``, or ``semi_implicit``: the solver evaluates the drag at the velocity at the end of the
@@ -287,7 +300,7 @@ class AeroForce(nn.Module):
         *,
         C_L: Number = 0.01,
         air_density: float = 1.225,
-        law: Literal["paper", "projected", "linear"] = "paper",
+        law: Literal["paper", "projected", "linear", "cross_flow"] = "paper",
         lift_direction: Literal["side", "lift"] = "side",
         unit_tangent: bool = False,
         drag_step: Literal["explicit", "semi_implicit"] = "explicit",
@@ -329,7 +342,7 @@ class AeroForce(nn.Module):
         """True if less than 5 % of the force depends on the side of the patch that the flow meets."""
         drag, friction, lift = (float(c.detach()) for c in (self.C_D, self.C_F, self.C_L.abs()))
         sided = lift / max(drag + friction + lift, 1e-30)
-        return self.law != "paper" and not self.unit_tangent and sided < 0.05
+        return self.law in ("projected", "linear") and not self.unit_tangent and sided < 0.05
 
     def rate(self, speed: Tensor, area: Tensor, mass: Tensor) -> Tensor:
         """:func:`drag_rate` [1/s], shape (..., P), with the coefficients of this component.

@@ -8,6 +8,7 @@ from gaussian_swaying.geometry.linalg_triton import (
     cofactor_change,
     cross3,
     dot3,
+    load3,
     matmul,
     matvec,
     outer3,
@@ -20,10 +21,10 @@ from gaussian_swaying.kernels.language import tl, triton
 
 @triton.jit
 def wind_terms_adjoint(
-    air, r, facing, across, tangent, a, drag, friction, lift,
+    air, r, facing, across, through, tangent, a, drag, friction, lift,
     LAW: tl.constexpr, LIFT: tl.constexpr, UNIT: tl.constexpr,
 ):  # fmt: skip
-    """Gradients of a . f of ``force_triton.wind_terms`` by its first five arguments and by drag, friction and lift."""
+    """Gradients of a . f of ``force_triton.wind_terms`` by its first six arguments and by drag, friction and lift."""
     speed = tl.sqrt(dot3(r, r))
     inverse = 1.0 / tl.maximum(speed, 1e-30)
     square = speed * speed
@@ -33,10 +34,15 @@ def wind_terms_adjoint(
     by_air = (zero, zero, zero)
     by_facing = (zero, zero, zero)
     by_across = (zero, zero, zero)
+    by_through = (zero, zero, zero)
     if LAW == 0:
         pressure = square * af
         by_r = scale3(2 * drag * af, r)
         by_facing = scale3(drag * square, a)
+    elif LAW == 3:
+        pressure = dot3(a, through)
+        by_r = by_air
+        by_through = scale3(drag, a)
     else:
         ac = dot3(a, across)
         if LAW == 2:
@@ -68,7 +74,7 @@ def wind_terms_adjoint(
         side = speed * product
         by_r = axpy3(1.0, by_r, lift, axpy3(product * inverse, r, speed, turn))
         by_facing = axpy3(1.0, by_facing, lift * speed, cross3(a, r))
-    return by_air, by_r, by_facing, by_across, by_tangent, (pressure, shear, side)
+    return by_air, by_r, by_facing, by_across, by_through, by_tangent, (pressure, shear, side)
 
 
 @triton.jit
@@ -92,16 +98,21 @@ def wind_force_adjoint(F, velocity, patch, numbers, air, table, a, OPTIONS: tl.c
     if OPTIONS[2]:
         length = tl.maximum(tl.sqrt(dot3(tangent, tangent)), 1e-18)  # finite where there is no tangent
         tangent = scale3(1 / length, tangent)
-    by_air, by_r, by_facing, by_across, by_tangent, parts = wind_terms_adjoint(
-        air, relative, scale3(sign, n), scale3(along, n), tangent, a, drag, friction, lift,
+    by_air, by_r, by_facing, by_across, by_through, by_tangent, parts = wind_terms_adjoint(
+        air, relative, scale3(sign, n), scale3(along, n), scale3(sign * along * along, n), tangent, a,
+        drag, friction, lift,
         OPTIONS[0], OPTIONS[1], OPTIONS[2],
     )  # fmt: skip
     if OPTIONS[2]:
         by_tangent = scale3(1 / length, axpy3(1.0, by_tangent, -dot3(by_tangent, tangent), tangent))
     by_across = axpy3(1.0, by_across, -1.0, by_tangent)
-    through = dot3(by_across, n)
-    by_r = axpy3(1.0, axpy3(1.0, by_r, 1.0, by_tangent), through, n)
-    by_n = axpy3(1.0, axpy3(sign, by_facing, along, by_across), through, relative)
+    by_along = dot3(by_across, n)
+    by_n = axpy3(sign, by_facing, along, by_across)
+    if OPTIONS[0] == 3:
+        by_along += 2 * sign * along * dot3(by_through, n)
+        by_n = axpy3(1.0, by_n, sign * along * along, by_through)
+    by_r = axpy3(1.0, axpy3(1.0, by_r, 1.0, by_tangent), by_along, n)
+    by_n = axpy3(1.0, by_n, by_along, relative)
     whole = drag * parts[0] + friction * parts[1] + lift * parts[2]
     half = half_density * patch[3]
     area = half * tl.minimum(size, widest)
@@ -123,6 +134,19 @@ def wind_force_adjoint(F, velocity, patch, numbers, air, table, a, OPTIONS: tl.c
 
 
 @triton.jit
+def flow_adjoint(table, first, count, w, by_q):
+    """Gradient by w of the last sum of ``force_triton.sums_over_patches`` times a vector."""
+    zero = w[0] * 0
+    by_w = (zero, zero, zero)
+    for k in range(0, tl.max(count)):
+        known = k < count
+        b = load3(table, 1, first + 8 + 4 * k, known)
+        share = 2 * tl.abs(dot3(b, w)) * dot3(b, by_q) / tl.maximum(dot3(b, b), 1.2e-38)
+        by_w = axpy3(1.0, by_w, tl.where(known, share, 0.0), b)
+    return by_w
+
+
+@triton.jit
 def wind_on_groups_adjoint(F, velocity, place, numbers, air, table, a, OPTIONS: tl.constexpr):
     """As :func:`wind_force_adjoint`, for ``force_triton.wind_on_groups`` without a unit tangent.
 
@@ -135,7 +159,7 @@ def wind_on_groups_adjoint(F, velocity, place, numbers, air, table, a, OPTIONS: 
     drag, friction, lift, half, widest = numbers
     c = cofactor(F)
     w = matvec(transpose(c), r)
-    tensor, rest, s, _u = sums_over_patches(table, first, count, w, False)
+    tensor, rest, s, _u, q = sums_over_patches(table, first, count, w, OPTIONS[0], False)
     turned = matmul(c, tensor)
     # a lane without patches gets an area, whose force is multiplied by zero
     whole = tl.where(real, rest, 1.0)
@@ -148,9 +172,12 @@ def wind_on_groups_adjoint(F, velocity, place, numbers, air, table, a, OPTIONS: 
     across = (across[0] / growth, across[1] / growth, across[2] / growth)
     facing = matvec(c, s)
     area = growth * rest
+    through = across
+    if OPTIONS[0] == 3:
+        through = scale3(1.0 / (growth * growth), matvec(c, q))
     tangent = axpy3(area, r, -1.0, across)
-    by_air, by_r, by_facing, by_across, by_tangent, parts = wind_terms_adjoint(
-        air, r, facing, across, tangent, a, drag, friction, lift, OPTIONS[0], OPTIONS[1], False
+    by_air, by_r, by_facing, by_across, by_through, by_tangent, parts = wind_terms_adjoint(
+        air, r, facing, across, through, tangent, a, drag, friction, lift, OPTIONS[0], OPTIONS[1], False
     )
     by_r = axpy3(1.0, by_r, area, by_tangent)
     by_across = axpy3(1.0, by_across, -1.0, by_tangent)
@@ -160,11 +187,17 @@ def wind_on_groups_adjoint(F, velocity, place, numbers, air, table, a, OPTIONS: 
     by_growth = by_area * rest - dot3(by_across, across) / growth - tl.where(growth > widest, total / growth, 0.0)
     scaled = (by_across[0] / growth, by_across[1] / growth, by_across[2] / growth)
     by_w = matvec(transpose(turned), scaled)
+    by_pressed = scale3(1.0 / (growth * growth), by_through)
+    if OPTIONS[0] == 3:
+        by_growth -= 2 * dot3(by_through, through) / growth
+        by_w = axpy3(1.0, by_w, 1.0, flow_adjoint(table, first, count, w, matvec(transpose(c), by_pressed)))
     by_r = axpy3(1.0, by_r, 1.0, matvec(c, by_w))
     by_grown = by_growth / (2 * growth * whole)
     by_turned = axpy9(1.0, outer3(scaled, w), by_grown, c)
     by_c = axpy9(1.0, outer3(by_facing, s), 1.0, matmul(by_turned, tensor))
     by_c = axpy9(1.0, by_c, 1.0, outer3(r, by_w))
+    if OPTIONS[0] == 3:
+        by_c = axpy9(1.0, by_c, 1.0, outer3(by_pressed, q))
     by_c = axpy9(1.0, by_c, by_grown, turned)
     scale = tl.where(real, half * cap, 0.0)
     by_c = axpy9(scale, by_c, 0.0, c)

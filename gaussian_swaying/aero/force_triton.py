@@ -18,14 +18,20 @@ from gaussian_swaying.kernels.language import tl, triton
 
 @triton.jit
 def wind_terms(
-    air, relative, facing, across, tangent, drag, friction, lift,
+    air, relative, facing, across, through, tangent, drag, friction, lift,
     LAW: tl.constexpr, LIFT: tl.constexpr, UNIT: tl.constexpr,
 ):  # fmt: skip
-    """``force.wind_terms``: force per half density, and the resistance per half density and area."""
+    """``force.wind_terms``: force per half density, and the resistance per half density and area.
+
+    ``through`` is ``pressed`` there.
+    """
     speed = tl.sqrt(dot3(relative, relative))
     blow = tl.sqrt(dot3(air, air)) if LAW == 2 else speed
     pressed = across
     pressure = drag * blow
+    if LAW == 3:
+        pressed = through
+        pressure = drag
     if LAW == 0:
         pressed = facing
         pressure = drag * speed * speed
@@ -87,8 +93,8 @@ def wind_force(F, velocity, position, patch, numbers, now, table, OPTIONS: tl.co
         size = tl.maximum(tl.sqrt(dot3(tangent, tangent)), 1.2e-38)
         tangent = (tangent[0] / size, tangent[1] / size, tangent[2] / size)
     force, yielding = wind_terms(
-        air, relative, scale3(sign, normal), scale3(along, normal), tangent, numbers[0], numbers[1], numbers[2],
-        OPTIONS[0], OPTIONS[1], OPTIONS[2],
+        air, relative, scale3(sign, normal), scale3(along, normal), scale3(sign * along * along, normal), tangent,
+        numbers[0], numbers[1], numbers[2], OPTIONS[0], OPTIONS[1], OPTIONS[2],
     )  # fmt: skip
     scale = numbers[3] * area
     resistance = area * 0
@@ -98,11 +104,18 @@ def wind_force(F, velocity, position, patch, numbers, now, table, OPTIONS: tl.co
 
 
 @triton.jit
-def add_direction(s, u, b, w, known, UNIT: tl.constexpr):
-    """Add the area vector b to the sums of signed vectors and (UNIT) of tangents of length |b|."""
+def add_direction(s, u, q, b, w, known, LAW: tl.constexpr, UNIT: tl.constexpr):
+    """Add the area vector b to three sums.
+
+    They are those of signed vectors, (UNIT) of tangents of length |b|, and (LAW 3) of b times the flow through it per
+    area, times the size of that flow.
+    """
     along = dot3(b, w)
     sign = tl.where(along < 0, -1.0, 1.0)
     s = (s[0] + sign * b[0], s[1] + sign * b[1], s[2] + sign * b[2])
+    if LAW == 3:
+        flow = sign * along * along / tl.maximum(dot3(b, b), 1.2e-38)
+        q = (q[0] + flow * b[0], q[1] + flow * b[1], q[2] + flow * b[2])
     if UNIT:
         squared = tl.maximum(dot3(b, b), 1.2e-38)
         share = along / squared
@@ -112,11 +125,11 @@ def add_direction(s, u, b, w, known, UNIT: tl.constexpr):
         scale = tl.sqrt(squared) / tl.maximum(tl.sqrt(x0 * x0 + x1 * x1 + x2 * x2), 1.2e-38)
         scale = tl.where(known, scale, 0.0)
         u = (u[0] + scale * x0, u[1] + scale * x1, u[2] + scale * x2)
-    return s, u
+    return s, u, q
 
 
 @triton.jit
-def sums_over_patches(table, first, count, w, UNIT: tl.constexpr):
+def sums_over_patches(table, first, count, w, LAW: tl.constexpr, UNIT: tl.constexpr):
     """The rows of ``PatchSums`` of each point: tensor and its trace, and the sums of :func:`add_direction`."""
     real = count > 0
     t0 = tl.load(table + first, real, 0.0)
@@ -130,17 +143,18 @@ def sums_over_patches(table, first, count, w, UNIT: tl.constexpr):
     zero = rest * 0
     s = (zero, zero, zero)
     u = (zero, zero, zero)
+    q = (zero, zero, zero)
     for k in range(0, tl.max(count), 4):  # four rows at once
         row = first + 8 + 4 * k
         b0 = load3(table, 1, row, k < count)
         b1 = load3(table, 1, row + 4, k + 1 < count)
         b2 = load3(table, 1, row + 8, k + 2 < count)
         b3 = load3(table, 1, row + 12, k + 3 < count)
-        s, u = add_direction(s, u, b0, w, k < count, UNIT)
-        s, u = add_direction(s, u, b1, w, k + 1 < count, UNIT)
-        s, u = add_direction(s, u, b2, w, k + 2 < count, UNIT)
-        s, u = add_direction(s, u, b3, w, k + 3 < count, UNIT)
-    return tensor, rest, s, u
+        s, u, q = add_direction(s, u, q, b0, w, k < count, LAW, UNIT)
+        s, u, q = add_direction(s, u, q, b1, w, k + 1 < count, LAW, UNIT)
+        s, u, q = add_direction(s, u, q, b2, w, k + 2 < count, LAW, UNIT)
+        s, u, q = add_direction(s, u, q, b3, w, k + 3 < count, LAW, UNIT)
+    return tensor, rest, s, u, q
 
 
 @triton.jit
@@ -159,7 +173,7 @@ def wind_on_groups(F, velocity, position, place, numbers, now, table, OPTIONS: t
     drag, friction, lift, half_density, widest = numbers
     c = cofactor(F)
     w = matvec(transpose(c), relative)
-    tensor, rest, s, u = sums_over_patches(table, first, count, w, OPTIONS[2])
+    tensor, rest, s, u, q = sums_over_patches(table, first, count, w, OPTIONS[0], OPTIONS[2])
     r0 = matvec(tensor, (c[0], c[1], c[2]))
     r1 = matvec(tensor, (c[3], c[4], c[5]))
     r2 = matvec(tensor, (c[6], c[7], c[8]))
@@ -171,12 +185,15 @@ def wind_on_groups(F, velocity, position, place, numbers, now, table, OPTIONS: t
     across = (across[0] / growth, across[1] / growth, across[2] / growth)
     facing = matvec(c, s)
     area = growth * rest
+    through = across
+    if OPTIONS[0] == 3:
+        through = scale3(1.0 / (growth * growth), matvec(c, q))
     if OPTIONS[2]:
         tangent = matvec(c, u)
     else:
         tangent = axpy3(area, relative, -1.0, across)
     force, yielding = wind_terms(
-        air, relative, facing, across, tangent, drag, friction, lift, OPTIONS[0], OPTIONS[1], OPTIONS[2]
+        air, relative, facing, across, through, tangent, drag, friction, lift, OPTIONS[0], OPTIONS[1], OPTIONS[2]
     )
     scale = tl.where(real, half_density * tl.minimum(widest / growth, 1.0), 0.0)
     resistance = scale * 0

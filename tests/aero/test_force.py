@@ -79,7 +79,7 @@ def test_sign_of_the_normal_does_not_matter(law):
     assert bool(((drag * (wind - velocity)).sum(-1) >= 0).all())
 
 
-@pytest.mark.parametrize("law", ["paper", "projected"])
+@pytest.mark.parametrize("law", ["paper", "projected", "cross_flow"])
 def test_quadratic_linear_and_relative(law, device, dtype):
     wind, velocity, normal, area = (t.to(device, dtype) for t in _random())
     aero = AeroForce(law=law)
@@ -105,6 +105,21 @@ def test_linear_law():
     twice = aero_force(wind, 2 * velocity, normal, area, law="linear", **options)
     torch.testing.assert_close(twice - at_rest, 2 * (force - at_rest))
     assert not bool(aero_force(torch.zeros(3).double(), velocity, normal, area, law="linear", **options).any())
+
+
+def test_cross_flow_law():
+    """1/2 rho A C_D |v_r.n| (v_r.n) n: as `projected` across the flow, and half of it at 30 degrees incidence."""
+    wind, velocity, normal, area = _random()
+    options = {"drag": 0.7, "friction": 0.0, "lift": 0.0}
+    force = aero_force(wind, velocity, normal, area, law="cross_flow", **options)
+    through = ((wind - velocity) * normal).sum(-1)
+    torch.testing.assert_close(force, (0.5 * RHO * 0.7 * through.abs() * through * area)[:, None] * normal)
+    tilted, across = _vector(0.5, 0.75**0.5, 0), _vector(1, 0, 0)
+    for normal, share in ((across, 1.0), (tilted, 0.5)):
+        found, projected = (
+            _force((2.0, 0, 0), normal.tolist(), drag=0.5, law=law) for law in ("cross_flow", "projected")
+        )
+        torch.testing.assert_close(found, share * projected)
 
 
 def test_linear_drag_rate_and_resistance():
@@ -207,7 +222,7 @@ def test_drag_rate_is_the_slope_of_the_force():
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        ({"law": "plate"}, "`law` to be one of paper, projected, linear"),
+        ({"law": "plate"}, "`law` to be one of paper, projected, linear, cross_flow"),
         ({"lift_direction": "up"}, "`lift_direction` to be one of side, lift"),
         ({"C_D": -0.1}, "`C_D` to not be negative"),
         ({"air_density": -1.0}, "`air_density` to not be negative"),

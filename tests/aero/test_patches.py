@@ -18,6 +18,7 @@ LAWS = {
     "projected": {"drag": 1.28, "friction": 0.0, "lift": 0.0, "law": "projected"},
     "projected with all terms": {"drag": 0.5, "friction": 0.4, "lift": 0.3, "law": "projected"},
     "linear with all terms": {"drag": 0.5, "friction": 0.4, "lift": 0.3, "law": "linear"},
+    "cross flow with all terms": {"drag": 0.5, "friction": 0.4, "lift": 0.3, "law": "cross_flow"},
     "paper with lift": {"drag": 0.5, "friction": 0.1, "lift": 0.5, "law": "paper", "lift_direction": "lift"},
     "unit tangent": {"drag": 0.5, "friction": 0.4, "lift": 0.1, "law": "paper", "unit_tangent": True},
 }
@@ -72,7 +73,9 @@ def test_force_is_the_sum_over_the_patches(law, spread):
         torch.testing.assert_close(now.sum(), area.sum())
 
 
-@pytest.mark.parametrize("law", ["projected", "projected with all terms", "linear with all terms", "paper"])
+@pytest.mark.parametrize(
+    "law", ["projected", "projected with all terms", "linear with all terms", "cross flow with all terms", "paper"]
+)
 def test_strain_costs_less_than_itself(law):
     """The mean growth of area stands for that of each patch: exact for one direction, else no worse than the strain."""
     velocity = torch.zeros(POINTS, 3, dtype=torch.float64)
