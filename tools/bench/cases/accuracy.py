@@ -9,13 +9,14 @@ from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import replace
 from functools import partial
+from itertools import product
 from typing import Any
 
 import torch
 
 from bench.case import Case, Measurement, option
 from bench.clock import guarded
-from bench.problems import bars, beams, flags, plates, strips, surfaces, vortex
+from bench.problems import bars, beams, flags, plates, reconfiguration, strips, surfaces, vortex
 from bench.problems.granular.angles import plane_strain_angle, shear_angle, triaxial_angle
 from bench.problems.granular.columns import column_collapse
 from bench.problems.granular.layers import angle_of_repose
@@ -119,6 +120,10 @@ def cases(device: str, thorough: bool) -> Iterable[tuple[str, Row, Callable[[], 
         for law, ks in (("paper", (0.25, 0.5, 0.75)), ("projected", (0.25, 0.5, 1.0, 2.0))):
             for k in ks:
                 yield case("hinged plate", plates.hinged_plate, variant, k=k, law=law)
+    for law, cauchy, cells in product(reconfiguration.POWERS, (1.0, 10.0, 100.0, 1000.0), (16, 32)):
+        yield case(
+            "plate that bends in a flow", reconfiguration.reconfiguration, "total", law=law, cauchy=cauchy, cells=cells
+        )
     for shape in ("plate", "sphere"):
         for law in ("paper", "projected"):
             for count, overlap in ((500, 0.5), (2000, 0.3), (2000, 1.0), (6000, 0.5)):

@@ -1,4 +1,4 @@
-r"""A plate that bends in a steady flow: its drag, against the elastica, and the wind at which an inverted flag diverges.
+r"""A plate that bends in a steady flow: its drag against that of the elastica.
 
 Gosselin, de Langre & Machado-Almeida (2010), "Drag reduction of flexible plates by reconfiguration", JFM 650, 319: a
 plate held across the flow in its middle, each half of length l bends with the flow. One number describes it, the Cauchy
@@ -27,9 +27,7 @@ BEHIND = 2
 """Cells of the plate that are held, before it begins."""
 POWERS = {"projected": 1, "cross_flow": 2}
 """The laws, and the power of the cosine between normal and flow that their pressure on a plate at rest follows."""
-DIVERGENCE = 6.330
-r""":math:`\tfrac12 \rho C_D U^2 l^3 / D` at which a plate held at its downwind end no longer returns, for a pressure
-proportional to its slope: the lowest root for :math:`D w'''' = -q w'`, with the exponentials of its three cube roots."""
+HELD = Box([None] * 3, [None, None, 0.0])
 
 
 def _from_the_tip(lean: float, law: str) -> tuple[float, float, float]:
@@ -78,9 +76,10 @@ def elastica(cauchy: float, law: str) -> tuple[float, float]:
     return float(drag), float(tip)
 
 
-def _plate(cells: int, slenderness: float, density: float, settings: Settings) -> tuple[MaterialPoints, torch.Tensor, float]:
+def _plate(
+    cells: int, slenderness: float, density: float, settings: Settings
+) -> tuple[MaterialPoints, torch.Tensor, float]:
     """A plate from z = 0 to z = l across y, in three layers with Simpson's weights, and what is held before it.
-
 
     Returns:
         The points, which of them are in the middle plane, and the area of each there.
@@ -130,7 +129,7 @@ def reconfiguration(
     thick = LENGTH / slenderness
     stiffness = YOUNG * thick**3 / 12
     speed = math.sqrt(cauchy * stiffness / (0.5 * AIR * LENGTH**3))
-    # so heavy that the drag damps its lowest mode critically, rho U / (density h) = 2 omega, but no heavier than at C = 30
+    # so heavy that the drag damps its lowest mode critically, rho U / (density h) = 2 omega; no heavier than at C = 30
     density = min(1.0, 30 / cauchy) * (0.5 * AIR * speed * LENGTH**2 / 3.516) ** 2 / (stiffness * thick)
     omega = 3.516 / LENGTH**2 * math.sqrt(stiffness / (density * thick))
     points, middle, area = _plate(cells, slenderness, density, settings)
@@ -138,7 +137,7 @@ def reconfiguration(
     areas = torch.where(middle, area, 0.0).to(points.position)
     aero = AeroForce(C_D=1.0, C_F=0.0, C_L=0.0, air_density=AIR, law=law)
     force = WindForce(aero, WindField([0.0, speed, 0.0]), normal, areas).to(points.position.device)
-    pins = PinnedRegion(Box([None] * 3, [None, None, 0.0]), "clamp")
+    pins = PinnedRegion(HELD, "clamp")
     solver = settings.solver(LENGTH / cells, boundaries=[pins], damping=omega * max(1.0, cauchy ** (1 / 3)))
     rigid = 0.5 * AIR * speed * speed * float(areas.sum())
 

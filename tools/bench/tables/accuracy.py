@@ -88,6 +88,11 @@ _table("hinged_plate", partial(_of, problem="hinged plate"), """
     variant = `{parameters.variant}` | law = `{parameters.law}` | k = {parameters.k} |
     angle [deg] = {result.angle:.2f} | exact [deg] = {result.exact:.2f} | error [deg] = {result.error:.2f}
     """)  # fmt: skip
+_table("reconfiguration", partial(_of, problem="plate that bends in a flow"), """
+    law = `{parameters.law}` | C = {parameters.cauchy:g} | cells = {parameters.cells} | R = {result.drag:.4f} |
+    R of the elastica = {result.exact:.4f} | error = {result.error:.2 %} | tip = {result.tip:.4f} |
+    tip of the elastica = {result.exact_tip:.4f}
+    """)  # fmt: skip
 _table("surface_drag", partial(_of, problem="surface drag"), """
     surface = {parameters.shape} | Gaussians = {parameters.count} | overlap = {parameters.overlap} |
     *areas `{parameters.area}`, law `{parameters.law}` = {result.share:.3f}
