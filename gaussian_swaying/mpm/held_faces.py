@@ -89,6 +89,22 @@ def thickness(points: Tensor, mass: Tensor, places: Tensor, dx: float) -> tuple[
     return least, least <= SHEET * dx and middle >= max(_WIDE * dx, _BROAD * least)
 
 
+@torch.no_grad()
+def normals(points: Tensor, mass: Tensor, places: Tensor, dx: float) -> Tensor:
+    """Unit normals of a sheet at some places, of either sign, shape (N, 3): those of at most 32 of them, the nearest.
+
+    The arguments are those of :func:`thickness`.
+    """
+    some = places[:: max(1, math.ceil(len(places) / _SAMPLES))]
+    found = []
+    for near in torch.cdist(some, points, compute_mode="donot_use_mm_for_euclid_dist") < _SEEN * dx:
+        weight, place = mass[near], points[near]
+        arm = place - (weight[:, None] * place).sum(0) / weight.sum()
+        found.append(torch.linalg.eigh((weight[:, None] * arm).T @ arm)[1][:, 0])
+    nearest = torch.cdist(places, some, compute_mode="donot_use_mm_for_euclid_dist").argmin(-1)
+    return torch.stack(found)[nearest]
+
+
 def face(points: Tensor, held: Tensor, dx: float) -> tuple[Tensor, Tensor]:
     """Places on the face between held and free particles, and directions across it.
 

@@ -81,17 +81,22 @@ def means(values: Tensor, mass: Tensor, group: Tensor) -> Tensor:
 
 
 @torch.no_grad()
-def groups(position: Tensor, mass: Tensor, cell: Tensor, apart: float) -> Tensor:
+def groups(
+    position: Tensor, mass: Tensor, cell: Tensor, apart: float, normal: Tensor | None = None, thick: float = 0.0
+) -> Tensor:
     """Group particles by cell, and join groups with close centres until all are some distance apart.
 
     A strip or a sheet that is thinner than a cell may cross the border of two. Two rows so close together would hold
-    its slope; joined they are the line, or the middle plane, that is meant.
+    its slope; joined they are the line, or the middle plane, that is meant. With a ``normal``, the points of a sheet
+    that is about as thick as a cell are joined through its thickness, too: the distance is that along the sheet.
 
     Args:
         position: Positions [m], shape (P, 3).
         mass: Masses [kg], shape (P,).
         cell: A number for the cell of each, shape (P,).
         apart: Least distance between centres [m].
+        normal: Unit normals of the sheet, of either sign, shape (P, 3).
+        thick: Largest distance along the normal at which groups are joined [m].
 
     Returns:
         The number of the group of each particle, shape (P,).
@@ -99,7 +104,14 @@ def groups(position: Tensor, mass: Tensor, cell: Tensor, apart: float) -> Tensor
     group = torch.unique(cell, return_inverse=True)[1]
     while len(group):
         centre = means(position, mass, group)
-        distance = torch.cdist(centre, centre, compute_mode="donot_use_mm_for_euclid_dist").fill_diagonal_(math.inf)
+        distance = torch.cdist(centre, centre, compute_mode="donot_use_mm_for_euclid_dist")
+        if normal is not None:
+            own_normal = normal[torch.zeros_like(group[: len(centre)]).scatter_(0, group, torch.arange(len(group)))]
+            across = (centre @ own_normal.T - (centre * own_normal).sum(-1)).abs()  # of each from the plane of another
+            across = torch.minimum(across, across.T)
+            along = (distance.square() - across.square()).clamp(min=0).sqrt()
+            distance = torch.where(across <= thick, along, distance)
+        distance.fill_diagonal_(math.inf)
         own = torch.arange(len(centre))
         least, nearest = distance.min(-1)
         # pairs that are nearest to each other; the first of equals, so that there always is one

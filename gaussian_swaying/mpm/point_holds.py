@@ -32,7 +32,7 @@ from gaussian_swaying._devices import double_home
 from gaussian_swaying.mpm.body import Body
 from gaussian_swaying.mpm.boundaries.boundary import CLOCK, Boundary
 from gaussian_swaying.mpm.boundaries.pinned_points import PinnedPoints
-from gaussian_swaying.mpm.held_faces import face_patches
+from gaussian_swaying.mpm.held_faces import SHEET, face_patches, normals, thickness
 from gaussian_swaying.mpm.held_rows import (
     LEAST_APART,
     LEAST_OWN,
@@ -163,7 +163,12 @@ class PointHolds:
                     assert own is not None
                     mass = own.mass.reshape(-1, count)[s].cpu().double()
                     some = (mass > 0).nonzero()[:, 0]
-                    group = groups(points[s][some], mass[some], cell[s][some], LEAST_APART * grid.dx)
+                    normal, held = None, points[s][some].detach()
+                    whole = body.points.mass.reshape(-1, count)[s].detach().cpu().double()
+                    if kinds[k] == "hinge" and thickness(points[s].detach(), whole, held, grid.dx)[1] and len(some):
+                        normal = normals(points[s].detach(), whole, held, grid.dx)
+                    apart, thick = LEAST_APART * grid.dx, SHEET * grid.dx
+                    group = groups(held, mass[some], cell[s][some], apart, normal, thick)
                     place = means(points[s][some], mass[some], group)
                     corner = cells_of_places(place.detach(), grid, massive)
                     release, along = None, clamped.expand(len(place), -1, 3)

@@ -91,7 +91,8 @@ class FlagScene(ProceduralScene):
         height: Length along z [m].
         spacing: Distance between Gaussians [m].
         overlap: Standard deviation of a Gaussian as a share of the spacing.
-        ripple: Amplitude of the ripple along y [m].
+        ripple: Amplitude of the ripple along y [m]. A few millimetres change what a light flag does: held along x, its
+            edge is not straight, and cannot turn without strain. Compare only flags with the same ripple.
         pattern: ``stripes`` (three bands of colour and a disc), ``white``, or ``printed``, with features everywhere
             (see :func:`~gaussian_swaying.scenes.printed_cloth.printed_colours`).
         yaw: Angle by which the flag is turned about its pole side, counter-clockwise seen from above [degrees].

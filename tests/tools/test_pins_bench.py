@@ -74,7 +74,7 @@ def test_rows_are_recorded_and_others_kept(tmp_path, monkeypatch):
         ({"rows": "glue"}, r"--rows takes nodes, .* not glue"),
         ({"patterns": "4"}, r"has no pattern4/cloth.npz"),
         ({"patterns": "curtain"}, r"has no curtain/cloth.npz"),
-        ({"patterns": "sail"}, r"--patterns takes 1, .*, curtain, light, not sail"),
+        ({"patterns": "sail"}, r"--patterns takes 1, .*, curtain, light, pennant, not sail"),
     ):
         with pytest.raises(SystemExit, match=message):
             of(**words)
