@@ -134,18 +134,10 @@ def test_a_hinge_of_a_sheet_as_thick_as_a_cell_is_a_line(turn):
     points = dataclasses.replace(points, position=thick, mass=share * points.mass, volume=share * points.volume)
     top = thick[:, 2] - math.sin(turn) / math.cos(turn) * thick[:, 0] > -0.6 * STEP / math.cos(turn)
     solver = MPMSolver(dx=DX, gravity=(0, 0, 0), boundaries=[PinnedRegion(Chosen(top), "hinge")])
-    state = solver.init_state(points)
+    solver.init_state(points)
     rows = solver.bound.point_holds.place.reshape(-1, 3)
     assert float(rows[:, 1].abs().max()) < 1e-9
     assert 6 < len(rows) <= 20 * STEP / held_rows.LEAST_APART / DX + 1
-    spin = torch.linalg.cross(
-        torch.tensor([math.cos(turn), 0.0, math.sin(turn)], dtype=torch.float64).expand_as(state.position),
-        state.position - state.position[top].mean(0),
-    )
-    held = solver.step(solver.init_state(points, velocity=spin), 1e-4)
-    close = (state.position - state.position[top].mean(0))[:, 2].abs() < 2 * DX  # what a clamp would stop
-    kept = float((held.velocity * spin)[close].sum() / spin[close].square().sum())
-    assert kept > 0.95
 
 
 def test_groups_are_joined_until_they_are_apart():
