@@ -90,7 +90,7 @@ _table("hinged_plate", partial(_of, problem="hinged plate"), """
     """)  # fmt: skip
 _table("reconfiguration", partial(_of, problem="plate that bends in a flow"), """
     law = `{parameters.law}` | C = {parameters.cauchy:g} | cells = {parameters.cells} | R = {result.drag:.4f} |
-    R of the elastica = {result.exact:.4f} | error = {result.error:.2 %} | tip = {result.tip:.4f} |
+    R of the elastica = {result.exact:.4f} | error = {result.error:.2f %} | tip = {result.tip:.4f} |
     tip of the elastica = {result.exact_tip:.4f}
     """)  # fmt: skip
 _table("surface_drag", partial(_of, problem="surface drag"), """
