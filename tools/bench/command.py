@@ -12,14 +12,10 @@ from bench.case import Case, Option, option
 from bench.slots import SlotError
 
 _OWN = (
-    "speed live accuracy pareto points backward gradients surfaces flags pins contact fit soft folds gallery previews"
+    "speed live accuracy pareto points backward gradients surfaces flags pins contact fit soft folds gallery previews "
+    "area blender places frames detail drawn refinement web sweeps winds"
 )
-_FILES = {
-    name: f"{name}.CASE"
-    for name in (
-        *_OWN.split(), "area", "blender", "places", "frames", "detail", "drawn", "refinement", "web", "sweeps", "winds"
-    )
-}
+_FILES = {name: f"{name}.CASE" for name in _OWN.split()}
 _FILES |= {"substep": "runs.SUBSTEP", "sim": "runs.SIM", "train": "training.CASE"}
 
 

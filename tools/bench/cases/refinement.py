@@ -39,8 +39,7 @@ class Rippled(Run):
 def _distance(run: Run, options: argparse.Namespace, to: Cloth) -> Row:
     """Solve a flag by ours, and compare it."""
     positions, found = run.solve(options.blender)
-    per_second = run.flag().fps / (run.frames - 1)
-    return found | {"per_simulated_s": found["seconds"] * per_second} | apart(run.flag(), run.cloth(positions), to)
+    return found | apart(run.flag(), run.cloth(positions), to)
 
 
 def _itself(make: type[Run], pattern: Flag, options: argparse.Namespace) -> tuple[Cloth, Row]:
