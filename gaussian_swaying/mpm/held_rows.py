@@ -106,8 +106,9 @@ def groups(
         centre = means(position, mass, group)
         distance = torch.cdist(centre, centre, compute_mode="donot_use_mm_for_euclid_dist")
         if normal is not None:
-            own_normal = normal[torch.zeros_like(group[: len(centre)]).scatter_(0, group, torch.arange(len(group)))]
-            across = (centre @ own_normal.T - (centre * own_normal).sum(-1)).abs()  # of each from the plane of another
+            first = torch.full_like(group[: len(centre)], len(group))
+            own_normal = normal[first.scatter_reduce(0, group, torch.arange(len(group)), "amin")]
+            across = ((centre[:, None] - centre) * own_normal).sum(-1).abs()  # of each from the plane of another
             across = torch.minimum(across, across.T)
             along = (distance.square() - across.square()).clamp(min=0).sqrt()
             distance = torch.where(across <= thick, along, distance)
