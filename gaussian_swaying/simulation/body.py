@@ -107,9 +107,24 @@ def body_of(
     if by_grid:
         chosen, owner, parent = grouped(samples, dx, scene.points_per_cell, apart, frame, dtype)
         patches = shared_wind(samples, owner, parent)
+    if scene.layers == 3:
+        _require_cells_as_large_as(float(chosen.thickness.max()), dx)
     points = with_gradients(chosen.points(scene.layers, laws, dtype), material)
     felt = Patches(patches[0].to(dtype), patches[1].to(dtype), patches[2], points.count)
     return Body(points, felt, int(chosen.surface.sum()), samples, len(source), owner)
+
+
+def _require_cells_as_large_as(thickness: float, dx: float) -> None:
+    """Refuse three layers across more than a cell: the middle one then moves apart from the faces without any strain.
+
+    The nodes have five planes across them, and the three slopes leave one motion besides a shift.
+    """
+    if thickness > dx * (1 + 1e-6):
+        raise ValueError(
+            f"A sheet of three layers (`scene.layers: 3`) that is {thickness:g} m thick needs cells at least as large, "
+            f"but `solver.dx` is {dx:g} m, and its layers would come apart: raise `solver.dx`, lower "
+            "`material.thickness`, or set `scene.layers` to 1."
+        )
 
 
 def specks_of(

@@ -40,3 +40,5 @@ def test_bad_input_is_refused():
         elastica(1.0, "paper")
     with pytest.raises(ValueError, match="`cauchy`"):
         elastica(0.0, "projected")
+    with pytest.raises(ValueError, match="`slenderness` of at least `cells`"):
+        reconfiguration(1.0, "projected", cells=16, slenderness=12.0)

@@ -435,6 +435,15 @@ def test_spacing_of_the_particles_is_in_metres(make_scene):
     assert one.points.count == half.points.count
 
 
+def test_three_layers_are_no_thicker_than_a_cell(make_scene):
+    """Else nothing holds the middle one to the faces: a motion that takes it off them strains none of the layers."""
+    cloud, thin, thick = _sheet_with_a_hole(), Material(thickness=0.1), Material(thickness=0.11)
+    assert make_scene(cloud, thin, 0.1, layers=3).points.count
+    assert make_scene(cloud, thick, 0.1, layers=1).points.count
+    with pytest.raises(ValueError, match=r"0\.11 m thick needs cells at least as large, but `solver\.dx` is 0\.1 m"):
+        make_scene(cloud, thick, 0.1, layers=3)
+
+
 def test_three_layers_are_a_plate(make_cloud, make_scene):
     """The mass of one, and its moment about the middle plane: that of a plate of this thickness, h² / 12."""
     cloud = make_cloud()

@@ -85,6 +85,11 @@ def _plate(
         The points, which of them are in the middle plane, and the area of each there.
     """
     dx, thick = LENGTH / cells, LENGTH / slenderness
+    if thick > dx:
+        raise ValueError(
+            f"Expected `slenderness` of at least `cells` ({cells}), but got {slenderness}: the layers of a plate that "
+            "is thicker than a cell come apart."
+        )
     along = (torch.arange(-2 * BEHIND, 2 * cells, dtype=torch.float64) + 0.5) * 0.5 * dx
     across = thick * torch.tensor([-0.5, 0.0, 0.5], dtype=torch.float64)
     columns = round(2 * WIDTH / dx)
