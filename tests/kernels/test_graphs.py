@@ -19,7 +19,7 @@ from gaussian_swaying.mpm.boundaries.velocity_box import VelocityBox
 
 def test_what_is_here_can_be_recorded():
     concrete = [*BOUNDARIES.values(), SineSway, UniformGust, GaussianGust]
-    assert len(concrete) == 17
+    assert len(concrete) == 18
     assert all(kind.recordable for kind in concrete if kind is not VelocityBox)  # which asks its region
 
 

@@ -702,16 +702,17 @@ def test_a_flag_of_a_file_has_its_own_truth(tool, flag_motion, monkeypatch, tmp_
     assert tool.main(["--flag", str(path), "--only", "cloth", "--damping", "3", "--out", str(tmp_path / "flags")]) == 1
 
 
-def test_two_flags_that_nothing_was_tuned_for(tool):
-    """A curtain in an oblique wind, and a light stiff flag in 3 m/s at 60 degrees to its plane."""
+def test_three_flags_that_nothing_was_tuned_for(tool):
+    """A curtain and a pennant in an oblique wind, and a light stiff flag in 3 m/s at 60 degrees to its plane."""
     expected = {"curtain": ((1.0, 1.4), 4e3, 25.0, 56.31), "light": ((1.2, 1.0), 8e3, 15.0, 60.0)}
+    expected["pennant"] = ((0.6, 1.6), 6e3, 20.0, 68.20)
     assert {path.stem for path in CONFIGS.glob("*.yaml")} == set(expected)
     for name, (sides, modulus, density, angle) in expected.items():
         flag = tool.read_flag(CONFIGS / f"{name}.yaml")
         assert ((flag.width, flag.height), flag.youngs_modulus, flag.density) == (sides, modulus, density)
         assert (flag.thickness, flag.poisson_ratio, flag.pinned, flag.damping) == (0.01, 0.3, "top", 1.0)
         speed = math.hypot(*flag.flow)
-        assert speed == pytest.approx({"curtain": 1.803, "light": 3.0}[name], abs=1e-3)
+        assert speed == pytest.approx({"curtain": 1.803, "light": 3.0, "pennant": 3.231}[name], abs=1e-3)
         assert math.degrees(math.asin(-flag.normal() @ flag.flow / speed)) == pytest.approx(angle, abs=0.01)
 
 

@@ -198,12 +198,13 @@ def film_of(simulation: Simulation, grid: GridSpec, nodes: Tensor, displacement:
         "camera": _camera(camera, scene, size),
         "title": f"{name[:1].upper()}{name[1:]} in the wind",
     }
+    doubled = order.to(position.device)  # where numbers in double precision live
     return Film(
         head,
-        position[order].float().numpy(force=True),
+        position[doubled].float().numpy(force=True),
         place.numpy(force=True),
-        scale[order].half().numpy(force=True),
-        _steps(turn[order]),
+        scale[doubled].half().numpy(force=True),
+        _steps(turn[doubled]),
         _steps(facing),
         (color[order].clamp(0, 1) * 255).round().to(torch.uint8).numpy(force=True),
         (growth(scene, camera)[order, None] * 255).round().to(torch.uint8).numpy(force=True),
@@ -251,12 +252,12 @@ def growth(scene: SimulatedScene, camera: Camera) -> Tensor:
     across, along = camera.width // BLOCK + 1, camera.height // BLOCK + 1
     inside = (seen[:, 2] > camera.near) & (x >= 0) & (x < across) & (y >= 0) & (y < along)
     # the geometric mean of the areas along three axes is that of a projection, up to the direction
-    area = torch.linalg.det(covariances.double()).clamp_min(0).pow(1 / 3) * float(fx * fy) / depth.double() ** 2
-    mass = scene.model.opacity().detach().double() * 2 * math.pi * area
-    block = torch.where(inside, y * across + x, across * along)
-    total = torch.zeros(across * along + 1, dtype=torch.float64, device=means.device).index_add(0, block, mass)
+    area = torch.linalg.det(in_double(covariances)).clamp_min(0).pow(1 / 3) * float(fx * fy) / in_double(depth) ** 2
+    mass = in_double(scene.model.opacity().detach()) * 2 * math.pi * area
+    block = torch.where(inside, y * across + x, across * along).to(mass.device)
+    total = mass.new_zeros(across * along + 1).index_add(0, block, mass)
     found = (LAYERS * BLOCK**2 / total[block].clamp_min(1e-30)).sqrt().clamp_max(1.0)
-    return torch.where(inside, found, 1.0).float()
+    return torch.where(inside.to(found.device), found, 1.0).float().to(means.device)
 
 
 def spread(position: Tensor) -> Tensor:
