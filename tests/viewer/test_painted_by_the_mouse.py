@@ -123,7 +123,8 @@ def test_a_stroke_is_seen_undone_saved_and_applied(page, window, until, tmp_path
     window.wait_for_function("!wind.brush.on")
     session.pause()
     session.reset()
-    until(lambda: np.abs(_picture(window) - plain).max() < 40)  # without tints; what is held has no shading
+    until(lambda: not any(_is_tinted(_picture(window)[y, x], plain[y, x]) for x, y in line))
+    until(lambda: np.median(np.abs(_picture(window) - plain)) < 3)  # what is held has no shading
     assert session.problem is None
     assert window.problems == []
 
