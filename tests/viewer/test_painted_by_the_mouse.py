@@ -78,6 +78,8 @@ def test_a_stroke_is_seen_undone_saved_and_applied(page, window, until, tmp_path
     """What was painted as held stays exactly where it is in the wind, while the rest moves."""
     session, painting = page.session, page.controls.painting
     until(lambda: session.snapshot.health.time > 0.1)
+    page.controls.arrow.value = False  # what viser draws above the object is made again with each simulation
+    page.controls.draw_handles()
     _begin(page, window, until)
     plain = _picture(window)
     places = _places(page, window)
@@ -123,8 +125,7 @@ def test_a_stroke_is_seen_undone_saved_and_applied(page, window, until, tmp_path
     window.wait_for_function("!wind.brush.on")
     session.pause()
     session.reset()
-    until(lambda: not any(_is_tinted(_picture(window)[y, x], plain[y, x]) for x, y in line))
-    until(lambda: np.median(np.abs(_picture(window) - plain)) < 3)  # what is held has no shading
+    until(lambda: np.abs(_picture(window) - plain).max() < 40)  # without tints; what is held has no shading
     assert session.problem is None
     assert window.problems == []
 
