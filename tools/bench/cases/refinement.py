@@ -36,10 +36,12 @@ class Rippled(Run):
         return [*super().arguments(), f"--scene.generator.init_args.ripple={RIPPLE}"]
 
 
-def _distance(run: Run, options: argparse.Namespace, to: Cloth) -> Row:
-    """Solve a flag by ours, and compare it."""
+def _distance(run: Run, options: argparse.Namespace, to: Cloth, flat: Cloth | None = None) -> Row:
+    """Solve a flag by ours, and compare it with its reference; one with the ripple with a ``flat`` one, too."""
     positions, found = run.solve(options.blender)
-    return found | apart(run.flag(), run.cloth(positions), to)
+    ours = run.cloth(positions)
+    found |= apart(run.flag(), ours, to)
+    return found if flat is None else found | {"to_flat": apart(run.flag(), ours, flat)}
 
 
 def _itself(make: type[Run], pattern: Flag, options: argparse.Namespace) -> tuple[Cloth, Row]:
@@ -64,15 +66,8 @@ def rows(options: argparse.Namespace, result: Row) -> Iterator[Measurement]:
             about["to_flat"] = apart(REFERENCES[pattern], uneven, flat)
             yield ("uneven", "reference"), about.copy
             for cells in options.grids:
-                work = partial(_uneven, Rippled(pattern, "ours", cells, options.frames), options, uneven, flat)
+                work = partial(_distance, Rippled(pattern, "ours", cells, options.frames), options, uneven, flat)
                 yield ("uneven", str(cells)), partial(guarded, work)
-
-
-def _uneven(run: Run, options: argparse.Namespace, uneven: Cloth, flat: Cloth) -> Row:
-    """Solve a rippled flag by ours, and compare it with a rippled and with a flat reference."""
-    positions, found = run.solve(options.blender)
-    ours = run.cloth(positions)
-    return found | apart(run.flag(), ours, uneven) | {"to_flat": apart(run.flag(), ours, flat)}
 
 
 CASE = Case(

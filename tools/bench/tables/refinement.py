@@ -5,15 +5,11 @@ from __future__ import annotations
 from collections.abc import Iterator
 from pathlib import Path
 
+from bench.tables.flag_benchmark import named
 from bench.tables.plots import plain_numbers, save_figure, subplots
 from bench.tables.render import GOAL, Goal, Row, judged, table
 
 PAGE = "flag_benchmark.md"
-
-
-def name_of(flag: int | str) -> str:
-    """A flag as the tables call it."""
-    return f"pattern {flag}" if isinstance(flag, int) else flag
 
 
 def _fronts(result: Row) -> Iterator[tuple[int | str, float, list[Row]]]:
@@ -27,7 +23,7 @@ def _fronts(result: Row) -> Iterator[tuple[int | str, float, list[Row]]]:
 def _rows(result: Row) -> Iterator[Row]:
     for flag, itself, own in _fronts(result):
         for row in own:
-            yield {"flag": name_of(flag), "itself": itself, "cells": row["cells"], "chamfer": row["chamfer"]}
+            yield {"flag": named(flag), "itself": itself, "cells": row["cells"], "chamfer": row["chamfer"]}
 
 
 table(PAGE, "refinement.rows", "refinement_*", _rows,
@@ -41,7 +37,7 @@ def _worse(result: Row) -> Iterator[Row]:
         distances = [row["chamfer"] for row in own]
         grown = [fine - min(distances[:k]) for k, fine in enumerate(distances) if k]
         last = {"cells": own[-1]["cells"], "last": distances[-1], "most": max(0.02, itself)}
-        yield {"flag": name_of(flag), "itself": itself, "grown": max(0.0, *grown)} | last
+        yield {"flag": named(flag), "itself": itself, "grown": max(0.0, *grown)} | last
 
 
 table(PAGE, "refinement.goals", "refinement_*", judged([
@@ -72,7 +68,7 @@ def plot(results: list[Row], pictures: Path) -> None:
     for number, (flag, itself, own) in enumerate(_fronts(result)):
         colour, cells = f"C{number}", [row["cells"] for row in own]
         distances = [100 * row["chamfer"] for row in own]
-        axis.plot(cells, distances, "o-", color=colour, label=f"{name_of(flag)} (reference: {100 * itself:.2f} %)")
+        axis.plot(cells, distances, "o-", color=colour, label=f"{named(flag)} (reference: {100 * itself:.2f} %)")
         axis.plot(1.03 * cells[-1], 100 * itself, "_", color=colour, markersize=14)
     axis.set_xscale("log")
     axis.set_ylim(bottom=0)
