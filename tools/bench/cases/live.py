@@ -123,6 +123,8 @@ def rows(options: argparse.Namespace, result: Row) -> Iterator[Measurement]:
         scenes["large flag"] = [*flag, "--solver.dx=0.0125", "--scene.generator.init_args.spacing=0.0031"]
     if options.ply:
         scenes[Path(options.ply).stem] = ["--config", str(configs / "hanging_object.yaml"), "--scene.ply", options.ply]
+    if options.scene:
+        scenes = {Path(options.scene).parent.name: ["--config", options.scene]}
     for name, arguments in scenes.items():
         yield ("rows", {"name": name}), partial(watch, arguments, options.device, options.seconds)
 
@@ -132,6 +134,7 @@ CASE = Case(
     rows,
     (
         option("--ply", "a captured object for configs/sim/hanging_object.yaml"),
+        option("--scene", "watch only this configuration, such as the draft of a preview"),
         option("--seconds", "for how long each scene is watched", type=float, default=20.0),
     ),
     page="live.md",

@@ -52,7 +52,8 @@ table(PAGE, "places.rows", "places_*", _places, """
     Gaussians = {gaussians:,} | of the plant = {plant:,} | file [MB] = {file_bytes:.0f (MB)} |
     preview [s] = {preview_s:.0f} | wanted = {wanted:g} | its memory [MB] = {preview_bytes:.0f (MB)} |
     per file = {preview_share:.2f} | the plant comes first = {right_first} | draft [s] = {draft_s or '-':.0f} |
-    announced [s] = {draft_announced_s or '-':.0f} | its memory [MB] = {draft_bytes or '-':.0f (MB)}
+    announced [s] = {draft_announced_s or '-':.0f} | its memory [MB] = {draft_bytes or '-':.0f (MB)} |
+    250 frames of 1920 x 1080 [s] = {film_s or '-':.1f}
     """, before="{source}")  # fmt: skip
 
 table(PAGE, "runs.substep", "substep_*", "substep", """
