@@ -15,7 +15,6 @@ from bench.case import Case, Measurement, numbers, option
 from bench.record import ROOT, Row
 from bench.simulate import what_failed
 
-
 FILM = 250  # frames
 SIZE = (1920, 1080)  # of their pictures
 
