@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from gaussian_swaying._checks import check_positive, check_shape
-from gaussian_swaying.geometry.groups import equal_rows, sums
+from gaussian_swaying.geometry.groups import equal_rows, joined, sums
 from gaussian_swaying.geometry.neighbours import nearest_neighbours
 
 LOOSE = 0.01  # share of the largest part; what is smaller and connected to nothing is loose
@@ -120,23 +120,6 @@ def loose_points(points: Tensor, side: float) -> Tensor:
     size = part.bincount()
     loose = (size[part] < LOOSE * size.max()) | (near.sum(-1) < 2)
     return (loose & ~loose.all())[group]
-
-
-def joined(count: int, pairs: Tensor) -> Tensor:
-    """Connected components: the component of each of ``count`` items, from the pairs that are connected.
-
-    Args:
-        count: Number of items.
-        pairs: Their numbers, shape (2, K).
-
-    Returns:
-        Numbers from 0 on, shape (count,).
-    """
-    from scipy.sparse import coo_matrix
-    from scipy.sparse.csgraph import connected_components
-
-    graph = coo_matrix((torch.ones(pairs.shape[1]), pairs.numpy()), (count, count))
-    return torch.from_numpy(connected_components(graph, directed=False)[1]).long()
 
 
 def connected_parts(points: Tensor, cell: float) -> Tensor:

@@ -9,8 +9,9 @@ from torch import Tensor
 
 from gaussian_swaying._checks import check_positive, check_vector
 from gaussian_swaying.gaussians.cloud import GaussianCloud
-from gaussian_swaying.gaussians.grouping import connected_parts, joined
+from gaussian_swaying.gaussians.grouping import connected_parts
 from gaussian_swaying.gaussians.harmonics import SH_DC
+from gaussian_swaying.geometry.groups import joined
 from gaussian_swaying.geometry.neighbours import nearest_neighbours, particle_spacing
 from gaussian_swaying.geometry.patches import smallest_axis_normal
 from gaussian_swaying.geometry.regions import Region

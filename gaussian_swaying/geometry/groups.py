@@ -60,3 +60,20 @@ def sums(values: Tensor, group: Tensor, count: int | None = None) -> Tensor:
     if count is None:
         count = int(group.max()) + 1 if len(group) else 0
     return values.new_zeros(count, *values.shape[1:]).index_add(0, group, values)
+
+
+def joined(count: int, pairs: Tensor) -> Tensor:
+    """Connected components: the component of each of ``count`` items, from the pairs that are connected.
+
+    Args:
+        count: Number of items.
+        pairs: Their numbers, shape (2, K).
+
+    Returns:
+        Numbers from 0 on, shape (count,).
+    """
+    from scipy.sparse import coo_matrix
+    from scipy.sparse.csgraph import connected_components
+
+    graph = coo_matrix((torch.ones(pairs.shape[1]), pairs.numpy()), (count, count))
+    return torch.from_numpy(connected_components(graph, directed=False)[1]).long()

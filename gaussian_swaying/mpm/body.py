@@ -4,10 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import torch
 from torch import Tensor
 
+from gaussian_swaying.geometry.groups import joined
 from gaussian_swaying.mpm.boundaries.boundary import CLOCK, Boundary
 from gaussian_swaying.mpm.boundaries.rigid_region import RigidRegion
 from gaussian_swaying.mpm.contact.surface import Surface
@@ -60,6 +62,18 @@ class Body:
         self.laws = LawDispatch(points)
         self.held = tuple(_held(points, boundary) for boundary in self.boundaries)
         self.rigid = [k for k, boundary in enumerate(self.boundaries) if isinstance(boundary, RigidRegion)]
+
+    @cached_property
+    def pieces(self) -> list[Tensor | None]:
+        """The points of each connected piece, int64, on the CPU; one entry of None if there is only one."""
+        attached = self.points.attached
+        if attached is None:
+            return [None]
+        attached = attached.cpu()
+        label = attached if attached.dim() == 1 else joined(self.points.count, attached.T)
+        _, of = torch.unique(label, return_inverse=True)
+        many = of.bincount()
+        return [None] if len(many) < 2 else list(of.argsort(stable=True).split(many.tolist()))
 
     def soften(self, particles: Tensor, factor: float) -> None:
         """Multiply the stiffness of some particles, bool (..., P), with a factor; ``points`` stay as they are."""

@@ -12,6 +12,7 @@ from gaussian_swaying.geometry.frame import SimFrame
 from gaussian_swaying.kernels.launch import replaces
 from gaussian_swaying.mpm.state import GridSpec, MaterialPoints, MPMState, State, bounding_grid
 from gaussian_swaying.mpm.transfer import Stencil, bspline_stencil, gather, scatter
+from gaussian_swaying.mpm.virtual_nodes import point_with_nodes, virtual_nodes
 
 
 class Followers(nn.Module, ABC):
@@ -44,6 +45,14 @@ class Followers(nn.Module, ABC):
     def places(self) -> Tensor:
         """Rest positions that are read [m], shape (M, 3)."""
 
+    def stencil(self, grid: GridSpec) -> Stencil:
+        """The 27 nodes of each place."""
+        return follower_stencil(self.places, grid, self.table(grid))
+
+    def table(self, grid: GridSpec) -> Tensor | None:
+        """Nodes of the places, shape (27, M), if the grid has virtual ones."""
+        return None
+
     @abstractmethod
     def some(self, index: Tensor) -> Followers:
         """Some of them, by their numbers (K,)."""
@@ -56,7 +65,7 @@ class Followers(nn.Module, ABC):
         if getattr(state, "node_displacement", None) is None:
             return None
         if self._nodes is None or self._nodes[0] != state.grid:
-            self._nodes = (state.grid, follower_stencil(self.places, state.grid).node.unique())
+            self._nodes = (state.grid, self.stencil(state.grid).node.unique())
         return self._nodes[1]
 
     def nodal(self, state: Any) -> Tensor | None:
@@ -135,14 +144,17 @@ class GridFollowers(Followers):
     Args:
         place: Rest positions that are read [m], shape (M, 3).
         arm: See :class:`Followers`.
+        nodes: The nodes of each, shape (27, M), if they are not those of the lattice (``virtual_nodes``).
     """
 
     reads = ("node_displacement",)
 
-    def __init__(self, place: Tensor, arm: Tensor | None) -> None:
+    def __init__(self, place: Tensor, arm: Tensor | None, nodes: Tensor | None = None) -> None:
         super().__init__(arm)
         self.register_buffer("place", place, persistent=False)
+        self.register_buffer("own_nodes", nodes, persistent=False)
         self.place: Tensor
+        self.own_nodes: Tensor | None
         self._known: tuple[GridSpec, torch.device, Stencil] | None = None
 
     @property
@@ -152,14 +164,19 @@ class GridFollowers(Followers):
 
     def some(self, index: Tensor) -> GridFollowers:
         """Some of them."""
-        return GridFollowers(self.place[index], None if self.arm is None else self.arm[index])
+        nodes = None if self.own_nodes is None else self.own_nodes[:, index]
+        return GridFollowers(self.place[index], None if self.arm is None else self.arm[index], nodes)
+
+    def table(self, grid: GridSpec) -> Tensor | None:
+        """See :meth:`Followers.table`."""
+        return self.own_nodes
 
     def stencil(self, grid: GridSpec) -> Stencil:
         """The 27 nodes of each follower."""
         known = self._known
         if known is None or known[0] != grid or known[1] != self.place.device:
             with torch.inference_mode(False):  # it outlives the call
-                known = (grid, self.place.device, follower_stencil(self.place, grid))
+                known = (grid, self.place.device, follower_stencil(self.place, grid, self.own_nodes))
             self._known = known
         return known[2]
 
@@ -210,9 +227,9 @@ class GridFollowers(Followers):
         return gather(_nodal(state.node_velocity), self.stencil(state.grid))[..., 0, :]
 
 
-def follower_stencil(place: Tensor, grid: GridSpec) -> Stencil:
+def follower_stencil(place: Tensor, grid: GridSpec, nodes: Tensor | None = None) -> Stencil:
     """The stencil of followers (M, 3) [m], as that of the material in ``total``."""
-    return bspline_stencil(place, grid, moments=False, snap=torch.finfo(place.dtype).eps ** 0.5)
+    return bspline_stencil(place, grid, moments=False, snap=torch.finfo(place.dtype).eps ** 0.5, nodes=nodes)
 
 
 def _nodal(field: Tensor | None) -> Tensor:
@@ -224,23 +241,31 @@ def _nodal(field: Tensor | None) -> Tensor:
 
 
 @torch.no_grad()
-def on_material(place: Tensor, nearest: Tensor, points: MaterialPoints, dx: float) -> Tensor:
+def on_material(place: Tensor, nearest: Tensor, points: MaterialPoints, dx: float) -> tuple[Tensor, Tensor | None]:
     """Places that can be read: their own if all their nodes have mass, otherwise those of a material point.
 
     A group's nodes are those of all its members, except where the centre of mass lies on the border of its cell.
 
     Args:
         place: Rest positions [m], shape (M, 3), float64.
-        nearest: A material point close to each, shape (M,).
+        nearest: A material point close to each, shape (M,); with ``attached`` parts, one of the part that it follows.
         points: The material.
         dx: Grid spacing [m].
 
     Returns:
-        Shape (M, 3).
+        The places, shape (M, 3), and the nodes of each, shape (27, M), or None if they are those of the lattice.
     """
     position = points.position
     grid = bounding_grid(position.amin(0), position.amax(0), dx, margin=0)
-    mass = scatter(follower_stencil(position, grid), points.mass[:, None, None])[:, 0]
+    rest = follower_stencil(position, grid)
+    virtual = virtual_nodes(rest.first, grid, points.attached)
     own = follower_stencil(place.to(position), grid)
-    empty = gather((mass <= 0).to(mass)[:, None], own)[:, 0, 0]
-    return torch.where((own.inside & (empty == 0))[:, None], place, position[nearest])
+    if virtual is None:
+        mass = scatter(rest, points.mass[:, None, None])[:, 0]
+        empty = gather((mass <= 0).to(mass)[:, None], own)[:, 0, 0]
+        return torch.where((own.inside & (empty == 0))[:, None], place, position[nearest]), None
+    first, node = rest.first.cpu(), virtual.node.cpu()
+    near = nearest.cpu()
+    host = point_with_nodes(own.first.cpu(), near, first, node, grid).where(own.inside.cpu(), -1)
+    read = torch.where((host >= 0)[:, None].to(place.device), place, position[nearest])
+    return read, virtual.node[:, torch.where(host >= 0, host, near).to(nearest.device)]

@@ -16,21 +16,24 @@ from gaussian_swaying.mpm.triton.total_kernels import gather
 
 @triton.jit(do_not_specialize=VARIES)
 def _follow(
-    fields, first, fraction, arm, axes, means, covariance, normal, solid,
+    fields, first, table, fraction, arm, axes, means, covariance, normal, solid,
     means_out, covariance_out, normal_out, rotation_out, square, per_metre, count, sx, sy, inverse_dx,
-    ARM: tl.constexpr, TURN: tl.constexpr, LIMIT: tl.constexpr, BLOCK: tl.constexpr,
+    ARM: tl.constexpr, TURN: tl.constexpr, LIMIT: tl.constexpr, BLOCK: tl.constexpr, VIRTUAL: tl.constexpr,
 ):  # fmt: skip
     """One Gaussian per lane: its displacement and F from the nodes, in the axes of the scene."""
     index = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
     mask = index < count
-    node = tl.load(first + index, mask, 0)
+    if VIRTUAL:
+        node = tl.minimum(index, count - 1)
+    else:
+        node = tl.load(first + index, mask, 0)
     f = (
         tl.load(fraction + index, mask, 1.0),
         tl.load(fraction + count + index, mask, 1.0),
         tl.load(fraction + 2 * count + index, mask, 1.0),
     )
     wz, gz = axis_weights(f[2], inverse_dx)
-    u, G, _v = gather(fields, node, sx, sy, f, wz, gz, inverse_dx, mask, False)
+    u, G, _v = gather(fields, node, sx, sy, f, wz, gz, inverse_dx, mask, False, table, count, VIRTUAL)
     if ARM:
         a = load3(arm, 1, 3 * index, mask)
         u = (
@@ -98,13 +101,14 @@ def follow(
     turns = torch.empty_like(given[1]) if rotations else given[1]
     limit = max_stretch is not None and solid is not None
     keeps = fields if solid is None or not limit else solid.contiguous().view(torch.int8)
+    table = stencil.first if stencil.nodes is None else stencil.nodes.contiguous()
     block = lanes(fields.device, 128)
     if count > 0:
         with torch.cuda.device_of(fields):
             launch(_follow, (triton.cdiv(count, block),))(
-                fields, stencil.first, fraction.contiguous(), fields if arm is None else arm.contiguous(),
+                fields, stencil.first, table, fraction.contiguous(), fields if arm is None else arm.contiguous(),
                 axes.contiguous(), *given, keeps, *made, turns,
                 float(max_stretch or 1) ** 2, per_metre, count, *strides, 1 / dx,
-                ARM=arm is not None, TURN=rotations, LIMIT=limit, BLOCK=block,
+                ARM=arm is not None, TURN=rotations, LIMIT=limit, BLOCK=block, VIRTUAL=stencil.nodes is not None,
             )  # fmt: skip
     return made[0], made[1], made[2], turns if rotations else None

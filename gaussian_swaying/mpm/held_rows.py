@@ -13,6 +13,7 @@ from torch import Tensor
 from gaussian_swaying.geometry.groups import sums
 from gaussian_swaying.mpm.state import GridSpec
 from gaussian_swaying.mpm.transfer import bspline_weights
+from gaussian_swaying.mpm.virtual_nodes import coordinates, shifts
 
 MOST_ROWS = 2000
 """Most rows of one scene: its inverse is dense."""
@@ -149,12 +150,6 @@ def cells_of_places(place: Tensor, grid: GridSpec, massive: Tensor) -> Tensor:
     return flat.where(fits, -1).gather(1, best)[:, 0]
 
 
-def shifts(grid: GridSpec) -> Tensor:
-    """Offsets of the 27 nodes of a stencil from the first, shape (27,)."""
-    _, ny, nz = grid.resolution
-    return torch.tensor([(i * ny + j) * nz + k for i, j, k in itertools.product(range(3), repeat=3)])
-
-
 def flat_index(node: Tensor, grid: GridSpec) -> Tensor:
     """Flat index of nodes (..., 3) of a grid."""
     _, ny, nz = grid.resolution
@@ -177,6 +172,7 @@ def rows_at(
     owner: int,
     start: float,
     release: Tensor,
+    node: Tensor | None = None,
 ) -> Rows:
     """The rows of some points: their values and, for a clamp, their slopes in units of one cell.
 
@@ -190,11 +186,11 @@ def rows_at(
         owner: The boundary.
         start: Time from which they are held [s].
         release: Times of their release [s], shape (N,).
+        node: The nodes of each, shape (N, 27); None for those of the lattice.
     """
-    _, ny, nz = grid.resolution
-    corner = torch.stack([first // (ny * nz), first // nz % ny, first % nz], dim=-1) + torch.tensor(grid.offset)
+    corner = coordinates(first, grid) + torch.tensor(grid.offset)
     value, slope = bspline_weights((place / grid.dx - corner).T)
-    node = first[:, None] + shifts(grid)
+    node = first[:, None] + shifts(grid) if node is None else node
     many = len(place)
     axes = torch.arange(3)[:, None, None]
     slopes = torch.stack([products(torch.where(axes == axis, slope, value)) for axis in range(3)], dim=-1)

@@ -29,6 +29,7 @@ import torch
 from torch import Tensor
 
 from gaussian_swaying._devices import double_home
+from gaussian_swaying.geometry.neighbours import nearest_neighbours
 from gaussian_swaying.mpm.body import Body
 from gaussian_swaying.mpm.boundaries.boundary import CLOCK, Boundary
 from gaussian_swaying.mpm.boundaries.pinned_points import PinnedPoints
@@ -48,6 +49,8 @@ from gaussian_swaying.mpm.held_rows import (
     rows_at,
 )
 from gaussian_swaying.mpm.state import GridSpec
+from gaussian_swaying.mpm.transfer import Stencil
+from gaussian_swaying.mpm.virtual_nodes import first_nodes, point_with_nodes
 
 POINTS = ("hinge", "clamp")
 """Kinds of boundaries that hold points."""
@@ -85,6 +88,85 @@ def _one_thread() -> Iterator[None]:
         torch.set_num_threads(before)
 
 
+@dataclass(frozen=True)
+class _Site:
+    """The particles of one scene on its nodes, where points are held; on the CPU.
+
+    Attributes:
+        points: Positions at rest [m], float64, shape (P, 3).
+        cell: First node of the cell of each, shape (P,).
+        node: Their nodes, shape (27, P); None for those of the lattice.
+        grid: The nodes.
+        massive: Which of them have mass, shape (G,).
+    """
+
+    points: Tensor
+    cell: Tensor
+    node: Tensor | None
+    grid: GridSpec
+    massive: Tensor
+
+    def rows(self, body: Body, k: int, kind: str, on_face: bool, scene: int, piece: Tensor | None) -> Rows:
+        """The rows of the ``k``-th boundary in a scene, on a piece of the body or on all of it (None)."""
+        boundary, own, least = body.boundaries[k], body.held[k], LEAST_OWN
+        count, dx = len(self.points), self.grid.dx
+        clamped = torch.eye(3, dtype=torch.float64) if kind == "clamp" else torch.zeros(0, 3)
+        whole = body.points.mass.reshape(-1, count)[scene].detach().cpu().double()
+        points = self.points if piece is None else self.points[piece]
+        whole = whole if piece is None else whole[piece]
+
+        def of_piece(field: Tensor) -> Tensor:
+            field = field.reshape(-1, count)[scene].cpu()
+            return field if piece is None else field[piece]
+
+        release = None
+        if isinstance(boundary, PinnedPoints):
+            place = boundary.at.detach().cpu().double()
+            corner, node = self._cells(place, None)
+            _require_material(boundary, corner)
+            along = clamped.expand(len(place), -1, 3)
+        elif on_face:
+            assert own is not None
+            place, along = face_patches(points, whole, of_piece(own.mass) > 0, dx)
+            corner, node = self._cells(place, piece)
+            some = (corner >= 0).nonzero()[:, 0]
+            place, along, corner = place[some], along[some], corner[some]
+            node, least = None if node is None else node[some], LEAST_OWN_ON_A_FACE
+        else:
+            assert own is not None
+            mass = of_piece(own.mass).double()
+            some = (mass > 0).nonzero()[:, 0]
+            normal, held = None, points[some].detach()
+            if kind == "hinge" and thickness(points.detach(), whole, held, dx)[1] and len(some):
+                normal = normals(points.detach(), whole, held, dx)
+            cell = self.cell if piece is None else self.cell[piece]
+            group = groups(held, mass[some], cell[some], LEAST_APART * dx, normal, SHEET * dx)
+            place = means(points[some], mass[some], group)
+            corner, node = self._cells(place.detach(), piece)
+            along = clamped.expand(len(place), -1, 3)
+            if own.release is not None:
+                release = means(of_piece(own.release)[some][:, None], mass[some], group)[:, 0]
+        if release is None:
+            release = torch.full((len(corner),), boundary.end, dtype=torch.float64)
+        at = (place, corner, self.grid, self.massive, along, least)
+        return rows_at(*at, k, boundary.holds_from, release.detach(), node)
+
+    def _cells(self, place: Tensor, piece: Tensor | None) -> tuple[Tensor, Tensor | None]:
+        """The cell of each place, -1 where there is none, and its nodes, shape (N, 27), if they are not the lattice's.
+
+        With virtual nodes a place has those of the material point that is nearest to it, in the same cell if it can be.
+        """
+        if self.node is None:
+            return cells_of_places(place, self.grid, self.massive), None
+        points = self.points.detach() if piece is None else self.points[piece].detach()
+        distance, index = (found[:, 0] for found in nearest_neighbours(points, 1, place.detach()))
+        near = index if piece is None else piece[index]
+        own = first_nodes(place.detach(), self.grid)
+        host = point_with_nodes(own, near, self.cell, self.node, self.grid)
+        host = torch.where(host < 0, near, host)
+        return self.cell[host].where(distance < 2 * self.grid.dx, -1), self.node[:, host].T
+
+
 class PointHolds:
     """All points that the boundaries of a body hold, bound to its grid.
 
@@ -93,7 +175,7 @@ class PointHolds:
         kinds: Kind of each boundary (``Boundary.hold_kind``).
         faces: Those that clamp a region, which is held on its face.
         still: Nodes that they hold themselves, bool, shape (..., G).
-        first: First node of the cell of each particle, over all scenes, shape (N,).
+        stencil: The nodes of the particles.
         grid: The nodes.
         inverse_mass: Their inverse mass [1/kg], 0 for a node without mass, shape (..., G).
 
@@ -122,7 +204,7 @@ class PointHolds:
         kinds: Sequence[str],
         faces: Sequence[int],
         still: Tensor,
-        first: Tensor,
+        stencil: Stencil,
         grid: GridSpec,
         inverse_mass: Tensor,
     ) -> None:
@@ -132,53 +214,22 @@ class PointHolds:
         device = double_home(position.device)
         count, nodes = position.shape[-2], grid.node_count
         points = position.reshape(-1, count, 3).cpu().double()
-        cell = first.reshape(-1, count).cpu() - nodes * torch.arange(len(points))[:, None]
+        cell = stencil.first.reshape(-1, count).cpu() - nodes * torch.arange(len(points))[:, None]
         inverse = inverse_mass.reshape(-1, nodes).cpu().double()
         with_mass = inverse.detach() > 0
         inverse = inverse.where(~still.reshape(-1, nodes).cpu(), 0.0)
         scenes = []
         for s in range(len(points)):
-            massive = with_mass[s]
-            parts = []
-            for k, boundary in enumerate(boundaries):
-                if kinds[k] not in POINTS:
-                    continue
-                own, least = body.held[k], LEAST_OWN
-                clamped = torch.eye(3, dtype=torch.float64) if kinds[k] == "clamp" else torch.zeros(0, 3)
-                if isinstance(boundary, PinnedPoints):
-                    place = boundary.at.detach().cpu().double()
-                    corner = cells_of_places(place, grid, massive)
-                    _require_material(boundary, corner)
-                    release, along = None, clamped.expand(len(place), -1, 3)
-                elif k in faces:
-                    assert own is not None
-                    held = own.mass.reshape(-1, count)[s].cpu() > 0
-                    mass = body.points.mass.reshape(-1, count)[s].cpu().double()
-                    place, along = face_patches(points[s], mass.detach(), held, grid.dx)
-                    corner = cells_of_places(place, grid, massive)
-                    some = (corner >= 0).nonzero()[:, 0]
-                    place, along, corner = place[some], along[some], corner[some]
-                    release, least = None, LEAST_OWN_ON_A_FACE
-                else:
-                    assert own is not None
-                    mass = own.mass.reshape(-1, count)[s].cpu().double()
-                    some = (mass > 0).nonzero()[:, 0]
-                    normal, held = None, points[s][some].detach()
-                    whole = body.points.mass.reshape(-1, count)[s].detach().cpu().double()
-                    if kinds[k] == "hinge" and thickness(points[s].detach(), whole, held, grid.dx)[1] and len(some):
-                        normal = normals(points[s].detach(), whole, held, grid.dx)
-                    apart, thick = LEAST_APART * grid.dx, SHEET * grid.dx
-                    group = groups(held, mass[some], cell[s][some], apart, normal, thick)
-                    place = means(points[s][some], mass[some], group)
-                    corner = cells_of_places(place.detach(), grid, massive)
-                    release, along = None, clamped.expand(len(place), -1, 3)
-                    if own.release is not None:
-                        when = own.release.reshape(-1, count)[s, :, None].cpu()
-                        release = means(when[some], mass[some], group)[:, 0]
-                if release is None:
-                    release = torch.full((len(corner),), boundary.end, dtype=torch.float64)
-                start, release = boundary.holds_from, release.detach()
-                parts.append(rows_at(place, corner, grid, massive, along, least, k, start, release))
+            own_nodes = None
+            if stencil.nodes is not None:
+                own_nodes = stencil.nodes.reshape(27, -1, count)[:, s].cpu() - s * nodes
+            site = _Site(points[s], cell[s], own_nodes, grid, with_mass[s])
+            parts = [
+                site.rows(body, k, kinds[k], k in faces, s, piece)
+                for k in range(len(boundaries))
+                if kinds[k] in POINTS
+                for piece in _pieces(body, k, s)
+            ]
             scenes.append(Rows.join(parts[::-1]))  # of two boundaries at the same place the last one counts
         later = torch.cat([rows.start for rows in scenes])
         starts = sorted(set(later[later > 0].tolist()))
@@ -324,6 +375,15 @@ class PointHolds:
             wanted = torch.where(slope, boundary.turning(place, dt), boundary.target(place, time, dt))
             goal = torch.where(owner == k, wanted, goal)
         return goal
+
+
+def _pieces(body: Body, k: int, scene: int) -> list[Tensor | None]:
+    """The pieces of which a boundary holds particles in a scene; one of None if all particles are one piece."""
+    held = body.held[k]
+    if held is None or len(body.pieces) == 1:
+        return [None]
+    own = held.mass.reshape(-1, held.mass.shape[-1])[scene].cpu() > 0
+    return [piece for piece in body.pieces if piece is None or bool(own[piece].any())]
 
 
 def _require_few(rows: Rows, boundaries: Sequence[Boundary]) -> None:

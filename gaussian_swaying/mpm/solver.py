@@ -197,9 +197,9 @@ class MPMSolver(Solver):
             transfer=self.transfer,
         )
 
-    def followers(self, place: Tensor, arm: Tensor | None) -> Followers | None:
-        """In ``total`` places are read from the nodes, each with its own stencil."""
-        return GridFollowers(place, arm) if self.neighbours_fixed else None
+    def followers(self, place: Tensor, arm: Tensor | None, nodes: Tensor | None = None) -> Followers | None:
+        """In ``total`` places are read from the nodes, each with its own stencil, or with given nodes (27, M)."""
+        return GridFollowers(place, arm, nodes) if self.neighbours_fixed else None
 
     def continued(self, other: Solver, state: MPMState, start: MPMState) -> MPMState | None:
         """The motion of another solver as a state of this one, such as the same body with other pins.

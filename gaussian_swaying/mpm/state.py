@@ -30,16 +30,23 @@ class GridSpec:
         dx: Grid spacing [m].
         offset: Lattice coordinates of the first node.
         resolution: Number of nodes along x, y and z.
+        virtual: Number of virtual nodes, which come after those (``virtual_nodes``).
     """
 
     dx: float
     offset: tuple[int, int, int]
     resolution: tuple[int, int, int]
+    virtual: int = 0
+
+    @property
+    def lattice_count(self) -> int:
+        """Number of nodes of one scene without virtual ones."""
+        return self.resolution[0] * self.resolution[1] * self.resolution[2]
 
     @property
     def node_count(self) -> int:
         """Number of nodes G of one scene."""
-        return self.resolution[0] * self.resolution[1] * self.resolution[2]
+        return self.lattice_count + self.virtual
 
     def holds(self, other: GridSpec) -> bool:
         """True if all nodes of another grid are among those of this one."""
@@ -66,7 +73,7 @@ class GridSpec:
         return GridSpec(self.dx, (offset[0], offset[1], offset[2]), (resolution[0], resolution[1], resolution[2]))
 
     def node_positions(self, like: Tensor) -> Tensor:
-        """Positions of the nodes [m], shape (G, 3), with the type and device of ``like``."""
+        """Positions of the nodes but virtual ones [m], shape (G, 3), with the type and device of ``like``."""
         axes = [
             (torch.arange(n, device=like.device) + o).to(like.dtype) * self.dx
             for n, o in zip(self.resolution, self.offset, strict=True)
@@ -114,6 +121,9 @@ class MaterialPoints:
         poisson_ratio: Poisson's ratio nu, shape (..., P).
         laws: The constitutive laws of the run.
         law_index: Which of ``laws`` applies to each particle, int64, shape (..., P); None if there is only one.
+        attached: Which points are attached to each other at rest, in all scenes: a number for each, int64, shape (P,),
+            the same for those of a piece, or pairs that are attached, shape (E, 2). Others never share nodes in
+            ``total``, however close they lie (``virtual_nodes``). None if all are.
     """
 
     position: Tensor
@@ -123,9 +133,12 @@ class MaterialPoints:
     poisson_ratio: Tensor
     laws: tuple[ConstitutiveLaw, ...] = _DEFAULT
     law_index: Tensor | None = None
+    attached: Tensor | None = None
 
     def __post_init__(self) -> None:
         check_shape("position", self.position, "P", 3)
+        if self.attached is not None:
+            _check_attached(self.attached, self.count)
         batch = tuple(self.position.shape[:-1])
         for name in (*_FIELDS, *(["law_index"] if self.law_index is not None else [])):
             value = getattr(self, name)
@@ -151,6 +164,7 @@ class MaterialPoints:
         poisson_ratio: Tensor | float,
         law: ConstitutiveLaw | Sequence[ConstitutiveLaw] | None = None,
         law_index: Tensor | None = None,
+        attached: Tensor | None = None,
     ) -> MaterialPoints:
         """Build the points from per-point tensors or from numbers that apply to all points.
 
@@ -162,6 +176,7 @@ class MaterialPoints:
             poisson_ratio: Poisson's ratio, in (-1, 0.5).
             law: Constitutive law, or several; fixed corotated elasticity if None.
             law_index: With several laws, which of them applies to each particle, int64, shape (..., P).
+            attached: Which points are attached to each other, see :class:`MaterialPoints`.
 
         Returns:
             The points, every field expanded to shape (..., P).
@@ -194,11 +209,15 @@ class MaterialPoints:
             law_index = law_index.to(position.device, torch.long).expand(position.shape[:-1])
             if not bool(((law_index >= 0) & (law_index < len(laws))).all()):
                 raise ValueError(f"Expected `law_index` to lie in 0 to {len(laws) - 1}, the last index of `laws`.")
-        return cls(position, rho * v, v, e, nu, laws, law_index)
+        return cls(position, rho * v, v, e, nu, laws, law_index, attached)
 
     @classmethod
     def join(cls, parts: Sequence[MaterialPoints]) -> MaterialPoints:
-        """Join several bodies into one: their points one after the other, each with its own law."""
+        """Join several bodies into one: their points one after the other, each with its own law.
+
+        They share nodes where they are close, if all points are attached in each of them; otherwise none are attached
+        to those of another body.
+        """
         laws: list[ConstitutiveLaw] = []
         index = []
         for part in parts:
@@ -208,14 +227,24 @@ class MaterialPoints:
             index.append(torch.tensor(place, device=own.device)[own])
         fields = {name: torch.cat([getattr(part, name) for part in parts], -1) for name in _FIELDS}
         position = torch.cat([part.position for part in parts], -2)
-        return cls(position, **fields, laws=tuple(laws), law_index=torch.cat(index, -1) if len(laws) > 1 else None)
+        one_law = len(laws) < 2
+        attached = _join_attached(parts)
+        law_index = None if one_law else torch.cat(index, -1)
+        return cls(position, **fields, laws=tuple(laws), law_index=law_index, attached=attached)
 
     @classmethod
     def stack(cls, parts: Sequence[MaterialPoints]) -> MaterialPoints:
         """Independent scenes with as many points each and the same laws, as one batch of shape (B, P, ·)."""
         fields = {name: torch.stack([getattr(part, name) for part in parts]) for name in ("position", *_FIELDS)}
         index = [part.law_index for part in parts if part.law_index is not None]
-        return cls(**fields, laws=parts[0].laws, law_index=torch.stack(index) if index else None)
+        law_index, attached = torch.stack(index) if index else None, parts[0].attached
+        for part in parts[1:]:
+            same = part.attached is attached or (
+                part.attached is not None and attached is not None and torch.equal(part.attached, attached)
+            )
+            if not same:
+                raise ValueError("Scenes of one batch need the same `attached`: run those that differ one by one.")
+        return cls(**fields, laws=parts[0].laws, law_index=law_index, attached=attached)
 
     @property
     def count(self) -> int:
@@ -231,10 +260,35 @@ class MaterialPoints:
         return each[:1].expand(self.mass.shape) if self.law_index is None else each[self.law_index]
 
     def map(self, function: Callable[[Tensor], Tensor]) -> MaterialPoints:
-        """Apply a function to every tensor (``.detach``, indexing); law indices stay integers."""
+        """Apply a function to every tensor (``.detach``, indexing); law indices stay integers, ``attached`` stays."""
         moved = {name: function(getattr(self, name)) for name in ("position", *_FIELDS)}
         index = None if self.law_index is None else function(self.law_index).long()
-        return MaterialPoints(**moved, laws=self.laws, law_index=index)
+        return MaterialPoints(**moved, laws=self.laws, law_index=index, attached=self.attached)
+
+
+def _check_attached(attached: Tensor, count: int) -> None:
+    """Raise ValueError unless it is a number for each point, or pairs of points."""
+    if attached.dtype != torch.int64 or not (attached.shape == (count,) or attached.shape[1:] == (2,)):
+        raise ValueError(
+            f"Expected `attached` to be int64, of shape ({count},) with a number for each point or (E, 2) with pairs "
+            f"of points, but got {attached.dtype} of shape {tuple(attached.shape)}."
+        )
+    if attached.dim() == 2 and not bool(((attached >= 0) & (attached < count)).all()):
+        raise ValueError(f"Expected the pairs of `attached` to be numbers of points from 0 to {count - 1}.")
+
+
+def _join_attached(parts: Sequence[MaterialPoints]) -> Tensor | None:
+    """``attached`` of several bodies as one."""
+    if all(part.attached is None for part in parts):
+        return None
+    if any(part.attached is not None and part.attached.dim() == 2 for part in parts):
+        raise ValueError("Bodies whose `attached` are pairs cannot be joined: give a number for each point.")
+    found, many = [], 0
+    for part in parts:
+        own = torch.zeros(part.count, dtype=torch.long) if part.attached is None else part.attached.cpu()
+        found.append(torch.unique(own, return_inverse=True)[1] + many)
+        many = int(found[-1].max()) + 1 if part.count else many
+    return torch.cat(found)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -324,14 +378,17 @@ class MPMState(State):
     node_velocity: Tensor | None = None
 
     def state_dict(self) -> dict[str, Any]:
-        """See :meth:`State.state_dict`; the grid as a dictionary."""
-        return super(MPMState, self).state_dict() | {"grid": dataclasses.asdict(self.grid)}
+        """See :meth:`State.state_dict`; the box of the grid as a dictionary."""
+        box = {name: getattr(self.grid, name) for name in ("dx", "offset", "resolution")}
+        return super(MPMState, self).state_dict() | {"grid": box}
 
     @classmethod
     def from_state_dict(cls, values: Mapping[str, Any], device: torch.device | str = "cpu") -> Self:
         """See :meth:`State.from_state_dict`."""
-        grid = values["grid"]
+        grid, nodes = values["grid"], values["node_displacement"]
         known = GridSpec(float(grid["dx"]), tuple(grid["offset"]), tuple(grid["resolution"]))
+        if nodes is not None:
+            known = dataclasses.replace(known, virtual=nodes.shape[-2] - known.lattice_count)
         return super(MPMState, cls).from_state_dict({**values, "grid": known}, device)
 
 

@@ -38,6 +38,7 @@ class Stencil:
         start: Index of the first entry of each node in that order, shape (all nodes + 1,), or None.
         matrices: ``basis`` as a sparse matrix from all nodes to the rows of all particles, and its transpose, for a
             stencil that is used many times, or None.
+        nodes: Flat indices of the nodes, shape (27, N), where they are not those of the lattice (``virtual_nodes``).
     """
 
     first: Tensor
@@ -49,6 +50,7 @@ class Stencil:
     order: Tensor | None = None
     start: Tensor | None = None
     matrices: tuple[Tensor, Tensor] | None = None
+    nodes: Tensor | None = None
 
     def __deepcopy__(self, memo: dict[int, Any]) -> "Stencil":
         """Return itself: a stencil is never modified, and PyTorch cannot deep-copy a sparse matrix."""
@@ -56,6 +58,8 @@ class Stencil:
 
     def layer(self, i: int) -> Tensor:
         """Flat index of the nine nodes with the ``i``-th x, shape (9 * N,), particles last."""
+        if self.nodes is not None:
+            return self.nodes[9 * i : 9 * i + 9].reshape(-1)
         return (self.first + self.shift[i, :, :, None]).reshape(-1)
 
     @property
@@ -66,6 +70,8 @@ class Stencil:
     @property
     def node(self) -> Tensor:
         """Flat index of the nodes of each particle, shape (N * 27,)."""
+        if self.nodes is not None:
+            return self.nodes.T.reshape(-1)
         return (self.first[:, None] + self.shift.reshape(-1)).reshape(-1)
 
     @property
@@ -86,6 +92,7 @@ def bspline_stencil(
     gradients: bool = True,
     deterministic: bool = False,
     fixed: bool = False,
+    nodes: Tensor | None = None,
 ) -> Stencil:
     r"""Quadratic B-spline weights and their gradients (Jiang et al. 2016, "The material point method", eq. 123).
 
@@ -103,6 +110,7 @@ def bspline_stencil(
         fixed: The stencil will be used many times: on a CPU, and without a gradient in ``position``, also keep
             ``matrices``. They take 432 bytes for each row of each particle in float32, and transfers then take a third
             of the time.
+        nodes: See :class:`Stencil`.
 
     Returns:
         The support of each particle.
@@ -142,6 +150,8 @@ def bspline_stencil(
         reach = torch.arange(3, device=f.device, dtype=f.dtype)
         factors.append(w * ((reach[:, None] - f[:, None]) * dx))
     stencil = Stencil(first, shift, torch.stack(factors), inside.reshape(position.shape[:-1]), batch, grid.node_count)
+    if nodes is not None:
+        stencil = replace(stencil, nodes=nodes)
     if fixed and _sparse_products(stencil.factors):
         return replace(stencil, matrices=_matrices(stencil))
     if not deterministic:

@@ -142,7 +142,7 @@ def _check_grid(grid: Any, start: Any, max_nodes: int) -> int:
         _require(
             three and all(type(value) is int for value in grid[name]), f"its `grid.{name}` is not three whole numbers"
         )
-    nodes = math.prod(grid["resolution"])
+    nodes = math.prod(grid["resolution"]) + (start.grid.node_count - math.prod(start.grid.resolution))
     _require(min(grid["resolution"]) > 0 and nodes <= max_nodes, "its `grid.resolution` is out of range")
     _require(max(abs(value) for value in grid["offset"]) < 2**31, "its `grid.offset` is out of range")
     fixed = start.node_displacement is not None

@@ -83,7 +83,7 @@ class SimulatedScene(nn.Module):
         cloud: GaussianCloud | None = None,
         fixed: bool = True,
         apart: Sequence[Region] = (),
-        followers: Callable[[Tensor, Tensor | None], Followers | None] = GridFollowers,
+        followers: Callable[..., Followers | None] = GridFollowers,
     ) -> None:
         super().__init__()
         cloud = scene.cloud() if cloud is None else cloud
@@ -153,10 +153,12 @@ class SimulatedScene(nn.Module):
         if not by_grid:
             self.follow: Followers = PointFollowers(anchor, _arm(own - place[anchor], dtype), self.points.position)
         else:
-            read = on_material(place, near, self.points, dx)
-            nodal = followers(read.to(dtype), _arm(place - read, dtype))
+            read, nodes = on_material(place, near, self.points, dx)
+            given = () if nodes is None else (nodes,)
+            nodal = followers(read.to(dtype), _arm(place - read, dtype), *given)
             if nodal is not None:
-                follow = followers(read[anchor].to(dtype), _arm(own - read[anchor], dtype))
+                given = () if nodes is None else (nodes[:, anchor],)
+                follow = followers(read[anchor].to(dtype), _arm(own - read[anchor], dtype), *given)
                 assert follow is not None
                 self.follow, self.track = follow, nodal
             else:  # a solver without nodes

@@ -58,13 +58,14 @@ def surface_of(samples: Samples, owner: Tensor, points: MaterialPoints, dx: floa
         0, group, torch.where(away <= nearest[group], torch.arange(len(group)), len(group)), "amin"
     )
     place, facing = part.position[first], part.normal[first]
-    read = on_material(place, owner[chosen[first]], points, dx)
+    near = owner[chosen[first]]
+    read, _ = on_material(place, near, points, dx)
     radius = (1.3 * (area / torch.pi).sqrt()).clamp(min=DISC * dx / PER_CELL)
     thickness = part.thickness[first]
     if contact is not None and contact.thickness is not None:
         thickness = torch.full_like(thickness, contact.thickness)
     place, facing, read = (t.to(kind) for t in (place, facing, read))
-    surface = Surface(place, facing, radius.to(kind), thickness.to(kind), read, contact)
+    surface = Surface(place, facing, radius.to(kind), thickness.to(kind), read, contact, near)
     if contact is not None:
         warn_close(surface)
     return surface

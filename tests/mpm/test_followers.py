@@ -31,4 +31,6 @@ def test_places_without_all_their_nodes_are_read_at_a_material_point():
     )
     nearest = torch.tensor([1, 0, 0, 1, 0, 1])
     expected = torch.cat([place[:2], points.position.double()[nearest[2:]]])
-    assert torch.equal(on_material(place, nearest, points, 1.0), expected)
+    read, nodes = on_material(place, nearest, points, 1.0)
+    assert nodes is None
+    assert torch.equal(read, expected)

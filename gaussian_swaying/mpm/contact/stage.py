@@ -18,6 +18,7 @@ from gaussian_swaying.mpm.contact.solve import SLACK, Constraints, Rows, acting,
 from gaussian_swaying.mpm.contact.surface import Contact, Surface
 from gaussian_swaying.mpm.state import GridSpec, MPMState
 from gaussian_swaying.mpm.transfer import bspline_stencil
+from gaussian_swaying.mpm.virtual_nodes import point_with_nodes
 
 LEAST_MARGIN = 0.5
 """Least distance beyond contact within which pairs are listed [cells]."""
@@ -91,6 +92,7 @@ class ContactStage:
         grid: The nodes.
         inverse_mass: Their inverse mass [1/kg], 0 for a node without mass, shape (..., G).
         deterministic: Whether sums on a GPU have a fixed order.
+        points: With virtual nodes, the first node of the cell of each material point and its nodes, over all scenes.
 
     Raises:
         ValueError: If a sample has no material.
@@ -104,6 +106,7 @@ class ContactStage:
         grid: GridSpec,
         inverse_mass: Tensor,
         deterministic: bool = False,
+        points: tuple[Tensor, Tensor] | None = None,
     ) -> None:
         self.deterministic = deterministic
         self.surface, self.contact, self.grid, self.dx = surface, surface.contact, grid, grid.dx
@@ -121,6 +124,8 @@ class ContactStage:
         basis = stencil.basis  # (C, 4, 27)
         arm = surface.place - surface.read
         self.node = stencil.node.reshape(-1, 27)
+        if points is not None:
+            self.node = self._nodes(stencil.first, *points)
         self.first, self.fraction = stencil.first, 1.5 + stencil.factors[1, :, 0] * grid.dx  # position in its cell
         self.slope = basis[:, 1:4]
         self.weight = basis[:, 0] + (arm[:, :, None] * self.slope).sum(1)
@@ -133,6 +138,19 @@ class ContactStage:
         self.lists: Lists | None = None
         self.made = 0
         """Number of times that the lists were made."""
+
+    def _nodes(self, first: Tensor, point_first: Tensor, point_node: Tensor) -> Tensor:
+        """The nodes of the samples, with virtual ones: those of the material point that each belongs to."""
+        near, many = self.surface.near, len(point_first) // self.scenes
+        if near is None:
+            raise ValueError("Contact of a body with `attached` parts needs `near` in its Surface.")
+        number = torch.arange(self.scenes).repeat_interleave(len(first) // self.scenes)
+        belongs = near.cpu() + many * number
+        host = point_with_nodes(first.cpu(), belongs, point_first.cpu(), point_node.cpu(), self.grid)
+        if bool((host < 0).any()):
+            k = int((host < 0).int().argmax())
+            raise ValueError(f"The contact sample {k} lies in a cell without material of its piece: move its `read`.")
+        return point_node.T[host.to(point_node.device)]
 
     # ---- lists
 

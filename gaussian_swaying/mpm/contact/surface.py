@@ -55,6 +55,7 @@ class Surface:
         read: Rest position at which the motion of each is interpolated [m], shape (C, 3): the sample itself, or one
             close to it if some of its nodes have no mass.
         contact: Contact of the surface with itself; None if only obstacles count.
+        near: The material point that each belongs to, shape (C,); the nearest one if None.
     """
 
     place: Tensor
@@ -63,6 +64,7 @@ class Surface:
     thickness: Tensor
     read: Tensor
     contact: Contact | None = None
+    near: Tensor | None = None
 
     def __post_init__(self) -> None:
         check_shape("place", self.place, "C", 3)
@@ -100,9 +102,11 @@ class Surface:
         h = thickness if contact is None or contact.thickness is None else contact.thickness
         full = place.new_full((len(place),), 1.0)
         facing = torch.zeros_like(place) if normal is None else normal.to(place)
-        return cls(place, facing, 0.75 * spacing * full, h * full, place, contact)
+        own = torch.arange(points.count, device=place.device).repeat(len(place) // points.count)
+        return cls(place, facing, 0.75 * spacing * full, h * full, place, contact, own)
 
     def map(self, function: Callable[[Tensor], Tensor]) -> Surface:
         """Apply a function to every tensor."""
         place, normal, read = (function(field) for field in (self.place, self.normal, self.read))
-        return Surface(place, normal, function(self.radius), function(self.thickness), read, self.contact)
+        near = None if self.near is None else self.near.to(place.device)
+        return Surface(place, normal, function(self.radius), function(self.thickness), read, self.contact, near)

@@ -12,6 +12,7 @@ from torch import Tensor
 
 from gaussian_swaying._devices import in_double
 from gaussian_swaying.geometry.linalg import polar_rotation
+from gaussian_swaying.geometry.neighbours import nearest_neighbours
 from gaussian_swaying.geometry.rigid import centre, fitted_gradient
 from gaussian_swaying.mpm.body import Body, Held
 from gaussian_swaying.mpm.boundaries.boundary import BY_BODY, Boundary
@@ -25,6 +26,7 @@ from gaussian_swaying.mpm.point_holds import POINTS, PointHolds
 from gaussian_swaying.mpm.state import GridSpec, MPMState
 from gaussian_swaying.mpm.timestep import kick_time
 from gaussian_swaying.mpm.transfer import bspline_stencil, gather, scatter
+from gaussian_swaying.mpm.virtual_nodes import VirtualNodes, virtual_nodes
 
 
 class Total(Formulation):
@@ -37,6 +39,7 @@ class Total(Formulation):
     Attributes:
         grid: The nodes.
         stencil: Support of the particles at rest.
+        virtual: Copies of nodes for connected parts, or None.
         node_mass: Mass of each node [kg], shape (..., G).
         node_inverse_mass: Its inverse [1/kg], 0 for a node without mass, shape (..., G).
         node_rest: Centre of the mass that each node carries, at rest [m], shape (..., G, 3), if a boundary needs node
@@ -61,8 +64,12 @@ class Total(Formulation):
             )
         self.grid = self.bounding_grid(position, margin=0)
         snap = torch.finfo(position.dtype).eps ** 0.5
+        self.virtual = self._virtual_nodes(snap)
+        if self.virtual is not None:
+            self.grid = replace(self.grid, virtual=self.virtual.original.shape[1])
+        nodes = None if self.virtual is None else self.virtual.node
         self.stencil = bspline_stencil(
-            position, self.grid, False, snap, deterministic=settings.deterministic, fixed=True
+            position, self.grid, False, snap, deterministic=settings.deterministic, fixed=True, nodes=nodes
         )
         self.node_mass = scatter(self.stencil, points.mass[..., None, None])[..., 0]
         self.node_inverse_mass = safe_inverse(self.node_mass)
@@ -80,6 +87,24 @@ class Total(Formulation):
         self._windows = self._point_windows()
         self._point_holds = self._hold_points()
         self.contact = self._contact()
+
+    def _virtual_nodes(self, snap: float) -> VirtualNodes | None:
+        points = self.body.points
+        if points.attached is None:
+            return None
+        first = bspline_stencil(points.position.detach(), self.grid, False, snap).first
+        scenes = math.prod(points.mass.shape[:-1])
+        number = torch.arange(scenes, device=first.device).repeat_interleave(points.count)
+        return virtual_nodes(first - number * self.grid.node_count, self.grid, points.attached, scenes)
+
+    def node_positions(self, like: Tensor) -> Tensor:
+        """Positions of the nodes [m], shape (G, 3), or with virtual ones (..., G, 3); type and device of ``like``."""
+        lattice = self.grid.node_positions(like)
+        if self.virtual is None:
+            return lattice
+        more = lattice[self.virtual.original]
+        every = torch.cat([lattice.expand(len(more), *lattice.shape), more], 1)
+        return every.reshape(*self.body.points.mass.shape[:-1], *every.shape[1:])
 
     def hold_kind(self, k: int) -> str:
         """Return what a boundary acts on; a pin without a kind holds a sheet by a hinge, and anything else by a clamp.
@@ -135,13 +160,19 @@ class Total(Formulation):
         )
         found = []
         for s, (place, weight) in enumerate(zip(position, mass, strict=True)):
-            if held is None:
-                pins = self.body.boundaries[k]
-                assert isinstance(pins, PinnedPoints)
-                where = pins.at.detach().cpu().to(place)
-            else:
-                where = place[held.mass.detach().reshape(-1, count)[s].cpu() > 0]
-            found.append(thickness(place, weight, where, self.settings.dx))
+            for own in self.body.pieces:
+                if held is None:
+                    pins = self.body.boundaries[k]
+                    assert isinstance(pins, PinnedPoints)
+                    where = pins.at.detach().cpu().to(place)
+                    if own is not None:
+                        nearest = nearest_neighbours(place.double(), 1, where.double())[1][:, 0]
+                        where = where[torch.isin(nearest, own)]
+                else:
+                    mine = held.mass.detach().reshape(-1, count)[s].cpu() > 0
+                    where = place[mine] if own is None else place[own][mine[own]]
+                whole = (place, weight) if own is None else (place[own], weight[own])
+                found.append(thickness(*whole, where, self.settings.dx))
         return max(thick for thick, _ in found), all(sheet for _, sheet in found)
 
     def acts_on_nodes(self, k: int) -> bool:
@@ -186,7 +217,7 @@ class Total(Formulation):
             assert held is not None
             assert held.share is not None
             still |= held.share > held.threshold
-        holds = PointHolds(self.body, self.kinds, faces, still, self.stencil.first, self.grid, self.node_inverse_mass)
+        holds = PointHolds(self.body, self.kinds, faces, still, self.stencil, self.grid, self.node_inverse_mass)
         if not holds.rows:
             return None  # a clamp that holds everything has no face
         if any(bool((body.mass.reshape(-1)[holds.affected] > 0).any()) for body in self._bodies):
@@ -201,7 +232,7 @@ class Total(Formulation):
         held = self.held[k]
         assert held is not None
         assert held.share is not None
-        rest, mass = in_double(self.grid.node_positions(self.node_mass)), in_double(self.node_mass)
+        rest, mass = in_double(self.node_positions(self.node_mass)), in_double(self.node_mass)
         return _RigidNodes(held.mass > 0, rest, torch.where(held.share > held.threshold, mass, 0.0))
 
     def _check_bodies(self) -> None:
@@ -221,8 +252,12 @@ class Total(Formulation):
             return None
         if surface is None:
             surface = Surface.of_points(body.points)
-        inverse = self.node_inverse_mass
-        return ContactStage(surface, body.boundaries, self.kinds, self.grid, inverse, self.settings.deterministic)
+        inverse, nodes = self.node_inverse_mass, None
+        if self.virtual is not None:
+            nodes = self.stencil.first, self.virtual.node
+        return ContactStage(
+            surface, body.boundaries, self.kinds, self.grid, inverse, self.settings.deterministic, nodes
+        )
 
     @classmethod
     def check_settings(cls, settings: Settings) -> None:
@@ -293,7 +328,7 @@ class Total(Formulation):
             shift = (state.position - points.position) * points.mass[..., None]
             position = self.node_rest + scatter(self.stencil, shift[..., None, :]) * inverse_mass
         if self.needs_lattice:
-            lattice = state.grid.node_positions(velocity) + displacement
+            lattice = self.node_positions(velocity) + displacement
         pressed = None
         if self.contact is not None:
             self.contact.update(state, dt)
@@ -378,7 +413,7 @@ class Total(Formulation):
         assert state.node_velocity is not None
         assert state.node_displacement is not None
         momentum = self.node_mass[..., None] * state.node_velocity
-        place = state.grid.node_positions(momentum) + state.node_displacement
+        place = self.node_positions(momentum) + state.node_displacement
         return momentum.sum(-2), torch.linalg.cross(place, momentum, dim=-1).sum(-2)
 
 
@@ -396,7 +431,7 @@ class _RigidNodes:
 
     Attributes:
         particles: Its particles, bool, shape (..., P).
-        rest: Nodes at rest [m], float64, shape (G, 3).
+        rest: Nodes at rest [m], float64, shape (G, 3), or with virtual ones (..., G, 3).
         mass: Mass of its nodes [kg], zero for others, float64, shape (..., G).
     """
 

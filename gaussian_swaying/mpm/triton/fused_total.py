@@ -8,6 +8,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from gaussian_swaying.geometry.groups import equal_rows
 from gaussian_swaying.kernels.graphs import RECORDED
 from gaussian_swaying.kernels.language import triton
 from gaussian_swaying.kernels.launch import lanes, launch
@@ -20,6 +21,7 @@ from gaussian_swaying.mpm.state import MPMState
 from gaussian_swaying.mpm.triton import total_kernels as kernels
 from gaussian_swaying.mpm.triton.fused import Fused, Part, check_indices
 from gaussian_swaying.mpm.triton.fused_contact import FusedContact
+from gaussian_swaying.mpm.virtual_nodes import shifts
 
 # time per particle for a number of lanes per cell, relative to 32 lanes, on an H200
 _LANE_COST = {4: 1.5, 8: 1.0, 16: 1.0, 32: 1.0, 64: 0.85}
@@ -46,8 +48,16 @@ class FusedTotal(Fused):
         body, points, stencil, grid = bound.body, bound.body.points, bound.stencil, bound.grid
         self.bound, self.grid = bound, grid
         first = stencil.first
-        order = torch.argsort(first, stable=True)
-        cells, sizes = torch.unique_consecutive(first[order], return_counts=True)
+        # with virtual nodes a cell is cut by the copies of its nodes that the particles have
+        unit = first if stencil.nodes is None else equal_rows(torch.cat([first[:, None], stencil.nodes.T], 1))
+        order = torch.argsort(unit, stable=True)
+        cells, sizes = torch.unique_consecutive(unit[order], return_counts=True)
+        self.virtual = stencil.nodes is not None
+        self.cell_nodes = cells.new_zeros(27, 0).int()
+        """The nodes of each cell, shape (27, cells), where they are not those of the lattice."""
+        if stencil.nodes is not None:
+            example = order[sizes.cumsum(0) - sizes]
+            cells, self.cell_nodes = first[example], stencil.nodes[:, example].int().contiguous()
         self.order, self.cells = order.int(), len(cells)
         ends = sizes.cumsum(0)
         self.cell_start = torch.cat([ends.new_zeros(1), ends]).int()
@@ -64,14 +74,17 @@ class FusedTotal(Fused):
         inverse = bound.node_inverse_mass.reshape(-1)
         active = (inverse > 0).nonzero()[:, 0]
         self.active, self.inverse_mass = active.int(), inverse[active].contiguous()
-        place = torch.full((len(inverse),), self.cells, dtype=torch.int32, device=self.device)
-        place[cells] = torch.arange(self.cells, dtype=torch.int32, device=self.device)
-        _, ny, nz = grid.resolution
-        shifts = [(i * ny + j) * nz + k for i in range(3) for j in range(3) for k in range(3)]
-        below = [active - shift for shift in shifts]
-        self.source = _sources(
-            torch.stack([torch.where(b >= 0, place[b.clamp(min=0)], self.cells) for b in below]), self.cells
-        )
+        if self.virtual:
+            rank = torch.zeros(len(inverse), dtype=torch.long, device=self.device)
+            rank[active] = torch.arange(len(active), device=self.device)
+            self.source = _sources_of(self.cell_nodes.long(), rank, inverse > 0)
+        else:
+            place = torch.full((len(inverse),), self.cells, dtype=torch.int32, device=self.device)
+            place[cells] = torch.arange(self.cells, dtype=torch.int32, device=self.device)
+            below = [active - shift for shift in shifts(grid).tolist()]
+            self.source = _sources(
+                torch.stack([torch.where(b >= 0, place[b.clamp(min=0)], self.cells) for b in below]), self.cells
+            )
         self.fields = torch.zeros(len(inverse), 8, **self.like)
         self.displacement, self.velocity = self.fields[:, :4], self.fields[:, 4:]
         self.lanes = lanes(self.device, _lanes(sizes))
@@ -91,7 +104,7 @@ class FusedTotal(Fused):
         )
         """True if the kernels apply all boundaries but obstacles, which are contact."""
         self.position = bound.needs_position
-        self.lattice = grid.node_positions(self.rest) if bound.needs_lattice else None
+        self.lattice = bound.node_positions(self.rest) if bound.needs_lattice else None
         self._take_pins()
         self.touching = None if bound.contact is None else FusedContact(bound, self.fields, self.active)
         self.shift = torch.zeros(len(inverse) if self.position else 0, 4, **self.like)
@@ -101,6 +114,14 @@ class FusedTotal(Fused):
         self._partial: dict[tuple[int, int, str], Tensor] = {}
         width = 8 if self.position else 4
         check_indices(max(8 * len(inverse), 27 * (self.pieces + 1) * width, 27 * len(active)))
+
+    @classmethod
+    def unsupported(cls, bound: Formulation, interpret: bool) -> str | None:
+        """Also refuses contact of a body with virtual nodes."""
+        why = super().unsupported(bound, interpret)
+        if why is None and isinstance(bound, Total) and bound.virtual is not None and bound.contact is not None:
+            return "contact and obstacles have no kernels for a body with `attached` parts"
+        return why
 
     @property
     def launches(self) -> bool:
@@ -140,6 +161,7 @@ class FusedTotal(Fused):
         within = torch.arange(self.pieces, device=self.device) - first[cell]
         self.piece_start = torch.cat([self.cell_start[cell] + most * within, self.cell_start[-1:]]).int()
         self.piece_node, self.piece_scene = self.cell_node[cell].contiguous(), self.cell_scene[cell].contiguous()
+        self.piece_nodes = self.cell_nodes[:, cell if self.virtual else cell[:0]].contiguous()
         self.first_piece = torch.cat([first, first.new_tensor([self.pieces])]).int()
 
     def _take_values(self, values: Tensor) -> None:
@@ -206,8 +228,9 @@ class FusedTotal(Fused):
         _, ny, nz = self.grid.resolution
         block = lanes(self.device, 128)
         launch(kernels.total_look, (-(-self.count // block),))(
-            self.fraction, self.material, self.count, self.particle_cell, self.cell_node, self.fields, self.speed,
-            ny * nz, nz, 1 / self.grid.dx, WAVE=self.wave, BLOCK=block, num_warps=4,
+            self.fraction, self.material, self.count, self.particle_cell, self.cell_node, self.cell_nodes, self.cells,
+            self.fields, self.speed,
+            ny * nz, nz, 1 / self.grid.dx, WAVE=self.wave, BLOCK=block, VIRTUAL=self.virtual, num_warps=4,
         )  # fmt: skip
 
     def substep(self, offset: int, options: dict[str, Any]) -> None:
@@ -220,12 +243,13 @@ class FusedTotal(Fused):
         per_program = lanes(self.device, max(1, 32 // self.lanes), 1)
         launch(kernels.total_particles, (-(-self.pieces // per_program),))(
             self.fraction, self.material, self.law, self.law_table, self.values, self.force_in, self.load, self.order,
-            self.count, self.piece_start, self.piece_node, self.piece_scene, self.pieces,
+            self.count, self.piece_start, self.piece_node, self.piece_scene, self.pieces, self.piece_nodes,
             self.fields, partial,
             self.schedule, self.vectors, self.scenes, self.tables.buffer, self.first_step, offset,
             ny * nz, nz, *self.grid.offset, self.grid.node_count, self.grid.dx, 1 / self.grid.dx,
             self.settings.stiffness_damping,
-            **options, POSITION=self.position, WIDTH=width, CELLS=per_program, LANES=self.lanes, num_warps=1,
+            **options, POSITION=self.position, WIDTH=width, CELLS=per_program, LANES=self.lanes,
+            VIRTUAL=self.virtual, num_warps=1,
             **REGISTERS.get(self.lanes, {}),
         )  # fmt: skip
         if self.pieces > self.cells:
@@ -342,9 +366,9 @@ class FusedTotal(Fused):
         block = lanes(self.device, 128)
         launch(kernels.total_read, (-(-self.count // block),))(
             self.fraction, self.load, self.order, self.rest, self.count, self.particle_cell, self.cell_node,
-            self.fields, kick, position, velocity, affine, F,
+            self.cell_nodes, self.cells, self.fields, kick, position, velocity, affine, F,
             ny * nz, nz, 1 / self.grid.dx,
-            WORK=work, IMPLICIT=implicit, BLOCK=block, num_warps=4,
+            WORK=work, IMPLICIT=implicit, BLOCK=block, VIRTUAL=self.virtual, num_warps=4,
         )  # fmt: skip
 
     def _look_at(self) -> MPMState:
@@ -385,6 +409,26 @@ def _sources(cell: Tensor, cells: int) -> Tensor:
     most = int((~none).sum(0).amax()) if none.shape[1] else 0  # material too light has no nodes
     first = none.byte().argsort(dim=0, stable=True)[:most]  # in the order of the places
     return (first * (cells + 1) + cell.gather(0, first)).int()
+
+
+def _sources_of(nodes: Tensor, rank: Tensor, has_mass: Tensor) -> Tensor:
+    """As :func:`_sources`, for cells whose nodes are not those of the lattice.
+
+    Args:
+        nodes: The nodes of each cell, shape (27, cells).
+        rank: Place of each node among those with mass, shape (all nodes,).
+        has_mass: Which nodes have mass, shape (all nodes,).
+    """
+    cells = nodes.shape[1]
+    place, cell = has_mass[nodes].nonzero().unbind(1)  # in the order of the places
+    row, to = place * (cells + 1) + cell, rank[nodes[place, cell]]
+    order = to.argsort(stable=True)
+    row, to = row[order], to[order]
+    many = to.bincount(minlength=int(has_mass.sum()))
+    within = torch.arange(len(to), device=to.device) - (many.cumsum(0) - many)[to]
+    found = to.new_full((int(many.max()) if len(many) else 0, len(many)), cells)  # a row of zeros
+    found[within, to] = row
+    return found.int()
 
 
 def _lanes(sizes: Tensor) -> int:

@@ -440,6 +440,8 @@ def why_not(fused: FusedTotal, state: MPMState, forces: Sequence[Force]) -> str 
     points = bound.body.points
     if not fused.plain or fused.touching is not None:
         return "boundaries other than pins that hold all the time, and contact, have no backward kernels"
+    if fused.virtual:
+        return "virtual nodes have no backward kernels"
     if any(derivative is None for derivative in fused.laws.adjoints):
         return "a law has no backward kernel (`LawFunctions.adjoint`)"
     twin = forces[0].twin() if forces else None

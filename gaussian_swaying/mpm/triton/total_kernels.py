@@ -26,8 +26,14 @@ from gaussian_swaying.mpm.triton.shared import (
 
 
 @triton.jit
-def gather(field, node, sx, sy, f, wz, gz, inverse_dx, mask, BOTH: tl.constexpr):
-    """Interpolate columns 0 to 2 of rows of eight, their derivatives [component, axis], and (BOTH) columns 4 to 6."""
+def gather(
+    field, node, sx, sy, f, wz, gz, inverse_dx, mask, BOTH: tl.constexpr,
+    table=None, columns=0, VIRTUAL: tl.constexpr = False,
+):  # fmt: skip
+    """Interpolate columns 0 to 2 of rows of eight, their derivatives [component, axis], and (BOTH) columns 4 to 6.
+
+    ``node`` is the first node on the lattice, or with VIRTUAL a column of a ``table`` of nodes, shape (27, columns).
+    """
     zero = wz[0] * 0
     u0, u1, u2, v0, v1, v2 = zero, zero, zero, zero, zero, zero
     g00, g01, g02, g10, g11, g12, g20, g21, g22 = zero, zero, zero, zero, zero, zero, zero, zero, zero
@@ -35,12 +41,17 @@ def gather(field, node, sx, sy, f, wz, gz, inverse_dx, mask, BOTH: tl.constexpr)
         wx, gx = node_weight(f[0], i, inverse_dx)
         for j in range(3):
             wy, gy = node_weight(f[1], j, inverse_dx)
-            row = field + (node + i * sx + j * sy) * 8
+            if not VIRTUAL:
+                row = field + (node + i * sx + j * sy) * 8
             s0, s1, s2, t0, t1, t2, r0, r1, r2 = zero, zero, zero, zero, zero, zero, zero, zero, zero
             for k in tl.static_range(3):
-                q0 = tl.load(row + k * 8, mask, 0.0)
-                q1 = tl.load(row + k * 8 + 1, mask, 0.0)
-                q2 = tl.load(row + k * 8 + 2, mask, 0.0)
+                if VIRTUAL:
+                    at = field + tl.load(table + ((i * 3 + j) * 3 + k) * columns + node) * 8
+                else:
+                    at = row + k * 8
+                q0 = tl.load(at, mask, 0.0)
+                q1 = tl.load(at + 1, mask, 0.0)
+                q2 = tl.load(at + 2, mask, 0.0)
                 s0 += wz[k] * q0
                 s1 += wz[k] * q1
                 s2 += wz[k] * q2
@@ -48,9 +59,9 @@ def gather(field, node, sx, sy, f, wz, gz, inverse_dx, mask, BOTH: tl.constexpr)
                 t1 += gz[k] * q1
                 t2 += gz[k] * q2
                 if BOTH:
-                    r0 += wz[k] * tl.load(row + k * 8 + 4, mask, 0.0)
-                    r1 += wz[k] * tl.load(row + k * 8 + 5, mask, 0.0)
-                    r2 += wz[k] * tl.load(row + k * 8 + 6, mask, 0.0)
+                    r0 += wz[k] * tl.load(at + 4, mask, 0.0)
+                    r1 += wz[k] * tl.load(at + 5, mask, 0.0)
+                    r2 += wz[k] * tl.load(at + 6, mask, 0.0)
             w = wx * wy
             dx = gx * wy
             dy = wx * gy
@@ -106,12 +117,16 @@ def load_particles(fraction, material, count, index, mask):
 
 
 @triton.jit
-def motion(fields, node, sx, sy, f, wz, gz, inverse_dx, known, VISCOUS: tl.constexpr, MOVING: tl.constexpr):
+def motion(
+    fields, node, sx, sy, f, wz, gz, inverse_dx, known, VISCOUS: tl.constexpr, MOVING: tl.constexpr,
+    table=None, columns=0, VIRTUAL: tl.constexpr = False,
+):  # fmt: skip
     """Displacement, F, velocity (with VISCOUS or MOVING) and the velocity's gradient (with VISCOUS) of particles."""
-    u, F, v = gather(fields, node, sx, sy, f, wz, gz, inverse_dx, known, MOVING and not VISCOUS)
+    BOTH: tl.constexpr = MOVING and not VISCOUS
+    u, F, v = gather(fields, node, sx, sy, f, wz, gz, inverse_dx, known, BOTH, table, columns, VIRTUAL)
     rate = F
     if VISCOUS:
-        v, rate, _v = gather(fields + 4, node, sx, sy, f, wz, gz, inverse_dx, known, False)
+        v, rate, _v = gather(fields + 4, node, sx, sy, f, wz, gz, inverse_dx, known, False, table, columns, VIRTUAL)
     return u, (F[0] + 1, F[1], F[2], F[3], F[4] + 1, F[5], F[6], F[7], F[8] + 1), v, rate
 
 
@@ -128,15 +143,17 @@ def law_row(law, law_table, index, mask, MULTI: tl.constexpr):
 @triton.jit(do_not_specialize=VARIES)
 def total_particles(
     fraction, material, law, law_table, values, force_in, load, order, count,
-    cell_start, cell_node, cell_scene, cells,
+    cell_start, cell_node, cell_scene, cells, cell_nodes,
     fields, partial,
     schedule, vectors, scenes, numbers, first_step, step_offset,
     sx, sy, ox, oy, oz, scene_size, dx, inverse_dx, viscous_time,
     LAWS: tl.constexpr, MULTI: tl.constexpr, FORCES: tl.constexpr, FORCE: tl.constexpr, IMPLICIT: tl.constexpr,
     VISCOUS: tl.constexpr, POSITION: tl.constexpr, WIDTH: tl.constexpr, CELLS: tl.constexpr, LANES: tl.constexpr,
+    VIRTUAL: tl.constexpr,
 ):  # fmt: skip
     """``total``: forces of the particles of some cells, summed into 27 rows of ``partial`` per cell.
 
+    With VIRTUAL the nodes of each cell are columns of ``cell_nodes``, and ``cell_node`` only says where it lies.
     Lanes without a particle have no volume, values of a twin or mass, so they add nothing. The first step of a rollout
     takes the previous substep from row 0 of the schedule.
     """
@@ -152,7 +169,13 @@ def total_particles(
         mask = index < end[:, None]
         f, volume, mu, lam = load_particles(fraction, material, count, index, mask)
         wz, gz = axis_weights(f[2], inverse_dx)
-        u, F, v, rate = motion(fields, node, sx, sy, f, wz, gz, inverse_dx, known, VISCOUS, LOADED)
+        if VIRTUAL:
+            place = tl.minimum(cell, cells - 1)[:, None]
+        else:
+            place = node
+        u, F, v, rate = motion(
+            fields, place, sx, sy, f, wz, gz, inverse_dx, known, VISCOUS, LOADED, cell_nodes, cells, VIRTUAL
+        )
         row = law_row(law, law_table, index, mask, MULTI)
         stress = pk1(F, mu, lam, row, LAWS)
         if VISCOUS:
@@ -389,19 +412,21 @@ def total_hold(
 
 @triton.jit(do_not_specialize=VARIES)
 def total_read(
-    fraction, load, order, rest, count, particle_cell, cell_node, fields, kick_before,
+    fraction, load, order, rest, count, particle_cell, cell_node, cell_nodes, cells, fields, kick_before,
     position_out, velocity_out, affine_out, F_out, sx, sy, inverse_dx,
-    WORK: tl.constexpr, IMPLICIT: tl.constexpr, BLOCK: tl.constexpr,
+    WORK: tl.constexpr, IMPLICIT: tl.constexpr, BLOCK: tl.constexpr, VIRTUAL: tl.constexpr,
 ):  # fmt: skip
     """``total``: the particle fields, in the order in which they were given."""
     index = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
     mask = index < count
     f = load3(fraction, count, index, mask)
-    node = tl.load(cell_node + tl.load(particle_cell + index, mask, 0), mask, 0)
+    node = tl.load(particle_cell + index, mask, 0)
+    if not VIRTUAL:
+        node = tl.load(cell_node + node, mask, 0)
     where = tl.load(order + index, mask, 0)
     wz, gz = axis_weights(f[2], inverse_dx)
-    u, F, _v = gather(fields, node, sx, sy, f, wz, gz, inverse_dx, mask, False)
-    v, rate, _v = gather(fields + 4, node, sx, sy, f, wz, gz, inverse_dx, mask, False)
+    u, F, _v = gather(fields, node, sx, sy, f, wz, gz, inverse_dx, mask, False, cell_nodes, cells, VIRTUAL)
+    v, rate, _v = gather(fields + 4, node, sx, sy, f, wz, gz, inverse_dx, mask, False, cell_nodes, cells, VIRTUAL)
     if WORK:
         zero = f[0] * 0
         account((zero, zero, zero), zero, v, 0.0, tl.load(kick_before), IMPLICIT, load, count, index, mask)
@@ -416,16 +441,18 @@ def total_read(
 
 @triton.jit(do_not_specialize=VARIES)
 def total_look(
-    fraction, material, count, particle_cell, cell_node, fields, out, sx, sy, inverse_dx,
-    WAVE: tl.constexpr, BLOCK: tl.constexpr,
+    fraction, material, count, particle_cell, cell_node, cell_nodes, cells, fields, out, sx, sy, inverse_dx,
+    WAVE: tl.constexpr, BLOCK: tl.constexpr, VIRTUAL: tl.constexpr,
 ):  # fmt: skip
     """``total``: as ``largest_speed``, from the nodal displacements."""
     index = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
     mask = index < count
     f = load3(fraction, count, index, mask)
-    node = tl.load(cell_node + tl.load(particle_cell + index, mask, 0), mask, 0)
+    node = tl.load(particle_cell + index, mask, 0)
+    if not VIRTUAL:
+        node = tl.load(cell_node + node, mask, 0)
     wz, gz = axis_weights(f[2], inverse_dx)
-    _u, F, _v = gather(fields, node, sx, sy, f, wz, gz, inverse_dx, mask, False)
+    _u, F, _v = gather(fields, node, sx, sy, f, wz, gz, inverse_dx, mask, False, cell_nodes, cells, VIRTUAL)
     F = (F[0] + 1, F[1], F[2], F[3], F[4] + 1, F[5], F[6], F[7], F[8] + 1)
     mu = tl.load(material + count + index, mask, 0.0)
     lam = tl.load(material + 2 * count + index, mask, 0.0)

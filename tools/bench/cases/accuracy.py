@@ -16,7 +16,7 @@ import torch
 
 from bench.case import Case, Measurement, option
 from bench.clock import guarded
-from bench.problems import bars, beams, flags, plates, reconfiguration, strips, surfaces, vortex
+from bench.problems import apart, bars, beams, flags, plates, reconfiguration, strips, surfaces, vortex
 from bench.problems.granular.angles import plane_strain_angle, shear_angle, triaxial_angle
 from bench.problems.granular.columns import column_collapse
 from bench.problems.granular.layers import angle_of_repose
@@ -62,6 +62,10 @@ def _clamped_end(cells: int, settings: Settings) -> dict[str, float]:
     """A beam of one shape on finer and finer grids, 1.3 cells from its end held, off the planes of the nodes."""
     place, length = (0.25, 0.13), 8.0 * cells
     return beams.held_cantilever(settings, float(cells), 1.3, place, length=length, kind="clamp", per_cell=4)
+
+
+def _comb(thickness: float, gap: float, how: str, settings: Settings) -> dict[str, float]:
+    return apart.comb(settings, thickness, gap, base=how == "base", shared=how == "shared")
 
 
 def _elements(settings: Settings) -> dict[str, float]:
@@ -111,6 +115,11 @@ def cases(device: str, thorough: bool) -> Iterable[tuple[str, Row, Callable[[], 
             yield case("held cantilever", _held_anyhow, "total", thickness=thickness, depth=depth)
     for cells in (2, 3, 4, 6, 8):
         yield case("clamped end", _clamped_end, "total", cells=cells)
+    for thickness in (0.3, 1.0):
+        for how in ("apart", "base", "shared"):
+            yield case("comb", _comb, "total", thickness=thickness, gap=0.3, how=how)
+    for layers in (1, 3):
+        yield case("close sheets", apart.sheets, "total, float32", gap=0.2, layers=layers)
     for variant in everyone:
         for cells in (16, 24, 32, 48) if thorough and variant == "total" else (16, 24, 32):
             yield case("vortex", vortex.vortex, variant, cells=cells)

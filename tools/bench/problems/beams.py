@@ -3,6 +3,7 @@ r"""A cantilever that sags under its weight, compared with the elastica, and one
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 
 import torch
 
@@ -217,36 +218,23 @@ def held_cantilever(
         quantities.
     """
     length = max(10 * thickness, 20.0) if length is None else length
-    along = (torch.arange(round((length + depth) * per_cell), dtype=torch.float64) + 0.5) / per_cell - depth
-    layers = max(round(thickness * per_cell), 3)
-    share = torch.full((layers,), 1 / layers, dtype=torch.float64)
-    across = (torch.arange(layers, dtype=torch.float64) + 0.5) / layers - 0.5
-    moment = thickness**3 / 12 * (1 - 1 / layers**2)
-    if thickness < 1:
-        across, share = across * layers / (layers - 1), torch.tensor([1 / 6, 2 / 3, 1 / 6], dtype=torch.float64)
-        moment = thickness**3 / 12
-    beam = torch.cartesian_prod(along, torch.tensor([-0.25, 0.25], dtype=torch.float64), thickness * across)
-    free = beam[:, 0] > 0
-    edge = float(along[along > 0][0]) - 0.5 / per_cell
-    span = float(along[-1]) + 0.5 / per_cell - edge
+    strip = Strip.of(thickness, depth, length, per_cell)
+    beam, span = strip.points, strip.span
     c, s = math.cos(angle), math.sin(angle)
     turn = torch.tensor([[c, 0, -s], [0, 1, 0], [s, 0, c]], dtype=torch.float64)
     like = torch.zeros((), dtype=settings.dtype, device=settings.device)
     points = MaterialPoints.create(
         (beam @ turn.T + torch.tensor([place[0], 0.0, place[1]], dtype=torch.float64)).to(like),
-        volume=(share.repeat(2 * len(along)) * thickness / (2 * per_cell)).to(like),
+        volume=strip.volume.to(like),
         density=1.0,
         youngs_modulus=1.0,
         poisson_ratio=0.0,
     )
-    pin = PinnedRegion(_Chosen(~free), kind)
+    pin = PinnedRegion(Chosen(~strip.free), kind)
     solver = settings.solver(1.0, boundaries=[Axial((1,)), pin])
     # only the lowest mode moves, with the rotation of its sections, and only the lowest mode is listened to: the others
     # would shift the time at which the velocity passes zero
-    omega, mode = timoshenko_mode(span, thickness, moment)
-    at = ((beam[:, 0] - edge) / span).clamp(0, 1) * (len(mode) - 1)
-    before = at.long().clamp(max=len(mode) - 2)
-    bent = torch.lerp(mode[before], mode[before + 1], (at - before)[:, None]) * free[:, None]
+    omega, bent = strip.mode()
     shape = bent[:, :1] * turn[:, 2] - (bent[:, 1] * beam[:, 2])[:, None] * turn[:, 0]
     velocity = (1e-5 * omega * span * shape).to(like)
     weight = points.mass.double().cpu()[:, None] * shape
@@ -258,17 +246,71 @@ def held_cantilever(
         many,
         lambda state: (weight * state.velocity.double().cpu()).sum(),
     )
-    series = run.series.reshape(-1)
-    past = int((series <= 0).int().argmax())
-    if past == 0:
+    crossing = first_zero(run.time, run.series.reshape(-1))
+    if crossing is None:
         return run.result(1.0, ratio=0.0)
-    before, after = float(series[past - 1]), float(series[past])
-    crossing = (past - 1 + before / (before - after)) * until / omega / many
     ratio = math.pi / 2 / (omega * crossing)
     return run.result(abs(ratio - 1), ratio=ratio)
 
 
-class _Chosen(Region):
+def first_zero(time: torch.Tensor, series: torch.Tensor) -> float | None:
+    """The time [s] at which a series (N,) that starts above zero passes it; None if it does not."""
+    past = int((series <= 0).int().argmax())
+    if past == 0:
+        return None
+    before, after = float(series[past - 1]), float(series[past])
+    start, end = float(time[past - 1]), float(time[past])
+    return start + (end - start) * before / (before - after)
+
+
+@dataclass(frozen=True)
+class Strip:
+    """A straight beam along x of which one end is held, with the points of a body on a grid of side one.
+
+    Attributes:
+        points: Positions [cells], the middle line at y = z = 0, and the held part at x < 0, shape (P, 3), float64.
+        volume: Volumes, for a width of one, shape (P,).
+        free: Points that are not held, bool, shape (P,).
+        edge: Where the free length begins: halfway between the last held and the first free points.
+        span: The free length.
+        thickness: Thickness.
+        moment: Second moment of area of the layers.
+    """
+
+    points: torch.Tensor
+    volume: torch.Tensor
+    free: torch.Tensor
+    edge: float
+    span: float
+    thickness: float
+    moment: float
+
+    @classmethod
+    def of(cls, thickness: float, depth: float, length: float, per_cell: int) -> Strip:
+        """A strip of some thickness, length and held depth [cells], with points per cell along it."""
+        along = (torch.arange(round((length + depth) * per_cell), dtype=torch.float64) + 0.5) / per_cell - depth
+        layers = max(round(thickness * per_cell), 3)
+        share = torch.full((layers,), 1 / layers, dtype=torch.float64)
+        across = (torch.arange(layers, dtype=torch.float64) + 0.5) / layers - 0.5
+        moment = thickness**3 / 12 * (1 - 1 / layers**2)
+        if thickness < 1:
+            across, share = across * layers / (layers - 1), torch.tensor([1 / 6, 2 / 3, 1 / 6], dtype=torch.float64)
+            moment = thickness**3 / 12
+        points = torch.cartesian_prod(along, torch.tensor([-0.25, 0.25], dtype=torch.float64), thickness * across)
+        volume = share.repeat(2 * len(along)) * thickness / (2 * per_cell)
+        edge = float(along[along > 0][0]) - 0.5 / per_cell
+        span = float(along[-1]) + 0.5 / per_cell - edge
+        return cls(points, volume, points[:, 0] > 0, edge, span, thickness, moment)
+
+    def mode(self) -> tuple[float, torch.Tensor]:
+        """Circular frequency of the lowest mode, and its displacement and rotation at the points, shape (P, 2)."""
+        omega, mode = timoshenko_mode(self.span, self.thickness, self.moment)
+        at = ((self.points[:, 0] - self.edge) / self.span).clamp(0, 1) * (len(mode) - 1)
+        before = at.long().clamp(max=len(mode) - 2)
+        return omega, torch.lerp(mode[before], mode[before + 1], (at - before)[:, None]) * self.free[:, None]
+
+
+class Chosen(Region):
     """Particles by their number."""
 
     def __init__(self, mask: torch.Tensor) -> None:

@@ -121,6 +121,25 @@ _table("clamped_end", _ends, """
     """)  # fmt: skip
 
 
+_HOW = {"apart": "each a piece", "base": "held ends one piece", "shared": "shared nodes"}
+
+
+def _combs(results: Results) -> Iterator[Row]:
+    for row in _of(results, "comb"):
+        time = 1e6 * row["result"]["wall_s"] / row["result"]["substeps"]
+        yield row | {"how": _HOW[row["parameters"]["how"]], "time": time}
+
+
+_table("comb", _combs, """
+    thickness [cells] = {parameters.thickness:g} | beams = {how} | lowest ratio = {result.lowest:.4g} |
+    highest ratio = {result.highest:.4g} | nodes of the box = {result.nodes:.0f} | time of a substep [µs] = {time:.0f}
+    """)  # fmt: skip
+_table("close_sheets", partial(_of, problem="close sheets"), """
+    layers of points = {parameters.layers} | difference from a sheet alone = {result.error:.2g %} |
+    on shared nodes = {result.shared:.3g %} | time of a substep over that on shared nodes = {result.cost:.2f}
+    """)  # fmt: skip
+
+
 def _angles(results: Results) -> Iterator[Row]:
     """Friction angles of the sand law, for an element and for a layer."""
     tests = {"shear": "simple shear", "triaxial": "triaxial compression", "plane_strain": "plane strain"}

@@ -150,6 +150,21 @@ def _ends(rows: Recorded) -> Iterator[Row]:
 _goal("cantilever clamped in a region, observed order in dx toward its own limit", "at least 1.8", SECOND, _ends,
       VARIANT, "{order:.2f}", "order >= 1.8")  # fmt: skip
 _errors("cantilever clamped in a region, frequency at 8 cells", "clamped end", 8, 0.005, BEAM)
+
+
+def _combs(rows: Recorded, how: str) -> Iterator[Row]:
+    return (row for row in _each(rows, "comb") if row["how"] == how)
+
+
+for _name, _how in (("each a piece", "apart"), ("held ends one piece", "base")):
+    _goal(f"comb of ten beams, gaps of 0.3 cells, {_name}: all frequencies", "within 3 % of a beam alone",
+          "chosen: as for one cantilever; shared nodes make one plate of them", partial(_combs, how=_how),
+          "{thickness:g} cells thick", ERROR, "error <= 0.03")  # fmt: skip
+_goal("two sheets with a gap of 0.2 cells: motion", "within 1 % of each alone", "chosen: rounding in float32 is all",
+      partial(_each, problem="close sheets"), "{layers} layers", ERROR, "error <= 0.01")  # fmt: skip
+_goal("two sheets with a gap of 0.2 cells: time of a substep", "at most 1.3 times that on shared nodes",
+      "chosen: twice as many cells have points, each with half as many", partial(_each, problem="close sheets"),
+      "{layers} layers", "{cost:.2f}", "cost <= 1.3")  # fmt: skip
 _goal("free elastic block, energy averaged over a period, at the end (`total` after 100 periods, the others after 20)",
       "change below 0.1 %",
       "symplectic steps keep the energy but for terms of the square of the substep; nothing in the problem takes any",

@@ -1,0 +1,346 @@
+"""Copies of nodes for parts that only lie close to each other."""
+
+import dataclasses
+import math
+
+import pytest
+import torch
+from bench.problems.apart import comb, sheets
+from bench.problems.settings import Settings
+
+from gaussian_swaying.aero.effects import LogProfile
+from gaussian_swaying.aero.force import AeroForce
+from gaussian_swaying.aero.wind import WindField
+from gaussian_swaying.aero.wind_force import WindForce
+from gaussian_swaying.geometry.linalg import polar_rotation
+from gaussian_swaying.geometry.regions import Box
+from gaussian_swaying.mpm.boundaries.ball import BallObstacle
+from gaussian_swaying.mpm.boundaries.handle import Handle
+from gaussian_swaying.mpm.boundaries.pinned_points import PinnedPoints
+from gaussian_swaying.mpm.boundaries.pinned_region import PinnedRegion
+from gaussian_swaying.mpm.boundaries.plane import Plane
+from gaussian_swaying.mpm.boundaries.rigid_region import RigidRegion
+from gaussian_swaying.mpm.boundaries.velocity_box import VelocityBox
+from gaussian_swaying.mpm.followers import GridFollowers, on_material
+from gaussian_swaying.mpm.solver import MPMSolver
+from gaussian_swaying.mpm.state import GridSpec, MaterialPoints, MPMState
+from gaussian_swaying.mpm.virtual_nodes import coordinates, virtual_nodes
+
+EDGE = Box([None, None, None], [1.0, None, None])
+
+
+def sheet(height, width=4, length=8):
+    """Two points in a cell of side one, and three layers of them."""
+    x, y = (torch.arange(2 * n, dtype=torch.float64) / 2 + 0.27 for n in (length, width))
+    return torch.cartesian_prod(x, y, height + torch.tensor([-0.05, 0.0, 0.05], dtype=torch.float64))
+
+
+def material(position, attached=None):
+    return MaterialPoints.create(
+        position, volume=0.01, density=1.0, youngs_modulus=100.0, poisson_ratio=0.3, attached=attached
+    )
+
+
+def together(*parts):
+    """The points of several parts, and the number of its part for each."""
+    return torch.cat(parts), torch.cat([torch.full((len(part),), k) for k, part in enumerate(parts)])
+
+
+def rolled(points, velocity=None, steps=60, transfer="torch", boundaries=(), push=None, **options):
+    solver = MPMSolver(1.0, gravity=(0, 0, -0.1), transfer=transfer, boundaries=boundaries, **options)
+    start = solver.init_state(points, velocity)
+    forces = None if push is None else lambda _: push
+    return solver, start, solver.rollout(start, 0.8 * solver.stable_substep(start), steps, forces)
+
+
+def fields(state):
+    return [getattr(state, f.name) for f in dataclasses.fields(MPMState) if f.name != "grid"]
+
+
+@pytest.mark.parametrize("transfer", ["torch", "kernels"])
+@pytest.mark.parametrize("how", ["number", "pairs"])
+def test_one_piece_is_the_same_bit_for_bit(transfer, how):
+    position = sheet(3.2)
+    attached = torch.zeros(len(position), dtype=torch.long)
+    if how == "pairs":
+        near = (position[:, None] - position).norm(dim=-1) < 0.8
+        attached = near.nonzero()
+    pins = [PinnedRegion(EDGE), Plane([0, 0, 2.9], [0, 0, 1])]
+    plain, known = (rolled(material(position, a), transfer=transfer, boundaries=pins)[2] for a in (None, attached))
+    assert known.grid == plain.grid
+    for one, other in zip(fields(plain), fields(known), strict=True):
+        assert one is other or (one == other if isinstance(one, float) else torch.equal(one, other))
+
+
+@pytest.mark.parametrize("transfer", ["torch", "kernels"])
+@pytest.mark.parametrize("kind", [None, "nodes", "hinge", "clamp"])
+def test_two_sheets_each_move_as_alone(transfer, kind):
+    """With a gap of a fifth of a cell; on shared nodes they differ by far more than the one per cent."""
+    parts = sheet(3.1), sheet(3.3)
+    pushes = [torch.tensor([0.0, 0.0, push], dtype=torch.float64).expand_as(parts[0]) for push in (2e-3, -1e-3)]
+    position, number = together(*parts)
+    how = {"boundaries": [PinnedRegion(EDGE, kind)], "transfer": transfer}
+    solver, start, both = rolled(material(position, number), push=torch.cat(pushes), **how)
+    glued = rolled(material(position), push=torch.cat(pushes), **how)[2]
+    assert start.grid.virtual > 0
+    assert solver.has_kernels == (transfer == "kernels")
+    for k, (part, push) in enumerate(zip(parts, pushes, strict=True)):
+        alone = rolled(material(part), push=push, **how)[2].position
+        far = (alone - part).norm(dim=-1).amax()
+        assert far > 0.1
+        assert (both.position[number == k] - alone).norm(dim=-1).amax() < 1e-9 * far
+        assert (glued.position[number == k] - alone).norm(dim=-1).amax() > 0.1 * far
+
+
+def strip(x, y, z):
+    return torch.cartesian_prod(*(torch.as_tensor(t, dtype=torch.float64) for t in (x, y, z)))
+
+
+def fork(gap):
+    """Two arms along x, and a base that joins them from x = 0 to 2; points that are neighbours are attached."""
+    along, across = torch.arange(0.25, 12.0, 0.5), torch.tensor([0.2, 0.6])
+    arms = strip(along, across, [0.2, 0.6]), strip(along, across + 0.4 + gap, [0.2, 0.6])
+    position, number = together(*arms)
+    near = (position[:, None] - position).abs().amax(-1) <= 0.51
+    apart = (number[:, None] != number) & (position[:, None, 0] > 2)
+    return position + 3.0, (near & ~apart).nonzero(), number
+
+
+def test_arms_share_nodes_only_where_the_base_is_near():
+    position, pairs, number = fork(0.1)
+    solver, start, _ = rolled(material(position, pairs), steps=1)
+    node, grid = solver.bound.stencil.nodes, start.grid
+    shared = set(node[:, number == 0].flatten().tolist()) & set(node[:, number == 1].flatten().tolist())
+    every = torch.arange(grid.node_count)[solver.bound.node_inverse_mass > 0]
+    at = solver.bound.node_positions(position)
+    assert grid.virtual > 0
+    # a node reaches 1.5 cells, and the base ends at x = 5
+    assert max(at[list(shared), 0]) < 5 + 1.5
+    copied = [n for n in every.tolist() if at[n, 0] > 6.5]
+    assert not shared & set(copied)
+    both = [n for n in every.tolist() if at[n, 0] < 5]
+    assert set(both) <= set(range(grid.lattice_count))  # no node near the base has a copy
+
+
+@pytest.mark.parametrize("how", ["a point", "points in a cell", "a line", "a sheet", "a block"])
+@pytest.mark.parametrize("turn", [0, 1, 2])
+def test_small_pieces_in_any_orientation_move_as_alone(how, turn):
+    """Among each other in the same cells: nothing is singular, whatever few points a piece has."""
+    reach = torch.arange(-2.0, 2.1, 0.4)
+    none = torch.zeros(1)
+    axes = {
+        "a point": (none, none, none),
+        "points in a cell": (torch.tensor([0.0, 0.2]), none, torch.tensor([0.0, 0.1])),
+        "a line": (reach, none, none),
+        "a sheet": (reach, reach, none),
+        "a block": (reach, torch.tensor([0.0, 0.3]), torch.tensor([0.0, 0.3])),
+    }[how]
+    piece = strip(*axes)
+    random = torch.Generator().manual_seed(turn)
+    parts, speeds = [], []
+    for _ in range(3):
+        rotation = polar_rotation(torch.randn(3, 3, generator=random, dtype=torch.float64))
+        if turn == 0:
+            rotation = torch.eye(3, dtype=torch.float64)
+        parts.append(piece @ rotation.T + 5 + 0.3 * torch.rand(3, generator=random, dtype=torch.float64))
+        rate = 0.05 * torch.randn(3, 3, generator=random, dtype=torch.float64)
+        speeds.append((parts[-1] - parts[-1].mean(0)) @ rate + torch.randn(3, generator=random, dtype=torch.float64))
+    position, number = together(*parts)
+    both = rolled(material(position, number), torch.cat(speeds), transfer="kernels")[2]
+    bound = MPMSolver(1.0)
+    bound.init_state(material(position, number))
+    assert torch.isfinite(bound.bound.node_inverse_mass).all()
+    for k, (part, speed) in enumerate(zip(parts, speeds, strict=True)):
+        alone = rolled(material(part), speed, transfer="torch")[2]
+        for name in ("position", "velocity", "F_elastic"):
+            mine, expected = getattr(both, name)[number == k], getattr(alone, name)
+            assert (mine - expected).abs().amax() < 1e-9 * max(1.0, float(expected.abs().amax()))
+        start = MPMSolver(1.0, gravity=(0, 0, 0)).init_state(material(part), speed)
+        assert both.velocity[number == k].norm(dim=-1).amax() < 1.5 * start.velocity.norm(dim=-1).amax() + 1.0
+
+
+BOUNDARIES = {
+    "handle": lambda: Handle(EDGE, velocity=[0.0, 0.3, 0.0]),
+    "points": lambda: PinnedPoints([[0.5, 1.0, 3.1], [0.5, 1.0, 3.3], [0.5, 3.0, 3.3]]),
+    "clamped points": lambda: PinnedPoints([[0.5, 1.0, 3.1], [0.5, 2.0, 3.3]], "clamp"),
+    "a pin with an end": lambda: PinnedRegion(EDGE, "hinge", end=0.1),
+    "a box of velocities": lambda: VelocityBox(Box([3.0, None, None], [5.0, None, None]), [0.1, 0.0, 0.2]),
+    "a rigid part": lambda: RigidRegion(Box([5.0, None, None], [None, None, None])),
+    "ground": lambda: Plane([0, 0, 3.05], [0, 0, 1]),
+    "a ball": lambda: BallObstacle([4.0, 2.0, 2.3], 0.7),
+}
+
+
+@pytest.mark.parametrize("name", list(BOUNDARIES))
+def test_boundaries_act_on_each_piece(name):
+    """The other sheet is far away for a piece alone, and has the boundaries of its own place."""
+    parts = sheet(3.1), sheet(3.3)
+    position, number = together(*parts)
+    both = rolled(material(position, number), boundaries=[BOUNDARIES[name]()])[2]
+    assert torch.isfinite(both.position).all()
+    fused = rolled(material(position, number), boundaries=[BOUNDARIES[name]()], transfer="auto")[2]
+    for field in ("position", "velocity", "node_displacement", "impulse"):
+        one, other = getattr(both, field), getattr(fused, field)
+        assert (one - other).abs().amax() < 1e-9 * max(1.0, float(one.abs().amax()))
+    far = sheet(3.3) + torch.tensor([0.0, 50.0, 0.0], dtype=torch.float64)
+    if name in ("points", "clamped points", "a rigid part", "a ball"):
+        return
+    apart, _ = together(parts[0], far)
+    distant = rolled(material(apart), boundaries=[BOUNDARIES[name]()])[2]
+    away = (both.position[number == 0] - distant.position[number == 0]).abs().amax()
+    assert away < 1e-9
+
+
+def test_held_points_hold_the_piece_that_they_lie_on():
+    parts = sheet(3.1), sheet(3.3)
+    position, number = together(*parts)
+    pins = [PinnedPoints([[0.5, 1.0, 3.3], [0.5, 3.0, 3.3]])]
+    both = rolled(material(position, number), boundaries=pins, transfer="kernels")[2]
+    fallen = position[number == 0][:, 2] - both.position[number == 0][:, 2]
+    assert (fallen - fallen.mean()).abs().amax() < 1e-9  # the lower sheet falls freely
+    alone = rolled(material(parts[1]), boundaries=pins, transfer="torch")[2]
+    assert (both.position[number == 1] - alone.position).abs().amax() < 1e-9
+
+
+def test_scenes_of_a_batch_have_their_own_copies():
+    parts = sheet(3.1), sheet(3.3)
+    position, number = together(*parts)
+    moved = position + torch.tensor([0.31, 0.22, 0.47], dtype=torch.float64)
+    one, two = material(position, number), material(moved, number)
+    batch = MaterialPoints.stack([one, two])
+    for transfer in ("torch", "kernels"):
+        both = rolled(batch, transfer=transfer, boundaries=[PinnedRegion(EDGE, "nodes")], steps=20)
+        assert both[1].grid.virtual > 0
+        for k, points in enumerate((one, two)):
+            solver = MPMSolver(1.0, gravity=(0, 0, -0.1), boundaries=[PinnedRegion(EDGE, "nodes")], transfer="torch")
+            state = solver.init_state(points)
+            alone = solver.rollout(state, 0.8 * both[0].stable_substep(both[1]), 20)
+            assert (both[2].position[k] - alone.position).abs().amax() < 1e-9
+
+
+def test_places_follow_their_own_piece():
+    parts = sheet(3.1), sheet(3.3)
+    position, number = together(*parts)
+    push = torch.where(number == 0, 2e-3, -1e-3)[:, None] * torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)
+    points = material(position, number)
+    start, state = rolled(points, boundaries=[PinnedRegion(EDGE)], push=push)[1:]
+    place = position + 0.05
+    read, nodes = on_material(place, torch.arange(len(place)), points, 1.0)
+    follow = GridFollowers(read, place - read, nodes)
+    move, _ = follow.motion(state)
+    slack = (0.2 * (state.F_total - torch.eye(3, dtype=torch.float64)).norm(dim=(-1, -2)).amax()).clamp(min=0.01)
+    assert (move - (state.position - position)).norm(dim=-1).amax() < slack
+    assert follow.nodes(state).max() >= start.grid.lattice_count
+    some = follow.some(torch.arange(5))
+    assert torch.equal(some.motion(state)[0], move[:5])
+    glued = GridFollowers(read, place - read).motion(state)[0]
+    assert (glued - move).norm(dim=-1).amax() > 0.1  # from the nodes of the other piece
+
+
+def test_wind_that_depends_on_the_place_in_kernels():
+    """A virtual node lies where the node lies that it is a copy of."""
+    position, number = together(sheet(3.1), sheet(3.3))
+    wind = WindField([5.0, 2.0, -1.0], effects=[LogProfile(height=3.0)])
+    up, area = torch.zeros_like(position), torch.full((len(position),), 0.01, dtype=torch.float64)
+    up[:, 2] = 1.0
+    ends = []
+    for transfer in ("torch", "kernels"):
+        solver = MPMSolver(1.0, boundaries=[PinnedRegion(EDGE)], transfer=transfer, stiffness_damping=1e-3)
+        state = solver.init_state(material(position, number))
+        ends.append(solver.rollout(state, 1e-2, 10, [WindForce(AeroForce(), wind, up, area)]))
+    away = (ends[0].position - position).abs().amax()
+    assert away > 1e-3
+    assert (ends[0].position - ends[1].position).abs().amax() < 1e-6 * away  # of its logarithm
+
+
+def test_a_state_is_saved_and_read():
+    position, number = together(sheet(3.1), sheet(3.3))
+    solver, start, state = rolled(material(position, number), steps=2)
+    again = MPMState.from_state_dict(state.state_dict())
+    assert again.grid == state.grid
+    end, other = (solver.rollout(s, 1e-3, 2).position for s in (state, again))
+    assert torch.equal(end, other)
+    assert solver.continued(solver, state, start) is not None
+
+
+def test_energy_and_momentum_are_kept():
+    position, number = together(sheet(3.1), sheet(3.3))
+    velocity = torch.stack([position[:, 1] - 2, 2 - position[:, 0], number - 0.5], -1) * 0.1
+    solver = MPMSolver(1.0, gravity=(0, 0, 0), transfer="kernels")
+    state = solver.init_state(material(position, number), velocity)
+    end = solver.rollout(state, 0.3 * solver.stable_substep(state), 200)
+    before, after = solver.bound.momenta(state), solver.bound.momenta(end)
+    assert all((a - b).abs().amax() < 1e-9 for a, b in zip(before, after, strict=True))
+    first, last = (float(solver.bound.kinetic(s) + solver.elastic_energy(s)) for s in (state, end))
+    assert math.isclose(first, last, rel_tol=1e-3)
+
+
+def test_gradients_come_from_torch():
+    position, number = together(sheet(3.1, 1, 2), sheet(3.3, 1, 2))
+    points = material(position, number)
+    modulus = points.youngs_modulus.clone().requires_grad_()
+    solver = MPMSolver(1.0, boundaries=[PinnedRegion(EDGE)])
+    state = solver.init_state(dataclasses.replace(points, youngs_modulus=modulus))
+    solver.rollout(state, 1e-2, 5).position.sum().backward()
+    assert modulus.grad.abs().amax() > 0
+    solver = MPMSolver(1.0, boundaries=[PinnedRegion(EDGE)], transfer="kernels")
+    state = solver.init_state(dataclasses.replace(points, youngs_modulus=modulus))
+    with pytest.raises(ValueError, match="virtual nodes have no backward kernels"):
+        solver.rollout(state, 1e-2, 5)
+
+
+def test_contact_of_attached_parts_has_no_kernels():
+    position, number = together(sheet(3.1), sheet(3.3))
+    solver = MPMSolver(1.0, boundaries=[BOUNDARIES["a ball"]()], transfer="kernels")
+    with pytest.raises(ValueError, match="contact and obstacles have no kernels"):
+        solver.init_state(material(position, number))
+
+
+def test_copies_are_numbered_after_the_lattice():
+    grid = GridSpec(1.0, (0, 0, 0), (4, 3, 3))
+    first = torch.tensor([0, 0, 9])
+    found = virtual_nodes(first, grid, torch.tensor([[0, 2]]))
+    assert found.original.shape == (1, 27)
+    assert torch.equal(found.node[:, 1], 36 + torch.arange(27))  # the second point is alone
+    assert torch.equal(found.original[0], torch.arange(27))
+    assert torch.equal(found.node[:18, 2], found.node[9:, 0])  # the others share what both reach
+    assert found.node[:, [0, 2]].max() < 36
+    assert virtual_nodes(first, grid, torch.tensor([[0, 2], [0, 1]])) is None
+    assert coordinates(torch.tensor(35), grid).tolist() == [3, 2, 2]
+
+
+@pytest.mark.parametrize(
+    ("attached", "what"),
+    [
+        (torch.zeros(7, dtype=torch.long), "with a number for each point or"),
+        (torch.zeros(8), "to be int64"),
+        (torch.tensor([[0, 8]]), "from 0 to 7"),
+    ],
+)
+def test_wrong_numbers_are_refused(attached, what):
+    with pytest.raises(ValueError, match=what):
+        material(torch.rand(8, 3), attached)
+
+
+def test_joined_bodies_keep_their_pieces():
+    one, two = material(torch.rand(4, 3)), material(torch.rand(3, 3), torch.tensor([5, 5, 9]))
+    assert MaterialPoints.join([one, two]).attached.tolist() == [0, 0, 0, 0, 1, 1, 2]
+    assert MaterialPoints.join([one, one]).attached is None
+    with pytest.raises(ValueError, match="cannot be joined"):
+        MaterialPoints.join([one, material(torch.rand(3, 3), torch.tensor([[0, 1]]))])
+    with pytest.raises(ValueError, match="same `attached`"):
+        MaterialPoints.stack([one, material(torch.rand(4, 3), torch.zeros(4, dtype=torch.long))])
+
+
+@pytest.mark.parametrize(("how", "most"), [({}, 0.03), ({"base": True}, 0.3), ({"shared": True}, math.inf)])
+def test_a_comb_has_the_frequencies_of_its_beams(how, most):
+    """Three short beams with gaps of 0.3 cells; the slow measurement has ten long ones."""
+    found = comb(Settings(), 1.0, 0.3, **how, count=3, shortest=6.0)
+    assert found["error"] < most
+    assert found["error"] > (1.0 if "shared" in how else 0.02 if "base" in how else 0.0)
+
+
+def test_close_sheets_move_as_alone_in_single_precision():
+    found = sheets(Settings(dtype=torch.float32), 0.2, layers=1, cells=6, repeats=1)
+    assert found["error"] < 1e-3
+    assert found["shared"] > 0.1
