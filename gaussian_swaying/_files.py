@@ -8,10 +8,14 @@ import math
 import os
 import re
 import stat
+import zlib
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
+
+PNG: dict[str, Any] = {"compress_level": 1, "compress_type": zlib.Z_RLE}
+"""How pictures are compressed: in two thirds of the time of zlib's level 3, and smaller."""
 
 _TEMPORARY = re.compile(r"\..+\.gs-writing-\d+(\.[A-Za-z0-9_]+)?")
 _KINDS = {

@@ -16,6 +16,7 @@ from einops import rearrange
 from torch import Tensor
 
 from gaussian_swaying._checks import check_positive, check_whole
+from gaussian_swaying._files import PNG
 from gaussian_swaying.rendering.cameras.camera import Camera, check_fov, look_at_camera
 
 _STEPS = 24  # samples along a ray, to find the interval of the first crossing
@@ -311,7 +312,7 @@ class GeneratedCapture:
             packed = self._pixels(camera)
             packed[..., :3] = (packed[..., :3] / packed[..., 3:].clamp_min(1e-6)).clamp(0, 1)
             pixels = packed.mul(255).round().to(torch.uint8)
-            imwrite(folder / "images" / f"{index:04d}.png", pixels.numpy(), compress_level=3)
+            imwrite(folder / "images" / f"{index:04d}.png", pixels.numpy(), **PNG)
             pose = torch.linalg.inv(camera.world_to_camera) * torch.tensor([1.0, -1.0, -1.0, 1.0]).double()
             return {"file_path": f"images/{index:04d}.png", "transform_matrix": pose.tolist()}
 

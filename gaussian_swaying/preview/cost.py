@@ -11,6 +11,7 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
+from gaussian_swaying._files import PNG
 from gaussian_swaying._provenance import cores, describe_device
 from gaussian_swaying.gaussians.cloud import GaussianCloud
 from gaussian_swaying.gaussians.harmonics import SH_DC
@@ -333,7 +334,7 @@ def _encode(image: Tensor) -> None:
 
     pixels = (image.clamp(0, 1) * 255).byte().cpu().numpy()
     for _ in range(2):
-        iio.imwrite("<bytes>", pixels, extension=".png", compress_level=3)
+        iio.imwrite("<bytes>", pixels, extension=".png", **PNG)
 
 
 def _seconds(simulation: Simulation, work: Callable[[], object]) -> float:
