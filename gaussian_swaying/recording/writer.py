@@ -20,8 +20,8 @@ from gaussian_swaying.gaussians.cloud import GaussianCloud
 from gaussian_swaying.gaussians.export import UsdFilm, read_usd_frame, usd_arrays
 from gaussian_swaying.geometry.frame import SimFrame
 
-# compression releases Python's lock, so the threads run in parallel; half of the cores are left for the simulation
-WORKERS = max(2, min(8, (os.cpu_count() or 1) // 2))
+# compression releases Python's lock, so the threads run in parallel; some cores are left for the simulation
+WORKERS = max(2, min(16, 3 * (os.cpu_count() or 1) // 4))
 QUEUE_LIMIT = 4 * WORKERS  # jobs waiting or running; a frame has up to five, so memory holds about one frame per thread
 _POLL = 0.2  # s; no wait is longer, so that Ctrl-C works on every platform
 
