@@ -11,6 +11,7 @@
 ``nu``           float64, (P,)               Poisson's ratio
 ``density``      float64, (P,)               density [kg/m³]
 ``thickness``    float64, (P,)               thickness of the surface [m]
+``attached``     text, (P,)                  the only part to which a part is attached; empty for any; may be missing
 ===============  ==========================  =======================================================================
 """
 
@@ -54,6 +55,7 @@ class Part:
         nu: Poisson's ratio; that of the object if None. A rigid part has none.
         density: Density [kg/m³]; that of the object if None.
         thickness: Thickness of the surface [m]; that of the object if None.
+        attached: The name of the only part to which it is attached, with ``scene.connected: surface``; any if None.
 
     Raises:
         ValueError: If a value is out of range, a part that is ``still`` has a material, or a ``rigid`` one E or nu.
@@ -66,6 +68,7 @@ class Part:
     nu: float | None = None
     density: float | None = None
     thickness: float | None = None
+    attached: str | None = None
 
     def __post_init__(self) -> None:
         if not self.name:
@@ -123,6 +126,19 @@ class Parts:
                 f"{int(self.labels.min())} to {int(self.labels.max())}."
             )
 
+        for part in self.parts:
+            if part.attached is not None and (part.attached not in names or part.attached == part.name):
+                raise ValueError(
+                    f"The part {part.name!r} is attached to {part.attached!r}, which is no other part: use one of "
+                    f"{', '.join(repr(name) for name in names if name != part.name)}."
+                )
+
+    def attached_to(self) -> list[int | None] | None:
+        """For each part the only other part to which it is attached, as its place, or None; None if no part has one."""
+        names = [part.name for part in self.parts]
+        found = [None if part.attached is None else names.index(part.attached) for part in self.parts]
+        return None if all(place is None for place in found) else found
+
     def __len__(self) -> int:
         """The number of Gaussians."""
         return len(self.labels)
@@ -177,6 +193,8 @@ class Parts:
             name: np.array([math.nan if getattr(p, name) is None else getattr(p, name) for p in self.parts], np.float64)
             for name in NUMBERS
         }
+        if self.attached_to() is not None:
+            numbers["attached"] = np.array([part.attached or "" for part in self.parts])
         path = Path(path)
         with atomic(path) as temporary, open(temporary, "wb") as file:
             np.savez_compressed(
@@ -196,7 +214,7 @@ class Parts:
         Raises:
             ValueError: If it cannot be read, or its arrays do not fit together.
         """
-        arrays = read_arrays(path, "the parts", ("count", "labels", "names", "roles"), NUMBERS)
+        arrays = read_arrays(path, "the parts", ("count", "labels", "names", "roles"), (*NUMBERS, "attached"))
         labels, names = arrays["labels"], arrays["names"]
         expected = {
             "count": arrays["count"].shape == () and arrays["count"].dtype.kind in "iu",
@@ -207,6 +225,8 @@ class Parts:
         expected |= {
             n: arrays[n].shape == names.shape and arrays[n].dtype.kind in "fiu" for n in NUMBERS if n in arrays
         }
+        if "attached" in arrays:
+            expected["attached"] = arrays["attached"].shape == names.shape and arrays["attached"].dtype.kind == "U"
         wrong = next((name for name, fits in expected.items() if not fits), None)
         if wrong is not None:
             found = f"shape {arrays[wrong].shape}, type {arrays[wrong].dtype}"
@@ -216,10 +236,12 @@ class Parts:
                 f"{path} is for {int(arrays['count']):,} Gaussians, but has {len(labels):,} labels: make the parts "
                 "again."
             )
-        values = [
+        values: list[dict[str, Any]] = [
             {n: float(arrays[n][k]) for n in NUMBERS if n in arrays and not math.isnan(arrays[n][k])}
             for k in range(len(names))
         ]
+        for own, other in zip(values, arrays.get("attached", ()), strict=False):
+            own.update({"attached": str(other)} if other else {})
         try:
             parts = [Part(str(n), str(r), **v) for n, r, v in zip(names, arrays["roles"], values, strict=True)]
             return cls(labels, parts)

@@ -13,8 +13,10 @@ from torch import Tensor
 
 from gaussian_swaying.gaussians.area import patch_area
 from gaussian_swaying.gaussians.cloud import GaussianCloud
+from gaussian_swaying.gaussians.connectivity import shades
 from gaussian_swaying.gaussians.harmonics import SH_DC
 from gaussian_swaying.geometry.covariances import covariance
+from gaussian_swaying.geometry.groups import equal_rows
 from gaussian_swaying.geometry.regions import Box, Region
 from gaussian_swaying.mpm.boundaries.boundary import Boundary
 from gaussian_swaying.preview.framing import SOLID, nearby, whole_box
@@ -38,6 +40,8 @@ WIND = (0, 140, 110)
 NORMAL = (250, 200, 40)
 UP = (40, 40, 40)
 SOFT = ((60, 70, 220), (0, 170, 60), (170, 60, 170), (220, 150, 0))  # of several soft parts, in turn
+PIECES = (*SOFT, (0, 160, 190), (200, 90, 40))  # of what is connected along the surface, in turn
+REACH = 3  # cells that a node reaches
 THING = 300  # width and height of the picture of a thing [pixels]
 MOST_DRAWN = 200_000  # Gaussians of it
 
@@ -225,7 +229,7 @@ def _view(simulation: Simulation, parts: Parts, camera: Camera, normals: int, ti
     rest = scene.rest()
     view = torch.nn.functional.normalize(rest.means - camera.position.to(rest.means), dim=-1)
     colours = scene.model.colors(view).clamp(0, 1)
-    colours = _tinted(colours, parts, _soft(simulation))
+    colours = _tinted(colours, parts, _pieces(simulation)[0] or _soft(simulation))
     plain = torch.full((3,), 0.96, device=colours.device)
     opacity = scene.model.opacity()
     renderer = make_renderer(colours.device, detail=DETAIL)
@@ -259,6 +263,25 @@ def _soft(simulation: Simulation) -> list[tuple[str, Tensor, tuple[int, ...]]]:
     if parts is None or len(soft) < 2:
         return []
     return [(name, parts.mask(name), SOFT[k % len(SOFT)]) for k, name in enumerate(soft)]
+
+
+def _pieces(simulation: Simulation) -> tuple[list[tuple[str, Tensor, tuple[int, ...]]], float]:
+    """Gaussians and colours of what shares nodes, if only what is connected does, and how much lies beside others.
+
+    What a node reaches has one colour if it is connected there, and pieces of it have different ones.
+    """
+    scene = simulation.scene
+    if scene.pairs is None:
+        return [], 0.0
+    index, side = scene.simulated.cpu(), REACH * simulation.solver.dx / scene.frame.metres_per_unit
+    cell = equal_rows((scene.model.means.detach().cpu().double()[index] / side).floor())
+    shade, several = shades(cell, scene.pairs, len(PIECES))
+    found = []
+    for k, colour in enumerate(PIECES):
+        mask = torch.zeros(len(scene.model.means), dtype=torch.bool)
+        mask[index[shade == k]] = True
+        found.append(("", mask, colour))
+    return found, float(several.double().mean())
 
 
 def _tinted(colours: Tensor, parts: Parts, soft: Sequence[tuple[str, Tensor, tuple[int, ...]]] = ()) -> Tensor:
@@ -394,6 +417,10 @@ def _entries(parts: Parts, simulation: Simulation) -> list[tuple[tuple[int, ...]
     ]
     if bool(parts.pushed.any()):
         entries.append((PUSHED, f"pushed: {int(parts.pushed.sum()):,} Gaussians"))
+    pieces, beside = _pieces(simulation)
+    if pieces:
+        words = f"one colour: connected along the surface; {100 * beside:.0f} % lie beside something else"
+        return [*entries, (PIECES[0], words)]
     return entries + [(tint, f"{name}: {int(mask.sum()):,} Gaussians, soft") for name, mask, tint in _soft(simulation)]
 
 

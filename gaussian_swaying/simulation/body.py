@@ -20,6 +20,7 @@ from gaussian_swaying.geometry.frame import SimFrame
 from gaussian_swaying.geometry.neighbours import nearest_neighbours
 from gaussian_swaying.geometry.regions import Region
 from gaussian_swaying.mpm.state import MaterialPoints
+from gaussian_swaying.simulation.attached import attached_points, attached_samples, pieces_in_cells
 from gaussian_swaying.simulation.material import Material, with_gradients
 from gaussian_swaying.simulation.sampling import Samples, grouped, sample_object, shared_wind
 from gaussian_swaying.simulation.scene import Scene
@@ -42,6 +43,7 @@ class Body:
         samples: Samples of the object: first one for each Gaussian, then extra ones, then those inside a solid.
         surface_samples: Number of those that are not inside.
         owner: The material point of each sample, shape (N,).
+        pairs: The pairs of samples that are attached, shape (E, 2), with ``scene.connected: surface``; else None.
     """
 
     points: MaterialPoints
@@ -50,6 +52,7 @@ class Body:
     samples: Samples
     surface_samples: int
     owner: Tensor
+    pairs: Tensor | None = None
 
 
 def body_of(
@@ -62,6 +65,7 @@ def body_of(
     dtype: torch.dtype,
     by_grid: bool,
     apart: Sequence[Region],
+    labels: Tensor | None = None,
 ) -> Body:
     """Turn Gaussians into what a solver takes: samples, their areas and material, groups, patches.
 
@@ -75,6 +79,7 @@ def body_of(
         dtype: Precision of the simulation.
         by_grid: Whether samples are grouped.
         apart: Regions whose borders no group crosses, in scene units.
+        labels: The part of each Gaussian, shape (N,), if the scene has parts.
 
     Returns:
         The body.
@@ -104,14 +109,19 @@ def body_of(
     samples, laws = sample_object(position, facing, body_area, area, filling, material, frame, dx)
     chosen, owner, feels = samples, torch.arange(len(samples.position)), samples.area > 0
     patches = samples.normal[feels], samples.area[feels], owner[feels]
+    pairs = piece = parent = None
+    if scene.connected == "surface":
+        pairs = attached_samples(samples.position, samples.normal, len(part.means), scene.parts, labels)
+        piece = pieces_in_cells(samples.position.to(dtype), dx, pairs)
     if by_grid:
-        chosen, owner, parent = grouped(samples, dx, scene.points_per_cell, apart, frame, dtype)
+        chosen, owner, parent = grouped(samples, dx, scene.points_per_cell, apart, frame, dtype, piece)
         patches = shared_wind(samples, owner, parent)
     if scene.layers == 3:
         _require_cells_as_large_as(float(chosen.thickness.max()), dx)
-    points = with_gradients(chosen.points(scene.layers, laws, dtype), material)
+    attached = None if pairs is None else attached_points(pairs, owner, parent, scene.layers)
+    points = with_gradients(chosen.points(scene.layers, laws, dtype, attached), material)
     felt = Patches(patches[0].to(dtype), patches[1].to(dtype), patches[2], points.count)
-    return Body(points, felt, int(chosen.surface.sum()), samples, len(source), owner)
+    return Body(points, felt, int(chosen.surface.sum()), samples, len(source), owner, pairs)
 
 
 def _require_cells_as_large_as(thickness: float, dx: float) -> None:

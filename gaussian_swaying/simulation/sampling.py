@@ -67,8 +67,13 @@ class Samples:
         """Some of the samples."""
         return Samples(**{f.name: getattr(self, f.name)[index] for f in fields(self)})
 
-    def points(self, layers: int, laws: Sequence[ConstitutiveLaw], dtype: torch.dtype) -> MaterialPoints:
-        """The samples as material points: one each, or three through the thickness (the other two at the end)."""
+    def points(
+        self, layers: int, laws: Sequence[ConstitutiveLaw], dtype: torch.dtype, attached: Tensor | None = None
+    ) -> MaterialPoints:
+        """The samples as material points: one each, or three through the thickness (the other two at the end).
+
+        ``attached`` are the pairs of points that are attached, shape (E, 2); None if all are.
+        """
         position, volume, index = self.position, self.volume, self.law_index
         properties = {name: getattr(self, name) for name in ("E", "nu", "density")}
         if layers == 3:
@@ -85,6 +90,7 @@ class Samples:
             poisson_ratio=properties["nu"].to(dtype),
             law=list(laws),
             law_index=index if len(laws) > 1 else None,
+            attached=attached,
         )
 
 
@@ -164,12 +170,18 @@ def cell_volume(position: Tensor, dx: float) -> Tensor:
 
 @torch.no_grad()
 def grouped(
-    samples: Samples, dx: float, per_cell: int, apart: Sequence[Region], frame: SimFrame, dtype: torch.dtype
+    samples: Samples,
+    dx: float,
+    per_cell: int,
+    apart: Sequence[Region],
+    frame: SimFrame,
+    dtype: torch.dtype,
+    piece: Tensor | None = None,
 ) -> tuple[Samples, Tensor, Tensor]:
     """Samples for a grid: for each group one or a few that keep its mass, centre of mass and volume.
 
-    A group never mixes materials, laws, the surface and the inside, samples that feel wind and samples that do not, or
-    the two sides of the border of a region in ``apart``.
+    A group never mixes materials, laws, the surface and the inside, samples that feel wind and samples that do not,
+    pieces, or the two sides of the border of a region in ``apart``.
 
     Args:
         samples: The samples.
@@ -179,6 +191,8 @@ def grouped(
         apart: Regions in scene units: those of pins and edits.
         frame: Conversion from scene units to metres.
         dtype: Precision of the solver.
+        piece: A number for each sample, the same for those that are attached in their cell, shape (N,); None if all
+            are.
 
     Returns:
         The points as samples, those on the surface first; the point that each sample belongs to, shape (N,); and the
@@ -188,7 +202,8 @@ def grouped(
     kind = equal_rows(kinds)
     where = frame.point_to_scene(samples.position)
     masks = [region.contains(where) for region in apart]
-    label = torch.stack([kind, samples.law_index, samples.surface, samples.area > 0, *masks], -1).long()
+    pieces = [] if piece is None else [piece]
+    label = torch.stack([kind, samples.law_index, samples.surface, samples.area > 0, *masks, *pieces], -1).long()
     matched = per_cell % 2 == 0
     cubes = per_cell // 2 if matched else per_cell
     group = grid_groups(samples.position.to(dtype), dx, cubes, samples.mass, samples.normal, label)

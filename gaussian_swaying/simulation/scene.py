@@ -74,6 +74,9 @@ class Scene:
             cell, a solid the cube, a cord as many. With 1 an object falls apart. An even number keeps the second
             moments of a group too (see :func:`~gaussian_swaying.simulation.sampling.matched_points`), so 2 is more
             accurate than 3.
+        connected: What shares nodes of the grid: ``grid``, all that lies within a cell, or ``surface``, only what is
+            connected along the surface (see :func:`~gaussian_swaying.gaussians.connectivity.attached_pairs`), so that
+            leaves closer than a cell move apart. ``surface`` needs ``solver.formulation: total``.
         normals: Normals of the patches: ``smallest_axis`` of each Gaussian, as in the paper, or ``neighbours``, of
             planes through neighbouring centres (see
             :func:`~gaussian_swaying.geometry.surface_normals.neighbour_normals`), which are better on large smooth
@@ -101,6 +104,7 @@ class Scene:
         points: Literal["gaussian", "grid"] | None = None,
         points_per_cell: int = 2,
         loose: Literal["simulate", "carry"] = "simulate",
+        connected: Literal["grid", "surface"] = "grid",
         normals: Literal["smallest_axis", "neighbours"] = "smallest_axis",
     ) -> None:
         check_literals(Scene.__init__, locals(), "scene.")
@@ -130,6 +134,9 @@ class Scene:
                 raise ValueError("Expected `scene.particle_spacing` null with `scene.filling`, which adds points.")
         if ply is None and generator is None:
             raise ValueError("The scene is empty: give `scene.ply` (a 3DGS .ply file) or `scene.generator`.")
+        if connected == "surface" and filling is not None:
+            raise ValueError("Expected `scene.connected` grid with `scene.filling`: what fills a solid has no surface.")
+        self.connected = connected
         self.ply, self.generator, self.region = ply, generator, region or Everything()
         self.parts = Parts.load(parts) if isinstance(parts, str | os.PathLike) else parts
         self.opacity_threshold, self.faint, self.up = float(opacity_threshold), faint, list(up)

@@ -70,6 +70,8 @@ class SimulatedScene(nn.Module):
         tracked: Number of points that :meth:`surface` returns.
         surface_places: Contact samples, which touch obstacles and each other, or None.
         drawn: Which Gaussians of the source are here: all but those that ``faint: drop`` leaves out, bool.
+        pairs: Simulated Gaussians that are attached, as places in ``simulated``, shape (E, 2), with
+            ``scene.connected: surface``; else None.
         source: The .ply file; None for a scene made in code.
         parts: The labels of its Gaussians, with roles and materials, or None.
     """
@@ -93,6 +95,11 @@ class SimulatedScene(nn.Module):
             raise ValueError(
                 "`scene.points: grid` needs `solver.formulation: total`, where Gaussians can follow the nodes: set "
                 "`scene.points` to gaussian."
+            )
+        if scene.connected == "surface" and not fixed:
+            raise ValueError(
+                "`scene.connected: surface` needs `solver.formulation: total`, where nodes keep their points: set "
+                "`scene.connected` to grid."
             )
         chosen = scene.select(cloud)
         still, held = torch.zeros_like(chosen), torch.zeros_like(chosen)
@@ -122,8 +129,10 @@ class SimulatedScene(nn.Module):
             parts = cloud.means[simulated], normals[simulated], weight
             normals = normals.index_put((simulated,), neighbour_normals(*parts))
         part = cloud.select(simulated)
-        body = body_of(part, normals[simulated], scene, material, self.frame, dx, dtype, by_grid, apart)
+        labels = None if scene.parts is None else scene.parts.labels[self.drawn][simulated]
+        body = body_of(part, normals[simulated], scene, material, self.frame, dx, dtype, by_grid, apart, labels)
         self.points, self.patches = body.points, body.patches
+        self.pairs = None if body.pairs is None else body.pairs[(body.pairs < len(simulated)).all(1)]
         self.on_surface, self.filled = body.on_surface, body.points.count // scene.layers - body.on_surface
         self.max_stretch = scene.max_stretch
         self._kept: tuple[MaterialPoints, Tensor] | None = None

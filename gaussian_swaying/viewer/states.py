@@ -24,10 +24,11 @@ from gaussian_swaying.viewer.session import Snapshot
 
 
 def drawable(snapshot: Snapshot) -> bool:
-    """True if a browser can draw a snapshot: the Gaussians follow nodes, and the light is one that it knows."""
+    """True if a browser can draw a snapshot: the Gaussians follow nodes of the lattice, in a light that it knows."""
     shader = snapshot.simulation.painter.shader
     with _turn(snapshot.simulation):
         has_nodes = snapshot.simulation.scene.follow.nodes(snapshot.state) is not None
+        has_nodes = has_nodes and getattr(snapshot.state, "grid").virtual == 0  # noqa: B009
     return has_nodes and (shader is None or isinstance(shader, DiffuseShader))
 
 

@@ -108,3 +108,13 @@ def test_gaussians_are_given_to_a_part():
     assert held.mask(role="held").tolist() == [True, False, False, True]
     assert held.labels.tolist() == [2, 3, 3, 2]
     assert parts.labels.tolist() == [0, 0, 1, 2]
+
+
+def test_the_file_keeps_what_a_part_is_attached_to(tmp_path):
+    parts = Parts([0, 1, 1], [Part("stem"), Part("leaf", attached="stem")])
+    again = Parts.load(parts.save(tmp_path / "parts.npz"))
+    assert again.parts == parts.parts
+    assert again.attached_to() == [None, 0]
+    assert Parts([0], [Part("stem")]).attached_to() is None
+    with pytest.raises(ValueError, match="The part 'leaf' is attached to 'stalk', which is no other part"):
+        Parts([0, 1], [Part("stem"), Part("leaf", attached="stalk")])

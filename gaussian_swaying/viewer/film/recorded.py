@@ -78,14 +78,20 @@ def read_film(run: Path) -> Film:
         run: The output folder of ``gaussian-swaying sim``.
 
     Raises:
-        ValueError: If the folder is not of a run, the run is of ``updated`` or has no recorded nodes, these are damaged
-            or move a Gaussian farther than any run does, or its splat has moved or changed.
+        ValueError: If the folder is not of a run, the run is of ``updated``, has no recorded nodes or parts with nodes
+            of their own, the nodes are damaged or move a Gaussian farther than any run does, or its splat has moved or
+            changed.
     """
     summary = _summary(run)
     simulation, name = _rebuild(run, summary)
     displacement = load_nodes(run / "nodes.npz")
     start: Any = simulation.start()
     grid, scene = start.grid, simulation.scene
+    if grid.virtual:
+        raise ValueError(
+            f"The run in {run} is of `scene.connected: surface`, where parts have nodes of their own, which a film "
+            "cannot show: its video does, or run it with `scene.connected: grid`."
+        )
     nodes = scene.follow.nodes(start)
     assert nodes is not None  # the run is of `total`
     if displacement.shape[1] != len(nodes):

@@ -1,0 +1,207 @@
+"""What is attached to what in a splat at rest: a graph along its surfaces, cut where two only pass near each other."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from gaussian_swaying._checks import check_shape
+from gaussian_swaying.geometry.groups import equal_rows, joined, sums
+from gaussian_swaying.geometry.neighbours import nearest_neighbours
+
+NEIGHBOURS = 16  # to which a Gaussian may be attached
+LOCAL = 6  # the distance to the neighbour of this number is the local spacing
+REACH = 2.0  # largest distance of two that are attached [local spacings]
+SMOOTH = 0.45  # share of the neighbours near the plane through them, above which a surface is smooth there
+NEAR = 0.35  # what is near it [local spacings]
+ROUNDS = 5  # of fitting a plane to the neighbours that are near the last one
+LEVEL = 1.2  # how far apart two smooth surfaces may lie along their normals [local spacings]
+ALIGNED = 0.5  # least cosine between their normals
+STRAY, SMALL = 12, 0.01  # a piece of fewer Gaussians, or of a smaller share of the largest, is attached to the nearest
+JOINTS = 8  # pairs that attach a part to another one where nothing else does
+
+
+@torch.no_grad()
+def attached_pairs(
+    means: Tensor, normals: Tensor, labels: Tensor | None = None, to: Sequence[int | None] | None = None
+) -> Tensor:
+    """The pairs of Gaussians that are attached to each other.
+
+    Two Gaussians are attached if each is among the nearest of one of them, at most :data:`REACH` local spacings away.
+    Where the surface is smooth around both, as on two leaves that touch, they must also lie on one surface: neither
+    far above the plane of the other, nor with another normal. A stem, an edge or a fold is not smooth, and nothing is
+    cut there. No cut ever takes a part off: pieces that hung together before it stay attached to each other where most
+    pairs were cut. A piece of few Gaussians is haze, and each of them is attached to the nearest of the others.
+
+    Colours are not looked at: a leaf differs from its own stem more than from the leaf beside it.
+
+    Args:
+        means: Centres, shape (N, 3).
+        normals: Unit normals, of either sign, with which the planes of smooth surfaces are looked for, shape (N, 3).
+        labels: The part of each, shape (N,).
+        to: For each part the only other part to which it is attached, as its number, or None for any.
+
+    Returns:
+        Pairs of different Gaussians, each once, int64, shape (E, 2), on the CPU.
+
+    Raises:
+        ValueError: If a shape is not the one above.
+    """
+    check_shape("means", means, None, 3)
+    where = means.detach().cpu().double()
+    count = len(where)
+    if count < 2:
+        return torch.zeros(0, 2, dtype=torch.long)
+    check_shape("normals", normals, count, 3)
+    distance, index = nearest_neighbours(where, min(NEIGHBOURS, count - 1))
+    spacing = distance[:, min(LOCAL, distance.shape[1]) - 1].clamp(min=1e-30)
+    spacing = spacing[index].median(1).values  # at an edge, others are farther away
+    first = torch.arange(count)[:, None].expand_as(index)
+    scale = (spacing[first] * spacing[index]).sqrt()
+    close = distance <= REACH * scale
+    pairs = _once(torch.stack([first[close], index[close]], 1), count)
+    if labels is not None and to is not None:
+        check_shape("labels", labels, count)
+        pairs = pairs[_allowed(pairs, labels.cpu(), to)]
+    normal, flat = _planes(where, normals.detach().cpu().double(), index, spacing)
+    a, b = pairs.unbind(1)
+    arm, size = where[b] - where[a], (spacing[a] * spacing[b]).sqrt()
+    above = torch.maximum((arm * normal[a]).sum(-1).abs(), (arm * normal[b]).sum(-1).abs())
+    turned = (normal[a] * normal[b]).sum(-1).abs() < ALIGNED
+    cut = flat[a] & flat[b] & ((above > LEVEL * size) | turned)
+    pairs = torch.cat([pairs[~cut], _put_back(count, pairs[~cut], pairs[cut])])
+    if labels is not None and to is not None:
+        pairs = torch.cat([pairs, _missing(where, pairs, labels.cpu(), to)])
+    return torch.cat([pairs, _strays(where, pairs)])
+
+
+def _once(pairs: Tensor, count: int) -> Tensor:
+    """Pairs in either order and more than once, each once."""
+    low, high = pairs.amin(1), pairs.amax(1)
+    key = torch.unique(low * count + high)
+    return torch.stack([key // count, key % count], 1)
+
+
+def _planes(where: Tensor, normals: Tensor, index: Tensor, spacing: Tensor) -> tuple[Tensor, Tensor]:
+    """Normals of planes through each Gaussian and those of its neighbours (N, K) that lie on one surface with it.
+
+    Also whether most of them do. Planes start from the normals and are fitted again to what is near them, so that one
+    stays on its surface where two cross.
+    """
+    arm = where[index] - where[:, None]
+    normal, many = torch.nn.functional.normalize(normals, dim=-1), index.shape[1]
+    for _ in range(ROUNDS):
+        above = (arm * normal[:, None]).sum(-1) / (NEAR * spacing[:, None])
+        weight = (1 + above.square()).reciprocal().square()
+        normal = torch.linalg.eigh((weight[..., None] * arm).mT @ arm)[1][..., 0]
+    above = (arm * normal[:, None]).sum(-1).abs() / spacing[:, None]
+    return normal, (above < NEAR).sum(1) >= SMOOTH * many
+
+
+def _put_back(count: int, kept: Tensor, cut: Tensor) -> Tensor:
+    """The cut pairs that are needed, so that what hung together still does: those between pieces with most of them."""
+    piece = joined(count, kept.T)
+    ends = piece[cut]
+    between = ends[:, 0] != ends[:, 1]
+    cut, ends = cut[between], ends[between].sort(1).values
+    if not len(cut):
+        return cut
+    contact = equal_rows(ends)
+    many = contact.bincount()
+    example = torch.zeros_like(many).index_copy(0, contact, torch.arange(len(contact)))
+    tree = torch.zeros(len(many), dtype=torch.bool)
+    parent = list(range(int(piece.max()) + 1))
+
+    def root(k: int) -> int:
+        while parent[k] != k:
+            parent[k] = parent[parent[k]]
+            k = parent[k]
+        return k
+
+    for c in many.argsort(descending=True, stable=True).tolist():
+        p, q = (root(k) for k in ends[example[c]].tolist())
+        if p != q:
+            parent[p], tree[c] = q, True
+    return cut[tree[contact]]
+
+
+def _strays(where: Tensor, pairs: Tensor) -> Tensor:
+    """Pairs that attach small pieces to the nearest Gaussians of larger ones."""
+    piece = joined(len(where), pairs.T)
+    size = piece.bincount()
+    largest = int(size.max())
+    stray = size[piece] < min(max(STRAY, SMALL * largest), largest)
+    own, others = stray.nonzero()[:, 0], (~stray).nonzero()[:, 0]
+    if not len(own):
+        return pairs[:0]
+    return torch.stack([own, others[nearest_neighbours(where[others], 1, where[own])[1][:, 0]]], 1)
+
+
+def _allowed(pairs: Tensor, labels: Tensor, to: Sequence[int | None]) -> Tensor:
+    """Which pairs the parts allow."""
+    only = torch.tensor([-1 if k is None else k for k in to])
+    a, b = labels[pairs].unbind(1)
+    fits = [(only[p] < 0) | (only[p] == q) for p, q in ((a, b), (b, a))]
+    return (a == b) | (fits[0] & fits[1])
+
+
+def _missing(where: Tensor, pairs: Tensor, labels: Tensor, to: Sequence[int | None]) -> Tensor:
+    """Pairs that attach a part to the one that it names, where none does: those nearest to each other."""
+    found = [pairs[:0]]
+    for part, other in enumerate(to):
+        if other is None:
+            continue
+        own, theirs = (labels == part).nonzero()[:, 0], (labels == other).nonzero()[:, 0]
+        ends = labels[pairs].sort(1).values
+        linked = (ends == torch.tensor(sorted((part, other)))).all(1)
+        if bool(linked.any()) or not len(own) or not len(theirs):
+            continue
+        distance, index = (t[:, 0] for t in nearest_neighbours(where[theirs], 1, where[own]))
+        best = distance.argsort(stable=True)[:JOINTS]
+        found.append(torch.stack([own[best], theirs[index[best]]], 1))
+    return torch.cat(found)
+
+
+def shades(cell: Tensor, pairs: Tensor, count: int = 6) -> tuple[Tensor, Tensor]:
+    """A number for each Gaussian so that those in one cell that are not attached within it differ.
+
+    Pieces of neighbouring cells that are attached have the same number where they can, so that a leaf has one.
+
+    Args:
+        cell: A number for the cell of each, from 0 on, shape (N,).
+        pairs: See :func:`attached_pairs`.
+        count: How many numbers there are.
+
+    Returns:
+        The numbers, shape (N,), and whether a cell has several pieces of at least :data:`STRAY` Gaussians, (N,).
+    """
+    piece = joined(len(cell), pairs[cell[pairs[:, 0]] == cell[pairs[:, 1]]].T)
+    many = int(piece.max()) + 1
+    size = piece.bincount()
+    of = torch.zeros(many, dtype=torch.long).index_copy(0, piece, cell)
+    ends = torch.unique(piece[pairs].sort(1).values, dim=0)
+    ends = ends[ends[:, 0] != ends[:, 1]]
+    beside: list[list[int]] = [[] for _ in range(many)]
+    for p, q in ends.tolist():
+        beside[p].append(q)
+        beside[q].append(p)
+    members: dict[int, list[int]] = {}
+    for k, c in enumerate(of.tolist()):
+        members.setdefault(c, []).append(k)
+    shade = np.full(many, -1)
+    for start in size.argsort(descending=True, stable=True).tolist():
+        queue = [start] if shade[start] < 0 else []
+        while queue:
+            k = queue.pop()
+            if shade[k] >= 0:
+                continue
+            taken = {int(shade[m]) for m in members[int(of[k])]}
+            wanted = [int(shade[m]) for m in beside[k] if shade[m] >= 0 and int(shade[m]) not in taken]
+            free = [c for c in range(count) if c not in taken] or [0]
+            shade[k] = max(set(wanted), key=wanted.count) if wanted else free[start % len(free)]
+            queue += [m for m in beside[k] if shade[m] < 0]
+    large = sums((size >= STRAY).long(), of)
+    return torch.from_numpy(shade)[piece], (large >= 2)[cell]

@@ -1,0 +1,85 @@
+"""Which material points are attached to each other, from which Gaussians are."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from gaussian_swaying.gaussians.connectivity import attached_pairs
+from gaussian_swaying.gaussians.parts import Parts
+from gaussian_swaying.geometry.groups import joined
+from gaussian_swaying.geometry.neighbours import nearest_neighbours
+
+_BRIDGES = 8  # neighbours to which an extra point on a large Gaussian is attached, as it fills a hole
+
+
+@torch.no_grad()
+def attached_samples(
+    position: Tensor, normal: Tensor, count: int, parts: Parts | None, labels: Tensor | None
+) -> Tensor:
+    """The pairs of samples of a surface that are attached.
+
+    Args:
+        position: Rest positions [m], those of the Gaussians first, then extra points, shape (N, 3).
+        normal: Unit normals, shape (N, 3).
+        count: Number of Gaussians.
+        parts: The parts of the splat.
+        labels: The part of each Gaussian, shape (count,).
+
+    Returns:
+        Pairs, int64, shape (E, 2).
+    """
+    to = None if parts is None else parts.attached_to()
+    pairs = [attached_pairs(position[:count], normal[:count], labels, to)]
+    further = position[count:].double()
+    if len(further):
+        index = nearest_neighbours(position.double(), min(_BRIDGES + 1, len(position)), further)[1]
+        own = torch.arange(count, len(position))[:, None].expand_as(index)
+        pairs.append(torch.stack([own, index], -1)[own != index])
+    return torch.cat(pairs)
+
+
+def pieces_in_cells(position: Tensor, dx: float, pairs: Tensor) -> Tensor:
+    """A number for each sample, the same for those in one cell that are attached within it.
+
+    Args:
+        position: Rest positions [m] in the precision of the solver, shape (N, 3).
+        dx: Grid spacing [m].
+        pairs: Pairs of samples that are attached, shape (E, 2).
+    """
+    a, b = torch.floor(position / dx - 0.5)[pairs].unbind(1)
+    return joined(len(position), pairs[(a == b).all(-1)].T)
+
+
+def attached_points(pairs: Tensor, owner: Tensor, parent: Tensor | None, layers: int) -> Tensor:
+    """The pairs of material points that are attached.
+
+    Args:
+        pairs: Pairs of samples, shape (E, 2).
+        owner: The point of each sample, shape (N,).
+        parent: The group of each point, shape (P,), all of whose points are attached; None for points that are samples.
+        layers: Layers of points through the thickness; those of a sheet of three come one after the other.
+
+    Returns:
+        Pairs, int64, shape (E', 2).
+    """
+    found = owner[pairs]
+    many = int(owner.max()) + 1
+    if parent is not None:
+        order = parent.argsort(stable=True)
+        size = parent.bincount()
+        start = size.cumsum(0) - size
+        rank = torch.arange(len(order)) - start[parent[order]]
+        for k in range(1, int(size.max())):  # with the one k places before it
+            late = (rank >= k).nonzero()[:, 0]
+            found = torch.cat([found, torch.stack([order[late - k], order[late]], -1)])
+        many = len(parent)
+    low, high = found.amin(1), found.amax(1)
+    key = torch.unique(low * many + high)
+    found = torch.stack([key // many, key % many], 1)
+    found = found[found[:, 0] != found[:, 1]]
+    if layers == 1:
+        return found
+    own = torch.arange(many)
+    across = [torch.stack([own + a * many, own + b * many], 1) for a, b in ((0, 1), (0, 2), (1, 2))]
+    return torch.cat([*(found + k * many for k in range(layers)), *across])

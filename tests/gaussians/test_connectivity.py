@@ -1,0 +1,143 @@
+"""What is attached to what in a splat."""
+
+import math
+
+import pytest
+import torch
+
+from gaussian_swaying.gaussians import connectivity
+from gaussian_swaying.gaussians.connectivity import shades
+from gaussian_swaying.geometry.groups import joined
+
+STEP = 0.1  # spacing of the points
+
+
+def random(seed):
+    return torch.Generator().manual_seed(seed)
+
+
+def sheet(seed, size=2.0, noise=0.15):
+    """Points on a square in the x-y plane, moved by some spacings at random."""
+    axis = torch.arange(0, size, STEP, dtype=torch.float64)
+    flat = torch.cartesian_prod(axis, axis, torch.zeros(1, dtype=torch.float64))
+    return flat + noise * STEP * torch.randn(flat.shape, generator=random(seed), dtype=torch.float64)
+
+
+def attached_pairs(points, *parts, normals=None):
+    """The pairs, with noisy normals: by default those of horizontal sheets."""
+    own = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64).expand(len(points), 3) if normals is None else normals
+    own = own + 0.3 * torch.randn(own.shape, generator=random(9), dtype=torch.float64)
+    return connectivity.attached_pairs(points, own, *parts)
+
+
+def number_of_pieces(points, pairs, least=1):
+    return int((joined(len(points), pairs.T).bincount() >= least).sum())
+
+
+def across(number, pairs):
+    """Pairs between different numbers."""
+    return pairs[number[pairs[:, 0]] != number[pairs[:, 1]]]
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_a_sheet_with_holes_is_one_piece(seed):
+    points = sheet(seed)
+    points = points[torch.rand(len(points), generator=random(seed)) > 0.25]
+    pairs = attached_pairs(points)
+    assert number_of_pieces(points, pairs) == 1
+    assert (points[pairs[:, 0]] - points[pairs[:, 1]]).norm(dim=-1).amax() < 5 * STEP
+
+
+@pytest.mark.parametrize(("gap", "pieces"), [(0.4, 1), (4.0, 2)])
+def test_two_layers_are_one_skin_and_two_sheets_are_two(gap, pieces):
+    """The noisy layers of one skin lie closer to each other than their points; leaves do not."""
+    points = torch.cat([sheet(0), sheet(1) + torch.tensor([0.03, 0.02, gap * STEP])])
+    assert number_of_pieces(points, attached_pairs(points)) == pieces
+
+
+def book(angle):
+    """Two leaves that stand on a stem each a side of it, and touch or cross each other farther out."""
+    leaf = sheet(0, noise=0.05)
+    turned = [leaf @ rotation(side * angle).T for side in (-1, 1)]
+    # the stem joins them below their edges
+    z = torch.arange(0, 2.0, STEP / 2, dtype=torch.float64)
+    stem = torch.stack([0 * z - STEP, z, 0 * z], -1)
+    around = torch.cat([stem + STEP * torch.tensor([0, 0, k], dtype=torch.float64) for k in range(-6, 7)])
+    shift = torch.tensor([0.0, 0.0, 6 * STEP], dtype=torch.float64)
+    points = torch.cat([turned[0] + shift, turned[1] - shift, around])
+    up = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)
+    facing = [(rotation(side * angle) @ up).expand(len(leaf), 3) for side in (-1, 1)]
+    normals = torch.cat([*facing, torch.tensor([[1.0, 0.0, 0.0]], dtype=torch.float64).expand(len(around), 3)])
+    return points, normals, torch.tensor([0] * len(leaf) + [1] * len(leaf) + [2] * len(around))
+
+
+def rotation(angle):
+    c, s = math.cos(angle), math.sin(angle)
+    return torch.tensor([[c, 0, s], [0, 1, 0], [-s, 0, c]], dtype=torch.float64)
+
+
+def test_leaves_that_cross_are_cut_where_they_do(monkeypatch):
+    points, normals, number = book(-0.6)  # they cross at about half of their length
+    pairs = attached_pairs(points, normals=normals)
+    assert number_of_pieces(points, pairs) == 1  # by their stem
+    leaves = across(number, pairs[(number[pairs] < 2).all(1)])
+    monkeypatch.setattr(connectivity, "SMOOTH", 2.0)  # nothing is smooth, so nothing is cut
+    whole = attached_pairs(points, normals=normals)
+    before = across(number, whole[(number[whole] < 2).all(1)])
+    assert len(before) > 500
+    assert len(leaves) < 0.1 * len(before)
+
+
+def test_what_hangs_together_is_never_taken_off():
+    """A sheet that stands on another one, and is attached to nothing else."""
+    upright = sheet(1) @ rotation(math.pi / 2).T
+    points = torch.cat([sheet(0), upright + torch.tensor([1.0, 0.0, 2.1], dtype=torch.float64)])
+    normals = torch.eye(3, dtype=torch.float64)[[2, 0]].repeat_interleave(len(upright), 0)
+    assert number_of_pieces(points, attached_pairs(points, normals=normals)) == 1
+
+
+def test_haze_is_attached_to_what_is_next_to_it():
+    haze = 2 * torch.rand(8, 3, generator=random(3), dtype=torch.float64) + torch.tensor([0, 0, 0.3])
+    points = torch.cat([sheet(0), haze])
+    pairs = attached_pairs(points)
+    assert number_of_pieces(points, pairs) == 1
+
+
+def test_a_twig_with_branches_is_one_piece():
+    z = torch.arange(0, 3, STEP / 2, dtype=torch.float64)
+    line = torch.stack([0 * z, 0 * z, z], -1)
+    branch = torch.tensor([0, 0, 1.5]) + torch.stack([z, 0 * z, 0.5 * z], -1)
+    points = torch.cat([line, branch]) + 0.01 * torch.randn(2 * len(z), 3, generator=random(0), dtype=torch.float64)
+    assert number_of_pieces(points, attached_pairs(points)) == 1
+
+
+def test_parts_say_what_they_are_attached_to():
+    """A leaf on another one: attached as they touch, or by their labels to a stem that touches neither."""
+    low, high = sheet(0), sheet(1) + torch.tensor([0.0, 0.0, 0.3 * STEP])
+    stem = sheet(2, size=0.3) + torch.tensor([-1.0, 0.0, 0.0])
+    points = torch.cat([low, high, stem])
+    labels = torch.tensor([0] * len(low) + [1] * len(high) + [2] * len(stem))
+    assert len(across(labels, attached_pairs(points, labels, [None, None, None]))) > 100
+    pairs = attached_pairs(points, labels, [2, 2, None])
+    ends = labels[across(labels, pairs)].sort(1).values
+    assert set(map(tuple, ends.tolist())) == {(0, 2), (1, 2)}
+    assert len(ends) == 16
+
+
+def test_few_gaussians():
+    assert attached_pairs(torch.rand(1, 3)).shape == (0, 2)
+    assert attached_pairs(torch.rand(2, 3)).tolist() == [[0, 1]]
+    assert len(attached_pairs(torch.zeros(5, 3))) == 10
+
+
+def test_shades_differ_in_a_cell_and_go_on_along_a_piece():
+    points = torch.cat([sheet(0), sheet(1) + torch.tensor([0.0, 0.0, 4 * STEP])])
+    pairs = attached_pairs(points)
+    number = torch.arange(2).repeat_interleave(len(points) // 2)
+    cell = ((points[:, 0] + 1) / 0.7).floor().long() * 5 + ((points[:, 1] + 1) / 0.7).floor().long()
+    shade, several = shades(torch.unique(cell, return_inverse=True)[1], pairs)
+    assert several[(points[:, :2] - 0.9).abs().amax(1) < 0.6].all()
+    assert len(shade[number == 0].unique()) == len(shade[number == 1].unique()) == 1
+    assert shade[0] != shade[-1]
+    alone = points[number == 0]
+    assert not shades(torch.zeros(len(alone), dtype=torch.long), attached_pairs(alone))[1].any()

@@ -1,0 +1,148 @@
+"""Scenes in which only what is connected along its surface shares nodes."""
+
+import dataclasses
+import types
+
+import pytest
+import torch
+
+from gaussian_swaying.gaussians.cloud import GaussianCloud
+from gaussian_swaying.gaussians.filling import InteriorFilling
+from gaussian_swaying.gaussians.parts import Part, Parts
+from gaussian_swaying.gaussians.ply import write_ply
+from gaussian_swaying.geometry.regions import Box
+from gaussian_swaying.mpm.boundaries.pinned_region import PinnedRegion
+from gaussian_swaying.mpm.solver import MPMSolver
+from gaussian_swaying.preview.picture import _pieces
+from gaussian_swaying.scenes.procedural import FlagScene, GivenScene
+from gaussian_swaying.simulation.attached import attached_points, pieces_in_cells
+from gaussian_swaying.simulation.material import Material
+from gaussian_swaying.simulation.scene import Scene
+from gaussian_swaying.simulation.simulation import Simulation
+from gaussian_swaying.viewer.film.recorded import read_film
+from gaussian_swaying.viewer.states import drawable
+
+DX, GAP = 0.2, 0.13
+
+
+def two_flags(gap=GAP):
+    """Two flags one in front of the other, nearer than a cell, and which of them each Gaussian belongs to."""
+    flag = FlagScene(spacing=0.03, width=0.9, height=0.6).generate()
+    far = dataclasses.replace(flag, means=flag.means + torch.tensor([0.0, gap, 0.0]))
+    fields = {f.name: [getattr(c, f.name) for c in (flag, far)] for f in dataclasses.fields(GaussianCloud)}
+    both = {name: None if values[0] is None else torch.cat(values) for name, values in fields.items()}
+    return GaussianCloud(**both), torch.arange(2).repeat_interleave(len(flag.means))
+
+
+def simulation(cloud, connected="surface", dx=DX, formulation="total", **scene):
+    edge = Box([None, None, None], [0.05, None, None])
+    solver = MPMSolver(dx, formulation, boundaries=[PinnedRegion(edge)])
+    return Simulation(
+        Scene(generator=GivenScene(cloud), connected=connected, metres_per_unit=1.0, **scene),
+        Material(E=2e3, density=20.0, thickness=0.01),
+        solver=solver,
+        wind=[1.0, 2.0, 0.0],
+        device="cpu",
+    )
+
+
+def ends(run, frames=4):
+    state = run.start()
+    for _ in range(frames):
+        state, _ = run.advance(state)
+    return run.scene.deformed(state).means, state
+
+
+@pytest.mark.parametrize("points", ["grid", "gaussian"])
+@pytest.mark.parametrize("layers", [1, 3])
+def test_flags_closer_than_a_cell_move_as_alone(points, layers):
+    """Each in the wind that it has, as none is behind the other for it."""
+    cloud, number = two_flags()
+    how = {"points": points, "layers": layers, "area": "coverage"}
+    both, state = ends(simulation(cloud, **how))
+    assert state.grid.virtual > 0
+    glued, _ = ends(simulation(cloud, "grid", **how))
+    alone, _ = ends(simulation(cloud.select(number == 0), "grid", **how))
+    rest = cloud.means[number == 0]
+    far = (alone - rest).norm(dim=-1).amax()
+    assert far > 0.02
+    assert (both[number == 0] - alone).norm(dim=-1).amax() < 0.02 * far
+    assert (glued[number == 0] - alone).norm(dim=-1).amax() > 0.05 * far
+
+
+@pytest.mark.parametrize("points", ["grid", "gaussian"])
+def test_one_flag_is_the_same_bit_for_bit(points):
+    cloud, number = two_flags()
+    flag = cloud.select(number == 0)
+    (one, state), (other, same) = (ends(simulation(flag, how, points=points), 2) for how in ("grid", "surface"))
+    assert torch.equal(one, other)
+    assert state.grid == same.grid
+    assert torch.equal(state.node_displacement, same.node_displacement)
+
+
+def test_parts_correct_what_was_found():
+    """Flags that lie on each other are one skin, unless a part says what it is attached to."""
+    cloud, number = two_flags(gap=0.02)
+    flags = [Part("pole", "held"), Part("near", attached="pole"), Part("far", attached="pole")]
+    labels = torch.where(cloud.means[:, 0] < 0.1, 0, number + 1)
+    apart = simulation(cloud, parts=Parts(labels, flags))
+    glued = simulation(cloud, parts=Parts(labels, [Part(p.name, p.role) for p in flags]))
+    assert apart.start().grid.virtual > 2 * glued.start().grid.virtual
+
+
+def test_points_of_a_group_are_attached_to_each_other():
+    pairs = attached_points(
+        torch.tensor([[0, 1], [2, 3]]), torch.tensor([0, 0, 2, 4]), torch.tensor([0, 0, 1, 1, 1]), 1
+    )
+    assert sorted(map(tuple, pairs.tolist())) == [(0, 1), (2, 3), (2, 4), (3, 4)]
+    pairs = attached_points(torch.tensor([[0, 1]]), torch.tensor([0, 1]), None, 3)
+    assert {(0, 1), (2, 3), (4, 5), (0, 2), (0, 4), (2, 4)} <= set(map(tuple, pairs.tolist()))
+
+
+def test_pieces_of_a_cell_are_those_attached_within_it():
+    place = torch.tensor([[0.6, 1.0, 1.0], [1.4, 1.0, 1.0], [1.6, 1.0, 1.0], [0.7, 1.0, 1.0]])
+    found = pieces_in_cells(place, 1.0, torch.tensor([[0, 2], [2, 1], [0, 3]]))
+    assert found[0] == found[3]
+    assert len(found.unique()) == 3
+
+
+def test_it_needs_the_total_formulation_and_a_surface():
+    cloud, _ = two_flags()
+    with pytest.raises(ValueError, match=r"`scene.connected: surface` needs `solver.formulation: total`"):
+        simulation(cloud, formulation="updated")
+    with pytest.raises(ValueError, match=r"`scene.connected` grid with `scene.filling`"):
+        Scene(generator=GivenScene(cloud), connected="surface", filling=InteriorFilling())
+
+
+def test_a_film_is_refused(tmp_path):
+    cloud, _ = two_flags()
+    path = tmp_path / "flags.ply"
+    write_ply(path, cloud)
+    config = tmp_path / "flags.yaml"
+    config.write_text(
+        f"scene: {{ply: {path}, connected: surface, metres_per_unit: 1}}\n"
+        f"solver: {{dx: {DX}}}\nmaterial: {{E: 2000, density: 20, thickness: 0.01}}\n"
+        "wind: {flow: [1, 2, 0]}\nrecorder: {video: false}\n"
+    )
+    run = Simulation.from_yaml(config)
+    run.run(tmp_path / "out", 2, progress=False)
+    with pytest.raises(ValueError, match=r"of `scene.connected: surface`, .* which a film cannot show"):
+        read_film(tmp_path / "out")
+
+
+def test_a_browser_does_not_draw_it():
+    session = types.SimpleNamespace(simulation=simulation(two_flags()[0]), state=None)
+    session.state = session.simulation.start()
+    assert not drawable(session)
+    session = types.SimpleNamespace(simulation=simulation(two_flags()[0], "grid"), state=None)
+    session.state = session.simulation.start()
+    assert drawable(session)
+
+
+def test_the_preview_shows_pieces_as_colours():
+    cloud, number = two_flags()
+    pieces, beside = _pieces(simulation(cloud))
+    assert beside > 0.8
+    front, back = (torch.stack([mask[number == k] for _, mask, _ in pieces]).any(1) for k in (0, 1))
+    assert not (front & back).any()
+    assert _pieces(simulation(cloud, "grid")) == ([], 0.0)
