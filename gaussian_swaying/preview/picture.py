@@ -276,7 +276,7 @@ def _pieces(simulation: Simulation) -> tuple[list[tuple[str, Tensor, tuple[int, 
     index, side = scene.simulated.cpu(), REACH * simulation.solver.dx / scene.frame.metres_per_unit
     cell = equal_rows((scene.model.means.detach().cpu().double()[index] / side).floor())
     shade, several = shades(cell, scene.pairs, len(PIECES))
-    found = []
+    found: list[tuple[str, Tensor, tuple[int, ...]]] = []
     for k, colour in enumerate(PIECES):
         mask = torch.zeros(len(scene.model.means), dtype=torch.bool)
         mask[index[shade == k]] = True
