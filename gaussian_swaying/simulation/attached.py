@@ -1,4 +1,4 @@
-"""Which material points are attached to each other, from which Gaussians are."""
+"""Attachments of material points to each other, from those of the Gaussians."""
 
 from __future__ import annotations
 
