@@ -63,6 +63,26 @@ def rotation_to_quat(rotation: Tensor) -> Tensor:
     return torch.where(quats[..., :1] < 0, -quats, quats)
 
 
+def quat_multiply(first: Tensor, second: Tensor) -> Tensor:
+    """Hamilton's product of quaternions: the rotation of ``second``, and then that of ``first``.
+
+    Args:
+        first: Quaternion wxyz, shape (4,).
+        second: Quaternions wxyz, shape (..., 4).
+
+    Returns:
+        Quaternions wxyz, not normalised, shape (..., 4).
+
+    Raises:
+        ValueError: If a tensor has another shape.
+    """
+    check_shape("first", first, 4)
+    check_shape("second", second, 4)
+    w, x, y, z = first.unbind(-1)
+    left = torch.stack([w, -x, -y, -z, x, w, -z, y, y, z, w, -x, z, -y, x, w]).view(4, 4)
+    return second @ left.T
+
+
 def rodrigues(turn: Tensor) -> tuple[Tensor, Tensor]:
     """The sine of an angle over it, and one less its cosine over its square, for an axis times angle [rad] (..., 3).
 

@@ -323,12 +323,13 @@ class Screen:
             began = time.perf_counter()
             snapshot = self.session.wait(number, 0.02)
             line, still = self.streams.line(key), self.session.paused or self.session.broken
-            drawn_there = line is not None and self._drawn_there(client, snapshot)
             camera = client.camera
-            now = (snapshot.number, self._version, self.shown, still, drawn_there or camera.update_timestamp)
-            if now == seen and not drawn_there:
-                continue
             try:
+                drawn_there = line is not None and self._drawn_there(client, snapshot)
+                drawn_there = drawn_there and self.streams.ready(snapshot, self._turn)  # millions take a while
+                now = (snapshot.number, self._version, self.shown, still, drawn_there or camera.update_timestamp)
+                if now == seen and not drawn_there:
+                    continue
                 if drawn_there:
                     assert line is not None
                     if not line.free:

@@ -156,6 +156,8 @@ class Streams:
         self._lines: dict[str, Line | None] = {}
         self._known: tuple[tuple[Any, ...], bytes] | None = None  # the scene that was asked for last
         self._making = threading.Lock()
+        self._maker: threading.Thread | None = None
+        self._failure: Exception | None = None
 
     def expect(self) -> str:
         """A key for another browser."""
@@ -180,11 +182,39 @@ class Streams:
 
     def scene(self, snapshot: Snapshot, turn: Tensor) -> tuple[tuple[Any, ...], bytes]:
         """Key and message of the scene of a snapshot; the same for all browsers. See :func:`.states.scene_message`."""
-        key = (snapshot.simulation, fingerprint([snapshot.simulation.scene]))
+        key = self._key(snapshot)
         with self._making:
             if self._known is None or self._known[0] != key:
                 self._known = (key, scene_message(snapshot, turn))
             return self._known
+
+    @staticmethod
+    def _key(snapshot: Snapshot) -> tuple[Any, ...]:
+        return snapshot.simulation, fingerprint([snapshot.simulation.scene])
+
+    def ready(self, snapshot: Snapshot, turn: Tensor) -> bool:
+        """True if :meth:`scene` has the scene of a snapshot; otherwise it is made meanwhile, in a thread.
+
+        Raises:
+            Exception: What went wrong when it was made.
+        """
+        known = self._known
+        if known is not None and known[0] == self._key(snapshot):
+            return True
+        if self._failure is not None:
+            failure, self._failure = self._failure, None
+            raise failure
+
+        def make() -> None:
+            try:
+                self.scene(snapshot, turn)
+            except Exception as error:
+                self._failure = error
+
+        if self._maker is None or not self._maker.is_alive():
+            self._maker = threading.Thread(target=make, name="scene", daemon=True)
+            self._maker.start()
+        return False
 
     def beside(self, handler: Callable[[Any], Any]) -> Callable[[Any], Any]:
         """The handler of all connections: those for states and strokes, and those of viser, which gets ``handler``."""

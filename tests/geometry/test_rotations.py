@@ -4,7 +4,7 @@ import pytest
 import torch
 from shared import unit
 
-from gaussian_swaying.geometry.rotations import quat_to_rotation, rotation_of, rotation_to_quat, turn_of
+from gaussian_swaying.geometry.rotations import quat_multiply, quat_to_rotation, rotation_of, rotation_to_quat, turn_of
 
 
 def test_quaternion_rotates_as_hamilton_product(device, dtype):
@@ -25,6 +25,14 @@ def test_rotation_to_quat_inverts(device, dtype):
     torch.testing.assert_close(back[4:], quats[4:], rtol=0, atol=1e-5 if dtype == torch.float32 else 1e-13)
 
 
+def test_a_product_of_quaternions_is_one_rotation_after_the_other():
+    draw = torch.Generator().manual_seed(4)
+    first = torch.randn(4, generator=draw, dtype=torch.float64)
+    second = torch.randn(5, 4, generator=draw, dtype=torch.float64)
+    both = quat_to_rotation(quat_multiply(first, second))
+    torch.testing.assert_close(both, quat_to_rotation(first) @ quat_to_rotation(second))
+
+
 def test_a_turn_is_the_exponential_of_its_cross_product():
     """Of any size; a small one, and its derivative at zero, are exact."""
     turn = torch.cat([4 * torch.randn(20, 3, dtype=torch.float64), torch.zeros(1, 3, dtype=torch.float64)])
@@ -40,6 +48,8 @@ def test_a_turn_is_the_exponential_of_its_cross_product():
     ("call", "name"),
     [
         (lambda z: quat_to_rotation(z(2, 3)), "quats"),
+        (lambda z: quat_multiply(z(3), z(2, 4)), "first"),
+        (lambda z: quat_multiply(z(4), z(2, 3)), "second"),
         (lambda z: rotation_to_quat(z(2, 3)), "rotation"),
     ],
 )

@@ -3,6 +3,7 @@
 import gzip
 import json
 import struct
+import threading
 import time
 import urllib.error
 import urllib.request
@@ -15,6 +16,8 @@ from websockets.exceptions import ConnectionClosed
 from websockets.sync.client import connect as connect_socket
 
 from gaussian_swaying.gaussians.parts import ROLES
+from gaussian_swaying.viewer import streams
+from gaussian_swaying.viewer.states import scene_message
 from gaussian_swaying.viewer.streams import ANSWER
 
 from .conftest import pictures_since
@@ -122,6 +125,31 @@ def test_a_browser_that_draws_gets_no_pictures(page, drawer, until):
         drawer.wait("scene")
         drawer.wait("state")
     assert pictures() == 0
+
+
+def test_pictures_come_while_a_scene_is_made(page, connect, until, monkeypatch):
+    """As of millions of Gaussians; and a scene that cannot be made is said on the page."""
+    made, begun = threading.Event(), []
+
+    def slow(snapshot, turn):
+        begun.append(time.perf_counter())
+        assert made.wait(30)
+        if len(begun) == 1:
+            raise ValueError("no memory")
+        return scene_message(snapshot, turn)
+
+    monkeypatch.setattr(streams, "scene_message", slow)
+    connect(page)
+    until(lambda: len(page.streams._lines) == 1)
+    drawer = Drawer(page, next(iter(page.streams._lines)))
+    until(lambda: begun and pictures_since(page, begun[0]) > 1)
+    assert len(begun) == 1
+    made.set()
+    until(lambda: page.notice is not None)
+    assert page.notice == "A picture could not be drawn: no memory"
+    drawer.wait("scene")
+    drawer.wait("state")
+    drawer.socket.close()
 
 
 def test_changes_come_as_what_they_are(page, drawer):

@@ -15,7 +15,7 @@ from torch import Tensor
 from gaussian_swaying._devices import in_double
 from gaussian_swaying.config.parser import parse_file
 from gaussian_swaying.gaussians.harmonics import sh_to_color
-from gaussian_swaying.geometry.covariances import covariance_to_quat_scale
+from gaussian_swaying.geometry.rotations import quat_multiply, rotation_to_quat
 from gaussian_swaying.mpm.followers import follower_stencil
 from gaussian_swaying.mpm.state import GridSpec
 from gaussian_swaying.mpm.transfer import gather
@@ -178,7 +178,9 @@ def film_of(simulation: Simulation, grid: GridSpec, nodes: Tensor, displacement:
     device = scene.model.means.device
     size, count = scene.size * scene.frame.metres_per_unit, len(scene.model.means)
     position = scene.frame.point_to_sim(in_double(scene.model.means)) / size
-    turn, scale = covariance_to_quat_scale(scene.frame.covariance_to_sim(in_double(scene.rest_covariances)) / size**2)
+    quats = torch.nn.functional.normalize(in_double(scene.model.quats.detach()), dim=-1)
+    turn = quat_multiply(rotation_to_quat(in_double(scene.frame.rotation)).to(quats), quats)
+    scale = in_double(scene.model.scales.detach()) + math.log(scene.frame.metres_per_unit / size)
     moving, order = order_of(scene)
     place = in_cells(scene.follow.places, grid).float().to(device)[moving]
     facing = torch.cat([scene.rest_facing.float(), scene.solid().float()[:, None]], dim=1)[moving]
@@ -250,7 +252,7 @@ def growth(scene: SimulatedScene, camera: Camera) -> Tensor:
         scene: The scene, at rest.
         camera: The first view, on the device of the scene.
     """
-    means, covariances = scene.model.means.detach(), scene.rest_covariances
+    means, scales = scene.model.means.detach(), in_double(scene.model.scales.detach())
     seen = means @ camera.world_to_camera[:3, :3].T + camera.world_to_camera[:3, 3]
     depth = seen[:, 2].clamp_min(camera.near)
     fx, fy, (cx, cy) = camera.intrinsics[0, 0], camera.intrinsics[1, 1], camera.intrinsics[:2, 2]
@@ -258,12 +260,22 @@ def growth(scene: SimulatedScene, camera: Camera) -> Tensor:
     across, along = camera.width // BLOCK + 1, camera.height // BLOCK + 1
     inside = (seen[:, 2] > camera.near) & (x >= 0) & (x < across) & (y >= 0) & (y < along)
     # the geometric mean of the areas along three axes is that of a projection, up to the direction
-    area = torch.linalg.det(in_double(covariances)).clamp_min(0).pow(1 / 3) * float(fx * fy) / in_double(depth) ** 2
+    area = (2 / 3 * scales.sum(-1)).exp() * float(fx * fy) / in_double(depth) ** 2
     mass = in_double(scene.model.opacity().detach()) * 2 * math.pi * area
     block = torch.where(inside, y * across + x, across * along).to(mass.device)
     total = mass.new_zeros(across * along + 1).index_add(0, block, mass)
     found = (LAYERS * BLOCK**2 / total[block].clamp_min(1e-30)).sqrt().clamp_max(1.0)
     return torch.where(inside.to(found.device), found, 1.0).float().to(means.device)
+
+
+_EVERY_THIRD_BIT = (
+    (32, 0x1F00000000FFFF),
+    (16, 0x1F0000FF0000FF),
+    (8, 0x100F00F00F00F00F),
+    (4, 0x10C30C30C30C30C3),
+    (2, 0x1249249249249249),
+)
+"""Shifts and masks that move bit k of a number of 20 bits to bit 3 k."""
 
 
 def spread(position: Tensor) -> Tensor:
@@ -277,11 +289,9 @@ def spread(position: Tensor) -> Tensor:
         return torch.arange(count, device=position.device)
     low, high = position.amin(0), position.amax(0)
     cells = ((position - low) / (high - low).clamp_min(1e-30) * (2**20 - 1)).long()
-    code = torch.zeros_like(cells[:, 0])
-    for bit in range(20):
-        for axis in range(3):
-            code |= (cells[:, axis] >> bit & 1) << (3 * bit + axis)
-    curve = torch.argsort(code, stable=True)
+    for shift, mask in _EVERY_THIRD_BIT:
+        cells = (cells | cells << shift) & mask
+    curve = torch.argsort(cells[:, 0] | cells[:, 1] << 1 | cells[:, 2] << 2, stable=True)
     bits = (count - 1).bit_length()
     rank = torch.arange(1 << bits, device=position.device)
     mirrored = torch.zeros_like(rank)

@@ -240,7 +240,7 @@ def bench_cube(plan: Plan, asked: int, walls: bool, turning: bool, device: torch
     box = [EnclosingBox([0.03] * 3, [1.6] * 3)] if walls else []
     # without gravity, in which it would fall out of its grid within the timed rollouts
     solver = MPMSolver(dx=1 / 128, formulation="updated", boundaries=box, gravity=[0.0, 0.0, 0.0])
-    start = solver.init_state(points, spin(points.position) if turning else None, margin=24)
+    start = solver.init_state(points, spin(points.position) if turning else None, margin=32)
     dt, steps = 0.7 * solver.stable_substep(start), plan.cube_steps
     state = start
 
