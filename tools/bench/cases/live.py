@@ -127,7 +127,7 @@ def rows(options: argparse.Namespace, result: Row) -> Iterator[Measurement]:
     if options.ply:
         scenes[Path(options.ply).stem] = ["--config", str(configs / "hanging_object.yaml"), "--scene.ply", options.ply]
     if options.scene:
-        scenes = {Path(options.scene).parent.name: ["--config", options.scene]}
+        scenes[Path(options.scene).parent.name] = ["--config", options.scene]
     for name, arguments in scenes.items():
         yield ("rows", {"name": name}), partial(watch, arguments, options.device, options.seconds)
 
@@ -137,7 +137,7 @@ CASE = Case(
     rows,
     (
         option("--ply", "a captured object for configs/sim/hanging_object.yaml"),
-        option("--scene", "watch only this configuration, such as the draft of a preview"),
+        option("--scene", "a configuration to watch, too, such as the draft of a preview"),
         option("--seconds", "for how long each scene is watched", type=float, default=20.0),
     ),
     page="live.md",

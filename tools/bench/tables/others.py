@@ -31,7 +31,7 @@ table("live.md", "live.rates", "live_*", _rates, """
     scene = {name} | Gaussians = {gaussians:,} | points = {points:,} | window = {pixels} | picture = {picture} |
     pictures a second = {pictures_per_s:.1f} | wanted = {wanted:g} | KB a picture = {picture_bytes:.0f (KB)} |
     simulated seconds per second = {real_time:.2g} | step [s] = {step_s:.3g} |
-    a control shows after [ms] = {latency_ms:.0f}
+    a control shows after [ms] = {latency_ms or '-':.0f}
     """, before="{source}\n\nReceived by one client on the same machine, without a browser.")  # fmt: skip
 
 table("live.md", "live.states", "live_cpu", "rows", """
