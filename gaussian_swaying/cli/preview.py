@@ -139,10 +139,13 @@ def preview_scene(options: argparse.Namespace, folder: Path) -> Preview:
     region = None if options.region is None else (options.region[:3], options.region[3:])
     capture = None if options.capture is None else captured_from(options.capture)
     quality = options.quality or "normal"
-    if options.move is not None and (region is not None or capture is not None):
-        one = "--region" if capture is None else "--capture"
-        raise ValueError(f"`--move` and `{one}` both choose what moves: leave out one of them.")
-    place = survey(cloud, up) if region is None and capture is None else None
+    if options.move is not None and region is not None:
+        raise ValueError("`--move` and `--region` both choose what moves: leave out one of them.")
+    place = None
+    if region is None and capture is None:
+        place = survey(cloud, up)
+    elif options.move is not None and capture is not None:  # otherwise it is the object that the photos show
+        place = survey(cloud, up or capture.up, capture.cameras)
     chosen = _numbers(options.move, place)
     part: GaussianCloud = cloud
     found = None

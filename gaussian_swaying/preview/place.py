@@ -17,6 +17,7 @@ from gaussian_swaying.geometry.neighbours import particle_spacing
 from gaussian_swaying.geometry.patches import smallest_axis_normal
 from gaussian_swaying.geometry.regions import Cylinder
 from gaussian_swaying.preview.framing import nearby
+from gaussian_swaying.preview.photos import seen_share
 from gaussian_swaying.preview.shape import (
     DIRECTIONS,
     largest_plane,
@@ -27,12 +28,14 @@ from gaussian_swaying.preview.shape import (
 )
 from gaussian_swaying.preview.suggest import RegionGuess, region_around, suggest_threshold, visible_weight
 from gaussian_swaying.preview.up import CONVENTION, UpGuess, given_up
+from gaussian_swaying.rendering.cameras.camera import Camera
 
 SAMPLE = 300_000  # Gaussians from which up, ground and extent are guessed
 FAR = 1.5  # extents of the fine detail from its middle, beyond which a Gaussian is background
 SPACINGS, CELLS = 3.0, 512  # a cell of connected parts: so many spacings, and at most so many along the extent
 FEWEST, SMALLEST = 64, 0.02  # Gaussians of a thing, and its longest side as a share of the extent
 MOST = 8  # things that are listed
+MEMBERS = 1000  # Gaussians of a thing that are looked for in the photos
 WIDE = 0.5  # share of the extent beyond which a thing is a part of the surroundings
 SPARSE = 0.3  # share of the cells of its box that a thing fills which is not thin
 COLUMNS = 64  # columns along the extent, whose lower ends are the ground
@@ -91,7 +94,9 @@ class Place:
     things: list[Thing]
 
 
-def survey(cloud: GaussianCloud, up: Sequence[float] | str | None = None) -> Place | None:
+def survey(
+    cloud: GaussianCloud, up: Sequence[float] | str | None = None, cameras: Sequence[Camera] = ()
+) -> Place | None:
     """Find the ground of a capture of a place, its background, and the things above the ground that may move.
 
     The fine half of the Gaussians tells where the cameras were near; what lies farther than :data:`FAR` of its extents
@@ -102,11 +107,13 @@ def survey(cloud: GaussianCloud, up: Sequence[float] | str | None = None) -> Pla
     - not as wide as half of the place, and not at its border (1);
     - thin: it fills little of its box, which stands upright (up to 1);
     - green, as leaves are (up to 1);
-    - flat, as a cloth is (1).
+    - flat, as a cloth is (1);
+    - in the photos: how much of it lies in them, on average (up to 2), if their cameras are known.
 
     Args:
         cloud: The splat.
         up: Direction that points up, as 3 numbers or as ``+x`` to ``-z``; guessed if None.
+        cameras: Those of the photos.
 
     Returns:
         The parts, or None if it has no ground, or a single thing on it and no background: then it is an object.
@@ -146,7 +153,7 @@ def survey(cloud: GaussianCloud, up: Sequence[float] | str | None = None) -> Pla
     cell = max(SPACINGS * particle_spacing(points), extent / CELLS)
     part = connected_parts(points, cell)
     axes = torch.stack([*plane_axes(normal), normal])
-    things = _things(cloud, solid, part, weight, middle, extent, cell, axes)
+    things = _things(cloud, solid, part, weight, middle, extent, cell, axes, cameras)
     alone = sum(len(thing.members) for thing in things[1:]) < 0.05 * int(solid.sum())
     if not things or ALONE not in things[0].reasons or (alone and int(far.sum()) < 0.01 * len(cloud)):
         return None
@@ -219,6 +226,7 @@ def _things(
     extent: float,
     cell: float,
     axes: Tensor,
+    cameras: Sequence[Camera],
 ) -> list[Thing]:
     """The connected parts that are large enough, with their scores, for boxes along axes (3, 3) that stand upright."""
     middle = axes @ middle.to(axes)
@@ -254,6 +262,9 @@ def _things(
             "green": share,
             "flat": 0.0 if sheet_normal(points) is None else 1.0,
         }
+        if cameras:
+            some = cloud.means[members[:: max(1, len(members) // MEMBERS)]]
+            reasons["in the photos"] = 2 * float(seen_share(some, cameras).mean())
         reasons = {why: round(value, 2) for why, value in reasons.items() if value >= 0.05}
         found.append(Thing(members, *ends, round(sum(reasons.values()), 2), reasons))
     return sorted(found, key=lambda thing: -thing.score)[:MOST]

@@ -17,6 +17,7 @@ from gaussian_swaying.geometry.rotations import quat_to_rotation
 from gaussian_swaying.preview.place import excerpt, survey
 from gaussian_swaying.preview.report import place_lines
 from gaussian_swaying.preview.suggest import suggest
+from gaussian_swaying.rendering.cameras.camera import look_at_camera
 from gaussian_swaying.scenes.alocasia import AlocasiaScene
 from gaussian_swaying.scenes.procedural import FlagScene
 from gaussian_swaying.simulation.simulation import Simulation
@@ -86,6 +87,21 @@ def test_the_scores_do_not_depend_on_the_tilt(garden, turn):
     assert _overlap(_mask(tilted.things[0].members), plant) > 0.95
     for before, after in zip(upright.things, tilted.things, strict=True):
         assert after.score == pytest.approx(before.score, abs=0.3)
+
+
+def test_what_the_photos_show_is_likelier(garden):
+    """One photo of the plant alone and one of all: the plant gets two points, and the hedge half of them."""
+    cloud, _ = garden
+    own = survey(cloud).things[0]
+    middle = 0.5 * (torch.tensor(own.low) + torch.tensor(own.high))
+    distances = {"close": 1.0, "far": 12.0}
+    eyes = {name: middle - torch.tensor([0.0, distance, 0.0]) for name, distance in distances.items()}
+    cameras = [look_at_camera(eye, middle, [0.0, 0.0, 1.0], 50.0, 64, 64) for eye in eyes.values()]
+    plant, hedge = survey(cloud, cameras=cameras).things
+    assert plant.members.equal(own.members)
+    assert plant.reasons["in the photos"] == 2
+    assert hedge.reasons["in the photos"] == 1
+    assert plant.score == pytest.approx(own.score + 2, abs=0.011)
 
 
 def test_no_other_things_are_offered_where_there_are_none(garden):
