@@ -136,6 +136,12 @@ def load_image(path: str | Path, lens: Lens, downscale: int = 1) -> Tensor:
     return rearrange(image.round_().clamp_(0, 255).to(torch.uint8), "c h w -> h w c").contiguous()
 
 
+def remapped(pixels: Tensor, lens: Lens) -> Tensor:
+    """Pixels (H, W, C) of dtype uint8, as ``lens.undistorted()`` sees them."""
+    image = remap(rearrange(pixels, "h w c -> c h w").float(), lens, lens.undistorted())
+    return rearrange(image.round_().clamp_(0, 255).to(torch.uint8), "c h w -> h w c").contiguous()
+
+
 def check_image_size(path: str | Path, size: tuple[int, int], lens: Lens) -> None:
     """Raise ValueError unless an image of ``size`` (width, height) [pixels] matches its lens."""
     if size != (lens.width, lens.height):

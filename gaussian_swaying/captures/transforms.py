@@ -57,6 +57,8 @@ def read_transforms(path: Path) -> tuple[list[PosedImage], list[str], Path | Non
         data, where = load_transforms(file), f"`{file}`"
         listed = _listed_splits(where, data)
         for index, frame in enumerate(data["frames"]):
+            if "video_path" in frame:  # a film, see fitting.videos
+                continue
             name = _file_path(where, index, frame)
             pose = read_pose(where, index, frame)
             check_rigid(f"The field `frames[{index}].transform_matrix` of the camera file {where}", pose)
@@ -64,7 +66,7 @@ def read_transforms(path: Path) -> tuple[list[PosedImage], list[str], Path | Non
             if image is None:
                 missing.append(name)
                 continue
-            lens = _read_lens(where, _merged(data, frame), image)
+            lens = lens_of_transforms(where, data, frame, image_size(image))
             own = split if listed is None else listed.get(name)
             images.append(PosedImage(name, image, lens, torch.linalg.inv(pose), own))
         for candidate in (data.get("ply_file_path"), "points3d.ply"):
@@ -133,7 +135,19 @@ def _listed_splits(where: str, data: dict[str, Any]) -> dict[str, str] | None:
     return result or None
 
 
-def _read_lens(where: str, fields: dict[str, Any], image: Path) -> Lens:
+def lens_of_transforms(where: str, data: dict[str, Any], frame: dict[str, Any], size: tuple[int, int]) -> Lens:
+    """The lens of a frame.
+
+    Args:
+        where: The file, for messages.
+        data: Its fields.
+        frame: Those of the frame.
+        size: Width and height of the pictures, if the file does not say them [pixels].
+
+    Raises:
+        ValueError: If a field is bad, or the lens is of another kind.
+    """
+    fields = _merged(data, frame)
     model = "a fisheye lens" if fields.get("is_fisheye") else fields.get("camera_model", "OPENCV")
     if model not in _PINHOLE_MODELS:
         raise ValueError(
@@ -146,7 +160,7 @@ def _read_lens(where: str, fields: dict[str, Any], image: Path) -> Lens:
                 f"The field `{name}` of the camera file {where} is not 0: only k1, k2, k3, p1 and p2 are "
                 "supported; undistort the images first."
             )
-    width, height = image_size(image)
+    width, height = size
     given = {name: value for name, value in fields.items() if value is not None}
     w, h, fx, fy, cx, cy = read_intrinsics(where, {"w": width, "h": height, **given}, None, None)
     distortion = tuple(read_number(where, fields, name) or 0.0 for name in ("k1", "k2", "p1", "p2", "k3"))

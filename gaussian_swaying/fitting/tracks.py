@@ -21,8 +21,8 @@ from gaussian_swaying.rendering.protocol import RenderOutput
 from gaussian_swaying.simulation.painter import Painter
 from gaussian_swaying.simulation.simulation import Simulation
 
-WINDOW = 15
-"""Side of the square that is followed [pixels]."""
+WINDOW, WIDE = 15, 960
+"""Side of the square that is followed, where the longer side of the picture has at most ``WIDE`` [pixels]."""
 LEVELS = 3
 BACK = 0.5
 """Largest distance between a point and the one found by following it back [pixels]."""
@@ -180,9 +180,9 @@ def follow(images: Any, start: Any) -> tuple[Any, Any]:
     import numpy as np
 
     cv2 = opencv()
-    options = {"winSize": (WINDOW, WINDOW), "maxLevel": LEVELS}
-    options["criteria"] = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 40, 0.001)
     count, (height, width) = len(start), images.shape[1:3]
+    options = {"winSize": (window_of(width, height),) * 2, "maxLevel": LEVELS}
+    options["criteria"] = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 40, 0.001)
     position = np.zeros((len(images), count, 2))
     seen = np.zeros((len(images), count), dtype=bool)
     now = np.ascontiguousarray(start - 0.5, dtype=np.float32)[:, None]
@@ -199,6 +199,11 @@ def follow(images: Any, start: Any) -> tuple[Any, Any]:
         now = np.where(seen[k][:, None, None], there, now)
         position[k] = now[:, 0] + 0.5
     return position, seen
+
+
+def window_of(width: int, height: int) -> int:
+    """Side of the square that is followed in a picture of this size [pixels]; odd."""
+    return 2 * round(WINDOW // 2 * max(1.0, max(width, height) / WIDE)) + 1
 
 
 def _chosen(simulation: Simulation, video: Footage, grey: Any, most: int) -> tuple[Tensor, Tensor]:
@@ -249,7 +254,8 @@ def _inside(pixel: Tensor, picture: RenderOutput, there: Tensor) -> Tensor:
 
 def _windows(places: Tensor, width: int, height: int) -> tuple[Tensor, Tensor]:
     """Columns and rows of the pixels in the window around each place (T, 2), clamped to the picture; shape (T, W²)."""
-    reach = torch.arange(WINDOW) - WINDOW // 2
+    side = window_of(width, height)
+    reach = torch.arange(side) - side // 2
     beside = torch.cartesian_prod(reach, reach)
     column, row = (places.long()[:, None] + beside).unbind(-1)
     return column.clamp(0, width - 1), row.clamp(0, height - 1)

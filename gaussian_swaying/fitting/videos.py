@@ -15,10 +15,10 @@ import torch
 from torch import Tensor
 
 from gaussian_swaying._inputs import check_regular
-from gaussian_swaying.captures.images import PosedImage, load_image, read_image
-from gaussian_swaying.captures.transforms import read_transforms, transforms_files
+from gaussian_swaying.captures.images import PosedImage, load_image, read_image, remapped
+from gaussian_swaying.captures.transforms import check_rigid, lens_of_transforms, read_transforms, transforms_files
 from gaussian_swaying.rendering.cameras.camera import Camera
-from gaussian_swaying.rendering.cameras.transforms_json import camera_of_transforms, load_transforms, read_number
+from gaussian_swaying.rendering.cameras.transforms_json import load_transforms, read_number, read_pose
 
 MOST_FRAMES = 10_000
 """Most frames of all videos of a fit."""
@@ -115,7 +115,8 @@ def read_videos(
     Each folder has a ``transforms.json`` as of Nerfstudio. A frame has ``file_path``, ``transform_matrix``, ``time``
     [s] and, with several cameras, ``camera``, a name or a number; a transparent image or ``mask_path`` gives the
     silhouette. An entry with ``video_path`` instead of ``file_path`` is a whole video of a camera that stands still:
-    ``time`` is then that of its first frame, and ``fps`` replaces the frame rate of the file. Cameras that are not
+    ``time`` is then that of its first frame, and ``fps`` replaces the frame rate of the file. Lens distortion is
+    removed from both. Cameras that are not
     wanted are not decoded; the others together may have :data:`MOST_FRAMES` and :data:`MOST_BYTES`.
 
     Args:
@@ -235,16 +236,21 @@ def _film(file: Path, where: str, data: dict[str, Any], index: int, begin: float
 
     entry = data["frames"][index]
     path = check_regular(file.parent / str(entry["video_path"]), "the video")
-    camera = camera_of_transforms(file, data, index)
-    size, fps = (camera.width, camera.height), read_number(where, entry, "fps")
+    fps = read_number(where, entry, "fps")
     if fps is not None and not fps > 0:
         raise ValueError(f"The field `frames[{index}].fps` of the camera file {where} is {fps:g}: set it above 0.")
     shots: list[_Shot] = []
-    limits = ["-max_pixels", str(MOST_PIXELS)], ["-frames:v", str(room.holds(*size) + 1)]
+    limits = ["-max_pixels", str(MOST_PIXELS)], ["-frames:v", str(room.frames + 1)]
     with closing(read_frames(path, input_params=limits[0], output_params=limits[1])) as film:
         head = _next(film, path)
-        if head is None or tuple(head["size"]) != size:
-            raise ValueError(f"The video {path} is not {size[0]} x {size[1]} as its camera in {where} says.")
+        size = (0, 0) if head is None else tuple(head["size"])
+        lens = lens_of_transforms(where, data, entry, size)
+        if (lens.width, lens.height) != size:
+            raise ValueError(f"The video {path} is not {lens.width} x {lens.height} as its camera in {where} says.")
+        seen = lens.undistorted()
+        pose = read_pose(where, index, entry)
+        check_rigid(f"The field `frames[{index}].transform_matrix` of the camera file {where}", pose)
+        camera = Camera(torch.linalg.inv(pose).float(), seen.intrinsics().float(), seen.width, seen.height)
         rate = fps or float(head["fps"])
         if not rate > 0:
             raise ValueError(f"The video {path} does not say its frame rate: add `fps` to its entry in {where}.")
@@ -252,6 +258,8 @@ def _film(file: Path, where: str, data: dict[str, Any], index: int, begin: float
         while (frame := _next(film, path)) is not None:
             room.take(path, *size)
             picture = torch.frombuffer(bytearray(frame), dtype=torch.uint8).reshape(size[1], size[0], 3)
+            if lens.distorted:
+                picture = remapped(picture, lens)
             shots.append(_Shot(begin + len(shots) / rate, camera, picture, None))
     return shots
 

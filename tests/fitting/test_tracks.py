@@ -8,7 +8,7 @@ import torch
 import yaml
 
 from gaussian_swaying.fitting.evidence import TrackEvidence
-from gaussian_swaying.fitting.tracks import _inside, drawn_beside, match, track
+from gaussian_swaying.fitting.tracks import _inside, drawn_beside, match, track, window_of
 from gaussian_swaying.fitting.variants import states_of
 from gaussian_swaying.fitting.videos import Footage, read_videos
 from gaussian_swaying.rendering.cameras.camera import look_at_camera, project
@@ -19,6 +19,11 @@ from gaussian_swaying.simulation.simulation import Simulation
 from .conftest import base, cameras
 
 cv2 = pytest.importorskip("cv2", reason="needs the extra [fit]")
+
+
+@pytest.mark.parametrize(("size", "side"), [((200, 120), 15), ((540, 960), 15), ((1080, 1920), 29), ((3840, 2160), 57)])
+def test_the_window_grows_with_the_picture(size, side):
+    assert window_of(*size) == side
 
 
 def test_follow_a_shift():

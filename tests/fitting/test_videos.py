@@ -41,6 +41,29 @@ def test_a_video_file(own, tmp_path):
     assert float((film.images[3, :120, :200].float() - pictures[3].astype("f4")).abs().mean()) < 6
 
 
+def test_a_lens_with_distortion_and_pictures_beside_a_film(own, tmp_path):
+    """A film is undistorted as stills are; one file may have both, for two cameras."""
+    given = json.loads((own / "video/transforms.json").read_text())["frames"]
+    stills = [frame | {"k1": 0.2} for frame in given if frame["camera"] == "left"]
+    for frame in stills:
+        frame.pop("mask_path", None)
+        pixels = np.pad(iio.imread(own / "video" / frame["file_path"])[..., :3], ((0, 8), (0, 8), (0, 0)))
+        iio.imwrite(tmp_path / frame["file_path"], pixels)
+    names = [tmp_path / frame["file_path"] for frame in stills]
+    iio.imwrite(tmp_path / "film.mp4", np.stack([iio.imread(name) for name in names]), fps=24)
+    stills = [frame | {"w": 208, "h": 128} for frame in stills]
+    first = {name: value for name, value in stills[0].items() if name != "file_path"}
+    film = first | {"video_path": "film.mp4", "camera": "film"}
+    (tmp_path / "transforms.json").write_text(json.dumps({"frames": [film, *stills]}))
+    filmed, taken = read_videos(tmp_path)
+    assert (filmed.name, taken.name) == ("film", "left")
+    assert filmed.size == taken.size
+    assert filmed.size != (208, 128)
+    assert torch.equal(filmed.cameras[0].intrinsics, taken.cameras[0].intrinsics)
+    assert torch.equal(filmed.cameras[0].world_to_camera, taken.cameras[0].world_to_camera)
+    assert float((filmed.images.float() - taken.images.float()).abs().mean()) < 6
+
+
 def test_bad_videos(own, tmp_path):
     with pytest.raises(FileNotFoundError, match="does not exist"):
         read_videos(tmp_path / "nowhere")

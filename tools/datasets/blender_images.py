@@ -111,7 +111,8 @@ class Studio:
             self._add_lamp(f"lamp{index}", lamp, center, lamp_size, 1.0 - ambient)
         if ambient:
             scene.world = bpy.data.worlds.new("world")
-            scene.world.color = (ambient, ambient, ambient)
+            scene.world.use_nodes = True  # Blender 5 reads no color of a world without nodes
+            scene.world.node_tree.nodes["Background"].inputs["Color"].default_value = (ambient, ambient, ambient, 1.0)
         camera = bpy.data.cameras.new("camera")
         camera.sensor_fit, camera.clip_start, camera.clip_end = "HORIZONTAL", 0.01, 1000.0
         self._camera = bpy.data.objects.new("camera", camera)
