@@ -39,8 +39,8 @@ from gaussian_swaying.fitting.least_squares import (
 )
 from gaussian_swaying.fitting.plan import Plan, parse_base, read_unknown
 from gaussian_swaying.fitting.report import Result, predictions, write_results
-from gaussian_swaying.fitting.tracks import Tracks, match, opencv, track
-from gaussian_swaying.fitting.unknowns import check_unknowns
+from gaussian_swaying.fitting.tracks import Tracks, match, opencv, still_until, track
+from gaussian_swaying.fitting.unknowns import FILM_START, check_unknowns
 from gaussian_swaying.fitting.variants import check_variants, states_of
 from gaussian_swaying.fitting.videos import Footage, frame_times, read_videos
 from gaussian_swaying.mpm.state import State
@@ -67,6 +67,9 @@ TOLERANCE = 3e-4
 """Shortest step of the last stage, as a share of the ranges."""
 ROUGH = 30
 """Factor by which the tolerance of the other steps is larger."""
+
+LONG_STILL = 0.05
+"""How long a film may be still before its motion, if its start is no unknown [s]; slow objects need a frame or two."""
 
 Say = Callable[[str], None]
 
@@ -246,6 +249,8 @@ class Fit:
         """
         clock = time.monotonic() - course.seconds
         if course.step < 0:
+            for note in self.notes():
+                self.say(note)
             course.place = self.search()
             self.say(f"search: {self._shown(course.place)}")
             self._check_apart(course)
@@ -297,11 +302,24 @@ class Fit:
             course.history,
             course.seconds,
             unsettled(normal, place, self.plan.unknowns, course.ended),
+            tuple(self.notes()),
         )
 
     def _normal(self, place: Tensor, evidence: Sequence[Evidence], times: Sequence[float]) -> Normal:
         blocks, steps = sensitivities(self.residuals(evidence, times), place)
         return normal_equations(blocks, scales_of(blocks, {part.kind: part.floor for part in evidence}), steps)
+
+    def notes(self) -> list[str]:
+        """What the videos say against the plan: a film that is still at first, without an unknown start."""
+        if FILM_START in (u.name for u in self.plan.unknowns) or not {"tracks", "matches"} & set(self.stages):
+            return []
+        still = min(still_until(own, v.times) for own, v in zip(self.tracks, self.videos, strict=True))
+        if still < LONG_STILL:
+            return []
+        return [
+            f"Nothing moves in the first {still:.2g} s of the film, but the simulation starts at once: add "
+            f"{FILM_START}: {{range: [0, {math.ceil(20 * still) / 10:g}]}} to `unknowns`, or cut the film."
+        ]
 
     def _check_apart(self, course: Course) -> None:
         first = self.stages[0]

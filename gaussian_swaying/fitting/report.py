@@ -14,7 +14,7 @@ from torch import Tensor
 from gaussian_swaying._files import write_json, write_table, write_text
 from gaussian_swaying.config.parser import config_text
 from gaussian_swaying.fitting.identifiability import Direction
-from gaussian_swaying.fitting.unknowns import Unknown
+from gaussian_swaying.fitting.unknowns import Unknown, of_simulation
 from gaussian_swaying.fitting.videos import Footage
 from gaussian_swaying.gaussians.model import DeformedGaussians
 from gaussian_swaying.simulation.parameters import POLAR, flow_of, in_settings
@@ -65,6 +65,7 @@ class Result:
         history: One row for each iteration.
         seconds: Time it took.
         unsettled: The reason why the values are not a local minimum, and a remedy; empty if they are one.
+        notes: What the videos say against the plan.
     """
 
     unknowns: Sequence[Unknown]
@@ -75,6 +76,7 @@ class Result:
     history: Sequence[Mapping[str, Any]]
     seconds: float
     unsettled: str = ""
+    notes: Sequence[str] = ()
 
     @property
     def values(self) -> dict[str, float]:
@@ -123,6 +125,7 @@ class Result:
         lines = [f"{'':<28}{'value':>12}{'error':>12}"]
         for row in self.rows():
             lines.append(f"{row['name']:<28}{row['value']:>12.5g}{row['standard_error']:>12.2g} {row['unit']}".rstrip())
+        lines += self.notes
         if self.unsettled:
             lines.append(self.unsettled)
         for name in self.vague:
@@ -209,6 +212,7 @@ def write_results(
                 }
                 for s in result.shown
             ],
+            "notes": list(result.notes),
             "not_settled": result.unsettled,
             "not_followed": result.astray,
             "not_determined": result.vague,
@@ -225,7 +229,7 @@ def scene_text(values: Mapping[str, float], parser: ArgumentParser, settings: Na
     found = settings.clone()
     if any(name in values for name in POLAR):
         found.wind.flow = flow_of(simulation.wind.flows[0].tolist(), values)  # type: ignore[index]
-    for name, value in values.items():
+    for name, value in of_simulation(values).items():
         if name not in POLAR:
             in_settings(found, name, value)
     told = "".join(f"# {name}: {value:.6g}\n" for name, value in values.items())

@@ -28,6 +28,8 @@ BACK = 0.5
 """Largest distance between a point and the one found by following it back [pixels]."""
 _DRAWN = 1e-3
 """Least sum of the weights of a Gaussian in a picture with which it counts as visible [pixels]."""
+STILL = 0.5
+"""How far a point moves that stands still [pixels]: noise and compression."""
 QUALITY = 0.02
 """Least texture of a point, as a share of the best one: smallest eigenvalue of the structure tensor."""
 EDGE = 4.0
@@ -70,6 +72,21 @@ def track(simulation: Simulation, video: Footage, most: int = 400) -> Tracks:
     chosen, start = _chosen(simulation, video, _grey(video.images[0]), most)
     position, seen = follow(video.images.numpy(), start.numpy())
     return Tracks(chosen, torch.from_numpy(position), torch.from_numpy(seen))
+
+
+def still_until(tracks: Tracks, times: Sequence[float]) -> float:
+    """Time of the last frame before what is followed begins to move [s]; 0 if it moves in the first frames.
+
+    A point has moved if it is more than :data:`STILL` from its first place. A quarter of the points has to.
+
+    Args:
+        tracks: Tracks of a video.
+        times: Its times.
+    """
+    moved = (tracks.position - tracks.position[:1]).norm(dim=-1)
+    moved = torch.where(tracks.seen, moved, torch.nan).nanquantile(0.75, dim=1)
+    begun = (moved > STILL).nonzero()[:, 0]
+    return float(times[max(int(begun[0]) - 1, 0)]) if len(begun) else 0.0
 
 
 def match(simulation: Simulation, video: Footage, states: Sequence[State], most: int = 400) -> Tracks:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 from gaussian_swaying._checks import check_choice
@@ -12,6 +12,8 @@ from gaussian_swaying.simulation.parameters import find, parameter, with_values
 from gaussian_swaying.simulation.simulation import Simulation
 
 SCALES = ("log", "linear")
+FILM_START = "film.start"
+"""Time in the film at which the motion starts, at rest until then [s]: no number of the simulation."""
 
 
 @dataclass(frozen=True)
@@ -20,7 +22,8 @@ class Unknown:
 
     Args:
         name: The option of ``sim``, such as ``material.E``; or ``wind.speed`` [m/s], ``wind.azimuth`` [degrees, from +x
-            towards +y] and ``wind.elevation`` [degrees above the ground], which together are ``wind.flow``.
+            towards +y] and ``wind.elevation`` [degrees above the ground], which together are ``wind.flow``; or
+            :data:`FILM_START` [s].
         low: Smallest value.
         high: Largest value.
         scale: ``log`` or ``linear``.
@@ -40,22 +43,25 @@ class Unknown:
         where = f"unknowns.{self.name}"
         check_choice(f"{where}.scale", self.scale, SCALES)
         known = find(self.name)
-        if known is None or known.kind != "number":
-            sought = [name for name in parameters.names() if parameter_kind(name) == "number"]
+        if self.name != FILM_START and (known is None or known.kind != "number"):
+            sought = [FILM_START, *(name for name in parameters.names() if parameter_kind(name) == "number")]
             raise ValueError(f"`{self.name}` cannot be sought: use {', '.join(sought)}, or put it into `known`.")
         if not (math.isfinite(self.low) and math.isfinite(self.high) and self.low < self.high):
             raise ValueError(f"Expected `{where}.range` to be [low, high], but got [{self.low}, {self.high}].")
         if self.scale == "log" and self.low <= 0:
             raise ValueError(f"Expected `{where}.range` above 0 with `scale: log`, but got {self.low}.")
-        for end in (self.low, self.high):
-            known.check(end, f"{where}.range")
+        if self.name == FILM_START and self.low < 0:
+            raise ValueError(f"Expected `{where}.range` from 0 on, as the film begins at rest, but got {self.low}.")
+        if known is not None:
+            known.check(self.low, f"{where}.range")
+            known.check(self.high, f"{where}.range")
         if self.start is not None and not self.low <= self.start <= self.high:
             raise ValueError(f"Expected `{where}.start` within its range, but got {self.start}.")
 
     @property
     def unit(self) -> str:
         """Its unit, empty for a pure number."""
-        return parameter(self.name).unit
+        return "s" if self.name == FILM_START else parameter(self.name).unit
 
     def value(self, share: float) -> float:
         """The value at a share of the range, 0 at ``low`` and 1 at ``high``."""
@@ -74,6 +80,11 @@ class Unknown:
         return self.value(share) * math.log(self.high / self.low) if self.scale == "log" else self.high - self.low
 
 
+def of_simulation(values: Mapping[str, float]) -> dict[str, float]:
+    """The values that are numbers of the simulation."""
+    return {name: value for name, value in values.items() if name != FILM_START}
+
+
 def parameter_kind(name: str) -> str:
     """``number``, ``whole`` or ``vector``."""
     return parameter(name.replace("*", "0")).kind
@@ -82,7 +93,7 @@ def parameter_kind(name: str) -> str:
 def default_scale(name: str, low: float) -> str:
     """``log`` for positive sizes, ``linear`` for angles, Poisson's ratio and ranges that reach zero."""
     known = find(name)
-    return "log" if low > 0 and (known is None or known.scale == "log") else "linear"
+    return "log" if low > 0 and name != FILM_START and (known is None or known.scale == "log") else "linear"
 
 
 def check_unknowns(simulation: Simulation, unknowns: Sequence[Unknown]) -> None:
@@ -93,4 +104,4 @@ def check_unknowns(simulation: Simulation, unknowns: Sequence[Unknown]) -> None:
     for name in names:
         if names.count(name) > 1:
             raise ValueError(f"`{name}` is in `unknowns` twice: remove one.")
-    with_values(simulation.setup, {unknown.name: unknown.value(0.5) for unknown in unknowns})
+    with_values(simulation.setup, of_simulation({unknown.name: unknown.value(0.5) for unknown in unknowns}))

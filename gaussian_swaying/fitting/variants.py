@@ -8,6 +8,7 @@ from dataclasses import dataclass
 
 import torch
 
+from gaussian_swaying.fitting.unknowns import FILM_START, of_simulation
 from gaussian_swaying.mpm.state import MaterialPoints, State
 from gaussian_swaying.simulation.diagnostics import SimulationDiverged
 from gaussian_swaying.simulation.parameters import Setup, parameter, with_values
@@ -24,7 +25,12 @@ class _Group:
     members: list[int]
     stepper: Stepper
     state: State
+    start: float
     diverged: bool = False
+
+    def moves(self, begin: float, end: float) -> float:
+        """How long they move between two times of the film [s]."""
+        return max(end - self.start, 0.0) - max(begin - self.start, 0.0)
 
 
 def check_variants(simulation: Simulation) -> None:
@@ -48,7 +54,8 @@ def states_of(
 
     Args:
         simulation: The base. Its motion starts from rest at time zero.
-        values: For each variant the values that replace those of the base.
+        values: For each variant the values that replace those of the base; with
+            :data:`~.unknowns.FILM_START`, it is at rest until then.
         times: Times [s], ascending, from 0 on.
         alike: Take the same substeps for all, those of the stiffest, so that differences come from the values alone. If
             not, variants that need more substeps are batches of their own, and a variant may end in NaN.
@@ -56,12 +63,12 @@ def states_of(
     Raises:
         SimulationDiverged: If a variant diverges, with ``alike``.
     """
-    setups = [with_values(simulation.setup, own) for own in values]
+    setups = [with_values(simulation.setup, of_simulation(own)) for own in values]
     groups = _groups(simulation, values, setups, alike)
     now = 0.0
     for time in times:
         if time > now:
-            _advance(groups, time - now, alike)
+            _advance(groups, now, time, alike)
             now = time
         found = [(member, group.state.scene(k)) for group in groups for k, member in enumerate(group.members)]
         yield [state for _, state in sorted(found, key=lambda pair: pair[0])]
@@ -70,7 +77,9 @@ def states_of(
 def _groups(simulation: Simulation, values: Sequence[Values], setups: Sequence[Setup], alike: bool) -> list[_Group]:
     shared: dict[tuple[object, ...], list[int]] = {}
     for number, (own, setup) in enumerate(zip(values, setups, strict=True)):
-        apart = [(name, value) for name, value in sorted(own.items()) if not parameter(name).batched]
+        apart = [
+            (name, value) for name, value in sorted(own.items()) if name == FILM_START or not parameter(name).batched
+        ]
         shared.setdefault((*apart, 0 if alike else _stiffness_class(setup.points)), []).append(number)
     found = []
     for members in shared.values():
@@ -78,14 +87,15 @@ def _groups(simulation: Simulation, values: Sequence[Values], setups: Sequence[S
         solver = simulation.solver.like(part[0].solver)
         solver.substep = None  # a stiffer variant may need a shorter one
         stepper = Stepper(solver, part, simulation.frame_dt, lenient=not alike)
-        found.append(_Group(members, stepper, stepper.bind()))
+        found.append(_Group(members, stepper, stepper.bind(), values[members[0]].get(FILM_START, 0.0)))
     return found
 
 
-def _advance(groups: Sequence[_Group], time: float, alike: bool) -> None:
-    """Advance all groups by some time [s]."""
+def _advance(groups: Sequence[_Group], begin: float, end: float, alike: bool) -> None:
+    """Advance all groups that move from one time of the film to another [s]."""
+    groups = [group for group in groups if group.moves(begin, end) > 0]
     for group in groups:
-        group.stepper.frame_dt = time
+        group.stepper.frame_dt = group.moves(begin, end)
     if not alike:
         for group in groups:
             try:
@@ -95,6 +105,8 @@ def _advance(groups: Sequence[_Group], time: float, alike: bool) -> None:
                 lost = {name: torch.nan * getattr(group.state, name) for name in ("position", "velocity", "F_total")}
                 group.state, group.diverged = group.state.replace(**lost), True
         return
+    if not groups:
+        return
     steps = max(group.stepper.substeps(group.state) for group in groups)
     while True:
         launched = [group.stepper.launch(group.state, steps) for group in groups]
@@ -103,8 +115,8 @@ def _advance(groups: Sequence[_Group], time: float, alike: bool) -> None:
         if all(one.steps == most for one in launched):
             break
         steps = most
-    for group, end in zip(groups, ends, strict=True):
-        group.state = end
+    for group, state in zip(groups, ends, strict=True):
+        group.state = state
 
 
 def _stiffness_class(points: MaterialPoints) -> int:
