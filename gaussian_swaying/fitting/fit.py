@@ -6,7 +6,7 @@ import math
 import os
 import sys
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -43,6 +43,7 @@ from gaussian_swaying.fitting.tracks import Tracks, match, opencv, still_until, 
 from gaussian_swaying.fitting.unknowns import FILM_START, check_unknowns
 from gaussian_swaying.fitting.variants import check_variants, states_of
 from gaussian_swaying.fitting.videos import Footage, frame_times, read_videos
+from gaussian_swaying.gaussians.model import DeformedGaussians
 from gaussian_swaying.mpm.state import State
 from gaussian_swaying.runs.folder import MARKER, claim_folder, hold_folder
 from gaussian_swaying.simulation.simulation import Simulation
@@ -290,9 +291,15 @@ class Fit:
         normal = self._normal(place, evidence or self.evidence(steps[-1][0], course.place), self.fitted)
         found = directions(normal.matrix, self.plan.unknowns, place)
         course.seconds = time.monotonic() - clock
-        painter, states = self.simulation.painter, self._run(place[None], self.times)
-        moved = (painter.deformed(own[0]) for own in states)
-        shown = predictions(self.simulation, self.videos, self.times, len(self.fitted), moved)
+        followed = _Followed(self) if {"tracks", "matches"} & set(self.stages) else None
+
+        def moved() -> Iterator[DeformedGaussians]:
+            for moment, own in zip(self.times, self._run(place[None], self.times), strict=True):
+                if followed is not None and moment <= self.fitted[-1]:
+                    followed.add(moment, own[0])
+                yield self.simulation.painter.deformed(own[0])
+
+        shown = predictions(self.simulation, self.videos, self.times, len(self.fitted), moved())
         return Result(
             self.plan.unknowns,
             tuple(course.place),
@@ -303,6 +310,7 @@ class Fit:
             course.seconds,
             unsettled(normal, place, self.plan.unknowns, course.ended),
             tuple(self.notes()),
+            {} if followed is None else followed.shares(),
         )
 
     def _normal(self, place: Tensor, evidence: Sequence[Evidence], times: Sequence[float]) -> Normal:
@@ -333,6 +341,33 @@ class Fit:
 
     def _shown(self, place: Sequence[float]) -> str:
         return ", ".join(f"{name} {value:.5g}" for name, value in self.values(place).items())
+
+
+class _Followed:
+    """How much of the motion of the tracks a simulation explains, added up frame by frame."""
+
+    def __init__(self, fit_: Fit) -> None:
+        self._simulation = fit_.simulation
+        self._own = {
+            video.name: TrackEvidence(fit_.simulation, video, tracks)
+            for video, tracks in zip(fit_.videos, fit_.tracks, strict=True)
+        }
+        self._left = dict.fromkeys(self._own, 0.0)
+        self._moved = dict.fromkeys(self._own, 0.0)
+
+    def add(self, moment: float, state: State) -> None:
+        for name, own in self._own.items():
+            frame = own.frame_at(moment)
+            if frame is None:
+                continue
+            tracks = own.tracks
+            moved = (tracks.position[frame] - tracks.position[0])[tracks.seen[frame]]
+            self._left[name] += float(own.residuals(self._simulation, [state], frame)[0].square().sum())
+            self._moved[name] += float(moved.square().sum())
+
+    def shares(self) -> dict[str, float]:
+        """The share of each camera in which something moves."""
+        return {name: 1 - self._left[name] / moved for name, moved in self._moved.items() if moved > 0}
 
 
 def _cost(progress: Progress) -> float:

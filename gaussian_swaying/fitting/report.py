@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -27,6 +27,8 @@ SHOWN = 3
 """Frames of the fitted and of the predicted part in a picture."""
 ASTRAY = 6.0
 """Largest accepted PSNR loss of fitted frames against the frame at rest [dB]; 6 dB is four times the squared error."""
+FOLLOWED, LOST = 0.9, 0.5
+"""Share of the tracked motion that the simulation has to explain in a good fit, and below which a fit has failed."""
 VAGUE = 0.25
 """Standard error, as a share of the range, above which an unknown is called not determined."""
 
@@ -66,6 +68,8 @@ class Result:
         seconds: Time it took.
         unsettled: The reason why the values are not a local minimum, and a remedy; empty if they are one.
         notes: What the videos say against the plan.
+        followed: For each camera, the share of the motion of its tracks in the fitted frames that the simulation
+            explains: 1 - (sum of squared distances) / (sum of squared displacements). Without tracks it is empty.
     """
 
     unknowns: Sequence[Unknown]
@@ -77,6 +81,7 @@ class Result:
     seconds: float
     unsettled: str = ""
     notes: Sequence[str] = ()
+    followed: Mapping[str, float] = field(default_factory=dict)
 
     @property
     def values(self) -> dict[str, float]:
@@ -105,6 +110,39 @@ class Result:
         """Names of cameras whose fitted frames the simulation does not follow: much worse than the one at rest."""
         return [one.camera for one in self.shown if one.fitted < one.rest - ASTRAY]
 
+    def doubts(self) -> tuple[list[str], list[str]]:
+        """Why the fit has failed, and why it is doubtful, as sentences with a remedy."""
+        failed: list[str] = []
+        doubtful = list(self.notes)
+        for name, share in self.followed.items():
+            told = (
+                f"camera {name}: the simulation explains {max(share, 0):.0%} of the motion of its tracks. Raise "
+                "`search`, widen the ranges, check the base and `known`, or film from a side where the motion is "
+                "across the picture."
+            )
+            if share < FOLLOWED:
+                (failed if share < LOST else doubtful).append(told)
+        for one in self.shown:
+            if one.camera in self.astray:
+                failed.append(
+                    f"camera {one.camera} is not followed: its fitted frames are {one.rest - one.fitted:.0f} dB worse "
+                    "than the one at rest, so the values may be wrong. Fit a shorter part (`until`), raise `search`, "
+                    "or check the base and `known`."
+                )
+        if self.unsettled:
+            doubtful.append(self.unsettled)
+        doubtful += [
+            f"{name} is not determined by this video: its error is a large part of its range." for name in self.vague
+        ]
+        doubtful += [f"{name} is at an end of its range: widen the range." for name in self.at_an_end]
+        return failed, doubtful
+
+    @property
+    def verdict(self) -> str:
+        """``good``, ``doubtful`` or ``failed``; see :meth:`doubts`."""
+        failed, doubtful = self.doubts()
+        return "failed" if failed else "doubtful" if doubtful else "good"
+
     def rows(self) -> list[dict[str, Any]]:
         """The table: a row for each unknown."""
         values, errors = self.values, self.errors
@@ -125,22 +163,12 @@ class Result:
         lines = [f"{'':<28}{'value':>12}{'error':>12}"]
         for row in self.rows():
             lines.append(f"{row['name']:<28}{row['value']:>12.5g}{row['standard_error']:>12.2g} {row['unit']}".rstrip())
-        lines += self.notes
-        if self.unsettled:
-            lines.append(self.unsettled)
-        for name in self.vague:
-            lines.append(f"{name} is not determined by this video: its error is a large part of its range.")
-        for name in self.at_an_end:
-            lines.append(f"{name} is at an end of its range: widen the range.")
         for one in self.shown:
             told = "" if math.isnan(one.predicted) else f", predicted frames {one.predicted:.2f} dB"
             lines.append(f"camera {one.camera}: fitted frames {one.fitted:.2f} dB{told}")
-            if one.camera in self.astray:
-                lines.append(
-                    f"camera {one.camera} is not followed: its fitted frames are {one.rest - one.fitted:.0f} dB worse "
-                    "than the one at rest, so the values may be wrong. Fit a shorter part (`until`), raise `search`, "
-                    "or check the base and `known`."
-                )
+        failed, doubtful = self.doubts()
+        told = {"good": "This fit is good.", "doubtful": "This fit is doubtful:", "failed": "This fit has failed:"}
+        lines += [told[self.verdict], *failed, *doubtful]
         return "\n".join(lines)
 
 
@@ -197,6 +225,7 @@ def write_results(
     for one in result.shown:
         iio.imwrite(pictures / f"{one.camera}.png", _labelled(one))
     write_table(folder / "values.csv", result.rows())
+    failed, doubtful = result.doubts()
     write_json(
         folder / "result.json",
         {
@@ -212,6 +241,9 @@ def write_results(
                 }
                 for s in result.shown
             ],
+            "verdict": result.verdict,
+            "why": [*failed, *doubtful],
+            "motion_explained": dict(result.followed),
             "notes": list(result.notes),
             "not_settled": result.unsettled,
             "not_followed": result.astray,

@@ -24,6 +24,9 @@ def test_own_data_with_noise(own, tmp_path, capsys):
     assert values["wind.speed"] == pytest.approx(TRUTH["wind.speed"], rel=0.01)
     assert values["material.E"] == pytest.approx(TRUTH["material.E"], rel=0.01)
     assert values["wind.azimuth"] == pytest.approx(TRUTH["wind.azimuth"], abs=1.0)
+    assert result.verdict == "good"
+    assert set(result.followed) == {"left", "right"}
+    assert min(result.followed.values()) > 0.95
     assert not result.vague
     assert not result.at_an_end
     for shown in result.shown:
@@ -38,6 +41,18 @@ def test_own_data_with_noise(own, tmp_path, capsys):
     again = Simulation.from_yaml(tmp_path / "fit/scene.yaml", device="cpu")
     assert pytest.approx(values["material.E"]) == again.material.E
     assert float(again.wind.flows[0].norm()) == pytest.approx(values["wind.speed"])
+
+
+def test_a_fit_that_cannot_follow_has_failed(own, tmp_path):
+    """The wind is sought on the wrong side only; the pictures alone would hardly tell."""
+    sought = {"wind.azimuth": [-100.0, -60.0], "material.E": [2e3, 5e4]}
+    result = fit(own / "base.yaml", own / "video", sought, tmp_path / "fit", device="cpu", search=8, progress=False)
+    assert result.verdict == "failed"
+    assert max(result.followed.values()) < 0.5
+    data = json.loads((tmp_path / "fit/result.json").read_text())
+    assert data["verdict"] == "failed"
+    assert "of the motion of its tracks" in data["why"][0]
+    assert data["motion_explained"] == result.followed
 
 
 @pytest.mark.slow(twin="test_resume_needs_the_same_plan")

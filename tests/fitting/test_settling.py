@@ -4,6 +4,7 @@ Covers: fitting.report.
 """
 
 import json
+from dataclasses import replace
 from itertools import groupby
 from operator import itemgetter
 
@@ -141,9 +142,29 @@ def test_a_camera_that_is_not_followed_is_named():
     shown = [Shown("left", 24.8, 19.0, 40.7, picture, ("",)), Shown("right", 37.0, 36.0, 40.0, picture, ("",))]
     result = Result(UNKNOWNS, (0.5, 0.5), 1e-4 * torch.eye(2), (), shown, (), 1.0)
     assert result.astray == ["left"]
+    assert result.verdict == "failed"
     (told,) = [line for line in result.text().splitlines() if "not followed" in line]
     assert "16 dB worse" in told
     assert "`until`" in told
+
+
+@pytest.mark.parametrize(
+    ("changes", "verdict", "words"),
+    [
+        ({}, "good", "This fit is good."),
+        ({"followed": {"left": 0.95, "right": 0.7}}, "doubtful", "camera right: the simulation explains 70% of"),
+        ({"followed": {"left": 0.95, "right": -1.8}}, "failed", "camera right: the simulation explains 0% of"),
+        ({"unsettled": "More `iterations`."}, "doubtful", "More `iterations`."),
+        ({"notes": ("Nothing moves.",)}, "doubtful", "Nothing moves."),
+        ({"place": (0.5, 1.0)}, "doubtful", "is at an end of its range"),
+        ({"covariance": torch.eye(2)}, "doubtful", "is not determined"),
+    ],
+)
+def test_the_verdict_of_a_fit(changes, verdict, words):
+    good = Result(UNKNOWNS, (0.5, 0.5), 1e-4 * torch.eye(2), (), (), (), 1.0, followed={"left": 0.95})
+    result = replace(good, **changes)
+    assert result.verdict == verdict
+    assert words in result.text()
 
 
 @pytest.mark.slow(twin="test_iterations_that_ran_out_on_the_way_are_told_with_the_remedy")
