@@ -167,8 +167,8 @@ class Result:
             told = "" if math.isnan(one.predicted) else f", predicted frames {one.predicted:.2f} dB"
             lines.append(f"camera {one.camera}: fitted frames {one.fitted:.2f} dB{told}")
         failed, doubtful = self.doubts()
-        told = {"good": "This fit is good.", "doubtful": "This fit is doubtful:", "failed": "This fit has failed:"}
-        lines += [told[self.verdict], *failed, *doubtful]
+        said = {"good": "This fit is good.", "doubtful": "This fit is doubtful:", "failed": "This fit has failed:"}
+        lines += [said[self.verdict], *failed, *doubtful]
         return "\n".join(lines)
 
 
