@@ -117,23 +117,32 @@ def body_of(
         chosen, owner, parent = grouped(samples, dx, scene.points_per_cell, apart, frame, dtype, piece)
         patches = shared_wind(samples, owner, parent)
     if scene.layers == 3:
-        _require_cells_as_large_as(float(chosen.thickness.max()), dx)
+        _require_cells_as_large_as(chosen.span, chosen.thickness, dx)
+    elif material.bending is not None or any(entry.bending is not None for entry in material.regions):
+        raise ValueError(
+            "Expected `scene.layers` 3 with `material.bending`: a single layer folds without resistance, and a solid "
+            "bends as its shape and `material.E` allow."
+        )
     attached = None if pairs is None else attached_points(pairs, owner, parent, scene.layers)
     points = with_gradients(chosen.points(scene.layers, laws, dtype, attached), material)
     felt = Patches(patches[0].to(dtype), patches[1].to(dtype), patches[2], points.count)
     return Body(points, felt, int(chosen.surface.sum()), samples, len(source), owner, pairs)
 
 
-def _require_cells_as_large_as(thickness: float, dx: float) -> None:
+def _require_cells_as_large_as(span: Tensor, thickness: Tensor, dx: float) -> None:
     """Refuse three layers across more than a cell: the middle one then moves apart from the faces without any strain.
 
     The nodes have five planes across them, and the three slopes leave one motion besides a shift.
     """
-    if thickness > dx * (1 + 1e-6):
+    most = int(span.argmax())
+    if float(span[most]) > dx * (1 + 1e-6):
+        own = bool(span[most] == thickness[most])
+        what = f"is {span[most]:g} m thick" if own else f"has its outer layers {span[most]:g} m apart"
+        lower = "`material.thickness`" if own else "`material.bending`, raise `material.E`"
         raise ValueError(
-            f"A sheet of three layers (`scene.layers: 3`) that is {thickness:g} m thick needs cells at least as large, "
-            f"but `solver.dx` is {dx:g} m, and its layers would come apart: raise `solver.dx`, lower "
-            "`material.thickness`, or set `scene.layers` to 1."
+            f"A sheet of three layers (`scene.layers: 3`) that {what} needs cells at least as large, but `solver.dx` "
+            f"is {dx:g} m, and its layers would come apart: raise `solver.dx`, lower {lower}, or set `scene.layers` "
+            "to 1."
         )
 
 

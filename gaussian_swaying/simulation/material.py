@@ -32,6 +32,7 @@ class MaterialRegion:
         nu: Poisson's ratio; unchanged if null.
         density: Density [kg/m³]; unchanged if null.
         thickness: Thickness of the surface [m]; unchanged if null.
+        bending: Bending stiffness [N m]; unchanged if null.
         law: Constitutive law; unchanged if null.
     """
 
@@ -40,6 +41,7 @@ class MaterialRegion:
     nu: float | None = None
     density: float | None = None
     thickness: float | None = None
+    bending: float | None = None
     law: ConstitutiveLaw | None = None
 
 
@@ -55,6 +57,10 @@ class Material:
         volume: ``patch`` (area x thickness, and the volume of the solid where ``scene.filling`` finds one) or ``cell``
             (PhysGaussian's rule for solids: cell volume / particles in it; with ``scene.layers`` 3 the layers share it,
             and ``thickness`` only says how far apart they lie).
+        bending: Bending stiffness of a sheet of three layers (``scene.layers`` 3), to a unit of its width [N m]: D of a
+            plate or a fabric. The outer layers then lie :func:`layer_distance` apart, so that it is independent of the
+            stiffness against stretch, E x thickness. E thickness³ / (12 (1 - nu²)) if null. An edit of E changes it in
+            proportion.
         law: Constitutive law, for example ``Sand`` (see :data:`gaussian_swaying.mpm.laws.LAWS`); fixed corotated
             elasticity if null. Plastic laws need ``solver.formulation: updated``.
         regions: Parts with a different material; later entries win.
@@ -68,6 +74,7 @@ class Material:
     density: Number = 200.0
     thickness: float = 0.01
     volume: Literal["patch", "cell"] = "patch"
+    bending: float | None = None
     law: ConstitutiveLaw | None = None
     regions: list[MaterialRegion] = field(default_factory=list)
 
@@ -86,15 +93,30 @@ class Material:
                 )
         entries: list[Material | MaterialRegion] = [self, *self.regions]
         for entry in entries:
-            given = {name: getattr(entry, name) for name in ("E", "nu", "density", "thickness")}
+            given = {name: getattr(entry, name) for name in ("E", "nu", "density", "thickness", "bending")}
             if entry is self:
                 given |= {name: number_of(given[name]) for name in DIFFERENTIABLE}
-            for name in ("E", "density", "thickness"):
+            for name in ("E", "density", "thickness", "bending"):
                 if given[name] is not None:
                     check_positive(f"material.{name}", given[name])
             if given["nu"] is not None:
                 check_plain("material.nu", given["nu"])
                 check_poisson_ratio("material.nu", given["nu"])
+        if any(entry.bending is not None for entry in entries):
+            self._check_bending()
+
+    def _check_bending(self) -> None:
+        if self.volume == "cell":
+            raise ValueError(
+                "Expected `material.volume` to be patch with `material.bending`, but got cell: the stiffness against "
+                "stretch, on which the layers' distance depends, is then not E x thickness."
+            )
+        for name in ("E", "nu"):
+            if requires_grad(getattr(self, name)):
+                raise ValueError(
+                    f"`material.{name}` requires a gradient, but `material.bending` says where the layers lie: leave "
+                    "`material.bending` out."
+                )
 
     @classmethod
     def named(cls, name: str, **own: Any) -> Material:
@@ -112,6 +134,24 @@ class Material:
             430.0
         """
         return cls(**(known_material(name).numbers | own))
+
+
+def layer_distance(bending: Tensor, E: Tensor, nu: Tensor, thickness: Tensor) -> Tensor:
+    r"""Distance of the outer two of three layers with Simpson's weights that have a bending stiffness.
+
+    Their second moment of area is :math:`h d^2 / 12`, so that Kirchhoff's plate has
+    :math:`D = E h d^2 / (12 (1 - \nu^2))`, and d is h for a plate of one material.
+
+    Args:
+        bending: D [N m], shape (N,).
+        E: Young's moduli [Pa], shape (N,).
+        nu: Poisson's ratios, shape (N,).
+        thickness: Thicknesses h [m], shape (N,).
+
+    Returns:
+        Distances d [m], shape (N,).
+    """
+    return (12 * bending * (1 - nu.square()) / (E * thickness)).sqrt()
 
 
 DIFFERENTIABLE = ("E", "nu", "density")

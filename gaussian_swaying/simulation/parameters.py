@@ -420,6 +420,13 @@ def _write_material(setup: Setup, values: Mapping[str, Any]) -> Setup:
             raise ValueError(
                 f"`{name}` is to change, but `material.regions` or `scene.parts` gives it too: remove it there."
             )
+    if material.bending is not None or any(part.bending is not None for part in material.regions):
+        for name in ("material.E", "material.nu"):
+            if name in values:
+                raise ValueError(
+                    f"`{name}` is to change, but with `material.bending` it says where the layers lie: make another "
+                    "simulation, or leave `material.bending` out."
+                )
     if "material.thickness" in values:
         ratio = values["material.thickness"] / _thickness(setup)
         points = thicker(setup, ratio).points

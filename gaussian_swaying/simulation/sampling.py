@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
 
@@ -18,14 +19,15 @@ from gaussian_swaying.geometry.regions import Region, whereabouts
 from gaussian_swaying.mpm.laws.fixed_corotated import FixedCorotated
 from gaussian_swaying.mpm.laws.law import ConstitutiveLaw
 from gaussian_swaying.mpm.state import MaterialPoints
-from gaussian_swaying.simulation.material import Material
+from gaussian_swaying.simulation.material import Material, layer_distance
 
 _FLAT = 0.01  # standard deviation [cubes] below which a group has no extent in a direction
 SHARED = 4
 """Largest number of directions in a group whose patches are shared among all its points."""
 
 SIMPSON = (2 / 3, 1 / 6, 1 / 6)  # middle plane and faces of a sheet: exact for the square of the height
-_PROPERTIES = ("E", "nu", "density", "thickness")
+_PROPERTIES = ("E", "nu", "density", "thickness", "bending")
+_KINDS = ("E", "nu", "density", "thickness", "span")
 
 
 @dataclass(frozen=True)
@@ -42,6 +44,7 @@ class Samples:
         nu: Poisson's ratios, shape (N,).
         density: Densities [kg/m³], shape (N,).
         thickness: Thicknesses of the surface [m], shape (N,).
+        span: Distances between the outer two of three layers [m], shape (N,).
         law_index: Which law applies to each, int64, shape (N,).
         surface: Which are on the surface, bool, shape (N,).
     """
@@ -55,6 +58,7 @@ class Samples:
     nu: Tensor
     density: Tensor
     thickness: Tensor
+    span: Tensor
     law_index: Tensor
     surface: Tensor
 
@@ -77,7 +81,7 @@ class Samples:
         position, volume, index = self.position, self.volume, self.law_index
         properties = {name: getattr(self, name) for name in ("E", "nu", "density")}
         if layers == 3:
-            out = 0.5 * self.thickness[:, None] * self.normal
+            out = 0.5 * self.span[:, None] * self.normal
             position = torch.cat([position, position + out, position - out])
             volume = torch.cat([part * volume for part in SIMPSON])
             properties = {name: value.repeat(3) for name, value in properties.items()}
@@ -127,7 +131,8 @@ def sample_object(
         body_area, area = (torch.cat([part, part.new_zeros(inside)]) for part in (body_area, area))
         surface = torch.cat([surface, torch.zeros(inside, dtype=torch.bool)])
     where = frame.point_to_scene(position)
-    properties = {name: torch.full_like(area, number_of(getattr(material, name))) for name in _PROPERTIES}
+    given = {name: getattr(material, name) for name in _PROPERTIES}
+    properties = {name: torch.full_like(area, math.nan if v is None else number_of(v)) for name, v in given.items()}
     laws, index = [material.law or FixedCorotated()], torch.zeros(len(position), dtype=torch.long)
     for entry in material.regions:
         inside_region = entry.region.contains(where)
@@ -150,7 +155,13 @@ def sample_object(
         if filling is not None:
             solid = torch.cat([filling.gaussian_volume, filling.volume]).to(volume)
             volume = torch.where(solid > 0, solid, volume)
-    return Samples(position, normal, body_area, area, volume, **properties, law_index=index, surface=surface), laws
+    bending = properties.pop("bending")
+    distance = layer_distance(bending, properties["E"], properties["nu"], properties["thickness"])
+    span = torch.where(bending.isnan(), properties["thickness"], distance)
+    found = Samples(
+        position, normal, body_area, area, volume, **properties, span=span, law_index=index, surface=surface
+    )
+    return found, laws
 
 
 def cell_volume(position: Tensor, dx: float) -> Tensor:
@@ -198,7 +209,7 @@ def grouped(
         The points as samples, those on the surface first; the point that each sample belongs to, shape (N,); and the
         group of each point, shape (P,).
     """
-    kinds = torch.stack([getattr(samples, name) for name in _PROPERTIES], -1)
+    kinds = torch.stack([getattr(samples, name) for name in _KINDS], -1)
     kind = equal_rows(kinds)
     where = frame.point_to_scene(samples.position)
     masks = [region.contains(where) for region in apart]

@@ -17,6 +17,7 @@ from gaussian_swaying.fitting.unknowns import Unknown, check_unknowns
 from gaussian_swaying.fitting.variants import states_of
 from gaussian_swaying.geometry.regions import Box
 from gaussian_swaying.mpm.forces import Force
+from gaussian_swaying.mpm.solver import MPMSolver
 from gaussian_swaying.scenes.procedural import FlagScene
 from gaussian_swaying.simulation import parameters
 from gaussian_swaying.simulation.edits import Edit
@@ -31,6 +32,7 @@ from gaussian_swaying.simulation.parameters import (
     value_of,
     with_values,
 )
+from gaussian_swaying.simulation.scene import Scene
 from gaussian_swaying.simulation.simulation import Simulation
 from gaussian_swaying.sweeps.plan import make_plan, parse_run, read_sweep
 from gaussian_swaying.sweeps.together import grouped
@@ -177,6 +179,14 @@ def test_what_is_out_of_range_or_not_there_is_refused_and_nothing_changes(name, 
 def test_what_is_no_number_is_refused(name, value):
     with pytest.raises(TypeError, match=name):
         parameter(name).check(value)
+
+
+@pytest.mark.parametrize("name", ["material.E", "material.nu"])
+def test_what_says_where_the_layers_lie_is_not_changed(name):
+    scene = Scene(generator=FlagScene(0.4, 0.3, 0.05), metres_per_unit=1.0, layers=3)
+    setup = Simulation(scene, Material(E=1e4, bending=1e-4), solver=MPMSolver(dx=0.1), device="cpu").setup
+    with pytest.raises(ValueError, match=f"`{name}` is to change, but with `material.bending`"):
+        with_values(setup, {name: 0.2})
 
 
 def test_material_that_a_region_gives_is_not_changed_everywhere(tmp_path):

@@ -16,7 +16,10 @@ FRAME = SimFrame(torch.zeros(3, dtype=DOUBLE), torch.eye(3, dtype=DOUBLE), 0.5)
 def _pairs():
     """Eight samples in one cell, on one sheet, two by two at the same place."""
     place = torch.tensor([[0.9, 0.9, 1.0], [1.1, 0.9, 1.0], [0.9, 1.1, 1.0], [1.1, 1.1, 1.0]], dtype=DOUBLE)
-    each = {name: torch.ones(8, dtype=DOUBLE) for name in ("body_area", "area", "volume", "E", "density", "thickness")}
+    each = {
+        name: torch.ones(8, dtype=DOUBLE)
+        for name in ("body_area", "area", "volume", "E", "density", "thickness", "span")
+    }
     return Samples(
         position=place.repeat_interleave(2, 0),
         normal=torch.tensor([0.0, 0.0, 1.0], dtype=DOUBLE).repeat(8, 1),
@@ -40,6 +43,7 @@ def test_like_samples_of_a_cell_are_one_group():
         ("nu", 0.4),
         ("density", 2.0),
         ("thickness", 2.0),
+        ("span", 2.0),
         ("law_index", 1),
         ("surface", False),
         ("area", 0.0),

@@ -461,6 +461,36 @@ def test_three_layers_are_a_plate(make_cloud, make_scene):
     assert len(three.deformed(_rest_state(three)).means) == len(cloud)
 
 
+def test_bending_says_where_the_layers_lie(make_cloud, make_scene):
+    """D = E h d² / (12 (1 - nu²)) for a distance d of the outer layers: mass and E h stay, also in a region."""
+    D = 2e5 * 0.01 * 0.004**2 / (12 * (1 - 0.3**2))
+    lower = MaterialRegion(Box([None] * 3, [None, None, 0.5]), bending=4 * D)
+    plate = Material(E=2e5, thickness=0.01)
+    fabric = dataclasses.replace(plate, bending=D, regions=[lower])
+    one, as_plate, bent = (make_scene(make_cloud(), m, layers=n) for m, n in ((plate, 1), (plate, 3), (fabric, 3)))
+    torch.testing.assert_close(bent.points.mass, as_plate.points.mass)
+    torch.testing.assert_close(bent.points.volume, as_plate.points.volume)
+    count = one.points.count
+    apart = (bent.points.position[count : 2 * count] - bent.points.position[2 * count :]).norm(dim=-1)
+    below = bent.frame.point_to_scene(bent.points.position[:count].double())[:, 2] < 0.5
+    assert 0 < int(below.sum()) < count
+    torch.testing.assert_close(apart, torch.where(below, 0.008, 0.004), rtol=1e-3, atol=0.0)
+
+
+def test_bending_that_does_not_fit_is_refused(make_scene):
+    cloud = _sheet_with_a_hole()
+    with pytest.raises(ValueError, match=r"`scene\.layers` 3 with `material\.bending`"):
+        make_scene(cloud, Material(bending=1e-4), 0.1)
+    with pytest.raises(ValueError, match=r"outer layers 0\.3\d* m apart needs cells .* lower `material\.bending`"):
+        make_scene(cloud, Material(E=1e3, thickness=0.01, bending=0.1), 0.1, layers=3)
+    with pytest.raises(ValueError, match=r"`material\.bending` to be"):
+        Material(bending=0.0)
+    with pytest.raises(ValueError, match=r"`material\.volume` to be patch"):
+        Material(bending=1e-4, volume="cell")
+    with pytest.raises(ValueError, match=r"`material\.nu` requires a gradient, but `material\.bending`"):
+        Material(nu=torch.tensor(0.3, requires_grad=True), bending=1e-4)
+
+
 @pytest.mark.parametrize(
     ("scene", "words"),
     [

@@ -93,6 +93,11 @@ _table("reconfiguration", partial(_of, problem="plate that bends in a flow"), ""
     R of the elastica = {result.exact:.4f} | error = {result.error:.2f %} | tip = {result.tip:.4f} |
     tip of the elastica = {result.exact_tip:.4f}
     """)  # fmt: skip
+_table("fabrics", partial(_of, problem="strip of a fabric that hangs"), """
+    fabric = {parameters.fabric} | mass [g/m²] = {result.grams:.0f} | D [µN m] = {result.micro:.0f} |
+    E h [N/m] = {parameters.stretch:g} | cells = {parameters.cells} | outer layers apart [cells] = {result.span:.2f} |
+    drop / L = {result.drop:.4f} | drop of the elastica = {result.exact:.4f} | error = {result.error:.2f %}
+    """, order=["parameters.fabric", "parameters.stretch", "parameters.cells"])  # fmt: skip
 _table("surface_drag", partial(_of, problem="surface drag"), """
     surface = {parameters.shape} | Gaussians = {parameters.count} | overlap = {parameters.overlap} |
     *areas `{parameters.area}`, law `{parameters.law}` = {result.share:.3f}
