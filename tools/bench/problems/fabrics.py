@@ -15,6 +15,7 @@ from bench.problems.settings import Axial, Result, Settings, follow
 from gaussian_swaying._checks import check_choice
 from gaussian_swaying.geometry.regions import Box
 from gaussian_swaying.mpm.boundaries.pinned_region import PinnedRegion
+from gaussian_swaying.mpm.solver import MPMSolver
 from gaussian_swaying.scenes.procedural import FlagScene
 from gaussian_swaying.simulation.material import Material
 from gaussian_swaying.simulation.scene import Scene
@@ -65,6 +66,7 @@ def hanging_strip(
     scene = Scene(generator=flag, metres_per_unit=1.0, layers=3)
     simulation = Simulation(scene, material, solver=hanging, device="cpu")
     points, solver = simulation.scene.points, simulation.solver
+    assert isinstance(solver, MPMSolver)
     start = solver.init_state(points, frame=simulation.scene.frame)
     place = simulation.scene.frame.point_to_scene(points.position.double())
     held = place[:, 0] < HELD * dx

@@ -76,7 +76,7 @@ def elastica(cauchy: float, law: str) -> tuple[float, float]:
     return float(drag), float(tip)
 
 
-def _plate(
+def plate(
     cells: int, slenderness: float, density: float, settings: Settings
 ) -> tuple[MaterialPoints, torch.Tensor, float]:
     """A plate from z = 0 to z = l across y, in three layers with Simpson's weights, and what is held before it.
@@ -137,7 +137,7 @@ def reconfiguration(
     # so heavy that the drag damps its lowest mode critically, rho U / (density h) = 2 omega; no heavier than at C = 30
     density = min(1.0, 30 / cauchy) * (0.5 * AIR * speed * LENGTH**2 / 3.516) ** 2 / (stiffness * thick)
     omega = 3.516 / LENGTH**2 * math.sqrt(stiffness / (density * thick))
-    points, middle, area = _plate(cells, slenderness, density, settings)
+    points, middle, area = plate(cells, slenderness, density, settings)
     normal = points.position.new_tensor([0.0, 1.0, 0.0]).expand_as(points.position)
     areas = torch.where(middle, area, 0.0).to(points.position)
     aero = AeroForce(C_D=1.0, C_F=0.0, C_L=0.0, air_density=AIR, law=law)

@@ -93,6 +93,11 @@ _table("reconfiguration", partial(_of, problem="plate that bends in a flow"), ""
     R of the elastica = {result.exact:.4f} | error = {result.error:.2f %} | tip = {result.tip:.4f} |
     tip of the elastica = {result.exact_tip:.4f}
     """)  # fmt: skip
+_table("divergence", partial(_orders, problem="inverted flag"), """
+    cells = {parameters.cells} | pressure at which it diverges = {result.kappa:.3f} | exact = {result.exact:.3f} |
+    error = {result.error:.2f %} | order = {order:.2f} | rate in 0.9 of the exact pressure = {result.below:.4f} |
+    in 1.1 of it = {result.above:.4f}
+    """)  # fmt: skip
 _table("fabrics", partial(_of, problem="strip of a fabric that hangs"), """
     fabric = {parameters.fabric} | mass [g/m²] = {result.grams:.0f} | D [µN m] = {result.micro:.0f} |
     E h [N/m] = {parameters.stretch:g} | cells = {parameters.cells} | outer layers apart [cells] = {result.span:.2f} |
