@@ -90,6 +90,19 @@ def thickness(points: Tensor, mass: Tensor, places: Tensor, dx: float) -> tuple[
 
 
 @torch.no_grad()
+def width(held: Tensor, mass: Tensor, dx: float) -> float:
+    """The width of a line or a patch of particles [m]: the middle one of its sides, within four cells.
+
+    Args:
+        held: Their positions [m], shape (N, 3), at least one.
+        mass: Their masses [kg], shape (N,).
+        dx: Grid spacing [m].
+    """
+    some = held[:: max(1, math.ceil(len(held) / _SAMPLES))]
+    return float(extents(held, mass, some, _SEEN * dx)[:, 1].median())
+
+
+@torch.no_grad()
 def normals(points: Tensor, mass: Tensor, places: Tensor, dx: float) -> Tensor:
     """Unit normals of a sheet at some places, of either sign, shape (N, 3): those of at most 32 of them, the nearest.
 

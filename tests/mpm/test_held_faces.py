@@ -4,6 +4,7 @@ Covers: mpm.held_rows.
 """
 
 import math
+import warnings
 
 import pytest
 import torch
@@ -124,6 +125,23 @@ def test_what_cannot_hold_is_warned_of_at_the_start():
         MPMSolver(DX, boundaries=[PinnedRegion(Box([None] * 3, [0.07, None, None]), "hinge")]).init_state(solid)
     with pytest.warns(UserWarning, match=r"`kind: clamp` of the PinnedPoints .* still turns: use a PinnedRegion"):
         MPMSolver(DX, boundaries=[PinnedPoints([[0.05, 0.1, 0.1]], "clamp")]).init_state(solid)
+
+
+@pytest.mark.parametrize("shift", [0.0, 0.03])
+@pytest.mark.parametrize(("rows", "wide"), [(2, False), (4, False), (6, True), (12, True)])
+def test_a_hinge_that_holds_several_lines_is_warned_of(rows, wide, shift):
+    """Rows of points lie a quarter of a cell apart; lines closer than 0.6 cells are joined."""
+    rest = _box(20, 12, 0.5) + torch.tensor([shift, 0.0, 0.0])
+    region = Box([None] * 3, [shift + 0.25 * rows * DX, None, None])
+    solver = MPMSolver(DX, boundaries=[PinnedRegion(region, "hinge")])
+    with warnings.catch_warnings(record=True) as told:
+        warnings.simplefilter("always")
+        solver.init_state(_material(rest))
+    holds = solver.bound.point_holds
+    along = holds.place[0, 0][~holds.slope[0, 0]][:, 0].sort()[0]
+    assert (float(along[-1] - along[0]) > 0.3 * DX) == wide
+    said = [str(one.message) for one in told if "holds several lines and with them the slope" in str(one.message)]
+    assert bool(said) == wide
 
 
 # ---- a clamped solid

@@ -21,7 +21,8 @@ from gaussian_swaying.mpm.contact.stage import ContactStage
 from gaussian_swaying.mpm.contact.surface import Surface
 from gaussian_swaying.mpm.damping import kelvin_voigt_pk1
 from gaussian_swaying.mpm.formulations.formulation import Formulation, Settings, held_share, safe_inverse
-from gaussian_swaying.mpm.held_faces import HELD_ALONE, SHEET, SOFTENED, thickness
+from gaussian_swaying.mpm.held_faces import HELD_ALONE, SHEET, SOFTENED, thickness, width
+from gaussian_swaying.mpm.held_rows import LEAST_APART
 from gaussian_swaying.mpm.point_holds import POINTS, PointHolds
 from gaussian_swaying.mpm.state import GridSpec, MPMState
 from gaussian_swaying.mpm.timestep import kick_time
@@ -110,7 +111,7 @@ class Total(Formulation):
         """Return what a boundary acts on; a pin without a kind holds a sheet by a hinge, and anything else by a clamp.
 
         Next to a rigid part it holds nodes, as points cannot share nodes with one. Warns if a hinge or a clamped place
-        is to hold a part of several cells in thickness, which it cannot.
+        is to hold a part of several cells in thickness, which it cannot, and if a hinge is wider than a line of points.
         """
         boundary, kind = self.body.boundaries[k], super().hold_kind(k)
         given = isinstance(boundary, PinnedPoints)
@@ -126,6 +127,14 @@ class Total(Formulation):
                 warnings.warn(
                     f"`kind: {kind}` of the {type(boundary).__name__} is to hold a part that is "
                     f"{thick / self.settings.dx:.2g} cells thick, which still turns: {remedy}.",
+                    UserWarning,
+                    stacklevel=2,
+                )
+            elif kind == "hinge" and (wide := self._held_width(k)) > 2 * LEAST_APART * self.settings.dx:
+                warnings.warn(
+                    f"The region of the {type(boundary).__name__} with `kind: hinge` is "
+                    f"{wide / self.settings.dx:.2g} cells wide, so it holds several lines and with them the slope: "
+                    "make it narrower than a cell (`solver.dx`), or set `kind` to clamp to hold the slope.",
                     UserWarning,
                     stacklevel=2,
                 )
@@ -149,6 +158,18 @@ class Total(Formulation):
             if len(near) and float(near.min()) < reach:
                 return True
         return False
+
+    def _held_width(self, k: int) -> float:
+        """The width of the line or patch that a boundary holds [m], the largest of all scenes."""
+        points, held = self.body.points, self.body.held[k]
+        assert held is not None
+        count, found = points.position.shape[-2], [0.0]
+        fields = points.position.detach().reshape(-1, count, 3), held.mass.detach().reshape(-1, count)
+        for place, weight in zip(*(field.cpu().double() for field in fields), strict=True):
+            own = weight > 0
+            if bool(own.any()):
+                found.append(width(place[own], weight[own], self.settings.dx))
+        return max(found)
 
     def _thickness(self, k: int) -> tuple[float, bool]:
         """The largest thickness of the body where a boundary holds it [m], and whether all scenes are sheets there."""
