@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
 
@@ -18,6 +19,7 @@ from gaussian_swaying.geometry.groups import equal_rows, sums
 from gaussian_swaying.geometry.regions import Region, whereabouts
 from gaussian_swaying.mpm.laws.fixed_corotated import FixedCorotated
 from gaussian_swaying.mpm.laws.law import ConstitutiveLaw
+from gaussian_swaying.mpm.laws.neo_hookean import NeoHookean
 from gaussian_swaying.mpm.state import MaterialPoints
 from gaussian_swaying.simulation.material import Material, layer_distance
 
@@ -148,6 +150,14 @@ def sample_object(
         if entry.law is not None:
             index[inside_region] = len(laws)
             laws.append(entry.law)
+    for k, law in enumerate(laws):
+        if isinstance(law, (FixedCorotated, NeoHookean)) and bool((properties["nu"][index == k] < 0).any()):
+            warnings.warn(
+                f"With `material.nu` below 0 the energy of {type(law).__name__} has no least value: material that is "
+                "deformed by some tens of percent runs away. Use `material.law: StVKHencky`, or a nu of at least 0.",
+                UserWarning,
+                stacklevel=2,
+            )
     if material.volume == "cell":
         volume = cell_volume(position, dx)
     else:

@@ -5,6 +5,7 @@ Covers: simulation.body, simulation.simulated_scene.
 
 import dataclasses
 import math
+import warnings
 
 import pytest
 import torch
@@ -15,6 +16,8 @@ from gaussian_swaying.geometry.linalg import polar_rotation
 from gaussian_swaying.geometry.regions import Box
 from gaussian_swaying.geometry.rotations import quat_to_rotation, rotation_from_z, rotation_to_quat
 from gaussian_swaying.mpm.boundaries.pinned_region import PinnedRegion
+from gaussian_swaying.mpm.laws.fixed_corotated import FixedCorotated
+from gaussian_swaying.mpm.laws.hencky import StVKHencky
 from gaussian_swaying.mpm.laws.neo_hookean import NeoHookean
 from gaussian_swaying.mpm.laws.sand import Sand
 from gaussian_swaying.mpm.solver import MPMSolver
@@ -475,6 +478,24 @@ def test_bending_says_where_the_layers_lie(make_cloud, make_scene):
     below = bent.frame.point_to_scene(bent.points.position[:count].double())[:, 2] < 0.5
     assert 0 < int(below.sum()) < count
     torch.testing.assert_close(apart, torch.where(below, 0.008, 0.004), rtol=1e-3, atol=0.0)
+
+
+@pytest.mark.parametrize("law", [FixedCorotated(), NeoHookean()])
+def test_a_negative_ratio_whose_energy_has_no_least_value_is_warned_of(law, make_scene):
+    """Stretched or compressed far enough, the energy falls below that at rest; Hencky's never does."""
+    nu, E = torch.tensor(-0.3, dtype=torch.float64), torch.tensor(1.0, dtype=torch.float64)
+    lame = E / (2 * (1 + nu)), E * nu / ((1 + nu) * (1 - 2 * nu))
+    sizes = torch.logspace(-3, 1, 41, dtype=torch.float64)
+    F = sizes[:, None, None] * torch.eye(3, dtype=torch.float64)
+    assert float(law.energy(F, *lame).min()) < -0.01
+    assert float(StVKHencky().energy(F, *lame).min()) >= 0
+    cloud = _sheet_with_a_hole()
+    with pytest.warns(UserWarning, match=f"`material.nu` below 0 the energy of {type(law).__name__} has no least"):
+        make_scene(cloud, Material(nu=-0.3, law=law), 0.1)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        make_scene(cloud, Material(nu=0.0, law=law), 0.1)
+        make_scene(cloud, Material(nu=-0.3, law=StVKHencky()), 0.1)
 
 
 def test_bending_that_does_not_fit_is_refused(make_scene):
