@@ -1,4 +1,4 @@
-"""What is attached to what in a splat at rest: a graph along its surfaces, cut where two only pass near each other."""
+"""The graph of what is attached in a splat at rest: along its surfaces, cut where two only pass near each other."""
 
 from __future__ import annotations
 
@@ -141,7 +141,7 @@ def _strays(where: Tensor, pairs: Tensor) -> Tensor:
 
 
 def _allowed(pairs: Tensor, labels: Tensor, to: Sequence[int | None]) -> Tensor:
-    """Which pairs the parts allow."""
+    """Return a mask of the pairs that the parts allow."""
     only = torch.tensor([-1 if k is None else k for k in to])
     a, b = labels[pairs].unbind(1)
     fits = [(only[p] < 0) | (only[p] == q) for p, q in ((a, b), (b, a))]
