@@ -41,6 +41,7 @@ PARTS: dict[str, tuple[str, ...]] = {
     "frames": _SIMULATION,
     "gallery": _DRAWN,
     "gradients": _SIMULATION,
+    "leaves": _DRAWN,
     "live": (*_DRAWN, "viewer"),
     "long_flag": _SIMULATION,
     "pareto": _PROBLEMS,

@@ -61,6 +61,37 @@ value("area.capture", "area_*", "{$1.$2:.1f}", lambda result: {
     for name, row in result["captures"].items()})  # fmt: skip
 
 
+def _leaves(result: Row) -> Iterator[Row]:
+    """Beside the finest shared grid, which is the reference, and the cost of nodes of their own."""
+    rows = {(row["cells"], row["connected"]): row for row in result["rows"]}
+    finest = max(cells for cells, connected in rows if connected == "grid")
+    for (cells, _), row in sorted(rows.items()):
+        shared = rows[cells, "grid"]
+        yield row | {
+            "share": row["relative"] / rows[finest, "grid"]["relative"],
+            "cost": row["substep_ms"] / shared["substep_ms"],
+            "finest": finest,
+        }
+
+
+table(PAGE, "leaves.rows", "leaves_*", _leaves, """
+    cells along the longest side = {cells} | `scene.connected` = `{connected}` | points = {points:,} |
+    nodes = {nodes:,} | motion of leaves = {motion:.2 %} | against each other = {relative:.2 %} |
+    over that of the finest shared grid = {share:.0 %} | substep [ms] = {substep_ms:.2f} |
+    over that on shared nodes = {cost:.2f}
+    """, before="{source}")  # fmt: skip
+LEAVES_GOALS = [
+    Goal("leaves at {cells} cells with nodes of their own, motion against each other, over that at {finest} cells",
+         "{share:.0 %}", "share >= 0.3", _leaves, "connected is 'surface' and cells < finest",
+         {"wanted": "at least {limit:.0 %}"}),
+    Goal("time of a substep at {cells} cells, over that on shared nodes", "{cost:.2f}", "cost <= 1.3", _leaves,
+         "connected is 'surface'", {"wanted": "at most {limit:g}"}),
+    Goal("{simulated_s:g} s at {cells} cells with pictures, on two cores", "{seconds:.0f} s", "seconds <= 120", "runs",
+         "connected is 'surface'", {"wanted": "at most {limit:g} s"}),
+]  # fmt: skip
+table(PAGE, "leaves.goals", "leaves_*", judged(LEAVES_GOALS), WANTED)
+
+
 def _memory(result: Row, chosen: str) -> list[Row]:
     return [row | {"checkpoint": row["checkpoint"] or chosen} for row in result["memory"]]
 
