@@ -77,6 +77,7 @@ def motion(config: Path, connected: str, cells: int, frames: int, device: str, f
     simulation = _of(config, connected, cells, device)
     scene = simulation.scene
     pairs = neighbours(simulation, far, near).to(scene.moving.device)
+    simulation.advance(simulation.start())  # makes the kernels
     state = simulation.start()
     relative, own, spent, took = [], [], 0.0, 0
     for _ in range(frames):

@@ -83,7 +83,7 @@ table(PAGE, "leaves.rows", "leaves_*", _leaves, """
 LEAVES_GOALS = [
     Goal("leaves at {cells} cells with nodes of their own, motion against each other, over that at {finest} cells",
          "{share:.0 %}", "share >= 0.3", _leaves, "connected is 'surface' and cells < finest",
-         {"wanted": "at least {limit:.0 %}"}),
+         {"wanted": "at least {limit:g %}"}),
     Goal("time of a substep at {cells} cells, over that on shared nodes", "{cost:.2f}", "cost <= 1.3", _leaves,
          "connected is 'surface'", {"wanted": "at most {limit:g}"}),
     Goal("{simulated_s:g} s at {cells} cells with pictures, on two cores", "{seconds:.0f} s", "seconds <= 120", "runs",
