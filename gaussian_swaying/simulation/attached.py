@@ -9,7 +9,11 @@ from gaussian_swaying.gaussians.connectivity import attached_pairs
 from gaussian_swaying.gaussians.parts import Parts
 from gaussian_swaying.geometry.groups import joined
 from gaussian_swaying.geometry.neighbours import nearest_neighbours
+from gaussian_swaying.mpm.state import bounding_grid
+from gaussian_swaying.mpm.virtual_nodes import first_nodes, virtual_nodes
 
+FEW, BEYOND = 12, 0.25
+"""Samples of a piece in a cell that are grouped with those of the next cell, from how far [cells]."""
 _BRIDGES = 8  # neighbours to which an extra point on a large Gaussian is attached, as it fills a hole
 
 
@@ -49,6 +53,46 @@ def pieces_in_cells(position: Tensor, dx: float, pairs: Tensor) -> Tensor:
     """
     a, b = torch.floor(position / dx - 0.5)[pairs].unbind(1)
     return joined(len(position), pairs[(a == b).all(-1)].T)
+
+
+@torch.no_grad()
+def lies_apart(position: Tensor, dx: float, pairs: Tensor) -> bool:
+    """True if some node of the grid reaches samples that are not attached to each other there.
+
+    Args:
+        position: Rest positions [m] in the precision of the solver, shape (N, 3).
+        dx: Grid spacing [m].
+        pairs: Pairs of samples that are attached, shape (E, 2).
+    """
+    grid = bounding_grid(position.amin(0), position.amax(0), dx, margin=0)
+    return virtual_nodes(first_nodes(position, grid), grid, pairs) is not None
+
+
+@torch.no_grad()
+def homes(position: Tensor, dx: float, pairs: Tensor, piece: Tensor) -> tuple[Tensor, Tensor]:
+    """Where samples are grouped: a few that a piece has beyond the border of a cell, at the next one across it.
+
+    They would have copies of nodes of their own, with hardly any mass.
+
+    Args:
+        position: Rest positions [m], shape (N, 3).
+        dx: Grid spacing [m].
+        pairs: Pairs of samples that are attached, shape (E, 2).
+        piece: From :func:`pieces_in_cells`, shape (N,).
+
+    Returns:
+        The places of the samples for the grid, shape (N, 3), and their pieces, shape (N,).
+    """
+    few = piece.bincount()[piece] < FEW
+    ends = torch.cat([pairs, pairs.flip(1)])
+    apart = (position[ends[:, 0]] - position[ends[:, 1]]).norm(dim=-1)
+    across = few[ends[:, 0]] & ~few[ends[:, 1]] & (apart < BEYOND * dx)
+    ends, apart = ends[across], apart[across]
+    order = apart.argsort(descending=True, stable=True)  # the nearest one is written last
+    other = torch.arange(len(position))
+    for own, to in ends[order].tolist():
+        other[own] = to
+    return position[other], piece[other]
 
 
 def attached_points(pairs: Tensor, owner: Tensor, parent: Tensor | None, layers: int) -> Tensor:

@@ -20,7 +20,7 @@ from gaussian_swaying.geometry.frame import SimFrame
 from gaussian_swaying.geometry.neighbours import nearest_neighbours
 from gaussian_swaying.geometry.regions import Region
 from gaussian_swaying.mpm.state import MaterialPoints
-from gaussian_swaying.simulation.attached import attached_points, attached_samples, pieces_in_cells
+from gaussian_swaying.simulation.attached import attached_points, attached_samples, homes, lies_apart, pieces_in_cells
 from gaussian_swaying.simulation.material import Material, with_gradients
 from gaussian_swaying.simulation.sampling import Samples, grouped, sample_object, shared_wind
 from gaussian_swaying.simulation.scene import Scene
@@ -109,12 +109,14 @@ def body_of(
     samples, laws = sample_object(position, facing, body_area, area, filling, material, frame, dx)
     chosen, owner, feels = samples, torch.arange(len(samples.position)), samples.area > 0
     patches = samples.normal[feels], samples.area[feels], owner[feels]
-    pairs = piece = parent = None
+    pairs = piece = home = parent = None
     if scene.connected == "surface":
+        rest = samples.position.to(dtype)
         pairs = attached_samples(samples.position, samples.normal, len(part.means), scene.parts, labels)
-        piece = pieces_in_cells(samples.position.to(dtype), dx, pairs)
+        if lies_apart(rest, dx, pairs):
+            home, piece = homes(samples.position, dx, pairs, pieces_in_cells(rest, dx, pairs))
     if by_grid:
-        chosen, owner, parent = grouped(samples, dx, scene.points_per_cell, apart, frame, dtype, piece)
+        chosen, owner, parent = grouped(samples, dx, scene.points_per_cell, apart, frame, dtype, piece, home)
         patches = shared_wind(samples, owner, parent)
     if scene.layers == 3:
         _require_cells_as_large_as(chosen.span, chosen.thickness, dx)
@@ -123,7 +125,9 @@ def body_of(
             "Expected `scene.layers` 3 with `material.bending`: a single layer folds without resistance, and a solid "
             "bends as its shape and `material.E` allow."
         )
-    attached = None if pairs is None else attached_points(pairs, owner, parent, scene.layers)
+    attached = None
+    if pairs is not None and piece is not None:
+        attached = attached_points(pairs, owner, parent, scene.layers)
     points = with_gradients(chosen.points(scene.layers, laws, dtype, attached), material)
     felt = Patches(patches[0].to(dtype), patches[1].to(dtype), patches[2], points.count)
     return Body(points, felt, int(chosen.surface.sum()), samples, len(source), owner, pairs)

@@ -198,6 +198,7 @@ def grouped(
     frame: SimFrame,
     dtype: torch.dtype,
     piece: Tensor | None = None,
+    home: Tensor | None = None,
 ) -> tuple[Samples, Tensor, Tensor]:
     """Samples for a grid: for each group one or a few that keep its mass, centre of mass and volume.
 
@@ -214,6 +215,7 @@ def grouped(
         dtype: Precision of the solver.
         piece: A number for each sample, the same for those that are attached in their cell, shape (N,); None if all
             are.
+        home: The places by which they are grouped [m], shape (N, 3), if these are not their own.
 
     Returns:
         The points as samples, those on the surface first; the point that each sample belongs to, shape (N,); and the
@@ -225,9 +227,10 @@ def grouped(
     masks = [region.contains(where) for region in apart]
     pieces = [] if piece is None else [piece]
     label = torch.stack([kind, samples.law_index, samples.surface, samples.area > 0, *masks, *pieces], -1).long()
+    home = samples.position if home is None else home
     matched = per_cell % 2 == 0
     cubes = per_cell // 2 if matched else per_cell
-    group = grid_groups(samples.position.to(dtype), dx, cubes, samples.mass, samples.normal, label)
+    group = grid_groups(home.to(dtype), dx, cubes, samples.mass, samples.normal, label)
     parts = torch.full((int(group.max()) + 1,), matched)  # which groups are divided into several points
     of = matched_points(samples.position, samples.mass, group, parts, dx / cubes)[2]
     group, parts = _parted(group, parts, group.bincount() <= of.bincount())  # no more points than there were

@@ -15,7 +15,7 @@ from gaussian_swaying.mpm.boundaries.pinned_region import PinnedRegion
 from gaussian_swaying.mpm.solver import MPMSolver
 from gaussian_swaying.preview.picture import _pieces
 from gaussian_swaying.scenes.procedural import FlagScene, GivenScene
-from gaussian_swaying.simulation.attached import attached_points, pieces_in_cells
+from gaussian_swaying.simulation.attached import attached_points, homes, lies_apart, pieces_in_cells
 from gaussian_swaying.simulation.material import Material
 from gaussian_swaying.simulation.scene import Scene
 from gaussian_swaying.simulation.simulation import Simulation
@@ -104,6 +104,26 @@ def test_pieces_of_a_cell_are_those_attached_within_it():
     found = pieces_in_cells(place, 1.0, torch.tensor([[0, 2], [2, 1], [0, 3]]))
     assert found[0] == found[3]
     assert len(found.unique()) == 3
+
+
+def test_a_few_samples_beyond_a_border_are_grouped_across_it():
+    """Cells end at halves: of 24 samples in a row along x, two lie beyond 1.5, and one on another piece."""
+    row = torch.stack([torch.linspace(0.6, 1.54, 24), torch.ones(24), torch.ones(24)], 1).double()
+    place = torch.cat([row, torch.tensor([[1.6, 1.2, 1.0]], dtype=torch.float64)])
+    pairs = torch.stack([torch.arange(23), torch.arange(1, 24)], 1)
+    home, piece = homes(place, 1.0, pairs, pieces_in_cells(place, 1.0, pairs))
+    beyond = (row[:, 0] > 1.5).nonzero()[:, 0].tolist()
+    assert beyond
+    assert piece[beyond[0]] == piece[0]
+    assert home[beyond[0], 0] < 1.5
+    assert torch.equal(home[: beyond[0]], place[: beyond[0]])
+    assert torch.equal(home[24], place[24])
+
+
+def test_what_is_connected_within_each_node_lies_nowhere_apart():
+    place = torch.tensor([[1.0, 1.0, 1.0], [1.3, 1.0, 1.0], [2.0, 1.0, 1.0], [9.0, 1.0, 1.0]])
+    assert not lies_apart(place, 1.0, torch.tensor([[0, 1], [1, 2]]))  # the last one is far away
+    assert lies_apart(place, 1.0, torch.tensor([[0, 1]]))
 
 
 def test_it_needs_the_total_formulation_and_a_surface():
