@@ -85,6 +85,8 @@ class FusedTotal(Fused):
             self.source = _sources(
                 torch.stack([torch.where(b >= 0, place[b.clamp(min=0)], self.cells) for b in below]), self.cells
             )
+        # those of no cell are a row of zeros, which is the last one of each of the 27
+        self.source_counts = (self.source % (self.cells + 1) != self.cells).sum(0, dtype=torch.int32)
         self.fields = torch.zeros(len(inverse), 8, **self.like)
         self.displacement, self.velocity = self.fields[:, :4], self.fields[:, 4:]
         self.lanes = lanes(self.device, _lanes(sizes))
@@ -258,7 +260,7 @@ class FusedTotal(Fused):
         nodes, block = len(self.active), lanes(self.device, 64, 1)
         source, sources = self.source, len(self.source)
         if block == 1:
-            launch(kernels.total_join, (nodes,))(source, sources, nodes, partial, self.joined, WIDTH=width)
+            launch(kernels.total_join, (nodes,))(source, self.source_counts, nodes, partial, self.joined, WIDTH=width)
             source, sources, partial = self.alone, 1, self.joined
         held = self.plain and any(self.bound.on_nodes)
         moves = self.plain and self.touching is None

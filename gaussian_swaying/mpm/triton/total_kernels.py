@@ -258,12 +258,12 @@ def total_pieces(pieces_in, partial, first_piece, cells, pieces, WIDTH: tl.const
 
 
 @triton.jit(do_not_specialize=VARIES)
-def total_join(source, sources, nodes, partial, joined, WIDTH: tl.constexpr):
+def total_join(source, counts, nodes, partial, joined, WIDTH: tl.constexpr):
     """``total``, on a CPU: the sums of the cells around a node, so that ``total_nodes`` has one source."""
     k = tl.program_id(0)
     column = tl.arange(0, WIDTH)
     total = tl.zeros([WIDTH], tl.float32)
-    for o in range(0, sources):
+    for o in range(0, tl.load(counts + k)):
         total += tl.load(partial + tl.load(source + o * nodes + k) * WIDTH + column)
     tl.store(joined + k * WIDTH + column, total)
 
