@@ -25,6 +25,7 @@ from bench.problems import (
     flags,
     plates,
     reconfiguration,
+    rods,
     strips,
     surfaces,
     vortex,
@@ -80,6 +81,15 @@ def _comb(thickness: float, gap: float, how: str, settings: Settings) -> dict[st
     return apart.comb(settings, thickness, gap, base=how == "base", shared=how == "shared")
 
 
+def _rod_anyhow(diameter: float, around: int, settings: Settings) -> dict[str, float]:
+    """The worst of nine rods: at three places on the grid and in three directions."""
+    places = ((0.0, 0.0, 0.0), (0.25, 0.13, 0.4), (0.5, 0.37, 0.5))
+    axes = ((1.0, 0.0, 0.0), (1.0, 0.5, 0.3), (1.0, 0.9, 0.1))
+    found = [rods.rod(settings, diameter, place, axis, around=around) for place in places for axis in axes]
+    ends = {"lowest": min(one["lowest"] for one in found), "highest": max(one["highest"] for one in found)}
+    return max(found, key=lambda one: one["error"]) | ends
+
+
 def _elements(settings: Settings) -> dict[str, float]:
     del settings  # element tests need no solver
     law = Sand(friction_angle=30.0)
@@ -132,6 +142,9 @@ def cases(device: str, thorough: bool) -> Iterable[tuple[str, Row, Callable[[], 
             yield case("comb", _comb, "total", thickness=thickness, gap=0.3, how=how)
     for layers in (1, 3):
         yield case("close sheets", apart.sheets, "total, float32", gap=0.2, layers=layers)
+    for around in (4, 8):
+        for diameter in (0.05, 0.1, 0.3, 1.0):
+            yield case("thin rod", _rod_anyhow, "total", diameter=diameter, around=around)
     for variant in everyone:
         for cells in (16, 24, 32, 48) if thorough and variant == "total" else (16, 24, 32):
             yield case("vortex", vortex.vortex, variant, cells=cells)

@@ -150,6 +150,12 @@ _table("close_sheets", partial(_of, problem="close sheets"), """
     """)  # fmt: skip
 
 
+_table("thin_rod", partial(_of, problem="thin rod"), """
+    diameter [cells] = {parameters.diameter:g} |
+    *{parameters.around} points in a section = {result.lowest:.3f} to {result.highest:.3f}
+    """, order=["parameters.diameter", "parameters.around"])  # fmt: skip
+
+
 def _angles(results: Results) -> Iterator[Row]:
     """Friction angles of the sand law, for an element and for a layer."""
     tests = {"shear": "simple shear", "triaxial": "triaxial compression", "plane_strain": "plane strain"}
