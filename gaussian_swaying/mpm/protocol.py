@@ -119,12 +119,13 @@ class Solver(nn.Module, ABC):
         """A solver with the same boundaries and other :attr:`settings`, without a material."""
         raise ValueError(f"{type(self).__name__} has no other settings: give it a method `like`.")
 
-    def followers(self, place: Tensor, arm: Tensor | None) -> Followers | None:
+    def followers(self, place: Tensor, arm: Tensor | None, nodes: Tensor | None = None) -> Followers | None:
         """An object that reads places in the material from a state; None to follow the nearest points.
 
         Args:
             place: Rest positions that are read [m], shape (M, 3).
             arm: From there to the places that follow [m], shape (M, 3).
+            nodes: Their nodes, shape (27, M), where those of the lattice will not do (``scene.connected: surface``).
         """
         return None
 
