@@ -106,6 +106,12 @@ def build_options() -> argparse.ArgumentParser:
         metavar="SHARE",
         help="largest displacement in that wind, as a share of the longest side; stiffness and thickness follow",
     )
+    add(
+        "--connected",
+        default="grid",
+        choices=("grid", "surface"),
+        help="what shares nodes of the grid: with surface, leaves closer than a cell move apart",
+    )
     add("--material", metavar="NAME", help=f"its numbers, instead of softer ones: {NAMES}")
     add("--frames", type=int, default=250, help="frames of the configuration")
     add("--quality", metavar="Q", help=f"grid of the starter: {', '.join(QUALITIES)}; default: normal")
@@ -155,6 +161,7 @@ def preview_scene(options: argparse.Namespace, folder: Path) -> Preview:
     suggestion = suggest(part, up, options.hold, region, options.longest_side, options.wind, capture, quality, found)
     if options.material is not None:
         suggestion = of_material(suggestion, options.material)
+    suggestion = replace(suggestion, connected=options.connected)
     begin = Stopwatch()
     draft, settings = _tried(suggestion, lambda made: draft_yaml(made, options.scene), options.device, part)
     startup = LOADED + read + begin.quiet
@@ -367,6 +374,8 @@ def _preview(options: argparse.Namespace) -> None:
     if options.config is not None and (options.quality is not None or options.minutes is not None):
         one = "--quality" if options.minutes is None else "--minutes"
         raise ValueError(f"`{one}` is for suggestions, and `--config` is shown unchanged: leave out one of them.")
+    if options.config is not None and options.connected != "grid":
+        raise ValueError("`--connected` is for suggestions, and `--config` is shown unchanged: leave out one of them.")
     if options.minutes is not None:
         check_positive("--minutes", options.minutes)
     if options.frames < 1:

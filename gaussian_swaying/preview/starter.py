@@ -137,7 +137,7 @@ scene:
   loose: carry                  # and so do specks that hang on nothing or by a thread
   area: open                    # the outer skin; coverage also counts layers and leaves that others hide
   points: grid                  # as many as the grid can use, holes filled; the Gaussians follow its nodes
-
+{_connected(s)}
 {_material(s)}
 solver:
   formulation: total            # particles keep their neighbours: cannot tear
@@ -208,6 +208,11 @@ def _parts(s: Suggestion) -> str:
         return ""
     path = json.dumps(s.parts.path, ensure_ascii=False)
     return f", without what is still\n{_comment(s.parts.words(), 2)}\n  parts: {path}"
+
+
+def _connected(s: Suggestion) -> str:
+    """The line of ``scene.connected``, if it is not the default."""
+    return "" if s.connected == "grid" else f"  connected: {s.connected:<19}# leaves closer than a cell move apart\n"
 
 
 def _padded(text: str, width: int) -> str:

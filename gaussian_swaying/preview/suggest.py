@@ -144,6 +144,7 @@ class Suggestion:
         parts: The parts of the object, if they are sure: a plant in a pot, a flag on its pole, what hangs from a cord,
             or a tree; else None.
         growth: Mean number of substeps of a frame over the number at rest, from the trial runs.
+        connected: ``scene.connected`` of the starter.
         real: Whether the numbers are those of the material; if not, they are such that it sways visibly.
     """
 
@@ -169,6 +170,7 @@ class Suggestion:
     camera_radius: float
     parts: FoundParts | None = None
     growth: float = 1.0
+    connected: str = "grid"
     real: bool = False
 
     @property

@@ -305,6 +305,7 @@ def test_bad_input_is_one_sentence(splat, tmp_path, capsys):
         (splat, ["--minutes", "1", "--quality", "fine"], "leave out one of them"),
         (splat, ["--config", str(FLAG), "--quality", "fine"], "`--quality` is for suggestions, and"),
         (splat, ["--config", str(FLAG), "--minutes", "3"], "`--minutes` is for suggestions, and"),
+        (splat, ["--config", str(FLAG), "--connected", "surface"], "`--connected` is for suggestions, and"),
         (splat, ["--config", str(typo)], "dxx"),
         (splat, ["--config", str(FLAG), "--capture", str(tmp_path)], "`--capture` is for suggestions, and"),
         (splat, ["--capture", str(tmp_path / "nowhere")], "nowhere"),

@@ -467,3 +467,11 @@ def test_a_given_material_has_its_own_numbers():
 def test_a_stray_point_far_away_does_not_join_the_parts():
     points = torch.tensor([[0.0, 0, 0], [0.01, 0, 0], [1.0, 0, 0], [-1e5, 0, 0]])
     assert connected_parts(points, 0.02).tolist() == [1, 1, 2, 0]
+
+
+def test_a_starter_says_what_shares_nodes_only_if_it_is_not_the_default():
+    found = suggest(FlagScene(spacing=0.1).generate(), quality="draft")
+    assert "connected" not in starter_yaml(found, "flag.ply")
+    for text in (starter_yaml, draft_yaml):
+        config = yaml.safe_load(text(dataclasses.replace(found, connected="surface"), "flag.ply"))
+        assert config["scene"]["connected"] == "surface"
