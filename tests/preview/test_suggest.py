@@ -471,7 +471,7 @@ def test_a_stray_point_far_away_does_not_join_the_parts():
 
 def test_a_starter_says_what_shares_nodes_only_if_it_is_not_the_default():
     found = suggest(FlagScene(spacing=0.1).generate(), quality="draft")
-    assert "connected" not in starter_yaml(found, "flag.ply")
+    assert "connected:" not in starter_yaml(found, "flag.ply")
     for text in (starter_yaml, draft_yaml):
         config = yaml.safe_load(text(dataclasses.replace(found, connected="surface"), "flag.ply"))
         assert config["scene"]["connected"] == "surface"
