@@ -70,7 +70,7 @@ def lies_apart(position: Tensor, dx: float, pairs: Tensor) -> bool:
 
 @torch.no_grad()
 def homes(position: Tensor, dx: float, pairs: Tensor, piece: Tensor) -> tuple[Tensor, Tensor]:
-    """Where samples are grouped: a few that a piece has beyond the border of a cell, at the next one across it.
+    """The places at which samples are grouped: a few of a piece beyond the border of a cell, at the next across it.
 
     They would have copies of nodes of their own, with hardly any mass.
 

@@ -1,7 +1,4 @@
-"""``bench.py leaves`` on two flags in place of leaves.
-
-Covers: tools/bench/cases/leaves.py.
-"""
+"""``bench.py leaves`` on two flags in place of leaves."""
 
 import dataclasses
 
