@@ -71,12 +71,12 @@ def _leaves(result: Row) -> Iterator[Row]:
 
 table(PAGE, "leaves.rows", "leaves_*", _leaves, """
     cells along the longest side = {cells} | `scene.connected` = `{connected}` | points = {points:,} |
-    nodes = {nodes:,} | motion of leaves = {motion:.2 %} | against each other = {relative:.2 %} |
-    over that of the finest shared grid = {share:.0 %}
+    nodes = {nodes:,} | motion of leaves = {motion:.2f %} | against each other = {relative:.2f %} |
+    over that of the finest shared grid = {share:.0f %}
     """, before="{source}")  # fmt: skip
 LEAVES_GOALS = [
     Goal("leaves at {cells} cells with nodes of their own, motion against each other, over that at {finest} cells",
-         "{share:.0 %}", "share >= 0.3", _leaves, "connected is 'surface' and cells < finest",
+         "{share:.0f %}", "share >= 0.3", _leaves, "connected is 'surface' and cells < finest",
          {"wanted": "at least {limit:g %}"}),
     Goal("time of a substep at {cells} cells, over that on shared nodes", "{cost:.2f} ({surface_ms:.2f} ms)",
          "cost <= 1.3", "costs", more={"wanted": "at most {limit:g}"}),
