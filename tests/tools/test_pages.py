@@ -53,7 +53,14 @@ def test_pages_are_filled_in_place_and_their_plots_drawn(bench, tmp_path):
     bench("pages", "--keep_ages", "--results", docs / "results")
     for name in NAMES:
         assert (docs / name).read_text() == (DOCS / name).read_text(), name
-    for picture in ("convergence.png", "pareto_cpu.png", "pareto_cuda.png", "speed_cpu.png", "speed_cuda.png"):
+    for picture in (
+        "convergence.png",
+        "nature.png",
+        "pareto_cpu.png",
+        "pareto_cuda.png",
+        "speed_cpu.png",
+        "speed_cuda.png",
+    ):
         assert (docs / "pictures" / picture).stat().st_size > 10_000
         assert (DOCS / "pictures" / picture).exists()
         assert any(f"(pictures/{picture})" in (DOCS / name).read_text() for name in NAMES)

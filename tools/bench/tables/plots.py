@@ -41,7 +41,7 @@ def save_figure(figure: Any, path: Path) -> None:
 
 
 def accuracy(results: list[Row], pictures: Path) -> None:
-    """Draw ``convergence.png`` from the rows of all records: error against cells, for the problems with an order."""
+    """Draw ``convergence.png``, error against cells for problems with an order, and ``nature.png``, from all rows."""
     rows = all_rows(results)
     panels = {
         "confined bar (frequency)": ("vibrating bar", {"ends": "free"}),
@@ -66,6 +66,47 @@ def accuracy(results: list[Row], pictures: Path) -> None:
     axes[0].set_ylabel("relative error")
     axes[0].legend(fontsize=8)
     save_figure(figure, pictures / "convergence.png")
+    _nature(rows, pictures / "nature.png")
+
+
+def _nature(rows: list[Row], path: Path) -> None:
+    """Draw a plate in a flow, an inverted flag and a hanging fabric beside what is exact."""
+    from bench.problems.reconfiguration import elastica
+
+    figure, (bent, inverted, fabric) = subplots(1, 3, figsize=(13, 3.8))
+    cauchy = [10 ** (0.25 * k) for k in range(13)]
+    for law, color in (("projected", "C0"), ("cross_flow", "C1")):
+        bent.loglog(cauchy, [elastica(c, law)[0] for c in cauchy], color=color, label=f"elastica, {law}")
+        found = select(rows, "plate that bends in a flow", law=law)
+        for cells, marker in ((16, "x"), (32, "s"), (64, "o")):
+            own = [row for row in found if row["parameters"]["cells"] == cells]
+            where = [row["parameters"]["cauchy"] for row in own], [row["result"]["drag"] for row in own]
+            bent.loglog(
+                *where, marker, color=color, markerfacecolor="none", label=f"{cells} cells" if color == "C0" else None
+            )
+    bent.set(xlabel="C", ylabel="R", title="Plate that bends in a flow: drag")
+    found = select(rows, "inverted flag")
+    for row in sorted(found, key=lambda row: row["parameters"]["cells"]):
+        rates = [row["result"]["below"], row["result"]["above"]]
+        inverted.plot([0.9, 1.1], rates, "o-", label=f"{row['parameters']['cells']} cells")
+    inverted.axhline(0, color="k", linewidth=0.8)
+    inverted.axvline(1, color="k", linewidth=0.8, linestyle=":")
+    inverted.set(xlabel="pressure over the exact one", ylabel="rate / frequency", title="Inverted flag: growth")
+    for stretch, marker in ((300.0, "s"), (1000.0, "o")):
+        found = select(rows, "strip of a fabric that hangs", fabric="ponte", stretch=stretch)
+        found = sorted(found, key=lambda row: row["parameters"]["cells"])
+        cells = [row["parameters"]["cells"] for row in found]
+        drops = [row["result"]["drop"] for row in found]
+        fabric.plot(cells, drops, marker + "-", label=f"E h = {stretch:g} N/m")
+    for row in found[:1]:
+        fabric.set_ylim(top=1.02 * row["result"]["exact"])
+        fabric.axhline(row["result"]["exact"], color="k", linestyle=":", label="elastica")
+    fabric.set(xlabel="cells", ylabel="drop / L", title="Hanging strip of ponte: drop of its tip")
+    fabric.set_xticks([8, 16, 32])
+    for axis in (bent, inverted, fabric):
+        axis.title.set_fontsize(10)
+        axis.legend(fontsize=8)
+    save_figure(figure, path)
 
 
 def pareto(results: list[Row], pictures: Path) -> None:
