@@ -95,9 +95,9 @@ def _nature(rows: list[Row], path: Path) -> None:
     for stretch, marker in ((300.0, "s"), (1000.0, "o")):
         found = select(rows, "strip of a fabric that hangs", fabric="ponte", stretch=stretch)
         found = sorted(found, key=lambda row: row["parameters"]["cells"])
-        cells = [row["parameters"]["cells"] for row in found]
+        counts = [row["parameters"]["cells"] for row in found]
         drops = [row["result"]["drop"] for row in found]
-        fabric.plot(cells, drops, marker + "-", label=f"E h = {stretch:g} N/m")
+        fabric.plot(counts, drops, marker + "-", label=f"E h = {stretch:g} N/m")
     for row in found[:1]:
         fabric.set_ylim(top=1.02 * row["result"]["exact"])
         fabric.axhline(row["result"]["exact"], color="k", linestyle=":", label="elastica")
