@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any
 
 PNG: dict[str, Any] = {"compress_level": 1, "compress_type": zlib.Z_RLE}
-"""How pictures are compressed: in two thirds of the time of zlib's level 3, and smaller."""
+"""Options with which pictures are compressed: in two thirds of the time of zlib's level 3, and smaller."""
 
 _TEMPORARY = re.compile(r"\..+\.gs-writing-\d+(\.[A-Za-z0-9_]+)?")
 _KINDS = {

@@ -70,7 +70,7 @@ ROUGH = 30
 """Factor by which the tolerance of the other steps is larger."""
 
 LONG_STILL = 0.05
-"""How long a film may be still before its motion, if its start is no unknown [s]; slow objects need a frame or two."""
+"""Longest time that a film may be still, if the start of its motion is no unknown [s]; slow objects need a frame."""
 
 Say = Callable[[str], None]
 
@@ -318,7 +318,7 @@ class Fit:
         return normal_equations(blocks, scales_of(blocks, {part.kind: part.floor for part in evidence}), steps)
 
     def notes(self) -> list[str]:
-        """What the videos say against the plan: a film that is still at first, without an unknown start."""
+        """Sentences on what speaks against the plan in the videos: a film that is still at first, without an unknown start."""
         if FILM_START in (u.name for u in self.plan.unknowns) or not {"tracks", "matches"} & set(self.stages):
             return []
         still = min(still_until(own, v.times) for own, v in zip(self.tracks, self.videos, strict=True))
@@ -344,7 +344,7 @@ class Fit:
 
 
 class _Followed:
-    """How much of the motion of the tracks a simulation explains, added up frame by frame."""
+    """The share of the motion of the tracks that a simulation explains, added up frame by frame."""
 
     def __init__(self, fit_: Fit) -> None:
         self._simulation = fit_.simulation

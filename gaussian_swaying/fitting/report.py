@@ -111,7 +111,7 @@ class Result:
         return [one.camera for one in self.shown if one.fitted < one.rest - ASTRAY]
 
     def doubts(self) -> tuple[list[str], list[str]]:
-        """Why the fit has failed, and why it is doubtful, as sentences with a remedy."""
+        """Reasons for which the fit has failed, and for which it is doubtful, as sentences with a remedy."""
         failed: list[str] = []
         doubtful = list(self.notes)
         for name, share in self.followed.items():

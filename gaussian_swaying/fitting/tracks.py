@@ -29,7 +29,7 @@ BACK = 0.5
 _DRAWN = 1e-3
 """Least sum of the weights of a Gaussian in a picture with which it counts as visible [pixels]."""
 STILL = 0.5
-"""How far a point moves that stands still [pixels]: noise and compression."""
+"""Largest distance that a point moves which stands still [pixels]: noise and compression."""
 QUALITY = 0.02
 """Least texture of a point, as a share of the best one: smallest eigenvalue of the structure tensor."""
 EDGE = 4.0

@@ -29,7 +29,7 @@ class _Group:
     diverged: bool = False
 
     def moves(self, begin: float, end: float) -> float:
-        """How long they move between two times of the film [s]."""
+        """The time for which they move between two times of the film [s]."""
         return max(end - self.start, 0.0) - max(begin - self.start, 0.0)
 
 
