@@ -318,7 +318,7 @@ class Fit:
         return normal_equations(blocks, scales_of(blocks, {part.kind: part.floor for part in evidence}), steps)
 
     def notes(self) -> list[str]:
-        """Sentences on what speaks against the plan in the videos: a film that is still at first, without such an unknown."""
+        """Sentences on what speaks against the plan in the videos: a film that is still, without such an unknown."""
         if FILM_START in (u.name for u in self.plan.unknowns) or not {"tracks", "matches"} & set(self.stages):
             return []
         still = min(still_until(own, v.times) for own, v in zip(self.tracks, self.videos, strict=True))
