@@ -133,13 +133,17 @@ def load_image(path: str | Path, lens: Lens, downscale: int = 1) -> Tensor:
         image = remap(image, lens, lens.undistorted())
     if downscale > 1:
         image = average_down(image, downscale)
+    return _pixels_of(image)
+
+
+def _pixels_of(image: Tensor) -> Tensor:
+    """Rounded pixels (H, W, C) of dtype uint8, of an image (C, H, W)."""
     return rearrange(image.round_().clamp_(0, 255).to(torch.uint8), "c h w -> h w c").contiguous()
 
 
 def remapped(pixels: Tensor, lens: Lens) -> Tensor:
     """Pixels (H, W, C) of dtype uint8, as ``lens.undistorted()`` sees them."""
-    image = remap(rearrange(pixels, "h w c -> c h w").float(), lens, lens.undistorted())
-    return rearrange(image.round_().clamp_(0, 255).to(torch.uint8), "c h w -> h w c").contiguous()
+    return _pixels_of(remap(rearrange(pixels, "h w c -> c h w").float(), lens, lens.undistorted()))
 
 
 def check_image_size(path: str | Path, size: tuple[int, int], lens: Lens) -> None:

@@ -205,11 +205,17 @@ def remap(image: Tensor, source: Lens, target: Lens) -> Tensor:
         ValueError: If ``image`` does not have the size of ``source``.
     """
     check_shape("image", image, None, source.height, source.width)
+    grid = _places(source, target, image.dtype).to(image.device)
+    return functional.grid_sample(image[None], grid, mode="bilinear", padding_mode="border", align_corners=False)[0]
+
+
+@lru_cache(maxsize=4)  # the frames of a film share a lens
+def _places(source: Lens, target: Lens, dtype: torch.dtype) -> Tensor:
+    """Where the pixels of a pinhole lens are in the picture of a distorted one, from -1 to 1, shape (1, H, W, 2)."""
     x = (torch.arange(target.width, dtype=torch.float64) + (0.5 - target.cx)) / target.fx
     y = (torch.arange(target.height, dtype=torch.float64) + (0.5 - target.cy)) / target.fy
-    rows, columns = torch.meshgrid(y.to(image.dtype), x.to(image.dtype), indexing="ij")
+    rows, columns = torch.meshgrid(y.to(dtype), x.to(dtype), indexing="ij")
     seen = distort(torch.stack([columns, rows], -1), source.distortion)
     focal = seen.new_tensor([2 * source.fx / source.width, 2 * source.fy / source.height])
     offset = seen.new_tensor([2 * source.cx / source.width - 1, 2 * source.cy / source.height - 1])
-    grid = (seen * focal + offset)[None]
-    return functional.grid_sample(image[None], grid, mode="bilinear", padding_mode="border", align_corners=False)[0]
+    return (seen * focal + offset)[None]

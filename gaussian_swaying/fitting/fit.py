@@ -139,6 +139,11 @@ class Fit:
     # ---- what is compared
 
     @property
+    def followed(self) -> bool:
+        """Whether points are followed from frame to frame: the videos may have too little texture if they are not."""
+        return "tracks" in self.stages or self.stages[0] == "matches"
+
+    @property
     def tracks(self) -> list[Tracks]:
         """Tracks of every camera."""
         if self._tracks is None:
@@ -291,7 +296,7 @@ class Fit:
         normal = self._normal(place, evidence or self.evidence(steps[-1][0], course.place), self.fitted)
         found = directions(normal.matrix, self.plan.unknowns, place)
         course.seconds = time.monotonic() - clock
-        followed = _Followed(self) if {"tracks", "matches"} & set(self.stages) else None
+        followed = _Followed(self) if self.followed else None
 
         def moved() -> Iterator[DeformedGaussians]:
             for moment, own in zip(self.times, self._run(place[None], self.times), strict=True):
@@ -319,7 +324,7 @@ class Fit:
 
     def notes(self) -> list[str]:
         """Sentences on what speaks against the plan in the videos: a film that is still, without such an unknown."""
-        if FILM_START in (u.name for u in self.plan.unknowns) or not {"tracks", "matches"} & set(self.stages):
+        if FILM_START in (u.name for u in self.plan.unknowns) or not self.followed:
             return []
         still = min(still_until(own, v.times) for own, v in zip(self.tracks, self.videos, strict=True))
         if still < LONG_STILL:

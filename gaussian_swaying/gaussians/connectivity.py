@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from gaussian_swaying._checks import check_shape
-from gaussian_swaying.geometry.groups import equal_rows, joined, sums
+from gaussian_swaying.geometry.groups import equal_rows, joined, once, sums
 from gaussian_swaying.geometry.neighbours import nearest_neighbours
 
 NEIGHBOURS = 16  # to which a Gaussian may be attached
@@ -62,7 +62,7 @@ def attached_pairs(
     first = torch.arange(count)[:, None].expand_as(index)
     scale = (spacing[first] * spacing[index]).sqrt()
     close = distance <= REACH * scale
-    pairs = _once(torch.stack([first[close], index[close]], 1), count)
+    pairs = once(torch.stack([first[close], index[close]], 1), count)
     if labels is not None and to is not None:
         check_shape("labels", labels, count)
         pairs = pairs[_allowed(pairs, labels.cpu(), to)]
@@ -76,13 +76,6 @@ def attached_pairs(
     if labels is not None and to is not None:
         pairs = torch.cat([pairs, _missing(where, pairs, labels.cpu(), to)])
     return torch.cat([pairs, _strays(where, pairs)])
-
-
-def _once(pairs: Tensor, count: int) -> Tensor:
-    """Pairs in either order and more than once, each once."""
-    low, high = pairs.amin(1), pairs.amax(1)
-    key = torch.unique(low * count + high)
-    return torch.stack([key // count, key % count], 1)
 
 
 def _planes(where: Tensor, normals: Tensor, index: Tensor, spacing: Tensor) -> tuple[Tensor, Tensor]:
@@ -103,6 +96,9 @@ def _planes(where: Tensor, normals: Tensor, index: Tensor, spacing: Tensor) -> t
 
 def _put_back(count: int, kept: Tensor, cut: Tensor) -> Tensor:
     """The cut pairs that are needed, so that what hung together still does: those between pieces with most of them."""
+    from scipy.sparse import coo_matrix
+    from scipy.sparse.csgraph import minimum_spanning_tree
+
     piece = joined(count, kept.T)
     ends = piece[cut]
     between = ends[:, 0] != ends[:, 1]
@@ -111,21 +107,12 @@ def _put_back(count: int, kept: Tensor, cut: Tensor) -> Tensor:
         return cut
     contact = equal_rows(ends)
     many = contact.bincount()
-    example = torch.zeros_like(many).index_copy(0, contact, torch.arange(len(contact)))
-    tree = torch.zeros(len(many), dtype=torch.bool)
-    parent = list(range(int(piece.max()) + 1))
-
-    def root(k: int) -> int:
-        while parent[k] != k:
-            parent[k] = parent[parent[k]]
-            k = parent[k]
-        return k
-
-    for c in many.argsort(descending=True, stable=True).tolist():
-        p, q = (root(k) for k in ends[example[c]].tolist())
-        if p != q:
-            parent[p], tree[c] = q, True
-    return cut[tree[contact]]
+    low, high = torch.zeros_like(many)[:, None].expand(-1, 2).index_copy(0, contact, ends).T
+    pieces = int(piece.max()) + 1
+    graph = coo_matrix((1 / many.double(), (low, high)), (pieces, pieces))
+    tree = minimum_spanning_tree(graph).tocoo()
+    needed = torch.isin(low * pieces + high, torch.from_numpy(tree.row * np.int64(pieces) + tree.col))
+    return cut[needed[contact]]
 
 
 def _strays(where: Tensor, pairs: Tensor) -> Tensor:

@@ -62,6 +62,21 @@ def sums(values: Tensor, group: Tensor, count: int | None = None) -> Tensor:
     return values.new_zeros(count, *values.shape[1:]).index_add(0, group, values)
 
 
+def once(pairs: Tensor, count: int) -> Tensor:
+    """Pairs of different items in either order and more than once, each once, sorted.
+
+    Args:
+        pairs: Their numbers, int64, shape (K, 2).
+        count: Number of items.
+
+    Returns:
+        The smaller number first, shape (E, 2).
+    """
+    low, high = pairs.amin(1), pairs.amax(1)
+    key = torch.unique((low * count + high)[low != high])
+    return torch.stack([key // count, key % count], 1)
+
+
 def joined(count: int, pairs: Tensor) -> Tensor:
     """Connected components: the component of each of ``count`` items, from the pairs that are connected.
 

@@ -7,7 +7,7 @@ from torch import Tensor
 
 from gaussian_swaying.gaussians.connectivity import attached_pairs
 from gaussian_swaying.gaussians.parts import Parts
-from gaussian_swaying.geometry.groups import joined
+from gaussian_swaying.geometry.groups import joined, once
 from gaussian_swaying.geometry.neighbours import nearest_neighbours
 from gaussian_swaying.mpm.state import bounding_grid
 from gaussian_swaying.mpm.virtual_nodes import first_nodes, virtual_nodes
@@ -88,10 +88,11 @@ def homes(position: Tensor, dx: float, pairs: Tensor, piece: Tensor) -> tuple[Te
     apart = (position[ends[:, 0]] - position[ends[:, 1]]).norm(dim=-1)
     across = few[ends[:, 0]] & ~few[ends[:, 1]] & (apart < BEYOND * dx)
     ends, apart = ends[across], apart[across]
-    order = apart.argsort(descending=True, stable=True)  # the nearest one is written last
-    other = torch.arange(len(position))
-    for own, to in ends[order].tolist():
-        other[own] = to
+    ends = ends[apart.argsort(stable=True)]
+    ends = ends[ends[:, 0].argsort(stable=True)]  # those of a sample one after the other, the nearest first
+    nearest = torch.ones(len(ends), dtype=torch.bool)
+    nearest[1:] = ends[1:, 0] != ends[:-1, 0]
+    other = torch.arange(len(position)).index_copy(0, *ends[nearest].unbind(1))
     return position[other], piece[other]
 
 
@@ -118,10 +119,7 @@ def attached_points(pairs: Tensor, owner: Tensor, parent: Tensor | None, layers:
             late = (rank >= k).nonzero()[:, 0]
             found = torch.cat([found, torch.stack([order[late - k], order[late]], -1)])
         many = len(parent)
-    low, high = found.amin(1), found.amax(1)
-    key = torch.unique(low * many + high)
-    found = torch.stack([key // many, key % many], 1)
-    found = found[found[:, 0] != found[:, 1]]
+    found = once(found, many)
     if layers == 1:
         return found
     own = torch.arange(many)

@@ -19,7 +19,6 @@ from gaussian_swaying.geometry.groups import equal_rows, sums
 from gaussian_swaying.geometry.regions import Region, whereabouts
 from gaussian_swaying.mpm.laws.fixed_corotated import FixedCorotated
 from gaussian_swaying.mpm.laws.law import ConstitutiveLaw
-from gaussian_swaying.mpm.laws.neo_hookean import NeoHookean
 from gaussian_swaying.mpm.state import MaterialPoints
 from gaussian_swaying.simulation.material import Material, layer_distance
 
@@ -151,10 +150,11 @@ def sample_object(
             index[inside_region] = len(laws)
             laws.append(entry.law)
     for k, law in enumerate(laws):
-        if isinstance(law, (FixedCorotated, NeoHookean)) and bool((properties["nu"][index == k] < 0).any()):
+        if bool((properties["nu"][index == k] < law.least_nu).any()):
             warnings.warn(
-                f"With `material.nu` below 0 the energy of {type(law).__name__} has no least value: material that is "
-                "deformed by some tens of percent runs away. Use `material.law: StVKHencky`, or a nu of at least 0.",
+                f"With `material.nu` below {law.least_nu:g} the energy of {type(law).__name__} has no least value: "
+                "material that is deformed by some tens of percent runs away. Use `material.law: StVKHencky`, or a nu "
+                f"of at least {law.least_nu:g}.",
                 UserWarning,
                 stacklevel=2,
             )

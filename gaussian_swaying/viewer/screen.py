@@ -325,18 +325,18 @@ class Screen:
             line, still = self.streams.line(key), self.session.paused or self.session.broken
             camera = client.camera
             try:
-                drawn_there = line is not None and self._drawn_there(client, snapshot)
-                drawn_there = drawn_there and self.streams.ready(snapshot, self._turn)  # millions take a while
+                scene = None
+                if line is not None and self._drawn_there(client, snapshot):
+                    scene = self.streams.scene(snapshot, self._turn)
+                drawn_there = scene is not None
                 now = (snapshot.number, self._version, self.shown, still, drawn_there or camera.update_timestamp)
                 if now == seen and not drawn_there:
                     continue
-                if drawn_there:
-                    assert line is not None
+                if line is not None and scene is not None:
                     if not line.free:
                         gone.wait(0.005)
                         continue
                     with self.session.lock:
-                        scene = partial(self.streams.scene, turn=self._turn)
                         sent = line.send(snapshot, still, scene, self.roles)
                     if pictured and line.draws:
                         client.scene.set_background_image(None)

@@ -64,7 +64,7 @@ class Line:
         self,
         snapshot: Snapshot,
         ended: bool,
-        scene: Callable[[Snapshot], tuple[tuple[Any, ...], bytes]],
+        scene: tuple[tuple[Any, ...], bytes],
         roles: Tensor | None = None,
     ) -> bool:
         """Send what the browser lacks of a snapshot; False if it lacks nothing, or has to take in more before.
@@ -72,7 +72,7 @@ class Line:
         Args:
             snapshot: The snapshot.
             ended: Whether no other follows for now.
-            scene: Gives the key and the message of its scene.
+            scene: The key and the message of its scene.
             roles: Roles whose tints are shown, see :func:`~gaussian_swaying.rendering.tints.by_role`, shape (N,); a
                 tensor is not changed once it was given.
         """
@@ -80,7 +80,7 @@ class Line:
             return False
         painter = snapshot.simulation.painter
         look = (painter.shader, painter.background)
-        key, made = scene(snapshot)
+        key, made = scene
         if self._scene is None or key != self._scene:
             self._scene, self._look, self._state, self._roles = key, look, (), None
             self._put(made)
@@ -180,41 +180,33 @@ class Streams:
         """Pictures a second of the browser that draws most."""
         return max((line.rate for line in list(self._lines.values()) if line is not None), default=0.0)
 
-    def scene(self, snapshot: Snapshot, turn: Tensor) -> tuple[tuple[Any, ...], bytes]:
-        """Key and message of the scene of a snapshot; the same for all browsers. See :func:`.states.scene_message`."""
-        key = self._key(snapshot)
-        with self._making:
-            if self._known is None or self._known[0] != key:
-                self._known = (key, scene_message(snapshot, turn))
-            return self._known
+    def scene(self, snapshot: Snapshot, turn: Tensor) -> tuple[tuple[Any, ...], bytes] | None:
+        """Key and message of the scene of a snapshot, the same for all browsers. See :func:`.states.scene_message`.
 
-    @staticmethod
-    def _key(snapshot: Snapshot) -> tuple[Any, ...]:
-        return snapshot.simulation, fingerprint([snapshot.simulation.scene])
-
-    def ready(self, snapshot: Snapshot, turn: Tensor) -> bool:
-        """True if :meth:`scene` has the scene of a snapshot; otherwise it is made meanwhile, in a thread.
+        Returns:
+            None while it is being made, in a thread: millions of Gaussians take seconds.
 
         Raises:
             Exception: What went wrong when it was made.
         """
-        known = self._known
-        if known is not None and known[0] == self._key(snapshot):
-            return True
-        if self._failure is not None:
-            failure, self._failure = self._failure, None
-            raise failure
+        key = (snapshot.simulation, fingerprint([snapshot.simulation.scene]))
 
         def make() -> None:
             try:
-                self.scene(snapshot, turn)
+                self._known = (key, scene_message(snapshot, turn))
             except Exception as error:
                 self._failure = error
 
-        if self._maker is None or not self._maker.is_alive():
-            self._maker = threading.Thread(target=make, name="scene", daemon=True)
-            self._maker.start()
-        return False
+        with self._making:
+            if self._known is not None and self._known[0] == key:
+                return self._known
+            if self._failure is not None:
+                failure, self._failure = self._failure, None
+                raise failure
+            if self._maker is None or not self._maker.is_alive():
+                self._maker = threading.Thread(target=make, name="scene", daemon=True)
+                self._maker.start()
+        return None
 
     def beside(self, handler: Callable[[Any], Any]) -> Callable[[Any], Any]:
         """The handler of all connections: those for states and strokes, and those of viser, which gets ``handler``."""

@@ -92,6 +92,27 @@ def test_two_sheets_each_move_as_alone(transfer, kind):
         assert (glued.position[number == k] - alone).norm(dim=-1).amax() > 0.1 * far
 
 
+def test_kernels_do_what_torch_does_on_each_device(kernel_device):
+    """In single precision: pins, wind that depends on the place, viscosity and followers, of two scenes."""
+    parts = sheet(3.1), sheet(3.3)
+    position, number = together(*parts)
+    batch = MaterialPoints.stack([material(position, number), material(position + 0.31, number)])
+    up, area = torch.zeros_like(batch.position), torch.full(batch.mass.shape, 0.01, dtype=torch.float64)
+    up[..., 2] = 1.0
+    wind, pins = WindField([5.0, 2.0, -1.0], effects=[LogProfile(height=3.0)]), [PinnedRegion(EDGE, "hinge")]
+    ends = []
+    for kind, where, transfer in ((torch.float64, "cpu", "torch"), (torch.float32, kernel_device, "kernels")):
+        points = batch.map(lambda t: t.to(where, kind))  # noqa: B023
+        solver = MPMSolver(1.0, boundaries=pins, transfer=transfer, stiffness_damping=1e-3).to(where)
+        state = solver.init_state(points)
+        load = WindForce(AeroForce(), wind, up.to(where, kind), area.to(where, kind)).to(where)
+        ends.append(solver.rollout(state, 1e-2, 20, [load]).position.cpu().double())
+    assert state.grid.virtual > 0
+    away = (ends[0] - batch.position).abs().amax()
+    assert away > 1e-3
+    assert (ends[0] - ends[1]).abs().amax() < 1e-3 * away
+
+
 def strip(x, y, z):
     return torch.cartesian_prod(*(torch.as_tensor(t, dtype=torch.float64) for t in (x, y, z)))
 

@@ -22,6 +22,8 @@ from gaussian_swaying.scenes.alocasia import AlocasiaScene
 from gaussian_swaying.scenes.procedural import FlagScene
 from gaussian_swaying.simulation.simulation import Simulation
 
+from .test_photos import write_capture
+
 COUNT = 40_000
 
 
@@ -193,6 +195,20 @@ def test_a_thing_is_chosen_by_its_number(file, tmp_path, capsys, monkeypatch):
     assert data["gaussians"]["sh_degree"] is None
     box = data["run"]
     assert box["box_max"][0] - box["box_min"][0] == pytest.approx(4.0, abs=0.1)
+
+
+def test_things_of_a_place_are_chosen_with_the_cameras_of_the_photos(file, tmp_path, capsys, monkeypatch):
+    """They rank the things, and tell which way is up."""
+    monkeypatch.setattr("gaussian_swaying.preview.cost.MOST_FRAMES", 2)
+    monkeypatch.setattr("gaussian_swaying.cli.preview.calibrated_suggestion", lambda found, draft, sway: found)
+    eyes = [(math.cos(k), -0.5, math.sin(k)) for k in range(6)]
+    middle, up = (0.0, -0.2, 0.0), (0.0, -1.0, 0.0)
+    cameras = [look_at_camera(eye, middle, up, 50.0, 64, 64, dtype=torch.float64) for eye in eyes]
+    capture = write_capture(tmp_path / "photos", cameras)
+    assert _preview(file, tmp_path / "out", "--capture", str(capture), "--move", "1") == 0
+    assert "in the photos (+2)" in capsys.readouterr().out
+    data = json.loads((tmp_path / "out" / "preview.json").read_text())
+    assert data["place"]["moves"] == [1]
 
 
 @pytest.mark.parametrize(

@@ -71,6 +71,8 @@ def fixed_corotated_moduli(F: Tensor, mu: Tensor, lam: Tensor) -> tuple[Tensor, 
 class FixedCorotated(ConstitutiveLaw):
     """Elastic solid that stays defined when crushed or inverted: foliage, cloth, rubber at moderate strain."""
 
+    least_nu = 0.0
+
     def energy(self, F: Tensor, mu: Tensor, lam: Tensor, internal: Tensor | None = None) -> Tensor:
         """See :func:`fixed_corotated_energy`."""
         return fixed_corotated_energy(F, mu, lam)

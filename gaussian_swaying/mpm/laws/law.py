@@ -23,10 +23,12 @@ class ConstitutiveLaw(Twinned, nn.Module, ABC):
         plastic: Whether there is a return map. The deformation gradient is then only the elastic part of the
             deformation since rest, which needs the ``updated`` formulation.
         internal: Initial value of the one internal variable of each particle, or None if there is none.
+        least_nu: Poisson's ratio below which the energy has no least value, and strongly deformed material runs away.
     """
 
     plastic: bool = False
     internal: float | None = None
+    least_nu: float = -1.0
 
     @abstractmethod
     def energy(self, F: Tensor, mu: Tensor, lam: Tensor, internal: Tensor | None = None) -> Tensor:

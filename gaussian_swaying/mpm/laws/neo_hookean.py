@@ -58,6 +58,8 @@ def neo_hookean_moduli(F: Tensor, mu: Tensor, lam: Tensor) -> tuple[Tensor, Tens
 class NeoHookean(ConstitutiveLaw):
     """Elastic solid that resists crushing without limit. It is the cheapest law: it needs no polar decomposition."""
 
+    least_nu = 0.0
+
     def energy(self, F: Tensor, mu: Tensor, lam: Tensor, internal: Tensor | None = None) -> Tensor:
         """See :func:`neo_hookean_energy`."""
         return neo_hookean_energy(F, mu, lam)

@@ -85,8 +85,6 @@ class FusedTotal(Fused):
             self.source = _sources(
                 torch.stack([torch.where(b >= 0, place[b.clamp(min=0)], self.cells) for b in below]), self.cells
             )
-        # those of no cell are a row of zeros, which is the last one of each of the 27
-        self.source_counts = (self.source % (self.cells + 1) != self.cells).sum(0, dtype=torch.int32)
         self.fields = torch.zeros(len(inverse), 8, **self.like)
         self.displacement, self.velocity = self.fields[:, :4], self.fields[:, 4:]
         self.lanes = lanes(self.device, _lanes(sizes))
@@ -110,8 +108,11 @@ class FusedTotal(Fused):
         self._take_pins()
         self.touching = None if bound.contact is None else FusedContact(bound, self.fields, self.active)
         self.shift = torch.zeros(len(inverse) if self.position else 0, 4, **self.like)
-        # a CPU sums the cells around a node by a kernel of its own (`total_join`)
-        self.joined = torch.zeros(len(active) if lanes(self.device, 0) else 0, 8, **self.like)
+        # a CPU sums the cells around a node by a kernel of its own (`total_join`), without the last row of each of the
+        # 27, which is of no cell
+        joined = self.source[:, : None if lanes(self.device, 0) else 0]
+        self.source_counts = (joined % (self.cells + 1) != self.cells).sum(0, dtype=torch.int32)
+        self.joined = torch.zeros(joined.shape[1], 8, **self.like)
         self.alone = torch.arange(len(self.joined), dtype=torch.int32, device=self.device)
         self._partial: dict[tuple[int, int, str], Tensor] = {}
         width = 8 if self.position else 4
