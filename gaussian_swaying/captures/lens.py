@@ -211,7 +211,7 @@ def remap(image: Tensor, source: Lens, target: Lens) -> Tensor:
 
 @lru_cache(maxsize=4)  # the frames of a film share a lens
 def _places(source: Lens, target: Lens, dtype: torch.dtype) -> Tensor:
-    """Where the pixels of a pinhole lens are in the picture of a distorted one, from -1 to 1, shape (1, H, W, 2)."""
+    """Places of the pixels of a pinhole lens in the picture of a distorted one, from -1 to 1, shape (1, H, W, 2)."""
     x = (torch.arange(target.width, dtype=torch.float64) + (0.5 - target.cx)) / target.fx
     y = (torch.arange(target.height, dtype=torch.float64) + (0.5 - target.cy)) / target.fy
     rows, columns = torch.meshgrid(y.to(dtype), x.to(dtype), indexing="ij")

@@ -140,7 +140,7 @@ class Fit:
 
     @property
     def followed(self) -> bool:
-        """Whether points are followed from frame to frame: the videos may have too little texture if they are not."""
+        """True if points are followed from frame to frame; otherwise the videos may have too little texture."""
         return "tracks" in self.stages or self.stages[0] == "matches"
 
     @property
