@@ -12,7 +12,7 @@ from gaussian_swaying.geometry.frame import SimFrame
 from gaussian_swaying.kernels.launch import replaces
 from gaussian_swaying.mpm.state import GridSpec, MaterialPoints, MPMState, State, bounding_grid
 from gaussian_swaying.mpm.transfer import Stencil, bspline_stencil, gather, scatter
-from gaussian_swaying.mpm.virtual_nodes import point_with_nodes, virtual_nodes
+from gaussian_swaying.mpm.virtual_nodes import first_nodes, point_with_nodes, virtual_nodes
 
 
 class Followers(nn.Module, ABC):
@@ -110,12 +110,14 @@ class PointFollowers(Followers):
         source: The point that each follows, shape (M,).
         arm: See :class:`Followers`.
         rest: Rest positions of the points [m], shape (P, 3).
+        attached: See :class:`~gaussian_swaying.mpm.state.MaterialPoints`; it decides which nodes they reach.
     """
 
     reads = ("position", "F_total")
 
-    def __init__(self, source: Tensor, arm: Tensor | None, rest: Tensor) -> None:
+    def __init__(self, source: Tensor, arm: Tensor | None, rest: Tensor, attached: Tensor | None = None) -> None:
         super().__init__(arm)
+        self._attached = attached
         self.register_buffer("source", source, persistent=False)
         self.register_buffer("rest", rest, persistent=False)
         self.source: Tensor
@@ -128,7 +130,13 @@ class PointFollowers(Followers):
 
     def some(self, index: Tensor) -> PointFollowers:
         """Some of them."""
-        return PointFollowers(self.source[index], None if self.arm is None else self.arm[index], self.rest)
+        arm = None if self.arm is None else self.arm[index]
+        return PointFollowers(self.source[index], arm, self.rest, self._attached)
+
+    def table(self, grid: GridSpec) -> Tensor | None:
+        """See :meth:`Followers.table`."""
+        virtual = virtual_nodes(first_nodes(self.rest, grid), grid, self._attached if grid.virtual else None)
+        return None if virtual is None else virtual.node[:, self.source]
 
     def _read(self, state: State) -> tuple[Tensor, Tensor]:
         return (state.position - self.rest)[self.source], state.F_total[self.source]

@@ -160,7 +160,8 @@ class SimulatedScene(nn.Module):
         own = self.frame.point_to_sim(cloud.means[moving].double())
         self.track: Followers | None = None
         if not by_grid:
-            self.follow: Followers = PointFollowers(anchor, _arm(own - place[anchor], dtype), self.points.position)
+            arm, points = _arm(own - place[anchor], dtype), self.points
+            self.follow: Followers = PointFollowers(anchor, arm, points.position, points.attached)
         else:
             read, nodes = on_material(place, near, self.points, dx)
             given = () if nodes is None else (nodes,)

@@ -24,11 +24,10 @@ from gaussian_swaying.viewer.session import Snapshot
 
 
 def drawable(snapshot: Snapshot) -> bool:
-    """True if a browser can draw a snapshot: the Gaussians follow nodes of the lattice, in a light that it knows."""
+    """True if a browser can draw a snapshot: the Gaussians follow nodes, in a light that it knows."""
     shader = snapshot.simulation.painter.shader
     with _turn(snapshot.simulation):
         has_nodes = snapshot.simulation.scene.follow.nodes(snapshot.state) is not None
-        has_nodes = has_nodes and getattr(snapshot.state, "grid").virtual == 0  # noqa: B009
     return has_nodes and (shader is None or isinstance(shader, DiffuseShader))
 
 
@@ -49,7 +48,7 @@ def scene_message(snapshot: Snapshot, turn: Tensor) -> bytes:
     moving, still = pack_splats(film, moving=True), pack_splats(film, moving=False)
     sizes = {"moving": len(moving), "still": len(still)}
     head = {"kind": "scene", "head": film.head, **sizes, "world": world.T.flatten().tolist()}
-    rest = film.order.astype("<u4").tobytes(), film.nodes.astype("<u4").tobytes()
+    rest = film.order.astype("<u4").tobytes(), film.stencils.astype("<u4").tobytes()
     return message(head, moving, still, *rest)
 
 

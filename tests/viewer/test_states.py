@@ -68,7 +68,7 @@ def test_a_scene_is_a_film_without_frames(session):
     moving, still = pack_splats(film, moving=True), pack_splats(film, moving=False)
     assert head["head"] == film.head
     assert (head["moving"], head["still"]) == (len(moving), len(still))
-    assert rest == moving + still + film.order.astype("<u4").tobytes() + film.nodes.astype("<u4").tobytes()
+    assert rest == moving + still + film.order.astype("<u4").tobytes() + film.stencils.astype("<u4").tobytes()
 
 
 def test_the_camera_finds_the_gaussians_in_any_scene(parser, settings, tmp_path):

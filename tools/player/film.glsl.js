@@ -34,9 +34,10 @@ export const FUNCTIONS = `
 
 // The motion of a Gaussian.
 const MOTION = (i) => `
-  vec3 place = uintBitsToFloat(texelFetch(${i.place}, texel, 0).xyz);
-  ivec3 base = ivec3(floor(place - 0.5));
-  vec3 f = place - vec3(base);
+  uvec4 placed = texelFetch(${i.place}, texel, 0);
+  vec3 place = uintBitsToFloat(placed.xyz);
+  int first = 9 * int(placed.w);
+  vec3 f = place - floor(place - 0.5);
   vec3 wx, wy, wz, sx, sy, sz;
   filmWeights(f.x, wx, sx);
   filmWeights(f.y, wy, sy);
@@ -45,11 +46,10 @@ const MOTION = (i) => `
   mat3 G = mat3(0.0);
   for (int a = 0; a < 3; ++a) {
     for (int b = 0; b < 3; ++b) {
-      // nodes along z are neighbours in the recorded list
-      int row = int(texelFetch(${i.rows}, base.zyx + ivec3(0, b, a), 0).r);
-      vec3 q0 = texelFetch(${i.moved}, filmTexel(row), 0).xyz;
-      vec3 q1 = texelFetch(${i.moved}, filmTexel(row + 1), 0).xyz;
-      vec3 q2 = texelFetch(${i.moved}, filmTexel(row + 2), 0).xyz;
+      uvec4 along_z = texelFetch(${i.rows}, filmTexel(first + 3 * a + b), 0);
+      vec3 q0 = texelFetch(${i.moved}, filmTexel(int(along_z.x)), 0).xyz;
+      vec3 q1 = texelFetch(${i.moved}, filmTexel(int(along_z.y)), 0).xyz;
+      vec3 q2 = texelFetch(${i.moved}, filmTexel(int(along_z.z)), 0).xyz;
       vec3 value = (wz.x * q0 + wz.y * q1 + wz.z * q2) * ${i.metre};
       vec3 along = (sz.x * q0 + sz.y * q1 + sz.z * q2) * ${i.metre};
       u += wx[a] * wy[b] * value;

@@ -63,7 +63,7 @@ const COARSE = 1 / 4; // of the window's pixels along each side, until all Gauss
 // `read(name)` gives a part of the file once it is there; `tell(sentence)` is called if the file ends too early.
 export async function play(read, tell) {
   const head = JSON.parse(new TextDecoder().decode(await read("head")));
-  const nodes = reader(await read("nodes"))(Uint32Array, head.nodes);
+  const stencils = reader(await read("stencils"))(Uint32Array, 27 * head.stencils);
   const frames = new Frames(head);
   const element = (name) => document.getElementById(name);
 
@@ -71,7 +71,7 @@ export async function play(read, tell) {
   const canvas = element("canvas");
   const drawing = new Drawing(canvas, (pictures) => wake(pictures));
   const { renderer } = drawing;
-  drawing.show(head, nodes);
+  drawing.show(head, stencils);
 
   async function take(index) {
     const [kind, first, last] = head.parts[index];

@@ -23,8 +23,8 @@ export function reader(bytes) {
 export const halves = Float32Array.from({ length: 65536 }, (_, bits) => THREE.DataUtils.fromHalfFloat(bits));
 
 // Bytes of a Gaussian, in the texels of each of its textures, as RECORD in page.py lists them: position and colour; rotation,
-// size and growth; for those that move also their place in the grid, and their normal.
-const TEXELS = { still: { rest: 16, shape: 15 }, moving: { rest: 16, shape: 15, place: 12, facing: 8 } };
+// size and growth; for those that move also their place in the grid, their stencil, and their normal.
+const TEXELS = { still: { rest: 16, shape: 15 }, moving: { rest: 16, shape: 15, place: 16, facing: 8 } };
 const STEP = 16; // bytes of a texel
 
 // ---- textures
@@ -45,14 +45,10 @@ function floats(count) {
   return made;
 }
 
-// Row of each node of the grid in the list of recorded nodes.
-function rowsTexture(nodes, [nx, ny, nz]) {
-  const data = new Uint32Array(nx * ny * nz);
-  nodes.forEach((node, row) => (data[node] = row));
-  const made = new THREE.DataArrayTexture(data, nz, ny, nx);
-  made.format = THREE.RedIntegerFormat;
-  made.type = THREE.UnsignedIntType;
-  made.internalFormat = "R32UI";
+// The 27 nodes of each stencil, as their rows in the list of nodes, in nine texels: those along z are together.
+function rowsTexture(stencils) {
+  const made = texels(stencils.length / 3);
+  stencils.forEach((row, k) => (made.image.data[4 * Math.floor(k / 3) + (k % 3)] = row));
   made.needsUpdate = true;
   return made;
 }
@@ -142,11 +138,9 @@ export class Drawing {
   }
 
   // Draw other Gaussians from now on, once they are added. Throws an Error if they are too many for this browser.
-  show(head, nodes) {
-    const { maxTextureSize } = this.renderer.capabilities;
-    const layers = this.renderer.getContext().getParameter(WebGL2RenderingContext.MAX_ARRAY_TEXTURE_LAYERS);
-    const height = Math.ceil(Math.max(head.count, nodes.length + 2) / WIDTH);
-    if (head.resolution[0] > layers || Math.max(height, ...head.resolution) > maxTextureSize)
+  show(head, stencils) {
+    const height = Math.ceil(Math.max(head.count, head.nodes, stencils.length / 3) / WIDTH);
+    if (height > this.renderer.capabilities.maxTextureSize)
       throw new Error("the scene is too large for the textures of this browser");
     this.clear();
     const { renderer } = this;
@@ -163,10 +157,10 @@ export class Drawing {
     });
     this.spark.sortWorker = makeSorter();
     this.count = head.count;
-    this.moved = floats(nodes.length + 2);
-    this.rows = rowsTexture(nodes, head.resolution);
+    this.moved = floats(head.nodes);
+    this.rows = rowsTexture(stencils);
     this.inputs = {
-      rows: new dyno.DynoUsampler2DArray({ value: this.rows }),
+      rows: new dyno.DynoUsampler2D({ value: this.rows }),
       moved: new dyno.DynoSampler2D({ value: this.moved }),
       cell: new dyno.DynoFloat({ value: head.cell }),
       metre: new dyno.DynoFloat({ value: head.metre }),

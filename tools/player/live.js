@@ -116,12 +116,12 @@ class Stage {
     if (head.kind === "scene") {
       this.drawing ??= new Drawing(this.canvas, (pictures) => (this.left = Math.max(this.left, pictures)));
       const last = head.moving + head.still;
-      const [order, nodes] = [new Uint32Array(head.head.count), new Uint32Array(head.head.nodes)];
+      const [order, stencils] = [new Uint32Array(head.head.count), new Uint32Array(27 * head.head.stencils)];
       new Uint8Array(order.buffer).set(rest.subarray(last, last + order.byteLength));
-      new Uint8Array(nodes.buffer).set(rest.subarray(last + order.byteLength));
+      new Uint8Array(stencils.buffer).set(rest.subarray(last + order.byteLength));
       this.place = new Uint32Array(order.length); // of each Gaussian of the splat among those that are drawn
       order.forEach((i, k) => (this.place[i] = k));
-      this.drawing.show(head.head, nodes);
+      this.drawing.show(head.head, stencils);
       this.drawing.add("moving", rest.subarray(0, head.moving));
       this.drawing.add("still", rest.subarray(head.moving, last));
       this.drawing.follow();

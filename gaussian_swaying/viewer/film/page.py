@@ -25,9 +25,10 @@ RECORD = {
     "scale": "<f2",
     "growth": "u1",
     "place": "<f4",
+    "stencil": "<u4",
     "facing": "<i2",
 }
-"""The numbers that are stored of a Gaussian, in this order; the last two only of those that move."""
+"""The numbers that are stored of a Gaussian, in this order; the last three only of those that move."""
 FIRST = {"moving": 1 << 11, "still": 1 << 12}
 """Gaussians that move, and that do not, in the first picture."""
 KINDS = ("moving", "still")
@@ -110,7 +111,10 @@ def pack(film: Film) -> dict[str, bytes]:
     counts = np.array([len(rows) for rows in far], np.uint32)
     parts = parts_of(film.head)
     start = len({kind for kind, _, _ in parts})
-    blocks = {"head": json.dumps(film.head | {"parts": parts, "start": start}).encode(), "nodes": _planes(film.nodes)}
+    blocks = {
+        "head": json.dumps(film.head | {"parts": parts, "start": start}).encode(),
+        "stencils": _planes(film.stencils),
+    }
     for index, (kind, first, last) in enumerate(parts):
         if kind == "frames":
             rows = np.concatenate(far[first:last])
@@ -166,9 +170,9 @@ def unpack(blocks: dict[str, bytes]) -> Film:
             last = bits[-1]
             continue
         rows, at = np.frombuffer(block, np.uint8).reshape(-1, count).T, 0
-        for name in list(RECORD)[: 7 if kind == "moving" else 5]:
+        for name in list(RECORD)[: 8 if kind == "moving" else 5]:
             own = np.dtype(RECORD[name])
-            width = own.itemsize * {"turn": 4, "facing": 4, "color": 4, "growth": 1}.get(name, 3)
+            width = own.itemsize * {"turn": 4, "facing": 4, "color": 4, "growth": 1, "stencil": 1}.get(name, 3)
             found[name].append(np.ascontiguousarray(rows[:, at : at + width]).view(own))
             at += width
     kinds = [kind for kind, _, _ in parts if kind != "frames"]
@@ -177,8 +181,8 @@ def unpack(blocks: dict[str, bytes]) -> Film:
         owners = kinds if len(pieces) == len(kinds) else ["moving"] * len(pieces)
         ordered = [piece for kind in KINDS for piece, owner in zip(pieces, owners, strict=True) if owner == kind]
         fields[name] = np.concatenate(ordered)
-    nodes = _unplaned(blocks["nodes"], np.dtype("<u4"))
-    return Film(head, **fields, order=np.arange(head["count"]), nodes=nodes, displacement=np.stack(moved))
+    stencils = _unplaned(blocks["stencils"], np.dtype("<u4")).reshape(-1, 27)
+    return Film(head, **fields, order=np.arange(head["count"]), stencils=stencils, displacement=np.stack(moved))
 
 
 def _planes(values: np.ndarray) -> bytes:

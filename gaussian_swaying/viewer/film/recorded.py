@@ -15,10 +15,12 @@ from torch import Tensor
 from gaussian_swaying._devices import in_double
 from gaussian_swaying.config.parser import parse_file
 from gaussian_swaying.gaussians.harmonics import sh_to_color
+from gaussian_swaying.geometry.groups import equal_rows
 from gaussian_swaying.geometry.rotations import quat_multiply, rotation_to_quat
 from gaussian_swaying.mpm.followers import follower_stencil
 from gaussian_swaying.mpm.state import GridSpec
-from gaussian_swaying.mpm.transfer import gather
+from gaussian_swaying.mpm.transfer import Stencil, gather
+from gaussian_swaying.mpm.virtual_nodes import coordinates
 from gaussian_swaying.recording.nodes import load_nodes
 from gaussian_swaying.rendering.cameras.camera import Camera
 from gaussian_swaying.rendering.shading import DiffuseShader
@@ -37,7 +39,8 @@ class Film:
     that some thousands show it already.
 
     The unit of length is the object's longest side at rest, with z up and the origin at its centre. A place is given in
-    cells of the grid, from its first node.
+    cells of the grid, from its first node. A stencil is 27 nodes, those along z next to each other; Gaussians in one
+    cell share one, except where parts of it have nodes of their own.
 
     Attributes:
         head: Further data for the page: sizes, time between frames [s], grid, light, camera, title.
@@ -45,12 +48,13 @@ class Film:
         place: Position at which those that move take displacement and gradient [cells], float32, shape (L, 3).
         scale: Logarithm of the standard deviations, float16, shape (N, 3).
         turn: Quaternions wxyz in steps of 1/32767, int16, shape (N, 4).
+        stencil: The number of the stencil of each of them, uint32, shape (L, 1).
         facing: Unit normals of those that move in steps of 1/32767, and 32767 for Gaussians of a solid, int16, shape
             (L, 4).
         color: Red, green, blue and opacity in steps of 1/255, uint8, shape (N, 4).
         growth: How much each grows while others are missing (:func:`growth`), in steps of 1/255, uint8, shape (N, 1).
         order: The index of each in the splat, int64, shape (N,); the file does not have it.
-        nodes: Flat indices of the nodes in the grid, rising, uint32, shape (M,).
+        stencils: The nodes of each stencil, as rows of ``displacement``, uint32, shape (S, 27).
         displacement: Displacement of the nodes [m], float32, shape (K, M, 3); float16 is enough for most.
         notes: Sentences on what the film does not show as the run does.
     """
@@ -58,13 +62,14 @@ class Film:
     head: dict[str, Any]
     position: np.ndarray
     place: np.ndarray
+    stencil: np.ndarray
     scale: np.ndarray
     turn: np.ndarray
     facing: np.ndarray
     color: np.ndarray
     growth: np.ndarray
     order: np.ndarray
-    nodes: np.ndarray
+    stencils: np.ndarray
     displacement: np.ndarray
     notes: tuple[str, ...] = ()
 
@@ -78,20 +83,14 @@ def read_film(run: Path) -> Film:
         run: The output folder of ``gaussian-swaying sim``.
 
     Raises:
-        ValueError: If the folder is not of a run, the run is of ``updated``, has no recorded nodes or parts with nodes
-            of their own, the nodes are damaged or move a Gaussian farther than any run does, or its splat has moved or
-            changed.
+        ValueError: If the folder is not of a run, the run is of ``updated`` or has no recorded nodes, the nodes are
+            damaged or move a Gaussian farther than any run does, or its splat has moved or changed.
     """
     summary = _summary(run)
     simulation, name = _rebuild(run, summary)
     displacement = load_nodes(run / "nodes.npz")
     start: Any = simulation.start()
     grid, scene = start.grid, simulation.scene
-    if grid.virtual:
-        raise ValueError(
-            f"The run in {run} is of `scene.connected: surface`, where parts have nodes of their own, which a film "
-            "cannot show: its video does, or run it with `scene.connected: grid`."
-        )
     nodes = scene.follow.nodes(start)
     assert nodes is not None  # the run is of `total`
     if displacement.shape[1] != len(nodes):
@@ -111,9 +110,9 @@ def _check_near(path: Path, scene: SimulatedScene, grid: GridSpec, nodes: Tensor
     moved farther than the farthest node, so only frames with such a node are looked at closely.
     """
     most = FARTHEST * scene.size * scene.frame.metres_per_unit
-    stencil = follower_stencil(in_double(scene.follow.places), grid)
+    stencil = follower_stencil(in_double(scene.follow.places), grid, scene.follow.table(grid))
     for k in (displacement.norm(dim=-1) > most).any(1).nonzero()[:, 0].tolist():
-        field = torch.zeros(math.prod(grid.resolution), 3, dtype=torch.float64)
+        field = torch.zeros(grid.node_count, 3, dtype=torch.float64)
         field[nodes] = displacement[k].double()
         farthest = float(gather(field, stencil)[..., 0, :].norm(dim=-1).max())
         if not farthest <= most:
@@ -182,7 +181,7 @@ def film_of(simulation: Simulation, grid: GridSpec, nodes: Tensor, displacement:
     turn = quat_multiply(rotation_to_quat(in_double(scene.frame.rotation)).to(quats), quats)
     scale = in_double(scene.model.scales.detach()) + math.log(scene.frame.metres_per_unit / size)
     moving, order = order_of(scene)
-    place = in_cells(scene.follow.places, grid).float().to(device)[moving]
+    place, stencil, stencils = stencils_of(scene.follow.stencil(grid), grid, nodes)
     facing = torch.cat([scene.rest_facing.float(), scene.solid().float()[:, None]], dim=1)[moving]
     color = sh_to_color(scene.model.sh0, torch.ones(count, 3, device=device))
     color = torch.cat([color, scene.model.opacity()[:, None]], dim=-1)
@@ -195,12 +194,12 @@ def film_of(simulation: Simulation, grid: GridSpec, nodes: Tensor, displacement:
         "count": count,
         "moving": len(moving),
         "nodes": len(nodes),
+        "stencils": len(stencils),
         "frames": len(displacement),
         "frame_dt": simulation.frame_dt,
         "metre": 1 / size,
         "cell": grid.dx / size,
         "corner": [first * grid.dx / size for first in grid.offset],
-        "resolution": list(grid.resolution),
         "max_stretch": scene.max_stretch,
         **look_of(painter),
         "camera": _camera(camera, scene, size),
@@ -210,14 +209,15 @@ def film_of(simulation: Simulation, grid: GridSpec, nodes: Tensor, displacement:
     return Film(
         head,
         position[doubled].float().numpy(force=True),
-        place.numpy(force=True),
+        place[moving].numpy(force=True),
+        stencil[moving, None].numpy(force=True).astype(np.uint32),
         scale[doubled].half().numpy(force=True),
         _steps(turn[doubled]),
         _steps(facing),
         (color[order].clamp(0, 1) * 255).round().to(torch.uint8).numpy(force=True),
         (growth(scene, camera)[order, None] * 255).round().to(torch.uint8).numpy(force=True),
         order.numpy(force=True),
-        nodes.numpy(force=True).astype(np.uint32),
+        stencils.numpy(force=True).astype(np.uint32),
         displacement.numpy(force=True),
         tuple(notes),
     )
@@ -309,17 +309,27 @@ def look_of(painter: Painter) -> dict[str, Any]:
     return {"shader": light, "background": painter.background.tolist()}
 
 
-def in_cells(places: Tensor, grid: GridSpec) -> Tensor:
-    """Places [m] in cells of the grid, from its first node, shape (N, 3), float64.
+def stencils_of(stencil: Stencil, grid: GridSpec, nodes: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Where places read the motion, as a browser does it.
 
-    Those that lie on a border between stencils but for rounding are moved onto it, as in
-    :func:`~gaussian_swaying.mpm.followers.follower_stencil`.
+    Args:
+        stencil: Of the places.
+        grid: The grid.
+        nodes: Flat indices of the nodes that are known, rising, shape (M,).
+
+    Returns:
+        The places in cells of the grid from its first node, float32, shape (N, 3); rounding leaves each in the cell of
+        its stencil, where it is ``floor(place - 0.5)``. The number of the stencil of each, shape (N,), and the rows of
+        the 27 nodes of each stencil in ``nodes``, shape (S, 27).
     """
-    cells = places / grid.dx
-    border = cells.floor() + 0.5
-    close = (cells - border).abs() < torch.finfo(places.dtype).eps ** 0.5
-    found = in_double(torch.where(close, border, cells))
-    return found - torch.tensor(grid.offset, device=found.device)
+    reached = stencil.node.reshape(-1, 27)
+    number = equal_rows(stencil.first[:, None] if stencil.nodes is None else reached)
+    count = int(number.max()) + 1 if len(number) else 0
+    example = number.new_zeros(count).index_copy(0, number, torch.arange(len(number), device=number.device))
+    low = coordinates(stencil.first, grid).float()
+    place = low + 1.5 + stencil.factors[1, :, 0].T * grid.dx  # from the slope of the first weight, (f - 1.5) / dx
+    last = torch.nextafter(low + 1.5, low)
+    return place.float().clamp(low + 0.5, last), number, torch.searchsorted(nodes, reached[example])
 
 
 def _steps(values: Tensor) -> np.ndarray:

@@ -1,8 +1,14 @@
 """A small flag, recorded as a run."""
 
-import pytest
-import yaml
+import dataclasses
 
+import pytest
+import torch
+import yaml
+from small_scenes import together
+
+from gaussian_swaying.gaussians.ply import write_ply
+from gaussian_swaying.scenes.procedural import FlagScene
 from gaussian_swaying.simulation.simulation import Simulation
 
 FRAMES = 6
@@ -57,6 +63,16 @@ def make_flag(tmp_path_factory):
         return Simulation.from_yaml(path, device="cpu")
 
     return make
+
+
+@pytest.fixture(scope="session")
+def flags(tmp_path_factory):
+    """Settings of a scene of two flags, one less than a cell behind the other, which share no nodes."""
+    flag = FlagScene(spacing=0.05).generate()
+    path = tmp_path_factory.mktemp("flags") / "flags.ply"
+    places = [flag.means + torch.tensor([0.0, y, 0.0]) for y in (-0.045, 0.04)]
+    write_ply(path, together(*(dataclasses.replace(flag, means=place) for place in places)))
+    return {"generator": None, "ply": str(path), "connected": "surface", "metres_per_unit": 1.0}
 
 
 @pytest.fixture(scope="session")

@@ -18,13 +18,18 @@ SHOWN = "!!window.film || !document.getElementById('message').textContent.starts
 
 
 LOW = {"class_path": "Box", "init_args": {"min": [None, None, 0.2], "max": [None] * 3}}
-STRETCHED = {"scene": {"max_stretch": 1.03, "region": LOW}}  # many are drawn at the limit, and a part stands still
 
 
 @pytest.fixture(scope="module")
-def run(make_flag, tmp_path_factory):
+def stretched(flags):
+    """Many Gaussians are drawn at the limit, a part stands still, and two flags have their own nodes."""
+    return {"scene": flags | {"max_stretch": 1.03, "region": LOW}}
+
+
+@pytest.fixture(scope="module")
+def run(make_flag, stretched, tmp_path_factory):
     folder = tmp_path_factory.mktemp("stretched") / "flag"
-    make_flag(**STRETCHED).run(folder, 6, progress=False)
+    make_flag(**stretched).run(folder, 6, progress=False)
     return folder
 
 
@@ -75,11 +80,11 @@ def _psnr(one, other):
     return 10 * np.log10(255**2 / np.mean((one - other) ** 2))
 
 
-def test_the_film_is_the_run(show, film, run, make_flag):
+def test_the_film_is_the_run(show, film, run, make_flag, stretched):
     """Centres from the GPU, pictures as those of the run, scrubbing, playing; nothing is asked of a network."""
     import imageio.v3 as iio
 
-    page, simulation = show(film), make_flag(**STRETCHED)
+    page, simulation = show(film), make_flag(**stretched)
     assert page.evaluate("document.getElementById('message').hidden")
     scene = simulation.scene
     size, pictures = scene.size * scene.frame.metres_per_unit, {}
@@ -134,8 +139,8 @@ def large(run, tmp_path_factory):
     """The same film as if it had many Gaussians and frames: in parts, of which the first are small."""
     target = tmp_path_factory.mktemp("large") / "film.html"
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(film_page, "FIRST", {"moving": 100, "still": 100})
-        patch.setattr(film_page, "PART", 150)
+        patch.setattr(film_page, "FIRST", {"moving": 200, "still": 200})
+        patch.setattr(film_page, "PART", 300)
         patch.setattr(film_page, "GROUP", 2)
         write_film(run, target)
     return target

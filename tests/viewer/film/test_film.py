@@ -32,27 +32,24 @@ from gaussian_swaying.viewer.film.page import PAGE, pack, page, unpack
 from gaussian_swaying.viewer.film.recorded import growth, read_film, spread
 
 FRAMES = 6
+FIELDS = ("position", "place", "stencil", "scale", "growth", "turn", "facing", "color", "stencils", "displacement")
 
 
 def moved(film, frame):
     """Centres and covariances of a film's frame [its units], by the formula of the page, in float64."""
     head = film.head
-    row = np.full(np.prod(head["resolution"]), -1)
-    row[film.nodes] = np.arange(len(film.nodes))
     count = len(film.position)
-    place = torch.cat([torch.from_numpy(film.place), torch.full((count - len(film.place), 3), -1.0)]).double()
-    base = (place - 0.5).floor()
-    w, slope = bspline_weights((place - base).T)
+    movers = len(film.place)
+    place = torch.cat([torch.from_numpy(film.place), torch.full((count - movers, 3), -1.0)])
+    f = (place - (place - 0.5).floor()).double()  # in float32, as the page does
+    place, (w, slope) = place.double(), bspline_weights(f.T)
+    rows = np.zeros((count, 27), int)
+    rows[:movers] = film.stencils[film.stencil[:, 0]]
     u, gradient = torch.zeros(len(place), 3).double(), torch.zeros(len(place), 3, 3).double()
     displacement = torch.from_numpy(film.displacement[frame]).double() * head["metre"]
     for i, j, k in np.ndindex(3, 3, 3):
-        x, y, z = (base + torch.tensor([i, j, k])).long().T.numpy()
-        _, ny, nz = head["resolution"]
-        at = row[np.maximum((x * ny + y) * nz + z, 0)]
-        q = displacement[np.maximum(at, 0)]
+        q = displacement[rows[:, 9 * i + 3 * j + k]]
         weights = w[0, i] * w[1, j] * w[2, k]
-        absent = (at < 0) & (place[:, 0].numpy() >= 0)
-        assert not bool((weights[absent] > 1e-12).any()), "a node is missing"
         u += weights[:, None] * q
         along = (slope[0, i] * w[1, j] * w[2, k], w[0, i] * slope[1, j] * w[2, k], w[0, i] * w[1, j] * slope[2, k])
         gradient += q[:, :, None] * torch.stack(along, dim=-1)[:, None, :]
@@ -101,6 +98,19 @@ def test_centres_and_covariances_are_those_of_the_run(make_flag, run, tmp_path, 
     assert most > 0.02  # it moved
 
 
+@pytest.mark.parametrize("points", ["grid", "gaussian"])
+def test_parts_with_nodes_of_their_own(make_flag, flags, tmp_path, points):
+    """Two flags closer than a cell, in one cell each with a stencil of its own."""
+    make = lambda: make_flag(scene=flags | {"points": points}, recorder={"images": False})  # noqa: E731
+    make().run(tmp_path / "run", 4, progress=False)
+    simulation, film = make(), read_film(tmp_path / "run")
+    cells = np.unique(np.floor(film.place - 0.5), axis=0)
+    assert film.head["stencils"] > 1.8 * len(cells)
+    for frame in simulation.frames(4):
+        most = check(simulation, film, frame.index, frame.state)
+    assert most > 0.02
+
+
 def test_carried_static_and_plated_gaussians(make_flag, tmp_path):
     """Part of the flag is static, part is faint and follows, and the sheet has three layers."""
     region = {"class_path": "Box", "init_args": {"min": [None, None, 0.2], "max": [None, None, None]}}
@@ -127,7 +137,7 @@ def test_nothing_is_lost_in_the_file(run, tmp_path, capsys):
     assert b"SparkRenderer" in blocks.pop("code")
     film, again = read_film(run), unpack(blocks)
     assert film.head == again.head
-    for name in ("position", "place", "scale", "growth", "turn", "facing", "color", "nodes", "displacement"):
+    for name in FIELDS:
         one, other = getattr(film, name), getattr(again, name)
         assert one.dtype == other.dtype
         assert np.array_equal(one, other)
@@ -137,7 +147,7 @@ def test_nothing_is_lost_in_the_file(run, tmp_path, capsys):
     data = sum(len(block) for block in pack(film).values())
     head, rest = film.head, len(parts["code"]) + 16_384
     far = sum(len(split_at(frame, (frame.astype("f2") != frame).any(1))[1]) for frame in film.displacement)
-    raw = 31 * head["count"] + 20 * head["moving"] + head["nodes"] * (4 + 6 * head["frames"])
+    raw = 31 * head["count"] + 24 * head["moving"] + 108 * head["stencils"] + 6 * head["nodes"] * head["frames"]
     raw += 4 * head["frames"] + 16 * far + len(blocks["head"])
     assert data == raw
     assert len(text) < rest + 4 / 3 * (1.001 * raw + 256)
@@ -153,16 +163,16 @@ def test_a_large_film_comes_in_parts(run, monkeypatch):
     monkeypatch.setattr(film_page, "GROUP", 4)
     film = read_film(run)
     film.head["moving"] = 250  # as if the others stood still
-    film = replace(film, place=film.place[:250], facing=film.facing[:250])
+    film = replace(film, place=film.place[:250], stencil=film.stencil[:250], facing=film.facing[:250])
     blocks = pack(film)
     head = json.loads(blocks["head"])
     assert head["start"] == 3
     assert head["parts"][:5] == [
         ["moving", 0, 30], ["still", 0, 20], ["frames", 0, 4], ["moving", 30, 130], ["still", 20, 120]
     ]  # fmt: skip
-    assert list(blocks) == ["head", "nodes", *(f"part-{k}" for k in range(len(head["parts"])))]
+    assert list(blocks) == ["head", "stencils", *(f"part-{k}" for k in range(len(head["parts"])))]
     again = unpack(blocks)
-    for name in ("position", "place", "scale", "growth", "turn", "facing", "color", "nodes", "displacement"):
+    for name in FIELDS:
         assert np.array_equal(getattr(film, name), getattr(again, name)), name
 
 
@@ -351,7 +361,7 @@ def test_braces_in_a_name_are_text(run):
     film.head["title"] = "{{parts}} {{background}} <b>"
     text = page(film)
     assert "<title>{{parts}} {{background}} &lt;b&gt;</title>" in text
-    assert text.count('id="film-nodes"') == 1
+    assert text.count('id="film-stencils"') == 1
 
 
 def test_a_splat_that_moved_or_changed_is_refused(make_flag, tmp_path, capsys):
