@@ -22,6 +22,7 @@ from gaussian_swaying.config.material_names import NAMES
 from gaussian_swaying.config.parser import parse_text
 from gaussian_swaying.gaussians.cloud import GaussianCloud
 from gaussian_swaying.gaussians.formats import read_gaussians
+from gaussian_swaying.preview.apart import why_apart
 from gaussian_swaying.preview.calibration import (
     SWAY,
     calibrated_suggestion,
@@ -36,7 +37,7 @@ from gaussian_swaying.preview.cost import (
     with_whole,
 )
 from gaussian_swaying.preview.photos import captured_from
-from gaussian_swaying.preview.picture import preview_picture, things_picture
+from gaussian_swaying.preview.picture import classify, preview_picture, things_picture
 from gaussian_swaying.preview.place import Place, excerpt, near_things, survey
 from gaussian_swaying.preview.report import (
     area_line,
@@ -108,9 +109,10 @@ def build_options() -> argparse.ArgumentParser:
     )
     add(
         "--connected",
-        default="grid",
-        choices=("grid", "surface"),
-        help="what shares nodes of the grid: with surface, leaves closer than a cell move apart",
+        default="auto",
+        choices=("auto", "grid", "surface"),
+        help="what shares nodes of the grid: with surface, leaves closer than a cell move apart; auto: for a plant "
+        "with such leaves",
     )
     add("--material", metavar="NAME", help=f"its numbers, instead of softer ones: {NAMES}")
     add("--frames", type=int, default=250, help="frames of the configuration")
@@ -159,12 +161,20 @@ def preview_scene(options: argparse.Namespace, folder: Path) -> Preview:
         part, upward, around = excerpt(place, cloud, chosen)
         found = upward, around
     suggestion = suggest(part, up, options.hold, region, options.longest_side, options.wind, capture, quality, found)
+    wanted = options.connected
+    if wanted == "auto":
+        wanted = "surface" if suggestion.material == "leaf" else "grid"
     if options.material is not None:
         suggestion = of_material(suggestion, options.material)
-    suggestion = replace(suggestion, connected=options.connected)
+    suggestion = replace(suggestion, connected=wanted)
     begin = Stopwatch()
     draft, settings = _tried(suggestion, lambda made: draft_yaml(made, options.scene), options.device, part)
     startup = LOADED + read + begin.quiet
+    if options.connected == "auto" and wanted == "surface":
+        why = why_apart(draft.scene, suggestion.dx, classify(draft).pinned)
+        suggestion = replace(suggestion, connected_reason=why or "", connected="grid" if why is None else "surface")
+        if why is None:
+            draft, settings = _tried(suggestion, lambda made: draft_yaml(made, options.scene), options.device, part)
     if settings.scene.ply != str(Path(options.scene).resolve()):
         raise ValueError(f"The path {options.scene!r} has another meaning in YAML: rename the file, without a colon.")
     suggestion = calibrated_suggestion(suggestion, draft, options.sway)
@@ -374,7 +384,7 @@ def _preview(options: argparse.Namespace) -> None:
     if options.config is not None and (options.quality is not None or options.minutes is not None):
         one = "--quality" if options.minutes is None else "--minutes"
         raise ValueError(f"`{one}` is for suggestions, and `--config` is shown unchanged: leave out one of them.")
-    if options.config is not None and options.connected != "grid":
+    if options.config is not None and options.connected != "auto":
         raise ValueError("`--connected` is for suggestions, and `--config` is shown unchanged: leave out one of them.")
     if options.minutes is not None:
         check_positive("--minutes", options.minutes)

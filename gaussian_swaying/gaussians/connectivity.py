@@ -152,22 +152,37 @@ def _missing(where: Tensor, pairs: Tensor, labels: Tensor, to: Sequence[int | No
     return torch.cat(found)
 
 
-def shades(cell: Tensor, pairs: Tensor, count: int = 6) -> tuple[Tensor, Tensor]:
-    """A number for each Gaussian so that those in one cell that are not attached within it differ.
+def pieces(cell: Tensor, pairs: Tensor) -> tuple[Tensor, Tensor]:
+    """What is attached within cells.
+
+    Args:
+        cell: A number for the cell of each Gaussian, from 0 on, shape (N,).
+        pairs: See :func:`attached_pairs`.
+
+    Returns:
+        The piece of each, shape (N,), and whether its cell has several of at least :data:`STRAY` Gaussians, (N,).
+    """
+    piece = joined(len(cell), pairs[cell[pairs[:, 0]] == cell[pairs[:, 1]]].T)
+    size = piece.bincount()
+    large = sums((size >= STRAY).long(), torch.zeros_like(size).index_copy(0, piece, cell))
+    return piece, (large >= 2)[cell]
+
+
+def shades(cell: Tensor, piece: Tensor, pairs: Tensor, count: int = 6) -> Tensor:
+    """A number for each Gaussian so that the pieces of a cell differ.
 
     Pieces of neighbouring cells that are attached have the same number where they can, so that a leaf has one.
 
     Args:
         cell: A number for the cell of each, from 0 on, shape (N,).
+        piece: See :func:`pieces`.
         pairs: See :func:`attached_pairs`.
         count: How many numbers there are.
 
     Returns:
-        The numbers, shape (N,), and whether a cell has several pieces of at least :data:`STRAY` Gaussians, (N,).
+        The numbers, shape (N,).
     """
-    piece = joined(len(cell), pairs[cell[pairs[:, 0]] == cell[pairs[:, 1]]].T)
-    many = int(piece.max()) + 1
-    size = piece.bincount()
+    many, size = int(piece.max()) + 1, piece.bincount()
     of = torch.zeros(many, dtype=torch.long).index_copy(0, piece, cell)
     ends = torch.unique(piece[pairs].sort(1).values, dim=0)
     ends = ends[ends[:, 0] != ends[:, 1]]
@@ -190,5 +205,4 @@ def shades(cell: Tensor, pairs: Tensor, count: int = 6) -> tuple[Tensor, Tensor]
             free = [c for c in range(count) if c not in taken] or [0]
             shade[k] = max(set(wanted), key=wanted.count) if wanted else free[start % len(free)]
             queue += [m for m in beside[k] if shade[m] < 0]
-    large = sums((size >= STRAY).long(), of)
-    return torch.from_numpy(shade)[piece], (large >= 2)[cell]
+    return torch.from_numpy(shade)[piece]

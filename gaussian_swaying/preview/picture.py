@@ -16,9 +16,9 @@ from gaussian_swaying.gaussians.cloud import GaussianCloud
 from gaussian_swaying.gaussians.connectivity import shades
 from gaussian_swaying.gaussians.harmonics import SH_DC
 from gaussian_swaying.geometry.covariances import covariance
-from gaussian_swaying.geometry.groups import equal_rows
 from gaussian_swaying.geometry.regions import Box, Region
 from gaussian_swaying.mpm.boundaries.boundary import Boundary
+from gaussian_swaying.preview.apart import pieces_of_nodes
 from gaussian_swaying.preview.framing import SOLID, nearby, whole_box
 from gaussian_swaying.preview.place import Place
 from gaussian_swaying.preview.ticks import draw_ticks
@@ -41,9 +41,9 @@ NORMAL = (250, 200, 40)
 UP = (40, 40, 40)
 SOFT = ((60, 70, 220), (0, 170, 60), (170, 60, 170), (220, 150, 0))  # of several soft parts, in turn
 PIECES = (*SOFT, (0, 160, 190), (200, 90, 40))  # of what is connected along the surface, in turn
-REACH = 3  # cells that a node reaches
 THING = 300  # width and height of the picture of a thing [pixels]
 MOST_DRAWN = 200_000  # Gaussians of it
+Tint = tuple[str, Tensor, tuple[int, ...]]  # a name, Gaussians and their colour
 
 
 @dataclass(frozen=True)
@@ -147,11 +147,19 @@ def preview_picture(
     elevation = max(-60.0, min(60.0, elevation))
     low, high = (torch.tensor(corner, dtype=torch.float64) for corner in whole or _whole(simulation, parts))
     center, reach = (0.5 * (low + high)).tolist(), 1.7 * float((high - low).norm())  # room for arrows and coordinates
-    views = []
+    views, (pieces, beside) = [], _pieces(simulation)
+    tints = pieces or _soft(simulation)
     for turn in (0.0, 90.0):
         camera = orbit_camera(center, frame.rotation[2], reach, azimuth - turn, elevation, 40.0, height, height)
-        views.append(_view(simulation, parts, camera.to(simulation.device), normals, f"azimuth {azimuth - turn:.0f}°"))
+        views.append(
+            _view(simulation, parts, camera.to(simulation.device), normals, f"azimuth {azimuth - turn:.0f}°", tints)
+        )
     entries = _entries(parts, simulation)
+    if pieces:
+        words = f"one colour: connected along the surface; {100 * beside:.0f} % lie beside something else"
+        entries.append((PIECES[0], words))
+    else:
+        entries += [(tint, f"{name}: {int(mask.sum()):,} Gaussians, soft") for name, mask, tint in tints]
     page = Image.new("RGB", (2 * height, height + 12 + 24 * -(-len(entries) // 2)), (255, 255, 255))
     for k, view in enumerate(views):
         page.paste(view, (k * height, 0))
@@ -221,7 +229,7 @@ def _whole(simulation: Simulation, parts: Parts) -> tuple[list[float], list[floa
     return whole_box(means, opacity, parts.simulated, outside, simulation.solver.dx / scene.frame.metres_per_unit)
 
 
-def _view(simulation: Simulation, parts: Parts, camera: Camera, normals: int, title: str) -> Any:
+def _view(simulation: Simulation, parts: Parts, camera: Camera, normals: int, title: str, tints: Sequence[Tint]) -> Any:
     """One view with annotations, as a PIL image."""
     from PIL import Image, ImageDraw, ImageFont
 
@@ -229,7 +237,7 @@ def _view(simulation: Simulation, parts: Parts, camera: Camera, normals: int, ti
     rest = scene.rest()
     view = torch.nn.functional.normalize(rest.means - camera.position.to(rest.means), dim=-1)
     colours = scene.model.colors(view).clamp(0, 1)
-    colours = _tinted(colours, parts, _pieces(simulation)[0] or _soft(simulation))
+    colours = _tinted(colours, parts, tints)
     plain = torch.full((3,), 0.96, device=colours.device)
     opacity = scene.model.opacity()
     renderer = make_renderer(colours.device, detail=DETAIL)
@@ -256,7 +264,7 @@ def _view(simulation: Simulation, parts: Parts, camera: Camera, normals: int, ti
     return picture
 
 
-def _soft(simulation: Simulation) -> list[tuple[str, Tensor, tuple[int, ...]]]:
+def _soft(simulation: Simulation) -> list[Tint]:
     """Names, Gaussians and colours of the soft parts, if there are several."""
     parts = simulation.scene.parts
     soft = [] if parts is None else [part.name for part in parts.parts if part.role == "soft"]
@@ -265,7 +273,7 @@ def _soft(simulation: Simulation) -> list[tuple[str, Tensor, tuple[int, ...]]]:
     return [(name, parts.mask(name), SOFT[k % len(SOFT)]) for k, name in enumerate(soft)]
 
 
-def _pieces(simulation: Simulation) -> tuple[list[tuple[str, Tensor, tuple[int, ...]]], float]:
+def _pieces(simulation: Simulation) -> tuple[list[Tint], float]:
     """Gaussians and colours of what shares nodes, if only what is connected does, and how much lies beside others.
 
     What a node reaches has one colour if it is connected there, and pieces of it have different ones.
@@ -273,18 +281,18 @@ def _pieces(simulation: Simulation) -> tuple[list[tuple[str, Tensor, tuple[int, 
     scene = simulation.scene
     if scene.pairs is None:
         return [], 0.0
-    index, side = scene.simulated.cpu(), REACH * simulation.solver.dx / scene.frame.metres_per_unit
-    cell = equal_rows((scene.model.means.detach().cpu().double()[index] / side).floor())
-    shade, several = shades(cell, scene.pairs, len(PIECES))
-    found: list[tuple[str, Tensor, tuple[int, ...]]] = []
+    index = scene.simulated.cpu()
+    cell, piece, beside = pieces_of_nodes(scene, simulation.solver.dx)
+    shade = shades(cell, piece, scene.pairs, len(PIECES))
+    found: list[Tint] = []
     for k, colour in enumerate(PIECES):
         mask = torch.zeros(len(scene.model.means), dtype=torch.bool)
         mask[index[shade == k]] = True
         found.append(("", mask, colour))
-    return found, float(several.double().mean())
+    return found, beside
 
 
-def _tinted(colours: Tensor, parts: Parts, soft: Sequence[tuple[str, Tensor, tuple[int, ...]]] = ()) -> Tensor:
+def _tinted(colours: Tensor, parts: Parts, soft: Sequence[Tint] = ()) -> Tensor:
     """Colours with soft parts, pinned and pushed Gaussians tinted and static ones grey and pale."""
     for _, mask, tint in soft:
         colours = torch.where(mask.to(colours.device)[:, None], tinted(colours, tint, 0.4), colours)
@@ -417,11 +425,7 @@ def _entries(parts: Parts, simulation: Simulation) -> list[tuple[tuple[int, ...]
     ]
     if bool(parts.pushed.any()):
         entries.append((PUSHED, f"pushed: {int(parts.pushed.sum()):,} Gaussians"))
-    pieces, beside = _pieces(simulation)
-    if pieces:
-        words = f"one colour: connected along the surface; {100 * beside:.0f} % lie beside something else"
-        return [*entries, (PIECES[0], words)]
-    return entries + [(tint, f"{name}: {int(mask.sum()):,} Gaussians, soft") for name, mask, tint in _soft(simulation)]
+    return entries
 
 
 def _legend(

@@ -99,11 +99,20 @@ def suggestion_lines(guess: Suggestion, further: int) -> list[str]:
         f"grid            quality {guess.quality}: dx = {guess.dx:g} m, {guess.longest_side / guess.dx:.0f} cells "
         f"along the longest side, {guess.dx / max(guess.spacing, 1e-30):.1f} times the particle spacing of "
         f"{guess.spacing:.3g} m",
+        *_nodes(guess),
         "further points  " + (f"{further:,} where Gaussians are sparse for this grid" if further else "none needed"),
         f"material        {_material(guess)}",
         f"wind            {wind_words(guess.flow, guess.up.direction)}",
     ]
     return ["", "guesses (each can be set instead, see --help)", *(f"  {line}" for line in lines)]
+
+
+def _nodes(guess: Suggestion) -> list[str]:
+    """The line that says why connected parts have nodes of their own, if that was not asked for."""
+    if not guess.connected_reason:
+        return []
+    words = "each connected part has its own (scene.connected: surface)"
+    return [f"nodes           {words}, as {guess.connected_reason}; --connected grid leaves them shared"]
 
 
 def area_line(run: dict[str, Any]) -> str:

@@ -145,6 +145,7 @@ class Suggestion:
             or a tree; else None.
         growth: Mean number of substeps of a frame over the number at rest, from the trial runs.
         connected: ``scene.connected`` of the starter.
+        connected_reason: Why it is ``surface``, in words, if that was not asked for.
         real: Whether the numbers are those of the material; if not, they are such that it sways visibly.
     """
 
@@ -171,6 +172,7 @@ class Suggestion:
     parts: FoundParts | None = None
     growth: float = 1.0
     connected: str = "grid"
+    connected_reason: str = ""
     real: bool = False
 
     @property

@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from gaussian_swaying.gaussians import connectivity
-from gaussian_swaying.gaussians.connectivity import shades
+from gaussian_swaying.gaussians.connectivity import pieces, shades
 from gaussian_swaying.geometry.groups import joined
 
 STEP = 0.1  # spacing of the points
@@ -135,9 +135,11 @@ def test_shades_differ_in_a_cell_and_go_on_along_a_piece():
     pairs = attached_pairs(points)
     number = torch.arange(2).repeat_interleave(len(points) // 2)
     cell = ((points[:, 0] + 1) / 0.7).floor().long() * 5 + ((points[:, 1] + 1) / 0.7).floor().long()
-    shade, several = shades(torch.unique(cell, return_inverse=True)[1], pairs)
+    cell = torch.unique(cell, return_inverse=True)[1]
+    piece, several = pieces(cell, pairs)
+    shade = shades(cell, piece, pairs)
     assert several[(points[:, :2] - 0.9).abs().amax(1) < 0.6].all()
     assert len(shade[number == 0].unique()) == len(shade[number == 1].unique()) == 1
     assert shade[0] != shade[-1]
     alone = points[number == 0]
-    assert not shades(torch.zeros(len(alone), dtype=torch.long), attached_pairs(alone))[1].any()
+    assert not pieces(torch.zeros(len(alone), dtype=torch.long), attached_pairs(alone))[1].any()

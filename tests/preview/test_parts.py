@@ -150,7 +150,8 @@ def test_the_starter_is_tried_on_its_own_grid(alocasia, tmp_path, monkeypatch, q
     monkeypatch.setattr("gaussian_swaying.cli.preview.calibrated_suggestion", calibrated)
     cloud = alocasia.select((alocasia.means[:, :2].norm(dim=-1) < 0.6) & (alocasia.means[:, 2] > 0.005))
     write_ply(tmp_path / "plant.ply", cloud)
-    options = ["--output", str(tmp_path / "out"), "--device", "cpu", "--height", "96", "--quality", quality]
+    options = ["--output", str(tmp_path / "out"), "--device", "cpu", "--height", "96", "--connected", "grid"]
+    options += ["--quality", quality]
     assert main([str(tmp_path / "plant.ply"), *options]) == 0
     assert tried == grids
     found = [
@@ -166,14 +167,18 @@ def test_the_preview_writes_the_parts_that_its_configurations_name(alocasia, tmp
     write_ply(tmp_path / "plant.ply", cloud)
     out = tmp_path / "out"
     options = [str(tmp_path / "plant.ply"), "--output", str(out), "--device", "cpu", "--height", "96", "--quality"]
+    monkeypatch.setattr("gaussian_swaying.cli.preview.why_apart", lambda scene, dx, held: f"{int(held.sum()) > 50}")
     assert main([*options, "draft"]) == 0
     told = capsys.readouterr().out
     assert "pot still" in told
+    assert "each connected part has its own (scene.connected: surface), as True; --connected grid leaves" in told
     assert str(out / "parts.npz") in told
     for name in ("draft", "starter"):
         config = yaml.safe_load((out / f"{name}.yaml").read_text())
         assert config["scene"]["parts"] == str(out / "parts.npz")
         assert config["solver"]["boundaries"] == []
+        assert config["scene"]["connected"] == "surface"
+    monkeypatch.setattr("gaussian_swaying.cli.preview.why_apart", lambda scene, dx, held: None)
     parts = Parts.load(out / "parts.npz")
     assert len(parts) == len(cloud)
     painted = Parts(parts.labels.flip(0), parts.parts)
@@ -182,4 +187,5 @@ def test_the_preview_writes_the_parts_that_its_configurations_name(alocasia, tmp
     assert Parts.load(out / "parts.1.npz").digest() == painted.digest()  # what was there is kept
     assert Parts.load(out / "parts.npz").digest() == parts.digest()
     assert main([*options, "draft"]) == 0
+    assert "connected" not in yaml.safe_load((out / "starter.yaml").read_text())["scene"]
     assert not (out / "parts.2.npz").exists()

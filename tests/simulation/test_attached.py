@@ -12,6 +12,7 @@ from gaussian_swaying.gaussians.parts import Part, Parts
 from gaussian_swaying.geometry.regions import Box
 from gaussian_swaying.mpm.boundaries.pinned_region import PinnedRegion
 from gaussian_swaying.mpm.solver import MPMSolver
+from gaussian_swaying.preview.apart import why_apart
 from gaussian_swaying.preview.picture import _pieces
 from gaussian_swaying.scenes.procedural import FlagScene, GivenScene
 from gaussian_swaying.simulation.attached import attached_points, homes, lies_apart, pieces_in_cells
@@ -146,3 +147,12 @@ def test_the_preview_shows_pieces_as_colours():
     front, back = (torch.stack([mask[number == k] for _, mask, _ in pieces]).any(1) for k in (0, 1))
     assert not (front & back).any()
     assert _pieces(simulation(cloud, "grid")) == ([], 0.0)
+
+
+def test_nodes_of_their_own_help_what_lies_close_and_is_held():
+    cloud, number = two_flags()
+    both = simulation(cloud).scene
+    edge = cloud.means[:, 0] < 0.1
+    assert why_apart(both, DX, edge) == "83 % lie within reach of a node beside what they are not attached to"
+    assert why_apart(both, 0.01, edge) is None
+    assert why_apart(both, DX, edge & (number == 0)) is None  # the other one would be blown away

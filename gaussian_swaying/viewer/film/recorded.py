@@ -310,7 +310,7 @@ def look_of(painter: Painter) -> dict[str, Any]:
 
 
 def stencils_of(stencil: Stencil, grid: GridSpec, nodes: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Where places read the motion, as a browser does it.
+    """The places at which the motion is read, and their stencils, for a browser.
 
     Args:
         stencil: Of the places.
