@@ -151,9 +151,8 @@ def preview_picture(
     tints = pieces or _soft(simulation)
     for turn in (0.0, 90.0):
         camera = orbit_camera(center, frame.rotation[2], reach, azimuth - turn, elevation, 40.0, height, height)
-        views.append(
-            _view(simulation, parts, camera.to(simulation.device), normals, f"azimuth {azimuth - turn:.0f}°", tints)
-        )
+        title = f"azimuth {azimuth - turn:.0f}°"
+        views.append(_view(simulation, parts, camera.to(simulation.device), normals, title, tints))
     entries = _entries(parts, simulation)
     if pieces:
         words = f"one colour: connected along the surface; {100 * beside:.0f} % lie beside something else"
@@ -415,7 +414,7 @@ def _draw_up(draw: ImageDraw, font: Any, base: Tensor, up: Tensor, camera: Camer
 def _entries(parts: Parts, simulation: Simulation) -> list[tuple[tuple[int, ...], str]]:
     """The colours of the views, and their meaning."""
     flow = mean_flow(simulation).tolist()
-    entries = [
+    entries: list[tuple[tuple[int, ...], str]] = [
         (REGION, f"box of the {int(parts.simulated.sum()):,} simulated Gaussians [scene units]"),
         (PINNED, f"held: {int(parts.pinned.sum()):,} Gaussians"),
         (WIND, f"steady wind {wind_words(flow, simulation.scene.frame.rotation[2].tolist())}"),
