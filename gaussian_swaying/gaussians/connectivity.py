@@ -153,7 +153,7 @@ def _missing(where: Tensor, pairs: Tensor, labels: Tensor, to: Sequence[int | No
 
 
 def pieces(cell: Tensor, pairs: Tensor) -> tuple[Tensor, Tensor]:
-    """What is attached within cells.
+    """Pieces of what is attached within cells.
 
     Args:
         cell: A number for the cell of each Gaussian, from 0 on, shape (N,).

@@ -14,7 +14,7 @@ ENOUGH = 0.1  # share of the Gaussians that lie beside something else, from whic
 
 
 def pieces_of_nodes(scene: SimulatedScene, dx: float) -> tuple[Tensor, Tensor, float]:
-    """What is connected along the surface within the reach of a node.
+    """Pieces of what is connected along the surface within the reach of a node.
 
     Args:
         scene: A scene of ``scene.connected: surface``.
