@@ -40,6 +40,15 @@ def chromium():
     return path
 
 
+@pytest.fixture(scope="session")
+def node():
+    """Path of Node.js, as :func:`chromium`."""
+    path = shutil.which("node")
+    if path is None:
+        (pytest.fail if os.environ.get("CI") else pytest.skip)("needs an installed Node.js")
+    return path
+
+
 @pytest.fixture(params=["cpu", pytest.param("cuda", marks=pytest.mark.gpu)])
 def device(request):
     """Each device in turn."""

@@ -1,10 +1,12 @@
 """Convert a splat for viewers: ``gaussian-swaying export scene.ply scene.splat``, or the ``ply`` folder of a run.
 
-With ``--web``, a recorded run becomes a film that a browser plays: ``gaussian-swaying export --web outputs/flag``.
+With ``--web``, a recorded run becomes a film that a browser plays: ``gaussian-swaying export --web outputs/flag``. With
+``--live-web``, a configuration becomes a page that simulates it: ``gaussian-swaying export --live-web flag``.
 """
 
 import argparse
 import json
+import sys
 from pathlib import Path
 
 import torch
@@ -38,6 +40,12 @@ def build_options() -> argparse.ArgumentParser:
         "--web",
         action="store_true",
         help="Write the run in the folder `source` as a film that a browser plays by itself.",
+    )
+    parser.add_argument(
+        "--live-web",
+        action="store_true",
+        help="Write the scene `source` as a page that simulates it in a browser; `export --live-web --help` has its "
+        "options.",
     )
     parser.add_argument("--fps", type=float, help="Frames per second of a folder; default: those of its run, or 25.")
     parser.add_argument(
@@ -106,10 +114,17 @@ def placement(options: argparse.Namespace) -> tuple[float, SimFrame, str]:
 
 def main(arguments: list[str] | None = None) -> int:
     """Parse and convert; 2 on bad input."""
-    parser = build_options()
-    return run_command(
-        lambda: export(parser.parse_args(arguments)), stopped="Stopped; nothing was written.", memory="fewer Gaussians"
-    )
+    given = sys.argv[1:] if arguments is None else arguments
+
+    def act() -> None:
+        if "--live-web" in given:
+            from gaussian_swaying.cli.live_web import export_live_web  # a conversion needs no simulation
+
+            export_live_web(given)
+        else:
+            export(build_options().parse_args(given))
+
+    return run_command(act, stopped="Stopped; nothing was written.", memory="fewer Gaussians")
 
 
 def export(options: argparse.Namespace) -> None:

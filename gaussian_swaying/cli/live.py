@@ -6,19 +6,15 @@ import argparse
 import sys
 import time
 import webbrowser
-from collections.abc import Callable, Sequence
-from pathlib import Path
+from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 from gaussian_swaying import _program as program
-from gaussian_swaying._yaml_limits import check_config_files
-from gaussian_swaying.cli.errors import guessing, run_command
-from gaussian_swaying.cli.shipped import with_shipped
-from gaussian_swaying.simulation.defaults import resolve_device
+from gaussian_swaying.cli.errors import run_command
+from gaussian_swaying.cli.scene import is_given, settings_of, words_of
 from gaussian_swaying.simulation.simulation import Simulation
 from gaussian_swaying.viewer.controls import Page
 from gaussian_swaying.viewer.real_time import in_real_time
-from gaussian_swaying.viewer.scenes import settings_of_splat
 from gaussian_swaying.viewer.session import Session, share_cores
 
 if TYPE_CHECKING:
@@ -88,58 +84,13 @@ def split(parser: ArgumentParser, arguments: Sequence[str]) -> tuple[argparse.Na
         ValueError: If there are two scenes, or the number of pixels cannot be.
     """
     options, rest = build_options().parse_known_args(arguments)
-    switches = {name for action in parser._actions if action.nargs == 0 for name in action.option_strings}
-    scenes: list[str] = []
-    further: list[str] = []
-    value_follows = False
-    for argument in rest:
-        if value_follows or argument.startswith("-"):
-            value_follows = not value_follows and "=" not in argument and argument not in switches
-            further.append(argument)
-        else:
-            scenes.append(argument)
+    scenes, further = words_of(parser, rest)
     if len(scenes) > 1:
         raise ValueError(f"Expected one SCENE, but got {' and '.join(scenes)}: give one of them.")
     if not 16 <= options.pixels <= 8192:
         raise ValueError(f"Expected `--pixels` from 16 to 8192, but got {options.pixels}.")
     options.scene = scenes[0] if scenes else None
     return options, further
-
-
-def settings_of(
-    parser: ArgumentParser,
-    scene: str | None,
-    further: Sequence[str],
-    folder: Path,
-    tell: Callable[[float, str], None] = lambda share, what: None,
-) -> Namespace:
-    """The settings of the scene to show.
-
-    Args:
-        parser: From :meth:`Simulation.parser`.
-        scene: A splat, a configuration, or None for the flag or the ``--config`` among the further options.
-        further: Options of ``gaussian-swaying sim``.
-        folder: Gets a file with the parts of a splat, if it has any.
-        tell: Called with the share that is done, from 0 to 1, and the name of the next task.
-
-    Raises:
-        ValueError: If a file or an option is bad.
-    """
-    given = list(further)
-    if scene is not None and Path(scene).suffix.lower() not in (".yaml", ".yml"):
-        if _given(given, "--config"):
-            raise ValueError("`SCENE` and `--config` both say what to show: give a splat with `--scene.ply`.")
-        with guessing(parser):
-            device = parser.parse_args([*given, "--scene.ply", scene]).device
-        print(f"Looking at {scene} for a first configuration, which takes up to a minute.", flush=True)
-        settings = settings_of_splat(parser, scene, resolve_device(device), folder, given, tell)
-    else:
-        config = scene or (None if _given(given, "--config") else "flag")
-        arguments = with_shipped([*(["--config", config] if config else []), *given], "sim")
-        check_config_files(arguments)
-        with guessing(parser):
-            settings = parser.parse_args(arguments)
-    return settings
 
 
 def session_of(parser: ArgumentParser, settings: Namespace, real_time: bool) -> Session:
@@ -167,11 +118,6 @@ def session_of(parser: ArgumentParser, settings: Namespace, real_time: bool) -> 
     return session
 
 
-def _given(options: Sequence[str], name: str) -> bool:
-    """True if an option is among those of the command line."""
-    return any(option.split("=")[0] == name for option in options)
-
-
 def _live(arguments: Sequence[str]) -> None:
     parser = Simulation.parser()
     options, further = split(parser, arguments)
@@ -185,7 +131,7 @@ def _live(arguments: Sequence[str]) -> None:
             webbrowser.open(page.url)
         settings = settings_of(parser, options.scene, further, page.scratch, page.progress)
         page.progress(0.8, "Making the simulation")
-        session = session_of(parser, settings, options.grid == "real-time" and not _given(further, "--solver.dx"))
+        session = session_of(parser, settings, options.grid == "real-time" and not is_given(further, "--solver.dx"))
         page.show(session)
         session.start()
         while True:

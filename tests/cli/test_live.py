@@ -15,7 +15,7 @@ import pytest
 import torch
 from shared import refused
 
-from gaussian_swaying.cli import live
+from gaussian_swaying.cli import live, scene
 from gaussian_swaying.gaussians.ply import write_ply
 from gaussian_swaying.preview.cost import Cost
 from gaussian_swaying.scenes.alocasia import AlocasiaScene
@@ -63,7 +63,7 @@ def test_pixels_are_limited(capsys, pixels):
 
 
 def test_without_a_scene_it_is_the_flag(parser, tmp_path):
-    settings = live.settings_of(parser, None, ["--solver.dx=0.2", "--device=cpu"], tmp_path)
+    settings = scene.settings_of(parser, None, ["--solver.dx=0.2", "--device=cpu"], tmp_path)
     assert settings.scene.generator.class_path.endswith("FlagScene")
     assert settings.solver.dx == 0.2
 
@@ -71,16 +71,16 @@ def test_without_a_scene_it_is_the_flag(parser, tmp_path):
 def test_a_configuration_and_a_shipped_one(parser, tmp_path):
     file = tmp_path / "mine.yaml"
     file.write_text("scene: {generator: {class_path: FlagScene}}\nsolver: {dx: 0.3}\n")
-    assert live.settings_of(parser, str(file), [], tmp_path).solver.dx == 0.3
-    assert live.settings_of(parser, None, ["--config", str(file), "--solver.dx=0.4"], tmp_path).solver.dx == 0.4
+    assert scene.settings_of(parser, str(file), [], tmp_path).solver.dx == 0.3
+    assert scene.settings_of(parser, None, ["--config", str(file), "--solver.dx=0.4"], tmp_path).solver.dx == 0.4
     with pytest.raises(ValueError, match="`SCENE` and `--config`"):
-        live.settings_of(parser, "my.ply", ["--config", str(file)], tmp_path)
+        scene.settings_of(parser, "my.ply", ["--config", str(file)], tmp_path)
 
 
 def test_a_splat_gets_what_the_preview_suggests(parser, tmp_path):
     path = tmp_path / "flag.ply"
     write_ply(path, FlagScene(spacing=0.025).generate())
-    settings = live.settings_of(parser, str(path), ["--device=cpu", "--wind.flow=[1,2,3]"], tmp_path)
+    settings = scene.settings_of(parser, str(path), ["--device=cpu", "--wind.flow=[1,2,3]"], tmp_path)
     assert settings.scene.ply == str(path)
     assert settings.wind.flow == [1, 2, 3]
     quick = settings_of_splat(parser, path, torch.device("cpu"), tmp_path, quick=True)
@@ -171,7 +171,7 @@ def cubed(simulation, frames, budget, pictures):
 
 def test_a_solver_of_ones_own_gets_no_trial(parser, monkeypatch, tmp_path):
     """It need not have a grid."""
-    settings = live.settings_of(parser, None, ["--solver.dx=0.2", "--device=cpu"], tmp_path)
+    settings = scene.settings_of(parser, None, ["--solver.dx=0.2", "--device=cpu"], tmp_path)
     simulation = Simulation.from_settings(parser, settings)
     monkeypatch.setattr(live, "Simulation", SimpleNamespace(from_settings=lambda parser, settings: simulation))
     monkeypatch.setattr(live, "share_cores", lambda: None)

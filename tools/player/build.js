@@ -1,9 +1,12 @@
-// Writes film.min.js of the package: the programs of films and of the live page, with what they use of Spark and three.js.
+// Writes film.min.js of the package, the programs of films and of both live pages with what they use of Spark and three.js, and
+// worker.min.js, the solver in a browser.
 import { build } from "esbuild";
 import { createHash } from "node:crypto";
 import { readFile } from "node:fs/promises";
 
-const OWN = "brush.js build.js film.glsl.js film.js gaussians.js live.js main.js playback.js sorter.js".split(" ");
+const OWN = "brush.js build.js film.glsl.js film.js gaussians.js live.js main.js playback.js sorter.js view.js".split(" ");
+OWN.push(..."dial.js page.js settings.js".split(" ").map((name) => `live_web/${name}`));
+const SOLVER = "aero.js block.js laws.js matrices.js solver.js wind.js worker.js".split(" ").map((name) => `live_web/${name}`);
 const SOURCES = [...OWN, "package-lock.json"]; // a test compares their checksum
 
 // Spark's WebAssembly, in it and in its worker, reads files of splats, builds levels of detail and sorts. A film needs only
@@ -25,8 +28,11 @@ async function cutSpark({ path }) {
   return { contents };
 }
 
-const checksum = createHash("sha256");
-for (const name of SOURCES) checksum.update(await readFile(name));
+async function banner(sources) {
+  const checksum = createHash("sha256");
+  for (const name of sources) checksum.update(await readFile(name));
+  return { js: `// Made by tools/player from ${checksum.digest("hex")}` };
+}
 
 await build({
   entryPoints: ["main.js"],
@@ -34,8 +40,18 @@ await build({
   bundle: true,
   minify: true,
   format: "iife",
-  banner: { js: `// Made by tools/player from ${checksum.digest("hex")}` },
+  banner: await banner(SOURCES),
   legalComments: "eof", // the full licences are in LICENSES.txt, which stands in each film
   logLevel: "info",
   plugins: [{ name: "cut-spark", setup: (made) => made.onLoad({ filter: /spark\.module\.js$/ }, cutSpark) }],
+});
+
+await build({
+  entryPoints: ["live_web/worker.js"],
+  outfile: "../../gaussian_swaying/viewer/live_web/page/worker.min.js",
+  bundle: true,
+  minify: true,
+  format: "iife",
+  banner: await banner(["build.js", ...SOLVER, "package-lock.json"]),
+  logLevel: "info",
 });

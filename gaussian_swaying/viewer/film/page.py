@@ -62,20 +62,31 @@ def write_film(run: Path, target: Path) -> Film:
 
 def page(film: Film) -> str:
     """The whole page of a film."""
-    blocks = {"code": (PAGE / "film.min.js").read_bytes(), **pack(film)}
+    return filled(PAGE / "film.html", film.head, {"code": (PAGE / "film.min.js").read_bytes(), **pack(film)})
+
+
+def filled(template: Path, head: dict[str, Any], blocks: dict[str, bytes]) -> str:
+    """A page of one file.
+
+    Args:
+        template: The page, with places for what differs.
+        head: The head of a film, of which title and background are put in.
+        blocks: What the page unpacks, by name, in the order in which it is needed.
+    """
     parts = [
         f'<script type="text/plain" id="film-{name}" data-size="{len(text)}">{text}</script>'
         for name, block in blocks.items()
         for text in [base64.b64encode(zlib.compress(block, 9)).decode()]
     ]
-    red, green, blue = (round(255 * value) for value in film.head["background"])
+    red, green, blue = (round(255 * value) for value in head["background"])
     words = {
-        "title": html.escape(film.head["title"]),
+        "title": html.escape(head["title"]),
         "background": f"rgb({red}, {green}, {blue})",
         "licences": (PAGE / "LICENSES.txt").read_text(encoding="utf-8"),
+        "loader": (PAGE / "loader.js").read_text(encoding="utf-8"),
         "parts": "\n".join(parts),
     }
-    text = (PAGE / "film.html").read_text(encoding="utf-8")
+    text = template.read_text(encoding="utf-8")
     return re.sub(r"{{(\w+)}}", lambda slot: words[slot[1]], text)  # once: what is put in may have braces of its own
 
 
@@ -110,11 +121,7 @@ def pack(film: Film) -> dict[str, bytes]:
     frames[1:] -= bits[:-1]  # modulo 65536
     counts = np.array([len(rows) for rows in far], np.uint32)
     parts = parts_of(film.head)
-    start = len({kind for kind, _, _ in parts})
-    blocks = {
-        "head": json.dumps(film.head | {"parts": parts, "start": start}).encode(),
-        "stencils": _planes(film.stencils),
-    }
+    blocks = pack_head(film, parts)
     for index, (kind, first, last) in enumerate(parts):
         if kind == "frames":
             rows = np.concatenate(far[first:last])
@@ -123,6 +130,15 @@ def pack(film: Film) -> dict[str, bytes]:
             block = pack_splats(film, kind == "moving", first, last)
         blocks[f"part-{index}"] = block
     return blocks
+
+
+def pack_head(film: Film, parts: list[list[Any]]) -> dict[str, bytes]:
+    """The first two blocks: the head, with the parts that follow, and the stencils."""
+    start = len({kind for kind, _, _ in parts})
+    return {
+        "head": json.dumps(film.head | {"parts": parts, "start": start}).encode(),
+        "stencils": _planes(film.stencils),
+    }
 
 
 def pack_splats(film: Film, moving: bool, first: int = 0, last: int | None = None) -> bytes:

@@ -1,0 +1,226 @@
+"""The block of bytes that the solver in a browser needs, and the scenes that it cannot simulate.
+
+The block is the length of its head (uint32, little-endian), the head in JSON, and the arrays that the head lists, in
+float32 or int32. The solver is ``tools/player/live_web/solver.js``; its definition is
+:mod:`~gaussian_swaying.mpm.formulations.total`.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from gaussian_swaying.aero.force import LAWS as AERO_LAWS
+from gaussian_swaying.aero.wind import GaussianGust, SineSway, UniformGust, WindField, stream_start
+from gaussian_swaying.mpm.boundaries.boundary import Boundary
+from gaussian_swaying.mpm.boundaries.pinned_points import PinnedPoints
+from gaussian_swaying.mpm.boundaries.pinned_region import PinnedRegion
+from gaussian_swaying.mpm.boundaries.plane import Plane
+from gaussian_swaying.mpm.formulations.total import Total
+from gaussian_swaying.mpm.laws.fixed_corotated import FixedCorotated
+from gaussian_swaying.mpm.laws.hencky import StVKHencky
+from gaussian_swaying.mpm.laws.neo_hookean import NeoHookean
+from gaussian_swaying.mpm.laws.spring_network import SpringNetwork
+from gaussian_swaying.mpm.solver import MPMSolver
+from gaussian_swaying.simulation.simulation import Simulation
+
+LAWS = (FixedCorotated, NeoHookean, StVKHencky, SpringNetwork)
+"""The laws that a browser knows, by their number in the block."""
+
+
+def check(simulation: Simulation) -> None:
+    """Check that a browser can simulate this.
+
+    Args:
+        simulation: The simulation, not started.
+
+    Raises:
+        ValueError: If it cannot; the message names the field and the remedy.
+    """
+    solver, setup = simulation.solver, simulation.setup
+    if not isinstance(solver, MPMSolver):
+        raise _refused("`custom_solver`", "leave it out")
+    if solver.formulation != "total":
+        raise _refused("`solver.formulation: updated`", "set it to total")
+    if setup.scene.surface_places is not None:
+        raise _refused("`contact` and obstacles", "set `contact` to null, and use Plane instead of obstacles")
+    if simulation.stepper.copies is not None:
+        raise _refused("`copies`", "leave them out")
+    if simulation.editor.edits:
+        raise _refused("`edits`", "leave them out")
+    if setup.forces:
+        raise _refused("`forces` of your own", "leave them out")
+    if setup.points.attached is not None:
+        raise _refused("`scene.connected: surface`, where parts have nodes of their own", "set it to grid")
+    wind = setup.wind
+    if type(wind) is not WindField or not wind.uniform:
+        raise _refused("a wind that differs from place to place", "leave out `wind.effects`")
+    for modulation in wind.modulations:
+        if type(modulation) not in (SineSway, UniformGust, GaussianGust):
+            raise _refused(f"the {type(modulation).__name__} in `wind.modulations`", "leave it out")
+    for law in setup.points.laws:
+        if type(law) not in LAWS:
+            known = ", ".join(one.__name__ for one in LAWS)
+            raise _refused(f"the law {type(law).__name__} in `material.law`", f"take one of {known}")
+    for boundary in solver.boundaries:
+        _check_boundary(boundary)
+
+
+def _check_boundary(boundary: Any) -> None:
+    name = type(boundary).__name__
+    if type(boundary) not in (PinnedRegion, PinnedPoints, Plane):
+        raise _refused(f"the {name} in `solver.boundaries`", "take a PinnedRegion, PinnedPoints or a Plane")
+    if type(boundary) is not Plane and not (boundary.holds_from <= 0 and boundary.end == math.inf):
+        raise _refused(f"`start` and `end` of the {name}", "leave them out")
+
+
+def _refused(what: str, remedy: str) -> ValueError:
+    return ValueError(f"The page of --live-web cannot simulate {what}: {remedy}.")
+
+
+def pack_solver(simulation: Simulation, nodes: Tensor) -> bytes:
+    """The block of a simulation that is at rest.
+
+    Args:
+        simulation: The simulation, after its ``start``; see :func:`check`.
+        nodes: The nodes that the Gaussians follow, as flat indices, shape (M,).
+    """
+    solver = simulation.solver
+    assert isinstance(solver, MPMSolver)
+    bound = solver.bound
+    assert isinstance(bound, Total)
+    body, points, stencil = bound.body, bound.body.points, bound.stencil
+    order = torch.argsort(stencil.first, stable=True)
+    cells, sizes = torch.unique_consecutive(stencil.first[order], return_counts=True)
+    active = (bound.node_inverse_mass > 0).nonzero()[:, 0]
+    held = torch.zeros_like(bound.node_mass, dtype=torch.bool)
+    planes = []
+    for boundary, own, acts in zip(body.boundaries, bound.held, bound.on_nodes, strict=True):
+        if isinstance(boundary, Plane):
+            planes.append(_plane(boundary))
+        elif acts:
+            assert own is not None
+            assert own.share is not None
+            held |= own.share > own.threshold
+    law = torch.zeros(points.count, dtype=torch.long) if points.law_index is None else points.law_index
+    numbers = torch.tensor([LAWS.index(type(one)) for one in points.laws])
+    arrays: dict[str, Tensor] = {
+        "cellStart": torch.cat([sizes.new_zeros(1), sizes.cumsum(0)]),
+        "cellNode": cells,
+        "fraction": (1.5 + stencil.factors[1, :, 0] * bound.grid.dx)[:, order].T,
+        "rest": points.position[order],
+        "volume": points.volume[order],
+        "mass": points.mass[order],
+        "mu": body.laws.mu[order],
+        "lam": body.laws.lam[order],
+        "law": numbers[law][order],
+        "active": active,
+        "inverseMass": bound.node_inverse_mass[active],
+        "held": held[active],
+        "nodeRest": bound.node_rest[active] if bound.node_rest is not None else active.new_zeros(0),
+        "followed": nodes,
+        **_wind_arrays(simulation, order),
+    }
+    rows = 0
+    if bound.point_holds is not None:
+        dense = bound.point_holds.dense(torch.float64)
+        rows = dense.push.shape[1]
+        arrays |= {"rowNode": dense.node.T, "rowWeight": dense.weight.T, "affected": dense.affected, "push": dense.push}
+    else:
+        arrays |= {name: active.new_zeros(0) for name in ("rowNode", "affected")}
+        arrays |= {name: points.mass.new_zeros(0) for name in ("rowWeight", "push")}
+    settings, scene = bound.settings, simulation.scene
+    head = {
+        "dx": settings.dx,
+        "resolution": list(bound.grid.resolution),
+        "gravity": list(settings.gravity),
+        "damping": settings.damping,
+        "viscous": settings.stiffness_damping,
+        "cfl": solver.cfl,
+        "substep": solver.substep,
+        "frameDt": simulation.frame_dt,
+        "size": scene.size * scene.frame.metres_per_unit,
+        "planes": planes,
+        "rows": rows,
+        "idle": simulation.stepper.idle,
+        "grouped": simulation.stepper.wind_force.sums is not None,
+        "aero": _aero(simulation),
+        "wind": _wind(simulation.wind),
+    }
+    return _joined(head, arrays)
+
+
+def _joined(head: dict[str, Any], arrays: dict[str, Tensor]) -> bytes:
+    listed, blocks = [], []
+    for name, values in arrays.items():
+        kind = "f4" if values.is_floating_point() else "i4"
+        listed.append([name, kind, values.numel()])
+        blocks.append(values.detach().cpu().contiguous().numpy().astype(np.dtype("<" + kind)).tobytes())
+    text = json.dumps(head | {"arrays": listed}, allow_nan=False).encode()
+    return b"".join([len(text).to_bytes(4, "little"), text, *blocks])
+
+
+def _plane(plane: Boundary) -> dict[str, Any]:
+    assert isinstance(plane, Plane)
+    return {
+        "point": plane.point.tolist(),
+        "normal": plane.normal.tolist(),
+        "kind": plane.kind,
+        "friction": plane.friction,
+        "start": plane.start,
+        "end": None if plane.end == math.inf else plane.end,
+    }
+
+
+def _aero(simulation: Simulation) -> dict[str, Any]:
+    aero = simulation.aero
+    return {
+        "drag": float(aero.C_D),
+        "friction": float(aero.C_F),
+        "lift": float(aero.C_L),
+        "airDensity": aero.air_density,
+        "law": AERO_LAWS.index(aero.law),
+        "lifted": aero.lift_direction == "lift",
+        "unitTangent": aero.unit_tangent,
+        "implicit": aero.drag_step == "semi_implicit",
+        "maxAreaRatio": None if aero.max_area_ratio == math.inf else aero.max_area_ratio,
+    }
+
+
+def _wind_arrays(simulation: Simulation, order: Tensor) -> dict[str, Tensor]:
+    """The patches of each point: area vectors and the sum of A N N^T, or a unit normal and an area."""
+    force = simulation.stepper.wind_force
+    sums, area = force.sums, force.area[order]
+    if sums is None:
+        return {"area": area, "patch": torch.cat([force.normal[order], area[:, None]], 1)}
+    count = sums.point.bincount(minlength=len(order))
+    first = (count.cumsum(0) - count)[order]
+    own = torch.repeat_interleave(torch.arange(len(order)), count[order])
+    ends = count[order].cumsum(0)
+    within = torch.arange(len(own)) - (ends - count[order])[own]
+    upper = sums.tensor[:, [0, 0, 0, 1, 1, 2], [0, 1, 2, 1, 2, 2]]
+    return {
+        "area": area,
+        "tensor": upper[order],
+        "firstVector": torch.cat([ends.new_zeros(1), ends]),
+        "vectors": sums.vector[first[own] + within],
+    }
+
+
+def _wind(wind: Any) -> dict[str, Any]:
+    parts: list[dict[str, Any]] = []
+    for stream, part in enumerate(wind.modulations):
+        start = str(stream_start(wind.seed, stream))  # of 64 bits
+        if isinstance(part, SineSway):
+            parts.append({"kind": "sway", "amplitude": part.amplitude, "period": part.period, "phase": part.phase})
+        elif isinstance(part, UniformGust):
+            parts.append({"kind": "uniform", "delta": part.delta, "interval": part.interval, "start": start})
+        else:
+            parts.append({"kind": "gaussian", "std": part.std, "interval": part.interval, "start": start})
+    linear = wind.interpolation == "linear"
+    return {"times": wind.times.tolist(), "flows": wind.flows.tolist(), "linear": linear, "modulations": parts}

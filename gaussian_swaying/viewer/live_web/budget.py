@@ -1,0 +1,99 @@
+"""The grid of a page without a server: the finest one that the machine of its visitors simulates in real time."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+from gaussian_swaying.simulation.simulation import Simulation
+from gaussian_swaying.viewer.changes import changed_settings
+from gaussian_swaying.viewer.live_web.block import check
+
+if TYPE_CHECKING:
+    from jsonargparse import ArgumentParser, Namespace
+
+TARGETS = {"phone": 0.5e6, "laptop": 1.5e6, "desktop": 3e6}
+"""Material points times substeps a second that a kind of machine computes, with room for drawing."""
+
+TRIALS = 5
+CLOSE = 0.8  # share of the budget that is good enough
+POWER = 3.5  # of the cost in the spacing: 3 for a sheet, 4 for a solid
+
+
+@dataclass(frozen=True, eq=False)
+class Fitted:
+    """A simulation that fits a budget.
+
+    Attributes:
+        simulation: The simulation.
+        sentence: What was chosen.
+    """
+
+    simulation: Simulation
+    sentence: str
+
+
+def load_of(simulation: Simulation) -> float:
+    """Material points times substeps in a second of a simulation at rest [1/s]."""
+    steps = simulation.solver.substeps(simulation.start(), simulation.frame_dt)
+    return simulation.setup.points.count * steps / simulation.frame_dt
+
+
+def fitted(parser: ArgumentParser, settings: Namespace, target: str) -> Fitted:
+    """Choose the points and the grid for a kind of machine.
+
+    Args:
+        parser: From :meth:`Simulation.parser`.
+        settings: The settings as they are configured.
+        target: One of :data:`TARGETS`.
+
+    Raises:
+        ValueError: If a browser cannot simulate the scene, or it cannot start.
+    """
+    configured, budget = float(settings.solver.dx), TARGETS[target]
+    made: dict[float, Simulation] = {}
+
+    def load(dx: float) -> float:
+        changes: dict[str, Any] = {"solver.dx": dx, "scene.points": "grid"}
+        changed = settings if dx == configured and settings.scene.points != "gaussian" else None
+        changed = changed_settings(parser, settings, changes) if changed is None else changed
+        made[dx] = Simulation.from_settings(parser, changed)
+        check(made[dx])
+        return load_of(made[dx])
+
+    dx, found = finest_within(load, configured, budget)
+    speed, points = budget / found, made[dx].setup.points.count
+    what = "Kept the configured grid" if dx == configured else f"Chose a grid of {dx:.3g} m instead of {configured:g} m"
+    fast = f"about {speed:.2g} x real time" if speed < 1 else "real time"
+    return Fitted(made[dx], f"{what} for a {target}: {points:,} points, {fast} expected.")
+
+
+def finest_within(load: Callable[[float], float], configured: float, budget: float) -> tuple[float, float]:
+    """The finest grid of those tried whose load is within a budget, and its load; if none is, the one of least load.
+
+    Args:
+        load: Load for a grid spacing [m]; ValueError where the grid is too coarse for the scene.
+        configured: The finest spacing [m].
+        budget: The largest load.
+    """
+    tried = {configured: load(configured)}  # its errors are those of the scene
+    too_coarse = float("inf")
+    dx = configured
+    for _ in range(TRIALS):
+        if CLOSE * budget <= tried[dx] <= budget or (dx == configured and tried[dx] <= budget):
+            break
+        wanted = max(configured, dx * (tried[dx] / (0.9 * budget)) ** (1 / POWER))
+        if wanted >= too_coarse:
+            wanted = (dx * too_coarse) ** 0.5
+        if wanted in tried:
+            break
+        try:
+            tried[wanted] = load(wanted)
+        except ValueError:
+            too_coarse = wanted
+            continue
+        dx = wanted
+    within = [one for one in tried if tried[one] <= budget]
+    best = min(within) if within else min(tried, key=lambda one: tried[one])
+    return best, tried[best]

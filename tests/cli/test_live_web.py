@@ -1,0 +1,58 @@
+"""``gaussian-swaying export --live-web``: what it writes, and what it says.
+
+Covers: cli.scene.
+"""
+
+import re
+
+import pytest
+from shared import refused
+
+from gaussian_swaying.cli.export import main
+from gaussian_swaying.cli.scene import words_of
+from gaussian_swaying.simulation.simulation import Simulation
+
+SMALL = ["--scene.generator.init_args.spacing=0.05", "--solver.dx", "0.2", "--material.E=9e3"]
+
+
+def test_a_page_from_the_name_of_a_configuration(tmp_path, capsys, monkeypatch):
+    """Beside where the command runs, with options of sim; for a phone the grid becomes coarser."""
+    monkeypatch.chdir(tmp_path)
+    assert main(["--live-web", "flag", *SMALL]) == 0
+    assert re.fullmatch(r"384 Gaussians, \d+ material points\nwrote flag\.html \(0\.\d MB\)\n", capsys.readouterr().out)
+    assert (tmp_path / "flag.html").read_text().startswith("<!doctype html>")
+    fine = ["--scene.generator.init_args.spacing=0.05", "--solver.dx=0.1", "--material.E=3e5"]
+    assert main(["--live-web", "flag", "phone.html", "--target", "phone", *fine]) == 0
+    told = capsys.readouterr().out
+    assert re.match(r"Chose a grid of [\d.]+ m instead of 0\.1 m for a phone: \d+ points, real time expected\.\n", told)
+
+
+def test_a_page_from_a_run(tmp_path, capsys):
+    run = tmp_path / "run"
+    run.mkdir()
+    (run / "config.yaml").write_text(
+        "scene:\n  generator:\n    class_path: FlagScene\n    init_args: {spacing: 0.1}\nsolver: {dx: 0.3}\n"
+    )
+    assert main(["--live-web", str(run)]) == 0
+    assert (run / "live.html").is_file()
+    assert f"wrote {run / 'live.html'} (" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("arguments", "sentence"),
+    [
+        (["flag", "page.txt"], "error: Expected the name of a page to end in .html, but got page.txt.\n"),
+        ([], "error: Expected a SCENE, and perhaps a FILE that ends in .html, but got neither.\n"),
+        (["sand"], "error: The page of --live-web cannot simulate `solver.formulation: updated`: set it to total.\n"),
+        (["flog"], "flog does not exist"),
+    ],
+)
+def test_bad_input_is_one_sentence(tmp_path, capsys, monkeypatch, arguments, sentence):
+    monkeypatch.chdir(tmp_path)
+    refused(main, ["--live-web", *arguments], capsys, sentence, folder=tmp_path)
+
+
+def test_words_and_options_in_any_order():
+    parser = Simulation.parser()
+    words, further = words_of(parser, ["a.yaml", "--solver.dx", "0.1", "b.html", "--material.E=3", "--print_config"])
+    assert (words, further) == (["a.yaml", "b.html"], ["--solver.dx", "0.1", "--material.E=3", "--print_config"])

@@ -1,0 +1,91 @@
+"""Small simulations, and the solver of a browser in Node.js."""
+
+import json
+import subprocess
+
+import numpy as np
+import pytest
+import torch
+import yaml
+
+from gaussian_swaying.simulation.simulation import Simulation
+from gaussian_swaying.viewer.live_web.block import check, pack_solver
+from gaussian_swaying.viewer.live_web.page import PAGE
+
+SIDE = {"class_path": "Box", "init_args": {"min": [None] * 3, "max": [0.06, None, None]}}
+CALM = {
+    "scene": {"generator": {"class_path": "FlagScene", "init_args": {"spacing": 0.05, "width": 0.6, "height": 0.4}}},
+    "material": {"E": 2e4, "nu": 0.3, "density": 60.0, "thickness": 0.02},
+    "solver": {
+        "dx": 0.1,
+        "damping": 2.0,
+        "boundaries": [{"class_path": "PinnedRegion", "init_args": {"region": SIDE}}],
+    },
+    "wind": {
+        "flow": [1.0, 2.0, 0.3],
+        "seed": 3,
+        "modulations": [
+            {"class_path": "SineSway", "init_args": {"amplitude": 0.3, "period": 1.5}},
+            {"class_path": "GaussianGust", "init_args": {"std": 0.3}},
+            {"class_path": "UniformGust", "init_args": {"delta": 0.2, "interval": 0.1}},
+        ],
+    },
+    "aero": {"C_D": 0.5, "C_F": 0.3, "C_L": 0.05, "law": "projected"},
+    "camera": {"class_path": "OrbitCamera", "init_args": {"width": 320, "height": 180, "azimuth": -70.0}},
+    "background": [0.5, 0.6, 0.7],
+}
+
+
+def merged(settings, changes):
+    """Settings with some changed; a dictionary with a class replaces the one before."""
+    both = dict(settings)
+    for name, value in changes.items():
+        inner = isinstance(value, dict) and "class_path" not in value and isinstance(both.get(name), dict)
+        both[name] = merged(both[name], value) if inner else value
+    return both
+
+
+@pytest.fixture(scope="session")
+def make(tmp_path_factory):
+    """The simulation of a calm sheet, with some settings changed."""
+
+    def make(**changes):
+        path = tmp_path_factory.mktemp("calm") / "calm.yaml"
+        path.write_text(yaml.safe_dump(merged(CALM, changes)))
+        return Simulation.from_yaml(path, device="cpu")
+
+    return make
+
+
+@pytest.fixture
+def in_node(node, request, tmp_path):
+    """Runs the built solver in Node.js: its answers to messages, and the last displacements of the nodes (M, 3)."""
+
+    def run(simulation, *messages):
+        check(simulation)
+        state = simulation.start()
+        nodes = simulation.scene.follow.nodes(state)
+        (tmp_path / "block").write_bytes(pack_solver(simulation, nodes))
+        script = request.config.rootpath / "tools/player/live_web/run.js"
+        command = [node, script, PAGE / "worker.min.js", tmp_path / "block", tmp_path / "state", json.dumps(messages)]
+        told = subprocess.run(command, capture_output=True, text=True, timeout=120, check=True)
+        moved = np.fromfile(tmp_path / "state", "<f4").reshape(len(nodes), 4)[:, :3]
+        return json.loads(told.stdout), torch.from_numpy(moved.copy())
+
+    return run
+
+
+def moved_means(simulation, state, moved):
+    """Centres of the Gaussians with the nodes moved (M, 3) as a browser says; the state gives the type."""
+    nodes = simulation.scene.follow.nodes(state)
+    displacement = torch.zeros_like(state.node_displacement)
+    displacement = displacement.index_copy(0, nodes, moved.to(displacement))
+    return simulation.scene.deformed(state.replace(node_displacement=displacement)).means
+
+
+def apart(simulation, state, moved):
+    """The largest distance of a Gaussian from its place in a state over the largest motion of one, and that motion."""
+    expected = simulation.scene.deformed(state).means
+    motion = (expected - simulation.scene.rest().means).norm(dim=-1).max()
+    error = (moved_means(simulation, state, moved) - expected).norm(dim=-1).max()
+    return float(error / motion), float(motion)

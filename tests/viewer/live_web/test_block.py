@@ -1,0 +1,141 @@
+"""The solver in a browser, in Node.js, against the package's own run."""
+
+import hashlib
+
+import pytest
+import torch
+
+from gaussian_swaying.mpm.forces import Force
+from gaussian_swaying.viewer.live_web.block import check
+from gaussian_swaying.viewer.live_web.page import PAGE
+
+from .conftest import SIDE, apart, moved_means
+
+
+def run(simulation, frames):
+    """The state after some frames, and the substeps of all of them."""
+    state, steps = simulation.start(), 0
+    for _ in range(frames):
+        steps += simulation.stepper.substeps(state)
+        state, _ = simulation.advance(state)
+    return state, steps
+
+
+def test_a_sheet_in_gusts_after_two_seconds(make, in_node):
+    """Within 1 % of the motion; it is a fraction of that, with the same substeps."""
+    simulation = make()
+    told, moved = in_node(simulation, {"kind": "frames", "count": 50})
+    state, steps = run(simulation, 50)
+    error, motion = apart(simulation, state, moved)
+    assert motion > 0.1
+    assert error < 2e-3
+    assert told[0]["substeps"] == steps
+
+
+PLANE = {
+    "class_path": "Plane",
+    "init_args": {"point": [0, 0, -0.18], "normal": [0, 0.2, 1], "kind": "separate", "friction": 0.4},
+}
+CLAMP = {"class_path": "PinnedRegion", "init_args": {"region": SIDE, "kind": "clamp"}}
+NODES = {"class_path": "PinnedRegion", "init_args": {"region": SIDE, "kind": "nodes"}}
+POINT = {"class_path": "PinnedPoints", "init_args": {"at": [[0.0, 0.0, 0.4]]}}
+SOFT = {"region": {"class_path": "Box", "init_args": {"min": [0.3, None, None], "max": [None] * 3}}, "E": 1e4}
+
+
+def law(name):
+    return {"class_path": name}
+
+
+CASES = {
+    "neo-hookean": {"material": {"law": law("NeoHookean")}},
+    "hencky": {"material": {"law": law("StVKHencky")}},
+    "springs": {"material": {"law": law("SpringNetwork")}},
+    "two laws": {"material": {"regions": [SOFT | {"law": law("NeoHookean")}]}},
+    "paper": {"aero": {"law": "paper", "lift_direction": "lift"}},
+    "cross flow": {"aero": {"law": "cross_flow", "unit_tangent": True}},
+    "linear": {"aero": {"law": "linear", "drag_step": "semi_implicit", "max_area_ratio": 1.01}},
+    "one patch a point": {"scene": {"points": "gaussian"}, "aero": {"unit_tangent": True, "max_area_ratio": 1.01}},
+    "semi-implicit": {"scene": {"points": "gaussian"}, "aero": {"drag_step": "semi_implicit", "law": "cross_flow"}},
+    "viscous": {"solver": {"stiffness_damping": 2e-3, "damping": 0.0}},
+    "fixed substep": {"solver": {"substep": 8e-4}},
+    "clamp and plane": {"scene": {"layers": 3}, "solver": {"boundaries": [CLAMP, PLANE]}},
+    "nodes and a point": {"solver": {"boundaries": [NODES, POINT]}},
+    "schedule": {
+        "wind": {
+            "interpolation": "linear",
+            "schedule": [{"time": 0.1, "flow": [1, 1, 0]}, {"time": 0.3, "flow": [0, 3, 0]}],
+        }
+    },
+    "still air": {"aero": {"C_D": 0.0, "C_F": 0.0, "C_L": 0.0}},
+}
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_laws_forces_and_boundaries(make, in_node, name):
+    simulation = make(**CASES[name])
+    told, moved = in_node(simulation, {"kind": "frames", "count": 10})
+    state, steps = run(simulation, 10)
+    error, motion = apart(simulation, state, moved)
+    assert motion > 5e-3
+    assert error < 1e-3
+    assert abs(told[0]["substeps"] - steps) <= 0.02 * steps
+
+
+def test_what_the_visitor_does(make, in_node):
+    """Another wind and stiffness are those of another configuration; a pull moves the place towards its aim."""
+    wind = {"kind": "wind", "flow": [0.0, -2.0, 0.0], "gusts": 0.0}
+    frames = {"kind": "frames", "count": 10}
+    _, moved = in_node(make(), wind, {"kind": "stiffness", "factor": 2.0}, frames)
+    same = make(wind={"flow": [0.0, -2.0, 0.0], "modulations": []}, material={"E": 4e4})
+    assert apart(same, run(same, 10)[0], moved)[0] < 1e-3
+    _, again = in_node(make(), frames, wind, {"kind": "stiffness", "factor": 2.0}, {"kind": "reset"}, frames)
+    assert torch.equal(again, moved)
+    grab = {"kind": "grab", "token": 7, "eye": [0.2, 2.0, 0.0], "ray": [0.0, -1.0, 0.0], "wide": 0.01}
+    aim = {"kind": "aim", "target": [0.2, -0.15, 0.0]}
+    simulation = make()
+    told, moved = in_node(simulation, grab, aim, frames)
+    assert told[0]["token"] == 7
+    assert abs(told[0]["place"][0] - 0.2) < 0.1
+    state = simulation.start()
+    pulled = moved_means(simulation, state, moved)[:, 1]
+    free = moved_means(simulation, state, in_node(simulation, grab, aim, {"kind": "release"}, frames)[1])[:, 1]
+    assert float(free.min()) > -0.05
+    assert -0.2 < float(pulled.min()) < -0.1
+    beside, _ = in_node(make(), grab | {"eye": [2.0, 2.0, 0.0]})
+    assert beside[0]["place"] is None
+
+
+class Lift(Force):
+    def forward(self, state):
+        return state.velocity
+
+
+REFUSED = {
+    "solver.formulation": {"solver": {"formulation": "updated"}},
+    "contact": {"contact": {"thickness": 0.01}},
+    "copies": {"copies": [{"shift": [0, 0, 0]}, {"shift": [0, 2, 0]}]},
+    "edits": {"edits": [{"time": 1.0, "E": 1e4}]},
+    "forces": {"forces": [{"class_path": f"{__name__}.Lift"}]},
+    "wind.effects": {"wind": {"effects": [{"class_path": "gaussian_swaying.aero.effects.PowerProfile"}]}},
+    "start": {"solver": {"boundaries": [{"class_path": "PinnedRegion", "init_args": {"region": SIDE, "end": 1.0}}]}},
+    "solver.boundaries": {
+        "solver": {"boundaries": [{"class_path": "VelocityBox", "init_args": {"region": SIDE, "velocity": [1, 0, 0]}}]}
+    },
+}
+
+
+@pytest.mark.parametrize("name", REFUSED)
+def test_what_a_browser_cannot_simulate_is_refused(make, name):
+    with pytest.raises(ValueError, match=rf"^The page of --live-web cannot simulate .*{name}.*\.$"):
+        check(make(**REFUSED[name]))
+
+
+def test_the_worker_is_built_from_its_sources(request):
+    """Its first line names their checksum; every source is part of the page or of the worker."""
+    player = request.config.rootpath / "tools/player"
+    own = ("aero", "block", "laws", "matrices", "solver", "wind", "worker")
+    names = ["build.js", *(f"live_web/{name}.js" for name in own), "package-lock.json"]
+    of_the_page = {"dial", "page", "settings"}
+    assert {path.stem for path in (player / "live_web").glob("*.js")} == {*own, *of_the_page, "run"}
+    checksum = hashlib.sha256(b"".join((player / name).read_bytes() for name in names)).hexdigest()
+    assert (PAGE / "worker.min.js").read_text().startswith(f"// Made by tools/player from {checksum}\n")

@@ -1,0 +1,152 @@
+"""The page without a server in a real browser: what it shows, what the visitor does, and damaged files.
+
+Covers: viewer.live_web.page.
+"""
+
+import re
+import time
+
+import pytest
+import torch
+
+from gaussian_swaying.viewer.film.recorded import order_of
+from gaussian_swaying.viewer.live_web.page import write_live_web
+
+FLAGS = [
+    "--no-sandbox",
+    "--disable-quic",
+    "--no-first-run",
+    "--disable-background-networking",
+    "--disable-component-update",
+]
+FLAGS += ["--disable-sync", "--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"]
+SHOWN = "!!window.windPage || !document.getElementById('message').textContent.startsWith('Loading')"
+
+
+@pytest.fixture(scope="module")
+def written(make, tmp_path_factory):
+    target = tmp_path_factory.mktemp("page") / "sheet.html"
+    write_live_web(make(), "sheet", target)
+    return target
+
+
+@pytest.fixture(scope="module")
+def browser(chromium):
+    from playwright.sync_api import sync_playwright
+
+    with sync_playwright() as driver:
+        started = driver.chromium.launch(executable_path=chromium, args=FLAGS)
+        yield started
+        started.close()
+
+
+@pytest.fixture
+def show(browser):
+    """Opens a page; what it tells and asks for is kept in ``page.told`` and ``page.asked``."""
+    context = browser.new_context(viewport={"width": 600, "height": 400})
+
+    def show(path, settings=""):
+        page = context.new_page()
+        page.told, page.asked = [], []
+        page.on("console", lambda message: page.told.append(message.text))
+        page.on("pageerror", lambda error: page.told.append(str(error)))
+        page.on("request", lambda request: page.asked.append(request.url))
+        page.goto(path.as_uri() + settings)
+        until(lambda: page.evaluate(SHOWN))
+        return page
+
+    yield show
+    context.close()
+
+
+def until(condition, seconds=60.0):
+    end = time.monotonic() + seconds
+    while not condition():
+        assert time.monotonic() < end, "it did not happen"
+        time.sleep(0.02)
+
+
+def test_after_two_seconds_the_gaussians_are_where_a_run_puts_them(show, written, make):
+    """Read back from the graphics card; within 1 % of the motion. Nothing is asked of a network."""
+    page, simulation = show(written), make()
+    page.evaluate("windPage.complete.then(() => { windPage.pause(); windPage.reset(); })")
+    told = page.evaluate("windPage.advance(50)")
+    assert told["simulated"] == pytest.approx(2.0)
+    assert page.evaluate("windPage.time()") == pytest.approx(2.0)
+    values = page.evaluate("windPage.positions().then((found) => Array.from(found))")
+    found = torch.tensor(values, dtype=torch.float64).reshape(-1, 3)
+    state = simulation.start()
+    for _ in range(50):
+        state, _ = simulation.advance(state)
+    scene = simulation.scene
+    size, order = scene.size * scene.frame.metres_per_unit, order_of(scene)[1]
+    rest, expected = (
+        scene.frame.point_to_sim(drawn.means.double())[order] / size for drawn in (scene.rest(), scene.deformed(state))
+    )
+    motion = float((expected - rest).norm(dim=-1).max())
+    assert motion > 0.1
+    assert float((found - expected).norm(dim=-1).max()) < 0.01 * motion
+    assert page.told == []
+    assert [url for url in page.asked if not url.startswith(("file:", "data:", "blob:"))] == []
+
+
+def test_what_the_visitor_does(show, written):
+    """The clock, pause, wind, link, a pull and a turn of the view."""
+    page = show(written, "#wind=0,0,0&gusts=0&stiffness=2&speed=0.25")
+    assert page.evaluate("[windPage.settings.wind, windPage.settings.gusts, windPage.settings.stiffness]") == [
+        [0, 0, 0],
+        0,
+        2,
+    ]
+    assert page.locator("#slow").get_attribute("aria-pressed") == "true"
+    link = page.evaluate("windPage.link()")
+    page.locator("#reset").click()
+    page.mouse.move(300, 190)
+    page.mouse.down()
+    until(lambda: page.evaluate("windPage.pulled()"))
+    page.mouse.move(310, 170)
+    page.mouse.up()
+    assert not page.evaluate("windPage.pulled()")
+    assert page.evaluate("windPage.link()") == link  # the view stood still
+    page.locator("#slow").click()
+    until(lambda: page.evaluate("windPage.time()") > 0.3)
+    page.locator("#play").click()
+    assert not page.evaluate("windPage.playing()")
+    time.sleep(0.2)
+    stopped = page.evaluate("windPage.time()")
+    time.sleep(0.2)
+    assert page.evaluate("windPage.time()") == stopped
+    page.locator("#play").click()
+    until(lambda: page.evaluate("windPage.time()") > stopped)
+    box = page.locator("#dial").bounding_box()
+    page.mouse.click(box["x"] + 0.9 * box["width"], box["y"] + 0.5 * box["height"])
+    assert page.evaluate("Math.hypot(...windPage.settings.wind)") == pytest.approx(10 * 0.8 / 0.96, rel=0.05)
+    link = page.evaluate("windPage.link()")
+    assert re.search(r"#wind=[-\d.,]+&gusts=0&stiffness=2&view=[-\d.,]+$", link)
+    page.mouse.move(10, 60)
+    page.mouse.down()
+    time.sleep(0.3)
+    page.mouse.move(60, 60, steps=4)
+    page.mouse.up()
+    until(lambda: page.evaluate("windPage.link()") != link)
+    other = show(written, link[link.index("#") :])
+    for part in ("windPage.settings.wind", "windPage.settings.gusts"):
+        assert other.evaluate(part) == pytest.approx(page.evaluate(part), abs=1e-3)
+    page.locator("#reset").click()
+    until(lambda: page.evaluate("windPage.time()") < 0.3)
+    assert page.told == other.told == []
+
+
+def test_a_file_that_is_cut_short_or_damaged_says_so(show, written, tmp_path):
+    content = written.read_text()
+    for k, name in enumerate(("code", "solver", "part-0")):
+        at = content.index(f'id="film-{name}"')
+        (tmp_path / f"{k}.html").write_text(content[: at + 200])
+        page = show(tmp_path / f"{k}.html")
+        message = page.locator("#message")
+        message.filter(has_text="The file of this page is cut short: copy it again, or export it again.").wait_for()
+        assert message.is_visible()
+    at = content.index(">", content.index('id="film-solver"')) + 100
+    (tmp_path / "damaged.html").write_text(content[:at] + "AAAA" + content[at + 4 :])
+    message = show(tmp_path / "damaged.html").locator("#message")
+    message.filter(has_text=re.compile(r"^This page cannot be shown \([^()]+\)\.$")).wait_for()

@@ -1,0 +1,21 @@
+// Reads the block that viewer/live_web/block.py packs: the length of its head, the head, and its arrays.
+
+/**
+ * @param {Uint8Array} bytes
+ * @returns {{head: any, arrays: Record<string, Float64Array | Int32Array>}} float32 arrays come as float64
+ */
+export function readBlock(bytes) {
+  const view = new DataView(bytes.buffer, bytes.byteOffset, bytes.byteLength);
+  const size = view.getUint32(0, true);
+  const head = JSON.parse(new TextDecoder().decode(bytes.subarray(4, 4 + size)));
+  let at = 4 + size;
+  /** @type {Record<string, Float64Array | Int32Array>} */
+  const arrays = {};
+  for (const [name, kind, count] of head.arrays) {
+    const part = bytes.slice(at, at + 4 * count).buffer;
+    if (part.byteLength !== 4 * count) throw new Error("the block of the solver is too short");
+    arrays[name] = kind === "f4" ? Float64Array.from(new Float32Array(part)) : new Int32Array(part);
+    at += 4 * count;
+  }
+  return { head, arrays };
+}

@@ -1,0 +1,111 @@
+// Runs the solver beside the page, in step with the clock. What it understands is in `does`, what it says in `post`.
+import { readBlock } from "./block.js";
+import { Solver } from "./solver.js";
+
+const BEHIND = 0.25; // s that it may be late before it stops trying to catch up
+const WINDOW = 2000; // ms, over which the speed is measured
+const BREATH = 4; // ms between frames, in which it hears what the page says
+
+/** @type {Solver} */
+let solver;
+let on = false;
+let speed = 1; // simulated seconds per second that are wanted
+let motion = 0; // counts the starts from rest
+/** @type {{now: number, time: number} | null} */
+let anchor = null;
+/** @type {[number, number][]} */
+let past = []; // when, and the simulated time, of the last frames
+/** @type {ReturnType<typeof setTimeout> | undefined} */
+let next;
+
+const post = (/** @type {any} */ message, /** @type {Transferable[]} */ moved = []) => self.postMessage(message, moved);
+
+function show() {
+  const moved = solver.drawn();
+  const [first] = past;
+  const last = past[past.length - 1];
+  const rate = past.length > 3 ? (last[1] - first[1]) / ((last[0] - first[0]) / 1000) : null;
+  post({ kind: "state", motion, time: solver.time, moved, rate, ended: !on }, [moved.buffer]);
+}
+
+function pace() {
+  clearTimeout(next);
+  if (!on || !solver) return;
+  const now = performance.now();
+  anchor ??= { now, time: solver.time };
+  const due = anchor.time + ((now - anchor.now) / 1000) * speed;
+  if (due - solver.time > BEHIND * speed) anchor = { now, time: solver.time };
+  if (solver.time > due) {
+    next = setTimeout(pace, Math.max(BREATH, ((solver.time - due) / speed) * 1000));
+    return;
+  }
+  try {
+    solver.advance();
+  } catch (error) {
+    on = false;
+    post({ kind: "failed", why: /** @type {Error} */ (error).message });
+    return;
+  }
+  const after = performance.now();
+  past.push([after, solver.time]);
+  while (after - past[0][0] > WINDOW) past.shift();
+  show();
+  next = setTimeout(pace, BREATH);
+}
+
+function restart() {
+  anchor = null;
+  past = [];
+  pace();
+}
+
+/** @type {Record<string, (given: any) => void>} */
+const does = {
+  load({ bytes }) {
+    solver = new Solver(readBlock(bytes));
+    show();
+  },
+  run(given) {
+    on = given.on;
+    speed = given.speed;
+    restart();
+  },
+  wind({ flow, gusts }) {
+    solver.wind.steady = flow;
+    solver.wind.gusts = gusts;
+  },
+  stiffness({ factor }) {
+    solver.stiffness = factor;
+  },
+  grab({ eye, ray, wide, token }) {
+    post({ kind: "grabbed", token, place: solver.grab(eye, ray, wide) });
+  },
+  aim({ target }) {
+    solver.pull?.target.set(target);
+  },
+  release() {
+    solver.pull = null;
+  },
+  reset() {
+    solver.reset();
+    motion++;
+    show();
+    restart();
+  },
+  // for tests and measurements
+  frames({ count }) {
+    const began = performance.now();
+    let substeps = 0;
+    for (let k = 0; k < count; k++) substeps += solver.advance();
+    show();
+    post({ kind: "done", substeps, seconds: (performance.now() - began) / 1000, simulated: count * solver.head.frameDt });
+  },
+};
+
+self.onmessage = ({ data }) => {
+  try {
+    does[data.kind](data);
+  } catch (error) {
+    post({ kind: "failed", why: /** @type {Error} */ (error).message });
+  }
+};
