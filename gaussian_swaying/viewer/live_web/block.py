@@ -17,6 +17,7 @@ from torch import Tensor
 
 from gaussian_swaying.aero.force import LAWS as AERO_LAWS
 from gaussian_swaying.aero.wind import GaussianGust, SineSway, UniformGust, WindField, stream_start
+from gaussian_swaying.geometry.groups import equal_rows
 from gaussian_swaying.mpm.boundaries.boundary import Boundary
 from gaussian_swaying.mpm.boundaries.pinned_points import PinnedPoints
 from gaussian_swaying.mpm.boundaries.pinned_region import PinnedRegion
@@ -55,8 +56,6 @@ def check(simulation: Simulation) -> None:
         raise _refused("`edits`", "leave them out")
     if setup.forces:
         raise _refused("`forces` of your own", "leave them out")
-    if setup.points.attached is not None:
-        raise _refused("`scene.connected: surface`, where parts have nodes of their own", "set it to grid")
     wind = setup.wind
     if type(wind) is not WindField or not wind.uniform:
         raise _refused("a wind that differs from place to place", "leave out `wind.effects`")
@@ -95,9 +94,14 @@ def pack_solver(simulation: Simulation, nodes: Tensor) -> bytes:
     bound = solver.bound
     assert isinstance(bound, Total)
     body, points, stencil = bound.body, bound.body.points, bound.stencil
-    order = torch.argsort(stencil.first, stable=True)
-    cells, sizes = torch.unique_consecutive(stencil.first[order], return_counts=True)
+    reached = stencil.node.reshape(-1, 27)
+    unit = equal_rows(torch.cat([stencil.first[:, None], reached], 1))  # the points of a cell that have the same nodes
+    order = torch.argsort(unit, stable=True)
+    _, sizes = torch.unique_consecutive(unit[order], return_counts=True)
     active = (bound.node_inverse_mass > 0).nonzero()[:, 0]
+    # nodes without mass do not move, and are one row after all others
+    row = torch.full_like(bound.node_mass, len(active), dtype=torch.long)
+    row[active] = torch.arange(len(active))
     held = torch.zeros_like(bound.node_mass, dtype=torch.bool)
     planes = []
     for boundary, own, acts in zip(body.boundaries, bound.held, bound.on_nodes, strict=True):
@@ -111,7 +115,7 @@ def pack_solver(simulation: Simulation, nodes: Tensor) -> bytes:
     numbers = torch.tensor([LAWS.index(type(one)) for one in points.laws])
     arrays: dict[str, Tensor] = {
         "cellStart": torch.cat([sizes.new_zeros(1), sizes.cumsum(0)]),
-        "cellNode": cells,
+        "cellNodes": row[reached[order[sizes.cumsum(0) - sizes]]],
         "fraction": (1.5 + stencil.factors[1, :, 0] * bound.grid.dx)[:, order].T,
         "rest": points.position[order],
         "volume": points.volume[order],
@@ -119,25 +123,24 @@ def pack_solver(simulation: Simulation, nodes: Tensor) -> bytes:
         "mu": body.laws.mu[order],
         "lam": body.laws.lam[order],
         "law": numbers[law][order],
-        "active": active,
-        "inverseMass": bound.node_inverse_mass[active],
+        "inverseMass": torch.nn.functional.pad(bound.node_inverse_mass[active], (0, 1)),
         "held": held[active],
         "nodeRest": bound.node_rest[active] if bound.node_rest is not None else active.new_zeros(0),
-        "followed": nodes,
+        "followed": row[nodes],
         **_wind_arrays(simulation, order),
     }
     rows = 0
     if bound.point_holds is not None:
         dense = bound.point_holds.dense(torch.float64)
         rows = dense.push.shape[1]
-        arrays |= {"rowNode": dense.node.T, "rowWeight": dense.weight.T, "affected": dense.affected, "push": dense.push}
+        arrays |= {"rowNode": row[dense.node.long()].T, "rowWeight": dense.weight.T}
+        arrays |= {"affected": row[dense.affected.long()], "push": dense.push}
     else:
         arrays |= {name: active.new_zeros(0) for name in ("rowNode", "affected")}
         arrays |= {name: points.mass.new_zeros(0) for name in ("rowWeight", "push")}
     settings, scene = bound.settings, simulation.scene
     head = {
         "dx": settings.dx,
-        "resolution": list(bound.grid.resolution),
         "gravity": list(settings.gravity),
         "damping": settings.damping,
         "viscous": settings.stiffness_damping,

@@ -1,11 +1,15 @@
 """The solver in a browser, in Node.js, against the package's own run."""
 
 import hashlib
+from dataclasses import replace
 
 import pytest
 import torch
+from small_scenes import together
 
+from gaussian_swaying.gaussians.ply import write_ply
 from gaussian_swaying.mpm.forces import Force
+from gaussian_swaying.scenes.procedural import FlagScene
 from gaussian_swaying.viewer.live_web.block import check
 from gaussian_swaying.viewer.live_web.page import PAGE
 
@@ -79,6 +83,19 @@ def test_laws_forces_and_boundaries(make, in_node, name):
     assert motion > 5e-3
     assert error < 1e-3
     assert abs(told[0]["substeps"] - steps) <= 0.02 * steps
+
+
+def test_parts_with_nodes_of_their_own(make, in_node, tmp_path):
+    """Two sheets, less than a cell apart."""
+    sheet = FlagScene(spacing=0.05, width=0.6, height=0.4).generate()
+    places = [sheet.means + torch.tensor([x, y, 0.0]) for x, y in ((0.0, -0.045), (0.0, 0.04))]
+    write_ply(tmp_path / "two.ply", together(*(replace(sheet, means=place) for place in places)))
+    scene = {"generator": None, "ply": str(tmp_path / "two.ply"), "connected": "surface", "metres_per_unit": 1.0}
+    simulation = make(scene=scene)
+    _, moved = in_node(simulation, {"kind": "frames", "count": 10})
+    state, _ = run(simulation, 10)
+    assert state.grid.virtual > 0
+    assert apart(simulation, state, moved)[0] < 1e-3
 
 
 def test_what_the_visitor_does(make, in_node):

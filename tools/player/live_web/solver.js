@@ -21,12 +21,8 @@ export class Solver {
     this.head = head;
     this.a = arrays;
     this.points = arrays.volume.length;
-    this.cells = arrays.cellNode.length;
-    const [nx, ny, nz] = head.resolution;
-    this.nodes = nx * ny * nz;
-    this.strides = [ny * nz, nz];
-    /** Numbers of the 27 nodes from the first one. */
-    this.shifts = Int32Array.from({ length: 27 }, (_, k) => Math.floor(k / 9) * ny * nz + (Math.floor(k / 3) % 3) * nz + (k % 3));
+    this.cells = arrays.cellStart.length - 1;
+    this.nodes = arrays.inverseMass.length; // the last one stands for all without mass, and does not move
     this.wind = new Wind(head.wind);
     this.aero = { ...head.aero, maxAreaRatio: head.aero.maxAreaRatio ?? Infinity };
     this.idle = head.idle;
@@ -149,13 +145,7 @@ export class Solver {
     for (const plane of head.planes) this.stop(plane);
     this.hold();
     const { displacement: U, velocity: V } = this;
-    const { active } = this.a;
-    for (let k = 0; k < active.length; k++) {
-      const at = 3 * active[k];
-      U[at] += dt * V[at];
-      U[at + 1] += dt * V[at + 1];
-      U[at + 2] += dt * V[at + 2];
-    }
+    for (let k = 0; k < U.length; k++) U[k] += dt * V[k];
     this.time += dt;
     this.substep = dt;
   }
@@ -165,26 +155,23 @@ export class Solver {
    * @param {boolean} looked @param {boolean} pushed
    */
   particles(looked, pushed) {
-    const { a, aero, idle, pull, stiffness, head, shifts } = this;
+    const { a, aero, idle, pull, stiffness, head } = this;
     const { displacement: U, velocity: V, force: A, resistance: D, shift: S } = this;
-    const { active, fraction, volume, mass, law, mu, lam, area, cellStart, cellNode } = a;
+    const { fraction, volume, mass, law, mu, lam, area, cellStart, cellNodes } = a;
     const viscous = head.viscous;
     const moving = S.length > 0;
     let fastest = 0;
     let stretched = 1;
     const dragged = pull !== null || (!idle && aero.implicit);
     const grouped = head.grouped;
-    for (let k = 0; k < active.length; k++) {
-      const at = 3 * active[k];
-      A[at] = A[at + 1] = A[at + 2] = 0;
-      D[active[k]] = 0;
-      if (moving) S[at] = S[at + 1] = S[at + 2] = 0;
-    }
+    A.fill(0);
+    if (dragged) D.fill(0);
+    S.fill(0);
     const inverse = 1 / head.dx;
     for (let c = 0; c < this.cells; c++) {
-      const node = cellNode[c];
+      const first = 27 * c;
       for (let k = 0; k < 27; k++) {
-        const at = 3 * (node + shifts[k]);
+        const at = 3 * cellNodes[first + k];
         const to = 3 * k;
         u27[to] = U[at], u27[to + 1] = U[at + 1], u27[to + 2] = U[at + 2];
         v27[to] = V[at], v27[to + 1] = V[at + 1], v27[to + 2] = V[at + 2];
@@ -248,11 +235,11 @@ export class Solver {
             a27[at + 3] += z1 * e0 + y1 * h0, a27[at + 4] += z1 * e1 + y1 * h1, a27[at + 5] += z1 * e2 + y1 * h2;
             a27[at + 6] += z2 * e0 + y2 * h0, a27[at + 7] += z2 * e1 + y2 * h1, a27[at + 8] += z2 * e2 + y2 * h2;
           }
-        if (drag > 0) this.spreadResistance(node, drag);
-        if (moving) this.spreadShift(node, mass[p]);
+        if (drag > 0) this.spreadResistance(first, drag);
+        if (moving) this.spreadShift(first, mass[p]);
       }
       for (let k = 0; pushed && k < 27; k++) {
-        const at = 3 * (node + shifts[k]);
+        const at = 3 * cellNodes[first + k];
         const from = 3 * k;
         A[at] += a27[from], A[at + 1] += a27[from + 1], A[at + 2] += a27[from + 2];
       }
@@ -291,16 +278,16 @@ export class Solver {
     out[3] = damping;
   }
 
-  spreadResistance(node, drag) {
+  spreadResistance(first, drag) {
     for (let k = 0; k < 27; k++)
-      this.resistance[node + this.shifts[k]] += drag * w[Math.floor(k / 9)] * w[3 + (Math.floor(k / 3) % 3)] * w[6 + (k % 3)];
+      this.resistance[this.a.cellNodes[first + k]] += drag * w[Math.floor(k / 9)] * w[3 + (Math.floor(k / 3) % 3)] * w[6 + (k % 3)];
   }
 
   /** Adds mass times displacement of a point, for the centres of the masses that nodes carry. */
-  spreadShift(node, mass) {
+  spreadShift(first, mass) {
     interpolate(u27, place);
     for (let k = 0; k < 27; k++) {
-      const at = 3 * (node + this.shifts[k]);
+      const at = 3 * this.a.cellNodes[first + k];
       const own = mass * w[Math.floor(k / 9)] * w[3 + (Math.floor(k / 3) % 3)] * w[6 + (k % 3)];
       for (let m = 0; m < 3; m++) this.shift[at + m] += own * place[m];
     }
@@ -309,17 +296,17 @@ export class Solver {
   /** Velocities of the nodes after `kick` seconds of force, gravity and damping. */
   accelerate(kick) {
     const { force: A, velocity: V, resistance: D, head, dragged } = this;
-    const { active, inverseMass, held } = this.a;
+    const { inverseMass, held } = this.a;
     const [g0, g1, g2] = head.gravity;
     const decay = Math.exp(-head.damping * kick);
-    for (let k = 0; k < active.length; k++) {
-      const at = 3 * active[k];
+    for (let k = 0; k < this.nodes - 1; k++) {
+      const at = 3 * k;
       if (held[k]) {
         V[at] = V[at + 1] = V[at + 2] = 0;
         continue;
       }
       const inverse = inverseMass[k];
-      const push = dragged ? kick / (1 + kick * D[active[k]] * inverse) : kick;
+      const push = dragged ? kick / (1 + kick * D[k] * inverse) : kick;
       V[at] = decay * (V[at] + push * (A[at] * inverse + g0));
       V[at + 1] = decay * (V[at + 1] + push * (A[at + 1] * inverse + g1));
       V[at + 2] = decay * (V[at + 2] + push * (A[at + 2] * inverse + g2));
@@ -331,14 +318,14 @@ export class Solver {
     const now = this.time + 1e-9;
     if (now < start || (end !== null && now >= end)) return;
     const { velocity: V, shift: S } = this;
-    const { active, inverseMass, nodeRest } = this.a;
-    for (let k = 0; k < active.length; k++) {
-      const at = 3 * active[k];
+    const { inverseMass, nodeRest } = this.a;
+    for (let k = 0; k < this.nodes - 1; k++) {
+      const at = 3 * k;
       const inverse = inverseMass[k];
       const depth =
-        (nodeRest[3 * k] + S[at] * inverse - point[0]) * n0 +
-        (nodeRest[3 * k + 1] + S[at + 1] * inverse - point[1]) * n1 +
-        (nodeRest[3 * k + 2] + S[at + 2] * inverse - point[2]) * n2;
+        (nodeRest[at] + S[at] * inverse - point[0]) * n0 +
+        (nodeRest[at + 1] + S[at + 1] * inverse - point[1]) * n1 +
+        (nodeRest[at + 2] + S[at + 2] * inverse - point[2]) * n2;
       if (depth > 0) continue;
       if (kind === "sticky") {
         V[at] = V[at + 1] = V[at + 2] = 0;
@@ -427,9 +414,9 @@ export class Solver {
 
   /** Places of all points [m]. */
   positions(to) {
-    const { rest, cellStart, cellNode, fraction } = this.a;
+    const { rest, cellStart, cellNodes, fraction } = this.a;
     for (let c = 0; c < this.cells; c++) {
-      for (let k = 0; k < 81; k++) u27[k] = this.displacement[3 * (cellNode[c] + this.shifts[Math.floor(k / 3)]) + (k % 3)];
+      for (let k = 0; k < 81; k++) u27[k] = this.displacement[3 * cellNodes[27 * c + Math.floor(k / 3)] + (k % 3)];
       for (let p = cellStart[c]; p < cellStart[c + 1]; p++) {
         weights(fraction, 3 * p, w, g, 1);
         interpolate(u27, place);
