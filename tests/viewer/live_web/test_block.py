@@ -87,8 +87,8 @@ def test_laws_forces_and_boundaries(make, in_node, name):
 
 def test_parts_with_nodes_of_their_own(make, in_node, tmp_path):
     """Two sheets, less than a cell apart."""
-    sheet = FlagScene(spacing=0.05, width=0.6, height=0.4).generate()
-    places = [sheet.means + torch.tensor([x, y, 0.0]) for x, y in ((0.0, -0.045), (0.0, 0.04))]
+    sheet = FlagScene(spacing=0.05).generate()
+    places = [sheet.means + torch.tensor([0.0, y, 0.0]) for y in (-0.045, 0.04)]
     write_ply(tmp_path / "two.ply", together(*(replace(sheet, means=place) for place in places)))
     scene = {"generator": None, "ply": str(tmp_path / "two.ply"), "connected": "surface", "metres_per_unit": 1.0}
     simulation = make(scene=scene)
