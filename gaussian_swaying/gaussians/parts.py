@@ -2,17 +2,18 @@
 
 ``parts.npz`` lies beside the splat and has these arrays, for N Gaussians and P parts:
 
-===============  ==========================  =======================================================================
-``count``        int64, ()                   N, so that the parts of another splat are noticed
-``labels``       uint8, or uint16, (N,)      the part of each Gaussian, in the order of the splat
-``names``        text, (P,)                  the names of the parts
-``roles``        text, (P,)                  ``soft``, ``rigid``, ``held`` or ``still``
-``E``            float64, (P,)               Young's modulus [Pa]; NaN for that of the object, here and below
-``nu``           float64, (P,)               Poisson's ratio
-``density``      float64, (P,)               density [kg/m³]
-``thickness``    float64, (P,)               thickness of the surface [m]
-``attached``     text, (P,)                  the only part to which a part is attached; empty for any; may be missing
-===============  ==========================  =======================================================================
+=================  ==========================  =======================================================================
+``count``          int64, ()                   N, so that the parts of another splat are noticed
+``labels``         uint8, or uint16, (N,)      the part of each Gaussian, in the order of the splat
+``names``          text, (P,)                  the names of the parts
+``roles``          text, (P,)                  ``soft``, ``rigid``, ``held`` or ``still``
+``E``              float64, (P,)               Young's modulus [Pa]; NaN for that of the object, here and below
+``nu``             float64, (P,)               Poisson's ratio
+``density``        float64, (P,)               density [kg/m³]
+``thickness``      float64, (P,)               thickness of the surface [m]
+``damping_ratio``  float64, (P,)               damping ratio; may be missing
+``attached``       text, (P,)                  the only part to which a part is attached; empty for any; may be missing
+=================  ==========================  =======================================================================
 """
 
 from __future__ import annotations
@@ -38,7 +39,7 @@ if TYPE_CHECKING:
     from scipy.spatial import cKDTree
 
 ROLES = ("soft", "rigid", "held", "still")
-NUMBERS = ("E", "nu", "density", "thickness")
+NUMBERS = ("E", "nu", "density", "thickness", "damping_ratio")
 MOST = 1 << 16  # parts of a file: labels are uint16
 
 
@@ -55,6 +56,7 @@ class Part:
         nu: Poisson's ratio; that of the object if None. A rigid part has none.
         density: Density [kg/m³]; that of the object if None.
         thickness: Thickness of the surface [m]; that of the object if None.
+        damping_ratio: Damping ratio at ``material.damping_frequency``; that of the object if None.
         attached: The name of the only part to which it is attached, with ``scene.connected: surface``; any if None.
 
     Raises:
@@ -68,6 +70,7 @@ class Part:
     nu: float | None = None
     density: float | None = None
     thickness: float | None = None
+    damping_ratio: float | None = None
     attached: str | None = None
 
     def __post_init__(self) -> None:
@@ -86,7 +89,7 @@ class Part:
                 check_plain(what, value)
                 check_poisson_ratio(what, value)
             elif value is not None:
-                check_positive(what, value)
+                check_positive(what, value, allow_zero=name == "damping_ratio")
 
     @property
     def has_material(self) -> bool:

@@ -1,4 +1,4 @@
-"""Stiffness-proportional damping: a viscous stress added to the elastic one."""
+"""Rayleigh damping: rates proportional to the mass, and a viscous stress, which is proportional to the stiffness."""
 
 import math
 
@@ -6,6 +6,19 @@ import torch
 from torch import Tensor
 
 from gaussian_swaying.geometry.linalg import matmul3
+
+
+def decay_rate(ratio: float, frequency: float) -> float:
+    r"""Rate :math:`\alpha = 4 \pi f \zeta` [1/s] at which velocities decay, for a damping ratio at a frequency.
+
+    A mode of circular frequency :math:`\omega` is damped with the ratio :math:`\alpha / (2 \omega)` (Rayleigh damping,
+    mass part), so one of twice the frequency has half of it.
+
+    Args:
+        ratio: :math:`\zeta`, share of critical damping.
+        frequency: f [Hz].
+    """
+    return 4 * math.pi * frequency * ratio
 
 
 def kelvin_voigt_pk1(F: Tensor, F_rate: Tensor, mu: Tensor, lam: Tensor, time: float) -> Tensor:

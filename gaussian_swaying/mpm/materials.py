@@ -11,6 +11,7 @@ import math
 from dataclasses import dataclass
 
 from gaussian_swaying._checks import check_choice
+from gaussian_swaying.mpm.damping import decay_rate
 
 
 @dataclass(frozen=True, slots=True)
@@ -37,8 +38,8 @@ class KnownMaterial:
 
     @property
     def damping(self) -> float:
-        """``solver.damping`` [1/s] with which a sway at 1 Hz has the damping ratio: 4 pi times it, to two digits."""
-        return float(f"{4 * math.pi * self.damping_ratio:.2g}")
+        """``solver.damping`` [1/s] with which a sway at 1 Hz has the damping ratio, to two digits."""
+        return float(f"{decay_rate(self.damping_ratio, 1.0):.2g}")
 
     @property
     def wave_speed(self) -> float:

@@ -124,6 +124,8 @@ class MaterialPoints:
         attached: Which points are attached to each other at rest, in all scenes: a number for each, int64, shape (P,),
             the same for those of a piece, or pairs that are attached, shape (E, 2). Others never share nodes in
             ``total``, however close they lie (``virtual_nodes``). None if all are.
+        damping: Rate at which the velocity of the material decays [1/s], shape (..., P), only in ``total``; None for
+            no damping.
     """
 
     position: Tensor
@@ -134,13 +136,14 @@ class MaterialPoints:
     laws: tuple[ConstitutiveLaw, ...] = _DEFAULT
     law_index: Tensor | None = None
     attached: Tensor | None = None
+    damping: Tensor | None = None
 
     def __post_init__(self) -> None:
         check_shape("position", self.position, "P", 3)
         if self.attached is not None:
             _check_attached(self.attached, self.count)
         batch = tuple(self.position.shape[:-1])
-        for name in (*_FIELDS, *(["law_index"] if self.law_index is not None else [])):
+        for name in (*_FIELDS, *(name for name in ("law_index", "damping") if getattr(self, name) is not None)):
             value = getattr(self, name)
             if tuple(value.shape) != batch:
                 raise ValueError(f"Expected `{name}` of shape {batch}, but got {tuple(value.shape)}.")
@@ -165,6 +168,7 @@ class MaterialPoints:
         law: ConstitutiveLaw | Sequence[ConstitutiveLaw] | None = None,
         law_index: Tensor | None = None,
         attached: Tensor | None = None,
+        damping: Tensor | float | None = None,
     ) -> MaterialPoints:
         """Build the points from per-point tensors or from numbers that apply to all points.
 
@@ -177,6 +181,7 @@ class MaterialPoints:
             law: Constitutive law, or several; fixed corotated elasticity if None.
             law_index: With several laws, which of them applies to each particle, int64, shape (..., P).
             attached: Which points are attached to each other, see :class:`MaterialPoints`.
+            damping: Rate at which the velocity decays [1/s], not negative.
 
         Returns:
             The points, every field expanded to shape (..., P).
@@ -209,7 +214,9 @@ class MaterialPoints:
             law_index = law_index.to(position.device, torch.long).expand(position.shape[:-1])
             if not bool(((law_index >= 0) & (law_index < len(laws))).all()):
                 raise ValueError(f"Expected `law_index` to lie in 0 to {len(laws) - 1}, the last index of `laws`.")
-        return cls(position, rho * v, v, e, nu, laws, law_index, attached)
+        if damping is not None:
+            damping = field("damping", damping, -1e-30, inf, "not to be negative, and finite [1/s]")
+        return cls(position, rho * v, v, e, nu, laws, law_index, attached, damping)
 
     @classmethod
     def join(cls, parts: Sequence[MaterialPoints]) -> MaterialPoints:
@@ -230,7 +237,9 @@ class MaterialPoints:
         one_law = len(laws) < 2
         attached = _join_attached(parts)
         law_index = None if one_law else torch.cat(index, -1)
-        return cls(position, **fields, laws=tuple(laws), law_index=law_index, attached=attached)
+        rates = _rates(parts)
+        damping = None if rates is None else torch.cat(rates, -1)
+        return cls(position, **fields, laws=tuple(laws), law_index=law_index, attached=attached, damping=damping)
 
     @classmethod
     def stack(cls, parts: Sequence[MaterialPoints]) -> MaterialPoints:
@@ -244,7 +253,9 @@ class MaterialPoints:
             )
             if not same:
                 raise ValueError("Scenes of one batch need the same `attached`: run those that differ one by one.")
-        return cls(**fields, laws=parts[0].laws, law_index=law_index, attached=attached)
+        rates = _rates(parts)
+        damping = None if rates is None else torch.stack(rates)
+        return cls(**fields, laws=parts[0].laws, law_index=law_index, attached=attached, damping=damping)
 
     @property
     def count(self) -> int:
@@ -263,7 +274,8 @@ class MaterialPoints:
         """Apply a function to every tensor (``.detach``, indexing); law indices stay integers, ``attached`` stays."""
         moved = {name: function(getattr(self, name)) for name in ("position", *_FIELDS)}
         index = None if self.law_index is None else function(self.law_index).long()
-        return MaterialPoints(**moved, laws=self.laws, law_index=index, attached=self.attached)
+        damping = None if self.damping is None else function(self.damping)
+        return MaterialPoints(**moved, laws=self.laws, law_index=index, attached=self.attached, damping=damping)
 
 
 def _check_attached(attached: Tensor, count: int) -> None:
@@ -275,6 +287,13 @@ def _check_attached(attached: Tensor, count: int) -> None:
         )
     if attached.dim() == 2 and not bool(((attached >= 0) & (attached < count)).all()):
         raise ValueError(f"Expected the pairs of `attached` to be numbers of points from 0 to {count - 1}.")
+
+
+def _rates(parts: Sequence[MaterialPoints]) -> list[Tensor] | None:
+    """``damping`` of several bodies; None if none of them is damped."""
+    if all(part.damping is None for part in parts):
+        return None
+    return [torch.zeros_like(part.mass) if part.damping is None else part.damping for part in parts]
 
 
 def _join_attached(parts: Sequence[MaterialPoints]) -> Tensor | None:

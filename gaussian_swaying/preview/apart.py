@@ -34,8 +34,8 @@ def pieces_of_nodes(scene: SimulatedScene, dx: float) -> tuple[Tensor, Tensor, f
 def why_apart(scene: SimulatedScene, dx: float, held: Tensor) -> str | None:
     """The reason for nodes of their own, in words; None if parts should share them.
 
-    They should not if much lies beside what it is not attached to, and all hangs together with what is held: what does not
-    would fall, though a grid may hold it.
+    They should not share them if much lies beside what it is not attached to, and all hangs together with what is held:
+    what does not would fall, though a grid may hold it.
 
     Args:
         scene: A scene of ``scene.connected: surface``.

@@ -33,6 +33,7 @@ class MaterialRegion:
         density: Density [kg/m³]; unchanged if null.
         thickness: Thickness of the surface [m]; unchanged if null.
         bending: Bending stiffness [N m]; unchanged if null.
+        damping_ratio: Damping ratio at ``damping_frequency`` of the object; unchanged if null.
         law: Constitutive law; unchanged if null.
     """
 
@@ -42,6 +43,7 @@ class MaterialRegion:
     density: float | None = None
     thickness: float | None = None
     bending: float | None = None
+    damping_ratio: float | None = None
     law: ConstitutiveLaw | None = None
 
 
@@ -61,6 +63,10 @@ class Material:
             plate or a fabric. The outer layers then lie :func:`layer_distance` apart, so that it is independent of the
             stiffness against stretch, E x thickness. E thickness³ / (12 (1 - nu²)) if null. An edit of E changes it in
             proportion.
+        damping_ratio: Share of critical damping of a vibration of ``damping_frequency``, in ``solver.formulation:
+            total``; parts and regions may have their own. The velocity decays at a rate of 4 pi times frequency and
+            ratio, so a vibration of twice the frequency has half of the ratio. None if null, beside ``solver.damping``.
+        damping_frequency: Frequency of a vibration that has the damping ratio [Hz].
         law: Constitutive law, for example ``Sand`` (see :data:`gaussian_swaying.mpm.laws.LAWS`); fixed corotated
             elasticity if null. Plastic laws need ``solver.formulation: updated``.
         regions: Parts with a different material; later entries win.
@@ -75,6 +81,8 @@ class Material:
     thickness: float = 0.01
     volume: Literal["patch", "cell"] = "patch"
     bending: float | None = None
+    damping_ratio: float | None = None
+    damping_frequency: float = 1.0
     law: ConstitutiveLaw | None = None
     regions: list[MaterialRegion] = field(default_factory=list)
 
@@ -99,9 +107,12 @@ class Material:
             for name in ("E", "density", "thickness", "bending"):
                 if given[name] is not None:
                     check_positive(f"material.{name}", given[name])
+            if entry.damping_ratio is not None:
+                check_positive("material.damping_ratio", entry.damping_ratio, allow_zero=True)
             if given["nu"] is not None:
                 check_plain("material.nu", given["nu"])
                 check_poisson_ratio("material.nu", given["nu"])
+        check_positive("material.damping_frequency", self.damping_frequency)
         if any(entry.bending is not None for entry in entries):
             self._check_bending()
 

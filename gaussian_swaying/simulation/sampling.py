@@ -17,6 +17,7 @@ from gaussian_swaying.gaussians.grouping import grid_groups
 from gaussian_swaying.geometry.frame import SimFrame
 from gaussian_swaying.geometry.groups import equal_rows, sums
 from gaussian_swaying.geometry.regions import Region, whereabouts
+from gaussian_swaying.mpm.damping import decay_rate
 from gaussian_swaying.mpm.laws.fixed_corotated import FixedCorotated
 from gaussian_swaying.mpm.laws.law import ConstitutiveLaw
 from gaussian_swaying.mpm.state import MaterialPoints
@@ -27,8 +28,8 @@ SHARED = 4
 """Largest number of directions in a group whose patches are shared among all its points."""
 
 SIMPSON = (2 / 3, 1 / 6, 1 / 6)  # middle plane and faces of a sheet: exact for the square of the height
-_PROPERTIES = ("E", "nu", "density", "thickness", "bending")
-_KINDS = ("E", "nu", "density", "thickness", "span")
+_PROPERTIES = ("E", "nu", "density", "thickness", "bending", "damping_ratio")
+_KINDS = ("E", "nu", "density", "thickness", "span", "damping")
 
 
 @dataclass(frozen=True)
@@ -46,6 +47,7 @@ class Samples:
         density: Densities [kg/m³], shape (N,).
         thickness: Thicknesses of the surface [m], shape (N,).
         span: Distances between the outer two of three layers [m], shape (N,).
+        damping: Rates at which the velocity decays [1/s], shape (N,).
         law_index: Which law applies to each, int64, shape (N,).
         surface: Which are on the surface, bool, shape (N,).
     """
@@ -60,6 +62,7 @@ class Samples:
     density: Tensor
     thickness: Tensor
     span: Tensor
+    damping: Tensor
     law_index: Tensor
     surface: Tensor
 
@@ -80,7 +83,7 @@ class Samples:
         ``attached`` are the pairs of points that are attached, shape (E, 2); None if all are.
         """
         position, volume, index = self.position, self.volume, self.law_index
-        properties = {name: getattr(self, name) for name in ("E", "nu", "density")}
+        properties = {name: getattr(self, name) for name in ("E", "nu", "density", "damping")}
         if layers == 3:
             out = 0.5 * self.span[:, None] * self.normal
             position = torch.cat([position, position + out, position - out])
@@ -96,6 +99,7 @@ class Samples:
             law=list(laws),
             law_index=index if len(laws) > 1 else None,
             attached=attached,
+            damping=properties["damping"].to(dtype) if bool((self.damping > 0).any()) else None,
         )
 
 
@@ -166,11 +170,13 @@ def sample_object(
             solid = torch.cat([filling.gaussian_volume, filling.volume]).to(volume)
             volume = torch.where(solid > 0, solid, volume)
     bending = properties.pop("bending")
+    damping = decay_rate(1.0, material.damping_frequency) * properties.pop("damping_ratio").nan_to_num(0.0)
     distance = layer_distance(bending, properties["E"], properties["nu"], properties["thickness"])
     span = torch.where(bending.isnan(), properties["thickness"], distance)
     found = Samples(
-        position, normal, body_area, area, volume, **properties, span=span, law_index=index, surface=surface
-    )
+        position, normal, body_area, area, volume, **properties, span=span, damping=damping, law_index=index,
+        surface=surface,
+    )  # fmt: skip
     return found, laws
 
 

@@ -6,7 +6,11 @@ import torch
 
 from gaussian_swaying.gaussians.parts import Part, PartRegion, Parts
 
-PARTS = [Part("pot", "still"), Part("soil", "held", E=2e6), Part("leaf", density=300.0, thickness=0.002, nu=0.4)]
+PARTS = [
+    Part("pot", "still"),
+    Part("soil", "held", E=2e6),
+    Part("leaf", density=300.0, thickness=0.002, nu=0.4, damping_ratio=0.1),
+]
 
 
 def test_the_file_keeps_labels_roles_and_materials(tmp_path):

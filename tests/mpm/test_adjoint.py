@@ -247,7 +247,9 @@ def _place(batch=()):
     return place + 2e-3 * torch.rand(*batch, *place.shape, generator=torch.Generator().manual_seed(0), dtype=WIDE)
 
 
-def _gradients(device, dtype, transfer, law, *, steps=4, checkpoint=2, batch=(), wind=True, groups=False, **settings):
+def _gradients(
+    device, dtype, transfer, law, *, steps=4, checkpoint=2, batch=(), wind=True, groups=False, damped=False, **settings
+):
     """Gradients of a mixture of all fields at the end by every input, by name, and that mixture."""
     place = _place(batch)
     values = {
@@ -266,6 +268,7 @@ def _gradients(device, dtype, transfer, law, *, steps=4, checkpoint=2, batch=(),
         poisson_ratio=values["poisson_ratio"],
         law=law,
         law_index=torch.arange(place.shape[-2]) % len(law) if isinstance(law, list) else None,
+        damping=30 * _random(9, *place.shape[:-1]).abs().to(device, dtype) if damped else None,
     )
     solver = MPMSolver(**{"dx": DX, "transfer": transfer, **settings})
     state = solver.init_state(points, values["velocity"])
@@ -316,8 +319,8 @@ def test_gradients_of_a_rollout(name, kernel_device):
 
 
 def test_gradients_with_viscosity_and_two_laws(kernel_device):
-    """The viscous stress, and particles of two laws."""
-    _compare(kernel_device, [FixedCorotated(), NeoHookean()], stiffness_damping=2e-3)
+    """The viscous stress, a rate of damping at each point, and particles of two laws."""
+    _compare(kernel_device, [FixedCorotated(), NeoHookean()], stiffness_damping=2e-3, damped=True)
 
 
 @pytest.mark.slow(gate=["cpu-clamp", "cpu-nodes"])

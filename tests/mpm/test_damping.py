@@ -1,11 +1,15 @@
 """Stiffness damping: what it damps and how much, what it does not damp, and how much it shortens the substep."""
 
 import math
+from dataclasses import replace
+from itertools import pairwise
 
 import pytest
 import torch
 
-from gaussian_swaying.mpm.damping import damped_substep, kelvin_voigt_pk1
+from gaussian_swaying.geometry.regions import Box
+from gaussian_swaying.mpm.boundaries.pinned_region import PinnedRegion
+from gaussian_swaying.mpm.damping import damped_substep, decay_rate, kelvin_voigt_pk1
 from gaussian_swaying.mpm.solver import MPMSolver
 from gaussian_swaying.mpm.state import MaterialPoints
 from gaussian_swaying.mpm.timestep import cfl_number, stable_limit, wave_speed
@@ -277,3 +281,67 @@ def test_solver_divides_a_frame_by_the_damped_substep(formulation):
 def test_negative_damping_is_refused():
     with pytest.raises(ValueError, match="`stiffness_damping` to not be negative"):
         MPMSolver(stiffness_damping=-1e-3)
+
+
+# ---- the damping of the material
+
+
+def _swing(stiffer, rate=0.0, beta=0.0):
+    """Frequency [rad/s] and damping ratio of the lowest bending mode, from the logarithmic decrement; the energies."""
+    points = _bar((30, 3, 3), 0.1 / 3, e=2e4 * stiffer**2)
+    points = replace(points, damping=torch.full_like(points.mass, rate)) if rate else points
+    pin = PinnedRegion(Box([None] * 3, [0.2, None, None]), kind="clamp")
+    solver = MPMSolver(dx=0.1, gravity=(0, 0, 0), boundaries=[pin], stiffness_damping=beta)
+    x = 1.875104 * ((points.position[:, 0] - 0.2) / 0.8).clamp(min=0)
+    shape = torch.cosh(x) - torch.cos(x) - 0.734096 * (torch.sinh(x) - torch.sin(x))  # clamped-free, textbook
+    velocity = torch.zeros_like(points.position)
+    velocity[:, 2] = 1e-3 * shape
+    state, dt, height, energy = solver.init_state(points, velocity), 2e-3 / stiffer, [], []
+    for _ in range(160):
+        state = solver.rollout(state, dt, 20)
+        height.append(float((points.mass * shape * (state.position - points.position)[:, 2]).sum()))
+        energy.append(float(sum(solver.energies(state).values())))
+    found = torch.tensor(height, dtype=torch.float64).abs()
+    peaks = ((found[1:-1] > found[:-2]) & (found[1:-1] >= found[2:])).nonzero()[:, 0] + 1
+    low, top, high = (found[peaks + k] for k in (-1, 0, 1))
+    bend = low - 2 * top + high  # a parabola through the largest three
+    size, place = top - 0.125 * (high - low) ** 2 / bend, peaks + 0.5 * (low - high) / bend
+    half, decrement = float(place.diff().mean()) * 20 * dt, -2 * float(size.log().diff().mean())
+    return math.pi / half, decrement / math.hypot(2 * math.pi, decrement), energy
+
+
+@pytest.mark.parametrize(("share", "beta"), [(1.0, 0.0), (0.6, 1e-2)])
+def test_a_cantilever_has_the_damping_ratio_at_two_frequencies(share, beta):
+    """Rayleigh: rate / (2 omega) + beta omega / 2; the energy never grows."""
+    first = _swing(1)[0]
+    rate = share * decay_rate(0.05, first / (2 * math.pi))
+    for stiffer in (1, 2):
+        omega, ratio, energy = _swing(stiffer, rate, beta / stiffer)
+        assert omega == pytest.approx(stiffer * first, rel=0.01)
+        assert ratio == pytest.approx(rate / (2 * omega) + beta / stiffer * omega / 2, rel=0.02)
+        tops = [max(energy[k : k + 20]) for k in range(0, 160, 20)]  # velocities are half a substep behind
+        assert all(after < before for before, after in pairwise(tops))
+
+
+def test_each_part_has_its_own_damping():
+    """Two bars far apart that drift: each decays by its own rate; where two meet, a node has the mean of its mass."""
+    one, other = (_bar((4, 2, 2), 0.05) for _ in range(2))
+    far = replace(other, position=other.position + 2.0, damping=torch.full_like(other.mass, 3.0))
+    points = MaterialPoints.join([one, far])
+    assert points.damping[: one.count].tolist() == [0.0] * one.count
+    solver = MPMSolver(dx=0.1, gravity=(0, 0, 0))
+    velocity = torch.ones_like(points.position)
+    state = solver.rollout(solver.init_state(points, velocity), 1e-3, 100)
+    expected = torch.exp(-0.1 * points.damping)[:, None].expand(-1, 3)
+    torch.testing.assert_close(state.velocity, expected, rtol=1e-12, atol=1e-12)
+    stacked = MaterialPoints.stack([one, replace(one, damping=torch.ones_like(one.mass))])
+    assert stacked.damping.mean(-1).tolist() == [0.0, 1.0]
+
+
+def test_damping_of_the_material_is_refused_in_updated_and_below_zero():
+    bar = _bar((3, 3, 3), 0.1)
+    with pytest.raises(ValueError, match=r"`material.damping_ratio` sets, needs `solver.formulation: total`"):
+        MPMSolver(dx=0.1, formulation="updated").init_state(replace(bar, damping=torch.ones_like(bar.mass)))
+    numbers = {"volume": 1e-3, "density": 1.0, "youngs_modulus": 1.0, "poisson_ratio": 0.3}
+    with pytest.raises(ValueError, match="`damping` not to be negative"):
+        MaterialPoints.create(bar.position, damping=-1.0, **numbers)

@@ -1,5 +1,7 @@
 """``scene.parts``: what is held and still stays, what is soft has its own material, and nothing tears."""
 
+import dataclasses
+import math
 import re
 from pathlib import Path
 
@@ -50,6 +52,23 @@ def test_what_is_still_and_held_stays_and_the_rest_bends_there(formulation):
     size = torch.stack([moved[column == k].amax() for k in range(int(column.max()) + 1)])
     assert float(size.diff().abs().max()) < 1.5 * 0.04  # columns are 0.04 apart, and the flag falls by its weight
     assert float(moved[(label == 2) & (CLOUD.means[:, 0] > 0.5)].min()) > 0.0  # what bends is next to it
+
+
+def test_parts_have_damping_ratios_of_their_own():
+    """A ratio at the frequency of the object, as a rate of 4 pi times both."""
+    roles = [*ROLES[:3], dataclasses.replace(ROLES[3], damping_ratio=0.1)]
+    material = Material(E=5e3, density=30.0, thickness=0.01, damping_ratio=0.02, damping_frequency=3.0)
+    points = flag(Parts(labels(), roles), material=material).scene.points
+    rates = points.damping.unique()
+    assert rates.tolist() == pytest.approx([12 * math.pi * 0.02, 12 * math.pi * 0.1])
+    hem = points.position[:, 0] > 0.95
+    assert bool((points.damping[hem] == rates[1]).all())
+    assert flag().scene.points.damping is None
+    with pytest.raises(ValueError, match=r"`material.damping_ratio` sets, needs `solver.formulation: total`"):
+        flag(material=material, formulation="updated").start()
+    for name, value in (("damping_ratio", -0.1), ("damping_frequency", 0.0)):
+        with pytest.raises(ValueError, match=f"`material.{name}` to"):
+            Material(**{name: value})
 
 
 @pytest.mark.parametrize("formulation", ["total", "updated"])

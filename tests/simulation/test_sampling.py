@@ -18,7 +18,7 @@ def _pairs():
     place = torch.tensor([[0.9, 0.9, 1.0], [1.1, 0.9, 1.0], [0.9, 1.1, 1.0], [1.1, 1.1, 1.0]], dtype=DOUBLE)
     each = {
         name: torch.ones(8, dtype=DOUBLE)
-        for name in ("body_area", "area", "volume", "E", "density", "thickness", "span")
+        for name in ("body_area", "area", "volume", "E", "density", "thickness", "span", "damping")
     }
     return Samples(
         position=place.repeat_interleave(2, 0),
@@ -44,6 +44,7 @@ def test_like_samples_of_a_cell_are_one_group():
         ("density", 2.0),
         ("thickness", 2.0),
         ("span", 2.0),
+        ("damping", 2.0),
         ("law_index", 1),
         ("surface", False),
         ("area", 0.0),

@@ -45,6 +45,8 @@ class Total(Formulation):
         node_inverse_mass: Its inverse [1/kg], 0 for a node without mass, shape (..., G).
         node_rest: Centre of the mass that each node carries, at rest [m], shape (..., G, 3), if a boundary needs node
             positions.
+        node_damping: Rate at which the velocity of each node decays, the mean over its mass [1/s], shape (..., G); None
+            for a material without damping of its own.
         contact: Contact with obstacles and itself, or None.
 
     Raises:
@@ -74,6 +76,10 @@ class Total(Formulation):
         )
         self.node_mass = scatter(self.stencil, points.mass[..., None, None])[..., 0]
         self.node_inverse_mass = safe_inverse(self.node_mass)
+        self.node_damping: Tensor | None = None
+        if points.damping is not None:
+            carried = scatter(self.stencil, (points.mass * points.damping).detach()[..., None, None])[..., 0]
+            self.node_damping = carried * self.node_inverse_mass.detach()
         self.node_rest: Tensor | None = None
         if self.needs_position:
             first_moment = scatter(self.stencil, (points.mass[..., None] * position)[..., None, :])
@@ -316,6 +322,11 @@ class Total(Formulation):
         momentum = scatter(self.stencil, (self.body.points.mass[..., None] * velocity)[..., None, :])
         node_velocity = momentum * self.node_inverse_mass[..., None]
         return self.read_particles(state, torch.zeros_like(node_velocity), node_velocity)
+
+    def decay(self, velocity: Tensor, time: float) -> Tensor:
+        """Also with the damping of the material."""
+        velocity = super().decay(velocity, time)
+        return velocity if self.node_damping is None else velocity * torch.exp(-time * self.node_damping)[..., None]
 
     def fit_grid(self, state: MPMState, horizon: float, margin: int) -> MPMState:
         """The unchanged state: the grid does not move."""

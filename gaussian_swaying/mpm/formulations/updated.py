@@ -33,6 +33,11 @@ class Updated(Formulation):
 
     def __init__(self, body: Body, settings: Settings) -> None:
         super().__init__(body, settings)
+        if body.points.damping is not None:
+            raise ValueError(
+                "`damping` of material points, which `material.damping_ratio` sets, needs `solver.formulation: total`: "
+                "use `solver.damping`, one rate for all of the material."
+            )
         if body.surface is not None and body.surface.contact is not None:
             raise ValueError(
                 "`contact` needs particles that keep their neighbours, which the updated formulation does not have: "

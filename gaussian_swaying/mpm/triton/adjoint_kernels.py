@@ -139,10 +139,10 @@ def particles_adjoint(
 
 @triton.jit(do_not_specialize=VARIES)
 def nodes_adjoint(
-    active, source, sources, inverse_mass, held, nodes, partial, fields, force_bar, history, bars, mass_bar,
+    active, source, sources, inverse_mass, rates, held, nodes, partial, fields, force_bar, history, bars, mass_bar,
     schedule, first_step, step_offset, last, gravity_x, gravity_y, gravity_z,
     SUM: tl.constexpr, PUSH: tl.constexpr, FINISH: tl.constexpr, VELOCITY: tl.constexpr, HELD: tl.constexpr,
-    MASS: tl.constexpr, WIDTH: tl.constexpr, BLOCK: tl.constexpr, SOURCES: tl.constexpr,
+    MASS: tl.constexpr, DAMPED: tl.constexpr, WIDTH: tl.constexpr, BLOCK: tl.constexpr, SOURCES: tl.constexpr,
 ):  # fmt: skip
     """Gradients by the nodal fields, and by the forces of the substep before.
 
@@ -183,6 +183,8 @@ def nodes_adjoint(
     if FINISH:
         kick = tl.load(schedule + (step + 1) * 4)
         decay = tl.load(schedule + (step + 1) * 4 + 2)
+        if DAMPED:
+            decay *= tl.exp(-kick * tl.load(rates + k, mask, 0.0))
         inverse = tl.load(inverse_mass + k, mask, 0.0)
         node = tl.load(active + k, mask, 0)
         before = history + (step.to(tl.int64) * nodes + k) * 8

@@ -74,6 +74,8 @@ class FusedTotal(Fused):
         inverse = bound.node_inverse_mass.reshape(-1)
         active = (inverse > 0).nonzero()[:, 0]
         self.active, self.inverse_mass = active.int(), inverse[active].contiguous()
+        self.damped = bound.node_damping is not None
+        self.rates = self.inverse_mass if bound.node_damping is None else bound.node_damping.reshape(-1)[active]
         if self.virtual:
             rank = torch.zeros(len(inverse), dtype=torch.long, device=self.device)
             rank[active] = torch.arange(len(active), device=self.device)
@@ -266,10 +268,10 @@ class FusedTotal(Fused):
         held = self.plain and any(self.bound.on_nodes)
         moves = self.plain and self.touching is None
         launch(kernels.total_nodes, (-(-nodes // block),))(
-            self.active, source, sources, self.inverse_mass, self.held, nodes, partial,
+            self.active, source, sources, self.inverse_mass, self.rates, self.held, nodes, partial,
             self.fields, self.shift, self.schedule, self.first_step, offset, *self.gravity, self.taken,
             IMPLICIT=options["IMPLICIT"], POSITION=self.position, WIDTH=width,
-            HELD=moves and held, MOVE=moves, BLOCK=block,
+            HELD=moves and held, MOVE=moves, DAMPED=self.damped, BLOCK=block,
             SOURCES=triton.next_power_of_2(sources), num_warps=4,
         )  # fmt: skip
         if self.touching is not None:

@@ -310,11 +310,13 @@ class TotalAdjoint:
     def _nodes(self, offset: int, asked: _Pass, **stages: bool) -> None:
         fused, block = self.fused, lanes(self.fused.device, 64, 1)
         launch(kernels.nodes_adjoint, (triton.cdiv(self.nodes, block),))(
-            fused.active, fused.source, len(fused.source), fused.inverse_mass, fused.held, self.nodes, asked.partial,
+            fused.active, fused.source, len(fused.source), fused.inverse_mass, fused.rates, fused.held, self.nodes,
+            asked.partial,
             fused.fields, self.force_bar, self.history, self.bars, self.mass_bar,
             fused.schedule, fused.first_step, offset, self.last, *fused.gravity,
             **stages, VELOCITY=asked.width == 8, HELD=any(fused.bound.on_nodes), MASS=asked.flags["MASS"],
-            WIDTH=asked.width, BLOCK=block, SOURCES=triton.next_power_of_2(len(fused.source)), num_warps=4,
+            DAMPED=fused.damped, WIDTH=asked.width, BLOCK=block,
+            SOURCES=triton.next_power_of_2(len(fused.source)), num_warps=4,
         )  # fmt: skip
 
     def _particles(self, offset: int, asked: _Pass) -> None:

@@ -294,10 +294,10 @@ def _end(node, k, mask, v0, v1, v2, inverse, held, taken, fields, dt, HELD: tl.c
 
 @triton.jit(do_not_specialize=VARIES)
 def total_nodes(
-    active, source, sources, inverse_mass, held, nodes, partial, fields, shift,
+    active, source, sources, inverse_mass, rates, held, nodes, partial, fields, shift,
     schedule, first_step, step_offset, gravity_x, gravity_y, gravity_z, taken,
     IMPLICIT: tl.constexpr, POSITION: tl.constexpr, WIDTH: tl.constexpr, HELD: tl.constexpr, MOVE: tl.constexpr,
-    BLOCK: tl.constexpr, SOURCES: tl.constexpr,
+    DAMPED: tl.constexpr, BLOCK: tl.constexpr, SOURCES: tl.constexpr,
 ):  # fmt: skip
     """``total``: nodal velocities and displacements from the sums of the cells around each node.
 
@@ -327,6 +327,8 @@ def total_nodes(
         push = kick / (1 + kick * drag * inverse)
     else:
         push = kick
+    if DAMPED:
+        decay *= tl.exp(-kick * tl.load(rates + k, mask, 0.0))
     place = fields + node * 8 + 4
     v0 = (tl.load(place, mask, 0.0) + push * (f0 * inverse + gravity_x)) * decay
     v1 = (tl.load(place + 1, mask, 0.0) + push * (f1 * inverse + gravity_y)) * decay

@@ -58,6 +58,12 @@ def test_gravity_damping_and_viscosity(kernel_device, case):
     check_agreement(run_in_wind(make_points(kernel_device), formulation, steps=2, mls=mls, **options))
 
 
+def test_damping_of_the_material(kernel_device):
+    """A rate at each point, beside that of the solver."""
+    rates = 40 * torch.rand(24, generator=torch.Generator().manual_seed(1)).to(kernel_device)
+    check_agreement(run_in_wind(make_points(kernel_device, damping=rates), "total", steps=2, damping=20.0))
+
+
 @pytest.mark.parametrize("kernel_device", ["cpu"], indirect=True)
 def test_mls(kernel_device):
     check_agreement(run_in_wind(make_points(kernel_device), "updated", mls=True))
