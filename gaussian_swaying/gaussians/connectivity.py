@@ -42,7 +42,8 @@ def attached_pairs(
         means: Centres, shape (N, 3).
         normals: Unit normals, of either sign, with which the planes of smooth surfaces are looked for, shape (N, 3).
         labels: The part of each, shape (N,).
-        to: For each part the only other part to which it is attached, as its number, or None for any.
+        to: For each part the only other part to which it is attached, as its number, or None for any; its own number
+            for a part that is attached to no other.
 
     Returns:
         Pairs of different Gaussians, each once, int64, shape (E, 2), on the CPU.
@@ -75,7 +76,8 @@ def attached_pairs(
     pairs = torch.cat([pairs[~cut], _put_back(count, pairs[~cut], pairs[cut])])
     if labels is not None and to is not None:
         pairs = torch.cat([pairs, _missing(where, pairs, labels.cpu(), to)])
-    return torch.cat([pairs, _strays(where, pairs)])
+    own = None if labels is None or to is None else torch.tensor([k == part for part, k in enumerate(to)])[labels.cpu()]
+    return torch.cat([pairs, _strays(where, pairs, own)])
 
 
 def _planes(where: Tensor, normals: Tensor, index: Tensor, spacing: Tensor) -> tuple[Tensor, Tensor]:
@@ -115,12 +117,14 @@ def _put_back(count: int, kept: Tensor, cut: Tensor) -> Tensor:
     return cut[needed[contact]]
 
 
-def _strays(where: Tensor, pairs: Tensor) -> Tensor:
-    """Pairs that attach small pieces to the nearest Gaussians of larger ones."""
+def _strays(where: Tensor, pairs: Tensor, alone: Tensor | None) -> Tensor:
+    """Pairs that attach small pieces to the nearest of larger ones; of what stays alone only very small ones."""
     piece = joined(len(where), pairs.T)
     size = piece.bincount()
     largest = int(size.max())
     stray = size[piece] < min(max(STRAY, SMALL * largest), largest)
+    if alone is not None:
+        stray &= ~(alone & (size[piece] >= STRAY))
     own, others = stray.nonzero()[:, 0], (~stray).nonzero()[:, 0]
     if not len(own):
         return pairs[:0]
@@ -139,7 +143,7 @@ def _missing(where: Tensor, pairs: Tensor, labels: Tensor, to: Sequence[int | No
     """Pairs that attach a part to the one that it names, where none does: those nearest to each other."""
     found = [pairs[:0]]
     for part, other in enumerate(to):
-        if other is None:
+        if other is None or other == part:
             continue
         own, theirs = (labels == part).nonzero()[:, 0], (labels == other).nonzero()[:, 0]
         ends = labels[pairs].sort(1).values

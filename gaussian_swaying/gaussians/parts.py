@@ -13,6 +13,7 @@
 ``thickness``      float64, (P,)               thickness of the surface [m]
 ``damping_ratio``  float64, (P,)               damping ratio; may be missing
 ``attached``       text, (P,)                  the only part to which a part is attached; empty for any; may be missing
+``joint_...``      float64, (P,)               ``stiffness`` [N/m] and ``turning`` [N m/rad] of joints; may be missing
 =================  ==========================  =======================================================================
 """
 
@@ -40,6 +41,7 @@ if TYPE_CHECKING:
 
 ROLES = ("soft", "rigid", "held", "still")
 NUMBERS = ("E", "nu", "density", "thickness", "damping_ratio")
+JOINT = ("joint_stiffness", "joint_turning")
 MOST = 1 << 16  # parts of a file: labels are uint16
 
 
@@ -58,9 +60,14 @@ class Part:
         thickness: Thickness of the surface [m]; that of the object if None.
         damping_ratio: Damping ratio at ``material.damping_frequency``; that of the object if None.
         attached: The name of the only part to which it is attached, with ``scene.connected: surface``; any if None.
+        joint_stiffness: With a joint instead of its material it is attached by a spring of this stiffness [N/m]; as
+            stiff as a substep allows if None and ``joint_turning`` is given.
+        joint_turning: Stiffness of the joint against turning [N m/rad]; 0 for a hinge to all sides, the default if
+            ``joint_stiffness`` is given.
 
     Raises:
-        ValueError: If a value is out of range, a part that is ``still`` has a material, or a ``rigid`` one E or nu.
+        ValueError: If a value is out of range, a part that is ``still`` has a material, a ``rigid`` one E or nu, or one
+            with a joint names no other.
     """
 
     name: str
@@ -72,6 +79,8 @@ class Part:
     thickness: float | None = None
     damping_ratio: float | None = None
     attached: str | None = None
+    joint_stiffness: float | None = None
+    joint_turning: float | None = None
 
     def __post_init__(self) -> None:
         if not self.name:
@@ -90,6 +99,18 @@ class Part:
                 check_poisson_ratio(what, value)
             elif value is not None:
                 check_positive(what, value, allow_zero=name == "damping_ratio")
+        for name in JOINT:
+            if getattr(self, name) is not None:
+                check_positive(f"{name} of the part {self.name!r}", getattr(self, name), allow_zero=True)
+        if self.has_joint and self.attached is None:
+            raise ValueError(
+                f"The part {self.name!r} has a joint to nothing: name the other part as `attached`, or remove it."
+            )
+
+    @property
+    def has_joint(self) -> bool:
+        """True if it is attached by a joint."""
+        return any(getattr(self, name) is not None for name in JOINT)
 
     @property
     def has_material(self) -> bool:
@@ -137,9 +158,15 @@ class Parts:
                 )
 
     def attached_to(self) -> list[int | None] | None:
-        """For each part the only other part to which it is attached, as its place, or None; None if no part has one."""
+        """For each part the only other part to which its material is attached, as its place, or None for any.
+
+        It is the part itself where it has a joint. None if no part names another.
+        """
         names = [part.name for part in self.parts]
-        found = [None if part.attached is None else names.index(part.attached) for part in self.parts]
+        found = [
+            None if part.attached is None else names.index(part.name if part.has_joint else part.attached)
+            for part in self.parts
+        ]
         return None if all(place is None for place in found) else found
 
     def __len__(self) -> int:
@@ -194,7 +221,7 @@ class Parts:
         small = np.uint8 if len(self.parts) <= 1 << 8 else np.uint16
         numbers: dict[str, Any] = {
             name: np.array([math.nan if getattr(p, name) is None else getattr(p, name) for p in self.parts], np.float64)
-            for name in NUMBERS
+            for name in (*NUMBERS, *(name for name in JOINT if any(part.has_joint for part in self.parts)))
         }
         if self.attached_to() is not None:
             numbers["attached"] = np.array([part.attached or "" for part in self.parts])
@@ -217,7 +244,7 @@ class Parts:
         Raises:
             ValueError: If it cannot be read, or its arrays do not fit together.
         """
-        arrays = read_arrays(path, "the parts", ("count", "labels", "names", "roles"), (*NUMBERS, "attached"))
+        arrays = read_arrays(path, "the parts", ("count", "labels", "names", "roles"), (*NUMBERS, *JOINT, "attached"))
         labels, names = arrays["labels"], arrays["names"]
         expected = {
             "count": arrays["count"].shape == () and arrays["count"].dtype.kind in "iu",
@@ -226,7 +253,9 @@ class Parts:
             "roles": arrays["roles"].shape == names.shape and arrays["roles"].dtype.kind == "U",
         }
         expected |= {
-            n: arrays[n].shape == names.shape and arrays[n].dtype.kind in "fiu" for n in NUMBERS if n in arrays
+            n: arrays[n].shape == names.shape and arrays[n].dtype.kind in "fiu"
+            for n in (*NUMBERS, *JOINT)
+            if n in arrays
         }
         if "attached" in arrays:
             expected["attached"] = arrays["attached"].shape == names.shape and arrays["attached"].dtype.kind == "U"
@@ -240,7 +269,7 @@ class Parts:
                 "again."
             )
         values: list[dict[str, Any]] = [
-            {n: float(arrays[n][k]) for n in NUMBERS if n in arrays and not math.isnan(arrays[n][k])}
+            {n: float(arrays[n][k]) for n in (*NUMBERS, *JOINT) if n in arrays and not math.isnan(arrays[n][k])}
             for k in range(len(names))
         ]
         for own, other in zip(values, arrays.get("attached", ()), strict=False):

@@ -39,7 +39,7 @@ def rigid_velocity(place: Tensor, velocity: Tensor, mass: Tensor, dt: float | Te
     identity = torch.eye(3, dtype=mass.dtype, device=mass.device)
     trace = moment.diagonal(dim1=-2, dim2=-1).sum(-1)[..., None, None]
     inertia = trace * identity - moment
-    inverse = _inverse(inertia)
+    inverse = symmetric_inverse(inertia)
     first = (inverse @ spin[..., None])[..., 0]
     turn = first
     for _ in range(ITERATIONS):
@@ -62,13 +62,22 @@ def fitted_gradient(rest: Tensor, field: Tensor, mass: Tensor) -> Tensor:
     """
     arm = rest - centre(rest, mass)
     moved = _outer(field - centre(field, mass), mass[..., None] * arm)
-    return matmul3(moved, _inverse(_outer(mass[..., None] * arm, arm)))
+    return matmul3(moved, symmetric_inverse(_outer(mass[..., None] * arm, arm)))
 
 
 def centre(field: Tensor, mass: Tensor) -> Tensor:
     """The mean of a field (..., K, 3), weighted with masses (..., K); shape (..., 1, 3)."""
     whole = mass.sum(-1)[..., None, None].clamp(min=torch.finfo(mass.dtype).tiny)
     return (mass[..., None] * field).sum(-2, keepdim=True) / whole
+
+
+def symmetric_inverse(matrix: Tensor) -> Tensor:
+    """The inverse of symmetric matrices (..., 3, 3) without waiting for a GPU; finite for singular ones."""
+    finfo = torch.finfo(matrix.dtype)
+    scale = matrix.diagonal(dim1=-2, dim2=-1).amax(-1)[..., None, None].clamp(min=finfo.tiny**0.25)
+    matrix = matrix / scale
+    cof = cofactor(matrix)
+    return cof / determinant(matrix, cof).clamp(min=finfo.eps)[..., None, None] / scale
 
 
 def _outer(a: Tensor, b: Tensor) -> Tensor:
@@ -80,12 +89,3 @@ def _axial(matrix: Tensor) -> Tensor:
     """The sum of r x w for a matrix that is the sum of w rᵀ, shape (..., 3)."""
     skew = matrix - matrix.mT
     return torch.stack([skew[..., 2, 1], skew[..., 0, 2], skew[..., 1, 0]], dim=-1)
-
-
-def _inverse(matrix: Tensor) -> Tensor:
-    """The inverse of symmetric matrices (..., 3, 3) without waiting for a GPU; finite for singular ones."""
-    finfo = torch.finfo(matrix.dtype)
-    scale = matrix.diagonal(dim1=-2, dim2=-1).amax(-1)[..., None, None].clamp(min=finfo.tiny**0.25)
-    matrix = matrix / scale
-    cof = cofactor(matrix)
-    return cof / determinant(matrix, cof).clamp(min=finfo.eps)[..., None, None] / scale

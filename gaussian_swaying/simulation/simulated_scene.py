@@ -22,9 +22,11 @@ from gaussian_swaying.mpm.boundaries.obstacle import Obstacle
 from gaussian_swaying.mpm.boundaries.still_gaussians import StillGaussians
 from gaussian_swaying.mpm.contact.surface import Contact, Surface
 from gaussian_swaying.mpm.followers import Followers, GridFollowers, PointFollowers, on_material
+from gaussian_swaying.mpm.joints import PointJoint
 from gaussian_swaying.mpm.state import MaterialPoints, State
 from gaussian_swaying.simulation.body import Body, body_of, specks_of
 from gaussian_swaying.simulation.extent import check_extent
+from gaussian_swaying.simulation.joints import joints_of
 from gaussian_swaying.simulation.material import Material
 from gaussian_swaying.simulation.scene import Scene
 from gaussian_swaying.simulation.touching import still_distance, surface_of
@@ -70,6 +72,7 @@ class SimulatedScene(nn.Module):
         tracked: Number of points that :meth:`surface` returns.
         surface_places: Contact samples, which touch obstacles and each other, or None.
         drawn: Which Gaussians of the source are here: all but those that ``faint: drop`` leaves out, bool.
+        joints: The joints of parts.
         pairs: Simulated Gaussians that are attached, as places in ``simulated``, shape (E, 2), with
             ``scene.connected: surface``; else None.
         source: The .ply file; None for a scene made in code.
@@ -132,6 +135,7 @@ class SimulatedScene(nn.Module):
         labels = None if scene.parts is None else scene.parts.labels[self.drawn][simulated]
         body = body_of(part, normals[simulated], scene, material, self.frame, dx, dtype, by_grid, apart, labels)
         self.points, self.patches = body.points, body.patches
+        self.joints = self._joints(scene, labels, body, dx)
         self.pairs = None if body.pairs is None else body.pairs[(body.pairs < len(simulated)).all(1)]
         self.on_surface, self.filled = body.on_surface, body.points.count // scene.layers - body.on_surface
         self.max_stretch = scene.max_stretch
@@ -190,6 +194,18 @@ class SimulatedScene(nn.Module):
         self.moving: Tensor
         self.rest_facing: Tensor
         self.identity: Tensor
+
+    @staticmethod
+    def _joints(scene: Scene, labels: Tensor | None, body: Body, dx: float) -> tuple[PointJoint, ...]:
+        """The joints of the parts of a scene."""
+        if scene.parts is None or labels is None or not any(part.has_joint for part in scene.parts.parts):
+            return ()
+        if scene.connected != "surface":
+            raise ValueError(
+                "Joints of parts need `scene.connected: surface`, as a grid joins what lies within a cell."
+            )
+        place, owner = body.samples.position[: len(labels)], body.owner[: len(labels)]
+        return joints_of(scene.parts, labels, place, owner, body.points.position.detach(), dx)
 
     def _apply(self, fn, recurse: bool = True) -> SimulatedScene:  # type: ignore[no-untyped-def] # noqa: ANN001
         super()._apply(fn, recurse)

@@ -21,9 +21,10 @@ from gaussian_swaying.aero.wind_force import WindForce
 from gaussian_swaying.geometry.patches import deform_patch
 from gaussian_swaying.kernels.graphs import fingerprint, tensors_in
 from gaussian_swaying.mpm.forces import Force
+from gaussian_swaying.mpm.joints import Joints
 from gaussian_swaying.mpm.protocol import Solver
 from gaussian_swaying.mpm.state import MaterialPoints, State
-from gaussian_swaying.mpm.timestep import MAX_CFL, rounding_speed
+from gaussian_swaying.mpm.timestep import MAX_CFL, rounding_speed, stable_limit
 from gaussian_swaying.simulation.copies import Copies
 from gaussian_swaying.simulation.diagnostics import (
     FrameDiagnostics,
@@ -99,6 +100,7 @@ class Stepper:
         self._steps = 1  # of the last frame
         self._wind_force: tuple[tuple[object, ...], WindForce] | None = None
         self._idle: tuple[tuple[object, ...], bool] | None = None
+        self._joints: tuple[tuple[object, ...], Joints] | None = None
         self._tearing: TearingGauge | None = None
         self._gauge = Gauge()
 
@@ -130,6 +132,18 @@ class Stepper:
         return self._wind_force[1]
 
     @property
+    def joints(self) -> list[Force]:
+        """The force of the joints between parts, if there are any; made again for another material."""
+        joints, key = self.scene.joints, tuple(setup.points for setup in self.setups)
+        if not joints:
+            return []
+        if self._joints is None or any(a is not b for a, b in zip(self._joints[0], key, strict=True)):
+            with torch.inference_mode(False), torch.no_grad():  # it outlives the call
+                longest = min(float(stable_limit(points, self.solver.dx).amin()) for points in key)
+                self._joints = key, Joints(key[0], joints, longest)
+        return [self._joints[1]]
+
+    @property
     def idle(self) -> bool:
         """True if the wind has no effect; computed again only if a coefficient changed, as it makes the host wait."""
         aero = self.setup.aero
@@ -140,8 +154,8 @@ class Stepper:
 
     @property
     def forces(self) -> list[Force]:
-        """The forces on the particles besides gravity: the wind, unless it has no effect, and the custom forces."""
-        custom = list(self.setup.forces)
+        """The forces on the particles besides gravity: the wind, unless it has no effect, joints and custom forces."""
+        custom = [*self.joints, *self.setup.forces]
         return custom if self.idle else [self.wind_force, *custom]
 
     def flows(self) -> Tensor:

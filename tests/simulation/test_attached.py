@@ -1,4 +1,7 @@
-"""Scenes in which only what is connected along its surface shares nodes."""
+"""Scenes in which only what is connected along its surface shares nodes.
+
+Covers: preview.apart.
+"""
 
 import dataclasses
 import types

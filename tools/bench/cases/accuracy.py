@@ -23,6 +23,7 @@ from bench.problems import (
     divergence,
     fabrics,
     flags,
+    joints,
     plates,
     reconfiguration,
     rods,
@@ -142,6 +143,9 @@ def cases(device: str, thorough: bool) -> Iterable[tuple[str, Row, Callable[[], 
             yield case("comb", _comb, "total", thickness=thickness, gap=0.3, how=how)
     for layers in (1, 3):
         yield case("close sheets", apart.sheets, "total, float32", gap=0.2, layers=layers)
+    yield case("pendulum on a hinge", joints.pendulum, "total")
+    for turning in (0.1, 1.0, 10.0, 1000.0):
+        yield case("joined beams", joints.joined_beams, "total", turning=turning)
     for around in (4, 8):
         for diameter in (0.05, 0.1, 0.3, 1.0):
             yield case("thin rod", _rod_anyhow, "total", diameter=diameter, around=around)

@@ -150,6 +150,15 @@ _table("close_sheets", partial(_of, problem="close sheets"), """
     """)  # fmt: skip
 
 
+_table("joints", partial(_of, problem="joined beams"), """
+    stiffness against turning, κ L / (E I) = {parameters.turning:g} |
+    frequency over that of Euler's beams = {result.ratio:.4f} | substeps = {result.substeps:.0f}
+    """)  # fmt: skip
+_table("pendulum", partial(_of, problem="pendulum on a hinge"), """
+    frequency over that of the rigid bar = {result.ratio:.4f} | substeps = {result.substeps:.0f}
+    """)  # fmt: skip
+
+
 _table("thin_rod", partial(_of, problem="thin rod"), """
     diameter [cells] = {parameters.diameter:g} |
     *{parameters.around} points in a section = {result.lowest:.3f} to {result.highest:.3f}

@@ -163,6 +163,12 @@ for _name, _how in (("each a piece", "apart"), ("held ends one piece", "base")):
 _goal("rods of 0.05 to 1 cell, 8 points in a section, at any of three places and directions: frequency",
       "within 5 % of a clamped beam's", "chosen: as for a beam of one cell, and a circle has few points",
       partial(_each, problem="thin rod", around=8), "{diameter:g}:", ERROR, "error <= 0.05")  # fmt: skip
+_goal("pendulum on a hinge: frequency", "within 1 % of the rigid bar's",
+      "chosen: lumped masses have a moment of inertia that is larger by a twentieth of a cell's square each way",
+      partial(_each, problem="pendulum on a hinge"), "12 cells long:", ERROR, "error <= 0.01")  # fmt: skip
+_goal("two beams of 20 cells and a joint with stiffness: frequency", "within 2 % of Euler's beams'",
+      "chosen: a joint holds what lies within a cell of it, a twentieth of each beam",
+      partial(_each, problem="joined beams"), "κ L / (E I) = {turning:g}:", ERROR, "error <= 0.02")  # fmt: skip
 _goal("two sheets with a gap of 0.2 cells: motion", "within 1 % of each alone", "chosen: rounding in float32 is all",
       partial(_each, problem="close sheets"), "{layers} layers", ERROR, "error <= 0.01")  # fmt: skip
 _goal("two sheets with a gap of 0.2 cells: time of a substep", "at most 1.3 times that on shared nodes",

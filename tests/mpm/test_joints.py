@@ -1,0 +1,142 @@
+"""Joints between points: forces of a rigid motion, momenta, closed forms, and how stiff a spring may be."""
+
+import math
+
+import pytest
+import torch
+from bench.problems.joints import joined_beams, pendulum
+from bench.problems.settings import Settings
+
+from gaussian_swaying.geometry.rotations import rotation_of
+from gaussian_swaying.mpm.joints import Joints, PointJoint, turn_between
+from gaussian_swaying.mpm.solver import MPMSolver
+from gaussian_swaying.mpm.state import MaterialPoints
+from gaussian_swaying.mpm.timestep import stable_limit
+
+DOUBLE = torch.float64
+AT = torch.tensor([1.0, 0.1, 0.2], dtype=DOUBLE)
+
+
+def blocks(flat=False):
+    """Two bodies side by side along x, which meet at a place, and the points of each."""
+    side = torch.arange(4, dtype=DOUBLE) / 4
+    one = torch.cartesian_prod(side, side, 0 * side if flat else side)
+    place = torch.cat([one, one + torch.tensor([1.05, 0.0, 0.1], dtype=DOUBLE)])
+    number = torch.arange(2).repeat_interleave(len(one))
+    density = 100 * (1 + torch.rand(len(place), generator=torch.Generator().manual_seed(0), dtype=DOUBLE))
+    numbers = {"volume": 0.01, "youngs_modulus": 1e4, "poisson_ratio": 0.3, "attached": number}
+    points = MaterialPoints.create(place, density=density, **numbers)
+    return points, [(number == k).nonzero()[:, 0] for k in (0, 1)]
+
+
+def moved(points, sets, turns, shifts):
+    """The state with each body turned about the joint and shifted."""
+    state = MPMSolver(0.5).init_state(points)
+    position, F = state.position.clone(), state.F_total.clone()
+    for own, turn, shift in zip(sets, turns, shifts, strict=True):
+        R = rotation_of(torch.tensor(turn, dtype=DOUBLE))
+        position[own] = (points.position[own] - AT) @ R.T + AT + torch.tensor(shift, dtype=DOUBLE)
+        F[own] = R
+    return state.replace(position=position, F_total=F)
+
+
+@pytest.mark.parametrize("flat", [False, True])
+def test_springs_act_on_what_parts_and_turns(flat):
+    """A rigid motion of both bodies: the force is that of the gap, the torque that of the turn between them."""
+    points, sets = blocks(flat)
+    joint = PointJoint(*sets, AT.tolist(), 30.0, 7.0)
+    joints = Joints(points, [joint], 1e-6)
+    together = [0.4, -0.3, 0.8]
+    still = joints(moved(points, sets, [together] * 2, [[1.0, 2.0, 3.0]] * 2))
+    assert float(still.abs().max()) < 1e-10
+    turn, shift = [0.0, 0.0, 0.3], [0.01, 0.02, -0.03]
+    state = moved(points, sets, [turn, [0.0] * 3], [shift, [0.0] * 3])
+    force = joints(state)
+    first, second = (force[own].sum(0) for own in sets)
+    gap = torch.tensor(shift, dtype=DOUBLE)
+    torch.testing.assert_close(first, -30.0 * gap, rtol=1e-6, atol=1e-9)
+    torch.testing.assert_close(second, -first, rtol=0, atol=1e-12)
+    arm = state.position[sets[0]] - (AT + gap)
+    torque = torch.linalg.cross(arm, force[sets[0]]).sum(0)
+    torch.testing.assert_close(torque, torch.tensor([0.0, 0.0, -2.1], dtype=DOUBLE), rtol=1e-6, atol=1e-8)
+    batch = state.replace(position=state.position.expand(2, -1, -1), F_total=state.F_total.expand(2, -1, -1, -1))
+    assert torch.equal(joints(batch)[1], force)
+
+
+def test_a_joint_to_a_place_and_several_at_once():
+    points, sets = blocks()
+    one, other = PointJoint(sets[0], None, [0.0, 0.0, 0.0], 5.0), PointJoint(*sets, AT.tolist(), 30.0)
+    state = moved(points, sets, [[0.1, 0.2, 0.3], [0.0] * 3], [[0.1, 0.0, 0.0], [0.0, 0.3, 0.0]])
+    each = [Joints(points, [joint], 1e-3)(state) for joint in (other, one)]
+    torch.testing.assert_close(Joints(points, [one, other], 1e-3)(state), sum(each), rtol=0, atol=1e-12)
+    anchor = AT - rotation_of(torch.tensor([0.1, 0.2, 0.3], dtype=DOUBLE)) @ AT
+    anchor[0] += 0.1
+    torch.testing.assert_close(each[1][sets[0]].sum(0), -5.0 * anchor, rtol=1e-4, atol=1e-12)
+    assert float(each[1][sets[1]].abs().max()) == 0.0
+
+
+def test_momenta_stay_and_the_energy_does_not_grow():
+    """Two bodies that fly and spin, joined by a spring that is as stiff as a substep allows."""
+    points, sets = blocks()
+    longest = float(stable_limit(points, 0.5).min())
+    joints = Joints(points, [PointJoint(*sets, AT.tolist(), turning=math.inf)], longest)
+    solver = MPMSolver(0.5, gravity=(0, 0, 0))
+    spin = torch.tensor([0.5, -1.0, 2.0], dtype=DOUBLE)
+    state = solver.init_state(points, torch.linalg.cross(spin.expand_as(points.position), points.position) + 1.0)
+    before, energy = solver.momenta(state), float(sum(solver.energies(state).values()))
+    for _ in range(4):
+        state = solver.rollout(state, 0.8 * longest, 100, joints)
+        assert float(sum(solver.energies(state).values())) < 1.01 * energy
+    after = solver.momenta(state)
+    for name, value in before.items():
+        torch.testing.assert_close(after[name], value, rtol=0, atol=1e-6 * float(value.norm()))
+    gap = Joints(points, [PointJoint(*sets, AT.tolist(), 1.0)], 1e-9)(state)[sets[0]].sum(0)
+    assert float(gap.norm()) < 0.02  # m
+
+
+@pytest.mark.parametrize("turning", [1.0, math.inf])
+def test_two_beams_and_a_joint_against_eulers_beams(turning):
+    assert joined_beams(Settings(), turning, length=14.0)["error"] < 0.04
+
+
+def test_a_pendulum_on_a_hinge():
+    assert pendulum(Settings(), length=10.0)["error"] < 0.015
+
+
+def test_a_spring_is_softened_as_a_substep_needs_it():
+    """Any stiffness is stable, and one that a substep can follow is kept."""
+    points, sets = blocks()
+    longest = float(stable_limit(points, 0.5).min())
+    found = {}
+    for stiffness in (1.0, 1e9, math.inf):
+        joints = Joints(points, [PointJoint(*sets, AT.tolist(), stiffness, stiffness)], longest)
+        found[stiffness] = float(joints.stiffness)
+    assert found[1.0] == pytest.approx(1.0, rel=1e-2)
+    assert found[1e9] == pytest.approx(found[math.inf], rel=1e-2)
+    light = 1 / points.mass[sets[0]].sum() + 1 / points.mass[sets[1]].sum()
+    assert found[math.inf] * float(light) * longest**2 < 2.0
+
+
+def test_what_is_no_joint_is_refused():
+    points, sets = blocks()
+    with pytest.raises(ValueError, match="stiffnesses of a joint not to be negative, but got -1 N/m"):
+        Joints(points, [PointJoint(*sets, AT.tolist(), -1.0)], 1e-3)
+    with pytest.raises(ValueError, match="A joint has no points"):
+        Joints(points, [PointJoint(sets[0], sets[1][:0], AT.tolist())], 1e-3)
+
+
+def test_the_turn_between_two_rotations():
+    turn = torch.tensor([[0.3, -1.0, 2.0], [1e-9, 0.0, 0.0], [0.0, 0.0, 0.0]], dtype=DOUBLE)
+    other = rotation_of(torch.tensor([[1.0, 0.2, 0.3]], dtype=DOUBLE))
+    torch.testing.assert_close(turn_between(rotation_of(turn) @ other, other), turn, rtol=1e-12, atol=1e-15)
+
+
+def test_kernels_take_them_as_torch_does():
+    points, sets = blocks()
+    joints = Joints(points, [PointJoint(*sets, AT.tolist(), 30.0, 7.0)], 1e-3)
+    ends = []
+    for transfer in ("torch", "kernels"):
+        solver = MPMSolver(0.5, transfer=transfer)
+        state = solver.rollout(solver.init_state(points, points.position.flip(-1)), 1e-3, 20, joints)
+        ends.append(state.position)
+    torch.testing.assert_close(*ends, rtol=0, atol=1e-12)

@@ -1,0 +1,76 @@
+"""Parts of a splat that a joint connects: what hangs on it stays there and turns."""
+
+import dataclasses
+
+import pytest
+import torch
+
+from gaussian_swaying.gaussians.cloud import GaussianCloud
+from gaussian_swaying.gaussians.parts import Part, Parts
+from gaussian_swaying.mpm.solver import MPMSolver
+from gaussian_swaying.scenes.procedural import FlagScene, GivenScene
+from gaussian_swaying.simulation.edits import Edit
+from gaussian_swaying.simulation.material import Material
+from gaussian_swaying.simulation.scene import Scene
+from gaussian_swaying.simulation.simulation import Simulation
+
+DX = 0.1
+
+
+def flags():
+    """A beam of cloth that is held, and one that continues it along x; which of them each Gaussian belongs to."""
+    flag = FlagScene(spacing=0.04, width=0.6, height=0.2).generate()
+    other = dataclasses.replace(flag, means=flag.means + torch.tensor([0.6, 0.0, 0.0]))
+    fields = {f.name: [getattr(c, f.name) for c in (flag, other)] for f in dataclasses.fields(GaussianCloud)}
+    both = {name: None if values[0] is None else torch.cat(values) for name, values in fields.items()}
+    return GaussianCloud(**both), torch.arange(2).repeat_interleave(len(flag.means))
+
+
+def simulation(connected="surface", **joint):
+    cloud, number = flags()
+    parts = Parts(number, [Part("pole", "held"), Part("vane", attached="pole", **joint)])
+    run = Simulation(
+        Scene(generator=GivenScene(cloud), parts=parts, connected=connected, metres_per_unit=1.0, layers=3),
+        Material(E=1e6, density=100.0, thickness=0.05),
+        solver=MPMSolver(DX, gravity=(0.0, 0.0, 0.0)),
+        wind=[0.0, 6.0, 0.0],
+        device="cpu",
+    )
+    return run, number
+
+
+def end(run, frames=8):
+    state = run.start()
+    for _ in range(frames):
+        state, _ = run.advance(state)
+    return run.scene.deformed(state).means - run.scene.rest().means
+
+
+def test_a_vane_turns_about_its_hinge_and_a_spring_holds_it():
+    loose, number = simulation(joint_turning=0.0)
+    moved = end(loose)
+    rest = loose.scene.rest().means
+    near = (rest[:, 0] - 0.62).abs() + (rest[:, 2] - 0.1).abs() < 0.05
+    tip = rest[:, 0] > 1.15
+    assert float(moved[number == 0].norm(dim=-1).max()) == 0.0
+    assert float(moved[near & (number == 1)].norm(dim=-1).max()) < 0.15 * float(moved[tip, 1].mean())
+    assert float(moved[tip, 1].mean()) > 0.1
+    stiff, _ = simulation(joint_turning=30.0)
+    assert float(end(stiff)[tip, 1].mean()) < 0.5 * float(moved[tip, 1].mean())
+    joints = loose.stepper.joints[0]
+    assert loose.stepper.joints[0] is joints
+    loose.edit(loose.start(), Edit(E=1e5))
+    assert float(loose.stepper.joints[0].stiffness) < 0.5 * float(joints.stiffness)  # substeps are longer
+
+
+def test_a_joint_needs_parts_that_are_apart():
+    with pytest.raises(ValueError, match=r"Joints of parts need `scene.connected: surface`"):
+        simulation(connected="grid", joint_turning=0.0)
+    with pytest.raises(ValueError, match=r"part 'leaf' has a joint to nothing: name the other part as `attached`"):
+        Part("leaf", joint_stiffness=3.0)
+    with pytest.raises(ValueError, match=r"joint_turning of the part 'leaf'.* negative"):
+        Part("leaf", attached="stem", joint_turning=-1.0)
+    cloud, number = flags()
+    parts = Parts(number, [Part("pole", "still"), Part("vane", attached="pole", joint_turning=0.0)])
+    with pytest.raises(ValueError, match="The part 'pole' has no Gaussian that is simulated"):
+        Simulation(Scene(generator=GivenScene(cloud), parts=parts, connected="surface"), device="cpu")
