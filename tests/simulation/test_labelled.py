@@ -191,9 +191,10 @@ recorder: {{images: false, video: false}}
 def test_the_examples_of_the_page_run(tmp_path, monkeypatch):
     page = (Path(__file__).parents[2] / "docs/parts.md").read_text(encoding="utf-8")
     monkeypatch.chdir(tmp_path)
-    first, second = ({}, {})
-    for names, block in zip((first, second), page.split("```python\n")[1:], strict=True):
+    joints, first, second = ({}, {}, {})
+    for names, block in zip((joints, first, second), page.split("```python\n")[1:], strict=True):
         exec(compile(block.split("```")[0], "parts.md", "exec"), names)
+    assert all(joints[name].has_joint for name in ("leaf", "vane", "lamp"))
     assert len(list(first["simulation"].frames(2))) == 2
     assert [part.name for part in second["parts"].parts] == ["cloth", "pole", "hem"]
     right = second["flag"].means[:, 0] > 0.9
