@@ -1,12 +1,13 @@
 // Writes film.min.js of the package, the programs of films and of both live pages with what they use of Spark and three.js, and
 // worker.min.js, the solver in a browser.
+import asc from "assemblyscript/asc";
 import { build } from "esbuild";
 import { createHash } from "node:crypto";
 import { readFile } from "node:fs/promises";
 
 const OWN = "brush.js build.js film.glsl.js film.js gaussians.js live.js main.js playback.js sorter.js view.js".split(" ");
 OWN.push(..."dial.js page.js settings.js".split(" ").map((name) => `live_web/${name}`));
-const SOLVER = "aero.js block.js laws.js matrices.js solver.js wind.js worker.js".split(" ").map((name) => `live_web/${name}`);
+const SOLVER = "aero.js block.js lanes.js laws.js matrices.js points.ts solver.js wind.js worker.js".split(" ").map((name) => `live_web/${name}`);
 const SOURCES = [...OWN, "package-lock.json"]; // a test compares their checksum
 
 // Spark's WebAssembly, in it and in its worker, reads files of splats, builds levels of detail and sorts. A film needs only
@@ -46,12 +47,33 @@ await build({
   plugins: [{ name: "cut-spark", setup: (made) => made.onLoad({ filter: /spark\.module\.js$/ }, cutSpark) }],
 });
 
+// The pass over all points, compiled to WebAssembly.
+async function compilePoints() {
+  const files = {};
+  const options = "-O3 --noAssert --runtime stub --enable simd --use abort= --outFile points.wasm".split(" ");
+  const { error, stderr } = await asc.main(["live_web/points.ts", ...options], {
+    writeFile: (name, contents) => (files[name] = contents),
+  });
+  if (error) throw new Error(stderr.toString());
+  return { contents: files["points.wasm"], loader: "binary" };
+}
+
+const points = {
+  name: "points",
+  setup(made) {
+    made.onResolve({ filter: /points\.wasm$/ }, ({ path }) => ({ path, namespace: "points" }));
+    made.onLoad({ filter: /.*/, namespace: "points" }, compilePoints);
+  },
+};
+
 await build({
   entryPoints: ["live_web/worker.js"],
   outfile: "../../gaussian_swaying/viewer/live_web/page/worker.min.js",
+  target: "es2022",
   bundle: true,
   minify: true,
   format: "iife",
   banner: await banner(["build.js", ...SOLVER, "package-lock.json"]),
   logLevel: "info",
+  plugins: [points],
 });

@@ -72,6 +72,7 @@ def test_after_two_seconds_the_gaussians_are_where_a_run_puts_them(show, written
     page.evaluate("windPage.complete.then(() => { windPage.pause(); windPage.reset(); })")
     told = page.evaluate("windPage.advance(50)")
     assert told["simulated"] == pytest.approx(2.0)
+    assert told["lanes"]
     assert page.evaluate("windPage.time()") == pytest.approx(2.0)
     values = page.evaluate("windPage.positions().then((found) => Array.from(found))")
     found = torch.tensor(values, dtype=torch.float64).reshape(-1, 3)

@@ -36,6 +36,8 @@ export class Solver {
     this.resistance = new Float64Array(this.nodes);
     this.shift = new Float64Array(head.planes.length ? 3 * this.nodes : 0);
     this.before = { displacement: this.displacement.slice(), velocity: this.velocity.slice() };
+    this.cell = new Int32Array(this.points); // of each point
+    for (let c = 0; c < this.cells; c++) this.cell.fill(c, arrays.cellStart[c], arrays.cellStart[c + 1]);
     this.blown = new Float64Array(3);
     this.now = new Float64Array(3);
     this.rates = new Float64Array(3 * head.rows);
@@ -140,7 +142,12 @@ export class Solver {
     const { head } = this;
     const kick = this.substep > 0 ? Math.min(0.5 * (this.substep + dt), 2 * dt) : dt;
     if (!this.idle) this.wind.blow(this.time, this.blown);
+    this.dragged = this.pull !== null || (!this.idle && this.aero.implicit);
+    this.force.fill(0);
+    if (this.dragged) this.resistance.fill(0);
     this.particles(looked, true);
+    if (this.pull !== null) this.pulls(this.pull);
+    if (head.planes.length) this.shifts();
     this.accelerate(kick);
     for (const plane of head.planes) this.stop(plane);
     this.hold();
@@ -155,18 +162,13 @@ export class Solver {
    * @param {boolean} looked @param {boolean} pushed
    */
   particles(looked, pushed) {
-    const { a, aero, idle, pull, stiffness, head } = this;
-    const { displacement: U, velocity: V, force: A, resistance: D, shift: S } = this;
+    const { a, aero, idle, stiffness, head } = this;
+    const { displacement: U, velocity: V, force: A } = this;
     const { fraction, volume, mass, law, mu, lam, area, cellStart, cellNodes } = a;
     const viscous = head.viscous;
-    const moving = S.length > 0;
     let fastest = 0;
     let stretched = 1;
-    const dragged = pull !== null || (!idle && aero.implicit);
     const grouped = head.grouped;
-    A.fill(0);
-    if (dragged) D.fill(0);
-    S.fill(0);
     const inverse = 1 / head.dx;
     for (let c = 0; c < this.cells; c++) {
       const first = 27 * c;
@@ -213,18 +215,11 @@ export class Solver {
           p5 += own * P[5], p6 += own * P[6], p7 += own * P[7], p8 += own * P[8];
         }
         let b0 = 0, b1 = 0, b2 = 0, drag = 0;
-        const blown = !idle && area[p] > 0;
-        if (blown || pull !== null) {
+        if (!idle && area[p] > 0) {
           interpolate(v27, velocity);
-          if (blown) {
-            if (grouped) onGroup(aero, this.blown, velocity[0], velocity[1], velocity[2], F, a.tensor, 6 * p, a.vectors, a.firstVector[p], a.firstVector[p + 1], out);
-            else onPatch(aero, this.blown, velocity[0], velocity[1], velocity[2], F, a.patch, 4 * p, out);
-            b0 = out[0], b1 = out[1], b2 = out[2], drag = out[3];
-          }
-          if (pull !== null && pull.held[p] > 0) {
-            this.pullOn(pull, p);
-            b0 += out[0], b1 += out[1], b2 += out[2], drag += out[3];
-          }
+          if (grouped) onGroup(aero, this.blown, velocity[0], velocity[1], velocity[2], F, a.tensor, 6 * p, a.vectors, a.firstVector[p], a.firstVector[p + 1], out);
+          else onPatch(aero, this.blown, velocity[0], velocity[1], velocity[2], F, a.patch, 4 * p, out);
+          b0 = out[0], b1 = out[1], b2 = out[2], drag = out[3];
         }
         for (let i = 0, at = 0; i < 3; i++)
           for (let j = 3; j < 6; j++, at += 9) {
@@ -236,7 +231,6 @@ export class Solver {
             a27[at + 6] += z2 * e0 + y2 * h0, a27[at + 7] += z2 * e1 + y2 * h1, a27[at + 8] += z2 * e2 + y2 * h2;
           }
         if (drag > 0) this.spreadResistance(first, drag);
-        if (moving) this.spreadShift(first, mass[p]);
       }
       for (let k = 0; pushed && k < 27; k++) {
         const at = 3 * cellNodes[first + k];
@@ -244,7 +238,6 @@ export class Solver {
         A[at] += a27[from], A[at + 1] += a27[from + 1], A[at + 2] += a27[from + 2];
       }
     }
-    this.dragged = dragged;
     if (looked) this.seen = { time: this.time, stiffness, wave: Math.sqrt(fastest), viscous: viscous * stretched };
   }
 
@@ -264,33 +257,59 @@ export class Solver {
       }
   }
 
-  /** A spring and a damper to where the visitor pulls; into `out`. */
-  pullOn(/** @type {Pull} */ pull, p) {
-    interpolate(u27, place);
-    const held = pull.held[p];
-    const { rest } = this.a;
-    let [x, y, z] = [0, 1, 2].map((m) => QUICK ** 2 * (pull.target[m] + pull.offset[3 * p + m] - rest[3 * p + m] - place[m]));
-    const limit = STRONGEST / Math.max(Math.hypot(x, y, z), STRONGEST);
-    const damping = 2 * QUICK * held;
-    out[0] = held * limit * x - damping * velocity[0];
-    out[1] = held * limit * y - damping * velocity[1];
-    out[2] = held * limit * z - damping * velocity[2];
-    out[3] = damping;
+  /** A spring and a damper to where the visitor pulls, on the points that are held. */
+  pulls(/** @type {Pull} */ pull) {
+    const { rest, cellNodes } = this.a;
+    for (let p = 0; p < this.points; p++) {
+      const held = pull.held[p];
+      if (held === 0) continue;
+      const first = 27 * this.cell[p];
+      this.at(p, first);
+      interpolate(v27, velocity);
+      const [x, y, z] = [0, 1, 2].map((m) => QUICK ** 2 * (pull.target[m] + pull.offset[3 * p + m] - rest[3 * p + m] - place[m]));
+      const limit = STRONGEST / Math.max(Math.hypot(x, y, z), STRONGEST);
+      const damping = 2 * QUICK * held;
+      out[0] = held * limit * x - damping * velocity[0];
+      out[1] = held * limit * y - damping * velocity[1];
+      out[2] = held * limit * z - damping * velocity[2];
+      for (let k = 0; k < 27; k++) for (let m = 0; m < 3; m++) this.force[3 * cellNodes[first + k] + m] += weightOf(k) * out[m];
+      this.spreadResistance(first, damping);
+    }
   }
 
   spreadResistance(first, drag) {
-    for (let k = 0; k < 27; k++)
-      this.resistance[this.a.cellNodes[first + k]] += drag * w[Math.floor(k / 9)] * w[3 + (Math.floor(k / 3) % 3)] * w[6 + (k % 3)];
+    for (let k = 0; k < 27; k++) this.resistance[this.a.cellNodes[first + k]] += drag * weightOf(k);
   }
 
-  /** Adds mass times displacement of a point, for the centres of the masses that nodes carry. */
-  spreadShift(first, mass) {
-    interpolate(u27, place);
-    for (let k = 0; k < 27; k++) {
-      const at = 3 * this.a.cellNodes[first + k];
-      const own = mass * w[Math.floor(k / 9)] * w[3 + (Math.floor(k / 3) % 3)] * w[6 + (k % 3)];
-      for (let m = 0; m < 3; m++) this.shift[at + m] += own * place[m];
+  /** Mass times displacement of the points, for the centres of the masses that nodes carry. */
+  shifts() {
+    const { shift: S } = this;
+    const { mass, cellNodes } = this.a;
+    S.fill(0);
+    for (let p = 0; p < this.points; p++) {
+      const first = 27 * this.cell[p];
+      this.at(p, first);
+      for (let k = 0; k < 27; k++) {
+        const at = 3 * cellNodes[first + k];
+        const own = mass[p] * weightOf(k);
+        S[at] += own * place[0], S[at + 1] += own * place[1], S[at + 2] += own * place[2];
+      }
     }
+  }
+
+  /** Makes a point the one that is worked on: fields of its nodes, weights, and its displacement. */
+  at(p, first) {
+    const { displacement: U, velocity: V } = this;
+    const { cellNodes, fraction } = this.a;
+    for (let k = 0; k < 27; k++) {
+      const at = 3 * cellNodes[first + k];
+      for (let m = 0; m < 3; m++) {
+        u27[3 * k + m] = U[at + m];
+        v27[3 * k + m] = V[at + m];
+      }
+    }
+    weights(fraction, 3 * p, w, g, 1 / this.head.dx);
+    interpolate(u27, place);
   }
 
   /** Velocities of the nodes after `kick` seconds of force, gravity and damping. */
@@ -414,14 +433,9 @@ export class Solver {
 
   /** Places of all points [m]. */
   positions(to) {
-    const { rest, cellStart, cellNodes, fraction } = this.a;
-    for (let c = 0; c < this.cells; c++) {
-      for (let k = 0; k < 81; k++) u27[k] = this.displacement[3 * cellNodes[27 * c + Math.floor(k / 3)] + (k % 3)];
-      for (let p = cellStart[c]; p < cellStart[c + 1]; p++) {
-        weights(fraction, 3 * p, w, g, 1);
-        interpolate(u27, place);
-        for (let m = 0; m < 3; m++) to[3 * p + m] = rest[3 * p + m] + place[m];
-      }
+    for (let p = 0; p < this.points; p++) {
+      this.at(p, 27 * this.cell[p]);
+      for (let m = 0; m < 3; m++) to[3 * p + m] = this.a.rest[3 * p + m] + place[m];
     }
   }
 
@@ -455,6 +469,9 @@ function weights(fraction, at, w, g, inverse) {
     g[k + 2] = (f - 0.5) * inverse;
   }
 }
+
+/** Weight of a node of the point that is worked on. */
+const weightOf = (/** @type {number} */ k) => w[Math.floor(k / 9)] * w[3 + (Math.floor(k / 3) % 3)] * w[6 + (k % 3)];
 
 /** Interpolates a field of the 27 nodes. */
 function interpolate(field, to) {

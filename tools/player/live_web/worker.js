@@ -1,5 +1,6 @@
 // Runs the solver beside the page, in step with the clock. What it understands is in `does`, what it says in `post`.
 import { readBlock } from "./block.js";
+import { fits, LanesSolver } from "./lanes.js";
 import { Solver } from "./solver.js";
 
 const BEHIND = 0.25; // s that it may be late before it stops trying to catch up
@@ -19,6 +20,18 @@ let past = []; // when, and the simulated time, of the last frames
 let next;
 
 const post = (/** @type {any} */ message, /** @type {Transferable[]} */ moved = []) => self.postMessage(message, moved);
+
+/** The fastest solver that this browser has, or with `plain` that in JavaScript. */
+function made(block, plain = false) {
+  if (!plain && fits(block)) {
+    try {
+      return new LanesSolver(block);
+    } catch {
+      // a browser without WebAssembly for four numbers at a time
+    }
+  }
+  return new Solver(block);
+}
 
 function show() {
   const moved = solver.drawn();
@@ -61,8 +74,8 @@ function restart() {
 
 /** @type {Record<string, (given: any) => void>} */
 const does = {
-  load({ bytes }) {
-    solver = new Solver(readBlock(bytes));
+  load({ bytes, plain }) {
+    solver = made(readBlock(bytes), plain);
     show();
   },
   run(given) {
@@ -98,7 +111,7 @@ const does = {
     let substeps = 0;
     for (let k = 0; k < count; k++) substeps += solver.advance();
     show();
-    post({ kind: "done", substeps, seconds: (performance.now() - began) / 1000, simulated: count * solver.head.frameDt });
+    post({ kind: "done", lanes: solver instanceof LanesSolver, substeps, seconds: (performance.now() - began) / 1000, simulated: count * solver.head.frameDt });
   },
 };
 
