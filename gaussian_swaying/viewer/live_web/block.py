@@ -54,6 +54,8 @@ def check(simulation: Simulation) -> None:
         raise _refused("`copies`", "leave them out")
     if simulation.editor.edits:
         raise _refused("`edits`", "leave them out")
+    if simulation.stepper.joints:
+        raise _refused("joints of `scene.parts`", "leave out `joint_stiffness` and `joint_turning` of its parts")
     if setup.forces:
         raise _refused("`forces` of your own", "leave them out")
     wind = setup.wind
@@ -125,6 +127,7 @@ def pack_solver(simulation: Simulation, nodes: Tensor) -> bytes:
         "law": numbers[law][order],
         "inverseMass": torch.nn.functional.pad(bound.node_inverse_mass[active], (0, 1)),
         "held": held[active],
+        "nodeDamping": bound.node_damping[active] if bound.node_damping is not None else points.mass.new_zeros(0),
         "nodeRest": bound.node_rest[active] if bound.node_rest is not None else active.new_zeros(0),
         "followed": row[nodes],
         **_wind_arrays(simulation, order),

@@ -315,9 +315,10 @@ export class Solver {
   /** Velocities of the nodes after `kick` seconds of force, gravity and damping. */
   accelerate(kick) {
     const { force: A, velocity: V, resistance: D, head, dragged } = this;
-    const { inverseMass, held } = this.a;
+    const { inverseMass, held, nodeDamping } = this.a;
+    const damped = nodeDamping.length > 0;
     const [g0, g1, g2] = head.gravity;
-    const decay = Math.exp(-head.damping * kick);
+    const all = Math.exp(-head.damping * kick);
     for (let k = 0; k < this.nodes - 1; k++) {
       const at = 3 * k;
       if (held[k]) {
@@ -325,6 +326,7 @@ export class Solver {
         continue;
       }
       const inverse = inverseMass[k];
+      const decay = damped ? all * Math.exp(-kick * nodeDamping[k]) : all;
       const push = dragged ? kick / (1 + kick * D[k] * inverse) : kick;
       V[at] = decay * (V[at] + push * (A[at] * inverse + g0));
       V[at + 1] = decay * (V[at + 1] + push * (A[at + 1] * inverse + g1));
