@@ -19,7 +19,7 @@ from gaussian_swaying.mpm.formulations.total import Total
 from gaussian_swaying.mpm.point_holds import DenseHolds
 from gaussian_swaying.mpm.state import MPMState
 from gaussian_swaying.mpm.triton import total_kernels as kernels
-from gaussian_swaying.mpm.triton.fused import Fused, Part, check_indices
+from gaussian_swaying.mpm.triton.fused import INTERPRETED, Fused, Part, check_indices
 from gaussian_swaying.mpm.triton.fused_contact import FusedContact
 from gaussian_swaying.mpm.virtual_nodes import shifts
 
@@ -29,8 +29,8 @@ _LANE_COST = {4: 1.5, 8: 1.0, 16: 1.0, 32: 1.0, 64: 0.85}
 # least number of pieces that `total` cuts its cells into: about the number of warps that an H200 runs at once
 _PROGRAMS = 2048
 
-# spilling registers is worth it, because more warps run at once
-REGISTERS = {64: {"maxnreg": 128}}
+REGISTERS = 128
+"""Most registers of a thread of the particles' kernel: spilling some is worth it, because more warps run at once."""
 
 
 class FusedTotal(Fused):
@@ -254,13 +254,12 @@ class FusedTotal(Fused):
             ny * nz, nz, *self.grid.offset, self.grid.node_count, self.grid.dx, 1 / self.grid.dx,
             self.settings.stiffness_damping,
             **options, POSITION=self.position, WIDTH=width, CELLS=per_program, LANES=self.lanes,
-            VIRTUAL=self.virtual, num_warps=1,
-            **REGISTERS.get(self.lanes, {}),
+            VIRTUAL=self.virtual, WIDE=self.device.type == "cuda" and not INTERPRETED, num_warps=1, maxnreg=REGISTERS,
         )  # fmt: skip
         if self.pieces > self.cells:
             pieces, partial = partial, self.sums(self.cells, width)
             self.join_pieces(pieces, partial, width)
-        nodes, block = len(self.active), lanes(self.device, 64, 1)
+        nodes, block = len(self.active), lanes(self.device, 16, 1)
         source, sources = self.source, len(self.source)
         if block == 1:
             launch(kernels.total_join, (nodes,))(source, self.source_counts, nodes, partial, self.joined, WIDTH=width)
@@ -272,7 +271,7 @@ class FusedTotal(Fused):
             self.fields, self.shift, self.schedule, self.first_step, offset, *self.gravity, self.taken,
             IMPLICIT=options["IMPLICIT"], POSITION=self.position, WIDTH=width,
             HELD=moves and held, MOVE=moves, DAMPED=self.damped, BLOCK=block,
-            SOURCES=triton.next_power_of_2(sources), num_warps=4,
+            SOURCES=triton.next_power_of_2(sources), num_warps=2,
         )  # fmt: skip
         if self.touching is not None:
             self.touching.apply(self.schedule, self.first_step, offset, self.time, self.dt)
@@ -294,10 +293,10 @@ class FusedTotal(Fused):
         launch(kernels.total_rows, (-(-rows // block),))(
             points.node, points.weight, rows, self.fields, self.residual, BLOCK=block, num_warps=1
         )
-        nodes, block = len(points.affected), lanes(self.device, 8, 1)
+        nodes, block = len(points.affected), lanes(self.device, 2, 1)
         launch(kernels.total_hold, (-(-nodes // block),))(
             points.affected, points.scene, points.push, self.residual, nodes, points.push.shape[1], self.fields,
-            self.schedule, self.first_step, offset, BLOCK=block, ROWS=lanes(self.device, 64), num_warps=2,
+            self.schedule, self.first_step, offset, BLOCK=block, ROWS=lanes(self.device, 128), num_warps=1,
         )  # fmt: skip
 
     def _impulse(self) -> Tensor:

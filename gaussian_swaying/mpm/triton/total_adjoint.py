@@ -333,7 +333,7 @@ class TotalAdjoint:
             ny * nz, nz, 1 / fused.grid.dx, fused.settings.stiffness_damping,
             LAWS=fused.laws, MULTI=options["MULTI"], FORCES=options["FORCES"], VISCOUS=options["VISCOUS"],
             MATERIAL=flags["MATERIAL"], SHARES=flags["SHARES"], WIDTH=asked.width, CELLS=per_program, LANES=fused.lanes,
-            num_warps=1, **REGISTERS.get(fused.lanes, {}),
+            num_warps=1, **({"maxnreg": REGISTERS} if fused.lanes == 64 else {}),
         )  # fmt: skip
         if cut:
             fused.join_pieces(to, asked.partial, asked.width)

@@ -19,8 +19,10 @@ from gaussian_swaying.mpm.triton.shared import (
     add_given,
     axis_weights,
     keep_largest,
+    load_four,
     node_weight,
     twin_forces,
+    vector,
     wave_speed,
 )
 
@@ -28,18 +30,19 @@ from gaussian_swaying.mpm.triton.shared import (
 @triton.jit
 def gather(
     field, node, sx, sy, f, wz, gz, inverse_dx, mask, BOTH: tl.constexpr,
-    table=None, columns=0, VIRTUAL: tl.constexpr = False,
+    table=None, columns=0, VIRTUAL: tl.constexpr = False, WIDE: tl.constexpr = False,
 ):  # fmt: skip
     """Interpolate columns 0 to 2 of rows of eight, their derivatives [component, axis], and (BOTH) columns 4 to 6.
 
     ``node`` is the first node on the lattice, or with VIRTUAL a column of a ``table`` of nodes, shape (27, columns).
+    With WIDE rows are loaded by :func:`load_four`, whatever the mask says; all nodes must be in the field.
     """
     zero = wz[0] * 0
     u0, u1, u2, v0, v1, v2 = zero, zero, zero, zero, zero, zero
     g00, g01, g02, g10, g11, g12, g20, g21, g22 = zero, zero, zero, zero, zero, zero, zero, zero, zero
     for i in range(3):
         wx, gx = node_weight(f[0], i, inverse_dx)
-        for j in range(3):
+        for j in tl.static_range(3):
             wy, gy = node_weight(f[1], j, inverse_dx)
             if not VIRTUAL:
                 row = field + (node + i * sx + j * sy) * 8
@@ -49,9 +52,10 @@ def gather(
                     at = field + tl.load(table + ((i * 3 + j) * 3 + k) * columns + node) * 8
                 else:
                     at = row + k * 8
-                q0 = tl.load(at, mask, 0.0)
-                q1 = tl.load(at + 1, mask, 0.0)
-                q2 = tl.load(at + 2, mask, 0.0)
+                if WIDE:
+                    q0, q1, q2, _q = load_four(at)
+                else:
+                    q0, q1, q2 = vector(at, mask)
                 s0 += wz[k] * q0
                 s1 += wz[k] * q1
                 s2 += wz[k] * q2
@@ -59,9 +63,13 @@ def gather(
                 t1 += gz[k] * q1
                 t2 += gz[k] * q2
                 if BOTH:
-                    r0 += wz[k] * tl.load(at + 4, mask, 0.0)
-                    r1 += wz[k] * tl.load(at + 5, mask, 0.0)
-                    r2 += wz[k] * tl.load(at + 6, mask, 0.0)
+                    if WIDE:
+                        p0, p1, p2, _p = load_four(at + 4)
+                    else:
+                        p0, p1, p2 = vector(at + 4, mask)
+                    r0 += wz[k] * p0
+                    r1 += wz[k] * p1
+                    r2 += wz[k] * p2
             w = wx * wy
             dx = gx * wy
             dy = wx * gy
@@ -119,14 +127,16 @@ def load_particles(fraction, material, count, index, mask):
 @triton.jit
 def motion(
     fields, node, sx, sy, f, wz, gz, inverse_dx, known, VISCOUS: tl.constexpr, MOVING: tl.constexpr,
-    table=None, columns=0, VIRTUAL: tl.constexpr = False,
+    table=None, columns=0, VIRTUAL: tl.constexpr = False, WIDE: tl.constexpr = False,
 ):  # fmt: skip
     """Displacement, F, velocity (with VISCOUS or MOVING) and the velocity's gradient (with VISCOUS) of particles."""
     BOTH: tl.constexpr = MOVING and not VISCOUS
-    u, F, v = gather(fields, node, sx, sy, f, wz, gz, inverse_dx, known, BOTH, table, columns, VIRTUAL)
+    u, F, v = gather(fields, node, sx, sy, f, wz, gz, inverse_dx, known, BOTH, table, columns, VIRTUAL, WIDE)
     rate = F
     if VISCOUS:
-        v, rate, _v = gather(fields + 4, node, sx, sy, f, wz, gz, inverse_dx, known, False, table, columns, VIRTUAL)
+        v, rate, _v = gather(
+            fields + 4, node, sx, sy, f, wz, gz, inverse_dx, known, False, table, columns, VIRTUAL, WIDE
+        )
     return u, (F[0] + 1, F[1], F[2], F[3], F[4] + 1, F[5], F[6], F[7], F[8] + 1), v, rate
 
 
@@ -149,7 +159,7 @@ def total_particles(
     sx, sy, ox, oy, oz, scene_size, dx, inverse_dx, viscous_time,
     LAWS: tl.constexpr, MULTI: tl.constexpr, FORCES: tl.constexpr, FORCE: tl.constexpr, IMPLICIT: tl.constexpr,
     VISCOUS: tl.constexpr, POSITION: tl.constexpr, WIDTH: tl.constexpr, CELLS: tl.constexpr, LANES: tl.constexpr,
-    VIRTUAL: tl.constexpr,
+    VIRTUAL: tl.constexpr, WIDE: tl.constexpr,
 ):  # fmt: skip
     """``total``: forces of the particles of some cells, summed into 27 rows of ``partial`` per cell.
 
@@ -158,10 +168,10 @@ def total_particles(
     takes the previous substep from row 0 of the schedule.
     """
     LOADED: tl.constexpr = (len(FORCES.functions) > 0) or FORCE
+    cell, real, start, end, node, scene, longest = cells_of(cell_start, cell_node, cell_scene, cells, CELLS)
     step = tl.load(first_step) + step_offset
     kick = tl.load(schedule + (step + 1) * 4)
     before = tl.load(schedule + step * 4)
-    cell, real, start, end, node, scene, longest = cells_of(cell_start, cell_node, cell_scene, cells, CELLS)
     lane = tl.arange(0, LANES)[None, :]
     known = real[:, None]
     for chunk in range(0, longest, LANES):
@@ -174,7 +184,7 @@ def total_particles(
         else:
             place = node
         u, F, v, rate = motion(
-            fields, place, sx, sy, f, wz, gz, inverse_dx, known, VISCOUS, LOADED, cell_nodes, cells, VIRTUAL
+            fields, place, sx, sy, f, wz, gz, inverse_dx, known, VISCOUS, LOADED, cell_nodes, cells, VIRTUAL, WIDE
         )
         row = law_row(law, law_table, index, mask, MULTI)
         stress = pk1(F, mu, lam, row, LAWS)
@@ -206,7 +216,7 @@ def total_particles(
             moved = (mass * u[0], mass * u[1], mass * u[2])
         for i in range(3):
             wx, gx = node_weight(f[0], i, inverse_dx)
-            for j in range(3):
+            for j in tl.static_range(3):
                 wy, gy = node_weight(f[1], j, inverse_dx)
                 w = wx * wy
                 ax = gx * wy
@@ -269,8 +279,10 @@ def total_join(source, counts, nodes, partial, joined, WIDTH: tl.constexpr):
 
 
 @triton.jit
-def _end(node, k, mask, v0, v1, v2, inverse, held, taken, fields, dt, HELD: tl.constexpr, MOVE: tl.constexpr):
-    """Stop the held nodes and sum the reaction impulses, write the velocities, and move the nodes."""
+def _end(
+    node, k, mask, v0, v1, v2, d0, d1, d2, inverse, held, taken, fields, dt, HELD: tl.constexpr, MOVE: tl.constexpr
+):
+    """Stop the held nodes and sum the reaction impulses, write the velocities, and move the nodes from ``d``."""
     if HELD:
         free = tl.load(held + k, mask, 0) == 0
         stopped = mask & (free == 0)
@@ -287,9 +299,9 @@ def _end(node, k, mask, v0, v1, v2, inverse, held, taken, fields, dt, HELD: tl.c
     tl.store(to + 5, v1, mask)
     tl.store(to + 6, v2, mask)
     if MOVE:
-        tl.store(to, tl.load(to, mask, 0.0) + dt * v0, mask)
-        tl.store(to + 1, tl.load(to + 1, mask, 0.0) + dt * v1, mask)
-        tl.store(to + 2, tl.load(to + 2, mask, 0.0) + dt * v2, mask)
+        tl.store(to, d0 + dt * v0, mask)
+        tl.store(to + 1, d1 + dt * v1, mask)
+        tl.store(to + 2, d2 + dt * v2, mask)
 
 
 @triton.jit(do_not_specialize=VARIES)
@@ -301,19 +313,27 @@ def total_nodes(
 ):  # fmt: skip
     """``total``: nodal velocities and displacements from the sums of the cells around each node.
 
-    ``source`` are the rows of ``partial`` that each node adds, of which no node has more than ``sources``.
+    ``source`` are the rows of ``partial`` that each node adds, of which no node has more than ``sources``. Everything
+    is loaded as soon as its address is known, so that the waits for the memory overlap.
     """
-    step = tl.load(first_step) + step_offset
-    kick = tl.load(schedule + (step + 1) * 4)
-    dt = tl.load(schedule + (step + 1) * 4 + 1)
-    decay = tl.load(schedule + (step + 1) * 4 + 2)
     k = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
     mask = k < nodes
     node = tl.load(active + k, mask, 0)
-    inverse = tl.load(inverse_mass + k, mask, 0.0)
     o = tl.arange(0, SOURCES)[:, None]  # all at once
     known = mask[None, :] & (o < sources)
     row = partial + tl.load(source + o * nodes + k[None, :], known, 0) * WIDTH
+    inverse = tl.load(inverse_mass + k, mask, 0.0)
+    step = tl.load(first_step) + step_offset
+    place = fields + node * 8
+    v0, v1, v2 = vector(place + 4, mask)
+    d0, d1, d2 = v0, v1, v2
+    if MOVE:
+        d0, d1, d2 = vector(place, mask)
+    kick = tl.load(schedule + (step + 1) * 4)
+    dt = tl.load(schedule + (step + 1) * 4 + 1)
+    decay = tl.load(schedule + (step + 1) * 4 + 2)
+    if DAMPED:
+        decay *= tl.exp(-kick * tl.load(rates + k, mask, 0.0))
     f0 = tl.sum(tl.load(row, known, 0.0), 0)
     f1 = tl.sum(tl.load(row + 1, known, 0.0), 0)
     f2 = tl.sum(tl.load(row + 2, known, 0.0), 0)
@@ -327,13 +347,10 @@ def total_nodes(
         push = kick / (1 + kick * drag * inverse)
     else:
         push = kick
-    if DAMPED:
-        decay *= tl.exp(-kick * tl.load(rates + k, mask, 0.0))
-    place = fields + node * 8 + 4
-    v0 = (tl.load(place, mask, 0.0) + push * (f0 * inverse + gravity_x)) * decay
-    v1 = (tl.load(place + 1, mask, 0.0) + push * (f1 * inverse + gravity_y)) * decay
-    v2 = (tl.load(place + 2, mask, 0.0) + push * (f2 * inverse + gravity_z)) * decay
-    _end(node, k, mask, v0, v1, v2, inverse, held, taken, fields, dt, HELD, MOVE)
+    v0 = (v0 + push * (f0 * inverse + gravity_x)) * decay
+    v1 = (v1 + push * (f1 * inverse + gravity_y)) * decay
+    v2 = (v2 + push * (f2 * inverse + gravity_z)) * decay
+    _end(node, k, mask, v0, v1, v2, d0, d1, d2, inverse, held, taken, fields, dt, HELD, MOVE)
     if POSITION:
         out = shift + node * 4
         tl.store(out, m0 * inverse, mask)
@@ -347,16 +364,16 @@ def total_end(
     HELD: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
     """``total``: the end of a substep after contact, which comes between ``total_nodes`` and it."""
-    dt = tl.load(schedule + (tl.load(first_step) + step_offset + 1) * 4 + 1)
     k = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
     mask = k < nodes
     node = tl.load(active + k, mask, 0)
     inverse = tl.load(inverse_mass + k, mask, 0.0)
-    place = fields + node * 8 + 4
-    v0 = tl.load(place, mask, 0.0)
-    v1 = tl.load(place + 1, mask, 0.0)
-    v2 = tl.load(place + 2, mask, 0.0)
-    _end(node, k, mask, v0, v1, v2, inverse, held, taken, fields, dt, HELD, True)
+    step = tl.load(first_step) + step_offset
+    place = fields + node * 8
+    v0, v1, v2 = vector(place + 4, mask)
+    d0, d1, d2 = vector(place, mask)
+    dt = tl.load(schedule + (step + 1) * 4 + 1)
+    _end(node, k, mask, v0, v1, v2, d0, d1, d2, inverse, held, taken, fields, dt, HELD, True)
 
 
 @triton.jit(do_not_specialize=VARIES)
@@ -369,17 +386,18 @@ def total_rows(node, weight, rows, fields, residual, BLOCK: tl.constexpr):
     known = mask[:, None] & (o < 27)
     place = fields + tl.load(node + each, known, 0) * 8 + 4
     w = tl.load(weight + each, known, 0.0)
+    out = residual + k * 4
+    total = out + rows * 4
+    t0, t1, t2 = vector(total, mask)
     r0 = tl.sum(w * tl.load(place, known, 0.0), 1)
     r1 = tl.sum(w * tl.load(place + 1, known, 0.0), 1)
     r2 = tl.sum(w * tl.load(place + 2, known, 0.0), 1)
-    out = residual + k * 4
     tl.store(out, r0, mask)
     tl.store(out + 1, r1, mask)
     tl.store(out + 2, r2, mask)
-    total = out + rows * 4
-    tl.store(total, tl.load(total, mask, 0.0) + r0, mask)
-    tl.store(total + 1, tl.load(total + 1, mask, 0.0) + r1, mask)
-    tl.store(total + 2, tl.load(total + 2, mask, 0.0) + r2, mask)
+    tl.store(total, t0 + r0, mask)
+    tl.store(total + 1, t1 + r1, mask)
+    tl.store(total + 2, t2 + r2, mask)
 
 
 @triton.jit(do_not_specialize=VARIES)
@@ -388,10 +406,14 @@ def total_hold(
     BLOCK: tl.constexpr, ROWS: tl.constexpr,
 ):  # fmt: skip
     """``total``: velocities and displacements of the nodes around held points, of which a scene has ``rows``."""
-    dt = tl.load(schedule + (tl.load(first_step) + step_offset + 1) * 4 + 1)
     n = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
     mask = n < nodes
     first = tl.load(scene + n, mask, 0) * rows
+    at = fields + tl.load(affected + n, mask, 0) * 8
+    step = tl.load(first_step) + step_offset
+    d0, d1, d2 = vector(at, mask)
+    v0, v1, v2 = vector(at + 4, mask)
+    dt = tl.load(schedule + (step + 1) * 4 + 1)
     a0 = tl.zeros([BLOCK], tl.float32)
     a1 = tl.zeros([BLOCK], tl.float32)
     a2 = tl.zeros([BLOCK], tl.float32)
@@ -403,13 +425,12 @@ def total_hold(
         a0 += tl.sum(b * tl.load(place, known, 0.0), 1)
         a1 += tl.sum(b * tl.load(place + 1, known, 0.0), 1)
         a2 += tl.sum(b * tl.load(place + 2, known, 0.0), 1)
-    at = fields + tl.load(affected + n, mask, 0) * 8
-    tl.store(at, tl.load(at, mask, 0.0) - dt * a0, mask)
-    tl.store(at + 1, tl.load(at + 1, mask, 0.0) - dt * a1, mask)
-    tl.store(at + 2, tl.load(at + 2, mask, 0.0) - dt * a2, mask)
-    tl.store(at + 4, tl.load(at + 4, mask, 0.0) - a0, mask)
-    tl.store(at + 5, tl.load(at + 5, mask, 0.0) - a1, mask)
-    tl.store(at + 6, tl.load(at + 6, mask, 0.0) - a2, mask)
+    tl.store(at, d0 - dt * a0, mask)
+    tl.store(at + 1, d1 - dt * a1, mask)
+    tl.store(at + 2, d2 - dt * a2, mask)
+    tl.store(at + 4, v0 - a0, mask)
+    tl.store(at + 5, v1 - a1, mask)
+    tl.store(at + 6, v2 - a2, mask)
 
 
 @triton.jit(do_not_specialize=VARIES)
