@@ -9,7 +9,8 @@ the 27 nodes are therefore taken axis by axis, in three layers of nine nodes wit
 
 import math
 import warnings
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from typing import Any
@@ -217,6 +218,19 @@ def _grid_constants(grid: GridSpec, device: torch.device) -> tuple[Tensor, Tenso
         reach = torch.arange(3, device=device)
         shift = reach[:, None, None] * (ny * nz) + reach[:, None] * nz + reach
     return offset, limit, strides, shift
+
+
+@contextmanager
+def in_fixed_order(wanted: bool) -> Iterator[None]:
+    """Make PyTorch sum in a fixed order on a GPU, if wanted."""
+    before, warns = torch.are_deterministic_algorithms_enabled(), torch.is_deterministic_algorithms_warn_only_enabled()
+    if wanted:
+        torch.use_deterministic_algorithms(True)
+    try:
+        yield
+    finally:
+        if wanted:
+            torch.use_deterministic_algorithms(before, warn_only=warns)
 
 
 def scatter(stencil: Stencil, coefficients: Tensor) -> Tensor:

@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import torch
@@ -17,7 +16,7 @@ from gaussian_swaying.mpm.contact.pairs import close_pairs
 from gaussian_swaying.mpm.contact.solve import SLACK, Constraints, Rows, acting, pair_gaps, resolve, weighted
 from gaussian_swaying.mpm.contact.surface import Contact, Surface
 from gaussian_swaying.mpm.state import GridSpec, MPMState
-from gaussian_swaying.mpm.transfer import bspline_stencil
+from gaussian_swaying.mpm.transfer import bspline_stencil, in_fixed_order
 from gaussian_swaying.mpm.virtual_nodes import point_with_nodes
 
 LEAST_MARGIN = 0.5
@@ -65,19 +64,6 @@ class Lists:
     time: float
     margin: float
     fastest: float
-
-
-@contextmanager
-def in_fixed_order(wanted: bool) -> Iterator[None]:
-    """Make PyTorch sum in a fixed order on a GPU, if wanted."""
-    before, warns = torch.are_deterministic_algorithms_enabled(), torch.is_deterministic_algorithms_warn_only_enabled()
-    if wanted:
-        torch.use_deterministic_algorithms(True)
-    try:
-        yield
-    finally:
-        if wanted:
-            torch.use_deterministic_algorithms(before, warn_only=warns)
 
 
 class ContactStage:

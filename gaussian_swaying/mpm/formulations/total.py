@@ -26,7 +26,7 @@ from gaussian_swaying.mpm.held_rows import LEAST_APART
 from gaussian_swaying.mpm.point_holds import POINTS, PointHolds
 from gaussian_swaying.mpm.state import GridSpec, MPMState
 from gaussian_swaying.mpm.timestep import kick_time
-from gaussian_swaying.mpm.transfer import bspline_stencil, gather, scatter
+from gaussian_swaying.mpm.transfer import bspline_stencil, gather, in_fixed_order, scatter
 from gaussian_swaying.mpm.virtual_nodes import VirtualNodes, virtual_nodes
 
 
@@ -74,15 +74,15 @@ class Total(Formulation):
         self.stencil = bspline_stencil(
             position, self.grid, False, snap, deterministic=settings.deterministic, fixed=True, nodes=nodes
         )
-        self.node_mass = scatter(self.stencil, points.mass[..., None, None])[..., 0]
+        self.node_mass = self._summed(points.mass[..., None])[..., 0]
         self.node_inverse_mass = safe_inverse(self.node_mass)
         self.node_damping: Tensor | None = None
         if points.damping is not None:
-            carried = scatter(self.stencil, (points.mass * points.damping).detach()[..., None, None])[..., 0]
+            carried = self._summed((points.mass * points.damping).detach()[..., None])[..., 0]
             self.node_damping = carried * self.node_inverse_mass.detach()
         self.node_rest: Tensor | None = None
         if self.needs_position:
-            first_moment = scatter(self.stencil, (points.mass[..., None] * position)[..., None, :])
+            first_moment = self._summed(points.mass[..., None] * position)
             self.node_rest = first_moment * self.node_inverse_mass[..., None]
         self.held = tuple(
             held if held is None or not self.on_nodes[k] else self._on_nodes(k, held)
@@ -94,6 +94,11 @@ class Total(Formulation):
         self._windows = self._point_windows()
         self._point_holds = self._hold_points()
         self.contact = self._contact()
+
+    def _summed(self, values: Tensor) -> Tensor:
+        """Sums of values of the particles (..., P, K) by nodes (..., G, K); also on a GPU in a fixed order."""
+        with in_fixed_order(values.is_cuda):
+            return scatter(self.stencil, values[..., None, :])
 
     def _virtual_nodes(self, snap: float) -> VirtualNodes | None:
         points = self.body.points
@@ -297,7 +302,7 @@ class Total(Formulation):
     def _on_nodes(self, k: int, held: Held) -> Held:
         """Return the particles that the ``k``-th boundary holds, with their constant share of the mass of each node."""
         boundary, face = self.body.boundaries[k], self.has_face(k)
-        share = scatter(self.stencil, held.mass[..., None, None])[..., 0] * self.node_inverse_mass
+        share = self._summed(held.mass[..., None])[..., 0] * self.node_inverse_mass
         threshold = HELD_ALONE if face else boundary.held_share
         if threshold is not None and not face and not bool((share > threshold).any()):
             count = int((held.mass > 0).sum())
@@ -319,7 +324,7 @@ class Total(Formulation):
     def first_state(self, velocity: Tensor, margin: int) -> MPMState:
         """The state at time zero, with velocities interpolated from the nodes."""
         state = super().first_state(velocity, margin)
-        momentum = scatter(self.stencil, (self.body.points.mass[..., None] * velocity)[..., None, :])
+        momentum = self._summed(self.body.points.mass[..., None] * velocity)
         node_velocity = momentum * self.node_inverse_mass[..., None]
         return self.read_particles(state, torch.zeros_like(node_velocity), node_velocity)
 
