@@ -96,7 +96,7 @@ def without_nan(value: Any) -> Any:
 def write_table(path: Path, rows: list[dict[str, Any]]) -> None:
     """Write dicts as CSV with a header, completely or not at all; missing values stay empty."""
     names = list({name: None for row in rows for name in row})
-    with atomic(path) as temporary, temporary.open("w", newline="") as file:
+    with atomic(path) as temporary, temporary.open("w", newline="", encoding="utf-8") as file:
         writer = csv.DictWriter(file, fieldnames=names)
         writer.writeheader()
         writer.writerows(rows)

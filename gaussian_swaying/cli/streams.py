@@ -94,7 +94,7 @@ def safe_streams() -> Iterator[tuple[SafeStream, SafeStream]]:
     before = sys.stdout, sys.stderr
     if None in before:
         _open_closed()
-    opened = [stream if stream is not None else open(os.devnull, "w") for stream in before]  # noqa: SIM115
+    opened = [stream if stream is not None else open(os.devnull, "w", encoding="utf-8") for stream in before]  # noqa: SIM115
     output, errors = (SafeStream(stream) for stream in opened)
     sys.stdout, sys.stderr = cast(TextIO, output), cast(TextIO, errors)
     try:

@@ -67,7 +67,11 @@ def without_splat() -> list[str]:
     """Names of the shipped configurations whose scene is made in code."""
     root = shipped.folder()
     names = shipped.names("sim")
-    return [name for name in names if root is not None and "generator:" in (root / "sim" / f"{name}.yaml").read_text()]
+    return [
+        name
+        for name in names
+        if root is not None and "generator:" in (root / "sim" / f"{name}.yaml").read_text("utf-8")
+    ]
 
 
 def caches() -> dict[str, Path]:

@@ -103,7 +103,7 @@ def ply_polygons(data: Any) -> list[list[int]]:
 
 
 def _read_obj(file: Path) -> tuple[Tensor, list[list[int]]]:
-    vertices, polygons = parse_obj(file.read_text())
+    vertices, polygons = parse_obj(file.read_text("utf-8"))
     return torch.tensor([row[:3] for row in vertices], dtype=torch.float64).reshape(-1, 3), polygons
 
 

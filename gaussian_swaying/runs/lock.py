@@ -43,7 +43,7 @@ class FolderLock:
                 "folder."
             ) from None
         with suppress(OSError):  # only for the message of others
-            path.write_text(json.dumps({"pid": os.getpid(), "host": platform.node()}))
+            path.write_text(json.dumps({"pid": os.getpid(), "host": platform.node()}), "utf-8")
         self._place = [folder]
         self._end = weakref.finalize(self, _release, lock, self._place, os.getpid())
 

@@ -36,12 +36,12 @@ def append_row(path: Path, row: dict[str, Any]) -> None:
     if not set(row) <= set(names):
         rows: list[dict[str, Any]] = []
         if names:
-            with path.open(newline="", errors="replace") as text:
+            with path.open(newline="", encoding="utf-8", errors="replace") as text:
                 rows = [{name: line.get(name) for name in names} for line in csv.DictReader(text)]
         wider = [*names, *sorted(set(row) - set(names))]
         write_table(path, [{name: line.get(name) for name in wider} for line in [*rows, row]])
         return
-    with path.open("a", newline="") as text:
+    with path.open("a", newline="", encoding="utf-8") as text:
         if not whole:  # the last row was cut off when the run was killed
             text.write("\r\n")
         csv.DictWriter(text, fieldnames=names).writerow(row)

@@ -74,7 +74,7 @@ class GeneratedDataModule(CaptureDataModule):
         settings = {name: value for name, value in vars(self.generated).items() if not name.startswith("_")}
         marker = folder / "generated.json"
         if marker.is_file():
-            held = json.loads(marker.read_text())
+            held = json.loads(marker.read_text("utf-8"))
             if held == settings:
                 return
             other = ", ".join(name for name in settings if held.get(name) != settings[name])
@@ -85,9 +85,9 @@ class GeneratedDataModule(CaptureDataModule):
         with tempfile.TemporaryDirectory(dir=folder.parent) as temporary:
             made = Path(temporary) / "capture"
             self.generated.write(made, max(self.workers, 1))
-            (made / marker.name).write_text(json.dumps(settings))
+            (made / marker.name).write_text(json.dumps(settings), "utf-8")
             try:
                 made.rename(folder)
             except OSError:  # another run was faster
-                if not marker.is_file() or json.loads(marker.read_text()) != settings:
+                if not marker.is_file() or json.loads(marker.read_text("utf-8")) != settings:
                     raise
