@@ -21,6 +21,7 @@ from gaussian_swaying.mpm.boundaries.pinned_region import PinnedRegion
 from gaussian_swaying.mpm.boundaries.plane import Plane
 from gaussian_swaying.mpm.boundaries.rigid_region import RigidRegion
 from gaussian_swaying.mpm.boundaries.velocity_box import VelocityBox
+from gaussian_swaying.mpm.contact.surface import Contact, Surface
 from gaussian_swaying.mpm.followers import GridFollowers, on_material
 from gaussian_swaying.mpm.solver import MPMSolver
 from gaussian_swaying.mpm.state import GridSpec, MaterialPoints, MPMState
@@ -47,7 +48,8 @@ def together(*parts):
 
 
 def rolled(points, velocity=None, steps=60, transfer="torch", boundaries=(), push=None, **options):
-    solver = MPMSolver(1.0, gravity=(0, 0, -0.1), transfer=transfer, boundaries=boundaries, **options)
+    options = {"gravity": (0, 0, -0.1)} | options
+    solver = MPMSolver(1.0, transfer=transfer, boundaries=boundaries, **options)
     start = solver.init_state(points, velocity)
     forces = None if push is None else lambda _: push
     return solver, start, solver.rollout(start, 0.8 * solver.stable_substep(start), steps, forces)
@@ -310,11 +312,24 @@ def test_gradients_come_from_torch():
         solver.rollout(state, 1e-2, 5)
 
 
-def test_contact_of_attached_parts_has_no_kernels():
-    position, number = together(sheet(3.1), sheet(3.3))
-    solver = MPMSolver(1.0, boundaries=[BOUNDARIES["a ball"]()], transfer="kernels")
-    with pytest.raises(ValueError, match="contact and obstacles have no kernels"):
-        solver.init_state(material(position, number))
+def test_contact_and_obstacles_in_kernels():
+    """Of two sheets in one cell the upper one meets a third one from above, and the lower one a ball from below."""
+    position, number = together(sheet(3.1), sheet(3.3), sheet(6.0))
+    points, up = material(position, number), torch.zeros_like(position)
+    up[:, 2] = 1.0
+    velocity = -2.0 * (number == 2)[:, None] * up
+    surface = Surface.of_points(points, up, 0.5, 0.2, Contact())
+    ends = []
+    for transfer in ("torch", "kernels"):
+        ball = BallObstacle([2.0, 2.0, 2.3], 0.7)
+        solver = MPMSolver(1.0, gravity=(0, 0, -1), boundaries=[ball], transfer=transfer)
+        start = solver.init_state(points, velocity, surface=surface)
+        assert start.grid.virtual > 0
+        ends.append(solver.rollout(start, 0.5 * solver.stable_substep(start), 60))
+    free = rolled(points, velocity, gravity=(0, 0, -1))
+    assert (ends[0].position - ends[1].position).abs().amax() < 1e-6
+    for k in (0, 1, 2):
+        assert (ends[0].velocity - free[2].velocity)[number == k].abs().amax() > 0.1  # all have met something
 
 
 def test_copies_are_numbered_after_the_lattice():

@@ -18,6 +18,7 @@ from gaussian_swaying.mpm.triton.contact_list_kernels import (
     WITHIN,
     largest_of,
     meet,
+    node_at,
     place_now,
     velocity_now,
 )
@@ -33,10 +34,10 @@ KEPT = tl.constexpr(1 - CREEP)
 @triton.jit
 def _place(
     fields, base, fraction, arm, rest, facing, radius, thickness, places, row, p, mask, sx, sy, inverse_dx,
-    ARMS: tl.constexpr, BLOCK: tl.constexpr,
+    ARMS: tl.constexpr, VIRTUAL: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
     """Position, thickness, normal and radius of samples now."""
-    x, a, b, c = place_now(fields, base, fraction, arm, rest, places, p, mask, sx, sy, inverse_dx, ARMS, BLOCK)
+    x, a, b, c = place_now(fields, base, fraction, arm, rest, places, p, mask, sx, sy, inverse_dx, ARMS, VIRTUAL, BLOCK)
     f = load3(facing, places, p, mask)
     a0 = 1 + a[0]
     b1 = 1 + b[1]
@@ -173,18 +174,20 @@ def _constrain_walls(
 
 
 @triton.jit
-def _mark_nodes(base, marked, p, mask, sx, sy):
+def _mark_nodes(base, marked, places, p, mask, sx, sy, VIRTUAL: tl.constexpr):
     """Mark the nodes around places."""
     one = tl.full(p.shape, 1, tl.int32)
     node = tl.load(base + p, mask, 0)
     for i in range(3):
         for j in range(3):
             for k in tl.static_range(3):
-                tl.store(marked + node + i * sx + j * sy + k, one, mask)
+                tl.store(marked + node_at(base, node, p, mask, places, i, j, k, sx, sy, VIRTUAL), one, mask)
 
 
 @triton.jit
-def _mobility(base, fraction, arm, total, moving, places, p, mask, sx, sy, inverse_dx, ARMS: tl.constexpr):
+def _mobility(
+    base, fraction, arm, total, moving, places, p, mask, sx, sy, inverse_dx, ARMS: tl.constexpr, VIRTUAL: tl.constexpr
+):
     """Bound of how much unit impulses at all constraints move each sample, as ``Rows.mobility``."""
     f = load3(fraction, places, p, mask)
     node = tl.load(base + p, mask, 0)
@@ -197,11 +200,11 @@ def _mobility(base, fraction, arm, total, moving, places, p, mask, sx, sy, inver
         wx, gx = node_weight(f[0], i, inverse_dx)
         for j in range(3):
             wy, gy = node_weight(f[1], j, inverse_dx)
-            at = total + node + i * sx + j * sy
             w = wx * wy
             g = gx * wy * a[0] + wx * gy * a[1]
             for k in tl.static_range(3):
-                found += tl.abs((w + g) * wz[k] + w * gz[k] * a[2]) * tl.load(at + k, mask, 0.0)
+                at = total + node_at(base, node, p, mask, places, i, j, k, sx, sy, VIRTUAL)
+                found += tl.abs((w + g) * wz[k] + w * gz[k] * a[2]) * tl.load(at, mask, 0.0)
     tl.store(moving + p * 4 + 3, found, mask)
 
 
@@ -370,7 +373,7 @@ def contact_solve(
     peak, gate, status,
     schedule, first_step, step_offset, sx, sy, inverse_dx, reach, slack, push, most, tolerance, friction,
     iterations,
-    PAIRS: tl.constexpr, WALLS: tl.constexpr, ARMS: tl.constexpr, BLOCK: tl.constexpr,
+    PAIRS: tl.constexpr, WALLS: tl.constexpr, ARMS: tl.constexpr, VIRTUAL: tl.constexpr, BLOCK: tl.constexpr,
     WIDE: tl.constexpr, TALL: tl.constexpr,
 ):  # fmt: skip
     """The impulses of a substep, added to the velocities of the nodes; see ``resolve``.
@@ -399,11 +402,24 @@ def contact_solve(
                 if tl.max(tl.load(near + p, mask, 0)) > 0:
                     _place(
                         fields, base, fraction, arm, rest, facing, radius, thickness, places, row, p, mask, sx, sy,
-                        inverse_dx, ARMS, BLOCK,
+                        inverse_dx, ARMS, VIRTUAL, BLOCK,
                     )  # fmt: skip
                     if WALLS == 0:
                         velocity_now(
-                            fields, base, fraction, arm, moving, places, p, mask, sx, sy, inverse_dx, ARMS, BLOCK
+                            fields,
+                            base,
+                            fraction,
+                            arm,
+                            moving,
+                            places,
+                            p,
+                            mask,
+                            sx,
+                            sy,
+                            inverse_dx,
+                            ARMS,
+                            VIRTUAL,
+                            BLOCK,
                         )
             meet(gate, programs)
         for first in range(pid * BLOCK, places, programs * BLOCK):
@@ -426,7 +442,7 @@ def contact_solve(
                         mask, count, dt, slack, push, most, WALLS, BLOCK,
                     )  # fmt: skip
                     if tl.max(count) > 0:
-                        _mark_nodes(base, marked, p, mask & (count > 0), sx, sy)
+                        _mark_nodes(base, marked, places, p, mask & (count > 0), sx, sy, VIRTUAL)
                 tl.store(many + p, count, mask)
                 for c in tl.static_range(8):
                     tl.store(impulse + p * 8 + c, tl.zeros([BLOCK], tl.float32), mask)
@@ -444,7 +460,7 @@ def contact_solve(
                 mask = p < places
                 mask = mask & (tl.load(many + p, mask, 0) > 0)
                 if tl.max(mask.to(tl.int32)) > 0:
-                    _mobility(base, fraction, arm, total, moving, places, p, mask, sx, sy, inverse_dx, ARMS)
+                    _mobility(base, fraction, arm, total, moving, places, p, mask, sx, sy, inverse_dx, ARMS, VIRTUAL)
             meet(gate, programs)
             k = 0
             going = 1
@@ -496,7 +512,20 @@ def contact_solve(
                         mask = mask & (tl.load(many + p, mask, 0) > 0)
                         if tl.max(mask.to(tl.int32)) > 0:
                             velocity_now(
-                                fields, base, fraction, arm, moving, places, p, mask, sx, sy, inverse_dx, ARMS, BLOCK
+                                fields,
+                                base,
+                                fraction,
+                                arm,
+                                moving,
+                                places,
+                                p,
+                                mask,
+                                sx,
+                                sy,
+                                inverse_dx,
+                                ARMS,
+                                VIRTUAL,
+                                BLOCK,
                             )
                     meet(gate, programs)
             if WALLS > 0:

@@ -44,12 +44,24 @@ def largest_of(peak, programs):
 
 
 @triton.jit
+def node_at(base, node, p, mask, places, i, j, k, sx, sy, VIRTUAL: tl.constexpr):
+    """One of the 27 nodes of samples, whose first node on the lattice is ``node``."""
+    if VIRTUAL:
+        found = tl.load(base + ((i * 3 + j) * 3 + k) * places + p, mask, 0)
+    else:
+        found = node + i * sx + j * sy + k
+    return found
+
+
+@triton.jit
 def interpolate(
-    field, base, fraction, places, p, mask, sx, sy, inverse_dx, DERIVATIVES: tl.constexpr, BLOCK: tl.constexpr
-):
+    field, base, fraction, places, p, mask, sx, sy, inverse_dx, DERIVATIVES: tl.constexpr,
+    VIRTUAL: tl.constexpr, BLOCK: tl.constexpr,
+):  # fmt: skip
     """Four columns of the nodes at samples, and their derivatives along the axes [1/m], of shape (BLOCK, 4) each.
 
-    As ``total_kernels.gather``, but a row of four columns is one load.
+    As ``total_kernels.gather``, but a row of four columns is one load. ``base`` is the first node of each sample, or
+    with VIRTUAL the table of their nodes, shape (27, places).
     """
     column = tl.arange(0, 4)[None, :]
     f = load3(fraction, places, p, mask)
@@ -61,11 +73,11 @@ def interpolate(
         wx, gx = node_weight(f[0], i, inverse_dx)
         for j in range(3):
             wy, gy = node_weight(f[1], j, inverse_dx)
-            at = field + (node + i * sx + j * sy)[:, None] * 8 + column
             s = tl.zeros([BLOCK, 4], tl.float32)
             t = s
             for k in tl.static_range(3):
-                q = tl.load(at + k * 8, mask[:, None], 0.0)
+                at = node_at(base, node, p, mask, places, i, j, k, sx, sy, VIRTUAL)
+                q = tl.load(field + at[:, None] * 8 + column, mask[:, None], 0.0)
                 s += wz[k][:, None] * q
                 if DERIVATIVES:
                     t += gz[k][:, None] * q
@@ -91,10 +103,11 @@ def three(x):
 
 @triton.jit
 def place_now(
-    fields, base, fraction, arm, rest, places, p, mask, sx, sy, inverse_dx, ARMS: tl.constexpr, BLOCK: tl.constexpr
-):
+    fields, base, fraction, arm, rest, places, p, mask, sx, sy, inverse_dx, ARMS: tl.constexpr,
+    VIRTUAL: tl.constexpr, BLOCK: tl.constexpr,
+):  # fmt: skip
     """Return the present positions of contact samples, and the derivatives of the displacement along each axis."""
-    u, d0, d1, d2 = interpolate(fields, base, fraction, places, p, mask, sx, sy, inverse_dx, True, BLOCK)
+    u, d0, d1, d2 = interpolate(fields, base, fraction, places, p, mask, sx, sy, inverse_dx, True, VIRTUAL, BLOCK)
     if ARMS:
         a = load3(arm, places, p, mask)
         u += a[0][:, None] * d0 + a[1][:, None] * d1 + a[2][:, None] * d2
@@ -105,10 +118,11 @@ def place_now(
 
 @triton.jit
 def velocity_now(
-    fields, base, fraction, arm, moving, places, p, mask, sx, sy, inverse_dx, ARMS: tl.constexpr, BLOCK: tl.constexpr
-):
+    fields, base, fraction, arm, moving, places, p, mask, sx, sy, inverse_dx, ARMS: tl.constexpr,
+    VIRTUAL: tl.constexpr, BLOCK: tl.constexpr,
+):  # fmt: skip
     """Read the velocity of places."""
-    v, d0, d1, d2 = interpolate(fields + 4, base, fraction, places, p, mask, sx, sy, inverse_dx, ARMS, BLOCK)
+    v, d0, d1, d2 = interpolate(fields + 4, base, fraction, places, p, mask, sx, sy, inverse_dx, ARMS, VIRTUAL, BLOCK)
     if ARMS:
         a = load3(arm, places, p, mask)
         v += a[0][:, None] * d0 + a[1][:, None] * d1 + a[2][:, None] * d2
@@ -119,12 +133,12 @@ def velocity_now(
 @triton.jit(do_not_specialize=CHANGES)
 def contact_positions(
     fields, base, fraction, arm, rest, places, position, moving, status, sx, sy, inverse_dx, ARMS: tl.constexpr,
-    BLOCK: tl.constexpr,
+    VIRTUAL: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
     """Write positions (C, 3) and velocities of all contact samples; reset the flag that something is in reach."""
     p = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
     mask = p < places
-    u, d0, d1, d2 = interpolate(fields, base, fraction, places, p, mask, sx, sy, inverse_dx, ARMS, BLOCK)
+    u, d0, d1, d2 = interpolate(fields, base, fraction, places, p, mask, sx, sy, inverse_dx, ARMS, VIRTUAL, BLOCK)
     if ARMS:
         a = load3(arm, places, p, mask)
         u += a[0][:, None] * d0 + a[1][:, None] * d1 + a[2][:, None] * d2
@@ -132,7 +146,7 @@ def contact_positions(
     moved = three(u)
     for c in tl.static_range(3):
         tl.store(position + p * 3 + c, x[c] + moved[c], mask)
-    velocity_now(fields, base, fraction, arm, moving, places, p, mask, sx, sy, inverse_dx, ARMS, BLOCK)
+    velocity_now(fields, base, fraction, arm, moving, places, p, mask, sx, sy, inverse_dx, ARMS, VIRTUAL, BLOCK)
     if tl.program_id(0) == 0:
         tl.store(status + ACTING, 0)
         tl.store(status + WITHIN, 0)
@@ -277,7 +291,7 @@ def contact_lists(
     position, counts, start, rank, item, ordered, sorted_, candidates, near, room, many, impulse,
     entry_start, entry_place, reached, touched_nodes, peak, sums, gate, status, margin,
     schedule, first_step, step_offset, sx, sy, inverse_dx, reach, apart, slack, least, ahead, last, chunk,
-    ARMS: tl.constexpr, BLOCK: tl.constexpr, WIDE: tl.constexpr, TALL: tl.constexpr,
+    ARMS: tl.constexpr, VIRTUAL: tl.constexpr, BLOCK: tl.constexpr, WIDE: tl.constexpr, TALL: tl.constexpr,
 ):  # fmt: skip
     """Make the lists again if a node may have moved too far since they were made.
 
@@ -330,7 +344,7 @@ def contact_lists(
             p = first + lane
             mask = p < places
             x, _a, _b, _c = place_now(
-                fields, base, fraction, arm, rest, places, p, mask, sx, sy, inverse_dx, ARMS, BLOCK
+                fields, base, fraction, arm, rest, places, p, mask, sx, sy, inverse_dx, ARMS, VIRTUAL, BLOCK
             )
             tl.store(many + p, tl.zeros([BLOCK], tl.int32), mask)
             for c in tl.static_range(3):

@@ -73,7 +73,8 @@ class FusedContact:
         self.position = torch.zeros_like(surface.place)
         self.rest, self.facing = surface.place.T.contiguous(), surface.normal.T.contiguous()
         self.radius, self.thickness = surface.radius.contiguous(), surface.thickness.contiguous()
-        self.base, self.fraction = stage.first.int(), stage.fraction.contiguous()
+        self.virtual, self.fraction = bound.virtual is not None, stage.fraction.contiguous()
+        self.base = (stage.node.T if self.virtual else stage.first).int().contiguous()
         arm = surface.place - surface.read
         self.arms = bool((arm != 0).any())
         self.arm = arm.T.contiguous()
@@ -210,7 +211,7 @@ class FusedContact:
         where = (self.fields, self.base, self.fraction, self.arm, self.rest)
         block, one = lanes(self.device, BLOCK, 1), lanes(self.device, BLOCK)
         options: dict[str, Any] = {
-            "ARMS": self.arms, "BLOCK": block, "TALL": lanes(self.device, TALL, 1), **_LAUNCH
+            "ARMS": self.arms, "VIRTUAL": self.virtual, "BLOCK": block, "TALL": lanes(self.device, TALL, 1), **_LAUNCH
         }  # fmt: skip
         if self.programs > 1:
             options["launch_cooperative_grid"] = True
@@ -227,7 +228,7 @@ class FusedContact:
         if walls:
             launch(list_kernels.contact_positions, (-(-self.places // block),))(
                 *where, self.places, self.position, self.moving, self.status, *strides,
-                ARMS=self.arms, BLOCK=block, num_warps=8,
+                ARMS=self.arms, VIRTUAL=self.virtual, BLOCK=block, num_warps=8,
             )  # fmt: skip
             for k, (solid, (_, obstacle)) in enumerate(zip(self.solids, stage.obstacles, strict=True)):
                 if solid is not None:

@@ -120,14 +120,6 @@ class FusedTotal(Fused):
         width = 8 if self.position else 4
         check_indices(max(8 * len(inverse), 27 * (self.pieces + 1) * width, 27 * len(active)))
 
-    @classmethod
-    def unsupported(cls, bound: Formulation, interpret: bool) -> str | None:
-        """Also refuses contact of a body with virtual nodes."""
-        why = super().unsupported(bound, interpret)
-        if why is None and isinstance(bound, Total) and bound.virtual is not None and bound.contact is not None:
-            return "contact and obstacles have no kernels for a body with `attached` parts"
-        return why
-
     @property
     def launches(self) -> bool:
         """True if the kernels apply all boundaries."""
