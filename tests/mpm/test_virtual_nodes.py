@@ -312,9 +312,29 @@ def test_gradients_come_from_torch():
         solver.rollout(state, 1e-2, 5)
 
 
+@pytest.mark.parametrize("transfer", ["torch", "kernels"])
+def test_close_parts_touch_and_do_not_pass_each_other(transfer):
+    """Sheets with a gap of 0.4 cells that are pushed together; on shared nodes they would be one body."""
+    position, number = together(sheet(3.1), sheet(3.5))
+    points, up = material(position, number), torch.zeros_like(position)
+    up[:, 2] = 1.0
+    velocity = (0.5 - number)[:, None] * up
+    ends = []
+    for contact in (Contact(), None):
+        surface = Surface.of_points(points, up, 0.5, 0.1, contact)
+        solver = MPMSolver(1.0, gravity=(0, 0, 0), transfer=transfer)
+        start = solver.init_state(points, velocity, surface=surface)
+        ends.append(solver.rollout(start, 0.5 * solver.stable_substep(start), 40))
+    gap, passed = ((end.position[number == 1] - end.position[number == 0])[:, 2] for end in ends)
+    assert passed.max() < 0.0
+    assert gap.min() > 0.099  # the thickness
+    twice = solver.momenta(ends[0])["linear"] - solver.momenta(start)["linear"]
+    assert twice.norm() < 1e-9
+
+
 def test_contact_and_obstacles_in_kernels():
-    """Of two sheets in one cell the upper one meets a third one from above, and the lower one a ball from below."""
-    position, number = together(sheet(3.1), sheet(3.3), sheet(6.0))
+    """Of two sheets in one cell, the upper one meets a third one from above, and the lower one a ball from below."""
+    position, number = together(sheet(3.1), sheet(3.5), sheet(6.0))
     points, up = material(position, number), torch.zeros_like(position)
     up[:, 2] = 1.0
     velocity = -2.0 * (number == 2)[:, None] * up

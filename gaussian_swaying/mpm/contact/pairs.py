@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import torch
 from torch import Tensor
 
@@ -16,7 +18,14 @@ _AHEAD = ((0, 1), (1, -1), (1, 0), (1, 1))
 
 
 @torch.no_grad()
-def close_pairs(place: Tensor, reach: float, rest: Tensor, apart: float) -> tuple[Tensor, Tensor]:
+def close_pairs(
+    place: Tensor,
+    reach: float,
+    rest: Tensor,
+    apart: float,
+    unconnected: Callable[[Tensor, Tensor], Tensor] | None = None,
+    least: float = 0.0,
+) -> tuple[Tensor, Tensor]:
     """All pairs of samples closer than ``reach`` that were at least ``apart`` from each other at rest.
 
     Samples are sorted by the cells of a grid as wide as ``reach``. Each looks at the samples after it in its own column
@@ -27,6 +36,8 @@ def close_pairs(place: Tensor, reach: float, rest: Tensor, apart: float) -> tupl
         reach: Distance [m].
         rest: Positions of the same samples at rest [m], shape (C, 3).
         apart: Least distance at rest [m].
+        unconnected: A mask of pairs, from the indices of their samples, whose parts are not connected there.
+        least: Least distance of such a pair at rest [m].
 
     Returns:
         Indices of the two samples of each pair, the smaller first, in rising order, shape (M,) each.
@@ -65,7 +76,10 @@ def close_pairs(place: Tensor, reach: float, rest: Tensor, apart: float) -> tupl
             b = begin[a] + torch.arange(len(a), device=device) + before - (ends - length)[a]
             near = (place[a] - place[b]).square().sum(-1) < reach * reach
             a, b = a[near], b[near]
-            far = (rest[a] - rest[b]).square().sum(-1) >= apart * apart
+            distance = (rest[a] - rest[b]).square().sum(-1)
+            far = distance >= apart * apart
+            if unconnected is not None:
+                far |= (distance >= least * least) & unconnected(order[a], order[b])
             found.append(torch.stack([order[a[far]], order[b[far]]]))
             if sum(part.shape[1] for part in found) > MOST_PAIRS:
                 raise ValueError(

@@ -17,7 +17,7 @@ from gaussian_swaying.mpm.contact.solve import SLACK, Constraints, Rows, acting,
 from gaussian_swaying.mpm.contact.surface import Contact, Surface
 from gaussian_swaying.mpm.state import GridSpec, MPMState
 from gaussian_swaying.mpm.transfer import bspline_stencil, in_fixed_order
-from gaussian_swaying.mpm.virtual_nodes import point_with_nodes
+from gaussian_swaying.mpm.virtual_nodes import coordinates, point_with_nodes
 
 LEAST_MARGIN = 0.5
 """Least distance beyond contact within which pairs are listed [cells]."""
@@ -110,8 +110,10 @@ class ContactStage:
         basis = stencil.basis  # (C, 4, 27)
         arm = surface.place - surface.read
         self.node = stencil.node.reshape(-1, 27)
+        self.corner: Tensor | None = None
         if points is not None:
             self.node = self._nodes(stencil.first, *points)
+            self.corner = coordinates(stencil.first % grid.node_count, grid)
         self.first, self.fraction = stencil.first, 1.5 + stencil.factors[1, :, 0] * grid.dx  # position in its cell
         self.slope = basis[:, 1:4]
         self.weight = basis[:, 0] + (arm[:, :, None] * self.slope).sum(1)
@@ -137,6 +139,14 @@ class ContactStage:
             k = int((host < 0).int().argmax())
             raise ValueError(f"The contact sample {k} lies in a cell without material of its piece: move its `read`.")
         return point_node.T[host.to(point_node.device)]
+
+    def unconnected(self, first: Tensor, second: Tensor) -> Tensor:
+        """A mask of pairs of samples, by their indices (M,), that have different copies of a node that both reach."""
+        assert self.corner is not None
+        away = self.corner[second] - self.corner[first]
+        place = away.new_tensor([9, 3, 1])
+        one, other = ((place * (sign * away).clamp(0, 2)).sum(-1) for sign in (1, -1))
+        return (away.abs() > 2).any(-1) | (self.node[first, one] != self.node[second, other])
 
     # ---- lists
 
@@ -172,7 +182,9 @@ class ContactStage:
         none = torch.zeros(0, dtype=torch.long, device=position.device)
         first = second = none
         if self.contact is not None:
-            first, second = close_pairs(position, self.reach + margin, self.surface.place, self.apart)
+            which = None if self.corner is None else self.unconnected
+            place, reach = self.surface.place, self.reach + margin
+            first, second = close_pairs(position, reach, place, self.apart, which, self.reach)
         near = []
         for _, obstacle in self.obstacles:
             distance = obstacle.touch(position, time, dt)[0] - 0.5 * self.surface.thickness

@@ -226,10 +226,13 @@ def _sort_places(
 
 @triton.jit
 def _search(
-    position, rest, start, ordered, sorted_, candidates, near, places, room, status, limit, apart, inverse_size, last,
-    programs, BLOCK: tl.constexpr, WIDE: tl.constexpr,
+    position, rest, base, corner, start, ordered, sorted_, candidates, near, places, room, status, limit, apart, beside,
+    inverse_size, last, programs, VIRTUAL: tl.constexpr, BLOCK: tl.constexpr, WIDE: tl.constexpr,
 ):  # fmt: skip
-    """The samples closer than ``limit`` to each that were at least ``apart`` from it at rest."""
+    """The samples closer than ``limit`` to each that were at least ``apart`` from it at rest.
+
+    With VIRTUAL also those that were at least ``beside`` from it, and have another copy of a node that both reach.
+    """
     lane = tl.arange(0, BLOCK)
     wide = tl.arange(0, WIDE)[None, :]
     for first in range(tl.program_id(0) * BLOCK, places, programs * BLOCK):
@@ -274,7 +277,19 @@ def _search(
                 q0 = tl.load(rest + q, known, 0.0) - r[0][:, None]
                 q1 = tl.load(rest + places + q, known, 0.0) - r[1][:, None]
                 q2 = tl.load(rest + 2 * places + q, known, 0.0) - r[2][:, None]
-                known = known & (q != p[:, None]) & (q0 * q0 + q1 * q1 + q2 * q2 >= apart * apart)
+                square = q0 * q0 + q1 * q1 + q2 * q2
+                far = square >= apart * apart
+                if VIRTUAL:
+                    c0 = tl.load(corner + q, known, 0) - tl.load(corner + p, mask, 0)[:, None]
+                    c1 = tl.load(corner + places + q, known, 0) - tl.load(corner + places + p, mask, 0)[:, None]
+                    c2 = tl.load(corner + 2 * places + q, known, 0) - tl.load(corner + 2 * places + p, mask, 0)[:, None]
+                    both = known & (c0 >= -2) & (c0 <= 2) & (c1 >= -2) & (c1 <= 2) & (c2 >= -2) & (c2 <= 2)
+                    one = (tl.maximum(c0, 0) * 3 + tl.maximum(c1, 0)) * 3 + tl.maximum(c2, 0)
+                    other = (tl.maximum(-c0, 0) * 3 + tl.maximum(-c1, 0)) * 3 + tl.maximum(-c2, 0)
+                    mine = tl.load(base + one * places + p[:, None], both, 0)
+                    theirs = tl.load(base + other * places + q, both, 1)
+                    far = far | ((square >= beside * beside) & (mine != theirs))
+                known = known & (q != p[:, None]) & far
                 hit = known.to(tl.int32)
                 to = found[:, None] + tl.cumsum(hit, 1) - hit
                 tl.store(candidates + p[:, None] * room + to, q, known & (to < room))
@@ -287,7 +302,7 @@ def _search(
 
 @triton.jit(do_not_specialize=CHANGES)
 def contact_lists(
-    active, carries, before, nodes, fields, base, fraction, arm, rest, places,
+    active, carries, before, nodes, fields, base, fraction, arm, rest, places, corner,
     position, counts, start, rank, item, ordered, sorted_, candidates, near, room, many, impulse,
     entry_start, entry_place, reached, touched_nodes, peak, sums, gate, status, margin,
     schedule, first_step, step_offset, sx, sy, inverse_dx, reach, apart, slack, least, ahead, last, chunk,
@@ -358,8 +373,8 @@ def contact_lists(
             programs, BLOCK, WIDE,
         )  # fmt: skip
         _search(
-            position, rest, start, ordered, sorted_, candidates, near, places, room, status, limit, apart, 1 / limit,
-            last, programs, BLOCK, WIDE,
+            position, rest, base, corner, start, ordered, sorted_, candidates, near, places, room, status, limit, apart,
+            reach, 1 / limit, last, programs, VIRTUAL, BLOCK, WIDE,
         )  # fmt: skip
         meet(gate, programs)
         tall = tl.arange(0, TALL)

@@ -75,6 +75,7 @@ class FusedContact:
         self.radius, self.thickness = surface.radius.contiguous(), surface.thickness.contiguous()
         self.virtual, self.fraction = bound.virtual is not None, stage.fraction.contiguous()
         self.base = (stage.node.T if self.virtual else stage.first).int().contiguous()
+        self.corner = self.base if stage.corner is None else stage.corner.T.int().contiguous()
         arm = surface.place - surface.read
         self.arms = bool((arm != 0).any())
         self.arm = arm.T.contiguous()
@@ -218,7 +219,7 @@ class FusedContact:
         if pairs:
             chunk = -(-(self.last + 1) // self.programs)
             launch(list_kernels.contact_lists, (self.programs,))(
-                self.active, self.carries, self.before, len(self.active), *where, self.places,
+                self.active, self.carries, self.before, len(self.active), *where, self.places, self.corner,
                 self.now, self.counts, self.start, self.rank, self.item, self.ordered, self.sorted, self.candidates,
                 self.near, self.room, self.many, self.impulse, self.entry_start, self.entry_place, self.reached,
                 len(self.touched), self.peak, self.sums, self.gate, self.status, self.margin, *now, stage.reach,
