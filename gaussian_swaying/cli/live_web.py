@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import tempfile
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
 from gaussian_swaying import _program as program
@@ -12,7 +13,7 @@ from gaussian_swaying.cli.scene import settings_of, words_of
 from gaussian_swaying.cli.shipped import names
 from gaussian_swaying.simulation.simulation import Simulation
 from gaussian_swaying.viewer.live_web.budget import TARGETS, fitted
-from gaussian_swaying.viewer.live_web.page import write_live_web
+from gaussian_swaying.viewer.live_web.page import ELEMENT, write_element, write_live_web
 
 
 def build_options() -> argparse.ArgumentParser:
@@ -31,11 +32,35 @@ def build_options() -> argparse.ArgumentParser:
         choices=tuple(TARGETS),
         help="fit the points and the grid to this kind of machine; without it they are those of the configuration",
     )
+    parser.add_argument(
+        "--element",
+        action="store_true",
+        help="also write gaussian-swaying.js beside the page, to show it in another page",
+    )
     return parser
 
 
-def export_live_web(arguments: Sequence[str]) -> None:
-    """Write the page, and report its size.
+@dataclass(frozen=True, eq=False)
+class Asked:
+    """The page that a command line asks for.
+
+    Attributes:
+        simulation: What runs in it.
+        name: What it shows.
+        target: The file.
+        sentence: The grid that was chosen, or None.
+        element: Whether the script for other pages is asked for, too.
+    """
+
+    simulation: Simulation
+    name: str
+    target: Path
+    sentence: str | None
+    element: bool
+
+
+def asked(arguments: Sequence[str]) -> Asked:
+    """The page that a command line asks for.
 
     Args:
         arguments: The command line.
@@ -58,19 +83,35 @@ def export_live_web(arguments: Sequence[str]) -> None:
         else:
             settings = settings_of(parser, str(config) if config.is_file() else scene, further, Path(folder))
         settings.device = "cpu"
-        if options.target is None:
-            simulation = Simulation.from_settings(parser, settings)
-        else:
-            found = fitted(parser, settings, options.target)
-            simulation = found.simulation
-            print(found.sentence)
         splat = settings.scene.ply
         made = getattr(settings.scene.generator, "class_path", "scene").rsplit(".", 1)[-1].removesuffix("Scene")
-        written = write_live_web(simulation, made if splat is None else Path(splat).stem, target)
+        name = made if splat is None else Path(splat).stem
+        if options.target is None:
+            return Asked(Simulation.from_settings(parser, settings), name, target, None, options.element)
+        found = fitted(parser, settings, options.target)
+        return Asked(found.simulation, name, target, found.sentence, options.element)
+
+
+def export_live_web(arguments: Sequence[str]) -> None:
+    """Write the page, and report its size.
+
+    Args:
+        arguments: The command line.
+
+    Raises:
+        ValueError: If an option is bad, or a browser cannot simulate the scene.
+    """
+    page = asked(arguments)
+    if page.sentence is not None:
+        print(page.sentence)
+    written = write_live_web(page.simulation, page.name, page.target)
     if written.notes:
         print("\n".join(f"note: {note.replace('the film', 'the page')}" for note in written.notes))
     print(f"{written.gaussians:,} Gaussians, {written.points:,} material points")
-    print(f"wrote {target} ({target.stat().st_size / 1e6:.1f} MB)")
+    if page.element:
+        write_element(page.target.parent)
+        print(f"wrote {page.target.with_name(ELEMENT)}")
+    print(f"wrote {page.target} ({page.target.stat().st_size / 1e6:.1f} MB)")
 
 
 def default_target(scene: str) -> Path:

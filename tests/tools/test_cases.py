@@ -292,6 +292,18 @@ def test_the_first_picture_of_a_place(monkeypatch):
     assert [row[0] for row in cells("web.first", record)] == ["one", "many"]
 
 
+@pytest.mark.usefixtures("chromium", "node")
+def test_size_and_speed_of_a_page(monkeypatch):
+    monkeypatch.setattr(web, "SPAN", 2)
+    monkeypatch.setattr(web, "WINDOW", (160, 90))
+    row = web.page_of(["flag", "--scene.generator.init_args.spacing=0.05", "--solver.dx=0.2", "--material.E=9e3"])
+    assert row["gaussians"] == 384
+    assert min(row["node"], row["plain"], row["browser"], row["first_s"]) > 0
+    record = HEAD | {"films": {}, "pages": {"small flag": row}}
+    assert cells("web.pages", record)[0][0] == "small flag"
+    assert len(cells("web.goals", record)) == 4
+
+
 def test_a_place_is_previewed_in_a_process_of_its_own():
     """Its memory is that of the preview, without what made the place."""
     row = places.previewed(20_000, "cpu", drafts=False)

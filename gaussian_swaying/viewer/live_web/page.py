@@ -18,6 +18,9 @@ from gaussian_swaying.viewer.live_web.block import check, pack_solver
 
 PAGE = Path(__file__).parent / "page"
 
+ELEMENT = "gaussian-swaying.js"
+"""The script with which another page shows this one in a ``<gaussian-swaying>``."""
+
 
 @dataclass(frozen=True)
 class Written:
@@ -51,6 +54,11 @@ def write_live_web(simulation: Simulation, name: str, target: Path) -> Written:
     text, film = page(simulation, name)
     write_text(target, text)
     return Written(film.head["count"], simulation.setup.points.count, film.notes)
+
+
+def write_element(folder: Path) -> None:
+    """Write :data:`ELEMENT` to a folder."""
+    write_text(folder / ELEMENT, (PAGE / ELEMENT).read_text(encoding="utf-8"))
 
 
 def page(simulation: Simulation, name: str) -> tuple[str, Film]:

@@ -10,7 +10,7 @@ import pytest
 import torch
 
 from gaussian_swaying.viewer.film.recorded import order_of
-from gaussian_swaying.viewer.live_web.page import write_live_web
+from gaussian_swaying.viewer.live_web.page import write_element, write_live_web
 
 FLAGS = [
     "--no-sandbox",
@@ -151,3 +151,20 @@ def test_a_file_that_is_cut_short_or_damaged_says_so(show, written, tmp_path):
     (tmp_path / "damaged.html").write_text(content[:at] + "AAAA" + content[at + 4 :])
     message = show(tmp_path / "damaged.html").locator("#message")
     message.filter(has_text=re.compile(r"^This page cannot be shown \([^()]+\)\.$")).wait_for()
+
+
+def test_a_page_within_another_page(browser, written):
+    """``<gaussian-swaying>`` passes its attributes on, also when they change."""
+    write_element(written.parent)
+    outer = written.parent / "outer.html"
+    element = f'<gaussian-swaying src="{written.name}" wind="1,2,0" view="0,-3,0,0,0,0"></gaussian-swaying>'
+    outer.write_text(f'<!doctype html><script src="gaussian-swaying.js"></script>{element}')
+    page = browser.new_page()
+    page.goto(outer.as_uri())
+    until(lambda: len(page.frames) == 2 and page.frames[1].evaluate("!!window.windPage"))
+    inner = page.frames[1]
+    assert inner.evaluate("windPage.settings.wind") == [1, 2, 0]
+    assert re.search(r"&?view=0,-3,0,0,0,0$", inner.evaluate("windPage.link()"))
+    page.evaluate("document.querySelector('gaussian-swaying').setAttribute('wind', '-3,0,0')")
+    until(lambda: inner.evaluate("windPage.settings.wind[0]") == -3)
+    page.close()

@@ -1,10 +1,13 @@
-"""What ``bench.py web`` measures: the size of films for the web, their error and their speed in a browser."""
+"""What ``bench.py web`` measures: films and pages for the web, their size, their error and their speed in a browser."""
 
 from __future__ import annotations
 
 import argparse
+import json
+import shlex
 import shutil
 import statistics
+import subprocess
 import tempfile
 import time
 from collections.abc import Iterator
@@ -17,12 +20,15 @@ import torch
 
 from bench.case import Case, Measurement, numbers, option
 from bench.places import write_swaying
-from bench.record import Row
+from bench.record import ROOT, Row
+from gaussian_swaying.cli.live_web import asked
 from gaussian_swaying.mpm.state import MPMState
 from gaussian_swaying.recording.checkpoint import read_checkpoint
 from gaussian_swaying.simulation.simulation import Simulation
 from gaussian_swaying.viewer.film import page
 from gaussian_swaying.viewer.film.page import write_film
+from gaussian_swaying.viewer.live_web.block import pack_solver
+from gaussian_swaying.viewer.live_web.page import PAGE, write_live_web
 
 WINDOW = (1440, 900)  # pixels
 FRAMES, REPEATS = 100, 3
@@ -31,7 +37,10 @@ FLAGS += ["--disable-component-update", "--use-gl=angle", "--use-angle=swiftshad
 
 
 def rows(options: argparse.Namespace, _: Row) -> Iterator[Measurement]:
-    """The film of each run, and those of places, in one part and in many."""
+    """The film of each run, those of places, in one part and in many, and pages that simulate."""
+    for line in options.page:
+        name, _, command = line.partition("=")
+        yield ("pages", name), partial(page_of, shlex.split(command or name))
     for count in options.places:
         for whole in (True, False):
             yield ("first", f"{count:,}, {'one' if whole else 'many'}"), partial(first_of, count, whole)
@@ -153,12 +162,73 @@ def _last_centres(run: Path) -> torch.Tensor:
     return scene.frame.point_to_sim(means) / (scene.size * scene.frame.metres_per_unit)
 
 
+TURNS, SPAN = 6, 25
+"""How often the solver of a page is timed, of which the fastest counts, and frames each time."""
+
+
+def page_of(command: list[str]) -> Row:
+    """Size and speed of a page that simulates: of its solver alone, in Node.js and in Chromium.
+
+    Args:
+        command: The scene and options of ``export --live-web``.
+    """
+    with tempfile.TemporaryDirectory() as temporary:
+        folder = Path(temporary)
+        page = asked([*command])
+        simulation, target = page.simulation, folder / "page.html"
+        written = write_live_web(simulation, page.name, target)
+        nodes = simulation.scene.follow.nodes(simulation.start())
+        assert nodes is not None
+        (folder / "block").write_bytes(pack_solver(simulation, nodes))
+        lanes, plain = _in_node(folder, False), _in_node(folder, True)
+        row: Row = {
+            "gaussians": written.gaussians,
+            "points": written.points,
+            "dx_m": simulation.solver.dx,
+            "substeps_per_s": lanes["substeps"] / lanes["simulated"],
+            "bytes": target.stat().st_size,
+            "node": lanes["simulated"] / lanes["cpu"],
+            "plain": plain["simulated"] / plain["cpu"],
+        }
+        return row | _in_page(target)
+
+
+def _in_node(folder: Path, plain: bool) -> Row:
+    """The turn of the solver in Node.js with the least CPU time, with ``plain`` without WebAssembly."""
+    turns = json.dumps([{"kind": "frames", "count": SPAN}] * TURNS)
+    script = ROOT / "tools" / "player" / "live_web" / "run.js"
+    command = ["node", script, PAGE / "worker.min.js", folder / "block", folder / "state", turns]
+    told = subprocess.run([*command, *["plain"] * plain], capture_output=True, text=True, check=True)
+    return min(json.loads(told.stdout), key=lambda turn: turn["cpu"])
+
+
+def _in_page(target: Path) -> Row:
+    """When a page shows its first picture, and the fastest turn of its solver while it draws, in Chromium."""
+    with _browser() as browser:
+        window = browser.new_page(viewport={"width": WINDOW[0], "height": WINDOW[1]})
+        window.set_default_timeout(600_000)
+        window.goto(target.as_uri(), wait_until="commit")
+        while not window.evaluate("!!window.windPage && windPage.first() !== null"):
+            time.sleep(0.25)
+        window.evaluate("windPage.complete.then(() => { windPage.pause(); windPage.reset(); })")
+        turns = [window.evaluate(f"windPage.advance({SPAN})") for _ in range(TURNS)]
+        best = min(turns, key=lambda turn: turn["seconds"])
+        row: Row = {"window": list(WINDOW), "chromium": browser.version, "first_s": window.evaluate("windPage.first()")}
+        return row | {"browser": best["simulated"] / best["seconds"]}
+
+
 CASE = Case(
-    "Measure films for the web: size, error, and speed in headless Chromium.",
+    "Measure films and pages for the web: size, error, and speed in headless Chromium.",
     rows,
     (
         option("--run", "folder of a finished run of `total`; repeatable", action="append", default=[]),
         numbers("--places", "Gaussians of places whose first picture is timed", default=""),
+        option(
+            "--page",
+            "a page that simulates, as its name, =, and the scene and options of export --live-web; repeatable",
+            action="append",
+            default=[],
+        ),
         option("--seconds", "for which a film plays while it is timed", type=float, default=20.0),
     ),
     page="web.md",

@@ -70,6 +70,27 @@ table("web.md", "web.first", "web_*", lambda result: result.get("first", {}).val
     file [MB] = {bytes:.1f (MB)} | first picture [s] = {first_s:.1f} | all has come [s] = {complete_s:.1f}
     """, before="{source}", empty="Not recorded yet.")  # fmt: skip
 
+PAGES = [
+    Goal("{key}: solver in {what}, simulated seconds per second, at least {limit:g}", "{speed:.2f}", "speed >= 1"),
+    Goal("{key}: file [MB], at most {limit:g}", "{megabytes:.1f}", "megabytes <= 12"),
+    Goal("{key}: first picture [s], at most {limit:g}", "{picture_s:.1f}", "picture_s <= 2"),
+]
+
+
+def _pages(result: Row) -> Iterator[Row]:
+    for key, row in result.get("pages", {}).items():
+        yield {"key": key, "what": "Node.js", "speed": row["node"]}
+        size = {"megabytes": row["bytes"] / 1e6, "picture_s": row["first_s"]}
+        yield {"key": key, "what": "Chromium", "speed": row["browser"]} | size
+
+
+table("web.md", "web.pages", "web_*", "pages", """
+    page = {key} | Gaussians = {gaussians:,} | points = {points:,} | grid [m] = {dx_m:.3g} |
+    substeps a second = {substeps_per_s:,.0f} | file [MB] = {bytes:.1f (MB)} | first picture [s] = {first_s:.1f} |
+    Node.js [x real time] = {node:.2f} | without WebAssembly = {plain:.2f} | Chromium = {browser:.2f}
+    """, before="{source}", empty="Not recorded yet.")  # fmt: skip
+table("web.md", "web.goals", "web_*", judged(PAGES, _pages), GOAL, empty="Not recorded yet.")
+
 _SHEET, _ORDER = "sheet = `{formulation}`, {particles:,} points", ("formulation", "particles")
 
 

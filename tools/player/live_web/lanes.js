@@ -40,7 +40,7 @@ export class LanesSolver extends Solver {
     const total = rows.reduce((sum, count) => sum + count, 0);
     const sizes = {
       starts: starts.length, nodes: 27 * this.cells, records: RECORD * chunks, vectors: 3 * LANES * total,
-      displacement: 3 * this.nodes, velocity: 3 * this.nodes, force: 3 * this.nodes, speeds: LANES * chunks,
+      displacement: 3 * this.nodes, velocity: 3 * this.nodes, force: 4 * this.nodes, speeds: LANES * chunks,
     };
     let end = Math.ceil(this.code.free() / 16) * 16;
     /** First byte of each array. @type {Record<string, number>} */
@@ -53,10 +53,11 @@ export class LanesSolver extends Solver {
     memory.grow(Math.max(0, Math.ceil((end - memory.buffer.byteLength) / 65536)));
     const view = (Kind, name) => new Kind(memory.buffer, this.where[name], sizes[name]);
     view(Int32Array, "starts").set(starts);
-    view(Int32Array, "nodes").set(a.cellNodes.map((node) => 12 * node)); // bytes
+    view(Int32Array, "nodes").set(a.cellNodes.map((node) => 4 * node)); // bytes of one number
     this.displacement = view(Float32Array, "displacement");
     this.velocity = view(Float32Array, "velocity");
     this.force = view(Float32Array, "force");
+    this.wide = 4;
     this.lanes = view(Float32Array, "speeds");
     this.before = { displacement: this.displacement.slice(), velocity: this.velocity.slice() };
 

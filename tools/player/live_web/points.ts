@@ -51,11 +51,6 @@ const scratch = memory.data(9 * 4, 16);
   return v128.bitselect(f32x4.neg(x), x, f32x4.lt(by, all(0)));
 }
 // @ts-ignore: decorator
-@inline function total(x: v128): f32 {
-  const pairs = f32x4.add(x, v128.shuffle<f32>(x, x, 2, 3, 0, 1));
-  return f32x4.extract_lane(pairs, 0) + f32x4.extract_lane(pairs, 1);
-}
-// @ts-ignore: decorator
 @inline function largest(x: v128): f32 {
   const pairs = f32x4.max(x, v128.shuffle<f32>(x, x, 2, 3, 0, 1));
   return max(f32x4.extract_lane(pairs, 0), f32x4.extract_lane(pairs, 1));
@@ -94,7 +89,7 @@ function corotated(mu: v128, lam: v128): void {
     c0 = cross(x4, x8, x5, x7), c1 = cross(x5, x6, x3, x8), c2 = cross(x3, x7, x4, x6);
     det = dot(x0, x1, x2, c0, c1, c2);
     const change = add(add(dot(d0, d1, d2, d0, d1, d2), dot(d3, d4, d5, d3, d4, d5)), dot(d6, d7, d8, d6, d7, d8));
-    if (!(largest(change) > 1e-8)) break;
+    if (!(largest(change) > 1e-6)) break; // the next change is below 1e-6
     c3 = cross(x2, x7, x1, x8), c4 = cross(x0, x8, x2, x6), c5 = cross(x1, x6, x0, x7);
     c6 = cross(x1, x5, x2, x4), c7 = cross(x2, x3, x0, x5), c8 = cross(x0, x4, x1, x3);
   }
@@ -257,7 +252,7 @@ export function particles(
         for (let j = 0; j < 3; ++j) {
           const wy = weight(fy, j), sy = slope(fy, j, slow);
           const row = nodes + 12 * (3 * i + j);
-          const n0 = load<u32>(row), n1 = load<u32>(row + 4), n2 = load<u32>(row + 8);
+          const n0 = 3 * load<u32>(row), n1 = 3 * load<u32>(row + 4), n2 = 3 * load<u32>(row + 8);
           let a = displacement + n0, b = displacement + n1, d = displacement + n2;
           let q0 = v128.load32_splat(a), q1 = v128.load32_splat(b), q2 = v128.load32_splat(d);
           const x = mul(sx, wy), y = mul(wx, sy), z = mul(wx, wy);
@@ -313,41 +308,63 @@ export function particles(
         blow(at, first, count, u0, u1, u2, sub(u0, v0), sub(u1, v1), sub(u2, v2), half, drag, friction, lift, law, lifted, most);
       }
       const b0 = B0, b1 = B1, b2 = B2;
-      let sum = sums;
-      for (let i = 0; i < 3; ++i) {
-        const wx = weight(fx, i), sx = slope(fx, i, slow);
-        for (let j = 0; j < 3; ++j, sum += 9 * VECTOR) {
-          const wy = weight(fy, j), sy = slope(fy, j, slow);
-          const x = mul(sx, wy), y = mul(wx, sy), z = mul(wx, wy);
-          const e0 = dot(z, x, y, b0, p0, p1), e1 = dot(z, x, y, b1, p3, p4), e2 = dot(z, x, y, b2, p6, p7);
-          const h0 = mul(p2, z), h1 = mul(p5, z), h2 = mul(p8, z);
-          put(sum, 0, q > from, mad(mul(z0, e0), y0, h0));
-          put(sum, 1, q > from, mad(mul(z0, e1), y0, h1));
-          put(sum, 2, q > from, mad(mul(z0, e2), y0, h2));
-          put(sum, 3, q > from, mad(mul(z1, e0), y1, h0));
-          put(sum, 4, q > from, mad(mul(z1, e1), y1, h1));
-          put(sum, 5, q > from, mad(mul(z1, e2), y1, h2));
-          put(sum, 6, q > from, mad(mul(z2, e0), y2, h0));
-          put(sum, 7, q > from, mad(mul(z2, e1), y2, h1));
-          put(sum, 8, q > from, mad(mul(z2, e2), y2, h2));
-        }
+      const wx0 = weight(fx, 0), wx1 = weight(fx, 1), wx2 = weight(fx, 2);
+      const sx0 = slope(fx, 0, slow), sx1 = slope(fx, 1, slow), sx2 = slope(fx, 2, slow);
+      const more = q > from;
+      for (let j = 0; j < 3; ++j) {
+        const wy = weight(fy, j), sy = slope(fy, j, slow);
+        const sum = sums + 9 * VECTOR * j;
+        const t0 = mul(p0, wy), t1 = mul(p3, wy), t2 = mul(p6, wy); // along x
+        const e0 = mad(mul(b0, wy), p1, sy), e1 = mad(mul(b1, wy), p4, sy), e2 = mad(mul(b2, wy), p7, sy);
+        const h0 = mul(p2, wy), h1 = mul(p5, wy), h2 = mul(p8, wy);
+        spread(sum, more, wx0, sx0, t0, t1, t2, e0, e1, e2, h0, h1, h2, z0, z1, z2, y0, y1, y2);
+        spread(sum + 27 * VECTOR, more, wx1, sx1, t0, t1, t2, e0, e1, e2, h0, h1, h2, z0, z1, z2, y0, y1, y2);
+        spread(sum + 54 * VECTOR, more, wx2, sx2, t0, t1, t2, e0, e1, e2, h0, h1, h2, z0, z1, z2, y0, y1, y2);
       }
     }
     if (!pushed) continue;
     for (let k: usize = 0; k < 27; ++k) {
-      const out = force + load<u32>(nodes + 4 * k);
+      const out = force + (load<u32>(nodes + 4 * k) << 2);
       const sum = sums + 3 * VECTOR * k;
-      store<f32>(out, load<f32>(out) + total(get(sum, 0)));
-      store<f32>(out, load<f32>(out, 4) + total(get(sum, 1)), 4);
-      store<f32>(out, load<f32>(out, 8) + total(get(sum, 2)), 8);
+      const x = get(sum, 0), y = get(sum, 1), z = get(sum, 2);
+      const pair = add(v128.shuffle<f32>(x, y, 0, 4, 1, 5), v128.shuffle<f32>(x, y, 2, 6, 3, 7)); // x02 y02 x13 y13
+      const last = add(z, v128.shuffle<f32>(z, z, 2, 3, 0, 1)); // z02 z13 z02 z13
+      const all = add(v128.shuffle<f32>(pair, last, 0, 1, 4, 4), v128.shuffle<f32>(pair, last, 2, 3, 5, 5));
+      v128.store(out, add(v128.load(out), all));
     }
   }
   return fastest;
 }
 
+/** Adds what a point gives to three nodes along z. */
 // @ts-ignore: decorator
-@inline function put(at: usize, k: usize, more: bool, x: v128): void {
-  v128.store(at + k * VECTOR, more ? add(get(at, k), x) : x);
+@inline function spread(
+  at: usize, more: bool, wx: v128, sx: v128, t0: v128, t1: v128, t2: v128, e0: v128, e1: v128, e2: v128, h0: v128, h1: v128, h2: v128,
+  z0: v128, z1: v128, z2: v128, y0: v128, y1: v128, y2: v128,
+): void {
+  const a0 = mad(mul(sx, t0), wx, e0), a1 = mad(mul(sx, t1), wx, e1), a2 = mad(mul(sx, t2), wx, e2);
+  const c0 = mul(wx, h0), c1 = mul(wx, h1), c2 = mul(wx, h2);
+  if (more) {
+    v128.store(at, add(get(at, 0), mad(mul(z0, a0), y0, c0)));
+    v128.store(at, add(get(at, 1), mad(mul(z0, a1), y0, c1)), 16);
+    v128.store(at, add(get(at, 2), mad(mul(z0, a2), y0, c2)), 32);
+    v128.store(at, add(get(at, 3), mad(mul(z1, a0), y1, c0)), 48);
+    v128.store(at, add(get(at, 4), mad(mul(z1, a1), y1, c1)), 64);
+    v128.store(at, add(get(at, 5), mad(mul(z1, a2), y1, c2)), 80);
+    v128.store(at, add(get(at, 6), mad(mul(z2, a0), y2, c0)), 96);
+    v128.store(at, add(get(at, 7), mad(mul(z2, a1), y2, c1)), 112);
+    v128.store(at, add(get(at, 8), mad(mul(z2, a2), y2, c2)), 128);
+  } else {
+    v128.store(at, mad(mul(z0, a0), y0, c0));
+    v128.store(at, mad(mul(z0, a1), y0, c1), 16);
+    v128.store(at, mad(mul(z0, a2), y0, c2), 32);
+    v128.store(at, mad(mul(z1, a0), y1, c0), 48);
+    v128.store(at, mad(mul(z1, a1), y1, c1), 64);
+    v128.store(at, mad(mul(z1, a2), y1, c2), 80);
+    v128.store(at, mad(mul(z2, a0), y2, c0), 96);
+    v128.store(at, mad(mul(z2, a1), y2, c1), 112);
+    v128.store(at, mad(mul(z2, a2), y2, c2), 128);
+  }
 }
 
 // @ts-ignore: decorator

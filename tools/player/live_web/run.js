@@ -14,7 +14,11 @@ globalThis.self = {
   },
 };
 runInThisContext(readFileSync(worker, "utf8"));
-for (const data of [{ kind: "load", bytes: new Uint8Array(readFileSync(block)), plain: plain === "plain" }, ...JSON.parse(messages)])
+for (const data of [{ kind: "load", bytes: new Uint8Array(readFileSync(block)), plain: plain === "plain" }, ...JSON.parse(messages)]) {
+  const [before, known] = [process.cpuUsage(), answers.length];
   globalThis.self.onmessage({ data });
+  const { user, system } = process.cpuUsage(before);
+  for (const answer of answers.slice(known)) answer.cpu = (user + system) / 1e6; // s
+}
 writeFileSync(state, new Uint8Array(last.buffer, last.byteOffset, last.byteLength));
 process.stdout.write(JSON.stringify(answers));

@@ -32,6 +32,7 @@ export class Solver {
     this.pull = null;
     this.displacement = new Float64Array(3 * this.nodes);
     this.velocity = new Float64Array(3 * this.nodes);
+    this.wide = 3; // numbers of a node in `force`
     this.force = new Float64Array(3 * this.nodes);
     this.resistance = new Float64Array(this.nodes);
     this.shift = new Float64Array(head.planes.length ? 3 * this.nodes : 0);
@@ -272,7 +273,7 @@ export class Solver {
       out[0] = held * limit * x - damping * velocity[0];
       out[1] = held * limit * y - damping * velocity[1];
       out[2] = held * limit * z - damping * velocity[2];
-      for (let k = 0; k < 27; k++) for (let m = 0; m < 3; m++) this.force[3 * cellNodes[first + k] + m] += weightOf(k) * out[m];
+      for (let k = 0; k < 27; k++) for (let m = 0; m < 3; m++) this.force[this.wide * cellNodes[first + k] + m] += weightOf(k) * out[m];
       this.spreadResistance(first, damping);
     }
   }
@@ -314,7 +315,7 @@ export class Solver {
 
   /** Velocities of the nodes after `kick` seconds of force, gravity and damping. */
   accelerate(kick) {
-    const { force: A, velocity: V, resistance: D, head, dragged } = this;
+    const { force: A, velocity: V, resistance: D, head, dragged, wide } = this;
     const { inverseMass, held, nodeDamping } = this.a;
     const damped = nodeDamping.length > 0;
     const [g0, g1, g2] = head.gravity;
@@ -328,9 +329,10 @@ export class Solver {
       const inverse = inverseMass[k];
       const decay = damped ? all * Math.exp(-kick * nodeDamping[k]) : all;
       const push = dragged ? kick / (1 + kick * D[k] * inverse) : kick;
-      V[at] = decay * (V[at] + push * (A[at] * inverse + g0));
-      V[at + 1] = decay * (V[at + 1] + push * (A[at + 1] * inverse + g1));
-      V[at + 2] = decay * (V[at + 2] + push * (A[at + 2] * inverse + g2));
+      const from = wide * k;
+      V[at] = decay * (V[at] + push * (A[from] * inverse + g0));
+      V[at + 1] = decay * (V[at + 1] + push * (A[from + 1] * inverse + g1));
+      V[at + 2] = decay * (V[at + 2] + push * (A[from + 2] * inverse + g2));
     }
   }
 
