@@ -7,11 +7,14 @@ import warnings
 from torch import Tensor
 
 from gaussian_swaying._checks import check_positive
+from gaussian_swaying.geometry.neighbours import nearest_neighbours
 
 _SAMPLE = 100_000  # Gaussians that are sorted, at most
 _FEW = 16  # fewer Gaussians are not checked
 FAR, TOO_FAR = 20, 1000  # multiples of the side of the box around 98 % of the Gaussians
-SHORT, TOO_SHORT = 3.0, 0.5  # cells along the longest side
+COARSE, SHORT, TOO_SHORT = 10.0, 3.0, 0.5  # cells along the longest side
+SPARSE = 0.75  # cells between neighbouring Gaussians
+_SPACED = 4096  # Gaussians whose nearest neighbour is searched
 
 
 def check_extent(means: Tensor, metres_per_unit: float, dx: float, index: Tensor | None = None) -> None:
@@ -49,13 +52,55 @@ def check_extent(means: Tensor, metres_per_unit: float, dx: float, index: Tensor
         warnings.warn(text, UserWarning, stacklevel=2)
     side = whole * metres_per_unit
     if side < SHORT * dx:
-        text = (
-            f"The object is {side:.3g} m long, {side / dx:.2g} cells of `solver.dx` = {dx:g} m, so it can hardly bend: "
-            f"lower `solver.dx` to about {side / 24:.2g} m, or check `scene.longest_side` or `scene.metres_per_unit`."
-        )
+        text = f"The object is {_cells(side, dx)}, so it can hardly bend: {_finer(side)}."
         if side < TOO_SHORT * dx:
             raise ValueError(text)
         warnings.warn(text, UserWarning, stacklevel=2)
+
+
+def coarse(side: float, dx: float) -> list[str]:
+    """A sentence about the grid of a run if the object has so few cells that a finer grid would move it otherwise.
+
+    Args:
+        side: Longest side of the object [m].
+        dx: Grid spacing [m].
+    """
+    if not SHORT * dx <= side < COARSE * dx:  # shorter ones are warned of at the start
+        return []
+    return [f"The object is {_cells(side, dx)}: on a finer grid it may move a quarter more, or less; {_finer(side)}."]
+
+
+def _cells(side: float, dx: float) -> str:
+    return f"{side:.3g} m long, {side / dx:.2g} cells of `solver.dx` = {dx:g} m"
+
+
+def _finer(side: float) -> str:
+    return f"lower `solver.dx` to about {side / 24:.2g} m, or check `scene.longest_side` or `scene.metres_per_unit`"
+
+
+def check_density(means: Tensor, metres_per_unit: float, dx: float) -> None:
+    """Warn of a grid that is too fine for the Gaussians, whose material is then too soft.
+
+    Args:
+        means: Centres of the simulated Gaussians [scene units], shape (N, 3).
+        metres_per_unit: Length of a scene unit [m].
+        dx: Grid spacing [m].
+
+    Warns:
+        UserWarning: If half of them are farther than three quarters of a cell from the nearest other one.
+    """
+    if len(means) < _FEW:
+        return
+    some = means[:: -(-len(means) // _SPACED)]
+    spacing = float(nearest_neighbours(means, 2, some)[0][:, 1].median()) * metres_per_unit  # the first is itself
+    if spacing > SPARSE * dx:
+        warnings.warn(
+            f"The Gaussians are {spacing:.3g} m apart, {spacing / dx:.2g} cells of `solver.dx` = {dx:g} m, so the "
+            f"material has gaps and its stiffness is wrong: raise `solver.dx` to about {2 * spacing:.2g} m, or set "
+            "`scene.particle_spacing` for points between them.",
+            UserWarning,
+            stacklevel=2,
+        )
 
 
 def suggest_spacing(longest_side: float, spacing: float, cells: int) -> float:

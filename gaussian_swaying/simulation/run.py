@@ -24,6 +24,7 @@ from gaussian_swaying.runs.seal import sha256
 from gaussian_swaying.simulation.copies import check_recorder
 from gaussian_swaying.simulation.diagnostics import SimulationDiverged, entry_names
 from gaussian_swaying.simulation.edits import SceneEditor
+from gaussian_swaying.simulation.extent import coarse
 from gaussian_swaying.simulation.frame import frames_from
 from gaussian_swaying.simulation.health import advice, extremes
 from gaussian_swaying.simulation.painter import Painter
@@ -114,7 +115,8 @@ def run_health(stepper: Stepper, log: Sequence[Mapping[str, Any]]) -> tuple[dict
     elastic = points.elastic
     size = scene.size * scene.frame.metres_per_unit
     found = extremes(log, where, size, None if elastic is None else elastic.cpu())
-    return found, advice(found, float(points.youngs_modulus.amax()), scene.filled == 0)
+    told = advice(found, float(points.youngs_modulus.amax()), scene.filled == 0)
+    return found, told + coarse(size, stepper.solver.dx)
 
 
 def written_once(recorder: Recorder, editor: SceneEditor) -> bool:

@@ -25,7 +25,7 @@ from gaussian_swaying.mpm.followers import Followers, GridFollowers, PointFollow
 from gaussian_swaying.mpm.joints import PointJoint
 from gaussian_swaying.mpm.state import MaterialPoints, State
 from gaussian_swaying.simulation.body import Body, body_of, specks_of
-from gaussian_swaying.simulation.extent import check_extent
+from gaussian_swaying.simulation.extent import check_density, check_extent
 from gaussian_swaying.simulation.joints import joints_of
 from gaussian_swaying.simulation.material import Material
 from gaussian_swaying.simulation.scene import Scene
@@ -117,6 +117,8 @@ class SimulatedScene(nn.Module):
         self.frame = SimFrame.fit(cloud.means[simulated], scene.up, scene.longest_side, scene.metres_per_unit)
         means = cloud.means[simulated]
         check_extent(means, self.frame.metres_per_unit, dx, simulated)
+        if scene.particle_spacing is None and scene.filling is None:
+            check_density(means, self.frame.metres_per_unit, dx)
         self.bounds = (means.amin(0), means.amax(0))
         largest = cloud.scales[simulated].amax().exp()  # a single Gaussian has a size too
         self.size = max(float((self.bounds[1] - self.bounds[0]).amax()), float(largest))

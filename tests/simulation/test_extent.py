@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from gaussian_swaying.simulation.extent import check_extent
+from gaussian_swaying.simulation.extent import check_density, check_extent, coarse
 
 
 def cube(count=1000):
@@ -33,3 +33,19 @@ def test_an_object_smaller_than_the_grid():
         check_extent(cube(), 1.0, 1000.0)
     with pytest.warns(UserWarning, match="2 cells of `solver.dx` = 0.5 m"):
         check_extent(cube(), 1.0, 0.5)
+
+
+def test_a_run_on_a_coarse_grid_says_so():
+    assert coarse(1.0, 0.1) == coarse(1.0, 0.5) == []
+    assert "9 cells of `solver.dx` = 0.1 m" in coarse(0.9, 0.1)[0]
+    assert coarse(0.9, 0.1)[0].endswith("`scene.metres_per_unit`.")
+
+
+def test_a_grid_too_fine_for_the_gaussians(recwarn):
+    steps = 0.1 * torch.arange(10.0)
+    sheet = torch.cartesian_prod(steps, steps, torch.zeros(1))
+    check_density(sheet, 1.0, 0.2)
+    check_density(sheet[:8], 1.0, 0.1)  # so few may be meant so
+    assert not recwarn.list
+    with pytest.warns(UserWarning, match=r"0.1 m apart, 1 cells.*raise `solver.dx` to about 0.2 m"):
+        check_density(sheet, 1.0, 0.1)
