@@ -72,6 +72,15 @@ def check(simulation: Simulation) -> None:
         _check_boundary(boundary)
 
 
+def in_webassembly(simulation: Simulation) -> bool:
+    """True if the browser's fast pass over the points knows all that a simulation asks for (``points.ts``)."""
+    solver, aero = simulation.solver, simulation.aero
+    assert isinstance(solver, MPMSolver)
+    known = {LAWS[0], LAWS[1]}
+    plain = simulation.stepper.idle or not (aero.unit_tangent or aero.drag_step == "semi_implicit")
+    return plain and solver.stiffness_damping == 0 and all(type(law) in known for law in simulation.setup.points.laws)
+
+
 def _check_boundary(boundary: Any) -> None:
     name = type(boundary).__name__
     if type(boundary) not in (PinnedRegion, PinnedPoints, Plane):
@@ -154,6 +163,7 @@ def pack_solver(simulation: Simulation, nodes: Tensor) -> bytes:
         "planes": planes,
         "rows": rows,
         "idle": simulation.stepper.idle,
+        "lanes": in_webassembly(simulation),
         "grouped": simulation.stepper.wind_force.sums is not None,
         "aero": _aero(simulation),
         "wind": _wind(simulation.wind),

@@ -1,17 +1,11 @@
 // The solver with its pass over all points in WebAssembly, four points at a time, in single precision as in the package.
-import { HENCKY, NEO_HOOKEAN } from "./laws.js";
+import { NEO_HOOKEAN } from "./laws.js";
 import { singular } from "./matrices.js";
 import code from "./points.wasm"; // build.js makes it from points.ts
 import { Solver } from "./solver.js";
 
 const LANES = 4;
 const RECORD = 16 * LANES; // numbers of four points: see the constructor
-
-/** True if points.ts knows all that a block asks for. @param {{head: any, arrays: Record<string, any>}} block */
-export function fits({ head, arrays }) {
-  const { aero } = head;
-  return head.viscous === 0 && (head.idle || !(aero.unitTangent || aero.implicit)) && arrays.law.every((law) => law < HENCKY);
-}
 
 export class LanesSolver extends Solver {
   /** @param {{head: any, arrays: Record<string, any>}} block Throws an Error where the browser has no such WebAssembly. */

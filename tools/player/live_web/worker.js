@@ -1,6 +1,6 @@
 // Runs the solver beside the page, in step with the clock. What it understands is in `does`, what it says in `post`.
 import { readBlock } from "./block.js";
-import { fits, LanesSolver } from "./lanes.js";
+import { LanesSolver } from "./lanes.js";
 import { Solver } from "./solver.js";
 
 const BEHIND = 0.25; // s that it may be late before it stops trying to catch up
@@ -23,7 +23,7 @@ const post = (/** @type {any} */ message, /** @type {Transferable[]} */ moved = 
 
 /** The fastest solver that this browser has, or with `plain` that in JavaScript. */
 function made(block, plain = false) {
-  if (!plain && fits(block)) {
+  if (!plain && block.head.lanes) {
     try {
       return new LanesSolver(block);
     } catch {
