@@ -40,6 +40,8 @@ SCENES = {
     "ball_on_cloth": "Ball dropped on a cloth",
     "two_flags": "Two flags",
     "leaves_contact": "Leaves that touch",
+    "ficus_apart": "Ficus, half as many cells, parts apart",
+    "alocasia_apart": "Alocasia, half as many cells, parts apart",
 }
 """Name of the file in configs/sim, without suffix, and title."""
 
@@ -48,6 +50,8 @@ _BASES = {
     "sand_to_foam": "sand",
     "flag1_pole": "flag1",
     "leaves_contact": "leaves",
+    "ficus_apart": "ficus",
+    "alocasia_apart": "alocasia",
 }
 """Files in configs/sim/variants, and the scenes that they vary."""
 
@@ -121,7 +125,9 @@ def run_scene(name: str, options: argparse.Namespace) -> Row:
 
 
 def preset_of(options: argparse.Namespace) -> str | None:
-    """The preset that is asked for, or the default of the device."""
+    """The preset that is asked for, or the default of the device; None for ``none``."""
+    if options.preset == "none":
+        return None
     return options.preset or ("preview" if options.device == "cpu" else None)
 
 
@@ -142,7 +148,9 @@ def of_today(name: str, row: Row) -> bool:
     return bool(row.get("configuration") == fingerprint(name, row.get("preset")))
 
 
-PRESET = option("--preset", "folder of overlays below configs/sim; `preview` by default on a CPU")
+PRESET = option(
+    "--preset", "folder of overlays below configs/sim; `preview` by default on a CPU, none for the whole scene"
+)
 CASE = Case(
     "Run the paper's scenes and make pictures of them.",
     rows,
