@@ -149,7 +149,7 @@ def of_today(name: str, row: Row) -> bool:
 
 
 PRESET = option(
-    "--preset", "folder of overlays below configs/sim; `preview` by default on a CPU, none for the whole scene"
+    "--preset", "folder of overlays below configs/sim, or none; `preview` by default on a CPU"
 )
 CASE = Case(
     "Run the paper's scenes and make pictures of them.",
