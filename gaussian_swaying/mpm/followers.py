@@ -14,6 +14,9 @@ from gaussian_swaying.mpm.state import GridSpec, MaterialPoints, MPMState, State
 from gaussian_swaying.mpm.transfer import Stencil, bspline_stencil, gather, scatter
 from gaussian_swaying.mpm.virtual_nodes import first_nodes, point_with_nodes, virtual_nodes
 
+EXTRAPOLATED = 3.0
+"""How much larger a weight may be at a place than at any material point; a node of small weights may swing far."""
+
 
 class Followers(nn.Module, ABC):
     """Places in the material whose motion is interpolated from a state.
@@ -275,5 +278,9 @@ def on_material(place: Tensor, nearest: Tensor, points: MaterialPoints, dx: floa
     first, node = rest.first.cpu(), virtual.node.cpu()
     near = nearest.cpu()
     host = point_with_nodes(own.first.cpu(), near, first, node, grid).where(own.inside.cpu(), -1)
+    most = torch.zeros(int(node.max()) + 1, dtype=position.dtype)  # largest weight of each node at any material point
+    most.scatter_reduce_(0, node.T.reshape(-1), rest.basis[:, 0].cpu().reshape(-1), "amax")
+    far = own.basis[:, 0].cpu() > EXTRAPOLATED * most[node.T[host.clamp(min=0)]]
+    host = host.where(~far.any(1), -1)
     read = torch.where((host >= 0)[:, None].to(place.device), place, position[nearest])
     return read, virtual.node[:, torch.where(host >= 0, host, near).to(nearest.device)]

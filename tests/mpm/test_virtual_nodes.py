@@ -260,6 +260,17 @@ def test_places_follow_their_own_piece():
     assert (glued - move).norm(dim=-1).amax() > 0.1  # from the nodes of the other piece
 
 
+def test_a_place_far_from_the_few_points_of_a_piece_is_read_at_one_of_them():
+    """A node that the points hardly reach may swing far; at the other end of their cell it would count."""
+    few = torch.tensor([3.55, 3.55, 3.55], dtype=torch.float64) + 0.02 * torch.rand(6, 3, dtype=torch.float64)
+    position, number = together(sheet(3.1), few)
+    place = torch.tensor([[3.56, 3.56, 3.56], [4.4, 4.4, 4.4]], dtype=torch.float64)
+    nearest = torch.full((2,), len(position) - 1)
+    read, nodes = on_material(place, nearest, material(position, number), 1.0)
+    assert torch.equal(read, torch.stack([place[0], position[-1]]))
+    assert torch.equal(nodes[:, 0], nodes[:, 1])
+
+
 def test_wind_that_depends_on_the_place_in_kernels():
     """A virtual node lies where the node lies that it is a copy of."""
     position, number = together(sheet(3.1), sheet(3.3))

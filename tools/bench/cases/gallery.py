@@ -148,9 +148,7 @@ def of_today(name: str, row: Row) -> bool:
     return bool(row.get("configuration") == fingerprint(name, row.get("preset")))
 
 
-PRESET = option(
-    "--preset", "folder of overlays below configs/sim, or none; `preview` by default on a CPU"
-)
+PRESET = option("--preset", "folder of overlays below configs/sim, or none; `preview` by default on a CPU")
 CASE = Case(
     "Run the paper's scenes and make pictures of them.",
     rows,
