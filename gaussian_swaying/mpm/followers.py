@@ -15,7 +15,7 @@ from gaussian_swaying.mpm.transfer import Stencil, bspline_stencil, gather, scat
 from gaussian_swaying.mpm.virtual_nodes import first_nodes, point_with_nodes, virtual_nodes
 
 EXTRAPOLATED = 3.0
-"""How much larger a weight may be at a place than at any material point; a node of small weights may swing far."""
+"""Largest weight of a node at a place, over that at any material point; a node of small weights may swing far."""
 
 
 class Followers(nn.Module, ABC):
