@@ -17,7 +17,7 @@ TARGETS = {"phone": 1.5e6, "laptop": 4e6, "desktop": 6e6}
 """Material points times substeps a second that a kind of machine computes, with room for drawing."""
 
 IN_JAVASCRIPT = 4.0
-"""How many times longer a substep takes where the fast pass over the points does not know a law or a force."""
+"""Factor by which a substep takes longer where the fast pass over the points does not know a law or a force."""
 
 TRIALS = 5
 CLOSE = 0.8  # share of the budget that is good enough
