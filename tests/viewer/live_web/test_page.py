@@ -91,6 +91,19 @@ def test_after_two_seconds_the_gaussians_are_where_a_run_puts_them(show, written
     assert [url for url in page.asked if not url.startswith(("file:", "data:", "blob:"))] == []
 
 
+def _grabbed(page):
+    """True if the mouse takes hold of the middle of the sheet, which must not have swung away since its start."""
+    page.locator("#reset").click()
+    page.mouse.move(300, 190)
+    page.mouse.down()
+    for _ in range(40):
+        if page.evaluate("windPage.pulled()"):
+            return True
+        time.sleep(0.02)
+    page.mouse.up()
+    return False
+
+
 def test_what_the_visitor_does(show, written):
     """The clock, pause, wind, link, a pull and a turn of the view."""
     page = show(written, "#wind=0,0,0&gusts=0&stiffness=2&speed=0.25")
@@ -101,10 +114,7 @@ def test_what_the_visitor_does(show, written):
     ]
     assert page.locator("#slow").get_attribute("aria-pressed") == "true"
     link = page.evaluate("windPage.link()")
-    page.locator("#reset").click()
-    page.mouse.move(300, 190)
-    page.mouse.down()
-    until(lambda: page.evaluate("windPage.pulled()"))
+    until(lambda: _grabbed(page))
     page.mouse.move(310, 170)
     page.mouse.up()
     assert not page.evaluate("windPage.pulled()")
@@ -118,6 +128,15 @@ def test_what_the_visitor_does(show, written):
     time.sleep(0.2)
     assert page.evaluate("windPage.time()") == stopped
     page.locator("#play").click()
+    until(lambda: page.evaluate("windPage.time()") > stopped)
+    hide = "(value) => { Object.defineProperty(document, 'hidden', { value, configurable: true }); "
+    hide += "document.dispatchEvent(new Event('visibilitychange')); }"
+    page.evaluate(hide, True)
+    time.sleep(0.2)
+    stopped = page.evaluate("windPage.time()")
+    time.sleep(0.2)
+    assert page.evaluate("windPage.time()") == stopped
+    page.evaluate(hide, False)
     until(lambda: page.evaluate("windPage.time()") > stopped)
     box = page.locator("#dial").bounding_box()
     page.mouse.click(box["x"] + 0.9 * box["width"], box["y"] + 0.5 * box["height"])
@@ -136,6 +155,15 @@ def test_what_the_visitor_does(show, written):
     page.locator("#reset").click()
     until(lambda: page.evaluate("windPage.time()") < 0.3)
     assert page.told == other.told == []
+
+
+def test_a_page_that_falls_behind_slows_time_and_says_so(show, make, tmp_path):
+    write_live_web(make(solver={"substep": 1e-5}), "sheet", tmp_path / "slow.html")
+    page = show(tmp_path / "slow.html")
+    page.locator("#note").filter(has_text="too slow for real time").wait_for(timeout=60_000)
+    told = page.locator("#note").inner_text()
+    assert re.fullmatch(r"This device is too slow for real time: the motion runs at 0\.\d\d of it\.", told)
+    assert page.evaluate("windPage.playing()")
 
 
 def test_a_file_that_is_cut_short_or_damaged_says_so(show, written, tmp_path):

@@ -5,6 +5,7 @@ import { Solver } from "./solver.js";
 
 const BEHIND = 0.25; // s that it may be late before it stops trying to catch up
 const WINDOW = 2000; // ms, over which the speed is measured
+const LEAST = 4; // frames that it is measured from
 const BREATH = 4; // ms between frames, in which it hears what the page says
 
 /** @type {Solver} */
@@ -37,7 +38,7 @@ function show() {
   const moved = solver.drawn();
   const [first] = past;
   const last = past[past.length - 1];
-  const rate = past.length > 3 ? (last[1] - first[1]) / ((last[0] - first[0]) / 1000) : null;
+  const rate = past.length >= LEAST ? (last[1] - first[1]) / ((last[0] - first[0]) / 1000) : null;
   post({ kind: "state", motion, time: solver.time, moved, rate, ended: !on }, [moved.buffer]);
 }
 
@@ -61,7 +62,7 @@ function pace() {
   }
   const after = performance.now();
   past.push([after, solver.time]);
-  while (after - past[0][0] > WINDOW) past.shift();
+  while (past.length > LEAST && after - past[0][0] > WINDOW) past.shift();
   show();
   next = setTimeout(pace, BREATH);
 }
