@@ -42,6 +42,7 @@ SCENES = {
     "leaves_contact": "Leaves that touch",
     "ficus_apart": "Ficus, half as many cells, parts apart",
     "alocasia_apart": "Alocasia, half as many cells, parts apart",
+    "leaves_apart": "Leaves, half as many cells, parts apart",
 }
 """Name of the file in configs/sim, without suffix, and title."""
 
@@ -52,6 +53,7 @@ _BASES = {
     "leaves_contact": "leaves",
     "ficus_apart": "ficus",
     "alocasia_apart": "alocasia",
+    "leaves_apart": "leaves",
 }
 """Files in configs/sim/variants, and the scenes that they vary."""
 
