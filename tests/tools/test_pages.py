@@ -20,7 +20,9 @@ NAMES = (
     "gallery.md",
     "live.md",
     "many.md",
+    "nature.md",
     "recording.md",
+    "stability.md",
     "training.md",
     "validation.md",
     "web.md",
@@ -60,6 +62,8 @@ def test_pages_are_filled_in_place_and_their_plots_drawn(bench, tmp_path):
         "pareto_cuda.png",
         "speed_cpu.png",
         "speed_cuda.png",
+        "stability.png",
+        "trees.png",
     ):
         assert (docs / "pictures" / picture).stat().st_size > 10_000
         assert (DOCS / "pictures" / picture).exists()

@@ -17,9 +17,11 @@ from bench.tables import (  # noqa: F401  each registers its slots
     flag_benchmark,
     goals,
     measured,
+    nature,
     others,
     plots,
     refinement,
+    stability,
     training,
     validation,
 )
@@ -28,9 +30,11 @@ from gaussian_swaying._files import write_text
 PLOTS: dict[str, Callable[[list[record.Row], Path], None]] = {
     "accuracy_*": plots.accuracy,
     "blender_*": blender.plot,
+    "nature_*": nature.plot,
     "pareto_*": plots.pareto,
     "refinement_*": refinement.plot,
     "speed_*": plots.speed,
+    "stability_*": stability.plot,
 }
 """Functions that draw into the folder of the pictures, by the records that they need."""
 

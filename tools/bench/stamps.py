@@ -44,6 +44,7 @@ PARTS: dict[str, tuple[str, ...]] = {
     "leaves": _DRAWN,
     "live": (*_DRAWN, "viewer"),
     "long_flag": _SIMULATION,
+    "nature": _PROBLEMS,
     "pareto": _PROBLEMS,
     "peers": (),  # other solvers
     "pins": (*_SIMULATION, "evaluation"),
@@ -54,6 +55,7 @@ PARTS: dict[str, tuple[str, ...]] = {
     "sim": _DRAWN,
     "soft": (*_DRAWN, "fitting"),
     "speed": _DRAWN,
+    "stability": (*_SIMULATION, "sweeps", "tools/bench/problems"),
     "substep": _SOLVER,
     "surfaces": (*_DRAWN, "training"),
     "sweeps": (*_DRAWN, "sweeps", "training"),

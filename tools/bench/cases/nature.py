@@ -1,0 +1,69 @@
+"""What ``bench.py nature`` measures: trees, crowns, plates that fall and fabrics that drape, beside what is known."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Callable, Iterable, Iterator
+from functools import partial
+from itertools import product
+from typing import Any
+
+from bench.case import Case, Measurement, option
+from bench.clock import guarded
+from bench.problems import crowns, falling, trees
+from bench.problems.settings import Result, Settings
+from bench.record import Row
+
+LEAVES = 180.0
+"""Area of one side of the leaves of the tree [m²], by which it loses the frequency that the measured one loses."""
+PULL = 1.2
+"""Of its top [m]."""
+
+
+def cases(settings: Settings) -> Iterable[tuple[str, Row, Callable[[], Result]]]:
+    """The name, the parameters and the function of each measurement."""
+
+    def case(name: str, function: Callable[..., Result], **parameters: Any) -> tuple[str, Row, Callable[[], Result]]:
+        return name, parameters, lambda: function(settings=settings, **parameters)
+
+    for leaf_area, dx in product((0.0, LEAVES), (1.0, 0.5, 0.25)):
+        yield case("tree, frequency", trees.frequency, leaf_area=leaf_area, dx=dx)
+    for dx in (0.5, 0.25):
+        yield case("tree, damping", trees.damping, leaf_area=0.0, pull=PULL, breeze=0.0, dx=dx)
+        yield case("tree, damping", trees.damping, leaf_area=LEAVES, pull=PULL, breeze=0.0, dx=dx)
+    for pull, breeze in ((0.3, 0.0), (0.6, 0.0), (2.0, 0.0), (0.3, 0.3)):
+        yield case("tree, damping", trees.damping, leaf_area=LEAVES, pull=pull, breeze=breeze, dx=0.5)
+    for species, cells in product(crowns.CROWNS, (8, 16)):
+        yield case("crown", crowns.crown, species=species, cells=cells)
+    for species, diameter in (
+        *product(("birch",), (0.009, 0.010, 0.011, 0.012, 0.014)),
+        *product(("Sitka spruce",), (0.014, 0.015, 0.016, 0.018)),
+    ):
+        yield case("crown of elasticas", crowns.of_elasticas, species=species, diameter=diameter)
+    for law, tilt in product(("projected", "cross_flow"), (0.0, 30.0, 60.0)):
+        yield case("falling plate", falling.fall, law=law, tilt=tilt)
+    for cells in (8, 16, 32):
+        yield case("falling plate that turns", falling.fall, law="cross_flow", spin=0.2, cells=cells)
+
+
+def _result(function: Callable[[], Row]) -> Row:
+    return {"result": guarded(function)}
+
+
+def rows(options: argparse.Namespace, result: Row) -> Iterator[Measurement]:
+    """All cases, or those whose problem has ``only`` in its name; a case that fails is recorded with its message."""
+    only = options.only or ""
+    result["rows"] = [row for row in result.get("rows", []) if only and only not in row["problem"]]
+    for name, parameters, function in cases(Settings(device=options.device)):
+        if only in name:
+            place = {"problem": name, "parameters": parameters}
+            yield ("rows", place), partial(_result, function)
+
+
+CASE = Case(
+    "Measure trees, crowns, falling plates and draped fabrics beside what is known of them.",
+    rows,
+    (option("--only", "only the problems whose name contains this"),),
+    page="nature.md",
+    keeps="any",
+)

@@ -1,0 +1,184 @@
+"""Tables, goals and the plot of ``bench.py nature``."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+from bench.problems.crowns import CROWNS
+from bench.problems.trees import tree
+from bench.tables.plots import save_figure, subplots
+from bench.tables.render import WANTED, Goal, Row, judged, table
+
+PAGE = "nature.md"
+GROWTH = 2.4
+"""The damping ratio of a tree with leaves over that without (T. D. Jackson, WindAndTrees_NaturalFrequencies)."""
+
+
+def _of(result: Row, problem: str) -> list[Row]:
+    return [row["parameters"] | row["result"] for row in result["rows"] if row["problem"] == problem]
+
+
+def _damping(result: Row) -> Iterator[Row]:
+    """Of each row its damping ratio over that of the bare tree on its grid."""
+    found = _of(result, "tree, damping")
+    bare = {row["dx"]: row["ratio"] for row in found if row["leaf_area"] == 0}
+    for row in sorted(found, key=lambda row: (row["dx"], row["leaf_area"], row["breeze"], row["pull"])):
+        yield row | {"over": row["ratio"] / bare[row["dx"]]}
+
+
+table(PAGE, "nature.frequency", "nature_*",
+      lambda result: sorted(_of(result, "tree, frequency"), key=lambda row: (row["leaf_area"], -row["dx"])), """
+    area of leaves [m²] = {leaf_area:g} | mass of wood [kg] = {wood:.0f} | mass of leaves [kg] = {leaves:.0f} |
+    dx [m] = {dx:g} | frequency [Hz] = {hertz:.4f} | of the frame [Hz] = {exact:.4f} | error = {error:.1f %}
+    """, before="{source}")  # fmt: skip
+table(PAGE, "nature.damping", "nature_*", _damping, """
+    area of leaves [m²] = {leaf_area:g} | pull [m] = {pull:g} | breeze [m/s] = {breeze:g} | dx [m] = {dx:g} |
+    damping ratio = {ratio:.4f} | of the mode alone = {exact:.4f} | error = {error:.1f %} |
+    over that without leaves = {over:.2f}
+    """)  # fmt: skip
+table(PAGE, "nature.crowns", "nature_*", lambda result: _of(result, "crown"), """
+    crown = {species} | cells along a branch = {cells} | R at 10 m/s = {R_10:.3f} | at 15 = {R_15:.3f} |
+    at 20 = {R_20:.3f} | at 25 = {R_25:.3f} | of elasticas at 25 = {exact_25:.3f} | n = {exponent:.3f} |
+    n of elasticas = {elastica:.3f} | n of the species = {known:.3f}
+    """)  # fmt: skip
+table(PAGE, "nature.thickness", "nature_*", lambda result: _of(result, "crown of elasticas"), """
+    crown = {species} | thickness of a branch [mm] = {diameter:.1f (mm)} | C at 10 m/s = {cauchy_10:.1f} |
+    C at 25 m/s = {cauchy_25:.1f} | n of elasticas = {exponent:.2f} | n of the species = {known:.3f}
+    """)  # fmt: skip
+table(PAGE, "nature.falling", "nature_*", lambda result: _of(result, "falling plate"), """
+    law = `{law}` | tilt [degrees] = {tilt:g} | speed across the plate at the end [m/s] = {speed:.4f} |
+    exact = {exact:.4f} | largest error on the way = {error:.3f %} | along the plate [m/s] = {along:.2f} |
+    turned by [degrees] = {turned:.4f}
+    """)  # fmt: skip
+table(PAGE, "nature.turning", "nature_*", lambda result: _of(result, "falling plate that turns"), """
+    cells along a side = {cells} | rate at which its spin decays [1/s] = {speed:.3f} | exact = {exact:.3f} |
+    error = {error:.1f %}
+    """)  # fmt: skip
+
+
+def _finest(result: Row, problem: str, size: str) -> list[Row]:
+    found = list(_damping(result)) if problem == "tree, damping" else _of(result, problem)
+    leafy = [row for row in found if row.get("leaf_area") != 0]
+    best = (min if size == "dx" else max)((row[size] for row in leafy), default=0)
+    return [row for row in found if row[size] == best]
+
+
+def _grown(result: Row) -> Iterator[Row]:
+    for row in _finest(result, "tree, damping", "dx"):
+        if row["leaf_area"] > 0:
+            yield row | {"off": row["over"] / GROWTH - 1}
+
+
+table(PAGE, "nature.goals", "nature_*", judged([
+    Goal("tree, frequency, {leaf_area:g} m² of leaves, dx {dx:g} m", "{error:.1f %}", "|error| <= 0.05",
+         lambda r: _finest(r, "tree, frequency", "dx"),
+         more={"wanted": "within 5 % of the frame's with the same masses"}),
+    Goal("tree, damping with leaves over without, pulled by {pull:g} m, dx {dx:g} m", "{over:.2f}", "|off| <= 0.2",
+         _grown, more={"wanted": "2.4 within 20 %, as measured"}),
+    Goal("tree, damping ratio, {leaf_area:g} m² of leaves, dx {dx:g} m", "{error:.1f %}", "|error| <= 0.05",
+         lambda r: _finest(r, "tree, damping", "dx"), more={"wanted": "within 5 % of that of its mode alone"}),
+    Goal("crown of a {species}, n, {cells} cells", "{exponent:.3f}", "|off| <= 0.15",
+         lambda r: [row | {"off": row["exponent"] - row["known"]} for row in _finest(r, "crown", "cells")],
+         more={"wanted": "{known:.3f} within 0.15"}),
+    Goal("crown of a {species}, drag at 25 m/s, {cells} cells", "{error:.1f %}", "|error| <= 0.05",
+         lambda r: _finest(r, "crown", "cells"), more={"wanted": "within 5 % of the elasticas'"}),
+    Goal("falling plate, `{law}`, tilted by {tilt:g} degrees", "{error:.3f %}", "|error| <= 0.01",
+         lambda r: _of(r, "falling plate"), more={"wanted": "speed within 1 % of the exact one at any time"}),
+    Goal("falling plate that turns, {cells} cells", "{error:.1f %}", "|error| <= 0.02",
+         lambda r: _finest(r, "falling plate that turns", "cells"),
+         more={"wanted": "decay of its spin within 2 % of the exact one"}),
+    ]), WANTED)  # fmt: skip
+
+
+def plot(results: list[Row], pictures: Path) -> None:
+    """Draw ``trees.png`` of a record: the tree, its frequency and damping, the crowns and their drag."""
+    (result,) = results
+    figure, (first, second) = subplots(2, 3, figsize=(13, 8.4))
+    _sketch(first[0])
+    _frequencies(first[1], _of(result, "tree, frequency"))
+    _dampings(first[2], list(_damping(result)))
+    _crowns(second[0])
+    _drags(second[1], _finest(result, "crown", "cells"))
+    _plates(second[2], _of(result, "falling plate"))
+    for axis in (*first, *second):
+        axis.title.set_fontsize(10)
+    save_figure(figure, pictures / "trees.png")
+
+
+def _sketch(axis: Any) -> None:
+    for number, piece in enumerate(tree(1.0)):
+        (x0, _, z0), (x1, _, z1) = piece.start, piece.end
+        axis.plot([x0, x1], [z0, z1], color="sienna", linewidth=3 if number == 0 else 1.5)
+        if piece.leaves:
+            x, z = x0 + (x1 - x0) / 3, z0 + (z1 - z0) / 3
+            axis.plot([x, x1], [z, z1], color="tab:green", linewidth=7, alpha=0.35, solid_capstyle="round")
+    axis.set(title="The tree: wood, and where its leaves are", xlabel="x [m]", ylabel="height [m]")
+    axis.set_aspect("equal")
+
+
+def _frequencies(axis: Any, rows: list[Row]) -> None:
+    for leafy, color in ((False, "sienna"), (True, "tab:green")):
+        own = sorted((row for row in rows if (row["leaf_area"] > 0) is leafy), key=lambda row: row["dx"])
+        axis.plot([row["dx"] for row in own], [row["hertz"] for row in own], "o-", color=color,
+                  label="with leaves" if leafy else "bare")  # fmt: skip
+        axis.axhline(own[0]["exact"], color=color, linestyle=":", label="frame of beams")
+        axis.axhspan(0.95 * own[0]["exact"], 1.05 * own[0]["exact"], color=color, alpha=0.12)
+    axis.set(title="Lowest frequency (bands: 5 %)", xlabel="dx [m]", ylabel="Hz", xlim=(0, None))
+    axis.legend(fontsize=8)
+
+
+def _dampings(axis: Any, rows: list[Row]) -> None:
+    axis.axhspan(0.8 * GROWTH, 1.2 * GROWTH, color="0.9")
+    axis.axhline(GROWTH, color="0.5", linestyle=":", label="one tree, measured (band: 20 %)")
+    still = [row for row in rows if row["leaf_area"] > 0 and row["breeze"] == 0]
+    for dx, marker in ((0.5, "s-"), (0.25, "o")):
+        own = sorted((row for row in still if row["dx"] == dx), key=lambda row: row["pull"])
+        axis.plot([r["pull"] for r in own], [r["over"] for r in own], marker, color="tab:green",
+                  markerfacecolor="none", label=f"air at rest, dx {dx:g} m")  # fmt: skip
+    for row in (row for row in rows if row["breeze"] > 0):
+        axis.plot(row["pull"], row["over"], "*", color="tab:blue", markersize=11,
+                  label=f"in a breeze of {row['breeze']:g} m/s")  # fmt: skip
+    axis.set(title="Damping ratio, with leaves over without", xlabel="pull at the top [m]", xlim=(0, None),
+             ylim=(1, None))  # fmt: skip
+    axis.legend(fontsize=8)
+
+
+COLORS = {"Sitka spruce": "tab:blue", "birch": "tab:green"}
+
+
+def _crowns(axis: Any) -> None:
+    for place, (name, kind) in enumerate(CROWNS.items()):
+        axis.plot([4 * place, 4 * place], [0, 6], color="sienna", linewidth=3)
+        for number, way in enumerate(kind.length * kind.ways(12)):
+            foot = 5.2 * number / 12 + 0.6 * (kind.rise < 0)
+            axis.plot([4 * place, 4 * place + way[0]], [foot, foot + way[2]], color=COLORS[name], linewidth=2.5)
+        axis.text(4 * place, -0.6, name, ha="center", fontsize=9)
+    axis.set(title="The two crowns, without wind", xlim=(-2, 6), ylim=(-1, 7))
+    axis.set_aspect("equal")
+    axis.axis("off")
+
+
+def _drags(axis: Any, rows: list[Row]) -> None:
+    speeds = (10, 15, 20, 25)
+    for row in rows:
+        color, name = COLORS[row["species"]], row["species"]
+        told = f"{name}: n = {row['exponent']:.2f} (species: {row['known']:.2f})"
+        axis.loglog(speeds, [row[f"R_{u}"] for u in speeds], "o", color=color, label=told)
+        axis.loglog(speeds, [row[f"exact_{u}"] for u in speeds], color=color, linewidth=1, label="sum of elasticas")
+    axis.set_xticks(speeds, [str(u) for u in speeds])
+    axis.set_yticks([0.2, 0.3, 0.5, 0.7, 1.0], ["0.2", "0.3", "0.5", "0.7", "1"])
+    axis.minorticks_off()
+    axis.set(title="Drag over that of the stiff crown", xlabel="wind [m/s]")
+    axis.legend(fontsize=8)
+
+
+def _plates(axis: Any, rows: list[Row]) -> None:
+    for law, marker, color in (("projected", "o", "tab:orange"), ("cross_flow", "s", "tab:blue")):
+        own = sorted((row for row in rows if row["law"] == law), key=lambda row: row["tilt"])
+        axis.plot([r["tilt"] for r in own], [r["speed"] for r in own], marker, color=color, label=f"{law}, across")
+        axis.plot([r["tilt"] for r in own], [r["exact"] for r in own], color=color, linewidth=1, label="exact")
+    axis.set(title="A plate falls: speed across itself at the end", xlabel="tilt [degrees]", ylabel="m/s",
+             ylim=(0, None))  # fmt: skip
+    axis.legend(fontsize=8)
