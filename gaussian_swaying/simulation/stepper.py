@@ -140,7 +140,10 @@ class Stepper:
         if self._joints is None or any(a is not b for a, b in zip(self._joints[0], key, strict=True)):
             with torch.inference_mode(False), torch.no_grad():  # it outlives the call
                 longest = min(float(stable_limit(points, self.solver.dx).amin()) for points in key)
-                self._joints = key, Joints(key[0], joints, longest)
+                made = [Joints(points, joints, longest) for points in {id(points): points for points in key}.values()]
+                for name in ("stiffness", "turning"):  # as soft as the lightest scene of a batch needs it
+                    setattr(made[0], name, torch.stack([getattr(one, name) for one in made]).amin(0))
+                self._joints = key, made[0]
         return [self._joints[1]]
 
     @property

@@ -9,6 +9,7 @@ from gaussian_swaying.gaussians.cloud import GaussianCloud
 from gaussian_swaying.gaussians.parts import Part, Parts
 from gaussian_swaying.mpm.solver import MPMSolver
 from gaussian_swaying.scenes.procedural import FlagScene, GivenScene
+from gaussian_swaying.simulation.batch import batch_of
 from gaussian_swaying.simulation.edits import Edit
 from gaussian_swaying.simulation.material import Material
 from gaussian_swaying.simulation.scene import Scene
@@ -61,6 +62,16 @@ def test_a_vane_turns_about_its_hinge_and_a_spring_holds_it():
     assert loose.stepper.joints[0] is joints
     loose.edit(loose.start(), Edit(E=1e5))
     assert float(loose.stepper.joints[0].stiffness) < 0.5 * float(joints.stiffness)  # substeps are longer
+
+
+def test_a_batch_has_joints_as_soft_as_its_lightest_scene_needs():
+    heavy, _ = simulation(joint_turning=1e9)
+    light = heavy.variant({"material.density": 5.0})
+    alone = light.stepper.joints[0]
+    for members in ([heavy, light], [light, heavy]):
+        joints = batch_of(members).joints[0]
+        for name in ("stiffness", "turning"):
+            torch.testing.assert_close(getattr(joints, name), getattr(alone, name))
 
 
 def test_a_joint_needs_parts_that_are_apart():
