@@ -56,9 +56,9 @@ def settings_of(
         ValueError: If a file or an option is bad.
     """
     given = list(further)
+    if scene is not None:
+        check_one_scene(given)
     if scene is not None and Path(scene).suffix.lower() not in (".yaml", ".yml"):
-        if is_given(given, "--config"):
-            raise ValueError("`SCENE` and `--config` both say what to show: give a splat with `--scene.ply`.")
         with guessing(parser):
             device = parser.parse_args([*given, "--scene.ply", scene]).device
         print(f"Looking at {scene} for a first configuration, which takes up to a minute.", flush=True)
@@ -70,6 +70,18 @@ def settings_of(
         with guessing(parser):
             settings = parser.parse_args(arguments)
     return settings
+
+
+def check_one_scene(options: Sequence[str]) -> None:
+    """Check that the options beside a scene do not name another one.
+
+    Raises:
+        ValueError: If there is a ``--config`` among them.
+    """
+    if is_given(options, "--config"):
+        raise ValueError(
+            "`SCENE` and `--config` both say what to show: leave out one of them, or give a splat with `--scene.ply`."
+        )
 
 
 def is_given(options: Sequence[str], name: str) -> bool:

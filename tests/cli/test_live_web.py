@@ -46,6 +46,9 @@ def test_a_page_from_a_run(tmp_path, capsys):
         (["flag", "page.txt"], "error: Expected the name of a page to end in .html, but got page.txt.\n"),
         ([], "error: Expected a SCENE, and perhaps a FILE that ends in .html, but got neither.\n"),
         (["sand"], "error: The page of --live-web cannot simulate `solver.formulation: updated`: set it to total.\n"),
+        (["flag", "--config", "leaf"], "error: `SCENE` and `--config` both say what to show: leave out one of them"),
+        (["a.yaml", "--config=b.yaml"], "error: `SCENE` and `--config` both say what to show: leave out one of them"),
+        (["flag", "no/page.html"], "error: The folder no of the page does not exist: make it, or name another one.\n"),
         (["flog"], "flog does not exist"),
     ],
 )
