@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from gaussian_swaying import _program as program
+from gaussian_swaying._files import check_not_taken
 from gaussian_swaying.cli.scene import check_one_scene, settings_of, words_of
 from gaussian_swaying.cli.shipped import names
 from gaussian_swaying.simulation.simulation import Simulation
@@ -78,6 +79,7 @@ def asked(arguments: Sequence[str]) -> Asked:
         raise ValueError(f"Expected the name of a page to end in .html, but got {target}.")
     if not target.parent.is_dir():
         raise ValueError(f"The folder {target.parent} of the page does not exist: make it, or name another one.")
+    check_not_taken(target)
     check_one_scene(further)
     config = Path(scene) / "config.yaml"
     with tempfile.TemporaryDirectory() as folder:

@@ -57,6 +57,19 @@ def test_bad_input_is_one_sentence(tmp_path, capsys, monkeypatch, arguments, sen
     refused(main, ["--live-web", *arguments], capsys, sentence, folder=tmp_path)
 
 
+def test_a_target_says_that_it_takes_the_points_of_the_grid(tmp_path, capsys):
+    page = str(tmp_path / "page.html")
+    assert main(["--live-web", "flag", page, "--target", "phone", *SMALL, "--scene.points", "gaussian"]) == 0
+    assert " grid, with `scene.points: grid`, for a phone: " in capsys.readouterr().out
+
+
+def test_a_folder_with_the_name_of_the_page(tmp_path, capsys):
+    page = tmp_path / "page.html"
+    page.mkdir()
+    assert main(["--live-web", "flag", str(page)]) == 2
+    assert "page.html to be a file, but it is a folder: move it away." in capsys.readouterr().err
+
+
 def test_words_and_options_in_any_order():
     parser = Simulation.parser()
     words, further = words_of(parser, ["a.yaml", "--solver.dx", "0.1", "b.html", "--material.E=3", "--print_config"])

@@ -69,6 +69,8 @@ def fitted(parser: ArgumentParser, settings: Namespace, target: str) -> Fitted:
     dx, found = finest_within(load, configured, budget)
     speed, points = budget / found, made[dx].setup.points.count
     what = "Kept the configured grid" if dx == configured else f"Chose a grid of {dx:.3g} m instead of {configured:g} m"
+    if settings.scene.points == "gaussian":
+        what += ", with `scene.points: grid`,"
     fast = f"about {speed:.2g} x real time" if speed < 1 else "real time"
     return Fitted(made[dx], f"{what} for a {target}: {points:,} points, {fast} expected.")
 
