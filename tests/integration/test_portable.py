@@ -4,6 +4,7 @@ It was not run on Windows; this finds what can be seen without one.
 """
 
 import ast
+from functools import cache
 from pathlib import Path
 
 import pytest
@@ -20,6 +21,7 @@ GUARDED = {("_provenance.py", "resource")}
 """Modules that are imported within a try."""
 
 
+@cache
 def _tree(path):
     return ast.parse(path.read_text("utf-8"))
 
