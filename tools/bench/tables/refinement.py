@@ -64,7 +64,7 @@ table(PAGE, "refinement.uneven", "refinement_*", _uneven, """
 def plot(results: list[Row], pictures: Path) -> None:
     """Draw ``refinement.png`` of a record: distance against cells, a line for each flag."""
     (result,) = results
-    figure, axis = subplots(figsize=(8, 5))
+    figure, axis = subplots(figsize=(9, 5))
     for number, (flag, itself, own) in enumerate(_fronts(result)):
         colour, cells = f"C{number}", [row["cells"] for row in own]
         distances = [100 * row["chamfer"] for row in own]
@@ -77,5 +77,7 @@ def plot(results: list[Row], pictures: Path) -> None:
     axis.set_title("Dashes on the right: the reference against itself", fontsize=10)
     axis.grid(True, which="major", linewidth=0.4, alpha=0.6)
     plain_numbers(axis)
-    axis.legend(fontsize=8)
+    axis.set_xticks(sorted({row["cells"] for *_, own in _fronts(result) for row in own}))
+    axis.set_xticks([], minor=True)
+    axis.legend(fontsize=8, loc="upper left", bbox_to_anchor=(1.01, 1.0))  # beside the lines, none of which it hides
     save_figure(figure, pictures / "refinement.png")
