@@ -222,15 +222,18 @@ def _grid_constants(grid: GridSpec, device: torch.device) -> tuple[Tensor, Tenso
 
 @contextmanager
 def in_fixed_order(wanted: bool) -> Iterator[None]:
-    """Make PyTorch sum in a fixed order on a GPU, if wanted."""
-    before, warns = torch.are_deterministic_algorithms_enabled(), torch.is_deterministic_algorithms_warn_only_enabled()
+    """Make PyTorch sum in a fixed order on a GPU, if wanted.
+
+    ``torch.use_deterministic_algorithms`` would do the same, but it also imports all of torch's compiler.
+    """
+    before = torch.get_deterministic_debug_mode()
     if wanted:
-        torch.use_deterministic_algorithms(True)
+        torch.set_deterministic_debug_mode("error")
     try:
         yield
     finally:
         if wanted:
-            torch.use_deterministic_algorithms(before, warn_only=warns)
+            torch.set_deterministic_debug_mode(before)
 
 
 def scatter(stencil: Stencil, coefficients: Tensor) -> Tensor:

@@ -1,5 +1,8 @@
 """Particle-grid transfers against the conservation laws that define APIC."""
 
+import subprocess
+import sys
+
 import pytest
 import torch
 from torch.utils._python_dispatch import TorchDispatchMode
@@ -445,3 +448,17 @@ def test_mls_is_another_discretisation_of_the_same_body():
 def test_mls_in_the_total_formulation_is_refused():
     with pytest.raises(ValueError, match=r"`mls` is a variant of the updated formulation: set `formulation`"):
         MPMSolver(formulation="total", mls=True)
+
+
+def test_fixed_order_is_restored_and_does_not_load_the_compiler_of_torch():
+    """``torch.use_deterministic_algorithms`` takes seconds at the start of a run on a GPU: it imports the compiler."""
+    code = (
+        "import sys, torch\n"
+        "from gaussian_swaying.mpm.transfer import in_fixed_order\n"
+        "torch.set_deterministic_debug_mode('warn')\n"
+        "with in_fixed_order(True):\n"
+        "    inside = torch.get_deterministic_debug_mode()\n"
+        "print(inside, torch.get_deterministic_debug_mode(), 'torch._inductor' in sys.modules)"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.split() == ["2", "1", "False"]
