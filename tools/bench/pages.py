@@ -30,6 +30,7 @@ from gaussian_swaying._files import write_text
 PLOTS: dict[str, Callable[[list[record.Row], Path], None]] = {
     "accuracy_*": plots.accuracy,
     "blender_*": blender.plot,
+    "contact_*": contact.plot,
     "nature_*": nature.plot,
     "pareto_*": plots.pareto,
     "refinement_*": refinement.plot,

@@ -22,7 +22,8 @@ class Contact:
         thickness: Distance that two surfaces keep [m]; null for the thickness of the material at each place. Obstacles
             are kept at half of it.
         friction: Coulomb coefficient.
-        iterations: Most iterations for the impulses of a substep. A few are enough, but for piles of many layers.
+        iterations: Most iterations for the impulses of a substep. Two or three are made where sheets touch, more at
+            an impact and in a pile; 16 are enough for eight layers.
 
     Raises:
         ValueError: If a number is out of range.

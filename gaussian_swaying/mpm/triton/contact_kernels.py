@@ -20,6 +20,8 @@ from gaussian_swaying.mpm.triton.contact_list_kernels import (
     meet,
     node_at,
     place_now,
+    store_velocity,
+    three,
     velocity_now,
 )
 from gaussian_swaying.mpm.triton.shared import axis_weights, node_weight
@@ -33,11 +35,18 @@ KEPT = tl.constexpr(1 - CREEP)
 
 @triton.jit
 def _place(
-    fields, base, fraction, arm, rest, facing, radius, thickness, places, row, p, mask, sx, sy, inverse_dx,
-    ARMS: tl.constexpr, VIRTUAL: tl.constexpr, BLOCK: tl.constexpr,
+    fields, base, fraction, arm, rest, facing, radius, thickness, places, row, moving, p, mask, sx, sy, inverse_dx,
+    BOTH: tl.constexpr, ARMS: tl.constexpr, VIRTUAL: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
-    """Position, thickness, normal and radius of samples now."""
-    x, a, b, c = place_now(fields, base, fraction, arm, rest, places, p, mask, sx, sy, inverse_dx, ARMS, VIRTUAL, BLOCK)
+    """Position, thickness, normal and radius of samples now, with BOTH also their velocity."""
+    x, v, d0, d1, d2 = place_now(
+        fields, base, fraction, arm, rest, places, p, mask, sx, sy, inverse_dx, True, BOTH, ARMS, VIRTUAL, BLOCK
+    )
+    if BOTH:
+        store_velocity(moving, p, mask, v)
+    a = three(d0)
+    b = three(d1)
+    c = three(d2)
     f = load3(facing, places, p, mask)
     a0 = 1 + a[0]
     b1 = 1 + b[1]
@@ -198,7 +207,7 @@ def _mobility(
     found = f[0] * 0
     for i in range(3):
         wx, gx = node_weight(f[0], i, inverse_dx)
-        for j in range(3):
+        for j in tl.static_range(3):
             wy, gy = node_weight(f[1], j, inverse_dx)
             w = wx * wy
             g = gx * wy * a[0] + wx * gy * a[1]
@@ -401,26 +410,9 @@ def contact_solve(
                 mask = p < places
                 if tl.max(tl.load(near + p, mask, 0)) > 0:
                     _place(
-                        fields, base, fraction, arm, rest, facing, radius, thickness, places, row, p, mask, sx, sy,
-                        inverse_dx, ARMS, VIRTUAL, BLOCK,
+                        fields, base, fraction, arm, rest, facing, radius, thickness, places, row, moving, p, mask, sx,
+                        sy, inverse_dx, WALLS == 0, ARMS, VIRTUAL, BLOCK,
                     )  # fmt: skip
-                    if WALLS == 0:
-                        velocity_now(
-                            fields,
-                            base,
-                            fraction,
-                            arm,
-                            moving,
-                            places,
-                            p,
-                            mask,
-                            sx,
-                            sy,
-                            inverse_dx,
-                            ARMS,
-                            VIRTUAL,
-                            BLOCK,
-                        )
             meet(gate, programs)
         for first in range(pid * BLOCK, places, programs * BLOCK):
             p = first + lane
@@ -512,21 +504,9 @@ def contact_solve(
                         mask = mask & (tl.load(many + p, mask, 0) > 0)
                         if tl.max(mask.to(tl.int32)) > 0:
                             velocity_now(
-                                fields,
-                                base,
-                                fraction,
-                                arm,
-                                moving,
-                                places,
-                                p,
-                                mask,
-                                sx,
-                                sy,
-                                inverse_dx,
-                                ARMS,
-                                VIRTUAL,
-                                BLOCK,
-                            )
+                                fields, base, fraction, arm, moving, places, p, mask, sx, sy, inverse_dx, ARMS,
+                                VIRTUAL, BLOCK,
+                            )  # fmt: skip
                     meet(gate, programs)
             if WALLS > 0:
                 tl.debug_barrier()  # another thread of this program may have written what is read next
@@ -535,8 +515,8 @@ def contact_solve(
                     mask = p < places
                     mask = mask & (tl.load(many + p, mask, 0) > 0)
                     if tl.max(mask.to(tl.int32)) > 0:
-                        for k in range(3 * WALLS):
-                            at = (k // 3 * places + p) * 3 + k % 3
+                        for c in range(3 * WALLS):
+                            at = (c // 3 * places + p) * 3 + c % 3
                             sum_ = tl.load(pressed_sum + at, mask, 0.0) + tl.load(pressed + at, mask, 0.0)
                             tl.store(pressed_sum + at, sum_, mask)
             if pid == 0:

@@ -55,39 +55,54 @@ def node_at(base, node, p, mask, places, i, j, k, sx, sy, VIRTUAL: tl.constexpr)
 
 @triton.jit
 def interpolate(
-    field, base, fraction, places, p, mask, sx, sy, inverse_dx, DERIVATIVES: tl.constexpr,
-    VIRTUAL: tl.constexpr, BLOCK: tl.constexpr,
+    field, base, fraction, arm, places, p, mask, sx, sy, inverse_dx, DERIVATIVES: tl.constexpr, BOTH: tl.constexpr,
+    ARMS: tl.constexpr, VIRTUAL: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
-    """Four columns of the nodes at samples, and their derivatives along the axes [1/m], of shape (BLOCK, 4) each.
+    """Four columns of the nodes at samples, of shape (BLOCK, 4), with BOTH also the next four; with ARMS at their ends.
 
-    As ``total_kernels.gather``, but a row of four columns is one load. ``base`` is the first node of each sample, or
+    Then the derivatives of the first four along the axes [1/m], of the same shape, zero without DERIVATIVES. As
+    ``total_kernels.gather``, but a row of four columns is one load. ``base`` is the first node of each sample, or
     with VIRTUAL the table of their nodes, shape (27, places).
     """
     column = tl.arange(0, 4)[None, :]
     f = load3(fraction, places, p, mask)
+    a = f
+    if ARMS:
+        a = load3(arm, places, p, mask)
     node = tl.load(base + p, mask, 0)
     wz, gz = axis_weights(f[2], inverse_dx)
     value = tl.zeros([BLOCK, 4], tl.float32)
-    d0, d1, d2 = value, value, value
+    following, d0, d1, d2 = value, value, value, value
     for i in range(3):
         wx, gx = node_weight(f[0], i, inverse_dx)
-        for j in range(3):
+        for j in tl.static_range(3):
             wy, gy = node_weight(f[1], j, inverse_dx)
             s = tl.zeros([BLOCK, 4], tl.float32)
-            t = s
+            t, m, n = s, s, s
             for k in tl.static_range(3):
-                at = node_at(base, node, p, mask, places, i, j, k, sx, sy, VIRTUAL)
-                q = tl.load(field + at[:, None] * 8 + column, mask[:, None], 0.0)
+                at = field + node_at(base, node, p, mask, places, i, j, k, sx, sy, VIRTUAL)[:, None] * 8 + column
+                q = tl.load(at, mask[:, None], 0.0)
                 s += wz[k][:, None] * q
-                if DERIVATIVES:
+                if DERIVATIVES or ARMS:
                     t += gz[k][:, None] * q
-            w = (wx * wy)[:, None]
-            value += w * s
+                if BOTH:
+                    q = tl.load(at + 4, mask[:, None], 0.0)
+                    m += wz[k][:, None] * q
+                    if ARMS:
+                        n += gz[k][:, None] * q
+            w = wx * wy
+            e = w
+            if ARMS:
+                e += gx * wy * a[0] + wx * gy * a[1]
+                value += (w * a[2])[:, None] * t
+                following += (w * a[2])[:, None] * n
+            value += e[:, None] * s
+            following += e[:, None] * m
             if DERIVATIVES:
                 d0 += (gx * wy)[:, None] * s
                 d1 += (wx * gy)[:, None] * s
-                d2 += w * t
-    return value, d0, d1, d2
+                d2 += w[:, None] * t
+    return value, following, d0, d1, d2
 
 
 @triton.jit
@@ -102,18 +117,24 @@ def three(x):
 
 
 @triton.jit
+def store_velocity(moving, p, mask, v):
+    """Write the velocities of samples, the first three columns of a tile."""
+    column = tl.arange(0, 4)[None, :]
+    tl.store(moving + p[:, None] * 4 + column, v, mask[:, None] & (column < 3))
+
+
+@triton.jit
 def place_now(
-    fields, base, fraction, arm, rest, places, p, mask, sx, sy, inverse_dx, ARMS: tl.constexpr,
-    VIRTUAL: tl.constexpr, BLOCK: tl.constexpr,
+    fields, base, fraction, arm, rest, places, p, mask, sx, sy, inverse_dx, DERIVATIVES: tl.constexpr,
+    BOTH: tl.constexpr, ARMS: tl.constexpr, VIRTUAL: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
-    """Return the present positions of contact samples, and the derivatives of the displacement along each axis."""
-    u, d0, d1, d2 = interpolate(fields, base, fraction, places, p, mask, sx, sy, inverse_dx, True, VIRTUAL, BLOCK)
-    if ARMS:
-        a = load3(arm, places, p, mask)
-        u += a[0][:, None] * d0 + a[1][:, None] * d1 + a[2][:, None] * d2
+    """Return the positions of contact samples now, with BOTH their velocities, and the slopes of the displacement."""
+    u, v, d0, d1, d2 = interpolate(
+        fields, base, fraction, arm, places, p, mask, sx, sy, inverse_dx, DERIVATIVES, BOTH, ARMS, VIRTUAL, BLOCK
+    )
     x = load3(rest, places, p, mask)
     u0, u1, u2 = three(u)
-    return (x[0] + u0, x[1] + u1, x[2] + u2), three(d0), three(d1), three(d2)
+    return (x[0] + u0, x[1] + u1, x[2] + u2), v, d0, d1, d2
 
 
 @triton.jit
@@ -122,12 +143,10 @@ def velocity_now(
     VIRTUAL: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
     """Read the velocity of places."""
-    v, d0, d1, d2 = interpolate(fields + 4, base, fraction, places, p, mask, sx, sy, inverse_dx, ARMS, VIRTUAL, BLOCK)
-    if ARMS:
-        a = load3(arm, places, p, mask)
-        v += a[0][:, None] * d0 + a[1][:, None] * d1 + a[2][:, None] * d2
-    column = tl.arange(0, 4)[None, :]
-    tl.store(moving + p[:, None] * 4 + column, v, mask[:, None] & (column < 3))
+    v, _n, _a, _b, _c = interpolate(
+        fields + 4, base, fraction, arm, places, p, mask, sx, sy, inverse_dx, False, False, ARMS, VIRTUAL, BLOCK
+    )
+    store_velocity(moving, p, mask, v)
 
 
 @triton.jit(do_not_specialize=CHANGES)
@@ -138,15 +157,12 @@ def contact_positions(
     """Write positions (C, 3) and velocities of all contact samples; reset the flag that something is in reach."""
     p = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
     mask = p < places
-    u, d0, d1, d2 = interpolate(fields, base, fraction, places, p, mask, sx, sy, inverse_dx, ARMS, VIRTUAL, BLOCK)
-    if ARMS:
-        a = load3(arm, places, p, mask)
-        u += a[0][:, None] * d0 + a[1][:, None] * d1 + a[2][:, None] * d2
-    x = load3(rest, places, p, mask)
-    moved = three(u)
+    x, v, _a, _b, _c = place_now(
+        fields, base, fraction, arm, rest, places, p, mask, sx, sy, inverse_dx, False, True, ARMS, VIRTUAL, BLOCK
+    )
     for c in tl.static_range(3):
-        tl.store(position + p * 3 + c, x[c] + moved[c], mask)
-    velocity_now(fields, base, fraction, arm, moving, places, p, mask, sx, sy, inverse_dx, ARMS, VIRTUAL, BLOCK)
+        tl.store(position + p * 3 + c, x[c], mask)
+    store_velocity(moving, p, mask, v)
     if tl.program_id(0) == 0:
         tl.store(status + ACTING, 0)
         tl.store(status + WITHIN, 0)
@@ -358,9 +374,10 @@ def contact_lists(
         for first in range(pid * BLOCK, places, programs * BLOCK):
             p = first + lane
             mask = p < places
-            x, _a, _b, _c = place_now(
-                fields, base, fraction, arm, rest, places, p, mask, sx, sy, inverse_dx, ARMS, VIRTUAL, BLOCK
-            )
+            x, _v, _a, _b, _c = place_now(
+                fields, base, fraction, arm, rest, places, p, mask, sx, sy, inverse_dx, False, False, ARMS, VIRTUAL,
+                BLOCK,
+            )  # fmt: skip
             tl.store(many + p, tl.zeros([BLOCK], tl.int32), mask)
             for c in tl.static_range(3):
                 tl.store(position + p * 4 + c, x[c], mask)

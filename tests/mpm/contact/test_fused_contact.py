@@ -7,6 +7,7 @@ import pytest
 import torch
 
 from gaussian_swaying.mpm.boundaries.ball import BallObstacle
+from gaussian_swaying.mpm.boundaries.half_space import HalfSpaceObstacle
 from gaussian_swaying.mpm.boundaries.pinned_points import PinnedPoints
 from gaussian_swaying.mpm.contact.pairs import close_pairs
 from gaussian_swaying.mpm.contact.surface import Contact
@@ -79,6 +80,15 @@ def test_obstacles_alone_do_what_they_do_in_torch(sheet, scene, device):
     torch.testing.assert_close(ends[1].velocity, ends[0].velocity, rtol=0, atol=1e-2)
     torch.testing.assert_close(taken[1], taken[0], rtol=0, atol=1e-4 * float(taken[0].abs().max()) + 1e-7)
     assert float(taken[1][1].abs().max()) == 0.0
+
+
+def test_iterations_are_counted_where_there_are_obstacles(sheet, scene, device):
+    """One in every substep of a sheet that presses on the ground."""
+    points = sheet(5, 5, dtype=torch.float32).map(lambda t: t.to(device))
+    ground = HalfSpaceObstacle([0.0, 0.0, -0.004], [0.0, 0.0, 1.0])
+    solver, state = scene(points, Contact(iterations=1), [ground], transfer="kernels", gravity=(0.0, 0.0, -9.8))
+    solver.rollout(state, DT, 6)
+    assert solver.fused().touching.rounds == 6
 
 
 @pytest.mark.slow(twin="test_the_lists_do_not_change_the_result")

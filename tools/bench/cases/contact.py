@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import math
 import time
 from collections.abc import Iterator
 from functools import partial
@@ -45,11 +46,13 @@ def sheets(points: int, device: torch.device) -> tuple[MaterialPoints, Tensor]:
     return level(place[place[:, 2].argsort(stable=True)].contiguous(), spacing, THICKNESS, 5e3)
 
 
-def prepare(points: int, case: str, device: torch.device) -> tuple[MPMSolver, MPMState, float]:
+def prepare(
+    points: int, case: str, device: torch.device, iterations: int = Contact.iterations
+) -> tuple[MPMSolver, MPMState, float]:
     """A solver, the state from which a rollout is timed, and its substep [s]."""
     made, normal = sheets(points, device)
     spacing = WIDTH / round((points / 2) ** 0.5)
-    contact = None if case == "off" else Contact(thickness=THICKNESS)
+    contact = None if case == "off" else Contact(thickness=THICKNESS, iterations=iterations)
     surface = None if contact is None else Surface.of_points(made, normal, spacing, THICKNESS, contact)
     solver = MPMSolver(dx=PER_CELL * spacing, gravity=(0.0, 0.0, 0.0))
     state = solver.init_state(made, surface=surface)
@@ -65,9 +68,9 @@ def prepare(points: int, case: str, device: torch.device) -> tuple[MPMSolver, MP
 
 
 @torch.inference_mode()
-def cost(points: int, case: str, device: torch.device, repeats: int) -> Row:
+def cost(points: int, case: str, device: torch.device, repeats: int, iterations: int = Contact.iterations) -> Row:
     """Milliseconds of a substep (on a CPU those of the processor), and the pairs that are listed."""
-    solver, state, dt = prepare(points, case, device)
+    solver, state, dt = prepare(points, case, device, iterations)
     roll = partial(solver.rollout, state, dt, STEPS)
     if device.type == "cuda":
         row = timed(roll, device, repeats, warm=3, share=1 / STEPS)  # the first makes room, the second records
@@ -92,7 +95,9 @@ def listed(solver: MPMSolver) -> int:
 
 
 @torch.inference_mode()
-def collision(speed: float, device: torch.device, points: int = 900, frames: int = 30) -> Row:
+def collision(
+    speed: float, device: torch.device, points: int = 900, frames: int = 30, iterations: int = Contact.iterations
+) -> Row:
     """A small sheet that flies onto a larger one: the gaps of all frames, and what crosses."""
     side = round(points**0.5)
     spacing = WIDTH / side
@@ -105,7 +110,9 @@ def collision(speed: float, device: torch.device, points: int = 900, frames: int
     velocity = torch.zeros_like(made.position)
     velocity[len(low) :] = speed * torch.tensor([0.3, 0.0, -1.0], device=device)
     solver = MPMSolver(dx=PER_CELL * spacing, gravity=(0.0, 0.0, 0.0))
-    state = solver.init_state(made, velocity, surface=Surface.of_points(made, normal, spacing, thickness, Contact()))
+    state = solver.init_state(
+        made, velocity, surface=Surface.of_points(made, normal, spacing, thickness, Contact(iterations=iterations))
+    )
     momentum = solver.momenta(state)["linear"].double()
     triangles = torch.cat([sheet_triangles(side, side), sheet_triangles(len(few), len(few), len(low))])
     frame, shares, crossed = 25 * spacing / speed / frames, [], 0
@@ -129,11 +136,18 @@ def collision(speed: float, device: torch.device, points: int = 900, frames: int
 
 
 @torch.inference_mode()
-def pile(seconds: float, device: torch.device, layers: int = 8, per_side: int = 5) -> list[Row]:
+def pile(
+    seconds: float,
+    device: torch.device,
+    layers: int = 8,
+    per_side: int = 5,
+    iterations: int = Contact.iterations,
+) -> list[Row]:
     """Layers that lie on each other and on the ground, shifted by some millimetres: what moves, each second.
 
     Energies are in units of the weight times a thickness, ``top`` is the height of the uppermost layer in thicknesses,
-    ``slid`` its mean place along x [m], and ``rounds`` the iterations of a substep, where the kernels count them.
+    ``slid`` its mean place along x [m], and ``rounds`` the iterations of a substep, where the kernels count them;
+    ``closest`` and ``gap`` are the least and the mean distance of layers in thicknesses, ``fastest`` a speed [m/s].
     """
     spacing, thickness = 0.02, 0.01
     axis = torch.arange(per_side, device=device, dtype=torch.float32) * spacing
@@ -142,7 +156,9 @@ def pile(seconds: float, device: torch.device, layers: int = 8, per_side: int = 
     made, normal = level(torch.cat([flat + corner for corner in low]), spacing, thickness)
     ground = HalfSpaceObstacle([0.0, 0.0, -0.5 * thickness], [0.0, 0.0, 1.0])
     solver = MPMSolver(dx=2.2 * spacing, gravity=(0.0, 0.0, -9.8), boundaries=[ground], stiffness_damping=1e-3)
-    state = solver.init_state(made, surface=Surface.of_points(made, normal, spacing, thickness, Contact()))
+    state = solver.init_state(
+        made, surface=Surface.of_points(made, normal, spacing, thickness, Contact(iterations=iterations))
+    )
     nodes = state.grid.node_positions(state.position)
     layer = ((nodes[:, 2] + 0.1) / 0.2).floor().clamp(0, layers - 1)
     moved = torch.zeros_like(nodes)
@@ -158,32 +174,69 @@ def pile(seconds: float, device: torch.device, layers: int = 8, per_side: int = 
         energy = {name: float(value) / (weight * thickness) for name, value in solver.energies(state).items()}
         top = state.position[-(per_side**2) :].mean(0)
         row = {"time": second + 1.0, **{name: energy[name] for name in ("kinetic", "elastic", "potential")}}
+        between = gaps(solver.bound.contact, state)  # type: ignore[attr-defined]
+        row |= {"closest": float(between.amin()), "gap": float(between.mean())}
+        row |= {"fastest": float(state.velocity.norm(dim=-1).amax())}
         rows.append(row | {"top": float(top[2]) / thickness, "slid": float(top[0])})
         if fused is not None:
             rows[-1]["rounds"] = (fused.touching.rounds - before) / count  # type: ignore[attr-defined]
     return rows
 
 
+@torch.inference_mode()
+def slide(degrees: float, device: torch.device, iterations: int, seconds: float = 0.5, friction: float = 0.3) -> float:
+    """The speed that a sheet has on a slope after a time, in units of what Coulomb's law gives a sheet that slides."""
+    spacing, thickness, tilt = 0.02, 0.01, math.radians(degrees)
+    axis = torch.arange(12, device=device, dtype=torch.float32) * spacing
+    made, normal = level(torch.cartesian_prod(axis, axis, torch.zeros(1, device=device)), spacing, thickness)
+    ground = HalfSpaceObstacle([0.0, 0.0, -0.5 * thickness], [0.0, 0.0, 1.0], friction=friction)
+    gravity = (9.8 * math.sin(tilt), 0.0, -9.8 * math.cos(tilt))
+    solver = MPMSolver(dx=2.2 * spacing, gravity=gravity, boundaries=[ground])
+    touching = Contact(iterations=iterations)
+    state = solver.init_state(made, surface=Surface.of_points(made, normal, spacing, thickness, touching))
+    count = solver.substeps(state, seconds)
+    state = solver.rollout(state, seconds / count, count)
+    return float(state.velocity[:, 0].mean()) / (seconds * 9.8 * (math.sin(tilt) - friction * math.cos(tilt)))
+
+
+def effort(iterations: int, device: torch.device, repeats: int) -> Row:
+    """How close surfaces come, how a pile rests and what it costs with at most so many iterations in a substep."""
+    points = 100_000 if device.type == "cuda" else 10_000
+    times = {case: cost(points, case, device, repeats, iterations)["median_ms"] for case in CASES}
+    return {
+        "iterations": iterations,
+        "points": points,
+        "ratio": {case: times[case] / times["off"] for case in CASES[1:]},
+        "collisions": {f"{speed:g}": collision(speed, device, iterations=iterations) for speed in (2.0, 50.0)},
+        "pile": pile(3.0, device, iterations=iterations)[-1],
+        "sliding_error": slide(20.0, device, iterations) - 1,
+    }
+
+
 def rows(options: argparse.Namespace, result: Row) -> Iterator[Measurement]:
-    """The cost of each case, the collisions, and the pile."""
+    """The cost of each case, the collisions, the pile, and all of them with few iterations."""
     device = torch.device(options.device)
-    for points in options.points or [10_000, 100_000, 1_000_000][: 3 if device.type == "cuda" else 2]:
+    sizes = [10_000, 100_000, 1_000_000][: 3 if device.type == "cuda" else 2]
+    for points in sizes if options.points is None else options.points:
         for case in CASES:
             yield ("rows", {"wanted": points, "case": case}), partial(cost, points, case, device, options.repeats)
     for speed in options.speeds:
         yield ("collisions", {"speed_m_s": speed}), partial(collision, speed, device)
     for row in pile(options.pile, device) if options.pile else ():
         yield ("pile", {"time": row["time"]}), row.copy
+    for count in options.effort:
+        yield ("effort", {"iterations": count}), partial(effort, count, device, options.repeats)
 
 
 CASE = Case(
     "Measure what contact costs, and how close surfaces come.",
     rows,
     (
-        numbers("--points", "of both sheets; 10000,100000 and, on a GPU, 1000000 if left out"),
+        numbers("--points", "of both sheets; 10000,100000 and, on a GPU, 1000000 if left out, none if empty"),
         option("--repeats", "timed rollouts of each case (default: %(default)s)", type=int, default=5),
         numbers("--speeds", "of the collisions [m/s]", float, "2,50"),
         option("--pile", "seconds that eight layers rest (default: %(default)g)", type=float, default=0.0),
+        numbers("--effort", "most iterations, each of which is measured (default: none)", int, ""),
     ),
     page="contact.md",
 )

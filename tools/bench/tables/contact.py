@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from pathlib import Path
 
 from bench.cases.contact import CASES
 from bench.cases.folds import REFERENCES, ROWS
+from bench.tables.plots import save_figure, subplots
 from bench.tables.render import GOAL, Goal, Row, fill, judged, table
 
 PAGE = "contact.md"
@@ -45,6 +47,47 @@ table(PAGE, "contact.pile", "contact_cuda", _pile, """
     time [s] = {time:.0f} | motion = {kinetic:.1e} | bending = {elastic:+.1e} | height = {potential:+.1e} |
     top layer [thicknesses] = {top:+.4f} | slid [mm] = {slid:+.2f (mm)} | iterations = {rounds or '-':.1f}
     """, before="{source}", empty="Not recorded.")  # fmt: skip
+
+
+table(PAGE, "contact.effort", "contact_*", "effort", """
+    iterations, at most = {iterations} | closest at 2 m/s = {collisions.2.closest:.2f} |
+    closest at 50 m/s = {collisions.50.closest:.2f} | crossings at 50 m/s = {collisions.50.crossings} |
+    closest in the pile = {pile.closest:.2f} | top layer = {pile.top:.2f} |
+    speed in the pile [mm/s] = {pile.fastest:.2f (mm)} | error of sliding = {sliding_error:.2f %} |
+    a fifth / off = {ratio.a fifth in contact:.2f} |
+    all / off = {ratio.all in contact:.2f}
+    """, before="{source}", empty="Not recorded.")  # fmt: skip
+
+
+def plot(results: list[Row], pictures: Path) -> None:
+    """Draw ``contact_effort.png``: what iterations do and cost."""
+    known = [result for result in results if result.get("effort")]
+    if not known:
+        return
+    figure, (left, right) = subplots(1, 2, figsize=(9, 3.4))
+    rows = known[0]["effort"]
+    most = [row["iterations"] for row in rows]
+    for name, found in {
+        "sheets that meet at 2 m/s": [row["collisions"]["2"]["closest"] for row in rows],
+        "sheets that meet at 50 m/s": [row["collisions"]["50"]["closest"] for row in rows],
+        "pile of eight layers": [row["pile"]["closest"] for row in rows],
+    }.items():
+        left.semilogx(most, found, "o-", label=name)
+    left.set_ylabel("closest [thicknesses]")
+    left.set_ylim(0, 1.05)
+    left.legend(fontsize=8)
+    for result, line in zip(known, ("o-", "s--"), strict=False):
+        for case in CASES[2:]:
+            found = [row["ratio"][case] for row in result["effort"]]
+            right.semilogx(most, found, line, label=f"{case}, {result['device']}")
+    right.set_ylabel("substep / substep without contact")
+    right.set_ylim(bottom=0)
+    right.legend(fontsize=8)
+    for axis in (left, right):
+        axis.set_xlabel("iterations in a substep, at most")
+        axis.set_xticks(most, [str(count) for count in most])
+        axis.minorticks_off()
+    save_figure(figure, pictures / "contact_effort.png")
 
 
 def _doubt(known: Row) -> float | None:
