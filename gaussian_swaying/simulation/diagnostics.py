@@ -282,6 +282,7 @@ def _joined(scenes: Sequence[FrameDiagnostics]) -> FrameDiagnostics:
     return replace(first, **found)
 
 
+@torch.no_grad()
 def measure(
     solver: Solver,
     state: State,
@@ -345,6 +346,7 @@ class Gauge:
         self.replayed = Replayed()
         self._made: Measurement | None = None
 
+    @torch.no_grad()
     def __call__(
         self,
         solver: Solver,
@@ -368,7 +370,7 @@ class Gauge:
         """
         small = state.position.is_cuda and state.position.shape[:-1].numel() <= RECORDED
         fixed = solver.neighbours_fixed and state.F_elastic is state.F_total
-        if not (small and fixed) or same is None or torch.is_grad_enabled():
+        if not (small and fixed) or same is None:
             return measure(solver, state, substeps, cfl, None, before, more(state))
 
         names = [name for name, value in state.fields().items() if isinstance(value, Tensor) and name not in _UNREAD]
