@@ -1,0 +1,267 @@
+"""A lattice Boltzmann flow in a box: inflow, outflow, ground and still walls."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Literal
+
+import torch
+from torch import Tensor, nn
+
+from gaussian_swaying._checks import check_choice, check_positive, check_whole
+from gaussian_swaying.air.collision import MOMENTS, collide, population, sums
+from gaussian_swaying.air.lattice import DIRECTIONS, OPPOSITE, WEIGHTS, LatticeUnits
+from gaussian_swaying.kernels.launch import replaces
+
+FACES = ("periodic", "wall", "open")
+FLUID, WALL, HELD = range(3)
+MOST_CELLS = 2**31 // MOMENTS
+"""Cells are counted in 32 bits."""
+
+Face = Literal["periodic", "wall", "open"]
+
+
+@dataclass(frozen=True, slots=True)
+class FlowState:
+    """What changes in a flow.
+
+    Attributes:
+        moments: Ten numbers for each cell after its collision, in units of the lattice (see :mod:`collision`), shape
+            (10, X, Y, Z).
+    """
+
+    moments: Tensor
+
+
+class LatticeFlow(nn.Module):
+    """A flow on a box of cubic cells: D3Q27, a regularised collision with third-order terms, Smagorinsky's model.
+
+    A wall lies halfway between the centres of a wall cell and its neighbour (bounce-back). The outermost cells of an
+    ``open`` face have the velocity of the wind and the pressure of their neighbour where the wind blows in or along the
+    face, and the pressure at rest and the velocity of their neighbour where it blows out. The outermost cells of a
+    ``wall`` face are wall cells. A wall may move along its surface. On a GPU and on a CPU the step runs as compiled kernels in float32; the functions of
+    :mod:`collision` and :meth:`step` in float64 are their definition.
+
+    Args:
+        cells: Cells along x, y and z. With one cell along an axis, which must be periodic, the flow is two-dimensional.
+        units: Metres and seconds of the lattice.
+        faces: ``periodic``, ``wall`` or ``open`` for each axis; or two of them, for its low and high face.
+        walls: Wall cells, bool, shape (X, Y, Z); None for none but those of the faces.
+        smagorinsky: Constant of the subgrid model; 0 for none. Published values lie between 0.1 and 0.2.
+
+    Attributes:
+        kind: 0 for air, 1 for a wall, 2 for a cell of an open face, int8, shape (X, Y, Z).
+        held: Flat index of the cells of open faces, int32, shape (H,).
+
+    Raises:
+        ValueError: If a number or shape is wrong.
+
+    Example:
+        >>> units = LatticeUnits.at_speed(0.1, 1.0, viscosity=1e-2, density=1.2)
+        >>> flow = LatticeFlow((8, 8, 8), units, faces=("periodic", "periodic", "periodic"))
+        >>> state = flow.step(flow.start([1.0, 0.0, 0.0]))
+        >>> flow.velocity(state)[:, 0, 0, 0]
+        tensor([1., 0., 0.])
+    """
+
+    def __init__(
+        self,
+        cells: Sequence[int],
+        units: LatticeUnits,
+        *,
+        faces: Sequence[Face | tuple[Face, Face]] = ("open", "open", "open"),
+        walls: Tensor | None = None,
+        smagorinsky: float = 0.1,
+    ) -> None:
+        super().__init__()
+        if len(cells) != 3 or len(faces) != 3:
+            raise ValueError(f"Expected three numbers of `cells` and three `faces`, but got {cells} and {faces}.")
+        sides = [face if isinstance(face, tuple) else (face, face) for face in faces]
+        for axis, (count, pair) in enumerate(zip(cells, sides, strict=True)):
+            check_whole("cells", count, 1)
+            for side in pair:
+                check_choice("faces", side, FACES)
+            if (pair[0] == "periodic") != (pair[1] == "periodic"):
+                raise ValueError(f"Expected both `faces` of axis {axis} to be periodic or none, but got {pair}.")
+            if pair[0] != "periodic" and count < 4:
+                raise ValueError(f"Expected at least 4 `cells` along axis {axis}, whose faces are {pair}: got {count}.")
+        shape = (int(cells[0]), int(cells[1]), int(cells[2]))
+        if shape[0] * shape[1] * shape[2] > MOST_CELLS:
+            raise ValueError(f"Expected at most {MOST_CELLS:,} `cells` in all, but got {shape}.")
+        check_positive("smagorinsky", smagorinsky, allow_zero=True)
+        self.cells, self.units, self.smagorinsky = shape, units, float(smagorinsky)
+        kind = torch.zeros(shape, dtype=torch.int8)
+        for axis, pair in enumerate(sides):
+            for side, end in zip(pair, (0, shape[axis] - 1), strict=True):
+                layer = kind.select(axis, end)
+                if side == "open":
+                    layer[layer != WALL] = HELD
+                elif side == "wall":
+                    layer.fill_(WALL)
+        if walls is not None:
+            if walls.shape != shape or walls.dtype != torch.bool:
+                raise ValueError(f"Expected `walls` to be bool of shape {shape}, but got {tuple(walls.shape)}.")
+            kind[walls.cpu()] = WALL
+        place = (kind == HELD).nonzero()
+        low = torch.tensor([int(pair[0] == "open") for pair in sides])
+        high = torch.tensor([n - 1 - int(pair[1] == "open") for n, pair in zip(shape, sides, strict=True)])
+        inner = torch.minimum(torch.maximum(place, low), high)
+        strides = torch.tensor([shape[1] * shape[2], shape[2], 1])
+        for name, value in (
+            ("kind", kind),
+            ("held", (place * strides).sum(-1).int()),
+            ("behind", (inner * strides).sum(-1).int()),
+            ("outward", (place - inner).float().contiguous()),
+            ("special", _special(kind)),
+        ):
+            self.register_buffer(name, value, persistent=False)
+        self.kind: Tensor
+        self.held: Tensor
+        self.behind: Tensor
+        self.outward: Tensor
+        self.special: Tensor
+
+    @property
+    def has_walls(self) -> bool:
+        """True if there are wall cells."""
+        return bool((self.kind == WALL).any())
+
+    def start(
+        self,
+        velocity: Sequence[float] | Tensor = (0.0, 0.0, 0.0),
+        wall_velocity: Tensor | None = None,
+        dtype: torch.dtype = torch.float32,
+    ) -> FlowState:
+        """A flow at the pressure at rest.
+
+        Args:
+            velocity: Of the air [m/s], three numbers or broadcastable to (3, X, Y, Z).
+            wall_velocity: Of the walls [m/s], along their surface, shape (3, X, Y, Z); still if None.
+            dtype: Precision; kernels take float32.
+        """
+        moments = torch.zeros(MOMENTS, *self.cells, dtype=dtype, device=self.kind.device)
+        given = torch.as_tensor(velocity, dtype=dtype, device=self.kind.device)
+        moments[1:4] = (given if given.ndim > 1 else given[:, None, None, None]) / self.units.speed
+        wall = self.kind == WALL
+        moments[1:4] = torch.where(wall, 0.0 if wall_velocity is None else wall_velocity / self.units.speed, moments[1:4])
+        return FlowState(moments)
+
+    def velocity(self, state: FlowState) -> Tensor:
+        """Velocity of the air [m/s], shape (3, X, Y, Z); in walls that of the wall."""
+        return state.moments[1:4] * self.units.speed
+
+    def pressure(self, state: FlowState) -> Tensor:
+        """Pressure above that at rest [Pa], shape (X, Y, Z)."""
+        return state.moments[0] * (self.units.density * self.units.speed**2 / 3)
+
+    def momentum(self, state: FlowState) -> Tensor:
+        """Momentum of the air in the box [kg m/s], shape (3,), float64."""
+        mass = (1 + state.moments[0].double()) * (self.kind == FLUID)
+        return (mass * state.moments[1:4].double()).sum((1, 2, 3)) * self.units.cell_mass * self.units.speed
+
+    def force_on_walls(self, state: FlowState, part: Tensor) -> Tensor:
+        """Force of the air on some wall cells in the next step [N], shape (3,), float64, by the momentum of what returns.
+
+        Args:
+            state: The state now.
+            part: The wall cells, bool, shape (X, Y, Z), away from the faces: the pressure at rest is left out, which
+                pushes a closed surface nowhere.
+        """
+        total = torch.zeros(3, dtype=torch.float64, device=part.device)
+        air = self.kind != WALL
+        for number, c in enumerate(DIRECTIONS):
+            link = (torch.roll(part, c, (0, 1, 2)) & air).nonzero(as_tuple=True)
+            if not len(link[0]):
+                continue
+            cells = state.moments[(slice(None), *link)].double()
+            wall = [(place - shift) % count for place, shift, count in zip(link, c, self.cells, strict=True)]
+            moving = state.moments[(slice(1, 4), *wall)].double()
+            along = torch.tensor(c, dtype=torch.float64, device=part.device)
+            back = 2 * population(cells, OPPOSITE[number]) + 6 * WEIGHTS[number] * (along[:, None] * moving).sum(0)
+            total -= along * back.sum()
+        return total * self.units.cell_mass * self.units.speed / self.units.dt
+
+    def step(
+        self, state: FlowState, wind: Tensor | None = None, acceleration: Sequence[float] = (0.0, 0.0, 0.0)
+    ) -> FlowState:
+        """Advance by one time step.
+
+        Args:
+            state: The state now.
+            wind: Velocity [m/s] at the cells of open faces, shape (3,) or (H, 3); still if None.
+            acceleration: Of all the air [m/s²].
+        """
+        out = torch.empty_like(state.moments)
+        self.advance(state.moments, out, wind, acceleration)
+        return FlowState(out)
+
+    def advance(
+        self, moments: Tensor, out: Tensor, wind: Tensor | None = None, acceleration: Sequence[float] = (0.0, 0.0, 0.0)
+    ) -> None:
+        """As :meth:`step`, into a given tensor."""
+        push = [a * self.units.dt / self.units.speed for a in acceleration]
+        held = self._held(wind, moments)
+        if replaces([moments]):
+            from gaussian_swaying.air.flow_kernels import step
+
+            step(self, moments, out, held, push)
+            return
+        self._step(moments, out, push)
+        if len(self.held):
+            hold(out, self.held.long(), self.behind.long(), self.outward, held)
+
+    def _held(self, wind: Tensor | None, like: Tensor) -> Tensor:
+        """The wind at the cells of open faces in lattice units, shape (H, 3)."""
+        given = like.new_zeros(3) if wind is None else wind.to(like) / self.units.speed
+        return given.expand(len(self.held), 3).contiguous()
+
+    def _step(self, moments: Tensor, out: Tensor, push: list[float]) -> None:
+        wall = self.kind == WALL
+        arrived = []
+        for number, c in enumerate(DIRECTIONS):
+            moved = torch.roll(population(moments, number), c, (0, 1, 2))
+            if self.has_walls:
+                moving = sum(a * torch.roll(moments[1 + k], c, (0, 1, 2)) for k, a in enumerate(c))
+                back = population(moments, OPPOSITE[number]) + 6 * WEIGHTS[number] * moving
+                moved = torch.where(torch.roll(wall, c, (0, 1, 2)), back, moved)
+            arrived.append(moved)
+        given = moments.new_tensor(push)[:, None, None, None] if any(push) else None
+        out.copy_(collide(*sums(arrived), self.units.relaxation, self.smagorinsky, given))
+        out.copy_(torch.where(wall, moments, out))
+
+
+def hold(moments: Tensor, held: Tensor, behind: Tensor, outward: Tensor, wind: Tensor) -> None:
+    """Set the cells of open faces, in place.
+
+    Args:
+        moments: Shape (10, X, Y, Z).
+        held: Flat index of the cells, shape (H,).
+        behind: Flat index of the cells behind them in the box, shape (H,).
+        outward: From there to them [cells], shape (H, 3).
+        wind: Velocity of the wind [cells per step], shape (H, 3).
+    """
+    flat = moments.reshape(MOMENTS, -1)
+    near = flat[:, behind]
+    out = (wind * outward.to(wind)).sum(-1) > 1e-6
+    leaving = near[1:4].T
+    into = (leaving * outward.to(wind)).sum(-1, keepdim=True).clamp(max=0)  # nothing flows back in
+    leaving = leaving - into * outward.to(wind) / outward.to(wind).square().sum(-1, keepdim=True)
+    flat[0, held] = torch.where(out, 0.0, near[0])
+    flat[1:4, held] = torch.where(out[:, None], leaving, wind).T
+    flat[4:, held] = near[4:]
+
+
+def _special(kind: Tensor) -> Tensor:
+    """Cells of air with a neighbour that is a wall or lies behind a periodic face, int32, shape (S,)."""
+    found = torch.zeros(kind.shape, dtype=torch.bool)
+    for c in DIRECTIONS:
+        found |= torch.roll(kind == WALL, c, (0, 1, 2))
+    for axis, count in enumerate(kind.shape):
+        if count > 1:
+            found.select(axis, 0).fill_(True)
+            found.select(axis, count - 1).fill_(True)
+    return (found & (kind == FLUID)).reshape(-1).nonzero()[:, 0].int()
+
+
+__all__ = ["FACES", "FLUID", "HELD", "MOST_CELLS", "WALL", "Face", "FlowState", "LatticeFlow", "hold"]
