@@ -330,6 +330,7 @@ class State:
         work: Work of the external forces since the start [J], shape (...) over the batch, float64.
         impulse: Reaction impulse: momentum that each boundary took from the body since the start [N s], in their order,
             shape (..., B, 3), float64; see :func:`support_force`.
+        air: Moments of computed air, shape (10, X, Y, Z), which a stepper advances; or None.
     """
 
     position: Tensor
@@ -342,6 +343,7 @@ class State:
     substep: float = 0.0
     work: Tensor = field(default_factory=lambda: torch.zeros((), dtype=torch.float64))
     impulse: Tensor = field(default_factory=lambda: torch.zeros(0, 3, dtype=torch.float64))
+    air: Tensor | None = None
 
     def replace(self, **changes: Any) -> Self:
         """A copy with some fields changed."""
@@ -360,7 +362,7 @@ class State:
 
     def tensors(self) -> list[Tensor]:
         """The fields that may require a gradient."""
-        without = ("lost", "time", "work", "impulse")
+        without = ("lost", "time", "work", "impulse", "air")
         return [v for k, v in self.fields().items() if isinstance(v, Tensor) and k not in without]
 
     def state_dict(self) -> dict[str, Any]:

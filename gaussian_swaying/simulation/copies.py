@@ -127,6 +127,8 @@ def copies_of(copies: Sequence[Copy], setup: Setup, solver: Solver) -> Copies:
 
 def _why_not(copies: Sequence[Copy], setup: Setup, solver: Solver) -> str | None:
     wind = setup.wind
+    if setup.air is not None:
+        return "`copies` cannot have computed air yet, which belongs to one object: set `air` to null."
     if setup.scene.surface_places is not None:
         return "`copies` cannot touch anything yet: set `contact` to null, and remove obstacles from the solver."
     if setup.forces:

@@ -22,6 +22,7 @@ from torch import Tensor, nn
 
 from gaussian_swaying._checks import check_literals, check_vector, number_of, requires_grad
 from gaussian_swaying._devices import in_double
+from gaussian_swaying.aero.computed_air import ComputedAir
 from gaussian_swaying.aero.force import AeroForce
 from gaussian_swaying.aero.wind import SpatialWind, WindField
 from gaussian_swaying.mpm.forces import Force
@@ -50,6 +51,7 @@ class Setup:
         aero: The force of the wind on patches.
         forces: The custom forces.
         solver: Numbers of the solver.
+        air: The box of computed air; None if the wind is given everywhere.
     """
 
     scene: SimulatedScene
@@ -59,6 +61,7 @@ class Setup:
     aero: AeroForce
     forces: tuple[Force, ...]
     solver: Any
+    air: ComputedAir | None = None
 
 
 Read = Callable[[Setup], Any]

@@ -14,6 +14,7 @@ import torch
 from gaussian_swaying._checks import check_choice, check_frames, check_positive, check_vector
 from gaussian_swaying._devices import double_home, move
 from gaussian_swaying._turns import Turn, in_turn
+from gaussian_swaying.aero.computed_air import ComputedAir
 from gaussian_swaying.aero.force import AeroForce
 from gaussian_swaying.aero.wind import SpatialWind, WindField
 from gaussian_swaying.config.parser import (
@@ -87,6 +88,8 @@ class Simulation:
         wind: Air velocity over time; in Python also one that varies in space, or three numbers [m/s]. Still air if
             None.
         aero: Force of the wind on patches; :class:`AeroForce` with its defaults if None.
+        air: Box in which the air is computed, with ``wind`` as its inflow; null for the wind as it is everywhere. See
+            docs/air.md.
         contact: Contact of the material with itself; null for none. Obstacles are boundaries of the solver.
         forces: Custom forces besides gravity and wind, each given by its class path.
         shader: Shading; null keeps the splat's colours.
@@ -142,6 +145,7 @@ class Simulation:
         solver: SolverLike | None = None,
         wind: WindLike | None = None,
         aero: AeroForce | None = None,
+        air: ComputedAir | None = None,
         contact: Contact | None = None,
         forces: list[Force] = [],  # noqa: B006  (never changed; the schema of the config shows it)
         shader: Shader | None = None,
@@ -194,7 +198,7 @@ class Simulation:
         blowing = as_wind(wind, model.frame)
         camera = as_camera(camera, cameras, blowing, model)
         own = tuple(force.in_frame(model.frame) for force in as_forces(forces))
-        setup = Setup(model, material, model.points, blowing, aero or AeroForce(), own, solver.settings)
+        setup = Setup(model, material, model.points, blowing, aero or AeroForce(), own, solver.settings, air)
         placed = copies_of(copies, setup, solver) if copies else None
         drawing = (shader, camera, cameras, colour, frame_dt, renderer)
         self._painter = Painter(model, *drawing) if placed is None else CopiesPainter(model, placed, *drawing)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import weakref
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from typing import NoReturn
 
@@ -13,6 +13,7 @@ from torch import Tensor
 
 from gaussian_swaying._devices import double_home, in_double
 from gaussian_swaying._turns import Turn, in_turn
+from gaussian_swaying.aero.computed_air import AirInBox
 from gaussian_swaying.aero.patches import Patches
 from gaussian_swaying.aero.shelter import Shelter
 from gaussian_swaying.aero.wind import WindField
@@ -101,6 +102,7 @@ class Stepper:
         self._wind_force: tuple[tuple[object, ...], WindForce] | None = None
         self._idle: tuple[tuple[object, ...], bool] | None = None
         self._joints: tuple[tuple[object, ...], Joints] | None = None
+        self._air: AirInBox | None = None
         self._tearing: TearingGauge | None = None
         self._gauge = Gauge()
 
@@ -157,9 +159,31 @@ class Stepper:
 
     @property
     def forces(self) -> list[Force]:
-        """The forces on the particles besides gravity: the wind, unless it has no effect, joints and custom forces."""
+        """The forces on the particles besides gravity: the wind, unless it has no effect, joints and custom forces.
+
+        The force of computed air is not among them; :meth:`roll` adds it.
+        """
         custom = [*self.joints, *self.setup.forces]
-        return custom if self.idle else [self.wind_force, *custom]
+        return custom if self.idle or self.setup.air is not None else [self.wind_force, *custom]
+
+    @property
+    def air(self) -> AirInBox | None:
+        """The computed air, if there is any; made by :meth:`start`."""
+        return self._air
+
+    def air_at(self, state: State, place: Tensor) -> Tensor:
+        """Velocity of the air at places [m/s]: that of the computed air, or else that of the wind.
+
+        Args:
+            state: The state.
+            place: Places [m], shape (P, 3).
+
+        Returns:
+            Broadcastable to (P, 3).
+        """
+        if self._air is not None and state.air is not None:
+            return self._air.velocity_at(state.air, place)
+        return self.wind_force.air(state.time, place)
 
     def flows(self) -> Tensor:
         """Flows of the wind without gusts [m/s], shape (K, 3); those of a spatial wind are at the particles."""
@@ -181,7 +205,7 @@ class Stepper:
         move, F = scene.follow.motion(state)
         normal, area = deform_patch(F, scene.rest_facing.to(F), F.new_ones(len(F)))
         place = scene.frame.point_to_sim(in_double(scene.model.means[scene.moving])).to(move) + move
-        wind = self.wind_force.air(state.time, place)
+        wind = self.air_at(state, place)
         force = self.setup.aero(wind, scene.follow.velocity(state), normal, torch.ones_like(area))
         return scene.on_gaussians(torch.where(scene.in_wind, torch.linalg.vector_norm(force, dim=-1), 0.0))
 
@@ -219,7 +243,17 @@ class Stepper:
         self._check_rounding(state, self.frame_dt / at_rest)
         self.most_substeps = min(MAX_GROWTH * at_rest, MAX_SUBSTEPS)
         self._tearing = None if self.solver.neighbours_fixed else TearingGauge(self.solver)
-        return state
+        return self._with_air(state)
+
+    def _with_air(self, state: State) -> State:
+        """The state at rest with computed air, if the setup has some."""
+        setup = self.setup
+        if setup.air is None:
+            self._air = None
+            return state
+        with torch.inference_mode(False), torch.no_grad():
+            self._air = AirInBox(setup.air, self.wind_force, self.solver, setup.scene.frame, self.frame_dt, state)
+            return state.replace(air=self._air.start(state.time))
 
     def rehearse(self) -> None:
         """Raise the errors that a start with the present setup would raise."""
@@ -375,7 +409,7 @@ class Stepper:
         if not (math.isfinite(rate) and blowing < MAX_WIND):
             cause = f"the wind of {blowing:.3g} m/s, or its drag, is NaN or infinite or beyond {MAX_WIND:g} m/s"
             self.give_up(state, cause, "check the flow and the modulations of the wind")
-        explicit = self.setup.aero.drag_step != "semi_implicit"
+        explicit = self.setup.aero.drag_step != "semi_implicit" and self.setup.air is None
         self._steps = max(steps, int(rate * self.frame_dt) + 1) if explicit else steps
         return self._steps
 
@@ -393,10 +427,24 @@ class Stepper:
         """
         progress, fitted = self.progress, self.solver.fit_grid(state, self.frame_dt, margin)
         watch = None if progress is None else lambda done: progress.substep(done, steps)
+        if self._air is not None:
+            return self._roll_with_air(fitted, steps, watch)
         # the end of a frame is checked with its measurements, as each check makes the host wait
         return self.solver.watched_rollout(
             fitted, self.frame_dt / steps, steps, self.forces, CFL_SAMPLES, watch, check=False
         )
+
+    def _roll_with_air(self, state: State, substeps: int, watch: Callable[[int], None] | None) -> tuple[State, Tensor]:
+        """As :meth:`roll`, of the body and the computed air."""
+        air = self._air
+        assert air is not None
+        if state.air is None or air.frame_dt != self.frame_dt:
+            raise ValueError("computed air has one length of the frame: start the simulation again for another one")
+        if any(tensor.requires_grad for tensor in state.tensors()):
+            raise ValueError("computed air has no gradients: set `air` to null")
+        air.load = self.wind_force
+        end, moments, courant = air.roll(self.solver, state, state.air, substeps, self.forces, CFL_SAMPLES, watch)
+        return end.replace(air=moments), courant
 
 
 class Launched:
@@ -539,6 +587,8 @@ def needs_of(stepper: Stepper, state: State, winds: Tensor | None) -> Tensor:
 def why_not_batched(setup: Setup) -> str | None:
     """Return the reason why a scene cannot be one of a batch; None if it can."""
     wind = setup.wind
+    if setup.air is not None:
+        return "the air is computed for one scene at a time; set `air` to null"
     if isinstance(wind, WindField) and any(isinstance(effect, Shelter) for effect in wind.effects):
         return "the wind has a Shelter, which depends on the motion of one scene; remove it from `wind.effects`"
     if setup.scene.surface_places is not None:

@@ -61,12 +61,12 @@ def streaks(stepper: Stepper, state: State, camera: Camera) -> tuple[Tensor, Ten
     seconds = 0.125 * wide / max(speed, 1e-6) if speed > 0 else 1.0
     places, speeds = [], []
     for _ in range(STEPS + 1):
-        air = stepper.wind_force.air(state.time, place.to(state.position))
+        air = stepper.air_at(state, place.to(state.position))
         air = in_double(air).expand_as(place)
         places.append(place)
         speeds.append(torch.linalg.vector_norm(air, dim=-1))
         half = place + 0.5 * seconds / STEPS * air  # midpoint rule
-        middle = in_double(stepper.wind_force.air(state.time, half.to(state.position))).expand_as(place)
+        middle = in_double(stepper.air_at(state, half.to(state.position))).expand_as(place)
         place = place + seconds / STEPS * middle
     points = torch.stack(places, 1)
     return frame.point_to_scene(points.reshape(-1, 3)).view_as(points), torch.stack(speeds, 1)

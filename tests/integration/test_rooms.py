@@ -10,6 +10,7 @@ FLOORS = (
     "kernels",
     "geometry",
     "gaussians metrics mpm runs",
+    "air",
     "aero rendering scenes",
     "captures",
     "interop recording",

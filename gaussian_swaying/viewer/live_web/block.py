@@ -56,6 +56,8 @@ def check(simulation: Simulation) -> None:
         raise _refused("`edits`", "leave them out")
     if simulation.stepper.joints:
         raise _refused("joints of `scene.parts`", "leave out `joint_stiffness` and `joint_turning` of its parts")
+    if setup.air is not None:
+        raise _refused("computed air", "set `air` to null")
     if setup.forces:
         raise _refused("`forces` of your own", "leave them out")
     wind = setup.wind

@@ -1,0 +1,389 @@
+"""Computed air: a flow in a box around the body, which the body bends and which bends the body."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import torch
+from torch import Tensor, nn
+
+from gaussian_swaying._checks import check_choice, check_plain, check_positive, check_vector, check_whole
+from gaussian_swaying._devices import double_home
+from gaussian_swaying.aero.obstacles import Obstacle
+from gaussian_swaying.aero.shelter import Shelter
+from gaussian_swaying.aero.wind import WindField
+from gaussian_swaying.aero.wind_force import WindForce
+from gaussian_swaying.air.flow import WALL, Face, FlowState, LatticeFlow
+from gaussian_swaying.air.immersed import Reach, exchange, give, layer_mass, velocity_at
+from gaussian_swaying.air.lattice import FASTEST, LatticeUnits
+from gaussian_swaying.geometry.frame import SimFrame
+from gaussian_swaying.geometry.regions import Region
+from gaussian_swaying.mpm.forces import Force
+from gaussian_swaying.mpm.protocol import Solver
+from gaussian_swaying.mpm.state import State
+from gaussian_swaying.mpm.timestep import look_marks
+
+LEAST_CELLS = 8
+"""Cells along the longest side of the body: with fewer, no wake of it is resolved."""
+
+LIGHTEST = 0.02
+"""Smallest ratio of the mass of a point to that of the layer of air that it moves."""
+
+
+class ComputedAir(nn.Module):
+    r"""A box in which the air is computed, by a lattice Boltzmann flow, instead of given by the wind.
+
+    The wind of the simulation blows in through the faces of the box. The surface of the body stops the air as an
+    immersed boundary (:mod:`~gaussian_swaying.air.immersed`), and gets the force that this takes. docs/air.md says what
+    it is good for, and what not.
+
+    Args:
+        low: Lower corner of the box [m], from the object's centre, z up.
+        high: Upper corner [m]. The last cells may reach beyond it.
+        cells: Cells along its longest side.
+        force: ``surface``: the body stops the air, for sheets that are larger than a few cells. ``law``: the law and
+            the coefficients of ``aero`` act on every patch, in the air at it, and the air loses what it gives, for
+            leaves and threads that are smaller than a cell.
+        ground: Whether the lower face is the ground; otherwise the wind blows along it.
+        walls: Regions in scene units in which there is no air, as around obstacles; they do not move.
+        viscosity: Kinematic viscosity of the air [m²/s].
+        smagorinsky: Constant of the subgrid model; 0 for none, which is for low Reynolds numbers.
+        speed: Speed [m/s] that is ``lattice_speed`` cells per step; null for the largest of the wind without gusts, and
+            half as much again.
+        lattice_speed: The smaller it is, the smaller is the error of compressibility, and the more steps a frame takes.
+
+    Raises:
+        ValueError: If a number is out of range.
+    """
+
+    def __init__(
+        self,
+        low: Sequence[float],
+        high: Sequence[float],
+        cells: int = 48,
+        *,
+        force: Literal["surface", "law"] = "surface",
+        ground: bool = False,
+        walls: list[Region] = [],  # noqa: B006  (never changed)
+        viscosity: float = 1.5e-5,
+        smagorinsky: float = 0.1,
+        speed: float | None = None,
+        lattice_speed: float = 0.1,
+    ) -> None:
+        super().__init__()
+        self.low, self.high = check_vector("low", low), check_vector("high", high)
+        if not all(a < b for a, b in zip(self.low, self.high, strict=True)):
+            raise ValueError(f"Expected `low` of the air below `high` along each axis, but got {low} and {high}.")
+        check_whole("cells", cells, LEAST_CELLS)
+        check_choice("force", force, ("surface", "law"))
+        check_positive("viscosity", viscosity)
+        check_positive("smagorinsky", smagorinsky, allow_zero=True)
+        check_positive("lattice_speed", lattice_speed)
+        if lattice_speed > FASTEST:
+            raise ValueError(f"Expected `lattice_speed` of at most {FASTEST}, but got {lattice_speed}.")
+        check_plain("speed", speed)
+        if speed is not None:
+            check_positive("speed", speed)
+        self.cells, self.force, self.ground, self.walls = cells, force, bool(ground), list(walls)
+        self.viscosity, self.smagorinsky = float(viscosity), float(smagorinsky)
+        self.speed, self.lattice_speed = speed, float(lattice_speed)
+
+    @property
+    def spacing(self) -> float:
+        """Side of a cell [m]."""
+        return max(b - a for a, b in zip(self.low, self.high, strict=True)) / self.cells
+
+    def counts(self) -> tuple[int, int, int]:
+        """Cells along x, y and z, with those within the ground."""
+        sides = [math.ceil((b - a) / self.spacing - 1e-6) for a, b in zip(self.low, self.high, strict=True)]
+        return sides[0], sides[1], sides[2] + self.ground
+
+
+class AirPush(Force):
+    """The force of computed air on the points, the same in all substeps of a step of the air.
+
+    Args:
+        points: Their number.
+        like: A tensor of their type and device.
+    """
+
+    recordable = True
+
+    def __init__(self, points: int, like: Tensor) -> None:
+        super().__init__()
+        self.register_buffer("value", like.new_zeros(points, 3), persistent=False)
+        self.value: Tensor
+
+    def forward(self, state: State) -> Tensor:
+        """Force [N], shape (P, 3)."""
+        return self.value
+
+
+@dataclass(frozen=True)
+class Resolution:
+    """What a box costs, and what it resolves.
+
+    Attributes:
+        cells: Cells along x, y and z.
+        spacing: Side of a cell [m].
+        steps: Steps of the air in a frame.
+        megabytes: Memory of the air on the device [MB].
+        reynolds: Reynolds number of the body: speed times longest side over viscosity.
+        resolved: The same with the viscosity that the subgrid model has where the speed changes within a cell,
+            :math:`\nu + C_s^2 h U`: eddies of larger Reynolds numbers are not resolved.
+    """
+
+    cells: tuple[int, int, int]
+    spacing: float
+    steps: int
+    megabytes: float
+    reynolds: float
+    resolved: float
+
+    def __str__(self) -> str:
+        size = " x ".join(map(str, self.cells))
+        return (
+            f"computed air: {size} cells of {100 * self.spacing:.3g} cm, {self.steps} steps a frame, "
+            f"{self.megabytes:.3g} MB; Reynolds number {self.reynolds:.2g}, resolved up to {self.resolved:.2g}"
+        )
+
+
+BYTES = 3 * 40 + 1 + 24
+"""Bytes for a cell: three sets of moments, its kind, and what points share among cells."""
+
+
+class AirInBox:
+    """The computed air of a run: its flow, and the exchange of momentum with a body.
+
+    Args:
+        settings: The box.
+        load: The wind on the patches of the body.
+        solver: The solver, bound to its material.
+        frame: From scene units to metres.
+        frame_dt: Length of a frame [s].
+        state: The state at rest.
+
+    Attributes:
+        flow: The flow.
+        steps: Its steps in a frame.
+        resolution: What it costs and resolves.
+
+    Raises:
+        ValueError: If the air cannot be right: too few cells, points too far apart or too light, a wind that has no
+            place here.
+    """
+
+    def __init__(
+        self, settings: ComputedAir, load: WindForce, solver: Solver, frame: SimFrame, frame_dt: float, state: State
+    ) -> None:
+        self.settings, self.frame_dt = settings, frame_dt
+        self.load, self._solver = load, solver
+        device, density = state.position.device, load.aero.air_density
+        if density == 0:
+            raise ValueError("Computed air needs `aero.air_density` above 0.")
+        wind = load.wind
+        if not isinstance(wind, WindField):
+            raise ValueError("Computed air takes its inflow from `wind`, a WindField: leave out the custom wind.")
+        apart = [type(effect).__name__ for effect in wind.effects if isinstance(effect, (Shelter, Obstacle))]
+        if apart:
+            raise ValueError(
+                f"Computed air makes wakes itself: remove {', '.join(apart)} from `wind.effects`, and put obstacles into "
+                "`air.walls`."
+            )
+        h, cells = settings.spacing, settings.counts()
+        fastest = float(torch.linalg.vector_norm(wind.flows.detach(), dim=-1).amax())
+        speed = settings.speed or 1.5 * fastest
+        if not speed > 0:
+            raise ValueError("Computed air in a still wind needs `air.speed`: the largest speed that is expected [m/s].")
+        self.steps = max(math.ceil(frame_dt * speed / (settings.lattice_speed * h) - 1e-9), 1)
+        units = LatticeUnits(h, frame_dt / self.steps, settings.viscosity, density)
+        self.origin = torch.tensor(settings.low, dtype=torch.float64)
+        if settings.ground:
+            self.origin[2] -= h
+        centres = self._centres(cells)
+        walls = torch.zeros(cells, dtype=torch.bool)
+        for region in settings.walls:
+            walls |= region.contains(frame.point_to_scene(centres)).cpu()
+        faces: list[Face | tuple[Face, Face]] = ["open", "open", ("wall", "open") if settings.ground else "open"]
+        self.flow = LatticeFlow(cells, units, faces=faces, walls=walls, smagorinsky=settings.smagorinsky).to(device)
+        self._inflow = centres.reshape(-1, 3)[self.flow.held.long().cpu()].to(double_home(device))
+        self.push = AirPush(state.position.shape[-2], state.position)
+        area, mass = load.area.reshape(-1), solver.points.mass
+        self._area = (area / h**2).to(torch.float32)
+        self._mass = (mass / units.cell_mass).to(torch.float32)
+        self.resolution = self._measured(state, speed)
+        self._check(state, area)
+
+    def _centres(self, cells: tuple[int, int, int]) -> Tensor:
+        axes = [torch.arange(n, dtype=torch.float64) + 0.5 for n in cells]
+        return self.origin + self.settings.spacing * torch.stack(torch.meshgrid(*axes, indexing="ij"), -1)
+
+    def _measured(self, state: State, speed: float) -> Resolution:
+        settings = self.settings
+        length = float((state.position.amax(0) - state.position.amin(0)).amax())
+        counted = math.prod(self.flow.cells)
+        eddies = settings.smagorinsky**2 * settings.spacing * speed
+        return Resolution(
+            self.flow.cells, settings.spacing, self.steps, counted * BYTES / 1e6,
+            speed * length / settings.viscosity, speed * length / (settings.viscosity + eddies),
+        )  # fmt: skip
+
+    def _check(self, state: State, area: Tensor) -> None:
+        h, settings = self.settings.spacing, self.settings
+        low, high = state.position.amin(0).tolist(), state.position.amax(0).tolist()
+        box = settings.low, settings.high
+        if not all(a + 2 * h <= x and y <= b - 2 * h for a, x, y, b in zip(box[0], low, high, box[1], strict=True)):
+            held = f"from {_rounded(low)} to {_rounded(high)} m"
+            raise ValueError(
+                f"The body reaches {held} from its centre, within two cells of the faces of `air`: lower `air.low`, or "
+                "raise `air.high`."
+            )
+        length = max(b - a for a, b in zip(low, high, strict=True))
+        if length < LEAST_CELLS * h:
+            raise ValueError(
+                f"The body is {length / h:.1f} cells of air long, and with fewer than {LEAST_CELLS} no wake is resolved: "
+                f"raise `air.cells` to {math.ceil(self.settings.cells * LEAST_CELLS * h / length)} or more."
+            )
+        if settings.force == "law":
+            return
+        widest = float(area.amax()) ** 0.5
+        if widest > h:
+            raise ValueError(
+                f"The points of the surface are {widest:.3g} m apart and the cells of air {h:.3g} m wide: air would pass "
+                f"between them. Lower `air.cells` to {int(self.settings.cells * h / widest)}, or give the surface more "
+                "points (`solver.dx`)."
+            )
+        reach = self._reach(state.position)
+        layer = layer_mass(self._area, reach, math.prod(self.flow.cells))
+        ratio = float(torch.where(layer > 0, self._mass / layer.clamp(min=1e-30), math.inf).amin())
+        if ratio < LIGHTEST:
+            raise ValueError(
+                f"A point of the surface weighs {ratio:.2g} of the layer of air that it moves, and below {LIGHTEST} the "
+                "force of the air is no longer right: raise `air.cells` or `material.density`."
+            )
+
+    def _reach(self, position: Tensor) -> Reach:
+        place = (position.detach() - self.origin.to(position)) / self.settings.spacing - 0.5
+        return Reach.around(place.float(), self.flow.kind)
+
+    def start(self, time: Tensor) -> Tensor:
+        """The moments of air that moves as the wind does, shape (10, X, Y, Z)."""
+        centres = self._centres(self.flow.cells).to(time.device)
+        wind = self.load.air(time, centres.reshape(-1, 3)).expand(centres.numel() // 3, 3)
+        velocity = wind.T.reshape(3, *self.flow.cells)
+        return self.flow.start(velocity.float()).moments
+
+    def velocity_at(self, moments: Tensor, place: Tensor) -> Tensor:
+        """Velocity of the air at places [m/s], shape (..., 3); 0 in walls, and at the border outside of the box."""
+        flat = place.reshape(-1, 3)
+        low = self.origin.to(flat)
+        high = low + self.settings.spacing * torch.tensor(self.flow.cells, device=flat.device)
+        edge = 2 * self.settings.spacing
+        found = velocity_at(moments, self._reach(torch.minimum(torch.maximum(flat, low + edge), high - edge)))
+        return (found * self.flow.units.speed).to(place).reshape(place.shape)
+
+    @torch.no_grad()
+    def roll(
+        self,
+        solver: Solver,
+        state: Any,
+        moments: Tensor,
+        substeps: int,
+        forces: Sequence[Force],
+        looks: int,
+        watch: Callable[[int], None] | None = None,
+    ) -> tuple[Any, Tensor, Tensor]:
+        """Advance the air and the body by a frame: in each step of the air, the exchange, the body, and then the air.
+
+        Args:
+            solver: The solver.
+            state: The state of the body now.
+            moments: Those of the air now; they stay as they are.
+            substeps: Substeps of the body that a frame needs; it takes as many in each step of the air.
+            forces: Other forces than that of the air.
+            looks: How often the Courant number is checked.
+            watch: Called with the number of substeps that are done.
+
+        Returns:
+            The state of the body, the moments of the air, and the largest Courant number.
+
+        Raises:
+            ValueError: If the wind is too fast for the steps, or points left the box.
+        """
+        units, each = self.flow.units, -(-substeps // self.steps)
+        dt, acting = units.dt / each, [self.push, *forces]
+        begin, end = (self._wind(state.time + k * self.frame_dt) for k in (0, 1))
+        self._check_speed(begin, end)
+        now, spare = torch.empty_like(moments), torch.empty_like(moments)
+        now.copy_(moments)
+        seen, marks = [], set(look_marks(self.steps, looks))
+        for step in range(self.steps):
+            taken = self._exchange(now, state)
+            scale = units.cell_mass * units.speed / units.dt
+            self.push.value.copy_(taken.to(self.push.value) * scale)
+            state, cfl = solver.watched_rollout(state, dt, each, acting, 1, None, check=False)
+            if step + 1 in marks:
+                seen.append(cfl)
+            self.flow.advance(now, spare, torch.lerp(begin, end, (step + 1) / self.steps))
+            now, spare = spare, now
+            if watch is not None:
+                watch((step + 1) * each)
+        self._check_inside(state)
+        return state, now, torch.stack(seen).amax()
+
+    def _exchange(self, moments: Tensor, state: State) -> Tensor:
+        """What the points take in a step, in units of the lattice; the air loses it."""
+        speed = self.flow.units.speed
+        reach = self._reach(state.position)
+        velocity = state.velocity.float() / speed
+        if self.settings.force == "surface":
+            return exchange(moments, velocity, self._area, self._mass, reach)
+        air = velocity_at(moments, reach)
+        force, _ = self.load.force(state, (air * speed).to(state.velocity))
+        taken = force.float() * (self.flow.units.dt / (self.flow.units.cell_mass * speed))
+        layer = layer_mass(self._area, reach, math.prod(self.flow.cells))
+        most = self._mass * layer / (self._mass + layer).clamp(min=1e-30)
+        most = most * torch.linalg.vector_norm(air - velocity, dim=-1)
+        size = torch.linalg.vector_norm(taken, dim=-1)
+        taken = taken * (most / size.clamp(min=1e-30)).clamp(max=1)[:, None]  # no more than stops the air at the point
+        give(moments, taken, reach)
+        return taken
+
+    def _wind(self, time: Tensor) -> Tensor:
+        """The wind at the open faces [m/s], shape (H, 3)."""
+        wind = self.load.air(time, self._inflow)
+        return wind.to(self.flow.outward).expand(len(self._inflow), 3)
+
+    def _check_speed(self, *winds: Tensor) -> None:
+        fastest = max(float(torch.linalg.vector_norm(wind, dim=-1).amax()) for wind in winds)
+        if not fastest <= FASTEST * self.flow.units.speed:
+            raise ValueError(
+                f"the wind of {fastest:.3g} m/s is too fast for the steps of the air, which are for up to "
+                f"{FASTEST * self.flow.units.speed:.3g} m/s: raise `air.speed`"
+            )
+
+    def _check_inside(self, state: State) -> None:
+        low = self.origin.to(state.position) + 1.5 * self.settings.spacing
+        high = torch.tensor(self.settings.high).to(state.position) - 0.5 * self.settings.spacing
+        out = ((state.position < low) | (state.position > high)).any()
+        if bool(out):
+            raise ValueError("the body has left the box of computed air: widen `air.low` and `air.high`")
+
+    def momentum(self, moments: Tensor) -> Tensor:
+        """Momentum of the air in the box [kg m/s], shape (3,), float64."""
+        return self.flow.momentum(FlowState(moments))
+
+    @property
+    def walls(self) -> Tensor:
+        """The wall cells, bool, shape (X, Y, Z)."""
+        return self.flow.kind == WALL
+
+
+def _rounded(values: Sequence[float]) -> str:
+    return "(" + ", ".join(f"{value:.3g}" for value in values) + ")"
+
+
+__all__ = ["AirInBox", "AirPush", "ComputedAir", "Resolution"]
