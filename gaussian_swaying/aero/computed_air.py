@@ -124,7 +124,7 @@ class AirPush(Force):
 
 @dataclass(frozen=True)
 class Resolution:
-    """What a box costs, and what it resolves.
+    r"""What a box costs, and what it resolves.
 
     Attributes:
         cells: Cells along x, y and z.
@@ -190,14 +190,16 @@ class AirInBox:
         apart = [type(effect).__name__ for effect in wind.effects if isinstance(effect, (Shelter, Obstacle))]
         if apart:
             raise ValueError(
-                f"Computed air makes wakes itself: remove {', '.join(apart)} from `wind.effects`, and put obstacles into "
-                "`air.walls`."
+                f"Computed air makes wakes itself: remove {', '.join(apart)} from `wind.effects`, and put obstacles "
+                "into `air.walls`."
             )
         h, cells = settings.spacing, settings.counts()
         fastest = float(torch.linalg.vector_norm(wind.flows.detach(), dim=-1).amax())
         speed = settings.speed or 1.5 * fastest
         if not speed > 0:
-            raise ValueError("Computed air in a still wind needs `air.speed`: the largest speed that is expected [m/s].")
+            raise ValueError(
+                "Computed air in a still wind needs `air.speed`: the largest speed that is expected [m/s]."
+            )
         self.steps = max(math.ceil(frame_dt * speed / (settings.lattice_speed * h) - 1e-9), 1)
         units = LatticeUnits(h, frame_dt / self.steps, settings.viscosity, density)
         self.origin = torch.tensor(settings.low, dtype=torch.float64)
@@ -244,16 +246,16 @@ class AirInBox:
         length = max(b - a for a, b in zip(low, high, strict=True))
         if length < LEAST_CELLS * h:
             raise ValueError(
-                f"The body is {length / h:.1f} cells of air long, and with fewer than {LEAST_CELLS} no wake is resolved: "
-                f"raise `air.cells` to {math.ceil(self.settings.cells * LEAST_CELLS * h / length)} or more."
+                f"The body is {length / h:.1f} cells of air long, and with fewer than {LEAST_CELLS} no wake is "
+                f"resolved: raise `air.cells` to {math.ceil(self.settings.cells * LEAST_CELLS * h / length)} or more."
             )
         if settings.force == "law":
             return
         widest = float(area.amax()) ** 0.5
         if widest > h:
             raise ValueError(
-                f"The points of the surface are {widest:.3g} m apart and the cells of air {h:.3g} m wide: air would pass "
-                f"between them. Lower `air.cells` to {int(self.settings.cells * h / widest)}, or give the surface more "
+                f"The points of the surface are {widest:.3g} m apart and the cells of air {h:.3g} m wide: air would "
+                f"pass between them. Lower `air.cells` to {int(self.settings.cells * h / widest)}, or give the surface more "
                 "points (`solver.dx`)."
             )
         reach = self._reach(state.position)
@@ -261,13 +263,16 @@ class AirInBox:
         ratio = float(torch.where(layer > 0, self._mass / layer.clamp(min=1e-30), math.inf).amin())
         if ratio < LIGHTEST:
             raise ValueError(
-                f"A point of the surface weighs {ratio:.2g} of the layer of air that it moves, and below {LIGHTEST} the "
-                "force of the air is no longer right: raise `air.cells` or `material.density`."
+                f"A point of the surface weighs {ratio:.2g} of the layer of air that it moves, and below {LIGHTEST} "
+                "the force of the air is no longer right: raise `air.cells` or `material.density`."
             )
 
     def _reach(self, position: Tensor) -> Reach:
-        place = (position.detach() - self.origin.to(position)) / self.settings.spacing - 0.5
-        return Reach.around(place.float(), self.flow.kind)
+        return Reach.around(self._place(position), self.flow.kind)
+
+    def _place(self, position: Tensor) -> Tensor:
+        """Positions [m] in cells from the centre of the first cell, float32."""
+        return ((position.detach() - self.origin.to(position)) / self.settings.spacing - 0.5).float()
 
     def start(self, time: Tensor) -> Tensor:
         """The moments of air that moves as the wind does, shape (10, X, Y, Z)."""
@@ -337,10 +342,10 @@ class AirInBox:
     def _exchange(self, moments: Tensor, state: State) -> Tensor:
         """What the points take in a step, in units of the lattice; the air loses it."""
         speed = self.flow.units.speed
-        reach = self._reach(state.position)
         velocity = state.velocity.float() / speed
         if self.settings.force == "surface":
-            return exchange(moments, velocity, self._area, self._mass, reach)
+            return exchange(moments, velocity, self._area, self._mass, self._place(state.position), self.flow.kind)
+        reach = self._reach(state.position)
         air = velocity_at(moments, reach)
         force, _ = self.load.force(state, (air * speed).to(state.velocity))
         taken = force.float() * (self.flow.units.dt / (self.flow.units.cell_mass * speed))

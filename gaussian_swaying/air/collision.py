@@ -42,7 +42,9 @@ def population(moments: Tensor, number: int) -> Tensor:
     c = DIRECTIONS[number]
     excess, u = moments[0], moments[1:4]
     rho = 1 + excess
-    N = {pair: moments[4 + k] for k, pair in enumerate(PAIRS)} | {(b, a): moments[4 + k] for k, (a, b) in enumerate(PAIRS)}
+    N = {pair: moments[4 + k] for k, pair in enumerate(PAIRS)} | {
+        (b, a): moments[4 + k] for k, (a, b) in enumerate(PAIRS)
+    }
     total = excess.clone()
     for a in range(3):
         if c[a]:

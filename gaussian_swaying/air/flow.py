@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Literal
 
 import torch
@@ -11,7 +11,7 @@ from torch import Tensor, nn
 
 from gaussian_swaying._checks import check_choice, check_positive, check_whole
 from gaussian_swaying.air.collision import MOMENTS, collide, population, sums
-from gaussian_swaying.air.lattice import DIRECTIONS, OPPOSITE, WEIGHTS, LatticeUnits
+from gaussian_swaying.air.lattice import DIRECTIONS, OPPOSITE, SOUND, WEIGHTS, LatticeUnits
 from gaussian_swaying.kernels.launch import replaces
 
 FACES = ("periodic", "wall", "open")
@@ -37,11 +37,11 @@ class FlowState:
 class LatticeFlow(nn.Module):
     """A flow on a box of cubic cells: D3Q27, a regularised collision with third-order terms, Smagorinsky's model.
 
-    A wall lies halfway between the centres of a wall cell and its neighbour (bounce-back). The outermost cells of an
-    ``open`` face have the velocity of the wind and the pressure of their neighbour where the wind blows in or along the
-    face, and the pressure at rest and the velocity of their neighbour where it blows out. The outermost cells of a
-    ``wall`` face are wall cells. A wall may move along its surface. On a GPU and on a CPU the step runs as compiled kernels in float32; the functions of
-    :mod:`collision` and :meth:`step` in float64 are their definition.
+    A wall lies halfway between the centres of a wall cell and its neighbour (bounce-back), and may move along its
+    surface. The outermost cells of a ``wall`` face are wall cells. Those of an ``open`` face have the velocity of the
+    wind and the pressure of their neighbour where the wind blows in or along the face (sound may leave, see
+    :func:`hold`), and the pressure at rest and the velocity of their neighbour where it blows out. In float32 the step
+    runs as compiled kernels on a GPU and on a CPU; :meth:`step` in float64 is their definition.
 
     Args:
         cells: Cells along x, y and z. With one cell along an axis, which must be periodic, the flow is two-dimensional.
@@ -144,7 +144,9 @@ class LatticeFlow(nn.Module):
         given = torch.as_tensor(velocity, dtype=dtype, device=self.kind.device)
         moments[1:4] = (given if given.ndim > 1 else given[:, None, None, None]) / self.units.speed
         wall = self.kind == WALL
-        moments[1:4] = torch.where(wall, 0.0 if wall_velocity is None else wall_velocity / self.units.speed, moments[1:4])
+        moments[1:4] = torch.where(
+            wall, 0.0 if wall_velocity is None else wall_velocity / self.units.speed, moments[1:4]
+        )
         return FlowState(moments)
 
     def velocity(self, state: FlowState) -> Tensor:
@@ -161,7 +163,7 @@ class LatticeFlow(nn.Module):
         return (mass * state.moments[1:4].double()).sum((1, 2, 3)) * self.units.cell_mass * self.units.speed
 
     def force_on_walls(self, state: FlowState, part: Tensor) -> Tensor:
-        """Force of the air on some wall cells in the next step [N], shape (3,), float64, by the momentum of what returns.
+        """Force of the air on some wall cells in the next step [N], shape (3,), float64: the momentum of what returns.
 
         Args:
             state: The state now.
@@ -171,12 +173,13 @@ class LatticeFlow(nn.Module):
         total = torch.zeros(3, dtype=torch.float64, device=part.device)
         air = self.kind != WALL
         for number, c in enumerate(DIRECTIONS):
-            link = (torch.roll(part, c, (0, 1, 2)) & air).nonzero(as_tuple=True)
-            if not len(link[0]):
+            link = (torch.roll(part, c, (0, 1, 2)) & air).nonzero()
+            if not len(link):
                 continue
-            cells = state.moments[(slice(None), *link)].double()
-            wall = [(place - shift) % count for place, shift, count in zip(link, c, self.cells, strict=True)]
-            moving = state.moments[(slice(1, 4), *wall)].double()
+            strides = link.new_tensor([self.cells[1] * self.cells[2], self.cells[2], 1])
+            behind = torch.remainder(link - link.new_tensor(c), link.new_tensor(self.cells))
+            flat = state.moments.reshape(MOMENTS, -1).double()
+            cells, moving = flat[:, (link * strides).sum(-1)], flat[1:4, (behind * strides).sum(-1)]
             along = torch.tensor(c, dtype=torch.float64, device=part.device)
             back = 2 * population(cells, OPPOSITE[number]) + 6 * WEIGHTS[number] * (along[:, None] * moving).sum(0)
             total -= along * back.sum()
@@ -232,7 +235,11 @@ class LatticeFlow(nn.Module):
 
 
 def hold(moments: Tensor, held: Tensor, behind: Tensor, outward: Tensor, wind: Tensor) -> None:
-    """Set the cells of open faces, in place.
+    r"""Set the cells of open faces, in place.
+
+    Where the wind does not blow out, they have its velocity and what lets sound leave: a wave that arrives with a
+    pressure p has the velocity :math:`p / (\rho c)`, which is added along the outward normal (c is the speed of sound).
+    At low Mach numbers this is small beside the wind, and without it sound would go to and fro between the faces.
 
     Args:
         moments: Shape (10, X, Y, Z).
@@ -248,7 +255,8 @@ def hold(moments: Tensor, held: Tensor, behind: Tensor, outward: Tensor, wind: T
     into = (leaving * outward.to(wind)).sum(-1, keepdim=True).clamp(max=0)  # nothing flows back in
     leaving = leaving - into * outward.to(wind) / outward.to(wind).square().sum(-1, keepdim=True)
     flat[0, held] = torch.where(out, 0.0, near[0])
-    flat[1:4, held] = torch.where(out[:, None], leaving, wind).T
+    normal = outward.to(wind) / outward.to(wind).square().sum(-1, keepdim=True).sqrt()
+    flat[1:4, held] = torch.where(out[:, None], leaving, wind + SOUND * near[0][:, None] * normal).T
     flat[4:, held] = near[4:]
 
 

@@ -187,23 +187,22 @@ def hold_faces(moments, held, behind, outward, wind, cells, count, BLOCK: tl.con
     out = x * ox + y * oy + z * oz > 1e-6
     into = tl.minimum(near[1] * ox + near[2] * oy + near[3] * oz, 0.0) / (ox * ox + oy * oy + oz * oz)
     tl.store(moments + at, tl.where(out, 0.0, near[0]), mask)
-    tl.store(moments + count + at, tl.where(out, near[1] - into * ox, x), mask)
-    tl.store(moments + 2 * count + at, tl.where(out, near[2] - into * oy, y), mask)
-    tl.store(moments + 3 * count + at, tl.where(out, near[3] - into * oz, z), mask)
+    sound = 0.5773502691896258 * near[0] / tl.sqrt(ox * ox + oy * oy + oz * oz)
+    tl.store(moments + count + at, tl.where(out, near[1] - into * ox, x + sound * ox), mask)
+    tl.store(moments + 2 * count + at, tl.where(out, near[2] - into * oy, y + sound * oy), mask)
+    tl.store(moments + 3 * count + at, tl.where(out, near[3] - into * oz, z + sound * oz), mask)
     for q in tl.static_range(4, 10):
         tl.store(moments + q * count + at, near[q], mask)
 
 
-def step(flow, moments, out, wind, push):  # type: ignore[no-untyped-def]  # noqa: ANN001, ANN201
+def step(flow, moments, out, wind, push):
     """See ``LatticeFlow.advance``; ``wind`` and ``push`` in units of the lattice."""
     block = lanes(moments.device, BLOCK, CPU_BLOCK)
     nx, ny, nz = flow.cells
     count = nx * ny * nz
     numbers = (flow.units.relaxation, 18 * 2**0.5 * flow.smagorinsky**2, *push)
     strides = (ny * nz if nx > 1 else 0, nz if ny > 1 else 0, 1 if nz > 1 else 0)
-    launch(flow_step, (triton.cdiv(count, block),))(
-        moments, out, flow.kind, count, *strides, *numbers, BLOCK=block
-    )
+    launch(flow_step, (triton.cdiv(count, block),))(moments, out, flow.kind, count, *strides, *numbers, BLOCK=block)
     if len(flow.special):
         launch(special_step, (triton.cdiv(len(flow.special), block),))(
             moments, out, flow.kind, flow.special, len(flow.special), count, nx, ny, nz, *numbers, BLOCK=block

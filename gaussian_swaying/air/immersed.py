@@ -11,7 +11,8 @@ cell). Air is read, and momentum given, with the quadratic B-spline of three cel
 (Peskin 2002, Acta Numerica 11); :math:`c_p = \sum_q \sum_n w_{pn} w_{qn} A_q / h^2` is how thickly the surface covers
 the cells at p. With it, what the points together give to a cell never moves the air beyond them, however many layers
 lie in a cell; on a heavy surface the air has the velocity of the surface after each step (direct forcing, Uhlmann 2005,
-J. Comput. Phys. 209). The reduced mass :math:`\mu` does the same for a light one, so that any ratio of masses is stable.
+J. Comput. Phys. 209). The reduced mass :math:`\mu` does the same for a light one, so that any ratio of masses is
+stable.
 Momentum is kept to rounding, as the weights of a point add up to one.
 """
 
@@ -24,6 +25,7 @@ from torch import Tensor
 
 from gaussian_swaying.air.collision import MOMENTS
 from gaussian_swaying.air.flow import FLUID
+from gaussian_swaying.kernels.launch import replaces
 from gaussian_swaying.mpm.transfer import bspline_weights
 
 
@@ -94,20 +96,28 @@ def layer_mass(area: Tensor, reach: Reach, cells: int) -> Tensor:
     return torch.where(cover > 0, area / cover.clamp(min=1e-30), 0.0)
 
 
-def exchange(moments: Tensor, velocity: Tensor, area: Tensor, mass: Tensor, reach: Reach) -> Tensor:
+def exchange(moments: Tensor, velocity: Tensor, area: Tensor, mass: Tensor, place: Tensor, kind: Tensor) -> Tensor:
     """The momentum that points take from the air in a step; the air loses it at once, in ``moments``.
+
+    In float32 it runs as kernels. On a GPU the order of their sums is not fixed.
 
     Args:
         moments: Of the flow, changed in place, shape (10, X, Y, Z).
         velocity: Of the points [cells per step], shape (P, 3).
         area: Their area in faces of a cell, shape (P,).
         mass: Their mass in units of the air in a cell, shape (P,).
-        reach: Their cells.
+        place: In cells from the centre of the first cell, shape (P, 3).
+        kind: What the cells are, see ``LatticeFlow``, shape (X, Y, Z).
 
     Returns:
         Momentum in units of that of a cell at one cell per step, shape (P, 3).
     """
-    cells = moments[0].numel()
+    if replaces([moments, velocity, area, mass, place]):
+        from gaussian_swaying.air import immersed_kernels
+
+        found: Tensor = immersed_kernels.exchange(moments, velocity, area, mass, place, kind)
+        return found
+    cells, reach = moments[0].numel(), Reach.around(place, kind)
     layer = layer_mass(area, reach, cells)
     both = mass + layer
     reduced = torch.where(both > 0, mass * layer / both.clamp(min=1e-30), 0.0)

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 from gaussian_swaying._checks import check_positive
 
-DIRECTIONS: tuple[tuple[int, int, int], ...] = tuple(itertools.product((0, 1, -1), repeat=3))  # type: ignore[assignment]
+DIRECTIONS: tuple[tuple[int, int, int], ...] = tuple(itertools.product((0, 1, -1), (0, 1, -1), (0, 1, -1)))
 """The velocities [cells per step], the one at rest first."""
 
 WEIGHTS: tuple[float, ...] = tuple(math.prod((2 / 3, 1 / 6)[abs(c)] for c in each) for each in DIRECTIONS)

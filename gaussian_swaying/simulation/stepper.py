@@ -411,6 +411,8 @@ class Stepper:
             self.give_up(state, cause, "check the flow and the modulations of the wind")
         explicit = self.setup.aero.drag_step != "semi_implicit" and self.setup.air is None
         self._steps = max(steps, int(rate * self.frame_dt) + 1) if explicit else steps
+        if self._air is not None:
+            self._steps = -(-self._steps // self._air.steps) * self._air.steps
         return self._steps
 
     def _winds(self, force: WindForce, state: State) -> Tensor:

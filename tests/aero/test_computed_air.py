@@ -1,0 +1,214 @@
+"""Computed air around a sheet: momentum, energy, masses, what it costs, and what is refused."""
+
+import pytest
+import torch
+
+from gaussian_swaying import AeroForce, Simulation, WindField
+from gaussian_swaying.aero.computed_air import ComputedAir
+from gaussian_swaying.aero.effects import LogProfile
+from gaussian_swaying.aero.obstacles import SphereObstacle
+from gaussian_swaying.geometry.regions import Box
+from gaussian_swaying.mpm.solver import MPMSolver
+from gaussian_swaying.scenes.procedural import FlagScene
+from gaussian_swaying.simulation.material import Material
+from gaussian_swaying.simulation.stepper import why_not_batched
+
+LOW, HIGH = [-1.2, -0.9, -0.9], [1.5, 0.9, 0.9]
+
+
+def _simulation(air=None, wind=(3.0, 0.5, 0.0), hold=True, density=100.0, dtype="float32", **changes):
+    """A small flag across a box of 27 x 18 x 18 cells."""
+    given = {"cells": 27, "speed": 6.0} | changes
+    return Simulation(
+        FlagScene(spacing=0.05),
+        Material(E=2e4, nu=0.3, density=density, thickness=0.01),
+        solver=MPMSolver(dx=0.1, gravity=[0.0, 0.0, 0.0]) if not hold else None,
+        hold=Box([None, None, None], [0.06, None, None]) if hold else None,
+        wind=wind if isinstance(wind, WindField) else list(wind),
+        air=air or ComputedAir(LOW, HIGH, **given),
+        dtype=dtype,
+        device="cpu",
+        frame_dt=0.02,
+    )
+
+
+def _run(simulation, frames):
+    stepper = simulation.stepper
+    state = stepper.start()
+    for _ in range(frames):
+        state, health = stepper.advance(state)
+    return stepper, state, health
+
+
+@pytest.mark.parametrize("dtype", ["float32", "float64"])
+def test_a_free_sheet_gets_the_momentum_that_the_air_loses(dtype):
+    """In one step of the air, with its faces and all; rounding of float32 is that of the air."""
+    stepper = _simulation(hold=False, dtype=dtype).stepper
+    state = stepper.start()
+    air = stepper.air
+    now = state.air.clone()
+    before = air.momentum(now)
+    taken = air._exchange(now, state).double() * air.flow.units.cell_mass * air.flow.units.speed
+    lost = before - air.momentum(now)
+    torch.testing.assert_close(lost, taken.sum(0), rtol=1e-4, atol=2e-6 * float(before.abs().max()))
+    air.push.value.copy_(taken / air.flow.units.dt)
+    end = stepper.solver.rollout(state, air.flow.units.dt / 4, 4, [air.push])
+    gained = stepper.solver.momenta(end)["linear"].double()
+    torch.testing.assert_close(gained, taken.sum(0), rtol=1e-4, atol=1e-7)
+
+
+def test_a_frame_moves_the_sheet_and_bends_the_air():
+    stepper, state, health = _run(_simulation(), 3)
+    assert health.kinetic > 0
+    assert health.lost == 0
+    behind = stepper.air_at(state, torch.tensor([[0.75, 0.0, 0.0], [0.0, 0.0, 0.75]]))
+    assert float(behind[0, 0]) < float(behind[1, 0])  # slower behind the flag than above it
+
+
+def test_still_air_takes_energy_and_gives_none():
+    """A sheet that is bent and let go, held at its pole."""
+    simulation = _simulation(wind=(0.0, 0.0, 0.0))
+    stepper = simulation.stepper
+    state = stepper.start()
+    kick = torch.zeros_like(state.velocity)
+    kick[:, 1] = 2.0 * (state.position[:, 0] + 0.6)
+    nodes = None if state.node_velocity is None else torch.zeros_like(state.node_velocity)
+    if nodes is not None:
+        place = state.grid.node_positions(state.position)
+        nodes[..., 1] = 2.0 * (place[:, 0] + 0.6).clamp(min=0)
+    state = state.replace(velocity=kick, node_velocity=nodes)
+    units = stepper.air.flow.units
+
+    def energy(state):
+        own = stepper.solver.energies(state)
+        moments = state.air.double()
+        flow = 0.5 * ((1 + moments[0]) * moments[1:4].square().sum(0)).sum() * units.cell_mass * units.speed**2
+        return float(own["kinetic"] + own["elastic"] + flow)
+
+    before = energy(state)
+    for _ in range(12):
+        state, _ = stepper.advance(state)
+        now = energy(state)
+        assert now <= before * 1.001
+        before = now
+
+
+@pytest.mark.slow(gate=["0.1", "100.0"])
+@pytest.mark.parametrize("ratio", [0.1, 1.0, 10.0, 100.0])
+def test_any_ratio_of_masses_ends_finite(ratio):
+    """Mass of the sheet per air of its length, from 0.1 to 100."""
+    density = ratio * 1.225 * 1.2 / 0.01
+    _, state, _ = _run(_simulation(density=density), 6)
+    assert bool(torch.isfinite(state.position).all())
+    assert bool(torch.isfinite(state.air).all())
+    assert float(state.velocity.norm(dim=-1).amax()) < 12.0
+
+
+def test_the_law_acts_in_the_air_at_the_patches():
+    """With ``force: law`` the air loses what the patches get, and less of it than with a surface that stops it."""
+    lost = {}
+    for force in ("law", "surface"):
+        stepper = _simulation(force=force, wind=(0.5, 3.0, 0.0)).stepper
+        state = stepper.start()
+        now = state.air.clone()
+        before = stepper.air.momentum(now)
+        taken = stepper.air._exchange(now, state).double().sum(0)
+        found = (before - stepper.air.momentum(now)) / (stepper.air.flow.units.cell_mass * stepper.air.flow.units.speed)
+        torch.testing.assert_close(found, taken, rtol=1e-3, atol=1e-4)
+        lost[force] = float(taken[1])
+    assert 0 < lost["law"] < lost["surface"]
+
+
+def test_the_inflow_is_any_wind():
+    wind = WindField([4.0, 0.0, 0.0], effects=[LogProfile([0.0, 0.0, -1.2], height=2.0, roughness=0.05)])
+    stepper, state, _ = _run(_simulation(wind=wind), 1)
+    low, high = stepper.air_at(state, torch.tensor([[-1.0, 0.0, -0.7], [-1.0, 0.0, 0.7]]))[:, 0]
+    assert float(low) < 0.8 * float(high)
+
+
+def test_ground_and_walls_are_still():
+    walls = [Box([-0.4, -0.8, -0.4], [-0.2, -0.6, 1.0])]
+    stepper = _simulation(ground=True, walls=walls).stepper
+    state = stepper.start()
+    assert bool(stepper.air.walls[:, :, 0].all())
+    assert bool(stepper.air.walls[:, :, 3:].any())
+    state, _ = stepper.advance(state)
+    assert float(state.air[1:4, stepper.air.walls].abs().max()) == 0
+
+
+def test_a_checkpoint_goes_on_bit_by_bit():
+    stepper, state, _ = _run(_simulation(), 2)
+    saved = type(state).from_state_dict(state.state_dict())
+    first, _ = stepper.advance(state)
+    again = _simulation().stepper
+    again.start()
+    second, _ = again.advance(saved)
+    assert torch.equal(first.position, second.position)
+    assert torch.equal(first.air, second.air)
+
+
+def test_a_batch_gradients_and_another_frame_are_refused():
+    stepper, state, _ = _run(_simulation(), 1)
+    with pytest.raises(RuntimeError, match="no gradients"):
+        stepper.advance(state.replace(velocity=state.velocity.clone().requires_grad_()))
+    stepper.frame_dt = 0.03
+    with pytest.raises(RuntimeError, match="length of the frame"):
+        stepper.advance(state)
+    assert "set `air` to null" in why_not_batched(stepper.setup)
+
+
+def test_what_a_box_costs_and_resolves():
+    stepper = _simulation().stepper
+    stepper.start()
+    found = stepper.air.resolution
+    assert found.cells == (27, 18, 18)
+    assert found.spacing == pytest.approx(0.1)
+    assert found.steps == 12
+    assert found.megabytes == pytest.approx(27 * 18 * 18 * 145e-6)
+    assert found.reynolds == pytest.approx(6.0 * 1.15 / 1.5e-5, rel=0.05)
+    assert found.resolved < found.reynolds
+    assert "Reynolds number" in str(found)
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"cells": 200}, "air would pass between them"),
+        ({"cells": 18}, "no wake is resolved"),
+        ({"density": 0.2}, "layer of air"),
+        ({"wind": (0.0, 0.0, 0.0), "speed": None}, "air.speed"),
+        ({"air": ComputedAir([-0.6, -0.9, -0.9], HIGH, 24, speed=6.0)}, "within two cells"),
+        ({"wind": WindField([3.0, 0.0, 0.0], effects=[SphereObstacle([0.0, 0.0, 0.0], 0.1)])}, "air.walls"),
+    ],
+)
+def test_what_cannot_be_right_is_refused(changes, message):
+    with pytest.raises(ValueError, match=message):
+        _simulation(**changes).stepper.start()
+
+
+def test_a_wind_that_outruns_the_steps_ends_the_run():
+    simulation = _simulation(speed=0.5)
+    with pytest.raises(RuntimeError, match="raise `air.speed`"):
+        _run(simulation, 1)
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"cells": 4}, "cells"),
+        ({"low": HIGH}, "below `high`"),
+        ({"lattice_speed": 0.5}, "lattice_speed"),
+        ({"viscosity": 0.0}, "viscosity"),
+        ({"force": "drag"}, "force"),
+        ({"speed": -1.0}, "speed"),
+    ],
+)
+def test_bad_settings(changes, message):
+    with pytest.raises(ValueError, match=message):
+        ComputedAir(**({"low": LOW, "high": HIGH} | changes))
+
+
+def test_a_wind_that_is_not_there_costs_nothing():
+    """The default coefficients of the wind's force do not act beside computed air."""
+    assert not any(type(force).__name__ == "WindForce" for force in _simulation().stepper.forces)
+    assert AeroForce().air_density > 0

@@ -1,0 +1,135 @@
+"""The flow against exact and published ones, and its kernels against torch.
+
+Covers: air.flow_kernels. The problems are those of tools/bench/problems/air.py; the bench records finer ones.
+"""
+
+import math
+
+import pytest
+import torch
+from bench.problems import air
+
+from gaussian_swaying.air.flow import HELD, WALL, FlowState, LatticeFlow
+from gaussian_swaying.air.lattice import LatticeUnits
+
+UNITS = LatticeUnits.at_speed(0.1, 1.0, viscosity=1e-3, density=1.2)
+BOXES = {
+    "wind over ground": ((12, 10, 9), ("open", "periodic", ("wall", "open"))),
+    "slab": ((12, 1, 9), ("open", "periodic", "open")),
+    "periodic": ((7, 6, 8), ("periodic",) * 3),
+    "flat": ((6, 8, 1), ("open", "wall", "periodic")),
+}
+
+
+def _random(flow, seed=0):
+    """A flow that differs from cell to cell, with moving walls, and a wind that blows in and out."""
+    draw = torch.Generator().manual_seed(seed)
+    velocity = torch.randn(3, *flow.cells, dtype=torch.float64, generator=draw)
+    walls = 0.1 * torch.randn(3, *flow.cells, dtype=torch.float64, generator=draw)
+    moments = flow.start(velocity, walls, dtype=torch.float64).moments
+    other = torch.randn(7, *flow.cells, dtype=torch.float64, generator=draw) * (flow.kind != WALL)
+    moments[0] += 0.01 * other[0]
+    moments[4:] += 0.001 * other[1:]
+    return FlowState(moments), torch.randn(len(flow.held), 3, dtype=torch.float64, generator=draw)
+
+
+@pytest.mark.parametrize("name", BOXES)
+@pytest.mark.parametrize("walls", [False, True])
+def test_kernels_compute_the_step(name, walls, kernel_device):
+    cells, faces = BOXES[name]
+    solid = torch.rand(cells, generator=torch.Generator().manual_seed(1)) < 0.05 if walls else None
+    flow = LatticeFlow(cells, UNITS, faces=faces, walls=solid)
+    state, wind = _random(flow)
+    push = (0.1, 0.2, 0.3)
+    expected = flow.step(state, wind, push).moments
+    single = flow.to(kernel_device).step(FlowState(state.moments.float().to(kernel_device)), wind, push).moments
+    torch.testing.assert_close(single.cpu().double(), expected, rtol=0, atol=3e-7)
+
+
+def test_mass_and_momentum_of_a_periodic_box_stay():
+    flow = LatticeFlow((6, 5, 7), UNITS, faces=("periodic",) * 3)
+    state, _ = _random(flow)
+    mass, momentum = state.moments[0].sum(), flow.momentum(state)
+    for _ in range(20):
+        state = flow.step(state)
+    torch.testing.assert_close(state.moments[0].sum(), mass)
+    torch.testing.assert_close(flow.momentum(state), momentum)
+
+
+def test_walls_get_the_momentum_that_the_air_loses():
+    walls = torch.zeros(8, 8, 8, dtype=torch.bool)
+    walls[3:5, 3:5, 3:6] = True
+    flow = LatticeFlow((8, 8, 8), UNITS, faces=("periodic",) * 3, walls=walls)
+    state, _ = _random(flow)
+    before, force = flow.momentum(state), flow.force_on_walls(state, walls)
+    after = flow.momentum(flow.step(state))
+    torch.testing.assert_close(before - after, force * UNITS.dt)
+
+
+def test_vortices_decay_with_second_order():
+    coarse, fine = air.taylor_green(16), air.taylor_green(32)
+    assert fine < 1e-3
+    assert math.log2(coarse / fine) > 1.6
+
+
+@pytest.mark.slow(gate=[])
+def test_vortices_decay_with_second_order_on_fine_grids():
+    coarse, fine = air.taylor_green(32), air.taylor_green(64)
+    assert math.log2(coarse / fine) > 1.8
+
+
+def test_flow_between_walls_is_of_second_order():
+    coarse, fine = air.poiseuille(8), air.poiseuille(16)
+    assert fine < 3e-3
+    assert math.log2(coarse / fine) == pytest.approx(2, abs=0.02)
+
+
+def test_cavity_agrees_with_ghia():
+    """Within 4 % of the speed of the lid with 32 cells; the bench has finer ones."""
+    assert air.cavity(32) < 0.015
+
+
+def test_wind_blows_through_an_open_box_undisturbed():
+    flow = LatticeFlow((12, 8, 8), UNITS)
+    state = flow.start([0.8, 0.3, -0.2])
+    for _ in range(60):
+        state = flow.step(state, torch.tensor([0.8, 0.3, -0.2]))
+    expected = torch.tensor([0.8, 0.3, -0.2])[:, None, None, None].expand(3, 12, 8, 8)
+    torch.testing.assert_close(flow.velocity(state), expected, rtol=0, atol=1e-5)
+    assert float(flow.pressure(state).abs().max()) < 1e-4
+
+
+def test_a_new_wind_fills_the_box():
+    flow = LatticeFlow((12, 8, 8), UNITS)
+    state = flow.start([0.5, 0.0, 0.0])
+    for _ in range(400):
+        state = flow.step(state, torch.tensor([1.0, 0.0, 0.0]))
+    torch.testing.assert_close(flow.velocity(state)[0].mean(), torch.tensor(1.0), rtol=0.02, atol=0)
+
+
+def test_kinds_of_cells():
+    walls = torch.zeros(6, 5, 5, dtype=torch.bool)
+    walls[2, 2, 2] = True
+    flow = LatticeFlow((6, 5, 5), UNITS, faces=("open", "open", ("wall", "open")), walls=walls)
+    assert bool((flow.kind[:, :, 0] == WALL).all())
+    assert int(flow.kind[2, 2, 2]) == WALL
+    assert bool((flow.kind[0, :, 1:] == HELD).all())
+    assert flow.has_walls
+    assert set(flow.kind.reshape(-1)[flow.held.long()].tolist()) == {HELD}
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"cells": (3, 8, 8)}, "At least 4|at least 4"),
+        ({"cells": (8, 8)}, "three numbers"),
+        ({"faces": (("periodic", "open"), "open", "open")}, "periodic or none"),
+        ({"faces": ("shut", "open", "open")}, "faces"),
+        ({"walls": torch.zeros(2, 2, 2, dtype=torch.bool)}, "walls"),
+        ({"smagorinsky": -1.0}, "smagorinsky"),
+        ({"cells": (2000, 2000, 2000)}, "at most"),
+    ],
+)
+def test_bad_input(changes, message):
+    with pytest.raises(ValueError, match=message):
+        LatticeFlow(**({"cells": (8, 8, 8), "units": UNITS} | changes))

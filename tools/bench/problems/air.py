@@ -1,0 +1,188 @@
+"""Flows with known solutions, in the computed air alone: no body moves in them.
+
+Lengths are in sizes of the body or of the box, velocities in that of the wind, so that the Reynolds number is one over
+the viscosity. Flows in a plane have one cell along y.
+"""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from torch import Tensor
+
+from gaussian_swaying.air.flow import FlowState, LatticeFlow
+from gaussian_swaying.air.immersed import exchange
+from gaussian_swaying.air.lattice import LatticeUnits
+
+GHIA = {
+    0.0547: -0.03717, 0.1016: -0.06434, 0.1719: -0.10150, 0.2813: -0.15662, 0.4531: -0.21090, 0.5: -0.20581,
+    0.6172: -0.13641, 0.8516: 0.23151, 0.9531: 0.68717, 0.9766: 0.84123,
+}  # fmt: skip
+"""Velocity along the lid on the upright line through the middle of the cavity at Re 100, by height (Ghia, Ghia and Shin
+1982, J. Comput. Phys. 48, table I)."""
+
+
+def units_of(spacing: float, reynolds: float, lattice_speed: float = 0.1) -> LatticeUnits:
+    """Units in which the wind is ``lattice_speed``, of air of density 1."""
+    return LatticeUnits.at_speed(spacing, 1.0, lattice_speed=lattice_speed, viscosity=1 / reynolds, density=1.0)
+
+
+def _relative(found: Tensor, exact: Tensor) -> float:
+    return float((found - exact).square().mean().sqrt() / exact.square().mean().sqrt())
+
+
+def taylor_green(cells: int, reynolds: float = 100.0, until: float = 0.5) -> float:
+    """Relative error of decaying vortices in a periodic box of side 1; the time step shrinks with the square of a cell.
+
+    The exact flow is u = (sin kx cos kz, 0, -cos kx sin kz) exp(-2 nu k² t), k = 2 pi.
+    """
+    units = units_of(1 / cells, reynolds, 0.8 / cells)
+    flow = LatticeFlow((cells, 1, cells), units, faces=("periodic",) * 3, smagorinsky=0)
+    axis, k = 2 * math.pi * (torch.arange(cells, dtype=torch.float64) + 0.5) / cells, 2 * math.pi
+    x, z = torch.meshgrid(axis, axis, indexing="ij")
+    start = torch.stack([x.sin() * z.cos(), 0 * x, -x.cos() * z.sin()])[:, :, None]
+    state, tau = flow.start(start, dtype=torch.float64), units.relaxation
+    state.moments[0] = 0.75 * ((2 * x).cos() + (2 * z).cos())[:, None] / units.speed**2
+    strain = (k * x.cos() * z.cos() * units.dt)[:, None]
+    state.moments[4] = -(1 - 1 / tau) * 2 * tau / 3 * strain  # the stress of the exact flow
+    state.moments[6] = -state.moments[4]
+    steps = round(until / units.dt)
+    for _ in range(steps):
+        state = flow.step(state)
+    return _relative(flow.velocity(state), start * math.exp(-2 / reynolds * k * k * steps * units.dt))
+
+
+def poiseuille(cells: int, reynolds: float = 10.0) -> float:
+    """Relative error of the steady flow between two walls, at a distance of 1, that a force of all the air drives."""
+    units = units_of(1 / cells, reynolds, 0.8 / cells)
+    flow = LatticeFlow((4, 1, cells + 2), units, faces=("periodic", "periodic", "wall"), smagorinsky=0)
+    height = (torch.arange(cells, dtype=torch.float64) + 0.5) / cells
+    exact, push = 4 * height * (1 - height), 8 / reynolds
+    start = torch.zeros(3, *flow.cells, dtype=torch.float64)
+    start[0, :, :, 1:-1] = exact
+    state = flow.start(start, dtype=torch.float64)
+    for _ in range(round(2 * reynolds / math.pi**2 / units.dt)):
+        state = flow.step(state, acceleration=(push, 0.0, 0.0))
+    found = flow.velocity(state)[0, 0, 0, 1:-1] - 0.5 * push * units.dt  # at the time of the step
+    return _relative(found, exact)
+
+
+def cavity(cells: int, until: float = 25.0, reynolds: float = 100.0) -> float:
+    """Largest difference from :data:`GHIA`, per speed of the lid."""
+    units = units_of(1 / cells, reynolds)
+    flow = LatticeFlow((cells + 2, 1, cells + 2), units, faces=("wall", "periodic", "wall"), smagorinsky=0)
+    lid = torch.zeros(3, *flow.cells)
+    lid[0, :, :, -1] = 1.0
+    state = flow.start(wall_velocity=lid)
+    state = _run(flow, state, round(until / units.dt))
+    u = flow.velocity(state)[0, :, 0]
+    middle = 0.5 * (u[cells // 2] + u[cells // 2 + 1])
+    worst = 0.0
+    for height, known in GHIA.items():
+        place = height * cells + 0.5
+        low = int(place)
+        worst = max(worst, abs(float(torch.lerp(middle[low], middle[low + 1], place - low)) - known))
+    return worst
+
+
+def _run(flow: LatticeFlow, state: FlowState, steps: int, wind: Tensor | None = None) -> FlowState:
+    now, spare = state.moments.clone(), torch.empty_like(state.moments)
+    for _ in range(steps):
+        flow.advance(now, spare, wind)
+        now, spare = spare, now
+    return FlowState(now)
+
+
+WIND = torch.tensor([1.0, 0.0, 0.0])
+
+
+def cylinder(
+    cells: int, until: float = 140.0, reynolds: float = 100.0, length: int = 30, height: int = 24
+) -> dict[str, float]:
+    """Street of vortices behind a cylinder of wall cells: Strouhal number, mean drag and amplitude of the lift.
+
+    Published for Re 100: a Strouhal number of 0.164 (Williamson 1989, J. Fluid Mech. 206), a drag of 1.33 to 1.35.
+
+    Args:
+        cells: Cells in a diameter.
+        until: Time [diameters over speed]; the last 50 are measured.
+        reynolds: Reynolds number.
+        length: Of the box in diameters; the cylinder stands 10 behind its front.
+        height: Of the box in diameters.
+    """
+    units = units_of(1 / cells, reynolds)
+    x = (torch.arange(length * cells) + 0.5) / cells - 10
+    z = (torch.arange(height * cells) + 0.5) / cells - height / 2
+    walls = (x[:, None].square() + z.square() < 0.25)[:, None]
+    flow = LatticeFlow(walls.shape, units, faces=("open", "periodic", "open"), walls=walls, smagorinsky=0)
+    diameter = math.sqrt(4 / math.pi * int(walls.sum())) / cells  # of the circle of the same area
+    start = torch.zeros(3, *walls.shape)
+    start[0] = 1
+    start[2] = 0.3 * torch.exp(-((x[:, None, None] - 1.5).square()) - z.square())
+    now, each, forces = flow.start(start), 10, []
+    for _ in range(round(until / units.dt / each)):
+        now = _run(flow, now, each, WIND)
+        forces.append(flow.force_on_walls(now, walls))
+    drag, lift = (torch.stack(forces)[-round(50 / units.dt / each) :] / (0.5 * diameter / cells))[:, [0, 2]].T
+    frequency = _frequency(lift, each * units.dt)
+    return {
+        "strouhal": diameter * frequency, "drag": float(drag.mean()), "lift": float(lift.max() - lift.min()) / 2,
+        "diameter": diameter,
+    }  # fmt: skip
+
+
+def _frequency(values: Tensor, dt: float) -> float:
+    """Mean frequency of upward crossings of the mean; 0 for fewer than two."""
+    values = values - values.mean()
+    at = ((values[:-1] < 0) & (values[1:] >= 0)).nonzero()[:, 0]
+    if len(at) < 2:
+        return 0.0
+    place = at + values[at] / (values[at] - values[at + 1])
+    return float((len(at) - 1) / ((place[-1] - place[0]) * dt))
+
+
+def sphere(
+    cells: int, until: float = 30.0, reynolds: float = 100.0, length: int = 12, width: int = 8
+) -> dict[str, float]:
+    """Drag of a sphere of wall cells; 1.09 at Re 100 (Clift, Grace and Weber 1978, standard drag curve)."""
+    units = units_of(1 / cells, reynolds)
+    x = (torch.arange(length * cells) + 0.5) / cells - 4
+    y = (torch.arange(width * cells) + 0.5) / cells - width / 2
+    walls = x[:, None, None].square() + y[:, None].square() + y.square() < 0.25
+    flow = LatticeFlow(walls.shape, units, walls=walls, smagorinsky=0)
+    diameter = (6 / math.pi * int(walls.sum())) ** (1 / 3) / cells
+    state = _run(flow, flow.start([1.0, 0.0, 0.0]), round((until - 2) / units.dt), WIND)
+    forces, each = [], 10
+    for _ in range(round(2 / units.dt / each)):
+        state = _run(flow, state, each, WIND)
+        forces.append(flow.force_on_walls(state, walls)[0])
+    force = float(torch.stack(forces).mean())
+    return {"drag": force / (0.5 * math.pi / 4 * diameter**2), "diameter": diameter}
+
+
+def plate(
+    cells: int, until: float = 40.0, reynolds: float = 300.0, length: int = 12, width: int = 8, smagorinsky: float = 0.0
+) -> dict[str, float]:
+    """Mean drag of a square plate across the flow, an immersed surface; 1.17 at high Reynolds numbers (Hoerner 1965).
+
+    The drag is the mean over the second half of the time.
+    """
+    units = units_of(1 / cells, reynolds)
+    flow = LatticeFlow((length * cells, width * cells, width * cells), units, smagorinsky=smagorinsky)
+    many = 2 * cells
+    side = (torch.arange(many) + 0.5) / many - 0.5
+    y, z = torch.meshgrid(side, side, indexing="ij")
+    place = torch.stack([torch.full_like(y, 4.0), y + width / 2, z + width / 2], -1).reshape(-1, 3) * cells - 0.5
+    area, mass = torch.full((many**2,), (cells / many) ** 2), torch.full((many**2,), 1e9)
+    still = torch.zeros(many**2, 3)
+    now = flow.start([1.0, 0.0, 0.0]).moments
+    spare, drag, steps = torch.empty_like(now), 0.0, round(until / units.dt)
+    for step in range(steps):
+        taken = exchange(now, still, area, mass, place, flow.kind)
+        if 2 * step >= steps:
+            drag += float(taken[:, 0].sum()) / (steps - steps // 2)
+        flow.advance(now, spare, WIND)
+        now, spare = spare, now
+    scale = units.cell_mass * units.speed / units.dt / 0.5
+    return {"drag": drag * scale}
