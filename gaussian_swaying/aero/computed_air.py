@@ -124,7 +124,7 @@ class AirPush(Force):
 
 @dataclass(frozen=True)
 class Resolution:
-    r"""What a box costs, and what it resolves.
+    r"""Cost of a box, and the Reynolds number that it resolves.
 
     Attributes:
         cells: Cells along x, y and z.
@@ -255,8 +255,8 @@ class AirInBox:
         if widest > h:
             raise ValueError(
                 f"The points of the surface are {widest:.3g} m apart and the cells of air {h:.3g} m wide: air would "
-                f"pass between them. Lower `air.cells` to {int(self.settings.cells * h / widest)}, or give the surface more "
-                "points (`solver.dx`)."
+                f"pass between them. Lower `air.cells` to {int(self.settings.cells * h / widest)}, or give the surface "
+                "more points (`solver.dx`)."
             )
         reach = self._reach(state.position)
         layer = layer_mass(self._area, reach, math.prod(self.flow.cells))
@@ -340,7 +340,7 @@ class AirInBox:
         return state, now, torch.stack(seen).amax()
 
     def _exchange(self, moments: Tensor, state: State) -> Tensor:
-        """What the points take in a step, in units of the lattice; the air loses it."""
+        """Momentum that the points take in a step, in units of the lattice; the air loses it."""
         speed = self.flow.units.speed
         velocity = state.velocity.float() / speed
         if self.settings.force == "surface":

@@ -24,7 +24,7 @@ Face = Literal["periodic", "wall", "open"]
 
 @dataclass(frozen=True, slots=True)
 class FlowState:
-    """What changes in a flow.
+    """The part of a flow that changes.
 
     Attributes:
         moments: Ten numbers for each cell after its collision, in units of the lattice (see :mod:`collision`), shape

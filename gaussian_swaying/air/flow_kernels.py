@@ -66,7 +66,7 @@ def _population(m, CX: tl.constexpr, CY: tl.constexpr, CZ: tl.constexpr):
 
 @triton.jit
 def _returned(own, wall, CX: tl.constexpr, CY: tl.constexpr, CZ: tl.constexpr):
-    """What comes back along (CX, CY, CZ) from a wall that may move."""
+    """The population that comes back along (CX, CY, CZ) from a wall that may move."""
     pushed = ((4 - 3 * CX * CX) * (4 - 3 * CY * CY) * (4 - 3 * CZ * CZ) / 36) * (
         CX * wall[1] + CY * wall[2] + CZ * wall[3]
     )

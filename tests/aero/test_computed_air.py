@@ -188,7 +188,7 @@ def test_what_cannot_be_right_is_refused(changes, message):
 
 def test_a_wind_that_outruns_the_steps_ends_the_run():
     simulation = _simulation(speed=0.5)
-    with pytest.raises(RuntimeError, match="raise `air.speed`"):
+    with pytest.raises(RuntimeError, match=r"raise `air\.speed`"):
         _run(simulation, 1)
 
 
