@@ -44,7 +44,7 @@ COMMAND_LINE_ONLY = ("preset", "physgaussian")
 RUN_ONLY = ("config", "output", "device", "frames", "resume")
 # constructor arguments that a YAML file sets within a component instead; components that may be null
 PYTHON_ONLY = ("up", "hold", "renderer", "cloud")
-NULLABLE = ("contact", "normalisation")
+NULLABLE = ("air", "contact", "normalisation")
 # components of one's own, by class path, and the arguments that they replace
 CUSTOM: dict[str, tuple[type, str]] = {"custom_wind": (SpatialWind, "wind"), "custom_solver": (Solver, "solver")}
 # arguments that may change between a run and the one that resumes it

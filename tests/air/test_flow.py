@@ -1,6 +1,8 @@
 """The flow against exact and published ones, and its kernels against torch.
 
-Covers: air.flow_kernels. The problems are those of tools/bench/problems/air.py; the bench records finer ones.
+The problems are those of tools/bench/problems/air.py; the bench records finer ones.
+
+Covers: air.flow_kernels.
 """
 
 import math
