@@ -4,8 +4,6 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
-from itertools import compress
-from operator import not_
 
 from torch import Tensor, nn
 
@@ -13,7 +11,7 @@ from gaussian_swaying._checks import check_like, check_shape
 from gaussian_swaying.geometry.frame import SimFrame
 from gaussian_swaying.kernels.graphs import Recordable, tensors_in
 from gaussian_swaying.mpm.state import State
-from gaussian_swaying.mpm.twins import Twinned
+from gaussian_swaying.mpm.twins import Twin, Twinned
 
 MOST_STEPS = 256
 """Largest number of substeps for which the numbers of a twin are taken at once."""
@@ -159,10 +157,12 @@ def tensors_of(forces: Sequence[Force]) -> list[Tensor]:
     return tensors_in(forces)
 
 
-def divide(forces: Sequence[Force]) -> tuple[tuple[Force, ...], tuple[Force, ...]]:
-    """The forces that have a twin, and the others, which run in torch."""
-    twinned = [force.twin() is not None for force in forces]
-    return tuple(compress(forces, twinned)), tuple(compress(forces, map(not_, twinned)))
+def divide(forces: Sequence[Force]) -> tuple[tuple[Force, ...], list[Twin], tuple[Force, ...]]:
+    """The forces that have a twin, their twins, and the others, which run in torch."""
+    twins = [force.twin() for force in forces]
+    fused = tuple(force for force, twin in zip(forces, twins, strict=True) if twin is not None)
+    asked = tuple(force for force, twin in zip(forces, twins, strict=True) if twin is None)
+    return fused, [twin for twin in twins if twin is not None], asked
 
 
 __all__ = ["Force", "ForceFunction", "Forces", "FunctionForce", "as_forces"]

@@ -20,7 +20,7 @@ from gaussian_swaying.mpm.contact.surface import Surface
 from gaussian_swaying.mpm.damping import damped_substep
 from gaussian_swaying.mpm.dispatch import LawDispatch
 from gaussian_swaying.mpm.followers import Followers, GridFollowers
-from gaussian_swaying.mpm.forces import Force, Forces, added, as_forces, divide, split, tensors_of
+from gaussian_swaying.mpm.forces import Force, Forces, added, as_forces, split, tensors_of
 from gaussian_swaying.mpm.formulations import FORMULATIONS
 from gaussian_swaying.mpm.formulations.formulation import Formulation, Settings
 from gaussian_swaying.mpm.formulations.total import Total
@@ -317,7 +317,9 @@ class MPMSolver(Solver):
 
     def _fused_for(self, state: MPMState, forces: Sequence[Force]) -> Fused:
         """As :meth:`fused`, for rollouts with forces; also None if the host has to call a force in every substep."""
-        if self._fused_obstacle is not None or not all(force.recordable for force in divide(forces)[1]):
+        if self._fused_obstacle is not None:
+            return None
+        if not all(force.recordable or force.twin() is not None for force in forces):
             return None
         asking = [*state.tensors(), *tensors_of(forces)] if torch.is_grad_enabled() else []
         return self.fused(*asking)

@@ -200,8 +200,10 @@ def test_a_force_says_for_itself_whether_it_can_be_recorded():
 def test_all_forces_with_a_twin_are_fused():
     *_, wind = _setting()
     spring, other = Spring(), WindForce(wind.aero, wind.wind, wind.normal, 2 * wind.area)
-    assert divide([spring, wind, other]) == ((wind, other), (spring,))
-    assert divide([spring]) == ((), (spring,))
+    fused, twins, asked = divide([spring, wind, other])
+    assert (fused, asked) == ((wind, other), (spring,))
+    assert [twin.function for twin in twins] == [force.twin().function for force in fused]
+    assert divide([spring]) == ((), [], (spring,))
     assert spring.twin() is None
     assert isinstance(wind.twin(), Twin)
 

@@ -194,8 +194,7 @@ class Fused(ABC):
         """
         with at_home(self.speed):
             self.speed.zero_()
-            fused, self.asked = divide(forces)
-            twins = [twin for force in fused if (twin := force.twin()) is not None]
+            fused, twins, self.asked = divide(forces)
             options = self.options_for(twins)
             options["FORCE"] = len(self.asked) > 0 or force is not None or drag is not None
             options["IMPLICIT"] = options["IMPLICIT"] or drag is not None or self._resists(state)

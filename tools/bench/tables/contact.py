@@ -79,7 +79,9 @@ def plot(results: list[Row], pictures: Path) -> None:
     for result, line in zip(known, ("o-", "s--"), strict=False):
         for case in CASES[2:]:
             found = [row["ratio"][case] for row in result["effort"]]
-            right.semilogx(most, found, line, label=f"{case}, {result['device']}")
+            right.semilogx(
+                [row["iterations"] for row in result["effort"]], found, line, label=f"{case}, {result['device']}"
+            )
     right.set_ylabel("substep / substep without contact")
     right.set_ylim(bottom=0)
     right.legend(fontsize=8)
