@@ -16,8 +16,9 @@ from gaussian_swaying.aero.obstacles import Obstacle
 from gaussian_swaying.aero.shelter import Shelter
 from gaussian_swaying.aero.wind import WindField
 from gaussian_swaying.aero.wind_force import WindForce
+from gaussian_swaying.air.collision import MOMENTS
 from gaussian_swaying.air.flow import WALL, Face, FlowState, LatticeFlow
-from gaussian_swaying.air.immersed import Reach, exchange, give, layer_mass, velocity_at
+from gaussian_swaying.air.immersed import Reach, give, look, together, velocity_at
 from gaussian_swaying.air.lattice import FASTEST, LatticeUnits
 from gaussian_swaying.geometry.frame import SimFrame
 from gaussian_swaying.geometry.regions import Region
@@ -25,6 +26,7 @@ from gaussian_swaying.mpm.forces import Force
 from gaussian_swaying.mpm.protocol import Solver
 from gaussian_swaying.mpm.state import State
 from gaussian_swaying.mpm.timestep import look_marks
+from gaussian_swaying.mpm.twins import Numbers, Twin
 
 LEAST_CELLS = 8
 """Cells along the longest side of the body: with fewer, no wake of it is resolved."""
@@ -103,23 +105,48 @@ class ComputedAir(nn.Module):
 
 
 class AirPush(Force):
-    """The force of computed air on the points, the same in all substeps of a step of the air.
+    r"""The force of computed air on the points in the substeps of a step of the air, :math:`\mathbf a - r \mathbf v`.
+
+    It decreases with the velocity of the points, so that it damps whatever they do within the step.
 
     Args:
         points: Their number.
         like: A tensor of their type and device.
+
+    Attributes:
+        numbers: Force at rest [N] and its decrease per velocity [kg/s] of each point, shape (P, 4).
     """
 
     recordable = True
 
     def __init__(self, points: int, like: Tensor) -> None:
         super().__init__()
-        self.register_buffer("value", like.new_zeros(points, 3), persistent=False)
-        self.value: Tensor
+        self.register_buffer("numbers", like.new_zeros(points, 4), persistent=False)
+        self.numbers: Tensor
+
+    def begin(self, at_rest: Tensor, rate: Tensor) -> None:
+        """Start a step of the air, with a force at rest (P, 3) and its decrease per velocity (P,)."""
+        self.numbers[:, :3] = at_rest
+        self.numbers[:, 3] = rate
+
+    def taken(self, before: State, after: State, substeps: int, dt: float) -> Tensor:
+        """Momentum that the points took between two states [kg m/s], shape (P, 3).
+
+        The sum of the velocities at which the force acted follows from the way of the points: symplectic Euler moves
+        them by the velocity at the end of each substep.
+        """
+        way = (after.position - before.position) - dt * (after.velocity - before.velocity)
+        return substeps * dt * self.numbers[:, :3] - self.numbers[:, 3:] * way
 
     def forward(self, state: State) -> Tensor:
         """Force [N], shape (P, 3)."""
-        return self.value
+        return self.numbers[:, :3] - self.numbers[:, 3:] * state.velocity
+
+    def twin(self) -> Twin:
+        """See :class:`~gaussian_swaying.mpm.twins.Twin`."""
+        from gaussian_swaying.aero.computed_air_triton import air_push
+
+        return Twin(air_push, per_point=Numbers(4, lambda: self.numbers), sources=(self.numbers,))
 
 
 @dataclass(frozen=True)
@@ -258,8 +285,8 @@ class AirInBox:
                 f"pass between them. Lower `air.cells` to {int(self.settings.cells * h / widest)}, or give the surface "
                 "more points (`solver.dx`)."
             )
-        reach = self._reach(state.position)
-        layer = layer_mass(self._area, reach, math.prod(self.flow.cells))
+        still = torch.zeros(MOMENTS, *self.flow.cells, device=self._area.device)
+        _, layer = look(still, self._area, self._place(state.position), self.flow.kind)
         ratio = float(torch.where(layer > 0, self._mass / layer.clamp(min=1e-30), math.inf).amin())
         if ratio < LIGHTEST:
             raise ValueError(
@@ -290,6 +317,10 @@ class AirInBox:
         found = velocity_at(moments, self._reach(torch.minimum(torch.maximum(flat, low + edge), high - edge)))
         return (found * self.flow.units.speed).to(place).reshape(place.shape)
 
+    def take(self, load: WindForce) -> None:
+        """Go on with another wind, or other coefficients."""
+        self.load = load
+
     @torch.no_grad()
     def roll(
         self,
@@ -301,7 +332,7 @@ class AirInBox:
         looks: int,
         watch: Callable[[int], None] | None = None,
     ) -> tuple[Any, Tensor, Tensor]:
-        """Advance the air and the body by a frame: in each step of the air, the exchange, the body, and then the air.
+        """Advance the air and the body by a frame: in each step of the air the body moves, and then the air.
 
         Args:
             solver: The solver.
@@ -326,10 +357,7 @@ class AirInBox:
         now.copy_(moments)
         seen, marks = [], set(look_marks(self.steps, looks))
         for step in range(self.steps):
-            taken = self._exchange(now, state)
-            scale = units.cell_mass * units.speed / units.dt
-            self.push.value.copy_(taken.to(self.push.value) * scale)
-            state, cfl = solver.watched_rollout(state, dt, each, acting, 1, None, check=False)
+            state, cfl = self._together(solver, state, now, dt, each, acting)
             if step + 1 in marks:
                 seen.append(cfl)
             self.flow.advance(now, spare, torch.lerp(begin, end, (step + 1) / self.steps))
@@ -339,23 +367,31 @@ class AirInBox:
         self._check_inside(state)
         return state, now, torch.stack(seen).amax()
 
-    def _exchange(self, moments: Tensor, state: State) -> Tensor:
-        """Momentum that the points take in a step, in units of the lattice; the air loses it."""
-        speed = self.flow.units.speed
-        velocity = state.velocity.float() / speed
+    def _together(
+        self, solver: Solver, state: Any, moments: Tensor, dt: float, substeps: int, acting: Sequence[Force]
+    ) -> tuple[Any, Tensor]:
+        """A step of the body, in substeps of ``dt``; the air loses what the body takes. Returns the Courant number, too."""
+        units, place = self.flow.units, self._place(state.position)
+        air, layer = look(moments, self._area, place, self.flow.kind)
+        air = (air * units.speed).to(state.velocity)
+        rate = (together(self._mass, layer / substeps) * (units.cell_mass / dt)).to(state.velocity)
         if self.settings.force == "surface":
-            return exchange(moments, velocity, self._area, self._mass, self._place(state.position), self.flow.kind)
-        reach = self._reach(state.position)
-        air = velocity_at(moments, reach)
-        force, _ = self.load.force(state, (air * speed).to(state.velocity))
-        taken = force.float() * (self.flow.units.dt / (self.flow.units.cell_mass * speed))
-        layer = layer_mass(self._area, reach, math.prod(self.flow.cells))
-        most = self._mass * layer / (self._mass + layer).clamp(min=1e-30)
-        most = most * torch.linalg.vector_norm(air - velocity, dim=-1)
-        size = torch.linalg.vector_norm(taken, dim=-1)
-        taken = taken * (most / size.clamp(min=1e-30)).clamp(max=1)[:, None]  # no more than stops the air at the point
-        give(moments, taken, reach)
-        return taken
+            self.push.begin(rate[:, None] * air, rate)
+        else:
+            self.push.begin(*self._law(state, air, rate))
+        end, cfl = solver.watched_rollout(state, dt, substeps, acting, 1, None, check=False)
+        taken = self.push.taken(state, end, substeps, dt)
+        give(moments, taken.float() / (units.cell_mass * units.speed), place, self.flow.kind)
+        return end, cfl
+
+    def _law(self, state: State, air: Tensor, most: Tensor) -> tuple[Tensor, Tensor]:
+        """The force of the law at rest, and its decrease per velocity, which is at most ``most`` [kg/s]."""
+        force, _ = self.load.force(state, air)
+        relative = torch.linalg.vector_norm(air - state.velocity, dim=-1)
+        size = torch.linalg.vector_norm(force, dim=-1)
+        rate = torch.minimum(size / relative.clamp(min=1e-6), most)
+        force = force * (rate * relative / size.clamp(min=1e-30)).clamp(max=1)[:, None]
+        return force + rate[:, None] * state.velocity, rate
 
     def _wind(self, time: Tensor) -> Tensor:
         """The wind at the open faces [m/s], shape (H, 3)."""

@@ -1,19 +1,20 @@
 r"""Thin surfaces in a lattice Boltzmann flow: immersed boundaries by direct forcing, with an exchange of momentum.
 
-A surface is a set of points with an area, a mass and a velocity. In a step each of them takes from the air around it,
-and the air loses, the momentum
+A surface is a set of points with an area. In a step of the air each of them takes from the air around it, and the air
+loses, the momentum
 
-.. math:: \mathbf J_p = \mu_p (\mathbf u(\mathbf x_p) - \mathbf v_p), \qquad
-    \frac1{\mu_p} = \frac1{m_p} + \frac1{\beta_p}, \qquad \beta_p = \frac{\rho h A_p}{c_p}
+.. math:: \mathbf J_p = \beta_p (\mathbf u(\mathbf x_p) - \bar{\mathbf v}_p), \qquad \beta_p = \frac{\rho h A_p}{c_p}
 
-as in an inelastic collision of the point with the mass :math:`\beta_p` of the layer of air at it (h is the side of a
-cell). Air is read, and momentum given, with the quadratic B-spline of three cells along each axis, a regularised delta
-(Peskin 2002, Acta Numerica 11); :math:`c_p = \sum_q \sum_n w_{pn} w_{qn} A_q / h^2` is how thickly the surface covers
-the cells at p. With it, what the points together give to a cell never moves the air beyond them, however many layers
-lie in a cell; on a heavy surface the air has the velocity of the surface after each step (direct forcing, Uhlmann 2005,
-J. Comput. Phys. 209). The reduced mass :math:`\mu` does the same for a light one, so that any ratio of masses is
-stable.
-Momentum is kept to rounding, as the weights of a point add up to one.
+where :math:`\bar v` is the mean velocity of the point in the step and :math:`\beta` the mass of the layer of air at it
+(h is the side of a cell). Air is read, and momentum given, with the quadratic B-spline of three cells along each axis,
+a regularised delta (Peskin 2002, Acta Numerica 11); :math:`c_p = \sum_q \sum_n w_{pn} w_{qn} A_q / h^2` is how thickly
+the surface covers the cells at p. With it, what the points together give to a cell never moves the air beyond them,
+however many layers lie in a cell, and the air has the velocity of the surface after each step (direct forcing, Uhlmann
+2005, J. Comput. Phys. 209). Momentum is kept to rounding, as the weights of a point add up to one.
+
+The force on the point is :math:`\beta (\mathbf u - \mathbf v) / \Delta t` in each substep of the body, with the air at the
+start of the step. So it is a drag, and air and point together lose the energy :math:`\tfrac12\beta(u - \bar v)^2` or
+more. A force that stayed the same in all substeps would feed vibrations that are faster than the step.
 """
 
 from __future__ import annotations
@@ -84,53 +85,74 @@ def velocity_at(moments: Tensor, reach: Reach) -> Tensor:
     return reach.read(moments[1:4].reshape(3, -1).T)
 
 
-def layer_mass(area: Tensor, reach: Reach, cells: int) -> Tensor:
-    r"""Mass of the layer of air that each point stops, :math:`A_p / c_p` in units of the air in a cell, shape (P,).
+def look(moments: Tensor, area: Tensor, place: Tensor, kind: Tensor) -> tuple[Tensor, Tensor]:
+    r"""Velocity of the air at points, and the mass of the layer of air at each, :math:`A_p / c_p`.
+
+    In float32 it runs as kernels. On a GPU the order of their sums is not fixed.
 
     Args:
+        moments: Of the flow, shape (10, X, Y, Z).
         area: Area of the points in faces of a cell, shape (P,).
-        reach: Their cells.
-        cells: Number of cells.
+        place: In cells from the centre of the first cell, shape (P, 3).
+        kind: What the cells are, see ``LatticeFlow``, shape (X, Y, Z).
+
+    Returns:
+        Shape (P, 3) [cells per step], and shape (P,) in units of the air in a cell; 0 for points without air.
     """
-    cover = reach.read(reach.spread(area[:, None], cells))[:, 0]
-    return torch.where(cover > 0, area / cover.clamp(min=1e-30), 0.0)
+    if replaces([moments, area, place]):
+        from gaussian_swaying.air import immersed_kernels
+
+        found: tuple[Tensor, Tensor] = immersed_kernels.look(moments, area, place, kind)
+        return found
+    reach = Reach.around(place, kind)
+    cover = reach.read(reach.spread(area[:, None], kind.numel()))[:, 0]
+    return velocity_at(moments, reach), torch.where(cover > 0, area / cover.clamp(min=1e-30), 0.0)
+
+
+def give(moments: Tensor, taken: Tensor, place: Tensor, kind: Tensor) -> None:
+    """Take momentum of points out of the air, in place.
+
+    Args:
+        moments: Of the flow, shape (10, X, Y, Z).
+        taken: What the points take, in units of the air in a cell at one cell per step, shape (P, 3).
+        place: See :func:`look`.
+        kind: See :func:`look`.
+    """
+    if replaces([moments, taken, place]):
+        from gaussian_swaying.air import immersed_kernels
+
+        immersed_kernels.give(moments, taken, place, kind)
+        return
+    flat = moments.reshape(MOMENTS, -1)
+    loss = Reach.around(place, kind).spread(taken, flat.shape[1]).T
+    flat[1:4] -= loss / (1 + flat[0])
+
+
+def together(mass: Tensor, layer: Tensor) -> Tensor:
+    r"""The reduced mass :math:`1 / (1/m + 1/\beta)` of two masses; 0 where one of them is 0."""
+    return mass * layer / (mass + layer).clamp(min=1e-30)
 
 
 def exchange(moments: Tensor, velocity: Tensor, area: Tensor, mass: Tensor, place: Tensor, kind: Tensor) -> Tensor:
-    """The momentum that points take from the air in a step; the air loses it at once, in ``moments``.
+    """The momentum that free points take from the air in a step without substeps; the air loses it, in ``moments``.
 
-    In float32 it runs as kernels. On a GPU the order of their sums is not fixed.
+    As in an inelastic collision of each point with the layer of air at it, so that any ratio of masses is stable.
 
     Args:
         moments: Of the flow, changed in place, shape (10, X, Y, Z).
         velocity: Of the points [cells per step], shape (P, 3).
         area: Their area in faces of a cell, shape (P,).
-        mass: Their mass in units of the air in a cell, shape (P,).
-        place: In cells from the centre of the first cell, shape (P, 3).
-        kind: What the cells are, see ``LatticeFlow``, shape (X, Y, Z).
+        mass: Their mass in units of the air in a cell, shape (P,); infinite for still ones is given as a large number.
+        place: See :func:`look`.
+        kind: See :func:`look`.
 
     Returns:
-        Momentum in units of that of a cell at one cell per step, shape (P, 3).
+        Momentum in units of the air in a cell at one cell per step, shape (P, 3).
     """
-    if replaces([moments, velocity, area, mass, place]):
-        from gaussian_swaying.air import immersed_kernels
-
-        found: Tensor = immersed_kernels.exchange(moments, velocity, area, mass, place, kind)
-        return found
-    cells, reach = moments[0].numel(), Reach.around(place, kind)
-    layer = layer_mass(area, reach, cells)
-    both = mass + layer
-    reduced = torch.where(both > 0, mass * layer / both.clamp(min=1e-30), 0.0)
-    taken = reduced[:, None] * (velocity_at(moments, reach) - velocity)
-    give(moments, taken, reach)
+    air, layer = look(moments, area, place, kind)
+    taken = together(mass, layer)[:, None] * (air - velocity)
+    give(moments, taken, place, kind)
     return taken
 
 
-def give(moments: Tensor, taken: Tensor, reach: Reach) -> None:
-    """Take momentum of points, shape (P, 3), out of the air, in place."""
-    flat = moments.reshape(MOMENTS, -1)
-    loss = reach.spread(taken, flat.shape[1]).T
-    flat[1:4] -= loss / (1 + flat[0])
-
-
-__all__ = ["Reach", "exchange", "give", "layer_mass", "velocity_at"]
+__all__ = ["Reach", "exchange", "give", "look", "together", "velocity_at"]

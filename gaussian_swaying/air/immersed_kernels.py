@@ -82,10 +82,8 @@ def cover(place, area, sums, kind, nx, ny, nz, count, rounds, ATOMIC: tl.constex
 
 
 @triton.jit
-def take(
-    place, area, mass, velocity, moments, sums, taken, kind, nx, ny, nz, cells, count, BLOCK: tl.constexpr,
-):  # fmt: skip
-    """The momentum that points take; see ``immersed.exchange``."""
+def read(place, area, moments, sums, velocity, layer, kind, nx, ny, nz, cells, count, BLOCK: tl.constexpr):
+    """Velocity of the air at points, and the mass of the layer at each."""
     p = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
     mask = p < count
     reach, scale = _reach(place, p, kind, nx, ny, nz, mask)
@@ -102,17 +100,15 @@ def take(
                 y += w * tl.load(moments + 2 * cells + at, mask, 0.0)
                 z += w * tl.load(moments + 3 * cells + at, mask, 0.0)
     covered = covered * scale
-    layer = tl.where(covered > 0, tl.load(area + p, mask, 0.0) / tl.maximum(covered, 1e-30), 0.0)
-    m = tl.load(mass + p, mask, 0.0)
-    reduced = m * layer / tl.maximum(m + layer, 1e-30)
-    # a point without air around it has no layer, and takes nothing
-    tl.store(taken + 3 * p, reduced * (x * scale - tl.load(velocity + 3 * p, mask, 0.0)), mask)
-    tl.store(taken + 3 * p + 1, reduced * (y * scale - tl.load(velocity + 3 * p + 1, mask, 0.0)), mask)
-    tl.store(taken + 3 * p + 2, reduced * (z * scale - tl.load(velocity + 3 * p + 2, mask, 0.0)), mask)
+    mass = tl.where(covered > 0, tl.load(area + p, mask, 0.0) / tl.maximum(covered, 1e-30), 0.0)
+    tl.store(layer + p, mass, mask)
+    tl.store(velocity + 3 * p, x * scale, mask)
+    tl.store(velocity + 3 * p + 1, y * scale, mask)
+    tl.store(velocity + 3 * p + 2, z * scale, mask)
 
 
 @triton.jit
-def give(place, taken, moments, kind, nx, ny, nz, cells, count, rounds, ATOMIC: tl.constexpr, BLOCK: tl.constexpr):
+def subtract(place, taken, moments, kind, nx, ny, nz, cells, count, rounds, ATOMIC: tl.constexpr, BLOCK: tl.constexpr):
     """Take the momentum of points out of the air."""
     for turn in range(rounds):
         p = (tl.program_id(0) * rounds + turn) * BLOCK + tl.arange(0, BLOCK)
@@ -131,21 +127,32 @@ def give(place, taken, moments, kind, nx, ny, nz, cells, count, rounds, ATOMIC: 
                     _add(moments + 3 * cells + at, w * z, mask, ATOMIC)
 
 
-def exchange(moments, velocity, area, mass, place, kind):
-    """See ``immersed.exchange``, with places in cells, shape (P, 3), in place of the reach; float32."""
-    count, device = len(place), place.device
-    nx, ny, nz = kind.shape
-    cells = nx * ny * nz
-    sums, taken = torch.zeros(cells, device=device), torch.empty(count, 3, device=device)
-    place, velocity = place.contiguous(), velocity.contiguous()
-    atomic = device.type == "cuda" or INTERPRETED
-    block = BLOCK if atomic else 1
-    programs, rounds = (triton.cdiv(count, block), 1) if atomic else (1, count)
-    scatter = {"ATOMIC": atomic, "BLOCK": block}
+def look(moments, area, place, kind):
+    """See ``immersed.look``; float32."""
+    place, (nx, ny, nz), cells, count = place.contiguous(), kind.shape, kind.numel(), len(place)
+    sums, layer = moments.new_zeros(cells), torch.empty_like(area)
+    velocity = torch.empty_like(place)
+    programs, rounds, scatter = _scatter(place)
     launch(cover, (programs,))(place, area, sums, kind, nx, ny, nz, count, rounds, **scatter)
-    wide = lanes(device, BLOCK, CPU_BLOCK)
-    launch(take, (triton.cdiv(count, wide),))(
-        place, area, mass, velocity, moments, sums, taken, kind, nx, ny, nz, cells, count, BLOCK=wide
+    wide = lanes(place.device, BLOCK, CPU_BLOCK)
+    launch(read, (triton.cdiv(count, wide),))(
+        place, area, moments, sums, velocity, layer, kind, nx, ny, nz, cells, count, BLOCK=wide
     )
-    launch(give, (programs,))(place, taken, moments, kind, nx, ny, nz, cells, count, rounds, **scatter)
-    return taken
+    return velocity, layer
+
+
+def give(moments, taken, place, kind):
+    """See ``immersed.give``; float32."""
+    (nx, ny, nz), cells = kind.shape, kind.numel()
+    programs, rounds, scatter = _scatter(place)
+    launch(subtract, (programs,))(
+        place.contiguous(), taken.contiguous(), moments, kind, nx, ny, nz, cells, len(place), rounds, **scatter
+    )
+
+
+def _scatter(place):
+    """Programs that add to cells, blocks of points for each, and their constants."""
+    atomic = place.device.type == "cuda" or INTERPRETED
+    count, block = len(place), BLOCK if atomic else 1
+    programs, rounds = (triton.cdiv(count, block), 1) if atomic else (1, count)
+    return programs, rounds, {"ATOMIC": atomic, "BLOCK": block}

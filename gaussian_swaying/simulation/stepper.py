@@ -444,7 +444,7 @@ class Stepper:
             raise ValueError("computed air has one length of the frame: start the simulation again for another one")
         if any(tensor.requires_grad for tensor in state.tensors()):
             raise ValueError("computed air has no gradients: set `air` to null")
-        air.load = self.wind_force
+        air.take(self.wind_force)
         end, moments, courant = air.roll(self.solver, state, state.air, substeps, self.forces, CFL_SAMPLES, watch)
         return end.replace(air=moments), courant
 

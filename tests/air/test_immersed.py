@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from gaussian_swaying.air.flow import LatticeFlow
-from gaussian_swaying.air.immersed import Reach, exchange, layer_mass, velocity_at
+from gaussian_swaying.air.immersed import Reach, exchange, look, velocity_at
 from gaussian_swaying.air.lattice import LatticeUnits
 
 UNITS = LatticeUnits.at_speed(0.1, 1.0, viscosity=1e-3, density=1.2)
@@ -100,7 +100,7 @@ def test_sheet_and_air_meet_at_their_common_velocity(ratio):
     moments[0] = 0
     moments[1:4] = torch.tensor([0.0, 0.0, 0.1])[:, None, None, None]
     place, area = _sheet()
-    layer = layer_mass(area, Reach.around(place, flow.kind), moments[0].numel())
+    _, layer = look(moments, area, place, flow.kind)
     mass, velocity = ratio * layer, torch.zeros_like(place)
     energy = 0.5 * moments[1:4].square().sum()
     taken = exchange(moments, velocity, area, mass, place, flow.kind)
