@@ -370,7 +370,10 @@ class AirInBox:
     def _together(
         self, solver: Solver, state: Any, moments: Tensor, dt: float, substeps: int, acting: Sequence[Force]
     ) -> tuple[Any, Tensor]:
-        """A step of the body, in substeps of ``dt``; the air loses what the body takes. Returns the Courant number, too."""
+        """A step of the body, in substeps of ``dt``; the air loses what the body takes.
+
+        Returns the Courant number, too.
+        """
         units, place = self.flow.units, self._place(state.position)
         air, layer = look(moments, self._area, place, self.flow.kind)
         air = (air * units.speed).to(state.velocity)

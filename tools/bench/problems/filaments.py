@@ -1,7 +1,7 @@
 """Filaments in a flow in a plane: flags whose flapping is published, with the exchange of momentum of computed air.
 
-The filament is a chain of points with stiff springs and Bernoulli's bending energy, not the package's solver, as a sheet
-of one layer of material points has no bending stiffness. Lengths are in its length, speeds in that of the flow, and the
+The filament is a chain of points with stiff springs and Bernoulli's bending energy, not the package's solver, as a
+sheet of one layer of material points has no bending stiffness. Lengths are in its length, speeds in that of the flow, and the
 density of the fluid is 1: a mass ratio is the mass of the filament per mass of fluid in a square of its length, and a
 bending stiffness is per rho U² L³.
 """
@@ -13,10 +13,18 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
-from bench.problems.air import WIND, _frequency, units_of
 
+from bench.problems.air import WIND, _frequency, units_of
+from gaussian_swaying import AeroForce, Simulation, WindField
+from gaussian_swaying.aero.computed_air import ComputedAir
+from gaussian_swaying.aero.wind import FlowKey
 from gaussian_swaying.air.flow import FlowState, LatticeFlow
 from gaussian_swaying.air.immersed import give, look
+from gaussian_swaying.geometry.regions import Box
+from gaussian_swaying.mpm.boundaries.pinned_region import PinnedRegion
+from gaussian_swaying.mpm.solver import MPMSolver
+from gaussian_swaying.scenes.procedural import FlagScene
+from gaussian_swaying.simulation.material import Material
 
 STRETCH = 400.0
 """Stiffness of the springs per rho U² L: the filament stretches by some thousandths."""
@@ -68,9 +76,9 @@ class Filament:
         force[1:] -= pull
         chain = self.place
         if self.held == "clamp":
-            chain = np.concatenate([chain[:1] - [[ds, 0.0]], chain])
+            chain = np.concatenate([chain[:1] - np.array([[ds, 0.0]]), chain])
         elif self.held == "tail":
-            chain = np.concatenate([chain, chain[-1:] + [[ds, 0.0]]])
+            chain = np.concatenate([chain, chain[-1:] + np.array([[ds, 0.0]])])
         bend = -self.bending / ds**3 * (chain[:-2] - 2 * chain[1:-1] + chain[2:])
         moment = np.zeros_like(chain)
         moment[:-2] += bend
@@ -134,8 +142,8 @@ def flap(
         lattice_speed: Of the flow.
 
     Returns:
-        ``tips``: the free end of each across the flow over time, shape (T, F); ``drags`` and ``dt``; and ``moments``, the
-        flow at the end.
+        ``tips``: the free end of each across the flow over time, shape (T, F); ``drags`` and ``dt``; and ``flow`` with
+        its ``state`` at the end.
     """
     h, units = 1 / cells, units_of(1 / cells, reynolds, lattice_speed)
     flow = LatticeFlow(
@@ -189,7 +197,9 @@ def measured(found: dict, which: int = 0) -> dict[str, float]:
 def flag(mass_ratio: float, bending: float, reynolds: float, *, tilt: float = 0.1, held: str = "clamp", **box) -> dict:
     """A flag in a flow; see :func:`measured`."""
     points = 2 * box.get("cells", 24) + 1
-    found = flap([Filament.straight(points, mass_ratio, bending, tilt, held=held)], [(0.0, 0.0)], reynolds=reynolds, **box)
+    found = flap(
+        [Filament.straight(points, mass_ratio, bending, tilt, held=held)], [(0.0, 0.0)], reynolds=reynolds, **box
+    )
     return measured(found)
 
 
@@ -209,3 +219,39 @@ def tandem(gap: float, cells: int = 24, until: float = 30.0, mass_ratio: float =
     found = flap([one(), one()], [(0.0, 0.0), (1.0 + gap, 0.0)], cells=cells, until=until, length=9.0 + gap)
     first, second = measured(found, 0), measured(found, 1)
     return {"first": first["drag"] / alone["drag"], "second": second["drag"] / alone["drag"], "alone": alone}
+
+
+def square_flag(cells: int = 20, until: float = 24.0, points: int = 24, device: str = "cpu") -> dict:
+    """A square flag in three dimensions, as a sheet of the package: Re 200, mass ratio 1, hardly any bending stiffness.
+
+    Published: an amplitude from peak to peak of 0.78 and a frequency of 0.26 (Huang and Sung 2010, J. Fluid Mech. 653),
+    0.81 and 0.27 (Tian and others 2014, J. Comput. Phys. 258), of the middle of the free edge.
+
+    Args:
+        cells: Cells of air in a side.
+        until: Time [sides over speed]; the last third is measured.
+        points: Points along a side.
+        device: Where it runs.
+    """
+    simulation = Simulation(
+        FlagScene(width=1.0, height=1.0, spacing=1 / points),
+        Material(E=1e5, nu=0.3, density=100.0, thickness=0.01),
+        solver=MPMSolver(
+            dx=2 / points,
+            gravity=[0.0, 0.0, 0.0],
+            boundaries=[PinnedRegion(Box([None, None, None], [0.7 / points, None, None]))],
+        ),
+        wind=WindField(schedule=[FlowKey(0.0, [1.0, 0.3, 0.0]), FlowKey(1.0, [1.0, 0.0, 0.0])]),
+        aero=AeroForce(air_density=1.0),
+        air=ComputedAir([-1.5, -2.0, -1.0], [4.5, 2.0, 1.0], 6 * cells, viscosity=1 / 200, smagorinsky=0, speed=1.2),
+        frame_dt=0.05,
+        device=device,
+    )
+    stepper, tips = simulation.stepper, []
+    state = stepper.start()
+    tip = (state.position - state.position.new_tensor([0.5, 0.0, 0.0])).norm(dim=-1).argmin()
+    for _ in range(round(until / 0.05)):
+        state, _ = stepper.advance(state)
+        tips.append(float(state.position[tip, 1]))
+    last = torch.tensor(tips[2 * len(tips) // 3 :])
+    return {"amplitude": float(last.max() - last.min()), "frequency": _frequency(last, 0.05), "tips": tips}
