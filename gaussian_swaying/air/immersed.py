@@ -13,8 +13,9 @@ however many layers lie in a cell, and the air has the velocity of the surface a
 2005, J. Comput. Phys. 209). Momentum is kept to rounding, as the weights of a point add up to one.
 
 The force on the point is :math:`\beta (\mathbf u - \mathbf v) / \Delta t` in each substep of the body, with the air at
-the start of the step. So it is a drag, and air and point together lose the energy :math:`\tfrac12\beta(u - \bar v)^2` or
-more. A force that stayed the same in all substeps would feed vibrations that are faster than the step.
+the start of the step. So it is a drag, and air and point together lose the energy
+:math:`\tfrac12\beta(u - \bar v)^2` or more. A force that stayed the same in all substeps would feed vibrations that are
+faster than the step.
 """
 
 from __future__ import annotations

@@ -1,4 +1,7 @@
-"""Computed air around a sheet: momentum, energy, masses, what it costs, and what is refused."""
+"""Computed air around a sheet: momentum, energy, masses, what it costs, and what is refused.
+
+Covers: aero.computed_air_triton.
+"""
 
 import pytest
 import torch
@@ -56,6 +59,17 @@ def test_a_free_sheet_gets_the_momentum_that_the_air_loses(dtype):
     # the air is float32
     torch.testing.assert_close(before - air.momentum(now), gained, rtol=1e-4, atol=2e-7 * float(before.abs().max()))
     assert float(gained[0]) > 0
+
+
+def test_the_kernels_push_as_torch_does():
+    """A step of the body with the twin of the force, and with the force in torch."""
+    stepper = _simulation(dtype="float64").stepper
+    state, air = stepper.start(), stepper.air
+    dt = air.flow.units.dt / 4
+    twin, _ = air._together(stepper.solver, state, state.air.clone(), dt, 4, [air.push])
+    torch_alone = stepper.solver.rollout(state, dt, 4, [lambda now: air.push(now)])
+    assert float(twin.velocity.norm(dim=-1).amax()) > 1e-3
+    torch.testing.assert_close(twin.velocity, torch_alone.velocity, rtol=1e-10, atol=1e-12)
 
 
 def test_a_frame_moves_the_sheet_and_bends_the_air():

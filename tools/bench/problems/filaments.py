@@ -1,9 +1,9 @@
 """Filaments in a flow in a plane: flags whose flapping is published, with the exchange of momentum of computed air.
 
 The filament is a chain of points with stiff springs and Bernoulli's bending energy, not the package's solver, as a
-sheet of one layer of material points has no bending stiffness. Lengths are in its length, speeds in that of the flow, and the
-density of the fluid is 1: a mass ratio is the mass of the filament per mass of fluid in a square of its length, and a
-bending stiffness is per rho U² L³.
+sheet of one layer of material points has no bending stiffness. Lengths are in its length, speeds in that of the flow,
+and the density of the fluid is 1: a mass ratio is the mass of the filament per mass of fluid in a square of its length,
+and a bending stiffness is per rho U² L³.
 """
 
 from __future__ import annotations
@@ -142,8 +142,8 @@ def flap(
         lattice_speed: Of the flow.
 
     Returns:
-        ``tips``: the free end of each across the flow over time, shape (T, F); ``drags`` and ``dt``; and ``flow`` with
-        its ``state`` at the end.
+        ``tips``: the free end of each across the flow over time, shape (T, F); ``drags`` and ``dt``; and ``flow``
+        with its ``state`` at the end.
     """
     h, units = 1 / cells, units_of(1 / cells, reynolds, lattice_speed)
     flow = LatticeFlow(
@@ -204,7 +204,7 @@ def flag(mass_ratio: float, bending: float, reynolds: float, *, tilt: float = 0.
 
 
 def hanging(cells: int = 24, until: float = 30.0) -> dict:
-    """The filament of Huang, Shin and Sung (2007, J. Comput. Phys. 226): mass ratio 1.5, Re 200, gravity 0.5 along it."""
+    """The filament of Huang, Shin and Sung (2007, J. Comput. Phys. 226): mass ratio 1.5, Re 200, gravity 0.5 along x."""
     one = Filament.straight(2 * cells + 1, 1.5, 0.0015, 0.1 * math.pi, gravity=0.5, held="hinge")
     return measured(flap([one], [(0.0, 0.0)], cells=cells, until=until))
 
