@@ -32,3 +32,36 @@ def test_each_wind_of_a_batch_moves_its_own_sheet():
 
 def test_the_wind_is_found_by_its_gradient():
     assert load("wind_by_gradient").main(true=2.0, first=1.0, rounds=6, side=4, steps=15) == pytest.approx(2, rel=1e-3)
+
+
+def test_a_splat_is_previewed_and_its_draft_runs(tmp_path):
+    moved = load("own_splat").main(tmp_path / "own", frames=6, spacing=0.06)
+    assert 0 < moved < 1
+    assert {path.name for path in (tmp_path / "own" / "preview").iterdir()} >= {"preview.png", "draft.yaml"}
+    assert (tmp_path / "own" / "run" / "video.mp4").stat().st_size > 1000
+
+
+def test_parts_of_a_plant_move_by_their_role_and_material(tmp_path):
+    found = load("plant_with_parts").main(tmp_path, frames=12, spacing=0.06, dx=0.12)
+    assert found["floor"] == 0
+    assert found["pot"] < 1e-5 < found["wood"] < found["leaf"]
+    assert (tmp_path / "plant.png").exists()
+
+
+def test_the_wind_moves_the_cloth_of_another_code():
+    """It hangs in the wind as a plate does: all loads are alike along it, so that it stays straight."""
+    found, exact = load("wind_on_own_cloth").main(side=8, seconds=3.0)
+    assert found == pytest.approx(exact, rel=0.03)
+
+
+def test_a_sweep_becomes_batches(tmp_path):
+    rows = load("sweep_to_dataset").main(tmp_path / "flags", frames=8, speeds=1, workers=1)
+    assert [wind for wind, _ in rows] == [[1.5, -0.5, 0.0], [1.5, 0.0, 0.0], [1.5, 0.5, 0.0]]
+    assert rows[0][1] < rows[1][1] < rows[2][1]
+
+
+def test_a_live_page_is_one_file(tmp_path):
+    assert load("live_page").main(tmp_path / "flag.html", spacing=0.06) > 100_000
+    text = (tmp_path / "flag.html").read_text(encoding="utf-8")
+    assert text.startswith("<!doctype html>")
+    assert "http" + "://" not in text.split("<script")[0]  # it asks no other site for anything
