@@ -204,7 +204,7 @@ def flag(mass_ratio: float, bending: float, reynolds: float, *, tilt: float = 0.
 
 
 def hanging(cells: int = 24, until: float = 30.0) -> dict:
-    """The filament of Huang, Shin and Sung (2007, J. Comput. Phys. 226): mass ratio 1.5, Re 200, gravity 0.5 along x."""
+    """The filament of Huang, Shin and Sung (2007, J. Comput. Phys. 226): mass ratio 1.5, Re 200, gravity 0.5."""
     one = Filament.straight(2 * cells + 1, 1.5, 0.0015, 0.1 * math.pi, gravity=0.5, held="hinge")
     return measured(flap([one], [(0.0, 0.0)], cells=cells, until=until))
 
