@@ -76,13 +76,15 @@ def test_the_quick_start_ends_without_warnings(name, tmp_path, capsys, monkeypat
     said, summary = _quick_start(tmp_path / "flag", capsys, name)
     assert said == summary["warnings"] == []
     assert summary["frames"] == 75
-    assert f"{summary['simulated_gaussians']:,} of {summary['gaussians']:,} Gaussians simulated on cpu\n" in README
+    counts = f"{summary['simulated_gaussians']:,} of {summary['gaussians']:,} Gaussians"
+    assert f"{counts} simulated by {summary['particles']:,} points on cpu\n" in README
 
 
 def test_every_file_that_the_readme_names_exists():
     named = re.findall(r"\]\((?!https?://)([^)]+)\)", README)
     named += re.findall(r"(?<![\w/])((?:docs|configs|tools)/[\w/.]+\.\w+)", README)
     assert len(named) > 15
+    assert len(README.splitlines()) < 150  # it shows; the pages argue
     for name in named:
         assert (ROOT / name).exists(), name
 
