@@ -62,6 +62,15 @@ def check_not_taken(path: Path) -> None:
         raise ValueError(f"Expected {path} to be a file, but it is a {kind}: move it away.")
 
 
+def check_page(path: Path, what: str) -> None:
+    """Raise ValueError if a page cannot be written to a path: its name ends in .html, and its folder exists."""
+    if path.suffix.lower() != ".html":
+        raise ValueError(f"Expected the name of a {what} to end in .html, but got {path}.")
+    if not path.parent.is_dir():
+        raise ValueError(f"The folder {path.parent} of the {what} does not exist: make it, or name another one.")
+    check_not_taken(path)
+
+
 @contextmanager
 def atomic(path: Path) -> Iterator[Path]:
     """Yield a temporary path in the same folder; it becomes ``path`` if the block succeeds and is removed if not."""

@@ -5,7 +5,7 @@ import json
 
 import pytest
 
-from gaussian_swaying._files import atomic, write_json, write_table
+from gaussian_swaying._files import atomic, check_page, write_json, write_table
 
 
 def test_a_file_appears_whole_or_not_at_all(tmp_path):
@@ -30,3 +30,13 @@ def test_rows_of_an_older_run_leave_their_gaps(tmp_path):
     write_table(tmp_path / "table.csv", [{"a": 1}, {"a": 2, "b": 3}])
     with (tmp_path / "table.csv").open(newline="") as file:
         assert list(csv.DictReader(file)) == [{"a": "1", "b": ""}, {"a": "2", "b": "3"}]
+
+
+def test_a_page_needs_its_name_and_a_folder(tmp_path):
+    check_page(tmp_path / "film.html", "film")
+    for name, told in {
+        "film.txt": "end in .html",
+        "no/film.html": "The folder .*no of the film does not exist: make it",
+    }.items():
+        with pytest.raises(ValueError, match=told):
+            check_page(tmp_path / name, "film")

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from gaussian_swaying import _program as program
-from gaussian_swaying._files import check_not_taken
+from gaussian_swaying._files import check_page
 from gaussian_swaying.cli.scene import check_one_scene, settings_of, words_of
 from gaussian_swaying.cli.shipped import names
 from gaussian_swaying.simulation.simulation import Simulation
@@ -75,11 +75,7 @@ def asked(arguments: Sequence[str]) -> Asked:
     if not 1 <= len(words) <= 2:
         raise ValueError(f"Expected a SCENE, and perhaps a FILE that ends in .html, but got {words or 'neither'}.")
     scene, target = words[0], default_target(words[0]) if len(words) == 1 else Path(words[1])
-    if target.suffix.lower() != ".html":
-        raise ValueError(f"Expected the name of a page to end in .html, but got {target}.")
-    if not target.parent.is_dir():
-        raise ValueError(f"The folder {target.parent} of the page does not exist: make it, or name another one.")
-    check_not_taken(target)
+    check_page(target, "page")
     check_one_scene(further)
     config = Path(scene) / "config.yaml"
     with tempfile.TemporaryDirectory() as folder:

@@ -298,10 +298,19 @@ def test_size_and_speed_of_a_page(monkeypatch):
     monkeypatch.setattr(web, "WINDOW", (160, 90))
     row = web.page_of(["flag", "--scene.generator.init_args.spacing=0.05", "--solver.dx=0.2", "--material.E=9e3"])
     assert row["gaussians"] == 384
-    assert min(row["node"], row["plain"], row["browser"], row["first_s"]) > 0
+    assert min(row["node"], row["hurried"], row["plain"], row["browser"], row["first_s"]) > 0
+    assert row["longest_per_s"] < row["substeps_per_s"]
     record = HEAD | {"films": {}, "pages": {"small flag": row}}
     assert cells("web.pages", record)[0][0] == "small flag"
     assert len(cells("web.goals", record)) == 4
+
+
+@pytest.mark.usefixtures("chromium")
+def test_memory_and_cpu_time_of_a_page():
+    row = web.watch(["flag", "--scene.generator.init_args.spacing=0.05", "--solver.dx=0.2", "--material.E=9e3"], 0.02)
+    assert row["hidden_cores"] < row["shown_cores"]
+    assert min(*row["heap_mb"], *row["resident_mb"]) > 1
+    assert cells("web.watched", HEAD | {"films": {}, "watched": {"small flag": row}})[0][0] == "small flag"
 
 
 def test_a_place_is_previewed_in_a_process_of_its_own():

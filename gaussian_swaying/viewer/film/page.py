@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from gaussian_swaying._files import write_text
+from gaussian_swaying._files import check_page, write_text
 from gaussian_swaying.recording.nodes import join_far, split_at
 from gaussian_swaying.viewer.film.recorded import Film, read_film
 
@@ -50,10 +50,9 @@ def write_film(run: Path, target: Path) -> Film:
 
     Raises:
         ValueError: If the run cannot become a film (see :func:`~gaussian_swaying.viewer.film.recorded.read_film`), or
-            the name of the target does not end in .html.
+            the target has no folder or does not end in .html.
     """
-    if target.suffix.lower() != ".html":
-        raise ValueError(f"Expected the name of a film to end in .html, but got {target}.")
+    check_page(target, "film")
     film = read_film(run)
     text = page(film)
     write_text(target, text)

@@ -29,6 +29,7 @@ from gaussian_swaying.mpm.laws.neo_hookean import NeoHookean
 from gaussian_swaying.mpm.laws.spring_network import SpringNetwork
 from gaussian_swaying.mpm.solver import MPMSolver
 from gaussian_swaying.simulation.simulation import Simulation
+from gaussian_swaying.viewer.live_web.longest import longest_courant
 
 LAWS = (FixedCorotated, NeoHookean, StVKHencky, SpringNetwork)
 """The laws that a browser knows, by their number in the block."""
@@ -159,6 +160,7 @@ def pack_solver(simulation: Simulation, nodes: Tensor) -> bytes:
         "damping": settings.damping,
         "viscous": settings.stiffness_damping,
         "cfl": solver.cfl,
+        "longest": max(solver.cfl, longest_courant(bound)),
         "substep": solver.substep,
         "frameDt": simulation.frame_dt,
         "size": scene.size * scene.frame.metres_per_unit,

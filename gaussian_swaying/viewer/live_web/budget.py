@@ -13,8 +13,8 @@ from gaussian_swaying.viewer.live_web.block import check, in_webassembly
 if TYPE_CHECKING:
     from jsonargparse import ArgumentParser, Namespace
 
-TARGETS = {"phone": 1.5e6, "laptop": 4e6, "desktop": 6e6}
-"""Material points times substeps a second that a kind of machine computes, with room for drawing."""
+TARGETS = {"phone": 2e6, "laptop": 5.5e6, "desktop": 8e6}
+"""Material points times substeps a second that a kind of machine computes, with room for drawing; longer substeps are its reserve."""
 
 IN_JAVASCRIPT = 4.0
 """Factor by which a substep takes longer where the fast pass over the points does not know a law or a force."""

@@ -8,7 +8,7 @@ from typing import Any
 
 import torch
 
-from gaussian_swaying._files import write_text
+from gaussian_swaying._files import check_page, write_text
 from gaussian_swaying.aero.wind import WindField
 from gaussian_swaying.simulation.simulation import Simulation
 from gaussian_swaying.viewer.film.page import PAGE as FILM_PAGE
@@ -47,10 +47,9 @@ def write_live_web(simulation: Simulation, name: str, target: Path) -> Written:
 
     Raises:
         ValueError: If a browser cannot simulate it (:func:`~gaussian_swaying.viewer.live_web.block.check`), it cannot
-            start, or the name of the target does not end in .html.
+            start, or the target has no folder or does not end in .html.
     """
-    if target.suffix.lower() != ".html":
-        raise ValueError(f"Expected the name of a page to end in .html, but got {target}.")
+    check_page(target, "page")
     text, film = page(simulation, name)
     write_text(target, text)
     return Written(film.head["count"], simulation.setup.points.count, film.notes)

@@ -38,6 +38,15 @@ def test_a_sheet_in_gusts_after_two_seconds(make, in_node):
         assert told[0]["lanes"] is not plain
 
 
+def test_longest_steps(make, in_node):
+    """Where a page falls behind, it takes fewer substeps, and is still within 1 % of the motion after two seconds."""
+    simulation = make()
+    state, steps = run(simulation, 50)
+    told, moved = in_node(simulation, {"kind": "frames", "count": 50, "hurried": True})
+    assert apart(simulation, state, moved)[0] < 0.01
+    assert told[0]["substeps"] < 0.75 * steps
+
+
 PLANE = {
     "class_path": "Plane",
     "init_args": {"point": [0, 0, -0.18], "normal": [0, 0.2, 1], "kind": "separate", "friction": 0.4},

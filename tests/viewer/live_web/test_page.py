@@ -12,14 +12,6 @@ import torch
 from gaussian_swaying.viewer.film.recorded import order_of
 from gaussian_swaying.viewer.live_web.page import write_element, write_live_web
 
-FLAGS = [
-    "--no-sandbox",
-    "--disable-quic",
-    "--no-first-run",
-    "--disable-background-networking",
-    "--disable-component-update",
-]
-FLAGS += ["--disable-sync", "--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"]
 SHOWN = "!!window.windPage || !document.getElementById('message').textContent.startsWith('Loading')"
 
 
@@ -30,18 +22,8 @@ def written(make, tmp_path_factory):
     return target
 
 
-@pytest.fixture(scope="module")
-def browser(chromium):
-    from playwright.sync_api import sync_playwright
-
-    with sync_playwright() as driver:
-        started = driver.chromium.launch(executable_path=chromium, args=FLAGS)
-        yield started
-        started.close()
-
-
 @pytest.fixture
-def show(browser):
+def show(browser, until):
     """Opens a page; what it tells and asks for is kept in ``page.told`` and ``page.asked``."""
     context = browser.new_context(viewport={"width": 600, "height": 400})
 
@@ -57,13 +39,6 @@ def show(browser):
 
     yield show
     context.close()
-
-
-def until(condition, seconds=60.0):
-    end = time.monotonic() + seconds
-    while not condition():
-        assert time.monotonic() < end, "it did not happen"
-        time.sleep(0.02)
 
 
 def test_after_two_seconds_the_gaussians_are_where_a_run_puts_them(show, written, make):
@@ -104,7 +79,7 @@ def _grabbed(page):
     return False
 
 
-def test_what_the_visitor_does(show, written):
+def test_what_the_visitor_does(show, written, until):
     """The clock, pause, wind, link, a pull and a turn of the view."""
     page = show(written, "#wind=0,0,0&gusts=0&stiffness=2&speed=0.25")
     assert page.evaluate("[windPage.settings.wind, windPage.settings.gusts, windPage.settings.stiffness]") == [
@@ -141,6 +116,9 @@ def test_what_the_visitor_does(show, written):
     box = page.locator("#dial").bounding_box()
     page.mouse.click(box["x"] + 0.9 * box["width"], box["y"] + 0.5 * box["height"])
     assert page.evaluate("Math.hypot(...windPage.settings.wind)") == pytest.approx(10 * 0.8 / 0.96, rel=0.05)
+    for name, ends in {"gusts": ("0", "3"), "stiffness": ("-3", "2")}.items():  # those of the link
+        slider = page.locator(f"#{name}")
+        assert (slider.get_attribute("min"), slider.get_attribute("max")) == ends
     link = page.evaluate("windPage.link()")
     assert re.search(r"#wind=[-\d.,]+&gusts=0&stiffness=2&view=[-\d.,]+$", link)
     page.mouse.move(10, 60)
@@ -181,7 +159,7 @@ def test_a_file_that_is_cut_short_or_damaged_says_so(show, written, tmp_path):
     message.filter(has_text=re.compile(r"^This page cannot be shown \([^()]+\)\.$")).wait_for()
 
 
-def test_a_page_within_another_page(browser, written):
+def test_a_page_within_another_page(browser, written, until):
     """``<gaussian-swaying>`` passes its attributes on, also when they change."""
     write_element(written.parent)
     outer = written.parent / "outer.html"

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import os
 import shlex
 import shutil
 import statistics
@@ -44,6 +45,9 @@ def rows(options: argparse.Namespace, _: Row) -> Iterator[Measurement]:
     for count in options.places:
         for whole in (True, False):
             yield ("first", f"{count:,}, {'one' if whole else 'many'}"), partial(first_of, count, whole)
+    for line in options.watch:
+        name, _, command = line.partition("=")
+        yield ("watched", name), partial(watch, shlex.split(command or name), options.minutes)
     for name in options.run:
         row = film_of(Path(name), options.seconds)
         yield ("films", row["title"]), row.copy
@@ -180,22 +184,24 @@ def page_of(command: list[str]) -> Row:
         nodes = simulation.scene.follow.nodes(simulation.start())
         assert nodes is not None
         (folder / "block").write_bytes(pack_solver(simulation, nodes))
-        lanes, plain = _in_node(folder, False), _in_node(folder, True)
+        hurried, lanes, plain = _in_node(folder, hurried=True), _in_node(folder), _in_node(folder, plain=True)
         row: Row = {
             "gaussians": written.gaussians,
             "points": written.points,
             "dx_m": simulation.solver.dx,
             "substeps_per_s": lanes["substeps"] / lanes["simulated"],
+            "longest_per_s": hurried["substeps"] / hurried["simulated"],
             "bytes": target.stat().st_size,
+            "hurried": hurried["simulated"] / hurried["cpu"],
             "node": lanes["simulated"] / lanes["cpu"],
             "plain": plain["simulated"] / plain["cpu"],
         }
         return row | _in_page(target)
 
 
-def _in_node(folder: Path, plain: bool) -> Row:
-    """The turn of the solver in Node.js with the least CPU time, with ``plain`` without WebAssembly."""
-    turns = json.dumps([{"kind": "frames", "count": SPAN}] * TURNS)
+def _in_node(folder: Path, *, plain: bool = False, hurried: bool = False) -> Row:
+    """The turn of the solver in Node.js with the least CPU time; without WebAssembly, or with the longest substeps."""
+    turns = json.dumps([{"kind": "frames", "count": SPAN, "hurried": hurried}] * TURNS)
     script = ROOT / "tools" / "player" / "live_web" / "run.js"
     command = ["node", script, PAGE / "worker.min.js", folder / "block", folder / "state", turns]
     told = subprocess.run([*command, *["plain"] * plain], capture_output=True, text=True, check=True)
@@ -208,13 +214,82 @@ def _in_page(target: Path) -> Row:
         window = browser.new_page(viewport={"width": WINDOW[0], "height": WINDOW[1]})
         window.set_default_timeout(600_000)
         window.goto(target.as_uri(), wait_until="commit")
-        while not window.evaluate("!!window.windPage && windPage.first() !== null"):
-            time.sleep(0.25)
+        _until_drawn(window)
         window.evaluate("windPage.complete.then(() => { windPage.pause(); windPage.reset(); })")
-        turns = [window.evaluate(f"windPage.advance({SPAN})") for _ in range(TURNS)]
+        turns = [window.evaluate(f"windPage.advance({SPAN}, true)") for _ in range(TURNS)]
         best = min(turns, key=lambda turn: turn["seconds"])
         row: Row = {"window": list(WINDOW), "chromium": browser.version, "first_s": window.evaluate("windPage.first()")}
         return row | {"browser": best["simulated"] / best["seconds"]}
+
+
+def _until_drawn(window: Any) -> None:
+    while not window.evaluate("!!window.windPage && windPage.first() !== null"):
+        time.sleep(0.25)
+
+
+EVERY = 30.0
+"""Seconds between two measurements of memory."""
+
+HIDE = """() => {
+  Object.defineProperty(document, "hidden", { value: true, configurable: true });
+  document.dispatchEvent(new Event("visibilitychange"));
+}"""
+
+
+def watch(command: list[str], minutes: float) -> Row:
+    """Memory of Chromium with a page that runs for some time, and its CPU time while the page is shown and hidden.
+
+    Args:
+        command: The scene and options of ``export --live-web``.
+        minutes: For how long.
+    """
+    with tempfile.TemporaryDirectory() as temporary, _browser() as browser:
+        page, target = asked([*command]), Path(temporary) / "page.html"
+        write_live_web(page.simulation, page.name, target)
+        window = browser.new_page(viewport={"width": 480, "height": 320})
+        window.goto(target.as_uri())
+        _until_drawn(window)
+        window.evaluate("windPage.complete")
+        heap = window.context.new_cdp_session(window)
+        processes, resident, used = _descendants(os.getpid()), [], []
+        before, began = _cpu_time(processes), time.perf_counter()
+        while time.perf_counter() - began < 60 * minutes:
+            time.sleep(min(EVERY, 60 * minutes))
+            heap.send("HeapProfiler.collectGarbage")
+            sizes = heap.send("Runtime.getHeapUsage")
+            used.append((sizes["usedSize"] + sizes["backingStorageSize"]) / 1e6)
+            resident.append(sum(_resident(one) for one in processes) / 1e6)
+        shown = (_cpu_time(processes) - before) / (time.perf_counter() - began)
+        rate = window.evaluate("windPage.time()") / (time.perf_counter() - began)
+        window.evaluate(HIDE)
+        time.sleep(2.0)
+        before, began = _cpu_time(processes), time.perf_counter()
+        time.sleep(10.0)
+        hidden = (_cpu_time(processes) - before) / (time.perf_counter() - began)
+        row: Row = {"minutes": minutes, "points": page.simulation.setup.points.count, "real_time": rate}
+        row |= {"heap_mb": used, "resident_mb": resident, "shown_cores": shown, "hidden_cores": hidden}
+        return row | {"chromium": browser.version}
+
+
+def _descendants(process: int) -> list[int]:
+    """Processes that a process started, and those that they started."""
+    found: list[int] = []
+    for task in Path(f"/proc/{process}/task").iterdir():
+        for child in map(int, (task / "children").read_text().split()):
+            found += [child, *_descendants(child)]
+    return found
+
+
+def _cpu_time(processes: list[int]) -> float:
+    """CPU time of processes [s]."""
+    fields = [Path(f"/proc/{one}/stat").read_text().rpartition(")")[2].split() for one in processes]
+    return sum(int(own[11]) + int(own[12]) for own in fields) / os.sysconf("SC_CLK_TCK")
+
+
+def _resident(process: int) -> float:
+    """Memory that only one process has, in bytes."""
+    lines = Path(f"/proc/{process}/smaps_rollup").read_text().splitlines()
+    return sum(1024.0 * int(line.split()[1]) for line in lines if line.startswith("Private_"))
 
 
 CASE = Case(
@@ -229,6 +304,8 @@ CASE = Case(
             action="append",
             default=[],
         ),
+        option("--watch", "as --page: its memory and CPU time are measured; repeatable", action="append", default=[]),
+        option("--minutes", "for which a page is watched", type=float, default=10.0),
         option("--seconds", "for which a film plays while it is timed", type=float, default=20.0),
     ),
     page="web.md",

@@ -79,15 +79,29 @@ PAGES = [
 
 def _pages(result: Row) -> Iterator[Row]:
     for key, row in result.get("pages", {}).items():
-        yield {"key": key, "what": "Node.js", "speed": row["node"]}
+        yield {"key": key, "what": "Node.js", "speed": row["hurried"]}
         size = {"megabytes": row["bytes"] / 1e6, "picture_s": row["first_s"]}
         yield {"key": key, "what": "Chromium", "speed": row["browser"]} | size
+
+
+def _watched(result: Row) -> Iterator[Row]:
+    for key, row in result.get("watched", {}).items():
+        early = min(1, len(row["heap_mb"]) - 1)
+        memory = {"early": row["resident_mb"][early], "late": row["resident_mb"][-1]}
+        yield {"key": key, **row, **memory, "early_heap": row["heap_mb"][early], "late_heap": row["heap_mb"][-1]}
 
 
 table("web.md", "web.pages", "web_*", "pages", """
     page = {key} | Gaussians = {gaussians:,} | points = {points:,} | grid [m] = {dx_m:.3g} |
     substeps a second = {substeps_per_s:,.0f} | file [MB] = {bytes:.1f (MB)} | first picture [s] = {first_s:.1f} |
-    Node.js [x real time] = {node:.2f} | without WebAssembly = {plain:.2f} | Chromium = {browser:.2f}
+    Node.js [x real time] = {node:.2f} | without WebAssembly = {plain:.2f} |
+    longest substeps: a second = {longest_per_s:,.0f} | Node.js = {hurried:.2f} | Chromium = {browser:.2f}
+    """, before="{source}", empty="Not recorded yet.")  # fmt: skip
+table("web.md", "web.watched", "web_*", _watched, """
+    page = {key} | points = {points:,} | minutes = {minutes:g} | x real time = {real_time:.2f} |
+    memory after a minute [MB] = {early:.0f} | at the end [MB] = {late:.0f} |
+    of it JavaScript after a minute [MB] = {early_heap:.1f} | JavaScript at the end [MB] = {late_heap:.1f} |
+    cores while it is shown = {shown_cores:.2f} | while it is hidden = {hidden_cores:.2f}
     """, before="{source}", empty="Not recorded yet.")  # fmt: skip
 table("web.md", "web.goals", "web_*", judged(PAGES, _pages), GOAL, empty="Not recorded yet.")
 

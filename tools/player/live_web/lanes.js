@@ -1,4 +1,4 @@
-// The solver with its pass over all points in WebAssembly, four points at a time, in single precision as in the package.
+// The solver with its passes over points and nodes in WebAssembly, four points at a time, in single precision as in the package.
 import { NEO_HOOKEAN } from "./laws.js";
 import { singular } from "./matrices.js";
 import code from "./points.wasm"; // build.js makes it from points.ts
@@ -34,7 +34,9 @@ export class LanesSolver extends Solver {
     const total = rows.reduce((sum, count) => sum + count, 0);
     const sizes = {
       starts: starts.length, nodes: 27 * this.cells, records: RECORD * chunks, vectors: 3 * LANES * total,
-      displacement: 3 * this.nodes, velocity: 3 * this.nodes, force: 4 * this.nodes, speeds: LANES * chunks,
+      displacement: 4 * this.nodes, velocity: 4 * this.nodes, force: 4 * this.nodes, speeds: LANES * chunks,
+      inverses: this.nodes, decays: this.nodes, resistances: this.nodes,
+      rowNode: a.rowNode.length, rowWeight: a.rowWeight.length, affected: a.affected.length, push: a.push.length, rates: 4 * head.rows,
     };
     let end = Math.ceil(this.code.free() / 16) * 16;
     /** First byte of each array. @type {Record<string, number>} */
@@ -47,12 +49,17 @@ export class LanesSolver extends Solver {
     memory.grow(Math.max(0, Math.ceil((end - memory.buffer.byteLength) / 65536)));
     const view = (Kind, name) => new Kind(memory.buffer, this.where[name], sizes[name]);
     view(Int32Array, "starts").set(starts);
-    view(Int32Array, "nodes").set(a.cellNodes.map((node) => 4 * node)); // bytes of one number
+    view(Int32Array, "nodes").set(a.cellNodes.map((node) => 16 * node)); // bytes
     this.displacement = view(Float32Array, "displacement");
     this.velocity = view(Float32Array, "velocity");
     this.force = view(Float32Array, "force");
-    this.wide = 4;
+    this.resistance = view(Float32Array, "resistances");
     this.lanes = view(Float32Array, "speeds");
+    this.decays = view(Float32Array, "decays");
+    this.kicked = NaN; // the time that `decays` are for [s]
+    view(Float32Array, "inverses").set(a.inverseMass);
+    for (const name of ["rowWeight", "push"]) view(Float32Array, name).set(a[name]);
+    for (const name of ["rowNode", "affected"]) view(Int32Array, name).set(a[name].map((node) => 16 * node));
     this.before = { displacement: this.displacement.slice(), velocity: this.velocity.slice() };
 
     const [records, whole] = [view(Float32Array, "records"), view(Int32Array, "records")];
@@ -118,5 +125,26 @@ export class LanesSolver extends Solver {
     if (!looked) return;
     this.seen = { time: this.time, stiffness, wave: Math.sqrt(fastest), viscous: 0 };
     for (let p = 0; p < this.points; p++) this.speed[p] = this.lanes[this.lane[p]];
+  }
+
+  accelerate(kick) {
+    const { head, where, nodes, a } = this;
+    if (kick !== this.kicked) {
+      this.kicked = kick;
+      for (let k = 0; k < nodes; k++) this.decays[k] = a.held[k] ? 0 : Math.exp(-kick * (head.damping + (a.nodeDamping[k] ?? 0)));
+    }
+    const { velocity, force, inverses, decays, resistances } = where;
+    this.code.accelerate(nodes - 1, velocity, force, inverses, decays, resistances, this.dragged, kick, ...head.gravity);
+  }
+
+  hold() {
+    const { where, head, a } = this;
+    if (head.rows === 0) return;
+    const { velocity, rowNode, rowWeight, affected, push, rates } = where;
+    this.code.hold(velocity, head.rows, rowNode, rowWeight, a.affected.length, affected, push, rates);
+  }
+
+  move(dt) {
+    this.code.move(this.nodes, this.where.displacement, this.where.velocity, dt);
   }
 }

@@ -4,10 +4,10 @@ import { reader } from "../gaussians.js";
 import { Playback } from "../playback.js";
 import { View } from "../view.js";
 import { Dial } from "./dial.js";
-import { readSettings, USUAL, writeSettings } from "./settings.js";
+import { LIMITS, readSettings, USUAL, writeSettings } from "./settings.js";
 
 const SLOW = 0.25; // simulated seconds per second in slow motion
-const BEHIND = 0.95; // of the wanted speed: below it the page says so
+const BEHIND = 0.95; // of the wanted speed, with the longest substeps: below it the page says so
 const PICKED = 12; // pixels from the object at which a finger still takes hold of it
 const PIXELS = [1, 0.75, 0.5, 0.35]; // of the window's along each side, where drawing is slow
 const FEW = 20; // pictures a second
@@ -82,6 +82,8 @@ export async function sway(read, tell) {
   // ---- controls
 
   const [play, slow, gusts, stiffness] = ["play", "slow", "gusts", "stiffness"].map(element);
+  [gusts.min, gusts.max] = LIMITS.gusts.map(String);
+  [stiffness.min, stiffness.max] = LIMITS.stiffness.map((factor) => String(Math.log2(factor)));
   const rim = Math.max(10, 2 * Math.hypot(head.wind[0], head.wind[1]));
   const dial = new Dial(element("dial"), rim, ([x, y]) => {
     settings.wind = [x, y, settings.wind?.[2] ?? head.wind[2]];
@@ -313,10 +315,10 @@ export async function sway(read, tell) {
     play: () => setPlaying(true),
     reset,
     // Advance by some frames at once, without the clock; resolves with how long that took.
-    advance: (count) =>
+    advance: (count, hurried = false) =>
       new Promise((resolve) => {
         answers.push(resolve);
-        say({ kind: "frames", count });
+        say({ kind: "frames", count, hurried });
       }),
     // Centres of the Gaussians as drawn for the newest state.
     positions: () => {

@@ -1,5 +1,5 @@
-// The pass over all points of solver.js in WebAssembly (AssemblyScript), four points of a cell at a time: `particles` there is the
-// definition. It knows two laws, FixedCorotated and NeoHookean, and the wind on groups of patches.
+// The passes of solver.js over points and nodes in WebAssembly (AssemblyScript), four points of a cell at a time: the functions of the
+// same names there are the definition. It knows two laws, FixedCorotated and NeoHookean, and the wind on groups of patches.
 
 const VECTOR: usize = 16; // bytes of four numbers
 const RECORD: usize = 16 * VECTOR; // of four points, see lanes.js
@@ -73,13 +73,17 @@ function corotated(mu: v128, lam: v128): void {
   let det = dot(x0, x1, x2, c0, c1, c2);
   const p = mul(lam, sub(det, all(1)));
   for (let step = 0; step < 6; ++step) {
-    const square = add(add(dot(x0, x1, x2, x0, x1, x2), dot(x3, x4, x5, x3, x4, x5)), dot(x6, x7, x8, x6, x7, x8));
-    const cofs = add(add(dot(c0, c1, c2, c0, c1, c2), dot(c3, c4, c5, c3, c4, c5)), dot(c6, c7, c8, c6, c7, c8));
     const inverse = f32x4.div(all(1), flip(f32x4.max(f32x4.abs(det), all(1e-9)), det));
-    const ratio = f32x4.div(mul(cofs, mul(inverse, inverse)), f32x4.max(square, all(1e-9)));
-    const zeta = f32x4.sqrt(f32x4.sqrt(f32x4.max(ratio, all(1e-37))));
-    const own = sub(mul(all(0.5), zeta), all(1));
-    const other = f32x4.div(mul(all(0.5), inverse), zeta);
+    let own = all(-0.5), other = mul(all(0.5), inverse);
+    const square = add(add(dot(x0, x1, x2, x0, x1, x2), dot(x3, x4, x5, x3, x4, x5)), dot(x6, x7, x8, x6, x7, x8));
+    const far = v128.or(f32x4.gt(f32x4.abs(sub(square, all(3))), all(0.5)), f32x4.gt(f32x4.abs(sub(det, all(1))), all(0.3)));
+    if (v128.any_true(far)) { // scaled, it converges from everywhere
+      const cofs = add(add(dot(c0, c1, c2, c0, c1, c2), dot(c3, c4, c5, c3, c4, c5)), dot(c6, c7, c8, c6, c7, c8));
+      const ratio = f32x4.div(mul(cofs, mul(inverse, inverse)), f32x4.max(square, all(1e-9)));
+      const zeta = f32x4.sqrt(f32x4.sqrt(f32x4.max(ratio, all(1e-37))));
+      own = sub(mul(all(0.5), zeta), all(1));
+      other = f32x4.div(other, zeta);
+    }
     const d0 = mad(mul(own, x0), other, c0), d1 = mad(mul(own, x1), other, c1), d2 = mad(mul(own, x2), other, c2);
     const d3 = mad(mul(own, x3), other, c3), d4 = mad(mul(own, x4), other, c4), d5 = mad(mul(own, x5), other, c5);
     const d6 = mad(mul(own, x6), other, c6), d7 = mad(mul(own, x7), other, c7), d8 = mad(mul(own, x8), other, c8);
@@ -252,7 +256,7 @@ export function particles(
         for (let j = 0; j < 3; ++j) {
           const wy = weight(fy, j), sy = slope(fy, j, slow);
           const row = nodes + 12 * (3 * i + j);
-          const n0 = 3 * load<u32>(row), n1 = 3 * load<u32>(row + 4), n2 = 3 * load<u32>(row + 8);
+          const n0 = load<u32>(row), n1 = load<u32>(row + 4), n2 = load<u32>(row + 8);
           let a = displacement + n0, b = displacement + n1, d = displacement + n2;
           let q0 = v128.load32_splat(a), q1 = v128.load32_splat(b), q2 = v128.load32_splat(d);
           const x = mul(sx, wy), y = mul(wx, sy), z = mul(wx, wy);
@@ -324,7 +328,7 @@ export function particles(
     }
     if (!pushed) continue;
     for (let k: usize = 0; k < 27; ++k) {
-      const out = force + (load<u32>(nodes + 4 * k) << 2);
+      const out = force + load<u32>(nodes + 4 * k);
       const sum = sums + 3 * VECTOR * k;
       const x = get(sum, 0), y = get(sum, 1), z = get(sum, 2);
       const pair = add(v128.shuffle<f32>(x, y, 0, 4, 1, 5), v128.shuffle<f32>(x, y, 2, 6, 3, 7)); // x02 y02 x13 y13
@@ -380,4 +384,42 @@ export function particles(
   if (k == 0) return mul(sub(f, all(1.5)), inverse);
   if (k == 1) return mul(mul(all(-2), sub(f, all(1))), inverse);
   return mul(sub(f, all(0.5)), inverse);
+}
+
+/** Velocities of the nodes after `kick` seconds of force and gravity; `decays` is what damping leaves of them, 0 for a node that is held. */
+export function accelerate(
+  nodes: i32, velocity: usize, force: usize, inverses: usize, decays: usize, resistances: usize, dragged: bool, kick: f32, g0: f32, g1: f32, g2: f32,
+): void {
+  const gravity = f32x4(g0, g1, g2, 0);
+  let push = all(kick);
+  for (let k = 0; k < nodes; ++k, velocity += VECTOR, force += VECTOR, inverses += 4, decays += 4) {
+    const inverse = v128.load32_splat(inverses);
+    if (dragged) push = all(kick / (1 + kick * load<f32>(resistances + 4 * k) * load<f32>(inverses)));
+    const gained = mul(push, add(mul(get(force, 0), inverse), gravity));
+    v128.store(velocity, mul(v128.load32_splat(decays), add(get(velocity, 0), gained)));
+  }
+}
+
+/** Stops the held points exactly. */
+export function hold(
+  velocity: usize, rows: i32, rowNode: usize, rowWeight: usize, count: i32, affected: usize, push: usize, rates: usize,
+): void {
+  for (let r = 0; r < rows; ++r) {
+    let sum = all(0);
+    for (let k = 0; k < 27; ++k, rowNode += 4, rowWeight += 4)
+      sum = mad(sum, v128.load32_splat(rowWeight), v128.load(velocity + load<u32>(rowNode)));
+    v128.store(rates + VECTOR * r, sum);
+  }
+  for (let k = 0; k < count; ++k, affected += 4) {
+    let sum = all(0);
+    for (let r = 0; r < rows; ++r, push += 4) sum = mad(sum, v128.load32_splat(push), get(rates, r));
+    const at = velocity + load<u32>(affected);
+    v128.store(at, sub(v128.load(at), sum));
+  }
+}
+
+export function move(nodes: i32, displacement: usize, velocity: usize, dt: f32): void {
+  const step = all(dt);
+  for (let k = 0; k < nodes; ++k, displacement += VECTOR, velocity += VECTOR)
+    v128.store(displacement, mad(get(displacement, 0), step, get(velocity, 0)));
 }

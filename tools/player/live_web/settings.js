@@ -7,7 +7,8 @@
 /** @type {Settings} */
 export const USUAL = { wind: null, gusts: 1, stiffness: 1, speed: 1, view: null };
 
-const MOST = { gusts: [0, 3], stiffness: [0.1, 10], speed: [0.05, 1] };
+/** The least and the largest value of each, which the sliders have, too. */
+export const LIMITS = { gusts: [0, 3], stiffness: [0.125, 4], speed: [0.05, 1] };
 const FASTEST = 50; // m/s
 
 /** The settings in a link; what is not there, or cannot be, is as usual. @param {string} text @returns {Settings} */
@@ -20,9 +21,9 @@ export function readSettings(text) {
   };
   const wind = numbers("wind", 3);
   if (wind && Math.hypot(...wind) <= FASTEST) found.wind = wind;
-  for (const name in MOST) {
+  for (const name in LIMITS) {
     const one = numbers(name, 1);
-    const [low, high] = MOST[name];
+    const [low, high] = LIMITS[name];
     if (one) found[name] = Math.min(Math.max(one[0], low), high);
   }
   const view = numbers("view", 6);

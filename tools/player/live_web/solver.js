@@ -7,6 +7,7 @@ const LOOKS = 8; // checks of the Courant number in a frame, as in simulation/st
 const LIMIT = 0.5; // a frame that exceeds it is repeated with shorter substeps
 const RETRIES = 4;
 const SAMPLES = 5; // winds of a frame that the drag is bounded with
+const WIDE = 4; // numbers of a node, of which the last one means nothing
 const MOST_GROWTH = 1000; // a frame that takes this many times the substeps of the first has diverged
 
 /** @typedef {{held: Float64Array, offset: Float64Array, target: Float64Array}} Pull See gaussian_swaying/viewer/pull.py. */
@@ -28,14 +29,15 @@ export class Solver {
     this.idle = head.idle;
     /** Stiffness, as a multiple of that in the file. */
     this.stiffness = 1;
+    /** Whether substeps are as long as is still stable; else they are those of the package. */
+    this.hurried = false;
     /** @type {Pull | null} */
     this.pull = null;
-    this.displacement = new Float64Array(3 * this.nodes);
-    this.velocity = new Float64Array(3 * this.nodes);
-    this.wide = 3; // numbers of a node in `force`
-    this.force = new Float64Array(3 * this.nodes);
+    this.displacement = new Float64Array(WIDE * this.nodes);
+    this.velocity = new Float64Array(WIDE * this.nodes);
+    this.force = new Float64Array(WIDE * this.nodes);
     this.resistance = new Float64Array(this.nodes);
-    this.shift = new Float64Array(head.planes.length ? 3 * this.nodes : 0);
+    this.shift = new Float64Array(head.planes.length ? WIDE * this.nodes : 0);
     this.before = { displacement: this.displacement.slice(), velocity: this.velocity.slice() };
     this.cell = new Int32Array(this.points); // of each point
     for (let c = 0; c < this.cells; c++) this.cell.fill(c, arrays.cellStart[c], arrays.cellStart[c + 1]);
@@ -54,6 +56,7 @@ export class Solver {
     this.time = 0;
     this.substep = 0; // the last one [s]
     this.pull = null;
+    this.hurried = false;
     /** The last measurement: when, the fastest wave [m/s], and the time of the viscous stress times its stiffening [s]. */
     this.seen = { time: NaN, stiffness: 1, wave: 0, viscous: 0 };
   }
@@ -65,7 +68,8 @@ export class Solver {
    * @returns {number} substeps
    */
   advance() {
-    const { frameDt, cfl, dx } = this.head;
+    const { frameDt, dx } = this.head;
+    const cfl = this.courant();
     const { before } = this;
     before.displacement.set(this.displacement);
     before.velocity.set(this.velocity);
@@ -88,12 +92,17 @@ export class Solver {
     }
   }
 
+  /** The wanted Courant number. */
+  courant() {
+    return this.hurried ? this.head.longest : this.head.cfl;
+  }
+
   /** Substeps of the next frame, from waves in the material and drag on light patches. */
   substeps() {
-    const { frameDt, cfl, dx, substep } = this.head;
+    const { frameDt, dx, substep } = this.head;
     this.look();
     const { viscous } = this.seen;
-    let longest = substep ?? cfl / Math.max(this.seen.wave / dx, 1e-30);
+    let longest = substep ?? this.courant() / Math.max(this.seen.wave / dx, 1e-30);
     if (viscous > 0 && substep === null) longest = longest ** 2 / (viscous + Math.sqrt(viscous ** 2 + longest ** 2));
     const waves = Math.max(1, Math.ceil(frameDt / longest - 1e-6));
     return this.aero.implicit ? waves : Math.max(waves, Math.floor(this.drag() * frameDt) + 1);
@@ -152,8 +161,7 @@ export class Solver {
     this.accelerate(kick);
     for (const plane of head.planes) this.stop(plane);
     this.hold();
-    const { displacement: U, velocity: V } = this;
-    for (let k = 0; k < U.length; k++) U[k] += dt * V[k];
+    this.move(dt);
     this.time += dt;
     this.substep = dt;
   }
@@ -174,7 +182,7 @@ export class Solver {
     for (let c = 0; c < this.cells; c++) {
       const first = 27 * c;
       for (let k = 0; k < 27; k++) {
-        const at = 3 * cellNodes[first + k];
+        const at = WIDE * cellNodes[first + k];
         const to = 3 * k;
         u27[to] = U[at], u27[to + 1] = U[at + 1], u27[to + 2] = U[at + 2];
         v27[to] = V[at], v27[to + 1] = V[at + 1], v27[to + 2] = V[at + 2];
@@ -234,7 +242,7 @@ export class Solver {
         if (drag > 0) this.spreadResistance(first, drag);
       }
       for (let k = 0; pushed && k < 27; k++) {
-        const at = 3 * cellNodes[first + k];
+        const at = WIDE * cellNodes[first + k];
         const from = 3 * k;
         A[at] += a27[from], A[at + 1] += a27[from + 1], A[at + 2] += a27[from + 2];
       }
@@ -273,7 +281,7 @@ export class Solver {
       out[0] = held * limit * x - damping * velocity[0];
       out[1] = held * limit * y - damping * velocity[1];
       out[2] = held * limit * z - damping * velocity[2];
-      for (let k = 0; k < 27; k++) for (let m = 0; m < 3; m++) this.force[this.wide * cellNodes[first + k] + m] += weightOf(k) * out[m];
+      for (let k = 0; k < 27; k++) for (let m = 0; m < 3; m++) this.force[WIDE * cellNodes[first + k] + m] += weightOf(k) * out[m];
       this.spreadResistance(first, damping);
     }
   }
@@ -291,7 +299,7 @@ export class Solver {
       const first = 27 * this.cell[p];
       this.at(p, first);
       for (let k = 0; k < 27; k++) {
-        const at = 3 * cellNodes[first + k];
+        const at = WIDE * cellNodes[first + k];
         const own = mass[p] * weightOf(k);
         S[at] += own * place[0], S[at + 1] += own * place[1], S[at + 2] += own * place[2];
       }
@@ -303,7 +311,7 @@ export class Solver {
     const { displacement: U, velocity: V } = this;
     const { cellNodes, fraction } = this.a;
     for (let k = 0; k < 27; k++) {
-      const at = 3 * cellNodes[first + k];
+      const at = WIDE * cellNodes[first + k];
       for (let m = 0; m < 3; m++) {
         u27[3 * k + m] = U[at + m];
         v27[3 * k + m] = V[at + m];
@@ -315,13 +323,13 @@ export class Solver {
 
   /** Velocities of the nodes after `kick` seconds of force, gravity and damping. */
   accelerate(kick) {
-    const { force: A, velocity: V, resistance: D, head, dragged, wide } = this;
+    const { force: A, velocity: V, resistance: D, head, dragged } = this;
     const { inverseMass, held, nodeDamping } = this.a;
     const damped = nodeDamping.length > 0;
     const [g0, g1, g2] = head.gravity;
     const all = Math.exp(-head.damping * kick);
     for (let k = 0; k < this.nodes - 1; k++) {
-      const at = 3 * k;
+      const at = WIDE * k;
       if (held[k]) {
         V[at] = V[at + 1] = V[at + 2] = 0;
         continue;
@@ -329,10 +337,9 @@ export class Solver {
       const inverse = inverseMass[k];
       const decay = damped ? all * Math.exp(-kick * nodeDamping[k]) : all;
       const push = dragged ? kick / (1 + kick * D[k] * inverse) : kick;
-      const from = wide * k;
-      V[at] = decay * (V[at] + push * (A[from] * inverse + g0));
-      V[at + 1] = decay * (V[at + 1] + push * (A[from + 1] * inverse + g1));
-      V[at + 2] = decay * (V[at + 2] + push * (A[from + 2] * inverse + g2));
+      V[at] = decay * (V[at] + push * (A[at] * inverse + g0));
+      V[at + 1] = decay * (V[at + 1] + push * (A[at + 1] * inverse + g1));
+      V[at + 2] = decay * (V[at + 2] + push * (A[at + 2] * inverse + g2));
     }
   }
 
@@ -343,12 +350,12 @@ export class Solver {
     const { velocity: V, shift: S } = this;
     const { inverseMass, nodeRest } = this.a;
     for (let k = 0; k < this.nodes - 1; k++) {
-      const at = 3 * k;
+      const [at, from] = [WIDE * k, 3 * k];
       const inverse = inverseMass[k];
       const depth =
-        (nodeRest[at] + S[at] * inverse - point[0]) * n0 +
-        (nodeRest[at + 1] + S[at + 1] * inverse - point[1]) * n1 +
-        (nodeRest[at + 2] + S[at + 2] * inverse - point[2]) * n2;
+        (nodeRest[from] + S[at] * inverse - point[0]) * n0 +
+        (nodeRest[from + 1] + S[at + 1] * inverse - point[1]) * n1 +
+        (nodeRest[from + 2] + S[at + 2] * inverse - point[2]) * n2;
       if (depth > 0) continue;
       if (kind === "sticky") {
         V[at] = V[at + 1] = V[at + 2] = 0;
@@ -375,7 +382,7 @@ export class Solver {
     for (let r = 0; r < rows; r++) {
       let [x, y, z] = [0, 0, 0];
       for (let k = 27 * r; k < 27 * r + 27; k++) {
-        const at = 3 * rowNode[k];
+        const at = WIDE * rowNode[k];
         x += rowWeight[k] * V[at];
         y += rowWeight[k] * V[at + 1];
         z += rowWeight[k] * V[at + 2];
@@ -391,11 +398,16 @@ export class Solver {
         y += push[from] * rates[3 * r + 1];
         z += push[from] * rates[3 * r + 2];
       }
-      const at = 3 * affected[k];
+      const at = WIDE * affected[k];
       V[at] -= x;
       V[at + 1] -= y;
       V[at + 2] -= z;
     }
+  }
+
+  move(dt) {
+    const { displacement: U, velocity: V } = this;
+    for (let k = 0; k < U.length; k++) U[k] += dt * V[k];
   }
 
   // ---- the visitor
@@ -448,7 +460,7 @@ export class Solver {
     const { followed } = this.a;
     const found = new Float32Array(4 * followed.length);
     for (let k = 0; k < followed.length; k++)
-      for (let m = 0; m < 3; m++) found[4 * k + m] = this.displacement[3 * followed[k] + m];
+      for (let m = 0; m < 3; m++) found[4 * k + m] = this.displacement[WIDE * followed[k] + m];
     return found;
   }
 }

@@ -6,6 +6,8 @@ import { Solver } from "./solver.js";
 const BEHIND = 0.25; // s that it may be late before it stops trying to catch up
 const WINDOW = 2000; // ms, over which the speed is measured
 const LEAST = 4; // frames that it is measured from
+const LATE = 0.95; // of the wanted speed: below it substeps become longer
+const EASY = 0.4; // share of the time in which it computes: below it they are those of the package again
 const BREATH = 4; // ms between frames, in which it hears what the page says
 
 /** @type {Solver} */
@@ -15,8 +17,8 @@ let speed = 1; // simulated seconds per second that are wanted
 let motion = 0; // counts the starts from rest
 /** @type {{now: number, time: number} | null} */
 let anchor = null;
-/** @type {[number, number][]} */
-let past = []; // when, and the simulated time, of the last frames
+/** @type {[number, number, number][]} */
+let past = []; // when, the simulated time, and how long it took [ms], of the last frames
 /** @type {ReturnType<typeof setTimeout> | undefined} */
 let next;
 
@@ -36,10 +38,26 @@ function made(block, plain = false) {
 
 function show() {
   const moved = solver.drawn();
-  const [first] = past;
-  const last = past[past.length - 1];
-  const rate = past.length >= LEAST ? (last[1] - first[1]) / ((last[0] - first[0]) / 1000) : null;
+  const rate = solver.hurried || solver.head.substep !== null ? measured()?.rate ?? null : null;
   post({ kind: "state", motion, time: solver.time, moved, rate, ended: !on }, [moved.buffer]);
+}
+
+/** Simulated seconds per second, and the share of the time in which it computes; null at first. */
+function measured() {
+  if (past.length < LEAST) return null;
+  const [first, last] = [past[0], past[past.length - 1]];
+  const wall = last[0] - first[0];
+  return { rate: (last[1] - first[1]) / (wall / 1000), busy: past.slice(1).reduce((sum, frame) => sum + frame[2], 0) / wall };
+}
+
+/** Takes longer substeps where it is late. */
+function hurry() {
+  const found = measured();
+  if (!found) return;
+  const hurried = found.rate < LATE * speed || (solver.hurried && found.busy > EASY);
+  if (hurried === solver.hurried) return;
+  solver.hurried = hurried;
+  past = [];
 }
 
 function pace() {
@@ -53,6 +71,7 @@ function pace() {
     next = setTimeout(pace, Math.max(BREATH, ((solver.time - due) / speed) * 1000));
     return;
   }
+  const began = performance.now();
   try {
     solver.advance();
   } catch (error) {
@@ -61,8 +80,9 @@ function pace() {
     return;
   }
   const after = performance.now();
-  past.push([after, solver.time]);
+  past.push([after, solver.time, after - began]);
   while (past.length > LEAST && after - past[0][0] > WINDOW) past.shift();
+  hurry();
   show();
   next = setTimeout(pace, BREATH);
 }
@@ -107,7 +127,8 @@ const does = {
     restart();
   },
   // for tests and measurements
-  frames({ count }) {
+  frames({ count, hurried }) {
+    solver.hurried = !!hurried;
     const began = performance.now();
     let substeps = 0;
     for (let k = 0; k < count; k++) substeps += solver.advance();
