@@ -47,10 +47,11 @@ await build({
   plugins: [{ name: "cut-spark", setup: (made) => made.onLoad({ filter: /spark\.module\.js$/ }, cutSpark) }],
 });
 
-// The pass over all points, compiled to WebAssembly.
-async function compilePoints() {
+// points.ts compiled to WebAssembly: points.wasm, and points.fused.wasm, which multiplies and adds in one instruction.
+async function compilePoints({ path }) {
   const files = {};
   const options = "-O3 --noAssert --runtime stub --enable simd --use abort= --outFile points.wasm".split(" ");
+  if (path.includes("fused")) options.push("--enable", "relaxed-simd");
   const { error, stderr } = await asc.main(["live_web/points.ts", ...options], {
     writeFile: (name, contents) => (files[name] = contents),
   });
@@ -61,7 +62,7 @@ async function compilePoints() {
 const points = {
   name: "points",
   setup(made) {
-    made.onResolve({ filter: /points\.wasm$/ }, ({ path }) => ({ path, namespace: "points" }));
+    made.onResolve({ filter: /points(\.fused)?\.wasm$/ }, ({ path }) => ({ path, namespace: "points" }));
     made.onLoad({ filter: /.*/, namespace: "points" }, compilePoints);
   },
 };

@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from jsonargparse import ArgumentParser, Namespace
 
 TARGETS = {"phone": 2e6, "laptop": 5.5e6, "desktop": 8e6}
-"""Material points times substeps a second that a kind of machine computes, with room for drawing; longer substeps are its reserve."""
+"""Material points times substeps of a run in a second that a kind of machine computes, with room for drawing."""
 
 IN_JAVASCRIPT = 4.0
 """Factor by which a substep takes longer where the fast pass over the points does not know a law or a force."""

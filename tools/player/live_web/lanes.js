@@ -1,7 +1,8 @@
 // The solver with its passes over points and nodes in WebAssembly, four points at a time, in single precision as in the package.
 import { NEO_HOOKEAN } from "./laws.js";
 import { singular } from "./matrices.js";
-import code from "./points.wasm"; // build.js makes it from points.ts
+import code from "./points.wasm"; // build.js makes both from points.ts
+import fused from "./points.fused.wasm";
 import { Solver } from "./solver.js";
 
 const LANES = 4;
@@ -13,7 +14,7 @@ export class LanesSolver extends Solver {
     super(block);
     const { head, arrays: a } = block;
     const env = { unreflected: (at) => this.unreflected(at), log: Math.log, cos: Math.cos, acos: Math.acos };
-    const { exports } = new WebAssembly.Instance(new WebAssembly.Module(code), { env });
+    const { exports } = new WebAssembly.Instance(new WebAssembly.Module(WebAssembly.validate(fused) ? fused : code), { env });
     this.code = /** @type {any} */ (exports);
     const starts = Int32Array.from({ length: this.cells + 1 });
     for (let c = 0; c < this.cells; c++) starts[c + 1] = starts[c] + Math.ceil((a.cellStart[c + 1] - a.cellStart[c]) / LANES);

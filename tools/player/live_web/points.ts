@@ -35,7 +35,9 @@ const scratch = memory.data(9 * 4, 16);
 // @ts-ignore: decorator
 @inline function mul(a: v128, b: v128): v128 { return f32x4.mul(a, b); }
 // @ts-ignore: decorator
-@inline function mad(c: v128, a: v128, b: v128): v128 { return f32x4.add(c, f32x4.mul(a, b)); }
+@inline function mad(c: v128, a: v128, b: v128): v128 { // in one instruction, where the browser has it
+  return ASC_FEATURE_RELAXED_SIMD ? f32x4.relaxed_madd(a, b, c) : f32x4.add(c, f32x4.mul(a, b));
+}
 // @ts-ignore: decorator
 @inline function all(x: f32): v128 { return f32x4.splat(x); }
 // @ts-ignore: decorator
