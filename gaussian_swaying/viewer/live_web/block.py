@@ -18,7 +18,12 @@ from torch import Tensor
 from gaussian_swaying.aero.force import LAWS as AERO_LAWS
 from gaussian_swaying.aero.wind import GaussianGust, SineSway, UniformGust, WindField, stream_start
 from gaussian_swaying.geometry.groups import equal_rows
+from gaussian_swaying.mpm.boundaries.ball import BallObstacle
+from gaussian_swaying.mpm.boundaries.block import BoxObstacle
 from gaussian_swaying.mpm.boundaries.boundary import Boundary
+from gaussian_swaying.mpm.boundaries.capsule import CapsuleObstacle
+from gaussian_swaying.mpm.boundaries.half_space import HalfSpaceObstacle
+from gaussian_swaying.mpm.boundaries.obstacle import Obstacle
 from gaussian_swaying.mpm.boundaries.pinned_points import PinnedPoints
 from gaussian_swaying.mpm.boundaries.pinned_region import PinnedRegion
 from gaussian_swaying.mpm.boundaries.plane import Plane
@@ -35,6 +40,10 @@ LAWS = (FixedCorotated, NeoHookean, StVKHencky, SpringNetwork)
 """The laws that a browser knows, by their number in the block."""
 
 
+OBSTACLES = (HalfSpaceObstacle, BallObstacle, CapsuleObstacle, BoxObstacle)
+"""The obstacles that a browser knows, as long as they stand still."""
+
+
 def check(simulation: Simulation) -> None:
     """Check that a browser can simulate this.
 
@@ -49,8 +58,8 @@ def check(simulation: Simulation) -> None:
         raise _refused("`custom_solver`", "leave it out")
     if solver.formulation != "total":
         raise _refused("`solver.formulation: updated`", "set it to total")
-    if setup.scene.surface_places is not None:
-        raise _refused("`contact` and obstacles", "set `contact` to null, and use Plane instead of obstacles")
+    if setup.scene.surface_places is not None and setup.scene.surface_places.contact is not None:
+        raise _refused("`contact` of the material with itself", "set `contact` to null")
     if simulation.stepper.copies is not None:
         raise _refused("`copies`", "leave them out")
     if simulation.editor.edits:
@@ -86,8 +95,13 @@ def in_webassembly(simulation: Simulation) -> bool:
 
 def _check_boundary(boundary: Any) -> None:
     name = type(boundary).__name__
+    if isinstance(boundary, OBSTACLES):
+        if not boundary.still:
+            raise _refused(f"the `path` of the {name}", "leave it out")
+        return
     if type(boundary) not in (PinnedRegion, PinnedPoints, Plane):
-        raise _refused(f"the {name} in `solver.boundaries`", "take a PinnedRegion, PinnedPoints or a Plane")
+        known = ", ".join(one.__name__ for one in (PinnedRegion, PinnedPoints, Plane, *OBSTACLES))
+        raise _refused(f"the {name} in `solver.boundaries`", f"take one of {known}")
     if type(boundary) is not Plane and not (boundary.holds_from <= 0 and boundary.end == math.inf):
         raise _refused(f"`start` and `end` of the {name}", "leave them out")
 
@@ -117,10 +131,12 @@ def pack_solver(simulation: Simulation, nodes: Tensor) -> bytes:
     row = torch.full_like(bound.node_mass, len(active), dtype=torch.long)
     row[active] = torch.arange(len(active))
     held = torch.zeros_like(bound.node_mass, dtype=torch.bool)
-    planes = []
+    planes, obstacles = [], []
     for boundary, own, acts in zip(body.boundaries, bound.held, bound.on_nodes, strict=True):
         if isinstance(boundary, Plane):
             planes.append(_plane(boundary))
+        elif isinstance(boundary, Obstacle):
+            obstacles.append(_obstacle(boundary))
         elif acts:
             assert own is not None
             assert own.share is not None
@@ -143,6 +159,7 @@ def pack_solver(simulation: Simulation, nodes: Tensor) -> bytes:
         "nodeRest": bound.node_rest[active] if bound.node_rest is not None else active.new_zeros(0),
         "followed": row[nodes],
         **_wind_arrays(simulation, order),
+        **_samples(bound, row),
     }
     rows = 0
     if bound.point_holds is not None:
@@ -165,6 +182,8 @@ def pack_solver(simulation: Simulation, nodes: Tensor) -> bytes:
         "frameDt": simulation.frame_dt,
         "size": scene.size * scene.frame.metres_per_unit,
         "planes": planes,
+        "obstacles": obstacles,
+        "iterations": bound.contact.iterations if bound.contact is not None else 0,
         "rows": rows,
         "idle": simulation.stepper.idle,
         "lanes": in_webassembly(simulation),
@@ -195,6 +214,36 @@ def _plane(plane: Boundary) -> dict[str, Any]:
         "start": plane.start,
         "end": None if plane.end == math.inf else plane.end,
     }
+
+
+def _obstacle(obstacle: Obstacle) -> dict[str, Any]:
+    if isinstance(obstacle, HalfSpaceObstacle):
+        kind, numbers = "half_space", obstacle.normal
+    elif isinstance(obstacle, BoxObstacle):
+        kind, numbers = "box", torch.cat([obstacle.half_sides, obstacle.axes.reshape(-1)])
+    elif isinstance(obstacle, CapsuleObstacle):
+        kind, numbers = "capsule", torch.cat([obstacle.radius[None], obstacle.half_axis])
+    else:
+        assert isinstance(obstacle, BallObstacle)
+        kind, numbers = "capsule", torch.nn.functional.pad(obstacle.radius[None], (0, 3))
+    return {
+        "kind": kind,
+        "center": obstacle.center.tolist(),
+        "numbers": numbers.tolist(),
+        "friction": obstacle.friction,
+        "gap": obstacle.gap,
+        "start": obstacle.start,
+        "end": None if obstacle.end == math.inf else obstacle.end,
+    }
+
+
+def _samples(bound: Total, row: Tensor) -> dict[str, Tensor]:
+    """The samples of the surface that touch obstacles; ``row`` is the row of each node."""
+    none, contact = bound.node_mass.new_zeros(0), bound.contact
+    if contact is None:
+        return {"sampleNode": row[:0], "sampleWeight": none, "samplePlace": none, "sampleHalf": none}
+    place, half = contact.surface.place, 0.5 * contact.surface.thickness
+    return {"sampleNode": row[contact.node], "sampleWeight": contact.weight, "samplePlace": place, "sampleHalf": half}
 
 
 def _aero(simulation: Simulation) -> dict[str, Any]:

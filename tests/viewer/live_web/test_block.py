@@ -105,6 +105,39 @@ def test_laws_forces_and_boundaries(make, in_node, name):
         assert told[0]["lanes"] is not plain
 
 
+def obstacle(name, **options):
+    return {"class_path": name, "init_args": options}
+
+
+OBSTACLES = {
+    "ground and ball": [
+        obstacle("HalfSpaceObstacle", point=[0, 0, -0.1], normal=[0, 0.1, 1], friction=0.4),
+        obstacle("BallObstacle", center=[0.25, 0.15, 0.1], radius=0.1, gap=0.005),
+    ],
+    "box": [obstacle("BoxObstacle", min=[0.2, 0.05, -0.2], max=[0.5, 0.2, 0.1], turn=[0.0, 0.0, 20.0])],
+    "rod, later": [
+        obstacle("CapsuleObstacle", first=[0.25, -0.3, 0.0], second=[0.25, 0.4, 0.05], radius=0.04, start=0.1)
+    ],
+}
+
+
+@pytest.mark.parametrize("name", OBSTACLES)
+def test_contact_with_what_stands_still(make, in_node, name):
+    """Within 1 % of the motion after two seconds, of which the obstacles stop a part."""
+    pins = {"class_path": "PinnedRegion", "init_args": {"region": SIDE}}
+    simulation = make(solver={"boundaries": [pins, *OBSTACLES[name]]})
+    state, steps = run(simulation, 50)
+    free, _ = run(make(), 50)
+    stopped = (state.position - free.position).norm(dim=-1).max()
+    for plain in (False, True):
+        told, moved = in_node(simulation, {"kind": "frames", "count": 50}, plain=plain)
+        error, motion = apart(simulation, state, moved)
+        assert motion > 0.05
+        assert float(stopped) > 0.1 * motion
+        assert error < 1e-3
+        assert told[0]["substeps"] == steps
+
+
 def test_parts_with_nodes_of_their_own(make, in_node, tmp_path):
     """Two sheets, less than a cell apart."""
     sheet = FlagScene(spacing=0.05).generate()
@@ -150,6 +183,20 @@ class Lift(Force):
 REFUSED = {
     "solver.formulation": {"solver": {"formulation": "updated"}},
     "contact": {"contact": {"thickness": 0.01}},
+    "path": {
+        "solver": {
+            "boundaries": [
+                {
+                    "class_path": "BallObstacle",
+                    "init_args": {
+                        "center": [0.4, 0.4, 0.0],
+                        "radius": 0.1,
+                        "path": {"times": [0, 1], "moves": [[0, 0, 0], [0, 1, 0]]},
+                    },
+                }
+            ]
+        }
+    },
     "copies": {"copies": [{"shift": [0, 0, 0]}, {"shift": [0, 2, 0]}]},
     "edits": {"edits": [{"time": 1.0, "E": 1e4}]},
     "forces": {"forces": [{"class_path": f"{__name__}.Lift"}]},
@@ -173,6 +220,7 @@ def test_the_worker_is_built_from_its_sources(request):
     own = [
         "aero.js",
         "block.js",
+        "contact.js",
         "lanes.js",
         "laws.js",
         "matrices.js",

@@ -38,6 +38,7 @@ export class LanesSolver extends Solver {
       displacement: 4 * this.nodes, velocity: 4 * this.nodes, force: 4 * this.nodes, speeds: LANES * chunks,
       inverses: this.nodes, decays: this.nodes, resistances: this.nodes,
       rowNode: a.rowNode.length, rowWeight: a.rowWeight.length, affected: a.affected.length, push: a.push.length, rates: 4 * head.rows,
+      sampleNode: a.sampleNode.length, sampleWeight: a.sampleWeight.length, moved: 4 * a.sampleHalf.length,
     };
     let end = Math.ceil(this.code.free() / 16) * 16;
     /** First byte of each array. @type {Record<string, number>} */
@@ -59,8 +60,9 @@ export class LanesSolver extends Solver {
     this.decays = view(Float32Array, "decays");
     this.kicked = NaN; // the time that `decays` are for [s]
     view(Float32Array, "inverses").set(a.inverseMass);
-    for (const name of ["rowWeight", "push"]) view(Float32Array, name).set(a[name]);
-    for (const name of ["rowNode", "affected"]) view(Int32Array, name).set(a[name].map((node) => 16 * node));
+    this.moved = view(Float32Array, "moved");
+    for (const name of ["rowWeight", "push", "sampleWeight"]) view(Float32Array, name).set(a[name]);
+    for (const name of ["rowNode", "affected", "sampleNode"]) view(Int32Array, name).set(a[name].map((node) => 16 * node));
     this.before = { displacement: this.displacement.slice(), velocity: this.velocity.slice() };
 
     const [records, whole] = [view(Float32Array, "records"), view(Int32Array, "records")];
@@ -132,7 +134,7 @@ export class LanesSolver extends Solver {
     const { head, where, nodes, a } = this;
     if (kick !== this.kicked) {
       this.kicked = kick;
-      for (let k = 0; k < nodes; k++) this.decays[k] = a.held[k] ? 0 : Math.exp(-kick * (head.damping + (a.nodeDamping[k] ?? 0)));
+      for (let k = 0; k < nodes; k++) this.decays[k] = Math.exp(-kick * (head.damping + (a.nodeDamping[k] ?? 0)));
     }
     const { velocity, force, inverses, decays, resistances } = where;
     this.code.accelerate(nodes - 1, velocity, force, inverses, decays, resistances, this.dragged, kick, ...head.gravity);
@@ -142,7 +144,13 @@ export class LanesSolver extends Solver {
     const { where, head, a } = this;
     if (head.rows === 0) return;
     const { velocity, rowNode, rowWeight, affected, push, rates } = where;
-    this.code.hold(velocity, head.rows, rowNode, rowWeight, a.affected.length, affected, push, rates);
+    this.code.read(head.rows, rowNode, rowWeight, velocity, rates);
+    this.code.hold(velocity, head.rows, a.affected.length, affected, push, rates);
+  }
+
+  samples() {
+    const { sampleNode, sampleWeight, displacement, moved } = this.where;
+    this.code.read(this.contact.count, sampleNode, sampleWeight, displacement, moved);
   }
 
   move(dt) {

@@ -149,6 +149,16 @@ function neoHookean(mu: v128, lam: v128): void {
   P6 = mad(mul(mu, F6), s, C6), P7 = mad(mul(mu, F7), s, C7), P8 = mad(mul(mu, F8), s, C8);
 }
 
+/** A bound of how much an area of the material grows, squared: the largest sum of a row of cof(FᵀF) (Gershgorin). */
+function largestArea(): v128 {
+  const c0 = cross(F4, F8, F5, F7), c1 = cross(F5, F6, F3, F8), c2 = cross(F3, F7, F4, F6);
+  const c3 = cross(F2, F7, F1, F8), c4 = cross(F0, F8, F2, F6), c5 = cross(F1, F6, F0, F7);
+  const c6 = cross(F1, F5, F2, F4), c7 = cross(F2, F3, F0, F5), c8 = cross(F0, F4, F1, F3);
+  const xy = f32x4.abs(dot(c0, c3, c6, c1, c4, c7)), xz = f32x4.abs(dot(c0, c3, c6, c2, c5, c8)), yz = f32x4.abs(dot(c1, c4, c7, c2, c5, c8));
+  const x = dot(c0, c3, c6, c0, c3, c6), y = dot(c1, c4, c7, c1, c4, c7), z = dot(c2, c5, c8, c2, c5, c8);
+  return f32x4.max(f32x4.max(add(x, add(xy, xz)), add(y, add(xy, yz))), add(z, add(xz, yz)));
+}
+
 /** As `waveModulus` in laws.js. */
 function wave(law: f32, lane: i32, mu: f64, lam: f64): f64 {
   const f0: f64 = lane_of(F0, lane), f1: f64 = lane_of(F1, lane), f2: f64 = lane_of(F2, lane);
@@ -196,7 +206,8 @@ function blow(
   for (let k = 0; k < count; ++k, vector += 3 * VECTOR) {
     const b0 = get(vector, 0), b1 = get(vector, 1), b2 = get(vector, 2);
     const along = dot(b0, b1, b2, w0, w1, w2);
-    s0 = add(s0, flip(b0, along)), s1 = add(s1, flip(b1, along)), s2 = add(s2, flip(b2, along));
+    const sign = v128.and(along, all(-0.0));
+    s0 = add(s0, v128.xor(b0, sign)), s1 = add(s1, v128.xor(b1, sign)), s2 = add(s2, v128.xor(b2, sign));
     if (law != CROSS_FLOW) continue;
     const flow = f32x4.div(mul(along, f32x4.abs(along)), f32x4.max(dot(b0, b1, b2, b0, b1, b2), all(1e-30)));
     p0 = mad(p0, flow, b0), p1 = mad(p1, flow, b1), p2 = mad(p2, flow, b2);
@@ -282,7 +293,9 @@ export function particles(
       if (looked) {
         v128.store(speeds + VECTOR * q, f32x4.sqrt(dot(v0, v1, v2, v0, v1, v2)));
         const real = load<i32>(at + 14 * VECTOR + 8);
+        const most = mul(mad(mul(all(2), mu), lam, f32x4.max(largestArea(), all(1))), mul(all(stiffness * 1.0001), get(at, 6)));
         for (let lane = 0; lane < real; ++lane) {
+          if (lane_of(laws, lane) < 0.5 && lane_of(most, lane) <= f32(fastest)) continue; // not the fastest
           const modulus = wave(lane_of(laws, lane), lane, lane_of(mu, lane), lane_of(lam, lane));
           const found = modulus * stiffness * lane_of(get(at, 6), lane);
           if (!(found <= fastest)) fastest = found;
@@ -388,7 +401,7 @@ export function particles(
   return mul(sub(f, all(0.5)), inverse);
 }
 
-/** Velocities of the nodes after `kick` seconds of force and gravity; `decays` is what damping leaves of them, 0 for a node that is held. */
+/** Velocities of the nodes after `kick` seconds of force and gravity; `decays` is what damping leaves of them. */
 export function accelerate(
   nodes: i32, velocity: usize, force: usize, inverses: usize, decays: usize, resistances: usize, dragged: bool, kick: f32, g0: f32, g1: f32, g2: f32,
 ): void {
@@ -402,16 +415,18 @@ export function accelerate(
   }
 }
 
-/** Stops the held points exactly. */
-export function hold(
-  velocity: usize, rows: i32, rowNode: usize, rowWeight: usize, count: i32, affected: usize, push: usize, rates: usize,
-): void {
+/** Weighted sums over 27 nodes each of a field. */
+export function read(rows: i32, node: usize, weight: usize, field: usize, out: usize): void {
   for (let r = 0; r < rows; ++r) {
     let sum = all(0);
-    for (let k = 0; k < 27; ++k, rowNode += 4, rowWeight += 4)
-      sum = mad(sum, v128.load32_splat(rowWeight), v128.load(velocity + load<u32>(rowNode)));
-    v128.store(rates + VECTOR * r, sum);
+    for (let k = 0; k < 27; ++k, node += 4, weight += 4)
+      sum = mad(sum, v128.load32_splat(weight), v128.load(field + load<u32>(node)));
+    v128.store(out + VECTOR * r, sum);
   }
+}
+
+/** Stops the held points exactly; `rates` are their velocities. */
+export function hold(velocity: usize, rows: i32, count: i32, affected: usize, push: usize, rates: usize): void {
   for (let k = 0; k < count; ++k, affected += 4) {
     let sum = all(0);
     for (let r = 0; r < rows; ++r, push += 4) sum = mad(sum, v128.load32_splat(push), get(rates, r));

@@ -1,5 +1,6 @@
 // The material point method in its total Lagrangian form; the definition is gaussian_swaying/mpm/formulations/total.py.
 import { onGroup, onPatch } from "./aero.js";
+import { Contact } from "./contact.js";
 import { largestSquare, stress, waveModulus } from "./laws.js";
 import { Wind } from "./wind.js";
 
@@ -18,7 +19,8 @@ const STRONGEST = 400; // m/s²
 
 export class Solver {
   /** @param {{head: any, arrays: Record<string, any>}} block */
-  constructor({ head, arrays }) {
+  constructor(block) {
+    const { head, arrays } = block;
     this.head = head;
     this.a = arrays;
     this.points = arrays.volume.length;
@@ -43,6 +45,9 @@ export class Solver {
     for (let c = 0; c < this.cells; c++) this.cell.fill(c, arrays.cellStart[c], arrays.cellStart[c + 1]);
     this.blown = new Float64Array(3);
     this.now = new Float64Array(3);
+    this.still = Int32Array.from(arrays.held.keys()).filter((k) => arrays.held[k]); // nodes that are held
+    this.contact = head.obstacles.length ? new Contact(block, WIDE) : null;
+    this.moved = new Float64Array(WIDE * (this.contact?.count ?? 0));
     this.rates = new Float64Array(3 * head.rows);
     this.speed = new Float64Array(this.points);
     this.first = null; // substeps of the first frame
@@ -159,7 +164,12 @@ export class Solver {
     if (this.pull !== null) this.pulls(this.pull);
     if (head.planes.length) this.shifts();
     this.accelerate(kick);
+    if (this.contact) {
+      this.samples();
+      this.contact.apply(this.velocity, this.moved, this.time, dt);
+    }
     for (const plane of head.planes) this.stop(plane);
+    for (const k of this.still) this.velocity.fill(0, WIDE * k, WIDE * k + 3);
     this.hold();
     this.move(dt);
     this.time += dt;
@@ -324,22 +334,29 @@ export class Solver {
   /** Velocities of the nodes after `kick` seconds of force, gravity and damping. */
   accelerate(kick) {
     const { force: A, velocity: V, resistance: D, head, dragged } = this;
-    const { inverseMass, held, nodeDamping } = this.a;
+    const { inverseMass, nodeDamping } = this.a;
     const damped = nodeDamping.length > 0;
     const [g0, g1, g2] = head.gravity;
     const all = Math.exp(-head.damping * kick);
     for (let k = 0; k < this.nodes - 1; k++) {
       const at = WIDE * k;
-      if (held[k]) {
-        V[at] = V[at + 1] = V[at + 2] = 0;
-        continue;
-      }
       const inverse = inverseMass[k];
       const decay = damped ? all * Math.exp(-kick * nodeDamping[k]) : all;
       const push = dragged ? kick / (1 + kick * D[k] * inverse) : kick;
       V[at] = decay * (V[at] + push * (A[at] * inverse + g0));
       V[at + 1] = decay * (V[at + 1] + push * (A[at + 1] * inverse + g1));
       V[at + 2] = decay * (V[at + 2] + push * (A[at + 2] * inverse + g2));
+    }
+  }
+
+  /** Displacement of the samples of contact, into `moved`. */
+  samples() {
+    const { displacement: U, moved } = this;
+    const { sampleNode, sampleWeight } = this.a;
+    moved.fill(0);
+    for (let k = 0; k < sampleNode.length; k++) {
+      const [at, from] = [WIDE * Math.floor(k / 27), WIDE * sampleNode[k]];
+      for (let m = 0; m < 3; m++) moved[at + m] += sampleWeight[k] * U[from + m];
     }
   }
 
