@@ -233,10 +233,15 @@ class AirInBox:
         if settings.ground:
             self.origin[2] -= h
         centres = self._centres(cells)
-        walls = torch.zeros(cells, dtype=torch.bool)
-        for region in settings.walls:
-            walls |= region.contains(frame.point_to_scene(centres)).cpu()
+
+        def solid(place: Tensor) -> Tensor:
+            inside = torch.zeros(place.shape[:-1], dtype=torch.bool)
+            for region in settings.walls:
+                inside |= region.contains(frame.point_to_scene(self.origin + h * place)).cpu()
+            return inside
+
         faces: list[Face | tuple[Face, Face]] = ["open", "open", ("wall", "open") if settings.ground else "open"]
+        walls = solid if settings.walls else None
         self.flow = LatticeFlow(cells, units, faces=faces, walls=walls, smagorinsky=settings.smagorinsky).to(device)
         self._inflow = centres.reshape(-1, 3)[self.flow.held.long().cpu()].to(double_home(device))
         self.push = AirPush(state.position.shape[-2], state.position)

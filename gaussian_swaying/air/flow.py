@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Literal
 
@@ -37,17 +37,19 @@ class FlowState:
 class LatticeFlow(nn.Module):
     """A flow on a box of cubic cells: D3Q27, a regularised collision with third-order terms, Smagorinsky's model.
 
-    A wall lies halfway between the centres of a wall cell and its neighbour (bounce-back), and may move along its
-    surface. The outermost cells of a ``wall`` face are wall cells. Those of an ``open`` face have the velocity of the
-    wind and the pressure of their neighbour where the wind blows in or along the face (sound may leave, see
-    :func:`hold`), and the pressure at rest and the velocity of their neighbour where it blows out. In float32 the step
-    runs as compiled kernels on a GPU and on a CPU; :meth:`step` in float64 is their definition.
+    A wall lies halfway between the centres of a wall cell and its neighbour (bounce-back), or, where its shape is given
+    as a function, where it is (interpolated bounce-back of Bouzidi, Firdaouss and Lallemand 2001, Phys. Fluids 13); it
+    may move along its surface. The outermost cells of a ``wall`` face are wall cells. Those of an ``open`` face have
+    the velocity of the wind and the pressure of their neighbour where the wind blows in or along the face (sound may
+    leave, see :func:`hold`), and the pressure at rest and the velocity of their neighbour where it blows out. In
+    float32 the step runs as compiled kernels on a GPU and on a CPU; :meth:`step` in float64 is their definition.
 
     Args:
         cells: Cells along x, y and z. With one cell along an axis, which must be periodic, the flow is two-dimensional.
         units: Metres and seconds of the lattice.
         faces: ``periodic``, ``wall`` or ``open`` for each axis; or two of them, for its low and high face.
-        walls: Wall cells, bool, shape (X, Y, Z); None for none but those of the faces.
+        walls: Wall cells, bool, shape (X, Y, Z); or a function that tells of places, in cells from the lower corner of
+            the box, shape (..., 3), whether they lie in a wall, shape (...). None for none but those of the faces.
         smagorinsky: Constant of the subgrid model; 0 for none. Published values lie between 0.1 and 0.2.
 
     Attributes:
@@ -71,7 +73,7 @@ class LatticeFlow(nn.Module):
         units: LatticeUnits,
         *,
         faces: Sequence[Face | tuple[Face, Face]] = ("open", "open", "open"),
-        walls: Tensor | None = None,
+        walls: Tensor | Callable[[Tensor], Tensor] | None = None,
         smagorinsky: float = 0.1,
     ) -> None:
         super().__init__()
@@ -99,7 +101,11 @@ class LatticeFlow(nn.Module):
                     layer[layer != WALL] = HELD
                 elif side == "wall":
                     layer.fill_(WALL)
-        if walls is not None:
+        solid = walls if callable(walls) and not isinstance(walls, Tensor) else None
+        if solid is not None:
+            axes = [torch.arange(n, dtype=torch.float64) + 0.5 for n in shape]
+            walls = solid(torch.stack(torch.meshgrid(*axes, indexing="ij"), -1)).bool()
+        if isinstance(walls, Tensor):
             if walls.shape != shape or walls.dtype != torch.bool:
                 raise ValueError(f"Expected `walls` to be bool of shape {shape}, but got {tuple(walls.shape)}.")
             kind[walls.cpu()] = WALL
@@ -114,6 +120,7 @@ class LatticeFlow(nn.Module):
             ("behind", (inner * strides).sum(-1).int()),
             ("outward", (place - inner).float().contiguous()),
             ("special", _special(kind)),
+            ("gaps", torch.zeros(0)),
         ):
             self.register_buffer(name, value, persistent=False)
         self.kind: Tensor
@@ -121,6 +128,9 @@ class LatticeFlow(nn.Module):
         self.behind: Tensor
         self.outward: Tensor
         self.special: Tensor
+        self.gaps: Tensor
+        if solid is not None:
+            self.gaps = _gaps(kind, self.special.long(), solid)
 
     @property
     def has_walls(self) -> bool:
@@ -171,19 +181,26 @@ class LatticeFlow(nn.Module):
                 pushes a closed surface nowhere.
         """
         total = torch.zeros(3, dtype=torch.float64, device=part.device)
-        air = self.kind != WALL
         for number, c in enumerate(DIRECTIONS):
-            link = (torch.roll(part, c, (0, 1, 2)) & air).nonzero()
-            if not len(link):
-                continue
-            strides = link.new_tensor([self.cells[1] * self.cells[2], self.cells[2], 1])
-            behind = torch.remainder(link - link.new_tensor(c), link.new_tensor(self.cells))
-            flat = state.moments.reshape(MOMENTS, -1).double()
-            cells, moving = flat[:, (link * strides).sum(-1)], flat[1:4, (behind * strides).sum(-1)]
-            along = torch.tensor(c, dtype=torch.float64, device=part.device)
-            back = 2 * population(cells, OPPOSITE[number]) + 6 * WEIGHTS[number] * (along[:, None] * moving).sum(0)
-            total -= along * back.sum()
+            arrived, source = self._arrived(state.moments, number)
+            back = population(state.moments.reshape(MOMENTS, -1)[:, self.special.long()], OPPOSITE[number])
+            given = ((back + arrived) * part.reshape(-1)[source]).double().sum()
+            total -= given * torch.tensor(c, dtype=torch.float64, device=part.device)
         return total * self.units.cell_mass * self.units.speed / self.units.dt
+
+    def _arrived(self, moments: Tensor, number: int) -> tuple[Tensor, Tensor]:
+        """A population that arrives at special cells, and the flat index of the cells that it comes from, (S,) each."""
+        flat, special, c = moments.reshape(MOMENTS, -1), self.special.long(), DIRECTIONS[number]
+        source, away = (_neighbour(special, self.cells, step) for step in (tuple(-a for a in c), c))
+        own, sent = flat[:, special], population(flat[:, source], number)
+        pushed = 6 * WEIGHTS[number] * sum(a * flat[1 + k, source] for k, a in enumerate(c))
+        back = population(own, OPPOSITE[number]) + pushed
+        if len(self.gaps):
+            gap = self.gaps[number].to(moments)
+            near = 2 * gap * (back - pushed) + (1 - 2 * gap) * population(flat[:, away], OPPOSITE[number]) + pushed
+            far = (back + (2 * gap - 1) * population(own, number)) / (2 * gap)
+            back = torch.where(gap < 0.5, near, far)
+        return torch.where(self.kind.reshape(-1)[source] == WALL, back, sent), source
 
     def step(
         self, state: FlowState, wind: Tensor | None = None, acceleration: Sequence[float] = (0.0, 0.0, 0.0)
@@ -221,13 +238,11 @@ class LatticeFlow(nn.Module):
 
     def _step(self, moments: Tensor, out: Tensor, push: list[float]) -> None:
         wall = self.kind == WALL
-        arrived = []
+        special, arrived = self.special.long(), []
         for number, c in enumerate(DIRECTIONS):
             moved = torch.roll(population(moments, number), c, (0, 1, 2))
             if self.has_walls:
-                moving = sum(a * torch.roll(moments[1 + k], c, (0, 1, 2)) for k, a in enumerate(c))
-                back = population(moments, OPPOSITE[number]) + 6 * WEIGHTS[number] * moving
-                moved = torch.where(torch.roll(wall, c, (0, 1, 2)), back, moved)
+                moved.reshape(-1)[special] = self._arrived(moments, number)[0]
             arrived.append(moved)
         given = moments.new_tensor(push)[:, None, None, None] if any(push) else None
         out.copy_(collide(*sums(arrived), self.units.relaxation, self.smagorinsky, given))
@@ -258,6 +273,38 @@ def hold(moments: Tensor, held: Tensor, behind: Tensor, outward: Tensor, wind: T
     normal = outward.to(wind) / outward.to(wind).square().sum(-1, keepdim=True).sqrt()
     flat[1:4, held] = torch.where(out[:, None], leaving, wind + SOUND * near[0][:, None] * normal).T
     flat[4:, held] = near[4:]
+
+
+def _neighbour(cell: Tensor, cells: tuple[int, int, int], step: Sequence[int]) -> Tensor:
+    """Flat index of the neighbours of cells, shape (S,), across periodic faces."""
+    _, ny, nz = cells
+    place = (cell // (ny * nz), cell // nz % ny, cell % nz)
+    x, y, z = (torch.remainder(p + s, n) for p, s, n in zip(place, step, cells, strict=True))
+    return (x * ny + y) * nz + z
+
+
+def _gaps(kind: Tensor, special: Tensor, solid: Callable[[Tensor], Tensor]) -> Tensor:
+    """Share of the way to the wall cell at which the wall lies, for each velocity and special cell, float32, (27, S).
+
+    One half where there is no wall, or no air on the other side to interpolate with.
+    """
+    cells = (int(kind.shape[0]), int(kind.shape[1]), int(kind.shape[2]))
+    flat, gaps = kind.reshape(-1), torch.full((len(DIRECTIONS), len(special)), 0.5)
+    _, ny, nz = cells
+    place = torch.stack([special // (ny * nz), special // nz % ny, special % nz], -1).double() + 0.5
+    for number, c in enumerate(DIRECTIONS):
+        source, away = (_neighbour(special, cells, step) for step in (tuple(-a for a in c), c))
+        chosen = (flat[source] == WALL) & (flat[away] != WALL)
+        start, way = place[chosen], -torch.tensor(c, dtype=torch.float64)
+        chosen[chosen.clone()] = inside = solid(start + way).bool()  # walls of faces lie halfway
+        start = start[inside]
+        low, high = torch.zeros(len(start), dtype=torch.float64), torch.ones(len(start), dtype=torch.float64)
+        for _ in range(16):
+            middle = 0.5 * (low + high)
+            within = solid(start + middle[:, None] * way).bool()
+            low, high = torch.where(within, low, middle), torch.where(within, middle, high)
+        gaps[number, chosen] = high.float()
+    return gaps
 
 
 def _special(kind: Tensor) -> Tensor:

@@ -65,12 +65,31 @@ def _population(m, CX: tl.constexpr, CY: tl.constexpr, CZ: tl.constexpr):
 
 
 @triton.jit
+def _pushed(wall, CX: tl.constexpr, CY: tl.constexpr, CZ: tl.constexpr):
+    """Population that a moving wall adds."""
+    weight = (4 - 3 * CX * CX) * (4 - 3 * CY * CY) * (4 - 3 * CZ * CZ) / 36
+    return weight * (CX * wall[1] + CY * wall[2] + CZ * wall[3])
+
+
+@triton.jit
 def _returned(own, wall, CX: tl.constexpr, CY: tl.constexpr, CZ: tl.constexpr):
     """The population that comes back along (CX, CY, CZ) from a wall that may move."""
-    pushed = ((4 - 3 * CX * CX) * (4 - 3 * CY * CY) * (4 - 3 * CZ * CZ) / 36) * (
-        CX * wall[1] + CY * wall[2] + CZ * wall[3]
-    )
-    return _population(own, -CX, -CY, -CZ) + pushed
+    return _population(own, -CX, -CY, -CZ) + _pushed(wall, CX, CY, CZ)
+
+
+@triton.jit
+def _row(i: tl.constexpr):
+    """Place of the component i - 1 in (0, 1, -1), as ``lattice.DIRECTIONS`` has them."""
+    return (i + 2) % 3
+
+
+@triton.jit
+def _interpolated(back, own, beyond, wall, gap, CX: tl.constexpr, CY: tl.constexpr, CZ: tl.constexpr):
+    """The population that comes back from a wall at a share of the way to its cell, see ``LatticeFlow._arrived``."""
+    pushed = _pushed(wall, CX, CY, CZ)
+    near = 2.0 * gap * (back - pushed) + (1.0 - 2.0 * gap) * _population(beyond, -CX, -CY, -CZ) + pushed
+    far = (back + (2.0 * gap - 1.0) * _population(own, CX, CY, CZ)) / (2.0 * tl.maximum(gap, 0.25))
+    return tl.where(gap < 0.5, near, far)
 
 
 @triton.jit
@@ -145,7 +164,8 @@ def _wrapped(x, n):
 
 @triton.jit
 def special_step(
-    moments, out, kind, special, specials, count, nx, ny, nz, relaxation, smagorinsky, px, py, pz, BLOCK: tl.constexpr,
+    moments, out, kind, special, gaps, specials, count, nx, ny, nz, relaxation, smagorinsky, px, py, pz,
+    CURVED: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
     """As :func:`flow_step`, for cells with a neighbour that is a wall or lies behind a periodic face."""
     lane = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
@@ -164,6 +184,11 @@ def special_step(
                 wall = tl.load(kind + source, mask, 0) == 1
                 m = _load_moments(moments, source, count, mask)
                 back = _returned(own, m, i - 1, j - 1, k - 1)
+                if CURVED:
+                    away = (_wrapped(x + (i - 1), nx) * ny + _wrapped(y + (j - 1), ny)) * nz + _wrapped(z + (k - 1), nz)
+                    beyond = _load_moments(moments, away, count, mask)
+                    gap = tl.load(gaps + (9 * _row(i) + 3 * _row(j) + _row(k)) * specials + lane, mask, 0.5)
+                    back = _interpolated(back, own, beyond, m, gap, i - 1, j - 1, k - 1)
                 f = tl.where(wall, back, _population(m, i - 1, j - 1, k - 1))
                 s = _gather(s, f, i - 1, j - 1, k - 1)
     s = _collide(s, relaxation, smagorinsky, px, py, pz)
@@ -205,7 +230,19 @@ def step(flow, moments, out, wind, push):
     launch(flow_step, (triton.cdiv(count, block),))(moments, out, flow.kind, count, *strides, *numbers, BLOCK=block)
     if len(flow.special):
         launch(special_step, (triton.cdiv(len(flow.special), block),))(
-            moments, out, flow.kind, flow.special, len(flow.special), count, nx, ny, nz, *numbers, BLOCK=block
+            moments,
+            out,
+            flow.kind,
+            flow.special,
+            flow.gaps,
+            len(flow.special),
+            count,
+            nx,
+            ny,
+            nz,
+            *numbers,
+            CURVED=len(flow.gaps) > 0,
+            BLOCK=block,
         )
     if len(flow.held):
         launch(hold_faces, (triton.cdiv(len(flow.held), block),))(

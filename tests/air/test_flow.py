@@ -48,6 +48,42 @@ def test_kernels_compute_the_step(name, walls, kernel_device):
     torch.testing.assert_close(single.cpu().double(), expected, rtol=0, atol=3e-7)
 
 
+def _ball(place):
+    return (place - torch.tensor([6.3, 5.2, 4.6], dtype=place.dtype)).square().sum(-1) < 2.6**2
+
+
+def test_kernels_compute_the_step_around_a_ball(kernel_device):
+    """With interpolated bounce-back; the wall lies where it is, not at the borders of cells."""
+    flow = LatticeFlow((12, 10, 9), UNITS, walls=_ball)
+    assert float(flow.gaps.min()) < 0.2
+    assert float(flow.gaps.max()) > 0.8
+    state, wind = _random(flow)
+    expected = flow.step(state, wind).moments
+    single = flow.to(kernel_device).step(FlowState(state.moments.float().to(kernel_device)), wind).moments
+    torch.testing.assert_close(single.cpu().double(), expected, rtol=0, atol=5e-7)
+
+
+@pytest.mark.parametrize("shift", [0.3, 0.8])
+def test_a_wall_between_cells_is_where_it_is(shift):
+    """A flow between walls that are not halfway: the exact parabola, within the error of its third-order remainder."""
+    cells, units = 12, LatticeUnits.at_speed(1 / 12, 1.0, lattice_speed=0.05, viscosity=0.1, density=1.0)
+    low, high = 1 + shift, 13 - shift
+
+    def inside(place):
+        return (place[..., 2] < low) | (place[..., 2] > high)
+
+    flow = LatticeFlow((4, 1, cells + 2), units, faces=("periodic",) * 3, walls=inside, smagorinsky=0)
+    height = torch.arange(cells + 2, dtype=torch.float64) + 0.5
+    exact = ((height - low) * (high - height)).clamp(min=0) / 36
+    start = torch.zeros(3, *flow.cells)
+    start[0] = exact
+    state, push = flow.start(start), 2 * 0.1 * 144 / 36
+    for _ in range(600):
+        state = flow.step(state, acceleration=(push, 0.0, 0.0))
+    found = (flow.velocity(state)[0, 0, 0] - 0.5 * push * units.dt).double() * (flow.kind[0, 0] == 0)
+    torch.testing.assert_close(found, exact * (flow.kind[0, 0] == 0), rtol=0, atol=0.01)
+
+
 def test_mass_and_momentum_of_a_periodic_box_stay():
     flow = LatticeFlow((6, 5, 7), UNITS, faces=("periodic",) * 3)
     state, _ = _random(flow)

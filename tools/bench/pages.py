@@ -10,6 +10,7 @@ from pathlib import Path
 from bench import record, slots, stamps
 from bench.tables import (  # noqa: F401  each registers its slots
     accuracy,
+    air,
     benchmarks,
     blender,
     contact,

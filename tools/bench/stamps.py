@@ -29,6 +29,7 @@ _SIMULATION = (*_SOLVER, "gaussians", "recording", "simulation")
 _DRAWN = (*_SIMULATION, "rendering")
 PARTS: dict[str, tuple[str, ...]] = {
     "accuracy": _PROBLEMS,
+    "air": ("air", *_PROBLEMS),
     "area": ("gaussians", "geometry"),
     "backward": _SOLVER,
     "blender": _SIMULATION,

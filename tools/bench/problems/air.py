@@ -11,7 +11,7 @@ import math
 import torch
 from torch import Tensor
 
-from gaussian_swaying.air.flow import FlowState, LatticeFlow
+from gaussian_swaying.air.flow import WALL, FlowState, LatticeFlow
 from gaussian_swaying.air.immersed import exchange
 from gaussian_swaying.air.lattice import LatticeUnits
 
@@ -114,21 +114,24 @@ def cylinder(
     units = units_of(1 / cells, reynolds)
     x = (torch.arange(length * cells) + 0.5) / cells - 10
     z = (torch.arange(height * cells) + 0.5) / cells - height / 2
-    walls = (x[:, None].square() + z.square() < 0.25)[:, None]
-    flow = LatticeFlow(walls.shape, units, faces=("open", "periodic", "open"), walls=walls, smagorinsky=0)
-    diameter = math.sqrt(4 / math.pi * int(walls.sum())) / cells  # of the circle of the same area
-    start = torch.zeros(3, *walls.shape)
+
+    def inside(place: Tensor) -> Tensor:
+        return (place[..., 0] / cells - 10).square() + (place[..., 2] / cells - height / 2).square() < 0.25
+
+    size = (length * cells, 1, height * cells)
+    flow = LatticeFlow(size, units, faces=("open", "periodic", "open"), walls=inside, smagorinsky=0)
+    walls = flow.kind == WALL
+    start = torch.zeros(3, *size)
     start[0] = 1
     start[2] = 0.3 * torch.exp(-((x[:, None, None] - 1.5).square()) - z.square())
     now, each, forces = flow.start(start), 10, []
     for _ in range(round(until / units.dt / each)):
         now = _run(flow, now, each, WIND)
         forces.append(flow.force_on_walls(now, walls))
-    drag, lift = (torch.stack(forces)[-round(50 / units.dt / each) :] / (0.5 * diameter / cells))[:, [0, 2]].T
+    drag, lift = (torch.stack(forces)[-round(50 / units.dt / each) :] / (0.5 / cells))[:, [0, 2]].T
     frequency = _frequency(lift, each * units.dt)
     return {
-        "strouhal": diameter * frequency, "drag": float(drag.mean()), "lift": float(lift.max() - lift.min()) / 2,
-        "diameter": diameter,
+        "strouhal": frequency, "drag": float(drag.mean()), "lift": float(lift.max() - lift.min()) / 2,
     }  # fmt: skip
 
 
@@ -147,18 +150,20 @@ def sphere(
 ) -> dict[str, float]:
     """Drag of a sphere of wall cells; 1.09 at Re 100 (Clift, Grace and Weber 1978, standard drag curve)."""
     units = units_of(1 / cells, reynolds)
-    x = (torch.arange(length * cells) + 0.5) / cells - 4
-    y = (torch.arange(width * cells) + 0.5) / cells - width / 2
-    walls = x[:, None, None].square() + y[:, None].square() + y.square() < 0.25
-    flow = LatticeFlow(walls.shape, units, walls=walls, smagorinsky=0)
-    diameter = (6 / math.pi * int(walls.sum())) ** (1 / 3) / cells
+    middle = torch.tensor([4.0, width / 2, width / 2], dtype=torch.float64)
+
+    def inside(place: Tensor) -> Tensor:
+        return (place / cells - middle).square().sum(-1) < 0.25
+
+    flow = LatticeFlow((length * cells, width * cells, width * cells), units, walls=inside, smagorinsky=0)
+    walls = flow.kind == WALL
     state = _run(flow, flow.start([1.0, 0.0, 0.0]), round((until - 2) / units.dt), WIND)
     forces, each = [], 10
     for _ in range(round(2 / units.dt / each)):
         state = _run(flow, state, each, WIND)
         forces.append(flow.force_on_walls(state, walls)[0])
     force = float(torch.stack(forces).mean())
-    return {"drag": force / (0.5 * math.pi / 4 * diameter**2), "diameter": diameter}
+    return {"drag": force / (math.pi / 8)}
 
 
 def plate(

@@ -1,0 +1,107 @@
+"""Tables and goals of ``bench.py air``."""
+
+from __future__ import annotations
+
+import math
+
+from bench.tables.render import WANTED, Goal, Row, judged, table
+
+PAGE = "air.md"
+EMPTY = "Not recorded yet."
+
+
+def _of(result: Row, problem: str) -> list[Row]:
+    found = [row["parameters"] | row["result"] for row in result.get("rows", []) if row["problem"] == problem]
+    return [row for row in found if "failed" not in row]
+
+
+def _order(result: Row, problem: str) -> list[Row]:
+    """The order of convergence of the two finest grids."""
+    found = sorted(_of(result, problem), key=lambda row: row["cells"])[-2:]
+    if len(found) < 2:
+        return []
+    (coarse, fine) = found
+    order = math.log(coarse["error"] / fine["error"]) / math.log(fine["cells"] / coarse["cells"])
+    return [fine | {"order": order}]
+
+
+def _finest(result: Row, problem: str, known: float | None = None, name: str = "drag") -> list[Row]:
+    found = sorted(_of(result, problem), key=lambda row: row["cells"])[-1:]
+    return [row | ({} if known is None else {"off": row[name] / known - 1}) for row in found]
+
+
+def _flat(result: Row) -> list[Row]:
+    """Flows with an exact or a published solution, one number each."""
+    named = {
+        "vortices": "vortices that decay, largest error of the velocity",
+        "walls": "flow between walls, error of the velocity",
+        "cavity": "cavity with a moving lid, Re 100, largest difference from Ghia and others, per speed of the lid",
+    }
+    return [row | {"name": text} for problem, text in named.items() for row in _of(result, problem)]
+
+
+table(PAGE, "air.exact", "air_*", _flat, """
+    flow = {name} | cells = {cells} | found = {error:.5f}
+    """, before="{source}", empty=EMPTY)  # fmt: skip
+
+
+def _bodies(result: Row) -> list[Row]:
+    known = {"cylinder": (1.34, "1.33 to 1.35"), "sphere": (1.09, "1.09"), "plate": (1.2, "1.2 to 1.3")}
+    return [
+        row | {"name": problem, "published": text, "off": row["drag"] / number - 1}
+        for problem, (number, text) in known.items()
+        for row in _of(result, problem)
+    ]
+
+
+table(PAGE, "air.bodies", "air_*", _bodies, """
+    body = {name} | cells across it = {cells} | drag = {drag:.3f} | published = {published} | Strouhal number =
+    [[{strouhal:.4f}]]
+    """, empty=EMPTY)  # fmt: skip
+table(PAGE, "air.inverted", "air_*", lambda result: _of(result, "inverted flag"), """
+    stiffness B / (rho U² L³) = {stiffness:g} | amplitude from peak to peak [lengths] = {amplitude:.2f} |
+    mean place of the free end = {mean:.2f}
+    """, empty=EMPTY)  # fmt: skip
+table(PAGE, "air.filaments", "air_*", lambda result: _of(result, "hanging filament"), """
+    cells in its length = {cells} | amplitude from peak to peak [lengths] = {amplitude:.3f} |
+    frequency [U / L] = {frequency:.3f} | drag = {drag:.3f}
+    """, empty=EMPTY)  # fmt: skip
+table(PAGE, "air.tandem", "air_*", lambda result: _of(result, "two flags"), """
+    gap [lengths] = {gap:g} | drag of the first per that of one alone = {first:.2f} | of the second = {second:.2f}
+    """, empty=EMPTY)  # fmt: skip
+
+
+def _sizes(result: Row) -> list[Row]:
+    return [row | {"name": " x ".join(map(str, row["size"]))} for row in _of(result, "flow")]
+
+
+table(PAGE, "air.speed", "air_*", _sizes, """
+    cells = {name} | million updates a second = {updates_per_s:.0f (10⁶)} | bytes for a cell = {bytes_per_cell}
+    """, empty=EMPTY)  # fmt: skip
+
+
+def _regimes(result: Row) -> list[Row]:
+    found = {row["stiffness"]: row for row in _of(result, "inverted flag")}
+    return [found[0.2] | {"stiff": found[0.5]["amplitude"]}] if {0.2, 0.5} <= set(found) else []
+
+
+table(PAGE, "air.goals", "air_*", judged([
+    Goal("vortices that decay, order of convergence", "{order:.2f}", "order >= 1.8", lambda r: _order(r, "vortices"),
+         more={"wanted": "second order"}),
+    Goal("flow between walls, order of convergence", "{order:.2f}", "order >= 1.8", lambda r: _order(r, "walls"),
+         more={"wanted": "second order"}),
+    Goal("cavity, {cells} cells", "{error:.3f}", "error <= 0.01", lambda r: _finest(r, "cavity"),
+         more={"wanted": "within 0.01 of Ghia and others"}),
+    Goal("sphere, Re 100, {cells} cells", "{drag:.3f}", "|off| <= 0.03", lambda r: _finest(r, "sphere", 1.09),
+         more={"wanted": "drag of 1.09 within 3 %"}),
+    Goal("cylinder, Re 100, {cells} cells", "{strouhal:.4f}", "|off| <= 0.03",
+         lambda r: _finest(r, "cylinder", 0.1645, "strouhal"), more={"wanted": "Strouhal number of 0.1645 within 3 %"}),
+    Goal("square plate across the flow, Re 300, {cells} cells", "{drag:.2f}", "drag >= 1.08 and drag <= 1.43",
+         lambda r: _finest(r, "plate"), more={"wanted": "1.2 to 1.3 within 10 %"}),
+    Goal("inverted flag: straight at a stiffness of 0.5, flaps at 0.2", "{stiff:.2f}, {amplitude:.2f}",
+         "stiff <= 0.1 and amplitude >= 0.5", _regimes, more={"wanted": "as in experiments"}),
+    Goal("`flag_in_air`, a frame", "{frame_s:.2f} s", "frame_s <= 1", lambda r: _of(r, "scene"),
+         more={"wanted": "a second on two CPU cores"}),
+    Goal("memory for a cell", "{bytes_per_cell} bytes", "bytes_per_cell <= 200", lambda r: _of(r, "flow")[:1],
+         more={"wanted": "at most 200 bytes"}),
+    ]), WANTED, empty=EMPTY)  # fmt: skip
