@@ -182,6 +182,43 @@ BYTES = 3 * 40 + 1 + 24
 """Bytes for a cell: three sets of moments, its kind, and what points share among cells."""
 
 
+def speed_of(settings: ComputedAir, wind: WindField) -> float:
+    """The speed [m/s] that is ``lattice_speed`` cells per step.
+
+    Raises:
+        ValueError: If it is not given, and the wind is still.
+    """
+    speed = settings.speed or 1.5 * float(torch.linalg.vector_norm(wind.flows.detach(), dim=-1).amax())
+    if not speed > 0:
+        raise ValueError("Computed air in a still wind needs `air.speed`: the largest speed that is expected [m/s].")
+    return speed
+
+
+def steps_of(settings: ComputedAir, wind: WindField, frame_dt: float) -> int:
+    """Steps of the air in a frame of ``frame_dt`` seconds."""
+    share = frame_dt * speed_of(settings, wind) / (settings.lattice_speed * settings.spacing)
+    return max(math.ceil(share - 1e-9), 1)
+
+
+def resolution(settings: ComputedAir, wind: WindField, frame_dt: float, position: Tensor) -> Resolution:
+    """Cost of a box, and the Reynolds number that it resolves.
+
+    Args:
+        settings: The box.
+        wind: The wind.
+        frame_dt: Length of a frame [s].
+        position: Points of the body at rest [m], shape (P, 3).
+
+    Raises:
+        ValueError: As :func:`speed_of`.
+    """
+    speed, length = speed_of(settings, wind), float((position.amax(0) - position.amin(0)).amax())
+    counts, h, nu = settings.counts(), settings.spacing, settings.viscosity
+    eddies = settings.smagorinsky**2 * h * speed
+    steps, megabytes = steps_of(settings, wind, frame_dt), math.prod(counts) * BYTES / 1e6
+    return Resolution(counts, h, steps, megabytes, speed * length / nu, speed * length / (nu + eddies))
+
+
 class AirInBox:
     """The computed air of a run: its flow, and the exchange of momentum with a body.
 
@@ -221,13 +258,7 @@ class AirInBox:
                 "into `air.walls`."
             )
         h, cells = settings.spacing, settings.counts()
-        fastest = float(torch.linalg.vector_norm(wind.flows.detach(), dim=-1).amax())
-        speed = settings.speed or 1.5 * fastest
-        if not speed > 0:
-            raise ValueError(
-                "Computed air in a still wind needs `air.speed`: the largest speed that is expected [m/s]."
-            )
-        self.steps = max(math.ceil(frame_dt * speed / (settings.lattice_speed * h) - 1e-9), 1)
+        self.steps = steps_of(settings, wind, frame_dt)
         units = LatticeUnits(h, frame_dt / self.steps, settings.viscosity, density)
         self.origin = torch.tensor(settings.low, dtype=torch.float64)
         if settings.ground:
@@ -248,22 +279,12 @@ class AirInBox:
         area, mass = load.area.reshape(-1), solver.points.mass
         self._area = (area / h**2).to(torch.float32)
         self._mass = (mass / units.cell_mass).to(torch.float32)
-        self.resolution = self._measured(state, speed)
+        self.resolution = resolution(settings, wind, frame_dt, state.position)
         self._check(state, area)
 
     def _centres(self, cells: tuple[int, int, int]) -> Tensor:
         axes = [torch.arange(n, dtype=torch.float64) + 0.5 for n in cells]
         return self.origin + self.settings.spacing * torch.stack(torch.meshgrid(*axes, indexing="ij"), -1)
-
-    def _measured(self, state: State, speed: float) -> Resolution:
-        settings = self.settings
-        length = float((state.position.amax(0) - state.position.amin(0)).amax())
-        counted = math.prod(self.flow.cells)
-        eddies = settings.smagorinsky**2 * settings.spacing * speed
-        return Resolution(
-            self.flow.cells, settings.spacing, self.steps, counted * BYTES / 1e6,
-            speed * length / settings.viscosity, speed * length / (settings.viscosity + eddies),
-        )  # fmt: skip
 
     def _check(self, state: State, area: Tensor) -> None:
         h, settings = self.settings.spacing, self.settings
@@ -435,4 +456,4 @@ def _rounded(values: Sequence[float]) -> str:
     return "(" + ", ".join(f"{value:.3g}" for value in values) + ")"
 
 
-__all__ = ["AirInBox", "AirPush", "ComputedAir", "Resolution"]
+__all__ = ["AirInBox", "AirPush", "ComputedAir", "Resolution", "resolution"]

@@ -167,6 +167,16 @@ class LatticeFlow(nn.Module):
         """Pressure above that at rest [Pa], shape (X, Y, Z)."""
         return state.moments[0] * (self.units.density * self.units.speed**2 / 3)
 
+    def vorticity(self, state: FlowState) -> Tensor:
+        """Curl of the velocity [1/s] by central differences, shape (3, X, Y, Z); 0 along axes of one cell."""
+        velocity, h = self.velocity(state), self.units.spacing
+
+        def slope(part: int, axis: int) -> Tensor:
+            field = velocity[part]
+            return torch.gradient(field, spacing=h, dim=axis)[0] if field.shape[axis] > 1 else torch.zeros_like(field)
+
+        return torch.stack([slope(2, 1) - slope(1, 2), slope(0, 2) - slope(2, 0), slope(1, 0) - slope(0, 1)])
+
     def momentum(self, state: FlowState) -> Tensor:
         """Momentum of the air in the box [kg m/s], shape (3,), float64."""
         mass = (1 + state.moments[0].double()) * (self.kind == FLUID)

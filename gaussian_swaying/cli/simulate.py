@@ -8,6 +8,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from gaussian_swaying._yaml_limits import check_config_files
+from gaussian_swaying.aero.computed_air import resolution
+from gaussian_swaying.aero.wind import WindField
 from gaussian_swaying.cli.errors import guessing, how_to_resume, run_command
 from gaussian_swaying.cli.shipped import with_shipped
 from gaussian_swaying.runs.signals import stop_signals
@@ -66,6 +68,8 @@ def _simulate(parser: ArgumentParser, arguments: Sequence[str], started: list[Si
     if scene.filled:
         print(f"{scene.filled:,} points fill the inside")
     print(scene.frame.describe())
+    if simulation.setup.air is not None and isinstance(simulation.wind, WindField):
+        print(resolution(simulation.setup.air, simulation.wind, simulation.frame_dt, scene.points.position))
     extra: dict[str, Any] = {"config": [str(file) for file in settings.config or []]}
     started.append(simulation)
     with stop_signals():

@@ -6,6 +6,7 @@ import sys
 import time
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, nullcontext, suppress
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -444,6 +445,7 @@ class Run:
             "mass_kg": float(points.mass.sum()),
             "patch_area_m2": float(scene.patches.area.sum()),
             "hull_area_m2": scene.hull_area(),
+            "computed_air": None if stepper.air is None else asdict(stepper.air.resolution),
             **stepper.solver.describe(state),
             "dtype": str(state.position.dtype).removeprefix("torch."),
             "frame": scene.frame.describe(),

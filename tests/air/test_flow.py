@@ -145,6 +145,16 @@ def test_a_new_wind_fills_the_box():
     torch.testing.assert_close(flow.velocity(state)[0].mean(), torch.tensor(1.0), rtol=0.02, atol=0)
 
 
+def test_vorticity_of_a_turning_flow():
+    flow = LatticeFlow((8, 7, 6), UNITS)
+    axes = [0.1 * torch.arange(n, dtype=torch.float64) for n in flow.cells]
+    place = torch.stack(torch.meshgrid(*axes, indexing="ij"))
+    spin = torch.tensor([0.2, -0.3, 0.5], dtype=torch.float64)
+    turning = torch.linalg.cross(spin[:, None, None, None].expand_as(place), place, dim=0)
+    found = flow.vorticity(flow.start(turning, dtype=torch.float64))
+    torch.testing.assert_close(found, 2 * spin[:, None, None, None].expand_as(found))
+
+
 def test_kinds_of_cells():
     walls = torch.zeros(6, 5, 5, dtype=torch.bool)
     walls[2, 2, 2] = True

@@ -6,16 +6,18 @@ import argparse
 import time
 from collections.abc import Callable, Iterable, Iterator
 from functools import partial
+from pathlib import Path
 from typing import Any
 
 import torch
 
-from bench.case import Case, Measurement, option
+from bench.case import PICTURES, Case, Measurement, option
 from bench.clock import guarded
 from bench.problems import air, filaments
 from bench.record import ROOT, Row
+from bench.tables.plots import save_figure, subplots
 from gaussian_swaying.aero.computed_air import BYTES
-from gaussian_swaying.air.flow import LatticeFlow
+from gaussian_swaying.air.flow import FlowState, LatticeFlow
 from gaussian_swaying.simulation.simulation import Simulation
 
 
@@ -92,6 +94,38 @@ def cases(device: str) -> Iterable[tuple[str, Row, Callable[[], Row]]]:
     yield "scene", {}, lambda: _scene(device)
 
 
+def picture(folder: str, frames: int = 60) -> Row:
+    """Draw ``air.png``: vorticity behind the flag of the shipped scene, and behind two flags in a row."""
+    simulation = Simulation.from_yaml(ROOT / "configs/sim/flag_in_air.yaml", device="cpu")
+    stepper = simulation.stepper
+    state = stepper.start()
+    for _ in range(frames):
+        state, _ = stepper.advance(state)
+    made = stepper.air
+    assert made is not None
+    settings, flow = made.settings, made.flow
+    figure, (left, right) = subplots(1, 2, figsize=(13, 4.2))
+    level = flow.cells[2] // 2
+    around = flow.vorticity(FlowState(state.air))[2, :, :, level]
+    extent = [settings.low[0], settings.high[0], settings.low[1], settings.high[1]]
+    style = {"cmap": "RdBu_r", "origin": "lower", "interpolation": "bilinear"}
+    left.imshow(around.T, extent=extent, vmin=-40, vmax=40, **style)
+    at = settings.low[2] + (level + 0.5) * settings.spacing
+    near = state.position[(state.position[:, 2] - at).abs() < 0.02]
+    left.plot(*near[near[:, 0].argsort(), :2].T, ".k", markersize=2)
+    left.set(title=f"flag_in_air from above after {frames} frames", xlabel="x [m]", ylabel="y [m]")
+    cells = 24
+    pair = [filaments.Filament.straight(2 * cells + 1, 0.5, 1e-3, 0.1) for _ in range(2)]
+    found = filaments.flap(pair, [(0.0, 0.0), (2.0, 0.0)], cells=cells, until=20.0, length=9.0, height=4.0)
+    around = -found["flow"].vorticity(found["state"])[1, :, 0]
+    right.imshow(around.T, extent=[-2, 7, -2, 2], vmin=-8, vmax=8, **style)
+    for shift, one in zip((0.0, 2.0), pair, strict=True):
+        right.plot(one.place[:, 0] + shift, one.place[:, 1], "k", linewidth=2)
+    right.set(title="Two flags in a plane, Re 200, after 20 lengths", xlabel="x / L", ylabel="z / L")
+    save_figure(figure, Path(folder) / "air.png")
+    return {"frames": frames}
+
+
 def _result(function: Callable[[], Row]) -> Row:
     return {"result": guarded(function)}
 
@@ -103,11 +137,13 @@ def rows(options: argparse.Namespace, result: Row) -> Iterator[Measurement]:
     for name, parameters, function in cases(options.device):
         if only in ("", name):
             yield ("rows", {"problem": name, "parameters": parameters}), partial(_result, function)
+    if only in ("", "picture"):
+        yield ("picture",), partial(picture, options.pictures)
 
 
 CASE = Case(
     "Measure computed air beside exact and published flows and flags, and its speed.",
     rows,
-    (option("--only", "only this problem"),),
+    (option("--only", "only this problem, or the picture"), PICTURES),
     page="air.md",
 )
