@@ -20,6 +20,7 @@ NAMES = (
     "gallery.md",
     "live.md",
     "many.md",
+    "air.md",
     "nature.md",
     "recording.md",
     "stability.md",
