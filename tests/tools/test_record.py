@@ -70,3 +70,17 @@ def test_a_row_that_another_process_measures_anew_is_not_put_back(tmp_path):
     found = json.loads((tmp_path / "flags_cpu.json").read_text())
     assert found["rows"] == {"one": {"1": {"y": 3}, "2": {"x": 2}}, "two": {"1": {"x": 2}}}
     assert found["note"] == "New."
+
+
+def test_rows_of_a_list_are_kept_from_both_processes(tmp_path):
+    record.write(tmp_path, "nature_cpu", {"device": "a", "rows": [{"x": 1}, {"x": 2}, {"x": 3}]}, quiet=True)
+
+    def measure(result, save):
+        def other(rows, keep):
+            keep(rows | {"rows": [{"x": 2}, {"x": 3}, {"x": 10}]})
+
+        record.go_on(tmp_path, "nature_cpu", {"device": "a"}, other)
+        save(result | {"rows": [{"x": 1}, {"x": 2}, {"x": 30}]})
+
+    record.go_on(tmp_path, "nature_cpu", {"device": "a"}, measure)
+    assert json.loads((tmp_path / "nature_cpu.json").read_text())["rows"] == [{"x": 2}, {"x": 30}, {"x": 10}]

@@ -83,7 +83,7 @@ def go_on(folder: Path, name: str, result: Row, measure: Callable[..., None], ke
         folder.mkdir(parents=True, exist_ok=True)
         with FileLock(path.with_suffix(".lock")):
             old = {} if fresh else there()
-            new = merged(old, changed(before, now))
+            new = merged(old, changed(before, now), before)
             new["measured"] = stamps.kept(old, new)
             write(folder, name, new, quiet=True)
             before, fresh = copy.deepcopy(now), False
@@ -93,11 +93,25 @@ def go_on(folder: Path, name: str, result: Row, measure: Callable[..., None], ke
     print(f"wrote {path}")
 
 
-def merged(old: Row, new: Row) -> Row:
-    """A record with the rows of both, those of ``new`` where both have one; tables of rows are merged, rows are not."""
-    both = dict(old)
+def merged(old: Row, new: Row, before: Row | None = None) -> Row:
+    """A record with the rows of both, those of ``new`` where both have one; tables of rows are merged, rows are not.
+
+    Args:
+        old: The record as it is now, with what other processes have done to it.
+        new: What this process has changed.
+        before: The record that it started from. A list of rows loses those that this process took away since, and
+            those that another one did.
+    """
+    both, before = dict(old), before or {}
     for key, value in new.items():
-        both[key] = merged(both[key], value) if _are_tables(value, both.get(key)) else value
+        was, there = before.get(key), both.get(key)
+        if _are_tables(value, there):
+            both[key] = merged(there, value, was if _are_tables(was) else None)  # type: ignore[arg-type]
+        elif isinstance(value, list) and isinstance(there, list) and isinstance(was, list):
+            own = [row for row in value if row not in was or row in there]
+            both[key] = own + [row for row in there if row not in was and row not in own]
+        else:
+            both[key] = value
     return both
 
 
