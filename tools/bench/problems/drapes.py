@@ -78,7 +78,7 @@ def shadow(edge: np.ndarray) -> float:
 
 
 def around(half: np.ndarray, folds: int) -> np.ndarray:
-    """A whole edge from that of a half fold, from its ridge at the angle 0 to its valley, shape (2 folds (N - 1), 3)."""
+    """A whole edge from the half of a fold, from its ridge at the angle 0 to its valley: (2 folds (N - 1), 3)."""
     back = half[-1:0:-1] * np.array([1.0, -1.0, 1.0])
     parts = []
     for k in range(folds):
@@ -88,7 +88,9 @@ def around(half: np.ndarray, folds: int) -> np.ndarray:
     return np.concatenate(parts)
 
 
-def of_shell(fabric: str, folds: int, cells: int = 12, stretch: float = 100.0, **_: object) -> Result:
+def of_shell(
+    fabric: str, folds: int, cells: int = 8, stretch: float = 100.0, settings: Settings | None = None
+) -> Result:
     """The drape coefficient of a shell, with its folds alike.
 
     Args:
@@ -96,10 +98,11 @@ def of_shell(fabric: str, folds: int, cells: int = 12, stretch: float = 100.0, *
         folds: Number of folds.
         cells: Spline cells along the free width and around a half fold.
         stretch: E h [N/m].
+        settings: Not used: the shell has numerics of its own.
 
     Returns:
-        ``drape``, ``energy`` (without the folds' support, of the fabric [mJ]), ``low`` and ``high`` (of the edge [m])
-        and ``residual`` (force over the weight).
+        ``drape``, ``energy`` (of the fabric, against its flat state [mJ]), ``low`` and ``high`` (of the edge [m]),
+        ``residual`` (force over the weight) and ``steps``.
     """
     check_choice("fabric", fabric, tuple(FABRICS))
     mass, stiffness = FABRICS[fabric]

@@ -103,7 +103,8 @@ class _Mesh:
         first = np.repeat(np.arange(rows), 3), np.repeat(np.arange(columns), 3)
         number = np.arange(self.shape[0] * self.shape[1]).reshape(self.shape)
         reach = np.arange(4)
-        self.index = number[(first[0][:, None] + reach)[:, None, :, None], (first[1][:, None] + reach)[None, :, None, :]]
+        row, column = first[0][:, None] + reach, first[1][:, None] + reach
+        self.index = number[row[:, None, :, None], column[None, :, None, :]]
         self.values = self.values.reshape(6, -1, 16)
         self.index = self.index.reshape(-1, 16)
         self.r = np.repeat(radii, len(angles))
