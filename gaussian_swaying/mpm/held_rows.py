@@ -37,6 +37,7 @@ LEAST_APART = 0.6
 Two halves of a strip one cell wide are half a cell apart: such a strip is one line, wherever it lies on the grid.
 """
 
+_AT_ONCE = 256  # points whose distances from all others are looked at
 _NO_WEIGHT = 1e-6  # of a node that a particle on the border of its cell does not reach
 
 
@@ -122,6 +123,32 @@ def groups(
             break
         group = torch.unique(torch.where(pair, own.minimum(nearest), own)[group], return_inverse=True)[1]
     return group
+
+
+def from_middle_plane(position: Tensor, mass: Tensor, normal: Tensor, apart: float, thick: float) -> Tensor:
+    """How far the points of a sheet are from its middle plane, along its normal.
+
+    The middle plane is where the mean of the points is that lie close by along the sheet. A cell may have some of the
+    layers there only, and their mean beside it: such places are not on one line, and would hold the slope.
+
+    Args:
+        position: Positions [m], shape (P, 3).
+        mass: Masses [kg], shape (P,).
+        normal: Unit normals of the sheet, of either sign, shape (P, 3).
+        apart: How far points lie close by along the sheet [m].
+        thick: Largest distance along the normal of points of the sheet [m].
+
+    Returns:
+        Vectors from the middle plane [m], shape (P, 3).
+    """
+    found = []
+    for own, up in zip(position.split(_AT_ONCE), normal.split(_AT_ONCE), strict=True):
+        arm = position - own[:, None]
+        across = (arm * up[:, None]).sum(-1)
+        along = (arm.square().sum(-1) - across.square()).clamp(min=0).sqrt()
+        weight = mass * ((along < apart) & (across.abs() <= thick))
+        found.append(-((weight * across).sum(-1) / weight.sum(-1))[:, None] * up)
+    return torch.cat(found)
 
 
 def cells_of_places(place: Tensor, grid: GridSpec, massive: Tensor) -> Tensor:

@@ -41,6 +41,7 @@ from gaussian_swaying.mpm.held_rows import (
     MOST_ROWS,
     Rows,
     cells_of_places,
+    from_middle_plane,
     gram,
     groups,
     independent_rows,
@@ -136,12 +137,14 @@ class _Site:
             assert own is not None
             mass = of_piece(own.mass).double()
             some = (mass > 0).nonzero()[:, 0]
-            normal, held = None, points[some].detach()
+            normal, held, place = None, points[some].detach(), points[some]
             if kind == "hinge" and thickness(points.detach(), whole, held, dx)[1] and len(some):
                 normal = normals(points.detach(), whole, held, dx)
+                off = from_middle_plane(held, mass[some], normal, LEAST_APART * dx, SHEET * dx)
+                held, place = held - off, place - off
             cell = self.cell if piece is None else self.cell[piece]
             group = groups(held, mass[some], cell[some], LEAST_APART * dx, normal, SHEET * dx)
-            place = means(points[some], mass[some], group)
+            place = means(place, mass[some], group)
             corner, node = self._cells(place.detach(), piece)
             along = clamped.expand(len(place), -1, 3)
             if own.release is not None:

@@ -140,6 +140,20 @@ def test_a_hinge_of_a_sheet_as_thick_as_a_cell_is_a_line(turn):
     assert 6 < len(rows) <= 20 * STEP / held_rows.LEAST_APART / DX + 1
 
 
+@pytest.mark.parametrize("yaw", [0.2, 0.6, 1.0])
+def test_a_hinge_of_a_sheet_across_the_grid_is_a_line(yaw):
+    """Cells cut the layers of such a sheet where each of them has some points only."""
+    flat = _sheet(layers=3, width=40)
+    x, y, z = flat.position.unbind(-1)
+    c, s = math.cos(yaw), math.sin(yaw)
+    points = dataclasses.replace(flat, position=torch.stack([c * x - 3 * s * y, s * x + 3 * c * y, z], -1))
+    solver = MPMSolver(dx=DX, gravity=(0, 0, 0), boundaries=[PinnedRegion(Box([None, None, -STEP], [None] * 3))])
+    solver.init_state(points)
+    rows = solver.bound.point_holds.place.reshape(-1, 3)
+    assert float((c * rows[:, 1] - s * rows[:, 0]).abs().max()) < 1e-9
+    assert len(rows) >= 40 * STEP / DX / 2
+
+
 def test_groups_are_joined_until_they_are_apart():
     place = torch.tensor([0.0, 0.1, 0.32, 0.9, 1.0, 2.0], dtype=torch.float64)
     position = torch.nn.functional.pad(place[:, None], (0, 2))
