@@ -58,6 +58,7 @@ def test_pages_are_filled_in_place_and_their_plots_drawn(bench, tmp_path):
         assert (docs / name).read_text() == (DOCS / name).read_text(), name
     for picture in (
         "convergence.png",
+        "drape.png",
         "nature.png",
         "pareto_cpu.png",
         "pareto_cuda.png",

@@ -125,6 +125,40 @@ def plot(results: list[Row], pictures: Path) -> None:
     for axis in (*first, *second):
         axis.title.set_fontsize(10)
     save_figure(figure, pictures / "trees.png")
+    figure, (curve, grids) = subplots(1, 2, figsize=(9.2, 3.9))
+    _drapes(curve, _draped(result), _of(result, "draped shell"))
+    _finer_drapes(grids, _draped(result))
+    save_figure(figure, pictures / "drape.png")
+
+
+def _drapes(axis: Any, rows: list[Row], shells: list[Row]) -> None:
+    length = {row["fabric"]: 1e3 * row["length"] for row in rows}
+    plain = [row for row in shells if row.get("stretch", 100.0) == 100.0 and "cells" not in row]
+    for folds in sorted({row["folds"] for row in plain}):
+        own = sorted((length[r["fabric"]], r["drape"]) for r in plain if r["folds"] == folds)
+        axis.plot(*zip(*own, strict=True), color="tab:blue", linewidth=2 if folds == rows[0]["folds"] else 0.7,
+                  label=f"shell, {folds} folds" if folds == rows[0]["folds"] else None)  # fmt: skip
+        axis.annotate(f"{folds} folds", own[-1], xytext=(4, -3), textcoords="offset points", fontsize=7)
+    for cells, marker in zip(sorted({row["cells"] for row in rows}), "sov", strict=False):
+        own = [row for row in rows if row["cells"] == cells]
+        axis.plot([1e3 * r["length"] for r in own], [r["drape"] for r in own], marker, color="tab:orange",
+                  markerfacecolor="none", label=f"points, {cells} cells along the free width")  # fmt: skip
+    for name, place in length.items():
+        axis.annotate(name, (place, 0.01), xycoords=("data", "axes fraction"), rotation=90, fontsize=7, va="bottom")
+    axis.set(title="Cusick's test", xlabel="bending length [mm]", ylabel="drape coefficient", xlim=(None, 28.2))
+    axis.legend(fontsize=7, loc="upper left")
+
+
+def _finer_drapes(axis: Any, rows: list[Row]) -> None:
+    for fabric in dict.fromkeys(row["fabric"] for row in rows):
+        own = [row for row in rows if row["fabric"] == fabric]
+        axis.plot([r["cells"] for r in own], [100 * r["error"] for r in own], "o-", label=fabric)
+    axis.axhspan(-10, 10, color="0.93")
+    axis.axhline(0, color="0.5", linewidth=0.8)
+    axis.set(title="Error against the shell with as many folds (band: 10 %)", xlabel="cells along the free width",
+             ylabel="%", ylim=(-12, 12))  # fmt: skip
+    axis.title.set_fontsize(10)
+    axis.legend(fontsize=8)
 
 
 def _sketch(axis: Any) -> None:

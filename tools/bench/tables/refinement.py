@@ -47,6 +47,21 @@ table(PAGE, "refinement.goals", "refinement_*", judged([
     ], _worse), GOAL)  # fmt: skip
 
 
+def _times(result: Row) -> Iterator[Row]:
+    """Of each flag the coarsest grid within 2 %, or the reference's own distance, beside the finest."""
+    for flag, itself, own in _fronts(result):
+        enough = next((row for row in own if row["chamfer"] <= max(0.02, itself)), None)
+        last = {"flag": named(flag), "finest": own[-1]["cells"], "fine_points": own[-1]["points"]}
+        last["fine_seconds"] = own[-1]["seconds"]
+        yield last | ({} if enough is None else {name: enough[name] for name in ("cells", "points", "seconds")})
+
+
+table(PAGE, "refinement.times", "refinement_*", _times, """
+    flag = {flag} | cells of the coarsest grid within 2 % = {cells} | points = {points:,.0f} | time [s] = {seconds:.0f} |
+    finest grid [cells] = {finest} | its points = {fine_points:,.0f} | its time [s] = {fine_seconds:.0f}
+    """)  # fmt: skip
+
+
 def _uneven(result: Row) -> Iterator[Row]:
     found = result.get("uneven", {})
     for name, row in found.items():
