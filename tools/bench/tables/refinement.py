@@ -53,12 +53,12 @@ def _times(result: Row) -> Iterator[Row]:
         enough = next((row for row in own if row["chamfer"] <= max(0.02, itself)), None)
         last = {"flag": named(flag), "finest": own[-1]["cells"], "fine_points": own[-1]["points"]}
         last["fine_seconds"] = own[-1]["seconds"]
-        yield last | ({} if enough is None else {name: enough[name] for name in ("cells", "points", "seconds")})
+        yield last | {name: enough and enough[name] for name in ("cells", "points", "seconds")}
 
 
 table(PAGE, "refinement.times", "refinement_*", _times, """
-    flag = {flag} | cells of the coarsest grid within 2 % = {cells} | points = {points:,.0f} | time [s] = {seconds:.0f} |
-    finest grid [cells] = {finest} | its points = {fine_points:,.0f} | its time [s] = {fine_seconds:.0f}
+    flag = {flag} | cells of the coarsest grid within 2 % = {cells} | points = {points:,.0f} |
+    time [s] = {seconds:.0f} | finest grid [cells] = {finest} | its points = {fine_points:,.0f} | its time [s] = {fine_seconds:.0f}
     """)  # fmt: skip
 
 
