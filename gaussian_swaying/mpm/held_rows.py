@@ -126,7 +126,7 @@ def groups(
 
 
 def from_middle_plane(position: Tensor, mass: Tensor, normal: Tensor, apart: float, thick: float) -> Tensor:
-    """How far the points of a sheet are from its middle plane, along its normal.
+    """Distance of the points of a sheet from its middle plane, as vectors along its normal.
 
     The middle plane is where the mean of the points is that lie close by along the sheet. A cell may have some of the
     layers there only, and their mean beside it: such places are not on one line, and would hold the slope.

@@ -58,7 +58,8 @@ def _times(result: Row) -> Iterator[Row]:
 
 table(PAGE, "refinement.times", "refinement_*", _times, """
     flag = {flag} | cells of the coarsest grid within 2 % = {cells} | points = {points:,.0f} |
-    time [s] = {seconds:.0f} | finest grid [cells] = {finest} | its points = {fine_points:,.0f} | its time [s] = {fine_seconds:.0f}
+    time [s] = {seconds:.0f} | finest grid [cells] = {finest} | its points = {fine_points:,.0f} |
+    its time [s] = {fine_seconds:.0f}
     """)  # fmt: skip
 
 
