@@ -33,8 +33,8 @@ def _finest(result: Row, problem: str, known: float | None = None, name: str = "
 def _flat(result: Row) -> list[Row]:
     """Flows with an exact or a published solution, one number each."""
     named = {
-        "vortices": "vortices that decay, largest error of the velocity",
-        "walls": "flow between walls, error of the velocity",
+        "vortices": "vortices that decay, relative error of the velocity",
+        "walls": "flow between walls, relative error of the velocity",
         "cavity": "cavity with a moving lid, Re 100, largest difference from Ghia and others, per speed of the lid",
     }
     return [row | {"name": text} for problem, text in named.items() for row in _of(result, problem)]
