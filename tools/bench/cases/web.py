@@ -227,6 +227,9 @@ def _until_drawn(window: Any) -> None:
         time.sleep(0.25)
 
 
+QUIET = 5.0
+"""Seconds without a picture after which none waits to be drawn."""
+
 EVERY = 30.0
 """Seconds between two measurements of memory."""
 
@@ -262,7 +265,9 @@ def watch(command: list[str], minutes: float) -> Row:
         shown = (_cpu_time(processes) - before) / (time.perf_counter() - began)
         rate = window.evaluate("windPage.time()") / (time.perf_counter() - began)
         window.evaluate(HIDE)
-        time.sleep(2.0)
+        drawn = None
+        while drawn != (drawn := window.evaluate("windPage.drawn()")):  # until the pictures that wait are drawn
+            time.sleep(QUIET)
         before, began = _cpu_time(processes), time.perf_counter()
         time.sleep(10.0)
         hidden = (_cpu_time(processes) - before) / (time.perf_counter() - began)
