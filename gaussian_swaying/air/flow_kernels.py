@@ -30,8 +30,14 @@ def _load_moments(moments, at, count, mask):
 
 
 @triton.jit
-def _population(m, CX: tl.constexpr, CY: tl.constexpr, CZ: tl.constexpr):
-    """``collision.population`` of the velocity (CX, CY, CZ)."""
+def _weight(x, y, z):
+    """36 times the weight of the velocity (x, y, z) of the lattice over its value at rest."""
+    return (4.0 - 3.0 * x * x) * (4.0 - 3.0 * y * y) * (4.0 - 3.0 * z * z) * 0.027777777777777776
+
+
+@triton.jit
+def _population(m, cx, cy, cz):
+    """``collision.population`` of the velocity (cx, cy, cz)."""
     rho = 1.0 + m[0]
     x = m[1]
     y = m[2]
@@ -39,80 +45,44 @@ def _population(m, CX: tl.constexpr, CY: tl.constexpr, CZ: tl.constexpr):
     xx = rho * x * x + m[4]
     yy = rho * y * y + m[5]
     zz = rho * z * z + m[6]
-    third = 0.3333333333333333
-    total = m[0] + 4.5 * ((CX * CX - third) * xx + (CY * CY - third) * yy + (CZ * CZ - third) * zz)
-    if CX != 0:
-        total += CX * (3.0 * rho * x)
-        total += (13.5 * CX * (CY * CY - third)) * (x * yy + 2.0 * y * m[7])
-        total += (13.5 * CX * (CZ * CZ - third)) * (x * zz + 2.0 * z * m[8])
-    if CY != 0:
-        total += CY * (3.0 * rho * y)
-        total += (13.5 * CY * (CX * CX - third)) * (y * xx + 2.0 * x * m[7])
-        total += (13.5 * CY * (CZ * CZ - third)) * (y * zz + 2.0 * z * m[9])
-    if CZ != 0:
-        total += CZ * (3.0 * rho * z)
-        total += (13.5 * CZ * (CX * CX - third)) * (z * xx + 2.0 * x * m[8])
-        total += (13.5 * CZ * (CY * CY - third)) * (z * yy + 2.0 * y * m[9])
-    if CX * CY != 0:
-        total += (9.0 * CX * CY) * (rho * x * y + m[7])
-    if CX * CZ != 0:
-        total += (9.0 * CX * CZ) * (rho * x * z + m[8])
-    if CY * CZ != 0:
-        total += (9.0 * CY * CZ) * (rho * y * z + m[9])
-    if CX * CY * CZ != 0:
-        total += (27.0 * CX * CY * CZ) * (rho * x * y * z + x * m[9] + y * m[8] + z * m[7])
-    return ((4 - 3 * CX * CX) * (4 - 3 * CY * CY) * (4 - 3 * CZ * CZ) / 216) * total
+    hx = 4.5 * (cx * cx) - 1.5
+    hy = 4.5 * (cy * cy) - 1.5
+    hz = 4.5 * (cz * cz) - 1.5
+    total = m[0] + hx * xx + hy * yy + hz * zz + 3.0 * rho * (cx * x + cy * y + cz * z)
+    total += 3.0 * cx * (hy * (x * yy + 2.0 * y * m[7]) + hz * (x * zz + 2.0 * z * m[8]))
+    total += 3.0 * cy * (hx * (y * xx + 2.0 * x * m[7]) + hz * (y * zz + 2.0 * z * m[9]))
+    total += 3.0 * cz * (hx * (z * xx + 2.0 * x * m[8]) + hy * (z * yy + 2.0 * y * m[9]))
+    total += 9.0 * (cx * cy * (rho * x * y + m[7]) + cx * cz * (rho * x * z + m[8]) + cy * cz * (rho * y * z + m[9]))
+    total += 27.0 * (cx * cy * cz) * (rho * x * y * z + x * m[9] + y * m[8] + z * m[7])
+    return 0.16666666666666666 * _weight(cx, cy, cz) * total
 
 
 @triton.jit
-def _pushed(wall, CX: tl.constexpr, CY: tl.constexpr, CZ: tl.constexpr):
+def _pushed(wall, cx, cy, cz):
     """Population that a moving wall adds."""
-    weight = (4 - 3 * CX * CX) * (4 - 3 * CY * CY) * (4 - 3 * CZ * CZ) / 36
-    return weight * (CX * wall[1] + CY * wall[2] + CZ * wall[3])
+    return _weight(cx, cy, cz) * (cx * wall[1] + cy * wall[2] + cz * wall[3])
 
 
 @triton.jit
-def _returned(own, wall, CX: tl.constexpr, CY: tl.constexpr, CZ: tl.constexpr):
-    """The population that comes back along (CX, CY, CZ) from a wall that may move."""
-    return _population(own, -CX, -CY, -CZ) + _pushed(wall, CX, CY, CZ)
-
-
-@triton.jit
-def _row(i: tl.constexpr):
-    """Place of the component i - 1 in (0, 1, -1), as ``lattice.DIRECTIONS`` has them."""
-    return (i + 2) % 3
-
-
-@triton.jit
-def _interpolated(back, own, beyond, wall, gap, CX: tl.constexpr, CY: tl.constexpr, CZ: tl.constexpr):
+def _interpolated(back, own, beyond, wall, gap, cx, cy, cz):
     """The population that comes back from a wall at a share of the way to its cell, see ``LatticeFlow._arrived``."""
-    pushed = _pushed(wall, CX, CY, CZ)
-    near = 2.0 * gap * (back - pushed) + (1.0 - 2.0 * gap) * _population(beyond, -CX, -CY, -CZ) + pushed
-    far = (back + (2.0 * gap - 1.0) * _population(own, CX, CY, CZ)) / (2.0 * tl.maximum(gap, 0.25))
+    pushed = _pushed(wall, cx, cy, cz)
+    near = 2.0 * gap * (back - pushed) + (1.0 - 2.0 * gap) * _population(beyond, -cx, -cy, -cz) + pushed
+    far = (back + (2.0 * gap - 1.0) * _population(own, cx, cy, cz)) / (2.0 * tl.maximum(gap, 0.25))
     return tl.where(gap < 0.5, near, far)
 
 
 @triton.jit
-def _gather(s, f, CX: tl.constexpr, CY: tl.constexpr, CZ: tl.constexpr):
+def _gather(s, f, cx, cy, cz):
     """Add a population to the ten sums."""
     a, x, y, z, xx, yy, zz, xy, xz, yz = s
-    a += f
-    if CX != 0:
-        x += CX * f
-        xx += f
-    if CY != 0:
-        y += CY * f
-        yy += f
-    if CZ != 0:
-        z += CZ * f
-        zz += f
-    if CX * CY != 0:
-        xy += (CX * CY) * f
-    if CX * CZ != 0:
-        xz += (CX * CZ) * f
-    if CY * CZ != 0:
-        yz += (CY * CZ) * f
-    return a, x, y, z, xx, yy, zz, xy, xz, yz
+    fx = cx * f
+    fy = cy * f
+    fz = cz * f
+    return (
+        a + f, x + fx, y + fy, z + fz, xx + cx * fx, yy + cy * fy, zz + cz * fz, xy + cy * fx, xz + cz * fx,
+        yz + cz * fy,
+    )  # fmt: skip
 
 
 @triton.jit
@@ -144,12 +114,15 @@ def flow_step(
     mask = at < count
     zero = tl.zeros((BLOCK,), tl.float32)
     s = (zero, zero, zero, zero, zero, zero, zero, zero, zero, zero)
-    for i in tl.static_range(3):
-        for j in tl.static_range(3):
+    for i in range(3):  # only the last loop is unrolled: a kernel for all 27 directions compiles for minutes
+        for j in range(3):
             for k in tl.static_range(3):
                 source = at - ((i - 1) * sx + (j - 1) * sy + (k - 1) * sz)
                 m = _load_moments(moments, source, count, mask & (source >= 0) & (source < count))
-                s = _gather(s, _population(m, i - 1, j - 1, k - 1), i - 1, j - 1, k - 1)
+                cx = 1.0 * i - 1.0
+                cy = 1.0 * j - 1.0
+                cz = 1.0 * k - 1.0
+                s = _gather(s, _population(m, cx, cy, cz), cx, cy, cz)
     s = _collide(s, relaxation, smagorinsky, px, py, pz)
     own = _load_moments(moments, at, count, mask)
     wall = tl.load(kind + at, mask, 1) == 1
@@ -177,20 +150,24 @@ def special_step(
     own = _load_moments(moments, at, count, mask)
     zero = tl.zeros((BLOCK,), tl.float32)
     s = (zero, zero, zero, zero, zero, zero, zero, zero, zero, zero)
-    for i in tl.static_range(3):
-        for j in tl.static_range(3):
+    for i in range(3):
+        for j in range(3):
             for k in tl.static_range(3):
+                cx = 1.0 * i - 1.0
+                cy = 1.0 * j - 1.0
+                cz = 1.0 * k - 1.0
                 source = (_wrapped(x - (i - 1), nx) * ny + _wrapped(y - (j - 1), ny)) * nz + _wrapped(z - (k - 1), nz)
                 wall = tl.load(kind + source, mask, 0) == 1
                 m = _load_moments(moments, source, count, mask)
-                back = _returned(own, m, i - 1, j - 1, k - 1)
+                back = _population(own, -cx, -cy, -cz) + _pushed(m, cx, cy, cz)
                 if CURVED:
                     away = (_wrapped(x + (i - 1), nx) * ny + _wrapped(y + (j - 1), ny)) * nz + _wrapped(z + (k - 1), nz)
                     beyond = _load_moments(moments, away, count, mask)
-                    gap = tl.load(gaps + (9 * _row(i) + 3 * _row(j) + _row(k)) * specials + lane, mask, 0.5)
-                    back = _interpolated(back, own, beyond, m, gap, i - 1, j - 1, k - 1)
-                f = tl.where(wall, back, _population(m, i - 1, j - 1, k - 1))
-                s = _gather(s, f, i - 1, j - 1, k - 1)
+                    row = 9 * ((i + 2) % 3) + 3 * ((j + 2) % 3) + (k + 2) % 3  # as in ``lattice.DIRECTIONS``
+                    gap = tl.load(gaps + row * specials + lane, mask, 0.5)
+                    back = _interpolated(back, own, beyond, m, gap, cx, cy, cz)
+                f = tl.where(wall, back, _population(m, cx, cy, cz))
+                s = _gather(s, f, cx, cy, cz)
     s = _collide(s, relaxation, smagorinsky, px, py, pz)
     for q in tl.static_range(10):
         tl.store(out + q * count + at, s[q], mask)
@@ -230,20 +207,9 @@ def step(flow, moments, out, wind, push):
     launch(flow_step, (triton.cdiv(count, block),))(moments, out, flow.kind, count, *strides, *numbers, BLOCK=block)
     if len(flow.special):
         launch(special_step, (triton.cdiv(len(flow.special), block),))(
-            moments,
-            out,
-            flow.kind,
-            flow.special,
-            flow.gaps,
-            len(flow.special),
-            count,
-            nx,
-            ny,
-            nz,
-            *numbers,
-            CURVED=len(flow.gaps) > 0,
-            BLOCK=block,
-        )
+            moments, out, flow.kind, flow.special, flow.gaps, len(flow.special), count, nx, ny, nz, *numbers,
+            CURVED=len(flow.gaps) > 0, BLOCK=block,
+        )  # fmt: skip
     if len(flow.held):
         launch(hold_faces, (triton.cdiv(len(flow.held), block),))(
             out, flow.held, flow.behind, flow.outward, wind, len(flow.held), count, BLOCK=block
