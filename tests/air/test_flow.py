@@ -110,7 +110,7 @@ def test_vortices_decay_with_second_order():
     assert math.log2(coarse / fine) > 1.6
 
 
-@pytest.mark.slow(gate=[])
+@pytest.mark.slow(twin="test_vortices_decay_with_second_order")
 def test_vortices_decay_with_second_order_on_fine_grids():
     coarse, fine = air.taylor_green(32), air.taylor_green(64)
     assert math.log2(coarse / fine) > 1.8
