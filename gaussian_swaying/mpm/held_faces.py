@@ -41,6 +41,7 @@ LAYER = 0.05
 
 _SEEN, _WIDE, _BROAD = 4.0, 2.0, 2.5  # cells around a held particle; least width in cells, and in thicknesses
 _SAMPLES = 32
+_TURNS = 8  # times that a normal is found again with the weights that it gives
 
 
 def extents(points: Tensor, mass: Tensor, centre: Tensor, radius: float) -> Tensor:
@@ -104,16 +105,26 @@ def width(held: Tensor, mass: Tensor, dx: float) -> float:
 
 @torch.no_grad()
 def normals(points: Tensor, mass: Tensor, places: Tensor, dx: float) -> Tensor:
-    """Unit normals of a sheet at some places, of either sign, shape (N, 3): those of at most 32 of them, the nearest.
+    """Unit normals of a sheet at some places, of either sign, shape (N, 3): that of the nearest of a few of them.
 
-    The arguments are those of :func:`thickness`.
+    They are the first ones in cubes of two cells, so that they do not depend on what lies elsewhere. The arguments are
+    those of :func:`thickness`.
     """
-    some = places[:: max(1, math.ceil(len(places) / _SAMPLES))]
+    cube = torch.unique((places / (2 * dx)).floor(), dim=0, return_inverse=True)[1]
+    order = torch.arange(len(places), device=places.device)
+    some = places[torch.full_like(order, len(places)).scatter_reduce(0, cube, order, "amin")[: int(cube.max()) + 1]]
     found = []
-    for near in torch.cdist(some, points, compute_mode="donot_use_mm_for_euclid_dist") < _SEEN * dx:
-        weight, place = mass[near], points[near]
-        arm = place - (weight[:, None] * place).sum(0) / weight.sum()
-        found.append(torch.linalg.eigh((weight[:, None] * arm).T @ arm)[1][:, 0])
+    for place in some:
+        near = (points - place).square().sum(-1) < (_SEEN * dx) ** 2 + (SHEET * dx) ** 2
+        arm, weight = points[near] - place, mass[near]
+        share = weight
+        for _ in range(_TURNS):  # weights that fade along the sheet, alike for all of its layers
+            centred = arm - (share[:, None] * arm).sum(0) / share.sum()
+            normal = torch.linalg.eigh((share[:, None] * centred).T @ centred)[1][:, 0]
+            across = arm @ normal
+            along = arm.square().sum(-1) - across.square()
+            share = weight * (1 - along / (_SEEN * dx) ** 2).clamp(min=0).square() * (across.abs() <= SHEET * dx)
+        found.append(normal)
     nearest = torch.cdist(places, some, compute_mode="donot_use_mm_for_euclid_dist").argmin(-1)
     return torch.stack(found)[nearest]
 
