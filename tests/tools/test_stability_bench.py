@@ -40,3 +40,17 @@ def test_a_small_map(tmp_path):
     moved = {name: [frame | {"displacement_mean": 1.0} for frame in each] for name, each in frames.items()}
     assert judged(told, frames, moved)["counts"][TOLD] == 2
     assert judged([one | {"said": []} for one in told], frames, moved)["counts"][WRONG] == 2
+
+
+def test_a_map_that_was_stopped_goes_on(tmp_path):
+    """A run that is complete is not done again, and one that is not is."""
+    axes = {"material.E": [1e5, 2e5]}
+    first = swept("sheet", 0.16, axes, tmp_path)
+    results = sorted((tmp_path / "runs" / "results").iterdir())
+    assert len(results) == 2
+    results[1].unlink()
+    kept = results[0].stat().st_mtime_ns
+    told, frames = swept("sheet", 0.16, axes, tmp_path)
+    assert results[0].stat().st_mtime_ns == kept
+    assert results[1].exists()
+    assert judged(told, frames, None) == judged(*first, None)

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import argparse
+import hashlib
 import re
-import tempfile
 from collections import Counter
 from collections.abc import Iterator
 from functools import partial
@@ -13,13 +13,15 @@ from typing import Any
 
 import yaml
 
-from bench.case import Case, Measurement, names
+from bench import stamps
+from bench.case import Case, Measurement, names, option
 from bench.problems.stability import AXES, BODIES, apart, configuration, energy_error, faults
 from bench.record import Row
 from gaussian_swaying._inputs import read_json
 from gaussian_swaying.cli.sweep import explain
 from gaussian_swaying.simulation.simulation import Simulation
 from gaussian_swaying.sweeps.plan import make_plan, read_sweep
+from gaussian_swaying.sweeps.record import SWEEP
 from gaussian_swaying.sweeps.sweep import run_sweep
 
 RIGHT, WARNED, TOLD, REFUSED, WRONG = "right", "warned", "wrong and warned", "refused", "wrong"
@@ -47,13 +49,18 @@ def sentence(text: str) -> str:
 
 
 def swept(body: str, dx: float, axes: dict[str, list[Any]], folder: Path) -> tuple[list[Row], Frames]:
-    """Sweep a body on a grid; what the package says of each run, and the frames of those that ended."""
+    """Sweep a body on a grid; what the package says of each run, and the frames of those that ended.
+
+    Runs that a sweep in the folder has completed are not done again.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
     base, file = folder / "base.yaml", folder / "sweep.yaml"
     base.write_text(yaml.safe_dump(configuration(BODIES[body], dx)))
     file.write_text(yaml.safe_dump({"base": str(base), "axes": axes}, sort_keys=False))
     plan = make_plan(read_sweep(file), Simulation.parser())
-    results = run_sweep(plan, folder / "runs", workers=1, threads=1, retries=0, explain=explain, device="cpu",
-                        progress=False)  # fmt: skip
+    resume = (folder / "runs" / SWEEP).exists()
+    results = run_sweep(plan, folder / "runs", resume=resume, workers=1, threads=1, retries=0, explain=explain,
+                        device="cpu", progress=False)  # fmt: skip
     told, frames = [], {}
     for name in plan.names:
         log = folder / "runs" / "logs" / f"{name}.txt"
@@ -85,15 +92,25 @@ def judged(told: list[Row], frames: Frames, reference: Frames | None) -> Row:
             "faults": dict(found.most_common()), "worst_right": worst}  # fmt: skip
 
 
+def code() -> str:
+    """A hash of the parts of the package that the map depends on."""
+    parts = [stamps.sources(part) for part in stamps.parts_of("stability") if "/" not in part]
+    return hashlib.sha256("".join(parts).encode()).hexdigest()[:8]
+
+
 def rows(options: argparse.Namespace, result: Row) -> Iterator[Measurement]:
-    """Each body from the finest grid to the coarsest, as the finest is the reference."""
-    result["axes"] = AXES
+    """Each body from the finest grid to the coarsest, as the finest is the reference.
+
+    The sweeps stay in a folder, so that a map that was stopped goes on; changed code has a folder of its own.
+    """
+    if result.get("axes") != AXES:
+        result |= {"axes": AXES, "rows": []}
+    kept = Path(options.runs) / code()
     for body in options.bodies:
         reference: Frames = {}
 
         def measure(body: str = body, dx: float = 0.0, first: bool = False, reference: Frames = reference) -> Row:
-            with tempfile.TemporaryDirectory() as folder:
-                told, frames = swept(body, dx, AXES, Path(folder))
+            told, frames = swept(body, dx, AXES, kept / f"{body}_{dx:g}")
             row = judged(told, frames, None if first else reference)
             if first:
                 reference.update(frames)
@@ -106,7 +123,7 @@ def rows(options: argparse.Namespace, result: Row) -> Iterator[Measurement]:
 CASE = Case(
     "Sweep three small bodies over grid, material and wind, and find which runs are wrong without a word.",
     rows,
-    (names("--bodies", BODIES),),
+    (names("--bodies", BODIES), option("--runs", "folder that keeps the runs", default="outputs/stability")),
     page="stability.md",
     device=False,
 )
