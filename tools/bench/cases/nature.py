@@ -10,7 +10,7 @@ from typing import Any
 
 from bench.case import Case, Measurement, option
 from bench.clock import guarded
-from bench.problems import crowns, drapes, falling, trees
+from bench.problems import crowns, drapes, falling, trees, wrinkles
 from bench.problems.fabrics import FABRICS
 from bench.problems.settings import Result, Settings
 from bench.record import Row
@@ -21,6 +21,8 @@ PULL = 1.2
 """Of its top [m]."""
 FOLDS = 5
 """Of a draped fabric: with so many the energy of all four is least."""
+THIN = 2e-7
+"""Bending stiffness of the sheet that wrinkles [N m]."""
 
 
 def cases(settings: Settings) -> Iterable[tuple[str, Row, Callable[[], Result]]]:
@@ -54,6 +56,16 @@ def cases(settings: Settings) -> Iterable[tuple[str, Row, Callable[[], Result]]]
         yield case("draped shell", drapes.of_shell, fabric=fabric, folds=folds)
     yield case("draped shell", drapes.of_shell, fabric="ponte", folds=FOLDS, cells=20)
     yield case("draped shell", drapes.of_shell, fabric="ponte", folds=FOLDS, stretch=1000.0)
+    yield case("wrinkled shell", wrinkles.of_shell, bending=THIN)
+    yield case("wrinkled shell", wrinkles.of_shell, bending=THIN, cells=56)
+    for factor in (4.0, 0.25):
+        yield case("wrinkled shell", wrinkles.of_shell, bending=factor * THIN)
+    for length in (0.4, 0.7):
+        yield case("wrinkled shell", wrinkles.of_shell, bending=THIN, length=length)
+    for strain in (0.025, 0.1):
+        yield case("wrinkled shell", wrinkles.of_shell, bending=THIN, strain=strain)
+    for cells in (32, 48, 64):
+        yield case("wrinkles", wrinkles.wrinkles, bending=THIN, cells=cells)
 
 
 def _result(function: Callable[[], Row]) -> Row:

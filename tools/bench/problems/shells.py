@@ -1,4 +1,4 @@
-r"""A ring of Kirchhoff and Love's shell that hangs from its inner edge, solved on its own: it shares nothing with MPM.
+r"""Kirchhoff and Love's shell, and a ring of it that hangs from its inner edge, solved on its own, without MPM.
 
 Places are cubic B-splines of the radius and the angle, so that curvatures are continuous (Kiendl et al. 2009,
 "Isogeometric shell analysis with Kirchhoff-Love elements", Computer Methods in Applied Mechanics and Engineering 198).
@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Protocol
 
 import numpy as np
 import torch
@@ -18,6 +19,26 @@ from scipy.sparse.linalg import splu
 from torch import Tensor
 
 GRAVITY = 9.81  # m/s²
+
+
+class Sheet(Protocol):
+    """What a sheet is made of: mass to a unit of area [kg/m²], E h [N/m], bending stiffness D [N m], and nu."""
+
+    @property
+    def mass(self) -> float:
+        """Mass to a unit of area [kg/m²]."""
+
+    @property
+    def stretch(self) -> float:
+        """E h [N/m]."""
+
+    @property
+    def bending(self) -> float:
+        """Bending stiffness D [N m]."""
+
+    @property
+    def nu(self) -> float:
+        """Poisson's ratio."""
 
 
 @dataclass(frozen=True)
@@ -58,7 +79,7 @@ class Drape:
     steps: int
 
 
-def density(g: Tensor, r: Tensor, ring: Ring) -> Tensor:
+def density(g: Tensor, r: Tensor, sheet: Sheet) -> Tensor:
     r"""Elastic energy to a unit of area at rest [J/m²].
 
     With Green's strain and the change of the second fundamental form in the basis of the ring at rest, both as
@@ -69,19 +90,19 @@ def density(g: Tensor, r: Tensor, ring: Ring) -> Tensor:
 
     Args:
         g: Derivatives of the place to r, t, rr, rt and tt, with the angle t, shape (15,).
-        r: Radius at rest [m].
-        ring: The ring.
+        r: Radius at rest [m]; 1 for Cartesian coordinates.
+        sheet: The sheet.
     """
     x_r, x_t, x_rr, x_rt, x_tt = g.reshape(5, 3)
     normal = torch.linalg.cross(x_r, x_t)
     normal = normal / normal.norm()
 
     def form(rr: Tensor, rt: Tensor, tt: Tensor) -> Tensor:
-        return 0.5 * ((rr + tt).square() - 2 * (1 - ring.nu) * (rr * tt - rt.square()))
+        return 0.5 * ((rr + tt).square() - 2 * (1 - sheet.nu) * (rr * tt - rt.square()))
 
     strain = form(0.5 * (x_r.dot(x_r) - 1), 0.5 * x_r.dot(x_t) / r, 0.5 * (x_t.dot(x_t) / r**2 - 1))
     bend = form(normal.dot(x_rr), normal.dot(x_rt) / r, normal.dot(x_tt) / r**2)
-    return ring.stretch / (1 - ring.nu**2) * strain + ring.bending * bend
+    return sheet.stretch / (1 - sheet.nu**2) * strain + sheet.bending * bend
 
 
 class _Mesh:
@@ -97,7 +118,7 @@ class _Mesh:
         points, weights = np.polynomial.legendre.leggauss(3)
         radii = ring.inner + span / rows * (np.arange(rows)[:, None] + 0.5 + 0.5 * points).ravel()
         angles = step * (np.arange(columns)[:, None] + 0.5 + 0.5 * points).ravel()
-        along, around = (_splines(knots, radii, rows), _splines(turns, angles, columns))
+        along, around = (splines(knots, radii, rows), splines(turns, angles, columns))
         pairs = [(0, 0), (1, 0), (0, 1), (2, 0), (1, 1), (0, 2)]
         self.values = np.stack([np.einsum("ai,bj->abij", along[a], around[b]) for a, b in pairs])
         first = np.repeat(np.arange(rows), 3), np.repeat(np.arange(columns), 3)
@@ -118,7 +139,7 @@ class _Mesh:
                               0 * mean[:, None] * ways], axis=-1)  # fmt: skip
         self.share, self.ways = (mean - ring.inner) / span, ways
         self.free = self._free(folds)
-        self.edge = _splines(turns, step * np.linspace(0, columns, 8 * columns + 1), columns)[0]
+        self.edge = splines(turns, step * np.linspace(0, columns, 8 * columns + 1), columns)[0]
         place = np.minimum(np.linspace(0, columns, 8 * columns + 1).astype(int), columns - 1)
         self.edge_index = place[:, None] + reach
 
@@ -151,7 +172,7 @@ class _Mesh:
         return csc_matrix((value, (row, column)), shape=(3 * rows * columns, count))
 
 
-def _splines(knots: np.ndarray, at: np.ndarray, cells: int) -> np.ndarray:
+def splines(knots: np.ndarray, at: np.ndarray, cells: int) -> np.ndarray:
     """The four cubic splines that are not zero at each place, and their first two derivatives: shape (3, N, 4)."""
     place = np.clip(np.searchsorted(knots, at, side="right") - 4, 0, cells - 1)
     every = BSpline(knots, np.eye(cells + 3), 3)
@@ -161,8 +182,6 @@ def _splines(knots: np.ndarray, at: np.ndarray, cells: int) -> np.ndarray:
 
 def hang(ring: Ring, folds: int = 4, cells: Sequence[int] = (16, 16), seed: float = 0.3, steps: int = 400) -> Drape:
     """Let a ring come to rest under its weight, in a state of given folds that are alike and symmetric.
-
-    Newton's method with a mass that gets smaller as the energy falls, as in backward Euler steps that get longer.
 
     Args:
         ring: The ring.
@@ -175,14 +194,76 @@ def hang(ring: Ring, folds: int = 4, cells: Sequence[int] = (16, 16), seed: floa
     place = mesh.rest.copy()
     place[..., 2] = width * mesh.share[:, None] ** 2 * seed * np.cos(folds * mesh.ways)
     place[:2, :, 2] = 0
+    total = ring.mass * GRAVITY * math.pi * (ring.outer**2 - ring.inner**2) / (2 * folds)
+    rate = (20.0 / width * math.sqrt(width * GRAVITY)) ** 2
+    rest = settle(mesh, ring, place, GRAVITY, rate, 1e-7 * total, steps)
+    at = rest.place[-1]
+    edge = np.einsum("ek,eki->ei", mesh.edge, at[mesh.edge_index])
+    return Drape(edge, rest.energy * 2 * folds, rest.force / total, rest.steps)
+
+
+class Mesh(Protocol):
+    r"""Splines of a sheet, the places of its control points at rest, and which of them may move.
+
+    Attributes:
+        shape: Number of control points along both directions.
+        values: The splines at each point of the quadrature, and their derivatives to r, t, rr, rt and tt, shape
+            (6, Q, 16).
+        index: The control points that they belong to, shape (Q, 16).
+        r: Radius at rest, 1 in Cartesian coordinates, shape (Q,).
+        weight: Area of each point of the quadrature [m²], shape (Q,).
+        rest: Control points at rest, or where they are held [m], shape (\*shape, 3).
+        free: From what is unknown to all components of the control points.
+    """
+
+    shape: tuple[int, int]
+    values: np.ndarray
+    index: np.ndarray
+    r: np.ndarray
+    weight: np.ndarray
+    rest: np.ndarray
+    free: csc_matrix
+
+
+@dataclass(frozen=True)
+class Rest:
+    r"""A sheet at rest.
+
+    Attributes:
+        place: Control points [m], shape (\*shape, 3).
+        energy: Elastic energy and that of the weight [J].
+        force: Largest force on a control point [N].
+        steps: Steps of Newton's method.
+    """
+
+    place: np.ndarray
+    energy: float
+    force: float
+    steps: int
+
+
+def settle(mesh: Mesh, sheet: Sheet, place: np.ndarray, gravity: float, rate: float, enough: float, steps: int) -> Rest:
+    """Let a sheet come to rest by Newton's method with a mass that gets smaller as the energy falls.
+
+    That is as in backward Euler steps that get longer.
+
+    Args:
+        mesh: Its splines.
+        sheet: The sheet.
+        place: Control points at the start [m].
+        gravity: Acceleration along -z [m/s²].
+        rate: Inverse of the square of the first step of time [1/s²].
+        enough: Force on a control point at which it rests [N].
+        steps: Most steps.
+    """
     free, every = mesh.free, mesh.rest.reshape(-1)
     shift = free.T @ (place.reshape(-1) - every) / np.asarray(free.multiply(free).sum(0)).ravel()
     r, weight, index = torch.tensor(mesh.r), mesh.weight, mesh.index
     inner = torch.tensor(mesh.values[1:].transpose(1, 0, 2).copy())
     load = np.zeros((len(every) // 3, 3))
-    np.add.at(load[:, 2], index, ring.mass * GRAVITY * weight[:, None] * mesh.values[0])
+    np.add.at(load[:, 2], index, sheet.mass * gravity * weight[:, None] * mesh.values[0])
     load = load.reshape(-1)
-    local = np.einsum("q,qa,qb->qab", ring.mass * weight, mesh.values[0], mesh.values[0])
+    local = np.einsum("q,qa,qb->qab", sheet.mass * weight, mesh.values[0], mesh.values[0])
     pairs = np.repeat(index, 16, 1).ravel(), np.tile(index, (1, 16)).ravel()
     size = len(every)
     mass = sum(coo_matrix((local.ravel(), (3 * pairs[0] + k, 3 * pairs[1] + k)), (size, size)) for k in range(3))
@@ -191,7 +272,7 @@ def hang(ring: Ring, folds: int = 4, cells: Sequence[int] = (16, 16), seed: floa
     both = np.repeat(dofs, 48, 1).ravel(), np.tile(dofs, (1, 48)).ravel()
 
     def one(g: Tensor, radius: Tensor) -> Tensor:
-        return density(g, radius, ring)
+        return density(g, radius, sheet)
 
     slope = torch.func.vmap(torch.func.grad_and_value(one))
     curve = torch.func.vmap(torch.func.hessian(one))
@@ -213,9 +294,7 @@ def hang(ring: Ring, folds: int = 4, cells: Sequence[int] = (16, 16), seed: floa
         full = torch.einsum("qaimj,qmb->qaibj", half, inner).reshape(-1).numpy()
         return (free.T @ coo_matrix((full, both), (size, size)).tocsc() @ free).tocsc()
 
-    total = ring.mass * GRAVITY * math.pi * (ring.outer**2 - ring.inner**2) / (2 * folds)
-    rate, taken = (20.0 / width * math.sqrt(width * GRAVITY)) ** 2, 0
-    now, force = energy(shift)
+    taken, (now, force) = 0, energy(shift)
     for taken in range(1, steps + 1):  # noqa: B007
         matrix = stiffness(shift)
         while True:
@@ -226,8 +305,6 @@ def hang(ring: Ring, folds: int = 4, cells: Sequence[int] = (16, 16), seed: floa
             rate *= 4
         shift, now, force = shift + step, after, pull
         rate *= 0.3
-        if np.abs(force).max() < 1e-7 * total:
+        if np.abs(force).max() < enough:
             break
-    at = (every + free @ shift).reshape(*mesh.shape, 3)[-1]
-    edge = np.einsum("ek,eki->ei", mesh.edge, at[mesh.edge_index])
-    return Drape(edge, now * 2 * folds, float(np.abs(force).max() / total), taken)
+    return Rest((every + free @ shift).reshape(*mesh.shape, 3), now, float(np.abs(force).max()), taken)

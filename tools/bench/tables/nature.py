@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+from bench.cases.nature import THIN
 from bench.problems.crowns import CROWNS
 from bench.problems.trees import tree
 from bench.tables.plots import save_figure, subplots
@@ -76,6 +78,41 @@ table(PAGE, "nature.shells", "nature_*",
     """)  # fmt: skip
 
 
+SHELL = {"strain": 0.05, "length": 0.5, "cells": 40}
+"""What a wrinkled shell has if nothing else is said."""
+
+
+def _shells(result: Row) -> list[Row]:
+    return [SHELL | row for row in _of(result, "wrinkled shell")]
+
+
+table(PAGE, "nature.wrinkles", "nature_*", lambda result: sorted(_of(result, "wrinkles"), key=lambda r: r["cells"]), """
+    cells across the width = {cells} | points = {points:,.0f} | outer layers apart [cells] = {span:.3f} |
+    wavelength [mm] = {wavelength:.1f (mm)} | of the shell = {exact:.1f (mm)} | error = {error:.1f %} |
+    amplitude [thicknesses] = {amplitude:.1f} | of the shell = {exact_amplitude:.1f} |
+    its change in the last tenth = {drift:.1f %} | time [s] = {wall_s:.0f}
+    """)  # fmt: skip
+table(PAGE, "nature.wrinkled_shells", "nature_*", _shells, """
+    bending stiffness [N m] = {bending:.2e} | length [m] = {length:g} | strain = {strain:.1f %} |
+    cells of the shell = {cells} | wavelength [mm] = {wavelength:.1f (mm)} |
+    of the formula = {formula:.1f (mm)} | from the formula's = {error:.1f %} |
+    amplitude [thicknesses] = {amplitude:.1f} | reach over the length = {reach:.2f}
+    """)  # fmt: skip
+
+
+def _powers(result: Row) -> Iterator[Row]:
+    """With which power the wavelength of the shell grows with what the formula says, from the least to the most."""
+    rows = [row for row in _shells(result) if row["cells"] == SHELL["cells"]]
+    for name, told, power in (("bending", "bending stiffness", 0.25), ("length", "length", 0.5),
+                              ("strain", "strain", -0.25)):  # fmt: skip
+        own = sorted((row for row in rows if all(row[key] == value for key, value in SHELL.items() if key != name)),
+                     key=lambda row: row[name])  # fmt: skip
+        own = [row for row in own if name == "bending" or row["bending"] == THIN]
+        if len({row[name] for row in own}) > 1:
+            grown = [math.log(own[-1][key] / own[0][key]) for key in ("wavelength", name)]
+            yield {"told": told, "wanted": power, "found": grown[0] / grown[1], "off": grown[0] / grown[1] - power}
+
+
 def _finest(result: Row, problem: str, size: str) -> list[Row]:
     found = list(_damping(result)) if problem == "tree, damping" else _of(result, problem)
     leafy = [row for row in found if row.get("leaf_area") != 0]
@@ -109,6 +146,13 @@ table(PAGE, "nature.goals", "nature_*", judged([
          more={"wanted": "decay of its spin within 2 % of the exact one"}),
     Goal("drape coefficient, {fabric}, {cells} cells", "{error:.1f %}", "|error| <= 0.1", _draped,
          more={"wanted": "within 10 % of the shell's"}),
+    Goal("wavelength of wrinkles, {cells} cells across", "{error:.1f %}", "|error| <= 0.1",
+         lambda r: _of(r, "wrinkles"), more={"wanted": "within 10 % of the shell's"}),
+    Goal("wavelength of the shell's wrinkles, power of the {told}", "{found:.3f}", "|off| <= 0.03", _powers,
+         more={"wanted": "{wanted:g} within 0.03"}),
+    Goal("wavelength of the shell's wrinkles, {cells} cells", "{error:.1f %}", "|error| <= 0.1",
+         lambda r: [row for row in _shells(r) if row["cells"] > SHELL["cells"]],
+         more={"wanted": "within 10 % of the formula's"}),
     ]), WANTED)  # fmt: skip
 
 
