@@ -190,15 +190,16 @@ def of_shell(
         settings: Not used: the shell has numerics of its own.
 
     Returns:
-        ``wavelength`` and that of the formula, ``formula`` [m], ``error`` (of the formula's, relative),
-        ``amplitude`` (half the height in the middle, in thicknesses of a plate), ``reach`` (see :class:`Wrinkled`),
-        ``steps`` and ``residual`` (force on a control point over that of the pull).
+        ``wavelength`` (0 if it stays flat) and that of the formula, ``formula`` [m], ``error`` (from the formula's,
+        relative), ``amplitude`` (half the height in the middle, in thicknesses of a plate), ``reach`` (see
+        :class:`Wrinkled`), ``steps`` and ``residual`` (force on a control point over that of the pull).
     """
     strip = Strip(bending, strain, length)
     found = shell(strip, (cells // 2, cells))
-    size = wavelength(found.across, WIDTH)
+    height = 0.5 * float(np.ptp(found.across)) / strip.height
+    size = wavelength(found.across, WIDTH) if height > FLAT else 0.0
     return {"wavelength": size, "formula": strip.wavelength, "error": size / strip.wavelength - 1,
-            "amplitude": 0.5 * float(np.ptp(found.across)) / strip.height, "reach": found.reach,
+            "amplitude": height, "reach": found.reach,
             "steps": found.rest.steps,
             "residual": found.rest.force / (strip.stretch * strip.strain * WIDTH)}  # fmt: skip
 

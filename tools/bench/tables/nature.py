@@ -102,12 +102,12 @@ table(PAGE, "nature.wrinkled_shells", "nature_*", _shells, """
 
 def _powers(result: Row) -> Iterator[Row]:
     """With which power the wavelength of the shell grows with what the formula says, from the least to the most."""
-    rows = [row for row in _shells(result) if row["cells"] == SHELL["cells"]]
+    rows = [row for row in _shells(result) if row["cells"] == SHELL["cells"] and row["wavelength"] > 0]
     for name, told, power in (("bending", "bending stiffness", 0.25), ("length", "length", 0.5),
                               ("strain", "strain", -0.25)):  # fmt: skip
         own = sorted((row for row in rows if all(row[key] == value for key, value in SHELL.items() if key != name)),
                      key=lambda row: row[name])  # fmt: skip
-        own = [row for row in own if name == "bending" or row["bending"] == THIN]
+        own = [row for row in own if name == "bending" or row["bending"] == 0.5 * THIN]
         if len({row[name] for row in own}) > 1:
             grown = [math.log(own[-1][key] / own[0][key]) for key in ("wavelength", name)]
             yield {"told": told, "wanted": power, "found": grown[0] / grown[1], "off": grown[0] / grown[1] - power}
