@@ -15,7 +15,7 @@ import numpy as np
 import torch
 from scipy.interpolate import BSpline
 from scipy.sparse import coo_matrix, csc_matrix
-from scipy.sparse.linalg import splu
+from scipy.sparse.linalg import eigsh, splu
 from torch import Tensor
 
 GRAVITY = 9.81  # m/s²
@@ -242,7 +242,16 @@ class Rest:
     steps: int
 
 
-def settle(mesh: Mesh, sheet: Sheet, place: np.ndarray, gravity: float, rate: float, enough: float, steps: int) -> Rest:
+def settle(
+    mesh: Mesh,
+    sheet: Sheet,
+    place: np.ndarray,
+    gravity: float,
+    rate: float,
+    enough: float,
+    steps: int,
+    nudge: float = 0.0,
+) -> Rest:
     """Let a sheet come to rest by Newton's method with a mass that gets smaller as the energy falls.
 
     That is as in backward Euler steps that get longer.
@@ -255,8 +264,9 @@ def settle(mesh: Mesh, sheet: Sheet, place: np.ndarray, gravity: float, rate: fl
         rate: Inverse of the square of the first step of time [1/s²].
         enough: Force on a control point at which it rests [N].
         steps: Most steps.
+        nudge: How far it is moved along its unstable mode where it rests but is not stable [m]; 0 for never.
     """
-    free, every = mesh.free, mesh.rest.reshape(-1)
+    first, free, every = rate, mesh.free, mesh.rest.reshape(-1)
     shift = free.T @ (place.reshape(-1) - every) / np.asarray(free.multiply(free).sum(0)).ravel()
     r, weight, index = torch.tensor(mesh.r), mesh.weight, mesh.index
     inner = torch.tensor(mesh.values[1:].transpose(1, 0, 2).copy())
@@ -306,5 +316,11 @@ def settle(mesh: Mesh, sheet: Sheet, place: np.ndarray, gravity: float, rate: fl
         shift, now, force = shift + step, after, pull
         rate *= 0.3
         if np.abs(force).max() < enough:
-            break
+            if not nudge:
+                break
+            square, way = (part[..., 0] for part in eigsh(stiffness(shift), 1, mass, -first))
+            if square > 0:
+                break
+            shift = shift + nudge * way / np.abs(way).max()
+            rate, (now, force) = -2 * square, energy(shift)
     return Rest((every + free @ shift).reshape(*mesh.shape, 3), now, float(np.abs(force).max()), taken)

@@ -145,7 +145,7 @@ def shell(strip: Strip, cells: tuple[int, int], seed: float = 2.0, steps: int = 
     place[..., 2] = seed * strip.height * np.sin(math.pi / 2 * along.clip(0, 1)) ** 2 * np.exp(-(across**2))
     tension = strip.stretch * strip.strain
     rate = 30 * tension / strip.mass * (math.pi / strip.length) ** 2
-    rest = settle(mesh, strip, place, 0.0, rate, 1e-9 * tension * WIDTH, steps)
+    rest = settle(mesh, strip, place, 0.0, rate, 1e-9 * tension * WIDTH, steps, strip.height)
     w, _ = _line(rest.place[-1, :, 2], cells[1], WIDTH / 2)
     axis, slope = _line(rest.place[:, 0, 2], cells[0], strip.length / 2)
     reach = math.pi * math.sqrt((axis**2).sum() / max((slope**2).sum(), 1e-300)) / strip.length

@@ -173,6 +173,35 @@ def plot(results: list[Row], pictures: Path) -> None:
     _drapes(curve, _draped(result), _of(result, "draped shell"))
     _finer_drapes(grids, _draped(result))
     save_figure(figure, pictures / "drape.png")
+    figure, (stiffnesses, grids) = subplots(1, 2, figsize=(9.2, 3.9))
+    _wrinkles(stiffnesses, _shells(result))
+    _finer_wrinkles(grids, _of(result, "wrinkles"))
+    save_figure(figure, pictures / "wrinkles.png")
+
+
+def _wrinkles(axis: Any, rows: list[Row]) -> None:
+    own = sorted((row for row in rows if all(row[k] == v for k, v in SHELL.items()) and row["wavelength"] > 0),
+                 key=lambda row: row["bending"])  # fmt: skip
+    stiff = [row["bending"] for row in own]
+    axis.loglog(stiff, [1e3 * row["formula"] for row in own], color="0.5", linestyle=":", label="Cerda and Mahadevan")
+    axis.loglog(stiff, [1e3 * row["wavelength"] for row in own], "o-", color="tab:blue", label="shell")
+    axis.set_yticks([15, 20, 30, 40], ["15", "20", "30", "40"])
+    axis.minorticks_off()
+    axis.set(title="Wrinkles of a stretched sheet", xlabel="bending stiffness [N m]", ylabel="wavelength [mm]")
+    axis.legend(fontsize=8)
+
+
+def _finer_wrinkles(axis: Any, rows: list[Row]) -> None:
+    own = sorted((row for row in rows if row["wavelength"] > 0), key=lambda row: row["cells"])
+    if own:
+        exact = 1e3 * own[-1]["exact"]
+        axis.axhspan(0.9 * exact, 1.1 * exact, color="0.93")
+        axis.axhline(exact, color="tab:blue", label="shell (band: 10 %)")
+        axis.axhline(1e3 * own[-1]["formula"], color="0.5", linestyle=":", label="Cerda and Mahadevan")
+        axis.plot([r["cells"] for r in own], [1e3 * r["wavelength"] for r in own], "o-", color="tab:orange",
+                  markerfacecolor="none", label="points in three layers")  # fmt: skip
+        axis.legend(fontsize=8)
+    axis.set(title="On finer grids", xlabel="cells across the width", ylabel="wavelength [mm]", ylim=(0, None))
 
 
 def _drapes(axis: Any, rows: list[Row], shells: list[Row]) -> None:
