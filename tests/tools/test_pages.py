@@ -66,6 +66,7 @@ def test_pages_are_filled_in_place_and_their_plots_drawn(bench, tmp_path):
         "speed_cuda.png",
         "stability.png",
         "trees.png",
+        "wrinkles.png",
     ):
         assert (docs / "pictures" / picture).stat().st_size > 10_000
         assert (DOCS / "pictures" / picture).exists()

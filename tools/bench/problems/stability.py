@@ -58,11 +58,11 @@ def _made(name: str, **options: Any) -> dict[str, Any]:
 
 BODIES = {
     "sheet": Body(_made("FlagScene", width=SIZE, height=0.5 * SIZE, spacing=0.00625),
-                  (0.02, None, None), (0.16, 0.08, 0.04, 0.02)),
-    "rod": Body(_made(f"{__name__}.RodScene"), (None, None, 0.03), (0.16, 0.08, 0.04, 0.02)),
+                  (0.02, None, None), (0.16, 0.08, 0.04, 0.02, 0.01)),
+    "rod": Body(_made(f"{__name__}.RodScene"), (None, None, 0.03), (0.16, 0.08, 0.04, 0.02, 0.01)),
     "block": Body(_made("gaussian_swaying.scenes.solid.SolidScene", shape="box", size=SIZE, spacing=0.025,
                         gaussians="shell") | {"filling": {}},
-                  (None, None, -0.08), (0.3, 0.2, 0.12, 0.08)),
+                  (None, None, -0.08), (0.3, 0.2, 0.12, 0.08, 0.035)),
 }  # fmt: skip
 """A sheet of one layer held at an edge, an upright tube held at its foot, and a block held at its bottom."""
 
