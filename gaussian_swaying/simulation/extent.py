@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import warnings
 
+import torch
 from torch import Tensor
 
 from gaussian_swaying._checks import check_positive
@@ -13,6 +14,7 @@ _SAMPLE = 100_000  # Gaussians that are sorted, at most
 _FEW = 16  # fewer Gaussians are not checked
 FAR, TOO_FAR = 20, 1000  # multiples of the side of the box around 98 % of the Gaussians
 COARSE, SHORT, TOO_SHORT = 10.0, 3.0, 0.5  # cells along the longest side
+NARROW, ROUND, BENT = (0.25, 4.0), 0.5, 0.2  # cells across a tube; least side over middle side; motion over length
 SPARSE = 0.75  # cells between neighbouring Gaussians
 _SPACED = 4096  # Gaussians whose nearest neighbour is searched
 
@@ -70,8 +72,30 @@ def coarse(side: float, dx: float) -> list[str]:
     return [f"The object is {_cells(side, dx)}: on a finer grid it may move a quarter more, or less; {_finer(side)}."]
 
 
-def _cells(side: float, dx: float) -> str:
-    return f"{side:.3g} m long, {side / dx:.2g} cells of `solver.dx` = {dx:g} m"
+def narrow(points: Tensor, dx: float, moved: float) -> list[str]:
+    """A sentence about a tube that is bent and has few cells across, so that the grid decides whether it flattens.
+
+    Args:
+        points: Rest positions of the points of a body that is not filled [m], shape (P, 3).
+        dx: Grid spacing [m].
+        moved: Largest displacement over the longest side.
+    """
+    if len(points) < _FEW or not moved > BENT:
+        return []
+    centred = (points[:: -(-len(points) // _SAMPLE)]).double()
+    centred = centred - centred.mean(0)
+    turned = centred @ torch.linalg.eigh(centred.T @ centred).eigenvectors
+    least, middle, _ = (turned.amax(0) - turned.amin(0)).sort().values.tolist()
+    if least < ROUND * middle or not NARROW[0] * dx <= middle < NARROW[1] * dx:
+        return []
+    return [
+        f"The object is hollow and {_cells(middle, dx, 'across')}: on a finer grid its section may flatten, and it "
+        f"bends more; lower `solver.dx` to about {middle / 6:.2g} m, and set `scene.filling` if it is solid."
+    ]
+
+
+def _cells(side: float, dx: float, way: str = "long") -> str:
+    return f"{side:.3g} m {way}, {side / dx:.2g} cells of `solver.dx` = {dx:g} m"
 
 
 def _finer(side: float) -> str:

@@ -25,7 +25,7 @@ from gaussian_swaying.runs.seal import sha256
 from gaussian_swaying.simulation.copies import check_recorder
 from gaussian_swaying.simulation.diagnostics import SimulationDiverged, entry_names
 from gaussian_swaying.simulation.edits import SceneEditor
-from gaussian_swaying.simulation.extent import coarse
+from gaussian_swaying.simulation.extent import coarse, narrow
 from gaussian_swaying.simulation.frame import frames_from
 from gaussian_swaying.simulation.health import advice, extremes
 from gaussian_swaying.simulation.painter import Painter
@@ -117,7 +117,10 @@ def run_health(stepper: Stepper, log: Sequence[Mapping[str, Any]]) -> tuple[dict
     size = scene.size * scene.frame.metres_per_unit
     found = extremes(log, where, size, None if elastic is None else elastic.cpu())
     told = advice(found, float(points.youngs_modulus.amax()), scene.filled == 0)
-    return found, told + coarse(size, stepper.solver.dx)
+    told += coarse(size, stepper.solver.dx)
+    if scene.filled == 0 and found["moved"] is not None:
+        told += narrow(points.position.reshape(-1, 3).cpu(), stepper.solver.dx, found["moved"]["share"])
+    return found, told
 
 
 def written_once(recorder: Recorder, editor: SceneEditor) -> bool:

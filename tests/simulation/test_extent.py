@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from gaussian_swaying.simulation.extent import check_density, check_extent, coarse
+from gaussian_swaying.simulation.extent import check_density, check_extent, coarse, narrow
 
 
 def cube(count=1000):
@@ -33,6 +33,20 @@ def test_an_object_smaller_than_the_grid():
         check_extent(cube(), 1.0, 1000.0)
     with pytest.warns(UserWarning, match="2 cells of `solver.dx` = 0.5 m"):
         check_extent(cube(), 1.0, 0.5)
+
+
+def test_a_bent_tube_of_few_cells_across_says_so():
+    """Whichever way it points; not a wide tube, a ribbon, a cord of points in line, or one that hardly moves."""
+    turn, along = torch.meshgrid(torch.arange(8) * torch.pi / 4, torch.arange(50) * 0.01, indexing="ij")
+    tube = torch.stack([0.02 * turn.cos(), 0.02 * turn.sin(), along], dim=-1).reshape(-1, 3)
+    tilted = tube @ torch.linalg.qr(torch.tensor([[1.0, 2, 3], [0, 1, 4], [5, 6, 0]]))[0]
+    (said,) = narrow(tube, 0.02, 0.3)
+    assert "0.04 m across, 2 cells of `solver.dx` = 0.02 m" in said
+    assert "lower `solver.dx` to about 0.0067 m, and set `scene.filling`" in said
+    assert len(narrow(tilted, 0.02, 0.3)) == 1
+    assert narrow(tube, 0.009, 0.3) == narrow(tube, 0.02, 0.1) == narrow(tube[:15], 0.02, 0.3) == []
+    assert narrow(tube * torch.tensor([1.0, 0.3, 1.0]), 0.02, 0.3) == []
+    assert narrow(tube * torch.tensor([0.0, 0.0, 1.0]), 0.02, 0.3) == []
 
 
 def test_a_run_on_a_coarse_grid_says_so():

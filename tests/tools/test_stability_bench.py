@@ -54,3 +54,15 @@ def test_a_map_that_was_stopped_goes_on(tmp_path):
     assert results[0].stat().st_mtime_ns == kept
     assert results[1].exists()
     assert judged(told, frames, None) == judged(*first, None)
+
+
+def test_a_bent_tube_is_not_silent(tmp_path):
+    """On 20 cells along it, but one across, it bends a third less than on a finer grid, and says why."""
+    axes = {"material.E": [1e6], "material.density": [30.0], "wind.flow": [[6.0, 2.0, 0.0]]}
+    told, frames = swept("rod", 0.02, axes, tmp_path / "coarse")
+    finer, reference = swept("rod", 0.01, axes, tmp_path / "fine")
+    assert judged(told, frames, reference)["letters"] == stability.LETTERS[TOLD]
+    (said,) = told[0]["said"]
+    assert "hollow" in said
+    assert "cells of `solver.dx` = 0.02 m" in said
+    assert "hollow" in finer[0]["said"][0]

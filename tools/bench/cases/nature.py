@@ -64,7 +64,7 @@ def cases(settings: Settings) -> Iterable[tuple[str, Row, Callable[[], Result]]]
         yield case("wrinkled shell", wrinkles.of_shell, bending=0.5 * THIN, length=length)
     for strain in (0.025, 0.1):
         yield case("wrinkled shell", wrinkles.of_shell, bending=0.5 * THIN, strain=strain)
-    for cells in (32, 48, 64):
+    for cells in (32, 48, 64, 80):
         yield case("wrinkles", wrinkles.wrinkles, bending=THIN, cells=cells)
 
 
