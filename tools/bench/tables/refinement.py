@@ -20,10 +20,11 @@ def _fronts(result: Row) -> Iterator[tuple[int | str, float, list[Row]]]:
         yield flag, result["references"][str(flag)]["chamfer"], own
 
 
-def _rows(result: Row) -> Iterator[Row]:
-    for flag, itself, own in _fronts(result):
-        for row in own:
-            yield {"flag": named(flag), "itself": itself, "cells": row["cells"], "chamfer": row["chamfer"]}
+def _rows(result: Row) -> list[Row]:
+    """By cells first, as the columns of the table are in the order of the rows."""
+    rows = [{"flag": named(flag), "itself": itself, "cells": row["cells"], "chamfer": row["chamfer"]}
+            for flag, itself, own in _fronts(result) for row in own]  # fmt: skip
+    return sorted(rows, key=lambda row: row["cells"])
 
 
 table(PAGE, "refinement.rows", "refinement_*", _rows,
