@@ -89,14 +89,18 @@ def check_choice(name: str, value: str, choices: tuple[str, ...]) -> None:
 def check_literals(function: Callable[..., Any], values: Mapping[str, Any], where: str = "") -> None:
     """Raise ValueError if an argument is none of the choices that its type, a ``Literal``, lists.
 
+    Numbers may be others where the type is also that of a number.
+
     Args:
         function: The function, or the ``__init__`` of a class.
         values: Its arguments by name; others are ignored.
         where: Begins the names in the message, for example ``scene.``.
     """
     for name, kind in get_type_hints(function).items():
-        for part in (kind, *get_args(kind)):
-            if get_origin(part) is Literal and not (values[name] is None and type(None) in get_args(kind)):
+        value, kinds = values.get(name), get_args(kind)
+        other = (value is None and type(None) in kinds) or (not isinstance(value, str) and float in kinds)
+        for part in (kind, *kinds):
+            if get_origin(part) is Literal and not other:
                 check_choice(f"{where}{name}", values[name], get_args(part))
 
 

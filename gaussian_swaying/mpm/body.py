@@ -97,6 +97,7 @@ class Body:
         """Tensors that a substep depends on, besides its state and forces; any of them may require a gradient."""
         points = self.points
         own = [points.position, points.mass, points.volume, points.youngs_modulus, points.poisson_ratio]
+        own += [] if points.bending is None else [points.bending]
         return own + [t for boundary in self.boundaries for t in (*boundary.parameters(), *boundary.buffers())]
 
 

@@ -400,7 +400,7 @@ class MPMSolver(Solver):
 
             cells = largest_speed(self.bound, state)
             if cells is not None:
-                return cells
+                return self.bound.with_bending(cells)
         return self.bound.cells_per_second(state)
 
     def fit_grid(self, state: MPMState, horizon: float, margin: int = 0) -> MPMState:
@@ -581,7 +581,7 @@ class MPMSolver(Solver):
         return end, torch.stack(seen).amax()
 
     def elastic_energy(self, state: MPMState) -> Tensor:
-        """Elastic energy [J], shape (...) over the batch; in a kernel if there is one."""
+        """Elastic energy [J], that of bending included, shape (...) over the batch; in a kernel if there is one."""
         points, laws = self.points, self.laws
         density = None
         wanted = torch.is_grad_enabled() and (state.F_elastic.requires_grad or laws.mu.requires_grad)
@@ -591,7 +591,7 @@ class MPMSolver(Solver):
             density = elastic_energy(self.bound.body, state.F_elastic)
         if density is None:
             density = laws.energy(state.F_elastic, state.internal)
-        return (points.volume * density).sum(-1)
+        return (points.volume * density).sum(-1) + self.bound.bending_energy(state)
 
     def energies(self, state: MPMState) -> dict[str, Tensor]:
         """Kinetic, elastic and gravitational energy [J], each of shape (...) over the batch."""

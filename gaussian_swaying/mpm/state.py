@@ -105,6 +105,8 @@ def bounding_grid(low: Tensor, high: Tensor, dx: float, margin: int) -> GridSpec
 
 _DEFAULT: tuple[ConstitutiveLaw, ...] = (FixedCorotated(),)
 _FIELDS = ("mass", "volume", "youngs_modulus", "poisson_ratio")
+_OPTIONAL = ("damping", "bending")
+_OPTIONAL_FIELDS = (*_OPTIONAL, "normal")
 
 
 @dataclass(frozen=True, slots=True)
@@ -126,6 +128,9 @@ class MaterialPoints:
             ``total``, however close they lie (``virtual_nodes``). None if all are.
         damping: Rate at which the velocity of the material decays [1/s], shape (..., P), only in ``total``; None for
             no damping.
+        normal: Unit normals of sheets of one layer that resist bending (``bending_patches``), of either sign, shape
+            (..., P, 3), only in ``total``; None if there are none.
+        bending: Bending stiffness times area [N m³], shape (..., P), zero for points that are not of such a sheet.
     """
 
     position: Tensor
@@ -137,18 +142,25 @@ class MaterialPoints:
     law_index: Tensor | None = None
     attached: Tensor | None = None
     damping: Tensor | None = None
+    normal: Tensor | None = None
+    bending: Tensor | None = None
 
     def __post_init__(self) -> None:
         check_shape("position", self.position, "P", 3)
         if self.attached is not None:
             _check_attached(self.attached, self.count)
         batch = tuple(self.position.shape[:-1])
-        for name in (*_FIELDS, *(name for name in ("law_index", "damping") if getattr(self, name) is not None)):
+        for name in (*_FIELDS, *(name for name in ("law_index", *_OPTIONAL) if getattr(self, name) is not None)):
             value = getattr(self, name)
             if tuple(value.shape) != batch:
                 raise ValueError(f"Expected `{name}` of shape {batch}, but got {tuple(value.shape)}.")
             check_finite(name, value)
         check_finite("position", self.position)
+        if (self.normal is None) != (self.bending is None):
+            given, missing = ("bending", "normal") if self.normal is None else ("normal", "bending")
+            raise ValueError(f"`{given}` needs `{missing}`, too: give both, or none for a sheet that does not bend.")
+        if self.normal is not None and tuple(self.normal.shape) != (*batch, 3):
+            raise ValueError(f"Expected `normal` of shape {(*batch, 3)}, but got {tuple(self.normal.shape)}.")
         if (self.law_index is None) != (len(self.laws) == 1):
             raise ValueError(
                 f"Expected `law_index` to say which of the {len(self.laws)} `laws` applies to each particle."
@@ -169,6 +181,8 @@ class MaterialPoints:
         law_index: Tensor | None = None,
         attached: Tensor | None = None,
         damping: Tensor | float | None = None,
+        normal: Tensor | None = None,
+        bending: Tensor | float | None = None,
     ) -> MaterialPoints:
         """Build the points from per-point tensors or from numbers that apply to all points.
 
@@ -182,6 +196,8 @@ class MaterialPoints:
             law_index: With several laws, which of them applies to each particle, int64, shape (..., P).
             attached: Which points are attached to each other, see :class:`MaterialPoints`.
             damping: Rate at which the velocity decays [1/s], not negative.
+            normal: Unit normals of a sheet of one layer that resists bending, shape (..., P, 3).
+            bending: Its bending stiffness times the area of a point [N m³], not negative.
 
         Returns:
             The points, every field expanded to shape (..., P).
@@ -216,7 +232,9 @@ class MaterialPoints:
                 raise ValueError(f"Expected `law_index` to lie in 0 to {len(laws) - 1}, the last index of `laws`.")
         if damping is not None:
             damping = field("damping", damping, -1e-30, inf, "not to be negative, and finite [1/s]")
-        return cls(position, rho * v, v, e, nu, laws, law_index, attached, damping)
+        if bending is not None:
+            bending = field("bending", bending, -1e-30, inf, "not to be negative, and finite [N m³]")
+        return cls(position, rho * v, v, e, nu, laws, law_index, attached, damping, normal, bending)
 
     @classmethod
     def join(cls, parts: Sequence[MaterialPoints]) -> MaterialPoints:
@@ -237,9 +255,8 @@ class MaterialPoints:
         one_law = len(laws) < 2
         attached = _join_attached(parts)
         law_index = None if one_law else torch.cat(index, -1)
-        rates = _rates(parts)
-        damping = None if rates is None else torch.cat(rates, -1)
-        return cls(position, **fields, laws=tuple(laws), law_index=law_index, attached=attached, damping=damping)
+        more = {name: torch.cat(own, -2 if name == "normal" else -1) for name, own in _optional(parts).items()}
+        return cls(position, **fields, laws=tuple(laws), law_index=law_index, attached=attached, **more)
 
     @classmethod
     def stack(cls, parts: Sequence[MaterialPoints]) -> MaterialPoints:
@@ -253,9 +270,8 @@ class MaterialPoints:
             )
             if not same:
                 raise ValueError("Scenes of one batch need the same `attached`: run those that differ one by one.")
-        rates = _rates(parts)
-        damping = None if rates is None else torch.stack(rates)
-        return cls(**fields, laws=parts[0].laws, law_index=law_index, attached=attached, damping=damping)
+        more = {name: torch.stack(own) for name, own in _optional(parts).items()}
+        return cls(**fields, laws=parts[0].laws, law_index=law_index, attached=attached, **more)
 
     @property
     def count(self) -> int:
@@ -274,8 +290,9 @@ class MaterialPoints:
         """Apply a function to every tensor (``.detach``, indexing); law indices stay integers, ``attached`` stays."""
         moved = {name: function(getattr(self, name)) for name in ("position", *_FIELDS)}
         index = None if self.law_index is None else function(self.law_index).long()
-        damping = None if self.damping is None else function(self.damping)
-        return MaterialPoints(**moved, laws=self.laws, law_index=index, attached=self.attached, damping=damping)
+        given = {name: getattr(self, name) for name in _OPTIONAL_FIELDS}
+        more = {name: None if value is None else function(value) for name, value in given.items()}
+        return MaterialPoints(**moved, laws=self.laws, law_index=index, attached=self.attached, **more)
 
 
 def _check_attached(attached: Tensor, count: int) -> None:
@@ -289,11 +306,15 @@ def _check_attached(attached: Tensor, count: int) -> None:
         raise ValueError(f"Expected the pairs of `attached` to be numbers of points from 0 to {count - 1}.")
 
 
-def _rates(parts: Sequence[MaterialPoints]) -> list[Tensor] | None:
-    """``damping`` of several bodies; None if none of them is damped."""
-    if all(part.damping is None for part in parts):
-        return None
-    return [torch.zeros_like(part.mass) if part.damping is None else part.damping for part in parts]
+def _optional(parts: Sequence[MaterialPoints]) -> dict[str, list[Tensor]]:
+    """The optional fields that one of several bodies has, for all of them: zero where one has none."""
+    found = {}
+    for name in _OPTIONAL_FIELDS:
+        given = [getattr(part, name) for part in parts]
+        if any(value is not None for value in given):
+            none = (torch.zeros_like(part.position if name == "normal" else part.mass) for part in parts)
+            found[name] = [zero if own is None else own for own, zero in zip(given, none, strict=True)]
+    return found
 
 
 def _join_attached(parts: Sequence[MaterialPoints]) -> Tensor | None:

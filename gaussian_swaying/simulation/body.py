@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
@@ -106,7 +107,7 @@ def body_of(
     body_area = frame.area_to_sim(areas).double()
     area = body_area if scene.wind_on == "all" else torch.where(outer, body_area, 0)
     facing = frame.direction_to_sim(normals[source].double())
-    samples, laws = sample_object(position, facing, body_area, area, filling, material, frame, dx)
+    samples, laws = sample_object(position, facing, body_area, area, filling, material, frame, dx, scene.layers)
     chosen, owner, feels = samples, torch.arange(len(samples.position)), samples.area > 0
     patches = samples.normal[feels], samples.area[feels], owner[feels]
     pairs = piece = home = parent = None
@@ -120,10 +121,9 @@ def body_of(
         patches = shared_wind(samples, owner, parent)
     if scene.layers == 3:
         _require_cells_as_large_as(chosen.span, chosen.thickness, dx)
-    elif material.bending is not None or any(entry.bending is not None for entry in material.regions):
+    elif filling is not None and bool((samples.bending > 0).any()):
         raise ValueError(
-            "Expected `scene.layers` 3 with `material.bending`: a single layer folds without resistance, and a solid "
-            "bends as its shape and `material.E` allow."
+            "Expected no `material.bending` with `scene.filling`: a solid bends as its shape and `material.E` allow."
         )
     attached = None
     if pairs is not None and piece is not None:
@@ -140,13 +140,13 @@ def _require_cells_as_large_as(span: Tensor, thickness: Tensor, dx: float) -> No
     """
     most = int(span.argmax())
     if float(span[most]) > dx * (1 + 1e-6):
-        own = bool(span[most] == thickness[most])
+        own = math.isclose(float(span[most]), float(thickness[most]), rel_tol=1e-6)
         what = f"is {span[most]:g} m thick" if own else f"has its outer layers {span[most]:g} m apart"
         lower = "`material.thickness`" if own else "`material.bending`, raise `material.E`"
         raise ValueError(
             f"A sheet of three layers (`scene.layers: 3`) that {what} needs cells at least as large, but `solver.dx` "
             f"is {dx:g} m, and its layers would come apart: raise `solver.dx`, lower {lower}, or set `scene.layers` "
-            "to 1."
+            "to 1, which bends by `material.bending` at any thickness."
         )
 
 

@@ -103,11 +103,15 @@ def edited_points(points: MaterialPoints, inside: Tensor, edit: Edit, flowed: bo
         kept.append(next(law for law in laws if type(law).plastic))
     place = torch.zeros(len(laws), dtype=torch.long, device=index.device)
     place[used] = torch.arange(len(used), device=index.device)
+    bending = points.bending
+    if bending is not None and edit.E is not None:
+        bending = torch.where(inside, bending * edit.E / points.youngs_modulus, bending)
     mass = points.mass if edit.density is None else torch.where(inside, edit.density * points.volume, points.mass)
     return dataclasses.replace(
         points,
         mass=mass,
         youngs_modulus=field(edit.E, points.youngs_modulus),
+        bending=bending,
         poisson_ratio=field(edit.nu, points.poisson_ratio),
         laws=tuple(kept),
         law_index=place[index] if len(kept) > 1 else None,

@@ -42,7 +42,7 @@ class MaterialRegion:
     nu: float | None = None
     density: float | None = None
     thickness: float | None = None
-    bending: float | None = None
+    bending: float | Literal["plate"] | None = None
     damping_ratio: float | None = None
     law: ConstitutiveLaw | None = None
 
@@ -59,10 +59,10 @@ class Material:
         volume: ``patch`` (area x thickness, and the volume of the solid where ``scene.filling`` finds one) or ``cell``
             (PhysGaussian's rule for solids: cell volume / particles in it; with ``scene.layers`` 3 the layers share it,
             and ``thickness`` only says how far apart they lie).
-        bending: Bending stiffness of a sheet of three layers (``scene.layers`` 3), to a unit of its width [N m]: D of a
-            plate or a fabric. The outer layers then lie :func:`layer_distance` apart, so that it is independent of the
-            stiffness against stretch, E x thickness. E thickness³ / (12 (1 - nu²)) if null. An edit of E changes it in
-            proportion.
+        bending: Bending stiffness of a sheet, to a unit of its width [N m]: D of a fabric, whatever its stiffness
+            against stretch, or ``plate`` for E thickness³ / (12 (1 - nu²)). With null a sheet of one layer is a
+            membrane, which folds without resistance, and one of three layers (``scene.layers`` 3) is a plate. One
+            layer needs a third of the points, and may be thicker than a cell. An edit of E changes it in proportion.
         damping_ratio: Share of critical damping of a vibration of ``damping_frequency``, in ``solver.formulation:
             total``; parts and regions may have their own. The velocity decays at a rate of 4 pi times frequency and
             ratio, so a vibration of twice the frequency has half of the ratio. None if null, beside ``solver.damping``.
@@ -80,7 +80,7 @@ class Material:
     density: Number = 200.0
     thickness: float = 0.01
     volume: Literal["patch", "cell"] = "patch"
-    bending: float | None = None
+    bending: float | Literal["plate"] | None = None
     damping_ratio: float | None = None
     damping_frequency: float = 1.0
     law: ConstitutiveLaw | None = None
@@ -105,7 +105,7 @@ class Material:
             if entry is self:
                 given |= {name: number_of(given[name]) for name in DIFFERENTIABLE}
             for name in ("E", "density", "thickness", "bending"):
-                if given[name] is not None:
+                if given[name] is not None and given[name] != PLATE:
                     check_positive(f"material.{name}", given[name])
             if entry.damping_ratio is not None:
                 check_positive("material.damping_ratio", entry.damping_ratio, allow_zero=True)
@@ -125,8 +125,7 @@ class Material:
         for name in ("E", "nu"):
             if requires_grad(getattr(self, name)):
                 raise ValueError(
-                    f"`material.{name}` requires a gradient, but `material.bending` says where the layers lie: leave "
-                    "`material.bending` out."
+                    f"`material.{name}` requires a gradient, which `material.bending` does not pass on: leave it out."
                 )
 
     @classmethod
@@ -147,6 +146,17 @@ class Material:
         return cls(**(known_material(name).numbers | own))
 
 
+def plate_stiffness(E: Tensor, nu: Tensor, thickness: Tensor) -> Tensor:
+    r"""Kirchhoff's stiffness :math:`D = E h^3 / (12 (1 - \nu^2))` of a plate [N m], shape (N,).
+
+    Args:
+        E: Young's moduli [Pa], shape (N,).
+        nu: Poisson's ratios, shape (N,).
+        thickness: Thicknesses h [m], shape (N,).
+    """
+    return E * thickness**3 / (12 * (1 - nu.square()))
+
+
 def layer_distance(bending: Tensor, E: Tensor, nu: Tensor, thickness: Tensor) -> Tensor:
     r"""Distance of the outer two of three layers with Simpson's weights that have a bending stiffness.
 
@@ -164,6 +174,9 @@ def layer_distance(bending: Tensor, E: Tensor, nu: Tensor, thickness: Tensor) ->
     """
     return (12 * bending * (1 - nu.square()) / (E * thickness)).sqrt()
 
+
+PLATE = "plate"
+"""The bending stiffness of a plate of the material's own E, nu and thickness."""
 
 DIFFERENTIABLE = ("E", "nu", "density")
 """Numbers of a :class:`Material` that may require a gradient."""

@@ -27,7 +27,7 @@ from gaussian_swaying.aero.force import AeroForce
 from gaussian_swaying.aero.wind import SpatialWind, WindField
 from gaussian_swaying.mpm.forces import Force
 from gaussian_swaying.mpm.state import MaterialPoints
-from gaussian_swaying.simulation.material import Material
+from gaussian_swaying.simulation.material import PLATE, Material
 from gaussian_swaying.simulation.simulated_scene import SimulatedScene
 
 if TYPE_CHECKING:
@@ -423,13 +423,16 @@ def _write_material(setup: Setup, values: Mapping[str, Any]) -> Setup:
             raise ValueError(
                 f"`{name}` is to change, but `material.regions` or `scene.parts` gives it too: remove it there."
             )
-    if material.bending is not None or any(part.bending is not None for part in material.regions):
+    bends = material.bending is not None or any(part.bending is not None for part in material.regions)
+    if bends and setup.points.bending is None:
         for name in ("material.E", "material.nu"):
             if name in values:
                 raise ValueError(
                     f"`{name}` is to change, but with `material.bending` it says where the layers lie: make another "
                     "simulation, or leave `material.bending` out."
                 )
+    if points.bending is not None and material.bending == PLATE:
+        points = replace(points, bending=points.bending * _stiffer(setup, values))
     if "material.thickness" in values:
         ratio = values["material.thickness"] / _thickness(setup)
         points = thicker(setup, ratio).points
@@ -444,6 +447,18 @@ def _write_material(setup: Setup, values: Mapping[str, Any]) -> Setup:
         points = replace(points, mass=points.volume * values["material.density"])
         material = replace(material, density=values["material.density"])
     return replace(setup, points=points, material=material)
+
+
+def _stiffer(setup: Setup, values: Mapping[str, Any]) -> Any:
+    """How many times as stiff against bending each point of a plate of one layer gets, by Kirchhoff's D."""
+    points, ratio = setup.points, 1.0
+    if "material.E" in values:
+        ratio = ratio * values["material.E"] / points.youngs_modulus
+    if "material.nu" in values:
+        ratio = ratio * (1 - points.poisson_ratio.square()) / (1 - values["material.nu"] ** 2)
+    if "material.thickness" in values:
+        ratio = ratio * (values["material.thickness"] / _thickness(setup)) ** 3
+    return ratio
 
 
 def thicker(setup: Setup, ratio: Any) -> Setup:

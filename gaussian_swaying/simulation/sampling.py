@@ -6,6 +6,7 @@ import math
 import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -21,7 +22,7 @@ from gaussian_swaying.mpm.damping import decay_rate
 from gaussian_swaying.mpm.laws.fixed_corotated import FixedCorotated
 from gaussian_swaying.mpm.laws.law import ConstitutiveLaw
 from gaussian_swaying.mpm.state import MaterialPoints
-from gaussian_swaying.simulation.material import Material, layer_distance
+from gaussian_swaying.simulation.material import PLATE, Material, layer_distance, plate_stiffness
 
 _FLAT = 0.01  # standard deviation [cubes] below which a group has no extent in a direction
 SHARED = 4
@@ -29,7 +30,7 @@ SHARED = 4
 
 SIMPSON = (2 / 3, 1 / 6, 1 / 6)  # middle plane and faces of a sheet: exact for the square of the height
 _PROPERTIES = ("E", "nu", "density", "thickness", "bending", "damping_ratio")
-_KINDS = ("E", "nu", "density", "thickness", "span", "damping")
+_KINDS = ("E", "nu", "density", "thickness", "bending", "damping")
 
 
 @dataclass(frozen=True)
@@ -46,7 +47,7 @@ class Samples:
         nu: Poisson's ratios, shape (N,).
         density: Densities [kg/m³], shape (N,).
         thickness: Thicknesses of the surface [m], shape (N,).
-        span: Distances between the outer two of three layers [m], shape (N,).
+        bending: Bending stiffnesses of sheets [N m], zero for a membrane, shape (N,).
         damping: Rates at which the velocity decays [1/s], shape (N,).
         law_index: Which law applies to each, int64, shape (N,).
         surface: Which are on the surface, bool, shape (N,).
@@ -61,7 +62,7 @@ class Samples:
     nu: Tensor
     density: Tensor
     thickness: Tensor
-    span: Tensor
+    bending: Tensor
     damping: Tensor
     law_index: Tensor
     surface: Tensor
@@ -70,6 +71,11 @@ class Samples:
     def mass(self) -> Tensor:
         """Masses [kg], shape (N,)."""
         return self.density * self.volume
+
+    @property
+    def span(self) -> Tensor:
+        """Distances between the outer two of three layers [m], shape (N,)."""
+        return layer_distance(self.bending, self.E, self.nu, self.thickness)
 
     def choose(self, index: Tensor) -> Samples:
         """Some of the samples."""
@@ -80,6 +86,7 @@ class Samples:
     ) -> MaterialPoints:
         """The samples as material points: one each, or three through the thickness (the other two at the end).
 
+        Those of one layer have a bending stiffness of their own, and so have three layers by their distance.
         ``attached`` are the pairs of points that are attached, shape (E, 2); None if all are.
         """
         position, volume, index = self.position, self.volume, self.law_index
@@ -90,6 +97,7 @@ class Samples:
             volume = torch.cat([part * volume for part in SIMPSON])
             properties = {name: value.repeat(3) for name, value in properties.items()}
             index = index.repeat(3)
+        bends = layers == 1 and bool((self.bending > 0).any())
         return MaterialPoints.create(
             position.to(dtype),
             volume=volume.to(dtype),
@@ -100,6 +108,8 @@ class Samples:
             law_index=index if len(laws) > 1 else None,
             attached=attached,
             damping=properties["damping"].to(dtype) if bool((self.damping > 0).any()) else None,
+            normal=self.normal.to(dtype) if bends else None,
+            bending=(self.bending * self.body_area).to(dtype) if bends else None,
         )
 
 
@@ -112,6 +122,7 @@ def sample_object(
     material: Material,
     frame: SimFrame,
     dx: float,
+    layers: int,
 ) -> tuple[Samples, list[ConstitutiveLaw]]:
     """The samples of an object with their material, and the laws of the material.
 
@@ -124,6 +135,7 @@ def sample_object(
         material: The material of the object.
         frame: Conversion from scene units to metres.
         dx: Grid spacing [m], for ``material.volume = "cell"``.
+        layers: Layers of points through the thickness of a sheet.
 
     Raises:
         ValueError: If a region of the material contains nothing.
@@ -137,7 +149,7 @@ def sample_object(
         surface = torch.cat([surface, torch.zeros(inside, dtype=torch.bool)])
     where = frame.point_to_scene(position)
     given = {name: getattr(material, name) for name in _PROPERTIES}
-    properties = {name: torch.full_like(area, math.nan if v is None else number_of(v)) for name, v in given.items()}
+    properties = {name: torch.full_like(area, _number(v)) for name, v in given.items()}
     laws, index = [material.law or FixedCorotated()], torch.zeros(len(position), dtype=torch.long)
     for entry in material.regions:
         inside_region = entry.region.contains(where)
@@ -149,7 +161,7 @@ def sample_object(
             )
         for name in _PROPERTIES:
             if getattr(entry, name) is not None:
-                properties[name][inside_region] = getattr(entry, name)
+                properties[name][inside_region] = _number(getattr(entry, name))
         if entry.law is not None:
             index[inside_region] = len(laws)
             laws.append(entry.law)
@@ -170,14 +182,19 @@ def sample_object(
             solid = torch.cat([filling.gaussian_volume, filling.volume]).to(volume)
             volume = torch.where(solid > 0, solid, volume)
     bending = properties.pop("bending")
+    of_plate = plate_stiffness(properties["E"], properties["nu"], properties["thickness"])
+    bending = torch.where(bending.isinf() | (bending.isnan() & (layers == 3)), of_plate, bending.nan_to_num(0.0))
     damping = decay_rate(1.0, material.damping_frequency) * properties.pop("damping_ratio").nan_to_num(0.0)
-    distance = layer_distance(bending, properties["E"], properties["nu"], properties["thickness"])
-    span = torch.where(bending.isnan(), properties["thickness"], distance)
     found = Samples(
-        position, normal, body_area, area, volume, **properties, span=span, damping=damping, law_index=index,
+        position, normal, body_area, area, volume, **properties, bending=bending, damping=damping, law_index=index,
         surface=surface,
     )  # fmt: skip
     return found, laws
+
+
+def _number(value: Any) -> float:
+    """The number of a property of a material: not a number for none, and infinity for the stiffness of a plate."""
+    return math.nan if value is None else math.inf if value == PLATE else number_of(value)
 
 
 def cell_volume(position: Tensor, dx: float) -> Tensor:

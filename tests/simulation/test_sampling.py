@@ -18,7 +18,7 @@ def _pairs():
     place = torch.tensor([[0.9, 0.9, 1.0], [1.1, 0.9, 1.0], [0.9, 1.1, 1.0], [1.1, 1.1, 1.0]], dtype=DOUBLE)
     each = {
         name: torch.ones(8, dtype=DOUBLE)
-        for name in ("body_area", "area", "volume", "E", "density", "thickness", "span", "damping")
+        for name in ("body_area", "area", "volume", "E", "density", "thickness", "bending", "damping")
     }
     return Samples(
         position=place.repeat_interleave(2, 0),
@@ -43,7 +43,7 @@ def test_like_samples_of_a_cell_are_one_group():
         ("nu", 0.4),
         ("density", 2.0),
         ("thickness", 2.0),
-        ("span", 2.0),
+        ("bending", 2.0),
         ("damping", 2.0),
         ("law_index", 1),
         ("surface", False),

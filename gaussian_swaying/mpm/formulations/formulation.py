@@ -7,7 +7,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
-from typing import ClassVar
+from typing import ClassVar, TypeVar
 
 import torch
 from torch import Tensor
@@ -25,6 +25,8 @@ from gaussian_swaying.mpm.damping import damped_substep
 from gaussian_swaying.mpm.state import GridSpec, MPMState, bounding_grid
 from gaussian_swaying.mpm.timestep import MAX_CFL, cfl_number, stable_limit, wave_speed
 from gaussian_swaying.mpm.transfer import Stencil, scatter
+
+_Number = TypeVar("_Number", float, Tensor)
 
 
 @dataclass(frozen=True, slots=True)
@@ -60,6 +62,7 @@ class Formulation(ABC):
         name: Its name in a configuration.
         neighbours_fixed: Whether particles keep their neighbours from the rest state, because the stencils do not move:
             such a body cannot tear, flow or leave its grid, and its velocity does not count in the Courant number.
+        bending_rate: Largest square of a circular frequency of sheets that bend by themselves [1/s²].
         viscous_power: Power of the largest squared stretch with which the viscous stress stiffens.
         held: As in the body, with the parts that are constant on this grid.
         kinds: Kind of each boundary: ``nodes``, points as ``hinge`` or ``clamp``, or ``surface``
@@ -72,6 +75,7 @@ class Formulation(ABC):
     name: ClassVar[str]
     neighbours_fixed: ClassVar[bool]
     viscous_power: ClassVar[int]
+    bending_rate: float = 0.0
 
     def __init__(self, body: Body, settings: Settings) -> None:
         self.body, self.settings = body, settings
@@ -246,6 +250,10 @@ class Formulation(ABC):
     def kinetic(self, state: MPMState) -> Tensor:
         """Kinetic energy [J], shape (...) over the batch."""
 
+    def bending_energy(self, state: MPMState) -> Tensor | float:
+        """Energy of sheets that bend by themselves [J], shape (...) over the batch."""
+        return 0.0
+
     @abstractmethod
     def momenta(self, state: MPMState) -> tuple[Tensor, Tensor]:
         """Linear [kg m/s] and angular momentum about the origin [kg m²/s], shape (..., 3) each."""
@@ -257,7 +265,8 @@ class Formulation(ABC):
         body, dx, spatial = self.body, self.settings.dx, not self.neighbours_fixed
         F, internal = (None, None) if state is None else (state.F_elastic.detach(), state.internal)
         limit = stable_limit(body.points, dx, F, internal, spatial=spatial, laws=body.laws)
-        return damped_substep(float(limit.detach().amin()), self.viscous_time(state))
+        shortest = (1 / float(limit.detach().amin()) ** 2 + self.bending_rate / 4) ** -0.5
+        return damped_substep(shortest, self.viscous_time(state))
 
     @cached_property
     def longest_substep(self) -> float:
@@ -266,14 +275,22 @@ class Formulation(ABC):
         identity = torch.eye(3, dtype=body.points.mass.dtype, device=body.points.mass.device)
         F = identity.expand(*body.points.mass.shape, 3, 3)
         speed = wave_speed(body.points, F, body.laws.initial_internal(), laws=body.laws).detach()
-        limit = MAX_CFL * self.settings.dx / max(float(speed.amax()), 1e-30)
+        limit = MAX_CFL / self.with_bending(max(float(speed.amax()) / self.settings.dx, 1e-30))
         return damped_substep(limit, self.settings.stiffness_damping)
 
     def cells_per_second(self, state: MPMState) -> Tensor:
         """Return the number of cells that the fastest wave crosses per second, a scalar tensor."""
         body, spatial, F = self.body, not self.neighbours_fixed, state.F_elastic.detach()
         speed = wave_speed(body.points, F, state.internal, spatial=spatial, laws=body.laws)
-        return cfl_number(1.0, self.settings.dx, speed, state.velocity if spatial else None).detach()
+        return self.with_bending(cfl_number(1.0, self.settings.dx, speed, state.velocity if spatial else None).detach())
+
+    def with_bending(self, cells: _Number) -> _Number:
+        r"""Cells per second of a wave that is as hard to resolve as some waves and the bending of sheets together.
+
+        The largest circular frequency of elastic waves is at most :math:`\sqrt 6` times their cells per second
+        (:mod:`~gaussian_swaying.mpm.timestep`), and squares of frequencies add up.
+        """
+        return (cells**2 + self.bending_rate / 6) ** 0.5 if self.bending_rate > 0 else cells
 
     def obstacle_cells(self, state: MPMState, seconds: float) -> float:
         """Return the cells per second of the fastest obstacle that acts on nodes, in some seconds from a state on.

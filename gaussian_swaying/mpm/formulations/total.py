@@ -14,6 +14,7 @@ from gaussian_swaying._devices import in_double
 from gaussian_swaying.geometry.linalg import polar_rotation
 from gaussian_swaying.geometry.neighbours import nearest_neighbours
 from gaussian_swaying.geometry.rigid import centre, fitted_gradient
+from gaussian_swaying.mpm.bending import bending_patches
 from gaussian_swaying.mpm.body import Body, Held
 from gaussian_swaying.mpm.boundaries.boundary import BY_BODY, Boundary
 from gaussian_swaying.mpm.boundaries.pinned_points import PinnedPoints
@@ -47,6 +48,7 @@ class Total(Formulation):
             positions.
         node_damping: Rate at which the velocity of each node decays, the mean over its mass [1/s], shape (..., G); None
             for a material without damping of its own.
+        bending: Patches of sheets of one layer that resist bending, or None.
         contact: Contact with obstacles and itself, or None.
 
     Raises:
@@ -90,7 +92,10 @@ class Total(Formulation):
         )
         self._bodies = [self._body(k) for k in self.body.rigid]
         self._check_bodies()
-        self._soften()
+        softened = self._soften()
+        self.bending = bending_patches(points, self.stencil, settings.dx, softened)
+        if self.bending is not None:
+            self.bending_rate = self.bending.fastest(self.node_inverse_mass)
         self._windows = self._point_windows()
         self._point_holds = self._hold_points()
         self.contact = self._contact()
@@ -216,15 +221,21 @@ class Total(Formulation):
         held = self.body.held[k]
         return self.kinds[k] == "clamp" and held is not None and held.release is None
 
-    def _soften(self) -> None:
-        """Reduce the stiffness of material that clamps hold all the time, see ``held_faces.SOFTENED``."""
+    def _soften(self) -> Tensor | None:
+        """Reduce the stiffness of material that clamps hold all the time; return the factors (``held_faces.SOFTENED``).
+
+        None if there is none.
+        """
         masks = [
             held.mass > 0
             for k, (held, boundary) in enumerate(zip(self.body.held, self.body.boundaries, strict=True))
             if held is not None and self.has_face(k) and _always(boundary)
         ]
-        if masks:
-            self.body.soften(torch.stack(masks).any(0), SOFTENED)
+        if not masks:
+            return None
+        own = torch.stack(masks).any(0)
+        self.body.soften(own, SOFTENED)
+        return torch.where(own, SOFTENED, 1.0)
 
     @property
     def point_holds(self) -> PointHolds | None:
@@ -353,6 +364,8 @@ class Total(Formulation):
         stress = stress * points.volume[..., None, None]
         value = torch.zeros_like(state.position) if force is None else force
         node_force = scatter(self.stencil, torch.cat([value[..., None, :], -stress.mT], dim=-2))
+        if self.bending is not None:
+            node_force = node_force + self.bending.forces(displacement)
         inverse_mass = self.node_inverse_mass[..., None]
         kick, yielding = kick_time(state, dt), None
         if drag is not None:
@@ -444,6 +457,11 @@ class Total(Formulation):
         """Kinetic energy of the nodes."""
         assert state.node_velocity is not None
         return 0.5 * (self.node_mass * state.node_velocity.square().sum(-1)).sum(-1)
+
+    def bending_energy(self, state: MPMState) -> Tensor | float:
+        """Energy of the patches of sheets of one layer."""
+        assert state.node_displacement is not None
+        return 0.0 if self.bending is None else self.bending.energy(state.node_displacement)
 
     def momenta(self, state: MPMState) -> tuple[Tensor, Tensor]:
         """Momenta of the nodes."""

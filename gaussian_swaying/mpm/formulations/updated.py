@@ -38,6 +38,11 @@ class Updated(Formulation):
                 "`damping` of material points, which `material.damping_ratio` sets, needs `solver.formulation: total`: "
                 "use `solver.damping`, one rate for all of the material."
             )
+        if body.points.bending is not None:
+            raise ValueError(
+                "`bending` of material points, which `material.bending` sets, needs `solver.formulation: total`: leave "
+                "it out, or use `scene.layers: 3`."
+            )
         if body.surface is not None and body.surface.contact is not None:
             raise ValueError(
                 "`contact` needs particles that keep their neighbours, which the updated formulation does not have: "

@@ -107,6 +107,7 @@ class FusedTotal(Fused):
         """True if the kernels apply all boundaries but obstacles, which are contact."""
         self.position = bound.needs_position
         self.lattice = bound.node_positions(self.rest) if bound.needs_lattice else None
+        self._take_patches()
         self._take_pins()
         self.touching = None if bound.contact is None else FusedContact(bound, self.fields, self.active)
         self.shift = torch.zeros(len(inverse) if self.position else 0, 4, **self.like)
@@ -124,6 +125,31 @@ class FusedTotal(Fused):
     def launches(self) -> bool:
         """True if the kernels apply all boundaries."""
         return self.plain and (self.touching is None or None not in self.touching.solids)
+
+    def _take_patches(self) -> None:
+        """The patches of sheets that bend by themselves, sorted by cell."""
+        bending = self.bound.bending
+        self.bent = 0
+        if bending is None:
+            return
+        place = torch.empty(self.count, dtype=torch.long, device=self.device)
+        place[self.order.long()] = self.particle_cell.long()
+        cell, order = torch.sort(place[bending.example], stable=True)
+        bent, many = torch.unique_consecutive(cell, return_counts=True)
+        self.bent, self.bent_cell = len(bent), bent.int()
+        self.first_patch = torch.nn.functional.pad(many.cumsum(0), (1, 0)).int()
+        self.patch_node = torch.nn.functional.pad(bending.node[order], (0, 5)).int().contiguous()
+        self.curving = torch.nn.functional.pad(bending.curving[order], (0, 5)).contiguous()
+        self.plate = torch.stack([bending.stiffness.detach(), bending.poisson], -1)[order].contiguous()
+        check_indices(self.curving.numel())
+
+    def bend(self, fields: Tensor, partial: Tensor, width: int) -> None:
+        """Add the forces of sheets that bend to the sums of the cells; those are linear in ``fields``, and symmetric."""
+        block = lanes(self.device, 4, 1)
+        launch(kernels.total_bend, (-(-self.bent // block),))(
+            self.bent_cell, self.first_patch, self.bent, self.patch_node, self.curving, self.plate, fields, partial,
+            self.cells, WIDTH=width, BLOCK=block, num_warps=1,
+        )  # fmt: skip
 
     def _take_pins(self) -> None:
         """Collect the nodes and points that pins without a time window hold."""
@@ -251,6 +277,8 @@ class FusedTotal(Fused):
         if self.pieces > self.cells:
             pieces, partial = partial, self.sums(self.cells, width)
             self.join_pieces(pieces, partial, width)
+        if self.bent:
+            self.bend(self.fields, partial, width)
         nodes, block = len(self.active), lanes(self.device, 16, 1)
         source, sources = self.source, len(self.source)
         if block == 1:

@@ -337,6 +337,8 @@ class TotalAdjoint:
         )  # fmt: skip
         if cut:
             fused.join_pieces(to, asked.partial, asked.width)
+        if fused.bent:
+            fused.bend(self.force_bar, asked.partial, asked.width)
 
     # ---- what it found
 

@@ -268,6 +268,45 @@ def total_pieces(pieces_in, partial, first_piece, cells, pieces, WIDTH: tl.const
 
 
 @triton.jit(do_not_specialize=VARIES)
+def total_bend(
+    bent_cell, first_patch, bent, patch_node, curving, plate, fields, partial, cells,
+    WIDTH: tl.constexpr, BLOCK: tl.constexpr,
+):  # fmt: skip
+    """``total``: add the forces of sheets that bend by themselves to the sums of their cells.
+
+    Each of ``bent`` cells has some patches, one after the other (:mod:`~gaussian_swaying.mpm.bending`), with rows of 32
+    nodes and of 3 x 32 derivatives, of which those beyond 27 are zero. The first three columns of ``fields`` move them.
+    """
+    k = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
+    real = k < bent
+    first = tl.load(first_patch + k, real, 0)
+    many = tl.load(first_patch + k + 1, real, 0) - first
+    o = tl.arange(0, 32)[None, :]
+    place = (o * (cells + 1) + tl.load(bent_cell + k, real, 0)[:, None]) * WIDTH
+    for n in range(0, tl.max(many)):
+        own = n < many
+        patch = first + n
+        known = own[:, None] & (o < 27)
+        at = fields + tl.load(patch_node + patch[:, None] * 32 + o, known, 0) * 8
+        row = curving + patch[:, None] * 96 + o
+        aa = tl.load(row, known, 0.0)
+        bb = tl.load(row + 32, known, 0.0)
+        ab = tl.load(row + 64, known, 0.0)
+        stiffness = tl.load(plate + 2 * patch, own, 0.0)
+        nu = tl.load(plate + 2 * patch + 1, own, 0.0)
+        for c in tl.static_range(3):
+            u = tl.load(at + c, known, 0.0)
+            ka = tl.sum(aa * u, 1)
+            kb = tl.sum(bb * u, 1)
+            kt = tl.sum(ab * u, 1)
+            ma = (stiffness * (ka + nu * kb))[:, None]
+            mb = (stiffness * (kb + nu * ka))[:, None]
+            mt = (2 * stiffness * (1 - nu) * kt)[:, None]
+            out = partial + place + c
+            tl.store(out, tl.load(out, known, 0.0) - (aa * ma + bb * mb + ab * mt), known)
+
+
+@triton.jit(do_not_specialize=VARIES)
 def total_join(source, counts, nodes, partial, joined, WIDTH: tl.constexpr):
     """``total``, on a CPU: the sums of the cells around a node, so that ``total_nodes`` has one source."""
     k = tl.program_id(0)
