@@ -591,7 +591,7 @@ class MPMSolver(Solver):
             density = elastic_energy(self.bound.body, state.F_elastic)
         if density is None:
             density = laws.energy(state.F_elastic, state.internal)
-        return (points.volume * density).sum(-1) + self.bound.bending_energy(state)
+        return (points.volume * density).sum(-1) + self.bound.sheet_energy(state)
 
     def energies(self, state: MPMState) -> dict[str, Tensor]:
         """Kinetic, elastic and gravitational energy [J], each of shape (...) over the batch."""

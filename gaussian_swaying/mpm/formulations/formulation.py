@@ -250,7 +250,7 @@ class Formulation(ABC):
     def kinetic(self, state: MPMState) -> Tensor:
         """Kinetic energy [J], shape (...) over the batch."""
 
-    def bending_energy(self, state: MPMState) -> Tensor | float:
+    def sheet_energy(self, state: MPMState) -> Tensor | float:
         """Energy of sheets that bend by themselves [J], shape (...) over the batch."""
         return 0.0
 

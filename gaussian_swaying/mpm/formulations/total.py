@@ -14,7 +14,6 @@ from gaussian_swaying._devices import in_double
 from gaussian_swaying.geometry.linalg import polar_rotation
 from gaussian_swaying.geometry.neighbours import nearest_neighbours
 from gaussian_swaying.geometry.rigid import centre, fitted_gradient
-from gaussian_swaying.mpm.bending import bending_patches
 from gaussian_swaying.mpm.body import Body, Held
 from gaussian_swaying.mpm.boundaries.boundary import BY_BODY, Boundary
 from gaussian_swaying.mpm.boundaries.pinned_points import PinnedPoints
@@ -25,6 +24,7 @@ from gaussian_swaying.mpm.formulations.formulation import Formulation, Settings,
 from gaussian_swaying.mpm.held_faces import HELD_ALONE, SHEET, SOFTENED, thickness, width
 from gaussian_swaying.mpm.held_rows import LEAST_APART
 from gaussian_swaying.mpm.point_holds import POINTS, PointHolds
+from gaussian_swaying.mpm.sheets import bending_patches, director_energy, flattened, sheet_pk1
 from gaussian_swaying.mpm.state import GridSpec, MPMState
 from gaussian_swaying.mpm.timestep import kick_time
 from gaussian_swaying.mpm.transfer import bspline_stencil, gather, in_fixed_order, scatter
@@ -49,6 +49,7 @@ class Total(Formulation):
         node_damping: Rate at which the velocity of each node decays, the mean over its mass [1/s], shape (..., G); None
             for a material without damping of its own.
         bending: Patches of sheets of one layer that resist bending, or None.
+        normal: Unit normals of their points at rest, zero elsewhere, shape (..., P, 3), if there are such sheets.
         contact: Contact with obstacles and itself, or None.
 
     Raises:
@@ -95,6 +96,9 @@ class Total(Formulation):
         softened = self._soften()
         self.bending = bending_patches(points, self.stencil, settings.dx, softened)
         if self.bending is not None:
+            assert points.bending is not None
+            assert points.normal is not None
+            self.normal = torch.where((points.bending.detach() > 0)[..., None], points.normal, 0.0)
             self.bending_rate = self.bending.fastest(self.node_inverse_mass)
         self._windows = self._point_windows()
         self._point_holds = self._hold_points()
@@ -355,12 +359,17 @@ class Total(Formulation):
         assert state.node_velocity is not None
         points, laws, time = self.body.points, self.body.laws, self.settings.stiffness_damping
         F, rate = state.F_elastic, state.affine
-        if self._bodies:  # at the border of a rigid part, the nodes strain its particles
+        if self._bodies or self.bending is not None:  # the nodes strain the particles otherwise than the state says
             raw = self.read_particles(state, displacement, state.node_velocity)
             F, rate = raw.F_elastic, raw.affine
-        stress = laws.pk1(F, None)
+        if self.bending is None:
+            stress = laws.pk1(F, None)
+        else:
+            stress = sheet_pk1(F, self.normal, laws.mu, laws.lam, partial(laws.pk1, internal=None))
+            F, rate = flattened(F, self.normal, laws.mu, laws.lam).F, self._along(rate)
         if time > 0:
-            stress = stress + kelvin_voigt_pk1(F, rate, laws.mu, laws.lam, time)
+            viscous = kelvin_voigt_pk1(F, rate, laws.mu, laws.lam, time)
+            stress = stress + (viscous if self.bending is None else self._along(viscous))
         stress = stress * points.volume[..., None, None]
         value = torch.zeros_like(state.position) if force is None else force
         node_force = scatter(self.stencil, torch.cat([value[..., None, :], -stress.mT], dim=-2))
@@ -389,11 +398,19 @@ class Total(Formulation):
         state = state.replace(time=state.time + dt, substep=dt, impulse=state.impulse + taken)
         return self.in_shape(self.read_particles(state, displacement + dt * velocity, velocity))
 
+    def _along(self, matrix: Tensor) -> Tensor:
+        """A gradient or stress without its part across sheets, (..., P, 3, 3)."""
+        n = self.normal[..., None]
+        return matrix - matrix @ n @ n.mT
+
     def in_shape(self, state: MPMState) -> MPMState:
-        """The state with nodes and particles of rigid parts exactly where these are.
+        """The state with nodes and particles of rigid parts exactly where these are, and sheets in plane stress.
 
         Particles at the border of a part have a small share of nodes that are not of it.
         """
+        if self.bending is not None:
+            flat = flattened(state.F_elastic, self.normal, self.body.laws.mu, self.body.laws.lam).F
+            state = state.replace(F_elastic=flat, F_total=flat)
         for body in self._bodies:
             state = body.in_shape(state, self.body.points.position)
         return state
@@ -458,10 +475,15 @@ class Total(Formulation):
         assert state.node_velocity is not None
         return 0.5 * (self.node_mass * state.node_velocity.square().sum(-1)).sum(-1)
 
-    def bending_energy(self, state: MPMState) -> Tensor | float:
-        """Energy of the patches of sheets of one layer."""
+    def sheet_energy(self, state: MPMState) -> Tensor | float:
+        """Energy of bending, and of what F does across sheets, whose membrane is that of the law."""
+        if self.bending is None:
+            return 0.0
         assert state.node_displacement is not None
-        return 0.0 if self.bending is None else self.bending.energy(state.node_displacement)
+        F = gather(state.node_displacement, self.stencil)[..., 1:4, :].mT
+        F = F + torch.eye(3, dtype=F.dtype, device=F.device)
+        own = self.body.points.volume * director_energy(F, self.normal, self.body.laws.mu)
+        return self.bending.energy(state.node_displacement) + own.sum(-1)
 
     def momenta(self, state: MPMState) -> tuple[Tensor, Tensor]:
         """Momenta of the nodes."""

@@ -129,9 +129,10 @@ class FusedTotal(Fused):
     def _take_patches(self) -> None:
         """The patches of sheets that bend by themselves, sorted by cell."""
         bending = self.bound.bending
-        self.bent = 0
+        self.bent, self.normals = 0, self.fraction
         if bending is None:
             return
+        self.normals = self.bound.normal.reshape(-1, 3)[self.order.long()].T.contiguous()
         place = torch.empty(self.count, dtype=torch.long, device=self.device)
         place[self.order.long()] = self.particle_cell.long()
         cell, order = torch.sort(place[bending.example], stable=True)
@@ -251,9 +252,10 @@ class FusedTotal(Fused):
         _, ny, nz = self.grid.resolution
         block = lanes(self.device, 128)
         launch(kernels.total_look, (-(-self.count // block),))(
-            self.fraction, self.material, self.count, self.particle_cell, self.cell_node, self.cell_nodes, self.cells,
+            self.fraction, self.material, self.normals, self.count, self.particle_cell, self.cell_node, self.cell_nodes, self.cells,
             self.fields, self.speed,
-            ny * nz, nz, 1 / self.grid.dx, WAVE=self.wave, BLOCK=block, VIRTUAL=self.virtual, num_warps=4,
+            ny * nz, nz, 1 / self.grid.dx, WAVE=self.wave, BLOCK=block, VIRTUAL=self.virtual,
+            SHEETS=self.bent > 0, num_warps=4,
         )  # fmt: skip
 
     def substep(self, offset: int, options: dict[str, Any]) -> None:
@@ -265,14 +267,15 @@ class FusedTotal(Fused):
         _, ny, nz = self.grid.resolution
         per_program = lanes(self.device, max(1, 32 // self.lanes), 1)
         launch(kernels.total_particles, (-(-self.pieces // per_program),))(
-            self.fraction, self.material, self.law, self.law_table, self.values, self.force_in, self.load, self.order,
+            self.fraction, self.material, self.normals, self.law, self.law_table, self.values, self.force_in, self.load, self.order,
             self.count, self.piece_start, self.piece_node, self.piece_scene, self.pieces, self.piece_nodes,
             self.fields, partial,
             self.schedule, self.vectors, self.scenes, self.tables.buffer, self.first_step, offset,
             ny * nz, nz, *self.grid.offset, self.grid.node_count, self.grid.dx, 1 / self.grid.dx,
             self.settings.stiffness_damping,
             **options, POSITION=self.position, WIDTH=width, CELLS=per_program, LANES=self.lanes,
-            VIRTUAL=self.virtual, WIDE=self.device.type == "cuda" and not INTERPRETED, num_warps=1, maxnreg=REGISTERS,
+            VIRTUAL=self.virtual, WIDE=self.device.type == "cuda" and not INTERPRETED, SHEETS=self.bent > 0,
+            num_warps=1, maxnreg=REGISTERS,
         )  # fmt: skip
         if self.pieces > self.cells:
             pieces, partial = partial, self.sums(self.cells, width)
@@ -389,10 +392,10 @@ class FusedTotal(Fused):
         _, ny, nz = self.grid.resolution
         block = lanes(self.device, 128)
         launch(kernels.total_read, (-(-self.count // block),))(
-            self.fraction, self.load, self.order, self.rest, self.count, self.particle_cell, self.cell_node,
+            self.fraction, self.material, self.normals, self.load, self.order, self.rest, self.count, self.particle_cell, self.cell_node,
             self.cell_nodes, self.cells, self.fields, kick, position, velocity, affine, F,
             ny * nz, nz, 1 / self.grid.dx,
-            WORK=work, IMPLICIT=implicit, BLOCK=block, VIRTUAL=self.virtual, num_warps=4,
+            WORK=work, IMPLICIT=implicit, BLOCK=block, VIRTUAL=self.virtual, SHEETS=self.bent > 0, num_warps=4,
         )  # fmt: skip
 
     def _look_at(self) -> MPMState:

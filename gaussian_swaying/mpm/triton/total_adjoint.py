@@ -337,8 +337,6 @@ class TotalAdjoint:
         )  # fmt: skip
         if cut:
             fused.join_pieces(to, asked.partial, asked.width)
-        if fused.bent:
-            fused.bend(self.force_bar, asked.partial, asked.width)
 
     # ---- what it found
 
@@ -444,6 +442,8 @@ def why_not(fused: FusedTotal, state: MPMState, forces: Sequence[Force]) -> str 
     points = bound.body.points
     if not fused.plain or fused.touching is not None:
         return "boundaries other than pins that hold all the time, and contact, have no backward kernels"
+    if fused.bent:
+        return "sheets of one layer that bend have no backward kernels"
     if fused.virtual:
         return "virtual nodes have no backward kernels"
     if any(derivative is None for derivative in fused.laws.adjoints):

@@ -13,6 +13,7 @@ from gaussian_swaying.geometry.linalg_triton import axpy9, load3, scale9
 from gaussian_swaying.kernels.language import tl, triton
 from gaussian_swaying.mpm.laws.triton.body import ROW, pk1
 from gaussian_swaying.mpm.triton.damping import kelvin_voigt_pk1
+from gaussian_swaying.mpm.triton.sheets import flattened, sheet_pk1, without_normal
 from gaussian_swaying.mpm.triton.shared import (
     VARIES,
     account,
@@ -152,14 +153,14 @@ def law_row(law, law_table, index, mask, MULTI: tl.constexpr):
 
 @triton.jit(do_not_specialize=VARIES)
 def total_particles(
-    fraction, material, law, law_table, values, force_in, load, order, count,
+    fraction, material, normals, law, law_table, values, force_in, load, order, count,
     cell_start, cell_node, cell_scene, cells, cell_nodes,
     fields, partial,
     schedule, vectors, scenes, numbers, first_step, step_offset,
     sx, sy, ox, oy, oz, scene_size, dx, inverse_dx, viscous_time,
     LAWS: tl.constexpr, MULTI: tl.constexpr, FORCES: tl.constexpr, FORCE: tl.constexpr, IMPLICIT: tl.constexpr,
     VISCOUS: tl.constexpr, POSITION: tl.constexpr, WIDTH: tl.constexpr, CELLS: tl.constexpr, LANES: tl.constexpr,
-    VIRTUAL: tl.constexpr, WIDE: tl.constexpr,
+    VIRTUAL: tl.constexpr, WIDE: tl.constexpr, SHEETS: tl.constexpr,
 ):  # fmt: skip
     """``total``: forces of the particles of some cells, summed into 27 rows of ``partial`` per cell.
 
@@ -187,9 +188,16 @@ def total_particles(
             fields, place, sx, sy, f, wz, gz, inverse_dx, known, VISCOUS, LOADED, cell_nodes, cells, VIRTUAL, WIDE
         )
         row = law_row(law, law_table, index, mask, MULTI)
-        stress = pk1(F, mu, lam, row, LAWS)
-        if VISCOUS:
-            stress = axpy9(1.0, stress, 1.0, kelvin_voigt_pk1(F, rate, mu, lam, viscous_time))
+        if SHEETS:
+            n = load3(normals, count, index, mask)
+            stress, F = sheet_pk1(F, n, mu, lam, row, LAWS)
+            if VISCOUS:
+                viscous = kelvin_voigt_pk1(F, without_normal(rate, n), mu, lam, viscous_time)
+                stress = axpy9(1.0, stress, 1.0, without_normal(viscous, n))
+        else:
+            stress = pk1(F, mu, lam, row, LAWS)
+            if VISCOUS:
+                stress = axpy9(1.0, stress, 1.0, kelvin_voigt_pk1(F, rate, mu, lam, viscous_time))
         stress = scale9(-volume, stress)
         zero = volume * 0
         value = (zero, zero, zero)
@@ -274,7 +282,7 @@ def total_bend(
 ):  # fmt: skip
     """``total``: add the forces of sheets that bend by themselves to the sums of their cells.
 
-    Each of ``bent`` cells has some patches, one after the other (:mod:`~gaussian_swaying.mpm.bending`), with rows of 32
+    Each of ``bent`` cells has some patches, one after the other (:mod:`~gaussian_swaying.mpm.sheets`), with rows of 32
     nodes and of 3 x 32 derivatives, of which those beyond 27 are zero. The first three columns of ``fields`` move them.
     """
     k = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
@@ -472,11 +480,20 @@ def total_hold(
     tl.store(at + 6, v2 - a2, mask)
 
 
+@triton.jit
+def _in_plane_stress(F, material, normals, count, index, mask):
+    """F of sheets of one layer in plane stress."""
+    mu = tl.load(material + count + index, mask, 1.0)
+    lam = tl.load(material + 2 * count + index, mask, 0.0)
+    flat, _m, _area, _thickness, _thinning = flattened(F, load3(normals, count, index, mask), mu, lam)
+    return flat
+
+
 @triton.jit(do_not_specialize=VARIES)
 def total_read(
-    fraction, load, order, rest, count, particle_cell, cell_node, cell_nodes, cells, fields, kick_before,
+    fraction, material, normals, load, order, rest, count, particle_cell, cell_node, cell_nodes, cells, fields, kick_before,
     position_out, velocity_out, affine_out, F_out, sx, sy, inverse_dx,
-    WORK: tl.constexpr, IMPLICIT: tl.constexpr, BLOCK: tl.constexpr, VIRTUAL: tl.constexpr,
+    WORK: tl.constexpr, IMPLICIT: tl.constexpr, BLOCK: tl.constexpr, VIRTUAL: tl.constexpr, SHEETS: tl.constexpr,
 ):  # fmt: skip
     """``total``: the particle fields, in the order in which they were given."""
     index = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
@@ -493,6 +510,8 @@ def total_read(
         zero = f[0] * 0
         account((zero, zero, zero), zero, v, 0.0, tl.load(kick_before), IMPLICIT, load, count, index, mask)
     F = (F[0] + 1, F[1], F[2], F[3], F[4] + 1, F[5], F[6], F[7], F[8] + 1)
+    if SHEETS:
+        F = _in_plane_stress(F, material, normals, count, index, mask)
     for k in tl.static_range(3):
         tl.store(position_out + where * 3 + k, tl.load(rest + where * 3 + k, mask, 0.0) + u[k], mask)
         tl.store(velocity_out + where * 3 + k, v[k], mask)
@@ -503,8 +522,8 @@ def total_read(
 
 @triton.jit(do_not_specialize=VARIES)
 def total_look(
-    fraction, material, count, particle_cell, cell_node, cell_nodes, cells, fields, out, sx, sy, inverse_dx,
-    WAVE: tl.constexpr, BLOCK: tl.constexpr, VIRTUAL: tl.constexpr,
+    fraction, material, normals, count, particle_cell, cell_node, cell_nodes, cells, fields, out, sx, sy, inverse_dx,
+    WAVE: tl.constexpr, BLOCK: tl.constexpr, VIRTUAL: tl.constexpr, SHEETS: tl.constexpr,
 ):  # fmt: skip
     """``total``: as ``largest_speed``, from the nodal displacements."""
     index = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
@@ -516,6 +535,8 @@ def total_look(
     wz, gz = axis_weights(f[2], inverse_dx)
     _u, F, _v = gather(fields, node, sx, sy, f, wz, gz, inverse_dx, mask, False, cell_nodes, cells, VIRTUAL)
     F = (F[0] + 1, F[1], F[2], F[3], F[4] + 1, F[5], F[6], F[7], F[8] + 1)
+    if SHEETS:
+        F = _in_plane_stress(F, material, normals, count, index, mask)
     mu = tl.load(material + count + index, mask, 0.0)
     lam = tl.load(material + 2 * count + index, mask, 0.0)
     density = tl.load(material + 3 * count + index, mask, 1.0) / tl.load(material + index, mask, 1.0)

@@ -5,12 +5,15 @@ import dataclasses
 import pytest
 import torch
 
-from gaussian_swaying.aero.force import AeroForce
-from gaussian_swaying.aero.wind import WindField
-from gaussian_swaying.aero.wind_force import WindForce
 from gaussian_swaying.geometry.linalg import polar_rotation
 from gaussian_swaying.geometry.regions import Box
 from gaussian_swaying.mpm.boundaries.pinned_region import PinnedRegion
+from gaussian_swaying.mpm.laws.fixed_corotated import FixedCorotated
+from gaussian_swaying.mpm.laws.hencky import StVKHencky
+from gaussian_swaying.mpm.laws.neo_hookean import NeoHookean
+from gaussian_swaying.mpm.laws.shared import lame_parameters
+from gaussian_swaying.mpm.laws.spring_network import SpringNetwork
+from gaussian_swaying.mpm.sheets import director_energy, flattened, sheet_pk1
 from gaussian_swaying.mpm.solver import MPMSolver
 from gaussian_swaying.mpm.state import MaterialPoints
 
@@ -171,12 +174,11 @@ def test_kernels_do_what_torch_does(kernel_device, how, dtype):
         torch.testing.assert_close(*(getattr(end, name) for end in ends), rtol=0, atol=atol)
 
 
-@pytest.mark.parametrize("transfer", ["torch", "kernels"])
-def test_gradients_by_stiffness_and_motion(transfer):
+def test_gradients_by_stiffness_and_motion_come_from_torch():
     points = sheet(turned(1), size=3)
     E = points.youngs_modulus.clone().requires_grad_()
     push = torch.zeros((), dtype=torch.float64, requires_grad=True)
-    solver = MPMSolver(1.0, gravity=(0, 0, 0), transfer=transfer)
+    solver = MPMSolver(1.0, gravity=(0, 0, 0))
     speed = 0.3 * points.position[..., [1, 2, 0]].sin() + push
 
     def final(E, speed):
@@ -190,6 +192,59 @@ def test_gradients_by_stiffness_and_motion(transfer):
         by_push = (final(E, speed + step) - final(E, speed - step)) / (2 * step)
     assert float(found[0].sum()) == pytest.approx(float(by_E), rel=1e-5)
     assert float(found[1]) == pytest.approx(float(by_push), rel=1e-6)
+
+
+def test_kernels_refuse_gradients():
+    points = sheet(turned(1), size=3)
+    solver = MPMSolver(1.0, gravity=(0, 0, 0), transfer="kernels")
+    speed = torch.zeros_like(points.position).requires_grad_()
+    with pytest.raises(ValueError, match="sheets of one layer that bend have no backward kernels"):
+        solver.rollout(solver.init_state(points, speed), 0.02, 2)
+
+
+LAWS = [FixedCorotated(), NeoHookean(), StVKHencky(), SpringNetwork()]
+
+
+@pytest.mark.parametrize("law", LAWS, ids=lambda law: type(law).__name__)
+def test_the_stress_of_a_sheet_is_the_slope_of_its_energy(law):
+    generator = torch.Generator().manual_seed(0)
+    count = 50
+    F = torch.eye(3, dtype=torch.float64) + 0.3 * torch.randn(count, 3, 3, generator=generator, dtype=torch.float64)
+    normal = torch.nn.functional.normalize(torch.randn(count, 3, generator=generator, dtype=torch.float64), dim=-1)
+    normal[:5] = 0
+    F[:5] = torch.eye(3, dtype=torch.float64)
+    mu, lam = (torch.full((count,), value, dtype=torch.float64) for value in (3.0, 4.0))
+    F.requires_grad_()
+    energy = law.energy(flattened(F, normal, mu, lam).F, mu, lam) + director_energy(F, normal, mu)
+    (slope,) = torch.autograd.grad(energy.sum(), F)
+    stress = sheet_pk1(F.detach(), normal, mu, lam, lambda own: law.pk1(own, mu, lam))
+    torch.testing.assert_close(stress, slope, rtol=1e-8, atol=1e-8)
+
+
+def test_a_sheet_is_stretched_as_in_plane_stress():
+    """E / (1 - nu^2) across a strip that cannot narrow, E along one that can; and it gets thinner by nu / (1 - nu)."""
+    mu, lam = (torch.full((1,), value, dtype=torch.float64) for value in lame_parameters(1.0, NU))
+    normal = torch.tensor([[0.0, 0.0, 1.0]], dtype=torch.float64)
+    stretch = torch.diag(torch.tensor([1e-6, 0.0, 0.7], dtype=torch.float64))[None] + torch.eye(3, dtype=torch.float64)
+    law = FixedCorotated()
+    flat = flattened(stretch, normal, mu, lam)
+    stress = law.pk1(flat.F, mu, lam)
+    assert float(stress[0, 0, 0]) == pytest.approx(1e-6 / (1 - NU**2), rel=1e-5)
+    assert float(stress[0, 2, 2]) == pytest.approx(0, abs=1e-11)
+    assert float(flat.F[0, 2, 2]) - 1 == pytest.approx(-1e-6 * NU / (1 - NU), rel=1e-4)
+
+
+def test_the_state_has_the_normal_of_the_sheet():
+    """Whatever the nodes do across it: F of a state turns the normal as the middle plane turns."""
+    points = sheet(turned(1))
+    for transfer in ("torch", "kernels"):
+        solver, state = bound(points, transfer=transfer)
+        state = solver.init_state(points, 0.5 * points.position[..., [1, 2, 0]].sin())
+        F = solver.rollout(state, 0.5 * solver.stable_substep(state), 40).F_elastic
+        out = (F @ points.normal[..., None])[..., 0]
+        along = F @ (torch.eye(3, dtype=torch.float64) - points.normal[..., :, None] * points.normal[..., None, :])
+        assert float((out[..., None, :] @ along).abs().max()) < 1e-12
+        assert float((F - torch.eye(3, dtype=torch.float64)).abs().max()) > 0.05
 
 
 def test_gradient_by_the_bending_stiffness():
