@@ -108,7 +108,9 @@ def sheet_pk1(F: Tensor, normal: Tensor, mu: Tensor, lam: Tensor, pk1: Callable[
     flat, n = flattened(F, normal, mu, lam), normal[..., None]
     P = pk1(flat.F)
     q, across = P @ n, n @ n.mT
-    volume = torch.where(across.diagonal(dim1=-2, dim2=-1).sum(-1)[..., None, None] > 0, flat.area * flat.thickness, 1.0)
+    volume = torch.where(
+        across.diagonal(dim1=-2, dim2=-1).sum(-1)[..., None, None] > 0, flat.area * flat.thickness, 1.0
+    )
     G = cofactor(flat.F) / volume
     P = P + flat.thinning * flat.area * (q.mT @ flat.direction) * G - flat.thickness * flat.direction @ (G.mT @ q).mT
     stress = P - P @ across
@@ -175,7 +177,8 @@ class Bending:
         if not len(self.node):
             return 0.0
         root = in_double(inverse_mass).reshape(-1, 1).sqrt()
-        double = Bending(self.node, *(in_double(t) for t in (self.curving, self.stiffness, self.poisson)), self.node)
+        curving, stiffness, poisson = (in_double(t) for t in (self.curving, self.stiffness, self.poisson))
+        double = Bending(self.node, curving, stiffness, poisson, self.example)
         generator = torch.Generator().manual_seed(0)
         mode = torch.randn(len(root), 3, generator=generator, dtype=torch.float64).to(root) * (root > 0)
         for _ in range(_ROUNDS):

@@ -291,7 +291,7 @@ class MaterialPoints:
         moved = {name: function(getattr(self, name)) for name in ("position", *_FIELDS)}
         index = None if self.law_index is None else function(self.law_index).long()
         given = {name: getattr(self, name) for name in _OPTIONAL_FIELDS}
-        more = {name: None if value is None else function(value) for name, value in given.items()}
+        more: Any = {name: None if value is None else function(value) for name, value in given.items()}
         return MaterialPoints(**moved, laws=self.laws, law_index=index, attached=self.attached, **more)
 
 

@@ -289,9 +289,7 @@ def test_energy_is_kept_while_a_sheet_shakes():
 )
 def test_wrong_numbers_are_refused(given, what):
     with pytest.raises(ValueError, match=what):
-        MaterialPoints.create(
-            torch.rand(4, 3), volume=1.0, density=1.0, youngs_modulus=1.0, poisson_ratio=0.0, **given
-        )
+        MaterialPoints.create(torch.rand(4, 3), volume=1.0, density=1.0, youngs_modulus=1.0, poisson_ratio=0.0, **given)
 
 
 def test_joined_bodies_keep_their_bending():

@@ -32,3 +32,13 @@ def test_what_holds_the_slope_fails_by_far(hold):
     assert run["error"] > 0.75
     assert run["slope"] < 0.1
     assert run["moment"] > 0.5
+
+
+@pytest.mark.parametrize(("hold", "sag"), [("hinge", 1.0), ("clamp", 0.2)])
+def test_one_layer_bends_by_itself(hold, sag):
+    """Off the nodes, with twice the cells of the coarse strip above, and a strip that is thicker than a cell."""
+    run = hinged_strip(8, Settings(), hold=hold, shift=0.3, layers=1)
+    assert run["residual"] < 1e-3
+    assert abs(1 - run["error"] if hold == "clamp" else 1 + run["error"]) == pytest.approx(sag, abs=0.02)
+    thick = hinged_strip(8, Settings(), hold=hold, shift=0.3, layers=1, slenderness=6, sag=0.001)
+    assert thick["error"] == pytest.approx(run["error"], abs=0.005)

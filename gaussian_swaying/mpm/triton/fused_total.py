@@ -145,7 +145,7 @@ class FusedTotal(Fused):
         check_indices(self.curving.numel())
 
     def bend(self, fields: Tensor, partial: Tensor, width: int) -> None:
-        """Add the forces of sheets that bend to the sums of the cells; those are linear in ``fields``, and symmetric."""
+        """Add the forces of sheets that bend, whose nodes ``fields`` has moved, to the sums of the cells."""
         block = lanes(self.device, 4, 1)
         launch(kernels.total_bend, (-(-self.bent // block),))(
             self.bent_cell, self.first_patch, self.bent, self.patch_node, self.curving, self.plate, fields, partial,
@@ -252,8 +252,8 @@ class FusedTotal(Fused):
         _, ny, nz = self.grid.resolution
         block = lanes(self.device, 128)
         launch(kernels.total_look, (-(-self.count // block),))(
-            self.fraction, self.material, self.normals, self.count, self.particle_cell, self.cell_node, self.cell_nodes, self.cells,
-            self.fields, self.speed,
+            self.fraction, self.material, self.normals, self.count, self.particle_cell, self.cell_node, self.cell_nodes,
+            self.cells, self.fields, self.speed,
             ny * nz, nz, 1 / self.grid.dx, WAVE=self.wave, BLOCK=block, VIRTUAL=self.virtual,
             SHEETS=self.bent > 0, num_warps=4,
         )  # fmt: skip
@@ -267,8 +267,8 @@ class FusedTotal(Fused):
         _, ny, nz = self.grid.resolution
         per_program = lanes(self.device, max(1, 32 // self.lanes), 1)
         launch(kernels.total_particles, (-(-self.pieces // per_program),))(
-            self.fraction, self.material, self.normals, self.law, self.law_table, self.values, self.force_in, self.load, self.order,
-            self.count, self.piece_start, self.piece_node, self.piece_scene, self.pieces, self.piece_nodes,
+            self.fraction, self.material, self.normals, self.law, self.law_table, self.values, self.force_in, self.load,
+            self.order, self.count, self.piece_start, self.piece_node, self.piece_scene, self.pieces, self.piece_nodes,
             self.fields, partial,
             self.schedule, self.vectors, self.scenes, self.tables.buffer, self.first_step, offset,
             ny * nz, nz, *self.grid.offset, self.grid.node_count, self.grid.dx, 1 / self.grid.dx,
@@ -392,8 +392,8 @@ class FusedTotal(Fused):
         _, ny, nz = self.grid.resolution
         block = lanes(self.device, 128)
         launch(kernels.total_read, (-(-self.count // block),))(
-            self.fraction, self.material, self.normals, self.load, self.order, self.rest, self.count, self.particle_cell, self.cell_node,
-            self.cell_nodes, self.cells, self.fields, kick, position, velocity, affine, F,
+            self.fraction, self.material, self.normals, self.load, self.order, self.rest, self.count, self.particle_cell,
+            self.cell_node, self.cell_nodes, self.cells, self.fields, kick, position, velocity, affine, F,
             ny * nz, nz, 1 / self.grid.dx,
             WORK=work, IMPLICIT=implicit, BLOCK=block, VIRTUAL=self.virtual, SHEETS=self.bent > 0, num_warps=4,
         )  # fmt: skip

@@ -1,6 +1,16 @@
 """Sheets of one layer as Triton functions; the reference is :mod:`~gaussian_swaying.mpm.sheets`."""
 
-from gaussian_swaying.geometry.linalg_triton import axpy3, axpy9, cofactor, dot3, matvec, outer3, scale3, scale9, transpose
+from gaussian_swaying.geometry.linalg_triton import (
+    axpy3,
+    axpy9,
+    cofactor,
+    dot3,
+    matvec,
+    outer3,
+    scale3,
+    scale9,
+    transpose,
+)
 from gaussian_swaying.kernels.language import tl, triton
 from gaussian_swaying.mpm.laws.triton.body import pk1
 from gaussian_swaying.mpm.sheets import DIRECTOR, LEAST

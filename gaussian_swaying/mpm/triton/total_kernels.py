@@ -13,7 +13,6 @@ from gaussian_swaying.geometry.linalg_triton import axpy9, load3, scale9
 from gaussian_swaying.kernels.language import tl, triton
 from gaussian_swaying.mpm.laws.triton.body import ROW, pk1
 from gaussian_swaying.mpm.triton.damping import kelvin_voigt_pk1
-from gaussian_swaying.mpm.triton.sheets import flattened, sheet_pk1, without_normal
 from gaussian_swaying.mpm.triton.shared import (
     VARIES,
     account,
@@ -26,6 +25,7 @@ from gaussian_swaying.mpm.triton.shared import (
     vector,
     wave_speed,
 )
+from gaussian_swaying.mpm.triton.sheets import flattened, sheet_pk1, without_normal
 
 
 @triton.jit
@@ -491,8 +491,8 @@ def _in_plane_stress(F, material, normals, count, index, mask):
 
 @triton.jit(do_not_specialize=VARIES)
 def total_read(
-    fraction, material, normals, load, order, rest, count, particle_cell, cell_node, cell_nodes, cells, fields, kick_before,
-    position_out, velocity_out, affine_out, F_out, sx, sy, inverse_dx,
+    fraction, material, normals, load, order, rest, count, particle_cell, cell_node, cell_nodes, cells, fields,
+    kick_before, position_out, velocity_out, affine_out, F_out, sx, sy, inverse_dx,
     WORK: tl.constexpr, IMPLICIT: tl.constexpr, BLOCK: tl.constexpr, VIRTUAL: tl.constexpr, SHEETS: tl.constexpr,
 ):  # fmt: skip
     """``total``: the particle fields, in the order in which they were given."""

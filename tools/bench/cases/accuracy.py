@@ -127,7 +127,8 @@ def cases(device: str, thorough: bool) -> Iterable[tuple[str, Row, Callable[[], 
             yield case("hanging bar held at points", HANGING_AT_POINTS, variant, cells=cells)
     for hold in ("hinge", "clamp", "nodes"):
         for cells in (8, 16, 32):
-            yield case("hinged strip", strips.hinged_strip, "total", cells=cells, hold=hold)
+            for layers in (3, 1):
+                yield case("hinged strip", strips.hinged_strip, "total", cells=cells, hold=hold, layers=layers)
     for variant in VARIANTS:
         for cells in (1, 2, 3, 4) if thorough else (1, 2):
             yield case("cantilever", beams.cantilever, variant, cells=cells, b=1.0)
@@ -163,8 +164,9 @@ def cases(device: str, thorough: bool) -> Iterable[tuple[str, Row, Callable[[], 
         *product(("ponte",), (300.0, 1000.0), (8, 32)),
         ("ponte", 300.0, 16),
     ]:
-        options = {"fabric": fabric, "stretch": stretch, "cells": cells}
-        yield case("strip of a fabric that hangs", fabrics.hanging_strip, "total, float32", **options)
+        for layers in (3, 1):
+            options = {"fabric": fabric, "stretch": stretch, "cells": cells, "layers": layers}
+            yield case("strip of a fabric that hangs", fabrics.hanging_strip, "total, float32", **options)
     finest = ((law, 1000.0, 64) for law in reconfiguration.POWERS)
     for law, cauchy, cells in [*product(reconfiguration.POWERS, (1.0, 10.0, 100.0, 1000.0), (16, 32)), *finest]:
         options = {"law": law, "cauchy": cauchy, "cells": cells} | ({"slenderness": 80.0} if cells == 64 else {})

@@ -33,10 +33,12 @@ def hanging_strip(
     length: float = 0.04,
     settle: float = 12.0,
     settings: Settings | None = None,
+    layers: int = 3,
 ) -> Result:
     r"""A strip of a fabric that hangs over an edge under its weight, from a scene as a user makes it.
 
-    It is clamped level at one end, in plane strain with :math:`\nu = 0.3`, and damped until it rests. The elastica of
+    It is clamped level at one end, in plane strain with :math:`\nu = 0.3`, and damped until it rests. A sheet of one
+    layer has :math:`\nu = 0`: its normals do not strain it, so that plane strain would not keep it from curving across. The elastica of
     :math:`b = \rho h g L^3 / D` is the exact shape of a strip that does not stretch. The free length begins halfway
     between the last held and the first free points.
 
@@ -47,6 +49,7 @@ def hanging_strip(
         length: Free length, about [m].
         settle: Time to simulate, in units of 1 / circular frequency of the lowest mode.
         settings: The numerics.
+        layers: Layers of points: 3, or 1 with a bending stiffness of their own.
 
     Returns:
         ``error`` (of the drop of the tip, relative), ``drop`` and ``exact`` (over the length), ``b``, ``span`` (of
@@ -62,8 +65,10 @@ def hanging_strip(
     omega = 3.516015 / length**2 * math.sqrt(stiffness / mass)
     boundaries = [Axial((2,)), pin]
     hanging = settings.solver(dx, gravity=(0.0, -GRAVITY, 0.0), boundaries=boundaries, damping=2 * omega)
-    material = Material(E=stretch / THICK, nu=0.3, density=mass / THICK, thickness=THICK, bending=stiffness)
-    scene = Scene(generator=flag, metres_per_unit=1.0, layers=3)
+    material = Material(
+        E=stretch / THICK, nu=0.3 if layers == 3 else 0.0, density=mass / THICK, thickness=THICK, bending=stiffness
+    )
+    scene = Scene(generator=flag, metres_per_unit=1.0, layers=layers)
     simulation = Simulation(scene, material, solver=hanging, device="cpu")
     points, solver = simulation.scene.points, simulation.solver
     assert isinstance(solver, MPMSolver)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 from functools import partial
+from itertools import product
 from typing import Any
 
 from bench.cases.accuracy import SINGLE, VARIANTS
@@ -74,14 +75,14 @@ _table("free_block", partial(_of, problem="free block"), """
 
 
 def _strips(results: Results) -> Iterator[Row]:
-    for hold in ("hinge", "clamp", "nodes"):
-        for row, before in _by_cells(_of(results, "hinged strip", hold=hold)):
+    for layers, hold in product((3, 1), ("hinge", "clamp", "nodes")):
+        for row, before in _by_cells(_of(results, "hinged strip", hold=hold, layers=layers)):
             yield row | {"order": order(before, row) if before and hold == "hinge" else ""}
 
 
 _table("hinged_strip", _strips, """
-    kind of the pins = `{parameters.hold}` | cells = {parameters.cells} | error of the sag = {result.error:.2e} |
-    order = {order:.2f} | slope at the end / exact = {result.slope:.4f} |
+    layers = {parameters.layers} | kind of the pins = `{parameters.hold}` | cells = {parameters.cells} |
+    error of the sag = {result.error:.2e} | order = {order:.2f} | slope at the end / exact = {result.slope:.4f} |
     error of the moment in the last cell / moment in the middle = {result.moment:.3g}
     """)  # fmt: skip
 _table("hinged_plate", partial(_of, problem="hinged plate"), """
@@ -100,9 +101,10 @@ _table("divergence", partial(_orders, problem="inverted flag"), """
     """)  # fmt: skip
 _table("fabrics", partial(_of, problem="strip of a fabric that hangs"), """
     fabric = {parameters.fabric} | mass [g/m²] = {result.grams:.0f} | D [µN m] = {result.micro:.0f} |
-    E h [N/m] = {parameters.stretch:g} | cells = {parameters.cells} | outer layers apart [cells] = {result.span:.2f} |
+    E h [N/m] = {parameters.stretch:g} | layers = {parameters.layers} | cells = {parameters.cells} |
+    outer layers apart [cells] = {result.span:.2f} |
     drop / L = {result.drop:.4f} | drop of the elastica = {result.exact:.4f} | error = {result.error:.2f %}
-    """, order=["parameters.fabric", "parameters.stretch", "parameters.cells"])  # fmt: skip
+    """, order=[f"parameters.{name}" for name in ("fabric", "stretch", "layers", "cells")])  # fmt: skip
 _table("surface_drag", partial(_of, problem="surface drag"), """
     surface = {parameters.shape} | Gaussians = {parameters.count} | overlap = {parameters.overlap} |
     *areas `{parameters.area}`, law `{parameters.law}` = {result.share:.3f}
