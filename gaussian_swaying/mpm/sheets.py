@@ -17,13 +17,12 @@ derivatives of a rigid motion vanish, and of a sheet that keeps its lengths they
 second derivatives that it needs. A sheet that is curved at rest feels the change of its curvature: its normals turn
 with F, whose second derivatives along the tangents are taken.
 
-In a cell the points of a sheet make one patch, with their mean place and normal and the sum of their stiffness: all of
-them share its 27 nodes. Several sheets in a cell, or a fold, make several.
+It is summed over the points, of which a cell of a sheet has four or more. With one point to a cell, a sheet that lies
+obliquely would bend where none feels it.
 """
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable
 from dataclasses import dataclass
 
@@ -39,12 +38,10 @@ from gaussian_swaying.mpm.transfer import Stencil, bspline_weights
 DIRECTOR = 0.01
 """Stiffness against shear across a sheet and against its thickness, as a share of that of a solid."""
 
-ALIKE = math.cos(math.radians(30))
-"""Normals of one patch make at most this angle with the first of them, as its cosine."""
-
 LEAST = 1e-6
 """Least area of a sheet over that at rest."""
 
+_AT_ONCE = 4096  # points
 _ROUNDS = 60  # of the power iteration
 
 
@@ -136,31 +133,22 @@ def director_energy(F: Tensor, normal: Tensor, mu: Tensor) -> Tensor:
 
 @dataclass(frozen=True)
 class Bending:
-    """The patches of sheets in the cells of a grid.
+    """The stiffness of sheets against bending, as a matrix between the 27 nodes of each cell that they cross.
 
     Attributes:
         node: Flat indices of the nodes of each, over all scenes, int64, shape (K, 27).
-        curving: Second derivatives of the splines along a and a, b and b, a and b [1/m²], shape (K, 3, 27).
-        stiffness: D times the area [N m³], shape (K,).
-        poisson: Poisson's ratio, shape (K,).
-        example: A point of each, int64, shape (K,).
+        stiffness: Symmetric matrices [N/m], shape (K, 27, 27).
+        example: A point in each, int64, shape (K,).
     """
 
     node: Tensor
-    curving: Tensor
     stiffness: Tensor
-    poisson: Tensor
     example: Tensor
 
     def forces(self, displacement: Tensor) -> Tensor:
         """Forces on the nodes [N] from their displacement [m], shape (..., G, 3)."""
         flat = displacement.reshape(-1, 3)
-        curvature = self.curving @ flat[self.node]
-        own = torch.stack([torch.ones_like(self.poisson), self.poisson], -1)
-        normal = torch.stack([own, own.flip(-1)], -1) @ curvature[:, :2]
-        twist = 2 * (1 - self.poisson)[:, None, None] * curvature[:, 2:]
-        moment = self.stiffness[:, None, None] * torch.cat([normal, twist], 1)
-        force = self.curving.mT @ moment
+        force = self.stiffness @ flat[self.node]
         return torch.zeros_like(flat).index_add(0, self.node.reshape(-1), -force.reshape(-1, 3)).view_as(displacement)
 
     def energy(self, displacement: Tensor) -> Tensor:
@@ -174,42 +162,18 @@ class Bending:
         Args:
             inverse_mass: Inverse mass of each node [1/kg], shape (..., G).
         """
-        if not len(self.node):
-            return 0.0
         root = in_double(inverse_mass).reshape(-1, 1).sqrt()
-        curving, stiffness, poisson = (in_double(t) for t in (self.curving, self.stiffness, self.poisson))
-        double = Bending(self.node, curving, stiffness, poisson, self.example)
+        double = Bending(self.node, in_double(self.stiffness), self.example)
         generator = torch.Generator().manual_seed(0)
         mode = torch.randn(len(root), 3, generator=generator, dtype=torch.float64).to(root) * (root > 0)
         for _ in range(_ROUNDS):
-            mode = mode / mode.norm()
+            mode = mode / mode.norm().clamp(min=torch.finfo(mode.dtype).tiny)
             mode = -root * double.forces(root * mode)
         return float(mode.norm())
 
 
-@torch.no_grad()
-def _members(stencil: Stencil, normal: Tensor, bends: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """The points that bend, the patch of each, and the sign that turns its normal to the side of the patch's."""
-    index = bends.nonzero()[:, 0]
-    first = stencil.first[index]
-    unit = first if stencil.nodes is None else equal_rows(torch.cat([first[:, None], stencil.nodes.T[index]], 1))
-    cell = torch.unique(unit, return_inverse=True)[1]
-    own = normal[index]
-    patch, sign = torch.full_like(index, -1), torch.ones_like(own[:, 0])
-    left, made = torch.arange(len(index), device=index.device), 0
-    while len(left):
-        cells, inverse = torch.unique(cell[left], return_inverse=True)
-        seed = torch.full_like(cells, len(index)).scatter_reduce(0, inverse, left, "amin")
-        cosine = (own[left] * own[seed[inverse]]).sum(-1)
-        near = cosine.abs() >= ALIKE
-        patch[left[near]] = made + inverse[near]
-        sign[left[near]] = cosine[near].sign()
-        left, made = left[~near], made + len(cells)
-    return index, patch, sign
-
-
-def bending_patches(points: MaterialPoints, stencil: Stencil, dx: float, softened: Tensor | None) -> Bending | None:
-    """The patches of the sheets of a material; None if it has none.
+def bending_of(points: MaterialPoints, stencil: Stencil, dx: float, softened: Tensor | None) -> Bending | None:
+    """The bending of the sheets of a material; None if it has none.
 
     Args:
         points: The material, of which ``normal`` and ``bending`` say what bends.
@@ -219,33 +183,28 @@ def bending_patches(points: MaterialPoints, stencil: Stencil, dx: float, softene
     """
     if points.bending is None or points.normal is None:
         return None
-    stiffness = points.bending.reshape(-1)
-    index, patch, sign = _members(stencil, points.normal.reshape(-1, 3), stiffness.detach() > 0)
+    own = points.bending.reshape(-1)
+    index = (own.detach() > 0).nonzero()[:, 0]
     if not len(index):
         return None
-    count = int(patch.max()) + 1
-    own = stiffness[index] if softened is None else stiffness[index] * softened.reshape(-1)[index]
-    share = in_double(stiffness.detach()[index])
+    own = own[index] if softened is None else own[index] * softened.reshape(-1)[index]
+    first = stencil.first[index]
+    unit = first if stencil.nodes is None else equal_rows(torch.cat([first[:, None], stencil.nodes.T[index]], 1))
+    cells, cell = torch.unique(unit, return_inverse=True)
+    fraction = 1.5 + stencil.factors[1, :, 0].T[index] * dx
+    normal, poisson = points.normal.detach().reshape(-1, 3)[index], points.poisson_ratio.detach().reshape(-1)[index]
+    stiffness = own.new_zeros(len(cells), 27, 27)
+    for some in torch.arange(len(index), device=index.device).split(_AT_ONCE):
+        a, b, twist = in_double(second_derivatives(fraction.detach()[some], normal[some], dx)).unbind(1)
+        nu = in_double(poisson[some])[:, None]
+        part = _outer(a, a + nu * b) + _outer(b, b + nu * a) + _outer(2 * (1 - nu) * twist, twist)
+        stiffness = stiffness.index_add(0, cell[some], own[some, None, None] * part.to(own))
+    example = torch.full_like(cells, len(points.bending.reshape(-1))).scatter_reduce(0, cell, index, "amin")
+    return Bending(stencil.node.view(-1, 27)[example], stiffness, example)
 
-    def mean(values: Tensor) -> Tensor:
-        whole = share.new_zeros(count).index_add(0, patch, share)
-        summed = share.new_zeros(count, *values.shape[1:])
-        return summed.index_add(0, patch, share.view(-1, *[1] * (values.dim() - 1)) * in_double(values)) / whole.view(
-            -1, *[1] * (values.dim() - 1)
-        )
 
-    fraction = mean(1.5 + in_double(stencil.factors[1, :, 0].T[index]) * dx)
-    normal = torch.nn.functional.normalize(mean(sign[:, None] * points.normal.reshape(-1, 3)[index]), dim=-1)
-    example = torch.full((count,), len(stiffness), device=index.device).scatter_reduce(0, patch, index, "amin")
-    node = stencil.node.view(-1, 27)[example]
-    like = stiffness.detach()
-    return Bending(
-        node,
-        second_derivatives(fraction, normal, dx).to(like),
-        torch.zeros(count, dtype=own.dtype, device=own.device).index_add(0, patch, own),
-        mean(points.poisson_ratio.detach().reshape(-1)[index]).to(like),
-        example,
-    )
+def _outer(a: Tensor, b: Tensor) -> Tensor:
+    return a[:, :, None] * b[:, None]
 
 
 def second_derivatives(fraction: Tensor, normal: Tensor, dx: float) -> Tensor:

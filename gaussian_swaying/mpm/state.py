@@ -128,7 +128,7 @@ class MaterialPoints:
             ``total``, however close they lie (``virtual_nodes``). None if all are.
         damping: Rate at which the velocity of the material decays [1/s], shape (..., P), only in ``total``; None for
             no damping.
-        normal: Unit normals of sheets of one layer that resist bending (``bending_patches``), of either sign, shape
+        normal: Unit normals of sheets of one layer that resist bending (``bending_of``), of either sign, shape
             (..., P, 3), only in ``total``; None if there are none.
         bending: Bending stiffness times area [N m³], shape (..., P), zero for points that are not of such a sheet.
     """

@@ -24,7 +24,7 @@ from gaussian_swaying.mpm.formulations.formulation import Formulation, Settings,
 from gaussian_swaying.mpm.held_faces import HELD_ALONE, SHEET, SOFTENED, thickness, width
 from gaussian_swaying.mpm.held_rows import LEAST_APART
 from gaussian_swaying.mpm.point_holds import POINTS, PointHolds
-from gaussian_swaying.mpm.sheets import bending_patches, director_energy, flattened, sheet_pk1
+from gaussian_swaying.mpm.sheets import bending_of, director_energy, flattened, sheet_pk1
 from gaussian_swaying.mpm.state import GridSpec, MPMState
 from gaussian_swaying.mpm.timestep import kick_time
 from gaussian_swaying.mpm.transfer import bspline_stencil, gather, in_fixed_order, scatter
@@ -48,7 +48,7 @@ class Total(Formulation):
             positions.
         node_damping: Rate at which the velocity of each node decays, the mean over its mass [1/s], shape (..., G); None
             for a material without damping of its own.
-        bending: Patches of sheets of one layer that resist bending, or None.
+        bending: Bending of sheets of one layer, or None.
         normal: Unit normals of their points at rest, zero elsewhere, shape (..., P, 3), if there are such sheets.
         contact: Contact with obstacles and itself, or None.
 
@@ -94,7 +94,7 @@ class Total(Formulation):
         self._bodies = [self._body(k) for k in self.body.rigid]
         self._check_bodies()
         softened = self._soften()
-        self.bending = bending_patches(points, self.stencil, settings.dx, softened)
+        self.bending = bending_of(points, self.stencil, settings.dx, softened)
         if self.bending is not None:
             assert points.bending is not None
             assert points.normal is not None

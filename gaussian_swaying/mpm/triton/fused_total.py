@@ -107,7 +107,7 @@ class FusedTotal(Fused):
         """True if the kernels apply all boundaries but obstacles, which are contact."""
         self.position = bound.needs_position
         self.lattice = bound.node_positions(self.rest) if bound.needs_lattice else None
-        self._take_patches()
+        self._take_sheets()
         self._take_pins()
         self.touching = None if bound.contact is None else FusedContact(bound, self.fields, self.active)
         self.shift = torch.zeros(len(inverse) if self.position else 0, 4, **self.like)
@@ -126,8 +126,8 @@ class FusedTotal(Fused):
         """True if the kernels apply all boundaries."""
         return self.plain and (self.touching is None or None not in self.touching.solids)
 
-    def _take_patches(self) -> None:
-        """The patches of sheets that bend by themselves, sorted by cell."""
+    def _take_sheets(self) -> None:
+        """The sheets that bend by themselves: the normals of their points, and their matrices."""
         bending = self.bound.bending
         self.bent, self.normals = 0, self.fraction
         if bending is None:
@@ -135,21 +135,17 @@ class FusedTotal(Fused):
         self.normals = self.bound.normal.reshape(-1, 3)[self.order.long()].T.contiguous()
         place = torch.empty(self.count, dtype=torch.long, device=self.device)
         place[self.order.long()] = self.particle_cell.long()
-        cell, order = torch.sort(place[bending.example], stable=True)
-        bent, many = torch.unique_consecutive(cell, return_counts=True)
-        self.bent, self.bent_cell = len(bent), bent.int()
-        self.first_patch = torch.nn.functional.pad(many.cumsum(0), (1, 0)).int()
-        self.patch_node = torch.nn.functional.pad(bending.node[order], (0, 5)).int().contiguous()
-        self.curving = torch.nn.functional.pad(bending.curving[order], (0, 5)).contiguous()
-        self.plate = torch.stack([bending.stiffness.detach(), bending.poisson], -1)[order].contiguous()
-        check_indices(self.curving.numel())
+        self.bent, self.bent_cell = len(bending.node), place[bending.example].int()
+        self.bent_node = bending.node.int().contiguous()
+        self.stiffness = torch.nn.functional.pad(bending.stiffness.detach(), (0, 5)).contiguous()
+        check_indices(self.stiffness.numel())
 
-    def bend(self, fields: Tensor, partial: Tensor, width: int) -> None:
-        """Add the forces of sheets that bend, whose nodes ``fields`` has moved, to the sums of the cells."""
+    def _bend(self, partial: Tensor, width: int) -> None:
+        """Add the forces of sheets that bend to the sums of the cells."""
         block = lanes(self.device, 4, 1)
         launch(kernels.total_bend, (-(-self.bent // block),))(
-            self.bent_cell, self.first_patch, self.bent, self.patch_node, self.curving, self.plate, fields, partial,
-            self.cells, WIDTH=width, BLOCK=block, num_warps=1,
+            self.bent_cell, self.bent_node, self.stiffness, self.fields, partial, self.bent, self.cells,
+            WIDTH=width, BLOCK=block, num_warps=4,
         )  # fmt: skip
 
     def _take_pins(self) -> None:
@@ -281,7 +277,7 @@ class FusedTotal(Fused):
             pieces, partial = partial, self.sums(self.cells, width)
             self.join_pieces(pieces, partial, width)
         if self.bent:
-            self.bend(self.fields, partial, width)
+            self._bend(partial, width)
         nodes, block = len(self.active), lanes(self.device, 16, 1)
         source, sources = self.source, len(self.source)
         if block == 1:
@@ -392,8 +388,8 @@ class FusedTotal(Fused):
         _, ny, nz = self.grid.resolution
         block = lanes(self.device, 128)
         launch(kernels.total_read, (-(-self.count // block),))(
-            self.fraction, self.material, self.normals, self.load, self.order, self.rest, self.count, self.particle_cell,
-            self.cell_node, self.cell_nodes, self.cells, self.fields, kick, position, velocity, affine, F,
+            self.fraction, self.material, self.normals, self.load, self.order, self.rest, self.count,
+            self.particle_cell, self.cell_node, self.cell_nodes, self.cells, self.fields, kick, position, velocity, affine, F,
             ny * nz, nz, 1 / self.grid.dx,
             WORK=work, IMPLICIT=implicit, BLOCK=block, VIRTUAL=self.virtual, SHEETS=self.bent > 0, num_warps=4,
         )  # fmt: skip

@@ -277,41 +277,30 @@ def total_pieces(pieces_in, partial, first_piece, cells, pieces, WIDTH: tl.const
 
 @triton.jit(do_not_specialize=VARIES)
 def total_bend(
-    bent_cell, first_patch, bent, patch_node, curving, plate, fields, partial, cells,
-    WIDTH: tl.constexpr, BLOCK: tl.constexpr,
+    bent_cell, bent_node, stiffness, fields, partial, bent, cells, WIDTH: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
     """``total``: add the forces of sheets that bend by themselves to the sums of their cells.
 
-    Each of ``bent`` cells has some patches, one after the other (:mod:`~gaussian_swaying.mpm.sheets`), with rows of 32
-    nodes and of 3 x 32 derivatives, of which those beyond 27 are zero. The first three columns of ``fields`` move them.
+    Each of ``bent`` cells has 27 nodes and as many rows of 32 columns of a matrix, of which those beyond 27 are zero.
     """
-    k = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
+    k = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)[:, None]
     real = k < bent
-    first = tl.load(first_patch + k, real, 0)
-    many = tl.load(first_patch + k + 1, real, 0) - first
     o = tl.arange(0, 32)[None, :]
-    place = (o * (cells + 1) + tl.load(bent_cell + k, real, 0)[:, None]) * WIDTH
-    for n in range(0, tl.max(many)):
-        own = n < many
-        patch = first + n
-        known = own[:, None] & (o < 27)
-        at = fields + tl.load(patch_node + patch[:, None] * 32 + o, known, 0) * 8
-        row = curving + patch[:, None] * 96 + o
-        aa = tl.load(row, known, 0.0)
-        bb = tl.load(row + 32, known, 0.0)
-        ab = tl.load(row + 64, known, 0.0)
-        stiffness = tl.load(plate + 2 * patch, own, 0.0)
-        nu = tl.load(plate + 2 * patch + 1, own, 0.0)
-        for c in tl.static_range(3):
-            u = tl.load(at + c, known, 0.0)
-            ka = tl.sum(aa * u, 1)
-            kb = tl.sum(bb * u, 1)
-            kt = tl.sum(ab * u, 1)
-            ma = (stiffness * (ka + nu * kb))[:, None]
-            mb = (stiffness * (kb + nu * ka))[:, None]
-            mt = (2 * stiffness * (1 - nu) * kt)[:, None]
-            out = partial + place + c
-            tl.store(out, tl.load(out, known, 0.0) - (aa * ma + bb * mb + ab * mt), known)
+    f0 = tl.zeros([BLOCK, 32], tl.float32)
+    f1 = tl.zeros([BLOCK, 32], tl.float32)
+    f2 = tl.zeros([BLOCK, 32], tl.float32)
+    for j in range(27):
+        at = fields + tl.load(bent_node + k * 27 + j, real, 0) * 8
+        row = tl.load(stiffness + (k * 27 + j) * 32 + o, real, 0.0)
+        u0, u1, u2 = vector(at, real)
+        f0 += row * u0
+        f1 += row * u1
+        f2 += row * u2
+    known = real & (o < 27)
+    out = partial + (o * (cells + 1) + tl.load(bent_cell + k, real, 0)) * WIDTH
+    tl.store(out, tl.load(out, known, 0.0) - f0, known)
+    tl.store(out + 1, tl.load(out + 1, known, 0.0) - f1, known)
+    tl.store(out + 2, tl.load(out + 2, known, 0.0) - f2, known)
 
 
 @triton.jit(do_not_specialize=VARIES)

@@ -38,7 +38,7 @@ def hanging_strip(
     r"""A strip of a fabric that hangs over an edge under its weight, from a scene as a user makes it.
 
     It is clamped level at one end, in plane strain with :math:`\nu = 0.3`, and damped until it rests. A sheet of one
-    layer has :math:`\nu = 0`: its normals do not strain it, so that plane strain would not keep it from curving across. The elastica of
+    layer has :math:`\nu = 0`: plane strain would not keep it from curving across. The elastica of
     :math:`b = \rho h g L^3 / D` is the exact shape of a strip that does not stretch. The free length begins halfway
     between the last held and the first free points.
 

@@ -29,7 +29,7 @@ def hinged_strip(
     per_cell: int = 2,
     layers: int = 3,
 ) -> Result:
-    r"""A strip in plane strain with :math:`\nu = 0`, in three layers or in one that bends by itself, held at both ends and loaded across.
+    r"""A strip in plane strain with :math:`\nu = 0` and three layers, or one, held at both ends and loaded across.
 
     For a load q per length and :math:`D = E h^3 / 12` (both to a unit of width), :math:`D w'''' = q` with
     :math:`w = w'' = 0` at both hinges gives :math:`w = q x (L^3 - 2 L x^2 + x^3) / (24 D)`: the middle moves by

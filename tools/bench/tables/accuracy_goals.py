@@ -208,8 +208,8 @@ _goal("inverted flag, pressure at which it diverges, at 32 cells", "within 2 %",
       partial(_each, problem="inverted flag", cells=32), "", ERROR, "|error| <= 0.02")  # fmt: skip
 _goal("strip of a fabric that hangs over an edge, drop at 16 cells", "within 3 %",
       "chosen: a fabric's stiffness is hardly known better",
-      partial(_each, problem="strip of a fabric that hangs", cells=16), "{fabric}, E h = {stretch:g} N/m, {layers} layers", ERROR,
-      "|error| <= 0.03")  # fmt: skip
+      partial(_each, problem="strip of a fabric that hangs", cells=16),
+      "{fabric}, E h = {stretch:g} N/m, {layers} layers", ERROR, "|error| <= 0.03")  # fmt: skip
 _goal("drag on a plate and a sphere, for any set of Gaussians, by area", "within 2.5 %",
       "flat patches on a sphere: (spacing / radius)², which is 4 pi / 500 with 500 Gaussians",
       partial(_worst, problem="surface drag", name="area"), "`{area}`", ERROR, "|error| <= 0.025")  # fmt: skip
