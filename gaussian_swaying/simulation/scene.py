@@ -57,9 +57,9 @@ class Scene:
             :func:`~gaussian_swaying.geometry.covariances.limit_deformed`), in pictures and exports; null for no limit.
             Nothing changes below the limit. Above it a Gaussian would look like a streak: two parts of the object that
             share cells of the grid were pulled apart, or a material flowed.
-        layers: Layers of material points through the thickness: 1 is a membrane that folds without resistance; 3
-            resists bending like a plate (the Gaussians in the middle plane, two more points at the faces of the sheet,
-            weights of Simpson's rule) and needs three times the points.
+        layers: Layers of material points through the thickness: 1 is a membrane that folds without resistance, or with
+            ``material.bending`` a sheet that bends; 3 resists bending like a plate (the Gaussians in the middle plane,
+            two more points at the faces of the sheet, weights of Simpson's rule) and needs three times the points.
         particle_spacing: Largest distance between neighbouring material points on the surface [m]. Larger Gaussians get
             extra points (see :func:`~gaussian_swaying.gaussians.subdivision.subdivide`). A splat trained without a
             limit on sizes needs this: use 0.45 ``solver.dx`` or less. Null for none with ``points: gaussian``; with

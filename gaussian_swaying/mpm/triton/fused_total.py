@@ -389,7 +389,8 @@ class FusedTotal(Fused):
         block = lanes(self.device, 128)
         launch(kernels.total_read, (-(-self.count // block),))(
             self.fraction, self.material, self.normals, self.load, self.order, self.rest, self.count,
-            self.particle_cell, self.cell_node, self.cell_nodes, self.cells, self.fields, kick, position, velocity, affine, F,
+            self.particle_cell, self.cell_node, self.cell_nodes, self.cells, self.fields, kick,
+            position, velocity, affine, F,
             ny * nz, nz, 1 / self.grid.dx,
             WORK=work, IMPLICIT=implicit, BLOCK=block, VIRTUAL=self.virtual, SHEETS=self.bent > 0, num_warps=4,
         )  # fmt: skip
