@@ -431,12 +431,12 @@ def _write_material(setup: Setup, values: Mapping[str, Any]) -> Setup:
                     f"`{name}` is to change, but with `material.bending` it says where the layers lie: make another "
                     "simulation, or leave `material.bending` out."
                 )
-    if points.bending is not None and material.bending == PLATE:
-        points = replace(points, bending=points.bending * _stiffer(setup, values))
     if "material.thickness" in values:
         ratio = values["material.thickness"] / _thickness(setup)
         points = thicker(setup, ratio).points
         material = replace(material, thickness=values["material.thickness"])
+    if points.bending is not None and setup.material.bending == PLATE:
+        points = replace(points, bending=points.bending * _stiffer(setup, values))
     if "material.E" in values:
         points = replace(points, youngs_modulus=everywhere(points.youngs_modulus, values["material.E"]))
         material = replace(material, E=values["material.E"])
@@ -450,7 +450,7 @@ def _write_material(setup: Setup, values: Mapping[str, Any]) -> Setup:
 
 
 def _stiffer(setup: Setup, values: Mapping[str, Any]) -> Any:
-    """How many times as stiff against bending each point of a plate of one layer gets, by Kirchhoff's D."""
+    """Factor of the stiffness against bending of each point of a plate of one layer, by Kirchhoff's D."""
     points, ratio = setup.points, 1.0
     if "material.E" in values:
         ratio = ratio * values["material.E"] / points.youngs_modulus

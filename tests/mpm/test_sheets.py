@@ -1,4 +1,7 @@
-"""Sheets of one layer that bend by an energy of their own."""
+"""Sheets of one layer that bend by an energy of their own.
+
+Covers: mpm.triton.sheets.
+"""
 
 import dataclasses
 

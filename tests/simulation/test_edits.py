@@ -49,13 +49,15 @@ def _frames(simulation, frames):
 
 def test_points_change_within_the_region_only():
     points = MaterialPoints.create(
-        torch.rand(6, 3), volume=2e-3, density=100.0, youngs_modulus=1e4, poisson_ratio=0.3, law=FixedCorotated()
-    )
+        torch.rand(6, 3), volume=2e-3, density=100.0, youngs_modulus=1e4, poisson_ratio=0.3, law=FixedCorotated(),
+        normal=torch.tensor([0.0, 0.0, 1.0]).expand(6, 3), bending=2.0,
+    )  # fmt: skip
     inside = torch.tensor([True, False, True, False, False, True])
     found = edited_points(points, inside, Edit(E=5e3, nu=0.1, density=50.0, law=NeoHookean()))
     assert torch.equal(found.youngs_modulus, torch.where(inside, 5e3, 1e4))
     torch.testing.assert_close(found.poisson_ratio, torch.where(inside, 0.1, 0.3))
     torch.testing.assert_close(found.mass, torch.where(inside, 0.1, 0.2))
+    torch.testing.assert_close(found.bending, torch.where(inside, 1.0, 2.0))
     assert [type(law) for law in found.laws] == [FixedCorotated, NeoHookean]
     assert torch.equal(found.law_index, inside.long())
     assert torch.equal(points.youngs_modulus, torch.full((6,), 1e4))

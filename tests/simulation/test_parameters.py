@@ -189,6 +189,16 @@ def test_what_says_where_the_layers_lie_is_not_changed(name):
         with_values(setup, {name: 0.2})
 
 
+def test_a_plate_of_one_layer_stiffens_with_what_changes():
+    """By Kirchhoff's D = E h^3 / (12 (1 - nu^2)); a stiffness that was given as a number stays."""
+    scene = Scene(generator=FlagScene(0.4, 0.3, 0.05), metres_per_unit=1.0)
+    changes = {"material.E": 3e4, "material.nu": 0.0, "material.thickness": 0.02}
+    for bending, factor in (("plate", 3 * (1 - 0.3**2) * 2**3), (1e-4, 1.0)):
+        setup = Simulation(scene, Material(E=1e4, bending=bending), solver=MPMSolver(dx=0.1), device="cpu").setup
+        changed = with_values(setup, changes)
+        torch.testing.assert_close(changed.points.bending, factor * setup.points.bending)
+
+
 def test_material_that_a_region_gives_is_not_changed_everywhere(tmp_path):
     region = {"class_path": "Box", "init_args": {"min": [None] * 3, "max": [0.2, None, None]}}
     material = CONFIG["material"] | {"regions": [{"region": region, "E": 2e4}]}

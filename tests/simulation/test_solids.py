@@ -156,6 +156,11 @@ def test_the_frame_reaches_the_filling():
     assert float(turned.points.position.norm(dim=-1).max()) < 0.3 + 0.5 * DX
 
 
+def test_a_solid_has_no_bending_stiffness_of_its_own():
+    with pytest.raises(ValueError, match=r"no `material\.bending` with `scene\.filling`"):
+        _scene(material=Material(bending="plate"))
+
+
 def test_regions_reach_the_filling():
     """They are in scene units and axes."""
     lower = MaterialRegion(Box([None, None, None], [None, 0.05, None]), density=400.0)
