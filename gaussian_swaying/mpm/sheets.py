@@ -3,8 +3,8 @@ r"""Sheets of one layer of points: a membrane in plane stress, with the bending 
 **Membrane.** What F does across the sheet does not count: the normal stays normal to the middle plane, and the sheet
 gets as thin as no stress across it needs (:func:`flattened`). With F itself, every point would hold the slope of the
 sheet to that of a second field of the nodes, which on a coarse grid is far stiffer than the sheet (shear locking): a
-strip of a fabric on eight cells hung 13 % less than it should, and now 3 %. A weak stiffness, :data:`DIRECTOR` of the material's
-own, keeps F across the sheet near its normal.
+strip of a fabric on eight cells hung 13 % less than it should, and now 3 %. A weak stiffness, :data:`DIRECTOR` of the
+material's own, keeps F across the sheet near its normal.
 
 **Bending.** Points in the middle plane strain only where it stretches or shears. The bending energy to a unit of area,
 
