@@ -21,9 +21,12 @@ def still(run, frames=1):
     return np.repeat(flag.rest(flag.grid().uv())[0][None].astype(np.float32), frames, axis=0)
 
 
-@pytest.mark.parametrize("pattern", [1, 2, 3])
+@pytest.mark.parametrize("pattern", [1, 2, 3, 4, "curtain"])
 def test_both_sides_have_the_same_flag(pattern):
-    """On fine grids, too, where Gaussians are made smaller; a ripple on one side alone would be seen."""
+    """On fine grids, too, where Gaussians are made smaller; a ripple on one side alone would be seen.
+
+    Pattern 4 and the curtain have a spacing in their configuration that does not divide their width.
+    """
     parser = Simulation.parser()
     for number in (40, 100):
         run = Run(pattern, "ours", number, 75)

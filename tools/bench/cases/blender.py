@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import math
 import statistics
 import subprocess
 import sys
@@ -33,6 +34,21 @@ from flag_reference import FlagPattern, least_quality  # isort: skip
 
 REFERENCES = {"blender": 160, "ours": 100}
 """The solvers, and the cells along the longer side of their motions that all are compared with."""
+
+
+def whole(width: float, height: float, spacing: float) -> float:
+    """The largest spacing up to a given one that divides both sides, so that a flag made in code has its size.
+
+    Args:
+        width: One side [m].
+        height: The other side [m].
+        spacing: The spacing wanted [m].
+    """
+    for columns in range(math.ceil(width / spacing - 1e-6), math.ceil(1.2 * width / spacing)):
+        rows = height * columns / width
+        if abs(rows - round(rows)) < 1e-6 * rows:
+            return spacing if abs(columns * spacing - width) < 1e-6 * width else width / columns
+    return spacing
 
 
 @dataclass(frozen=True)
@@ -69,8 +85,12 @@ class Run:
         variant = pins.variant(pins.Pin("hinge", round(dx, 6), linear=True), self.pattern)
         more = ["--recorder.images=false", "--recorder.video=false"]
         made = yaml.safe_load(flags.matched_configs(self.pattern)[-1].read_text())["scene"]["generator"]["init_args"]
-        if made["spacing"] > 0.45 * dx:  # extra points on Gaussians would make the flag heavier by a hundredth
-            more.append(f"--scene.generator.init_args.spacing={made['spacing'] / 2}")
+        spacing = made["spacing"]
+        if spacing > 0.45 * dx:  # extra points on Gaussians would make the flag heavier by a hundredth
+            spacing /= 2
+        spacing = whole(self.flag().width, self.flag().height, spacing)
+        if spacing != made["spacing"]:
+            more.append(f"--scene.generator.init_args.spacing={spacing}")
         return [*flags.sim_arguments(self.pattern, variant, Path("none"), None), *more]
 
     def solve(self, blender: str) -> tuple[np.ndarray, Row]:
