@@ -211,6 +211,7 @@ def wrinkles(
     length: float = 0.5,
     rest: float = 20.0,
     seed: float = 2.0,
+    shell_cells: int = 40,
     settings: Settings | None = None,
 ) -> Result:
     r"""Pull a sheet of three layers by its ends, from a scene as a user makes it, and let it rest.
@@ -224,6 +225,7 @@ def wrinkles(
         length: See :class:`Strip`.
         rest: Time after the pull, in units of 1 / circular frequency of the stretched sheet.
         seed: Height that the speed would reach without a force, in thicknesses of a plate.
+        shell_cells: Spline cells of the shell across half the width.
         settings: The numerics.
 
     Returns:
@@ -268,7 +270,7 @@ def wrinkles(
     run = follow(solver, start, (PULL + rest) / omega / frames, frames, across)
     heights = 0.5 * (run.series.amax(1) - run.series.amin(1)) / strip.height
     size = wavelength(run.series[-1].numpy(), WIDTH) if heights[-1] > FLAT else 0.0
-    known = of_shell(bending, strain, length)
+    known = of_shell(bending, strain, length, shell_cells)
     return run.result(
         size / known["wavelength"] - 1,
         wavelength=size,
