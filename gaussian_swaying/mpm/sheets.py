@@ -156,6 +156,15 @@ class Bending:
         return -0.5 * (displacement * self.forces(displacement)).sum((-2, -1))
 
     @torch.no_grad()
+    def rows(self) -> Tensor:
+        """Rows v of each cell, as few as the rank of its matrix, the sum of v v^T; shape (K, rank of all, 27)."""
+        values, vectors = torch.linalg.eigh(in_double(self.stiffness))
+        least = 27 * torch.finfo(self.stiffness.dtype).eps * values[:, -1:]
+        rank = int((values > least).sum(-1).amax())
+        scaled = vectors * values.clamp(min=0).sqrt()[:, None]
+        return scaled.mT[:, 27 - rank :].to(self.stiffness)
+
+    @torch.no_grad()
     def fastest(self, inverse_mass: Tensor) -> float:
         """The largest square of a circular frequency [1/s²] of the sheets alone.
 

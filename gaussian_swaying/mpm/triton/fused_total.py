@@ -137,15 +137,16 @@ class FusedTotal(Fused):
         place[self.order.long()] = self.particle_cell.long()
         self.bent, self.bent_cell = len(bending.node), place[bending.example].int()
         self.bent_node = bending.node.int().contiguous()
-        self.stiffness = torch.nn.functional.pad(bending.stiffness.detach(), (0, 5)).contiguous()
-        check_indices(self.stiffness.numel())
+        rows = torch.nn.functional.pad(bending.rows(), (0, 5))
+        self.rank = triton.next_power_of_2(rows.shape[1]) if lanes(self.device, 1, 0) else rows.shape[1]
+        self.curving = torch.nn.functional.pad(rows, (0, 0, 0, self.rank - rows.shape[1])).contiguous()
+        check_indices(self.curving.numel())
 
     def _bend(self, partial: Tensor, width: int) -> None:
         """Add the forces of sheets that bend to the sums of the cells."""
-        block = lanes(self.device, 4, 1)
-        launch(kernels.total_bend, (-(-self.bent // block),))(
-            self.bent_cell, self.bent_node, self.stiffness, self.fields, partial, self.bent, self.cells,
-            WIDTH=width, BLOCK=block, num_warps=4,
+        launch(kernels.total_bend, (self.bent,))(
+            self.bent_cell, self.bent_node, self.curving, self.fields, partial, self.cells,
+            WIDTH=width, RANK=self.rank, ROWS=lanes(self.device, self.rank, 1), num_warps=1,
         )  # fmt: skip
 
     def _take_pins(self) -> None:
