@@ -66,6 +66,8 @@ def cases(settings: Settings) -> Iterable[tuple[str, Row, Callable[[], Result]]]
         yield case("wrinkled shell", wrinkles.of_shell, bending=0.5 * THIN, strain=strain)
     for cells in (32, 48, 64, 80):
         yield case("wrinkles", wrinkles.wrinkles, bending=THIN, cells=cells)
+    for cells in (32, 48):
+        yield case("wrinkles", wrinkles.wrinkles, bending=THIN, cells=cells, layers=1)
 
 
 def _result(function: Callable[[], Row]) -> Row:

@@ -212,9 +212,10 @@ def wrinkles(
     rest: float = 20.0,
     seed: float = 2.0,
     shell_cells: int = 40,
+    layers: int = 3,
     settings: Settings | None = None,
 ) -> Result:
-    r"""Pull a sheet of three layers by its ends, from a scene as a user makes it, and let it rest.
+    r"""Pull a sheet by its ends, from a scene as a user makes it, and let it rest.
 
     It begins with a speed along its axis, as a sheet that is quite flat would stay so.
 
@@ -226,6 +227,7 @@ def wrinkles(
         rest: Time after the pull, in units of 1 / circular frequency of the stretched sheet.
         seed: Height that the speed would reach without a force, in thicknesses of a plate.
         shell_cells: Spline cells of the shell across half the width.
+        layers: Layers of points: 3, or 1 with a bending stiffness of their own.
         settings: The numerics.
 
     Returns:
@@ -248,7 +250,7 @@ def wrinkles(
     boundaries += [PinnedRegion(end, "clamp", start=pull) for end in ends]
     material = Material(E=strip.stretch / THICK, nu=strip.nu, density=strip.mass / THICK, thickness=THICK,
                         bending=bending)  # fmt: skip
-    scene = Scene(generator=flag, metres_per_unit=1.0, layers=3, points="gaussian")
+    scene = Scene(generator=flag, metres_per_unit=1.0, layers=layers, points="gaussian")
     simulation = Simulation(scene, material, solver=settings.solver(dx, boundaries=boundaries, damping=omega),
                             device=settings.device)  # fmt: skip
     points, solver = simulation.scene.points, simulation.solver
