@@ -93,10 +93,10 @@ def _pulled(result: Row) -> list[Row]:
 
 
 table(PAGE, "nature.wrinkles", "nature_*", _pulled, """
-    layers = {layers} | cells across the width = {cells} | points = {points:,.0f} | outer layers apart [cells] = {span:.3f} |
-    wavelength [mm] = {wavelength:.1f (mm)} | of the shell = {exact:.1f (mm)} | error = {error:.1f %} |
-    amplitude [thicknesses] = {amplitude:.1f} | of the shell = {exact_amplitude:.1f} |
-    its change in the last tenth = {drift:.1f %} | time [s] = {wall_s:.0f}
+    layers = {layers} | cells across the width = {cells} | points = {points:,.0f} |
+    outer layers apart [cells] = {span:.3f} | wavelength [mm] = {wavelength:.1f (mm)} |
+    of the shell = {exact:.1f (mm)} | error = {error:.1f %} | amplitude [thicknesses] = {amplitude:.1f} |
+    of the shell's = {exact_amplitude:.1f} | its change in the last tenth = {drift:.1f %} | time [s] = {wall_s:.0f}
     """)  # fmt: skip
 table(PAGE, "nature.wrinkled_shells", "nature_*", _shells, """
     bending stiffness [N m] = {bending:.2e} | length [m] = {length:g} | strain = {strain:.1f %} |
@@ -147,7 +147,7 @@ table(PAGE, "nature.goals", "nature_*", judged([
          more={"wanted": "decay of its spin within 2 % of the exact one"}),
     Goal("drape coefficient, {fabric}, {cells} cells", "{error:.1f %}", "|error| <= 0.1", _draped,
          more={"wanted": "within 10 % of the shell's"}),
-    Goal("wavelength of wrinkles, {layers} layers, {cells} cells across", "{error:.1f %}", "|error| <= 0.1",
+    Goal("wavelength of wrinkles, layers: {layers}, {cells} cells across", "{error:.1f %}", "|error| <= 0.1",
          _pulled, more={"wanted": "within 10 % of the shell's"}),
     Goal("wavelength of the shell's wrinkles, and the formula {told}", "{worst:.1f %}", "|worst| <= most", _formulas,
          more={"wanted": "within {most:.0f %} of each other"}),
