@@ -41,7 +41,7 @@ DIRECTOR = 0.01
 LEAST = 1e-6
 """Least area of a sheet over that at rest."""
 
-_AT_ONCE = 4096  # points
+_AT_ONCE = 4096  # points or cells; a GPU has a limit
 _ROUNDS = 60  # of the power iteration
 
 
@@ -158,7 +158,8 @@ class Bending:
     @torch.no_grad()
     def rows(self) -> Tensor:
         """Rows v of each cell, as few as the rank of its matrix, the sum of v v^T; shape (K, rank of all, 27)."""
-        values, vectors = torch.linalg.eigh(in_double(self.stiffness))
+        parts = [torch.linalg.eigh(in_double(some)) for some in self.stiffness.split(_AT_ONCE)]
+        values, vectors = (torch.cat(column) for column in zip(*parts, strict=True))
         least = 27 * torch.finfo(self.stiffness.dtype).eps * values[:, -1:]
         rank = int((values > least).sum(-1).amax())
         scaled = vectors * values.clamp(min=0).sqrt()[:, None]
