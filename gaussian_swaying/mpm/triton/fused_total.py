@@ -29,6 +29,9 @@ _LANE_COST = {4: 1.5, 8: 1.0, 16: 1.0, 32: 1.0, 64: 0.85}
 # least number of pieces that `total` cuts its cells into: about the number of warps that an H200 runs at once
 _PROGRAMS = 2048
 
+_BENT = 4
+"""Cells of a program that bends sheets, on a GPU; measured."""
+
 REGISTERS = 128
 """Most registers of a thread of the particles' kernel: spilling some is worth it, because more warps run at once."""
 
@@ -138,15 +141,15 @@ class FusedTotal(Fused):
         self.bent, self.bent_cell = len(bending.node), place[bending.example].int()
         self.bent_node = bending.node.int().contiguous()
         rows = torch.nn.functional.pad(bending.rows(), (0, 5))
-        self.rank = triton.next_power_of_2(rows.shape[1]) if lanes(self.device, 1, 0) else rows.shape[1]
-        self.curving = torch.nn.functional.pad(rows, (0, 0, 0, self.rank - rows.shape[1])).contiguous()
+        self.rank, self.curving = rows.shape[1], rows.contiguous()
         check_indices(self.curving.numel())
 
     def _bend(self, partial: Tensor, width: int) -> None:
         """Add the forces of sheets that bend to the sums of the cells."""
-        launch(kernels.total_bend, (self.bent,))(
-            self.bent_cell, self.bent_node, self.curving, self.fields, partial, self.cells,
-            WIDTH=width, RANK=self.rank, ROWS=lanes(self.device, self.rank, 1), num_warps=1,
+        block = lanes(self.device, _BENT, 1)
+        launch(kernels.total_bend, (-(-self.bent // block),))(
+            self.bent_cell, self.bent_node, self.curving, self.fields, partial, self.bent, self.cells,
+            WIDTH=width, RANK=self.rank, BLOCK=block, num_warps=1,
         )  # fmt: skip
 
     def _take_pins(self) -> None:

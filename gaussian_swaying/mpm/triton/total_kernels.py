@@ -277,31 +277,29 @@ def total_pieces(pieces_in, partial, first_piece, cells, pieces, WIDTH: tl.const
 
 @triton.jit(do_not_specialize=VARIES)
 def total_bend(
-    bent_cell, bent_node, curving, fields, partial, cells, WIDTH: tl.constexpr, RANK: tl.constexpr, ROWS: tl.constexpr
-):
-    """``total``: add the forces of sheets that bend by themselves to the sums of one of their cells.
+    bent_cell, bent_node, curving, fields, partial, bent, cells, WIDTH: tl.constexpr, RANK: tl.constexpr,
+    BLOCK: tl.constexpr,
+):  # fmt: skip
+    """``total``: add the forces of sheets that bend by themselves to the sums of their cells.
 
-    The cell has 27 nodes and RANK rows v of 32 columns, of which those beyond 27 are zero: the forces are -v (v u).
+    Each of ``bent`` cells has 27 nodes and RANK rows v of 32 columns, of which those beyond 27 are zero: the forces are
+    -v (v u). What is there already is loaded first, so that the waits for the memory overlap.
     """
-    k = tl.program_id(0)
+    k = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
+    known = k < bent
     o = tl.arange(0, 32)[None, :]
-    real = o < 27
-    at = fields + tl.load(bent_node + k * 27 + o, real, 0) * 8
-    u0, u1, u2 = vector(at, real)
-    f0 = u0 * 0
-    f1 = u0 * 0
-    f2 = u0 * 0
-    for first in range(0, RANK, ROWS):
-        row = first + tl.arange(0, ROWS)[:, None]
-        v = tl.load(curving + (k * RANK + row) * 32 + o)
-        f0 += tl.sum(v * tl.sum(v * u0, 1)[:, None], 0)[None, :]
-        f1 += tl.sum(v * tl.sum(v * u1, 1)[:, None], 0)[None, :]
-        f2 += tl.sum(v * tl.sum(v * u2, 1)[:, None], 0)[None, :]
-    out = partial + (o * (cells + 1) + tl.load(bent_cell + k)) * WIDTH
-    s0, s1, s2 = vector(out, real)
-    tl.store(out, s0 - f0, real)
-    tl.store(out + 1, s1 - f1, real)
-    tl.store(out + 2, s2 - f2, real)
+    real = known[:, None] & (o < 27)
+    out = partial + (o * (cells + 1) + tl.load(bent_cell + k, known, 0)[:, None]) * WIDTH
+    f0, f1, f2 = vector(out, real)
+    u0, u1, u2 = vector(fields + tl.load(bent_node + k[:, None] * 27 + o, real, 0) * 8, real)
+    for r in range(RANK):
+        v = tl.load(curving + (k[:, None] * RANK + r) * 32 + o, known[:, None], 0.0)
+        f0 -= v * tl.sum(v * u0, 1)[:, None]
+        f1 -= v * tl.sum(v * u1, 1)[:, None]
+        f2 -= v * tl.sum(v * u2, 1)[:, None]
+    tl.store(out, f0, real)
+    tl.store(out + 1, f1, real)
+    tl.store(out + 2, f2, real)
 
 
 @triton.jit(do_not_specialize=VARIES)
