@@ -78,3 +78,19 @@ def test_each_grid_is_compared_with_the_finest_mesh(solved, tmp_path):
     ]
     plot([result], tmp_path)
     assert (tmp_path / "refinement.png").stat().st_size > 10_000
+
+
+def test_one_layer_is_recorded_beside_three(solved, tmp_path):
+    parser = Simulation.parser()
+    run = parser.parse_args([*refinement.OneLayer("pennant", "ours", 20, 3).arguments(), "--device=cpu"])
+    assert (run.scene.layers, run.material.bending) == (1, "plate")
+    small = ["--flags", "pennant", "--grids", "8", "--blender_cells", "16,32", "--frames", "4"]
+    small += ["--references", tmp_path]
+    three, _ = measure("refinement", *small, result=json.loads(json.dumps(HEAD)))
+    solved.clear()
+    both, _ = measure("refinement", *small, "--layers", "1", result=three)
+    assert ("OneLayer", "pennant", "ours", 8) in solved
+    assert [row["cells"] for row in both["rows"]] == [8]
+    (line,) = cells("refinement.one_layer", both)
+    assert line[:3] == ["pennant", "8", "7"]
+    assert line[3] == line[5]

@@ -36,6 +36,15 @@ class Rippled(Run):
         return [*super().arguments(), f"--scene.generator.init_args.ripple={RIPPLE}"]
 
 
+@dataclass(frozen=True)
+class OneLayer(Run):
+    """A flag of one layer of points that bends by itself."""
+
+    def arguments(self) -> list[str]:
+        """See :meth:`Run.arguments`."""
+        return [*super().arguments(), "--scene.layers=1", "--material.bending=plate"]
+
+
 def _distance(run: Run, options: argparse.Namespace, to: Cloth, flat: Cloth | None = None) -> Row:
     """Solve a flag by ours, and compare it with its reference; one with the ripple with a ``flat`` one, too."""
     positions, found = run.solve(options.blender)
@@ -57,6 +66,11 @@ def rows(options: argparse.Namespace, result: Row) -> Iterator[Measurement]:
     result |= {"frames": options.frames, "note": options.note}
     for pattern in options.flags:
         flat, about = _itself(Run, pattern, options)
+        if options.layers == 1:
+            for cells in options.grids:
+                work = partial(_distance, OneLayer(pattern, "ours", cells, options.frames), options, flat)
+                yield ("one_layer", {"flag": pattern, "cells": cells}), partial(guarded, work)
+            continue
         yield ("references", str(pattern)), about.copy
         for cells in options.grids:
             work = partial(_distance, Run(pattern, "ours", cells, options.frames), options, flat)
@@ -81,6 +95,7 @@ CASE = Case(
         numbers("--blender_cells", "cells along the longer side of the reference, and of a finer one",
                 default="120,160"),
         numbers("--grids", "cells of our grids along the longer side", default="30,40,60,80"),
+        option("--layers", "of points: 3, or 1, which is recorded beside them", type=int, choices=(1, 3), default=3),
         option("--frames", "frames, the first being the rest shape", type=int, default=125),
         NOTE,
     ),

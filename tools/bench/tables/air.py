@@ -40,7 +40,7 @@ def _flat(result: Row) -> list[Row]:
     return [row | {"name": text} for problem, text in named.items() for row in _of(result, problem)]
 
 
-table(PAGE, "air.exact", "air_*", _flat, """
+table(PAGE, "air.exact", "air_cpu", _flat, """
     flow = {name} | cells = {cells} | found = {error:.5f}
     """, before="{source}", empty=EMPTY)  # fmt: skip
 
@@ -54,19 +54,19 @@ def _bodies(result: Row) -> list[Row]:
     ]
 
 
-table(PAGE, "air.bodies", "air_*", _bodies, """
+table(PAGE, "air.bodies", "air_cpu", _bodies, """
     body = {name} | cells across it = {cells} | drag = {drag:.3f} | published = {published} | Strouhal number =
     [[{strouhal:.4f}]]
     """, empty=EMPTY)  # fmt: skip
-table(PAGE, "air.inverted", "air_*", lambda result: _of(result, "inverted flag"), """
+table(PAGE, "air.inverted", "air_cpu", lambda result: _of(result, "inverted flag"), """
     stiffness B / (rho U² L³) = {stiffness:g} | amplitude from peak to peak [lengths] = {amplitude:.2f} |
     mean place of the free end = {mean:.2f}
     """, empty=EMPTY)  # fmt: skip
-table(PAGE, "air.filaments", "air_*", lambda result: _of(result, "hanging filament"), """
+table(PAGE, "air.filaments", "air_cpu", lambda result: _of(result, "hanging filament"), """
     cells in its length = {cells} | amplitude from peak to peak [lengths] = {amplitude:.3f} |
     frequency [U / L] = {frequency:.3f} | drag = {drag:.3f}
     """, empty=EMPTY)  # fmt: skip
-table(PAGE, "air.tandem", "air_*", lambda result: _of(result, "two flags"), """
+table(PAGE, "air.tandem", "air_cpu", lambda result: _of(result, "two flags"), """
     gap [lengths] = {gap:g} | drag of the first per that of one alone = {first:.2f} | of the second = {second:.2f}
     """, empty=EMPTY)  # fmt: skip
 
@@ -77,7 +77,7 @@ def _sizes(result: Row) -> list[Row]:
 
 table(PAGE, "air.speed", "air_*", _sizes, """
     cells = {name} | million updates a second = {updates_per_s:.0f (10⁶)} | bytes for a cell = {bytes_per_cell}
-    """, empty=EMPTY)  # fmt: skip
+    """, before="{source}", empty=EMPTY)  # fmt: skip
 
 
 def _regimes(result: Row) -> list[Row]:
@@ -85,7 +85,7 @@ def _regimes(result: Row) -> list[Row]:
     return [found[0.2] | {"stiff": found[0.5]["amplitude"]}] if {0.2, 0.5} <= set(found) else []
 
 
-table(PAGE, "air.goals", "air_*", judged([
+table(PAGE, "air.goals", "air_cpu", judged([
     Goal("vortices that decay, order of convergence", "{order:.2f}", "order >= 1.8", lambda r: _order(r, "vortices"),
          more={"wanted": "second order"}),
     Goal("flow between walls, order of convergence", "{order:.2f}", "order >= 1.8", lambda r: _order(r, "walls"),

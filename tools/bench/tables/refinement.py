@@ -78,6 +78,22 @@ table(PAGE, "refinement.uneven", "refinement_*", _uneven, """
     """)  # fmt: skip
 
 
+def _one_layer(result: Row) -> Iterator[Row]:
+    """The rows of one layer beside those of three."""
+    three = {(row["flag"], row["cells"]): row for row in result["rows"] if "failed" not in row}
+    rows = [row for row in result.get("one_layer", []) if "failed" not in row]
+    for row in sorted(rows, key=lambda row: (str(row["flag"]), row["cells"])):
+        other = three.get((row["flag"], row["cells"]), {})
+        more = {f"three_{name}": other.get(name) for name in ("points", "chamfer")}
+        yield {name: row[name] for name in ("cells", "points", "chamfer")} | {"flag": named(row["flag"])} | more
+
+
+table(PAGE, "refinement.one_layer", "refinement_*", _one_layer, """
+    flag = {flag} | cells = {cells} | points of one layer = {points:,.0f} | distance = {chamfer:.2f %} |
+    points of three layers = {three_points:,.0f} | their distance = {three_chamfer:.2f %}
+    """)  # fmt: skip
+
+
 def plot(results: list[Row], pictures: Path) -> None:
     """Draw ``refinement.png`` of a record: distance against cells, a line for each flag."""
     (result,) = results
