@@ -141,3 +141,14 @@ def browser(chromium):
         started = driver.chromium.launch(executable_path=chromium, args=FLAGS)
         yield started
         started.close()
+
+
+@pytest.fixture(scope="module")
+def shading_browser(chromium):
+    """As ``browser``, with WebGPU on an adapter in software where this Chromium has one."""
+    from playwright.sync_api import sync_playwright
+
+    with sync_playwright() as driver:
+        started = driver.chromium.launch(executable_path=chromium, args=[*FLAGS, "--enable-unsafe-webgpu"])
+        yield started
+        started.close()

@@ -7,7 +7,9 @@ import { readFile } from "node:fs/promises";
 
 const OWN = "brush.js build.js film.glsl.js film.js gaussians.js live.js main.js playback.js sorter.js view.js".split(" ");
 OWN.push(..."dial.js page.js settings.js".split(" ").map((name) => `live_web/${name}`));
-const SOLVER = "aero.js block.js contact.js lanes.js laws.js matrices.js points.ts solver.js wind.js worker.js".split(" ").map((name) => `live_web/${name}`);
+const SOLVER = "aero.js block.js contact.js lanes.js laws.js matrices.js points.ts solver.js substep.wgsl webgpu.js wind.js worker.js"
+  .split(" ")
+  .map((name) => `live_web/${name}`);
 const SOURCES = [...OWN, "package-lock.json"]; // a test compares their checksum
 
 // Spark's WebAssembly, in it and in its worker, reads files of splats, builds levels of detail and sorts. A film needs only
@@ -67,6 +69,14 @@ const points = {
   },
 };
 
+// Shaders without comments and indents.
+async function readShader({ path }) {
+  const lines = (await readFile(path, "utf8")).replace(/\/\*[^]*?\*\/|\/\/.*/g, "").split("\n");
+  return { contents: lines.map((line) => line.trim()).filter(Boolean).join("\n"), loader: "text" };
+}
+
+const shaders = { name: "shaders", setup: (made) => made.onLoad({ filter: /\.wgsl$/ }, readShader) };
+
 await build({
   entryPoints: ["live_web/worker.js"],
   outfile: "../../gaussian_swaying/viewer/live_web/page/worker.min.js",
@@ -76,5 +86,5 @@ await build({
   format: "iife",
   banner: await banner(["build.js", ...SOLVER, "package-lock.json"]),
   logLevel: "info",
-  plugins: [points],
+  plugins: [points, shaders],
 });

@@ -9,6 +9,7 @@ import torch
 import yaml
 
 from gaussian_swaying.simulation.simulation import Simulation
+from gaussian_swaying.viewer.film.recorded import order_of
 from gaussian_swaying.viewer.live_web.block import check, pack_solver
 from gaussian_swaying.viewer.live_web.page import PAGE
 
@@ -45,6 +46,9 @@ def merged(settings, changes):
     return both
 
 
+SHOWN = "!!window.windPage || !document.getElementById('message').textContent.startsWith('Loading')"
+
+
 @pytest.fixture(scope="session")
 def make(tmp_path_factory):
     """The simulation of a calm sheet, with some settings changed."""
@@ -79,9 +83,9 @@ def in_node(node, request, tmp_path):
 def moved_means(simulation, state, moved):
     """Centres of the Gaussians with the nodes moved (M, 3) as a browser says; the state gives the type."""
     nodes = simulation.scene.follow.nodes(state)
-    displacement = torch.zeros_like(state.node_displacement)
-    displacement = displacement.index_copy(0, nodes, moved.to(displacement))
-    return simulation.scene.deformed(state.replace(node_displacement=displacement)).means
+    still = torch.zeros_like(state.node_displacement)
+    displacement = still.index_copy(0, nodes, moved.to(still))
+    return simulation.scene.deformed(simulation.solver.bound.read_particles(state, displacement, still)).means
 
 
 def apart(simulation, state, moved):
@@ -90,3 +94,36 @@ def apart(simulation, state, moved):
     motion = (expected - simulation.scene.rest().means).norm(dim=-1).max()
     error = (moved_means(simulation, state, moved) - expected).norm(dim=-1).max()
     return float(error / motion), float(motion)
+
+
+def opened(context, path, settings, until):
+    """A page; what it tells and asks for is kept in ``page.told`` and ``page.asked``."""
+    page = context.new_page()
+    page.told, page.asked = [], []
+    page.on("console", lambda message: page.told.append(message.text))
+    page.on("pageerror", lambda error: page.told.append(str(error)))
+    page.on("request", lambda request: page.asked.append(request.url))
+    page.goto(path.as_uri() + settings)
+    until(lambda: page.evaluate(SHOWN))
+    return page
+
+
+def asked_of_a_network(page):
+    """Addresses that a page asked for outside its file."""
+    return [url for url in page.asked if not url.startswith(("file:", "data:", "blob:"))]
+
+
+def drawn_apart(page, simulation):
+    """As :func:`apart`, of the Gaussians as a page draws them, read back from there; the motion in sizes of the object."""
+    values = page.evaluate("windPage.positions().then((found) => Array.from(found))")
+    found = torch.tensor(values, dtype=torch.float64).reshape(-1, 3)
+    state = simulation.start()
+    for _ in range(round(page.evaluate("windPage.time()") / simulation.frame_dt)):
+        state, _ = simulation.advance(state)
+    scene = simulation.scene
+    size, order = scene.size * scene.frame.metres_per_unit, order_of(scene)[1]
+    rest, expected = (
+        scene.frame.point_to_sim(drawn.means.double())[order] / size for drawn in (scene.rest(), scene.deformed(state))
+    )
+    motion = float((expected - rest).norm(dim=-1).max())
+    return float((found - expected).norm(dim=-1).max()) / motion, motion

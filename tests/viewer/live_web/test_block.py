@@ -227,6 +227,8 @@ def test_the_worker_is_built_from_its_sources(request):
         "matrices.js",
         "points.ts",
         "solver.js",
+        "substep.wgsl",
+        "webgpu.js",
         "wind.js",
         "worker.js",
     ]

@@ -7,12 +7,10 @@ import re
 import time
 
 import pytest
-import torch
 
-from gaussian_swaying.viewer.film.recorded import order_of
 from gaussian_swaying.viewer.live_web.page import write_element, write_live_web
 
-SHOWN = "!!window.windPage || !document.getElementById('message').textContent.startsWith('Loading')"
+from .conftest import asked_of_a_network, drawn_apart, opened
 
 
 @pytest.fixture(scope="module")
@@ -24,46 +22,24 @@ def written(make, tmp_path_factory):
 
 @pytest.fixture
 def show(browser, until):
-    """Opens a page; what it tells and asks for is kept in ``page.told`` and ``page.asked``."""
     context = browser.new_context(viewport={"width": 600, "height": 400})
-
-    def show(path, settings=""):
-        page = context.new_page()
-        page.told, page.asked = [], []
-        page.on("console", lambda message: page.told.append(message.text))
-        page.on("pageerror", lambda error: page.told.append(str(error)))
-        page.on("request", lambda request: page.asked.append(request.url))
-        page.goto(path.as_uri() + settings)
-        until(lambda: page.evaluate(SHOWN))
-        return page
-
-    yield show
+    yield lambda path, settings="": opened(context, path, settings, until)
     context.close()
 
 
 def test_after_two_seconds_the_gaussians_are_where_a_run_puts_them(show, written, make):
     """Read back from the graphics card; within 1 % of the motion. Nothing is asked of a network."""
-    page, simulation = show(written), make()
+    page = show(written)
     page.evaluate("windPage.complete.then(() => { windPage.pause(); windPage.reset(); })")
     told = page.evaluate("windPage.advance(50)")
     assert told["simulated"] == pytest.approx(2.0)
     assert told["lanes"]
     assert page.evaluate("windPage.time()") == pytest.approx(2.0)
-    values = page.evaluate("windPage.positions().then((found) => Array.from(found))")
-    found = torch.tensor(values, dtype=torch.float64).reshape(-1, 3)
-    state = simulation.start()
-    for _ in range(50):
-        state, _ = simulation.advance(state)
-    scene = simulation.scene
-    size, order = scene.size * scene.frame.metres_per_unit, order_of(scene)[1]
-    rest, expected = (
-        scene.frame.point_to_sim(drawn.means.double())[order] / size for drawn in (scene.rest(), scene.deformed(state))
-    )
-    motion = float((expected - rest).norm(dim=-1).max())
+    error, motion = drawn_apart(page, make())
     assert motion > 0.1
-    assert float((found - expected).norm(dim=-1).max()) < 0.01 * motion
+    assert error < 0.01
     assert page.told == []
-    assert [url for url in page.asked if not url.startswith(("file:", "data:", "blob:"))] == []
+    assert asked_of_a_network(page) == []
 
 
 def _grabbed(page):

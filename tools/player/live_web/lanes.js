@@ -8,6 +8,22 @@ import { Solver } from "./solver.js";
 const LANES = 4;
 const RECORD = 16 * LANES; // numbers of four points: see the constructor
 
+/** Area vectors of the patches of each point, three numbers each. @param {Solver} solver @returns {number[][]} */
+export function areaVectors({ a, head, points }) {
+  return Array.from({ length: points }, (_, p) => {
+    if (head.grouped) return Array.from(a.vectors.subarray(3 * a.firstVector[p], 3 * a.firstVector[p + 1]));
+    const area = a.patch[4 * p + 3];
+    return area > 0 ? [0, 1, 2].map((m) => area * a.patch[4 * p + m]) : [];
+  });
+}
+
+/** Six numbers of the sum of A N N^T of a point. @param {Solver} solver @param {number} p @returns {number[]} */
+export function tensorOf({ a, head }, p) {
+  if (head.grouped) return Array.from(a.tensor.subarray(6 * p, 6 * p + 6));
+  const [x, y, z, area] = a.patch.subarray(4 * p, 4 * p + 4);
+  return [x * x, x * y, x * z, y * y, y * z, z * z].map((square) => area * square);
+}
+
 export class LanesSolver extends Solver {
   /** @param {{head: any, arrays: Record<string, any>}} block Throws an Error where the browser has no such WebAssembly. */
   constructor(block) {
@@ -26,7 +42,7 @@ export class LanesSolver extends Solver {
       const within = p - a.cellStart[c];
       this.lane[p] = LANES * (starts[c] + Math.floor(within / LANES)) + (within % LANES);
     }
-    const vectors = this.areaVectors();
+    const vectors = areaVectors(this);
     const rows = new Int32Array(chunks); // of area vectors, as many as the point with most of them has
     vectors.forEach((own, p) => {
       const chunk = Math.floor(this.lane[p] / LANES);
@@ -75,7 +91,7 @@ export class LanesSolver extends Solver {
     }
     vectors.forEach((own, p) => {
       const at = Math.floor(this.lane[p] / LANES) * RECORD + (this.lane[p] % LANES);
-      const [volume, tensor] = [a.volume[p], this.tensorOf(p)];
+      const [volume, tensor] = [a.volume[p], tensorOf(this, p)];
       const numbers = [0, 1, 2].map((m) => a.fraction[3 * p + m]);
       numbers.push(volume, a.mu[p], a.lam[p], volume / a.mass[p], ...tensor, a.law[p] === NEO_HOOKEAN ? 1 : 0);
       numbers.forEach((number, k) => (records[at + LANES * k] = number));
@@ -88,24 +104,6 @@ export class LanesSolver extends Solver {
       own.forEach((number, k) => (table[first + LANES * k + (this.lane[p] % LANES)] = number));
     });
     this.reset();
-  }
-
-  /** Area vectors of the patches of each point, three numbers each. @returns {number[][]} */
-  areaVectors() {
-    const { a, head } = this;
-    return Array.from({ length: this.points }, (_, p) => {
-      if (head.grouped) return Array.from(a.vectors.subarray(3 * a.firstVector[p], 3 * a.firstVector[p + 1]));
-      const area = a.patch[4 * p + 3];
-      return area > 0 ? [0, 1, 2].map((m) => area * a.patch[4 * p + m]) : [];
-    });
-  }
-
-  /** Six numbers of the sum of A N N^T of a point. @returns {number[]} */
-  tensorOf(p) {
-    const { a, head } = this;
-    if (head.grouped) return Array.from(a.tensor.subarray(6 * p, 6 * p + 6));
-    const [x, y, z, area] = a.patch.subarray(4 * p, 4 * p + 4);
-    return [x * x, x * y, x * z, y * y, y * z, z * z].map((square) => area * square);
   }
 
   /** The nearest rotation of an inverted F, for points.ts. */

@@ -34,7 +34,7 @@ export async function sway(read, tell) {
   const { drawing } = view;
   const worker = startWorker(await read("worker"));
   const playback = new Playback();
-  const state = { playing: true, motion: 0, failed: null, rate: null, pull: null, stale: false, message: "", count: 0 };
+  const state = { playing: true, motion: 0, failed: null, rate: null, pull: null, stale: false, message: "", count: 0, solver: "", why: null };
   const say = (/** @type {any} */ message, /** @type {Transferable[]} */ given = []) => worker.postMessage(message, given);
   const answers = []; // promises of tests, see `advance`
 
@@ -47,6 +47,7 @@ export async function sway(read, tell) {
       playback.add(data, performance.now() / 1000, data.ended);
     } else if (data.kind === "grabbed") grabbed(data);
     else if (data.kind === "done") answers.shift()?.(data);
+    else if (data.kind === "solver") [state.solver, state.why] = [data.name, data.why];
     else if (data.kind === "failed") {
       state.failed = data.why;
       setPlaying(false);
@@ -58,7 +59,7 @@ export async function sway(read, tell) {
     explain();
   };
   const block = await read("solver");
-  say({ kind: "load", bytes: block }, [block.buffer]);
+  say({ kind: "load", bytes: block, solver: settings.solver }, [block.buffer]);
   await view.open();
   const { camera, controls } = view;
   if (settings.view) {
@@ -73,6 +74,7 @@ export async function sway(read, tell) {
     const wanted = settings.speed;
     const late = state.playing && state.rate !== null && state.rate < BEHIND * wanted;
     let sentence = late ? `This device is too slow for real time: the motion runs at ${state.rate.toFixed(2)} of it.` : "";
+    if (!sentence && state.why && settings.solver === "webgpu") sentence = `WebGPU is not used, as ${state.why}: the processor computes the motion.`;
     if (state.failed) sentence = `The motion has stopped, as ${state.failed}: press Reset.`;
     if (sentence === state.message) return;
     state.message = sentence;
@@ -122,7 +124,9 @@ export async function sway(read, tell) {
 
   function sendAll() {
     sendWind();
+    explain();
     say({ kind: "stiffness", factor: settings.stiffness });
+    say({ kind: "solver", which: settings.solver });
     run();
     showAll();
   }
@@ -309,6 +313,10 @@ export async function sway(read, tell) {
     first: () => view.first,
     time: () => playback.newest,
     rate: () => state.rate,
+    solver: () => state.solver, // webgpu, webassembly or javascript
+    why: () => state.why, // it is not WebGPU
+    // As if the graphics card were lost.
+    lose: () => say({ kind: "lose" }),
     playing: () => state.playing,
     pulled: () => state.pull?.held ?? false,
     pause: () => setPlaying(false),

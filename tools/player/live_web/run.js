@@ -10,13 +10,13 @@ let last = new Float32Array();
 globalThis.self = {
   postMessage: (message) => {
     if (message.kind === "state") last = message.moved;
-    else answers.push(message);
+    else if (message.kind !== "solver") answers.push(message);
   },
 };
 runInThisContext(readFileSync(worker, "utf8"));
 for (const data of [{ kind: "load", bytes: new Uint8Array(readFileSync(block)), plain: plain === "plain" }, ...JSON.parse(messages)]) {
   const [before, known] = [process.cpuUsage(), answers.length];
-  globalThis.self.onmessage({ data });
+  await globalThis.self.onmessage({ data });
   const { user, system } = process.cpuUsage(before);
   for (const answer of answers.slice(known)) answer.cpu = (user + system) / 1e6; // s
 }

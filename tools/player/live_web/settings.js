@@ -1,11 +1,15 @@
-// What a visitor has set, as the link of the page keeps it: #wind=4,0,0&gusts=0.5&stiffness=2&speed=0.25&view=x,y,z,x,y,z
+// What a visitor has set, as the link of the page keeps it: #wind=4,0,0&gusts=0.5&stiffness=2&speed=0.25&view=x,y,z,x,y,z, and
+// where it is computed: solver=webgpu or solver=worker
 
 /**
- * @typedef {{wind: number[] | null, gusts: number, stiffness: number, speed: number, view: number[] | null}} Settings
+ * @typedef {{wind: number[] | null, gusts: number, stiffness: number, speed: number, view: number[] | null,
+ *   solver: string}} Settings
  */
 
 /** @type {Settings} */
-export const USUAL = { wind: null, gusts: 1, stiffness: 1, speed: 1, view: null };
+export const USUAL = { wind: null, gusts: 1, stiffness: 1, speed: 1, view: null, solver: "auto" };
+
+const SOLVERS = ["webgpu", "worker"];
 
 /** The least and the largest value of each, which the sliders have, too. */
 export const LIMITS = { gusts: [0, 3], stiffness: [0.125, 4], speed: [0.05, 1] };
@@ -28,12 +32,15 @@ export function readSettings(text) {
   }
   const view = numbers("view", 6);
   if (view && Math.hypot(view[0] - view[3], view[1] - view[4], view[2] - view[5]) > 0) found.view = view;
+  const solver = given.get("solver");
+  if (solver !== null && SOLVERS.includes(solver)) found.solver = solver;
   return found;
 }
 
 /** @param {Settings} settings @returns {string} without the leading # */
 export function writeSettings(settings) {
-  const text = (value) => [value].flat().map((part) => String(Number(part.toFixed(3)))).join(",");
+  const one = (part) => (typeof part === "number" ? String(Number(part.toFixed(3))) : part);
+  const text = (value) => [value].flat().map(one).join(",");
   return Object.keys(USUAL)
     .filter((name) => settings[name] !== null && settings[name] !== USUAL[name])
     .map((name) => `${name}=${text(settings[name])}`)

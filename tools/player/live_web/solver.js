@@ -4,18 +4,18 @@ import { Contact } from "./contact.js";
 import { largestSquare, stress, waveModulus } from "./laws.js";
 import { Wind } from "./wind.js";
 
-const LOOKS = 8; // checks of the Courant number in a frame, as in simulation/stepper.py
+export const LOOKS = 8; // checks of the Courant number in a frame, as in simulation/stepper.py
 const LIMIT = 0.5; // a frame that exceeds it is repeated with shorter substeps
 const RETRIES = 4;
 const SAMPLES = 5; // winds of a frame that the drag is bounded with
-const WIDE = 4; // numbers of a node, of which the last one means nothing
+export const WIDE = 4; // numbers of a node, of which the last one means nothing
 const MOST_GROWTH = 1000; // a frame that takes this many times the substeps of the first has diverged
 
 /** @typedef {{held: Float64Array, offset: Float64Array, target: Float64Array}} Pull See gaussian_swaying/viewer/pull.py. */
 
 const REACH = 0.06; // radius of what is pulled, as a share of the longest side
-const QUICK = 40; // 1/s
-const STRONGEST = 400; // m/s²
+export const QUICK = 40; // 1/s
+export const STRONGEST = 400; // m/s²
 
 export class Solver {
   /** @param {{head: any, arrays: Record<string, any>}} block */
@@ -73,7 +73,18 @@ export class Solver {
    * @returns {number} substeps
    */
   advance() {
-    const { frameDt, dx } = this.head;
+    const frame = this.frame();
+    let told = frame.next();
+    while (!told.done) told = frame.next(this.roll(this.head.frameDt / told.value, told.value));
+    return told.value;
+  }
+
+  /**
+   * The trials of a frame: yields its substeps, and gets what `roll` returned for them.
+   * @returns {Generator<number, number, number>}
+   */
+  *frame() {
+    const { dx } = this.head;
     const cfl = this.courant();
     const { before } = this;
     before.displacement.set(this.displacement);
@@ -83,7 +94,7 @@ export class Solver {
     this.first ??= steps;
     for (let retry = 0; ; retry++) {
       if (steps > MOST_GROWTH * this.first) throw new Error("the motion has become too fast to be computed");
-      const courant = this.roll(frameDt / steps, steps) / dx;
+      const courant = (yield steps) / dx;
       if (courant <= Math.max(LIMIT, 1.25 * cfl) || this.head.substep !== null) return steps;
       if (retry === RETRIES) {
         if (courant <= 2) return steps;
@@ -360,10 +371,16 @@ export class Solver {
     }
   }
 
-  /** Stops the nodes at or behind a plane, as plane_velocity in mpm/boundaries/plane.py. */
-  stop({ point, normal: [n0, n1, n2], kind, friction, start, end }) {
+  /** Whether a boundary acts now. */
+  acts({ start, end }) {
     const now = this.time + 1e-9;
-    if (now < start || (end !== null && now >= end)) return;
+    return now >= start && (end === null || now < end);
+  }
+
+  /** Stops the nodes at or behind a plane, as plane_velocity in mpm/boundaries/plane.py. */
+  stop(plane) {
+    if (!this.acts(plane)) return;
+    const { point, normal: [n0, n1, n2], kind, friction } = plane;
     const { velocity: V, shift: S } = this;
     const { inverseMass, nodeRest } = this.a;
     for (let k = 0; k < this.nodes - 1; k++) {

@@ -2,6 +2,7 @@
 import { readBlock } from "./block.js";
 import { LanesSolver } from "./lanes.js";
 import { Solver } from "./solver.js";
+import { GpuSolver, NoWebGPU, openGpu } from "./webgpu.js";
 
 const BEHIND = 0.25; // s that it may be late before it stops trying to catch up
 const WINDOW = 2000; // ms, over which the speed is measured
@@ -12,6 +13,11 @@ const BREATH = 4; // ms between frames, in which it hears what the page says
 
 /** @type {Solver} */
 let solver;
+/** @type {{head: any, arrays: Record<string, any>}} */
+let block;
+let plain = false; // without WebAssembly
+let wanted = "auto"; // or "webgpu" or "worker": where the motion is computed
+let chain = Promise.resolve(); // one thing after the other, as frames on a graphics card take their time
 let on = false;
 let speed = 1; // simulated seconds per second that are wanted
 let motion = 0; // counts the starts from rest
@@ -24,8 +30,8 @@ let next;
 
 const post = (/** @type {any} */ message, /** @type {Transferable[]} */ moved = []) => self.postMessage(message, moved);
 
-/** The fastest solver that this browser has, or with `plain` that in JavaScript. */
-function made(block, plain = false) {
+/** The fastest solver on the processor that this browser has, or with `plain` that in JavaScript. */
+function made() {
   if (!plain && block.head.lanes) {
     try {
       return new LanesSolver(block);
@@ -34,6 +40,55 @@ function made(block, plain = false) {
     }
   }
   return new Solver(block);
+}
+
+const queue = (/** @type {() => any} */ task) => (chain = chain.then(task).catch(({ message }) => post({ kind: "failed", why: message })));
+
+/** Says what computes, and why it is not WebGPU, once that is known. @param {string | null} why */
+function tell(why = null) {
+  const name = solver instanceof GpuSolver ? "webgpu" : solver instanceof LanesSolver ? "webassembly" : "javascript";
+  post({ kind: "solver", name, why });
+}
+
+/** Another solver goes on with the motion. @param {Solver} next @param {string | null} why */
+function takeOver(next, why = null) {
+  for (const name of ["displacement", "velocity"]) next[name].set(solver[name]);
+  const { time, substep, stiffness, hurried, pull, wind, first } = solver;
+  Object.assign(next, { time, substep, stiffness, hurried, pull, wind, first });
+  if (solver instanceof GpuSolver) solver.device.destroy();
+  solver = next;
+  past = [];
+  tell(why);
+}
+
+/** Computes as is wanted, as far as possible; until WebGPU is there, the processor does. */
+async function choose() {
+  if (wanted === "worker") {
+    if (solver instanceof GpuSolver) takeOver(made());
+    return;
+  }
+  if (solver instanceof GpuSolver) return;
+  try {
+    const found = await openGpu(block, wanted === "webgpu");
+    queue(() => {
+      if (wanted === "worker" || solver instanceof GpuSolver) return found.device.destroy();
+      takeOver(found);
+      found.device.lost.then(() => queue(() => solver === found && takeOver(made(), found.broken)));
+    });
+  } catch (error) {
+    tell(/** @type {Error} */ (error).message);
+  }
+}
+
+/** Advances by a frame; where the graphics card fails, the processor goes on. */
+async function forward() {
+  try {
+    return await solver.advance();
+  } catch (error) {
+    if (!(error instanceof NoWebGPU)) throw error;
+    takeOver(made(), error.message);
+    return solver.advance();
+  }
 }
 
 function show() {
@@ -60,7 +115,7 @@ function hurry() {
   past = [];
 }
 
-function pace() {
+async function pace() {
   clearTimeout(next);
   if (!on || !solver) return;
   const now = performance.now();
@@ -68,12 +123,12 @@ function pace() {
   const due = anchor.time + ((now - anchor.now) / 1000) * speed;
   if (due - solver.time > BEHIND * speed) anchor = { now, time: solver.time };
   if (solver.time > due) {
-    next = setTimeout(pace, Math.max(BREATH, ((solver.time - due) / speed) * 1000));
+    next = setTimeout(queue, Math.max(BREATH, ((solver.time - due) / speed) * 1000), pace);
     return;
   }
   const began = performance.now();
   try {
-    solver.advance();
+    await forward();
   } catch (error) {
     on = false;
     post({ kind: "failed", why: /** @type {Error} */ (error).message });
@@ -84,25 +139,34 @@ function pace() {
   while (past.length > LEAST && after - past[0][0] > WINDOW) past.shift();
   hurry();
   show();
-  next = setTimeout(pace, BREATH);
+  next = setTimeout(queue, BREATH, pace);
 }
 
 function restart() {
   anchor = null;
   past = [];
-  pace();
+  return pace();
 }
 
 /** @type {Record<string, (given: any) => void>} */
 const does = {
-  load({ bytes, plain }) {
-    solver = made(readBlock(bytes), plain);
+  load(given) {
+    block = readBlock(given.bytes);
+    ({ plain = false, solver: wanted = "auto" } = given);
+    solver = made();
     show();
+    tell();
+    choose();
+  },
+  solver({ which }) {
+    if (which === wanted) return;
+    wanted = which;
+    choose();
   },
   run(given) {
     on = given.on;
     speed = given.speed;
-    restart();
+    return restart();
   },
   wind({ flow, gusts }) {
     solver.wind.steady = flow;
@@ -124,23 +188,20 @@ const does = {
     solver.reset();
     motion++;
     show();
-    restart();
+    return restart();
   },
   // for tests and measurements
-  frames({ count, hurried }) {
+  async frames({ count, hurried }) {
     solver.hurried = !!hurried;
     const began = performance.now();
     let substeps = 0;
-    for (let k = 0; k < count; k++) substeps += solver.advance();
+    for (let k = 0; k < count; k++) substeps += await forward();
     show();
-    post({ kind: "done", lanes: solver instanceof LanesSolver, substeps, seconds: (performance.now() - began) / 1000, simulated: count * solver.head.frameDt });
+    post({ kind: "done", gpu: solver instanceof GpuSolver, lanes: solver instanceof LanesSolver, substeps, seconds: (performance.now() - began) / 1000, simulated: count * solver.head.frameDt });
+  },
+  lose() {
+    if (solver instanceof GpuSolver) solver.device.destroy();
   },
 };
 
-self.onmessage = ({ data }) => {
-  try {
-    does[data.kind](data);
-  } catch (error) {
-    post({ kind: "failed", why: /** @type {Error} */ (error).message });
-  }
-};
+self.onmessage = ({ data }) => queue(() => does[data.kind](data));

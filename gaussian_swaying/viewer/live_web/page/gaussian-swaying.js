@@ -1,8 +1,8 @@
 // <gaussian-swaying src="flag.html" wind="4,0,0" view="0,-2,0,0,0,0"></gaussian-swaying>: a page of export --live-web within another page.
 // Attributes, besides src: wind (x, y and z, m/s), gusts, stiffness and speed (1 as in the page), view (place of the camera, and what it
-// looks at), as in the link that the page's button copies.
+// looks at), and solver (webgpu or worker), as in the link that the page's button copies.
 (() => {
-  const SETTINGS = ["wind", "gusts", "stiffness", "speed", "view"];
+  const SETTINGS = ["wind", "gusts", "stiffness", "speed", "view", "solver"];
 
   class GaussianSwaying extends HTMLElement {
     static observedAttributes = ["src", ...SETTINGS];

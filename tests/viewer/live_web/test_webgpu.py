@@ -1,0 +1,197 @@
+"""The solver in compute shaders, on an adapter in software, against the package's own run.
+
+Covers: viewer.live_web.block.
+"""
+
+import base64
+import time
+
+import pytest
+import torch
+
+from gaussian_swaying.viewer.live_web.block import check, pack_solver
+from gaussian_swaying.viewer.live_web.page import PAGE, write_live_web
+
+from .conftest import apart, asked_of_a_network, drawn_apart, moved_means, opened
+from .test_block import CASES, run
+
+LOST = "WebGPU is not used, as {}: the processor computes the motion."
+
+ASK = """async ([program, block, messages]) => {
+  const url = URL.createObjectURL(new Blob([program], { type: "text/javascript" }));
+  const worker = new Worker(url);
+  const answers = [];
+  let [moved, ready] = [null, false];
+  const result = await new Promise((resolve, reject) => {
+    worker.onerror = (event) => reject(new Error(event.message));
+    worker.onmessage = ({ data }) => {
+      if (data.kind === "state") moved = Array.from(data.moved);
+      else answers.push(data);
+      if (!ready && data.kind === "solver" && (data.name === "webgpu" || data.why)) {
+        ready = true;
+        for (const message of messages) worker.postMessage(message);
+      }
+      if (data.kind === "failed" || data.kind === "done") resolve({ answers, moved });
+    };
+    const bytes = Uint8Array.from(atob(block), (letter) => letter.charCodeAt(0));
+    worker.postMessage({ kind: "load", bytes, solver: "webgpu" });
+  });
+  worker.terminate();
+  return result;
+}"""
+
+
+@pytest.fixture(scope="module")
+def context(shading_browser, tmp_path_factory):
+    """A context of a Chromium with WebGPU, and an empty page of it."""
+    empty = tmp_path_factory.mktemp("empty") / "empty.html"
+    empty.write_text("<!doctype html><title>Empty</title>")
+    made = shading_browser.new_context(viewport={"width": 600, "height": 400})
+    made.empty = made.new_page()
+    made.empty.goto(empty.as_uri())
+    if not made.empty.evaluate("navigator.gpu?.requestAdapter().then((adapter) => !!adapter)"):
+        pytest.skip("this Chromium offers WebGPU no adapter in software")
+    return made
+
+
+@pytest.fixture
+def on_gpu(context):
+    """Runs the worker alone with WebGPU: its answers but the first, and the last nodes (M, 3)."""
+
+    def on_gpu(simulation, *messages, before=""):
+        check(simulation)
+        nodes = simulation.scene.follow.nodes(simulation.start())
+        block = base64.b64encode(pack_solver(simulation, nodes)).decode()
+        program = before + (PAGE / "worker.min.js").read_text()
+        told = context.empty.evaluate(ASK, [program, block, list(messages)])
+        return told["answers"][1:], torch.tensor(told["moved"]).reshape(len(nodes), 4)[:, :3]
+
+    return on_gpu
+
+
+@pytest.fixture(scope="module")
+def written(make, tmp_path_factory):
+    target = tmp_path_factory.mktemp("page") / "sheet.html"
+    write_live_web(make(), "sheet", target)
+    return target
+
+
+@pytest.fixture
+def show(context, until):
+    pages = []
+
+    def show(path, settings=""):
+        pages.append(opened(context, path, settings, until))
+        return pages[-1]
+
+    yield show
+    for page in pages:
+        page.close()
+
+
+LEFT_OUT = {"cross flow, fixed substep", "one patch a point"}  # their parts are in other cases
+
+
+@pytest.mark.parametrize("name", [name for name in CASES if name not in LEFT_OUT])
+def test_laws_forces_and_boundaries(make, on_gpu, name):
+    simulation = make(**CASES[name])
+    state, steps = run(simulation, 10)
+    told, moved = on_gpu(simulation, {"kind": "frames", "count": 10})
+    assert [told[0]["name"], told[-1]["gpu"]] == ["webgpu", True]
+    error, motion = apart(simulation, state, moved)
+    assert motion > 5e-3
+    assert error < 1e-3
+    assert abs(told[-1]["substeps"] - steps) <= 0.02 * steps
+
+
+def test_what_the_visitor_does(make, on_gpu):
+    """Another wind and stiffness, also after a reset, are those of another configuration; a pull moves a place."""
+    wind = {"kind": "wind", "flow": [0.0, -2.0, 0.0], "gusts": 0.0}
+    frames, stiffer = {"kind": "frames", "count": 10}, {"kind": "stiffness", "factor": 2.0}
+    _, moved = on_gpu(
+        make(),
+        stiffer,
+        {"kind": "grab", "token": 1, "eye": [2.0, 2.0, 0.0], "ray": [0.0, -1.0, 0.0], "wide": 0.01},
+        wind,
+        {"kind": "reset"},
+        frames,
+    )
+    same = make(wind={"flow": [0.0, -2.0, 0.0], "modulations": []}, material={"E": 4e4})
+    assert apart(same, run(same, 10)[0], moved)[0] < 1e-3
+    grab = {"kind": "grab", "token": 7, "eye": [0.2, 2.0, 0.0], "ray": [0.0, -1.0, 0.0], "wide": 0.01}
+    simulation = make()
+    told, moved = on_gpu(simulation, grab, {"kind": "aim", "target": [0.2, -0.15, 0.0]}, frames)
+    assert told[-1]["gpu"]
+    pulled = moved_means(simulation, simulation.start(), moved)[:, 1]
+    assert -0.2 < float(pulled.min()) < -0.1
+
+
+def test_a_page_after_two_seconds_and_after_its_device_is_lost(show, written, make, until):
+    """Within 1 % of the motion. Then the processor goes on with the motion, and the page says so."""
+    page = show(written, "#solver=webgpu")
+    page.evaluate("windPage.complete.then(() => windPage.pause())")
+    until(lambda: page.evaluate("windPage.solver()") == "webgpu")
+    page.evaluate("windPage.reset()")
+    assert page.evaluate("windPage.advance(50)")["gpu"]
+    error, motion = drawn_apart(page, make())
+    assert motion > 0.1
+    assert error < 0.01
+    assert not page.locator("#note").is_visible()
+    page.evaluate("windPage.lose()")
+    told = page.evaluate("windPage.advance(10)")
+    assert told["lanes"]
+    assert page.evaluate("windPage.solver()") == "webassembly"
+    assert page.evaluate("windPage.time()") == pytest.approx(2.4)
+    assert drawn_apart(page, make())[0] < 0.01
+    assert page.locator("#note").inner_text() == LOST.format(page.evaluate("windPage.why()"))
+    assert asked_of_a_network(page) == []
+
+
+def test_a_device_that_is_lost_while_the_page_plays(show, written, until):
+    page = show(written, "#solver=webgpu")
+    until(lambda: page.evaluate("windPage.solver()") == "webgpu")
+    page.evaluate("windPage.lose()")
+    until(lambda: page.evaluate("windPage.solver()") == "webassembly")
+    stopped = page.evaluate("windPage.time()")
+    until(lambda: page.evaluate("windPage.time()") > stopped)
+    assert page.evaluate("windPage.playing()")
+
+
+def test_chosen_by_hand(show, written, until):
+    """By itself a page takes no adapter in software, and says nothing; another solver goes on with the motion."""
+    page = show(written, "")
+    until(lambda: page.evaluate("windPage.why()") == "it would run on the processor")
+    assert page.evaluate("windPage.solver()") == "webassembly"
+    assert not page.locator("#note").is_visible()
+    for name, solver in {"webgpu": "webgpu", "worker": "webassembly"}.items():
+        before = page.evaluate("windPage.time()")
+        page.evaluate(f"location.hash = 'solver={name}'")
+        until(lambda solver=solver: page.evaluate("windPage.solver()") == solver)
+        until(lambda before=before: page.evaluate("windPage.time()") > before)
+        assert f"solver={name}" in page.evaluate("windPage.link()")
+    assert page.told == []
+    page = show(written, "#solver=worker")
+    time.sleep(0.3)
+    assert [page.evaluate("windPage.solver()"), page.evaluate("windPage.why()")] == ["webassembly", None]
+
+
+BROKEN = "GPUDevice.prototype.createComputePipelineAsync = () => Promise.reject(new Error('no pipeline'));"
+ABSENT = "Object.defineProperty(navigator, 'gpu', { value: undefined });"
+OBSTACLE = {"class_path": "BallObstacle", "init_args": {"center": [0.25, 0.15, 0.1], "radius": 0.1}}
+REASONS = {
+    "its device failed: no pipeline": (BROKEN, {}),
+    "this browser does not offer it": (ABSENT, {}),
+    "the scene has obstacles": (
+        "",
+        {"solver": {"boundaries": [CASES["clamp and plane"]["solver"]["boundaries"][0], OBSTACLE]}},
+    ),
+}
+
+
+@pytest.mark.parametrize("why", REASONS)
+def test_where_there_is_no_webgpu_the_processor_computes(make, on_gpu, why):
+    before, changes = REASONS[why]
+    told, moved = on_gpu(make(**changes), {"kind": "frames", "count": 1}, before=before)
+    assert told[0] == {"kind": "solver", "name": "webassembly", "why": why}
+    assert told[-1]["lanes"]
+    assert float(moved.norm(dim=-1).max()) > 0

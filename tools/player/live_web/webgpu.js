@@ -1,0 +1,318 @@
+// The solver in compute shaders, where the browser has WebGPU. It computes frame by frame: the state at the start of each is uploaded, and
+// that at its end read back, so that all else is as in solver.js and another solver can go on where this one stops.
+import { Solver, QUICK, STRONGEST, LOOKS, WIDE } from "./solver.js";
+import { areaVectors, tensorOf } from "./lanes.js";
+import shader from "./substep.wgsl";
+
+const GROUP = 64; // points or nodes that are worked on together
+const BATCH = 64; // substeps that are sent at once
+const STRIDE = 256; // bytes between the numbers of two substeps
+const MOST_GROUPS = 65535;
+const SOFTWARE = /swiftshader|llvmpipe|lavapipe|basic render|warp/i;
+
+/** Buffers by their number in the shader; the second says whether it writes to them. @type {Record<string, [number, boolean]>} */
+const BUFFERS = {
+  points: [0, false], cellNodes: [1, false], vectors: [2, false], held: [3, false], displacement: [4, true], velocity: [5, true],
+  stresses: [6, true], cellStart: [7, false], sums: [8, true], nodes: [9, false], entries: [10, false], planes: [11, false],
+  rows: [12, false], rates: [13, true], affected: [14, false], push: [15, false], speeds: [16, true], fastest: [17, true],
+};
+
+/** What each pass reads and writes: at most eight buffers, which every device has. */
+const PASSES = {
+  particles: "points cellNodes vectors held displacement velocity stresses",
+  spread: "points stresses cellStart sums",
+  accelerate: "displacement velocity sums nodes entries planes",
+  rate: "velocity rows rates",
+  hold: "displacement velocity rates affected push",
+  look: "points cellNodes displacement velocity speeds fastest",
+};
+
+const PLANE_KINDS = ["sticky", "slip", "separate"];
+
+/** Says that WebGPU cannot be used, or no longer; its message follows "as". */
+export class NoWebGPU extends Error {}
+
+/** Why a scene is not simulated in compute shaders; null if it is. @returns {string | null} */
+export function uncovered({ head, arrays }) {
+  if (head.obstacles.length) return "the scene has obstacles";
+  if (head.planes.length > 32) return "the scene has more than 32 planes";
+  if (27 * (arrays.cellStart.length - 1) > GROUP * MOST_GROUPS) return "the scene has too many points";
+  return null;
+}
+
+/**
+ * @param {{head: any, arrays: Record<string, any>}} block @param {boolean} byHand also on an adapter that is software
+ * @returns {Promise<GpuSolver>} Rejects with NoWebGPU.
+ */
+export async function openGpu(block, byHand) {
+  const why = uncovered(block);
+  if (why) throw new NoWebGPU(why);
+  const gpu = globalThis.navigator?.gpu;
+  const adapter = await gpu?.requestAdapter();
+  if (!adapter) throw new NoWebGPU("this browser does not offer it");
+  const info = adapter.info ?? {};
+  const names = `${info.vendor} ${info.architecture} ${info.device} ${info.description}`;
+  if (!byHand && (info.isFallbackAdapter || adapter.isFallbackAdapter || SOFTWARE.test(names))) throw new NoWebGPU("it would run on the processor");
+  let device;
+  try {
+    device = await adapter.requestDevice();
+    device.pushErrorScope("out-of-memory");
+    device.pushErrorScope("validation");
+    const solver = new GpuSolver(block, device);
+    await solver.compile();
+    const errors = [await device.popErrorScope(), await device.popErrorScope()];
+    for (const error of errors) if (error) throw error;
+    return solver;
+  } catch (error) {
+    device?.destroy();
+    throw new NoWebGPU(`its device failed: ${/** @type {Error} */ (error).message}`);
+  }
+}
+
+export class GpuSolver extends Solver {
+  /** @param {{head: any, arrays: Record<string, any>}} block @param {any} device GPUDevice */
+  constructor(block, device) {
+    super(block);
+    this.device = device;
+    /** Why the device cannot go on. @type {string | null} */
+    this.broken = null;
+    device.lost.then(({ message }) => (this.broken ??= message || "its device was lost"));
+    device.onuncapturederror = ({ error }) => (this.broken ??= error.message);
+    const { nodes, points, cells } = this;
+    this.displacement = new Float32Array(WIDE * nodes);
+    this.velocity = new Float32Array(WIDE * nodes);
+    this.before = { displacement: this.displacement.slice(), velocity: this.velocity.slice() };
+    this.counts = { particles: points, spread: 27 * cells, accelerate: nodes - 1, rate: this.head.rows, hold: this.a.affected.length, look: points };
+    /** @type {any} what the last pull uploaded */
+    this.uploaded = null;
+    this.fill();
+    this.reset();
+  }
+
+  /** Makes the buffers, with all that is constant. */
+  fill() {
+    const { a, head, nodes, points, cells, device } = this;
+    const record = { points: new Float32Array(20 * points), nodes: new Float32Array(8 * nodes), planes: new Float32Array(8 * head.planes.length) };
+    const whole = { points: new Uint32Array(record.points.buffer), nodes: new Uint32Array(record.nodes.buffer), planes: new Uint32Array(record.planes.buffer) };
+    const vectors = areaVectors(this);
+    const table = new Float32Array(4 * vectors.reduce((sum, own) => sum + own.length / 3, 0));
+    let row = 0;
+    for (let p = 0; p < points; p++) {
+      const at = 20 * p;
+      const tensor = tensorOf(this, p);
+      const own = vectors[p];
+      record.points.set(a.fraction.subarray(3 * p, 3 * p + 3), at);
+      record.points.set([a.volume[p], a.mass[p], a.mu[p], a.lam[p]], at + 4);
+      record.points[at + 9] = own.length ? a.area[p] : 0;
+      record.points.set([tensor[0], tensor[1], tensor[2], tensor[0] + tensor[3] + tensor[5], tensor[3], tensor[4], tensor[5]], at + 12);
+      whole.points[at + 3] = this.cell[p];
+      whole.points[at + 8] = a.law[p];
+      whole.points[at + 10] = row;
+      for (let k = 0; k < own.length; k += 3) table.set(own.slice(k, k + 3), 4 * row++);
+      whole.points[at + 11] = row;
+    }
+    const ends = new Uint32Array(nodes + 1); // of the entries of each node
+    for (const node of a.cellNodes) ends[node + 1]++;
+    for (let k = 0; k < nodes; k++) ends[k + 1] += ends[k];
+    const next = ends.slice();
+    const entries = new Uint32Array(27 * cells);
+    a.cellNodes.forEach((node, k) => (entries[next[node]++] = k));
+    for (let k = 0; k < nodes; k++) {
+      const at = 8 * k;
+      if (a.nodeRest.length) record.nodes.set(a.nodeRest.subarray(3 * k, 3 * k + 3), at);
+      record.nodes.set([a.inverseMass[k], a.nodeDamping[k] ?? 0], at + 3);
+      whole.nodes.set([a.held[k] ?? 0, ends[k], ends[k + 1]], at + 5);
+    }
+    head.planes.forEach(({ point, normal, kind, friction }, k) => {
+      record.planes.set([...point, friction, ...normal], 8 * k);
+      whole.planes[8 * k + 7] = PLANE_KINDS.indexOf(kind);
+    });
+    const rows = new Float32Array(2 * a.rowNode.length);
+    const rowNodes = new Uint32Array(rows.buffer);
+    a.rowNode.forEach((node, k) => (rowNodes[2 * k] = node));
+    a.rowWeight.forEach((weight, k) => (rows[2 * k + 1] = weight));
+    const usage = globalThis.GPUBufferUsage;
+    /** @type {Record<string, any>} */
+    this.buffers = {};
+    /** @param {string} name @param {ArrayBufferView | number} content or its size [bytes] */
+    const make = (name, content, use = usage.STORAGE | usage.COPY_DST | usage.COPY_SRC) => {
+      const bytes = typeof content === "number" ? content : content.byteLength;
+      this.buffers[name] = device.createBuffer({ size: Math.max(96, 16 * Math.ceil(bytes / 16)), usage: use });
+      if (typeof content !== "number") device.queue.writeBuffer(this.buffers[name], 0, content);
+    };
+    make("points", record.points);
+    make("cellNodes", Uint32Array.from(a.cellNodes));
+    make("vectors", table);
+    make("held", 16 * points);
+    make("displacement", 16 * nodes);
+    make("velocity", 16 * nodes);
+    make("stresses", 64 * points);
+    make("cellStart", Uint32Array.from(a.cellStart));
+    make("sums", 27 * 16 * cells * (head.planes.length ? 2 : 1));
+    make("nodes", record.nodes);
+    make("entries", entries);
+    make("planes", record.planes);
+    make("rows", rows);
+    make("rates", 16 * head.rows);
+    make("affected", Uint32Array.from(a.affected));
+    make("push", Float32Array.from(a.push));
+    make("speeds", 4 * points);
+    make("fastest", 8 * (LOOKS + 1));
+    make("now", STRIDE * (BATCH + 1), usage.UNIFORM | usage.COPY_DST);
+    this.sizes = { displacement: 16 * nodes, velocity: 16 * nodes, speeds: 4 * points, fastest: 8 * (LOOKS + 1) };
+    make("found", Object.values(this.sizes).reduce((sum, size) => sum + size, 0), usage.MAP_READ | usage.COPY_DST);
+  }
+
+  /** Makes the pipelines. */
+  async compile() {
+    const { device, head, aero, counts } = this;
+    const module = device.createShaderModule({ code: shader });
+    for (const { type, lineNum, message } of (await module.getCompilationInfo()).messages)
+      if (type === "error") throw new Error(`${message} in line ${lineNum} of its shader`);
+    const constants = {
+      POINTS: this.points, SPREAD: counts.spread, NODES: counts.accelerate, ROWS: counts.rate, AFFECTED: counts.hold,
+      PLANES: head.planes.length, INVERSE: 1 / head.dx, GRAVITY_X: head.gravity[0], GRAVITY_Y: head.gravity[1],
+      GRAVITY_Z: head.gravity[2], DAMPING: head.damping, VISCOUS: head.viscous, WINDY: !this.idle, GROUPED: head.grouped,
+      DRAG: aero.drag, FRICTION: aero.friction, LIFT: aero.lift, AIR: aero.airDensity, AERO_LAW: aero.law, LIFTED: aero.lifted,
+      UNIT_TANGENT: aero.unitTangent, IMPLICIT: aero.implicit, MOST_AREA: Math.min(aero.maxAreaRatio, 1e30), QUICK, STRONGEST,
+    };
+    const visibility = globalThis.GPUShaderStage.COMPUTE;
+    const layoutOf = (entries) => device.createBindGroupLayout({ entries: entries.map((entry) => ({ visibility, ...entry })) });
+    const changing = layoutOf([{ binding: 0, buffer: { type: "uniform", hasDynamicOffset: true } }]);
+    this.changing = device.createBindGroup({ layout: changing, entries: [{ binding: 0, resource: { buffer: this.buffers.now, size: STRIDE } }] });
+    /** @type {Record<string, any>} */
+    this.passes = {};
+    await Promise.all(
+      Object.entries(PASSES).map(async ([name, list]) => {
+        const used = list.split(" ");
+        const type = (written) => ({ type: written ? "storage" : "read-only-storage" });
+        const own = layoutOf(used.map((buffer) => ({ binding: BUFFERS[buffer][0], buffer: type(BUFFERS[buffer][1]) })));
+        const group = device.createBindGroup({
+          layout: own,
+          entries: used.map((buffer) => ({ binding: BUFFERS[buffer][0], resource: { buffer: this.buffers[buffer] } })),
+        });
+        const layout = device.createPipelineLayout({ bindGroupLayouts: [own, changing] });
+        const compute = { module, entryPoint: name, constants };
+        const pipeline = await device.createComputePipelineAsync({ layout, compute });
+        this.passes[name] = { pipeline, group, groups: Math.ceil(counts[name] / GROUP) };
+      }),
+    );
+  }
+
+  /** See Solver; resolves with the substeps, and rejects with NoWebGPU if the device fails. */
+  // @ts-ignore: the others do it at once
+  async advance() {
+    const [time, substep] = [this.time, this.substep];
+    try {
+      if (this.seen.time !== time) await this.roll(0, 0);
+      const frame = this.frame();
+      let told = frame.next();
+      while (!told.done) told = frame.next(await this.roll(this.head.frameDt / told.value, told.value));
+      return told.value;
+    } catch (error) {
+      [this.time, this.substep] = [time, substep]; // those of the displacements
+      throw error;
+    }
+  }
+
+  /** The last measurement is there; the stress is the stiffness times that in the file, and so is the square of the wave. */
+  look() {
+    this.seen.wave *= Math.sqrt(this.stiffness / this.seen.stiffness);
+    this.seen.stiffness = this.stiffness;
+  }
+
+  /** See Solver. */
+  // @ts-ignore: the others do it at once
+  async roll(dt, steps) {
+    const { device, buffers, pull, head } = this;
+    const { queue } = device;
+    queue.writeBuffer(buffers.displacement, 0, this.displacement);
+    queue.writeBuffer(buffers.velocity, 0, this.velocity);
+    if (pull !== null && pull !== this.uploaded) {
+      this.uploaded = pull;
+      const held = Float32Array.from({ length: 4 * this.points }, (_, k) => {
+        const [p, m] = [k >> 2, k & 3];
+        return m === 3 ? pull.held[p] : pull.offset[3 * p + m] - this.a.rest[3 * p + m];
+      });
+      queue.writeBuffer(buffers.held, 0, held);
+    }
+    const every = Math.max(1, Math.ceil(steps / LOOKS));
+    const numbers = new Float32Array((STRIDE / 4) * (BATCH + 1));
+    const whole = new Uint32Array(numbers.buffer);
+    let slot = 0;
+    for (let from = 0; from <= steps; from += BATCH) {
+      const encoder = device.createCommandEncoder();
+      if (from === 0) encoder.clearBuffer(buffers.fastest);
+      const pass = encoder.beginComputePass();
+      const run = (/** @type {string} */ name, /** @type {number} */ at) => {
+        const { pipeline, group, groups } = this.passes[name];
+        if (groups === 0) return;
+        pass.setPipeline(pipeline);
+        pass.setBindGroup(0, group);
+        pass.setBindGroup(1, this.changing, [at]);
+        pass.dispatchWorkgroups(groups);
+      };
+      for (let k = from; k < Math.min(from + BATCH, steps + 1); k++) {
+        const at = (STRIDE / 4) * (k - from);
+        const looked = k === steps || (k > 0 && k % every === 0);
+        whole[at + 11] = slot;
+        if (looked) {
+          slot++;
+          run("look", 4 * at);
+        }
+        if (k === steps) break;
+        const kick = this.substep > 0 ? Math.min(0.5 * (this.substep + dt), 2 * dt) : dt;
+        if (!this.idle) this.wind.blow(this.time, this.blown);
+        numbers.set([...this.blown, kick, ...(pull?.target ?? [0, 0, 0]), dt, this.stiffness], at);
+        whole[at + 9] = pull === null ? 0 : 1;
+        whole[at + 10] = head.planes.reduce((bits, plane, p) => bits | (this.acts(plane) ? 1 << p : 0), 0);
+        for (const name of ["particles", "spread", "accelerate", "rate", "hold"]) run(name, 4 * at);
+        this.time += dt;
+        this.substep = dt;
+      }
+      pass.end();
+      if (from + BATCH > steps) {
+        let to = 0;
+        for (const name in this.sizes) {
+          encoder.copyBufferToBuffer(buffers[name], 0, buffers.found, to, this.sizes[name]);
+          to += this.sizes[name];
+        }
+      }
+      queue.writeBuffer(buffers.now, 0, numbers);
+      queue.submit([encoder.finish()]);
+    }
+    const found = await this.found();
+    this.displacement.set(found.displacement);
+    this.velocity.set(found.velocity);
+    this.speed.set(found.speeds);
+    let farthest = 0;
+    for (let k = 0; k < slot; k++) {
+      const wave = Math.sqrt(this.stiffness * found.fastest[2 * k]);
+      const viscous = head.viscous * Math.max(found.fastest[2 * k + 1], 1);
+      this.seen = { time: this.time, stiffness: this.stiffness, wave, viscous };
+      farthest = Math.max(farthest, Math.sqrt(dt * dt + 2 * viscous * dt) * wave);
+    }
+    return this.displacement.every(Number.isFinite) ? farthest : NaN;
+  }
+
+  /** Reads back what `sizes` names. */
+  async found() {
+    const { found } = this.buffers;
+    try {
+      if (this.broken === null) await found.mapAsync(globalThis.GPUMapMode.READ);
+    } catch (error) {
+      this.broken ??= /** @type {Error} */ (error).message;
+    }
+    if (this.broken !== null) throw new NoWebGPU(this.broken);
+    const bytes = found.getMappedRange();
+    /** @type {Record<string, Float32Array>} */
+    const parts = {};
+    let from = 0;
+    for (const name in this.sizes) {
+      parts[name] = new Float32Array(bytes.slice(from, from + this.sizes[name]));
+      from += this.sizes[name];
+    }
+    found.unmap();
+    return parts;
+  }
+}
