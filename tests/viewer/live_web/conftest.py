@@ -114,7 +114,7 @@ def asked_of_a_network(page):
 
 
 def drawn_apart(page, simulation):
-    """As :func:`apart`, of the Gaussians as a page draws them, read back from there; the motion in sizes of the object."""
+    """As :func:`apart`, of the Gaussians as a page draws them, read back from there; in sizes of the object."""
     values = page.evaluate("windPage.positions().then((found) => Array.from(found))")
     found = torch.tensor(values, dtype=torch.float64).reshape(-1, 3)
     state = simulation.start()
