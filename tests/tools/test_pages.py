@@ -1,6 +1,7 @@
 """Pages of the documentation: a person writes them, and their slots say what was recorded."""
 
 import json
+import re
 import shutil
 from pathlib import Path
 
@@ -44,6 +45,14 @@ def test_the_committed_pages_say_what_is_recorded():
     assert {path.name for path in found} >= {*NAMES, "README.md"}
     for path, text in found.items():
         assert text == path.read_text(), f"{path.name} is not what docs/results says: run `python tools/bench.py pages`"
+
+
+def test_no_page_says_that_something_is_not_recorded_yet():
+    """A table without rows leaves its place empty, with the sentence that introduces it."""
+    missing = re.compile(r"not (recorded|measured|shown) yet", re.IGNORECASE)
+    assert missing.search("| a GPU | Not recorded yet. |")
+    pages_of_users = [ROOT / "README.md", *sorted(DOCS.glob("*.md"))]
+    assert [path.name for path in pages_of_users if missing.search(path.read_text(encoding="utf-8"))] == []
 
 
 def test_pages_are_filled_in_place_and_their_plots_drawn(bench, tmp_path):

@@ -61,7 +61,7 @@ def test_tables():
     assert [row[2] for row in goals] == ["yes", "yes", "yes", "no", "yes"]
     assert "1.60 times" in goals[3][1]
     assert [row[1] for row in cells("sweeps.goals", [cpu])] == ["40 complete, 5 killed, tables equal", *["-"] * 4]
-    assert shown("sweeps.gpus", [cpu]) == shown("sweeps.training", [cpu]) == ["Not recorded yet."]
+    assert shown("sweeps.gpus", [cpu]) == shown("sweeps.training", [cpu]) == []
     gpu["gpus"]["rows"] = {"1": {"failed": "no memory"}}
     assert "failed: no memory" in cells("sweeps.gpus", [gpu])[0]
 

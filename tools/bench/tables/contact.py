@@ -46,7 +46,7 @@ def _pile(result: Row) -> Iterator[Row]:
 table(PAGE, "contact.pile", "contact_cuda", _pile, """
     time [s] = {time:.0f} | motion = {kinetic:.1e} | bending = {elastic:+.1e} | height = {potential:+.1e} |
     top layer [thicknesses] = {top:+.4f} | slid [mm] = {slid:+.2f (mm)} | iterations = {rounds or '-':.1f}
-    """, before="{source}", empty="Not recorded.")  # fmt: skip
+    """, before="{source}", empty="")  # fmt: skip
 
 
 table(PAGE, "contact.effort", "contact_*", "effort", """
@@ -56,7 +56,7 @@ table(PAGE, "contact.effort", "contact_*", "effort", """
     speed in the pile [mm/s] = {pile.fastest:.2f (mm)} | error of sliding = {sliding_error:.2f %} |
     a fifth / off = {ratio.a fifth in contact:.2f} |
     all / off = {ratio.all in contact:.2f}
-    """, before="{source}", empty="Not recorded.")  # fmt: skip
+    """, before="{source}", empty="")  # fmt: skip
 
 
 def plot(results: list[Row], pictures: Path) -> None:

@@ -68,7 +68,7 @@ table("web.md", "web.films", "web_*", "films", """
 table("web.md", "web.first", "web_*", lambda result: result.get("first", {}).values(), """
     parts = {parts} | Gaussians = {gaussians:,} | that move = {moving:,} | frames = {frames} |
     file [MB] = {bytes:.1f (MB)} | first picture [s] = {first_s:.1f} | all has come [s] = {complete_s:.1f}
-    """, before="{source}", empty="Not recorded yet.")  # fmt: skip
+    """, before="{source}", empty="")  # fmt: skip
 
 PAGES = [
     Goal("{key}: solver in {what}, simulated seconds per second, at least {limit:g}", "{speed:.2f}", "speed >= 1"),
@@ -96,14 +96,14 @@ table("web.md", "web.pages", "web_*", "pages", """
     substeps a second = {substeps_per_s:,.0f} | file [MB] = {bytes:.1f (MB)} | first picture [s] = {first_s:.1f} |
     Node.js [x real time] = {node:.2f} | without WebAssembly = {plain:.2f} |
     longest substeps: a second = {longest_per_s:,.0f} | Node.js = {hurried:.2f} | Chromium = {browser:.2f}
-    """, before="{source}", empty="Not recorded yet.")  # fmt: skip
+    """, before="{source}", empty="")  # fmt: skip
 table("web.md", "web.watched", "web_*", _watched, """
     page = {key} | points = {points:,} | minutes = {minutes:g} | x real time = {real_time:.2f} |
     memory after a minute [MB] = {early:.0f} | at the end [MB] = {late:.0f} |
     of it JavaScript after a minute [MB] = {early_heap:.1f} | JavaScript at the end [MB] = {late_heap:.1f} |
     cores while it is shown = {shown_cores:.2f} | while it is hidden = {hidden_cores:.2f}
-    """, before="{source}", empty="Not recorded yet.")  # fmt: skip
-table("web.md", "web.goals", "web_*", judged(PAGES, _pages), GOAL, empty="Not recorded yet.")
+    """, before="{source}", empty="")  # fmt: skip
+table("web.md", "web.goals", "web_*", judged(PAGES, _pages), GOAL, empty="")
 
 _SHEET, _ORDER = "sheet = `{formulation}`, {particles:,} points", ("formulation", "particles")
 
@@ -123,11 +123,12 @@ def _boxes(result: Row) -> Iterator[Row]:
 table("wind.md", "winds.rows", "winds_*", "rows", f"""
     {_SHEET} | wind = {{wind}} | runs in = {{path}} | substep [ms] = {{median_ms:.3g}} |
     per that in uniform gusts = {{ratio:.2f}}
-    """, before="{source}", order=_ORDER, empty="Not recorded yet.")  # fmt: skip
+    """, before="{source}", order=_ORDER, empty="")  # fmt: skip
 table("wind.md", "winds.obstacles", "winds_*", "obstacles", f"""
     {_SHEET} | obstacle = {{obstacle}} | runs in = {{path}} | substep [ms] = {{median_ms:.3g}} |
     per that without = {{ratio:.2f}}
-    """, before="{source}", order=_ORDER, empty="Not recorded yet.")  # fmt: skip
+    """, before="Substeps of a sheet that lies on an obstacle of the solver ([contact.md](contact.md)), without wind: "
+    "{source}", order=_ORDER, empty="")  # fmt: skip
 WIND_GOALS = [
     Goal("substep in turbulence, `{formulation}`, {particles:,} points", "{ratio:.2f}", "ratio <= most",
          _winds, "wind is 'turbulence'",
@@ -200,15 +201,18 @@ def _training(results: list[Row]) -> Iterator[Row]:
 table("many.md", "sweeps.workers", "sweeps_*", _workers, """
     {runs} small flags, {workers} workers = {key} | killed = {killed} | complete = {complete} |
     runs begun = {attempts} | seconds = {seconds:.0f}
-    """, together=True, empty="Not recorded yet.")  # fmt: skip
+    """, together=True, empty="")  # fmt: skip
 table("many.md", "sweeps.gpus", "sweeps_*", _gpus, """
     = {what} | points of each = {particles:,} | whole command [s] = {wall_s:.1f} | frames [s] = {frames_s:.1f} |
     10⁶ particle substeps/s = {per_s:,.0f (10⁶)} | memory of a GPU [GiB] = {memory_bytes:.2f (GiB)}
-    """, together=True, empty="Not recorded yet.")  # fmt: skip
+    """, together=True, empty="", before="Square flags of 0.8 m in different winds, without pictures and files, one "
+    "group on each GPU. The last row is one flag with as many points as all of them. *Frames* leaves out the start of "
+    "the programs:")  # fmt: skip
 table("many.md", "sweeps.training", "sweeps_*", _training, """
     the fox, 1080 x 1920 pixels = {what} | steps = {steps} | seconds = {seconds:.1f} | PSNR [dB] = {psnr_db:.2f} |
     Gaussians = {gaussians:,}
-    """, together=True, empty="Not recorded yet.")  # fmt: skip
+    """, together=True, empty="", before="Training with photos enlarged to 1080 x 1920 pixels and the photometric loss "
+    "only; PSNR is that of the written splat on photos that were held out:")  # fmt: skip
 
 
 def _scenes(result: Row) -> Iterator[Row]:
