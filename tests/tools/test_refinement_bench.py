@@ -94,3 +94,20 @@ def test_one_layer_is_recorded_beside_three(solved, tmp_path):
     (line,) = cells("refinement.one_layer", both)
     assert line[:3] == ["pennant", "8", "7"]
     assert line[3] == line[5]
+
+
+def test_contact_is_on_both_sides_and_recorded_beside_none(solved, tmp_path):
+    ours, blender = (refinement.Touching("pennant", solver, 32, 3) for solver in ("ours", "blender"))
+    run = Simulation.parser().parse_args([*ours.arguments(), "--device=cpu"])
+    assert (run.contact.thickness, run.contact.friction) == (refinement.DISTANCE, 0)
+    assert (blender.flag().self_collision, blender.flag().self_distance) == (True, refinement.DISTANCE)
+    small = ["--flags", "pennant", "--grids", "8", "--blender_cells", "16,32", "--frames", "4"]
+    small += ["--references", tmp_path]
+    free, _ = measure("refinement", *small, result=json.loads(json.dumps(HEAD)))
+    solved.clear()
+    both, _ = measure("refinement", *small, "--contact", result=free)
+    assert solved == [("Touching", "pennant", *rest) for rest in (("blender", 32), ("blender", 16), ("ours", 8))]
+    (line,) = cells("refinement.touching", both)
+    assert line[:2] == ["pennant", "8"]
+    assert line[2] == line[3]
+    assert float(line[5].split()[0]) == 0

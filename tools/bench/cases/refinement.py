@@ -15,12 +15,14 @@ from bench.clock import guarded
 from bench.record import Row
 
 from flag_motion import Cloth  # isort: skip  `flags` has added the folder of the data sets
-from flag_reference import FlagPattern  # isort: skip
+from flag_reference import FlagPattern, least_quality  # isort: skip
 
 RIPPLE = 0.003
 """Amplitude of the ripple of splats made in code [m], which a reference at rest may lack."""
 UNEVEN: Flag = "pennant"
 """The flag that is also solved with that ripple."""
+DISTANCE = 0.005
+"""Distance that a cloth with self-contact keeps from itself, on both sides [m]."""
 
 
 @dataclass(frozen=True)
@@ -45,6 +47,20 @@ class OneLayer(Run):
         return [*super().arguments(), "--scene.layers=1", "--material.bending=plate"]
 
 
+@dataclass(frozen=True)
+class Touching(Run):
+    """A flag with self-contact at :data:`DISTANCE`, without friction."""
+
+    def flag(self) -> FlagPattern:
+        """See :meth:`Run.flag`."""
+        flag = replace(super().flag(), self_collision=True, self_distance=DISTANCE)
+        return flag if self.solver == "ours" else replace(flag, quality=least_quality(flag))
+
+    def arguments(self) -> list[str]:
+        """See :meth:`Run.arguments`."""
+        return [*super().arguments(), f"--contact.thickness={DISTANCE}", "--contact.friction=0"]
+
+
 def _distance(run: Run, options: argparse.Namespace, to: Cloth, flat: Cloth | None = None) -> Row:
     """Solve a flag by ours, and compare it with its reference; one with the ripple with a ``flat`` one, too."""
     positions, found = run.solve(options.blender)
@@ -65,6 +81,15 @@ def rows(options: argparse.Namespace, result: Row) -> Iterator[Measurement]:
     result["versions"] = result["versions"] | {"bpy": version(options.blender)}
     result |= {"frames": options.frames, "note": options.note}
     for pattern in options.flags:
+        if options.contact:
+            touching, about = _itself(Touching, pattern, options)
+            free = reference(Run(pattern, "blender", options.blender_cells[-1], options.frames), options)
+            about["to_free"] = apart(REFERENCES[pattern], touching, free)
+            yield ("touching_references", str(pattern)), about.copy
+            for cells in options.grids:
+                work = partial(_distance, Touching(pattern, "ours", cells, options.frames), options, touching)
+                yield ("touching", {"flag": pattern, "cells": cells}), partial(guarded, work)
+            continue
         flat, about = _itself(Run, pattern, options)
         if options.layers == 1:
             for cells in options.grids:
@@ -96,6 +121,7 @@ CASE = Case(
                 default="120,160"),
         numbers("--grids", "cells of our grids along the longer side", default="30,40,60,80"),
         option("--layers", "of points: 3, or 1, which is recorded beside them", type=int, choices=(1, 3), default=3),
+        option("--contact", "with self-contact on both sides, recorded beside the rows without", action="store_true"),
         option("--frames", "frames, the first being the rest shape", type=int, default=125),
         NOTE,
     ),

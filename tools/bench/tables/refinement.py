@@ -94,6 +94,24 @@ table(PAGE, "refinement.one_layer", "refinement_*", _one_layer, """
     """)  # fmt: skip
 
 
+def _touching(result: Row) -> Iterator[Row]:
+    """The rows with self-contact beside those without."""
+    free = {(row["flag"], row["cells"]): row for row in result["rows"] if "failed" not in row}
+    rows = [row for row in result.get("touching", []) if "failed" not in row]
+    for row in sorted(rows, key=lambda row: (str(row["flag"]), row["cells"])):
+        known = result["touching_references"][str(row["flag"])]
+        more = {"itself": known["chamfer"], "to_free": known["to_free"]["chamfer"]}
+        more["free"] = free.get((row["flag"], row["cells"]), {}).get("chamfer")
+        yield {name: row[name] for name in ("cells", "chamfer")} | {"flag": named(row["flag"])} | more
+
+
+table(PAGE, "refinement.touching", "refinement_*", _touching, """
+    flag = {flag} | cells = {cells} | distance, both with self-contact = {chamfer:.2f %} |
+    both without = {free:.2f %} | reference with self-contact against itself = {itself:.2f %} |
+    reference with self-contact against that without = {to_free:.2f %}
+    """)  # fmt: skip
+
+
 def plot(results: list[Row], pictures: Path) -> None:
     """Draw ``refinement.png`` of a record: distance against cells, a line for each flag."""
     (result,) = results
