@@ -127,6 +127,11 @@ def test_cavity_agrees_with_ghia():
     assert air.cavity(32) < 0.015
 
 
+def test_a_bubble_lies_behind_a_step():
+    """At a Reynolds number of 100 it is 2.92 steps long (Erturk 2008); a step is three cells here."""
+    assert air.step(6, reynolds=100.0, until=10.0)["bubble"] == pytest.approx(2.92, abs=0.5)
+
+
 def test_wind_blows_through_an_open_box_undisturbed():
     flow = LatticeFlow((12, 8, 8), UNITS)
     state = flow.start([0.8, 0.3, -0.2])

@@ -3,21 +3,23 @@
 from __future__ import annotations
 
 import argparse
+import statistics
 import time
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterator
 from functools import partial
 from pathlib import Path
 from typing import Any
 
 import torch
 
-from bench.case import PICTURES, Case, Measurement, option
+from bench.case import PICTURES, Case, Measurement, names
 from bench.clock import guarded
-from bench.problems import air, filaments
+from bench.problems import air, filaments, flutter, tumbling
 from bench.record import ROOT, Row
 from bench.tables.plots import save_figure, subplots
 from gaussian_swaying.aero.computed_air import BYTES
 from gaussian_swaying.air.flow import FlowState, LatticeFlow
+from gaussian_swaying.air.immersed import exchange
 from gaussian_swaying.simulation.simulation import Simulation
 
 
@@ -66,31 +68,94 @@ def _number(name: str, found: Any) -> Row:
     return {name: found} if isinstance(found, float) else {k: v for k, v in found.items() if k != "tips"}
 
 
-def cases(device: str) -> Iterable[tuple[str, Row, Callable[[], Row]]]:
-    """The name, the parameters and the function of each measurement."""
+def _coupling(device: str, cells: tuple[int, int, int], points: int, steps: int = 60) -> Row:
+    """Share of the exchange with a sheet in a step of the air: its time with and without, by turns."""
+    flow = LatticeFlow(cells, air.units_of(0.02, 1e5)).to(device)
+    now = flow.start([1.0, 0.0, 0.0]).moments
+    spare, wind = torch.empty_like(now), torch.tensor([1.0, 0.0, 0.0], device=device)
+    side = round(points**0.5)
+    line = (torch.arange(side, device=device) + 0.5) / side - 0.5
+    first, second = torch.meshgrid(line, line, indexing="ij")
+    size = 0.5 * min(cells[1:])
+    middle = torch.tensor([cells[0] / 3, cells[1] / 2, cells[2] / 2], device=device)
+    place = torch.stack([first, 0.2 * first, second], -1).reshape(-1, 3) * size + middle
+    area = torch.full((side**2,), (size / side) ** 2, device=device)
+    still, mass = torch.zeros(side**2, 3, device=device), torch.full((side**2,), 1.0, device=device)
+    times: dict[bool, list[float]] = {False: [], True: []}
+    for coupled in [False, True] * 6:
+        _wait(device)
+        began = time.perf_counter()
+        for _ in range(steps):
+            if coupled:
+                exchange(now, still, area, mass, place, flow.kind)
+            flow.advance(now, spare, wind)
+            now, spare = spare, now
+        _wait(device)
+        times[coupled].append((time.perf_counter() - began) / steps)
+    alone, both = (statistics.median(times[coupled][1:]) for coupled in (False, True))
+    return {"alone_s": alone, "coupled_s": both, "share": 1 - alone / both, "points": side**2}
+
+
+def _onset(mass_ratio: float, cells: int) -> Row:
+    """Where a flag begins to flutter, beside the linear theory of an ideal flow."""
+    linear, frequency = flutter.onset(mass_ratio)
+    found, tried = flutter.neutral(lambda stiffness: flutter.growth(mass_ratio, stiffness, cells=cells), linear)
+    speed = (linear / found) ** 0.5
+    return {"linear": linear, "frequency": frequency, "growths": tried, "found": found, "speed": speed}
+
+
+def _fall(froude: float) -> Row:
+    return {name: value for name, value in tumbling.falling(froude, until=50.0).items() if name != "angles"}
+
+
+Problem = tuple[str, Row, Callable[[], Row]]
+
+
+def _on_a_laptop() -> Iterator[Problem]:
+    """Flows in a plane, and small ones in space."""
     for cells in (16, 32, 64):
         yield "vortices", {"cells": cells}, lambda cells=cells: _number("error", air.taylor_green(cells))
     for cells in (8, 16):
         yield "walls", {"cells": cells}, lambda cells=cells: _number("error", air.poiseuille(cells))
     for cells in (32, 64, 96):
         yield "cavity", {"cells": cells}, lambda cells=cells: _number("error", air.cavity(cells))
+    for cells in (20, 40):
+        yield "step", {"cells": cells}, partial(air.step, cells)
     for stiffness in (0.5, 0.2, 0.03):
-        given = {"stiffness": stiffness}
-        yield (
-            "inverted flag",
-            given,
-            lambda k=stiffness: filaments.flag(1.0, k, 200.0, held="tail", cells=20, until=40.0, before=3.0),
-        )
-    for cells in (24, 32):
-        yield "hanging filament", {"cells": cells}, lambda cells=cells: filaments.hanging(cells, until=24.0)
-    for gap in (0.5, 2.0):
-        yield "two flags", {"gap": gap}, lambda gap=gap: filaments.tandem(gap, cells=20, until=24.0)
-    yield "plate", {"cells": 10}, lambda: air.plate(10, until=20.0)
-    yield "cylinder", {"cells": 12}, lambda: air.cylinder(12, until=110.0)
-    for cells in (10, 14):
-        yield "sphere", {"cells": cells}, lambda cells=cells: air.sphere(cells, until=12.0)
-    yield "flow", {"size": [48, 32, 32]}, lambda: _flow(device, (48, 32, 32))
-    yield "flow", {"size": [128, 96, 96]}, lambda: _flow(device, (128, 96, 96), 20)
+        bent = partial(filaments.flag, 1.0, stiffness, 200.0, held="tail", cells=20, until=40.0, before=3.0)
+        yield "inverted flag", {"stiffness": stiffness}, bent
+    for cells in (24, 32, 48):
+        yield "hanging filament", {"cells": cells}, partial(filaments.hanging, cells, until=24.0)
+    for gap in (0.25, 0.5, 1.0, 2.0, 4.0):
+        yield "two flags", {"gap": gap}, partial(filaments.tandem, gap, cells=20, until=24.0)
+    for mass_ratio, cells in ((0.2, 24), (0.2, 36), (0.5, 24), (1.0, 24), (1.0, 36), (2.0, 24)):
+        yield "onset", {"mass_ratio": mass_ratio, "cells": cells}, partial(_onset, mass_ratio, cells)
+    for froude in (0.3, 0.5, 0.9, 1.2):
+        yield "falling plate", {"froude": froude}, partial(_fall, froude)
+    yield "plate", {"cells": 10}, partial(air.plate, 10, until=20.0)
+    yield "cylinder", {"cells": 12}, partial(air.cylinder, 12, until=110.0)
+
+
+def _on_a_gpu() -> Iterator[Problem]:
+    """What needs more cells than a laptop has time for."""
+    for cells, length, width in ((16, 12, 8), (16, 18, 12), (24, 18, 12)):
+        given = {"cells": cells, "length": length, "width": width}
+        yield "sphere", given, partial(air.sphere, cells, 24.0, length=length, width=width, device="cuda")
+    for cells in (12, 24):
+        yield "cylinder", {"cells": cells}, partial(air.cylinder, cells, device="cuda")
+    for cells in (10, 20):
+        yield "plate", {"cells": cells}, partial(air.plate, cells, 20.0, device="cuda")
+    for cells, width in ((16, 4), (24, 4), (32, 4), (32, 8), (48, 4)):
+        given = {"cells": cells, "width": width}
+        yield "square flag", given, partial(filaments.square_flag, cells, width=width, device="cuda")
+
+
+def cases(device: str) -> Iterator[Problem]:
+    """The name, the parameters and the function of each measurement."""
+    yield from _on_a_gpu() if device == "cuda" else _on_a_laptop()
+    for size, steps in (((48, 32, 32), 60), ((128, 96, 96), 20)):
+        yield "flow", {"size": list(size)}, partial(_flow, device, size, steps)
+        yield "coupling", {"size": list(size)}, partial(_coupling, device, size, 20_000, steps)
     yield "scene", {}, lambda: _scene(device)
 
 
@@ -131,19 +196,20 @@ def _result(function: Callable[[], Row]) -> Row:
 
 
 def rows(options: argparse.Namespace, result: Row) -> Iterator[Measurement]:
-    """All cases, or those whose problem is ``only``."""
-    only = options.only or ""
-    result["rows"] = [row for row in result.get("rows", []) if only and only != row["problem"]]
+    """The cases whose problem is one of ``only``."""
+    result["rows"] = [row for row in result.get("rows", []) if row["problem"] not in options.only]
     for name, parameters, function in cases(options.device):
-        if only in ("", name):
+        if name in options.only:
             yield ("rows", {"problem": name, "parameters": parameters}), partial(_result, function)
-    if only in ("", "picture"):
+    if "picture" in options.only and options.device == "cpu":
         yield ("picture",), partial(picture, options.pictures)
 
+
+NAMES = list(dict.fromkeys([name for device in ("cpu", "cuda") for name, *_ in cases(device)] + ["picture"]))
 
 CASE = Case(
     "Measure computed air beside exact and published flows and flags, and its speed.",
     rows,
-    (option("--only", "only this problem, or the picture"), PICTURES),
+    (names("--only", NAMES, "only these problems"), PICTURES),
     page="air.md",
 )

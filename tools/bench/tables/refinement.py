@@ -109,7 +109,7 @@ table(PAGE, "refinement.touching", "refinement_*", _touching, """
     flag = {flag} | cells = {cells} | distance, both with self-contact = {chamfer:.2f %} |
     both without = {free:.2f %} | reference with self-contact against itself = {itself:.2f %} |
     reference with self-contact against that without = {to_free:.2f %}
-    """)  # fmt: skip
+    """, empty="", before="With self-contact at 5 mm, without friction, on both sides:")  # fmt: skip
 
 
 def plot(results: list[Row], pictures: Path) -> None:
