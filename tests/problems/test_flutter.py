@@ -26,7 +26,7 @@ def test_vibrations_of_a_beam_are_orthonormal():
 
 
 def test_a_heavier_flag_needs_more_stiffness():
-    """The jump between mass ratios of 0.7 and 0.8 is the known one between two branches (Alben 2008, Phys. Fluids 20)."""
+    """Between mass ratios of 0.7 and 0.8 it jumps from one branch to another (Alben 2008, Phys. Fluids 20)."""
     found = [onset(ratio, count=120)[0] for ratio in (0.2, 0.7, 0.8, 2.0)]
     assert found == sorted(found)
     assert found[2] > 2 * found[1]

@@ -6,7 +6,7 @@ from bench.problems.tumbling import falling
 
 
 def test_a_heavy_plate_begins_to_fall_freely():
-    """Before the air resists: m g = 1/2 at a mass of 100, on the mass of the plate and that of the air it moves, pi / 4."""
+    """Before the air resists: m g = 1/2 moves the plate, of mass 100, and the air that it pushes, pi / 4."""
     found = falling(10.0, cells=10, until=0.5, side=6, tilt=0.0)
     assert found["speed"] == pytest.approx(0.375 * 0.5 / (100 + np.pi / 4), rel=0.02)
     assert found["swing"] == pytest.approx(0.0, abs=1e-4)
