@@ -99,8 +99,8 @@ table(PAGE, "air.square", "air_cuda", lambda result: _of(result, "square flag"),
     cells in a side = {cells} | width of the box [sides] = {width} |
     amplitude from peak to peak [sides] = {amplitude:.3f} |
     frequency [U / L] = {frequency:.3f}
-    """, empty="", before="The square flag in three dimensions, at a Reynolds number of 200 and mass ratio 1, a sheet of "
-    "the package. Published are an amplitude of 0.78 and a frequency of 0.26 (Huang and Sung 2010), 0.81 and 0.27 "
+    """, empty="", before="The square flag in three dimensions, at a Reynolds number of 200 and mass ratio 1, a sheet "
+    "of the package. Published are an amplitude of 0.78 and a frequency of 0.26 (Huang and Sung 2010), 0.81 and 0.27 "
     "(Tian and others 2014):\n\n{source}",
     )  # fmt: skip
 table(PAGE, "air.step", "air_cpu", lambda result: _of(result, "step"), """
