@@ -15,12 +15,12 @@ def rows():
     """The table of the docs, as the code gives it."""
     lines = [
         "| name | `E` [Pa] | `nu` | `density` [kg/m³] | `thickness` [mm] | mass [kg/m²] | `solver.damping` [1/s] "
-        "| waves [m/s] | read in a source | our estimate |",
-        "|---|---|---|---|---|---|---|---|---|---|",
+        "| waves [m/s] | read in a source |",
+        "|---|---|---|---|---|---|---|---|---|",
     ]
     for name, m in MATERIALS.items():
         numbers = (f"{m.E:.1e}", m.nu, f"{m.density:g}", f"{1e3 * m.thickness:g}", f"{m.density * m.thickness:.2g}")
-        cells = (f"`{name}`", *numbers, f"{m.damping:g}", f"{m.wave_speed:.0f}", m.source or "-", m.estimated)
+        cells = (f"`{name}`", *numbers, f"{m.damping:g}", f"{m.wave_speed:.0f}", m.source or "-")
         lines.append(f"| {' | '.join(map(str, cells))} |")
     return lines
 
