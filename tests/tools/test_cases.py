@@ -305,6 +305,31 @@ def test_size_and_speed_of_a_page(monkeypatch):
     assert len(cells("web.goals", record)) == 4
 
 
+@pytest.mark.usefixtures("chromium", "node")
+def test_size_and_speed_of_the_page_of_a_made_rider(monkeypatch):
+    monkeypatch.setattr(web, "SPAN", 1)
+    monkeypatch.setattr(web, "TURNS", 1)
+    monkeypatch.setattr(web, "RIDER_DX", 0.1)
+    row = web.page_of_rider(3000)
+    assert row["gaussians"] == 3000
+    assert 300 < row["points"] < 3000
+    assert row["browser"] > 0
+
+
+@pytest.mark.usefixtures("chromium")
+def test_time_of_a_substep_in_compute_shaders(monkeypatch):
+    monkeypatch.setattr(web, "FEW", 1)
+    try:
+        row = web.shaded(["flag", "--scene.generator.init_args.spacing=0.05", "--solver.dx=0.2", "--material.E=9e3"])
+    except SystemExit:
+        pytest.skip("this Chromium offers WebGPU no adapter in software")
+    assert row["worker_s"] > 0
+    name, points, substeps, *numbers = cells("web.shaders", HEAD | {"films": {}, "shaders": {"small flag": row}})[0]
+    assert (name, int(points)) == ("small flag", row["points"])
+    speed = 1 / (float(substeps.replace(",", "")) * row["webgpu_s"])
+    assert float(numbers[-1]) == pytest.approx(speed, rel=0.05)
+
+
 @pytest.mark.usefixtures("chromium")
 def test_memory_and_cpu_time_of_a_page():
     row = web.watch(["flag", "--scene.generator.init_args.spacing=0.05", "--solver.dx=0.2", "--material.E=9e3"], 0.02)

@@ -22,6 +22,7 @@ import torch
 from bench.case import Case, Measurement, numbers, option
 from bench.places import write_swaying
 from bench.record import ROOT, Row
+from bench.riders import write_rider
 from gaussian_swaying.cli.live_web import asked
 from gaussian_swaying.mpm.state import MPMState
 from gaussian_swaying.recording.checkpoint import read_checkpoint
@@ -35,6 +36,7 @@ WINDOW = (1440, 900)  # pixels
 FRAMES, REPEATS = 100, 3
 FLAGS = ["--no-sandbox", "--disable-quic", "--no-first-run", "--disable-background-networking", "--disable-sync"]
 FLAGS += ["--disable-component-update", "--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"]
+WEBGPU = "--enable-unsafe-webgpu"  # also on an adapter in software
 
 
 def rows(options: argparse.Namespace, _: Row) -> Iterator[Measurement]:
@@ -42,6 +44,11 @@ def rows(options: argparse.Namespace, _: Row) -> Iterator[Measurement]:
     for line in options.page:
         name, _, command = line.partition("=")
         yield ("pages", name), partial(page_of, shlex.split(command or name))
+    for count in options.riders:
+        yield ("pages", f"made rider of {count:,} Gaussians"), partial(page_of_rider, count)
+    for line in options.shade:
+        name, _, command = line.partition("=")
+        yield ("shaders", name), partial(shaded, shlex.split(command or name))
     for count in options.places:
         for whole in (True, False):
             yield ("first", f"{count:,}, {'one' if whole else 'many'}"), partial(first_of, count, whole)
@@ -97,13 +104,13 @@ def _open(film: Path) -> Row:
 
 
 @contextmanager
-def _browser() -> Iterator[Any]:
+def _browser(*flags: str) -> Iterator[Any]:
     """Chromium with software WebGL2."""
     from playwright.sync_api import sync_playwright
 
     chromium = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
     with sync_playwright() as driver:
-        browser = driver.chromium.launch(executable_path=chromium, args=FLAGS)
+        browser = driver.chromium.launch(executable_path=chromium, args=[*FLAGS, *flags])
         try:
             yield browser
         finally:
@@ -197,6 +204,49 @@ def page_of(command: list[str]) -> Row:
             "plain": plain["simulated"] / plain["cpu"],
         }
         return row | _in_page(target)
+
+
+RIDER_DX = 0.0455
+"""Spacing of the grid of a made rider [m], for some 5,000 points."""
+
+
+def page_of_rider(count: int) -> Row:
+    """As :func:`page_of`, of a made rider on a bicycle of some Gaussians."""
+    with tempfile.TemporaryDirectory() as folder:
+        return page_of([str(write_rider(Path(folder), count, RIDER_DX))])
+
+
+FEW = 2
+"""Frames in which substeps in compute shaders are timed."""
+
+
+def shaded(command: list[str]) -> Row:
+    """Time of a substep in the page's worker, and in compute shaders on an adapter in software.
+
+    Args:
+        command: The scene and options of ``export --live-web``.
+    """
+    with tempfile.TemporaryDirectory() as temporary, _browser(WEBGPU) as browser:
+        page, target = asked([*command]), Path(temporary) / "page.html"
+        write_live_web(page.simulation, page.name, target)
+        row: Row = {"points": page.simulation.setup.points.count, "chromium": browser.version}
+        for solver in ("worker", "webgpu"):
+            window = browser.new_page(viewport={"width": 480, "height": 320})
+            window.set_default_timeout(600_000)
+            window.goto(f"{target.as_uri()}#solver={solver}")
+            _until_drawn(window)
+            window.evaluate("windPage.complete.then(() => windPage.pause())")
+            while (window.evaluate("windPage.solver()") == "webgpu") != (solver == "webgpu"):
+                if why := window.evaluate("windPage.why()"):
+                    raise SystemExit(f"error: WebGPU is not used, as {why}")
+                time.sleep(0.1)
+            window.evaluate("windPage.reset()")
+            turns = [window.evaluate(f"windPage.advance({FEW})") for _ in range(REPEATS)]
+            best = min(turns, key=lambda turn: turn["seconds"] / turn["substeps"])
+            row |= {f"{solver}_s": best["seconds"] / best["substeps"]}
+            row["substeps_per_s"] = best["substeps"] / best["simulated"]
+            window.close()
+        return row
 
 
 def _in_node(folder: Path, *, plain: bool = False, hurried: bool = False) -> Row:
@@ -308,6 +358,10 @@ CASE = Case(
             "a page that simulates, as its name, =, and the scene and options of export --live-web; repeatable",
             action="append",
             default=[],
+        ),
+        numbers("--riders", "Gaussians of a made rider on a bicycle, whose page is measured", default=""),
+        option(
+            "--shade", "as --page: its substeps in compute shaders are timed; repeatable", action="append", default=[]
         ),
         option("--watch", "as --page: its memory and CPU time are measured; repeatable", action="append", default=[]),
         option("--minutes", "for which a page is watched", type=float, default=10.0),

@@ -97,6 +97,19 @@ table("web.md", "web.pages", "web_*", "pages", """
     Node.js [x real time] = {node:.2f} | without WebAssembly = {plain:.2f} |
     longest substeps: a second = {longest_per_s:,.0f} | Node.js = {hurried:.2f} | Chromium = {browser:.2f}
     """, before="{source}", empty="")  # fmt: skip
+
+
+def _shaders(result: Row) -> Iterator[Row]:
+    for key, row in result.get("shaders", {}).items():
+        speeds = {f"{name}_x": 1 / (row[f"{name}_s"] * row["substeps_per_s"]) for name in ("worker", "webgpu")}
+        yield {"key": key, **row, **speeds}
+
+
+table("web.md", "web.shaders", "web_*", _shaders, """
+    page = {key} | points = {points:,} | substeps a second = {substeps_per_s:,.0f} |
+    WebAssembly: a substep [ms] = {worker_s:.2f (ms)} | WebGPU in software: a substep [ms] = {webgpu_s:.2f (ms)} |
+    WebAssembly [x real time] = {worker_x:.2f} | WebGPU in software [x real time] = {webgpu_x:.3f}
+    """, before="{source}", empty="")  # fmt: skip
 table("web.md", "web.watched", "web_*", _watched, """
     page = {key} | points = {points:,} | minutes = {minutes:g} | x real time = {real_time:.2f} |
     memory after a minute [MB] = {early:.0f} | at the end [MB] = {late:.0f} |

@@ -1,5 +1,5 @@
 // A substep of solver.js in compute shaders, in single precision: the functions of the same names there, in laws.js, matrices.js and
-// aero.js are the definition. `particles` works on a point, `spread` on a node of a cell, `accelerate` on a node; none of them adds to
+// aero.js are the definition. `particles` works on a point, `spread` on three nodes of a cell, `accelerate` on a node; none of them adds to
 // what another one writes, so that the order of all sums is the same every time.
 
 struct Point {
@@ -42,7 +42,7 @@ struct Step {
 @group(1) @binding(0) var<uniform> now: Step;
 
 override POINTS: u32;
-override SPREAD: u32; // nodes of all cells
+override SPREAD: u32; // rows of three nodes of all cells
 override NODES: u32;
 override ROWS: u32;
 override AFFECTED: u32;
@@ -91,34 +91,39 @@ fn slopes(f: f32) -> vec3f {
 /** Fields of the nodes at a point. The columns of F are along x, y and z. */
 struct Fields { F: mat3x3f, L: mat3x3f, place: vec3f, speed: vec3f }
 
+/** Adds what three nodes along z give. */
+fn add(found: ptr<function, Fields>, at: u32, x: f32, y: f32, z: f32, wz: vec3f, gz: vec3f) {
+  let a = cellNodes[at];
+  let b = cellNodes[at + 1];
+  let c = cellNodes[at + 2];
+  var q = mat3x3f(displacement[a].xyz, displacement[b].xyz, displacement[c].xyz);
+  var s = q * wz;
+  (*found).F += mat3x3f(x * s, y * s, z * (q * gz));
+  (*found).place += z * s;
+  q = mat3x3f(velocity[a].xyz, velocity[b].xyz, velocity[c].xyz);
+  s = q * wz;
+  if (VISCOUS > 0) { (*found).L += mat3x3f(x * s, y * s, z * (q * gz)); }
+  (*found).speed += z * s;
+}
+
 fn fieldsOf(point: Point) -> Fields {
-  var wx = weights(point.fraction.x);
-  var wy = weights(point.fraction.y);
+  let wx = weights(point.fraction.x);
+  let wy = weights(point.fraction.y);
   let wz = weights(point.fraction.z);
-  var gx = slopes(point.fraction.x);
-  var gy = slopes(point.fraction.y);
+  let gx = slopes(point.fraction.x);
+  let gy = slopes(point.fraction.y);
   let gz = slopes(point.fraction.z);
   var found = Fields(mat3x3f(1, 0, 0, 0, 1, 0, 0, 0, 1), mat3x3f(), vec3f(), vec3f());
-  var at = 27 * point.cell;
-  for (var i = 0u; i < 3; i++) {
-    for (var j = 0u; j < 3; j++) {
-      let a = cellNodes[at];
-      let b = cellNodes[at + 1];
-      let c = cellNodes[at + 2];
-      at += 3;
-      let x = gx[i] * wy[j];
-      let y = wx[i] * gy[j];
-      let z = wx[i] * wy[j];
-      var q = mat3x3f(displacement[a].xyz, displacement[b].xyz, displacement[c].xyz);
-      var s = q * wz;
-      found.F += mat3x3f(x * s, y * s, z * (q * gz));
-      found.place += z * s;
-      q = mat3x3f(velocity[a].xyz, velocity[b].xyz, velocity[c].xyz);
-      s = q * wz;
-      if (VISCOUS > 0) { found.L += mat3x3f(x * s, y * s, z * (q * gz)); }
-      found.speed += z * s;
-    }
-  }
+  let at = 27 * point.cell;
+  add(&found, at, gx.x * wy.x, wx.x * gy.x, wx.x * wy.x, wz, gz);
+  add(&found, at + 3, gx.x * wy.y, wx.x * gy.y, wx.x * wy.y, wz, gz);
+  add(&found, at + 6, gx.x * wy.z, wx.x * gy.z, wx.x * wy.z, wz, gz);
+  add(&found, at + 9, gx.y * wy.x, wx.y * gy.x, wx.y * wy.x, wz, gz);
+  add(&found, at + 12, gx.y * wy.y, wx.y * gy.y, wx.y * wy.y, wz, gz);
+  add(&found, at + 15, gx.y * wy.z, wx.y * gy.z, wx.y * wy.z, wz, gz);
+  add(&found, at + 18, gx.z * wy.x, wx.z * gy.x, wx.z * wy.x, wz, gz);
+  add(&found, at + 21, gx.z * wy.y, wx.z * gy.y, wx.z * wy.y, wz, gz);
+  add(&found, at + 24, gx.z * wy.z, wx.z * gy.z, wx.z * wy.z, wz, gz);
   return found;
 }
 
@@ -418,31 +423,44 @@ fn particles(@builtin(global_invocation_id) id: vec3u) {
 fn spread(@builtin(global_invocation_id) id: vec3u) {
   let k = id.x;
   if (k >= SPREAD) { return; }
-  let cell = k / 27;
-  let within = k % 27;
-  let i = within / 9;
-  let j = (within / 3) % 3;
-  let l = within % 3;
-  var sum = vec4f();
-  var shift = vec3f();
+  let cell = k / 9;
+  let row = vec2u((k % 9) / 3, k % 3);
+  // weights along x and y are scale * distance² + offset
+  let middle = 1.5 - 0.5 * vec2f(row);
+  let scale = select(vec2f(0.5), vec2f(-1), row == vec2u(1));
+  let offset = select(vec2f(), vec2f(0.75), row == vec2u(1));
+  var sum = array<vec4f, 3>();
+  var shift = array<vec3f, 3>();
   for (var p = cellStart[cell]; p < cellStart[cell + 1]; p++) {
     let f = points[p].fraction;
-    let w = vec3f(weights(f.x)[i], weights(f.y)[j], weights(f.z)[l]);
-    let g = vec3f(slopes(f.x)[i], slopes(f.y)[j], slopes(f.z)[l]);
-    let whole = w.x * w.y * w.z;
+    let far = f.xy - middle;
+    let w = scale * far * far + offset;
+    let g = 2.0 * INVERSE * scale * far;
+    let wz = weights(f.z);
+    let gz = slopes(f.z);
     let x = stresses[4 * p];
     let y = stresses[4 * p + 1];
     let z = stresses[4 * p + 2];
     let last = stresses[4 * p + 3];
-    let force = (g.x * w.y * w.z) * x.xyz + (w.x * g.y * w.z) * y.xyz + (w.x * w.y * g.z) * z.xyz + whole * vec3f(x.w, y.w, z.w);
-    sum += vec4f(force, whole * last.w);
-    shift += whole * last.xyz;
+    let whole = w.x * w.y;
+    let own = vec4f((g.x * w.y) * x.xyz + (w.x * g.y) * y.xyz + whole * vec3f(x.w, y.w, z.w), whole * last.w);
+    let along = vec4f(whole * z.xyz, 0);
+    sum[0] += wz.x * own + gz.x * along;
+    sum[1] += wz.y * own + gz.y * along;
+    sum[2] += wz.z * own + gz.z * along;
+    if (PLANES > 0) {
+      shift[0] += (whole * wz.x) * last.xyz;
+      shift[1] += (whole * wz.y) * last.xyz;
+      shift[2] += (whole * wz.z) * last.xyz;
+    }
   }
-  if (PLANES == 0) {
-    sums[k] = sum;
-  } else {
-    sums[2 * k] = sum;
-    sums[2 * k + 1] = vec4f(shift, 0);
+  for (var l = 0u; l < 3; l++) {
+    if (PLANES == 0) {
+      sums[3 * k + l] = sum[l];
+    } else {
+      sums[6 * k + 2 * l] = sum[l];
+      sums[6 * k + 2 * l + 1] = vec4f(shift[l], 0);
+    }
   }
 }
 

@@ -36,7 +36,7 @@ export class NoWebGPU extends Error {}
 export function uncovered({ head, arrays }) {
   if (head.obstacles.length) return "the scene has obstacles";
   if (head.planes.length > 32) return "the scene has more than 32 planes";
-  if (27 * (arrays.cellStart.length - 1) > GROUP * MOST_GROUPS) return "the scene has too many points";
+  if (9 * (arrays.cellStart.length - 1) > GROUP * MOST_GROUPS) return "the scene has too many points";
   return null;
 }
 
@@ -82,7 +82,7 @@ export class GpuSolver extends Solver {
     this.displacement = new Float32Array(WIDE * nodes);
     this.velocity = new Float32Array(WIDE * nodes);
     this.before = { displacement: this.displacement.slice(), velocity: this.velocity.slice() };
-    this.counts = { particles: points, spread: 27 * cells, accelerate: nodes - 1, rate: this.head.rows, hold: this.a.affected.length, look: points };
+    this.counts = { particles: points, spread: 9 * cells, accelerate: nodes - 1, rate: this.head.rows, hold: this.a.affected.length, look: points };
     /** @type {any} what the last pull uploaded */
     this.uploaded = null;
     this.fill();
