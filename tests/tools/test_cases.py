@@ -328,6 +328,7 @@ def test_time_of_a_substep_in_compute_shaders(monkeypatch):
     assert (name, int(points)) == ("small flag", row["points"])
     speed = 1 / (float(substeps.replace(",", "")) * row["webgpu_s"])
     assert float(numbers[-1]) == pytest.approx(speed, rel=0.05)
+    assert float(numbers[1]) == pytest.approx(1e3 * row["webgpu_s"], abs=0.05)
 
 
 @pytest.mark.usefixtures("chromium")

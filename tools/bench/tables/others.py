@@ -101,13 +101,14 @@ table("web.md", "web.pages", "web_*", "pages", """
 
 def _shaders(result: Row) -> Iterator[Row]:
     for key, row in result.get("shaders", {}).items():
-        speeds = {f"{name}_x": 1 / (row[f"{name}_s"] * row["substeps_per_s"]) for name in ("worker", "webgpu")}
-        yield {"key": key, **row, **speeds}
+        both = ("worker", "webgpu")
+        speeds = {f"{name}_x": 1 / (row[f"{name}_s"] * row["substeps_per_s"]) for name in both}
+        yield {"key": key, **row, **speeds, **{f"{name}_ms": 1e3 * row[f"{name}_s"] for name in both}}
 
 
 table("web.md", "web.shaders", "web_*", _shaders, """
     page = {key} | points = {points:,} | substeps a second = {substeps_per_s:,.0f} |
-    WebAssembly: a substep [ms] = {worker_s:.2f (ms)} | WebGPU in software: a substep [ms] = {webgpu_s:.2f (ms)} |
+    WebAssembly: a substep [ms] = {worker_ms:.2f} | WebGPU in software: a substep [ms] = {webgpu_ms:.1f} |
     WebAssembly [x real time] = {worker_x:.2f} | WebGPU in software [x real time] = {webgpu_x:.3f}
     """, before="{source}", empty="")  # fmt: skip
 table("web.md", "web.watched", "web_*", _watched, """
