@@ -257,11 +257,10 @@ def headline(results: Results) -> str:
 
 
 def _doubts(results: Results) -> Row:
-    """The distances of references from themselves, a ``_`` for each space of their names, and the largest of all."""
+    """The largest distance of a reference from itself."""
     known = uncertainty(results)
     own = [one["chamfer"] for ways in known.values() for name, one in ways.items() if name not in _OTHER]
-    ways_of = {flag: {name.replace(" ", "_"): one for name, one in ways.items()} for flag, ways in known.items()}
-    return {"most": max(own, default=None)} | ways_of
+    return {"most": max(own, default=None)}
 
 
 def _at_rest(_: Results) -> Row:
@@ -276,7 +275,6 @@ def _at_rest(_: Results) -> Row:
 
 
 value("flags.reference_doubt", "flags_*", "{most:.2f %}", _doubts, together=True)
-value("flags.reference_distance", "flags_*", "{$2.$1.chamfer:.2f %}", _doubts, together=True)
 value("flags.distance", "flags_*", "{rows.$1.$2.chamfer_share:.2f %}")
 value("flags.tilt", "flags_*", "{rows.$1.$2.tilt.neighbours.tilt_40cm_deg:.2f} degrees")
 value("flags.ripple", "flags_*", "{$1.ripple:g mm}", _at_rest, together=True)

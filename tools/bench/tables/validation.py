@@ -182,9 +182,6 @@ LONG_GOALS = [
 table(PAGE, "long_flag.goals", "long_flag", judged(LONG_GOALS), BECAUSE)
 value("long_flag.growth", "long_flag", "{$1:.1f %}", _growth)
 value("long_flag.damping", "long_flag", "{$1.damping_per_s:g} 1/s")
-value("long_flag.kinetic", "long_flag", "{$1.$2:.3g} J", lambda found: {
-    name: {str(k): energy for k, energy in enumerate(run["energy_per_minute_J"]["kinetic_of_particles"], 1)}
-    for name, run in found.items() if name != "measured"})  # fmt: skip
 
 
 def _as_exact(result: Row) -> Iterator[Row]:
