@@ -6,7 +6,7 @@ from pathlib import Path
 ROOT = Path(__file__).resolve().parents[2]
 GOAL = 30_000
 """Words by hand that the documentation should have at most."""
-LIMIT = 32_400
+LIMIT = 32_200
 """Words by hand that it may have now. It only goes down, until it is the goal."""
 LEFT_OUT = re.compile(
     r"(?<!`)<!-- begin: [^>]*-->.*?<!-- end -->"  # filled by tools/bench.py
