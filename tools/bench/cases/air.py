@@ -142,10 +142,10 @@ def _on_a_gpu() -> Iterator[Problem]:
         given = {"cells": cells, "length": length, "width": width}
         yield "sphere", given, partial(air.sphere, cells, 24.0, length=length, width=width, device="cuda")
     for cells in (12, 24):
-        yield "cylinder", {"cells": cells}, partial(air.cylinder, cells, device="cuda")
+        yield "cylinder", {"cells": cells}, partial(air.cylinder, cells, 110.0, device="cuda")
     for cells in (10, 20):
         yield "plate", {"cells": cells}, partial(air.plate, cells, 20.0, device="cuda")
-    for cells, width in ((16, 4), (24, 4), (32, 4), (32, 8), (48, 4)):
+    for cells, width in ((16, 4), (24, 4), (32, 4), (24, 8), (48, 4)):
         given = {"cells": cells, "width": width}
         yield "square flag", given, partial(filaments.square_flag, cells, width=width, device="cuda")
 

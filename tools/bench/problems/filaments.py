@@ -229,23 +229,29 @@ def square_flag(cells: int = 20, until: float = 24.0, width: int = 4, device: st
     0.81 and 0.27 (Tian and others 2014, J. Comput. Phys. 258), of the middle of the free edge.
 
     Args:
-        cells: Cells of air in a side, and points of the sheet.
+        cells: Cells of air in a side.
         until: Time [sides over speed]; the last third is measured.
         width: Of the box across the flag [sides].
         device: Where it runs.
     """
+    points = 2 * math.ceil(0.6 * cells)  # closer than the cells, and two to a cell of the grid
     simulation = Simulation(
-        Scene(generator=FlagScene(width=1.0, height=1.0, spacing=1 / cells), layers=1),
+        Scene(generator=FlagScene(width=1.0, height=1.0, spacing=1 / points), layers=1),
         Material(E=1e5, nu=0.3, density=100.0, thickness=0.01, bending=1e-4),
         solver=MPMSolver(
-            dx=2 / cells,
+            dx=2 / points,
             gravity=[0.0, 0.0, 0.0],
-            boundaries=[PinnedRegion(Box([None, None, None], [0.7 / cells, None, None]))],
+            boundaries=[PinnedRegion(Box([None, None, None], [0.7 / points, None, None]))],
         ),
         wind=WindField(schedule=[FlowKey(0.0, [1.0, 0.3, 0.0]), FlowKey(1.0, [1.0, 0.0, 0.0])]),
         aero=AeroForce(air_density=1.0),
         air=ComputedAir(
-            [-1.5, -width / 2, -1.0], [4.5, width / 2, 1.0], 6 * cells, viscosity=1 / 200, smagorinsky=0, speed=1.2
+            [-1.5, -width / 2, -1.0],
+            [4.5, width / 2, 1.0],
+            max(6, width) * cells,
+            viscosity=1 / 200,
+            smagorinsky=0,
+            speed=1.2,
         ),
         frame_dt=0.05,
         device=device,
