@@ -228,6 +228,7 @@ def test_the_worker_is_built_from_its_sources(request):
         "points.ts",
         "solver.js",
         "substep.wgsl",
+        "touch.wgsl",
         "webgpu.js",
         "wind.js",
         "worker.js",

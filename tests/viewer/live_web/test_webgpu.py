@@ -12,12 +12,12 @@ import torch
 from gaussian_swaying.viewer.live_web.block import check, pack_solver
 from gaussian_swaying.viewer.live_web.page import PAGE, write_live_web
 
-from .conftest import apart, asked_of_a_network, drawn_apart, moved_means, opened
-from .test_block import CASES, run
+from .conftest import apart, asked_of_a_network, drawn_apart, merged, moved_means, opened
+from .test_block import CASES, OBSTACLES, PLANE, run
 
 LOST = "WebGPU is not used, as {}: the processor computes the motion."
 
-ASK = """async ([program, block, messages]) => {
+ASK = """async ([program, block, messages, solver, last]) => {
   const url = URL.createObjectURL(new Blob([program], { type: "text/javascript" }));
   const worker = new Worker(url);
   const answers = [];
@@ -31,10 +31,10 @@ ASK = """async ([program, block, messages]) => {
         ready = true;
         for (const message of messages) worker.postMessage(message);
       }
-      if (data.kind === "failed" || data.kind === "done") resolve({ answers, moved });
+      if (data.kind === "failed" || data.kind === "done" || data.why === last) resolve({ answers, moved });
     };
     const bytes = Uint8Array.from(atob(block), (letter) => letter.charCodeAt(0));
-    worker.postMessage({ kind: "load", bytes, solver: "webgpu" });
+    worker.postMessage({ kind: "load", bytes, solver });
   });
   worker.terminate();
   return result;
@@ -58,12 +58,12 @@ def context(shading_browser, tmp_path_factory):
 def on_gpu(context):
     """Runs the worker alone with WebGPU: its answers but the first, and the last nodes (M, 3)."""
 
-    def on_gpu(simulation, *messages, before=""):
+    def on_gpu(simulation, *messages, before="", solver="webgpu", last=""):
         check(simulation)
         nodes = simulation.scene.follow.nodes(simulation.start())
         block = base64.b64encode(pack_solver(simulation, nodes)).decode()
         program = before + (PAGE / "worker.min.js").read_text()
-        told = context.empty.evaluate(ASK, [program, block, list(messages)])
+        told = context.empty.evaluate(ASK, [program, block, list(messages), solver, last])
         return told["answers"][1:], torch.tensor(told["moved"]).reshape(len(nodes), 4)[:, :3]
 
     return on_gpu
@@ -89,18 +89,45 @@ def show(context, until):
         page.close()
 
 
-LEFT_OUT = {"cross flow, fixed substep", "one patch a point"}  # their parts are in other cases
+def both(one, other, part=None):
+    """Two cases in one, of the second only a part."""
+    return merged(CASES[one], {part: CASES[other][part]} if part else CASES[other])
 
 
-@pytest.mark.parametrize("name", [name for name in CASES if name not in LEFT_OUT])
+MIXED = {
+    "two laws, schedule, paper": both("two laws, schedule", "neo-hookean, paper", "aero"),
+    "hencky, unit tangent, clamp and plane": both("hencky, unit tangent", "clamp and plane"),
+    "springs, viscous, pinned points": both("springs, viscous", "nodes and a point, still air", "solver"),
+    "linear, semi-implicit": CASES["linear, semi-implicit"],
+    "one patch, unit tangent": CASES["one patch, unit tangent"],
+}
+
+
+@pytest.mark.parametrize("name", MIXED)
 def test_laws_forces_and_boundaries(make, on_gpu, name):
-    simulation = make(**CASES[name])
+    simulation = make(**MIXED[name])
     state, steps = run(simulation, 10)
     told, moved = on_gpu(simulation, {"kind": "frames", "count": 10})
     assert [told[0]["name"], told[-1]["gpu"]] == ["webgpu", True]
     error, motion = apart(simulation, state, moved)
     assert motion > 5e-3
     assert error < 1e-3
+    assert abs(told[-1]["substeps"] - steps) <= 0.02 * steps
+
+
+@pytest.mark.parametrize(("name", "law"), [("ground and ball", "FixedCorotated"), ("box", "StVKHencky")])
+def test_contact_with_what_stands_still(make, on_gpu, name, law):
+    """Within 1 % of the motion after a second, of which the obstacles stop a part."""
+    pins = CASES["nodes and a point, still air"]["solver"]["boundaries"][:1]
+    settings = {"material": {"law": {"class_path": law}}}
+    simulation = make(solver={"boundaries": [*pins, *OBSTACLES[name]]}, **settings)
+    state, steps = run(simulation, 25)
+    free, _ = run(make(solver={"boundaries": pins}, **settings), 25)
+    told, moved = on_gpu(simulation, {"kind": "frames", "count": 25})
+    error, motion = apart(simulation, state, moved)
+    assert told[-1]["gpu"]
+    assert float((state.position - free.position).norm(dim=-1).max()) > 0.1 * motion
+    assert error < 0.01
     assert abs(told[-1]["substeps"] - steps) <= 0.02 * steps
 
 
@@ -176,15 +203,12 @@ def test_chosen_by_hand(show, written, until):
 
 
 BROKEN = "GPUDevice.prototype.createComputePipelineAsync = () => Promise.reject(new Error('no pipeline'));"
+OTHER = "Object.defineProperty(GPUAdapter.prototype, 'info', { value: { vendor: 'other' } });"
 ABSENT = "Object.defineProperty(navigator, 'gpu', { value: undefined });"
-OBSTACLE = {"class_path": "BallObstacle", "init_args": {"center": [0.25, 0.15, 0.1], "radius": 0.1}}
 REASONS = {
     "its device failed: no pipeline": (BROKEN, {}),
     "this browser does not offer it": (ABSENT, {}),
-    "the scene has obstacles": (
-        "",
-        {"solver": {"boundaries": [CASES["clamp and plane"]["solver"]["boundaries"][0], OBSTACLE]}},
-    ),
+    "the scene has more than 32 planes or obstacles": ("", {"solver": {"boundaries": [PLANE] * 33}}),
 }
 
 
@@ -195,3 +219,11 @@ def test_where_there_is_no_webgpu_the_processor_computes(make, on_gpu, why):
     assert told[0] == {"kind": "solver", "name": "webassembly", "why": why}
     assert told[-1]["lanes"]
     assert float(moved.norm(dim=-1).max()) > 0
+
+
+def test_where_webgpu_is_slower_the_processor_computes(make, on_gpu):
+    """A page that is late with both takes the faster one."""
+    told, _ = on_gpu(
+        make(), {"kind": "run", "on": True, "speed": 1e3}, before=OTHER, solver="auto", last="it is too slow here"
+    )
+    assert [answer["name"] for answer in told] == ["webgpu", "webassembly"]

@@ -1,5 +1,5 @@
 // A substep of solver.js in compute shaders, in single precision: the functions of the same names there, in laws.js, matrices.js and
-// aero.js are the definition. `particles` works on a point, `spread` on three nodes of a cell, `accelerate` on a node; none of them adds to
+// aero.js are the definition, and those of touch.wgsl for contact. `particles` works on a point, `spread` on three nodes of a cell, `accelerate` on a node; none of them adds to
 // what another one writes, so that the order of all sums is the same every time.
 
 struct Point {
@@ -14,11 +14,12 @@ struct Node { rest: vec3f, inverse: f32, damping: f32, held: u32, first: u32, la
 struct Plane { point: vec3f, friction: f32, normal: vec3f, kind: u32 }
 struct Share { node: u32, weight: f32 }
 
-/** What differs from substep to substep. `planes` has a bit for each plane that acts. */
+/** What differs from substep to substep. `planes` and `obstacles` have a bit for each one that acts. */
 struct Step {
   wind: vec3f, kick: f32,
   aim: vec3f, dt: f32,
   stiffness: f32, pulled: u32, planes: u32, slot: u32,
+  obstacles: u32,
 }
 
 @group(0) @binding(0) var<storage, read> points: array<Point>;
@@ -47,6 +48,7 @@ override NODES: u32;
 override ROWS: u32;
 override AFFECTED: u32;
 override PLANES: u32;
+override OBSTACLES: u32;
 override INVERSE: f32; // 1/dx
 override GRAVITY_X: f32;
 override GRAVITY_Y: f32;
@@ -481,20 +483,33 @@ fn accelerate(@builtin(global_invocation_id) id: vec3u) {
   if (k >= NODES) { return; }
   let node = nodes[k];
   var force = vec4f();
-  var shift = vec3f();
-  for (var e = node.first; e < node.last; e++) {
-    if (PLANES == 0) {
-      force += sums[entries[e]];
-    } else {
-      force += sums[2 * entries[e]];
-      shift += sums[2 * entries[e] + 1].xyz;
-    }
-  }
+  for (var e = node.first; e < node.last; e++) { force += sums[select(entries[e], 2 * entries[e], PLANES > 0)]; }
   let decay = exp(-now.kick * (DAMPING + node.damping));
   let kick = now.kick / (1.0 + now.kick * force.w * node.inverse);
-  var V = decay * (velocity[k].xyz + kick * (force.xyz * node.inverse + vec3f(GRAVITY_X, GRAVITY_Y, GRAVITY_Z)));
-  for (var p = 0u; p < PLANES; p++) {
-    if ((now.planes & (1u << p)) != 0) { V = stop(planes[p], node.rest + shift * node.inverse, V); }
+  let V = decay * (velocity[k].xyz + kick * (force.xyz * node.inverse + vec3f(GRAVITY_X, GRAVITY_Y, GRAVITY_Z)));
+  if (OBSTACLES > 0) {
+    velocity[k] = vec4f(V, 0);
+  } else {
+    end(k, node, V);
+  }
+}
+
+/** What follows contact. */
+@compute @workgroup_size(64)
+fn finish(@builtin(global_invocation_id) id: vec3u) {
+  let k = id.x;
+  if (k < NODES) { end(k, nodes[k], velocity[k].xyz); }
+}
+
+/** Planes and pins of nodes, and the motion. */
+fn end(k: u32, node: Node, free: vec3f) {
+  var V = free;
+  if (PLANES > 0) {
+    var shift = vec3f();
+    for (var e = node.first; e < node.last; e++) { shift += sums[2 * entries[e] + 1].xyz; }
+    for (var p = 0u; p < PLANES; p++) {
+      if ((now.planes & (1u << p)) != 0) { V = stop(planes[p], node.rest + shift * node.inverse, V); }
+    }
   }
   if (node.held > 0) { V = vec3f(); }
   velocity[k] = vec4f(V, 0);

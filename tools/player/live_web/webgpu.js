@@ -2,7 +2,8 @@
 // that at its end read back, so that all else is as in solver.js and another solver can go on where this one stops.
 import { Solver, QUICK, STRONGEST, LOOKS, WIDE } from "./solver.js";
 import { areaVectors, tensorOf } from "./lanes.js";
-import shader from "./substep.wgsl";
+import substep from "./substep.wgsl";
+import touch from "./touch.wgsl";
 
 const GROUP = 64; // points or nodes that are worked on together
 const BATCH = 64; // substeps that are sent at once
@@ -15,6 +16,8 @@ const BUFFERS = {
   points: [0, false], cellNodes: [1, false], vectors: [2, false], held: [3, false], displacement: [4, true], velocity: [5, true],
   stresses: [6, true], cellStart: [7, false], sums: [8, true], nodes: [9, false], entries: [10, false], planes: [11, false],
   rows: [12, false], rates: [13, true], affected: [14, false], push: [15, false], speeds: [16, true], fastest: [17, true],
+  places: [18, false], reach: [19, false], obstacles: [20, false], readers: [21, false], touches: [22, true], impulses: [23, true],
+  loads: [24, true],
 };
 
 /** What each pass reads and writes: at most eight buffers, which every device has. */
@@ -22,20 +25,46 @@ const PASSES = {
   particles: "points cellNodes vectors held displacement velocity stresses",
   spread: "points stresses cellStart sums",
   accelerate: "displacement velocity sums nodes entries planes",
+  meet: "displacement velocity places reach obstacles touches impulses",
+  weigh: "nodes reach readers impulses loads",
+  resolve: "velocity nodes reach readers touches impulses loads",
+  finish: "displacement velocity sums nodes entries planes",
   rate: "velocity rows rates",
   hold: "displacement velocity rates affected push",
   look: "points cellNodes displacement velocity speeds fastest",
 };
 
+const SUBSTEP = "particles spread accelerate meet weigh resolve finish rate hold".split(" ");
+
 const PLANE_KINDS = ["sticky", "slip", "separate"];
+const OBSTACLE_KINDS = ["half_space", "capsule", "box"];
+const MOST = 32; // planes or obstacles
 
 /** Says that WebGPU cannot be used, or no longer; its message follows "as". */
 export class NoWebGPU extends Error {}
 
+/** For each number below `count`, where its places in a list begin among all places. */
+function grouped(/** @type {ArrayLike<number>} */ list, /** @type {number} */ count) {
+  const ends = new Uint32Array(count + 1);
+  for (let k = 0; k < list.length; k++) ends[list[k] + 1]++;
+  for (let k = 0; k < count; k++) ends[k + 1] += ends[k];
+  const next = ends.slice();
+  const entries = new Uint32Array(list.length);
+  for (let k = 0; k < list.length; k++) entries[next[list[k]]++] = k;
+  return { ends, entries };
+}
+
+/** Nodes and weights, in turn. */
+function shares(/** @type {ArrayLike<number>} */ nodes, /** @type {ArrayLike<number>} */ weights) {
+  const both = new Float32Array(2 * nodes.length);
+  const whole = new Uint32Array(both.buffer);
+  for (let k = 0; k < nodes.length; k++) (whole[2 * k] = nodes[k]), (both[2 * k + 1] = weights[k]);
+  return both;
+}
+
 /** Why a scene is not simulated in compute shaders; null if it is. @returns {string | null} */
 export function uncovered({ head, arrays }) {
-  if (head.obstacles.length) return "the scene has obstacles";
-  if (head.planes.length > 32) return "the scene has more than 32 planes";
+  if (Math.max(head.obstacles.length, head.planes.length) > MOST) return `the scene has more than ${MOST} planes or obstacles`;
   if (9 * (arrays.cellStart.length - 1) > GROUP * MOST_GROUPS) return "the scene has too many points";
   return null;
 }
@@ -82,7 +111,11 @@ export class GpuSolver extends Solver {
     this.displacement = new Float32Array(WIDE * nodes);
     this.velocity = new Float32Array(WIDE * nodes);
     this.before = { displacement: this.displacement.slice(), velocity: this.velocity.slice() };
-    this.counts = { particles: points, spread: 9 * cells, accelerate: nodes - 1, rate: this.head.rows, hold: this.a.affected.length, look: points };
+    const samples = this.contact?.count ?? 0;
+    this.counts = {
+      particles: points, spread: 9 * cells, accelerate: nodes - 1, meet: samples, weigh: samples && nodes - 1, resolve: samples && 1,
+      finish: samples && nodes - 1, rate: this.head.rows, hold: this.a.affected.length, look: points,
+    };
     /** @type {any} what the last pull uploaded */
     this.uploaded = null;
     this.fill();
@@ -111,12 +144,7 @@ export class GpuSolver extends Solver {
       for (let k = 0; k < own.length; k += 3) table.set(own.slice(k, k + 3), 4 * row++);
       whole.points[at + 11] = row;
     }
-    const ends = new Uint32Array(nodes + 1); // of the entries of each node
-    for (const node of a.cellNodes) ends[node + 1]++;
-    for (let k = 0; k < nodes; k++) ends[k + 1] += ends[k];
-    const next = ends.slice();
-    const entries = new Uint32Array(27 * cells);
-    a.cellNodes.forEach((node, k) => (entries[next[node]++] = k));
+    const { ends, entries } = grouped(a.cellNodes, nodes);
     for (let k = 0; k < nodes; k++) {
       const at = 8 * k;
       if (a.nodeRest.length) record.nodes.set(a.nodeRest.subarray(3 * k, 3 * k + 3), at);
@@ -127,10 +155,16 @@ export class GpuSolver extends Solver {
       record.planes.set([...point, friction, ...normal], 8 * k);
       whole.planes[8 * k + 7] = PLANE_KINDS.indexOf(kind);
     });
-    const rows = new Float32Array(2 * a.rowNode.length);
-    const rowNodes = new Uint32Array(rows.buffer);
-    a.rowNode.forEach((node, k) => (rowNodes[2 * k] = node));
-    a.rowWeight.forEach((weight, k) => (rows[2 * k + 1] = weight));
+    const obstacles = new Float32Array(20 * head.obstacles.length);
+    head.obstacles.forEach(({ center, kind, numbers: n, friction, gap }, k) => {
+      obstacles.set(center, 20 * k);
+      new Uint32Array(obstacles.buffer)[20 * k + 3] = OBSTACLE_KINDS.indexOf(kind);
+      if (kind === "box") obstacles.set([...n.slice(0, 3), 0, ...n.slice(3, 6), friction, ...n.slice(6, 9), gap, ...n.slice(9, 12)], 20 * k + 4);
+      else obstacles.set([...n, ...Array(8 - n.length).fill(0)].slice(0, 7).concat(friction, 0, 0, 0, gap), 20 * k + 4);
+    });
+    const places = Float32Array.from({ length: 4 * a.sampleHalf.length }, (_, k) => (k % 4 < 3 ? a.samplePlace[3 * (k >> 2) + (k % 4)] : a.sampleHalf[k >> 2]));
+    const named = grouped(a.sampleNode, nodes);
+    const readers = Uint32Array.from([...named.ends.map((end) => end + nodes + 1), ...named.entries]);
     const usage = globalThis.GPUBufferUsage;
     /** @type {Record<string, any>} */
     this.buffers = {};
@@ -152,10 +186,17 @@ export class GpuSolver extends Solver {
     make("nodes", record.nodes);
     make("entries", entries);
     make("planes", record.planes);
-    make("rows", rows);
+    make("rows", shares(a.rowNode, a.rowWeight));
     make("rates", 16 * head.rows);
     make("affected", Uint32Array.from(a.affected));
     make("push", Float32Array.from(a.push));
+    make("places", places);
+    make("reach", shares(a.sampleNode, a.sampleWeight));
+    make("obstacles", obstacles);
+    make("readers", readers);
+    make("touches", 64 * head.obstacles.length * places.length / 4);
+    make("impulses", 4 * places.length);
+    make("loads", 4 * nodes);
     make("speeds", 4 * points);
     make("fastest", 8 * (LOOKS + 1));
     make("now", STRIDE * (BATCH + 1), usage.UNIFORM | usage.COPY_DST);
@@ -166,12 +207,13 @@ export class GpuSolver extends Solver {
   /** Makes the pipelines. */
   async compile() {
     const { device, head, aero, counts } = this;
-    const module = device.createShaderModule({ code: shader });
+    const module = device.createShaderModule({ code: substep + touch });
     for (const { type, lineNum, message } of (await module.getCompilationInfo()).messages)
       if (type === "error") throw new Error(`${message} in line ${lineNum} of its shader`);
     const constants = {
       POINTS: this.points, SPREAD: counts.spread, NODES: counts.accelerate, ROWS: counts.rate, AFFECTED: counts.hold,
-      PLANES: head.planes.length, INVERSE: 1 / head.dx, GRAVITY_X: head.gravity[0], GRAVITY_Y: head.gravity[1],
+      PLANES: head.planes.length, OBSTACLES: counts.meet && head.obstacles.length, SAMPLES: counts.meet, ITERATIONS: head.iterations,
+      DX: head.dx, INVERSE: 1 / head.dx, GRAVITY_X: head.gravity[0], GRAVITY_Y: head.gravity[1],
       GRAVITY_Z: head.gravity[2], DAMPING: head.damping, VISCOUS: head.viscous, WINDY: !this.idle, GROUPED: head.grouped,
       DRAG: aero.drag, FRICTION: aero.friction, LIFT: aero.lift, AIR: aero.airDensity, AERO_LAW: aero.law, LIFTED: aero.lifted,
       UNIT_TANGENT: aero.unitTangent, IMPLICIT: aero.implicit, MOST_AREA: Math.min(aero.maxAreaRatio, 1e30), QUICK, STRONGEST,
@@ -183,8 +225,9 @@ export class GpuSolver extends Solver {
     /** @type {Record<string, any>} */
     this.passes = {};
     await Promise.all(
-      Object.entries(PASSES).map(async ([name, list]) => {
-        const used = list.split(" ");
+      Object.keys(PASSES).map(async (name) => {
+        if (counts[name] === 0) return;
+        const used = PASSES[name].split(" ");
         const type = (written) => ({ type: written ? "storage" : "read-only-storage" });
         const own = layoutOf(used.map((buffer) => ({ binding: BUFFERS[buffer][0], buffer: type(BUFFERS[buffer][1]) })));
         const group = device.createBindGroup({
@@ -245,8 +288,8 @@ export class GpuSolver extends Solver {
       if (from === 0) encoder.clearBuffer(buffers.fastest);
       const pass = encoder.beginComputePass();
       const run = (/** @type {string} */ name, /** @type {number} */ at) => {
+        if (!(name in this.passes)) return;
         const { pipeline, group, groups } = this.passes[name];
-        if (groups === 0) return;
         pass.setPipeline(pipeline);
         pass.setBindGroup(0, group);
         pass.setBindGroup(1, this.changing, [at]);
@@ -265,8 +308,10 @@ export class GpuSolver extends Solver {
         if (!this.idle) this.wind.blow(this.time, this.blown);
         numbers.set([...this.blown, kick, ...(pull?.target ?? [0, 0, 0]), dt, this.stiffness], at);
         whole[at + 9] = pull === null ? 0 : 1;
-        whole[at + 10] = head.planes.reduce((bits, plane, p) => bits | (this.acts(plane) ? 1 << p : 0), 0);
-        for (const name of ["particles", "spread", "accelerate", "rate", "hold"]) run(name, 4 * at);
+        const acting = (/** @type {any[]} */ all) => all.reduce((bits, one, p) => bits | (this.acts(one) ? 1 << p : 0), 0);
+        whole[at + 10] = acting(head.planes);
+        whole[at + 12] = acting(head.obstacles);
+        for (const name of SUBSTEP) run(name, 4 * at);
         this.time += dt;
         this.substep = dt;
       }

@@ -6,6 +6,7 @@ import { GpuSolver, NoWebGPU, openGpu } from "./webgpu.js";
 
 const BEHIND = 0.25; // s that it may be late before it stops trying to catch up
 const WINDOW = 2000; // ms, over which the speed is measured
+const FULL = 0.7; // share of it after which WebGPU and the processor are compared
 const LEAST = 4; // frames that it is measured from
 const LATE = 0.95; // of the wanted speed: below it substeps become longer
 const EASY = 0.4; // share of the time in which it computes: below it they are those of the package again
@@ -17,6 +18,9 @@ let solver;
 let block;
 let plain = false; // without WebAssembly
 let wanted = "auto"; // or "webgpu" or "worker": where the motion is computed
+/** Speed with WebGPU where it was too slow, so that the processor is tried. @type {number | null} */
+let slow = null;
+let settled = false; // whether both were tried
 let chain = Promise.resolve(); // one thing after the other, as frames on a graphics card take their time
 let on = false;
 let speed = 1; // simulated seconds per second that are wanted
@@ -97,22 +101,32 @@ function show() {
   post({ kind: "state", motion, time: solver.time, moved, rate, ended: !on }, [moved.buffer]);
 }
 
-/** Simulated seconds per second, and the share of the time in which it computes; null at first. */
+/** Simulated seconds per second, the share of the time in which it computes, and how long that was [ms]; null at first. */
 function measured() {
   if (past.length < LEAST) return null;
   const [first, last] = [past[0], past[past.length - 1]];
   const wall = last[0] - first[0];
-  return { rate: (last[1] - first[1]) / (wall / 1000), busy: past.slice(1).reduce((sum, frame) => sum + frame[2], 0) / wall };
+  return { wall, rate: (last[1] - first[1]) / (wall / 1000), busy: past.slice(1).reduce((sum, frame) => sum + frame[2], 0) / wall };
 }
 
-/** Takes longer substeps where it is late. */
+/** Takes longer substeps where it is late; where even those of WebGPU are, the faster one of WebGPU and the processor. */
 function hurry() {
   const found = measured();
   if (!found) return;
-  const hurried = found.rate < LATE * speed || (solver.hurried && found.busy > EASY);
-  if (hurried === solver.hurried) return;
-  solver.hurried = hurried;
-  past = [];
+  const late = found.rate < LATE * speed;
+  const hurried = late || (solver.hurried && found.busy > EASY);
+  if (hurried !== solver.hurried) {
+    solver.hurried = hurried;
+    past = [];
+  } else if (late && !settled && wanted === "auto" && found.wall > FULL * WINDOW) {
+    if (solver instanceof GpuSolver) {
+      slow = found.rate;
+      takeOver(made(), "it is too slow here");
+    } else if (slow !== null) {
+      settled = true;
+      if (found.rate < slow) choose();
+    }
+  }
 }
 
 async function pace() {
