@@ -132,7 +132,8 @@ def _on_a_laptop() -> Iterator[Problem]:
         yield "onset", {"mass_ratio": mass_ratio, "cells": cells}, partial(_onset, mass_ratio, cells)
     for froude in (0.3, 0.5, 0.9, 1.2):
         yield "falling plate", {"froude": froude}, partial(_fall, froude)
-    yield "plate", {"cells": 10}, partial(air.plate, 10, until=20.0)
+    yield "plate", {"cells": 10}, partial(air.plate, 10)
+    yield "square flag", {"cells": 24, "width": 8}, partial(filaments.square_flag, 24, width=8)
     yield "cylinder", {"cells": 12}, partial(air.cylinder, 12, until=110.0)
 
 
@@ -144,8 +145,8 @@ def _on_a_gpu() -> Iterator[Problem]:
     for cells in (12, 24):
         yield "cylinder", {"cells": cells}, partial(air.cylinder, cells, 110.0, device="cuda")
     for cells in (10, 20):
-        yield "plate", {"cells": cells}, partial(air.plate, cells, 20.0, device="cuda")
-    for cells, width in ((16, 4), (24, 4), (32, 4), (24, 8), (48, 4)):
+        yield "plate", {"cells": cells}, partial(air.plate, cells, device="cuda")
+    for cells, width in ((24, 4), (32, 8), (48, 8)):
         given = {"cells": cells, "width": width}
         yield "square flag", given, partial(filaments.square_flag, cells, width=width, device="cuda")
 
