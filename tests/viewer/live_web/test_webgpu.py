@@ -34,7 +34,8 @@ ASK = """async ([program, block, messages, solver, last]) => {
       if (data.kind === "failed" || data.kind === "done" || data.why === last) resolve({ answers, moved });
     };
     const bytes = Uint8Array.from(atob(block), (letter) => letter.charCodeAt(0));
-    worker.postMessage({ kind: "load", bytes, solver });
+    worker.postMessage({ kind: "load", bytes });
+    worker.postMessage({ kind: "solver", which: solver });
   });
   worker.terminate();
   return result;

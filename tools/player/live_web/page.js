@@ -59,7 +59,7 @@ export async function sway(read, tell) {
     explain();
   };
   const block = await read("solver");
-  say({ kind: "load", bytes: block, solver: settings.solver }, [block.buffer]);
+  say({ kind: "load", bytes: block }, [block.buffer]);
   await view.open();
   const { camera, controls } = view;
   if (settings.view) {

@@ -17,7 +17,7 @@ let solver;
 /** @type {{head: any, arrays: Record<string, any>}} */
 let block;
 let plain = false; // without WebAssembly
-let wanted = "auto"; // or "webgpu" or "worker": where the motion is computed
+let wanted = ""; // "auto", "webgpu" or "worker": where the motion is computed
 /** Speed with WebGPU where it was too slow, so that the processor is tried. @type {number | null} */
 let slow = null;
 let settled = false; // whether both were tried
@@ -166,12 +166,12 @@ function restart() {
 const does = {
   load(given) {
     block = readBlock(given.bytes);
-    ({ plain = false, solver: wanted = "auto" } = given);
+    plain = !!given.plain;
     solver = made();
     show();
     tell();
-    choose();
   },
+  // said when the first pictures are drawn, which WebGPU would delay
   solver({ which }) {
     if (which === wanted) return;
     wanted = which;
