@@ -10,6 +10,8 @@ from dataclasses import asdict
 from typing import Any
 
 from gaussian_swaying import _program as program
+from gaussian_swaying.aero.computed_air import resolution
+from gaussian_swaying.aero.wind import WindField
 from gaussian_swaying.gaussians.cloud import GaussianCloud
 from gaussian_swaying.gaussians.ply import OPAQUE_LOGIT
 from gaussian_swaying.preview.cost import Cost
@@ -135,6 +137,7 @@ def run_lines(run: dict[str, Any]) -> list[str]:
         f"  frame           {run['frame']}",
         f"  grid            dx = {run['dx_m']:g} m, {run['formulation']}",
         f"  wind            {wind_words(run['flow'], run['up'])}, before modulations",
+        *([f"  air             {run['air']}"] if run["air"] else []),
     ]
 
 
@@ -337,7 +340,16 @@ def run_dict(simulation: Simulation) -> dict[str, Any]:
         "formulation": simulation.solver.formulation,
         "flow": mean_flow(simulation).tolist(),
         "up": scene.frame.rotation[2].tolist(),
+        "air": _air(simulation),
     }
+
+
+def _air(simulation: Simulation) -> str | None:
+    """What the box of computed air costs and resolves; None without one."""
+    air, wind = simulation.stepper.setup.air, simulation.wind
+    if air is None or not isinstance(wind, WindField):
+        return None
+    return str(resolution(air, wind, simulation.frame_dt, simulation.scene.points.position))
 
 
 def cost_dict(cost: Cost) -> dict[str, Any]:

@@ -352,3 +352,18 @@ def test_a_note_on_infinite_opacities_is_for_the_preview_alone(tmp_path, capsys)
     small = ["--camera.init_args.width=16", "--camera.init_args.height=9", "--device=cpu", "--frames=1"]
     assert simulate(["--config", str(tmp_path / "out/draft.yaml"), *small, f"--output={tmp_path / 'run'}"]) == 0
     assert "infinite logit" not in "".join(capsys.readouterr())
+
+
+def test_what_computed_air_costs_is_said(splat, tmp_path, capsys):
+    pin = {"class_path": "PinnedRegion", "init_args": {"region": {"class_path": "Box", "init_args": {
+        "min": [None] * 3, "max": [0.1, None, None]}}}}  # fmt: skip
+    mine = tmp_path / "mine.yaml"
+    mine.write_text(yaml.safe_dump({"frames": 2, "solver": {"dx": 0.2, "boundaries": [pin]},
+        "wind": {"flow": [1.0, 2.0, 0.0]}, "recorder": {"images": False, "video": False},
+        "air": {"low": [-2.0, -2.0, -2.0], "high": [3.0, 2.0, 2.0], "cells": 40}}))  # fmt: skip
+    assert preview(splat, tmp_path / "out", "--config", str(mine)) == 0
+    (line,) = [line for line in capsys.readouterr().out.splitlines() if line.startswith("  air  ")]
+    told = json.loads((tmp_path / "out/preview.json").read_text())["run"]["air"]
+    assert line.endswith(told)
+    assert "40 x 32 x 32 cells of 12.5 cm" in told
+    assert "Reynolds number" in told
