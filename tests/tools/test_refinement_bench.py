@@ -111,3 +111,10 @@ def test_contact_is_on_both_sides_and_recorded_beside_none(solved, tmp_path):
     assert line[:2] == ["pennant", "8"]
     assert line[2] == line[3]
     assert float(line[5].split()[0]) == 0
+
+
+def test_one_layer_and_three_take_turns(solved, tmp_path):
+    small = ["--flags", "pennant", "--grids", "8", "--frames", "4", "--rounds", "2", "--references", tmp_path]
+    result, _ = measure("refinement", *small, result=json.loads(json.dumps(HEAD)) | {"rows": [], "references": {}})
+    assert [kind for kind, *_ in solved] == ["Run", "OneLayer"] * 3
+    assert cells("refinement.turns", result) == [["pennant", "8", "2.0", "2.0", "1.00"]]

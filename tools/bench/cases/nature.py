@@ -52,6 +52,8 @@ def cases(settings: Settings) -> Iterable[tuple[str, Row, Callable[[], Result]]]
     for cells, fabric in product((6, 8), FABRICS):
         yield case("drape", drapes.drape, fabric=fabric, folds=FOLDS, cells=cells)
     yield case("drape", drapes.drape, fabric="ponte", folds=FOLDS, cells=12)
+    for cells, fabric in product((6, 8), FABRICS):
+        yield case("drape", drapes.drape, fabric=fabric, folds=FOLDS, cells=cells, layers=1)
     for fabric, folds in product(FABRICS, (4, 5, 6, 7)):
         yield case("draped shell", drapes.of_shell, fabric=fabric, folds=folds)
     yield case("draped shell", drapes.of_shell, fabric="ponte", folds=FOLDS, cells=20)

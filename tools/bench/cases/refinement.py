@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import statistics
 import sys
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
@@ -69,6 +70,22 @@ def _distance(run: Run, options: argparse.Namespace, to: Cloth, flat: Cloth | No
     return found if flat is None else found | {"to_flat": apart(run.flag(), ours, flat)}
 
 
+def _turns(pattern: Flag, cells: int, options: argparse.Namespace) -> Row:
+    """Seconds of three layers and of one, which take turns, and how they compare in each turn."""
+    kinds = {
+        "three": Run(pattern, "ours", cells, options.frames),
+        "one": OneLayer(pattern, "ours", cells, options.frames),
+    }
+    times: dict[str, list[float]] = {name: [] for name in kinds}
+    for turn in range(options.rounds + 1):  # the first compiles the kernels
+        for name, run in kinds.items():
+            seconds = run.solve(options.blender)[1]["seconds"]
+            if turn:
+                times[name].append(seconds)
+    ratios = [one / three for one, three in zip(times["one"], times["three"], strict=True)]
+    return {name: statistics.median(values) for name, values in times.items()} | {"ratio": statistics.median(ratios)}
+
+
 def _itself(make: type[Run], pattern: Flag, options: argparse.Namespace) -> tuple[Cloth, Row]:
     """The finer of two meshes of Blender's, and how far the other is from it."""
     coarser, finer = (make(pattern, "blender", cells, options.frames) for cells in options.blender_cells)
@@ -81,6 +98,13 @@ def rows(options: argparse.Namespace, result: Row) -> Iterator[Measurement]:
     result["versions"] = result["versions"] | {"bpy": version(options.blender)}
     result |= {"frames": options.frames, "note": options.note}
     for pattern in options.flags:
+        if options.rounds:
+            for cells in options.grids:
+                yield (
+                    ("turns", {"flag": pattern, "cells": cells}),
+                    partial(guarded, partial(_turns, pattern, cells, options)),
+                )
+            continue
         if options.contact:
             touching, about = _itself(Touching, pattern, options)
             free = reference(Run(pattern, "blender", options.blender_cells[-1], options.frames), options)
@@ -121,6 +145,7 @@ CASE = Case(
                 default="120,160"),
         numbers("--grids", "cells of our grids along the longer side", default="30,40,60,80"),
         option("--layers", "of points: 3, or 1, which is recorded beside them", type=int, choices=(1, 3), default=3),
+        option("--rounds", "only the times of three layers and of one, in so many turns", type=int, default=0),
         option("--contact", "with self-contact on both sides, recorded beside the rows without", action="store_true"),
         option("--frames", "frames, the first being the rest shape", type=int, default=125),
         NOTE,

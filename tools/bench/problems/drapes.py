@@ -119,6 +119,7 @@ def drape(
     stretch: float = 100.0,
     settle: float = 12.0,
     seed: float = 0.3,
+    layers: int = 3,
     settings: Settings | None = None,
 ) -> Result:
     r"""Let a fabric drape over a disc under its weight, from a scene as a user makes it.
@@ -133,6 +134,7 @@ def drape(
         stretch: E h [N/m].
         settle: Time to simulate, in units of 1 / circular frequency of a strip as long as the free width.
         seed: Height of the folds that the first velocities would reach without a force, over the free width.
+        layers: Layers of points: 3, or 1, whose sheet bends by itself.
         settings: The numerics.
 
     Returns:
@@ -153,7 +155,7 @@ def drape(
     pin = PinnedRegion(Cylinder([0.0] * 3, [0.0, 0.0, 1.0], DISC, 1.0), "clamp")
     solver = settings.solver(dx, gravity=(0.0, 0.0, -GRAVITY), boundaries=[pin], damping=2 * omega)
     material = Material(E=stretch / THICK, nu=NU, density=mass / THICK, thickness=THICK, bending=stiffness)
-    made = Scene(generator=scene, metres_per_unit=1.0, layers=3, points="gaussian")
+    made = Scene(generator=scene, metres_per_unit=1.0, layers=layers, points="gaussian")
     simulation = Simulation(made, material, solver=solver, device=settings.device)
     points, solver = simulation.scene.points, simulation.solver
     assert isinstance(solver, MPMSolver)

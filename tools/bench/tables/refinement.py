@@ -94,6 +94,19 @@ table(PAGE, "refinement.one_layer", "refinement_*", _one_layer, """
     """)  # fmt: skip
 
 
+def _turns(result: Row) -> Iterator[Row]:
+    """Times of three layers and of one, by flag and grid."""
+    for row in sorted(result.get("turns", []), key=lambda row: (str(row["flag"]), row["cells"])):
+        if "failed" not in row:
+            yield row | {"flag": named(row["flag"])}
+
+
+table(PAGE, "refinement.turns", "refinement_*", _turns, """
+    flag = {flag} | cells = {cells} | three layers [s] = {three:.1f} | one layer [s] = {one:.1f} |
+    one over three, median of the turns = {ratio:.2f}
+    """, empty="", before="Their times, by turns:")  # fmt: skip
+
+
 def _touching(result: Row) -> Iterator[Row]:
     """The rows with self-contact beside those without."""
     free = {(row["flag"], row["cells"]): row for row in result["rows"] if "failed" not in row}
@@ -113,22 +126,32 @@ table(PAGE, "refinement.touching", "refinement_*", _touching, """
 
 
 def plot(results: list[Row], pictures: Path) -> None:
-    """Draw ``refinement.png`` of a record: distance against cells, a line for each flag."""
+    """Draw ``refinement.png`` of a record: distance against cells, and against time, a line for each flag."""
     (result,) = results
-    figure, axis = subplots(figsize=(9, 5))
+    figure, (axis, times) = subplots(1, 2, figsize=(13, 5), sharey=True)
     for number, (flag, itself, own) in enumerate(_fronts(result)):
         colour, cells = f"C{number}", [row["cells"] for row in own]
         distances = [100 * row["chamfer"] for row in own]
-        axis.plot(cells, distances, "o-", color=colour, label=f"{named(flag)} (reference: {100 * itself:.2f} %)")
+        axis.plot(cells, distances, "o-", color=colour)
+        times.plot(
+            [row["seconds"] for row in own],
+            distances,
+            "o-",
+            color=colour,
+            label=f"{named(flag)} (reference: {100 * itself:.2f} %)",
+        )
         axis.plot(1.03 * cells[-1], 100 * itself, "_", color=colour, markersize=14)
-    axis.set_xscale("log")
     axis.set_ylim(bottom=0)
     axis.set_xlabel("cells along the longer side")
     axis.set_ylabel("distance [% of the longer side]")
     axis.set_title("Dashes on the right: the reference against itself", fontsize=10)
-    axis.grid(True, which="major", linewidth=0.4, alpha=0.6)
-    plain_numbers(axis)
+    times.set_title("Time of the first frames, on a shared CPU", fontsize=10)
+    times.set_xlabel("time [s]")
+    for one in (axis, times):
+        one.set_xscale("log")
+        one.grid(True, which="major", linewidth=0.4, alpha=0.6)
+        plain_numbers(one)
     axis.set_xticks(sorted({row["cells"] for *_, own in _fronts(result) for row in own}))
     axis.set_xticks([], minor=True)
-    axis.legend(fontsize=8, loc="upper left", bbox_to_anchor=(1.01, 1.0))  # beside the lines, none of which it hides
+    times.legend(fontsize=8, loc="upper left", bbox_to_anchor=(1.01, 1.0))  # beside the lines, none of which it hides
     save_figure(figure, pictures / "refinement.png")
