@@ -69,7 +69,8 @@ def _draped(result: Row) -> list[Row]:
 table(PAGE, "nature.drape", "nature_*", _draped, """
     fabric = {fabric} | bending length [mm] = {length:.1f (mm)} | cells along the free width = {cells} |
     layers = {layers} | points = {points:,.0f} | outer layers apart [cells] = {span:.2f} |
-    drape coefficient = {drape:.1f %} | of the shell = {exact:.1f %} | error = {error:.1f %} | folds at rest = {folds_found:.0f}
+    drape coefficient = {drape:.1f %} | of the shell = {exact:.1f %} | error = {error:.1f %} |
+    folds at rest = {folds_found:.0f}
     """)  # fmt: skip
 table(PAGE, "nature.shells", "nature_*",
       lambda result: [{"cells": 8, "stretch": 100.0} | row for row in _of(result, "draped shell")], """
