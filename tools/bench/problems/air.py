@@ -179,7 +179,7 @@ def sphere(
 
 
 def plate(
-    cells: int, until: float = 80.0, reynolds: float = 300.0, length: int = 12, width: int = 8, device: str = "cpu"
+    cells: int, until: float = 40.0, reynolds: float = 300.0, length: int = 12, width: int = 8, device: str = "cpu"
 ) -> dict[str, float]:
     """Mean drag of a square plate across the flow, an immersed surface; 1.17 at high Reynolds numbers (Hoerner 1965).
 

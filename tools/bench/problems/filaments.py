@@ -210,7 +210,7 @@ def hanging(cells: int = 24, until: float = 30.0) -> dict:
     return measured(flap([one], [(0.0, 0.0)], cells=cells, until=until))
 
 
-def tandem(gap: float, cells: int = 24, until: float = 30.0, mass_ratio: float = 0.5, bending: float = 1e-3) -> dict:
+def tandem(gap: float, cells: int = 24, until: float = 30.0, mass_ratio: float = 1.5, bending: float = 1e-3) -> dict:
     """Two flags one behind the other: drag of each per that of one alone."""
     alone = flag(mass_ratio, bending, 200.0, cells=cells, until=until)
 

@@ -84,7 +84,7 @@ def _falls(result: Row) -> Iterator[Row]:
     """Each plate, and whether it does what it does in experiments: it flutters below a Froude number of 0.67."""
     for row in _of(result, "falling plate"):
         light = row["froude"] < 0.67
-        does = "flutters" if row["turns"] < 1 and row["swing"] > 0.2 else "tumbles" if row["turns"] >= 1 else "glides"
+        does = "flutters" if row["swing"] < math.pi - 0.1 else "tumbles" if row["turns"] >= 1 else "turns over at times"
         known = "flutters" if light else "tumbles"
         yield row | {"known": known, "does": does, "right": does == known, "degrees": math.degrees(row["swing"])}
 
@@ -122,7 +122,9 @@ table(PAGE, "air.coupling", "air_*", _couplings, """
     """, before="{source}", empty="")  # fmt: skip
 table(PAGE, "air.tandem", "air_cpu", lambda result: _of(result, "two flags"), """
     gap [lengths] = {gap:g} | drag of the first per that of one alone = {first:.2f} | of the second = {second:.2f}
-    """, empty="", before="Two flags in a plane, one behind the other, of mass ratio 0.5 and stiffness 0.001:",
+    """, empty="", before="Two flags in a plane, one behind the other, of mass ratio 1.5 and stiffness 0.001. In "
+    "experiments the first one has less drag than alone, and the second one more, the closer they are (Ristroph and Zhang "
+    "2008):",
     )  # fmt: skip
 
 
