@@ -345,7 +345,7 @@ def run_dict(simulation: Simulation) -> dict[str, Any]:
 
 
 def _air(simulation: Simulation) -> str | None:
-    """What the box of computed air costs and resolves; None without one."""
+    """Cost and resolution of the box of computed air; None without one."""
     air, wind = simulation.stepper.setup.air, simulation.wind
     if air is None or not isinstance(wind, WindField):
         return None
