@@ -152,4 +152,4 @@ FOLD_GOALS = [
     Goal("{title}: within {above:g %} above the uncertainty of {other}", "{near:.2f %}, {doubt:.2f %} + {above:g %}",
          "near <= most", _near),
 ]  # fmt: skip
-table(PAGE, "folds.goals", "folds_*", judged(FOLD_GOALS), GOAL, empty="This record has none of our flags.")
+table(PAGE, "folds.goals", "folds_*", judged(FOLD_GOALS), GOAL, empty="")

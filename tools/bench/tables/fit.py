@@ -26,7 +26,6 @@ _BLANK = dict.fromkeys(("direction_error_deg", "material.E_error", "psnr_predict
 """What a row need not have."""
 _FOUND = """ = {name} | speed = {speed_error:+.2f %} | direction = {direction_error_deg:.2f °} |
     E = {material.E_error:+.2f %} | predicted frames = {psnr_predicted_db:.1f dB} | time = {seconds:.0f s}"""
-_NONE = "Not measured yet."
 
 
 def _rows(result: Row, part: str) -> Iterator[Row]:
@@ -62,11 +61,11 @@ def _counted(result: Row) -> Row:
 
 
 table(PAGE, "fit.own", "fit_*", partial(_rows, part="own"), f"{_FOUND} | within 1 % and 1 degree = {{reached}}",
-      before=_data, each=True, empty=_NONE)  # fmt: skip
+      before=_data, each=True, empty="")  # fmt: skip
 table(PAGE, "fit.blender", "fit_*", partial(_rows, part="blender"), f"""
     {_FOUND} | splat at rest = {{psnr_rest_db:.1f dB}} | 28 dB, or as at rest = {{sharp}} |
     fitted; mesh; changes of scene.yaml = {{base}} | goal reached = {{reached}}
-    """, before="{source}", order=["key"], each=True, empty=_NONE)  # fmt: skip
+    """, before="{source}", order=["key"], each=True, empty="")  # fmt: skip
 value("fit.within", "fit_*", "{reached:g} of {all}", _counted)
 value("fit.sharp", "fit_*", "{sharp:g} of {all}", _counted)
 
@@ -84,7 +83,7 @@ def _biases(result: Row) -> Iterator[Row]:
 table(PAGE, "fit.bias", "fit_*", _biases, """
     case and grid = {name} | distance = {told} | speed = {speed_error:+.2f %} |
     azimuth = {azimuth_error_deg:+.2f °} | E = {material.E_error:+.2f %} | points = {points:,}
-    """, before="{source}", each=True, empty=_NONE)  # fmt: skip
+    """, before="{source}", each=True, empty="")  # fmt: skip
 
 
 def _unfitted(result: Row) -> Iterator[Row]:
@@ -96,7 +95,7 @@ def _unfitted(result: Row) -> Iterator[Row]:
 
 table(PAGE, "fit.reference", "fit_*", _unfitted, """
     predicted frames = {case} | *{motion} = {psnr_predicted_db:.1f dB}
-    """, before="{source}", each=True, empty=_NONE)  # fmt: skip
+    """, before="{source}", each=True, empty="")  # fmt: skip
 
 
 def _motions(result: Row) -> Iterator[Row]:
@@ -110,8 +109,8 @@ def _motions(result: Row) -> Iterator[Row]:
 table(PAGE, "fit.soft_motion", "soft_*", _motions, """
     = {name} | mean distance = {mean_m:.2f mm} | largest distance = {largest_m:.1f mm} |
     first swing = {swing:+.1f %} | deflection later = {deflection:+.1f %}
-    """, before="{source}", each=True, empty=_NONE)  # fmt: skip
+    """, before="{source}", each=True, empty="")  # fmt: skip
 table(PAGE, "fit.soft", "soft_*", partial(_rows, part="fits"), f"""
     {_FOUND} | of the processor = {{processor_s:.0f s}} | splat at rest = {{psnr_rest_db:.1f dB}} |
     fitted; changes of scene.yaml = {{base}}
-    """, before="{source}", each=True, empty=_NONE)  # fmt: skip
+    """, before="{source}", each=True, empty="")  # fmt: skip
