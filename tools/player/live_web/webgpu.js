@@ -287,12 +287,13 @@ export class GpuSolver extends Solver {
       const encoder = device.createCommandEncoder();
       if (from === 0) encoder.clearBuffer(buffers.fastest);
       const pass = encoder.beginComputePass();
+      let bound = -1; // where the numbers of the substep are
       const run = (/** @type {string} */ name, /** @type {number} */ at) => {
         if (!(name in this.passes)) return;
         const { pipeline, group, groups } = this.passes[name];
         pass.setPipeline(pipeline);
         pass.setBindGroup(0, group);
-        pass.setBindGroup(1, this.changing, [at]);
+        if (at !== bound) pass.setBindGroup(1, this.changing, [(bound = at)]);
         pass.dispatchWorkgroups(groups);
       };
       for (let k = from; k < Math.min(from + BATCH, steps + 1); k++) {
