@@ -1,0 +1,245 @@
+"""Registration: the camera of a frame, from the frame and the splat that it shows.
+
+Features of pictures of the splat are matched with those of the frame (SIFT, Lowe 2004). The depth of a picture makes
+points in space of them, and a camera sees these points where the frame has them (perspective-n-point with RANSAC). From
+there the picture and the frame are nearly the same, and points that are followed from one to the other by Lucas and
+Kanade's method make the camera exact.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from gaussian_swaying._checks import check_whole
+from gaussian_swaying.fitting.tracks import follow, opencv
+from gaussian_swaying.rendering.cameras.camera import Camera, look_at_camera
+from gaussian_swaying.rendering.protocol import RenderOutput
+
+RATIO = 0.8
+"""Largest distance of a feature to its match, per that to the next best one (Lowe 2004)."""
+NEAR = 0.006
+"""Largest distance between a point and its match that agree on a camera, as a share of the picture's diagonal."""
+LEAST = 12
+"""Fewest matches that make a camera."""
+SOLID = 0.9
+"""Least opacity of the picture at a feature, whose depth is then known."""
+ROUNDS = 6
+"""Most pictures that are drawn from a camera that is already near."""
+
+
+@dataclass(frozen=True, eq=False)
+class Registration:
+    """The camera of a frame.
+
+    Attributes:
+        camera: The camera.
+        matches: Points that were matched at the end.
+        agreeing: Those that agree on the camera.
+        residual: Root mean square of their distances [pixels].
+    """
+
+    camera: Camera
+    matches: int
+    agreeing: int
+    residual: float
+
+
+def cameras_around(
+    center: Sequence[float] | Tensor,
+    distance: float,
+    up: Sequence[float] | Tensor,
+    fov_y_degrees: float,
+    width: int,
+    height: int,
+    count: int = 12,
+    elevations: Sequence[float] = (0.0, 30.0),
+) -> list[Camera]:
+    """Cameras around an object from which a registration may start.
+
+    Args:
+        center: Of the object [scene units], shape (3,).
+        distance: From there [scene units].
+        up: Direction that is up, shape (3,).
+        fov_y_degrees: Vertical field of view [degrees].
+        width: Of the frame [pixels].
+        height: Of the frame [pixels].
+        count: Directions around the object.
+        elevations: Angles above the level [degrees].
+    """
+    check_whole("count", count, 1)
+    middle = torch.as_tensor(center, dtype=torch.float64)
+    axis = torch.nn.functional.normalize(torch.as_tensor(up, dtype=torch.float64), dim=0)
+    across = torch.eye(3, dtype=torch.float64)[int(axis.abs().argmin())]
+    first = torch.nn.functional.normalize(torch.linalg.cross(axis, across), dim=0)
+    second = torch.linalg.cross(axis, first)
+    found = []
+    for elevation in map(math.radians, elevations):
+        for turn in (2 * math.pi * k / count for k in range(count)):
+            level = math.cos(turn) * first + math.sin(turn) * second
+            eye = middle + distance * (math.cos(elevation) * level + math.sin(elevation) * axis)
+            found.append(look_at_camera(eye, middle, axis, fov_y_degrees, width, height, dtype=torch.float64))
+    return found
+
+
+def register(
+    draw: Callable[[Camera], RenderOutput], frame: Tensor, start: Sequence[Camera], *, focal: bool = False
+) -> Registration:
+    """Find the camera of a frame of something that stands still.
+
+    Args:
+        draw: Draws the splat, at rest.
+        frame: The frame, dtype uint8, shape (H, W, 3), without lens distortion.
+        start: Cameras to begin with, of the frame's size and with its intrinsics; the one with the most matches that
+            agree is taken. One is enough if it is within some 20 degrees.
+        focal: Whether the focal length is to be found, too. It needs depth in what is seen, or a slanted surface.
+
+    Raises:
+        ImportError: Without OpenCV.
+        ValueError: If the frame and the cameras do not fit, or the splat is not found in the frame.
+    """
+    cv2 = opencv()
+    height, width = frame.shape[:2]
+    if not start or any((camera.width, camera.height) != (width, height) for camera in start):
+        raise ValueError(f"Expected `start` to be cameras of the frame's size, {width} x {height}.")
+    grey = _grey(frame)
+    sift = cv2.SIFT_create(nfeatures=4000, contrastThreshold=0.02)
+    wanted = sift.detectAndCompute(grey, None)
+    best: _Found | None = None
+    for camera in start:
+        found = _by_features(cv2, sift, wanted, draw(camera), camera, focal=False)
+        if found is not None and (best is None or found.agreeing > best.agreeing):
+            best = found
+    if best is None:
+        raise ValueError(
+            "The splat was not found in the frame: give a camera that is nearer, a frame that shows more of it, or one "
+            "with more texture."
+        )
+    for turn in range(ROUNDS):
+        picture, before = draw(best.camera), best
+        found = _by_features(cv2, sift, wanted, picture, best.camera, focal) if turn < 2 else None
+        if turn >= 2 or found is None:
+            found = _by_flow(cv2, grey, picture, best.camera, focal) or found
+        if found is None:
+            break
+        best = found
+        if turn >= 3 and _apart(best.camera, before.camera) < 1e-4:
+            break
+    return Registration(best.camera, best.matches, best.agreeing, best.residual)
+
+
+@dataclass(frozen=True, eq=False)
+class _Found:
+    camera: Camera
+    matches: int
+    agreeing: int
+    residual: float
+
+
+def _grey(image: Tensor) -> Any:
+    """An image of bytes or of colours in [0, 1] as grey bytes whose contrast is the same everywhere."""
+    whole = image.float() if image.dtype == torch.uint8 else image.detach().float().cpu().clamp(0, 1) * 255
+    grey = whole @ torch.tensor([0.299, 0.587, 0.114])
+    equal = opencv().createCLAHE(clipLimit=3.0, tileGridSize=(8, 8))  # takes what another light changes
+    return equal.apply(grey.round().to(torch.uint8).numpy())
+
+
+def _in_space(picture: RenderOutput, camera: Camera, pixel: Any) -> tuple[Any, Any]:
+    """Places on the surface that pixels (N, 2) of a picture show, float64, and a mask of those whose depth is known."""
+    import numpy as np
+
+    alpha = picture.alpha[..., 0].detach().cpu().numpy()
+    depth = (picture.depth / picture.alpha.clamp(min=1e-3))[..., 0].detach().cpu().numpy().astype(np.float64)
+    height, width = alpha.shape
+    x, y = pixel[:, 0] - 0.5, pixel[:, 1] - 0.5
+    column, row = np.clip(np.floor(x).astype(int), 0, width - 2), np.clip(np.floor(y).astype(int), 0, height - 2)
+    corners = [(row + i, column + j) for i in (0, 1) for j in (0, 1)]
+    known = np.min([alpha[corner] for corner in corners], 0) > SOLID
+    fx, fy = x - column, y - row
+    shares = ((1 - fy) * (1 - fx), (1 - fy) * fx, fy * (1 - fx), fy * fx)
+    z = sum(share * depth[corner] for share, corner in zip(shares, corners, strict=True))
+    K = camera.intrinsics.double().cpu().numpy()
+    local = np.stack([(pixel[:, 0] - K[0, 2]) / K[0, 0] * z, (pixel[:, 1] - K[1, 2]) / K[1, 1] * z, z], 1)
+    view = camera.world_to_camera.double().cpu().numpy()
+    return (local - view[:3, 3]) @ view[:3, :3], known
+
+
+def _by_features(
+    cv2: Any, sift: Any, wanted: tuple[Any, Any], picture: RenderOutput, camera: Camera, focal: bool
+) -> _Found | None:
+    """The camera from matched features; None if too few agree."""
+    import numpy as np
+
+    mask = (picture.alpha[..., 0].detach().cpu().numpy() > SOLID).astype(np.uint8)
+    points, codes = sift.detectAndCompute(_grey(picture.color), mask)
+    if codes is None or wanted[1] is None or len(points) < LEAST or len(wanted[0]) < LEAST:
+        return None
+    pairs = cv2.BFMatcher().knnMatch(codes, wanted[1], k=2)
+    good = [pair[0] for pair in pairs if len(pair) == 2 and pair[0].distance < RATIO * pair[1].distance]
+    if len(good) < LEAST:
+        return None
+    here = np.array([points[one.queryIdx].pt for one in good]) + 0.5  # OpenCV counts from the centre of a pixel
+    there = np.array([wanted[0][one.trainIdx].pt for one in good]) + 0.5
+    return _pose(cv2, picture, camera, here, there, focal, NEAR * math.hypot(camera.width, camera.height))
+
+
+def _by_flow(cv2: Any, grey: Any, picture: RenderOutput, camera: Camera, focal: bool) -> _Found | None:
+    """The camera from points that are followed from the picture to the frame; None if too few are."""
+    import numpy as np
+
+    drawn = _grey(picture.color)
+    mask = cv2.erode((picture.alpha[..., 0].detach().cpu().numpy() > SOLID).astype(np.uint8), np.ones((9, 9), np.uint8))
+    corners = cv2.goodFeaturesToTrack(drawn, 600, 0.01, 6, mask=mask)
+    if corners is None or len(corners) < LEAST:
+        return None
+    here = corners.reshape(-1, 2).astype(np.float64) + 0.5
+    colours = np.stack([drawn, grey])[..., None].repeat(3, -1)
+    place, seen = follow(colours, here)
+    return _pose(cv2, picture, camera, here[seen[1]], place[1][seen[1]], focal, 1.5)
+
+
+def _pose(
+    cv2: Any, picture: RenderOutput, camera: Camera, here: Any, there: Any, focal: bool, near: float
+) -> _Found | None:
+    """The camera that sees what the picture shows at ``here`` at ``there``; None if too few pairs agree."""
+    import numpy as np
+
+    world, known = _in_space(picture, camera, here)
+    world, there = world[known], np.ascontiguousarray(there[known], dtype=np.float64)
+    if len(world) < LEAST:
+        return None
+    K = camera.intrinsics.double().cpu().numpy().copy()
+    done, turn, shift, index = cv2.solvePnPRansac(
+        world, there, K, None, iterationsCount=2000, reprojectionError=near, confidence=0.9999, flags=cv2.SOLVEPNP_SQPNP
+    )
+    if not done or index is None or len(index) < LEAST:
+        return None
+    index = index[:, 0]
+    turn, shift = cv2.solvePnPRefineLM(world[index], there[index], K, None, turn, shift)
+    if focal:
+        flags = cv2.CALIB_USE_INTRINSIC_GUESS | cv2.CALIB_FIX_PRINCIPAL_POINT | cv2.CALIB_FIX_ASPECT_RATIO
+        flags |= cv2.CALIB_ZERO_TANGENT_DIST | cv2.CALIB_FIX_K1 | cv2.CALIB_FIX_K2 | cv2.CALIB_FIX_K3
+        size = (camera.width, camera.height)
+        given = ([world[index].astype(np.float32)], [there[index].astype(np.float32)], size, K, None)
+        _, K, _, (turn,), (shift,) = cv2.calibrateCamera(*given, flags=flags)
+    off = cv2.projectPoints(world[index], turn, shift, K, None)[0].reshape(-1, 2) - there[index]
+    view = np.eye(4)
+    view[:3, :3], view[:3, 3] = cv2.Rodrigues(turn)[0], shift.reshape(3)
+    seen = replace(camera, world_to_camera=torch.from_numpy(view), intrinsics=torch.from_numpy(np.asarray(K, float)))
+    return _Found(seen, len(world), len(index), float(np.sqrt((off**2).sum(1).mean())))
+
+
+def _apart(one: Camera, other: Camera) -> float:
+    """Angle between two cameras [rad], or their distance per distance to the origin of the scene if that is more."""
+    a, b = one.world_to_camera.double(), other.world_to_camera.double()
+    turn = ((a[:3, :3] @ b[:3, :3].T).trace() - 1) / 2
+    far = (one.position.double() - other.position.double()).norm() / one.position.double().norm().clamp(min=1e-9)
+    return max(float(turn.clamp(-1, 1).acos()), float(far))
+
+
+__all__ = ["Registration", "cameras_around", "register"]
