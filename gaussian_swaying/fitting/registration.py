@@ -1,9 +1,9 @@
 """Registration: the camera of a frame, from the frame and the splat that it shows.
 
 Features of pictures of the splat are matched with those of the frame (SIFT, Lowe 2004). The depth of a picture makes
-points in space of them, and a camera sees these points where the frame has them (perspective-n-point with RANSAC). From
-there the picture and the frame are nearly the same, and points that are followed from one to the other by Lucas and
-Kanade's method make the camera exact.
+points in space of them, and a camera sees these points where the frame has them (perspective-n-point with RANSAC). A
+picture from there has more features in common with the frame, so it is done again. Where few are found, as in thin
+things, points are followed from the picture to the frame by Lucas and Kanade's method.
 """
 
 from __future__ import annotations
@@ -29,8 +29,10 @@ LEAST = 12
 """Fewest matches that make a camera."""
 SOLID = 0.9
 """Least opacity of the picture at a feature, whose depth is then known."""
-ROUNDS = 6
-"""Most pictures that are drawn from a camera that is already near."""
+ENOUGH = 60
+"""Features that agree with which none need to be followed."""
+ROUNDS = 3
+"""Pictures that are drawn from a camera that is already near, for features and for points that are followed."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -120,16 +122,10 @@ def register(
             "The splat was not found in the frame: give a camera that is nearer, a frame that shows more of it, or one "
             "with more texture."
         )
-    for turn in range(ROUNDS):
-        picture, before = draw(best.camera), best
-        found = _by_features(cv2, sift, wanted, picture, best.camera, focal) if turn < 2 else None
-        if turn >= 2 or found is None:
-            found = _by_flow(cv2, grey, picture, best.camera, focal) or found
-        if found is None:
-            break
-        best = found
-        if turn >= 3 and _apart(best.camera, before.camera) < 1e-4:
-            break
+    for _ in range(ROUNDS):
+        best = _by_features(cv2, sift, wanted, draw(best.camera), best.camera, focal) or best
+    for _ in range(ROUNDS if best.agreeing < ENOUGH else 0):
+        best = _by_flow(cv2, grey, draw(best.camera), best.camera, focal) or best
     return Registration(best.camera, best.matches, best.agreeing, best.residual)
 
 
@@ -193,8 +189,8 @@ def _by_flow(cv2: Any, grey: Any, picture: RenderOutput, camera: Camera, focal: 
     import numpy as np
 
     drawn = _grey(picture.color)
-    mask = cv2.erode((picture.alpha[..., 0].detach().cpu().numpy() > SOLID).astype(np.uint8), np.ones((9, 9), np.uint8))
-    corners = cv2.goodFeaturesToTrack(drawn, 600, 0.01, 6, mask=mask)
+    mask = cv2.erode((picture.alpha[..., 0].detach().cpu().numpy() > SOLID).astype(np.uint8), np.ones((5, 5), np.uint8))
+    corners = cv2.goodFeaturesToTrack(drawn, 1000, 0.005, 3, mask=mask)
     if corners is None or len(corners) < LEAST:
         return None
     here = corners.reshape(-1, 2).astype(np.float64) + 0.5
@@ -232,14 +228,6 @@ def _pose(
     view[:3, :3], view[:3, 3] = cv2.Rodrigues(turn)[0], shift.reshape(3)
     seen = replace(camera, world_to_camera=torch.from_numpy(view), intrinsics=torch.from_numpy(np.asarray(K, float)))
     return _Found(seen, len(world), len(index), float(np.sqrt((off**2).sum(1).mean())))
-
-
-def _apart(one: Camera, other: Camera) -> float:
-    """Angle between two cameras [rad], or their distance per distance to the origin of the scene if that is more."""
-    a, b = one.world_to_camera.double(), other.world_to_camera.double()
-    turn = ((a[:3, :3] @ b[:3, :3].T).trace() - 1) / 2
-    far = (one.position.double() - other.position.double()).norm() / one.position.double().norm().clamp(min=1e-9)
-    return max(float(turn.clamp(-1, 1).acos()), float(far))
 
 
 __all__ = ["Registration", "cameras_around", "register"]
