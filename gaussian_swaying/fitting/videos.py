@@ -242,7 +242,7 @@ def _film(file: Path, where: str, data: dict[str, Any], index: int, begin: float
     shots: list[_Shot] = []
     limits = ["-max_pixels", str(MOST_PIXELS)], ["-frames:v", str(room.frames + 1)]
     with closing(read_frames(path, input_params=limits[0], output_params=limits[1])) as film:
-        head = _next(film, path)
+        head = next_of(film, path)
         size = (0, 0) if head is None else tuple(head["size"])
         lens = lens_of_transforms(where, data, entry, size)
         if (lens.width, lens.height) != size:
@@ -255,7 +255,7 @@ def _film(file: Path, where: str, data: dict[str, Any], index: int, begin: float
         if not rate > 0:
             raise ValueError(f"The video {path} does not say its frame rate: add `fps` to its entry in {where}.")
         room.check(path, *size, frames=int(head["fps"] * head["duration"]))  # what it says; it may have more
-        while (frame := _next(film, path)) is not None:
+        while (frame := next_of(film, path)) is not None:
             room.take(path, *size)
             picture = torch.frombuffer(bytearray(frame), dtype=torch.uint8).reshape(size[1], size[0], 3)
             if lens.distorted:
@@ -264,7 +264,7 @@ def _film(file: Path, where: str, data: dict[str, Any], index: int, begin: float
     return shots
 
 
-def _next(film: Any, path: Path) -> Any:
+def next_of(film: Any, path: Path) -> Any:
     """Return the next item of ffmpeg's generator (the metadata, then frames); None at the end."""
     try:
         return next(film, None)
