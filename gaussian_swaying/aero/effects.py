@@ -16,6 +16,9 @@ from gaussian_swaying.geometry.frame import SimFrame
 from gaussian_swaying.kernels.graphs import Recordable
 from gaussian_swaying.mpm.twins import Numbers, Twin, Twinned
 
+SPREAD = 58.0
+"""The updraft of a plume falls off as exp(-SPREAD r^2 / z^2)."""
+
 
 @dataclass(frozen=True)
 class Moment:
@@ -164,3 +167,66 @@ class PowerProfile(Profile):
 
         numbers = Numbers(3, lambda: [self.ground[2], 1 / self.height, self.exponent])
         return Twin(power_profile, numbers=numbers, sources=(self,))
+
+
+class Plume(WindEffect):
+    r"""Warm air that rises over a fire or a radiator, and the air that it draws in from the sides, added to the wind.
+
+    The mean flow of a round turbulent plume (Shabbir and George 1994), without divergence:
+
+    .. math:: w = 3.4 \, B^{1/3} z^{-1/3} e^{-58 r^2 / z^2}, \qquad B = \frac{2 g Q}{7 p}
+
+    with the heat Q, g = 9.81 m/s2, the pressure p = 101325 Pa, the distance r from the axis and the height z above a
+    point below the source, at which the plume is as wide as the source. It does not bend, so it is for winds weaker
+    than the updraft, and flames themselves are hotter and faster. There is nothing below the source.
+
+    Args:
+        source: Centre of the source, in scene units. In Python [m], z up.
+        radius: Distance from the axis at which the updraft is 1/e of that in the middle at the source, in scene units.
+        heat: Heat that goes into the air [W]: 50 for a candle, 1000 for a person in the cold, 10000 for a small fire.
+
+    Raises:
+        ValueError: If ``radius`` or ``heat`` is not positive.
+
+    Example:
+        >>> plume = Plume(radius=0.1, heat=10000.0)
+        >>> moment = Moment(torch.zeros(()), torch.zeros(3), torch.zeros(3))
+        >>> plume(torch.zeros(3), torch.tensor([[0.0, 0.0, 1.0]]), moment)
+        tensor([[0.0000, 0.0000, 1.8343]])
+    """
+
+    recordable = True
+
+    def __init__(self, source: Sequence[float] = (0.0, 0.0, 0.0), radius: float = 0.1, heat: float = 10000.0) -> None:
+        super().__init__()
+        check_positive("radius", radius)
+        check_positive("heat", heat)
+        self.source, self.radius, self.heat = list(check_vector("source", source)), float(radius), float(heat)
+
+    @property
+    def speed(self) -> float:
+        """Updraft in the middle times the cube root of the height z [m^(4/3)/s]."""
+        return 3.4 * (2 / 7 * 9.81 * self.heat / 101325) ** (1 / 3)
+
+    def forward(self, velocity: Tensor, position: Tensor, moment: Moment) -> Tensor:
+        """Add the plume to the velocity."""
+        x, y, above = (part - at for part, at in zip(position.unbind(-1), self.source, strict=True))
+        height = above.clamp(min=0.0) + math.sqrt(SPREAD) * self.radius
+        off = (SPREAD * (x * x + y * y) / height.square()).clamp(min=1e-12)
+        up, fall = self.speed * height.pow(-1 / 3), (-off).exp()
+        drawn = up / height * (fall + 5 / 6 * (-off).expm1() / off)
+        plume = torch.stack([drawn * x, drawn * y, up * fall], dim=-1)
+        return velocity + torch.where(above[..., None] >= 0, plume, 0.0)
+
+    def in_frame(self, frame: SimFrame) -> WindEffect:
+        """The source in metres."""
+        other = copy(self)
+        other.source, other.radius = placed(frame, self.source), self.radius * frame.metres_per_unit
+        return other
+
+    def twin(self) -> Twin:
+        """See :class:`~gaussian_swaying.mpm.twins.Twin`."""
+        from gaussian_swaying.aero.effects_triton import plume
+
+        numbers = Numbers(6, lambda: [*self.source, math.sqrt(SPREAD) * self.radius, self.speed, SPREAD])
+        return Twin(plume, numbers=numbers, sources=(self,))

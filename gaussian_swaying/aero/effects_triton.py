@@ -83,6 +83,22 @@ def power_profile(v, x, numbers, now, table, OPTIONS: tl.constexpr):
 
 
 @triton.jit
+def plume(v, x, numbers, now, table, OPTIONS: tl.constexpr):
+    """``Plume``; ``numbers``: its source (3), height of the source above the point, speed, spread."""
+    a = x[0] - numbers[0]
+    b = x[1] - numbers[1]
+    above = x[2] - numbers[2]
+    height = tl.maximum(above, 0.0) + numbers[3]
+    off = numbers[5] * (a * a + b * b) / (height * height)
+    fall = tl.exp(-off)
+    share = tl.where(off < 1e-2, 1 - off / 2 + off * off / 6, (1 - fall) / tl.maximum(off, 1e-2))
+    up = numbers[4] * tl.exp(-tl.log(height) / 3)
+    up = tl.where(above >= 0, up, 0.0)
+    drawn = up / height * (fall - 5 / 6 * share)
+    return v[0] + drawn * a, v[1] + drawn * b, v[2] + up * fall
+
+
+@triton.jit
 def carried_field(v, x, numbers, now, table, OPTIONS: tl.constexpr):
     """``CarriedField``; ``numbers``: from places to cells (9), from its axes (9), its sizes (3).
 

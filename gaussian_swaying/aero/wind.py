@@ -22,6 +22,7 @@ from gaussian_swaying._checks import (
     check_choice,
     check_plain,
     check_positive,
+    check_shape,
     check_vector,
     number_of,
     requires_grad,
@@ -370,11 +371,19 @@ class WindField(nn.Module):
 
         Returns:
             Broadcastable to (..., P, 3), in the dtype of ``position`` if there are effects.
+
+        Raises:
+            TypeError: If an effect returned no tensor.
+            ValueError: If its velocity has another shape.
         """
         if not self.uniform:
             velocity = velocity.to(position)
         for effect in self.effects:
             velocity = effect(velocity, position, moment)
+            check_shape(f"velocity of {type(effect).__name__}", velocity, 3)
+            rows = velocity.shape[-2:-1]
+            if rows and rows[0] != 1 and rows != position.shape[-2:-1]:
+                check_shape(f"velocity of {type(effect).__name__}", velocity, *position.shape[-2:])
         return velocity
 
     def forward(self, time: Tensor | float) -> Tensor:
