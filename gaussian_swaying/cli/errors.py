@@ -9,6 +9,8 @@ import os
 import re
 import shlex
 import sys
+import sysconfig
+import traceback
 import warnings
 from argparse import ArgumentError, ArgumentParser
 from collections.abc import Callable, Iterator, Sequence
@@ -27,6 +29,9 @@ from gaussian_swaying.kernels.cpu import compiled, compiled_sentence
 from gaussian_swaying.runs.signals import exit_code
 
 OK, BUG, BAD_INPUT = 0, 1, 2
+PACKAGE = Path(__file__).parents[1]
+LIBRARIES = {Path(sysconfig.get_path(name)) for name in ("stdlib", "platstdlib", "purelib", "platlib")}
+"""Folders of Python and of what is installed."""
 
 # messages of torch and numpy when an array exceeds the memory or its size cannot be counted
 _MEMORY = re.compile(
@@ -91,11 +96,7 @@ def run_command(
             if os.environ.get("GAUSSIAN_SWAYING_DEBUG") == "1":
                 raise
             for_users = sentence(error, memory, expected, arguments)
-            bug = (
-                f"{type(error).__name__}: {first_line(error)} This is a bug in gaussian_swaying: please report it with "
-                "the traceback that GAUSSIAN_SWAYING_DEBUG=1 shows."
-            )
-            tell(f"error: {for_users or bug}", error)
+            tell(f"error: {for_users or _bug(error)}", error)
             return BUG if for_users is None else BAD_INPUT
 
     with safe_streams() as (output, _):
@@ -106,6 +107,18 @@ def run_command(
                 raise SystemExit(BAD_INPUT) from None
             raise
         return code if _was_written(output) else code or BAD_INPUT
+
+
+def _bug(error: Exception) -> str:
+    """The message of a bug, and the line if it is in a file of the user, such as a force of their own."""
+    what = f"{type(error).__name__}: {first_line(error).rstrip('.')}."
+    shown = "the traceback that GAUSSIAN_SWAYING_DEBUG=1 shows."
+    for frame in reversed(traceback.extract_tb(error.__traceback__)):
+        if Path(frame.filename).is_relative_to(PACKAGE):
+            break
+        if Path(frame.filename).is_file() and not any(map(Path(frame.filename).is_relative_to, LIBRARIES)):
+            return f"{what} It was raised in {frame.filename}, line {frame.lineno}: correct it there, with {shown}"
+    return f"{what} This is a bug in gaussian_swaying: please report it with {shown}"
 
 
 def _was_written(output: SafeStream) -> bool:
@@ -161,7 +174,7 @@ def sentence(
     if isinstance(error, RuntimeError) and _WRITER.search(text):
         return f"A file could not be written ({text}): the disk may be full."
     if isinstance(error, ArgumentError):
-        return f"{parser_sentence(str(error), arguments)}; --help lists the options."
+        return f"{parser_sentence(str(error), arguments).rstrip('.')}; --help lists the options."
     if isinstance(error, (ValueError, TypeError, *expected)):
         return parser_sentence(str(error), arguments)
     if isinstance(error, ImportError) and error.name and not error.name.startswith("gaussian_swaying"):

@@ -18,7 +18,7 @@ import pytest
 import torch
 from shared import refused
 
-from gaussian_swaying.cli.errors import guessing, run_command, sentence
+from gaussian_swaying.cli.errors import guessing, parser_sentence, run_command, sentence
 from gaussian_swaying.cli.streams import SafeStream
 from gaussian_swaying.geometry.patches import deform_all
 from gaussian_swaying.kernels import cpu
@@ -74,15 +74,24 @@ def test_what_input_and_machine_cause_is_a_sentence(error, words, capsys):
 
 def test_a_bug_is_called_one(capsys, monkeypatch):
     """And keeps its traceback where it is asked for."""
-    assert run_command(raising(KeyError("colour"))) == 1
+    assert run_command(lambda: parser_sentence(None)) == 1
     said = capsys.readouterr().err
-    assert said.startswith("error: KeyError: 'colour'")
-    assert "bug" in said
+    assert said.startswith("error: AttributeError: 'NoneType'")
+    assert "bug in gaussian_swaying: please report it" in said
     assert "Traceback" not in said
     assert sentence(AttributeError("no such thing")) is None
     monkeypatch.setenv("GAUSSIAN_SWAYING_DEBUG", "1")
     with pytest.raises(KeyError):
         run_command(raising(KeyError("colour")))
+
+
+@pytest.mark.parametrize("fault", [lambda: {}["colour"], lambda: torch.ones(3) + torch.ones(2)])
+def test_an_error_in_a_file_of_the_user_names_its_line(fault, capsys):
+    """Such as that of an effect, although the package called it; torch's own frames and lines do not count."""
+    assert run_command(fault) == 1
+    said = capsys.readouterr().err
+    assert f"raised in {__file__}, line {fault.__code__.co_firstlineno}: correct it there" in said
+    assert "report" not in said
 
 
 def test_codes_and_what_is_said(capsys):
@@ -93,6 +102,8 @@ def test_codes_and_what_is_said(capsys):
     assert run_command(raising(StopIteration("here")), expected=(StopIteration,)) == 2
     assert run_command(raising(ArgumentError(None, "no such option"))) == 2
     assert "no such option; --help lists the options." in capsys.readouterr().err
+    run_command(raising(ArgumentError(None, "No such option: leave it out.")))
+    assert "leave it out; --help lists the options." in capsys.readouterr().err
 
 
 def test_a_warning_is_one_line_and_said_once(capsys):
