@@ -14,7 +14,8 @@ PACKAGE = TESTS.parent / "gaussian_swaying"
 def test_what_is_slow_has_a_twin_in_the_gate(request):
     if not any(TESTS.is_relative_to(Path(given.partition("::")[0]).resolve()) for given in request.config.args):
         pytest.skip("needs all tests")  # twins may be in other files
-    assert without_a_twin([item for item in request.session.items if isinstance(item, pytest.Function)]) == []
+    alone = without_a_twin([item for item in request.session.items if isinstance(item, pytest.Function)])
+    assert alone == [], "these need a small test in the gate: `pytest.mark.slow(twin=...)` names it (tests/nightly.py)"
 
 
 @pytest.mark.parametrize(
@@ -53,8 +54,9 @@ def test_every_module_has_a_test_file_of_its_name_or_is_named_in_the_one_that_co
         name for name, path in modules.items() if (TESTS / path.parent / f"test_{path.name.lstrip('_')}.py").exists()
     ]
     assert len(own) > 100
-    assert sorted(set(modules) - {*own, *named}) == []
-    assert sorted(set(named) - set(modules)) == []  # moved or gone
+    missing = sorted(set(modules) - {*own, *named})
+    assert missing == [], "room.name needs tests/room/test_name.py, or `Covers: room.name.` in another file's docstring"
+    assert sorted(set(named) - set(modules)) == [], "`Covers:` names modules that were moved or are gone"
 
 
 def _covered(path):

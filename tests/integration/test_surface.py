@@ -15,4 +15,4 @@ def test_options_after_the_first_two_are_keyword_only():
         given = list(inspect.signature(getattr(gaussian_swaying, name)).parameters.values())
         free = [part for part in given if part.kind is part.POSITIONAL_OR_KEYWORD]
         loose += [f"{name}({part.name})" for part in free[2:] if part.default is not part.empty and name not in FREE]
-    assert loose == []
+    assert loose == [], "put a `*` before these arguments"
