@@ -183,7 +183,7 @@ class Plume(WindEffect):
     Args:
         source: Centre of the source, in scene units. In Python [m], z up.
         radius: Distance from the axis at which the updraft is 1/e of that in the middle at the source, in scene units.
-        heat: Heat that goes into the air [W]: 50 for a candle, 1000 for a person in the cold, 10000 for a small fire.
+        heat: Heat that goes into the air [W]: 50 for a candle, 1000 for a radiator, 10000 for a small fire.
 
     Raises:
         ValueError: If ``radius`` or ``heat`` is not positive.
