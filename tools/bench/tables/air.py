@@ -123,8 +123,8 @@ table(PAGE, "air.coupling", "air_*", _couplings, """
 table(PAGE, "air.tandem", "air_cpu", lambda result: _of(result, "two flags"), """
     gap [lengths] = {gap:g} | drag of the first per that of one alone = {first:.2f} | of the second = {second:.2f}
     """, empty="", before="Two flags in a plane, one behind the other, of mass ratio 1.5 and stiffness 0.001. In "
-    "experiments the first one has less drag than alone, the less the closer they are, and the second one more (Ristroph "
-    "and Zhang 2008):",
+    "experiments the first one has less drag than alone, the less the closer they are, and the second one more "
+    "(Ristroph and Zhang 2008):",
     )  # fmt: skip
 
 

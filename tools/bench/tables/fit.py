@@ -114,3 +114,12 @@ table(PAGE, "fit.soft", "soft_*", partial(_rows, part="fits"), f"""
     {_FOUND} | of the processor = {{processor_s:.0f s}} | splat at rest = {{psnr_rest_db:.1f dB}} |
     fitted; changes of scene.yaml = {{base}}
     """, before="{source}", each=True, empty="")  # fmt: skip
+
+
+table("fit.md", "registration.rows", "registration_cpu", lambda result: [
+    row | {"view": row["field of view"]} for row in result.get("rows", [])], """
+    object = {object} | field of view = {view} | cameras within 0.5 degrees and 1 % = {right} of {poses} |
+    angle, median [degrees] = {degrees:.2f} | largest = {most_degrees:.2f} |
+    place, median [% of the distance] = {distance:.2f (%)} | largest = {most_distance:.2f (%)} |
+    time [s] = {seconds:.1f}
+    """, empty="", before="Cameras of pictures in another light, found from no pose:\n\n{source}")  # fmt: skip
