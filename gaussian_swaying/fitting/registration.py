@@ -211,7 +211,7 @@ def _pose(
         return None
     K = camera.intrinsics.double().cpu().numpy().copy()
     done, turn, shift, index = cv2.solvePnPRansac(
-        world, there, K, None, iterationsCount=2000, reprojectionError=near, confidence=0.9999, flags=cv2.SOLVEPNP_SQPNP
+        world, there, K, None, iterationsCount=2000, reprojectionError=near, confidence=0.9999, flags=cv2.SOLVEPNP_AP3P
     )
     if not done or index is None or len(index) < LEAST:
         return None

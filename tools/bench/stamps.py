@@ -53,6 +53,7 @@ PARTS: dict[str, tuple[str, ...]] = {
     "previews": (*_SIMULATION, "preview"),
     "places": (*_SIMULATION, "preview"),
     "refinement": _SIMULATION,
+    "registration": ("gaussians", "geometry", "rendering", "fitting"),
     "sim": _DRAWN,
     "soft": (*_DRAWN, "fitting"),
     "speed": _DRAWN,
