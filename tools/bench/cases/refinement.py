@@ -96,7 +96,8 @@ def _itself(make: type[Run], pattern: Flag, options: argparse.Namespace) -> tupl
 def rows(options: argparse.Namespace, result: Row) -> Iterator[Measurement]:
     """Each flag on grids from coarse to fine; then the uneven one, on both sides and against the flat one."""
     result["versions"] = result["versions"] | {"bpy": version(options.blender)}
-    result |= {"frames": options.frames, "note": options.note}
+    kind = "turns_" if options.rounds else "touching_" if options.contact else ""
+    result |= {f"{kind}frames": options.frames, "note": options.note}
     for pattern in options.flags:
         if options.rounds:
             for cells in options.grids:

@@ -104,7 +104,7 @@ def _turns(result: Row) -> Iterator[Row]:
 table(PAGE, "refinement.turns", "refinement_*", _turns, """
     flag = {flag} | cells = {cells} | three layers [s] = {three:.1f} | one layer [s] = {one:.1f} |
     one over three, median of the turns = {ratio:.2f}
-    """, empty="", before="Their times, by turns:")  # fmt: skip
+    """, empty="", before="Their times, by turns, of the first {turns_frames} frames:")  # fmt: skip
 
 
 def _touching(result: Row) -> Iterator[Row]:
@@ -122,7 +122,8 @@ table(PAGE, "refinement.touching", "refinement_*", _touching, """
     flag = {flag} | cells = {cells} | distance, both with self-contact = {chamfer:.2f %} |
     both without = {free:.2f %} | reference with self-contact against itself = {itself:.2f %} |
     reference with self-contact against that without = {to_free:.2f %}
-    """, empty="", before="With self-contact at 5 mm, without friction, on both sides:")  # fmt: skip
+    """, empty="", before="With self-contact at 5 mm, without friction, on both sides, in the "
+    "first {touching_frames} frames; without it in the first {frames}:")  # fmt: skip
 
 
 def plot(results: list[Row], pictures: Path) -> None:
