@@ -145,6 +145,8 @@ def main() -> None:
     needs("netcdf", ["sim", *small, f"--wind.effects=[{json.dumps(wind)}]", "--output=other"])
     needs("fit", "fit --config=printed_flag --output=other")
     tried.add("fit")
+    needs("fit", "register run/frames/00001.png flag.ply --output=other")
+    tried.add("register")
     needs("viewer", "live --no-browser")
     tried.add("live")
     os.environ["CUDA_VISIBLE_DEVICES"] = ""

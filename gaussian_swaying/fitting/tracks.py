@@ -293,7 +293,8 @@ def opencv() -> Any:
         import cv2
     except ImportError as error:
         raise ImportError(
-            "Tracks and matches need OpenCV: pip install 'gaussian-swaying[fit]', or leave them out of `stages`.",
+            "Tracks, matches and registration need OpenCV: pip install 'gaussian-swaying[fit]', or leave tracks and "
+            "matches out of `stages`.",
             name="cv2",
         ) from error
     return cv2
