@@ -86,7 +86,7 @@ class Run:
         more = ["--recorder.images=false", "--recorder.video=false"]
         made = yaml.safe_load(flags.matched_configs(self.pattern)[-1].read_text())["scene"]["generator"]["init_args"]
         spacing = made["spacing"]
-        if spacing > 0.45 * dx:  # extra points on Gaussians would make the flag heavier by a hundredth
+        while spacing > 0.45 * dx:  # extra points on Gaussians would make the flag heavier by a hundredth
             spacing /= 2
         spacing = whole(self.flag().width, self.flag().height, spacing)
         if spacing != made["spacing"]:
