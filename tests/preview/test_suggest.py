@@ -47,7 +47,6 @@ from gaussian_swaying.preview.suggest import (
 from gaussian_swaying.preview.up import CONVENTION, floor_mask, guess_up
 from gaussian_swaying.scenes.leaves import LeavesScene
 from gaussian_swaying.scenes.procedural import FlagScene
-from gaussian_swaying.simulation.body import SPECK
 from gaussian_swaying.simulation.extent import suggest_spacing
 from gaussian_swaying.simulation.simulation import Simulation
 
@@ -381,7 +380,7 @@ def test_page_states_the_numbers_of_the_rules():
     for text in (
         f"z up (Blender), y down (COLMAP) | {CONVENTION['+z']:g} |",
         f"y up (glTF) | {CONVENTION['+y']:g} |",
-        f"up to {MAX_BOXES} small boxes",
+        f"up to {MAX_BOXES} boxes",
         *(f"| `{name}` | {cells} |" for name, cells in QUALITIES.items()),
         f"at most {MOST_CELLS} cells",
         f"{KEPT_AREA:.0%}".replace("%", " % of the visible area"),
@@ -391,7 +390,6 @@ def test_page_states_the_numbers_of_the_rules():
         f"first {calibration.SECONDS:g} s",
         f"between {calibration.STRETCH[0]:g} and {calibration.STRETCH[1]:g}",
         f"less than {LOOSE:.0%}".replace("%", " % of what the largest part has"),
-        f"side `dx` / {1 / SPECK:g}",
         f"{PIN_DEPTH:.0%}".replace("%", " % of the length deep"),
         f"below {SHEET:g} of the next",
     ):

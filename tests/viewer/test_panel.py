@@ -4,6 +4,7 @@ Covers: viewer.controls, viewer.files, viewer.gusts.
 """
 
 import math
+import uuid
 
 import pytest
 import yaml
@@ -179,12 +180,14 @@ def test_the_button_says_that_a_video_counts_simulated_time(page, client, until)
 
 
 def _upload(client, button, content, name="x"):
+    """As a browser does, under a name of its own: the last transfer's may still be in use."""
+    transfer = str(uuid.uuid4())
     client.send(
-        "FileTransferStartUpload", source_component_uuid=button._impl.uuid, transfer_uuid="one", filename=name,
+        "FileTransferStartUpload", source_component_uuid=button._impl.uuid, transfer_uuid=transfer, filename=name,
         mime_type="", part_count=1, size_bytes=len(content),
     )  # fmt: skip
     client.send(
-        "FileTransferPart", source_component_uuid=button._impl.uuid, transfer_uuid="one", part_index=0, content=content
+        "FileTransferPart", source_component_uuid=button._impl.uuid, transfer_uuid=transfer, part_index=0, content=content
     )
 
 
