@@ -187,8 +187,9 @@ def _upload(client, button, content, name="x"):
         mime_type="", part_count=1, size_bytes=len(content),
     )  # fmt: skip
     client.send(
-        "FileTransferPart", source_component_uuid=button._impl.uuid, transfer_uuid=transfer, part_index=0, content=content
-    )
+        "FileTransferPart", source_component_uuid=button._impl.uuid, transfer_uuid=transfer, part_index=0,
+        content=content,
+    )  # fmt: skip
 
 
 def test_a_configuration_is_loaded(page, client, until):
