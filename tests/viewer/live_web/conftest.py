@@ -11,7 +11,7 @@ import yaml
 from gaussian_swaying.simulation.simulation import Simulation
 from gaussian_swaying.viewer.film.recorded import order_of
 from gaussian_swaying.viewer.live_web.block import check, pack_solver
-from gaussian_swaying.viewer.live_web.page import PAGE
+from gaussian_swaying.viewer.live_web.page import PAGE, write_live_web
 
 SIDE = {"class_path": "Box", "init_args": {"min": [None] * 3, "max": [0.06, None, None]}}
 CALM = {
@@ -59,6 +59,14 @@ def make(tmp_path_factory):
         return Simulation.from_yaml(path, device="cpu")
 
     return make
+
+
+@pytest.fixture(scope="session")
+def written(make, tmp_path_factory):
+    """The page of the calm sheet."""
+    target = tmp_path_factory.mktemp("page") / "sheet.html"
+    write_live_web(make(), "sheet", target)
+    return target
 
 
 @pytest.fixture

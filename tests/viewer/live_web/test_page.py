@@ -13,13 +13,6 @@ from gaussian_swaying.viewer.live_web.page import write_element, write_live_web
 from .conftest import asked_of_a_network, drawn_apart, opened
 
 
-@pytest.fixture(scope="module")
-def written(make, tmp_path_factory):
-    target = tmp_path_factory.mktemp("page") / "sheet.html"
-    write_live_web(make(), "sheet", target)
-    return target
-
-
 @pytest.fixture
 def show(browser, until):
     context = browser.new_context(viewport={"width": 600, "height": 400})

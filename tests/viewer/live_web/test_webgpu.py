@@ -10,7 +10,7 @@ import pytest
 import torch
 
 from gaussian_swaying.viewer.live_web.block import check, pack_solver
-from gaussian_swaying.viewer.live_web.page import PAGE, write_live_web
+from gaussian_swaying.viewer.live_web.page import PAGE
 
 from .conftest import apart, asked_of_a_network, drawn_apart, merged, moved_means, opened
 from .test_block import CASES, OBSTACLES, PLANE, run
@@ -68,13 +68,6 @@ def on_gpu(context):
         return told["answers"][1:], torch.tensor(told["moved"]).reshape(len(nodes), 4)[:, :3]
 
     return on_gpu
-
-
-@pytest.fixture(scope="module")
-def written(make, tmp_path_factory):
-    target = tmp_path_factory.mktemp("page") / "sheet.html"
-    write_live_web(make(), "sheet", target)
-    return target
 
 
 @pytest.fixture
