@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import Any, Literal
 
 import torch
@@ -22,6 +23,7 @@ from gaussian_swaying.air.immersed import Reach, give, look, together, velocity_
 from gaussian_swaying.air.lattice import FASTEST, LatticeUnits
 from gaussian_swaying.geometry.frame import SimFrame
 from gaussian_swaying.geometry.regions import Region
+from gaussian_swaying.kernels.graphs import Replayed
 from gaussian_swaying.mpm.forces import Force
 from gaussian_swaying.mpm.protocol import Solver
 from gaussian_swaying.mpm.state import State
@@ -129,13 +131,19 @@ class AirPush(Force):
         self.numbers[:, :3] = at_rest
         self.numbers[:, 3] = rate
 
-    def taken(self, before: State, after: State, substeps: int, dt: float) -> Tensor:
-        """Momentum that the points took between two states [kg m/s], shape (P, 3).
+    def taken(self, way: Tensor, faster: Tensor, substeps: int, dt: float) -> Tensor:
+        """Momentum that the points took in some substeps [kg m/s], shape (P, 3).
 
         The sum of the velocities at which the force acted follows from the way of the points: symplectic Euler moves
         them by the velocity at the end of each substep.
+
+        Args:
+            way: How far the points moved [m], shape (P, 3).
+            faster: By how much their velocity changed [m/s], shape (P, 3).
+            substeps: How many there were.
+            dt: The substep [s].
         """
-        way = (after.position - before.position) - dt * (after.velocity - before.velocity)
+        way = way - dt * faster
         return substeps * dt * self.numbers[:, :3] - self.numbers[:, 3:] * way
 
     def forward(self, state: State) -> Tensor:
@@ -178,8 +186,8 @@ class Resolution:
         )
 
 
-BYTES = 3 * 40 + 1 + 24
-"""Bytes for a cell: three sets of moments, its kind, and what points share among cells."""
+BYTES = 4 * 40 + 1 + 24
+"""Bytes for a cell: four sets of moments (three on a CPU), its kind, and what points share among cells."""
 
 
 def speed_of(settings: ComputedAir, wind: WindField) -> float:
@@ -263,6 +271,7 @@ class AirInBox:
         self.origin = torch.tensor(settings.low, dtype=torch.float64)
         if settings.ground:
             self.origin[2] -= h
+        self._origin = self.origin.to(state.position)
         centres = self._centres(cells)
 
         def solid(place: Tensor) -> Tensor:
@@ -276,6 +285,8 @@ class AirInBox:
         self.flow = LatticeFlow(cells, units, faces=faces, walls=walls, smagorinsky=settings.smagorinsky).to(device)
         self._inflow = centres.reshape(-1, 3)[self.flow.held.long().cpu()].to(double_home(device))
         self.push = AirPush(state.position.shape[-2], state.position)
+        self._pair: list[Tensor] = []  # on a GPU, where recorded steps go to and fro between them
+        self._begins, self._ends = ([Replayed(), Replayed()] for _ in range(2))
         area, mass = load.area.reshape(-1), solver.points.mass
         self._area = (area / h**2).to(torch.float32)
         self._mass = (mass / units.cell_mass).to(torch.float32)
@@ -325,7 +336,7 @@ class AirInBox:
 
     def _place(self, position: Tensor) -> Tensor:
         """Positions [m] in cells from the centre of the first cell, float32."""
-        return ((position.detach() - self.origin.to(position)) / self.settings.spacing - 0.5).float()
+        return ((position.detach() - self._origin.to(position)) / self.settings.spacing - 0.5).float()
 
     def start(self, time: Tensor) -> Tensor:
         """The moments of air that moves as the wind does, shape (10, X, Y, Z)."""
@@ -379,39 +390,63 @@ class AirInBox:
         dt, acting = units.dt / each, [self.push, *forces]
         begin, end = (self._wind(state.time + k * self.frame_dt) for k in (0, 1))
         self._check_speed(begin, end)
-        now, spare = torch.empty_like(moments), torch.empty_like(moments)
-        now.copy_(moments)
+        pair = self._sets(moments)
+        pair[0].copy_(moments)
         seen, marks = [], set(look_marks(self.steps, looks))
         for step in range(self.steps):
-            state, cfl = self._together(solver, state, now, dt, each, acting)
+            now, spare = pair[step % 2], pair[1 - step % 2]
+            key = (now.data_ptr(), spare.data_ptr(), each, dt)
+            begun = partial(self._begin, now, each, dt)
+            if self.settings.force == "surface":
+                (place,) = self._begins[step % 2](key, begun, state.position, state.velocity)
+            else:
+                (place,) = begun(state.position, state.velocity, state)
+            after, cfl = solver.watched_rollout(state, dt, each, acting, 1, None, check=False)
             if step + 1 in marks:
                 seen.append(cfl)
-            self.flow.advance(now, spare, torch.lerp(begin, end, (step + 1) / self.steps))
-            now, spare = spare, now
+            wind = torch.lerp(begin, end, (step + 1) / self.steps)
+            way, faster = after.position - state.position, after.velocity - state.velocity
+            self._ends[step % 2](key, partial(self._end, now, spare, each, dt), place, way, faster, wind)
+            state = after
             if watch is not None:
                 watch((step + 1) * each)
         self._check_inside(state)
-        return state, now, torch.stack(seen).amax()
+        last = pair[self.steps % 2]
+        return state, last.clone() if self._pair else last, torch.stack(seen).amax()
 
-    def _together(
-        self, solver: Solver, state: Any, moments: Tensor, dt: float, substeps: int, acting: Sequence[Force]
-    ) -> tuple[Any, Tensor]:
-        """A step of the body, in substeps of ``dt``; the air loses what the body takes.
+    def _sets(self, moments: Tensor) -> list[Tensor]:
+        """Two sets of moments for the steps of a frame; on a GPU always the same ones."""
+        if moments.is_cuda and not self._pair:
+            with torch.inference_mode(False):
+                self._pair = [torch.empty_like(moments) for _ in range(2)]
+        return self._pair or [torch.empty_like(moments) for _ in range(2)]
 
-        Returns the Courant number, too.
+    def _begin(
+        self, moments: Tensor, substeps: int, dt: float, position: Tensor, velocity: Tensor, state: State | None = None
+    ) -> list[Tensor]:
+        """Begin a step: the force of the air in the substeps of the body. Returns the points in cells, shape (P, 3).
+
+        The law needs the whole ``state``.
         """
-        units, place = self.flow.units, self._place(state.position)
+        units, place = self.flow.units, self._place(position)
         air, layer = look(moments, self._area, place, self.flow.kind)
-        air = (air * units.speed).to(state.velocity)
-        rate = (together(self._mass, layer / substeps) * (units.cell_mass / dt)).to(state.velocity)
-        if self.settings.force == "surface":
-            self.push.begin(rate[:, None] * air, rate)
-        else:
-            self.push.begin(*self._law(state, air, rate))
-        end, cfl = solver.watched_rollout(state, dt, substeps, acting, 1, None, check=False)
-        taken = self.push.taken(state, end, substeps, dt)
+        air = (air * units.speed).to(velocity)
+        rate = (together(self._mass, layer / substeps) * (units.cell_mass / dt)).to(velocity)
+        self.push.begin(*((rate[:, None] * air, rate) if state is None else self._law(state, air, rate)))
+        return [place]
+
+    def _lose(self, moments: Tensor, substeps: int, dt: float, place: Tensor, way: Tensor, faster: Tensor) -> Tensor:
+        """Take from the air what the body took in a step [kg m/s], shape (P, 3), which is returned."""
+        taken = self.push.taken(way, faster, substeps, dt)
+        units = self.flow.units
         give(moments, taken.float() / (units.cell_mass * units.speed), place, self.flow.kind)
-        return end, cfl
+        return taken
+
+    def _end(self, now: Tensor, out: Tensor, substeps: int, dt: float, *given: Tensor) -> list[Tensor]:
+        """End a step: the air loses what the body took, and moves on under the last given, the wind at the faces."""
+        self._lose(now, substeps, dt, *given[:-1])
+        self.flow.advance(now, out, given[-1])
+        return []
 
     def _law(self, state: State, air: Tensor, most: Tensor) -> tuple[Tensor, Tensor]:
         """The force of the law at rest, and its decrease per velocity, which is at most ``most`` [kg/s]."""

@@ -7,10 +7,11 @@ import pytest
 import torch
 
 from gaussian_swaying import AeroForce, Simulation, WindField
-from gaussian_swaying.aero.computed_air import ComputedAir
+from gaussian_swaying.aero.computed_air import BYTES, ComputedAir
 from gaussian_swaying.aero.effects import LogProfile
 from gaussian_swaying.aero.obstacles import SphereObstacle
 from gaussian_swaying.geometry.regions import Box
+from gaussian_swaying.kernels.graphs import Replayed
 from gaussian_swaying.mpm.solver import MPMSolver
 from gaussian_swaying.scenes.procedural import FlagScene
 from gaussian_swaying.simulation.material import Material
@@ -19,7 +20,7 @@ from gaussian_swaying.simulation.stepper import why_not_batched
 LOW, HIGH = [-1.2, -0.9, -0.9], [1.5, 0.9, 0.9]
 
 
-def _simulation(air=None, wind=(3.0, 0.5, 0.0), hold=True, density=100.0, dtype="float32", **changes):
+def _simulation(air=None, wind=(3.0, 0.5, 0.0), hold=True, density=100.0, dtype="float32", device="cpu", **changes):
     """A small flag across a box of 27 x 18 x 18 cells."""
     given = {"cells": 27, "speed": 6.0} | changes
     return Simulation(
@@ -30,9 +31,19 @@ def _simulation(air=None, wind=(3.0, 0.5, 0.0), hold=True, density=100.0, dtype=
         wind=wind if isinstance(wind, WindField) else list(wind),
         air=air or ComputedAir(LOW, HIGH, **given),
         dtype=dtype,
-        device="cpu",
+        device=device,
         frame_dt=0.02,
     )
+
+
+def _together(stepper, state, now, substeps=4):
+    """A step of the body without one of the air: the state then, and what its points took."""
+    air, dt = stepper.air, stepper.air.flow.units.dt / substeps
+    whole = [state] if air.settings.force == "law" else []
+    (place,) = air._begin(now, substeps, dt, state.position, state.velocity, *whole)
+    end, _ = stepper.solver.watched_rollout(state, dt, substeps, [air.push], 1, None, check=False)
+    way, faster = end.position - state.position, end.velocity - state.velocity
+    return end, air._lose(now, substeps, dt, place, way, faster)
 
 
 def _run(simulation, frames):
@@ -48,13 +59,12 @@ def test_a_free_sheet_gets_the_momentum_that_the_air_loses(dtype):
     """In one step of the air, with its faces and all; rounding of float32 is that of the air."""
     stepper = _simulation(hold=False, dtype=dtype).stepper
     state = stepper.start()
-    air, units = stepper.air, stepper.air.flow.units
-    now = state.air.clone()
+    air, now = stepper.air, state.air.clone()
     before = air.momentum(now)
-    end, _ = air._together(stepper.solver, state, now, units.dt / 4, 4, [air.push])
+    end, taken = _together(stepper, state, now)
     gained = stepper.solver.momenta(end)["linear"].double()
     tolerance = 1e-4 if dtype == "float32" else 1e-9
-    taken = air.push.taken(state, end, 4, units.dt / 4).double().sum(0)
+    taken = taken.double().sum(0)
     torch.testing.assert_close(gained, taken, rtol=tolerance, atol=tolerance * float(gained.abs().max()))
     # the air is float32
     torch.testing.assert_close(before - air.momentum(now), gained, rtol=1e-4, atol=2e-7 * float(before.abs().max()))
@@ -66,7 +76,7 @@ def test_the_kernels_push_as_torch_does():
     stepper = _simulation(dtype="float64").stepper
     state, air = stepper.start(), stepper.air
     dt = air.flow.units.dt / 4
-    twin, _ = air._together(stepper.solver, state, state.air.clone(), dt, 4, [air.push])
+    twin, _ = _together(stepper, state, state.air.clone())
     torch_alone = stepper.solver.rollout(state, dt, 4, [lambda now: air.push(now)])
     assert float(twin.velocity.norm(dim=-1).amax()) > 1e-3
     torch.testing.assert_close(twin.velocity, torch_alone.velocity, rtol=1e-10, atol=1e-12)
@@ -119,16 +129,28 @@ def test_any_ratio_of_masses_ends_finite(ratio):
     assert float(state.velocity.norm(dim=-1).amax()) < 12.0
 
 
+@pytest.mark.gpu
+@pytest.mark.parametrize("force", ["surface", "law"])
+def test_recorded_steps_are_those_that_are_not(force, monkeypatch):
+    """From the second frame on all steps replay graphs; their sums are in any order, as atomic ones are."""
+    _, replayed, _ = _run(_simulation(device="cuda", force=force), 4)
+    monkeypatch.setattr(Replayed, "__call__", lambda self, key, function, *inputs: list(function(*inputs)))
+    _, plain, _ = _run(_simulation(device="cuda", force=force), 4)
+    scale = float(plain.velocity.abs().max())
+    assert scale > 0.01
+    torch.testing.assert_close(replayed.velocity, plain.velocity, rtol=0, atol=1e-3 * scale)
+    torch.testing.assert_close(replayed.air, plain.air, rtol=0, atol=1e-4 * float(plain.air[1:4].abs().max()))
+
+
 def test_the_law_acts_in_the_air_at_the_patches():
     """With ``force: law`` the air loses what the patches get, and less of it than with a surface that stops it."""
     lost = {}
     for force in ("law", "surface"):
         stepper = _simulation(force=force, wind=(0.5, 3.0, 0.0)).stepper
         state = stepper.start()
-        air, units, now = stepper.air, stepper.air.flow.units, state.air.clone()
+        air, now = stepper.air, state.air.clone()
         before = air.momentum(now)
-        end, _ = air._together(stepper.solver, state, now, units.dt / 4, 4, [air.push])
-        taken = air.push.taken(state, end, 4, units.dt / 4).double().sum(0)
+        taken = _together(stepper, state, now)[1].double().sum(0)
         torch.testing.assert_close(before - air.momentum(now), taken, rtol=1e-3, atol=1e-6)
         lost[force] = float(taken[1])
     assert 0 < lost["law"] < lost["surface"]
@@ -179,7 +201,7 @@ def test_what_a_box_costs_and_resolves():
     assert found.cells == (27, 18, 18)
     assert found.spacing == pytest.approx(0.1)
     assert found.steps == 12
-    assert found.megabytes == pytest.approx(27 * 18 * 18 * 145e-6)
+    assert found.megabytes == pytest.approx(27 * 18 * 18 * BYTES * 1e-6)
     assert found.reynolds == pytest.approx(6.0 * 1.15 / 1.5e-5, rel=0.05)
     assert found.resolved < found.reynolds
     assert "Reynolds number" in str(found)
