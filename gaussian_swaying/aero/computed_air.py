@@ -123,7 +123,9 @@ class AirPush(Force):
 
     def __init__(self, points: int, like: Tensor) -> None:
         super().__init__()
-        self.register_buffer("numbers", like.new_zeros(points, 4), persistent=False)
+        with torch.inference_mode(False):  # recorded steps write it outside that mode
+            numbers = torch.zeros(points, 4, dtype=like.dtype, device=like.device)
+        self.register_buffer("numbers", numbers, persistent=False)
         self.numbers: Tensor
 
     def begin(self, at_rest: Tensor, rate: Tensor) -> None:

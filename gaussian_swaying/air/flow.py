@@ -190,13 +190,13 @@ class LatticeFlow(nn.Module):
             part: The wall cells, bool, shape (X, Y, Z), away from the faces: the pressure at rest is left out, which
                 pushes a closed surface nowhere.
         """
-        total = torch.zeros(3, dtype=torch.float64, device=part.device)
+        total = [torch.zeros((), dtype=torch.float64, device=part.device)] * 3
         for number, c in enumerate(DIRECTIONS):
             arrived, source = self._arrived(state.moments, number)
             back = population(state.moments.reshape(MOMENTS, -1)[:, self.special.long()], OPPOSITE[number])
             given = ((back + arrived) * part.reshape(-1)[source]).double().sum()
-            total -= given * torch.tensor(c, dtype=torch.float64, device=part.device)
-        return total * self.units.cell_mass * self.units.speed / self.units.dt
+            total = [t - a * given for t, a in zip(total, c, strict=True)]
+        return torch.stack(total) * self.units.cell_mass * self.units.speed / self.units.dt
 
     def _arrived(self, moments: Tensor, number: int) -> tuple[Tensor, Tensor]:
         """A population that arrives at special cells, and the flat index of the cells that it comes from, (S,) each."""

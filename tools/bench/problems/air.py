@@ -14,6 +14,7 @@ from torch import Tensor
 from gaussian_swaying.air.flow import WALL, FlowState, LatticeFlow
 from gaussian_swaying.air.immersed import exchange
 from gaussian_swaying.air.lattice import LatticeUnits
+from gaussian_swaying.kernels.graphs import Replayed
 
 GHIA = {
     0.0547: -0.03717, 0.1016: -0.06434, 0.1719: -0.10150, 0.2813: -0.15662, 0.4531: -0.21090, 0.5: -0.20581,
@@ -98,6 +99,21 @@ def _run(flow: LatticeFlow, state: FlowState, steps: int, wind: Tensor | None = 
 WIND = torch.tensor([1.0, 0.0, 0.0])
 
 
+def _forces(flow: LatticeFlow, state: FlowState, walls: Tensor, times: int) -> Tensor:
+    """Force on walls after each ten steps in :data:`WIND` [N], shape (times, 3), on the CPU."""
+    now, spare = state.moments.clone(), torch.empty_like(state.moments)
+    replayed, wind = Replayed(), WIND.to(now.device)
+
+    def ten(wind: Tensor) -> list[Tensor]:
+        for _ in range(5):
+            flow.advance(now, spare, wind)
+            flow.advance(spare, now, wind)
+        return [flow.force_on_walls(FlowState(now), walls)]
+
+    with torch.no_grad():
+        return torch.stack([replayed("ten", ten, wind)[0] for _ in range(times)]).cpu()
+
+
 def cylinder(
     cells: int, until: float = 140.0, reynolds: float = 100.0, length: int = 30, height: int = 24, device: str = "cpu"
 ) -> dict[str, float]:
@@ -126,12 +142,9 @@ def cylinder(
     start = torch.zeros(3, *size)
     start[0] = 1
     start[2] = 0.3 * torch.exp(-((x[:, None, None] - 1.5).square()) - z.square())
-    now, each, forces = flow.start(start.to(device)), 10, []
-    for _ in range(round(until / units.dt / each)):
-        now = _run(flow, now, each, WIND)
-        forces.append(flow.force_on_walls(now, walls))
-    drag, lift = (torch.stack(forces).cpu()[-round(50 / units.dt / each) :] / (0.5 / cells))[:, [0, 2]].T
-    frequency = _frequency(lift, each * units.dt)
+    forces = _forces(flow, flow.start(start.to(device)), walls, round(until / units.dt / 10))
+    drag, lift = (forces[-round(50 / units.dt / 10) :] / (0.5 / cells))[:, [0, 2]].T
+    frequency = _frequency(lift, 10 * units.dt)
     return {
         "strouhal": frequency, "drag": float(drag.mean()), "lift": float(lift.max() - lift.min()) / 2,
     }  # fmt: skip
@@ -170,12 +183,8 @@ def sphere(
     flow.to(device)
     walls = flow.kind == WALL
     state = _run(flow, flow.start([1.0, 0.0, 0.0]), round((until - 2) / units.dt), WIND)
-    forces, each = [], 10
-    for _ in range(round(2 / units.dt / each)):
-        state = _run(flow, state, each, WIND)
-        forces.append(flow.force_on_walls(state, walls)[0])
-    force = float(torch.stack(forces).mean())
-    return {"drag": force / (math.pi / 8)}
+    force = _forces(flow, state, walls, round(2 / units.dt / 10))[:, 0].mean()
+    return {"drag": float(force) / (math.pi / 8)}
 
 
 def plate(
@@ -203,15 +212,19 @@ def plate(
     still = torch.zeros(many**2, 3)
     place, area, mass, still, wind = (given.to(device) for given in (place, area, mass, still, WIND))
     now = flow.start([1.0, 0.0, 0.0]).moments
-    spare, drag, steps = torch.empty_like(now), 0.0, round(until / units.dt)
-    for step in range(steps):
-        taken = exchange(now, still, area, mass, place, flow.kind)
-        if 2 * step >= steps:
-            drag = drag + taken[:, 0].double().sum() / (steps - steps // 2)
-        flow.advance(now, spare, wind)
-        now, spare = spare, now
+    spare, replayed = torch.empty_like(now), Replayed()
+
+    def two(wind: Tensor) -> list[Tensor]:
+        taken = torch.zeros((), dtype=torch.float64, device=wind.device)
+        for first, second in ((now, spare), (spare, now)):
+            taken = taken + exchange(first, still, area, mass, place, flow.kind)[:, 0].double().sum()
+            flow.advance(first, second, wind)
+        return [taken / 2]
+
+    with torch.no_grad():
+        taken = torch.stack([replayed("two", two, wind)[0] for _ in range(round(until / units.dt / 2))])
     scale = units.cell_mass * units.speed / units.dt / 0.5
-    return {"drag": float(drag) * scale}
+    return {"drag": float(taken[len(taken) // 2 :].mean()) * scale}
 
 
 def step(cells: int, reynolds: float = 200.0, until: float = 60.0) -> dict[str, float]:
