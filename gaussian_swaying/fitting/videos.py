@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import os
 from collections.abc import Callable, Sequence
 from contextlib import closing
@@ -115,9 +116,10 @@ def read_videos(
     Each folder has a ``transforms.json`` as of Nerfstudio. A frame has ``file_path``, ``transform_matrix``, ``time``
     [s] and, with several cameras, ``camera``, a name or a number; a transparent image or ``mask_path`` gives the
     silhouette. An entry with ``video_path`` instead of ``file_path`` is a whole video of a camera that stands still:
-    ``time`` is then that of its first frame, and ``fps`` replaces the frame rate of the file. Lens distortion is
-    removed from both. Cameras that are not
-    wanted are not decoded; the others together may have :data:`MOST_FRAMES` and :data:`MOST_BYTES`.
+    ``time`` is then that of its first frame, and ``fps`` replaces the frame rate of the file. ``begin`` and ``seconds``
+    [s] choose a part of the film, and only that part is decoded; ``w`` and ``h`` scale it. Lens distortion is removed
+    from both. Cameras that are not wanted are not decoded; the others together may have :data:`MOST_FRAMES` and
+    :data:`MOST_BYTES`.
 
     Args:
         paths: A folder or a transforms.json, or several. Their times belong to the same clock.
@@ -239,8 +241,21 @@ def _film(file: Path, where: str, data: dict[str, Any], index: int, begin: float
     fps = read_number(where, entry, "fps")
     if fps is not None and not fps > 0:
         raise ValueError(f"The field `frames[{index}].fps` of the camera file {where} is {fps:g}: set it above 0.")
+    begun, seconds = (read_number(where, entry, name) for name in ("begin", "seconds"))
+    for name, value, good in (
+        ("begin", begun, (begun or 0) >= 0),
+        ("seconds", seconds, seconds is None or seconds > 0),
+    ):
+        if not good:
+            raise ValueError(
+                f"The field `frames[{index}].{name}` of the camera file {where} is {value:g}: set it to a time in the "
+                "film [s]."
+            )
+    wanted = [read_number(where, {name: data.get(name)} | entry, name) for name in ("w", "h")]
     shots: list[_Shot] = []
-    limits = ["-max_pixels", str(MOST_PIXELS)], ["-frames:v", str(room.frames + 1)]
+    taken = [] if not begun else ["-ss", f"{begun:.6f}"]
+    taken += [] if seconds is None else ["-t", f"{seconds:.6f}"]
+    limits = ["-max_pixels", str(MOST_PIXELS), *taken], ["-frames:v", str(room.frames + 1), *scaled(*wanted)]
     with closing(read_frames(path, input_params=limits[0], output_params=limits[1])) as film:
         head = next_of(film, path)
         size = (0, 0) if head is None else tuple(head["size"])
@@ -254,7 +269,8 @@ def _film(file: Path, where: str, data: dict[str, Any], index: int, begin: float
         rate = fps or float(head["fps"])
         if not rate > 0:
             raise ValueError(f"The video {path} does not say its frame rate: add `fps` to its entry in {where}.")
-        room.check(path, *size, frames=int(head["fps"] * head["duration"]))  # what it says; it may have more
+        length = min(head["duration"] - (begun or 0), math.inf if seconds is None else seconds)
+        room.check(path, *size, frames=int(head["fps"] * max(length, 0)))  # what it says; it may have more
         while (frame := next_of(film, path)) is not None:
             room.take(path, *size)
             picture = torch.frombuffer(bytearray(frame), dtype=torch.uint8).reshape(size[1], size[0], 3)
@@ -262,6 +278,13 @@ def _film(file: Path, where: str, data: dict[str, Any], index: int, begin: float
                 picture = remapped(picture, lens)
             shots.append(_Shot(begin + len(shots) / rate, camera, picture, None))
     return shots
+
+
+def scaled(width: float | None, height: float | None) -> list[str]:
+    """Options of ffmpeg that scale a film to a size [pixels], in its own proportions; none if there is no size."""
+    if not (width and height):
+        return []
+    return ["-vf", f"scale={width:.0f}:{height:.0f}:force_original_aspect_ratio=decrease:flags=area"]
 
 
 def next_of(film: Any, path: Path) -> Any:

@@ -143,6 +143,26 @@ def test_a_film_that_is_longer_than_it_says(tmp_path, monkeypatch, decoded):
     assert decoded[path.name] == 101 * 3 * 64 * 64
 
 
+def test_a_part_of_a_film_at_half_its_size(tmp_path, decoded):
+    """Only that part is delivered by ffmpeg, however long the film is."""
+
+    path = _film(tmp_path, (64, 32), 300, says=(32, 16), begin=4.0, seconds=0.5)
+    bright = np.repeat(np.arange(300, dtype=np.uint8) % 200 + 20, 64 * 32 * 3).reshape(300, 32, 64, 3)
+    iio.imwrite(path, bright, fps=24)
+    (film,) = read_videos(tmp_path)
+    assert film.images.shape == (12, 16, 32, 3)
+    assert film.images[:, 8, 16, 1].float().numpy() == pytest.approx(np.arange(96, 108) + 20, abs=2.5)
+    assert decoded[path.name] == film.images.numel()
+    assert film.times == pytest.approx([k / 24 for k in range(12)])
+
+
+@pytest.mark.parametrize(("name", "value"), [("begin", -1.0), ("seconds", 0.0)])
+def test_a_part_that_is_none(tmp_path, name, value):
+    _film(tmp_path, (64, 64), 3, **{name: value})
+    with pytest.raises(ValueError, match=rf"`frames\[0\].{name}`.*a time in the film"):
+        read_videos(tmp_path)
+
+
 def test_frames_that_are_too_large(tmp_path, monkeypatch, decoded):
     """ffmpeg refuses to decode them; those of another size than their camera's go no further than the header."""
     huge = _film(tmp_path, (64, 64), 3)
