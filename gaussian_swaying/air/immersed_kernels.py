@@ -61,7 +61,7 @@ def _reach(place, p, kind, nx, ny, nz, mask):
 @triton.jit
 def _add(pointer, value, mask, ATOMIC: tl.constexpr):
     if ATOMIC:
-        tl.atomic_add(pointer, value, mask=mask)
+        tl.atomic_add(pointer, value, mask, sem="relaxed")
     else:
         tl.store(pointer, tl.load(pointer, mask, 0.0) + value, mask)
 

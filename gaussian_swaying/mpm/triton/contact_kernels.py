@@ -438,8 +438,8 @@ def contact_solve(
                 tl.store(many + p, count, mask)
                 for c in tl.static_range(8):
                     tl.store(impulse + p * 8 + c, tl.zeros([BLOCK], tl.float32), mask)
-                tl.atomic_add(status + ACTING, tl.sum(count))
-                tl.atomic_max(status + NEEDED_SLOTS, tl.max(needed) + WALLS)
+                tl.atomic_add(status + ACTING, tl.sum(count), sem="relaxed")
+                tl.atomic_max(status + NEEDED_SLOTS, tl.max(needed) + WALLS, sem="relaxed")
         meet(gate, programs)
         if tl.load(status + ACTING) > 0:
             _count_nodes(

@@ -199,7 +199,7 @@ def _sort_places(
         p = first + lane
         mask = p < places
         _x, _y, _z, bucket = _own_bucket(position, p, mask, inverse_size, last)
-        tl.store(rank + p, tl.atomic_add(counts + bucket, 1, mask), mask)
+        tl.store(rank + p, tl.atomic_add(counts + bucket, 1, mask, sem="relaxed"), mask)
     meet(gate, programs)
     own = tl.zeros([BLOCK], tl.int32)
     for first in range(0, chunk, BLOCK):
@@ -312,8 +312,8 @@ def _search(
                 found += tl.sum(hit, 1)
         tl.store(near + p, tl.minimum(found, room), mask)
         found = tl.where(mask, found, 0)
-        tl.atomic_max(status + NEEDED_ROOM, tl.max(found))
-        tl.atomic_add(status + LISTED, tl.sum(found))
+        tl.atomic_max(status + NEEDED_ROOM, tl.max(found), sem="relaxed")
+        tl.atomic_add(status + LISTED, tl.sum(found), sem="relaxed")
 
 
 @triton.jit(do_not_specialize=CHANGES)
