@@ -133,6 +133,10 @@ class AirPush(Force):
         self.numbers[:, :3] = at_rest
         self.numbers[:, 3] = rate
 
+    def written(self) -> None:
+        """Tell who keeps a copy of the numbers that they changed: a replayed graph writes them unseen."""
+        torch.autograd.graph.increment_version(self.numbers)
+
     def taken(self, way: Tensor, faster: Tensor, substeps: int, dt: float) -> Tensor:
         """Momentum that the points took in some substeps [kg m/s], shape (P, 3).
 
@@ -401,6 +405,7 @@ class AirInBox:
             begun = partial(self._begin, now, each, dt)
             if self.settings.force == "surface":
                 (place,) = self._begins[step % 2](key, begun, state.position, state.velocity)
+                self.push.written()
             else:
                 (place,) = begun(state.position, state.velocity, state)
             after, cfl = solver.watched_rollout(state, dt, each, acting, 1, None, check=False)

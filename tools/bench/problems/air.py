@@ -99,19 +99,24 @@ def _run(flow: LatticeFlow, state: FlowState, steps: int, wind: Tensor | None = 
 WIND = torch.tensor([1.0, 0.0, 0.0])
 
 
-def _forces(flow: LatticeFlow, state: FlowState, walls: Tensor, times: int) -> Tensor:
-    """Force on walls after each ten steps in :data:`WIND` [N], shape (times, 3), on the CPU."""
+EACH = 20
+"""Steps between two looks at a force on walls, which takes longer than a step."""
+
+
+def _forces(flow: LatticeFlow, state: FlowState, walls: Tensor, until: float) -> Tensor:
+    """Force on walls after each :data:`EACH` steps in :data:`WIND` [N], shape (times, 3), on the CPU."""
     now, spare = state.moments.clone(), torch.empty_like(state.moments)
     replayed, wind = Replayed(), WIND.to(now.device)
 
-    def ten(wind: Tensor) -> list[Tensor]:
-        for _ in range(5):
+    def several(wind: Tensor) -> list[Tensor]:
+        for _ in range(EACH // 2):
             flow.advance(now, spare, wind)
             flow.advance(spare, now, wind)
         return [flow.force_on_walls(FlowState(now), walls)]
 
+    times = round(until / flow.units.dt / EACH)
     with torch.no_grad():
-        return torch.stack([replayed("ten", ten, wind)[0] for _ in range(times)]).cpu()
+        return torch.stack([replayed("several", several, wind)[0] for _ in range(times)]).cpu()
 
 
 def cylinder(
@@ -142,9 +147,9 @@ def cylinder(
     start = torch.zeros(3, *size)
     start[0] = 1
     start[2] = 0.3 * torch.exp(-((x[:, None, None] - 1.5).square()) - z.square())
-    forces = _forces(flow, flow.start(start.to(device)), walls, round(until / units.dt / 10))
-    drag, lift = (forces[-round(50 / units.dt / 10) :] / (0.5 / cells))[:, [0, 2]].T
-    frequency = _frequency(lift, 10 * units.dt)
+    state = _run(flow, flow.start(start.to(device)), round((until - 50) / units.dt), WIND)
+    drag, lift = (_forces(flow, state, walls, 50.0) / (0.5 / cells))[:, [0, 2]].T
+    frequency = _frequency(lift, EACH * units.dt)
     return {
         "strouhal": frequency, "drag": float(drag.mean()), "lift": float(lift.max() - lift.min()) / 2,
     }  # fmt: skip
@@ -183,7 +188,7 @@ def sphere(
     flow.to(device)
     walls = flow.kind == WALL
     state = _run(flow, flow.start([1.0, 0.0, 0.0]), round((until - 2) / units.dt), WIND)
-    force = _forces(flow, state, walls, round(2 / units.dt / 10))[:, 0].mean()
+    force = _forces(flow, state, walls, 2.0)[:, 0].mean()
     return {"drag": float(force) / (math.pi / 8)}
 
 
