@@ -1,14 +1,16 @@
-"""Find the wind and the material from video: ``gaussian-swaying fit --config FIT.yaml``."""
+"""Find the wind and the material from video: ``gaussian-swaying fit FILM --splat SPLAT``, or ``--config FIT.yaml``."""
 
 from __future__ import annotations
 
 import argparse
+import shlex
 import sys
 from collections.abc import Sequence
 from pathlib import Path
 
 from gaussian_swaying import _program as program
-from gaussian_swaying.cli.errors import command, guessing, run_command
+from gaussian_swaying.cli.errors import guessing, run_command
+from gaussian_swaying.cli.preview import joined
 from gaussian_swaying.cli.shipped import with_shipped
 from gaussian_swaying.runs.signals import stop_signals
 from gaussian_swaying.simulation.simulation import Simulation
@@ -24,9 +26,18 @@ def build_parser() -> argparse.ArgumentParser:
         "errors, pictures of what is left, and a configuration for `sim`.",
     )
     add = parser.add_argument
-    add("--config", required=True, help="YAML file with base, videos, unknowns and, if needed, known; docs/fit.md")
-    add("--output", help="folder for the results; outputs/fits/<name of the file> if left out")
-    add("--resume", action="store_true", help="continue the fit in the folder after its last iteration")
+    add("film", nargs="?", metavar="FILM", help="a film from a tripod, which begins with the object at rest")
+    add("--splat", metavar="SPLAT", help="the splat that the film shows")
+    add("--length", nargs=2, metavar=("NAME", "METRES"), help="a known length: object, a part such as pole, "
+        "or X,Y:X,Y, two places in the first frame (pixels); without it, speed and E are not absolute")  # fmt: skip
+    add("--up", nargs="+", metavar="UP", help="+x, -x, ... -z or 3 numbers: up in the splat, instead of a guess")
+    add("--hold", metavar="END", help="end that is held: top, bottom, none, +x, ... or -z, instead of a guess")
+    add("--focal", type=float, metavar="MM", help="focal length of the film, equivalent to 35 mm film; if "
+        "left out, that which the film says, or found")  # fmt: skip
+    add("--config", help="instead of FILM: a YAML file with base, videos, unknowns and, if needed, known; docs/fit.md")
+    add("--check", action="store_true", help="only write the files and pictures to look at before the fit")
+    add("--output", help="folder for the results; outputs/fits/<name of the film or file> if left out")
+    add("--resume", action="store_true", help="with --config: continue the fit in the folder after its last iteration")
     add("--device", default="auto", choices=("auto", "cpu", "cuda"), help="auto takes a GPU if there is one")
     return parser
 
@@ -38,14 +49,13 @@ def main(arguments: Sequence[str] | None = None) -> int:
         0 on success, 2 on bad input or if the video cannot tell the unknowns apart, 130 if stopped with Ctrl-C, 143 by
         SIGTERM. With ``GAUSSIAN_SWAYING_DEBUG=1`` errors keep their traceback.
     """
-    arguments = sys.argv[1:] if arguments is None else list(arguments)
+    arguments = joined(sys.argv[1:] if arguments is None else arguments)
     parser = build_parser()
-    begun: list[Path] = []
+    begun: list[str] = []
 
     def advice(error: BaseException) -> str | None:
         """Return the command that continues the fit, if the user stopped it."""
-        stopped = isinstance(error, KeyboardInterrupt) and begun and (begun[0] / "fit.json").exists()
-        return f"To continue it:\n  {command(arguments, '--resume')}" if stopped else None
+        return f"To continue it:\n  {begun[0]}" if isinstance(error, KeyboardInterrupt) and begun else None
 
     return run_command(
         lambda: fit(parser.parse_args(arguments), begun),
@@ -56,19 +66,52 @@ def main(arguments: Sequence[str] | None = None) -> int:
     )
 
 
-def fit(options: argparse.Namespace, begun: list[Path]) -> int:
-    """Fit and print the table; the folder is put into ``begun`` once it is the fit's."""
-    from gaussian_swaying.fitting.fit import OURS, run_fit
+def fit(options: argparse.Namespace, begun: list[str]) -> int:
+    """Fit and print the table; the command that continues the fit is put into ``begun`` once it can."""
+    from gaussian_swaying.fitting.fit import OURS, check_fit, run_fit
     from gaussian_swaying.fitting.plan import read_plan
 
-    file = Path(with_shipped(["--config", options.config], "fit")[1])
+    _check(options)
+    if options.film is None:
+        file = Path(with_shipped(["--config", options.config], "fit")[1])
+        folder = Path(options.output or Path("outputs") / "fits" / file.stem)
+    else:
+        from gaussian_swaying.cli.fit_film import RESULT, prepare
+
+        whole = Path(options.output or Path("outputs") / "fits" / Path(options.film).stem)
+        file, folder = prepare(options, whole), whole / RESULT
+        print(f"wrote {file}", flush=True)
+    again = shlex.join([*program.words("fit"), "--config", str(options.config or file), "--output", str(folder)])
     plan = read_plan(file, lambda name: with_shipped(["--config", name], "sim")[1])
-    folder = Path(options.output or Path("outputs") / "fits" / file.stem)
     with guessing(Simulation.parser()), stop_signals():
+        if options.check:
+            for path in check_fit(plan, folder, device=options.device):
+                print(f"wrote {path}")
+            print(f"to fit:\n  {again}")
+            return 0
         result = run_fit(
-            plan, folder, resume=options.resume, device=options.device, started=lambda: begun.append(folder)
+            plan,
+            folder,
+            resume=options.resume,
+            device=options.device,
+            started=lambda: begun.append(f"{again} --resume"),
         )
     print(result.text())
     for name in OURS[1:]:
         print(f"wrote {folder / name}")
     return 0
+
+
+def _check(options: argparse.Namespace) -> None:
+    """Raise ValueError if options do not go together."""
+    if (options.film is None) == (options.config is None):
+        raise ValueError("Expected either a film, as in `fit film.mp4 --splat my.ply`, or `--config` with a fit file.")
+    given = [name for name in ("splat", "length", "up", "hold", "focal") if getattr(options, name) is not None]
+    if options.film is None and given:
+        raise ValueError(f"`--{given[0]}` is for a film, and the file of `--config` says it: leave out one of them.")
+    if options.film is not None and options.splat is None:
+        raise ValueError(f"There is no splat for {options.film}: add --splat my.ply.")
+    if options.film is not None and options.resume:
+        raise ValueError("`--resume` continues the fit of a file: give the fit file with --config, and --output.")
+    if options.resume and options.check:
+        raise ValueError("`--check` stops before a fit, and `--resume` continues one: leave out one of them.")

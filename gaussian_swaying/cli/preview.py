@@ -143,7 +143,7 @@ def preview_scene(options: argparse.Namespace, folder: Path) -> Preview:
     large = path.is_file() and path.stat().st_size > LARGE
     cloud = read_gaussians(path, 0 if large else None)
     read = reading.quiet
-    up = None if options.up is None else _up(options.up)
+    up = None if options.up is None else up_of(options.up)
     region = None if options.region is None else (options.region[:3], options.region[3:])
     capture = None if options.capture is None else captured_from(options.capture)
     quality = options.quality or "normal"
@@ -330,7 +330,7 @@ def _pipeline(
     return Simulation.from_settings(parser, settings, **({} if cloud is None else {"cloud": cloud})), settings
 
 
-def _up(values: Sequence[str]) -> list[float] | str:
+def up_of(values: Sequence[str]) -> list[float] | str:
     """An up direction from the command line."""
     if len(values) == 1:
         return values[0]
@@ -340,7 +340,7 @@ def _up(values: Sequence[str]) -> list[float] | str:
         raise ValueError(f"Expected `--up` to be +x, -x, ... -z or 3 numbers, but got {' '.join(values)}.") from None
 
 
-def _joined(arguments: Sequence[str]) -> list[str]:
+def joined(arguments: Sequence[str]) -> list[str]:
     """The command line with ``--up=-y`` for ``--up -y``, where argparse would take -y for an option."""
     joined: list[str] = []
     for argument in arguments:
@@ -361,7 +361,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         0 if all went well, 2 on bad input, 130 if stopped with Ctrl-C. With the environment variable
         ``GAUSSIAN_SWAYING_DEBUG=1`` errors keep their traceback.
     """
-    arguments = _joined(sys.argv[1:] if arguments is None else arguments)
+    arguments = joined(sys.argv[1:] if arguments is None else arguments)
     parser = build_options()
     return run_command(
         lambda: _preview(parser.parse_args(with_shipped(arguments, "sim"))),

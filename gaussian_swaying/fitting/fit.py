@@ -8,7 +8,7 @@ import sys
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +17,7 @@ from torch import Tensor
 
 from gaussian_swaying._files import write_json
 from gaussian_swaying._inputs import read_json
+from gaussian_swaying.fitting.before import write_before
 from gaussian_swaying.fitting.evidence import (
     Block,
     Evidence,
@@ -38,7 +39,7 @@ from gaussian_swaying.fitting.least_squares import (
     unsettled,
 )
 from gaussian_swaying.fitting.plan import Plan, parse_base, read_unknown
-from gaussian_swaying.fitting.report import Result, predictions, write_results
+from gaussian_swaying.fitting.report import BEFORE, Result, consequences, predictions, wind_seen, write_results
 from gaussian_swaying.fitting.tracks import Tracks, match, opencv, still_until, track
 from gaussian_swaying.fitting.unknowns import FILM_START, check_unknowns
 from gaussian_swaying.fitting.variants import check_variants, states_of
@@ -49,7 +50,8 @@ from gaussian_swaying.runs.folder import MARKER, claim_folder, hold_folder
 from gaussian_swaying.simulation.simulation import Simulation
 
 PROGRESS, VALUES, RESULT, SCENE, PICTURES = "fit.json", "values.csv", "result.json", "scene.yaml", "pictures"
-OURS = (PROGRESS, VALUES, RESULT, SCENE, PICTURES)
+PAGE = "page.html"
+OURS = (PROGRESS, PAGE, VALUES, RESULT, SCENE, PICTURES)
 HORIZONS = (0.25, 0.5)
 """Shares of the fitted frames that the first stage takes, one after the other, and all frames if no matches follow.
 
@@ -155,6 +157,10 @@ class Fit:
                 )
         return self._tracks
 
+    def look(self, folder: Path) -> list[Path]:
+        """Write pictures to look at before the fit, into ``before`` of a folder, and return them."""
+        return write_before(folder / BEFORE, self.simulation, self.videos, self.tracks if self.followed else None)
+
     def evidence(self, stage: str, matched: Sequence[float] = ()) -> list[Evidence]:
         """Return the residuals of a stage, one list entry for each video and kind."""
         found: list[Evidence] = []
@@ -243,12 +249,13 @@ class Fit:
         scales = {b.kind: COARSE[b.kind] * (width if b.kind in ("tracks", "matches") else 1) for b in blocks}
         return huber(blocks, scales)
 
-    def run(self, course: Course, keep: Callable[[Course], None]) -> Result:
+    def run(self, course: Course, keep: Callable[[Course], None], films: Path | None = None) -> Result:
         """Do the steps that are missing, and return the result.
 
         Args:
             course: The resume state; a new one for a new fit.
             keep: Called after every iteration, to write the course.
+            films: Folder for films beside the fit; None for none.
 
         Raises:
             ValueError: If the video cannot tell the unknowns apart.
@@ -304,7 +311,7 @@ class Fit:
                     followed.add(moment, own[0])
                 yield self.simulation.painter.deformed(own[0])
 
-        shown = predictions(self.simulation, self.videos, self.times, len(self.fitted), moved())
+        shown = predictions(self.simulation, self.videos, self.times, len(self.fitted), moved(), films)
         return Result(
             self.plan.unknowns,
             tuple(course.place),
@@ -411,19 +418,8 @@ def run_fit(
     """
     folder, parser = Path(output), Simulation.parser()
     settings = parse_base(plan, parser)
-    if {"tracks", "matches"} & set(plan.stages):
-        opencv()  # before anything that takes time
-    settings.device = device
-    own = settings.clone()
-    own.camera = own.cameras = None  # the videos have their own
-    simulation = Simulation.from_settings(parser, own)
-    begin = time.monotonic()
-
-    def say(line: str) -> None:
-        if progress:
-            print(f"[{time.monotonic() - begin:6.0f} s] {line}", file=sys.stderr, flush=True)
-
-    fit_ = Fit(simulation, read_videos(list(plan.videos), plan.cameras), plan, say)
+    fit_ = _ready(plan, parser, settings, device, progress)
+    simulation = fit_.simulation
     described = _described(plan, simulation)
     remedy = "choose another with --output"
     if resume and not (folder / PROGRESS).exists():
@@ -436,15 +432,59 @@ def run_fit(
         def keep(course: Course) -> None:
             write_json(folder / PROGRESS, {"plan": described, "course": vars(course)})
 
-        result = fit_.run(course, keep)
+        fit_.look(folder)
+        result = fit_.run(course, keep, folder / PICTURES)
+        told = consequences(plan.assumed, result.values, simulation, settings.solver.gravity)
+        seen = wind_seen(result.values, fit_.videos, simulation)
+        result = replace(result, assumed=told, seen=seen)
         write_results(folder, result, parser, settings, simulation)
         return result
     finally:
         lock.release()
-        if not (folder / PROGRESS).exists():  # it was refused before the first iteration: nothing stays
+        if not (folder / PROGRESS).exists():  # it was refused before the first iteration: only pictures stay
             (folder / MARKER).unlink(missing_ok=True)
             with suppress(OSError):
                 folder.rmdir()
+
+
+def check_fit(plan: Plan, output: str | os.PathLike[str], *, device: str = "auto", progress: bool = True) -> list[Path]:
+    """Read all that a fit needs, and write the pictures that it writes before it starts.
+
+    Args:
+        plan: From :func:`~gaussian_swaying.fitting.plan.read_plan`.
+        output: The folder of the fit.
+        device: ``auto``, ``cpu`` or ``cuda``.
+        progress: Print what the videos say against the plan.
+
+    Returns:
+        The pictures.
+
+    Raises:
+        ImportError: As :func:`run_fit`.
+        ValueError: As :func:`run_fit`.
+    """
+    parser = Simulation.parser()
+    fit_ = _ready(plan, parser, parse_base(plan, parser), device, progress)
+    for note in fit_.notes():
+        fit_.say(note)
+    return fit_.look(Path(output))
+
+
+def _ready(plan: Plan, parser: Any, settings: Any, device: str, progress: bool) -> Fit:
+    """The fit of a plan, with everything read."""
+    if {"tracks", "matches"} & set(plan.stages):
+        opencv()  # before anything that takes time
+    settings.device = device
+    own = settings.clone()
+    own.camera = own.cameras = None  # the videos have their own
+    simulation = Simulation.from_settings(parser, own)
+    begin = time.monotonic()
+
+    def say(line: str) -> None:
+        if progress:
+            print(f"[{time.monotonic() - begin:6.0f} s] {line}", file=sys.stderr, flush=True)
+
+    return Fit(simulation, read_videos(list(plan.videos), plan.cameras), plan, say)
 
 
 def fit(

@@ -20,6 +20,8 @@ if TYPE_CHECKING:
 STAGES = ("tracks", "silhouettes", "matches", "pixels")
 """Stages of a fit, in this order: tracks from frame to frame; silhouettes; Gaussians matched from rendered frames to
 frames of the video, three rounds; colours."""
+ASSUMED = ("length", "mass")
+"""What a base may contain that nobody measured."""
 
 
 @dataclass(frozen=True)
@@ -40,6 +42,7 @@ class Plan:
         limit: Largest condition number of the sensitivities; above it the fit is refused.
         seed: Seed of the coarse search.
         cameras: Names of the cameras that are used; None for all.
+        assumed: What nobody measured, of :data:`ASSUMED`; the result says what follows.
     """
 
     base: Sequence[str]
@@ -55,11 +58,15 @@ class Plan:
     limit: float = 1e3
     seed: int = 0
     cameras: Sequence[str] | None = None
+    assumed: Sequence[str] = ()
 
     def __post_init__(self) -> None:
         for name in self.stages:
             if name not in STAGES:
                 raise ValueError(f"Expected `stages` to be of {', '.join(STAGES)}, but got {name!r}.")
+        for name in self.assumed:
+            if name not in ASSUMED:
+                raise ValueError(f"Expected `assumed` to be of {', '.join(ASSUMED)}, but got {name!r}.")
         if not self.stages:
             raise ValueError(f"Expected `stages` to have at least one of {', '.join(STAGES)}.")
         if not 0 < self.fit_share <= 1:
@@ -97,7 +104,7 @@ def read_plan(path: str | os.PathLike[str], find: Callable[[str], str] = str) ->
             f"Expected `known` in {file} to have options of `sim` as names (material.E), but got {known!r:.60}."
         )
     settings = {name: given[name] for name in names[4:] if given.get(name) is not None}
-    for name in ("stages", "cameras"):
+    for name in ("stages", "cameras", "assumed"):
         if name in settings:
             settings[name] = _names(file, name, settings[name])
     for name in ("fit_share", "until", "limit"):

@@ -13,16 +13,20 @@ from torch import Tensor
 
 from gaussian_swaying._files import write_json, write_table, write_text
 from gaussian_swaying.config.parser import config_text
+from gaussian_swaying.fitting.before import titled
 from gaussian_swaying.fitting.identifiability import Direction
 from gaussian_swaying.fitting.unknowns import Unknown, of_simulation
 from gaussian_swaying.fitting.videos import Footage
 from gaussian_swaying.gaussians.model import DeformedGaussians
+from gaussian_swaying.recording.video import VideoEncoder
 from gaussian_swaying.simulation.parameters import POLAR, flow_of, in_settings
 from gaussian_swaying.simulation.simulation import Simulation
 
 if TYPE_CHECKING:
     from jsonargparse import ArgumentParser, Namespace
 
+BEFORE = "before"
+"""Folder of the pictures that are written before a fit starts."""
 SHOWN = 3
 """Frames of the fitted and of the predicted part in a picture."""
 ASTRAY = 6.0
@@ -70,6 +74,8 @@ class Result:
         notes: What the videos say against the plan.
         followed: For each camera, the share of the motion of its tracks in the fitted frames that the simulation
             explains: 1 - (sum of squared distances) / (sum of squared displacements). Without tracks it is empty.
+        assumed: What the values rest on that nobody measured, as sentences.
+        seen: Where the wind blows, as each camera sees it, as sentences.
     """
 
     unknowns: Sequence[Unknown]
@@ -82,6 +88,8 @@ class Result:
     unsettled: str = ""
     notes: Sequence[str] = ()
     followed: Mapping[str, float] = field(default_factory=dict)
+    assumed: Sequence[str] = ()
+    seen: Sequence[str] = ()
 
     @property
     def values(self) -> dict[str, float]:
@@ -166,9 +174,12 @@ class Result:
         for one in self.shown:
             told = "" if math.isnan(one.predicted) else f", predicted frames {one.predicted:.2f} dB"
             lines.append(f"camera {one.camera}: fitted frames {one.fitted:.2f} dB{told}")
+        lines += self.seen
         failed, doubtful = self.doubts()
         said = {"good": "This fit is good.", "doubtful": "This fit is doubtful:", "failed": "This fit has failed:"}
         lines += [said[self.verdict], *failed, *doubtful]
+        if self.assumed:
+            lines += ["Not measured:", *self.assumed]
         return "\n".join(lines)
 
 
@@ -178,6 +189,7 @@ def predictions(
     times: Sequence[float],
     fitted: int,
     moved: Iterable[DeformedGaussians],
+    films: Path | None = None,
 ) -> list[Shown]:
     """Compare moving Gaussians with whole videos.
 
@@ -187,24 +199,28 @@ def predictions(
         times: Times of ``moved`` [s].
         fitted: Number of them that were fitted.
         moved: All Gaussians at each of the times.
+        films: Folder for ``film_CAMERA.mp4``: the video beside the fit.
     """
     chosen = {k for part in (range(1, fitted), range(fitted, len(times))) for k in _spread(part)}
     squares: list[tuple[list[float], list[float]]] = [([], []) for _ in videos]
     rows: list[list[tuple[str, Tensor]]] = [[] for _ in videos]
-    for k, (time, gaussians) in enumerate(zip(times, moved, strict=True)):
-        for number, video in enumerate(videos):
-            frame = next((f for f, own in enumerate(video.times) if abs(own - time) < 2e-6), None)
-            if frame is None:
-                continue
-            painter = simulation.painter
-            camera = video.cameras[frame].to(painter.device)
-            shown = painter.draw(gaussians, painter.colors(gaussians, camera), camera).color.clamp(0, 1).float().cpu()
-            real = video.images[frame].float() / 255
-            squares[number][k >= fitted].append(float((shown - real).square().mean()))
-            if k in chosen:
-                difference = (0.5 + 0.5 * (shown - real)).clamp(0, 1)
-                told = f"{time:.3g} s, {'predicted' if k >= fitted else 'fitted'}"
-                rows[number].append((told, torch.cat([real, shown, difference], 1)))
+    painter = simulation.painter
+    with Films(films, videos) as beside:
+        for k, (time, gaussians) in enumerate(zip(times, moved, strict=True)):
+            for number, video in enumerate(videos):
+                frame = next((f for f, own in enumerate(video.times) if abs(own - time) < 2e-6), None)
+                if frame is None:
+                    continue
+                camera = video.cameras[frame].to(painter.device)
+                drawn = painter.draw(gaussians, painter.colors(gaussians, camera), camera)
+                shown = drawn.color.clamp(0, 1).float().cpu()
+                real = video.images[frame].float() / 255
+                squares[number][k >= fitted].append(float((shown - real).square().mean()))
+                part = "predicted" if k >= fitted else "fitted"
+                beside.add(number, [(f"film, {time:.2f} s", real), (part, shown)])
+                if k in chosen:
+                    difference = (0.5 + 0.5 * (shown - real)).clamp(0, 1)
+                    rows[number].append((f"{time:.3g} s, {part}", torch.cat([real, shown, difference], 1)))
     found = []
     for video, own, row in zip(videos, squares, rows, strict=True):
         picture = (torch.cat([part for _, part in row]) * 255).round().to(torch.uint8)
@@ -214,16 +230,55 @@ def predictions(
     return found
 
 
+class Films:
+    """Writes ``film_CAMERA.mp4``, a video beside its fit, for each camera, within a ``with``.
+
+    Args:
+        folder: Where to write; None to write nothing.
+        videos: The videos.
+    """
+
+    def __init__(self, folder: Path | None, videos: Sequence[Footage]) -> None:
+        self._encoders: list[VideoEncoder] = []
+        if folder is None:
+            return
+        folder.mkdir(exist_ok=True)
+        for video in videos:
+            rate = (len(video.times) - 1) / (video.times[-1] - video.times[0])
+            self._encoders.append(VideoEncoder(folder / f"film_{video.name}.mp4", rate))
+
+    def add(self, number: int, panels: Sequence[tuple[str, Tensor]]) -> None:
+        """Add a frame of a camera: titles and pictures (H, W, 3), colours in [0, 1]."""
+        if self._encoders:
+            self._encoders[number].write(titled(panels))
+
+    def __enter__(self) -> Films:
+        return self
+
+    def __exit__(self, kind: Any, error: Any, trace: Any) -> None:
+        for encoder in self._encoders:
+            if kind is None:
+                encoder.finish()
+            encoder.abort()
+
+
 def write_results(
     folder: Path, result: Result, parser: ArgumentParser, settings: Namespace, simulation: Simulation
 ) -> None:
-    """Write ``values.csv``, ``result.json``, ``scene.yaml`` and the folder ``pictures``."""
+    """Write ``values.csv``, ``result.json``, ``scene.yaml``, ``page.html`` and the folder ``pictures``."""
     import imageio.v3 as iio
+
+    from gaussian_swaying.fitting.page import write_page
 
     pictures = folder / "pictures"
     pictures.mkdir(exist_ok=True)
     for one in result.shown:
         iio.imwrite(pictures / f"{one.camera}.png", _labelled(one))
+    own = [one.camera for one in result.shown]
+    films = [pictures / f"film_{name}.mp4" for name in own]
+    further = [folder / BEFORE / f"{kind}_{name}.png" for kind in ("rest", "tracks") for name in own]
+    further = [*(pictures / f"{name}.png" for name in own), *(path for path in further if path.exists())]
+    write_page(folder / "page.html", "/".join(folder.resolve().parts[-2:]), result, films, further)
     write_table(folder / "values.csv", result.rows())
     failed, doubtful = result.doubts()
     write_json(
@@ -245,6 +300,7 @@ def write_results(
             "why": [*failed, *doubtful],
             "motion_explained": dict(result.followed),
             "notes": list(result.notes),
+            "assumed": list(result.assumed),
             "not_settled": result.unsettled,
             "not_followed": result.astray,
             "not_determined": result.vague,
@@ -266,6 +322,60 @@ def scene_text(values: Mapping[str, float], parser: ArgumentParser, settings: Na
             in_settings(found, name, value)
     told = "".join(f"# {name}: {value:.6g}\n" for name, value in values.items())
     return "# Found by gaussian-swaying fit:\n" + told + f"frames: {settings.frames}\n" + config_text(parser, found)
+
+
+def consequences(
+    assumed: Sequence[str], values: Mapping[str, float], simulation: Simulation, gravity: Sequence[float]
+) -> list[str]:
+    """What follows for the values from what was only assumed, as sentences.
+
+    Args:
+        assumed: ``length`` or ``mass``, or both.
+        values: The values that were found.
+        simulation: The scene.
+        gravity: Of the scene [m/s²].
+    """
+    scene, found = simulation.scene, []
+    longest = scene.size * scene.frame.metres_per_unit
+    if "length" in assumed:
+        speed = values.get("wind.speed")
+        told = "" if speed is None else f" In its own lengths the speed is {speed / longest:.3g} a second."
+        found.append(
+            f"No length is known: the longest side of what moves was taken as {longest:.3g} m. Metres a second and "
+            f"pascals have no absolute value then, while angles do.{told}"
+            + (
+                " Gravity makes both depend on the length: measure one, and give it with --length."
+                if any(gravity)
+                else ""
+            )
+        )
+    if "mass" in assumed:
+        area = float(scene.points.mass.sum() / scene.patches.area.sum())
+        found.append(
+            f"The mass was taken as {area:.3g} kg/m². With twice the mass the speed is about 1.4 times and E twice as "
+            "large: weigh it, and set material.density."
+        )
+    return found
+
+
+def wind_seen(values: Mapping[str, float], videos: Sequence[Footage], simulation: Simulation) -> list[str]:
+    """Where the wind blows in the picture of each camera, as sentences; none if no direction was sought."""
+    if not {"wind.azimuth", "wind.elevation"} & set(values):
+        return []
+    start = simulation.wind.flows[0].tolist()  # type: ignore[index]
+    flow = torch.tensor(flow_of(start, values), dtype=torch.float64)
+    scene = flow @ simulation.scene.frame.rotation.double().cpu()
+    found = []
+    for video in videos:
+        turn = video.cameras[0].world_to_camera[:3, :3].double().cpu()
+        right, down, away = (turn @ scene / scene.norm()).tolist()
+        ways = [
+            f"{math.degrees(math.asin(min(1.0, abs(away)))):.0f} degrees {'away from' if away > 0 else 'towards'} it"
+        ]
+        ways += [f"to the {'right' if right > 0 else 'left'}"] if abs(right) > 0.1 else []
+        ways += ["down" if down > 0 else "up"] if abs(down) > 0.2 else []
+        found.append(f"camera {video.name} sees the wind blow {', '.join([*ways[1:], ways[0]])}")
+    return found
 
 
 def _labelled(shown: Shown) -> Any:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import math
 import os
 from collections.abc import Callable, Sequence
@@ -282,6 +283,7 @@ def _film(file: Path, where: str, data: dict[str, Any], index: int, begin: float
 
 def scaled(width: float | None, height: float | None) -> list[str]:
     """Options of ffmpeg that scale a film to a size [pixels], in its own proportions; none if there is no size."""
+    logging.getLogger("imageio_ffmpeg").setLevel(logging.ERROR)  # it warns of every film that is scaled
     if not (width and height):
         return []
     return ["-vf", f"scale={width:.0f}:{height:.0f}:force_original_aspect_ratio=decrease:flags=area"]

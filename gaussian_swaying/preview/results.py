@@ -71,11 +71,16 @@ def write(preview: Preview, folder: Path) -> list[Path]:
         files.append(preview.parts.save(path))
     for name, text in preview.configurations.items():
         path = folder / f"{name}.yaml"
-        if path.exists() and path.read_text(encoding="utf-8") != text:
-            path.rename(_unused(folder, name, "yaml"))
+        keep_aside(path, text)
         path.write_text(text, encoding="utf-8")
         files.append(path)
     return files
+
+
+def keep_aside(path: Path, text: str) -> None:
+    """Rename a file that has another text, as it may have been edited: ``fit.yaml`` to ``fit.1.yaml``, and so on."""
+    if path.exists() and path.read_text(encoding="utf-8") != text:
+        path.rename(_unused(path.parent, path.stem, path.suffix[1:]))
 
 
 def _same(path: Path, parts: Parts) -> bool:

@@ -1,0 +1,291 @@
+"""From a film and a splat to the files of a fit: ``gaussian-swaying fit FILM --splat SPLAT``."""
+
+from __future__ import annotations
+
+import argparse
+import math
+import os
+import shlex
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+import yaml
+from torch import Tensor
+
+from gaussian_swaying import _program as program
+from gaussian_swaying._files import write_json, write_text
+from gaussian_swaying.cli.preview import build_options, preview_scene
+from gaussian_swaying.cli.register import CAMERAS, PICTURE, VIEW, first_cameras, fov_of, painter_of, transforms
+from gaussian_swaying.fitting.film import Film, begins_to_move, first_frame, open_film, pixels_of_focal
+from gaussian_swaying.gaussians.cloud import GaussianCloud
+from gaussian_swaying.preview.results import Preview, keep_aside, write
+from gaussian_swaying.rendering.cameras.camera import Camera
+from gaussian_swaying.rendering.protocol import RenderOutput
+
+PLAN, LOOK, RESULT = "fit.yaml", "preview", "result"
+SECONDS = 1.5
+"""Time of motion that is fitted; half as much again is predicted [s]."""
+LEAD = 0.4
+"""Longest time at rest that is kept before the motion [s]."""
+SOFTER, STIFFER = 1 / 30, 30.0
+"""Range of E, per that with which the preview sways visibly."""
+SPEED = (0.5, 25.0)
+"""Range of the wind [m/s]."""
+OBJECT = "object"
+"""Name of the whole in ``--length``."""
+
+
+@dataclass(frozen=True)
+class Seen:
+    """What the first frame shows: film, frame, splat, camera, and the picture of the splat from there."""
+
+    film: Film
+    frame: Tensor
+    cloud: GaussianCloud
+    camera: Camera
+    picture: RenderOutput
+
+
+def prepare(options: argparse.Namespace, folder: Path) -> Path:
+    """Write the files of a fit and pictures of what they rest on, and say what was found.
+
+    Args:
+        options: ``film``, ``splat``, ``length``, ``up``, ``hold``, ``focal`` and ``device``, see ``fit --help``.
+        folder: Where to write.
+
+    Returns:
+        The fit file.
+
+    Raises:
+        ValueError: If the film or the splat cannot be used; the message says what to do.
+    """
+    length = _length(options.length)
+    if options.focal is not None and not 5 <= options.focal <= 1000:
+        raise ValueError(f"Expected `--focal` from 5 to 1000 mm, but got {options.focal:g}.")
+    seen, told = _registered(options)
+    print(told, flush=True)
+    folder.mkdir(parents=True, exist_ok=True)
+    _write_registration(seen, folder)
+    moves = begins_to_move(seen.film, seen.picture.alpha[..., 0].cpu())
+    if moves is None:
+        raise ValueError(
+            f"Nothing moves in the film {options.film} where the splat is: look at {folder / PICTURE}, and give a film "
+            "in which the wind moves it."
+        )
+    begin = max(0.0, moves - LEAD)
+    seconds = min(1.5 * SECONDS + moves - begin, seen.film.seconds - begin)
+    look = folder / LOOK
+    preview = _previewed(options, look, 1.0)
+    if length is not None:
+        ratio = _scale(*length, seen, preview)
+        if ratio != 1.0:
+            preview = _previewed(options, look, ratio)
+    write(preview, look)
+    where = os.path.relpath(seen.film.path.resolve(), folder.resolve())
+    data = transforms(seen.camera, where)
+    data["frames"][0] |= {"begin": round(begin, 4), "seconds": round(seconds, 4)}
+    write_json(folder / CAMERAS, data)
+    text = plan_text(preview, _background(seen), moves - begin, length is not None, folder)
+    keep_aside(folder / PLAN, text)
+    write_text(folder / PLAN, text)
+    print(f"{options.film} moves from {moves:.2f} s on; {begin:.2f} s to {begin + seconds:.2f} s of it are used")
+    print("\n".join(_guesses(preview, options, length)))
+    print(f"look at {folder / PICTURE}: frame and splat have to show the same; and at {look / 'preview.png'}")
+    return folder / PLAN
+
+
+def _length(given: Sequence[str] | None) -> tuple[str, float] | None:
+    """Name and metres of ``--length``."""
+    if given is None:
+        return None
+    name, metres = given
+    try:
+        value = float(metres)
+    except ValueError:
+        value = math.nan
+    if not 0 < value < math.inf:
+        raise ValueError(
+            f"Expected `--length` to be a name and a length in metres, such as pole 2.4, but got {metres}."
+        )
+    return name, value
+
+
+def _registered(options: argparse.Namespace) -> tuple[Seen, str]:
+    """The first frame with its camera, and a sentence on it."""
+    from gaussian_swaying.fitting.registration import register
+    from gaussian_swaying.gaussians.formats import read_gaussians
+
+    film = open_film(options.film)
+    frame, cloud = first_frame(film), read_gaussians(options.splat, 0)
+    draw, up = painter_of(cloud), None if options.up is None else _direction(options.up)
+    focal, fov = options.focal or film.focal, VIEW
+    if focal is not None:
+        fov = 2 * math.degrees(math.atan(0.5 * film.height / pixels_of_focal(focal, film.width, film.height)))
+    start = first_cameras(cloud, up, fov, film.width, film.height)
+    try:
+        found = register(draw, frame, start, focal=focal is None)
+    except ValueError as error:
+        raise ValueError(
+            f"The splat was not found in the first frame of {options.film}. It has to show the object at rest, large "
+            "and with texture, from a side that was captured; `--up` and `--focal` help."
+        ) from error
+    source = "found" if focal is None else f"of {focal:g} mm" + ("" if options.focal else ", as the film says")
+    told = (
+        f"camera: {found.agreeing} of {found.matches} points agree, {found.residual:.1f} pixels off; focal length "
+        f"{source} ({fov_of(found.camera):.0f} degrees from top to bottom)"
+    )
+    return Seen(film, frame, cloud, found.camera, draw(found.camera)), told
+
+
+def _direction(words: Sequence[str]) -> list[float]:
+    from gaussian_swaying.cli.preview import up_of
+    from gaussian_swaying.preview.shape import DIRECTIONS
+
+    found = up_of(words)
+    return list(DIRECTIONS[found]) if isinstance(found, str) and found in DIRECTIONS else list(found)  # type: ignore[arg-type]
+
+
+def _write_registration(seen: Seen, folder: Path) -> None:
+    import imageio.v3 as iio
+
+    from gaussian_swaying.fitting.before import side_by_side, titled
+
+    iio.imwrite(folder / PICTURE, titled(side_by_side(seen.frame, seen.picture.color, seen.picture.alpha)))
+
+
+def _background(seen: Seen) -> list[float]:
+    """The colour that most of the first frame has where the splat is not; that of all of it if it is everywhere."""
+    around = seen.picture.alpha[..., 0].cpu() < 0.05
+    pixels = seen.frame[around] if bool(around.any()) else seen.frame.flatten(0, 1)
+    return [round(value / 255, 3) for value in pixels.median(0).values.tolist()]
+
+
+def _previewed(options: argparse.Namespace, folder: Path, longest: float) -> Preview:
+    """The preview of the splat, whose longest side has a length [m]."""
+    words = [str(options.splat), f"--longest-side={longest:.9g}", f"--device={options.device}"]
+    given = build_options().parse_args(words)
+    given.up, given.hold = options.up, options.hold
+    return preview_scene(given, folder)
+
+
+def _scale(name: str, metres: float, seen: Seen, preview: Preview) -> float:
+    """The length of the longest side [m] with which a named length has so many metres.
+
+    Args:
+        name: ``object``, a part, or two places in the film's first frame [pixels], as X,Y:X,Y.
+        metres: The length.
+        seen: The first frame.
+        preview: Of the splat with a longest side of 1 m.
+    """
+    if name == OBJECT:
+        return metres
+    metres_per_unit = preview.data["suggestion"]["metres_per_unit"]
+    if ":" in name:
+        return metres / (float((_place(name, 0, seen) - _place(name, 1, seen)).norm()) * metres_per_unit)
+    parts = preview.parts
+    names = [] if parts is None else [part.name for part in parts.parts]
+    if parts is None or name not in names:
+        raise ValueError(
+            f"The splat has no part {name!r}: `--length` may name {', '.join([*names, OBJECT])}, or two places in the "
+            "first frame, such as 120,80:120,640 (pixels from its left and upper edges)."
+        )
+    return metres / (
+        extent(seen.cloud.means[parts.mask(name)], preview.data["suggestion"]["up"]["direction"]) * metres_per_unit
+    )
+
+
+def extent(points: Tensor, up: Sequence[float]) -> float:
+    """The longest side of an upright box around points (N, 3) [scene units], turned as they are seen from above."""
+    axis = torch.tensor(up, dtype=torch.float64)
+    axis = axis / axis.norm()
+    centred = points.double() - points.double().mean(0)
+    level = centred - (centred @ axis)[:, None] * axis
+    sides = torch.linalg.eigh(level.T @ level)[1].T[1:]
+    along = centred @ torch.cat([axis[None], sides]).T
+    return float((along.quantile(0.998, 0) - along.quantile(0.002, 0)).max())
+
+
+def _place(name: str, number: int, seen: Seen) -> Tensor:
+    """The place in the splat that a pixel of the first frame shows, shape (3,)."""
+    try:
+        x, y = (float(value) / seen.film.full for value in name.split(":")[number].split(","))
+    except ValueError:
+        raise ValueError(f"Expected `--length` to have two places such as 120,80:120,640, but got {name}.") from None
+    column, row = int(x), int(y)
+    alpha = seen.picture.alpha[..., 0]
+    if not (0 <= column < alpha.shape[1] and 0 <= row < alpha.shape[0]) or float(alpha[row, column]) < 0.5:
+        raise ValueError(
+            f"The place {name.split(':')[number]} of `--length` is not on the splat: look at {PICTURE} for places."
+        )
+    depth = float(seen.picture.depth[row, column, 0] / alpha[row, column])
+    K, view = seen.camera.intrinsics.double(), seen.camera.world_to_camera.double()
+    ray = torch.tensor([(x - float(K[0, 2])) / float(K[0, 0]), (y - float(K[1, 2])) / float(K[1, 1]), 1.0])
+    return view[:3, :3].T @ (depth * ray.double() - view[:3, 3])
+
+
+def plan_text(preview: Preview, background: Sequence[float], still: float, scaled: bool, folder: Path) -> str:
+    """The fit file.
+
+    Args:
+        preview: Of the splat.
+        background: Colour behind it in the film.
+        still: Time at rest before the motion [s].
+        scaled: Whether a length is known.
+        folder: Of the fit file.
+    """
+    guess = preview.data["suggestion"]
+    material = yaml.safe_load(preview.configurations["draft"])["material"]
+    low, high = (float(f"{material['E'] * factor:.1e}") for factor in (SOFTER, STIFFER))
+    middle, half = 0.0, 180.0
+    if guess["hold"]["end"] == "side":  # a flag flies away from its pole
+        middle, half = math.degrees(math.atan2(guess["flow"][1], guess["flow"][0])), 120.0
+    around = [round(middle - half), round(middle + half)]
+    start = ""
+    if still >= 0.05:
+        entry = f"  film.start: {{range: [0.0, {still + 0.1:.2f}], start: {0.8 * still:.2f}}}"
+        start = f"{entry}   # s; when the motion starts\n"
+    again = shlex.join([*program.words("fit"), "--config", str(folder / PLAN), "--output", str(folder / RESULT)])
+    return f"""\
+# Made from a film. Every number may be changed; then:
+#   {again}
+base: {LOOK}/draft.yaml           # the splat, what holds it, its material: guesses; {LOOK}/starter.yaml is finer
+videos: {CAMERAS}          # the part of the film that is used, and its camera
+known:                          # replaces what the base says
+  wind.modulations: []          # a steady wind
+  background: {background}   # around the splat in the film
+  material.density: {material["density"]:<12g}# kg/m3; not measured
+  material.thickness: {material["thickness"]:<10.4g}# m; with the density it makes the mass of an area
+assumed: [{"mass" if scaled else "mass, length"}]        # not measured; the result says what follows
+unknowns:
+  wind.speed: {{range: [{SPEED[0]}, {SPEED[1]}]}}                # m/s
+  wind.azimuth: {{range: {around}}}            # degrees from +x towards +y, with z up
+  material.E: {{range: [{low:g}, {high:g}]}}           # Pa
+{start}until: {still + SECONDS:.2f}                     # s of the used part that are fitted; the rest is predicted
+search: 48                      # simulations of the coarse search
+"""
+
+
+def _guesses(preview: Preview, options: argparse.Namespace, length: Any) -> list[str]:
+    """What the preview guessed, as lines."""
+    guess = preview.data["suggestion"]
+    hold = guess["hold"]
+    lines = [
+        f"guessed: up is {[round(v, 2) for v in guess['up']['direction']]} (confidence {guess['up']['confidence']})"
+    ]
+    lines.append(f"guessed: held at the {hold['end']} (confidence {hold['confidence']}): {hold['reason']}")
+    if guess["parts"] is not None:
+        lines.append("parts: " + ", ".join(f"{n} {p['role']}" for n, p in guess["parts"]["parts"].items()))
+    size = " x ".join(f"{side:.3g}" for side in guess["size_m"])
+    known = (
+        "as --length says"
+        if length is not None
+        else "which nobody measured: give --length, such as --length object 1.5"
+    )
+    lines.append(f"size of what moves: {size} m, {known}")
+    return lines
+
+
+__all__ = ["extent", "plan_text", "prepare"]

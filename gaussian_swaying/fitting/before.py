@@ -1,0 +1,124 @@
+"""Pictures to look at before a fit: the splat at rest beside the first frame, what is held, and what is followed."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from gaussian_swaying.fitting.tracks import Tracks
+from gaussian_swaying.fitting.videos import Footage
+from gaussian_swaying.rendering.cameras.camera import Camera
+from gaussian_swaying.simulation.simulation import Simulation
+
+BAND = 22
+"""Height of the line of text above a picture [pixels]."""
+HELD, MOVING, STILL = (0.85, 0.1, 0.1), (0.1, 0.65, 0.25), (0.55, 0.55, 0.55)
+"""Colours of what is held, what moves, and what is only drawn."""
+
+
+def write_before(
+    folder: Path, simulation: Simulation, videos: Sequence[Footage], tracks: Sequence[Tracks] | None
+) -> list[Path]:
+    """Write ``rest_CAMERA.png`` and, if points are followed, ``tracks_CAMERA.png``.
+
+    Args:
+        folder: Where to write; made if it is missing.
+        simulation: The scene.
+        videos: The videos.
+        tracks: Their tracks; None if nothing is followed.
+
+    Returns:
+        The files.
+    """
+    import imageio.v3 as iio
+
+    folder.mkdir(parents=True, exist_ok=True)
+    files = []
+    for number, video in enumerate(videos):
+        pictures = {f"rest_{video.name}.png": at_rest(simulation, video)}
+        if tracks is not None:
+            pictures[f"tracks_{video.name}.png"] = tracks_picture(video, tracks[number])
+        for name, picture in pictures.items():
+            iio.imwrite(folder / name, picture)
+            files.append(folder / name)
+    return files
+
+
+def side_by_side(frame: Tensor, shown: Tensor, alpha: Tensor) -> list[tuple[str, Tensor]]:
+    """A frame, the splat half over it, and the splat, each with a title.
+
+    Args:
+        frame: The frame, dtype uint8, shape (H, W, 3).
+        shown: The splat's picture, colours in [0, 1], shape (H, W, 3).
+        alpha: Its opacity, shape (H, W, 1).
+    """
+    real, drawn = frame.float() / 255, shown.detach().float().cpu().clamp(0, 1)
+    cover = 0.5 * alpha.detach().float().cpu()
+    return [("first frame", real), ("splat half over it", real * (1 - cover) + drawn * cover), ("splat", drawn)]
+
+
+def at_rest(simulation: Simulation, video: Footage) -> Any:
+    """The first frame, the scene at rest half over it and alone, and what is held there, as a NumPy array."""
+    scene, painter = simulation.scene, simulation.painter
+    camera: Camera = video.cameras[0].to(painter.device)
+    with torch.no_grad():
+        rest = scene.rest()
+        picture = painter.draw(rest, painter.colors(rest, camera), camera)
+        roles = painter.draw(rest, role_colours(simulation).to(painter.device), camera)
+    panels = side_by_side(video.images[0], picture.color, picture.alpha)
+    panels.append(("red: held, green: moves, grey: still", roles.color.detach().float().cpu().clamp(0, 1)))
+    return titled(panels)
+
+
+def role_colours(simulation: Simulation) -> Tensor:
+    """A colour for each Gaussian of a scene: held, moving or still; shape (N, 3)."""
+    from gaussian_swaying.preview.picture import classify
+
+    parts = classify(simulation)
+    colours = torch.tensor(STILL).repeat(len(parts.simulated), 1)
+    colours[(parts.simulated | parts.carried).cpu()] = torch.tensor(MOVING)
+    colours[parts.pinned.cpu()] = torch.tensor(HELD)
+    return colours
+
+
+def tracks_picture(video: Footage, tracks: Tracks) -> Any:
+    """The first frame, pale, with the ways of the points that are followed, as a NumPy array (H, W, 3)."""
+    import numpy as np
+    from PIL import Image, ImageDraw
+
+    pale = (video.images[0].float() * 0.4 + 255 * 0.6).round().to(torch.uint8)
+    picture = Image.fromarray(pale.numpy())
+    draw = ImageDraw.Draw(picture)
+    for number in range(tracks.position.shape[1]):
+        seen = tracks.seen[:, number]
+        way = [tuple(place) for place in tracks.position[seen, number].tolist()]
+        colour = (20, 90, 220) if bool(seen[-1]) else (220, 120, 0)
+        if len(way) > 1:
+            draw.line(way, fill=colour, width=1)
+        x, y = way[0]
+        draw.ellipse((x - 1.5, y - 1.5, x + 1.5, y + 1.5), fill=colour)
+    lost = int((~tracks.seen[-1]).sum())
+    told = f"{tracks.position.shape[1]} points followed; orange: {lost} lost"
+    return titled([(told, torch.from_numpy(np.asarray(picture).copy()).float() / 255)])
+
+
+def titled(panels: Sequence[tuple[str, Tensor]]) -> Any:
+    """Pictures (H, W, 3) side by side, colours in [0, 1], with a title above each, as a NumPy array."""
+    import numpy as np
+    from PIL import Image, ImageDraw, ImageFont
+
+    joined = torch.cat([panel for _, panel in panels], 1)
+    height, width = joined.shape[:2]
+    picture = Image.new("RGB", (width, height + BAND), (255, 255, 255))
+    picture.paste(Image.fromarray((joined.clamp(0, 1) * 255).round().to(torch.uint8).numpy()), (0, BAND))
+    draw, font = ImageDraw.Draw(picture), ImageFont.load_default(13)
+    for number, (title, _) in enumerate(panels):
+        draw.text((number * width // len(panels) + 6, 3), title, fill=(0, 0, 0), font=font)
+    return np.asarray(picture)
+
+
+__all__ = ["at_rest", "side_by_side", "titled", "tracks_picture", "write_before"]

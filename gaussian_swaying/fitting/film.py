@@ -1,0 +1,143 @@
+"""What a film says before it is fitted: its size, rate and focal length, its first frame, and when it begins to move.
+
+Frames are read one by one in reduced size, so memory does not grow with the film.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+import subprocess
+from collections.abc import Generator
+from contextlib import closing
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from gaussian_swaying._inputs import check_regular
+from gaussian_swaying.fitting.videos import MOST_PIXELS, next_of, scaled
+
+SIDE = 960
+"""Longer side of the frames that are used, at most [pixels]."""
+SMALL = 240
+"""Longer side of the frames in which motion is looked for, at most [pixels]."""
+DIFFERENT, MOVED = 8.0, 0.02
+"""Grey levels by which a pixel differs that has moved, and the share of such pixels in a frame that has."""
+DIAGONAL = math.hypot(36, 24)
+"""Of the film to which a focal length in mm is equivalent [mm]."""
+_FOCAL = re.compile(r"focal.?length\S*35mm\S*\s*:\s*([0-9.]+)", re.IGNORECASE)
+
+
+@dataclass(frozen=True)
+class Film:
+    """A film that is read in reduced size.
+
+    Attributes:
+        path: The file.
+        width: Of the frames as they are read [pixels].
+        height: Of them.
+        full: Factor by which the film itself is larger.
+        fps: Frames per second.
+        seconds: Its length [s], as the file says.
+        focal: Focal length that the file says, equivalent to one on 35 mm film [mm]; None if it says none.
+    """
+
+    path: Path
+    width: int
+    height: int
+    full: float
+    fps: float
+    seconds: float
+    focal: float | None = None
+
+
+def open_film(path: str | Path) -> Film:
+    """Read the head of a film.
+
+    Raises:
+        FileNotFoundError: If there is no such film.
+        ValueError: If it cannot be read, or has no frames.
+    """
+    file = check_regular(Path(path), "the film")
+    with closing(_frames(file, [])) as frames:
+        head = next_of(frames, file)
+        if head is None or next_of(frames, file) is None:
+            raise ValueError(f"The film {file} has no frames: convert it to mp4.")
+    width, height = head["size"]
+    factor = max(1.0, max(width, height) / SIDE)
+    if not head["fps"] > 0:
+        raise ValueError(f"The film {file} does not say its frame rate: convert it to mp4.")
+    size = round(width / factor), round(height / factor)
+    return Film(file, *size, factor, float(head["fps"]), float(head["duration"]), _focal(file))
+
+
+def first_frame(film: Film) -> Tensor:
+    """The first frame, dtype uint8, shape (H, W, 3)."""
+    with closing(_frames(film.path, scaled(film.width, film.height))) as frames:
+        head, frame = next_of(frames, film.path), next_of(frames, film.path)
+        return torch.frombuffer(bytearray(frame), dtype=torch.uint8).reshape(*head["size"][::-1], 3)
+
+
+def pixels_of_focal(millimetres: float, width: int, height: int) -> float:
+    """Focal length in pixels of one that is equivalent to so many mm on 35 mm film.
+
+    Example:
+        >>> round(pixels_of_focal(43.27, 300, 400))
+        500
+    """
+    return millimetres * math.hypot(width, height) / DIAGONAL
+
+
+def begins_to_move(film: Film, where: Tensor) -> float | None:
+    """Time of the first frame that differs from the first one where the object is [s]; None if there is none.
+
+    Args:
+        film: The film; the object is at rest in its first frame. Brighter and darker frames do not count as motion.
+        where: The opacity of the object in the first frame, shape (H, W).
+    """
+    factor = max(1.0, max(film.width, film.height) / SMALL)
+    size = round(film.width / factor), round(film.height / factor)
+    first: Tensor | None = None
+    with closing(_frames(film.path, scaled(*size), grey=True)) as frames:
+        width, height = next_of(frames, film.path)["size"]
+        mask = torch.nn.functional.interpolate(where[None, None].float(), size=(height, width), mode="area")[0, 0] > 0.3
+        if not bool(mask.any()):
+            mask = torch.ones_like(mask)
+        number = 0
+        while (frame := next_of(frames, film.path)) is not None:
+            grey = torch.frombuffer(bytearray(frame), dtype=torch.uint8).reshape(height, width)[mask].float()
+            if first is None:
+                first = grey
+            level = grey * (first.mean() / grey.mean().clamp(min=1.0))
+            if float(((level - first).abs() > DIFFERENT).float().mean()) > MOVED:
+                return number / film.fps
+            number += 1
+    return None
+
+
+def _frames(path: Path, options: list[str], grey: bool = False) -> Generator[Any, None, None]:
+    from imageio_ffmpeg import read_frames
+
+    kind = {"pix_fmt": "gray", "bits_per_pixel": 8} if grey else {}
+    found: Generator[Any, None, None] = read_frames(
+        path, input_params=["-max_pixels", str(MOST_PIXELS)], output_params=options, **kind
+    )
+    return found
+
+
+def _focal(path: Path) -> float | None:
+    """The focal length among the tags of a film, as phones write it [mm on 35 mm film]."""
+    from imageio_ffmpeg import get_ffmpeg_exe
+
+    told = subprocess.run(
+        [get_ffmpeg_exe(), "-hide_banner", "-i", str(path)], capture_output=True, stdin=subprocess.DEVNULL, check=False
+    )
+    found = _FOCAL.search(told.stderr.decode(errors="replace"))
+    value = float(found[1]) if found else 0.0
+    return value if 5 <= value <= 1000 else None
+
+
+__all__ = ["Film", "begins_to_move", "first_frame", "open_film", "pixels_of_focal"]

@@ -1,0 +1,84 @@
+"""The page of a fit: the film beside the fit, the values, and what speaks against them, in one .html file."""
+
+from __future__ import annotations
+
+import base64
+import html
+import io
+from collections.abc import Sequence
+from pathlib import Path
+
+from gaussian_swaying._files import write_text
+from gaussian_swaying.fitting.report import Result
+
+_STYLE = """
+body { font: 16px/1.5 system-ui, sans-serif; margin: 2em auto; max-width: 70em; padding: 0 1em; color: #222; }
+table { border-collapse: collapse; } td, th { padding: .2em .8em; text-align: right; border-bottom: 1px solid #ddd; }
+td:first-child, th:first-child { text-align: left; } video, img { max-width: 100%; border: 1px solid #ddd; } video { max-height: 85vh; }
+.good { color: #06752e; } .doubtful { color: #9a6200; } .failed { color: #b00020; }
+"""
+_SLOW = "for (const film of document.querySelectorAll('video')) film.playbackRate = 0.5;"
+
+
+def write_page(target: Path, name: str, result: Result, films: Sequence[Path], pictures: Sequence[Path]) -> None:
+    """Write the page.
+
+    Args:
+        target: The .html file.
+        name: Its title.
+        result: The fit.
+        films: The film beside the fit of each camera (.mp4).
+        pictures: Further pictures (.png), shown below with their names.
+    """
+    failed, doubtful = result.doubts()
+    rows = "".join(
+        f"<tr><td>{html.escape(row['name'])}</td><td>{row['value']:.5g}</td><td>± {row['standard_error']:.2g}</td>"
+        f"<td>{html.escape(row['unit'])}</td><td>{row['low']:g} to {row['high']:g}</td></tr>"
+        for row in result.rows()
+    )
+    shown = "".join(
+        f'<video src="data:video/mp4;base64,{_packed(film.read_bytes())}" autoplay loop muted controls></video>'
+        for film in films
+    )
+    below = "".join(f"<h3>{html.escape(_title(one))}</h3>{_picture(one)}" for one in pictures)
+    text = f"""<!doctype html>
+<html lang="en"><meta charset="utf-8"><title>{html.escape(name)}</title><style>{_STYLE}</style>
+<h1>{html.escape(name)}</h1>
+<p class="{result.verdict}"><b>This fit {"has failed" if failed else f"is {result.verdict}"}.</b></p>
+{_list([*failed, *doubtful])}
+{_list(result.seen)}
+<table><tr><th></th><th>value</th><th>standard error</th><th></th><th>range</th></tr>{rows}</table>
+{_list(result.assumed)}
+<h2>The film beside the fit</h2>
+<p>At half speed. What is called predicted was not fitted.</p>
+{shown}
+<h2>Pictures</h2>
+{below}
+<script>{_SLOW}</script></html>
+"""
+    write_text(target, text)
+
+
+def _list(sentences: Sequence[str]) -> str:
+    return "<ul>" + "".join(f"<li>{html.escape(one)}</li>" for one in sentences) + "</ul>" if sentences else ""
+
+
+def _title(picture: Path) -> str:
+    kind, _, camera = picture.stem.partition("_")
+    titles = {"rest": "Before the fit: the scene at rest", "tracks": "Before the fit: points that are followed"}
+    return f"{titles[kind]}, camera {camera}" if kind in titles else f"Film, fit and difference, camera {picture.stem}"
+
+
+def _picture(path: Path) -> str:
+    from PIL import Image
+
+    data = io.BytesIO()
+    Image.open(path).convert("RGB").save(data, format="JPEG", quality=88)
+    return f'<img src="data:image/jpeg;base64,{_packed(data.getvalue())}" alt="{html.escape(path.stem)}">'
+
+
+def _packed(data: bytes) -> str:
+    return base64.b64encode(data).decode("ascii")
+
+
+__all__ = ["write_page"]

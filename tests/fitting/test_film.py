@@ -1,0 +1,77 @@
+"""What a film says before it is fitted."""
+
+import subprocess
+
+import imageio_ffmpeg
+import numpy as np
+import pytest
+import torch
+
+from gaussian_swaying.fitting import film as films
+from gaussian_swaying.fitting.film import begins_to_move, first_frame, open_film
+from gaussian_swaying.recording.video import VideoEncoder
+
+
+def _film(path, frames, rate=25):
+    encoder = VideoEncoder(path, rate)
+    for frame in frames:
+        encoder.write(frame)
+    encoder.finish()
+    return path
+
+
+def _square(left, light=1.0, noise=0.0, size=(96, 160)):
+    """A striped square on grey, at a place."""
+    picture = np.full((*size, 3), 90.0)
+    stripes = 60 + 120 * (np.arange(40) // 4 % 2)
+    picture[30:70, left : left + 40] = stripes[None, :, None]
+    picture = picture * light + noise * np.random.default_rng(int(left * 7 + 100 * light)).standard_normal(
+        picture.shape
+    )
+    return picture.clip(0, 255).astype(np.uint8)
+
+
+def _where():
+    where = torch.zeros(96, 160)
+    where[30:70, 60:100] = 1.0
+    return where
+
+
+def test_the_time_at_which_it_moves(tmp_path):
+    """Noise and a brighter light are no motion."""
+    still = [_square(60, 1.0 + 0.02 * (k % 3), 3.0) for k in range(20)]
+    moving = [_square(60 + 2 * k, 1.0, 3.0) for k in range(1, 10)]
+    path = _film(tmp_path / "a.mp4", still + moving)
+    assert begins_to_move(open_film(path), _where()) == pytest.approx(0.8, abs=0.05)
+    assert begins_to_move(open_film(_film(tmp_path / "b.mp4", still)), _where()) is None
+
+
+def test_what_moves_beside_the_object_does_not_count(tmp_path):
+    frames = [_square(60) for _ in range(20)]
+    for k, frame in enumerate(frames):
+        frame[80:96, 4 * k : 4 * k + 10] = 255
+    assert begins_to_move(open_film(_film(tmp_path / "a.mp4", frames)), _where()) is None
+
+
+def test_a_large_film_is_read_in_reduced_size(tmp_path, monkeypatch):
+    monkeypatch.setattr(films, "SIDE", 80)
+    film = open_film(_film(tmp_path / "a.mp4", [_square(60)] * 5))
+    assert (film.width, film.height, film.full, film.fps) == (80, 48, 2.0, 25.0)
+    frame = first_frame(film)
+    assert frame.shape == (48, 80, 3)
+    assert float(frame[5, 5].float().mean()) == pytest.approx(90, abs=4)
+
+
+def test_the_focal_length_of_a_phone(tmp_path):
+    path = _film(tmp_path / "a.mp4", [_square(60)] * 3)
+    assert open_film(path).focal is None
+    tag = "com.apple.quicktime.camera.focal_length.35mm_equivalent=26"
+    command = [imageio_ffmpeg.get_ffmpeg_exe(), "-i", str(path), "-c", "copy", "-movflags", "use_metadata_tags"]
+    subprocess.run([*command, "-metadata", tag, str(tmp_path / "b.mp4")], check=True, capture_output=True)
+    assert open_film(tmp_path / "b.mp4").focal == 26.0
+
+
+def test_no_film(tmp_path):
+    (tmp_path / "a.mp4").write_bytes(b"no film")
+    with pytest.raises(ValueError, match=r"a\.mp4 cannot be read"):
+        open_film(tmp_path / "a.mp4")
