@@ -40,7 +40,7 @@ OBJECT = "object"
 
 @dataclass(frozen=True)
 class Seen:
-    """What the first frame shows: film, frame, splat, camera, and the picture of the splat from there."""
+    """The first frame and what it shows: film, frame, splat, camera, and the picture of the splat from there."""
 
     film: Film
     frame: Tensor
@@ -269,7 +269,7 @@ search: 48                      # simulations of the coarse search
 
 
 def _guesses(preview: Preview, options: argparse.Namespace, length: Any) -> list[str]:
-    """What the preview guessed, as lines."""
+    """The guesses of the preview, as lines."""
     guess = preview.data["suggestion"]
     hold = guess["hold"]
     lines = [

@@ -1,4 +1,4 @@
-"""What a film says before it is fitted: its size, rate and focal length, its first frame, and when it begins to move.
+"""A film before it is fitted: its size, rate and focal length, its first frame, and when it begins to move.
 
 Frames are read one by one in reduced size, so memory does not grow with the film.
 """

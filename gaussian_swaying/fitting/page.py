@@ -14,7 +14,8 @@ from gaussian_swaying.fitting.report import Result
 _STYLE = """
 body { font: 16px/1.5 system-ui, sans-serif; margin: 2em auto; max-width: 70em; padding: 0 1em; color: #222; }
 table { border-collapse: collapse; } td, th { padding: .2em .8em; text-align: right; border-bottom: 1px solid #ddd; }
-td:first-child, th:first-child { text-align: left; } video, img { max-width: 100%; border: 1px solid #ddd; } video { max-height: 85vh; }
+td:first-child, th:first-child { text-align: left; } video, img { max-width: 100%; border: 1px solid #ddd; }
+video { max-height: 85vh; }
 .good { color: #06752e; } .doubtful { color: #9a6200; } .failed { color: #b00020; }
 """
 _SLOW = "for (const film of document.querySelectorAll('video')) film.playbackRate = 0.5;"

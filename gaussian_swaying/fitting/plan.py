@@ -21,7 +21,7 @@ STAGES = ("tracks", "silhouettes", "matches", "pixels")
 """Stages of a fit, in this order: tracks from frame to frame; silhouettes; Gaussians matched from rendered frames to
 frames of the video, three rounds; colours."""
 ASSUMED = ("length", "mass")
-"""What a base may contain that nobody measured."""
+"""Things in a base that nobody measured, perhaps."""
 
 
 @dataclass(frozen=True)

@@ -327,7 +327,7 @@ def scene_text(values: Mapping[str, float], parser: ArgumentParser, settings: Na
 def consequences(
     assumed: Sequence[str], values: Mapping[str, float], simulation: Simulation, gravity: Sequence[float]
 ) -> list[str]:
-    """What follows for the values from what was only assumed, as sentences.
+    """Sentences on what follows for the values from what was only assumed.
 
     Args:
         assumed: ``length`` or ``mass``, or both.
@@ -359,7 +359,7 @@ def consequences(
 
 
 def wind_seen(values: Mapping[str, float], videos: Sequence[Footage], simulation: Simulation) -> list[str]:
-    """Where the wind blows in the picture of each camera, as sentences; none if no direction was sought."""
+    """Sentences on where the wind blows in the picture of each camera; none if no direction was sought."""
     if not {"wind.azimuth", "wind.elevation"} & set(values):
         return []
     start = simulation.wind.flows[0].tolist()  # type: ignore[index]

@@ -1,4 +1,4 @@
-"""What a film says before it is fitted."""
+"""Size, focal length and first frame of a film, and the time at which it begins to move."""
 
 import subprocess
 

@@ -12,7 +12,7 @@ import pytest
 import torch
 from small_scenes import plain_cloud, together
 
-from gaussian_swaying.cli.preview import _joined, build_options
+from gaussian_swaying.cli.preview import joined, build_options
 from gaussian_swaying.preview.hold import guess_hold, hanging_cord
 from gaussian_swaying.preview.report import doubts, preview_command
 from gaussian_swaying.preview.suggest import CELLS, suggest, visible_weight
@@ -218,7 +218,7 @@ def test_weak_guesses_print_the_commands_of_both():
     found = suggest(splat(ball([0.0, 0.0, 0.0], 1.0), move=AWAY))
     lines = doubts(found, options, defaults)
     commands = [shlex.split(line.partition("#")[0]) for line in lines if "python" in line]
-    told = [build_options().parse_args(_joined(command[2:])) for command in commands]
+    told = [build_options().parse_args(joined(command[2:])) for command in commands]
     assert {told[0].up[0], told[1].up[0]} == {"+z", "-y"}
     assert [again.hold for again in told] == [None, None, "bottom", "top"]
     for again in told:
