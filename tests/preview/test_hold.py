@@ -12,7 +12,7 @@ import pytest
 import torch
 from small_scenes import plain_cloud, together
 
-from gaussian_swaying.cli.preview import joined, build_options
+from gaussian_swaying.cli.preview import build_options, joined
 from gaussian_swaying.preview.hold import guess_hold, hanging_cord
 from gaussian_swaying.preview.report import doubts, preview_command
 from gaussian_swaying.preview.suggest import CELLS, suggest, visible_weight
