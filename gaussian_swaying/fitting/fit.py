@@ -39,6 +39,7 @@ from gaussian_swaying.fitting.least_squares import (
     unsettled,
 )
 from gaussian_swaying.fitting.plan import Plan, parse_base, read_unknown
+from gaussian_swaying.fitting.prepared import Judged, prepared
 from gaussian_swaying.fitting.report import BEFORE, Result, consequences, predictions, wind_seen, write_results
 from gaussian_swaying.fitting.tracks import Tracks, match, opencv, still_until, track
 from gaussian_swaying.fitting.unknowns import FILM_START, check_unknowns
@@ -112,16 +113,23 @@ class Fit:
         videos: From :func:`~gaussian_swaying.fitting.videos.read_videos`.
         plan: The unknowns, and how to find them.
         say: Called with a line for each thing that is done.
+        judged: What the background said of the videos, see :func:`~gaussian_swaying.fitting.prepared.prepared`.
 
     Raises:
         ValueError: If the plan does not fit the simulation or the videos.
     """
 
     def __init__(
-        self, simulation: Simulation, videos: Sequence[Footage], plan: Plan, say: Say = lambda line: None
+        self,
+        simulation: Simulation,
+        videos: Sequence[Footage],
+        plan: Plan,
+        say: Say = lambda line: None,
+        judged: Sequence[Judged] = (),
     ) -> None:
         check_unknowns(simulation, plan.unknowns)
         self.simulation, self.videos, self.plan, self.say = simulation, list(videos), plan, say
+        self.judged = tuple(judged)
         self.times = frame_times(videos)
         fitted = max(3, round(plan.fit_share * len(self.times)))
         if plan.until is not None:
@@ -323,6 +331,7 @@ class Fit:
             unsettled(normal, place, self.plan.unknowns, course.ended),
             tuple(self.notes()),
             {} if followed is None else followed.shares(),
+            judged=self.judged,
         )
 
     def _normal(self, place: Tensor, evidence: Sequence[Evidence], times: Sequence[float]) -> Normal:
@@ -333,7 +342,7 @@ class Fit:
         """Sentences on what speaks against the plan in the videos: a film that is still, without such an unknown."""
         if FILM_START in (u.name for u in self.plan.unknowns) or not self.followed:
             return []
-        still = min(still_until(own, v.times) for own, v in zip(self.tracks, self.videos, strict=True))
+        still = min(still_until(self.simulation, v, own) for v, own in zip(self.videos, self.tracks, strict=True))
         if still < LONG_STILL:
             return []
         return [
@@ -484,7 +493,9 @@ def _ready(plan: Plan, parser: Any, settings: Any, device: str, progress: bool) 
         if progress:
             print(f"[{time.monotonic() - begin:6.0f} s] {line}", file=sys.stderr, flush=True)
 
-    return Fit(simulation, read_videos(list(plan.videos), plan.cameras), plan, say)
+    videos = read_videos(list(plan.videos), plan.cameras)
+    videos, judged = prepared(simulation, videos, plan.hand_held, plan.also_moves, say)
+    return Fit(simulation, videos, plan, say, judged)
 
 
 def fit(

@@ -43,6 +43,8 @@ class Plan:
         seed: Seed of the coarse search.
         cameras: Names of the cameras that are used; None for all.
         assumed: What nobody measured, of :data:`ASSUMED`; the result says what follows.
+        hand_held: Whether the cameras move otherwise than the videos say; None if their background is to tell.
+        also_moves: Names of parts of the splat that move in the videos, though the simulation does not move them.
     """
 
     base: Sequence[str]
@@ -59,6 +61,8 @@ class Plan:
     seed: int = 0
     cameras: Sequence[str] | None = None
     assumed: Sequence[str] = ()
+    hand_held: bool | None = None
+    also_moves: Sequence[str] = ()
 
     def __post_init__(self) -> None:
         for name in self.stages:
@@ -104,12 +108,14 @@ def read_plan(path: str | os.PathLike[str], find: Callable[[str], str] = str) ->
             f"Expected `known` in {file} to have options of `sim` as names (material.E), but got {known!r:.60}."
         )
     settings = {name: given[name] for name in names[4:] if given.get(name) is not None}
-    for name in ("stages", "cameras", "assumed"):
+    for name in ("stages", "cameras", "assumed", "also_moves"):
         if name in settings:
             settings[name] = _names(file, name, settings[name])
     for name in ("fit_share", "until", "limit"):
         if name in settings and (isinstance(settings[name], bool) or not isinstance(settings[name], int | float)):
             raise ValueError(f"Expected `{name}` in {file} to be a number, but got {settings[name]!r}.")
+    if not isinstance(settings.get("hand_held", True), bool):
+        raise ValueError(f"Expected `hand_held` in {file} to be true or false, but got {settings['hand_held']!r}.")
     base = [_beside(file, name) or find(name) for name in _names(file, "base", given.get("base"))]
     import_forces(base)
     return Plan(

@@ -17,7 +17,7 @@ import torch
 from torch import Tensor
 
 from gaussian_swaying._checks import check_whole
-from gaussian_swaying.fitting.tracks import follow, opencv
+from gaussian_swaying.fitting.tracks import follow, opencv, window_of
 from gaussian_swaying.rendering.cameras.camera import Camera, look_at_camera
 from gaussian_swaying.rendering.protocol import RenderOutput
 
@@ -44,12 +44,15 @@ class Registration:
         matches: Points that were matched at the end.
         agreeing: Those that agree on the camera.
         residual: Root mean square of their distances [pixels].
+        spread: Covariance of a small rotation of the camera's axes [rad], and of a shift along them [scene units],
+            float64, shape (6, 6). Points nearer than the window in which they are followed count as one.
     """
 
     camera: Camera
     matches: int
     agreeing: int
     residual: float
+    spread: Tensor
 
 
 def cameras_around(
@@ -109,10 +112,10 @@ def register(
     height, width = frame.shape[:2]
     if not start or any((camera.width, camera.height) != (width, height) for camera in start):
         raise ValueError(f"Expected `start` to be cameras of the frame's size, {width} x {height}.")
-    grey = _grey(frame)
+    grey = grey_of(frame)
     sift = cv2.SIFT_create(nfeatures=4000, contrastThreshold=0.02)
     wanted = sift.detectAndCompute(grey, None)
-    best: _Found | None = None
+    best: Registration | None = None
     for camera in start:
         found = _by_features(cv2, sift, wanted, draw(camera), camera, focal=False)
         if found is not None and (best is None or found.agreeing > best.agreeing):
@@ -126,19 +129,26 @@ def register(
         best = _by_features(cv2, sift, wanted, draw(best.camera), best.camera, focal) or best
     for _ in range(ROUNDS if best.agreeing < ENOUGH else 0):
         best = _by_flow(cv2, grey, draw(best.camera), best.camera, focal) or best
-    return Registration(best.camera, best.matches, best.agreeing, best.residual)
+    return best
 
 
-@dataclass(frozen=True, eq=False)
-class _Found:
-    camera: Camera
-    matches: int
-    agreeing: int
-    residual: float
+def refine(frame: Tensor, picture: RenderOutput, camera: Camera, where: Tensor) -> Registration | None:
+    """The camera of a frame, from points that are followed there from a picture taken nearby.
+
+    Args:
+        frame: The frame, dtype uint8, shape (H, W, 3).
+        picture: The splat, drawn from ``camera``.
+        camera: A camera so near that most points move by less than some 20 pixels.
+        where: The pixels of the picture that count, bool, shape (H, W).
+
+    Returns:
+        None if too few points agree.
+    """
+    return _by_flow(opencv(), grey_of(frame), picture, camera, False, where)
 
 
-def _grey(image: Tensor) -> Any:
-    """An image of bytes or of colours in [0, 1] as grey bytes whose contrast is the same everywhere."""
+def grey_of(image: Tensor) -> Any:
+    """An image of bytes or of colours in [0, 1], (H, W, 3), as grey bytes whose contrast is the same everywhere."""
     whole = image.float() if image.dtype == torch.uint8 else image.detach().float().cpu().clamp(0, 1) * 255
     grey = whole @ torch.tensor([0.299, 0.587, 0.114])
     equal = opencv().createCLAHE(clipLimit=3.0, tileGridSize=(8, 8))  # takes what another light changes
@@ -167,12 +177,12 @@ def _in_space(picture: RenderOutput, camera: Camera, pixel: Any) -> tuple[Any, A
 
 def _by_features(
     cv2: Any, sift: Any, wanted: tuple[Any, Any], picture: RenderOutput, camera: Camera, focal: bool
-) -> _Found | None:
+) -> Registration | None:
     """The camera from matched features; None if too few agree."""
     import numpy as np
 
     mask = (picture.alpha[..., 0].detach().cpu().numpy() > SOLID).astype(np.uint8)
-    points, codes = sift.detectAndCompute(_grey(picture.color), mask)
+    points, codes = sift.detectAndCompute(grey_of(picture.color), mask)
     if codes is None or wanted[1] is None or len(points) < LEAST or len(wanted[0]) < LEAST:
         return None
     pairs = cv2.BFMatcher().knnMatch(codes, wanted[1], k=2)
@@ -184,12 +194,16 @@ def _by_features(
     return _pose(cv2, picture, camera, here, there, focal, NEAR * math.hypot(camera.width, camera.height))
 
 
-def _by_flow(cv2: Any, grey: Any, picture: RenderOutput, camera: Camera, focal: bool) -> _Found | None:
+def _by_flow(
+    cv2: Any, grey: Any, picture: RenderOutput, camera: Camera, focal: bool, where: Tensor | None = None
+) -> Registration | None:
     """The camera from points that are followed from the picture to the frame; None if too few are."""
     import numpy as np
 
-    drawn = _grey(picture.color)
-    mask = cv2.erode((picture.alpha[..., 0].detach().cpu().numpy() > SOLID).astype(np.uint8), np.ones((5, 5), np.uint8))
+    drawn = grey_of(picture.color)
+    solid = picture.alpha[..., 0].detach().cpu().numpy() > SOLID
+    solid = solid if where is None else solid & where.numpy()
+    mask = cv2.erode(solid.astype(np.uint8), np.ones((5, 5), np.uint8))
     corners = cv2.goodFeaturesToTrack(drawn, 1000, 0.005, 3, mask=mask)
     if corners is None or len(corners) < LEAST:
         return None
@@ -201,7 +215,7 @@ def _by_flow(cv2: Any, grey: Any, picture: RenderOutput, camera: Camera, focal: 
 
 def _pose(
     cv2: Any, picture: RenderOutput, camera: Camera, here: Any, there: Any, focal: bool, near: float
-) -> _Found | None:
+) -> Registration | None:
     """The camera that sees what the picture shows at ``here`` at ``there``; None if too few pairs agree."""
     import numpy as np
 
@@ -227,7 +241,24 @@ def _pose(
     view = np.eye(4)
     view[:3, :3], view[:3, 3] = cv2.Rodrigues(turn)[0], shift.reshape(3)
     seen = replace(camera, world_to_camera=torch.from_numpy(view), intrinsics=torch.from_numpy(np.asarray(K, float)))
-    return _Found(seen, len(world), len(index), float(np.sqrt((off**2).sum(1).mean())))
+    residual = float(np.sqrt((off**2).sum(1).mean()))
+    spread = _spread(world[index], there[index], seen, residual)
+    return Registration(seen, len(world), len(index), residual, spread)
 
 
-__all__ = ["Registration", "cameras_around", "register"]
+def _spread(world: Any, there: Any, camera: Camera, residual: float) -> Tensor:
+    """Covariance of a camera (6, 6), from the points (N, 3) that it sees at ``there`` (N, 2), off by ``residual``."""
+    view, K = camera.world_to_camera, camera.intrinsics
+    local = torch.from_numpy(world) @ view[:3, :3].T + view[:3, 3]
+    x, y, z = local.unbind(1)
+    zero = torch.zeros_like(z)
+    by_place = torch.stack([K[0, 0] / z, zero, -K[0, 0] * x / z**2, zero, K[1, 1] / z, -K[1, 1] * y / z**2], 1)
+    by_place = by_place.unflatten(1, (2, 3))
+    by_turn = torch.linalg.cross(local[:, None].expand_as(by_place), by_place)
+    slope = torch.cat([by_turn, by_place], 2).flatten(0, 1)
+    apart = len(set(map(tuple, (there // window_of(camera.width, camera.height)).astype(int).tolist())))
+    variance = 0.5 * residual**2 * len(world) / apart
+    return variance * torch.linalg.pinv(slope.T @ slope, hermitian=True)
+
+
+__all__ = ["Registration", "cameras_around", "grey_of", "refine", "register"]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -15,6 +15,7 @@ from gaussian_swaying._files import write_json, write_table, write_text
 from gaussian_swaying.config.parser import config_text
 from gaussian_swaying.fitting.before import titled
 from gaussian_swaying.fitting.identifiability import Direction
+from gaussian_swaying.fitting.prepared import Judged
 from gaussian_swaying.fitting.unknowns import Unknown, of_simulation
 from gaussian_swaying.fitting.videos import Footage
 from gaussian_swaying.gaussians.model import DeformedGaussians
@@ -76,6 +77,7 @@ class Result:
             explains: 1 - (sum of squared distances) / (sum of squared displacements). Without tracks it is empty.
         assumed: What the values rest on that nobody measured, as sentences.
         seen: Where the wind blows, as each camera sees it, as sentences.
+        judged: What the background says of the video of each camera; nothing without one.
     """
 
     unknowns: Sequence[Unknown]
@@ -90,6 +92,7 @@ class Result:
     followed: Mapping[str, float] = field(default_factory=dict)
     assumed: Sequence[str] = ()
     seen: Sequence[str] = ()
+    judged: Sequence[Judged] = ()
 
     @property
     def values(self) -> dict[str, float]:
@@ -121,7 +124,7 @@ class Result:
     def doubts(self) -> tuple[list[str], list[str]]:
         """Reasons for which the fit has failed, and for which it is doubtful, as sentences with a remedy."""
         failed: list[str] = []
-        doubtful = list(self.notes)
+        doubtful = [*self.notes, *(doubt for one in self.judged for doubt in one.doubts())]
         for name, share in self.followed.items():
             told = (
                 f"camera {name}: the simulation explains {max(share, 0):.0%} of the motion of its tracks. Raise "
@@ -175,6 +178,7 @@ class Result:
             told = "" if math.isnan(one.predicted) else f", predicted frames {one.predicted:.2f} dB"
             lines.append(f"camera {one.camera}: fitted frames {one.fitted:.2f} dB{told}")
         lines += self.seen
+        lines += [sentence for one in self.judged for sentence in one.sentences()]
         failed, doubtful = self.doubts()
         said = {"good": "This fit is good.", "doubtful": "This fit is doubtful:", "failed": "This fit has failed:"}
         lines += [said[self.verdict], *failed, *doubtful]
@@ -301,6 +305,7 @@ def write_results(
             "motion_explained": dict(result.followed),
             "notes": list(result.notes),
             "assumed": list(result.assumed),
+            "background": [asdict(one) for one in result.judged],
             "not_settled": result.unsettled,
             "not_followed": result.astray,
             "not_determined": result.vague,

@@ -74,19 +74,24 @@ def track(simulation: Simulation, video: Footage, most: int = 400) -> Tracks:
     return Tracks(chosen, torch.from_numpy(position), torch.from_numpy(seen))
 
 
-def still_until(tracks: Tracks, times: Sequence[float]) -> float:
+def still_until(simulation: Simulation, video: Footage, tracks: Tracks) -> float:
     """Time of the last frame before what is followed begins to move [s]; 0 if it moves in the first frames.
 
-    A point has moved if it is more than :data:`STILL` from its first place. A quarter of the points has to.
+    A point has moved if it is more than :data:`STILL` from where the camera of the frame would see it if it had stayed.
+    A quarter of the points has to.
 
     Args:
-        tracks: Tracks of a video.
-        times: Its times.
+        simulation: The scene.
+        video: The video.
+        tracks: Its tracks.
     """
-    moved = (tracks.position - tracks.position[:1]).norm(dim=-1)
+    scene = simulation.scene
+    means = scene.model.means.detach()[scene.moving[tracks.index.to(scene.moving.device)]]
+    off = tracks.position - torch.stack([project(means, camera)[0] for camera in video.cameras])
+    moved = (off - off[:1]).norm(dim=-1)
     moved = torch.where(tracks.seen, moved, torch.nan).nanquantile(0.75, dim=1)
     begun = (moved > STILL).nonzero()[:, 0]
-    return float(times[max(int(begun[0]) - 1, 0)]) if len(begun) else 0.0
+    return float(video.times[max(int(begun[0]) - 1, 0)]) if len(begun) else 0.0
 
 
 def match(simulation: Simulation, video: Footage, states: Sequence[State], most: int = 400) -> Tracks:

@@ -47,7 +47,7 @@ def write_video(
                     "mask_path": f"{stem}_mask.png",
                     "camera": name,
                     "time": frame.index * simulation.frame_dt,
-                    "transform_matrix": _opengl(camera).tolist(),
+                    "transform_matrix": opengl(camera).tolist(),
                     "fl_x": float(camera.intrinsics[0, 0]),
                     "fl_y": float(camera.intrinsics[1, 1]),
                     "cx": float(camera.intrinsics[0, 2]),
@@ -63,9 +63,9 @@ def _bytes(picture: Tensor):  # type: ignore[no-untyped-def]
     return picture.round().clamp(0, 255).to(torch.uint8).numpy()
 
 
-def _opengl(camera: Camera) -> Tensor:
+def opengl(camera: Camera) -> Tensor:
     """Camera-to-world matrix with OpenGL axes."""
     return torch.linalg.inv(camera.world_to_camera.cpu().double()) * torch.tensor([1.0, -1.0, -1.0, 1.0])
 
 
-__all__ = ["write_video"]
+__all__ = ["opengl", "write_video"]

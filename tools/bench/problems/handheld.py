@@ -1,0 +1,156 @@
+"""A flag in front of walls, filmed by a hand that shakes, with exposure and white balance that drift, as H.264."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import torch
+import yaml
+from torch import Tensor
+
+from bench.problems.films import opengl
+from bench.record import Row
+from gaussian_swaying.gaussians.ply import write_ply
+from gaussian_swaying.geometry.rotations import rotation_of
+from gaussian_swaying.rendering.cameras.camera import Camera, look_at_camera
+from gaussian_swaying.scenes.procedural import FlagScene, both
+from gaussian_swaying.simulation.simulation import Simulation
+
+TRUTH: Row = {"flow": [4.0, 3.0, 0.0], "material.E": 1e4}
+FPS = 30
+MIDDLE = (0.2, 0.05, 0.15)
+"""The point at which the hand aims [m]."""
+
+
+def write_base(folder: Path, spacing: float = 0.025, wall: float = 0.02, film: str = "film") -> Path:
+    """Write the splat of a flag before two walls, ``room.ply``, and the configuration of its simulation.
+
+    Args:
+        folder: Where to write.
+        spacing: Distance between the Gaussians of the flag [m].
+        wall: The same of the walls; not finite for none.
+        film: The folder of the film.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    cloud = FlagScene(0.4, 0.3, spacing, ripple=0.01, pattern="printed").generate()
+    if math.isfinite(wall):
+        back = FlagScene(2.4, 1.6, wall, ripple=0.05, pattern="printed").generate()
+        side = FlagScene(0.5, 1.6, wall, ripple=0.03, pattern="printed", yaw=65).generate()
+        for part, shift in ((back, (-0.9, 0.6, -0.7)), (side, (0.75, 0.1, -0.7))):
+            cloud = both(cloud, replace(part, means=part.means + torch.tensor(shift)))
+    write_ply(folder / "room.ply", cloud)
+    sheet = {"class_path": "Box", "init_args": {"min": [None, -0.06, None], "max": [0.5, 0.06, None]}}
+    pole = {"class_path": "Box", "init_args": {"min": [None] * 3, "max": [0.06, None, None]}}
+    settings = {
+        "frame_dt": 1 / FPS,
+        "scene": {"ply": str(folder / "room.ply"), "region": sheet, "area": "coverage", "metres_per_unit": 1.0},
+        "material": {"E": TRUTH["material.E"], "nu": 0.3, "density": 25.0, "thickness": 0.01},
+        "solver": {
+            "dx": 0.1,
+            "boundaries": [{"class_path": "PinnedRegion", "init_args": {"kind": None, "region": pole}}],
+        },
+        "wind": {"flow": TRUTH["flow"]},
+        "aero": {"C_D": 0.1, "C_F": 0.3, "C_L": 0.005},
+    }
+    (folder / "base.yaml").write_text(yaml.safe_dump(settings), encoding="utf-8")
+    return folder / "base.yaml"
+
+
+def tripod(width: int, height: int) -> Camera:
+    """The camera of the first frame, without shake."""
+    return look_at_camera((0.05, -0.95, 0.35), MIDDLE, (0, 0, 1), 38.0, width, height, dtype=torch.float64)
+
+
+def shaken(camera: Camera, frames: int, degrees: float, seed: int = 0) -> list[Camera]:
+    """The camera in a hand: it turns by as many degrees (root mean square) and moves by a hundredth of the distance.
+
+    Each of six numbers is a sum of waves of 0.4 to 2 Hz, as a hand sways, and one of 9 Hz, a tenth as large, as it
+    trembles.
+
+    Args:
+        camera: The camera without shake, which the first frame has.
+        frames: Number of frames, :data:`FPS` a second.
+        degrees: How much it turns.
+        seed: Of the phases.
+    """
+    generator = torch.Generator().manual_seed(seed)
+    time = torch.arange(frames, dtype=torch.float64) / FPS
+    phase = 2 * math.pi * torch.rand(5, 6, generator=generator, dtype=torch.float64)
+    waves = zip((0.4, 0.8, 1.3, 2.0, 9.0), (1.0, 0.7, 0.5, 0.35, 0.1), strict=True)
+    own = sum(size * torch.sin(2 * math.pi * hz * time[:, None] + phase[n]) for n, (hz, size) in enumerate(waves))
+    assert isinstance(own, Tensor)
+    own = own - own[:1]
+    distance = float((camera.position - torch.tensor(MIDDLE, dtype=torch.float64)).norm())
+    turn, shift = (part / part.square().sum(1).mean().sqrt() for part in own.split(3, 1))
+    turned = rotation_of(math.radians(degrees) * turn)
+    found = []
+    for k in range(frames):
+        view = camera.world_to_camera.clone()
+        view[:3] = turned[k] @ view[:3]
+        view[:3, 3] += 0.01 * degrees * distance * shift[k]
+        found.append(replace(camera, world_to_camera=view))
+    return found
+
+
+def drift(frames: int) -> Tensor:
+    """Gains of red, green and blue in each frame, as a phone changes them: darker by a quarter, and warmer; (F, 3)."""
+    way = torch.linspace(0, 1, frames, dtype=torch.float64)[:, None]
+    ripple = 0.02 * torch.sin(2 * math.pi * 4 * way)
+    return 1 + way * torch.tensor([-0.15, -0.25, -0.35], dtype=torch.float64) + ripple
+
+
+def write_film(
+    simulation: Simulation, folder: Path, cameras: Sequence[Camera], gains: Tensor | None = None, crf: int = 28
+) -> None:
+    """Simulate, and write what a moving camera sees as ``film.mp4`` with the camera of its first frame alone.
+
+    Args:
+        simulation: The simulation; frames are ``frame_dt`` apart.
+        folder: Where to write.
+        cameras: The camera of each frame.
+        gains: Of each frame and colour, shape (F, 3); ones if None.
+        crf: Compression of H.264; 28 is that of small files.
+    """
+    from imageio_ffmpeg import write_frames
+
+    folder.mkdir(parents=True, exist_ok=True)
+    first, painter = cameras[0], simulation.painter
+    generator = torch.Generator().manual_seed(0)
+    film = write_frames(
+        str(folder / "film.mp4"),
+        (first.width, first.height),
+        fps=1 / simulation.frame_dt,
+        macro_block_size=2,
+        quality=None,
+        output_params=["-crf", str(crf)],
+    )
+    film.send(None)
+    for frame in simulation.frames(len(cameras)):
+        gaussians = painter.deformed(frame.state)
+        own = cameras[frame.index].to(painter.device, torch.float32)
+        colour = painter.draw(gaussians, painter.colors(gaussians, own), own).color.cpu().double()
+        colour = colour * (1 if gains is None else gains[frame.index])
+        colour = 255 * colour + 2.0 * torch.randn(colour.shape, generator=generator)
+        film.send(colour.round().clamp(0, 255).to(torch.uint8).numpy().tobytes())
+    film.close()
+    lens = {name: float(first.intrinsics[at]) for name, at in
+            {"fl_x": (0, 0), "fl_y": (1, 1), "cx": (0, 2), "cy": (1, 2)}.items()}  # fmt: skip
+    entry = {"video_path": "film.mp4", "time": 0.0, "transform_matrix": opengl(first).tolist()}
+    fields = lens | {"w": first.width, "h": first.height, "frames": [entry]}
+    (folder / "transforms.json").write_text(json.dumps(fields), encoding="utf-8")
+
+
+def off(found: Camera, true: Camera) -> tuple[float, float]:
+    """Angle between two cameras [degrees], and their distance as a share of that to what they look at."""
+    turn = found.world_to_camera[:3, :3].double() @ true.world_to_camera[:3, :3].double().T
+    sine = (turn - turn.T)[[2, 0, 1], [1, 2, 0]].norm() / 2
+    distance = (true.position.double() - torch.tensor(MIDDLE, dtype=torch.float64)).norm()
+    apart = (found.position.double() - true.position.double()).norm()
+    return math.degrees(math.asin(min(1.0, float(sine)))), float(apart / distance)
+
+
+__all__ = ["TRUTH", "drift", "off", "shaken", "tripod", "write_base", "write_film"]
