@@ -49,7 +49,7 @@ class Motion:
 
 
 def moves_by(video: Footage, background: Background) -> float:
-    """How far the background goes in the film of a camera that is said to stand still [pixels].
+    """Distance that the background goes in the film of a camera that is said to stand still [pixels].
 
     It is the median over points, and the largest of :data:`LOOKS` frames. 0 if the background has too few points.
     """

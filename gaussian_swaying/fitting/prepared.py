@@ -22,12 +22,12 @@ MANY = 0.2
 
 @dataclass(frozen=True)
 class Judged:
-    """What the background says of the film of a camera.
+    """The judgement of the background on the film of a camera.
 
     Attributes:
         camera: Name of the camera.
         frames: Number of its frames.
-        moved: How far the background goes in the film of a camera that is said to stand still [pixels].
+        moved: Distance that the background goes in the film of a camera that is said to stand still [pixels].
         hand_held: Whether the camera of each frame was found.
         residual: Median distance of points of the background from where these cameras see them [pixels].
         unseen: Number of frames that show too little of the background; they have the camera of their neighbours.
@@ -43,7 +43,7 @@ class Judged:
     gains: tuple[tuple[float, ...], ...] = ()
 
     def sentences(self) -> list[str]:
-        """What was done to the film."""
+        """Sentences on what was done to the film."""
         found = []
         if self.hand_held:
             found.append(
@@ -60,7 +60,7 @@ class Judged:
         return found
 
     def doubts(self) -> list[str]:
-        """What speaks against the fit."""
+        """Sentences that speak against the fit."""
         if self.unseen <= MANY * self.frames:
             return []
         return [
