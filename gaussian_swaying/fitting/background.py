@@ -16,8 +16,8 @@ from gaussian_swaying.simulation.simulation import Simulation
 SHARE = 0.02
 """Share of a pixel from which what moves is seen in it."""
 REACH = 0.25
-"""Distance that what is simulated is expected to go, as a share of its longer side in the picture. What goes farther is left
-to the robust estimates."""
+"""Distance that what is simulated is expected to go, as a share of its longer side in the picture. What goes farther is
+left to the robust estimates."""
 
 
 class Background:
