@@ -5,16 +5,20 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 from torch import Tensor
 
 from gaussian_swaying.fitting.tracks import Tracks
+from gaussian_swaying.fitting.unknowns import FILM_START
 from gaussian_swaying.fitting.variants import Values, states_of
 from gaussian_swaying.fitting.videos import Footage
+from gaussian_swaying.gaussians.model import DeformedGaussians
 from gaussian_swaying.mpm.state import State
 from gaussian_swaying.rendering.cameras.camera import project
 from gaussian_swaying.simulation.diagnostics import SimulationDiverged
+from gaussian_swaying.simulation.painter import Painter
 from gaussian_swaying.simulation.simulation import Simulation
 
 PATCHES = 4
@@ -60,12 +64,24 @@ class Evidence(ABC):
         return None
 
     @abstractmethod
+    def shown(self, simulation: Simulation, states: Sequence[State]) -> Any:
+        """What states show in any frame: the part of :meth:`residuals` that is computed once for several frames."""
+
+    @abstractmethod
+    def beside(self, shown: Any, frame: int) -> tuple[Tensor, Tensor]:
+        """Differences between a frame and what some states show, as :meth:`residuals`."""
+
     def residuals(self, simulation: Simulation, states: Sequence[State], frame: int) -> tuple[Tensor, Tensor]:
         """Differences in a frame, shape (B, R, D), and their clusters, shape (R,)."""
+        return self.beside(self.shown(simulation, states), frame)
 
 
 class TrackEvidence(Evidence):
-    """Residuals of tracks: positions of Gaussians in the simulation minus those tracked in the video [pixels]."""
+    """Residuals of tracks: positions of Gaussians in the simulation minus those tracked in the video [pixels].
+
+    Attributes:
+        rest: Places of the Gaussians at rest [scene units], on the CPU, shape (T, 3).
+    """
 
     kind, floor = "tracks", 0.05
 
@@ -75,19 +91,20 @@ class TrackEvidence(Evidence):
         self.tracks = tracks
         index = tracks.index.to(scene.moving.device)
         self._follow = scene.follow.some(index).to(scene.moving.device)
-        self._rest = scene.model.means.detach()[scene.moving[index]]
-        self._cluster = _patch_of(self._rest.cpu())
+        self._means = scene.model.means.detach()[scene.moving[index]]
+        self.rest = self._means.cpu()
+        self._cluster = _patch_of(self.rest)
 
-    def residuals(self, simulation: Simulation, states: Sequence[State], frame: int) -> tuple[Tensor, Tensor]:
+    def shown(self, simulation: Simulation, states: Sequence[State]) -> Tensor:
+        """Places of the Gaussians [scene units], shape (B, T, 3)."""
+        moves = torch.stack([self._follow.motion(state)[0] for state in states]).to(self._means)
+        return (self._means + simulation.scene.frame.displacement_to_scene(moves)).cpu()
+
+    def beside(self, shown: Tensor, frame: int) -> tuple[Tensor, Tensor]:
         """See the base class; D is 2."""
         seen = self.tracks.seen[frame]
-        wanted = self.tracks.position[frame, seen]
-        found = []
-        for state in states:
-            move = self._follow.motion(state)[0]
-            means = self._rest + simulation.scene.frame.displacement_to_scene(move.to(self._rest))
-            found.append(project(means.cpu()[seen], self.video.cameras[frame])[0] - wanted)
-        return torch.stack(found), self._cluster[seen]
+        pixel = project(shown[:, seen].flatten(0, 1), self.video.cameras[frame])[0].unflatten(0, (len(shown), -1))
+        return pixel - self.tracks.position[frame, seen], self._cluster[seen]
 
 
 class PictureEvidence(Evidence):
@@ -106,9 +123,13 @@ class PictureEvidence(Evidence):
         self.kind, self.masks = "silhouettes" if masks else "pixels", masks
         self.factor = max(1, round(video.size[0] / width))
 
-    def residuals(self, simulation: Simulation, states: Sequence[State], frame: int) -> tuple[Tensor, Tensor]:
+    def shown(self, simulation: Simulation, states: Sequence[State]) -> tuple[Painter, list[DeformedGaussians]]:
+        """The painter, and the Gaussians of each state."""
+        return simulation.painter, [simulation.painter.deformed(state) for state in states]
+
+    def beside(self, shown: tuple[Painter, list[DeformedGaussians]], frame: int) -> tuple[Tensor, Tensor]:
         """See the base class; D is 1 for silhouettes and 3 for colours."""
-        painter = simulation.painter
+        painter, several = shown
         camera = self.video.cameras[frame].to(painter.device)
         if self.masks:
             assert self.video.masks is not None
@@ -117,11 +138,10 @@ class PictureEvidence(Evidence):
             wanted = self.video.images[frame]
         target = self._averaged(wanted.to(painter.device).float() / 255)
         found = []
-        for state in states:
-            gaussians = painter.deformed(state)
+        for gaussians in several:
             picture = painter.draw(gaussians, painter.colors(gaussians, camera), camera)
-            shown = picture.alpha if self.masks else picture.color
-            found.append((self._averaged(shown.float()) - target).flatten(0, 1))
+            seen = picture.alpha if self.masks else picture.color
+            found.append((self._averaged(seen.float()) - target).flatten(0, 1))
         rows, columns = target.shape[:2]
         row, column = (torch.arange(n) * PATCHES // n for n in (rows, columns))
         cluster = (row[:, None] * PATCHES + column).reshape(-1)
@@ -138,6 +158,7 @@ def compare(
     values: Sequence[Values],
     times: Sequence[float],
     careful: bool = True,
+    moving: bool = False,
 ) -> list[Block]:
     """Simulate variants and compare each with the videos.
 
@@ -148,6 +169,7 @@ def compare(
         times: Times of the frames to compare [s], ascending.
         careful: Take the same substeps for all. If not, or if one of them diverges, each variant takes its own, and may
             end in NaN.
+        moving: Whether the videos begin in motion; their first frame is then compared, too.
 
     Returns:
         One block for each kind, joined over cameras and times; clusters of different kinds and, for pictures, cameras
@@ -156,7 +178,7 @@ def compare(
     parts: dict[str, list[tuple[Tensor, Tensor]]] = {}
     try:
         for time, states in zip(times, states_of(simulation, values, times, alike=careful), strict=True):
-            if time <= 0:  # at rest all variants are alike
+            if time <= 0 and not moving:  # at rest all variants are alike
                 continue
             for place, part in enumerate(evidence):
                 frame = part.frame_at(time)
@@ -168,7 +190,48 @@ def compare(
     except SimulationDiverged:
         if not careful:
             raise
-        return compare(simulation, evidence, values, times, careful=False)
+        return compare(simulation, evidence, values, times, careful=False, moving=moving)
+    return _joined(parts)
+
+
+def compare_starts(
+    simulation: Simulation,
+    evidence: Sequence[Evidence],
+    values: Sequence[Values],
+    times: Sequence[float],
+    starts: Sequence[float],
+) -> list[list[Block]]:
+    """Compare variants as if each had begun to move at each of some times of the film, from one simulation of each.
+
+    Args:
+        simulation: The base, in a wind that does not depend on time.
+        evidence: The comparisons to make.
+        values: The values of each variant; their own start is left out.
+        times: Times of the frames to compare [s], ascending.
+        starts: Times in the film at which the motion begins [s].
+
+    Returns:
+        For each start the blocks of all variants, also of the first frame; a variant that diverged ends in NaN.
+    """
+    wanted: dict[int, list[tuple[int, float]]] = {}  # what is compared with a state, by its time [microseconds]
+    for number, start in enumerate(starts):
+        for time in times:
+            wanted.setdefault(round(1e6 * max(0.0, time - start)), []).append((number, time))
+    moments = sorted(wanted)
+    own = [{name: value for name, value in one.items() if name != FILM_START} for one in values]
+    parts: list[dict[str, list[tuple[Tensor, Tensor]]]] = [{} for _ in starts]
+    runs = states_of(simulation, own, [1e-6 * moment for moment in moments], alike=False)
+    for moment, states in zip(moments, runs, strict=True):
+        for part in evidence:
+            shown = part.shown(simulation, states)
+            for number, time in wanted[moment]:
+                if (frame := part.frame_at(time)) is not None:
+                    parts[number].setdefault(part.kind, []).append(part.beside(shown, frame))
+    return [_joined(own) for own in parts]
+
+
+def _joined(parts: Mapping[str, Sequence[tuple[Tensor, Tensor]]]) -> list[Block]:
+    """One block for each kind of residuals and their clusters."""
     return [
         Block(kind, torch.cat([found for found, _ in own], 1), torch.cat([cluster for _, cluster in own]))
         for kind, own in parts.items()

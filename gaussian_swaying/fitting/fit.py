@@ -24,6 +24,7 @@ from gaussian_swaying.fitting.evidence import (
     PictureEvidence,
     TrackEvidence,
     compare,
+    compare_starts,
     scales_of,
 )
 from gaussian_swaying.fitting.identifiability import check_apart, directions
@@ -41,12 +42,13 @@ from gaussian_swaying.fitting.least_squares import (
 from gaussian_swaying.fitting.plan import Plan, parse_base, read_unknown
 from gaussian_swaying.fitting.prepared import Judged, prepared
 from gaussian_swaying.fitting.report import BEFORE, Result, consequences, predictions, wind_seen, write_results
-from gaussian_swaying.fitting.tracks import Tracks, match, opencv, still_until, track
+from gaussian_swaying.fitting.tracks import Tracks, beside_rest, match, opencv, still_until, track
 from gaussian_swaying.fitting.unknowns import FILM_START, check_unknowns
 from gaussian_swaying.fitting.variants import check_variants, states_of
 from gaussian_swaying.fitting.videos import Footage, frame_times, read_videos
 from gaussian_swaying.gaussians.model import DeformedGaussians
 from gaussian_swaying.mpm.state import State
+from gaussian_swaying.rendering.cameras.camera import project
 from gaussian_swaying.runs.folder import MARKER, claim_folder, hold_folder
 from gaussian_swaying.simulation.simulation import Simulation
 
@@ -74,6 +76,12 @@ ROUGH = 30
 
 LONG_STILL = 0.05
 """Longest time that a film may be still, if the start of its motion is no unknown [s]; slow objects need a frame."""
+BEGUN, BEGINS = 12, 10
+"""Simulations that are compared with the first frame of a film in motion, and starts of each."""
+MOST_STARTS = 60
+"""Most starts of the motion that the coarse search tries with each simulation."""
+AWAY = 3.0
+"""Largest distance between the first frame and the splat at rest in a film that begins at rest [pixels]."""
 
 Say = Callable[[str], None]
 
@@ -85,6 +93,7 @@ class Course:
     Attributes:
         step: Number of the step, which is a stage at a horizon.
         place: Values of the unknowns, as shares of their ranges.
+        first: Values (as shares) whose simulation the first frame looks like; empty if it shows the scene at rest.
         matched: Values (as shares) at which the Gaussians of the current step were matched; empty if they were not.
         damping: See :class:`~gaussian_swaying.fitting.least_squares.Progress`.
         iteration: Iterations done in this step.
@@ -96,6 +105,7 @@ class Course:
 
     step: int = -1
     place: list[float] = field(default_factory=list)
+    first: list[float] = field(default_factory=list)
     matched: list[float] = field(default_factory=list)
     damping: float = START
     iteration: int = 0
@@ -145,6 +155,7 @@ class Fit:
             )
         check_variants(simulation)
         self._tracks: list[Tracks] | None = None
+        self.first: list[float] = []
 
     # ---- what is compared
 
@@ -154,10 +165,16 @@ class Fit:
         return "tracks" in self.stages or self.stages[0] == "matches"
 
     @property
+    def moving(self) -> bool:
+        """True if the films may begin in motion."""
+        return any(u.name == FILM_START and u.low < 0 for u in self.plan.unknowns)
+
+    @property
     def tracks(self) -> list[Tracks]:
         """Tracks of every camera."""
         if self._tracks is None:
-            self._tracks = [track(self.simulation, video, self.plan.tracks) for video in self.videos]
+            shown = self._first_shown([self.first]) if self.first else [None]
+            self._tracks = [track(self.simulation, video, self.plan.tracks, shown[0]) for video in self.videos]
             if sum(len(own.index) for own in self._tracks) < 4:
                 raise ValueError(
                     "Fewer than four points of the object can be followed: give sharper videos, or use the `stages` "
@@ -168,6 +185,29 @@ class Fit:
     def look(self, folder: Path) -> list[Path]:
         """Write pictures to look at before the fit, into ``before`` of a folder, and return them."""
         return write_before(folder / BEFORE, self.simulation, self.videos, self.tracks if self.followed else None)
+
+    def _first_shown(self, places: Sequence[Sequence[float]]) -> list[DeformedGaussians]:
+        """What simulations with the values of some places show when the film begins."""
+        states = next(self._run(torch.tensor(places, dtype=torch.float64), [0.0]))
+        return [self.simulation.painter.deformed(state) for state in states]
+
+    def begin_from(self, places: Tensor) -> list[float]:
+        """Return which of some places (B, U) the first frame of a film in motion looks like most, with its best start.
+
+        That is the one from whose pictures the most Gaussians are found in the first frames.
+        """
+        column = [u.name for u in self.plan.unknowns].index(FILM_START)
+        known = self.plan.unknowns[column]
+        trials = places.repeat_interleave(BEGINS, 0)
+        low, high = 0.0, known.share(min(max(0.0, known.low), known.high))
+        trials[:, column] = torch.linspace(low, high, BEGINS, dtype=places.dtype).repeat(len(places))
+        brief = [replace(video, images=video.images[:1]) for video in self.videos]
+        found = []
+        for shown in self._first_shown(trials.tolist()):
+            tracks = [track(self.simulation, video, self.plan.tracks, shown) for video in brief]
+            found.append(sum(int(own.seen[0].sum()) for own in tracks))
+        best = max(range(len(found)), key=found.__getitem__)
+        return [float(share) for share in trials[best]]
 
     def evidence(self, stage: str, matched: Sequence[float] = ()) -> list[Evidence]:
         """Return the residuals of a stage, one list entry for each video and kind."""
@@ -190,7 +230,10 @@ class Fit:
             for own, probe in zip(states, probes, strict=True):
                 if probe.frame_at(moment) is not None:
                     own.append(found[0])
-        tracks = [match(self.simulation, v, own, self.plan.tracks) for v, own in zip(self.videos, states, strict=True)]
+        tracks = [
+            match(self.simulation, v, own, self.plan.tracks, self.moving)
+            for v, own in zip(self.videos, states, strict=True)
+        ]
         return [TrackEvidence(self.simulation, v, own) for v, own in zip(self.videos, tracks, strict=True)]
 
     def _run(self, places: Tensor, times: Sequence[float]) -> Any:
@@ -204,7 +247,9 @@ class Fit:
         """The residuals of some evidence up to a horizon, as a function of places (B, U)."""
 
         def at(places: Tensor) -> list[Block]:
-            return compare(self.simulation, evidence, [self.values(place) for place in places], times)
+            return compare(
+                self.simulation, evidence, [self.values(place) for place in places], times, moving=self.moving
+            )
 
         return at
 
@@ -234,28 +279,47 @@ class Fit:
         moving = [k for k, u in enumerate(unknowns) if u.start is None and not u.name.startswith(("aero.", "solver."))]
         if not plan.search or not moving:
             return begin
-        first = self.stages[0]
-        evidence = self.evidence("tracks" if first == "matches" else first)
-        times = self.fitted[: max(3, round(SEARCHED * len(self.fitted)))]
         places = torch.tensor([begin]).repeat(max(1, 3 * plan.search // 4), 1).double()
         sobol = torch.quasirandom.SobolEngine(len(moving), scramble=True, seed=plan.seed)
         places[:, moving] = sobol.draw(len(places)).double()
-        costs = self._coarse(places, evidence, times)
+        if self.moving and self.followed:
+            self.first, self._tracks = self.begin_from(places[:BEGUN]), None
+        first = self.stages[0]
+        evidence = self.evidence("tracks" if first == "matches" else first)
+        times = self.fitted[: max(3, round(SEARCHED * len(self.fitted)))]
+        places, costs = self._coarse(places, evidence, times)
         generator = torch.Generator().manual_seed(plan.seed)
         near = places[int(costs.argmin())].repeat(plan.search - len(places), 1)
         if len(near):
             shift = torch.randn(len(near), len(moving), generator=generator, dtype=torch.float64)
             near[:, moving] = (near[:, moving] + NEAR * shift).clamp(0.02, 0.98)
-            places, costs = torch.cat([places, near]), torch.cat([costs, self._coarse(near, evidence, times)])
+            near, others = self._coarse(near, evidence, times)
+            places, costs = torch.cat([places, near]), torch.cat([costs, others])
         if not bool(torch.isfinite(costs).any()):
             raise ValueError("Every simulation of the coarse search diverged: narrow the ranges of `unknowns`.")
         return [float(share) for share in places[int(costs.argmin())]]
 
-    def _coarse(self, places: Tensor, evidence: Sequence[Evidence], times: Sequence[float]) -> Tensor:
-        blocks = compare(self.simulation, evidence, [self.values(p) for p in places], times, careful=False)
+    def _coarse(self, places: Tensor, evidence: Sequence[Evidence], times: Sequence[float]) -> tuple[Tensor, Tensor]:
+        """Return the places with the best start of the motion for each, and their costs.
+
+        In a steady wind one simulation shows what any start would.
+        """
         width = max(video.size[0] for video in self.videos)
-        scales = {b.kind: COARSE[b.kind] * (width if b.kind in ("tracks", "matches") else 1) for b in blocks}
-        return huber(blocks, scales)
+        scales = {kind: size * (width if kind in ("tracks", "matches") else 1) for kind, size in COARSE.items()}
+        values = [self.values(place) for place in places]
+        known = {u.name: u for u in self.plan.unknowns}.get(FILM_START)
+        if known is None or known.start is not None:
+            return places, huber(compare(self.simulation, evidence, values, times, False, self.moving), scales)
+        step = max(times[1] - times[0], (known.high - known.low) / MOST_STARTS)
+        starts = [step * k for k in range(math.ceil(known.low / step), math.floor(known.high / step) + 1)] or [
+            known.low
+        ]
+        each = torch.stack([huber(b, scales) for b in compare_starts(self.simulation, evidence, values, times, starts)])
+        costs, best = each.min(0)
+        places = places.clone()
+        column = [u.name for u in self.plan.unknowns].index(FILM_START)
+        places[:, column] = torch.tensor([known.share(start) for start in starts], dtype=places.dtype)[best]
+        return places, costs
 
     def run(self, course: Course, keep: Callable[[Course], None], films: Path | None = None) -> Result:
         """Do the steps that are missing, and return the result.
@@ -273,10 +337,13 @@ class Fit:
             for note in self.notes():
                 self.say(note)
             course.place = self.search()
+            course.first = list(self.first)
             self.say(f"search: {self._shown(course.place)}")
             self._check_apart(course)
             course.step, course.seconds = 0, time.monotonic() - clock
             keep(course)
+        if self.first != course.first:  # it is continued
+            self.first, self._tracks = course.first, None
         steps = self.steps()
         evidence: list[Evidence] = []
         while course.step < len(steps):
@@ -343,12 +410,18 @@ class Fit:
         if FILM_START in (u.name for u in self.plan.unknowns) or not self.followed:
             return []
         still = min(still_until(self.simulation, v, own) for v, own in zip(self.videos, self.tracks, strict=True))
-        if still < LONG_STILL:
-            return []
-        return [
-            f"Nothing moves in the first {still:.2g} s of the film, but the simulation starts at once: add "
-            f"{FILM_START}: {{range: [0, {math.ceil(20 * still) / 10:g}]}} to `unknowns`, or cut the film."
-        ]
+        if still >= LONG_STILL:
+            return [
+                f"Nothing moves in the first {still:.2g} s of the film, but the simulation starts at once: add "
+                f"{FILM_START}: {{range: [0, {math.ceil(20 * still) / 10:g}]}} to `unknowns`, or cut the film."
+            ]
+        beside = max(beside_rest(self.simulation, video, self.plan.tracks) for video in self.videos)
+        if beside > AWAY:
+            return [
+                f"The first frame is {beside:.2g} pixels away from the splat at rest, and moves: the film begins in "
+                f"motion. Add {FILM_START}: {{range: [-1, 0]}} to `unknowns`, or give a film that begins at rest."
+            ]
+        return []
 
     def _check_apart(self, course: Course) -> None:
         first = self.stages[0]
@@ -382,7 +455,8 @@ class _Followed:
             if frame is None:
                 continue
             tracks = own.tracks
-            moved = (tracks.position[frame] - tracks.position[0])[tracks.seen[frame]]
+            seen = tracks.seen[frame]
+            moved = tracks.position[frame, seen] - project(own.rest[seen], own.video.cameras[frame])[0]
             self._left[name] += float(own.residuals(self._simulation, [state], frame)[0].square().sum())
             self._moved[name] += float(moved.square().sum())
 

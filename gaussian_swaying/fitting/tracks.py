@@ -7,7 +7,7 @@ does not return to where it came from.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import torch
@@ -34,6 +34,8 @@ QUALITY = 0.02
 """Least texture of a point, as a share of the best one: smallest eigenvalue of the structure tensor."""
 EDGE = 4.0
 """Least distance from the edges of the picture [pixels]."""
+ALIKE = 0.7
+"""Least correlation of a point's surroundings in a picture of the splat and in the first frame."""
 OPAQUE = 0.3
 """Least opacity of a Gaussian that is followed."""
 BEHIND = 0.03
@@ -58,20 +60,64 @@ class Tracks:
     seen: Tensor
 
 
-def track(simulation: Simulation, video: Footage, most: int = 400) -> Tracks:
-    """Follow the Gaussians that a camera sees in its first frame, at rest.
+def track(simulation: Simulation, video: Footage, most: int = 400, first: DeformedGaussians | None = None) -> Tracks:
+    """Follow the Gaussians that a camera sees in its first frame.
 
     Args:
         simulation: The scene, at rest where the video begins.
         video: The video.
         most: Largest number of tracks; those with the most texture are taken.
+        first: What the first frame shows, about, if it is not the scene at rest. The Gaussians are followed from a
+            picture of it to the first frame; those whose surroundings do not look alike there are not seen.
 
     Raises:
         ImportError: Without OpenCV.
     """
-    chosen, start = _chosen(simulation, video, _grey(video.images[0]), most)
-    position, seen = follow(video.images.numpy(), start.numpy())
-    return Tracks(chosen, torch.from_numpy(position), torch.from_numpy(seen))
+    if first is None:
+        chosen, start = _chosen(simulation, video, _grey(video.images[0]), most)
+        position, seen = map(torch.from_numpy, follow(video.images.numpy(), start.numpy()))
+        return Tracks(chosen, position, seen)
+    drawn = drawn_by(simulation, first, video.cameras[0])
+    chosen, start = _chosen(simulation, video, _grey(drawn), most, first)
+    images = torch.cat([drawn[None], video.images])
+    position, seen = map(torch.from_numpy, follow(images.numpy(), start.numpy()))
+    seen &= _alike(images[:2], position[:2]) > ALIKE
+    return Tracks(chosen, position[1:], seen[1:])
+
+
+def drawn_by(simulation: Simulation, gaussians: DeformedGaussians, camera: Camera) -> Tensor:
+    """The picture of some Gaussians in a camera, dtype uint8, shape (H, W, 3)."""
+    painter = simulation.painter
+    own = camera.to(painter.device)
+    with torch.no_grad():
+        colour = painter.draw(gaussians, painter.colors(gaussians, own), own).color
+    return (colour.clamp(0, 1) * 255).round().to(torch.uint8).cpu()
+
+
+def beside_rest(simulation: Simulation, video: Footage, most: int = 400) -> float:
+    """Distance between the splat at rest and the first frame of a video [pixels], of the upper quarter of points.
+
+    A shift of all points alike is a fault of the camera, and left out.
+    """
+    rest, moving = simulation.scene.rest(), simulation.scene.moving
+    found = track(simulation, replace(video, images=video.images[:1]), most, rest)
+    means = rest.means[moving[found.index.to(moving.device)]].cpu()
+    off = (found.position[0] - project(means, video.cameras[0])[0])[found.seen[0]]
+    return float((off - off.median(0).values).norm(dim=-1).quantile(0.75)) if len(off) else 0.0
+
+
+def _alike(images: Tensor, position: Tensor) -> Tensor:
+    """Correlation of the surroundings of points in two pictures (2, H, W, 3) at positions (2, T, 2), shape (T,)."""
+    side = window_of(images.shape[2], images.shape[1])
+    planes = images.double().mean(-1)[:, None]
+    height, width = planes.shape[-2:]
+    reach = torch.arange(side, dtype=torch.float64) - side // 2
+    row, column = torch.meshgrid(reach, reach, indexing="ij")
+    places = position[:, :, None] + torch.stack([column, row], -1).reshape(1, 1, -1, 2)
+    grid = 2 * places / torch.tensor([width, height], dtype=torch.float64) - 1
+    found = torch.nn.functional.grid_sample(planes, grid, padding_mode="border", align_corners=False)[:, 0]
+    found = found - found.mean(-1, keepdim=True)
+    return (found[0] * found[1]).sum(-1) / (found[0].norm(dim=-1) * found[1].norm(dim=-1)).clamp(min=1e-9)
 
 
 def still_until(simulation: Simulation, video: Footage, tracks: Tracks) -> float:
@@ -94,7 +140,9 @@ def still_until(simulation: Simulation, video: Footage, tracks: Tracks) -> float
     return float(video.times[max(int(begun[0]) - 1, 0)]) if len(begun) else 0.0
 
 
-def match(simulation: Simulation, video: Footage, states: Sequence[State], most: int = 400) -> Tracks:
+def match(
+    simulation: Simulation, video: Footage, states: Sequence[State], most: int = 400, moving: bool = False
+) -> Tracks:
     """Find the Gaussians of a simulation in the video: match each rendered frame with the frame of the camera.
 
     Nothing drifts, as every frame is matched anew, and a Gaussian that comes into sight again is found again. The
@@ -104,7 +152,7 @@ def match(simulation: Simulation, video: Footage, states: Sequence[State], most:
     centre, by a part of a pixel that depends on the angle of view (:func:`drawn_beside`). A video of the real object
     does not have this offset; one that was rendered from the splat has it, too. The first frame, at rest, shows which
     is the case. The offset that remains there comes from a camera that is not quite right: its median is subtracted in
-    all frames.
+    all frames, unless the video begins in motion.
 
     Near the border of the object a window shows more border than texture, and the border of a splat is not quite that
     of the real object. Such Gaussians are left out.
@@ -114,11 +162,16 @@ def match(simulation: Simulation, video: Footage, states: Sequence[State], most:
         video: The video.
         states: The state at the time of each frame of the video; fewer if only the first frames are wanted.
         most: Largest number of Gaussians.
+        moving: Whether the video begins in motion.
     """
     import numpy as np
 
     scene, painter, count = simulation.scene, simulation.painter, len(video.times)
-    chosen, _ = _chosen(simulation, video, _grey(video.images[0]), most)
+    if moving:
+        begun = painter.deformed(states[0])
+        chosen, _ = _chosen(simulation, video, _grey(drawn_by(simulation, begun, video.cameras[0])), most, begun)
+    else:
+        chosen, _ = _chosen(simulation, video, _grey(video.images[0]), most)
     index = scene.moving[chosen.to(scene.moving.device)]
     position = torch.zeros(count, len(chosen), 2, dtype=torch.float64)
     seen = torch.zeros(count, len(chosen), dtype=torch.bool)
@@ -138,6 +191,7 @@ def match(simulation: Simulation, video: Footage, states: Sequence[State], most:
             beside = drawn_beside(painter, gaussians, camera, pixel)
             if k == 0 and bool(seen[0].any()):
                 share, shift = _at_rest((position[0] - pixel)[seen[0]], beside[seen[0]])
+                shift = torch.zeros_like(shift) if moving else shift
             position[k] += share * beside
         position[k] -= shift
     return Tracks(chosen, position, seen)
@@ -228,15 +282,17 @@ def window_of(width: int, height: int) -> int:
     return 2 * round(WINDOW // 2 * max(1.0, max(width, height) / WIDE)) + 1
 
 
-def _chosen(simulation: Simulation, video: Footage, grey: Any, most: int) -> tuple[Tensor, Tensor]:
-    """Return Gaussians that are visible at rest and have texture around them, a few pixels apart; and their pixels."""
+def _chosen(
+    simulation: Simulation, video: Footage, grey: Any, most: int, first: DeformedGaussians | None = None
+) -> tuple[Tensor, Tensor]:
+    """Return Gaussians that are visible at first and have texture around them, a few pixels apart; and their pixels."""
     import numpy as np
 
     scene, painter, camera = simulation.scene, simulation.painter, video.cameras[0]
     with torch.no_grad():
-        rest = scene.rest()
-        pixel, depth = project(rest.means[scene.moving], camera)
-        picture = painter.draw(rest, painter.colors(rest, camera.to(painter.device)), camera.to(painter.device))
+        first, own = first or scene.rest(), camera.to(painter.device)
+        pixel, depth = project(first.means[scene.moving], camera)
+        picture = painter.draw(first, painter.colors(first, own), own)
     opaque = scene.model.opacity().cpu()[scene.moving.cpu()] > OPAQUE
     place = (_in_sight(pixel, depth, picture, BEHIND * scene.size) & opaque).nonzero()[:, 0]
     column, row = pixel[place].long().unbind(-1)

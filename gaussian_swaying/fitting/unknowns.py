@@ -13,7 +13,8 @@ from gaussian_swaying.simulation.simulation import Simulation
 
 SCALES = ("log", "linear")
 FILM_START = "film.start"
-"""Time in the film at which the motion starts, at rest until then [s]: no number of the simulation."""
+"""Time in the film at which the motion starts, at rest until then [s]; below 0, the wind has blown for so long when the
+film begins. It is no number of the simulation."""
 
 
 @dataclass(frozen=True)
@@ -50,8 +51,6 @@ class Unknown:
             raise ValueError(f"Expected `{where}.range` to be [low, high], but got [{self.low}, {self.high}].")
         if self.scale == "log" and self.low <= 0:
             raise ValueError(f"Expected `{where}.range` above 0 with `scale: log`, but got {self.low}.")
-        if self.name == FILM_START and self.low < 0:
-            raise ValueError(f"Expected `{where}.range` from 0 on, as the film begins at rest, but got {self.low}.")
         if known is not None:
             known.check(self.low, f"{where}.range")
             known.check(self.high, f"{where}.range")

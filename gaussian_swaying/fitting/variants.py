@@ -55,7 +55,7 @@ def states_of(
     Args:
         simulation: The base. Its motion starts from rest at time zero.
         values: For each variant the values that replace those of the base; with
-            :data:`~.unknowns.FILM_START`, it is at rest until then.
+            :data:`~.unknowns.FILM_START`, it is at rest until then, or has moved since then if that is below zero.
         times: Times [s], ascending, from 0 on.
         alike: Take the same substeps for all, those of the stiffest, so that differences come from the values alone. If
             not, variants that need more substeps are batches of their own, and a variant may end in NaN.
@@ -65,6 +65,9 @@ def states_of(
     """
     setups = [with_values(simulation.setup, of_simulation(own)) for own in values]
     groups = _groups(simulation, values, setups, alike)
+    before = math.ceil(max(0.0, -min(group.start for group in groups)) / simulation.frame_dt)
+    for k in range(-before, 0):  # the run-up, frame by frame
+        _advance(groups, k * simulation.frame_dt, (k + 1) * simulation.frame_dt, alike)
     now = 0.0
     for time in times:
         if time > now:

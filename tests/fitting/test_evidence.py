@@ -53,8 +53,11 @@ def test_tracks_share_their_clusters_over_cameras_and_pictures_do_not(monkeypatc
             super().__init__(SimpleNamespace(times=(0.0, 0.5, 1.0)))
             self.kind = kind
 
-        def residuals(self, simulation, states, frame):
-            return torch.zeros(len(states), PATCHES**2, 1), torch.arange(PATCHES**2)
+        def shown(self, simulation, states):
+            return states
+
+        def beside(self, shown, frame):
+            return torch.zeros(len(shown), PATCHES**2, 1), torch.arange(PATCHES**2)
 
     monkeypatch.setattr(evidence, "states_of", lambda _, values, times, **__: [[None] * len(values) for _ in times])
     parts = [Given(kind) for kind in ("pixels", "tracks", "pixels", "tracks", "pixels")]

@@ -1,13 +1,16 @@
-"""A film that is still at first: the time at which the motion starts is one more unknown."""
+"""A film that is still at first or begins in motion: the time at which the motion starts is one more unknown."""
 
 import json
 import shutil
+from dataclasses import replace
 
 import pytest
 import torch
 
+from gaussian_swaying.fitting.evidence import TrackEvidence, compare, compare_starts
 from gaussian_swaying.fitting.fit import Fit, fit
 from gaussian_swaying.fitting.plan import Plan
+from gaussian_swaying.fitting.tracks import track
 from gaussian_swaying.fitting.unknowns import FILM_START, Unknown, default_scale
 from gaussian_swaying.fitting.variants import states_of
 from gaussian_swaying.fitting.videos import read_videos
@@ -16,7 +19,7 @@ from .conftest import TRUTH
 
 pytest.importorskip("cv2", reason="needs the extra [fit]")
 
-STILL = 4  # frames
+STILL, CUT = 4, 3  # frames
 
 
 @pytest.fixture
@@ -36,6 +39,20 @@ def late(own, tmp_path):
             still.append(frame | {"file_path": name, "time": k / 24})
     file.write_text(json.dumps({"frames": [*still, *moved]}))
     return folder
+
+
+@pytest.fixture
+def cut(own, tmp_path):
+    """The video of the flag without its first frames."""
+    file = own / "video/transforms.json"
+    frames = [frame for frame in json.loads(file.read_text())["frames"] if frame["time"] > (CUT - 0.5) / 24]
+    for frame in frames:
+        frame["time"] -= CUT / 24
+        for name in ("file_path", "mask_path"):
+            frame[name] = str(own / "video" / frame[name])
+    (tmp_path / "cut").mkdir()
+    (tmp_path / "cut/transforms.json").write_text(json.dumps({"frames": frames}))
+    return tmp_path / "cut"
 
 
 def test_the_start_of_the_motion_is_found(own, late, tmp_path):
@@ -73,8 +90,56 @@ def test_variants_that_start_at_other_times(simulation):
     assert [float(state.time) for state in between] == pytest.approx([0, 0.5 / 24, 1.5 / 24, 2.5 / 24, 3.5 / 24])
 
 
-def test_a_start_before_the_film_is_refused():
+def test_a_start_has_a_linear_range_in_seconds():
     assert default_scale(FILM_START, 0.1) == "linear"
-    assert Unknown(FILM_START, 0.0, 1.0).unit == "s"
-    with pytest.raises(ValueError, match=r"`unknowns.film.start.range` from 0 on, as the film begins at rest"):
-        Unknown(FILM_START, -0.1, 1.0)
+    assert Unknown(FILM_START, -0.1, 1.0).unit == "s"
+
+
+def test_a_film_that_begins_in_motion(own, cut, tmp_path):
+    """The wind has blown for some frames; how long is found with the rest, and the note says that it is needed."""
+    sought = {"wind.speed": [2.0, 12.0], "material.E": [2e3, 5e4], FILM_START: [-0.4, 0.2]}
+    options = {"device": "cpu", "search": 16, "progress": False}
+    result = fit(own / "base.yaml", cut, sought, tmp_path / "fit", fit_share=0.8, **options)
+    assert result.values[FILM_START] == pytest.approx(-CUT / 24, abs=0.004)
+    assert result.values["wind.speed"] == pytest.approx(TRUTH["wind.speed"], rel=0.02)
+    assert result.values["material.E"] == pytest.approx(TRUTH["material.E"], rel=0.03)
+    assert json.loads((tmp_path / "fit/fit.json").read_text())["course"]["first"]
+
+
+def test_a_film_in_motion_is_said(own, cut, simulation):
+    """And nothing once the unknown is there."""
+    plan = Plan([str(own / "base.yaml")], [str(cut)], [Unknown("wind.speed", 2.0, 12.0)])
+    (note,) = Fit(simulation, read_videos(cut), plan).notes()
+    assert note.endswith("film.start: {range: [-1, 0]} to `unknowns`, or give a film that begins at rest.")
+    known = Plan(plan.base, plan.videos, [*plan.unknowns, Unknown(FILM_START, -0.4, 0.0)])
+    assert Fit(simulation, read_videos(cut), known).notes() == []
+
+
+def test_variants_that_started_before_the_film(simulation):
+    times = [k / 24 for k in range(3)]
+    now, before = zip(*states_of(simulation, [{}, {FILM_START: -2 / 24}], times), strict=True)
+    assert torch.equal(before[0].position, now[2].position)
+    assert [float(state.time) for state in before] == pytest.approx([2 / 24, 3 / 24, 4 / 24])
+
+
+def test_starts_that_are_compared_at_once(own, simulation):
+    """One simulation shows what any start would: as simulations of each start do."""
+    (video, _) = read_videos(own / "video")
+    evidence = [TrackEvidence(simulation, video, track(simulation, video))]
+    times, starts = list(video.times[:5]), [-2 / 24, 0.0, 1 / 24]
+    together = compare_starts(simulation, evidence, [{"wind.speed": 4.0}], times, starts)
+    apart = [{"wind.speed": 4.0, FILM_START: start} for start in starts]
+    (block,) = compare(simulation, evidence, apart, times, careful=False, moving=True)
+    for number, (own_block,) in enumerate(together):
+        assert own_block.values[0].shape == block.values[number].shape
+        assert (own_block.values[0] - block.values[number]).abs().max() < 0.02  # other steps
+    assert (together[0][0].values - together[1][0].values).abs().max() > 1
+
+
+def test_gaussians_that_look_otherwise_are_not_seen(own, simulation):
+    """The picture of one state is followed to that of another; far from it, nothing that is found is trusted."""
+    (video, _) = read_videos(own / "video")
+    near = track(simulation, video, first=simulation.scene.rest())
+    assert near.seen[0].float().mean() > 0.8
+    blank = replace(video, images=torch.full_like(video.images, 128))
+    assert not track(simulation, blank, first=simulation.scene.rest()).seen[0].any()
