@@ -65,7 +65,7 @@ class Evidence(ABC):
 
     @abstractmethod
     def shown(self, simulation: Simulation, states: Sequence[State]) -> Any:
-        """What states show in any frame: the part of :meth:`residuals` that is computed once for several frames."""
+        """The part of :meth:`residuals` that is the same for all frames."""
 
     @abstractmethod
     def beside(self, shown: Any, frame: int) -> tuple[Tensor, Tensor]:
@@ -103,7 +103,9 @@ class TrackEvidence(Evidence):
     def beside(self, shown: Tensor, frame: int) -> tuple[Tensor, Tensor]:
         """See the base class; D is 2."""
         seen = self.tracks.seen[frame]
-        pixel = project(shown[:, seen].flatten(0, 1), self.video.cameras[frame])[0].unflatten(0, (len(shown), -1))
+        pixel = project(shown[:, seen].flatten(0, 1), self.video.cameras[frame])[0].unflatten(
+            0, (len(shown), int(seen.sum()))
+        )
         return pixel - self.tracks.position[frame, seen], self._cluster[seen]
 
 

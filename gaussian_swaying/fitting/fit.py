@@ -187,7 +187,7 @@ class Fit:
         return write_before(folder / BEFORE, self.simulation, self.videos, self.tracks if self.followed else None)
 
     def _first_shown(self, places: Sequence[Sequence[float]]) -> list[DeformedGaussians]:
-        """What simulations with the values of some places show when the film begins."""
+        """Gaussians of simulations with the values of some places when the film begins."""
         states = next(self._run(torch.tensor(places, dtype=torch.float64), [0.0]))
         return [self.simulation.painter.deformed(state) for state in states]
 
