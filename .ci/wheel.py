@@ -93,6 +93,18 @@ def needs(extra: str, arguments: str | list[str]) -> None:
     assert f"gaussian-swaying[{extra}]" in told, told
 
 
+def write_film(path: Path) -> None:
+    """A film of three grey frames of 64 x 36 pixels."""
+    import numpy as np
+
+    from gaussian_swaying.recording.video import VideoEncoder
+
+    encoder = VideoEncoder(path, 30)
+    for _ in range(3):
+        encoder.write(np.full((36, 64, 3), 90, np.uint8))
+    encoder.finish()
+
+
 def main() -> None:
     """All commands; an assertion that fails ends the program."""
     import gaussian_swaying
@@ -144,6 +156,11 @@ def main() -> None:
     wind = {"class_path": "RecordedWind", "init_args": {"path": "wind.nc"}}
     needs("netcdf", ["sim", *small, f"--wind.effects=[{json.dumps(wind)}]", "--output=other"])
     needs("fit", "fit --config=printed_flag --output=other")
+    write_film(Path("film.mp4"))
+    needs("fit", "fit film.mp4 --splat flag.ply --length object 1.2 --up +z --output=other")
+    code, told = call("fit film.mp4 --output=other")
+    assert code == 2, told
+    assert "add --splat" in told, told
     tried.add("fit")
     needs("fit", "register run/frames/00001.png flag.ply --output=other")
     tried.add("register")

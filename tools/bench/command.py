@@ -13,7 +13,8 @@ from bench.slots import SlotError
 
 _OWN = (
     "speed live accuracy pareto points backward gradients surfaces flags pins contact fit soft folds gallery previews "
-    "area blender places frames detail drawn leaves refinement web sweeps winds stability nature air registration"
+    "area blender places frames detail drawn leaves refinement web sweeps winds stability nature air registration "
+    "film_fit"
 )
 _FILES = {name: f"{name}.CASE" for name in _OWN.split()}
 _FILES |= {"substep": "runs.SUBSTEP", "sim": "runs.SIM", "train": "training.CASE"}

@@ -36,6 +36,7 @@ PARTS: dict[str, tuple[str, ...]] = {
     "contact": _SIMULATION,
     "detail": ("rendering", "geometry"),
     "drawn": (*_DRAWN, "viewer"),
+    "film_fit": (*_DRAWN, "fitting", "preview"),
     "fit": (*_DRAWN, "fitting"),
     "flags": (*_DRAWN, "evaluation", "training"),
     "folds": (*_SIMULATION, "evaluation"),

@@ -20,6 +20,8 @@ FOV = 55.0
 WARM = (1.0, 0.94, 0.82)
 """Light of the film, which is not that of the splat."""
 TRUTH = {"wind.speed": 9.0, "wind.azimuth": 35.0, "material.E": 5e4}
+POLE = 2.5
+"""Height of the pole [m]."""
 FLAG = (1.2, 0.8)
 """Length and height of the cloth [m]."""
 
@@ -102,4 +104,4 @@ def write_case(
     write_film(folder / "film.mp4", folder / "truth.yaml", size, still, moving)
 
 
-__all__ = ["TRUTH", "flag_on_pole", "write_case", "write_film"]
+__all__ = ["POLE", "TRUTH", "flag_on_pole", "write_case", "write_film"]
