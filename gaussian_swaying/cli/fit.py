@@ -26,7 +26,7 @@ def build_parser() -> argparse.ArgumentParser:
         "errors, pictures of what is left, and a configuration for `sim`.",
     )
     add = parser.add_argument
-    add("film", nargs="?", metavar="FILM", help="a film from a tripod, which begins with the object at rest")
+    add("film", nargs="?", metavar="FILM", help="a film that begins with the object at rest")
     add("--splat", metavar="SPLAT", help="the splat that the film shows")
     add("--length", nargs=2, metavar=("NAME", "METRES"), help="a known length: object, a part such as pole, "
         "or X,Y:X,Y, two places in the first frame (pixels); without it, speed and E are not absolute")  # fmt: skip

@@ -80,7 +80,7 @@ def prepare(options: argparse.Namespace, folder: Path) -> Path:
     look = folder / LOOK
     preview = _previewed(options, look, 1.0)
     if length is not None:
-        ratio = _scale(*length, seen, preview)
+        ratio = longest_side(*length, seen, preview)
         if ratio != 1.0:
             preview = _previewed(options, look, ratio)
     write(preview, look)
@@ -171,7 +171,7 @@ def _previewed(options: argparse.Namespace, folder: Path, longest: float) -> Pre
     return preview_scene(given, folder)
 
 
-def _scale(name: str, metres: float, seen: Seen, preview: Preview) -> float:
+def longest_side(name: str, metres: float, seen: Seen, preview: Preview) -> float:
     """The length of the longest side [m] with which a named length has so many metres.
 
     Args:
@@ -288,4 +288,4 @@ def _guesses(preview: Preview, options: argparse.Namespace, length: Any) -> list
     return lines
 
 
-__all__ = ["extent", "plan_text", "prepare"]
+__all__ = ["Seen", "extent", "longest_side", "plan_text", "prepare"]

@@ -18,6 +18,7 @@ import torch
 from torch import Tensor
 
 from gaussian_swaying._inputs import check_regular
+from gaussian_swaying.fitting.tracks import opencv
 from gaussian_swaying.fitting.videos import MOST_PIXELS, next_of, scaled
 
 SIDE = 960
@@ -28,6 +29,8 @@ DIFFERENT, MOVED = 8.0, 0.02
 """Grey levels by which a pixel differs that has moved, and the share of such pixels in a frame that has."""
 DIAGONAL = math.hypot(36, 24)
 """Of the film to which a focal length in mm is equivalent [mm]."""
+LEAST = 8
+"""Fewest points of the background that tell how a hand shakes."""
 _FOCAL = re.compile(r"focal.?length\S*35mm\S*\s*:\s*([0-9.]+)", re.IGNORECASE)
 
 
@@ -92,30 +95,68 @@ def pixels_of_focal(millimetres: float, width: int, height: int) -> float:
 
 
 def begins_to_move(film: Film, where: Tensor) -> float | None:
-    """Time of the first frame that differs from the first one where the object is [s]; None if there is none.
+    """Time of the first frame in which the object is not as in the first one [s]; None if there is none.
+
+    A hand that shakes moves the background, too, and does not count.
 
     Args:
         film: The film; the object is at rest in its first frame. Brighter and darker frames do not count as motion.
         where: The opacity of the object in the first frame, shape (H, W).
     """
+    import numpy as np
+
     factor = max(1.0, max(film.width, film.height) / SMALL)
     size = round(film.width / factor), round(film.height / factor)
-    first: Tensor | None = None
+    first: Any = None
     with closing(_frames(film.path, scaled(*size), grey=True)) as frames:
         width, height = next_of(frames, film.path)["size"]
         mask = torch.nn.functional.interpolate(where[None, None].float(), size=(height, width), mode="area")[0, 0] > 0.3
         if not bool(mask.any()):
             mask = torch.ones_like(mask)
-        number = 0
+        number, inside = 0, mask.numpy()
         while (frame := next_of(frames, film.path)) is not None:
-            grey = torch.frombuffer(bytearray(frame), dtype=torch.uint8).reshape(height, width)[mask].float()
+            grey = np.frombuffer(frame, dtype=np.uint8).reshape(height, width)
             if first is None:
-                first = grey
-            level = grey * (first.mean() / grey.mean().clamp(min=1.0))
-            if float(((level - first).abs() > DIFFERENT).float().mean()) > MOVED:
+                first, steady = grey, _Steady(grey, inside)
+            if _differs(first, grey, inside) and _differs(first, steady.aligned(grey), inside):
                 return number / film.fps
             number += 1
     return None
+
+
+def _differs(first: Any, grey: Any, where: Any) -> bool:
+    """Whether some pixels of a frame are not those of the first one, but for its brightness."""
+    before, now = (picture[where].astype(float) for picture in (first, grey))
+    level = now * (before.mean() / max(now.mean(), 1.0))
+    return bool((abs(level - before) > DIFFERENT).mean() > MOVED)
+
+
+class _Steady:
+    """Takes the shake of a hand off a frame, by points of the background in the first one.
+
+    Args:
+        first: The first frame, uint8 (H, W).
+        inside: Where the object is, bool (H, W).
+    """
+
+    def __init__(self, first: Any, inside: Any) -> None:
+        import numpy as np
+
+        cv2 = opencv()
+        around = 255 * (cv2.dilate(inside.astype(np.uint8), np.ones((15, 15), np.uint8)) == 0).astype(np.uint8)
+        self._first, self._points = first, cv2.goodFeaturesToTrack(first, 200, 0.05, 5, mask=around)
+
+    def aligned(self, grey: Any) -> Any:
+        """The frame, moved and turned onto the first one; as it is if the background has too few points."""
+        cv2 = opencv()
+        if self._points is None or len(self._points) < LEAST:
+            return grey
+        there, found, _ = cv2.calcOpticalFlowPyrLK(self._first, grey, self._points, None)
+        kept = found[:, 0] > 0
+        if kept.sum() < LEAST:
+            return grey
+        turn, _ = cv2.estimateAffinePartial2D(there[kept], self._points[kept])
+        return grey if turn is None else cv2.warpAffine(grey, turn, grey.shape[::-1], borderMode=cv2.BORDER_REPLICATE)
 
 
 def _frames(path: Path, options: list[str], grey: bool = False) -> Generator[Any, None, None]:

@@ -14,12 +14,16 @@ from PIL import Image
 from shared import refused
 
 from gaussian_swaying.cli.fit import main
-from gaussian_swaying.cli.fit_film import extent
+from gaussian_swaying.cli.fit_film import Seen, extent, longest_side
+from gaussian_swaying.cli.preview import build_options, preview_scene
+from gaussian_swaying.cli.register import painter_of
 from gaussian_swaying.fitting.before import HELD, MOVING
 from gaussian_swaying.fitting.film import first_frame, open_film
 from gaussian_swaying.fitting.plan import read_plan
 from gaussian_swaying.fitting.videos import read_videos
+from gaussian_swaying.gaussians.formats import read_gaussians
 from gaussian_swaying.recording.video import VideoEncoder
+from gaussian_swaying.rendering.cameras.camera import project
 
 pytest.importorskip("cv2")
 
@@ -85,27 +89,30 @@ def test_the_pictures_before_the_fit(checked):
     assert Image.open(checked / "registration.png").size == (3 * 270, 480 + 22)
 
 
-def test_an_edited_file_is_kept_and_a_check_of_it_works(case, checked, capsys):
-    edited = (checked / "fit.yaml").read_text() + "tracks: 30\n"
-    (checked / "fit.yaml").write_text(edited)
-    assert main(["--config", str(checked / "fit.yaml"), "--output", str(checked / "result"), "--check"]) == 0
-    assert "tracks_0.png" in capsys.readouterr().out
-    given = [str(case / "film.mp4"), "--splat", str(case / "my.ply"), "--output", str(checked), "--check"]
-    assert main([*given, "--length", "object", "2.5", "--up", "+z"]) == 0
-    assert (checked / "fit.1.yaml").read_text() == edited
+@pytest.fixture(scope="module")
+def seen(case):
+    """The first frame with its true camera, and the preview of the splat."""
+    film, cloud, camera = open_film(case / "film.mp4"), read_gaussians(case / "my.ply", 0), camera_of(270, 480)
+    preview = preview_scene(build_options().parse_args([str(case / "my.ply"), "--device=cpu"]), case / "look")
+    return Seen(film, first_frame(film), cloud, camera, painter_of(cloud)(camera)), preview
 
 
-def test_a_length_between_two_places_of_the_first_frame(case):
-    """The pole from its ball to its foot, as the true camera sees them."""
-    from gaussian_swaying.rendering.cameras.camera import project
+def test_known_lengths(seen):
+    """All say that the pole is 2.5 m high, which is the longest side of all."""
+    ends = project(torch.tensor([[-0.03, 0.0, 0.8], [-0.03, 0.0, -1.3]]), camera_of(270, 480))[0]
+    places = ":".join(f"{x:.0f},{y:.0f}" for x, y in ends.tolist())
+    for name, metres in (("object", 2.5), ("pole", 2.5), ("cloth", 1.2), (places, 2.1)):
+        assert longest_side(name, metres, *seen) == pytest.approx(2.5, rel=0.03), name
 
-    ends = torch.tensor([[-0.03, 0.0, 0.8], [-0.03, 0.0, -1.3]])
-    pixel = project(ends, camera_of(270, 480))[0]
-    name = ":".join(f"{x:.0f},{y:.0f}" for x, y in pixel.tolist())
-    given = [str(case / "film.mp4"), "--splat", str(case / "my.ply"), "--length", name, "2.1", "--up", "+z"]
-    assert main([*given, "--output", str(case / "places"), "--check"]) == 0
-    base = yaml.safe_load((case / "places/preview/draft.yaml").read_text())
-    assert base["scene"]["longest_side"] == pytest.approx(1.2, rel=0.05)
+
+@pytest.mark.parametrize(
+    ("name", "told"),
+    [("mast", "no part 'mast': `--length` may name cloth, pole, object"), ("5,5:10,10", "is not on the splat"),
+     ("5:9", "two places"), ("5,5:9999,9", "is not on the splat")],
+)  # fmt: skip
+def test_lengths_of_nothing(seen, name, told):
+    with pytest.raises(ValueError, match=told):
+        longest_side(name, 2.0, *seen)
 
 
 def test_the_extent_does_not_depend_on_the_turn():
@@ -116,19 +123,24 @@ def test_the_extent_does_not_depend_on_the_turn():
         assert extent(points, [0.0, 0.0, 1.0]) == pytest.approx(1.0, abs=0.01)
 
 
-def test_without_a_length_the_result_says_what_follows(case, capsys):
-    """A very small fit to its end: the page, and the sentence on what the values rest on."""
-    given = [str(case / "film.mp4"), "--splat", str(case / "my.ply"), "--up", "+z", "--output", str(case / "own")]
+def test_a_fit_without_a_length_keeps_the_edited_file(case, checked, capsys):
+    """A very small fit to its end: the page, and the sentences on what the values rest on."""
+    edited = (checked / "fit.yaml").read_text() + "tracks: 30\n"
+    (checked / "fit.yaml").write_text(edited)
+    given = [str(case / "film.mp4"), "--splat", str(case / "my.ply"), "--up", "+z", "--output", str(checked)]
     assert main([*given, "--check"]) == 0
     assert "nobody measured" in capsys.readouterr().out
-    text = (case / "own/fit.yaml").read_text().replace("search: 48", "search: 0\nstages: [tracks]\niterations: 1")
-    (case / "own/fit.yaml").write_text(text)
-    assert main(["--config", str(case / "own/fit.yaml"), "--output", str(case / "own/result"), "--device", "cpu"]) == 0
+    assert (checked / "fit.1.yaml").read_text() == edited
+    plan = yaml.safe_load((checked / "fit.yaml").read_text())
+    plan |= {"search": 0, "stages": ["tracks"], "iterations": 1, "until": 0.4}
+    plan["known"] |= {"solver.dx": 0.06}
+    (checked / "small.yaml").write_text(yaml.safe_dump(plan))
+    assert main(["--config", str(checked / "small.yaml"), "--output", str(case / "result"), "--device", "cpu"]) == 0
     told = capsys.readouterr().out
     assert "In its own lengths the speed is" in told
     assert "weigh it" in told
     assert "sees the wind blow to the" in told
-    page = (case / "own/result/page.html").read_text()
+    page = (case / "result/page.html").read_text()
     assert page.count("data:video/mp4;base64,") == 1
     assert page.count("data:image/jpeg;base64,") == 3
     assert "wind.azimuth" in page
@@ -152,14 +164,14 @@ def test_bad_options(words, told, tmp_path, monkeypatch, capsys):
     refused(main, words, capsys, told, folder=tmp_path)
 
 
-def test_films_and_lengths_that_do_not_work(case, capsys):
-    film, splat, out = str(case / "film.mp4"), str(case / "my.ply"), str(case / "bad")
-    for name, told in (("mast", "no part 'mast'"), ("5,5:10,10", "is not on the splat"), ("5:9", "two places")):
-        refused(main, [film, "--splat", splat, "--length", name, "2", "--output", out], capsys, told)
-    for name, shown, told in (("grey", False, "was not found in the first frame"), ("still", True, "Nothing moves")):
-        encoder = VideoEncoder(case / f"{name}.mp4", 30)
-        first = first_frame(open_film(film)).numpy() if shown else np.full((480, 270, 3), 90, np.uint8)
-        for _ in range(10):
-            encoder.write(first)
-        encoder.finish()
-        refused(main, [str(case / f"{name}.mp4"), "--splat", splat, "--output", out], capsys, told)
+@pytest.mark.parametrize(
+    ("shown", "told"), [(False, "was not found in the first frame"), (True, "Nothing moves in the film")]
+)
+def test_films_that_do_not_work(case, shown, told, capsys):
+    first = first_frame(open_film(case / "film.mp4")).numpy() if shown else np.full((480, 270, 3), 90, np.uint8)
+    encoder = VideoEncoder(case / "other.mp4", 30)
+    for _ in range(5):
+        encoder.write(first)
+    encoder.finish()
+    splat, out = str(case / "my.ply"), str(case / "bad")
+    refused(main, [str(case / "other.mp4"), "--splat", splat, "--output", out], capsys, told)

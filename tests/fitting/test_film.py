@@ -11,6 +11,8 @@ from gaussian_swaying.fitting import film as films
 from gaussian_swaying.fitting.film import begins_to_move, first_frame, open_film
 from gaussian_swaying.recording.video import VideoEncoder
 
+pytest.importorskip("cv2")
+
 
 def _film(path, frames, rate=25):
     encoder = VideoEncoder(path, rate)
@@ -51,6 +53,23 @@ def test_what_moves_beside_the_object_does_not_count(tmp_path):
     for k, frame in enumerate(frames):
         frame[80:96, 4 * k : 4 * k + 10] = 255
     assert begins_to_move(open_film(_film(tmp_path / "a.mp4", frames)), _where()) is None
+
+
+def test_a_hand_that_shakes_is_no_motion(tmp_path):
+    """The background shows how it shakes; without one, it cannot be told from motion."""
+    spots = np.random.default_rng(0).integers(40, 200, (24, 40)).repeat(4, 0).repeat(4, 1)[..., None]
+
+    def frames(background):
+        for k in range(30):
+            picture = _square(60 + 2 * max(0, k - 19))
+            empty = np.asarray(picture == 90).all(-1, keepdims=True)
+            if background:
+                picture = np.where(empty, spots, picture).astype(np.uint8)
+            yield np.roll(picture, (round(1.5 * np.sin(k)), round(2 * np.sin(0.7 * k))), (0, 1))
+
+    film = open_film(_film(tmp_path / "a.mp4", frames(True)))
+    assert begins_to_move(film, _where()) == pytest.approx(0.8, abs=0.1)
+    assert begins_to_move(open_film(_film(tmp_path / "b.mp4", frames(False))), _where()) < 0.2
 
 
 def test_a_large_film_is_read_in_reduced_size(tmp_path, monkeypatch):
