@@ -20,6 +20,8 @@ from gaussian_swaying._files import write_json, write_text
 from gaussian_swaying.cli.preview import build_options, preview_scene
 from gaussian_swaying.cli.register import CAMERAS, PICTURE, VIEW, first_cameras, fov_of, painter_of, transforms
 from gaussian_swaying.fitting.film import Film, begins_to_move, first_frame, open_film, pixels_of_focal
+from gaussian_swaying.fitting.held import HeldEnd, held_end
+from gaussian_swaying.fitting.videos import read_videos
 from gaussian_swaying.gaussians.cloud import GaussianCloud
 from gaussian_swaying.preview.results import Preview, keep_aside, write
 from gaussian_swaying.rendering.cameras.camera import Camera
@@ -77,22 +79,29 @@ def prepare(options: argparse.Namespace, folder: Path) -> Path:
         )
     begin = max(0.0, moves - LEAD)
     seconds = min(1.5 * SECONDS + moves - begin, seen.film.seconds - begin)
-    look = folder / LOOK
-    preview = _previewed(options, look, 1.0)
-    if length is not None:
-        ratio = longest_side(*length, seen, preview)
-        if ratio != 1.0:
-            preview = _previewed(options, look, ratio)
-    write(preview, look)
     where = os.path.relpath(seen.film.path.resolve(), folder.resolve())
     data = transforms(seen.camera, where)
     data["frames"][0] |= {"begin": round(begin, 4), "seconds": round(seconds, 4)}
     write_json(folder / CAMERAS, data)
+    look, hold = folder / LOOK, options.hold
+    preview = _previewed(options, look, 1.0, hold)
+    told, held = "", None
+    if hold is None and preview.parts is None and preview.things is None:  # what the splat itself does not show surely
+        held = _held(seen, preview, folder)
+    if held is not None:
+        hold = held.name
+        told = (
+            f"held: {hold}, as the film shows; that end moves by {held.moves:.1f} pixels, the rest by {held.others:.0f}"
+        )
+    ratio = 1.0 if length is None else longest_side(*length, seen, preview)
+    if ratio != 1.0 or hold != options.hold:
+        preview = _previewed(options, look, ratio, hold)
+    write(preview, look)
     text = plan_text(preview, _background(seen), moves - begin, length is not None, folder)
     keep_aside(folder / PLAN, text)
     write_text(folder / PLAN, text)
     print(f"{options.film} moves from {moves:.2f} s on; {begin:.2f} s to {begin + seconds:.2f} s of it are used")
-    print("\n".join(_guesses(preview, options, length)))
+    print("\n".join(_guesses(preview, told, length)))
     print(f"look at {folder / PICTURE}: frame and splat have to show the same; and at {look / 'preview.png'}")
     return folder / PLAN
 
@@ -163,11 +172,17 @@ def _background(seen: Seen) -> list[float]:
     return [round(value / 255, 3) for value in pixels.median(0).values.tolist()]
 
 
-def _previewed(options: argparse.Namespace, folder: Path, longest: float) -> Preview:
-    """The preview of the splat, whose longest side has a length [m]."""
+def _held(seen: Seen, preview: Preview, folder: Path) -> HeldEnd | None:
+    """The end that the film shows to be still."""
+    (video,) = read_videos(folder / CAMERAS)
+    return held_end(video, seen.picture, preview.data["suggestion"]["up"]["direction"])
+
+
+def _previewed(options: argparse.Namespace, folder: Path, longest: float, hold: str | None) -> Preview:
+    """The preview of the splat, whose longest side has a length [m], and which is held at an end, or guessed."""
     words = [str(options.splat), f"--longest-side={longest:.9g}", f"--device={options.device}"]
     given = build_options().parse_args(words)
-    given.up, given.hold = options.up, options.hold
+    given.up, given.hold = options.up, hold
     return preview_scene(given, folder)
 
 
@@ -268,14 +283,14 @@ search: 48                      # simulations of the coarse search
 """
 
 
-def _guesses(preview: Preview, options: argparse.Namespace, length: Any) -> list[str]:
+def _guesses(preview: Preview, told: str, length: Any) -> list[str]:
     """The guesses of the preview, as lines."""
     guess = preview.data["suggestion"]
     hold = guess["hold"]
     lines = [
         f"guessed: up is {[round(v, 2) for v in guess['up']['direction']]} (confidence {guess['up']['confidence']})"
     ]
-    lines.append(f"guessed: held at the {hold['end']} (confidence {hold['confidence']}): {hold['reason']}")
+    lines.append(told or f"guessed: held at the {hold['end']} (confidence {hold['confidence']}): {hold['reason']}")
     if guess["parts"] is not None:
         lines.append("parts: " + ", ".join(f"{n} {p['role']}" for n, p in guess["parts"]["parts"].items()))
     size = " x ".join(f"{side:.3g}" for side in guess["size_m"])

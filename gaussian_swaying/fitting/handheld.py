@@ -51,7 +51,8 @@ class Motion:
 def moves_by(video: Footage, background: Background) -> float:
     """Distance that the background goes in the film of a camera that is said to stand still [pixels].
 
-    It is the median over points, and the largest of :data:`LOOKS` frames. 0 if the background has too few points.
+    It is the median over points and the largest of :data:`LOOKS` frames. Of each point only the motion across its edge
+    counts, as nothing holds it along a plain pole. 0 if the background has too few points.
     """
     import numpy as np
 
@@ -62,12 +63,14 @@ def moves_by(video: Footage, background: Background) -> float:
     if corners is None or len(corners) < LEAST:
         return 0.0
     start, most = corners.reshape(-1, 2) + 0.5, 0.0
+    column, row = corners.reshape(-1, 2).round().astype(int).T
+    across = cv2.cornerEigenValsAndVecs(first, 7, 3)[row, column, 2:4]
     last = len(video.times) - 1
     for k in sorted({round(last * (n + 1) / LOOKS) for n in range(LOOKS)}):
         pair = np.stack([first, grey_of(video.images[k])])[..., None].repeat(3, -1)
         position, seen = follow(pair, start)
         if seen[1].sum() >= LEAST:
-            most = max(most, float(np.median(np.linalg.norm((position[1] - start)[seen[1]], axis=-1))))
+            most = max(most, float(np.median(abs(((position[1] - start) * across)[seen[1]].sum(-1)))))
     return most
 
 

@@ -155,7 +155,7 @@ def grey_of(image: Tensor) -> Any:
     return equal.apply(grey.round().to(torch.uint8).numpy())
 
 
-def _in_space(picture: RenderOutput, camera: Camera, pixel: Any) -> tuple[Any, Any]:
+def in_space(picture: RenderOutput, camera: Camera, pixel: Any) -> tuple[Any, Any]:
     """Places on the surface that pixels (N, 2) of a picture show, float64, and a mask of those whose depth is known."""
     import numpy as np
 
@@ -219,7 +219,7 @@ def _pose(
     """The camera that sees what the picture shows at ``here`` at ``there``; None if too few pairs agree."""
     import numpy as np
 
-    world, known = _in_space(picture, camera, here)
+    world, known = in_space(picture, camera, here)
     world, there = world[known], np.ascontiguousarray(there[known], dtype=np.float64)
     if len(world) < LEAST:
         return None

@@ -11,7 +11,7 @@ from gaussian_swaying.fitting.background import Background
 from gaussian_swaying.fitting.fit import fit
 from gaussian_swaying.fitting.handheld import follow_camera, moves_by, smooth, stands_still
 from gaussian_swaying.fitting.tracks import still_until, track
-from gaussian_swaying.fitting.videos import read_videos
+from gaussian_swaying.fitting.videos import Footage, read_videos
 from gaussian_swaying.rendering.cameras.camera import project
 from gaussian_swaying.simulation.simulation import Simulation
 
@@ -62,7 +62,7 @@ def test_only_the_camera_that_moves_is_seen_to_move(folder, simulation):
     background = Background(simulation)
     moved = {name: moves_by(read_videos(folder / name)[0], background) for name in ("tripod", "hand", "drift")}
     assert moved["tripod"] < 0.2
-    assert moved["hand"] > 5
+    assert moved["hand"] > 3
     assert moved["drift"] == pytest.approx(moved["hand"], abs=0.5)
 
 
@@ -144,3 +144,28 @@ def test_the_wind_is_found_as_from_a_tripod(folder, tmp_path):
         assert result.verdict != "failed", result.text()
     without = fitted("hand", hand_held=False)
     assert without.verdict == "failed"
+
+
+class _All:
+    """A background that is everywhere."""
+
+    def draw(self, camera):
+        return None, torch.ones(camera.height, camera.width, dtype=torch.bool)
+
+
+@pytest.mark.parametrize(("move", "most"), [((0, 3), 0.3), ((3, 0), 3.5)])
+def test_a_plain_pole_holds_no_point_along_itself(move, most):
+    """Faint marks that slide along an upright pole say nothing of the camera; a pole that goes sideways does."""
+    row, column = np.mgrid[:HEIGHT, :WIDTH]
+
+    def frame(right, down):
+        marks = 3.0 * np.sin(0.9 * (row - down)) * np.cos(0.7 * (row - down))
+        pole = (abs(column - 150 - right) < 6) * (90.0 + marks)
+        return (60 + pole).astype(np.uint8)[..., None].repeat(3, -1)
+
+    frames = [frame(*(k / 8 * part for part in move)) for k in range(9)]
+    camera = tripod(WIDTH, HEIGHT)
+    video = Footage("a", tuple(0.1 * k for k in range(9)), (camera,) * 9, torch.from_numpy(np.stack(frames)))
+    moved = moves_by(video, _All())
+    assert moved < most
+    assert move[0] == 0 or moved > 2.0
