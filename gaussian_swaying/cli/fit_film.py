@@ -36,19 +36,22 @@ SOFTER, STIFFER = 1 / 30, 30.0
 """Range of E, per that with which the preview sways visibly."""
 SPEED = (0.5, 25.0)
 """Range of the wind [m/s]."""
+ROUGH = 1.5e-3
+"""Distance of points from where a camera sees them with which it may be wrong, as a share of the picture's diagonal."""
 OBJECT = "object"
 """Name of the whole in ``--length``."""
 
 
 @dataclass(frozen=True)
 class Seen:
-    """The first frame and what it shows: film, frame, splat, camera, and the picture of the splat from there."""
+    """The first frame, the splat, the camera with its residual [pixels], and the splat's picture from there."""
 
     film: Film
     frame: Tensor
     cloud: GaussianCloud
     camera: Camera
     picture: RenderOutput
+    residual: float
 
 
 def prepare(options: argparse.Namespace, folder: Path) -> Path:
@@ -77,6 +80,12 @@ def prepare(options: argparse.Namespace, folder: Path) -> Path:
             f"Nothing moves in the film {options.film} where the splat is: look at {folder / PICTURE}, and give a film "
             "in which the wind moves it."
         )
+    at_once = moves < 1.5 / seen.film.fps
+    if at_once and seen.residual > ROUGH * math.hypot(seen.film.width, seen.film.height):
+        raise ValueError(
+            f"The film {options.film} begins in motion, and its camera was found to {seen.residual:.1f} pixels only: "
+            "cut it so that it begins with the object at rest, or write a fit file with a camera that you know."
+        )
     begin = max(0.0, moves - LEAD)
     seconds = min(1.5 * SECONDS + moves - begin, seen.film.seconds - begin)
     where = os.path.relpath(seen.film.path.resolve(), folder.resolve())
@@ -97,7 +106,7 @@ def prepare(options: argparse.Namespace, folder: Path) -> Path:
     if ratio != 1.0 or hold != options.hold:
         preview = _previewed(options, look, ratio, hold)
     write(preview, look)
-    text = plan_text(preview, _background(seen), moves - begin, length is not None, folder)
+    text = plan_text(preview, _background(seen), None if at_once else moves - begin, length is not None, folder)
     keep_aside(folder / PLAN, text)
     write_text(folder / PLAN, text)
     print(f"{options.film} moves from {moves:.2f} s on; {begin:.2f} s to {begin + seconds:.2f} s of it are used")
@@ -146,7 +155,7 @@ def _registered(options: argparse.Namespace) -> tuple[Seen, str]:
         f"camera: {found.agreeing} of {found.matches} points agree, {found.residual:.1f} pixels off; focal length "
         f"{source} ({fov_of(found.camera):.0f} degrees from top to bottom)"
     )
-    return Seen(film, frame, cloud, found.camera, draw(found.camera)), told
+    return Seen(film, frame, cloud, found.camera, draw(found.camera), found.residual), told
 
 
 def _direction(words: Sequence[str]) -> list[float]:
@@ -241,13 +250,13 @@ def _place(name: str, number: int, seen: Seen) -> Tensor:
     return view[:3, :3].T @ (depth * ray.double() - view[:3, 3])
 
 
-def plan_text(preview: Preview, background: Sequence[float], still: float, scaled: bool, folder: Path) -> str:
+def plan_text(preview: Preview, background: Sequence[float], still: float | None, scaled: bool, folder: Path) -> str:
     """The fit file.
 
     Args:
         preview: Of the splat.
         background: Colour behind it in the film.
-        still: Time at rest before the motion [s].
+        still: Time at rest before the motion [s]; None if the film may begin in motion.
         scaled: Whether a length is known.
         folder: Of the fit file.
     """
@@ -258,29 +267,28 @@ def plan_text(preview: Preview, background: Sequence[float], still: float, scale
     if guess["hold"]["end"] == "side":  # a flag flies away from its pole
         middle, half = math.degrees(math.atan2(guess["flow"][1], guess["flow"][0])), 120.0
     around = [round(middle - half), round(middle + half)]
-    start = ""
-    if still >= 0.05:
-        entry = f"  film.start: {{range: [0.0, {still + 0.1:.2f}], start: {0.8 * still:.2f}}}"
-        start = f"{entry}   # s; when the motion starts\n"
+    first, last = (-1.0, 0.1) if still is None else (0.0, round(still + 0.1, 2))
+    still = still or 0.0
     again = shlex.join([*program.words("fit"), "--config", str(folder / PLAN), "--output", str(folder / RESULT)])
-    return f"""\
-# Made from a film. Every number may be changed; then:
-#   {again}
-base: {LOOK}/draft.yaml           # the splat, what holds it, its material: guesses; {LOOK}/starter.yaml is finer
-videos: {CAMERAS}          # the part of the film that is used, and its camera
-known:                          # replaces what the base says
-  wind.modulations: []          # a steady wind
-  background: {background}   # around the splat in the film
-  material.density: {material["density"]:<12g}# kg/m3; not measured
-  material.thickness: {material["thickness"]:<10.4g}# m; with the density it makes the mass of an area
-assumed: [{"mass" if scaled else "mass, length"}]        # not measured; the result says what follows
-unknowns:
-  wind.speed: {{range: [{SPEED[0]}, {SPEED[1]}]}}                # m/s
-  wind.azimuth: {{range: {around}}}            # degrees from +x towards +y, with z up
-  material.E: {{range: [{low:g}, {high:g}]}}           # Pa
-{start}until: {still + SECONDS:.2f}                     # s of the used part that are fitted; the rest is predicted
-search: 48                      # simulations of the coarse search
-"""
+    lines = [
+        (f"base: {LOOK}/draft.yaml", f"the splat, what holds it, its material: guesses; {LOOK}/starter.yaml is finer"),
+        (f"videos: {CAMERAS}", "the part of the film that is used, and its camera"),
+        ("known:", "replaces what the base says"),
+        ("  wind.modulations: []", "a steady wind"),
+        (f"  background: {list(background)}", "around the splat in the film"),
+        (f"  material.density: {material['density']:g}", "kg/m3; not measured"),
+        (f"  material.thickness: {material['thickness']:.4g}", "m; with the density it makes the mass of an area"),
+        (f"assumed: [{'mass' if scaled else 'mass, length'}]", "not measured; the result says what follows"),
+        ("unknowns:", "with the ranges in which they are sought"),
+        (f"  wind.speed: {{range: {list(SPEED)}}}", "m/s"),
+        (f"  wind.azimuth: {{range: {around}}}", "degrees from +x towards +y, with z up"),
+        (f"  material.E: {{range: [{low:.1e}, {high:.1e}]}}", "Pa"),
+        (f"  film.start: {{range: [{first}, {last}]}}", "s; when the motion starts; before 0 for a film in motion"),
+        (f"until: {still + SECONDS:.2f}", "s of the used part that are fitted; the rest is predicted"),
+        ("search: 48", "simulations of the coarse search"),
+    ]
+    head = f"# Made from a film. Every number may be changed; then:\n#   {again}\n"
+    return head + "".join(f"{line:<44}# {told}\n" for line, told in lines)
 
 
 def _guesses(preview: Preview, told: str, length: Any) -> list[str]:

@@ -94,7 +94,7 @@ def seen(case):
     """The first frame with its true camera, and the preview of the splat."""
     film, cloud, camera = open_film(case / "film.mp4"), read_gaussians(case / "my.ply", 0), camera_of(270, 480)
     preview = preview_scene(build_options().parse_args([str(case / "my.ply"), "--device=cpu"]), case / "look")
-    return Seen(film, first_frame(film), cloud, camera, painter_of(cloud)(camera)), preview
+    return Seen(film, first_frame(film), cloud, camera, painter_of(cloud)(camera), 0.0), preview
 
 
 def test_known_lengths(seen):
