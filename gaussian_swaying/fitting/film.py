@@ -125,7 +125,7 @@ def begins_to_move(film: Film, where: Tensor) -> float | None:
 
 
 def _differs(first: Any, grey: Any, where: Any) -> bool:
-    """Whether some pixels of a frame are not those of the first one, but for its brightness."""
+    """Return whether some pixels of a frame are not those of the first one, but for its brightness."""
     before, now = (picture[where].astype(float) for picture in (first, grey))
     level = now * (before.mean() / max(now.mean(), 1.0))
     return bool((abs(level - before) > DIFFERENT).mean() > MOVED)
