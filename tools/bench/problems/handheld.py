@@ -14,6 +14,7 @@ from torch import Tensor
 
 from bench.problems.films import opengl
 from bench.record import Row
+from gaussian_swaying.gaussians.harmonics import SH_DC
 from gaussian_swaying.gaussians.ply import write_ply
 from gaussian_swaying.geometry.rotations import rotation_of
 from gaussian_swaying.rendering.cameras.camera import Camera, look_at_camera
@@ -26,22 +27,28 @@ MIDDLE = (0.2, 0.05, 0.15)
 """The point at which the hand aims [m]."""
 
 
-def write_base(folder: Path, spacing: float = 0.025, wall: float = 0.02, film: str = "film") -> Path:
+def write_base(folder: Path, spacing: float = 0.025, wall: float = 0.02, back: bool = True, worn: bool = False) -> Path:
     """Write the splat of a flag before two walls, ``room.ply``, and the configuration of its simulation.
 
     Args:
         folder: Where to write.
         spacing: Distance between the Gaussians of the flag [m].
         wall: The same of the walls; not finite for none.
-        film: The folder of the film.
+        back: Whether there is a wall behind the flag, and not just one beside it.
+        worn: Whether the splat has faults, as a capture has: colours that are off by 0.05, and walls by 3 mm.
     """
     folder.mkdir(parents=True, exist_ok=True)
-    cloud = FlagScene(0.4, 0.3, spacing, ripple=0.01, pattern="printed").generate()
+    flag = cloud = FlagScene(0.4, 0.3, spacing, ripple=0.01, pattern="printed").generate()
     if math.isfinite(wall):
-        back = FlagScene(2.4, 1.6, wall, ripple=0.05, pattern="printed").generate()
-        side = FlagScene(0.5, 1.6, wall, ripple=0.03, pattern="printed", yaw=65).generate()
-        for part, shift in ((back, (-0.9, 0.6, -0.7)), (side, (0.75, 0.1, -0.7))):
+        behind = FlagScene(2.4, 1.6, wall, ripple=0.05, pattern="printed").generate()
+        beside = FlagScene(0.5, 1.6, wall, ripple=0.03, pattern="printed", yaw=65).generate()
+        for part, shift in [(behind, (-0.9, 0.6, -0.7))] * back + [(beside, (0.75, 0.1, -0.7))]:
             cloud = both(cloud, replace(part, means=part.means + torch.tensor(shift)))
+    if worn:
+        generator = torch.Generator().manual_seed(0)
+        colour, place = (torch.randn(shape, generator=generator) for shape in (cloud.sh.shape, cloud.means.shape))
+        place[: len(flag.means)] = 0
+        cloud = replace(cloud, sh=cloud.sh + 0.05 / SH_DC * colour, means=cloud.means + 0.003 * place)
     write_ply(folder / "room.ply", cloud)
     sheet = {"class_path": "Box", "init_args": {"min": [None, -0.06, None], "max": [0.5, 0.06, None]}}
     pole = {"class_path": "Box", "init_args": {"min": [None] * 3, "max": [0.06, None, None]}}
