@@ -25,12 +25,16 @@ RATIO = 0.8
 """Largest distance of a feature to its match, per that to the next best one (Lowe 2004)."""
 NEAR = 0.006
 """Largest distance between a point and its match that agree on a camera, as a share of the picture's diagonal."""
+CLOSE = 1.5
+"""The same of points that are followed on thin things [pixels]."""
 LEAST = 12
 """Fewest matches that make a camera."""
 SOLID = 0.9
 """Least opacity of the picture at a feature, whose depth is then known."""
 ENOUGH = 60
 """Features that agree with which none need to be followed."""
+REFINED = 5
+"""Times that a camera is refined and the points that agree on it are chosen anew."""
 ROUNDS = 3
 """Pictures that are drawn from a camera that is already near, for features and for points that are followed."""
 
@@ -144,7 +148,8 @@ def refine(frame: Tensor, picture: RenderOutput, camera: Camera, where: Tensor) 
     Returns:
         None if too few points agree.
     """
-    return _by_flow(opencv(), grey_of(frame), picture, camera, False, where)
+    near = NEAR * math.hypot(camera.width, camera.height)
+    return _by_flow(opencv(), grey_of(frame), picture, camera, False, near, where)
 
 
 def grey_of(image: Tensor) -> Any:
@@ -195,7 +200,13 @@ def _by_features(
 
 
 def _by_flow(
-    cv2: Any, grey: Any, picture: RenderOutput, camera: Camera, focal: bool, where: Tensor | None = None
+    cv2: Any,
+    grey: Any,
+    picture: RenderOutput,
+    camera: Camera,
+    focal: bool,
+    near: float = CLOSE,
+    where: Tensor | None = None,
 ) -> Registration | None:
     """The camera from points that are followed from the picture to the frame; None if too few are."""
     import numpy as np
@@ -210,7 +221,7 @@ def _by_flow(
     here = corners.reshape(-1, 2).astype(np.float64) + 0.5
     colours = np.stack([drawn, grey])[..., None].repeat(3, -1)
     place, seen = follow(colours, here)
-    return _pose(cv2, picture, camera, here[seen[1]], place[1][seen[1]], focal, 1.5)
+    return _pose(cv2, picture, camera, here[seen[1]], place[1][seen[1]], focal, near)
 
 
 def _pose(
@@ -230,7 +241,12 @@ def _pose(
     if not done or index is None or len(index) < LEAST:
         return None
     index = index[:, 0]
-    turn, shift = cv2.solvePnPRefineLM(world[index], there[index], K, None, turn, shift)
+    for _ in range(REFINED):
+        turn, shift = cv2.solvePnPRefineLM(world[index], there[index], K, None, turn, shift)
+        off = cv2.projectPoints(world, turn, shift, K, None)[0].reshape(-1, 2) - there
+        index = np.flatnonzero(np.linalg.norm(off, axis=1) < near)
+        if len(index) < LEAST:
+            return None
     if focal:
         flags = cv2.CALIB_USE_INTRINSIC_GUESS | cv2.CALIB_FIX_PRINCIPAL_POINT | cv2.CALIB_FIX_ASPECT_RATIO
         flags |= cv2.CALIB_ZERO_TANGENT_DIST | cv2.CALIB_FIX_K1 | cv2.CALIB_FIX_K2 | cv2.CALIB_FIX_K3
