@@ -16,13 +16,21 @@ from gaussian_swaying.fitting.variants import Values, states_of
 from gaussian_swaying.fitting.videos import Footage
 from gaussian_swaying.gaussians.model import DeformedGaussians
 from gaussian_swaying.mpm.state import State
-from gaussian_swaying.rendering.cameras.camera import project
+from gaussian_swaying.rendering.cameras.camera import Camera, project
 from gaussian_swaying.simulation.diagnostics import SimulationDiverged
 from gaussian_swaying.simulation.painter import Painter
 from gaussian_swaying.simulation.simulation import Simulation
 
+LEAST_FACING = 0.05
+"""Least weight of the residuals of a point that is seen edge-on."""
+MOMENTS = 4
+"""Parts of the time, which sort residuals into clusters of errors that are alike all over the object."""
 PATCHES = 4
 """Squares along each side of the grid that sorts tracks and pixels into clusters of correlated errors."""
+
+
+Parts = dict[str, list[tuple[Tensor, Tensor, Tensor]]]
+"""Residuals of each kind, with their clusters and moments, frame by frame."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -34,11 +42,17 @@ class Block:
         values: Differences between simulation and video for each variant, float64, shape (B, R, D); in pixels for
             tracks, else in grey levels from 0 to 1.
         cluster: Index of the cluster of correlated residuals that each belongs to, shape (R,).
+        moment: Index of the part of the time that each belongs to, shape (R,); None if all are of one.
     """
 
     kind: str
     values: Tensor
     cluster: Tensor
+    moment: Tensor | None = None
+
+    def of(self, values: Tensor) -> Block:
+        """The block with other values."""
+        return Block(self.kind, values, self.cluster, self.moment)
 
 
 class Evidence(ABC):
@@ -79,21 +93,36 @@ class Evidence(ABC):
 class TrackEvidence(Evidence):
     """Residuals of tracks: positions of Gaussians in the simulation minus those tracked in the video [pixels].
 
+    Args:
+        simulation: The simulation.
+        video: The video.
+        tracks: Its tracks.
+        weighed: Multiply each residual by :func:`facing`, as a camera that sees a surface edge-on hardly tells where
+            its points are.
+
     Attributes:
         rest: Places of the Gaussians at rest [scene units], on the CPU, shape (T, 3).
     """
 
     kind, floor = "tracks", 0.05
 
-    def __init__(self, simulation: Simulation, video: Footage, tracks: Tracks) -> None:
+    def __init__(self, simulation: Simulation, video: Footage, tracks: Tracks, weighed: bool = False) -> None:
         super().__init__(video)
         scene = simulation.scene
-        self.tracks = tracks
+        self.tracks, self._weighed = tracks, weighed
         index = tracks.index.to(scene.moving.device)
         self._follow = scene.follow.some(index).to(scene.moving.device)
         self._means = scene.model.means.detach()[scene.moving[index]]
         self.rest = self._means.cpu()
         self._cluster = _patch_of(self.rest)
+        self._weight = torch.ones(len(index), 1, dtype=torch.float64)
+        if weighed:
+            normals = scene.rest().normals[scene.moving[index]].cpu()
+            self._weight = facing(normals, self.rest, video.cameras[0])[:, None]
+
+    def on(self, simulation: Simulation) -> TrackEvidence:
+        """The same tracks for the same scene on another grid."""
+        return TrackEvidence(simulation, self.video, self.tracks, self._weighed)
 
     def shown(self, simulation: Simulation, states: Sequence[State]) -> Tensor:
         """Places of the Gaussians [scene units], shape (B, T, 3)."""
@@ -106,7 +135,7 @@ class TrackEvidence(Evidence):
         pixel = project(shown[:, seen].flatten(0, 1), self.video.cameras[frame])[0].unflatten(
             0, (len(shown), int(seen.sum()))
         )
-        return pixel - self.tracks.position[frame, seen], self._cluster[seen]
+        return self._weight[seen] * (pixel - self.tracks.position[frame, seen]), self._cluster[seen]
 
 
 class PictureEvidence(Evidence):
@@ -177,9 +206,10 @@ def compare(
         One block for each kind, joined over cameras and times; clusters of different kinds and, for pictures, cameras
         differ.
     """
-    parts: dict[str, list[tuple[Tensor, Tensor]]] = {}
+    parts: Parts = {}
     try:
-        for time, states in zip(times, states_of(simulation, values, times, alike=careful), strict=True):
+        runs = states_of(simulation, values, times, alike=careful)
+        for number, (time, states) in enumerate(zip(times, runs, strict=True)):
             if time <= 0 and not moving:  # at rest all variants are alike
                 continue
             for place, part in enumerate(evidence):
@@ -188,7 +218,8 @@ def compare(
                     continue
                 found, cluster = part.residuals(simulation, states, frame)
                 shift = 0 if part.kind == "tracks" else place * PATCHES**2
-                parts.setdefault(part.kind, []).append((found, cluster + shift))
+                moment = torch.full_like(cluster, number * MOMENTS // len(times))
+                parts.setdefault(part.kind, []).append((found, cluster + shift, moment))
     except SimulationDiverged:
         if not careful:
             raise
@@ -221,23 +252,25 @@ def compare_starts(
             wanted.setdefault(round(1e6 * max(0.0, time - start)), []).append((number, time))
     moments = sorted(wanted)
     own = [{name: value for name, value in one.items() if name != FILM_START} for one in values]
-    parts: list[dict[str, list[tuple[Tensor, Tensor]]]] = [{} for _ in starts]
+    parts: list[Parts] = [{} for _ in starts]
     runs = states_of(simulation, own, [1e-6 * moment for moment in moments], alike=False)
     for moment, states in zip(moments, runs, strict=True):
         for part in evidence:
             shown = part.shown(simulation, states)
             for number, time in wanted[moment]:
                 if (frame := part.frame_at(time)) is not None:
-                    parts[number].setdefault(part.kind, []).append(part.beside(shown, frame))
+                    found, cluster = part.beside(shown, frame)
+                    parts[number].setdefault(part.kind, []).append((found, cluster, torch.zeros_like(cluster)))
     return [_joined(own) for own in parts]
 
 
-def _joined(parts: Mapping[str, Sequence[tuple[Tensor, Tensor]]]) -> list[Block]:
-    """One block for each kind of residuals and their clusters."""
-    return [
-        Block(kind, torch.cat([found for found, _ in own], 1), torch.cat([cluster for _, cluster in own]))
-        for kind, own in parts.items()
-    ]
+def _joined(parts: Parts) -> list[Block]:
+    """One block for each kind of residuals, with their clusters and moments."""
+    found = []
+    for kind, own in parts.items():
+        values, cluster, moment = zip(*own, strict=True)
+        found.append(Block(kind, torch.cat(values, 1), torch.cat(cluster), torch.cat(moment)))
+    return found
 
 
 def scales_of(blocks: Sequence[Block], floors: Mapping[str, float], member: int = 0) -> dict[str, float]:
@@ -251,6 +284,13 @@ def scales_of(blocks: Sequence[Block], floors: Mapping[str, float], member: int 
         sigma = float(size.nanmedian()) / middle if size.numel() else 0.0
         found[block.kind] = max(sigma, floors[block.kind])
     return found
+
+
+def facing(normals: Tensor, points: Tensor, camera: Camera) -> Tensor:
+    """Foreshortening of surfaces with some normals at some points (T, 3) in a camera, shape (T,): 1 if seen face-on."""
+    view = camera.world_to_camera.cpu().double()
+    ray = torch.nn.functional.normalize(points.double() + view[:3, :3].T @ view[:3, 3], dim=-1)
+    return (normals.double() * ray).sum(-1).abs().clamp(min=LEAST_FACING)
 
 
 def _patch_of(points: Tensor) -> Tensor:

@@ -6,6 +6,7 @@ import math
 import os
 import sys
 import time
+import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
@@ -31,12 +32,14 @@ from gaussian_swaying.fitting.identifiability import check_apart, directions
 from gaussian_swaying.fitting.least_squares import (
     LEAST_GAIN,
     START,
+    DivergedError,
     Normal,
     Progress,
     huber,
     iterate,
     normal_equations,
     sensitivities,
+    shift_by,
     unsettled,
 )
 from gaussian_swaying.fitting.plan import Plan, parse_base, read_unknown
@@ -76,6 +79,22 @@ ROUGH = 30
 
 LONG_STILL = 0.05
 """Longest time that a film may be still, if the start of its motion is no unknown [s]; slow objects need a frame."""
+SPREAD = ("wind.speed", "wind.azimuth")
+"""Unknowns whose starts are spread over their ranges although one was given."""
+APART, SAME = 0.15, 0.03
+"""Least distance between starts, and largest between ends that are the same, as a share of a range."""
+BRIEF = 4
+"""Most iterations of a short solve at a horizon."""
+RIVAL = 1.15
+"""Cost per that of the best end below which another end is as good."""
+NOISE = 0.5
+"""Distance of a track that its own error explains [pixels]."""
+DRAG = ("aero.C_D", "aero.C_F")
+"""Coefficients that scale the force of the wind."""
+HELD, LEAST_HELD = 7, 6
+"""One of so many tracks is not fitted, if there are at least so many of them."""
+GRIDS = (0.8, 1.25)
+"""Cells of other grids that tell the error of the grid, per its own."""
 BEGUN, BEGINS = 12, 10
 """Simulations that are compared with the first frame of a film in motion, and starts of each."""
 MOST_STARTS = 60
@@ -94,6 +113,7 @@ class Course:
         step: Number of the step, which is a stage at a horizon.
         place: Values of the unknowns, as shares of their ranges.
         first: Values (as shares) whose simulation the first frame looks like; empty if it shows the scene at rest.
+        rivals: Where other starts ended, as shares, to be compared with the end.
         matched: Values (as shares) at which the Gaussians of the current step were matched; empty if they were not.
         damping: See :class:`~gaussian_swaying.fitting.least_squares.Progress`.
         iteration: Iterations done in this step.
@@ -106,6 +126,7 @@ class Course:
     step: int = -1
     place: list[float] = field(default_factory=list)
     first: list[float] = field(default_factory=list)
+    rivals: list[list[float]] = field(default_factory=list)
     matched: list[float] = field(default_factory=list)
     damping: float = START
     iteration: int = 0
@@ -123,6 +144,8 @@ class Fit:
         videos: From :func:`~gaussian_swaying.fitting.videos.read_videos`.
         plan: The unknowns, and how to find them.
         say: Called with a line for each thing that is done.
+        on_grid: Makes the simulation with cells so many times as large, to know what the grid does to the values; None
+            to leave that.
         judged: What the background said of the videos, see :func:`~gaussian_swaying.fitting.prepared.prepared`.
 
     Raises:
@@ -136,10 +159,11 @@ class Fit:
         plan: Plan,
         say: Say = lambda line: None,
         judged: Sequence[Judged] = (),
+        on_grid: Callable[[float], Simulation] | None = None,
     ) -> None:
         check_unknowns(simulation, plan.unknowns)
         self.simulation, self.videos, self.plan, self.say = simulation, list(videos), plan, say
-        self.judged = tuple(judged)
+        self.judged, self.on_grid = tuple(judged), on_grid
         self.times = frame_times(videos)
         fitted = max(3, round(plan.fit_share * len(self.times)))
         if plan.until is not None:
@@ -216,7 +240,7 @@ class Fit:
             return [PictureEvidence(video, masks=False) for video in self.videos]
         if stage == "tracks" or (stage == "silhouettes" and "tracks" in self.stages):
             pairs = zip(self.videos, self.tracks, strict=True)
-            found += [TrackEvidence(self.simulation, video, tracks) for video, tracks in pairs]
+            found += [TrackEvidence(self.simulation, video, _fitted(tracks), weighed=True) for video, tracks in pairs]
         if stage == "silhouettes":
             found += [PictureEvidence(video, masks=True) for video in self.videos if video.masks is not None]
         if stage == "matches":
@@ -234,7 +258,8 @@ class Fit:
             match(self.simulation, v, own, self.plan.tracks, self.moving)
             for v, own in zip(self.videos, states, strict=True)
         ]
-        return [TrackEvidence(self.simulation, v, own) for v, own in zip(self.videos, tracks, strict=True)]
+        pairs = zip(self.videos, tracks, strict=True)
+        return [TrackEvidence(self.simulation, v, _fitted(own), weighed=True) for v, own in pairs]
 
     def _run(self, places: Tensor, times: Sequence[float]) -> Any:
         return states_of(self.simulation, [self.values(place) for place in places], times, alike=False)
@@ -269,16 +294,22 @@ class Fit:
             found += [(stage, share) for share in shares]
         return found
 
-    def search(self) -> list[float]:
-        """Return the best values of a coarse search: Sobol's sequence over the ranges, then draws around the best.
+    def search(self) -> list[list[float]]:
+        """Return the best starts of a coarse search: Sobol's sequence over the ranges, then draws around the best.
 
-        Coefficients and damping stay in the middle of their ranges. Simulations of similar stiffness are one batch.
+        Coefficients and damping stay in the middle of their ranges, and what has a ``start`` stays there, but for
+        :data:`SPREAD`. Values that were given are the first start. Simulations of similar stiffness are one batch.
         """
         unknowns, plan = self.plan.unknowns, self.plan
         begin = [0.5 if u.start is None else u.share(u.start) for u in unknowns]
-        moving = [k for k, u in enumerate(unknowns) if u.start is None and not u.name.startswith(("aero.", "solver."))]
+        given = any(u.start is not None for u in unknowns)
+        moving = [
+            k
+            for k, u in enumerate(unknowns)
+            if (u.start is None or u.name in SPREAD) and not u.name.startswith(("aero.", "solver."))
+        ]
         if not plan.search or not moving:
-            return begin
+            return [begin]
         places = torch.tensor([begin]).repeat(max(1, 3 * plan.search // 4), 1).double()
         sobol = torch.quasirandom.SobolEngine(len(moving), scramble=True, seed=plan.seed)
         places[:, moving] = sobol.draw(len(places)).double()
@@ -287,17 +318,73 @@ class Fit:
         first = self.stages[0]
         evidence = self.evidence("tracks" if first == "matches" else first)
         times = self.fitted[: max(3, round(SEARCHED * len(self.fitted)))]
+        places = torch.cat([torch.tensor([begin] * given, dtype=torch.float64).reshape(-1, len(begin)), places])
         places, costs = self._coarse(places, evidence, times)
         generator = torch.Generator().manual_seed(plan.seed)
-        near = places[int(costs.argmin())].repeat(plan.search - len(places), 1)
+        near = places[int(costs.argmin())].repeat(plan.search - 3 * plan.search // 4, 1)
         if len(near):
             shift = torch.randn(len(near), len(moving), generator=generator, dtype=torch.float64)
             near[:, moving] = (near[:, moving] + NEAR * shift).clamp(0.02, 0.98)
             near, others = self._coarse(near, evidence, times)
             places, costs = torch.cat([places, near]), torch.cat([costs, others])
         if not bool(torch.isfinite(costs).any()):
-            raise ValueError("Every simulation of the coarse search diverged: narrow the ranges of `unknowns`.")
-        return [float(share) for share in places[int(costs.argmin())]]
+            raise DivergedError("Every simulation of the coarse search diverged: narrow the ranges of `unknowns`.")
+        found = places[:1].tolist() if given else []
+        for place in places[costs.argsort()].tolist():
+            apart = all(max(abs(place[k] - other[k]) for k in moving) > APART for other in found)
+            if len(found) < plan.starts and apart:
+                found.append(place)
+        return found
+
+    def best_of(self, places: Sequence[Sequence[float]]) -> list[list[float]]:
+        """Solve from several starts for a short while, and return the best end, and others with nearly its cost.
+
+        Horizons grow, and at each the worse half is left.
+        """
+        if len(places) < 2:
+            return [list(place) for place in places]
+        evidence = self.evidence("tracks" if self.stages[0] == "matches" else self.stages[0])
+        kept, left = [list(place) for place in places], len(places)
+        for share in HORIZONS:
+            times = self.fitted[: max(3, round(share * len(self.fitted)))]
+            ended, costs = self._brief(kept, evidence, times)
+            for place, cost in zip(ended, costs, strict=True):
+                self.say(f"start to {times[-1]:.3g} s: cost {cost:.3g}, {self._shown(place)}")
+            left = (left + 1) // 2
+            kept = ended[:left]
+        return kept[:1] + [place for place, cost in zip(ended[1:], costs[1:], strict=True) if cost < 2 * costs[0]][:1]
+
+    def _brief(
+        self, places: Sequence[Sequence[float]], evidence: Sequence[Evidence], times: Sequence[float]
+    ) -> tuple[list[list[float]], list[float]]:
+        """Short solves from some places: their ends, apart from each other and the best first, and their costs."""
+        floors = {part.kind: part.floor for part in evidence}
+        residuals, ended = self.residuals(evidence, times), []
+        for place in places:
+            progress = Progress(torch.tensor(place, dtype=torch.float64))
+            with suppress(DivergedError):
+                while not progress.done and progress.iteration < BRIEF:
+                    iterate(residuals, lambda b: scales_of(b, floors), progress, ROUGH * TOLERANCE, ROUGH * LEAST_GAIN)
+                ended.append(progress.place)
+        if not ended:
+            raise DivergedError("Every simulation of a start diverged: narrow the ranges of `unknowns`.")
+        blocks = residuals(torch.stack(ended))
+        each = [scales_of(blocks, floors, k) for k in range(len(ended))]
+        costs = huber(blocks, {kind: min(one[kind] for one in each) for kind in floors})
+        apart: list[int] = []
+        for k in costs.argsort().tolist():
+            if all(float((ended[k] - ended[j]).abs().amax()) > SAME for j in apart):
+                apart.append(k)
+        return [ended[k].tolist() for k in apart], [float(costs[k]) for k in apart]
+
+    def _as_good(self, place: Sequence[float], others: Sequence[Sequence[float]]) -> list[dict[str, float]]:
+        """Values that other starts end at, over all fitted frames, with nearly the cost of a place."""
+        if not others:
+            return []
+        evidence = self.evidence("tracks" if self.stages[0] == "matches" else self.stages[0])
+        ended, costs = self._brief([place, *others], evidence, self.fitted)
+        near = [end for end, cost in zip(ended, costs, strict=True) if cost < RIVAL * costs[0]]
+        return [self.values(end) for end in near if max(abs(a - b) for a, b in zip(end, place, strict=True)) > 2 * SAME]
 
     def _coarse(self, places: Tensor, evidence: Sequence[Evidence], times: Sequence[float]) -> tuple[Tensor, Tensor]:
         """Return the places with the best start of the motion for each, and their costs.
@@ -336,7 +423,7 @@ class Fit:
         if course.step < 0:
             for note in self.notes():
                 self.say(note)
-            course.place = self.search()
+            course.place, *course.rivals = self.best_of(self.search())
             course.first = list(self.first)
             self.say(f"search: {self._shown(course.place)}")
             self._check_apart(course)
@@ -375,7 +462,7 @@ class Fit:
             course.ended = ""
             keep(course)
         place = torch.tensor(course.place, dtype=torch.float64)
-        normal = self._normal(place, evidence or self.evidence(steps[-1][0], course.place), self.fitted)
+        normal, model = self._at_the_end(place, evidence or self.evidence(steps[-1][0], course.place))
         found = directions(normal.matrix, self.plan.unknowns, place)
         course.seconds = time.monotonic() - clock
         followed = _Followed(self) if self.followed else None
@@ -390,7 +477,7 @@ class Fit:
         return Result(
             self.plan.unknowns,
             tuple(course.place),
-            normal.covariance(),
+            normal.covariance() + model,
             found,
             shown,
             course.history,
@@ -399,14 +486,45 @@ class Fit:
             tuple(self.notes()),
             {} if followed is None else followed.shares(),
             judged=self.judged,
+            rivals=self._as_good(course.place, course.rivals),
         )
+
+    def _at_the_end(self, place: Tensor, evidence: Sequence[Evidence]) -> tuple[Normal, Tensor]:
+        """The normal equations at a place, and the covariance that the grid adds, shape (U, U).
+
+        The residuals on a finer and on a coarser grid move the minimum, mostly as the body lies otherwise in cells.
+        """
+        blocks, steps = sensitivities(self.residuals(evidence, self.fitted), place)
+        scales = scales_of(blocks, {part.kind: part.floor for part in evidence})
+        normal = normal_equations(blocks, scales, steps)
+        model = torch.zeros_like(normal.matrix)
+        for ratio in GRIDS if self.on_grid else ():
+            assert self.on_grid is not None
+            with warnings.catch_warnings():  # of an object of few cells
+                warnings.simplefilter("ignore")
+                other = self.on_grid(ratio)
+            own = [e.on(other) if isinstance(e, TrackEvidence) else e for e in evidence]
+            others = compare(other, own, [self.values(place)], self.fitted, moving=self.moving)
+            shift = shift_by(normal, blocks, others, scales, steps)
+            model += torch.outer(shift, shift)
+        return normal, model
 
     def _normal(self, place: Tensor, evidence: Sequence[Evidence], times: Sequence[float]) -> Normal:
         blocks, steps = sensitivities(self.residuals(evidence, times), place)
         return normal_equations(blocks, scales_of(blocks, {part.kind: part.floor for part in evidence}), steps)
 
     def notes(self) -> list[str]:
-        """Sentences on what speaks against the plan in the videos: a film that is still, without such an unknown."""
+        """Sentences on what speaks against the plan: unknowns that are confounded, a start that is missing."""
+        names = [u.name for u in self.plan.unknowns]
+        confounded = [
+            f"wind.speed and {name} move the object in nearly the same way, so both may be far off: put one of them "
+            "into `known`."
+            for name in DRAG
+            if name in names and "wind.speed" in names
+        ]
+        return confounded + self._notes_on_start()
+
+    def _notes_on_start(self) -> list[str]:
         if FILM_START in (u.name for u in self.plan.unknowns) or not self.followed:
             return []
         still = min(still_until(self.simulation, v, own) for v, own in zip(self.videos, self.tracks, strict=True))
@@ -438,12 +556,12 @@ class Fit:
 
 
 class _Followed:
-    """The share of the motion of the tracks that a simulation explains, added up frame by frame."""
+    """The share of the motion of tracks that were not fitted which a simulation explains, added up frame by frame."""
 
     def __init__(self, fit_: Fit) -> None:
         self._simulation = fit_.simulation
         self._own = {
-            video.name: TrackEvidence(fit_.simulation, video, tracks)
+            video.name: TrackEvidence(fit_.simulation, video, _held_out(tracks))
             for video, tracks in zip(fit_.videos, fit_.tracks, strict=True)
         }
         self._left = dict.fromkeys(self._own, 0.0)
@@ -456,13 +574,32 @@ class _Followed:
                 continue
             tracks = own.tracks
             seen = tracks.seen[frame]
+            if not bool(seen.any()):
+                continue
             moved = tracks.position[frame, seen] - project(own.rest[seen], own.video.cameras[frame])[0]
-            self._left[name] += float(own.residuals(self._simulation, [state], frame)[0].square().sum())
+            off = own.residuals(self._simulation, [state], frame)[0].square().sum(-1)
+            self._left[name] += float((off - NOISE**2).clamp(min=0).sum())
             self._moved[name] += float(moved.square().sum())
 
     def shares(self) -> dict[str, float]:
         """The share of each camera in which something moves."""
         return {name: 1 - self._left[name] / moved for name, moved in self._moved.items() if moved > 0}
+
+
+def _held(tracks: Tracks) -> Tensor:
+    """Mask of the tracks that are not fitted, but judge the fit; none if there are too few."""
+    held = tracks.index % HELD == 0
+    return held if int(held.sum()) >= LEAST_HELD else torch.zeros_like(held)
+
+
+def _fitted(tracks: Tracks) -> Tracks:
+    return replace(tracks, seen=tracks.seen & ~_held(tracks))
+
+
+def _held_out(tracks: Tracks) -> Tracks:
+    """The tracks that were not fitted; all if there are too few."""
+    held = _held(tracks)
+    return replace(tracks, seen=tracks.seen & held) if bool(held.any()) else tracks
 
 
 def _cost(progress: Progress) -> float:
@@ -569,7 +706,13 @@ def _ready(plan: Plan, parser: Any, settings: Any, device: str, progress: bool) 
 
     videos = read_videos(list(plan.videos), plan.cameras)
     videos, judged = prepared(simulation, videos, plan.hand_held, plan.also_moves, say)
-    return Fit(simulation, videos, plan, say, judged)
+
+    def on_grid(ratio: float) -> Simulation:
+        given = own.clone()
+        given.solver.dx = ratio * given.solver.dx
+        return Simulation.from_settings(parser, given)
+
+    return Fit(simulation, videos, plan, say, judged, on_grid)
 
 
 def fit(

@@ -38,6 +38,10 @@ Rescale = Callable[[Sequence[Block]], dict[str, float]]
 """Robust standard deviation of the first variant's residuals, for each kind."""
 
 
+class DivergedError(ValueError):
+    """No simulation of a step is finite."""
+
+
 @dataclass(frozen=True, eq=False)
 class Normal:
     """Normal equations: sums over the residuals and their sensitivities at a point.
@@ -46,29 +50,32 @@ class Normal:
         cost: Mean of Huber's function over all residuals, each in standard deviations.
         gradient: Weighed sum of sensitivity times residual, shape (U,).
         matrix: Weighed sum of sensitivity times sensitivity, J^T W J, shape (U, U).
-        scores: The gradient of each cluster of correlated residuals, shape (C, U).
+        scores: The gradient of each cluster of correlated residuals, shape (C, U): patches of the object at all times,
+            and parts of the time all over the object.
         count: Number of residuals.
     """
 
     cost: float
     gradient: Tensor
     matrix: Tensor
-    scores: Tensor
+    scores: tuple[Tensor, Tensor]
     count: int
 
     def covariance(self) -> Tensor:
         r"""Covariance of the unknowns in shares of their ranges, shape (U, U).
 
-        :math:`A^{-1} \bigl(\tfrac{C}{C - 1} \sum_c g_c g_c^T\bigr) A^{-1} + A^{-1}`, where the gradients are summed
-        over clusters of correlated residuals (neighbouring tracks at all times): the sandwich of White (1980) and Liang
-        & Zeger (1986). The usual :math:`s^2 A^{-1}` takes all residuals for independent, and is far too small alone. It
-        is added, as the sandwich of few clusters, or of residuals below the lower bound of the standard deviation, may
-        be near zero.
+        :math:`A^{-1} \bigl(\sum \tfrac{C}{C - 1} \sum_c g_c g_c^T\bigr) A^{-1} + A^{-1}`, where the gradients are
+        summed over clusters of correlated residuals: the sandwich of White (1980) and Liang & Zeger (1986).
+        Neighbouring tracks at all times are clusters, and so are all tracks in a part of the time, as a fault of the
+        model is alike all over the object. The usual :math:`s^2 A^{-1}` takes all residuals for
+        independent, and is far too small alone. It is added, as the sandwich of few clusters, or of residuals below the
+        lower bound of the standard deviation, may be near zero.
         """
         inverse = torch.linalg.pinv(self.matrix, hermitian=True)
-        clusters = int((self.scores.abs().sum(-1) > 0).sum())
-        factor = clusters / max(clusters - 1, 1)
-        middle = factor * self.scores.mT @ self.scores
+        middle = torch.zeros_like(self.matrix)
+        for scores in self.scores:
+            clusters = int((scores.abs().sum(-1) > 0).sum())
+            middle = middle + clusters / max(clusters - 1, 1) * scores.mT @ scores
         return inverse @ middle @ inverse + inverse
 
 
@@ -114,23 +121,52 @@ def normal_equations(blocks: Sequence[Block], scales: Mapping[str, float], steps
     unknowns, gradient, matrix, count = len(steps), 0.0, 0.0, 0
     clusters = sum(int(block.cluster.max()) + 1 if len(block.cluster) else 0 for block in blocks)
     scores, first = torch.zeros(clusters, unknowns, dtype=torch.float64), 0
+    times = torch.zeros(1 + max(int(_moment(block).amax()) for block in blocks), unknowns, dtype=torch.float64)
     for block in blocks:
         sigma = scales[block.kind]
         residual = block.values[0] / sigma
         change = (block.values[1:] - block.values[:1]) / (sigma * steps[:, None, None])
         usable = torch.isfinite(residual).all(-1) & torch.isfinite(change).all(-1).all(0)
         residual, change, cluster = residual[usable], change[:, usable], block.cluster[usable]
+        moment = _moment(block)[usable]
         weight = HUBER / residual.norm(dim=-1).clamp(min=HUBER)
         own = ((change * residual).sum(-1) * weight).mT  # (R, U)
         gradient = gradient + own.sum(0)
         flat = (change * weight.sqrt()[:, None]).flatten(1)
         matrix = matrix + flat @ flat.mT
         scores.index_add_(0, cluster + first, own)
+        times.index_add_(0, moment, own)
         first, count = first + (int(block.cluster.max()) + 1 if len(block.cluster) else 0), count + len(residual)
     assert isinstance(gradient, Tensor)
     assert isinstance(matrix, Tensor)
-    base = [Block(b.kind, b.values[:1], b.cluster) for b in blocks]
-    return Normal(float(huber(base, scales)[0]), gradient, matrix, scores, count)
+    base = [block.of(block.values[:1]) for block in blocks]
+    return Normal(float(huber(base, scales)[0]), gradient, matrix, (scores, times), count)
+
+
+def _moment(block: Block) -> Tensor:
+    return torch.zeros_like(block.cluster, dtype=torch.long) if block.moment is None else block.moment
+
+
+def shift_by(
+    normal: Normal, blocks: Sequence[Block], others: Sequence[Block], scales: Mapping[str, float], steps: Tensor
+) -> Tensor:
+    """Shift of the minimum if the residuals were others, in shares of the ranges, shape (U,).
+
+    Args:
+        normal: The normal equations.
+        blocks: Residuals of 1 + U variants, as :func:`normal_equations` took them.
+        others: The other residuals, of one variant.
+        scales: Standard deviation of each kind.
+        steps: The difference in each unknown, as a share of its range, shape (U,).
+    """
+    gradient = torch.zeros_like(normal.gradient)
+    for block, other in zip(blocks, others, strict=True):
+        sigma = scales[block.kind]
+        weight = HUBER / (block.values[0] / sigma).norm(dim=-1).clamp(min=HUBER)
+        change = torch.nan_to_num((other.values[0] - block.values[0]) / sigma)
+        slope = torch.nan_to_num((block.values[1:] - block.values[:1]) / (sigma * steps[:, None, None]))
+        gradient = gradient + ((slope * change).sum(-1) * weight).sum(-1)
+    return -torch.linalg.pinv(normal.matrix, hermitian=True) @ gradient
 
 
 def sensitivities(residuals: Residuals, place: Tensor) -> tuple[list[Block], Tensor]:
@@ -146,7 +182,7 @@ def sensitivities(residuals: Residuals, place: Tensor) -> tuple[list[Block], Ten
     found = []
     for block in residuals(torch.cat([place[None], *beside])):
         here, high, low = block.values.split([1, unknowns, unknowns])
-        found.append(Block(block.kind, torch.cat([here, here + high - low]), block.cluster))
+        found.append(block.of(torch.cat([here, here + high - low])))
     return found, up - down
 
 
@@ -175,13 +211,13 @@ def iterate(
     if progress.normal is None:
         progress.normal, progress.scales, _ = linearised(residuals, rescale, progress.place)
         if progress.normal.count == 0:
-            raise ValueError("Every simulation of a step diverged: narrow the ranges of `unknowns`.")
+            raise DivergedError("Every simulation of a step diverged: narrow the ranges of `unknowns`.")
     normal = progress.normal
     progress.iteration += 1
     trial = step_from(normal, progress.place, progress.damping)
     moved = float((trial - progress.place).abs().amax())
     there, scales, blocks = linearised(residuals, rescale, trial)
-    gain = normal.cost - float(huber([Block(b.kind, b.values[:1], b.cluster) for b in blocks], progress.scales)[0])
+    gain = normal.cost - float(huber([block.of(block.values[:1]) for block in blocks], progress.scales)[0])
     if not gain > 0:
         progress.damping = max(progress.damping * WORSE, LEAST_DAMPING)
         if moved < tolerance or progress.damping > MOST_DAMPING:

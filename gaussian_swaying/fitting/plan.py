@@ -37,6 +37,7 @@ class Plan:
         fit_share: Share of the frames that is fitted; the rest is predicted.
         until: Fit the frames up to this time [s] instead of a share of them.
         search: Number of simulations of the coarse search; 0 starts at ``start`` or in the middle of the ranges.
+        starts: Number of starts that the search gives to short solves, of which the best goes on.
         iterations: Most iterations of a stage at each horizon.
         tracks: Most tracks of a camera.
         limit: Largest condition number of the sensitivities; above it the fit is refused.
@@ -55,6 +56,7 @@ class Plan:
     fit_share: float = 0.5
     until: float | None = None
     search: int = 64
+    starts: int = 3
     iterations: int = 8
     tracks: int = 400
     limit: float = 1e3
@@ -75,7 +77,7 @@ class Plan:
             raise ValueError(f"Expected `stages` to have at least one of {', '.join(STAGES)}.")
         if not 0 < self.fit_share <= 1:
             raise ValueError(f"Expected `fit_share` above 0 and at most 1, but got {self.fit_share}.")
-        for name, least in (("search", 0), ("iterations", 1), ("tracks", 4), ("seed", 0)):
+        for name, least in (("search", 0), ("starts", 1), ("iterations", 1), ("tracks", 4), ("seed", 0)):
             check_whole(name, getattr(self, name), least)
         if not self.limit > 1:
             raise ValueError(f"Expected `limit` above 1, but got {self.limit}.")

@@ -32,7 +32,7 @@ SHOWN = 3
 """Frames of the fitted and of the predicted part in a picture."""
 ASTRAY = 6.0
 """Largest accepted PSNR loss of fitted frames against the frame at rest [dB]; 6 dB is four times the squared error."""
-FOLLOWED, LOST = 0.9, 0.5
+FOLLOWED, LOST = 0.95, 0.5
 """Share of the tracked motion that the simulation has to explain in a good fit, and below which a fit has failed."""
 VAGUE = 0.25
 """Standard error, as a share of the range, above which an unknown is called not determined."""
@@ -74,10 +74,12 @@ class Result:
         unsettled: The reason why the values are not a local minimum, and a remedy; empty if they are one.
         notes: What the videos say against the plan.
         followed: For each camera, the share of the motion of its tracks in the fitted frames that the simulation
-            explains: 1 - (sum of squared distances) / (sum of squared displacements). Without tracks it is empty.
+            explains: 1 - (sum of squared distances) / (sum of squared displacements), of tracks that were not fitted
+            and without half a pixel of noise. Without tracks it is empty.
         assumed: What the values rest on that nobody measured, as sentences.
         seen: Where the wind blows, as each camera sees it, as sentences.
         judged: What the background says of the video of each camera; nothing without one.
+        rivals: Other values that fit nearly as well.
     """
 
     unknowns: Sequence[Unknown]
@@ -93,6 +95,7 @@ class Result:
     assumed: Sequence[str] = ()
     seen: Sequence[str] = ()
     judged: Sequence[Judged] = ()
+    rivals: Sequence[Mapping[str, float]] = ()
 
     @property
     def values(self) -> dict[str, float]:
@@ -125,6 +128,9 @@ class Result:
         """Reasons for which the fit has failed, and for which it is doubtful, as sentences with a remedy."""
         failed: list[str] = []
         doubtful = [*self.notes, *(doubt for one in self.judged for doubt in one.doubts())]
+        for rival in self.rivals:
+            told = ", ".join(f"{name} {value:.4g}" for name, value in rival.items())
+            doubtful.append(f"Another start fits nearly as well ({told}). Film longer, or from one more side.")
         for name, share in self.followed.items():
             told = (
                 f"camera {name}: the simulation explains {max(share, 0):.0%} of the motion of its tracks. Raise "
@@ -134,7 +140,7 @@ class Result:
             if share < FOLLOWED:
                 (failed if share < LOST else doubtful).append(told)
         for one in self.shown:
-            if one.camera in self.astray:
+            if one.camera in self.astray and self.followed.get(one.camera, 0.0) < FOLLOWED:
                 failed.append(
                     f"camera {one.camera} is not followed: its fitted frames are {one.rest - one.fitted:.0f} dB worse "
                     "than the one at rest, so the values may be wrong. Fit a shorter part (`until`), raise `search`, "

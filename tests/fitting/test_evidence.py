@@ -7,10 +7,23 @@ import pytest
 import torch
 
 from gaussian_swaying.fitting import evidence
-from gaussian_swaying.fitting.evidence import PATCHES, Block, Evidence, PictureEvidence, compare, scales_of
+from gaussian_swaying.fitting.evidence import (
+    LEAST_FACING,
+    PATCHES,
+    Block,
+    Evidence,
+    PictureEvidence,
+    TrackEvidence,
+    compare,
+    facing,
+    scales_of,
+)
 from gaussian_swaying.fitting.fit import Fit
 from gaussian_swaying.fitting.plan import Plan, read_unknown
+from gaussian_swaying.fitting.tracks import Tracks
+from gaussian_swaying.fitting.variants import states_of
 from gaussian_swaying.fitting.videos import read_videos
+from gaussian_swaying.rendering.cameras.camera import look_at_camera
 
 
 @pytest.mark.parametrize("masks", [False, True])
@@ -34,6 +47,28 @@ def test_scales_are_those_of_normal_noise():
         values[:, :200] = 50.0
         block = Block("tracks", values, torch.zeros(4000, dtype=torch.long))
         assert scales_of([block], {"tracks": 0.0})["tracks"] == pytest.approx(0.3, rel=0.1)
+
+
+def test_points_that_are_seen_edge_on_count_little():
+    """By the cosine of the angle between the ray and the normal."""
+    camera = look_at_camera((0.0, -2.0, 0.0), (0.0, 0.0, 0.0), (0, 0, 1), 40.0, 60, 40)
+    normals = torch.tensor([[0.0, 1.0, 0.0], [0.0, -1.0, 0.0], [0.6, 0.8, 0.0], [1.0, 0.0, 0.0]])
+    found = facing(normals, torch.zeros(4, 3), camera)
+    assert found.tolist() == pytest.approx([1.0, 1.0, 0.8, LEAST_FACING], abs=1e-6)
+
+
+def test_weighed_tracks_are_those_times_their_weight(own, simulation):
+    (left, _) = read_videos(own / "video")
+    index = torch.arange(5)
+    tracks = Tracks(index, torch.zeros(13, 5, 2).double(), torch.ones(13, 5, dtype=torch.bool))
+    states = next(states_of(simulation, [{}], [0.0]))
+    plain, weighed = (
+        TrackEvidence(simulation, left, tracks, w).residuals(simulation, states, 0)[0] for w in (False, True)
+    )
+    normals = simulation.scene.rest().normals[simulation.scene.moving[index]]
+    expected = facing(normals, TrackEvidence(simulation, left, tracks).rest, left.cameras[0])
+    assert expected.max() < 0.99
+    torch.testing.assert_close(weighed, plain * expected[:, None])
 
 
 def test_silhouettes_need_masks(own, simulation):

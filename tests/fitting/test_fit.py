@@ -2,15 +2,19 @@
 
 import csv
 import json
+import math
+from dataclasses import replace
 
 import pytest
+import torch
+import yaml
 
-from gaussian_swaying.fitting.fit import Course, Fit, fit, run_fit
+from gaussian_swaying.fitting.fit import GRIDS, HELD, Course, Fit, fit, run_fit
 from gaussian_swaying.fitting.plan import Plan, read_unknown
 from gaussian_swaying.fitting.videos import read_videos
 from gaussian_swaying.simulation.simulation import Simulation
 
-from .conftest import TRUTH
+from .conftest import TRUTH, base
 
 pytest.importorskip("cv2", reason="needs the extra [fit]")
 
@@ -41,6 +45,71 @@ def test_own_data_with_noise(own, tmp_path, capsys):
     again = Simulation.from_yaml(tmp_path / "fit/scene.yaml", device="cpu")
     assert pytest.approx(values["material.E"]) == again.material.E
     assert float(again.wind.flows[0].norm()) == pytest.approx(values["wind.speed"])
+
+
+def test_starts_that_are_far_off(own, tmp_path, capsys):
+    """Three times the speed and 60 degrees off: other starts are tried as well, and the best goes on."""
+    sought = {
+        "wind.speed": {"range": [1.0, 20.0], "start": 15.0},
+        "wind.azimuth": {"range": [-60.0, 140.0], "start": 97.0},
+        "material.E": {"range": [2e3, 5e4], "start": 3e4},
+    }
+    result = fit(own / "base.yaml", own / "video", sought, tmp_path / "fit", device="cpu", search=16)
+    assert result.values["wind.speed"] == pytest.approx(TRUTH["wind.speed"], rel=0.01)
+    assert result.values["wind.azimuth"] == pytest.approx(TRUTH["wind.azimuth"], abs=1.0)
+    assert capsys.readouterr().err.count("] start to ") >= 2
+    course = json.loads((tmp_path / "fit/fit.json").read_text())["course"]
+    assert [len(place) for place in course["rivals"]] == [3] * len(course["rivals"])
+
+
+def test_another_end_that_fits_as_well_is_a_rival(own, simulation):
+    """And one that is the same, or fits worse, is none."""
+    sought = [read_unknown("wind.speed", [2.0, 12.0])]
+    plan = Plan([str(own / "base.yaml")], [str(own / "video")], sought)
+    made = Fit(simulation, read_videos(own / "video"), plan)
+    ends = {"far": 0.9, "near": 0.51, "here": 0.5}
+    for costs, expected in (([1.0, 1.1], 1), ([1.0, 1.3], 0)):
+        made._brief = lambda places, evidence, times, costs=costs: ([[ends["here"]], [ends["far"]]], costs)
+        assert len(made._as_good([ends["here"]], [[ends["far"]]])) == expected
+    made._brief = lambda places, evidence, times: ([[ends["near"]]], [1.0])
+    assert made._as_good([ends["here"]], [[ends["far"]]]) == []
+
+
+def test_a_drag_that_is_sought_with_the_speed_is_remarked_on(own, simulation):
+    videos = read_videos(own / "video")
+    sought = [read_unknown("wind.speed", [2.0, 12.0]), read_unknown("aero.C_D", [0.02, 0.5])]
+    plan = Plan([str(own / "base.yaml")], [str(own / "video")], sought)
+    (note,) = Fit(simulation, videos, plan).notes()
+    assert note.startswith("wind.speed and aero.C_D move the object in nearly the same way")
+    assert Fit(simulation, videos, replace(plan, unknowns=sought[1:])).notes() == []
+
+
+def test_some_tracks_are_held_out_and_judge_the_fit(own, simulation):
+    plan = Plan([str(own / "base.yaml")], [str(own / "video")], [read_unknown("wind.speed", [2.0, 12.0])])
+    made = Fit(simulation, read_videos(own / "video"), plan)
+    (first, _) = made.evidence("tracks")
+    (all_of_it, _) = made.tracks
+    held = all_of_it.seen[0] & ~first.tracks.seen[0]
+    assert 0.1 <= held.sum() / all_of_it.seen[0].sum() <= 0.2
+    assert (all_of_it.index[held] % HELD == 0).all()
+
+
+def test_the_error_of_the_grid_is_in_the_standard_errors(own, simulation):
+    """None if the other grids show the same; if they show the flag in another wind, as far off as that wind."""
+    plan = Plan([str(own / "base.yaml")], [str(own / "video")], [read_unknown("wind.speed", [2.0, 12.0])])
+    videos = read_videos(own / "video")
+    place = torch.tensor([plan.unknowns[0].share(5.0)], dtype=torch.float64)
+
+    def model(other):
+        made = Fit(simulation, videos, plan, on_grid=lambda ratio: other)
+        return float(made._at_the_end(place, made.evidence("tracks"))[1])
+
+    assert model(simulation) == 0
+    settings = base(material={"E": 1e4, "nu": 0.3, "density": 27.0, "thickness": 0.01})
+    (own / "denser.yaml").write_text(yaml.safe_dump(settings))
+    denser = Simulation.from_yaml(own / "denser.yaml", device="cpu")
+    share = math.log((27 / 25) ** 0.5) / math.log(6)  # the pressure of a faster wind for the mass
+    assert model(denser) ** 0.5 == pytest.approx(math.sqrt(len(GRIDS)) * share, rel=0.6)
 
 
 def test_a_fit_that_cannot_follow_has_failed(own, tmp_path):

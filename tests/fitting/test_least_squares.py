@@ -15,6 +15,7 @@ from gaussian_swaying.fitting.least_squares import (
     linearised,
     normal_equations,
     sensitivities,
+    shift_by,
 )
 from gaussian_swaying.fitting.unknowns import Unknown
 
@@ -127,6 +128,40 @@ def test_the_error_of_a_mean_is_that_of_its_clusters_and_of_its_residuals(cluste
     expected = float(between + sigma**2 / (clusters * size))
     assert found.shape == (1, 1)
     assert float(found) == pytest.approx(expected, rel=1e-10)  # rounding of a difference of 0.004
+
+
+def test_errors_that_are_alike_all_over_the_object_count_by_their_time():
+    """As clusters: the mean of values that are off by one number in each half of the time."""
+    values = torch.tensor([0.1, -0.1], dtype=torch.float64).repeat_interleave(8)
+    cluster, moment = torch.arange(16) % 4, torch.arange(2).repeat_interleave(8)
+    variants = torch.stack([values, values + 0.004])
+    steps = torch.tensor([0.004], dtype=torch.float64)
+    sigma = 0.2
+    found = [
+        float(
+            normal_equations(
+                [Block("tracks", variants[..., None], cluster, part)], {"tracks": sigma}, steps
+            ).covariance()
+        )
+        for part in (moment, None)
+    ]
+    assert found[0] - found[1] == pytest.approx(0.1**2, rel=1e-9)  # 2 / (2 - 1) * 2 * 0.1^2 / 4
+    assert found[1] == pytest.approx(sigma**2 / 16, rel=1e-9)
+
+
+def test_other_residuals_move_the_minimum():
+    """Of a line through points: by the slope of the change, whatever the residuals were."""
+    slope = torch.linspace(1, 2, 20, dtype=torch.float64)
+    rest = 0.01 * torch.randn(20, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+
+    def residuals(places):
+        return [Block("tracks", (places * slope + rest)[..., None], torch.arange(20))]
+
+    place, sigma = torch.tensor([0.5], dtype=torch.float64), {"tracks": 10.0}
+    blocks, steps = sensitivities(residuals, place)
+    normal = normal_equations(blocks, sigma, steps)
+    others = [Block("tracks", (place * slope + rest - 0.3 * slope)[None, :, None], torch.arange(20))]
+    assert shift_by(normal, blocks, others, sigma, steps).tolist() == pytest.approx([0.3])
 
 
 def test_the_cost_is_hubers_function():

@@ -28,7 +28,7 @@ FPS = 30
 SIZE = (320, 240)
 NOISE, CRF = 3.0, 28
 """Noise of each pixel and colour [grey levels of 255], and the quality of H.264 that a phone's film has."""
-FINER = 0.8
+FINER = 2 / 3
 """Cells of the film's grid per those of the fit's."""
 SPACING = 0.02
 """Distance between the Gaussians of a cloth [m]."""
@@ -59,7 +59,7 @@ KINDS = {
     "curtain": Kind((0.6, 0.6), ("top",), 2.5, 65.0, 4e3),
     "banner": Kind((0.6, 0.4), ("left", "right"), 3.5, 70.0, 6e3),
     "pole flag": Kind((0.6, 0.4), ("left",), 4.0, 40.0, 8e3),
-    "post": Kind((0.06, 0.3), ("foot",), 3.0, 60.0, 1e4, 60.0),
+    "post": Kind((0.12, 0.42), ("foot",), 3.5, 60.0, 6e3, 60.0),
 }
 
 
@@ -128,7 +128,7 @@ def settings_of(film: Film, folder: Path, finer: float = 1.0) -> dict[str, Any]:
         "left": ([None] * 3, [edge, None, None]),
         "right": ([width - edge, None, None], [None] * 3),
         "top": ([None, None, height - edge], [None] * 3),
-        "foot": ([None] * 3, [None, None, 0.03]),
+        "foot": ([None] * 3, [None, None, 0.04]),
     }
     pins = [
         {
@@ -146,7 +146,7 @@ def settings_of(film: Film, folder: Path, finer: float = 1.0) -> dict[str, Any]:
     scene: dict[str, Any] = {"metres_per_unit": 1.0}
     if soft:
         write_ply(folder / "post.ply", _post(width, height))
-        scene |= {"ply": str(folder / "post.ply"), "filling": {"spacing": 0.015}}
+        scene |= {"ply": str(folder / "post.ply"), "filling": {"spacing": 0.02}}
     else:
         init = {"width": width, "height": height, "spacing": SPACING, "ripple": 0.005, "pattern": "printed"}
         scene["generator"] = {"class_path": "FlagScene", "init_args": init}
@@ -156,7 +156,7 @@ def settings_of(film: Film, folder: Path, finer: float = 1.0) -> dict[str, Any]:
         "background": [0.46, 0.58, 0.72],
         "scene": scene,
         "material": material | ({"law": "NeoHookean"} if soft else {"thickness": 0.01}),
-        "solver": {"dx": (0.03 if soft else 0.05) * finer, "cfl": 0.4 * finer, "boundaries": pins},
+        "solver": {"dx": (0.048 if soft else 0.06) * finer, "cfl": 0.4 * finer, "boundaries": pins},
         "wind": {"flow": [film.speed, 0.0, 0.0]} if film.ramp == 1 else {"schedule": _ramp(film)},
         "aero": {"C_D": 1.0, "C_F": 0.0, "C_L": 0.0, "law": "projected"},
         "cameras": {
@@ -219,7 +219,7 @@ def _read(settings: dict[str, Any], path: Path) -> Simulation:
     return Simulation.from_yaml(path, device="cpu")
 
 
-def _post(side: float, height: float, spacing: float = 0.006):  # type: ignore[no-untyped-def]
+def _post(side: float, height: float, spacing: float = 0.01):  # type: ignore[no-untyped-def]
     """A post of printed foam as flat Gaussians on its skin."""
     half = 0.5 * side
     patches = box([-half, -half, 0.0], [half, half, height], spacing)

@@ -1,0 +1,73 @@
+"""Small films with known answers: what a film shows, and what is counted of their fits."""
+
+import json
+
+import pytest
+import yaml
+from bench.cases import fit_films
+from bench.cases.fit_films import covered, misses
+from bench.problems.fit_films import FPS, KINDS, Film, drawn, make
+
+from gaussian_swaying.fitting.videos import read_videos
+
+from .conftest import HEAD, measure
+
+pytest.importorskip("cv2")
+
+
+def test_films_that_begin_earlier_and_later(tmp_path):
+    """The first frames are still, or those of the motion are cut."""
+    films = {start: Film("pole flag", 4.0, 40.0, 8e3, seconds=0.3, start=start) for start in (0.0, 0.1, -0.1)}
+    frames = {}
+    for start, film in films.items():
+        make(film, tmp_path / str(start))
+        (video,) = read_videos(tmp_path / str(start))
+        assert len(video.times) == round(0.3 * FPS)
+        frames[start] = video.images.float()
+
+    def apart(a, b):
+        return float((a - b).abs().mean())
+
+    noise = apart(frames[0.1][0], frames[0.1][2])
+    assert apart(frames[0.1][0], frames[0.1][3]) < 1.5 * noise  # the motion begins with this frame
+    assert apart(frames[0.1][0], frames[0.1][8]) > 1.5 * noise
+    assert apart(frames[-0.1][0], frames[0.0][3]) < apart(frames[-0.1][0], frames[0.0][0])
+    base = yaml.safe_load((tmp_path / "0.0/base.yaml").read_text())
+    assert base["wind"]["flow"] == [KINDS["pole flag"].speed, 0.0, 0.0]  # not the answer
+
+
+@pytest.mark.parametrize("kind", list(KINDS))
+def test_drawn_films_differ_and_bad_starts_stay_in_their_ranges(kind):
+    first, second = drawn(kind, 0), drawn(kind, 1)
+    assert first.truth != second.truth
+    assert first == drawn(kind, 0)
+    for film in (first, second):
+        for name, entry in film.unknowns(3.0).items():
+            assert entry["range"][0] <= entry["start"] <= entry["range"][1]
+            assert entry["range"][0] < film.truth[name] < entry["range"][1]
+        assert "start" not in film.unknowns()["wind.speed"]
+
+
+def test_what_is_counted():
+    good = {"errors": {"wind.speed": 0.04, "wind.azimuth": -4.0, "material.E": 0.1}}
+    good["standard_errors"] = {"wind.speed": 0.03, "wind.azimuth": 1.0, "material.E": 0.2}
+    assert not misses(good)
+    assert misses(good | {"errors": good["errors"] | {"wind.azimuth": 6.0}})
+    assert not misses(good | {"errors": good["errors"] | {"wind.azimuth": 6.0}}, 2)
+    assert misses({"verdict": "failed"})
+    found = covered([good, {"verdict": "failed"}])
+    assert found["wind.speed"] == found["material.E"] == 1
+    assert found["wind.azimuth"] == 0
+    assert found["all"] == pytest.approx(2 / 3)
+    assert found["films"] == 1
+
+
+def test_a_fit_of_a_film_is_recorded(monkeypatch):
+    monkeypatch.setattr(fit_films, "UNTIL", 0.3)
+    monkeypatch.setattr(fit_films, "TRACKS", 40)
+    options = ("--parts", "coverage", "--kinds", "banner", "--films", "1")
+    result, _ = measure("fit_films", *options, result=json.loads(json.dumps(HEAD)))
+    (row,) = result["coverage"].values()
+    assert set(row["errors"]) == set(row["standard_errors"]) == {"wind.speed", "wind.azimuth", "material.E"}
+    assert min(row["standard_errors"].values()) > 0
+    assert row["verdict"] in ("good", "doubtful", "failed")

@@ -1,0 +1,117 @@
+"""``bench.py fit_films``: small films of things in wind, fitted: begun in motion, from bad starts, and many of them."""
+
+from __future__ import annotations
+
+import argparse
+import math
+import tempfile
+import time
+from collections.abc import Iterator
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+from bench.case import Case, Measurement, names, option
+from bench.problems.fit_films import KINDS, Film, drawn, make
+from bench.record import Row
+from gaussian_swaying.fitting.fit import fit
+from gaussian_swaying.fitting.unknowns import FILM_START
+
+UNTIL, SEARCH, TRACKS = 1.0, 32, 200
+"""Fitted part of a film [s], simulations of the coarse search, and most tracks."""
+GOALS = {"wind.speed": 0.05, "wind.azimuth": 5.0, "material.E": 0.15}
+"""Largest errors that are wanted: shares, and degrees."""
+NEAR = 1.15
+"""How far off the start values of the films are that only test the standard errors."""
+PARTS = ("starts", "verdicts", "coverage", "winds")
+
+
+def rows(options: argparse.Namespace, result: Row) -> Iterator[Measurement]:
+    """Fits of the films of each part."""
+    kinds = options.kinds
+    if "starts" in options.parts:
+        for kind in kinds:
+            for start in (0.2, -0.2):
+                film = drawn(kind, 2, start=start)
+                told = f"{kind}, {'still' if start > 0 else 'moving'} for {abs(start):g} s"
+                yield ("starts", told), partial(fitted, film, {FILM_START: [-0.5, 0.5]})
+    if "verdicts" in options.parts:
+        for number in range(options.films):
+            for kind in kinds:
+                yield ("verdicts", f"{kind} {number}"), partial(fitted, drawn(kind, number), {}, off=3.0)
+    if "coverage" in options.parts:
+        for number in range(options.films):
+            kind = list(kinds)[number % len(kinds)]
+            film = drawn(kind, 100 + number, seconds=UNTIL)
+            yield ("coverage", f"{kind} {number}"), partial(fitted, film, {}, off=NEAR, search=0)
+    if "winds" in options.parts:
+        for kind in kinds:
+            for ramp in (1.0, 2.0):
+                film = drawn(kind, 3, ramp=ramp)
+                yield ("winds", f"{kind}, speed times {ramp:g}"), partial(fitted, film, {}, wind_changes=True)
+
+
+def fitted(film: Film, more: dict[str, Any], off: float = 1.0, search: int = SEARCH, **settings: Any) -> Row:
+    """A film's fit: errors, standard errors, and the verdict with its reasons."""
+    with tempfile.TemporaryDirectory() as scratch:
+        folder = Path(scratch)
+        make(film, folder)
+        begin = time.process_time()
+        settings = {"until": UNTIL, "search": search, "tracks": TRACKS} | settings
+        unknowns = film.unknowns(off) | {name: {"range": ends} for name, ends in more.items()}
+        try:
+            found = fit(
+                folder / "base.yaml", folder, unknowns, folder / "fit", device="cpu", progress=False, **settings
+            )
+        except ValueError as error:
+            return {"verdict": "failed", "why": [str(error)], "processor_s": time.process_time() - begin}
+    failed, doubtful = found.doubts()
+    return {
+        "errors": errors(film, found.values),
+        "standard_errors": errors(film, {n: film.truth[n] + found.errors[n] for n in film.truth}),
+        "further": {name: [found.values[name], found.errors[name]] for name in more},
+        "verdict": found.verdict,
+        "why": [*failed, *doubtful],
+        "explained": min(found.followed.values()),
+        "seconds": found.seconds,
+        "processor_s": time.process_time() - begin,
+    }
+
+
+def errors(film: Film, values: dict[str, float]) -> dict[str, float]:
+    """Errors of speed and E as shares, of the azimuth in degrees."""
+    found = {}
+    for name, true in film.truth.items():
+        found[name] = values[name] - true if name == "wind.azimuth" else values[name] / true - 1
+    return found
+
+
+def misses(row: Row, times: float = 1.0) -> bool:
+    """Whether an error is so many times what is wanted; a fit that was refused misses."""
+    if "errors" not in row:
+        return True
+    return any(not abs(row["errors"][name]) <= times * most for name, most in GOALS.items())
+
+
+def covered(rows: list[Row]) -> dict[str, float]:
+    """Share of the errors within two standard errors, of each unknown and of all."""
+    known = [row for row in rows if "errors" in row]
+    found = {
+        name: [abs(row["errors"][name]) <= 2 * abs(row["standard_errors"][name]) for row in known] for name in GOALS
+    }
+    every = [inside for own in found.values() for inside in own]
+    shares = {name: sum(own) / len(own) if own else math.nan for name, own in (found | {"all": every}).items()}
+    return shares | {"films": float(len(known))}
+
+
+CASE = Case(
+    "Find wind and material from small films: begun in motion, from bad starts, of a wind that changes, and many.",
+    rows,
+    (
+        names("--parts", PARTS, default=("starts", "verdicts")),
+        names("--kinds", list(KINDS), default=list(KINDS)),
+        option("--films", "films of each thing, or of the part coverage in all", type=int, default=2),
+    ),
+    page="fit.md",
+    device=False,
+)
