@@ -360,6 +360,12 @@ class AirInBox:
         found = velocity_at(moments, self._reach(torch.minimum(torch.maximum(flat, low + edge), high - edge)))
         return (found * self.flow.units.speed).to(place).reshape(place.shape)
 
+    def vorticity_at(self, moments: Tensor, place: Tensor) -> Tensor:
+        """Vorticity of the air at places [1/s], shape (..., 3); 0 in walls and outside of the box."""
+        flat = place.reshape(-1, 3)
+        field = self.flow.vorticity(FlowState(moments)).reshape(3, -1).T
+        return self._reach(flat).read(field).to(place).reshape(place.shape)
+
     def take(self, load: WindForce) -> None:
         """Go on with another wind, or other coefficients."""
         self.load = load

@@ -70,9 +70,9 @@ class Recorder:
     ``F_00000``), ``nodes.npz`` (arrays ``displacement_00000`` and ``far_00000``), ``checkpoint.pt``, ``summary.json``,
     ``diagnostics.csv`` (a row per frame), ``config.yaml``, ``video.mp4``.
 
-    Other renders have separate folders, ``depth``, ``normal``, ``force`` and ``wind``, and videos with these names.
-    Further cameras have the same layout in ``cameras/<name>``. Except for colour and wind, pixels without Gaussians are
-    black.
+    Other renders have separate folders with their names, and videos with these names.
+    Further cameras have the same layout in ``cameras/<name>``. Pixels of depth, normal and force without
+    Gaussians are black.
 
     - ``depth``: along the optical axis, from yellow, one longest side of the object in front of its centre at rest, to
       violet, as far behind it. The numbers are in ``depth_raw`` as 16-bit PNG: 0 for empty pixels, else steps of
@@ -81,6 +81,8 @@ class Recorder:
     - ``force``: wind force per area [Pa], violet at 0 to yellow at ``force_scale``.
     - ``wind``: the colour picture, paler, with streaks of air that drift with the wind, near a plane through the object
       along the flow, violet in still air to yellow at 1.5 times the flow.
+    - ``vorticity``: the colour picture, paler, with the vorticity of computed air across the same plane: blue turns
+      clockwise as the camera sees it, red the other way.
 
     Images, trajectory, .ply and checkpoint are written in the background: the methods make a copy and return. They wait
     only if the disk or ffmpeg is so slow that the queue is full. If something cannot be written, the next method call,
@@ -93,7 +95,7 @@ class Recorder:
         trajectory: Write position (float32, metres, z up) and F (float16) of the simulated particles for each frame.
         checkpoint_every: Write the state for ``--resume`` every ``checkpoint_every`` frames; 0 for never.
         fps: Frames per second of the video; null for real time, 1 / frame_dt.
-        renders: Pictures of each frame: ``color``, ``depth``, ``normal``, ``force``, ``wind``.
+        renders: Pictures of each frame: ``color``, ``depth``, ``normal``, ``force``, ``wind``, ``vorticity``.
         depth_step: Depth of one step of the PNG in ``depth_raw`` [m].
         normal_axes: ``camera`` (x right, y up, z towards the camera) or ``world`` (simulation axes, z up).
         force_scale: End of the colour scale of ``force`` [Pa]; null for the largest force per area of the wind, without

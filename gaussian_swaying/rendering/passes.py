@@ -12,7 +12,7 @@ from torch import Tensor
 from gaussian_swaying._checks import check_shape
 from gaussian_swaying.rendering.protocol import RenderOutput
 
-PASSES = ("color", "depth", "normal", "force", "wind")
+PASSES = ("color", "depth", "normal", "force", "wind", "vorticity")
 COVERED = 0.5
 """Smallest opacity of a pixel with a depth, a normal or a force."""
 MAX_STEPS = 65535

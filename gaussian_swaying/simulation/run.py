@@ -32,7 +32,7 @@ from gaussian_swaying.simulation.painter import Painter
 from gaussian_swaying.simulation.progress import RunProgress
 from gaussian_swaying.simulation.simulated_scene import SimulatedScene
 from gaussian_swaying.simulation.stepper import Stepper
-from gaussian_swaying.simulation.wind_picture import draw_wind
+from gaussian_swaying.simulation.wind_picture import draw_vorticity, draw_wind
 
 MAX_LOOKS = 2_000  # largest number of frames whose cameras are checked before a run
 
@@ -207,6 +207,10 @@ class Run:
         self.stepper, self.scene = editor.stepper, painter.scene
         if self.stepper.copies is not None:
             check_recorder(recorder)
+        if "vorticity" in recorder.renders and self.stepper.setup.air is None:
+            raise ValueError(
+                "`recorder.renders` has `vorticity`, which only computed air has: add `air`, or remove it."
+            )
         self.files: list[Path] = []
         self.log: list[dict[str, Any]] = []
         self._lines: list[str] = []  # the log as a checkpoint stores it, which is written every frame
@@ -406,7 +410,7 @@ class Run:
             colours = painter.colors(gaussians, camera)
         images: dict[str, Tensor] = {}
         with walls("rendering"):
-            if {"color", "depth", "wind"} & set(recorder.renders):
+            if {"color", "depth", "wind", "vorticity"} & set(recorder.renders):
                 picture = painter.draw(gaussians, colours, camera)
                 images["color"] = picture.color
             if "depth" in recorder.renders:
@@ -420,6 +424,8 @@ class Run:
                 images["force"] = painter.draw_pressure(pressure, gaussians, camera, self.force_end)
             if "wind" in recorder.renders:
                 images["wind"] = draw_wind(self.stepper, state, camera, picture)
+            if "vorticity" in recorder.renders:
+                images["vorticity"] = draw_vorticity(self.stepper, state, camera, picture)
         with walls("writing"):
             for render in recorder.renders:
                 recorder.write_image(frame, images[render], frame_folder(render, name))

@@ -1,4 +1,4 @@
-"""The wind in pictures: streaks of air that drift with it, over the picture of the object."""
+"""The wind in pictures, over the picture of the object: streaks that drift with it, and vorticity of computed air."""
 
 from __future__ import annotations
 
@@ -37,13 +37,11 @@ def streaks(stepper: Stepper, state: State, camera: Camera) -> tuple[Tensor, Ten
     Returns:
         Places, scene units, shape (S, STEPS + 1, 3), and the speed at them [m/s], shape (S, STEPS + 1).
     """
-    scene, frame, wind = stepper.scene, stepper.scene.frame, stepper.setup.wind
+    frame, wind = stepper.scene.frame, stepper.setup.wind
     device, double = double_home(state.position.device), torch.float64
-    centre = frame.point_to_sim(scene.center.to(device).double()[None])[0]
-    eye = frame.point_to_sim(camera.position.to(device).double()[None])[0]
+    mean, centre, eye = _middle(stepper, state, camera)
     view = centre - eye
     distance = view.norm()
-    mean = wind.mean_flow(state.time) if isinstance(wind, WindField) else in_double(stepper.flows()).mean(0)
     carried = wind.carried(state.time) if isinstance(wind, WindField) else mean * state.time
     right, up = _plane(mean, view / distance)
     high = 1.15 * float(distance) * camera.height / float(camera.intrinsics[1, 1])
@@ -70,6 +68,15 @@ def streaks(stepper: Stepper, state: State, camera: Camera) -> tuple[Tensor, Ten
         place = place + seconds / STEPS * middle
     points = torch.stack(places, 1)
     return frame.point_to_scene(points.reshape(-1, 3)).view_as(points), torch.stack(speeds, 1)
+
+
+def _middle(stepper: Stepper, state: State, camera: Camera) -> tuple[Tensor, Tensor, Tensor]:
+    """Mean flow [m/s], centre of the object and eye [m], each of shape (3,)."""
+    device, frame, wind = double_home(state.position.device), stepper.scene.frame, stepper.setup.wind
+    centre = frame.point_to_sim(stepper.scene.center.to(device).double()[None])[0]
+    eye = frame.point_to_sim(camera.position.to(device).double()[None])[0]
+    mean = wind.mean_flow(state.time) if isinstance(wind, WindField) else in_double(stepper.flows()).mean(0)
+    return mean, centre, eye
 
 
 def _plane(flow: Tensor, ahead: Tensor) -> tuple[Tensor, Tensor]:
@@ -144,3 +151,43 @@ def draw_wind(
     under = 0.75 * picture.color.detach().cpu().float().clamp(0, 1) + 0.25
     alpha = pixels[..., 3:]
     return under * (1 - alpha) + pixels[..., :3] * alpha
+
+
+def draw_vorticity(stepper: Stepper, state: State, camera: Camera, picture: RenderOutput) -> Tensor:
+    """The picture of the object, paler, with the vorticity of computed air in the plane of the streaks.
+
+    Its part across the plane is drawn: blue turns clockwise as the camera sees it, red the other way, in full colour
+    from eight times the flow per longest side of the object on. The object hides what is behind it.
+
+    Args:
+        stepper: The stepper of the simulation, with computed air.
+        state: The state.
+        camera: The camera, on the device of the Gaussians.
+        picture: Picture of the object from the camera.
+
+    Returns:
+        Shape (H, W, 3), on the CPU.
+    """
+    air, frame, moments = stepper.air, stepper.scene.frame, state.air
+    assert air is not None
+    assert moments is not None
+    mean, centre, eye = (part.cpu() for part in _middle(stepper, state, camera))
+    axis = torch.linalg.cross(*_plane(mean, (centre - eye) / (centre - eye).norm()))
+    axis = axis if float((axis * (eye - centre)).sum()) > 0 else -axis  # towards the camera
+    view, intrinsics = camera.world_to_camera.cpu().double(), camera.intrinsics.cpu().double()
+    row, column = torch.meshgrid(
+        *(torch.arange(n, dtype=torch.float64) + 0.5 for n in (camera.height, camera.width)), indexing="ij"
+    )
+    x, y = (column - intrinsics[0, 2]) / intrinsics[0, 0], (row - intrinsics[1, 2]) / intrinsics[1, 1]
+    ways = torch.stack([x, y, torch.ones_like(x)], -1) @ view[:3, :3]  # a depth of one along each ray, scene units
+    ways = frame.point_to_sim((camera.position.cpu().double() + ways).reshape(-1, 3)).view_as(ways) - eye
+    depth = ((centre - eye) * axis).sum() / (ways * axis).sum(-1)
+    place = (eye + depth.clamp(0, 1e6).nan_to_num(0.0)[..., None] * ways).reshape(-1, 3)
+    turning = air.vorticity_at(moments, place.to(state.position)).cpu().double() @ axis
+    size = float((state.position.amax(0) - state.position.amin(0)).amax())
+    share = turning.view_as(depth) * size / (8 * max(float(mean.norm()), 1e-6))
+    seen = mean_depth(picture).cpu()
+    alpha = (share.abs().clamp(max=1) * (depth > 0) * ~((seen > 0) & (seen < depth)))[..., None].float()
+    colours = torch.where(share[..., None] > 0, torch.tensor([0.70, 0.09, 0.17]), torch.tensor([0.13, 0.40, 0.67]))
+    under = 0.5 * picture.color.detach().cpu().float().clamp(0, 1) + 0.5
+    return under * (1 - alpha) + colours * alpha

@@ -1,14 +1,20 @@
 """The wind in pictures."""
 
+from dataclasses import replace
+
 import imageio.v3 as iio
 import pytest
 import torch
 
+from gaussian_swaying.aero.computed_air import ComputedAir
 from gaussian_swaying.aero.obstacles import SphereObstacle
 from gaussian_swaying.aero.wind import WindField
 from gaussian_swaying.recording.recorder import Recorder
 from gaussian_swaying.rendering.cameras.camera import look_at_camera, project
-from gaussian_swaying.simulation.wind_picture import STEPS, draw_wind, streaks
+from gaussian_swaying.rendering.passes import mean_depth
+from gaussian_swaying.scenes.procedural import FlagScene
+from gaussian_swaying.simulation.simulation import Simulation
+from gaussian_swaying.simulation.wind_picture import STEPS, draw_vorticity, draw_wind, streaks
 
 
 def test_streaks_follow_the_wind(make_simulation):
@@ -75,3 +81,46 @@ def test_a_run_draws_the_wind(make_simulation, tmp_path, flow):
     assert picture.shape == (18, 32, 3)
     assert (tmp_path / "run" / "wind.mp4").exists()
     assert not (tmp_path / "run" / "frames").exists()
+
+
+def _in_air():
+    box = ComputedAir([-1.2, -0.9, -0.9], [1.5, 0.9, 0.9], 27, speed=6.0)
+    return Simulation(FlagScene(spacing=0.05), wind=[3.0, 0.0, 0.0], air=box)
+
+
+@pytest.mark.parametrize("spin", [20.0, -20.0])
+def test_vorticity_is_red_where_air_turns_against_the_clock(spin):
+    """Air that turns as a whole, seen along its axis: one colour in the box, none outside, and none over the flag."""
+    simulation = _in_air()
+    stepper, state = simulation.stepper, simulation.start()
+    centre = simulation.scene.center.double()
+    eye = centre + 4.0 * torch.tensor([0.0, -1.0, 0.0])
+    camera = look_at_camera(eye.tolist(), centre.tolist(), (0.0, 0.0, 1.0), 60.0, 96, 64)
+    x, _, z = stepper.air._centres(stepper.air.flow.cells).permute(3, 0, 1, 2).float()
+    state.air[1:4] = torch.stack([-spin / 2 * z, 0 * x, spin / 2 * x]) / stepper.air.flow.units.speed
+    inside = stepper.air.vorticity_at(state.air, torch.tensor([[0.1, 0.2, 0.3], [0.1, 0.2, 3.0]]))
+    torch.testing.assert_close(inside, torch.tensor([[0.0, -spin, 0.0], [0.0, 0.0, 0.0]]), rtol=1e-4, atol=1e-3)
+    gaussians = simulation.painter.deformed(state)
+    seen = simulation.painter.draw(gaussians, simulation.painter.colors(gaussians, camera), camera)
+    found = draw_vorticity(stepper, state, camera, seen)
+    change = found - (0.5 * seen.color.clamp(0, 1) + 0.5)
+    red_less_blue = change[..., 0] - change[..., 2]
+    assert float(red_less_blue[32, 62]) * spin > 1.0  # behind the flag
+    assert float(change[2, 2].abs().max()) == 0
+    bare = draw_vorticity(stepper, state.replace(air=torch.zeros_like(state.air)), camera, seen)
+    assert float((bare - (0.5 * seen.color.clamp(0, 1) + 0.5)).abs().max()) == 0
+    covered = mean_depth(seen) > 0
+    assert bool(covered[32, 48])
+    for nearer, hides in ((0.9, True), (1.1, False)):  # the flag in front of the plane, and behind it
+        moved = replace(seen, depth=nearer * seen.depth)
+        change = draw_vorticity(stepper, state, camera, moved) - (0.5 * seen.color.clamp(0, 1) + 0.5)
+        assert bool((change[covered] == 0).all()) == hides
+
+
+def test_a_run_draws_vorticity_in_computed_air_alone(make_simulation, tmp_path):
+    simulation = _in_air()
+    simulation.run(tmp_path / "run", 1, progress=False, recorder=Recorder(renders=["vorticity"]))
+    assert iio.imread(tmp_path / "run" / "vorticity" / "00000.png").ndim == 3
+    with pytest.raises(ValueError, match="which only computed air has: add `air`"):
+        make_simulation().run(tmp_path / "other", 1, progress=False, recorder=Recorder(renders=["vorticity"]))
+    assert not (tmp_path / "other").exists()
