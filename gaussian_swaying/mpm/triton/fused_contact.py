@@ -31,20 +31,20 @@ LEAST_MARGIN = 0.1
 AHEAD = 8.0
 """Substeps of the fastest node for which lists stay complete, unless that is more than the reach of contact."""
 
-BLOCK, TALL = 128, 32
-"""Samples, and nodes, of a program at a time."""
+BLOCK, TALL = 64, 16
+"""Samples, and nodes, of a program at a time: small ones, so that few places in contact keep many programs busy."""
 
 WIDE, WIDE_SEARCH = 8, 4
 """Candidates of a contact sample that are tested together, in a substep and when lists are made (8 there would spill).
 """
 
-PER_PROCESSOR = 4
+PER_PROCESSOR = 8
 """Programs on each multiprocessor; all of them must run at once."""
 
 LIGHT = 0.01
 """A node of a smaller weight hardly moves any sample, however far it moves itself: see :func:`_carries`."""
 
-_LAUNCH: dict[str, Any] = {"num_warps": 4, "maxnreg": 128}
+_LAUNCH: dict[str, Any] = {"num_warps": 2, "maxnreg": 128}
 
 
 class FusedContact:
@@ -229,7 +229,7 @@ class FusedContact:
         if walls:
             launch(list_kernels.contact_positions, (-(-self.places // block),))(
                 *where, self.places, self.position, self.moving, self.status, *strides,
-                ARMS=self.arms, VIRTUAL=self.virtual, BLOCK=block, num_warps=8,
+                ARMS=self.arms, VIRTUAL=self.virtual, BLOCK=block, num_warps=4,
             )  # fmt: skip
             for k, (solid, (_, obstacle)) in enumerate(zip(self.solids, stage.obstacles, strict=True)):
                 if solid is not None:
