@@ -22,7 +22,6 @@ from gaussian_swaying.mpm.triton.contact_list_kernels import (
     place_now,
     store_velocity,
     three,
-    update_lists,
     velocity_now,
 )
 from gaussian_swaying.mpm.triton.shared import axis_weights, node_weight
@@ -374,8 +373,8 @@ def _push_nodes(
         tl.store(to, tl.load(to, mask[:, None], 0.0) + tl.sum(found, 1), mask[:, None])
 
 
-@triton.jit
-def _solve(
+@triton.jit(do_not_specialize=CHANGES)
+def contact_solve(
     fields, base, fraction, arm, rest, facing, radius, thickness, places, candidates, near, room,
     wall_gap, wall_normal, wall_drive, wall_valid, wall_friction, pressed,
     pressed_sum, row, moving, many, other, data, slots, impulse,
@@ -401,7 +400,7 @@ def _solve(
         listed = tl.load(status + WITHIN)
     if PAIRS:
         listed += tl.load(status + LISTED)
-        limit += slack + 2 * largest_of(peak + MOST_PROGRAMS, programs)  # see `update_lists`
+        limit += slack + 2 * largest_of(peak + MOST_PROGRAMS, programs)  # see `contact_lists`
     if listed > 0:
         if PAIRS:
             if pid == 0:
@@ -522,32 +521,3 @@ def _solve(
                             tl.store(pressed_sum + at, sum_, mask)
             if pid == 0:
                 tl.store(status + ROUNDS, tl.load(status + ROUNDS) + k)
-
-
-@triton.jit(do_not_specialize=CHANGES)
-def contact(
-    active, carries, before, nodes, corner, position, counts, start, rank, item, ordered, sorted_, sums, margin,
-    fields, base, fraction, arm, rest, facing, radius, thickness, places, candidates, near, room,
-    wall_gap, wall_normal, wall_drive, wall_valid, wall_friction, pressed, pressed_sum,
-    row, moving, many, other, data, slots, impulse,
-    touched, entry_start, entry_place, entry_weight, reached, marked, total, touched_nodes, peak, gate, status,
-    schedule, first_step, step_offset, sx, sy, inverse_dx, reach, apart, slack, least, ahead, last, chunk,
-    push, most, tolerance, friction, iterations,
-    PAIRS: tl.constexpr, WALLS: tl.constexpr, ARMS: tl.constexpr, VIRTUAL: tl.constexpr, BLOCK: tl.constexpr,
-    WIDE: tl.constexpr, SEARCH: tl.constexpr, TALL: tl.constexpr,
-):  # fmt: skip
-    """Contact in a substep: the lists, if they are too old, and the impulses."""
-    if PAIRS:
-        update_lists(
-            active, carries, before, nodes, fields, base, fraction, arm, rest, places, corner, position, counts, start,
-            rank, item, ordered, sorted_, candidates, near, room, many, impulse, entry_start, entry_place, reached,
-            touched_nodes, peak, sums, gate, status, margin, schedule, first_step, step_offset, sx, sy, inverse_dx,
-            reach, apart, slack, least, ahead, last, chunk, ARMS, VIRTUAL, BLOCK, SEARCH, TALL,
-        )  # fmt: skip
-    _solve(
-        fields, base, fraction, arm, rest, facing, radius, thickness, places, candidates, near, room, wall_gap,
-        wall_normal, wall_drive, wall_valid, wall_friction, pressed, pressed_sum, row, moving, many, other, data,
-        slots, impulse, touched, entry_start, entry_place, entry_weight, reached, marked, total, touched_nodes, peak,
-        gate, status, schedule, first_step, step_offset, sx, sy, inverse_dx, reach, slack, push, most, tolerance,
-        friction, iterations, PAIRS, WALLS, ARMS, VIRTUAL, BLOCK, WIDE, TALL,
-    )  # fmt: skip

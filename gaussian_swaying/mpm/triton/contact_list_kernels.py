@@ -316,8 +316,8 @@ def _search(
         tl.atomic_add(status + LISTED, tl.sum(found), sem="relaxed")
 
 
-@triton.jit
-def update_lists(
+@triton.jit(do_not_specialize=CHANGES)
+def contact_lists(
     active, carries, before, nodes, fields, base, fraction, arm, rest, places, corner,
     position, counts, start, rank, item, ordered, sorted_, candidates, near, room, many, impulse,
     entry_start, entry_place, reached, touched_nodes, peak, sums, gate, status, margin,
@@ -407,4 +407,3 @@ def update_lists(
                 q = tl.load(entry_place + begin[:, None] + k + entry, real, 0)
                 found += tl.sum(tl.load(near + q, real, 0), 1)
             tl.store(reached + n, found, mask)
-        meet(gate, programs)

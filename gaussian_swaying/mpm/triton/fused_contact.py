@@ -216,6 +216,16 @@ class FusedContact:
         }  # fmt: skip
         if self.programs > 1:
             options["launch_cooperative_grid"] = True
+        if pairs:
+            chunk = -(-(self.last + 1) // self.programs)
+            launch(list_kernels.contact_lists, (self.programs,))(
+                self.active, self.carries, self.before, len(self.active), *where, self.places, self.corner,
+                self.now, self.counts, self.start, self.rank, self.item, self.ordered, self.sorted, self.candidates,
+                self.near, self.room, self.many, self.impulse, self.entry_start, self.entry_place, self.reached,
+                len(self.touched), self.peak, self.sums, self.gate, self.status, self.margin, *now, stage.reach,
+                stage.apart, SLACK * dx, LEAST_MARGIN * dx, AHEAD, self.last, -(-chunk // block) * block,
+                WIDE=lanes(self.device, WIDE_SEARCH), **options,
+            )  # fmt: skip
         if walls:
             launch(list_kernels.contact_positions, (-(-self.places // block),))(
                 *where, self.places, self.position, self.moving, self.status, *strides,
@@ -237,18 +247,14 @@ class FusedContact:
                 self.wall_drive[k].copy_(drive)
                 self.wall_valid[k].copy_(obstacle.active(time).expand(self.places))
                 self.within.fill_(1)
-        chunk = -(-(self.last + 1) // self.programs)
-        launch(kernels.contact, (self.programs,))(
-            self.active, self.carries, self.before, len(self.active), self.corner, self.now, self.counts, self.start,
-            self.rank, self.item, self.ordered, self.sorted, self.sums, self.margin,
+        launch(kernels.contact_solve, (self.programs,))(
             *where, self.facing, self.radius, self.thickness, self.places, self.candidates, self.near, self.room,
             self.wall_gap, self.wall_normal, self.wall_drive, self.wall_valid, self.friction, self.pressed,
             self.pressed_sum, self.row, self.moving, self.many, self.other, self.data, self.slots, self.impulse,
             self.touched, self.entry_start, self.entry_place, self.entry_weight, self.reached, self.marked, self.total,
-            len(self.touched), self.peak, self.gate, self.status, *now, stage.reach, stage.apart, SLACK * dx,
-            LEAST_MARGIN * dx, AHEAD, self.last, -(-chunk // block) * block, PUSH, PUSH_CELLS * dx, TOLERANCE * dx,
-            0.0 if stage.contact is None else stage.contact.friction, stage.iterations, PAIRS=pairs, WALLS=walls,
-            WIDE=WIDE, SEARCH=lanes(self.device, WIDE_SEARCH), **options,
+            len(self.touched), self.peak, self.gate, self.status, *now, stage.reach, SLACK * dx, PUSH,
+            PUSH_CELLS * dx, TOLERANCE * dx, 0.0 if stage.contact is None else stage.contact.friction,
+            stage.iterations, PAIRS=pairs, WALLS=walls, WIDE=WIDE, **options,
         )  # fmt: skip
 
 
