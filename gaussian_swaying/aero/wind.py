@@ -310,6 +310,13 @@ class WindField(nn.Module):
         other._buffers = self._buffers | {"flows": flows, "times": self.times.new_zeros(1)}
         return other
 
+    def with_schedule(self, times: Sequence[float], flows: Sequence[VectorLike]) -> WindField:
+        """The same wind with other flows [m/s] at some times [s], ascending, and linear between them."""
+        other, rows = copy(self), flow_rows("flow", flows).to(self.flows.device)
+        other._buffers = self._buffers | {"flows": rows, "times": self.times.new_tensor(times)}
+        other.interpolation = "linear"
+        return other
+
     def mean_flow(self, time: Tensor) -> Tensor:
         """The flow without modulations [m/s] at times [s] of shape (...); shape (..., 3), float64."""
         last = self.times.numel() - 1

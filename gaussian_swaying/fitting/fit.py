@@ -19,6 +19,7 @@ from torch import Tensor
 from gaussian_swaying._files import write_json
 from gaussian_swaying._inputs import read_json
 from gaussian_swaying.fitting.before import write_before
+from gaussian_swaying.fitting.changing import PRIOR, changes_of, prior_of, steady_share
 from gaussian_swaying.fitting.evidence import (
     Block,
     Evidence,
@@ -93,6 +94,10 @@ DRAG = ("aero.C_D", "aero.C_F")
 """Coefficients that scale the force of the wind."""
 HELD, LEAST_HELD = 7, 6
 """One of so many tracks is not fitted, if there are at least so many of them."""
+LATER = 0.2
+"""Share of the fitted frames that a wind which changes has to predict."""
+PREFERRED = 0.8
+"""Distance that it leaves there per that of a steady one, above which the steady one is taken."""
 GRIDS = (0.8, 1.25)
 """Cells of other grids that tell the error of the grid, per its own."""
 BEGUN, BEGINS = 12, 10
@@ -272,9 +277,10 @@ class Fit:
         """The residuals of some evidence up to a horizon, as a function of places (B, U)."""
 
         def at(places: Tensor) -> list[Block]:
-            return compare(
-                self.simulation, evidence, [self.values(place) for place in places], times, moving=self.moving
-            )
+            values = [self.values(place) for place in places]
+            prior = prior_of(self.plan.unknowns, places)
+            found = compare(self.simulation, evidence, values, times, moving=self.moving)
+            return found if prior is None else [*found, Block(PRIOR, prior, torch.arange(prior.shape[1]))]
 
         return at
 
@@ -358,19 +364,18 @@ class Fit:
         self, places: Sequence[Sequence[float]], evidence: Sequence[Evidence], times: Sequence[float]
     ) -> tuple[list[list[float]], list[float]]:
         """Short solves from some places: their ends, apart from each other and the best first, and their costs."""
-        floors = {part.kind: part.floor for part in evidence}
         residuals, ended = self.residuals(evidence, times), []
         for place in places:
             progress = Progress(torch.tensor(place, dtype=torch.float64))
             with suppress(DivergedError):
                 while not progress.done and progress.iteration < BRIEF:
-                    iterate(residuals, lambda b: scales_of(b, floors), progress, ROUGH * TOLERANCE, ROUGH * LEAST_GAIN)
+                    iterate(residuals, _scaled(evidence), progress, ROUGH * TOLERANCE, ROUGH * LEAST_GAIN)
                 ended.append(progress.place)
         if not ended:
             raise DivergedError("Every simulation of a start diverged: narrow the ranges of `unknowns`.")
         blocks = residuals(torch.stack(ended))
-        each = [scales_of(blocks, floors, k) for k in range(len(ended))]
-        costs = huber(blocks, {kind: min(one[kind] for one in each) for kind in floors})
+        each = [_scaled(evidence)(blocks, k) for k in range(len(ended))]
+        costs = huber(blocks, {kind: min(one[kind] for one in each) for kind in each[0]})
         apart: list[int] = []
         for k in costs.argsort().tolist():
             if all(float((ended[k] - ended[j]).abs().amax()) > SAME for j in apart):
@@ -442,10 +447,9 @@ class Fit:
             place = torch.tensor(course.place, dtype=torch.float64)
             progress = Progress(place, course.damping, course.iteration, done=course.ended)
             last, residuals = course.step == len(steps) - 1, self.residuals(evidence, times)
-            floors = {part.kind: part.floor for part in evidence}
             while not progress.done and progress.iteration < self.plan.iterations:
                 close = (TOLERANCE, LEAST_GAIN) if last else (ROUGH * TOLERANCE, ROUGH * LEAST_GAIN)
-                iterate(residuals, lambda blocks: scales_of(blocks, floors), progress, *close)  # noqa: B023
+                iterate(residuals, _scaled(evidence), progress, *close)
                 course.place, course.damping = progress.place.tolist(), progress.damping
                 course.iteration, course.ended = progress.iteration, progress.done
                 course.seconds = time.monotonic() - clock
@@ -461,10 +465,60 @@ class Fit:
             course.step, course.iteration, course.damping, course.matched = course.step + 1, 0, START, []
             course.ended = ""
             keep(course)
-        place = torch.tensor(course.place, dtype=torch.float64)
-        normal, model = self._at_the_end(place, evidence or self.evidence(steps[-1][0], course.place))
-        found = directions(normal.matrix, self.plan.unknowns, place)
+        evidence = evidence or self.evidence(steps[-1][0], course.place)
+        wider, places = self._changed(course.place, evidence) if self.plan.wind_changes else (self, course.place)
+        if wider is not self:
+            evidence = wider.evidence(steps[-1][0], places)
         course.seconds = time.monotonic() - clock
+        return wider.result(course, places, evidence, films)
+
+    def _changed(self, place: Sequence[float], evidence: Sequence[Evidence]) -> tuple[Fit, list[float]]:
+        """The fit in a wind that changes, and its place, if it predicts held-out frames better; else this one.
+
+        Both are fitted to the first four fifths of the fitted frames, and compared in the others.
+        """
+        known = max(3, round((1 - LATER) * len(self.fitted)))
+        early, late = self.fitted[:known], self.fitted[known:]
+        unknowns = changes_of(self.plan.unknowns, self.fitted[-1])
+        wider = Fit(
+            self.simulation,
+            self.videos,
+            replace(self.plan, unknowns=[*self.plan.unknowns, *unknowns]),
+            self.say,
+            self.judged,
+            self.on_grid,
+        )
+        wider.first, wider._tracks = self.first, self._tracks
+        start = [*place, *map(steady_share, unknowns)]
+        left = []
+        for fit_, begin in ((self, list(place)), (wider, start)):
+            end = fit_.solved(begin, evidence, early)
+            (block, *_) = compare(self.simulation, evidence, [fit_.values(end)], self.fitted, moving=self.moving)
+            frames = compare(self.simulation, evidence, [fit_.values(end)], early, moving=self.moving)[0]
+            left.append(float(block.values[0, frames.values.shape[1] :].norm(dim=-1).nanmedian()))
+        told = f"{left[1]:.3g} pixels from the tracks after {early[-1]:.3g} s, a steady one {left[0]:.3g}"
+        self.say(f"a wind that changes is {told}")
+        if not late or not left[1] < PREFERRED * left[0]:
+            return self, list(place)
+        for _ in range(2):
+            end = wider.solved(end, wider.evidence(self.stages[-1], end), self.fitted)
+        return wider, end
+
+    def solved(self, place: Sequence[float], evidence: Sequence[Evidence], times: Sequence[float]) -> list[float]:
+        """The place at which the iterations from another end."""
+        progress = Progress(torch.tensor(place, dtype=torch.float64))
+        while not progress.done and progress.iteration < self.plan.iterations:
+            iterate(self.residuals(evidence, times), _scaled(evidence), progress, ROUGH * TOLERANCE, ROUGH * LEAST_GAIN)
+            self.say(f"to {times[-1]:.3g} s, {progress.iteration}: {self._shown(progress.place.tolist())}")
+        return progress.place.tolist()
+
+    def result(
+        self, course: Course, places: Sequence[float], evidence: Sequence[Evidence], films: Path | None
+    ) -> Result:
+        """The result at a place, from a course that has ended and the evidence of its last stage."""
+        place = torch.tensor(places, dtype=torch.float64)
+        normal, model = self._at_the_end(place, evidence)
+        found = directions(normal.matrix, self.plan.unknowns, place)
         followed = _Followed(self) if self.followed else None
 
         def moved() -> Iterator[DeformedGaussians]:
@@ -476,7 +530,7 @@ class Fit:
         shown = predictions(self.simulation, self.videos, self.times, len(self.fitted), moved(), films)
         return Result(
             self.plan.unknowns,
-            tuple(course.place),
+            tuple(places),
             normal.covariance() + model,
             found,
             shown,
@@ -486,7 +540,7 @@ class Fit:
             tuple(self.notes()),
             {} if followed is None else followed.shares(),
             judged=self.judged,
-            rivals=self._as_good(course.place, course.rivals),
+            rivals=self._as_good(course.place, course.rivals) if len(places) == len(course.place) else (),
         )
 
     def _at_the_end(self, place: Tensor, evidence: Sequence[Evidence]) -> tuple[Normal, Tensor]:
@@ -495,7 +549,7 @@ class Fit:
         The residuals on a finer and on a coarser grid move the minimum, mostly as the body lies otherwise in cells.
         """
         blocks, steps = sensitivities(self.residuals(evidence, self.fitted), place)
-        scales = scales_of(blocks, {part.kind: part.floor for part in evidence})
+        scales = _scaled(evidence)(blocks)
         normal = normal_equations(blocks, scales, steps)
         model = torch.zeros_like(normal.matrix)
         for ratio in GRIDS if self.on_grid else ():
@@ -505,13 +559,13 @@ class Fit:
                 other = self.on_grid(ratio)
             own = [e.on(other) if isinstance(e, TrackEvidence) else e for e in evidence]
             others = compare(other, own, [self.values(place)], self.fitted, moving=self.moving)
-            shift = shift_by(normal, blocks, others, scales, steps)
+            shift = shift_by(normal, blocks[: len(others)], others, scales, steps)  # the prior stays
             model += torch.outer(shift, shift)
         return normal, model
 
     def _normal(self, place: Tensor, evidence: Sequence[Evidence], times: Sequence[float]) -> Normal:
         blocks, steps = sensitivities(self.residuals(evidence, times), place)
-        return normal_equations(blocks, scales_of(blocks, {part.kind: part.floor for part in evidence}), steps)
+        return normal_equations(blocks, _scaled(evidence)(blocks), steps)
 
     def notes(self) -> list[str]:
         """Sentences on what speaks against the plan: unknowns that are confounded, a start that is missing."""
@@ -553,6 +607,17 @@ class Fit:
 
     def _shown(self, place: Sequence[float]) -> str:
         return ", ".join(f"{name} {value:.5g}" for name, value in self.values(place).items())
+
+
+def _scaled(evidence: Sequence[Evidence]) -> Callable[..., dict[str, float]]:
+    """The function that gives the standard deviations of a variant's residuals; that of the prior is one."""
+    floors = {part.kind: part.floor for part in evidence}
+
+    def scales(blocks: Sequence[Block], member: int = 0) -> dict[str, float]:
+        known = [block for block in blocks if block.kind != PRIOR]
+        return scales_of(known, floors, member) | dict.fromkeys((b.kind for b in blocks if b.kind == PRIOR), 1.0)
+
+    return scales
 
 
 class _Followed:

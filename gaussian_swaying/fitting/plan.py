@@ -40,6 +40,8 @@ class Plan:
         starts: Number of starts that the search gives to short solves, of which the best goes on.
         iterations: Most iterations of a stage at each horizon.
         tracks: Most tracks of a camera.
+        wind_changes: Whether the wind may change during the film; it does if that predicts the last fifth of the fitted
+            frames better.
         limit: Largest condition number of the sensitivities; above it the fit is refused.
         seed: Seed of the coarse search.
         cameras: Names of the cameras that are used; None for all.
@@ -59,6 +61,7 @@ class Plan:
     starts: int = 3
     iterations: int = 8
     tracks: int = 400
+    wind_changes: bool = False
     limit: float = 1e3
     seed: int = 0
     cameras: Sequence[str] | None = None
@@ -79,6 +82,8 @@ class Plan:
             raise ValueError(f"Expected `fit_share` above 0 and at most 1, but got {self.fit_share}.")
         for name, least in (("search", 0), ("starts", 1), ("iterations", 1), ("tracks", 4), ("seed", 0)):
             check_whole(name, getattr(self, name), least)
+        if self.wind_changes and "wind.speed" not in {u.name for u in self.unknowns}:
+            raise ValueError("Expected `wind.speed` in `unknowns` with `wind_changes`: add it.")
         if not self.limit > 1:
             raise ValueError(f"Expected `limit` above 1, but got {self.limit}.")
 
@@ -116,8 +121,9 @@ def read_plan(path: str | os.PathLike[str], find: Callable[[str], str] = str) ->
     for name in ("fit_share", "until", "limit"):
         if name in settings and (isinstance(settings[name], bool) or not isinstance(settings[name], int | float)):
             raise ValueError(f"Expected `{name}` in {file} to be a number, but got {settings[name]!r}.")
-    if not isinstance(settings.get("hand_held", True), bool):
-        raise ValueError(f"Expected `hand_held` in {file} to be true or false, but got {settings['hand_held']!r}.")
+    for name in ("hand_held", "wind_changes"):
+        if not isinstance(settings.get(name, True), bool):
+            raise ValueError(f"Expected `{name}` in {file} to be true or false, but got {settings[name]!r}.")
     base = [_beside(file, name) or find(name) for name in _names(file, "base", given.get("base"))]
     import_forces(base)
     return Plan(

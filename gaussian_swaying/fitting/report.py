@@ -14,9 +14,10 @@ from torch import Tensor
 from gaussian_swaying._files import write_json, write_table, write_text
 from gaussian_swaying.config.parser import config_text
 from gaussian_swaying.fitting.before import titled
+from gaussian_swaying.fitting.changing import changing
 from gaussian_swaying.fitting.identifiability import Direction
 from gaussian_swaying.fitting.prepared import Judged
-from gaussian_swaying.fitting.unknowns import Unknown, of_simulation
+from gaussian_swaying.fitting.unknowns import Unknown, is_change, of_simulation
 from gaussian_swaying.fitting.videos import Footage
 from gaussian_swaying.gaussians.model import DeformedGaussians
 from gaussian_swaying.recording.video import VideoEncoder
@@ -34,8 +35,9 @@ ASTRAY = 6.0
 """Largest accepted PSNR loss of fitted frames against the frame at rest [dB]; 6 dB is four times the squared error."""
 FOLLOWED, LOST = 0.95, 0.5
 """Share of the tracked motion that the simulation has to explain in a good fit, and below which a fit has failed."""
-VAGUE = 0.25
-"""Standard error, as a share of the range, above which an unknown is called not determined."""
+VAGUE, TURNED = 0.25, 10.0
+"""Standard error, as a share of the range (of the value on a logarithmic scale), and of an angle [degrees], above which
+an unknown is called not determined."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -104,15 +106,20 @@ class Result:
 
     @property
     def errors(self) -> dict[str, float]:
-        """Standard errors, in the units of the values. They contain the noise of the video, not faults of the model."""
+        """Standard errors, in the units of the values. They contain noise and the error of the grid, nothing else."""
         share = self.covariance.diagonal().clamp(min=0).sqrt().tolist()
         return {u.name: s * u.slope(p) for u, s, p in zip(self.unknowns, share, self.place, strict=True)}
 
     @property
     def vague(self) -> list[str]:
         """Names of unknowns that the video does not determine."""
-        share = self.covariance.diagonal().clamp(min=0).sqrt().tolist()
-        return [u.name for u, s in zip(self.unknowns, share, strict=True) if s > VAGUE]
+        values, errors, found = self.values, self.errors, []
+        for u in self.unknowns:
+            most = VAGUE * (abs(values[u.name]) if u.scale == "log" else u.high - u.low)
+            most = min(most, TURNED) if u.unit == "degrees" else most
+            if errors[u.name] > most:
+                found.append(u.name)
+        return found
 
     @property
     def at_an_end(self) -> list[str]:
@@ -149,7 +156,9 @@ class Result:
         if self.unsettled:
             doubtful.append(self.unsettled)
         doubtful += [
-            f"{name} is not determined by this video: its error is a large part of its range." for name in self.vague
+            f"{name} is not determined by this video: its error is large. Film longer or from one more side, or lower "
+            "`solver.dx`."
+            for name in self.vague
         ]
         doubtful += [f"{name} is at an end of its range: widen the range." for name in self.at_an_end]
         return failed, doubtful
@@ -328,6 +337,11 @@ def scene_text(values: Mapping[str, float], parser: ArgumentParser, settings: Na
     found = settings.clone()
     if any(name in values for name in POLAR):
         found.wind.flow = flow_of(simulation.wind.flows[0].tolist(), values)  # type: ignore[index]
+    if any(map(is_change, values)):
+        wind = changing(simulation.wind.with_flow(found.wind.flow), values)  # type: ignore[operator]
+        rows = zip(wind.times.tolist(), wind.flows.tolist(), strict=True)
+        found.wind.schedule = [{"time": time, "flow": flow} for time, flow in rows]
+        found.wind.interpolation = wind.interpolation
     for name, value in of_simulation(values).items():
         if name not in POLAR:
             in_settings(found, name, value)

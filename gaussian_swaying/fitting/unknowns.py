@@ -16,6 +16,14 @@ FILM_START = "film.start"
 """Time in the film at which the motion starts, at rest until then [s]; below 0, the wind has blown for so long when the
 film begins. It is no number of the simulation."""
 
+CHANGES = ("wind.speed@", "wind.azimuth@")
+"""Begins of the names of the wind at a time of the film, see :mod:`~gaussian_swaying.fitting.changing`."""
+
+
+def is_change(name: str) -> bool:
+    """True for an unknown of a wind that changes: no number of the simulation."""
+    return name.startswith(CHANGES)
+
 
 @dataclass(frozen=True)
 class Unknown:
@@ -44,7 +52,8 @@ class Unknown:
         where = f"unknowns.{self.name}"
         check_choice(f"{where}.scale", self.scale, SCALES)
         known = find(self.name)
-        if self.name != FILM_START and (known is None or known.kind != "number"):
+        own = self.name == FILM_START or is_change(self.name)
+        if not own and (known is None or known.kind != "number"):
             sought = [FILM_START, *(name for name in parameters.names() if parameter_kind(name) == "number")]
             raise ValueError(f"`{self.name}` cannot be sought: use {', '.join(sought)}, or put it into `known`.")
         if not (math.isfinite(self.low) and math.isfinite(self.high) and self.low < self.high):
@@ -60,6 +69,8 @@ class Unknown:
     @property
     def unit(self) -> str:
         """Its unit, empty for a pure number."""
+        if is_change(self.name):
+            return "" if self.name.startswith(CHANGES[0]) else "degrees"
         return "s" if self.name == FILM_START else parameter(self.name).unit
 
     def value(self, share: float) -> float:
@@ -81,7 +92,7 @@ class Unknown:
 
 def of_simulation(values: Mapping[str, float]) -> dict[str, float]:
     """The values that are numbers of the simulation."""
-    return {name: value for name, value in values.items() if name != FILM_START}
+    return {name: value for name, value in values.items() if name != FILM_START and not is_change(name)}
 
 
 def parameter_kind(name: str) -> str:

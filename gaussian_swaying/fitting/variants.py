@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 
-from gaussian_swaying.fitting.unknowns import FILM_START, of_simulation
+from gaussian_swaying.aero.wind import WindField
+from gaussian_swaying.fitting.changing import changing
+from gaussian_swaying.fitting.unknowns import FILM_START, is_change, of_simulation
 from gaussian_swaying.mpm.state import MaterialPoints, State
 from gaussian_swaying.simulation.diagnostics import SimulationDiverged
 from gaussian_swaying.simulation.parameters import Setup, parameter, with_values
@@ -63,7 +65,7 @@ def states_of(
     Raises:
         SimulationDiverged: If a variant diverges, with ``alike``.
     """
-    setups = [with_values(simulation.setup, of_simulation(own)) for own in values]
+    setups = [_setup_of(simulation.setup, own) for own in values]
     groups = _groups(simulation, values, setups, alike)
     before = math.ceil(max(0.0, -min(group.start for group in groups)) / simulation.frame_dt)
     for k in range(-before, 0):  # the run-up, frame by frame
@@ -77,11 +79,21 @@ def states_of(
         yield [state for _, state in sorted(found, key=lambda pair: pair[0])]
 
 
+def _setup_of(setup: Setup, values: Values) -> Setup:
+    """The setup of a variant, in a wind that changes if its values say so."""
+    found = with_values(setup, of_simulation(values))
+    if isinstance(found.wind, WindField):
+        found = replace(found, wind=changing(found.wind, values))
+    return found
+
+
 def _groups(simulation: Simulation, values: Sequence[Values], setups: Sequence[Setup], alike: bool) -> list[_Group]:
     shared: dict[tuple[object, ...], list[int]] = {}
     for number, (own, setup) in enumerate(zip(values, setups, strict=True)):
         apart = [
-            (name, value) for name, value in sorted(own.items()) if name == FILM_START or not parameter(name).batched
+            (name, value)
+            for name, value in sorted(own.items())
+            if name == FILM_START or not (is_change(name) or parameter(name).batched)
         ]
         shared.setdefault((*apart, 0 if alike else _stiffness_class(setup.points)), []).append(number)
     found = []

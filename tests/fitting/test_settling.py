@@ -160,6 +160,7 @@ def test_a_camera_that_is_not_followed_is_named():
         ({"rivals": ({"wind.speed": 9.0},)}, "doubtful", "Another start fits nearly as well (wind.speed 9)"),
         ({"place": (0.5, 1.0)}, "doubtful", "is at an end of its range"),
         ({"covariance": torch.eye(2)}, "doubtful", "is not determined"),
+        ({"covariance": torch.diag(torch.tensor([0.0, 0.04]))}, "doubtful", "material.E is not determined"),
     ],
 )
 def test_the_verdict_of_a_fit(changes, verdict, words):

@@ -40,7 +40,7 @@ def rows(options: argparse.Namespace, result: Row) -> Iterator[Measurement]:
             for kind in kinds:
                 yield ("verdicts", f"{kind} {number}"), partial(fitted, drawn(kind, number), {}, off=3.0)
     if "coverage" in options.parts:
-        for number in range(options.films):
+        for number in range(options.first, options.films):
             kind = list(kinds)[number % len(kinds)]
             film = drawn(kind, 100 + number, seconds=UNTIL)
             yield ("coverage", f"{kind} {number}"), partial(fitted, film, {}, off=NEAR, search=0)
@@ -48,7 +48,8 @@ def rows(options: argparse.Namespace, result: Row) -> Iterator[Measurement]:
         for kind in kinds:
             for ramp in (1.0, 2.0):
                 film = drawn(kind, 3, ramp=ramp)
-                yield ("winds", f"{kind}, speed times {ramp:g}"), partial(fitted, film, {}, wind_changes=True)
+                told = f"{kind}, {ramp:g} times the speed"
+                yield ("winds", told), partial(fitted, film, {}, wind_changes=True)
 
 
 def fitted(film: Film, more: dict[str, Any], off: float = 1.0, search: int = SEARCH, **settings: Any) -> Row:
@@ -69,7 +70,9 @@ def fitted(film: Film, more: dict[str, Any], off: float = 1.0, search: int = SEA
     return {
         "errors": errors(film, found.values),
         "standard_errors": errors(film, {n: film.truth[n] + found.errors[n] for n in film.truth}),
-        "further": {name: [found.values[name], found.errors[name]] for name in more},
+        "further": {name: [found.values[name], found.errors[name]] for name in found.values if name not in film.truth},
+        "gain_at_the_end": found.values.get(f"wind.speed@{UNTIL:.4g}", 1.0),
+        "true_gain": 1 + (film.ramp - 1) * UNTIL / film.seconds,
         "verdict": found.verdict,
         "why": [*failed, *doubtful],
         "explained": min(found.followed.values()),
@@ -111,6 +114,7 @@ CASE = Case(
         names("--parts", PARTS, default=("starts", "verdicts")),
         names("--kinds", list(KINDS), default=list(KINDS)),
         option("--films", "films of each thing, or of the part coverage in all", type=int, default=2),
+        option("--first", "number of the first film of the part coverage", type=int, default=0),
     ),
     page="fit.md",
     device=False,

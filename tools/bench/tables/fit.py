@@ -6,6 +6,7 @@ import math
 from collections.abc import Iterator
 from functools import partial
 
+from bench.cases.fit_films import GOALS, covered, misses
 from bench.tables.render import Row, fill, table, value
 from gaussian_swaying.fitting.report import ASTRAY
 
@@ -114,6 +115,55 @@ table(PAGE, "fit.soft", "soft_*", partial(_rows, part="fits"), f"""
     {_FOUND} | of the processor = {{processor_s:.0f s}} | splat at rest = {{psnr_rest_db:.1f dB}} |
     fitted; changes of scene.yaml = {{base}}
     """, before="{source}", each=True, empty="")  # fmt: skip
+
+
+def _films(result: Row, part: str) -> Iterator[Row]:
+    """Fits of small films: how far they miss, and what they say of themselves."""
+    for name, row in result.get(part, {}).items():
+        off = {"speed": "", "azimuth": "", "E": ""}
+        if "errors" in row:
+            off = {key: row["errors"][own] for key, own in zip(off, GOALS, strict=True)}
+        missed = "yes" if misses(row, 2) else ""
+        start = row.get("further", {}).get("film.start", ("",))[0]
+        yield {"name": name, "missed": missed, "start": start, "gain_at_the_end": "", "true_gain": ""} | row | off
+
+
+_OFF = "speed = {speed:+.1f %} | azimuth = {azimuth:+.1f °} | E = {E:+.1f %}"
+table(
+    PAGE,
+    "fit.starts",
+    "fit_films_cpu",
+    partial(_films, part="starts"),
+    f"film = {{name}} | {_OFF} | start = {{start:.2f s}} | verdict = {{verdict}}",
+    empty="",
+    before="{source}",
+)
+table(
+    PAGE,
+    "fit.verdicts",
+    "fit_films_cpu",
+    partial(_films, part="verdicts"),
+    f"""
+    film = {{name}} | {_OFF} | verdict = {{verdict}} | more than twice the goals off = {{missed}} |
+    processor = {{processor_s:.0f s}}""",
+    empty="",
+    before="{source}",
+)
+table(
+    PAGE,
+    "fit.winds",
+    "fit_films_cpu",
+    partial(_films, part="winds"),
+    f"""
+    film = {{name}} | {_OFF} | speed after 1 s per that at first = {{gain_at_the_end:.2f}} | true = {{true_gain:.2f}} |
+    verdict = {{verdict}}""",
+    empty="",
+    before="{source}",
+)
+table(PAGE, "fit.coverage", "fit_films_cpu", lambda result: [covered(list(result["coverage"].values()))]
+      if result.get("coverage") else [], """
+    films = {films:.0f} | speed = {wind.speed:.0f %} | azimuth = {wind.azimuth:.0f %} | E = {material.E:.0f %} |
+    all = {all:.0f %}""", empty="", before="{source}")  # fmt: skip
 
 
 table("fit.md", "registration.rows", "registration_cpu", lambda result: [
