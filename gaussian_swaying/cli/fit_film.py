@@ -20,8 +20,8 @@ from gaussian_swaying._files import write_json, write_text
 from gaussian_swaying.cli.preview import build_options, preview_scene
 from gaussian_swaying.cli.register import CAMERAS, PICTURE, VIEW, first_cameras, fov_of, painter_of, transforms
 from gaussian_swaying.fitting.film import Film, begins_to_move, first_frame, open_film, pixels_of_focal
-from gaussian_swaying.fitting.held import HeldEnd, held_end
-from gaussian_swaying.fitting.videos import read_videos
+from gaussian_swaying.fitting.held import held_end, moving_box, moving_points
+from gaussian_swaying.fitting.videos import Footage, read_videos
 from gaussian_swaying.gaussians.cloud import GaussianCloud
 from gaussian_swaying.preview.results import Preview, keep_aside, write
 from gaussian_swaying.rendering.cameras.camera import Camera
@@ -36,8 +36,10 @@ SOFTER, STIFFER = 1 / 30, 30.0
 """Range of E, per that with which the preview sways visibly."""
 SPEED = (0.5, 25.0)
 """Range of the wind [m/s]."""
-ROUGH = 1.5e-3
+ROUGH = 1.2e-3
 """Distance of points from where a camera sees them with which it may be wrong, as a share of the picture's diagonal."""
+UPRIGHT, NEARLY = 0.5, 0.85
+"""Cosines of the angles to the film's own up within which a guess of up is right, and an axis is taken for it."""
 OBJECT = "object"
 """Name of the whole in ``--length``."""
 
@@ -70,11 +72,11 @@ def prepare(options: argparse.Namespace, folder: Path) -> Path:
     length = _length(options.length)
     if options.focal is not None and not 5 <= options.focal <= 1000:
         raise ValueError(f"Expected `--focal` from 5 to 1000 mm, but got {options.focal:g}.")
-    seen, told = _registered(options)
-    print(told, flush=True)
+    seen, sentence = _registered(options)
+    print(sentence, flush=True)
     folder.mkdir(parents=True, exist_ok=True)
     _write_registration(seen, folder)
-    moves = begins_to_move(seen.film, seen.picture.alpha[..., 0].cpu())
+    moves = begins_to_move(seen.film, seen.picture, seen.camera)
     if moves is None:
         raise ValueError(
             f"Nothing moves in the film {options.film} where the splat is: look at {folder / PICTURE}, and give a film "
@@ -92,19 +94,14 @@ def prepare(options: argparse.Namespace, folder: Path) -> Path:
     data = transforms(seen.camera, where)
     data["frames"][0] |= {"begin": round(begin, 4), "seconds": round(seconds, 4)}
     write_json(folder / CAMERAS, data)
-    look, hold = folder / LOOK, options.hold
-    preview = _previewed(options, look, 1.0, hold)
-    told, held = "", None
-    if hold is None and preview.parts is None and preview.things is None:  # what the splat itself does not show surely
-        held = _held(seen, preview, folder)
-    if held is not None:
-        hold = held.name
-        told = (
-            f"held: {hold}, as the film shows; that end moves by {held.moves:.1f} pixels, the rest by {held.others:.0f}"
-        )
-    ratio = 1.0 if length is None else longest_side(*length, seen, preview)
-    if ratio != 1.0 or hold != options.hold:
-        preview = _previewed(options, look, ratio, hold)
+    look, wanted = folder / LOOK, {"up": options.up, "hold": options.hold}
+    preview = _previewed(options, look, wanted)
+    shown, told = _shown(seen, read_videos(folder / CAMERAS)[0], preview, wanted)
+    if shown:
+        preview = _previewed(options, look, wanted | shown)
+    if length is not None:
+        longest = longest_side(*length, seen, preview)
+        preview = _previewed(options, look, wanted | shown | {"longest_side": longest})
     write(preview, look)
     text = plan_text(preview, _background(seen), None if at_once else moves - begin, length is not None, folder)
     keep_aside(folder / PLAN, text)
@@ -181,17 +178,57 @@ def _background(seen: Seen) -> list[float]:
     return [round(value / 255, 3) for value in pixels.median(0).values.tolist()]
 
 
-def _held(seen: Seen, preview: Preview, folder: Path) -> HeldEnd | None:
-    """The end that the film shows to be still."""
-    (video,) = read_videos(folder / CAMERAS)
-    return held_end(video, seen.picture, preview.data["suggestion"]["up"]["direction"])
+def _shown(seen: Seen, video: Footage, preview: Preview, wanted: dict[str, Any]) -> tuple[dict[str, Any], list[str]]:
+    """Options of the preview that the film knows better than the splat, and sentences on them."""
+    shown: dict[str, Any] = {}
+    guess, told = preview.data["suggestion"]["up"], []
+    up = guess["direction"]
+    if wanted["up"] is None and guess["confidence"] in ("low", "medium"):
+        upright = upright_in(seen.camera, up)
+        if upright is not None:
+            shown["up"], up = upright, _direction(upright)
+            told.append(f"up: {' '.join(upright)}, as the film is upright")
+    if preview.parts is not None and not shown:
+        return {}, []
+    places, moved = moving_points(video, seen.picture)
+    box = moving_box(places, moved, seen.cloud)
+    if box is not None:
+        low, high = box
+        shown["region"] = [round(value, 4) for value in (*low.tolist(), *high.tolist())]
+        told.append(f"what moves in the film: from {shown['region'][:3]} to {shown['region'][3:]}")
+        inside = ((places >= low) & (places <= high)).all(-1)
+        places, moved = places[inside], moved[inside]
+    held = None if wanted["hold"] is not None else held_end(places, moved, up)
+    if held is not None:
+        shown["hold"] = held.name
+        told.append(
+            f"held: {held.name}, as the film shows; that end moves by {held.moves:.1f} pixels, the rest by "
+            f"{held.others:.0f}"
+        )
+    return shown, told
 
 
-def _previewed(options: argparse.Namespace, folder: Path, longest: float, hold: str | None) -> Preview:
-    """The preview of the splat, whose longest side has a length [m], and which is held at an end, or guessed."""
-    words = [str(options.splat), f"--longest-side={longest:.9g}", f"--device={options.device}"]
-    given = build_options().parse_args(words)
-    given.up, given.hold = options.up, hold
+def upright_in(camera: Camera, guess: Sequence[float]) -> list[str] | None:
+    """The axis of a splat that is up in a film, or 3 numbers; None if a guess is up in it, too.
+
+    Args:
+        camera: Of the film, which nobody holds upside down.
+        guess: A direction in the splat, shape (3,).
+    """
+    from gaussian_swaying.preview.shape import DIRECTIONS
+
+    up = -camera.world_to_camera[1, :3].double()
+    along = {name: float(up @ torch.tensor(axis, dtype=torch.float64)) for name, axis in DIRECTIONS.items()}
+    if float(up @ torch.tensor(guess, dtype=torch.float64)) > UPRIGHT:
+        return None
+    best = max(along, key=along.__getitem__)
+    return [best] if along[best] > NEARLY else [f"{part:.4f}" for part in up.tolist()]
+
+
+def _previewed(options: argparse.Namespace, folder: Path, wanted: dict[str, Any]) -> Preview:
+    """The preview of the splat with some options of ``preview``."""
+    given = build_options().parse_args([str(options.splat), f"--device={options.device}"])
+    vars(given).update(wanted)
     return preview_scene(given, folder)
 
 
@@ -262,6 +299,7 @@ def plan_text(preview: Preview, background: Sequence[float], still: float | None
     """
     guess = preview.data["suggestion"]
     material = yaml.safe_load(preview.configurations["draft"])["material"]
+    assumed = ["mass", *(() if scaled else ("length",)), *(() if still is not None else ("camera",))]
     low, high = (float(f"{material['E'] * factor:.1e}") for factor in (SOFTER, STIFFER))
     middle, half = 0.0, 180.0
     if guess["hold"]["end"] == "side":  # a flag flies away from its pole
@@ -278,7 +316,7 @@ def plan_text(preview: Preview, background: Sequence[float], still: float | None
         (f"  background: {list(background)}", "around the splat in the film"),
         (f"  material.density: {material['density']:g}", "kg/m3; not measured"),
         (f"  material.thickness: {material['thickness']:.4g}", "m; with the density it makes the mass of an area"),
-        (f"assumed: [{'mass' if scaled else 'mass, length'}]", "not measured; the result says what follows"),
+        (f"assumed: [{', '.join(assumed)}]", "not measured; the result says what follows"),
         ("unknowns:", "with the ranges in which they are sought"),
         (f"  wind.speed: {{range: {list(SPEED)}}}", "m/s"),
         (f"  wind.azimuth: {{range: {around}}}", "degrees from +x towards +y, with z up"),
@@ -291,14 +329,16 @@ def plan_text(preview: Preview, background: Sequence[float], still: float | None
     return head + "".join(f"{line:<44}# {told}\n" for line, told in lines)
 
 
-def _guesses(preview: Preview, told: str, length: Any) -> list[str]:
+def _guesses(preview: Preview, told: Sequence[str], length: Any) -> list[str]:
     """The guesses of the preview, as lines."""
     guess = preview.data["suggestion"]
     hold = guess["hold"]
-    lines = [
-        f"guessed: up is {[round(v, 2) for v in guess['up']['direction']]} (confidence {guess['up']['confidence']})"
-    ]
-    lines.append(told or f"guessed: held at the {hold['end']} (confidence {hold['confidence']}): {hold['reason']}")
+    lines = list(told)
+    if guess["up"]["confidence"] != "given":
+        direction = [round(part, 2) for part in guess["up"]["direction"]]
+        lines.append(f"guessed: up is {direction} (confidence {guess['up']['confidence']})")
+    if hold["confidence"] != "given":
+        lines.append(f"guessed: held at the {hold['end']} (confidence {hold['confidence']}): {hold['reason']}")
     if guess["parts"] is not None:
         lines.append("parts: " + ", ".join(f"{n} {p['role']}" for n, p in guess["parts"]["parts"].items()))
     size = " x ".join(f"{side:.3g}" for side in guess["size_m"])

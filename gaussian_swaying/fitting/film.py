@@ -18,8 +18,11 @@ import torch
 from torch import Tensor
 
 from gaussian_swaying._inputs import check_regular
-from gaussian_swaying.fitting.tracks import opencv
+from gaussian_swaying.fitting.registration import in_space
+from gaussian_swaying.fitting.tracks import follow, opencv
 from gaussian_swaying.fitting.videos import MOST_PIXELS, next_of, scaled
+from gaussian_swaying.rendering.cameras.camera import Camera
+from gaussian_swaying.rendering.protocol import RenderOutput
 
 SIDE = 960
 """Longer side of the frames that are used, at most [pixels]."""
@@ -29,6 +32,10 @@ DIFFERENT, MOVED = 8.0, 0.02
 """Grey levels by which a pixel differs that has moved, and the share of such pixels in a frame that has."""
 DIAGONAL = math.hypot(36, 24)
 """Of the film to which a focal length in mm is equivalent [mm]."""
+FULL = 0.6
+"""Share of the picture that a splat covers which has surroundings: then most of its points stand still."""
+STRAY, IN_A_ROW = 1.5, 3
+"""Distance of a point that moves from where the camera sees it at rest [pixels], and frames in which some do."""
 LEAST = 8
 """Fewest points of the background that tell how a hand shakes."""
 _FOCAL = re.compile(r"focal.?length\S*35mm\S*\s*:\s*([0-9.]+)", re.IGNORECASE)
@@ -94,14 +101,16 @@ def pixels_of_focal(millimetres: float, width: int, height: int) -> float:
     return millimetres * math.hypot(width, height) / DIAGONAL
 
 
-def begins_to_move(film: Film, where: Tensor) -> float | None:
+def begins_to_move(film: Film, picture: RenderOutput, camera: Camera) -> float | None:
     """Time of the first frame in which the object is not as in the first one [s]; None if there is none.
 
-    A hand that shakes moves the background, too, and does not count.
+    A hand that shakes moves the background, too, and does not count: what lies around the splat, or most of a splat
+    that fills the picture.
 
     Args:
         film: The film; the object is at rest in its first frame. Brighter and darker frames do not count as motion.
-        where: The opacity of the object in the first frame, shape (H, W).
+        picture: The splat, drawn from the camera of the first frame.
+        camera: That camera.
     """
     import numpy as np
 
@@ -110,16 +119,20 @@ def begins_to_move(film: Film, where: Tensor) -> float | None:
     first: Any = None
     with closing(_frames(film.path, scaled(*size), grey=True)) as frames:
         width, height = next_of(frames, film.path)["size"]
-        mask = torch.nn.functional.interpolate(where[None, None].float(), size=(height, width), mode="area")[0, 0] > 0.3
+        where = picture.alpha[..., 0].detach().cpu().float()[None, None]
+        mask = torch.nn.functional.interpolate(where, size=(height, width), mode="area")[0, 0] > 0.3
         if not bool(mask.any()):
             mask = torch.ones_like(mask)
-        number, inside = 0, mask.numpy()
+        number, in_a_row, inside = 0, 0, mask.numpy()
+        full = inside.mean() > FULL
         while (frame := next_of(frames, film.path)) is not None:
             grey = np.frombuffer(frame, dtype=np.uint8).reshape(height, width)
             if first is None:
-                first, steady = grey, _Steady(grey, inside)
-            if _differs(first, grey, inside) and _differs(first, steady.aligned(grey), inside):
-                return number / film.fps
+                first, steady = grey, _Room(grey, picture, camera) if full else _Steady(grey, inside)
+            moves = _differs(first, grey, inside) and steady.differs(grey)
+            in_a_row = in_a_row + 1 if moves else 0
+            if in_a_row == (IN_A_ROW if full else 1):
+                return (number + 1 - in_a_row) / film.fps
             number += 1
     return None
 
@@ -144,9 +157,14 @@ class _Steady:
 
         cv2 = opencv()
         around = 255 * (cv2.dilate(inside.astype(np.uint8), np.ones((15, 15), np.uint8)) == 0).astype(np.uint8)
-        self._first, self._points = first, cv2.goodFeaturesToTrack(first, 200, 0.05, 5, mask=around)
+        self._first, self._inside = first, inside
+        self._points = cv2.goodFeaturesToTrack(first, 200, 0.05, 5, mask=around)
 
-    def aligned(self, grey: Any) -> Any:
+    def differs(self, grey: Any) -> bool:
+        """Return whether the object is not as in the first frame, once the shake is off."""
+        return _differs(self._first, self._aligned(grey), self._inside)
+
+    def _aligned(self, grey: Any) -> Any:
         """The frame, moved and turned onto the first one; as it is if the background has too few points."""
         cv2 = opencv()
         if self._points is None or len(self._points) < LEAST:
@@ -157,6 +175,62 @@ class _Steady:
             return grey
         turn, _ = cv2.estimateAffinePartial2D(there[kept], self._points[kept])
         return grey if turn is None else cv2.warpAffine(grey, turn, grey.shape[::-1], borderMode=cv2.BORDER_REPLICATE)
+
+
+class _Room:
+    """Tells what moves in a splat that fills the picture, most of which stands still.
+
+    Args:
+        first: The first frame, uint8 (H, W).
+        picture: The splat, drawn from its camera, which may be larger.
+        camera: That camera.
+    """
+
+    def __init__(self, first: Any, picture: RenderOutput, camera: Camera) -> None:
+        import numpy as np
+
+        scale = np.array([camera.width / first.shape[1], camera.height / first.shape[0]])
+        corners = opencv().goodFeaturesToTrack(first, 500, 0.01, 4)
+        self._first = first
+        self._start = np.zeros((0, 2)) if corners is None else corners.reshape(-1, 2) + 0.5
+        self._world, self._known = in_space(picture, camera, self._start * scale)
+        self._intrinsics = camera.intrinsics.double().numpy() / np.array([[scale[0]], [scale[1]], [1.0]])
+
+    def differs(self, grey: Any) -> bool:
+        """Return whether some points are not where a camera sees those that stand still."""
+        import numpy as np
+
+        (_, there), (_, seen) = follow(np.stack([self._first, grey])[..., None].repeat(3, -1), self._start)
+        used = seen & self._known
+        off = off_camera(self._world[used], there[used], self._intrinsics, STRAY)
+        return off is not None and bool((off > STRAY).sum() >= max(LEAST, MOVED * len(off)))
+
+
+def off_camera(world: Any, there: Any, intrinsics: Any, near: float) -> Any:
+    """Distances of points in a frame from where the camera sees them that agrees with most of them [pixels].
+
+    Args:
+        world: Their places in space, shape (T, 3).
+        there: Where they are in the frame [pixels], shape (T, 2).
+        intrinsics: Of the camera, shape (3, 3).
+        near: Largest distance of points that agree [pixels].
+
+    Returns:
+        Shape (T,); None if less than half of them agree on a camera.
+    """
+    import numpy as np
+
+    cv2 = opencv()
+    if len(world) < LEAST:
+        return None
+    done, turn, shift, agree = cv2.solvePnPRansac(
+        world, there, intrinsics, None, reprojectionError=near, flags=cv2.SOLVEPNP_AP3P
+    )
+    if not done or len(agree) < 0.5 * len(world):
+        return None
+    agree = agree[:, 0]
+    turn, shift = cv2.solvePnPRefineLM(world[agree], there[agree], intrinsics, None, turn, shift)
+    return np.linalg.norm(cv2.projectPoints(world, turn, shift, intrinsics, None)[0].reshape(-1, 2) - there, axis=-1)
 
 
 def _frames(path: Path, options: list[str], grey: bool = False) -> Generator[Any, None, None]:
@@ -181,4 +255,4 @@ def _focal(path: Path) -> float | None:
     return value if 5 <= value <= 1000 else None
 
 
-__all__ = ["Film", "begins_to_move", "first_frame", "open_film", "pixels_of_focal"]
+__all__ = ["Film", "begins_to_move", "first_frame", "off_camera", "open_film", "pixels_of_focal"]

@@ -1,4 +1,4 @@
-"""The end at which an object is held, from a film of it: the one that does not move."""
+"""The part of a splat that moves in a film, and the end at which it is held: the one that does not move."""
 
 from __future__ import annotations
 
@@ -9,9 +9,13 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from gaussian_swaying.fitting.film import FULL, LEAST, off_camera
 from gaussian_swaying.fitting.registration import SOLID, in_space
 from gaussian_swaying.fitting.tracks import follow, opencv
 from gaussian_swaying.fitting.videos import Footage
+from gaussian_swaying.gaussians.cloud import GaussianCloud
+from gaussian_swaying.gaussians.grouping import connected_parts
+from gaussian_swaying.geometry.neighbours import particle_spacing
 from gaussian_swaying.rendering.protocol import RenderOutput
 
 END = 0.12
@@ -22,6 +26,13 @@ FEWEST = 5
 """Fewest points that make an end."""
 STILL, MOVED = 0.35, 3.0
 """Largest motion of a held end, per that of the liveliest quarter of the points, and the least of these [pixels]."""
+
+LIVELY = 0.25
+"""Motion of what moves, per that of the liveliest fiftieth of the points; the rest is drift of the tracks."""
+MOST = 0.5
+"""Largest share of the points that move if there are things around that do not."""
+CELLS, PAD = 24, 0.02
+"""Cells along what moves, within two of which things are connected; and what its box is larger, as shares of it."""
 
 
 @dataclass(frozen=True)
@@ -41,21 +52,17 @@ class HeldEnd:
     others: float
 
 
-def held_end(video: Footage, picture: RenderOutput, up: Sequence[float]) -> HeldEnd | None:
+def held_end(places: Tensor, moved: Tensor, up: Sequence[float]) -> HeldEnd | None:
     """Find the end of an object that moves least in a film.
 
     Args:
-        video: The film; the object is at rest in its first frame.
-        picture: The object, drawn from the camera of the first frame.
+        places: Of points on the object, shape (T, 3).
+        moved: How far each goes [pixels], shape (T,).
         up: Direction that is up, shape (3,).
 
     Returns:
         None if no end is much more still than the rest, as in an object that is held at a corner or within.
-
-    Raises:
-        ImportError: Without OpenCV.
     """
-    places, moved = moving_points(video, picture)
     if len(moved) < 4 * FEWEST:
         return None
     others = float(moved.quantile(0.75))
@@ -80,21 +87,77 @@ def held_end(video: Footage, picture: RenderOutput, up: Sequence[float]) -> Held
     return HeldEnd(name, tuple(ends[name].tolist()), moves, others)
 
 
+def moving_box(places: Tensor, moved: Tensor, cloud: GaussianCloud) -> tuple[Tensor, Tensor] | None:
+    """The box of what moves among things that do not, and of all that is connected with it.
+
+    Args:
+        places: Of points that the film shows, shape (T, 3).
+        moved: How far each goes [pixels], shape (T,).
+        cloud: The splat.
+
+    Returns:
+        Lower and upper corner [scene units], shape (3,); None if most of what is seen moves, or hardly anything.
+    """
+    goes = moved > max(MOVED, LIVELY * float(moved.quantile(0.98))) if len(moved) else moved > 0
+    if not 4 * FEWEST <= int(goes.sum()) <= MOST * len(goes):
+        return None
+    low, high = (places[goes].quantile(share, dim=0) for share in (0.02, 0.98))
+    longest = float((high - low).max())
+    means = cloud.means.double()
+    near = ((means > low - longest) & (means < high + longest)).all(-1) & (cloud.opacities > 0)
+    points = means[near]
+    part = connected_parts(points, max(longest / CELLS, 2 * particle_spacing(points)))
+    inside = ((points >= low) & (points <= high)).all(-1)
+    if not bool(inside.any()):
+        return None
+    own = points[part == int(part[inside].mode().values)]
+    pad = PAD * longest
+    return own.amin(0) - pad, own.amax(0) + pad
+
+
 def moving_points(video: Footage, picture: RenderOutput) -> tuple[Tensor, Tensor]:
-    """Places in the splat of points of the object that are followed, (T, 3), and how far each goes, (T,) [pixels]."""
+    """Follow points of a splat through a film, and take the shake of a hand off.
+
+    Args:
+        video: The film; the object is at rest in its first frame.
+        picture: The splat, drawn from the camera of the first frame.
+
+    Returns:
+        The places in the splat of those that are seen for half of the film, (T, 3), and how far each goes at most, (T,)
+        [pixels].
+
+    Raises:
+        ImportError: Without OpenCV.
+    """
     import numpy as np
 
     cv2: Any = opencv()
     grey = cv2.cvtColor(video.images[0].numpy(), cv2.COLOR_RGB2GRAY)
     cover = (picture.alpha[..., 0].detach().cpu().numpy() > SOLID).astype(np.uint8)
-    corners = cv2.goodFeaturesToTrack(grey, 600, 0.01, 5, mask=cover)
-    if corners is None:
-        return torch.zeros(0, 3, dtype=torch.float64), torch.zeros(0, dtype=torch.float64)
-    start = corners.reshape(-1, 2).astype(np.float64) + 0.5
-    position, seen = follow(video.images.numpy(), start)
-    world, known = in_space(picture, video.cameras[0], start)
-    gone = np.where(seen, np.linalg.norm(position - position[:1], axis=-1), 0.0).max(0)
-    return torch.from_numpy(world[known]), torch.from_numpy(gone[known])
+    around = (cv2.dilate(cover, np.ones((31, 31), np.uint8)) == 0).astype(np.uint8)
+    corners = [cv2.goodFeaturesToTrack(grey, 600, 0.01, 5, mask=mask) for mask in (cover, around)]
+    there, beside = (np.zeros((0, 2)) if one is None else one.reshape(-1, 2) + 0.5 for one in corners)
+    position, seen = follow(video.images.numpy(), np.concatenate([there, beside]))
+    world, known = in_space(picture, video.cameras[0], there)
+    outside = position[:, len(there) :], seen[:, len(there) :]
+    position, seen = position[:, : len(there)], seen[:, : len(there)]
+    gone = np.zeros(len(there))
+    K = video.cameras[0].intrinsics.double().numpy()
+    for k in range(1, len(position)):
+        used = known & seen[k]
+        if len(beside) >= LEAST:  # what lies around the splat
+            moved, valid = outside[0][k], outside[1][k]
+            turn = cv2.estimateAffinePartial2D(outside[0][0][valid], moved[valid], ransacReprojThreshold=1.5)[0]
+            start = position[0] if turn is None else position[0] @ turn[:, :2].T + turn[:, 2]
+            far = np.linalg.norm(position[k] - start, axis=-1)[used]
+        elif cover.mean() > FULL:
+            far = off_camera(world[used], position[k, used], K, MOVED)
+        else:
+            far = np.linalg.norm(position[k] - position[0], axis=-1)[used]
+        if far is not None:
+            gone[used] = np.maximum(gone[used], far)
+    kept = known & (seen.mean(0) > 0.5)
+    return torch.from_numpy(world[kept]), torch.from_numpy(gone[kept])
 
 
-__all__ = ["HeldEnd", "held_end", "moving_points"]
+__all__ = ["HeldEnd", "held_end", "moving_box", "moving_points"]

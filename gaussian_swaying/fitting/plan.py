@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 STAGES = ("tracks", "silhouettes", "matches", "pixels")
 """Stages of a fit, in this order: tracks from frame to frame; silhouettes; Gaussians matched from rendered frames to
 frames of the video, three rounds; colours."""
-ASSUMED = ("length", "mass")
+ASSUMED = ("length", "mass", "camera")
 """Things in a base that nobody measured, perhaps."""
 
 

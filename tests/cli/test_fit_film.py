@@ -14,7 +14,7 @@ from PIL import Image
 from shared import refused
 
 from gaussian_swaying.cli.fit import main
-from gaussian_swaying.cli.fit_film import Seen, extent, longest_side
+from gaussian_swaying.cli.fit_film import Seen, extent, longest_side, upright_in
 from gaussian_swaying.cli.preview import build_options, preview_scene
 from gaussian_swaying.cli.register import painter_of
 from gaussian_swaying.fitting.before import HELD, MOVING
@@ -23,7 +23,7 @@ from gaussian_swaying.fitting.plan import read_plan
 from gaussian_swaying.fitting.videos import read_videos
 from gaussian_swaying.gaussians.formats import read_gaussians
 from gaussian_swaying.recording.video import VideoEncoder
-from gaussian_swaying.rendering.cameras.camera import project
+from gaussian_swaying.rendering.cameras.camera import look_at_camera, project
 
 pytest.importorskip("cv2")
 
@@ -175,3 +175,12 @@ def test_films_that_do_not_work(case, shown, told, capsys):
     encoder.finish()
     splat, out = str(case / "my.ply"), str(case / "bad")
     refused(main, [str(case / "other.mp4"), "--splat", splat, "--output", out], capsys, told)
+
+
+def test_a_film_is_not_upside_down():
+    """A guess that is up in the film, too, stays; else the nearest axis of the splat is taken, or numbers."""
+    level = look_at_camera((0.0, -3.0, 1.0), (0.0, 0.0, 0.5), (0, 0, 1), 40.0, 20, 10)
+    assert upright_in(level, [0.2, 0.0, 0.9]) is None
+    assert upright_in(level, [0.0, -1.0, 0.0]) == ["+z"]
+    tilted = look_at_camera((0.0, -3.0, 0.0), (0.0, 0.0, 0.0), (0.7, 0.0, 0.7), 40.0, 20, 10)
+    assert [float(part) for part in upright_in(tilted, [0.0, 0.0, -1.0])] == pytest.approx([0.707, 0, 0.707], abs=0.01)

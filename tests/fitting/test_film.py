@@ -10,6 +10,10 @@ import torch
 from gaussian_swaying.fitting import film as films
 from gaussian_swaying.fitting.film import begins_to_move, first_frame, open_film
 from gaussian_swaying.recording.video import VideoEncoder
+from gaussian_swaying.rendering.cameras.camera import look_at_camera
+from gaussian_swaying.rendering.protocol import RenderOutput
+
+from .test_held import room
 
 pytest.importorskip("cv2")
 
@@ -33,26 +37,27 @@ def _square(left, light=1.0, noise=0.0, size=(96, 160)):
     return picture.clip(0, 255).astype(np.uint8)
 
 
-def _where():
-    where = torch.zeros(96, 160)
-    where[30:70, 60:100] = 1.0
-    return where
+def _moves(path):
+    """The time at which the square, which is drawn at its first place, begins to move."""
+    alpha = torch.zeros(96, 160, 1)
+    alpha[30:70, 60:100] = 1.0
+    camera = look_at_camera((0.0, -3.0, 0.0), (0.0, 0.0, 0.0), (0, 0, 1), 40.0, 160, 96)
+    return begins_to_move(open_film(path), RenderOutput(alpha.expand(-1, -1, 3), alpha, 3 * alpha), camera)
 
 
 def test_the_time_at_which_it_moves(tmp_path):
     """Noise and a brighter light are no motion."""
     still = [_square(60, 1.0 + 0.02 * (k % 3), 3.0) for k in range(20)]
     moving = [_square(60 + 2 * k, 1.0, 3.0) for k in range(1, 10)]
-    path = _film(tmp_path / "a.mp4", still + moving)
-    assert begins_to_move(open_film(path), _where()) == pytest.approx(0.8, abs=0.05)
-    assert begins_to_move(open_film(_film(tmp_path / "b.mp4", still)), _where()) is None
+    assert _moves(_film(tmp_path / "a.mp4", still + moving)) == pytest.approx(0.8, abs=0.05)
+    assert _moves(_film(tmp_path / "b.mp4", still)) is None
 
 
 def test_what_moves_beside_the_object_does_not_count(tmp_path):
     frames = [_square(60) for _ in range(20)]
     for k, frame in enumerate(frames):
         frame[80:96, 4 * k : 4 * k + 10] = 255
-    assert begins_to_move(open_film(_film(tmp_path / "a.mp4", frames)), _where()) is None
+    assert _moves(_film(tmp_path / "a.mp4", frames)) is None
 
 
 def test_a_hand_that_shakes_is_no_motion(tmp_path):
@@ -67,9 +72,21 @@ def test_a_hand_that_shakes_is_no_motion(tmp_path):
                 picture = np.where(empty, spots, picture).astype(np.uint8)
             yield np.roll(picture, (round(1.5 * np.sin(k)), round(2 * np.sin(0.7 * k))), (0, 1))
 
-    film = open_film(_film(tmp_path / "a.mp4", frames(True)))
-    assert begins_to_move(film, _where()) == pytest.approx(0.8, abs=0.1)
-    assert begins_to_move(open_film(_film(tmp_path / "b.mp4", frames(False))), _where()) < 0.2
+    assert _moves(_film(tmp_path / "a.mp4", frames(True))) == pytest.approx(0.8, abs=0.1)
+    assert _moves(_film(tmp_path / "b.mp4", frames(False))) < 0.2
+
+
+def test_a_hand_that_shakes_in_a_room(tmp_path):
+    """The splat fills the picture: most of it stands still, and tells where the camera is."""
+    video, picture, _ = room(0)
+    frames = [video.images[max(0, k - 20) // 2].numpy() for k in range(35)]
+    frames = [
+        np.roll(frame, (round(3 * np.sin(k)), round(4 * np.sin(0.7 * k))), (0, 1)) for k, frame in enumerate(frames)
+    ]
+    film = open_film(_film(tmp_path / "a.mp4", frames))
+    assert begins_to_move(film, picture, video.cameras[0]) == pytest.approx(0.88, abs=0.13)
+    still = open_film(_film(tmp_path / "b.mp4", frames[:20]))
+    assert begins_to_move(still, picture, video.cameras[0]) is None
 
 
 def test_a_large_film_is_read_in_reduced_size(tmp_path, monkeypatch):
