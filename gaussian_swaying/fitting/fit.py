@@ -568,7 +568,7 @@ class Fit:
         return normal_equations(blocks, _scaled(evidence)(blocks), steps)
 
     def notes(self) -> list[str]:
-        """Sentences on what speaks against the plan: unknowns that are confounded, a start that is missing."""
+        """Sentences on what speaks against the plan: unknowns that are confounded, a camera, a missing start."""
         names = [u.name for u in self.plan.unknowns]
         confounded = [
             f"wind.speed and {name} move the object in nearly the same way, so both may be far off: put one of them "
@@ -576,7 +576,11 @@ class Fit:
             for name in DRAG
             if name in names and "wind.speed" in names
         ]
-        return confounded + self._notes_on_start()
+        rough = [
+            "The camera was found from a frame in which the object may move already, so all values may be off: give a "
+            "film that begins at rest."
+        ]
+        return confounded + rough * ("camera" in self.plan.assumed) + self._notes_on_start()
 
     def _notes_on_start(self) -> list[str]:
         if FILM_START in (u.name for u in self.plan.unknowns) or not self.followed:

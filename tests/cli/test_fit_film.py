@@ -14,7 +14,7 @@ from PIL import Image
 from shared import refused
 
 from gaussian_swaying.cli.fit import main
-from gaussian_swaying.cli.fit_film import Seen, extent, longest_side, upright_in
+from gaussian_swaying.cli.fit_film import Seen, extent, longest_side, plan_text, upright_in
 from gaussian_swaying.cli.preview import build_options, preview_scene
 from gaussian_swaying.cli.register import painter_of
 from gaussian_swaying.fitting.before import HELD, MOVING
@@ -184,3 +184,10 @@ def test_a_film_is_not_upside_down():
     assert upright_in(level, [0.0, -1.0, 0.0]) == ["+z"]
     tilted = look_at_camera((0.0, -3.0, 0.0), (0.0, 0.0, 0.0), (0.7, 0.0, 0.7), 40.0, 20, 10)
     assert [float(part) for part in upright_in(tilted, [0.0, 0.0, -1.0])] == pytest.approx([0.707, 0, 0.707], abs=0.01)
+
+
+def test_a_film_that_may_begin_in_motion_is_doubted(seen, tmp_path):
+    text = plan_text(seen[1], [0.1, 0.2, 0.3], None, True, tmp_path)
+    plan = yaml.safe_load(text)
+    assert plan["assumed"] == ["mass", "camera"]
+    assert plan["unknowns"]["film.start"]["range"] == [-1.0, 0.1]

@@ -82,6 +82,8 @@ def test_a_drag_that_is_sought_with_the_speed_is_remarked_on(own, simulation):
     (note,) = Fit(simulation, videos, plan).notes()
     assert note.startswith("wind.speed and aero.C_D move the object in nearly the same way")
     assert Fit(simulation, videos, replace(plan, unknowns=sought[1:])).notes() == []
+    (note,) = Fit(simulation, videos, replace(plan, unknowns=sought[1:], assumed=["mass", "camera"])).notes()
+    assert "The camera was found from a frame in which the object may move already" in note
 
 
 def test_some_tracks_are_held_out_and_judge_the_fit(own, simulation):
