@@ -36,7 +36,7 @@ def rows(options: argparse.Namespace, result: Row) -> Iterator[Measurement]:
                 told = f"{kind}, {'still' if start > 0 else 'moving'} for {abs(start):g} s"
                 yield ("starts", told), partial(fitted, film, {FILM_START: [-0.5, 0.5]})
     if "verdicts" in options.parts:
-        for number in range(options.films):
+        for number in range(options.first, options.films):
             for kind in kinds:
                 yield ("verdicts", f"{kind} {number}"), partial(fitted, drawn(kind, number), {}, off=3.0)
     if "coverage" in options.parts:
@@ -114,7 +114,7 @@ CASE = Case(
         names("--parts", PARTS, default=("starts", "verdicts")),
         names("--kinds", list(KINDS), default=list(KINDS)),
         option("--films", "films of each thing, or of the part coverage in all", type=int, default=2),
-        option("--first", "number of the first film of the part coverage", type=int, default=0),
+        option("--first", "number of the first of these films", type=int, default=0),
     ),
     page="fit.md",
     device=False,
