@@ -10,7 +10,7 @@ from bench.problems.fit_films import FPS, KINDS, Film, drawn, make
 
 from gaussian_swaying.fitting.videos import read_videos
 
-from .conftest import HEAD, measure
+from .conftest import HEAD, cells, measure
 
 pytest.importorskip("cv2")
 
@@ -71,3 +71,21 @@ def test_a_fit_of_a_film_is_recorded(monkeypatch):
     assert set(row["errors"]) == set(row["standard_errors"]) == {"wind.speed", "wind.azimuth", "material.E"}
     assert min(row["standard_errors"].values()) > 0
     assert row["verdict"] in ("good", "doubtful", "failed")
+
+
+def test_what_the_page_shows():
+    """A fit that misses by more than twice the goals is named, one that was refused has no numbers."""
+    row = {"errors": {"wind.speed": 0.04, "wind.azimuth": -12.0, "material.E": 0.1}, "processor_s": 30.0}
+    row["standard_errors"] = {"wind.speed": 0.03, "wind.azimuth": 1.0, "material.E": 0.2}
+    row |= {"verdict": "doubtful", "further": {"film.start": [-0.2, 0.01]}, "gain_at_the_end": 1.7, "true_gain": 1.67}
+    refused = {"verdict": "failed", "why": ["No."], "processor_s": 3.0}
+    record = json.loads(json.dumps(HEAD))
+    record |= {part: {"banner 0": row} for part in ("starts", "winds", "coverage")}
+    record["verdicts"] = {"banner 0": row, "post 0": refused}
+    assert cells("fit.verdicts", record) == [
+        ["banner 0", "+4.0 %", "-12.0°", "+10.0 %", "doubtful", "yes", "30 s"],
+        ["post 0", "", "", "", "failed", "yes", "3 s"],
+    ]
+    assert cells("fit.starts", record) == [["banner 0", "+4.0 %", "-12.0°", "+10.0 %", "-0.20 s", "doubtful"]]
+    assert cells("fit.winds", record) == [["banner 0", "+4.0 %", "-12.0°", "+10.0 %", "1.70", "1.67", "doubtful"]]
+    assert cells("fit.coverage", record) == [["1", "100 %", "0 %", "100 %", "67 %"]]
