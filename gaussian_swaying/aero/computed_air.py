@@ -21,6 +21,7 @@ from gaussian_swaying.air.collision import MOMENTS
 from gaussian_swaying.air.flow import WALL, Face, FlowState, LatticeFlow
 from gaussian_swaying.air.immersed import Reach, give, look, together, velocity_at
 from gaussian_swaying.air.lattice import FASTEST, LatticeUnits
+from gaussian_swaying.geometry.distance import DistanceGrid
 from gaussian_swaying.geometry.frame import SimFrame
 from gaussian_swaying.geometry.regions import Region
 from gaussian_swaying.kernels.graphs import Replayed
@@ -53,6 +54,7 @@ class ComputedAir(nn.Module):
             leaves and threads that are smaller than a cell.
         ground: Whether the lower face is the ground; otherwise the wind blows along it.
         walls: Regions in scene units in which there is no air, as around obstacles; they do not move.
+        still_walls: Whether the Gaussians of the scene that stand still are walls, at least a cell thick.
         viscosity: Kinematic viscosity of the air [m²/s].
         smagorinsky: Constant of the subgrid model; 0 for none, which is for low Reynolds numbers.
         speed: Speed [m/s] that is ``lattice_speed`` cells per step; null for the largest of the wind without gusts, and
@@ -72,6 +74,7 @@ class ComputedAir(nn.Module):
         force: Literal["surface", "law"] = "surface",
         ground: bool = False,
         walls: list[Region] = [],  # noqa: B006  (never changed)
+        still_walls: bool = False,
         viscosity: float = 1.5e-5,
         smagorinsky: float = 0.1,
         speed: float | None = None,
@@ -92,6 +95,7 @@ class ComputedAir(nn.Module):
         if speed is not None:
             check_positive("speed", speed)
         self.cells, self.force, self.ground, self.walls = cells, force, bool(ground), list(walls)
+        self.still_walls = bool(still_walls)
         self.viscosity, self.smagorinsky = float(viscosity), float(smagorinsky)
         self.speed, self.lattice_speed = speed, float(lattice_speed)
 
@@ -243,6 +247,7 @@ class AirInBox:
         frame: From scene units to metres.
         frame_dt: Length of a frame [s].
         state: The state at rest.
+        still: Distance from what stands still in the scene; air within half a cell of it is wall. None for none.
 
     Attributes:
         flow: The flow.
@@ -255,7 +260,14 @@ class AirInBox:
     """
 
     def __init__(
-        self, settings: ComputedAir, load: WindForce, solver: Solver, frame: SimFrame, frame_dt: float, state: State
+        self,
+        settings: ComputedAir,
+        load: WindForce,
+        solver: Solver,
+        frame: SimFrame,
+        frame_dt: float,
+        state: State,
+        still: DistanceGrid | None = None,
     ) -> None:
         self.settings, self.frame_dt = settings, frame_dt
         self.load, self._solver = load, solver
@@ -284,10 +296,12 @@ class AirInBox:
             inside = torch.zeros(place.shape[:-1], dtype=torch.bool)
             for region in settings.walls:
                 inside |= region.contains(frame.point_to_scene(self.origin + h * place)).cpu()
+            if still is not None:
+                inside |= still.at(self.origin + h * place)[0] < 0.5 * h
             return inside
 
         faces: list[Face | tuple[Face, Face]] = ["open", "open", ("wall", "open") if settings.ground else "open"]
-        walls = solid if settings.walls else None
+        walls = solid if settings.walls or still is not None else None
         self.flow = LatticeFlow(cells, units, faces=faces, walls=walls, smagorinsky=settings.smagorinsky).to(device)
         self._inflow = centres.reshape(-1, 3)[self.flow.held.long().cpu()].to(double_home(device))
         self.push = AirPush(state.position.shape[-2], state.position)

@@ -13,6 +13,7 @@ from gaussian_swaying.gaussians.area import patch_area
 from gaussian_swaying.gaussians.cloud import GaussianCloud
 from gaussian_swaying.gaussians.model import DeformedGaussians, GaussianSurfaceModel
 from gaussian_swaying.geometry.directions import hull_area
+from gaussian_swaying.geometry.distance import DistanceGrid
 from gaussian_swaying.geometry.frame import SimFrame
 from gaussian_swaying.geometry.neighbours import nearest_neighbours
 from gaussian_swaying.geometry.patches import deform_all
@@ -229,14 +230,27 @@ class SimulatedScene(nn.Module):
         self.surface_places = surface_of(body.samples, body.owner, self.points, self._dx, contact)
         for obstacle in obstacles:
             if isinstance(obstacle, StillGaussians):
-                low, high = self._box(obstacle.margin)
-                still = torch.ones(len(self.model.means), dtype=torch.bool)
-                still[self.moving] = False
-                still[self.simulated] = False  # a part that is held belongs to the body
-                means = self.frame.point_to_sim(self.model.means.detach()[still].double())
-                shape = self.frame.covariance_to_sim(self.rest_covariances[still].double())
-                opacity = self.model.opacity().detach()[still]
-                obstacle.take(still_distance(means, shape, opacity, low, high, obstacle.cells, obstacle.level))
+                obstacle.take(self.still_distance(*self._box(obstacle.margin), obstacle.cells, obstacle.level))
+
+    @torch.no_grad()
+    def still_distance(self, low: Tensor, high: Tensor, cells: int, level: float = 0.5) -> DistanceGrid:
+        """Signed distance from the surface of the Gaussians that stand still, in a box.
+
+        Args:
+            low: Lower corner of the box [m], shape (3,).
+            high: Upper corner of the box [m], shape (3,).
+            cells: Cells along its longest side.
+            level: Density of the surface, from 0 to 1.
+
+        Raises:
+            ValueError: If they are nowhere that dense.
+        """
+        still = torch.ones(len(self.model.means), dtype=torch.bool)
+        still[self.moving.cpu()] = False
+        still[self.simulated.cpu()] = False  # a part that is held belongs to the body
+        means = self.frame.point_to_sim(self.model.means.cpu()[still].double())
+        shape = self.frame.covariance_to_sim(self.rest_covariances.cpu()[still].double())
+        return still_distance(means, shape, self.model.opacity().cpu()[still], low, high, cells, level)
 
     def _box(self, margin: float) -> tuple[Tensor, Tensor]:
         """Corners [m] of a box around the points at rest, with a margin in lengths of its longest side."""

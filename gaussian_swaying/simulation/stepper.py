@@ -252,7 +252,13 @@ class Stepper:
             self._air = None
             return state
         with torch.inference_mode(False), torch.no_grad():
-            self._air = AirInBox(setup.air, self.wind_force, self.solver, setup.scene.frame, self.frame_dt, state)
+            still = None
+            if setup.air.still_walls:
+                low, high = (torch.tensor(corner, dtype=torch.float64) for corner in (setup.air.low, setup.air.high))
+                still = setup.scene.still_distance(low, high, 2 * setup.air.cells)
+            self._air = AirInBox(
+                setup.air, self.wind_force, self.solver, setup.scene.frame, self.frame_dt, state, still
+            )
             return state.replace(air=self._air.start(state.time))
 
     def rehearse(self) -> None:

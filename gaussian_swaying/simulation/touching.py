@@ -127,7 +127,7 @@ def still_distance(
     if not bool(dense.any()):
         raise ValueError(
             f"The Gaussians that stand still are nowhere denser than {level:g} around the object, so they cannot be an "
-            "obstacle: lower `level` of the StillGaussians, or leave it out."
+            "obstacle or a wall: lower `level` of the StillGaussians, or leave it or `air.still_walls` out."
         )
     axes = [torch.arange(n, dtype=torch.float64) for n in shape]
     nodes = torch.cartesian_prod(*axes).reshape(*shape, 3)

@@ -13,8 +13,9 @@ from gaussian_swaying.aero.obstacles import SphereObstacle
 from gaussian_swaying.geometry.regions import Box
 from gaussian_swaying.kernels.graphs import Replayed
 from gaussian_swaying.mpm.solver import MPMSolver
-from gaussian_swaying.scenes.procedural import FlagScene
+from gaussian_swaying.scenes.procedural import FlagScene, GivenScene, both
 from gaussian_swaying.simulation.material import Material
+from gaussian_swaying.simulation.scene import Scene
 from gaussian_swaying.simulation.stepper import why_not_batched
 
 LOW, HIGH = [-1.2, -0.9, -0.9], [1.5, 0.9, 0.9]
@@ -171,6 +172,34 @@ def test_ground_and_walls_are_still():
     assert bool(stepper.air.walls[:, :, 3:].any())
     state, _ = stepper.advance(state)
     assert float(state.air[1:4, stepper.air.walls].abs().max()) == 0
+
+
+def test_gaussians_that_stand_still_are_walls():
+    """A flag beside a screen of Gaussians: cells within half a cell of it are walls, and the air stops there."""
+    flag, screen = FlagScene(spacing=0.05).generate(), FlagScene(spacing=0.05, yaw=90.0).generate()
+    screen.means[:] += torch.tensor([1.5, -0.6, 0.0])
+    scene = Scene(generator=GivenScene(both(flag, screen)), region=Box([None, None, None], [1.3, None, None]))
+    air = ComputedAir(LOW, [2.0, 0.9, 0.9], 32, speed=6.0, still_walls=True)
+    simulation = Simulation(
+        scene, Material(E=2e4, nu=0.3, density=100.0, thickness=0.01), wind=[3.0, 0.5, 0.0], air=air, frame_dt=0.02,
+        hold=Box([None, None, None], [0.06, None, None]),
+    )  # fmt: skip
+    stepper, state, _ = _run(simulation, 2)
+    wall = stepper.air.walls.nonzero() * stepper.air.settings.spacing + torch.tensor(LOW) + 0.05
+    offset = wall - (torch.tensor([1.5, 0.0, 0.4]) - simulation.scene.center)
+    assert len(wall) > 80
+    assert float(offset[:, 0].abs().max()) < 0.11
+    assert float(offset[:, 1].abs().max()) < 0.71
+    assert float(offset[:, 2].abs().max()) < 0.51
+    assert float(state.air[1:4, stepper.air.walls].abs().max()) == 0
+    place = simulation.scene.frame.point_to_sim(torch.tensor([[1.6, 0.0, 0.4], [1.6, 1.0, 0.4]]))
+    behind, beside = stepper.air_at(state, place)[:, 0]
+    assert float(behind) < 0.5 * float(beside)
+
+
+def test_walls_of_a_scene_where_nothing_stands_still_are_refused():
+    with pytest.raises(ValueError, match=r"air\.still_walls"):
+        _simulation(air=ComputedAir(LOW, HIGH, 27, speed=6.0, still_walls=True)).stepper.start()
 
 
 def test_a_checkpoint_goes_on_bit_by_bit():

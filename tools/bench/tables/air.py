@@ -128,6 +128,28 @@ table(PAGE, "air.tandem", "air_cpu", lambda result: _of(result, "two flags"), ""
     )  # fmt: skip
 
 
+def _costs(result: Row) -> Iterator[Row]:
+    """The error of each problem beside the seconds that it took."""
+    errors = {
+        "vortices": ("vortices that decay, velocity", lambda r: r["error"]),
+        "walls": ("flow between walls, velocity", lambda r: r["error"]),
+        "cavity": ("cavity, velocity per speed of the lid", lambda r: r["error"]),
+        "cylinder": ("cylinder, Strouhal number", lambda r: abs(r["strouhal"] / 0.1645 - 1)),
+        "sphere": ("sphere, drag", lambda r: abs(r["drag"] / 1.09 - 1)),
+        "square flag": ("square flag, amplitude", lambda r: abs(r["amplitude"] / 0.78 - 1)),
+    }
+    for row in result.get("rows", []):
+        if row["problem"] in errors and "seconds" in row and "failed" not in row["result"]:
+            name, error = errors[row["problem"]]
+            found = {"name": name, "error": error(row["result"]), "seconds": row["seconds"]}
+            yield row["parameters"] | found
+
+
+table(PAGE, "air.cost", "air_*", _costs, """
+    problem = {name} | cells = {cells} | error = {error:.2f %} | time [s] = {seconds:.1f}
+    """, before="Speed against error, with the start of a problem:\n\n{source}", empty="")  # fmt: skip
+
+
 def _sizes(result: Row) -> list[Row]:
     return [row | {"name": " x ".join(map(str, row["size"]))} for row in _of(result, "flow")]
 
