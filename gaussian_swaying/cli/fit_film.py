@@ -17,13 +17,15 @@ from torch import Tensor
 
 from gaussian_swaying import _program as program
 from gaussian_swaying._files import write_json, write_text
-from gaussian_swaying.cli.preview import build_options, preview_scene
-from gaussian_swaying.cli.register import CAMERAS, PICTURE, VIEW, first_cameras, fov_of, painter_of, transforms
+from gaussian_swaying.cli.preview import build_options, preview_scene, up_of
+from gaussian_swaying.cli.register import CAMERAS, PICTURE, STILLS, VIEW, first_cameras, fov_of, painter_of, transforms
 from gaussian_swaying.fitting.film import Film, begins_to_move, first_frame, open_film, pixels_of_focal
 from gaussian_swaying.fitting.held import held_end, moving_box, moving_points
 from gaussian_swaying.fitting.videos import Footage, read_videos
 from gaussian_swaying.gaussians.cloud import GaussianCloud
+from gaussian_swaying.preview.hold import given_hold
 from gaussian_swaying.preview.results import Preview, keep_aside, write
+from gaussian_swaying.preview.shape import DIRECTIONS
 from gaussian_swaying.rendering.cameras.camera import Camera
 from gaussian_swaying.rendering.protocol import RenderOutput
 
@@ -72,7 +74,11 @@ def prepare(options: argparse.Namespace, folder: Path) -> Path:
     length = _length(options.length)
     if options.focal is not None and not 5 <= options.focal <= 1000:
         raise ValueError(f"Expected `--focal` from 5 to 1000 mm, but got {options.focal:g}.")
-    seen, sentence = _registered(options)
+    if options.hold is not None:
+        given_hold(options.hold, (0.0, 0.0, 1.0))  # refuses what is no end
+    if Path(options.film).suffix.lower() in STILLS:
+        raise ValueError(f"{options.film} is a picture: give a film, or find its camera with `register`.")
+    seen, sentence = _registered(options, None if options.up is None else _direction(options.up))
     print(sentence, flush=True)
     folder.mkdir(parents=True, exist_ok=True)
     _write_registration(seen, folder)
@@ -128,14 +134,14 @@ def _length(given: Sequence[str] | None) -> tuple[str, float] | None:
     return name, value
 
 
-def _registered(options: argparse.Namespace) -> tuple[Seen, str]:
+def _registered(options: argparse.Namespace, up: Sequence[float] | None) -> tuple[Seen, str]:
     """The first frame with its camera, and a sentence on it."""
     from gaussian_swaying.fitting.registration import register
     from gaussian_swaying.gaussians.formats import read_gaussians
 
     film = open_film(options.film)
     frame, cloud = first_frame(film), read_gaussians(options.splat, 0)
-    draw, up = painter_of(cloud), None if options.up is None else _direction(options.up)
+    draw = painter_of(cloud)
     focal, fov = options.focal or film.focal, VIEW
     if focal is not None:
         fov = 2 * math.degrees(math.atan(0.5 * film.height / pixels_of_focal(focal, film.width, film.height)))
@@ -156,11 +162,12 @@ def _registered(options: argparse.Namespace) -> tuple[Seen, str]:
 
 
 def _direction(words: Sequence[str]) -> list[float]:
-    from gaussian_swaying.cli.preview import up_of
-    from gaussian_swaying.preview.shape import DIRECTIONS
-
+    """The direction of ``--up``, shape (3,)."""
     found = up_of(words)
-    return list(DIRECTIONS[found]) if isinstance(found, str) and found in DIRECTIONS else list(found)  # type: ignore[arg-type]
+    direction = list(DIRECTIONS.get(found, ())) if isinstance(found, str) else list(found)
+    if len(direction) != 3 or not any(direction):
+        raise ValueError(f"Expected `--up` to be {', '.join(DIRECTIONS)} or 3 numbers, but got {' '.join(words)}.")
+    return direction
 
 
 def _write_registration(seen: Seen, folder: Path) -> None:
@@ -215,8 +222,6 @@ def upright_in(camera: Camera, guess: Sequence[float]) -> list[str] | None:
         camera: Of the film, which nobody holds upside down.
         guess: A direction in the splat, shape (3,).
     """
-    from gaussian_swaying.preview.shape import DIRECTIONS
-
     up = -camera.world_to_camera[1, :3].double()
     along = {name: float(up @ torch.tensor(axis, dtype=torch.float64)) for name, axis in DIRECTIONS.items()}
     if float(up @ torch.tensor(guess, dtype=torch.float64)) > UPRIGHT:

@@ -156,6 +156,10 @@ def test_a_fit_without_a_length_keeps_the_edited_file(case, checked, capsys):
         (["film.mp4", "--splat", "a.ply", "--resume"], "`--resume`"),
         (["film.mp4", "--splat", "a.ply", "--length", "pole", "long"], "a length in metres"),
         (["film.mp4", "--splat", "a.ply", "--focal", "0.03"], "`--focal` from 5 to 1000 mm"),
+        (["film.mp4", "--splat", "a.ply", "--up", "north"], "`--up` to be +x"),
+        (["film.mp4", "--splat", "a.ply", "--up", "0", "1"], "or 3 numbers, but got 0 1"),
+        (["film.mp4", "--splat", "a.ply", "--hold", "left"], "`--hold`"),
+        (["film.png", "--splat", "a.ply"], "is a picture"),
         (["film.mp4", "--splat", "a.ply"], "film.mp4"),
     ],
 )
