@@ -14,10 +14,19 @@ from gaussian_swaying.fitting.report import Result
 _STYLE = """
 body { font: 16px/1.5 system-ui, sans-serif; margin: 2em auto; max-width: 70em; padding: 0 1em; color: #222; }
 table { border-collapse: collapse; } td, th { padding: .2em .8em; text-align: right; border-bottom: 1px solid #ddd; }
-td:first-child, th:first-child { text-align: left; } video, img { max-width: 100%; border: 1px solid #ddd; }
+td:first-child, .told { text-align: left; } .told { color: #666; }
+video, img { max-width: 100%; border: 1px solid #ddd; }
 video { max-height: 85vh; }
 .good { color: #06752e; } .doubtful { color: #9a6200; } .failed { color: #b00020; }
 """
+_MEANING = {
+    "wind.speed": "speed of the wind",
+    "wind.azimuth": "where it blows, from +x towards +y of the splat with z up",
+    "wind.elevation": "where it blows, above the level",
+    "material.E": "Young's modulus: stiffness",
+    "material.density": "density",
+    "film.start": "start of the motion, in the part of the film that is used",
+}
 _SLOW = "for (const film of document.querySelectorAll('video')) film.playbackRate = 0.5;"
 
 
@@ -33,7 +42,8 @@ def write_page(target: Path, name: str, result: Result, films: Sequence[Path], p
     """
     failed, doubtful = result.doubts()
     rows = "".join(
-        f"<tr><td>{html.escape(row['name'])}</td><td>{row['value']:.5g}</td><td>± {row['standard_error']:.2g}</td>"
+        f"<tr><td>{html.escape(row['name'])}</td><td class='told'>{html.escape(_MEANING.get(row['name'], ''))}</td>"
+        f"<td>{row['value']:.5g}</td><td>± {row['standard_error']:.2g}</td>"
         f"<td>{html.escape(row['unit'])}</td><td>{row['low']:g} to {row['high']:g}</td></tr>"
         for row in result.rows()
     )
@@ -47,9 +57,8 @@ def write_page(target: Path, name: str, result: Result, films: Sequence[Path], p
 <h1>{html.escape(name)}</h1>
 <p class="{result.verdict}"><b>This fit {"has failed" if failed else f"is {result.verdict}"}.</b></p>
 {_list([*failed, *doubtful])}
-{_list(result.seen)}
-<table><tr><th></th><th>value</th><th>standard error</th><th></th><th>range</th></tr>{rows}</table>
-{_list(result.assumed)}
+<table><tr><th></th><th></th><th>value</th><th>standard error</th><th></th><th>range</th></tr>{rows}</table>
+{_list([*result.seen, *result.assumed])}
 <h2>The film beside the fit</h2>
 <p>At half speed. What is called predicted was not fitted.</p>
 {shown}
