@@ -23,7 +23,7 @@ GOALS = {"wind.speed": 0.05, "wind.azimuth": 5.0, "material.E": 0.15}
 """Largest errors that are wanted: shares, and degrees."""
 NEAR = 1.15
 """How far off the start values of the films are that only test the standard errors."""
-PARTS = ("starts", "verdicts", "coverage", "winds")
+PARTS = ("starts", "verdicts", "alone", "coverage", "winds")
 
 
 def rows(options: argparse.Namespace, result: Row) -> Iterator[Measurement]:
@@ -39,6 +39,11 @@ def rows(options: argparse.Namespace, result: Row) -> Iterator[Measurement]:
         for number in range(options.first, options.films):
             for kind in kinds:
                 yield ("verdicts", f"{kind} {number}"), partial(fitted, drawn(kind, number), {}, off=3.0)
+    if "alone" in options.parts:
+        for number in range(options.first, options.films):
+            for kind in kinds:
+                work = partial(fitted, drawn(kind, number), {}, off=3.0, search=0)
+                yield ("verdicts", f"{kind} {number}, from this start alone"), work
     if "coverage" in options.parts:
         for number in range(options.first, options.films):
             kind = list(kinds)[number % len(kinds)]
