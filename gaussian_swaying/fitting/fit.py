@@ -86,7 +86,9 @@ APART, SAME = 0.15, 0.03
 """Least distance between starts, and largest between ends that are the same, as a share of a range."""
 BRIEF = 4
 """Most iterations of a short solve at a horizon."""
-RIVAL = 1.15
+SHAKEN = 0.12
+"""Change of what is sought of the material at the end, to see whether the fit returns, as a share of the range."""
+RIVAL = 1.05
 """Cost per that of the best end below which another end is as good."""
 NOISE = 0.5
 """Distance of a track that its own error explains [pixels]."""
@@ -383,11 +385,15 @@ class Fit:
         return [ended[k].tolist() for k in apart], [float(costs[k]) for k in apart]
 
     def _as_good(self, place: Sequence[float], others: Sequence[Sequence[float]]) -> list[dict[str, float]]:
-        """Values that other starts end at, over all fitted frames, with nearly the cost of a place."""
-        if not others:
+        """Values that other starts, and softer and stiffer ones, end at over all fitted frames with as little cost."""
+        tried = [list(other) for other in others]
+        for k, u in enumerate(self.plan.unknowns):
+            for side in (-SHAKEN, SHAKEN) if u.name.startswith("material.") else ():
+                tried.append([*place[:k], min(max(place[k] + side, 0.0), 1.0), *place[k + 1 :]])
+        if not tried:
             return []
         evidence = self.evidence("tracks" if self.stages[0] == "matches" else self.stages[0])
-        ended, costs = self._brief([place, *others], evidence, self.fitted)
+        ended, costs = self._brief([place, *tried], evidence, self.fitted)
         near = [end for end, cost in zip(ended, costs, strict=True) if cost < RIVAL * costs[0]]
         return [self.values(end) for end in near if max(abs(a - b) for a, b in zip(end, place, strict=True)) > 2 * SAME]
 

@@ -137,7 +137,9 @@ class Result:
         doubtful = [*self.notes, *(doubt for one in self.judged for doubt in one.doubts())]
         for rival in self.rivals:
             told = ", ".join(f"{name} {value:.4g}" for name, value in rival.items())
-            doubtful.append(f"Another start fits nearly as well ({told}). Film longer, or from one more side.")
+            doubtful.append(
+                f"Another start fits as well or better ({told}). Begin there (`start`), or film from one more side."
+            )
         for name, share in self.followed.items():
             told = (
                 f"camera {name}: the simulation explains {max(share, 0):.0%} of the motion of its tracks. Raise "

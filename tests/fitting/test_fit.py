@@ -9,7 +9,7 @@ import pytest
 import torch
 import yaml
 
-from gaussian_swaying.fitting.fit import GRIDS, HELD, Course, Fit, fit, run_fit
+from gaussian_swaying.fitting.fit import GRIDS, HELD, SHAKEN, Course, Fit, fit, run_fit
 from gaussian_swaying.fitting.plan import Plan, read_unknown
 from gaussian_swaying.fitting.videos import read_videos
 from gaussian_swaying.simulation.simulation import Simulation
@@ -68,11 +68,30 @@ def test_another_end_that_fits_as_well_is_a_rival(own, simulation):
     plan = Plan([str(own / "base.yaml")], [str(own / "video")], sought)
     made = Fit(simulation, read_videos(own / "video"), plan)
     ends = {"far": 0.9, "near": 0.51, "here": 0.5}
-    for costs, expected in (([1.0, 1.1], 1), ([1.0, 1.3], 0)):
+    for costs, expected in (([1.0, 1.04], 1), ([1.0, 1.3], 0)):
         made._brief = lambda places, evidence, times, costs=costs: ([[ends["here"]], [ends["far"]]], costs)
         assert len(made._as_good([ends["here"]], [[ends["far"]]])) == expected
     made._brief = lambda places, evidence, times: ([[ends["near"]]], [1.0])
     assert made._as_good([ends["here"]], [[ends["far"]]]) == []
+    assert made._as_good([ends["here"]], []) == []  # nothing else is tried
+
+
+def test_a_softer_and_a_stiffer_material_are_tried_at_the_end(own, simulation):
+    """One of them fits better, so the end is a local minimum, and the fit is doubted."""
+    sought = [read_unknown("wind.speed", [2.0, 12.0]), read_unknown("material.E", [2e3, 5e4])]
+    plan = Plan([str(own / "base.yaml")], [str(own / "video")], sought)
+    made = Fit(simulation, read_videos(own / "video"), plan)
+    tried = []
+
+    def brief(places, evidence, times):
+        tried.extend(places)
+        return [places[1], places[0]], [1.0, 2.0]
+
+    made._brief = brief
+    (found,) = made._as_good([0.5, 0.5], [])
+    assert [place[1] for place in tried] == [0.5, 0.5 - SHAKEN, 0.5 + SHAKEN]
+    assert {place[0] for place in tried} == {0.5}
+    assert found == made.values([0.5, 0.5 - SHAKEN])
 
 
 def test_a_drag_that_is_sought_with_the_speed_is_remarked_on(own, simulation):
