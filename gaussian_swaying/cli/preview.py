@@ -37,7 +37,7 @@ from gaussian_swaying.preview.cost import (
     with_whole,
 )
 from gaussian_swaying.preview.photos import captured_from
-from gaussian_swaying.preview.picture import classify, preview_picture, things_picture
+from gaussian_swaying.preview.picture import preview_picture, things_picture
 from gaussian_swaying.preview.place import Place, excerpt, near_things, survey
 from gaussian_swaying.preview.report import (
     area_line,
@@ -67,6 +67,7 @@ from gaussian_swaying.preview.suggest import (
     suggest,
 )
 from gaussian_swaying.simulation.progress import duration
+from gaussian_swaying.simulation.roles import classify
 from gaussian_swaying.simulation.simulation import Simulation
 
 LARGE = 256_000_000  # bytes of a file of which only the constant colours are read

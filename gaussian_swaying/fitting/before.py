@@ -12,6 +12,7 @@ from torch import Tensor
 from gaussian_swaying.fitting.tracks import Tracks
 from gaussian_swaying.fitting.videos import Footage
 from gaussian_swaying.rendering.cameras.camera import Camera
+from gaussian_swaying.simulation.roles import classify
 from gaussian_swaying.simulation.simulation import Simulation
 
 BAND = 22
@@ -76,8 +77,6 @@ def at_rest(simulation: Simulation, video: Footage) -> Any:
 
 def role_colours(simulation: Simulation) -> Tensor:
     """A colour for each Gaussian of a scene: held, moving or still; shape (N, 3)."""
-    from gaussian_swaying.preview.picture import classify
-
     parts = classify(simulation)
     colours = torch.tensor(STILL).repeat(len(parts.simulated), 1)
     colours[(parts.simulated | parts.carried).cpu()] = torch.tensor(MOVING)

@@ -43,9 +43,18 @@ from gaussian_swaying.fitting.least_squares import (
     shift_by,
     unsettled,
 )
+from gaussian_swaying.fitting.page import write_page
 from gaussian_swaying.fitting.plan import Plan, parse_base, read_unknown
 from gaussian_swaying.fitting.prepared import Judged, prepared
-from gaussian_swaying.fitting.report import BEFORE, Result, consequences, predictions, wind_seen, write_results
+from gaussian_swaying.fitting.report import (
+    BEFORE,
+    PICTURES,
+    Result,
+    consequences,
+    predictions,
+    wind_seen,
+    write_results,
+)
 from gaussian_swaying.fitting.tracks import Tracks, beside_rest, match, opencv, still_until, track
 from gaussian_swaying.fitting.unknowns import FILM_START, check_unknowns
 from gaussian_swaying.fitting.variants import check_variants, states_of
@@ -56,7 +65,7 @@ from gaussian_swaying.rendering.cameras.camera import project
 from gaussian_swaying.runs.folder import MARKER, claim_folder, hold_folder
 from gaussian_swaying.simulation.simulation import Simulation
 
-PROGRESS, VALUES, RESULT, SCENE, PICTURES = "fit.json", "values.csv", "result.json", "scene.yaml", "pictures"
+PROGRESS, VALUES, RESULT, SCENE = "fit.json", "values.csv", "result.json", "scene.yaml"
 PAGE = "page.html"
 OURS = (PROGRESS, PAGE, VALUES, RESULT, SCENE, PICTURES)
 HORIZONS = (0.25, 0.5)
@@ -733,6 +742,7 @@ def run_fit(
         seen = wind_seen(result.values, fit_.videos, simulation)
         result = replace(result, assumed=told, seen=seen)
         write_results(folder, result, parser, settings, simulation)
+        write_page(folder, result)
         return result
     finally:
         lock.release()

@@ -9,7 +9,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from gaussian_swaying._files import write_text
-from gaussian_swaying.fitting.report import Result
+from gaussian_swaying.fitting.report import BEFORE, PICTURES, Result
 
 _STYLE = """
 body { font: 16px/1.5 system-ui, sans-serif; margin: 2em auto; max-width: 70em; padding: 0 1em; color: #222; }
@@ -30,16 +30,17 @@ _MEANING = {
 _SLOW = "for (const film of document.querySelectorAll('video')) film.playbackRate = 0.5;"
 
 
-def write_page(target: Path, name: str, result: Result, films: Sequence[Path], pictures: Sequence[Path]) -> None:
-    """Write the page.
+def write_page(folder: Path, result: Result) -> None:
+    """Write ``page.html``, named after the last two folders of its path.
 
     Args:
-        target: The .html file.
-        name: Its title.
+        folder: Where the pictures of the fit are; the page goes there.
         result: The fit.
-        films: The film beside the fit of each camera (.mp4).
-        pictures: Further pictures (.png), shown below with their names.
     """
+    name, own = "/".join(folder.resolve().parts[-2:]), [one.camera for one in result.shown]
+    films = [folder / PICTURES / f"film_{camera}.mp4" for camera in own]
+    looked = [folder / BEFORE / f"{kind}_{camera}.png" for kind in ("rest", "tracks") for camera in own]
+    pictures = [*(folder / PICTURES / f"{camera}.png" for camera in own), *(path for path in looked if path.exists())]
     failed, doubtful = result.doubts()
     rows = "".join(
         f"<tr><td>{html.escape(row['name'])}</td><td class='told'>{html.escape(_MEANING.get(row['name'], ''))}</td>"
@@ -66,7 +67,7 @@ def write_page(target: Path, name: str, result: Result, films: Sequence[Path], p
 {below}
 <script>{_SLOW}</script></html>
 """
-    write_text(target, text)
+    write_text(folder / "page.html", text)
 
 
 def _list(sentences: Sequence[str]) -> str:

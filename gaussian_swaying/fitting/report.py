@@ -27,7 +27,7 @@ from gaussian_swaying.simulation.simulation import Simulation
 if TYPE_CHECKING:
     from jsonargparse import ArgumentParser, Namespace
 
-BEFORE = "before"
+BEFORE, PICTURES = "before", "pictures"
 """Folder of the pictures that are written before a fit starts."""
 SHOWN = 3
 """Frames of the fitted and of the predicted part in a picture."""
@@ -286,20 +286,13 @@ class Films:
 def write_results(
     folder: Path, result: Result, parser: ArgumentParser, settings: Namespace, simulation: Simulation
 ) -> None:
-    """Write ``values.csv``, ``result.json``, ``scene.yaml``, ``page.html`` and the folder ``pictures``."""
+    """Write ``values.csv``, ``result.json``, ``scene.yaml`` and the folder ``pictures``."""
     import imageio.v3 as iio
 
-    from gaussian_swaying.fitting.page import write_page
-
-    pictures = folder / "pictures"
+    pictures = folder / PICTURES
     pictures.mkdir(exist_ok=True)
     for one in result.shown:
         iio.imwrite(pictures / f"{one.camera}.png", _labelled(one))
-    own = [one.camera for one in result.shown]
-    films = [pictures / f"film_{name}.mp4" for name in own]
-    further = [folder / BEFORE / f"{kind}_{name}.png" for kind in ("rest", "tracks") for name in own]
-    further = [*(pictures / f"{name}.png" for name in own), *(path for path in further if path.exists())]
-    write_page(folder / "page.html", "/".join(folder.resolve().parts[-2:]), result, films, further)
     write_table(folder / "values.csv", result.rows())
     failed, doubtful = result.doubts()
     write_json(

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -17,7 +16,6 @@ from gaussian_swaying.gaussians.connectivity import shades
 from gaussian_swaying.gaussians.harmonics import SH_DC
 from gaussian_swaying.geometry.covariances import covariance
 from gaussian_swaying.geometry.regions import Box, Region
-from gaussian_swaying.mpm.boundaries.boundary import Boundary
 from gaussian_swaying.preview.apart import pieces_of_nodes
 from gaussian_swaying.preview.framing import SOLID, nearby, whole_box
 from gaussian_swaying.preview.place import Place
@@ -27,6 +25,7 @@ from gaussian_swaying.rendering.cameras.camera import Camera, orbit_camera, proj
 from gaussian_swaying.rendering.gsplat_renderer import make_renderer
 from gaussian_swaying.rendering.thinning import DETAIL
 from gaussian_swaying.rendering.tints import HELD, greyed, tinted
+from gaussian_swaying.simulation.roles import Roles, classify, conditions
 from gaussian_swaying.simulation.simulation import Simulation
 
 if TYPE_CHECKING:
@@ -44,59 +43,6 @@ PIECES = (*SOFT, (0, 160, 190), (200, 90, 40))  # of what is connected along the
 THING = 300  # width and height of the picture of a thing [pixels]
 MOST_DRAWN = 200_000  # Gaussians of it
 Tint = tuple[str, Tensor, tuple[int, ...]]  # a name, Gaussians and their colour
-
-
-@dataclass(frozen=True)
-class Parts:
-    """The roles of Gaussians, masks of shape (N,).
-
-    Attributes:
-        simulated: Those selected by region and opacity.
-        carried: Faint and loose ones that follow them.
-        pinned: Simulated ones that a condition holds.
-        pushed: Simulated ones that an impulse pushes.
-        names: The kind of each condition and the number of its particles, in words.
-    """
-
-    simulated: Tensor
-    carried: Tensor
-    pinned: Tensor
-    pushed: Tensor
-    names: list[str]
-
-
-def classify(simulation: Simulation) -> Parts:
-    """Sort the Gaussians into simulated, carried, held and pushed ones.
-
-    Raises:
-        ValueError: If a condition holds nothing.
-    """
-    scene = simulation.scene
-    simulated, carried, pinned, pushed = (torch.zeros(len(scene.model.means), dtype=torch.bool) for _ in range(4))
-    index = scene.simulated.cpu()
-    carried[scene.carried.cpu()] = True
-    simulated[index], carried[index] = True, False
-    where = scene.frame.point_to_sim(scene.model.means.detach()[scene.simulated].double()).to(
-        scene.points.position.dtype
-    )
-    names = []
-    for boundary in conditions(simulation):
-        moved = boundary.in_frame(scene.frame)
-        mask = moved.particle_mask(scene.points.position)
-        name = type(boundary).__name__
-        if mask is None:
-            names.append(name)
-            continue
-        own = moved.particle_mask(where)
-        assert own is not None
-        (pushed if boundary.held_share is None else pinned)[index[own.cpu()]] = True
-        names.append(f"{name}: {int(mask.sum()):,} particles")
-    return Parts(simulated, carried, pinned, pushed, names)
-
-
-def conditions(simulation: Simulation) -> list[Boundary]:
-    """The boundary conditions of a run, in scene units."""
-    return [b for b in simulation.solver.boundaries if isinstance(b, Boundary)]
 
 
 def box_edges(low: Iterable[float], high: Iterable[float]) -> Tensor:
@@ -215,7 +161,7 @@ def things_picture(cloud: GaussianCloud, place: Place, chosen: Sequence[int], de
     return np.asarray(page)
 
 
-def _whole(simulation: Simulation, parts: Parts) -> tuple[list[float], list[float]]:
+def _whole(simulation: Simulation, parts: Roles) -> tuple[list[float], list[float]]:
     """Corners of the box of the whole object, including parts that do not move [scene units]."""
     scene = simulation.scene
     means, opacity = scene.model.means.detach().cpu(), scene.model.opacity().detach().cpu()
@@ -228,7 +174,7 @@ def _whole(simulation: Simulation, parts: Parts) -> tuple[list[float], list[floa
     return whole_box(means, opacity, parts.simulated, outside, simulation.solver.dx / scene.frame.metres_per_unit)
 
 
-def _view(simulation: Simulation, parts: Parts, camera: Camera, normals: int, title: str, tints: Sequence[Tint]) -> Any:
+def _view(simulation: Simulation, parts: Roles, camera: Camera, normals: int, title: str, tints: Sequence[Tint]) -> Any:
     """One view with annotations, as a PIL image."""
     from PIL import Image, ImageDraw, ImageFont
 
@@ -291,7 +237,7 @@ def _pieces(simulation: Simulation) -> tuple[list[Tint], float]:
     return found, beside
 
 
-def _tinted(colours: Tensor, parts: Parts, soft: Sequence[Tint] = ()) -> Tensor:
+def _tinted(colours: Tensor, parts: Roles, soft: Sequence[Tint] = ()) -> Tensor:
     """Colours with soft parts, pinned and pushed Gaussians tinted and static ones grey and pale."""
     for _, mask, tint in soft:
         colours = torch.where(mask.to(colours.device)[:, None], tinted(colours, tint, 0.4), colours)
@@ -330,7 +276,7 @@ def _draw_arrow(
     draw.polygon([tuple(c.tolist()) for c in corners], fill=colour)
 
 
-def _draw_normals(draw: ImageDraw, scene: Any, parts: Parts, camera: Camera, count: int) -> None:
+def _draw_normals(draw: ImageDraw, scene: Any, parts: Roles, camera: Camera, count: int) -> None:
     """Normals of an even sample of simulated patches, flipped to the eye."""
     index = parts.simulated.nonzero()[:, 0]
     # the largest visible patch of each cell of a coarse lattice over the picture, so that they are spread
@@ -411,7 +357,7 @@ def _draw_up(draw: ImageDraw, font: Any, base: Tensor, up: Tensor, camera: Camer
     draw.text((36, camera.height - 36), "up", fill=UP, font=font)
 
 
-def _entries(parts: Parts, simulation: Simulation) -> list[tuple[tuple[int, ...], str]]:
+def _entries(parts: Roles, simulation: Simulation) -> list[tuple[tuple[int, ...], str]]:
     """The colours of the views, and their meaning."""
     flow = mean_flow(simulation).tolist()
     entries: list[tuple[tuple[int, ...], str]] = [

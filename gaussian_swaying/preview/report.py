@@ -16,12 +16,13 @@ from gaussian_swaying.gaussians.cloud import GaussianCloud
 from gaussian_swaying.gaussians.ply import OPAQUE_LOGIT
 from gaussian_swaying.preview.cost import Cost
 from gaussian_swaying.preview.parts import FoundParts
-from gaussian_swaying.preview.picture import classify, conditions, mean_flow
+from gaussian_swaying.preview.picture import mean_flow
 from gaussian_swaying.preview.place import Place
 from gaussian_swaying.preview.starter import region_dict
 from gaussian_swaying.preview.suggest import MOST_CELLS, Suggestion, finest_spacing
 from gaussian_swaying.preview.up import wind_words
 from gaussian_swaying.simulation.progress import duration
+from gaussian_swaying.simulation.roles import classify, conditions
 from gaussian_swaying.simulation.simulation import Simulation
 
 

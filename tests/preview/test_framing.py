@@ -14,12 +14,13 @@ from small_scenes import plain_cloud, together
 from gaussian_swaying.gaussians.ply import write_ply
 from gaussian_swaying.geometry.regions import Box
 from gaussian_swaying.preview.framing import RADIUS, orbit_frame, whole_box
-from gaussian_swaying.preview.picture import _whole, classify
+from gaussian_swaying.preview.picture import _whole
 from gaussian_swaying.preview.starter import starter_yaml
 from gaussian_swaying.preview.suggest import suggest
 from gaussian_swaying.preview.ticks import COLOUR, draw_ticks, nice_ticks
 from gaussian_swaying.rendering.cameras.camera import look_at_camera, project
 from gaussian_swaying.scenes.procedural import FlagScene
+from gaussian_swaying.simulation.roles import classify
 from gaussian_swaying.simulation.simulation import Simulation
 
 

@@ -1,4 +1,7 @@
-"""What a preview draws, writes as a configuration, and expects of the cost."""
+"""What a preview draws, writes as a configuration, and expects of the cost.
+
+Covers: simulation.roles.
+"""
 
 import json
 import math
@@ -18,10 +21,8 @@ from gaussian_swaying.preview.cost import estimate_cost
 from gaussian_swaying.preview.picture import (
     PINNED,
     PUSHED,
-    Parts,
     _tinted,
     box_edges,
-    classify,
     mean_flow,
     preview_picture,
     project,
@@ -33,6 +34,7 @@ from gaussian_swaying.recording.recorder import Recorder
 from gaussian_swaying.rendering.cameras.camera import look_at_camera
 from gaussian_swaying.rendering.torch_renderer import render_torch
 from gaussian_swaying.scenes.procedural import FlagScene
+from gaussian_swaying.simulation.roles import Roles, classify
 from gaussian_swaying.simulation.simulation import Simulation
 
 POLE = Box([None, None, None], [0.11, None, None])
@@ -45,7 +47,7 @@ def test_tints_leave_three_tenths_of_the_colour_and_what_is_still_is_pale_and_gr
     """Black and white Gaussians: moving, pushed, pinned, both, and not simulated."""
     moving, pushed, pinned = (torch.tensor(row) for row in ([1, 1, 1, 1, 0], [0, 1, 0, 1, 0], [0, 0, 1, 1, 0]))
     none = torch.zeros(5, dtype=torch.bool)
-    parts = Parts(simulated=moving.bool(), carried=none, pinned=pinned.bool(), pushed=pushed.bool(), names=[])
+    parts = Roles(simulated=moving.bool(), carried=none, pinned=pinned.bool(), pushed=pushed.bool(), names=[])
     push, pin = torch.tensor(PUSHED) / 255, torch.tensor(PINNED) / 255
     for value in (0.0, 1.0):
         own = torch.full((3,), value)

@@ -20,7 +20,6 @@ from gaussian_swaying.kernels.language import INTERPRETED
 from gaussian_swaying.mpm import followers_triton
 from gaussian_swaying.mpm.laws.neo_hookean import NeoHookean
 from gaussian_swaying.mpm.solver import MPMSolver
-from gaussian_swaying.preview.picture import classify
 from gaussian_swaying.recording.recorder import Recorder
 from gaussian_swaying.recording.trajectory import load_trajectory
 from gaussian_swaying.scenes.leaves import LeavesScene
@@ -29,6 +28,7 @@ from gaussian_swaying.scenes.solid import SolidScene
 from gaussian_swaying.simulation.diagnostics import measure
 from gaussian_swaying.simulation.edits import Edit
 from gaussian_swaying.simulation.material import Material, MaterialRegion
+from gaussian_swaying.simulation.roles import classify
 from gaussian_swaying.simulation.sampling import matched_points
 from gaussian_swaying.simulation.scene import Scene
 from gaussian_swaying.simulation.simulated_scene import SimulatedScene
