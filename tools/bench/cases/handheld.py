@@ -35,6 +35,7 @@ ROWS: dict[str, dict[str, Any]] = {
     "hand": {},
     "hand, exposure drifts": {"drifts": True},
     "hand, exposure drifts, splat with faults": {"drifts": True, "worn": True},
+    "hand, exposure drifts, real walls": {"drifts": True, "real": True},
     "hand, exposure drifts, only a wall beside the flag": {"drifts": True, "back": False},
     "hand, taken for a tripod": {"hand_held": False},
 }
@@ -44,6 +45,7 @@ def measured(
     degrees: float = 1.0,
     drifts: bool = False,
     worn: bool = False,
+    real: bool = False,
     back: bool = True,
     hand_held: bool | None = None,
     search: int = 24,
@@ -54,18 +56,19 @@ def measured(
         degrees: Shake of the hand, root mean square; 0 for a tripod.
         drifts: Whether exposure and white balance drift.
         worn: Whether the splat that is fitted has faults which the film has not.
+        real: Whether the walls of the film are photographed by rays, and the splat's are twice as fine.
         back: Whether there is a wall behind the flag.
         hand_held: The option of the fit.
         search: Simulations of the coarse search.
     """
     with tempfile.TemporaryDirectory() as scratch:
-        folder = Path(scratch)
-        filmed = Simulation.from_yaml(write_base(folder / "filmed", back=back), device="cpu")
+        folder, wall = Path(scratch), 0.01 if real else 0.02
+        filmed = Simulation.from_yaml(write_base(folder / "filmed", wall=wall, back=back), device="cpu")
         still = tripod(*SIZE)
         true = shaken(still, FRAMES, degrees) if degrees else [still] * FRAMES
         gains = drift(FRAMES) if drifts else torch.ones(FRAMES, 3, dtype=torch.float64)
-        write_film(filmed, folder / "film", true, gains)
-        base = write_base(folder / "known", back=back, worn=worn)
+        write_film(filmed, folder / "film", true, gains, real=real)
+        base = write_base(folder / "known", wall=wall, back=back, worn=worn)
         videos, begin = read_videos(folder / "film"), time.process_time()
         (video,), (judged,) = prepared(Simulation.from_yaml(base, device="cpu"), videos, hand_held)
         took = time.process_time() - begin

@@ -18,11 +18,16 @@ from gaussian_swaying.gaussians.harmonics import SH_DC
 from gaussian_swaying.gaussians.ply import write_ply
 from gaussian_swaying.geometry.rotations import rotation_of
 from gaussian_swaying.rendering.cameras.camera import Camera, look_at_camera
+from gaussian_swaying.scenes.printed_cloth import PERIOD, printed_colours
 from gaussian_swaying.scenes.procedural import FlagScene, both
 from gaussian_swaying.simulation.simulation import Simulation
 
 TRUTH: Row = {"flow": [4.0, 3.0, 0.0], "material.E": 1e4}
 FPS = 30
+WALLS = ((2.4, 1.6, 0.0, (-0.9, 0.6, -0.7)), (0.5, 1.6, 65.0, (0.75, 0.1, -0.7)))
+"""Width, height [m], turn from the x axis [degrees] and lower corner [m] of the walls behind and beside the flag."""
+TEXELS = 400
+"""Places along a period of the print at which it is photographed."""
 MIDDLE = (0.2, 0.05, 0.15)
 """The point at which the hand aims [m]."""
 
@@ -40,10 +45,9 @@ def write_base(folder: Path, spacing: float = 0.025, wall: float = 0.02, back: b
     folder.mkdir(parents=True, exist_ok=True)
     flag = cloud = FlagScene(0.4, 0.3, spacing, ripple=0.01, pattern="printed").generate()
     if math.isfinite(wall):
-        behind = FlagScene(2.4, 1.6, wall, ripple=0.05, pattern="printed").generate()
-        beside = FlagScene(0.5, 1.6, wall, ripple=0.03, pattern="printed", yaw=65).generate()
-        for part, shift in [(behind, (-0.9, 0.6, -0.7))] * back + [(beside, (0.75, 0.1, -0.7))]:
-            cloud = both(cloud, replace(part, means=part.means + torch.tensor(shift)))
+        for width, height, yaw, corner in WALLS if back else WALLS[1:]:
+            part = FlagScene(width, height, wall, ripple=0.0, pattern="printed", yaw=yaw).generate()
+            cloud = both(cloud, replace(part, means=part.means + torch.tensor(corner)))
     if worn:
         generator = torch.Generator().manual_seed(0)
         colour, place = (torch.randn(shape, generator=generator) for shape in (cloud.sh.shape, cloud.means.shape))
@@ -110,8 +114,39 @@ def drift(frames: int) -> Tensor:
     return 1 + way * torch.tensor([-0.15, -0.25, -0.35], dtype=torch.float64) + ripple
 
 
+def photographed(camera: Camera, texture: Tensor, finer: int = 2) -> Tensor:
+    """The walls themselves, by rays and not as Gaussians, black elsewhere, float64, shape (H, W, 3).
+
+    Args:
+        camera: The camera.
+        texture: Their print over a period, shape (T, T, 3).
+        finer: Rays along a side of each pixel.
+    """
+    rows, columns = ((torch.arange(n * finer) + 0.5).double() / finer for n in (camera.height, camera.width))
+    row, column = torch.meshgrid(rows, columns, indexing="ij")
+    local = torch.stack([column, row, torch.ones_like(row)], -1) @ camera.intrinsics.double().inverse().T
+    ray, eye = local @ camera.world_to_camera[:3, :3].double(), camera.position.double()
+    near, colour = torch.full_like(row, math.inf), torch.zeros_like(ray)
+    for width, height, yaw, corner in WALLS:
+        turn, origin = math.radians(yaw), eye.new_tensor(corner)
+        along = eye.new_tensor([math.cos(turn), math.sin(turn), 0])
+        normal = eye.new_tensor([-math.sin(turn), math.cos(turn), 0])
+        far = (origin - eye) @ normal / (ray @ normal)
+        place = eye + far[..., None] * ray - origin
+        x, z = place @ along, place[..., 2]
+        seen = (far > 0) & (far < near) & (x > 0) & (x < width) & (z > 0) & (z < height)
+        texel = (torch.stack([x, z], -1)[seen] * (len(texture) / PERIOD)).long() % len(texture)
+        near[seen], colour[seen] = far[seen], texture[texel[:, 0], texel[:, 1]]
+    return colour.unflatten(0, (-1, finer)).unflatten(2, (-1, finer)).mean((1, 3))
+
+
 def write_film(
-    simulation: Simulation, folder: Path, cameras: Sequence[Camera], gains: Tensor | None = None, crf: int = 28
+    simulation: Simulation,
+    folder: Path,
+    cameras: Sequence[Camera],
+    gains: Tensor | None = None,
+    crf: int = 28,
+    real: bool = False,
 ) -> None:
     """Simulate, and write what a moving camera sees as ``film.mp4`` with the camera of its first frame alone.
 
@@ -121,6 +156,7 @@ def write_film(
         cameras: The camera of each frame.
         gains: Of each frame and colour, shape (F, 3); ones if None.
         crf: Compression of H.264; 28 is that of small files.
+        real: Whether the walls are photographed, and not drawn as the splat is.
     """
     from imageio_ffmpeg import write_frames
 
@@ -136,10 +172,17 @@ def write_film(
         output_params=["-crf", str(crf)],
     )
     film.send(None)
+    moving = simulation.scene.moving if real else torch.arange(len(simulation.scene.model.means))
+    step = (torch.arange(TEXELS) + 0.5) * (PERIOD / TEXELS)
+    texture = printed_colours(*torch.meshgrid(step, step, indexing="ij")) if real else None
     for frame in simulation.frames(len(cameras)):
         gaussians = painter.deformed(frame.state)
         own = cameras[frame.index].to(painter.device, torch.float32)
-        colour = painter.draw(gaussians, painter.colors(gaussians, own), own).color.cpu().double()
+        parts = gaussians.means, gaussians.covariances, painter.opacity(), painter.colors(gaussians, own)
+        drawn = painter.renderer(*(part[moving] for part in parts), own)
+        colour = drawn.color.cpu().double()
+        if texture is not None:
+            colour += (1 - drawn.alpha.cpu().double()) * photographed(cameras[frame.index], texture)
         colour = colour * (1 if gains is None else gains[frame.index])
         colour = 255 * colour + 2.0 * torch.randn(colour.shape, generator=generator)
         film.send(colour.round().clamp(0, 255).to(torch.uint8).numpy().tobytes())
