@@ -299,7 +299,8 @@ def _chosen(
     width, height = video.size
     texture = torch.from_numpy(np.asarray(opencv().cornerMinEigenVal(grey, 7)))
     score = texture[row, column]
-    good = score > QUALITY * texture.max()
+    sharpest = texture.max() if scene.all_move else score.amax() if len(score) else 0.0  # not that of a background
+    good = score > QUALITY * sharpest
     place, score, column, row = (part[good] for part in (place, score, column, row))
     order = score.argsort(descending=True, stable=True)
     taken = torch.zeros(height + 8, width + 8, dtype=torch.bool)

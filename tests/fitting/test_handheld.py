@@ -130,10 +130,11 @@ def test_the_wind_is_found_as_from_a_tripod(folder, tmp_path):
 
     def fitted(film, **settings):
         output = tmp_path / (film + "".join(settings))
-        options = {"device": "cpu", "search": 12, "progress": False, "known": {"material.E": TRUTH["material.E"]}}
+        options = {"device": "cpu", "search": 8, "starts": 1, "progress": False}
+        options["known"] = {"material.E": TRUTH["material.E"]}
         return fit(folder / "base.yaml", folder / film, SOUGHT, output, **options, **settings)
 
-    for film in ("tripod", "hand", "drift"):
+    for film in ("tripod", "drift"):
         result = fitted(film)
         assert result.values["wind.speed"] == pytest.approx(5.0, rel=0.01)
         assert result.values["wind.azimuth"] == pytest.approx(36.87, abs=0.5)

@@ -13,7 +13,7 @@ pytest.importorskip("cv2")
 def test_a_film_from_a_hand_and_one_taken_for_a_tripod(monkeypatch):
     monkeypatch.setattr(handheld, "FRAMES", 16)
     monkeypatch.setattr(handheld, "SIZE", (240, 136))
-    names = ["hand, exposure drifts", "hand, taken for a tripod"]
+    names = ["hand, exposure drifts, real walls", "hand, taken for a tripod"]
     rows = [word for name in names for word in ("--row", name)]
     result, _ = measure("handheld", *rows, "--search", "6", result=json.loads(json.dumps(HEAD)))
     found, missed = cells("handheld.rows", result)

@@ -187,5 +187,6 @@ table("fit.md", "handheld.rows", "handheld_cpu", lambda result: [
     verdict = {verdict} | time of the processor [s] = {processor_s:.0f}
     """, empty="", before=(
     "Errors of cameras, gains and fits of a flag before walls: 480 x 270, H.264 at crf 28, 1.5 s, of which half is "
-    "fitted; 1 degree of shake (root mean square), and a brightness that falls by 15 % (red) to 35 % (blue):"
+    "fitted; 1 degree of shake (root mean square), and a brightness that falls by 15 % (red) to 35 % (blue). "
+    "The film is drawn from the splat, but for walls that are real, which rays photograph:"
     "\n\n{source}"))  # fmt: skip
