@@ -235,18 +235,15 @@ def _pose(
     if len(world) < LEAST:
         return None
     K = camera.intrinsics.double().cpu().numpy().copy()
-    done, turn, shift, index = cv2.solvePnPRansac(
+    done, turn, shift, _ = cv2.solvePnPRansac(
         world, there, K, None, iterationsCount=2000, reprojectionError=near, confidence=0.9999, flags=cv2.SOLVEPNP_AP3P
     )
-    if not done or index is None or len(index) < LEAST:
+    view = camera.world_to_camera.double().cpu().numpy()
+    begun = cv2.solvePnPRefineLM(world, there, K, None, cv2.Rodrigues(view[:3, :3])[0], view[:3, 3:].copy())
+    found = [_agreeing(cv2, world, there, K, near, *pair) for pair in [begun] + [(turn, shift)] * done]
+    index, turn, shift = max(found, key=lambda one: len(one[0]))
+    if len(index) < LEAST:
         return None
-    index = index[:, 0]
-    for _ in range(REFINED):
-        turn, shift = cv2.solvePnPRefineLM(world[index], there[index], K, None, turn, shift)
-        off = cv2.projectPoints(world, turn, shift, K, None)[0].reshape(-1, 2) - there
-        index = np.flatnonzero(np.linalg.norm(off, axis=1) < near)
-        if len(index) < LEAST:
-            return None
     if focal:
         flags = cv2.CALIB_USE_INTRINSIC_GUESS | cv2.CALIB_FIX_PRINCIPAL_POINT | cv2.CALIB_FIX_ASPECT_RATIO
         flags |= cv2.CALIB_ZERO_TANGENT_DIST | cv2.CALIB_FIX_K1 | cv2.CALIB_FIX_K2 | cv2.CALIB_FIX_K3
@@ -260,6 +257,20 @@ def _pose(
     residual = float(np.sqrt((off**2).sum(1).mean()))
     spread = _spread(world[index], there[index], seen, residual)
     return Registration(seen, len(world), len(index), residual, spread)
+
+
+def _agreeing(cv2: Any, world: Any, there: Any, K: Any, near: float, turn: Any, shift: Any) -> tuple[Any, Any, Any]:
+    """The points that agree on a pose, and the pose, refined on them."""
+    import numpy as np
+
+    index: Any = np.arange(0)
+    for _ in range(REFINED):
+        off = cv2.projectPoints(world, turn, shift, K, None)[0].reshape(-1, 2) - there
+        index = np.flatnonzero(np.linalg.norm(off, axis=1) < near)
+        if len(index) < LEAST:
+            break
+        turn, shift = cv2.solvePnPRefineLM(world[index], there[index], K, None, turn, shift)
+    return index, turn, shift
 
 
 def _spread(world: Any, there: Any, camera: Camera, residual: float) -> Tensor:
