@@ -83,6 +83,8 @@ def take(
     heads = {name.split(".")[0] for name in names if find(name) is None}
     if not heads <= {"wind", "aero", *PICTURE}:
         return None
+    if "frame_dt" in heads and simulation.setup.air is not None:
+        return None  # computed air has one length of the frame
     if any(name.startswith("material.") for name in numbers) and (simulation.material.regions or settings.edits):
         return None  # each part has its own
     if not all(parameter(name).same_points for name in numbers):

@@ -385,6 +385,25 @@ def test_on_a_gpu_it_is_changed_and_drawn_at_the_same_time(parser, settings, unt
     assert torch.isfinite(session.snapshot.state.position).all()
 
 
+def test_computed_air_keeps_the_length_of_its_frames(parser, request, until, monkeypatch):
+    """Where steps take long they stay as long, another wind blows in at once, and another length starts anew."""
+    monkeypatch.setattr("gaussian_swaying.viewer.session.SLOW", 0.0)
+    config = request.config.rootpath / "configs/sim/flag_in_air.yaml"
+    small = [f"--config={config}", "--scene.generator.init_args.spacing=0.05", "--solver.dx=0.1", "--air.cells=24"]
+    session = Session(parser, parser.parse_args(small)).start()
+    try:
+        until(lambda: session.snapshot.number > 2)
+        assert session.simulation.frame_dt == 0.04
+        session.change({"wind.flow": [3.0, 0.0, 0.0]})
+        until(lambda: session.simulation.wind.flows.tolist() == [[3.0, 0.0, 0.0]])
+        assert session.snapshot.health.time > 0
+        session.change({"frame_dt": 0.02})
+        until(lambda: session.simulation.frame_dt == 0.02 and session.snapshot.number > 2)
+        assert session.problem is None
+    finally:
+        session.close()
+
+
 def test_a_step_that_is_under_way_does_not_lower_the_rates(session):
     now = time.perf_counter()
     session._steps.extend((now - 1.03 + 0.04 * k, 0.04 * k) for k in range(26))  # the last one 0.03 s ago

@@ -3,10 +3,14 @@
 from __future__ import annotations
 
 import gc
+import json
 import statistics
+import subprocess
+import sys
 import time
 from collections.abc import Callable
 from functools import partial
+from pathlib import Path
 from typing import Any
 
 import torch
@@ -83,6 +87,27 @@ def clear() -> None:
     gc.collect()
     if torch.cuda.is_available():
         torch.cuda.empty_cache()
+
+
+_MEASURED = """
+import json, resource, subprocess, sys, time
+begin = time.perf_counter()
+done = subprocess.run(sys.argv[1:], stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True)
+seconds, used = time.perf_counter() - begin, resource.getrusage(resource.RUSAGE_CHILDREN)
+peak = used.ru_maxrss * (1 if sys.platform == "darwin" else 1024)
+row = {"seconds": seconds, "processor_s": used.ru_utime + used.ru_stime, "bytes": peak}
+print(json.dumps(row | {"code": done.returncode, "told": done.stderr}))
+"""
+"""Runs a command from a small process: the peak of a process begins with the memory of the one that starts it."""
+
+
+def command(words: list[str], folder: Path) -> Row:
+    """Seconds, seconds of the processor and peak memory [bytes] of a command, its exit code, and what it told."""
+    done = subprocess.run(
+        [sys.executable, "-c", _MEASURED, *words], cwd=folder, capture_output=True, text=True, check=True
+    )
+    row: Row = json.loads(done.stdout)
+    return row
 
 
 def guarded(function: Callable[[], Row]) -> Row:

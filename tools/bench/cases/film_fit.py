@@ -4,16 +4,14 @@ from __future__ import annotations
 
 import argparse
 import json
-import os
-import subprocess
 import sys
 import tempfile
-import time
 from collections.abc import Iterator
 from functools import partial
 from pathlib import Path
 
 from bench.case import Case, Measurement, option
+from bench.clock import command
 from bench.problems.flag_film import POLE, TRUTH, write_case
 from bench.record import Row
 
@@ -35,21 +33,17 @@ def measured(seconds: float) -> Row:
         folder = Path(scratch)
         write_case(folder, SIZE, seconds - MOVING, MOVING)
         words = ["fit", "film.mp4", "--splat", "my.ply", "--length", "pole", str(POLE), "--output", "out"]
-        began = time.perf_counter()
-        process = subprocess.Popen([sys.executable, "-c", COMMAND, *words], cwd=folder)
-        _, status, used = os.wait4(process.pid, 0)
-        process.returncode = os.waitstatus_to_exitcode(status)
-        if process.returncode:
-            raise RuntimeError(f"fit ended with {process.returncode}")
-        wall = time.perf_counter() - began
+        took = command([sys.executable, "-c", COMMAND, *words], folder)
+        if took["code"]:
+            raise RuntimeError(f"fit ended with {took['code']}: {took['told']}")
         told = json.loads((folder / "out/result/result.json").read_text(encoding="utf-8"))
     values = {row["name"]: row["value"] for row in told["values"]}
     return {
         "frames": round(30 * seconds),
         "size": list(SIZE),
-        "wall_s": wall,
-        "processor_s": used.ru_utime + used.ru_stime,
-        "peak_bytes": used.ru_maxrss * (1 if sys.platform == "darwin" else 1024),
+        "wall_s": took["seconds"],
+        "processor_s": took["processor_s"],
+        "peak_bytes": took["bytes"],
         "speed_error": values["wind.speed"] / TRUTH["wind.speed"] - 1,
         "azimuth_error_deg": abs(values["wind.azimuth"] - TRUTH["wind.azimuth"]),
         "E_error": values["material.E"] / TRUTH["material.E"] - 1,

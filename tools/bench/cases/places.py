@@ -12,6 +12,7 @@ from functools import partial
 from pathlib import Path
 
 from bench.case import Case, Measurement, numbers, option
+from bench.clock import command
 from bench.record import ROOT, Row
 from bench.simulate import what_failed
 
@@ -69,23 +70,9 @@ def previewed(
     return row
 
 
-_MEASURED = """
-import json, resource, subprocess, sys, time
-begin = time.perf_counter()
-done = subprocess.run(sys.argv[1:], stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True)
-seconds, used = time.perf_counter() - begin, resource.getrusage(resource.RUSAGE_CHILDREN)
-print(json.dumps({"seconds": seconds, "bytes": 1024 * used.ru_maxrss, "code": done.returncode, "told": done.stderr}))
-"""
-"""Runs a command from a small process: the peak of a process begins with the memory of the one that starts it."""
-
-
 def _tool(name: str, options: list[str]) -> Row:
     """Seconds and peak memory [bytes] of a program of the folder tools, or why it failed."""
-    command = [sys.executable, str(ROOT / "tools" / f"{name}.py"), *options]
-    done = subprocess.run(
-        [sys.executable, "-c", _MEASURED, *command], cwd=ROOT, capture_output=True, text=True, check=True
-    )
-    row: Row = json.loads(done.stdout)
+    row = command([sys.executable, str(ROOT / "tools" / f"{name}.py"), *options], ROOT)
     told = row.pop("told")
     return {"failed": what_failed(told)} if row.pop("code") else row
 
