@@ -70,10 +70,10 @@ def gain_of(image: Tensor, picture: Tensor, still: Tensor) -> Tensor | None:
 
 def with_gains(images: Tensor, found: Sequence[Tensor] | Tensor) -> Tensor:
     """Frames (F, H, W, 3), uint8, divided by their gains (F, 3)."""
-    return torch.stack([
-        (image.float() / gain.float()).round().clamp(0, 255).to(torch.uint8)
-        for image, gain in zip(images, found, strict=True)
-    ])  # fmt: skip
+    out = torch.empty_like(images)  # a film may be large: no second list of its frames
+    for one, image, gain in zip(out, images, found, strict=True):
+        one.copy_((image.float() / gain.float()).round().clamp(0, 255))
+    return out
 
 
 def _averaged(picture: Tensor) -> Tensor:

@@ -322,9 +322,8 @@ class Session:
                 return
         self._publish(state, health)
         took, wanted = time.perf_counter() - began, float(self.settings.frame_dt)
-        if simulation.setup.air is not None:
-            pass  # computed air has one length of the frame
-        elif took > SLOW and simulation.frame_dt > 1.01 * wanted / SHORTEST:
+        shortest = wanted if simulation.setup.air is not None else wanted / SHORTEST  # computed air has one length
+        if took > SLOW and simulation.frame_dt > 1.01 * shortest:
             simulation.frame_dt = simulation.frame_dt / 2
         elif took < FAST and simulation.frame_dt < 0.99 * wanted:
             simulation.frame_dt = min(2 * simulation.frame_dt, wanted)
