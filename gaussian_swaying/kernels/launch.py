@@ -61,6 +61,11 @@ def lanes(device: torch.device, gpu: int, cpu: int = LANES) -> int:
     return gpu if device.type == "cuda" or INTERPRETED else cpu
 
 
+def wide(device: torch.device) -> bool:
+    """True if one instruction of the device can add four numbers in a row: NVIDIA's GPUs from 9.0 on."""
+    return device.type == "cuda" and not INTERPRETED and torch.cuda.get_device_capability(device) >= (9, 0)
+
+
 def launch(kernel: Any, grid: Sequence[int]) -> Callable[..., None]:
     """Return a function that runs the programs of a kernel, or records them if launches are being recorded.
 
@@ -94,4 +99,4 @@ def call(change: Callable[[], object], device: torch.device) -> None:
     cpu.call(change)
 
 
-__all__ = ["LANES", "call", "compiles", "lanes", "launch", "replaces"]
+__all__ = ["LANES", "call", "compiles", "lanes", "launch", "replaces", "wide"]

@@ -8,7 +8,7 @@ import torch
 from gaussian_swaying.kernels import cpu
 from gaussian_swaying.kernels import launch as module
 from gaussian_swaying.kernels.language import tl, triton
-from gaussian_swaying.kernels.launch import LANES, call, compiles, lanes, launch
+from gaussian_swaying.kernels.launch import LANES, call, compiles, lanes, launch, wide
 
 
 @triton.jit
@@ -33,6 +33,14 @@ def test_blocks_of_a_cpu_have_lanes_of_their_own():
     there, here = torch.device("cuda"), torch.device("cpu")
     assert (lanes(there, 128), lanes(there, 128, 1)) == (128, 128)
     assert (lanes(here, 128), lanes(here, 128, 1)) == (LANES, 1)
+
+
+def test_only_newer_gpus_add_four_numbers_at_once(monkeypatch):
+    monkeypatch.setattr(torch.cuda, "get_device_capability", lambda device: (9, 0))
+    assert wide(torch.device("cuda"))
+    assert not wide(torch.device("cpu"))
+    monkeypatch.setattr(torch.cuda, "get_device_capability", lambda device: (8, 9))
+    assert not wide(torch.device("cuda"))
 
 
 def test_the_interpreter_takes_the_blocks_of_a_gpu(monkeypatch):

@@ -8,7 +8,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from gaussian_swaying.kernels.launch import LANES, lanes, launch
+from gaussian_swaying.kernels.launch import LANES, lanes, launch, wide
 from gaussian_swaying.mpm.body import Held
 from gaussian_swaying.mpm.formulations.formulation import Formulation
 from gaussian_swaying.mpm.state import GridSpec, MPMState
@@ -60,6 +60,7 @@ class FusedUpdated(Fused):
         self.solids = Solids(solids_of(bound.body.boundaries) if self.scenes == 1 else [], self.law_table)
         self.clock = torch.zeros(2, dtype=torch.float64, device=self.device)  # time at step 0, substep [s]
         self.crowd = crowd_of(points.position, bound.settings.dx)
+        self.wide = wide(self.device)
         self.crossing = 1e-3  # how many cells a particle enters in a substep; measured by the rollouts
         self._measured = torch.zeros(1, pin_memory=self.device.type == "cuda")
         self._copied: torch.cuda.Event | None = None
@@ -258,7 +259,7 @@ class FusedUpdated(Fused):
             self.first_step, offset, self.law_table, self.force_in, *grid.offset, *grid.resolution, grid.dx,
             1 / grid.dx, settings.stiffness_damping, self.particles, self.parts, self.part_node,
             **options, PLASTIC=self.plastic, MLS=settings.mls, WIDTH=self.momentum.shape[1], GATHER=gather,
-            SCATTER=scatter, ATOMIC=self.atomic, BLOCK=block, num_warps=1,
+            SCATTER=scatter, ATOMIC=self.atomic, WIDE=self.wide, BLOCK=block, num_warps=1,
         )  # fmt: skip
         if scatter and not self.atomic:
             self._scatter(options["IMPLICIT"])
@@ -385,9 +386,10 @@ def sorted_for(crowd: float, crossing: float, count: int) -> int:
 
     As the order gets stale, particles in a row no longer share their cell, and more atomic sums meet: the time of a
     substep grows with their share. Together with the time of the sorts it is least after :math:`\sqrt{S / r}` substeps,
-    with the rate r at which particles enter other cells. S suits a cube with eight points in a cell, turning and sorted
-    after 4 to 64 substeps, on an H200. A cell with fewer points gains less from the order; one with more belongs to a
-    sheet, whose neighbours cross into other cells together; how far the interval should grow there is not measured.
+    with the rate r at which particles enter other cells. S suits a cube with eight points in a cell, turning, on an
+    H100: an eighth, a quarter and half of the interval were slower. A cell with fewer points gains less from the order;
+    one with more belongs to a sheet, whose neighbours cross into other cells together; how far the interval should grow
+    there is not measured.
     A small body waits for the host, not for sums.
 
     Args:
@@ -396,6 +398,6 @@ def sorted_for(crowd: float, crossing: float, count: int) -> int:
         count: Number of particles.
     """
     crowd = max(crowd, 1.0)
-    best = math.sqrt(0.4 / max(crossing, 1e-9)) * max(8 / crowd, math.sqrt(crowd / 8))
+    best = math.sqrt(6.4 / max(crossing, 1e-9)) * max(8 / crowd, math.sqrt(crowd / 8))
     least = min(max(round(2e6 / max(count, 1)), LEAST), 32)
     return int(min(max(round(best), least), MOST))

@@ -1,8 +1,8 @@
 """Kernels of the ``updated`` substep; the reference is :mod:`~gaussian_swaying.mpm.formulations.updated`.
 
 One kernel gathers the end of a substep and scatters the start of the next, so a particle is read and written once.
-Particles are sorted by cell from time to time; neighbours in that order that share a cell are summed by a segmented
-scan, and only the last one of each segment is added to the grid, atomically.
+Particles are sorted by cell from time to time; up to eight neighbours in that order that share a cell are summed by a
+segmented scan, and only the last one of each segment is added to the grid, atomically.
 
 Rows of node arrays: velocity, or momentum and mass, in four columns. The sums also have four, or eight with implicit
 drag.
@@ -17,20 +17,28 @@ from gaussian_swaying.mpm.triton.obstacle_kernels import ROW as SOLID_ROW
 from gaussian_swaying.mpm.triton.shared import (
     VARIES,
     account,
+    add_four,
     add_given,
     axis_weights,
     keep_largest,
+    load_four,
     node_weight,
     twin_forces,
+    vector,
     wave_speed,
 )
+
+REACH = tl.constexpr(3)
+"""Shuffles of a sum over neighbours: 2^REACH of them at most are added up before they are added to the grid."""
 
 PART = tl.constexpr(32)
 """Numbers that a particle adds to the grid, on a CPU."""
 
 
 @triton.jit
-def _gather_affine(field, node, sx, sy, f, wz, gz, mz, inverse_dx, dx, mask, SLOPES: tl.constexpr):
+def _gather_affine(
+    field, node, sx, sy, f, wz, gz, mz, inverse_dx, dx, mask, SLOPES: tl.constexpr, WIDE: tl.constexpr
+):  # fmt: skip
     """Interpolated vector, its moments about the particle and (SLOPES) its derivatives [component, axis]."""
     zero = wz[0] * 0
     v0, v1, v2 = zero, zero, zero
@@ -44,9 +52,10 @@ def _gather_affine(field, node, sx, sy, f, wz, gz, mz, inverse_dx, dx, mask, SLO
             row = field + (node + i * sx + j * sy) * 4
             s0, s1, s2, t0, t1, t2, r0, r1, r2 = zero, zero, zero, zero, zero, zero, zero, zero, zero
             for k in tl.static_range(3):
-                q0 = tl.load(row + k * 4, mask, 0.0)
-                q1 = tl.load(row + k * 4 + 1, mask, 0.0)
-                q2 = tl.load(row + k * 4 + 2, mask, 0.0)
+                if WIDE:
+                    q0, q1, q2, _rest = load_four(row + k * 4)
+                else:
+                    q0, q1, q2 = vector(row + k * 4, mask)
                 s0 += wz[k] * q0
                 s1 += wz[k] * q1
                 s2 += wz[k] * q2
@@ -93,13 +102,14 @@ def _larger(a, b):
 
 
 @triton.jit
-def _sum_segments(a, l1, l2, l4, l8, l16, s1, s2, s4, s8, s16):
-    """Sum of each segment of 32 lanes, in its last lane: five shuffles, each from a lane of the same segment."""
-    a += tl.where(s1, tl.gather(a, l1, 0), 0.0)
-    a += tl.where(s2, tl.gather(a, l2, 0), 0.0)
-    a += tl.where(s4, tl.gather(a, l4, 0), 0.0)
-    a += tl.where(s8, tl.gather(a, l8, 0), 0.0)
-    a += tl.where(s16, tl.gather(a, l16, 0), 0.0)
+def _sum_segments(a, lane, first):
+    """Sum of each segment of 32 lanes, in its last lane: REACH shuffles, each from a lane of the same segment.
+
+    ``first`` is the first lane of a lane's segment. A segment has at most 2^REACH lanes.
+    """
+    for k in tl.static_range(REACH):
+        from_lane = lane - (1 << k)
+        a += tl.where(from_lane >= first, tl.gather(a, tl.maximum(from_lane, 0), 0), 0.0)
     return a
 
 
@@ -121,7 +131,7 @@ def updated_particles(
     ox, oy, oz, nx, ny, nz, dx, inverse_dx, viscous_time, scene_size, parts, part_node,
     LAWS: tl.constexpr, PLASTIC: tl.constexpr, MULTI: tl.constexpr, FORCES: tl.constexpr, FORCE: tl.constexpr,
     IMPLICIT: tl.constexpr, VISCOUS: tl.constexpr, MLS: tl.constexpr, WIDTH: tl.constexpr, GATHER: tl.constexpr,
-    SCATTER: tl.constexpr, ATOMIC: tl.constexpr, BLOCK: tl.constexpr,
+    SCATTER: tl.constexpr, ATOMIC: tl.constexpr, WIDE: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
     """``updated``: the end of substep ``step`` - 1 (GATHER) and the start of substep ``step`` (SCATTER).
 
@@ -163,9 +173,12 @@ def updated_particles(
         inside = mask & okx & oky & okz
         node = tl.where(inside, (bx * ny + by) * nz + bz, 0) + scene * (nx * ny * nz)
         wz, gz = axis_weights(fz, inverse_dx)
+        if WIDE:  # it reads under no mask
+            wz = (tl.where(inside, wz[0], 0.0), tl.where(inside, wz[1], 0.0), tl.where(inside, wz[2], 0.0))
+            gz = (tl.where(inside, gz[0], 0.0), tl.where(inside, gz[1], 0.0), tl.where(inside, gz[2], 0.0))
         mz = (-fz * wz[0] * dx, (1 - fz) * wz[1] * dx, (2 - fz) * wz[2] * dx)
         v, C, L = _gather_affine(
-            velocity, node, sx, sy, (fx, fy, fz), wz, gz, mz, inverse_dx, dx, inside, SLOPES=not MLS
+            velocity, node, sx, sy, (fx, fy, fz), wz, gz, mz, inverse_dx, dx, inside, SLOPES=not MLS, WIDE=WIDE
         )
         C = scale9(4 * inverse_dx * inverse_dx, C)
         if MLS:
@@ -237,20 +250,11 @@ def updated_particles(
         if ATOMIC:
             # neighbours in the order that share a cell form a segment
             lane = tl.arange(0, 32)
-            following = tl.gather(node, tl.minimum(lane + 1, 31), 0)
-            last = ((node != following) | (lane == 31)) & (node >= 0)
-            l1 = tl.maximum(lane - 1, 0)
-            l2 = tl.maximum(lane - 2, 0)
-            l4 = tl.maximum(lane - 4, 0)
-            l8 = tl.maximum(lane - 8, 0)
-            l16 = tl.maximum(lane - 16, 0)
-            head = (node != tl.gather(node, l1, 0)) | (lane == 0)
+            head = (node != tl.gather(node, tl.maximum(lane - 1, 0), 0)) | (lane == 0)
             first = tl.associative_scan(tl.where(head, lane, 0), 0, _larger)
-            s1 = lane - 1 >= first
-            s2 = lane - 2 >= first
-            s4 = lane - 4 >= first
-            s8 = lane - 8 >= first
-            s16 = lane - 16 >= first
+            first += ((lane - first) >> REACH) << REACH  # longer segments are cut
+            following = tl.gather(first, tl.minimum(lane + 1, 31), 0)
+            last = ((first != following) | (lane == 31)) & (node >= 0)
             for i in range(3):
                 wx, gx = node_weight(fx, i, inverse_dx)
                 rx = (i - fx) * dx
@@ -278,17 +282,20 @@ def updated_particles(
                             a0 += sw * slope[2]
                             a1 += sw * slope[5]
                             a2 += sw * slope[8]
-                        a0 = _sum_segments(a0, l1, l2, l4, l8, l16, s1, s2, s4, s8, s16)
-                        a1 = _sum_segments(a1, l1, l2, l4, l8, l16, s1, s2, s4, s8, s16)
-                        a2 = _sum_segments(a2, l1, l2, l4, l8, l16, s1, s2, s4, s8, s16)
-                        a3 = _sum_segments(a3, l1, l2, l4, l8, l16, s1, s2, s4, s8, s16)
+                        a0 = _sum_segments(a0, lane, first)
+                        a1 = _sum_segments(a1, lane, first)
+                        a2 = _sum_segments(a2, lane, first)
+                        a3 = _sum_segments(a3, lane, first)
                         row = momentum + (node + i * sx + j * sy + k) * WIDTH
-                        tl.atomic_add(row, a0, last, sem="relaxed")
-                        tl.atomic_add(row + 1, a1, last, sem="relaxed")
-                        tl.atomic_add(row + 2, a2, last, sem="relaxed")
-                        tl.atomic_add(row + 3, a3, last, sem="relaxed")
+                        if WIDE:
+                            add_four(row, (a0, a1, a2, a3), last)
+                        else:
+                            tl.atomic_add(row, a0, last, sem="relaxed")
+                            tl.atomic_add(row + 1, a1, last, sem="relaxed")
+                            tl.atomic_add(row + 2, a2, last, sem="relaxed")
+                            tl.atomic_add(row + 3, a3, last, sem="relaxed")
                         if IMPLICIT:
-                            a4 = _sum_segments(wz[k] * (w * resistance), l1, l2, l4, l8, l16, s1, s2, s4, s8, s16)
+                            a4 = _sum_segments(wz[k] * (w * resistance), lane, first)
                             tl.atomic_add(row + 4, a4, last, sem="relaxed")
         else:
             tl.store(part_node + index, node, mask)

@@ -151,6 +151,17 @@ def test_looks_at_other_laws(kernel_device, formulation):
 
 
 @pytest.mark.gpu
+@pytest.mark.parametrize("wide", [False, True], ids=["of one number", "of four numbers"])
+def test_atomic_sums(wide, monkeypatch):
+    """An older GPU adds the numbers of a node one by one; more points share a cell than are summed up before."""
+    if wide and torch.cuda.get_device_capability() < (9, 0):
+        pytest.skip("this GPU has no such instruction")
+    monkeypatch.setattr(fused_updated, "wide", lambda device: wide)
+    points = make_points(torch.device("cuda"), PLASTIC["sand"], count=100)
+    check_agreement(run_both(points, lambda solver, state: solver.rollout(state, DT, 3), "updated"))
+
+
+@pytest.mark.gpu
 @pytest.mark.parametrize("formulation", FORMULATIONS)
 def test_many_substeps(formulation):
     """Round-off grows in fifty substeps, though not by much where the motion is stable."""
