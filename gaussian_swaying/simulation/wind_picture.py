@@ -119,22 +119,22 @@ def draw_wind(
     Returns:
         Shape (H, W, 3), on the CPU.
     """
-    from PIL import Image, ImageDraw
+    from PIL import Image, ImageChops, ImageDraw
 
     places, speeds = (part.cpu() for part in streaks(stepper, state, camera))
     largest = largest or speed_scale(stepper) or float(speeds.amax()) or 1.0
     pixel, depth = project(places.reshape(-1, 3), camera)
     pixel, depth = pixel.view(*speeds.shape, 2), depth.view_as(speeds)
-    seen = mean_depth(picture).to(depth)
     row, column = (pixel[..., k].nan_to_num(-1).clamp(-1, 1e6).floor().long() for k in (1, 0))
     shown = (depth > 1e-3) & (row >= 0) & (row < camera.height) & (column >= 0) & (column < camera.width)
-    front = seen[row.clamp(0, camera.height - 1), column.clamp(0, camera.width - 1)]
+    behind = row.clamp(0, camera.height - 1) * camera.width + column.clamp(0, camera.width - 1)
+    front = mean_depth(picture).reshape(-1)[behind.to(picture.color.device)].to(depth)
     hidden = (front > 0) & (front < depth)
-    colours = (255 * colormap(speeds / largest)).round().int().tolist()
+    colours = (255 * colormap(speeds / largest)).tolist()
     ratio = 2  # drawn larger and reduced, so that the lines are smooth
     size = (camera.width * ratio, camera.height * ratio)
-    layer = Image.new("RGBA", size)
-    draw = ImageDraw.Draw(layer)
+    cover, layer = Image.new("L", size), Image.new("RGB", size)  # opacity, and colour times opacity
+    pens = ImageDraw.Draw(cover), ImageDraw.Draw(layer)
     thick = max(3, round(0.009 * camera.height * ratio))
     points, visible = (ratio * pixel).tolist(), (shown & ~hidden).tolist()
     for streak, colour, known in zip(points, colours, visible, strict=True):
@@ -142,15 +142,19 @@ def draw_wind(
             if known[k] and known[k + 1]:
                 share = (k + 1) / STEPS
                 ends, width = [tuple(streak[k]), tuple(streak[k + 1])], max(1, round(thick * (0.35 + 0.65 * share)))
-                draw.line(ends, fill=(*colour[k], int(40 + 215 * share)), width=width)
+                opacity = round(40 + 215 * share)
+                dim = tuple(round(c * opacity / 255) for c in colour[k])
+                for pen, fill in zip(pens, (opacity, dim), strict=True):
+                    pen.line(ends, fill=fill, width=width)
         if known[STEPS]:
             (x, y), r = streak[STEPS], 0.75 * thick
-            draw.ellipse([x - r, y - r, x + r, y + r], fill=(*colour[STEPS], 255))
-    over = layer.reduce(ratio)
-    pixels = torch.frombuffer(bytearray(over.tobytes()), dtype=torch.uint8).view(camera.height, camera.width, 4) / 255
-    under = 0.75 * picture.color.detach().cpu().float().clamp(0, 1) + 0.25
-    alpha = pixels[..., 3:]
-    return under * (1 - alpha) + pixels[..., :3] * alpha
+            for pen, fill in zip(pens, (255, tuple(round(c) for c in colour[STEPS])), strict=True):
+                pen.ellipse([x - r, y - r, x + r, y + r], fill=fill)
+    paler = (191.25 * picture.color.detach().float().clamp(0, 1) + 63.75).round().to(torch.uint8).cpu()
+    clear = ImageChops.invert(cover.reduce(ratio))
+    seen = ImageChops.multiply(Image.fromarray(paler.numpy()), Image.merge("RGB", [clear] * 3))
+    over = ImageChops.add(seen, layer.reduce(ratio))
+    return torch.frombuffer(bytearray(over.tobytes()), dtype=torch.uint8).view(camera.height, camera.width, 3) / 255
 
 
 def draw_vorticity(stepper: Stepper, state: State, camera: Camera, picture: RenderOutput) -> Tensor:
