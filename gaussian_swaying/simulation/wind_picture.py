@@ -134,7 +134,7 @@ def draw_wind(
     ratio = 2  # drawn larger and reduced, so that the lines are smooth
     size = (camera.width * ratio, camera.height * ratio)
     cover, layer = Image.new("L", size), Image.new("RGB", size)  # opacity, and colour times opacity
-    pens = ImageDraw.Draw(cover), ImageDraw.Draw(layer)
+    cover_pen, layer_pen = ImageDraw.Draw(cover), ImageDraw.Draw(layer)
     thick = max(3, round(0.009 * camera.height * ratio))
     points, visible = (ratio * pixel).tolist(), (shown & ~hidden).tolist()
     for streak, colour, known in zip(points, colours, visible, strict=True):
@@ -143,13 +143,12 @@ def draw_wind(
                 share = (k + 1) / STEPS
                 ends, width = [tuple(streak[k]), tuple(streak[k + 1])], max(1, round(thick * (0.35 + 0.65 * share)))
                 opacity = round(40 + 215 * share)
-                dim = tuple(round(c * opacity / 255) for c in colour[k])
-                for pen, fill in zip(pens, (opacity, dim), strict=True):
-                    pen.line(ends, fill=fill, width=width)
+                cover_pen.line(ends, fill=opacity, width=width)
+                layer_pen.line(ends, fill=tuple(round(c * opacity / 255) for c in colour[k]), width=width)
         if known[STEPS]:
             (x, y), r = streak[STEPS], 0.75 * thick
-            for pen, fill in zip(pens, (255, tuple(round(c) for c in colour[STEPS])), strict=True):
-                pen.ellipse([x - r, y - r, x + r, y + r], fill=fill)
+            cover_pen.ellipse([x - r, y - r, x + r, y + r], fill=255)
+            layer_pen.ellipse([x - r, y - r, x + r, y + r], fill=tuple(round(c) for c in colour[STEPS]))
     paler = (191.25 * picture.color.detach().float().clamp(0, 1) + 63.75).round().to(torch.uint8).cpu()
     clear = ImageChops.invert(cover.reduce(ratio))
     seen = ImageChops.multiply(Image.fromarray(paler.numpy()), Image.merge("RGB", [clear] * 3))

@@ -9,7 +9,7 @@ from gaussian_swaying.geometry.linalg_triton import load3
 from gaussian_swaying.kernels.language import ON_GPU, tl, triton
 from gaussian_swaying.mpm.triton.shared import VARIES, axis_weights, node_weight
 
-CHANGES = (*VARIES, "places", "room", "slots", "touched_nodes", "last", "chunk", "iterations")
+CHANGES = (*VARIES, "places", "touched_nodes", "last", "chunk", "iterations")
 
 MOST_PROGRAMS = tl.constexpr(1024 if ON_GPU else 8)
 """Most programs that meet; a row of ``peak`` has as many entries."""

@@ -10,6 +10,8 @@ from torch import Tensor
 
 from gaussian_swaying.kernels.launch import LANES, lanes, launch, wide
 from gaussian_swaying.mpm.body import Held
+from gaussian_swaying.mpm.boundaries.boundary import Boundary
+from gaussian_swaying.mpm.boundaries.pinned_region import PinnedRegion
 from gaussian_swaying.mpm.formulations.formulation import Formulation
 from gaussian_swaying.mpm.state import GridSpec, MPMState
 from gaussian_swaying.mpm.triton import updated_kernels as kernels
@@ -57,7 +59,20 @@ class FusedUpdated(Fused):
         self.inverse_mass = torch.zeros(0, **self.like)
         self.weight = torch.zeros(0, **self.like)
         self.node_position: Tensor | None = None
-        self.solids = Solids(solids_of(bound.body.boundaries) if self.scenes == 1 else [], self.law_table)
+        boundaries = bound.body.boundaries
+        pins = {k: held for k, held in enumerate(bound.body.held) if held and _pins(boundaries[k], held)}
+        parts = solids_of(boundaries, pins)
+        self.solids = Solids(parts or [], self.law_table)
+        pins = pins if parts is not None else {}
+        self.pinned = [(held.mass > 0).reshape(-1).to(torch.int8) for held in pins.values()]
+        """For each pin, the particles that it holds."""
+        windows = [[boundaries[k].start, boundaries[k].end] for k in pins]
+        self.windows_of_pins = torch.tensor(windows, dtype=torch.float64, device=self.device).reshape(-1)
+        turns = [(k, n) for n, (_, k) in enumerate(self.solids.parts)] + [(k, -1 - n) for n, k in enumerate(pins)]
+        self.turns = tuple(sorted(turns, key=lambda turn: turn[0]))
+        """What acts on nodes, in order: the number of its boundary, and of the solid, or -1 less that of the pin."""
+        self.marks_of_pins = torch.zeros(len(pins), 0, dtype=torch.int32, device=self.device)
+        """The last substep in which each pin held each node, counted from 1."""
         self.clock = torch.zeros(2, dtype=torch.float64, device=self.device)  # time at step 0, substep [s]
         self.crowd = crowd_of(points.position, bound.settings.dx)
         self.wide = wide(self.device)
@@ -109,13 +124,15 @@ class FusedUpdated(Fused):
                 self.windows = torch.empty(SHARES * spans * SPAN * width, **self.like)
                 self.marks = torch.zeros(spans * SHARES, dtype=torch.int8, device=self.device)
                 self.occupied = torch.zeros(spans, dtype=torch.int8, device=self.device)
-                programs = -(-room // self.node_block) if self.solids.parts else 0
-                self.pressed = torch.zeros(programs, *self.impulse.reshape(-1, 3).shape, dtype=torch.float64).to(
-                    self.device
-                )
+                self.marks_of_pins = torch.zeros(len(self.pinned), room, dtype=torch.int32, device=self.device)
         if grid != self.grid:
             self.repeater.forget()  # they read the node positions
             self.grid, self.node_position = grid, None
+            slots = 1 if self.scenes == 1 else self.node_block // grid.node_count + 2
+            programs = -(-nodes // self.node_block) if self.turns else 0
+            with torch.inference_mode(False):
+                pressed = torch.zeros(programs, slots, len(self.body.boundaries), 3, dtype=torch.float64)
+                self.pressed = pressed.to(self.device)
             if self._acting and (self.bound.needs_position or self.bound.needs_lattice):
                 self.node_position = grid.node_positions(self.velocity)
 
@@ -125,6 +142,7 @@ class FusedUpdated(Fused):
         self._take_grid(state.grid, 8 if options["IMPLICIT"] else 4)
         self.impulse.zero_()
         self.pressed.zero_()
+        self.marks_of_pins.zero_()
         self.clock.copy_(torch.stack([self.time, self.dt]))
         self.solids.take()
         self.solids.prepare(self.time, self.dt, steps)
@@ -145,8 +163,8 @@ class FusedUpdated(Fused):
                 self._look()
             done = mark
         self._measure_crossing()
-        if self.solids.parts:
-            self.impulse.add_(self.pressed.sum(0).view_as(self.impulse))
+        if self.turns:
+            self.impulse.add_(self._pressed().view_as(self.impulse))
         return {**self._read(state), "impulse": self.impulse, **({"work": self._work()} if part.loaded else {})}
 
     def _sorted_for(self) -> int:
@@ -166,7 +184,16 @@ class FusedUpdated(Fused):
     @property
     def _acting(self) -> bool:
         """True if boundary conditions act in torch."""
-        return len(self.body.boundaries) > 0 and not self.solids.parts
+        return len(self.body.boundaries) > 0 and not self.turns
+
+    def _pressed(self) -> Tensor:
+        """Sum of what the programs of the nodes took, for each scene, shape (scenes, B, 3)."""
+        slots = self.pressed.shape[1]
+        first = torch.arange(len(self.pressed), device=self.device) * self.node_block // self.grid.node_count
+        found = self.pressed.new_zeros(self.scenes + slots, *self.pressed.shape[2:])
+        for k in range(slots):
+            found.index_add_(0, first + k, self.pressed[:, k])
+        return found[: self.scenes]
 
     def _start(self, options: dict[str, Any]) -> None:
         """The start of a substep without the end of the one before."""
@@ -279,16 +306,24 @@ class FusedUpdated(Fused):
         )  # fmt: skip
 
     def _nodes(self, offset: int, options: dict[str, Any]) -> None:
-        nodes = self.grid.node_count * self.scenes
+        grid, nodes = self.grid, self.grid.node_count * self.scenes
         block = self.node_block
-        acting, (_, ny, nz), solids = self._acting, self.grid.resolution, self.solids
+        acting, (_, ny, nz), solids = self._acting, grid.resolution, self.solids
+        if not acting:
+            rows = lanes(self.device, 128)
+            for pinned, marks in zip(self.pinned, self.marks_of_pins, strict=True):
+                launch(kernels.updated_pin, (-(-self.count // rows),))(
+                    self.moving, self.order, pinned, marks, self.count, *grid.offset, *grid.resolution, grid.dx,
+                    self.particles, self.first_step, offset, BLOCK=rows, num_warps=4,
+                )  # fmt: skip
         launch(kernels.updated_nodes, (-(-nodes // block),))(
             self.momentum, self.velocity, self.inverse_mass, self.occupied, nodes, self.schedule, self.first_step,
             offset, *self.gravity, solids.rows, solids.windows, solids.poses, solids.tables.buffer, self.clock,
-            self.pressed, len(self.impulse.reshape(-1, 3)), *self.grid.offset, ny, nz, self.grid.dx,
-            IMPLICIT=options["IMPLICIT"], WIDTH=self.momentum.shape[1], KEEP=acting,
+            self.pressed, self.pressed.shape[1], self.windows_of_pins, self.marks_of_pins, self.marks_of_pins.shape[1],
+            *grid.offset, ny, nz, grid.node_count, grid.dx, IMPLICIT=options["IMPLICIT"], WIDTH=self.momentum.shape[1],
+            KEEP=acting, TURNS=() if acting else self.turns, BOUNDARIES=len(self.body.boundaries),
             SOLIDS=solids.twins, KINDS=solids.kinds, MOVES=solids.moves, MOVING=any(solids.moves),
-            SPARSE=not (self.atomic or acting), BLOCK=block, num_warps=4,
+            SCENES=self.scenes > 1, SPARSE=not (self.atomic or acting), BLOCK=block, num_warps=4,
         )  # fmt: skip
         if acting:
             self._constrain()
@@ -367,6 +402,11 @@ class FusedUpdated(Fused):
         internal = self._room("internal", *shape[:-1]) if self.internal else None
         fields = self._read_into(position, velocity, affine, F, F_total, lost, internal)
         return MPMState(**fields, time=self.time, grid=self.grid)
+
+
+def _pins(boundary: Boundary, held: Held) -> bool:
+    """True if a boundary holds the nodes of some particles at rest, all at once."""
+    return type(boundary) is PinnedRegion and held.release is None
 
 
 def crowd_of(position: Tensor, dx: float) -> float:

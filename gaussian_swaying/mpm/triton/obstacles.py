@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Container, Sequence
 
 import torch
 from torch import Tensor
@@ -18,15 +18,17 @@ from gaussian_swaying.mpm.twins import Composed, Tables, Watched
 Solid = Plane | Obstacle
 
 
-def solids_of(boundaries: Sequence[Boundary]) -> list[tuple[Solid, int]]:
-    """All solids, each with the number of its boundary; none if a boundary has no twin.
+def solids_of(boundaries: Sequence[Boundary], pins: Container[int] = ()) -> list[tuple[Solid, int]] | None:
+    """All solids, each with the number of its boundary; None if a boundary has no twin.
 
     Args:
         boundaries: The boundary conditions of a body.
+        pins: Numbers of those that are no solids.
     """
-    if any(boundary.twin() is None for boundary in boundaries):
-        return []
-    return [(part, k) for k, one in enumerate(boundaries) for part in one.modules() if isinstance(part, Solid)]
+    others = [(one, k) for k, one in enumerate(boundaries) if k not in pins]
+    if any(boundary.twin() is None for boundary, _ in others):
+        return None
+    return [(part, k) for one, k in others for part in one.modules() if isinstance(part, Solid)]
 
 
 class Solids:

@@ -18,7 +18,7 @@ Row 0 has a last column: how long forces act in the last substep.
 # again whenever one of them becomes one or a multiple of 16, in the middle of a run, even while a graph is recorded.
 VARIES = (
     "count", "cells", "pieces", "nodes", "rows", "scenes", "scene_size", "step_offset", "sx", "sy", "ox", "oy", "oz",
-    "nx", "ny", "nz", "all_rows", "active_count", "boundaries", "shares", "bent",
+    "nx", "ny", "nz", "all_rows", "active_count", "shares", "bent", "room", "scene_nodes", "slots",
 )  # fmt: skip
 
 

@@ -408,17 +408,21 @@ def updated_join(
 @triton.jit(do_not_specialize=VARIES)
 def updated_nodes(
     momentum, velocity, inverse_mass, occupied, nodes, schedule, first_step, step_offset,
-    gravity_x, gravity_y, gravity_z, solids, windows, poses, numbers, clock, impulse, boundaries,
-    ox, oy, oz, ny, nz, dx,
-    IMPLICIT: tl.constexpr, WIDTH: tl.constexpr, KEEP: tl.constexpr, SOLIDS: tl.constexpr, KINDS: tl.constexpr,
-    MOVES: tl.constexpr, MOVING: tl.constexpr, SPARSE: tl.constexpr, BLOCK: tl.constexpr,
+    gravity_x, gravity_y, gravity_z, solids, windows, poses, numbers, clock, impulse, slots, pin_windows, marks, room,
+    ox, oy, oz, ny, nz, scene_nodes, dx,
+    IMPLICIT: tl.constexpr, WIDTH: tl.constexpr, KEEP: tl.constexpr, TURNS: tl.constexpr, BOUNDARIES: tl.constexpr,
+    SOLIDS: tl.constexpr, KINDS: tl.constexpr, MOVES: tl.constexpr, MOVING: tl.constexpr, SCENES: tl.constexpr,
+    SPARSE: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
     """``updated``: nodal velocities from momenta and masses, set back to zero unless SPARSE; KEEP for boundaries.
 
-    All SOLIDS are applied here, in order; see :mod:`~gaussian_swaying.mpm.triton.obstacle_kernels`. KINDS and MOVES say
-    of each how it stops and whether it moves. With MOVING there are poses for every substep. ``clock`` has the time at
-    step 0 and the substep [s], float64; ``impulse`` (programs, B, 3) collects the reaction impulses, float64.
-    With SPARSE the velocities of programs that are not ``occupied`` stay as they are: no particle is near.
+    All TURNS are applied here, in order: each is the number of a boundary, and that of one of the SOLIDS (see
+    :mod:`~gaussian_swaying.mpm.triton.obstacle_kernels`), or -1 less that of a pin. KINDS and MOVES say of each solid
+    how it stops and whether it moves. With MOVING there are poses for every substep. ``marks`` (pins, room) is the last
+    substep in which each pin held a node, counted from 1. ``clock`` has the time at step 0 and the substep [s],
+    float64; ``impulse`` (programs, slots, B, 3), float64, collects the reaction impulses on nodes of the first scene of
+    a program, and of those after it. With SPARSE the velocities of programs that are not ``occupied`` stay as they are:
+    no particle is near.
     """
     if SPARSE:  # noqa: SIM102  (Triton leaves out what is under a constant that is false)
         if tl.load(occupied + tl.program_id(0)) == 0:
@@ -443,27 +447,45 @@ def updated_nodes(
         (tl.load(row + 1, mask, 0.0) * share + push * gravity_y) * decay,
         (tl.load(row + 2, mask, 0.0) * share + push * gravity_z) * decay,
     )
-    COUNT: tl.constexpr = len(SOLIDS.functions)
-    if COUNT > 0:
+    if len(TURNS) > 0:
         now = tl.load(clock) + step * tl.load(clock + 1)
         pose = poses
         if MOVING:
-            pose = poses + step * (COUNT * POSE)
+            pose = poses + step * (len(SOLIDS.functions) * POSE)
+        own = k
+        if SCENES:
+            own = k % scene_nodes
         x = (
-            (k // (ny * nz) + ox).to(tl.float32) * dx,
-            (k // nz % ny + oy).to(tl.float32) * dx,
-            (k % nz + oz).to(tl.float32) * dx,
+            (own // (ny * nz) + ox).to(tl.float32) * dx,
+            (own // nz % ny + oy).to(tl.float32) * dx,
+            (own % nz + oz).to(tl.float32) * dx,
         )
-        for w in tl.static_range(COUNT):
-            held, behind = stop_nodes(
-                v, x, solids + w * SOLID_ROW, pose + w * POSE, numbers, some & mask, SOLIDS, w, KINDS[w], MOVES[w]
-            )
-            hit = tl.where(acts(windows + 2 * w, now), behind & some & mask, False)
+        for n in tl.static_range(len(TURNS)):
+            w: tl.constexpr = TURNS[n][1]
+            if w < 0:
+                held = (v[0] * 0, v[0] * 0, v[0] * 0)
+                behind = tl.load(marks + (-1 - w) * room + k, mask, 0) == step + 1
+                window = pin_windows - 2 * (1 + w)
+            else:
+                held, behind = stop_nodes(
+                    v, x, solids + w * SOLID_ROW, pose + w * POSE, numbers, some & mask, SOLIDS, w, KINDS[w], MOVES[w]
+                )
+                window = windows + 2 * w
+            hit = tl.where(acts(window, now), behind & some & mask, False)
             u = (tl.where(hit, held[0], v[0]), tl.where(hit, held[1], v[1]), tl.where(hit, held[2], v[2]))
             if tl.sum(hit.to(tl.int32)) > 0:  # few blocks touch a solid
-                to = impulse + 3 * (tl.program_id(0) * boundaries + tl.load(solids + w * SOLID_ROW + 2).to(tl.int32))
-                for c in tl.static_range(3):
-                    tl.store(to + c, tl.load(to + c) + tl.sum((mass * (v[c] - u[c])).to(tl.float64)))
+                first = tl.program_id(0) * BLOCK // scene_nodes
+                last = first
+                if SCENES:
+                    last = tl.minimum((tl.program_id(0) + 1) * BLOCK, nodes) // scene_nodes
+                for scene in range(first, last + 1):
+                    to = impulse + 3 * ((tl.program_id(0) * slots + scene - first) * BOUNDARIES + TURNS[n][0])
+                    there = hit
+                    if SCENES:
+                        there = hit & (k // scene_nodes == scene)
+                    for c in tl.static_range(3):
+                        taken = tl.where(there, (mass * (v[c] - u[c])).to(tl.float64), 0.0)
+                        tl.store(to + c, tl.load(to + c) + tl.sum(taken))
             v = u
     store3(velocity, 1, k * 4, v, mask)
     if KEEP:
@@ -473,6 +495,40 @@ def updated_nodes(
         used = mask & (mass != 0)
         for c in tl.static_range(WIDTH):
             tl.store(row + c, zero, used)
+
+
+@triton.jit(do_not_specialize=VARIES)
+def updated_pin(
+    moving, order, pinned, marks, count, ox, oy, oz, nx, ny, nz, dx, scene_size, first_step, step_offset,
+    BLOCK: tl.constexpr,
+):  # fmt: skip
+    """``updated``: write the number of the substep, counted from 1, to the nodes of the particles that a pin holds."""
+    index = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
+    mask = index < count
+    where = tl.load(order + index, mask, 0)
+    held = mask & (tl.load(pinned + where, mask, 0) > 0)
+    if tl.sum(held.to(tl.int32)) > 0:
+        node, (fx, fy, fz), inside = _stencil(moving, index, count, where, held, ox, oy, oz, nx, ny, nz, dx, scene_size)
+        number = tl.zeros([BLOCK], tl.int32) + tl.load(first_step) + step_offset + 1
+        wz, _gz = axis_weights(fz, 1.0)
+        for i in range(3):
+            wx, _gx = node_weight(fx, i, 1.0)
+            for j in range(3):
+                wy, _gy = node_weight(fy, j, 1.0)
+                to = marks + node + (i * ny + j) * nz
+                for k in tl.static_range(3):
+                    tl.store(to + k, number, inside & (wx * wy * wz[k] > 0))
+
+
+@triton.jit
+def _stencil(moving, index, count, where, mask, ox, oy, oz, nx, ny, nz, dx, scene_size):
+    """First node around some particles, their place in its cell, and whether the grid has all of their nodes."""
+    bx, fx, okx = _locate(tl.load(moving + index, mask, 0.0), dx, ox, nx)
+    by, fy, oky = _locate(tl.load(moving + count + index, mask, 0.0), dx, oy, ny)
+    bz, fz, okz = _locate(tl.load(moving + 2 * count + index, mask, 0.0), dx, oz, nz)
+    inside = mask & okx & oky & okz
+    node = tl.where(inside, (bx * ny + by) * nz + bz, 0) + (where // scene_size) * (nx * ny * nz)
+    return node, (fx, fy, fz), inside
 
 
 @triton.jit(do_not_specialize=VARIES)
@@ -567,11 +623,8 @@ def pin_mass(moving, order, pinned, weight, count, ox, oy, oz, nx, ny, nz, dx, s
         mask = index < count
         where = tl.load(order + index, mask, 0)
         mass = tl.load(pinned + where, mask, 0.0)
-        bx, fx, okx = _locate(tl.load(moving + index, mask, 0.0), dx, ox, nx)
-        by, fy, oky = _locate(tl.load(moving + count + index, mask, 0.0), dx, oy, ny)
-        bz, fz, okz = _locate(tl.load(moving + 2 * count + index, mask, 0.0), dx, oz, nz)
-        inside = mask & okx & oky & okz & (mass > 0)
-        node = tl.where(inside, (bx * ny + by) * nz + bz, 0) + (where // scene_size) * (nx * ny * nz)
+        mask = mask & (mass > 0)
+        node, (fx, fy, fz), inside = _stencil(moving, index, count, where, mask, ox, oy, oz, nx, ny, nz, dx, scene_size)
         wz, _gz = axis_weights(fz, 1.0)
         for i in range(3):
             wx, _gx = node_weight(fx, i, 1.0)

@@ -55,6 +55,12 @@ BOUNDARIES = {
         EnclosingBox([0.11, 0.1, 0.1], [0.2, 0.2, 0.2], "separate", 0.1, end=1.5 * DT),
     ],
     "velocity box": lambda: [VelocityBox(TOP, [0.0, 1.0, 0.0], **WINDOW)],
+    "walls and pins": lambda: [
+        Plane([0.0, 0.0, 0.13], [0.1, 0.0, 1.0], "separate", 0.4),
+        PinnedRegion(LEFT, "nodes", **WINDOW),
+        EnclosingBox([0.1, 0.1, 0.1], [0.2, 0.2, 0.2], "slip", 0.2),
+        PinnedRegion(TOP, "nodes", start=0.5 * DT),
+    ],
     "pin and plane": lambda: [PinnedRegion(LEFT, "nodes"), Plane([0.0, 0.0, 0.13], [0.0, 0.0, 1.0], "sticky")],
     "knock and release": lambda: [SequentialRelease(LEFT, end=1.5 * DT), Impulse(Everything(), [0, 0, 0.02], end=DT)],
 }
@@ -70,7 +76,10 @@ BOUNDARIES = {
         *(pytest.param("cuda", name, marks=pytest.mark.gpu) for name in BOUNDARIES),
         *(
             ("cpu", name)
-            for name in ("two pins", "hinge", "handle", "hinged handle", "knock and release", "plane", "box", "walls")
+            for name in (
+                *("two pins", "hinge", "handle", "hinged handle", "knock and release", "plane", "box", "walls"),
+                "walls and pins",
+            )
         ),
     ],
     indirect=["kernel_device"],
@@ -105,18 +114,39 @@ def test_points_that_are_held(kernel_device, name):
     _boundaries_case(kernel_device, "total", POINT_HOLDS[name])
 
 
-def test_planes_and_boxes_are_a_part_of_the_kernel_of_the_nodes(kernel_device):
-    """Of one scene in `updated`, if nothing else acts; in torch an enclosing box takes as long as the substep."""
-    points = make_points(kernel_device, count=12)
-    with_walls, with_pin, batch = (
-        make_solver("kernels", "updated", boundaries=BOUNDARIES[name]()) for name in ("walls", "pin and plane", "walls")
+@pytest.mark.parametrize(
+    ("kernel_device", "name"), on_each("pin and plane", "walls and pins", cpu=["walls"]), indirect=["kernel_device"]
+)
+def test_boundaries_of_many_scenes(kernel_device, name):
+    """Each scene has its own reaction impulses; a program may have nodes of two."""
+    points = make_points(kernel_device, count=12, batch=(3,))
+
+    def start(solver, points):
+        state = set_going(solver, points)
+        return state.replace(velocity=state.velocity * torch.tensor([1.0, -2.0, 3.0]).to(kernel_device)[:, None, None])
+
+    ends = run_both(
+        points,
+        lambda solver, state: solver.rollout(state, DT, 3),
+        "updated",
+        start=start,
+        boundaries=BOUNDARIES[name](),
     )
-    for solver in (with_walls, with_pin):
+    check_agreement(ends)
+    assert len(torch.unique(ends[1].impulse.abs().sum((1, 2)))) == 3
+
+
+def test_which_boundaries_are_a_part_of_the_kernel_of_the_nodes(kernel_device):
+    """Planes, boxes and pins, in order; in torch an enclosing box takes as long as the substep."""
+    points, turns = make_points(kernel_device, count=12), {}
+    for name in ("walls", "pin and plane", "walls and pins", "handle"):
+        solver = make_solver("kernels", "updated", boundaries=BOUNDARIES[name]())
         solver.init_state(points)
-    batch.init_state(make_points(kernel_device, count=12, batch=(2,)))
-    assert len(with_walls.fused().solids.parts) == 7
-    assert with_pin.fused().solids.parts == []
-    assert batch.fused().solids.parts == []
+        turns[name] = solver.fused().turns
+    assert turns["walls"] == ((0, 0), *((1, 1 + n) for n in range(6)))
+    assert turns["pin and plane"] == ((0, -1), (1, 0))
+    assert turns["walls and pins"] == ((0, 0), (1, -1), *((2, 1 + n) for n in range(6)), (3, -2))
+    assert turns["handle"] == ()
 
 
 def test_a_plane_that_is_moved_in_place(kernel_device):
