@@ -70,7 +70,7 @@ class FusedUpdated(Fused):
         self.windows_of_pins = torch.tensor(windows, dtype=torch.float64, device=self.device).reshape(-1)
         turns = [(k, n) for n, (_, k) in enumerate(self.solids.parts)] + [(k, -1 - n) for n, k in enumerate(pins)]
         self.turns = tuple(sorted(turns, key=lambda turn: turn[0]))
-        """What acts on nodes, in order: the number of its boundary, and of the solid, or -1 less that of the pin."""
+        """Solids and pins in order: the number of the boundary, and that of the solid, or -1 less that of the pin."""
         self.marks_of_pins = torch.zeros(len(pins), 0, dtype=torch.int32, device=self.device)
         """The last substep in which each pin held each node, counted from 1."""
         self.clock = torch.zeros(2, dtype=torch.float64, device=self.device)  # time at step 0, substep [s]
