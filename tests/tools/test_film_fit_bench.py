@@ -24,7 +24,7 @@ def test_what_a_command_takes_and_finds(monkeypatch):
     monkeypatch.setattr(film_fit, "COMMAND", FIT)
     made = []
     monkeypatch.setattr(film_fit, "write_case", lambda folder, size, still, moving: made.append((still, moving)))
-    result, _ = measure("film_fit", "--seconds", "4", result=json.loads(json.dumps(HEAD)))
+    result, _ = measure("film_fit", "--device", "cpu", "--seconds", "4", result=json.loads(json.dumps(HEAD)))
     (row,) = result["rows"]
     assert made == [(1.5, 2.5)]
     assert row["frames"] == 120
@@ -39,4 +39,4 @@ def test_a_command_that_fails_is_no_row(monkeypatch):
     monkeypatch.setattr(film_fit, "COMMAND", "import sys; sys.exit(2)")
     monkeypatch.setattr(film_fit, "write_case", lambda *given: None)
     with pytest.raises(RuntimeError, match="fit ended with 2"):
-        film_fit.measured(3.0)
+        film_fit.measured(3.0, "cpu")

@@ -24,15 +24,15 @@ COMMAND = "import sys; from gaussian_swaying.cli.main import main; sys.exit(main
 def rows(options: argparse.Namespace, result: Row) -> Iterator[Measurement]:
     """The whole command for films of some lengths [s]."""
     for seconds in options.seconds or (3.0, 60.0):
-        yield ("rows", {"film": f"{seconds:g} s"}), partial(measured, seconds)
+        yield ("rows", {"film": f"{seconds:g} s"}), partial(measured, seconds, options.device)
 
 
-def measured(seconds: float) -> Row:
+def measured(seconds: float, device: str) -> Row:
     """Make a film and fit it; time, memory of the largest process, and what is found."""
     with tempfile.TemporaryDirectory() as scratch:
         folder = Path(scratch)
         write_case(folder, SIZE, seconds - MOVING, MOVING)
-        words = ["fit", "film.mp4", "--splat", "my.ply", "--length", "pole", str(POLE), "--output", "out"]
+        words = ["fit", "film.mp4", "--splat", "my.ply", "--length", "pole", str(POLE), "--output", "out", "--device", device]
         took = command([sys.executable, "-c", COMMAND, *words], folder)
         if took["code"]:
             raise RuntimeError(f"fit ended with {took['code']}: {took['told']}")
@@ -56,5 +56,4 @@ CASE = Case(
     rows,
     (option("--seconds", "length of a film; repeatable", action="append", type=float),),
     page="fit.md",
-    device=False,
 )
