@@ -11,9 +11,9 @@ import importlib.util
 import io
 import json
 import os
+import subprocess
 import sys
 import time
-from importlib.metadata import entry_points
 from pathlib import Path
 from typing import Any
 
@@ -63,8 +63,9 @@ def words(options: dict[str, Any]) -> list[str]:
 
 
 def call(arguments: str | list[str]) -> tuple[int, str]:
-    """Exit code and all that a command prints; it is called as the installed script does."""
-    main = entry_points(group="console_scripts")["gaussian-swaying"].load()
+    """Exit code and all that a command prints."""
+    from gaussian_swaying.cli.main import main
+
     given = arguments.split() if isinstance(arguments, str) else arguments
     told, begin = io.StringIO(), time.monotonic()
     with contextlib.redirect_stdout(told), contextlib.redirect_stderr(told):
@@ -113,6 +114,11 @@ def main() -> None:
     assert Path(gaussian_swaying.__file__).is_relative_to(sys.prefix), gaussian_swaying.__file__
     found = [name for name in EXTRAS if importlib.util.find_spec(name)]
     assert found == [], f"the environment holds more than the base dependencies: {found}"
+    script = "from importlib.metadata import entry_points as e; e(group='console_scripts')['gaussian-swaying'].load()()"
+    told = subprocess.run(
+        [sys.executable, "-c", script, "--version"], capture_output=True, text=True, check=True
+    ).stdout
+    assert told == f"gaussian-swaying {gaussian_swaying.__version__}\n", told
     tried = set()
     for command in COMMANDS:
         code, told = call(f"{command} --help")

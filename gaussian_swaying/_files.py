@@ -14,6 +14,8 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 PNG: dict[str, Any] = {"compress_level": 1, "compress_type": zlib.Z_RLE}
 """Options with which pictures are compressed: in two thirds of the time of zlib's level 3, and smaller."""
 
@@ -80,6 +82,20 @@ def atomic(path: Path) -> Iterator[Path]:
         os.replace(temporary, path)
     finally:
         temporary.unlink(missing_ok=True)
+
+
+def cache_folder() -> Path:
+    """Folder of the compiled kernels: ``GAUSSIAN_SWAYING_CACHE``, or ``gaussian_swaying`` where caches are kept."""
+    given = os.environ.get("GAUSSIAN_SWAYING_CACHE")
+    base = os.environ.get("XDG_CACHE_HOME") or os.environ.get("LOCALAPPDATA") or Path.home() / ".cache"
+    return Path(given) if given else Path(base) / "gaussian_swaying"
+
+
+def save_png(path: Path, pixels: np.ndarray) -> None:
+    """Write a picture, uint8 (H, W, 3) or uint16 (H, W), as PNG; imageio would load all formats that Pillow knows."""
+    from PIL import Image
+
+    Image.fromarray(pixels).save(path, "PNG", **PNG)
 
 
 def write_text(path: Path, text: str) -> None:

@@ -1,8 +1,6 @@
 """Convert a PhysGaussian configuration: ``python tools/convert_physgaussian.py config.json --output my.yaml``."""
 
-import sys
-
-from gaussian_swaying.cli.convert import main
+from gaussian_swaying.cli.main import run
 
 if __name__ == "__main__":
-    sys.exit(main())
+    run("convert")

@@ -1,8 +1,6 @@
 """Compare a run with a reference: ``python tools/eval.py RUN REFERENCE --output DIR``."""
 
-import sys
-
-from gaussian_swaying.cli.evaluate import main
+from gaussian_swaying.cli.main import run
 
 if __name__ == "__main__":
-    sys.exit(main())
+    run("eval")

@@ -1,8 +1,6 @@
 """Convert a splat for viewers: ``python tools/export.py scene.ply scene.splat``."""
 
-import sys
-
-from gaussian_swaying.cli.export import main
+from gaussian_swaying.cli.main import run
 
 if __name__ == "__main__":
-    sys.exit(main())
+    run("export")

@@ -6,9 +6,7 @@ the splat, and writes a first configuration. With ``--config`` it shows what tha
 
 from __future__ import annotations
 
-import sys
-
-from gaussian_swaying.cli.preview import main
+from gaussian_swaying.cli.main import run
 
 if __name__ == "__main__":
-    sys.exit(main())
+    run("preview")

@@ -1,8 +1,6 @@
 """Simulate a scene in the wind: ``python tools/sim.py --config configs/sim/flag.yaml``."""
 
-import sys
-
-from gaussian_swaying.cli.simulate import main
+from gaussian_swaying.cli.main import run
 
 if __name__ == "__main__":
-    sys.exit(main())
+    run("sim")

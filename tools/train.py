@@ -1,8 +1,6 @@
 """Train Gaussians from photos: ``python tools/train.py fit --config configs/train/quick_cpu.yaml``."""
 
-import sys
-
-from gaussian_swaying.cli.train import main
+from gaussian_swaying.cli.main import run
 
 if __name__ == "__main__":
-    sys.exit(main())
+    run("train")

@@ -8,6 +8,7 @@ import sys
 from collections.abc import Sequence
 from importlib import import_module
 from types import ModuleType
+from typing import NoReturn
 
 import gaussian_swaying
 from gaussian_swaying import _program as program
@@ -55,6 +56,16 @@ def main(arguments: Sequence[str] | None = None) -> int:
     program.called(given[0])
     code: int = _imported(COMMANDS[given[0]][0]).main(given[1:])
     return code
+
+
+def run(command: str | None = None) -> NoReturn:
+    """Run a command with the arguments of the process, and end the process.
+
+    Args:
+        command: The command of a program of the folder tools; None for the installed program, whose first argument
+            names it.
+    """
+    program.leave(main() if command is None else _imported(COMMANDS[command][0]).main())
 
 
 def _imported(name: str) -> ModuleType:

@@ -76,7 +76,7 @@ def without_splat() -> list[str]:
 
 def caches() -> dict[str, Path]:
     """Return the cache folders of compiled kernels, of Triton and of gsplat."""
-    from torch.utils.cpp_extension import _get_build_directory
+    from gaussian_swaying.rendering.gsplat_renderer import build_folder
 
     triton = os.environ.get("TRITON_CACHE_DIR") or Path.home() / ".triton" / "cache"
-    return {"Triton's kernels": Path(triton), "gsplat's kernels": Path(_get_build_directory("gsplat_cuda", False))}
+    return {"Triton's kernels": Path(triton), "gsplat's kernels": build_folder()}

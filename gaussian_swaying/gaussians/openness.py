@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from gaussian_swaying._checks import check_shape
+from gaussian_swaying._parallel import in_threads
 from gaussian_swaying.geometry.directions import axes_across, spread_lines
 
 LEAST = 1e-3
@@ -26,6 +27,7 @@ _OPAQUE = 0.99  # largest opacity; the optical depth of 1 would be infinite
 _FINE = 2.0  # parts that are cut from an area as large as the cross-section of a column
 _PIECES = 256  # parts of a patch, at most
 _PARTS = 3  # parts of a patch on average, at most
+_AT_ONCE = 2_000_000  # parts in memory together, on lines that are followed side by side
 _WIDE = 4096  # columns side by side, and depth of the picture in sides of a column; the rest is moved to its border
 
 
@@ -108,9 +110,10 @@ def openness(
     column = _COLUMN * float(area.median().sqrt())
     owner, part, pieces = _cut(place, normal, scale, area, column)
     part = (part - place.median(0).values) / column
-    light, shares, gaps, total = (torch.zeros(count, dtype=torch.float64) for _ in range(4))
     lines = spread_lines(_LINES)
-    for number, (line, first, second) in enumerate(zip(lines, *axes_across(lines), strict=True)):
+
+    def along(number: int, line: Tensor, first: Tensor, second: Tensor) -> tuple[Tensor, ...]:
+        """Patches, and what they get of a line: light, shares of the skin, gaps and weights."""
         turn = torch.stack([first, second, line], dim=-1)
         facing = normal @ turn
         cosine = facing[:, 2].abs()
@@ -130,10 +133,15 @@ def openness(
         weight = torch.where(cosine > _FACING, cosine, 0)
         arriving = (-before).exp() + (-after).exp()
         clear = (_DARK * before < math.log(2)).double() + (_DARK * after < math.log(2)).double()
-        light.index_add_(0, patch, weight * arriving * (-torch.expm1(-near) / kept) * (tau / near))
-        shares.index_add_(0, patch, weight * (-torch.expm1(-wide) / kept) * (tau / wide))
-        gaps.index_add_(0, patch, torch.where(cosine > _THROUGH, 0.5 * weight * clear, 0))
-        total.index_add_(0, patch, weight)
+        light = weight * arriving * (-torch.expm1(-near) / kept) * (tau / near)
+        shares = weight * (-torch.expm1(-wide) / kept) * (tau / wide)
+        return patch, light, shares, torch.where(cosine > _THROUGH, 0.5 * weight * clear, 0), weight
+
+    light, shares, gaps, total = sums = [torch.zeros(count, dtype=torch.float64) for _ in range(4)]
+    each = range(_LINES), lines, *axes_across(lines)
+    for patch, *found in in_threads(along, *each, most=_AT_ONCE // len(part)):
+        for whole, of_line in zip(sums, found, strict=True):
+            whole.index_add_(0, patch, of_line)
     low, high = _GAP
     gap = ((gaps / total - low) / (high - low)).clamp(0, 1)
     return torch.maximum(light / total, (shares / total).clamp_max(1) * gap).clamp(LEAST, 1).to(means)

@@ -21,14 +21,15 @@ def nearest_neighbours(points: Tensor, count: int, queries: Tensor | None = None
     Returns:
         Distances, ascending, and indices, each of shape (M, count).
     """
-    from scipy.spatial import cKDTree
-
     points = points.detach().cpu()
     places = points if queries is None else queries.detach().cpu().to(points.dtype)
     if len(places) == 0:
         return places.new_empty(0, count), torch.empty(0, count, dtype=torch.long)
+    from scipy.spatial import cKDTree
+
     candidates = np.arange(1, count + 1 + (queries is None))
-    index = torch.from_numpy(cKDTree(points.numpy()).query(places.numpy(), candidates)[1])
+    found = cKDTree(points.numpy()).query(places.numpy(), candidates, workers=torch.get_num_threads())
+    index = torch.from_numpy(found[1])
     if queries is None:
         itself = index == torch.arange(len(points))[:, None]
         itself[:, -1] |= ~itself.any(-1)  # more points than `count` are at the same place

@@ -22,7 +22,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from gaussian_swaying._files import atomic
+from gaussian_swaying._files import atomic, cache_folder
 
 _KINDS = {
     torch.float32: "*f32", torch.float64: "*f64", torch.int32: "*i32", torch.int64: "*i64", torch.int8: "*i8",
@@ -135,14 +135,6 @@ def _linker() -> Any:
     return _llvm().create_lljit_compiler()
 
 
-@cache
-def _folder() -> Path:
-    """Folder of the compiled kernels: ``GAUSSIAN_SWAYING_CACHE``, or ``gaussian_swaying`` where caches are kept."""
-    given = os.environ.get("GAUSSIAN_SWAYING_CACHE")
-    base = os.environ.get("XDG_CACHE_HOME") or os.environ.get("LOCALAPPDATA") or Path.home() / ".cache"
-    return Path(given) if given else Path(base) / "gaussian_swaying"
-
-
 def _compiled(text: str, machine: Any = None) -> bytes:
     """An object file from LLVM's text, for this processor if no other code generator is given."""
     llvm, machine = _llvm(), machine or _machine()
@@ -193,7 +185,7 @@ def _found_or_compiled(kernel: Any, constants: dict[str, Any], kinds: dict[str, 
         _sources(), device_source(kernel), options, kinds, real,
         __version__, _llvm().llvm_version_info, _llvm().get_host_cpu_name(), _features(),
     )  # fmt: skip
-    path = _folder() / f"{kernel.fn.__name__}_{hashlib.sha256(repr(parts).encode()).hexdigest()[:32]}.o"
+    path = cache_folder() / f"{kernel.fn.__name__}_{hashlib.sha256(repr(parts).encode()).hexdigest()[:32]}.o"
     try:
         return _linked(path.read_bytes(), "kernel")[0]
     except (OSError, RuntimeError):  # it is not there, or broken
@@ -225,7 +217,7 @@ def compiled_sentence(before: int) -> str | None:
     if count <= before:
         return None
     kernels = "1 kernel" if count == 1 else f"{count} kernels"
-    return f"Compiled {kernels} for this CPU in {seconds:.1f} s, once (kept in {_folder()})."
+    return f"Compiled {kernels} for this CPU in {seconds:.1f} s, once (kept in {cache_folder()})."
 
 
 @cache

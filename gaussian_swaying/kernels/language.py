@@ -119,6 +119,10 @@ ON_GPU = (torch.cuda.is_available() or INTERPRETED) and importlib.util.find_spec
 if ON_GPU:
     import triton  # type: ignore[no-redef]
     import triton.language as tl  # type: ignore[no-redef]
+
+    from gaussian_swaying.kernels.triton_key import remember_key
+
+    remember_key()
 else:
     triton = Compiler()
     tl = triton.language

@@ -20,7 +20,7 @@ import torch
 from torch import Tensor
 
 from gaussian_swaying._checks import check_choice, check_literals, check_positive
-from gaussian_swaying._files import PNG, atomic, remove_temporaries, write_json, write_table, write_text
+from gaussian_swaying._files import atomic, remove_temporaries, save_png, write_json, write_table, write_text
 from gaussian_swaying.gaussians.cloud import GaussianCloud
 from gaussian_swaying.gaussians.export import SUFFIXES, Format, export_cloud
 from gaussian_swaying.geometry.frame import SimFrame
@@ -56,10 +56,8 @@ class _Film:
 
 
 def _write_png(path: Path, pixels: np.ndarray) -> None:
-    import imageio.v3 as iio
-
     with atomic(path) as temporary:
-        iio.imwrite(temporary, pixels, **PNG)
+        save_png(temporary, pixels)
 
 
 @dataclass(eq=False)

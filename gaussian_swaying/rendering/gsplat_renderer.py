@@ -1,15 +1,21 @@
 """Renderer on top of the CUDA rasterizer of gsplat."""
 
+import importlib.util
+import os
 import sys
+import threading
 import warnings
+from contextlib import suppress
 from functools import cache
 from pathlib import Path
+from types import ModuleType
 
 import torch
 from filelock import FileLock, Timeout
-from torch import Tensor, nn
+from torch import Tensor, _appdirs, nn
 
 from gaussian_swaying._checks import check_positive
+from gaussian_swaying._files import write_text
 from gaussian_swaying.gaussians.harmonics import sh_degree
 from gaussian_swaying.rendering.cameras.camera import Camera
 from gaussian_swaying.rendering.protocol import (
@@ -38,7 +44,9 @@ def load_kernels() -> bool:
     """Load gsplat's CUDA kernels, or compile them at the first use on a machine.
 
     One process compiles at a time and the others wait: gsplat 1.5.3 deletes the folder of a build that is not finished,
-    also if another process is at work there. Later calls do nothing.
+    also if another process is at work there. What was compiled and loaded once is loaded by its file from then on, as
+    long as gsplat, its sources, torch and the options are the same: gsplat would call the compilers again to ask for
+    their versions. Later calls do nothing.
 
     Returns:
         Whether there are kernels: False if gsplat finds no compiler.
@@ -46,23 +54,88 @@ def load_kernels() -> bool:
     Raises:
         Exception: The message of the compiler, if it fails.
     """
-    from torch.utils.cpp_extension import _get_build_directory
+    with _LOADING:
+        library = build_folder() / "gsplat_cuda.so"
+        stamp = library.with_suffix(".stamp")
+        try:
+            if stamp.read_text() == _stamp(library):
+                _load(library)
+                return True
+        except (ImportError, OSError, UnicodeError):  # it was never loaded, or is broken
+            pass
+        lock = FileLock(library.parent.with_suffix(".lock"))
+        try:
+            library.parent.mkdir(parents=True, exist_ok=True)
+            lock.acquire(timeout=0)
+        except Timeout:
+            print("Another process is compiling the CUDA kernels of gsplat: waiting until it is done.", file=sys.stderr)
+            lock.acquire()
+        except OSError:  # a folder that cannot be written to: what lies there was compiled before
+            pass
+        try:
+            from gsplat.cuda._backend import _C
+        except ModuleNotFoundError:  # another version of gsplat, which keeps its kernels elsewhere
+            return True
+        finally:
+            lock.release()
+        if getattr(_C, "__file__", None) == str(library):  # and not kernels that gsplat came with
+            with suppress(OSError):  # a folder that cannot be written to
+                write_text(stamp, _stamp(library))
+        return _C is not None
 
-    lock = FileLock(Path(_get_build_directory("gsplat_cuda", verbose=False)).with_suffix(".lock"))
-    try:
-        lock.acquire(timeout=0)
-    except Timeout:
-        print("Another process is compiling the CUDA kernels of gsplat: waiting until it is done.", file=sys.stderr)
-        lock.acquire()
-    except OSError:  # a folder that cannot be written to: what lies there was compiled before
-        pass
-    try:
-        from gsplat.cuda._backend import _C
-    except ModuleNotFoundError:  # another version of gsplat, which keeps its kernels elsewhere
-        return True
-    finally:
-        lock.release()
-    return _C is not None
+
+_LOADING = threading.Lock()
+
+
+def loaded_before() -> bool:
+    """True if :func:`load_kernels` finds kernels that it has loaded before, so that it takes a moment."""
+    return (build_folder() / "gsplat_cuda.stamp").is_file()
+
+
+def build_folder() -> Path:
+    """The folder in which torch compiles the kernels of gsplat; its own function for it takes long to import."""
+    root = os.environ.get("TORCH_EXTENSIONS_DIR")
+    if root is None:
+        python = f"py{sys.version_info.major}{sys.version_info.minor}{getattr(sys, 'abiflags', '')}"
+        version = "cpu" if torch.version.cuda is None else f"cu{torch.version.cuda.replace('.', '')}"
+        home = os.path.realpath(_appdirs.user_cache_dir(appname="torch_extensions"))
+        root = os.path.join(home, f"{python}_{version}")
+    return Path(root) / "gsplat_cuda"
+
+
+def _stamp(library: Path) -> str:
+    """All that a library of gsplat's kernels was compiled from, and its size and time.
+
+    Raises:
+        OSError: If there is no library.
+        ImportError: If there is no gsplat.
+    """
+    from importlib.metadata import version
+
+    found = importlib.util.find_spec("gsplat")
+    if found is None or found.origin is None:
+        raise ImportError("no gsplat")
+    sources = Path(found.origin).parent / "cuda"
+    newest = max(file.stat().st_mtime_ns for folder in ("", "csrc", "include") for file in (sources / folder).glob("*"))
+    devices = [torch.cuda.get_device_capability(device) for device in range(torch.cuda.device_count())]
+    options, file = {name: os.environ.get(name) for name in _OPTIONS}, library.stat()
+    made_of = version("gsplat"), str(sources), newest, torch.__version__, devices, options
+    return repr((*made_of, file.st_size, file.st_mtime_ns))
+
+
+_OPTIONS = ("TORCH_CUDA_ARCH_LIST", "NO_FAST_MATH", "FAST_COMPILE", "USE_PRECOMPILED_HEADERS", "CUDA_HOME", "CXX")
+
+
+def _load(library: Path) -> None:
+    """Load a library as the kernels of gsplat."""
+    spec = importlib.util.spec_from_file_location("gsplat_cuda", library)
+    assert spec is not None
+    assert spec.loader is not None
+    kernels = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(kernels)
+    backend = ModuleType("gsplat.cuda._backend")
+    backend._C = kernels  # type: ignore[attr-defined]
+    sys.modules[backend.__name__] = backend
 
 
 def render_gsplat(

@@ -39,6 +39,7 @@ from gaussian_swaying.recording.recorder import Recorder
 from gaussian_swaying.rendering.cameras.camera_path import CameraPath
 from gaussian_swaying.rendering.protocol import Renderer
 from gaussian_swaying.rendering.shading import Shader
+from gaussian_swaying.simulation.ahead import load_ahead
 from gaussian_swaying.simulation.copies import Copy, copies_of
 from gaussian_swaying.simulation.copies_painter import CopiesPainter
 from gaussian_swaying.simulation.defaults import (
@@ -170,6 +171,7 @@ class Simulation:
         check_choice("dtype", dtype, ("float32", "float64"))
         colour = check_vector("background", background)
         target = resolve_device(device)
+        wait_for_device = load_ahead(target)
         if dtype == "float64" and double_home(target) != target:
             raise ValueError(
                 "`dtype: float64` needs a device with double precision, which mps is not: use `device: cpu`."
@@ -199,6 +201,7 @@ class Simulation:
         camera = as_camera(camera, cameras, blowing, model)
         own = tuple(force.in_frame(model.frame) for force in as_forces(forces))
         setup = Setup(model, material, model.points, blowing, aero or AeroForce(), own, solver.settings, air)
+        wait_for_device()
         placed = copies_of(copies, setup, solver) if copies else None
         drawing = (shader, camera, cameras, colour, frame_dt, renderer)
         self._painter = Painter(model, *drawing) if placed is None else CopiesPainter(model, placed, *drawing)

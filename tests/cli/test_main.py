@@ -4,6 +4,7 @@ Covers: _program, cli.shipped.
 """
 
 import runpy
+import subprocess
 import sys
 from pathlib import Path
 
@@ -48,6 +49,26 @@ def test_each_tool_is_a_program(name, monkeypatch, capsys):
         runpy.run_path(str(ROOT / "tools" / f"{name}.py"), run_name="__main__")
     assert left.value.code in (0, None)
     assert capsys.readouterr().out.startswith(f"usage: {name}.py")
+
+
+def test_a_script_ends_at_once_after_its_threads_and_exit_handlers():
+    """What Python would take apart is left; the exit code and all that was printed arrive."""
+    code = """
+import atexit, sys, threading, time
+from gaussian_swaying.cli import main
+
+class Part:
+    def __del__(self):
+        print("taken apart")
+
+part = Part()
+atexit.register(print, "handler")
+threading.Thread(target=lambda: (time.sleep(0.2), print("thread"))).start()
+main.main = lambda: 3
+main.run()
+"""
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    assert (done.returncode, done.stdout, done.stderr) == (3, "thread\nhandler\n", "")
 
 
 def test_commands_that_are_printed_can_be_pasted(monkeypatch):

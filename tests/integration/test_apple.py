@@ -266,7 +266,7 @@ def test_a_mac_computes_on_its_cpu_unless_asked(tmp_path, monkeypatch):
 def test_the_kernels_of_a_run_compile_for_arm64(triple, processor, head, tmp_path, monkeypatch):
     """All that LLVM has to know of another processor is its name."""
     texts, plain = [], cpu._compiled
-    monkeypatch.setattr(cpu, "_folder", lambda: tmp_path)
+    monkeypatch.setattr(cpu, "cache_folder", lambda: tmp_path)
     monkeypatch.setattr(cpu, "_COMPILED", {})
     monkeypatch.setattr(cpu, "_compiled", lambda text: texts.append(text) or plain(text))
     list(_simulation(device="cpu").frames(2))

@@ -71,6 +71,19 @@ def test_import_is_light_and_every_module_imports_without_the_heavy_libraries():
     assert done.stdout.strip() == "[]", done.stdout + done.stderr
 
 
+def test_a_run_imports_only_what_it_needs(tmp_path):
+    """On a CPU, with pictures and a video; each of these takes a tenth of a second or more."""
+    heavy = ["cv2", "gsplat", "imageio", "lightning", "matplotlib", "pandas", "PIL.TiffImagePlugin", "scipy.optimize"]
+    heavy += ["scipy.stats", "setuptools", "sympy", "torch._dynamo", "torch._inductor", "torch.utils.cpp_extension"]
+    heavy += ["torchmetrics", "triton", "viser"]
+    small = ["--config=flag", "--scene.generator.init_args.spacing=0.05", "--solver.dx=0.1", "--frames=2"]
+    small += ["--camera.init_args.width=32", "--camera.init_args.height=18", "--device=cpu", f"--output={tmp_path}"]
+    run = f"import sys; from gaussian_swaying.cli.main import main; main(['sim', *{small}])"
+    done = _python("-c", f"{run}\nprint([name for name in {heavy} if name in sys.modules])", TRITON_INTERPRET="0")
+    assert done.stdout.splitlines()[-1:] == ["[]"], done.stdout + done.stderr
+    assert (tmp_path / "video.mp4").is_file()
+
+
 @pytest.mark.skipif(torch.cuda.is_available(), reason="shows what happens without a GPU")
 def test_gpu_tests_skip_without_a_gpu_and_fail_if_one_is_required():
     command = ["-m", "pytest", "-q", "-p", "no:cacheprovider", "-m", "gpu", "tests/aero/test_wind.py"]

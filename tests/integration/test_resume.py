@@ -14,6 +14,7 @@ import torch
 from shared import refused
 
 from gaussian_swaying.cli.simulate import main
+from gaussian_swaying.recording import recorder
 from gaussian_swaying.recording.checkpoint import read_checkpoint
 from gaussian_swaying.recording.trajectory import load_trajectory
 from gaussian_swaying.runs.seal import save_sealed
@@ -204,7 +205,6 @@ def test_ctrl_c_while_the_queue_is_full(whole, tmp_path):
         "import functools, pathlib, signal, sys, time\n"
         # ignored where a script starts the tests in the background
         "signal.signal(signal.SIGINT, signal.default_int_handler)\n"
-        "import imageio.v3 as iio\n"
         "from gaussian_swaying.cli import simulate\n"
         "from gaussian_swaying.recording import recorder\n"
         f"full, go_on = pathlib.Path({str(full)!r}), pathlib.Path({str(go_on)!r})\n"
@@ -213,11 +213,11 @@ def test_ctrl_c_while_the_queue_is_full(whole, tmp_path):
         "        if self.pending == self.limit: full.touch()\n"
         "        super().submit(*arguments, **settings)\n"
         "recorder.FrameWriter = functools.partial(Writer, limit=8)\n"
-        "write = iio.imwrite\n"
+        "write = recorder.save_png\n"
         "def hang(path, *arguments, **settings):\n"
         "    while not go_on.exists(): time.sleep(0.01)\n"
         "    write(path, *arguments, **settings)\n"
-        "iio.imwrite = hang\n"
+        "recorder.save_png = hang\n"
         "sys.exit(simulate.main(sys.argv[1:]))\n"
     )
     process = subprocess.Popen(
@@ -334,7 +334,7 @@ def test_a_refused_run_does_not_move_the_earlier_one(stopped, capsys):
 def test_checkpoints_are_written_after_what_they_promise(tmp_path, monkeypatch):
     """A checkpoint of frame k exists only once the picture and the trajectory of frame k do, however slow they are."""
     seen = []
-    save, write = torch.save, iio.imwrite
+    save, write = torch.save, recorder.save_png
 
     def check(checkpoint, path):
         for frame in range(checkpoint["frame"] + 1):
@@ -348,6 +348,6 @@ def test_checkpoints_are_written_after_what_they_promise(tmp_path, monkeypatch):
         write(*arguments, **settings)
 
     monkeypatch.setattr(torch, "save", check)
-    monkeypatch.setattr(iio, "imwrite", slow)
+    monkeypatch.setattr(recorder, "save_png", slow)
     assert main(_arguments(tmp_path / "run")) == 0
     assert seen == list(range(FRAMES))

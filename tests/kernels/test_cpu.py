@@ -160,7 +160,7 @@ def test_a_broken_file_is_replaced(folder, broken):
 def test_the_folder_need_not_be_writable(tmp_path, monkeypatch):
     """As where the home folder is on a read-only disk: here a file stands in the way."""
     (tmp_path / "file").touch()
-    monkeypatch.setattr(cpu, "_folder", lambda: tmp_path / "file" / "kernels")
+    monkeypatch.setattr(cpu, "cache_folder", lambda: tmp_path / "file" / "kernels")
     monkeypatch.setattr(cpu, "_COMPILED", {})
     assert torch.equal(_shifted(), EXPECTED)
     assert [path.name for path in tmp_path.iterdir()] == ["file"]
@@ -179,7 +179,7 @@ def test_where_the_folder_is(given, expected, monkeypatch):
         monkeypatch.delenv(name, raising=False)
     for name, value in given.items():
         monkeypatch.setenv(name, value)
-    assert cpu._folder.__wrapped__() == Path(expected)
+    assert cpu.cache_folder() == Path(expected)
 
 
 # ---- threads

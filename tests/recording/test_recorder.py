@@ -62,7 +62,7 @@ def test_a_failing_write_leaves_no_half_file(what, make_simulation, tmp_path, mo
     recorder.open(tmp_path / "run")
     before = _names(tmp_path)
     if what == "image":
-        _failing(monkeypatch, iio, "imwrite")
+        _failing(monkeypatch, recorder_module, "save_png")
         write = lambda: recorder.write_image(1, torch.zeros(2, 2, 3))  # noqa: E731
     elif what == "trajectory":
         _failing(monkeypatch, np, "savez")
@@ -243,15 +243,15 @@ def _not_again(monkeypatch):
     monkeypatch.setattr(recorder_module, "encode_video", lambda *_: pytest.fail("the video was encoded again"))
 
 
-def _before_imwrite(monkeypatch, action):
+def _before_png(monkeypatch, action):
     """Do something in the thread that writes a PNG, given its frame number."""
-    write = iio.imwrite
+    write = recorder_module.save_png
 
     def wrapped(path, *arguments, **settings):
         action(int(path.name.split(".")[1]))
         write(path, *arguments, **settings)
 
-    monkeypatch.setattr(iio, "imwrite", wrapped)
+    monkeypatch.setattr(recorder_module, "save_png", wrapped)
 
 
 def _full_disk(monkeypatch):
@@ -263,7 +263,7 @@ def _full_disk(monkeypatch):
             assert fail.wait(LONG)
             raise OSError(28, "No space left on device")
 
-    _before_imwrite(monkeypatch, disk_full)
+    _before_png(monkeypatch, disk_full)
     return fail
 
 
@@ -278,7 +278,7 @@ def test_the_video_is_in_order_though_the_pngs_are_not(tmp_path, monkeypatch):
         if frame == 4:
             later.set()
 
-    _before_imwrite(monkeypatch, reverse)
+    _before_png(monkeypatch, reverse)
     _not_again(monkeypatch)
     recorder = Recorder(trajectory=False)
     recorder.open(tmp_path / "run", real_time_fps=10.0)
@@ -294,7 +294,7 @@ def test_the_video_is_in_order_though_the_pngs_are_not(tmp_path, monkeypatch):
 
 def test_what_is_changed_after_the_call_is_written_as_it_was(tmp_path, monkeypatch):
     gate = threading.Event()
-    _before_imwrite(monkeypatch, lambda _: gate.wait(LONG))
+    _before_png(monkeypatch, lambda _: gate.wait(LONG))
     recorder = Recorder()
     recorder.open(tmp_path / "run")
     image, position, F, log = _grey(2), torch.ones(4, 3), torch.ones(4, 3, 3).half(), [1]
@@ -364,7 +364,7 @@ def test_a_run_whose_disk_is_full_can_be_resumed(frame, make_simulation, tmp_pat
     with monkeypatch.context() as patch:
         wait = Recorder.wait
         patch.setattr(Recorder, "wait", lambda self: (fail.set() if self._folder else None, wait(self)))
-        _before_imwrite(patch, disk_full)
+        _before_png(patch, disk_full)
         with pytest.raises(OSError, match=f"frames/0000{frame}.png could not be written: No space left on device"):
             _run(make_simulation(), tmp_path / "run", 4)
     summary = json.loads((tmp_path / "run" / "summary.json").read_text())
@@ -469,10 +469,11 @@ def test_a_recorder_that_is_not_closed_leaves_its_frames_and_no_process(how, tmp
 def test_a_program_that_ends_without_closing_loses_no_frame(tmp_path):
     """Nor does it hang, or leave half a video."""
     code = (
-        "import time, torch, imageio.v3 as iio\n"
+        "import time, torch\n"
+        "from gaussian_swaying.recording import recorder as module\n"
         "from gaussian_swaying.recording.recorder import Recorder\n"
-        "write = iio.imwrite\n"
-        "iio.imwrite = lambda *a, **k: (time.sleep(0.5), write(*a, **k))\n"
+        "write = module.save_png\n"
+        "module.save_png = lambda *a: (time.sleep(0.5), write(*a))\n"
         "recorder = Recorder()\n"
         f"recorder.open({str(tmp_path / 'run')!r})\n"
         "for k in range(3): recorder.write_image(k, torch.zeros(16, 16, 3))\n"
@@ -493,7 +494,7 @@ def test_a_run_holds_no_more_than_the_queue(make_simulation, tmp_path, monkeypat
             most.append(self.pending)
 
     monkeypatch.setattr(recorder_module, "FrameWriter", partial(Watched, limit=3, workers=1))
-    _before_imwrite(monkeypatch, lambda _: time.sleep(0.05))
+    _before_png(monkeypatch, lambda _: time.sleep(0.05))
     _not_again(monkeypatch)
     _run(make_simulation(), tmp_path / "run", 5)
     assert max(most) == 3

@@ -12,7 +12,9 @@ from filelock import FileLock
 from gaussian_swaying.rendering.cameras.camera import look_at_camera
 from gaussian_swaying.rendering.gsplat_renderer import (
     GsplatRenderer,
+    build_folder,
     load_kernels,
+    loaded_before,
     make_renderer,
     rasterize_splat,
     render_gsplat,
@@ -155,7 +157,7 @@ def test_a_picture_is_that_of_gsplat_s_rasterization():
 
 def test_one_process_compiles_the_kernels_of_gsplat_at_a_time(tmp_path, monkeypatch, capsys):
     """The others say that they wait; afterwards the kernels are loaded once."""
-    monkeypatch.setattr("torch.utils.cpp_extension._get_build_directory", lambda *a, **k: str(tmp_path / "gsplat_cuda"))
+    monkeypatch.setenv("TORCH_EXTENSIONS_DIR", str(tmp_path))
     backend = types.ModuleType("gsplat.cuda._backend")
     backend._C = object()
     monkeypatch.setitem(sys.modules, "gsplat.cuda._backend", backend)
@@ -174,6 +176,48 @@ def test_one_process_compiles_the_kernels_of_gsplat_at_a_time(tmp_path, monkeypa
     assert "Another process is compiling" in capsys.readouterr().err
     other.acquire(timeout=0)  # it was released
     other.release()
+
+
+def test_the_folder_of_the_kernels_is_that_of_torch(tmp_path, monkeypatch):
+    from torch.utils.cpp_extension import _get_build_directory
+
+    monkeypatch.delenv("TORCH_EXTENSIONS_DIR", raising=False)
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    assert str(build_folder()) == _get_build_directory("gsplat_cuda", verbose=False)
+    monkeypatch.setenv("TORCH_EXTENSIONS_DIR", str(tmp_path / "mine"))
+    assert str(build_folder()) == _get_build_directory("gsplat_cuda", verbose=False)
+
+
+def test_kernels_that_were_loaded_before_are_loaded_by_their_file(tmp_path, monkeypatch):
+    """Any compiled module stands for them; with another torch or another option gsplat itself is asked again."""
+    monkeypatch.setenv("TORCH_EXTENSIONS_DIR", str(tmp_path))
+    library = tmp_path / "gsplat_cuda" / "gsplat_cuda.so"
+    library.parent.mkdir()
+    library.write_bytes(b"compiled")
+    backend = types.ModuleType("gsplat.cuda._backend")
+    backend._C = types.SimpleNamespace(__file__=str(library))
+    by_file = []
+
+    def load(name, asked_gsplat):
+        monkeypatch.setitem(sys.modules, backend.__name__, backend)
+        load_kernels.cache_clear()
+        by_file.clear()
+        assert load_kernels() is True
+        assert by_file == ([] if asked_gsplat else [library]), name
+
+    monkeypatch.setattr("gaussian_swaying.rendering.gsplat_renderer._load", by_file.append)
+    assert not loaded_before()
+    load("first", True)
+    assert loaded_before()
+    load("second", False)
+    monkeypatch.setenv("NO_FAST_MATH", "1")
+    load("other option", True)
+    load("the same option", False)
+    monkeypatch.setattr(torch, "__version__", "3.0")
+    load("other torch", True)
+    library.write_bytes(b"compiled anew")
+    load("other library", True)
+    load_kernels.cache_clear()
 
 
 @pytest.mark.gpu
