@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Callable
-from functools import cache
+from functools import cache, partial
 from pathlib import Path
-from typing import Any
 
 from gaussian_swaying._files import cache_folder, write_text
 
@@ -19,12 +18,7 @@ def remember_key() -> None:
 
     for home in (names, compiler):  # the second until version 3.3
         if hasattr(home, "triton_key"):
-            home.triton_key = _from_file(home.triton_key, Path(triton.__file__).parent)
-
-
-def _from_file(key: Callable[[], str], root: Path) -> Callable[[], str]:
-    """A function for the hash, which reads the file at the first call."""
-    return cache(lambda: remembered(key, root))
+            home.triton_key = cache(partial(remembered, home.triton_key, Path(triton.__file__).parent))
 
 
 def remembered(key: Callable[[], str], root: Path) -> str:
@@ -34,10 +28,8 @@ def remembered(key: Callable[[], str], root: Path) -> str:
         key: Computes the hash.
         root: The folder of Triton. Names, sizes and times of its modules and its library tell of a change.
     """
-    parts: list[Any] = []
-    for file in sorted([*root.rglob("*.py"), *root.glob("_C/libtriton.*")]):
-        known = file.stat()
-        parts.append((str(file), known.st_size, known.st_mtime_ns))
+    files = sorted([*root.rglob("*.py"), *root.glob("_C/libtriton.*")])
+    parts = [(str(file), file.stat().st_size, file.stat().st_mtime_ns) for file in files]
     kept = cache_folder() / f"triton_{hashlib.sha256(repr(parts).encode()).hexdigest()[:32]}.key"
     try:
         return kept.read_text()

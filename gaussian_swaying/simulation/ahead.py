@@ -26,16 +26,18 @@ def load_ahead(device: torch.device) -> Callable[[], None]:
     """
     if device.type != "cuda":
         return lambda: None
-    thread = threading.Thread(target=_load, args=(device,), name="load-ahead")
+    current = torch.cuda.current_device() if torch.cuda.is_initialized() else 0  # a new thread begins with the first
+    number = current if device.index is None else device.index
+    thread = threading.Thread(target=_load, args=(number,), name="load-ahead")
     thread.start()
     return thread.join
 
 
-def _load(device: torch.device) -> None:
+def _load(number: int) -> None:
     for step in (
-        lambda: torch.empty(1, device=device),
-        lambda: compiles(device.type),
+        lambda: torch.empty(1, device="cuda"),
+        lambda: compiles("cuda"),
         lambda: loaded_before() and load_kernels(),
     ):
-        with suppress(Exception):
+        with suppress(Exception), torch.cuda.device(number):
             step()

@@ -1,6 +1,7 @@
 """What a GPU needs is loaded in a thread, while the scene is made."""
 
 import threading
+from contextlib import contextmanager
 
 import torch
 
@@ -8,7 +9,12 @@ from gaussian_swaying.simulation import ahead
 
 
 def test_each_step_is_done_once_in_a_thread_and_errors_are_left_to_others(monkeypatch):
-    done = []
+    done, entered = [], []
+
+    @contextmanager
+    def device(number):
+        entered.append(number)
+        yield
 
     def step(name):
         def work(*_, **__):
@@ -17,6 +23,7 @@ def test_each_step_is_done_once_in_a_thread_and_errors_are_left_to_others(monkey
 
         return work
 
+    monkeypatch.setattr(torch.cuda, "device", device)
     monkeypatch.setattr(torch, "empty", step("context"))
     monkeypatch.setattr(ahead, "compiles", step("triton"))
     monkeypatch.setattr(ahead, "load_kernels", step("gsplat"))
@@ -25,6 +32,15 @@ def test_each_step_is_done_once_in_a_thread_and_errors_are_left_to_others(monkey
         monkeypatch.setattr(ahead, "loaded_before", lambda before=before: before)
         ahead.load_ahead(torch.device("cuda"))()
         assert done == [(name, "load-ahead") for name in steps]
+    assert set(entered) == {0}
     done.clear()
     ahead.load_ahead(torch.device("cpu"))()
     assert done == []
+    entered.clear()
+    ahead.load_ahead(torch.device("cuda:1"))()
+    assert set(entered) == {1}
+    monkeypatch.setattr(torch.cuda, "is_initialized", lambda: True)
+    monkeypatch.setattr(torch.cuda, "current_device", lambda: 2)
+    entered.clear()
+    ahead.load_ahead(torch.device("cuda"))()
+    assert set(entered) == {2}
