@@ -29,6 +29,7 @@ from gaussian_swaying.fitting.evidence import (
     compare_starts,
     scales_of,
 )
+from gaussian_swaying.fitting.held_out import Followed, fitted_part
 from gaussian_swaying.fitting.identifiability import check_apart, directions
 from gaussian_swaying.fitting.least_squares import (
     LEAST_GAIN,
@@ -61,7 +62,6 @@ from gaussian_swaying.fitting.variants import check_variants, states_of
 from gaussian_swaying.fitting.videos import Footage, frame_times, read_videos
 from gaussian_swaying.gaussians.model import DeformedGaussians
 from gaussian_swaying.mpm.state import State
-from gaussian_swaying.rendering.cameras.camera import project
 from gaussian_swaying.runs.folder import MARKER, claim_folder, hold_folder
 from gaussian_swaying.simulation.simulation import Simulation
 
@@ -99,12 +99,8 @@ SHAKEN = 0.12
 """Change of what is sought of the material at the end, to see whether the fit returns, as a share of the range."""
 RIVAL = 1.05
 """Cost per that of the best end below which another end is as good."""
-NOISE = 0.5
-"""Distance of a track that its own error explains [pixels]."""
 DRAG = ("aero.C_D", "aero.C_F")
 """Coefficients that scale the force of the wind."""
-HELD, LEAST_HELD = 7, 6
-"""One of so many tracks is not fitted, if there are at least so many of them."""
 LATER = 0.2
 """Share of the fitted frames that a wind which changes has to predict."""
 PREFERRED = 0.8
@@ -256,7 +252,9 @@ class Fit:
             return [PictureEvidence(video, masks=False) for video in self.videos]
         if stage == "tracks" or (stage == "silhouettes" and "tracks" in self.stages):
             pairs = zip(self.videos, self.tracks, strict=True)
-            found += [TrackEvidence(self.simulation, video, _fitted(tracks), weighed=True) for video, tracks in pairs]
+            found += [
+                TrackEvidence(self.simulation, video, fitted_part(tracks), weighed=True) for video, tracks in pairs
+            ]
         if stage == "silhouettes":
             found += [PictureEvidence(video, masks=True) for video in self.videos if video.masks is not None]
         if stage == "matches":
@@ -275,7 +273,7 @@ class Fit:
             for v, own in zip(self.videos, states, strict=True)
         ]
         pairs = zip(self.videos, tracks, strict=True)
-        return [TrackEvidence(self.simulation, v, _fitted(own), weighed=True) for v, own in pairs]
+        return [TrackEvidence(self.simulation, v, fitted_part(own), weighed=True) for v, own in pairs]
 
     def _run(self, places: Tensor, times: Sequence[float]) -> Any:
         return states_of(self.simulation, [self.values(place) for place in places], times, alike=False)
@@ -534,7 +532,7 @@ class Fit:
         place = torch.tensor(places, dtype=torch.float64)
         normal, model = self._at_the_end(place, evidence)
         found = directions(normal.matrix, self.plan.unknowns, place)
-        followed = _Followed(self) if self.followed else None
+        followed = Followed(self.simulation, self.videos, self.tracks) if self.followed else None
 
         def moved() -> Iterator[DeformedGaussians]:
             for moment, own in zip(self.times, self._run(place[None], self.times), strict=True):
@@ -637,53 +635,6 @@ def _scaled(evidence: Sequence[Evidence]) -> Callable[..., dict[str, float]]:
         return scales_of(known, floors, member) | dict.fromkeys((b.kind for b in blocks if b.kind == PRIOR), 1.0)
 
     return scales
-
-
-class _Followed:
-    """The share of the motion of tracks that were not fitted which a simulation explains, added up frame by frame."""
-
-    def __init__(self, fit_: Fit) -> None:
-        self._simulation = fit_.simulation
-        self._own = {
-            video.name: TrackEvidence(fit_.simulation, video, _held_out(tracks))
-            for video, tracks in zip(fit_.videos, fit_.tracks, strict=True)
-        }
-        self._left = dict.fromkeys(self._own, 0.0)
-        self._moved = dict.fromkeys(self._own, 0.0)
-
-    def add(self, moment: float, state: State) -> None:
-        for name, own in self._own.items():
-            frame = own.frame_at(moment)
-            if frame is None:
-                continue
-            tracks = own.tracks
-            seen = tracks.seen[frame]
-            if not bool(seen.any()):
-                continue
-            moved = tracks.position[frame, seen] - project(own.rest[seen], own.video.cameras[frame])[0]
-            off = own.residuals(self._simulation, [state], frame)[0].square().sum(-1)
-            self._left[name] += float((off - NOISE**2).clamp(min=0).sum())
-            self._moved[name] += float(moved.square().sum())
-
-    def shares(self) -> dict[str, float]:
-        """The share of each camera in which something moves."""
-        return {name: 1 - self._left[name] / moved for name, moved in self._moved.items() if moved > 0}
-
-
-def _held(tracks: Tracks) -> Tensor:
-    """Mask of the tracks that are not fitted, but judge the fit; none if there are too few."""
-    held = tracks.index % HELD == 0
-    return held if int(held.sum()) >= LEAST_HELD else torch.zeros_like(held)
-
-
-def _fitted(tracks: Tracks) -> Tracks:
-    return replace(tracks, seen=tracks.seen & ~_held(tracks))
-
-
-def _held_out(tracks: Tracks) -> Tracks:
-    """The tracks that were not fitted; all if there are too few."""
-    held = _held(tracks)
-    return replace(tracks, seen=tracks.seen & held) if bool(held.any()) else tracks
 
 
 def _cost(progress: Progress) -> float:

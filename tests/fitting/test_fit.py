@@ -1,4 +1,7 @@
-"""Whole fits of a small flag: own data with noise, stopped and continued, and refused where hopeless."""
+"""Whole fits of a small flag: own data with noise, stopped and continued, and refused where hopeless.
+
+Covers: fitting.held_out.
+"""
 
 import csv
 import json
@@ -9,7 +12,8 @@ import pytest
 import torch
 import yaml
 
-from gaussian_swaying.fitting.fit import GRIDS, HELD, SHAKEN, Course, Fit, fit, run_fit
+from gaussian_swaying.fitting.fit import GRIDS, SHAKEN, Course, Fit, fit, run_fit
+from gaussian_swaying.fitting.held_out import HELD
 from gaussian_swaying.fitting.plan import Plan, read_unknown
 from gaussian_swaying.fitting.videos import read_videos
 from gaussian_swaying.simulation.simulation import Simulation
