@@ -4,6 +4,7 @@ Covers: .
 """
 
 import json
+import os
 import subprocess
 import sys
 from collections import Counter
@@ -13,7 +14,7 @@ import pytest
 import torch
 import yaml
 from bench import record, slots, stamps
-from bench.case import Case, at_once, chosen, put
+from bench.case import Case, apart, at_once, chosen, put
 from bench.cases import accuracy, backward, contact, places, previews, web, winds
 from bench.command import CASES
 from bench.problems.contacts import crossings, sheet_triangles
@@ -128,6 +129,13 @@ def test_measurements_at_once_are_all_made_and_unknown_names_refused():
     assert chosen("--rows", ("a", "b"), "b,") == ["b"]
     with pytest.raises(SystemExit, match="--rows takes a, b, not c"):
         chosen("--rows", ("a", "b"), "a,c")
+
+
+def test_measurements_apart_are_made_in_other_processes_of_one_thread():
+    works = {"process": os.getpid, "threads": torch.get_num_threads}
+    found = {place: work() for place, work in apart(1, (((name,), work) for name, work in works.items()))}
+    assert found["process",] != os.getpid()
+    assert found["threads",] == 1
 
 
 def test_bench_starts_without_the_packages_of_extras():

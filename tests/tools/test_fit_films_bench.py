@@ -1,6 +1,7 @@
 """Small films with known answers: what a film shows, and what is counted of their fits."""
 
 import json
+from types import SimpleNamespace
 
 import pytest
 import yaml
@@ -67,10 +68,28 @@ def test_a_fit_of_a_film_is_recorded(monkeypatch):
     monkeypatch.setattr(fit_films, "TRACKS", 40)
     options = ("--parts", "coverage", "--kinds", "banner", "--films", "1")
     result, _ = measure("fit_films", *options, result=json.loads(json.dumps(HEAD)))
+    assert list(result["coverage"]) == ["banner 0"]
     (row,) = result["coverage"].values()
     assert set(row["errors"]) == set(row["standard_errors"]) == {"wind.speed", "wind.azimuth", "material.E"}
     assert min(row["standard_errors"].values()) > 0
     assert row["verdict"] in ("good", "doubtful", "failed")
+
+
+def test_independent_films_have_numbers_and_rows_of_their_own(monkeypatch):
+    """Each is another film, and all are measured in processes."""
+    asked = []
+    monkeypatch.setattr(fit_films, "apart", lambda count, works: asked.append(count) or works)
+    options = SimpleNamespace(parts=fit_films.PARTS, kinds=["post"], first=0, films=2, independent=False, processes=1)
+    tuned = dict(fit_films.rows(options, {}))
+    assert not asked
+    options.independent, options.processes = True, 3
+    new = dict(fit_films.rows(options, {}))
+    assert asked == [3]
+    assert ("coverage", "post 1") in tuned
+    assert ("independent_coverage", "post 201") in new
+    assert ("independent_verdicts", "post 200, from this start alone") in new
+    films = [work.args[0] for works in (tuned, new) for (part, _), work in works.items() if "coverage" in part]
+    assert len({film.speed for film in films}) == 4
 
 
 def test_what_the_page_shows():
@@ -81,11 +100,23 @@ def test_what_the_page_shows():
     refused = {"verdict": "failed", "why": ["No."], "processor_s": 3.0}
     record = json.loads(json.dumps(HEAD))
     record |= {part: {"banner 0": row} for part in ("starts", "winds", "coverage")}
-    record["verdicts"] = {"banner 0": row, "post 0": refused}
+    fine = row | {"errors": dict.fromkeys(row["errors"], 0.0), "verdict": "good"}
+    record["verdicts"] = {"banner 0": row, "banner 1": fine, "post 0": refused}
+    record["independent_verdicts"] = {"post 200, from this start alone": row | {"verdict": "good"}}
     assert cells("fit.verdicts", record) == [
-        ["banner 0", "+4.0 %", "-12.0°", "+10.0 %", "doubtful", "yes", "30 s"],
-        ["post 0", "", "", "", "failed", "yes", "3 s"],
+        ["banner", "0 to 199", "2", "1", "1", "1", "0", "0", "30 s"],
+        ["post", "0 to 199", "1", "0", "0", "0", "1", "0", "3 s"],
+        ["post, from this start alone", "from 200", "1", "0", "1", "0", "0", "1", "30 s"],
+    ]
+    assert cells("fit.missed", record) == [
+        ["banner 0", "+4.0 %", "-12.0°", "+10.0 %", "doubtful", "yes"],
+        ["post 0", "", "", "", "failed", "yes"],
+        ["post 200, from this start alone", "+4.0 %", "-12.0°", "+10.0 %", "good", "yes"],
     ]
     assert cells("fit.starts", record) == [["banner 0", "+4.0 %", "-12.0°", "+10.0 %", "-0.20 s", "doubtful"]]
     assert cells("fit.winds", record) == [["banner 0", "+4.0 %", "-12.0°", "+10.0 %", "1.70", "1.67", "doubtful"]]
-    assert cells("fit.coverage", record) == [["1", "100 %", "0 %", "100 %", "67 %"]]
+    record["independent_coverage"] = {"banner 200": fine}
+    assert cells("fit.coverage", record) == [
+        ["0 to 199", "1", "100 %", "0 %", "100 %", "67 %"],
+        ["from 200", "1", "100 %", "100 %", "100 %", "100 %"],
+    ]

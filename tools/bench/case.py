@@ -10,12 +10,16 @@ from __future__ import annotations
 
 import argparse
 import json
+import multiprocessing
 from collections.abc import Callable, Collection, Iterable, Iterator
-from concurrent.futures import ThreadPoolExecutor, as_completed
+from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor, as_completed
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Any
+
+import torch
 
 from bench import record
 from bench.record import ROOT, Row
@@ -82,6 +86,23 @@ def at_once(count: int, measurements: Iterable[Measurement]) -> Iterator[Measure
         waiting = {pool.submit(work): place for place, work in measurements}
         for done in as_completed(waiting):
             yield waiting[done], done.result
+
+
+def apart(count: int, measurements: Iterable[Measurement]) -> Iterator[Measurement]:
+    """Measurements that are made in processes of one thread each, in the order in which they end."""
+    with ProcessPoolExecutor(count, multiprocessing.get_context("spawn"), _alone) as pool:
+        waiting = {pool.submit(work): place for place, work in measurements}
+        for done in as_completed(waiting):
+            yield waiting[done], done.result
+
+
+def _alone() -> None:
+    """Keep a process to one thread."""
+    torch.set_num_threads(1)
+    with suppress(ImportError):
+        import cv2
+
+        cv2.setNumThreads(1)
 
 
 def _told(place: Place, row: Row) -> str:

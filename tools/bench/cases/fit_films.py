@@ -4,14 +4,16 @@ from __future__ import annotations
 
 import argparse
 import math
+import os
 import tempfile
 import time
 from collections.abc import Iterator
 from functools import partial
 from pathlib import Path
+from statistics import median
 from typing import Any
 
-from bench.case import Case, Measurement, names, option
+from bench.case import Case, Measurement, apart, names, option
 from bench.problems.fit_films import KINDS, Film, drawn, make
 from bench.record import Row
 from gaussian_swaying.fitting.fit import fit
@@ -23,32 +25,39 @@ GOALS = {"wind.speed": 0.05, "wind.azimuth": 5.0, "material.E": 0.15}
 """Largest errors that are wanted: shares, and degrees."""
 NEAR = 1.15
 """How far off the start values of the films are that only test the standard errors."""
+INDEPENDENT = 200
+"""Number of the first film that nobody looked at while the fit was made; thresholds are those of earlier numbers."""
 PARTS = ("starts", "verdicts", "alone", "coverage", "winds")
 
 
 def rows(options: argparse.Namespace, result: Row) -> Iterator[Measurement]:
-    """Fits of the films of each part."""
-    kinds = options.kinds
+    """Fits of the films of each part, in processes of their own if there are several."""
+    if options.processes == 1:
+        yield from _fits(options)
+        return
+    os.environ["OMP_NUM_THREADS"] = "1"  # before a process imports torch
+    yield from apart(options.processes, _fits(options))
+
+
+def _fits(options: argparse.Namespace) -> Iterator[Measurement]:
+    kinds, numbers = options.kinds, range(options.first, options.films)
+    section, shift = ("independent_", INDEPENDENT) if options.independent else ("", 0)
     if "starts" in options.parts:
         for kind in kinds:
             for start in (0.2, -0.2):
                 film = drawn(kind, 2, start=start)
                 told = f"{kind}, {'still' if start > 0 else 'moving'} for {abs(start):g} s"
                 yield ("starts", told), partial(fitted, film, {FILM_START: [-0.5, 0.5]})
-    if "verdicts" in options.parts:
-        for number in range(options.first, options.films):
+    for name, told, search in (("verdicts", "", SEARCH), ("alone", ", from this start alone", 0)):
+        for number in numbers if name in options.parts else ():
             for kind in kinds:
-                yield ("verdicts", f"{kind} {number}"), partial(fitted, drawn(kind, number), {}, off=3.0)
-    if "alone" in options.parts:
-        for number in range(options.first, options.films):
-            for kind in kinds:
-                work = partial(fitted, drawn(kind, number), {}, off=3.0, search=0)
-                yield ("verdicts", f"{kind} {number}, from this start alone"), work
+                work = partial(fitted, drawn(kind, shift + number), {}, off=3.0, search=search)
+                yield (f"{section}verdicts", f"{kind} {shift + number}{told}"), work
     if "coverage" in options.parts:
-        for number in range(options.first, options.films):
+        for number in numbers:
             kind = list(kinds)[number % len(kinds)]
-            film = drawn(kind, 100 + number, seconds=UNTIL)
-            yield ("coverage", f"{kind} {number}"), partial(fitted, film, {}, off=NEAR, search=0)
+            film = drawn(kind, 100 + shift + number, seconds=UNTIL)
+            yield (f"{section}coverage", f"{kind} {shift + number}"), partial(fitted, film, {}, off=NEAR, search=0)
     if "winds" in options.parts:
         for kind in kinds:
             for ramp in (1.0, 2.0):
@@ -101,6 +110,15 @@ def misses(row: Row, times: float = 1.0) -> bool:
     return any(not abs(row["errors"][name]) <= times * most for name, most in GOALS.items())
 
 
+def counted(rows: list[Row]) -> Row:
+    """Numbers of films: within the goals, of each verdict, and called good though more than twice the goals off."""
+    verdicts = [row["verdict"] for row in rows]
+    found: Row = {name: verdicts.count(name) for name in ("good", "doubtful", "failed")}
+    wrong = sum(row["verdict"] == "good" and misses(row, 2) for row in rows)
+    found |= {"films": len(rows), "within": sum(not misses(row) for row in rows), "wrong": wrong}
+    return found | {"processor_s": median(row["processor_s"] for row in rows)}
+
+
 def covered(rows: list[Row]) -> dict[str, float]:
     """Share of the errors within two standard errors, of each unknown and of all."""
     known = [row for row in rows if "errors" in row]
@@ -120,6 +138,8 @@ CASE = Case(
         names("--kinds", list(KINDS), default=list(KINDS)),
         option("--films", "films of each thing, or of the part coverage in all", type=int, default=2),
         option("--first", "number of the first of these films", type=int, default=0),
+        option("--independent", "films on which nothing was tuned, apart from the others", action="store_true"),
+        option("--processes", "films that are fitted at the same time", type=int, default=1),
     ),
     page="fit.md",
     device=False,

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Iterator
 from functools import partial
 
-from bench.cases.fit_films import GOALS, covered, misses
+from bench.cases.fit_films import GOALS, INDEPENDENT, counted, covered, misses
 from bench.tables.render import Row, fill, table, value
 from gaussian_swaying.fitting.report import ASTRAY
 
@@ -138,17 +139,35 @@ table(
     empty="",
     before="{source}",
 )
-table(
-    PAGE,
-    "fit.verdicts",
-    "fit_films_cpu",
-    partial(_films, part="verdicts"),
-    f"""
-    film = {{name}} | {_OFF} | verdict = {{verdict}} | more than twice the goals off = {{missed}} |
-    processor = {{processor_s:.0f s}}""",
-    empty="",
-    before="{source}",
-)
+_SETS = {"": f"0 to {INDEPENDENT - 1}", "independent_": f"from {INDEPENDENT}"}
+
+
+def _verdicts(result: Row) -> Iterator[Row]:
+    """What fits from bad starts say of themselves: numbers of films of each thing."""
+    for section, told in _SETS.items():
+        sorted_in: dict[str, list[Row]] = {}
+        for name, row in result.get(f"{section}verdicts", {}).items():
+            sorted_in.setdefault(re.sub(" [0-9]+", "", name), []).append(row)
+        for kind, rows in sorted_in.items():
+            yield {"numbers": told, "kind": kind} | counted(rows)
+
+
+def _missed(result: Row) -> Iterator[Row]:
+    """The fits from bad starts that miss the goals, or are not called good."""
+    for section in _SETS:
+        for row in _films(result, f"{section}verdicts"):
+            if row["verdict"] != "good" or misses(row):
+                yield row
+
+
+table(PAGE, "fit.verdicts", "fit_films_cpu", _verdicts, """
+    films = {kind} | numbers = {numbers} | fitted = {films} | within the goals = {within} | good = {good} |
+    doubtful = {doubtful} | failed = {failed} | good, but more than twice the goals off = {wrong} |
+    processor, median = {processor_s:.0f s}
+    """, empty="", before="{source}")  # fmt: skip
+table(PAGE, "fit.missed", "fit_films_cpu", _missed, f"""
+    film = {{name}} | {_OFF} | verdict = {{verdict}} | more than twice the goals off = {{missed}}
+    """, empty="", before="{source}")  # fmt: skip
 table(
     PAGE,
     "fit.winds",
@@ -160,10 +179,11 @@ table(
     empty="",
     before="{source}",
 )
-table(PAGE, "fit.coverage", "fit_films_cpu", lambda result: [covered(list(result["coverage"].values()))]
-      if result.get("coverage") else [], """
-    films = {films:.0f} | speed = {wind.speed:.0f %} | azimuth = {wind.azimuth:.0f %} | E = {material.E:.0f %} |
-    all = {all:.0f %}""", empty="", before="{source}")  # fmt: skip
+table(PAGE, "fit.coverage", "fit_films_cpu", lambda result: [
+    covered(list(result[f"{section}coverage"].values())) | {"numbers": told}
+    for section, told in _SETS.items() if result.get(f"{section}coverage")], """
+    numbers = {numbers} | films = {films:.0f} | speed = {wind.speed:.0f %} | azimuth = {wind.azimuth:.0f %} |
+    E = {material.E:.0f %} | all = {all:.0f %}""", empty="", before="{source}")  # fmt: skip
 
 
 table("fit.md", "registration.rows", "registration_cpu", lambda result: [
