@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
+from copy import copy
 from dataclasses import dataclass
 from typing import Any
 
@@ -99,6 +100,7 @@ class TrackEvidence(Evidence):
         tracks: Its tracks.
         weighed: Multiply each residual by :func:`facing`, as a camera that sees a surface edge-on hardly tells where
             its points are.
+        trust: What else each residual is multiplied by, shape (F, T); None for 1.
 
     Attributes:
         rest: Places of the Gaussians at rest [scene units], on the CPU, shape (T, 3).
@@ -106,10 +108,17 @@ class TrackEvidence(Evidence):
 
     kind, floor = "tracks", 0.05
 
-    def __init__(self, simulation: Simulation, video: Footage, tracks: Tracks, weighed: bool = False) -> None:
+    def __init__(
+        self,
+        simulation: Simulation,
+        video: Footage,
+        tracks: Tracks,
+        weighed: bool = False,
+        trust: Tensor | None = None,
+    ) -> None:
         super().__init__(video)
         scene = simulation.scene
-        self.tracks, self._weighed = tracks, weighed
+        self.tracks, self._weighed, self._trust = tracks, weighed, trust
         index = tracks.index.to(scene.moving.device)
         self._follow = scene.follow.some(index).to(scene.moving.device)
         self._means = scene.model.means.detach()[scene.moving[index]]
@@ -122,7 +131,13 @@ class TrackEvidence(Evidence):
 
     def on(self, simulation: Simulation) -> TrackEvidence:
         """The same tracks for the same scene on another grid."""
-        return TrackEvidence(simulation, self.video, self.tracks, self._weighed)
+        return TrackEvidence(simulation, self.video, self.tracks, self._weighed, self._trust)
+
+    def trusting(self, trust: Tensor) -> TrackEvidence:
+        """The same tracks, with residuals multiplied by ``trust``, shape (F, T)."""
+        found = copy(self)
+        found._trust = trust
+        return found
 
     def shown(self, simulation: Simulation, states: Sequence[State]) -> Tensor:
         """Places of the Gaussians [scene units], shape (B, T, 3)."""
@@ -135,7 +150,8 @@ class TrackEvidence(Evidence):
         pixel = project(shown[:, seen].flatten(0, 1), self.video.cameras[frame])[0].unflatten(
             0, (len(shown), int(seen.sum()))
         )
-        return self._weight[seen] * (pixel - self.tracks.position[frame, seen]), self._cluster[seen]
+        weight = self._weight[seen] if self._trust is None else self._weight[seen] * self._trust[frame, seen, None]
+        return weight * (pixel - self.tracks.position[frame, seen]), self._cluster[seen]
 
 
 class PictureEvidence(Evidence):

@@ -9,7 +9,9 @@ import time
 import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
+from copy import copy
 from dataclasses import dataclass, field, replace
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -29,6 +31,7 @@ from gaussian_swaying.fitting.evidence import (
     compare_starts,
     scales_of,
 )
+from gaussian_swaying.fitting.grids import trusted
 from gaussian_swaying.fitting.held_out import Followed, fitted_part
 from gaussian_swaying.fitting.identifiability import check_apart, directions
 from gaussian_swaying.fitting.least_squares import (
@@ -41,7 +44,6 @@ from gaussian_swaying.fitting.least_squares import (
     iterate,
     normal_equations,
     sensitivities,
-    shift_by,
     unsettled,
 )
 from gaussian_swaying.fitting.page import write_page
@@ -99,6 +101,8 @@ SHAKEN = 0.12
 """Change of what is sought of the material at the end, to see whether the fit returns, as a share of the range."""
 RIVAL = 1.05
 """Cost per that of the best end below which another end is as good."""
+ROUNDS = 2
+"""Most times that a fit goes on from a better end."""
 DRAG = ("aero.C_D", "aero.C_F")
 """Coefficients that scale the force of the wind."""
 LATER = 0.2
@@ -107,6 +111,8 @@ PREFERRED = 0.8
 """Distance that it leaves there per that of a steady one, above which the steady one is taken."""
 GRIDS = (0.8, 1.25)
 """Cells of other grids that tell the error of the grid, per its own."""
+REFINED = 5
+"""Most iterations on another grid."""
 BEGUN, BEGINS = 12, 10
 """Simulations that are compared with the first frame of a film in motion, and starts of each."""
 MOST_STARTS = 60
@@ -126,7 +132,8 @@ class Course:
         place: Values of the unknowns, as shares of their ranges.
         first: Values (as shares) whose simulation the first frame looks like; empty if it shows the scene at rest.
         rivals: Where other starts ended, as shares, to be compared with the end.
-        matched: Values (as shares) at which the Gaussians of the current step were matched; empty if they were not.
+        matched: Values (as shares) at which the current step began, and Gaussians were matched; empty before it.
+        rounds: How often it went on from another end.
         damping: See :class:`~gaussian_swaying.fitting.least_squares.Progress`.
         iteration: Iterations done in this step.
         ended: The reason why the iterations of this step ended; empty if they did not.
@@ -140,6 +147,7 @@ class Course:
     first: list[float] = field(default_factory=list)
     rivals: list[list[float]] = field(default_factory=list)
     matched: list[float] = field(default_factory=list)
+    rounds: int = 0
     damping: float = START
     iteration: int = 0
     ended: str = ""
@@ -275,6 +283,16 @@ class Fit:
         pairs = zip(self.videos, tracks, strict=True)
         return [TrackEvidence(self.simulation, v, fitted_part(own), weighed=True) for v, own in pairs]
 
+    def _trusted(self, evidence: Sequence[Evidence], place: Sequence[float]) -> list[Evidence]:
+        """The evidence, with less weight on what the grid changes at a place."""
+        return trusted(self.simulation, self._grids(), evidence, self.values(place), self.fitted)
+
+    def _grids(self) -> list[Simulation]:
+        """The same scene on other grids."""
+        with warnings.catch_warnings():  # of an object of few cells
+            warnings.simplefilter("ignore")
+            return [self.on_grid(ratio) for ratio in GRIDS] if self.on_grid else []
+
     def _run(self, places: Tensor, times: Sequence[float]) -> Any:
         return states_of(self.simulation, [self.values(place) for place in places], times, alike=False)
 
@@ -391,18 +409,26 @@ class Fit:
                 apart.append(k)
         return [ended[k].tolist() for k in apart], [float(costs[k]) for k in apart]
 
-    def _as_good(self, place: Sequence[float], others: Sequence[Sequence[float]]) -> list[dict[str, float]]:
-        """Values that other starts, and softer and stiffer ones, end at over all fitted frames with as little cost."""
-        tried = [list(other) for other in others]
+    def _others(
+        self, place: Sequence[float], rivals: Sequence[Sequence[float]]
+    ) -> tuple[list[dict[str, float]], list[float]]:
+        """Values of other ends that cost as little as the best one, and the best place if it is clearly better.
+
+        Other starts, a softer and a stiffer material are tried over all fitted frames.
+        """
+        tried = [list(other) for other in rivals]
         for k, u in enumerate(self.plan.unknowns):
             for side in (-SHAKEN, SHAKEN) if u.name.startswith("material.") else ():
                 tried.append([*place[:k], min(max(place[k] + side, 0.0), 1.0), *place[k + 1 :]])
         if not tried:
-            return []
-        evidence = self.evidence("tracks" if self.stages[0] == "matches" else self.stages[0])
+            return [], []
+        evidence = self._trusted(self.evidence("tracks" if self.stages[0] == "matches" else self.stages[0]), place)
         ended, costs = self._brief([place, *tried], evidence, self.fitted)
-        near = [end for end, cost in zip(ended, costs, strict=True) if cost < RIVAL * costs[0]]
-        return [self.values(end) for end in near if max(abs(a - b) for a, b in zip(end, place, strict=True)) > 2 * SAME]
+        away = [max(abs(a - b) for a, b in zip(end, place, strict=True)) for end in ended]
+        near = [k for k, cost in enumerate(costs) if cost < RIVAL * costs[0]]
+        own = away.index(min(away))
+        better = ended[0] if own not in near and away[0] > 2 * SAME else []
+        return [self.values(ended[k]) for k in near if away[k] > 2 * SAME], better
 
     def _coarse(self, places: Tensor, evidence: Sequence[Evidence], times: Sequence[float]) -> tuple[Tensor, Tensor]:
         """Return the places with the best start of the motion for each, and their costs.
@@ -450,13 +476,32 @@ class Fit:
         if self.first != course.first:  # it is continued
             self.first, self._tracks = course.first, None
         steps = self.steps()
-        evidence: list[Evidence] = []
-        while course.step < len(steps):
+        while True:
+            evidence = self._stepped(course, keep, clock)
+            others, better = self._others(course.place, course.rivals)
+            if not better or course.rounds == ROUNDS:
+                break
+            self.say(f"another start fits better, so the fit goes on from there: {self._shown(better)}")
+            course.rivals, course.place, course.rounds = [*course.rivals, course.place], better, course.rounds + 1
+            course.step = next(k for k, (_, share) in enumerate(steps) if share == 1)
+            course.iteration, course.damping, course.matched, course.ended = 0, START, [], ""
+            keep(course)
+        wider, places = self._changed(course.place, evidence) if self.plan.wind_changes else (self, course.place)
+        if wider is not self:
+            evidence = wider._trusted(wider.evidence(steps[-1][0], places), places)
+        course.seconds = time.monotonic() - clock
+        return wider.result(course, places, evidence, films, others if wider is self else ())
+
+    def _stepped(self, course: Course, keep: Callable[[Course], None], clock: float) -> list[Evidence]:
+        """Do the steps that are missing, and return the evidence of the last one."""
+        steps = self.steps()
+        while True:
             stage, share = steps[course.step]
             times = self.fitted[: max(3, round(share * len(self.fitted)))]
-            if stage == "matches" and not course.matched:
-                course.matched = list(course.place)
+            course.matched = course.matched or list(course.place)
             evidence = self.evidence(stage, course.matched)
+            if share > HORIZONS[-1]:
+                evidence = self._trusted(evidence, course.matched)
             place = torch.tensor(course.place, dtype=torch.float64)
             progress = Progress(place, course.damping, course.iteration, done=course.ended)
             last, residuals = course.step == len(steps) - 1, self.residuals(evidence, times)
@@ -474,16 +519,10 @@ class Fit:
                 self.say(f"{stage} to {times[-1]:.3g} s, {progress.iteration}: {self._shown(course.place)}")
                 keep(course)
             if last:  # more `iterations` continue it
-                break
+                return evidence
             course.step, course.iteration, course.damping, course.matched = course.step + 1, 0, START, []
             course.ended = ""
             keep(course)
-        evidence = evidence or self.evidence(steps[-1][0], course.place)
-        wider, places = self._changed(course.place, evidence) if self.plan.wind_changes else (self, course.place)
-        if wider is not self:
-            evidence = wider.evidence(steps[-1][0], places)
-        course.seconds = time.monotonic() - clock
-        return wider.result(course, places, evidence, films)
 
     def _changed(self, place: Sequence[float], evidence: Sequence[Evidence]) -> tuple[Fit, list[float]]:
         """The fit in a wind that changes, and its place, if it predicts held-out frames better; else this one.
@@ -505,7 +544,7 @@ class Fit:
         start = [*place, *map(steady_share, unknowns)]
         left = []
         for fit_, begin in ((self, list(place)), (wider, start)):
-            end = fit_.solved(begin, evidence, early)
+            end = fit_.solved(begin, evidence, early, self.plan.iterations)
             (block, *_) = compare(self.simulation, evidence, [fit_.values(end)], self.fitted, moving=self.moving)
             frames = compare(self.simulation, evidence, [fit_.values(end)], early, moving=self.moving)[0]
             left.append(float(block.values[0, frames.values.shape[1] :].norm(dim=-1).nanmedian()))
@@ -514,21 +553,35 @@ class Fit:
         if not late or not left[1] < PREFERRED * left[0]:
             return self, list(place)
         for _ in range(2):
-            end = wider.solved(end, wider.evidence(self.stages[-1], end), self.fitted)
+            own = wider._trusted(wider.evidence(self.stages[-1], end), end)
+            end = wider.solved(end, own, self.fitted, self.plan.iterations)
         return wider, end
 
-    def solved(self, place: Sequence[float], evidence: Sequence[Evidence], times: Sequence[float]) -> list[float]:
-        """The place at which the iterations from another end."""
+    def solved(
+        self,
+        place: Sequence[float],
+        evidence: Sequence[Evidence],
+        times: Sequence[float],
+        most: int,
+        tolerance: float = ROUGH * TOLERANCE,
+        least_gain: float = ROUGH * LEAST_GAIN,
+    ) -> list[float]:
+        """The place at which so many iterations from another end, at most."""
         progress = Progress(torch.tensor(place, dtype=torch.float64))
-        while not progress.done and progress.iteration < self.plan.iterations:
-            iterate(self.residuals(evidence, times), _scaled(evidence), progress, ROUGH * TOLERANCE, ROUGH * LEAST_GAIN)
+        while not progress.done and progress.iteration < most:
+            iterate(self.residuals(evidence, times), _scaled(evidence), progress, tolerance, least_gain)
             self.say(f"to {times[-1]:.3g} s, {progress.iteration}: {self._shown(progress.place.tolist())}")
         return progress.place.tolist()
 
     def result(
-        self, course: Course, places: Sequence[float], evidence: Sequence[Evidence], films: Path | None
+        self,
+        course: Course,
+        places: Sequence[float],
+        evidence: Sequence[Evidence],
+        films: Path | None,
+        rivals: Sequence[Mapping[str, float]],
     ) -> Result:
-        """The result at a place, from a course that has ended and the evidence of its last stage."""
+        """The result at a place, from a course that has ended, the evidence of its last stage, and other answers."""
         place = torch.tensor(places, dtype=torch.float64)
         normal, model = self._at_the_end(place, evidence)
         found = directions(normal.matrix, self.plan.unknowns, place)
@@ -553,27 +606,24 @@ class Fit:
             tuple(self.notes()),
             {} if followed is None else followed.shares(),
             judged=self.judged,
-            rivals=self._as_good(course.place, course.rivals) if len(places) == len(course.place) else (),
+            rivals=rivals,
         )
 
     def _at_the_end(self, place: Tensor, evidence: Sequence[Evidence]) -> tuple[Normal, Tensor]:
         """The normal equations at a place, and the covariance that the grid adds, shape (U, U).
 
-        The residuals on a finer and on a coarser grid move the minimum, mostly as the body lies otherwise in cells.
+        The same residuals have their minimum elsewhere on a finer and on a coarser grid. It is found by iterations, as
+        a linear step is much too short.
         """
-        blocks, steps = sensitivities(self.residuals(evidence, self.fitted), place)
-        scales = _scaled(evidence)(blocks)
-        normal = normal_equations(blocks, scales, steps)
-        model = torch.zeros_like(normal.matrix)
-        for ratio in GRIDS if self.on_grid else ():
-            assert self.on_grid is not None
-            with warnings.catch_warnings():  # of an object of few cells
-                warnings.simplefilter("ignore")
-                other = self.on_grid(ratio)
+        normal, model = self._normal(place, evidence, self.fitted), torch.zeros(2 * (len(place),), dtype=torch.float64)
+        for other in self._grids():
             own = [e.on(other) if isinstance(e, TrackEvidence) else e for e in evidence]
-            others = compare(other, own, [self.values(place)], self.fitted, moving=self.moving)
-            shift = shift_by(normal, blocks[: len(others)], others, scales, steps)  # the prior stays
-            model += torch.outer(shift, shift)
+            there = copy(self)
+            there.simulation, there.say = other, lambda line: None
+            with suppress(DivergedError):
+                end = there.solved(place.tolist(), own, self.fitted, REFINED, TOLERANCE, LEAST_GAIN)
+                shift = torch.tensor(end, dtype=torch.float64) - place
+                model += torch.outer(shift, shift)
         return normal, model
 
     def _normal(self, place: Tensor, evidence: Sequence[Evidence], times: Sequence[float]) -> Normal:
@@ -743,6 +793,7 @@ def _ready(plan: Plan, parser: Any, settings: Any, device: str, progress: bool) 
     videos = read_videos(list(plan.videos), plan.cameras)
     videos, judged = prepared(simulation, videos, plan.hand_held, plan.also_moves, say)
 
+    @cache
     def on_grid(ratio: float) -> Simulation:
         given = own.clone()
         given.solver.dx = ratio * given.solver.dx

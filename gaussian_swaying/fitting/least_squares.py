@@ -147,28 +147,6 @@ def _moment(block: Block) -> Tensor:
     return torch.zeros_like(block.cluster, dtype=torch.long) if block.moment is None else block.moment
 
 
-def shift_by(
-    normal: Normal, blocks: Sequence[Block], others: Sequence[Block], scales: Mapping[str, float], steps: Tensor
-) -> Tensor:
-    """Shift of the minimum if the residuals were others, in shares of the ranges, shape (U,).
-
-    Args:
-        normal: The normal equations.
-        blocks: Residuals of 1 + U variants, as :func:`normal_equations` took them.
-        others: The other residuals, of one variant.
-        scales: Standard deviation of each kind.
-        steps: The difference in each unknown, as a share of its range, shape (U,).
-    """
-    gradient = torch.zeros_like(normal.gradient)
-    for block, other in zip(blocks, others, strict=True):
-        sigma = scales[block.kind]
-        weight = HUBER / (block.values[0] / sigma).norm(dim=-1).clamp(min=HUBER)
-        change = torch.nan_to_num((other.values[0] - block.values[0]) / sigma)
-        slope = torch.nan_to_num((block.values[1:] - block.values[:1]) / (sigma * steps[:, None, None]))
-        gradient = gradient + ((slope * change).sum(-1) * weight).sum(-1)
-    return -torch.linalg.pinv(normal.matrix, hermitian=True) @ gradient
-
-
 def sensitivities(residuals: Residuals, place: Tensor) -> tuple[list[Block], Tensor]:
     """Return the residuals at a point with their central differences, and the widths of these, shape (U,).
 

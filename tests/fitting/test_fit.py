@@ -12,7 +12,7 @@ import pytest
 import torch
 import yaml
 
-from gaussian_swaying.fitting.fit import GRIDS, SHAKEN, Course, Fit, fit, run_fit
+from gaussian_swaying.fitting.fit import GRIDS, ROUNDS, SHAKEN, Course, Fit, fit, run_fit
 from gaussian_swaying.fitting.held_out import HELD
 from gaussian_swaying.fitting.plan import Plan, read_unknown
 from gaussian_swaying.fitting.videos import read_videos
@@ -67,21 +67,26 @@ def test_starts_that_are_far_off(own, tmp_path, capsys):
 
 
 def test_another_end_that_fits_as_well_is_a_rival(own, simulation):
-    """And one that is the same, or fits worse, is none."""
+    """And one that is the same, or fits worse, is none. One that fits clearly better is to go on from."""
     sought = [read_unknown("wind.speed", [2.0, 12.0])]
     plan = Plan([str(own / "base.yaml")], [str(own / "video")], sought)
     made = Fit(simulation, read_videos(own / "video"), plan)
-    ends = {"far": 0.9, "near": 0.51, "here": 0.5}
-    for costs, expected in (([1.0, 1.04], 1), ([1.0, 1.3], 0)):
-        made._brief = lambda places, evidence, times, costs=costs: ([[ends["here"]], [ends["far"]]], costs)
-        assert len(made._as_good([ends["here"]], [[ends["far"]]])) == expected
-    made._brief = lambda places, evidence, times: ([[ends["near"]]], [1.0])
-    assert made._as_good([ends["here"]], [[ends["far"]]]) == []
-    assert made._as_good([ends["here"]], []) == []  # nothing else is tried
+    here, near, far = [0.5], [0.51], [0.9]
+
+    def others(*ended):
+        made._brief = lambda places, evidence, times: ([end for end, _ in ended], [cost for _, cost in ended])
+        return made._others(here, [far])
+
+    assert others((here, 1.0), (far, 1.04)) == ([made.values(far)], [])
+    assert others((far, 1.0), (here, 1.04)) == ([made.values(far)], [])
+    assert others((here, 1.0), (far, 1.3)) == ([], [])
+    assert others((far, 1.0), (near, 1.3)) == ([made.values(far)], far)
+    assert others((near, 1.0)) == ([], [])
+    assert made._others(here, []) == ([], [])  # nothing else is tried
 
 
 def test_a_softer_and_a_stiffer_material_are_tried_at_the_end(own, simulation):
-    """One of them fits better, so the end is a local minimum, and the fit is doubted."""
+    """One of them fits better, so the end is a local minimum."""
     sought = [read_unknown("wind.speed", [2.0, 12.0]), read_unknown("material.E", [2e3, 5e4])]
     plan = Plan([str(own / "base.yaml")], [str(own / "video")], sought)
     made = Fit(simulation, read_videos(own / "video"), plan)
@@ -92,10 +97,33 @@ def test_a_softer_and_a_stiffer_material_are_tried_at_the_end(own, simulation):
         return [places[1], places[0]], [1.0, 2.0]
 
     made._brief = brief
-    (found,) = made._as_good([0.5, 0.5], [])
+    found, better = made._others([0.5, 0.5], [])
     assert [place[1] for place in tried] == [0.5, 0.5 - SHAKEN, 0.5 + SHAKEN]
     assert {place[0] for place in tried} == {0.5}
-    assert found == made.values([0.5, 0.5 - SHAKEN])
+    assert better == [0.5, 0.5 - SHAKEN]
+    assert found == [made.values(better)]
+
+
+@pytest.mark.parametrize(("better", "rounds"), [(1, 1), (9, ROUNDS)])
+def test_a_fit_goes_on_from_a_better_end_but_not_for_ever(own, simulation, better, rounds):
+    """Each time with all fitted frames, and the end that it left is compared with the next one."""
+    plan = Plan([str(own / "base.yaml")], [str(own / "video")], [read_unknown("wind.speed", [2.0, 12.0])])
+    made = Fit(simulation, read_videos(own / "video"), replace(plan, search=0, iterations=1, tracks=40))
+    asked, said, course = [], [], Course()
+
+    def others(place, rivals):
+        asked.append((place, rivals))
+        return [{"wind.speed": 9.0}], [0.9] * (len(asked) <= better)
+
+    made._others, made.say = others, said.append
+    result = made.run(course, lambda course: None)
+    assert course.rounds == len(asked) - 1 == rounds
+    assert course.rivals == asked[-1][1] == [place for place, _ in asked[:-1]]
+    assert result.rivals == [{"wind.speed": 9.0}]
+    steps = [(row["stage"], row["horizon_s"]) for row in course.history]
+    again = steps[len(made.steps()) :]
+    assert again == [("matches", made.fitted[-1])] * 2 * rounds
+    assert sum(line.endswith(f"goes on from there: {made._shown([0.9])}") for line in said) == rounds
 
 
 def test_a_drag_that_is_sought_with_the_speed_is_remarked_on(own, simulation):
@@ -123,13 +151,15 @@ def test_the_error_of_the_grid_is_in_the_standard_errors(own, simulation):
     """None if the other grids show the same; if they show the flag in another wind, as far off as that wind."""
     plan = Plan([str(own / "base.yaml")], [str(own / "video")], [read_unknown("wind.speed", [2.0, 12.0])])
     videos = read_videos(own / "video")
-    place = torch.tensor([plan.unknowns[0].share(5.0)], dtype=torch.float64)
+    made = Fit(simulation, videos, plan)
+    evidence = made.evidence("tracks")
+    place = torch.tensor(made.solved([plan.unknowns[0].share(5.0)], evidence, made.fitted, 9, 1e-4, 0.0))
 
     def model(other):
-        made = Fit(simulation, videos, plan, on_grid=lambda ratio: other)
-        return float(made._at_the_end(place, made.evidence("tracks"))[1])
+        made.on_grid = lambda ratio: other
+        return float(made._at_the_end(place, evidence)[1])
 
-    assert model(simulation) == 0
+    assert model(simulation) ** 0.5 < 1e-3
     settings = base(material={"E": 1e4, "nu": 0.3, "density": 27.0, "thickness": 0.01})
     (own / "denser.yaml").write_text(yaml.safe_dump(settings))
     denser = Simulation.from_yaml(own / "denser.yaml", device="cpu")

@@ -15,7 +15,6 @@ from gaussian_swaying.fitting.least_squares import (
     linearised,
     normal_equations,
     sensitivities,
-    shift_by,
 )
 from gaussian_swaying.fitting.unknowns import Unknown
 
@@ -147,21 +146,6 @@ def test_errors_that_are_alike_all_over_the_object_count_by_their_time():
     ]
     assert found[0] - found[1] == pytest.approx(0.1**2, rel=1e-9)  # 2 / (2 - 1) * 2 * 0.1^2 / 4
     assert found[1] == pytest.approx(sigma**2 / 16, rel=1e-9)
-
-
-def test_other_residuals_move_the_minimum():
-    """Of a line through points: by the slope of the change, whatever the residuals were."""
-    slope = torch.linspace(1, 2, 20, dtype=torch.float64)
-    rest = 0.01 * torch.randn(20, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
-
-    def residuals(places):
-        return [Block("tracks", (places * slope + rest)[..., None], torch.arange(20))]
-
-    place, sigma = torch.tensor([0.5], dtype=torch.float64), {"tracks": 10.0}
-    blocks, steps = sensitivities(residuals, place)
-    normal = normal_equations(blocks, sigma, steps)
-    others = [Block("tracks", (place * slope + rest - 0.3 * slope)[None, :, None], torch.arange(20))]
-    assert shift_by(normal, blocks, others, sigma, steps).tolist() == pytest.approx([0.3])
 
 
 def test_the_cost_is_hubers_function():

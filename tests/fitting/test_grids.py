@@ -1,0 +1,63 @@
+"""Points that another grid moves otherwise count less."""
+
+import pytest
+import torch
+import yaml
+
+from gaussian_swaying.fitting.evidence import PictureEvidence, TrackEvidence, compare
+from gaussian_swaying.fitting.grids import trusted
+from gaussian_swaying.fitting.held_out import NOISE
+from gaussian_swaying.fitting.tracks import track
+from gaussian_swaying.fitting.videos import read_videos
+from gaussian_swaying.simulation.simulation import Simulation
+
+from .conftest import base
+
+pytest.importorskip("cv2", reason="needs the extra [fit]")
+
+
+@pytest.fixture
+def left(own, simulation):
+    (video, _) = read_videos(own / "video")
+    return TrackEvidence(simulation, video, track(simulation, video, 40), weighed=True)
+
+
+def test_points_count_by_how_far_another_grid_moves_them(own, simulation, left):
+    """By 1 / sqrt(1 + d^2 / n^2), with the distance d in each coordinate; at rest they count as before."""
+    settings = base()
+    settings["solver"]["dx"] = 0.08
+    (own / "finer.yaml").write_text(yaml.safe_dump(settings))
+    finer = Simulation.from_yaml(own / "finer.yaml", device="cpu")
+    times, pictures = left.video.times[:7], PictureEvidence(left.video, masks=False)
+    (part, same) = trusted(simulation, [finer], [left, pictures], {}, times)
+    assert same is pictures
+    compared = {"own": (simulation, left), "other": (finer, left.on(finer)), "less": (simulation, part)}
+    values = {name: compare(scene, [e], [{}], times, moving=True)[0].values[0] for name, (scene, e) in compared.items()}
+    weight = left._weight[left.tracks.seen[0]]
+    weights = torch.cat([left._weight[seen] for seen in left.tracks.seen[:7]])
+    away = ((values["other"] - values["own"]) / weights).norm(dim=-1)
+    expected = (1 + 0.5 * away.square() / NOISE**2).rsqrt()
+    assert expected[: len(weight)].tolist() == pytest.approx([1.0] * len(weight), abs=1e-4)
+    assert expected.min() < 0.9
+    torch.testing.assert_close(values["less"], expected[:, None] * values["own"], rtol=1e-3, atol=1e-4)
+
+
+def test_without_other_grids_or_points_nothing_changes(simulation, left):
+    assert trusted(simulation, [], [left], {}, left.video.times[:3]) == [left]
+    pictures = PictureEvidence(left.video, masks=True)
+    assert trusted(simulation, [simulation], [pictures], {}, left.video.times[:3]) == [pictures]
+
+
+def test_a_grid_on_which_the_scene_diverges_says_nothing(simulation, left, monkeypatch):
+    from gaussian_swaying.fitting import grids
+
+    pixels = grids._pixels
+    calls = []
+
+    def lost(*given):
+        calls.append(given)
+        return {key: torch.nan * own if len(calls) == 2 else own for key, own in pixels(*given).items()}
+
+    monkeypatch.setattr(grids, "_pixels", lost)
+    (part,) = trusted(simulation, [simulation, simulation], [left], {}, left.video.times[:3])
+    assert bool((part._trust == 1).all())
