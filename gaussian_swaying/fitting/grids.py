@@ -1,4 +1,4 @@
-"""What the grid may do to a film: points are trusted less where a finer and a coarser grid move them otherwise."""
+"""Effects of the grid: points are trusted less where a finer and a coarser grid move them otherwise."""
 
 from __future__ import annotations
 
@@ -59,7 +59,7 @@ def trusted(
 def _pixels(
     simulation: Simulation, parts: Sequence[TrackEvidence], values: Values, times: Sequence[float]
 ) -> dict[tuple[int, int], Tensor]:
-    """Where the points of each part are in each frame [pixels], shape (T, 2)."""
+    """Places of the points of each part in each frame [pixels], shape (T, 2)."""
     found = {}
     for time, states in zip(times, states_of(simulation, [values], times, alike=False), strict=True):
         for number, part in enumerate(parts):
