@@ -405,6 +405,24 @@ def updated_join(
             tl.store(own + every, tl.zeros([SHARES], tl.int8))
 
 
+@triton.jit
+def _stop(
+    v, x, k, mask, step, solids, windows, pose, numbers, pin_windows, marks, room,
+    SOLIDS: tl.constexpr, w: tl.constexpr, KINDS: tl.constexpr, MOVES: tl.constexpr,
+):  # fmt: skip
+    """Velocity of nodes k at x held by solid w, or by pin -1 - w; which nodes it holds, and its time window."""
+    if w < 0:
+        held = (v[0] * 0, v[0] * 0, v[0] * 0)
+        behind = tl.load(marks + (-1 - w) * room + k, mask, 0) == step + 1
+        window = pin_windows - 2 * (1 + w)
+    else:
+        held, behind = stop_nodes(
+            v, x, solids + w * SOLID_ROW, pose + w * POSE, numbers, mask, SOLIDS, w, KINDS[w], MOVES[w]
+        )
+        window = windows + 2 * w
+    return held, behind, window
+
+
 @triton.jit(do_not_specialize=VARIES)
 def updated_nodes(
     momentum, velocity, inverse_mass, occupied, nodes, schedule, first_step, step_offset,
@@ -461,16 +479,10 @@ def updated_nodes(
             (own % nz + oz).to(tl.float32) * dx,
         )
         for n in tl.static_range(len(TURNS)):
-            w: tl.constexpr = TURNS[n][1]
-            if w < 0:
-                held = (v[0] * 0, v[0] * 0, v[0] * 0)
-                behind = tl.load(marks + (-1 - w) * room + k, mask, 0) == step + 1
-                window = pin_windows - 2 * (1 + w)
-            else:
-                held, behind = stop_nodes(
-                    v, x, solids + w * SOLID_ROW, pose + w * POSE, numbers, some & mask, SOLIDS, w, KINDS[w], MOVES[w]
-                )
-                window = windows + 2 * w
+            held, behind, window = _stop(
+                v, x, k, some & mask, step, solids, windows, pose, numbers, pin_windows, marks, room,
+                SOLIDS, TURNS[n][1], KINDS, MOVES,
+            )  # fmt: skip
             hit = tl.where(acts(window, now), behind & some & mask, False)
             u = (tl.where(hit, held[0], v[0]), tl.where(hit, held[1], v[1]), tl.where(hit, held[2], v[2]))
             if tl.sum(hit.to(tl.int32)) > 0:  # few blocks touch a solid
@@ -508,7 +520,7 @@ def updated_pin(
     where = tl.load(order + index, mask, 0)
     held = mask & (tl.load(pinned + where, mask, 0) > 0)
     if tl.sum(held.to(tl.int32)) > 0:
-        node, (fx, fy, fz), inside = _stencil(moving, index, count, where, held, ox, oy, oz, nx, ny, nz, dx, scene_size)
+        node, fx, fy, fz, inside = _stencil(moving, index, count, where, held, ox, oy, oz, nx, ny, nz, dx, scene_size)
         number = tl.zeros([BLOCK], tl.int32) + tl.load(first_step) + step_offset + 1
         wz, _gz = axis_weights(fz, 1.0)
         for i in range(3):
@@ -528,7 +540,7 @@ def _stencil(moving, index, count, where, mask, ox, oy, oz, nx, ny, nz, dx, scen
     bz, fz, okz = _locate(tl.load(moving + 2 * count + index, mask, 0.0), dx, oz, nz)
     inside = mask & okx & oky & okz
     node = tl.where(inside, (bx * ny + by) * nz + bz, 0) + (where // scene_size) * (nx * ny * nz)
-    return node, (fx, fy, fz), inside
+    return node, fx, fy, fz, inside
 
 
 @triton.jit(do_not_specialize=VARIES)
@@ -624,7 +636,7 @@ def pin_mass(moving, order, pinned, weight, count, ox, oy, oz, nx, ny, nz, dx, s
         where = tl.load(order + index, mask, 0)
         mass = tl.load(pinned + where, mask, 0.0)
         mask = mask & (mass > 0)
-        node, (fx, fy, fz), inside = _stencil(moving, index, count, where, mask, ox, oy, oz, nx, ny, nz, dx, scene_size)
+        node, fx, fy, fz, inside = _stencil(moving, index, count, where, mask, ox, oy, oz, nx, ny, nz, dx, scene_size)
         wz, _gz = axis_weights(fz, 1.0)
         for i in range(3):
             wx, _gx = node_weight(fx, i, 1.0)

@@ -32,7 +32,19 @@ def measured(seconds: float, device: str) -> Row:
     with tempfile.TemporaryDirectory() as scratch:
         folder = Path(scratch)
         write_case(folder, SIZE, seconds - MOVING, MOVING)
-        words = ["fit", "film.mp4", "--splat", "my.ply", "--length", "pole", str(POLE), "--output", "out", "--device", device]
+        words = [
+            "fit",
+            "film.mp4",
+            "--splat",
+            "my.ply",
+            "--length",
+            "pole",
+            str(POLE),
+            "--output",
+            "out",
+            "--device",
+            device,
+        ]
         took = command([sys.executable, "-c", COMMAND, *words], folder)
         if took["code"]:
             raise RuntimeError(f"fit ended with {took['code']}: {took['told']}")
