@@ -89,6 +89,14 @@ def test_an_edge_that_is_held_carries_half_a_cell(cloth, held):
     assert grid.cell**2 * (grid.count - len(edge[0])) == pytest.approx(0.96 - 0.5 * grid.cell**2 * len(edge[0]))
 
 
+def test_two_sides_that_are_held_carry_half_a_cell_each(cloth):
+    grid = cloth.Grid.of_cells(1.2, 0.8, 12, "sides")
+    share = _vertex_areas(grid) / grid.cell**2
+    np.testing.assert_allclose(share[[0, -1], 2:-2], 0.5)
+    np.testing.assert_allclose(share[1:-1, 2:-2], 1)
+    assert grid.cell**2 * grid.count == pytest.approx(0.96 + grid.cell**2 * len(share[0]))
+
+
 def test_patterns_have_the_parameters_of_the_paper(reference):
     """Young's modulus, density and flow of the table; mass, pressure and bending follow from them."""
     expected = {1: (5e3, 50.0, (0, 0, 0)), 2: (3e3, 30.0, (2.5, 0.5, 0)), 3: (3e3, 20.0, (2, 0, 0))}
@@ -644,7 +652,7 @@ def test_any_flag_is_read_from_a_file(tool, tmp_path):
     [
         ({"E": None}, "has no `E`: add it, in Pa"),
         ({"pins": None}, "has no `pins`: add it, one of left, corners, top"),
-        ({"pins": "right"}, "Expected `pins` to be one of left, corners, top, but got 'right'"),
+        ({"pins": "right"}, "Expected `pins` to be one of left, corners, top, sides, but got 'right'"),
         ({"pins": ["top"]}, "Expected `pins` in .* to be one of left, corners, top"),
         ({"size": 1.2}, "Expected `size` in .* to be a list of 2 numbers, width and height in m, but got 1.2"),
         ({"size": [1.2, 0]}, "Expected `size` to be positive and finite, but got 0"),

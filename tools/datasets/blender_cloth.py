@@ -89,7 +89,7 @@ class Grid:
         height: Length along z [m].
         columns: Number of faces along x.
         rows: Number of faces along z.
-        held: The held edge: ``left``, ``top`` or None.
+        held: The held edges: ``left``, ``top``, ``sides`` (left and right) or None.
     """
 
     width: float
@@ -118,10 +118,8 @@ class Grid:
     @property
     def cells(self) -> tuple[float, float]:
         """Sides of a cell along x and z [m]; half a cell of the cloth belongs to a held edge."""
-        return (
-            self.width / (self.columns + (0.5 if self.held == "left" else 1.0)),
-            self.height / (self.rows + (0.5 if self.held == "top" else 1.0)),
-        )
+        across = {"left": 0.5, "sides": 0.0}.get(self.held or "", 1.0)
+        return self.width / (self.columns + across), self.height / (self.rows + (0.5 if self.held == "top" else 1.0))
 
     @property
     def cell(self) -> float:
@@ -141,7 +139,7 @@ class Grid:
 
     def uv(self) -> np.ndarray:
         """Place of each vertex on the cloth, in 0 to 1, float64, shape (V, 2)."""
-        first = 1.0 if self.held == "left" else 1.5
+        first = 1.0 if self.held in ("left", "sides") else 1.5
         u = np.r_[0.0, (first + np.arange(self.columns - 1)) * self.cells[0] / self.width, 1.0]
         v = np.r_[0.0, (1.5 + np.arange(self.rows - 1)) * self.cells[1] / self.height, 1.0]
         return np.stack(np.meshgrid(u, v, indexing="ij"), -1).reshape(-1, 2)

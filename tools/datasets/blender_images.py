@@ -100,13 +100,9 @@ class Studio:
         bpy.ops.wm.read_factory_settings(use_empty=True)
         scene = self._scene = bpy.context.scene
         self._set_render(scene, samples, transparent, transfer, threads)
-        self._mesh = bpy.data.meshes.new("sheet")
-        self._mesh.from_pydata(np.zeros((len(uv), 3)).tolist(), [], faces.tolist())
-        layer = self._mesh.uv_layers.new()
-        layer.data.foreach_set("uv", uv[faces.reshape(-1)].astype(np.float32).reshape(-1))
+        self._transfer = transfer
+        self._mesh = self._add_mesh("sheet", np.zeros((len(uv), 3)), faces, uv, texture, repeats=False).data
         self._mesh.polygons.foreach_set("use_smooth", np.ones(len(faces), dtype=bool))
-        self._mesh.materials.append(_cloth_material(bpy, texture, transfer))
-        scene.collection.objects.link(bpy.data.objects.new("sheet", self._mesh))
         for index, lamp in enumerate(lamps):
             self._add_lamp(f"lamp{index}", lamp, center, lamp_size, 1.0 - ambient)
         if ambient:
@@ -137,6 +133,30 @@ class Studio:
         render.image_settings.file_format = "PNG"
         render.image_settings.color_mode = "RGBA" if transparent else "RGB"
         render.image_settings.color_depth = "8"
+
+    def _add_mesh(
+        self, name: str, vertices: np.ndarray, faces: np.ndarray, uv: np.ndarray, texture: np.ndarray, repeats: bool
+    ) -> Any:
+        mesh = self._bpy.data.meshes.new(name)
+        mesh.from_pydata(vertices.tolist(), [], faces.tolist())
+        layer = mesh.uv_layers.new()
+        layer.data.foreach_set("uv", uv[faces.reshape(-1)].astype(np.float32).reshape(-1))
+        mesh.materials.append(_cloth_material(self._bpy, texture, self._transfer, repeats))
+        thing = self._bpy.data.objects.new(name, mesh)
+        self._scene.collection.objects.link(thing)
+        return thing
+
+    def add_room(self, vertices: np.ndarray, faces: np.ndarray, uv: np.ndarray, texture: np.ndarray) -> None:
+        """Add something that stands still; the shadow of the sheet falls on it, but it keeps no light off the sheet.
+
+        Args:
+            vertices: Its corners [m], shape (V, 3).
+            faces: Squares, shape (Q, 4).
+            uv: Position of its corners on the texture, which repeats, shape (V, 2).
+            texture: Colours in 0 to 1, upper row first, shape (H, W, 3).
+        """
+        thing = self._add_mesh("room", vertices, faces, uv, texture, repeats=True)
+        thing.visible_shadow = thing.visible_diffuse = False
 
     def _add_lamp(self, name: str, position: np.ndarray, center: np.ndarray, size: float, share: float) -> None:
         from mathutils import Matrix
@@ -181,7 +201,7 @@ def _quiet() -> Iterator[None]:
             os.close(kept)
 
 
-def _cloth_material(bpy: Any, texture: np.ndarray, transfer: str) -> Any:
+def _cloth_material(bpy: Any, texture: np.ndarray, transfer: str, repeats: bool) -> Any:
     height, width = texture.shape[:2]
     image = bpy.data.images.new("texture", width, height, float_buffer=False)
     image.colorspace_settings.name = "Non-Color" if transfer == "linear" else "sRGB"
@@ -194,7 +214,7 @@ def _cloth_material(bpy: Any, texture: np.ndarray, transfer: str) -> Any:
     nodes, links = material.node_tree.nodes, material.node_tree.links
     nodes.clear()
     picture = nodes.new("ShaderNodeTexImage")
-    picture.image, picture.extension = image, "EXTEND"
+    picture.image, picture.extension = image, "REPEAT" if repeats else "EXTEND"
     diffuse, output = nodes.new("ShaderNodeBsdfDiffuse"), nodes.new("ShaderNodeOutputMaterial")
     links.new(picture.outputs["Color"], diffuse.inputs["Color"])
     links.new(diffuse.outputs["BSDF"], output.inputs["Surface"])

@@ -72,7 +72,8 @@ class FitVideo:
             raise ValueError(f"Expected `size` of at least 16 x 16 pixels, but got {self.size[0]} x {self.size[1]}.")
 
 
-def _flag(flow: tuple[float, float, float], material: str) -> FlagPattern:
+def flag(flow: tuple[float, float, float], material: str) -> FlagPattern:
+    """A flag that hangs by its upper edge in a flow [m/s], of one of :data:`MATERIALS`."""
     stiffness, density = MATERIALS[material]
     return FlagPattern(
         stiffness,
@@ -92,10 +93,10 @@ def _flag(flow: tuple[float, float, float], material: str) -> FlagPattern:
 
 
 CASES: dict[str, FlagPattern] = {
-    **{f"flag_wind{wind}_{material}": _flag(FLOWS[wind], material) for material in MATERIALS for wind in FLOWS},
-    "curtain": replace(_flag((1.0, 1.5, 0.0), "a"), youngs_modulus=4e3, density=25.0, height=1.2, cells=60),
+    **{f"flag_wind{wind}_{material}": flag(FLOWS[wind], material) for material in MATERIALS for wind in FLOWS},
+    "curtain": replace(flag((1.0, 1.5, 0.0), "a"), youngs_modulus=4e3, density=25.0, height=1.2, cells=60),
     **{
-        f"pole_wind{number}": replace(_flag(flow, "b"), density=20.0, pinned="left", cells=60)
+        f"pole_wind{number}": replace(flag(flow, "b"), density=20.0, pinned="left", cells=60)
         for number, flow in enumerate([(1.6, 1.4, 0.0), (4.5, 2.2, 0.0)], 1)
     },
 }

@@ -4,12 +4,16 @@ from __future__ import annotations
 
 import io
 import math
+from collections.abc import Iterable
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 from blender_images import View, look_at
 from fit_cases import FitVideo
 from flag_pictures import view_of_all
+
+from gaussian_swaying._files import atomic
 
 _PLACES = ((-28, 8), (36, 14), (152, 10), (-140, 6), (72, 22), (-72, 18), (108, 16), (-104, 4))
 """Azimuth from the mean normal of the cloth, and elevation, of each camera [degrees]."""
@@ -77,6 +81,28 @@ def compress(picture: np.ndarray, quality: int) -> bytes:
     file = io.BytesIO()
     Image.fromarray(picture).save(file, format="JPEG", quality=quality, subsampling="4:2:0")
     return file.getvalue()
+
+
+def write_h264(path: Path, pictures: Iterable[np.ndarray], size: tuple[int, int], fps: float, crf: int = 28) -> None:
+    """Write pictures, uint8 (H, W, 3), as a film in H.264.
+
+    Args:
+        path: The .mp4 file; it gets its name only when it is complete.
+        pictures: The frames.
+        size: Width and height [pixels].
+        fps: Frames per second.
+        crf: Compression; 28 is that of small files.
+    """
+    from imageio_ffmpeg import write_frames
+
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with atomic(path) as temporary:
+        more = ["-f", "mp4", "-crf", str(crf)]
+        film = write_frames(str(temporary), size, fps=fps, macro_block_size=2, quality=None, output_params=more)
+        film.send(None)
+        for picture in pictures:
+            film.send(np.ascontiguousarray(picture).tobytes())
+        film.close()
 
 
 def composite(rgba: np.ndarray, background: tuple[float, float, float]) -> np.ndarray:

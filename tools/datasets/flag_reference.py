@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from blender_cloth import BENDING_LIMIT, ClothMaterial, ClothRun, Grid, bending_number, blender_settings
 
-PINNED = ("left", "corners", "top")
+PINNED = ("left", "corners", "top", "sides")
 
 PAPER = (1, 2, 3)
 """The numbers of the paper's flags in ``PATTERNS``."""
@@ -33,7 +33,7 @@ class FlagPattern:
         poisson_ratio: nu; paper. Blender's springs have 0.32 to 0.33.
         density: [kg/m³]; paper.
         flow: Velocity of the air [m/s], constant and uniform; paper.
-        pinned: ``left`` edge, ``top`` edge, or three ``corners`` with the lower left one free; paper.
+        pinned: ``left`` edge, ``top`` edge, both ``sides``, or three ``corners`` with the lower left one free; paper.
         texture: ``white``, ``stripes``, or the path of an image. White for pattern 1: paper.
         paper_drag: C_D, C_F and C_L of the paper's table, for the paper's force law. Kept for the record: Blender's
             wind follows another law.
@@ -135,7 +135,7 @@ class FlagPattern:
 
     def grid(self) -> Grid:
         """The mesh."""
-        held = self.pinned if self.pinned in ("left", "top") else None
+        held = None if self.pinned == "corners" else self.pinned
         return Grid.of_cells(self.width, self.height, self.cells, held)
 
     def rest(self, uv: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -154,6 +154,8 @@ class FlagPattern:
             return np.array([[0.0, 0.0, 0.0, 1.0]])
         if self.pinned == "top":
             return np.array([[0.0, 1.0, 1.0, 1.0]])
+        if self.pinned == "sides":
+            return np.array([[0.0, 0.0, 0.0, 1.0], [1.0, 1.0, 0.0, 1.0]])
         u, v = self.corner / self.width, self.corner / self.height
         return np.array([[0.0, u, 1 - v, 1.0], [1 - u, 1.0, 1 - v, 1.0], [1 - u, 1.0, 0.0, v]])
 

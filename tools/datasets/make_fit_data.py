@@ -94,7 +94,7 @@ def filmed_cloth(pattern: FlagPattern, folder: Path, video: FitVideo) -> Filmed:
     motion = read_cloth(folder / "cloth.npz")
     normal = mean_normal(motion.positions, motion.faces, pattern.normal())
     grid, texture = pattern.grid(), draw_texture(pattern, 640)
-    studio = partial(_studio, grid.faces(), grid.uv(), texture, pattern.center(), pattern.longer_side, video)
+    studio = partial(studio_of, grid.faces(), grid.uv(), texture, pattern.center(), pattern.longer_side, video)
     return Filmed(motion.positions, normal, pattern.fps, settings_hash(motion.settings), studio)
 
 
@@ -103,7 +103,7 @@ def filmed_soft(pattern: SoftPattern, folder: Path, video: FitVideo) -> Filmed:
     positions, settings = read_soft(folder / "motion.npz")
     points, faces, uv = skin(pattern)
     middle = np.array([0.0, 0.0, 0.5 * pattern.height])
-    studio = partial(_studio, faces, uv, texture(pattern), middle, pattern.height, video)
+    studio = partial(studio_of, faces, uv, texture(pattern), middle, pattern.height, video)
     return Filmed(positions[:, points], np.array([0.0, -1.0, 0.0]), pattern.fps, settings_hash(settings), studio)
 
 
@@ -140,7 +140,7 @@ def make_pictures(filmed: Filmed, folder: Path, video: FitVideo) -> int:
     return len(missing)
 
 
-def _studio(
+def studio_of(
     faces: np.ndarray, uv: np.ndarray, texture: np.ndarray, center: np.ndarray, longest: float, video: FitVideo
 ) -> Studio:
     """A body of a longest side, and a lamp on each side, so that both sides are lit alike.
@@ -173,8 +173,8 @@ def make_case(name: str, pattern: FlagPattern, folder: Path, video: FitVideo, la
     if solve_pattern(pattern, folder / "cloth.npz"):
         report(f"cloth solved in {time.time() - started:.0f} s")
     write_json(folder / "truth.json", truth_fields(pattern, video))
-    _write_yaml(folder / "scene.yaml", scene_settings(pattern, video, law, folder.as_posix()))
-    _write_yaml(folder / "fit.yaml", fit_settings(folder.as_posix()))
+    write_yaml(folder / "scene.yaml", scene_settings(pattern, video, law, folder.as_posix()))
+    write_yaml(folder / "fit.yaml", fit_settings(folder.as_posix()))
     _film(filmed_cloth(pattern, folder, video), folder, video, report)
 
 
@@ -193,8 +193,8 @@ def make_soft(pattern: SoftPattern, folder: Path, video: FitVideo) -> None:
     with atomic(folder / "gaussians.npz") as temporary:
         np.savez_compressed(temporary, positions=places.astype(np.float32))
     write_json(folder / "truth.json", soft_case.truth_fields(pattern, video))
-    _write_yaml(folder / "scene.yaml", soft_case.scene_settings(pattern, video, folder.as_posix()))
-    _write_yaml(folder / "fit.yaml", fit_settings(folder.as_posix()) | {"unknowns": soft_case.SOUGHT})
+    write_yaml(folder / "scene.yaml", soft_case.scene_settings(pattern, video, folder.as_posix()))
+    write_yaml(folder / "fit.yaml", fit_settings(folder.as_posix()) | {"unknowns": soft_case.SOUGHT})
     _film(filmed_soft(pattern, folder, video), folder, video, report)
 
 
@@ -205,7 +205,8 @@ def _film(filmed: Filmed, folder: Path, video: FitVideo, report: Callable[[str],
     report(f"{made} pictures in {seconds:.0f} s" + (f", {seconds / made:.2f} s each" if made else ""))
 
 
-def _write_yaml(path: Path, settings: dict[str, Any]) -> None:
+def write_yaml(path: Path, settings: dict[str, Any]) -> None:
+    """Write a configuration."""
     write_text(path, yaml.safe_dump(settings, sort_keys=False, default_flow_style=None, width=110))
 
 

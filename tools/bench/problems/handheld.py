@@ -76,7 +76,9 @@ def tripod(width: int, height: int) -> Camera:
     return look_at_camera((0.05, -0.95, 0.35), MIDDLE, (0, 0, 1), 38.0, width, height, dtype=torch.float64)
 
 
-def shaken(camera: Camera, frames: int, degrees: float, seed: int = 0) -> list[Camera]:
+def shaken(
+    camera: Camera, frames: int, degrees: float, seed: int = 0, middle: Sequence[float] = MIDDLE
+) -> list[Camera]:
     """The camera in a hand: it turns by as many degrees (root mean square) and moves by a hundredth of the distance.
 
     Each of six numbers is a sum of waves of 0.4 to 2 Hz, as a hand sways, and one of 9 Hz, a tenth as large, as it
@@ -87,6 +89,7 @@ def shaken(camera: Camera, frames: int, degrees: float, seed: int = 0) -> list[C
         frames: Number of frames, :data:`FPS` a second.
         degrees: How much it turns.
         seed: Of the phases.
+        middle: The point at which the hand aims [m].
     """
     generator = torch.Generator().manual_seed(seed)
     time = torch.arange(frames, dtype=torch.float64) / FPS
@@ -95,7 +98,7 @@ def shaken(camera: Camera, frames: int, degrees: float, seed: int = 0) -> list[C
     own = sum(size * torch.sin(2 * math.pi * hz * time[:, None] + phase[n]) for n, (hz, size) in enumerate(waves))
     assert isinstance(own, Tensor)
     own = own - own[:1]
-    distance = float((camera.position - torch.tensor(MIDDLE, dtype=torch.float64)).norm())
+    distance = float((camera.position - torch.tensor(middle, dtype=torch.float64)).norm())
     turn, shift = (part / part.square().sum(1).mean().sqrt() for part in own.split(3, 1))
     turned = rotation_of(math.radians(degrees) * turn)
     found = []

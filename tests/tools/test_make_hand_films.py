@@ -1,0 +1,144 @@
+"""Films from a hand: cloth with its held edges, the room in Blender and as a splat, cameras, files, and starts."""
+
+import json
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+import yaml
+
+from gaussian_swaying import Simulation
+from gaussian_swaying.fitting.plan import read_plan
+from gaussian_swaying.fitting.videos import read_videos
+from gaussian_swaying.gaussians.harmonics import SH_DC
+
+from .conftest import beside
+
+TOOL = "make_hand_films"
+room = beside("room")
+cases = beside("fit_cases")
+motions = beside("flag_motion")
+
+
+def _moved(tool, motions, name, folder, frames):
+    """A cloth of few cells that is blown by the same way in each frame, as a file."""
+    pattern = replace(tool.CLOTHS[name], cells=10, fps=tool.FPS, frames=frames)
+    grid = pattern.grid()
+    rest = pattern.rest(grid.uv())[0]
+    way = np.linspace(0, 0.02 * (frames - 1), frames)[:, None, None] * np.array([0.0, 1.0, 0.0])
+    settings = json.dumps({"cells": 10})
+    parts = {"faces": grid.faces(), "uv": grid.uv(), "columns": grid.columns, "rows": grid.rows, "settings": settings}
+    folder.mkdir(parents=True, exist_ok=True)
+    np.savez(folder / "cloth.npz", positions=(rest + way).astype(np.float32), **parts)
+    return pattern
+
+
+@pytest.mark.parametrize("name", ["curtain", "banner", "pole_flag"])
+def test_a_row_of_gaussians_lies_on_each_held_edge(tool, name):
+    pattern = tool.CLOTHS[name]
+    means = tool.cloth_cloud(pattern, 0.05).means
+    x, z = means[:, 0], means[:, 2]
+    ends = {"left": (x.min(), 0.0), "top": (z.max(), pattern.height), "sides": (x.min() - x.max(), -pattern.width)}
+    found, line = ends[pattern.pinned]
+    assert float(found) == pytest.approx(line, abs=1e-6)
+    free = {"left": pattern.width - x.max(), "top": z.min(), "sides": z.min()}[pattern.pinned]
+    assert 0.02 < float(free) < 0.03  # half a patch
+
+
+def test_the_room_has_the_same_print_in_blender_and_as_a_splat(room):
+    surfaces = room.squares(np.zeros(3), np.array([1.0, 0.6, 1.2]), -0.3)
+    corners, faces, uv = room.mesh(surfaces, 1.2)
+    image = room.tile(160)
+    light = np.array([-0.6, -0.8, 0.0])
+    cloud = room.splat(surfaces, 1.2, 0.2, 2 * light, 0.4)
+    begin, off_by = 0, []
+    for face, (corner, a, b) in zip(faces, surfaces, strict=True):
+        columns, rows = (max(1, round(float(np.linalg.norm(side)) / 0.2)) for side in (a, b))
+        own = slice(begin, begin + rows * columns)
+        begin = own.stop
+        off = cloud.means[own].numpy() - corner
+        u, v = ((off @ side) / (side @ side) for side in (a, b))
+        low, right, _, up = uv[face]
+        place = (low + u[:, None] * (right - low) + v[:, None] * (up - low)) % 1
+        column, row = ((place * [1, -1] + [0, 1]) * len(image)).astype(int).clip(0, len(image) - 1).T
+        colours = 0.5 + SH_DC * cloud.sh[own, 0].numpy()
+        normal = np.cross(a, b) / np.linalg.norm(np.cross(a, b))
+        lit = 0.4 + 0.6 * abs(normal @ light)
+        off_by += np.abs(colours - lit * image[row, column]).max(-1).tolist()
+        np.testing.assert_allclose(cloud.normals[own].numpy() - normal, 0, atol=1e-5)
+        np.testing.assert_allclose(corners[face[2]], corner + a + b)
+    assert begin == len(cloud)
+    assert np.quantile(off_by, 0.8) < 0.02  # the others are at edges of discs
+
+
+def test_films_that_begin_before_and_into_the_motion(tool, cases, motions, tmp_path):
+    """The same pictures make both; a fit reads them, and its base holds the cloth and nothing of the room."""
+    import imageio.v3 as iio
+
+    pictures = 30
+    pattern = _moved(tool, motions, "banner", tmp_path, pictures - tool.SHIFT)
+    video = cases.FitVideo(1, (64, 112), 33.0, read_noise=0.0, shot_noise=0.0)
+    thing = replace(tool.filmed_cloth(pattern, tmp_path, video, 0.05, 0.2), spacing=0.2)
+    view = tool.aimed(thing, video)
+    views = tool.in_hand(thing, view, pictures, 0)
+    turns = [math.degrees(math.acos(min(1.0, (np.trace(v.pose[:3, :3].T @ view.pose[:3, :3]) - 1) / 2))) for v in views]
+    assert 0.3 < np.sqrt(np.mean(np.square(turns))) < 2.0
+    (tmp_path / "pictures").mkdir()
+    for k in range(pictures):
+        iio.imwrite(tmp_path / f"pictures/{k:04d}.png", np.full((112, 64, 3), 4 * k + 40, np.uint8))
+    for name, start, first in (("still", 0.2, 0), ("moving", -0.2, 12)):
+        folder = tmp_path / name
+        tool.write_film(thing, tmp_path, folder, video, view, views)
+        truth = json.loads((folder / "truth.json").read_text())
+        assert truth["start"] == pytest.approx(start)
+        assert len(truth["cameras"]) == 18
+        np.testing.assert_allclose(truth["cameras"][0], views[first].pose)
+        (film,) = read_videos(folder)
+        assert len(film.times) == 18
+        assert float(film.images[0].float().mean()) == pytest.approx(4 * first + 40, abs=2)
+        plan = read_plan(folder / "fit.yaml")
+        starts = {u.name: u.start for u in plan.unknowns}
+        ratio = 3.0 if start < 0 else 1 / 3
+        assert starts["wind.speed"] == pytest.approx(truth["speed"] * ratio, rel=1e-3)
+        assert starts["material.E"] == pytest.approx(truth["E"] / ratio, rel=1e-3)
+        assert abs(starts["wind.azimuth"] - truth["azimuth"]) == pytest.approx(60, abs=0.01)
+        scene = yaml.safe_load((folder / "scene.yaml").read_text())
+        assert np.linalg.norm(np.subtract(scene["wind"]["flow"], truth["flow"])) > 0.3 * truth["speed"]
+        simulation = Simulation.from_yaml(folder / "scene.yaml", camera=None, device="cpu")
+        assert len(torch.zeros(len(simulation.scene.rest().means))[simulation.scene.moving]) == len(thing.cloud)
+        pins = simulation.solver.boundaries
+        assert len(pins) == 2
+        held = sum(int(pin.region.contains(thing.cloud.means).sum()) for pin in pins)
+        assert held == 2 * round(pattern.height / 0.05)
+
+
+@pytest.mark.parametrize("name", ["curtain", "banner", "pole_flag"])
+def test_ranges_hold_the_truth(tool, cases, name):
+    truth = cases.truth_fields(tool.CLOTHS[name], cases.FitVideo())
+    for key, (low, high) in tool.RANGES.items():
+        own = truth[{"wind.speed": "speed", "wind.azimuth": "azimuth", "material.E": "E"}[key]]
+        assert low < own < high
+        if key != "wind.azimuth":
+            assert low < own / tool.OFF
+            assert own * tool.OFF < high
+
+
+def test_a_film_by_blender(tool, tmp_path, capsys):
+    pytest.importorskip("bpy", reason="needs the extra [blender]")
+    import imageio.v3 as iio
+
+    words = ["--preview", "--case", "banner", "--frames", "6", "--out", str(tmp_path)]
+    assert tool.main(words) == 0
+    first = iio.imread(tmp_path / "banner/pictures/0000.png").astype(float)
+    last = iio.imread(tmp_path / "banner/pictures/0017.png").astype(float)
+    assert first.shape == (192, 108, 3)
+    assert first.std() > 20  # lit, with a print
+    assert abs(first - last).mean() > 2
+    for name in tool.FILMS:
+        (film,) = read_videos(tmp_path / "banner" / name)
+        assert film.images.shape == (6, 192, 108, 3)
+    capsys.readouterr()
+    assert tool.main(words) == 0
+    assert ": 0 pictures" in capsys.readouterr().out
