@@ -50,9 +50,9 @@ def _fits(options: argparse.Namespace) -> Iterator[Measurement]:
                 yield ("starts", told), partial(fitted, film, {FILM_START: [-0.5, 0.5]})
     for name, told, search in (("verdicts", "", SEARCH), ("alone", ", from this start alone", 0)):
         for number in numbers if name in options.parts else ():
-            for kind in kinds:
-                work = partial(fitted, drawn(kind, shift + number), {}, off=3.0, search=search)
-                yield (f"{section}verdicts", f"{kind} {shift + number}{told}"), work
+            kind, which = list(kinds)[number % len(kinds)], shift + number // len(kinds)
+            work = partial(fitted, drawn(kind, which), {}, off=3.0, search=search)
+            yield (f"{section}verdicts", f"{kind} {which}{told}"), work
     if "coverage" in options.parts:
         for number in numbers:
             kind = list(kinds)[number % len(kinds)]
@@ -136,7 +136,7 @@ CASE = Case(
     (
         names("--parts", PARTS, default=("starts", "verdicts")),
         names("--kinds", list(KINDS), default=list(KINDS)),
-        option("--films", "films of each thing, or of the part coverage in all", type=int, default=2),
+        option("--films", "films of each of the parts that have many, in all", type=int, default=8),
         option("--first", "number of the first of these films", type=int, default=0),
         option("--independent", "films on which nothing was tuned, apart from the others", action="store_true"),
         option("--processes", "films that are fitted at the same time", type=int, default=1),
