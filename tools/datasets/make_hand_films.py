@@ -77,8 +77,8 @@ CLOTHS: dict[str, FlagPattern] = {
         flag((3.1, 2.6, 0.0), "b"), youngs_modulus=8e3, density=25.0, pinned="left", width=0.6, height=0.4, cells=60
     ),
 }
-"""Cloths. The banner is as heavy as real ones. On the flag, which folds up as it falls, meshes of Blender's cloth agree to
-millimetres; on the larger ones of :data:`fit_cases.CASES` they are centimetres apart after 0.3 s."""
+"""Cloths. The banner is as heavy as real ones. On the flag, which folds up as it falls, meshes of Blender's cloth agree
+to millimetres; on the larger ones of :data:`fit_cases.CASES` they are centimetres apart after 0.3 s."""
 CELLS = 15
 """Cells of the grid of a fit along the longer side of a cloth."""
 POST = "post"

@@ -23,6 +23,24 @@ def _peers(rows: list[Row]) -> Iterator[Row]:
         yield {"case": case, "solver": solver, "times": "; ".join(fill("{points:,}: {ms:g}", row) for row in own)}
 
 
+def _turning(results: list[Row]) -> Iterator[Row]:
+    """Blocks in a box, of ``bench.py speed``, beside the other solvers that have walls."""
+    peers = [row for result in results for row in result.get("rows", []) if "walls included" in row.get("solver", "")]
+    ours = [row for result in results for row in result.get("cube", []) if row["walls"]]
+    for row in sorted(ours, key=lambda row: row["asked"]):
+        times = {peer["solver"].split(",")[0]: peer["ms"] for peer in peers if peer["points"] == row["asked"]}
+        if times:
+            how = "turning" if row["turning"] else "falling from rest"
+            ratio = min(times.values()) / row["median_ms"]
+            yield row | {"how": how, "peers": times, "ratio": ratio, "reached": ratio >= 1.5}
+
+
+table(PAGE, "peers.turning", "*pee*", _turning, """
+    points = {particles:,} | motion = {how} | ours [ms] = {median_ms:.3g} | CK-MPM [ms] = {peers.CK-MPM:.3g} |
+    claymore [ms] = {peers.claymore:.3g} | the faster one per ours = {ratio:.2f} | 1.5 wanted = {reached}
+    """, before="Blocks in a box, ours as in the table of cubes above:", together=True)  # fmt: skip
+
+
 def _announced(result: Row) -> Iterator[Row]:
     """Each run: that of a configuration, or the draft and the starter of a splat."""
     for name, row in result["previews"].items():
