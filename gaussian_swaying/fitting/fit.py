@@ -44,6 +44,7 @@ from gaussian_swaying.fitting.least_squares import (
     iterate,
     normal_equations,
     sensitivities,
+    step_from,
     unsettled,
 )
 from gaussian_swaying.fitting.page import write_page
@@ -500,7 +501,7 @@ class Fit:
             times = self.fitted[: max(3, round(share * len(self.fitted)))]
             course.matched = course.matched or list(course.place)
             evidence = self.evidence(stage, course.matched)
-            if share > HORIZONS[-1]:
+            if share >= HORIZONS[-1]:
                 evidence = self._trusted(evidence, course.matched)
             place = torch.tensor(course.place, dtype=torch.float64)
             progress = Progress(place, course.damping, course.iteration, done=course.ended)
@@ -544,7 +545,7 @@ class Fit:
         start = [*place, *map(steady_share, unknowns)]
         left = []
         for fit_, begin in ((self, list(place)), (wider, start)):
-            end = fit_.solved(begin, evidence, early, self.plan.iterations)
+            end = fit_.solved(begin, evidence, early)
             (block, *_) = compare(self.simulation, evidence, [fit_.values(end)], self.fitted, moving=self.moving)
             frames = compare(self.simulation, evidence, [fit_.values(end)], early, moving=self.moving)[0]
             left.append(float(block.values[0, frames.values.shape[1] :].norm(dim=-1).nanmedian()))
@@ -553,23 +554,14 @@ class Fit:
         if not late or not left[1] < PREFERRED * left[0]:
             return self, list(place)
         for _ in range(2):
-            own = wider._trusted(wider.evidence(self.stages[-1], end), end)
-            end = wider.solved(end, own, self.fitted, self.plan.iterations)
+            end = wider.solved(end, wider._trusted(wider.evidence(self.stages[-1], end), end), self.fitted)
         return wider, end
 
-    def solved(
-        self,
-        place: Sequence[float],
-        evidence: Sequence[Evidence],
-        times: Sequence[float],
-        most: int,
-        tolerance: float = ROUGH * TOLERANCE,
-        least_gain: float = ROUGH * LEAST_GAIN,
-    ) -> list[float]:
-        """The place at which so many iterations from another end, at most."""
+    def solved(self, place: Sequence[float], evidence: Sequence[Evidence], times: Sequence[float]) -> list[float]:
+        """The place at which the iterations from another end."""
         progress = Progress(torch.tensor(place, dtype=torch.float64))
-        while not progress.done and progress.iteration < most:
-            iterate(self.residuals(evidence, times), _scaled(evidence), progress, tolerance, least_gain)
+        while not progress.done and progress.iteration < self.plan.iterations:
+            iterate(self.residuals(evidence, times), _scaled(evidence), progress, ROUGH * TOLERANCE, ROUGH * LEAST_GAIN)
             self.say(f"to {times[-1]:.3g} s, {progress.iteration}: {self._shown(progress.place.tolist())}")
         return progress.place.tolist()
 
@@ -613,17 +605,22 @@ class Fit:
         """The normal equations at a place, and the covariance that the grid adds, shape (U, U).
 
         The same residuals have their minimum elsewhere on a finer and on a coarser grid. It is found by iterations, as
-        a linear step is much too short.
+        a linear step is often too short; that step counts where none lowers the cost.
         """
         normal, model = self._normal(place, evidence, self.fitted), torch.zeros(2 * (len(place),), dtype=torch.float64)
         for other in self._grids():
             own = [e.on(other) if isinstance(e, TrackEvidence) else e for e in evidence]
-            there = copy(self)
-            there.simulation, there.say = other, lambda line: None
+            there, progress = copy(self), Progress(place)
+            there.simulation = other
+            residuals = there.residuals(own, self.fitted)
             with suppress(DivergedError):
-                end = there.solved(place.tolist(), own, self.fitted, REFINED, TOLERANCE, LEAST_GAIN)
-                shift = torch.tensor(end, dtype=torch.float64) - place
-                model += torch.outer(shift, shift)
+                while not progress.done and progress.iteration < REFINED:
+                    iterate(residuals, _scaled(own), progress, TOLERANCE, LEAST_GAIN)
+            if progress.normal is None:
+                continue
+            moved = not torch.equal(progress.place, place)
+            shift = (progress.place if moved else step_from(progress.normal, place)) - place
+            model += torch.outer(shift, shift)
         return normal, model
 
     def _normal(self, place: Tensor, evidence: Sequence[Evidence], times: Sequence[float]) -> Normal:
