@@ -186,12 +186,20 @@ def test_stopped_and_continued(own, tmp_path):
     """A fit that is stopped after some iterations and continued ends where an undisturbed one does, bit for bit."""
     sought = [read_unknown(name, SOUGHT[name]) for name in ("wind.speed", "wind.azimuth")]
     plan = Plan([str(own / "base.yaml")], [str(own / "video")], sought, search=8, iterations=2, tracks=40)
-    whole = run_fit(plan, tmp_path / "whole", device="cpu", progress=False)
+    simulation = Simulation.from_yaml(own / "base.yaml", device="cpu")
+    settings = base()
+    settings["solver"]["dx"] *= 1.25
+    (tmp_path / "coarser.yaml").write_text(yaml.safe_dump(settings))
+    coarser = Simulation.from_yaml(tmp_path / "coarser.yaml", device="cpu")
+
+    def made():
+        return Fit(simulation, read_videos(own / "video"), plan, on_grid=lambda ratio: coarser)
+
+    whole = made().run(Course(), lambda course: None)
 
     class StopError(Exception):
         pass
 
-    simulation = Simulation.from_yaml(own / "base.yaml", device="cpu")
     seen = []
 
     def keep(course):
@@ -202,7 +210,7 @@ def test_stopped_and_continued(own, tmp_path):
     course, stops = Course(), 0
     while True:
         try:
-            result = Fit(simulation, read_videos(own / "video"), plan).run(course, keep)
+            result = made().run(course, keep)
             break
         except StopError:
             course, stops = Course(**seen[-1]), stops + 1
