@@ -190,27 +190,37 @@ class LatticeFlow(nn.Module):
             part: The wall cells, bool, shape (X, Y, Z), away from the faces: the pressure at rest is left out, which
                 pushes a closed surface nowhere.
         """
+        flat = state.moments.reshape(MOMENTS, -1)
+
+        def sent(number: int, cells: Tensor) -> Tensor:
+            return population(flat[:, cells], number)
+
         total = [torch.zeros((), dtype=torch.float64, device=part.device)] * 3
         for number, c in enumerate(DIRECTIONS):
-            arrived, source = self._arrived(state.moments, number)
-            back = population(state.moments.reshape(MOMENTS, -1)[:, self.special.long()], OPPOSITE[number])
+            arrived, source = self._arrived(state.moments, number, sent)
+            back = sent(OPPOSITE[number], self.special.long())
             given = ((back + arrived) * part.reshape(-1)[source]).double().sum()
             total = [t - a * given for t, a in zip(total, c, strict=True)]
         return torch.stack(total) * self.units.cell_mass * self.units.speed / self.units.dt
 
-    def _arrived(self, moments: Tensor, number: int) -> tuple[Tensor, Tensor]:
-        """A population that arrives at special cells, and the flat index of the cells that it comes from, (S,) each."""
+    def _arrived(self, moments: Tensor, number: int, sent: Callable[[int, Tensor], Tensor]) -> tuple[Tensor, Tensor]:
+        """A population that arrives at special cells, and the flat index of the cells that it comes from, (S,) each.
+
+        Args:
+            moments: Those of all cells.
+            number: The number of the velocity.
+            sent: A population of some cells, by its number and their flat index.
+        """
         flat, special, c = moments.reshape(MOMENTS, -1), self.special.long(), DIRECTIONS[number]
         source, away = (_neighbour(special, self.cells, step) for step in (tuple(-a for a in c), c))
-        own, sent = flat[:, special], population(flat[:, source], number)
         pushed = 6 * WEIGHTS[number] * sum(a * flat[1 + k, source] for k, a in enumerate(c))
-        back = population(own, OPPOSITE[number]) + pushed
+        back = sent(OPPOSITE[number], special) + pushed
         if len(self.gaps):
             gap = self.gaps[number].to(moments)
-            near = 2 * gap * (back - pushed) + (1 - 2 * gap) * population(flat[:, away], OPPOSITE[number]) + pushed
-            far = (back + (2 * gap - 1) * population(own, number)) / (2 * gap)
+            near = 2 * gap * (back - pushed) + (1 - 2 * gap) * sent(OPPOSITE[number], away) + pushed
+            far = (back + (2 * gap - 1) * sent(number, special)) / (2 * gap)
             back = torch.where(gap < 0.5, near, far)
-        return torch.where(self.kind.reshape(-1)[source] == WALL, back, sent), source
+        return torch.where(self.kind.reshape(-1)[source] == WALL, back, sent(number, source)), source
 
     def step(
         self, state: FlowState, wind: Tensor | None = None, acceleration: Sequence[float] = (0.0, 0.0, 0.0)
@@ -249,10 +259,12 @@ class LatticeFlow(nn.Module):
     def _step(self, moments: Tensor, out: Tensor, push: list[float]) -> None:
         wall = self.kind == WALL
         special, arrived = self.special.long(), []
+        populations = [population(moments, number) for number in range(len(DIRECTIONS))]
         for number, c in enumerate(DIRECTIONS):
-            moved = torch.roll(population(moments, number), c, (0, 1, 2))
+            moved = torch.roll(populations[number], c, (0, 1, 2))
             if self.has_walls:
-                moved.reshape(-1)[special] = self._arrived(moments, number)[0]
+                come, _ = self._arrived(moments, number, lambda k, cells: populations[k].reshape(-1)[cells])
+                moved.reshape(-1)[special] = come
             arrived.append(moved)
         given = moments.new_tensor(push)[:, None, None, None] if any(push) else None
         out.copy_(collide(*sums(arrived), self.units.relaxation, self.smagorinsky, given))

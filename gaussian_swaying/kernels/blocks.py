@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import lru_cache
 from typing import Any, cast
 
 from llvmlite import ir
@@ -85,6 +86,15 @@ def is_number(value: Value) -> bool:
     return isinstance(value, (bool, int, float))
 
 
+@lru_cache(maxsize=4096)
+def _constant(number: Any, sign: float, kind: str, shape: Shape) -> Block:
+    """A block of one number; LLVM's value of it is immutable, and writes itself once."""
+    lanes = math.prod(shape)
+    if lanes == 1:
+        return Block(ir.Constant(TYPES[kind], number), kind, shape)
+    return Block(ir.Constant(ir.VectorType(TYPES[kind], lanes), [number] * lanes), kind, shape)
+
+
 class Emitter:
     """Emits LLVM instructions for operations on blocks.
 
@@ -109,12 +119,8 @@ class Emitter:
 
     def constant(self, number: complex, kind: str, shape: Shape = ()) -> Block:
         """A block of one number."""
-        lanes, scalar = math.prod(shape), TYPES[kind]
         plain: Any = float(cast(float, number)) if kind[0] == "f" else int(cast(float, number))
-        one = ir.Constant(scalar, plain)
-        if lanes == 1:
-            return Block(one, kind, shape)
-        return Block(ir.Constant(ir.VectorType(scalar, lanes), [plain] * lanes), kind, shape)
+        return _constant(plain, math.copysign(1, plain), kind, shape)  # 0.0 and -0.0 are equal
 
     def block(self, value: Value, like: Block | None = None) -> Block:
         """A value as a block; a Python number takes the type of ``like``, if it can."""
@@ -176,11 +182,12 @@ class Emitter:
         else:
             vector, index = ir.VectorType(TYPES[block.kind], lanes), ir.IntType(32)
             one = self.builder.insert_element(ir.Constant(vector, ir.Undefined), block.value, index(0))
-            mask = ir.Constant(ir.VectorType(index, lanes), [0] * lanes)
+            mask = self.constant(0, "i32", (lanes,)).value
             made = Block(self.builder.shuffle_vector(one, ir.Constant(vector, ir.Undefined), mask), block.kind, shape)
         return replace(made, first=block.value, stride=0) if block.kind in ("i32", "i64") else made
 
     @staticmethod
+    @lru_cache(maxsize=4096)
     def common_shape(*shapes: Shape) -> Shape:
         """The shape to which blocks are repeated before an operation."""
         rank = max(map(len, shapes))

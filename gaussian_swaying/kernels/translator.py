@@ -308,51 +308,48 @@ class _Translator(Emitter):
         return self.convert(self.block(self._eval(test, scope)), "i1")
 
     def _repeat(self, names: set[str], more: Callable[[], Block], body: Callable[[Scope], None], scope: Scope) -> None:
-        """A loop; what it changes is kept in memory, which LLVM turns into registers."""
+        """A loop; what it changes is kept in memory, which LLVM turns into registers.
+
+        The body is carried out with the types from before the loop. If it changes them, it is taken back, and carried
+        out again with the types of both.
+        """
         leave, self._leave = self._leave, None
-        kinds = self._kinds_in_loop(sorted(names & scope.keys()), body, scope)
-        places = {}
-        for name, kind in kinds.items():
-            places[name] = self._places(kind)
-            self._keep(places[name], self._fit(scope[name], kind))
+        given = {name: scope[name] for name in sorted(names & scope.keys())}
+        kinds = {name: self._join(value, value) for name, value in given.items()}
         b, function = self.builder, self.builder.function
-        head, inside, after = (function.append_basic_block() for _ in range(3))
-        b.branch(head)
-        b.position_at_end(head)
-        for name, kind in kinds.items():
-            scope[name] = self._kept(places[name], kind)
-        b.cbranch(more().value, inside, after)
-        b.position_at_end(inside)
-        inner = dict(scope)
-        body(inner)
-        for name, kind in kinds.items():
-            self._keep(places[name], self._fit(inner[name], kind))
+        here, done, before = b.block, len(b.block.instructions), len(function.blocks)
+        for last in (False, False, True):
+            places = {name: self._places(kind) for name, kind in kinds.items() if not isinstance(kind, _Same)}
+            for name in places:
+                self._keep(places[name], self._fit(given[name], kinds[name]))
+            head, inside, after = (function.append_basic_block() for _ in range(3))
+            b.branch(head)
+            b.position_at_end(head)
+            scope.update({name: self._kept(places[name], kinds[name]) for name in places})
+            b.cbranch(more().value, inside, after)
+            b.position_at_end(inside)
+            inner = dict(scope)
+            body(inner)
+            joined = kinds if last else self._joined(kinds, given, inner)
+            if joined == kinds:
+                break
+            kinds, here.terminator = joined, None
+            del here.instructions[done:], function.blocks[before:]
+            b.position_at_end(here)
+        for name in places:
+            self._keep(places[name], self._fit(inner[name], kinds[name]))
         b.branch(head)
         b.position_at_end(after)
         self._leave = leave
-        for name, kind in kinds.items():
-            scope[name] = self._kept(places[name], kind)
+        scope.update({name: self._kept(places[name], kinds[name]) for name in places})
 
-    def _kinds_in_loop(self, names: list[str], body: Callable[[Scope], None], scope: Scope) -> dict[str, Any]:
-        """The types of variables that a loop changes: the body is carried out for them once, in vain."""
-        kinds = {name: self._join(scope[name], scope[name]) for name in names}
-        builder, entry, dummies = self.builder, self.entry, self._dummy
-        here = builder.block
-        for _ in range(2):
-            scratch = ir.Function(ir.Module(), ir.FunctionType(ir.VoidType(), []), "scratch")
-            builder.position_at_end(scratch.append_basic_block())
-            self.entry, self._dummy = ir.IRBuilder(scratch.append_basic_block()), {}
-            inner = dict(scope)
-            for name, kind in kinds.items():
-                inner[name] = self._fit(scope[name], kind)
-            body(inner)
-            joined = {name: self._join(self._fit(scope[name], kinds[name]), inner[name]) for name in names}
-            builder.position_at_end(here)
-            self.entry, self._dummy = entry, dummies
-            if joined == kinds:
-                break
-            kinds = joined
-        return {name: kind for name, kind in kinds.items() if not isinstance(kind, _Same)}
+    def _joined(self, kinds: dict[str, Any], before: Scope, after: Scope) -> dict[str, Any]:
+        """The types of variables that have values of some types before a loop and others after it."""
+        here, scratch = self.builder.block, ir.Function(ir.Module(), ir.FunctionType(ir.VoidType(), []), "scratch")
+        self.builder.position_at_end(scratch.append_basic_block())  # what is converted here is of no use
+        joined = {name: self._join(self._fit(before[name], kind), after[name]) for name, kind in kinds.items()}
+        self.builder.position_at_end(here)
+        return joined
 
     # ---- values that depend on the way
 
@@ -439,21 +436,26 @@ class _Translator(Emitter):
         raise TranslationError(f"`{name}` is not known here")
 
     def _eval(self, node: ast.expr, scope: Scope) -> Value:
-        match node:
-            case ast.Constant(value=value):
-                return value
+        match node:  # the frequent ones first
             case ast.Name(id=name):
                 return self._lookup(name, scope)
+            case ast.Call(func=func, args=args, keywords=keywords):
+                named = {word.arg: self._eval(word.value, scope) for word in keywords if word.arg is not None}
+                return self._invoke(self._eval(func, scope), tuple(self._eval(arg, scope) for arg in args), named)
+            case ast.BinOp(left=left, op=op, right=right):
+                return self._binary(op, self._eval(left, scope), self._eval(right, scope))
+            case ast.Attribute(value=owner, attr=attr):
+                return self._attribute(self._eval(owner, scope), attr)
+            case ast.Constant(value=value):
+                return value
+            case ast.Compare(left=left, ops=[op], comparators=[right]):
+                return self._compare(op, self._eval(left, scope), self._eval(right, scope))
             case ast.Tuple(elts=parts):
                 return tuple(self._eval(part, scope) for part in parts)
             case ast.List(elts=parts):
                 return tuple(self._eval(part, scope) for part in parts)
-            case ast.BinOp(left=left, op=op, right=right):
-                return self._binary(op, self._eval(left, scope), self._eval(right, scope))
             case ast.UnaryOp(op=op, operand=operand):
                 return self._one(op, self._eval(operand, scope))
-            case ast.Compare(left=left, ops=[op], comparators=[right]):
-                return self._compare(op, self._eval(left, scope), self._eval(right, scope))
             case ast.BoolOp(op=op, values=values):
                 return self._logic(op, values, scope)
             case ast.IfExp(test=test, body=body, orelse=orelse):
@@ -461,13 +463,8 @@ class _Translator(Emitter):
                 if isinstance(condition, Block):
                     return self.where(condition, self._eval(body, scope), self._eval(orelse, scope))
                 return self._eval(body if condition else orelse, scope)
-            case ast.Attribute(value=owner, attr=attr):
-                return self._attribute(self._eval(owner, scope), attr)
             case ast.Subscript(value=owner, slice=index):
                 return self._item(self._eval(owner, scope), index, scope)
-            case ast.Call(func=func, args=args, keywords=keywords):
-                named = {word.arg: self._eval(word.value, scope) for word in keywords if word.arg is not None}
-                return self._invoke(self._eval(func, scope), tuple(self._eval(arg, scope) for arg in args), named)
         raise TranslationError(f"cannot translate `{ast.unparse(node)}`")
 
     def _binary(self, op: ast.operator, x: Value, y: Value) -> Value:

@@ -1,6 +1,7 @@
 """Films from a hand: what is measured, and what is shown of it."""
 
 import json
+from functools import partial
 
 import pytest
 from bench.cases import handheld
@@ -13,6 +14,7 @@ pytest.importorskip("cv2")
 def test_a_film_from_a_hand_and_one_taken_for_a_tripod(monkeypatch):
     monkeypatch.setattr(handheld, "FRAMES", 16)
     monkeypatch.setattr(handheld, "SIZE", (240, 136))
+    monkeypatch.setattr(handheld, "Plan", partial(handheld.Plan, starts=1))
     names = ["hand, exposure drifts, real walls", "hand, taken for a tripod"]
     rows = [word for name in names for word in ("--row", name)]
     result, _ = measure("handheld", *rows, "--search", "6", result=json.loads(json.dumps(HEAD)))
