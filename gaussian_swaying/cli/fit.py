@@ -28,8 +28,9 @@ def build_parser() -> argparse.ArgumentParser:
     add = parser.add_argument
     add("film", nargs="?", metavar="FILM", help="a film that begins with the object at rest")
     add("--splat", metavar="SPLAT", help="the splat that the film shows")
-    add("--length", nargs=2, metavar=("NAME", "METRES"), help="a known length: object, a part such as pole, "
-        "or X,Y:X,Y, two places in the first frame (pixels); without it, speed and E are not absolute")  # fmt: skip
+    add("--length", nargs="+", metavar="LENGTH", help="a known length, NAME METRES: object, a part such as pole, or "
+        "X,Y:X,Y, two places in the first frame (pixels); or gravity, if the weight is to tell it; without it, speed "
+        "and E are not absolute")  # fmt: skip
     add("--up", nargs="+", metavar="UP", help="+x, -x, ... -z or 3 numbers: up in the splat, instead of a guess")
     add("--hold", metavar="END", help="end that is held: top, bottom, none, +x, ... or -z, instead of a guess")
     add("--focal", type=float, metavar="MM", help="focal length of the film, equivalent to 35 mm film; if "

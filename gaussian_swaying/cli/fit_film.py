@@ -21,6 +21,7 @@ from gaussian_swaying.cli.preview import build_options, preview_scene, up_of
 from gaussian_swaying.cli.register import CAMERAS, PICTURE, STILLS, VIEW, first_cameras, fov_of, painter_of, transforms
 from gaussian_swaying.fitting.film import Film, begins_to_move, first_frame, open_film, pixels_of_focal
 from gaussian_swaying.fitting.held import held_end, moving_box, moving_points
+from gaussian_swaying.fitting.scale import SCALE
 from gaussian_swaying.fitting.videos import Footage, read_videos
 from gaussian_swaying.gaussians.cloud import GaussianCloud
 from gaussian_swaying.preview.hold import given_hold
@@ -44,6 +45,8 @@ UPRIGHT, NEARLY = 0.5, 0.85
 """Cosines of the angles to the film's own up within which a guess of up is right, and an axis is taken for it."""
 OBJECT = "object"
 """Name of the whole in ``--length``."""
+GRAVITY, SHORTER, LONGER = "gravity", 0.25, 4.0
+"""Name in ``--length`` if the weight is to tell the scale, and the range of lengths, per the guess."""
 
 
 @dataclass(frozen=True)
@@ -71,7 +74,7 @@ def prepare(options: argparse.Namespace, folder: Path) -> Path:
     Raises:
         ValueError: If the film or the splat cannot be used; the message says what to do.
     """
-    length = _length(options.length)
+    length, weighed = _length(options.length), options.length == [GRAVITY]
     if options.focal is not None and not 5 <= options.focal <= 1000:
         raise ValueError(f"Expected `--focal` from 5 to 1000 mm, but got {options.focal:g}.")
     if options.hold is not None:
@@ -108,28 +111,34 @@ def prepare(options: argparse.Namespace, folder: Path) -> Path:
     if length is not None:
         longest = longest_side(*length, seen, preview)
         preview = _previewed(options, look, wanted | shown | {"longest_side": longest})
+    if weighed and not any(yaml.safe_load(preview.configurations["draft"])["solver"]["gravity"]):
+        raise ValueError(
+            "`--length gravity` is for a sheet alone, or for what nothing holds: anything else was captured in balance "
+            "with its weight. Give a length that you know."
+        )
     write(preview, look)
-    text = plan_text(preview, _background(seen), None if at_once else moves - begin, length is not None, folder)
+    scaled = GRAVITY if weighed else "" if length is None else "length"
+    text = plan_text(preview, _background(seen), None if at_once else moves - begin, scaled, folder)
     keep_aside(folder / PLAN, text)
     write_text(folder / PLAN, text)
     print(f"{options.film} moves from {moves:.2f} s on; {begin:.2f} s to {begin + seconds:.2f} s of it are used")
-    print("\n".join(_guesses(preview, told, length)))
+    print("\n".join(_guesses(preview, told, scaled)))
     print(f"look at {folder / PICTURE}: frame and splat have to show the same; and at {look / 'preview.png'}")
     return folder / PLAN
 
 
 def _length(given: Sequence[str] | None) -> tuple[str, float] | None:
     """Name and metres of ``--length``."""
-    if given is None:
+    if given is None or list(given) == [GRAVITY]:
         return None
-    name, metres = given
+    name, metres = given if len(given) == 2 else (given[0], " ".join(given[1:]) or "nothing")
     try:
         value = float(metres)
     except ValueError:
         value = math.nan
     if not 0 < value < math.inf:
         raise ValueError(
-            f"Expected `--length` to be a name and a length in metres, such as pole 2.4, but got {metres}."
+            f"Expected `--length` to be gravity, or a name and a length in metres, such as pole 2.4, but got {metres}."
         )
     return name, value
 
@@ -292,14 +301,14 @@ def _place(name: str, number: int, seen: Seen) -> Tensor:
     return view[:3, :3].T @ (depth * ray.double() - view[:3, 3])
 
 
-def plan_text(preview: Preview, background: Sequence[float], still: float | None, scaled: bool, folder: Path) -> str:
+def plan_text(preview: Preview, background: Sequence[float], still: float | None, scaled: str, folder: Path) -> str:
     """The fit file.
 
     Args:
         preview: Of the splat.
         background: Colour behind it in the film.
         still: Time at rest before the motion [s]; None if the film may begin in motion.
-        scaled: Whether a length is known.
+        scaled: ``length`` if one is known, ``gravity`` if the weight is to tell it; empty if neither.
         folder: Of the fit file.
     """
     guess = preview.data["suggestion"]
@@ -312,6 +321,8 @@ def plan_text(preview: Preview, background: Sequence[float], still: float | None
     around = [round(middle - half), round(middle + half)]
     first, last = (-1.0, 0.1) if still is None else (0.0, round(still + 0.1, 2))
     still = still or 0.0
+    metres = guess["metres_per_unit"]
+    sizes = [float(f"{metres * factor:.2g}") for factor in (SHORTER, LONGER)]
     again = shlex.join([*program.words("fit"), "--config", str(folder / PLAN), "--output", str(folder / RESULT)])
     lines = [
         (f"base: {LOOK}/draft.yaml", f"the splat, what holds it, its material: guesses; {LOOK}/starter.yaml is finer"),
@@ -326,6 +337,7 @@ def plan_text(preview: Preview, background: Sequence[float], still: float | None
         (f"  wind.speed: {{range: {list(SPEED)}}}", "m/s"),
         (f"  wind.azimuth: {{range: {around}}}", "degrees from +x towards +y, with z up"),
         (f"  material.E: {{range: [{low:.1e}, {high:.1e}]}}", "Pa"),
+        *([(f"  {SCALE}: {{range: {sizes}}}", "m; told by the weight")] if scaled == GRAVITY else []),
         (f"  film.start: {{range: [{first}, {last}]}}", "s; when the motion starts; before 0 for a film in motion"),
         (f"until: {still + SECONDS:.2f}", "s of the used part that are fitted; the rest is predicted"),
         ("search: 48", "simulations of the coarse search"),
@@ -334,7 +346,7 @@ def plan_text(preview: Preview, background: Sequence[float], still: float | None
     return head + "".join(f"{line:<44}# {told}\n" for line, told in lines)
 
 
-def _guesses(preview: Preview, told: Sequence[str], length: Any) -> list[str]:
+def _guesses(preview: Preview, told: Sequence[str], scaled: str) -> list[str]:
     """The guesses of the preview, as lines."""
     guess = preview.data["suggestion"]
     hold = guess["hold"]
@@ -347,12 +359,12 @@ def _guesses(preview: Preview, told: Sequence[str], length: Any) -> list[str]:
     if guess["parts"] is not None:
         lines.append("parts: " + ", ".join(f"{n} {p['role']}" for n, p in guess["parts"]["parts"].items()))
     size = " x ".join(f"{side:.3g}" for side in guess["size_m"])
-    known = (
-        "as --length says"
-        if length is not None
-        else "which nobody measured: give --length, such as --length object 1.5"
-    )
-    lines.append(f"size of what moves: {size} m, {known}")
+    known = {
+        "length": "as --length says",
+        GRAVITY: "a guess: the weight is to tell it",
+        "": "which nobody measured: give --length, such as --length object 1.5",
+    }
+    lines.append(f"size of what moves: {size} m, {known[scaled]}")
     return lines
 
 

@@ -17,11 +17,13 @@ from gaussian_swaying.fitting.before import titled
 from gaussian_swaying.fitting.changing import changing
 from gaussian_swaying.fitting.identifiability import Direction
 from gaussian_swaying.fitting.prepared import Judged
+from gaussian_swaying.fitting.scale import SCALE
 from gaussian_swaying.fitting.unknowns import Unknown, is_change, of_simulation
+from gaussian_swaying.fitting.variants import setup_of
 from gaussian_swaying.fitting.videos import Footage
 from gaussian_swaying.gaussians.model import DeformedGaussians
 from gaussian_swaying.recording.video import VideoEncoder
-from gaussian_swaying.simulation.parameters import POLAR, flow_of, in_settings
+from gaussian_swaying.simulation.parameters import POLAR, flow_of, in_settings, value_of
 from gaussian_swaying.simulation.simulation import Simulation
 
 if TYPE_CHECKING:
@@ -329,18 +331,26 @@ def write_results(
 
 def scene_text(values: Mapping[str, float], parser: ArgumentParser, settings: Namespace, simulation: Simulation) -> str:
     """The configuration of the base with the values that were found, as YAML for ``sim``."""
-    found = settings.clone()
+    found, ratio, remark = settings.clone(), 1.0, ""
+    if SCALE in values:
+        ratio = values[SCALE] / simulation.scene.frame.metres_per_unit
+        remark = f"# Below, a metre is a length of {ratio:.6g} m.\n"
     if any(name in values for name in POLAR):
         found.wind.flow = flow_of(simulation.wind.flows[0].tolist(), values)  # type: ignore[index]
     if any(map(is_change, values)):
         wind = changing(simulation.wind.with_flow(found.wind.flow), values)  # type: ignore[operator]
         rows = zip(wind.times.tolist(), wind.flows.tolist(), strict=True)
-        found.wind.schedule = [{"time": time, "flow": flow} for time, flow in rows]
+        found.wind.schedule = [{"time": time, "flow": [part / ratio for part in flow]} for time, flow in rows]
         found.wind.interpolation = wind.interpolation
     for name, value in of_simulation(values).items():
         if name not in POLAR:
             in_settings(found, name, value)
-    told = "".join(f"# {name}: {value:.6g}\n" for name, value in values.items())
+    if SCALE in values:
+        setup = setup_of(simulation.setup, values)
+        for name in ("material.E", "material.density", "solver.gravity"):
+            in_settings(found, name, value_of(setup, name))
+        found.wind.flow = [part / ratio for part in found.wind.flow]
+    told = "".join(f"# {name}: {value:.6g}\n" for name, value in values.items()) + remark
     return "# Found by gaussian-swaying fit:\n" + told + f"frames: {settings.frames}\n" + config_text(parser, found)
 
 

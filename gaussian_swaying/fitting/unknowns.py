@@ -7,6 +7,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 from gaussian_swaying._checks import check_choice
+from gaussian_swaying.fitting.scale import SCALE, at_scale
 from gaussian_swaying.simulation import parameters
 from gaussian_swaying.simulation.parameters import find, parameter, with_values
 from gaussian_swaying.simulation.simulation import Simulation
@@ -32,7 +33,7 @@ class Unknown:
     Args:
         name: The option of ``sim``, such as ``material.E``; or ``wind.speed`` [m/s], ``wind.azimuth`` [degrees, from +x
             towards +y] and ``wind.elevation`` [degrees above the ground], which together are ``wind.flow``; or
-            :data:`FILM_START` [s].
+            :data:`FILM_START` [s], or :data:`~gaussian_swaying.fitting.scale.SCALE` [m].
         low: Smallest value.
         high: Largest value.
         scale: ``log`` or ``linear``.
@@ -52,9 +53,9 @@ class Unknown:
         where = f"unknowns.{self.name}"
         check_choice(f"{where}.scale", self.scale, SCALES)
         known = find(self.name)
-        own = self.name == FILM_START or is_change(self.name)
+        own = self.name in (FILM_START, SCALE) or is_change(self.name)
         if not own and (known is None or known.kind != "number"):
-            sought = [FILM_START, *(name for name in parameters.names() if parameter_kind(name) == "number")]
+            sought = [FILM_START, SCALE, *(name for name in parameters.names() if parameter_kind(name) == "number")]
             raise ValueError(f"`{self.name}` cannot be sought: use {', '.join(sought)}, or put it into `known`.")
         if not (math.isfinite(self.low) and math.isfinite(self.high) and self.low < self.high):
             raise ValueError(f"Expected `{where}.range` to be [low, high], but got [{self.low}, {self.high}].")
@@ -71,7 +72,8 @@ class Unknown:
         """Its unit, empty for a pure number."""
         if is_change(self.name):
             return "" if self.name.startswith(CHANGES[0]) else "degrees"
-        return "s" if self.name == FILM_START else parameter(self.name).unit
+        own = {FILM_START: "s", SCALE: "m"}
+        return own[self.name] if self.name in own else parameter(self.name).unit
 
     def value(self, share: float) -> float:
         """The value at a share of the range, 0 at ``low`` and 1 at ``high``."""
@@ -92,7 +94,7 @@ class Unknown:
 
 def of_simulation(values: Mapping[str, float]) -> dict[str, float]:
     """The values that are numbers of the simulation."""
-    return {name: value for name, value in values.items() if name != FILM_START and not is_change(name)}
+    return {n: value for n, value in values.items() if n not in (FILM_START, SCALE) and not is_change(n)}
 
 
 def parameter_kind(name: str) -> str:
@@ -114,4 +116,7 @@ def check_unknowns(simulation: Simulation, unknowns: Sequence[Unknown]) -> None:
     for name in names:
         if names.count(name) > 1:
             raise ValueError(f"`{name}` is in `unknowns` twice: remove one.")
-    with_values(simulation.setup, of_simulation({unknown.name: unknown.value(0.5) for unknown in unknowns}))
+    values = {unknown.name: unknown.value(0.5) for unknown in unknowns}
+    setup = with_values(simulation.setup, of_simulation(values))
+    if SCALE in values:
+        at_scale(setup, values[SCALE])

@@ -10,6 +10,7 @@ import torch
 
 from gaussian_swaying.aero.wind import WindField
 from gaussian_swaying.fitting.changing import changing
+from gaussian_swaying.fitting.scale import SCALE, at_scale
 from gaussian_swaying.fitting.unknowns import FILM_START, is_change, of_simulation
 from gaussian_swaying.mpm.state import MaterialPoints, State
 from gaussian_swaying.simulation.diagnostics import SimulationDiverged
@@ -65,7 +66,7 @@ def states_of(
     Raises:
         SimulationDiverged: If a variant diverges, with ``alike``.
     """
-    setups = [_setup_of(simulation.setup, own) for own in values]
+    setups = [setup_of(simulation.setup, own) for own in values]
     groups = _groups(simulation, values, setups, alike)
     before = math.ceil(max(0.0, -min(group.start for group in groups)) / simulation.frame_dt)
     for k in range(-before, 0):  # the run-up, frame by frame
@@ -79,12 +80,12 @@ def states_of(
         yield [state for _, state in sorted(found, key=lambda pair: pair[0])]
 
 
-def _setup_of(setup: Setup, values: Values) -> Setup:
-    """The setup of a variant, in a wind that changes if its values say so."""
+def setup_of(setup: Setup, values: Values) -> Setup:
+    """The setup of a variant, in a wind that changes and at another scale if its values say so."""
     found = with_values(setup, of_simulation(values))
     if isinstance(found.wind, WindField):
         found = replace(found, wind=changing(found.wind, values))
-    return found
+    return at_scale(found, values[SCALE]) if SCALE in values else found
 
 
 def _groups(simulation: Simulation, values: Sequence[Values], setups: Sequence[Setup], alike: bool) -> list[_Group]:
@@ -93,7 +94,7 @@ def _groups(simulation: Simulation, values: Sequence[Values], setups: Sequence[S
         apart = [
             (name, value)
             for name, value in sorted(own.items())
-            if name == FILM_START or not (is_change(name) or parameter(name).batched)
+            if name in (FILM_START, SCALE) or not (is_change(name) or parameter(name).batched)
         ]
         shared.setdefault((*apart, 0 if alike else _stiffness_class(setup.points)), []).append(number)
     found = []

@@ -4,6 +4,7 @@ Covers: fitting.before, fitting.page.
 """
 
 import math
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -20,6 +21,7 @@ from gaussian_swaying.cli.register import painter_of
 from gaussian_swaying.fitting.before import HELD, MOVING
 from gaussian_swaying.fitting.film import first_frame, open_film
 from gaussian_swaying.fitting.plan import read_plan
+from gaussian_swaying.fitting.scale import SCALE
 from gaussian_swaying.fitting.videos import read_videos
 from gaussian_swaying.gaussians.formats import read_gaussians
 from gaussian_swaying.recording.video import VideoEncoder
@@ -146,6 +148,21 @@ def test_a_fit_without_a_length_keeps_the_edited_file(case, checked, capsys):
     assert "wind.azimuth" in page
 
 
+def test_the_weight_as_a_ruler(case, checked, capsys):
+    """The length of a scene unit is sought; a flag that was captured with its pole, in balance, is refused."""
+    given = [str(case / "film.mp4"), "--splat", str(case / "my.ply"), "--up", "+z", "--length", "gravity"]
+    assert main([*given, "--output", str(case / "weighed"), "--check"]) == 2
+    assert "captured in balance" in capsys.readouterr().err
+    draft = (checked / "preview/draft.yaml").read_text()
+    guess = {"metres_per_unit": 0.5, "hold": {"end": "top"}, "flow": [1.0, 0.0, 0.0]}
+    preview = SimpleNamespace(data={"suggestion": guess}, configurations={"draft": draft})
+    (checked / "weighed.yaml").write_text(plan_text(preview, [0.5, 0.5, 0.5], 0.1, "gravity", checked))
+    plan = read_plan(checked / "weighed.yaml")
+    (scale,) = [u for u in plan.unknowns if u.name == SCALE]
+    assert (scale.low, scale.high) == (0.12, 2.0)
+    assert plan.assumed == ["mass"]
+
+
 @pytest.mark.parametrize(
     ("words", "told"),
     [
@@ -155,6 +172,7 @@ def test_a_fit_without_a_length_keeps_the_edited_file(case, checked, capsys):
         (["--config", "b.yaml", "--up", "+z"], "`--up` is for a film"),
         (["film.mp4", "--splat", "a.ply", "--resume"], "`--resume`"),
         (["film.mp4", "--splat", "a.ply", "--length", "pole", "long"], "a length in metres"),
+        (["film.mp4", "--splat", "a.ply", "--length", "pole"], "but got nothing"),
         (["film.mp4", "--splat", "a.ply", "--focal", "0.03"], "`--focal` from 5 to 1000 mm"),
         (["film.mp4", "--splat", "a.ply", "--up", "north"], "`--up` to be +x"),
         (["film.mp4", "--splat", "a.ply", "--up", "0", "1"], "or 3 numbers, but got 0 1"),

@@ -114,6 +114,8 @@ def test_what_the_page_shows():
         ["post 200, from this start alone", "+4.0 %", "-12.0°", "+10.0 %", "good", "yes"],
     ]
     assert cells("fit.starts", record) == [["banner 0", "+4.0 %", "-12.0°", "+10.0 %", "-0.20 s", "doubtful"]]
+    record["scales"] = {"banner": row | {"further": {"scene.metres_per_unit": [0.994, 0.01]}}}
+    assert cells("fit.scales", record) == [["banner", "+4.0 %", "-12.0°", "+10.0 %", "0.994 m", "0.010 m", "doubtful"]]
     assert cells("fit.winds", record) == [["banner 0", "+4.0 %", "-12.0°", "+10.0 %", "1.70", "1.67", "doubtful"]]
     record["independent_coverage"] = {"banner 200": fine}
     assert cells("fit.coverage", record) == [

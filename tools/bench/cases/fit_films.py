@@ -17,6 +17,7 @@ from bench.case import Case, Measurement, apart, names, option
 from bench.problems.fit_films import KINDS, Film, drawn, make
 from bench.record import Row
 from gaussian_swaying.fitting.fit import fit
+from gaussian_swaying.fitting.scale import SCALE
 from gaussian_swaying.fitting.unknowns import FILM_START
 
 UNTIL, SEARCH, TRACKS = 1.0, 32, 200
@@ -27,7 +28,7 @@ NEAR = 1.15
 """How far off the start values of the films are that only test the standard errors."""
 INDEPENDENT = 200
 """Number of the first film that nobody looked at while the fit was made; thresholds are those of earlier numbers."""
-PARTS = ("starts", "verdicts", "alone", "coverage", "winds")
+PARTS = ("starts", "verdicts", "alone", "coverage", "winds", "scales")
 
 
 def rows(options: argparse.Namespace, result: Row) -> Iterator[Measurement]:
@@ -64,6 +65,9 @@ def _fits(options: argparse.Namespace) -> Iterator[Measurement]:
                 film = drawn(kind, 3, ramp=ramp)
                 told = f"{kind}, {ramp:g} times the speed"
                 yield ("winds", told), partial(fitted, film, {}, wind_changes=True)
+    if "scales" in options.parts:
+        for kind in kinds:
+            yield ("scales", kind), partial(fitted, drawn(kind, 4), {SCALE: [1 / 3, 3.0]})
 
 
 def fitted(film: Film, more: dict[str, Any], off: float = 1.0, search: int = SEARCH, **settings: Any) -> Row:

@@ -10,6 +10,7 @@ from functools import partial
 from bench.cases.fit_films import GOALS, INDEPENDENT, counted, covered, misses
 from bench.tables.render import Row, fill, table, value
 from gaussian_swaying.fitting.report import ASTRAY
+from gaussian_swaying.fitting.scale import SCALE
 
 PAGE = "fit.md"
 
@@ -126,7 +127,9 @@ def _films(result: Row, part: str) -> Iterator[Row]:
             off = {key: row["errors"][own] for key, own in zip(off, GOALS, strict=True)}
         missed = "yes" if misses(row, 2) else ""
         start = row.get("further", {}).get("film.start", ("",))[0]
-        yield {"name": name, "missed": missed, "start": start, "gain_at_the_end": "", "true_gain": ""} | row | off
+        scale = dict(zip(("scale", "scale_error"), row.get("further", {}).get(SCALE, ("", "")), strict=True))
+        blank = {"name": name, "missed": missed, "start": start, "gain_at_the_end": "", "true_gain": ""}
+        yield blank | scale | row | off
 
 
 _OFF = "speed = {speed:+.1f %} | azimuth = {azimuth:+.1f °} | E = {E:+.1f %}"
@@ -179,6 +182,10 @@ table(
     empty="",
     before="{source}",
 )
+table(PAGE, "fit.scales", "fit_films_cpu", partial(_films, part="scales"), f"""
+    film = {{name}} | {_OFF} | length found, of 1 m = {{scale:.3f m}} | standard error = {{scale_error:.3f m}} |
+    verdict = {{verdict}}
+    """, empty="", before="{source}")  # fmt: skip
 table(PAGE, "fit.coverage", "fit_films_cpu", lambda result: [
     covered(list(result[f"{section}coverage"].values())) | {"numbers": told}
     for section, told in _SETS.items() if result.get(f"{section}coverage")], """

@@ -1,0 +1,85 @@
+"""The length of a scene unit as an unknown: the same motion as that of a scene of that length."""
+
+import pytest
+import torch
+import yaml
+from bench.problems.fit_films import Film, settings_of
+
+from gaussian_swaying.fitting.report import scene_text
+from gaussian_swaying.fitting.scale import SCALE
+from gaussian_swaying.fitting.unknowns import Unknown, check_unknowns
+from gaussian_swaying.fitting.variants import states_of
+from gaussian_swaying.simulation.simulation import Simulation
+
+from .conftest import base
+
+TIMES = [0.0, 0.1, 0.2, 0.3]
+
+
+def made(folder, metres_per_unit, **changes):
+    """The flag, of another size, on the same cells."""
+    settings = base(**changes)
+    settings["scene"]["metres_per_unit"] = metres_per_unit
+    settings["solver"]["dx"] *= metres_per_unit
+    path = folder / f"{metres_per_unit:g}.yaml"
+    path.write_text(yaml.safe_dump(settings))
+    return Simulation.from_yaml(path, device="cpu")
+
+
+def moved(simulation, values):
+    """Motion of the particles after 0.3 s [scene units]."""
+    *_, (state,) = states_of(simulation, [values], TIMES)
+    return simulation.scene.frame.displacement_to_scene(state.position - simulation.setup.points.position)
+
+
+@pytest.mark.parametrize("values", [{}, {"wind.speed": 4.0, "material.E": 2e4, "wind.speed@0.3": 2.0}])
+def test_the_motion_is_that_of_the_scene_in_its_own_length(tmp_path, values):
+    small, large = made(tmp_path, 1.0), made(tmp_path, 1.7)
+    real = moved(large, values)
+    assert real.abs().max() > 0.01
+    torch.testing.assert_close(moved(small, values | {SCALE: 1.7}), real, rtol=1e-3, atol=1e-5)
+    assert (moved(small, values) - real).abs().max() > 0.01
+
+
+def test_a_filled_body_keeps_its_density(tmp_path):
+    """A post of foam, bent by the wind and its weight."""
+    found = []
+    for scale in (1.0, 1.7):
+        settings = settings_of(Film("post", 4.0, 0.0, 4e3), tmp_path)
+        settings["scene"] |= {"metres_per_unit": scale, "filling": {"spacing": 0.03 * scale}}
+        settings["solver"]["dx"] *= scale
+        (tmp_path / "post.yaml").write_text(yaml.safe_dump(settings))
+        found.append(Simulation.from_yaml(tmp_path / "post.yaml", device="cpu"))
+    small, large = found
+    real = moved(large, {})
+    assert real.abs().max() > 0.01
+    same, other = (moved(small, values).sort(0).values for values in ({SCALE: 1.7}, {}))  # as points are in any order
+    torch.testing.assert_close(same, real.sort(0).values, rtol=1e-3, atol=1e-5)
+    assert (other - real.sort(0).values).abs().max() > 0.01
+
+
+def test_the_configuration_that_is_written_moves_as_the_fit(tmp_path):
+    small = made(tmp_path, 1.0)
+    parser, values = Simulation.parser(), {"wind.speed": 4.0, "wind.azimuth": 20.0, "material.E": 2e4, SCALE: 1.7}
+    settings = parser.parse_args(["--config", str(tmp_path / "1.yaml")])
+    (tmp_path / "scene.yaml").write_text(scene_text(values, parser, settings, small))
+    torch.testing.assert_close(
+        moved(Simulation.from_yaml(tmp_path / "scene.yaml", device="cpu"), {}),
+        moved(small, values),
+        rtol=1e-3,
+        atol=1e-5,
+    )
+
+
+def test_what_has_a_length_of_its_own_is_refused(tmp_path):
+    unknown = Unknown(SCALE, 0.5, 2.0, "log")
+    assert unknown.unit == "m"
+    check_unknowns(made(tmp_path, 1.0), [unknown])
+    gust = [{"class_path": "SineSway"}]
+    for changes, told in (
+        ({"wind": {"flow": [4.0, 0.0, 0.0], "modulations": gust}}, "plain wind"),
+        ({"solver": {"dx": 0.1, "gravity": [0.0, 0.0, 0.0]}}, "Without gravity"),
+        ({"scene": base()["scene"] | {"layers": 3}}, "scene.layers"),
+    ):
+        with pytest.raises(ValueError, match=told):
+            check_unknowns(made(tmp_path, 1.0, **changes), [unknown])
