@@ -200,7 +200,7 @@ table("fit.md", "registration.rows", "registration_cpu", lambda result: [
     place, median [% of the distance] = {distance:.2f (%)} | largest = {most_distance:.2f (%)} |
     time [s] = {seconds:.1f}
     """, empty="", before="Cameras of pictures in another light, found from no pose:\n\n{source}")  # fmt: skip
-table("fit.md", "film_fit.rows", "film_fit_cpu", "rows", """
+table("fit.md", "film_fit.rows", "film_fit_*", "rows", """
     film of = {film} | whole command [s] = {wall_s:.0f} | of the processor [s] = {processor_s:.0f} |
     memory [GiB] = {peak_bytes:.2f (GiB)} | speed = {speed_error:+.1f %} | azimuth = {azimuth_error_deg:.1f}° |
     E = {E_error:+.1f %} | verdict = {verdict}
