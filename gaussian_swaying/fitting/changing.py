@@ -18,8 +18,8 @@ from gaussian_swaying.aero.wind import WindField
 from gaussian_swaying.fitting.unknowns import CHANGES, FILM_START, Unknown, is_change
 from gaussian_swaying.simulation.parameters import flow_of
 
-KNOTS = 3
-"""Times after the first frame at which the wind is sought."""
+KNOTS, EVERY = 3, 0.4
+"""Fewest times after the first frame at which the wind is sought, and the longest time between two of them [s]."""
 WALK = {"wind.speed@": 0.5, "wind.azimuth@": 20.0}
 """Standard deviations of the change in a second: of the logarithm of the speed, and of the azimuth [degrees]."""
 PRIOR = "prior"
@@ -33,7 +33,8 @@ def changes_of(unknowns: Sequence[Unknown], until: float) -> list[Unknown]:
     The azimuth changes only where it is sought.
     """
     sought = [kind for kind in CHANGES if kind[:-1] in {u.name for u in unknowns}]
-    times = [until * (k + 1) / KNOTS for k in range(KNOTS)]
+    count = max(KNOTS, math.ceil(until / EVERY))
+    times = [until * (k + 1) / count for k in range(count)]
     return [Unknown(f"{kind}{time:.4g}", *RANGES[kind]) for kind in sought for time in times]
 
 

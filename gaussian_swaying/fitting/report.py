@@ -15,6 +15,7 @@ from gaussian_swaying._files import write_json, write_table, write_text
 from gaussian_swaying.config.parser import config_text
 from gaussian_swaying.fitting.before import titled
 from gaussian_swaying.fitting.changing import changing
+from gaussian_swaying.fitting.gusts import Gusts, gusts_of
 from gaussian_swaying.fitting.identifiability import Direction
 from gaussian_swaying.fitting.prepared import Judged
 from gaussian_swaying.fitting.scale import SCALE
@@ -113,6 +114,11 @@ class Result:
         return {u.name: s * u.slope(p) for u, s, p in zip(self.unknowns, share, self.place, strict=True)}
 
     @property
+    def gusts(self) -> Gusts | None:
+        """Mean, intensity and time scale of a wind that changes; None of a steady one."""
+        return gusts_of(self.unknowns, self.place, self.covariance)
+
+    @property
     def vague(self) -> list[str]:
         """Names of unknowns that the video does not determine."""
         values, errors, found = self.values, self.errors, []
@@ -197,6 +203,7 @@ class Result:
             told = "" if math.isnan(one.predicted) else f", predicted frames {one.predicted:.2f} dB"
             lines.append(f"camera {one.camera}: fitted frames {one.fitted:.2f} dB{told}")
         lines += self.seen
+        lines += [self.gusts.sentence()] if self.gusts else []
         lines += [sentence for one in self.judged for sentence in one.sentences()]
         failed, doubtful = self.doubts()
         said = {"good": "This fit is good.", "doubtful": "This fit is doubtful:", "failed": "This fit has failed:"}
@@ -315,6 +322,7 @@ def write_results(
             "verdict": result.verdict,
             "why": [*failed, *doubtful],
             "motion_explained": dict(result.followed),
+            "gusts": asdict(result.gusts) | {"time_scale_is_told": result.gusts.told} if result.gusts else None,
             "notes": list(result.notes),
             "assumed": list(result.assumed),
             "background": [asdict(one) for one in result.judged],

@@ -1,5 +1,6 @@
 """A wind that changes during a film: its speed and azimuth at a few times, taken where they predict better."""
 
+import json
 import math
 
 import pytest
@@ -24,6 +25,7 @@ def test_the_unknowns_of_a_wind_that_changes():
     names = [u.name for u in changes_of([SPEED, AZIMUTH], 0.6)]
     assert names == [f"wind.{kind}@{time}" for kind in ("speed", "azimuth") for time in ("0.2", "0.4", "0.6")]
     assert [u.name for u in changes_of([SPEED], 0.6)] == names[:KNOTS]
+    assert [u.name.split("@")[1] for u in changes_of([SPEED], 2.8)] == ["0.4", "0.8", "1.2", "1.6", "2", "2.4", "2.8"]
     assert [u.value(steady_share(u)) for u in changes_of([SPEED, AZIMUTH], 0.6)] == pytest.approx([1] * 3 + [0] * 3)
     assert {u.unit for u in changes_of([SPEED, AZIMUTH], 0.6)} == {"", "degrees"}
 
@@ -77,6 +79,9 @@ def test_it_is_taken_where_it_predicts_better(own, tmp_path, ramp, capsys):
         assert set(result.values) == set(sought)
         return
     assert len(result.values) == len(sought) + KNOTS
+    assert result.gusts.seconds == pytest.approx(0.75)
+    assert result.gusts.sentence() in result.text()
+    assert json.loads((tmp_path / "fit/result.json").read_text())["gusts"]["time_scale_is_told"] is False
     assert result.values["wind.speed"] == pytest.approx(TRUTH["wind.speed"], rel=0.1)
     assert result.values["wind.speed@0.75"] == pytest.approx(2.0, rel=0.15)
     again = Simulation.from_yaml(tmp_path / "fit/scene.yaml", device="cpu")

@@ -1,13 +1,15 @@
 """Small films with known answers: what a film shows, and what is counted of their fits."""
 
 import json
+import math
 from types import SimpleNamespace
 
 import pytest
+import torch
 import yaml
 from bench.cases import fit_films
 from bench.cases.fit_films import covered, misses
-from bench.problems.fit_films import FPS, KINDS, Film, drawn, make
+from bench.problems.fit_films import FPS, KINDS, Film, drawn, make, speeds
 
 from gaussian_swaying.fitting.videos import read_videos
 
@@ -35,6 +37,16 @@ def test_films_that_begin_earlier_and_later(tmp_path):
     assert apart(frames[-0.1][0], frames[0.0][3]) < apart(frames[-0.1][0], frames[0.0][0])
     base = yaml.safe_load((tmp_path / "0.0/base.yaml").read_text())
     assert base["wind"]["flow"] == [KINDS["pole flag"].speed, 0.0, 0.0]  # not the answer
+
+
+def test_a_wind_with_gusts_has_their_intensity_and_time_scale():
+    """Of a film so long that its own numbers are those of the process."""
+    film = Film("banner", 4.0, 40.0, 8e3, seconds=2000.0, gusts=(0.2, 0.5))
+    found = torch.tensor([speed for _, speed in speeds(film)], dtype=torch.float64)
+    assert float(found.mean()) == pytest.approx(4.0, rel=0.03)
+    assert float(found.std()) == pytest.approx(0.8, rel=0.05)
+    off = found - found.mean()
+    assert float((off[5:] * off[:-5]).mean() / off.square().mean()) == pytest.approx(math.exp(-1), abs=0.06)
 
 
 @pytest.mark.parametrize("kind", list(KINDS))
@@ -116,6 +128,12 @@ def test_what_the_page_shows():
     assert cells("fit.starts", record) == [["banner 0", "+4.0 %", "-12.0°", "+10.0 %", "-0.20 s", "doubtful"]]
     record["scales"] = {"banner": row | {"further": {"scene.metres_per_unit": [0.994, 0.01]}}}
     assert cells("fit.scales", record) == [["banner", "+4.0 %", "-12.0°", "+10.0 %", "0.994 m", "0.010 m", "doubtful"]]
+    spectrum = {"mean": [3.0, 2.7, 3.4], "intensity": [0.2, 0.1, 0.4], "time_scale": [0.6, 0.3, 3.0], "told": False}
+    record["gusts"] = {"banner": row | {"gusts": spectrum, "true_mean": 3.1}, "post": refused}
+    assert cells("fit.gusts", record) == [
+        ["banner", "3 (2.7 to 3.4)", "3.10", "0.2 (0.1 to 0.4)", "0.6 (0.3 to 3)", "no", "doubtful"],
+        ["post", "", "", "", "", "no", "failed"],
+    ]
     assert cells("fit.winds", record) == [["banner 0", "+4.0 %", "-12.0°", "+10.0 %", "1.70", "1.67", "doubtful"]]
     record["independent_coverage"] = {"banner 200": fine}
     assert cells("fit.coverage", record) == [

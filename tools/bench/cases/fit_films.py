@@ -8,13 +8,14 @@ import os
 import tempfile
 import time
 from collections.abc import Iterator
+from dataclasses import asdict
 from functools import partial
 from pathlib import Path
-from statistics import median
+from statistics import fmean, median
 from typing import Any
 
 from bench.case import Case, Measurement, apart, names, option
-from bench.problems.fit_films import KINDS, Film, drawn, make
+from bench.problems.fit_films import KINDS, Film, drawn, make, speeds
 from bench.record import Row
 from gaussian_swaying.fitting.fit import fit
 from gaussian_swaying.fitting.scale import SCALE
@@ -22,13 +23,15 @@ from gaussian_swaying.fitting.unknowns import FILM_START
 
 UNTIL, SEARCH, TRACKS = 1.0, 32, 200
 """Fitted part of a film [s], simulations of the coarse search, and most tracks."""
+GUSTY, GUSTS = 3.0, (0.25, 0.5)
+"""Length of a film with gusts [s], and their intensity and time scale [s]."""
 GOALS = {"wind.speed": 0.05, "wind.azimuth": 5.0, "material.E": 0.15}
 """Largest errors that are wanted: shares, and degrees."""
 NEAR = 1.15
 """How far off the start values of the films are that only test the standard errors."""
 INDEPENDENT = 200
 """Number of the first film that nobody looked at while the fit was made; thresholds are those of earlier numbers."""
-PARTS = ("starts", "verdicts", "alone", "coverage", "winds", "scales")
+PARTS = ("starts", "verdicts", "alone", "coverage", "winds", "scales", "gusts")
 
 
 def rows(options: argparse.Namespace, result: Row) -> Iterator[Measurement]:
@@ -68,6 +71,10 @@ def _fits(options: argparse.Namespace) -> Iterator[Measurement]:
     if "scales" in options.parts:
         for kind in kinds:
             yield ("scales", kind), partial(fitted, drawn(kind, 4), {SCALE: [1 / 3, 3.0]})
+    if "gusts" in options.parts:
+        for kind in kinds:
+            film = drawn(kind, 5, seconds=GUSTY, gusts=GUSTS)
+            yield ("gusts", kind), partial(fitted, film, {}, wind_changes=True, until=GUSTY)
 
 
 def fitted(film: Film, more: dict[str, Any], off: float = 1.0, search: int = SEARCH, **settings: Any) -> Row:
@@ -91,6 +98,8 @@ def fitted(film: Film, more: dict[str, Any], off: float = 1.0, search: int = SEA
         "further": {name: [found.values[name], found.errors[name]] for name in found.values if name not in film.truth},
         "gain_at_the_end": found.values.get(f"wind.speed@{UNTIL:.4g}", 1.0),
         "true_gain": 1 + (film.ramp - 1) * UNTIL / film.seconds,
+        "gusts": None if found.gusts is None else asdict(found.gusts) | {"told": found.gusts.told},
+        "true_mean": fmean(speed for _, speed in speeds(film)),
         "verdict": found.verdict,
         "why": [*failed, *doubtful],
         "explained": min(found.followed.values()),

@@ -30,6 +30,8 @@ NOISE, CRF = 3.0, 28
 """Noise of each pixel and colour [grey levels of 255], and the quality of H.264 that a phone's film has."""
 FINER = 2 / 3
 """Cells of the film's grid per those of the fit's."""
+GUST = 0.1
+"""Time between two speeds of a wind with gusts [s]."""
 SPACING = 0.02
 """Distance between the Gaussians of a cloth [m]."""
 
@@ -75,6 +77,7 @@ class Film:
         seconds: Its length.
         start: Time at which the motion begins [s]; below 0, the film begins in motion.
         ramp: The speed at the end per that at the begin; 1 for a steady wind.
+        gusts: Standard deviation of the speed per its mean, and the time scale of its changes [s]; None for none.
         seed: Of the noise.
     """
 
@@ -85,7 +88,13 @@ class Film:
     seconds: float = 1.5
     start: float = 0.0
     ramp: float = 1.0
+    gusts: tuple[float, float] | None = None
     seed: int = 0
+
+    @property
+    def steady(self) -> bool:
+        """True in a wind that does not change."""
+        return self.ramp == 1 and self.gusts is None
 
     @property
     def truth(self) -> dict[str, float]:
@@ -157,7 +166,7 @@ def settings_of(film: Film, folder: Path, finer: float = 1.0) -> dict[str, Any]:
         "scene": scene,
         "material": material | ({"law": "NeoHookean"} if soft else {"thickness": 0.01}),
         "solver": {"dx": (0.048 if soft else 0.06) * finer, "cfl": 0.4 * finer, "boundaries": pins},
-        "wind": {"flow": [film.speed, 0.0, 0.0]} if film.ramp == 1 else {"schedule": _ramp(film)},
+        "wind": {"flow": [film.speed, 0.0, 0.0]} if film.steady else {"schedule": _schedule(film)},
         "aero": {"C_D": 1.0, "C_F": 0.0, "C_L": 0.0, "law": "projected"},
         "cameras": {
             "phone": {
@@ -178,7 +187,7 @@ def make(film: Film, folder: Path) -> None:
     """Write ``film.mp4`` with its ``transforms.json``, ``base.yaml`` with a wind of its own, and ``truth.json``."""
     folder.mkdir(parents=True, exist_ok=True)
     own = copy.deepcopy(settings_of(film, folder, FINER))
-    if film.ramp == 1:
+    if film.steady:
         turn = math.radians(film.azimuth)
         own["wind"]["flow"] = [film.speed * math.cos(turn), film.speed * math.sin(turn), 0.0]
     simulation = _read(own, folder / "film.yaml")
@@ -197,19 +206,29 @@ def make(film: Film, folder: Path) -> None:
     fields = lens | {"w": camera.width, "h": camera.height, "frames": [entry]}
     (folder / "transforms.json").write_text(json.dumps(fields), encoding="utf-8")
     kind = KINDS[film.kind]
-    base = settings_of(replace(film, E=kind.E, speed=kind.speed, ramp=1.0), folder)
+    base = settings_of(replace(film, E=kind.E, speed=kind.speed, ramp=1.0, gusts=None), folder)
     (folder / "base.yaml").write_text(yaml.safe_dump(base), encoding="utf-8")
     (folder / "truth.json").write_text(json.dumps(film.truth), encoding="utf-8")
 
 
-def _ramp(film: Film) -> list[dict[str, Any]]:
-    """The wind of a film whose speed rises from its first frame to its last."""
-    turn = math.radians(film.azimuth)
-    found = []
-    for time, factor in ((0.0, 1.0), (film.seconds, film.ramp)):
-        speed = film.speed * factor
-        found.append({"time": time, "flow": [speed * math.cos(turn), speed * math.sin(turn), 0.0]})
+def speeds(film: Film) -> list[tuple[float, float]]:
+    """Times [s] and speeds [m/s] of a wind that rises from the first frame to the last, or has gusts."""
+    if film.gusts is None:
+        return [(0.0, film.speed), (film.seconds, film.ramp * film.speed)]
+    intensity, scale = film.gusts
+    draw, now, found = random.Random(f"gusts {film.kind} {film.seed}"), 0.0, []
+    keep = math.exp(-GUST / scale)
+    for k in range(math.ceil(film.seconds / GUST) + 1):
+        now = keep * now + math.sqrt(1 - keep**2) * draw.gauss(0, 1) if k else draw.gauss(0, 1)
+        found.append((GUST * k, film.speed * max(0.1, 1 + intensity * now)))
     return found
+
+
+def _schedule(film: Film) -> list[dict[str, Any]]:
+    turn = math.radians(film.azimuth)
+    return [
+        {"time": time, "flow": [speed * math.cos(turn), speed * math.sin(turn), 0.0]} for time, speed in speeds(film)
+    ]
 
 
 def _read(settings: dict[str, Any], path: Path) -> Simulation:

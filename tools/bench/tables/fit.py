@@ -186,6 +186,22 @@ table(PAGE, "fit.scales", "fit_films_cpu", partial(_films, part="scales"), f"""
     film = {{name}} | {_OFF} | length found, of 1 m = {{scale:.3f m}} | standard error = {{scale_error:.3f m}} |
     verdict = {{verdict}}
     """, empty="", before="{source}")  # fmt: skip
+
+
+def _gusts(result: Row) -> Iterator[Row]:
+    """Mean, intensity and time scale of winds with gusts, as intervals."""
+    for name, row in result.get("gusts", {}).items():
+        known = row.get("gusts") or {}
+        told = {key: "{:.2g} ({:.2g} to {:.2g})".format(*known[key]) if known else "" for key in _SPECTRUM}
+        blank = {"true_mean": ""}
+        yield blank | row | told | {"name": name, "told": "yes" if known.get("told") else "no"}
+
+
+_SPECTRUM = ("mean", "intensity", "time_scale")
+table(PAGE, "fit.gusts", "fit_films_cpu", _gusts, """
+    film = {name} | mean [m/s] = {mean} | of the film [m/s] = {true_mean:.2f} | intensity = {intensity} |
+    time scale [s] = {time_scale} | time scale is told = {told} | verdict = {verdict}
+    """, empty="", before="{source}")  # fmt: skip
 table(PAGE, "fit.coverage", "fit_films_cpu", lambda result: [
     covered(list(result[f"{section}coverage"].values())) | {"numbers": told}
     for section, told in _SETS.items() if result.get(f"{section}coverage")], """
