@@ -6,6 +6,7 @@ does not return to where it came from.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
@@ -26,6 +27,8 @@ WINDOW, WIDE = 15, 960
 LEVELS = 3
 BACK = 0.5
 """Largest distance between a point and the one found by following it back [pixels]."""
+AROUND = 6.0
+"""Border around the windows in which Gaussians are drawn to see how they overlap, in their standard deviations."""
 _DRAWN = 1e-3
 """Least sum of the weights of a Gaussian in a picture with which it counts as visible [pixels]."""
 STILL = 0.5
@@ -212,14 +215,18 @@ def drawn_beside(painter: Painter, gaussians: DeformedGaussians, camera: Camera,
     Returns:
         Rendered minus projected centre [pixels], float64, shape (T, 2).
     """
-    opacity, width, height = painter.scene.model.opacity().detach(), camera.width, camera.height
+    if not len(places):
+        return torch.zeros(0, 2, dtype=torch.float64)
+    opacity, (column, row) = painter.scene.model.opacity().detach(), _windows(places, camera.width, camera.height)
+    camera, left, top = _part(camera, gaussians, column, row)
+    width, height = camera.width, camera.height
 
     def drawn(colours: Tensor) -> Tensor:
         return painter.renderer(gaussians.means, gaussians.covariances, opacity, colours, camera).color
 
-    row, column = torch.meshgrid(torch.arange(height) + 0.5, torch.arange(width) + 0.5, indexing="ij")
+    y, x = torch.meshgrid(torch.arange(height) + 0.5, torch.arange(width) + 0.5, indexing="ij")
     middle = torch.tensor([0.5 * width, 0.5 * height])
-    asked = torch.stack([torch.ones(height, width), column - middle[0], row - middle[1]], -1).to(opacity)
+    asked = torch.stack([torch.ones(height, width), x - middle[0], y - middle[1]], -1).to(opacity)
     colours = torch.zeros(len(opacity), 3, device=opacity.device, requires_grad=True)
     with torch.enable_grad():
         (sums,) = torch.autograd.grad(drawn(colours), colours, asked)
@@ -227,9 +234,26 @@ def drawn_beside(painter: Painter, gaussians: DeformedGaussians, camera: Camera,
     shift = torch.where(weight > _DRAWN, sums[:, 1:] / weight - centre, 0.0)
     with torch.no_grad():
         field = drawn(torch.cat([shift, (weight > _DRAWN).to(shift)], 1)).cpu().double()
-    column, row = _windows(places, width, height)
-    found = field[row, column].mean(1)
+    found = field[row - top, column - left].mean(1)
     return found[:, :2] / found[:, 2:].clamp(min=1e-6)
+
+
+def _part(camera: Camera, gaussians: DeformedGaussians, column: Tensor, row: Tensor) -> tuple[Camera, int, int]:
+    """The camera of the part of a picture with some pixels and the Gaussians in them; its left and upper end."""
+    pixel, depth = project(gaussians.means, camera)
+    low, high = (torch.stack([end(column), end(row)]).to(pixel) for end in (torch.min, torch.max))
+    near = ((pixel >= low) & (pixel <= high)).all(-1) & (depth > camera.near)
+    size = (
+        gaussians.covariances.diagonal(dim1=-2, dim2=-1).amax(-1).sqrt()[near] * camera.intrinsics[0, 0] / depth[near]
+    )
+    border = math.ceil(AROUND * float(size.quantile(0.95))) if len(size) else 0
+    left, top = (max(0, int(end) - border) for end in low)
+    right, bottom = (
+        min(most, int(end) + border + 1) for most, end in zip((camera.width, camera.height), high, strict=True)
+    )
+    lens = camera.intrinsics.clone()
+    lens[:2, 2] -= lens.new_tensor([left, top])
+    return replace(camera, intrinsics=lens, width=right - left, height=bottom - top), left, top
 
 
 def _at_rest(off: Tensor, beside: Tensor) -> tuple[float, Tensor]:

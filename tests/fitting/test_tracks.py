@@ -7,6 +7,7 @@ import pytest
 import torch
 import yaml
 
+from gaussian_swaying.fitting import tracks
 from gaussian_swaying.fitting.evidence import TrackEvidence
 from gaussian_swaying.fitting.tracks import _inside, drawn_beside, match, track, window_of
 from gaussian_swaying.fitting.variants import states_of
@@ -120,6 +121,24 @@ def test_where_a_gaussian_is_drawn_is_the_mean_of_its_pixels(simulation):
     window = field[row - 7 : row + 8, column - 7 : column + 8].sum((0, 1))
     found = drawn_beside(painter, gaussians, camera, centres[20:21])[0]
     torch.testing.assert_close(found.float(), window[:2] / window[2], atol=1e-3, rtol=0)
+
+
+def test_only_the_surroundings_of_windows_are_drawn(simulation, monkeypatch):
+    """And what is found is that of the whole picture."""
+    painter, camera = simulation.painter, cameras()["left"]
+    move = torch.tensor([[0.0, 0.0, 200.0], [0.0, 0.0, 120.0], [0.0, 0.0, 0.0]])
+    camera = replace(camera, intrinsics=camera.intrinsics + move, width=600, height=360)
+    gaussians = painter.scene.rest()
+    places = project(gaussians.means, camera)[0][20:22]
+    drawn = []
+    hook = painter.renderer.register_forward_hook(lambda _, given, out: drawn.append(out.color[..., 0].numel()))
+    found = drawn_beside(painter, gaussians, camera, places)
+    assert max(drawn) < 0.5 * 600 * 360
+    monkeypatch.setattr(tracks, "AROUND", 1000.0)
+    torch.testing.assert_close(found, drawn_beside(painter, gaussians, camera, places), atol=1e-3, rtol=0)
+    assert drawn[-1] == 600 * 360
+    hook.remove()
+    assert drawn_beside(painter, gaussians, camera, places[:0]).shape == (0, 2)
 
 
 def _photographed(camera, finer=3):
