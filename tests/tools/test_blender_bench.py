@@ -28,7 +28,7 @@ def test_both_sides_have_the_same_flag(pattern):
     Pattern 4 and the curtain have a spacing in their configuration that does not divide their width.
     """
     parser = Simulation.parser()
-    for number in (160, 40, 100):
+    for number in (160, 40, 100) if pattern == 1 else (160, 100, 40):  # the last one is built
         run = Run(pattern, "ours", number, 75)
         flag, settings = run.flag(), parser.parse_args([*run.arguments(), "--device=cpu"])
         assert settings.solver.dx == pytest.approx(flag.longer_side / number, rel=1e-4)

@@ -51,7 +51,10 @@ def strain(F):
 @pytest.mark.parametrize("transfer", TRANSFERS)
 @pytest.mark.parametrize("formulation", FORMULATIONS)
 def test_a_free_part_keeps_momenta_energy_and_shape(formulation, transfer):
-    """It turns about no axis of its own, so that the axis of its rotation moves: 1,000 substeps, 1.4 turns."""
+    """It turns about no axis of its own, so that the axis of its rotation moves: 1,000 substeps, 1.4 turns.
+
+    Torch, which is slow, takes 300 of them.
+    """
     points, solver = bar(RigidRegion(Everything()), formulation=formulation, transfer=transfer, gravity=(0, 0, 0))
     arm = points.position - points.position.mean(0)
     spin = torch.tensor([3.0, 8.0, 1.0], dtype=torch.float64).expand_as(arm)
@@ -59,7 +62,7 @@ def test_a_free_part_keeps_momenta_energy_and_shape(formulation, transfer):
     state = solver.rollout(solver.init_state(points, velocity, margin=2), 1e-3, 1)
     momenta, energy = solver.momenta(state), solver.energies(state)["kinetic"]
     distance, errors = torch.pdist(points.position), []
-    for _ in range(10):
+    for _ in range(3 if transfer == "torch" else 10):
         state = solver.rollout(solver.fit_grid(state, 0.1), 1e-3, 100)
         errors.append(float((torch.pdist(state.position) - distance).abs().max()))
         assert strain(state.F_total) < 1e-12
