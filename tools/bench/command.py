@@ -14,7 +14,7 @@ from bench.slots import SlotError
 _OWN = (
     "speed live accuracy pareto points backward gradients surfaces flags pins contact fit soft folds gallery previews "
     "area blender places frames detail drawn leaves refinement web sweeps winds stability nature air registration "
-    "film_fit handheld fit_films"
+    "film_fit handheld fit_films hand_films"
 )
 _FILES = {name: f"{name}.CASE" for name in _OWN.split()}
 _FILES |= {"substep": "runs.SUBSTEP", "sim": "runs.SIM", "train": "training.CASE"}

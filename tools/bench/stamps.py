@@ -43,6 +43,7 @@ PARTS: dict[str, tuple[str, ...]] = {
     "frames": _SIMULATION,
     "gallery": _DRAWN,
     "gradients": _SIMULATION,
+    "hand_films": (*_DRAWN, "fitting"),
     "handheld": (*_DRAWN, "fitting"),
     "leaves": _DRAWN,
     "live": (*_DRAWN, "viewer"),

@@ -68,8 +68,8 @@ SEEN = 1.25
 """Part of the room that is in the splat, in widths and heights of the picture."""
 OFF, TURNED = 3.0, 60.0
 """How far the start values of a fit are off: factor, and degrees."""
-UNTIL = 1.2
-"""Time of the motion up to which it is fitted [s]."""
+UNTIL = 1.0
+"""Length of the motion that is fitted [s]."""
 CLOTHS: dict[str, FlagPattern] = {
     "curtain": CASES["curtain"],
     "banner": replace(flag((1.0, 2.3, 0.0), "b"), density=50.0, pinned="sides", cells=50),
@@ -79,7 +79,7 @@ CLOTHS: dict[str, FlagPattern] = {
 }
 """Cloths. The banner is as heavy as real ones. On the flag, which folds up as it falls, meshes of Blender's cloth agree
 to millimetres; on the larger ones of :data:`fit_cases.CASES` they are centimetres apart after 0.3 s."""
-CELLS = 15
+CELLS = 12
 """Cells of the grid of a fit along the longer side of a cloth."""
 POST = "post"
 RANGES = {"wind.speed": (0.5, 16.0), "wind.azimuth": (-80.0, 160.0), "material.E": (1e3, 4e4)}
@@ -294,7 +294,12 @@ def write_film(thing: Thing, case: Path, folder: Path, video: FitVideo, view: Vi
     write_h264(folder / "film.mp4", noisy, video.size, FPS)
     lens = {"fl_x": view.focal, "fl_y": view.focal, "cx": 0.5 * view.width, "cy": 0.5 * view.height}
     start = sign * SHIFT / FPS
-    entry = {"video_path": "film.mp4", "time": 0.0, "seconds": 1.5 + start, "transform_matrix": view.pose.tolist()}
+    entry = {
+        "video_path": "film.mp4",
+        "time": 0.0,
+        "seconds": 0.3 + _until(sign),
+        "transform_matrix": view.pose.tolist(),
+    }
     write_json(folder / "transforms.json", lens | {"w": view.width, "h": view.height, "frames": [entry]})
     place = folder.resolve().as_posix()
     write_ply(folder / "splat.ply", both(thing.cloud, _seen(thing, video, view)))
@@ -320,6 +325,11 @@ def _seen(thing: Thing, video: FitVideo, view: View) -> GaussianCloud:
     return cloud.select(inside)
 
 
+def _until(sign: int) -> float:
+    """Time of a film up to which it is fitted [s]."""
+    return UNTIL + max(0, sign) * SHIFT / FPS
+
+
 def fit_settings(thing: Thing, sign: int) -> dict[str, Any]:
     """A configuration of ``gaussian-swaying fit``, whose start values are far off."""
     true = {"wind.speed": thing.truth["speed"], "material.E": thing.truth["E"]}
@@ -333,8 +343,9 @@ def fit_settings(thing: Thing, sign: int) -> dict[str, Any]:
         "base": ["scene.yaml"],
         "videos": ["."],
         "unknowns": unknowns | {"film.start": {"range": [-0.5, 0.5]}},
-        "until": UNTIL + sign * SHIFT / FPS,
-        "search": 48,
+        "until": _until(sign),
+        "search": 32,
+        "tracks": 200,
     }
 
 

@@ -202,6 +202,18 @@ table(PAGE, "fit.gusts", "fit_films_cpu", _gusts, """
     film = {name} | mean [m/s] = {mean} | of the film [m/s] = {true_mean:.2f} | intensity = {intensity} |
     time scale [s] = {time_scale} | time scale is told = {told} | verdict = {verdict}
     """, empty="", before="{source}")  # fmt: skip
+table(
+    PAGE,
+    "hand_films.rows",
+    "hand_films_cpu",
+    partial(_films, part="rows"),
+    f"""
+    film = {{name}} | {_OFF} | start = {{start:.2f s}} | verdict = {{verdict}} |
+    more than twice the goals off = {{missed}} | processor = {{processor_s:.0f s}} |
+    memory = {{peak_bytes:.2f (GiB)}}""",
+    empty="",
+    before="{source}",
+)
 table(PAGE, "fit.coverage", "fit_films_cpu", lambda result: [
     covered(list(result[f"{section}coverage"].values())) | {"numbers": told}
     for section, told in _SETS.items() if result.get(f"{section}coverage")], """
