@@ -16,7 +16,7 @@ if "moving" in sys.argv[3]:
     sys.exit(2)
 pathlib.Path("fit").mkdir()
 found = {"wind.speed": (2.18, 0.1), "wind.azimuth": (47.0, 2.0), "material.E": (4e3, 4e2), "film.start": (0.19, 0.01)}
-rows = [{"name": name, "value": value, "error": error} for name, (value, error) in found.items()]
+rows = [{"name": name, "value": value, "standard_error": error} for name, (value, error) in found.items()]
 told = {"values": rows, "verdict": "doubtful", "why": ["Rough."], "motion_explained": {"0": 0.9}}
 pathlib.Path("fit/result.json").write_text(json.dumps(told))
 """

@@ -18,8 +18,8 @@ LARGER = 2.0
 """How much larger the print is than on cloth, for something that is 1 m long."""
 PALE = 0.55
 """Share of grey that is mixed into the print."""
-OVERLAP = 0.65
-"""Standard deviation of a Gaussian per its distance to the next one: nothing is seen through."""
+OVERLAP = 0.6
+"""Standard deviation of a Gaussian per its distance to the next one: little is seen through."""
 TEXELS = 800
 """Texels along a period of the print."""
 

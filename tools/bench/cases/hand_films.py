@@ -49,7 +49,8 @@ def measured(folder: Path) -> Row:
     return row | {
         "errors": errors,
         "standard_errors": {
-            name: values[name]["error"] / (1 if own == "azimuth" else truth[own]) for name, own in NAMES.items()
+            name: values[name]["standard_error"] / (1 if own == "azimuth" else truth[own])
+            for name, own in NAMES.items()
         },
         "start": values["film.start"]["value"],
         "true_start": truth["start"],
