@@ -38,7 +38,7 @@ ASTRAY = 6.0
 """Largest accepted PSNR loss of fitted frames against the frame at rest [dB]; 6 dB is four times the squared error."""
 FOLLOWED, LOST = 0.95, 0.5
 """Share of the tracked motion that the simulation has to explain in a good fit, and below which a fit has failed."""
-VAGUE, TURNED = 0.25, 10.0
+VAGUE, TURNED = 0.25, 5.0
 """Standard error, as a share of the range (of the value on a logarithmic scale), and of an angle [degrees], above which
 an unknown is called not determined."""
 
