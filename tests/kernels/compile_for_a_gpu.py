@@ -1,4 +1,3 @@
-# ruff: noqa: E402
 """Compiles the kernels of a few rollouts for a GPU of NVIDIA on a machine that may have none; prints their names.
 
 A program of its own, as kernels belong to Triton or to the compiler for a CPU from their import on. Launches compile
@@ -10,31 +9,23 @@ import sys
 from pathlib import Path
 
 import torch
-from triton import compile as compiled
-from triton.backends.compiler import GPUTarget
-from triton.compiler import ASTSource
 
-sys.path.insert(0, str(Path(__file__).parents[1]))
-here = torch.cuda.is_available
-torch.cuda.is_available = lambda: True
-from gaussian_swaying.kernels import language  # noqa: F401
-
-torch.cuda.is_available = here
-from gaussian_swaying.kernels import launch as module
-
-TYPES = {torch.float32: "*fp32", torch.float64: "*fp64", torch.int32: "*i32", torch.int8: "*i8", torch.int64: "*i64"}
-TYPES |= {torch.bool: "*i1", torch.uint8: "*u8"}
 OPTIONS = ("num_warps", "num_stages", "maxnreg")
 seen = set()
 
 
 def kind(value):
     if isinstance(value, torch.Tensor):
-        return TYPES[value.dtype]
+        types = {torch.float32: "*fp32", torch.float64: "*fp64", torch.int32: "*i32", torch.int64: "*i64"}
+        return (types | {torch.int8: "*i8", torch.uint8: "*u8", torch.bool: "*i1"})[value.dtype]
     return "i32" if isinstance(value, int) else "fp32"
 
 
 def launch(kernel, grid):
+    from triton import compile as compiled
+    from triton.backends.compiler import GPUTarget
+    from triton.compiler import ASTSource
+
     def run(*given, **named):
         named.pop("launch_cooperative_grid", None)
         options = {name: named.pop(name) for name in OPTIONS if name in named}
@@ -49,14 +40,26 @@ def launch(kernel, grid):
     return run
 
 
-module.launch, module.wide = launch, lambda device: True
-module.lanes, module.compiles = lambda device, gpu, cpu=8: gpu, lambda device: True
+def main():
+    sys.path.insert(0, str(Path(__file__).parents[1]))
+    here, torch.cuda.is_available = torch.cuda.is_available, lambda: True
+    from gaussian_swaying.kernels import language  # noqa: F401
 
-from mpm.triton.bodies import DT, make_load, make_points, make_solver, set_going
-from mpm.triton.test_boundaries import BOUNDARIES
+    torch.cuda.is_available = here
+    from gaussian_swaying.kernels import launch as module
 
-for formulation, boundaries in (("updated", "walls and pins"), ("updated", "handle"), ("total", "two pins")):
-    points = make_points("cpu", count=12, batch=(2,))
-    solver = make_solver("kernels", formulation, boundaries=BOUNDARIES[boundaries]())
-    with contextlib.suppress(ValueError, FloatingPointError):  # of what the rollout should have computed
-        solver.rollout(set_going(solver, points), DT, 3, make_load(points))
+    module.launch, module.wide = launch, lambda device: True
+    module.lanes, module.compiles = lambda device, gpu, cpu=8: gpu, lambda device: True
+
+    from mpm.triton.bodies import DT, make_load, make_points, make_solver, set_going
+    from mpm.triton.test_boundaries import BOUNDARIES
+
+    for formulation, boundaries in (("updated", "walls and pins"), ("updated", "handle"), ("total", "two pins")):
+        points = make_points("cpu", count=12, batch=(2,))
+        solver = make_solver("kernels", formulation, boundaries=BOUNDARIES[boundaries]())
+        with contextlib.suppress(ValueError, FloatingPointError):  # of what the rollout should have computed
+            solver.rollout(set_going(solver, points), DT, 3, make_load(points))
+
+
+if __name__ == "__main__":
+    main()
