@@ -32,7 +32,7 @@ def remembered(key: Callable[[], str], root: Path) -> str:
     parts = [(str(file), file.stat().st_size, file.stat().st_mtime_ns) for file in files]
     kept = cache_folder() / f"triton_{hashlib.sha256(repr(parts).encode()).hexdigest()[:32]}.key"
     try:
-        return kept.read_text()
+        return kept.read_text(encoding="utf-8")
     except OSError:
         pass
     found = key()

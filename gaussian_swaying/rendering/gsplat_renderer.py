@@ -58,7 +58,7 @@ def load_kernels() -> bool:
         library = build_folder() / "gsplat_cuda.so"
         stamp = library.with_suffix(".stamp")
         try:
-            if stamp.read_text() == _stamp(library):
+            if stamp.read_text(encoding="utf-8") == _stamp(library):
                 _load(library)
                 return True
         except (ImportError, OSError, UnicodeError):  # it was never loaded, or is broken
