@@ -2,36 +2,47 @@
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Callable, Iterable, Iterator
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import Future, ThreadPoolExecutor
 from typing import TypeVar
 
 import torch
 
 ResultT = TypeVar("ResultT")
 
+AHEAD = 2
+"""Pieces that each thread may be ahead of what is taken."""
 
-def in_threads(work: Callable[..., ResultT], *arguments: Iterable[object], most: int) -> Iterator[ResultT]:
+
+def in_threads(work: Callable[..., ResultT], *arguments: Iterable[object], threads: int) -> Iterator[ResultT]:
     """As ``map``, with the results in the order of the arguments, for any number of threads.
 
-    Each thread runs the operations of torch alone, so no more threads are at work than torch has.
+    Each thread runs the operations of torch alone, with the gradients and the inference mode of the caller.
 
     Args:
         work: The function.
         arguments: Its arguments, one iterable for each.
-        most: Largest number of threads.
+        threads: Number of threads; with one, the caller does the work, with all threads of torch.
     """
-    count, grad = torch.get_num_threads(), torch.is_grad_enabled()
-    if min(count, most) <= 1:
+    if threads <= 1:
         yield from map(work, *arguments)
         return
+    count, grad, inference = torch.get_num_threads(), torch.is_grad_enabled(), torch.is_inference_mode_enabled()
 
-    def with_grad(*given: object) -> ResultT:
-        with torch.set_grad_enabled(grad):  # a thread begins with gradients
+    def alike(given: tuple[object, ...]) -> ResultT:
+        with torch.inference_mode(inference), torch.set_grad_enabled(grad):  # of each thread
             return work(*given)
 
-    with ThreadPoolExecutor(min(count, most), initializer=torch.set_num_threads, initargs=(1,)) as pool:
-        try:
-            yield from pool.map(with_grad, *arguments)
-        finally:
-            torch.set_num_threads(count)  # for threads that begin later
+    waiting: deque[Future[ResultT]] = deque()
+    pool = ThreadPoolExecutor(threads, initializer=torch.set_num_threads, initargs=(1,))
+    try:
+        for given in zip(*arguments, strict=False):
+            waiting.append(pool.submit(alike, given))
+            if len(waiting) > AHEAD * threads:
+                yield waiting.popleft().result()
+        while waiting:
+            yield waiting.popleft().result()
+    finally:
+        pool.shutdown(cancel_futures=True)
+        torch.set_num_threads(count)  # for threads that begin later

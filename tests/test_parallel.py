@@ -20,7 +20,7 @@ def test_it_is_map(threads):
     torch.set_num_threads(threads)
     try:
         with torch.no_grad():
-            found = list(in_threads(work, range(5), "abcde", most=4))
+            found = list(in_threads(work, range(5), "abcde", threads=threads))
         later = []
         thread = threading.Thread(target=lambda: later.append(torch.get_num_threads()))
         thread.start()
@@ -31,12 +31,12 @@ def test_it_is_map(threads):
     assert later == [threads]
 
 
-def test_one_at_a_time_if_more_need_too_much_memory():
+def test_the_caller_does_the_work_alone_if_no_more_threads_are_wanted():
     here = []
     before = torch.get_num_threads()
     torch.set_num_threads(3)
     try:
-        list(in_threads(lambda _: here.append(threading.current_thread()), range(3), most=0))
+        list(in_threads(lambda _: here.append(threading.current_thread()), range(3), threads=0))
     finally:
         torch.set_num_threads(before)
     assert here == [threading.current_thread()] * 3
@@ -47,7 +47,22 @@ def test_an_error_is_raised_and_the_threads_are_as_before():
     torch.set_num_threads(2)
     try:
         with pytest.raises(ZeroDivisionError):
-            list(in_threads(lambda number: 1 // number, [1, 0], most=2))
+            list(in_threads(lambda number: 1 // number, [1, 0], threads=2))
         assert torch.get_num_threads() == 2
     finally:
         torch.set_num_threads(before)
+
+
+def test_no_more_is_done_than_a_few_pieces_ahead():
+    """Results that nobody has taken yet fill the memory."""
+    done = []
+    found = in_threads(done.append, range(50), threads=2)
+    next(found)
+    found.close()
+    assert len(done) < 10
+
+
+def test_threads_have_the_inference_mode_of_the_caller():
+    with torch.inference_mode():
+        assert list(in_threads(lambda _: torch.is_inference_mode_enabled(), range(3), threads=2)) == [True] * 3
+    assert list(in_threads(lambda _: torch.is_inference_mode_enabled(), range(3), threads=2)) == [False] * 3

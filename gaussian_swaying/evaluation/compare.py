@@ -5,12 +5,10 @@ from __future__ import annotations
 import math
 import os
 import sys
-from collections import deque
-from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import Future, ThreadPoolExecutor
+from collections.abc import Sequence
 from contextlib import suppress
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
@@ -21,6 +19,7 @@ from tqdm import tqdm
 from gaussian_swaying._checks import check_positive, check_shape
 from gaussian_swaying._files import without_nan, write_json, write_text
 from gaussian_swaying._inputs import check_archive, read_json
+from gaussian_swaying._parallel import in_threads
 from gaussian_swaying._provenance import describe_device, versions
 from gaussian_swaying.captures.images import image_size, read_image
 from gaussian_swaying.evaluation.comparison_picture import comparison_picture
@@ -160,6 +159,7 @@ def compare_run(
     if video is not None and with_pictures:
         encoder = VideoEncoder(Path(video), 1 / float(summary.get("frame_dt_s") or 0.04))
 
+    @torch.inference_mode()
     def compared(number: int) -> tuple[dict[str, Any], np.ndarray | None, list[Tensor]]:
         """The numbers of a frame, its picture for the video, and what the network gets: reference and run."""
         row: dict[str, Any] = {"frame": first + number, "reference_frame": first_reference + number}
@@ -179,7 +179,8 @@ def compare_run(
     rows: list[dict[str, Any]] = []
     prepared: list[list[Tensor]] = []
     try:
-        done = in_threads(compared, count, device)
+        # reading and writing pictures takes longer than comparing them
+        done = in_threads(compared, range(count), threads=min(8, os.cpu_count() or 1))
         for row, film, small in tqdm(done, total=count, unit="frame", disable=not progress, file=sys.stderr):
             if encoder is not None and film is not None:
                 encoder.write(film)
@@ -465,36 +466,3 @@ def _number(value: float | None, form: str) -> str:
 
 def _line(cells: Sequence[str], widths: Sequence[int]) -> str:
     return f"| {cells[0]:<{widths[0]}} | {cells[1]:>{widths[1]}} | {cells[2]:>{widths[2]}} |"
-
-
-T = TypeVar("T")
-
-AHEAD = 2  # frames that each thread may be ahead
-
-
-def in_threads(work: Callable[[int], T], count: int, device: torch.device) -> Iterator[T]:
-    """``work(0)`` to ``work(count - 1)`` in order, computed by threads: one for each core, at most eight.
-
-    Reading and writing pictures takes longer than comparing them. On a CPU each thread computes with one core.
-    """
-    workers = max(1, min(8, os.cpu_count() or 1))
-    threads = torch.get_num_threads()
-    waiting: deque[Future[T]] = deque()
-
-    def one(number: int) -> T:
-        with torch.inference_mode():  # it is set per thread
-            return work(number)
-
-    pool = ThreadPoolExecutor(workers, "compare")
-    try:
-        if device.type == "cpu":
-            torch.set_num_threads(1)
-        for number in range(count):
-            waiting.append(pool.submit(one, number))
-            if len(waiting) > AHEAD * workers:
-                yield waiting.popleft().result()
-        while waiting:
-            yield waiting.popleft().result()
-    finally:
-        pool.shutdown(cancel_futures=True)
-        torch.set_num_threads(threads)

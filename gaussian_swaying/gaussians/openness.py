@@ -139,7 +139,8 @@ def openness(
 
     light, shares, gaps, total = sums = [torch.zeros(count, dtype=torch.float64) for _ in range(4)]
     each = range(_LINES), lines, *axes_across(lines)
-    for patch, *found in in_threads(along, *each, most=_AT_ONCE // len(part)):
+    threads = min(torch.get_num_threads(), _AT_ONCE // len(part))
+    for patch, *found in in_threads(along, *each, threads=threads):
         for whole, of_line in zip(sums, found, strict=True):
             whole.index_add_(0, patch, of_line)
     low, high = _GAP

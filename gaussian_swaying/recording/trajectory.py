@@ -8,6 +8,7 @@ from __future__ import annotations
 import os
 import re
 import shutil
+import threading
 import zipfile
 from collections.abc import Iterator, Mapping
 from pathlib import Path
@@ -112,6 +113,10 @@ def _check_array(stream: IO[bytes], sizes: tuple[int, ...], kind: type, particle
         raise ValueError(f"an array of {dtype} {shape} is not from this run")
 
 
+_PARSING = threading.Lock()
+"""Held while NumPy parses headers: Python 3.11 raises a SystemError where two threads parse at once."""
+
+
 def load_trajectory(path: str | os.PathLike[str], frame: int) -> tuple[Tensor, Tensor]:
     """Position [m, z up] (P, 3) and F (P, 3, 3) of the simulated particles at one recorded frame.
 
@@ -126,4 +131,6 @@ def load_trajectory(path: str | os.PathLike[str], frame: int) -> tuple[Tensor, T
         name = f"{frame:05d}"
         if f"position_{name}" not in arrays:
             raise ValueError(f"{path} has no frame {frame}: it has {len(arrays.files) // 2} frames.")
-        return torch.from_numpy(arrays[f"position_{name}"]), torch.from_numpy(arrays[f"F_{name}"]).float()
+        with _PARSING:
+            position, F = arrays[f"position_{name}"], arrays[f"F_{name}"]
+        return torch.from_numpy(position), torch.from_numpy(F).float()

@@ -26,6 +26,7 @@ from gaussian_swaying.gaussians.harmonics import sh_to_color
 from gaussian_swaying.gaussians.ply import read_ply, write_ply
 from gaussian_swaying.geometry.covariances import covariance
 from gaussian_swaying.recording import recorder as recorder_module
+from gaussian_swaying.recording import trajectory
 from gaussian_swaying.recording.recorder import Recorder
 from gaussian_swaying.recording.trajectory import load_trajectory
 from gaussian_swaying.recording.video import VideoEncoder
@@ -696,3 +697,32 @@ def test_foreign_files_are_not_overwritten(name, make_simulation, tmp_path):
 def test_a_recorder_without_a_folder():
     with pytest.raises(RuntimeError, match=r"`open\(folder\)`"):
         Recorder().write_summary({})
+
+
+def test_arrays_are_read_by_one_thread_at_a_time(tmp_path, monkeypatch):
+    """Where two threads parse headers at once and the collector runs, Python 3.11 raises a SystemError now and then."""
+    (tmp_path / "trajectory.npz").touch()
+    inside, most = [], []
+
+    class Archive(dict):
+        def __enter__(self):
+            return self
+
+        def __exit__(self, *error):
+            pass
+
+        def __getitem__(self, name):
+            inside.append(name)
+            most.append(len(inside))
+            time.sleep(0.01)
+            inside.remove(name)
+            return np.zeros((5, 3), dtype=np.float32)
+
+    monkeypatch.setattr(trajectory, "check_archive", lambda path, what: path)
+    monkeypatch.setattr(np, "load", lambda path: Archive({"position_00000": 0, "F_00000": 0}))
+    threads = [threading.Thread(target=load_trajectory, args=(tmp_path / "trajectory.npz", 0)) for _ in range(3)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert most == [1] * 6

@@ -5,13 +5,14 @@ from __future__ import annotations
 import json
 import os
 import random
+import runpy
 import struct
 import zlib
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
-from commands import ROOT, load
 from sandbox import Case
 
 VALUES = (
@@ -19,7 +20,8 @@ VALUES = (
     [[1e30] * 4] * 4, "../../../etc/passwd", "\u0000", "/dev/zero", [1, 2, 3],
 )  # fmt: skip
 Change = Callable[[random.Random, Path], None]
-TOOLS = load(ROOT / "tests/captures/conftest.py")
+ROOT = Path(__file__).parents[2]
+TOOLS = SimpleNamespace(**runpy.run_path(str(ROOT / "tests/captures/conftest.py")))
 
 
 def _json(folder: Path) -> Any:

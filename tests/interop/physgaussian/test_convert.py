@@ -10,7 +10,6 @@ import copy
 import json
 import math
 import re
-import runpy
 from pathlib import Path
 
 import pytest
@@ -19,6 +18,7 @@ import yaml
 from shared import refused
 from small_scenes import plain_cloud
 
+from gaussian_swaying.cli.convert import main as convert_main
 from gaussian_swaying.cli.simulate import main
 from gaussian_swaying.gaussians.parts import Part, Parts
 from gaussian_swaying.gaussians.ply import write_ply
@@ -42,7 +42,6 @@ from gaussian_swaying.scenes.procedural import FlagScene
 from gaussian_swaying.simulation.normalisation import Normalisation
 from gaussian_swaying.simulation.simulation import Simulation
 
-TOOL = Path(__file__).parents[3] / "tools/convert_physgaussian.py"
 PAGE = Path(__file__).parents[3] / "docs/physgaussian.md"
 PARSER = Simulation.parser()
 REST = {"start_time": 0.0, "end_time": 1e3}
@@ -928,14 +927,13 @@ def test_parts_of_the_splat_work_with_a_converted_configuration(tmp_path):
 # ---- command lines
 
 
-def test_the_tool_writes_what_sim_reads(tmp_path, capsys):
+def test_the_command_writes_what_sim_reads(tmp_path, capsys):
     """To a file or to the standard output, the same; bad input leaves nothing behind."""
     config, output = tmp_path / "wolf.json", tmp_path / "wolf.yaml"
     config.write_text(json.dumps(PUBLISHED["wolf"]))
-    tool = runpy.run_path(str(TOOL))["main"]
-    assert tool([str(config)]) == 0
+    assert convert_main([str(config)]) == 0
     streams = capsys.readouterr()
-    assert tool([str(config), "--output", str(output)]) == 0
+    assert convert_main([str(config), "--output", str(output)]) == 0
     assert output.read_text() == streams.out
     assert streams.out.startswith("# PhysGaussian's wolf.json, converted.")
     assert "note: `release_particles_sequentially`" in streams.err
@@ -947,7 +945,9 @@ def test_the_tool_writes_what_sim_reads(tmp_path, capsys):
     assert direct == settings
     output.unlink()
     config.write_text(json.dumps({"g": STILL, "densty": 1}))
-    refused(tool, [str(config), "--output", str(output)], capsys, "error: Unknown key `densty`", folder=tmp_path)
+    refused(
+        convert_main, [str(config), "--output", str(output)], capsys, "error: Unknown key `densty`", folder=tmp_path
+    )
 
 
 @pytest.mark.parametrize("text", ["{", "[]", None])
