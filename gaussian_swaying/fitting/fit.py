@@ -59,6 +59,7 @@ from gaussian_swaying.fitting.report import (
     wind_seen,
     write_results,
 )
+from gaussian_swaying.fitting.rivals import rivals_of
 from gaussian_swaying.fitting.tracks import Tracks, beside_rest, match, opencv, still_until, track
 from gaussian_swaying.fitting.unknowns import FILM_START, check_unknowns
 from gaussian_swaying.fitting.variants import check_variants, states_of
@@ -98,8 +99,6 @@ APART, SAME = 0.15, 0.03
 """Least distance between starts, and largest between ends that are the same, as a share of a range."""
 BRIEF = 4
 """Most iterations of a short solve at a horizon."""
-SHAKEN = 0.12
-"""Change of what is sought of the material at the end, to see whether the fit returns, as a share of the range."""
 RIVAL = 1.05
 """Cost per that of the best end below which another end is as good."""
 ROUNDS = 2
@@ -415,12 +414,9 @@ class Fit:
     ) -> tuple[list[dict[str, float]], list[float]]:
         """Values of other ends that cost as little as the best one, and the best place if it is clearly better.
 
-        Other starts, a softer and a stiffer material are tried over all fitted frames.
+        Other starts, and the rivals that are known of any fit, are tried over all fitted frames.
         """
-        tried = [list(other) for other in rivals]
-        for k, u in enumerate(self.plan.unknowns):
-            for side in (-SHAKEN, SHAKEN) if u.name.startswith("material.") else ():
-                tried.append([*place[:k], min(max(place[k] + side, 0.0), 1.0), *place[k + 1 :]])
+        tried = [*map(list, rivals), *rivals_of(self.simulation.setup, self.plan.unknowns, place)]
         if not tried:
             return [], []
         evidence = self._trusted(self.evidence("tracks" if self.stages[0] == "matches" else self.stages[0]), place)

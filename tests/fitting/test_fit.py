@@ -12,9 +12,10 @@ import pytest
 import torch
 import yaml
 
-from gaussian_swaying.fitting.fit import GRIDS, ROUNDS, SHAKEN, Course, Fit, fit, run_fit
+from gaussian_swaying.fitting.fit import GRIDS, ROUNDS, Course, Fit, fit, run_fit
 from gaussian_swaying.fitting.held_out import HELD
 from gaussian_swaying.fitting.plan import Plan, read_unknown
+from gaussian_swaying.fitting.rivals import SHAKEN
 from gaussian_swaying.fitting.videos import read_videos
 from gaussian_swaying.simulation.simulation import Simulation
 

@@ -188,6 +188,8 @@ class FusedUpdated(Fused):
 
     def _pressed(self) -> Tensor:
         """Sum of what the programs of the nodes took, for each scene, shape (scenes, B, 3)."""
+        if self.scenes == 1:
+            return self.pressed.sum((0, 1))[None]
         slots = self.pressed.shape[1]
         first = torch.arange(len(self.pressed), device=self.device) * self.node_block // self.grid.node_count
         found = self.pressed.new_zeros(self.scenes + slots, *self.pressed.shape[2:])

@@ -1,0 +1,84 @@
+"""Rivals of the end of a fit: other values that may explain the same film, to be tried before it is believed.
+
+A fit ends in the nearest minimum of its cost. Two kinds of other minima are known: of a flapping flag, those of softer
+and stiffer materials; and of a sheet, that of the wind mirrored at its normal, which presses as hard on it. Only the
+friction and the edges tell that from the true wind, so it explains nearly as much of the motion.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+
+import torch
+
+from gaussian_swaying.fitting.unknowns import Unknown
+from gaussian_swaying.simulation.parameters import Setup, flow_of
+
+SHAKEN = 0.12
+"""Change of what is sought of the material, as a share of the range."""
+FLAT = 0.8
+"""Part of the area that faces one way, level with the ground, from which the wind may be mirrored: a mean square."""
+TURN = 5.0
+"""Least angle between the wind and its mirror image [degrees]."""
+
+
+def rivals_of(setup: Setup, unknowns: Sequence[Unknown], place: Sequence[float]) -> list[list[float]]:
+    """Places from which to start again at the end of a fit, as shares of the ranges, within them.
+
+    Args:
+        setup: The scene.
+        unknowns: What is sought.
+        place: Where the fit ended.
+
+    Returns:
+        For each number of the material a smaller and a larger one, then the mirrored wind if there is one.
+    """
+    found = []
+    for k, unknown in enumerate(unknowns):
+        for side in (-SHAKEN, SHAKEN) if unknown.name.startswith("material.") else ():
+            found.append([*place[:k], min(max(place[k] + side, 0.0), 1.0), *place[k + 1 :]])
+    names = [unknown.name for unknown in unknowns]
+    if "wind.azimuth" in names:
+        k = names.index("wind.azimuth")
+        values = {u.name: u.value(share) for u, share in zip(unknowns, place, strict=True)}
+        azimuth = mirrored(setup, values)
+        share = unknowns[k].share(_within(azimuth, unknowns[k])) if azimuth is not None else -1.0
+        if 0 <= share <= 1:
+            found.append([*place[:k], share, *place[k + 1 :]])
+    return found
+
+
+def mirrored(setup: Setup, values: Mapping[str, float]) -> float | None:
+    r"""Return the azimuth of the wind mirrored at the normal of a sheet at rest [degrees]; None if nothing is flat.
+
+    The pressure on a sheet with normal n depends on :math:`w \cdot n` and the speed, which the mirror image
+    :math:`2 (w \cdot n) n - w` leaves. Level with the ground, that is the azimuth :math:`2 \beta - \alpha`, with the
+    azimuth :math:`\beta` of n.
+
+    Args:
+        setup: The scene.
+        values: Values of the unknowns, with ``wind.azimuth``.
+    """
+    patches = setup.scene.patches
+    normal = patches.normal.double()[:, :2]
+    weight = patches.area.double() / patches.area.double().sum()
+    shares, axes = torch.linalg.eigh((weight[:, None, None] * normal[:, :, None] * normal[:, None, :]).sum(0).cpu())
+    if not float(shares[-1]) >= FLAT:
+        return None
+    facing = math.degrees(math.atan2(float(axes[1, -1]), float(axes[0, -1])))
+    x, y, _ = flow_of((1.0, 0.0, 0.0), values)
+    azimuth = math.degrees(math.atan2(y, x))
+    other = 2 * facing - azimuth
+    return other if abs(_turned(other - azimuth)) >= TURN else None
+
+
+def _turned(angle: float) -> float:
+    """An angle between -180 and 180 degrees."""
+    return (angle + 180) % 360 - 180
+
+
+def _within(azimuth: float, unknown: Unknown) -> float:
+    """The same direction within a range if it has it, nearest to the middle."""
+    middle = 0.5 * (unknown.low + unknown.high)
+    return middle + _turned(azimuth - middle)

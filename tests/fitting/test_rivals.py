@@ -1,0 +1,65 @@
+"""Other values that may explain the same film."""
+
+import math
+
+import pytest
+import torch
+
+from gaussian_swaying.fitting.fit import Fit
+from gaussian_swaying.fitting.plan import Plan, read_unknown
+from gaussian_swaying.fitting.rivals import SHAKEN, mirrored, rivals_of
+from gaussian_swaying.fitting.videos import read_videos
+from gaussian_swaying.simulation.parameters import flow_of
+
+
+def test_the_wind_is_mirrored_at_the_normal_of_a_sheet(simulation):
+    """The flag is nearly the plane of x and z: a wind along +x + y has the same pressure as one along -x + y."""
+    assert mirrored(simulation.setup, {"wind.azimuth": 56.0}) == pytest.approx(124.0, abs=3.0)
+    patches = simulation.scene.patches
+    pressed = []
+    for azimuth in (56.0, mirrored(simulation.setup, {"wind.azimuth": 56.0})):
+        flow = torch.tensor(flow_of((3.0, 0.0, 0.0), {"wind.azimuth": azimuth}))
+        pressed.append(float((patches.area * (patches.normal @ flow).square()).sum()))
+    assert pressed[1] == pytest.approx(pressed[0], rel=1e-4)
+
+
+def test_a_wind_across_a_sheet_or_along_it_is_its_own_mirror_image(simulation):
+    """Along it, the image blows the other way: a flag would be on the other side of its pole, which a fit can try."""
+    assert mirrored(simulation.setup, {"wind.azimuth": 90.0}) is None
+    assert math.cos(math.radians(mirrored(simulation.setup, {"wind.azimuth": 0.0}))) == pytest.approx(-1, abs=0.01)
+
+
+def test_a_body_that_faces_all_ways_has_no_mirror_image(simulation):
+    patches = simulation.scene.patches
+    turn = torch.linspace(0, math.pi, len(patches.normal))
+    normal, own = torch.stack([turn.cos(), turn.sin(), torch.zeros_like(turn)], -1), patches.normal
+    patches.normal = normal
+    try:
+        assert mirrored(simulation.setup, {"wind.azimuth": 56.0}) is None
+    finally:
+        patches.normal = own
+
+
+def test_rivals_lie_within_the_ranges(simulation):
+    sought = [read_unknown("wind.azimuth", [-80.0, 160.0]), read_unknown("material.E", [1e3, 1e5])]
+    softer, stiffer, other = rivals_of(simulation.setup, sought, [0.5, 0.95])
+    assert (softer, stiffer) == ([0.5, pytest.approx(0.95 - SHAKEN)], [0.5, 1.0])
+    assert sought[0].value(other[0]) == pytest.approx(140.0, abs=3.0)
+    assert other[1] == 0.95
+    narrow = [read_unknown("wind.azimuth", [0.0, 90.0])]
+    assert rivals_of(simulation.setup, narrow, [0.5]) == []  # 135 degrees is known to be wrong
+    around = [read_unknown("wind.azimuth", [150.0, 450.0])]
+    (again,) = rivals_of(simulation.setup, around, [0.6])  # 330 degrees is -30
+    assert around[0].value(again[0]) == pytest.approx(210.0, abs=3.0)
+
+
+def test_a_fit_tries_them_at_its_end(own, simulation):
+    """The mirror image fits better, so the fit goes on there."""
+    sought = [read_unknown("wind.azimuth", [0.0, 180.0])]
+    plan = Plan([str(own / "base.yaml")], [str(own / "video")], sought)
+    made = Fit(simulation, read_videos(own / "video"), plan)
+    made._brief = lambda places, evidence, times: (places[::-1], [1.0, 2.0])
+    others, better = made._others([0.3], [])
+    assert better == rivals_of(simulation.setup, sought, [0.3])[0]
+    assert made.values(better)["wind.azimuth"] == pytest.approx(180 - 54, abs=3.0)
+    assert others == [made.values(better)]
