@@ -59,7 +59,7 @@ from gaussian_swaying.fitting.report import (
     wind_seen,
     write_results,
 )
-from gaussian_swaying.fitting.rivals import rivals_of
+from gaussian_swaying.fitting.rivals import bent_alike, rivals_of
 from gaussian_swaying.fitting.tracks import Tracks, beside_rest, match, opencv, still_until, track
 from gaussian_swaying.fitting.unknowns import FILM_START, check_unknowns
 from gaussian_swaying.fitting.variants import check_variants, states_of
@@ -331,7 +331,8 @@ class Fit:
         """Return the best starts of a coarse search: Sobol's sequence over the ranges, then draws around the best.
 
         Coefficients and damping stay in the middle of their ranges, and what has a ``start`` stays there, but for
-        :data:`SPREAD`. Values that were given are the first start. Simulations of similar stiffness are one batch.
+        :data:`SPREAD`. Then other stiffnesses are tried that bend as far as the best. Values that were given are the
+        first start. Simulations of similar stiffness are one batch.
         """
         unknowns, plan = self.plan.unknowns, self.plan
         begin = [0.5 if u.start is None else u.share(u.start) for u in unknowns]
@@ -353,18 +354,21 @@ class Fit:
         times = self.fitted[: max(3, round(SEARCHED * len(self.fitted)))]
         places = torch.cat([torch.tensor([begin] * given, dtype=torch.float64).reshape(-1, len(begin)), places])
         places, costs = self._coarse(places, evidence, times)
+        if others := bent_alike(unknowns, places[int(costs.argmin())].tolist()):
+            stiff, other = self._coarse(torch.tensor(others, dtype=torch.float64), evidence, times)
+            places, costs = torch.cat([places, stiff]), torch.cat([costs, other])
         generator = torch.Generator().manual_seed(plan.seed)
         near = places[int(costs.argmin())].repeat(plan.search - 3 * plan.search // 4, 1)
         if len(near):
             shift = torch.randn(len(near), len(moving), generator=generator, dtype=torch.float64)
             near[:, moving] = (near[:, moving] + NEAR * shift).clamp(0.02, 0.98)
-            near, others = self._coarse(near, evidence, times)
-            places, costs = torch.cat([places, near]), torch.cat([costs, others])
+            near, other = self._coarse(near, evidence, times)
+            places, costs = torch.cat([places, near]), torch.cat([costs, other])
         if not bool(torch.isfinite(costs).any()):
             raise DivergedError("Every simulation of the coarse search diverged: narrow the ranges of `unknowns`.")
         found = places[:1].tolist() if given else []
         for place in places[costs.argsort()].tolist():
-            apart = all(max(abs(place[k] - other[k]) for k in moving) > APART for other in found)
+            apart = all(max(abs(a - b) for a, b in zip(place, other, strict=True)) > APART for other in found)
             if len(found) < plan.starts and apart:
                 found.append(place)
         return found

@@ -1,8 +1,9 @@
-"""Rivals of the end of a fit: other values that may explain the same film, to be tried before it is believed.
+"""Rivals: other values that may explain the same film, to be tried at the start of a fit and before its end is believed.
 
-A fit ends in the nearest minimum of its cost. Two kinds of other minima are known: of a flapping flag, those of softer
-and stiffer materials; and of a sheet, that of the wind mirrored at its normal, which presses as hard on it. Only the
-friction and the edges tell that from the true wind, so it explains nearly as much of the motion.
+A fit ends in the nearest minimum of its cost. Three kinds of others are known: of a body that swings, a stiffer one in
+more wind; of a flapping flag, those of softer and stiffer materials; and of a sheet, that of the wind mirrored at its
+normal, which presses as hard on it. Only the friction and the edges tell that from the true wind, so it explains nearly
+as much of the motion.
 """
 
 from __future__ import annotations
@@ -19,6 +20,8 @@ SHAKEN = 0.12
 """Change of what is sought of the material, as a share of the range."""
 FLAT = 0.8
 """Part of the area that faces one way, level with the ground, from which the wind may be mirrored: a mean square."""
+SCANNED = 16
+"""Values of Young's modulus over its range that are tried in a wind that bends the object as far."""
 TURN = 5.0
 """Least angle between the wind and its mirror image [degrees]."""
 
@@ -46,6 +49,34 @@ def rivals_of(setup: Setup, unknowns: Sequence[Unknown], place: Sequence[float])
         share = unknowns[k].share(_within(azimuth, unknowns[k])) if azimuth is not None else -1.0
         if 0 <= share <= 1:
             found.append([*place[:k], share, *place[k + 1 :]])
+    return found
+
+
+def bent_alike(unknowns: Sequence[Unknown], place: Sequence[float]) -> list[list[float]]:
+    r"""Places with another Young's modulus and the wind that bends the object as far, at first and at rest in the end.
+
+    The bend grows as :math:`w^2 / E`, so a start that is several times too stiff and too windy shows it, too, only with
+    oscillations that are too fast: the cost has a minimum there, and many on the way to the true one.
+
+    Args:
+        unknowns: What is sought.
+        place: Where the wind bends it as far as it should, as shares of the ranges.
+
+    Returns:
+        :data:`SCANNED` places over the range of ``material.E``; none if that or ``wind.speed`` is not sought.
+    """
+    names = [unknown.name for unknown in unknowns]
+    if not {"material.E", "wind.speed"} <= set(names):
+        return []
+    k, j = names.index("material.E"), names.index("wind.speed")
+    stiffness, wind, found = unknowns[k], unknowns[j], []
+    for number in range(SCANNED):
+        other = list(place)
+        other[k] = (number + 0.5) / SCANNED
+        ratio = stiffness.value(other[k]) / stiffness.value(place[k])
+        speed = wind.value(place[j]) * math.sqrt(ratio)
+        other[j] = wind.share(min(max(speed, wind.low), wind.high))
+        found.append(other)
     return found
 
 

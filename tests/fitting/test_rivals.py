@@ -7,9 +7,13 @@ import torch
 
 from gaussian_swaying.fitting.fit import Fit
 from gaussian_swaying.fitting.plan import Plan, read_unknown
-from gaussian_swaying.fitting.rivals import SHAKEN, mirrored, rivals_of
+from gaussian_swaying.fitting.rivals import SCANNED, SHAKEN, bent_alike, mirrored, rivals_of
 from gaussian_swaying.fitting.videos import read_videos
 from gaussian_swaying.simulation.parameters import flow_of
+
+from .conftest import TRUTH
+
+pytest.importorskip("cv2", reason="needs the extra [fit]")
 
 
 def test_the_wind_is_mirrored_at_the_normal_of_a_sheet(simulation):
@@ -63,3 +67,29 @@ def test_a_fit_tries_them_at_its_end(own, simulation):
     assert better == rivals_of(simulation.setup, sought, [0.3])[0]
     assert made.values(better)["wind.azimuth"] == pytest.approx(180 - 54, abs=3.0)
     assert others == [made.values(better)]
+
+
+def test_other_stiffnesses_bend_as_far():
+    """All over the range of E, with the square of the speed in proportion where its range allows that."""
+    sought = [read_unknown("wind.speed", [1.0, 9.0]), read_unknown("material.E", [1e3, 1e5])]
+    start = [sought[0].share(3.0), sought[1].share(1e4)]
+    found = [[u.value(share) for u, share in zip(sought, place, strict=True)] for place in bent_alike(sought, start)]
+    assert len(found) == SCANNED
+    assert [e for _, e in found] == pytest.approx([1e3 * 100 ** ((k + 0.5) / SCANNED) for k in range(SCANNED)])
+    for speed, e in found:
+        assert speed == pytest.approx(min(max(3.0 * math.sqrt(e / 1e4), 1.0), 9.0))
+    assert bent_alike(sought[:1], start[:1]) == bent_alike(sought[1:], start[1:]) == []
+
+
+def test_the_search_finds_the_stiffness_although_its_start_is_three_times_off(own, simulation):
+    """The start stays the first, and is not the best."""
+    sought = [
+        read_unknown("wind.speed", {"range": [1.0, 20.0], "start": 15.0}),
+        read_unknown("material.E", {"range": [1e3, 1e5], "start": 3e4}),
+    ]
+    plan = Plan([str(own / "base.yaml")], [str(own / "video")], sought, search=16, starts=2)
+    made = Fit(simulation, read_videos(own / "video"), plan)
+    begin, best = (made.values(place) for place in made.search())
+    assert begin == pytest.approx({"wind.speed": 15.0, "material.E": 3e4})
+    assert best["material.E"] == pytest.approx(TRUTH["material.E"], rel=0.6)
+    assert best["wind.speed"] == pytest.approx(TRUTH["wind.speed"], rel=0.3)
