@@ -26,7 +26,7 @@ def _peers(rows: list[Row]) -> Iterator[Row]:
 def _turning(results: list[Row]) -> Iterator[Row]:
     """Blocks in a box, of ``bench.py speed``, beside the other solvers that have walls."""
     peers = [row for result in results for row in result.get("rows", []) if "walls included" in row.get("solver", "")]
-    ours = [row for result in results for row in result.get("cube", []) if row["walls"]]
+    ours = [row | {"on": result["device"]} for result in results for row in result.get("cube", []) if row["walls"]]
     for row in sorted(ours, key=lambda row: row["asked"]):
         times = {peer["solver"].split(",")[0]: peer["ms"] for peer in peers if peer["points"] == row["asked"]}
         if times:
@@ -36,9 +36,9 @@ def _turning(results: list[Row]) -> Iterator[Row]:
 
 
 table(PAGE, "peers.turning", "*pee*", _turning, """
-    points = {particles:,} | motion = {how} | ours [ms] = {median_ms:.3g} | CK-MPM [ms] = {peers.CK-MPM:.3g} |
+    points = {particles:,} | motion = {how} | ours on = {on} | ours [ms] = {median_ms:.3g} | CK-MPM [ms] = {peers.CK-MPM:.3g} |
     claymore [ms] = {peers.claymore:.3g} | the faster one per ours = {ratio:.2f} | 1.5 wanted = {reached}
-    """, before="Blocks in a box, ours as in the table of cubes above:", together=True)  # fmt: skip
+    """, before="Blocks in a box, the other solvers on an H200:", together=True)  # fmt: skip
 
 
 def _announced(result: Row) -> Iterator[Row]:
