@@ -96,6 +96,7 @@ def fit(options: argparse.Namespace, begun: list[str]) -> int:
             resume=options.resume,
             device=options.device,
             started=lambda: begun.append(f"{again} --resume"),
+            in_use=[Path(file)],
         )
     print(result.text())
     for name in OURS[1:]:

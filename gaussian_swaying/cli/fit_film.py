@@ -315,7 +315,7 @@ def plan_text(preview: Preview, background: Sequence[float], still: float | None
     material = yaml.safe_load(preview.configurations["draft"])["material"]
     assumed = ["mass", *(() if scaled else ("length",)), *(() if still is not None else ("camera",))]
     low, high = (float(f"{material['E'] * factor:.1e}") for factor in (SOFTER, STIFFER))
-    middle, half = 0.0, 180.0
+    middle, half = 0.0, 200.0  # more than all ways round, so that none is at an end of the range
     if guess["hold"]["end"] == "side":  # a flag flies away from its pole
         middle, half = math.degrees(math.atan2(guess["flow"][1], guess["flow"][0])), 120.0
     around = [round(middle - half), round(middle + half)]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import math
 import os
 import sys
@@ -59,7 +60,7 @@ from gaussian_swaying.fitting.report import (
     wind_seen,
     write_results,
 )
-from gaussian_swaying.fitting.rivals import bent_alike, rivals_of
+from gaussian_swaying.fitting.rivals import apart_by, bent_alike, rivals_of
 from gaussian_swaying.fitting.tracks import Tracks, beside_rest, match, opencv, still_until, track
 from gaussian_swaying.fitting.unknowns import FILM_START, check_unknowns
 from gaussian_swaying.fitting.variants import check_variants, states_of
@@ -199,7 +200,20 @@ class Fit:
             )
         check_variants(simulation)
         self._tracks: list[Tracks] | None = None
+        self._other_grids: list[Simulation] | None = None
+        self._check_begins()
         self.first: list[float] = []
+
+    def _check_begins(self) -> None:
+        """Points are followed from the start of the motion, or a state before it, so all cameras have to see that."""
+        sought = [u.low for u in self.plan.unknowns if u.name == FILM_START]
+        for video in self.videos:
+            begin, step = video.times[0], (video.times[-1] - video.times[0]) / max(len(video.times) - 1, 1)
+            if self.followed and begin > max([1.5 * step, *sought]):
+                raise ValueError(
+                    f"The frames of camera {video.name} begin at {begin:.3g} s, but points are followed from 0 s on: "
+                    "cut all videos to the same beginning, or leave that camera out of `cameras`."
+                )
 
     # ---- what is compared
 
@@ -289,9 +303,17 @@ class Fit:
 
     def _grids(self) -> list[Simulation]:
         """The same scene on other grids."""
-        with warnings.catch_warnings():  # of an object of few cells
-            warnings.simplefilter("ignore")
-            return [self.on_grid(ratio) for ratio in GRIDS] if self.on_grid else []
+        if self._other_grids is None:
+            self._other_grids = []
+            for ratio in GRIDS if self.on_grid else ():
+                try:
+                    with warnings.catch_warnings():  # of an object of few cells
+                        warnings.simplefilter("ignore")
+                        self._other_grids.append(self.on_grid(ratio))  # type: ignore[misc]
+                except ValueError as error:
+                    told = f"cells {ratio:g} times as large, to know the error of the grid, are not possible: {error}"
+                    self.say(told)
+        return self._other_grids
 
     def _run(self, places: Tensor, times: Sequence[float]) -> Any:
         return states_of(self.simulation, [self.values(place) for place in places], times, alike=False)
@@ -343,6 +365,8 @@ class Fit:
             if (u.start is None or u.name in SPREAD) and not u.name.startswith(("aero.", "solver."))
         ]
         if not plan.search or not moving:
+            if self.moving and self.followed:
+                self.first, self._tracks = begin, None
             return [begin]
         places = torch.tensor([begin]).repeat(max(1, 3 * plan.search // 4), 1).double()
         sobol = torch.quasirandom.SobolEngine(len(moving), scramble=True, seed=plan.seed)
@@ -368,7 +392,7 @@ class Fit:
             raise DivergedError("Every simulation of the coarse search diverged: narrow the ranges of `unknowns`.")
         found = places[:1].tolist() if given else []
         for place in places[costs.argsort()].tolist():
-            apart = all(max(abs(a - b) for a, b in zip(place, other, strict=True)) > APART for other in found)
+            apart = all(apart_by(unknowns, place, other) > APART for other in found)
             if len(found) < plan.starts and apart:
                 found.append(place)
         return found
@@ -409,7 +433,7 @@ class Fit:
         costs = huber(blocks, {kind: min(one[kind] for one in each) for kind in each[0]})
         apart: list[int] = []
         for k in costs.argsort().tolist():
-            if all(float((ended[k] - ended[j]).abs().amax()) > SAME for j in apart):
+            if all(apart_by(self.plan.unknowns, ended[k].tolist(), ended[j].tolist()) > SAME for j in apart):
                 apart.append(k)
         return [ended[k].tolist() for k in apart], [float(costs[k]) for k in apart]
 
@@ -425,7 +449,7 @@ class Fit:
             return [], []
         evidence = self._trusted(self.evidence("tracks" if self.stages[0] == "matches" else self.stages[0]), place)
         ended, costs = self._brief([place, *tried], evidence, self.fitted)
-        away = [max(abs(a - b) for a, b in zip(end, place, strict=True)) for end in ended]
+        away = [apart_by(self.plan.unknowns, end, place) for end in ended]
         near = [k for k, cost in enumerate(costs) if cost < RIVAL * costs[0]]
         own = away.index(min(away))
         better = ended[0] if own not in near and away[0] > 2 * SAME else []
@@ -699,6 +723,7 @@ def run_fit(
     device: str = "auto",
     progress: bool = True,
     started: Callable[[], None] = lambda: None,
+    in_use: Sequence[Path] = (),
 ) -> Result:
     """Do a fit and write its folder: values.csv, result.json, scene.yaml and pictures.
 
@@ -709,6 +734,7 @@ def run_fit(
         device: ``auto``, ``cpu`` or ``cuda``.
         progress: Print a line for each iteration.
         started: Called when the folder is locked.
+        in_use: Other files that are needed, as the fit file: an earlier fit in a folder with one is not moved aside.
 
     Returns:
         The result.
@@ -726,7 +752,8 @@ def run_fit(
     remedy = "choose another with --output"
     if resume and not (folder / PROGRESS).exists():
         raise ValueError(f"There is nothing to resume in {folder}: it has no {PROGRESS}; leave out --resume.")
-    lock = hold_folder(folder, remedy) if resume else claim_folder(folder, OURS, remedy)
+    needed = [*in_use, *(Path(path) for path in (*plan.base, *plan.videos, settings.scene.ply) if path)]
+    lock = hold_folder(folder, remedy) if resume else claim_folder(folder, OURS, remedy, needed)
     try:
         course = _read_course(folder, described) if resume else Course()
         started()
@@ -843,12 +870,16 @@ def _described(plan: Plan, simulation: Simulation) -> dict[str, Any]:
     """Return the resume key: all settings that must be the same in a fit and the one that it continues."""
     own = {name: value for name, value in vars(plan).items() if name not in ("base", "unknowns", "iterations")}
     sought = {u.name: [u.low, u.high, u.scale, u.start] for u in plan.unknowns}
-    own = {name: list(value) if isinstance(value, tuple) else value for name, value in own.items()}
-    return {**own, "unknowns": sought, "scene": simulation.config}
+    told = {**own, "unknowns": sought, "scene": simulation.config}
+    return json.loads(json.dumps(told))  # as it will be read
 
 
 def _read_course(folder: Path, described: Mapping[str, Any]) -> Course:
     kept = read_json(folder / PROGRESS, "progress of the fit")
+    if not isinstance(kept, dict) or set(kept) != {"plan", "course"} or set(kept["course"]) != set(vars(Course())):
+        raise ValueError(
+            f"{folder / PROGRESS} is of another version of the program: leave out --resume to begin again."
+        )
     if kept["plan"] != described:
         changed = [name for name in described if kept["plan"].get(name) != described[name]]
         raise ValueError(

@@ -231,7 +231,7 @@ def predictions(
         moved: All Gaussians at each of the times.
         films: Folder for ``film_CAMERA.mp4``: the video beside the fit.
     """
-    chosen = {k for part in (range(1, fitted), range(fitted, len(times))) for k in _spread(part)}
+    chosen = [_chosen(video, times, fitted) for video in videos]
     squares: list[tuple[list[float], list[float]]] = [([], []) for _ in videos]
     rows: list[list[tuple[str, Tensor]]] = [[] for _ in videos]
     painter = simulation.painter
@@ -248,7 +248,7 @@ def predictions(
                 squares[number][k >= fitted].append(float((shown - real).square().mean()))
                 part = "predicted" if k >= fitted else "fitted"
                 beside.add(number, [(f"film, {time:.2f} s", real), (part, shown)])
-                if k in chosen:
+                if k in chosen[number]:
                     difference = (0.5 + 0.5 * (shown - real)).clamp(0, 1)
                     rows[number].append((f"{time:.3g} s, {part}", torch.cat([real, shown, difference], 1)))
     found = []
@@ -345,8 +345,10 @@ def scene_text(values: Mapping[str, float], parser: ArgumentParser, settings: Na
         remark = f"# Below, a metre is a length of {ratio:.6g} m.\n"
     if any(name in values for name in POLAR):
         found.wind.flow = flow_of(simulation.wind.flows[0].tolist(), values)  # type: ignore[index]
-    if any(map(is_change, values)):
-        wind = changing(simulation.wind.with_flow(found.wind.flow), values)  # type: ignore[operator]
+    changes = any(map(is_change, values))
+    if changes or (SCALE in values and found.wind.schedule):
+        wind: Any = simulation.wind
+        wind = changing(wind.with_flow(found.wind.flow), values) if changes else wind
         rows = zip(wind.times.tolist(), wind.flows.tolist(), strict=True)
         found.wind.schedule = [{"time": time, "flow": [part / ratio for part in flow]} for time, flow in rows]
         found.wind.interpolation = wind.interpolation
@@ -358,6 +360,8 @@ def scene_text(values: Mapping[str, float], parser: ArgumentParser, settings: Na
         for name in ("material.E", "material.density", "solver.gravity"):
             in_settings(found, name, value_of(setup, name))
         found.wind.flow = [part / ratio for part in found.wind.flow]
+        if found.material.bending is not None:
+            found.material.bending /= ratio**5
     told = "".join(f"# {name}: {value:.6g}\n" for name, value in values.items()) + remark
     return "# Found by gaussian-swaying fit:\n" + told + f"frames: {settings.frames}\n" + config_text(parser, found)
 
@@ -434,7 +438,14 @@ def _labelled(shown: Shown) -> Any:
     return np.asarray(picture)
 
 
-def _spread(places: range) -> list[int]:
+def _chosen(video: Footage, times: Sequence[float], fitted: int) -> set[int]:
+    """Numbers of the times whose frames of a video are in its picture, fitted and predicted ones."""
+    own = [k for k, time in enumerate(times) if any(abs(one - time) < 2e-6 for one in video.times)]
+    parts = [k for k in own if 0 < k < fitted], [k for k in own if k >= fitted]
+    return {k for part in parts for k in _spread(part)} or set(own)
+
+
+def _spread(places: Sequence[int]) -> list[int]:
     """Up to :data:`SHOWN` of the given numbers, evenly spaced and including the last."""
     count = min(SHOWN, len(places))
     return [places[(k + 1) * len(places) // count - 1] for k in range(count)]

@@ -1,4 +1,4 @@
-"""Rivals: other values that may explain the same film, to be tried at the start of a fit and before its end is believed.
+"""Rivals: other values that may explain the same film, to be tried at the start of a fit and at its end.
 
 A fit ends in the nearest minimum of its cost. Three kinds of others are known: of a body that swings, a stiffer one in
 more wind; of a flapping flag, those of softer and stiffer materials; and of a sheet, that of the wind mirrored at its
@@ -50,6 +50,18 @@ def rivals_of(setup: Setup, unknowns: Sequence[Unknown], place: Sequence[float])
         if 0 <= share <= 1:
             found.append([*place[:k], share, *place[k + 1 :]])
     return found
+
+
+def apart_by(unknowns: Sequence[Unknown], one: Sequence[float], other: Sequence[float]) -> float:
+    """Return the largest distance of two places, as a share of a range; azimuths 360 degrees apart are the same."""
+    most = 0.0
+    for unknown, a, b in zip(unknowns, one, other, strict=True):
+        away = abs(a - b)
+        if unknown.name == "wind.azimuth":
+            wide = unknown.high - unknown.low
+            away = abs(_turned(wide * (a - b))) / wide
+        most = max(most, away)
+    return most
 
 
 def bent_alike(unknowns: Sequence[Unknown], place: Sequence[float]) -> list[list[float]]:

@@ -39,6 +39,11 @@ def at_scale(setup: Setup, metres_per_unit: float) -> Setup:
             f"`{SCALE}` can be sought only with `material.volume: patch` and `scene.layers: 1`: set them, or measure a "
             "length."
         )
+    if setup.points.bending is not None and (isinstance(setup.material.bending, str) or setup.material.regions):
+        raise ValueError(
+            f"`{SCALE}` can be sought only with one `material.bending` in N m: give it as a number and without parts, "
+            "or measure a length."
+        )
     ratio = metres_per_unit / scene.frame.metres_per_unit
     changes = {"material.E": value_of(setup, "material.E") / ratio ** (3 if sheet else 2)}
     if sheet:

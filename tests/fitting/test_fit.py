@@ -6,6 +6,7 @@ Covers: fitting.held_out.
 import csv
 import json
 import math
+import shutil
 from dataclasses import replace
 
 import pytest
@@ -159,7 +160,7 @@ def test_the_error_of_the_grid_is_in_the_standard_errors(own, simulation):
         place = torch.tensor(made.solved(place.tolist(), evidence, made.fitted), dtype=torch.float64)
 
     def model(other):
-        made.on_grid = lambda ratio: other
+        made.on_grid, made._other_grids = lambda ratio: other, None
         return float(made._at_the_end(place, evidence)[1])
 
     assert model(simulation) ** 0.5 < 5e-3
@@ -232,6 +233,67 @@ def test_resume_needs_the_same_plan(own, tmp_path):
     other = Plan([str(own / "base.yaml")], [str(own / "video")], sought, tracks=50, **given)
     with pytest.raises(ValueError, match="another `tracks`"):
         run_fit(other, tmp_path / "fit", resume=True, device="cpu", progress=False)
+
+
+def test_progress_of_another_version_is_refused(own, tmp_path):
+    sought = [read_unknown("wind.speed", SOUGHT["wind.speed"])]
+    known = {"wind.flow": (4.0, 3.0, 0.0)}  # JSON has lists
+    plan = Plan([str(own / "base.yaml")], [str(own / "video")], sought, known=known, search=0, iterations=1, tracks=40)
+    run_fit(plan, tmp_path / "fit", device="cpu", progress=False)
+    run_fit(plan, tmp_path / "fit", resume=True, device="cpu", progress=False)
+    file = tmp_path / "fit/fit.json"
+    kept = json.loads(file.read_text())
+    for broken in ({}, kept | {"course": {"step": 0}}):
+        file.write_text(json.dumps(broken))
+        with pytest.raises(ValueError, match="another version of the program: leave out --resume"):
+            run_fit(plan, tmp_path / "fit", resume=True, device="cpu", progress=False)
+
+
+def test_an_earlier_fit_beside_what_is_needed_is_not_moved(own, tmp_path):
+    """Or the base would be gone, and the third time there is none."""
+    shutil.copy(own / "base.yaml", tmp_path / "base.yaml")
+    sought = [read_unknown("wind.speed", SOUGHT["wind.speed"])]
+    plan = Plan([str(tmp_path / "base.yaml")], [str(own / "video")], sought, search=0, iterations=1, tracks=40)
+    run_fit(plan, tmp_path, device="cpu", progress=False)
+    with pytest.raises(ValueError, match=r"base\.yaml is in it and is needed now: choose another with --output"):
+        run_fit(plan, tmp_path, device="cpu", progress=False)
+    assert (tmp_path / "base.yaml").exists()
+    other = replace(plan, base=[str(own / "base.yaml")])
+    with pytest.raises(ValueError, match=r"base\.yaml is in it"):
+        run_fit(other, tmp_path, device="cpu", progress=False, in_use=[tmp_path / "base.yaml"])
+
+
+def test_another_grid_that_the_scene_refuses_is_left_out_and_said(own, simulation):
+    plan = Plan([str(own / "base.yaml")], [str(own / "video")], [read_unknown("wind.speed", [2.0, 12.0])])
+    said, asked = [], []
+
+    def on_grid(ratio):
+        asked.append(ratio)
+        if ratio < 1:
+            raise ValueError("`solver.dx` is too small.")
+        return simulation
+
+    made = Fit(simulation, read_videos(own / "video"), plan, said.append, on_grid=on_grid)
+    assert made._grids() == made._grids() == [simulation]
+    assert asked == list(GRIDS)
+    (line,) = said
+    assert (
+        line == "cells 0.8 times as large, to know the error of the grid, are not possible: `solver.dx` is too small."
+    )
+
+
+def test_cameras_begin_together(own, simulation):
+    """Unless nothing moves until then."""
+    left, right = read_videos(own / "video")
+    cut = {name: getattr(right, name)[5:] for name in ("times", "cameras", "images", "masks")}
+    sought = [read_unknown("wind.speed", [2.0, 12.0])]
+    plan = Plan([str(own / "base.yaml")], [str(own / "video")], sought)
+    with pytest.raises(ValueError, match=r"camera right begin at 0\.208 s.*cut all videos to the same beginning"):
+        Fit(simulation, [left, replace(right, **cut)], plan)
+    later = read_unknown("film.start", [0.25, 0.5])
+    assert Fit(simulation, [left, replace(right, **cut)], replace(plan, unknowns=[*sought, later])).videos
+    shift = tuple(time + 0.03 for time in right.times)  # by less than a frame
+    assert Fit(simulation, [left, replace(right, times=shift)], plan).videos
 
 
 def test_what_cannot_be_told_apart_is_refused(own, tmp_path):

@@ -7,7 +7,7 @@ import torch
 
 from gaussian_swaying.fitting.fit import Fit
 from gaussian_swaying.fitting.plan import Plan, read_unknown
-from gaussian_swaying.fitting.rivals import SCANNED, SHAKEN, bent_alike, mirrored, rivals_of
+from gaussian_swaying.fitting.rivals import SCANNED, SHAKEN, apart_by, bent_alike, mirrored, rivals_of
 from gaussian_swaying.fitting.videos import read_videos
 from gaussian_swaying.simulation.parameters import flow_of
 
@@ -93,3 +93,11 @@ def test_the_search_finds_the_stiffness_although_its_start_is_three_times_off(ow
     assert begin == pytest.approx({"wind.speed": 15.0, "material.E": 3e4})
     assert best["material.E"] == pytest.approx(TRUTH["material.E"], rel=0.6)
     assert best["wind.speed"] == pytest.approx(TRUTH["wind.speed"], rel=0.3)
+
+
+def test_azimuths_that_are_a_turn_apart_are_the_same():
+    sought = [read_unknown("wind.azimuth", [-200.0, 200.0]), read_unknown("wind.speed", [1.0, 9.0])]
+    at = [sought[0].share(179.0), 0.5]
+    assert apart_by(sought, at, [sought[0].share(-179.0), 0.5]) == pytest.approx(2 / 400)
+    assert apart_by(sought, at, [sought[0].share(139.0), 0.5]) == pytest.approx(40 / 400)
+    assert apart_by(sought, at, [at[0], 0.3]) == pytest.approx(0.2)

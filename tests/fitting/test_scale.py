@@ -58,9 +58,19 @@ def test_a_filled_body_keeps_its_density(tmp_path):
     assert (other - real.sort(0).values).abs().max() > 0.01
 
 
-def test_the_configuration_that_is_written_moves_as_the_fit(tmp_path):
-    small = made(tmp_path, 1.0)
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {},
+        {"wind": {"schedule": [{"time": 0.0, "flow": [4.0, 3.0, 0.0]}, {"time": 0.3, "flow": [1.0, 0.0, 0.0]}]}},
+        {"material": base()["material"] | {"bending": 0.02}},
+    ],
+)
+def test_the_configuration_that_is_written_moves_as_the_fit(tmp_path, changes):
+    small = made(tmp_path, 1.0, **changes)
     parser, values = Simulation.parser(), {"wind.speed": 4.0, "wind.azimuth": 20.0, "material.E": 2e4, SCALE: 1.7}
+    if "wind" in changes:
+        values = {"material.E": 2e4, SCALE: 1.7}
     settings = parser.parse_args(["--config", str(tmp_path / "1.yaml")])
     (tmp_path / "scene.yaml").write_text(scene_text(values, parser, settings, small))
     torch.testing.assert_close(
@@ -80,6 +90,7 @@ def test_what_has_a_length_of_its_own_is_refused(tmp_path):
         ({"wind": {"flow": [4.0, 0.0, 0.0], "modulations": gust}}, "plain wind"),
         ({"solver": {"dx": 0.1, "gravity": [0.0, 0.0, 0.0]}}, "Without gravity"),
         ({"scene": base()["scene"] | {"layers": 3}}, "scene.layers"),
+        ({"material": base()["material"] | {"bending": "plate"}}, "one `material.bending` in N m"),
     ):
         with pytest.raises(ValueError, match=told):
             check_unknowns(made(tmp_path, 1.0, **changes), [unknown])

@@ -106,6 +106,16 @@ def test_a_film_that_begins_in_motion(own, cut, tmp_path):
     assert json.loads((tmp_path / "fit/fit.json").read_text())["course"]["first"]
 
 
+def test_a_film_in_motion_begins_at_the_start_that_was_given(own, cut, simulation):
+    """Without a search, too, points are followed from where they are in the first frame."""
+    sought = [Unknown("wind.speed", 2.0, 12.0, start=5.0), Unknown(FILM_START, -0.3, 0.0, start=-CUT / 24)]
+    plan = Plan([str(own / "base.yaml")], [str(cut)], sought, search=0)
+    made = Fit(simulation, read_videos(cut), plan)
+    (place,) = made.search()
+    assert made.first == place
+    assert made.values(place)[FILM_START] == pytest.approx(-CUT / 24)
+
+
 def test_a_film_in_motion_is_said(own, cut, simulation):
     """And nothing once the unknown is there."""
     plan = Plan([str(own / "base.yaml")], [str(cut)], [Unknown("wind.speed", 2.0, 12.0)])

@@ -36,8 +36,9 @@ def _turning(results: list[Row]) -> Iterator[Row]:
 
 
 table(PAGE, "peers.turning", "*pee*", _turning, """
-    points = {particles:,} | motion = {how} | ours on = {on} | ours [ms] = {median_ms:.3g} | CK-MPM [ms] = {peers.CK-MPM:.3g} |
-    claymore [ms] = {peers.claymore:.3g} | the faster one per ours = {ratio:.2f} | 1.5 wanted = {reached}
+    points = {particles:,} | motion = {how} | ours on = {on} | ours [ms] = {median_ms:.3g} |
+    CK-MPM [ms] = {peers.CK-MPM:.3g} | claymore [ms] = {peers.claymore:.3g} |
+    the faster one per ours = {ratio:.2f} | 1.5 wanted = {reached}
     """, before="Blocks in a box, the other solvers on an H200:", together=True)  # fmt: skip
 
 
