@@ -104,11 +104,9 @@ def first_frame(film: Path) -> Tensor:
 
     if film.suffix.lower() in STILLS:
         return read_image(film)[..., :3].contiguous()
-    from imageio_ffmpeg import read_frames
+    from gaussian_swaying.fitting.videos import frames_of, next_of
 
-    from gaussian_swaying.fitting.videos import MOST_PIXELS, next_of
-
-    with closing(read_frames(film, input_params=["-max_pixels", str(MOST_PIXELS)])) as frames:
+    with closing(frames_of(film)) as frames:
         head, frame = next_of(frames, film), next_of(frames, film)
         if head is None or frame is None:
             raise ValueError(f"The film {film} has no frames: convert it to mp4.")

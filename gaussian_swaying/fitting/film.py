@@ -8,7 +8,6 @@ from __future__ import annotations
 import math
 import re
 import subprocess
-from collections.abc import Generator
 from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
@@ -20,7 +19,7 @@ from torch import Tensor
 from gaussian_swaying._inputs import check_regular
 from gaussian_swaying.fitting.registration import in_space
 from gaussian_swaying.fitting.tracks import follow, opencv
-from gaussian_swaying.fitting.videos import MOST_PIXELS, next_of, scaled
+from gaussian_swaying.fitting.videos import frames_of, next_of, scaled
 from gaussian_swaying.rendering.cameras.camera import Camera
 from gaussian_swaying.rendering.protocol import RenderOutput
 
@@ -72,7 +71,7 @@ def open_film(path: str | Path) -> Film:
         ValueError: If it cannot be read, or has no frames.
     """
     file = check_regular(Path(path), "the film")
-    with closing(_frames(file, [])) as frames:
+    with closing(frames_of(file)) as frames:
         head = next_of(frames, file)
         if head is None or next_of(frames, file) is None:
             raise ValueError(f"The film {file} has no frames: convert it to mp4.")
@@ -81,12 +80,12 @@ def open_film(path: str | Path) -> Film:
     if not head["fps"] > 0:
         raise ValueError(f"The film {file} does not say its frame rate: convert it to mp4.")
     size = round(width / factor), round(height / factor)
-    return Film(file, *size, factor, float(head["fps"]), float(head["duration"]), _focal(file))
+    return Film(file, *size, factor, head["fps"], float(head["duration"]), _focal(file))
 
 
 def first_frame(film: Film) -> Tensor:
     """The first frame, dtype uint8, shape (H, W, 3)."""
-    with closing(_frames(film.path, scaled(film.width, film.height))) as frames:
+    with closing(frames_of(film.path, outputs=scaled(film.width, film.height))) as frames:
         head, frame = next_of(frames, film.path), next_of(frames, film.path)
         return torch.frombuffer(bytearray(frame), dtype=torch.uint8).reshape(*head["size"][::-1], 3)
 
@@ -117,7 +116,7 @@ def begins_to_move(film: Film, picture: RenderOutput, camera: Camera) -> float |
     factor = max(1.0, max(film.width, film.height) / SMALL)
     size = round(film.width / factor), round(film.height / factor)
     first: Any = None
-    with closing(_frames(film.path, scaled(*size), grey=True)) as frames:
+    with closing(frames_of(film.path, outputs=scaled(*size), grey=True)) as frames:
         width, height = next_of(frames, film.path)["size"]
         where = picture.alpha[..., 0].detach().cpu().float()[None, None]
         mask = torch.nn.functional.interpolate(where, size=(height, width), mode="area")[0, 0] > 0.3
@@ -231,16 +230,6 @@ def off_camera(world: Any, there: Any, intrinsics: Any, near: float) -> Any:
     agree = agree[:, 0]
     turn, shift = cv2.solvePnPRefineLM(world[agree], there[agree], intrinsics, None, turn, shift)
     return np.linalg.norm(cv2.projectPoints(world, turn, shift, intrinsics, None)[0].reshape(-1, 2) - there, axis=-1)
-
-
-def _frames(path: Path, options: list[str], grey: bool = False) -> Generator[Any, None, None]:
-    from imageio_ffmpeg import read_frames
-
-    kind = {"pix_fmt": "gray", "bits_per_pixel": 8} if grey else {}
-    found: Generator[Any, None, None] = read_frames(
-        path, input_params=["-max_pixels", str(MOST_PIXELS)], output_params=options, **kind
-    )
-    return found
 
 
 def _focal(path: Path) -> float | None:

@@ -5,9 +5,10 @@ from __future__ import annotations
 import logging
 import math
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Generator, Sequence
 from contextlib import closing
 from dataclasses import dataclass
+from fractions import Fraction
 from functools import partial
 from itertools import pairwise
 from pathlib import Path
@@ -235,8 +236,6 @@ def _picture(item: PosedImage, cover: Path | None, time: float, room: _Room) -> 
 
 def _film(file: Path, where: str, data: dict[str, Any], index: int, begin: float, room: _Room) -> list[_Shot]:
     """The frames of a video file, decoded one by one as long as there is room."""
-    from imageio_ffmpeg import read_frames
-
     entry = data["frames"][index]
     path = check_regular(file.parent / str(entry["video_path"]), "the video")
     fps = read_number(where, entry, "fps")
@@ -256,8 +255,7 @@ def _film(file: Path, where: str, data: dict[str, Any], index: int, begin: float
     shots: list[_Shot] = []
     taken = [] if not begun else ["-ss", f"{begun:.6f}"]
     taken += [] if seconds is None else ["-t", f"{seconds:.6f}"]
-    limits = ["-max_pixels", str(MOST_PIXELS), *taken], ["-frames:v", str(room.frames + 1), *scaled(*wanted)]
-    with closing(read_frames(path, input_params=limits[0], output_params=limits[1])) as film:
+    with closing(frames_of(path, taken, ["-frames:v", str(room.frames + 1), *scaled(*wanted)])) as film:
         head = next_of(film, path)
         size = (0, 0) if head is None else tuple(head["size"])
         lens = lens_of_transforms(where, data, entry, size)
@@ -267,7 +265,7 @@ def _film(file: Path, where: str, data: dict[str, Any], index: int, begin: float
         pose = read_pose(where, index, entry)
         check_rigid(f"The field `frames[{index}].transform_matrix` of the camera file {where}", pose)
         camera = Camera(torch.linalg.inv(pose).float(), seen.intrinsics().float(), seen.width, seen.height)
-        rate = fps or float(head["fps"])
+        rate = fps or head["fps"]
         if not rate > 0:
             raise ValueError(f"The video {path} does not say its frame rate: add `fps` to its entry in {where}.")
         length = min(head["duration"] - (begun or 0), math.inf if seconds is None else seconds)
@@ -279,6 +277,42 @@ def _film(file: Path, where: str, data: dict[str, Any], index: int, begin: float
                 picture = remapped(picture, lens)
             shots.append(_Shot(begin + len(shots) / rate, camera, picture, None))
     return shots
+
+
+def frames_of(
+    path: Path, inputs: Sequence[str] = (), outputs: Sequence[str] = (), grey: bool = False
+) -> Generator[Any, None, None]:
+    """Read a film at the frame rate that its head states.
+
+    ffmpeg would repeat frames of a film with a variable rate up to a higher one, which the head does not tell.
+
+    Args:
+        path: The file.
+        inputs: Options of ffmpeg for the file.
+        outputs: Options of ffmpeg for the frames.
+        grey: Whether pixels have one byte instead of three.
+
+    Yields:
+        The head as of imageio-ffmpeg, whose ``fps`` is the rate of the frames (0 if it is not known), then the bytes of
+        each frame.
+    """
+    from imageio_ffmpeg import read_frames
+
+    kind = {"pix_fmt": "gray", "bits_per_pixel": 8} if grey else {}
+    limits = ["-max_pixels", str(MOST_PIXELS)]
+    with closing(read_frames(path, input_params=limits, output_params=["-frames:v", "1"])) as film:
+        rate = _rate(next(film)["fps"])
+    steady = ["-r", str(rate)] if rate else []
+    given: dict[str, Any] = {"input_params": [*limits, *inputs], "output_params": [*steady, *outputs]}
+    with closing(read_frames(path, **given, **kind)) as film:
+        yield next(film) | {"fps": float(rate)}
+        yield from film
+
+
+def _rate(stated: float) -> Fraction:
+    """The frame rate of a film, whose head rounds that of television to two digits, such as 24000/1001 to 23.98."""
+    television = Fraction(1000 * round(1.001 * stated), 1001)
+    return television if abs(television - stated) < 0.0051 else Fraction(stated).limit_denominator(100)
 
 
 def scaled(width: float | None, height: float | None) -> list[str]:

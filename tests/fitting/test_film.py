@@ -53,6 +53,15 @@ def test_the_time_at_which_it_moves(tmp_path):
     assert _moves(_film(tmp_path / "b.mp4", still)) is None
 
 
+def test_the_time_at_which_a_film_with_a_variable_frame_rate_moves(tmp_path):
+    """At rest it has 10 frames a second, in motion 50."""
+    path = _film(tmp_path / "all.mp4", [_square(60)] * 50 + [_square(60 + 2 * k) for k in range(1, 30)], 50)
+    kept = "select='lt(n,50)*not(mod(n,5))+gte(n,50)'"
+    words = ["-v", "error", "-i", str(path), "-vf", kept, "-c:v", "libx264", str(tmp_path / "a.mp4")]
+    subprocess.run([imageio_ffmpeg.get_ffmpeg_exe(), *words], check=True)
+    assert _moves(tmp_path / "a.mp4") == pytest.approx(1.0, abs=0.1)
+
+
 def test_what_moves_beside_the_object_does_not_count(tmp_path):
     frames = [_square(60) for _ in range(20)]
     for k, frame in enumerate(frames):

@@ -3,6 +3,7 @@
 import json
 import shutil
 import subprocess
+from fractions import Fraction
 
 import imageio.v3 as iio
 import imageio_ffmpeg
@@ -154,6 +155,38 @@ def test_a_part_of_a_film_at_half_its_size(tmp_path, decoded):
     assert film.images[:, 8, 16, 1].float().numpy() == pytest.approx(np.arange(96, 108) + 20, abs=2.5)
     assert decoded[path.name] == film.images.numel()
     assert film.times == pytest.approx([k / 24 for k in range(12)])
+
+
+def _variable(path):
+    """A film of 3 s, grey by its time: 20 frames a second, then 60, then 15."""
+    source = "color=c=black:s=64x64:r=60:d=3,geq=lum='20+N':cb=128:cr=128"
+    kept = "select='lt(n,60)*not(mod(n,3))+between(n,60,79)+gt(n,79)*not(mod(n,4))'"
+    words = ["-y", "-v", "error", "-f", "lavfi", "-i", f"{source},{kept}", "-c:v", "libx264", "-qp", "1"]
+    subprocess.run([imageio_ffmpeg.get_ffmpeg_exe(), *words, "-pix_fmt", "yuv420p", str(path)], check=True)
+
+
+@pytest.mark.parametrize(("begin", "rate"), [(0.0, None), (1.0, None), (0.0, 10.0)])
+def test_a_film_with_a_variable_frame_rate(tmp_path, begin, rate):
+    """A frame is seen at its time, until the next one; ``fps`` spreads the same frames over another time."""
+    path = _film(tmp_path, (64, 64), 3, **({"begin": begin} if begin else {}), **({"fps": rate} if rate else {}))
+    _variable(path)
+    (film,) = read_videos(tmp_path)
+    shown = (film.images[:, 32, 32, 1].double() * 219 / 255 + 16 - 20) / 60 - begin
+    slower = 1.0 if rate is None else 65 / 2.95 / rate  # 65 frames in 2.95 s
+    assert film.times[-1] / slower == pytest.approx(2.95 - begin, abs=0.1)
+    late = torch.tensor(film.times, dtype=torch.float64) / slower - shown
+    assert -0.05 < float(late.min()) < float(late.max()) < 0.1
+
+
+@pytest.mark.parametrize("rate", ["24", "25", "24000/1001", "30000/1001", "100/3", "240"])
+def test_a_constant_frame_rate_changes_no_frame(tmp_path, rate):
+    path = tmp_path / "film.mkv"
+    words = ["-y", "-v", "error", "-f", "lavfi", "-i", f"testsrc=s=64x32:r={rate}:d=10", "-c:v", "libx264", "-bf", "2"]
+    subprocess.run([imageio_ffmpeg.get_ffmpeg_exe(), *words, "-pix_fmt", "yuv420p", str(path)], check=True)
+    for part in ([], ["-ss", "1.013", "-t", "2.5"]):
+        head, *frames = videos.frames_of(path, part)
+        assert frames == list(imageio_ffmpeg.read_frames(path, input_params=part))[1:]
+        assert head["fps"] == pytest.approx(float(Fraction(rate)), rel=1e-12 if rate != "100/3" else 2e-4)
 
 
 @pytest.mark.parametrize(("name", "value"), [("begin", -1.0), ("seconds", 0.0)])
