@@ -50,7 +50,7 @@ class Film:
         height: Of them.
         full: Factor by which the film itself is larger.
         fps: Frames per second.
-        seconds: Its length [s], as the file says.
+        seconds: Its length [s], as the file says; infinite if it says none, as films that browsers record.
         focal: Focal length that the file says, equivalent to one on 35 mm film [mm]; None if it says none.
     """
 
@@ -80,7 +80,7 @@ def open_film(path: str | Path) -> Film:
     if not head["fps"] > 0:
         raise ValueError(f"The film {file} does not say its frame rate: convert it to mp4.")
     size = round(width / factor), round(height / factor)
-    return Film(file, *size, factor, head["fps"], float(head["duration"]), _focal(file))
+    return Film(file, *size, factor, head["fps"], float(head["duration"]) or math.inf, _focal(file))
 
 
 def first_frame(film: Film) -> Tensor:

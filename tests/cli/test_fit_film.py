@@ -4,8 +4,10 @@ Covers: fitting.before, fitting.page.
 """
 
 import math
+import subprocess
 from types import SimpleNamespace
 
+import imageio_ffmpeg
 import numpy as np
 import pytest
 import torch
@@ -89,6 +91,18 @@ def test_the_pictures_before_the_fit(checked):
     blue = (tracks[..., 2] - tracks[..., 0] > 120).nonzero()
     assert len(blue[0]) > 100
     assert Image.open(checked / "registration.png").size == (3 * 270, 480 + 22)
+
+
+def test_a_film_that_does_not_say_its_length(case, checked, tmp_path):
+    """As those that browsers record: all of it is used."""
+    path = tmp_path / "film.mkv"
+    with path.open("wb") as file:  # ffmpeg cannot go back to write the length
+        words = ["-v", "error", "-i", str(case / "film.mp4"), "-c", "copy", "-f", "matroska", "-"]
+        subprocess.run([imageio_ffmpeg.get_ffmpeg_exe(), *words], check=True, stdout=file)
+    given = [str(path), "--splat", str(case / "my.ply"), "--up", "+z", "--focal", "36.2", "--device", "cpu", "--check"]
+    assert main([*given, "--output", str(tmp_path / "out")]) == 0
+    (video,), (same,) = (read_videos(folder / "transforms.json") for folder in (tmp_path / "out", checked))
+    assert video.times == pytest.approx(same.times, abs=2e-3)
 
 
 @pytest.fixture(scope="module")
