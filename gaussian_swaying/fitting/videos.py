@@ -228,9 +228,10 @@ def _picture(item: PosedImage, cover: Path | None, time: float, room: _Room) -> 
     pixels = load_image(item.path, item.lens)
     mask = pixels[..., 3].clone() if pixels.shape[-1] == 4 else None
     if cover is not None:
-        mask = read_image(cover)[..., 0].clone()
-        if mask.shape != pixels.shape[:2]:
+        found = read_image(cover)[..., :1]
+        if found.shape[:2] != (item.lens.height, item.lens.width):
             raise ValueError(f"The mask {cover} is not as large as its frame {item.path}.")
+        mask = (remapped(found, item.lens) if item.lens.distorted else found)[..., 0].clone()
     return [_Shot(time, camera, pixels[..., :3].contiguous(), mask)]
 
 

@@ -65,6 +65,20 @@ def test_a_lens_with_distortion_and_pictures_beside_a_film(own, tmp_path):
     assert float((filmed.images.float() - taken.images.float()).abs().mean()) < 6
 
 
+def test_a_mask_is_undistorted_as_its_frame(own, tmp_path):
+    shutil.copytree(own / "video", tmp_path, dirs_exist_ok=True)
+    frames = json.loads((own / "video/transforms.json").read_text())["frames"]
+    for frame in frames:
+        iio.imwrite(tmp_path / frame["mask_path"], iio.imread(tmp_path / frame["file_path"])[..., 1])
+    (tmp_path / "transforms.json").write_text(json.dumps({"k1": 0.2, "frames": frames}))
+    for video in read_videos(tmp_path):
+        assert video.size != (200, 120)
+        assert torch.equal(video.masks, video.images[..., 1])
+    iio.imwrite(tmp_path / frames[0]["mask_path"], np.zeros((120, 199), np.uint8))
+    with pytest.raises(ValueError, match="is not as large as its frame"):
+        read_videos(tmp_path)
+
+
 def test_bad_videos(own, tmp_path):
     with pytest.raises(FileNotFoundError, match="does not exist"):
         read_videos(tmp_path / "nowhere")
