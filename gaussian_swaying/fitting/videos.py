@@ -104,10 +104,12 @@ class _Part:
     Attributes:
         begin: Time of the first one [s].
         read: Decodes them.
+        lost: The picture, if it does not exist.
     """
 
     begin: float
     read: Callable[[_Room], list[_Shot]]
+    lost: Path | None = None
 
 
 def read_videos(
@@ -146,6 +148,12 @@ def read_videos(
     for name in cameras or ():
         if name not in parts:
             raise ValueError(f"There is no camera {name!r} in `videos`: `cameras` may be {', '.join(sorted(parts))}.")
+    lost = [part.lost for name in sorted(cameras or parts) for part in parts[name] if part.lost]
+    if lost:
+        raise ValueError(
+            f"{len(lost)} of the pictures of `videos` do not exist, the first of them {lost[0]}: put them there, or "
+            "remove their frames from transforms.json."
+        )
     room = _Room()
     return [
         _footage(name, [shot for part in parts[name] for shot in part.read(room)], begin)
@@ -202,17 +210,18 @@ def _read(path: Path) -> dict[str, list[_Part]]:
         posed = {item.name: item for item in read_transforms(file)[0]}
         for k, frame in enumerate(frames):
             name = str(frame.get("file_path", "")).replace("\\", "/").removeprefix("./")
-            if "video_path" in frame or name not in posed:
+            if "video_path" in frame:
                 continue
             time = read_number(where, frame, "time")
             if time is None:
                 raise ValueError(f"The field `frames[{k}].time` of the camera file {where} is missing: add it [s].")
             mask = frame.get("mask_path")
             cover = file.parent / mask if isinstance(mask, str) else None
-            part = _Part(time, partial(_picture, posed[name], cover, time))
+            if name in posed:
+                part = _Part(time, partial(_picture, posed[name], cover, time))
+            else:
+                part = _Part(time, lambda room: [], lost=file.parent / name)
             parts.setdefault(_camera_name(frame), []).append(part)
-    if not parts:
-        raise ValueError(f"{path} has no frames on disk: put the images of its transforms.json beside it.")
     return parts
 
 

@@ -99,6 +99,18 @@ def test_bad_videos(own, tmp_path):
             read_videos(tmp_path / "video")
 
 
+def test_pictures_that_are_missing(own, tmp_path):
+    """They do not matter for a camera that is not wanted."""
+    shutil.copytree(own / "video", tmp_path, dirs_exist_ok=True)
+    for k in (3, 7):
+        (tmp_path / f"left_{k:04d}.png").unlink()
+    with pytest.raises(
+        ValueError, match=r"^2 of the pictures of `videos` do not exist, the first .*left_0003\.png: put"
+    ):
+        read_videos(tmp_path)
+    assert len(read_videos(tmp_path, ["right"])[0].times) == FRAMES
+
+
 def _film(folder, size, frames, *, says=None, **fields):
     """A grey film of some hundred bytes a second, and its transforms.json; ``says`` replaces its size there."""
     width, height = size
