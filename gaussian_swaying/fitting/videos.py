@@ -204,7 +204,7 @@ def _read(path: Path) -> dict[str, list[_Part]]:
         for k in films:
             begin = read_number(where, frames[k], "time") or 0.0
             part = _Part(begin, partial(_film, file, where, data, k, begin))
-            parts.setdefault(_camera_name(frames[k]), []).append(part)
+            parts.setdefault(_camera_name(where, k, frames[k]), []).append(part)
         if len(films) == len(frames):
             continue
         posed = {item.name: item for item in read_transforms(file)[0]}
@@ -221,12 +221,19 @@ def _read(path: Path) -> dict[str, list[_Part]]:
                 part = _Part(time, partial(_picture, posed[name], cover, time))
             else:
                 part = _Part(time, lambda room: [], lost=file.parent / name)
-            parts.setdefault(_camera_name(frame), []).append(part)
+            parts.setdefault(_camera_name(where, k, frame), []).append(part)
     return parts
 
 
-def _camera_name(frame: dict[str, Any]) -> str:
-    return str(frame.get("camera", frame.get("camera_name", "0")))
+def _camera_name(where: str, index: int, frame: dict[str, Any]) -> str:
+    field = "camera" if "camera" in frame else "camera_name"
+    name = str(frame.get(field, "0"))
+    if "/" in name or "\\" in name:  # files are named after it
+        raise ValueError(
+            f"The field `frames[{index}].{field}` of the camera file {where} is {name!r}: set it to a name without / "
+            "and \\."
+        )
+    return name
 
 
 def _picture(item: PosedImage, cover: Path | None, time: float, room: _Room) -> list[_Shot]:

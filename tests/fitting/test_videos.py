@@ -255,6 +255,20 @@ def test_pictures_share_the_room_of_the_films(own, monkeypatch):
         read_videos(own / "video")
 
 
+@pytest.mark.parametrize("name", ["rig/left", "..\\left", "../../left"])
+def test_a_camera_name_that_is_a_path(own, tmp_path, name):
+    """Files of results are named after cameras."""
+    _film(tmp_path, (64, 64), 3, camera=name)
+    with pytest.raises(ValueError, match=r"`frames\[0\].camera` .* without /"):
+        read_videos(tmp_path)
+    given = json.loads((own / "video/transforms.json").read_text())
+    given["frames"][0]["camera"] = name
+    shutil.copytree(own / "video", tmp_path / "video")
+    (tmp_path / "video/transforms.json").write_text(json.dumps(given))
+    with pytest.raises(ValueError, match=r"`frames\[0\].camera` .* without /"):
+        read_videos(tmp_path / "video")
+
+
 @pytest.mark.parametrize("rate", [0, -24])
 def test_a_frame_rate_that_is_none(tmp_path, rate):
     _film(tmp_path, (64, 64), 3, fps=rate)
