@@ -419,23 +419,49 @@ class Fit:
         self, places: Sequence[Sequence[float]], evidence: Sequence[Evidence], times: Sequence[float]
     ) -> tuple[list[list[float]], list[float]]:
         """Short solves from some places: their ends, apart from each other and the best first, and their costs."""
-        residuals, ended = self.residuals(evidence, times), []
-        for place in places:
-            progress = Progress(torch.tensor(place, dtype=torch.float64))
-            with suppress(DivergedError):
-                while not progress.done and progress.iteration < BRIEF:
-                    iterate(residuals, _scaled(evidence), progress, ROUGH * TOLERANCE, ROUGH * LEAST_GAIN)
-                ended.append(progress.place)
-        if not ended:
+        return self._ranked([self._ended(place, evidence, times) for place in places])
+
+    def _ended(
+        self, place: Sequence[float], evidence: Sequence[Evidence], times: Sequence[float]
+    ) -> tuple[list[float], list[Block], dict[str, float]] | None:
+        """Where a short solve ends, its residuals and their standard deviations; None if it diverges."""
+        residuals, progress = self.residuals(evidence, times), Progress(torch.tensor(place, dtype=torch.float64))
+        with suppress(DivergedError):
+            while not progress.done and progress.iteration < BRIEF:
+                iterate(residuals, _scaled(evidence), progress, ROUGH * TOLERANCE, ROUGH * LEAST_GAIN)
+            blocks = residuals(progress.place[None])
+            return progress.place.tolist(), blocks, _scaled(evidence)(blocks)
+        return None
+
+    def _ranked(
+        self, solved: Sequence[tuple[list[float], list[Block], dict[str, float]] | None]
+    ) -> tuple[list[list[float]], list[float]]:
+        """Ends that are apart from each other, the best first, and their costs with the least standard deviations."""
+        found = [one for one in solved if one is not None]
+        if not found:
             raise DivergedError("Every simulation of a start diverged: narrow the ranges of `unknowns`.")
-        blocks = residuals(torch.stack(ended))
-        each = [_scaled(evidence)(blocks, k) for k in range(len(ended))]
-        costs = huber(blocks, {kind: min(one[kind] for one in each) for kind in each[0]})
+        scales = {kind: min(own[kind] for _, _, own in found) for kind in found[0][2]}
+        costs = [float(huber(blocks, scales)) for _, blocks, _ in found]
         apart: list[int] = []
-        for k in costs.argsort().tolist():
-            if all(apart_by(self.plan.unknowns, ended[k].tolist(), ended[j].tolist()) > SAME for j in apart):
+        for k in sorted(range(len(found)), key=costs.__getitem__):
+            if all(apart_by(self.plan.unknowns, found[k][0], found[j][0]) > SAME for j in apart):
                 apart.append(k)
-        return [ended[k].tolist() for k in apart], [float(costs[k]) for k in apart]
+        return [found[k][0] for k in apart], [costs[k] for k in apart]
+
+    def _each_from_its_own(
+        self, places: Sequence[Sequence[float]], stage: str
+    ) -> tuple[list[list[float]], list[float]]:
+        """Short solves as :meth:`_brief`, of a film in motion: each compares the points that its own first frame has.
+
+        Points that are followed from where one place has them speak for that place.
+        """
+        solved = []
+        for place in places:
+            own = copy(self)
+            own.first, own._tracks = list(place), None
+            with suppress(DivergedError, ValueError):  # it has no such points
+                solved.append(own._ended(place, own._trusted(own.evidence(stage), place), self.fitted))
+        return self._ranked(solved)
 
     def _others(
         self, place: Sequence[float], rivals: Sequence[Sequence[float]]
@@ -447,8 +473,11 @@ class Fit:
         tried = [*map(list, rivals), *rivals_of(self.simulation.setup, self.plan.unknowns, place)]
         if not tried:
             return [], []
-        evidence = self._trusted(self.evidence("tracks" if self.stages[0] == "matches" else self.stages[0]), place)
-        ended, costs = self._brief([place, *tried], evidence, self.fitted)
+        stage = "tracks" if self.stages[0] == "matches" else self.stages[0]
+        if self.moving and self.followed:
+            ended, costs = self._each_from_its_own([place, *tried], stage)
+        else:
+            ended, costs = self._brief([place, *tried], self._trusted(self.evidence(stage), place), self.fitted)
         away = [apart_by(self.plan.unknowns, end, place) for end in ended]
         near = [k for k, cost in enumerate(costs) if cost < RIVAL * costs[0]]
         own = away.index(min(away))
@@ -508,6 +537,9 @@ class Fit:
                 break
             self.say(f"another start fits better, so the fit goes on from there: {self._shown(better)}")
             course.rivals, course.place, course.rounds = [*course.rivals, course.place], better, course.rounds + 1
+            if self.moving and self.followed:
+                self.first, self._tracks = list(better), None
+                course.first = list(better)
             course.step = next(k for k, (_, share) in enumerate(steps) if share == 1)
             course.iteration, course.damping, course.matched, course.ended = 0, START, [], ""
             keep(course)

@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from gaussian_swaying.fitting.evidence import TrackEvidence, compare, compare_starts
-from gaussian_swaying.fitting.fit import Fit, fit
+from gaussian_swaying.fitting.fit import Course, Fit, fit
 from gaussian_swaying.fitting.plan import Plan
 from gaussian_swaying.fitting.tracks import track
 from gaussian_swaying.fitting.unknowns import FILM_START, Unknown, default_scale
@@ -114,6 +114,35 @@ def test_a_film_in_motion_begins_at_the_start_that_was_given(own, cut, simulatio
     (place,) = made.search()
     assert made.first == place
     assert made.values(place)[FILM_START] == pytest.approx(-CUT / 24)
+
+
+def test_rivals_of_a_film_in_motion_are_judged_by_the_points_of_their_own_first_frames(
+    own, cut, simulation, monkeypatch
+):
+    """Points that are followed from where a wrong wind has them speak for that wind. A fit goes on with the better's."""
+    sought = [Unknown("wind.azimuth", -60.0, 150.0), Unknown(FILM_START, -0.2, 0.0)]
+    plan = Plan([str(own / "base.yaml")], [str(cut)], sought, search=0, iterations=1)
+    wrong = [sought[0].share(90.0), sought[1].share(-CUT / 24)]
+    true = [sought[0].share(TRUTH["wind.azimuth"]), wrong[1]]
+    made, seen = Fit(simulation, read_videos(cut), plan), []
+    shown = made._first_shown
+
+    def first_shown(places):
+        seen.extend(list(place) for place in places)
+        return shown(places)
+
+    made._first_shown = first_shown
+    made.first = wrong
+    monkeypatch.setattr("gaussian_swaying.fitting.fit.BRIEF", 0)  # where they are, not where they would go
+    ended, costs = made._each_from_its_own([wrong, true], "tracks")
+    assert seen == [wrong, true]
+    assert ended == [true, wrong]
+    assert costs[1] > 3 * costs[0]
+    assert made.first == wrong
+    monkeypatch.setattr(made, "_others", lambda place, rivals: ([], [] if made.first == true else true))
+    course = Course()
+    made.run(course, lambda course: None)
+    assert course.first == made.first == true
 
 
 def test_a_film_in_motion_is_said(own, cut, simulation):
