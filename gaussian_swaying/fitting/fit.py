@@ -424,7 +424,7 @@ class Fit:
     def _ended(
         self, place: Sequence[float], evidence: Sequence[Evidence], times: Sequence[float]
     ) -> tuple[list[float], list[Block], dict[str, float]] | None:
-        """Where a short solve ends, its residuals and their standard deviations; None if it diverges."""
+        """The end of a short solve, its residuals and their standard deviations; None if it diverges."""
         residuals, progress = self.residuals(evidence, times), Progress(torch.tensor(place, dtype=torch.float64))
         with suppress(DivergedError):
             while not progress.done and progress.iteration < BRIEF:

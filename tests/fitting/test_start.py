@@ -119,7 +119,7 @@ def test_a_film_in_motion_begins_at_the_start_that_was_given(own, cut, simulatio
 def test_rivals_of_a_film_in_motion_are_judged_by_the_points_of_their_own_first_frames(
     own, cut, simulation, monkeypatch
 ):
-    """Points that are followed from where a wrong wind has them speak for that wind. A fit goes on with the better's."""
+    """Points that are followed from where a wrong wind has them speak for that wind; a fit goes on with the better."""
     sought = [Unknown("wind.azimuth", -60.0, 150.0), Unknown(FILM_START, -0.2, 0.0)]
     plan = Plan([str(own / "base.yaml")], [str(cut)], sought, search=0, iterations=1)
     wrong = [sought[0].share(90.0), sought[1].share(-CUT / 24)]
