@@ -87,8 +87,10 @@ def atomic(path: Path) -> Iterator[Path]:
 def cache_folder() -> Path:
     """Folder of the compiled kernels: ``GAUSSIAN_SWAYING_CACHE``, or ``gaussian_swaying`` where caches are kept."""
     given = os.environ.get("GAUSSIAN_SWAYING_CACHE")
+    if given:
+        return Path(given)
     base = os.environ.get("XDG_CACHE_HOME") or os.environ.get("LOCALAPPDATA") or Path.home() / ".cache"
-    return Path(given) if given else Path(base) / "gaussian_swaying"
+    return Path(base) / "gaussian_swaying"
 
 
 def save_png(path: Path, pixels: np.ndarray) -> None:

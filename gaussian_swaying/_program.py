@@ -6,7 +6,6 @@ import atexit
 import os
 import sys
 import threading
-from contextlib import suppress
 from pathlib import Path
 from typing import NoReturn
 
@@ -56,6 +55,10 @@ def leave(code: int) -> NoReturn:
     threading._shutdown()  # type: ignore[attr-defined]  # as multiprocessing ends its processes
     atexit._run_exitfuncs()
     for stream in (sys.stdout, sys.stderr):
-        with suppress(AttributeError, OSError, ValueError):  # there is none, it is closed, or its disk is full
+        try:
             stream.flush()
+        except (AttributeError, ValueError, BrokenPipeError):  # there is none, or it is closed
+            pass
+        except OSError:  # its disk is full
+            code = code or 120  # as Python says it
     os._exit(code)

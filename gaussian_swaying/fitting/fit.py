@@ -460,7 +460,11 @@ class Fit:
             own = copy(self)
             own.first, own._tracks = list(place), None
             with suppress(DivergedError, ValueError):  # it has no such points
-                solved.append(own._ended(place, own._trusted(own.evidence(stage), place), self.fitted))
+                evidence = own.evidence(stage)
+                found = own._ended(place, own._trusted(evidence, place), self.fitted)
+                if found is not None:  # its points are trusted by how far grids are apart there: compare them untrusted
+                    blocks = own.residuals(evidence, self.fitted)(torch.tensor(found[:1], dtype=torch.float64))
+                    solved.append((found[0], blocks, _scaled(evidence)(blocks)))
         return self._ranked(solved)
 
     def _others(
@@ -475,7 +479,10 @@ class Fit:
             return [], []
         stage = "tracks" if self.stages[0] == "matches" else self.stages[0]
         if self.moving and self.followed:
-            ended, costs = self._each_from_its_own([place, *tried], stage)
+            try:
+                ended, costs = self._each_from_its_own([place, *tried], stage)
+            except DivergedError:
+                return [], []
         else:
             ended, costs = self._brief([place, *tried], self._trusted(self.evidence(stage), place), self.fitted)
         away = [apart_by(self.plan.unknowns, end, place) for end in ended]
@@ -597,7 +604,7 @@ class Fit:
             self.judged,
             self.on_grid,
         )
-        wider.first, wider._tracks = self.first, self._tracks
+        wider.first, wider._tracks = self.first, self.tracks if self.followed else None
         start = [*place, *map(steady_share, unknowns)]
         left = []
         for fit_, begin in ((self, list(place)), (wider, start)):

@@ -329,7 +329,8 @@ def frames_of(
 def _rate(stated: float) -> Fraction:
     """The frame rate of a film, whose head rounds that of television to two digits, such as 24000/1001 to 23.98."""
     television = Fraction(1000 * round(1.001 * stated), 1001)
-    return television if abs(television - stated) < 0.0051 else Fraction(stated).limit_denominator(100)
+    rounded = stated != round(stated) and abs(television - stated) < 0.0051
+    return television if rounded else Fraction(stated).limit_denominator(100)
 
 
 def scaled(width: float | None, height: float | None) -> list[str]:

@@ -61,7 +61,7 @@ def load_kernels() -> bool:
             if stamp.read_text(encoding="utf-8") == _stamp(library):
                 _load(library)
                 return True
-        except (ImportError, OSError, UnicodeError):  # it was never loaded, or is broken
+        except (ImportError, OSError, ValueError):  # it was never loaded, or is broken
             pass
         lock = FileLock(library.parent.with_suffix(".lock"))
         try:
@@ -89,7 +89,11 @@ _LOADING = threading.Lock()
 
 def loaded_before() -> bool:
     """True if :func:`load_kernels` finds kernels that it has loaded before, so that it takes a moment."""
-    return (build_folder() / "gsplat_cuda.stamp").is_file()
+    folder = build_folder()
+    try:
+        return (folder / "gsplat_cuda.stamp").read_text(encoding="utf-8") == _stamp(folder / "gsplat_cuda.so")
+    except (ImportError, OSError, ValueError):
+        return False
 
 
 def build_folder() -> Path:

@@ -3,6 +3,7 @@
 Covers: _program, cli.shipped.
 """
 
+import os
 import runpy
 import subprocess
 import sys
@@ -69,6 +70,14 @@ main.run()
 """
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
     assert (done.returncode, done.stdout, done.stderr) == (3, "thread\nhandler\n", "")
+
+
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="needs a file that is always full")
+def test_a_full_disk_is_no_success():
+    code = "import sys; sys.argv = ['gaussian-swaying', '--version']; from gaussian_swaying.cli.main import run; run()"
+    with open("/dev/full", "w") as full:
+        buffered = {**os.environ, "PYTHONUNBUFFERED": ""}
+        assert subprocess.run([sys.executable, "-c", code], stdout=full, cwd=ROOT, env=buffered).returncode == 120
 
 
 def test_commands_that_are_printed_can_be_pasted(monkeypatch):

@@ -139,10 +139,39 @@ def test_rivals_of_a_film_in_motion_are_judged_by_the_points_of_their_own_first_
     assert ended == [true, wrong]
     assert costs[1] > 3 * costs[0]
     assert made.first == wrong
+    made._trusted = lambda evidence, place: [p.trusting(torch.full(p.tracks.seen.shape, 0.1)) for p in evidence]
+    assert made._each_from_its_own([wrong, true], "tracks") == (ended, costs)  # trust of its own favours no place
     monkeypatch.setattr(made, "_others", lambda place, rivals: ([], [] if made.first == true else true))
+    del made._trusted
     course = Course()
     made.run(course, lambda course: None)
     assert course.first == made.first == true
+
+
+def test_ends_whose_first_frames_show_no_points_have_no_rivals(own, cut, simulation):
+    sought = [Unknown("wind.azimuth", -60.0, 150.0), Unknown(FILM_START, -0.2, 0.0)]
+    made = Fit(simulation, read_videos(cut), Plan([str(own / "base.yaml")], [str(cut)], sought))
+    made.first = [0.5, 0.5]
+
+    def no_points(stage):
+        raise ValueError("Fewer than four points of the object can be followed.")
+
+    made.evidence = no_points
+    assert made._others([0.5, 0.5], [[0.1, 0.5]]) == ([], [])
+
+
+def test_a_changing_wind_in_a_film_in_motion_keeps_the_points(own, cut, simulation, monkeypatch):
+    """Also of a fit that was continued: its own were not followed yet, and its place has no changes."""
+    sought = [Unknown("wind.speed", 2.0, 12.0), Unknown(FILM_START, -0.2, 0.0)]
+    made = Fit(simulation, read_videos(cut), Plan([str(own / "base.yaml")], [str(cut)], sought))
+    made.first = [0.5, sought[1].share(-CUT / 24)]
+    evidence = made.evidence("tracks")
+    made._tracks = None
+    monkeypatch.setattr(Fit, "solved", lambda self, place, evidence, times: list(place))
+    monkeypatch.setattr("gaussian_swaying.fitting.fit.PREFERRED", 2.0)
+    wider, _ = made._changed(made.first, evidence)
+    assert wider is not made
+    assert wider.tracks is made.tracks
 
 
 def test_a_film_in_motion_is_said(own, cut, simulation):

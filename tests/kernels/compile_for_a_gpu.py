@@ -31,6 +31,7 @@ def launch(kernel, grid):
         options = {name: named.pop(name) for name in OPTIONS if name in named}
         types = dict(zip(kernel.arg_names, map(kind, given), strict=False)) | dict.fromkeys(named, "constexpr")
         key = kernel.fn.__name__, str(types), str(named)
+        assert set(named) <= set(kernel.arg_names), sorted(set(named) - set(kernel.arg_names))
         if key not in seen:
             seen.add(key)
             constants = {(kernel.arg_names.index(name),): value for name, value in named.items()}

@@ -179,6 +179,8 @@ def test_where_the_folder_is(given, expected, monkeypatch):
         monkeypatch.delenv(name, raising=False)
     for name, value in given.items():
         monkeypatch.setenv(name, value)
+    if "HOME" not in given:  # it is not asked for, and need not be there
+        monkeypatch.setattr(Path, "home", lambda: pytest.fail("no home"))
     assert cpu.cache_folder() == Path(expected)
 
 

@@ -211,6 +211,7 @@ def test_kernels_that_were_loaded_before_are_loaded_by_their_file(tmp_path, monk
     assert loaded_before()
     load("second", False)
     monkeypatch.setenv("NO_FAST_MATH", "1")
+    assert not loaded_before()
     load("other option", True)
     load("the same option", False)
     monkeypatch.setattr(torch, "__version__", "3.0")

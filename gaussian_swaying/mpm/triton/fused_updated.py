@@ -31,6 +31,10 @@ LEAST, MOST = 4, 64
 """Fewest and most substeps between two sorts of the particles by cell."""
 
 
+FIRST_CROSSING = 1e-3
+"""Cells that a particle enters in a substep, where nothing moves or nothing was measured."""
+
+
 class FusedUpdated(Fused):
     """Substeps of the ``updated`` formulation; particles are sorted by cell at the start of each part.
 
@@ -76,7 +80,7 @@ class FusedUpdated(Fused):
         self.clock = torch.zeros(2, dtype=torch.float64, device=self.device)  # time at step 0, substep [s]
         self.crowd = crowd_of(points.position, bound.settings.dx)
         self.wide = wide(self.device)
-        self.crossing = 1e-3  # how many cells a particle enters in a substep; measured by the rollouts
+        self.crossing = FIRST_CROSSING  # how many cells a particle enters in a substep; measured by the rollouts
         self._measured = torch.zeros(1, pin_memory=self.device.type == "cuda")
         self._copied: torch.cuda.Event | None = None
         self.filled = torch.zeros(0, dtype=torch.int32, device=self.device)
@@ -124,6 +128,7 @@ class FusedUpdated(Fused):
                 self.windows = torch.empty(SHARES * spans * SPAN * width, **self.like)
                 self.marks = torch.zeros(spans * SHARES, dtype=torch.int8, device=self.device)
                 self.occupied = torch.zeros(spans, dtype=torch.int8, device=self.device)
+                check_indices(len(self.pinned) * room)  # marks have a sign
                 self.marks_of_pins = torch.zeros(len(self.pinned), room, dtype=torch.int32, device=self.device)
         if grid != self.grid:
             self.repeater.forget()  # they read the node positions
@@ -147,6 +152,8 @@ class FusedUpdated(Fused):
         self.solids.take()
         self.solids.prepare(self.time, self.dt, steps)
         self._load(state)
+        if not self.atomic:
+            self._measured.copy_(self._crossing(state.velocity.double()))
         self._start(options)
         done, every = 0, self._sorted_for()
         for mark in sorted({*looks, *range(every, steps, every), steps}):
@@ -168,18 +175,26 @@ class FusedUpdated(Fused):
         return {**self._read(state), "impulse": self.impulse, **({"work": self._work()} if part.loaded else {})}
 
     def _sorted_for(self) -> int:
-        """Return the number of substeps between sorts, from the speed at the end of the last finished rollout."""
+        """Return the number of substeps between sorts, from the speed at the end of the last finished rollout.
+
+        Where sums have an order, which the sorts decide, the speed is that at the start: a run that is resumed has it.
+        """
         if self._copied is None or self._copied.query():
-            self.crossing = float(self._measured) or self.crossing
+            self.crossing = float(self._measured) or FIRST_CROSSING
         return sorted_for(self.crowd, self.crossing, self.count)
 
     def _measure_crossing(self) -> None:
         """Measure how many cells a particle enters in a substep, on average, without waiting."""
-        moved = self.moving[12:15].abs().mean() * 3 * self.dt.to(self.moving.dtype) / self.settings.dx
-        self._measured.copy_(moved.nan_to_num(0.0, 0.0)[None], non_blocking=True)
+        if not self.atomic:
+            return
+        self._measured.copy_(self._crossing(self.moving[12:15]), non_blocking=True)
         if self.device.type == "cuda":
             self._copied = torch.cuda.Event()
             self._copied.record()
+
+    def _crossing(self, velocity: Tensor) -> Tensor:
+        moved = velocity.abs().mean() * 3 * self.dt.to(velocity.dtype) / self.settings.dx
+        return moved.nan_to_num(0.0, 0.0)[None]
 
     @property
     def _acting(self) -> bool:
