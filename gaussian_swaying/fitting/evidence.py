@@ -118,7 +118,7 @@ class TrackEvidence(Evidence):
     ) -> None:
         super().__init__(video)
         scene = simulation.scene
-        self.tracks, self._weighed, self._trust = tracks, weighed, trust
+        self.tracks, self._weighed, self.trust = tracks, weighed, trust
         index = tracks.index.to(scene.moving.device)
         self._follow = scene.follow.some(index).to(scene.moving.device)
         self._means = scene.model.means.detach()[scene.moving[index]]
@@ -131,12 +131,12 @@ class TrackEvidence(Evidence):
 
     def on(self, simulation: Simulation) -> TrackEvidence:
         """The same tracks for the same scene on another grid."""
-        return TrackEvidence(simulation, self.video, self.tracks, self._weighed, self._trust)
+        return TrackEvidence(simulation, self.video, self.tracks, self._weighed, self.trust)
 
     def trusting(self, trust: Tensor) -> TrackEvidence:
         """The same tracks, with residuals multiplied by ``trust``, shape (F, T)."""
         found = copy(self)
-        found._trust = trust
+        found.trust = trust
         return found
 
     def shown(self, simulation: Simulation, states: Sequence[State]) -> Tensor:
@@ -150,7 +150,7 @@ class TrackEvidence(Evidence):
         pixel = project(shown[:, seen].flatten(0, 1), self.video.cameras[frame])[0].unflatten(
             0, (len(shown), int(seen.sum()))
         )
-        weight = self._weight[seen] if self._trust is None else self._weight[seen] * self._trust[frame, seen, None]
+        weight = self._weight[seen] if self.trust is None else self._weight[seen] * self.trust[frame, seen, None]
         return weight * (pixel - self.tracks.position[frame, seen]), self._cluster[seen]
 
 

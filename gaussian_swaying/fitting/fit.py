@@ -32,7 +32,7 @@ from gaussian_swaying.fitting.evidence import (
     compare_starts,
     scales_of,
 )
-from gaussian_swaying.fitting.grids import trusted
+from gaussian_swaying.fitting.grids import distrust, trusted
 from gaussian_swaying.fitting.held_out import Followed, fitted_part
 from gaussian_swaying.fitting.identifiability import check_apart, directions
 from gaussian_swaying.fitting.least_squares import (
@@ -434,14 +434,18 @@ class Fit:
         return None
 
     def _ranked(
-        self, solved: Sequence[tuple[list[float], list[Block], dict[str, float]] | None]
+        self, solved: Sequence[tuple[list[float], list[Block], dict[str, float]] | None], more: Sequence[float] = ()
     ) -> tuple[list[list[float]], list[float]]:
-        """Ends that are apart from each other, the best first, and their costs with the least standard deviations."""
+        """Ends that are apart from each other, the best first, and their costs with the least standard deviations.
+
+        ``more`` is added to the costs of those that have ended.
+        """
         found = [one for one in solved if one is not None]
         if not found:
             raise DivergedError("Every simulation of a start diverged: narrow the ranges of `unknowns`.")
         scales = {kind: min(own[kind] for _, _, own in found) for kind in found[0][2]}
         costs = [float(huber(blocks, scales)) for _, blocks, _ in found]
+        costs = [cost + other for cost, other in zip(costs, more or [0.0] * len(costs), strict=True)]
         apart: list[int] = []
         for k in sorted(range(len(found)), key=costs.__getitem__):
             if all(apart_by(self.plan.unknowns, found[k][0], found[j][0]) > SAME for j in apart):
@@ -455,17 +459,16 @@ class Fit:
 
         Points that are followed from where one place has them speak for that place.
         """
-        solved = []
+        solved, more = [], []
         for place in places:
             own = copy(self)
             own.first, own._tracks = list(place), None
             with suppress(DivergedError, ValueError):  # it has no such points
-                evidence = own.evidence(stage)
-                found = own._ended(place, own._trusted(evidence, place), self.fitted)
-                if found is not None:  # its points are trusted by how far grids are apart there: compare them untrusted
-                    blocks = own.residuals(evidence, self.fitted)(torch.tensor(found[:1], dtype=torch.float64))
-                    solved.append((found[0], blocks, _scaled(evidence)(blocks)))
-        return self._ranked(solved)
+                evidence = own._trusted(own.evidence(stage), place)
+                if (found := own._ended(place, evidence, self.fitted)) is not None:
+                    solved.append(found)
+                    more.append(distrust(evidence, self.fitted))
+        return self._ranked(solved, more)
 
     def _others(
         self, place: Sequence[float], rivals: Sequence[Sequence[float]]

@@ -56,6 +56,24 @@ def trusted(
     return found
 
 
+def distrust(evidence: Sequence[Evidence], times: Sequence[float]) -> float:
+    r"""Return what the trust in points adds to the cost of a place: the mean of :math:`-2 \log` of it.
+
+    Points that count less have smaller residuals. That is no better fit: with the larger variance that is assumed of
+    them, minus the logarithm of the likelihood has this term for their two coordinates.
+
+    Args:
+        evidence: From :func:`trusted`.
+        times: Times of the frames that are compared [s].
+    """
+    found = []
+    for part in evidence:
+        if isinstance(part, TrackEvidence) and part.trust is not None:
+            frames = [frame for time in times if (frame := part.frame_at(time)) is not None]
+            found.append(-2 * part.trust[frames][part.tracks.seen[frames]].log())
+    return float(torch.cat(found).mean()) if found else 0.0
+
+
 def _pixels(
     simulation: Simulation, parts: Sequence[TrackEvidence], values: Values, times: Sequence[float]
 ) -> dict[tuple[int, int], Tensor]:

@@ -1,11 +1,13 @@
 """Points that another grid moves otherwise count less."""
 
+import math
+
 import pytest
 import torch
 import yaml
 
 from gaussian_swaying.fitting.evidence import PictureEvidence, TrackEvidence, compare
-from gaussian_swaying.fitting.grids import trusted
+from gaussian_swaying.fitting.grids import distrust, trusted
 from gaussian_swaying.fitting.held_out import NOISE
 from gaussian_swaying.fitting.tracks import track
 from gaussian_swaying.fitting.videos import read_videos
@@ -60,4 +62,15 @@ def test_a_grid_on_which_the_scene_diverges_says_nothing(simulation, left, monke
 
     monkeypatch.setattr(grids, "_pixels", lost)
     (part,) = trusted(simulation, [simulation, simulation], [left], {}, left.video.times[:3])
-    assert bool((part._trust == 1).all())
+    assert bool((part.trust == 1).all())
+
+
+def test_less_trust_is_no_better_fit(left):
+    """The likelihood has its logarithm for both coordinates, of the points that are seen in the frames compared."""
+    times = left.video.times[:4]
+    trust = torch.full(left.tracks.seen.shape, 1.0, dtype=torch.float64)
+    trust[2] = 0.5
+    seen = left.tracks.seen[:4]
+    expected = 2 * math.log(2) * int(seen[2].sum()) / int(seen.sum())
+    assert distrust([left.trusting(trust), PictureEvidence(left.video, masks=False)], times) == pytest.approx(expected)
+    assert distrust([left], times) == 0.0

@@ -139,8 +139,11 @@ def test_rivals_of_a_film_in_motion_are_judged_by_the_points_of_their_own_first_
     assert ended == [true, wrong]
     assert costs[1] > 3 * costs[0]
     assert made.first == wrong
-    made._trusted = lambda evidence, place: [p.trusting(torch.full(p.tracks.seen.shape, 0.1)) for p in evidence]
-    assert made._each_from_its_own([wrong, true], "tracks") == (ended, costs)  # trust of its own favours no place
+    made._trusted = lambda evidence, place: [
+        p.trusting(torch.full(p.tracks.seen.shape, 0.1 if place == wrong else 1.0)) for p in evidence
+    ]
+    less = dict(zip(*(map(str, part) for part in made._each_from_its_own([wrong, true], "tracks")), strict=True))
+    assert float(less[str(wrong)]) > float(less[str(true)])  # smaller residuals by less trust are no better fit
     monkeypatch.setattr(made, "_others", lambda place, rivals: ([], [] if made.first == true else true))
     del made._trusted
     course = Course()
