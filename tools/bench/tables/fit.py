@@ -210,7 +210,7 @@ table(
     f"""
     film = {{name}} | {_OFF} | start = {{start:.2f s}} | verdict = {{verdict}} |
     more than twice the goals off = {{missed}} | processor = {{processor_s:.0f s}} |
-    memory = {{peak_bytes:.2f (GiB)}}""",
+    memory [GiB] = {{peak_bytes:.2f (GiB)}}""",
     empty="",
     before="{source}",
 )
