@@ -69,14 +69,10 @@ class Evidence(ABC):
 
     def __init__(self, video: Footage) -> None:
         self.video = video
-        self._frame = {round(1e6 * time): k for k, time in enumerate(video.times)}
 
     def frame_at(self, time: float) -> int | None:
-        """The frame that was taken at a time [s]; None if there is none."""
-        for shift in (0, -1, 1):
-            if (found := self._frame.get(round(1e6 * time) + shift)) is not None:
-                return found
-        return None
+        """See :meth:`~gaussian_swaying.fitting.videos.Footage.frame_at`."""
+        return self.video.frame_at(time)
 
     @abstractmethod
     def shown(self, simulation: Simulation, states: Sequence[State]) -> Any:

@@ -12,7 +12,6 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from copy import copy
 from dataclasses import dataclass, field, replace
-from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -608,6 +607,7 @@ class Fit:
             self.on_grid,
         )
         wider.first, wider._tracks = self.first, self.tracks if self.followed else None
+        wider._other_grids = self._grids()
         start = [*place, *map(steady_share, unknowns)]
         left = []
         for fit_, begin in ((self, list(place)), (wider, start)):
@@ -859,7 +859,6 @@ def _ready(plan: Plan, parser: Any, settings: Any, device: str, progress: bool) 
     videos = read_videos(list(plan.videos), plan.cameras)
     videos, judged = prepared(simulation, videos, plan.hand_held, plan.also_moves, say)
 
-    @cache
     def on_grid(ratio: float) -> Simulation:
         given = own.clone()
         given.solver.dx = ratio * given.solver.dx

@@ -238,7 +238,7 @@ def predictions(
     with Films(films, videos) as beside:
         for k, (time, gaussians) in enumerate(zip(times, moved, strict=True)):
             for number, video in enumerate(videos):
-                frame = next((f for f, own in enumerate(video.times) if abs(own - time) < 2e-6), None)
+                frame = video.frame_at(time)
                 if frame is None:
                     continue
                 camera = video.cameras[frame].to(painter.device)
@@ -440,7 +440,7 @@ def _labelled(shown: Shown) -> Any:
 
 def _chosen(video: Footage, times: Sequence[float], fitted: int) -> set[int]:
     """Numbers of the times whose frames of a video are in its picture, fitted and predicted ones."""
-    own = [k for k, time in enumerate(times) if any(abs(one - time) < 2e-6 for one in video.times)]
+    own = [k for k, time in enumerate(times) if video.frame_at(time) is not None]
     parts = [k for k in own if 0 < k < fitted], [k for k in own if k >= fitted]
     return {k for part in parts for k in _spread(part)} or set(own)
 

@@ -65,10 +65,10 @@ def apart_by(unknowns: Sequence[Unknown], one: Sequence[float], other: Sequence[
 
 
 def bent_alike(unknowns: Sequence[Unknown], place: Sequence[float]) -> list[list[float]]:
-    r"""Places with another Young's modulus and the wind that bends the object as far, at first and at rest in the end.
+    r"""Places with another Young's modulus, and the wind that bends the object as far.
 
-    The bend grows as :math:`w^2 / E`, so a start that is several times too stiff and too windy shows it, too, only with
-    oscillations that are too fast: the cost has a minimum there, and many on the way to the true one.
+    The bend grows as :math:`w^2 / E`. A place that is several times too stiff and too windy bends as far, but swings
+    too fast. The cost has a minimum there, and others on the way to the true one.
 
     Args:
         unknowns: What is sought.

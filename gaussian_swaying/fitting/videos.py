@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 import math
 import os
+from bisect import bisect_left
 from collections.abc import Callable, Generator, Sequence
 from contextlib import closing
 from dataclasses import dataclass
@@ -28,6 +29,9 @@ MOST_FRAMES = 10_000
 
 MOST_BYTES = 2 << 30
 """Most bytes of their decoded pixels: 345 frames of 1920 x 1080. Reading takes up to twice as much memory."""
+
+CLOSE = 2e-6
+"""Times of frames of several cameras that are the same [s]."""
 
 MOST_PIXELS = 40_000_000
 """Most pixels of a frame of a film; 8K has 33 million. ffmpeg itself refuses larger ones."""
@@ -55,6 +59,11 @@ class Footage:
     def size(self) -> tuple[int, int]:
         """Width and height [pixels]."""
         return self.images.shape[2], self.images.shape[1]
+
+    def frame_at(self, time: float) -> int | None:
+        """The frame that was taken at a time [s], to two microseconds; None if there is none."""
+        found = bisect_left(self.times, time - CLOSE)
+        return found if found < len(self.times) and self.times[found] < time + CLOSE else None
 
 
 @dataclass

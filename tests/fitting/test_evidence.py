@@ -1,7 +1,6 @@
 """Residuals of pictures and silhouettes: as small as the noise at the truth, and larger away from it."""
 
 import dataclasses
-from types import SimpleNamespace
 
 import pytest
 import torch
@@ -22,7 +21,7 @@ from gaussian_swaying.fitting.fit import Fit
 from gaussian_swaying.fitting.plan import Plan, read_unknown
 from gaussian_swaying.fitting.tracks import Tracks
 from gaussian_swaying.fitting.variants import states_of
-from gaussian_swaying.fitting.videos import read_videos
+from gaussian_swaying.fitting.videos import Footage, read_videos
 from gaussian_swaying.rendering.cameras.camera import look_at_camera
 
 
@@ -85,7 +84,7 @@ def test_tracks_share_their_clusters_over_cameras_and_pictures_do_not(monkeypatc
         floor = 1.0
 
         def __init__(self, kind):
-            super().__init__(SimpleNamespace(times=(0.0, 0.5, 1.0)))
+            super().__init__(Footage("a", (0.0, 0.5, 1.0), (), torch.zeros(3, 1, 1, 3, dtype=torch.uint8)))
             self.kind = kind
 
         def shown(self, simulation, states):

@@ -269,6 +269,14 @@ def test_a_camera_name_that_is_a_path(own, tmp_path, name):
         read_videos(tmp_path / "video")
 
 
+def test_the_frame_at_a_time():
+    """To two microseconds, as cameras write their times in decimals."""
+    third = 1 / 3
+    seen = videos.Footage("a", (0.0, third, 2 * third), (), torch.zeros(3, 1, 1, 3, dtype=torch.uint8))
+    assert [seen.frame_at(time) for time in (0.0, 0.333333, 0.333334, 0.666667)] == [0, 1, 1, 2]
+    assert [seen.frame_at(time) for time in (-0.1, 0.33333, 0.33334, 0.5, 0.7)] == [None] * 5
+
+
 @pytest.mark.parametrize("rate", [0, -24])
 def test_a_frame_rate_that_is_none(tmp_path, rate):
     _film(tmp_path, (64, 64), 3, fps=rate)
