@@ -7,6 +7,7 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
+from gaussian_swaying.fitting.overlap import Overlap
 from gaussian_swaying.fitting.registration import SOLID
 from gaussian_swaying.fitting.tracks import opencv
 from gaussian_swaying.rendering.cameras.camera import Camera
@@ -55,6 +56,10 @@ class Background:
             drawn = painter.renderer(rest.means, rest.covariances, painter.opacity(), self._moves, camera).color
         simulated, named, _ = (drawn > SHARE).cpu().unbind(-1)
         return picture, (picture.alpha[..., 0].cpu() > SOLID) & ~_widened(simulated) & ~named
+
+    def overlap(self, camera: Camera) -> Overlap:
+        """The offsets by which the picture of a camera shows the scene at rest beside its place."""
+        return Overlap(self._painter, self._rest, camera)
 
 
 def _widened(moving: Tensor) -> Tensor:

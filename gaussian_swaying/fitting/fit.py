@@ -60,6 +60,7 @@ from gaussian_swaying.fitting.report import (
     write_results,
 )
 from gaussian_swaying.fitting.rivals import apart_by, bent_alike, rivals_of
+from gaussian_swaying.fitting.straight import straight
 from gaussian_swaying.fitting.tracks import Tracks, beside_rest, match, opencv, still_until, track
 from gaussian_swaying.fitting.unknowns import FILM_START, check_unknowns
 from gaussian_swaying.fitting.variants import check_variants, states_of
@@ -86,11 +87,10 @@ NEAR = 0.1
 """Standard deviation of the second part of the search, as a share of the ranges."""
 COARSE = {"tracks": 0.02, "matches": 0.02, "silhouettes": 0.1, "pixels": 0.1}
 """Standard deviations of residuals in the coarse search: shares of the picture's width, and grey levels."""
-TOLERANCE = 3e-4
-"""Shortest step of the last stage, as a share of the ranges."""
-ROUGH = 30
-"""Factor by which the tolerance of the other steps is larger."""
-
+CLOSELY = (3e-4, LEAST_GAIN)
+"""Shortest step of the last stage, as a share of the ranges, and least gain, as a share of the cost."""
+ROUGHLY = (30 * CLOSELY[0], 30 * CLOSELY[1])
+"""The same of the other steps."""
 LONG_STILL = 0.05
 """Longest time that a film may be still, if the start of its motion is no unknown [s]; slow objects need a frame."""
 SPREAD = ("wind.speed", "wind.azimuth")
@@ -198,6 +198,7 @@ class Fit:
                 "The videos have no silhouettes: give `mask_path` or transparent images, or add tracks to `stages`."
             )
         check_variants(simulation)
+        self.retract = straight(plan.unknowns)
         self._tracks: list[Tracks] | None = None
         self._other_grids: list[Simulation] | None = None
         self._check_begins()
@@ -230,8 +231,8 @@ class Fit:
     def tracks(self) -> list[Tracks]:
         """Tracks of every camera."""
         if self._tracks is None:
-            shown = self._first_shown([self.first]) if self.first else [None]
-            self._tracks = [track(self.simulation, video, self.plan.tracks, shown[0]) for video in self.videos]
+            shown = self._first_shown() if self.first else None
+            self._tracks = [track(self.simulation, video, self.plan.tracks, shown) for video in self.videos]
             if sum(len(own.index) for own in self._tracks) < 4:
                 raise ValueError(
                     "Fewer than four points of the object can be followed: give sharper videos, or use the `stages` "
@@ -243,28 +244,31 @@ class Fit:
         """Write pictures to look at before the fit, into ``before`` of a folder, and return them."""
         return write_before(folder / BEFORE, self.simulation, self.videos, self.tracks if self.followed else None)
 
-    def _first_shown(self, places: Sequence[Sequence[float]]) -> list[DeformedGaussians]:
-        """Gaussians of simulations with the values of some places when the film begins."""
-        states = next(self._run(torch.tensor(places, dtype=torch.float64), [0.0]))
-        return [self.simulation.painter.deformed(state) for state in states]
+    def _first_shown(self) -> DeformedGaussians:
+        """Gaussians of the simulation from which the points are followed when the film begins."""
+        states = next(self._run(torch.tensor([self.first], dtype=torch.float64), [0.0]))
+        return self.simulation.painter.deformed(states[0])
 
     def begin_from(self, places: Tensor) -> list[float]:
         """Return which of some places (B, U) the first frame of a film in motion looks like most, with its best start.
 
-        That is the one from whose pictures the most Gaussians are found in the first frames.
+        That is the one from whose pictures the most Gaussians are found in the first frames. One simulation of each
+        shows all starts.
         """
         column = [u.name for u in self.plan.unknowns].index(FILM_START)
         known = self.plan.unknowns[column]
-        trials = places.repeat_interleave(BEGINS, 0)
-        low, high = 0.0, known.share(min(max(0.0, known.low), known.high))
-        trials[:, column] = torch.linspace(low, high, BEGINS, dtype=places.dtype).repeat(len(places))
+        before = torch.linspace(max(0.0, -known.high), -known.low, BEGINS, dtype=torch.float64).tolist()
         brief = [replace(video, images=video.images[:1]) for video in self.videos]
-        found = []
-        for shown in self._first_shown(trials.tolist()):
-            tracks = [track(self.simulation, video, self.plan.tracks, shown) for video in brief]
-            found.append(sum(int(own.seen[0].sum()) for own in tracks))
-        best = max(range(len(found)), key=found.__getitem__)
-        return [float(share) for share in trials[best]]
+        values = [{name: v for name, v in self.values(place).items() if name != FILM_START} for place in places]
+        best, most = places[0], -1
+        for ago, states in zip(before, states_of(self.simulation, values, before, alike=False), strict=True):
+            for place, state in zip(places, states[: None if ago else 1], strict=False):  # at rest all are alike
+                shown = self.simulation.painter.deformed(state)
+                tracks = [track(self.simulation, video, self.plan.tracks, shown) for video in brief]
+                if (found := sum(int(own.seen[0].sum()) for own in tracks)) > most:
+                    most, best = found, place.clone()
+                    best[column] = known.share(-ago)
+        return [float(share) for share in best]
 
     def evidence(self, stage: str, matched: Sequence[float] = ()) -> list[Evidence]:
         """Return the residuals of a stage, one list entry for each video and kind."""
@@ -427,7 +431,7 @@ class Fit:
         residuals, progress = self.residuals(evidence, times), Progress(torch.tensor(place, dtype=torch.float64))
         with suppress(DivergedError):
             while not progress.done and progress.iteration < BRIEF:
-                iterate(residuals, _scaled(evidence), progress, ROUGH * TOLERANCE, ROUGH * LEAST_GAIN)
+                iterate(residuals, _scaled(evidence), progress, *ROUGHLY, self.retract)
             blocks = residuals(progress.place[None])
             return progress.place.tolist(), blocks, _scaled(evidence)(blocks)
         return None
@@ -487,6 +491,8 @@ class Fit:
                 return [], []
         else:
             ended, costs = self._brief([place, *tried], self._trusted(self.evidence(stage), place), self.fitted)
+        for end, cost in zip(ended, costs, strict=True):
+            self.say(f"rival: cost {cost:.5g}, {self._shown(end)}")
         away = [apart_by(self.plan.unknowns, end, place) for end in ended]
         near = [k for k, cost in enumerate(costs) if cost < RIVAL * costs[0]]
         own = away.index(min(away))
@@ -572,8 +578,7 @@ class Fit:
             progress = Progress(place, course.damping, course.iteration, done=course.ended)
             last, residuals = course.step == len(steps) - 1, self.residuals(evidence, times)
             while not progress.done and progress.iteration < self.plan.iterations:
-                close = (TOLERANCE, LEAST_GAIN) if last else (ROUGH * TOLERANCE, ROUGH * LEAST_GAIN)
-                iterate(residuals, _scaled(evidence), progress, *close)
+                iterate(residuals, _scaled(evidence), progress, *(CLOSELY if last else ROUGHLY), self.retract)
                 course.place, course.damping = progress.place.tolist(), progress.damping
                 course.iteration, course.ended = progress.iteration, progress.done
                 course.seconds = time.monotonic() - clock
@@ -627,7 +632,7 @@ class Fit:
         """The place at which the iterations from another end."""
         progress = Progress(torch.tensor(place, dtype=torch.float64))
         while not progress.done and progress.iteration < self.plan.iterations:
-            iterate(self.residuals(evidence, times), _scaled(evidence), progress, ROUGH * TOLERANCE, ROUGH * LEAST_GAIN)
+            iterate(self.residuals(evidence, times), _scaled(evidence), progress, *ROUGHLY, self.retract)
             self.say(f"to {times[-1]:.3g} s, {progress.iteration}: {self._shown(progress.place.tolist())}")
         return progress.place.tolist()
 
@@ -681,7 +686,7 @@ class Fit:
             residuals = there.residuals(own, self.fitted)
             with suppress(DivergedError):
                 while not progress.done and progress.iteration < REFINED:
-                    iterate(residuals, _scaled(own), progress, TOLERANCE, LEAST_GAIN)
+                    iterate(residuals, _scaled(own), progress, *CLOSELY, self.retract)
             if progress.normal is None:
                 continue
             moved = not torch.equal(progress.place, place)

@@ -2,9 +2,12 @@
 
 Each frame is compared with the splat at rest, drawn from where the last frame's camera was: points of the background
 are followed from the picture to the frame, and a camera sees their places in space where the frame has them
-(:func:`~gaussian_swaying.fitting.registration.refine`). So nothing drifts. A Kalman smoother for random accelerations,
-in the form of Whittaker (1923), then takes off noise: that of the measurement is known from the points, and the
-accelerations are those of the largest likelihood, so that a shake that is larger than the noise stays.
+(:func:`~gaussian_swaying.fitting.registration.refine`). So nothing drifts. Where the splat is drawn beside its place
+(:class:`~gaussian_swaying.fitting.overlap.Overlap`) and the film is not, the points are moved there first.
+
+A Kalman smoother for random accelerations, in the form of Whittaker (1923), then takes off noise: that of the
+measurement is known from the points, and the accelerations are those of the largest likelihood, so that a shake that is
+larger than the noise stays.
 
 All rows of a frame count as taken at once: a rolling shutter is ignored.
 """
@@ -19,11 +22,12 @@ import torch
 from torch import Tensor
 
 from gaussian_swaying.fitting.background import Background
+from gaussian_swaying.fitting.overlap import Overlap
 from gaussian_swaying.fitting.registration import LEAST, Registration, grey_of, refine
 from gaussian_swaying.fitting.tracks import follow, opencv
 from gaussian_swaying.fitting.videos import Footage
 from gaussian_swaying.geometry.rotations import rotation_of
-from gaussian_swaying.rendering.cameras.camera import Camera
+from gaussian_swaying.rendering.cameras.camera import Camera, project
 
 LOOKS = 8
 """Frames that are compared with the first one to see whether a camera moves."""
@@ -31,6 +35,8 @@ ROUNDS, FIRST = 2, 4
 """Pictures that are drawn for a frame, and for the first one."""
 AGREE = 0.25
 """Least share of the points of a frame that agree on its camera."""
+ASIDE = 0.02
+"""Way that the picture goes, as a share of its longer side, after which the splat's overlap is another."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -93,16 +99,24 @@ def follow_camera(video: Footage, background: Background) -> Motion:
     found: list[Registration | None] = []
     residuals: list[float] = []
     last: Camera | None = None
+    overlap: Overlap | None = None
+    itself: bool | None = None
+    pivot = _pivot(video.cameras[0], background)
     for k, given in enumerate(video.cameras):
         camera = given if last is None else _carried(given, video.cameras[k - 1], last)
         seen = None
-        for _ in range(FIRST if last is None else ROUNDS):
+        for number in range(FIRST if last is None else ROUNDS):
+            near = last is not None or number > 0
+            if near and itself is not False and (overlap is None or _goes(overlap.camera, camera, pivot)):
+                overlap = background.overlap(camera)
             picture, still = background.draw(camera)
-            here = refine(video.images[k], picture, camera, still)
+            here = refine(video.images[k], picture, camera, still, overlap, itself)
             if here is None or here.agreeing < AGREE * here.matches:
                 seen = None
                 break
             seen, camera = here, here.camera
+        if seen is not None and itself is None:
+            itself = seen.itself
         last = camera
         found.append(seen)
         residuals += [] if seen is None else [seen.residual]
@@ -113,7 +127,7 @@ def follow_camera(video: Footage, background: Background) -> Motion:
             "stands still in the splat: stand it on a tripod, or film something still and textured, too, and have it "
             "in the splat."
         )
-    cameras = smoothed(found, video.times, _pivot(video.cameras[0], background))
+    cameras = smoothed(found, video.times, pivot)
     like = video.cameras[0].world_to_camera
     cameras = [replace(camera, world_to_camera=camera.world_to_camera.to(like)) for camera in cameras]
     return Motion(tuple(cameras), unseen, float(torch.tensor(residuals).median()))
@@ -196,6 +210,12 @@ def _carried(given: Camera, before: Camera, found: Camera) -> Camera:
     """A camera moved from the last frame's, which was found, as the given ones move; still if they are."""
     there, then, now = (c.world_to_camera.double().cpu() for c in (found, before, given))
     return replace(given, world_to_camera=now @ torch.linalg.inv(then) @ there, intrinsics=found.intrinsics)
+
+
+def _goes(camera: Camera, other: Camera, pivot: Tensor) -> bool:
+    """True if two cameras see a point so far apart that the splat's overlap is another."""
+    here, there = (project(pivot[None], one.to("cpu", torch.float64))[0] for one in (camera, other))
+    return float((here - there).norm()) > ASIDE * max(camera.width, camera.height)
 
 
 def _pivot(camera: Camera, background: Background) -> Tensor:

@@ -1,7 +1,8 @@
 """Robust nonlinear least squares by Levenberg and Marquardt's method, with a batch of simulations for each step.
 
-A step takes one batch: the residuals at its end and their sensitivities, by central differences. Residuals are divided
-by their robust standard deviation, and weighed by Huber's function, so that wrong tracks count little.
+A step takes one batch: the residuals at its end and their sensitivities, by central differences. If it does not lower
+the cost, one more batch tries shorter ones. Residuals are divided by their robust standard deviation, and weighed by
+Huber's function, so that wrong tracks count little.
 """
 
 from __future__ import annotations
@@ -23,10 +24,12 @@ HUBER = 1.345
 START = 1e-6
 """Damping of the first step: nearly none, as damping mostly slows combinations that the video hardly determines."""
 BETTER, WORSE, LEAST_DAMPING = 0.03, 30.0, 1e-3
-"""Factor on the damping after a step that lowered the cost, after one that did not, and least damping after the latter.
-"""
-MOST_DAMPING = 1e4
-"""Damping at which the search for a lower cost ends."""
+"""Factor on the damping after a step that lowered the cost at once and as expected, that between the shorter steps that
+are tried after one that did not lower it, and their least damping."""
+SHORTER = 5
+"""Shorter steps that are tried at once."""
+AS_EXPECTED = 0.5
+"""Least share of the fall of the cost that linear residuals have, with which the damping is lowered."""
 LEAST_GAIN = 1e-4
 NO_STEP = "no step is better"
 REACH = 0.25
@@ -36,6 +39,8 @@ Residuals = Callable[[Tensor], list[Block]]
 """Residuals at some points (B, U), each a share of every range."""
 Rescale = Callable[[Sequence[Block]], dict[str, float]]
 """Robust standard deviation of the first variant's residuals, for each kind."""
+Retract = Callable[[Tensor, Tensor], Tensor]
+"""The end of a step from a place, both in shares of the ranges (U,): the sum, or along what is straight otherwise."""
 
 
 class DivergedError(ValueError):
@@ -172,7 +177,12 @@ def linearised(residuals: Residuals, rescale: Rescale, place: Tensor) -> tuple[N
 
 
 def iterate(
-    residuals: Residuals, rescale: Rescale, progress: Progress, tolerance: float, least_gain: float = LEAST_GAIN
+    residuals: Residuals,
+    rescale: Rescale,
+    progress: Progress,
+    tolerance: float,
+    least_gain: float = LEAST_GAIN,
+    retract: Retract = torch.add,
 ) -> None:
     """One iteration; ``progress`` is updated, also with the reason to stop.
 
@@ -182,6 +192,7 @@ def iterate(
         progress: The state to start from.
         tolerance: Smallest step worth another iteration, as a share of the ranges.
         least_gain: Smallest share of the cost worth another iteration.
+        retract: Takes a step.
 
     Raises:
         ValueError: If nothing is finite where it starts.
@@ -190,19 +201,32 @@ def iterate(
         progress.normal, progress.scales, _ = linearised(residuals, rescale, progress.place)
         if progress.normal.count == 0:
             raise DivergedError("Every simulation of a step diverged: narrow the ranges of `unknowns`.")
-    normal = progress.normal
+    normal, place = progress.normal, progress.place
     progress.iteration += 1
-    trial = step_from(normal, progress.place, progress.damping)
-    moved = float((trial - progress.place).abs().amax())
+
+    def end_with(damping: float) -> Tensor:
+        return retract(place, step_from(normal, place, damping) - place).clamp(0.0, 1.0)
+
+    trial = end_with(progress.damping)
     there, scales, blocks = linearised(residuals, rescale, trial)
-    gain = normal.cost - float(huber([block.of(block.values[:1]) for block in blocks], progress.scales)[0])
-    if not gain > 0:
-        progress.damping = max(progress.damping * WORSE, LEAST_DAMPING)
-        if moved < tolerance or progress.damping > MOST_DAMPING:
+    cost = float(huber([block.of(block.values[:1]) for block in blocks], progress.scales)[0])
+    shortened = not cost < normal.cost
+    if shortened:
+        least = max(progress.damping * WORSE, LEAST_DAMPING)
+        dampings = [least * WORSE**k for k in range(SHORTER)]
+        trials = torch.stack([end_with(damping) for damping in dampings])
+        costs = huber(residuals(trials), progress.scales)
+        best = int(costs.argmin())
+        cost, trial, progress.damping = float(costs[best]), trials[best], dampings[best]
+        if not cost < normal.cost:
             progress.done = NO_STEP
-        return
+            return
+        there, scales, _ = linearised(residuals, rescale, trial)
+    moved, gain = float((trial - place).abs().amax()), normal.cost - cost
     progress.place, progress.normal, progress.scales = trial, there, scales
-    damped, progress.damping = progress.damping > LEAST_DAMPING, progress.damping * BETTER
+    damped = progress.damping > LEAST_DAMPING
+    if not shortened and gain > AS_EXPECTED * normal.cost * expected_gain(normal, trial - place):
+        progress.damping *= BETTER
     if damped:  # a short step says nothing
         return
     if moved < tolerance:

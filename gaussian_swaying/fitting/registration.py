@@ -17,8 +17,9 @@ import torch
 from torch import Tensor
 
 from gaussian_swaying._checks import check_whole
-from gaussian_swaying.fitting.tracks import follow, opencv, window_of
-from gaussian_swaying.rendering.cameras.camera import Camera, look_at_camera
+from gaussian_swaying.fitting.overlap import Overlap, window_of
+from gaussian_swaying.fitting.tracks import follow, opencv
+from gaussian_swaying.rendering.cameras.camera import Camera, look_at_camera, project
 from gaussian_swaying.rendering.protocol import RenderOutput
 
 RATIO = 0.8
@@ -50,6 +51,7 @@ class Registration:
         residual: Root mean square of their distances [pixels].
         spread: Covariance of a small rotation of the camera's axes [rad], and of a shift along them [scene units],
             float64, shape (6, 6). Points nearer than the window in which they are followed count as one.
+        itself: Whether the frame shows the thing itself, and not what the splat shows; False if it was not asked.
     """
 
     camera: Camera
@@ -57,6 +59,7 @@ class Registration:
     agreeing: int
     residual: float
     spread: Tensor
+    itself: bool = False
 
 
 def cameras_around(
@@ -136,7 +139,14 @@ def register(
     return best
 
 
-def refine(frame: Tensor, picture: RenderOutput, camera: Camera, where: Tensor) -> Registration | None:
+def refine(
+    frame: Tensor,
+    picture: RenderOutput,
+    camera: Camera,
+    where: Tensor,
+    overlap: Overlap | None = None,
+    itself: bool | None = None,
+) -> Registration | None:
     """The camera of a frame, from points that are followed there from a picture taken nearby.
 
     Args:
@@ -144,12 +154,14 @@ def refine(frame: Tensor, picture: RenderOutput, camera: Camera, where: Tensor) 
         picture: The splat, drawn from ``camera``.
         camera: A camera so near that most points move by less than some 20 pixels.
         where: The pixels of the picture that count, bool, shape (H, W).
+        overlap: Of the picture, or of one from nearby; None to take the picture as it is.
+        itself: Whether the frame shows the thing itself, so that the overlap counts; None to find out.
 
     Returns:
         None if too few points agree.
     """
     near = NEAR * math.hypot(camera.width, camera.height)
-    return _by_flow(opencv(), grey_of(frame), picture, camera, False, near, where)
+    return _by_flow(opencv(), grey_of(frame), picture, camera, False, near, where, overlap, itself)
 
 
 def grey_of(image: Tensor) -> Any:
@@ -207,6 +219,8 @@ def _by_flow(
     focal: bool,
     near: float = CLOSE,
     where: Tensor | None = None,
+    overlap: Overlap | None = None,
+    itself: bool | None = None,
 ) -> Registration | None:
     """The camera from points that are followed from the picture to the frame; None if too few are."""
     import numpy as np
@@ -221,17 +235,39 @@ def _by_flow(
     here = corners.reshape(-1, 2).astype(np.float64) + 0.5
     colours = np.stack([drawn, grey])[..., None].repeat(3, -1)
     place, seen = follow(colours, here)
-    return _pose(cv2, picture, camera, here[seen[1]], place[1][seen[1]], focal, near)
+    return _pose(cv2, picture, camera, here[seen[1]], place[1][seen[1]], focal, near, overlap, itself)
 
 
 def _pose(
-    cv2: Any, picture: RenderOutput, camera: Camera, here: Any, there: Any, focal: bool, near: float
+    cv2: Any,
+    picture: RenderOutput,
+    camera: Camera,
+    here: Any,
+    there: Any,
+    focal: bool,
+    near: float,
+    overlap: Overlap | None = None,
+    itself: bool | None = None,
 ) -> Registration | None:
     """The camera that sees what the picture shows at ``here`` at ``there``; None if too few pairs agree."""
     import numpy as np
 
     world, known = in_space(picture, camera, here)
     world, there = world[known], np.ascontiguousarray(there[known], dtype=np.float64)
+    if overlap is None:
+        return _seen_from(cv2, world, there, camera, focal, near)
+    beside = overlap.at(torch.from_numpy(world)).numpy()
+    if itself is None:
+        found = _seen_from(cv2, world, there, camera, focal, near)
+        itself = found is not None and _lacking(world, there, beside, found.camera, near) > 0.5
+    found = _seen_from(cv2, world, there + itself * beside, camera, focal, near)
+    return None if found is None else replace(found, itself=itself)
+
+
+def _seen_from(cv2: Any, world: Any, there: Any, camera: Camera, focal: bool, near: float) -> Registration | None:
+    """The camera that sees places (N, 3) at pixels (N, 2), near another; None if too few agree."""
+    import numpy as np
+
     if len(world) < LEAST:
         return None
     K = camera.intrinsics.double().cpu().numpy().copy()
@@ -259,6 +295,28 @@ def _pose(
     return Registration(seen, len(world), len(index), residual, spread)
 
 
+def _lacking(world: Any, there: Any, beside: Any, camera: Camera, near: float) -> float:
+    """The share of an overlap that explains best what no small change of the camera does.
+
+    It is near 1 in a frame of the thing itself, but below, as the overlap is not known exactly, and near 0 in one of
+    what the splat shows.
+
+    Args:
+        world: Places (N, 3).
+        there: Where the frame has them [pixels], shape (N, 2).
+        beside: Where the splat is drawn, beside where they are [pixels], shape (N, 2).
+        camera: A camera that sees the places about there.
+        near: Distance from which a place is somewhere else [pixels].
+    """
+    places, shift = torch.from_numpy(world), torch.from_numpy(beside)
+    off = torch.from_numpy(there) - project(places, camera)[0]
+    good = off.norm(dim=-1) < near
+    basis = torch.linalg.qr(_slope(places[good], camera)).Q
+    left, along = (part[good].flatten() for part in (off, shift))
+    along = along - basis @ (basis.T @ along)
+    return float(-(left @ along) / (along @ along).clamp(min=1e-12))
+
+
 def _agreeing(cv2: Any, world: Any, there: Any, K: Any, near: float, turn: Any, shift: Any) -> tuple[Any, Any, Any]:
     """The points that agree on a pose, and the pose, refined on them."""
     import numpy as np
@@ -275,17 +333,22 @@ def _agreeing(cv2: Any, world: Any, there: Any, K: Any, near: float, turn: Any, 
 
 def _spread(world: Any, there: Any, camera: Camera, residual: float) -> Tensor:
     """Covariance of a camera (6, 6), from the points (N, 3) that it sees at ``there`` (N, 2), off by ``residual``."""
+    slope = _slope(torch.from_numpy(world), camera)
+    apart = len(set(map(tuple, (there // window_of(camera.width, camera.height)).astype(int).tolist())))
+    variance = 0.5 * residual**2 * len(world) / apart
+    return variance * torch.linalg.pinv(slope.T @ slope, hermitian=True)
+
+
+def _slope(places: Tensor, camera: Camera) -> Tensor:
+    """Derivatives of the pixels of places (N, 3) by a small rotation of the camera's axes and a shift, (2N, 6)."""
     view, K = camera.world_to_camera, camera.intrinsics
-    local = torch.from_numpy(world) @ view[:3, :3].T + view[:3, 3]
+    local = places @ view[:3, :3].T + view[:3, 3]
     x, y, z = local.unbind(1)
     zero = torch.zeros_like(z)
     by_place = torch.stack([K[0, 0] / z, zero, -K[0, 0] * x / z**2, zero, K[1, 1] / z, -K[1, 1] * y / z**2], 1)
     by_place = by_place.unflatten(1, (2, 3))
     by_turn = torch.linalg.cross(local[:, None].expand_as(by_place), by_place)
-    slope = torch.cat([by_turn, by_place], 2).flatten(0, 1)
-    apart = len(set(map(tuple, (there // window_of(camera.width, camera.height)).astype(int).tolist())))
-    variance = 0.5 * residual**2 * len(world) / apart
-    return variance * torch.linalg.pinv(slope.T @ slope, hermitian=True)
+    return torch.cat([by_turn, by_place], 2).flatten(0, 1)
 
 
 __all__ = ["Registration", "cameras_around", "grey_of", "refine", "register"]

@@ -6,7 +6,6 @@ does not return to where it came from.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
@@ -14,23 +13,17 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from gaussian_swaying.fitting.overlap import drawn_beside, window_of, windows
 from gaussian_swaying.fitting.videos import Footage
 from gaussian_swaying.gaussians.model import DeformedGaussians
 from gaussian_swaying.mpm.state import State
 from gaussian_swaying.rendering.cameras.camera import Camera, project
 from gaussian_swaying.rendering.protocol import RenderOutput
-from gaussian_swaying.simulation.painter import Painter
 from gaussian_swaying.simulation.simulation import Simulation
 
-WINDOW, WIDE = 15, 960
-"""Side of the square that is followed, where the longer side of the picture has at most ``WIDE`` [pixels]."""
 LEVELS = 3
 BACK = 0.5
 """Largest distance between a point and the one found by following it back [pixels]."""
-AROUND = 6.0
-"""Border around the windows in which Gaussians are drawn to see how they overlap, in their standard deviations."""
-_DRAWN = 1e-3
-"""Least sum of the weights of a Gaussian in a picture with which it counts as visible [pixels]."""
 STILL = 0.5
 """Largest distance that a point moves which stands still [pixels]: noise and compression."""
 QUALITY = 0.02
@@ -200,62 +193,6 @@ def match(
     return Tracks(chosen, position, seen)
 
 
-def drawn_beside(painter: Painter, gaussians: DeformedGaussians, camera: Camera, places: Tensor) -> Tensor:
-    """Return the offset between the rendered and the projected centres of Gaussians, averaged over windows.
-
-    The rendered centre of a Gaussian is the mean of all pixels, weighted by its share of each after alpha compositing.
-    These weights are the derivatives of the picture by the colours.
-
-    Args:
-        painter: Draws the picture.
-        gaussians: All Gaussians of it, N.
-        camera: Its camera, on their device.
-        places: Centres of the windows [pixels], shape (T, 2).
-
-    Returns:
-        Rendered minus projected centre [pixels], float64, shape (T, 2).
-    """
-    if not len(places):
-        return torch.zeros(0, 2, dtype=torch.float64)
-    opacity, (column, row) = painter.scene.model.opacity().detach(), _windows(places, camera.width, camera.height)
-    camera, left, top = _part(camera, gaussians, column, row)
-    width, height = camera.width, camera.height
-
-    def drawn(colours: Tensor) -> Tensor:
-        return painter.renderer(gaussians.means, gaussians.covariances, opacity, colours, camera).color
-
-    y, x = torch.meshgrid(torch.arange(height) + 0.5, torch.arange(width) + 0.5, indexing="ij")
-    middle = torch.tensor([0.5 * width, 0.5 * height])
-    asked = torch.stack([torch.ones(height, width), x - middle[0], y - middle[1]], -1).to(opacity)
-    colours = torch.zeros(len(opacity), 3, device=opacity.device, requires_grad=True)
-    with torch.enable_grad():
-        (sums,) = torch.autograd.grad(drawn(colours), colours, asked)
-    weight, centre = sums[:, :1], (project(gaussians.means, camera)[0] - middle).to(sums)
-    shift = torch.where(weight > _DRAWN, sums[:, 1:] / weight - centre, 0.0)
-    with torch.no_grad():
-        field = drawn(torch.cat([shift, (weight > _DRAWN).to(shift)], 1)).cpu().double()
-    found = field[row - top, column - left].mean(1)
-    return found[:, :2] / found[:, 2:].clamp(min=1e-6)
-
-
-def _part(camera: Camera, gaussians: DeformedGaussians, column: Tensor, row: Tensor) -> tuple[Camera, int, int]:
-    """The camera of the part of a picture with some pixels and the Gaussians in them; its left and upper end."""
-    pixel, depth = project(gaussians.means, camera)
-    low, high = (torch.stack([end(column), end(row)]).to(pixel) for end in (torch.min, torch.max))
-    near = ((pixel >= low) & (pixel <= high)).all(-1) & (depth > camera.near)
-    size = (
-        gaussians.covariances.diagonal(dim1=-2, dim2=-1).amax(-1).sqrt()[near] * camera.intrinsics[0, 0] / depth[near]
-    )
-    border = math.ceil(AROUND * float(size.quantile(0.95))) if len(size) else 0
-    left, top = (max(0, int(end) - border) for end in low)
-    right, bottom = (
-        min(most, int(end) + border + 1) for most, end in zip((camera.width, camera.height), high, strict=True)
-    )
-    lens = camera.intrinsics.clone()
-    lens[:2, 2] -= lens.new_tensor([left, top])
-    return replace(camera, intrinsics=lens, width=right - left, height=bottom - top), left, top
-
-
 def _at_rest(off: Tensor, beside: Tensor) -> tuple[float, Tensor]:
     """Return the share of the splat's offsets that a video at rest lacks, 0 to 1, and the median of the rest (2,).
 
@@ -299,11 +236,6 @@ def follow(images: Any, start: Any) -> tuple[Any, Any]:
         now = np.where(seen[k][:, None, None], there, now)
         position[k] = now[:, 0] + 0.5
     return position, seen
-
-
-def window_of(width: int, height: int) -> int:
-    """Side of the square that is followed in a picture of this size [pixels]; odd."""
-    return 2 * round(WINDOW // 2 * max(1.0, max(width, height) / WIDE)) + 1
 
 
 def _chosen(
@@ -350,18 +282,9 @@ def _in_sight(pixel: Tensor, depth: Tensor, picture: RenderOutput, behind: float
 def _inside(pixel: Tensor, picture: RenderOutput, there: Tensor) -> Tensor:
     """Mask of the points ``there`` whose window contains no border of the object; all of them if hardly any is left."""
     alpha = picture.alpha[..., 0].cpu()
-    column, row = _windows(pixel, alpha.shape[1], alpha.shape[0])
+    column, row = windows(pixel, alpha.shape[1], alpha.shape[0])
     inside = there & (alpha[row, column] >= 0.5).all(-1)
     return inside if int(inside.sum()) >= THIN * int(there.sum()) else there
-
-
-def _windows(places: Tensor, width: int, height: int) -> tuple[Tensor, Tensor]:
-    """Columns and rows of the pixels in the window around each place (T, 2), clamped to the picture; shape (T, W²)."""
-    side = window_of(width, height)
-    reach = torch.arange(side) - side // 2
-    beside = torch.cartesian_prod(reach, reach)
-    column, row = (places.long()[:, None] + beside).unbind(-1)
-    return column.clamp(0, width - 1), row.clamp(0, height - 1)
 
 
 def _grey(images: Tensor) -> Any:

@@ -125,13 +125,13 @@ def test_rivals_of_a_film_in_motion_are_judged_by_the_points_of_their_own_first_
     wrong = [sought[0].share(90.0), sought[1].share(-CUT / 24)]
     true = [sought[0].share(TRUTH["wind.azimuth"]), wrong[1]]
     made, seen = Fit(simulation, read_videos(cut), plan), []
-    shown = made._first_shown
+    shown = Fit._first_shown
 
-    def first_shown(places):
-        seen.extend(list(place) for place in places)
-        return shown(places)
+    def first_shown(self):
+        seen.append(list(self.first))
+        return shown(self)
 
-    made._first_shown = first_shown
+    monkeypatch.setattr(Fit, "_first_shown", first_shown)
     made.first = wrong
     monkeypatch.setattr("gaussian_swaying.fitting.fit.BRIEF", 0)  # where they are, not where they would go
     ended, costs = made._each_from_its_own([wrong, true], "tracks")

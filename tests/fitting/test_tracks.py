@@ -7,9 +7,9 @@ import pytest
 import torch
 import yaml
 
-from gaussian_swaying.fitting import tracks
 from gaussian_swaying.fitting.evidence import TrackEvidence
-from gaussian_swaying.fitting.tracks import _inside, drawn_beside, match, track, window_of
+from gaussian_swaying.fitting.overlap import drawn_beside, window_of
+from gaussian_swaying.fitting.tracks import _inside, match, track
 from gaussian_swaying.fitting.variants import states_of
 from gaussian_swaying.fitting.videos import Footage, read_videos
 from gaussian_swaying.rendering.cameras.camera import look_at_camera, project
@@ -17,7 +17,7 @@ from gaussian_swaying.rendering.protocol import RenderOutput
 from gaussian_swaying.scenes.printed_cloth import printed_colours
 from gaussian_swaying.simulation.simulation import Simulation
 
-from .conftest import base, cameras
+from .conftest import base
 
 cv2 = pytest.importorskip("cv2", reason="needs the extra [fit]")
 
@@ -96,49 +96,6 @@ def _printed(folder, spacing):
     file = folder / f"{spacing}.yaml"
     file.write_text(yaml.safe_dump(base(scene=scene)))
     return Simulation.from_yaml(file, device="cpu")
-
-
-def test_where_a_gaussian_is_drawn_is_the_mean_of_its_pixels(simulation):
-    """Against pictures of one Gaussian after the other: white, behind and in front of black ones."""
-    painter, camera = simulation.painter, cameras()["left"]
-    gaussians, opacity = painter.scene.rest(), painter.scene.model.opacity()
-    centres = project(gaussians.means, camera)[0]
-    rows, columns = torch.meshgrid(torch.arange(120) + 0.5, torch.arange(200) + 0.5, indexing="ij")
-    sums = torch.zeros(len(centres), 3)
-    for k in range(len(centres)):
-        colours = torch.zeros(len(centres), 3)
-        colours[k] = 1
-        white = painter.renderer(gaussians.means, gaussians.covariances, opacity, colours, camera).color[..., 0]
-        sums[k] = torch.stack([white.sum(), (white * columns).sum(), (white * rows).sum()])
-    shift = sums[:, 1:] / sums[:, :1] - centres
-    assert shift.norm(dim=-1).amax() > 1
-    field = torch.zeros(120, 200, 3)
-    for k in range(len(centres)):
-        colours = torch.zeros(len(centres), 3)
-        colours[k] = torch.cat([shift[k], torch.ones(1)])
-        field += painter.renderer(gaussians.means, gaussians.covariances, opacity, colours, camera).color
-    column, row = centres[20].long().tolist()
-    window = field[row - 7 : row + 8, column - 7 : column + 8].sum((0, 1))
-    found = drawn_beside(painter, gaussians, camera, centres[20:21])[0]
-    torch.testing.assert_close(found.float(), window[:2] / window[2], atol=1e-3, rtol=0)
-
-
-def test_only_the_surroundings_of_windows_are_drawn(simulation, monkeypatch):
-    """And what is found is that of the whole picture."""
-    painter, camera = simulation.painter, cameras()["left"]
-    move = torch.tensor([[0.0, 0.0, 200.0], [0.0, 0.0, 120.0], [0.0, 0.0, 0.0]])
-    camera = replace(camera, intrinsics=camera.intrinsics + move, width=600, height=360)
-    gaussians = painter.scene.rest()
-    places = project(gaussians.means, camera)[0][20:22]
-    drawn = []
-    hook = painter.renderer.register_forward_hook(lambda _, given, out: drawn.append(out.color[..., 0].numel()))
-    found = drawn_beside(painter, gaussians, camera, places)
-    assert max(drawn) < 0.5 * 600 * 360
-    monkeypatch.setattr(tracks, "AROUND", 1000.0)
-    torch.testing.assert_close(found, drawn_beside(painter, gaussians, camera, places), atol=1e-3, rtol=0)
-    assert drawn[-1] == 600 * 360
-    hook.remove()
-    assert drawn_beside(painter, gaussians, camera, places[:0]).shape == (0, 2)
 
 
 def _photographed(camera, finer=3):

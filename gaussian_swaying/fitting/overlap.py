@@ -1,0 +1,122 @@
+"""Overlap: where Gaussians overlap, a picture shows mostly the nearest ones, so it shows a surface beside its place.
+
+It is beside by a part of a pixel that depends on the angle of view. A splat that was trained on pictures shows a
+surface where they do; one that was made of points on the surface does not. A film of the thing tells which is the case.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import torch
+from torch import Tensor
+
+from gaussian_swaying.gaussians.model import DeformedGaussians
+from gaussian_swaying.rendering.cameras.camera import Camera, project
+from gaussian_swaying.simulation.painter import Painter
+
+WINDOW, WIDE = 15, 960
+"""Side of the square that is followed, where the longer side of the picture has at most ``WIDE`` [pixels]."""
+AROUND = 6.0
+"""Border around the windows in which Gaussians are drawn to see how they overlap, in their standard deviations."""
+_DRAWN = 1e-3
+"""Least sum of the weights of a Gaussian in a picture with which it counts as visible [pixels]."""
+
+
+class Overlap:
+    """The offset between what a splat shows and where it is, all over a picture.
+
+    Args:
+        painter: Draws the picture.
+        gaussians: All Gaussians of it.
+        camera: Its camera.
+    """
+
+    def __init__(self, painter: Painter, gaussians: DeformedGaussians, camera: Camera) -> None:
+        self.camera = camera
+        self._step = window_of(camera.width, camera.height) // 2
+        rows, columns = (torch.arange(0, side, self._step) for side in (camera.height, camera.width))
+        places = torch.cartesian_prod(rows, columns).flip(-1) + 0.5
+        found = drawn_beside(painter, gaussians, camera.to(painter.device), places)
+        self._field = found.T.reshape(1, 2, len(rows), len(columns))
+
+    def at(self, places: Tensor) -> Tensor:
+        """The offset at places in space (N, 3), float64: rendered minus projected pixels, shape (N, 2)."""
+        pixel = project(places, self.camera.to("cpu", torch.float64))[0]
+        ends = self._step * (torch.tensor(self._field.shape[:1:-1]) - 1)  # the last column and row
+        grid = 2 * (pixel - 0.5) / ends - 1
+        found = torch.nn.functional.grid_sample(
+            self._field, grid[None, None], padding_mode="border", align_corners=True
+        )
+        return found[0, :, 0].T
+
+
+def drawn_beside(painter: Painter, gaussians: DeformedGaussians, camera: Camera, places: Tensor) -> Tensor:
+    """Return the offset between the rendered and the projected centres of Gaussians, averaged over windows.
+
+    The rendered centre of a Gaussian is the mean of all pixels, weighted by its share of each after alpha compositing.
+    These weights are the derivatives of the picture by the colours.
+
+    Args:
+        painter: Draws the picture.
+        gaussians: All Gaussians of it, N.
+        camera: Its camera, on their device.
+        places: Centres of the windows [pixels], shape (T, 2).
+
+    Returns:
+        Rendered minus projected centre [pixels], float64, shape (T, 2).
+    """
+    if not len(places):
+        return torch.zeros(0, 2, dtype=torch.float64)
+    opacity, (column, row) = painter.scene.model.opacity().detach(), windows(places, camera.width, camera.height)
+    camera, left, top = _part(camera, gaussians, column, row)
+    width, height = camera.width, camera.height
+
+    def drawn(colours: Tensor) -> Tensor:
+        return painter.renderer(gaussians.means, gaussians.covariances, opacity, colours, camera).color
+
+    y, x = torch.meshgrid(torch.arange(height) + 0.5, torch.arange(width) + 0.5, indexing="ij")
+    middle = torch.tensor([0.5 * width, 0.5 * height])
+    asked = torch.stack([torch.ones(height, width), x - middle[0], y - middle[1]], -1).to(opacity)
+    colours = torch.zeros(len(opacity), 3, device=opacity.device, requires_grad=True)
+    with torch.enable_grad():
+        (sums,) = torch.autograd.grad(drawn(colours), colours, asked)
+    weight, centre = sums[:, :1], (project(gaussians.means, camera)[0] - middle).to(sums)
+    shift = torch.where(weight > _DRAWN, sums[:, 1:] / weight - centre, 0.0)
+    with torch.no_grad():
+        field = drawn(torch.cat([shift, (weight > _DRAWN).to(shift)], 1)).cpu().double()
+    found = field[row - top, column - left].mean(1)
+    return found[:, :2] / found[:, 2:].clamp(min=1e-6)
+
+
+def _part(camera: Camera, gaussians: DeformedGaussians, column: Tensor, row: Tensor) -> tuple[Camera, int, int]:
+    """The camera of the part of a picture with some pixels and the Gaussians in them; its left and upper end."""
+    pixel, depth = project(gaussians.means, camera)
+    low, high = (torch.stack([end(column), end(row)]).to(pixel) for end in (torch.min, torch.max))
+    near = ((pixel >= low) & (pixel <= high)).all(-1) & (depth > camera.near)
+    size = (
+        gaussians.covariances.diagonal(dim1=-2, dim2=-1).amax(-1).sqrt()[near] * camera.intrinsics[0, 0] / depth[near]
+    )
+    border = math.ceil(AROUND * float(size.quantile(0.95))) if len(size) else 0
+    left, top = (max(0, int(end) - border) for end in low)
+    right, bottom = (
+        min(most, int(end) + border + 1) for most, end in zip((camera.width, camera.height), high, strict=True)
+    )
+    lens = camera.intrinsics.clone()
+    lens[:2, 2] -= lens.new_tensor([left, top])
+    return replace(camera, intrinsics=lens, width=right - left, height=bottom - top), left, top
+
+
+def window_of(width: int, height: int) -> int:
+    """Side of the square that is followed in a picture of this size [pixels]; odd."""
+    return 2 * round(WINDOW // 2 * max(1.0, max(width, height) / WIDE)) + 1
+
+
+def windows(places: Tensor, width: int, height: int) -> tuple[Tensor, Tensor]:
+    """Columns and rows of the pixels in the window around each place (T, 2), clamped to the picture; shape (T, W²)."""
+    side = window_of(width, height)
+    reach = torch.arange(side) - side // 2
+    beside = torch.cartesian_prod(reach, reach)
+    column, row = (places.long()[:, None] + beside).unbind(-1)
+    return column.clamp(0, width - 1), row.clamp(0, height - 1)

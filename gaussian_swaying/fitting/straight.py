@@ -1,0 +1,46 @@
+"""Steps of the wind in the plane of its components, and not along its speed and azimuth.
+
+A sheet feels mostly the wind across it. All winds with the same such component move it nearly alike, and they lie on a
+straight line in the plane, but on a curve of speed and azimuth, along which a long step leaves the valley of the cost.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor
+
+from gaussian_swaying.fitting.least_squares import Retract
+from gaussian_swaying.fitting.unknowns import Unknown
+
+LEAST = 0.05
+"""Least speed after a step, per that before."""
+
+
+def straight(unknowns: Sequence[Unknown]) -> Retract:
+    """Return the function that takes a step from a place, both as shares of the ranges (U,).
+
+    Args:
+        unknowns: What is sought. Without ``wind.speed`` and ``wind.azimuth``, a step is added.
+    """
+    names = [unknown.name for unknown in unknowns]
+    if not {"wind.speed", "wind.azimuth"} <= set(names):
+        return torch.add
+    k, j = names.index("wind.speed"), names.index("wind.azimuth")
+    speed, azimuth = unknowns[k], unknowns[j]
+
+    def moved(place: Tensor, step: Tensor) -> Tensor:
+        end, here = place + step, float(place[k])
+        along = max(1 + float(step[k]) * speed.slope(here) / speed.value(here), LEAST)
+        across = math.radians(float(step[j]) * azimuth.slope(float(place[j])))
+        end[k] = speed.share(speed.value(here) * math.hypot(along, across))
+        turned = azimuth.value(float(place[j])) + math.degrees(math.atan2(across, along))
+        end[j] = azimuth.share(turned)
+        return end
+
+    return moved
+
+
+__all__ = ["straight"]

@@ -1,0 +1,70 @@
+"""The offset between the place of a surface and where a splat shows it."""
+
+from dataclasses import replace
+
+import torch
+
+from gaussian_swaying.fitting import overlap
+from gaussian_swaying.fitting.overlap import Overlap, drawn_beside
+from gaussian_swaying.rendering.cameras.camera import project
+
+from .conftest import cameras
+
+
+def test_where_a_gaussian_is_drawn_is_the_mean_of_its_pixels(simulation):
+    """Against pictures of one Gaussian after the other: white, behind and in front of black ones."""
+    painter, camera = simulation.painter, cameras()["left"]
+    gaussians, opacity = painter.scene.rest(), painter.scene.model.opacity()
+    centres = project(gaussians.means, camera)[0]
+    rows, columns = torch.meshgrid(torch.arange(120) + 0.5, torch.arange(200) + 0.5, indexing="ij")
+    sums = torch.zeros(len(centres), 3)
+    for k in range(len(centres)):
+        colours = torch.zeros(len(centres), 3)
+        colours[k] = 1
+        white = painter.renderer(gaussians.means, gaussians.covariances, opacity, colours, camera).color[..., 0]
+        sums[k] = torch.stack([white.sum(), (white * columns).sum(), (white * rows).sum()])
+    shift = sums[:, 1:] / sums[:, :1] - centres
+    assert shift.norm(dim=-1).amax() > 1
+    field = torch.zeros(120, 200, 3)
+    for k in range(len(centres)):
+        colours = torch.zeros(len(centres), 3)
+        colours[k] = torch.cat([shift[k], torch.ones(1)])
+        field += painter.renderer(gaussians.means, gaussians.covariances, opacity, colours, camera).color
+    column, row = centres[20].long().tolist()
+    window = field[row - 7 : row + 8, column - 7 : column + 8].sum((0, 1))
+    found = drawn_beside(painter, gaussians, camera, centres[20:21])[0]
+    torch.testing.assert_close(found.float(), window[:2] / window[2], atol=1e-3, rtol=0)
+
+
+def test_only_the_surroundings_of_windows_are_drawn(simulation, monkeypatch):
+    """And what is found is that of the whole picture."""
+    painter, camera = simulation.painter, cameras()["left"]
+    move = torch.tensor([[0.0, 0.0, 200.0], [0.0, 0.0, 120.0], [0.0, 0.0, 0.0]])
+    camera = replace(camera, intrinsics=camera.intrinsics + move, width=600, height=360)
+    gaussians = painter.scene.rest()
+    places = project(gaussians.means, camera)[0][20:22]
+    drawn = []
+    hook = painter.renderer.register_forward_hook(lambda _, given, out: drawn.append(out.color[..., 0].numel()))
+    found = drawn_beside(painter, gaussians, camera, places)
+    assert max(drawn) < 0.5 * 600 * 360
+    monkeypatch.setattr(overlap, "AROUND", 1000.0)
+    torch.testing.assert_close(found, drawn_beside(painter, gaussians, camera, places), atol=1e-3, rtol=0)
+    assert drawn[-1] == 600 * 360
+    hook.remove()
+    assert drawn_beside(painter, gaussians, camera, places[:0]).shape == (0, 2)
+
+
+def test_the_offset_all_over_a_picture(simulation):
+    """Between the points of a lattice, and outside the picture that of its edge."""
+    painter, camera = simulation.painter, cameras()["left"]
+    gaussians = painter.scene.rest()
+    pixel = project(gaussians.means, camera)[0]
+    inside = ((pixel > 20) & (pixel < torch.tensor([180.0, 100.0]))).all(-1)
+    known = drawn_beside(painter, gaussians, camera, pixel[inside])
+    assert known.norm(dim=-1).median() > 0.5
+    every = Overlap(painter, gaussians, camera)
+    found = every.at(gaussians.means.double()[inside])
+    assert found.dtype == torch.float64
+    assert (found - known).norm(dim=-1).median() < 0.1
+    away = torch.tensor([[50.0, 0.0, 0.0]], dtype=torch.float64)
+    assert every.at(away).isfinite().all()

@@ -1,0 +1,63 @@
+"""Steps in the plane of the wind's components."""
+
+import math
+
+import pytest
+import torch
+
+from gaussian_swaying.fitting.evidence import Block
+from gaussian_swaying.fitting.least_squares import Progress, iterate
+from gaussian_swaying.fitting.straight import straight
+from gaussian_swaying.fitting.unknowns import Unknown
+
+SOUGHT = [
+    Unknown("wind.speed", 0.5, 16.0, "log"),
+    Unknown("material.E", 1e3, 1e5, "log"),
+    Unknown("wind.azimuth", -80.0, 160.0),
+]
+
+
+def _components(place):
+    speed, angle = SOUGHT[0].value(float(place[0])), math.radians(SOUGHT[2].value(float(place[2])))
+    return speed * math.cos(angle), speed * math.sin(angle)
+
+
+@pytest.mark.parametrize("size", [1e-4, 0.1])
+def test_a_step_is_straight_in_the_plane(size):
+    """Halves of it lie on the way of the whole; its begin is that of speed and azimuth; E is added."""
+    place, step = torch.tensor([0.4, 0.3, 0.5], dtype=torch.float64), size * torch.tensor([0.7, 0.2, -1.0]).double()
+    take = straight(SOUGHT)
+    begin, middle, end = (_components(take(place, share * step)) for share in (0.0, 0.5, 1.0))
+    assert middle == pytest.approx([0.5 * (a + b) for a, b in zip(begin, end, strict=True)], rel=1e-9)
+    moved = take(place, step) - place
+    assert float(moved[1]) == pytest.approx(0.2 * size)
+    if size < 1e-3:
+        assert moved.tolist() == pytest.approx(step.tolist(), rel=1e-3)
+    else:
+        assert not torch.allclose(moved, step, rtol=0.05)
+
+
+def test_without_speed_and_azimuth_a_step_is_added():
+    place = torch.tensor([0.2, 0.4], dtype=torch.float64)
+    assert torch.equal(straight(SOUGHT[:2])(place, place), place + place)
+
+
+def test_a_wind_across_a_sheet_is_found_in_few_steps():
+    """The wind across is seen forty times as well as that along the sheet, so the valley is straight in the plane."""
+    wanted, across = _components([0.5, 0.5, 0.7]), torch.tensor([math.cos(0.3), math.sin(0.3)], dtype=torch.float64)
+    along = torch.stack([-across[1], across[0]])
+
+    def valley(places):
+        off = torch.tensor([_components(place) for place in places], dtype=torch.float64) - torch.tensor(wanted)
+        values = torch.stack([20 * off @ across, 0.5 * off @ along, places[:, 1] - 0.5], -1)
+        return [Block("tracks", values[:, :, None], torch.arange(3))]
+
+    taken = []
+    for retract in (straight(SOUGHT), torch.add):
+        progress = Progress(torch.tensor([0.55, 0.3, 0.45], dtype=torch.float64))
+        while not progress.done and progress.iteration < 60:
+            iterate(valley, lambda blocks: {"tracks": 1.0}, progress, 1e-6, retract=retract)
+        taken.append(progress.iteration)
+        assert progress.place.tolist() == pytest.approx([0.5, 0.5, 0.7], abs=1e-3)
+    assert taken[0] < 8
+    assert taken[1] > 2 * taken[0]
