@@ -20,6 +20,8 @@ WINDOW, WIDE = 15, 960
 """Side of the square that is followed, where the longer side of the picture has at most ``WIDE`` [pixels]."""
 AROUND = 6.0
 """Border around the windows in which Gaussians are drawn to see how they overlap, in their standard deviations."""
+MANY = 1000
+"""Windows that are averaged at a time, so that memory does not grow with the picture."""
 _DRAWN = 1e-3
 """Least sum of the weights of a Gaussian in a picture with which it counts as visible [pixels]."""
 
@@ -69,8 +71,8 @@ def drawn_beside(painter: Painter, gaussians: DeformedGaussians, camera: Camera,
     """
     if not len(places):
         return torch.zeros(0, 2, dtype=torch.float64)
-    opacity, (column, row) = painter.scene.model.opacity().detach(), windows(places, camera.width, camera.height)
-    camera, left, top = _part(camera, gaussians, column, row)
+    opacity, whole = painter.opacity().detach(), (camera.width, camera.height)
+    camera, left, top = _part(camera, gaussians, places)
     width, height = camera.width, camera.height
 
     def drawn(colours: Tensor) -> Tensor:
@@ -86,19 +88,25 @@ def drawn_beside(painter: Painter, gaussians: DeformedGaussians, camera: Camera,
     shift = torch.where(weight > _DRAWN, sums[:, 1:] / weight - centre, 0.0)
     with torch.no_grad():
         field = drawn(torch.cat([shift, (weight > _DRAWN).to(shift)], 1)).cpu().double()
-    found = field[row - top, column - left].mean(1)
+    found = torch.cat(
+        [
+            field[row - top, column - left].mean(1)
+            for column, row in (windows(some, *whole) for some in places.split(MANY))
+        ]
+    )
     return found[:, :2] / found[:, 2:].clamp(min=1e-6)
 
 
-def _part(camera: Camera, gaussians: DeformedGaussians, column: Tensor, row: Tensor) -> tuple[Camera, int, int]:
-    """The camera of the part of a picture with some pixels and the Gaussians in them; its left and upper end."""
+def _part(camera: Camera, gaussians: DeformedGaussians, places: Tensor) -> tuple[Camera, int, int]:
+    """The camera of the part of a picture with some windows and the Gaussians in them; its left and upper end."""
     pixel, depth = project(gaussians.means, camera)
-    low, high = (torch.stack([end(column), end(row)]).to(pixel) for end in (torch.min, torch.max))
+    outer = windows(torch.stack([places.amin(0), places.amax(0)]), camera.width, camera.height)
+    low, high = (torch.stack([end(side) for side in outer]).to(pixel) for end in (torch.min, torch.max))
     near = ((pixel >= low) & (pixel <= high)).all(-1) & (depth > camera.near)
     size = (
         gaussians.covariances.diagonal(dim1=-2, dim2=-1).amax(-1).sqrt()[near] * camera.intrinsics[0, 0] / depth[near]
     )
-    border = math.ceil(AROUND * float(size.quantile(0.95))) if len(size) else 0
+    border = math.ceil(AROUND * float(size.kthvalue(math.ceil(0.95 * len(size))).values)) if len(size) else 0
     left, top = (max(0, int(end) - border) for end in low)
     right, bottom = (
         min(most, int(end) + border + 1) for most, end in zip((camera.width, camera.height), high, strict=True)

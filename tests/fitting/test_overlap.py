@@ -54,8 +54,8 @@ def test_only_the_surroundings_of_windows_are_drawn(simulation, monkeypatch):
     assert drawn_beside(painter, gaussians, camera, places[:0]).shape == (0, 2)
 
 
-def test_the_offset_all_over_a_picture(simulation):
-    """Between the points of a lattice, and outside the picture that of its edge."""
+def test_the_offset_all_over_a_picture(simulation, monkeypatch):
+    """Between the points of a lattice, and outside the picture that of its edge; however many windows are averaged."""
     painter, camera = simulation.painter, cameras()["left"]
     gaussians = painter.scene.rest()
     pixel = project(gaussians.means, camera)[0]
@@ -65,6 +65,8 @@ def test_the_offset_all_over_a_picture(simulation):
     every = Overlap(painter, gaussians, camera)
     found = every.at(gaussians.means.double()[inside])
     assert found.dtype == torch.float64
+    monkeypatch.setattr(overlap, "MANY", 7)
+    torch.testing.assert_close(drawn_beside(painter, gaussians, camera, pixel[inside]), known)
     assert (found - known).norm(dim=-1).median() < 0.1
     away = torch.tensor([[50.0, 0.0, 0.0]], dtype=torch.float64)
     assert every.at(away).isfinite().all()
