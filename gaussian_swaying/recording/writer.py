@@ -191,8 +191,8 @@ class FrameWriter:
                     self._jobs[later:] = [other for other in self._jobs[later:] if other.running]
                     self._error = self._error or error
                 self._jobs.remove(job)
+                del job  # frees the frame that it refers to, before whoever waits goes on
                 self._changed.notify_all()
-            del job  # frees the frame that it refers to
 
 
 def write_usd_frame(path: Path, cloud: GaussianCloud, frame: SimFrame) -> None:
