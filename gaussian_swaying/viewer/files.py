@@ -96,15 +96,16 @@ class Files:
         """Load an uploaded file; of its name, only the ending is used."""
         folder = Folder()
         try:
-            settings = read(button.value.content, Path(button.value.name).suffix.lower(), folder)
+            try:
+                settings = read(button.value.content, Path(button.value.name).suffix.lower(), folder)
+            finally:  # before another file may come
+                button._impl.value = replace(button.value, content=b"")
             self.page.progress(0.8, "Making the simulation")
             self.session.load(settings, partial(self._there, folder), self._ended)
         except Exception as error:
             self.page.tell(one_line(error))
             self._ended()
             folder.cleanup()
-        finally:
-            button._impl.value = replace(button.value, content=b"")
 
     def _ended(self) -> None:
         self.page.progress(None)

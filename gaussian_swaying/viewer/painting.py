@@ -146,9 +146,10 @@ class Painting:
         """Show tints, and what can be done."""
         strokes, scene = self._strokes, self.session.simulation.scene
         on = strokes is not None and self._paints
-        self.page.roles = None
+        roles = None
         if strokes is not None and on:
-            self.page.roles = strokes.roles if bool(scene.drawn.all()) else strokes.roles[scene.drawn]
+            roles = strokes.roles if bool(scene.drawn.all()) else strokes.roles[scene.drawn]
+        self.page.roles = roles  # at once, as other threads draw them
         self.page.redraw()
         self.back.disabled = not on or strokes is None or len(strokes) == 0
         self.apply.disabled, self.save.disabled = strokes is None, strokes is None and scene.parts is None

@@ -308,17 +308,17 @@ class Session:
             with torch.inference_mode():
                 state, health = simulation.advance(self.snapshot.state)
         except SimulationDiverged as error:
-            self._broken, self.problem = True, str(error)
+            self.problem, self._broken = str(error), True  # in this order, for those who look at it meanwhile
             return
         except Exception as error:  # out of memory, a kernel that fails: the page goes on
-            self._broken, self.problem = True, one_line(error)
+            self.problem, self._broken = one_line(error), True
             return
         if simulation.editor.edits:
             try:
                 with self.lock:
                     state = simulation.editor.edit_due(state)
             except Exception as error:
-                self._broken, self.problem = True, one_line(error)
+                self.problem, self._broken = one_line(error), True
                 return
         self._publish(state, health)
         took, wanted = time.perf_counter() - began, float(self.settings.frame_dt)

@@ -1,5 +1,6 @@
 """A small flag, and a session of it."""
 
+import threading
 import time
 
 import pytest
@@ -53,6 +54,14 @@ def until(condition, seconds=60.0):
     while not condition():
         assert time.monotonic() < end, "it did not happen"
         time.sleep(0.01)
+
+
+def pause(session):
+    """Pause a session that runs, and wait until the step that was under way is done."""
+    session.pause()
+    done = threading.Event()
+    session._ask(done.set)
+    assert done.wait(60), "the session does nothing"
 
 
 def pictures_since(page, began):

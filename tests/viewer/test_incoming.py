@@ -22,6 +22,8 @@ from gaussian_swaying.viewer.incoming import (
 )
 from gaussian_swaying.viewer.pictures import draw
 
+from .conftest import pause
+
 
 @pytest.fixture
 def client(page, connect):
@@ -107,8 +109,8 @@ def test_a_value_out_of_range_gets_a_sentence(page, client, until):
             assert handle.label in page.notice
             assert handle.value == before
         client.set(handle, good[name])
-        until(lambda: not page.notice)  # it is the sentence on a number that is being typed
-        assert handle.value == good[name]
+        # the sentence is on a number that is being typed
+        until(lambda handle=handle, value=good[name]: not page.notice and handle.value == value)
 
 
 def test_the_sentence_names_the_range(page):
@@ -204,8 +206,7 @@ def test_many_clients_at_once_are_served_in_turn(page, connect, until, capfd, mo
 def test_what_is_held_is_drawn_between_changes(page):
     """A change takes the solver's material away for a moment."""
     session, solver = page.session, page.session.simulation.solver
-    session.pause()
-    time.sleep(0.2)
+    pause(session)
     drawn = []
     drawing = threading.Thread(target=lambda: drawn.append(page.controls.holding.places()))
     with session.lock:

@@ -78,9 +78,11 @@ def painter(page, connect, until):
 
 def _painting(page, connect, until):
     client, made = _join(page, connect, until)
+    motion = page.session.snapshot.motion
     client.set(page.controls.painting.on, True)
     assert made.told() == {"on": True, "radius": 20.0}
-    until(lambda: page.session.paused and page.session.snapshot.health.time == 0)
+    until(lambda: page.session.paused and page.session.snapshot.motion > motion)  # which begins at rest
+    assert page.session.snapshot.health.time == 0
     made.client = client
     return made
 
@@ -103,7 +105,10 @@ def test_while_it_is_painted_the_object_is_at_rest_and_then_it_goes_on(page, con
     session, painting = page.session, page.controls.painting
     client, painter = _join(page, connect, until)
     until(lambda: session.snapshot.health.time > 0.05)
+    came, take = [], page.brushes.take
+    page.brushes.take = lambda key, move: (take(key, move), came.append(move))
     painter.move([200, 150])  # before painting is on
+    until(lambda: came)
     client.set(painting.on, True)
     assert painter.told() == {"on": True, "radius": 20.0}
     until(lambda: session.paused and session.snapshot.health.time == 0)
@@ -137,11 +142,12 @@ def test_a_stroke_paints_what_is_under_it_and_is_undone_as_a_whole(page, painter
     painter.move([230, 165])
     painter.move([230, 165], [230, 170], first=False)
     until(lambda: np.array_equal(_labelled(page, "still"), second | _near(places, [230, 165])))
-    until(lambda: page.roles.tolist() == painting._strokes.roles.tolist())
+    still = int(_labelled(page, "still").sum())
+    until(lambda: f"still: {still} Gaussians" in painting.legend.content)  # which is shown last
+    assert page.roles.tolist() == painting._strokes.roles.tolist()
     assert page._version > version  # the server draws it, too
     assert len(painting._strokes) == 2
-    assert "held: " in painting.legend.content
-    assert f"{int(first.sum())} Gaussians" in painting.legend.content
+    assert f"held: {int(first.sum())} Gaussians" in painting.legend.content
     painter.client.set(painting.back, True)
     until(lambda: not _labelled(page, "still").any())
     assert np.array_equal(_labelled(page), first)
@@ -149,6 +155,16 @@ def test_a_stroke_paints_what_is_under_it_and_is_undone_as_a_whole(page, painter
     until(lambda: painting.back.disabled)
     assert not _labelled(page).any()
     assert page.notice is None
+
+
+def test_tints_do_not_vanish_while_a_stroke_is_painted(page, painter, until, monkeypatch):
+    """Other threads draw them at any time."""
+    shown = [page.roles]
+    watched = property(lambda page: shown[-1], lambda page, roles: shown.append(roles))
+    monkeypatch.setattr(type(page), "roles", watched, raising=False)
+    painter.move([200, 150])
+    until(lambda: shown[-1] is not None and shown[-1].any())
+    assert all(roles is not None for roles in shown)
 
 
 def test_the_camera_is_that_of_the_browser(page):
@@ -434,10 +450,10 @@ def test_parts_of_the_scene_are_painted_on(parser, settings, connect, until, tmp
         assert page.roles.tolist() == [ROLES.index(given.parts[k].role) for k in given.labels]
         painter.choose(page.controls.painting.part, "<cloth> (soft)", until)
         painter.move([200, 150])
-        until(lambda: len(page.controls.painting._strokes) == 1)
-        now = page.controls.painting._strokes.parts()
-        assert now.parts == given.parts
-        assert now.mask("<cloth>").sum() > given.mask("<cloth>").sum()
+        strokes = page.controls.painting._strokes
+        until(lambda: strokes.parts().mask("<cloth>").sum() > given.mask("<cloth>").sum())
+        assert len(strokes) == 1
+        assert strokes.parts().parts == given.parts
     finally:
         page.close()
         session.close()

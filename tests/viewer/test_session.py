@@ -4,6 +4,7 @@ Covers: viewer.pull.
 """
 
 import dataclasses
+import math
 import threading
 import time
 from types import SimpleNamespace
@@ -18,6 +19,8 @@ from gaussian_swaying.simulation.simulation import Simulation
 from gaussian_swaying.viewer.pictures import draw
 from gaussian_swaying.viewer.session import WINDOW, Session
 
+from .conftest import pause
+
 
 def _position(session):
     return session.snapshot.state.position
@@ -26,8 +29,7 @@ def _position(session):
 def test_it_goes_on_pauses_and_steps(session, until):
     session.start()
     until(lambda: session.snapshot.health.time > 0.1)
-    session.pause()
-    time.sleep(0.3)
+    pause(session)
     now = session.snapshot
     time.sleep(0.3)
     assert session.snapshot is now
@@ -61,16 +63,15 @@ def test_reset_goes_back_to_rest(session, until):
     assert torch.equal(_position(session), rest)
 
 
-def test_it_does_the_same_as_a_loop_over_frames(parser, settings, session, until):
+def test_it_does_the_same_as_a_loop_over_frames(parser, settings, session, until, monkeypatch):
     """Not paced or shortened, a session computes the frames of the simulation, bit for bit."""
+    monkeypatch.setattr("gaussian_swaying.viewer.session.SLOW", math.inf)
     session.pause()
     session.start()
-    session.simulation.frame_dt = settings.frame_dt
     for _ in range(3):
         number = session.snapshot.number
         session.step()
         until(lambda number=number: session.snapshot.number > number)
-        session.simulation.frame_dt = settings.frame_dt
     frames = list(Simulation.from_settings(parser, settings).frames(4))
     assert torch.equal(_position(session), frames[-1].state.position)
 
@@ -103,8 +104,8 @@ def test_what_changes_in_motion(session, until, values, found):
 def test_gravity_that_was_changed_acts(session, until):
     """Without wind, and with gravity upwards, the flag rises."""
     session.change({"wind.flow": [0.0, 0.0, 0.0], "wind.modulations": [], "solver.gravity": [0.0, 0.0, 9.8]})
-    session.start()
     rest = _position(session)[:, 2].mean()
+    session.start()
     until(lambda: session.snapshot.health.time > 0.3)
     assert _position(session)[:, 2].mean() > rest + 0.05
 
@@ -181,8 +182,8 @@ def _stiffness(session):
 
 def test_restore_brings_pins_and_material_back(session, until):
     """All that was changed, and the motion starts at rest; that can be undone, too."""
-    session.start()
     first, rest, stiffness = session.yaml(), _position(session).clone(), _stiffness(session)
+    session.start()
     session.change({"solver.boundaries": []})
     until(lambda: len(session.simulation.solver.bound.body.boundaries) == 0)
     session.change({"material.E": 2e4, "wind.flow": [0.0, 1.0, 0.0], "wind.modulations": [], "shader": None})
@@ -234,8 +235,9 @@ def test_undo_takes_the_last_change_back_in_motion(session, until, monkeypatch):
 def test_undo_heals_what_diverged_and_forgets_what_was_refused(session, until):
     session.start()
     session.change({"material.E": -1.0})
-    until(lambda: session.problem is not None)
-    assert (session.changes, session.revision) == (0, 1)
+    until(lambda: session.revision == 1)
+    assert session.problem is not None
+    assert session.changes == 0
     session.change({"wind.flow": [1e7, 0.0, 0.0]})
     until(lambda: session.broken)
     session.undo()
@@ -249,12 +251,13 @@ def test_material_of_parts_is_that_of_a_run(parser, settings, until, tmp_path):
     file = tmp_path / "edited.yaml"
     edit = {"time": 0.06, "E": 5e4}
     file.write_text(yaml.safe_dump(yaml.safe_load(config_text(parser, settings)) | {"edits": [edit]}))
-    session = Session(parser, parser.parse_args(["--config", str(file), "--device=cpu"])).start()
+    session = Session(parser, parser.parse_args(["--config", str(file), "--device=cpu"]))
 
     def stiffest():
         return float(session.simulation.scene.points.youngs_modulus.amax())
 
     assert stiffest() < 1e4
+    session.start()
     until(lambda: stiffest() == pytest.approx(5e4))
     session.change({"material.E": 2e4})
     until(lambda: session.settings.material.E == 2e4)
@@ -404,8 +407,9 @@ def test_computed_air_keeps_the_length_of_its_frames(parser, request, until, mon
         session.close()
 
 
-def test_a_step_that_is_under_way_does_not_lower_the_rates(session):
-    now = time.perf_counter()
+def test_a_step_that_is_under_way_does_not_lower_the_rates(session, monkeypatch):
+    now = 100.0
+    monkeypatch.setattr("gaussian_swaying.viewer.session.time", SimpleNamespace(perf_counter=lambda: now))
     session._steps.extend((now - 1.03 + 0.04 * k, 0.04 * k) for k in range(26))  # the last one 0.03 s ago
     assert session.rates().real_time == pytest.approx(1.0, abs=0.02)
     session._steps.clear()
