@@ -101,13 +101,13 @@ def follow_camera(video: Footage, background: Background) -> Motion:
     last: Camera | None = None
     overlap: Overlap | None = None
     itself: bool | None = None
-    pivot = _pivot(video.cameras[0], background)
+    probes = _probes(video.cameras[0], background)
     for k, given in enumerate(video.cameras):
         camera = given if last is None else _carried(given, video.cameras[k - 1], last)
         seen = None
         for number in range(FIRST if last is None else ROUNDS):
             near = last is not None or number > 0
-            if near and itself is not False and (overlap is None or _goes(overlap.camera, camera, pivot)):
+            if near and itself is not False and (overlap is None or _goes(overlap.camera, camera, probes)):
                 overlap = background.overlap(camera)
             picture, still = background.draw(camera)
             here = refine(video.images[k], picture, camera, still, overlap, itself)
@@ -127,7 +127,7 @@ def follow_camera(video: Footage, background: Background) -> Motion:
             "stands still in the splat: stand it on a tripod, or film something still and textured, too, and have it "
             "in the splat."
         )
-    cameras = smoothed(found, video.times, pivot)
+    cameras = smoothed(found, video.times, probes[0])
     like = video.cameras[0].world_to_camera
     cameras = [replace(camera, world_to_camera=camera.world_to_camera.to(like)) for camera in cameras]
     return Motion(tuple(cameras), unseen, float(torch.tensor(residuals).median()))
@@ -212,19 +212,24 @@ def _carried(given: Camera, before: Camera, found: Camera) -> Camera:
     return replace(given, world_to_camera=now @ torch.linalg.inv(then) @ there, intrinsics=found.intrinsics)
 
 
-def _goes(camera: Camera, other: Camera, pivot: Tensor) -> bool:
-    """True if two cameras see a point so far apart that the splat's overlap is another."""
-    here, there = (project(pivot[None], one.to("cpu", torch.float64))[0] for one in (camera, other))
-    return float((here - there).norm()) > ASIDE * max(camera.width, camera.height)
+def _goes(camera: Camera, other: Camera, probes: Tensor) -> bool:
+    """True if two cameras see some points (N, 3) so differently that the splat's overlap is another."""
+    here, there = (project(probes, one.to("cpu", torch.float64))[0] for one in (camera, other))
+    return float((here - there).norm(dim=-1).amax()) > ASIDE * max(camera.width, camera.height)
 
 
-def _pivot(camera: Camera, background: Background) -> Tensor:
-    """The point in the middle of the picture as far away as the background is (3,)."""
+def _probes(camera: Camera, background: Background) -> Tensor:
+    """Points that a camera sees (4, 3): in the middle of the picture, as far away as the background is, and beside it.
+
+    The others are to the right, below and nearer, so that they also tell if a camera rolls, comes nearer, or walks
+    around the first.
+    """
     picture, still = background.draw(camera)
     depth = (picture.depth / picture.alpha.clamp(min=1e-3))[..., 0].cpu()
-    far = depth[still if bool(still.any()) else depth > 0].median()
-    view = camera.world_to_camera.double().cpu()
-    return camera.position.double().cpu() + float(far) * view[2, :3]
+    far = float(depth[still if bool(still.any()) else depth > 0].median())
+    view, around = camera.world_to_camera.double().cpu(), torch.tensor([0.3, 0.3, -0.3], dtype=torch.float64)
+    middle = camera.position.double().cpu() + far * view[2, :3]
+    return torch.cat([middle[None], middle + far * around[:, None] * view[:3, :3]])
 
 
 __all__ = ["Motion", "follow_camera", "moves_by", "smooth", "smoothed", "stands_still"]

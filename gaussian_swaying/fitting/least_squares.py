@@ -90,7 +90,7 @@ class Progress:
 
     Attributes:
         place: Values of the unknowns, as shares of their ranges, shape (U,).
-        damping: Damping of the last accepted step.
+        damping: Damping of the next step.
         iteration: Iterations done.
         normal: The normal equations at ``place``; None if they are to be computed.
         scales: Standard deviations of each kind of residual there.
@@ -227,7 +227,8 @@ def iterate(
     damped = progress.damping > LEAST_DAMPING
     if not shortened and gain > AS_EXPECTED * normal.cost * expected_gain(normal, trial - place):
         progress.damping *= BETTER
-    if damped:  # a short step says nothing
+    if damped:  # a short step says nothing, but if it is the best
+        progress.done = NO_STEP if shortened and moved < tolerance else ""
         return
     if moved < tolerance:
         progress.done = f"the last step was below {tolerance:g} of every range"

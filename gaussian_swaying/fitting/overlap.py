@@ -20,6 +20,8 @@ WINDOW, WIDE = 15, 960
 """Side of the square that is followed, where the longer side of the picture has at most ``WIDE`` [pixels]."""
 AROUND = 6.0
 """Border around the windows in which Gaussians are drawn to see how they overlap, in their standard deviations."""
+LARGE = 2.0
+"""Standard deviations of Gaussians that are left out, per the side of a window."""
 MANY = 1000
 """Windows that are averaged at a time, so that memory does not grow with the picture."""
 _DRAWN = 1e-3
@@ -37,20 +39,25 @@ class Overlap:
 
     def __init__(self, painter: Painter, gaussians: DeformedGaussians, camera: Camera) -> None:
         self.camera = camera
-        self._step = window_of(camera.width, camera.height) // 2
-        rows, columns = (torch.arange(0, side, self._step) for side in (camera.height, camera.width))
+        share = min(1.0, WIDE / max(camera.width, camera.height))
+        width, height = (round(share * side) for side in (camera.width, camera.height))
+        self._scale = torch.tensor([width / camera.width, height / camera.height], dtype=torch.float64)
+        lens = camera.intrinsics.double().cpu().clone()
+        lens[:2] *= self._scale[:, None]
+        small = replace(camera.to("cpu", torch.float64), intrinsics=lens, width=width, height=height)
+        self._small, self._step = small, window_of(width, height) // 2
+        rows, columns = (torch.arange(0, side, self._step) for side in (height, width))
         places = torch.cartesian_prod(rows, columns).flip(-1) + 0.5
-        found = drawn_beside(painter, gaussians, camera.to(painter.device), places)
-        self._field = found.T.reshape(1, 2, len(rows), len(columns))
+        found = drawn_beside(painter, gaussians, small.to(painter.device, camera.intrinsics.dtype), places)
+        self._field = (found / self._scale).T.reshape(1, 2, len(rows), len(columns))
 
     def at(self, places: Tensor) -> Tensor:
         """The offset at places in space (N, 3), float64: rendered minus projected pixels, shape (N, 2)."""
-        pixel = project(places, self.camera.to("cpu", torch.float64))[0]
+        pixel = project(places, self._small)[0]
         ends = self._step * (torch.tensor(self._field.shape[:1:-1]) - 1)  # the last column and row
         grid = 2 * (pixel - 0.5) / ends - 1
-        found = torch.nn.functional.grid_sample(
-            self._field, grid[None, None], padding_mode="border", align_corners=True
-        )
+        grid = grid[None, None]
+        found = torch.nn.functional.grid_sample(self._field, grid, padding_mode="border", align_corners=True)
         return found[0, :, 0].T
 
 
@@ -58,7 +65,8 @@ def drawn_beside(painter: Painter, gaussians: DeformedGaussians, camera: Camera,
     """Return the offset between the rendered and the projected centres of Gaussians, averaged over windows.
 
     The rendered centre of a Gaussian is the mean of all pixels, weighted by its share of each after alpha compositing.
-    These weights are the derivatives of the picture by the colours.
+    These weights are the derivatives of the picture by the colours. Gaussians larger than windows, as those of a sky,
+    have no place in them, and are left out.
 
     Args:
         painter: Draws the picture.
@@ -72,7 +80,11 @@ def drawn_beside(painter: Painter, gaussians: DeformedGaussians, camera: Camera,
     if not len(places):
         return torch.zeros(0, 2, dtype=torch.float64)
     opacity, whole = painter.opacity().detach(), (camera.width, camera.height)
-    camera, left, top = _part(camera, gaussians, places)
+    pixel, depth = project(gaussians.means, camera)
+    wide = gaussians.covariances.diagonal(dim1=-2, dim2=-1).amax(-1).sqrt().to(depth)
+    size = wide * float(camera.intrinsics[0, 0]) / depth.clamp(min=camera.near)
+    small = size < LARGE * window_of(*whole)
+    camera, left, top = _part(camera, pixel, size, small & (depth > camera.near), places)
     width, height = camera.width, camera.height
 
     def drawn(colours: Tensor) -> Tensor:
@@ -85,9 +97,10 @@ def drawn_beside(painter: Painter, gaussians: DeformedGaussians, camera: Camera,
     with torch.enable_grad():
         (sums,) = torch.autograd.grad(drawn(colours), colours, asked)
     weight, centre = sums[:, :1], (project(gaussians.means, camera)[0] - middle).to(sums)
-    shift = torch.where(weight > _DRAWN, sums[:, 1:] / weight - centre, 0.0)
+    counts = (weight > _DRAWN) & small.to(weight.device)[:, None]
+    shift = torch.where(counts, sums[:, 1:] / weight - centre, 0.0)
     with torch.no_grad():
-        field = drawn(torch.cat([shift, (weight > _DRAWN).to(shift)], 1)).cpu().double()
+        field = drawn(torch.cat([shift, counts.to(shift)], 1)).cpu().double()
     found = torch.cat(
         [
             field[row - top, column - left].mean(1)
@@ -97,20 +110,22 @@ def drawn_beside(painter: Painter, gaussians: DeformedGaussians, camera: Camera,
     return found[:, :2] / found[:, 2:].clamp(min=1e-6)
 
 
-def _part(camera: Camera, gaussians: DeformedGaussians, places: Tensor) -> tuple[Camera, int, int]:
-    """The camera of the part of a picture with some windows and the Gaussians in them; its left and upper end."""
-    pixel, depth = project(gaussians.means, camera)
+def _part(camera: Camera, pixel: Tensor, size: Tensor, some: Tensor, places: Tensor) -> tuple[Camera, int, int]:
+    """The camera of some windows and what is around them, also beyond the picture; its left and upper end.
+
+    Args:
+        camera: The camera of the picture.
+        pixel: Centres of the Gaussians [pixels], shape (N, 2).
+        size: Their standard deviations [pixels], shape (N,).
+        some: Those that are to be whole, bool, shape (N,).
+        places: Centres of the windows [pixels], shape (T, 2).
+    """
     outer = windows(torch.stack([places.amin(0), places.amax(0)]), camera.width, camera.height)
     low, high = (torch.stack([end(side) for side in outer]).to(pixel) for end in (torch.min, torch.max))
-    near = ((pixel >= low) & (pixel <= high)).all(-1) & (depth > camera.near)
-    size = (
-        gaussians.covariances.diagonal(dim1=-2, dim2=-1).amax(-1).sqrt()[near] * camera.intrinsics[0, 0] / depth[near]
-    )
-    border = math.ceil(AROUND * float(size.kthvalue(math.ceil(0.95 * len(size))).values)) if len(size) else 0
-    left, top = (max(0, int(end) - border) for end in low)
-    right, bottom = (
-        min(most, int(end) + border + 1) for most, end in zip((camera.width, camera.height), high, strict=True)
-    )
+    near = size[some & ((pixel >= low) & (pixel <= high)).all(-1)]
+    border = math.ceil(AROUND * float(near.kthvalue(math.ceil(0.95 * len(near))).values)) if len(near) else 0
+    left, top = (int(end) - border for end in low)
+    right, bottom = (int(end) + border + 1 for end in high)
     lens = camera.intrinsics.clone()
     lens[:2, 2] -= lens.new_tensor([left, top])
     return replace(camera, intrinsics=lens, width=right - left, height=bottom - top), left, top

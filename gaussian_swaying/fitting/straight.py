@@ -12,7 +12,7 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from gaussian_swaying.fitting.least_squares import Retract
+from gaussian_swaying.fitting.least_squares import REACH, Retract
 from gaussian_swaying.fitting.unknowns import Unknown
 
 LEAST = 0.05
@@ -31,13 +31,20 @@ def straight(unknowns: Sequence[Unknown]) -> Retract:
     k, j = names.index("wind.speed"), names.index("wind.azimuth")
     speed, azimuth = unknowns[k], unknowns[j]
 
-    def moved(place: Tensor, step: Tensor) -> Tensor:
-        end, here = place + step, float(place[k])
+    def end_of(place: Tensor, step: Tensor) -> Tensor:
+        end, here, begin = place + step, float(place[k]), float(place[j])
         along = max(1 + float(step[k]) * speed.slope(here) / speed.value(here), LEAST)
-        across = math.radians(float(step[j]) * azimuth.slope(float(place[j])))
+        across = math.radians(float(step[j]) * azimuth.slope(begin))
+        turned = azimuth.value(begin) + math.degrees(math.atan2(across, along))
         end[k] = speed.share(speed.value(here) * math.hypot(along, across))
-        turned = azimuth.value(float(place[j])) + math.degrees(math.atan2(across, along))
-        end[j] = azimuth.share(turned)
+        end[j] = azimuth.share(min(max(turned, azimuth.low), azimuth.high))
+        return end
+
+    def moved(place: Tensor, step: Tensor) -> Tensor:
+        if not speed.value(float(place[k])) > 0:  # it has no direction there
+            return place + step
+        while float(((end := end_of(place, step)) - place).abs().amax()) > 1.001 * REACH:  # shorter on the same line
+            step = 0.5 * step
         return end
 
     return moved

@@ -1,5 +1,6 @@
 """A hand-held camera: films of a flag in front of walls, from cameras that are known."""
 
+import math
 from dataclasses import replace
 
 import numpy as np
@@ -10,11 +11,11 @@ from bench.problems.handheld import TRUTH, drift, off, shaken, tripod, write_bas
 from gaussian_swaying.fitting import registration
 from gaussian_swaying.fitting.background import Background
 from gaussian_swaying.fitting.fit import fit
-from gaussian_swaying.fitting.handheld import follow_camera, moves_by, smooth, stands_still
+from gaussian_swaying.fitting.handheld import _goes, follow_camera, moves_by, smooth, stands_still
 from gaussian_swaying.fitting.prepared import prepared
 from gaussian_swaying.fitting.tracks import still_until, track
 from gaussian_swaying.fitting.videos import Footage, read_videos
-from gaussian_swaying.rendering.cameras.camera import project
+from gaussian_swaying.rendering.cameras.camera import look_at_camera, project
 from gaussian_swaying.simulation.simulation import Simulation
 
 pytest.importorskip("cv2", reason="needs the extra [fit]")
@@ -81,11 +82,37 @@ def test_the_overlap_of_a_splat_does_not_turn_the_camera(film, walls, monkeypatc
         found = follow_camera(video, background).cameras
         return np.median([off(one, other) for one, other in zip(found, true, strict=True)], axis=0)
 
+    shares, lacking = [], registration._lacking
+
+    def measured(*given):
+        shares.append(lacking(*given))
+        return shares[-1]
+
+    monkeypatch.setattr(registration, "_lacking", measured)
     degrees, distance = apart()
     assert degrees < 0.12
     assert distance < 0.003
+    assert shares == pytest.approx([float(film == "real")] * 3, abs=0.25)  # only in the first frame
     monkeypatch.setattr(registration, "_lacking", lambda *given: float(film != "real"))
     assert apart()[0] > 0.2
+
+
+def test_another_view_is_another_overlap():
+    """From elsewhere, nearer, or rolled; a shake of half a degree is none."""
+    eye, middle = torch.tensor([0.0, -2.0, 0.5]), torch.tensor([0.0, 0.0, 0.5])
+    camera = look_at_camera(eye, middle, (0, 0, 1), 38.0, WIDTH, HEIGHT, dtype=torch.float64)
+    probes = torch.tensor([[0.0, 0.0, 0.5], [0.6, 0.0, 0.5], [0.0, 0.0, -0.1], [0.0, -0.6, 0.5]], dtype=torch.float64)
+
+    def seen(turn=0.0, near=1.0, roll=0.0, aim=0.0):
+        angle, lean, aside = (math.radians(one) for one in (turn, roll, aim))
+        place = (near * 2 * math.sin(angle), -near * 2 * math.cos(angle), 0.5)
+        up = (math.sin(lean), 0, math.cos(lean))
+        target = (2 * math.tan(aside), 0.0, 0.5)
+        return look_at_camera(place, target, up, 38.0, WIDTH, HEIGHT, dtype=torch.float64)
+
+    assert not _goes(camera, seen(aim=0.5), probes)
+    for other in (seen(turn=6.0), seen(near=0.85), seen(roll=6.0), seen(aim=3.0)):
+        assert _goes(camera, other, probes)
 
 
 def test_only_the_camera_that_moves_is_seen_to_move(folder, simulation):

@@ -113,6 +113,49 @@ def test_the_lowest_place_of_a_narrow_valley_is_found():
     assert progress.place.tolist() == pytest.approx([0.7, 0.441], abs=1e-3)
 
 
+def _steep(places):
+    return [Block("tracks", (10 * (places[:, :1] - 0.2).atan())[:, :, None], torch.zeros(1, dtype=torch.long))]
+
+
+def test_after_a_shorter_step_the_sensitivities_are_those_of_its_end():
+    """Its damping is kept, and lowered after a step at once that is as expected."""
+    seen = []
+
+    def residuals(places):
+        seen.append(len(places))
+        assert bool(((places >= 0) & (places <= 1)).all())
+        return _steep(places)
+
+    progress = Progress(torch.tensor([0.3], dtype=torch.float64))
+    far = lambda place, step: place + 8 * step  # noqa: E731
+    iterate(residuals, lambda blocks: {"tracks": 1.0}, progress, 1e-6, retract=far)
+    assert seen == [3, 3, 5, 3]
+    kept = progress.damping
+    assert kept >= 1e-3
+    there, _, _ = linearised(_steep, lambda blocks: {"tracks": 1.0}, progress.place)
+    assert progress.normal.cost == there.cost
+    assert torch.equal(progress.normal.gradient, there.gradient)
+    iterate(residuals, lambda blocks: {"tracks": 1.0}, progress, 1e-6)
+    assert seen[4:] == [3]
+    assert progress.damping < 0.1 * kept
+
+
+def test_a_rough_valley_ends():
+    """Shorter and shorter steps that lower the cost by nearly nothing are an end."""
+
+    def rough(places):
+        x, y = places.T
+        wave = 0.1 / (2 * torch.pi) * torch.sin(2 * torch.pi * x / 0.05)
+        values = torch.stack([x - 0.9 + wave, 30 * (y - 0.9 * x.square())], -1)[:, :, None]
+        return [Block("tracks", values, torch.arange(2))]
+
+    progress = Progress(torch.tensor([0.3, 0.081], dtype=torch.float64))
+    while not progress.done and progress.iteration < 40:
+        iterate(rough, lambda blocks: {"tracks": 0.1}, progress, 9e-3, 3e-3)
+    assert progress.done
+    assert progress.iteration < 25
+
+
 @pytest.mark.parametrize("clusters", [1, 2, 5])
 def test_the_error_of_a_mean_is_that_of_its_clusters_and_of_its_residuals(clusters):
     """A mean of C clusters of equal size, in textbooks: variance of their means over C, and sigma^2 / n beside it."""

@@ -2,11 +2,14 @@
 
 from dataclasses import replace
 
+import pytest
 import torch
 
+from gaussian_swaying import Simulation
 from gaussian_swaying.fitting import overlap
 from gaussian_swaying.fitting.overlap import Overlap, drawn_beside
 from gaussian_swaying.rendering.cameras.camera import project
+from gaussian_swaying.scenes.procedural import FlagScene
 
 from .conftest import cameras
 
@@ -47,9 +50,9 @@ def test_only_the_surroundings_of_windows_are_drawn(simulation, monkeypatch):
     hook = painter.renderer.register_forward_hook(lambda _, given, out: drawn.append(out.color[..., 0].numel()))
     found = drawn_beside(painter, gaussians, camera, places)
     assert max(drawn) < 0.5 * 600 * 360
-    monkeypatch.setattr(overlap, "AROUND", 1000.0)
+    monkeypatch.setattr(overlap, "AROUND", 30.0)
     torch.testing.assert_close(found, drawn_beside(painter, gaussians, camera, places), atol=1e-3, rtol=0)
-    assert drawn[-1] == 600 * 360
+    assert drawn[-1] > 2 * max(drawn[:2])
     hook.remove()
     assert drawn_beside(painter, gaussians, camera, places[:0]).shape == (0, 2)
 
@@ -70,3 +73,56 @@ def test_the_offset_all_over_a_picture(simulation, monkeypatch):
     assert (found - known).norm(dim=-1).median() < 0.1
     away = torch.tensor([[50.0, 0.0, 0.0]], dtype=torch.float64)
     assert every.at(away).isfinite().all()
+
+
+def test_the_edge_of_a_picture_does_not_cut_gaussians(simulation):
+    """The offset near the edge is that in a wider picture."""
+    painter, camera = simulation.painter, cameras()["left"]
+    gaussians = painter.scene.rest()
+    left = float(project(gaussians.means, camera)[0][:, 0].median())
+    lens = camera.intrinsics - torch.tensor([[0.0, 0.0, left - 3], [0.0, 0.0, 0.0], [0.0, 0.0, 0.0]])
+    cut, place = replace(camera, intrinsics=lens), torch.tensor([[3.0, 60.0]])
+    whole = drawn_beside(painter, gaussians, camera, place + torch.tensor([[left - 3, 0.0]]))
+    found = drawn_beside(painter, gaussians, cut, place)
+    assert float(whole.norm()) > 0.3
+    assert float((found - whole).norm()) < 0.3 * float(whole.norm())
+
+
+def test_large_gaussians_have_no_part_in_it(simulation, monkeypatch):
+    """Some haze in front of all, whose centre is far from every window."""
+    painter, camera = simulation.painter, cameras()["left"]
+    gaussians, opacity = painter.scene.rest(), painter.opacity()
+    places = project(gaussians.means, camera)[0][20:22]
+    known = drawn_beside(painter, gaussians, camera, places)
+    eye = camera.position.to(gaussians.means)
+    haze = eye + 0.5 * (gaussians.means[:1] - eye)
+    means = torch.cat([gaussians.means, haze])
+    covariances = torch.cat([gaussians.covariances, 0.2**2 * torch.eye(3)[None]])
+    monkeypatch.setattr(type(painter), "opacity", lambda self: torch.cat([opacity, torch.tensor([0.05])]))
+    hazy = replace(gaussians, means=means, covariances=covariances)
+    assert float((drawn_beside(painter, hazy, camera, places) - known).norm(dim=-1).amax()) < 0.1
+
+
+def test_a_large_picture_is_looked_at_in_a_smaller_one(simulation, monkeypatch):
+    """And the offsets are those of its own pixels."""
+    painter, camera = simulation.painter, cameras()["left"]
+    gaussians, drawn = painter.scene.rest(), []
+    means = gaussians.means.double()
+    inside = ((project(means, camera)[0] - torch.tensor([100.0, 60.0])).abs() < torch.tensor([60.0, 30.0])).all(-1)
+    whole = Overlap(painter, gaussians, camera).at(means[inside]).median(0).values
+    hook = painter.renderer.register_forward_hook(lambda _, given, out: drawn.append(out.color.shape[1]))
+    monkeypatch.setattr(overlap, "WIDE", 100)
+    found = Overlap(painter, gaussians, camera).at(means[inside]).median(0).values
+    hook.remove()
+    assert max(drawn) < 200
+    assert torch.allclose(found, whole, rtol=0.25)
+
+
+@pytest.mark.gpu
+def test_on_a_gpu_it_is_that_of_a_cpu(tmp_path):
+    scenes = {}
+    for device in ("cpu", "cuda"):
+        own = Simulation(FlagScene(0.4, 0.3, 0.02, pattern="printed", ripple=0.02), device=device)
+        scenes[device] = Overlap(own.painter, own.scene.rest(), cameras()["left"])
+        means = own.scene.rest().means.double().cpu()
+    assert (scenes["cuda"].at(means) - scenes["cpu"].at(means)).norm(dim=-1).median() < 0.05

@@ -151,6 +151,18 @@ def test_rivals_of_a_film_in_motion_are_judged_by_the_points_of_their_own_first_
     assert course.first == made.first == true
 
 
+@pytest.mark.parametrize("ends", [(-0.2, 0.0), (-0.2, 0.1), (-0.2, -0.05)])
+def test_the_place_that_a_film_in_motion_begins_from(own, cut, simulation, ends):
+    """The wind whose simulation looks most like the first frame, and when it was so; not another wind's, nor rest."""
+    sought = [Unknown("wind.azimuth", -60.0, 150.0), Unknown(FILM_START, *ends)]
+    made = Fit(simulation, read_videos(cut), Plan([str(own / "base.yaml")], [str(cut)], sought))
+    winds = (110.0, TRUTH["wind.azimuth"], -50.0)
+    places = torch.tensor([[sought[0].share(wind), 0.5] for wind in winds], dtype=torch.float64)
+    azimuth, start = made.values(made.begin_from(places)).values()
+    assert azimuth == pytest.approx(TRUTH["wind.azimuth"])
+    assert start == pytest.approx(-CUT / 24, abs=0.05)
+
+
 def test_ends_whose_first_frames_show_no_points_have_no_rivals(own, cut, simulation):
     sought = [Unknown("wind.azimuth", -60.0, 150.0), Unknown(FILM_START, -0.2, 0.0)]
     made = Fit(simulation, read_videos(cut), Plan([str(own / "base.yaml")], [str(cut)], sought))

@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from gaussian_swaying.fitting.evidence import Block
-from gaussian_swaying.fitting.least_squares import Progress, iterate
+from gaussian_swaying.fitting.least_squares import REACH, Progress, iterate
 from gaussian_swaying.fitting.straight import straight
 from gaussian_swaying.fitting.unknowns import Unknown
 
@@ -61,3 +61,32 @@ def test_a_wind_across_a_sheet_is_found_in_few_steps():
         assert progress.place.tolist() == pytest.approx([0.5, 0.5, 0.7], abs=1e-3)
     assert taken[0] < 8
     assert taken[1] > 2 * taken[0]
+
+
+@pytest.mark.parametrize("step", [[-0.25, 0.0, 0.0], [0.0, 0.0, 0.25], [-0.25, 0.0, -0.25], [0.1, 0.25, 0.25]])
+def test_no_step_is_too_long(step):
+    """Against the wind, the end on the line would have a far lower speed."""
+    place, step = torch.tensor([0.9, 0.3, 0.5], dtype=torch.float64), torch.tensor(step, dtype=torch.float64)
+    moved = straight(SOUGHT)(place, step) - place
+    assert float(moved.abs().amax()) <= 1.001 * REACH
+    assert float(moved.abs().amax()) > 0.05
+
+
+def test_a_wind_does_not_blow_back():
+    place = torch.tensor([0.5, 0.5, 0.5], dtype=torch.float64)
+    end = straight([Unknown("wind.speed", 0.5, 16.0), *SOUGHT[1:]])(place, torch.tensor([-1.0, 0.0, 0.1]).double())
+    assert abs(float(end[2] - place[2])) <= REACH
+    assert float(end[0]) < 0.5
+
+
+def test_without_wind_a_step_is_added():
+    place, step = torch.tensor([0.0, 0.5], dtype=torch.float64), torch.tensor([0.1, -0.2], dtype=torch.float64)
+    sought = [Unknown("wind.speed", 0.0, 10.0), SOUGHT[2]]
+    assert torch.equal(straight(sought)(place, step), place + step)
+
+
+def test_an_azimuth_with_a_logarithmic_scale_stays_in_its_range():
+    sought = [SOUGHT[0], Unknown("wind.azimuth", 1.0, 90.0, "log")]
+    end = straight(sought)(torch.tensor([0.4, 0.3]).double(), torch.tensor([-0.1, -0.25]).double())
+    assert end.isfinite().all()
+    assert float(end[1]) >= 0
