@@ -99,8 +99,10 @@ APART, SAME = 0.15, 0.03
 """Least distance between starts, and largest between ends that are the same, as a share of a range."""
 BRIEF = 4
 """Most iterations of a short solve at a horizon."""
-RIVAL = 1.05
-"""Cost per that of the best end below which another end is as good."""
+RIVAL = 1.1
+"""Cost per that of the best end below which another end may be right as well: a wrong one can be 5 % lower."""
+LOWER = 1.02
+"""Cost per that of the best end above which a fit goes on from there."""
 ROUNDS = 2
 """Most times that a fit goes on from a better end."""
 DRAG = ("aero.C_D", "aero.C_F")
@@ -496,7 +498,7 @@ class Fit:
         away = [apart_by(self.plan.unknowns, end, place) for end in ended]
         near = [k for k, cost in enumerate(costs) if cost < RIVAL * costs[0]]
         own = away.index(min(away))
-        better = ended[0] if own not in near and away[0] > 2 * SAME else []
+        better = ended[0] if costs[own] > LOWER * costs[0] and away[0] > 2 * SAME else []
         return [self.values(ended[k]) for k in near if away[k] > 2 * SAME], better
 
     def _coarse(self, places: Tensor, evidence: Sequence[Evidence], times: Sequence[float]) -> tuple[Tensor, Tensor]:

@@ -69,7 +69,7 @@ def test_starts_that_are_far_off(own, tmp_path, capsys):
 
 
 def test_another_end_that_fits_as_well_is_a_rival(own, simulation):
-    """And one that is the same, or fits worse, is none. One that fits clearly better is to go on from."""
+    """And one that is the same, or fits worse, is none. One that fits better is to go on from."""
     sought = [read_unknown("wind.speed", [2.0, 12.0])]
     plan = Plan([str(own / "base.yaml")], [str(own / "video")], sought)
     made = Fit(simulation, read_videos(own / "video"), plan)
@@ -80,7 +80,9 @@ def test_another_end_that_fits_as_well_is_a_rival(own, simulation):
         return made._others(here, [far])
 
     assert others((here, 1.0), (far, 1.04)) == ([made.values(far)], [])
-    assert others((far, 1.0), (here, 1.04)) == ([made.values(far)], [])
+    assert others((here, 1.0), (far, 1.09)) == ([made.values(far)], [])
+    assert others((far, 1.0), (here, 1.01)) == ([made.values(far)], [])
+    assert others((far, 1.0), (here, 1.04)) == ([made.values(far)], far)
     assert others((here, 1.0), (far, 1.3)) == ([], [])
     assert others((far, 1.0), (near, 1.3)) == ([made.values(far)], far)
     assert others((near, 1.0)) == ([], [])
