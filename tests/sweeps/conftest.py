@@ -1,6 +1,11 @@
 """Sweeps of tiny flags: as a file, and done once without disturbance."""
 
+import json
 import multiprocessing
+import os
+import signal
+import time
+from contextlib import suppress
 from pathlib import Path
 
 import pytest
@@ -8,6 +13,7 @@ import yaml
 from bench.problems.small_sweep import AXES, SETTINGS
 
 from gaussian_swaying.cli.sweep import main
+from gaussian_swaying.runs.lock import LOCK
 from gaussian_swaying.sweeps import pool
 
 FLAG = Path(__file__).parents[2] / "configs/sim/flag.yaml"
@@ -18,6 +24,32 @@ def write_sweep(path, axes=AXES, draws=2, settings=None, **more):
     fields = {"base": str(FLAG), "settings": SETTINGS | (settings or {}), "axes": axes, "draws": draws}
     path.write_text(yaml.safe_dump(fields | more, sort_keys=False))
     return path
+
+
+def holders(folder):
+    """The process that writes to each run, by the name of the run."""
+    found = {}
+    for lock in sorted((folder / "runs").glob(f"*/{LOCK}")):
+        with suppress(OSError, ValueError):  # it has just ended
+            found[lock.parent.name] = json.loads(lock.read_bytes())["pid"]
+    return found
+
+
+def kill_in_a_run(folder, process):
+    """Kill a process while it writes to a run; the name of the run, or None if it writes to none now.
+
+    It is stopped first, as otherwise it might end the run between the look and the kill; and it is waited for, as its
+    lock stays, and a zombie could be killed once more.
+    """
+    name, end = None, time.monotonic() + 60
+    with suppress(ProcessLookupError):
+        os.kill(process, signal.SIGSTOP)
+        name = next((name for name, holder in holders(folder).items() if holder == process), None)
+        os.kill(process, signal.SIGCONT if name is None else signal.SIGKILL)
+        while name is not None and time.monotonic() < end:
+            os.kill(process, 0)
+            time.sleep(0.005)
+    return name
 
 
 @pytest.fixture(scope="session")

@@ -21,14 +21,15 @@ from PIL import Image
 from shared import refused
 
 from gaussian_swaying.cli.sweep import explain, main
-from gaussian_swaying.runs.lock import FolderLock
+from gaussian_swaying.runs.lock import LOCK, FolderLock, FolderLocked
 from gaussian_swaying.simulation.simulation import Simulation
 from gaussian_swaying.sweeps import worker
 from gaussian_swaying.sweeps.backend import Job
 from gaussian_swaying.sweeps.worker import do
 
+from .conftest import holders, kill_in_a_run
+
 PROGRAM = "import sys; from gaussian_swaying.cli.main import main; sys.exit(main())"
-LOCK = ".gaussian_swaying.lock"
 
 
 def _start(file, folder, *more):
@@ -44,15 +45,6 @@ def _wait(condition, seconds=120):
         time.sleep(0.01)
 
 
-def _holders(folder):
-    """Processes that write to a run."""
-    found = []
-    for lock in (folder / "runs").glob(f"*/{LOCK}"):
-        with suppress(OSError, ValueError):  # it has just ended
-            found.append(json.loads(lock.read_bytes())["pid"])
-    return found
-
-
 def _done(folder):
     return {file: file.stat().st_mtime_ns for file in (folder / "results").glob("*.json")}
 
@@ -63,16 +55,32 @@ def _rows(path):
 
 
 def _kill_workers(folder, times, seed, over):
-    """Kill a worker at random, some times; returns how often."""
-    stream, killed = random.Random(seed), 0
+    """Kill a worker at random, some times; returns how often.
+
+    Runs are kept locked and let go one by one, so that they are not all done before, however fast the machine is.
+    """
+    stream, killed, longest, kept = random.Random(seed), 0, 0.2, []
+    gone = {os.getpid()}  # and those that were killed, whose locks stay
+    _wait(lambda: (folder / "sweep.csv").exists() or over())
+    for number in range(8):
+        run = folder / f"runs/{number:05d}"
+        run.mkdir(parents=True, exist_ok=True)
+        with suppress(FolderLocked):  # it has begun
+            kept.append(FolderLock(run))
     while killed < times and not over():
-        time.sleep(stream.uniform(0.0, 0.2))
-        while not (holders := _holders(folder)) and not over():  # a run of a fast machine is over within the pause
+        if kept:
+            kept.pop(0).release()
+        while not (found := set(holders(folder).values()) - gone) and not over():
             time.sleep(0.005)
-        if holders:
-            with suppress(ProcessLookupError):
-                os.kill(stream.choice(holders), signal.SIGKILL)
-                killed += 1
+        time.sleep(stream.uniform(0.0, longest))
+        process = stream.choice(sorted(found)) if found else None
+        if process is not None and kill_in_a_run(folder, process) is not None:
+            gone.add(process)
+            killed += 1
+        else:
+            longest /= 2  # a run of a fast machine is over within the pause
+    for lock in kept:
+        lock.release()
     return killed
 
 
@@ -171,7 +179,7 @@ def test_forty_runs_and_five_killed_workers(tmp_path, sweep_file):
 def test_a_killed_driver_loses_only_what_was_running(undisturbed, tmp_path, sweep_file, capsys):
     file, folder = sweep_file(tmp_path / "tiny.yaml"), tmp_path / "out"
     driver = _start(file, folder, "--device", "cpu")
-    _wait(lambda: len(_done(folder)) >= 2 and _holders(folder))
+    _wait(lambda: len(_done(folder)) >= 2 and holders(folder))
     driver.kill()
     driver.communicate()
     before = _done(folder)
@@ -188,9 +196,13 @@ def test_a_stopped_sweep_ends_in_order(undisturbed, tmp_path, sweep_file, number
     """Ctrl-C reaches the workers too, SIGTERM only the driver."""
     file, folder = sweep_file(tmp_path / "tiny.yaml"), tmp_path / "out"
     driver = _start(file, folder, "--device", "cpu")
-    _wait(lambda: _done(folder) and _holders(folder))
+    _wait(lambda: (folder / "sweep.csv").exists())
+    (folder / "runs/00007").mkdir(parents=True)
+    last = FolderLock(folder / "runs/00007")  # so that the sweep goes on until it is stopped
+    _wait(lambda: len(_done(folder)) == 7 or (_done(folder) and len(holders(folder)) > 1))
     (os.killpg if number == signal.SIGINT else os.kill)(driver.pid, number)
     _, error = driver.communicate(timeout=120)
+    last.release()
     assert driver.returncode == code, error
     assert "Stopped; complete runs are kept" in error
     assert "--resume" in error

@@ -5,11 +5,8 @@ Covers: simulation.batch.
 
 import csv
 import json
-import os
-import signal
 import threading
 import time
-from contextlib import suppress
 
 import numpy as np
 import pytest
@@ -23,6 +20,8 @@ from gaussian_swaying.simulation.simulation import Simulation
 from gaussian_swaying.sweeps.backend import Job
 from gaussian_swaying.sweeps.plan import make_plan, parse_run, read_sweep
 from gaussian_swaying.sweeps.together import grouped, members_of, texts
+
+from .conftest import holders, kill_in_a_run
 
 FIXED = {"solver.substep": 2e-3, "frames": 5}
 OPTIONS = ("--workers", "2", "--device", "cpu")
@@ -140,11 +139,8 @@ def test_a_killed_job_of_several_runs(tmp_path, sweep_file):
     def kill():
         end = time.monotonic() + 120
         while not killed and time.monotonic() < end:
-            for lock in (out / "runs").glob("*/.gaussian_swaying.lock"):
-                with suppress(OSError, ValueError):
-                    os.kill(json.loads(lock.read_bytes())["pid"], signal.SIGKILL)
-                    killed.append(lock)
-                    break
+            found = [kill_in_a_run(out, process) for process in list(holders(out).values())[:1]]
+            killed.extend(name for name in found if name is not None)
             time.sleep(0.01)
 
     killer = threading.Thread(target=kill, daemon=True)
