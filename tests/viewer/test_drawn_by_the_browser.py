@@ -11,7 +11,7 @@ pytest.importorskip("viser", reason="needs the extra [viewer]")
 from gaussian_swaying.viewer.film.page import PAGE
 from gaussian_swaying.viewer.film.recorded import order_of
 
-from .conftest import FLAGS, pictures_since
+from .conftest import FLAGS, pause, pictures_since
 
 
 @pytest.fixture(scope="module")
@@ -204,11 +204,13 @@ def test_the_canvas_shows_the_state_as_the_server_draws_it(page, open_window, un
     """Centres from the GPU, and the picture, of a paused flag, from another side than at first."""
     session, window = page.session, open_window()
     until(lambda: session.snapshot.health.time > 0.2)
-    session.pause()
-    with page.server.atomic():
-        for client in page.server.get_clients().values():
-            client.camera.position = client.camera.position + np.array([0.3, 0.1, 0.2])
-    time.sleep(1.0)
+    pause(session)
+    (client,) = page.server.get_clients().values()
+    wanted = client.camera.position + np.array([0.3, 0.1, 0.2])
+    client.camera.position = wanted
+    asked = client.camera.update_timestamp
+    until(lambda: client.camera.update_timestamp > asked and np.allclose(client.camera.position, wanted, atol=1e-3))
+    window.evaluate("new Promise((drawn) => requestAnimationFrame(() => requestAnimationFrame(drawn)))")
     window.wait_for_function(f"wind.playback.shown === {session.snapshot.health.time}")
     snapshot = session.snapshot
     scene = snapshot.simulation.scene
