@@ -260,7 +260,7 @@ class Fit:
         column = [u.name for u in self.plan.unknowns].index(FILM_START)
         known = self.plan.unknowns[column]
         before = torch.linspace(max(0.0, -known.high), -known.low, BEGINS, dtype=torch.float64).tolist()
-        brief = [replace(video, images=video.images[:1]) for video in self.videos]
+        brief = [replace(video, images=video.images[:1], itself=False) for video in self.videos]  # it only counts
         values = [{name: v for name, v in self.values(place).items() if name != FILM_START} for place in places]
         best, most = places[0], -1
         for ago, states in zip(before, states_of(self.simulation, values, before, alike=False), strict=True):

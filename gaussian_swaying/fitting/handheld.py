@@ -47,11 +47,13 @@ class Motion:
         cameras: The camera of each frame.
         unseen: Frames that show too little of the background; their cameras lie between those of their neighbours.
         residual: Median over the frames of the root mean square distance of the points that agree [pixels].
+        itself: Whether the film shows the thing itself, and not what the splat shows.
     """
 
     cameras: tuple[Camera, ...]
     unseen: tuple[int, ...]
     residual: float
+    itself: bool
 
 
 def moves_by(video: Footage, background: Background) -> float:
@@ -130,7 +132,7 @@ def follow_camera(video: Footage, background: Background) -> Motion:
     cameras = smoothed(found, video.times, probes[0])
     like = video.cameras[0].world_to_camera
     cameras = [replace(camera, world_to_camera=camera.world_to_camera.to(like)) for camera in cameras]
-    return Motion(tuple(cameras), unseen, float(torch.tensor(residuals).median()))
+    return Motion(tuple(cameras), unseen, float(torch.tensor(residuals).median()), bool(itself))
 
 
 def smoothed(found: Sequence[Registration | None], times: Sequence[float], pivot: Tensor) -> list[Camera]:

@@ -111,7 +111,7 @@ def prepared(
             one = replace(one, moved=moves_by(video, background))
         if hand_held or (one.moved > STILL and hand_held is None):
             motion = follow_camera(video, background)
-            video = replace(video, cameras=motion.cameras)
+            video = replace(video, cameras=motion.cameras, itself=motion.itself)
             one = replace(one, hand_held=True, residual=motion.residual, unseen=len(motion.unseen))
         bright = gains(video, background)
         if bright is not None:

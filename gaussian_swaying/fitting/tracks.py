@@ -78,6 +78,8 @@ def track(simulation: Simulation, video: Footage, most: int = 400, first: Deform
     images = torch.cat([drawn[None], video.images])
     position, seen = map(torch.from_numpy, follow(images.numpy(), start.numpy()))
     seen &= _alike(images[:2], position[:2]) > ALIKE
+    if video.itself:  # where the splat shows them is beside their places
+        position += drawn_beside(simulation.painter, first, video.cameras[0].to(simulation.painter.device), start)
     return Tracks(chosen, position[1:], seen[1:])
 
 

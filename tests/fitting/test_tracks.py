@@ -136,6 +136,22 @@ def test_matches_are_not_shifted_where_the_print_of_a_splat_is(real, tmp_path):
         assert off.norm() < 0.1
 
 
+def test_points_from_a_picture_of_the_splat_are_where_the_thing_has_them(tmp_path):
+    """A film of the thing shows what the splat draws beside its places where it is; one of the splat does not."""
+    simulation = _printed(tmp_path, 0.01)
+    rest, view = simulation.scene.rest(), look_at_camera((0.7, -0.5, 0.35), (0.2, 0.0, 0.15), (0, 0, 1), 45.0, 240, 180)
+    footage = Footage("moved", (0.0, 0.1), (view, view), _photographed(view).expand(2, -1, -1, -1))
+    means = rest.means[simulation.scene.moving]
+    found = {}
+    for itself in (True, False):
+        tracks = track(simulation, replace(footage, itself=itself), first=rest)
+        off = (tracks.position - project(means[tracks.index], view)[0]).norm(dim=-1)
+        found[itself] = [float(off[k][tracks.seen[k]].median()) for k in range(2)]
+        assert tracks.seen[1].sum() > 20
+    assert max(found[True]) < 0.5 * min(found[False])
+    assert min(found[False]) > 0.5
+
+
 def test_windows_over_the_border_are_left_out_unless_the_thing_is_thin():
     """Of a square of 60 pixels, and of a stripe of 8."""
     places = torch.cartesian_prod(torch.arange(2.5, 100, 5), torch.arange(2.5, 100, 5)).double()
