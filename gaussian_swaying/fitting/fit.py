@@ -59,7 +59,7 @@ from gaussian_swaying.fitting.report import (
     wind_seen,
     write_results,
 )
-from gaussian_swaying.fitting.rivals import apart_by, bent_alike, rivals_of
+from gaussian_swaying.fitting.rivals import apart_by, bent_alike, is_mirrored, rivals_of
 from gaussian_swaying.fitting.straight import straight
 from gaussian_swaying.fitting.tracks import Tracks, beside_rest, match, opencv, still_until, track
 from gaussian_swaying.fitting.unknowns import FILM_START, check_unknowns
@@ -99,8 +99,9 @@ APART, SAME = 0.15, 0.03
 """Least distance between starts, and largest between ends that are the same, as a share of a range."""
 BRIEF = 4
 """Most iterations of a short solve at a horizon."""
-RIVAL = 1.1
-"""Cost per that of the best end below which another end may be right as well: a wrong one can be 5 % lower."""
+RIVAL, MIRRORED = 1.05, 1.25
+"""Cost per that of the best end below which another end may be right as well, and that of the mirrored wind, which
+differs by so little that errors of the model decide: a wrong one was lower by a tenth."""
 LOWER = 1.02
 """Cost per that of the best end above which a fit goes on from there."""
 ROUNDS = 2
@@ -482,7 +483,8 @@ class Fit:
 
         Other starts, and the rivals that are known of any fit, are tried over all fitted frames.
         """
-        tried = [*map(list, rivals), *rivals_of(self.simulation.setup, self.plan.unknowns, place)]
+        setup, unknowns = self.simulation.setup, self.plan.unknowns
+        tried = [*map(list, rivals), *rivals_of(setup, unknowns, place)]
         if not tried:
             return [], []
         stage = "tracks" if self.stages[0] == "matches" else self.stages[0]
@@ -495,8 +497,9 @@ class Fit:
             ended, costs = self._brief([place, *tried], self._trusted(self.evidence(stage), place), self.fitted)
         for end, cost in zip(ended, costs, strict=True):
             self.say(f"rival: cost {cost:.5g}, {self._shown(end)}")
-        away = [apart_by(self.plan.unknowns, end, place) for end in ended]
-        near = [k for k, cost in enumerate(costs) if cost < RIVAL * costs[0]]
+        away = [apart_by(unknowns, end, place) for end in ended]
+        most = [MIRRORED if is_mirrored(setup, unknowns, place, end) else RIVAL for end in ended]
+        near = [k for k, cost in enumerate(costs) if cost < most[k] * costs[0]]
         own = away.index(min(away))
         better = ended[0] if costs[own] > LOWER * costs[0] and away[0] > 2 * SAME else []
         return [self.values(ended[k]) for k in near if away[k] > 2 * SAME], better

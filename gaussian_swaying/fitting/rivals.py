@@ -24,6 +24,8 @@ SCANNED = 16
 """Values of Young's modulus over its range that are tried in a wind that bends the object as far."""
 TURN = 5.0
 """Least angle between the wind and its mirror image [degrees]."""
+MIRROR = 20.0
+"""Largest angle between the end of another start and the mirror image of the wind that is still one [degrees]."""
 
 
 def rivals_of(setup: Setup, unknowns: Sequence[Unknown], place: Sequence[float]) -> list[list[float]]:
@@ -114,6 +116,13 @@ def mirrored(setup: Setup, values: Mapping[str, float]) -> float | None:
     azimuth = math.degrees(math.atan2(y, x))
     other = 2 * facing - azimuth
     return other if abs(_turned(other - azimuth)) >= TURN else None
+
+
+def is_mirrored(setup: Setup, unknowns: Sequence[Unknown], place: Sequence[float], end: Sequence[float]) -> bool:
+    """True if the wind at the end of another start is about the mirror image of that at a place, both as shares."""
+    values, there = ({u.name: u.value(share) for u, share in zip(unknowns, one, strict=True)} for one in (place, end))
+    other = mirrored(setup, values) if "wind.azimuth" in values else None
+    return other is not None and abs(_turned(there["wind.azimuth"] - other)) < MIRROR
 
 
 def _turned(angle: float) -> float:

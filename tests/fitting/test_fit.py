@@ -80,7 +80,7 @@ def test_another_end_that_fits_as_well_is_a_rival(own, simulation):
         return made._others(here, [far])
 
     assert others((here, 1.0), (far, 1.04)) == ([made.values(far)], [])
-    assert others((here, 1.0), (far, 1.09)) == ([made.values(far)], [])
+    assert others((here, 1.0), (far, 1.09)) == ([], [])
     assert others((far, 1.0), (here, 1.01)) == ([made.values(far)], [])
     assert others((far, 1.0), (here, 1.04)) == ([made.values(far)], far)
     assert others((here, 1.0), (far, 1.3)) == ([], [])

@@ -69,6 +69,16 @@ def test_a_fit_tries_them_at_its_end(own, simulation):
     assert others == [made.values(better)]
 
 
+def test_the_mirrored_wind_is_a_rival_for_longer(own, simulation):
+    """It differs by less than a model's errors."""
+    sought = [read_unknown("wind.azimuth", [0.0, 180.0])]
+    made = Fit(simulation, read_videos(own / "video"), Plan([str(own / "base.yaml")], [str(own / "video")], sought))
+    for end, cost, told in ((0.7, 1.2, True), (0.65, 1.2, True), (0.7, 1.3, False), (0.95, 1.2, False)):
+        made._brief = lambda places, evidence, times, end=end, cost=cost: ([places[0], [end]], [1.0, cost])
+        others, better = made._others([0.3], [])
+        assert (others == [made.values([end])], better) == (told, [])
+
+
 def test_other_stiffnesses_bend_as_far():
     """All over the range of E, with the square of the speed in proportion where its range allows that."""
     sought = [read_unknown("wind.speed", [1.0, 9.0]), read_unknown("material.E", [1e3, 1e5])]
