@@ -211,6 +211,9 @@ def iterate(
     there, scales, blocks = linearised(residuals, rescale, trial)
     cost = float(huber([block.of(block.values[:1]) for block in blocks], progress.scales)[0])
     shortened = not cost < normal.cost
+    if shortened and float((trial - place).abs().amax()) < tolerance:  # a shorter one is none either
+        progress.done = NO_STEP
+        return
     if shortened:
         least = max(progress.damping * WORSE, LEAST_DAMPING)
         dampings = [least * WORSE**k for k in range(SHORTER)]

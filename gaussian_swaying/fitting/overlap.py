@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from gaussian_swaying.gaussians.model import DeformedGaussians
-from gaussian_swaying.rendering.cameras.camera import Camera, project
+from gaussian_swaying.rendering.cameras.camera import Camera, project, resized_intrinsics
 from gaussian_swaying.simulation.painter import Painter
 
 WINDOW, WIDE = 15, 960
@@ -41,15 +41,16 @@ class Overlap:
         self.camera = camera
         share = min(1.0, WIDE / max(camera.width, camera.height))
         width, height = (round(share * side) for side in (camera.width, camera.height))
-        self._scale = torch.tensor([width / camera.width, height / camera.height], dtype=torch.float64)
-        lens = camera.intrinsics.double().cpu().clone()
-        lens[:2] *= self._scale[:, None]
-        small = replace(camera.to("cpu", torch.float64), intrinsics=lens, width=width, height=height)
+        scale = torch.tensor([width / camera.width, height / camera.height], dtype=torch.float64)
+        small = camera.to("cpu", torch.float64)
+        (fx, _, cx), (_, fy, cy), _ = small.intrinsics.tolist()
+        lens, *_ = resized_intrinsics(camera.width, camera.height, fx, fy, cx, cy, width, height)
+        small = replace(small, intrinsics=lens.double(), width=width, height=height)
         self._small, self._step = small, window_of(width, height) // 2
         rows, columns = (torch.arange(0, side, self._step) for side in (height, width))
         places = torch.cartesian_prod(rows, columns).flip(-1) + 0.5
         found = drawn_beside(painter, gaussians, small.to(painter.device, camera.intrinsics.dtype), places)
-        self._field = (found / self._scale).T.reshape(1, 2, len(rows), len(columns))
+        self._field = (found / scale).T.reshape(1, 2, len(rows), len(columns))
 
     def at(self, places: Tensor) -> Tensor:
         """The offset at places in space (N, 3), float64: rendered minus projected pixels, shape (N, 2)."""

@@ -298,8 +298,7 @@ def _seen_from(cv2: Any, world: Any, there: Any, camera: Camera, focal: bool, ne
 def _lacking(world: Any, there: Any, beside: Any, camera: Camera, near: float) -> float:
     """The share of an overlap that explains best what no small change of the camera does.
 
-    It is near 1 in a frame of the thing itself, but below, as the overlap is not known exactly, and near 0 in one of
-    what the splat shows.
+    It is near 1 in a frame of the thing itself, and near 0 in one of what the splat shows.
 
     Args:
         world: Places (N, 3).

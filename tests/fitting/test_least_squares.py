@@ -9,6 +9,7 @@ import torch
 from gaussian_swaying.fitting.evidence import Block, scales_of
 from gaussian_swaying.fitting.identifiability import check_apart, condition, directions
 from gaussian_swaying.fitting.least_squares import (
+    NO_STEP,
     Progress,
     huber,
     iterate,
@@ -138,6 +139,21 @@ def test_after_a_shorter_step_the_sensitivities_are_those_of_its_end():
     iterate(residuals, lambda blocks: {"tracks": 1.0}, progress, 1e-6)
     assert seen[4:] == [3]
     assert progress.damping < 0.1 * kept
+
+
+def test_a_step_below_the_tolerance_that_is_not_better_is_the_end():
+    """Shorter ones are not tried."""
+    seen = []
+
+    def residuals(places):
+        seen.append(len(places))
+        return _steep(places)
+
+    progress = Progress(torch.tensor([0.2001], dtype=torch.float64))
+    iterate(residuals, lambda blocks: {"tracks": 1.0}, progress, 1e-3, retract=torch.sub)
+    assert seen == [3, 3]
+    assert progress.done == NO_STEP
+    assert float(progress.place) == 0.2001
 
 
 def test_a_rough_valley_ends():
