@@ -18,6 +18,8 @@ of the area :math:`\kappa` stands for that of each patch.
 
 from __future__ import annotations
 
+from copy import copy
+
 import torch
 from torch import Tensor, nn
 
@@ -90,6 +92,23 @@ class PatchSums(nn.Module):
         self.tensor: Tensor
         self.vector: Tensor
         self.point: Tensor
+
+    def grouped(self, group: Tensor, count: int, coarse: bool = False) -> PatchSums:
+        """The sums of groups of points.
+
+        Args:
+            group: The group of each point, shape (P,).
+            count: Number of groups.
+            coarse: As in the constructor.
+        """
+        other = copy(self)
+        other._buffers = dict(self._buffers)
+        tensor, length = sums(self.tensor, group, count), self.vector.norm(dim=-1)
+        normal = self.vector / length[:, None].clamp(min=torch.finfo(length.dtype).tiny)
+        fields = (normal.double(), length.double(), group[self.point], tensor.double())
+        vector, owner = joined_directions(*(field.cpu() for field in fields), coarse)
+        other.tensor, other.vector, other.point = tensor, vector.to(self.vector), owner.to(self.point.device)
+        return other
 
     @property
     def area(self) -> Tensor:

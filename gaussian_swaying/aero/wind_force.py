@@ -287,6 +287,21 @@ class WindForce(Force):
         blown = _blow(wind, times)
         return lambda state, k: self.force(state, wind.shaped(blown[k], state.position, moments[k]))
 
+    def on_sites(self, site: Tensor, count: int) -> WindForce:
+        """The wind on the patches of groups of points, with a drag that is semi-implicit; see ``Force.on_sites``."""
+        scenes = max(1, site.shape[:-1].numel())
+        shift = count * torch.arange(scenes, device=site.device)[:, None]
+        group = (site.reshape(scenes, -1) + shift).reshape(-1)
+        other, aero = copy(self), copy(self.aero)
+        aero.drag_step = "semi_implicit"
+        other._modules = {**self._modules, "aero": aero}
+        if self.sums is not None:
+            other.sums = self.sums.grouped(group, scenes * count, aero.mostly_linear)
+        else:
+            normal, area = self.normal.expand(*site.shape, 3).reshape(-1, 3), self.area.expand(site.shape).reshape(-1)
+            other.sums = PatchSums(Patches(normal, area, group, scenes * count), coarse=aero.mostly_linear)
+        return other
+
     def twin(self) -> Twin | None:
         """See :class:`~gaussian_swaying.mpm.twins.Twin`; None if an effect has none, or the lists are too long."""
         wind, aero, sums = self._fields[0], self.aero, self.sums

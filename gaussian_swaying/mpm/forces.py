@@ -79,6 +79,18 @@ class Force(Recordable, Twinned, nn.Module, ABC):
         """
         return lambda state, k: self(state)
 
+    def on_sites(self, site: Tensor, count: int) -> Force | None:
+        """The same force on groups of points that move as one, as the ``modes`` formulation asks; None if it has none.
+
+        Args:
+            site: The group of each point, shape (..., P).
+            count: Number of groups.
+
+        Returns:
+            A force on a state whose points are the groups.
+        """
+        return None
+
 
 class FunctionForce(Force):
     """A function of the state as a force; the host calls it in every substep.

@@ -412,12 +412,14 @@ class MPMState(State):
         grid: The nodes in use.
         node_displacement: Nodal displacement [m], shape (..., G, 3), or None.
         node_velocity: Nodal velocity [m/s], shape (..., G, 3), or None.
+        modal: Amplitudes of the modes and their rates, shape (..., 2, M), in the ``modes`` formulation; or None.
     """
 
     affine: Tensor
     grid: GridSpec
     node_displacement: Tensor | None = None
     node_velocity: Tensor | None = None
+    modal: Tensor | None = None
 
     def state_dict(self) -> dict[str, Any]:
         """See :meth:`State.state_dict`; the box of the grid as a dictionary."""

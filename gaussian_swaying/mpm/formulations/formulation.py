@@ -246,6 +246,10 @@ class Formulation(ABC):
 
     # ---- measures of a state
 
+    def elastic(self, state: MPMState) -> Tensor | None:
+        """Elastic energy [J], shape (...) over the batch; None if it is that of the laws at the particles."""
+        return None
+
     @abstractmethod
     def kinetic(self, state: MPMState) -> Tensor:
         """Kinetic energy [J], shape (...) over the batch."""
@@ -259,6 +263,10 @@ class Formulation(ABC):
         """Linear [kg m/s] and angular momentum about the origin [kg m²/s], shape (..., 3) each."""
 
     # ---- how long a substep may be
+
+    def frame_steps(self, seconds: float) -> int | None:
+        """Substeps in some seconds, for a formulation that is stable with any; None to follow the fastest wave."""
+        return None
 
     def stable_substep(self, state: MPMState | None) -> float:
         """Longest substep [s] that is stable for any arrangement of particles (one GPU synchronisation)."""

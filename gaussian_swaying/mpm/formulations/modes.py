@@ -1,0 +1,417 @@
+r"""The ``modes`` formulation: a body that sways about its rest, as the amplitudes of a few modes.
+
+A displacement of the nodes is :math:`u_i = \tilde R(\psi_i q)\, \phi_i q` with the amplitudes q, the shapes
+:math:`\phi` and rotations :math:`\psi` of the modes (:mod:`~gaussian_swaying.mpm.modal`), and
+:math:`\tilde R(w) = \int_0^1 R(s w)\, ds`: modal warping (Choi & Ko 2005, IEEE TVCG 11:91), so that leaves turn instead
+of growing. A rigid turn is exact. Velocities are :math:`R\, \phi\, \dot q` and loads :math:`\phi^T R^T f`, so the power
+of a force is that of its load.
+
+Each mode is stepped exactly under a load that is constant in a substep, with its own damping. Forces act on *sites*,
+the points that have the same nodes, in the middle of a substep; their drag acts at the mean velocity of the substep
+(one small system of equations).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from functools import cached_property
+
+import torch
+from torch import Tensor
+
+from gaussian_swaying._devices import in_double
+from gaussian_swaying.geometry.rotations import rodrigues, rotation_of
+from gaussian_swaying.mpm.body import Body
+from gaussian_swaying.mpm.boundaries.boundary import Boundary
+from gaussian_swaying.mpm.boundaries.pinned_points import PinnedPoints
+from gaussian_swaying.mpm.boundaries.pinned_region import PinnedRegion
+from gaussian_swaying.mpm.boundaries.rigid_region import RigidRegion
+from gaussian_swaying.mpm.damping import decay_rate
+from gaussian_swaying.mpm.forces import Force, split
+from gaussian_swaying.mpm.formulations.formulation import Settings
+from gaussian_swaying.mpm.formulations.total import Total
+from gaussian_swaying.mpm.modal import Analysis, analysis_of
+from gaussian_swaying.mpm.state import MPMState, State
+from gaussian_swaying.mpm.transfer import gather, scatter
+
+MOST_MODES = 80
+LONGEST, SHORTEST = 0.01, 0.0025
+"""Longest and shortest substep [s]: 4 and 16 in a frame of 0.04 s."""
+PER_PERIOD = 20
+"""Substeps in a period of the first mode, between these limits."""
+
+
+class Modes(Total):
+    """Modes of ``total`` at rest: for a held elastic body that sways by less than some 40 % of its size.
+
+    Args:
+        body: The material with its laws and boundaries.
+        settings: Numbers and switches of the solver.
+
+    Attributes:
+        square: Squares of the circular frequencies of the modes [1/s²], shape (..., M).
+        ratio: Damping ratios of the modes, shape (..., M).
+        first: Circular frequency of the lean in a wind [rad/s], the highest of all scenes.
+
+    Raises:
+        ValueError: If nothing holds the body, something touches it, a boundary moves it, or a law is plastic.
+    """
+
+    name = "modes"
+
+    def __init__(self, body: Body, settings: Settings) -> None:
+        why = why_not_modes(body)
+        if why is not None:
+            raise ValueError(f"`solver.formulation: modes` is for a held body that sways about its rest, but {why}.")
+        super().__init__(body, settings)
+        scenes = max(1, math.prod(body.points.mass.shape[:-1]))
+        with torch.no_grad():
+            self._bind([analysis_of(self, scene, MOST_MODES) for scene in range(scenes)])
+
+    def _bind(self, found: Sequence[Analysis]) -> None:
+        points, batch, count = self.body.points, tuple(self.body.points.mass.shape[:-1]), self.body.points.count
+        modes = min(len(one.square) for one in found)
+        like = points.position.detach()
+
+        def stacked(name: str, dtype: torch.dtype = like.dtype) -> Tensor:
+            every = torch.stack([torch.as_tensor(getattr(one, name))[..., :modes] for one in found])
+            return every.to(like.device, dtype).reshape(*batch, *every.shape[1:])
+
+        mass = points.mass.detach().sum(-1)
+        norm = mass.rsqrt()[..., None, None]
+        self.shape, self.turn = norm * stacked("shape"), norm * stacked("turn")
+        site = torch.stack([torch.as_tensor(one.site) for one in found]).to(like.device)
+        sites = int(site.amax()) + 1
+        self.site = site.reshape(*batch, count)
+        self.sites = sites
+
+        def padded(name: str) -> Tensor:
+            rows = [torch.as_tensor(getattr(one, name))[:, :modes].reshape(-1, 3, modes) for one in found]
+            every = torch.stack([torch.nn.functional.pad(row, (0, 0, 0, 0, 0, sites - len(row))) for row in rows])
+            return norm * every.to(like.device, like.dtype).reshape(*batch, 3 * sites, modes)
+
+        self.site_shape, self.site_turn = padded("site_shape"), padded("site_turn")
+        direct = torch.stack([
+            torch.nn.functional.pad(torch.as_tensor(one.direct), (0, sites - one.direct.shape[1])) for one in found
+        ])  # fmt: skip
+        self.direct = direct.to(like).reshape(*batch, *direct.shape[1:])
+        self.site_mass = self.at_sites(points.mass.detach()[..., None])[..., 0]
+        self.site_rest = self._mean_at_sites(points.position.detach())
+        own = points.volume.detach()
+        modulus = (points.youngs_modulus.detach() * own).sum(-1) / own.sum(-1)
+        self.reaction = (modulus * mass.rsqrt())[..., None, None, None] * stacked("reaction")
+        unit = in_double(modulus / mass)
+        firsts = torch.tensor([one.first for one in found], dtype=torch.float64, device=unit.device)
+        self.firsts = (firsts.reshape(batch) * unit).sqrt()
+        self.first = float(self.firsts.amax())
+        self._square = in_double(stacked("square", torch.float64)) * unit[..., None]
+        self.dropped = max(one.dropped for one in found)
+
+    # ---- numbers that may have a gradient
+
+    @property
+    def square(self) -> Tensor:
+        """Squares of the circular frequencies [1/s²], shape (..., M), float64.
+
+        Their derivatives by the stiffness and mass of each point are those of the Rayleigh quotient of each mode.
+        """
+        points = self.body.points
+        square = self._square
+        E, mass = points.youngs_modulus, points.mass
+        if not torch.is_grad_enabled() or not (E.requires_grad or mass.requires_grad):
+            return square
+        stored, moved = self._shares
+        stiffer = ((in_double(E) / in_double(E.detach()) - 1)[..., None] * stored).sum(-2)
+        heavier = ((in_double(mass) / in_double(mass.detach()) - 1)[..., None] * moved).sum(-2)
+        return square * (1 + stiffer) / (1 + heavier)
+
+    @property
+    def inertia(self) -> Tensor:
+        """Generalised masses of the modes, which are one, shape (..., M); with the gradient of the masses."""
+        mass = self.body.points.mass
+        one = torch.ones_like(self._square)
+        if not torch.is_grad_enabled() or not mass.requires_grad:
+            return one
+        return one + ((in_double(mass) / in_double(mass.detach()) - 1)[..., None] * self._shares[1]).sum(-2)
+
+    @cached_property
+    def _shares(self) -> tuple[Tensor, Tensor]:
+        """Share of the points in the elastic and the kinetic energy of each mode, shape (..., P, M) each."""
+        body = self.body
+        mu, lam = body.laws.mu.detach(), body.laws.lam.detach()
+        nodes, modes = self.grid.node_count, self.shape.shape[-1]
+        field = self.shape.reshape(*self.shape.shape[:-2], nodes, 3 * modes)
+        rows = gather(field, self.stencil).unflatten(-1, (3, modes))
+        value, slope = rows[..., 0, :, :], rows[..., 1:4, :, :]
+        strain = 0.5 * (slope + slope.transpose(-3, -2))
+        trace = strain.diagonal(dim1=-3, dim2=-2).sum(-1)
+        density = 2 * mu[..., None] * strain.square().sum((-3, -2)) + lam[..., None] * trace.square()
+        stored = in_double(body.points.volume.detach()[..., None] * density)
+        moved = in_double(body.points.mass.detach()[..., None] * value.square().sum(-2))
+        return stored / stored.sum(-2, keepdim=True).clamp(min=1e-300), moved
+
+    @cached_property
+    def ratio(self) -> Tensor:
+        """Damping ratios of the modes, shape (..., M), float64: of the material, and of the solver's two dampings."""
+        rate = self.settings.damping / 2 + self._square * (self.settings.stiffness_damping / 2)
+        found = rate / self._square.sqrt().clamp(min=1e-12)
+        damping = self.body.points.damping
+        if damping is None:
+            return found
+        own = in_double(damping.detach()) / decay_rate(1.0, 1.0)
+        return found + (own[..., None] * self._shares[1]).sum(-2)
+
+    # ---- sites
+
+    def at_sites(self, values: Tensor) -> Tensor:
+        """Sums of values of the points (..., P, K) over the sites, shape (..., S, K)."""
+        index = self.site[..., None].expand_as(values)
+        return values.new_zeros(*values.shape[:-2], self.sites, values.shape[-1]).scatter_add(-2, index, values)
+
+    def _mean_at_sites(self, values: Tensor) -> Tensor:
+        mass = self.body.points.mass.detach()[..., None]
+        return self.at_sites(mass * values) / self.site_mass[..., None].clamp(min=torch.finfo(mass.dtype).tiny)
+
+    def _site_state(self, q: Tensor, p: Tensor, like: MPMState, time: Tensor) -> State:
+        """The sites as points that turn without strain, by amplitudes and their rates."""
+        shift = _vectors(self.site_shape, torch.stack([q, p], -1))
+        turn = _vectors(self.site_turn, q[..., None])[..., 0]
+        R = rotation_of(turn)
+        velocity = _turned(R, shift[..., 1])
+        lost = torch.zeros(velocity.shape[:-1], dtype=torch.bool, device=velocity.device)
+        place = self.site_rest + warped(turn, shift[..., 0])
+        return State(position=place, velocity=velocity, F_elastic=R, F_total=R, lost=lost, time=time)
+
+    # ---- steps
+
+    def first_state(self, velocity: Tensor, margin: int) -> MPMState:
+        """The state at time zero; of a first velocity remains what the modes can show."""
+        state = super().first_state(velocity, margin)
+        assert state.node_velocity is not None
+        p = (self.node_mass[..., None] * state.node_velocity).flatten(-2)
+        p = (p[..., None, :] @ self.shape)[..., 0, :]
+        return self.shown(state, torch.zeros_like(p), p)
+
+    def shown(self, state: MPMState, q: Tensor, p: Tensor) -> MPMState:
+        """The state with nodes and points where amplitudes and their rates, shape (..., M), place them."""
+        shift = _vectors(self.shape, torch.stack([q, p], -1))
+        turn = _vectors(self.turn, q[..., None])[..., 0]
+        velocity = _turned(rotation_of(turn), shift[..., 1])
+        state = state.replace(modal=torch.stack([q, p], -2))
+        return self.in_shape(self.read_particles(state, warped(turn, shift[..., 0]), velocity))
+
+    def amplitudes(self, state: MPMState) -> tuple[Tensor, Tensor]:
+        """Amplitudes [m sqrt(kg)] and their rates, shape (..., M) each; those of another solver are projected."""
+        if state.modal is not None and state.modal.shape[-1] == self.shape.shape[-1]:
+            return state.modal[..., 0, :], state.modal[..., 1, :]
+        assert state.node_displacement is not None
+        assert state.node_velocity is not None
+        both = torch.stack([state.node_displacement, state.node_velocity], -3)
+        moment = (self.node_mass[..., None, :, None] * both).flatten(-2)
+        found = moment @ self.shape
+        return found[..., 0, :], found[..., 1, :]
+
+    def rollout(
+        self,
+        state: MPMState,
+        dt: float,
+        steps: int,
+        forces: Sequence[Force],
+        watch: Callable[[int], None] | None = None,
+    ) -> MPMState:
+        """Advance by several substeps; see ``MPMSolver.rollout``."""
+        q, p = self.amplitudes(state)
+        middle = state.time + 0.5 * dt
+        groups = [force.on_sites(self.site, self.sites) for force in forces]
+        sources = [None if one is None else one.during(middle, dt, steps) for one in groups]
+        square, inertia, ratio = self.square, self.inertia, self.ratio
+        alpha = ratio * square.sqrt()
+        decay, sine, cosine = _oscillation(square, alpha, dt)
+        gain = (decay * sine / inertia).to(q)  # of the velocity by a load
+        own = [x.to(q) for x in (decay * (cosine + alpha * sine), decay * sine, decay * (cosine - alpha * sine))]
+        square, still = square.to(q), (square * inertia).to(q)
+        gravity = self.gravity.to(q)
+        work, impulse, drag, solve = state.work, state.impulse, None, None
+        lagging = self._lagging(state, forces, groups)
+        for k in range(steps):
+            time = state.time + (k + 0.5) * dt
+            seen = self._site_state(q + 0.5 * dt * p, p, state, time)
+            load, resistance = torch.zeros_like(seen.velocity), None
+            for source, force in zip(sources, groups, strict=True):
+                if source is not None:
+                    assert force is not None
+                    value, against = split(source(seen, k), force, seen)
+                    load = load + value
+                    if against is not None:
+                        resistance = against if resistance is None else resistance + against
+            general = None if lagging is None else lagging(q, p, state.time + k * dt)
+            if solve is None:
+                drag, solve = self._drag(resistance, general, gain)
+            outer = self._pull(seen.F_total, load)
+            if general is not None:
+                outer = outer + general[0]
+            weight = self._pull(seen.F_total, self.site_mass[..., None] * gravity)
+            free = own[2] * p - square * own[1] * q + gain * (outer + weight)
+            new = free if drag is None else free + solve(-0.5 * gain * _product(drag, free - p))
+            if drag is not None:
+                outer = outer - 0.5 * _product(drag, new - p)
+            rest = (outer + weight) / still
+            after = rest + own[0] * (q - rest) + own[1] * p
+            work = work + in_double(outer * (after - q)).sum(-1)
+            mean = 0.5 * (q + after)
+            taken = (self.reaction @ mean[..., None, :, None])[..., 0] + self.direct @ load
+            impulse = impulse + dt * in_double(taken)
+            q, p = after, new
+            if watch is not None:
+                watch(k + 1)
+        state = state.replace(time=state.time + steps * dt, substep=dt, work=work, impulse=impulse)
+        return self.shown(state, q, p)
+
+    def _pull(self, R: Tensor, load: Tensor) -> Tensor:
+        """The load on the modes by forces on the sites, shape (..., M)."""
+        local = (R.mT @ load[..., None])[..., 0].flatten(-2)
+        return (local[..., None, :] @ self.site_shape)[..., 0, :]
+
+    def _drag(
+        self, resistance: Tensor | None, general: tuple[Tensor, Tensor | None] | None, gain: Tensor
+    ) -> tuple[Tensor | None, Callable[[Tensor], Tensor]]:
+        """Drag of the modes, (..., M, M), and a function that solves with one plus half of the drag times the gain."""
+        drag = None
+        if resistance is not None:
+            weight = resistance.repeat_interleave(3, -1)[..., None]
+            drag = self.site_shape.mT @ (weight * self.site_shape)
+        if general is not None and general[1] is not None:
+            drag = general[1] if drag is None else drag + general[1]
+        if drag is None:
+            return None, lambda x: x
+        identity = torch.eye(drag.shape[-1], dtype=drag.dtype, device=drag.device)
+        factor = torch.linalg.lu_factor(identity + 0.5 * gain[..., None] * drag)
+        return drag, lambda x: torch.linalg.lu_solve(*factor, x[..., None])[..., 0]
+
+    def _lagging(
+        self, state: MPMState, forces: Sequence[Force], groups: Sequence[Force | None]
+    ) -> Callable[[Tensor, Tensor, Tensor], tuple[Tensor, Tensor | None]] | None:
+        """Loads on the modes, and their drag, of forces that need all points; None if there are none."""
+        others = [force for force, group in zip(forces, groups, strict=True) if group is None]
+        if not others:
+            return None
+
+        def at(q: Tensor, p: Tensor, time: Tensor) -> tuple[Tensor, Tensor | None]:
+            now = self.shown(state.replace(time=time), q, p)
+            turn = _vectors(self.turn, q[..., None])[..., 0]
+            load, drag = None, None
+            for force in others:
+                value, against = split(force(now), force, now)
+                load = value if load is None else load + value
+                if against is not None:
+                    drag = against if drag is None else drag + against
+            assert load is not None
+            local = _turned(rotation_of(-turn), scatter(self.stencil, load[..., None, :])).flatten(-2)
+            pulled = (local[..., None, :] @ self.shape)[..., 0, :]
+            if drag is None:
+                return pulled, None
+            lumped = scatter(self.stencil, drag[..., None, None])[..., 0].repeat_interleave(3, -1)[..., None]
+            return pulled, self.shape.mT @ (lumped * self.shape)
+
+        return at
+
+    # ---- measures and limits
+
+    def frame_steps(self, seconds: float) -> int:
+        """Number of substeps in some seconds: 4 to 16 in a frame of 0.04 s, by the first frequency."""
+        period = 2 * math.pi / max(self.first, 1e-12)
+        return max(1, math.ceil(seconds / min(max(period / PER_PERIOD, SHORTEST), LONGEST) - 1e-9))
+
+    def stable_substep(self, state: MPMState | None) -> float:
+        """No substep is unstable."""
+        return math.inf
+
+    @cached_property
+    def longest_substep(self) -> float:
+        """No substep is unstable."""
+        return math.inf
+
+    def cells_per_second(self, state: MPMState) -> Tensor:
+        """Zero: waves are not stepped."""
+        return torch.zeros((), dtype=torch.float64, device=state.time.device)
+
+    def kinetic(self, state: MPMState) -> Tensor:
+        """Kinetic energy of the modes [J]."""
+        return 0.5 * (self.inertia * in_double(self.amplitudes(state)[1]).square()).sum(-1)
+
+    def elastic(self, state: MPMState) -> Tensor:
+        """Elastic energy of the modes [J]."""
+        return 0.5 * (self.square * self.inertia * in_double(self.amplitudes(state)[0]).square()).sum(-1)
+
+
+def why_not_modes(body: Body) -> str | None:
+    """Return the reason why a body cannot sway by modes; None if it can."""
+    if body.surface is not None:
+        return "it touches itself or an obstacle: set it to total"
+    if body.points.bending is not None:
+        return "`material.bending` makes it a sheet, which folds: set it to total"
+    if body.laws.plastic:
+        return f"the law {body.laws.plastic_names[0]} flows: set it to updated"
+    held = False
+    for boundary in body.boundaries:
+        if isinstance(boundary, RigidRegion):
+            continue
+        if not _holds_still(boundary):
+            return f"the {type(boundary).__name__} moves it, or does not hold it all the time: set it to total"
+        held = True
+    return None if held else "nothing holds it: pin a part of it, or set it to total"
+
+
+def _holds_still(boundary: Boundary) -> bool:
+    """True for a pin that holds all the time and does not move."""
+    still = type(boundary).forward is PinnedRegion.forward or isinstance(boundary, PinnedPoints)
+    always = boundary.holds_from <= 0 and boundary.end == math.inf
+    return still and always and not boundary.moves and boundary.release_time(torch.zeros(1, 3)) is None
+
+
+def warped(turn: Tensor, shift: Tensor) -> Tensor:
+    r"""A displacement that is turned along its way: :math:`\int_0^1 R(s w)\, ds\; d` (Choi & Ko 2005, equation 13).
+
+    Args:
+        turn: Rotation w of a place, axis times angle [rad], shape (..., 3).
+        shift: Its displacement d by a linear mode [m], shape (..., 3).
+
+    Returns:
+        Shape (..., 3).
+    """
+    _, cosine = rodrigues(turn)  # (1 - cos a) / a²
+    first = torch.linalg.cross(turn, shift)
+    square = turn.square().sum(-1, keepdim=True)
+    small = square < 1e-2
+    safe = torch.where(small, torch.ones_like(square), square)
+    angle = safe.sqrt()
+    cubic = torch.where(small, 1 / 6 - square / 120 + square.square() / 5040, (1 - torch.sin(angle) / angle) / safe)
+    return shift + cosine * first + cubic * torch.linalg.cross(turn, first)
+
+
+def _vectors(shape: Tensor, amplitudes: Tensor) -> Tensor:
+    """Vectors of nodes or sites (..., N, 3, K) from shapes (..., 3N, M) and amplitudes (..., M, K)."""
+    return (shape @ amplitudes).unflatten(-2, (-1, 3))
+
+
+def _turned(R: Tensor, vectors: Tensor) -> Tensor:
+    return (R @ vectors[..., None])[..., 0]
+
+
+def _product(matrix: Tensor, vector: Tensor) -> Tensor:
+    return (matrix @ vector[..., None])[..., 0]
+
+
+def _oscillation(square: Tensor, alpha: Tensor, dt: float) -> tuple[Tensor, Tensor, Tensor]:
+    r"""Decay :math:`e^{-\alpha t}`, :math:`\sin(\omega_d t) / \omega_d` and :math:`\cos(\omega_d t)` of damped modes.
+
+    Modes that are damped more than critically have hyperbolic functions.
+    """
+    apart = square - alpha.square()
+    rate = apart.abs().clamp(min=1e-12).sqrt()
+    over = apart < 0
+    angle = (rate * dt).clamp(max=300.0)
+    sine = torch.where(over, torch.sinh(torch.where(over, angle, 0.0)), torch.sin(angle)) / rate
+    cosine = torch.where(over, torch.cosh(torch.where(over, angle, 0.0)), torch.cos(angle))
+    return torch.exp(-alpha * dt), sine, cosine
