@@ -14,6 +14,7 @@ the points that have the same nodes, in the middle of a substep; their drag acts
 from __future__ import annotations
 
 import math
+import weakref
 from collections.abc import Callable, Sequence
 from functools import cached_property
 
@@ -107,6 +108,7 @@ class Modes(Total):
         self.first = float(self.firsts.amax())
         self._square = in_double(stacked("square", torch.float64)) * unit[..., None]
         self.dropped = max(one.dropped for one in found)
+        self._forces: dict[int, tuple[weakref.ref[Force], Force | None]] = {}
 
     # ---- numbers that may have a gradient
 
@@ -169,6 +171,14 @@ class Modes(Total):
         index = self.site[..., None].expand_as(values)
         return values.new_zeros(*values.shape[:-2], self.sites, values.shape[-1]).scatter_add(-2, index, values)
 
+    def _grouped(self, force: Force) -> Force | None:
+        """A force on the sites, made once; None if it has to see all points."""
+        known = self._forces.get(id(force))
+        if known is None or known[0]() is not force:
+            self._forces = {key: own for key, own in self._forces.items() if own[0]() is not None}
+            known = self._forces[id(force)] = weakref.ref(force), force.on_sites(self.site, self.sites)
+        return known[1]
+
     def _mean_at_sites(self, values: Tensor) -> Tensor:
         mass = self.body.points.mass.detach()[..., None]
         return self.at_sites(mass * values) / self.site_mass[..., None].clamp(min=torch.finfo(mass.dtype).tiny)
@@ -223,7 +233,7 @@ class Modes(Total):
         """Advance by several substeps; see ``MPMSolver.rollout``."""
         q, p = self.amplitudes(state)
         middle = state.time + 0.5 * dt
-        groups = [force.on_sites(self.site, self.sites) for force in forces]
+        groups = [self._grouped(force) for force in forces]
         sources = [None if one is None else one.during(middle, dt, steps) for one in groups]
         square, inertia, ratio = self.square, self.inertia, self.ratio
         alpha = ratio * square.sqrt()
