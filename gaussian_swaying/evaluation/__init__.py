@@ -1,1 +1,1 @@
-"""Comparison of a run with a reference."""
+"""Comparison of a run with a reference, and measures of motion."""

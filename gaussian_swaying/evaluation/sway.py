@@ -1,0 +1,306 @@
+"""Measures of motion: does a thing sway, and at which frequency does it ring? And pictures that show motion."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable
+from dataclasses import dataclass
+from typing import TypeAlias
+
+import numpy as np
+from torch import Tensor
+
+Array: TypeAlias = np.ndarray | Tensor
+
+MOVES = 0.1  # a point moves if its largest displacement is over this share of the scale of all
+PARTS = 8
+FEWEST = 8  # frames
+
+
+@dataclass(frozen=True)
+class SwayScore:
+    """Motion of a thing in the wind, by :func:`sway_score`.
+
+    A *moving* point has a largest displacement over a tenth of that which 98 % of all points stay below. The *side* is
+    the longest side of the box around the moving points at rest, without 1 % of them at each end. All else is measured
+    after the first seconds, which are skipped. The *top* is the tenth of the moving points for which the length of the
+    mean displacement plus the RMS (root mean square) of the fluctuation about it is largest.
+
+    Attributes:
+        lean: Mean over the top of the length of the mean displacement, over the side.
+        sway: RMS of the fluctuation of the top, over the side.
+        ratio: ``sway`` over ``lean``. A natural wind gives some 0.2 to 0.6; below 0.1 a thing leans and stands still.
+        peak: Frequency at which the fluctuation of the mean of the top has most power along its main axis [Hz].
+        peak_share: Share of the power above 0.05 Hz that lies between 2/3 and 4/3 of ``peak``.
+        drift: Change of the mean displacement of the top from the first half of the time to the second, over that
+            length that ``lean`` is a share of: a thing that still creeps.
+        together: Mean correlation of the fluctuation along the main axis between eight clusters of the moving points.
+            1 is a thing that rocks as one piece. Clusters that fluctuate less than 5 % of ``sway`` are left out; NaN if
+            fewer than two are left.
+        cross: Minor over major axis of the fluctuation of the mean of the top, by its two largest standard deviations.
+            Nature's is some 0.4 to 0.9; a sine along one line has 0.
+        still: Largest displacement of the points said to be still, at any time, over the side; NaN if none are.
+        stiller: Median of the largest displacements of the points that do not move, over the side; 0 if all move.
+        moving_share: Share of the points that move.
+        side: The side [unit of the positions].
+    """
+
+    lean: float
+    sway: float
+    ratio: float
+    peak: float
+    peak_share: float
+    drift: float
+    together: float
+    cross: float
+    still: float
+    stiller: float
+    moving_share: float
+    side: float
+
+
+def sway_score(
+    rest: Array, displacement: Array, times: Array, still: Array | None = None, skip: float = 2.0
+) -> SwayScore:
+    """Measure whether a thing sways, or leans, rocks, trembles or creeps.
+
+    Args:
+        rest: Positions of points at rest, in any unit, shape (N, 3).
+        displacement: Displacements from there in each frame, shape (T, N, 3).
+        times: Times of the frames, evenly spaced [s], shape (T,).
+        still: Mask (N,) of the points that should not move, such as pinned ones; None if none are known.
+        skip: Time before which frames are ignored, as the wind still pushes the thing over [s].
+
+    Returns:
+        The score, without units but for ``peak`` [Hz] and ``side``. If nothing moves, all is 0 or NaN.
+
+    Raises:
+        ValueError: If shapes or times do not fit, or fewer than 8 frames are left after ``skip``.
+    """
+    rest, displacement, times = _numbers(rest), _numbers(displacement), _numbers(times)
+    if rest.ndim != 2 or displacement.shape != (len(times), *rest.shape):
+        raise ValueError(
+            "Expected `rest` (N, 3), `displacement` (T, N, 3) and `times` (T,), but got shapes "
+            f"{rest.shape}, {displacement.shape} and {times.shape}."
+        )
+    late = times >= skip
+    if late.sum() < FEWEST:
+        raise ValueError(
+            f"Expected at least {FEWEST} frames from `skip` = {skip:g} s on, but got {late.sum()}: give more frames."
+        )
+    step = _step(times[late])
+    farthest = np.linalg.norm(displacement, axis=2).max(axis=0)
+    moving = farthest > MOVES * np.quantile(farthest, 0.98)
+    if not moving.any():
+        nan = math.nan
+        return SwayScore(0.0, 0.0, nan, nan, nan, nan, nan, nan, nan, 0.0, 0.0, nan)
+    low, high = np.quantile(rest[moving], [0.01, 0.99], axis=0)
+    side = max(float((high - low).max()), np.finfo(np.float64).tiny)
+
+    moved = displacement[late][:, moving]
+    mean = moved.mean(axis=0)
+    fluctuation = moved - mean
+    rms = np.sqrt(np.square(fluctuation).sum(axis=2).mean(axis=0))
+    activity = np.linalg.norm(mean, axis=1) + rms
+    top = activity >= np.quantile(activity, 0.9)
+    leaning = max(float(np.linalg.norm(mean[top], axis=1).mean()), 1e-9 * side)
+    swaying = float(np.sqrt(np.square(rms[top]).mean()))
+
+    of_top = moved[:, top].mean(axis=1)
+    first, second = np.split(of_top, [len(of_top) // 2])
+    along, spreads, axes = np.linalg.svd(of_top - of_top.mean(axis=0), full_matrices=False)
+    peak, share = _peak(along[:, 0] * spreads[0], step)
+    told = None if still is None else farthest[_numbers(still).astype(bool)]
+    return SwayScore(
+        lean=leaning / side,
+        sway=swaying / side,
+        ratio=swaying / leaning,
+        peak=peak,
+        peak_share=share,
+        drift=float(np.linalg.norm(second.mean(axis=0) - first.mean(axis=0))) / leaning,
+        together=_together(rest[moving], fluctuation @ axes[0], least=0.05 * swaying),
+        cross=float(spreads[1] / spreads[0]) if spreads[0] > 0 else 0.0,
+        still=float(told.max()) / side if told is not None and len(told) else math.nan,
+        stiller=float(np.median(farthest[~moving])) / side if not moving.all() else 0.0,
+        moving_share=float(moving.mean()),
+        side=side,
+    )
+
+
+def _numbers(values: Array) -> np.ndarray:
+    """Plain float64 numbers of an array or a tensor on any device."""
+    return np.asarray(values.detach().cpu() if isinstance(values, Tensor) else values, dtype=np.float64)
+
+
+def _step(times: np.ndarray) -> float:
+    """The time from frame to frame, which must be the same throughout [s]."""
+    steps = np.diff(times)
+    step = float(steps.mean())
+    if step <= 0 or np.abs(steps - step).max() > 0.01 * step:
+        raise ValueError("Expected `times` that increase evenly, but they do not: give frames of one interval.")
+    return step
+
+
+def _peak(line: np.ndarray, step: float) -> tuple[float, float]:
+    """Frequency of most power [Hz], and the share of the power near it.
+
+    A straight line is removed, the rest weighted by a Hann window and filled up with zeros to four times its length.
+    Frequencies with fewer than 1.5 periods in the whole time cannot be the peak.
+    """
+    count, duration = len(line), (len(line) - 1) * step
+    time = np.arange(count) * step
+    level = line - np.polyval(np.polyfit(time, line, deg=1), time)
+    power = np.square(np.abs(np.fft.rfft(level * np.hanning(count), n=4 * count)))
+    frequency = np.fft.rfftfreq(4 * count, step)
+    peak = float(frequency[np.argmax(np.where(frequency > 1.5 / duration, power, -1.0))])
+    near = (frequency > peak * 2 / 3) & (frequency < peak * 4 / 3)
+    total = float(power[frequency > 0.05].sum())
+    return peak, float(power[near].sum()) / total if total > 0 else math.nan
+
+
+def _together(rest: np.ndarray, lines: np.ndarray, least: float) -> float:
+    """Mean correlation between clusters of points, of the fluctuation (T, N) along one axis."""
+    from scipy.cluster.vq import kmeans2
+
+    if len(rest) < PARTS:
+        return math.nan
+    _, part = kmeans2(rest, PARTS, seed=0, minit="++")
+    means = [lines[:, part == number].mean(axis=1) for number in range(PARTS) if (part == number).sum() > 5]
+    means = [line for line in means if line.std() > least]
+    if len(means) < 2:
+        return math.nan
+    return float(np.corrcoef(means)[np.triu_indices(len(means), k=1)].mean())
+
+
+# ---- a free decay
+
+
+def natural_frequency(displacement: Array, times: Array) -> tuple[float, float]:
+    """Natural frequency and damping ratio of a thing that was let go in still air.
+
+    The displacement is projected on its first principal component. There u = c + a exp(-δ f t) cos(2π f t + φ) is
+    fitted, where δ is the logarithmic decrement and f the frequency of the damped motion. Then ζ = δ / √(4π² + δ²) is
+    the damping ratio and f / √(1 - ζ²) the natural frequency.
+
+    Args:
+        displacement: Displacements in each frame, in any unit, shape (T, ...).
+        times: Times of the frames, evenly spaced [s], shape (T,).
+
+    Returns:
+        The natural frequency [Hz] and the damping ratio.
+
+    Raises:
+        ValueError: If the shapes or times do not fit, or fewer than three swings to either side are seen.
+    """
+    from scipy.optimize import curve_fit
+
+    displacement, times = _numbers(displacement), _numbers(times)
+    if len(displacement) != len(times) or len(times) < FEWEST:
+        raise ValueError(
+            f"Expected `displacement` (T, ...) and `times` (T,) of at least {FEWEST} frames, but got shapes "
+            f"{displacement.shape} and {times.shape}."
+        )
+    step = _step(times)
+    line, time = _main_component(displacement.reshape(len(times), -1)), times - times[0]
+    frequency, decrement, offset = _first_guess(line, step)
+
+    def decay(t: np.ndarray, f: float, delta: float, cosine: float, sine: float, level: float) -> np.ndarray:
+        turn = 2 * np.pi * f * t
+        return level + np.exp(-delta * f * t) * (cosine * np.cos(turn) + sine * np.sin(turn))
+
+    guess = (frequency, decrement, line[0] - offset, 0.0, offset)
+    found, _ = curve_fit(decay, time, line, p0=guess, maxfev=20_000)
+    f, delta = abs(float(found[0])), float(found[1]) * math.copysign(1.0, float(found[0]))
+    ratio = delta / math.hypot(2 * math.pi, delta)
+    return f / math.sqrt(1 - ratio**2), ratio
+
+
+def _main_component(rows: np.ndarray) -> np.ndarray:
+    """Rows (T, K) on their first principal component (T,), the largest value positive and of size 1."""
+    centred = rows - rows.mean(axis=0)
+    if not centred.any():
+        raise ValueError("Expected a `displacement` that changes, but it does not: nothing swings.")
+    line = np.linalg.eigh(centred @ centred.T)[1][:, -1]  # T by T, as K may be large
+    return line / line[np.abs(line).argmax()]
+
+
+def _first_guess(line: np.ndarray, step: float) -> tuple[float, float, float]:
+    """Frequency [Hz] by zero crossings, logarithmic decrement by the height of the swings between them, and level."""
+    level = float(line[len(line) // 2 :].mean())
+    swings = np.flatnonzero(np.diff(np.sign(line - level)))  # the last frames before a crossing
+    heights = np.array([np.abs(part - level).max() for part in np.split(line, swings + 1)[1:-1]])
+    if len(heights) < 2:
+        raise ValueError(
+            f"Expected at least three crossings of the resting place, but got {len(swings)}: give more frames, or a "
+            "thing with less damping."
+        )
+    # small swings at the end are noise, so each counts by its height
+    per_half = np.polyfit(np.arange(len(heights)), np.log(heights), deg=1, w=heights)[0]
+    large = swings[: 1 + max(2, int((heights > 0.2 * heights.max()).sum()))]
+    half_period = (large[-1] - large[0]) / (len(large) - 1) * step
+    return 0.5 / half_period, -2 * float(per_half), level
+
+
+# ---- pictures of motion
+
+
+def contact_sheet(frames: Iterable[Array], columns: int) -> np.ndarray:
+    """Frames side by side, row by row.
+
+    Args:
+        frames: Pictures of one size, uint8, each of shape (H, W, 3).
+        columns: Number of frames in a row.
+
+    Returns:
+        The picture, uint8, shape (rows · H, columns · W, 3); places without a frame are black.
+
+    Raises:
+        ValueError: If there is no frame, or ``columns`` is not positive.
+    """
+    film = _film(frames)
+    if columns < 1:
+        raise ValueError(f"Expected `columns` of at least 1, but got {columns}.")
+    count, height, width, _ = film.shape
+    rows = math.ceil(count / columns)
+    places = np.zeros((rows * columns, height, width, 3), dtype=np.uint8)
+    places[:count] = film
+    grid = places.reshape(rows, columns, height, width, 3)
+    return grid.transpose(0, 2, 1, 3, 4).reshape(rows * height, columns * width, 3)
+
+
+def space_time(frames: Iterable[Array], column: int | None = None, row: int | None = None) -> np.ndarray:
+    """One line of pixels over time: what stands still is a straight stripe, what sways a wave.
+
+    Args:
+        frames: Pictures of one size, uint8, each of shape (H, W, 3).
+        column: Column of pixels, whose T copies stand side by side; the middle one if neither is given.
+        row: Row of pixels instead, whose T copies lie one below the other.
+
+    Returns:
+        The picture, uint8, shape (H, T, 3), or (T, W, 3) for a row.
+
+    Raises:
+        ValueError: If there is no frame, or both a column and a row are given, or one outside the picture.
+    """
+    film = _film(frames)
+    if column is not None and row is not None:
+        raise ValueError("Expected `column` or `row`, but got both: remove one.")
+    height, width = film.shape[1:3]
+    name, given, size = ("column", column, width) if row is None else ("row", row, height)
+    line = size // 2 if given is None else given
+    if not 0 <= line < size:
+        raise ValueError(f"Expected `{name}` from 0 to {size - 1}, but got {line}.")
+    return film[:, :, line].transpose(1, 0, 2).copy() if row is None else film[:, line].copy()
+
+
+def _film(frames: Iterable[Array]) -> np.ndarray:
+    """Frames as one array (T, H, W, 3)."""
+    pictures = [np.asarray(frame.cpu() if isinstance(frame, Tensor) else frame) for frame in frames]
+    if not pictures:
+        raise ValueError("Expected at least one picture in `frames`, but got none.")
+    for picture in pictures:
+        if picture.dtype != np.uint8 or picture.ndim != 3 or picture.shape != (*pictures[0].shape[:2], 3):
+            raise ValueError(
+                f"Expected `frames` of uint8 and one shape (H, W, 3), but got {picture.dtype} {picture.shape}."
+            )
+    return np.stack(pictures)
