@@ -20,6 +20,7 @@ from __future__ import annotations
 
 import hashlib
 from dataclasses import dataclass, fields
+from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -87,7 +88,6 @@ class Structure:
         scene: Which scene of a batch.
 
     Attributes:
-        stiffness: K of the nodes, with pinned points and ties as stiff rows [N/m for a mean modulus of 1 Pa].
         mass: Mass of the nodes, of 1 kg in all, shape (G,).
         spread: Displacement of the nodes by that of the degrees of freedom, sparse, shape (3G, n).
         value: Weights of the nodes at the points, sparse, shape (P, G).
@@ -118,26 +118,42 @@ class Structure:
         ]
         self.value, self.slope = rows[0], rows[1:]
         self.mass = self.value.T @ self.point_mass
-        mu, lam = of_scene(body.laws.mu), of_scene(body.laws.lam)
-        self.volume = volume
-        K = self._hooke(basis[:, 1:], volume * mu / self.mean_modulus, volume * lam / self.mean_modulus)
+        self.volume, self._basis = volume, basis[:, 1:]
+        self._lame = [volume * of_scene(field) / self.mean_modulus for field in (body.laws.mu, body.laws.lam)]
         self.pinned, rows_of = self._pins()
-        self.stiff = STIFF_ROW * float(abs(K.diagonal()).max())
         self.pins = [
             (k, sparse.kron(weight, sparse.identity(3), format="csr"), is_slope) for k, weight, is_slope in rows_of
         ]
-        for _, row, _ in self.pins:
-            K = K + self.stiff * (row.T @ row)
-        self.loose = self._tie(K)
-        for row in self.loose:
-            K = K + self.stiff / STIFF_ROW * (row.T @ row)
-        self.stiffness = K.tocsr()
+        self.loose = self._tie()
         self.spread = self._degrees()
 
-    def _hooke(self, slope: np.ndarray, mu: np.ndarray, lam: np.ndarray) -> Any:
-        """The stiffness of Hooke's law, from slopes (P, 3, 27) and Lamé's parameters times volumes (P,)."""
+    @cached_property
+    def stiffness(self) -> Any:
+        """K of the nodes, with pinned points and ties as stiff rows [N/m for a mean modulus of 1 Pa], sparse."""
+        return self.with_rows(self.hooke())
+
+    def with_rows(self, K: Any) -> Any:
+        """A stiffness with pinned points and ties as stiff rows."""
+        self.stiff = STIFF_ROW * float(abs(K.diagonal()).max())
+        for _, row, _ in self.pins:
+            K = K + self.stiff * (row.T @ row)
+        for row in self.loose:
+            K = K + self.stiff / STIFF_ROW * (row.T @ row)
+        return K.tocsr()
+
+    def reduced(self, K: Any) -> tuple[Any, Any]:
+        """Stiffness and mass of the degrees of freedom, by a stiffness of the nodes."""
         import scipy.sparse as sparse
 
+        S = self.spread
+        return (S.T @ K @ S).tocsc(), (S.T @ sparse.diags(np.repeat(self.mass, 3)) @ S).tocsc()
+
+    def hooke(self, some: np.ndarray | None = None) -> Any:
+        """The stiffness of Hooke's law, of all points or of some of them, bool (P,), for a mean modulus of 1 Pa."""
+        import scipy.sparse as sparse
+
+        mu, lam = self._lame if some is None else [field * some for field in self._lame]
+        slope = self._basis
         order = np.argsort(self.site, kind="stable")
         many = np.bincount(self.site)
         first = np.cumsum(many) - many
@@ -204,7 +220,7 @@ class Structure:
                         rows.append((k, sparse.csr_matrix((w.ravel(), node[some].ravel(), start), shape), is_slope))
         return pinned, rows
 
-    def _tie(self, K: Any) -> list[Any]:
+    def _tie(self) -> list[Any]:
         """Rows that make a piece which nothing holds follow the nearest point that is held, as if glued to it."""
         import scipy.sparse as sparse
         from scipy.sparse.csgraph import connected_components
@@ -287,7 +303,6 @@ class Structure:
             ValueError: If nothing holds the body or it is too large.
         """
         import scipy.linalg as linalg
-        import scipy.sparse as sparse
 
         S = self.spread
         if S.shape[1] > MOST_UNKNOWNS:
@@ -295,16 +310,14 @@ class Structure:
                 f"`solver.formulation: modes` would have {S.shape[1]:,} unknowns (at most {MOST_UNKNOWNS:,}): raise "
                 "`solver.dx`, or set it to total."
             )
-        K = (S.T @ self.stiffness @ S).tocsc()
-        M = (S.T @ sparse.diags(np.repeat(self.mass, 3)) @ S).tocsc()
-        load = self._loads()
+        K, M = self.reduced(self.stiffness)
+        load = self.loads(CLUSTERS)
         whole = S.T @ load[:, :3]
         shift = self._first_guess()
         for _ in range(8):
-            solve = _factor(K + shift * M)
+            solve = factor(K + shift * M)
             lean = solve(whole)
-            quotient = (lean * (K @ lean)).sum(0) / (lean * (M @ lean)).sum(0)
-            first = float(quotient[:2].min())  # a wind is level
+            first = rayleigh(K, M, lean)
             if SHIFT**2 * first > 0.5 * shift:
                 break
             shift = SHIFT**2 * first
@@ -330,12 +343,12 @@ class Structure:
         side = float(np.ptp(self.rest, axis=0).max())
         return max(self.volume.sum() / max(side, 1e-30) ** 2, 1e-300)
 
-    def _loads(self) -> np.ndarray:
+    def loads(self, clusters: int) -> np.ndarray:
         """Loads on the nodes along three axes: on the whole, and on clusters of points; shape (3G, 3 + 3 clusters)."""
         from scipy.cluster.vq import kmeans2
 
-        count = min(CLUSTERS, max(1, self.count // 4))
-        _, label = kmeans2(self.rest, count, seed=0, minit="++")
+        count = min(clusters, max(1, self.count // 4))
+        label = kmeans2(self.rest, count, seed=0, minit="++")[1] if count else np.zeros(self.count, int)
         share = self.volume / self.volume.sum()
         of = np.concatenate([share[:, None], share[:, None] * (label[:, None] == np.arange(count))], 1)
         nodal = self.value.T @ of
@@ -385,11 +398,17 @@ class Structure:
         )
 
 
+def rayleigh(K: Any, M: Any, shapes: np.ndarray) -> float:
+    """Rayleigh's quotient of leans along x, y and z, shape (n, 3), for a level wind: the lower one of x and y."""
+    quotient = (shapes * (K @ shapes)).sum(0) / (shapes * (M @ shapes)).sum(0)
+    return float(quotient[:2].min())
+
+
 def _symmetric(matrix: np.ndarray) -> np.ndarray:
     return 0.5 * (matrix + matrix.T)
 
 
-def _factor(matrix: Any) -> Any:
+def factor(matrix: Any) -> Any:
     """A function that solves with a symmetric positive sparse matrix."""
     import scipy.sparse.linalg as linalg
 
@@ -473,4 +492,4 @@ def _write(path: Path, found: Analysis) -> None:
         return
 
 
-__all__ = ["Analysis", "Structure", "analysis_of"]
+__all__ = ["Analysis", "Structure", "analysis_of", "factor", "rayleigh"]

@@ -278,6 +278,24 @@ class Modes(Total):
         state = state.replace(time=state.time + steps * dt, substep=dt, work=work, impulse=impulse)
         return self.shown(state, q, p)
 
+    @torch.no_grad()
+    def leaning(self, force: Force, rounds: int = 40) -> MPMState:
+        """The state in which a steady force is in balance with the stiffness, by damped iteration.
+
+        Args:
+            force: A force that has groups (``Force.on_sites``), such as a steady wind.
+            rounds: Iterations, each of which goes half of the way.
+        """
+        state = self.first_state(torch.zeros_like(self.body.points.position), 0)
+        q, p = self.amplitudes(state)
+        group, square = self._grouped(force), self.square.to(q)
+        assert group is not None
+        for _ in range(rounds):
+            seen = self._site_state(q, p, state, state.time)
+            load, _ = split(group(seen), group, seen)
+            q = 0.5 * (q + self._pull(seen.F_total, load) / square)
+        return self.shown(state, q, p)
+
     def _pull(self, R: Tensor, load: Tensor) -> Tensor:
         """The load on the modes by forces on the sites, shape (..., M)."""
         local = (R.mT @ load[..., None])[..., 0].flatten(-2)

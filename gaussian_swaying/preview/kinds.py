@@ -1,0 +1,167 @@
+"""What kind of thing a splat shows, and how things of that kind sway.
+
+Frequencies, masses and damping are those of trees, plants and hanging things that were measured; what is an estimate is
+marked in :data:`KINDS`.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from gaussian_swaying.gaussians.cloud import GaussianCloud
+from gaussian_swaying.gaussians.harmonics import SH_DC
+from gaussian_swaying.preview.parts import FoundParts, greenish
+from gaussian_swaying.preview.shape import plane_axes, quantile
+
+
+@dataclass(frozen=True)
+class Kind:
+    """How a kind of thing sways.
+
+    Attributes:
+        words: Its name in a sentence.
+        side: Usual length of its longest side [m], for a splat without a scale.
+        frequency: First frequency in still air times the square root of the height [Hz sqrt(m)]; for ``hanging`` of the
+            length from the pivot to the centre of mass, for ``rigid`` the frequency itself [Hz]. None for cloth, whose
+            own numbers decide.
+        mass: Mass per frontal area [kg/m²].
+        mass_by_height: Further mass per frontal area and height [kg/m³].
+        drag: Drag coefficient of the whole on its frontal area.
+        damping_ratio: Damping ratio in still air, without that of the air.
+        material: The known material of its surface.
+        other: The known material of its stems or wood, or of its cord.
+        leaf: First frequency of a leaf or twig on a stem that does not move [Hz], at least.
+        source: Where the numbers are from.
+    """
+
+    words: str
+    side: float
+    frequency: float | None
+    mass: float
+    drag: float
+    damping_ratio: float
+    material: str
+    other: str = "wood"
+    mass_by_height: float = 0.0
+    leaf: float = 3.0
+    source: str = ""
+
+    def first_frequency(self, height: float) -> float | None:
+        """First frequency [Hz] at a height, or length, [m]; None for cloth."""
+        if self.frequency is None or self.words == KINDS["rigid"].words:
+            return self.frequency
+        return self.frequency / math.sqrt(height)
+
+    def area_mass(self, height: float) -> float:
+        """Mass per frontal area [kg/m²] at a height [m]."""
+        return self.mass + self.mass_by_height * height
+
+    @property
+    def cloth(self) -> bool:
+        """True for a sheet, which is simulated by material points."""
+        return self.frequency is None
+
+
+_TREES = "frequency: 844 trees of Jackson et al. 2021 (Biogeosciences 18:4059), k / sqrt(H); mass, drag: estimates"
+KINDS = {
+    "plant": Kind("a plant in a pot", 1.0, 1.4, 0.9, 0.58, 0.04, "leaf", "stem", source=_TREES),
+    "succulent": Kind("a succulent", 0.3, 2.7, 8.0, 0.8, 0.03, "succulent", "stem", leaf=8.0, source="estimates"),
+    "grass": Kind("a tuft of grass", 0.5, 1.5, 0.5, 0.58, 0.06, "grass", "grass", source=_TREES),
+    "shrub": Kind("a shrub", 1.2, 1.75, 2.5, 0.57, 0.04, "leaf", "twig", source=_TREES),
+    "tree": Kind("a tree", 8.0, 1.55, 0.0, 0.45, 0.05, "leaf", "bark", mass_by_height=0.61, source=_TREES),
+    "sapling": Kind("a young tree", 2.5, 1.6, 2.0, 0.48, 0.04, "leaf", "bark", source=_TREES),
+    "conifer": Kind("a conifer", 8.0, 1.4, 0.0, 0.45, 0.04, "leaf", "bark", mass_by_height=0.6, source=_TREES),
+    "hanging": Kind("a hanging thing", 1.0, 0.5, 12.0, 0.6, 0.02, "wood", source="a pendulum; mass, drag: estimates"),
+    "cloth": Kind("a hanging cloth", 1.0, None, 0.2, 1.0, 0.02, "fabric", source="fabric of 0.2 kg/m²"),
+    "flag": Kind("a flag", 1.0, None, 0.12, 1.0, 0.02, "fabric", source="nylon of 0.12 kg/m²"),
+    "person": Kind("a person", 1.75, 1.3, 25.0, 1.0, 0.1, "clothes", source="estimates"),
+    "rigid": Kind("a rigid thing", 1.0, 40.0, 8.0, 1.0, 0.02, "wood", source="no vibration below 10 Hz is seen"),
+}
+"""The kinds by name."""
+
+STANDS_LOW = 0.6  # height of a succulent over its width, at most
+TALL = (1.8, 5.0)  # height of a person over its width
+SKIN = 0.12  # share of the visible area of a head that has the colour of skin, at least
+NARROW_TOP = 0.35  # width of a conifer near its top over that near its foot
+THREADS = 0.5  # share of a tuft of grass that is longer than wide
+YOUNG = 4.0  # m; a tree up to this height is a young one
+
+
+def kind_of(
+    cloud: GaussianCloud,
+    simulated: Tensor,
+    up: Sequence[float],
+    weight: Tensor,
+    end: str,
+    sheet: bool,
+    parts: FoundParts | None,
+) -> tuple[str, str]:
+    """Guess the kind of a thing.
+
+    Args:
+        cloud: The splat.
+        simulated: The Gaussians that move, bool, shape (N,).
+        up: Up direction, a unit vector.
+        weight: Visible area of each Gaussian, shape (N,).
+        end: Where it is held: ``top``, ``bottom``, ``side`` or ``none``.
+        sheet: Whether it is a sheet.
+        parts: Its parts, if some were found.
+
+    Returns:
+        The name of the kind, and why, in words.
+    """
+    names = set() if parts is None else {part.name for part in parts.parts.parts}
+    index = simulated.nonzero()[:, 0]
+    means, axis = cloud.means.detach()[index].double(), torch.tensor(list(up), dtype=torch.float64)
+    visible = weight[index].double()
+    height = means @ axis
+    low, high = quantile(height, 0.005), quantile(height, 0.995)
+    wide = max(quantile(means @ a, 0.98) - quantile(means @ a, 0.02) for a in plane_axes(axis))
+    green = greenish(cloud.sh.detach()[index])
+    leafy = float((visible * green).sum() / visible.sum().clamp(min=1e-30))
+    if "pot" in names:
+        if high - low < STANDS_LOW * wide:
+            return "succulent", "it stands in a pot, wider than high"
+        return "plant", "it stands in a pot"
+    if "cloth" in names or (sheet and end == "side"):
+        return "flag", "a sheet that is held at one side"
+    if sheet:
+        return "cloth", "a sheet"
+    if end == "top":
+        return "hanging", "it is held at its top"
+    if leafy > 0.35 or "leaf" in names:
+        cone = _width(means, height, axis, 0.75, 0.9) < NARROW_TOP * _width(means, height, axis, 0.1, 0.3)
+        if cone:
+            return "conifer", "it is green, and narrow at the top"
+        if "leaf" in names:
+            return "tree", "a green crown on a bare trunk"
+        return "shrub", f"{leafy:.0%} of it is green"
+    if end == "bottom" and TALL[0] < (high - low) / max(wide, 1e-30) < TALL[1]:
+        head = height > high - 0.16 * (high - low)
+        share = float((visible * _skin(cloud, index))[head].sum() / visible[head].sum().clamp(min=1e-30))
+        slim = _width(means, height, axis, 0.88, 1.0) < 0.75 * _width(means, height, axis, 0.55, 0.8)
+        if share > SKIN and slim:
+            return "person", f"{share:.0%} of its upper end has the colour of skin, above something wider"
+    return "rigid", "neither green, nor a sheet, nor hanging: it stands, and there is little to sway"
+
+
+def _width(means: Tensor, height: Tensor, up: Tensor, first: float, last: float) -> float:
+    """Width of a slice between two shares of the height."""
+    low, high = quantile(height, 0.005), quantile(height, 0.995)
+    share = (height - low) / max(high - low, 1e-30)
+    part = means[(share >= first) & (share <= last)]
+    if len(part) < 8:
+        return 0.0
+    return max(quantile(part @ a, 0.95) - quantile(part @ a, 0.05) for a in plane_axes(up))
+
+
+def _skin(cloud: GaussianCloud, index: Tensor) -> Tensor:
+    """True for Gaussians of the colour of skin, from light to dark: red above green above blue, not vivid."""
+    red, green, blue = (0.5 + SH_DC * cloud.sh.detach()[index, 0].double()).clamp(0, 1).unbind(-1)
+    bright = red.clamp(min=1e-6)
+    return (green / bright > 0.55) & (green / bright < 0.9) & (blue / bright > 0.35) & (blue < green) & (red > 0.2)

@@ -1,0 +1,222 @@
+r"""Stiffness, mass and drag with which a thing sways as its kind does in nature, by linear algebra in place of trials.
+
+First frequency :math:`\omega_1` and mass per frontal area :math:`M_A` alone decide how far a thing leans in a wind U, by
+:math:`\rho C_D U^2 / (2 M_A \omega_1^2)`. Mass and drag of the whole are those of the kind on the silhouette that is
+seen; the stiffness of the grid that runs is scaled until Rayleigh's quotient of the lean is the first frequency of the
+kind and height. Leaves on stems have a frequency of their own, with the stems pinned.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from gaussian_swaying.aero.wind import WindField
+from gaussian_swaying.aero.wind_force import WindForce
+from gaussian_swaying.geometry.groups import equal_rows
+from gaussian_swaying.mpm.body import Body
+from gaussian_swaying.mpm.formulations.modes import Modes
+from gaussian_swaying.mpm.formulations.total import Total
+from gaussian_swaying.mpm.modal import SHIFT, Structure, factor, rayleigh
+from gaussian_swaying.mpm.solver import MPMSolver
+from gaussian_swaying.preview.kinds import KINDS, Kind
+from gaussian_swaying.preview.shape import quantile
+from gaussian_swaying.simulation.parameters import other_with
+from gaussian_swaying.simulation.simulation import Simulation
+
+MOST_LEAN = 0.4
+"""Lean over the longest side above which modes will not do."""
+SILHOUETTE = 96
+"""Cells along the longest side in which the silhouette is counted."""
+ABOVE = 1.5
+"""Least frequency of leaves on pinned stems, over that of the whole."""
+
+
+@dataclass(frozen=True)
+class Natural:
+    """Numbers of a thing that sways as its kind does.
+
+    Attributes:
+        height: Height [m], or length from the pivot to the centre of mass of a hanging thing, that decides its
+            frequency.
+        frequency: First frequency in still air [Hz].
+        mass: Mass of what moves [kg].
+        frontal: Area of its silhouette in the wind [m²].
+        thicker: Factor on the thicknesses of the surface.
+        stiffer: Factors on the Young's moduli, by their present values.
+        drag: Factor on the drag, friction and lift coefficients.
+        lean: Mean displacement of the upper tenth in the mean wind, over the longest side.
+    """
+
+    height: float
+    frequency: float
+    mass: float
+    frontal: float
+    thicker: float
+    stiffer: dict[float, float]
+    drag: float
+    lean: float
+
+
+def natural(simulation: Simulation, kind: Kind, flow: Tensor, intensity: float) -> Natural:
+    """Find the numbers of a kind for a scene, and give them to the simulation.
+
+    Args:
+        simulation: The scene in the formulation ``modes``, with any stiffness, thickness and drag; it is changed.
+        kind: Its kind, no cloth.
+        flow: Mean wind [m/s], z up, shape (3,).
+        intensity: Intensity of its turbulence.
+
+    Raises:
+        ValueError: If nothing holds it.
+    """
+    scene, setup = simulation.scene, simulation.setup
+    solver = simulation.solver
+    assert isinstance(solver, MPMSolver)
+    total = Total(Body(setup.points, solver.framed(scene.frame)), setup.solver)
+    structure = Structure(total)
+    place = structure.rest
+    free = structure.pinned[structure.table].max(1) < 0
+    free = free if free.any() else np.ones(len(place), bool)
+    height = _height(structure, free, kind)
+    frequency = kind.first_frequency(height)
+    assert frequency is not None
+    frontal = silhouette(torch.from_numpy(place[free]), flow)
+    moving = float(structure.point_mass[free].sum())
+    own = float(setup.points.mass.double().sum())
+    wanted = kind.area_mass(height) * frontal
+    thicker = wanted / (own * moving)
+    stiffer = _stiffness(structure, setup.points.youngs_modulus, own * thicker, thicker, frequency, kind)
+    points = setup.points
+    E = points.youngs_modulus.clone()
+    for value, ratio in stiffer.items():
+        E[points.youngs_modulus == value] *= ratio
+    points = replace(points, mass=points.mass * thicker, volume=points.volume * thicker, youngs_modulus=E)
+    speed = float(flow.norm())
+    drag = _drag(simulation, frontal, kind)
+    aero = other_with(simulation.aero, **{name: drag * getattr(simulation.aero, name) for name in ("C_D", "C_F", "C_L")})
+    simulation.adopt(replace(setup, points=points, aero=aero))
+    simulation.solver.init_state(points, frame=scene.frame)
+    bound = solver.bound
+    assert isinstance(bound, Modes)
+    steady = WindForce(aero, WindField(flow * math.sqrt(1 + intensity**2)), scene.patches)
+    state = bound.leaning(steady)
+    lean = _lean(state.position - points.position, points.position) if speed > 0 else 0.0
+    return Natural(height, frequency, wanted, frontal, thicker, stiffer, drag, lean)
+
+
+def silhouette(place: Tensor, flow: Tensor) -> float:
+    """Area of the silhouette of points [m²], shape (P, 3), seen along a level flow, shape (3,).
+
+    Counted in square cells of at least half the distance of neighbouring points.
+    """
+    along = torch.nn.functional.normalize(flow.double() * flow.new_tensor([1.0, 1.0, 0.0]), dim=0)
+    across = torch.stack([-along[1], along[0], torch.zeros_like(along[0])])
+    flat = torch.stack([place.double() @ across, place.double()[:, 2]], -1)
+    side = float((flat.amax(0) - flat.amin(0)).amax())
+    cell = side / SILHOUETTE
+    while cell < side:  # coarser, until the cells of a closed surface are mostly full
+        index = (flat / cell).floor().long()
+        count = int(equal_rows(index).max()) + 1
+        if len(flat) > 3 * count:
+            break
+        cell *= 1.25
+    return count * cell**2
+
+
+def _height(structure: Structure, free: np.ndarray, kind: Kind) -> float:
+    """The length that decides the frequency [m]."""
+    z = structure.rest[:, 2]
+    if kind is KINDS["hanging"]:
+        middle = float((structure.point_mass[free] * z[free]).sum() / structure.point_mass[free].sum())
+        return max(float(z[~free].min() if (~free).any() else z.max()) - middle, 1e-3)
+    return max(quantile(torch.from_numpy(z[free]), 0.99) - quantile(torch.from_numpy(z[free]), 0.01), 1e-3)
+
+
+def _stiffness(
+    structure: Structure, modulus: Tensor, mass: float, thicker: float, frequency: float, kind: Kind
+) -> dict[float, float]:
+    """Factors on the moduli, by their values: first the leaves on pinned stems, then the stems."""
+    E = modulus.double().cpu().numpy()
+    values = np.unique(E)
+    target = (2 * math.pi * frequency) ** 2
+    unit = mass / (structure.mean_modulus * thicker)  # of squares of frequencies, for the structure's own units
+    load = structure.loads(0)[:, :3]
+
+    def quotient(parts: list[tuple[float, object]], spread: object = None) -> float:
+        K = structure.with_rows(sum(ratio * K for ratio, K in parts[1:]) + parts[0][0] * parts[0][1])  # type: ignore[operator]
+        K, M = structure.reduced(K)
+        lean = factor(K + SHIFT**2 * target * unit * M)(structure.spread.T @ load)
+        return rayleigh(K, M, lean) / unit
+
+    if len(values) == 1:
+        whole = structure.hooke()
+        ratio = target / quotient([(1.0, whole)])
+        for _ in range(2):  # the shift is that of the stiffness found
+            ratio *= target / quotient([(ratio, whole)])
+        return {float(values[0]): ratio}
+    soft = E == values[0]  # leaves have the lowest modulus
+    leaves, stems = structure.hooke(soft), structure.hooke(~soft)
+    wanted = (2 * math.pi * max(kind.leaf, ABOVE * frequency)) ** 2
+    leaf = wanted * unit / _on_pinned_stems(structure, leaves, soft, wanted * unit)
+    low, high, stem = 1e-6, 1e12, leaf
+    for _ in range(12):
+        found = quotient([(leaf, leaves), (stem, stems)])
+        if abs(found / target - 1) < 0.01:
+            break
+        low, high = (stem, high) if found < target else (low, stem)
+        following = stem * (target / found) ** 1.3
+        stem = following if low < following < high else math.sqrt(low * high)
+    return {float(value): leaf if value == values[0] else stem for value in values}
+
+
+def _on_pinned_stems(structure: Structure, leaves: object, soft: np.ndarray, target: float) -> float:
+    """Rayleigh's quotient of the leaves with all nodes pinned that carry more than a little of the stems."""
+    import scipy.sparse as sparse
+
+    share = structure.value.T @ (structure.point_mass * ~soft)
+    nodes = (share <= 0.07 * structure.mass) & (structure.pinned < 0) & (structure.mass > 1e-7 * structure.mass.max())
+    index = (3 * np.flatnonzero(nodes)[:, None] + np.arange(3)).ravel()
+    if len(index) == 0:
+        return target
+    K = leaves[index][:, index].tocsc()  # type: ignore[index]
+    M = sparse.diags(np.repeat(structure.mass, 3)[index]).tocsc()
+    load, ratio = structure.loads(0)[index, :3], 1.0
+    for _ in range(3):
+        scaled = ratio * K
+        ratio *= target / rayleigh(scaled, M, factor(scaled + SHIFT**2 * target * M)(load))
+    return target / ratio
+
+
+def _drag(simulation: Simulation, frontal: float, kind: Kind) -> float:
+    """Factor on the coefficients that gives the whole the drag of its kind."""
+    scene, aero = simulation.scene, simulation.aero
+    points = simulation.setup.points
+    still = torch.zeros_like(points.position)
+    identity = torch.eye(3).to(still).expand(*still.shape, 3)
+    direction = simulation.wind.flows[0].to(still)  # type: ignore[union-attr]
+    direction = direction / direction.norm().clamp(min=1e-12)
+    force = WindForce(aero, WindField(direction.double()), scene.patches)
+    from gaussian_swaying.mpm.state import State
+
+    lost = torch.zeros(len(still), dtype=torch.bool)
+    time = torch.zeros((), dtype=torch.float64)
+    state = State(position=points.position, velocity=still, F_elastic=identity, F_total=identity, lost=lost, time=time)
+    pull = float((force(state)[0].sum(0) * direction).sum())
+    return kind.drag * 0.5 * aero.air_density * frontal / max(pull, 1e-30)
+
+
+def _lean(moved: Tensor, rest: Tensor) -> float:
+    """Mean displacement of the tenth that moves most, over the longest side of what moves."""
+    size = moved.norm(dim=-1)
+    moving = size > 0.1 * quantile(size, 0.98)
+    if not bool(moving.any()):
+        return 0.0
+    some = rest[moving].double()
+    side = max(quantile(some[:, k], 0.99) - quantile(some[:, k], 0.01) for k in range(3))
+    top = size[moving]
+    return float(top[top >= quantile(top, 0.9)].mean()) / max(side, 1e-30)
