@@ -205,3 +205,24 @@ def test_the_lift_is_the_weight_of_the_air(hanging):
     expected = mass[:, None] * torch.tensor([0.0, -0.5, 9.8], dtype=torch.float64)
     torch.testing.assert_close(lift(state), expected, rtol=1e-9, atol=1e-12)
     assert float(lift.potential(state)) == pytest.approx(-float((expected * state.position).sum()))
+
+
+@pytest.mark.gpu
+@pytest.mark.parametrize("formulation", ["total", "updated"])
+def test_a_gpu_does_the_same_with_recorded_frames(formulation, hanging):
+    """In float32, with another breadth from the third frame on."""
+    if not torch.cuda.is_available():
+        pytest.skip("needs a CUDA device")
+    found = []
+    for device in ("cpu", "cuda"):
+        settings = {"formulation": formulation, "dtype": torch.float32, "wind": WindField([1.0, 5.0, 0.0])}
+        simulation = hanging(air(drag=0.5), **settings).to(device)
+        states, log = run(simulation, 3)
+        state = simulation.change(states[-1], {"aero.added_mass": 0.3})
+        states, more = run(simulation, 4, state)
+        found.append((states[-1].position.cpu(), [*log, *more]))
+    torch.testing.assert_close(found[0][0], found[1][0], rtol=0, atol=1e-4)
+    largest = max(health.kinetic for health in found[0][1])
+    for name in ("kinetic", "potential", "wind_work"):
+        ours, theirs = ([getattr(health, name) for health in log] for _, log in found)
+        assert ours == pytest.approx(theirs, abs=0.01 * largest)
