@@ -200,3 +200,9 @@ def wind_on_groups(F, velocity, position, place, numbers, now, table, OPTIONS: t
     if OPTIONS[3]:
         resistance = scale * area * yielding
     return scale3(scale, force), resistance
+
+
+@triton.jit
+def steady_force(F, velocity, position, point, numbers, now, table, OPTIONS: tl.constexpr):
+    """``added_mass.AirLift``: the numbers of a point are its force; no resistance."""
+    return (point[0], point[1], point[2]), point[0] * 0

@@ -2,7 +2,7 @@
 
 A variant with another length is simulated on the same grid, in a metre of its own. With a scene unit that is r times as
 long, the same motion in scene units has 1/r of the wind and of gravity. A sheet of the same mass of an area has 1/r of
-the density and 1/r³ of E then, and a filled body 1/r² of E.
+the density and 1/r³ of E then, and a filled body 1/r² of E. The breadth of ``aero.added_mass`` is a length: 1/r.
 """
 
 from __future__ import annotations
@@ -51,4 +51,6 @@ def at_scale(setup: Setup, metres_per_unit: float) -> Setup:
     found = with_values(setup, changes | {"solver.gravity": [part / ratio for part in gravity]})
     if setup.points.bending is not None:
         found = replace(found, points=replace(found.points, bending=setup.points.bending / ratio**5))
+    if setup.aero.added_mass:
+        found = replace(found, aero=other_with(setup.aero, added_mass=setup.aero.added_mass / ratio))
     return replace(found, wind=other_with(wind, flows=wind.flows / ratio))

@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 
 import torch
 
+from gaussian_swaying.aero.added_mass import with_added_mass
 from gaussian_swaying.aero.wind import WindField
 from gaussian_swaying.fitting.changing import changing
 from gaussian_swaying.fitting.scale import SCALE, at_scale
@@ -96,7 +97,7 @@ def _groups(simulation: Simulation, values: Sequence[Values], setups: Sequence[S
             for name, value in sorted(own.items())
             if name in (FILM_START, SCALE) or not (is_change(name) or parameter(name).batched)
         ]
-        shared.setdefault((*apart, 0 if alike else _stiffness_class(setup.points)), []).append(number)
+        shared.setdefault((*apart, 0 if alike else _stiffness_class(_bound(setup))), []).append(number)
     found = []
     for members in shared.values():
         part = [setups[k] for k in members]
@@ -133,6 +134,11 @@ def _advance(groups: Sequence[_Group], begin: float, end: float, alike: bool) ->
         steps = most
     for group, state in zip(groups, ends, strict=True):
         group.state = state
+
+
+def _bound(setup: Setup) -> MaterialPoints:
+    """The material as a stepper binds it."""
+    return with_added_mass(setup.points, setup.scene.patches, setup.aero)
 
 
 def _stiffness_class(points: MaterialPoints) -> int:

@@ -1,8 +1,8 @@
-"""Materials by name: numbers for cloth, leaves and wood, with what was read in a source and what is an estimate.
+"""Materials by name: numbers for cloth, plants, wood and what stands still, with what was read and what is an estimate.
 
-They are of the size of the real material's, at small strain and the same in all directions, which cloth, grass and
-wood are not. Real ones are much stiffer than what is usually simulated, and a wave may cross at most part of a cell
-in a substep: see :attr:`KnownMaterial.wave_speed`.
+They are of the size of the real material's, at small strain and the same in all directions, which cloth, grass, stems,
+wood and cardboard are not. Real ones are much stiffer than what is usually simulated, and a wave may cross at most part
+of a cell in a substep: see :attr:`KnownMaterial.wave_speed`.
 """
 
 from __future__ import annotations
@@ -72,6 +72,10 @@ MATERIALS: dict[str, KnownMaterial] = {
     "canvas": KnownMaterial(
         1.8e7, 0.3, 565.0, 0.0006, 0.02, f"duck of 10 oz/yd², which is 339 g/m²; {_WOVEN}", "nu, thickness, damping"
     ),
+    "fabric": KnownMaterial(
+        8e6, 0.3, 400.0, 0.0005, 0.02, "", "all; a woven fabric of unknown kind, between cotton and canvas"
+    ),
+    "clothes": KnownMaterial(3e6, 0.3, 350.0, 0.0007, 0.05, "", "all; of a person, between a T-shirt and denim"),
     "leather": KnownMaterial(1e8, 0.4, 930.0, 0.0012, 0.05, "", "all; for ranges see Ashby 2011"),
     "rubber": KnownMaterial(2e6, 0.45, 925.0, 0.002, 0.05, "", "all; for ranges see Ashby 2011; nu is nearer to 0.5"),
     "paper": KnownMaterial(
@@ -79,19 +83,29 @@ MATERIALS: dict[str, KnownMaterial] = {
         "bending stiffness, density and thickness of flags in a wind tunnel: data of juandadamo/2024_flags",
         "nu, damping",
     ),
+    "cardboard": KnownMaterial(
+        2.5e9, 0.3, 140.0, 0.0035, 0.02, "", "all; corrugated board, E for a bending stiffness of 10 N m"
+    ),
     "grass": KnownMaterial(
         4.9e8, 0.3, 700.0, 0.00025, 0.05,
         "fibres, 2 % of a blade and more (Vincent 1991), carry 90 to 95 % of its stiffness (Vincent 1982)",
         "all; E for fibres of 23 GPa",
     ),
     "leaf": KnownMaterial(5e7, 0.3, 800.0, 0.00025, 0.05, "", "all; for measurements see Onoda et al. 2015"),
+    "succulent": KnownMaterial(
+        5e6, 0.45, 950.0, 0.005, 0.03, "mass above 0.9 kg/m²: Lamont 2025", "E, nu, density, thickness, damping"
+    ),
+    "stem": KnownMaterial(5e8, 0.35, 950.0, 0.005, 0.07, "", "all; a green stem along its fibres, see Niklas 1992"),
     "twig": KnownMaterial(
         2e9, 0.35, 900.0, 0.002, 0.05,
         "E within that of branches, 0.7 to 4.6 GPa: Cannell & Morgan 1987; damping of a tree in winter: data of "
         "TobyDJackson/WindAndTrees_NaturalFrequencies",
         "nu, density, thickness",
     ),
+    "bark": KnownMaterial(3e8, 0.3, 500.0, 0.01, 0.05, "", "all"),
     "wood": KnownMaterial(1e10, 0.35, 500.0, 0.01, 0.005, "", "all; dry softwood along the grain, see Ross 2010"),
+    "metal": KnownMaterial(2e11, 0.3, 7850.0, 0.001, 0.002, "", "all; a sheet of steel, for others see Ashby 2011"),
+    "stone": KnownMaterial(5e10, 0.25, 2650.0, 0.02, 0.002, "", "all; granite, for others see Ashby 2011"),
 }  # fmt: skip
 """The known materials by name."""
 

@@ -10,7 +10,7 @@ from typing import Any
 
 import torch
 
-from gaussian_swaying.simulation.diagnostics import SimulationDiverged, measure
+from gaussian_swaying.simulation.diagnostics import SimulationDiverged
 from gaussian_swaying.simulation.run import Run
 from gaussian_swaying.simulation.simulation import Simulation
 from gaussian_swaying.simulation.stepper import Stepper
@@ -71,7 +71,7 @@ def run_batch(
                 batch.advance(state)
         startup = (time.perf_counter() - begin) / len(members)
         begin = time.perf_counter()
-        each = measure(batch.solver, state, 0, 0.0).each()
+        each = batch.at_first(state).each()
         for frame in range(frames):
             launched = batch.launch(state) if frame + 1 < frames else None
             for index, run in runs.items():

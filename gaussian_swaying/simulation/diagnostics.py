@@ -12,6 +12,7 @@ import torch
 from torch import Tensor
 
 from gaussian_swaying._devices import in_double
+from gaussian_swaying.aero.added_mass import AirLift
 from gaussian_swaying.geometry.linalg import determinant, matmul3, symmetric_eigenvalues
 from gaussian_swaying.geometry.neighbours import nearest_neighbours
 from gaussian_swaying.kernels.graphs import RECORDED, Replayed
@@ -46,9 +47,9 @@ class FrameDiagnostics:
         time: Simulated time [s].
         substeps: Substeps of the frame.
         cfl: Largest Courant number of the frame.
-        kinetic: Kinetic energy [J].
+        kinetic: Kinetic energy [J], with that of carried air (``aero.added_mass``), as the momenta.
         elastic: Elastic energy [J].
-        potential: Potential energy of gravity [J].
+        potential: Potential energy of gravity [J], of the material alone.
         wind_work: Work of the wind on the material during the frame [J].
         momentum_x: Linear momentum [kg m/s].
         momentum_y: Linear momentum [kg m/s].
@@ -291,20 +292,27 @@ def measure(
     tearing: TearingGauge | None = None,
     before: State | None = None,
     more: Tensor | None = None,
+    lift: AirLift | None = None,
 ) -> Measurement:
     """Start the measurements of :func:`diagnose`, with the same arguments, without waiting for the device.
 
-    ``more`` are further numbers to read with them, float64, shape (n,).
+    ``more`` are further numbers to read with them, float64, shape (n,). ``lift`` is the force that takes off the weight
+    of carried air: its potential energy is part of that of gravity, and its work none of the wind's.
     """
     start = state if before is None else before
     moved = torch.linalg.vector_norm(state.position - solver.points.position, dim=-1)
     energies, momenta = solver.energies(state), solver.momenta(state)
+    work = state.work - start.work
+    if lift is not None:
+        lifted = lift.potential(state)
+        energies["potential"] = energies["potential"] + lifted.to(energies["potential"])
+        work = work + (lifted - lift.potential(start)).to(work.device)
     J = determinant(state.F_total)
     F = in_double(state.F_total)
     squares = symmetric_eigenvalues(matmul3(F.mT, F))
     columns = {
         **energies,
-        "wind_work": state.work - start.work,
+        "wind_work": work,
         **{f"momentum_{axis}": momenta["linear"][..., k] for k, axis in enumerate("xyz")},
         **{f"angular_momentum_{axis}": momenta["angular"][..., k] for k, axis in enumerate("xyz")},
         "lost": state.lost.sum(-1),
@@ -356,6 +364,7 @@ class Gauge:
         before: State,
         more: Callable[[State], Tensor],
         same: tuple[object, ...] | None,
+        lift: AirLift | None = None,
     ) -> Measurement:
         """As :func:`measure`, without counting torn particles.
 
@@ -367,24 +376,26 @@ class Gauge:
             before: The state at the start of the frame.
             more: Function of the state that computes further numbers.
             same: Key of all else that ``more`` depends on; another key makes another recording. None to record nothing.
+            lift: As in :func:`measure`; it changes only with ``solver.identity``.
         """
         small = state.position.is_cuda and state.position.shape[:-1].numel() <= RECORDED
         fixed = solver.neighbours_fixed and state.F_elastic is state.F_total
         if not (small and fixed) or same is None:
-            return measure(solver, state, substeps, cfl, None, before, more(state))
+            return measure(solver, state, substeps, cfl, None, before, more(state), lift)
 
         names = [name for name, value in state.fields().items() if isinstance(value, Tensor) and name not in _UNREAD]
+        first = ["work", "impulse", "time"] if lift is None else ["work", "impulse", "time", "position"]
 
-        def values(its_cfl: Tensor, work: Tensor, impulse: Tensor, began: Tensor, *fields: Tensor) -> list[Tensor]:
-            found = dict(zip(names, fields, strict=True))
+        def values(its_cfl: Tensor, *fields: Tensor) -> list[Tensor]:
+            found = dict(zip(names, fields[len(first) :], strict=True))
             end = state.replace(**found, F_elastic=found["F_total"])
-            start = end.replace(work=work, impulse=impulse, time=began)
-            self._made = measure(solver, end, substeps, its_cfl, None, start, more(end))
+            start = end.replace(**dict(zip(first, fields[: len(first)], strict=True)))
+            self._made = measure(solver, end, substeps, its_cfl, None, start, more(end), lift)
             return [self._made.values]
 
-        given = [getattr(state, name) for name in names]
+        given = [*(getattr(before, name) for name in first), *(getattr(state, name) for name in names)]
         key = (solver.identity, *same)
-        (found,) = self.replayed(key, values, cfl, before.work, before.impulse, before.time, *given)
+        (found,) = self.replayed(key, values, cfl, *given)
         assert self._made is not None
         return self._made.again(substeps, found)
 

@@ -13,7 +13,7 @@ from gaussian_swaying.gaussians.export import export_cloud
 from gaussian_swaying.gaussians.model import DeformedGaussians
 from gaussian_swaying.mpm.state import State
 from gaussian_swaying.rendering.protocol import RenderOutput
-from gaussian_swaying.simulation.diagnostics import FrameDiagnostics, diagnose
+from gaussian_swaying.simulation.diagnostics import FrameDiagnostics
 from gaussian_swaying.simulation.edits import SceneEditor
 from gaussian_swaying.simulation.painter import Painter
 from gaussian_swaying.simulation.stepper import Launched
@@ -129,7 +129,7 @@ def frames_from(
                         "one loop before the next, or make a Simulation for each."
                     )
                 if index == 0:
-                    health = diagnose(stepper.solver, state, 0, 0.0)
+                    health = stepper.at_first(state).read()
                 else:
                     if launched is None and stepper.progress is not None:
                         stepper.progress.begin(index)

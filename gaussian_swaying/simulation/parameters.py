@@ -557,6 +557,7 @@ _ONE_LAYER: dict[str, Any] = {"open": True, "batched": True, "same_points": Fals
 register("material.thickness", _thickness, write=_write_material, unit="m", **_SIZE, **_ONE_LAYER)
 for _name, _low in (("C_D", 0.0), ("C_F", 0.0), ("C_L", -math.inf)):
     register(f"aero.{_name}", _of_aero(_name), write=_write_aero, low=_low, scale="log", differentiable=True)
+register("aero.added_mass", _of_aero("added_mass"), write=_write_aero, unit="m", **_SIZE)
 register(
     "solver.gravity", lambda setup: list(_of_solver("gravity")(setup)), write=_write_solver, unit="m/s²", kind="vector"
 )

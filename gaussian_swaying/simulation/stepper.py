@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import operator
 import weakref
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
@@ -13,6 +14,7 @@ from torch import Tensor
 
 from gaussian_swaying._devices import double_home, in_double
 from gaussian_swaying._turns import Turn, in_turn
+from gaussian_swaying.aero.added_mass import AirLift, carried_mass, with_added_mass
 from gaussian_swaying.aero.computed_air import AirInBox
 from gaussian_swaying.aero.patches import Patches
 from gaussian_swaying.aero.shelter import Shelter
@@ -71,6 +73,7 @@ class Stepper:
         setup: Scene, material and drivers; those of the first scene of a batch, without the places of copies.
         setups: The setups of all scenes now; :meth:`take` changes them.
         starts: How often it was started.
+        lift: Takes the weight of carried air off the points (``aero.added_mass``); None if there is none.
         progress: Shows how far a frame is, if there is one.
         most_substeps: A frame that needs more ends the run.
 
@@ -102,6 +105,9 @@ class Stepper:
         self._wind_force: tuple[tuple[object, ...], WindForce] | None = None
         self._idle: tuple[tuple[object, ...], bool] | None = None
         self._joints: tuple[tuple[object, ...], Joints] | None = None
+        self._materials: dict[tuple[int, int, float], tuple[MaterialPoints, Tensor, MaterialPoints]] = {}
+        self._bound: tuple[MaterialPoints, ...] = ()
+        self.lift: AirLift | None = None
         self._air: AirInBox | None = None
         self._tearing: TearingGauge | None = None
         self._gauge = Gauge()
@@ -134,11 +140,30 @@ class Stepper:
         return self._wind_force[1]
 
     @property
+    def materials(self) -> tuple[MaterialPoints, ...]:
+        """The material of each scene as the solver gets it: that of its setup, with the air that it carries."""
+        known, self._materials, found = self._materials, {}, []
+        for setup in self.setups:
+            points, patches, aero = setup.points, setup.scene.patches, setup.aero
+            if aero.carried == 0:
+                found.append(points)
+                continue
+            key = (id(points), id(patches.area), aero.carried)  # both are kept, so no new object gets their numbers
+            entry = known.get(key) or self._materials.get(key)
+            if entry is None:
+                with torch.inference_mode(False), torch.enable_grad():  # it outlives the call
+                    entry = points, patches.area, with_added_mass(points, patches, aero)
+            self._materials[key] = entry
+            found.append(entry[2])
+        return tuple(found)
+
+    @property
     def joints(self) -> list[Force]:
         """The force of the joints between parts, if there are any; made again for another material."""
-        joints, key = self.scene.joints, tuple(setup.points for setup in self.setups)
+        joints = self.scene.joints
         if not joints:
             return []
+        key = self.materials
         if self._joints is None or any(a is not b for a, b in zip(self._joints[0], key, strict=True)):
             with torch.inference_mode(False), torch.no_grad():  # it outlives the call
                 longest = min(float(stable_limit(points, self.solver.dx).amin()) for points in key)
@@ -161,9 +186,9 @@ class Stepper:
     def forces(self) -> list[Force]:
         """The forces on the particles besides gravity: the wind, unless it has no effect, joints and custom forces.
 
-        The force of computed air is not among them; :meth:`roll` adds it.
+        The lift of carried air is one of them. The force of computed air is not among them; :meth:`roll` adds it.
         """
-        custom = [*self.joints, *self.setup.forces]
+        custom = [*([] if self.lift is None else [self.lift]), *self.joints, *self.setup.forces]
         return custom if self.idle or self.setup.air is not None else [self.wind_force, *custom]
 
     @property
@@ -269,10 +294,15 @@ class Stepper:
 
     def bind(self) -> State:
         """Bind the solver to the material; returns the state at rest."""
-        scene, points = self.scene, self.setup.points
-        if self.batched:
-            points = MaterialPoints.stack([setup.points for setup in self.setups])
+        scene, self._bound = self.scene, self.materials
+        points = MaterialPoints.stack(self._bound) if self.batched else self._bound[0]
         state: State = self.solver.init_state(points, frame=scene.frame, surface=scene.surface_places)
+        self.lift = None
+        if any(setup.aero.carried for setup in self.setups) and any(self.solver.gravity):
+            with torch.inference_mode(False), torch.no_grad():  # it outlives the call
+                air = [carried_mass(setup.scene.patches, setup.aero) for setup in self.setups]
+                mass = torch.stack(air) if self.batched else air[0]
+                self.lift = AirLift(mass.to(points.mass), self.solver.gravity)
         return state
 
     def _check_rounding(self, state: State, dt: float) -> None:
@@ -306,7 +336,8 @@ class Stepper:
         before, self.setup, self.setups = self.setup, setup, self._spread(setup)
         if setup.solver is not before.solver:
             self.solver.settings = setup.solver
-        if state is None or (setup.points is before.points and setup.solver is before.solver):
+        kept = len(self._bound) == len(self.setups) and all(map(operator.is_, self._bound, self.materials))
+        if state is None or (kept and setup.solver is before.solver):
             return state
         start = self.bind().internal
         if start is not None and state.internal is not None and changed is not None:
@@ -378,9 +409,13 @@ class Stepper:
             return needs_of(self, at, None if idle else self._winds(self.wind_force.foreseen(at), at))
 
         if not ahead:
-            return measure(self.solver, end, steps, courant, self._tearing, state)
+            return measure(self.solver, end, steps, courant, self._tearing, state, lift=self.lift)
         same = None if parts is None else (idle, self.frame_dt, parts)
-        return self._gauge(self.solver, end, steps, courant, state, needs, same)
+        return self._gauge(self.solver, end, steps, courant, state, needs, same, self.lift)
+
+    def at_first(self, state: State) -> Measurement:
+        """Start measuring a state, such as the first, without a frame that led to it."""
+        return measure(self.solver, state, 0, 0.0, lift=self.lift)
 
     def give_up(self, state: State, cause: str, remedy: str | None = None) -> NoReturn:
         """Raise SimulationDiverged, naming the particle with the largest deformation."""

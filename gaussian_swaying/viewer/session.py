@@ -17,7 +17,7 @@ from gaussian_swaying.config.parser import config_text
 from gaussian_swaying.mpm.state import State
 from gaussian_swaying.rendering.gsplat_renderer import make_renderer
 from gaussian_swaying.rendering.thinning import DETAIL
-from gaussian_swaying.simulation.diagnostics import FrameDiagnostics, SimulationDiverged, diagnose
+from gaussian_swaying.simulation.diagnostics import FrameDiagnostics, SimulationDiverged
 from gaussian_swaying.simulation.simulation import Simulation
 from gaussian_swaying.viewer.changes import changed_settings, take
 from gaussian_swaying.viewer.pull import Pull
@@ -363,7 +363,7 @@ class Session:
         self._broken, self.problem, self._anchor = False, None, None
         self._steps.clear()
         self._motion += 1
-        self._publish(state, diagnose(self.simulation.solver, state, 0, 0.0))
+        self._publish(state, self.simulation.stepper.at_first(state).read())
 
     def _reset(self) -> None:
         self._begin(self.simulation.start())

@@ -5,7 +5,7 @@ import math
 import pytest
 import torch
 
-from gaussian_swaying.aero.force import LAWS, AeroForce, aero_force, capped_area, drag_rate
+from gaussian_swaying.aero.force import LAWS, AeroForce, added_mass_per_area, aero_force, capped_area, drag_rate
 
 RHO = 1.225
 
@@ -227,6 +227,9 @@ def test_drag_rate_is_the_slope_of_the_force():
         ({"C_D": -0.1}, "`C_D` to not be negative"),
         ({"air_density": -1.0}, "`air_density` to not be negative"),
         ({"C_L": float("nan")}, "`C_L` to be finite"),
+        ({"added_mass": -0.1}, "`added_mass` to not be negative"),
+        ({"added_mass": float("nan")}, "`added_mass` to not be negative"),
+        ({"added_mass": float("inf")}, "`added_mass` to not be negative and finite"),
         ({"max_area_ratio": 0.0}, "`max_area_ratio` to be positive, or null"),
         ({"max_area_ratio": -1.0}, "`max_area_ratio` to be positive, or null"),
         ({"max_area_ratio": float("nan")}, "`max_area_ratio` to be positive, or null"),
@@ -235,6 +238,15 @@ def test_drag_rate_is_the_slope_of_the_force():
 def test_bad_settings_are_refused(arguments, message):
     with pytest.raises(ValueError, match=message):
         AeroForce(**arguments)
+
+
+def test_a_plate_carries_the_air_of_a_cylinder_of_its_breadth():
+    """Lamb: rho pi (b / 2)² for a length of the plate, which has an area of b."""
+    for breadth in (0.05, 1.0, 3.0):
+        assert added_mass_per_area(breadth, RHO) * breadth == pytest.approx(RHO * math.pi * (breadth / 2) ** 2)
+    assert math.sqrt(0.2 / (0.2 + added_mass_per_area(1.0, 1.225))) == pytest.approx(0.415, abs=5e-4)
+    assert AeroForce(added_mass=2.0, air_density=RHO).carried == added_mass_per_area(2.0, RHO)
+    assert AeroForce().carried == AeroForce(added_mass=2.0, air_density=0.0).carried == 0.0
 
 
 def test_the_area_in_the_wind_is_capped():

@@ -41,6 +41,14 @@ def test_the_motion_is_that_of_the_scene_in_its_own_length(tmp_path, values):
     assert (moved(small, values) - real).abs().max() > 0.01
 
 
+def test_the_breadth_of_the_air_that_is_carried_is_in_metres(tmp_path):
+    aero = {"C_D": 0.1, "C_F": 0.3, "added_mass": 0.4}
+    small, large = made(tmp_path, 1.0, aero=aero), made(tmp_path, 1.7, aero=aero)
+    real = moved(large, {})
+    torch.testing.assert_close(moved(small, {SCALE: 1.7}), real, rtol=1e-3, atol=1e-5)
+    assert (moved(small, {SCALE: 1.7, "aero.added_mass": 0.0}) - real).abs().max() > 0.01
+
+
 def test_a_filled_body_keeps_its_density(tmp_path):
     """A post of foam, bent by the wind and its weight."""
     found = []

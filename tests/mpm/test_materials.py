@@ -1,32 +1,14 @@
-"""Materials by name: their table, and the one of the docs."""
+"""Materials by name; tests/tools/test_pages.py compares the table of the docs."""
 
 import math
-from pathlib import Path
 
 import pytest
 
 from gaussian_swaying.mpm.materials import MATERIALS, known_material, name_of
 
-DOCS = Path(__file__).resolve().parents[2] / "docs" / "configuration.md"
-NAMES = ["cotton", "silk", "denim", "canvas", "leather", "rubber", "paper", "grass", "leaf", "twig", "wood"]
-
-
-def rows():
-    """The table of the docs, as the code gives it."""
-    lines = [
-        "| name | `E` [Pa] | `nu` | `density` [kg/m³] | `thickness` [mm] | mass [kg/m²] | `solver.damping` [1/s] "
-        "| waves [m/s] | read in a source |",
-        "|---|---|---|---|---|---|---|---|---|",
-    ]
-    for name, m in MATERIALS.items():
-        numbers = (f"{m.E:.1e}", m.nu, f"{m.density:g}", f"{1e3 * m.thickness:g}", f"{m.density * m.thickness:.2g}")
-        cells = (f"`{name}`", *numbers, f"{m.damping:g}", f"{m.wave_speed:.0f}", m.source or "-")
-        lines.append(f"| {' | '.join(map(str, cells))} |")
-    return lines
-
-
-def test_the_docs_have_the_table_of_the_code():
-    assert "\n".join(rows()) in DOCS.read_text()
+CLOTHS = ["cotton", "silk", "denim", "canvas", "fabric", "clothes"]
+PLANTS = ["grass", "leaf", "succulent", "stem", "twig", "bark"]
+NAMES = [*CLOTHS, "leather", "rubber", "paper", "cardboard", *PLANTS, "wood", "metal", "stone"]
 
 
 def test_all_are_there_and_told_apart():
@@ -48,6 +30,27 @@ def test_numbers_are_those_of_their_sources():
     assert math.isclose(canvas.density * canvas.thickness, 10 * 0.0283495 / 0.9144**2, rel_tol=0.01)
     assert math.isclose(silk.density * silk.thickness, 12 * 4.34e-3, rel_tol=0.01)
     assert 0.7e9 <= known_material("twig").E <= 4.6e9
+    succulent = known_material("succulent")
+    assert 0.9 < succulent.density * succulent.thickness < 10
+
+
+def test_the_kinds_of_thing_have_the_mass_and_stiffness_of_their_sizes():
+    """kg/m² of sheets; the bending stiffness of corrugated board, 5 to 15 N m; green wood is heavier than dry wood."""
+    for name, low, high in (
+        ("leaf", 0.15, 0.3),
+        ("fabric", 0.1, 0.35),
+        ("clothes", 0.14, 0.35),
+        ("cardboard", 0.4, 0.6),
+    ):
+        known = known_material(name)
+        assert low <= known.density * known.thickness <= high
+    leaf, board = known_material("leaf"), known_material("cardboard")
+    assert math.isclose(leaf.density * leaf.thickness, 0.2)
+    assert 5 <= board.E * board.thickness**3 / (12 * (1 - board.nu**2)) <= 15
+    assert 900 <= known_material("stem").density <= 1000
+    assert 1e8 <= known_material("stem").E <= 1e9
+    stiffness = [known_material(name).E for name in ("succulent", "leaf", "stem", "twig", "wood", "stone", "metal")]
+    assert stiffness == sorted(stiffness)
 
 
 def test_damping_is_that_of_a_sway_at_1_hz():

@@ -14,6 +14,7 @@ ROOT = Path(__file__).parents[2]
 DOCS = ROOT / "docs"
 NAMES = (
     "benchmarks.md",
+    "configuration.md",
     "contact.md",
     "fit.md",
     "flag_benchmark.md",

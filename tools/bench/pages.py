@@ -17,6 +17,7 @@ from bench.tables import (  # noqa: F401  each registers its slots
     fit,
     flag_benchmark,
     goals,
+    materials,
     measured,
     nature,
     others,

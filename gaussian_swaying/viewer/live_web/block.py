@@ -68,6 +68,8 @@ def check(simulation: Simulation) -> None:
         raise _refused("joints of `scene.parts`", "leave out `joint_stiffness` and `joint_turning` of its parts")
     if setup.points.bending is not None:
         raise _refused("`material.bending` of a sheet of one layer", "set `scene.layers` to 3")
+    if setup.aero.carried:
+        raise _refused("the air that the material carries", "set `aero.added_mass` to 0")
     if setup.air is not None:
         raise _refused("computed air", "set `air` to null")
     if setup.forces:

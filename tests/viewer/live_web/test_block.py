@@ -200,6 +200,7 @@ REFUSED = {
     "copies": {"copies": [{"shift": [0, 0, 0]}, {"shift": [0, 2, 0]}]},
     "edits": {"edits": [{"time": 1.0, "E": 1e4}]},
     "material.bending": {"material": {"bending": "plate"}},
+    "aero.added_mass": {"aero": {"added_mass": 0.5}},
     "forces": {"forces": [{"class_path": f"{__name__}.Lift"}]},
     "wind.effects": {"wind": {"effects": [{"class_path": "gaussian_swaying.aero.effects.PowerProfile"}]}},
     "start": {"solver": {"boundaries": [{"class_path": "PinnedRegion", "init_args": {"region": SIDE, "end": 1.0}}]}},

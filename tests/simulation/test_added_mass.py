@@ -1,0 +1,228 @@
+"""Air that a sheet carries along: inertia without weight in everything that a stepper does.
+
+Covers: aero.added_mass.
+"""
+
+import math
+from dataclasses import replace
+
+import pytest
+import torch
+
+from gaussian_swaying.aero.added_mass import AirLift
+from gaussian_swaying.aero.force import AeroForce, added_mass_per_area
+from gaussian_swaying.aero.wind import WindField
+from gaussian_swaying.geometry.regions import Box
+from gaussian_swaying.mpm.boundaries.pinned_region import PinnedRegion
+from gaussian_swaying.simulation.batch import batch_of
+from gaussian_swaying.simulation.edits import Edit
+from gaussian_swaying.simulation.material import Material
+
+BREADTH, SHEET = 1.0, 0.3  # m, kg/m²
+SLOWER = math.sqrt(SHEET / (SHEET + added_mass_per_area(BREADTH, 1.225)))
+STIFF = Material(E=2e4, density=30.0, thickness=0.01)
+
+
+def air(breadth=BREADTH, drag=0.0, **settings):
+    return AeroForce(drag, drag, C_L=0.0, added_mass=breadth, **settings)
+
+
+def run(simulation, frames, state=None):
+    """The states and the diagnostics of some frames."""
+    state = simulation.start() if state is None else state
+    states, log = [state], []
+    for _ in range(frames):
+        state, health = simulation.advance(state)
+        states.append(state)
+        log.append(health)
+    return states, log
+
+
+@pytest.fixture
+def hanging(make_simulation):
+    """A sheet that hangs from its upper edge; gravity is slanted, so that it starts to swing."""
+
+    def make(aero, **settings):
+        top = PinnedRegion(Box([None, None, 0.69], [None, None, None]))
+        given = {"gravity": (0.0, 0.5, -9.8), "dtype": torch.float64, "material": STIFF, "wind": WindField()}
+        return make_simulation(aero=aero, pinned=False, boundaries=[top], **(given | settings))
+
+    return make
+
+
+@pytest.mark.parametrize("formulation", ["total", "updated"])
+def test_still_air_slows_a_hanging_sheet(formulation, hanging):
+    """All forces are the same, so the motion is that without air, in slower time: by sqrt(sigma / (sigma + m))."""
+    without = hanging(air(0.0), formulation=formulation)
+    carrying = hanging(air(), formulation=formulation, frame_dt=0.04 / SLOWER)
+    slow, fast = (run(simulation, 15)[0][-1].position for simulation in (carrying, without))
+    assert float((fast - without.setup.points.position).abs().amax()) > 0.02
+    torch.testing.assert_close(slow, fast, rtol=0, atol=1e-9)
+
+
+def test_its_frequency_is_that_of_the_plate_with_its_air(hanging):
+    """From the time of the first turn of the swing, with the same frames; 2 %."""
+
+    def turn(aero):
+        states, _ = run(hanging(aero, frame_dt=0.02), 90)
+        swing = torch.stack([state.position[:, 1].mean() for state in states])
+        k = int((swing[1:-1] > torch.maximum(swing[:-2], swing[2:])).nonzero()[0]) + 1
+        before, at, after = swing[k - 1 : k + 2].tolist()
+        return 0.02 * (k + 0.5 * (before - after) / (before - 2 * at + after))
+
+    assert turn(air(0.0)) / turn(air()) == pytest.approx(SLOWER, rel=0.02)
+
+
+@pytest.mark.parametrize("transfer", ["torch", "kernels"])
+@pytest.mark.parametrize("formulation", ["total", "updated"])
+def test_a_sheet_falls_slower_as_it_has_to_move_air(formulation, transfer, make_simulation):
+    """By g sigma / (sigma + m)."""
+    simulation = make_simulation(
+        aero=air(), material=STIFF, wind=WindField(), pinned=False, formulation=formulation, transfer=transfer
+    )
+    states, _ = run(simulation, 5)
+    speed = -float(states[-1].velocity[:, 2].mean())
+    assert speed == pytest.approx(9.8 * SLOWER**2 * 0.2, rel=1e-4)
+    assert simulation.stepper.idle  # no wind, but air
+
+
+def test_energy_is_kept_in_still_air_without_drag(hanging):
+    """Kinetic energy is with the air, potential energy without: both are those of the sheet without air at its time."""
+    without, carrying = hanging(air(0.0), cfl=0.1), hanging(air(), cfl=0.1, frame_dt=0.04 / SLOWER)
+    logs = []
+    for simulation in (without, carrying):
+        first = simulation.stepper.at_first(simulation.start()).read()
+        logs.append([first, *run(simulation, 25)[1]])
+    mass, position = without.setup.points.mass, without.setup.points.position
+    weight = mass[:, None] * torch.tensor([0.0, 0.5, -9.8], dtype=torch.float64)
+    assert logs[1][0].potential == pytest.approx(-float((weight * position).sum()))
+    for name in ("kinetic", "elastic", "potential"):
+        ours, theirs = ([getattr(health, name) for health in log] for log in logs)
+        assert ours == pytest.approx(theirs, abs=1e-9)
+    total = [health.kinetic + health.elastic + health.potential for health in logs[1]]
+    assert max(abs(energy - total[0]) for energy in total) < 0.02 * max(health.kinetic for health in logs[1])
+
+
+def test_the_air_that_is_lifted_is_no_work_of_the_wind(hanging):
+    """To first order in the substep, as forces act between the times of the positions; the sum does not grow."""
+    worst = []
+    for cfl in (0.1, 0.05):
+        _, log = run(hanging(air(), cfl=cfl), 25)
+        worst.append(max(abs(sum(health.wind_work for health in log[:k])) for k in range(1, 26)))
+        assert worst[-1] < 0.1 * max(health.kinetic for health in log)
+    assert worst[1] < 0.6 * worst[0]
+
+
+@pytest.mark.parametrize("formulation", ["total", "updated"])
+def test_kernels_and_torch_agree(formulation, hanging):
+    """In float64, with wind and gravity."""
+    ends = []
+    for transfer in ("torch", "kernels"):
+        wind = WindField([1.0, 5.0, 0.0])
+        simulation = hanging(air(drag=0.5), wind=wind, transfer=transfer, formulation=formulation)
+        states, log = run(simulation, 5)
+        ends.append((states[-1].position, log[-1]))
+    torch.testing.assert_close(ends[0][0], ends[1][0], rtol=0, atol=1e-10)
+    for name in ("kinetic", "potential", "wind_work"):
+        assert getattr(ends[0][1], name) == pytest.approx(getattr(ends[1][1], name), rel=1e-7)
+
+
+def test_a_batch_is_as_each_alone(hanging):
+    """Of two densities, in other winds."""
+    first = hanging(air(drag=0.5), wind=WindField([1.0, 4.0, 0.0]), substep=0.004)
+    other = first.variant({"material.density": 50.0, "wind.speed": 2.0})
+    batch = batch_of([first, other])
+    state = batch.start()
+    for _ in range(3):
+        state, health = batch.advance(state)
+    assert health.potential == pytest.approx(sum(run(one, 3)[1][-1].potential for one in (first, other)))
+    for k, one in enumerate((first, other)):
+        torch.testing.assert_close(state.scene(k).position, run(one, 3)[0][-1].position, rtol=0, atol=1e-10)
+
+
+def test_a_changed_breadth_binds_again_and_another_coefficient_does_not(hanging):
+    simulation = hanging(air())
+    state = simulation.start()
+    stepper, points = simulation.stepper, simulation.setup.points
+    area = simulation.scene.patches.areas()
+
+    def carried():
+        assert simulation.setup.points.mass is points.mass  # the material itself
+        return (simulation.solver.points.mass - points.mass) / area
+
+    torch.testing.assert_close(carried(), torch.full_like(area, added_mass_per_area(BREADTH, 1.225)))
+    bound = simulation.solver.identity
+    state = simulation.change(state, {"aero.C_D": 0.3})
+    assert simulation.solver.identity is bound
+    state = simulation.change(state, {"aero.added_mass": 0.5})
+    torch.testing.assert_close(carried(), torch.full_like(area, added_mass_per_area(0.5, 1.225)))
+    torch.testing.assert_close(
+        stepper.lift.force[:, 2], 9.8 * area * added_mass_per_area(0.5, 1.225), rtol=1e-12, atol=0
+    )
+    state = simulation.adopt(replace(simulation.setup, aero=air(0.5, drag=0.3, air_density=2.0)), state)
+    torch.testing.assert_close(carried(), torch.full_like(area, added_mass_per_area(0.5, 2.0)))
+    state = simulation.change(state, {"solver.gravity": [0.0, 0.0, 0.0]})
+    assert stepper.lift is None
+    assert stepper.forces == [stepper.wind_force]  # C_D is not zero any more
+    state = simulation.change(state, {"aero.added_mass": 0.0})
+    assert simulation.solver.points is simulation.setup.points
+    assert torch.isfinite(simulation.advance(state)[0].position).all()
+
+
+def test_an_edit_keeps_the_air(hanging):
+    simulation = hanging(air())
+    state = simulation.edit(simulation.start(), Edit(density=60.0))
+    expected = simulation.setup.points.mass + added_mass_per_area(BREADTH, 1.225) * simulation.scene.patches.areas()
+    torch.testing.assert_close(simulation.solver.points.mass, expected)
+    assert torch.isfinite(simulation.advance(state)[0].position).all()
+
+
+def test_gradients_by_the_density_pass(hanging):
+    """Compared with the difference of two runs."""
+
+    def end(density):
+        simulation = hanging(air(), material=STIFF, substep=0.004)
+        state = simulation.change(simulation.start(), {"material.density": density})
+        return simulation.advance(state)[0].position[:, 1].mean()
+
+    density = torch.tensor(30.0, dtype=torch.float64, requires_grad=True)
+    (slope,) = torch.autograd.grad(end(density), density)
+    assert float(slope) == pytest.approx(float(end(30.1) - end(29.9)) / 0.2, rel=1e-3)
+
+
+def test_without_gravity_no_force_is_added(hanging):
+    simulation = hanging(air(), gravity=(0.0, 0.0, 0.0))
+    simulation.start()
+    assert simulation.forces == []
+
+
+def test_the_lift_is_the_weight_of_the_air(hanging):
+    simulation = hanging(air())
+    state = simulation.start()
+    (lift,) = simulation.forces
+    assert isinstance(lift, AirLift)
+    mass = simulation.solver.points.mass - simulation.setup.points.mass
+    expected = mass[:, None] * torch.tensor([0.0, -0.5, 9.8], dtype=torch.float64)
+    torch.testing.assert_close(lift(state), expected, rtol=1e-9, atol=1e-12)
+    assert float(lift.potential(state)) == pytest.approx(-float((expected * state.position).sum()))
+
+
+@pytest.mark.gpu
+@pytest.mark.parametrize("formulation", ["total", "updated"])
+def test_a_gpu_does_the_same_with_recorded_frames(formulation, hanging):
+    """In float32, with another breadth from the third frame on."""
+    if not torch.cuda.is_available():
+        pytest.skip("needs a CUDA device")
+    found = []
+    for device in ("cpu", "cuda"):
+        settings = {"formulation": formulation, "dtype": torch.float32, "wind": WindField([1.0, 5.0, 0.0])}
+        simulation = hanging(air(drag=0.5), **settings).to(device)
+        states, log = run(simulation, 3)
+        state = simulation.change(states[-1], {"aero.added_mass": 0.3})
+        states, more = run(simulation, 4, state)
+        found.append((states[-1].position.cpu(), [*log, *more]))
+    torch.testing.assert_close(found[0][0], found[1][0], rtol=0, atol=1e-4)
+    largest = max(health.kinetic for health in found[0][1])
+    for name in ("kinetic", "potential", "wind_work"):
+        ours, theirs = ([getattr(health, name) for health in log] for _, log in found)
+        assert ours == pytest.approx(theirs, abs=0.01 * largest)
