@@ -94,6 +94,7 @@ class CarriedField(WindEffect):
         self.register_buffer("place", torch.tensor(self.origin, dtype=torch.float64), persistent=False)
         found = torch.tensor(check_vector("anchor", anchor), dtype=torch.float64)
         self.register_buffer("anchor", found, persistent=False)
+        self.register_buffer("start", torch.zeros(3, dtype=torch.float64), persistent=False)
         self.register_buffer("repeats", torch.tensor(wraps), persistent=False)
         self.table: Tensor
         self.axes: Tensor
@@ -101,6 +102,7 @@ class CarriedField(WindEffect):
         self.step: Tensor
         self.place: Tensor
         self.anchor: Tensor
+        self.start: Tensor
         self.repeats: Tensor
 
     def along(self, flow: Tensor) -> None:
@@ -119,7 +121,7 @@ class CarriedField(WindEffect):
 
         It is reduced to the first period along the axes that repeat, so that float32 is precise enough.
         """
-        place = self.anchor - (self.place + carried) @ self.axes.T
+        place = self.anchor - (self.place + self.start + carried) @ self.axes.T
         return torch.where(self.repeats.to(place.device), place.remainder(self.sides), place) / self.step
 
     def strength(self, flow: Tensor) -> Tensor | float:
@@ -175,6 +177,7 @@ class Turbulence(CarriedField):
         cells: Cells of the box along the wind, across and up.
         spacing: Side of a cell [m]; a sixteenth of ``length`` if null.
         seed: Another seed is another turbulence.
+        start: How far the air has come when the run begins [m], z up: another stretch of the same turbulence.
 
     Example:
         >>> gusts = Turbulence(intensity=0.2, length=1.0, cells=[32, 16, 16], spacing=0.25)
@@ -194,6 +197,7 @@ class Turbulence(CarriedField):
         cells: Sequence[int] = (256, 128, 128),
         spacing: float | None = None,
         seed: int = 0,
+        start: Sequence[float] = (0.0, 0.0, 0.0),
     ) -> None:
         check_positive("intensity", intensity, allow_zero=True)
         check_positive("length", length)
@@ -205,6 +209,7 @@ class Turbulence(CarriedField):
         relative = 1 / math.sqrt(sheared_variances(float(gamma))[0])  # the component along the wind has the intensity
         # Mann's box has a direction, and so has one whose repetition is avoided by a turn
         super().__init__(table, [side] * 3, scale=float(intensity) * relative, tilted=gamma == 0)
+        self.start = torch.tensor(check_vector("start", start), dtype=torch.float64)
         self.intensity, self.length, self.spectrum, self.gamma = float(intensity), float(length), spectrum, float(gamma)
 
     @property

@@ -16,6 +16,8 @@ from typing import Any
 from gaussian_swaying import _program as program
 from gaussian_swaying._checks import check_positive
 from gaussian_swaying._yaml_limits import check_config_files
+from gaussian_swaying.aero.looks import LOOKS
+from gaussian_swaying.aero.wind import WindField
 from gaussian_swaying.cli.errors import guessing, parser_sentence, run_command
 from gaussian_swaying.cli.shipped import with_shipped
 from gaussian_swaying.config.material_names import NAMES
@@ -23,11 +25,6 @@ from gaussian_swaying.config.parser import parse_text
 from gaussian_swaying.gaussians.cloud import GaussianCloud
 from gaussian_swaying.gaussians.formats import read_gaussians
 from gaussian_swaying.preview.apart import why_apart
-from gaussian_swaying.preview.calibration import (
-    SWAY,
-    calibrated_suggestion,
-    check_sway,
-)
 from gaussian_swaying.preview.cost import (
     Cost,
     Stopwatch,
@@ -36,6 +33,8 @@ from gaussian_swaying.preview.cost import (
     scaled_seconds,
     with_whole,
 )
+from gaussian_swaying.preview.kinds import KINDS
+from gaussian_swaying.preview.natural import Natural, natural
 from gaussian_swaying.preview.photos import captured_from
 from gaussian_swaying.preview.picture import preview_picture, things_picture
 from gaussian_swaying.preview.place import Place, excerpt, near_things, survey
@@ -56,7 +55,7 @@ from gaussian_swaying.preview.report import (
 )
 from gaussian_swaying.preview.results import Preview, splat_name, write
 from gaussian_swaying.preview.shape import DIRECTIONS, bounds
-from gaussian_swaying.preview.starter import draft_yaml, starter_yaml
+from gaussian_swaying.preview.starter import starter_yaml
 from gaussian_swaying.preview.suggest import (
     QUALITIES,
     Suggestion,
@@ -65,6 +64,7 @@ from gaussian_swaying.preview.suggest import (
     gaussian_statistics,
     of_material,
     suggest,
+    with_natural,
 )
 from gaussian_swaying.simulation.progress import duration
 from gaussian_swaying.simulation.roles import classify
@@ -99,15 +99,10 @@ def build_options() -> argparse.ArgumentParser:
     add("--hold", metavar="END", help="end that is held: top, bottom, none, +x, -x, ... or -z, instead of a guess")
     add("--region", nargs=6, type=float, metavar="V", help="box to simulate: lower and upper corner [scene units]")
     add("--move", metavar="N[,M]", help="things of a place that move, by their numbers; default: the likeliest one")
-    add("--longest-side", type=float, default=1.0, metavar="M", help="length of the longest side of the object [m]")
-    add("--wind", type=float, default=6.0, metavar="M/S", help="speed of the wind in the configuration [m/s]")
-    add(
-        "--sway",
-        type=float,
-        default=SWAY,
-        metavar="SHARE",
-        help="largest displacement in that wind, as a share of the longest side; stiffness and thickness follow",
-    )
+    add("--longest-side", type=float, metavar="M", help="length of the longest side [m]; default: usual for its kind")
+    add("--look", default="breeze", choices=tuple(LOOKS), help="mean speed and turbulence of the wind (default: breeze)")
+    add("--wind", type=float, metavar="M/S", help="mean speed of the wind [m/s], instead of that of the look")
+    add("--kind", choices=tuple(KINDS), help="what it is, which decides frequency, mass and damping; default: a guess")
     add(
         "--connected",
         default="auto",
@@ -115,7 +110,7 @@ def build_options() -> argparse.ArgumentParser:
         help="what shares nodes of the grid: with surface, leaves closer than a cell move apart; auto: for a plant "
         "with such leaves",
     )
-    add("--material", metavar="NAME", help=f"its numbers, instead of softer ones: {NAMES}")
+    add("--material", metavar="NAME", help=f"the numbers of a material, instead of those of its kind: {NAMES}")
     add("--frames", type=int, default=250, help="frames of the configuration")
     add("--quality", metavar="Q", help=f"grid of the starter: {', '.join(QUALITIES)}; default: normal")
     add("--minutes", type=float, metavar="N", help="instead: the finest grid whose run takes at most this long here")
@@ -138,7 +133,6 @@ def preview_scene(options: argparse.Namespace, folder: Path) -> Preview:
         ValueError: If the splat or an option is bad, or the configuration does not run.
         FileNotFoundError: If there is no such splat.
     """
-    check_sway(options.sway)
     path = Path(options.scene).resolve()  # as in the YAML, so that it warns once
     reading = Stopwatch()
     large = path.is_file() and path.stat().st_size > LARGE
@@ -161,64 +155,59 @@ def preview_scene(options: argparse.Namespace, folder: Path) -> Preview:
     if place is not None:
         part, upward, around = excerpt(place, cloud, chosen)
         found = upward, around
-    suggestion = suggest(part, up, options.hold, region, options.longest_side, options.wind, capture, quality, found)
-    wanted = options.connected
-    if wanted == "auto":
-        wanted = "surface" if suggestion.material == "leaf" else "grid"
+    suggestion = suggest(
+        part, up, options.hold, region, options.longest_side, options.wind, capture, quality, found, options.look,
+        options.kind,
+    )  # fmt: skip
     if options.material is not None:
         suggestion = of_material(suggestion, options.material)
+    leafy = KINDS[suggestion.kind].material in ("leaf", "grass", "succulent")
+    wanted = ("surface" if leafy else "grid") if options.connected == "auto" else options.connected
     suggestion = replace(suggestion, connected=wanted)
     begin = Stopwatch()
-    draft, settings = _tried(suggestion, lambda made: draft_yaml(made, options.scene), options.device, part)
+    made: dict[float, tuple[Suggestion, Simulation, Any]] = {}  # the starter with several grids
+
+    def make(suggestion: Suggestion) -> None:
+        made[suggestion.dx] = _natural(suggestion, options, part)
+
+    make(suggestion)
     startup = LOADED + read + begin.quiet
     if options.connected == "auto" and wanted == "surface":
-        why = why_apart(draft.scene, suggestion.dx, classify(draft).pinned)
+        simulation = made[suggestion.dx][1]
+        why = why_apart(simulation.scene, suggestion.dx, classify(simulation).pinned)
         suggestion = replace(suggestion, connected_reason=why or "", connected="grid" if why is None else "surface")
         if why is None:
-            draft, settings = _tried(suggestion, lambda made: draft_yaml(made, options.scene), options.device, part)
+            make(suggestion)
+        else:
+            first = made[suggestion.dx]
+            made[suggestion.dx] = (replace(first[0], connected_reason=why), *first[1:])
+    settings = made[suggestion.dx][2]
     if settings.scene.ply != str(Path(options.scene).resolve()):
         raise ValueError(f"The path {options.scene!r} has another meaning in YAML: rename the file, without a colon.")
-    suggestion = calibrated_suggestion(suggestion, draft, options.sway)
-
-    def cost_of(simulation: Simulation, frames: int) -> Cost:
-        cost = estimate_cost(simulation, frames, startup, suggestion.growth)
-        return cost if part is cloud else with_whole(cost, simulation, cloud)
-
-    costs = {"draft": cost_of(draft, settings.frames)}
-    made: dict[float, Simulation] = {}  # the starter with several grids
 
     def measure(dx: float) -> Cost:
-        wanted = replace(suggestion, dx=dx)
-        made[dx] = _tried(wanted, lambda made: starter_yaml(made, options.scene, options.frames), options.device, part)[
-            0
-        ]
-        return cost_of(made[dx], options.frames)
+        if dx not in made:
+            make(replace(suggestion, dx=dx))
+        cost = estimate_cost(made[dx][1], options.frames, startup)
+        return cost if part is cloud else with_whole(cost, made[dx][1], cloud)
 
-    costs["starter"] = measure(suggestion.dx)
+    cost = measure(suggestion.dx)
     grids = {name: at_quality(suggestion, name).dx for name in QUALITIES}
+    chosen_quality = suggestion.quality
     if options.minutes is not None:
         wish, finest = 60 * options.minutes, finest_spacing(suggestion)
-        costs["starter"] = finest_within(measure, wish, costs["starter"], costs["draft"], finest, grids["draft"])
-        suggestion = replace(suggestion, dx=costs["starter"].dx, quality=f"--minutes {options.minutes:g}")
-    simulation, looked = made[suggestion.dx], suggestion
+        cost = finest_within(measure, wish, cost, cost, finest, grids["draft"])
+        chosen_quality = f"--minutes {options.minutes:g}"
+    suggestion, simulation, _ = made[cost.dx]
+    suggestion = replace(suggestion, quality=chosen_quality)
     parts = suggestion.parts
     if parts is not None:
-        # stalks thinner than a cell: the grid of a draft makes them too stiff
-        if suggestion.pin is None and suggestion.dx < grids["draft"]:
-            suggestion = calibrated_suggestion(suggestion, simulation, options.sway)
-            costs["starter"] = cost_of(simulation, options.frames)
         if place is not None:
             parts = parts.within(near_things(place, cloud, chosen))
-        parts = replace(parts, path=str((folder / "parts.npz").resolve()))
-        suggestion, looked = replace(suggestion, parts=parts), replace(looked, parts=parts)
-    texts = {
-        "draft": draft_yaml(looked, options.scene),
-        "starter": starter_yaml(suggestion, options.scene, options.frames),
-    }
+        suggestion = replace(suggestion, parts=replace(parts, path=str((folder / "parts.npz").resolve())))
+    text = starter_yaml(suggestion, options.scene, options.frames)
     others = {
-        name: scaled_seconds(costs["starter"], costs["draft"], dx)
-        for name, dx in grids.items()
-        if name != suggestion.quality
+        name: scaled_seconds(cost, cost, dx) for name, dx in grids.items() if name != suggestion.quality
     }
     data: dict[str, Any] = {
         "splat": str(options.scene),
@@ -226,8 +215,7 @@ def preview_scene(options: argparse.Namespace, folder: Path) -> Preview:
         "gaussians": gaussian_statistics(cloud) | ({"sh_degree": None} if large else {}),
         "suggestion": suggestion_dict(suggestion),
         "run": run_dict(simulation),
-        "cost": cost_dict(costs["starter"]),
-        "draft_cost": cost_dict(costs["draft"]),
+        "cost": cost_dict(cost),
         "qualities": {name: {"dx_m": grids[name], "total_seconds": time} for name, time in others.items()},
     }
     report = splat_lines(options.scene, cloud, data)
@@ -242,20 +230,14 @@ def preview_scene(options: argparse.Namespace, folder: Path) -> Preview:
         specks = f"{simulation.scene.loose:,} specks hang on nothing or by a thread"
         report.append(f"  note: {specks}; they follow their nearest neighbours (scene.loose: carry)")
     report += [f"  {line}" for line in doubts(suggestion, options, build_options().parse_args([]))]
-    report += cost_lines(costs["starter"])
-    report += quality_lines(suggestion, costs["starter"], options.minutes, grids, others)
-    output, stem = Path("outputs"), splat_name(options.scene)
-    report.append("")
-    for name, what, where in (
-        ("draft", "a first look", output / f"{stem}_draft"),
-        ("starter", "the starter", output / stem),
-    ):
-        pictures = f"{video_length(texts[name])}, {duration(costs[name].total_seconds)} here"
-        report.append(f"{what} ({pictures}):")
-        report.append(f"  {shlex.join(program.words('sim'))} --config {folder / name}.yaml --output {where}")
+    report += cost_lines(cost)
+    report += quality_lines(suggestion, cost, options.minutes, grids, others)
+    where = Path("outputs") / splat_name(options.scene)
+    report += ["", f"the starter ({video_length(text)}, {duration(cost.total_seconds)} here):"]
+    report.append(f"  {shlex.join(program.words('sim'))} --config {folder / 'starter'}.yaml --output {where}")
     picture = preview_picture(simulation, options.height, whole=suggestion.whole)
     labels = None if suggestion.parts is None else suggestion.parts.parts
-    return Preview("\n".join(report), data, picture, texts, things, labels)
+    return Preview("\n".join(report), data, picture, {"starter": text}, things, labels)
 
 
 def preview_config(options: argparse.Namespace) -> Preview:
@@ -292,6 +274,28 @@ def preview_config(options: argparse.Namespace) -> Preview:
         *cost_lines(cost),
     ]
     return Preview("\n".join(report), data, preview_picture(simulation, options.height), {})
+
+
+def _natural(
+    suggestion: Suggestion, options: argparse.Namespace, cloud: GaussianCloud
+) -> tuple[Suggestion, Simulation, Any]:
+    """The suggestion with the numbers of its kind, its simulation, and the settings."""
+
+    def made(of: Suggestion) -> tuple[Simulation, Any]:
+        return _tried(of, lambda own: starter_yaml(own, options.scene, options.frames), options.device, cloud)
+
+    simulation, settings = made(suggestion)
+    if suggestion.sways:
+        suggestion = with_natural(suggestion, natural_of(suggestion, simulation))
+        if not suggestion.by_modes:
+            simulation, settings = made(suggestion)
+    return suggestion, simulation, settings
+
+
+def natural_of(suggestion: Suggestion, simulation: Simulation) -> Natural:
+    """The numbers of the kind of a suggestion, which its simulation gets."""
+    assert isinstance(simulation.wind, WindField)
+    return natural(simulation, KINDS[suggestion.kind], simulation.wind.flows[0], LOOKS[suggestion.look].intensity)
 
 
 def _tried(

@@ -6,7 +6,7 @@ The stiffness matrix of the ``total`` formulation at rest is constant, so a few 
   laws share at small strain; :math:`M` is the lumped mass of the nodes. Pinned nodes go, pinned points are stiff rows,
   and a rigid part has six degrees of freedom.
 - **Shift.** Captures have bits that hang on a corner of a cell; the lowest eigenvectors are theirs. :math:`K + s M` with
-  :math:`s = (0.28\, \omega_1)^2` tames them, where :math:`\omega_1` is the first frequency that is found with the shift
+  :math:`s = (\omega_1 / 2)^2` tames them, where :math:`\omega_1` is the first frequency that is found with the shift
   itself, starting from a stiff guess.
 - **First frequency.** Rayleigh's quotient of the shape in which the body leans in the wind.
 - **Modes.** Load-dependent Ritz vectors (Wilson, Yuan & Dickens 1982, Earthq. Eng. Struct. Dyn. 10:813) in place of
@@ -33,7 +33,7 @@ from gaussian_swaying.geometry.groups import equal_rows
 if TYPE_CHECKING:
     from gaussian_swaying.mpm.formulations.total import Total
 
-SHIFT = 0.28
+SHIFT = 0.5
 """Frequency of the shift over the first one."""
 LOOSE = 0.4
 """Frequency over the first one below which a mode is a loose bit."""
@@ -45,7 +45,7 @@ MOST_UNKNOWNS = 150_000
 """A body with more is refused: its factor would fill the memory."""
 KEPT = 32
 """Analyses in the cache."""
-_VERSION = 1  # of the analysis, in the name of the file
+_VERSION = 2  # of the analysis, in the name of the file
 
 
 @dataclass(frozen=True)
@@ -431,15 +431,16 @@ def analysis_of(total: Total, scene: int, most: int) -> Analysis:
         most: Largest number of modes.
     """
     path = cache_folder() / f"modes_{_content(total, scene, most)}.npz"
-    found = _read(path)
+    numbers = _numbers(total, scene)
+    found = _read(path, numbers)
     if found is None:
         found = Structure(total, scene).analyse(most)
-        _write(path, found)
+        _write(path, found, numbers)
     return found
 
 
 def _content(total: Total, scene: int, most: int) -> str:
-    """A hash of everything that the modes depend on."""
+    """A hash of what the modes depend on, but for :func:`_numbers`."""
     points, digest = total.body.points, hashlib.sha256()
     count = points.count
 
@@ -449,13 +450,8 @@ def _content(total: Total, scene: int, most: int) -> str:
                 value = value.detach().cpu().contiguous().numpy()
             digest.update(value.tobytes() if isinstance(value, np.ndarray) else repr(value).encode())
 
-    def relative(field: torch.Tensor) -> np.ndarray:
-        own = field.detach().reshape(-1, count)[scene].double().cpu().numpy()
-        return np.float32(own / own.mean())
-
     add(_VERSION, SHIFT, LOOSE, CLUSTERS, STIFF_ROW, most, total.grid, points.attached)
     add(points.position.reshape(-1, count, 3)[scene], points.poisson_ratio.reshape(-1, count)[scene])
-    add(*(relative(field) for field in (points.mass, points.volume, points.youngs_modulus, total.body.laws.mu)))
     add(total.kinds, total.body.rigid)
     for held in total.held:
         if held is not None:
@@ -466,10 +462,19 @@ def _content(total: Total, scene: int, most: int) -> str:
     return digest.hexdigest()[:32]
 
 
-def _read(path: Path) -> Analysis | None:
-    """A kept analysis; None if there is none that can be read."""
+def _numbers(total: Total, scene: int) -> np.ndarray:
+    """Masses, volumes and stiffnesses of the points over their means, which rounding may change a little, (3, P)."""
+    points = total.body.points
+    own = [field.detach().reshape(-1, points.count)[scene] for field in (points.mass, points.volume, total.body.laws.mu)]
+    return np.stack([(field / field.mean()).float().cpu().numpy() for field in own])
+
+
+def _read(path: Path, numbers: np.ndarray) -> Analysis | None:
+    """A kept analysis of a body of these numbers, to 1e-4; None if there is none that can be read."""
     try:
         with np.load(path, allow_pickle=False) as file:
+            if not np.allclose(file["numbers"], numbers, rtol=1e-4, atol=0):
+                return None
             values = {f.name: file[f.name] for f in fields(Analysis)}
     except (OSError, ValueError, KeyError, EOFError):
         return None
@@ -477,13 +482,14 @@ def _read(path: Path) -> Analysis | None:
     return Analysis(**values)
 
 
-def _write(path: Path, found: Analysis) -> None:
+def _write(path: Path, found: Analysis, numbers: np.ndarray) -> None:
     """Keep an analysis, and forget those that were used longest ago; a folder that cannot be written is no fault."""
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         with atomic(path) as temporary:
             np.savez(
                 temporary,
+                numbers=numbers,
                 **{f.name: np.asarray(getattr(found, f.name)) for f in fields(Analysis)},
             )
         for old in sorted(path.parent.glob("modes_*.npz"), key=lambda p: p.stat().st_mtime)[:-KEPT]:

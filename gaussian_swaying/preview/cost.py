@@ -79,7 +79,6 @@ def estimate_cost(
     simulation: Simulation,
     frames: int,
     startup_seconds: float = 0.0,
-    growth: float = 1.0,
     budget: float = BUDGET,
     pictures: bool = True,
 ) -> Cost:
@@ -92,7 +91,6 @@ def estimate_cost(
         simulation: The run.
         frames: Number of frames of the run.
         startup_seconds: Time to prepare the run [s], if known.
-        growth: Mean number of substeps of a frame over the number at rest, if known.
         budget: Time for the frames that are timed [s], about.
         pictures: Whether pictures count, if the run makes some.
 
@@ -107,7 +105,7 @@ def estimate_cost(
     state = simulation.start()
     at_rest = solver.substeps(state, simulation.frame_dt)
     warm_up, each, taken = _timed_frames(simulation, state, at_rest, budget)
-    steps = max(at_rest * growth, statistics.mean(taken), _drag_substeps(simulation, state, frames))
+    steps = max(at_rest, statistics.mean(taken), _drag_substeps(simulation, state, frames))
     seconds = statistics.median(each)
     drawn = _picture_seconds(simulation, state, seconds * steps) if pictures and simulation.recorder.images else None
     return Cost(

@@ -85,11 +85,12 @@ KINDS = {
 """The kinds by name."""
 
 STANDS_LOW = 0.6  # height of a succulent over its width, at most
+LEAFY = 0.35  # green share of the visible area of a plant, at least
 TALL = (1.8, 5.0)  # height of a person over its width
 SKIN = 0.12  # share of the visible area of a head that has the colour of skin, at least
-NARROW_TOP = 0.35  # width of a conifer near its top over that near its foot
-THREADS = 0.5  # share of a tuft of grass that is longer than wide
-YOUNG = 4.0  # m; a tree up to this height is a young one
+NARROW_TOP = 0.45  # width of a conifer in its upper quarter over that near its foot
+SLENDER = 2.2  # height of a young tree over its width, at least
+THREAD = 2.2  # length of the Gaussians of grass over their width, at least
 
 
 def kind_of(
@@ -122,10 +123,13 @@ def kind_of(
     height = means @ axis
     low, high = quantile(height, 0.005), quantile(height, 0.995)
     wide = max(quantile(means @ a, 0.98) - quantile(means @ a, 0.02) for a in plane_axes(axis))
-    green = greenish(cloud.sh.detach()[index])
+    red, leaf_green, _ = (0.5 + SH_DC * cloud.sh.detach()[index, 0].double()).clamp(0, 1).unbind(-1)
+    green = greenish(cloud.sh.detach()[index]) & (leaf_green > 0.97 * red)  # gold is no leaf
     leafy = float((visible * green).sum() / visible.sum().clamp(min=1e-30))
     if "pot" in names:
-        if high - low < STANDS_LOW * wide:
+        plant = means if parts is None else means[(parts.parts.labels[index] == _label(parts, "leaf"))]
+        tall = quantile(plant @ axis, 0.98) - quantile(plant @ axis, 0.02)
+        if tall < STANDS_LOW * wide:
             return "succulent", "it stands in a pot, wider than high"
         return "plant", "it stands in a pot"
     if "cloth" in names or (sheet and end == "side"):
@@ -134,12 +138,18 @@ def kind_of(
         return "cloth", "a sheet"
     if end == "top":
         return "hanging", "it is held at its top"
-    if leafy > 0.35 or "leaf" in names:
-        cone = _width(means, height, axis, 0.75, 0.9) < NARROW_TOP * _width(means, height, axis, 0.1, 0.3)
+    if leafy > LEAFY or "leaf" in names:
+        cone = _width(means, height, axis, 0.75, 1.0) < NARROW_TOP * _width(means, height, axis, 0.05, 0.25)
         if cone:
             return "conifer", "it is green, and narrow at the top"
         if "leaf" in names:
-            return "tree", "a green crown on a bare trunk"
+            young = high - low > SLENDER * wide
+            return ("sapling" if young else "tree"), "a green crown on a bare trunk"
+        scales = cloud.scales.detach()[index].exp().sort(-1, descending=True).values
+        thread = float((scales[:, 0] / scales[:, 1].clamp(min=1e-30)).median())
+        base = _width(means, height, axis, 0.0, 0.1) < 0.5 * wide
+        if thread > THREAD and base and leafy > 0.95:
+            return "grass", "thin and green, from one base"
         return "shrub", f"{leafy:.0%} of it is green"
     if end == "bottom" and TALL[0] < (high - low) / max(wide, 1e-30) < TALL[1]:
         head = height > high - 0.16 * (high - low)
@@ -150,14 +160,21 @@ def kind_of(
     return "rigid", "neither green, nor a sheet, nor hanging: it stands, and there is little to sway"
 
 
+def _label(found: FoundParts, name: str) -> int:
+    """The label of a part; that of the last one if there is none of that name."""
+    names = [part.name for part in found.parts.parts]
+    return names.index(name) if name in names else len(names) - 1
+
+
 def _width(means: Tensor, height: Tensor, up: Tensor, first: float, last: float) -> float:
-    """Width of a slice between two shares of the height."""
+    """Mean width of slices of a twentieth of the height, between two shares of it."""
     low, high = quantile(height, 0.005), quantile(height, 0.995)
-    share = (height - low) / max(high - low, 1e-30)
-    part = means[(share >= first) & (share <= last)]
-    if len(part) < 8:
-        return 0.0
-    return max(quantile(part @ a, 0.95) - quantile(part @ a, 0.05) for a in plane_axes(up))
+    share, found = (height - low) / max(high - low, 1e-30), []
+    for k in range(round(20 * first), round(20 * last)):
+        part = means[(share >= k / 20) & (share < (k + 1) / 20)]
+        if len(part) >= 8:
+            found.append(max(quantile(part @ a, 0.95) - quantile(part @ a, 0.05) for a in plane_axes(up)))
+    return sum(found) / max(len(found), 1)
 
 
 def _skin(cloud: GaussianCloud, index: Tensor) -> Tensor:

@@ -23,8 +23,10 @@ from gaussian_swaying.mpm.formulations.modes import Modes
 from gaussian_swaying.mpm.formulations.total import Total
 from gaussian_swaying.mpm.modal import SHIFT, Structure, factor, rayleigh
 from gaussian_swaying.mpm.solver import MPMSolver
+from gaussian_swaying.mpm.state import State
 from gaussian_swaying.preview.kinds import KINDS, Kind
 from gaussian_swaying.preview.shape import quantile
+from gaussian_swaying.preview.stretch import typical_start
 from gaussian_swaying.simulation.parameters import other_with
 from gaussian_swaying.simulation.simulation import Simulation
 
@@ -47,9 +49,10 @@ class Natural:
         mass: Mass of what moves [kg].
         frontal: Area of its silhouette in the wind [m²].
         thicker: Factor on the thicknesses of the surface.
-        stiffer: Factors on the Young's moduli, by their present values.
+        stiffer: Young's moduli [Pa], by those before.
         drag: Factor on the drag, friction and lift coefficients.
         lean: Mean displacement of the upper tenth in the mean wind, over the longest side.
+        start: Time at which a typical stretch of the turbulence begins [s].
     """
 
     height: float
@@ -60,6 +63,7 @@ class Natural:
     stiffer: dict[float, float]
     drag: float
     lean: float
+    start: float
 
 
 def natural(simulation: Simulation, kind: Kind, flow: Tensor, intensity: float) -> Natural:
@@ -90,23 +94,32 @@ def natural(simulation: Simulation, kind: Kind, flow: Tensor, intensity: float) 
     own = float(setup.points.mass.double().sum())
     wanted = kind.area_mass(height) * frontal
     thicker = wanted / (own * moving)
-    stiffer = _stiffness(structure, setup.points.youngs_modulus, own * thicker, thicker, frequency, kind)
-    points = setup.points
-    E = points.youngs_modulus.clone()
-    for value, ratio in stiffer.items():
-        E[points.youngs_modulus == value] *= ratio
-    points = replace(points, mass=points.mass * thicker, volume=points.volume * thicker, youngs_modulus=E)
-    speed = float(flow.norm())
+    found = _stiffness(structure, setup.points.youngs_modulus, own * thicker, thicker, frequency, kind)
+    stiffer = {value: value * ratio for value, ratio in found.items()}
     drag = _drag(simulation, frontal, kind)
     aero = other_with(simulation.aero, **{name: drag * getattr(simulation.aero, name) for name in ("C_D", "C_F", "C_L")})
-    simulation.adopt(replace(setup, points=points, aero=aero))
-    simulation.solver.init_state(points, frame=scene.frame)
-    bound = solver.bound
-    assert isinstance(bound, Modes)
     steady = WindForce(aero, WindField(flow * math.sqrt(1 + intensity**2)), scene.patches)
+    used = stiffer
+    for _ in range(2):  # the second time the mode itself has the frequency; the shapes stay
+        points = setup.points
+        E = points.youngs_modulus.clone()
+        for value, modulus in stiffer.items():
+            E[points.youngs_modulus == value] = modulus
+        points = replace(points, mass=points.mass * thicker, volume=points.volume * thicker, youngs_modulus=E)
+        simulation.adopt(replace(setup, points=points, aero=aero))
+        simulation.solver.init_state(points, frame=scene.frame)
+        bound = solver.bound
+        assert isinstance(bound, Modes)
+        used = stiffer
+        ratio = (2 * math.pi * frequency) ** 2 / float(bound.square[bound.main_mode(steady)])
+        stiffer = {value: modulus * ratio for value, modulus in stiffer.items()}
     state = bound.leaning(steady)
-    lean = _lean(state.position - points.position, points.position) if speed > 0 else 0.0
-    return Natural(height, frequency, wanted, frontal, thicker, stiffer, drag, lean)
+    lean = _lean(state.position - points.position, points.position) if bool(flow.any()) else 0.0
+    speed = float(flow.norm())
+    of_air = aero.air_density * kind.drag * speed / (4 * math.pi * frequency * kind.area_mass(height))
+    some = torch.from_numpy(place[np.flatnonzero(free)[:: max(1, int(free.sum()) // 8)]])
+    start = typical_start(simulation.wind, some, frequency, kind.damping_ratio + of_air)
+    return Natural(height, frequency, wanted, frontal, thicker, used, drag, lean, start)
 
 
 def silhouette(place: Tensor, flow: Tensor) -> float:
@@ -201,8 +214,6 @@ def _drag(simulation: Simulation, frontal: float, kind: Kind) -> float:
     direction = simulation.wind.flows[0].to(still)  # type: ignore[union-attr]
     direction = direction / direction.norm().clamp(min=1e-12)
     force = WindForce(aero, WindField(direction.double()), scene.patches)
-    from gaussian_swaying.mpm.state import State
-
     lost = torch.zeros(len(still), dtype=torch.bool)
     time = torch.zeros((), dtype=torch.float64)
     state = State(position=points.position, velocity=still, F_elastic=identity, F_total=identity, lost=lost, time=time)

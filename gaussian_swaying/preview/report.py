@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import math
 import shlex
 from collections.abc import Sequence
 from dataclasses import asdict
@@ -15,6 +16,8 @@ from gaussian_swaying.aero.wind import WindField
 from gaussian_swaying.gaussians.cloud import GaussianCloud
 from gaussian_swaying.gaussians.ply import OPAQUE_LOGIT
 from gaussian_swaying.preview.cost import Cost
+from gaussian_swaying.preview.kinds import KINDS
+from gaussian_swaying.preview.natural import Natural
 from gaussian_swaying.preview.parts import FoundParts
 from gaussian_swaying.preview.picture import mean_flow
 from gaussian_swaying.preview.place import Place
@@ -104,8 +107,9 @@ def suggestion_lines(guess: Suggestion, further: int) -> list[str]:
         f"{guess.spacing:.3g} m",
         *_nodes(guess),
         "further points  " + (f"{further:,} where Gaussians are sparse for this grid" if further else "none needed"),
+        f"kind            {_kind(guess)}",
         f"material        {_material(guess)}",
-        f"wind            {wind_words(guess.flow, guess.up.direction)}",
+        f"wind            {guess.look}, {wind_words(guess.flow, guess.up.direction)}, with turbulence",
     ]
     return ["", "guesses (each can be set instead, see --help)", *(f"  {line}" for line in lines)]
 
@@ -151,13 +155,19 @@ def cost_lines(cost: Cost) -> list[str]:
     return [
         "",
         f"cost on this machine ({cost.device})",
-        f"  substep         {cost.substep:.3g} s, {cost.substeps} per frame (stable up to {cost.stable_substep:.3g} s; "
-        f"waves of {cost.wave_speed:.3g} m/s)",
+        f"  substep         {cost.substep:.3g} s, {cost.substeps} per frame ({_stable(cost)})",
         f"  work            {cost.particles:,} particles x {cost.substeps} substeps x {cost.frames} frames = "
         f"{cost.particles * cost.substeps * cost.frames:.2g}; grid of {' x '.join(map(str, cost.grid))} nodes",
         f"  a frame         {duration(frame)}{picture}, from {duration(cost.substep_seconds)} per substep",
         f"  the run         about {duration(cost.total_seconds)}, if nothing else runs",
     ]
+
+
+def _stable(cost: Cost) -> str:
+    """What limits a substep."""
+    if math.isinf(cost.stable_substep):
+        return "modes, which are stable with any"
+    return f"stable up to {cost.stable_substep:.3g} s; waves of {cost.wave_speed:.3g} m/s"
 
 
 def quality_lines(
@@ -209,10 +219,24 @@ def _numbers(values: Sequence[float]) -> str:
     return "[" + ", ".join(f"{value + 0.0:.3g}" for value in values) + "]"
 
 
+def _kind(guess: Suggestion) -> str:
+    """What it is, and how it sways."""
+    words = f"{guess.kind} ({KINDS[guess.kind].words}): {guess.kind_reason}"
+    n = guess.natural
+    if n is None:
+        return words
+    how = f"{n.frequency:.3g} Hz in still air, leans by {n.lean:.2%} of its longest side"
+    by = "modes" if guess.by_modes else "material points"
+    still = "; there is little to sway" if guess.kind == "rigid" else ""
+    return f"{words}; {how}; by {by}, as {guess.why_formulation}{still}"
+
+
 def _material(guess: Suggestion) -> str:
-    softer = "" if guess.real else " (softer than its table)"
-    numbers = f"E = {guess.youngs_modulus:.1e} Pa, {guess.thickness:.2g} m thick"
-    return f"{guess.material}{softer}, {numbers}: {guess.stiffness_reason}"
+    numbers = f"E = {guess.youngs_modulus:.2g} Pa, {guess.density:.3g} kg/m^3, {guess.thickness:.2g} m thick"
+    if guess.real:
+        return f"{guess.material}, {numbers}: as it was given"
+    moving = "" if guess.natural is None else f"; {guess.natural.mass:.2g} kg move"
+    return f"{guess.material}, {numbers}{moving}"
 
 
 def _why(confidence: str, reason: str) -> str:
@@ -304,7 +328,23 @@ def suggestion_dict(guess: Suggestion) -> dict[str, Any]:
         "material": guess.material,
         "youngs_modulus_Pa": guess.youngs_modulus,
         "thickness_m": guess.thickness,
-        "stiffness_reason": guess.stiffness_reason,
+        "density_kg_m3": guess.density,
+        "look": guess.look,
+        "kind": {"name": guess.kind, "reason": guess.kind_reason},
+        "formulation": "modes" if guess.by_modes else "total",
+        "formulation_reason": guess.why_formulation,
+        "natural": None if guess.natural is None else _natural_dict(guess.natural),
+    }
+
+
+def _natural_dict(found: Natural) -> dict[str, float]:
+    """Frequency, mass and lean of its kind."""
+    return {
+        "frequency_Hz": found.frequency,
+        "length_m": found.height,
+        "mass_kg": found.mass,
+        "silhouette_m2": found.frontal,
+        "lean": found.lean,
     }
 
 

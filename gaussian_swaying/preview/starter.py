@@ -10,15 +10,19 @@ from pathlib import Path
 from typing import Any
 
 from gaussian_swaying import _program as program
+from gaussian_swaying.aero.looks import CELLS, LOOKS, turbulence_length
 from gaussian_swaying.geometry.regions import Box, Cylinder, Not, Region, Union
 from gaussian_swaying.mpm.materials import known_material
-from gaussian_swaying.preview.suggest import Suggestion, at_quality
+from gaussian_swaying.preview.kinds import KINDS
+from gaussian_swaying.preview.suggest import Suggestion
 from gaussian_swaying.preview.up import wind_words
 
-DRAFT_FRAMES = 51  # 2 s
-DRAFT_PICTURE = (480, 270)
-STARTER_PICTURE = (960, 540)
-_CLOTH_AERO = """\
+PICTURE = (960, 540)
+
+
+def _aero(s: Suggestion) -> str:
+    if s.kind == "flag" and not s.real:
+        return """\
 aero:
   C_D: 0.1                      # the paper's flags
   C_F: 0.3
@@ -26,15 +30,21 @@ aero:
   air_density: 1.225            # kg/m^3
   law: paper
 """
-
-
-_SHELL_AERO = """\
+    why = "patches of a captured shell face the wind at every angle"
+    if s.natural is not None:
+        why = f"a drag of {KINDS[s.kind].drag:g} on the silhouette of {s.natural.frontal:.2g} m^2"
+    added = ""
+    if s.kind == "cloth" and not s.real:
+        breadth = sorted(s.size)[1]
+        added = f"\n  added_mass: {breadth:<18.3g}# m; breadth of the sheet, which carries air with it"
+    return f"""\
 aero:
-  C_D: 0.5                      # the paper's captures
-  C_F: 0.4
-  C_L: 0.01
+  C_D: {s.drag:<25.4g}# {why}
+  C_F: {0.05 * s.drag:<25.4g}
+  C_L: {0.01 * s.drag:<25.4g}
   air_density: 1.225            # kg/m^3
-  law: projected                # patches of a captured shell face the wind at every angle
+  law: projected
+  drag_step: semi_implicit{added}
 """
 
 
@@ -43,17 +53,18 @@ def _material(s: Suggestion) -> str:
         known = known_material(s.material)
         numbers = f"{known.E:.2g} Pa, {known.density:g} kg/m^3, {known.thickness:g} m thick"
         return f"material: {s.material:<22}# {numbers}; others: `gaussian-swaying preview --help`\n"
-    density, why = (400.0, "lighter objects follow the gusts faster")
-    if s.sheet:
-        density, why = (30.0, "the paper's flags, whose E is 3e3 to 6e3")
+    kind, why, mass = KINDS[s.kind], "a larger E bends less and needs more substeps", ""
+    if s.natural is not None:
+        why = f"stiff enough for {s.natural.frequency:.3g} Hz on this grid"
+        mass = f", so that {s.natural.mass:.3g} kg move"
+    ratio = kind.damping_ratio * (s.natural.frequency if s.natural is not None and not s.by_modes else 1.0)
     return f"""\
-material:
-  name: {s.material:<24}# a guess; `material: {s.material}` alone takes its own numbers, stiffer than those below
-  # {s.stiffness_reason}
-  E: {s.youngs_modulus:<27.1e}# Pa; a larger E bends less and needs more substeps
+material:                       # {s.material}; {kind.words}: {s.kind_reason}
+  E: {s.youngs_modulus:<27.6g}# Pa; {why}
   nu: 0.3
-  density: {density:<21}# kg/m^3; {why}
-  thickness: {s.thickness:<19.4g}# m; a shell; the mass of a patch is density x thickness x area
+  density: {s.density:<21.6g}# kg/m^3
+  thickness: {s.thickness:<19.6g}# m; the mass of a patch is density x thickness x area{mass}
+  damping_ratio: {ratio:<15.4g}# share of critical damping, without that of the air
 """
 
 
@@ -79,12 +90,6 @@ def region_dict(region: Region) -> dict[str, Any]:
     return {"class_path": type(region).__name__, "init_args": arguments}
 
 
-def draft_yaml(suggestion: Suggestion, ply: str | Path) -> str:
-    """A configuration for a first look: like :func:`starter_yaml`, of quality draft, with 2 s and a small picture."""
-    title = "# A first look: 2 s, a small picture. Quality: draft."
-    return _yaml(at_quality(suggestion, "draft"), ply, DRAFT_FRAMES, DRAFT_PICTURE, title)
-
-
 def starter_yaml(suggestion: Suggestion, ply: str | Path, frames: int = 250) -> str:
     """The configuration as text.
 
@@ -96,11 +101,6 @@ def starter_yaml(suggestion: Suggestion, ply: str | Path, frames: int = 250) -> 
     Returns:
         YAML for ``--config`` of a simulation.
     """
-    title = f"# A first configuration. Quality: {suggestion.quality}."
-    return _yaml(suggestion, ply, frames, STARTER_PICTURE, title)
-
-
-def _yaml(suggestion: Suggestion, ply: str | Path, frames: int, size: tuple[int, int], title: str) -> str:
     s = suggestion
     path = json.dumps(str(Path(ply).resolve()), ensure_ascii=False)
     region = s.region.region()
@@ -115,12 +115,13 @@ def _yaml(suggestion: Suggestion, ply: str | Path, frames: int, size: tuple[int,
         region: {json.dumps(region_dict(s.pin))}"""
     elif s.parts is not None:
         boundaries = " []               # what is held is said by scene.parts"
-    falls = s.sheet or not s.fixed
+    falls = KINDS[s.kind].cloth or not s.fixed
     gravity = "[0.0, 0.0, -9.8]" if falls else "[0.0, 0.0, 0.0] "
     why = "for cloth and objects without pins" if falls else "it was captured in balance with its weight"
     return f"""\
-{title}
-# Guessed from the splat; every number may be changed.{_chosen(s)}
+{_comment(_wind_words(s), 0)}
+{_comment(_sway_words(s), 0)}
+# Guessed from the splat; every number may be changed. Quality: {s.quality}.
 #   {shlex.join(program.words("sim"))} --config THIS_FILE
 frames: {frames:<24}# {frames * 0.04:.3g} s at 25 frames a second
 frame_dt: 0.04                  # s
@@ -140,23 +141,17 @@ scene:
 {_connected(s)}
 {_material(s)}
 solver:
-  formulation: total            # particles keep their neighbours: cannot tear
+  formulation: {"modes" if s.by_modes else "total":<17}# {s.why_formulation}
   dx: {s.dx:<26.6g}# m; quality {s.quality}: {s.longest_side / s.dx:.0f} cells along the longest side
   cfl: 0.4
   gravity: {gravity}     # m/s^2, z up; {why}
-  damping: {_damping(s):<21.3g}# 1/s; losses in air and material
-  boundaries:{boundaries}
+{_solver_damping(s)}  boundaries:{boundaries}
 
 wind:
   flow: {_padded(json.dumps(list(s.flow)), 24)}# {wind_words(s.flow, s.up.direction)}
   seed: 0
-  modulations:
-    - class_path: SineSway
-      init_args: {{amplitude: 0.5, period: 2.0}}
-    - class_path: GaussianGust
-      init_args: {{std: 0.3}}
-
-{_CLOTH_AERO if s.sheet else _SHELL_AERO}
+{_gusts(s)}
+{_aero(s)}
 shader:
   class_path: DiffuseShader
   init_args:
@@ -168,8 +163,8 @@ shader:
 camera:
   class_path: OrbitCamera
   init_args:
-    width: {size[0]}
-    height: {size[1]}
+    width: {PICTURE[0]}
+    height: {PICTURE[1]}
     fov_y: 40.0                 # degrees
     azimuth: {s.azimuth:<19.6g}# degrees about up; shows the broad side
     elevation: 8.0
@@ -181,16 +176,48 @@ recorder:
 """
 
 
-def _chosen(s: Suggestion) -> str:
-    """The end of the first comment: why the material has its numbers."""
-    if s.real:
+def _wind_words(s: Suggestion) -> str:
+    """What wind it has and why."""
+    look, speed = LOOKS[s.look], math.hypot(*s.flow)
+    other = f", at {speed:g} m/s as it was asked for" if abs(speed - look.speed) > 0.01 else ""
+    return (
+        f"Wind: {s.look} ({look.words}{other}), {speed:g} m/s at the object with turbulence of {look.intensity:.0%}, "
+        f"{turbulence_length(_middle(s)):.3g} m long. Other looks: --look {', '.join(LOOKS)}."
+    )
+
+
+def _sway_words(s: Suggestion) -> str:
+    """What it is and how it will sway."""
+    kind = KINDS[s.kind]
+    if s.real or s.natural is None:
+        return f"It is taken for {kind.words}: {s.kind_reason}."
+    n = s.natural
+    still = " There is little to sway." if s.kind == "rigid" else ""
+    return (
+        f"It is taken for {kind.words}: {s.kind_reason}. First frequency in still air {n.frequency:.3g} Hz, for a length of "
+        f"{n.height:.3g} m; mean lean of its top {n.lean:.2%} of its longest side.{still}"
+    )
+
+
+def _middle(s: Suggestion) -> float:
+    """Height of its middle above the ground [m]."""
+    return 0.5 * s.size[2]
+
+
+def _gusts(s: Suggestion) -> str:
+    length, look = turbulence_length(_middle(s)), LOOKS[s.look]
+    return f"""\
+  effects:
+    - class_path: Turbulence    # von Karman's spectrum; coherent in space, so that parts move out of phase
+      init_args: {{intensity: {look.intensity:g}, length: {length:.4g}, cells: {list(CELLS)},
+                  start: {[round(s.start * c, 3) + 0.0 for c in s.flow]}}}  # m; a typical stretch of it
+"""
+
+
+def _solver_damping(s: Suggestion) -> str:
+    if not s.real:
         return ""
-    return " A splat does not show its material: E and thickness are chosen\n# so that it sways visibly in this wind."
-
-
-def _damping(s: Suggestion) -> float:
-    """Decay rate of motion [1/s]."""
-    return known_material(s.material).damping if s.real else 0.2 if s.sheet else 1.0
+    return f"  damping: {known_material(s.material).damping:<21.3g}# 1/s; losses in air and material\n"
 
 
 def _kind(s: Suggestion) -> str:

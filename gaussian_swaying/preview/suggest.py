@@ -14,11 +14,12 @@ import torch
 from torch import Tensor
 
 from gaussian_swaying._checks import check_choice, check_positive
+from gaussian_swaying.aero.looks import LOOKS
 from gaussian_swaying.captures.capture_camera import photo_azimuth
 from gaussian_swaying.gaussians.area import patch_area
 from gaussian_swaying.gaussians.cloud import GaussianCloud
 from gaussian_swaying.gaussians.grouping import connected_parts
-from gaussian_swaying.gaussians.harmonics import SH_DC
+from gaussian_swaying.gaussians.parts import Part, Parts
 from gaussian_swaying.gaussians.ply import OPAQUE_LOGIT
 from gaussian_swaying.geometry.frame import SimFrame
 from gaussian_swaying.geometry.neighbours import particle_spacing
@@ -27,7 +28,9 @@ from gaussian_swaying.geometry.regions import Box, Not, Region, Union
 from gaussian_swaying.mpm.materials import known_material
 from gaussian_swaying.preview.framing import orbit_frame, whole_box
 from gaussian_swaying.preview.hold import PIN_DEPTH, HoldGuess, end_region, given_hold, guess_hold
-from gaussian_swaying.preview.parts import FoundParts, plant_parts
+from gaussian_swaying.preview.kinds import KINDS, kind_of
+from gaussian_swaying.preview.natural import MOST_LEAN, Natural
+from gaussian_swaying.preview.parts import FoundParts, plant_parts, with_materials
 from gaussian_swaying.preview.photos import CapturedFrom, ShownObject, shown_object
 from gaussian_swaying.preview.shape import (
     FEWEST,
@@ -36,7 +39,7 @@ from gaussian_swaying.preview.shape import (
     rounded,
     sheet_normal,
 )
-from gaussian_swaying.preview.supports import flag_on_pole, hanging_parts, standing_parts
+from gaussian_swaying.preview.supports import flag_on_pole, hanging_parts, potted_parts, standing_parts, swinging_parts
 from gaussian_swaying.preview.up import UpGuess, given_up, guess_up
 from gaussian_swaying.simulation.extent import suggest_spacing
 
@@ -44,7 +47,7 @@ QUALITIES = {"draft": 16, "normal": 24, "fine": 48}  # cells along the longest s
 CELLS = QUALITIES["normal"]
 MOST_CELLS = 96  # of a grid that is chosen by its time
 CLOTH_E, CLOTH_THICKNESS = 6e3, 0.01  # Pa, m; a sheet: the cloth of the paper's flags
-SHELL_E, SHELL_THICKNESS = 5e5, 0.01  # Pa, share of the longest side; everything else: a shell of rubber
+SHELL_E = 1e6  # Pa; of everything else, until its frequency is known
 THRESHOLDS = (0.1, 0.05, 0.02, 0.01, 0.0)  # of opacity; the first is the paper's
 KEPT_AREA = 0.95  # share of the visible area that the threshold must keep
 MAX_BOXES = 8  # largest number of boxes that cut specks out of the region
@@ -132,18 +135,22 @@ class Suggestion:
         sheet: Whether the object is a thin sheet.
         azimuth: Azimuth of a camera that sees the broad side, or the side seen in photos [degrees].
         flow: Wind across the picture, or along a sheet from its held side [m/s], z up.
-        material: The known material that it is most like, by its shape and colour, or that was given.
-        youngs_modulus: Young's modulus [Pa], a first guess;
-            :mod:`~gaussian_swaying.preview.calibration` finds a better one.
+        start: Time at which a typical stretch of the turbulence begins [s].
+        look: The name of the wind, one of :data:`~gaussian_swaying.aero.looks.LOOKS`.
+        kind: What it is, one of :data:`~gaussian_swaying.preview.kinds.KINDS`.
+        kind_reason: Why, in words.
+        material: The known material of its surface, of the kind or as it was given.
+        youngs_modulus: Young's modulus [Pa]; :mod:`~gaussian_swaying.preview.natural` finds that of the kind.
+        density: Density of the surface [kg/m³].
         thickness: Thickness of the surface [m], also a first guess.
-        stiffness_reason: The reason for both, in words.
+        drag: Factor on the coefficients of the wind's force.
+        natural: Frequency, mass and lean of the kind, if it sways by modes or could.
         whole: Corners of the box of the whole object, including parts that do not move [scene units].
         camera_offset: Vector from the centre of the moving part to that of the whole, in multiples of the longest side
             of the moving part.
         camera_radius: Distance of a camera that shows the whole, in the same unit.
         parts: The parts of the object, if they are sure: a plant in a pot, a flag on its pole, what hangs from a cord,
             or a tree; else None.
-        growth: Mean number of substeps of a frame over the number at rest, from the trial runs.
         connected: ``scene.connected`` of the starter.
         connected_reason: Why it is ``surface``, in words, if that was not asked for.
         real: Whether the numbers are those of the material; if not, they are such that it sways visibly.
@@ -162,18 +169,44 @@ class Suggestion:
     sheet: bool
     azimuth: float
     flow: tuple[float, ...]
+    look: str
+    kind: str
+    kind_reason: str
     material: str
     youngs_modulus: float
+    density: float
     thickness: float
-    stiffness_reason: str
     whole: tuple[list[float], list[float]]
     camera_offset: tuple[float, ...]
     camera_radius: float
     parts: FoundParts | None = None
-    growth: float = 1.0
+    start: float = 0.0
+    drag: float = 1.0
+    natural: Natural | None = None
     connected: str = "grid"
     connected_reason: str = ""
     real: bool = False
+
+    @property
+    def sways(self) -> bool:
+        """True if its numbers are those of its kind: it is held, no cloth, and no material was given."""
+        return self.fixed and not self.real and not KINDS[self.kind].cloth
+
+    @property
+    def by_modes(self) -> bool:
+        """True if modes will do: it leans by less than :data:`MOST_LEAN`."""
+        return self.sways and (self.natural is None or self.natural.lean < MOST_LEAN)
+
+    @property
+    def why_formulation(self) -> str:
+        """Why it sways by modes or by material points, in words."""
+        if self.by_modes:
+            return "it is held, nothing touches, and it leans by less than 40 %"
+        if self.sways:
+            return "it leans by more than 40 %, which modes cannot do"
+        if self.real:
+            return "a material was given"
+        return "cloth folds" if self.fixed else "nothing holds it"
 
     @property
     def fixed(self) -> bool:
@@ -186,11 +219,13 @@ def suggest(
     up: Sequence[float] | str | None = None,
     hold: str | None = None,
     region: tuple[Sequence[float], Sequence[float]] | None = None,
-    longest_side: float = 1.0,
-    speed: float = 6.0,
+    longest_side: float | None = None,
+    speed: float | None = None,
     capture: CapturedFrom | None = None,
     quality: str = "normal",
     found: tuple[UpGuess, RegionGuess] | None = None,
+    look: str = "breeze",
+    kind: str | None = None,
 ) -> Suggestion:
     """Guess a first configuration.
 
@@ -199,12 +234,14 @@ def suggest(
         up: Direction that points up, as 3 numbers or as ``+x`` to ``-z``; guessed if None.
         hold: ``top``, ``bottom``, ``none`` or ``+x`` to ``-z``; guessed if None.
         region: Corners of the box to simulate [scene units]; guessed if None.
-        longest_side: Length of the longest side of the object [m].
-        speed: Speed of the wind [m/s].
+        longest_side: Length of the longest side of the object [m]; the usual one of its kind if None.
+        speed: Speed of the wind [m/s]; that of the look if None.
         capture: The cameras of the splat's photos, which define the up direction and the object.
         quality: ``draft``, ``normal`` or ``fine``. Only the grid spacing depends on it.
         found: The up direction and the simulated part, if they are known; ``up``, ``region`` and ``capture`` are then
             not used for them.
+        look: ``breeze``, ``gusts`` or ``storm``.
+        kind: One of :data:`~gaussian_swaying.preview.kinds.KINDS`; guessed if None.
 
     Returns:
         The suggestion.
@@ -212,8 +249,14 @@ def suggest(
     Raises:
         ValueError: If the splat has too few Gaussians, or an argument does not fit the splat.
     """
-    check_positive("--longest-side", longest_side)
+    if longest_side is not None:
+        check_positive("--longest-side", longest_side)
+    check_choice("--look", look, tuple(LOOKS))
+    speed = LOOKS[look].speed if speed is None else speed
     check_positive("--wind", speed, allow_zero=True)
+    if kind is not None:
+        check_choice("--kind", kind, tuple(KINDS))
+    unscaled, longest_side = longest_side is None, longest_side or 1.0
     check_choice("--quality", quality, tuple(QUALITIES))
     if len(cloud) < FEWEST:
         raise ValueError(f"The splat has {len(cloud)} Gaussians, too few for an object; at least {FEWEST} are needed.")
@@ -287,14 +330,32 @@ def suggest(
             found_parts = hanging_parts(cloud, chosen.simulated, upward.direction, weight, ending)
         elif held.end == "bottom":
             depth = max(PIN_DEPTH * float(metres[:, 2].amax() - metres[:, 2].amin()), 1.5 * dx) / frame.metres_per_unit
-            found_parts = standing_parts(cloud, chosen.simulated, upward.direction, weight, depth)
+            found_parts = potted_parts(cloud, chosen.simulated, upward.direction, weight)
+            found_parts = found_parts or standing_parts(cloud, chosen.simulated, upward.direction, weight, depth)
         pin = pin if found_parts is None else None
+    flat = sheet_normal(points)
+    name, why_kind = kind_of(
+        cloud, chosen.simulated, upward.direction, weight, held.end, flat is not None, found_parts
+    )
+    if kind is not None:
+        name, why_kind = kind, "given"
+    if name == "hanging" and held.end == "top" and (found_parts is None or "cord" in _names(found_parts)):
+        ends = end_region(points, held.direction, dx / frame.metres_per_unit)
+        found_parts = swinging_parts(cloud, chosen.simulated, upward.direction, weight, ends, dx / frame.metres_per_unit)
+        pin = None
+    if unscaled:
+        ratio = KINDS[name].side
+        frame = SimFrame.fit(means[chosen.simulated], upward.direction, None, frame.metres_per_unit * ratio)
+        metres, spacing, longest_side = metres * ratio, spacing * ratio, longest_side * ratio
+        dx = suggest_spacing(longest_side, spacing, CELLS)
+    if found_parts is not None and flat is None:
+        found_parts = with_materials(found_parts, KINDS[name], float(metres[:, 2].amax() - metres[:, 2].amin()))
+    known = known_material(KINDS[name].material)
     azimuth, turn = broad_side(metres), 20.0  # the broad side, seen slightly from the side
     front = None if capture is None else photo_azimuth(capture.eyes, points.double().mean(0), frame.rotation)
     if front is not None:
         azimuth, turn = front, 0.0
     flow = _across_picture(azimuth, speed)
-    flat = sheet_normal(points)
     if held.end == "side" and flat is not None:  # along the sheet from the pole, and slightly onto it
         away = -frame.direction_to_sim(torch.tensor(held.direction, dtype=torch.float64))
         onto = torch.linalg.cross(torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64), away)
@@ -320,29 +381,19 @@ def suggest(
         sheet=flat is not None,
         azimuth=round(azimuth + turn, 1),
         flow=tuple(round(c, 2) + 0.0 for c in flow),
-        material="cotton" if flat is not None else "leaf" if is_green(cloud, chosen.simulated, visible) else "rubber",
-        youngs_modulus=SHELL_E if flat is None else CLOTH_E,
-        thickness=SHELL_THICKNESS * longest_side if flat is None else CLOTH_THICKNESS,
-        stiffness_reason="rubber, not tried" if flat is None else "the cloth of the paper's flags, not tried",
+        look=look,
+        kind=name,
+        kind_reason=why_kind,
+        material=KINDS[name].material,
+        youngs_modulus=CLOTH_E if KINDS[name].cloth else SHELL_E,
+        density=KINDS[name].mass / CLOTH_THICKNESS if KINDS[name].cloth else known.density,
+        thickness=CLOTH_THICKNESS if KINDS[name].cloth else known.thickness,
         whole=whole,
         camera_offset=offset,
         camera_radius=radius,
         parts=found_parts,
     )
     return at_quality(suggestion, quality)
-
-
-def is_green(cloud: GaussianCloud, simulated: Tensor, weight: Tensor) -> bool:
-    """True if most of the visible area of the simulated Gaussians is greener than it is red or blue, by a tenth.
-
-    Args:
-        cloud: The splat.
-        simulated: The simulated Gaussians, shape (N,).
-        weight: Visible area of each of them.
-    """
-    red, green, blue = (0.5 + SH_DC * cloud.sh.detach()[simulated, 0].double()).clamp(0, 1).unbind(-1)
-    share = (weight * (green > 1.1 * red.maximum(blue))).sum() / weight.sum().clamp(min=1e-30)
-    return float(share) > 0.5
 
 
 def of_material(suggestion: Suggestion, name: str) -> Suggestion:
@@ -353,8 +404,8 @@ def of_material(suggestion: Suggestion, name: str) -> Suggestion:
     """
     known = known_material(name, "--material")
     return replace(
-        suggestion, material=name, real=True, youngs_modulus=known.E, thickness=known.thickness,
-        stiffness_reason="its numbers, as it was given",
+        suggestion, material=name, real=True, youngs_modulus=known.E, density=known.density,
+        thickness=known.thickness,
     )  # fmt: skip
 
 
@@ -367,6 +418,34 @@ def at_quality(suggestion: Suggestion, quality: str) -> Suggestion:
 def finest_spacing(suggestion: Suggestion) -> float:
     """The finest grid spacing [m] that a time may choose: ``MOST_CELLS``, and at least twice the particle spacing."""
     return suggest_spacing(suggestion.longest_side, suggestion.spacing, MOST_CELLS)
+
+
+def with_natural(suggestion: Suggestion, found: Natural) -> Suggestion:
+    """The suggestion with the numbers of its kind, that :func:`~gaussian_swaying.preview.natural.natural` found."""
+    s, parts = suggestion, suggestion.parts
+    frequency = 1.0 if found.lean < MOST_LEAN else found.frequency  # `total` has the ratio at 1 Hz
+
+    def own(part: Part) -> Part:
+        given = {name: getattr(part, name) for name in ("thickness", "E", "damping_ratio")}
+        changed: dict[str, float] = {}
+        if given["thickness"] is not None:
+            changed["thickness"] = given["thickness"] * found.thicker
+        if given["E"] is not None:
+            changed["E"] = found.stiffer.get(given["E"], given["E"])
+        if given["damping_ratio"] is not None:
+            changed["damping_ratio"] = given["damping_ratio"] * frequency
+        return replace(part, **changed)
+
+    if parts is not None:
+        parts = replace(parts, parts=Parts(parts.parts.labels, [own(part) for part in parts.parts.parts]))
+    return replace(
+        s, youngs_modulus=found.stiffer.get(s.youngs_modulus, s.youngs_modulus), thickness=s.thickness * found.thicker,
+        drag=s.drag * found.drag, parts=parts, natural=found, start=found.start,
+    )  # fmt: skip
+
+
+def _names(found: FoundParts) -> list[str]:
+    return [part.name for part in found.parts.parts]
 
 
 def _across_picture(azimuth: float, speed: float) -> tuple[float, ...]:

@@ -10,6 +10,7 @@ from torch import Tensor
 
 from gaussian_swaying.gaussians.cloud import GaussianCloud
 from gaussian_swaying.gaussians.parts import Part, Parts
+from gaussian_swaying.geometry.regions import Region
 from gaussian_swaying.preview.hold import cord_heights
 from gaussian_swaying.preview.parts import FoundParts, greenish, labels_for_all, woody
 from gaussian_swaying.preview.shape import FEWEST, plane_axes, quantile, sheet_normal
@@ -19,8 +20,12 @@ SLIM = 0.04  # width of a pole, as a share of the height
 BARE = 0.08  # share of the slices in which a pole is to be seen alone
 CLOTH = 0.3  # width of a slice with cloth, as a share of the widest
 OUTSIDE = 0.02  # share of the Gaussians of a flag that may lie on the other side of its pole
+RIPPLED = 0.35  # depth of a flag over its length, seen from above
+FOOT = 5  # slices in which the ground around a trunk may be wide
+RIM, POT = (0.25, 0.8), 0.15  # height of the rim of a pot, as a share of all; green share of what is below it
 TRUNK, CROWN = 0.12, 0.5  # height of a bare trunk, as a share of that of the tree; green share of what is above
 NARROW = 0.35  # width of a trunk, as a share of that of the crown
+NECK, NECK_SHARE = 3.0, 0.1  # cells, share of the height: what bends above a hanging body
 POST, SLENDER = 0.25, 0.08  # height of a post, as a share of that of the object, and its width, as a share of the same
 
 
@@ -50,7 +55,16 @@ def flag_on_pole(cloud: GaussianCloud, simulated: Tensor, up: Sequence[float]) -
     """
     index = simulated.nonzero()[:, 0]
     means = cloud.means.detach()[index].double()
-    normal, axis = sheet_normal(means), torch.tensor(list(up), dtype=torch.float64)
+    axis = torch.tensor(list(up), dtype=torch.float64)
+    normal = sheet_normal(means)
+    if normal is None:  # a foot makes the whole no sheet, and ripples the cloth
+        upper = means @ axis
+        cloth = means[upper > 0.5 * (quantile(upper, 0.01) + quantile(upper, 0.99))]
+        level = cloth - cloth.mean(0)
+        level = level - (level @ axis)[:, None] * axis
+        values, axes = torch.linalg.eigh(torch.cov(level.T))  # the first is upright
+        if float(values[1].clamp(min=0) / values[2].clamp(min=1e-30)) < RIPPLED**2:
+            normal = tuple(axes[:, 1].tolist())
     if normal is None or abs(float(torch.tensor(normal, dtype=torch.float64) @ axis)) > 0.3:
         return None
     aside = torch.linalg.cross(axis, torch.tensor(normal, dtype=torch.float64))
@@ -119,6 +133,73 @@ def hanging_parts(
     return FoundParts(parts, f"a cord {ends[1] - ends[0]:.2g} long, right above the middle of what hangs on it")
 
 
+def potted_parts(
+    cloud: GaussianCloud, simulated: Tensor, up: Sequence[float], weight: Tensor
+) -> FoundParts | None:
+    """The parts of a plant in a pot by colour alone: the lower part is not green and as wide as the plant.
+
+    Args:
+        cloud: The splat.
+        simulated: The Gaussians of the object, bool, shape (N,).
+        up: Up direction, a unit vector.
+        weight: Visible area of each Gaussian, shape (N,).
+
+    Returns:
+        The parts: the pot is held, leaves are soft; None if there is no such pot.
+    """
+    index = simulated.nonzero()[:, 0]
+    axis, means = torch.tensor(list(up), dtype=torch.float64), cloud.means.detach()[index].double()
+    height, visible, green = means @ axis, weight[index].double(), greenish(cloud.sh.detach()[index])
+    low, high = quantile(height, 0.005), quantile(height, 0.995)
+    if high <= low:
+        return None
+    which = ((height - low) / (high - low) * SLICES).long().clamp(0, SLICES - 1)
+    leafy, wide = [], []
+    for k in range(SLICES):
+        own = (which == k).nonzero()[:, 0]
+        leafy.append(float((visible * green)[own].sum() / visible[own].sum().clamp(min=1e-30)))
+        spread = [quantile(means[own] @ a, 0.95) - quantile(means[own] @ a, 0.05) for a in plane_axes(axis)] if len(own) else [0.0]
+        wide.append(max(spread))
+    rim = next((k for k in range(SLICES) if leafy[k] > 0.5), SLICES)
+    if not RIM[0] * SLICES <= rim < RIM[1] * SLICES:
+        return None
+    if sum(leafy[:rim]) > POT * rim or min(wide[:rim]) < 0.4 * max(wide) or sum(leafy[rim:]) < 0.5 * (SLICES - rim):
+        return None
+    label = torch.where(which < rim, 0, 1)
+    labels = labels_for_all(cloud.means.detach(), index, label, high - low, 2)
+    parts = _parts(labels, [Part("pot", "held"), Part("leaf"), Part("surroundings", "still")])
+    return FoundParts(parts, f"not green and as wide as the rest up to {rim / SLICES:.2f} of the height, and green above")
+
+
+def swinging_parts(
+    cloud: GaussianCloud, simulated: Tensor, up: Sequence[float], weight: Tensor, hook: Region, cell: float
+) -> FoundParts:
+    """The parts of a thing that hangs: its upper end is held, a cord or neck below it bends, and the rest is rigid.
+
+    Args:
+        cloud: The splat.
+        simulated: The Gaussians of the object, bool, shape (N,).
+        up: Up direction, a unit vector.
+        weight: Visible area of each Gaussian, shape (N,).
+        hook: Its upper end.
+        cell: Grid spacing [scene units].
+    """
+    index = simulated.nonzero()[:, 0]
+    axis, means = torch.tensor(list(up), dtype=torch.float64), cloud.means.detach()[index].double()
+    height = means @ axis
+    size = float(height.amax() - height.amin())
+    held = hook.contains(cloud.means.detach())[index]
+    ends = cord_heights(means, weight[index].double(), axis)
+    lowest = float(height[held].amin()) if bool(held.any()) else float(height.amax())
+    bends = lowest - max(NECK * cell, NECK_SHARE * size) if ends is None else min(ends[0], lowest - NECK * cell)
+    label = torch.where(height > bends, 1, 2)
+    label[held] = 0
+    labels = labels_for_all(cloud.means.detach(), index, label, size, 3)
+    parts = _parts(labels, [Part("hook", "held"), Part("cord"), Part("body", "rigid"), Part("surroundings", "still")])
+    what = f"a neck of {(lowest - bends) / size:.2f} of the height" if ends is None else "a cord"
+    return FoundParts(parts, f"it hangs from its upper end by {what}")
+
+
 def standing_parts(
     cloud: GaussianCloud, simulated: Tensor, up: Sequence[float], weight: Tensor, depth: float
 ) -> FoundParts | None:
@@ -148,19 +229,21 @@ def standing_parts(
         max(quantile(means[own] @ a, 0.95) - quantile(means[own] @ a, 0.05) for a in across) if len(own) else 0.0
         for own in ((which == k).nonzero()[:, 0] for k in range(SLICES))
     ]
-    bare = next((k for k in range(SLICES) if not 0 < wide[k] < NARROW * max(wide)), SLICES)
+    most = max(wide)
+    start = next((k for k in range(FOOT) if 0 < wide[k] < NARROW * most), 0)  # above a lawn or a disc of soil
+    bare = next((k for k in range(start, SLICES) if not 0 < wide[k] < NARROW * most), SLICES)
     if not TRUNK * SLICES <= bare < 0.85 * SLICES:
         return None
-    trunk, crown = which < bare, which >= bare
+    trunk, crown, ground = (which < bare) & (which >= start), which >= bare, which < start
     brown, leafy = (
         float((visible * of)[some].sum() / visible[some].sum()) for of, some in ((~green, trunk), (green, crown))
     )
     tree = brown >= 0.8 and leafy >= CROWN
-    slim = max(wide[:bare]) < SLENDER * (high - low)
+    slim = start == 0 and max(wide[:bare]) < SLENDER * (high - low)
     if not tree and (leafy >= CROWN or bare < POST * SLICES or not slim):
         return None
     label = torch.where(trunk | woody(means, green, high - low) if tree else trunk, 1, 2)
-    label[trunk & (height < quantile(height[trunk], 0.01) + depth)] = 0
+    label[ground | (trunk & (height < quantile(height[trunk], 0.01) + depth))] = 0
     if int((label == 2).sum()) < FEWEST:
         return None
     labels = labels_for_all(cloud.means.detach(), index, label, high - low, 3)

@@ -10,6 +10,7 @@ import torch
 
 from gaussian_swaying._checks import VectorLike, check_vector
 from gaussian_swaying.aero.force import AeroForce
+from gaussian_swaying.aero.looks import look
 from gaussian_swaying.aero.wind import SpatialWind, WindField, flow_rows
 from gaussian_swaying.captures.capture_camera import CaptureCamera, photo_azimuth, read_views
 from gaussian_swaying.gaussians.cloud import GaussianCloud
@@ -37,7 +38,7 @@ from gaussian_swaying.simulation.simulated_scene import SimulatedScene
 
 if TYPE_CHECKING:
     SceneLike = Scene | ProceduralScene | GaussianCloud | str | os.PathLike[str]
-    WindLike = WindField | SpatialWind | VectorLike
+    WindLike = WindField | SpatialWind | VectorLike | str
     DeviceLike = torch.device | str
     SolverLike = Solver
     MaterialLike = Material | str
@@ -131,7 +132,7 @@ def as_solver(
 
 
 def as_wind(wind: WindLike | None, frame: SimFrame) -> WindField | SpatialWind:
-    """Return the given wind, a steady wind from three numbers [m/s], or still air for None.
+    """Return the given wind, a look by its name, a steady wind from three numbers [m/s], or still air for None.
 
     Places of its effects are converted from scene units to metres.
     """
@@ -139,6 +140,8 @@ def as_wind(wind: WindLike | None, frame: SimFrame) -> WindField | SpatialWind:
         return wind.in_frame(frame)
     if isinstance(wind, SpatialWind):
         return wind
+    if isinstance(wind, str):
+        return look(wind).in_frame(frame)
     return WindField() if wind is None else WindField(flow_rows("wind", [wind])[0])
 
 

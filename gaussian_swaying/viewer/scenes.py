@@ -12,9 +12,12 @@ import torch
 
 from gaussian_swaying.config.parser import parse_text
 from gaussian_swaying.gaussians.formats import read_gaussians
-from gaussian_swaying.preview.calibration import SWAY, calibrated_suggestion
-from gaussian_swaying.preview.starter import draft_yaml, starter_yaml
-from gaussian_swaying.preview.suggest import suggest
+from gaussian_swaying.aero.looks import LOOKS
+from gaussian_swaying.aero.wind import WindField
+from gaussian_swaying.preview.kinds import KINDS
+from gaussian_swaying.preview.natural import natural
+from gaussian_swaying.preview.starter import starter_yaml
+from gaussian_swaying.preview.suggest import suggest, with_natural
 from gaussian_swaying.simulation.simulation import Simulation
 
 if TYPE_CHECKING:
@@ -39,7 +42,7 @@ def settings_of_splat(
         folder: Gets ``parts.npz``, which the settings name, if the splat has parts.
         further: Options that replace what is suggested.
         tell: Called with the share that is done, from 0 to 1, and the name of the next task.
-        quick: Whether they are those of its draft, with a coarser grid, in place of its starter's.
+        quick: Whether the grid is a coarser one than that of its starter.
 
     Raises:
         ValueError: If the file is not a splat, or nothing in it can move.
@@ -54,9 +57,13 @@ def settings_of_splat(
         saved = found.parts.parts.save(folder / "parts.npz")
         found = replace(found, parts=replace(found.parts, path=str(saved)))
     own = ["--device", device.type]
-    tell(0.35, "Making a draft")
-    draft = Simulation.from_settings(parser, parse_text(parser, draft_yaml(found, str(file)), own))
-    tell(0.5, "Trying how stiff it is")
-    found = calibrated_suggestion(found, draft, SWAY)
-    text = draft_yaml(found, str(file)) if quick else starter_yaml(found, str(file))
+    if found.sways:
+        tell(0.35, "Finding how it sways")
+        simulation = Simulation.from_settings(parser, parse_text(parser, starter_yaml(found, str(file)), own))
+        assert isinstance(simulation.wind, WindField)
+        numbers = natural(simulation, KINDS[found.kind], simulation.wind.flows[0], LOOKS[found.look].intensity)
+        found = with_natural(found, numbers)
+        if found.parts is not None:
+            found.parts.parts.save(folder / "parts.npz")
+    text = starter_yaml(found, str(file))
     return parse_text(parser, text, [*own, *further])

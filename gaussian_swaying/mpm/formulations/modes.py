@@ -144,13 +144,13 @@ class Modes(Total):
         mu, lam = body.laws.mu.detach(), body.laws.lam.detach()
         nodes, modes = self.grid.node_count, self.shape.shape[-1]
         field = self.shape.reshape(*self.shape.shape[:-2], nodes, 3 * modes)
-        rows = gather(field, self.stencil).unflatten(-1, (3, modes))
-        value, slope = rows[..., 0, :, :], rows[..., 1:4, :, :]
+        slope = gather(field, self.stencil).unflatten(-1, (3, modes))[..., 1:4, :, :]
+        speed = gather(field.unflatten(-1, (3, modes)).square().sum(-2), self.stencil)[..., 0, :]
         strain = 0.5 * (slope + slope.transpose(-3, -2))
         trace = strain.diagonal(dim1=-3, dim2=-2).sum(-1)
         density = 2 * mu[..., None] * strain.square().sum((-3, -2)) + lam[..., None] * trace.square()
         stored = in_double(body.points.volume.detach()[..., None] * density)
-        moved = in_double(body.points.mass.detach()[..., None] * value.square().sum(-2))
+        moved = in_double(body.points.mass.detach()[..., None] * speed)
         return stored / stored.sum(-2, keepdim=True).clamp(min=1e-300), moved
 
     @cached_property
@@ -277,6 +277,16 @@ class Modes(Total):
                 watch(k + 1)
         state = state.replace(time=state.time + steps * dt, substep=dt, work=work, impulse=impulse)
         return self.shown(state, q, p)
+
+    @torch.no_grad()
+    def main_mode(self, force: Force) -> Tensor:
+        """The mode with most of the lean under a steady force, shape (...)."""
+        state = self.first_state(torch.zeros_like(self.body.points.position), 0)
+        q, p = self.amplitudes(state)
+        seen, group = self._site_state(q, p, state, state.time), self._grouped(force)
+        assert group is not None
+        load, _ = split(group(seen), group, seen)
+        return (in_double(self._pull(seen.F_total, load)) / self.square).abs().argmax(-1)
 
     @torch.no_grad()
     def leaning(self, force: Force, rounds: int = 40) -> MPMState:
