@@ -199,10 +199,12 @@ def grouped_force(
     grown = ((turned * cof).sum((-2, -1)) / rest.clamp(min=torch.finfo(rest.dtype).tiny)).clamp(min=0)
     growth = grown.clamp(min=torch.finfo(rest.dtype).tiny).sqrt()
     across = (turned * pulled[..., None, :]).sum(-1) / growth[..., None]  # T v_r
-    dots = (patches.vector * pulled[patches.point]).sum(-1, keepdim=True)
-    sign = torch.where(dots < 0, -1.0, 1.0)
-    signed = sums(sign * patches.vector, patches.point, len(relative))
-    facing = (cof * signed[..., None, :]).sum(-1)  # s
+    facing = torch.zeros_like(across)
+    if law in ("paper", "cross_flow") or unit_tangent or not _is_zero(lift):
+        dots = (patches.vector * pulled[patches.point]).sum(-1, keepdim=True)
+        sign = torch.where(dots < 0, -1.0, 1.0)
+        signed = sums(sign * patches.vector, patches.point, len(relative))
+        facing = (cof * signed[..., None, :]).sum(-1)  # s
     area = growth * rest
     pressed = torch.zeros_like(across)
     if law == "cross_flow":
@@ -226,6 +228,13 @@ def grouped_force(
         cap = (max_area_ratio / growth).clamp(max=1.0)
         scale, area = scale * cap, area * cap
     return scale[..., None] * terms, area
+
+
+def _is_zero(coefficient: Tensor | float) -> bool:
+    """True for a coefficient that is known to be zero without waiting for a GPU."""
+    if isinstance(coefficient, Tensor):
+        return not (coefficient.is_cuda or coefficient.requires_grad) and float(coefficient) == 0
+    return coefficient == 0
 
 
 def _length(x: Tensor) -> Tensor:

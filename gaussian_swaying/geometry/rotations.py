@@ -101,11 +101,13 @@ def turn_of(turn: Tensor) -> Tensor:
     Returns:
         Shape (..., 3, 3).
     """
-    sine, cosine = rodrigues(turn)
+    sine, cosine = (part[..., None] for part in rodrigues(turn))
     x, y, z = turn.unbind(-1)
     zero = torch.zeros_like(x)
     cross = torch.stack([zero, -z, y, z, zero, -x, -y, x, zero], dim=-1).unflatten(-1, (3, 3))
-    return sine[..., None] * cross + cosine[..., None] * (cross @ cross)
+    outer = turn[..., :, None] * turn[..., None, :]
+    square = turn.square().sum(-1)[..., None, None] * torch.eye(3, dtype=turn.dtype, device=turn.device)
+    return torch.addcmul(sine * cross, cosine, outer - square)
 
 
 def rotation_of(turn: Tensor) -> Tensor:

@@ -45,7 +45,7 @@ MOST_UNKNOWNS = 150_000
 """A body with more is refused: its factor would fill the memory."""
 KEPT = 32
 """Analyses in the cache."""
-_VERSION = 2  # of the analysis, in the name of the file
+_VERSION = 3  # of the analysis, in the name of the file
 
 
 @dataclass(frozen=True)
@@ -54,8 +54,9 @@ class Analysis:
 
     Attributes:
         square: Squares of the circular frequencies [1/s²], ascending, shape (M,).
-        shape: Displacement of the nodes, normalised by the mass [1/sqrt(kg)], shape (3G, M).
-        turn: Rotation of the nodes [1/(m sqrt(kg))], shape (3G, M).
+        node: The nodes that move, shape (N,).
+        shape: Their displacement, normalised by the mass [1/sqrt(kg)], shape (3N, M).
+        turn: Their rotation [1/(m sqrt(kg))], shape (3N, M).
         site: The site of each point, shape (P,): the points that have the same nodes move as one.
         site_shape: As ``shape``, of the sites, shape (3S, M).
         site_turn: As ``turn``, of the sites, shape (3S, M).
@@ -68,6 +69,7 @@ class Analysis:
     """
 
     square: np.ndarray
+    node: np.ndarray
     shape: np.ndarray
     turn: np.ndarray
     site: np.ndarray
@@ -371,6 +373,7 @@ class Structure:
             np.add.at(total, self.site, self.point_mass[:, None] * field)
             return total / own[:, None]
 
+        node = np.flatnonzero(shape.reshape(self.nodes, -1).any(1))
         boundaries = len(self.total.kinds)
         reaction, direct = np.zeros((boundaries, 3, modes)), np.zeros((boundaries, sites))
         forces = (self.stiffness @ shape).reshape(self.nodes, 3, modes)
@@ -385,8 +388,9 @@ class Structure:
                 reaction[k] += (np.asarray(size)[:, :, None] * pull).sum(0)
         return Analysis(
             square=square,
-            shape=shape,
-            turn=turn.reshape(3 * self.nodes, modes),
+            node=node,
+            shape=shape.reshape(self.nodes, -1)[node].reshape(-1, modes),
+            turn=turn[node].reshape(-1, modes),
             site=self.site,
             site_shape=at_sites(self.at_points(shape).reshape(self.count, -1)).reshape(3 * sites, modes),
             site_turn=at_sites(turn_points.reshape(self.count, -1)).reshape(3 * sites, modes),

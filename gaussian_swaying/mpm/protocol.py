@@ -108,6 +108,11 @@ class Solver(nn.Module, ABC):
         return self.points
 
     @property
+    def exact(self) -> bool:
+        """True if no substep is unstable, however fast the waves and however strong the drag."""
+        return False
+
+    @property
     def has_kernels(self) -> bool:
         """True if compiled kernels are used where no gradient is needed."""
         return False

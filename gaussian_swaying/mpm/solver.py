@@ -274,6 +274,11 @@ class MPMSolver(Solver):
         return obstacle
 
     @property
+    def exact(self) -> bool:
+        """True for ``modes``, whose substeps are exact and whose drag is implicit."""
+        return isinstance(self._bound, Modes)
+
+    @property
     def has_kernels(self) -> bool:
         """True if the substep of the kernels is used where no gradient is needed."""
         return self._bound is not None and self._fused_obstacle is None
@@ -579,8 +584,7 @@ class MPMSolver(Solver):
             The state ``steps * dt`` later, and the largest Courant number seen, a scalar tensor.
         """
         acting, steps = as_forces(forces), check_begin(self.bound, state, dt, steps, check)
-        exact = isinstance(self.bound, Modes)  # in one piece, as no substep is unstable
-        marks, end, seen = [steps] if exact else look_marks(steps, looks), state, []
+        marks, end, seen = [steps] if self.exact else look_marks(steps, looks), state, []
         fused = self._fused_for(state, acting) if self.stiffness_damping == 0 else None
         if fused is not None and fused.watches:
             end, cells = fused.rollout(state, dt, steps, acting, looks=marks, watch=watch)

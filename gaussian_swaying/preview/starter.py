@@ -41,7 +41,7 @@ aero:
 aero:
   C_D: {s.drag:<25.4g}# {why}
   C_F: {0.05 * s.drag:<25.4g}
-  C_L: {0.01 * s.drag:<25.4g}
+  C_L: 0.0
   air_density: 1.225            # kg/m^3
   law: projected
   drag_step: semi_implicit{added}

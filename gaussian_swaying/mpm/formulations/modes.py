@@ -81,18 +81,23 @@ class Modes(Total):
 
         mass = points.mass.detach().sum(-1)
         norm = mass.rsqrt()[..., None, None]
-        self.shape, self.turn = norm * stacked("shape"), norm * stacked("turn")
+        # all scenes have the nodes of the one with most; those that fill up are the first node, with a shape of zero
+        most = max(len(one.node) for one in found)
+        nodes = torch.stack([torch.nn.functional.pad(torch.as_tensor(one.node), (0, most - len(one.node))) for one in found])
+        self.node = nodes.to(like.device).reshape(*batch, most)
         site = torch.stack([torch.as_tensor(one.site) for one in found]).to(like.device)
         sites = int(site.amax()) + 1
         self.site = site.reshape(*batch, count)
         self.sites = sites
 
-        def padded(name: str) -> Tensor:
+        def padded(name: str, count: int) -> Tensor:
             rows = [torch.as_tensor(getattr(one, name))[:, :modes].reshape(-1, 3, modes) for one in found]
-            every = torch.stack([torch.nn.functional.pad(row, (0, 0, 0, 0, 0, sites - len(row))) for row in rows])
-            return norm * every.to(like.device, like.dtype).reshape(*batch, 3 * sites, modes)
+            every = torch.stack([torch.nn.functional.pad(row, (0, 0, 0, 0, 0, count - len(row))) for row in rows])
+            return norm * every.to(like.device, like.dtype).reshape(*batch, 3 * count, modes)
 
-        self.site_shape, self.site_turn = padded("site_shape"), padded("site_turn")
+        self.shape, self.turn = padded("shape", most), padded("turn", most)
+        self.site_modes = torch.cat([padded("site_shape", sites), padded("site_turn", sites)], -2)
+        self.site_shape = self.site_modes[..., : 3 * sites, :]
         direct = torch.stack([
             torch.nn.functional.pad(torch.as_tensor(one.direct), (0, sites - one.direct.shape[1])) for one in found
         ])  # fmt: skip
@@ -107,6 +112,7 @@ class Modes(Total):
         self.firsts = (firsts.reshape(batch) * unit).sqrt()
         self.first = float(self.firsts.amax())
         self._square = in_double(stacked("square", torch.float64)) * unit[..., None]
+        self._unlost = torch.zeros(self.site_mass.shape, dtype=torch.bool, device=like.device)
         self.dropped = max(one.dropped for one in found)
         self._forces: dict[int, tuple[weakref.ref[Force], Force | None]] = {}
 
@@ -142,8 +148,8 @@ class Modes(Total):
         """Share of the points in the elastic and the kinetic energy of each mode, shape (..., P, M) each."""
         body = self.body
         mu, lam = body.laws.mu.detach(), body.laws.lam.detach()
-        nodes, modes = self.grid.node_count, self.shape.shape[-1]
-        field = self.shape.reshape(*self.shape.shape[:-2], nodes, 3 * modes)
+        modes = self.shape.shape[-1]
+        field = self._everywhere(self.shape.unflatten(-2, (-1, 3)).flatten(-2))
         slope = gather(field, self.stencil).unflatten(-1, (3, modes))[..., 1:4, :, :]
         speed = gather(field.unflatten(-1, (3, modes)).square().sum(-2), self.stencil)[..., 0, :]
         strain = 0.5 * (slope + slope.transpose(-3, -2))
@@ -185,13 +191,13 @@ class Modes(Total):
 
     def _site_state(self, q: Tensor, p: Tensor, like: MPMState, time: Tensor) -> State:
         """The sites as points that turn without strain, by amplitudes and their rates."""
-        shift = _vectors(self.site_shape, torch.stack([q, p], -1))
-        turn = _vectors(self.site_turn, q[..., None])[..., 0]
+        shift, turn = (self.site_modes @ torch.stack([q, p], -1)).unflatten(-2, (2, -1, 3)).unbind(-4)
+        turn = turn[..., 0]
         R = rotation_of(turn)
         velocity = _turned(R, shift[..., 1])
-        lost = torch.zeros(velocity.shape[:-1], dtype=torch.bool, device=velocity.device)
-        place = self.site_rest + warped(turn, shift[..., 0])
-        return State(position=place, velocity=velocity, F_elastic=R, F_total=R, lost=lost, time=time)
+        moved = shift[..., 0]
+        place = self.site_rest + moved + 0.5 * torch.linalg.cross(turn, moved)  # second order, for the wind there
+        return State(position=place, velocity=velocity, F_elastic=R, F_total=R, lost=self._unlost, time=time)
 
     # ---- steps
 
@@ -199,17 +205,28 @@ class Modes(Total):
         """The state at time zero; of a first velocity remains what the modes can show."""
         state = super().first_state(velocity, margin)
         assert state.node_velocity is not None
-        p = (self.node_mass[..., None] * state.node_velocity).flatten(-2)
-        p = (p[..., None, :] @ self.shape)[..., 0, :]
+        p = self._project(self.node_mass[..., None] * state.node_velocity)
         return self.shown(state, torch.zeros_like(p), p)
 
     def shown(self, state: MPMState, q: Tensor, p: Tensor) -> MPMState:
         """The state with nodes and points where amplitudes and their rates, shape (..., M), place them."""
         shift = _vectors(self.shape, torch.stack([q, p], -1))
         turn = _vectors(self.turn, q[..., None])[..., 0]
-        velocity = _turned(rotation_of(turn), shift[..., 1])
+        moved = torch.cat([warped(turn, shift[..., 0]), _turned(rotation_of(turn), shift[..., 1])], -1)
+        displacement, velocity = self._everywhere(moved).split(3, -1)
         state = state.replace(modal=torch.stack([q, p], -2))
-        return self.in_shape(self.read_particles(state, warped(turn, shift[..., 0]), velocity))
+        return self.in_shape(self.read_particles(state, displacement.contiguous(), velocity.contiguous()))
+
+    def _everywhere(self, values: Tensor) -> Tensor:
+        """Values of the nodes that move (..., N, K) on all nodes, zero on the others, shape (..., G, K)."""
+        index = self.node[..., None].expand_as(values)
+        shape = (*values.shape[:-2], self.grid.node_count, values.shape[-1])
+        return values.new_zeros(shape).scatter_add(-2, index, values)
+
+    def _project(self, nodal: Tensor) -> Tensor:
+        """Loads or momenta of the nodes (..., G, 3) on the modes, shape (..., M)."""
+        own = nodal.gather(-2, self.node[..., None].expand(*self.node.shape, 3)).flatten(-2)
+        return (own[..., None, :] @ self.shape)[..., 0, :]
 
     def amplitudes(self, state: MPMState) -> tuple[Tensor, Tensor]:
         """Amplitudes [m sqrt(kg)] and their rates, shape (..., M) each; those of another solver are projected."""
@@ -217,10 +234,8 @@ class Modes(Total):
             return state.modal[..., 0, :], state.modal[..., 1, :]
         assert state.node_displacement is not None
         assert state.node_velocity is not None
-        both = torch.stack([state.node_displacement, state.node_velocity], -3)
-        moment = (self.node_mass[..., None, :, None] * both).flatten(-2)
-        found = moment @ self.shape
-        return found[..., 0, :], found[..., 1, :]
+        mass = self.node_mass[..., None]
+        return self._project(mass * state.node_displacement), self._project(mass * state.node_velocity)
 
     def rollout(
         self,
@@ -240,7 +255,7 @@ class Modes(Total):
         decay, sine, cosine = _oscillation(square, alpha, dt)
         gain = (decay * sine / inertia).to(q)  # of the velocity by a load
         own = [x.to(q) for x in (decay * (cosine + alpha * sine), decay * sine, decay * (cosine - alpha * sine))]
-        square, still = square.to(q), (square * inertia).to(q)
+        back, still = square.to(q) * own[1], (square * inertia).to(q)
         gravity = self.gravity.to(q)
         work, impulse, drag, solve = state.work, state.impulse, None, None
         lagging = self._lagging(state, forces, groups)
@@ -261,12 +276,15 @@ class Modes(Total):
             outer = self._pull(seen.F_total, load)
             if general is not None:
                 outer = outer + general[0]
-            weight = self._pull(seen.F_total, self.site_mass[..., None] * gravity)
-            free = own[2] * p - square * own[1] * q + gain * (outer + weight)
+            pulled = outer
+            if any(self.settings.gravity):
+                pulled = outer + self._pull(seen.F_total, self.site_mass[..., None] * gravity)
+            free = own[2] * p - back * q + gain * pulled
             new = free if drag is None else free + solve(-0.5 * gain * _product(drag, free - p))
             if drag is not None:
-                outer = outer - 0.5 * _product(drag, new - p)
-            rest = (outer + weight) / still
+                lost = 0.5 * _product(drag, new - p)
+                outer, pulled = outer - lost, pulled - lost
+            rest = pulled / still
             after = rest + own[0] * (q - rest) + own[1] * p
             work = work + in_double(outer * (after - q)).sum(-1)
             mean = 0.5 * (q + after)
@@ -337,7 +355,7 @@ class Modes(Total):
 
         def at(q: Tensor, p: Tensor, time: Tensor) -> tuple[Tensor, Tensor | None]:
             now = self.shown(state.replace(time=time), q, p)
-            turn = _vectors(self.turn, q[..., None])[..., 0]
+            turn = self._everywhere(_vectors(self.turn, q[..., None])[..., 0])
             load, drag = None, None
             for force in others:
                 value, against = split(force(now), force, now)
@@ -345,11 +363,11 @@ class Modes(Total):
                 if against is not None:
                     drag = against if drag is None else drag + against
             assert load is not None
-            local = _turned(rotation_of(-turn), scatter(self.stencil, load[..., None, :])).flatten(-2)
-            pulled = (local[..., None, :] @ self.shape)[..., 0, :]
+            pulled = self._project(_turned(rotation_of(-turn), scatter(self.stencil, load[..., None, :])))
             if drag is None:
                 return pulled, None
-            lumped = scatter(self.stencil, drag[..., None, None])[..., 0].repeat_interleave(3, -1)[..., None]
+            lumped = scatter(self.stencil, drag[..., None, None])[..., 0].gather(-1, self.node)
+            lumped = lumped.repeat_interleave(3, -1)[..., None]
             return pulled, self.shape.mT @ (lumped * self.shape)
 
         return at
