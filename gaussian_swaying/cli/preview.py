@@ -165,29 +165,25 @@ def preview_scene(options: argparse.Namespace, folder: Path) -> Preview:
     wanted = ("surface" if leafy else "grid") if options.connected == "auto" else options.connected
     suggestion = replace(suggestion, connected=wanted)
     begin = Stopwatch()
-    made: dict[float, tuple[Suggestion, Simulation, Any]] = {}  # the starter with several grids
 
-    def make(suggestion: Suggestion) -> None:
-        made[suggestion.dx] = _natural(suggestion, options, part)
+    def build(of: Suggestion) -> tuple[Simulation, Any]:
+        return _tried(of, lambda own: starter_yaml(own, options.scene, options.frames), options.device, part)
 
-    make(suggestion)
-    startup = LOADED + read + begin.quiet
+    simulation, settings = build(suggestion)
     if options.connected == "auto" and wanted == "surface":
-        simulation = made[suggestion.dx][1]
         why = why_apart(simulation.scene, suggestion.dx, classify(simulation).pinned)
         suggestion = replace(suggestion, connected_reason=why or "", connected="grid" if why is None else "surface")
         if why is None:
-            make(suggestion)
-        else:
-            first = made[suggestion.dx]
-            made[suggestion.dx] = (replace(first[0], connected_reason=why), *first[1:])
-    settings = made[suggestion.dx][2]
+            simulation, settings = build(suggestion)
+    made = {suggestion.dx: _natural(suggestion, simulation, build)}  # the starter with several grids
+    startup = LOADED + read + begin.quiet
     if settings.scene.ply != str(Path(options.scene).resolve()):
         raise ValueError(f"The path {options.scene!r} has another meaning in YAML: rename the file, without a colon.")
 
     def measure(dx: float) -> Cost:
         if dx not in made:
-            make(replace(suggestion, dx=dx))
+            finer = replace(suggestion, dx=dx)
+            made[dx] = _natural(finer, build(finer)[0], build)
         cost = estimate_cost(made[dx][1], options.frames, startup)
         return cost if part is cloud else with_whole(cost, made[dx][1], cloud)
 
@@ -198,7 +194,7 @@ def preview_scene(options: argparse.Namespace, folder: Path) -> Preview:
         wish, finest = 60 * options.minutes, finest_spacing(suggestion)
         cost = finest_within(measure, wish, cost, cost, finest, grids["draft"])
         chosen_quality = f"--minutes {options.minutes:g}"
-    suggestion, simulation, _ = made[cost.dx]
+    suggestion, simulation = made[cost.dx]
     suggestion = replace(suggestion, quality=chosen_quality)
     parts = suggestion.parts
     if parts is not None:
@@ -277,19 +273,14 @@ def preview_config(options: argparse.Namespace) -> Preview:
 
 
 def _natural(
-    suggestion: Suggestion, options: argparse.Namespace, cloud: GaussianCloud
-) -> tuple[Suggestion, Simulation, Any]:
-    """The suggestion with the numbers of its kind, its simulation, and the settings."""
-
-    def made(of: Suggestion) -> tuple[Simulation, Any]:
-        return _tried(of, lambda own: starter_yaml(own, options.scene, options.frames), options.device, cloud)
-
-    simulation, settings = made(suggestion)
+    suggestion: Suggestion, simulation: Simulation, build: Callable[[Suggestion], tuple[Simulation, Any]]
+) -> tuple[Suggestion, Simulation]:
+    """The suggestion with the numbers of its kind, and its simulation, which has them."""
     if suggestion.sways:
         suggestion = with_natural(suggestion, natural_of(suggestion, simulation))
         if not suggestion.by_modes:
-            simulation, settings = made(suggestion)
-    return suggestion, simulation, settings
+            simulation = build(suggestion)[0]
+    return suggestion, simulation
 
 
 def natural_of(suggestion: Suggestion, simulation: Simulation) -> Natural:

@@ -8,7 +8,8 @@ The stiffness matrix of the ``total`` formulation at rest is constant, so a few 
 - **Shift.** Captures have bits that hang on a corner of a cell; the lowest eigenvectors are theirs. :math:`K + s M` with
   :math:`s = (\omega_1 / 2)^2` tames them, where :math:`\omega_1` is the first frequency that is found with the shift
   itself, starting from a stiff guess.
-- **First frequency.** Rayleigh's quotient of the shape in which the body leans in the wind.
+- **First frequency.** That of the mode that moves most in a level wind, near Rayleigh's quotient of the lean, in the
+  softer direction.
 - **Modes.** Load-dependent Ritz vectors (Wilson, Yuan & Dickens 1982, Earthq. Eng. Struct. Dyn. 10:813) in place of
   eigenvectors: the answers to loads along three axes, on the whole and on clusters of points, and the answers to their
   inertia. Modes below :data:`LOOSE` of the first frequency are loose bits and are left out.
@@ -35,8 +36,12 @@ if TYPE_CHECKING:
 
 SHIFT = 0.5
 """Frequency of the shift over the first one."""
-LOOSE = 0.4
+LOOSE = 0.6
 """Frequency over the first one below which a mode is a loose bit."""
+NEAR = (0.6, 1.5)
+"""Frequencies over Rayleigh's quotient of the lean between which the first mode is looked for."""
+BITS = 0.03
+"""Share of the mass that moves in a mode of a few bits, at most."""
 CLUSTERS = 24
 """Clusters of points that are loaded one by one."""
 STIFF_ROW = 1e4
@@ -45,7 +50,7 @@ MOST_UNKNOWNS = 150_000
 """A body with more is refused: its factor would fill the memory."""
 KEPT = 32
 """Analyses in the cache."""
-_VERSION = 3  # of the analysis, in the name of the file
+_VERSION = 7  # of the analysis, in the name of the file
 
 
 @dataclass(frozen=True)
@@ -62,9 +67,7 @@ class Analysis:
         site_turn: As ``turn``, of the sites, shape (3S, M).
         reaction: Force on each boundary by the amplitudes, shape (B, 3, M).
         direct: Share of the load on a site that each boundary takes directly, shape (B, S).
-        first: Square of the circular frequency of the lean [1/s²].
-        lean: Displacement of the points that lean in a wind along each axis with this frequency, of unit mean square
-            over the mass, shape (3, P, 3).
+        first: Square of the first circular frequency [1/s²].
         dropped: Number of modes that were left out as loose bits.
     """
 
@@ -78,7 +81,6 @@ class Analysis:
     reaction: np.ndarray
     direct: np.ndarray
     first: float
-    lean: np.ndarray
     dropped: int
 
 
@@ -295,17 +297,16 @@ class Structure:
         parts = [along[j][:, k] - along[k][:, j] for j, k in ((1, 2), (2, 0), (0, 1))]
         return 0.5 * np.stack(parts, 1)
 
-    def analyse(self, most: int) -> Analysis:
+    def analyse(self, most: int, guess: float | None = None) -> Analysis:
         """Find the modes.
 
         Args:
             most: Largest number of modes.
+            guess: Square of the first circular frequency, if it is roughly known [1/s²]; it saves time.
 
         Raises:
             ValueError: If nothing holds the body or it is too large.
         """
-        import scipy.linalg as linalg
-
         S = self.spread
         if S.shape[1] > MOST_UNKNOWNS:
             raise ValueError(
@@ -314,31 +315,22 @@ class Structure:
             )
         K, M = self.reduced(self.stiffness)
         load = self.loads(CLUSTERS)
-        whole = S.T @ load[:, :3]
-        shift = self._first_guess()
-        for _ in range(8):
+        whole = S.T @ load[:, :2]
+        shift = _power_of_two(self._first_guess() if guess is None else SHIFT**2 * guess)
+        for _ in range(12):
             solve = factor(K + shift * M)
-            lean = solve(whole)
-            first = rayleigh(K, M, lean)
-            if SHIFT**2 * first > 0.5 * shift:
+            first = rayleigh(K, M, solve(whole))
+            following = _power_of_two(SHIFT**2 * first)
+            if following == shift or (following > shift and guess is None):
                 break
-            shift = SHIFT**2 * first
+            shift = following
         blocks = [solve(S.T @ load)]
         blocks.append(solve(M @ np.linalg.qr(blocks[0])[0]))
-        R = np.concatenate(blocks, 1)
-        for _ in range(2):  # the second time it is exact
-            R = R / np.maximum(np.sqrt((R * (M @ R)).sum(0)), 1e-300)
-            size, axes = np.linalg.eigh(R.T @ (M @ R))
-            keep = size > 1e-9 * size.max()
-            R = R @ (axes[:, keep] / np.sqrt(size[keep]))
-        square, turn = linalg.eigh(_symmetric(R.T @ (K @ R)), _symmetric(R.T @ (M @ R)))
+        square, modes = reduced_modes(K, M, np.concatenate(blocks, 1))
+        first = min(square[k] for k in _main(square, modes.T @ whole, first, self._mass_share(S @ modes)))
         dropped = int((square < LOOSE**2 * first).sum())
         chosen = np.arange(dropped, min(dropped + most, len(square)))
-        shape = S @ (R @ turn[:, chosen])
-        lean = S @ lean
-        at = self.at_points(lean)
-        at = at / np.sqrt((self.point_mass[:, None, None] * at**2).sum((0, 1)))
-        return self._result(square[chosen], shape, first, at.transpose(2, 0, 1), dropped)
+        return self._result(square[chosen], S @ modes[:, chosen], float(first), dropped)
 
     def _first_guess(self) -> float:
         """A shift that is too large: the square of the frequency of a wave along the body."""
@@ -359,9 +351,12 @@ class Structure:
             found[:, axis, :, axis] = nodal
         return found.reshape(3 * self.nodes, -1)
 
-    def _result(
-        self, square: np.ndarray, shape: np.ndarray, first: float, lean: np.ndarray, dropped: int
-    ) -> Analysis:
+    def _mass_share(self, shape: np.ndarray) -> np.ndarray:
+        """Share of the mass that moves in some shapes (3G, M), as if all of it moved alike, shape (M,)."""
+        square = (shape.reshape(self.nodes, 3, -1) ** 2).sum(1)
+        return (self.mass @ square) ** 2 / np.maximum(self.mass.sum() * (self.mass @ square**2), 1e-300)
+
+    def _result(self, square: np.ndarray, shape: np.ndarray, first: float, dropped: int) -> Analysis:
         modes, sites = shape.shape[1], int(self.site.max()) + 1
         turn_points = self.turn_at_points(shape)
         weighted = (self.value.T @ (self.point_mass[:, None] * turn_points.reshape(self.count, -1)))
@@ -397,15 +392,43 @@ class Structure:
             reaction=reaction,
             direct=direct,
             first=first,
-            lean=lean,
             dropped=dropped,
         )
 
 
+def reduced_modes(K: Any, M: Any, vectors: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Modes within the span of some vectors (n, k): squares of frequencies, ascending, and shapes of unit mass."""
+    import scipy.linalg as linalg
+
+    R = vectors
+    for _ in range(2):  # the second time it is exact
+        R = R / np.maximum(np.sqrt((R * (M @ R)).sum(0)), 1e-300)
+        size, axes = np.linalg.eigh(R.T @ (M @ R))
+        keep = size > 1e-9 * size.max()
+        R = R @ (axes[:, keep] / np.sqrt(size[keep]))
+    square, turn = linalg.eigh(_symmetric(R.T @ (K @ R)), _symmetric(R.T @ (M @ R)))
+    return np.maximum(square, 1e-300), R @ turn
+
+
+def _power_of_two(value: float) -> float:
+    """The nearest power of two, so that a shift does not depend on where the search for it began."""
+    return float(2.0 ** np.round(np.log2(value)))
+
+
 def rayleigh(K: Any, M: Any, shapes: np.ndarray) -> float:
-    """Rayleigh's quotient of leans along x, y and z, shape (n, 3), for a level wind: the lower one of x and y."""
-    quotient = (shapes * (K @ shapes)).sum(0) / (shapes * (M @ shapes)).sum(0)
-    return float(quotient[:2].min())
+    """Rayleigh's quotient of the leans along x and y (n, 2): the lower one."""
+    return float(((shapes * (K @ shapes)).sum(0) / (shapes * (M @ shapes)).sum(0)).min())
+
+
+def _main(square: np.ndarray, pull: np.ndarray, about: float, share: np.ndarray) -> list[int]:
+    """The mode that moves most under each of some loads (M, k), among those near the square of a frequency.
+
+    A mode counts in which more than a few bits move, by the ``share`` of the mass that moves (M,), if there is one.
+    """
+    near = (square > NEAR[0] ** 2 * about) & (square < NEAR[1] ** 2 * about)
+    near = near & (share > BITS) if (near & (share > BITS)).any() else near
+    moved = np.abs(pull / square[:, None])
+    return [int(k) for k in (moved * near[:, None] if near.any() else moved).argmax(0)]
 
 
 def _symmetric(matrix: np.ndarray) -> np.ndarray:
@@ -423,7 +446,7 @@ def factor(matrix: Any) -> Any:
 # ---- the cache
 
 
-def analysis_of(total: Total, scene: int, most: int) -> Analysis:
+def analysis_of(total: Total, scene: int, most: int, guess: float | None = None) -> Analysis:
     """The modes of a scene, from the cache if the same body was analysed before.
 
     The cache is in the folder of compiled kernels, by the content of the body: its points, pins, relative masses and
@@ -433,12 +456,13 @@ def analysis_of(total: Total, scene: int, most: int) -> Analysis:
         total: The body, bound to its grid.
         scene: Which scene of a batch.
         most: Largest number of modes.
+        guess: See :meth:`Structure.analyse`.
     """
     path = cache_folder() / f"modes_{_content(total, scene, most)}.npz"
     numbers = _numbers(total, scene)
     found = _read(path, numbers)
     if found is None:
-        found = Structure(total, scene).analyse(most)
+        found = Structure(total, scene).analyse(most, guess)
         _write(path, found, numbers)
     return found
 

@@ -2,8 +2,8 @@ r"""Stiffness, mass and drag with which a thing sways as its kind does in nature
 
 First frequency :math:`\omega_1` and mass per frontal area :math:`M_A` alone decide how far a thing leans in a wind U, by
 :math:`\rho C_D U^2 / (2 M_A \omega_1^2)`. Mass and drag of the whole are those of the kind on the silhouette that is
-seen; the stiffness of the grid that runs is scaled until Rayleigh's quotient of the lean is the first frequency of the
-kind and height. Leaves on stems have a frequency of their own, with the stems pinned.
+seen; the stiffness of the grid that runs is scaled until the main mode of the lean has the first frequency of the kind and
+height. Leaves on stems have a frequency of their own, with the stems pinned.
 """
 
 from __future__ import annotations
@@ -19,9 +19,9 @@ from gaussian_swaying.aero.wind import WindField
 from gaussian_swaying.aero.wind_force import WindForce
 from gaussian_swaying.geometry.groups import equal_rows
 from gaussian_swaying.mpm.body import Body
-from gaussian_swaying.mpm.formulations.modes import Modes
+from gaussian_swaying.mpm.formulations.modes import MOST_MODES, Modes
 from gaussian_swaying.mpm.formulations.total import Total
-from gaussian_swaying.mpm.modal import SHIFT, Structure, factor, rayleigh
+from gaussian_swaying.mpm.modal import SHIFT, Structure, analysis_of, factor, rayleigh
 from gaussian_swaying.mpm.solver import MPMSolver
 from gaussian_swaying.mpm.state import State
 from gaussian_swaying.preview.kinds import KINDS, Kind
@@ -107,11 +107,16 @@ def natural(simulation: Simulation, kind: Kind, flow: Tensor, intensity: float) 
             E[points.youngs_modulus == value] = modulus
         points = replace(points, mass=points.mass * thicker, volume=points.volume * thicker, youngs_modulus=E)
         simulation.adopt(replace(setup, points=points, aero=aero))
+        if used is stiffer:
+            whole = Total(Body(points, solver.framed(scene.frame)), setup.solver)
+            volume, own = points.volume.double(), points.mass.double().sum()
+            unit = float(own / ((points.youngs_modulus * volume).sum() / volume.sum()))
+            analysis_of(whole, 0, MOST_MODES, unit * (2 * math.pi * frequency) ** 2)  # is in the cache now
         simulation.solver.init_state(points, frame=scene.frame)
         bound = solver.bound
         assert isinstance(bound, Modes)
         used = stiffer
-        ratio = (2 * math.pi * frequency) ** 2 / float(bound.square[bound.main_mode(steady)])
+        ratio = (2 * math.pi * frequency) ** 2 / bound.first**2
         stiffer = {value: modulus * ratio for value, modulus in stiffer.items()}
     state = bound.leaning(steady)
     lean = _lean(state.position - points.position, points.position) if bool(flow.any()) else 0.0
@@ -158,13 +163,12 @@ def _stiffness(
     values = np.unique(E)
     target = (2 * math.pi * frequency) ** 2
     unit = mass / (structure.mean_modulus * thicker)  # of squares of frequencies, for the structure's own units
-    load = structure.loads(0)[:, :3]
+    load = structure.loads(0)[:, :2]
 
     def quotient(parts: list[tuple[float, object]], spread: object = None) -> float:
         K = structure.with_rows(sum(ratio * K for ratio, K in parts[1:]) + parts[0][0] * parts[0][1])  # type: ignore[operator]
         K, M = structure.reduced(K)
-        lean = factor(K + SHIFT**2 * target * unit * M)(structure.spread.T @ load)
-        return rayleigh(K, M, lean) / unit
+        return rayleigh(K, M, factor(K + SHIFT**2 * target * unit * M)(structure.spread.T @ load)) / unit
 
     if len(values) == 1:
         whole = structure.hooke()
@@ -177,9 +181,9 @@ def _stiffness(
     wanted = (2 * math.pi * max(kind.leaf, ABOVE * frequency)) ** 2
     leaf = wanted * unit / _on_pinned_stems(structure, leaves, soft, wanted * unit)
     low, high, stem = 1e-6, 1e12, leaf
-    for _ in range(12):
+    for _ in range(8):
         found = quotient([(leaf, leaves), (stem, stems)])
-        if abs(found / target - 1) < 0.01:
+        if abs(found / target - 1) < 0.1:  # the mode itself will be exact
             break
         low, high = (stem, high) if found < target else (low, stem)
         following = stem * (target / found) ** 1.3
@@ -198,10 +202,9 @@ def _on_pinned_stems(structure: Structure, leaves: object, soft: np.ndarray, tar
         return target
     K = leaves[index][:, index].tocsc()  # type: ignore[index]
     M = sparse.diags(np.repeat(structure.mass, 3)[index]).tocsc()
-    load, ratio = structure.loads(0)[index, :3], 1.0
-    for _ in range(3):
-        scaled = ratio * K
-        ratio *= target / rayleigh(scaled, M, factor(scaled + SHIFT**2 * target * M)(load))
+    load, ratio = structure.loads(0)[index, :2], 1.0
+    for _ in range(2):
+        ratio *= target / rayleigh(ratio * K, M, factor(ratio * K + SHIFT**2 * target * M)(load))
     return target / ratio
 
 

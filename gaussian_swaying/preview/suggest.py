@@ -356,7 +356,7 @@ def suggest(
     if front is not None:
         azimuth, turn = front, 0.0
     flow = _across_picture(azimuth, speed)
-    if held.end == "side" and flat is not None:  # along the sheet from the pole, and slightly onto it
+    if held.end == "side":  # along the sheet from the pole, and slightly onto it
         away = -frame.direction_to_sim(torch.tensor(held.direction, dtype=torch.float64))
         onto = torch.linalg.cross(torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64), away)
         flow = tuple(speed * float(c) for c in math.cos(0.25) * away + math.sin(0.25) * onto)

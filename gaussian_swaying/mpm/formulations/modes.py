@@ -53,7 +53,7 @@ class Modes(Total):
     Attributes:
         square: Squares of the circular frequencies of the modes [1/s²], shape (..., M).
         ratio: Damping ratios of the modes, shape (..., M).
-        first: Circular frequency of the lean in a wind [rad/s], the highest of all scenes.
+        first: First circular frequency [rad/s], the highest of all scenes.
 
     Raises:
         ValueError: If nothing holds the body, something touches it, a boundary moves it, or a law is plastic.
@@ -295,16 +295,6 @@ class Modes(Total):
                 watch(k + 1)
         state = state.replace(time=state.time + steps * dt, substep=dt, work=work, impulse=impulse)
         return self.shown(state, q, p)
-
-    @torch.no_grad()
-    def main_mode(self, force: Force) -> Tensor:
-        """The mode with most of the lean under a steady force, shape (...)."""
-        state = self.first_state(torch.zeros_like(self.body.points.position), 0)
-        q, p = self.amplitudes(state)
-        seen, group = self._site_state(q, p, state, state.time), self._grouped(force)
-        assert group is not None
-        load, _ = split(group(seen), group, seen)
-        return (in_double(self._pull(seen.F_total, load)) / self.square).abs().argmax(-1)
 
     @torch.no_grad()
     def leaning(self, force: Force, rounds: int = 40) -> MPMState:
