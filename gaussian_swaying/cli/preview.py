@@ -34,7 +34,7 @@ from gaussian_swaying.preview.cost import (
     with_whole,
 )
 from gaussian_swaying.preview.kinds import KINDS
-from gaussian_swaying.preview.natural import Natural, natural
+from gaussian_swaying.preview.natural import Natural, cloth_start, natural
 from gaussian_swaying.preview.photos import captured_from
 from gaussian_swaying.preview.picture import preview_picture, things_picture
 from gaussian_swaying.preview.place import Place, excerpt, near_things, survey
@@ -161,7 +161,7 @@ def preview_scene(options: argparse.Namespace, folder: Path) -> Preview:
     )  # fmt: skip
     if options.material is not None:
         suggestion = of_material(suggestion, options.material)
-    leafy = KINDS[suggestion.kind].material in ("leaf", "grass", "succulent")
+    leafy = suggestion.kind in ("plant", "succulent", "grass")  # whose leaves are seen one by one
     wanted = ("surface" if leafy else "grid") if options.connected == "auto" else options.connected
     suggestion = replace(suggestion, connected=wanted)
     begin = Stopwatch()
@@ -280,6 +280,9 @@ def _natural(
         suggestion = with_natural(suggestion, natural_of(suggestion, simulation))
         if not suggestion.by_modes:
             simulation = build(suggestion)[0]
+    elif KINDS[suggestion.kind].cloth and suggestion.fixed:
+        start = cloth_start(simulation, KINDS[suggestion.kind], suggestion.size)
+        suggestion = replace(suggestion, start=start)
     return suggestion, simulation
 
 

@@ -72,10 +72,10 @@ KINDS = {
     "plant": Kind("a plant in a pot", 1.0, 1.4, 0.9, 0.58, 0.04, "leaf", "stem", source=_TREES),
     "succulent": Kind("a succulent", 0.3, 2.7, 8.0, 0.8, 0.03, "succulent", "stem", leaf=8.0, source="estimates"),
     "grass": Kind("a tuft of grass", 0.5, 1.5, 0.5, 0.58, 0.06, "grass", "grass", source=_TREES),
-    "shrub": Kind("a shrub", 1.2, 1.75, 2.5, 0.57, 0.04, "leaf", "twig", source=_TREES),
-    "tree": Kind("a tree", 8.0, 1.55, 0.0, 0.45, 0.05, "leaf", "bark", mass_by_height=0.61, source=_TREES),
+    "shrub": Kind("a shrub", 1.2, 1.75, 2.0, 0.57, 0.04, "leaf", "twig", source=_TREES),
+    "tree": Kind("a tree", 8.0, 1.55, 0.0, 0.45, 0.05, "leaf", "bark", mass_by_height=0.8, source=_TREES),
     "sapling": Kind("a young tree", 2.5, 1.6, 2.0, 0.48, 0.04, "leaf", "bark", source=_TREES),
-    "conifer": Kind("a conifer", 8.0, 1.4, 0.0, 0.45, 0.04, "leaf", "bark", mass_by_height=0.6, source=_TREES),
+    "conifer": Kind("a conifer", 8.0, 1.4, 0.0, 0.45, 0.04, "leaf", "bark", mass_by_height=0.8, source=_TREES),
     "hanging": Kind("a hanging thing", 1.0, 0.5, 12.0, 0.6, 0.02, "wood", source="a pendulum; mass, drag: estimates"),
     "cloth": Kind("a hanging cloth", 1.0, None, 0.2, 1.0, 0.02, "fabric", source="fabric of 0.2 kg/m²"),
     "flag": Kind("a flag", 1.0, None, 0.12, 1.0, 0.02, "fabric", source="nylon of 0.12 kg/m²"),
@@ -148,7 +148,7 @@ def kind_of(
         scales = cloud.scales.detach()[index].exp().sort(-1, descending=True).values
         thread = float((scales[:, 0] / scales[:, 1].clamp(min=1e-30)).median())
         base = _width(means, height, axis, 0.0, 0.1) < 0.5 * wide
-        if thread > THREAD and base and leafy > 0.95:
+        if thread > THREAD and base and leafy > 0.8:
             return "grass", "thin and green, from one base"
         return "shrub", f"{leafy:.0%} of it is green"
     if end == "bottom" and TALL[0] < (high - low) / max(wide, 1e-30) < TALL[1]:

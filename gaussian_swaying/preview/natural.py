@@ -9,12 +9,14 @@ height. Leaves on stems have a frequency of their own, with the stems pinned.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
 from torch import Tensor
 
+from gaussian_swaying.aero.force import added_mass_per_area
 from gaussian_swaying.aero.wind import WindField
 from gaussian_swaying.aero.wind_force import WindForce
 from gaussian_swaying.geometry.groups import equal_rows
@@ -26,10 +28,12 @@ from gaussian_swaying.mpm.solver import MPMSolver
 from gaussian_swaying.mpm.state import State
 from gaussian_swaying.preview.kinds import KINDS, Kind
 from gaussian_swaying.preview.shape import quantile
-from gaussian_swaying.preview.stretch import typical_start
+from gaussian_swaying.preview.stretch import cloth_motion, linear_motion, rate_for, typical_start
 from gaussian_swaying.simulation.parameters import other_with
 from gaussian_swaying.simulation.simulation import Simulation
 
+FLAPS, HANGS, CLOTH_RATIO = 0.35, 0.6, 0.3
+"""Frequency of a flag times its length over the wind, of a hanging sheet times the root of its length; damping ratio."""
 MOST_LEAN = 0.4
 """Lean over the longest side above which modes will not do."""
 SILHOUETTE = 96
@@ -120,11 +124,33 @@ def natural(simulation: Simulation, kind: Kind, flow: Tensor, intensity: float) 
         stiffer = {value: modulus * ratio for value, modulus in stiffer.items()}
     state = bound.leaning(steady)
     lean = _lean(state.position - points.position, points.position) if bool(flow.any()) else 0.0
-    speed = float(flow.norm())
-    of_air = aero.air_density * kind.drag * speed / (4 * math.pi * frequency * kind.area_mass(height))
-    some = torch.from_numpy(place[np.flatnonzero(free)[:: max(1, int(free.sum()) // 8)]])
-    start = typical_start(simulation.wind, some, frequency, kind.damping_ratio + of_air)
+    shift = bound.at_sites(points.mass[:, None] * (state.position - points.position)).norm(dim=-1) / bound.site_mass
+    top = (shift >= quantile(shift, 0.9)).nonzero()[:, 0].cpu().numpy()
+    assert isinstance(simulation.wind, WindField)
+    start = 0.0
+    if bool(flow.any()):
+        start = typical_start(linear_motion(bound, steady, simulation.wind, top, rate_for(frequency)), frequency)
     return Natural(height, frequency, wanted, frontal, thicker, used, drag, lean, start)
+
+
+def cloth_start(simulation: Simulation, kind: Kind, size: Sequence[float]) -> float:
+    """Time at which a typical stretch of the wind begins for a cloth [s], by its pendulum or flapping.
+
+    Args:
+        simulation: The scene.
+        kind: ``cloth`` or ``flag``.
+        size: Sides of the cloth [m], z up.
+    """
+    wind, aero = simulation.wind, simulation.aero
+    if not isinstance(wind, WindField) or wind.uniform or not bool(wind.flows.any()):
+        return 0.0
+    frequency = FLAPS * float(wind.flows[0].norm()) / max(size)
+    if kind is KINDS["cloth"]:
+        carried = added_mass_per_area(sorted(size)[1], aero.air_density)
+        frequency = HANGS / math.sqrt(size[2]) * math.sqrt(kind.mass / (kind.mass + carried))
+    places = simulation.setup.points.position
+    places = places[:: max(1, len(places) // 8)]
+    return typical_start(cloth_motion(wind, places, frequency, CLOTH_RATIO), frequency)
 
 
 def silhouette(place: Tensor, flow: Tensor) -> float:
@@ -152,7 +178,8 @@ def _height(structure: Structure, free: np.ndarray, kind: Kind) -> float:
     if kind is KINDS["hanging"]:
         middle = float((structure.point_mass[free] * z[free]).sum() / structure.point_mass[free].sum())
         return max(float(z[~free].min() if (~free).any() else z.max()) - middle, 1e-3)
-    return max(quantile(torch.from_numpy(z[free]), 0.99) - quantile(torch.from_numpy(z[free]), 0.01), 1e-3)
+    foot = quantile(torch.from_numpy(z[~free]), 0.95) if (~free).any() else float(z.min())
+    return max(quantile(torch.from_numpy(z[free]), 0.99) - foot, 1e-3)
 
 
 def _stiffness(

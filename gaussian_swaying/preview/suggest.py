@@ -194,14 +194,16 @@ class Suggestion:
 
     @property
     def by_modes(self) -> bool:
-        """True if modes will do: it leans by less than :data:`MOST_LEAN`."""
-        return self.sways and (self.natural is None or self.natural.lean < MOST_LEAN)
+        """True if modes will do: it leans by less than :data:`MOST_LEAN`, or turns as one, which modes do exactly."""
+        little = self.natural is None or self.natural.lean < MOST_LEAN or self.kind == "hanging"
+        return self.sways and little
 
     @property
     def why_formulation(self) -> str:
         """Why it sways by modes or by material points, in words."""
         if self.by_modes:
-            return "it is held, nothing touches, and it leans by less than 40 %"
+            how = "turns as one" if self.kind == "hanging" else "leans by less than 40 %"
+            return f"it is held, nothing touches, and it {how}"
         if self.sways:
             return "it leans by more than 40 %, which modes cannot do"
         if self.real:
@@ -360,8 +362,9 @@ def suggest(
         away = -frame.direction_to_sim(torch.tensor(held.direction, dtype=torch.float64))
         onto = torch.linalg.cross(torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64), away)
         flow = tuple(speed * float(c) for c in math.cos(0.25) * away + math.sin(0.25) * onto)
-    elif flat is not None:  # a curtain is moved by wind that hits its face
+    elif flat is not None or name in ("hanging", "person"):  # what is flat is moved by wind that hits its face
         flow = _across_picture(azimuth - 90, speed)
+        turn = turn if flat is not None or front is not None else 50.0
     outside = upward.ground if shown is None else upward.ground | ~shown.mask
     if found_parts is not None:
         outside = outside | found_parts.around
