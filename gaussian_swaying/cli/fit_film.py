@@ -111,7 +111,7 @@ def prepare(options: argparse.Namespace, folder: Path) -> Path:
     if length is not None:
         longest = longest_side(*length, seen, preview)
         preview = _previewed(options, look, wanted | shown | {"longest_side": longest})
-    if weighed and not any(yaml.safe_load(preview.configurations["draft"])["solver"]["gravity"]):
+    if weighed and not any(yaml.safe_load(preview.configurations["starter"])["solver"]["gravity"]):
         raise ValueError(
             "`--length gravity` is for a sheet alone, or for what nothing holds: anything else was captured in balance "
             "with its weight. Give a length that you know."
@@ -241,7 +241,7 @@ def upright_in(camera: Camera, guess: Sequence[float]) -> list[str] | None:
 
 def _previewed(options: argparse.Namespace, folder: Path, wanted: dict[str, Any]) -> Preview:
     """The preview of the splat with some options of ``preview``."""
-    given = build_options().parse_args([str(options.splat), f"--device={options.device}"])
+    given = build_options().parse_args([str(options.splat), f"--device={options.device}", "--quality=draft"])
     vars(given).update(wanted)
     return preview_scene(given, folder)
 
@@ -312,7 +312,7 @@ def plan_text(preview: Preview, background: Sequence[float], still: float | None
         folder: Of the fit file.
     """
     guess = preview.data["suggestion"]
-    material = yaml.safe_load(preview.configurations["draft"])["material"]
+    material = yaml.safe_load(preview.configurations["starter"])["material"]
     assumed = ["mass", *(() if scaled else ("length",)), *(() if still is not None else ("camera",))]
     low, high = (float(f"{material['E'] * factor:.1e}") for factor in (SOFTER, STIFFER))
     middle, half = 0.0, 200.0  # more than all ways round, so that none is at an end of the range
@@ -325,10 +325,10 @@ def plan_text(preview: Preview, background: Sequence[float], still: float | None
     sizes = [float(f"{metres * factor:.2g}") for factor in (SHORTER, LONGER)]
     again = shlex.join([*program.words("fit"), "--config", str(folder / PLAN), "--output", str(folder / RESULT)])
     lines = [
-        (f"base: {LOOK}/draft.yaml", f"the splat, what holds it, its material: guesses; {LOOK}/starter.yaml is finer"),
+        (f"base: {LOOK}/starter.yaml", "the splat, what holds it, its material: guesses, on a coarse grid"),
         (f"videos: {CAMERAS}", "the part of the film that is used, and its camera"),
         ("known:", "replaces what the base says"),
-        ("  wind.modulations: []", "a steady wind"),
+        ("  wind.effects: []", "a steady wind"),
         (f"  background: {list(background)}", "around the splat in the film"),
         (f"  material.density: {material['density']:g}", "kg/m3; not measured"),
         (f"  material.thickness: {material['thickness']:.4g}", "m; with the density it makes the mass of an area"),

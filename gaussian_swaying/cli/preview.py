@@ -161,7 +161,7 @@ def preview_scene(options: argparse.Namespace, folder: Path) -> Preview:
     )  # fmt: skip
     if options.material is not None:
         suggestion = of_material(suggestion, options.material)
-    leafy = suggestion.kind in ("plant", "succulent", "grass")  # whose leaves are seen one by one
+    leafy = suggestion.kind in ("plant", "succulent")  # whose leaves are seen one by one
     wanted = ("surface" if leafy else "grid") if options.connected == "auto" else options.connected
     suggestion = replace(suggestion, connected=wanted)
     begin = Stopwatch()

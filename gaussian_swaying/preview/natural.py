@@ -202,6 +202,7 @@ def _stiffness(
         ratio = target / quotient([(1.0, whole)])
         for _ in range(2):  # the shift is that of the stiffness found
             ratio *= target / quotient([(ratio, whole)])
+        _check_loose(ratio)
         return {float(values[0]): ratio}
     soft = E == values[0]  # leaves have the lowest modulus
     leaves, stems = structure.hooke(soft), structure.hooke(~soft)
@@ -215,7 +216,17 @@ def _stiffness(
         low, high = (stem, high) if found < target else (low, stem)
         following = stem * (target / found) ** 1.3
         stem = following if low < following < high else math.sqrt(low * high)
+    _check_loose(stem)
     return {float(value): leaf if value == values[0] else stem for value in values}
+
+
+def _check_loose(ratio: float) -> None:
+    """Raise ValueError if no stiffness gives a thing its frequency, as most of it hangs loose."""
+    if not 1e-9 < ratio < 1e9:
+        raise ValueError(
+            "Most of it hangs loose, so that no stiffness gives it the frequency of its kind: use `--connected grid`, or "
+            "hold more of it."
+        )
 
 
 def _on_pinned_stems(structure: Structure, leaves: object, soft: np.ndarray, target: float) -> float:

@@ -41,7 +41,6 @@ def announced_and_taken(name: str, previewed: list[str], ran: list[str], device:
         runs = {"run": (data["cost"], ran)}
         if not ran:
             runs = {
-                "draft": (data["draft_cost"], ["--config", str(seen / "draft.yaml")]),
                 "starter": (data["cost"], ["--config", str(seen / "starter.yaml")]),
             }
         for kind, (cost, options) in runs.items():
