@@ -300,6 +300,8 @@ class WindForce(Force):
         else:
             normal, area = self.normal.expand(*site.shape, 3).reshape(-1, 3), self.area.expand(site.shape).reshape(-1)
             other.sums = PatchSums(Patches(normal, area, group, scenes * count), coarse=aero.mostly_linear)
+        area = other.sums.area.reshape(*site.shape[:-1], count)
+        other._buffers = {**self._buffers, "area": area, "normal": area.new_zeros(*area.shape, 3)}
         return other
 
     def twin(self) -> Twin | None:

@@ -17,6 +17,7 @@ import math
 import weakref
 from collections.abc import Callable, Sequence
 from functools import cached_property
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -29,7 +30,8 @@ from gaussian_swaying.mpm.boundaries.pinned_points import PinnedPoints
 from gaussian_swaying.mpm.boundaries.pinned_region import PinnedRegion
 from gaussian_swaying.mpm.boundaries.rigid_region import RigidRegion
 from gaussian_swaying.mpm.damping import decay_rate
-from gaussian_swaying.mpm.forces import Force, split
+from gaussian_swaying.kernels.launch import replaces
+from gaussian_swaying.mpm.forces import Force, split, tensors_of
 from gaussian_swaying.mpm.formulations.formulation import Settings
 from gaussian_swaying.mpm.formulations.total import Total
 from gaussian_swaying.mpm.modal import Analysis, analysis_of
@@ -114,6 +116,7 @@ class Modes(Total):
         self._square = in_double(stacked("square", torch.float64)) * unit[..., None]
         self._unlost = torch.zeros(self.site_mass.shape, dtype=torch.bool, device=like.device)
         self.dropped = max(one.dropped for one in found)
+        self._site_forces: Any = None
         self._forces: dict[int, tuple[weakref.ref[Force], Force | None]] = {}
 
     # ---- numbers that may have a gradient
@@ -189,9 +192,28 @@ class Modes(Total):
         mass = self.body.points.mass.detach()[..., None]
         return self.at_sites(mass * values) / self.site_mass[..., None].clamp(min=torch.finfo(mass.dtype).tiny)
 
-    def _site_state(self, q: Tensor, p: Tensor, like: MPMState, time: Tensor) -> State:
-        """The sites as points that turn without strain, by amplitudes and their rates."""
-        shift, turn = (self.site_modes @ torch.stack([q, p], -1)).unflatten(-2, (2, -1, 3)).unbind(-4)
+    def _kernel(
+        self, state: MPMState, groups: Sequence[Force | None], time: Tensor, dt: float, steps: int
+    ) -> Any:
+        """The kernel of the forces on the sites, with their numbers; None where torch computes them."""
+        twins = [force.twin() for force in groups if force is not None]
+        given = [state.position, *tensors_of([force for force in groups if force is not None]), *self.body.tensors()]
+        if not twins or None in twins or not replaces((state.position,)):
+            return None
+        if torch.is_grad_enabled() and any(tensor.requires_grad for tensor in (*state.tensors(), *given)):
+            return None
+        if self._site_forces is None:
+            from gaussian_swaying.mpm.triton.sites import SiteForces
+
+            with torch.inference_mode(False):
+                self._site_forces = SiteForces(self.site_rest)
+        with torch.inference_mode(False), torch.no_grad():
+            self._site_forces.prepare(twins, time, dt, steps)
+        return self._site_forces
+
+    def _site_state(self, moved: Tensor, time: Tensor) -> State:
+        """The sites as points that turn without strain, by their displacements and turns and the rates of both."""
+        shift, turn = moved.unflatten(-2, (2, -1, 3)).unbind(-4)
         turn = turn[..., 0]
         R = rotation_of(turn)
         velocity = _turned(R, shift[..., 1])
@@ -249,7 +271,8 @@ class Modes(Total):
         q, p = self.amplitudes(state)
         middle = state.time + 0.5 * dt
         groups = [self._grouped(force) for force in forces]
-        sources = [None if one is None else one.during(middle, dt, steps) for one in groups]
+        kernel = self._kernel(state, groups, middle, dt, steps)
+        sources = [None if one is None or kernel else one.during(middle, dt, steps) for one in groups]
         square, inertia, ratio = self.square, self.inertia, self.ratio
         alpha = ratio * square.sqrt()
         decay, sine, cosine = _oscillation(square, alpha, dt)
@@ -261,23 +284,32 @@ class Modes(Total):
         lagging = self._lagging(state, forces, groups)
         for k in range(steps):
             time = state.time + (k + 0.5) * dt
-            seen = self._site_state(q + 0.5 * dt * p, p, state, time)
-            load, resistance = torch.zeros_like(seen.velocity), None
-            for source, force in zip(sources, groups, strict=True):
-                if source is not None:
-                    assert force is not None
-                    value, against = split(source(seen, k), force, seen)
-                    load = load + value
-                    if against is not None:
-                        resistance = against if resistance is None else resistance + against
+            weighs, resistance = any(self.settings.gravity), None
+            moved = self.site_modes @ torch.stack([q + 0.5 * dt * p, p], -1)
+            seen = None if kernel and not weighs else self._site_state(moved, time)
+            if kernel is not None:
+                found = kernel(moved, k)
+                load, resistance = found[..., 3:6], found[..., 6]
+                outer = self._of_sites(found[..., :3])
+            else:
+                assert seen is not None
+                load = torch.zeros_like(seen.velocity)
+                for source, force in zip(sources, groups, strict=True):
+                    if source is not None:
+                        assert force is not None
+                        value, against = split(source(seen, k), force, seen)
+                        load = load + value
+                        if against is not None:
+                            resistance = against if resistance is None else resistance + against
+                outer = self._pull(seen.F_total, load)
             general = None if lagging is None else lagging(q, p, state.time + k * dt)
             if solve is None:
                 drag, solve = self._drag(resistance, general, gain)
-            outer = self._pull(seen.F_total, load)
             if general is not None:
                 outer = outer + general[0]
             pulled = outer
-            if any(self.settings.gravity):
+            if weighs:
+                assert seen is not None
                 pulled = outer + self._pull(seen.F_total, self.site_mass[..., None] * gravity)
             free = own[2] * p - back * q + gain * pulled
             new = free if drag is None else free + solve(-0.5 * gain * _product(drag, free - p))
@@ -309,15 +341,18 @@ class Modes(Total):
         group, square = self._grouped(force), self.square.to(q)
         assert group is not None
         for _ in range(rounds):
-            seen = self._site_state(q, p, state, state.time)
+            seen = self._site_state(self.site_modes @ torch.stack([q, p], -1), state.time)
             load, _ = split(group(seen), group, seen)
             q = 0.5 * (q + self._pull(seen.F_total, load) / square)
         return self.shown(state, q, p)
 
     def _pull(self, R: Tensor, load: Tensor) -> Tensor:
         """The load on the modes by forces on the sites, shape (..., M)."""
-        local = (R.mT @ load[..., None])[..., 0].flatten(-2)
-        return (local[..., None, :] @ self.site_shape)[..., 0, :]
+        return self._of_sites((R.mT @ load[..., None])[..., 0])
+
+    def _of_sites(self, local: Tensor) -> Tensor:
+        """The load on the modes by forces on the sites in their own axes, shape (..., M)."""
+        return (local.flatten(-2)[..., None, :] @ self.site_shape)[..., 0, :]
 
     def _drag(
         self, resistance: Tensor | None, general: tuple[Tensor, Tensor | None] | None, gain: Tensor
