@@ -109,7 +109,10 @@ def session_of(parser: ArgumentParser, settings: Namespace, real_time: bool) -> 
     simulation = Simulation.from_settings(parser, settings)
     if simulation.device.type == "cpu":
         share_cores()
-    if not real_time or settings.custom_solver is not None:
+    by_modes = settings.custom_solver is None and settings.solver.formulation == "modes"
+    if by_modes:  # their stiffness is that of the configured grid, on which they are in real time
+        print("The configured grid is kept, as the modes have their frequencies on it.", flush=True)
+    if by_modes or not real_time or settings.custom_solver is not None:
         return Session(parser, settings, simulation)
     choice = in_real_time(parser, settings, simulation)
     print(choice.sentence, flush=True)

@@ -131,7 +131,7 @@ def _summary(run: Path) -> dict[str, Any]:
         formulation = summary["formulation"]
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise ValueError(f"{run / 'summary.json'} cannot be read ({error}): run the simulation again.") from error
-    if formulation != "total":
+    if formulation not in ("total", "modes"):
         raise ValueError(
             f"The run in {run} is of `solver.formulation: {formulation}`, where nodes do not move with the material: "
             "a film needs a run of `total`."

@@ -57,7 +57,7 @@ def check(simulation: Simulation) -> None:
     if not isinstance(solver, MPMSolver):
         raise _refused("`custom_solver`", "leave it out")
     if solver.formulation != "total":
-        raise _refused("`solver.formulation: updated`", "set it to total")
+        raise _refused(f"`solver.formulation: {solver.formulation}`", "set it to total")
     if setup.scene.surface_places is not None and setup.scene.surface_places.contact is not None:
         raise _refused("`contact` of the material with itself", "set `contact` to null")
     if simulation.stepper.copies is not None:
