@@ -1,0 +1,102 @@
+"""The kernel of the forces on the sites of ``modes``, against torch.
+
+Covers: mpm.triton.site_kernels.
+"""
+
+import pytest
+import torch
+
+from gaussian_swaying import AeroForce, Box, MaterialPoints, MPMSolver, WindField, WindForce
+from gaussian_swaying.aero.effects import LogProfile
+from gaussian_swaying.aero.looks import look
+from gaussian_swaying.aero.patches import Patches
+from gaussian_swaying.mpm.boundaries.pinned_region import PinnedRegion
+from gaussian_swaying.mpm.formulations.modes import Modes
+
+DT, STEPS = 0.01, 4
+
+
+def post(device, scale=1.0):
+    """A post of 0.2 x 0.2 x 1 m with two patches of random directions on each point."""
+    axes = (torch.linspace(0, 0.2, 4), torch.linspace(0, 0.2, 4), torch.linspace(0, 1, 20))
+    place = torch.stack(torch.meshgrid(*axes, indexing="ij"), -1).reshape(-1, 3).to(device)
+    count, generator = len(place), torch.Generator().manual_seed(0)
+    points = MaterialPoints.create(
+        place, volume=0.04 / count, density=100.0, youngs_modulus=2e5 * scale, poisson_ratio=0.3, damping=0.5
+    )
+    normal = torch.nn.functional.normalize(torch.randn(2 * count, 3, generator=generator), dim=-1).to(device)
+    area = torch.full((2 * count,), 0.3 / count, device=device)
+    return points, Patches(normal, area, torch.arange(count, device=device).repeat(2), count)
+
+
+def solver(**more):
+    foot = PinnedRegion(Box([None] * 3, [None, None, 0.05]), kind="nodes")
+    return MPMSolver(dx=0.1, formulation="modes", gravity=(0, 0, -2.0), boundaries=[foot], **more)
+
+
+WINDS = {
+    "storm": lambda: look("storm"),
+    "steady": lambda: WindField([6.0, 2.0, 0.0]),
+    "profile": lambda: WindField([6.0, 2.0, 0.0], effects=[LogProfile(ground=(0.0, 0.0, -0.1), height=1.0)]),
+}
+
+
+@pytest.mark.parametrize("law", ["projected", "paper", "cross_flow"])
+@pytest.mark.parametrize("wind", WINDS)
+def test_kernel_agrees_with_torch(kernel_device, monkeypatch, wind, law):
+    """Both are float32: their difference stays some roundings of the motion, as no mode is unstable."""
+    points, patches = post(kernel_device)
+    aero = AeroForce(C_D=1.0, C_F=0.1, C_L=0.05, law=law).to(kernel_device)
+    force = WindForce(aero, WINDS[wind]().to(kernel_device), patches)
+    ends = []
+    for kernels in (True, False):
+        with monkeypatch.context() as patch:
+            if not kernels:
+                patch.setattr(Modes, "_kernel", lambda *given: None)
+            own = solver()
+            state = own.init_state(points)
+            for _ in range(5):
+                state = own.rollout(state, DT, STEPS, [force])
+        ends.append(state)
+        assert (own.bound._site_forces is not None) == kernels
+    fast, slow = ends
+    moved = float((slow.position - points.position).abs().max())
+    assert moved > 0.01
+    assert float((fast.position - slow.position).abs().max()) < 2e-5 * moved
+    assert float((fast.velocity - slow.velocity).abs().max()) < 1e-4 * float(slow.velocity.abs().max())
+    assert float(fast.work) == pytest.approx(float(slow.work), rel=1e-4)
+    assert torch.allclose(fast.impulse, slow.impulse, rtol=1e-4, atol=1e-4 * float(slow.impulse.abs().max()))
+
+
+def test_scenes_of_a_batch_have_winds_of_their_own(kernel_device):
+    found = []
+    winds = [WindField([4.0, 0.0, 0.0]), WindField([0.0, 7.0, 0.0])]
+    aero = AeroForce(C_D=1.0, C_F=0.1, C_L=0.0, law="projected").to(kernel_device)
+    both = [post(kernel_device, scale) for scale in (1.0, 3.0)]
+    for (points, patches), wind in zip(both, winds, strict=True):
+        alone = solver()
+        state = alone.init_state(points)
+        found.append(alone.rollout(state, DT, 8, [WindForce(aero, wind.to(kernel_device), patches)]).position)
+    count = both[0][0].count
+    joined = Patches(
+        *(torch.cat([getattr(patches, name) for _, patches in both]) for name in ("normal", "area")),
+        torch.cat([both[0][1].point, both[1][1].point + count]),
+        2 * count,
+    )
+    own = solver()
+    state = own.init_state(MaterialPoints.stack([points for points, _ in both]))
+    end = own.rollout(state, DT, 8, [WindForce(aero, [wind.to(kernel_device) for wind in winds], joined)])
+    for k in range(2):
+        moved = float((found[k] - both[k][0].position).abs().max())
+        assert float((end.position[k] - found[k]).abs().max()) < 1e-5 * moved
+
+
+def test_a_gradient_runs_in_torch():
+    points, patches = post("cpu")
+    aero = AeroForce(C_D=torch.tensor(1.0, requires_grad=True), C_F=0.1, C_L=0.0, law="projected")
+    own = solver()
+    state = own.init_state(points)
+    end = own.rollout(state, DT, STEPS, [WindForce(aero, WindField([6.0, 0.0, 0.0]), patches)])
+    assert own.bound._site_forces is None
+    (slope,) = torch.autograd.grad(end.position[..., 0].sum(), aero.C_D)
+    assert float(slope) > 0
