@@ -199,7 +199,7 @@ class Suggestion:
 
     @property
     def why_formulation(self) -> str:
-        """Why it sways by modes or by material points, in words."""
+        """The reason why it sways by modes or by material points, in words."""
         if self.by_modes:
             how = "turns as one" if self.kind == "hanging" else "leans by less than 40 %"
             return f"it is held, nothing touches, and it {how}"
