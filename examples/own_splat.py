@@ -1,7 +1,7 @@
-"""A splat of your own: ``python examples/own_splat.py my_splat.ply`` looks at it and lets it move for two seconds.
+"""A splat of your own: ``python examples/own_splat.py my_splat.ply`` looks at it and lets it move in a breeze.
 
-``gaussian-swaying preview`` guesses which way is up, what moves, where it is held and how stiff it is, explains each
-guess, and writes a configuration. Without a path, the example makes a flag on its pole as a stand-in for a capture.
+``gaussian-swaying preview`` guesses which way is up, what moves, where it is held and what kind of thing it is, explains
+each guess, and writes a configuration. Without a path, the example makes a flag on its pole as a stand-in for a capture.
 """
 
 import sys
@@ -14,12 +14,12 @@ from gaussian_swaying.scenes.flag_on_stand import FlagOnStandScene
 
 
 def main(folder: Path, splat: Path | None = None, frames: int | None = None, spacing: float = 0.03) -> float:
-    """Preview a splat, run its draft, and return how far the Gaussians moved on average at most [m].
+    """Preview a splat, run its starter, and return how far the Gaussians moved on average at most [m].
 
     Args:
         folder: Where everything goes: the preview, and the run with its video.
         splat: File in any format that can be read; None for a flag that is made here.
-        frames: Frames of the draft; 2 s if None.
+        frames: Frames of the starter; 10 s if None.
         spacing: Distance between the Gaussians of that flag [m].
     """
     folder.mkdir(parents=True, exist_ok=True)
@@ -29,7 +29,7 @@ def main(folder: Path, splat: Path | None = None, frames: int | None = None, spa
     if preview([str(splat), "--output", str(folder / "preview")]) != 0:  # the same as the command
         raise SystemExit("the preview says what is wrong")
     parser = Simulation.parser()
-    settings = parser.parse_args(["--config", str(folder / "preview" / "draft.yaml")])
+    settings = parser.parse_args(["--config", str(folder / "preview" / "starter.yaml")])
     simulation = Simulation.from_settings(parser, settings)
     return simulation.run(folder / "run", frames=frames)["displacement_mean_max_m"]
 

@@ -36,7 +36,7 @@ SECONDS = 1.5
 LEAD = 0.4
 """Longest time at rest that is kept before the motion [s]."""
 SOFTER, STIFFER = 1 / 30, 30.0
-"""Range of E, per that with which the preview sways visibly."""
+"""Range of E, per that which the preview guesses."""
 SPEED = (0.5, 25.0)
 """Range of the wind [m/s]."""
 ROUGH = 1.2e-3

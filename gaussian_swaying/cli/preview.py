@@ -120,7 +120,7 @@ def build_options() -> argparse.ArgumentParser:
 
 
 def preview_scene(options: argparse.Namespace, folder: Path) -> Preview:
-    """Suggest a configuration for a splat, find its stiffness in short runs, and draw it.
+    """Suggest a configuration for a splat, find the numbers with which it sways as its kind does, and draw it.
 
     Args:
         options: From :func:`build_options`.

@@ -197,7 +197,7 @@ class Structure:
         return sum(parts[1:], parts[0])
 
     def _pins(self) -> tuple[np.ndarray, list[tuple[int, Any, bool]]]:
-        """Which boundary holds each node, -1 for none, shape (G,); and the rows of pinned points."""
+        """The boundary that holds each node, -1 for none, shape (G,); and the rows of pinned points."""
         import scipy.sparse as sparse
 
         total, scene = self.total, self.scene

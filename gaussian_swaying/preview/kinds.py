@@ -1,4 +1,4 @@
-"""What kind of thing a splat shows, and how things of that kind sway.
+"""The kind of thing that a splat shows, and how things of that kind sway.
 
 Frequencies, masses and damping are those of trees, plants and hanging things that were measured; what is an estimate is
 marked in :data:`KINDS`.
@@ -21,7 +21,7 @@ from gaussian_swaying.preview.shape import plane_axes, quantile
 
 @dataclass(frozen=True)
 class Kind:
-    """How a kind of thing sways.
+    """A kind of thing, by how it sways.
 
     Attributes:
         words: Its name in a sentence.

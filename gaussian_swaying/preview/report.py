@@ -164,7 +164,7 @@ def cost_lines(cost: Cost) -> list[str]:
 
 
 def _stable(cost: Cost) -> str:
-    """What limits a substep."""
+    """The limit of a substep, in words."""
     if math.isinf(cost.stable_substep):
         return "modes, which are stable with any"
     return f"stable up to {cost.stable_substep:.3g} s; waves of {cost.wave_speed:.3g} m/s"
@@ -220,7 +220,7 @@ def _numbers(values: Sequence[float]) -> str:
 
 
 def _kind(guess: Suggestion) -> str:
-    """What it is, and how it sways."""
+    """Its kind, and how it sways."""
     words = f"{guess.kind} ({KINDS[guess.kind].words}): {guess.kind_reason}"
     n = guess.natural
     if n is None:

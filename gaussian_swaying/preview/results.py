@@ -20,7 +20,7 @@ class Preview:
         report: Text for the user.
         data: The same as plain numbers, for preview.json.
         picture: 8-bit RGB, shape (H, W, 3).
-        configurations: Their names and YAML, ``draft`` and ``starter``; none with ``--config``.
+        configurations: Their names and YAML, ``starter``; none with ``--config``.
         things: What may move in a capture of a place, 8-bit RGB, shape (H, W, 3); None for an object.
         parts: The parts of the object; None if there is only one.
     """
@@ -47,7 +47,7 @@ def splat_name(path: str | Path) -> str:
 
 
 def write(preview: Preview, folder: Path) -> list[Path]:
-    """Write preview.json and preview.png, and if there are any, things.png, parts.npz, draft.yaml and starter.yaml.
+    """Write preview.json and preview.png, and if there are any, things.png, parts.npz and starter.yaml.
 
     An existing configuration that differs is kept as ``starter.1.yaml``, ``starter.2.yaml``, ..., since it may have
     been edited; and so are parts.

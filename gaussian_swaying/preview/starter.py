@@ -177,7 +177,7 @@ recorder:
 
 
 def _wind_words(s: Suggestion) -> str:
-    """What wind it has and why."""
+    """Its wind, and why."""
     look, speed = LOOKS[s.look], math.hypot(*s.flow)
     other = f", at {speed:g} m/s as it was asked for" if abs(speed - look.speed) > 0.01 else ""
     return (
@@ -187,7 +187,7 @@ def _wind_words(s: Suggestion) -> str:
 
 
 def _sway_words(s: Suggestion) -> str:
-    """What it is and how it will sway."""
+    """Its kind, and how it will sway."""
     kind = KINDS[s.kind]
     if s.real or s.natural is None:
         return f"It is taken for {kind.words}: {s.kind_reason}."

@@ -158,7 +158,7 @@ def _motion(push: np.ndarray, square: np.ndarray, alpha: np.ndarray, tip: np.nda
 
 
 def _fault(part: np.ndarray, spread: float, frequency: float) -> float:
-    """How far the fluctuation of a stretch (T, 3) is from a typical one: the sum of its faults, each over a small one.
+    """Distance of the fluctuation of a stretch (T, 3) from a typical one: the sum of its faults, each over a small one.
 
     The frequency is that for each sample.
     """

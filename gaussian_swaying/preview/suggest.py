@@ -1,7 +1,6 @@
 """A suggestion for the first configuration of a splat: bounds, up axis, sizes, and every number that a run needs.
 
-Everything here is a guess, made with rules that are stated with the result. The rules do not depend on what the object
-is.
+Everything here is a guess, made with rules that are stated with the result.
 """
 
 from __future__ import annotations
@@ -153,7 +152,7 @@ class Suggestion:
             or a tree; else None.
         connected: ``scene.connected`` of the starter.
         connected_reason: Why it is ``surface``, in words, if that was not asked for.
-        real: Whether the numbers are those of the material; if not, they are such that it sways visibly.
+        real: Whether the numbers are those of the material; if not, it sways as its kind does.
     """
 
     up: UpGuess
@@ -200,7 +199,7 @@ class Suggestion:
 
     @property
     def why_formulation(self) -> str:
-        """Why it sways by modes or by material points, in words."""
+        """The reason why it sways by modes or by material points, in words."""
         if self.by_modes:
             how = "turns as one" if self.kind == "hanging" else "leans by less than 40 %"
             return f"it is held, nothing touches, and it {how}"
@@ -400,7 +399,7 @@ def suggest(
 
 
 def of_material(suggestion: Suggestion, name: str) -> Suggestion:
-    """The suggestion with the numbers of a known material, which no trial run changes.
+    """The suggestion with the numbers of a known material, in place of those of its kind.
 
     Raises:
         ValueError: If there is no material of that name; the message lists the names.

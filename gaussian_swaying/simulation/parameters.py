@@ -1,6 +1,6 @@
 """The numbers of a simulation that may change: their names, units and ranges, and how each gets into a simulation.
 
-Edits, the live page, fits, sweeps, the preview's calibration and assignment in Python all use this list. A number of a
+Edits, the live page, fits, sweeps, the preview and assignment in Python all use this list. A number of a
 force of your own joins it in one line::
 
     register("forces.Breath.strength", unit="N", low=0.0)

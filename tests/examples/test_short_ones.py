@@ -46,10 +46,10 @@ def test_the_wind_is_found_by_its_gradient():
     assert load("wind_by_gradient").main(true=2.0, first=1.0, rounds=6, side=4, steps=15) == pytest.approx(2, rel=1e-3)
 
 
-def test_a_splat_is_previewed_and_its_draft_runs(tmp_path):
+def test_a_splat_is_previewed_and_its_starter_runs(tmp_path):
     moved = load("own_splat").main(tmp_path / "own", frames=6, spacing=0.06)
     assert 0 < moved < 1
-    assert {path.name for path in (tmp_path / "own" / "preview").iterdir()} >= {"preview.png", "draft.yaml"}
+    assert {path.name for path in (tmp_path / "own" / "preview").iterdir()} >= {"preview.png", "starter.yaml"}
     assert (tmp_path / "own" / "run" / "video.mp4").stat().st_size > 1000
 
 

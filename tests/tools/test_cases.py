@@ -349,10 +349,10 @@ def test_memory_and_cpu_time_of_a_page():
 
 def test_a_place_is_previewed_in_a_process_of_its_own():
     """Its memory is that of the preview, without what made the place."""
-    row = places.previewed(20_000, "cpu", drafts=False)
+    row = places.previewed(20_000, "cpu", starters=False)
     assert row["right_first"]
     assert row["plant"] > 500
     assert row["preview_share"] == row["preview_bytes"] / row["file_bytes"]
     assert 1e8 < row["preview_bytes"] < 2e9
-    assert "draft_s" not in row
+    assert "starter_s" not in row
     assert "nothing.ply" in places._tool("preview", ["nothing.ply"])["failed"]

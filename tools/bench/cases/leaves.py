@@ -57,6 +57,7 @@ def neighbours(simulation: Simulation, least: float, most: float) -> Tensor:
 
 def _of(config: Path, connected: str, cells: int | None, device: str) -> Simulation:
     settings: dict[str, Any] = yaml.safe_load(config.read_text())
+    settings["solver"]["formulation"] = "total"  # which the finest grid needs; a starter has modes
     settings["scene"]["connected"] = connected
     for name in ("ply", "parts"):
         if settings["scene"].get(name):

@@ -137,7 +137,7 @@ CASE = Case(
     rows,
     (
         option("--ply", "a captured object for configs/sim/hanging_object.yaml"),
-        option("--scene", "a configuration to watch, too, such as the draft of a preview"),
+        option("--scene", "a configuration to watch, too, such as the starter of a preview"),
         option("--seconds", "for how long each scene is watched", type=float, default=20.0),
     ),
     page="live.md",

@@ -1,4 +1,4 @@
-"""What ``bench.py places`` measures: the preview and the draft of captures of a place, with their memory."""
+"""What ``bench.py places`` measures: the preview and the starter of captures of a place, with their memory."""
 
 from __future__ import annotations
 
@@ -21,22 +21,22 @@ SIZE = (1920, 1080)  # of their pictures
 
 
 def previewed(
-    count: int, device: str, drafts: bool, keep: str | None = None, films: bool = False, video: bool = True
+    count: int, device: str, starters: bool, keep: str | None = None, films: bool = False, video: bool = True
 ) -> Row:
-    """A place of so many Gaussians: its preview, whether the plant comes first, its draft, and a film.
+    """A place of so many Gaussians: its preview, whether the plant comes first, its starter, and a film.
 
     Args:
         count: Number of Gaussians.
         device: ``cpu`` or ``cuda``.
-        drafts: Whether the draft is run too.
+        starters: Whether the starter is run too.
         keep: Folder where the place and all results stay; a temporary one if None.
-        films: Whether ``FILM`` frames of the draft are drawn in ``SIZE``, too.
-        video: Whether draft and film encode a video beside their pictures.
+        films: Whether ``FILM`` frames of the starter are drawn in ``SIZE``, too.
+        video: Whether starter and film encode a video beside their pictures.
     """
     with tempfile.TemporaryDirectory() as temporary:
         folder = Path(keep or temporary)
         folder.mkdir(parents=True, exist_ok=True)
-        file, seen, out = (folder / f"{name}_{count}" for name in ("place", "preview", "draft"))
+        file, seen, out = (folder / f"{name}_{count}" for name in ("place", "preview", "starter"))
         file = file.with_suffix(".ply")
         # in a process of its own: the memory of this one would count as that of those which it starts
         make = f"from bench.places import write; write({str(file)!r}, {count})"
@@ -52,16 +52,17 @@ def previewed(
         first = data["place"]["things"][0]
         off = max(abs(a - b) for end in ("min", "max") for a, b in zip(first[end], plant[end], strict=True))
         row["right_first"] = off < 0.02 and 0.9 < first["gaussians"] / plant["gaussians"] < 1.1
-        if drafts:
-            draft = ["--config", str(seen / "draft.yaml"), "--device", device, "--recorder.video", str(video).lower()]
-            took = _tool("sim", [*draft, "--output", str(out)])
+        if starters:
+            starter = ["--config", str(seen / "starter.yaml"), "--device", device]
+            starter += ["--recorder.video", str(video).lower()]
+            took = _tool("sim", [*starter, "--output", str(out)])
             if "failed" in took:
                 return row | took
-            row |= {"draft_s": took["seconds"], "draft_bytes": took["bytes"], "video": video}
-            row["draft_announced_s"] = data["draft_cost"]["total_seconds"]
+            row |= {"starter_s": took["seconds"], "starter_bytes": took["bytes"], "video": video}
+            row["starter_announced_s"] = data["cost"]["total_seconds"]
             if films:
                 size = [f"--camera.init_args.{n}={x}" for n, x in zip(("width", "height"), SIZE, strict=True)]
-                took = _tool("sim", [*draft, "--frames", str(FILM), *size, "--output", str(folder / "film")])
+                took = _tool("sim", [*starter, "--frames", str(FILM), *size, "--output", str(folder / "film")])
                 if "failed" in took:
                     return row | took
                 summary = json.loads((folder / "film" / "summary.json").read_text())
@@ -81,16 +82,16 @@ def rows(options: argparse.Namespace, _: Row) -> Iterator[Measurement]:
     """One place of each size."""
     for count in options.counts:
         films, video = options.films, not options.without_video
-        work = partial(previewed, count, options.device, count <= options.drafts, options.keep, films, video)
+        work = partial(previewed, count, options.device, count <= options.starters, options.keep, films, video)
         yield ("places", f"{count:,}"), work
 
 
 CASE = Case(
-    "Measure the preview and the draft of captures of a place.",
+    "Measure the preview and the starter of captures of a place.",
     rows,
     (
         numbers("--counts", "Gaussians of the places", default="300000,1000000,3000000"),
-        option("--drafts", "most Gaussians of a place whose draft is run", type=int, default=3_000_000),
+        option("--starters", "most Gaussians of a place whose starter is run", type=int, default=3_000_000),
         option("--keep", "folder where the places and all results stay"),
         option("--films", f"draw {FILM} frames of {SIZE[0]} x {SIZE[1]}, too", action="store_true"),
         option("--without-video", "write the pictures only", action="store_true"),

@@ -24,7 +24,7 @@ def announced_and_taken(name: str, previewed: list[str], ran: list[str], device:
     Args:
         name: What it is called in the record.
         previewed: Options of tools/preview.py.
-        ran: Options of tools/sim.py; none for the draft and the starter that the preview writes.
+        ran: Options of tools/sim.py; none for the starter that the preview writes.
         device: ``cpu`` or ``cuda``.
         frames: Only the first frames.
     """
@@ -38,32 +38,27 @@ def announced_and_taken(name: str, previewed: list[str], ran: list[str], device:
             return {"name": name, "failed": what_failed(done.stderr)}
         row: Row = {"name": name, "preview_s": time.perf_counter() - begin}
         data = json.loads((seen / "preview.json").read_text())
-        runs = {"run": (data["cost"], ran)}
-        if not ran:
-            runs = {
-                "starter": (data["cost"], ["--config", str(seen / "starter.yaml")]),
-            }
-        for kind, (cost, options) in runs.items():
-            more = short if ran else []
-            begin = time.perf_counter()
-            done = _tool("sim", [*options, *more, "--device", device, "--output", str(out / kind)])
-            taken = time.perf_counter() - begin
-            if done.returncode:
-                return row | {"failed": what_failed(done.stderr)}
-            summary = json.loads((out / kind / "summary.json").read_text())
-            announced = cost["total_seconds"]
-            if ran and short:  # the preview of a configuration has all its frames
-                share = (summary["frames"] - 1) / max(cost["frames"] - 1, 1)
-                announced = cost["startup_seconds"] + share * (announced - cost["startup_seconds"])
-            row[kind] = {
-                "announced_s": announced,
-                "process_s": taken,
-                "ratio": announced / taken,
-                "frames": summary["frames"],
-                "announced_substeps": cost["substeps"],
-                "substeps": summary["substeps"] / max(summary["frames"] - 1, 1),
-                "wall_s": summary["wall_s"],
-            }
+        cost = data["cost"]
+        options = [*ran, *short] if ran else ["--config", str(seen / "starter.yaml")]
+        begin = time.perf_counter()
+        done = _tool("sim", [*options, "--device", device, "--output", str(out)])
+        taken = time.perf_counter() - begin
+        if done.returncode:
+            return row | {"failed": what_failed(done.stderr)}
+        summary = json.loads((out / "summary.json").read_text())
+        announced = cost["total_seconds"]
+        if ran and short:  # the preview of a configuration has all its frames
+            share = (summary["frames"] - 1) / max(cost["frames"] - 1, 1)
+            announced = cost["startup_seconds"] + share * (announced - cost["startup_seconds"])
+        row["run" if ran else "starter"] = {
+            "announced_s": announced,
+            "process_s": taken,
+            "ratio": announced / taken,
+            "frames": summary["frames"],
+            "announced_substeps": cost["substeps"],
+            "substeps": summary["substeps"] / max(summary["frames"] - 1, 1),
+            "wall_s": summary["wall_s"],
+        }
     return row
 
 
@@ -79,7 +74,7 @@ def _scene(name: str, options: argparse.Namespace) -> Row:
 
 
 def rows(options: argparse.Namespace, _: Row) -> Iterator[Measurement]:
-    """The scenes, and the draft and the starter of each splat."""
+    """The scenes, and the starter of each splat."""
     yield from ((("previews", name), partial(_scene, name, options)) for name in options.scenes)
     for ply in options.ply:
         name, previewed = f"{Path(ply).stem}, {options.quality}", [ply, "--quality", options.quality]
@@ -93,7 +88,7 @@ CASE = Case(
     (
         names("--scenes", gallery.SCENES),
         gallery.PRESET,
-        option("--ply", "a splat whose draft and starter are run too", action="append", default=[]),
+        option("--ply", "a splat whose starter is run too", action="append", default=[]),
         option("--quality", "of the starter of --ply: draft, normal, fine", default="normal"),
         FRAMES,
     ),

@@ -43,9 +43,9 @@ table(PAGE, "peers.turning", "*pee*", _turning, """
 
 
 def _announced(result: Row) -> Iterator[Row]:
-    """Each run: that of a configuration, or the draft and the starter of a splat."""
+    """Each run: that of a configuration, or the starter of a splat."""
     for name, row in result["previews"].items():
-        for kind in ("run", "draft", "starter"):
+        for kind in ("run", "starter"):
             if kind in row:
                 known = {"name": name if kind == "run" else f"{name}, {kind}"}
                 yield row | known | {"run": row[kind]}
@@ -70,8 +70,8 @@ def _places(result: Row) -> Iterator[Row]:
 table(PAGE, "places.rows", "places_*", _places, """
     Gaussians = {gaussians:,} | of the plant = {plant:,} | file [MB] = {file_bytes:.0f (MB)} |
     preview [s] = {preview_s:.0f} | wanted = {wanted:g} | its memory [MB] = {preview_bytes:.0f (MB)} |
-    per file = {preview_share:.2f} | the plant comes first = {right_first} | draft [s] = {draft_s or '-':.0f} |
-    announced [s] = {draft_announced_s or '-':.0f} | its memory [MB] = {draft_bytes or '-':.0f (MB)} |
+    per file = {preview_share:.2f} | the plant comes first = {right_first} | starter [s] = {starter_s or '-':.0f} |
+    announced [s] = {starter_announced_s or '-':.0f} | its memory [MB] = {starter_bytes or '-':.0f (MB)} |
     250 frames of 1920 x 1080 [s] = {film_s or '-':.1f}
     """, before="{source}")  # fmt: skip
 
