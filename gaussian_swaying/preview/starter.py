@@ -179,9 +179,9 @@ recorder:
 def _wind_words(s: Suggestion) -> str:
     """Its wind, and why."""
     look, speed = LOOKS[s.look], math.hypot(*s.flow)
-    other = f", at {speed:g} m/s as it was asked for" if abs(speed - look.speed) > 0.01 else ""
+    other = f", at {speed:.3g} m/s as it was asked for" if abs(speed - look.speed) > 0.01 else ""
     return (
-        f"Wind: {s.look} ({look.words}{other}), {speed:g} m/s at the object with turbulence of {look.intensity:.0%}, "
+        f"Wind: {s.look} ({look.words}{other}), {speed:.3g} m/s at the object with turbulence of {look.intensity:.0%}, "
         f"{turbulence_length(_middle(s)):.3g} m long. Other looks: --look {', '.join(LOOKS)}."
     )
 
