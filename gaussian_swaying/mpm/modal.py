@@ -5,9 +5,9 @@ The stiffness matrix of the ``total`` formulation at rest is constant, so a few 
 - **Stiffness.** :math:`K = \sum_p V_p\, B_p^T C_p B_p` over the gradients of the stencils, with Hooke's law, which all
   laws share at small strain; :math:`M` is the lumped mass of the nodes. Pinned nodes go, pinned points are stiff rows,
   and a rigid part has six degrees of freedom.
-- **Shift.** Captures have bits that hang on a corner of a cell; the lowest eigenvectors are theirs. :math:`K + s M` with
-  :math:`s = (\omega_1 / 2)^2` tames them, where :math:`\omega_1` is the first frequency that is found with the shift
-  itself, starting from a stiff guess.
+- **Shift.** Captures have bits that hang on a corner of a cell; the lowest eigenvectors are theirs. :math:`K + s M`
+  with :math:`s = (\omega_1 / 2)^2` tames them, where :math:`\omega_1` is the first frequency that is found with the
+  shift itself, starting from a stiff guess.
 - **First frequency.** That of the mode that moves most in a level wind, near Rayleigh's quotient of the lean, in the
   softer direction.
 - **Modes.** Load-dependent Ritz vectors (Wilson, Yuan & Dickens 1982, Earthq. Eng. Struct. Dyn. 10:813) in place of
@@ -117,9 +117,7 @@ class Structure:
         self.mean_modulus = float((of_scene(points.youngs_modulus) * volume).sum() / volume.sum())
         self.table, self.site = table.numpy(), equal_rows(table).numpy()
         start = np.arange(0, 27 * count + 1, 27)
-        rows = [
-            sparse.csr_matrix((basis[:, k].ravel(), self.table.ravel(), start), (count, nodes)) for k in range(4)
-        ]
+        rows = [sparse.csr_matrix((basis[:, k].ravel(), self.table.ravel(), start), (count, nodes)) for k in range(4)]
         self.value, self.slope = rows[0], rows[1:]
         self.mass = self.value.T @ self.point_mass
         self.volume, self._basis = volume, basis[:, 1:]
@@ -265,7 +263,7 @@ class Structure:
         columns = []
         place = self.total.node_positions(self.total.node_mass).reshape(-1, self.nodes, 3)
         where = place[min(self.scene, len(place) - 1)].double().cpu().numpy()
-        for body in self.total._bodies:
+        for body in self.total.rigid_bodies:
             own = np.flatnonzero(body.mass.reshape(-1, self.nodes)[self.scene].cpu().numpy() > 0)
             still = bool((self.pinned[own] >= 0).any())
             free[own] = False
@@ -280,9 +278,7 @@ class Structure:
             part = sparse.coo_matrix(block.reshape(-1, 6))
             columns.append(sparse.csr_matrix((part.data, (rows[part.row], part.col)), (3 * self.nodes, 6)))
         index = (3 * np.flatnonzero(free)[:, None] + np.arange(3)).ravel()
-        ones = sparse.csr_matrix(
-            (np.ones(len(index)), (index, np.arange(len(index)))), (3 * self.nodes, len(index))
-        )
+        ones = sparse.csr_matrix((np.ones(len(index)), (index, np.arange(len(index)))), (3 * self.nodes, len(index)))
         return sparse.hstack([ones, *columns]).tocsr()
 
     # ---- what follows from it
@@ -359,7 +355,7 @@ class Structure:
     def _result(self, square: np.ndarray, shape: np.ndarray, first: float, dropped: int) -> Analysis:
         modes, sites = shape.shape[1], int(self.site.max()) + 1
         turn_points = self.turn_at_points(shape)
-        weighted = (self.value.T @ (self.point_mass[:, None] * turn_points.reshape(self.count, -1)))
+        weighted = self.value.T @ (self.point_mass[:, None] * turn_points.reshape(self.count, -1))
         turn = weighted / np.maximum(self.mass, 1e-7 * self.mass.max())[:, None]
         own = np.bincount(self.site, self.point_mass, sites)
 
@@ -493,7 +489,9 @@ def _content(total: Total, scene: int, most: int) -> str:
 def _numbers(total: Total, scene: int) -> np.ndarray:
     """Masses, volumes and stiffnesses of the points over their means, which rounding may change a little, (3, P)."""
     points = total.body.points
-    own = [field.detach().reshape(-1, points.count)[scene] for field in (points.mass, points.volume, total.body.laws.mu)]
+    own = [
+        field.detach().reshape(-1, points.count)[scene] for field in (points.mass, points.volume, total.body.laws.mu)
+    ]
     return np.stack([(field / field.mean()).float().cpu().numpy() for field in own])
 
 
@@ -515,11 +513,8 @@ def _write(path: Path, found: Analysis, numbers: np.ndarray) -> None:
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         with atomic(path) as temporary:
-            np.savez(
-                temporary,
-                numbers=numbers,
-                **{f.name: np.asarray(getattr(found, f.name)) for f in fields(Analysis)},
-            )
+            kept: dict[str, Any] = {f.name: np.asarray(getattr(found, f.name)) for f in fields(Analysis)}
+            np.savez(temporary, numbers=numbers, **kept)
         for old in sorted(path.parent.glob("modes_*.npz"), key=lambda p: p.stat().st_mtime)[:-KEPT]:
             old.unlink(missing_ok=True)
     except OSError:

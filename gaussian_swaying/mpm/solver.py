@@ -470,7 +470,9 @@ class MPMSolver(Solver):
         if force is None and drag is None:
             return self.rollout(state, dt, 1, acting, check=waits)
         if isinstance(self.bound, Modes):
-            given = FunctionForce(lambda state: (force if force is not None else torch.zeros_like(state.position), drag))
+            given = FunctionForce(
+                lambda state: (force if force is not None else torch.zeros_like(state.position), drag)
+            )
             return self.rollout(state, dt, 1, (*acting, given), check=waits)
         found = [split(part(state), part, state) for part in acting]
         end = self._step(state, dt, *added([(force, drag), *found]))

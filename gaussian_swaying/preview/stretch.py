@@ -1,7 +1,7 @@
 """A typical stretch of turbulence: ten seconds of wind in which a thing moves as it does in the long run.
 
-Ten seconds of real wind are seldom typical: their mean may lie a third off. The motion in a long record follows from the
-modes and the wind at some places, linearly, and the stretch is taken whose motion is closest to that of the record.
+Ten seconds of real wind are seldom typical: their mean may lie a third off. The motion in a long record follows from
+the modes and the wind at some places, linearly, and the stretch is taken whose motion is closest to that of the record.
 """
 
 from __future__ import annotations

@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -28,9 +29,9 @@ from gaussian_swaying.geometry.regions import Box, Not, Region, Union
 from gaussian_swaying.mpm.materials import known_material
 from gaussian_swaying.preview.framing import orbit_frame, whole_box
 from gaussian_swaying.preview.hold import PIN_DEPTH, HoldGuess, end_region, given_hold, guess_hold
-from gaussian_swaying.preview.kinds import KINDS, kind_of
+from gaussian_swaying.preview.kinds import KINDS, kind_of, with_materials
 from gaussian_swaying.preview.natural import MOST_LEAN, Natural
-from gaussian_swaying.preview.parts import FoundParts, plant_parts, with_materials
+from gaussian_swaying.preview.parts import FoundParts, plant_parts
 from gaussian_swaying.preview.photos import CapturedFrom, ShownObject, shown_object
 from gaussian_swaying.preview.shape import (
     FEWEST,
@@ -336,14 +337,14 @@ def suggest(
             found_parts = found_parts or standing_parts(cloud, chosen.simulated, upward.direction, weight, depth)
         pin = pin if found_parts is None else None
     flat = sheet_normal(points)
-    name, why_kind = kind_of(
-        cloud, chosen.simulated, upward.direction, weight, held.end, flat is not None, found_parts
-    )
+    name, why_kind = kind_of(cloud, chosen.simulated, upward.direction, weight, held.end, flat is not None, found_parts)
     if kind is not None:
         name, why_kind = kind, "given"
     if name == "hanging" and held.end == "top" and (found_parts is None or "cord" in _names(found_parts)):
         ends = end_region(points, held.direction, dx / frame.metres_per_unit)
-        found_parts = swinging_parts(cloud, chosen.simulated, upward.direction, weight, ends, dx / frame.metres_per_unit)
+        found_parts = swinging_parts(
+            cloud, chosen.simulated, upward.direction, weight, ends, dx / frame.metres_per_unit
+        )
         pin = None
     if unscaled:
         ratio = KINDS[name].side
@@ -430,7 +431,7 @@ def with_natural(suggestion: Suggestion, found: Natural) -> Suggestion:
 
     def own(part: Part) -> Part:
         given = {name: getattr(part, name) for name in ("thickness", "E", "damping_ratio")}
-        changed: dict[str, float] = {}
+        changed: dict[str, Any] = {}
         if given["thickness"] is not None:
             changed["thickness"] = given["thickness"] * found.thicker
         if given["E"] is not None:

@@ -12,13 +12,13 @@ from pathlib import Path
 import pytest
 import torch
 import yaml
+from gaussian_swaying.preview.calibration import CLOSE
 from shared import refused
 from small_scenes import plain_cloud, together
 
 from gaussian_swaying.cli.preview import main
 from gaussian_swaying.cli.simulate import main as simulate
 from gaussian_swaying.gaussians.ply import write_ply
-from gaussian_swaying.preview.calibration import CLOSE
 from gaussian_swaying.preview.cost import Cost
 from gaussian_swaying.preview.results import splat_name
 from gaussian_swaying.scenes.procedural import FlagScene
