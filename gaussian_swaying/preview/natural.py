@@ -107,7 +107,8 @@ def natural(simulation: Simulation, kind: Kind, flow: Tensor, intensity: float) 
         simulation.aero, **{name: drag * getattr(simulation.aero, name) for name in ("C_D", "C_F", "C_L")}
     )
     steady = WindForce(aero, WindField(flow * math.sqrt(1 + intensity**2)), scene.patches)
-    used, bound = stiffer, solver.bound
+    used = stiffer
+    modes: Modes | None = None
     for _ in range(2):  # the second time the mode itself has the frequency; the shapes stay
         points = setup.points
         E = points.youngs_modulus.clone()
@@ -121,19 +122,20 @@ def natural(simulation: Simulation, kind: Kind, flow: Tensor, intensity: float) 
             unit = float(whole_mass / ((points.youngs_modulus * volume).sum() / volume.sum()))
             analysis_of(whole, 0, MOST_MODES, unit * (2 * math.pi * frequency) ** 2)  # is in the cache now
         simulation.solver.init_state(points, frame=scene.frame)
-        used, bound = stiffer, solver.bound
+        bound = solver.bound
         assert isinstance(bound, Modes)
+        used, modes = stiffer, bound
         ratio = (2 * math.pi * frequency) ** 2 / bound.first**2
         stiffer = {value: modulus * ratio for value, modulus in stiffer.items()}
-    assert isinstance(bound, Modes)
-    state = bound.leaning(steady)
+    assert modes is not None
+    state = modes.leaning(steady)
     lean = _lean(state.position - points.position, points.position) if bool(flow.any()) else 0.0
-    shift = bound.at_sites(points.mass[:, None] * (state.position - points.position)).norm(dim=-1) / bound.site_mass
+    shift = modes.at_sites(points.mass[:, None] * (state.position - points.position)).norm(dim=-1) / modes.site_mass
     top = (shift >= quantile(shift, 0.9)).nonzero()[:, 0].cpu().numpy()
     assert isinstance(simulation.wind, WindField)
     start = 0.0
     if bool(flow.any()):
-        start = typical_start(linear_motion(bound, steady, simulation.wind, top, rate_for(frequency)), frequency)
+        start = typical_start(linear_motion(modes, steady, simulation.wind, top, rate_for(frequency)), frequency)
     return Natural(height, frequency, wanted, frontal, thicker, used, drag, lean, start)
 
 

@@ -301,7 +301,8 @@ def suggest(
         why = [*upward.reasons, "a plant stands in a pot at the lower end"]
         upward = replace(upward, confidence="high", reasons=why)
     found_parts = plant if flag is None else flag.found
-    if found_parts is not None:  # the length is that of the whole, with pot or pole
+    if found_parts is not None:  # the length is that of the whole, with pot or pole and without the ground around it
+        frame = SimFrame.fit(means[chosen.simulated & ~found_parts.around], upward.direction, longest_side)
         chosen = replace(chosen, simulated=chosen.simulated & ~found_parts.still)
         frame = SimFrame.fit(means[chosen.simulated], upward.direction, None, frame.metres_per_unit)
     points, visible = means[chosen.simulated], weight[chosen.simulated]
@@ -359,7 +360,7 @@ def suggest(
     if front is not None:
         azimuth, turn = front, 0.0
     flow = _across_picture(azimuth, speed)
-    if held.end == "side":  # along the sheet from the pole, and slightly onto it
+    if held.end == "side" and KINDS[name].cloth:  # along the sheet from the pole, and slightly onto it
         away = -frame.direction_to_sim(torch.tensor(held.direction, dtype=torch.float64))
         onto = torch.linalg.cross(torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64), away)
         flow = tuple(speed * float(c) for c in math.cos(0.25) * away + math.sin(0.25) * onto)

@@ -67,7 +67,7 @@ def test_the_file_that_a_fit_reads(checked):
     for u in plan.unknowns[:3]:
         assert u.low < TRUTH[u.name] < u.high
     assert plan.assumed == ["mass"]
-    base = yaml.safe_load((checked / "preview/draft.yaml").read_text())
+    base = yaml.safe_load((checked / "preview/starter.yaml").read_text())
     assert base["scene"]["longest_side"] == pytest.approx(1.2, rel=0.03)
     assert plan.known["background"] == pytest.approx([0.9 * 0.45, 0.9 * 0.5 * 0.94, 0.9 * 0.55 * 0.82], abs=0.02)
     (video,) = read_videos(plan.videos)
@@ -167,9 +167,9 @@ def test_the_weight_as_a_ruler(case, checked, capsys):
     given = [str(case / "film.mp4"), "--splat", str(case / "my.ply"), "--up", "+z", "--length", "gravity"]
     assert main([*given, "--output", str(case / "weighed"), "--check"]) == 2
     assert "captured in balance" in capsys.readouterr().err
-    draft = (checked / "preview/draft.yaml").read_text()
+    starter = (checked / "preview/starter.yaml").read_text()
     guess = {"metres_per_unit": 0.5, "hold": {"end": "top"}, "flow": [1.0, 0.0, 0.0]}
-    preview = SimpleNamespace(data={"suggestion": guess}, configurations={"draft": draft})
+    preview = SimpleNamespace(data={"suggestion": guess}, configurations={"starter": starter})
     (checked / "weighed.yaml").write_text(plan_text(preview, [0.5, 0.5, 0.5], 0.1, "gravity", checked))
     plan = read_plan(checked / "weighed.yaml")
     (scale,) = [u for u in plan.unknowns if u.name == SCALE]
