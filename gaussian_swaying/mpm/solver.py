@@ -228,6 +228,8 @@ class MPMSolver(Solver):
         assert state.node_displacement is not None
         assert state.node_velocity is not None
         moved = start.replace(time=state.time, substep=state.substep, work=state.work)
+        if isinstance(after, Modes):  # what of the motion its modes can show
+            return after.shown(moved, *after.amplitudes(state.replace(modal=None)))
         return after.read_particles(moved, state.node_displacement, state.node_velocity)
 
     def domain(self, state: MPMState) -> tuple[list[float], list[float]]:

@@ -3,6 +3,7 @@
 Covers: fitting.before, fitting.page.
 """
 
+import dataclasses
 import math
 import subprocess
 from types import SimpleNamespace
@@ -16,6 +17,7 @@ from bench.problems.flag_film import TRUTH, camera_of, write_case
 from PIL import Image
 from shared import refused
 
+from gaussian_swaying.cli import fit_film
 from gaussian_swaying.cli.fit import main
 from gaussian_swaying.cli.fit_film import Seen, extent, longest_side, plan_text, upright_in
 from gaussian_swaying.cli.preview import build_options, preview_scene
@@ -162,8 +164,18 @@ def test_a_fit_without_a_length_keeps_the_edited_file(case, checked, capsys):
     assert "wind.azimuth" in page
 
 
-def test_the_weight_as_a_ruler(case, checked, capsys):
-    """The length of a scene unit is sought; a flag that was captured with its pole, in balance, is refused."""
+def test_the_weight_as_a_ruler(case, checked, capsys, monkeypatch):
+    """The length of a scene unit is sought; what was captured in balance with its weight, as a plant, is refused."""
+    previewed = fit_film._previewed
+
+    def weightless(*given):
+        preview = previewed(*given)
+        starter = yaml.safe_load(preview.configurations["starter"])
+        assert starter["solver"]["gravity"][2] == -9.8  # a flag is not in balance
+        starter["solver"]["gravity"] = [0.0, 0.0, 0.0]
+        return dataclasses.replace(preview, configurations={"starter": yaml.safe_dump(starter)})
+
+    monkeypatch.setattr(fit_film, "_previewed", weightless)
     given = [str(case / "film.mp4"), "--splat", str(case / "my.ply"), "--up", "+z", "--length", "gravity"]
     assert main([*given, "--output", str(case / "weighed"), "--check"]) == 2
     assert "captured in balance" in capsys.readouterr().err
