@@ -24,6 +24,7 @@ from dataclasses import dataclass, fields
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
+from zipfile import BadZipFile
 
 import numpy as np
 import torch
@@ -46,6 +47,8 @@ CLUSTERS = 24
 """Clusters of points that are loaded one by one."""
 STIFF_ROW = 1e4
 """Stiffness of a pinned point over the largest entry of the stiffness matrix."""
+NO_STIFFNESS = 1e-10
+"""Square of the first frequency over that of a wave along the body, below which its stiffness is rounding."""
 MOST_UNKNOWNS = 150_000
 """A body with more is refused: its factor would fill the memory."""
 KEPT = 32
@@ -301,7 +304,7 @@ class Structure:
             guess: Square of the first circular frequency, if it is roughly known [1/s²]; it saves time.
 
         Raises:
-            ValueError: If nothing holds the body or it is too large.
+            ValueError: If nothing holds the body, most of it hangs loose, or it is too large.
         """
         S = self.spread
         if S.shape[1] > MOST_UNKNOWNS:
@@ -312,10 +315,16 @@ class Structure:
         K, M = self.reduced(self.stiffness)
         load = self.loads(CLUSTERS)
         whole = S.T @ load[:, :2]
-        shift = _power_of_two(self._first_guess() if guess is None else SHIFT**2 * guess)
+        begin = self._first_guess()
+        shift = _power_of_two(begin if guess is None else SHIFT**2 * guess)
         for _ in range(12):
             solve = factor(K + shift * M)
             first = rayleigh(K, M, solve(whole))
+            if not first > NO_STIFFNESS * begin:
+                raise ValueError(
+                    "`solver.formulation: modes` is for a body that stands against the wind, but most of this one "
+                    "hangs loose: hold more of it, give it more points in each cell, or set it to total."
+                )
             following = _power_of_two(SHIFT**2 * first)
             if following == shift or (following > shift and guess is None):
                 break
@@ -502,7 +511,7 @@ def _read(path: Path, numbers: np.ndarray) -> Analysis | None:
             if not np.allclose(file["numbers"], numbers, rtol=1e-4, atol=0):
                 return None
             values = {f.name: file[f.name] for f in fields(Analysis)}
-    except (OSError, ValueError, KeyError, EOFError):
+    except (OSError, ValueError, KeyError, EOFError, BadZipFile):
         return None
     values["first"], values["dropped"] = float(values["first"]), int(values["dropped"])
     return Analysis(**values)
