@@ -105,8 +105,9 @@ class PatchSums(nn.Module):
         other._buffers = dict(self._buffers)
         tensor, length = sums(self.tensor, group, count), self.vector.norm(dim=-1)
         normal = self.vector / length[:, None].clamp(min=torch.finfo(length.dtype).tiny)
-        fields = (normal.double(), length.double(), group[self.point], tensor.double())
-        vector, owner = joined_directions(*(field.cpu() for field in fields), coarse)
+        vector, owner = joined_directions(
+            normal.double().cpu(), length.double().cpu(), group[self.point].cpu(), tensor.double().cpu(), coarse
+        )
         other.tensor, other.vector, other.point = tensor, vector.to(self.vector), owner.to(self.point.device)
         return other
 

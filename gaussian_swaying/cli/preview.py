@@ -100,7 +100,9 @@ def build_options() -> argparse.ArgumentParser:
     add("--region", nargs=6, type=float, metavar="V", help="box to simulate: lower and upper corner [scene units]")
     add("--move", metavar="N[,M]", help="things of a place that move, by their numbers; default: the likeliest one")
     add("--longest-side", type=float, metavar="M", help="length of the longest side [m]; default: usual for its kind")
-    add("--look", default="breeze", choices=tuple(LOOKS), help="mean speed and turbulence of the wind (default: breeze)")
+    add(
+        "--look", default="breeze", choices=tuple(LOOKS), help="mean speed and turbulence of the wind (default: breeze)"
+    )
     add("--wind", type=float, metavar="M/S", help="mean speed of the wind [m/s], instead of that of the look")
     add("--kind", choices=tuple(KINDS), help="what it is, which decides frequency, mass and damping; default: a guess")
     add(
@@ -202,9 +204,7 @@ def preview_scene(options: argparse.Namespace, folder: Path) -> Preview:
             parts = parts.within(near_things(place, cloud, chosen))
         suggestion = replace(suggestion, parts=replace(parts, path=str((folder / "parts.npz").resolve())))
     text = starter_yaml(suggestion, options.scene, options.frames)
-    others = {
-        name: scaled_seconds(cost, cost, dx) for name, dx in grids.items() if name != suggestion.quality
-    }
+    others = {name: scaled_seconds(cost, cost, dx) for name, dx in grids.items() if name != suggestion.quality}
     data: dict[str, Any] = {
         "splat": str(options.scene),
         "bounds": bounds(cloud.means),

@@ -5,9 +5,9 @@ The stiffness matrix of the ``total`` formulation at rest is constant, so a few 
 - **Stiffness.** :math:`K = \sum_p V_p\, B_p^T C_p B_p` over the gradients of the stencils, with Hooke's law, which all
   laws share at small strain; :math:`M` is the lumped mass of the nodes. Pinned nodes go, pinned points are stiff rows,
   and a rigid part has six degrees of freedom.
-- **Shift.** Captures have bits that hang on a corner of a cell; the lowest eigenvectors are theirs. :math:`K + s M` with
-  :math:`s = (\omega_1 / 2)^2` tames them, where :math:`\omega_1` is the first frequency that is found with the shift
-  itself, starting from a stiff guess.
+- **Shift.** Captures have bits that hang on a corner of a cell; the lowest eigenvectors are theirs. :math:`K + s M`
+  with :math:`s = (\omega_1 / 2)^2` tames them, where :math:`\omega_1` is the first frequency that is found with the
+  shift itself, starting from a stiff guess.
 - **First frequency.** That of the mode that moves most in a level wind, near Rayleigh's quotient of the lean, in the
   softer direction.
 - **Modes.** Load-dependent Ritz vectors (Wilson, Yuan & Dickens 1982, Earthq. Eng. Struct. Dyn. 10:813) in place of
@@ -24,6 +24,7 @@ from dataclasses import dataclass, fields
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
+from zipfile import BadZipFile
 
 import numpy as np
 import torch
@@ -46,6 +47,8 @@ CLUSTERS = 24
 """Clusters of points that are loaded one by one."""
 STIFF_ROW = 1e4
 """Stiffness of a pinned point over the largest entry of the stiffness matrix."""
+NO_STIFFNESS = 1e-10
+"""Square of the first frequency over that of a wave along the body, below which its stiffness is rounding."""
 MOST_UNKNOWNS = 150_000
 """A body with more is refused: its factor would fill the memory."""
 KEPT = 32
@@ -117,9 +120,7 @@ class Structure:
         self.mean_modulus = float((of_scene(points.youngs_modulus) * volume).sum() / volume.sum())
         self.table, self.site = table.numpy(), equal_rows(table).numpy()
         start = np.arange(0, 27 * count + 1, 27)
-        rows = [
-            sparse.csr_matrix((basis[:, k].ravel(), self.table.ravel(), start), (count, nodes)) for k in range(4)
-        ]
+        rows = [sparse.csr_matrix((basis[:, k].ravel(), self.table.ravel(), start), (count, nodes)) for k in range(4)]
         self.value, self.slope = rows[0], rows[1:]
         self.mass = self.value.T @ self.point_mass
         self.volume, self._basis = volume, basis[:, 1:]
@@ -265,7 +266,7 @@ class Structure:
         columns = []
         place = self.total.node_positions(self.total.node_mass).reshape(-1, self.nodes, 3)
         where = place[min(self.scene, len(place) - 1)].double().cpu().numpy()
-        for body in self.total._bodies:
+        for body in self.total.rigid_bodies:
             own = np.flatnonzero(body.mass.reshape(-1, self.nodes)[self.scene].cpu().numpy() > 0)
             still = bool((self.pinned[own] >= 0).any())
             free[own] = False
@@ -280,9 +281,7 @@ class Structure:
             part = sparse.coo_matrix(block.reshape(-1, 6))
             columns.append(sparse.csr_matrix((part.data, (rows[part.row], part.col)), (3 * self.nodes, 6)))
         index = (3 * np.flatnonzero(free)[:, None] + np.arange(3)).ravel()
-        ones = sparse.csr_matrix(
-            (np.ones(len(index)), (index, np.arange(len(index)))), (3 * self.nodes, len(index))
-        )
+        ones = sparse.csr_matrix((np.ones(len(index)), (index, np.arange(len(index)))), (3 * self.nodes, len(index)))
         return sparse.hstack([ones, *columns]).tocsr()
 
     # ---- what follows from it
@@ -305,7 +304,7 @@ class Structure:
             guess: Square of the first circular frequency, if it is roughly known [1/s²]; it saves time.
 
         Raises:
-            ValueError: If nothing holds the body or it is too large.
+            ValueError: If nothing holds the body, most of it hangs loose, or it is too large.
         """
         S = self.spread
         if S.shape[1] > MOST_UNKNOWNS:
@@ -316,10 +315,16 @@ class Structure:
         K, M = self.reduced(self.stiffness)
         load = self.loads(CLUSTERS)
         whole = S.T @ load[:, :2]
-        shift = _power_of_two(self._first_guess() if guess is None else SHIFT**2 * guess)
+        begin = self._first_guess()
+        shift = _power_of_two(begin if guess is None else SHIFT**2 * guess)
         for _ in range(12):
             solve = factor(K + shift * M)
             first = rayleigh(K, M, solve(whole))
+            if not first > NO_STIFFNESS * begin:
+                raise ValueError(
+                    "`solver.formulation: modes` is for a body that stands against the wind, but most of this one "
+                    "hangs loose: hold more of it, give it more points in each cell, or set it to total."
+                )
             following = _power_of_two(SHIFT**2 * first)
             if following == shift or (following > shift and guess is None):
                 break
@@ -359,7 +364,7 @@ class Structure:
     def _result(self, square: np.ndarray, shape: np.ndarray, first: float, dropped: int) -> Analysis:
         modes, sites = shape.shape[1], int(self.site.max()) + 1
         turn_points = self.turn_at_points(shape)
-        weighted = (self.value.T @ (self.point_mass[:, None] * turn_points.reshape(self.count, -1)))
+        weighted = self.value.T @ (self.point_mass[:, None] * turn_points.reshape(self.count, -1))
         turn = weighted / np.maximum(self.mass, 1e-7 * self.mass.max())[:, None]
         own = np.bincount(self.site, self.point_mass, sites)
 
@@ -493,7 +498,9 @@ def _content(total: Total, scene: int, most: int) -> str:
 def _numbers(total: Total, scene: int) -> np.ndarray:
     """Masses, volumes and stiffnesses of the points over their means, which rounding may change a little, (3, P)."""
     points = total.body.points
-    own = [field.detach().reshape(-1, points.count)[scene] for field in (points.mass, points.volume, total.body.laws.mu)]
+    own = [
+        field.detach().reshape(-1, points.count)[scene] for field in (points.mass, points.volume, total.body.laws.mu)
+    ]
     return np.stack([(field / field.mean()).float().cpu().numpy() for field in own])
 
 
@@ -504,7 +511,7 @@ def _read(path: Path, numbers: np.ndarray) -> Analysis | None:
             if not np.allclose(file["numbers"], numbers, rtol=1e-4, atol=0):
                 return None
             values = {f.name: file[f.name] for f in fields(Analysis)}
-    except (OSError, ValueError, KeyError, EOFError):
+    except (OSError, ValueError, KeyError, EOFError, BadZipFile):
         return None
     values["first"], values["dropped"] = float(values["first"]), int(values["dropped"])
     return Analysis(**values)
@@ -515,11 +522,8 @@ def _write(path: Path, found: Analysis, numbers: np.ndarray) -> None:
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         with atomic(path) as temporary:
-            np.savez(
-                temporary,
-                numbers=numbers,
-                **{f.name: np.asarray(getattr(found, f.name)) for f in fields(Analysis)},
-            )
+            kept: dict[str, Any] = {f.name: np.asarray(getattr(found, f.name)) for f in fields(Analysis)}
+            np.savez(temporary, numbers=numbers, **kept)
         for old in sorted(path.parent.glob("modes_*.npz"), key=lambda p: p.stat().st_mtime)[:-KEPT]:
             old.unlink(missing_ok=True)
     except OSError:

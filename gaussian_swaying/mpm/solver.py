@@ -228,6 +228,8 @@ class MPMSolver(Solver):
         assert state.node_displacement is not None
         assert state.node_velocity is not None
         moved = start.replace(time=state.time, substep=state.substep, work=state.work)
+        if isinstance(after, Modes):  # what of the motion its modes can show
+            return after.shown(moved, *after.amplitudes(state.replace(modal=None)))
         return after.read_particles(moved, state.node_displacement, state.node_velocity)
 
     def domain(self, state: MPMState) -> tuple[list[float], list[float]]:
@@ -470,7 +472,9 @@ class MPMSolver(Solver):
         if force is None and drag is None:
             return self.rollout(state, dt, 1, acting, check=waits)
         if isinstance(self.bound, Modes):
-            given = FunctionForce(lambda state: (force if force is not None else torch.zeros_like(state.position), drag))
+            given = FunctionForce(
+                lambda state: (force if force is not None else torch.zeros_like(state.position), drag)
+            )
             return self.rollout(state, dt, 1, (*acting, given), check=waits)
         found = [split(part(state), part, state) for part in acting]
         end = self._step(state, dt, *added([(force, drag), *found]))

@@ -8,13 +8,15 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
 
 from gaussian_swaying.gaussians.cloud import GaussianCloud
 from gaussian_swaying.gaussians.harmonics import SH_DC
+from gaussian_swaying.gaussians.parts import Parts
+from gaussian_swaying.mpm.materials import known_material
 from gaussian_swaying.preview.parts import FoundParts, greenish
 from gaussian_swaying.preview.shape import plane_axes, quantile
 
@@ -92,6 +94,8 @@ NARROW_TOP = 0.45  # width of a conifer in its upper quarter over that near its 
 SLENDER = 2.2  # height of a young tree over its width, at least
 THREAD = 2.2  # length of the Gaussians of grass over their width, at least
 
+STEM_E = 2e6  # Pa; of stems and wood, until their frequency is known
+
 
 def kind_of(
     cloud: GaussianCloud,
@@ -158,6 +162,32 @@ def kind_of(
         if share > SKIN and slim:
             return "person", f"{share:.0%} of its upper end has the colour of skin, above something wider"
     return "rigid", "neither green, nor a sheet, nor hanging: it stands, and there is little to sway"
+
+
+def with_materials(found: FoundParts, kind: Kind, height: float) -> FoundParts:
+    """The same parts with the densities, thicknesses and damping of their kind of thing.
+
+    Leaves and cloth have that of a sheet. Stems and wood are rods of which the surface is seen, so their thickness is
+    half of a radius: 3 mm for a stem, and a 120th of the height for wood, branches included. They get twice the
+    modulus, by which :mod:`~gaussian_swaying.preview.natural` tells them from leaves.
+
+    Args:
+        found: The parts.
+        kind: What the whole is.
+        height: Its height [m].
+    """
+    of = {"leaf": kind.material, "stem": kind.other, "wood": kind.other, "foot": kind.other, "post": kind.other}
+    of |= {"head": kind.material, "cord": kind.other, "body": kind.material, "hook": kind.other}
+    parts = []
+    for part in found.parts.parts:
+        if part.role == "still" or part.name not in of:
+            parts.append(part)
+            continue
+        known, sheet = known_material(of[part.name]), part.name in ("leaf", "head", "body")
+        thickness = known.thickness if sheet else 0.0015 if part.name == "stem" else height / 240
+        E = None if sheet or part.role == "rigid" else STEM_E
+        parts.append(replace(part, density=known.density, thickness=thickness, damping_ratio=kind.damping_ratio, E=E))
+    return replace(found, parts=Parts(found.parts.labels, parts))
 
 
 def _label(found: FoundParts, name: str) -> int:

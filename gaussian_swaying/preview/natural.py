@@ -1,9 +1,9 @@
 r"""Stiffness, mass and drag with which a thing sways as its kind does in nature, by linear algebra in place of trials.
 
-First frequency :math:`\omega_1` and mass per frontal area :math:`M_A` alone decide how far a thing leans in a wind U, by
-:math:`\rho C_D U^2 / (2 M_A \omega_1^2)`. Mass and drag of the whole are those of the kind on the silhouette that is
-seen; the stiffness of the grid that runs is scaled until the main mode of the lean has the first frequency of the kind and
-height. Leaves on stems have a frequency of their own, with the stems pinned.
+First frequency :math:`\omega_1` and mass per frontal area :math:`M_A` alone decide how far a thing leans in a wind U,
+by :math:`\rho C_D U^2 / (2 M_A \omega_1^2)`. Mass and drag of the whole are those of the kind on the silhouette that is
+seen; the stiffness of the grid that runs is scaled until the main mode of the lean has the first frequency of the kind
+and height. Leaves on stems have a frequency of their own, with the stems pinned.
 """
 
 from __future__ import annotations
@@ -11,6 +11,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 import torch
@@ -33,7 +34,7 @@ from gaussian_swaying.simulation.parameters import other_with
 from gaussian_swaying.simulation.simulation import Simulation
 
 FLAPS, HANGS, CLOTH_RATIO = 0.35, 0.6, 0.3
-"""Frequency of a flag times its length over the wind, of a hanging sheet times the root of its length; damping ratio."""
+"""Frequency of a flag times its length over the wind; of a hanging sheet times the root of its length; damping."""
 MOST_LEAN = 0.4
 """Lean over the longest side above which modes will not do."""
 SILHOUETTE = 96
@@ -93,17 +94,21 @@ def natural(simulation: Simulation, kind: Kind, flow: Tensor, intensity: float) 
     height = _height(structure, free, kind)
     frequency = kind.first_frequency(height)
     assert frequency is not None
-    frontal = silhouette(torch.from_numpy(place[free]), flow)
+    along = flow if bool(flow.any()) else torch.tensor([1.0, 0.0, 0.0], dtype=torch.float64)  # it is still
+    frontal = silhouette(torch.from_numpy(place[free]), along)
     moving = float(structure.point_mass[free].sum())
     own = float(setup.points.mass.double().sum())
     wanted = kind.area_mass(height) * frontal
     thicker = wanted / (own * moving)
     found = _stiffness(structure, setup.points.youngs_modulus, own * thicker, thicker, frequency, kind)
     stiffer = {value: value * ratio for value, ratio in found.items()}
-    drag = _drag(simulation, frontal, kind)
-    aero = other_with(simulation.aero, **{name: drag * getattr(simulation.aero, name) for name in ("C_D", "C_F", "C_L")})
+    drag = _drag(simulation, frontal, along, kind)
+    aero = other_with(
+        simulation.aero, **{name: drag * getattr(simulation.aero, name) for name in ("C_D", "C_F", "C_L")}
+    )
     steady = WindForce(aero, WindField(flow * math.sqrt(1 + intensity**2)), scene.patches)
     used = stiffer
+    modes: Modes | None = None
     for _ in range(2):  # the second time the mode itself has the frequency; the shapes stay
         points = setup.points
         E = points.youngs_modulus.clone()
@@ -113,23 +118,24 @@ def natural(simulation: Simulation, kind: Kind, flow: Tensor, intensity: float) 
         simulation.adopt(replace(setup, points=points, aero=aero))
         if used is stiffer:
             whole = Total(Body(points, solver.framed(scene.frame)), setup.solver)
-            volume, own = points.volume.double(), points.mass.double().sum()
-            unit = float(own / ((points.youngs_modulus * volume).sum() / volume.sum()))
+            volume, whole_mass = points.volume.double(), points.mass.double().sum()
+            unit = float(whole_mass / ((points.youngs_modulus * volume).sum() / volume.sum()))
             analysis_of(whole, 0, MOST_MODES, unit * (2 * math.pi * frequency) ** 2)  # is in the cache now
         simulation.solver.init_state(points, frame=scene.frame)
         bound = solver.bound
         assert isinstance(bound, Modes)
-        used = stiffer
+        used, modes = stiffer, bound
         ratio = (2 * math.pi * frequency) ** 2 / bound.first**2
         stiffer = {value: modulus * ratio for value, modulus in stiffer.items()}
-    state = bound.leaning(steady)
+    assert modes is not None
+    state = modes.leaning(steady)
     lean = _lean(state.position - points.position, points.position) if bool(flow.any()) else 0.0
-    shift = bound.at_sites(points.mass[:, None] * (state.position - points.position)).norm(dim=-1) / bound.site_mass
+    shift = modes.at_sites(points.mass[:, None] * (state.position - points.position)).norm(dim=-1) / modes.site_mass
     top = (shift >= quantile(shift, 0.9)).nonzero()[:, 0].cpu().numpy()
     assert isinstance(simulation.wind, WindField)
     start = 0.0
     if bool(flow.any()):
-        start = typical_start(linear_motion(bound, steady, simulation.wind, top, rate_for(frequency)), frequency)
+        start = typical_start(linear_motion(modes, steady, simulation.wind, top, rate_for(frequency)), frequency)
     return Natural(height, frequency, wanted, frontal, thicker, used, drag, lean, start)
 
 
@@ -192,25 +198,27 @@ def _stiffness(
     unit = mass / (structure.mean_modulus * thicker)  # of squares of frequencies, for the structure's own units
     load = structure.loads(0)[:, :2]
 
-    def quotient(parts: list[tuple[float, object]], spread: object = None) -> float:
-        K = structure.with_rows(sum(ratio * K for ratio, K in parts[1:]) + parts[0][0] * parts[0][1])  # type: ignore[operator]
-        K, M = structure.reduced(K)
+    def quotient(*parts: tuple[float, Any]) -> float:
+        whole = parts[0][0] * parts[0][1]
+        for ratio, K in parts[1:]:
+            whole = whole + ratio * K
+        K, M = structure.reduced(structure.with_rows(whole))
         return rayleigh(K, M, factor(K + SHIFT**2 * target * unit * M)(structure.spread.T @ load)) / unit
 
     if len(values) == 1:
         whole = structure.hooke()
-        ratio = target / quotient([(1.0, whole)])
+        ratio = target / quotient((1.0, whole))
         for _ in range(2):  # the shift is that of the stiffness found
-            ratio *= target / quotient([(ratio, whole)])
+            ratio *= target / quotient((ratio, whole))
         _check_loose(ratio)
         return {float(values[0]): ratio}
-    soft = E == values[0]  # leaves have the lowest modulus
+    soft = values[0] == E  # leaves have the lowest modulus
     leaves, stems = structure.hooke(soft), structure.hooke(~soft)
     wanted = (2 * math.pi * max(kind.leaf, ABOVE * frequency)) ** 2
     leaf = wanted * unit / _on_pinned_stems(structure, leaves, soft, wanted * unit)
     low, high, stem = 1e-6, 1e12, leaf
     for _ in range(8):
-        found = quotient([(leaf, leaves), (stem, stems)])
+        found = quotient((leaf, leaves), (stem, stems))
         if abs(found / target - 1) < 0.1:  # the mode itself will be exact
             break
         low, high = (stem, high) if found < target else (low, stem)
@@ -224,12 +232,12 @@ def _check_loose(ratio: float) -> None:
     """Raise ValueError if no stiffness gives a thing its frequency, as most of it hangs loose."""
     if not 1e-9 < ratio < 1e9:
         raise ValueError(
-            "Most of it hangs loose, so that no stiffness gives it the frequency of its kind: use `--connected grid`, or "
-            "hold more of it."
+            "Most of it hangs loose, so that no stiffness gives it the frequency of its kind: use `--connected grid`, "
+            "or hold more of it."
         )
 
 
-def _on_pinned_stems(structure: Structure, leaves: object, soft: np.ndarray, target: float) -> float:
+def _on_pinned_stems(structure: Structure, leaves: Any, soft: np.ndarray, target: float) -> float:
     """Rayleigh's quotient of the leaves with all nodes pinned that carry more than a little of the stems."""
     import scipy.sparse as sparse
 
@@ -238,7 +246,7 @@ def _on_pinned_stems(structure: Structure, leaves: object, soft: np.ndarray, tar
     index = (3 * np.flatnonzero(nodes)[:, None] + np.arange(3)).ravel()
     if len(index) == 0:
         return target
-    K = leaves[index][:, index].tocsc()  # type: ignore[index]
+    K = leaves[index][:, index].tocsc()
     M = sparse.diags(np.repeat(structure.mass, 3)[index]).tocsc()
     load, ratio = structure.loads(0)[index, :2], 1.0
     for _ in range(2):
@@ -246,17 +254,16 @@ def _on_pinned_stems(structure: Structure, leaves: object, soft: np.ndarray, tar
     return target / ratio
 
 
-def _drag(simulation: Simulation, frontal: float, kind: Kind) -> float:
-    """Factor on the coefficients that gives the whole the drag of its kind."""
+def _drag(simulation: Simulation, frontal: float, flow: Tensor, kind: Kind) -> float:
+    """Factor on the coefficients that gives the whole the drag of its kind in a wind along a flow."""
     scene, aero = simulation.scene, simulation.aero
     points = simulation.setup.points
     still = torch.zeros_like(points.position)
     identity = torch.eye(3).to(still).expand(*still.shape, 3)
-    direction = simulation.wind.flows[0].to(still)  # type: ignore[union-attr]
-    direction = direction / direction.norm().clamp(min=1e-12)
+    direction = flow.to(still) / flow.to(still).norm()
     force = WindForce(aero, WindField(direction.double()), scene.patches)
-    lost = torch.zeros(len(still), dtype=torch.bool)
-    time = torch.zeros((), dtype=torch.float64)
+    lost = torch.zeros(len(still), dtype=torch.bool, device=still.device)
+    time = torch.zeros((), dtype=torch.float64, device=still.device)
     state = State(position=points.position, velocity=still, F_elastic=identity, F_total=identity, lost=lost, time=time)
     pull = float((force(state)[0].sum(0) * direction).sum())
     return kind.drag * 0.5 * aero.air_density * frontal / max(pull, 1e-30)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
@@ -16,11 +15,7 @@ from gaussian_swaying.gaussians.harmonics import SH_DC
 from gaussian_swaying.gaussians.parts import Part, Parts
 from gaussian_swaying.geometry.groups import equal_rows, sums
 from gaussian_swaying.geometry.neighbours import nearest_neighbours
-from gaussian_swaying.mpm.materials import known_material
 from gaussian_swaying.preview.shape import FEWEST, plane_axes, quantile
-
-if TYPE_CHECKING:
-    from gaussian_swaying.preview.kinds import Kind
 
 GREEN = 0.08  # how much greener than red and blue, as a share of the brightness
 SLICES, SECTORS = 40, 16  # of the height; of a slice
@@ -35,8 +30,6 @@ NEIGHBOURS = 12  # whose most frequent label a Gaussian near the pot gets
 CELL, NEAR = 0.006, 0.03  # of the height: cells in which shapes are looked at, and how far around
 SEEN = 8  # cells around that show a shape
 THIN, LONG, THREAD = 0.25, 0.5, 0.12  # third over second variance of the places around, and second over first (twice)
-
-STEM_E = 2e6  # Pa; of stems and wood, until their frequency is known
 
 POT_LABEL, SOIL, STEM, LEAF, AROUND = range(5)
 NAMES = ("pot", "soil", "stem", "leaf", "surroundings")
@@ -104,34 +97,6 @@ class _Pot:
         return (across - torch.from_numpy(centre)).norm(dim=-1) / torch.from_numpy(
             np.interp(at, self.heights, self.radii)
         )
-
-
-def with_materials(found: FoundParts, kind: Kind, height: float) -> FoundParts:
-    """The same parts with the densities, thicknesses and damping of their kind of thing.
-
-    Leaves and cloth have that of a sheet. Stems and wood are rods of which the surface is seen, so their thickness is
-    half of a radius: 3 mm for a stem, and a 120th of the height for wood, branches included. They get twice the
-    modulus, by which :mod:`~gaussian_swaying.preview.natural` tells them from leaves.
-
-    Args:
-        found: The parts.
-        kind: What the whole is.
-        height: Its height [m].
-    """
-    of = {"leaf": kind.material, "stem": kind.other, "wood": kind.other, "foot": kind.other, "post": kind.other}
-    of |= {"head": kind.material, "cord": kind.other, "body": kind.material, "hook": kind.other}
-    parts = []
-    for part in found.parts.parts:
-        if part.role == "still" or part.name not in of:
-            parts.append(part)
-            continue
-        known, sheet = known_material(of[part.name]), part.name in ("leaf", "head", "body")
-        thickness = known.thickness if sheet else 0.0015 if part.name == "stem" else height / 240
-        E = None if sheet or part.role == "rigid" else STEM_E
-        parts.append(
-            replace(part, density=known.density, thickness=thickness, damping_ratio=kind.damping_ratio, E=E)
-        )
-    return replace(found, parts=Parts(found.parts.labels, parts))
 
 
 def plant_parts(cloud: GaussianCloud, simulated: Tensor, up: Sequence[float], weight: Tensor) -> FoundParts | None:

@@ -194,8 +194,8 @@ def _sway_words(s: Suggestion) -> str:
     n = s.natural
     still = " There is little to sway." if s.kind == "rigid" else ""
     return (
-        f"It is taken for {kind.words}: {s.kind_reason}. First frequency in still air {n.frequency:.3g} Hz, for a length of "
-        f"{n.height:.3g} m; mean lean of its top {n.lean:.2%} of its longest side.{still}"
+        f"It is taken for {kind.words}: {s.kind_reason}. First frequency in still air {n.frequency:.3g} Hz, for a "
+        f"length of {n.height:.3g} m; mean lean of its top {n.lean:.2%} of its longest side.{still}"
     )
 
 

@@ -8,6 +8,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -27,9 +28,9 @@ from gaussian_swaying.geometry.regions import Box, Not, Region, Union
 from gaussian_swaying.mpm.materials import known_material
 from gaussian_swaying.preview.framing import orbit_frame, whole_box
 from gaussian_swaying.preview.hold import PIN_DEPTH, HoldGuess, end_region, given_hold, guess_hold
-from gaussian_swaying.preview.kinds import KINDS, kind_of
+from gaussian_swaying.preview.kinds import KINDS, kind_of, with_materials
 from gaussian_swaying.preview.natural import MOST_LEAN, Natural
-from gaussian_swaying.preview.parts import FoundParts, plant_parts, with_materials
+from gaussian_swaying.preview.parts import FoundParts, plant_parts
 from gaussian_swaying.preview.photos import CapturedFrom, ShownObject, shown_object
 from gaussian_swaying.preview.shape import (
     FEWEST,
@@ -299,7 +300,8 @@ def suggest(
         why = [*upward.reasons, "a plant stands in a pot at the lower end"]
         upward = replace(upward, confidence="high", reasons=why)
     found_parts = plant if flag is None else flag.found
-    if found_parts is not None:  # the length is that of the whole, with pot or pole
+    if found_parts is not None:  # the length is that of the whole, with pot or pole and without the ground around it
+        frame = SimFrame.fit(means[chosen.simulated & ~found_parts.around], upward.direction, longest_side)
         chosen = replace(chosen, simulated=chosen.simulated & ~found_parts.still)
         frame = SimFrame.fit(means[chosen.simulated], upward.direction, None, frame.metres_per_unit)
     points, visible = means[chosen.simulated], weight[chosen.simulated]
@@ -335,14 +337,14 @@ def suggest(
             found_parts = found_parts or standing_parts(cloud, chosen.simulated, upward.direction, weight, depth)
         pin = pin if found_parts is None else None
     flat = sheet_normal(points)
-    name, why_kind = kind_of(
-        cloud, chosen.simulated, upward.direction, weight, held.end, flat is not None, found_parts
-    )
+    name, why_kind = kind_of(cloud, chosen.simulated, upward.direction, weight, held.end, flat is not None, found_parts)
     if kind is not None:
         name, why_kind = kind, "given"
     if name == "hanging" and held.end == "top" and (found_parts is None or "cord" in _names(found_parts)):
         ends = end_region(points, held.direction, dx / frame.metres_per_unit)
-        found_parts = swinging_parts(cloud, chosen.simulated, upward.direction, weight, ends, dx / frame.metres_per_unit)
+        found_parts = swinging_parts(
+            cloud, chosen.simulated, upward.direction, weight, ends, dx / frame.metres_per_unit
+        )
         pin = None
     if unscaled:
         ratio = KINDS[name].side
@@ -357,7 +359,7 @@ def suggest(
     if front is not None:
         azimuth, turn = front, 0.0
     flow = _across_picture(azimuth, speed)
-    if held.end == "side":  # along the sheet from the pole, and slightly onto it
+    if held.end == "side" and KINDS[name].cloth:  # along the sheet from the pole, and slightly onto it
         away = -frame.direction_to_sim(torch.tensor(held.direction, dtype=torch.float64))
         onto = torch.linalg.cross(torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64), away)
         flow = tuple(speed * float(c) for c in math.cos(0.25) * away + math.sin(0.25) * onto)
@@ -429,7 +431,7 @@ def with_natural(suggestion: Suggestion, found: Natural) -> Suggestion:
 
     def own(part: Part) -> Part:
         given = {name: getattr(part, name) for name in ("thickness", "E", "damping_ratio")}
-        changed: dict[str, float] = {}
+        changed: dict[str, Any] = {}
         if given["thickness"] is not None:
             changed["thickness"] = given["thickness"] * found.thicker
         if given["E"] is not None:

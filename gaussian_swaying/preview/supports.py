@@ -133,9 +133,7 @@ def hanging_parts(
     return FoundParts(parts, f"a cord {ends[1] - ends[0]:.2g} long, right above the middle of what hangs on it")
 
 
-def potted_parts(
-    cloud: GaussianCloud, simulated: Tensor, up: Sequence[float], weight: Tensor
-) -> FoundParts | None:
+def potted_parts(cloud: GaussianCloud, simulated: Tensor, up: Sequence[float], weight: Tensor) -> FoundParts | None:
     """The parts of a plant in a pot by colour alone: the lower part is not green and as wide as the plant.
 
     Args:
@@ -158,7 +156,11 @@ def potted_parts(
     for k in range(SLICES):
         own = (which == k).nonzero()[:, 0]
         leafy.append(float((visible * green)[own].sum() / visible[own].sum().clamp(min=1e-30)))
-        spread = [quantile(means[own] @ a, 0.95) - quantile(means[own] @ a, 0.05) for a in plane_axes(axis)] if len(own) else [0.0]
+        spread = (
+            [quantile(means[own] @ a, 0.95) - quantile(means[own] @ a, 0.05) for a in plane_axes(axis)]
+            if len(own)
+            else [0.0]
+        )
         wide.append(max(spread))
     rim = next((k for k in range(SLICES) if leafy[k] > 0.5), SLICES)
     if not RIM[0] * SLICES <= rim < RIM[1] * SLICES:
@@ -168,7 +170,9 @@ def potted_parts(
     label = torch.where(which < rim, 0, 1)
     labels = labels_for_all(cloud.means.detach(), index, label, high - low, 2)
     parts = _parts(labels, [Part("pot", "held"), Part("leaf"), Part("surroundings", "still")])
-    return FoundParts(parts, f"not green and as wide as the rest up to {rim / SLICES:.2f} of the height, and green above")
+    return FoundParts(
+        parts, f"not green and as wide as the rest up to {rim / SLICES:.2f} of the height, and green above"
+    )
 
 
 def swinging_parts(

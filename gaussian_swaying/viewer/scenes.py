@@ -10,10 +10,10 @@ from typing import TYPE_CHECKING
 
 import torch
 
-from gaussian_swaying.config.parser import parse_text
-from gaussian_swaying.gaussians.formats import read_gaussians
 from gaussian_swaying.aero.looks import LOOKS
 from gaussian_swaying.aero.wind import WindField
+from gaussian_swaying.config.parser import parse_text
+from gaussian_swaying.gaussians.formats import read_gaussians
 from gaussian_swaying.preview.kinds import KINDS
 from gaussian_swaying.preview.natural import natural
 from gaussian_swaying.preview.starter import starter_yaml

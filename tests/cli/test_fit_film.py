@@ -3,6 +3,7 @@
 Covers: fitting.before, fitting.page.
 """
 
+import dataclasses
 import math
 import subprocess
 from types import SimpleNamespace
@@ -16,6 +17,7 @@ from bench.problems.flag_film import TRUTH, camera_of, write_case
 from PIL import Image
 from shared import refused
 
+from gaussian_swaying.cli import fit_film
 from gaussian_swaying.cli.fit import main
 from gaussian_swaying.cli.fit_film import Seen, extent, longest_side, plan_text, upright_in
 from gaussian_swaying.cli.preview import build_options, preview_scene
@@ -67,7 +69,7 @@ def test_the_file_that_a_fit_reads(checked):
     for u in plan.unknowns[:3]:
         assert u.low < TRUTH[u.name] < u.high
     assert plan.assumed == ["mass"]
-    base = yaml.safe_load((checked / "preview/draft.yaml").read_text())
+    base = yaml.safe_load((checked / "preview/starter.yaml").read_text())
     assert base["scene"]["longest_side"] == pytest.approx(1.2, rel=0.03)
     assert plan.known["background"] == pytest.approx([0.9 * 0.45, 0.9 * 0.5 * 0.94, 0.9 * 0.55 * 0.82], abs=0.02)
     (video,) = read_videos(plan.videos)
@@ -162,14 +164,24 @@ def test_a_fit_without_a_length_keeps_the_edited_file(case, checked, capsys):
     assert "wind.azimuth" in page
 
 
-def test_the_weight_as_a_ruler(case, checked, capsys):
-    """The length of a scene unit is sought; a flag that was captured with its pole, in balance, is refused."""
+def test_the_weight_as_a_ruler(case, checked, capsys, monkeypatch):
+    """The length of a scene unit is sought; what was captured in balance with its weight, as a plant, is refused."""
+    previewed = fit_film._previewed
+
+    def weightless(*given):
+        preview = previewed(*given)
+        starter = yaml.safe_load(preview.configurations["starter"])
+        assert starter["solver"]["gravity"][2] == -9.8  # a flag is not in balance
+        starter["solver"]["gravity"] = [0.0, 0.0, 0.0]
+        return dataclasses.replace(preview, configurations={"starter": yaml.safe_dump(starter)})
+
+    monkeypatch.setattr(fit_film, "_previewed", weightless)
     given = [str(case / "film.mp4"), "--splat", str(case / "my.ply"), "--up", "+z", "--length", "gravity"]
     assert main([*given, "--output", str(case / "weighed"), "--check"]) == 2
     assert "captured in balance" in capsys.readouterr().err
-    draft = (checked / "preview/draft.yaml").read_text()
+    starter = (checked / "preview/starter.yaml").read_text()
     guess = {"metres_per_unit": 0.5, "hold": {"end": "top"}, "flow": [1.0, 0.0, 0.0]}
-    preview = SimpleNamespace(data={"suggestion": guess}, configurations={"draft": draft})
+    preview = SimpleNamespace(data={"suggestion": guess}, configurations={"starter": starter})
     (checked / "weighed.yaml").write_text(plan_text(preview, [0.5, 0.5, 0.5], 0.1, "gravity", checked))
     plan = read_plan(checked / "weighed.yaml")
     (scale,) = [u for u in plan.unknowns if u.name == SCALE]

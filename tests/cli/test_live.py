@@ -21,7 +21,7 @@ from gaussian_swaying.preview.cost import Cost
 from gaussian_swaying.scenes.alocasia import AlocasiaScene
 from gaussian_swaying.scenes.procedural import FlagScene
 from gaussian_swaying.simulation.simulation import Simulation
-from gaussian_swaying.viewer import real_time, scenes
+from gaussian_swaying.viewer import real_time
 from gaussian_swaying.viewer.scenes import settings_of_splat
 
 
@@ -90,11 +90,10 @@ def test_a_splat_gets_what_the_preview_suggests(parser, tmp_path):
     assert torch.isfinite(frames[-1].state.position).all()
 
 
-def test_a_plant_in_a_pot_moves_in_it(parser, tmp_path, monkeypatch):
+def test_a_plant_in_a_pot_moves_in_it(parser, tmp_path):
     """Its parts are in a file that the settings name."""
     path = tmp_path / "plant.ply"
     write_ply(path, AlocasiaScene(spacing=0.005).generate())
-    monkeypatch.setattr(scenes, "calibrated_suggestion", lambda found, *given: found)  # which takes long
     settings = settings_of_splat(parser, path, torch.device("cpu"), tmp_path, quick=True)
     assert settings.scene.parts == str(tmp_path / "parts.npz")
     scene = Simulation.from_settings(parser, settings).scene

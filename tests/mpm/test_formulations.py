@@ -296,7 +296,7 @@ class Loose(Formulation):
 
 def test_a_third_formulation_is_one_class(monkeypatch):
     """The solver runs it like its own formulations: forces and their work, energies, substeps and grid."""
-    with pytest.raises(ValueError, match="`formulation` to be one of total, updated, but got 'loose'"):
+    with pytest.raises(ValueError, match="`formulation` to be one of modes, total, updated, but got 'loose'"):
         MPMSolver(formulation="loose")
     monkeypatch.setitem(known.FORMULATIONS, "loose", Loose)
     points = _points((0.2, 0.2, 0.2), 0.05)

@@ -146,7 +146,7 @@ def test_wall_and_room_are_left_out(tmp_path):
     held = found.pin.contains(everything) & simulated
     assert 0 < float(everything[held][:, 0].max()) < 0.3
     assert abs(found.azimuth) < 10  # seen from where the photos were taken, not through the wall
-    assert found.flow[1] == pytest.approx(6.0, abs=0.5)
+    assert found.flow[1] == pytest.approx(3.0, abs=0.25)  # across the picture
     alone = suggest(plain_cloud(everything))  # without cameras it takes in the room
     assert int(alone.region.simulated.sum()) > 2 * int(simulated.sum())
 

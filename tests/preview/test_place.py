@@ -137,7 +137,7 @@ def test_several_things_move_as_one_object(garden):
     assert float(inside[plant].double().mean()) > 0.97
     hedge = (cloud.means[:, 1] < -0.05) & (cloud.means.norm(dim=-1) > 1.5) & (cloud.means.norm(dim=-1) < 3)
     assert float(inside[hedge].double().mean()) > 0.97
-    assert suggest(shown, found=(upward, region)).size[0] == pytest.approx(1.0, abs=0.01)
+    assert suggest(shown, found=(upward, region), longest_side=1.0).size[0] == pytest.approx(1.0, abs=0.01)
 
 
 @pytest.fixture
@@ -154,7 +154,6 @@ def _preview(file, out, *options):
 def test_the_preview_of_a_place(file, garden, tmp_path, capsys, monkeypatch):
     """It lists what may move, draws it, and its starter simulates the same Gaussians of the whole file."""
     monkeypatch.setattr("gaussian_swaying.preview.cost.MOST_FRAMES", 2)
-    monkeypatch.setattr("gaussian_swaying.cli.preview.calibrated_suggestion", lambda found, draft, sway: found)
     out = tmp_path / "out"
     assert _preview(file, out) == 0
     told = capsys.readouterr().out
@@ -183,7 +182,6 @@ def test_the_preview_of_a_place(file, garden, tmp_path, capsys, monkeypatch):
 
 def test_a_thing_is_chosen_by_its_number(file, tmp_path, capsys, monkeypatch):
     monkeypatch.setattr("gaussian_swaying.preview.cost.MOST_FRAMES", 2)
-    monkeypatch.setattr("gaussian_swaying.cli.preview.calibrated_suggestion", lambda found, draft, sway: found)
     monkeypatch.setattr("gaussian_swaying.cli.preview.LARGE", 0)
     assert _preview(file, tmp_path / "out", "--move", "2, 2") == 0
     told = capsys.readouterr().out
@@ -200,7 +198,6 @@ def test_a_thing_is_chosen_by_its_number(file, tmp_path, capsys, monkeypatch):
 def test_things_of_a_place_are_chosen_with_the_cameras_of_the_photos(file, tmp_path, capsys, monkeypatch):
     """They rank the things, and tell which way is up."""
     monkeypatch.setattr("gaussian_swaying.preview.cost.MOST_FRAMES", 2)
-    monkeypatch.setattr("gaussian_swaying.cli.preview.calibrated_suggestion", lambda found, draft, sway: found)
     eyes = [(math.cos(k), -0.5, math.sin(k)) for k in range(6)]
     middle, up = (0.0, -0.2, 0.0), (0.0, -1.0, 0.0)
     cameras = [look_at_camera(eye, middle, up, 50.0, 64, 64, dtype=torch.float64) for eye in eyes]

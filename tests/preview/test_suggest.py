@@ -13,6 +13,7 @@ import torch
 import yaml
 from small_scenes import plain_cloud, together, turned_cloud
 
+from gaussian_swaying.aero.looks import LOOKS
 from gaussian_swaying.config.parser import parse_text
 from gaussian_swaying.gaussians.cloud import GaussianCloud
 from gaussian_swaying.gaussians.grouping import LOOSE, connected_parts
@@ -22,10 +23,10 @@ from gaussian_swaying.geometry.patches import smallest_axis_normal
 from gaussian_swaying.geometry.regions import Box, Cylinder
 from gaussian_swaying.geometry.rotations import quat_to_rotation
 from gaussian_swaying.mpm.materials import MATERIALS
-from gaussian_swaying.preview import calibration
 from gaussian_swaying.preview.hold import PIN_DEPTH, end_region
+from gaussian_swaying.preview.kinds import KINDS
 from gaussian_swaying.preview.shape import SHEET, bounds, sheet_normal
-from gaussian_swaying.preview.starter import DRAFT_FRAMES, draft_yaml, starter_yaml
+from gaussian_swaying.preview.starter import starter_yaml
 from gaussian_swaying.preview.suggest import (
     CELLS,
     CLOTH_E,
@@ -115,8 +116,8 @@ def test_flag_has_known_up_pins_region_and_spacing():
     assert found.pin.max[0] == pytest.approx(0.025 + 1.5 * 0.087 * 1.15, abs=1e-3)
     assert found.pin.max[1:] == (math.inf, math.inf)
     # from the pole along the flag, a little onto it
-    assert found.flow[0] == pytest.approx(6 * math.cos(0.25), abs=0.01)
-    assert abs(found.flow[1]) == pytest.approx(6 * math.sin(0.25), abs=0.01)
+    assert found.flow[0] == pytest.approx(LOOKS["breeze"].speed * math.cos(0.25), abs=0.01)
+    assert abs(found.flow[1]) == pytest.approx(LOOKS["breeze"].speed * math.sin(0.25), abs=0.01)
 
 
 def test_fine_flag_gets_the_cells_of_its_longest_side():
@@ -149,10 +150,9 @@ def test_a_quality_is_a_grid_and_nothing_else():
         same = dataclasses.replace(one, dx=0.042, quality="normal")
         assert starter_yaml(same, "flag.ply") == starter_yaml(found["normal"], "flag.ply")
         text = starter_yaml(one, "flag.ply")
-        assert text.startswith(f"# A first configuration. Quality: {name}.\n")
+        assert f"every number may be changed. Quality: {name}.\n" in text
         assert f"# m; quality {name}: " in text
         assert yaml.safe_load(text)["solver"]["dx"] == one.dx
-        assert draft_yaml(one, "flag.ply") == draft_yaml(found["normal"], "flag.ply")
     assert finest_spacing(found["normal"]) == found["fine"].dx
     assert finest_spacing(dataclasses.replace(found["normal"], spacing=1e-4)) == float(f"{1 / MOST_CELLS:.2g}")
     with pytest.raises(ValueError, match="Expected `--quality` to be one of draft, normal, fine, but got 'best'"):
@@ -384,11 +384,6 @@ def test_page_states_the_numbers_of_the_rules():
         *(f"| `{name}` | {cells} |" for name, cells in QUALITIES.items()),
         f"at most {MOST_CELLS} cells",
         f"{KEPT_AREA:.0%}".replace("%", " % of the visible area"),
-        f"default is {calibration.SWAY:.0%}".replace("%", " %"),
-        f"from {calibration.SOFTEST:.0e} to {calibration.STIFFEST:.0e} Pa".replace("e+0", "e"),
-        f"{100 * calibration.THINNEST:g} to {100 * calibration.THICKEST:g} % of the longest side",
-        f"first {calibration.SECONDS:g} s",
-        f"between {calibration.STRETCH[0]:g} and {calibration.STRETCH[1]:g}",
         f"less than {LOOSE:.0%}".replace("%", " % of what the largest part has"),
         f"{PIN_DEPTH:.0%}".replace("%", " % of the length deep"),
         f"below {SHEET:g} of the next",
@@ -397,20 +392,6 @@ def test_page_states_the_numbers_of_the_rules():
     assert CONVENTION["-y"] == CONVENTION["+z"]
     example = page.split("```python\n")[1].split("```")[0]
     exec(compile(example, "own_scene.md", "exec"), {})
-
-
-def test_draft_is_the_starter_on_a_coarser_grid():
-    found = suggest(FlagScene(spacing=0.0125).generate())
-    starter, draft = (yaml.safe_load(make(found, "flag.ply")) for make in (starter_yaml, draft_yaml))
-    assert draft["solver"]["dx"] == float(f"{1 / QUALITIES['draft']:.2g}") > starter["solver"]["dx"]
-    assert draft["frames"] == DRAFT_FRAMES < starter["frames"]
-    assert draft["camera"]["init_args"]["height"] < starter["camera"]["init_args"]["height"]
-    assert draft["scene"]["points"] == starter["scene"]["points"] == "grid"
-    for part in ("material", "wind", "aero", "shader"):
-        assert draft[part] == starter[part]
-    assert draft["solver"]["boundaries"] == starter["solver"]["boundaries"]
-    coarse = suggest(FlagScene(spacing=0.1).generate())  # too few Gaussians for a coarser grid to be any
-    assert yaml.safe_load(draft_yaml(coarse, "flag.ply"))["solver"]["dx"] == coarse.dx
 
 
 def test_only_cloth_and_what_falls_has_weight():
@@ -425,25 +406,27 @@ def test_only_cloth_and_what_falls_has_weight():
         found = suggest(tree(), hold=hold)
         assert found.youngs_modulus == SHELL_E
         assert gravity(found) == weight
-        assert math.hypot(*found.flow) == pytest.approx(6, abs=0.01)
+        assert math.hypot(*found.flow) == pytest.approx(LOOKS["breeze"].speed, abs=0.01)
 
 
-def test_the_material_is_guessed_by_shape_and_colour():
-    """And named in the starter, whose softer numbers win."""
+def test_the_material_is_that_of_its_kind():
+    """By shape and colour; its density, thickness and damping are in the starter, and so is its own stiffness."""
     leaves = LeavesScene().generate()
     grey = tree()
     green = dataclasses.replace(grey, sh=grey.sh + 0.5 * torch.tensor([-1.0, 1.0, -1.0]))
     flag = FlagScene(spacing=0.05).generate()
-    for cloud, name in ((flag, "cotton"), (leaves, "leaf"), (green, "leaf"), (grey, "rubber")):
+    for cloud, name in ((flag, "fabric"), (leaves, "leaf"), (green, "leaf"), (grey, "wood")):
         found = suggest(cloud)
-        assert found.material == name
+        assert found.material == KINDS[found.kind].material == name
         text = starter_yaml(found, "it.ply")
         material = yaml.safe_load(text)["material"]
-        assert material == {"name": name, "nu": 0.3} | {key: material[key] for key in ("E", "density", "thickness")}
-        assert material["E"] == found.youngs_modulus < MATERIALS[name].E
+        assert float(material["E"]) == found.youngs_modulus < MATERIALS["wood"].E
+        assert material["damping_ratio"] == KINDS[found.kind].damping_ratio
+        area_mass = KINDS["flag"].mass if found.kind == "flag" else MATERIALS[name].density * MATERIALS[name].thickness
+        assert material["density"] * material["thickness"] == pytest.approx(area_mass, rel=1e-5)
         settings = parse_text(Simulation.parser(), text.replace("it.ply", "x.ply"))
-        assert (settings.material.E, settings.material.thickness) == (material["E"], found.thickness)
-        assert settings.solver.damping == (0.2 if name == "cotton" else 1.0)
+        assert (settings.material.E, settings.material.thickness) == (found.youngs_modulus, found.thickness)
+        assert settings.solver.damping == 0
 
 
 def test_a_given_material_has_its_own_numbers():
@@ -451,10 +434,11 @@ def test_a_given_material_has_its_own_numbers():
     found = of_material(suggest(FlagScene(spacing=0.05).generate()), "silk")
     silk = MATERIALS["silk"]
     assert (found.youngs_modulus, found.thickness) == (silk.E, silk.thickness)
-    assert calibration.calibrated_suggestion(found, None, 0.1) is found
+    assert not found.sways
     text = starter_yaml(found, "it.ply")
     assert yaml.safe_load(text)["material"] == "silk"
-    assert "sways visibly" not in text
+    assert "in still air" not in text
+    assert yaml.safe_load(text)["solver"]["formulation"] == "total"
     settings = parse_text(Simulation.parser(), text)
     assert {name: settings.material[name] for name in silk.numbers} == silk.numbers
     assert settings.solver.damping == silk.damping
@@ -470,6 +454,5 @@ def test_a_stray_point_far_away_does_not_join_the_parts():
 def test_a_starter_says_what_shares_nodes_only_if_it_is_not_the_default():
     found = suggest(FlagScene(spacing=0.1).generate(), quality="draft")
     assert "connected:" not in starter_yaml(found, "flag.ply")
-    for text in (starter_yaml, draft_yaml):
-        config = yaml.safe_load(text(dataclasses.replace(found, connected="surface"), "flag.ply"))
-        assert config["scene"]["connected"] == "surface"
+    config = yaml.safe_load(starter_yaml(dataclasses.replace(found, connected="surface"), "flag.ply"))
+    assert config["scene"]["connected"] == "surface"

@@ -130,13 +130,16 @@ def test_what_hangs_from_a_cord():
     cloud = lamp()
     guess = suggest(cloud, up="+z")
     parts, height = guess.parts.parts, cloud.means[:, 2] - 5.0
-    assert [(part.name, part.role) for part in parts.parts] == [("hook", "held"), ("cord", "soft"), ("body", "soft")]
+    assert [(part.name, part.role) for part in parts.parts] == [("hook", "held"), ("cord", "soft"), ("body", "rigid")]
     assert bool(parts.mask("hook")[height > 0.88].all())
     assert bool(parts.mask("cord")[(height > 0.32) & (height < 0.8)].all())
     assert bool(parts.mask("body")[height < 0.22].all())
     assert guess.pin is None
     assert guess.fixed
-    assert "a cord 0.6" in guess.parts.reason
+    assert guess.kind == "hanging"
+    assert guess.parts.reason == "it hangs from its upper end by a cord"
+    cord = hanging_parts(cloud, all_of(cloud), UP, visible_weight(cloud), height > 0.88)
+    assert "a cord 0.6" in cord.reason
     thick = lamp(radius=0.1)
     assert hanging_parts(thick, all_of(thick), UP, visible_weight(thick), all_of(thick)) is None
 

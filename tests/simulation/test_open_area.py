@@ -17,7 +17,7 @@ from gaussian_swaying.gaussians.formats import read_gaussians
 from gaussian_swaying.gaussians.ply import write_ply
 from gaussian_swaying.geometry.rotations import rotation_to_quat
 from gaussian_swaying.preview.report import run_dict, run_lines
-from gaussian_swaying.preview.starter import draft_yaml, starter_yaml
+from gaussian_swaying.preview.starter import starter_yaml
 from gaussian_swaying.preview.suggest import suggest
 from gaussian_swaying.scenes.procedural import FlagScene
 from gaussian_swaying.simulation.material import Material
@@ -107,8 +107,7 @@ def test_preview_tells_area_and_hull(capture):
 
 def test_starter_of_a_capture_is_open(capture):
     found = suggest(read_gaussians(capture), quality="draft")
-    for text in (starter_yaml(found, capture), draft_yaml(found, capture)):
-        assert yaml.safe_load(text)["scene"]["area"] == "open"
+    assert yaml.safe_load(starter_yaml(found, capture))["scene"]["area"] == "open"
 
 
 def test_summary_has_area_and_hull(tmp_path, capture):

@@ -287,7 +287,7 @@ def test_a_splat_that_is_loaded_tells_how_far_it_is(name, page, client, until, t
     until(lambda: told[-1] is None)
     shares = [share for share in told if share is not None]
     assert shares == sorted(shares)
-    assert len(shares) > 4
+    assert len(shares) >= 3
     until(lambda: page.controls.stiffness.value == page.session.settings.material.E)
     assert f"scene{name[4:].lower()}" in page.session.yaml()
 

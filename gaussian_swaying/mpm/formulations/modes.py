@@ -85,7 +85,9 @@ class Modes(Total):
         norm = mass.rsqrt()[..., None, None]
         # all scenes have the nodes of the one with most; those that fill up are the first node, with a shape of zero
         most = max(len(one.node) for one in found)
-        nodes = torch.stack([torch.nn.functional.pad(torch.as_tensor(one.node), (0, most - len(one.node))) for one in found])
+        nodes = torch.stack(
+            [torch.nn.functional.pad(torch.as_tensor(one.node), (0, most - len(one.node))) for one in found]
+        )
         self.node = nodes.to(like.device).reshape(*batch, most)
         site = torch.stack([torch.as_tensor(one.site) for one in found]).to(like.device)
         sites = int(site.amax()) + 1

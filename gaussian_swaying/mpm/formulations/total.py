@@ -91,7 +91,7 @@ class Total(Formulation):
             held if held is None or not self.on_nodes[k] else self._on_nodes(k, held)
             for k, held in enumerate(body.held)
         )
-        self._bodies = [self._body(k) for k in self.body.rigid]
+        self.rigid_bodies = [self._body(k) for k in self.body.rigid]
         self._check_bodies()
         softened = self._soften()
         self.bending = bending_of(points, self.stencil, settings.dx, softened)
@@ -267,7 +267,7 @@ class Total(Formulation):
         holds = PointHolds(self.body, self.kinds, faces, still, self.stencil, self.grid, self.node_inverse_mass)
         if not holds.rows:
             return None  # a clamp that holds everything has no face
-        if any(bool((body.mass.reshape(-1)[holds.affected] > 0).any()) for body in self._bodies):
+        if any(bool((body.mass.reshape(-1)[holds.affected] > 0).any()) for body in self.rigid_bodies):
             raise ValueError(
                 "A pin holds points of a rigid part or next to it, which it cannot: set its `kind` to nodes, which "
                 "holds the whole part, or leave three cells of soft material between."
@@ -284,8 +284,8 @@ class Total(Formulation):
 
     def _check_bodies(self) -> None:
         """Raise ValueError if two rigid parts share nodes."""
-        for k, body in enumerate(self._bodies):
-            for other, before in enumerate(self._bodies[:k]):
+        for k, body in enumerate(self.rigid_bodies):
+            for other, before in enumerate(self.rigid_bodies[:k]):
                 if bool(((body.mass > 0) & (before.mass > 0)).any()):
                     names = [repr(_region(self.body.boundaries[self.body.rigid[i]])) for i in (other, k)]
                     raise ValueError(
@@ -359,7 +359,9 @@ class Total(Formulation):
         assert state.node_velocity is not None
         points, laws, time = self.body.points, self.body.laws, self.settings.stiffness_damping
         F, rate = state.F_elastic, state.affine
-        if self._bodies or self.bending is not None:  # the nodes strain the particles otherwise than the state says
+        if (
+            self.rigid_bodies or self.bending is not None
+        ):  # the nodes strain the particles otherwise than the state says
             raw = self.read_particles(state, displacement, state.node_velocity)
             F, rate = raw.F_elastic, raw.affine
         if self.bending is None:
@@ -411,7 +413,7 @@ class Total(Formulation):
         if self.bending is not None:
             flat = flattened(state.F_elastic, self.normal, self.body.laws.mu, self.body.laws.lam).F
             state = state.replace(F_elastic=flat, F_total=flat)
-        for body in self._bodies:
+        for body in self.rigid_bodies:
             state = body.in_shape(state, self.body.points.position)
         return state
 
