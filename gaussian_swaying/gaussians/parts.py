@@ -190,19 +190,6 @@ class Parts:
         wanted = [(name is None or p.name == name) and (role is None or p.role == role) for p in self.parts]
         return torch.tensor(wanted)[self.labels]
 
-    def with_part(self, part: Part, members: Tensor) -> Parts:
-        """The parts with some Gaussians given to a part, which is new or takes the place of the one with its name.
-
-        Args:
-            part: The part.
-            members: Its Gaussians, bool, shape (N,); those that it has already stay.
-        """
-        check_shape("members", members, len(self))
-        names = [known.name for known in self.parts]
-        place = names.index(part.name) if part.name in names else len(names)
-        parts = [*self.parts[:place], part, *self.parts[place + 1 :]]
-        return Parts(torch.where(members.cpu(), place, self.labels), parts)
-
     def digest(self) -> str:
         """A checksum of labels, roles and materials."""
         content = self.labels.numpy().tobytes() + repr(self.parts).encode()

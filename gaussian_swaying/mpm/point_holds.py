@@ -317,20 +317,6 @@ class PointHolds:
             share=self.taken_by[0] @ inverse,
         )
 
-    def condition(self) -> float:
-        """The largest condition number of the normalised products of the kept rows, over phases and scenes."""
-        worst = 1.0
-        for w in self.whitening.detach().cpu().flatten(0, 1):
-            w = w[: int((w.diagonal() != 0).sum())]
-            w = w[:, : len(w)]
-            if len(w):
-                inverse = w.T @ w
-                factor = torch.linalg.inv(w)
-                scale = factor.square().sum(-1).rsqrt()
-                values = torch.linalg.eigvalsh(scale[:, None] * torch.linalg.inv(inverse) * scale)
-                worst = max(worst, float(values[-1] / values[0]))
-        return worst
-
     def _at(self, field: Tensor, phase: Tensor) -> Tensor:
         """A field of the current phase; the host does not wait."""
         return field[0] if len(self.starts) == 0 else field.index_select(0, phase)[0]
