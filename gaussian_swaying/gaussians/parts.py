@@ -58,7 +58,7 @@ class Part:
         nu: Poisson's ratio; that of the object if None. A rigid part has none.
         density: Density [kg/m³]; that of the object if None.
         thickness: Thickness of the surface [m]; that of the object if None.
-        damping_ratio: Damping ratio at ``material.damping_frequency``; that of the object if None.
+        damping_ratio: Damping ratio at 1 Hz; that of the object if None.
         attached: The name of the only part to which it is attached, with ``scene.connected: surface``; any if None.
         joint_stiffness: With a joint instead of its material it is attached by a spring of this stiffness [N/m]; as
             stiff as a substep allows if None and ``joint_turning`` is given.

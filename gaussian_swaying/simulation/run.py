@@ -218,7 +218,7 @@ class Run:
         if painter.device.type == "cuda":
             torch.cuda.reset_peak_memory_stats(painter.device)
         self.splat = splat_checksum(self.scene)
-        self.force_end = recorder.force_scale or self.stepper.force_scale()
+        self.force_end = self.stepper.force_scale()
         self.still_once = recorder.ply_every > 0 and written_once(recorder, editor)
 
     @torch.inference_mode()
@@ -416,9 +416,9 @@ class Run:
             if "depth" in recorder.renders:
                 depth, (near, far) = passes.mean_depth(picture), painter.depth_range(frame, name)
                 images["depth"] = passes.depth_colors(depth, near, far)
-                steps = passes.depth_steps(depth, recorder.depth_step / self.scene.frame.metres_per_unit)
+                steps = passes.depth_steps(depth * self.scene.frame.metres_per_unit)
             if "normal" in recorder.renders:
-                images["normal"] = painter.draw_normals(gaussians, camera, recorder.normal_axes)
+                images["normal"] = painter.draw_normals(gaussians, camera)
             if "force" in recorder.renders:
                 pressure = self.stepper.wind_pressure(state)
                 images["force"] = painter.draw_pressure(pressure, gaussians, camera, self.force_end)
