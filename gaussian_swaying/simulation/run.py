@@ -16,6 +16,7 @@ from torch import Tensor
 from gaussian_swaying._checks import check_positive
 from gaussian_swaying._provenance import describe_device, peak_memory, versions
 from gaussian_swaying.gaussians.model import DeformedGaussians
+from gaussian_swaying.mpm.formulations.formulation import MAX_NODES
 from gaussian_swaying.mpm.state import State
 from gaussian_swaying.recording.checkpoint import check_state, log_lines, unreadable
 from gaussian_swaying.recording.recorder import Recorder, frame_folder
@@ -91,10 +92,9 @@ def _check_checkpoint(
             f"The Gaussians in {output} follow {nodes} nodes, but those of the scene follow {followed}: resume with "
             "the same splat, or start again without --resume."
         )
-    most_nodes = getattr(stepper.solver.settings, "max_nodes", 0)
     try:
         entries = entry_names(start.impulse.shape[-2])
-        check_state(checkpoint, start, stepper.frame_dt, most_nodes, bool(editor.edits), entries)
+        check_state(checkpoint, start, stepper.frame_dt, MAX_NODES, bool(editor.edits), entries)
     except (ValueError, TypeError, KeyError, RuntimeError) as error:
         raise unreadable(output / "checkpoint.pt", error) from error
     if checkpoint["frame"] >= frames:

@@ -407,7 +407,6 @@ GUST = '[{"class_path": "SineSway", "init_args": {"amplitud": 1.0}}]'
         (["--solver.dx", "0"], ["`dx`"]),
         (["--solver.formulation", "totl"], ["solver.formulation", "Expected one of total, updated"]),
         (["--solver.substep", "1.0"], ["`substep` of 1 s", "stable one of 0.0", "lower it"]),
-        (["--solver.max_nodes", "10"], ["`max_nodes`", "coarsen `dx`"]),
         (["--camera", INSIDE], ["camera", "inside the object", "move it out"]),
         (["--recorder.images", "false"], ["`recorder.images`"]),
         (["--config", "/nowhere/at_all.yaml"], ["/nowhere/at_all.yaml", "does not exist"]),

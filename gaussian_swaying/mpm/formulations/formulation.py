@@ -29,6 +29,10 @@ from gaussian_swaying.mpm.transfer import Stencil, scatter
 _Number = TypeVar("_Number", float, Tensor)
 
 
+MAX_NODES = 64_000_000
+"""Largest grid; a larger one raises an error instead of filling the memory."""
+
+
 @dataclass(frozen=True, slots=True)
 class Settings:
     """The solver settings that a formulation needs; ``MPMSolver`` explains the fields."""
@@ -37,15 +41,14 @@ class Settings:
     gravity: tuple[float, ...]
     damping: float
     stiffness_damping: float
-    max_nodes: int
     mls: bool
     deterministic: bool
 
     def __post_init__(self) -> None:
-        for name in ("dx", "damping", "stiffness_damping", "max_nodes"):
+        for name in ("dx", "damping", "stiffness_damping"):
             value = getattr(self, name)
             check_positive(name, value, allow_zero=name.endswith("damping"))
-            object.__setattr__(self, name, int(value) if name == "max_nodes" else float(value))
+            object.__setattr__(self, name, float(value))
 
 
 class Formulation(ABC):
@@ -152,22 +155,22 @@ class Formulation(ABC):
 
         Raises:
             FloatingPointError: If a position is NaN or infinite.
-            ValueError: If the grid would be larger than ``max_nodes``, or too far away.
+            ValueError: If the grid would be larger than :data:`MAX_NODES`, or too far away.
         """
-        dx, most = self.settings.dx, self.settings.max_nodes
+        dx = self.settings.dx
         flat = position.detach().reshape(-1, 3)
         low, high = flat.amin(0), flat.amax(0)
         if not bool(torch.isfinite(low).all() & torch.isfinite(high).all()):
             raise not_finite("position", flat)
         grid = bounding_grid(low, high, dx, margin)
-        if grid.node_count > most:
+        if grid.node_count > MAX_NODES:
             size = [round(v, 3) for v in (high - low).tolist()]
             what = f"The particles span {size} m"
             if 2 * margin * dx > max(size):
                 what = f"The particles may fly {margin * dx:.3g} m in any direction within a frame, at {speed:.3g} m/s"
             raise ValueError(
                 f"{what}, which takes {grid.node_count:,} grid nodes at dx = {dx:g} m, more "
-                f"than `max_nodes` = {most:,}: select a smaller region, coarsen `dx` or raise `max_nodes`."
+                f"than {MAX_NODES:,}: select a smaller region, or coarsen `dx`."
             )
         if max(map(abs, grid.offset)) >= 2**31:
             raise ValueError(
