@@ -28,7 +28,6 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from gaussian_swaying._devices import double_home
 from gaussian_swaying.geometry.neighbours import nearest_neighbours
 from gaussian_swaying.mpm.body import Body
 from gaussian_swaying.mpm.boundaries.boundary import CLOCK, Boundary
@@ -214,7 +213,7 @@ class PointHolds:
         self.boundaries = boundaries = body.boundaries
         position = body.points.position
         self.moving = tuple(k for k, b in enumerate(boundaries) if kinds[k] in POINTS and b.moves)
-        device = double_home(position.device)
+        device = position.device
         count, nodes = position.shape[-2], grid.node_count
         points = position.reshape(-1, count, 3).cpu().double()
         cell = stencil.first.reshape(-1, count).cpu() - nodes * torch.arange(len(points))[:, None]

@@ -12,7 +12,6 @@ import torch
 from torch import Tensor, nn
 
 from gaussian_swaying._checks import check_choice, check_positive, check_vector
-from gaussian_swaying._devices import move
 from gaussian_swaying.geometry.frame import SimFrame
 from gaussian_swaying.mpm.body import Body
 from gaussian_swaying.mpm.boundaries.boundary import Boundary
@@ -359,7 +358,7 @@ class MPMSolver(Solver):
         check_rest(points, velocity)
         self._framed = None if frame is None else tuple(self.framed(frame))
         self._bound = None
-        move(self, points.position.device)  # the solver moves to the device of its material
+        self.to(points.position.device)  # the solver moves to the device of its material
         self._bind(points, surface)
         return self.bound.first_state(velocity.expand_as(points.position), margin)
 

@@ -382,8 +382,6 @@ class Recorder:
             cloud: The Gaussians, in scene units; they must not change.
             frame: Scene units to metres with z up, for USD and glTF.
         """
-        if cloud.means.device.type == "mps":  # which has no event here for another thread to wait for
-            cloud = cloud.to("cpu")
         if self.export_format == "usd":
             self.write_ply(index, lambda path: write_usd_frame(path, cloud, frame))
         else:

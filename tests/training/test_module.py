@@ -9,10 +9,7 @@ import os
 import lightning
 import pytest
 import torch
-from lightning.pytorch.accelerators import CPUAccelerator
 from lightning.pytorch.callbacks import ModelCheckpoint
-from lightning.pytorch.strategies import SingleDeviceStrategy
-from pretend_mps import pretended_mps
 
 from gaussian_swaying.gaussians.ply import read_ply
 from gaussian_swaying.training.densification import (
@@ -395,25 +392,3 @@ def test_a_view_without_gaussians(data, make_trainer):
     data.initial_cloud = lambda degree: cloud
     make_trainer(5).fit(module, data)
     assert torch.isfinite(module.splat.means).all()
-
-
-class _Pretended(CPUAccelerator):
-    def setup_device(self, device):
-        assert device.type == "mps"
-
-
-def test_a_training_asks_only_for_what_the_gpu_of_a_mac_has(data, tmp_path):
-    """Lightning takes the GPU of a Mac by itself."""
-    module = SplatTrainer(
-        sh_degree=1, sh_every=4, lpips=None, densification=DefaultDensification(start=1, every=4, grow_grad2d=1e-4)
-    )
-    with pretended_mps() as mode:
-        strategy = SingleDeviceStrategy(accelerator=_Pretended(), device=torch.device("mps"))
-        trainer = lightning.Trainer(
-            strategy=strategy, max_steps=6, max_epochs=-1, default_root_dir=tmp_path, logger=False,
-            enable_model_summary=False, enable_progress_bar=False, check_val_every_n_epoch=None, val_check_interval=6,
-        )  # fmt: skip
-        trainer.fit(module, data)
-    assert len(module.splat) > data.points
-    assert mode.seen["_embedding_bag"] > 0
-    assert math.isfinite(float(trainer.callback_metrics["val/psnr"]))

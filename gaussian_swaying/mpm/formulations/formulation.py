@@ -13,7 +13,6 @@ import torch
 from torch import Tensor
 
 from gaussian_swaying._checks import check_positive
-from gaussian_swaying._devices import double_home, sum_in_double
 from gaussian_swaying.geometry.linalg import symmetric_eigenvalues
 from gaussian_swaying.mpm.body import Body, Held
 from gaussian_swaying.mpm.boundaries.boundary import Boundary, Nodes
@@ -91,7 +90,7 @@ class Formulation(ABC):
         device = body.points.position.device
         with torch.inference_mode(False):  # an ordinary tensor, which a gradient may need
             # float64 on the device: no copy in a step, full precision in a float64 run
-            self.gravity = torch.tensor(settings.gravity, dtype=torch.float64, device=double_home(device))
+            self.gravity = torch.tensor(settings.gravity, dtype=torch.float64, device=device)
 
     def hold_kind(self, k: int) -> str:
         """Return what the ``k``-th boundary acts on, see ``Boundary.hold_kind``."""
@@ -128,10 +127,10 @@ class Formulation(ABC):
             F_elastic=identity,
             F_total=identity,
             lost=torch.zeros(position.shape[:-1], dtype=torch.bool, device=position.device),
-            time=torch.zeros((), dtype=torch.float64, device=double_home(position.device)),
+            time=torch.zeros((), dtype=torch.float64, device=position.device),
             grid=self.first_grid(margin),
             internal=self.body.laws.initial_internal(),
-            work=torch.zeros(position.shape[:-2], dtype=torch.float64, device=double_home(position.device)),
+            work=torch.zeros(position.shape[:-2], dtype=torch.float64, device=position.device),
             impulse=self.no_impulse(),
         )
 
@@ -139,7 +138,7 @@ class Formulation(ABC):
         """A reaction impulse of zero for each boundary, shape (..., B, 3), float64."""
         position = self.body.points.position
         shape = (*position.shape[:-2], len(self.kinds), 3)
-        return torch.zeros(shape, dtype=torch.float64, device=double_home(position.device))
+        return torch.zeros(shape, dtype=torch.float64, device=position.device)
 
     @abstractmethod
     def fit_grid(self, state: MPMState, horizon: float, margin: int) -> MPMState:
@@ -240,7 +239,7 @@ class Formulation(ABC):
                 pinned = nodes.held & boundary.active(time)
                 fixed = pinned if fixed is None else fixed | pinned
             with torch.no_grad():
-                taken[k] = sum_in_double(mass[..., None] * (before - velocity), -2)
+                taken[k] = (mass[..., None] * (before - velocity)).sum(-2, dtype=torch.float64)
         return velocity, torch.stack(taken, dim=-2) if taken else self.no_impulse()
 
     def in_shape(self, state: MPMState) -> MPMState:
