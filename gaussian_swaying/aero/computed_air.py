@@ -12,7 +12,6 @@ import torch
 from torch import Tensor, nn
 
 from gaussian_swaying._checks import check_choice, check_plain, check_positive, check_vector, check_whole
-from gaussian_swaying._devices import double_home
 from gaussian_swaying.aero.obstacles import Obstacle
 from gaussian_swaying.aero.shelter import Shelter
 from gaussian_swaying.aero.wind import WindField
@@ -303,7 +302,7 @@ class AirInBox:
         faces: list[Face | tuple[Face, Face]] = ["open", "open", ("wall", "open") if settings.ground else "open"]
         walls = solid if settings.walls or still is not None else None
         self.flow = LatticeFlow(cells, units, faces=faces, walls=walls, smagorinsky=settings.smagorinsky).to(device)
-        self._inflow = centres.reshape(-1, 3)[self.flow.held.long().cpu()].to(double_home(device))
+        self._inflow = centres.reshape(-1, 3)[self.flow.held.long().cpu()].to(device)
         self.push = AirPush(state.position.shape[-2], state.position)
         self._pair: list[Tensor] = []  # on a GPU, where recorded steps go to and fro between them
         self._begins, self._ends = ([Replayed(), Replayed()] for _ in range(2))

@@ -37,14 +37,12 @@ def wind_terms(
     facing: Product,
     across: Product,
     pressed: Tensor,
-    tangent: Product,
+    tangent: Tensor,
     *,
     drag: Tensor | float,
     friction: Tensor | float,
     lift: Tensor | float,
     law: str,
-    lift_direction: str,
-    unit_tangent: bool,
 ) -> Tensor:
     r"""Drag, friction and lift per half density: the law of the force, of one patch or of a sum over patches.
 
@@ -57,13 +55,11 @@ def wind_terms(
         across: The part of the flow through the patch, :math:`A\, (\mathbf{v}_r \cdot \mathbf{n})\, \mathbf{n}`.
         pressed: The same times the size of the flow through the patch,
             :math:`A\, |\mathbf{v}_r \cdot \mathbf{n}| (\mathbf{v}_r \cdot \mathbf{n})\, \mathbf{n}`.
-        tangent: The part along it, and what it is divided by; with a unit tangent, area times direction.
+        tangent: The part along it.
         drag: C_D.
         friction: C_F.
         lift: C_L.
-        law: See :func:`aero_force`; the other options, too.
-        lift_direction: See there.
-        unit_tangent: See there.
+        law: See :func:`aero_force`.
 
     Returns:
         Shape (..., P, 3).
@@ -75,11 +71,8 @@ def wind_terms(
         pressure = drag * pressed
     else:
         pressure = drag * (drag_speed(wind, speed[..., 0], law)[..., None] * across[0]) * across[1]
-    rub = friction * speed.square() if unit_tangent else friction * speed
-    shear = rub * tangent[0] / tangent[1]
     side = torch.linalg.cross(relative, facing[0] * facing[1], dim=-1)
-    lifting = lift * (speed * side if lift_direction == "side" else torch.linalg.cross(side, relative, dim=-1))
-    return pressure + shear + lifting
+    return pressure + friction * speed * tangent + lift * (speed * side)
 
 
 def aero_force(
@@ -93,8 +86,6 @@ def aero_force(
     lift: Tensor | float,
     air_density: float = 1.225,
     law: str = "paper",
-    lift_direction: str = "side",
-    unit_tangent: bool = False,
 ) -> Tensor:
     r"""Drag, friction and lift on patches in relative wind (paper, "Aerodynamics").
 
@@ -124,9 +115,6 @@ def aero_force(
             alone, :math:`\tfrac12 \rho A C_D |\mathbf{v}_r \cdot \mathbf{n}| (\mathbf{v}_r \cdot \mathbf{n})\,
             \mathbf{n}` (the independence principle: Taylor 1952; Gosselin, de Langre & Machado-Almeida 2010, JFM 650,
             319, for plates that bend). Friction and lift are those of the other laws.
-        lift_direction: ``side`` is the paper's d x n, a force perpendicular to flow and normal; ``lift`` is (d x n) x
-            d, in the plane of flow and normal.
-        unit_tangent: Normalise d^t (a possible reading of the paper's hat) instead of using the projection itself.
 
     Returns:
         Force [N], shape (..., P, 3).
@@ -135,7 +123,6 @@ def aero_force(
         ValueError: If a shape does not fit or an option is unknown.
     """
     check_choice("law", law, LAWS)
-    check_choice("lift_direction", lift_direction, ("side", "lift"))
     patches = velocity.shape[-2]
     check_shape("velocity", velocity, "P", 3)
     check_shape("normal", normal, patches, 3)
@@ -147,10 +134,9 @@ def aero_force(
     sign = torch.where(along < 0, -1.0, 1.0)
     oriented = sign * normal
     tangent = relative - along * normal
-    size = _length(tangent) if unit_tangent else 1.0
     terms = wind_terms(
-        wind, relative, (1.0, oriented), (sign * along, oriented), along * along * oriented, (tangent, size), drag=drag,
-        friction=friction, lift=lift, law=law, lift_direction=lift_direction, unit_tangent=unit_tangent,
+        wind, relative, (1.0, oriented), (sign * along, oriented), along * along * oriented, tangent, drag=drag,
+        friction=friction, lift=lift, law=law,
     )  # fmt: skip
     return (0.5 * air_density) * area[..., None] * terms
 
@@ -166,8 +152,6 @@ def grouped_force(
     lift: Tensor | float,
     air_density: float = 1.225,
     law: str = "paper",
-    lift_direction: str = "side",
-    unit_tangent: bool = False,
     max_area_ratio: float = math.inf,
 ) -> tuple[Tensor, Tensor]:
     r"""Force on the patches of each point, see :mod:`~gaussian_swaying.aero.patches`, and their area now.
@@ -182,8 +166,6 @@ def grouped_force(
         lift: C_L.
         air_density: Density of the air [kg/m³].
         law: As in :func:`aero_force`.
-        lift_direction: As there.
-        unit_tangent: As there.
         max_area_ratio: Largest ratio of the area to that at rest (see
             :func:`capped_area`).
 
@@ -200,7 +182,7 @@ def grouped_force(
     growth = grown.clamp(min=torch.finfo(rest.dtype).tiny).sqrt()
     across = (turned * pulled[..., None, :]).sum(-1) / growth[..., None]  # T v_r
     facing = torch.zeros_like(across)
-    if law in ("paper", "cross_flow") or unit_tangent or not _is_zero(lift):
+    if law in ("paper", "cross_flow") or not _is_zero(lift):
         dots = (patches.vector * pulled[patches.point]).sum(-1, keepdim=True)
         sign = torch.where(dots < 0, -1.0, 1.0)
         signed = sums(sign * patches.vector, patches.point, len(relative))
@@ -212,16 +194,9 @@ def grouped_force(
         pressed = (cof * sums(flow * patches.vector, patches.point, len(relative))[..., None, :]).sum(-1)
         pressed = pressed / growth.square()[..., None]
     tangent = area[..., None] * relative - across
-    if unit_tangent:
-        length = torch.linalg.vector_norm(patches.vector, dim=-1, keepdim=True)
-        unit = patches.vector / length
-        along = dots / length
-        flat = pulled[patches.point] - along * unit
-        flat = length * flat / _length(flat)
-        tangent = (cof * sums(flat, patches.point, len(relative))[..., None, :]).sum(-1)
     terms = wind_terms(
-        wind, relative, (facing, 1.0), (across, 1.0), pressed, (tangent, 1.0), drag=drag, friction=friction, lift=lift,
-        law=law, lift_direction=lift_direction, unit_tangent=unit_tangent,
+        wind, relative, (facing, 1.0), (across, 1.0), pressed, tangent, drag=drag, friction=friction, lift=lift,
+        law=law,
     )  # fmt: skip
     scale = 0.5 * air_density * (rest > 0).to(rest)
     if max_area_ratio < math.inf:
@@ -235,11 +210,6 @@ def _is_zero(coefficient: Tensor | float) -> bool:
     if isinstance(coefficient, Tensor):
         return not (coefficient.is_cuda or coefficient.requires_grad) and float(coefficient) == 0
     return coefficient == 0
-
-
-def _length(x: Tensor) -> Tensor:
-    """Length of vectors (..., 3), at least the smallest normal number, shape (..., 1)."""
-    return torch.linalg.vector_norm(x, dim=-1, keepdim=True).clamp(min=torch.finfo(x.dtype).tiny)
 
 
 def drag_rate(speed: Tensor, area: Tensor, mass: Tensor, coefficient: Tensor | float, air_density: float) -> Tensor:
@@ -309,8 +279,6 @@ class AeroForce(nn.Module):
         C_L: Lift coefficient.
         air_density: Density of the air [kg/m³].
         law: ``paper``, ``projected``, ``linear`` or ``cross_flow``.
-        lift_direction: ``side`` or ``lift``.
-        unit_tangent: Normalise the tangential flow direction.
         drag_step: ``explicit``, or ``semi_implicit``: the solver evaluates the drag at the velocity at the end of the
             substep (see :meth:`resistance`), so that very light objects in strong wind need no shorter substeps.
         max_area_ratio: Largest ratio of a patch's area in the wind to its area at rest (see :func:`capped_area`); null
@@ -336,8 +304,6 @@ class AeroForce(nn.Module):
         C_L: Number = 0.01,
         air_density: float = 1.225,
         law: Literal["paper", "projected", "linear", "cross_flow"] = "paper",
-        lift_direction: Literal["side", "lift"] = "side",
-        unit_tangent: bool = False,
         drag_step: Literal["explicit", "semi_implicit"] = "explicit",
         max_area_ratio: float | None = None,
         added_mass: float = 0.0,
@@ -345,7 +311,6 @@ class AeroForce(nn.Module):
         super().__init__()
         check_choice("law", law, LAWS)
         check_choice("drag_step", drag_step, ("explicit", "semi_implicit"))
-        check_choice("lift_direction", lift_direction, ("side", "lift"))
         numbers = {"C_D": number_of(C_D), "C_F": number_of(C_F), "air_density": air_density, "added_mass": added_mass}
         for name, value in numbers.items():
             check_positive(name, value, allow_zero=True)
@@ -363,8 +328,7 @@ class AeroForce(nn.Module):
         self.C_D: Tensor
         self.C_F: Tensor
         self.C_L: Tensor
-        self.air_density, self.law = float(air_density), law
-        self.lift_direction, self.unit_tangent, self.drag_step = lift_direction, unit_tangent, drag_step
+        self.air_density, self.law, self.drag_step = float(air_density), law, drag_step
         self.max_area_ratio = math.inf if max_area_ratio is None else float(max_area_ratio)
         self.added_mass = float(added_mass)
 
@@ -385,7 +349,7 @@ class AeroForce(nn.Module):
         """True if less than 5 % of the force depends on the side of the patch that the flow meets."""
         drag, friction, lift = (float(c.detach()) for c in (self.C_D, self.C_F, self.C_L.abs()))
         sided = lift / max(drag + friction + lift, 1e-30)
-        return self.law in ("projected", "linear") and not self.unit_tangent and sided < 0.05
+        return self.law in ("projected", "linear") and sided < 0.05
 
     def rate(self, speed: Tensor, area: Tensor, mass: Tensor) -> Tensor:
         """:func:`drag_rate` [1/s], shape (..., P), with the coefficients of this component.
@@ -451,8 +415,6 @@ class AeroForce(nn.Module):
             "lift": self.C_L,
             "air_density": self.air_density,
             "law": self.law,
-            "lift_direction": self.lift_direction,
-            "unit_tangent": self.unit_tangent,
         }
 
     def extra_repr(self) -> str:

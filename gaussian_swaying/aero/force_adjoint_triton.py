@@ -20,10 +20,7 @@ from gaussian_swaying.kernels.language import tl, triton
 
 
 @triton.jit
-def wind_terms_adjoint(
-    air, r, facing, across, through, tangent, a, drag, friction, lift,
-    LAW: tl.constexpr, LIFT: tl.constexpr, UNIT: tl.constexpr,
-):  # fmt: skip
+def wind_terms_adjoint(air, r, facing, across, through, tangent, a, drag, friction, lift, LAW: tl.constexpr):
     """Gradients of a . f of ``force_triton.wind_terms`` by its first six arguments and by drag, friction and lift."""
     speed = tl.sqrt(dot3(r, r))
     inverse = 1.0 / tl.maximum(speed, 1e-30)
@@ -54,26 +51,14 @@ def wind_terms_adjoint(
             by_r = scale3(drag * ac * inverse, r)
         pressure = blow * ac
         by_across = scale3(drag * blow, a)
-    if UNIT:
-        shear = square * at
-        by_r = axpy3(1.0, by_r, 2 * friction * at, r)
-        by_tangent = scale3(friction * square, a)
-    else:
-        shear = speed * at
-        by_r = axpy3(1.0, by_r, friction * at * inverse, r)
-        by_tangent = scale3(friction * speed, a)
-    if LIFT:
-        ar = dot3(a, r)
-        rf = dot3(r, facing)
-        side = square * af - ar * rf
-        by_r = axpy3(1.0, by_r, lift, axpy3(1.0, axpy3(2 * af, r, -rf, a), -ar, facing))
-        by_facing = axpy3(1.0, by_facing, lift, axpy3(square, a, -ar, r))
-    else:
-        turn = cross3(facing, a)
-        product = dot3(r, turn)
-        side = speed * product
-        by_r = axpy3(1.0, by_r, lift, axpy3(product * inverse, r, speed, turn))
-        by_facing = axpy3(1.0, by_facing, lift * speed, cross3(a, r))
+    shear = speed * at
+    by_r = axpy3(1.0, by_r, friction * at * inverse, r)
+    by_tangent = scale3(friction * speed, a)
+    turn = cross3(facing, a)
+    product = dot3(r, turn)
+    side = speed * product
+    by_r = axpy3(1.0, by_r, lift, axpy3(product * inverse, r, speed, turn))
+    by_facing = axpy3(1.0, by_facing, lift * speed, cross3(a, r))
     return by_air, by_r, by_facing, by_across, by_through, by_tangent, (pressure, shear, side)
 
 
@@ -95,16 +80,10 @@ def wind_force_adjoint(F, velocity, patch, numbers, air, table, a, OPTIONS: tl.c
     along = dot3(relative, n)
     sign = tl.where(along < 0, -1.0, 1.0)
     tangent = axpy3(1.0, relative, -along, n)
-    if OPTIONS[2]:
-        length = tl.maximum(tl.sqrt(dot3(tangent, tangent)), 1e-18)  # finite where there is no tangent
-        tangent = scale3(1 / length, tangent)
     by_air, by_r, by_facing, by_across, by_through, by_tangent, parts = wind_terms_adjoint(
         air, relative, scale3(sign, n), scale3(along, n), scale3(sign * along * along, n), tangent, a,
-        drag, friction, lift,
-        OPTIONS[0], OPTIONS[1], OPTIONS[2],
+        drag, friction, lift, OPTIONS[0],
     )  # fmt: skip
-    if OPTIONS[2]:
-        by_tangent = scale3(1 / length, axpy3(1.0, by_tangent, -dot3(by_tangent, tangent), tangent))
     by_across = axpy3(1.0, by_across, -1.0, by_tangent)
     by_along = dot3(by_across, n)
     by_n = axpy3(sign, by_facing, along, by_across)
@@ -148,7 +127,7 @@ def flow_adjoint(table, first, count, w, by_q):
 
 @triton.jit
 def wind_on_groups_adjoint(F, velocity, place, numbers, air, table, a, OPTIONS: tl.constexpr):
-    """As :func:`wind_force_adjoint`, for ``force_triton.wind_on_groups`` without a unit tangent.
+    """As :func:`wind_force_adjoint`, for ``force_triton.wind_on_groups``.
 
     The names are those of ``aero.force.grouped_force``; the sum over the sides that the patches show is constant.
     """
@@ -159,7 +138,7 @@ def wind_on_groups_adjoint(F, velocity, place, numbers, air, table, a, OPTIONS: 
     drag, friction, lift, half, widest = numbers
     c = cofactor(F)
     w = matvec(transpose(c), r)
-    tensor, rest, s, _u, q = sums_over_patches(table, first, count, w, OPTIONS[0], False)
+    tensor, rest, s, q = sums_over_patches(table, first, count, w, OPTIONS[0])
     turned = matmul(c, tensor)
     # a lane without patches gets an area, whose force is multiplied by zero
     whole = tl.where(real, rest, 1.0)
@@ -177,7 +156,7 @@ def wind_on_groups_adjoint(F, velocity, place, numbers, air, table, a, OPTIONS: 
         through = scale3(1.0 / (growth * growth), matvec(c, q))
     tangent = axpy3(area, r, -1.0, across)
     by_air, by_r, by_facing, by_across, by_through, by_tangent, parts = wind_terms_adjoint(
-        air, r, facing, across, through, tangent, a, drag, friction, lift, OPTIONS[0], OPTIONS[1], False
+        air, r, facing, across, through, tangent, a, drag, friction, lift, OPTIONS[0]
     )
     by_r = axpy3(1.0, by_r, area, by_tangent)
     by_across = axpy3(1.0, by_across, -1.0, by_tangent)

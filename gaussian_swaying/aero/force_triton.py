@@ -17,10 +17,7 @@ from gaussian_swaying.kernels.language import tl, triton
 
 
 @triton.jit
-def wind_terms(
-    air, relative, facing, across, through, tangent, drag, friction, lift,
-    LAW: tl.constexpr, LIFT: tl.constexpr, UNIT: tl.constexpr,
-):  # fmt: skip
+def wind_terms(air, relative, facing, across, through, tangent, drag, friction, lift, LAW: tl.constexpr):
     """``force.wind_terms``: force per half density, and the resistance per half density and area.
 
     ``through`` is ``pressed`` there.
@@ -36,14 +33,8 @@ def wind_terms(
         pressed = facing
         pressure = drag * speed * speed
     shear = friction * speed
-    if UNIT:
-        shear = shear * speed
     side = cross3(relative, facing)
-    lifting = lift
-    if LIFT:
-        side = cross3(side, relative)
-    else:
-        lifting = lift * speed
+    lifting = lift * speed
     force = (
         pressure * pressed[0] + shear * tangent[0] + lifting * side[0],
         pressure * pressed[1] + shear * tangent[1] + lifting * side[1],
@@ -78,36 +69,31 @@ def wind_force(F, velocity, position, patch, numbers, now, table, OPTIONS: tl.co
     """``WindForce`` on patches (normal and area at rest): force and resistance [kg/s].
 
     ``numbers``: C_D, C_F, C_L, half the density of the air, largest ratio of areas. ``now``: velocity without effects,
-    and the numbers of each effect. ``OPTIONS``: place of the law in ``force.LAWS``, lift in the plane of flow and
-    normal, unit tangent, semi-implicit drag, effects.
+    and the numbers of each effect. ``OPTIONS``: place of the law in ``force.LAWS``, semi-implicit drag, effects.
     """
-    EFFECTS: tl.constexpr = OPTIONS[4]
+    EFFECTS: tl.constexpr = OPTIONS[2]
     air = shaped_wind(position, now, table, EFFECTS)
     normal, area = deform_patch(F, (patch[0], patch[1], patch[2]), patch[3], numbers[4])
     relative = (air[0] - velocity[0], air[1] - velocity[1], air[2] - velocity[2])
     along = dot3(relative, normal)
     sign = tl.where(along < 0, -1.0, 1.0)
     tangent = axpy3(1.0, relative, -along, normal)
-    if OPTIONS[2]:
-        # normalise first: in a wind along the normal the tangent is zero, and the other order would overflow
-        size = tl.maximum(tl.sqrt(dot3(tangent, tangent)), 1.2e-38)
-        tangent = (tangent[0] / size, tangent[1] / size, tangent[2] / size)
     force, yielding = wind_terms(
         air, relative, scale3(sign, normal), scale3(along, normal), scale3(sign * along * along, normal), tangent,
-        numbers[0], numbers[1], numbers[2], OPTIONS[0], OPTIONS[1], OPTIONS[2],
+        numbers[0], numbers[1], numbers[2], OPTIONS[0],
     )  # fmt: skip
     scale = numbers[3] * area
     resistance = area * 0
-    if OPTIONS[3]:
+    if OPTIONS[1]:
         resistance = scale * yielding
     return scale3(scale, force), resistance
 
 
 @triton.jit
-def add_direction(s, u, q, b, w, known, LAW: tl.constexpr, UNIT: tl.constexpr):
-    """Add the area vector b to three sums.
+def add_direction(s, q, b, w, LAW: tl.constexpr):
+    """Add the area vector b to two sums.
 
-    They are those of signed vectors, (UNIT) of tangents of length |b|, and (LAW 3) of b times the flow through it per
+    They are those of signed vectors, and (LAW 3) of b times the flow through it per
     area, times the size of that flow.
     """
     along = dot3(b, w)
@@ -116,20 +102,11 @@ def add_direction(s, u, q, b, w, known, LAW: tl.constexpr, UNIT: tl.constexpr):
     if LAW == 3:
         flow = sign * along * along / tl.maximum(dot3(b, b), 1.2e-38)
         q = (q[0] + flow * b[0], q[1] + flow * b[1], q[2] + flow * b[2])
-    if UNIT:
-        squared = tl.maximum(dot3(b, b), 1.2e-38)
-        share = along / squared
-        x0 = w[0] - share * b[0]
-        x1 = w[1] - share * b[1]
-        x2 = w[2] - share * b[2]
-        scale = tl.sqrt(squared) / tl.maximum(tl.sqrt(x0 * x0 + x1 * x1 + x2 * x2), 1.2e-38)
-        scale = tl.where(known, scale, 0.0)
-        u = (u[0] + scale * x0, u[1] + scale * x1, u[2] + scale * x2)
-    return s, u, q
+    return s, q
 
 
 @triton.jit
-def sums_over_patches(table, first, count, w, LAW: tl.constexpr, UNIT: tl.constexpr):
+def sums_over_patches(table, first, count, w, LAW: tl.constexpr):
     """The rows of ``PatchSums`` of each point: tensor and its trace, and the sums of :func:`add_direction`."""
     real = count > 0
     t0 = tl.load(table + first, real, 0.0)
@@ -142,7 +119,6 @@ def sums_over_patches(table, first, count, w, LAW: tl.constexpr, UNIT: tl.conste
     rest = t0 + t3 + t5
     zero = rest * 0
     s = (zero, zero, zero)
-    u = (zero, zero, zero)
     q = (zero, zero, zero)
     for k in range(0, tl.max(count), 4):  # four rows at once
         row = first + 8 + 4 * k
@@ -150,11 +126,11 @@ def sums_over_patches(table, first, count, w, LAW: tl.constexpr, UNIT: tl.conste
         b1 = load3(table, 1, row + 4, k + 1 < count)
         b2 = load3(table, 1, row + 8, k + 2 < count)
         b3 = load3(table, 1, row + 12, k + 3 < count)
-        s, u, q = add_direction(s, u, q, b0, w, k < count, LAW, UNIT)
-        s, u, q = add_direction(s, u, q, b1, w, k + 1 < count, LAW, UNIT)
-        s, u, q = add_direction(s, u, q, b2, w, k + 2 < count, LAW, UNIT)
-        s, u, q = add_direction(s, u, q, b3, w, k + 3 < count, LAW, UNIT)
-    return tensor, rest, s, u, q
+        s, q = add_direction(s, q, b0, w, LAW)
+        s, q = add_direction(s, q, b1, w, LAW)
+        s, q = add_direction(s, q, b2, w, LAW)
+        s, q = add_direction(s, q, b3, w, LAW)
+    return tensor, rest, s, q
 
 
 @triton.jit
@@ -164,7 +140,7 @@ def wind_on_groups(F, velocity, position, place, numbers, now, table, OPTIONS: t
     ``place``: first row in the table of ``PatchSums``, which follows that of the effects, and number of vectors there.
     The rest is as in :func:`wind_force`.
     """
-    EFFECTS: tl.constexpr = OPTIONS[4]
+    EFFECTS: tl.constexpr = OPTIONS[2]
     air = shaped_wind(position, now, table, EFFECTS)
     first = EFFECTS.size + 4 * place[0].to(tl.int32)
     count = place[1].to(tl.int32)
@@ -173,7 +149,7 @@ def wind_on_groups(F, velocity, position, place, numbers, now, table, OPTIONS: t
     drag, friction, lift, half_density, widest = numbers
     c = cofactor(F)
     w = matvec(transpose(c), relative)
-    tensor, rest, s, u, q = sums_over_patches(table, first, count, w, OPTIONS[0], OPTIONS[2])
+    tensor, rest, s, q = sums_over_patches(table, first, count, w, OPTIONS[0])
     r0 = matvec(tensor, (c[0], c[1], c[2]))
     r1 = matvec(tensor, (c[3], c[4], c[5]))
     r2 = matvec(tensor, (c[6], c[7], c[8]))
@@ -188,16 +164,11 @@ def wind_on_groups(F, velocity, position, place, numbers, now, table, OPTIONS: t
     through = across
     if OPTIONS[0] == 3:
         through = scale3(1.0 / (growth * growth), matvec(c, q))
-    if OPTIONS[2]:
-        tangent = matvec(c, u)
-    else:
-        tangent = axpy3(area, relative, -1.0, across)
-    force, yielding = wind_terms(
-        air, relative, facing, across, through, tangent, drag, friction, lift, OPTIONS[0], OPTIONS[1], OPTIONS[2]
-    )
+    tangent = axpy3(area, relative, -1.0, across)
+    force, yielding = wind_terms(air, relative, facing, across, through, tangent, drag, friction, lift, OPTIONS[0])
     scale = tl.where(real, half_density * tl.minimum(widest / growth, 1.0), 0.0)
     resistance = scale * 0
-    if OPTIONS[3]:
+    if OPTIONS[1]:
         resistance = scale * area * yielding
     return scale3(scale, force), resistance
 

@@ -71,19 +71,6 @@ def energy_spectrum(k: Tensor, length: float, spectrum: str = "von_karman") -> T
     return (_ENERGY * VON_KARMAN * length) * square * square * (1 + square).pow(-17 / 6)
 
 
-def across_spectrum(k1: Tensor, length: float, spectrum: str = "von_karman") -> Tensor:
-    r"""As :func:`along_spectrum`, for the other two components of isotropic turbulence.
-
-    :math:`F_{22} = \tfrac12 (F_{11} - k_1 F_{11}')` (Batchelor 1953, 3.4.17).
-    """
-    along = along_spectrum(k1, length, spectrum)
-    if spectrum == "kaimal":
-        x = 3 / math.pi * length * k1.abs()
-        return 0.5 * along * (1 + 5 / 3 * x / (1 + x))
-    x = (VON_KARMAN * length * k1).square()
-    return 0.5 * along * (1 + 5 / 3 * x / (1 + x))
-
-
 def resolved_share(length: float, spacing: tuple[float, float, float], spectrum: str = "von_karman") -> float:
     """Share of the variance of the component along the wind that cells of this size resolve.
 

@@ -341,10 +341,10 @@ class WindForce(Force):
                 "per_point": Numbers(2, lambda: sums.lists().reshape(*self.area.shape, 2)),
                 "table": Numbers(4 * sums.rows, sums.table),
                 "sources": (sums.tensor, sums.vector),
-                "adjoint": wind_on_groups_adjoint if smooth and not aero.unit_tangent else None,
+                "adjoint": wind_on_groups_adjoint if smooth else None,
             }
         return Twin(
-            options=(LAWS.index(aero.law), aero.lift_direction == "lift", aero.unit_tangent, implicit),
+            options=(LAWS.index(aero.law), implicit),
             numbers=Numbers(5, numbers),
             per_substep=Numbers(width, partial(self._with_effects, parts) if parts else self.winds),
             implicit=implicit,

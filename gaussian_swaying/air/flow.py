@@ -163,10 +163,6 @@ class LatticeFlow(nn.Module):
         """Velocity of the air [m/s], shape (3, X, Y, Z); in walls that of the wall."""
         return state.moments[1:4] * self.units.speed
 
-    def pressure(self, state: FlowState) -> Tensor:
-        """Pressure above that at rest [Pa], shape (X, Y, Z)."""
-        return state.moments[0] * (self.units.density * self.units.speed**2 / 3)
-
     def vorticity(self, state: FlowState) -> Tensor:
         """Curl of the velocity [1/s] by central differences, shape (3, X, Y, Z); 0 along axes of one cell."""
         velocity, h = self.velocity(state), self.units.spacing

@@ -10,6 +10,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+import torch
 from jsonargparse import Namespace
 from lightning.pytorch import LightningDataModule, Trainer
 from lightning.pytorch.callbacks import ModelCheckpoint, ProgressBar, TQDMProgressBar
@@ -40,7 +41,7 @@ from gaussian_swaying.training.strategy import SplatParallel
 TRAINER_DEFAULTS: dict[str, Any] = {
     "max_steps": 60_000,
     "max_epochs": -1,  # training counts images, not epochs
-    "accelerator": "auto",
+    "accelerator": "cuda" if torch.cuda.is_available() else "cpu",
     "devices": 1,
     "check_val_every_n_epoch": None,
     "num_sanity_val_steps": 0,

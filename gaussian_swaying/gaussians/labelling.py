@@ -1,4 +1,4 @@
-"""Gaussians of a part, from a region, or from one of its Gaussians: what is connected to it, or looks like it."""
+"""Gaussians of a part, from one of them: what is connected to it, or looks like it."""
 
 from __future__ import annotations
 
@@ -14,27 +14,9 @@ from gaussian_swaying.gaussians.harmonics import SH_DC
 from gaussian_swaying.geometry.groups import joined
 from gaussian_swaying.geometry.neighbours import nearest_neighbours, particle_spacing
 from gaussian_swaying.geometry.patches import smallest_axis_normal
-from gaussian_swaying.geometry.regions import Region
 
 NEIGHBOURS = 12  # to which a Gaussian may be connected
 REACH = 4.0  # spacings of the Gaussians within which they are
-
-
-def in_region(cloud: GaussianCloud, region: Region) -> Tensor:
-    """The Gaussians whose centres are in a region, bool, shape (N,).
-
-    Args:
-        cloud: The splat.
-        region: The region [scene units].
-
-    Raises:
-        ValueError: If there are none.
-    """
-    inside = region.contains(cloud.means.detach())
-    if not bool(inside.any()):
-        low, high = region.bounds(cloud.means)
-        raise ValueError(f"No Gaussian is in {region!r}: the centres lie between {low} and {high}.")
-    return inside
 
 
 def connected(cloud: GaussianCloud, seed: Sequence[float], reach: float | None = None) -> Tensor:

@@ -58,7 +58,7 @@ class Part:
         nu: Poisson's ratio; that of the object if None. A rigid part has none.
         density: Density [kg/m³]; that of the object if None.
         thickness: Thickness of the surface [m]; that of the object if None.
-        damping_ratio: Damping ratio at ``material.damping_frequency``; that of the object if None.
+        damping_ratio: Damping ratio at 1 Hz; that of the object if None.
         attached: The name of the only part to which it is attached, with ``scene.connected: surface``; any if None.
         joint_stiffness: With a joint instead of its material it is attached by a spring of this stiffness [N/m]; as
             stiff as a substep allows if None and ``joint_turning`` is given.
@@ -189,19 +189,6 @@ class Parts:
             )
         wanted = [(name is None or p.name == name) and (role is None or p.role == role) for p in self.parts]
         return torch.tensor(wanted)[self.labels]
-
-    def with_part(self, part: Part, members: Tensor) -> Parts:
-        """The parts with some Gaussians given to a part, which is new or takes the place of the one with its name.
-
-        Args:
-            part: The part.
-            members: Its Gaussians, bool, shape (N,); those that it has already stay.
-        """
-        check_shape("members", members, len(self))
-        names = [known.name for known in self.parts]
-        place = names.index(part.name) if part.name in names else len(names)
-        parts = [*self.parts[:place], part, *self.parts[place + 1 :]]
-        return Parts(torch.where(members.cpu(), place, self.labels), parts)
 
     def digest(self) -> str:
         """A checksum of labels, roles and materials."""

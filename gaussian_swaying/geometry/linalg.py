@@ -9,8 +9,6 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from gaussian_swaying._devices import in_double
-
 
 def cofactor(matrix: Tensor) -> Tensor:
     r"""Cofactor matrix, :math:`\operatorname{cof} F = \det(F) F^{-T}`, defined for singular matrices too.
@@ -141,12 +139,6 @@ def symmetric_eigenvalues(matrix: Tensor) -> Tensor:
     first = mean + 2 * radius * angle.cos()
     last = mean + 2 * radius * (angle + 2 * math.pi / 3).cos()
     return torch.stack([first, 3 * mean - first - last, last], dim=-1)
-
-
-def singular_values(matrix: Tensor) -> Tensor:
-    """Singular values of 3x3 matrices (..., 3, 3), largest first, computed in float64; for diagnostics."""
-    double = in_double(matrix)
-    return symmetric_eigenvalues(double.mT @ double).clamp(min=0).sqrt()
 
 
 _PAIRS = ((0, 1, 2), (0, 2, 1), (1, 2, 0))  # two axes and the third

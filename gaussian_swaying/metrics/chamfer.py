@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import torch
 from torch import Tensor
-from torchmetrics import Metric  # noqa: TID253 - a class of torchmetrics, imported when it is used
 
 from gaussian_swaying._checks import check_choice, check_shape
 from gaussian_swaying.metrics.nearest import nearest_distances
@@ -74,60 +73,3 @@ def _combine(forward: Tensor, backward: Tensor, squared: bool, reduction: str, d
         terms = [term.square() for term in terms]
     values = torch.stack([term.mean() if reduction == "mean" else term.sum() for term in terms])
     return values.mean() if direction == "average" else values.sum()
-
-
-class ChamferDistance(Metric):
-    """Mean over frames of :func:`chamfer_distance`.
-
-    Every pair of sets has the same weight, whatever its number of points. Pass frames whose sets differ in size one by
-    one.
-
-    Args:
-        squared: Add squared distances.
-        reduction: ``mean`` or ``sum`` over the points of each set.
-        direction: ``both`` (added), ``average``, ``forward`` or ``backward``.
-        pairs: Largest number of distances in memory at a time.
-        kwargs: Options of :class:`torchmetrics.Metric`.
-
-    Raises:
-        ValueError: If an option is unknown.
-
-    Example:
-        >>> metric = ChamferDistance(direction="forward")
-        >>> metric.update(torch.zeros(1, 3), torch.tensor([[3.0, 0.0, 4.0]]))
-        >>> metric.update(torch.zeros(1, 3), torch.tensor([[1.0, 0.0, 0.0]]))
-        >>> metric.compute()
-        tensor(3., dtype=torch.float64)
-    """
-
-    is_differentiable = False
-    higher_is_better = False
-    full_state_update = False
-    total: Tensor
-    count: Tensor
-
-    def __init__(
-        self,
-        squared: bool = False,
-        reduction: str = "mean",
-        direction: str = "both",
-        pairs: int | None = None,
-        **kwargs: object,
-    ) -> None:
-        super().__init__(**kwargs)
-        check_choice("reduction", reduction, REDUCTIONS)
-        check_choice("direction", direction, DIRECTIONS)
-        self.squared, self.reduction, self.direction, self.pairs = squared, reduction, direction, pairs
-        self.add_state("total", torch.zeros((), dtype=torch.float64), dist_reduce_fx="sum")
-        self.add_state("count", torch.zeros((), dtype=torch.long), dist_reduce_fx="sum")
-
-    def update(self, source: Tensor, target: Tensor) -> None:
-        """Add frames: points of the run (..., P, 3) and of the reference (..., Q, 3) [m]."""
-        options = {"squared": self.squared, "reduction": self.reduction, "direction": self.direction}
-        values = chamfer_distance(source, target, pairs=self.pairs, **options)  # type: ignore[arg-type]
-        self.total += values.sum(dtype=torch.float64)
-        self.count += values.numel()
-
-    def compute(self) -> Tensor:
-        """The mean over all frames so far [m], or [m²] if ``squared``; NaN without frames."""
-        return self.total / self.count

@@ -28,7 +28,6 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from gaussian_swaying._devices import double_home
 from gaussian_swaying.geometry.neighbours import nearest_neighbours
 from gaussian_swaying.mpm.body import Body
 from gaussian_swaying.mpm.boundaries.boundary import CLOCK, Boundary
@@ -214,7 +213,7 @@ class PointHolds:
         self.boundaries = boundaries = body.boundaries
         position = body.points.position
         self.moving = tuple(k for k, b in enumerate(boundaries) if kinds[k] in POINTS and b.moves)
-        device = double_home(position.device)
+        device = position.device
         count, nodes = position.shape[-2], grid.node_count
         points = position.reshape(-1, count, 3).cpu().double()
         cell = stencil.first.reshape(-1, count).cpu() - nodes * torch.arange(len(points))[:, None]
@@ -316,20 +315,6 @@ class PointHolds:
             push=push.to(dtype).contiguous(),
             share=self.taken_by[0] @ inverse,
         )
-
-    def condition(self) -> float:
-        """The largest condition number of the normalised products of the kept rows, over phases and scenes."""
-        worst = 1.0
-        for w in self.whitening.detach().cpu().flatten(0, 1):
-            w = w[: int((w.diagonal() != 0).sum())]
-            w = w[:, : len(w)]
-            if len(w):
-                inverse = w.T @ w
-                factor = torch.linalg.inv(w)
-                scale = factor.square().sum(-1).rsqrt()
-                values = torch.linalg.eigvalsh(scale[:, None] * torch.linalg.inv(inverse) * scale)
-                worst = max(worst, float(values[-1] / values[0]))
-        return worst
 
     def _at(self, field: Tensor, phase: Tensor) -> Tensor:
         """A field of the current phase; the host does not wait."""

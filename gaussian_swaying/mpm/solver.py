@@ -12,7 +12,6 @@ import torch
 from torch import Tensor, nn
 
 from gaussian_swaying._checks import check_choice, check_positive, check_vector
-from gaussian_swaying._devices import move
 from gaussian_swaying.geometry.frame import SimFrame
 from gaussian_swaying.mpm.body import Body
 from gaussian_swaying.mpm.boundaries.boundary import Boundary
@@ -62,7 +61,6 @@ class MPMSolver(Solver):
         cfl: Courant number of the adaptive substep, ``dt = cfl dx / (c + |v|)``; up to 0.47 is stable near rest for any
             arrangement of particles and any Poisson's ratio.
         substep: Fixed substep [s] instead of the adaptive one; checked against the stable one.
-        max_nodes: Largest grid [nodes]; a larger grid raises an error instead of filling the memory.
         mls: Stress term and update of F as in MLS-MPM (Hu et al. 2018); only in ``updated``.
         deterministic: On a GPU, sum in a fixed order, so that repeated runs give the same bits; slower. On a CPU the
             order is always fixed. Gradients on a GPU are not covered.
@@ -92,7 +90,6 @@ class MPMSolver(Solver):
         stiffness_damping: float = 0.0,
         cfl: float = 0.4,
         substep: float | None = None,
-        max_nodes: int = 64_000_000,
         mls: bool = False,
         deterministic: bool = False,
         boundaries: Sequence[Boundary] = (),
@@ -105,7 +102,7 @@ class MPMSolver(Solver):
         if substep is not None:
             check_positive("substep", substep)
         gravity = check_vector("gravity", gravity)
-        self.settings = Settings(dx, gravity, damping, stiffness_damping, max_nodes, mls, deterministic)
+        self.settings = Settings(dx, gravity, damping, stiffness_damping, mls, deterministic)
         self.formulation: Literal["total", "updated", "modes"] = formulation
         self.transfer: Literal["auto", "torch", "kernels"] = transfer
         self.cfl, self.substep = float(cfl), substep
@@ -138,11 +135,6 @@ class MPMSolver(Solver):
     def stiffness_damping(self) -> float:
         """Time constant of the stiffness damping [s]."""
         return self.settings.stiffness_damping
-
-    @property
-    def max_nodes(self) -> int:
-        """Largest grid [nodes]."""
-        return self.settings.max_nodes
 
     @property
     def mls(self) -> bool:
@@ -368,7 +360,7 @@ class MPMSolver(Solver):
         check_rest(points, velocity)
         self._framed = None if frame is None else tuple(self.framed(frame))
         self._bound = None
-        move(self, points.position.device)  # the solver moves to the device of its material
+        self.to(points.position.device)  # the solver moves to the device of its material
         self._bind(points, surface)
         return self.bound.first_state(velocity.expand_as(points.position), margin)
 
@@ -432,7 +424,7 @@ class MPMSolver(Solver):
 
         Raises:
             FloatingPointError: If a position or a speed is NaN or infinite.
-            ValueError: If the grid would be larger than ``max_nodes``.
+            ValueError: If the grid would be larger than ``MAX_NODES``.
         """
         return self.bound.fit_grid(state, horizon, margin)
 

@@ -12,7 +12,6 @@ import torch
 from torch import Tensor
 
 from gaussian_swaying._checks import check_finite, check_shape
-from gaussian_swaying._devices import on_device
 from gaussian_swaying.mpm.laws.fixed_corotated import FixedCorotated
 from gaussian_swaying.mpm.laws.law import ConstitutiveLaw
 
@@ -393,7 +392,7 @@ class State:
     @classmethod
     def from_state_dict(cls, values: Mapping[str, Any], device: torch.device | str = "cpu") -> Self:
         """Rebuild a state saved by :meth:`state_dict`."""
-        moved: dict[str, Any] = {k: on_device(v, device) if isinstance(v, Tensor) else v for k, v in values.items()}
+        moved: dict[str, Any] = {k: v.to(device) if isinstance(v, Tensor) else v for k, v in values.items()}
         if moved["F_total"] is None:
             moved["F_total"] = moved["F_elastic"]
         return cls(**moved)

@@ -73,10 +73,12 @@ class Recorder:
     Gaussians are black.
 
     - ``depth``: along the optical axis, from yellow, one longest side of the object in front of its centre at rest, to
-      violet, as far behind it. The numbers are in ``depth_raw`` as 16-bit PNG: 0 for empty pixels, else steps of
-      ``depth_step``.
-    - ``normal``: flipped towards the camera, (n + 1) / 2 in red, green and blue, in ``normal_axes``.
-    - ``force``: wind force per area [Pa], violet at 0 to yellow at ``force_scale``.
+      violet, as far behind it. The numbers are in ``depth_raw`` as 16-bit PNG: 0 for empty pixels, else steps
+      of 1 mm.
+    - ``normal``: flipped towards the camera, (n + 1) / 2 in red, green and blue; x right, y up, z towards the
+      camera.
+    - ``force``: wind force per area [Pa], violet at 0 to yellow at the largest of the wind, without gusts, on
+      a patch at rest; that value is in summary.json.
     - ``wind``: the colour picture, paler, with streaks of air that drift with the wind, near a plane through the object
       along the flow, violet in still air to yellow at 1.5 times the flow.
     - ``vorticity``: the colour picture, paler, with the vorticity of computed air across the same plane: blue turns
@@ -94,10 +96,6 @@ class Recorder:
         checkpoint_every: Write the state for ``--resume`` every ``checkpoint_every`` frames; 0 for never.
         fps: Frames per second of the video; null for real time, 1 / frame_dt.
         renders: Pictures of each frame: ``color``, ``depth``, ``normal``, ``force``, ``wind``, ``vorticity``.
-        depth_step: Depth of one step of the PNG in ``depth_raw`` [m].
-        normal_axes: ``camera`` (x right, y up, z towards the camera) or ``world`` (simulation axes, z up).
-        force_scale: End of the colour scale of ``force`` [Pa]; null for the largest force per area of the wind, without
-            gusts, on a patch at rest; the value is in summary.json.
         export_format: Format of the Gaussians: ``ply`` (3DGS, with normals), ``compressed_ply`` (for SuperSplat),
             ``splat``, ``spz``, ``sog``, ``glb`` (glTF, in metres with y up), or ``usd`` (all frames in one
             animation.usdc, in metres; needs usd-core). See ``gaussian_swaying.gaussians.export``.
@@ -117,16 +115,13 @@ class Recorder:
     checkpoint_every: int = 1
     fps: float | None = None
     renders: Sequence[str] = ("color",)
-    depth_step: float = 0.001
-    normal_axes: Literal["camera", "world"] = "camera"
-    force_scale: float | None = None
     export_format: Format = "ply"
     nodes: bool = True
     ply_still: Literal["auto", "once", "frames"] = "auto"
 
     def __post_init__(self) -> None:
         check_literals(type(self).__init__, vars(self), "recorder.")
-        for name in ("ply_every", "checkpoint_every", "fps", "depth_step", "force_scale"):
+        for name in ("ply_every", "checkpoint_every", "fps"):
             if (value := getattr(self, name)) is not None:
                 check_positive(f"recorder.{name}", value, allow_zero=name.endswith("every"))
         renders = self.renders
@@ -387,8 +382,6 @@ class Recorder:
             cloud: The Gaussians, in scene units; they must not change.
             frame: Scene units to metres with z up, for USD and glTF.
         """
-        if cloud.means.device.type == "mps":  # which has no event here for another thread to wait for
-            cloud = cloud.to("cpu")
         if self.export_format == "usd":
             self.write_ply(index, lambda path: write_usd_frame(path, cloud, frame))
         else:

@@ -25,17 +25,16 @@ def mean_depth(picture: RenderOutput) -> Tensor:
     return torch.where(covered, picture.depth / picture.alpha.clamp_min(COVERED), 0.0)[..., 0]
 
 
-def depth_steps(depth: Tensor, step: float) -> Tensor:
-    """Depth as whole numbers for a 16-bit picture: 0 for empty pixels, otherwise 1 to 65535.
+def depth_steps(depth: Tensor) -> Tensor:
+    """Depth as millimetres for a 16-bit picture: 0 for empty pixels, otherwise 1 to 65535.
 
     Args:
-        depth: Depth, 0 for empty pixels, shape (...).
-        step: Depth of one step, in the same unit.
+        depth: Depth [m], 0 for empty pixels, shape (...).
 
     Returns:
         Shape (...), int32.
     """
-    steps = (depth / step).round().clamp(1, MAX_STEPS)
+    steps = (1000 * depth).round().clamp(1, MAX_STEPS)
     return torch.where(depth > 0, steps, 0.0).int()
 
 

@@ -14,7 +14,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from gaussian_swaying._checks import check_positive
-from gaussian_swaying._devices import double_home, in_double
+from gaussian_swaying._devices import in_double
 from gaussian_swaying.gaussians.harmonics import sh_to_color
 from gaussian_swaying.geometry.covariances import covariance
 from gaussian_swaying.rendering import raster
@@ -216,8 +216,7 @@ def composite_gaussians(
     pixel_count = width * height
     log_stop = math.log(MIN_TRANSMITTANCE)
     blended = features.new_zeros(pixel_count, features.shape[-1] + 1)
-    home = double_home(features.device)
-    log_transmittance = torch.zeros(pixel_count, dtype=torch.float64, device=home)
+    log_transmittance = torch.zeros(pixel_count, dtype=torch.float64, device=features.device)
     features = torch.cat([features, torch.ones_like(features[:, :1])], -1)
     started = False
     for spans in _row_spans(projected, width, height, max_pairs):
@@ -232,7 +231,7 @@ def composite_gaussians(
                 step -= (before[start:end] - before[start]).int().index_select(0, span)
                 pixel = step + spans.pixel[start:end].index_select(0, span)
                 if started:
-                    going = (log_transmittance > log_stop).to(pixel.device)
+                    going = log_transmittance > log_stop
                     keep = going.index_select(0, pixel).nonzero().squeeze(-1)
                     span, step, pixel = (item.index_select(0, keep) for item in (span, step, pixel))
                 pixel, order = torch.sort(pixel, stable=True)
@@ -245,9 +244,9 @@ def composite_gaussians(
             alpha = torch.where(alpha >= MIN_ALPHA, alpha, 0.0)
             log_factor = in_double(torch.log1p(-alpha))
             summed = functional.pad(log_factor.cumsum(0), (1, 0))
-            at_bounds = summed.index_select(0, bounds.to(home))
+            at_bounds = summed.index_select(0, bounds)
             entry = log_transmittance - at_bounds[:-1]
-            transmittance = (summed[:-1] + entry.index_select(0, pixel.to(home))).to(alpha).exp()
+            transmittance = (summed[:-1] + entry.index_select(0, pixel)).to(alpha).exp()
             weight = torch.where(transmittance * (1.0 - alpha) > MIN_TRANSMITTANCE, transmittance * alpha, 0.0)
             blended = blended + functional.embedding_bag(
                 spans.gaussian[start:end].index_select(0, span),

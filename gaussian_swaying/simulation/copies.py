@@ -10,7 +10,7 @@ import torch
 from torch import Tensor, nn
 
 from gaussian_swaying._checks import check_vector, check_whole
-from gaussian_swaying._devices import double_home, in_double
+from gaussian_swaying._devices import in_double
 from gaussian_swaying.aero.copied_wind import CopiedWind
 from gaussian_swaying.aero.shelter import Shelter
 from gaussian_swaying.aero.wind import WindField
@@ -88,7 +88,7 @@ class Copies(nn.Module):
 
     def setups(self, setup: Setup) -> tuple[Setup, ...]:
         """The setups of a batch: that of the object, each with the wind of a copy."""
-        home = double_home(setup.scene.identity.device)
+        home = setup.scene.identity.device
         found = []
         for number, copy in enumerate(self.copies):
             seed = copy.seed

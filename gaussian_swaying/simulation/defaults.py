@@ -43,7 +43,7 @@ if TYPE_CHECKING:
     SolverLike = Solver
     MaterialLike = Material | str
 else:  # what a YAML file can contain: the annotations of the constructor are its schema
-    SceneLike, WindLike, DeviceLike = Scene, WindField, Literal["auto", "cpu", "cuda", "mps"]
+    SceneLike, WindLike, DeviceLike = Scene, WindField, Literal["auto", "cpu", "cuda"]
     SolverLike, MaterialLike = MPMSolver, Material
 
 HoldLike = Region | PinnedRegion | PinnedPoints
@@ -52,15 +52,13 @@ CELLS = 32
 
 
 def resolve_device(device: DeviceLike) -> torch.device:
-    """The device of a name: ``auto`` (a CUDA GPU if there is one, else the CPU), ``cpu``, ``cuda`` or ``mps``.
+    """The device of a name: ``auto`` (a CUDA GPU if there is one, else the CPU), ``cpu`` or ``cuda``.
 
     Raises:
         ValueError: If the machine does not have it.
     """
     if isinstance(device, torch.device):
         return device
-    if device.startswith("mps") and not torch.backends.mps.is_available():
-        raise ValueError("`--device mps` needs a Mac with an Apple GPU, but found none: use --device auto or cpu.")
     if device != "auto" and not device.startswith("cuda"):
         return torch.device(device)
     if torch.cuda.is_available():

@@ -33,7 +33,7 @@ class MaterialRegion:
         density: Density [kg/m³]; unchanged if null.
         thickness: Thickness of the surface [m]; unchanged if null.
         bending: Bending stiffness [N m]; unchanged if null.
-        damping_ratio: Damping ratio at ``damping_frequency`` of the object; unchanged if null.
+        damping_ratio: Damping ratio at 1 Hz; unchanged if null.
         law: Constitutive law; unchanged if null.
     """
 
@@ -63,10 +63,9 @@ class Material:
             against stretch, or ``plate`` for E thickness³ / (12 (1 - nu²)). With null a sheet of one layer is a
             membrane, which folds without resistance, and one of three layers (``scene.layers`` 3) is a plate. One
             layer needs a third of the points, and may be thicker than a cell. An edit of E changes it in proportion.
-        damping_ratio: Share of critical damping of a vibration of ``damping_frequency``, in ``solver.formulation:
-            total``; parts and regions may have their own. The velocity decays at a rate of 4 pi times frequency and
-            ratio, so a vibration of twice the frequency has half of the ratio. None if null, beside ``solver.damping``.
-        damping_frequency: Frequency of a vibration that has the damping ratio [Hz].
+        damping_ratio: Share of critical damping of a vibration of 1 Hz, in ``solver.formulation: total``; parts and
+            regions may have their own. The velocity decays at a rate of 4 pi Hz times the ratio, so a vibration of
+            twice the frequency has half of the ratio. None if null, beside ``solver.damping``.
         law: Constitutive law, for example ``Sand`` (see :data:`gaussian_swaying.mpm.laws.LAWS`); fixed corotated
             elasticity if null. Plastic laws need ``solver.formulation: updated``.
         regions: Parts with a different material; later entries win.
@@ -82,7 +81,6 @@ class Material:
     volume: Literal["patch", "cell"] = "patch"
     bending: float | Literal["plate"] | None = None
     damping_ratio: float | None = None
-    damping_frequency: float = 1.0
     law: ConstitutiveLaw | None = None
     regions: list[MaterialRegion] = field(default_factory=list)
 
@@ -112,7 +110,6 @@ class Material:
             if given["nu"] is not None:
                 check_plain("material.nu", given["nu"])
                 check_poisson_ratio("material.nu", given["nu"])
-        check_positive("material.damping_frequency", self.damping_frequency)
         if any(entry.bending is not None for entry in entries):
             self._check_bending()
 

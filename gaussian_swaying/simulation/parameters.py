@@ -174,11 +174,6 @@ def register(name: str, read: Read | None = None, *, write: Write | None = None,
     return _KNOWN[name]
 
 
-def forget(name: str) -> None:
-    """Take a parameter off the list, as a test does at its end."""
-    _KNOWN.pop(name, None)
-
-
 def names() -> list[str]:
     """The names of all parameters; ``*`` stands for the place of a modulation."""
     return list(_KNOWN)

@@ -16,6 +16,7 @@ from torch import Tensor
 from gaussian_swaying._checks import check_positive
 from gaussian_swaying._provenance import describe_device, peak_memory, versions
 from gaussian_swaying.gaussians.model import DeformedGaussians
+from gaussian_swaying.mpm.formulations.formulation import MAX_NODES
 from gaussian_swaying.mpm.state import State
 from gaussian_swaying.recording.checkpoint import check_state, log_lines, unreadable
 from gaussian_swaying.recording.recorder import Recorder, frame_folder
@@ -91,10 +92,9 @@ def _check_checkpoint(
             f"The Gaussians in {output} follow {nodes} nodes, but those of the scene follow {followed}: resume with "
             "the same splat, or start again without --resume."
         )
-    most_nodes = getattr(stepper.solver.settings, "max_nodes", 0)
     try:
         entries = entry_names(start.impulse.shape[-2])
-        check_state(checkpoint, start, stepper.frame_dt, most_nodes, bool(editor.edits), entries)
+        check_state(checkpoint, start, stepper.frame_dt, MAX_NODES, bool(editor.edits), entries)
     except (ValueError, TypeError, KeyError, RuntimeError) as error:
         raise unreadable(output / "checkpoint.pt", error) from error
     if checkpoint["frame"] >= frames:
@@ -218,7 +218,7 @@ class Run:
         if painter.device.type == "cuda":
             torch.cuda.reset_peak_memory_stats(painter.device)
         self.splat = splat_checksum(self.scene)
-        self.force_end = recorder.force_scale or self.stepper.force_scale()
+        self.force_end = self.stepper.force_scale()
         self.still_once = recorder.ply_every > 0 and written_once(recorder, editor)
 
     @torch.inference_mode()
@@ -416,9 +416,9 @@ class Run:
             if "depth" in recorder.renders:
                 depth, (near, far) = passes.mean_depth(picture), painter.depth_range(frame, name)
                 images["depth"] = passes.depth_colors(depth, near, far)
-                steps = passes.depth_steps(depth, recorder.depth_step / self.scene.frame.metres_per_unit)
+                steps = passes.depth_steps(depth * self.scene.frame.metres_per_unit)
             if "normal" in recorder.renders:
-                images["normal"] = painter.draw_normals(gaussians, camera, recorder.normal_axes)
+                images["normal"] = painter.draw_normals(gaussians, camera)
             if "force" in recorder.renders:
                 pressure = self.stepper.wind_pressure(state)
                 images["force"] = painter.draw_pressure(pressure, gaussians, camera, self.force_end)

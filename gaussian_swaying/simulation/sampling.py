@@ -184,7 +184,7 @@ def sample_object(
     bending = properties.pop("bending")
     of_plate = plate_stiffness(properties["E"], properties["nu"], properties["thickness"])
     bending = torch.where(bending.isinf() | (bending.isnan() & (layers == 3)), of_plate, bending.nan_to_num(0.0))
-    damping = decay_rate(1.0, material.damping_frequency) * properties.pop("damping_ratio").nan_to_num(0.0)
+    damping = decay_rate(1.0, 1.0) * properties.pop("damping_ratio").nan_to_num(0.0)
     found = Samples(
         position, normal, body_area, area, volume, **properties, bending=bending, damping=damping, law_index=index,
         surface=surface,

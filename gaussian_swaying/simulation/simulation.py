@@ -12,7 +12,6 @@ from typing import TYPE_CHECKING, Any, Literal
 import torch
 
 from gaussian_swaying._checks import check_choice, check_frames, check_positive, check_vector
-from gaussian_swaying._devices import double_home, move
 from gaussian_swaying._turns import Turn, in_turn
 from gaussian_swaying.aero.computed_air import ComputedAir
 from gaussian_swaying.aero.force import AeroForce
@@ -109,8 +108,7 @@ class Simulation:
             object alone. See docs/many.md.
         frame_dt: Time between frames [s].
         dtype: Precision of the solver.
-        device: auto uses a CUDA GPU if there is one, else the CPU. ``mps`` (a Mac) runs torch's substeps and renderer,
-            in float32; the compiled kernels are on the CPU.
+        device: auto uses a CUDA GPU if there is one, else the CPU.
         up: Python only, if ``scene`` is not a :class:`Scene`: direction in the scene that points up.
         hold: Python only, if no solver is given: what is held in place. A region, or a pin with a kind of its own:
             ``PinnedRegion(region, kind="clamp")`` also holds the slope, ``PinnedPoints`` holds given places.
@@ -172,10 +170,6 @@ class Simulation:
         colour = check_vector("background", background)
         target = resolve_device(device)
         wait_for_device = load_ahead(target)
-        if dtype == "float64" and double_home(target) != target:
-            raise ValueError(
-                "`dtype: float64` needs a device with double precision, which mps is not: use `device: cpu`."
-            )
         damping = known_material(material).damping if isinstance(material, str) else 0.0
         settings, material = as_scene(scene, up), as_material(material)
         cloud = settings.cloud() if cloud is None else cloud  # read once
@@ -255,7 +249,7 @@ class Simulation:
         """Move all components to a device; returns the simulation."""
         setup, solver = self.setup, self.solver
         for part in (self._painter, solver, setup.wind, setup.aero, *setup.forces):
-            move(part, device)
+            part.to(device)
         self._stepper.take(replace(setup, points=self.scene.points))
         return self
 
@@ -368,7 +362,7 @@ class Simulation:
         before = self.setup
         with torch.inference_mode(False):
             for part in (setup.wind, setup.aero, *setup.forces):
-                move(part, self.device)
+                part.to(self.device)
             if setup.points is not before.points:
                 self.scene.points = setup.points
                 self._editor.rebase(setup.points)
@@ -396,7 +390,7 @@ class Simulation:
         solver = self.solver.like(setup.solver)
         scene = other_with(self.scene, points=setup.points, model=other_with(self.scene.model, sh0=sh0, shN=shN))
         other._painter = other_with(self._painter, scene=scene)
-        setup = replace(setup, scene=scene, wind=move(setup.wind, self.device))
+        setup = replace(setup, scene=scene, wind=setup.wind.to(self.device))
         other._stepper = Stepper(solver, setup, self.frame_dt, turn=self.turn, copies=self._stepper.copies)
         other._editor = SceneEditor(other._stepper, self._editor.edits)
         other._recorder, other.files, other._given = self._recorder_or(recorder), [], dict(self._given)

@@ -12,7 +12,7 @@ from typing import NoReturn
 import torch
 from torch import Tensor
 
-from gaussian_swaying._devices import double_home, in_double
+from gaussian_swaying._devices import in_double
 from gaussian_swaying._turns import Turn, in_turn
 from gaussian_swaying.aero.added_mass import AirLift, carried_mass, with_added_mass
 from gaussian_swaying.aero.computed_air import AirInBox
@@ -218,7 +218,7 @@ class Stepper:
             return torch.cat(flows)
         position = self.setup.points.position
         position = position.expand(len(self.setups), *position.shape) if self.batched else position
-        air = self.wind_force.air(torch.zeros((), dtype=torch.float64, device=double_home(position.device)), position)
+        air = self.wind_force.air(torch.zeros((), dtype=torch.float64, device=position.device), position)
         return air.reshape(-1, 3)
 
     @in_turn

@@ -7,7 +7,7 @@ import math
 import torch
 from torch import Tensor
 
-from gaussian_swaying._devices import double_home, in_double
+from gaussian_swaying._devices import in_double
 from gaussian_swaying.aero.wind import WindField
 from gaussian_swaying.mpm.state import State
 from gaussian_swaying.rendering.cameras.camera import Camera, project
@@ -38,7 +38,7 @@ def streaks(stepper: Stepper, state: State, camera: Camera) -> tuple[Tensor, Ten
         Places, scene units, shape (S, STEPS + 1, 3), and the speed at them [m/s], shape (S, STEPS + 1).
     """
     frame, wind = stepper.scene.frame, stepper.setup.wind
-    device, double = double_home(state.position.device), torch.float64
+    device, double = state.position.device, torch.float64
     mean, centre, eye = _middle(stepper, state, camera)
     view = centre - eye
     distance = view.norm()
@@ -72,7 +72,7 @@ def streaks(stepper: Stepper, state: State, camera: Camera) -> tuple[Tensor, Ten
 
 def _middle(stepper: Stepper, state: State, camera: Camera) -> tuple[Tensor, Tensor, Tensor]:
     """Mean flow [m/s], centre of the object and eye [m], each of shape (3,)."""
-    device, frame, wind = double_home(state.position.device), stepper.scene.frame, stepper.setup.wind
+    device, frame, wind = state.position.device, stepper.scene.frame, stepper.setup.wind
     centre = frame.point_to_sim(stepper.scene.center.to(device).double()[None])[0]
     eye = frame.point_to_sim(camera.position.to(device).double()[None])[0]
     mean = wind.mean_flow(state.time) if isinstance(wind, WindField) else in_double(stepper.flows()).mean(0)

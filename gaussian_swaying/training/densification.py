@@ -131,26 +131,6 @@ class Densification(ABC):
         self._restored = dict(state)
 
 
-class NoDensification(Densification):
-    """The number of Gaussians does not change."""
-
-    def make_strategy(self, device: torch.device) -> None:
-        """None is needed."""
-        return
-
-    def _initial_state(self, scene_scale: float) -> dict[str, Any]:
-        return {}
-
-    def before_backward(self, step: int, screen: ScreenGaussians) -> None:
-        """Nothing to prepare."""
-
-    def after_step(self, step: int, screen: ScreenGaussians) -> None:
-        """Nothing changes."""
-
-    def _advance(self, parameters: dict[str, nn.Parameter], step: int, screen: ScreenGaussians) -> None:
-        raise AssertionError("never called")
-
-
 class DefaultDensification(Densification):
     """Copy, split and prune by the gradient on the screen: gsplat's ``DefaultStrategy`` (Kerbl et al. 2023).
 

@@ -11,7 +11,7 @@ import torch
 from PIL import Image
 from torch import Tensor
 
-from gaussian_swaying._devices import double_home, in_double
+from gaussian_swaying._devices import in_double
 from gaussian_swaying.geometry.rotations import quat_to_rotation
 from gaussian_swaying.rendering.cameras.camera import Camera
 from gaussian_swaying.rendering.tints import by_role
@@ -113,7 +113,7 @@ def under_cursor(snapshot: Snapshot, origin: Sequence[float], direction: Sequenc
     """
     scene = snapshot.simulation.scene
     means = snapshot.simulation.painter.deformed(snapshot.state).means
-    seen = (scene.model.opacity() > 0.2).to(double_home(means.device))
+    seen = (scene.model.opacity() > 0.2).to(means.device)
     means = in_double(means)
     start = torch.tensor(list(origin), dtype=torch.float64, device=means.device)
     along = torch.nn.functional.normalize(torch.tensor(list(direction), dtype=torch.float64), dim=0).to(means)

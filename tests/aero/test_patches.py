@@ -19,8 +19,7 @@ LAWS = {
     "projected with all terms": {"drag": 0.5, "friction": 0.4, "lift": 0.3, "law": "projected"},
     "linear with all terms": {"drag": 0.5, "friction": 0.4, "lift": 0.3, "law": "linear"},
     "cross flow with all terms": {"drag": 0.5, "friction": 0.4, "lift": 0.3, "law": "cross_flow"},
-    "paper with lift": {"drag": 0.5, "friction": 0.1, "lift": 0.5, "law": "paper", "lift_direction": "lift"},
-    "unit tangent": {"drag": 0.5, "friction": 0.4, "lift": 0.1, "law": "paper", "unit_tangent": True},
+    "paper with lift": {"drag": 0.5, "friction": 0.1, "lift": 0.5, "law": "paper"},
 }
 POINTS = 40
 

@@ -123,7 +123,7 @@ def test_cameras_and_renders_from_a_configuration(tmp_path, capsys):
     keys = [{"time": 0.0, "azimuth": -70, "elevation": 8, "radius": 2}, {"time": 1.0, "azimuth": -40}]
     side = {"class_path": "OrbitCamera", "init_args": size | {"azimuth": 0.0}}
     cameras = {"side": side, "flight": {"class_path": "KeyframedCamera", "init_args": size | {"keys": keys}}}
-    more = {"cameras": cameras, "recorder": {"renders": ["color", "normal"], "normal_axes": "world"}}
+    more = {"cameras": cameras, "recorder": {"renders": ["color", "normal"]}}
     (tmp_path / "more.yaml").write_text(yaml.safe_dump(more))
     out = tmp_path / "run"
     assert _code([*SMALL, "--config", str(tmp_path / "more.yaml"), "--output", str(out)]) == 0
@@ -407,7 +407,6 @@ GUST = '[{"class_path": "SineSway", "init_args": {"amplitud": 1.0}}]'
         (["--solver.dx", "0"], ["`dx`"]),
         (["--solver.formulation", "totl"], ["solver.formulation", "Expected one of total, updated"]),
         (["--solver.substep", "1.0"], ["`substep` of 1 s", "stable one of 0.0", "lower it"]),
-        (["--solver.max_nodes", "10"], ["`max_nodes`", "coarsen `dx`"]),
         (["--camera", INSIDE], ["camera", "inside the object", "move it out"]),
         (["--recorder.images", "false"], ["`recorder.images`"]),
         (["--config", "/nowhere/at_all.yaml"], ["/nowhere/at_all.yaml", "does not exist"]),

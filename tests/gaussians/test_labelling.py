@@ -1,4 +1,4 @@
-"""Gaussians of a part, from a region or a seed."""
+"""Gaussians of a part, from a seed."""
 
 import dataclasses
 
@@ -7,8 +7,7 @@ import torch
 from small_scenes import plain_cloud, together
 
 from gaussian_swaying.gaussians.harmonics import SH_DC
-from gaussian_swaying.gaussians.labelling import alike, connected, in_region
-from gaussian_swaying.geometry.regions import Box
+from gaussian_swaying.gaussians.labelling import alike, connected
 
 
 def sheet(turned=False, color=(0.5, 0.5, 0.5), shift=(0.0, 0.0, 0.0)):
@@ -25,13 +24,6 @@ def sheet(turned=False, color=(0.5, 0.5, 0.5), shift=(0.0, 0.0, 0.0)):
 def of(cloud, number):
     """Whether each Gaussian is one of the hundred of a sheet."""
     return torch.arange(len(cloud)) // 100 == number
-
-
-def test_a_region_holds_its_centres():
-    cloud = together(sheet(), sheet(shift=(3.0, 0.0, 0.0)))
-    assert torch.equal(in_region(cloud, Box([2.0, None, None], [None, None, None])), of(cloud, 1))
-    with pytest.raises(ValueError, match="No Gaussian is in"):
-        in_region(cloud, Box([9.0, None, None], [None, None, None]))
 
 
 def test_what_is_apart_is_not_connected():

@@ -103,17 +103,6 @@ def test_the_region_of_a_part_is_what_is_nearest_to_it():
     assert repr(region) == "of the part 'left'"
 
 
-def test_gaussians_are_given_to_a_part():
-    parts = Parts([0, 0, 1, 2], PARTS)
-    more = parts.with_part(Part("stem", E=1e6), torch.tensor([False, True, True, False]))
-    assert [part.name for part in more.parts] == ["pot", "soil", "leaf", "stem"]
-    assert more.labels.tolist() == [0, 3, 3, 2]
-    held = more.with_part(Part("leaf", "held"), torch.tensor([True, False, False, False]))
-    assert held.mask(role="held").tolist() == [True, False, False, True]
-    assert held.labels.tolist() == [2, 3, 3, 2]
-    assert parts.labels.tolist() == [0, 0, 1, 2]
-
-
 def test_the_file_keeps_what_a_part_is_attached_to(tmp_path):
     parts = Parts([0, 1, 1], [Part("stem"), Part("leaf", attached="stem")])
     again = Parts.load(parts.save(tmp_path / "parts.npz"))

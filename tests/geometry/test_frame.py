@@ -1,6 +1,6 @@
 """Scene units to metres and back, against closed forms.
 
-Covers: simulation.frame.
+Covers: _devices, simulation.frame.
 """
 
 import dataclasses

@@ -3,12 +3,10 @@
 Covers: metrics.nearest.
 """
 
-import copy
-
 import pytest
 import torch
 
-from gaussian_swaying.metrics.chamfer import ChamferDistance, chamfer_distance
+from gaussian_swaying.metrics.chamfer import chamfer_distance
 from gaussian_swaying.metrics.nearest import nearest_distances
 
 
@@ -152,42 +150,3 @@ def test_a_position_that_is_nan_is_not_hidden(count):
 def test_bad_input(source, target, options, message):
     with pytest.raises(ValueError, match=message):
         chamfer_distance(torch.rand(source), torch.rand(target), **options)
-
-
-def test_metric_is_the_mean_over_frames(device):
-    frames = [(torch.rand(n, 3, device=device), torch.rand(m, 3, device=device)) for n, m in ((9, 5), (30, 8), (4, 4))]
-    metric = ChamferDistance(squared=True).to(device)
-    for source, target in frames:
-        metric.update(source, target)
-    expected = torch.stack([chamfer_distance(s, t, squared=True) for s, t in frames]).double().mean()
-    torch.testing.assert_close(metric.compute(), expected)
-
-
-def test_metric_counts_a_batch_as_frames_and_resets():
-    source, target = torch.rand(3, 9, 3), torch.rand(3, 5, 3)
-    metric, single = ChamferDistance(), ChamferDistance()
-    metric.update(source, target)
-    for one, other in zip(source, target, strict=True):
-        single.update(one, other)
-    torch.testing.assert_close(metric.compute(), single.compute())
-    assert int(metric.count) == 3
-    metric.reset()
-    metric.update(source[0], source[0])
-    assert float(metric.compute()) == 0.0
-
-
-def test_metrics_of_two_processes_add_up():
-    """States are summed, as torchmetrics does when it gathers them."""
-    frames = [(torch.rand(9, 3), torch.rand(7, 3)) for _ in range(4)]
-    whole, parts = ChamferDistance(), [ChamferDistance(), ChamferDistance()]
-    for number, pair in enumerate(frames):
-        whole.update(*pair)
-        parts[number % 2].update(*pair)
-    merged = copy.deepcopy(parts[0])
-    merged.merge_state(parts[1])
-    torch.testing.assert_close(merged.compute(), whole.compute())
-
-
-def test_metric_rejects_options_when_it_is_made():
-    with pytest.raises(ValueError, match="Expected `direction`"):
-        ChamferDistance(direction="up")

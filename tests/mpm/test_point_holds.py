@@ -226,6 +226,18 @@ def test_places_are_converted_from_scene_units():
 # ---- which rows are kept
 
 
+def _condition(holds):
+    """The largest condition number of the normalised products of the kept rows, over phases and scenes."""
+    worst = 1.0
+    for w in holds.whitening.flatten(0, 1):
+        w = w[: int((w.diagonal() != 0).sum())]
+        product = torch.linalg.inv(w[:, : len(w)].T @ w[:, : len(w)])
+        scale = product.diagonal().rsqrt()
+        values = torch.linalg.eigvalsh(scale[:, None] * product * scale)
+        worst = max(worst, float(values[-1] / values[0]))
+    return worst
+
+
 @pytest.mark.parametrize("patch", [1, 2, 8])
 @pytest.mark.parametrize(("kind", "most"), [("hinge", 50.0), ("clamp", 1000.0)])
 def test_kept_rows_are_independent_at_any_angle(kind, most, patch):
@@ -242,7 +254,7 @@ def test_kept_rows_are_independent_at_any_angle(kind, most, patch):
         solver.init_state(points)
         holds = solver.bound.point_holds
         assert int((holds.release[0, 0] > 0).sum()) >= 0.8 * 20 * STEP / DX
-        worst = max(worst, holds.condition())
+        worst = max(worst, _condition(holds))
     assert 1.5 < worst < most
 
 
@@ -261,14 +273,6 @@ def test_a_line_along_the_grid_keeps_all_its_cells():
     along = holds.place[0, 0][slope][:, 0] > 0
     assert int(along.sum()) <= 2  # the slope along the line depends on the values, except at its ends
     assert int(slope.sum()) >= 2 * len(line)
-    assert holds.condition() < 200
-
-
-def test_condition_of_a_plain_line_is_small():
-    points = _sheet(width=40, shift=(0.05, 0.02, 0.03))
-    solver = MPMSolver(DX, boundaries=[PinnedRegion(Box([None, None, -0.001], [None] * 3))])
-    solver.init_state(points)
-    assert 1.5 < solver.bound.point_holds.condition() < 8
 
 
 def test_rows_come_in_the_order_of_their_release():

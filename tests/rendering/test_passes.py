@@ -39,7 +39,7 @@ def test_the_depth_of_a_wall():
 
 def test_depth_in_16_bits():
     """0 is kept for nothing; no depth falls to it, and what is beyond the range is at its end."""
-    found = depth_steps(torch.tensor([0.0, 1e-5, 0.0014, 2.0, 100.0]), 0.001)
+    found = depth_steps(torch.tensor([0.0, 1e-5, 0.0014, 2.0, 100.0]))
     assert found.dtype == torch.int32
     assert found.tolist() == [0, 1, 1, 2000, 65535]
 

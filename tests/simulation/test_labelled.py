@@ -55,20 +55,19 @@ def test_what_is_still_and_held_stays_and_the_rest_bends_there(formulation):
 
 
 def test_parts_have_damping_ratios_of_their_own():
-    """A ratio at the frequency of the object, as a rate of 4 pi times both."""
-    roles = [*ROLES[:3], dataclasses.replace(ROLES[3], damping_ratio=0.1)]
-    material = Material(E=5e3, density=30.0, thickness=0.01, damping_ratio=0.02, damping_frequency=3.0)
+    """A ratio at 1 Hz, as a rate of 4 pi times it."""
+    roles = [*ROLES[:3], dataclasses.replace(ROLES[3], damping_ratio=0.3)]
+    material = Material(E=5e3, density=30.0, thickness=0.01, damping_ratio=0.06)
     points = flag(Parts(labels(), roles), material=material).scene.points
     rates = points.damping.unique()
-    assert rates.tolist() == pytest.approx([12 * math.pi * 0.02, 12 * math.pi * 0.1])
+    assert rates.tolist() == pytest.approx([4 * math.pi * 0.06, 4 * math.pi * 0.3])
     hem = points.position[:, 0] > 0.95
     assert bool((points.damping[hem] == rates[1]).all())
     assert flag().scene.points.damping is None
     with pytest.raises(ValueError, match=r"`material.damping_ratio` sets, needs `solver.formulation: total`"):
         flag(material=material, formulation="updated").start()
-    for name, value in (("damping_ratio", -0.1), ("damping_frequency", 0.0)):
-        with pytest.raises(ValueError, match=f"`material.{name}` to"):
-            Material(**{name: value})
+    with pytest.raises(ValueError, match=r"`material\.damping_ratio` to"):
+        Material(damping_ratio=-0.1)
 
 
 @pytest.mark.parametrize("formulation", ["total", "updated"])
@@ -191,17 +190,11 @@ recorder: {{images: false, video: false}}
 def test_the_examples_of_the_page_run(tmp_path, monkeypatch):
     page = (Path(__file__).parents[2] / "docs/parts.md").read_text(encoding="utf-8")
     monkeypatch.chdir(tmp_path)
-    joints, first, second = ({}, {}, {})
-    for names, block in zip((joints, first, second), page.split("```python\n")[1:], strict=True):
+    joints, first = {}, {}
+    for names, block in zip((joints, first), page.split("```python\n")[1:], strict=True):
         exec(compile(block.split("```")[0], "parts.md", "exec"), names)
     assert all(joints[name].has_joint for name in ("leaf", "vane", "lamp"))
     assert len(list(first["simulation"].frames(2))) == 2
-    assert [part.name for part in second["parts"].parts] == ["cloth", "pole", "hem"]
-    right = second["flag"].means[:, 0] > 0.9
-    assert torch.equal(second["parts"].mask("hem"), right)
-    x = second["flag"].means[:, 0]
-    assert float(second["halves"].mask("right")[x > 0.9].double().mean()) > 0.6  # it is striped
-    assert float(second["halves"].mask("left")[x < 0.4].double().mean()) > 0.6
     described = page.split("## The file")[1].split("```")[0]
     rows = re.findall(r"^\| (`.*?) \|", described, re.MULTILINE)
     assert {name for row in rows for name in re.findall(r"`(\w+)`", row)} == set(np.load(tmp_path / "parts.npz"))

@@ -117,7 +117,7 @@ def breath(tmp_path, monkeypatch):
     path = tmp_path / "breath.yaml"
     path.write_text(yaml.safe_dump(CONFIG | {"forces": [{"class_path": "users_breath.Breath"}]}))
     yield path
-    parameters.forget("forces.Breath.strength")
+    parameters._KNOWN.pop("forces.Breath.strength", None)
     import sys
 
     sys.modules.pop("users_breath", None)

@@ -9,7 +9,6 @@ from gaussian_swaying.training.densification import (
     PARAMETERS,
     DefaultDensification,
     MCMCDensification,
-    NoDensification,
 )
 from gaussian_swaying.training.initial import gaussians_from_points
 
@@ -110,15 +109,6 @@ def test_after_the_last_step_nothing_is_kept():
     densification.before_backward(5, screen)
     densification.after_step(5, screen)
     assert densification.state_dict()["grad2d"] is None
-
-
-def test_no_densification():
-    model = _model()
-    densification = NoDensification()
-    densification.attach(model, _optimizer(model), 1.0)
-    densification.after_step(600, _screen([9.0], [0]))
-    assert len(model) == 6
-    assert densification.state_dict() == {}
 
 
 def test_what_needs_cuda_says_so():

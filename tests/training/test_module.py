@@ -9,17 +9,13 @@ import os
 import lightning
 import pytest
 import torch
-from lightning.pytorch.accelerators import CPUAccelerator
 from lightning.pytorch.callbacks import ModelCheckpoint
-from lightning.pytorch.strategies import SingleDeviceStrategy
-from pretend_mps import pretended_mps
 
 from gaussian_swaying.gaussians.ply import read_ply
 from gaussian_swaying.training.densification import (
     PARAMETERS,
     DefaultDensification,
     MCMCDensification,
-    NoDensification,
 )
 from gaussian_swaying.training.finite import TrainingDiverged
 from gaussian_swaying.training.initial import gaussians_from_points
@@ -215,7 +211,7 @@ def test_gaussians_that_are_not_finite_are_not_kept(data, make_trainer, tmp_path
                 module.splat.quats.data[3] = math.nan
 
     only_rgb = {"anisotropy": 0, "entropy": 0, "size": 0}
-    module = _module(loss_weights=only_rgb, densification=NoDensification())
+    module = _module(loss_weights=only_rgb, densification=DefaultDensification(stop=0))
     callbacks = [Spoils(), _checkpoints(tmp_path, every=3)]
     with pytest.raises(TrainingDiverged, match=r"step 6: a value of `.*step=3\.ckpt"):
         make_trainer(20, enable_checkpointing=True, callbacks=callbacks).fit(module, data)
@@ -327,7 +323,7 @@ def test_schedules(data, make_trainer):
     module = SplatTrainer(sh_degree=2, sh_every=10)
     assert [module.active_degree(step) for step in (0, 9, 10, 25, 99)] == [0, 0, 1, 2, 2]
     assert SplatTrainer(sh_degree=2, sh_every=0).active_degree(0) == 2
-    module = _module(densification=NoDensification())
+    module = _module(densification=DefaultDensification(stop=0))
     make_trainer(3).fit(module, data)
     got = [group["lr"] for optimizer in module.trainer.optimizers for group in optimizer.param_groups]
     assert got == pytest.approx([means_rate(rates, 1.5, 2, 3), 5e-3, 1e-3, 5e-2, 2.5e-3, 2.5e-3 / 20])
@@ -357,7 +353,7 @@ def test_backgrounds(data):
 
 def test_gaussians_from_a_file(data, make_trainer, tmp_path):
     """A splat of a higher degree is cut, one of a lower one extended."""
-    make_trainer(1).fit(_module(densification=NoDensification()), data)
+    make_trainer(1).fit(_module(densification=DefaultDensification(stop=0)), data)
     for degree in (0, 2):
         module = _module(init_ply=str(tmp_path / "run/point_cloud.ply"), sh_degree=degree)
         make_trainer(1, folder="other").fit(module, data)
@@ -396,25 +392,3 @@ def test_a_view_without_gaussians(data, make_trainer):
     data.initial_cloud = lambda degree: cloud
     make_trainer(5).fit(module, data)
     assert torch.isfinite(module.splat.means).all()
-
-
-class _Pretended(CPUAccelerator):
-    def setup_device(self, device):
-        assert device.type == "mps"
-
-
-def test_a_training_asks_only_for_what_the_gpu_of_a_mac_has(data, tmp_path):
-    """Lightning takes the GPU of a Mac by itself."""
-    module = SplatTrainer(
-        sh_degree=1, sh_every=4, lpips=None, densification=DefaultDensification(start=1, every=4, grow_grad2d=1e-4)
-    )
-    with pretended_mps() as mode:
-        strategy = SingleDeviceStrategy(accelerator=_Pretended(), device=torch.device("mps"))
-        trainer = lightning.Trainer(
-            strategy=strategy, max_steps=6, max_epochs=-1, default_root_dir=tmp_path, logger=False,
-            enable_model_summary=False, enable_progress_bar=False, check_val_every_n_epoch=None, val_check_interval=6,
-        )  # fmt: skip
-        trainer.fit(module, data)
-    assert len(module.splat) > data.points
-    assert mode.seen["_embedding_bag"] > 0
-    assert math.isfinite(float(trainer.callback_metrics["val/psnr"]))

@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from gaussian_swaying._devices import double_home, in_double
+from gaussian_swaying._devices import in_double
 from gaussian_swaying.mpm.boundaries.boundary import Boundary
 from gaussian_swaying.mpm.boundaries.obstacle import Obstacle
 from gaussian_swaying.mpm.contact.pairs import close_pairs
@@ -228,7 +228,7 @@ class ContactStage:
             float64.
         """
         lists = self.lists
-        taken = torch.zeros(self.scenes, self.count, 3, dtype=torch.float64, device=double_home(velocity.device))
+        taken = torch.zeros(self.scenes, self.count, 3, dtype=torch.float64, device=velocity.device)
         if lists is None or len(lists.place) == 0:
             return velocity, taken
         flat, rows = velocity.reshape(-1, 3), lists.rows

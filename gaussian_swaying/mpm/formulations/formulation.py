@@ -13,7 +13,6 @@ import torch
 from torch import Tensor
 
 from gaussian_swaying._checks import check_positive
-from gaussian_swaying._devices import double_home, sum_in_double
 from gaussian_swaying.geometry.linalg import symmetric_eigenvalues
 from gaussian_swaying.mpm.body import Body, Held
 from gaussian_swaying.mpm.boundaries.boundary import Boundary, Nodes
@@ -29,6 +28,10 @@ from gaussian_swaying.mpm.transfer import Stencil, scatter
 _Number = TypeVar("_Number", float, Tensor)
 
 
+MAX_NODES = 64_000_000
+"""Largest grid; a larger one raises an error instead of filling the memory."""
+
+
 @dataclass(frozen=True, slots=True)
 class Settings:
     """The solver settings that a formulation needs; ``MPMSolver`` explains the fields."""
@@ -37,15 +40,14 @@ class Settings:
     gravity: tuple[float, ...]
     damping: float
     stiffness_damping: float
-    max_nodes: int
     mls: bool
     deterministic: bool
 
     def __post_init__(self) -> None:
-        for name in ("dx", "damping", "stiffness_damping", "max_nodes"):
+        for name in ("dx", "damping", "stiffness_damping"):
             value = getattr(self, name)
             check_positive(name, value, allow_zero=name.endswith("damping"))
-            object.__setattr__(self, name, int(value) if name == "max_nodes" else float(value))
+            object.__setattr__(self, name, float(value))
 
 
 class Formulation(ABC):
@@ -88,7 +90,7 @@ class Formulation(ABC):
         device = body.points.position.device
         with torch.inference_mode(False):  # an ordinary tensor, which a gradient may need
             # float64 on the device: no copy in a step, full precision in a float64 run
-            self.gravity = torch.tensor(settings.gravity, dtype=torch.float64, device=double_home(device))
+            self.gravity = torch.tensor(settings.gravity, dtype=torch.float64, device=device)
 
     def hold_kind(self, k: int) -> str:
         """Return what the ``k``-th boundary acts on, see ``Boundary.hold_kind``."""
@@ -125,10 +127,10 @@ class Formulation(ABC):
             F_elastic=identity,
             F_total=identity,
             lost=torch.zeros(position.shape[:-1], dtype=torch.bool, device=position.device),
-            time=torch.zeros((), dtype=torch.float64, device=double_home(position.device)),
+            time=torch.zeros((), dtype=torch.float64, device=position.device),
             grid=self.first_grid(margin),
             internal=self.body.laws.initial_internal(),
-            work=torch.zeros(position.shape[:-2], dtype=torch.float64, device=double_home(position.device)),
+            work=torch.zeros(position.shape[:-2], dtype=torch.float64, device=position.device),
             impulse=self.no_impulse(),
         )
 
@@ -136,7 +138,7 @@ class Formulation(ABC):
         """A reaction impulse of zero for each boundary, shape (..., B, 3), float64."""
         position = self.body.points.position
         shape = (*position.shape[:-2], len(self.kinds), 3)
-        return torch.zeros(shape, dtype=torch.float64, device=double_home(position.device))
+        return torch.zeros(shape, dtype=torch.float64, device=position.device)
 
     @abstractmethod
     def fit_grid(self, state: MPMState, horizon: float, margin: int) -> MPMState:
@@ -152,22 +154,22 @@ class Formulation(ABC):
 
         Raises:
             FloatingPointError: If a position is NaN or infinite.
-            ValueError: If the grid would be larger than ``max_nodes``, or too far away.
+            ValueError: If the grid would be larger than :data:`MAX_NODES`, or too far away.
         """
-        dx, most = self.settings.dx, self.settings.max_nodes
+        dx = self.settings.dx
         flat = position.detach().reshape(-1, 3)
         low, high = flat.amin(0), flat.amax(0)
         if not bool(torch.isfinite(low).all() & torch.isfinite(high).all()):
             raise not_finite("position", flat)
         grid = bounding_grid(low, high, dx, margin)
-        if grid.node_count > most:
+        if grid.node_count > MAX_NODES:
             size = [round(v, 3) for v in (high - low).tolist()]
             what = f"The particles span {size} m"
             if 2 * margin * dx > max(size):
                 what = f"The particles may fly {margin * dx:.3g} m in any direction within a frame, at {speed:.3g} m/s"
             raise ValueError(
                 f"{what}, which takes {grid.node_count:,} grid nodes at dx = {dx:g} m, more "
-                f"than `max_nodes` = {most:,}: select a smaller region, coarsen `dx` or raise `max_nodes`."
+                f"than {MAX_NODES:,}: select a smaller region, or coarsen `dx`."
             )
         if max(map(abs, grid.offset)) >= 2**31:
             raise ValueError(
@@ -237,7 +239,7 @@ class Formulation(ABC):
                 pinned = nodes.held & boundary.active(time)
                 fixed = pinned if fixed is None else fixed | pinned
             with torch.no_grad():
-                taken[k] = sum_in_double(mass[..., None] * (before - velocity), -2)
+                taken[k] = (mass[..., None] * (before - velocity)).sum(-2, dtype=torch.float64)
         return velocity, torch.stack(taken, dim=-2) if taken else self.no_impulse()
 
     def in_shape(self, state: MPMState) -> MPMState:

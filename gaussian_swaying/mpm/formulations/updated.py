@@ -13,7 +13,14 @@ from gaussian_swaying.geometry.linalg import matmul3, polar_rotation
 from gaussian_swaying.geometry.rigid import centre
 from gaussian_swaying.mpm.body import Body
 from gaussian_swaying.mpm.damping import kelvin_voigt_pk1
-from gaussian_swaying.mpm.formulations.formulation import Formulation, Settings, held_share, not_finite, safe_inverse
+from gaussian_swaying.mpm.formulations.formulation import (
+    MAX_NODES,
+    Formulation,
+    Settings,
+    held_share,
+    not_finite,
+    safe_inverse,
+)
 from gaussian_swaying.mpm.state import GridSpec, MPMState
 from gaussian_swaying.mpm.timestep import kick_time
 from gaussian_swaying.mpm.transfer import bspline_stencil, g2p, scatter, scatter_momentum
@@ -78,7 +85,7 @@ class Updated(Formulation):
         serves = state.grid.holds(grid) and state.grid.node_count <= 3 * roomy.node_count
         if serves and not margin:  # callers give a margin if the grid was too small
             return state
-        return state.replace(grid=roomy if roomy.node_count <= self.settings.max_nodes else grid)
+        return state.replace(grid=roomy if roomy.node_count <= MAX_NODES else grid)
 
     def step(self, state: MPMState, dt: float, force: Tensor | None, drag: Tensor | None) -> MPMState:
         """One substep: momenta to the nodes, their new velocity, and back to the particles, which move with it."""

@@ -93,7 +93,7 @@ def in_webassembly(simulation: Simulation) -> bool:
     solver, aero = simulation.solver, simulation.aero
     assert isinstance(solver, MPMSolver)
     known = {LAWS[0], LAWS[1]}
-    plain = simulation.stepper.idle or not (aero.unit_tangent or aero.drag_step == "semi_implicit")
+    plain = simulation.stepper.idle or aero.drag_step != "semi_implicit"
     return plain and solver.stiffness_damping == 0 and all(type(law) in known for law in simulation.setup.points.laws)
 
 
@@ -258,8 +258,6 @@ def _aero(simulation: Simulation) -> dict[str, Any]:
         "lift": float(aero.C_L),
         "airDensity": aero.air_density,
         "law": AERO_LAWS.index(aero.law),
-        "lifted": aero.lift_direction == "lift",
-        "unitTangent": aero.unit_tangent,
         "implicit": aero.drag_step == "semi_implicit",
         "maxAreaRatio": None if aero.max_area_ratio == math.inf else aero.max_area_ratio,
     }

@@ -42,11 +42,11 @@ from .bodies import (
     ("kernel_device", "settings"),
     on_each(
         {"drag_step": "semi_implicit"},
-        {"law": "projected", "lift_direction": "lift", "unit_tangent": True},
+        {"law": "projected"},
         {"max_area_ratio": 0.9},
         {"law": "linear", "drag_step": "semi_implicit"},
         {"law": "cross_flow", "drag_step": "semi_implicit"},
-        cpu=[{"law": "projected"}, {"law": "linear"}, {"lift_direction": "lift"}, {"unit_tangent": True}],
+        cpu=[{"law": "linear"}],
     ),
     indirect=["kernel_device"],
     ids=lambda value: value if isinstance(value, str) else ", ".join(map(str, value.values())),
@@ -60,10 +60,9 @@ def test_every_kind_of_wind(kernel_device, formulation, settings):
     ("kernel_device", "settings"),
     on_each(
         {"drag_step": "semi_implicit", "max_area_ratio": 0.9},
-        {"law": "projected", "lift_direction": "lift", "unit_tangent": True},
+        {"law": "projected"},
         {"law": "linear", "drag_step": "semi_implicit"},
         {"law": "cross_flow"},
-        cpu=[{"law": "projected"}],
     ),
     indirect=["kernel_device"],
     ids=lambda value: value if isinstance(value, str) else ", ".join(map(str, value.values())),
@@ -121,11 +120,11 @@ def test_patches_without_flow_and_flat_ones(kernel_device):
 
 @pytest.mark.parametrize("formulation", FORMULATIONS)
 def test_wind_along_the_normal(kernel_device, formulation):
-    """Nothing of it is tangential, and the direction of a zero vector is zero."""
+    """Nothing of it is tangential."""
     points = make_points(kernel_device)
     up = torch.tensor([0.0, 0.0, 1.0], device=kernel_device).expand(*points.position.shape)
     wind = WindField([0.0, 0.0, -50.0]).to(kernel_device)
-    load = WindForce(AeroForce(unit_tangent=True).to(kernel_device), wind, up, 0.01 * torch.ones_like(points.mass))
+    load = WindForce(AeroForce().to(kernel_device), wind, up, 0.01 * torch.ones_like(points.mass))
 
     def start(solver, points):
         return solver.init_state(points)

@@ -90,10 +90,10 @@ def both(one, other, part=None):
 
 MIXED = {
     "two laws, schedule, paper": both("two laws, schedule", "neo-hookean, paper", "aero"),
-    "hencky, unit tangent, clamp and plane": both("hencky, unit tangent", "clamp and plane"),
+    "hencky, cross flow, clamp and plane": both("hencky, cross flow", "clamp and plane"),
     "springs, viscous, pinned points": both("springs, viscous", "nodes and a point, still air", "solver"),
     "linear, semi-implicit": CASES["linear, semi-implicit"],
-    "one patch, unit tangent": CASES["one patch, unit tangent"],
+    "one patch, cross flow": CASES["one patch, cross flow"],
 }
 
 

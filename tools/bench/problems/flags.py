@@ -8,7 +8,6 @@ from torch import Tensor
 from bench.problems.settings import Result, Run, Settings, follow
 from gaussian_swaying.aero.force import AeroForce
 from gaussian_swaying.aero.wind import SineSway, WindField
-from gaussian_swaying.geometry.linalg import singular_values
 from gaussian_swaying.geometry.patches import deform_patch
 from gaussian_swaying.geometry.regions import Box
 from gaussian_swaying.mpm.boundaries.pinned_region import PinnedRegion
@@ -85,7 +84,7 @@ def flag(
 
 
 def _health(run: Run, gauge: TearingGauge) -> Result:
-    stretch = singular_values(run.state.F_total)
+    stretch = torch.linalg.svdvals(run.state.F_total.double())
     return run.result(
         float("nan"),
         torn=float(gauge(run.state.position).sum()),

@@ -8,8 +8,8 @@ const CROSS_FLOW = 3;
 /**
  * @typedef {object} Aero
  * @property {number} drag C_D @property {number} friction C_F @property {number} lift C_L
- * @property {number} airDensity [kg/m³] @property {number} law @property {boolean} lifted lift_direction is "lift"
- * @property {boolean} unitTangent @property {boolean} implicit drag_step is "semi_implicit"
+ * @property {number} airDensity [kg/m³] @property {number} law
+ * @property {boolean} implicit drag_step is "semi_implicit"
  * @property {number} maxAreaRatio Infinity for no cap
  */
 
@@ -18,16 +18,11 @@ function terms(/** @type {Aero} */ aero, scale, area, wind, r0, r1, r2, face, ac
   const square = r0 * r0 + r1 * r1 + r2 * r2;
   const speed = Math.sqrt(square);
   const blowing = aero.law === LINEAR ? Math.sqrt(wind[0] * wind[0] + wind[1] * wind[1] + wind[2] * wind[2]) : speed;
-  const rub = aero.friction * (aero.unitTangent ? square : speed);
+  const rub = aero.friction * speed;
   const pushed = aero.law === PAPER ? face : aero.law === CROSS_FLOW ? pressed : across;
   const push = aero.drag * (aero.law === PAPER ? square : aero.law === CROSS_FLOW ? 1 : blowing);
-  let l0 = r1 * face[2] - r2 * face[1], l1 = r2 * face[0] - r0 * face[2], l2 = r0 * face[1] - r1 * face[0];
-  let side = aero.lift * speed;
-  if (aero.lifted) {
-    const s0 = l0, s1 = l1, s2 = l2;
-    l0 = s1 * r2 - s2 * r1, l1 = s2 * r0 - s0 * r2, l2 = s0 * r1 - s1 * r0;
-    side = aero.lift;
-  }
+  const l0 = r1 * face[2] - r2 * face[1], l1 = r2 * face[0] - r0 * face[2], l2 = r0 * face[1] - r1 * face[0];
+  const side = aero.lift * speed;
   out[0] = scale * (push * pushed[0] + rub * tangent[0] + side * l0);
   out[1] = scale * (push * pushed[1] + rub * tangent[1] + side * l1);
   out[2] = scale * (push * pushed[2] + rub * tangent[2] + side * l2);
@@ -64,10 +59,6 @@ export function onPatch(aero, wind, v0, v1, v2, F, patch, at, out) {
   across[0] = along * n0, across[1] = along * n1, across[2] = along * n2;
   tangent[0] = r0 - across[0], tangent[1] = r1 - across[1], tangent[2] = r2 - across[2];
   pressed[0] = along * along * face[0], pressed[1] = along * along * face[1], pressed[2] = along * along * face[2];
-  if (aero.unitTangent) {
-    const size = Math.sqrt(tangent[0] * tangent[0] + tangent[1] * tangent[1] + tangent[2] * tangent[2]) || 1;
-    tangent[0] /= size, tangent[1] /= size, tangent[2] /= size;
-  }
   terms(aero, 0.5 * aero.airDensity * area, area, wind, r0, r1, r2, face, across, pressed, tangent, out);
 }
 
@@ -96,7 +87,7 @@ export function onGroup(aero, wind, v0, v1, v2, F, tensor, at, vectors, first, l
   across[0] = (m0 * w0 + m1 * w1 + m2 * w2) / growth;
   across[1] = (m3 * w0 + m4 * w1 + m5 * w2) / growth;
   across[2] = (m6 * w0 + m7 * w1 + m8 * w2) / growth;
-  let s0 = 0, s1 = 0, s2 = 0, p0 = 0, p1 = 0, p2 = 0, u0 = 0, u1 = 0, u2 = 0;
+  let s0 = 0, s1 = 0, s2 = 0, p0 = 0, p1 = 0, p2 = 0;
   for (let k = 3 * first; k < 3 * last; k += 3) {
     const b0 = vectors[k], b1 = vectors[k + 1], b2 = vectors[k + 2];
     const dot = b0 * w0 + b1 * w1 + b2 * w2;
@@ -105,13 +96,6 @@ export function onGroup(aero, wind, v0, v1, v2, F, tensor, at, vectors, first, l
     if (aero.law === CROSS_FLOW) {
       const flow = (dot * Math.abs(dot)) / (b0 * b0 + b1 * b1 + b2 * b2);
       p0 += flow * b0, p1 += flow * b1, p2 += flow * b2;
-    }
-    if (aero.unitTangent) {
-      const square = b0 * b0 + b1 * b1 + b2 * b2;
-      const along = dot / square;
-      const x0 = w0 - along * b0, x1 = w1 - along * b1, x2 = w2 - along * b2;
-      const size = Math.sqrt(square / (x0 * x0 + x1 * x1 + x2 * x2 || 1));
-      u0 += size * x0, u1 += size * x1, u2 += size * x2;
     }
   }
   face[0] = c0 * s0 + c1 * s1 + c2 * s2;
@@ -123,13 +107,7 @@ export function onGroup(aero, wind, v0, v1, v2, F, tensor, at, vectors, first, l
     pressed[2] = (c6 * p0 + c7 * p1 + c8 * p2) / (growth * growth);
   }
   const whole = growth * rest;
-  if (aero.unitTangent) {
-    tangent[0] = c0 * u0 + c1 * u1 + c2 * u2;
-    tangent[1] = c3 * u0 + c4 * u1 + c5 * u2;
-    tangent[2] = c6 * u0 + c7 * u1 + c8 * u2;
-  } else {
-    tangent[0] = whole * r0 - across[0], tangent[1] = whole * r1 - across[1], tangent[2] = whole * r2 - across[2];
-  }
+  tangent[0] = whole * r0 - across[0], tangent[1] = whole * r1 - across[1], tangent[2] = whole * r2 - across[2];
   const cap = Math.min(aero.maxAreaRatio / growth, 1);
   terms(aero, 0.5 * aero.airDensity * cap, whole * cap, wind, r0, r1, r2, face, across, pressed, tangent, out);
 }

@@ -121,7 +121,7 @@ export class LanesSolver extends Solver {
     const fastest = this.code.particles(
       this.cells, where.starts, where.nodes, where.records, where.vectors, where.displacement, where.velocity, where.force,
       where.speeds, 1 / this.head.dx, stiffness, blown[0], blown[1], blown[2], 0.5 * aero.airDensity, aero.drag, aero.friction,
-      aero.lift, aero.law, aero.lifted, Math.min(aero.maxAreaRatio, 1e30), !idle, looked, pushed,
+      aero.lift, aero.law, Math.min(aero.maxAreaRatio, 1e30), !idle, looked, pushed,
     );
     if (!looked) return;
     this.seen = { time: this.time, stiffness, wave: Math.sqrt(fastest), viscous: 0 };

@@ -188,7 +188,7 @@ function wave(law: f32, lane: i32, mu: f64, lam: f64): f64 {
 /** The force of the wind on the patches of four points, into B0 to B2; see `onGroup` in aero.js. */
 function blow(
   at: usize, vector: usize, count: i32, u0: v128, u1: v128, u2: v128, r0: v128, r1: v128, r2: v128,
-  half: f32, drag: f32, friction: f32, lift: f32, law: i32, lifted: bool, most: f32,
+  half: f32, drag: f32, friction: f32, lift: f32, law: i32, most: f32,
 ): void {
   const t00 = get(at, 7), t01 = get(at, 8), t02 = get(at, 9), t11 = get(at, 10), t12 = get(at, 11), t22 = get(at, 12);
   const rest = add(add(t00, t11), t22);
@@ -227,11 +227,7 @@ function blow(
   push = mul(push, all(drag));
   const rub = mul(speed, all(friction));
   const whole = mul(growth, rest);
-  let l0 = cross(r1, h2, r2, h1), l1 = cross(r2, h0, r0, h2), l2 = cross(r0, h1, r1, h0), side = mul(speed, all(lift));
-  if (lifted) {
-    const x0 = l0, x1 = l1, x2 = l2;
-    l0 = cross(x1, r2, x2, r1), l1 = cross(x2, r0, x0, r2), l2 = cross(x0, r1, x1, r0), side = all(lift);
-  }
+  const l0 = cross(r1, h2, r2, h1), l1 = cross(r2, h0, r0, h2), l2 = cross(r0, h1, r1, h0), side = mul(speed, all(lift));
   const scale = mul(all(half), f32x4.min(mul(all(most), shrunk), all(1)));
   B0 = mul(scale, mad(mad(mul(push, q0), rub, sub(mul(whole, r0), a0)), side, l0));
   B1 = mul(scale, mad(mad(mul(push, q1), rub, sub(mul(whole, r1), a1)), side, l1));
@@ -244,7 +240,7 @@ function blow(
 export function particles(
   cells: i32, cellStart: usize, cellNodes: usize, records: usize, vectors: usize, displacement: usize, velocity: usize, force: usize,
   speeds: usize, inverse: f32, stiffness: f32, wind0: f32, wind1: f32, wind2: f32, half: f32, drag: f32, friction: f32, lift: f32,
-  law: i32, lifted: bool, most: f32, windy: bool, looked: bool, pushed: bool,
+  law: i32, most: f32, windy: bool, looked: bool, pushed: bool,
 ): f64 {
   const u0 = all(wind0), u1 = all(wind1), u2 = all(wind2);
   let fastest: f64 = 0;
@@ -324,7 +320,7 @@ export function particles(
       B0 = all(0), B1 = all(0), B2 = all(0);
       if (blown) {
         const first = vectors + 3 * VECTOR * load<i32>(at + 14 * VECTOR);
-        blow(at, first, count, u0, u1, u2, sub(u0, v0), sub(u1, v1), sub(u2, v2), half, drag, friction, lift, law, lifted, most);
+        blow(at, first, count, u0, u1, u2, sub(u0, v0), sub(u1, v1), sub(u2, v2), half, drag, friction, lift, law, most);
       }
       const b0 = B0, b1 = B1, b2 = B2;
       const wx0 = weight(fx, 0), wx1 = weight(fx, 1), wx2 = weight(fx, 2);

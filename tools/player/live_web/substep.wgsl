@@ -56,14 +56,11 @@ override GRAVITY_Z: f32;
 override DAMPING: f32;
 override VISCOUS: f32;
 override WINDY: bool;
-override GROUPED: bool;
 override DRAG: f32;
 override FRICTION: f32;
 override LIFT: f32;
 override AIR: f32;
 override AERO_LAW: u32;
-override LIFTED: bool;
-override UNIT_TANGENT: bool;
 override IMPLICIT: bool;
 override MOST_AREA: f32;
 override QUICK: f32;
@@ -361,27 +358,16 @@ fn blow(point: Point, F: mat3x3f, moving: vec3f) -> vec4f {
   let across = M * w / growth;
   var s = vec3f();
   var p = vec3f();
-  var u = vec3f();
   for (var k = point.first; k < point.last; k++) {
     let b = vectors[k].xyz;
     let along = dot(b, w);
     let square = dot(b, b);
     s += select(b, -b, along < 0);
     if (AERO_LAW == CROSS_FLOW) { p += (along * abs(along) / square) * b; }
-    if (UNIT_TANGENT && GROUPED) {
-      let x = w - (along / square) * b;
-      let size = dot(x, x);
-      u += sqrt(square / select(size, 1.0, size == 0)) * x;
-    }
   }
   let face = C * s;
   let whole = growth * point.own;
-  var tangent = whole * r - across;
-  if (UNIT_TANGENT && GROUPED) { tangent = C * u; }
-  if (UNIT_TANGENT && !GROUPED) {
-    let size = length(tangent);
-    tangent *= whole / select(size, 1.0, size == 0);
-  }
+  let tangent = whole * r - across;
   let cap = min(MOST_AREA / growth, 1.0);
   let square = dot(r, r);
   let speed = sqrt(square);
@@ -389,10 +375,8 @@ fn blow(point: Point, F: mat3x3f, moving: vec3f) -> vec4f {
   var pushed = (DRAG * blowing) * across;
   if (AERO_LAW == PAPER) { pushed = (DRAG * square) * face; }
   if (AERO_LAW == CROSS_FLOW) { pushed = (DRAG / (growth * growth)) * (C * p); }
-  var side = (LIFT * speed) * cross(r, face);
-  if (LIFTED) { side = LIFT * cross(cross(r, face), r); }
-  let rub = FRICTION * select(speed, square, UNIT_TANGENT);
-  let force = (0.5 * AIR * cap) * (pushed + rub * tangent + side);
+  let side = (LIFT * speed) * cross(r, face);
+  let force = (0.5 * AIR * cap) * (pushed + FRICTION * speed * tangent + side);
   let drag = 0.5 * AIR * whole * cap * (DRAG * blowing + (FRICTION + abs(LIFT)) * speed);
   return vec4f(force, select(0.0, drag, IMPLICIT));
 }
