@@ -1,7 +1,7 @@
 """A splat of your own: ``python examples/own_splat.py my_splat.ply`` looks at it and lets it move in a breeze.
 
-``gaussian-swaying preview`` guesses which way is up, what moves, where it is held and what kind of thing it is, explains
-each guess, and writes a configuration. Without a path, the example makes a flag on its pole as a stand-in for a capture.
+``gaussian-swaying preview`` guesses which way is up, what moves, where it is held and what kind of thing it is,
+explains each guess, and writes a configuration. Without a path, the example makes a flag on its pole instead.
 """
 
 import sys

@@ -24,13 +24,13 @@ from torch import Tensor
 
 from gaussian_swaying._devices import in_double
 from gaussian_swaying.geometry.rotations import rodrigues, rotation_of
+from gaussian_swaying.kernels.launch import replaces
 from gaussian_swaying.mpm.body import Body
 from gaussian_swaying.mpm.boundaries.boundary import Boundary
 from gaussian_swaying.mpm.boundaries.pinned_points import PinnedPoints
 from gaussian_swaying.mpm.boundaries.pinned_region import PinnedRegion
 from gaussian_swaying.mpm.boundaries.rigid_region import RigidRegion
 from gaussian_swaying.mpm.damping import decay_rate
-from gaussian_swaying.kernels.launch import replaces
 from gaussian_swaying.mpm.forces import Force, split, tensors_of
 from gaussian_swaying.mpm.formulations.formulation import Settings
 from gaussian_swaying.mpm.formulations.total import Total
@@ -194,9 +194,7 @@ class Modes(Total):
         mass = self.body.points.mass.detach()[..., None]
         return self.at_sites(mass * values) / self.site_mass[..., None].clamp(min=torch.finfo(mass.dtype).tiny)
 
-    def _kernel(
-        self, state: MPMState, groups: Sequence[Force | None], time: Tensor, dt: float, steps: int
-    ) -> Any:
+    def _kernel(self, state: MPMState, groups: Sequence[Force | None], time: Tensor, dt: float, steps: int) -> Any:
         """The kernel of the forces on the sites, with their numbers; None where torch computes them."""
         twins = [force.twin() for force in groups if force is not None]
         given = [state.position, *tensors_of([force for force in groups if force is not None]), *self.body.tensors()]
