@@ -13,7 +13,7 @@ def site_forces(
     """Forces on sites that turn without strain, as ``Modes._site_state`` places them.
 
     ``moved`` has two columns, for amplitudes and their rates, and in each scene the displacements and then the turns of
-    its sites. ``out`` gets a row of eight for each: the force in the axes of the site, that in space, and its resistance.
+    its sites. ``out`` gets a row of eight for each: the force in the axes of the site, that in space, its resistance.
     """
     index = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
     mask = index < count
@@ -35,11 +35,7 @@ def site_forces(
     )  # fmt: skip
     bend = cross3((x, y, z), shift)
     start = load3(rest, 1, 3 * index, mask)
-    place = (
-        start[0] + shift[0] + 0.5 * bend[0],
-        start[1] + shift[1] + 0.5 * bend[1],
-        start[2] + shift[2] + 0.5 * bend[2],
-    )
+    place = axpy3(1.0, start, 1.0, axpy3(0.5, bend, 1.0, shift))
     force, resistance = twin_forces(
         FORCES, R, matvec(R, speed), place, index, mask, scene, values, count, vectors, scenes, step_offset, numbers
     )
