@@ -88,7 +88,8 @@ def test_scenes_of_a_batch_have_winds_of_their_own(kernel_device):
     end = own.rollout(state, DT, 8, [WindForce(aero, [wind.to(kernel_device) for wind in winds], joined)])
     for k in range(2):
         moved = float((found[k] - both[k][0].position).abs().max())
-        assert float((end.position[k] - found[k]).abs().max()) < 1e-5 * moved
+        assert moved > 1e-3
+        assert float((end.position[k] - found[k]).abs().max()) < 1e-5 * moved + 1.2e-7  # rounding of a place at 1 m
 
 
 def test_a_gradient_runs_in_torch():
