@@ -178,7 +178,7 @@ recorder:
 
 def _wind_words(s: Suggestion) -> str:
     """What wind it has and why."""
-    look, speed = LOOKS[s.look], math.hypot(*s.flow)
+    look, speed = LOOKS[s.look], float(f"{math.hypot(*s.flow):.3g}")  # the flow is rounded
     other = f", at {speed:g} m/s as it was asked for" if abs(speed - look.speed) > 0.01 else ""
     return (
         f"Wind: {s.look} ({look.words}{other}), {speed:g} m/s at the object with turbulence of {look.intensity:.0%}, "
