@@ -306,11 +306,12 @@ class Modes(Total):
             if solve is None:
                 drag, solve = self._drag(resistance, general, gain)
             if general is not None:
-                outer = outer + general[0]
+                outer, load = outer + general[0], load + general[2]
             pulled = outer
             if weighs:
                 assert seen is not None
-                pulled = outer + self._pull(seen.F_total, self.site_mass[..., None] * gravity)
+                weight = self.site_mass[..., None] * gravity
+                pulled, load = outer + self._pull(seen.F_total, weight), load + weight
             free = own[2] * p - back * q + gain * pulled
             new = free if drag is None else free + solve(-0.5 * gain * _product(drag, free - p))
             if drag is not None:
@@ -355,7 +356,7 @@ class Modes(Total):
         return (local.flatten(-2)[..., None, :] @ self.site_shape)[..., 0, :]
 
     def _drag(
-        self, resistance: Tensor | None, general: tuple[Tensor, Tensor | None] | None, gain: Tensor
+        self, resistance: Tensor | None, general: tuple[Tensor, Tensor | None, Tensor] | None, gain: Tensor
     ) -> tuple[Tensor | None, Callable[[Tensor], Tensor]]:
         """Drag of the modes, (..., M, M), and a function that solves with one plus half of the drag times the gain."""
         drag = None
@@ -372,13 +373,13 @@ class Modes(Total):
 
     def _lagging(
         self, state: MPMState, forces: Sequence[Force], groups: Sequence[Force | None]
-    ) -> Callable[[Tensor, Tensor, Tensor], tuple[Tensor, Tensor | None]] | None:
-        """Loads on the modes, and their drag, of forces that need all points; None if there are none."""
+    ) -> Callable[[Tensor, Tensor, Tensor], tuple[Tensor, Tensor | None, Tensor]] | None:
+        """Loads on the modes, their drag, and loads on the sites, of forces that need all points; None without any."""
         others = [force for force, group in zip(forces, groups, strict=True) if group is None]
         if not others:
             return None
 
-        def at(q: Tensor, p: Tensor, time: Tensor) -> tuple[Tensor, Tensor | None]:
+        def at(q: Tensor, p: Tensor, time: Tensor) -> tuple[Tensor, Tensor | None, Tensor]:
             now = self.shown(state.replace(time=time), q, p)
             turn = self._everywhere(_vectors(self.turn, q[..., None])[..., 0])
             load, drag = None, None
@@ -390,10 +391,10 @@ class Modes(Total):
             assert load is not None
             pulled = self._project(_turned(rotation_of(-turn), scatter(self.stencil, load[..., None, :])))
             if drag is None:
-                return pulled, None
+                return pulled, None, self.at_sites(load)
             lumped = scatter(self.stencil, drag[..., None, None])[..., 0].gather(-1, self.node)
             lumped = lumped.repeat_interleave(3, -1)[..., None]
-            return pulled, self.shape.mT @ (lumped * self.shape)
+            return pulled, self.shape.mT @ (lumped * self.shape), self.at_sites(load)
 
         return at
 

@@ -1,0 +1,355 @@
+"""The `modes` formulation against `total`, exact energies, and what it refuses.
+
+Covers: mpm.formulations.modes.
+"""
+
+import math
+
+import pytest
+import torch
+from small_scenes import plain_cloud
+
+from gaussian_swaying.aero.force import AeroForce
+from gaussian_swaying.aero.wind import WindField
+from gaussian_swaying.aero.wind_force import WindForce
+from gaussian_swaying.geometry.regions import Box
+from gaussian_swaying.geometry.rotations import rotation_of
+from gaussian_swaying.mpm.boundaries.pinned_region import PinnedRegion
+from gaussian_swaying.mpm.damping import decay_rate
+from gaussian_swaying.mpm.forces import Force
+from gaussian_swaying.mpm.formulations.modes import LONGEST, SHORTEST, Modes, warped
+from gaussian_swaying.mpm.laws.sand import Sand
+from gaussian_swaying.mpm.solver import MPMSolver
+from gaussian_swaying.mpm.state import MaterialPoints
+
+FOOT = Box([None] * 3, [None, None, 0.1])
+POINTS = 320
+
+
+@pytest.fixture(autouse=True, scope="module")
+def cache(tmp_path_factory):
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("GAUSSIAN_SWAYING_CACHE", str(tmp_path_factory.mktemp("cache")))
+        yield
+
+
+def post(E=1e6, density=100.0, ratio=0.0, law=None, **more):
+    """A square post of 1 m, four points and two cells wide."""
+    axes = [(torch.arange(n, dtype=torch.float64) + 0.5) * 0.05 for n in (4, 4, 20)]
+    damping = decay_rate(ratio, 1.0) if ratio else None
+    return MaterialPoints.create(
+        torch.cartesian_prod(*axes), volume=0.05**3, density=density, youngs_modulus=E, poisson_ratio=0.3, law=law,
+        damping=damping, **more,
+    )  # fmt: skip
+
+
+def solver_of(formulation="modes", pins=None, **more):
+    pins = [PinnedRegion(FOOT, kind="nodes")] if pins is None else pins
+    return MPMSolver(0.1, formulation, **{"gravity": (0, 0, 0), "boundaries": pins, "transfer": "torch"} | more)
+
+
+def wind(speed=8.0, drag=1.0, points=POINTS):
+    """On one patch along x for each point, 0.2 m² in all."""
+    normal = torch.zeros(points, 3, dtype=torch.float64)
+    normal[:, 0] = 1.0
+    area = torch.full((points,), 0.2 / points, dtype=torch.float64)
+    aero = AeroForce(law="projected", C_D=drag, C_F=0.0, C_L=0.0, drag_step="semi_implicit")
+    return WindForce(aero, WindField(torch.as_tensor([1.0, 0.0, 0.0], dtype=torch.float64) * speed), normal, area)
+
+
+def run(solver, state, force=None, frames=1, seconds=0.04):
+    for _ in range(frames):
+        steps = solver.substeps(state, seconds)
+        state = solver.rollout(state, seconds / steps, steps, force)
+    return state
+
+
+def pulled(solver, points, size, frames=0):
+    """The state after a push along x at time zero."""
+    velocity = torch.zeros_like(points.position)
+    velocity[:, 0] = size * points.position[:, 2] ** 2
+    return run(solver, solver.init_state(points, velocity), frames=frames)
+
+
+def energy(solver, state):
+    found = solver.energies(state)
+    return found["kinetic"] + found["elastic"]
+
+
+# ---- against total
+
+
+@pytest.mark.parametrize(("speed", "lean", "error"), [(7.5, 0.08, 0.03), (15.0, 0.3, 0.10)])
+def test_it_leans_as_total_does(speed, lean, error):
+    """The mean state in a steady wind: modes are linear and warped, so the error grows with the square of the lean."""
+    points, moved = post(E=7e4, ratio=0.5), []
+    for formulation in ("modes", "total"):
+        solver = solver_of(formulation)
+        state = run(solver, solver.init_state(points), wind(speed, 1.2), frames=60)  # what swings is below e^-10
+        moved.append(state.position - points.position)
+    top = points.position[:, 2] > 0.95
+    assert float(moved[1][top].mean(0).norm()) == pytest.approx(lean, rel=0.2)
+    apart = (moved[0] - moved[1]).norm(dim=-1)
+    assert float(apart.max()) < error * float(moved[1].norm(dim=-1).max())
+
+
+# ---- energy and damping
+
+
+def test_energy_is_constant_in_still_air():
+    """Each mode is stepped exactly, so what is left is rounding: some 1e-16 for each of 1500 substeps."""
+    points, solver = post(), solver_of()
+    state = pulled(solver, points, 1.0)
+    first = energy(solver, state)
+    assert float(first) > 0
+    for _ in range(10):
+        state = run(solver, state, frames=10)
+        torch.testing.assert_close(energy(solver, state), first, rtol=1e-12, atol=0)
+    assert float(state.work) == 0
+
+
+def test_the_work_of_a_force_is_the_gain_of_energy():
+    class Push(Force):
+        def forward(self, state):
+            return state.position.new_tensor([0.02, 0.01, 0.0]).expand_as(state.position)
+
+        def on_sites(self, site, count):
+            weight = torch.zeros(count, dtype=torch.float64).index_add_(0, site, torch.ones_like(site).double())
+
+            class Summed(Force):
+                def forward(self, state):
+                    return weight[:, None] * state.position.new_tensor([0.02, 0.01, 0.0])
+
+            return Summed()
+
+    for force in (Push(), Push().forward):  # as groups, and as a function that sees all points
+        points, solver = post(E=1e5), solver_of()
+        state = solver.init_state(points)
+        state = run(solver, state, force, frames=25)
+        gain = energy(solver, state)
+        assert float(gain) > 1e-4
+        # the load is that of the middle of a substep, and is constant in it: no error
+        assert float(state.work) == pytest.approx(float(gain), rel=1e-10)
+
+
+def free_decay(solver, points):
+    """Damping ratio of the mode of the lean by its energy, as its amplitude is known at any time."""
+    state = pulled(solver, points, 0.1)
+    bound = solver.bound
+    own = int((bound.square.sqrt() - bound.first).abs().argmin())
+    q, p = (torch.zeros_like(x) for x in bound.amplitudes(state))
+    q[own] = 1e-3
+    state = bound.shown(state, q, p)
+    seconds = 0.04 * 50
+    state = run(solver, state, frames=50)
+    q, p = bound.amplitudes(state)
+    omega = float(bound.square[own].sqrt())
+    return own, omega, seconds, float(q[own]), float(p[own])
+
+
+@pytest.mark.parametrize(
+    ("ratio", "rate", "stiff"), [(0.03, 0.0, 0.0), (0.0, 0.4, 0.0), (0.0, 0.0, 2e-3), (0.03, 0.4, 2e-3)]
+)
+def test_a_free_decay_has_the_ratio_of_the_material_and_of_the_solver(ratio, rate, stiff):
+    """The closed form q = e^(-zeta w t) (cos(w_d t) + zeta w / w_d sin(w_d t)), to rounding."""
+    solver = solver_of(damping=rate, stiffness_damping=stiff)
+    own, omega, seconds, q, p = free_decay(solver, post(ratio=ratio))
+    zeta = ratio + rate / (2 * omega) + stiff * omega / 2
+    assert float(solver.bound.ratio[own]) == pytest.approx(zeta, rel=1e-6)  # the mass of float64 shares
+    damped = omega * math.sqrt(1 - zeta**2)
+    decay = math.exp(-zeta * omega * seconds)
+    exact = 1e-3 * decay * (math.cos(damped * seconds) + zeta * omega / damped * math.sin(damped * seconds))
+    assert q == pytest.approx(exact, abs=1e-3 * 1e-6)
+    assert p == pytest.approx(-1e-3 * decay * omega**2 / damped * math.sin(damped * seconds), abs=1e-3 * omega * 1e-6)
+
+
+@pytest.mark.parametrize("weight", [(0.0, 0.0, 0.0), (0.0, 0.0, -9.8)])
+def test_the_support_takes_the_load_in_balance(weight):
+    """The impulse of the pin in a second of rest is the load, but for what acts next to the pin.
+
+    It would be carried by modes that are stiffer than those that are kept: those of two cells of ten above the pin,
+    with a half of the load of the first.
+    """
+    load = torch.tensor([2.0, 0.5, 0.0], dtype=torch.float64)
+    points, solver = post(E=1e7, ratio=0.9), solver_of(gravity=weight)
+
+    def force(state):
+        return (load / POINTS).expand_as(state.position)
+
+    state = run(solver, solver.init_state(points), force, frames=50)
+    later = run(solver, state, force, frames=25)
+    taken = (later.impulse - state.impulse).reshape(-1, 3).sum(0)
+    load = load + points.mass.sum() * torch.tensor(weight, dtype=torch.float64)
+    assert float((taken - load).norm()) < 0.12 * float(load.norm())
+
+
+# ---- warping
+
+
+def test_a_rigid_turn_is_exact():
+    """d = w x r, integrated along the turn, is R(w) r - r."""
+    w = torch.tensor([[0.3, -0.2, 0.9], [0.0, 0.0, 1e-4], [2.0, 0.0, 0.0]], dtype=torch.float64)
+    r = torch.randn(3, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    found = warped(w, torch.linalg.cross(w, r))
+    exact = (rotation_of(w) @ r[..., None])[..., 0] - r
+    torch.testing.assert_close(found, exact, rtol=1e-9, atol=1e-13)
+    torch.testing.assert_close(warped(0 * w, r), r, rtol=0, atol=0)
+
+
+# ---- batches and gradients
+
+
+def test_a_batch_is_its_scenes():
+    points = [post(E=1e5), post(E=3e5, density=150.0)]
+    fields = ("youngs_modulus", "mass")
+    both = MaterialPoints.create(
+        torch.stack([one.position for one in points]), volume=0.05**3,
+        density=torch.stack([one.mass / 0.05**3 for one in points]),
+        youngs_modulus=torch.stack([one.youngs_modulus for one in points]), poisson_ratio=0.3,
+    )  # fmt: skip
+    assert all(torch.equal(getattr(both, name)[0], getattr(points[0], name)) for name in fields)
+    one = wind(6.0)
+    twice = WindForce(one.aero, one.wind, one.normal.expand(2, POINTS, 3), one.area.expand(2, POINTS))
+    solver = solver_of()
+    together = solver.init_state(both)
+    together = solver.rollout(together, 0.01, 40, twice)
+    for k in range(2):
+        alone = solver_of()
+        state = alone.rollout(alone.init_state(points[k]), 0.01, 40, wind(6.0))
+        torch.testing.assert_close(together.position[k], state.position, rtol=1e-9, atol=1e-12)
+        torch.testing.assert_close(together.work[k], state.work, rtol=1e-9, atol=1e-12)
+
+
+@pytest.mark.parametrize("name", ["flow", "E", "C_D", "density"])
+def test_gradients_are_those_of_differences(name):
+    """Of the place of the top after half a second; the shapes of the modes do not change with a factor of E or mass."""
+
+    def top(value):
+        numbers = {"flow": 6.0, "E": 1e5, "C_D": 1.0, "density": 100.0} | {name: value}
+        points = post(E=numbers["E"], density=numbers["density"])
+        force = wind(numbers["flow"], numbers["C_D"])
+        solver = solver_of()
+        state = solver.rollout(solver.init_state(points), 0.01, 50, force)
+        return state.position[points.position[:, 2] > 0.95, 0].mean()
+
+    first = {"flow": 6.0, "E": 1e5, "C_D": 1.0, "density": 100.0}[name]
+    value = torch.tensor(first, dtype=torch.float64, requires_grad=True)
+    (slope,) = torch.autograd.grad(top(value), value)
+    step = 1e-4 * first
+    with torch.no_grad():
+        after, before = (top(torch.tensor(first + sign * step, dtype=torch.float64)) for sign in (1, -1))
+    expected = (after - before) / (2 * step)  # its error is some (step / first)² = 1e-8
+    assert abs(float(expected)) > 0
+    assert float(slope) == pytest.approx(float(expected), rel=1e-6)
+
+
+# ---- in a simulation
+
+
+def swaying(make_simulation):
+    """A slab of 0.2 m, four points thick."""
+    axes = [(torch.arange(n) + 0.5) * 0.05 for n in (16, 4, 12)]
+    cloud = plain_cloud(torch.cartesian_prod(*axes), -3.5, logit=3.0)
+    scene = {"metres_per_unit": 1.0, "opacity_threshold": 0.0}
+    return make_simulation(cloud, scene=scene, formulation="modes", gravity=(0, 0, 0), dx=0.1)
+
+
+def test_a_run_that_goes_on_is_the_same_to_the_bit(make_simulation, tmp_path):
+    def made():
+        return swaying(make_simulation)
+
+    whole = [frame.state for frame in made().frames(7)]
+    simulation = made()
+    state = simulation.start()
+    for _ in range(3):
+        state, _ = simulation.advance(state)
+    kept = {name: getattr(state, name) for name in state.__dataclass_fields__}
+    torch.save({name: value for name, value in kept.items() if isinstance(value, torch.Tensor)}, tmp_path / "s.pt")
+    saved = torch.load(tmp_path / "s.pt")
+    assert "modal" in saved
+    again = made()
+    state = again.start().replace(**saved)
+    for _ in range(3):
+        state, _ = again.advance(state)
+    assert torch.equal(state.modal, whole[6].modal)
+    assert torch.equal(state.position, whole[6].position)
+
+
+def test_a_change_keeps_the_motion_continuous(make_simulation):
+    """Of the stiffness, the damping and the wind: the next frame goes on from where it is."""
+    simulation = swaying(make_simulation)
+    state = simulation.start()
+    for _ in range(10):
+        state, _ = simulation.advance(state)
+    for values in ({"material.E": 9e3}, {"solver.damping": 3.0}, {"wind.speed": 1.0}):
+        before = state
+        state = simulation.change(state, values)
+        q, p = simulation.solver.bound.amplitudes(state)
+        shown = simulation.solver.bound.shown(state, q, p)
+        torch.testing.assert_close(shown.position, before.position, rtol=1e-5, atol=1e-6)
+        torch.testing.assert_close(shown.velocity, before.velocity, rtol=1e-4, atol=1e-5)
+        state, _ = simulation.advance(state)
+        moved = (state.position - before.position).norm(dim=-1).max()
+        assert float(moved) < 0.04 * 3 * float(before.velocity.norm(dim=-1).max()) + 0.01
+
+
+def test_another_pin_keeps_what_of_the_motion_its_modes_can_show():
+    points, solver = post(E=1e5), solver_of()
+    state = run(solver, pulled(solver, points, 0.5), frames=5)
+    wider = solver_of(pins=[PinnedRegion(Box([None] * 3, [None, None, 0.2]))])
+    start = wider.init_state(points)
+    after = wider.continued(solver, state, start)
+    top = points.position[:, 2] > 0.95
+    moved, kept = (s.position[top] - points.position[top] for s in (state, after))
+    assert float(moved[:, 0].mean()) > 0.005
+    assert float((kept - moved).norm(dim=-1).mean()) < 0.3 * float(moved.norm(dim=-1).mean())
+    assert float(after.time) == float(state.time)
+
+
+# ---- limits
+
+
+def test_a_frame_has_from_four_to_sixteen_substeps():
+    for stiffness, expected in ((1e2, 4), (1e4, 4), (2e6, None), (1e9, 16)):
+        solver = solver_of()
+        state = solver.init_state(post(E=stiffness))
+        steps = solver.substeps(state, 0.04)
+        wanted = 2 * math.pi / solver.bound.first / 20
+        assert steps == math.ceil(0.04 / min(max(wanted, SHORTEST), LONGEST) - 1e-9)
+        assert expected is None or steps == expected
+        assert 4 <= steps <= 16
+        assert solver.bound.stable_substep(state) == math.inf
+
+
+def test_any_force_acts():
+    """A function of the state, and a force with a drag, whose work is what the motion loses."""
+    points, solver = post(E=1e5), solver_of()
+    state = solver.rollout(solver.init_state(points), 0.01, 30, lambda s: torch.full_like(s.position, 0.01))
+    assert bool((state.position - points.position)[-1, :2].gt(0.001).all())
+
+    def brake(now):
+        return -0.5 * now.velocity, torch.full_like(now.position[..., 0], 0.5)
+
+    moving = pulled(solver, points, 1.0)
+    first = energy(solver, moving)
+    after = solver.rollout(moving, 0.01, 100, brake)
+    assert float(energy(solver, after)) < 0.01 * float(first)
+    assert float(after.work) == pytest.approx(float(energy(solver, after) - first), rel=0.02)
+
+
+@pytest.mark.parametrize(
+    ("points", "pins", "words"),
+    [
+        ({}, [], "nothing holds it: pin a part of it, or set it to total"),
+        ({"law": Sand()}, None, "the law Sand flows: set it to updated"),
+        ({"normal": torch.tensor([0.0, 1.0, 0.0]).double().expand(POINTS, 3), "bending": 1e-6}, None,
+         "`material.bending` makes it a sheet, which folds: set it to total"),
+        ({}, [PinnedRegion(FOOT, end=2.0)], "does not hold it all the time: set it to total"),
+    ],
+)  # fmt: skip
+def test_what_modes_cannot_do_is_refused(points, pins, words):
+    with pytest.raises(ValueError, match=r"`solver.formulation: modes` is for a held body") as error:
+        solver_of(pins=pins).init_state(post(**points))
+    assert words in str(error.value)
+    assert isinstance(solver_of("total"), MPMSolver)
+    assert Modes.name == "modes"

@@ -1,0 +1,177 @@
+"""The starter sways as it announces: first frequency, mean lean, mass and drag; and what is rigid stands still."""
+
+import dataclasses
+import math
+
+import pytest
+import torch
+import yaml
+from small_scenes import plain_cloud
+
+from gaussian_swaying.cli.preview import build_options, preview_scene
+from gaussian_swaying.evaluation.sway import natural_frequency, sway_score
+from gaussian_swaying.gaussians.harmonics import SH_DC
+from gaussian_swaying.gaussians.ply import write_ply
+from gaussian_swaying.preview.kinds import KINDS
+from gaussian_swaying.preview.natural import cloth_start, silhouette
+from gaussian_swaying.scenes.procedural import FlagScene
+from gaussian_swaying.simulation.simulation import Simulation
+
+GREEN, GREY = (0.2, 0.5, 0.15), (0.5, 0.5, 0.5)
+
+
+@pytest.fixture(autouse=True)
+def _few_frames(monkeypatch):
+    monkeypatch.setattr("gaussian_swaying.preview.cost.MOST_FRAMES", 2)
+
+
+def block(sides, color, count=3000):
+    """The six faces of a box, seen from outside."""
+    draw = torch.Generator().manual_seed(0)
+    low, high = torch.zeros(3), torch.tensor(sides)
+    place = low + (high - low) * torch.rand(count, 3, generator=draw)
+    face = torch.randint(6, (count,), generator=draw)
+    for k in range(6):
+        place[face == k, k // 2] = (low if k % 2 else high)[k // 2]
+    cloud = plain_cloud(place + torch.tensor([3.0, 4.0, 0.0]), -4.0, logit=3.0)
+    sh = ((torch.tensor(color) - 0.5) / SH_DC).expand(count, 3)
+    return dataclasses.replace(cloud, sh=sh[:, None])
+
+
+def previewed(cloud, folder, *options):
+    write_ply(folder / "it.ply", cloud)
+    given = [str(folder / "it.ply"), "--up", "+z", "--device", "cpu", "--quality", "draft", "--height", "96", *options]
+    preview = preview_scene(build_options().parse_args(given), folder)
+    (folder / "starter.yaml").write_text(preview.configurations["starter"])
+    return preview, Simulation.from_yaml(folder / "starter.yaml", device="cpu")
+
+
+def words(preview):
+    """The comments at the top of the starter, without their line breaks."""
+    return preview.configurations["starter"].split("frames:")[0].replace("\n# ", " ")
+
+
+def moved(simulation, state, frames):
+    rest, found = simulation.scene.points.position, [state.position]
+    for _ in range(frames):
+        state, _ = simulation.advance(state)
+        found.append(state.position)
+    return torch.stack(found) - rest, torch.arange(frames + 1) * simulation.frame_dt
+
+
+@pytest.fixture(scope="module")
+def shrub(tmp_path_factory):
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("gaussian_swaying.preview.cost.MOST_FRAMES", 2)
+        folder = tmp_path_factory.mktemp("shrub")
+        return previewed(block([0.5, 0.4, 1.0], GREEN), folder, "--hold", "bottom", "--kind", "shrub")
+
+
+def test_it_has_the_frequency_and_mass_that_it_announces(shrub):
+    """In a free decay from its lean; 15 %, as further modes move with the first, and the air is carried along."""
+    preview, simulation = shrub
+    told = preview.data["suggestion"]["natural"]
+    height = told["length_m"]
+    assert height == pytest.approx(1.2 - 0.2, rel=0.05)  # of 1.2 m, without what is held: two cells and a half
+    assert told["frequency_Hz"] == pytest.approx(KINDS["shrub"].frequency / math.sqrt(height))
+    assert told["mass_kg"] == pytest.approx(KINDS["shrub"].mass * told["silhouette_m2"])
+    state = simulation.start()
+    bound = simulation.solver.bound
+    assert bound.first / (2 * math.pi) == pytest.approx(told["frequency_Hz"], rel=0.05)  # after another analysis
+    q, p = bound.amplitudes(state)
+    own = int((bound.square.sqrt() - bound.first).abs().argmin())
+    q = q.clone()
+    q[own] = 0.02
+    simulation.change(state, {"wind.speed": 0.0})
+    line, times = moved(simulation, bound.shown(state, q, p), 200)
+    frequency, ratio = natural_frequency(line.double(), times)
+    assert frequency == pytest.approx(told["frequency_Hz"], rel=0.15)
+    assert ratio > 0.8 * KINDS["shrub"].damping_ratio
+
+
+def test_it_leans_as_it_announces(shrub):
+    """Over eight seconds after two, in its own wind; 25 %, as the stretch is typical to some 15 %."""
+    preview, _ = shrub
+    given = yaml.safe_load(preview.configurations["starter"])
+    told = preview.data["suggestion"]["natural"]
+    simulation = Simulation.from_settings(*_settings(preview))
+    line, times = moved(simulation, simulation.start(), 250)
+    score = sway_score(simulation.scene.points.position, line, times)
+    assert score.lean == pytest.approx(told["lean"], rel=0.25)
+    assert 0.05 < score.ratio < 1.0
+    assert given["solver"]["formulation"] == "modes"
+
+
+def _settings(preview):
+    from gaussian_swaying.config.parser import parse_text
+
+    parser = Simulation.parser()
+    return parser, parse_text(parser, preview.configurations["starter"], ["--device", "cpu"])
+
+
+def test_what_is_rigid_stands_still_in_a_storm(tmp_path):
+    """By less than a thousandth of its size; and the report says so."""
+    preview, simulation = previewed(
+        block([0.3, 0.25, 0.7], GREY, 1500), tmp_path, "--hold", "bottom", "--look", "storm"
+    )
+    told = preview.data["suggestion"]
+    assert told["kind"]["name"] == "rigid"
+    assert told["natural"]["lean"] < 1e-3
+    assert "there is little to sway" in preview.report
+    text = preview.configurations["starter"]
+    assert text.startswith("# Wind: storm (whole trees move), 15 m/s at the object with turbulence of 22%")
+    assert "There is little to sway." in words(preview)
+    line, _ = moved(simulation, simulation.start(), 25)
+    assert 0 < float(line.norm(dim=-1).max()) < 1e-3 * simulation.scene.size * simulation.scene.frame.metres_per_unit
+
+
+def test_kind_look_and_speed_are_those_of_the_options(tmp_path):
+    cloud = block([0.5, 0.4, 0.7], GREY, 1500)
+    preview, simulation = previewed(
+        cloud, tmp_path, "--hold", "bottom", "--look", "gusts", "--wind", "5", "--kind", "shrub"
+    )
+    text = preview.configurations["starter"]
+    assert text.startswith("# Wind: gusts (small branches and small trees move, at 5 m/s as it was asked for), 5 m/s")
+    assert "It is taken for a shrub: given. First frequency in still air" in words(preview)
+    assert float(simulation.wind.flows[0].norm()) == pytest.approx(5.0, abs=0.01)
+    assert simulation.wind.effects[0].intensity == 0.25
+    assert preview.data["suggestion"]["kind"] == {"name": "shrub", "reason": "given"}
+    assert "little to sway" not in preview.report
+    assert set(preview.configurations) == {"starter"}
+
+
+def test_still_air_has_numbers_too(tmp_path):
+    """Mass and drag of the kind, for a wind that is turned on later."""
+    preview, simulation = previewed(block([0.5, 0.4, 1.0], GREEN, 1500), tmp_path, "--hold", "bottom", "--wind", "0")
+    told = preview.data["suggestion"]["natural"]
+    assert told["lean"] == 0
+    assert told["mass_kg"] == pytest.approx(KINDS["shrub"].mass * told["silhouette_m2"])
+    assert 0.1 < told["silhouette_m2"] < 1.0
+    assert 0.01 < float(simulation.aero.C_D) < 100
+
+
+def test_a_cloth_begins_at_a_typical_stretch(tmp_path):
+    """And its numbers are those of fabric, not of a frequency."""
+    preview, simulation = previewed(FlagScene(spacing=0.1).generate(), tmp_path, "--hold=-x")
+    told = preview.data["suggestion"]
+    assert told["kind"]["name"] == "flag"
+    assert told["natural"] is None
+    assert told["formulation"] == "total"
+    start = simulation.wind.effects[0].start
+    speed = float(simulation.wind.flows[0].norm())
+    found = cloth_start(simulation, KINDS["flag"], told["size_m"])
+    assert found > 0
+    assert float(start.norm()) > 10 * speed / 2  # some of the long record went before
+    assert float(torch.linalg.cross(start, simulation.wind.flows[0].double()).norm()) < 1e-2 * float(start.norm())
+
+
+@pytest.mark.parametrize("turn", [0.0, 0.6])
+def test_the_silhouette_of_a_square_is_its_area(turn):
+    """Seen at an angle, it is narrower; 5 %, as cells at its edge count whole."""
+    side = (torch.arange(60) + 0.5) / 60
+    y, z = (x.flatten() for x in torch.meshgrid(side, side, indexing="ij"))
+    plate = torch.stack([torch.zeros_like(y), y, z], -1)
+    flow = torch.tensor([math.cos(turn), math.sin(turn), 0.0])
+    assert silhouette(plate, flow) == pytest.approx(math.cos(turn), rel=0.05)
+    twice = torch.cat([plate, plate + torch.tensor([0.5, 0.0, 0.0])])
+    assert silhouette(twice, torch.tensor([2.0, 0.0, 0.0])) == pytest.approx(1.0, rel=0.05)  # one hides the other
