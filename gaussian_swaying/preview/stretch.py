@@ -21,7 +21,7 @@ PLACES = 24  # at which the wind is taken
 SKIPPED, SHORTEST, PERIODS = 2.0, 10.0, 10.0  # s at the start; s, and periods, of a stretch
 RINGING = 12  # modes whose motion before the start is taken off
 STEP, COMPARED = 0.24, 1500  # s between stretches; those with the best means whose fluctuation is compared
-DRIFT, OFF = 0.01, 0.1  # small differences of the halves, and from the record, over the mean
+DRIFT, OFF = 0.01, 0.03  # small differences of the halves, and from the record, over the mean
 RESTLESS = 0.65  # fluctuation over the mean, at most
 LEAD = 2.5  # power at the frequency over that below, at least
 SHARE = (0.2, 0.65)  # share of the power near the frequency
@@ -66,7 +66,7 @@ def typical_start(motion: Motion, frequency: float) -> float:
         part = (moved[k : k + length] - ringing(k, length))[skipped:]
         apart = np.linalg.norm(part[:half].mean(0) - part[half:].mean(0)) / DRIFT
         away = np.linalg.norm(part.mean(0) - whole.mean(0)) / OFF
-        restless = max(float(np.linalg.norm(part.std(0))) / mean - RESTLESS, 0.0) / 0.05
+        restless = max(float(np.linalg.norm(part.std(0))) / mean - RESTLESS, 0.0) / 0.1
         faults.append((apart + away) / mean + restless + _fault(part, spread, frequency / rate))
     return float(chosen[int(np.argmin(faults))] / rate)
 
@@ -178,7 +178,7 @@ def _fault(part: np.ndarray, spread: float, frequency: float) -> float:
     lead = power[own].max() / max(power[below].max(initial=0.0), 1e-300)
     share = power[(f > 2 / 3) & (f < 4 / 3)].sum() / power.sum()
     tonal = max(share - SHARE[1], SHARE[0] - share, 0.0)
-    return uneven / 0.2 + (narrow + tonal) / 0.05 + max(np.log(LEAD / lead), 0.0) / 0.1
+    return uneven / 0.2 + (narrow + tonal) / 0.1 + max(np.log(LEAD / lead), 0.0) / 0.1
 
 
 __all__ = ["Motion", "cloth_motion", "linear_motion", "rate_for", "typical_start"]
