@@ -411,7 +411,8 @@ class MPMState(State):
         grid: The nodes in use.
         node_displacement: Nodal displacement [m], shape (..., G, 3), or None.
         node_velocity: Nodal velocity [m/s], shape (..., G, 3), or None.
-        modal: Amplitudes of the modes and their rates, shape (..., 2, M), in the ``modes`` formulation; or None.
+        modal: Amplitudes of the modes of a body of 1 kg and their rates, shape (..., 2, M), in the ``modes``
+            formulation; or None.
     """
 
     affine: Tensor

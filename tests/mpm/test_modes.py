@@ -353,3 +353,14 @@ def test_what_modes_cannot_do_is_refused(points, pins, words):
     assert words in str(error.value)
     assert isinstance(solver_of("total"), MPMSolver)
     assert Modes.name == "modes"
+
+
+def test_another_density_keeps_the_place():
+    """The state has the amplitudes of 1 kg, so that a live change of the mass does not make the motion jump."""
+    first, second = solver_of(), solver_of()
+    state = run(first, first.init_state(post()), wind(points=POINTS), frames=10)
+    second.init_state(post(density=200.0))
+    moved = second.bound.shown(state, *second.bound.amplitudes(state))
+    assert float((state.position - post().position).abs().max()) > 1e-3
+    assert torch.allclose(moved.position, state.position, rtol=0, atol=1e-12)
+    assert torch.allclose(moved.velocity, state.velocity, rtol=0, atol=1e-12)

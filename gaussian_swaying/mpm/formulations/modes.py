@@ -83,6 +83,7 @@ class Modes(Total):
 
         mass = points.mass.detach().sum(-1)
         norm = mass.rsqrt()[..., None, None]
+        self._norm = norm  # of the state, whose amplitudes stay where they are if the mass changes
         # all scenes have the nodes of the one with most; those that fill up are the first node, with a shape of zero
         most = max(len(one.node) for one in found)
         nodes = torch.stack(
@@ -236,7 +237,7 @@ class Modes(Total):
         turn = _vectors(self.turn, q[..., None])[..., 0]
         moved = torch.cat([warped(turn, shift[..., 0]), _turned(rotation_of(turn), shift[..., 1])], -1)
         displacement, velocity = self._everywhere(moved).split(3, -1)
-        state = state.replace(modal=torch.stack([q, p], -2))
+        state = state.replace(modal=self._norm * torch.stack([q, p], -2))
         return self.in_shape(self.read_particles(state, displacement.contiguous(), velocity.contiguous()))
 
     def _everywhere(self, values: Tensor) -> Tensor:
@@ -253,7 +254,8 @@ class Modes(Total):
     def amplitudes(self, state: MPMState) -> tuple[Tensor, Tensor]:
         """Amplitudes [m sqrt(kg)] and their rates, shape (..., M) each; those of another solver are projected."""
         if state.modal is not None and state.modal.shape[-1] == self.shape.shape[-1]:
-            return state.modal[..., 0, :], state.modal[..., 1, :]
+            own = state.modal / self._norm
+            return own[..., 0, :], own[..., 1, :]
         assert state.node_displacement is not None
         assert state.node_velocity is not None
         mass = self.node_mass[..., None]
