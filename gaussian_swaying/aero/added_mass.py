@@ -52,7 +52,7 @@ class AirLift(Force):
 
     Example:
         >>> AirLift(torch.tensor([0.5]), [0.0, 0.0, -10.0]).force
-        tensor([[0., 0., 5.]])
+        tensor([[-0., -0., 5.]])
     """
 
     recordable = True

@@ -8,9 +8,9 @@ from typing import TYPE_CHECKING, Any, Literal
 
 import torch
 
-from gaussian_swaying._checks import VectorLike, check_vector
+from gaussian_swaying._checks import VectorLike, check_choice, check_vector
 from gaussian_swaying.aero.force import AeroForce
-from gaussian_swaying.aero.looks import look
+from gaussian_swaying.aero.looks import LOOKS, look
 from gaussian_swaying.aero.wind import SpatialWind, WindField, flow_rows
 from gaussian_swaying.captures.capture_camera import CaptureCamera, photo_azimuth, read_views
 from gaussian_swaying.gaussians.cloud import GaussianCloud
@@ -139,6 +139,7 @@ def as_wind(wind: WindLike | None, frame: SimFrame) -> WindField | SpatialWind:
     if isinstance(wind, SpatialWind):
         return wind
     if isinstance(wind, str):
+        check_choice("wind", wind, tuple(LOOKS))
         return look(wind).in_frame(frame)
     return WindField() if wind is None else WindField(flow_rows("wind", [wind])[0])
 

@@ -424,7 +424,7 @@ def test_module_moves_its_material(dtype):
     ("arguments", "message"),
     [
         ({"dx": 0.0}, "`dx` to be positive"),
-        ({"formulation": "lagrange"}, "`formulation` to be one of total, updated"),
+        ({"formulation": "lagrange"}, "`formulation` to be one of modes, total, updated"),
         ({"gravity": (0, 0)}, "`gravity` to have 3 numbers, but got 2"),
         ({"damping": -1.0}, "`damping` to not be negative"),
         ({"cfl": 0.0}, "`cfl` to be positive"),

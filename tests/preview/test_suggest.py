@@ -45,7 +45,7 @@ from gaussian_swaying.preview.suggest import (
     suggest_threshold,
     visible_weight,
 )
-from gaussian_swaying.preview.up import CONVENTION, floor_mask, guess_up
+from gaussian_swaying.preview.up import floor_mask, guess_up
 from gaussian_swaying.scenes.leaves import LeavesScene
 from gaussian_swaying.scenes.procedural import FlagScene
 from gaussian_swaying.simulation.extent import suggest_spacing
@@ -378,8 +378,6 @@ def test_specks_beyond_the_boxes_follow_their_neighbours(make_scene):
 def test_page_states_the_numbers_of_the_rules():
     page = (Path(__file__).parents[2] / "docs/own_scene.md").read_text(encoding="utf-8")
     for text in (
-        f"z up (Blender), y down (COLMAP) | {CONVENTION['+z']:g} |",
-        f"y up (glTF) | {CONVENTION['+y']:g} |",
         f"up to {MAX_BOXES} boxes",
         *(f"| `{name}` | {cells} |" for name, cells in QUALITIES.items()),
         f"at most {MOST_CELLS} cells",
@@ -389,7 +387,6 @@ def test_page_states_the_numbers_of_the_rules():
         f"below {SHEET:g} of the next",
     ):
         assert text in page, text
-    assert CONVENTION["-y"] == CONVENTION["+z"]
     example = page.split("```python\n")[1].split("```")[0]
     exec(compile(example, "own_scene.md", "exec"), {})
 
