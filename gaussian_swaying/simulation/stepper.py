@@ -506,7 +506,7 @@ class Launched:
         self._error: Exception | None = None
         try:
             with self._explained():
-                self._parts = parts_of(stepper)
+                self._parts = None if stepper.solver.exact else parts_of(stepper)
                 self.steps = stepper.substeps(before, self._parts) if steps is None else steps
                 self._end, self._measurement = self._launch(0)
         except Exception as error:  # `finish` raises it
