@@ -17,7 +17,6 @@ from gaussian_swaying import _program as program
 from gaussian_swaying._checks import check_positive
 from gaussian_swaying._yaml_limits import check_config_files
 from gaussian_swaying.aero.looks import LOOKS
-from gaussian_swaying.aero.wind import WindField
 from gaussian_swaying.cli.errors import guessing, parser_sentence, run_command
 from gaussian_swaying.cli.shipped import with_shipped
 from gaussian_swaying.config.material_names import NAMES
@@ -34,7 +33,6 @@ from gaussian_swaying.preview.cost import (
     with_whole,
 )
 from gaussian_swaying.preview.kinds import KINDS
-from gaussian_swaying.preview.natural import Natural, cloth_start, natural
 from gaussian_swaying.preview.photos import captured_from
 from gaussian_swaying.preview.picture import preview_picture, things_picture
 from gaussian_swaying.preview.place import Place, excerpt, near_things, survey
@@ -59,12 +57,12 @@ from gaussian_swaying.preview.starter import starter_yaml
 from gaussian_swaying.preview.suggest import (
     QUALITIES,
     Suggestion,
+    as_its_kind,
     at_quality,
     finest_spacing,
     gaussian_statistics,
     of_material,
     suggest,
-    with_natural,
 )
 from gaussian_swaying.simulation.progress import duration
 from gaussian_swaying.simulation.roles import classify
@@ -276,20 +274,10 @@ def _natural(
     suggestion: Suggestion, simulation: Simulation, build: Callable[[Suggestion], tuple[Simulation, Any]]
 ) -> tuple[Suggestion, Simulation]:
     """The suggestion with the numbers of its kind, and its simulation, which has them."""
-    if suggestion.sways:
-        suggestion = with_natural(suggestion, natural_of(suggestion, simulation))
-        if not suggestion.by_modes:
-            simulation = build(suggestion)[0]
-    elif KINDS[suggestion.kind].cloth and suggestion.fixed:
-        start = cloth_start(simulation, KINDS[suggestion.kind], suggestion.size)
-        suggestion = replace(suggestion, start=start)
+    suggestion = as_its_kind(suggestion, simulation)
+    if suggestion.sways and not suggestion.by_modes:
+        simulation = build(suggestion)[0]
     return suggestion, simulation
-
-
-def natural_of(suggestion: Suggestion, simulation: Simulation) -> Natural:
-    """The numbers of the kind of a suggestion, which its simulation gets."""
-    assert isinstance(simulation.wind, WindField)
-    return natural(simulation, KINDS[suggestion.kind], simulation.wind.flows[0], LOOKS[suggestion.look].intensity)
 
 
 def _tried(

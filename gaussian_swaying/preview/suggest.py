@@ -15,6 +15,7 @@ from torch import Tensor
 
 from gaussian_swaying._checks import check_choice, check_positive
 from gaussian_swaying.aero.looks import LOOKS
+from gaussian_swaying.aero.wind import WindField
 from gaussian_swaying.captures.capture_camera import photo_azimuth
 from gaussian_swaying.gaussians.area import patch_area
 from gaussian_swaying.gaussians.cloud import GaussianCloud
@@ -29,7 +30,7 @@ from gaussian_swaying.mpm.materials import known_material
 from gaussian_swaying.preview.framing import orbit_frame, whole_box
 from gaussian_swaying.preview.hold import PIN_DEPTH, HoldGuess, end_region, given_hold, guess_hold
 from gaussian_swaying.preview.kinds import KINDS, kind_of, with_materials
-from gaussian_swaying.preview.natural import MOST_LEAN, Natural
+from gaussian_swaying.preview.natural import MOST_LEAN, Natural, cloth_start, natural
 from gaussian_swaying.preview.parts import FoundParts, plant_parts
 from gaussian_swaying.preview.photos import CapturedFrom, ShownObject, shown_object
 from gaussian_swaying.preview.shape import (
@@ -42,6 +43,7 @@ from gaussian_swaying.preview.shape import (
 from gaussian_swaying.preview.supports import flag_on_pole, hanging_parts, potted_parts, standing_parts, swinging_parts
 from gaussian_swaying.preview.up import UpGuess, given_up, guess_up
 from gaussian_swaying.simulation.extent import suggest_spacing
+from gaussian_swaying.simulation.simulation import Simulation
 
 QUALITIES = {"draft": 16, "normal": 24, "fine": 48}  # cells along the longest side; normal is enough for bending
 CELLS = QUALITIES["normal"]
@@ -422,6 +424,23 @@ def at_quality(suggestion: Suggestion, quality: str) -> Suggestion:
 def finest_spacing(suggestion: Suggestion) -> float:
     """The finest grid spacing [m] that a time may choose: ``MOST_CELLS``, and at least twice the particle spacing."""
     return suggest_spacing(suggestion.longest_side, suggestion.spacing, MOST_CELLS)
+
+
+def as_its_kind(suggestion: Suggestion, simulation: Simulation) -> Suggestion:
+    """The suggestion with the numbers of its kind, and a typical stretch of its wind.
+
+    Args:
+        suggestion: What :func:`suggest` found.
+        simulation: That of its starter; it gets the numbers, too, if it sways by modes.
+    """
+    kind, wind = KINDS[suggestion.kind], simulation.wind
+    if suggestion.sways:
+        assert isinstance(wind, WindField)
+        found = natural(simulation, kind, wind.flows[0], LOOKS[suggestion.look].intensity)
+        return with_natural(suggestion, found)
+    if kind.cloth and suggestion.fixed:
+        return replace(suggestion, start=cloth_start(simulation, kind, suggestion.size))
+    return suggestion
 
 
 def with_natural(suggestion: Suggestion, found: Natural) -> Suggestion:

@@ -10,14 +10,10 @@ from typing import TYPE_CHECKING
 
 import torch
 
-from gaussian_swaying.aero.looks import LOOKS
-from gaussian_swaying.aero.wind import WindField
 from gaussian_swaying.config.parser import parse_text
 from gaussian_swaying.gaussians.formats import read_gaussians
-from gaussian_swaying.preview.kinds import KINDS
-from gaussian_swaying.preview.natural import natural
 from gaussian_swaying.preview.starter import starter_yaml
-from gaussian_swaying.preview.suggest import suggest, with_natural
+from gaussian_swaying.preview.suggest import as_its_kind, suggest
 from gaussian_swaying.simulation.simulation import Simulation
 
 if TYPE_CHECKING:
@@ -57,13 +53,10 @@ def settings_of_splat(
         saved = found.parts.parts.save(folder / "parts.npz")
         found = replace(found, parts=replace(found.parts, path=str(saved)))
     own = ["--device", device.type]
-    if found.sways:
-        tell(0.35, "Finding how it sways")
-        simulation = Simulation.from_settings(parser, parse_text(parser, starter_yaml(found, str(file)), own))
-        assert isinstance(simulation.wind, WindField)
-        numbers = natural(simulation, KINDS[found.kind], simulation.wind.flows[0], LOOKS[found.look].intensity)
-        found = with_natural(found, numbers)
-        if found.parts is not None:
-            found.parts.parts.save(folder / "parts.npz")
+    tell(0.35, "Finding how it sways")
+    simulation = Simulation.from_settings(parser, parse_text(parser, starter_yaml(found, str(file)), own))
+    found = as_its_kind(found, simulation)
+    if found.parts is not None:
+        found.parts.parts.save(folder / "parts.npz")
     text = starter_yaml(found, str(file))
     return parse_text(parser, text, [*own, *further])
