@@ -16,12 +16,15 @@ import torch
 from shared import refused
 
 from gaussian_swaying.cli import live, scene
+from gaussian_swaying.cli.preview import main as preview
+from gaussian_swaying.gaussians.export import export_cloud
 from gaussian_swaying.gaussians.ply import write_ply
 from gaussian_swaying.preview.cost import Cost
 from gaussian_swaying.scenes.alocasia import AlocasiaScene
+from gaussian_swaying.scenes.flag_on_stand import FlagOnStandScene
 from gaussian_swaying.scenes.procedural import FlagScene
 from gaussian_swaying.simulation.simulation import Simulation
-from gaussian_swaying.viewer import real_time
+from gaussian_swaying.viewer import real_time, scenes
 from gaussian_swaying.viewer.scenes import settings_of_splat
 
 
@@ -203,3 +206,17 @@ def test_ctrl_c_ends_it_cleanly(tmp_path):
         assert "Ended." in rest
     finally:
         process.kill()
+
+
+def test_a_splat_has_the_wind_of_its_preview(tmp_path):
+    """Of a cloth, too, whose stretch of the turbulence is looked for without modes."""
+    splat = tmp_path / "flag.ply"
+    export_cloud(splat, FlagOnStandScene(spacing=0.05).generate())
+    parser = Simulation.parser()
+    live = scenes.settings_of_splat(parser, splat, torch.device("cpu"), tmp_path)
+    assert preview([str(splat), "--output", str(tmp_path / "look"), "--device", "cpu"]) == 0
+    starter = parser.parse_args(["--config", str(tmp_path / "look" / "starter.yaml")])
+    turbulence = live.wind.effects[0]["init_args"]
+    assert any(turbulence["start"])
+    assert turbulence["start"] == starter.wind.effects[0]["init_args"]["start"]
+    assert live.wind.flow == starter.wind.flow
