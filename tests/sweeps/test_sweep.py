@@ -46,7 +46,7 @@ def _wait(condition, seconds=120):
 
 
 def _done(folder):
-    return {file: file.stat().st_mtime_ns for file in (folder / "results").glob("*.json")}
+    return {file: file.stat().st_mtime_ns for file in (folder / "results").glob("[0-9]*.json")}
 
 
 def _rows(path):
