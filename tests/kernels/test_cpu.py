@@ -2,6 +2,7 @@
 
 import importlib
 import os
+import shutil
 import subprocess
 import sys
 import threading
@@ -134,16 +135,32 @@ def test_a_second_process_compiles_nothing(folder, own, tmp_path, monkeypatch, c
         ("own_kernel.py", "ONE + 0", "ONE + 5", 106.0),
         ("own_kernel.py", "constexpr(1)", "constexpr(2)", 102.0),
         ("own_numbers.py", "100", "200", 201.0),
+        ("own_kernel.py", "def added", "# unused\ndef added", 101.0),
+        ("own_numbers.py", "@triton", "# unused\n@triton", 101.0),
     ],
-    ids=["kernel", "function that is passed", "constant", "function of another file"],
+    ids=["kernel", "function that is passed", "constant", "function of another file", "host", "comment in another file"],
 )
 def test_a_change_of_the_source_counts(folder, own, tmp_path, file, old, new, expected):
-    """Also of what a kernel calls and names, in files outside the package."""
+    """Also of what a kernel calls and names in other files, but not of what is beside it."""
     assert own() == 101.0
     path = tmp_path / file
     path.write_text(path.read_text().replace(old, new))
     assert own() == expected
-    assert len(list(folder.iterdir())) == 2
+    assert len(list(folder.iterdir())) == (1 if expected == 101.0 else 2)
+
+
+def test_a_change_of_the_translator_counts_and_one_of_another_room_does_not(folder, own, tmp_path, monkeypatch):
+    """For kernels of the whole package, of which this is a copy."""
+    package = Path(cpu.__file__).parents[1]
+    copy = shutil.copytree(package, tmp_path / "package", ignore=shutil.ignore_patterns("__pycache__"))
+    monkeypatch.setattr(cpu, "__file__", str(copy / "kernels" / "cpu.py"))
+    monkeypatch.setattr(cpu, "_sources", cpu._sources.__wrapped__)
+    assert own() == 101.0
+    for number, file in [(1, "gaussians/area_triton.py"), (2, "kernels/blocks.py")]:
+        with (copy / file).open("a") as text:
+            text.write("# a comment\n")
+        assert own() == 101.0
+        assert len(list(folder.iterdir())) == number
 
 
 @pytest.mark.parametrize("broken", [b"", b"no object", "cut"], ids=["empty", "text", "cut"])

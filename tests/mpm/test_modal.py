@@ -22,7 +22,7 @@ FOOT = Box([None] * 3, [None, None, 0.1])
 
 @pytest.fixture(autouse=True)
 def cache(tmp_path, monkeypatch):
-    monkeypatch.setenv("GAUSSIAN_SWAYING_CACHE", str(tmp_path / "cache"))
+    monkeypatch.setattr(modal, "cache_folder", lambda: tmp_path / "cache")
     return tmp_path / "cache"
 
 

@@ -14,6 +14,7 @@ from gaussian_swaying.aero.wind import WindField
 from gaussian_swaying.aero.wind_force import WindForce
 from gaussian_swaying.geometry.regions import Box
 from gaussian_swaying.geometry.rotations import rotation_of
+from gaussian_swaying.mpm import modal
 from gaussian_swaying.mpm.boundaries.pinned_region import PinnedRegion
 from gaussian_swaying.mpm.damping import decay_rate
 from gaussian_swaying.mpm.forces import Force
@@ -29,7 +30,8 @@ POINTS = 320
 @pytest.fixture(autouse=True, scope="module")
 def cache(tmp_path_factory):
     with pytest.MonkeyPatch.context() as patch:
-        patch.setenv("GAUSSIAN_SWAYING_CACHE", str(tmp_path_factory.mktemp("cache")))
+        folder = tmp_path_factory.mktemp("cache")
+        patch.setattr(modal, "cache_folder", lambda: folder)
         yield
 
 
