@@ -138,7 +138,7 @@ def test_a_second_process_compiles_nothing(folder, own, tmp_path, monkeypatch, c
         ("own_kernel.py", "def added", "# unused\ndef added", 101.0),
         ("own_numbers.py", "@triton", "# unused\n@triton", 101.0),
     ],
-    ids=["kernel", "function that is passed", "constant", "function of another file", "host", "comment in another file"],
+    ids=["kernel", "function that is passed", "constant", "function of another file", "host", "comment elsewhere"],
 )
 def test_a_change_of_the_source_counts(folder, own, tmp_path, file, old, new, expected):
     """Also of what a kernel calls and names in other files, but not of what is beside it."""
