@@ -4,10 +4,11 @@ import re
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[2]
-LIMIT = 30_000
+LIMIT = 26_000
 """Words by hand that the documentation has at most."""
 LEFT_OUT = re.compile(
     r"(?<!`)<!-- begin: [^>]*-->.*?<!-- end -->"  # filled by tools/bench.py
+    r"|^\|[^\n]*$"  # tables: numbers, most of them
     r"|^[ ]*(?P<fence>```+|~~~+)[^\n]*\n.*?^[ ]*(?P=fence)[ ]*$"
     r"|(?<!`)<!--.*?-->"
     r"|(?<=\])\([^()\s]*\)",  # the target of a link, not its text
@@ -23,9 +24,9 @@ def words(text):
 def test_words_by_hand_are_counted_and_nothing_else():
     text = """# Two words
 
-| one | two |
+| not | counted |
 |---|---|
-| three | four |
+| nor | this |
 
 A [link of four](https://example.org/page) <!-- unseen --> `inline`.
 <!-- begin: speed.frames speed_cpu -->
@@ -39,7 +40,7 @@ code = "here"
   ~~~
 Last.
 """
-    assert words(text) == 2 + 4 + 5 + 1
+    assert words(text) == 2 + 5 + 1
 
 
 def test_the_pages_are_short_enough():

@@ -204,7 +204,7 @@ def test_the_estimate_is_within_a_factor_of_two_of_the_run(make, tmp_path):
 
 @pytest.mark.gpu
 def test_kernels_are_loaded_before_a_gpu_is_timed():
-    """They are a part of the start, and not of a frame; ``bench.py previews`` compares the estimate with runs."""
+    """They are a part of the start, and not of a frame."""
     first, second = (estimate_cost(flag("cuda"), 250) for _ in range(2))
     assert 0 < first.startup_seconds <= cost_module.WARM_UP
     assert 0 < second.startup_seconds <= cost_module.WARM_UP

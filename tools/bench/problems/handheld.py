@@ -7,13 +7,13 @@ import math
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import torch
 import yaml
 from torch import Tensor
 
 from bench.problems.films import opengl
-from bench.record import Row
 from gaussian_swaying.gaussians.harmonics import SH_DC
 from gaussian_swaying.gaussians.ply import write_ply
 from gaussian_swaying.geometry.rotations import rotation_of
@@ -22,7 +22,7 @@ from gaussian_swaying.scenes.printed_cloth import PERIOD, printed_colours
 from gaussian_swaying.scenes.procedural import FlagScene, both
 from gaussian_swaying.simulation.simulation import Simulation
 
-TRUTH: Row = {"flow": [4.0, 3.0, 0.0], "material.E": 1e4}
+TRUTH: dict[str, Any] = {"flow": [4.0, 3.0, 0.0], "material.E": 1e4}
 FPS = 30
 WALLS = ((2.4, 1.6, 0.0, (-0.9, 0.6, -0.7)), (0.5, 1.6, 65.0, (0.75, 0.1, -0.7)))
 """Width, height [m], turn from the x axis [degrees] and lower corner [m] of the walls behind and beside the flag."""

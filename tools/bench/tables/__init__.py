@@ -1,1 +1,0 @@
-"""Tables, values and goals of the pages, declared for the renderer, and plots; most files have the name of a page."""
