@@ -1,0 +1,68 @@
+"""Small runs end where they ended before: kernels in float32, torch in float64, and kernels of a GPU.
+
+A run in float32 may be four times as far from its record as the record is from the same run in float64, which is the
+rounding of one run as it has grown; two runs that add in another order differ by about twice that. In float64 it is
+2^-29 of that. Both may also differ by four units in the last place of float32, to which records are rounded, and torch
+by 1e-6 of the largest number, as areas, masses and normals are found in float32 in any case.
+
+If a change of the physics is meant, ``python tests/golden/make.py`` with the names of the cases writes new records.
+"""
+
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+sys.path.append(str(Path(__file__).parent))
+from golden.cases import CASES, CONFIGS, picture, run
+from golden.make import FILES, TORCH, scale
+
+QUANTUM = 2.0**-22
+
+
+def check(name, kind, found, growth, share):
+    """Positions, covariances and energies are those of a record, but for its rounding times ``growth``."""
+    with np.load(FILES / f"{name}.npz") as record:
+        assert len(found["means"]) == record["count"]
+        for key, values in found.items():
+            if key != "energies":
+                values = values[record["index"]]
+            expected = record[f"{kind}_{key}"].astype(float)
+            bound = growth * record[f"rounding_{key}"] + share * scale(key, expected)
+            error = np.abs(values - expected)
+            assert (error <= bound).all(), f"{key}: {(error / (bound + 1e-300)).max():.3g} times the bound"
+        return record.get("picture")
+
+
+@pytest.fixture
+def folder(tmp_path, monkeypatch, request):
+    """An empty one, in which analyses of modes are kept, too, so that none is from other code."""
+    if request.node.callspec.params["name"] == "modes":
+        monkeypatch.setenv("GAUSSIAN_SWAYING_CACHE", str(tmp_path / "cache"))
+    return tmp_path
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_kernels(name, folder, kernel_device):
+    more = {"solver.deterministic": True} if kernel_device.type == "cuda" and name != "modes" else {}
+    found, frame = run(name, folder, device=kernel_device.type, **more)
+    kept = check(name, "kernels", found, 4.0, QUANTUM)
+    if frame is not None:
+        differs = np.abs(picture(frame).astype(int) - kept) > 2
+        assert differs.mean() < 0.01
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_torch(name, folder):
+    found, _ = run(name, folder, 2, device="cpu", **TORCH)
+    check(name, "torch", found, 4.0 * 2.0**-29, 1e-6)
+
+
+def test_every_shipped_configuration_has_a_case():
+    """But for those of training, fits and sweeps."""
+    used = {f"{name}.yaml" for files, _ in CASES.values() for name in files}
+    paths = {
+        path.relative_to(CONFIGS).as_posix() for room in ("sim", "bench") for path in CONFIGS.rglob(f"{room}/**/*.yaml")
+    }
+    assert used == paths - {"bench/train.yaml"}
