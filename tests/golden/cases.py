@@ -13,6 +13,7 @@ import torch
 
 from gaussian_swaying import Force, GaussianCloud, Simulation, write_ply
 from gaussian_swaying.gaussians.parts import Part, Parts
+from gaussian_swaying.rendering.torch_renderer import TorchRenderer
 from gaussian_swaying.scenes import FlagScene
 from gaussian_swaying.simulation.batch import batch_of
 
@@ -231,7 +232,7 @@ def simulation_of(name, folder, **arithmetic):
     texts = {key: value if isinstance(value, str) else json.dumps(value) for key, value in settings.items()}
     options = [text for file in files for text in ("--config", str(CONFIGS / f"{file}.yaml"))]
     options += [text for key, value in texts.items() for text in (f"--{key}", value)]
-    return Simulation.from_settings(parser(), parser().parse_args(options))
+    return Simulation.from_settings(parser(), parser().parse_args(options), renderer=TorchRenderer())
 
 
 def frames_of_batch(simulation):
