@@ -1,9 +1,10 @@
 """Small runs end where they ended before: kernels in float32, torch in float64, and kernels of a GPU.
 
-A run in float32 may be four times as far from its record as the record is from the same run in float64, which is the
-rounding of one run as it has grown; two runs that add in another order differ by about twice that. In float64 it is
-2^-29 of that. Both may also differ by four units in the last place of float32, to which records are rounded, and torch
-by 1e-6 of the largest number, as areas, masses and normals are found in float32 in any case.
+A record has the distance between its run in float32 and the same run in float64: one sample of the rounding as it has
+grown. Others, on two more kinds of processor and a GPU, were up to 17 times as large for single numbers such as an
+energy, so 32 times are allowed, and 2^-29 of that in float64. The rest is four units in the last place of float32, to
+which records are rounded, and in float64 1e-6 of the largest number, as areas, masses and normals are found in float32
+in any case. Of a picture, three pixels in a hundred may differ, where Gaussians at one depth are drawn in another order.
 
 If a change of the physics is meant, ``python tests/golden/make.py`` with the names of the cases writes new records.
 """
@@ -18,6 +19,7 @@ sys.path.append(str(Path(__file__).parent))
 from golden.cases import CASES, CONFIGS, picture, run
 from golden.make import FILES, TORCH, scale
 
+GROWTH = 32.0
 QUANTUM = 2.0**-22
 
 
@@ -47,16 +49,16 @@ def folder(tmp_path, monkeypatch, request):
 def test_kernels(name, folder, kernel_device):
     more = {"solver.deterministic": True} if kernel_device.type == "cuda" and name != "modes" else {}
     found, frame = run(name, folder, device=kernel_device.type, **more)
-    kept = check(name, "kernels", found, 4.0, QUANTUM)
+    kept = check(name, "kernels", found, GROWTH, QUANTUM)
     if frame is not None:
         differs = np.abs(picture(frame).astype(int) - kept) > 2
-        assert differs.mean() < 0.01
+        assert differs.mean() < 0.03
 
 
 @pytest.mark.parametrize("name", CASES)
 def test_torch(name, folder):
     found, _ = run(name, folder, 2, device="cpu", **TORCH)
-    check(name, "torch", found, 4.0 * 2.0**-29, 1e-6)
+    check(name, "torch", found, GROWTH * 2.0**-29, 1e-6)
 
 
 def test_every_shipped_configuration_has_a_case():

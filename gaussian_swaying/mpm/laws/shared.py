@@ -81,8 +81,8 @@ def spectral_moduli(
     twist = (y[..., :, None] + y[..., None, :]) / total
     flip = divided_differences(a, function)
     largest = symmetric_eigenvalues(hessian)[..., 0]
-    i, j = (0, 0, 1), (1, 2, 2)
-    twist, flip, mixed = twist[..., i, j], flip[..., i, j], mixed[..., i, j]
+    # a list of places as an index would be copied to the GPU, which a graph cannot capture
+    twist, flip, mixed = (torch.stack([x[..., 0, 1], x[..., 0, 2], x[..., 1, 2]], -1) for x in (twist, flip, mixed))
     bound = torch.maximum(largest, torch.maximum(twist, flip).amax(-1))
     wave = torch.maximum(twist - mixed, flip + mixed).amax(-1)
     wave = torch.maximum(wave, own.amax(-1))
