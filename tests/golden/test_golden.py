@@ -4,7 +4,7 @@ A record has the distance between its run in float32 and the same run in float64
 grown. Others, on two more kinds of processor and a GPU, were up to 17 times as large for single numbers such as an
 energy, so 32 times are allowed, and 2^-29 of that in float64. The rest is four units in the last place of float32, to
 which records are rounded, and in float64 1e-6 of the largest number, as areas, masses and normals are found in float32
-in any case. Of a picture, three pixels in a hundred may differ, where Gaussians at one depth are drawn in another order.
+in any case. Of a picture, 3 % may differ, as Gaussians at one depth are drawn in another order.
 
 If a change of the physics is meant, ``python tests/golden/make.py`` with the names of the cases writes new records.
 """
