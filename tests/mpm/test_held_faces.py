@@ -8,8 +8,6 @@ import warnings
 
 import pytest
 import torch
-from bench.problems.beams import held_cantilever, timoshenko_mode
-from bench.problems.settings import Settings
 
 from gaussian_swaying.geometry.regions import Box, Everything, Region
 from gaussian_swaying.mpm.boundaries.handle import Handle
@@ -145,34 +143,6 @@ def test_a_hinge_that_holds_several_lines_is_warned_of(rows, wide, shift):
 
 
 # ---- a clamped solid
-
-
-def test_the_frequency_of_a_slender_beam_is_eulers():
-    h, length = 0.5, 100.0
-    euler = 3.516015 * math.sqrt(h**2 / 12) / length**2
-    assert timoshenko_mode(length, h, h**3 / 12)[0] == pytest.approx(euler, rel=3e-4)
-    thick = timoshenko_mode(10.0, 1.0, 1 / 12)[0]  # shear and rotary inertia, both of the order of (h / L)²
-    # by Dunkerley, 1 / w² = 1 / w_bending² + 1 / w_shear², with w_shear = pi / (2 L) sqrt(5/6 G), and a little more
-    ratio = thick / (3.516015 * math.sqrt(1 / 12) / 100)
-    shear = math.pi / 20 * math.sqrt(5 / 12)
-    dunkerley = 1 / math.sqrt(1 + (3.516015 * math.sqrt(1 / 12) / 100 / shear) ** 2)
-    assert dunkerley - 2 / 12 / 100 < ratio < dunkerley
-
-
-@pytest.mark.slow(gate=["2.0-0.51-place0-0.0"])
-@pytest.mark.parametrize(
-    ("thick", "depth", "place", "angle"),
-    [
-        (2.0, 0.51, (0.25, 0.13), 0.0),
-        (2.0, 1.01, (0.5, 0.37), 0.5),
-        (0.3, 2.01, (0.81, 0.71), 0.5),
-        (1.0, 0.3, (0, 0), 0),
-    ],
-)
-def test_a_held_cantilever_has_the_frequency_of_a_clamped_beam(thick, depth, place, angle):
-    """Within 3 %. A hinge leaves it free, and held nodes are off by the position on the grid."""
-    found = held_cantilever(Settings(), thick, depth, place, angle, per_cell=3)
-    assert found["ratio"] == pytest.approx(1, abs=0.03)
 
 
 def test_held_material_is_soft_and_takes_its_weight():

@@ -4,8 +4,6 @@ import math
 
 import pytest
 import torch
-from bench.problems.joints import joined_beams, pendulum
-from bench.problems.settings import Settings
 
 from gaussian_swaying.geometry.rotations import rotation_of
 from gaussian_swaying.mpm.joints import Joints, PointJoint, turn_between
@@ -92,15 +90,6 @@ def test_momenta_stay_and_the_energy_does_not_grow():
         torch.testing.assert_close(after[name], value, rtol=0, atol=1e-6 * float(value.norm()))
     gap = Joints(points, [PointJoint(*sets, AT.tolist(), 1.0)], 1e-9)(state)[sets[0]].sum(0)
     assert float(gap.norm()) < 0.02  # m
-
-
-@pytest.mark.parametrize("turning", [1.0, math.inf])
-def test_two_beams_and_a_joint_against_eulers_beams(turning):
-    assert joined_beams(Settings(), turning, length=14.0)["error"] < 0.04
-
-
-def test_a_pendulum_on_a_hinge():
-    assert pendulum(Settings(), length=10.0)["error"] < 0.015
 
 
 def test_a_spring_is_softened_as_a_substep_needs_it():

@@ -5,8 +5,6 @@ import math
 
 import pytest
 import torch
-from bench.problems.apart import comb, sheets
-from bench.problems.settings import Settings
 
 from gaussian_swaying.aero.effects import LogProfile
 from gaussian_swaying.aero.force import AeroForce
@@ -397,17 +395,3 @@ def test_joined_bodies_keep_their_pieces():
         MaterialPoints.join([one, material(torch.rand(3, 3), torch.tensor([[0, 1]]))])
     with pytest.raises(ValueError, match="same `attached`"):
         MaterialPoints.stack([one, material(torch.rand(4, 3), torch.zeros(4, dtype=torch.long))])
-
-
-@pytest.mark.parametrize(("how", "most"), [({}, 0.03), ({"base": True}, 0.3), ({"shared": True}, math.inf)])
-def test_a_comb_has_the_frequencies_of_its_beams(how, most):
-    """Three short beams with gaps of 0.3 cells; the slow measurement has ten long ones."""
-    found = comb(Settings(), 1.0, 0.3, **how, count=3, shortest=6.0)
-    assert found["error"] < most
-    assert found["error"] > (1.0 if "shared" in how else 0.02 if "base" in how else 0.0)
-
-
-def test_close_sheets_move_as_alone_in_single_precision():
-    found = sheets(Settings(dtype=torch.float32), 0.2, layers=1, cells=6, repeats=1)
-    assert found["error"] < 1e-3
-    assert found["shared"] > 0.1

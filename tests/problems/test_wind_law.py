@@ -4,8 +4,7 @@ import math
 
 import pytest
 import torch
-from bench.problems.plates import Hinge, hinged_plate, hinged_plate_angle
-from bench.problems.settings import Settings
+from bench.problems.plates import Hinge
 from bench.problems.surfaces import sphere_of_gaussians, surface_drag
 
 from gaussian_swaying.aero.force import AeroForce
@@ -97,49 +96,6 @@ def test_force_on_a_plate_does_not_depend_on_the_gaussians_that_carry_it(law):
 
 
 # ---- a plate on a hinge
-
-
-ANGLES = {
-    ("paper", 0.25): 14.48,
-    ("paper", 0.5): 30.0,
-    ("paper", 0.75): 48.59,
-    ("projected", 0.25): 14.04,
-    ("projected", 0.5): 26.57,
-    ("projected", 1.0): 45.0,
-    ("projected", 2.0): 63.43,
-}
-
-
-@pytest.mark.parametrize(("law", "k"), ANGLES)
-def test_the_angle_of_a_hinged_plate(law, k):
-    """sin(angle) = k for the full normal force, tan(angle) = k for its projection."""
-    assert hinged_plate_angle(k, law) == pytest.approx(ANGLES[law, k], abs=0.005)
-
-
-@pytest.mark.slow(gate=["projected-0.5"])
-@pytest.mark.parametrize(("law", "k"), ANGLES)
-def test_a_hinged_plate_comes_to_rest_at_the_angle_of_its_law(law, k):
-    """The goal is one degree."""
-    found = hinged_plate(k, law, cells=4)
-    assert abs(found["error"]) < 0.2
-    assert abs(found["drift"]) < 0.4
-    assert abs(found["slip"]) < 0.01
-
-
-@pytest.mark.slow(twin="test_a_hinge_lets_turn_and_holds")
-@pytest.mark.parametrize(("law", "k"), [("paper", 0.5), ("projected", 2.0)])
-def test_a_hinged_plate_in_the_updated_formulation(law, k):
-    found = hinged_plate(k, law, Settings(formulation="updated"), cells=4)
-    assert abs(found["error"]) < 0.5
-    assert abs(found["slip"]) < 0.01
-
-
-@pytest.mark.slow(twin="test_a_hinged_plate_comes_to_rest_at_the_angle_of_its_law")
-def test_the_paper_law_lifts_a_hinged_plate_to_the_horizontal_and_no_further():
-    """k > 1 has no equilibrium below 90 degrees; there the normal turns along the flow, and the force with it."""
-    found = hinged_plate(2.0, "paper", cells=4)
-    assert found["exact"] == 90.0
-    assert abs(found["error"]) < 1.0
 
 
 @pytest.mark.parametrize("formulation", ["total", "updated"])

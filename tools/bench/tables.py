@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import json
+import math
 from types import SimpleNamespace as Run
 
+from bench.known import KNOWN, plain
 from bench.report import SECTIONS, grid, percent, reached, source, table
 from bench.runner import read
 from gaussian_swaying.mpm.materials import MATERIALS
@@ -179,3 +182,52 @@ def _refinement() -> str:
 
 
 SECTIONS["flags.refinement"] = _refinement
+
+
+# ---- validation.md, nature.md, air.md
+
+
+def _wanted(name: str, low: float, high: float) -> str:
+    if low == high:
+        return f"{name} {high:.3g}"
+    if math.isinf(high):
+        return f"{name} at least {low:.3g}"
+    return f"{name} at most {high:.3g}" if low in (-high, 0, -math.inf) else f"{name} {low:.3g} to {high:.3g}"
+
+
+def _setting(value: object) -> str:
+    return (
+        " and ".join(map(str, value))
+        if isinstance(value, list)
+        else f"`{value}`"
+        if isinstance(value, str)
+        else str(value)
+    )
+
+
+def _known(page: str) -> str:
+    runs = {json.dumps(run.parameters, sort_keys=True): run for run in read("known")}
+    rows, shown = [], []
+    for one in KNOWN:
+        name = one.name
+        for parameters in map(plain, one.fine if one.page == page else ()):
+            run = runs.get(json.dumps({"problem": one.name} | parameters, sort_keys=True))
+            if run is None or hasattr(run, "failed"):
+                continue
+            found = one.verdicts(vars(run) | parameters, one.goal)
+            setting = ", ".join(
+                _setting(value) if key == "variant" else f"{key} {_setting(value)}"
+                for key, value in parameters.items() if key != "worst"
+            )  # fmt: skip
+            measured = ", ".join(f"{key} {value:.3g}" for key, (value, _, _) in found.items())
+            wanted = ", ".join(_wanted(key, low, high) for key, (_, low, high) in found.items())
+            good = all(low <= value <= high for value, low, high in found.values())
+            rows.append(f"{name} | {setting} | {measured} | {wanted} | {reached(good)}")
+            shown.append(run)
+            name = ""
+    return grid("problem | setting | measured | wanted | reached", rows) + "\n\n" + source(shown)
+
+
+SECTIONS["known.validation"] = lambda: _known("validation.md")
+SECTIONS["known.nature"] = lambda: _known("nature.md")
+SECTIONS["known.air"] = lambda: _known("air.md")

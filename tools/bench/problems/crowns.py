@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 import torch
@@ -117,26 +117,6 @@ def elastica_drags(kind: Crown, speeds: Sequence[float], branches: int) -> np.nd
     cauchy = [kind.cauchy(speed) for speed in speeds]
     each = sum(np.array(branch_drag(cauchy, math.asin(way[0]))) for way in kind.ways(branches))
     return 0.5 * AIR * C_D * kind.width * kind.length * np.array(speeds) ** 2 * each
-
-
-def of_elasticas(
-    species: str, diameter: float, branches: int = 12, settings: Settings | None = None
-) -> dict[str, float]:
-    """The exponent of a crown of elasticas with branches of another thickness, without a simulation.
-
-    Args:
-        species: One of :data:`CROWNS`.
-        diameter: Of the branches [m].
-        branches: Number of branches.
-        settings: Not used.
-
-    Returns:
-        ``exponent``, ``known`` (that of the species), ``cauchy_10`` and ``cauchy_25``.
-    """
-    del settings
-    kind = replace(CROWNS[species], diameter=diameter)
-    found = exponent(SPEEDS, list(elastica_drags(kind, SPEEDS, branches)))
-    return {"exponent": found, "known": kind.exponent, "cauchy_10": kind.cauchy(10.0), "cauchy_25": kind.cauchy(25.0)}
 
 
 def crown(

@@ -204,24 +204,6 @@ def flag(mass_ratio: float, bending: float, reynolds: float, *, tilt: float = 0.
     return measured(found)
 
 
-def hanging(cells: int = 24, until: float = 30.0) -> dict:
-    """The filament of Huang, Shin and Sung (2007, J. Comput. Phys. 226): mass ratio 1.5, Re 200, gravity 0.5."""
-    one = Filament.straight(2 * cells + 1, 1.5, 0.0015, 0.1 * math.pi, gravity=0.5, held="hinge")
-    return measured(flap([one], [(0.0, 0.0)], cells=cells, until=until))
-
-
-def tandem(gap: float, cells: int = 24, until: float = 30.0, mass_ratio: float = 1.5, bending: float = 1e-3) -> dict:
-    """Two flags one behind the other: drag of each per that of one alone."""
-    alone = flag(mass_ratio, bending, 200.0, cells=cells, until=until)
-
-    def one() -> Filament:
-        return Filament.straight(2 * cells + 1, mass_ratio, bending, 0.1)
-
-    found = flap([one(), one()], [(0.0, 0.0), (1.0 + gap, 0.0)], cells=cells, until=until, length=9.0 + gap)
-    first, second = measured(found, 0), measured(found, 1)
-    return {"first": first["drag"] / alone["drag"], "second": second["drag"] / alone["drag"], "alone": alone}
-
-
 def square_flag(cells: int = 20, until: float = 24.0, width: int = 4, device: str = "cpu") -> dict:
     """A square flag in three dimensions, as a sheet of the package: Re 200, mass ratio 1, bending stiffness 0.0001.
 
