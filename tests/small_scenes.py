@@ -1,12 +1,15 @@
 """Small scenes that are built from tensors, as fixtures of conftest.py."""
 
+import dataclasses
 import math
 
 import pytest
 import torch
 
 from gaussian_swaying.aero.wind import WindField
+from gaussian_swaying.cli.preview import build_options, preview_scene
 from gaussian_swaying.gaussians.cloud import GaussianCloud
+from gaussian_swaying.gaussians.harmonics import SH_DC
 from gaussian_swaying.gaussians.ply import write_ply
 from gaussian_swaying.geometry.regions import Box
 from gaussian_swaying.geometry.rotations import quat_to_rotation
@@ -45,6 +48,30 @@ def plain_cloud(means, log_scales=-4.0, quats=(1.0, 0.0, 0.0, 0.0), logit=3.0):
         opacities=torch.as_tensor(logit).expand(count),
         sh=torch.zeros(count, 1, 3),
     )
+
+
+GREEN = (0.2, 0.5, 0.15)
+
+
+def block(sides, color, count=3000):
+    """The six faces of a box, seen from outside."""
+    draw = torch.Generator().manual_seed(0)
+    low, high = torch.zeros(3), torch.tensor(sides)
+    place = low + (high - low) * torch.rand(count, 3, generator=draw)
+    face = torch.randint(6, (count,), generator=draw)
+    for k in range(6):
+        place[face == k, k // 2] = (low if k % 2 else high)[k // 2]
+    cloud = plain_cloud(place + torch.tensor([3.0, 4.0, 0.0]), -4.0, logit=3.0)
+    sh = ((torch.tensor(color) - 0.5) / SH_DC).expand(count, 3)
+    return dataclasses.replace(cloud, sh=sh[:, None])
+
+
+def previewed(cloud, folder, *options):
+    write_ply(folder / "it.ply", cloud)
+    given = [str(folder / "it.ply"), "--up", "+z", "--device", "cpu", "--quality", "draft", "--height", "96", *options]
+    preview = preview_scene(build_options().parse_args(given), folder)
+    (folder / "starter.yaml").write_text(preview.configurations["starter"])
+    return preview, Simulation.from_yaml(folder / "starter.yaml", device="cpu")
 
 
 def varied_cloud(count=300, degree=1, seed=0, normals=False):

@@ -1,49 +1,24 @@
 """The starter sways as it announces: first frequency, mean lean, mass and drag; and what is rigid stands still."""
 
-import dataclasses
 import math
 
 import pytest
 import torch
 import yaml
-from small_scenes import plain_cloud
+from small_scenes import GREEN, block, previewed
 
-from gaussian_swaying.cli.preview import build_options, preview_scene
 from gaussian_swaying.evaluation.sway import natural_frequency, sway_score
-from gaussian_swaying.gaussians.harmonics import SH_DC
-from gaussian_swaying.gaussians.ply import write_ply
 from gaussian_swaying.preview.kinds import KINDS
 from gaussian_swaying.preview.natural import cloth_start, silhouette
 from gaussian_swaying.scenes.procedural import FlagScene
 from gaussian_swaying.simulation.simulation import Simulation
 
-GREEN, GREY = (0.2, 0.5, 0.15), (0.5, 0.5, 0.5)
+GREY = (0.5, 0.5, 0.5)
 
 
 @pytest.fixture(autouse=True)
 def _few_frames(monkeypatch):
     monkeypatch.setattr("gaussian_swaying.preview.cost.MOST_FRAMES", 2)
-
-
-def block(sides, color, count=3000):
-    """The six faces of a box, seen from outside."""
-    draw = torch.Generator().manual_seed(0)
-    low, high = torch.zeros(3), torch.tensor(sides)
-    place = low + (high - low) * torch.rand(count, 3, generator=draw)
-    face = torch.randint(6, (count,), generator=draw)
-    for k in range(6):
-        place[face == k, k // 2] = (low if k % 2 else high)[k // 2]
-    cloud = plain_cloud(place + torch.tensor([3.0, 4.0, 0.0]), -4.0, logit=3.0)
-    sh = ((torch.tensor(color) - 0.5) / SH_DC).expand(count, 3)
-    return dataclasses.replace(cloud, sh=sh[:, None])
-
-
-def previewed(cloud, folder, *options):
-    write_ply(folder / "it.ply", cloud)
-    given = [str(folder / "it.ply"), "--up", "+z", "--device", "cpu", "--quality", "draft", "--height", "96", *options]
-    preview = preview_scene(build_options().parse_args(given), folder)
-    (folder / "starter.yaml").write_text(preview.configurations["starter"])
-    return preview, Simulation.from_yaml(folder / "starter.yaml", device="cpu")
 
 
 def words(preview):

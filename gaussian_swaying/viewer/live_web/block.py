@@ -1,8 +1,8 @@
 """The block of bytes that the solver in a browser needs, and the scenes that it cannot simulate.
 
 The block is the length of its head (uint32, little-endian), the head in JSON, and the arrays that the head lists, in
-float32 or int32. The solver is ``tools/player/live_web/solver.js``; its definition is
-:mod:`~gaussian_swaying.mpm.formulations.total`.
+float32 or whole numbers. The solvers are ``solver.js`` and ``modal.js`` in ``tools/player/live_web``; their definitions
+are :mod:`~gaussian_swaying.mpm.formulations.total` and :mod:`~gaussian_swaying.mpm.formulations.modes`.
 """
 
 from __future__ import annotations
@@ -15,8 +15,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from gaussian_swaying.aero.carried import Turbulence
 from gaussian_swaying.aero.force import LAWS as AERO_LAWS
 from gaussian_swaying.aero.wind import GaussianGust, SineSway, UniformGust, WindField, stream_start
+from gaussian_swaying.aero.wind_force import WindForce
 from gaussian_swaying.geometry.groups import equal_rows
 from gaussian_swaying.mpm.boundaries.ball import BallObstacle
 from gaussian_swaying.mpm.boundaries.block import BoxObstacle
@@ -27,6 +29,7 @@ from gaussian_swaying.mpm.boundaries.obstacle import Obstacle
 from gaussian_swaying.mpm.boundaries.pinned_points import PinnedPoints
 from gaussian_swaying.mpm.boundaries.pinned_region import PinnedRegion
 from gaussian_swaying.mpm.boundaries.plane import Plane
+from gaussian_swaying.mpm.formulations.modes import Modes
 from gaussian_swaying.mpm.formulations.total import Total
 from gaussian_swaying.mpm.laws.fixed_corotated import FixedCorotated
 from gaussian_swaying.mpm.laws.hencky import StVKHencky
@@ -38,7 +41,6 @@ from gaussian_swaying.viewer.live_web.longest import longest_courant
 
 LAWS = (FixedCorotated, NeoHookean, StVKHencky, SpringNetwork)
 """The laws that a browser knows, by their number in the block."""
-
 
 OBSTACLES = (HalfSpaceObstacle, BallObstacle, CapsuleObstacle, BoxObstacle)
 """The obstacles that a browser knows, as long as they stand still."""
@@ -56,7 +58,8 @@ def check(simulation: Simulation) -> None:
     solver, setup = simulation.solver, simulation.setup
     if not isinstance(solver, MPMSolver):
         raise _refused("`custom_solver`", "leave it out")
-    if solver.formulation != "total":
+    sways = solver.formulation == "modes"
+    if not sways and solver.formulation != "total":
         raise _refused(f"`solver.formulation: {solver.formulation}`", "set it to total")
     if setup.scene.surface_places is not None and setup.scene.surface_places.contact is not None:
         raise _refused("`contact` of the material with itself", "set `contact` to null")
@@ -75,11 +78,15 @@ def check(simulation: Simulation) -> None:
     if setup.forces:
         raise _refused("`forces` of your own", "leave them out")
     wind = setup.wind
-    if type(wind) is not WindField or not wind.uniform:
-        raise _refused("a wind that differs from place to place", "leave out `wind.effects`")
+    stirred = sways and isinstance(wind, WindField) and list(map(type, wind.effects)) == [Turbulence]
+    if type(wind) is not WindField or not (wind.uniform or stirred):
+        remedy = "leave out `wind.effects`, of which `solver.formulation: modes` takes one Turbulence"
+        raise _refused("a wind that differs from place to place", remedy)
     for modulation in wind.modulations:
         if type(modulation) not in (SineSway, UniformGust, GaussianGust):
             raise _refused(f"the {type(modulation).__name__} in `wind.modulations`", "leave it out")
+    if sways:  # it checks the rest itself
+        return
     for law in setup.points.laws:
         if type(law) not in LAWS:
             known = ", ".join(one.__name__ for one in LAWS)
@@ -94,7 +101,12 @@ def in_webassembly(simulation: Simulation) -> bool:
     assert isinstance(solver, MPMSolver)
     known = {LAWS[0], LAWS[1]}
     plain = simulation.stepper.idle or aero.drag_step != "semi_implicit"
-    return plain and solver.stiffness_damping == 0 and all(type(law) in known for law in simulation.setup.points.laws)
+    return (
+        solver.formulation == "total"
+        and plain
+        and solver.stiffness_damping == 0
+        and all(type(law) in known for law in simulation.setup.points.laws)
+    )
 
 
 def _check_boundary(boundary: Any) -> None:
@@ -125,6 +137,21 @@ def pack_solver(simulation: Simulation, nodes: Tensor) -> bytes:
     assert isinstance(solver, MPMSolver)
     bound = solver.bound
     assert isinstance(bound, Total)
+    settings, scene = bound.settings, simulation.scene
+    head = {
+        "dx": settings.dx,
+        "gravity": list(settings.gravity),
+        "damping": settings.damping,
+        "viscous": settings.stiffness_damping,
+        "substep": solver.substep,
+        "frameDt": simulation.frame_dt,
+        "size": scene.size * scene.frame.metres_per_unit,
+        "idle": simulation.stepper.idle,
+        "wind": _wind(simulation.wind),
+    }
+    if isinstance(bound, Modes):
+        return _pack_modes(head, simulation, bound, nodes)
+    force = simulation.stepper.wind_force
     body, points, stencil = bound.body, bound.body.points, bound.stencil
     reached = stencil.node.reshape(-1, 27)
     unit = equal_rows(torch.cat([stencil.first[:, None], reached], 1))  # the points of a cell that have the same nodes
@@ -162,7 +189,7 @@ def pack_solver(simulation: Simulation, nodes: Tensor) -> bytes:
         "nodeDamping": bound.node_damping[active] if bound.node_damping is not None else points.mass.new_zeros(0),
         "nodeRest": bound.node_rest[active] if bound.node_rest is not None else active.new_zeros(0),
         "followed": row[nodes],
-        **_wind_arrays(simulation, order),
+        **_wind_arrays(force, order),
         **_samples(bound, row),
     }
     rows = 0
@@ -174,34 +201,59 @@ def pack_solver(simulation: Simulation, nodes: Tensor) -> bytes:
     else:
         arrays |= {name: active.new_zeros(0) for name in ("rowNode", "affected")}
         arrays |= {name: points.mass.new_zeros(0) for name in ("rowWeight", "push")}
-    settings, scene = bound.settings, simulation.scene
-    head = {
-        "dx": settings.dx,
-        "gravity": list(settings.gravity),
-        "damping": settings.damping,
-        "viscous": settings.stiffness_damping,
+    head |= {
         "cfl": solver.cfl,
         "longest": max(solver.cfl, longest_courant(bound)),
-        "substep": solver.substep,
-        "frameDt": simulation.frame_dt,
-        "size": scene.size * scene.frame.metres_per_unit,
         "planes": planes,
         "obstacles": obstacles,
         "iterations": bound.contact.iterations if bound.contact is not None else 0,
         "rows": rows,
-        "idle": simulation.stepper.idle,
         "lanes": in_webassembly(simulation),
-        "grouped": simulation.stepper.wind_force.sums is not None,
-        "aero": _aero(simulation),
-        "wind": _wind(simulation.wind),
+        "grouped": force.sums is not None,
+        "aero": _aero(force),
     }
     return _joined(head, arrays)
+
+
+def _pack_modes(head: dict[str, Any], simulation: Simulation, bound: Modes, nodes: Tensor) -> bytes:
+    """The block of a body that sways by its modes, with shapes in small whole numbers."""
+    force = simulation.stepper.wind_force.on_sites(bound.site, bound.sites)
+    omega = bound.square.sqrt()
+    every = [bound._everywhere(x.unflatten(-2, (-1, 3)).flatten(-2))[nodes] for x in (bound.shape, bound.turn)]
+    shapes = dict(zip(("siteShape", "siteTurn"), bound.site_modes.chunk(2, -2), strict=True))
+    shapes |= dict(zip(("nodeShape", "nodeTurn"), (x.reshape(-1, len(omega)) for x in every), strict=True))
+    arrays = {
+        "omega": omega,
+        "ratio": bound.ratio - (head["damping"] / omega + head["viscous"] * omega) / 2,  # that of the material
+        "rest": bound.site_rest,
+        "mass": bound.site_mass,
+        **_wind_arrays(force, torch.arange(bound.sites)),
+    }
+    for name, shape in shapes.items():  # loads of one size move a mode by 1 / omega^2, at a rate of 1 / omega
+        scaled = shape.double() / omega
+        largest = scaled.abs().amax(-1, keepdim=True)  # that of a speck may be a hundred times the usual one
+        step = (largest / 32767).clamp(min=float(largest[largest > 0].median()) / 256)
+        arrays |= {name: (scaled / step).round().short(), f"{name}Step": step}
+    wind = simulation.wind
+    assert isinstance(wind, WindField)
+    for effect in wind.effects:
+        assert isinstance(effect, Turbulence)
+        unit = float(effect.table.abs().max()) / 64
+        arrays["turbulence"] = (effect.table / unit).round().char()
+        head["wind"]["turbulence"] = {
+            "cells": list(effect.table.shape[:3]),
+            "axes": effect.axes.tolist(),
+            "side": effect.spacing[0],
+            "offset": effect.offset(torch.zeros(3, dtype=torch.float64)).tolist(),
+            "scale": effect.scale * unit,
+        }
+    return _joined(head | {"modes": list(shapes), "period": 2 * math.pi / bound.first, "aero": _aero(force)}, arrays)
 
 
 def _joined(head: dict[str, Any], arrays: dict[str, Tensor]) -> bytes:
     listed, blocks = [], []
     for name, values in arrays.items():
-        kind = "f4" if values.is_floating_point() else "i4"
+        kind = "f4" if values.is_floating_point() else {torch.int8: "i1", torch.int16: "i2"}.get(values.dtype, "i4")
         listed.append([name, kind, values.numel()])
         blocks.append(values.detach().cpu().contiguous().numpy().astype(np.dtype("<" + kind)).tobytes())
     text = json.dumps(head | {"arrays": listed}, allow_nan=False).encode()
@@ -250,8 +302,8 @@ def _samples(bound: Total, row: Tensor) -> dict[str, Tensor]:
     return {"sampleNode": row[contact.node], "sampleWeight": contact.weight, "samplePlace": place, "sampleHalf": half}
 
 
-def _aero(simulation: Simulation) -> dict[str, Any]:
-    aero = simulation.aero
+def _aero(force: WindForce) -> dict[str, Any]:
+    aero = force.aero
     return {
         "drag": float(aero.C_D),
         "friction": float(aero.C_F),
@@ -263,9 +315,8 @@ def _aero(simulation: Simulation) -> dict[str, Any]:
     }
 
 
-def _wind_arrays(simulation: Simulation, order: Tensor) -> dict[str, Tensor]:
+def _wind_arrays(force: WindForce, order: Tensor) -> dict[str, Tensor]:
     """The patches of each point: area vectors and the sum of A N N^T, or a unit normal and an area."""
-    force = simulation.stepper.wind_force
     sums, area = force.sums, force.area[order]
     if sums is None:
         return {"area": area, "patch": torch.cat([force.normal[order], area[:, None]], 1)}

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 import torch
 import yaml
+from small_scenes import GREEN, block, previewed
 
 from gaussian_swaying.simulation.simulation import Simulation
 from gaussian_swaying.viewer.film.recorded import order_of
@@ -49,16 +50,31 @@ def merged(settings, changes):
 SHOWN = "!!window.windPage || !document.getElementById('message').textContent.startsWith('Loading')"
 
 
-@pytest.fixture(scope="session")
-def make(tmp_path_factory):
-    """The simulation of a calm sheet, with some settings changed."""
+def maker(settings, tmp_path_factory):
+    """Makes the simulation of a configuration, with some settings changed."""
 
     def make(**changes):
-        path = tmp_path_factory.mktemp("calm") / "calm.yaml"
-        path.write_text(yaml.safe_dump(merged(CALM, changes)))
+        path = tmp_path_factory.mktemp("made") / "made.yaml"
+        path.write_text(yaml.safe_dump(merged(settings, changes)))
         return Simulation.from_yaml(path, device="cpu")
 
     return make
+
+
+@pytest.fixture(scope="session")
+def make(tmp_path_factory):
+    """The simulation of a calm sheet, with some settings changed."""
+    return maker(CALM, tmp_path_factory)
+
+
+@pytest.fixture(scope="session")
+def sway(tmp_path_factory):
+    """That of the starter of a shrub, which sways by modes in a wind with turbulence."""
+    folder = tmp_path_factory.mktemp("shrub")
+    preview, _ = previewed(
+        block([0.5, 0.4, 1.0], GREEN), folder, "--hold", "bottom", "--kind", "shrub", "--look", "gusts"
+    )
+    return maker(yaml.safe_load(preview.configurations["starter"]), tmp_path_factory)
 
 
 @pytest.fixture(scope="session")

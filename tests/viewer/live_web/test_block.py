@@ -135,6 +135,25 @@ def test_contact_with_what_stands_still(make, in_node, name):
         assert told[0]["substeps"] == steps
 
 
+ROUNDED = 5e-3
+"""Of the motion: shapes are rounded to some thousandths, and turbulence to a sixteenth of its standard deviation."""
+
+
+def test_the_starter_of_a_plant_by_its_modes(sway, in_node):
+    simulation = sway()
+    state, steps = run(simulation, 50)
+    steady, _ = run(sway(wind={"effects": []}), 50)
+    told, moved = in_node(simulation, {"kind": "frames", "count": 50})
+    error, motion = apart(simulation, state, moved)
+    assert motion > 0.05
+    assert float((state.position - steady.position).norm(dim=-1).max()) > 0.1 * motion
+    assert error < ROUNDED
+    assert told[0]["substeps"] == steps
+    effects = [{"class_path": f"gaussian_swaying.aero.{name}"} for name in ("carried.Turbulence", "effects.LogProfile")]
+    with pytest.raises(ValueError, match=r"of which `solver.formulation: modes` takes one Turbulence\.$"):
+        check(sway(wind={"effects": effects}))
+
+
 def test_parts_with_nodes_of_their_own(make, in_node, tmp_path):
     """Two sheets, less than a cell apart."""
     sheet = FlagScene(spacing=0.05).generate()
@@ -170,6 +189,28 @@ def test_what_the_visitor_does(make, in_node):
     assert -0.2 < float(pulled.min()) < -0.1
     beside, _ = in_node(make(), grab | {"eye": [2.0, 2.0, 0.0]})
     assert beside[0]["place"] is None
+
+
+def test_what_the_visitor_does_to_modes(sway, in_node):
+    """As above, of a shrub that weighs something."""
+    simulation = sway(solver={"gravity": [0.0, 0.0, -9.8]})
+    wind = {"kind": "wind", "flow": [0.0, -2.0, 0.0], "gusts": 0.0}
+    frames, stiffer = {"kind": "frames", "count": 10}, {"kind": "stiffness", "factor": 2.0}
+    _, moved = in_node(simulation, frames, wind, stiffer, {"kind": "reset"}, frames)
+    modulus = 2 * float(simulation.setup.points.youngs_modulus[0])
+    same = sway(
+        solver={"gravity": [0.0, 0.0, -9.8]}, wind={"flow": wind["flow"], "effects": []}, material={"E": modulus}
+    )
+    assert apart(same, run(same, 10)[0], moved)[0] < ROUNDED
+    simulation, calm = sway(), (wind | {"flow": [0.0, 0.0, 0.0]}, stiffer | {"factor": 0.125})
+    grab = {"kind": "grab", "token": 7, "eye": [0.0, -3.0, 0.4], "ray": [0.0, 1.0, 0.0], "wide": 0.01}
+    aim = {"kind": "aim", "target": [0.1, -0.24, 0.4]}
+    told, moved = in_node(simulation, *calm, grab, aim, frames)
+    assert told[0]["place"] == pytest.approx([0.0, -0.24, 0.4], abs=0.05)
+    along = moved_means(simulation, simulation.start(), moved) - simulation.scene.rest().means
+    assert 0.02 < along[:, 0].max() < 0.1
+    _, free = in_node(simulation, *calm, grab, aim, {"kind": "release"}, frames)
+    assert not free.any()
 
 
 class Lift(Force):
@@ -219,10 +260,12 @@ def test_the_worker_is_built_from_its_sources(request):
     own = [
         "aero.js",
         "block.js",
+        "body.js",
         "contact.js",
         "lanes.js",
         "laws.js",
         "matrices.js",
+        "modal.js",
         "points.ts",
         "solver.js",
         "substep.wgsl",

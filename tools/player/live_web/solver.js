@@ -1,8 +1,8 @@
 // The material point method in its total Lagrangian form; the definition is gaussian_swaying/mpm/formulations/total.py.
 import { onGroup, onPatch } from "./aero.js";
+import { Body, tug } from "./body.js";
 import { Contact } from "./contact.js";
 import { largestSquare, stress, waveModulus } from "./laws.js";
-import { Wind } from "./wind.js";
 
 export const LOOKS = 8; // checks of the Courant number in a frame, as in simulation/stepper.py
 const LIMIT = 0.5; // a frame that exceeds it is repeated with shorter substeps
@@ -11,30 +11,13 @@ const SAMPLES = 5; // winds of a frame that the drag is bounded with
 export const WIDE = 4; // numbers of a node, of which the last one means nothing
 const MOST_GROWTH = 1000; // a frame that takes this many times the substeps of the first has diverged
 
-/** @typedef {{held: Float64Array, offset: Float64Array, target: Float64Array}} Pull See gaussian_swaying/viewer/pull.py. */
-
-const REACH = 0.06; // radius of what is pulled, as a share of the longest side
-export const QUICK = 40; // 1/s
-export const STRONGEST = 400; // m/s²
-
-export class Solver {
+export class Solver extends Body {
   /** @param {{head: any, arrays: Record<string, any>}} block */
   constructor(block) {
+    super(block);
     const { head, arrays } = block;
-    this.head = head;
-    this.a = arrays;
-    this.points = arrays.volume.length;
     this.cells = arrays.cellStart.length - 1;
     this.nodes = arrays.inverseMass.length; // the last one stands for all without mass, and does not move
-    this.wind = new Wind(head.wind);
-    this.aero = { ...head.aero, maxAreaRatio: head.aero.maxAreaRatio ?? Infinity };
-    this.idle = head.idle;
-    /** Stiffness, as a multiple of that in the file. */
-    this.stiffness = 1;
-    /** Whether substeps are as long as is still stable; else they are those of the package. */
-    this.hurried = false;
-    /** @type {Pull | null} */
-    this.pull = null;
     this.displacement = new Float64Array(WIDE * this.nodes);
     this.velocity = new Float64Array(WIDE * this.nodes);
     this.force = new Float64Array(WIDE * this.nodes);
@@ -291,17 +274,11 @@ export class Solver {
   pulls(/** @type {Pull} */ pull) {
     const { rest, cellNodes } = this.a;
     for (let p = 0; p < this.points; p++) {
-      const held = pull.held[p];
-      if (held === 0) continue;
+      if (pull.held[p] === 0) continue;
       const first = 27 * this.cell[p];
       this.at(p, first);
       interpolate(v27, velocity);
-      const [x, y, z] = [0, 1, 2].map((m) => QUICK ** 2 * (pull.target[m] + pull.offset[3 * p + m] - rest[3 * p + m] - place[m]));
-      const limit = STRONGEST / Math.max(Math.hypot(x, y, z), STRONGEST);
-      const damping = 2 * QUICK * held;
-      out[0] = held * limit * x - damping * velocity[0];
-      out[1] = held * limit * y - damping * velocity[1];
-      out[2] = held * limit * z - damping * velocity[2];
+      const damping = tug(pull, p, place.map((x, m) => rest[3 * p + m] + x), velocity, out);
       for (let k = 0; k < 27; k++) for (let m = 0; m < 3; m++) this.force[WIDE * cellNodes[first + k] + m] += weightOf(k) * out[m];
       this.spreadResistance(first, damping);
     }
@@ -442,43 +419,6 @@ export class Solver {
   move(dt) {
     const { displacement: U, velocity: V } = this;
     for (let k = 0; k < U.length; k++) U[k] += dt * V[k];
-  }
-
-  // ---- the visitor
-
-  /**
-   * Takes hold of the material where a ray meets it.
-   * @param {number[]} eye [m] @param {number[]} ray unit vector @param {number} wide tangent of how far from the ray it may be
-   * @returns {number[] | null} the place [m]
-   */
-  grab(eye, ray, wide) {
-    const { rest, mass } = this.a;
-    const position = new Float64Array(3 * this.points);
-    let [best, at] = [Infinity, -1];
-    this.positions(position);
-    for (let p = 0; p < this.points; p++) {
-      let depth = 0;
-      for (let m = 0; m < 3; m++) depth += (position[3 * p + m] - eye[m]) * ray[m];
-      const off = Math.hypot(...[0, 1, 2].map((m) => position[3 * p + m] - eye[m] - depth * ray[m]));
-      const reached = Math.max(off - this.head.dx / 2, 0) / depth;
-      if (depth > 0 && reached < wide && depth + 20 * off < best) [best, at] = [depth + 20 * off, p];
-    }
-    if (at < 0) return null;
-    const centre = position.subarray(3 * at, 3 * at + 3);
-    const reach = REACH * this.head.size;
-    const held = new Float64Array(this.points);
-    const mean = [0, 0, 0];
-    let sum = 0;
-    for (let p = 0; p < this.points; p++) {
-      const far = Math.hypot(...[0, 1, 2].map((m) => position[3 * p + m] - centre[m]));
-      held[p] = far < reach || p === at ? mass[p] * Math.exp(-(((2 * far) / reach) ** 2)) : 0;
-      sum += held[p];
-      for (let m = 0; m < 3; m++) mean[m] += held[p] * position[3 * p + m];
-    }
-    for (let m = 0; m < 3; m++) mean[m] /= sum;
-    const offset = position.map((x, i) => x - mean[i % 3]);
-    this.pull = { held, offset, target: Float64Array.from(mean) };
-    return [...mean];
   }
 
   /** Places of all points [m]. */

@@ -1,6 +1,7 @@
 // The solver in compute shaders, where the browser has WebGPU. It computes frame by frame: the state at the start of each is uploaded, and
 // that at its end read back, so that all else is as in solver.js and another solver can go on where this one stops.
-import { Solver, QUICK, STRONGEST, LOOKS, WIDE } from "./solver.js";
+import { QUICK, STRONGEST } from "./body.js";
+import { LOOKS, Solver, WIDE } from "./solver.js";
 import { areaVectors, tensorOf } from "./lanes.js";
 import substep from "./substep.wgsl";
 import touch from "./touch.wgsl";

@@ -4,7 +4,8 @@
  * @typedef {{kind: "sway", amplitude: number, period: number, phase: number}} Sway
  * @typedef {{kind: "uniform", delta: number, interval: number, start: string}} UniformGust
  * @typedef {{kind: "gaussian", std: number, interval: number, start: string}} GaussianGust
- * @typedef {{times: number[], flows: number[][], linear: boolean, modulations: (Sway | UniformGust | GaussianGust)[]}} Flow
+ * @typedef {{times: number[], flows: number[][], linear: boolean, modulations: (Sway | UniformGust | GaussianGust)[],
+ *   turbulence?: {cells: number[], axes: number[][], side: number, offset: number[], scale: number}}} Flow
  */
 
 const WORD = (1n << 64n) - 1n;
@@ -28,10 +29,14 @@ export function normal(/** @type {bigint} */ start, /** @type {number} */ counte
   return Math.sqrt(-2 * Math.log(uniform(start, counter, lane))) * Math.cos(2 * Math.PI * uniform(start, counter, lane + 3));
 }
 
+const [share, corner] = [new Float64Array(3), new Int32Array(6)];
+
 export class Wind {
-  /** @param {Flow} flow */
-  constructor({ times, flows, linear, modulations }) {
-    Object.assign(this, { times, flows, linear });
+  /** @param {Flow} flow @param {Int8Array} [table] of the turbulence */
+  constructor({ times, flows, linear, modulations, turbulence }, table) {
+    Object.assign(this, { times, flows, linear, turbulence, table });
+    /** How far the air has come [m]. */
+    this.carried = [0, 0, 0];
     this.modulations = modulations.map((part) => ({ ...part, start: BigInt(part.start ?? 0) & WORD, at: -1, drawn: [0, 0, 0] }));
     /** How strong sway and gusts are, as a share of those in the file. */
     this.gusts = 1;
@@ -71,5 +76,33 @@ export class Wind {
         else v[i] *= 1 + this.gusts * part.delta * (2 * part.drawn[0] - 1);
     }
     out.set(v);
+  }
+
+  /** Lets the flow carry the air on. */
+  carry(/** @type {number} */ time, /** @type {number} */ dt) {
+    this.mean(time).forEach((flow, i) => (this.carried[i] += dt * flow));
+  }
+
+  /** Adds the turbulence at a place [m] to an air velocity; see CarriedField in gaussian_swaying/aero/carried.py. */
+  stir(/** @type {number} */ time, /** @type {Float64Array} */ place, /** @type {Float64Array} */ out) {
+    const { cells, axes, side, offset, scale } = this.turbulence;
+    for (let i = 0; i < 3; i++) {
+      let at = offset[i];
+      for (let m = 0; m < 3; m++) at += (axes[i][m] * (place[m] - this.carried[m])) / side;
+      const low = Math.floor(at);
+      share[i] = at - low;
+      corner[i] = low - cells[i] * Math.floor(low / cells[i]);
+      corner[3 + i] = (corner[i] + 1) % cells[i];
+    }
+    const strength = this.gusts * scale * Math.hypot(...this.mean(time));
+    for (let c = 0; c < 8; c++) {
+      let [weight, row] = [strength, 0];
+      for (let i = 0; i < 3; i++) {
+        const upper = (c >> i) & 1;
+        weight *= upper ? share[i] : 1 - share[i];
+        row = row * cells[i] + corner[3 * upper + i];
+      }
+      for (let i = 0; i < 3; i++) for (let m = 0; m < 3; m++) out[m] += weight * axes[i][m] * this.table[3 * row + i];
+    }
   }
 }

@@ -1,6 +1,7 @@
 // Runs the solver beside the page, in step with the clock. What it understands is in `does`, what it says in `post`.
 import { readBlock } from "./block.js";
 import { LanesSolver } from "./lanes.js";
+import { ModalSolver } from "./modal.js";
 import { Solver } from "./solver.js";
 import { GpuSolver, NoWebGPU, openGpu } from "./webgpu.js";
 
@@ -12,7 +13,7 @@ const LATE = 0.95; // of the wanted speed: below it substeps become longer
 const EASY = 0.4; // share of the time in which it computes: below it they are those of the package again
 const BREATH = 4; // ms between frames, in which it hears what the page says
 
-/** @type {Solver} */
+/** @type {any} */
 let solver;
 /** @type {{head: any, arrays: Record<string, any>}} */
 let block;
@@ -36,6 +37,7 @@ const post = (/** @type {any} */ message, /** @type {Transferable[]} */ moved = 
 
 /** The fastest solver on the processor that this browser has, or with `plain` that in JavaScript. */
 function made() {
+  if (block.head.modes) return new ModalSolver(block);
   if (!plain && block.head.lanes) {
     try {
       return new LanesSolver(block);
@@ -72,6 +74,7 @@ async function choose() {
     return;
   }
   if (solver instanceof GpuSolver) return;
+  if (solver instanceof ModalSolver) return tell("the object sways by modes");
   try {
     const found = await openGpu(block, wanted === "webgpu");
     queue(() => {
