@@ -19,9 +19,7 @@ from gaussian_swaying import (
     AeroForce,
     Box,
     Edit,
-    Force,
     Frame,
-    GaussianCloud,
     Material,
     MPMSolver,
     PinnedPoints,
@@ -30,10 +28,7 @@ from gaussian_swaying import (
     Scene,
     Simulation,
     SineSway,
-    SpatialWind,
     WindField,
-    load_trajectory,
-    write_ply,
 )
 from gaussian_swaying.config.parser import CUSTOM, PYTHON_ONLY, arguments_of
 from gaussian_swaying.mpm.laws.sand import Sand
@@ -41,8 +36,6 @@ from gaussian_swaying.scenes import FlagScene
 from gaussian_swaying.simulation.normalisation import Normalisation
 
 ROOT = Path(__file__).resolve().parents[2]
-PAGE = (ROOT / "docs" / "python.md").read_text()
-EXAMPLES = re.findall(r"```python\n(.*?)```\n\n```text\n(.*?)```", PAGE, flags=re.DOTALL)
 POLE = Box([None, None, None], [0.11, None, None])
 SMALL = {"hold": POLE, "material": Material(E=3e3, density=30.0), "wind": [6.0, 1.5, 0.0], "device": "cpu"}
 
@@ -52,38 +45,6 @@ def _flag(**changes):
 
 
 # ---- Python
-
-
-@pytest.mark.slow(gate=["three lines", "sequence", "by hand", "wind", "forces", "batches", "gradient"])
-@pytest.mark.parametrize(
-    ("example", "output"),
-    EXAMPLES,
-    ids=["three lines", "sequence", "by hand", "wind", "numbers", "forces", "supports", "batches", "gradient"],
-)
-def test_examples_of_the_page_print_what_it_shows(example, output, capsys, tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    exec(compile(example, "docs/python.md", "exec"), {})
-    printed, number = capsys.readouterr().out, r"[+-]?\d+\.\d+"
-    assert re.sub(number, "#", printed) == re.sub(number, "#", output)
-    for found, expected in zip(re.findall(number, printed), re.findall(number, output), strict=True):
-        digit = 10.0 ** -len(expected.split(".")[1])
-        assert float(found) == pytest.approx(float(expected), rel=0.02, abs=1.01 * digit)
-
-
-def test_the_page_has_an_example_for_each_heading():
-    assert len(EXAMPLES) == PAGE.count("```python") == PAGE.count("\n## ") == 9
-
-
-def test_a_file_its_gaussians_and_what_made_them_are_the_same(tmp_path):
-    source = FlagScene(spacing=0.1)
-    write_ply(tmp_path / "flag.ply", source.generate())
-    ends = []
-    for scene in (source, source.generate(), tmp_path / "flag.ply", str(tmp_path / "flag.ply")):
-        *_, last = Simulation(scene, **SMALL).frames(3)
-        ends.append(last.state.position)
-    assert isinstance(source.generate(), GaussianCloud)
-    assert all(torch.equal(end, ends[0]) for end in ends)
-    assert float((ends[0] - _flag().start().position).abs().max()) > 1e-3
 
 
 def test_a_frame_has_what_its_state_says():
@@ -107,62 +68,6 @@ def test_nothing_is_drawn_before_it_is_asked_for(monkeypatch):
     monkeypatch.setattr(type(simulation.painter), "colors", lambda *_: pytest.fail("a frame was shaded"))
     monkeypatch.setattr(type(simulation.painter), "deformed", lambda *_: pytest.fail("a frame was deformed"))
     assert len(list(simulation.frames(2))) == 2
-
-
-def test_frames_are_those_of_a_run(tmp_path):
-    """Also with an edit between two frames, and a second time from the same object."""
-    edits = [Edit(time=0.08, E=3e4, color=[1.0, 0.0, 0.0]), Edit(time=0.04, density=60.0)]
-    simulation = _flag(edits=edits)
-    simulation.run(tmp_path / "run", 5, progress=False, recorder=Recorder(images=False, video=False))
-    for _ in range(2):
-        for frame in simulation.frames(5):
-            position, F = load_trajectory(tmp_path / "run/trajectory.npz", frame.index)
-            now, strain = simulation.scene.surface(frame.state)
-            assert torch.equal(now, position)
-            torch.testing.assert_close(F.float(), strain, rtol=0, atol=2e-3)  # kept as float16
-        assert float(simulation.solver.points.youngs_modulus[0]) == 3e4
-    *_, plain = _flag().frames(5)
-    assert not torch.equal(plain.state.position, frame.state.position)
-
-
-def test_another_wind_holds_from_the_next_frame_on():
-    """The same as a run in that wind from the state in which it was assigned."""
-    simulation, ends = _flag(), []
-    for frame in simulation.frames(4):
-        if frame.index == 1:
-            simulation.wind, middle = WindField([0.0, -8.0, 0.0]), frame.state
-    other = _flag(wind=[0.0, -8.0, 0.0])
-    other.start()
-    for _ in range(2):
-        middle, _ = other.advance(middle)
-    assert torch.equal(middle.position, frame.state.position)
-    for aero in (AeroForce(C_D=0.0, C_F=0.0, C_L=0.0), AeroForce()):  # without effect, and with it again
-        simulation.aero = aero
-        ends.append(len(simulation.forces))
-    assert ends == [0, 1]
-
-
-class Shear(SpatialWind):
-    def forward(self, time, position):
-        return position[..., :1] * position.new_tensor([0.0, 5.0, 0.0])
-
-
-def test_a_wind_that_depends_on_the_place():
-    simulation = _flag(wind=Shear())
-    *_, last = simulation.frames(5)
-    moved = (last.state.position - simulation.scene.points.position)[:, 1]
-    tip, pole = (moved[simulation.scene.points.position[:, 0] * side > 0.3].mean() for side in (1, -1))
-    assert float(tip) > 0.01  # x > 0: the air goes to +y there, and to -y on the other side
-    assert float(pole) < 0
-
-
-def test_gradients_reach_the_wind():
-    wind = WindField([6.0, 1.5, 0.0])
-    wind.flows.requires_grad_()
-    simulation = _flag(wind=wind)
-    state, _ = simulation.advance(simulation.start())
-    state.position[:, 1].mean().backward()
-    assert float(wind.flows.grad[0, 1]) > 0
 
 
 # ---- nothing is said twice
@@ -255,49 +160,6 @@ def test_a_file_that_is_wrong(config, line, words):
     config.write_text(re.sub(rf"(?m)^{line.split(':')[0]}:.*\n", "", YAML) + line + "\n")
     with pytest.raises(ValueError, match=words):
         Simulation.from_yaml(config)
-
-
-FORCES = '''
-import torch
-from gaussian_swaying import Force
-
-
-class Pull(Force):
-    """Towards a place given in scene units."""
-
-    recordable = True
-
-    def __init__(self, target: list[float], strength: float = 1.0) -> None:
-        super().__init__()
-        self.register_buffer("target", torch.tensor(target))
-        self.strength = strength
-
-    def in_frame(self, frame):
-        return Pull(frame.point_to_sim(self.target.double()).tolist(), self.strength)
-
-    def forward(self, state):
-        return self.strength * (self.target.to(state.position) - state.position)
-'''
-
-
-def test_a_force_of_another_package_by_its_class_path(config, tmp_path, monkeypatch):
-    (tmp_path / "my_forces.py").write_text(FORCES)
-    monkeypatch.syspath_prepend(tmp_path)
-    given = "forces:\n  - class_path: my_forces.Pull\n    init_args: {target: [1.0, 3.0, 0.5], strength: 0.2}\n"
-    config.write_text(YAML.replace("device:", given + "device:"))
-    simulation = Simulation.from_yaml(config, wind=[0, 0, 0], aero=AeroForce(C_D=0.0, C_F=0.0, C_L=0.0))
-    (force,) = simulation.forces
-    assert isinstance(force, Force)
-    place = simulation.scene.frame.point_to_sim(torch.tensor([1.0, 3.0, 0.5], dtype=torch.float64))
-    torch.testing.assert_close(force.target.double(), place, rtol=0, atol=1e-6)
-    *_, last = simulation.frames(4)
-    assert float((last.state.position - simulation.scene.points.position)[:, 1].mean()) > 1e-3
-    *_, still = Simulation.from_yaml(config, forces=[], wind=[0, 0, 0]).frames(4)
-    assert float((still.state.position - simulation.scene.points.position)[:, 1].mean().abs()) < 1e-3
-    # the same list, in Python
-    own = sys.modules["my_forces"].Pull([1.0, 3.0, 0.5], 0.2)
-    *_, same = Simulation.from_yaml(config, forces=[own], wind=[0, 0, 0], aero=simulation.aero).frames(4)
-    assert torch.equal(same.state.position, last.state.position)
 
 
 def test_settings_are_not_changed_by_a_simulation():
@@ -577,12 +439,6 @@ def test_a_camera_that_is_not_there():
     (frame,) = _flag().frames(1)
     with pytest.raises(ValueError, match="no camera 'side'"):
         frame.render("side")
-
-
-def test_a_function_is_a_force_too():
-    simulation = _flag(wind=None, forces=[lambda state: torch.tensor([0.0, 0.01, 0.0]).expand_as(state.velocity)])
-    *_, last = simulation.frames(3)
-    assert float((last.state.position - simulation.scene.points.position)[:, 1].mean()) > 1e-4
 
 
 def test_a_normalisation_leaves_the_components_as_they_are():

@@ -1,0 +1,142 @@
+"""Simulation as users meet it in Python and in a YAML: short forms, frames, winds, gradients, several together."""
+
+import re
+from pathlib import Path
+
+import pytest
+import torch
+
+from gaussian_swaying import (
+    AeroForce,
+    Box,
+    Edit,
+    GaussianCloud,
+    Material,
+    MPMSolver,
+    PinnedRegion,
+    Recorder,
+    Simulation,
+    SpatialWind,
+    WindField,
+    load_trajectory,
+    write_ply,
+)
+from gaussian_swaying.scenes import FlagScene
+from gaussian_swaying.simulation.batch import batch_of
+
+ROOT = Path(__file__).resolve().parents[2]
+PAGE = (ROOT / "docs" / "python.md").read_text()
+EXAMPLES = re.findall(r"```python\n(.*?)```\n\n```text\n(.*?)```", PAGE, flags=re.DOTALL)
+POLE = Box([None, None, None], [0.11, None, None])
+SMALL = {"hold": POLE, "material": Material(E=3e3, density=30.0), "wind": [6.0, 1.5, 0.0], "device": "cpu"}
+
+
+def _flag(**changes):
+    return Simulation(FlagScene(spacing=0.1), **(SMALL | changes))
+
+
+@pytest.mark.slow(gate=["three lines", "sequence", "by hand", "wind", "forces", "batches", "gradient"])
+@pytest.mark.parametrize(
+    ("example", "output"),
+    EXAMPLES,
+    ids=["three lines", "sequence", "by hand", "wind", "numbers", "forces", "supports", "batches", "gradient"],
+)
+def test_examples_of_the_page_print_what_it_shows(example, output, capsys, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    exec(compile(example, "docs/python.md", "exec"), {})
+    printed, number = capsys.readouterr().out, r"[+-]?\d+\.\d+"
+    assert re.sub(number, "#", printed) == re.sub(number, "#", output)
+    for found, expected in zip(re.findall(number, printed), re.findall(number, output), strict=True):
+        digit = 10.0 ** -len(expected.split(".")[1])
+        assert float(found) == pytest.approx(float(expected), rel=0.02, abs=1.01 * digit)
+
+
+def test_the_page_has_an_example_for_each_heading():
+    assert len(EXAMPLES) == PAGE.count("```python") == PAGE.count("\n## ") == 9
+
+
+def test_a_file_its_gaussians_and_what_made_them_are_the_same(tmp_path):
+    source = FlagScene(spacing=0.1)
+    write_ply(tmp_path / "flag.ply", source.generate())
+    ends = []
+    for scene in (source, source.generate(), tmp_path / "flag.ply", str(tmp_path / "flag.ply")):
+        *_, last = Simulation(scene, **SMALL).frames(3)
+        ends.append(last.state.position)
+    assert isinstance(source.generate(), GaussianCloud)
+    assert all(torch.equal(end, ends[0]) for end in ends)
+    assert float((ends[0] - _flag().start().position).abs().max()) > 1e-3
+
+
+def test_frames_are_those_of_a_run(tmp_path):
+    """Also with an edit between two frames, and a second time from the same object."""
+    edits = [Edit(time=0.08, E=3e4, color=[1.0, 0.0, 0.0]), Edit(time=0.04, density=60.0)]
+    simulation = _flag(edits=edits)
+    simulation.run(tmp_path / "run", 5, progress=False, recorder=Recorder(images=False, video=False))
+    for _ in range(2):
+        for frame in simulation.frames(5):
+            position, F = load_trajectory(tmp_path / "run/trajectory.npz", frame.index)
+            now, strain = simulation.scene.surface(frame.state)
+            assert torch.equal(now, position)
+            torch.testing.assert_close(F.float(), strain, rtol=0, atol=2e-3)  # kept as float16
+        assert float(simulation.solver.points.youngs_modulus[0]) == 3e4
+    *_, plain = _flag().frames(5)
+    assert not torch.equal(plain.state.position, frame.state.position)
+
+
+def test_another_wind_holds_from_the_next_frame_on():
+    """The same as a run in that wind from the state in which it was assigned."""
+    simulation, ends = _flag(), []
+    for frame in simulation.frames(4):
+        if frame.index == 1:
+            simulation.wind, middle = WindField([0.0, -8.0, 0.0]), frame.state
+    other = _flag(wind=[0.0, -8.0, 0.0])
+    other.start()
+    for _ in range(2):
+        middle, _ = other.advance(middle)
+    assert torch.equal(middle.position, frame.state.position)
+    for aero in (AeroForce(C_D=0.0, C_F=0.0, C_L=0.0), AeroForce()):  # without effect, and with it again
+        simulation.aero = aero
+        ends.append(len(simulation.forces))
+    assert ends == [0, 1]
+
+
+class Shear(SpatialWind):
+    def forward(self, time, position):
+        return position[..., :1] * position.new_tensor([0.0, 5.0, 0.0])
+
+
+def test_a_wind_that_depends_on_the_place():
+    simulation = _flag(wind=Shear())
+    *_, last = simulation.frames(5)
+    moved = (last.state.position - simulation.scene.points.position)[:, 1]
+    tip, pole = (moved[simulation.scene.points.position[:, 0] * side > 0.3].mean() for side in (1, -1))
+    assert float(tip) > 0.01  # x > 0: the air goes to +y there, and to -y on the other side
+    assert float(pole) < 0
+
+
+def test_a_function_is_a_force_too():
+    simulation = _flag(wind=None, forces=[lambda state: torch.tensor([0.0, 0.01, 0.0]).expand_as(state.velocity)])
+    *_, last = simulation.frames(3)
+    assert float((last.state.position - simulation.scene.points.position)[:, 1].mean()) > 1e-4
+
+
+@pytest.mark.parametrize("formulation", ["total", "updated"])
+def test_runs_in_one_rollout_end_as_each_alone(formulation):
+    """They differ in wind and material; the substep of the rollout is the shortest, so all have a fixed one."""
+    pins = [PinnedRegion(POLE)]
+    solver = MPMSolver(dx=0.2, formulation=formulation, substep=2e-3, boundaries=pins, transfer="torch")
+    first = _flag(hold=None, solver=solver, dtype="float64")
+    members = [first, first.variant({"wind.speed": 9.0}), first.variant({"material.E": 2e4, "wind.azimuth": 50.0})]
+    batch = batch_of(members)
+    state = batch.start()
+    for _ in range(3):
+        state, _ = batch.advance(state)
+    ends = []
+    for member in members:
+        alone = member.start()
+        for _ in range(3):
+            alone, _ = member.advance(alone)
+        ends.append(alone.position)
+    # forces are added in another order, some ten times in each of 60 substeps
+    torch.testing.assert_close(state.position, torch.stack(ends), rtol=0, atol=1e-12)
+    assert all(float((ends[k] - ends[0]).abs().max()) > 1e-3 for k in (1, 2))
