@@ -202,17 +202,6 @@ def test_walls_of_a_scene_where_nothing_stands_still_are_refused():
         _simulation(air=ComputedAir(LOW, HIGH, 27, speed=6.0, still_walls=True)).stepper.start()
 
 
-def test_a_checkpoint_goes_on_bit_by_bit():
-    stepper, state, _ = _run(_simulation(), 2)
-    saved = type(state).from_state_dict(state.state_dict())
-    first, _ = stepper.advance(state)
-    again = _simulation().stepper
-    again.start()
-    second, _ = again.advance(saved)
-    assert torch.equal(first.position, second.position)
-    assert torch.equal(first.air, second.air)
-
-
 def test_a_batch_gradients_and_another_frame_are_refused():
     stepper, state, _ = _run(_simulation(), 1)
     with pytest.raises(RuntimeError, match="no gradients"):

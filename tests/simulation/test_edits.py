@@ -17,7 +17,6 @@ from gaussian_swaying.mpm.laws.plasticine import Plasticine
 from gaussian_swaying.mpm.laws.sand import Sand
 from gaussian_swaying.mpm.state import MaterialPoints
 from gaussian_swaying.recording.recorder import Recorder
-from gaussian_swaying.recording.trajectory import load_trajectory
 from gaussian_swaying.simulation.edits import Edit, edited_points, recolored
 from gaussian_swaying.simulation.material import Material, MaterialRegion
 
@@ -249,29 +248,6 @@ def test_the_kernels_take_an_edit(formulation, make_cloud, make_simulation):
         torch.testing.assert_close(two, one, rtol=0, atol=2e-4 * float(one.abs().max()))
     gap = float((ends[0].F_total - ends[0].F_elastic).abs().max())
     assert gap > 0.02 if formulation == "updated" else gap == 0
-
-
-@pytest.mark.parametrize("stop", [2, 3])
-def test_a_resumed_run_is_the_same_run(stop, make_simulation, tmp_path):
-    """Stopped before or after the edit, positions and pictures are those of the run that was not."""
-    edits = [
-        Edit(_free_half(), time=0.0, color=[0.0, 1.0, 0.0]),
-        Edit(_free_half(), time=0.08, E=2e4, density=60.0, law=NeoHookean(), color=WHITE),
-    ]
-    one, two = tmp_path / "one", tmp_path / "two"
-    whole = _with(make_simulation(), *edits).run(one, 5, progress=False, recorder=Recorder())
-    _with(make_simulation(), *edits).run(two, stop, progress=False, recorder=Recorder())
-    resumed = _with(make_simulation(), *edits).run(two, 5, resume=True, progress=False, recorder=Recorder())
-    assert resumed["per_frame"] == whole["per_frame"]
-    assert resumed["edits"] == whole["edits"] == 2
-    for frame in range(5):
-        position, F = load_trajectory(two / "trajectory.npz", frame)
-        expected, expected_F = load_trajectory(one / "trajectory.npz", frame)
-        assert torch.equal(position, expected)
-        assert torch.equal(F, expected_F)
-        name = f"frames/{frame:05d}.png"
-        assert (two / name).read_bytes() == (one / name).read_bytes()
-    assert (one / "frames/00001.png").read_bytes() != (one / "frames/00002.png").read_bytes()
 
 
 def test_what_cannot_be_is_refused_before_anything_is_written(make_simulation, tmp_path):

@@ -13,7 +13,6 @@ from gaussian_swaying.aero.effects import LogProfile
 from gaussian_swaying.aero.obstacles import SphereObstacle
 from gaussian_swaying.aero.shelter import Shelter
 from gaussian_swaying.aero.wind import WindField
-from gaussian_swaying.recording.recorder import Recorder
 from gaussian_swaying.simulation.simulation import Simulation
 from gaussian_swaying.simulation.stepper import parts_of
 
@@ -48,20 +47,6 @@ def test_shelter_is_refreshed_in_every_frame(make_simulation):
         tables.append(simulation.wind.effects[0].table.clone())
     assert float(tables[0].min()) < 0.99
     assert not torch.equal(tables[0], tables[2])
-
-
-def test_a_run_in_such_a_wind_resumes_bit_for_bit(make_simulation, tmp_path):
-    recorder = Recorder(images=False, video=False)
-    whole, parts = make_simulation(), make_simulation()
-    for simulation in (whole, parts):
-        simulation.wind = _wind()
-    whole.run(tmp_path / "whole", 6, progress=False, recorder=recorder)
-    parts.run(tmp_path / "parts", 3, progress=False, recorder=recorder)
-    later = make_simulation()
-    later.wind = _wind()
-    later.run(tmp_path / "parts", 6, resume=True, progress=False, recorder=Recorder(images=False, video=False))
-    ends = [torch.load(tmp_path / name / "checkpoint.pt", weights_only=True)["state"] for name in ("whole", "parts")]
-    assert torch.equal(ends[0]["position"], ends[1]["position"])
 
 
 def test_every_effect_can_be_named_in_a_configuration(tmp_path):
