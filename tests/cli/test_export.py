@@ -98,13 +98,6 @@ def test_damaged_summary(changes, tmp_path, capsys):
     refused(main, [str(run / "ply"), str(tmp_path / "film.usdc")], capsys, *words)
 
 
-def test_files_of_viewers_are_read_again(tmp_path):
-    write_ply(tmp_path / "flag.ply", FlagScene(spacing=0.1).generate())
-    for source, target in (("flag.ply", "a.compressed.ply"), ("a.compressed.ply", "b.splat"), ("b.splat", "c.ply")):
-        assert main([str(tmp_path / source), str(tmp_path / target)]) == 0
-    assert len(read_ply(tmp_path / "c.ply")) == 96
-
-
 def test_the_version_of_spz(tmp_path, capsys):
     pytest.importorskip("zstandard")
     write_ply(tmp_path / "flag.ply", FlagScene(spacing=0.1).generate())

@@ -53,18 +53,6 @@ def check_refused(arguments, output, capsys, *words):
 # ---- what works
 
 
-def test_a_run(tmp_path, capsys):
-    assert main([*SMALL, "--output", str(tmp_path / "run")]) == 0
-    out = capsys.readouterr().out
-    assert "96 of 96 Gaussians simulated on cpu" in out
-    assert "1 scene unit = 1 m" in out
-    for name in ("video.mp4", "trajectory.npz", "summary.json", "frames", "diagnostics.csv", "checkpoint.pt"):
-        assert f"wrote {tmp_path / 'run' / name}\n" in out
-    summary = json.loads((tmp_path / "run" / "summary.json").read_text())
-    assert summary["config"] == [str(FLAG)]
-    assert summary["frames"] == 2
-
-
 def test_a_material_that_flows(tmp_path, capsys):
     """A law with its own arguments on the command line; `total` refuses it in one sentence."""
     law = ["--material.law", "Sand", "--material.law.init_args.friction_angle", "35"]
@@ -353,17 +341,12 @@ def test_a_bad_splat(make, words, tmp_path, capsys):
 
 # ---- bad settings
 
-EMPTY_BOX = '{"class_path": "Box", "init_args": {"min": [5, 5, 5], "max": [6, 6, 6]}}'
-INSIDE = '{"class_path": "LookAtCamera", "init_args": {"eye": [0.6, 0.0, 0.4], "target": [0.6, 1.0, 0.4]}}'
 GUST = '[{"class_path": "SineSway", "init_args": {"amplitud": 1.0}}]'
 
 
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
-        (["--scene.region", EMPTY_BOX], ["No Gaussian is selected", "Box(min=[5.0", "move the region"]),
-        (["--scene.opacity_threshold", "0.999"], ["opacity threshold", "lower the threshold"]),
-        (["--solver.boundaries", _pin([5, 5, 5], [6, 6, 6])], ["holds no particle", "`region`"]),
         (["--bogus", "1"], ["--bogus", "--help"]),
         (["--scene.bogus", "1"], ["--scene.bogus", "--help"]),
         (["--scene.generator.init_args.spacng", "0.1"], ["spacng", "scene.generator", "--help"]),
@@ -373,7 +356,6 @@ GUST = '[{"class_path": "SineSway", "init_args": {"amplitud": 1.0}}]'
         (["--frames", "0"], ["`frames`", "from 1 to"]),
         (["--frame_dt", "0"], ["`frame_dt`"]),
         (["--background", "[0.5]"], ["`background`", "3 numbers"]),
-        (["--material.nu", "0.5"], ["`material.nu`", "0.49"]),
         (["--material.nu", "0.7"], ["`material.nu`"]),
         (["--material.E", "0"], ["`material.E`", "positive"]),
         (["--material.E", "-5"], ["`material.E`"]),
@@ -383,13 +365,9 @@ GUST = '[{"class_path": "SineSway", "init_args": {"amplitud": 1.0}}]'
         (["--material.volume", "cube"], ['"material.volume": Expected one of patch, cell']),
         (["--wind.flow", "[1.0, 2.0]"], ["`flow`", "3 numbers"]),
         (["--scene.up", "[0, 0, 0]"], ["`scene.up`", "[0, -1, 0]"]),
-        (["--scene.longest_side", "1.0"], ["longest_side", "metres_per_unit", "not both"]),
         (["--solver.dx", "0"], ["`dx`"]),
         (["--solver.formulation", "totl"], ["solver.formulation", "Expected one of total, updated"]),
-        (["--solver.substep", "1.0"], ["`substep` of 1 s", "stable one of 0.0", "lower it"]),
-        (["--camera", INSIDE], ["camera", "inside the object", "move it out"]),
         (["--recorder.images", "false"], ["`recorder.images`"]),
-        (["--config", "/nowhere/at_all.yaml"], ["/nowhere/at_all.yaml", "does not exist"]),
     ],
     ids=lambda value: " ".join(value)[:40] if value and value[0].startswith("--") else "",
 )

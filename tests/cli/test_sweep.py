@@ -66,17 +66,3 @@ def test_unknown_options_end_with_usage(capsys):
     with pytest.raises(SystemExit) as left:
         program(["sweep", "flag_winds", "--worker-count", "3"])
     assert left.value.code == 2
-
-
-def test_a_sweep_from_the_installed_program(tmp_path, monkeypatch, capsys):
-    """Two runs, and the files that are named."""
-    monkeypatch.chdir(tmp_path)
-    settings = {"frames": 2, "scene.generator.init_args.spacing": 0.1, "solver.dx": 0.2, "solver.boundaries": []}
-    settings |= {"camera.init_args.width": 32, "camera.init_args.height": 18, "recorder.video": False}
-    file = _file(tmp_path / "two.yaml", settings=settings, axes={"wind.seed": [1, 2]})
-    assert program(["sweep", file, "--workers", "1", "--device", "cpu"]) == 0
-    out = capsys.readouterr().out
-    assert "2 runs: 2 complete" in out
-    for name in ("runs", "sweep.csv", "contact_sheet.png"):
-        assert f"wrote outputs/sweeps/two/{name}\n" in out
-        assert (tmp_path / "outputs/sweeps/two" / name).exists()
