@@ -73,4 +73,5 @@ def _seed():
 
 
 # now that the environment is set
+from small_films import own  # noqa: E402, F401
 from small_scenes import flag_ply, make_cloud, make_scene, make_simulation  # noqa: E402, F401

@@ -7,6 +7,7 @@ import pytest
 import torch
 import yaml
 from bench.problems.films import write_video
+from small_films import TRUTH, base, cameras
 
 from gaussian_swaying.fitting.changing import KNOTS, WALK, changes_of, knots_of, prior_of, steady_share
 from gaussian_swaying.fitting.fit import fit
@@ -14,8 +15,6 @@ from gaussian_swaying.fitting.plan import Plan, read_plan
 from gaussian_swaying.fitting.unknowns import FILM_START, Unknown
 from gaussian_swaying.fitting.variants import states_of
 from gaussian_swaying.simulation.simulation import Simulation
-
-from .conftest import TRUTH, base, cameras
 
 SPEED, AZIMUTH = Unknown("wind.speed", 2.0, 12.0, "log"), Unknown("wind.azimuth", -20.0, 100.0)
 

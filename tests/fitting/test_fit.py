@@ -3,7 +3,6 @@
 Covers: fitting.held_out.
 """
 
-import csv
 import json
 import math
 import shutil
@@ -12,6 +11,7 @@ from dataclasses import replace
 import pytest
 import torch
 import yaml
+from small_films import TRUTH, base
 
 from gaussian_swaying.fitting.fit import GRIDS, ROUNDS, Course, Fit, fit, run_fit
 from gaussian_swaying.fitting.held_out import HELD
@@ -20,37 +20,9 @@ from gaussian_swaying.fitting.rivals import SHAKEN
 from gaussian_swaying.fitting.videos import read_videos
 from gaussian_swaying.simulation.simulation import Simulation
 
-from .conftest import TRUTH, base
-
 pytest.importorskip("cv2", reason="needs the extra [fit]")
 
 SOUGHT = {"wind.speed": [2.0, 12.0], "wind.azimuth": [-20.0, 100.0], "material.E": [2e3, 5e4]}
-
-
-def test_own_data_with_noise(own, tmp_path, capsys):
-    """Easier than a real video, as the model is right: within 1 % and 1 degree."""
-    result = fit(own / "base.yaml", own / "video", SOUGHT, tmp_path / "fit", device="cpu", search=16, progress=False)
-    values = result.values
-    assert values["wind.speed"] == pytest.approx(TRUTH["wind.speed"], rel=0.01)
-    assert values["material.E"] == pytest.approx(TRUTH["material.E"], rel=0.01)
-    assert values["wind.azimuth"] == pytest.approx(TRUTH["wind.azimuth"], abs=1.0)
-    assert result.verdict == "doubtful"  # on a grid of four cells
-    assert result.vague == ["wind.azimuth", "material.E"]
-    assert set(result.followed) == {"left", "right"}
-    assert min(result.followed.values()) > 0.95
-    assert not result.at_an_end
-    for shown in result.shown:
-        assert shown.fitted > 35
-        assert shown.predicted > 35
-    with (tmp_path / "fit/values.csv").open() as file:
-        rows = {row["name"]: row for row in csv.DictReader(file)}
-    assert float(rows["material.E"]["value"]) == values["material.E"]
-    assert float(rows["wind.speed"]["standard_error"]) == result.errors["wind.speed"] > 0
-    assert (tmp_path / "fit/pictures/left.png").stat().st_size > 0
-    assert json.loads((tmp_path / "fit/result.json").read_text())["not_determined"] == result.vague
-    again = Simulation.from_yaml(tmp_path / "fit/scene.yaml", device="cpu")
-    assert pytest.approx(values["material.E"]) == again.material.E
-    assert float(again.wind.flows[0].norm()) == pytest.approx(values["wind.speed"])
 
 
 def test_starts_that_are_far_off(own, tmp_path, capsys):

@@ -5,6 +5,7 @@ import math
 import pytest
 import torch
 import yaml
+from small_films import base
 
 from gaussian_swaying.fitting.evidence import PictureEvidence, TrackEvidence, compare
 from gaussian_swaying.fitting.grids import distrust, trusted
@@ -12,8 +13,6 @@ from gaussian_swaying.fitting.held_out import NOISE
 from gaussian_swaying.fitting.tracks import track
 from gaussian_swaying.fitting.videos import read_videos
 from gaussian_swaying.simulation.simulation import Simulation
-
-from .conftest import base
 
 pytest.importorskip("cv2", reason="needs the extra [fit]")
 

@@ -4,14 +4,13 @@ from dataclasses import replace
 
 import pytest
 import torch
+from small_films import cameras
 
 from gaussian_swaying import Simulation
 from gaussian_swaying.fitting import overlap
 from gaussian_swaying.fitting.overlap import Overlap, drawn_beside
 from gaussian_swaying.rendering.cameras.camera import project
 from gaussian_swaying.scenes.procedural import FlagScene
-
-from .conftest import cameras
 
 
 def test_where_a_gaussian_is_drawn_is_the_mean_of_its_pixels(simulation):

@@ -4,14 +4,13 @@ import math
 
 import pytest
 import torch
+from small_films import TRUTH
 
 from gaussian_swaying.fitting.fit import Fit
 from gaussian_swaying.fitting.plan import Plan, read_unknown
 from gaussian_swaying.fitting.rivals import SCANNED, SHAKEN, apart_by, bent_alike, mirrored, rivals_of
 from gaussian_swaying.fitting.videos import read_videos
 from gaussian_swaying.simulation.parameters import flow_of
-
-from .conftest import TRUTH
 
 pytest.importorskip("cv2", reason="needs the extra [fit]")
 

@@ -4,14 +4,13 @@ import pytest
 import torch
 import yaml
 from bench.problems.fit_films import Film, settings_of
+from small_films import base
 
 from gaussian_swaying.fitting.report import scene_text
 from gaussian_swaying.fitting.scale import SCALE
 from gaussian_swaying.fitting.unknowns import Unknown, check_unknowns
 from gaussian_swaying.fitting.variants import states_of
 from gaussian_swaying.simulation.simulation import Simulation
-
-from .conftest import base
 
 TIMES = [0.0, 0.1, 0.2, 0.3]
 

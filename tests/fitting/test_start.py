@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import pytest
 import torch
+from small_films import TRUTH
 
 from gaussian_swaying.fitting.evidence import TrackEvidence, compare, compare_starts
 from gaussian_swaying.fitting.fit import Course, Fit, fit
@@ -14,8 +15,6 @@ from gaussian_swaying.fitting.tracks import track
 from gaussian_swaying.fitting.unknowns import FILM_START, Unknown, default_scale
 from gaussian_swaying.fitting.variants import states_of
 from gaussian_swaying.fitting.videos import read_videos
-
-from .conftest import TRUTH
 
 pytest.importorskip("cv2", reason="needs the extra [fit]")
 

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import torch
 import yaml
+from small_films import base
 
 from gaussian_swaying.fitting.evidence import TrackEvidence
 from gaussian_swaying.fitting.overlap import drawn_beside, window_of
@@ -16,8 +17,6 @@ from gaussian_swaying.rendering.cameras.camera import look_at_camera, project
 from gaussian_swaying.rendering.protocol import RenderOutput
 from gaussian_swaying.scenes.printed_cloth import printed_colours
 from gaussian_swaying.simulation.simulation import Simulation
-
-from .conftest import base
 
 cv2 = pytest.importorskip("cv2", reason="needs the extra [fit]")
 

@@ -3,12 +3,11 @@
 import pytest
 import torch
 import yaml
+from small_films import base
 
 from gaussian_swaying.fitting.unknowns import Unknown, check_unknowns
 from gaussian_swaying.simulation.parameters import flow_of, with_values
 from gaussian_swaying.simulation.simulation import Simulation
-
-from .conftest import base
 
 
 @pytest.mark.parametrize("scale", ["log", "linear"])

@@ -3,6 +3,7 @@
 import pytest
 import torch
 import yaml
+from small_films import base
 
 from gaussian_swaying.aero.force import AeroForce
 from gaussian_swaying.aero.patches import Patches
@@ -15,8 +16,6 @@ from gaussian_swaying.mpm.state import MaterialPoints
 from gaussian_swaying.scenes.procedural import FlagScene
 from gaussian_swaying.simulation import stepper
 from gaussian_swaying.simulation.simulation import Simulation
-
-from .conftest import base
 
 TIMES = [0.0, 1 / 24, 2 / 24, 4 / 24]
 

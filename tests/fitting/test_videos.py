@@ -10,11 +10,10 @@ import imageio_ffmpeg
 import numpy as np
 import pytest
 import torch
+from small_films import FRAMES, cameras
 
 from gaussian_swaying.fitting import videos
 from gaussian_swaying.fitting.videos import frame_times, read_videos
-
-from .conftest import FRAMES, cameras
 
 
 def test_two_cameras(own):

@@ -1,0 +1,74 @@
+"""Pages that a user can put on any website, in a browser: the film of a run, and a simulation."""
+
+import io
+import json
+
+import imageio.v3 as iio
+import numpy as np
+import pytest
+
+from gaussian_swaying.cli.main import main
+
+POLE = {"class_path": "Box", "init_args": {"min": [None] * 3, "max": [0.11, None, None]}}
+PIN = {"class_path": "PinnedRegion", "init_args": {"region": POLE}}
+SMALL = ["--scene.generator.init_args.spacing=0.05", "--solver.dx=0.1", f"--solver.boundaries={json.dumps([PIN])}"]
+GRAPHICS = ["--no-sandbox", "--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"]
+
+
+@pytest.fixture
+def show(chromium):
+    """Opens a page and waits until an expression is true there; what it tells and asks for is kept."""
+    from playwright.sync_api import sync_playwright
+
+    with sync_playwright() as driver:
+        browser = driver.chromium.launch(executable_path=chromium, args=GRAPHICS)
+
+        def show(path, ready):
+            page = browser.new_page(viewport={"width": 480, "height": 270})
+            page.told, page.asked = [], []
+            page.on("console", lambda message: page.told.append(message.text))
+            page.on("pageerror", lambda error: page.told.append(str(error)))
+            page.on("request", lambda request: page.asked.append(request.url))
+            page.goto(path.as_uri())
+            page.wait_for_function(ready, timeout=60_000)
+            return page
+
+        yield show
+        browser.close()
+
+
+def picture(page):
+    """The canvas without the controls, shape (H, W, 3)."""
+    page.add_style_tag(content="header, footer { display: none !important; }")
+    return iio.imread(io.BytesIO(page.screenshot()))[..., :3].astype(float)
+
+
+def check_motion(page, before):
+    """The picture has changed, nothing went wrong, and nothing was asked of a network."""
+    assert np.abs(picture(page) - before).max() > 20
+    assert page.told == []
+    assert [url for url in page.asked if not url.startswith(("file:", "data:", "blob:"))] == []
+
+
+def test_a_film(show, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    size = ["--camera.init_args.width=64", "--camera.init_args.height=36"]
+    assert main(["sim", "--config=flag", "--device=cpu", "--frames=6", "--output=run", *SMALL, *size]) == 0
+    assert main(["export", "--web", "run"]) == 0
+    page = show(tmp_path / "run/film.html", "!!window.film")
+    page.evaluate("film.seek(0)")
+    assert page.evaluate("film.frame()") == 0
+    before = picture(page)
+    page.evaluate("film.seek(5)")
+    check_motion(page, before)
+
+
+def test_a_simulation(show, tmp_path, monkeypatch):
+    """The visitor's browser simulates one second."""
+    monkeypatch.chdir(tmp_path)
+    assert main(["export", "--live-web", "flag", *SMALL, "--material.E=9e3"]) == 0
+    page = show(tmp_path / "flag.html", "!!window.windPage")
+    page.evaluate("windPage.complete.then(() => { windPage.pause(); windPage.reset(); })")
+    before = picture(page)
+    assert page.evaluate("windPage.advance(25)")["simulated"] == pytest.approx(1.0)
+    check_motion(page, before)
