@@ -6,7 +6,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-import torch
 import yaml
 
 from gaussian_swaying import Simulation
@@ -44,40 +43,6 @@ def test_the_pressure_on_a_plate_is_that_of_the_closed_form(newton, angle, order
     np.testing.assert_allclose(forces[1], expected / 6, rtol=1e-12, atol=1e-15)
 
 
-def test_what_moves_with_the_wind_feels_none(newton):
-    positions, _ = _plate(0.3)
-    air = newton.Air((3.0, 4.0, 1.0))
-    velocities = np.tile([3.0, 4.0, 1.0], (4, 1))
-    assert not newton.skin_forces(positions, velocities, np.array([[0, 1, 2], [0, 2, 3]]), air).any()
-    half = newton.skin_forces(positions, 0.5 * velocities, np.array([[0, 1, 2], [0, 2, 3]]), air)
-    full = newton.skin_forces(positions, 0.0 * velocities, np.array([[0, 1, 2], [0, 2, 3]]), air)
-    np.testing.assert_allclose(4 * half, full, rtol=1e-12)
-
-
-def test_it_is_the_law_of_the_package(newton):
-    """The same published law, written twice: ``projected`` without friction and lift."""
-    from gaussian_swaying.aero.force import aero_force
-
-    draw = np.random.default_rng(0)
-    positions, velocities = draw.normal(size=(3, 3)), draw.normal(size=(3, 3))
-    air = newton.Air((1.0, -2.0, 0.5), 1.3, 0.7)
-    double = np.cross(positions[1] - positions[0], positions[2] - positions[0])
-    size = np.linalg.norm(double)
-    ours = aero_force(
-        torch.tensor(air.flow).double(),
-        torch.from_numpy(velocities.mean(0, keepdims=True)),
-        torch.from_numpy(double[None] / size),
-        torch.tensor([0.5 * size]),
-        drag=0.7,
-        friction=0.0,
-        lift=0.0,
-        air_density=1.3,
-        law="projected",
-    )
-    found = newton.skin_forces(positions, velocities, np.array([[0, 1, 2]]), air)
-    np.testing.assert_allclose(found.sum(0), ours[0].numpy(), rtol=1e-9)
-
-
 # ---- the body
 
 
@@ -94,20 +59,6 @@ def test_newtons_moduli_give_the_stress_of_hooke_at_small_strain(newton):
     small = 0.5 * (strain + strain.T)
     mu, lam = young / (2 * (1 + nu)), young * nu / ((1 + nu) * (1 - 2 * nu))
     np.testing.assert_allclose(stress, 2 * mu * small + lam * np.trace(small) * np.eye(3), atol=2e-4 * 2 * mu * 1e-6)
-
-
-def test_the_masses_of_tetrahedra_add_up(newton):
-    corners = np.array([[0.0, 0, 0], [1, 0, 0], [0, 2, 0], [0, 0, 3], [1, 2, 3]])
-    mass = newton.lumped_mass(corners, np.array([[0, 1, 2, 3], [1, 2, 3, 4]]), 10.0)
-    assert mass[0] == pytest.approx(10.0 * 1.0 / 4)
-    assert mass.sum() == pytest.approx(10.0 * (1.0 + 2.0))
-
-
-def test_meshes_that_do_not_end_where_the_held_part_ends_are_refused(soft):
-    assert soft.SoftPattern(cells=4).block.counts == (4, 4, 20)
-    for cells in (1, 3, 5):
-        with pytest.raises(ValueError, match="`cells`"):
-            soft.SoftPattern(cells=cells)
 
 
 def test_places_follow_the_vertices(soft):
@@ -138,19 +89,6 @@ def test_the_skin_is_closed_and_faces_outwards(soft):
     assert places.max() <= 1
 
 
-def test_the_splat_has_the_colours_of_the_texture(soft):
-    pattern = soft.SoftPattern()
-    cloud = soft.splat(pattern, 0.006)
-    on_print = soft.unfolded(pattern, cloud.means.double().numpy(), cloud.normals.numpy())
-    picture = soft.texture(pattern, 0.002)
-    assert picture.shape == (150, 180, 3)
-    column = (on_print[:, 0] / 0.002).astype(int)
-    row = 149 - (on_print[:, 1] / 0.002).astype(int)
-    colours = 0.5 + 0.28209479177387814 * cloud.sh[:, 0].numpy()
-    assert np.abs(picture[row, column] - colours).mean() < 0.04  # discs have edges
-    assert colours.std(0).min() > 0.1
-
-
 # ---- files
 
 
@@ -175,34 +113,7 @@ def test_the_scene_and_the_fit_can_be_read_and_start_wrong(soft, tool, tmp_path)
     assert np.linalg.norm(np.subtract(settings["wind"]["flow"], truth["flow"])) > 0.3 * truth["speed"]
 
 
-def test_two_motions_are_compared(soft):
-    rest = np.stack([np.zeros(11), np.zeros(11), np.linspace(0, 1, 11)], 1)
-    sway = np.array([0.0, 0.2, 0.1, 0.1])[:, None, None] * rest[None, :, 2:] * np.array([1.0, 0.0, 0.0])
-    found = soft.compared(rest + 1.1 * sway, rest + sway, np.array([2.0, 0.0, 0.0]))
-    assert found["swing"] == pytest.approx(1.1)
-    assert found["deflection"] == pytest.approx(1.1)
-    assert found["largest_m"] == pytest.approx(0.02)
-    assert found["mean_m"] == pytest.approx(0.1 * 0.1 * 0.5)
-
-
 # ---- Newton
-
-
-@pytest.mark.slow(twin="test_newtons_moduli_give_the_stress_of_hooke_at_small_strain")
-def test_newtons_block_bends_as_a_beam_does(newton):
-    """A push across a block of few cells; a mesh of 4 cells is 12 % stiffer than a beam with shear (Timoshenko)."""
-    pytest.importorskip("newton")
-    block = newton.Block(0.06, 0.30, 0.03, 4, 3e4, 0.0, 60.0)
-    push, free = 2.0, 0.27
-    rate = 3.516 * 0.06 / math.sqrt(12) * math.sqrt(3e4 / 60.0) / free**2
-    run = newton.SoftRun(frames=13, fps=24, steps=160, gravity=0.0, damping=1.5 * rate, push=(push, 0.0, 0.0))
-    found = newton.solve_block(block, None, run)
-    top = block.vertices()[:, 2] > 0.299
-    load = 60.0 * 0.06**2 * push
-    beam = load * free**4 / (8 * 3e4 * 0.06**4 / 12) + load * free**2 / (2 * 5 / 6 * 1.5e4 * 0.06**2)
-    assert (found[-1] - found[0])[top, 0].mean() / beam == pytest.approx(0.88, abs=0.02)
-    held = block.vertices()[:, 2] < 0.031
-    np.testing.assert_array_equal(found[-1][held], found[0][held])
 
 
 def test_a_motion_is_solved_once_and_other_settings_are_refused(soft, tmp_path):
@@ -219,20 +130,3 @@ def test_a_motion_is_solved_once_and_other_settings_are_refused(soft, tmp_path):
     moved = (positions[-1] - positions[0])[-1]
     assert moved[0] > 0.01  # with the wind
     assert moved[1] / moved[0] == pytest.approx(2.6 / 4.4, rel=0.05)
-
-
-def test_steps_that_are_too_long_are_named(newton):
-    pytest.importorskip("newton")
-    block = newton.Block(0.06, 0.30, 0.03, 2, 3e4, 0.3, 60.0)
-    with pytest.raises(ArithmeticError, match="`steps`"):
-        newton.solve_block(block, newton.Air((5.0, 0.0, 0.0)), newton.SoftRun(frames=4, fps=24, steps=5))
-
-
-def test_without_newton_the_extra_is_named(tool, monkeypatch, tmp_path, capsys):
-    def missing():
-        raise ImportError("install them with `pip install 'gaussian-swaying[peers]'`")
-
-    monkeypatch.setattr(tool, "require_newton", missing)
-    assert tool.main(["--case", "soft", "--out", str(tmp_path / "data")]) == 1
-    assert "[peers]" in capsys.readouterr().err
-    assert not (tmp_path / "data").exists()

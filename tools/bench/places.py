@@ -26,11 +26,6 @@ GROUND, HEDGE, FAR = 6.0, (4.0, 5.0, 1.3), (12.0, 40.0)
 def place(count: int, seed: int = 0, sh_degree: int = 3) -> tuple[GaussianCloud, Tensor]:
     """A capture of a place with y down, as COLMAP has it, 0.4 scene units to a metre.
 
-    Args:
-        count: Number of Gaussians, at least 20,000.
-        seed: Of their places and colours.
-        sh_degree: Degree of their spherical harmonics.
-
     Returns:
         The Gaussians in random order, and which of them are the plant and its pot, shape (count,).
     """
@@ -91,13 +86,7 @@ def write(file: str, count: int) -> None:
 
 
 def write_swaying(folder: Path, count: int, **settings: Any) -> Path:
-    """Write a place whose plant sways, with its parts and a configuration, and return the latter.
-
-    Args:
-        folder: Folder of the files.
-        count: Number of Gaussians.
-        settings: Further settings of the configuration.
-    """
+    """Write a place whose plant sways, with its parts and a configuration, and return the latter."""
     cloud, plant = place(count)
     write_ply(folder / "place.ply", cloud)
     Parts(plant.long(), [Part("place", "still"), Part("plant")]).save(folder / "parts.npz")

@@ -50,11 +50,7 @@ Divided by vertex mass and quality, 0.4 crumpled a flag of 1 cm cells at the sca
 
 
 def require_bpy() -> Any:
-    """Import ``bpy``.
-
-    Raises:
-        ImportError: If it is not installed; the message names the extra.
-    """
+    """Import ``bpy``."""
     try:
         import bpy
     except ImportError as error:
@@ -100,11 +96,7 @@ class Grid:
 
     @classmethod
     def of_cells(cls, width: float, height: float, cells: int, held: str | None = None) -> Grid:
-        """The mesh with ``cells`` square cells along the longer side.
-
-        Raises:
-            ValueError: If the shorter side is not a whole number of cells (to within 5 %), or less than two.
-        """
+        """The mesh with ``cells`` square cells along the longer side."""
         cell = max(width, height) / cells
         across, up = max(1, round(width / cell)), max(1, round(height / cell))
         if abs(height / up / (width / across) - 1) > 0.05 or min(across, up) < 2:
@@ -222,17 +214,9 @@ def bending_number(grid: Grid, material: ClothMaterial, run: ClothRun) -> float:
 def blender_settings(grid: Grid, material: ClothMaterial, run: ClothRun) -> dict[str, float]:
     """Blender's settings for a sheet, from the measured relations.
 
-    Args:
-        grid: The mesh.
-        material: Its material.
-        run: Gravity, wind and solver settings.
-
     Returns:
         ``mass`` to ``air_damping`` of the cloth, ``gravity`` of the scene, ``strength`` and ``flow`` of the wind; with
         self-contact, ``self_distance_min`` to ``collision_quality`` of the collisions.
-
-    Raises:
-        ValueError: If the mesh is too coarse for the distance of self-contact.
     """
     rate2 = run.fps**2
     mass = material.areal_density * grid.cell**2
@@ -281,21 +265,10 @@ def solve_cloth(
 ) -> np.ndarray:
     """Simulate a sheet with Blender.
 
-    Args:
-        grid: Its mesh.
-        vertices: Rest shape [m], without stretched springs; shape (V, 3).
-        pins: Vertices that are held.
-        material: Its material.
-        run: Gravity, wind and solver settings.
-        report: Called after each frame with its number, from 1.
+    Units: ``vertices`` [m].
 
     Returns:
         Vertices at each frame [m], float32, shape (frames, V, 3).
-
-    Raises:
-        ImportError: If ``bpy`` is not installed.
-        ValueError: If ``quality`` is too low for the bending of this mesh.
-        ArithmeticError: If the solver blew up.
     """
     number = bending_number(grid, material, run)
     if number > BENDING_LIMIT:

@@ -64,22 +64,7 @@ class Studio:
     The light is set so that white cloth facing one lamp has the pixel value 1 with ``linear``, and each colour of the
     texture has its own value. The cloth scatters diffusely and equally on both sides.
 
-    Args:
-        faces: Squares of the sheet, shape (Q, 4).
-        uv: Position of its vertices on the texture, shape (V, 2).
-        texture: Colours in 0 to 1, upper row first, shape (H, W, 3).
-        lamps: Positions of the area lights [m], shape (L, 3).
-        center: Point that they shine on [m], shape (3,).
-        lamp_size: Side of a lamp [m].
-        samples: Light paths per pixel.
-        transparent: Give the images an alpha channel instead of a black background.
-        transfer: ``linear``: pixel values are proportional to light, and so are the textures. ``srgb``: both are as
-            from a camera.
-        threads: Threads to render with; 0 for all.
-        ambient: Share of the light that comes from everywhere; the lamps have the rest.
-
-    Raises:
-        ImportError: If ``bpy`` is not there.
+    Units: ``lamps``, ``center``, ``lamp_size`` [m].
     """
 
     def __init__(
@@ -149,11 +134,7 @@ class Studio:
     def add_room(self, vertices: np.ndarray, faces: np.ndarray, uv: np.ndarray, texture: np.ndarray) -> None:
         """Add something that stands still; the shadow of the sheet falls on it, but it keeps no light off the sheet.
 
-        Args:
-            vertices: Its corners [m], shape (V, 3).
-            faces: Squares, shape (Q, 4).
-            uv: Position of its corners on the texture, which repeats, shape (V, 2).
-            texture: Colours in 0 to 1, upper row first, shape (H, W, 3).
+        Units: ``vertices`` [m].
         """
         thing = self._add_mesh("room", vertices, faces, uv, texture, repeats=True)
         thing.visible_shadow = thing.visible_diffuse = False

@@ -57,11 +57,7 @@ class FitVideo:
     threads: int = 1
 
     def __post_init__(self) -> None:
-        """Check the fields.
-
-        Raises:
-            ValueError: If one is out of range; the message names it.
-        """
+        """Check the fields."""
         for name, low, high in (("cameras", 1, 8), ("samples", 1, 4096), ("quality", 1, 95), ("threads", 0, 1024)):
             if not low <= getattr(self, name) <= high:
                 raise ValueError(f"Expected `{name}` from {low} to {high}, but got {getattr(self, name)}.")
@@ -159,13 +155,7 @@ def scene_settings(
 ) -> dict[str, Any]:
     """A configuration of ``gaussian-swaying sim`` for a case, with wrong values for what is sought.
 
-    Args:
-        pattern: The case.
-        video: Its video.
-        law: ``projected``, that of a plate, or ``linear``, that of the data.
-        folder: Where the case is.
-        spacing: Distance between Gaussians [m]. For a cloth that is held at its top it is made a little less, so that a
-            row of them lies on the held line: half a spacing further in turns the wind that is found by degrees.
+    Units: ``spacing`` [m].
     """
     height = pattern.height
     edge: dict[str, Any] = {"min": [None, None, None], "max": [round(1.1 * spacing, 6), None, None]}

@@ -22,10 +22,7 @@ _PLACES = ((-28, 8), (36, 14), (152, 10), (-140, 6), (72, 22), (-72, 18), (108, 
 def mean_normal(positions: np.ndarray, faces: np.ndarray, rest_normal: np.ndarray) -> np.ndarray:
     """Mean direction that a moving cloth faces, made level and of length one.
 
-    Args:
-        positions: The motion [m], shape (F, V, 3).
-        faces: Squares, shape (Q, 4).
-        rest_normal: Chooses the side, and is the answer where the cloth faces up and down alike; shape (3,).
+    Units: ``positions`` [m].
 
     Returns:
         Shape (3,).
@@ -42,10 +39,7 @@ def mean_normal(positions: np.ndarray, faces: np.ndarray, rest_normal: np.ndarra
 def ring_views(positions: np.ndarray, normal: np.ndarray, video: FitVideo) -> list[View]:
     """Still cameras on tripods around a cloth, each of which sees all of the motion.
 
-    Args:
-        positions: The motion [m], shape (F, V, 3).
-        normal: Direction in which the first two look at it from both sides of, see :func:`mean_normal`.
-        video: Number, size and field of view.
+    Units: ``positions`` [m].
     """
     heading = math.atan2(normal[1], normal[0])
     views = []
@@ -59,11 +53,6 @@ def ring_views(positions: np.ndarray, normal: np.ndarray, video: FitVideo) -> li
 
 def add_noise(picture: np.ndarray, video: FitVideo, key: tuple[int, ...]) -> np.ndarray:
     """Noise of a sensor: that of reading out, and that of counting photons, whose variance grows with the light.
-
-    Args:
-        picture: Colours in 0 to 1, shape (H, W, 3).
-        video: Strength and seed.
-        key: Numbers of this picture; the same numbers give the same noise.
 
     Returns:
         Colours in 0 to 255, uint8, shape (H, W, 3).
@@ -86,12 +75,7 @@ def compress(picture: np.ndarray, quality: int) -> bytes:
 def write_h264(path: Path, pictures: Iterable[np.ndarray], size: tuple[int, int], fps: float, crf: int = 28) -> None:
     """Write pictures, uint8 (H, W, 3), as a film in H.264.
 
-    Args:
-        path: The .mp4 file; it gets its name only when it is complete.
-        pictures: The frames.
-        size: Width and height [pixels].
-        fps: Frames per second.
-        crf: Compression; 28 is that of small files.
+    Units: ``size`` [pixels].
     """
     from imageio_ffmpeg import write_frames
 

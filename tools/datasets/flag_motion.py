@@ -10,7 +10,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import newton_cloth
 import numpy as np
 from blender_cloth import solve_cloth
 from flag_reference import FlagPattern
@@ -94,33 +93,13 @@ def _between(nodes: np.ndarray, places: np.ndarray) -> tuple[np.ndarray, np.ndar
     return low, ((places - nodes[low]) / np.diff(nodes)[low]).astype(np.float32)[:, None]
 
 
-SOLVERS = ("blender", "newton")
-
-
-def motion_settings(pattern: FlagPattern, solver: str = "blender") -> dict[str, Any]:
-    """Everything that a motion depends on."""
-    return pattern.cloth_settings() | ({} if solver == "blender" else newton_cloth.settings())
-
-
-def solve_pattern(
-    pattern: FlagPattern, path: Path, report: Callable[[int], None] | None = None, solver: str = "blender"
-) -> bool:
+def solve_pattern(pattern: FlagPattern, path: Path, report: Callable[[int], None] | None = None) -> bool:
     """Solve a flag and write its motion, unless the file exists.
-
-    Args:
-        pattern: The flag.
-        path: The ``.npz`` to write, see :func:`read_cloth`.
-        report: Called after each frame.
-        solver: One of ``SOLVERS``.
 
     Returns:
         Whether it was solved.
-
-    Raises:
-        ImportError: If the solver is not there.
-        ValueError: If the file exists but has other settings, or if ``quality`` is too low for the mesh.
     """
-    settings = motion_settings(pattern, solver)
+    settings = pattern.cloth_settings()
     if path.exists():
         check_settings(path, read_cloth(path).settings, settings)
         return False
@@ -128,8 +107,7 @@ def solve_pattern(
     uv = grid.uv()
     rest, normals = pattern.rest(uv)
     pins = pattern.pins(uv)
-    solve = solve_cloth if solver == "blender" else newton_cloth.solve_cloth
-    positions = solve(grid, rest, pins, material, run, report)
+    positions = solve_cloth(grid, rest, pins, material, run, report)
     arrays: dict[str, Any] = {
         "positions": positions,
         "faces": grid.faces().astype(np.int32),
@@ -165,36 +143,7 @@ def solve_pattern(
 
 
 def read_cloth(path: str | os.PathLike[str]) -> Cloth:
-    """Read a motion.
-
-    Args:
-        path: The ``.npz``. Besides the fields of :class:`Cloth` it has ``rest_normals``, ``pins`` (indices),
-            ``pin_uv`` (boxes), ``areal_density``, ``membrane_stiffness``, ``bending_stiffness``, ``gravity``, ``flow``
-            and more, with their ``units``, and the ``hash`` of ``settings``.
-
-    Raises:
-        ValueError: If it is not such a file.
-    """
+    """Read a motion."""
     found = read_arrays(path, "the motion of a flag", ("positions", "faces", "uv", "columns", "rows", "settings"))
     positions, faces, uv = (found[name] for name in ("positions", "faces", "uv"))
     return Cloth(positions, faces, uv, int(found["columns"]), int(found["rows"]), json.loads(str(found["settings"])))
-
-
-def extrapolate(fine: Path, coarse: Path, path: Path) -> None:
-    r"""Write the motion to which those on two meshes converge, as far as their errors fall as the square of a cell.
-
-    Richardson's extrapolation, at the places of the finer mesh:
-    :math:`x_f + (x_f - x_c) / ((n_f / n_c)^2 - 1)` with the numbers of cells n.
-
-    Args:
-        fine: A motion.
-        coarse: The same one on fewer cells.
-        path: The ``.npz`` to write, with all other fields of ``fine``.
-    """
-    own, other = read_cloth(fine), read_cloth(coarse)
-    ratio = own.settings["cells"] / other.settings["cells"]
-    moved = own.positions + (own.positions - other.sample(own.uv)) / (ratio**2 - 1)
-    with np.load(fine, allow_pickle=False) as file:
-        arrays = dict(file) | {"positions": moved.astype(np.float32)}
-    with atomic(path) as temporary:
-        np.savez_compressed(temporary, **arrays)

@@ -22,9 +22,6 @@ def draw_texture(pattern: FlagPattern, width: int = 1024) -> np.ndarray:
 
     ``white`` is plain, ``stripes`` has three bands and a disc, ``printed`` has features everywhere, as in
     ``FlagScene``, and anything else is the path of an image.
-
-    Raises:
-        ValueError: If the image cannot be read.
     """
     if pattern.texture == "white":
         return np.full((2, 2, 3), _WHITE, dtype=np.float32)
@@ -56,11 +53,7 @@ def draw_texture(pattern: FlagPattern, width: int = 1024) -> np.ndarray:
 def sphere_views(pattern: FlagPattern, count: int, size: int, angle: float = math.radians(40.0)) -> list[View]:
     """Cameras all around the flag at rest, spread evenly over a sphere on a golden spiral, upright in z.
 
-    Args:
-        pattern: The flag; each image shows all of it.
-        count: Number of cameras.
-        size: Width and height of their images [pixels].
-        angle: Field of view [radians].
+    Units: ``size`` [pixels]; ``angle`` [radians].
     """
     radius = 1.1 * 0.5 * math.hypot(pattern.width, pattern.height, 2 * pattern.ripple) / math.sin(0.5 * angle)
     index = np.arange(count) + 0.5
@@ -77,12 +70,7 @@ def reference_view(
 ) -> View:
     """The camera of the reference video: it looks along the initial normal, and the whole motion is in view.
 
-    Args:
-        pattern: The flag.
-        positions: The motion [m], shape (F, V, 3).
-        width: Width of the image [pixels].
-        height: Height of the image [pixels].
-        angle: Horizontal field of view [radians].
+    Units: ``positions`` [m]; ``width``, ``height`` [pixels]; ``angle`` [radians].
     """
     frame = look_at(pattern.center() + pattern.normal(), pattern.center())[:3, :3]
     return view_of_all(frame, positions, width, height, angle)
@@ -91,12 +79,7 @@ def reference_view(
 def view_of_all(frame: np.ndarray, positions: np.ndarray, width: int, height: int, angle: float) -> View:
     """The camera with given axes that has a whole motion in view, with 4 % of margin on each side.
 
-    Args:
-        frame: Its axes in the world as columns: right, up, backward; shape (3, 3).
-        positions: The motion [m], shape (F, V, 3).
-        width: Width of the image [pixels].
-        height: Height of the image [pixels].
-        angle: Horizontal field of view [radians].
+    Units: ``positions`` [m]; ``width``, ``height`` [pixels]; ``angle`` [radians].
     """
     seen = positions.reshape(-1, 3).astype(np.float64) @ frame  # right, up, towards the camera
     middle = 0.5 * (seen.min(0) + seen.max(0))

@@ -83,11 +83,7 @@ class FlagPattern:
     bending: float = 1.0
 
     def __post_init__(self) -> None:
-        """Check the fields.
-
-        Raises:
-            ValueError: If one is out of range; the message names it.
-        """
+        """Check the fields."""
         for name in ("youngs_modulus", "density", "thickness", "width", "height", "corner"):
             if not 0 < getattr(self, name) < math.inf:
                 raise ValueError(f"Expected `{name}` to be positive and finite, but got {getattr(self, name)}.")

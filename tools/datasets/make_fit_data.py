@@ -44,18 +44,17 @@ from fit_video import (
     ring_views,
     video_fields,
 )
-from flag_motion import extrapolate, read_cloth, settings_hash, solve_pattern
+from flag_motion import read_cloth, settings_hash, solve_pattern
 from flag_pictures import draw_texture
 from flag_reference import FlagPattern
-from make_flag_dataset import claim, make_uncertainty, missing_pictures
-from newton_cloth import require_newton
+from make_flag_dataset import claim, missing_pictures
+from newton_soft import require_newton
 from soft_case import (
     SOFT,
     SoftPattern,
     moved_places,
     read_soft,
     skin,
-    soft_uncertainty,
     solve_soft,
     splat,
     texture,
@@ -66,8 +65,6 @@ from gaussian_swaying.gaussians.ply import write_ply
 
 FAR = 60.0
 """Distance of the lamps, in longest sides of the body."""
-UNCERTAINTY = ("steps doubled", "coarser")
-"""How else the motions are solved, see :func:`flag_difference.variants`."""
 
 
 @dataclass(frozen=True)
@@ -225,7 +222,6 @@ def parse(argv: list[str] | None = None) -> argparse.Namespace:
     add("--cells", type=int, help="cells of the mesh along the length (50, or 60; soft: along the width, 10)")
     add("--frames", type=int, help="number of frames, the first at rest (97; soft: 49)")
     add("--law", choices=LAWS, default="projected", help="force law in scene.yaml (projected)")
-    add("--uncertainty", action="store_true", help="solve the motions otherwise, too, and compare")
     add("--threads", type=int, default=base.threads, help="threads to render with; 0 for all (1)")
     add("--preview", action="store_true", help="coarse mesh, small pictures, one second")
     return parser.parse_args(argv)
@@ -252,14 +248,7 @@ def _do_cloth(name: str, options: argparse.Namespace) -> None:
     require_bpy()
     cells = options.cells or (20 if options.preview else None)
     pattern = case_of(name, cells, options.frames or (25 if options.preview else None))
-    if options.uncertainty:
-        found = make_uncertainty(pattern, options.out / name, list(UNCERTAINTY), print, every=1)
-        for variant, row in found["variants"].items():
-            print(f"{name}: {variant}: {100 * row['corresponding']:.2f} % of the longer side", flush=True)
-        other = options.out / name / "uncertainty"
-        extrapolate(options.out / name / "cloth.npz", other / "coarser.npz", other / "extrapolated.npz")
-    else:
-        make_case(name, pattern, options.out / name, video, options.law)
+    make_case(name, pattern, options.out / name, video, options.law)
 
 
 def _do_soft(name: str, options: argparse.Namespace) -> None:
@@ -268,12 +257,8 @@ def _do_soft(name: str, options: argparse.Namespace) -> None:
     base = SoftPattern()
     cells = options.cells or (4 if options.preview else base.cells)
     pattern = replace(base, cells=cells, frames=options.frames or (13 if options.preview else base.frames))
-    if options.uncertainty:
-        for variant, row in soft_uncertainty(pattern, options.out / name).items():
-            print(f"{name}: {variant}: {1e3 * row['mean_m']:.2f} mm", flush=True)
-    else:
-        require_bpy()
-        make_soft(pattern, options.out / name, video)
+    require_bpy()
+    make_soft(pattern, options.out / name, video)
 
 
 def main(argv: list[str] | None = None) -> int:

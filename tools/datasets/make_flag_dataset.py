@@ -2,10 +2,8 @@
 
 ``python tools/datasets/make_flag_dataset.py --preview``      the paper's three, small, in two minutes on two cores
 ``python tools/datasets/make_flag_dataset.py --pattern 2``    one, at full size
-``python tools/datasets/make_flag_dataset.py --pattern 1 2 3 4 5 --only cloth``  the motions for ``bench.py pins``
+``python tools/datasets/make_flag_dataset.py --pattern 1 2 3 4 5 --only cloth``  only the motions
 ``python tools/datasets/make_flag_dataset.py --flag configs/flags/curtain.yaml``  any flag, described in a YAML file
-``python tools/datasets/make_flag_dataset.py --check``        measures how Blender's settings relate to SI units
-``python tools/datasets/make_flag_dataset.py --uncertainty``  how far each motion is from other solutions of it
 
 Needs Blender as a Python module: ``pip install 'gaussian-swaying[blender]'``, Python 3.11. Everything runs on the CPU.
 
@@ -29,15 +27,12 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from blender_checks import check_relations
 from blender_cloth import require_bpy
 from blender_images import TRANSFERS, Studio
-from flag_difference import VARIANTS, difference, variants
 from flag_file import read_flag
-from flag_motion import SOLVERS, check_settings, motion_settings, read_cloth, settings_hash, solve_pattern
+from flag_motion import check_settings, read_cloth, settings_hash, solve_pattern
 from flag_pictures import draw_texture, frame_order, lamp_position, reference_view, sphere_views, transforms_fields
 from flag_reference import PAPER, PATTERNS, FlagPattern, least_quality
-from newton_cloth import require_newton
 
 from gaussian_swaying._files import atomic, write_json
 
@@ -72,11 +67,7 @@ PREVIEW = Pictures(size=(320, 180), samples=4, views=24, view_size=128, every=10
 
 
 def claim(folder: Path, settings: dict[str, Any]) -> None:
-    """Make a folder and record the settings of its contents.
-
-    Raises:
-        ValueError: If the folder was made with other settings; the message names them.
-    """
+    """Make a folder and record the settings of its contents."""
     path = folder / "settings.json"
     if path.exists():
         check_settings(folder, json.loads(path.read_text(encoding="utf-8")), settings)
@@ -193,47 +184,6 @@ def write_film(path: Path, frames: list[Path], fps: int) -> bool:
     return True
 
 
-def make_uncertainty(
-    pattern: FlagPattern,
-    folder: Path,
-    names: list[str],
-    report: Report,
-    every: int = 5,
-    along: int = 80,
-    solver: str = "blender",
-) -> dict[str, Any]:
-    """Solve variants of a flag and compare them with it.
-
-    Args:
-        pattern: The flag; its own motion is ``cloth.npz``, solved if it does not exist.
-        folder: Folder of the pattern. Motions go to ``uncertainty/``.
-        names: Keys of :func:`flag_difference.variants`.
-        report: Called with a line of progress.
-        every: Compare only every ``every``-th frame.
-        along: Points compared along the longer side.
-        solver: One of :data:`flag_motion.SOLVERS`.
-
-    Returns:
-        What is written to ``uncertainty.json``: for each variant the fields of :func:`flag_difference.difference`.
-    """
-    own = folder / "cloth.npz"
-    solve_pattern(pattern, own, _every_25th(report, "cloth", pattern.frames), solver)
-    settings = motion_settings(pattern, solver)
-    result: dict[str, Any] = {
-        "settings": settings,
-        "hash": settings_hash(settings),
-        "unit": "shares of the longer side; mean over frames; Chamfer distance is half the sum of both mean distances",
-        "variants": {},
-    }
-    for name, variant in variants(pattern, names).items():
-        path = folder / "uncertainty" / f"{name.replace(' ', '_')}.npz"
-        solve_pattern(variant, path, _every_25th(report, name, pattern.frames), solver)
-        numbers = difference(pattern, read_cloth(own), read_cloth(path), every, along)
-        result["variants"][name] = {"cells": variant.cells, "quality": variant.quality, **numbers}
-    write_json(folder / "uncertainty.json", result)
-    return result
-
-
 def _every_25th(report: Report, what: str, frames: int) -> Callable[[int], None]:
     def frame_done(frame: int) -> None:
         if frame % 25 == 0:
@@ -285,7 +235,6 @@ def parse(argv: list[str] | None = None) -> argparse.Namespace:
     add("--damping", type=float, help="rate at which every velocity decays [1/s] (2 in pattern 1, else 1)")
     add("--self-collision", action="store_true", default=None, help="turn self-contact on")
     add("--self-distance", type=float, help="distance that the cloth then keeps from itself [m] (half a cell)")
-    add("--solver", choices=SOLVERS, default="blender", help="newton: another cloth solver, without wind or pictures")
     add("--size", type=_size, metavar="WIDTHxHEIGHT", help="size of the video [pixels] (1920x1080)")
     add("--samples", type=int, help="light paths per pixel (16)")
     add("--views", type=int, help="number of photos of the rest shape (200)")
@@ -293,20 +242,11 @@ def parse(argv: list[str] | None = None) -> argparse.Namespace:
     add("--transfer", choices=TRANSFERS, help="linear: pixels proportional to light; srgb: as from a camera (linear)")
     add("--every", type=int, help="render only every N-th frame (1)")
     add("--threads", type=int, help="threads to render with; 0 for all (0)")
-    add("--check", action="store_true", help="measure the relations between Blender's settings and SI units")
-    add("--uncertainty", action="store_true", help="solve the flags otherwise, and compare")
-    add("--variants", nargs="+", choices=sorted(VARIANTS), default=list(VARIANTS), help="how")
-    add("--json", type=Path, help="where --check writes what it measured (default: check.json in --out)")
     return parser.parse_args(argv)
 
 
 def flags_of(options: argparse.Namespace) -> dict[str, FlagPattern]:
-    """The flags chosen on the command line, by the names of their folders.
-
-    Raises:
-        FileNotFoundError: If a file of ``--flag`` does not exist.
-        ValueError: If such a file is invalid, or two flags have one name.
-    """
+    """The flags chosen on the command line, by the names of their folders."""
     numbers = (() if options.flag else PAPER) if options.pattern is None else options.pattern
     flags = {f"pattern{number}": PATTERNS[number] for number in numbers}
     for file in options.flag:
@@ -318,11 +258,7 @@ def flags_of(options: argparse.Namespace) -> dict[str, FlagPattern]:
 
 
 def flag_of(flag: FlagPattern, options: argparse.Namespace) -> FlagPattern:
-    """A flag with the options of the command line.
-
-    Raises:
-        ValueError: If an option is out of range.
-    """
+    """A flag with the options of the command line."""
     names = ("frames", "texture", "drag", "damping", "self_collision", "self_distance", "cells")
     given = {name: getattr(options, name) for name in names if getattr(options, name) is not None}
     if options.flag_size:
@@ -334,11 +270,7 @@ def flag_of(flag: FlagPattern, options: argparse.Namespace) -> FlagPattern:
 
 
 def pictures_of(options: argparse.Namespace) -> Pictures:
-    """The pictures chosen on the command line.
-
-    Raises:
-        ValueError: If an option is out of range.
-    """
+    """The pictures chosen on the command line."""
     base = PREVIEW if options.preview else Pictures()
     given = {name: getattr(options, name) for name in asdict(base) if getattr(options, name) is not None}
     for name, value in given.items():
@@ -356,14 +288,9 @@ def make(name: str, pattern: FlagPattern, options: argparse.Namespace) -> None:
     def report(line: str) -> None:
         print(f"{name}: {line}", flush=True)
 
-    if options.uncertainty:
-        found = make_uncertainty(pattern, folder, options.variants, report, solver=options.solver)
-        for variant, row in found["variants"].items():
-            report(f"{variant}: Chamfer distance {100 * row['chamfer']:.2f} % of the longer side")
-        return
     started = time.time()
     if "cloth" in options.only:
-        solve_pattern(pattern, folder / "cloth.npz", _every_25th(report, "cloth", pattern.frames), options.solver)
+        solve_pattern(pattern, folder / "cloth.npz", _every_25th(report, "cloth", pattern.frames))
         make_truth(pattern, folder)
     if "train" in options.only:
         make_train(pattern, folder / "train", pictures, report)
@@ -376,18 +303,7 @@ def main(argv: list[str] | None = None) -> int:
     """Run the command line; returns the exit code."""
     options = parse(argv)
     try:
-        if options.solver == "newton":
-            require_newton()
-        else:
-            require_bpy()
-        if options.check:
-            path = options.json or options.out / "check.json"
-            rows = check_relations()
-            path.parent.mkdir(parents=True, exist_ok=True)
-            write_json(path, rows)
-            for row in rows["checks"]:
-                print(f"{row['name']}: {row['measured']:.4g} {row['unit']}, {row['ratio']:.4f} of what was expected")
-            return 0
+        require_bpy()
         for name, flag in flags_of(options).items():
             make(name, flag, options)
     except (ImportError, ValueError, ArithmeticError, FileNotFoundError) as error:

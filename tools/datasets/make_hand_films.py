@@ -38,7 +38,7 @@ from flag_pictures import draw_texture
 from flag_reference import FlagPattern, least_quality
 from make_fit_data import studio_of, write_yaml
 from make_flag_dataset import claim, missing_pictures
-from newton_cloth import require_newton
+from newton_soft import require_newton
 from room import Square, block, mesh, splat, squares, tile
 from soft_case import SoftPattern, read_soft, skin, solve_soft
 

@@ -13,7 +13,19 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from newton_cloth import require_newton
+
+
+def require_newton() -> tuple[Any, Any]:
+    """Import ``newton`` and ``warp``."""
+    try:
+        import newton
+        import warp
+    except ImportError as error:
+        raise ImportError(
+            "The soft body needs newton and warp-lang: install them with `pip install 'gaussian-swaying[peers]'`."
+        ) from error
+    warp.config.quiet = True
+    return newton, warp
 
 
 @dataclass(frozen=True)
@@ -39,11 +51,7 @@ def skin_forces(positions: np.ndarray, velocities: np.ndarray, triangles: np.nda
     with the velocity of the air relative to the middle of the triangle. It does not depend on the side that a normal
     points to: the side in the wind is pushed and the one in the lee is pulled.
 
-    Args:
-        positions: Vertices [m], shape (V, 3).
-        velocities: Their velocities [m/s], shape (V, 3).
-        triangles: Indices of corners, shape (T, 3).
-        air: The wind.
+    Units: ``positions`` [m]; ``velocities`` [m/s].
 
     Returns:
         Forces on the vertices [N], float64, shape (V, 3).
@@ -135,18 +143,8 @@ class SoftRun:
 def solve_block(block: Block, air: Air | None, run: SoftRun, report: Any = None) -> np.ndarray:
     """Simulate a block with Newton, from rest.
 
-    Args:
-        block: The body.
-        air: Wind; None for none.
-        run: Frames and steps.
-        report: Called with the number of each frame that is done.
-
     Returns:
         Positions of :meth:`Block.vertices` at each frame [m], float32, shape (F, V, 3).
-
-    Raises:
-        ImportError: If Newton is not installed.
-        ArithmeticError: If the steps are too long.
     """
     newton, warp = require_newton()
     with warp.ScopedDevice("cpu"):

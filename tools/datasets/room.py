@@ -30,10 +30,7 @@ Square = tuple[np.ndarray, np.ndarray, np.ndarray]
 def squares(low: np.ndarray, high: np.ndarray, ground: float) -> list[Square]:
     """The room around a motion that stays between two corners: two walls, the ground, and three boxes.
 
-    Args:
-        low: Lower corner of the motion [m], shape (3,).
-        high: Its upper corner, shape (3,).
-        ground: Height of the ground [m].
+    Units: ``low``, ``ground`` [m].
     """
     size = float((high - low).max())
     left, back = low[0] - 0.9 * size, high[1] + 0.35 * size
@@ -73,9 +70,7 @@ def tile(texels: int = TEXELS) -> np.ndarray:
 def mesh(room: Sequence[Square], size: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """The surfaces for Blender: corners [m], squares of them, and places on :func:`tile`, which repeats.
 
-    Args:
-        room: The surfaces.
-        size: Length of what is filmed [m].
+    Units: ``size`` [m].
 
     Returns:
         Shapes (4 S, 3), (S, 4) and (4 S, 2).
@@ -89,12 +84,7 @@ def mesh(room: Sequence[Square], size: float) -> tuple[np.ndarray, np.ndarray, n
 def splat(room: Sequence[Square], size: float, spacing: float, light: Sequence[float], ambient: float) -> GaussianCloud:
     """The surfaces as flat Gaussians, with the light of two lamps in opposite directions, but without shadows.
 
-    Args:
-        room: The surfaces.
-        size: Length of what is filmed [m].
-        spacing: Distance between Gaussians [m].
-        light: Direction to a lamp, shape (3,).
-        ambient: Share of ambient light.
+    Units: ``size``, ``spacing`` [m].
     """
     patches = join([_patches(k, *sides, size, spacing) for k, sides in enumerate(room)])
     way = torch.tensor(light, dtype=torch.float64)

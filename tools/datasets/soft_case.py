@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import json
 import math
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +17,7 @@ from fit_cases import START, FitVideo, shared_truth
 from flag_motion import check_settings
 from newton_soft import Air, Block, SoftRun, solve_block
 
-from gaussian_swaying._files import atomic, write_json
+from gaussian_swaying._files import atomic
 from gaussian_swaying._inputs import read_arrays
 from gaussian_swaying.gaussians.cloud import GaussianCloud
 from gaussian_swaying.scenes.patches import box, to_cloud
@@ -79,11 +79,7 @@ class SoftPattern:
     fps: int = 24
 
     def __post_init__(self) -> None:
-        """Check the mesh.
-
-        Raises:
-            ValueError: If no layer of vertices is where the held part ends.
-        """
+        """Check the mesh."""
         if self.cells < 2 or any(abs(part / self.block.cell - round(part / self.block.cell)) > 1e-6 for part in
                                  (self.height, self.held)):  # fmt: skip
             raise ValueError(
@@ -121,10 +117,6 @@ def solve_soft(pattern: SoftPattern, path: Path) -> bool:
 
     Returns:
         Whether it was solved.
-
-    Raises:
-        ImportError: If Newton is not there.
-        ValueError: If the file exists but has other settings.
     """
     settings = pattern.motion_settings()
     if path.exists():
@@ -146,10 +138,7 @@ def read_soft(path: Path) -> tuple[np.ndarray, dict[str, Any]]:
 def moved_places(pattern: SoftPattern, positions: np.ndarray, places: np.ndarray) -> np.ndarray:
     """Where places of the body at rest are at each frame, between the vertices by trilinear interpolation.
 
-    Args:
-        pattern: The case; only its mesh matters.
-        positions: Of the vertices [m], shape (F, V, 3).
-        places: In the body at rest [m], shape (P, 3).
+    Units: ``positions``, ``places`` [m].
 
     Returns:
         Shape (F, P, 3), float64.
@@ -164,53 +153,6 @@ def moved_places(pattern: SoftPattern, positions: np.ndarray, places: np.ndarray
         weight = np.where(corner, share, 1 - share).prod(1)
         total += weight[:, None] * positions[:, (k * (counts[1] + 1) + j) * (counts[0] + 1) + i]
     return total
-
-
-def soft_uncertainty(pattern: SoftPattern, folder: Path) -> dict[str, Any]:
-    """Solve the case otherwise, and compare with it; writes ``uncertainty.json``.
-
-    Returns:
-        Fields of :func:`compared` for a mesh with two cells less along a side, one with four less, and this one with
-        twice the steps.
-    """
-    coarse = replace(pattern, cells=pattern.cells - 4)
-    other = {
-        f"{pattern.cells - 2} cells": replace(pattern, cells=pattern.cells - 2),
-        f"{coarse.cells} cells": coarse,
-        f"{coarse.cells} cells, steps doubled": replace(coarse, steps=2 * coarse.run.steps),
-    }
-    solve_soft(pattern, folder / "motion.npz")
-    places = splat(pattern, pattern.side / 6).means.double().numpy()
-    own = moved_places(pattern, read_soft(folder / "motion.npz")[0], places)
-    rows = {}
-    for name, variant in other.items():
-        path = folder / "uncertainty" / f"{name.replace(', ', '_').replace(' ', '_')}.npz"
-        solve_soft(variant, path)
-        rows[name] = compared(moved_places(variant, read_soft(path)[0], places), own, np.array(pattern.flow))
-    write_json(folder / "uncertainty.json", {"settings": pattern.motion_settings(), "variants": rows})
-    return rows
-
-
-def compared(ours: np.ndarray, true: np.ndarray, flow: np.ndarray) -> dict[str, Any]:
-    """How far two motions (F, N, 3) of the same places [m] are apart; flow is the wind.
-
-    ``deflection`` is how far the uppermost places are blown along the wind on average over the second half of the
-    frames, and ``swing`` the farthest that they go, both as shares of those of the true motion.
-    """
-    apart = np.linalg.norm(ours - true, axis=-1)
-    height = true[0, :, 2]
-    top = height > height.max() - 0.01 * np.ptp(height)
-    way = flow / np.linalg.norm(flow)
-    blown, wanted = (((each - true[0])[:, top] @ way).mean(1) for each in (ours, true))
-    half = len(true) // 2
-    return {
-        "mean_m": float(apart.mean()),
-        "largest_m": float(apart.max()),
-        "per_frame_m": [round(value, 6) for value in apart.mean(1).tolist()],
-        "swing_m": float(wanted.max()),
-        "deflection": float(blown[half:].mean() / wanted[half:].mean()),
-        "swing": float(blown.max() / wanted.max()),
-    }
 
 
 # ---- the skin

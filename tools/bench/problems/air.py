@@ -126,13 +126,7 @@ def cylinder(
 
     Published for Re 100: a Strouhal number of 0.164 (Williamson 1989, J. Fluid Mech. 206), a drag of 1.33 to 1.35.
 
-    Args:
-        cells: Cells in a diameter.
-        until: Time [diameters over speed]; the last 50 are measured.
-        reynolds: Reynolds number.
-        length: Of the box in diameters; the cylinder stands 10 behind its front.
-        height: Of the box in diameters.
-        device: Where it runs.
+    Units: ``until`` [diameters over speed].
     """
     units = units_of(1 / cells, reynolds)
     x = (torch.arange(length * cells) + 0.5) / cells - 10
@@ -177,13 +171,7 @@ def sphere(
 ) -> dict[str, float]:
     """Drag of a sphere of wall cells; 1.09 at Re 100 (Clift, Grace and Weber 1978, standard drag curve).
 
-    Args:
-        cells: Cells in a diameter.
-        until: Time [diameters over speed]; the last two are measured.
-        reynolds: Reynolds number.
-        length: Of the box in diameters; the sphere stands a third of it behind its front.
-        width: Of the box in diameters.
-        device: Where it runs.
+    Units: ``until`` [diameters over speed].
     """
     units = units_of(1 / cells, reynolds)
     middle = torch.tensor([length / 3, width / 2, width / 2], dtype=torch.float64)
@@ -207,13 +195,7 @@ def plate(
     The drag is the mean over the second half of the time. An immersed surface acts as if it were about half a cell
     larger at each of its edges.
 
-    Args:
-        cells: Cells in a side.
-        until: Time [sides over speed].
-        reynolds: Reynolds number.
-        length: Of the box in sides; the plate stands 4 behind its front.
-        width: Of the box in sides.
-        device: Where it runs.
+    Units: ``until`` [sides over speed].
     """
     units = units_of(1 / cells, reynolds)
     flow = LatticeFlow((length * cells, width * cells, width * cells), units, smagorinsky=0).to(device)
@@ -248,11 +230,6 @@ def step(cells: int, reynolds: float = 200.0, until: float = 60.0) -> dict[str, 
 
     Published for an expansion of 2 and a Reynolds number of 200, of the mean speed and twice the height of the inlet:
     4.982 (Erturk 2008, Computers & Fluids 37).
-
-    Args:
-        cells: Cells in the height of the channel, which is 1.
-        reynolds: Reynolds number.
-        until: Time; the mean speed in the inlet is 1.
     """
     units, before, length = units_of(1 / cells, reynolds, 0.07), 2, 10
     size = (length * cells, 1, cells + 2)

@@ -29,14 +29,7 @@ def comb(
     Each starts in its lowest mode, every second one in the other direction, and all bend towards each other. Their ends
     lie 2 cells deep in a :class:`PinnedRegion`.
 
-    Args:
-        settings: The numerics.
-        thickness: Thickness of the beams [cells].
-        gap: Gap between them [cells].
-        base: Whether the held ends are one piece; otherwise each beam is a piece.
-        shared: Whether beams share the nodes of the grid, as they do without ``attached``.
-        count: Number of beams.
-        shortest: Length of the shortest [cells].
+    Units: ``thickness``, ``gap``, ``shortest`` [cells].
 
     Returns:
         ``lowest`` and ``highest`` of the ratios of frequency over that of Timoshenko's beam alone, ``error``, the
@@ -93,12 +86,7 @@ def comb(
 def sheets(settings: Settings, gap: float, layers: int = 3, cells: int = 24, repeats: int = 5) -> Result:
     """Two square sheets above each other, held at one edge and pushed apart, compared with each of them alone.
 
-    Args:
-        settings: The numerics.
-        gap: Gap between them [cells].
-        layers: Layers of points of a sheet, a twentieth of a cell apart.
-        cells: Length of their sides.
-        repeats: How often the substep is timed.
+    Units: ``gap`` [cells].
 
     Returns:
         ``error``: the largest distance from a point of a sheet alone, over the largest displacement of that sheet;

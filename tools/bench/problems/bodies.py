@@ -137,11 +137,7 @@ def layered_skin(layers: int = 4, gap: float = 1.0, opacity: float = 0.5, count:
 def hazy_sphere(thickness: float = 5.0, opacity: float | None = None, count: int = 60_000, tilt: float = 0.3) -> Body:
     """A sphere whose Gaussians lie up to some spacings below its surface, are tilted, and differ in size and opacity.
 
-    Args:
-        thickness: Thickness of the haze [spacings].
-        opacity: Opacity of all, or None for values spread evenly from 0.1 to 0.99.
-        count: Number of Gaussians.
-        tilt: Standard deviation of each component of what is added to the normals.
+    Units: ``thickness`` [spacings].
     """
     turn, draw = _random(count, 20)
     sizes, _ = _random(count, 21)
@@ -156,11 +152,7 @@ def hazy_sphere(thickness: float = 5.0, opacity: float | None = None, count: int
 def leaf_ball(index: float, side: float = 0.32, across: int = 12, seed: int = 40) -> Body:
     """Square leaves of any direction, spread evenly over a ball of radius 1 m.
 
-    Args:
-        index: Leaf area index: area of the leaves over the shadow of the ball.
-        side: Side of a leaf [m].
-        across: Gaussians along a side of a leaf.
-        seed: Seed of places and directions.
+    Units: ``side`` [m].
     """
     leaves = round(index * math.pi / side**2)
     turn, draw = _random(leaves, seed)

@@ -16,10 +16,6 @@ _CHUNK = 20_000_000
 def gaps(stage: ContactStage, state: MPMState) -> Tensor:
     """Distances of all surfaces that lie above each other and were no neighbours at rest, in units of the thickness.
 
-    Args:
-        stage: The contact of a body.
-        state: Its state.
-
     Returns:
         One for each pair of places whose discs lie above each other, shape (M,); none farther than the reach of a disc.
     """
@@ -54,9 +50,7 @@ def crossings(place: Tensor, triangles: Tensor) -> int:
     An edge crosses a triangle if its ends lie on different sides of its plane, and the line through it passes all three
     sides of the triangle in the same direction: signs of volumes of tetrahedra.
 
-    Args:
-        place: Corners [m], shape (P, 3).
-        triangles: Their numbers, shape (T, 3).
+    Units: ``place`` [m].
 
     Returns:
         The number; zero if no part of the surface passes through another.

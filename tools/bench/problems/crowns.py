@@ -79,9 +79,7 @@ def branch_drag(cauchy: Sequence[float], lean: float) -> list[float]:
     from the direction across the flow: as in :mod:`~bench.problems.reconfiguration`, but clamped at an angle. It is
     followed from no wind, so that of several solutions it is that to which the branch bends.
 
-    Args:
-        cauchy: C.
-        lean: Angle of the branch from the direction across the flow, positive downstream [rad].
+    Units: ``lean`` [rad].
     """
     from scipy.integrate import solve_ivp
     from scipy.optimize import fsolve
@@ -129,13 +127,7 @@ def crown(
 ) -> Result:
     """Let the branches of a crown come to rest in winds of some speeds, and fit the exponent of its drag.
 
-    Args:
-        species: One of :data:`CROWNS`.
-        speeds: Of the wind [m/s], ascending.
-        cells: Cells along a branch.
-        branches: Number of branches, which share no nodes of the grid.
-        settle: Time to simulate in each wind, in units of 1 / circular frequency of the lowest mode of a branch.
-        settings: The numerics.
+    Units: ``speeds`` [m/s].
 
     Returns:
         ``error`` (of the drag at the last speed, relative to the elasticas), ``exponent``, ``elastica`` (that of the

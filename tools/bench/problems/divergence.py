@@ -50,11 +50,6 @@ def divergence(cells: int = 32, settings: Settings | None = None, slenderness: f
     the damping c of the solver and of the air. The stiffness :math:`\lambda` of the mode falls with the pressure of the
     wind, and the plate diverges where it is zero.
 
-    Args:
-        cells: Cells along the plate.
-        settings: The numerics.
-        slenderness: L over the thickness.
-
     Returns:
         ``error`` (of the pressure at which it diverges, relative), ``kappa`` and ``exact``, ``below`` and ``above``
         (rates :math:`\sigma` in the two winds, in units of the circular frequency of the lowest mode without wind) and

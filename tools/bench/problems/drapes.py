@@ -44,10 +44,7 @@ alike, by splines on eight cells along the free width and around half a fold, co
 class RingScene(ProceduralScene):
     """A level ring around the origin, in rings of patches.
 
-    Args:
-        inner: Inner radius [m].
-        outer: Outer radius [m].
-        spacing: Distance between the rings, and at most that between Gaussians along one [m].
+    Units: ``inner``, ``outer``, ``spacing`` [m].
     """
 
     inner: float = DISC
@@ -98,15 +95,6 @@ def drape(
 
     The disc holds the fabric between its faces, as a clamp. The fabric is thrown with the folds it is to have, and
     damped until it rests.
-
-    Args:
-        fabric: One of :data:`~bench.problems.fabrics.FABRICS`.
-        folds: Number of folds, 4 to 7.
-        cells: Cells along the free width of 6 cm.
-        settle: Time to simulate, in units of 1 / circular frequency of a strip as long as the free width.
-        seed: Height of the folds that the first velocities would reach without a force, over the free width.
-        layers: Layers of points: 3, or 1, whose sheet bends by itself.
-        settings: The numerics.
 
     Returns:
         ``drape``, ``folds_found`` (which wave of the edge is the largest), ``low`` and ``high`` (of the edge [m]),

@@ -42,14 +42,7 @@ def hanging_strip(
     :math:`b = \rho h g L^3 / D` is the exact shape of a strip that does not stretch. The free length begins halfway
     between the last held and the first free points.
 
-    Args:
-        fabric: One of :data:`FABRICS`.
-        cells: Cells along the free length.
-        stretch: E h [N/m], which does not change the result where ``material.bending`` holds.
-        length: Free length, about [m].
-        settle: Time to simulate, in units of 1 / circular frequency of the lowest mode.
-        settings: The numerics.
-        layers: Layers of points: 3, or 1 with a bending stiffness of their own.
+    Units: ``stretch`` [N/m]; ``length`` [m].
 
     Returns:
         ``error`` (of the drop of the tip, relative), ``drop`` and ``exact`` (over the length), ``b``, ``span`` (of

@@ -26,8 +26,7 @@ YOUNG = 1e5  # Pa; only its stiffness, it bears no load that is not even
 def terminal(tilt: float = 0.0) -> float:
     r"""Speed across the plate at which ``cross_flow`` bears it [m/s], :math:`\sqrt{2 m g \cos\alpha / (\rho C_D)}`.
 
-    Args:
-        tilt: Angle of the plate from the horizontal [degrees].
+    Units: ``tilt`` [degrees].
     """
     return math.sqrt(2 * MASS * GRAVITY * math.cos(math.radians(tilt)) / (AIR * C_D))
 
@@ -35,10 +34,7 @@ def terminal(tilt: float = 0.0) -> float:
 def sliding(tilt: float, law: str, times: np.ndarray) -> np.ndarray:
     """Speeds of a plate that keeps its angle, across and along itself [m/s], shape (N, 2), from rest.
 
-    Args:
-        tilt: Angle from the horizontal [degrees].
-        law: ``projected`` or ``cross_flow``.
-        times: When [s], ascending from 0.
+    Units: ``tilt`` [degrees]; ``times`` [s].
     """
     from scipy.integrate import solve_ivp
 
@@ -61,13 +57,7 @@ def fall(
 ) -> Result:
     r"""Let a plate fall from rest, and compare its speed at any time with that of a plate that keeps its angle.
 
-    Args:
-        tilt: Angle from the horizontal [degrees].
-        law: ``projected`` or ``cross_flow``.
-        spin: Rate at which it turns in the end of its fall [1/s]; it then falls at its terminal speed from the start.
-        cells: Cells along a side.
-        settle: Time to simulate, in units of terminal speed over gravity.
-        settings: The numerics.
+    Units: ``tilt`` [degrees].
 
     Returns:
         ``error`` (largest difference of the speed, over the last one; with ``spin`` of the rate at which the spin

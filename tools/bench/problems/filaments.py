@@ -92,11 +92,6 @@ class Filament:
     def advance(self, air: np.ndarray, layer: np.ndarray, dt: float) -> np.ndarray:
         """Take a step in as many substeps as it needs (symplectic Euler).
 
-        Args:
-            air: Velocity of the air at its points, shape (N, 2).
-            layer: Mass of the layer of air at each, per depth, shape (N,).
-            dt: The step.
-
         Returns:
             Momentum that its points take from the air, per depth, shape (N, 2).
         """
@@ -130,17 +125,6 @@ def flap(
     lattice_speed: float = 0.1,
 ) -> dict:
     """Filaments in a uniform flow along x.
-
-    Args:
-        filaments: The filaments; they are changed.
-        at: Where the first point of each is, along and across the flow, from the middle of the height.
-        cells: Cells in a length.
-        reynolds: Reynolds number of the length.
-        until: Time; the second half is measured.
-        length: Of the box.
-        height: Of the box.
-        before: Length of the box before the origin.
-        lattice_speed: Of the flow.
 
     Returns:
         ``tips``: the free end of each across the flow over time, shape (T, F); ``drags`` and ``dt``; and ``flow``
@@ -210,11 +194,7 @@ def square_flag(cells: int = 20, until: float = 24.0, width: int = 4, device: st
     Published: an amplitude from peak to peak of 0.78 and a frequency of 0.26 (Huang and Sung 2010, J. Fluid Mech. 653),
     0.81 and 0.27 (Tian and others 2014, J. Comput. Phys. 258), of the middle of the free edge.
 
-    Args:
-        cells: Cells of air in a side.
-        until: Time [sides over speed]; the last third is measured.
-        width: Of the box across the flag [sides].
-        device: Where it runs.
+    Units: ``until`` [sides over speed]; ``width`` [sides].
     """
     points = 2 * math.ceil(0.6 * cells)  # closer than the cells, and two to a cell of the grid
     simulation = Simulation(

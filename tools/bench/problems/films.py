@@ -16,16 +16,7 @@ from gaussian_swaying.simulation.simulation import Simulation
 def write_video(
     simulation: Simulation, folder: Path, cameras: Mapping[str, Camera], frames: int, noise: float = 0.0, seed: int = 0
 ) -> None:
-    """Simulate, and write what each camera sees: PNG files with silhouettes, and ``transforms.json``.
-
-    Args:
-        simulation: The simulation; frames are ``frame_dt`` apart.
-        folder: Where to write.
-        cameras: The cameras by name; they stand still.
-        frames: Number of frames; the first is at rest.
-        noise: Standard deviation of the noise of each pixel and colour, in grey levels of 255.
-        seed: Seed of the noise.
-    """
+    """Simulate, and write what each camera sees: PNG files with silhouettes, and ``transforms.json``."""
     import imageio.v3 as iio
 
     folder.mkdir(parents=True, exist_ok=True)

@@ -67,12 +67,7 @@ def write_film(
 ) -> None:
     """Render a film: the thing is at rest for some time [s], then it moves; with noise and another light.
 
-    Args:
-        path: The .mp4 file.
-        scene: A configuration of ``sim``, of 30 frames a second.
-        size: Width and height [pixels].
-        still: Time at rest [s].
-        moving: Time in motion [s].
+    Units: ``size`` [pixels]; ``still``, ``moving`` [s].
     """
     simulation = Simulation.from_yaml(scene, device="cpu")
     painter, camera = simulation.painter, camera_of(*size)

@@ -20,11 +20,7 @@ WIDTH, HEIGHT, FRAME = 1.2, 0.8, 0.04  # m, m, s
 def flag_points(spacing: float, settings: Settings, youngs_modulus: float, density: float) -> MaterialPoints:
     """A sheet of one layer of particles in the x-z plane, 1.2 m by 0.8 m and 0.01 m thick, with a slight ripple.
 
-    Args:
-        spacing: Distance between particles [m].
-        settings: Type and device.
-        youngs_modulus: Young's modulus [Pa].
-        density: Density [kg/m³].
+    Units: ``spacing`` [m]; ``youngs_modulus`` [Pa]; ``density`` [kg/m³].
 
     Returns:
         The material points.
@@ -53,14 +49,7 @@ def flag(
 ) -> tuple[Result, Tensor]:
     """A flag pinned along a strip of 2.5 cm at its pole, in a swaying wind, with the paper's coefficients for flags.
 
-    Args:
-        dx: Grid spacing [m].
-        settings: The numerics.
-        frames: Frames of 0.04 s.
-        spacing: Distance between particles [m]; keep it when ``dx`` changes, so that runs can be compared.
-        youngs_modulus: Young's modulus [Pa].
-        density: Density [kg/m³].
-        wind: Mean air velocity [m/s]; its largest component sways by half with a period of 1.5 s.
+    Units: ``dx``, ``spacing`` [m]; ``youngs_modulus`` [Pa]; ``density`` [kg/m³]; ``wind`` [m/s].
 
     Returns:
         The result (``error`` is not known: see :func:`distance`; ``torn``: particles with a neighbour farther than two
@@ -97,9 +86,7 @@ def _health(run: Run, gauge: TearingGauge) -> Result:
 def distance(series: Tensor, reference: Tensor) -> float:
     """Mean distance of corresponding particles over all frames, as a share of the longer side of the flag.
 
-    Args:
-        series: Positions of each frame [m], shape (frames + 1, P, 3).
-        reference: The same for the run to compare with.
+    Units: ``series`` [m].
 
     Returns:
         The share; infinite if a position is infinite.

@@ -35,12 +35,7 @@ MIDDLE = (0.2, 0.05, 0.15)
 def write_base(folder: Path, spacing: float = 0.025, wall: float = 0.02, back: bool = True, worn: bool = False) -> Path:
     """Write the splat of a flag before two walls, ``room.ply``, and the configuration of its simulation.
 
-    Args:
-        folder: Where to write.
-        spacing: Distance between the Gaussians of the flag [m].
-        wall: The same of the walls; not finite for none.
-        back: Whether there is a wall behind the flag, and not just one beside it.
-        worn: Whether the splat has faults, as a capture has: colours that are off by 0.05, and walls by 3 mm.
+    Units: ``spacing`` [m].
     """
     folder.mkdir(parents=True, exist_ok=True)
     flag = cloud = FlagScene(0.4, 0.3, spacing, ripple=0.01, pattern="printed").generate()
@@ -84,12 +79,7 @@ def shaken(
     Each of six numbers is a sum of waves of 0.4 to 2 Hz, as a hand sways, and one of 9 Hz, a tenth as large, as it
     trembles.
 
-    Args:
-        camera: The camera without shake, which the first frame has.
-        frames: Number of frames, :data:`FPS` a second.
-        degrees: How much it turns.
-        seed: Of the phases.
-        middle: The point at which the hand aims [m].
+    Units: ``middle`` [m].
     """
     generator = torch.Generator().manual_seed(seed)
     time = torch.arange(frames, dtype=torch.float64) / FPS
@@ -118,13 +108,7 @@ def drift(frames: int) -> Tensor:
 
 
 def photographed(camera: Camera, texture: Tensor, finer: int = 2) -> Tensor:
-    """The walls themselves, by rays and not as Gaussians, black elsewhere, float64, shape (H, W, 3).
-
-    Args:
-        camera: The camera.
-        texture: Their print over a period, shape (T, T, 3).
-        finer: Rays along a side of each pixel.
-    """
+    """The walls themselves, by rays and not as Gaussians, black elsewhere, float64, shape (H, W, 3)."""
     rows, columns = ((torch.arange(n * finer) + 0.5).double() / finer for n in (camera.height, camera.width))
     row, column = torch.meshgrid(rows, columns, indexing="ij")
     local = torch.stack([column, row, torch.ones_like(row)], -1) @ camera.intrinsics.double().inverse().T
@@ -151,16 +135,7 @@ def write_film(
     crf: int = 28,
     real: bool = False,
 ) -> None:
-    """Simulate, and write what a moving camera sees as ``film.mp4`` with the camera of its first frame alone.
-
-    Args:
-        simulation: The simulation; frames are ``frame_dt`` apart.
-        folder: Where to write.
-        cameras: The camera of each frame.
-        gains: Of each frame and colour, shape (F, 3); ones if None.
-        crf: Compression of H.264; 28 is that of small files.
-        real: Whether the walls are photographed, and not drawn as the splat is.
-    """
+    """Simulate, and write what a moving camera sees as ``film.mp4`` with the camera of its first frame alone."""
     from imageio_ffmpeg import write_frames
 
     folder.mkdir(parents=True, exist_ok=True)

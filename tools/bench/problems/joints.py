@@ -63,9 +63,7 @@ def pendulum(settings: Settings, length: float = 12.0) -> Result:
     Its weight stretches it by a thousandth, and lumped masses have a moment of inertia that is larger by
     :math:`m \Delta x^2 / 2`.
 
-    Args:
-        settings: The numerics.
-        length: Length of the bar [cells].
+    Units: ``length`` [cells].
 
     Returns:
         ``ratio``: frequency over that of the rigid bar, ``error``: its distance from one, and the common quantities.
@@ -85,10 +83,7 @@ def joined_beams(settings: Settings, turning: float, length: float = 20.0) -> Re
 
     Each is free at its far end, and at the joint it has no shear and the moment :math:`E I w'' = 2 \kappa w'`.
 
-    Args:
-        settings: The numerics.
-        turning: :math:`\kappa L / (E I)`; infinite for one beam of twice the length.
-        length: Length L of each [cells].
+    Units: ``length`` [cells].
 
     Returns:
         ``ratio``: frequency over that of the beams, ``error``: its distance from one, and the common quantities.

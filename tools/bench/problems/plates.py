@@ -28,9 +28,7 @@ class Hinge(Boundary):
     the axis does not change. The reaction passes through the axis, without a moment, if the material around is
     symmetric about it, and all motion is in the y-z plane, the same along x.
 
-    Args:
-        dx: Grid spacing [m].
-        rest: Rest positions of the nodes of the ``total`` formulation [m], shape (G, 3); None for ``updated``.
+    Units: ``dx``, ``rest`` [m].
     """
 
     needs_lattice = True
@@ -69,10 +67,6 @@ def hinged_plate_angle(k: float, law: str) -> float:
     the normal is flipped along the flow: the plate is driven up from below and down from above, and stays edge-on (a
     sliding mode).
 
-    Args:
-        k: :math:`q A C_D / (m g)` with :math:`q = \rho U^2 / 2`.
-        law: ``paper`` or ``projected``.
-
     Returns:
         The angle.
     """
@@ -97,14 +91,7 @@ def hinged_plate(
     so there is no bending. Its stiffness keeps the stretch below one percent. The angle is that of the line from the
     hinge to the centre of mass.
 
-    Args:
-        k: Pressure over weight, :math:`q A C_D / (m g)`.
-        law: ``paper`` or ``projected``.
-        settings: The numerics.
-        cells: Grid cells from the hinge to the lower edge; more than 3.
-        seconds: Time to come to rest [s].
-        damping: Rate at which velocities decay [1/s], near critical for the swing.
-        per_cell: Particles per cell and axis.
+    Units: ``seconds`` [s].
 
     Returns:
         ``error`` [degrees] with its sign, ``angle`` and ``exact`` [degrees], ``drift``: change of the angle in the last

@@ -62,10 +62,6 @@ def elastica(cauchy: float, law: str) -> tuple[float, float]:
 
     .. math:: \theta' = M, \quad M' = -(F_y \cos\theta - F_z \sin\theta), \quad F_y' = -p \cos\theta, \quad
         F_z' = p \sin\theta, \qquad \theta(0) = 0, \; M(1) = F_y(1) = F_z(1) = 0.
-
-    Args:
-        cauchy: C.
-        law: One of :data:`POWERS`.
     """
     from scipy.optimize import brentq
 
@@ -115,14 +111,6 @@ def reconfiguration(
     settle: float = 16.0,
 ) -> Result:
     r"""Bend a plate in a steady wind until it rests, and compare its drag with that of the elastica.
-
-    Args:
-        cauchy: C.
-        law: One of :data:`POWERS`.
-        cells: Cells along the plate.
-        settings: The numerics.
-        slenderness: l over the thickness. Neglected: the stretch, C R (h / l)² / 12 relative.
-        settle: Time to simulate, in units of 1 / circular frequency of the lowest mode without wind.
 
     Returns:
         ``error`` (of R, relative), ``drag`` (R), ``exact`` (that of the elastica), ``tip`` and ``exact_tip`` (its place

@@ -16,10 +16,6 @@ from gaussian_swaying.mpm.state import MaterialPoints, MPMState
 def section(diameter: float, count: int) -> Tensor:
     r"""Points on a circle that have the second moment of a disc, :math:`\pi d^4 / 64`, about every axis.
 
-    Args:
-        diameter: Diameter d of the disc.
-        count: Number of points, at least 3.
-
     Returns:
         Places across the rod, shape (count, 2), float64.
     """
@@ -40,14 +36,7 @@ def rod(
 
     The rod has ``around`` points in each section (:func:`section`). Two cells of it lie in a :class:`PinnedRegion`.
 
-    Args:
-        settings: The numerics.
-        diameter: Diameter [cells].
-        place: How far the rod is moved off the planes of the nodes [cells].
-        axis: Its direction.
-        length: Free length [cells].
-        per_cell: Sections in a cell of its length.
-        around: Points of a section.
+    Units: ``diameter``, ``place``, ``length`` [cells].
 
     Returns:
         ``lowest`` and ``highest`` of the two frequencies over that of Timoshenko's beam, ``error``, the largest

@@ -54,11 +54,7 @@ class Settings:
 
 
 class Axial(Boundary):
-    """Prevents motion along the given axes: lateral confinement, or plane strain.
-
-    Args:
-        axes: The axes, 0 to 2.
-    """
+    """Prevents motion along the given axes: lateral confinement, or plane strain."""
 
     def __init__(self, axes: Sequence[int]) -> None:
         super().__init__()
@@ -73,13 +69,7 @@ class Axial(Boundary):
 def lattice(dx: float, low: Sequence[int], high: Sequence[int], settings: Settings, per_cell: int = 2) -> Tensor:
     """Points in a box of whole cells, evenly spaced.
 
-    Args:
-        dx: Grid spacing [m].
-        low: Lower corner [cells].
-        high: Upper corner [cells]; along an axis where it equals the lower corner there is a single layer, on the
-            nodes.
-        settings: Type and device.
-        per_cell: Points per cell and axis.
+    Units: ``dx`` [m]; ``low``, ``high`` [cells].
 
     Returns:
         Positions [m], shape (P, 3).
@@ -107,16 +97,7 @@ def block(
 ) -> MaterialPoints:
     """A block of fixed corotated material in a box of whole cells; a single layer counts as ``dx`` thick.
 
-    Args:
-        dx: Grid spacing [m].
-        low: Lower corner [cells].
-        high: Upper corner [cells].
-        settings: Type and device.
-        density: Density [kg/m³].
-        youngs_modulus: Young's modulus [Pa].
-        poisson_ratio: Poisson's ratio.
-        per_cell: Points per cell and axis.
-        shift: How far the body is moved along x, off the planes of the nodes [cells].
+    Units: ``dx`` [m]; ``low``, ``high``, ``shift`` [cells]; ``density`` [kg/m³]; ``youngs_modulus`` [Pa].
 
     Returns:
         The material points.
@@ -167,13 +148,7 @@ def follow(
 ) -> Run:
     """Roll out frame by frame, each in equal substeps chosen by the solver, and observe after each.
 
-    Args:
-        solver: The solver that made ``state``.
-        state: The first state.
-        frame: Length of a frame [s].
-        frames: Number of frames.
-        observe: Function that returns the observation of a state.
-        force: External force on each particle [N].
+    Units: ``frame`` [s]; ``force`` [N].
 
     Returns:
         The last state, the observations and the time taken.
@@ -199,9 +174,7 @@ def follow(
 def fit_sinusoid(time: Tensor, values: Tensor) -> tuple[float, float]:
     r"""Fit :math:`e^{-\gamma t} (a \cos \omega t + b \sin \omega t)` to a series by least squares (Gauss-Newton).
 
-    Args:
-        time: Times [s], shape (N,), float64.
-        values: The series, shape (N,), float64, with at least two changes of sign, from which the first guess is made.
+    Units: ``time`` [s].
 
     Returns:
         Circular frequency and decay rate, both [1/s].

@@ -19,10 +19,7 @@ SIZE = 0.4
 class RodScene(ProceduralScene):
     """An upright tube from the origin.
 
-    Args:
-        length: Length [m].
-        radius: Radius [m].
-        spacing: Distance between Gaussians [m].
+    Units: ``length``, ``radius``, ``spacing`` [m].
     """
 
     length: float = SIZE
@@ -122,10 +119,6 @@ def apart(frames: Sequence[Mapping[str, float]], reference: Sequence[Mapping[str
 
 def faults(frames: Sequence[Mapping[str, float]], reference: Sequence[Mapping[str, float]] | None) -> list[str]:
     """What is wrong with a run that has ended, found without the warnings of the package.
-
-    Args:
-        frames: Diagnostics of its frames.
-        reference: Those of the run on the finest grid; None if there is none to compare with.
 
     Returns:
         Some of ``not a number``, ``inverted`` (material turned inside out), ``energy`` (:func:`energy_error`) and

@@ -41,17 +41,7 @@ def hinged_strip(
     adds :math:`q L^2 / (8 \tfrac56 G h)`, which is :math:`1.92\,(h / L)^2`, relative. Neglected: the tension of a strip
     whose ends do not approach each other, some :math:`3\,(w / h)^2`, relative; so the deflection is small.
 
-    Args:
-        cells: Cells along the strip.
-        settings: The numerics.
-        hold: ``hinge`` or ``clamp`` hold the middle plane at both ends (:class:`PinnedPoints`); ``nodes`` is a
-            :class:`PinnedRegion` of two cells beyond each end, for comparison.
-        slenderness: Length over thickness.
-        sag: Deflection of the middle over the thickness, for hinges.
-        settle: Time to simulate, in units of 1 / circular frequency of the lowest mode.
-        shift: How far the strip is moved off the planes of the nodes, along itself and across [cells].
-        per_cell: Points per cell along the strip.
-        layers: Layers of points: 3, or 1 with a bending stiffness of their own.
+    Units: ``shift`` [cells].
 
     Returns:
         ``error`` (of the deflection of the middle, relative to that with hinges), ``slope`` (at the ends, over that

@@ -20,10 +20,7 @@ RADIUS, SIDE = 0.5, 0.8  # [m]
 def sphere_of_gaussians(count: int, overlap: float, radius: float = RADIUS) -> GaussianSurfaceModel:
     """Discs on a spiral over a sphere, evenly spread.
 
-    Args:
-        count: Number of Gaussians.
-        overlap: Standard deviation of a disc over the spacing.
-        radius: Radius [m].
+    Units: ``radius`` [m].
 
     Returns:
         The surface.
@@ -53,13 +50,6 @@ def surface_drag(shape: str, count: int, overlap: float, area: str, law: str) ->
     With C_D = 1 and the dynamic pressure q the plate of side L feels q L² in either law. Both halves of a sphere of
     radius R feel the wind, as normals are flipped along the flow: the integral of abs(n.d) gives 2 pi R² q in the law
     ``paper``, that of (n.d)² gives 4 pi R² q / 3 in ``projected``.
-
-    Args:
-        shape: ``plate`` or ``sphere``.
-        count: Approximate number of Gaussians.
-        overlap: Standard deviation of a Gaussian over the spacing.
-        area: ``coverage`` or ``paper``.
-        law: As in :func:`~gaussian_swaying.aero.force.aero_force`.
 
     Returns:
         ``error`` (relative), ``share`` of the exact force and ``gaussians``.

@@ -62,10 +62,7 @@ class Piece:
 def tree(leaf_area: float = 0.0, height: float = 17.3, branches: int = 16) -> list[Piece]:
     """A stem with branches in a spiral, in the golden angle from each to the next.
 
-    Args:
-        leaf_area: Area of one side of all leaves [m²].
-        height: Of the stem [m].
-        branches: Number of branches.
+    Units: ``leaf_area`` [m²]; ``height`` [m].
     """
     stem = Piece((0.0, 0.0, 0.0), (0.0, 0.0, height), (0.17, 0.05))
     found = []
@@ -238,11 +235,7 @@ FOOT = Box([None] * 3, [None, None, 0.0])
 def frequency(leaf_area: float = 0.0, dx: float = 0.5, settings: Settings | None = None, **shape: float) -> Result:
     """The lowest frequency of a tree, from the quarter of a period after which its mode stands still.
 
-    Args:
-        leaf_area: Area of one side of its leaves [m²]; it feels no air here.
-        dx: Grid spacing [m].
-        settings: The numerics.
-        shape: Other options of :func:`tree`.
+    Units: ``leaf_area`` [m²]; ``dx`` [m].
 
     Returns:
         ``error`` (of the frequency, relative to the frame), ``hertz``, ``exact``, ``wood`` and ``leaves`` (masses [kg])
@@ -280,15 +273,7 @@ def damping(
     with the square of the speed of the air against it, so the damping depends on the pull and on the breeze. The
     reference is the equation of the mode alone (:func:`mode_damping`), fitted in the same way.
 
-    Args:
-        leaf_area: Area of one side of the leaves [m²].
-        pull: Motion of the top in the first swing, without air [m].
-        breeze: Speed of the air along the sway [m/s].
-        wood: Damping ratio of the tree without leaves.
-        dx: Grid spacing [m].
-        settings: The numerics.
-        periods: How long it is watched, in periods of the frame.
-        shape: Other options of :func:`tree`.
+    Units: ``leaf_area`` [m²]; ``pull``, ``dx`` [m]; ``breeze`` [m/s].
 
     Returns:
         ``ratio`` (damping ratio), ``exact`` (that of the equation of the mode), ``error`` (relative to it), ``hertz``
@@ -326,14 +311,7 @@ def mode_damping(
     .. math:: \ddot q + r \dot q + \omega^2 q = \frac{1}{M} \sum_i \tfrac12 \rho C_D A_i |\mathbf{v}_i|
         (\mathbf{v}_i \mathbf{n}_i) (\mathbf{n}_i \phi_i), \qquad \mathbf{v}_i = \mathbf{u} - \dot q \phi_i
 
-    Args:
-        one: The tree.
-        rate: Damping r of the wood [1/s].
-        pull: Of the top [m].
-        breeze: Speed of the air [m/s].
-        frame: Time between the values [s].
-        frames: How many there are after the first.
-        steps: Steps within a frame.
+    Units: ``pull`` [m]; ``breeze`` [m/s]; ``frame`` [s].
 
     Returns:
         Speeds [m/s], shape (frames + 1,).

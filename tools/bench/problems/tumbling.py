@@ -29,13 +29,7 @@ def falling(
     In the frame of the box the air is accelerated by as much as the plate is the other way, and comes in through the
     faces with the velocity opposite to the plate's.
 
-    Args:
-        froude: See the module.
-        cells: Cells in the plate's length.
-        reynolds: Reynolds number of length and speed.
-        until: Time [L / U].
-        side: Of the box.
-        tilt: Angle of the plate from the level at the start [rad].
+    Units: ``until`` [L / U]; ``tilt`` [rad].
 
     Returns:
         ``turns`` in all, the largest ``swing`` from the level [rad] before a half turn, the mean ``speed`` of the fall

@@ -51,12 +51,7 @@ def body_force(rest: Tensor, time: Tensor, amplitude: float, mu: float, density:
     :math:`P_{RR} = P_{\theta\theta} = 2 \mu (1 - \cos\varphi)`, :math:`P_{R\theta} = 2 \mu \sin\varphi` and
     :math:`P_{\theta R} = 2 \mu (\gamma - \sin\varphi)`; the divergence is taken in polar coordinates.
 
-    Args:
-        rest: Rest position [m], shape (..., 3), with the first two components inside the annulus.
-        time: Time [s], scalar.
-        amplitude: Largest turn A [rad].
-        mu: Shear modulus [Pa].
-        density: Density [kg/m³].
+    Units: ``rest`` [m]; ``time`` [s]; ``amplitude`` [rad]; ``mu`` [Pa]; ``density`` [kg/m³].
 
     Returns:
         Shape (..., 3).
@@ -82,9 +77,6 @@ def body_force(rest: Tensor, time: Tensor, amplitude: float, mu: float, density:
 def annulus(cells: int) -> tuple[Tensor, Tensor]:
     """Rings of points, two per cell along the radius and along each ring, one cell thick.
 
-    Args:
-        cells: Cells to a metre.
-
     Returns:
         Positions [m], shape (P, 3), and volumes [m³], shape (P,), float64.
     """
@@ -107,11 +99,7 @@ def vortex(cells: int, settings: Settings, amplitude: float = 1.0, part: float =
     The velocity of symplectic Euler is half a substep before its displacement, so it starts with the exact velocity at
     that time.
 
-    Args:
-        cells: Cells per metre; half as many across the annulus.
-        settings: The numerics.
-        amplitude: Largest turn A [rad].
-        part: Share of the period to simulate; at 0.5 the rotation is largest, at 1 everything is back in place.
+    Units: ``amplitude`` [rad].
 
     Returns:
         ``error`` (root mean square of the error of the displacement at the end, relative to the largest root mean

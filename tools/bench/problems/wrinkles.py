@@ -74,9 +74,7 @@ class Strip:
 def wavelength(height: np.ndarray, width: float) -> float:
     """The wavelength at which the spectrum of a line is largest.
 
-    Args:
-        height: Evenly spaced along the line, shape (N,).
-        width: Length of the line [m].
+    Units: ``width`` [m].
     """
     count = len(height)
     power = np.abs(np.fft.rfft(height - height.mean(), 64 * count))
@@ -95,13 +93,7 @@ def wrinkles(
 
     It begins with a speed along its axis, as a sheet that is quite flat would stay so.
 
-    Args:
-        bending: One of :data:`SHELL` [N m].
-        cells: Cells across the width.
-        rest: Time after the pull, in units of 1 / circular frequency of the stretched sheet.
-        seed: Height that the speed would reach without a force, in thicknesses of a plate.
-        layers: Layers of points: 3, or 1 with a bending stiffness of their own.
-        settings: The numerics.
+    Units: ``bending`` [N m].
 
     Returns:
         ``wavelength`` (0 if it stays flat), that of the shell (``exact``) and of the ``formula`` [m], ``error`` (from

@@ -35,12 +35,7 @@ def column_at_rest(
 ) -> Result:
     """A square of sand between smooth walls, as deep as wide, with the stress due to its weight.
 
-    Args:
-        settings: The numerics under test.
-        cells: Grid cells along each side of 0.1 m.
-        friction_angle: Friction angle of the law [degrees].
-        seconds: Time [s].
-        more: ``compression``, ``volume_correction`` and ``floor_friction``, see :func:`column_collapse`.
+    Units: ``friction_angle`` [degrees]; ``seconds`` [s].
 
     Returns:
         ``error``: the largest displacement of a particle, over the width; ``settlement``: how far the surface sinks in
@@ -90,16 +85,7 @@ def column_collapse(
     32 and 64 cells, and 0.68 with 16 cells and a third of the Courant number. Experiments with sand, which mobilises
     less friction in plane strain than this cone, gave 1.2; 20 degrees on 32 cells give 1.64.
 
-    Args:
-        aspect: Height over half width or radius, :math:`a = H_0 / L_0`.
-        settings: The numerics under test.
-        cells: Grid cells along the half width; ``aspect * cells`` must be a whole number.
-        planar: Plane strain, or else a round column.
-        friction_angle: Friction angle of the law [degrees].
-        volume_correction: See :class:`~gaussian_swaying.mpm.laws.sand.Sand`.
-        floor_friction: Coulomb coefficient of the floor, or None for a sticky floor.
-        compression: Weight of the column over Young's modulus, about the compression at its foot.
-        duration: Time over :math:`\sqrt{H_0 / g}`; in experiments a column rests after about 3.
+    Units: ``friction_angle`` [degrees].
 
     Returns:
         ``runout``: the 99th percentile of the distance of particles from the symmetry plane or axis, less that at the

@@ -64,14 +64,7 @@ def inclined_layer(
     each substep. The layer starts with the stress due to its weight on a level floor; gravity is tilted during the
     first third of the time.
 
-    Args:
-        angles: Inclinations [degrees].
-        settings: The numerics under test.
-        cells: Grid cells over the depth of 0.1 m.
-        friction_angle: Friction angle of the law [degrees].
-        volume_correction: See :class:`~gaussian_swaying.mpm.laws.sand.Sand`.
-        seconds: Time [s].
-        compression: Weight of the layer over Young's modulus.
+    Units: ``angles``, ``friction_angle`` [degrees]; ``seconds`` [s].
 
     Returns:
         For each angle the acceleration of the layer down the slope, over g, in the second half of the time, and its
@@ -116,12 +109,7 @@ def angle_of_repose(
     A layer flows if it accelerates by more than 0.2 % of g. In theory the acceleration is
     :math:`g (\sin\theta - \mu \cos\theta)`. The dissipation of the grid reduces it, and more so on coarser grids.
 
-    Args:
-        settings: The numerics under test.
-        cells: Grid cells over the depth.
-        friction_angle: Friction angle of the law [degrees].
-        angles: The inclinations tried, ascending [degrees]; at least the last two must flow.
-        more: ``volume_correction``, ``seconds`` and ``compression``, see :func:`inclined_layer`.
+    Units: ``friction_angle``, ``angles`` [degrees].
 
     Returns:
         ``stands`` and ``flows``: the steepest angle at rest, and the gentlest that flows [degrees]; ``friction_deg``:
@@ -162,14 +150,7 @@ def tossed_layer(
     Its velocity grows from zero at the floor to the value that lifts the surface by ``rise``. Where sand is pulled
     apart, the return map forgets the gap. Without correction the layer is therefore taller after it falls back.
 
-    Args:
-        settings: The numerics under test.
-        cells: Grid cells over the depth of 0.1 m.
-        friction_angle: Friction angle of the law [degrees].
-        volume_correction: See :class:`~gaussian_swaying.mpm.laws.sand.Sand`.
-        rise: How far the surface would fly, over the depth.
-        seconds: Time [s].
-        compression: Weight of the layer over Young's modulus.
+    Units: ``friction_angle`` [degrees]; ``seconds`` [s].
 
     Returns:
         ``volume_ratio``: height of the centre of mass at the end, over that at the start; ``error``: that less one;
