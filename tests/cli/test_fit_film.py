@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 import torch
 import yaml
-from bench.problems.flag_film import TRUTH, camera_of, write_case
+from flag_film import TRUTH, camera_of, write_case
 from PIL import Image
 from shared import refused
 

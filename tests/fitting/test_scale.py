@@ -3,13 +3,14 @@
 import pytest
 import torch
 import yaml
-from bench.problems.fit_films import Film, settings_of
 from small_films import base
 
 from gaussian_swaying.fitting.report import scene_text
 from gaussian_swaying.fitting.scale import SCALE
 from gaussian_swaying.fitting.unknowns import Unknown, check_unknowns
 from gaussian_swaying.fitting.variants import states_of
+from gaussian_swaying.gaussians.ply import write_ply
+from gaussian_swaying.scenes.patches import box, to_cloud
 from gaussian_swaying.simulation.simulation import Simulation
 
 TIMES = [0.0, 0.1, 0.2, 0.3]
@@ -50,11 +51,20 @@ def test_the_breadth_of_the_air_that_is_carried_is_in_metres(tmp_path):
 
 def test_a_filled_body_keeps_its_density(tmp_path):
     """A post of foam, bent by the wind and its weight."""
+    write_ply(tmp_path / "post.ply", to_cloud(box([-0.06, -0.06, 0.0], [0.06, 0.06, 0.42], 0.01), overlap=0.5))
+    foot = {"class_path": "Box", "init_args": {"min": [None] * 3, "max": [None, None, 0.04]}}
+    pin = {"class_path": "PinnedRegion", "init_args": {"kind": "nodes", "region": foot}}
     found = []
     for scale in (1.0, 1.7):
-        settings = settings_of(Film("post", 4.0, 0.0, 4e3), tmp_path)
-        settings["scene"] |= {"metres_per_unit": scale, "filling": {"spacing": 0.03 * scale}}
-        settings["solver"]["dx"] *= scale
+        scene = {"ply": str(tmp_path / "post.ply"), "metres_per_unit": scale, "filling": {"spacing": 0.03 * scale}}
+        settings = {
+            "frame_dt": 1 / 30,
+            "scene": scene,
+            "material": {"E": 4e3, "nu": 0.3, "density": 60.0, "law": "NeoHookean"},
+            "solver": {"dx": 0.048 * scale, "boundaries": [pin]},
+            "wind": {"flow": [4.0, 0.0, 0.0]},
+            "aero": {"C_D": 1.0, "C_F": 0.0, "C_L": 0.0, "law": "projected"},
+        }
         (tmp_path / "post.yaml").write_text(yaml.safe_dump(settings))
         found.append(Simulation.from_yaml(tmp_path / "post.yaml", device="cpu"))
     small, large = found

@@ -2,9 +2,9 @@
 
 import math
 
+import bodies
 import pytest
 import torch
-from bench.problems import bodies
 
 from gaussian_swaying.gaussians.area import coverage_area
 from gaussian_swaying.gaussians.model import GaussianSurfaceModel

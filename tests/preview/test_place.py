@@ -7,7 +7,7 @@ from dataclasses import replace
 import pytest
 import torch
 import yaml
-from bench.places import place
+from places import place
 from shared import refused
 from small_scenes import turned_cloud
 

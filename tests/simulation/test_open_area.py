@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 import torch
 import yaml
-from bench.problems.bodies import cluttered_sphere
+from bodies import cluttered_sphere
 from small_scenes import plain_cloud
 
 from gaussian_swaying.gaussians.filling import InteriorFilling

@@ -10,13 +10,29 @@ from pathlib import Path
 
 import pytest
 import yaml
-from bench.problems.small_sweep import AXES, SETTINGS
 
 from gaussian_swaying.cli.sweep import main
 from gaussian_swaying.runs.lock import LOCK
 from gaussian_swaying.sweeps import pool
 
 FLAG = Path(__file__).parents[2] / "configs/sim/flag.yaml"
+_POLE = {"class_path": "Box", "init_args": {"min": [None, None, None], "max": [0.11, None, None]}}
+
+SETTINGS = {
+    "frames": 12,
+    "scene.generator.init_args.spacing": 0.1,
+    "solver.dx": 0.2,
+    "solver.boundaries": [{"class_path": "PinnedRegion", "init_args": {"region": _POLE}}],
+    "camera.init_args.width": 32,
+    "camera.init_args.height": 18,
+}
+"""Options of all runs."""
+AXES = {
+    "wind.flow": [[4.0, 1.0, 0.0], [8.0, 2.0, 0.0]],
+    "material.E": {"from": 3e3, "to": 3e4, "count": 2, "scale": "log"},
+    "wind.seed": {"draw": "integer", "low": 0, "high": 10**6},
+}
+"""Four runs for each draw."""
 
 
 def write_sweep(path, axes=AXES, draws=2, settings=None, **more):

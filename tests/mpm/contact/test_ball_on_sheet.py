@@ -4,7 +4,7 @@ import math
 
 import pytest
 import torch
-from bench.problems.contacts import crossings, gaps, sheet_triangles
+from contacts import crossings, gaps, sheet_triangles
 
 from gaussian_swaying.geometry.regions import Box, Not
 from gaussian_swaying.mpm.boundaries.pinned_region import PinnedRegion

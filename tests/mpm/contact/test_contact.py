@@ -8,7 +8,7 @@ from functools import partial
 
 import pytest
 import torch
-from bench.problems.contacts import crossings, gaps, sheet_triangles
+from contacts import crossings, gaps, sheet_triangles
 
 from gaussian_swaying.mpm.boundaries.half_space import HalfSpaceObstacle
 from gaussian_swaying.mpm.boundaries.pinned_points import PinnedPoints

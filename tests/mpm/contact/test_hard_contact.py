@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import pytest
 import torch
-from bench.problems.contacts import crossings, sheet_triangles
+from contacts import crossings, sheet_triangles
 
 from gaussian_swaying.mpm.contact.surface import Contact
 from gaussian_swaying.mpm.solver import MPMSolver

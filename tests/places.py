@@ -2,18 +2,12 @@
 
 from __future__ import annotations
 
-import json
 import math
-from pathlib import Path
-from typing import Any
 
 import torch
-import yaml
 from torch import Tensor
 
 from gaussian_swaying.gaussians.cloud import GaussianCloud
-from gaussian_swaying.gaussians.parts import Part, Parts
-from gaussian_swaying.gaussians.ply import write_ply
 from gaussian_swaying.scenes.alocasia import AlocasiaScene
 
 SHARES = {"ground": 0.40, "hedges": 0.42, "haze": 0.14}
@@ -74,38 +68,6 @@ def place(count: int, seed: int = 0, sh_degree: int = 3) -> tuple[GaussianCloud,
     rest = 0.02 * torch.randn(count, (sh_degree + 1) ** 2 - 1, 3, generator=draw)
     cloud = GaussianCloud(**(fields | {"sh": torch.cat([fields["sh"], rest], 1)})).select(order)
     return _turned(cloud), mine[order]
-
-
-def write(file: str, count: int) -> None:
-    """Write a place, and beside it as .json the number of Gaussians and the box of its plant."""
-    cloud, plant = place(count)
-    write_ply(file, cloud)
-    points = cloud.means[plant]
-    known = {"gaussians": len(points), "min": points.amin(0).tolist(), "max": points.amax(0).tolist()}
-    Path(file).with_suffix(".json").write_text(json.dumps(known))
-
-
-def write_swaying(folder: Path, count: int, **settings: Any) -> Path:
-    """Write a place whose plant sways, with its parts and a configuration, and return the latter."""
-    cloud, plant = place(count)
-    write_ply(folder / "place.ply", cloud)
-    Parts(plant.long(), [Part("place", "still"), Part("plant")]).save(folder / "parts.npz")
-    low = float(cloud.means[plant][:, 1].amax()) - 0.05  # y points down
-    foot = {"class_path": "Box", "init_args": {"min": [None, low, None], "max": [None] * 3}}
-    known = {
-        "scene": {
-            "ply": str(folder / "place.ply"),
-            "parts": str(folder / "parts.npz"),
-            "up": [0.0, -1.0, 0.0],
-            "metres_per_unit": 2.5,
-        },
-        "material": {"E": 3e5, "nu": 0.3, "density": 200.0, "thickness": 0.01},
-        "solver": {"dx": 0.06, "boundaries": [{"class_path": "PinnedRegion", "init_args": {"region": foot}}]},
-        "wind": {"flow": [4.0, 2.0, 0.0]},
-    }
-    file = folder / "place.yaml"
-    file.write_text(yaml.safe_dump(known | settings))
-    return file
 
 
 def _plant(count: int) -> GaussianCloud:

@@ -3,22 +3,13 @@
 from __future__ import annotations
 
 import math
-import time
-from collections.abc import Callable
 from dataclasses import dataclass
-from functools import partial
 
 import torch
 from torch import Tensor
 
-from bench.problems.settings import Result
-from gaussian_swaying.gaussians.area import coverage_area
 from gaussian_swaying.gaussians.cloud import GaussianCloud
 from gaussian_swaying.gaussians.model import GaussianSurfaceModel
-from gaussian_swaying.gaussians.openness import openness
-from gaussian_swaying.scenes.ficus import FicusScene
-from gaussian_swaying.scenes.leaves import LeavesScene
-from gaussian_swaying.scenes.procedural import FlagScene
 
 CROWN = 0.33  # height of the lowest leaf of the ficus, above its pot [m]
 
@@ -175,59 +166,3 @@ def of_cloud(cloud: GaussianCloud, threshold: float = 0.1, above: float | None =
         kept &= model.means[:, 2] > above
     means, scales = (part.detach()[kept].double() for part in (model.means, model.scales))
     return Body(means, model.normals()[kept].double(), scales, opacity[kept].double(), None)
-
-
-BODIES: dict[str, Callable[[], Body]] = {
-    "plate": plate,
-    "plate, rough by 0.2 spacings": lambda: plate(roughness=0.2),
-    "faint plate, opacity 0.4": lambda: plate(opacity=0.4),
-    "sphere": shell,
-    "sphere, opacity 0.6": lambda: shell(opacity=0.6),
-    "sphere with clutter inside": cluttered_sphere,
-    "sphere with faint clutter inside": lambda: cluttered_sphere(opacity=0.3),
-    "box with clutter inside": cluttered_box,
-    "two shells, 0.2 m apart": two_shells,
-    "two shells, 0.05 m apart": lambda: two_shells(inner=0.95),
-    "skin of 3 layers, opacity 0.9": lambda: layered_skin(3, 1.0, 0.9),
-    "skin of 4 layers, opacity 0.5": layered_skin,
-    "skin of 6 layers half a spacing apart, opacity 0.9": lambda: layered_skin(6, 0.5, 0.9),
-    "haze of 2 spacings, opacity 0.9": lambda: hazy_sphere(2.0, 0.9),
-    "haze of 5 spacings, opacity 0.5": lambda: hazy_sphere(5.0, 0.5),
-    "haze of 5 spacings, opacity 0.1 to 0.99": hazy_sphere,
-    "flag": lambda: of_cloud(FlagScene().generate()),
-    "leafy branch, 50 leaves": lambda: of_cloud(LeavesScene(leaves=50).generate()),
-    "leafy branch, 150 leaves": lambda: of_cloud(LeavesScene().generate()),
-    "crown of 300 leaves": lambda: of_cloud(FicusScene(leaves=300).generate(), above=CROWN),
-    "crown of 2,400 leaves": lambda: of_cloud(FicusScene().generate(), above=CROWN),
-    **{f"open ball of leaves, leaf area index {i}": partial(leaf_ball, i) for i in (1, 2)},
-    **{f"dense ball of leaves, leaf area index {i}": partial(leaf_ball, i) for i in (3, 4, 6)},
-    "unresolved: plate, rough by 1 spacing": lambda: plate(roughness=1.0),
-    "unresolved: clutter right under a sphere": lambda: cluttered_sphere(radius=0.98),
-    "unresolved: haze with normals tilted by 45 degrees": lambda: hazy_sphere(tilt=0.8),
-}
-"""What ``bench.py area`` measures; each with the area that the wind should find."""
-
-
-def area_shares(body: Body) -> Result:
-    """Sums of the areas ``coverage`` and ``open`` of a body over its true area, and how long each took [s].
-
-    Returns:
-        ``gaussians``, ``area`` [m²], ``coverage`` and ``open`` (shares), ``coverage_s`` and ``open_s``, the time of the
-        second one beyond the first, and ``open_cpu_s``, the processor time of the latter.
-    """
-    shape = body.means, body.normals, body.log_scales
-    begin = time.perf_counter()
-    covered = coverage_area(*shape, body.opacity)
-    between, busy = time.perf_counter(), time.process_time()
-    weight = openness(*shape, covered, body.opacity)
-    end, done = time.perf_counter(), time.process_time()
-    area = float(covered.sum()) if body.area is None else body.area
-    return {
-        "gaussians": float(len(body.means)),
-        "area": area,
-        "coverage": float(covered.sum()) / area,
-        "open": float((covered * weight).sum()) / area,
-        "coverage_s": between - begin,
-        "open_s": end - between,
-        "open_cpu_s": done - busy,
-    }
