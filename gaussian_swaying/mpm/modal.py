@@ -8,11 +8,12 @@ The stiffness matrix of the ``total`` formulation at rest is constant, so a few 
 - **Shift.** Captures have bits that hang on a corner of a cell; the lowest eigenvectors are theirs. :math:`K + s M`
   with :math:`s = (\omega_1 / 2)^2` tames them, where :math:`\omega_1` is the first frequency that is found with the
   shift itself, starting from a stiff guess.
-- **First frequency.** That of the mode that moves most in a level wind, near Rayleigh's quotient of the lean, in the
-  softer direction.
+- **First frequency.** That of the mode on which a level wind does most work, near Rayleigh's quotient of the lean, in
+  the softer direction.
 - **Modes.** Load-dependent Ritz vectors (Wilson, Yuan & Dickens 1982, Earthq. Eng. Struct. Dyn. 10:813) in place of
   eigenvectors: the answers to loads along three axes, on the whole and on clusters of points, and the answers to their
-  inertia. Modes below :data:`LOOSE` of the first frequency are loose bits and are left out.
+  inertia. Loose bits are left out: modes below :data:`LOOSE` of the first frequency, and those below the first
+  frequency in which less than :data:`BITS` of the mass moves.
 
 All results are for a body of 1 kg with a mean Young's modulus of 1 Pa, so that they serve for any factor of either.
 """
@@ -53,7 +54,7 @@ MOST_UNKNOWNS = 150_000
 """A body with more is refused: its factor would fill the memory."""
 KEPT = 32
 """Analyses in the cache."""
-_VERSION = 7  # of the analysis, in the name of the file
+_VERSION = 8  # of the analysis, in the name of the file
 
 
 @dataclass(frozen=True)
@@ -332,10 +333,11 @@ class Structure:
         blocks = [solve(S.T @ load)]
         blocks.append(solve(M @ np.linalg.qr(blocks[0])[0]))
         square, modes = reduced_modes(K, M, np.concatenate(blocks, 1))
-        first = min(square[k] for k in _main(square, modes.T @ whole, first, self._mass_share(S @ modes)))
-        dropped = int((square < LOOSE**2 * first).sum())
-        chosen = np.arange(dropped, min(dropped + most, len(square)))
-        return self._result(square[chosen], S @ modes[:, chosen], float(first), dropped)
+        share = self._mass_share(S @ modes)
+        first = min(square[k] for k in _main(square, modes.T @ whole, first, share))
+        loose = (square < LOOSE**2 * first) | ((square < first) & (share < BITS))
+        chosen = np.flatnonzero(~loose)[:most]
+        return self._result(square[chosen], S @ modes[:, chosen], float(first), int(loose.sum()))
 
     def _first_guess(self) -> float:
         """A shift that is too large: the square of the frequency of a wave along the body."""
@@ -426,13 +428,13 @@ def rayleigh(K: Any, M: Any, shapes: np.ndarray) -> float:
 
 
 def _main(square: np.ndarray, pull: np.ndarray, about: float, share: np.ndarray) -> list[int]:
-    """The mode that moves most under each of some loads (M, k), among those near the square of a frequency.
+    """The mode on which each of some loads (M, k) does most work, among those near the square of a frequency.
 
     A mode counts in which more than a few bits move, by the ``share`` of the mass that moves (M,), if there is one.
     """
     near = (square > NEAR[0] ** 2 * about) & (square < NEAR[1] ** 2 * about)
     near = near & (share > BITS) if (near & (share > BITS)).any() else near
-    moved = np.abs(pull / square[:, None])
+    moved = pull**2 / square[:, None]
     return [int(k) for k in (moved * near[:, None] if near.any() else moved).argmax(0)]
 
 

@@ -1,9 +1,10 @@
 r"""Stiffness, mass and drag with which a thing sways as its kind does in nature, by linear algebra in place of trials.
 
 First frequency :math:`\omega_1` and mass per frontal area :math:`M_A` alone decide how far a thing leans in a wind U,
-by :math:`\rho C_D U^2 / (2 M_A \omega_1^2)`. Mass and drag of the whole are those of the kind on the silhouette that is
-seen; the stiffness of the grid that runs is scaled until the main mode of the lean has the first frequency of the kind
-and height. Leaves on stems have a frequency of their own, with the stems pinned.
+by :math:`\rho C_D U^2 / (2 M_A \omega_1^2)`. The mass of the whole is that of the kind on the silhouette that is seen;
+the stiffness of the grid that runs is scaled until the main mode of the lean has the first frequency of the kind and
+height; and the drag, that of the kind on the silhouette, is scaled until the top leans as the formula says. Leaves on
+stems have a frequency of their own, with the stems pinned.
 """
 
 from __future__ import annotations
@@ -17,7 +18,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from gaussian_swaying.aero.force import added_mass_per_area
+from gaussian_swaying.aero.force import AeroForce, added_mass_per_area
 from gaussian_swaying.aero.wind import WindField
 from gaussian_swaying.aero.wind_force import WindForce
 from gaussian_swaying.geometry.groups import equal_rows
@@ -41,6 +42,8 @@ SILHOUETTE = 96
 """Cells along the longest side in which the silhouette is counted."""
 ABOVE = 1.5
 """Least frequency of leaves on pinned stems, over that of the whole."""
+TIP, LITTLE, MOST_CHANGE = 0.7, 0.02, 2.5
+"""Mean displacement over that of the top; lean at which it is linear; largest change of the drag for a natural lean."""
 
 
 @dataclass(frozen=True)
@@ -56,6 +59,7 @@ class Natural:
         thicker: Factor on the thicknesses of the surface.
         stiffer: Young's moduli [Pa], by those before.
         drag: Factor on the drag, friction and lift coefficients.
+        coefficient: Drag coefficient of the whole on its silhouette.
         lean: Mean displacement of the upper tenth in the mean wind, over the longest side.
         start: Time at which a typical stretch of the turbulence begins [s].
     """
@@ -67,6 +71,7 @@ class Natural:
     thicker: float
     stiffer: dict[float, float]
     drag: float
+    coefficient: float
     lean: float
     start: float
 
@@ -103,11 +108,9 @@ def natural(simulation: Simulation, kind: Kind, flow: Tensor, intensity: float) 
     found = _stiffness(structure, setup.points.youngs_modulus, own * thicker, thicker, frequency, kind)
     stiffer = {value: value * ratio for value, ratio in found.items()}
     drag = _drag(simulation, frontal, along, kind)
-    aero = other_with(
-        simulation.aero, **{name: drag * getattr(simulation.aero, name) for name in ("C_D", "C_F", "C_L")}
-    )
-    steady = WindForce(aero, WindField(flow * math.sqrt(1 + intensity**2)), scene.patches)
-    used = stiffer
+    aero, coefficient = _with_drag(simulation.aero, drag), kind.drag
+    mean = flow * math.sqrt(1 + intensity**2)
+    used, leans = stiffer, bool(flow.any()) and kind not in (KINDS["hanging"], KINDS["rigid"])
     modes: Modes | None = None
     for _ in range(2):  # the second time the mode itself has the frequency; the shapes stay
         points = setup.points
@@ -127,16 +130,28 @@ def natural(simulation: Simulation, kind: Kind, flow: Tensor, intensity: float) 
         used, modes = stiffer, bound
         ratio = (2 * math.pi * frequency) ** 2 / bound.first**2
         stiffer = {value: modulus * ratio for value, modulus in stiffer.items()}
+        if leans:
+            top = 0.5 * aero.air_density * kind.drag * float(mean.square().sum())
+            top /= TIP * kind.area_mass(height) * (2 * math.pi * frequency) ** 2
+            little = math.sqrt(LITTLE * height / top)  # of the wind, in which the lean is linear
+            state = modes.leaning(WindForce(aero, WindField(mean * little), scene.patches))
+            moved = _top(state.position - points.position, points.position)[0] / little**2 / ratio
+            change = min(max(top / max(moved, 1e-30), 1 / MOST_CHANGE), MOST_CHANGE)
+            aero, leans = _with_drag(aero, change), False
+            drag, coefficient = drag * change, coefficient * change
     assert modes is not None
-    state = modes.leaning(steady)
-    lean = _lean(state.position - points.position, points.position) if bool(flow.any()) else 0.0
-    shift = modes.at_sites(points.mass[:, None] * (state.position - points.position)).norm(dim=-1) / modes.site_mass
+    steady, lean = WindForce(aero, WindField(mean), scene.patches), 0.0
+    shift = modes.leaning(steady).position - points.position
+    if bool(flow.any()):
+        moved, side = _top(shift, points.position)
+        lean = moved / side
+    shift = modes.at_sites(points.mass[:, None] * shift).norm(dim=-1) / modes.site_mass
     top = (shift >= quantile(shift, 0.9)).nonzero()[:, 0].cpu().numpy()
     assert isinstance(simulation.wind, WindField)
     start = 0.0
     if bool(flow.any()):
         start = typical_start(linear_motion(modes, steady, simulation.wind, top, rate_for(frequency)), frequency)
-    return Natural(height, frequency, wanted, frontal, thicker, used, drag, lean, start)
+    return Natural(height, frequency, wanted, frontal, thicker, used, drag, coefficient, lean, start)
 
 
 def cloth_start(simulation: Simulation, kind: Kind, size: Sequence[float]) -> float:
@@ -269,13 +284,18 @@ def _drag(simulation: Simulation, frontal: float, flow: Tensor, kind: Kind) -> f
     return kind.drag * 0.5 * aero.air_density * frontal / max(pull, 1e-30)
 
 
-def _lean(moved: Tensor, rest: Tensor) -> float:
-    """Mean displacement of the tenth that moves most, over the longest side of what moves."""
-    size = moved.norm(dim=-1)
+def _with_drag(aero: AeroForce, factor: float) -> AeroForce:
+    """The same force with other coefficients."""
+    return other_with(aero, **{name: factor * getattr(aero, name) for name in ("C_D", "C_F", "C_L")})
+
+
+def _top(shift: Tensor, rest: Tensor) -> tuple[float, float]:
+    """Mean displacement of the tenth that moves most, and the longest side of what moves [m]."""
+    size = shift.norm(dim=-1)
     moving = size > 0.1 * quantile(size, 0.98)
     if not bool(moving.any()):
-        return 0.0
+        return 0.0, 1.0
     some = rest[moving].double()
     side = max(quantile(some[:, k], 0.99) - quantile(some[:, k], 0.01) for k in range(3))
     top = size[moving]
-    return float(top[top >= quantile(top, 0.9)].mean()) / max(side, 1e-30)
+    return float(top[top >= quantile(top, 0.9)].mean()), max(side, 1e-30)

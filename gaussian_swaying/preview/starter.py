@@ -32,7 +32,7 @@ aero:
 """
     why = "patches of a captured shell face the wind at every angle"
     if s.natural is not None:
-        why = f"a drag of {KINDS[s.kind].drag:g} on the silhouette of {s.natural.frontal:.2g} m^2"
+        why = f"a drag of {s.natural.coefficient:.2g} on the silhouette of {s.natural.frontal:.2g} m^2"
     added = ""
     if s.kind == "cloth" and not s.real:
         breadth = sorted(s.size)[1]

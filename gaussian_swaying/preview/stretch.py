@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -16,16 +17,14 @@ from gaussian_swaying.aero.wind import WindField
 from gaussian_swaying.aero.wind_force import WindForce
 from gaussian_swaying.mpm.formulations.modes import Modes
 
-SAMPLES, RATE, LEAST_RATE, PER_PERIOD = 22_500, 25.0, 8.0, 14.0  # of a record; in a second; in a period
-PLACES = 24  # at which the wind is taken
+SAMPLES, RATE, LEAST_RATE, PER_PERIOD = 60_000, 25.0, 6.0, 10.0  # of a record; in a second; in a period
+PLACES, LINES = 96, 20  # at which the wind is taken; lines along the wind on which they lie
 SKIPPED, SHORTEST, PERIODS = 2.0, 10.0, 10.0  # s at the start; s, and periods, of a stretch
-RINGING = 12  # modes whose motion before the start is taken off
+FASTEST, RINGING = 3.0, 12  # frequency over the first above which a mode does not swing; modes that ring on
 STEP, COMPARED = 0.24, 700  # s between stretches; those with the best means whose fluctuation is compared
-DRIFT, OFF = 0.01, 0.03  # small differences of the halves, and from the record, over the mean
-RESTLESS = 0.65  # fluctuation over the mean, at most
-LEAD = 2.5  # power at the frequency over that below, at least
-SHARE = (0.2, 0.65)  # share of the power near the frequency
-ROUND = (0.5, 0.85)  # minor over major axis
+# what a typical stretch has, and how far off counts as a fault: over the mean, in the last three as a ratio or its log
+DRIFT, OFF, RESTLESS = (0.0, 0.03, 0.02), (0.0, 0.12, 0.08), (0.25, 0.68, 0.07)
+EVEN, ROUND, SHARE, LEAD = (0.0, 0.2, 0.2), (0.47, 0.85, 0.05), (0.2, 0.65, 0.1), (0.5, math.inf, 0.3)
 
 
 Motion = tuple[np.ndarray, Callable[[int, int], np.ndarray]]
@@ -35,6 +34,20 @@ Motion = tuple[np.ndarray, Callable[[int, int], np.ndarray]]
 def rate_for(frequency: float) -> float:
     """Samples in a second of the record of a thing with a first frequency [Hz]."""
     return min(max(PER_PERIOD * frequency, LEAST_RATE), RATE)
+
+
+class Response(NamedTuple):
+    """Slow complex vibrations of a tip, and what of a load on the modes each takes.
+
+    Attributes:
+        root: Their complex frequencies [1/s], shape (K,).
+        out: The motion of the tip by their amplitudes, shape (3, K).
+        taken: Real and imaginary loads on them, and what the tip moves at once, by loads on the modes, (M, 2 K + 3).
+    """
+
+    root: np.ndarray
+    out: np.ndarray
+    taken: np.ndarray
 
 
 def typical_start(motion: Motion, frequency: float) -> float:
@@ -58,23 +71,24 @@ def typical_start(motion: Motion, frequency: float) -> float:
     first, second = (
         (sums[begin + skipped + k * half + half] - sums[begin + skipped + k * half]) / half for k in range(2)
     )
-    drift = np.linalg.norm(first - second, axis=1) / mean / DRIFT
-    off = np.linalg.norm(0.5 * (first + second) - whole.mean(0), axis=1) / mean / OFF
-    chosen = begin[(drift + off).argsort()[:COMPARED]]
+    drift = np.linalg.norm(first - second, axis=1) / mean
+    off = np.linalg.norm(0.5 * (first + second) - whole.mean(0), axis=1) / mean
+    chosen = begin[(_fault(drift, DRIFT) + _fault(off, OFF)).argsort()[:COMPARED]]
     faults = []
     for k in chosen:
         part = (moved[k : k + length] - ringing(k, length))[skipped:]
-        apart = np.linalg.norm(part[:half].mean(0) - part[half:].mean(0)) / DRIFT
-        away = np.linalg.norm(part.mean(0) - whole.mean(0)) / OFF
-        restless = max(float(np.linalg.norm(part.std(0))) / mean - RESTLESS, 0.0) / 0.1
-        faults.append((apart + away) / mean + restless + _fault(part, spread, frequency / rate))
+        apart = np.linalg.norm(part[:half].mean(0) - part[half:].mean(0)) / mean
+        away = np.linalg.norm(part.mean(0) - whole.mean(0)) / mean
+        restless = np.linalg.norm(part.std(0)) / mean
+        whole_of = _fault(apart, DRIFT) + _fault(away, OFF) + _fault(restless, RESTLESS)
+        faults.append(whole_of + _faults(part, spread, frequency / rate))
     return float(chosen[int(np.argmin(faults))] / rate)
 
 
 def linear_motion(bound: Modes, force: WindForce, wind: WindField, top: np.ndarray, rate: float) -> Motion:
     """Mean displacement of some sites in a long record of a wind, without turns [m].
 
-    The air's damping is that in the mean wind, as a diagonal: three quarters of that along it.
+    The air's damping is that in the mean wind, twice as strong along it as across.
 
     Args:
         bound: The modes of the body, of one scene.
@@ -95,17 +109,18 @@ def linear_motion(bound: Modes, force: WindForce, wind: WindField, top: np.ndarr
     shape = bound.site_shape.double().cpu().unflatten(0, (-1, 3))
     pull = pressed @ shape  # of a unit of |u| u, shape (S, 3, M)
     place = bound.site_rest.double().cpu()
+    square, flow = bound.square.double().cpu(), wind.flows[0].double().cpu()
+    along = torch.nn.functional.normalize(flow, dim=0)
+    weight = pressed * flow.norm() @ (eye + torch.outer(along, along))
+    damping = torch.diag(2 * bound.ratio.double().cpu() * square.sqrt())
+    damping = damping + shape.flatten(0, 1).T @ (weight @ shape).flatten(0, 1)
+    tip = shape[torch.from_numpy(top)].mean(0)
     centre, label = kmeans2(place.numpy(), min(PLACES, len(place)), seed=0, minit="++")
+    response = _response(square.numpy(), damping.numpy(), tip.numpy(), FASTEST * bound.first)
+    pull = pull @ torch.from_numpy(response.taken)
     of_place = torch.zeros(len(centre), 3, pull.shape[-1], dtype=torch.float64)
     of_place.index_add_(0, torch.from_numpy(label).long(), pull)
-    air = _air(wind, torch.from_numpy(centre), rate)
-    push = (air.norm(dim=-1, keepdim=True) * air).flatten(1) @ of_place.flatten(0, 1)
-    square, speed = bound.square.double().cpu(), float(wind.flows[0].norm())
-    omega = square.sqrt()
-    weight = (pressed * speed) @ shape
-    alpha = bound.ratio.double().cpu() * omega + 0.75 * (shape * weight).sum((0, 1))
-    tip = shape[torch.from_numpy(top)].mean(0)
-    return _motion(push.numpy(), square.numpy(), torch.minimum(alpha, 0.95 * omega).numpy(), tip.numpy(), rate)
+    return _motion(_push(wind, torch.from_numpy(centre), of_place, rate), response, rate)
 
 
 def cloth_motion(wind: WindField, places: torch.Tensor, frequency: float, ratio: float) -> Motion:
@@ -118,67 +133,108 @@ def cloth_motion(wind: WindField, places: torch.Tensor, frequency: float, ratio:
         ratio: Damping ratio, with that of the air.
     """
     rate, omega = rate_for(frequency), 2 * math.pi * frequency
-    air = _air(wind, places.double().cpu(), rate).mean(1)
+    air = _air(wind, places.double().cpu(), rate, SAMPLES, 0).mean(1)
     push = (air.norm(dim=-1, keepdim=True) * air).numpy()
-    return _motion(push, np.full(3, omega**2), np.full(3, ratio * omega), np.eye(3), rate)
+    response = _response(np.full(3, omega**2), 2 * ratio * omega * np.eye(3), np.eye(3), math.inf)
+    return _motion(push @ response.taken, response, rate)
 
 
-def _air(wind: WindField, places: torch.Tensor, rate: float) -> torch.Tensor:
-    """Wind at places (K, 3) in a long record [m/s], shape (T, K, 3)."""
-    times = torch.arange(SAMPLES, dtype=torch.float64) / rate
+def _push(wind: WindField, places: torch.Tensor, pull: torch.Tensor, rate: float) -> np.ndarray:
+    """Loads in a long record, (T, C), by places (K, 3) and what |u| u pulls there, (K, 3, C).
+
+    What the wind carries comes to the places on one line along it one after the other.
+    """
+    from scipy.cluster.vq import kmeans2
+
+    flow = wind.flows[0].double().cpu()
+    along = torch.nn.functional.normalize(flow, dim=0)
+    down = places @ along
+    across = places - down[:, None] * along
+    line, label = kmeans2(across.numpy(), min(LINES, len(places)), seed=0, minit="++")
+    late = (down / flow.norm() * rate).numpy()  # in samples
+    before, first = math.ceil(late.max()) + 1, math.floor(late.min())
+    air = _air(wind, torch.from_numpy(line), rate, SAMPLES + before - first, before)
+    pressed = (air.norm(dim=-1, keepdim=True) * air).numpy()
+    push = np.zeros((SAMPLES, pull.shape[-1]))
+    for k, own in enumerate(late):
+        n, here = math.floor(own), pressed[:, label[k]]
+        begin, share = before - n, own - n
+        at = (1 - share) * here[begin : begin + SAMPLES] + share * here[begin - 1 : begin - 1 + SAMPLES]
+        push += at @ pull[k].numpy()
+    return push
+
+
+def _air(wind: WindField, places: torch.Tensor, rate: float, samples: int, before: int) -> torch.Tensor:
+    """Wind at places (K, 3) in a record that begins some samples ``before`` time zero [m/s], shape (T, K, 3)."""
+    times = (torch.arange(samples, dtype=torch.float64) - before) / rate
     flow = wind.flows[0].double().cpu()  # carries the turbulence, so an earlier place is a later time
-    where = (places - times[:, None, None] * flow).reshape(-1, 3)
-    return wind.at(times[0], where).double().reshape(len(times), -1, 3)
+    where = (places - times[:, None, None] * flow).reshape(-1, 3).float()
+    return wind.at(torch.zeros((), dtype=torch.float64), where).double().reshape(len(times), -1, 3)
 
 
-def _motion(push: np.ndarray, square: np.ndarray, alpha: np.ndarray, tip: np.ndarray, rate: float) -> Motion:
-    """The motion of a tip by modes of given loads (T, M), squares of frequencies, decay rates and shapes (3, M)."""
+def _response(square: np.ndarray, damping: np.ndarray, tip: np.ndarray, fastest: float) -> Response:
+    """How a tip (3, M) answers to loads on modes of squares of frequencies (M,) and damping [1/s], (M, M).
+
+    Vibrations faster than some circular frequency follow the load at once.
+    """
+    zero = np.zeros(damping.shape)
+    root, left = np.linalg.eig(np.block([[zero, np.eye(len(zero))], [-np.diag(square), -damping]]))
+    into, out = np.linalg.inv(left)[:, len(zero) :], tip @ left[: len(zero)]
+    out = out * np.where(root.imag > 0, 2.0, 1.0)  # with its conjugate
+    slow = (root.imag >= 0) & (abs(root) < fastest)
+    fast = (root.imag >= 0) & ~slow
+    at_once = (out[:, fast] / -root[fast]) @ into[fast]
+    return Response(root[slow], out[:, slow], np.concatenate([into[slow].real, into[slow].imag, at_once.real]).T)
+
+
+def _motion(load: np.ndarray, response: Response, rate: float) -> Motion:
+    """The motion of a tip under the loads of a response, (T, 2 K + 3)."""
     from scipy.signal import lfilter
 
-    dt, moved = 1 / rate, np.zeros((len(push), 3))
-    free = []  # decay, frequency, amplitudes and tip of each mode that matters
-    for k in range(len(square)):
-        a, w = float(alpha[k]), math.sqrt(float(square[k] - alpha[k] ** 2))
-        decay, sine, cosine = math.exp(-a * dt), math.sin(w * dt), math.cos(w * dt)
-        # exact for steps of the load: q + 2 poles
-        b1 = 1 - decay * (cosine + a / w * sine)
-        b2 = decay * (decay + a / w * sine - cosine)
-        amplitude = lfilter([0.0, b1, b2], [1.0, -2 * decay * cosine, decay**2], push[:, k]) / float(square[k])
-        moved += amplitude[:, None] * tip[:, k]
-        free.append((a, w, amplitude, tip[:, k], float(amplitude.std() * np.linalg.norm(tip[:, k]))))
-    free.sort(key=lambda mode: -mode[-1])
+    count, dt = len(response.root), 1 / rate
+    moved, free = load[:, 2 * count :].copy(), []
+    for k, root in enumerate(response.root):
+        decay = np.exp(root * dt)  # exact for steps of the load
+        amplitude = lfilter([0.0, (decay - 1) / root], [1.0, -decay], load[:, k] + 1j * load[:, count + k])
+        moved += (amplitude[:, None] * response.out[:, k]).real
+        free.append((float(amplitude.std() * np.linalg.norm(response.out[:, k])), root, amplitude, response.out[:, k]))
+    free.sort(key=lambda mode: -mode[0])
 
     def ringing(start: int, samples: int) -> np.ndarray:
         time, left = np.arange(samples) * dt, np.zeros((samples, 3))
-        for a, w, amplitude, way, _ in free[:RINGING]:
-            q, p = amplitude[start], (amplitude[start + 1] - amplitude[start - 1]) / (2 * dt)
-            swing = q * np.cos(w * time) + (p + a * q) / w * np.sin(w * time)
-            left += (np.exp(-a * time) * swing)[:, None] * way
+        for _, root, amplitude, way in free[:RINGING]:
+            left += (np.exp(root * time)[:, None] * (amplitude[start] * way)).real
         return left
 
     return moved, ringing
 
 
-def _fault(part: np.ndarray, spread: float, frequency: float) -> float:
-    """Distance of the fluctuation of a stretch (T, 3) from a typical one: the sum of its faults, each over a small one.
+def _fault(value: Any, allowed: tuple[float, float, float]) -> Any:
+    """One for a value outside its range by the last number or more, and a little more the farther it is."""
+    low, high, size = allowed
+    apart = np.maximum(np.maximum(low - value, value - high), 0.0) / size
+    return np.minimum(apart, 1.0) + 0.25 * apart
+
+
+def _faults(part: np.ndarray, spread: float, frequency: float) -> float:
+    """Faults of the fluctuation of a stretch (T, 3): its size, how round it is, and its spectrum.
 
     The frequency is that for each sample.
     """
     apart = part - part.mean(0)
-    uneven = abs(np.log(np.linalg.norm(apart.std(0)) / spread))
     left, sizes, _ = np.linalg.svd(apart, full_matrices=False)
-    narrow = max(ROUND[0] - sizes[1] / sizes[0], sizes[1] / sizes[0] - ROUND[1], 0.0)
+    uneven = abs(np.log(np.linalg.norm(apart.std(0)) / spread))
+    found = _fault(uneven, EVEN) + _fault(sizes[1] / sizes[0], ROUND)
     if 1.15 * frequency > 0.5:  # it follows the wind: its own vibration is not in the record
-        return float(uneven / 0.2 + narrow / 0.1)
+        return float(found)
     line, time = left[:, 0], np.arange(len(part))
     line = line - np.polyval(np.polyfit(time, line, 1), time)
     power = np.abs(np.fft.rfft(line * np.hanning(len(line)), 4 * len(line))) ** 2
     f = np.fft.rfftfreq(4 * len(line)) / frequency
     own, below = (f > 0.85) & (f < 1.15), (f > 1.5 / len(line) / frequency) & (f <= 0.75)
-    lead = power[own].max() / max(power[below].max(initial=0.0), 1e-300)
+    lead = np.log(power[own].max() / max(power[below].max(initial=0.0), 1e-300))
     share = power[(f > 2 / 3) & (f < 4 / 3)].sum() / power.sum()
-    tonal = max(share - SHARE[1], SHARE[0] - share, 0.0)
-    return uneven / 0.2 + (narrow + tonal) / 0.1 + max(np.log(LEAD / lead), 0.0) / 0.1
+    return float(found + _fault(share, SHARE) + _fault(lead, LEAD))
 
 
 __all__ = ["Motion", "cloth_motion", "linear_motion", "rate_for", "typical_start"]

@@ -15,8 +15,8 @@ from gaussian_swaying.preview.stretch import cloth_motion, rate_for, typical_sta
 def test_the_stretch_is_as_the_record(frequency, ratio):
     """In ten seconds after two, without what rang before: the same mean in both halves, and that of the record.
 
-    The sum of all faults is least, so each is small, or little more: means to 0.15 and 0.1, and the fluctuation to 0.4.
-    One stretch of ten seconds of a turbulence of 30 % would be off by more (a standard deviation of some 0.15).
+    The sum of all faults is least, and most stretches have one: means to 0.2, which OFF and its size allow, and to 0.1,
+    and the fluctuation to 0.4. In any stretch of ten seconds the halves differ by 0.2 or more (the median).
     """
     wind = look("breeze", height=0.5, seed=1)
     moved, ringing = motion = cloth_motion(wind, torch.zeros(1, 3), frequency, ratio)
@@ -25,24 +25,50 @@ def test_the_stretch_is_as_the_record(frequency, ratio):
     part = (moved[begin : begin + length] - ringing(begin, length))[round(2 * rate) :]
     whole = moved[round(20 * rate) :]
     mean, half = whole.mean(0), len(part) // 2
-    assert np.linalg.norm(part.mean(0) - mean) < 0.15 * np.linalg.norm(mean)
+    assert np.linalg.norm(part.mean(0) - mean) < 0.2 * np.linalg.norm(mean)
     assert np.linalg.norm(part[:half].mean(0) - part[half:].mean(0)) < 0.1 * np.linalg.norm(mean)
     assert np.linalg.norm(part.std(0)) == pytest.approx(np.linalg.norm(whole.std(0)), rel=0.4)
 
 
 def test_the_motion_is_that_of_an_oscillator():
     """In a constant load it comes to rest at load / omega², and the load acts in the step after it."""
-    square, alpha = (2 * math.pi) ** 2, 0.9
+    square, alpha, tip = np.array([(2 * math.pi) ** 2]), 0.9, np.array([[2.0], [0.0], [0.0]])
+    response = stretch._response(square, np.array([[2 * alpha]]), tip, math.inf)
     push = np.ones((400, 1))
-    moved, ringing = stretch._motion(push, np.array([square]), np.array([alpha]), np.array([[2.0], [0.0], [0.0]]), 20.0)
-    omega, time = math.sqrt(square - alpha**2), np.arange(400) / 20
+    moved, ringing = stretch._motion(push @ response.taken, response, 20.0)
+    omega, time = math.sqrt(square[0] - alpha**2), np.arange(400) / 20
     exact = 2 / square * (1 - np.exp(-alpha * time) * (np.cos(omega * time) + alpha / omega * np.sin(omega * time)))
     np.testing.assert_allclose(moved[:, 0], exact, atol=1e-12)
     assert not moved[:, 1:].any()
     push[100:] = 0  # then it rings down, and that is what is left of what was before
-    moved, ringing = stretch._motion(push, np.array([square]), np.array([alpha]), np.array([[2.0], [0.0], [0.0]]), 20.0)
-    # the rate at the start is a central difference: an error of (omega dt)² / 6 = 1.6 %
-    np.testing.assert_allclose(ringing(120, 100), moved[120:220], atol=0.02 * abs(moved[120:140]).max())
+    moved, ringing = stretch._motion(push @ response.taken, response, 20.0)
+    np.testing.assert_allclose(ringing(120, 100), moved[120:220], atol=1e-12)
+    at_once = stretch._response(square, np.array([[2 * alpha]]), tip, 1.0)
+    np.testing.assert_allclose((push @ at_once.taken)[:, 0], 2 / square[0] * push[:, 0])
+
+
+def test_modes_that_share_their_damping_are_those_of_the_matrix():
+    """Two modes with a full damping matrix: the steady motion in a constant load is that of the stiffness alone."""
+    square, damping = np.array([4.0, 9.0]), np.array([[0.8, 0.5], [0.3, 1.2]])
+    response = stretch._response(square, damping, np.eye(3)[:, :2], math.inf)
+    moved, _ = stretch._motion(np.tile([1.0, -2.0], (4000, 1)) @ response.taken, response, 20.0)
+    np.testing.assert_allclose(moved[-1], [1 / 4, -2 / 9, 0], atol=1e-9)
+    # and in a sine of 0.4 Hz that of (omega² - w² + i w damping), to the delay of half a step
+    w, time = 0.8 * math.pi, np.arange(4000) / 50
+    moved, _ = stretch._motion(np.sin(w * time)[:, None] * [1.0, 0.0] @ response.taken, response, 50.0)
+    answer = np.linalg.solve(np.diag(square) - w**2 * np.eye(2) + 1j * w * damping, [1.0, 0.0])
+    expected = (answer * np.exp(1j * w * (time[2000:, None] - 0.01))).imag
+    np.testing.assert_allclose(moved[2000:, :2], expected, atol=1e-3 * abs(answer).max())
+
+
+def test_places_on_one_line_meet_the_same_wind_one_after_the_other():
+    wind = look("gusts", seed=3)
+    places, pull = torch.tensor([[0.0, 0.2, 0.1], [1.6, 0.2, 0.1]], dtype=torch.float64), torch.zeros(2, 3, 2).double()
+    pull[0, 0, 0] = pull[1, 0, 1] = 1.0
+    push = stretch._push(wind, places, pull, 25.0)
+    np.testing.assert_allclose(push[5:, 1], push[:-5, 0], rtol=1e-4)  # 1.6 m in 5 samples at 8 m/s
+    air = wind.at(torch.tensor(4.0, dtype=torch.float64), places[:1].float())[0].double()
+    assert push[100, 0] == pytest.approx(float(air.norm() * air[0]), rel=1e-3)
 
 
 def test_a_thing_that_is_too_stiff_for_the_record_follows_the_wind():
@@ -54,6 +80,6 @@ def test_a_thing_that_is_too_stiff_for_the_record_follows_the_wind():
 
 
 def test_samples_suit_the_frequency():
-    assert rate_for(0.1) == 8.0
-    assert rate_for(1.0) == 14.0
+    assert rate_for(0.1) == 6.0
+    assert rate_for(1.0) == 10.0
     assert rate_for(40.0) == 25.0
