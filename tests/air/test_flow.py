@@ -8,7 +8,7 @@ Covers: air.flow_kernels.
 import pytest
 import torch
 
-from gaussian_swaying.air.flow import HELD, WALL, FlowState, LatticeFlow
+from gaussian_swaying.air.flow import HELD, WALL, FlowState, LatticeFlow, hold
 from gaussian_swaying.air.lattice import LatticeUnits
 
 UNITS = LatticeUnits.at_speed(0.1, 1.0, viscosity=1e-3, density=1.2)
@@ -43,6 +43,19 @@ def test_kernels_compute_the_step(name, walls, kernel_device):
     expected = flow.step(state, wind, push).moments
     single = flow.to(kernel_device).step(FlowState(state.moments.float().to(kernel_device)), wind, push).moments
     torch.testing.assert_close(single.cpu().double(), expected, rtol=0, atol=3e-7)
+
+
+def test_nothing_flows_back_in_where_the_wind_blows_out():
+    """At an open face the air behind it goes on, along the face in any case and across it outwards alone."""
+    flow = LatticeFlow((6, 5, 4), UNITS)
+    state, _ = _random(flow)
+    moments, wind = state.moments.clone(), 0.01 * flow.outward
+    hold(moments, flow.held, flow.behind, flow.outward, wind)
+    before, after = (given[1:4].reshape(3, -1).T for given in (state.moments, moments))
+    across = flow.outward / flow.outward.norm(dim=-1, keepdim=True)
+    came, left = ((part[index.long()] * across).sum(-1) for part, index in ((before, flow.behind), (after, flow.held)))
+    assert int((came < 0).sum()) > 20
+    torch.testing.assert_close(left, came.clamp(min=0).to(left), rtol=0, atol=1e-12)
 
 
 def _ball(place):

@@ -74,6 +74,18 @@ def test_the_offset_all_over_a_picture(simulation, monkeypatch):
     assert every.at(away).isfinite().all()
 
 
+def test_between_the_points_of_its_lattice_it_is_linear(simulation):
+    """An offset that is the pixel itself, as known on the lattice, is the pixel everywhere in it."""
+    painter, camera = simulation.painter, cameras()["left"]
+    found, means = Overlap(painter, painter.scene.rest(), camera), painter.scene.rest().means.double()
+    rows, columns = (found._step * torch.arange(n, dtype=torch.float64) + 0.5 for n in found._field.shape[2:])
+    found._field = torch.stack(torch.meshgrid(columns, rows, indexing="xy"))[None]
+    pixel = project(means, camera)[0]
+    inside = ((pixel > 1) & (pixel < torch.stack([columns[-1], rows[-1]]))).all(-1)
+    assert int(inside.sum()) > 20
+    torch.testing.assert_close(found.at(means[inside]), pixel[inside], rtol=0, atol=1e-6)
+
+
 def test_the_edge_of_a_picture_does_not_cut_gaussians(simulation):
     """The offset near the edge is that in a wider picture."""
     painter, camera = simulation.painter, cameras()["left"]

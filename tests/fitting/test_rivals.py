@@ -1,6 +1,7 @@
 """Other values that may explain the same film."""
 
 import math
+from types import SimpleNamespace
 
 import pytest
 import torch
@@ -30,6 +31,14 @@ def test_a_wind_across_a_sheet_or_along_it_is_its_own_mirror_image(simulation):
     """Along it, the image blows the other way: a flag would be on the other side of its pole, which a fit can try."""
     assert mirrored(simulation.setup, {"wind.azimuth": 90.0}) is None
     assert math.cos(math.radians(mirrored(simulation.setup, {"wind.azimuth": 0.0}))) == pytest.approx(-1, abs=0.01)
+
+
+def test_a_large_patch_counts_as_its_area():
+    """Nine patches that face x have less area than the one that faces y, at which the wind is mirrored."""
+    normal = torch.tensor([[1.0, 0.0, 0.0]] * 9 + [[0.0, 1.0, 0.0]])
+    area = torch.tensor([0.001] * 9 + [0.5])
+    setup = SimpleNamespace(scene=SimpleNamespace(patches=SimpleNamespace(normal=normal, area=area)))
+    assert mirrored(setup, {"wind.azimuth": 56.0}) == pytest.approx(124.0)
 
 
 def test_a_body_that_faces_all_ways_has_no_mirror_image(simulation):

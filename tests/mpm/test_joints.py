@@ -114,6 +114,26 @@ def test_what_is_no_joint_is_refused():
         Joints(points, [PointJoint(sets[0], sets[1][:0], AT.tolist())], 1e-3)
 
 
+@pytest.mark.parametrize("turn", [[0.0, 1.4, 0.0], [1.2, 0.0, 0.0], [0.9, -0.8, 0.4]])
+def test_a_joint_of_lines(turn):
+    """Bars along z, one turned by up to 80 degrees: what a line can feel of the torque is across it as it lies now."""
+    z = torch.arange(5, dtype=DOUBLE) / 4
+    place = torch.cat([torch.stack([0 * z + x, 0 * z, z], -1) for x in (0.0, 1.0)])
+    numbers = {"volume": 0.01, "density": 100.0, "youngs_modulus": 1e4, "poisson_ratio": 0.3}
+    points = MaterialPoints.create(place, **numbers, attached=torch.arange(2).repeat_interleave(5))
+    sets = [torch.arange(5), torch.arange(5, 10)]
+    joints = Joints(points, [PointJoint(*sets, AT.tolist(), 30.0, 7.0)], 1e-6)
+    state = moved(points, sets, [turn, [0.0] * 3], [[0.0] * 3] * 2)
+    force = joints(state)
+    torch.testing.assert_close(force.sum(0), torch.zeros(3, dtype=DOUBLE), rtol=0, atol=1e-9)
+    for own, sign in zip(sets, (-1.0, 1.0), strict=True):
+        along = torch.nn.functional.normalize(state.position[own[-1]] - state.position[own[0]], dim=0)
+        torque = sign * 7.0 * torch.tensor(turn, dtype=DOUBLE)
+        felt = torch.linalg.cross(state.position[own] - AT, force[own]).sum(0)
+        across = torque - (torque @ along) * along
+        torch.testing.assert_close(felt, across, rtol=1e-6, atol=1e-6)  # a share of F decides the turn about it
+
+
 def test_the_turn_between_two_rotations():
     turn = torch.tensor([[0.3, -1.0, 2.0], [1e-9, 0.0, 0.0], [0.0, 0.0, 0.0]], dtype=DOUBLE)
     other = rotation_of(torch.tensor([[1.0, 0.2, 0.3]], dtype=DOUBLE))

@@ -16,7 +16,7 @@ from gaussian_swaying.mpm.laws.hencky import StVKHencky
 from gaussian_swaying.mpm.laws.neo_hookean import NeoHookean
 from gaussian_swaying.mpm.laws.shared import lame_parameters
 from gaussian_swaying.mpm.laws.spring_network import SpringNetwork
-from gaussian_swaying.mpm.sheets import director_energy, flattened, sheet_pk1
+from gaussian_swaying.mpm.sheets import bending_of, director_energy, flattened, sheet_pk1
 from gaussian_swaying.mpm.solver import MPMSolver
 from gaussian_swaying.mpm.state import MaterialPoints
 
@@ -71,6 +71,15 @@ def test_the_energy_is_that_of_kirchhoffs_plate_in_any_direction(seed):
     ):
         energy = float(form.bending.energy(height[:, None] * rotation[:, 2]))
         assert energy == pytest.approx(0.5 * D * density * area, rel=1e-10)
+
+
+def test_a_softened_point_bends_as_much_more_easily():
+    points = sheet(turned(1), size=3)
+    form = bound(points)[0].bound
+    moved = torch.randn(form.node_positions(points.position).shape, generator=torch.Generator().manual_seed(0)).double()
+    share = torch.full((len(points.position),), 0.25, dtype=torch.float64)
+    soft = bending_of(points, form.stencil, 1.0, share)
+    torch.testing.assert_close(soft.forces(moved), 0.25 * form.bending.forces(moved))
 
 
 def test_motion_without_curvature_has_no_force():

@@ -23,7 +23,7 @@ from gaussian_swaying.mpm.contact.surface import Contact, Surface
 from gaussian_swaying.mpm.followers import GridFollowers, on_material
 from gaussian_swaying.mpm.solver import MPMSolver
 from gaussian_swaying.mpm.state import GridSpec, MaterialPoints, MPMState
-from gaussian_swaying.mpm.virtual_nodes import coordinates, virtual_nodes
+from gaussian_swaying.mpm.virtual_nodes import coordinates, first_nodes, point_with_nodes, shifts, virtual_nodes
 
 EDGE = Box([None, None, None], [1.0, None, None])
 
@@ -111,6 +111,19 @@ def test_kernels_do_what_torch_does_on_each_device(kernel_device):
     away = (ends[0] - batch.position).abs().amax()
     assert away > 1e-3
     assert (ends[0] - ends[1]).abs().amax() < 1e-3 * away
+
+
+def test_a_place_takes_the_nodes_of_a_point_of_its_cell_that_is_near():
+    """Of one that shares nodes with the point that the place belongs to, and no other copies of them."""
+    grid = GridSpec(1.0, (0, 0, 0), (12, 4, 4))
+    x = torch.tensor([1.2, 2.2, 9.2], dtype=torch.float64)
+    first = first_nodes(torch.stack([x, 0 * x + 1.2, 0 * x + 1.2], -1), grid)
+    nodes = (first[:, None] + shifts(grid)).T.contiguous()
+    place, near = first[[0, 1, 1, 1]], torch.tensor([0, 1, 0, 2])
+    assert point_with_nodes(place, near, first, nodes, grid).tolist() == [0, 1, 1, -1]
+    copied = nodes.clone()
+    copied[:, 1] += 1000
+    assert point_with_nodes(place, near, first, copied, grid).tolist() == [0, 1, -1, -1]
 
 
 def strip(x, y, z):

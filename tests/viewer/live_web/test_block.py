@@ -10,7 +10,7 @@ from small_scenes import together
 from gaussian_swaying.gaussians.ply import write_ply
 from gaussian_swaying.mpm.forces import Force
 from gaussian_swaying.scenes.procedural import FlagScene
-from gaussian_swaying.viewer.live_web.block import check
+from gaussian_swaying.viewer.live_web.block import check, in_webassembly
 from gaussian_swaying.viewer.live_web.page import PAGE
 
 from .conftest import SIDE, apart, moved_means
@@ -252,6 +252,17 @@ REFUSED = {
 def test_what_a_browser_cannot_simulate_is_refused(make, name):
     with pytest.raises(ValueError, match=rf"^The page of --live-web cannot simulate .*{name}.*\.$"):
         check(make(**REFUSED[name]))
+
+
+def test_the_fast_pass_takes_what_it_knows_alone(make):
+    """Two laws, drag in explicit steps, and no viscosity; the rest is done by the plain pass."""
+    assert in_webassembly(make())
+    for changes in (
+        {"solver": {"stiffness_damping": 1e-4}},
+        {"aero": {"drag_step": "semi_implicit"}},
+        {"material": {"law": {"class_path": "StVKHencky"}}},
+    ):
+        assert not in_webassembly(make(**changes))
 
 
 def test_the_worker_is_built_from_its_sources(request):

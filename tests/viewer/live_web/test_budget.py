@@ -23,6 +23,20 @@ def test_the_finest_grid_within_the_budget(budget):
     assert len(tried) <= 6
 
 
+def test_of_two_grids_within_the_budget_it_is_the_finer():
+    """A load that falls faster than foreseen: the first guess is too coarse, and a finer one is tried."""
+    tried = {}
+
+    def load(dx):
+        tried[dx] = 100 * (0.05 / dx) ** 5
+        return tried[dx]
+
+    dx, found = finest_within(load, 0.05, 1.0)
+    within = [one for one in tried if tried[one] <= 1.0]
+    assert len(within) > 1
+    assert (dx, found) == (min(within), tried[min(within)])
+
+
 def test_the_configured_grid_is_kept_if_it_fits():
     assert finest_within(sheet, 0.2, 1e9) == (0.2, sheet(0.2))
 
