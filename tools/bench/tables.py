@@ -231,3 +231,38 @@ def _known(page: str) -> str:
 SECTIONS["known.validation"] = lambda: _known("validation.md")
 SECTIONS["known.nature"] = lambda: _known("nature.md")
 SECTIONS["known.air"] = lambda: _known("air.md")
+
+# ---- wind.md, contact.md, validation.md
+
+
+def _wind(run: Run) -> str:
+    ratios = " | ".join(f"{own['ratio']:.2f}" for name, own in run.winds.items() if name in WINDS)
+    return f"{_on(run)} | `{run.formulation}` | {run.particles:,} | {run.winds['uniform']['median_ms']:.3g} | {ratios}"
+
+
+WINDS = ("turbulence", "profile, turbulence", "profile, turbulence, shelter", "cylinder")
+table("speed.winds", "winds", " | ".join(["device", "formulation", "points", "uniform gusts [ms]", *WINDS]), _wind)
+
+
+def _contact() -> str:
+    runs = read("contact")
+    took = {(run.device, run.asked, run.case): run.median_ms for run in runs}
+    cases = ("nothing near", "a fifth in contact", "all in contact")
+    rows = []
+    for run in runs:
+        if run.case == "off":
+            ratios = [took[run.device, run.asked, case] / run.median_ms for case in cases]
+            told = " | ".join(f"{ratio:.2f}" if ratio <= 1.5 else f"**{ratio:.2f}**" for ratio in ratios)
+            rows.append(f"{_on(run)} | {run.points:,} | {run.median_ms:.3g} | {told}")
+    return grid(" | ".join(["device", "points", "off [ms]", *cases]), rows) + "\n\n" + source(runs)
+
+
+SECTIONS["speed.contact"] = _contact
+table(
+    "speed.backward", "backward",
+    "points | computed by | plain substep [ms] | with a gradient [ms] | backward [ms] | backward over plain, 4 wanted "
+    "| memory of 2,000 substeps, 2 GiB wanted",
+    lambda run: f"{run.points:,} | {'torch' if run.by == 'torch' else 'kernels'} | {run.plain_ms:.3g} "
+    f"| {run.forward_ms:.3g} | {run.backward_ms:.3g} | {run.ratio:.1f} "
+    f"| {f'{run.memory_bytes / 2**30:.2f} GiB' if hasattr(run, 'memory_bytes') else DASH}",
+)  # fmt: skip
