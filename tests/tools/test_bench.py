@@ -56,3 +56,21 @@ def test_the_pages_say_what_is_recorded():
     used = (ROOT / "docs").glob("*.md")
     pages = "".join(page.read_text(encoding="utf-8") for page in used)
     assert [name for name in report.SECTIONS if f"<!-- begin: {name} -->" not in pages] == []
+
+
+@pytest.mark.slow(twin="test_a_run_adds_a_line_and_the_last_one_counts")
+def test_studies_run_at_their_smallest():
+    studies.load()
+    small = {
+        "substep": {"case": "substep", "asked": 400},
+        "batches": {"case": "batch", "formulation": "total", "gusts": True},
+        "contact": {"asked": 400, "case": "all in contact"},
+        "backward": {"asked": 400, "by": "auto", "steps": 8},
+        "frames": {"case": "frame", "dx_m": 0.1},
+    }
+    for name, parameters in small.items():
+        numbers = runner.STUDIES[name].function(**parameters, device="cpu")
+        assert all(value >= 0 for value in numbers.values() if isinstance(value, float)), name
+    error = runner.STUDIES["convergence"].function("hanging bar (tip)", "total", 8)["error"]
+    assert runner.STUDIES["pareto"].function("bar", 16, "total", 0.4, "cpu")["error"] < 0.01
+    assert error < 0.0026  # 1 / (8 cells²)

@@ -1,0 +1,95 @@
+"""Flags beside the motions of Blender's cloth: ways to simulate them, and finer grids.
+
+``python tools/datasets/make_flag_dataset.py`` makes the motions in ``outputs/flags``, with splats of photos trained by
+``tools/train.py --config configs/train/flag.yaml`` in ``outputs/flags/pattern1/splat`` and so on.
+"""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+import tempfile
+from pathlib import Path
+
+from bench.runner import ROOT, Row, study
+from gaussian_swaying.evaluation.compare import compare_run
+from gaussian_swaying.simulation.simulation import Simulation
+
+DATA = ROOT / "outputs" / "flags"
+FLAGS = ("1", "2", "3", "4", "5", "curtain", "light", "pennant")
+CHANGES = ("--material.volume=cell", "--scene.layers=1", "--material.law=FixedCorotated", "--scene.area=equal")
+WAYS: dict[str, tuple[list[str], list[str], bool]] = {
+    "ours": ([], [], False),
+    "to_volume": ([], [*CHANGES[:1]], True),
+    "to_layer": ([], [*CHANGES[:2]], True),
+    "to_law": ([], [*CHANGES[:3]], True),
+    "to_area": ([], [*CHANGES], True),
+    "to_wind": (["no_normals"], [*CHANGES], True),
+    "particle": (["particle"], [], True),
+    "own_volumes": (["particle"], [], False),
+    "no_surface": (["no_surface"], [], False),
+    "no_shading": (["no_shading"], [], False),
+    "neighbours": ([], ["--scene.normals=neighbours"], False),
+}
+"""Files of configs/bench/variants, options, and whether the flag gets the mass of ours."""
+
+
+def arguments(flag: str, splats: str, way: str) -> list[str]:
+    """Options of ``tools/sim.py``; pattern 4 and later hang by their top edge like pattern 3."""
+    files, options, _ = WAYS[way]
+    base, own = (flag, []) if flag in "123" else ("3", [f"bench/flag{flag}" if flag.isdigit() else f"bench/{flag}"])
+    names = [f"sim/flag{base}", f"bench/flag{base}", *own, *(f"bench/variants/{name}" for name in files)]
+    words = [word for name in names for word in ("--config", f"configs/{name}.yaml")] + options
+    if splats == "trained":
+        words += [f"--scene.ply={folder(flag) / 'splat' / 'point_cloud.ply'}"]
+    if {"particle", "no_surface", "no_normals"} & set(files):  # friction equals drag
+        words += [f"--aero.C_F={0.8 if flag == '2' else 1.28}"]
+    return words
+
+
+def folder(flag: str) -> Path:
+    """The reference of a flag."""
+    return DATA / (f"pattern{flag}" if flag.isdigit() else flag)
+
+
+def mass_of(words: list[str]) -> tuple[float, float, float]:
+    """Mass, Young's modulus and density of a flag."""
+    parser = Simulation.parser()
+    settings = parser.parse_args([*words, "--device=cpu"])
+    points = Simulation.from_settings(parser, settings).scene.points
+    return float(points.mass.sum()), settings.material.E, settings.material.density
+
+
+def compared(words: list[str], flag: str, device: str, frames: int | None = None) -> Row:
+    """Simulate, and compare the surfaces, and the pictures where the reference has all of them."""
+    with tempfile.TemporaryDirectory() as name:
+        output = Path(name)
+        command = [sys.executable, "tools/sim.py", *words, "--device", device, "--output", name]
+        command += ["--recorder.video=false", "--recorder.trajectory=true"] + [f"--frames={frames}"] * bool(frames)
+        subprocess.run(command, cwd=ROOT, check=True, stdout=subprocess.DEVNULL)
+        summary = json.loads((output / "summary.json").read_text())
+        found = compare_run(output, folder(flag), frames=frames or summary["frames"], device=device)
+    row = {key: summary[key] for key in ("particles", "frames", "substeps", "torn_particles", "stretch_max", "mass_kg")}
+    return row | {"chamfer_share": found["chamfer_share"], "psnr_db": found["mean"].get("psnr_db")}
+
+
+@study("flags", [{"splats": s, "variant": w, "flag": f} for s in ("made", "trained") for w in WAYS for f in FLAGS])
+def flags(splats: str, variant: str, flag: str, device: str) -> Row:
+    """One flag in one way."""
+    words = arguments(flag, splats, variant)
+    if WAYS[variant][2]:
+        own, E, density = mass_of(words)
+        factor = mass_of(arguments(flag, splats, "ours"))[0] / own
+        words += [f"--material.E={factor * E!r}", f"--material.density={factor * density!r}"]
+    return compared(words, flag, device)
+
+
+@study("refinement", [{"flag": flag, "cells": cells} for flag in FLAGS for cells in (20, 30, 40, 60, 80)])
+def refinement(flag: str, cells: int, device: str) -> Row:
+    """The first 100 frames of a flag on a grid with so many cells along its longer side, in the linear law."""
+    longer = {"3": 2.0, "4": 1.4, "curtain": 1.4, "pennant": 1.6}.get(flag, 1.2)
+    dx = longer / cells
+    words = [*arguments(flag, "made", "ours"), f"--solver.dx={dx}", f"--scene.particle_spacing={0.45 * dx}"]
+    found = compared([*words, "--aero.law=linear"], flag, device, 100)
+    return {"chamfer": found["chamfer_share"], "points": found["particles"]}
