@@ -112,7 +112,7 @@ class Known:
         return {name: (results[name], number(low), number(high)) for name, (low, high) in goal.items()}
 
     def missed(self, results: Row, goal: Goal) -> list[str]:
-        """What is not as it should be."""
+        """Results that are not as they should be."""
         found = self.verdicts(results, goal).items()
         return [
             f"{name} is {value:.6g}, not in [{a:.6g}, {b:.6g}]" for name, (value, a, b) in found if not a <= value <= b

@@ -24,7 +24,7 @@ Grid = Iterable[Row] | Callable[[str], Iterable[Row]]
 
 @dataclass(frozen=True)
 class Study:
-    """What is measured.
+    """A measurement.
 
     Attributes:
         name: Of the command and of the file of records.

@@ -116,7 +116,7 @@ def vibrating_bar(
 
 
 def kept_by_transfers(theta: float) -> float:
-    """What APIC keeps of a wave of ``theta`` radians a cell in one transfer, two points to a cell (1D)."""
+    """The share that APIC keeps of a wave of ``theta`` radians a cell in one transfer, two points to a cell (1D)."""
 
     def weight(x: float) -> float:
         return 0.75 - x * x if abs(x) < 0.5 else 0.5 * max(1.5 - abs(x), 0.0) ** 2

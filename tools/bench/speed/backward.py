@@ -1,4 +1,4 @@
-"""What a gradient through a rollout costs."""
+"""The cost of a gradient through a rollout."""
 
 from __future__ import annotations
 

@@ -23,7 +23,7 @@ DT, STEPS = 1e-4, 64
 
 
 def seconds(call: Callable[[], object], device: str) -> float:
-    """How long a call takes, with what it leaves to a GPU."""
+    """Seconds of a call, with what it leaves to a GPU."""
     begin = time.perf_counter()
     call()
     if device != "cpu":

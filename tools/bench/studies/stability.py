@@ -1,4 +1,4 @@
-"""Where runs are right, and what they say where they are not: three small bodies over grid, material and wind."""
+"""Runs that are right, and what is said of the others: three small bodies over grid, material and wind."""
 
 from __future__ import annotations
 
