@@ -2,6 +2,7 @@
 
     python tools/bench.py                          # names of the studies
     python tools/bench.py NAME [--device cuda] [--only TEXT]
+    python tools/bench.py NAME --plot              # the figure of a study that has one, from its records
     python tools/bench.py report [--check]
 
 A run appends a line to ``docs/results/NAME.jsonl``. ``report`` fills the tables of docs/*.md.
@@ -25,6 +26,7 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("name", nargs="?", help="a study, or `report`")
     parser.add_argument("--device", default="cpu")
     parser.add_argument("--only", default="", help="only runs whose parameters contain this text")
+    parser.add_argument("--plot", action="store_true", help="draw the figure of a study from its records")
     parser.add_argument("--check", action="store_true", help="of `report`: change nothing, and fail if a page differs")
     options = parser.parse_args(arguments)
     studies.load()
@@ -32,7 +34,9 @@ def main(arguments: list[str] | None = None) -> int:
         stale = report(options.check)
         print(*stale, sep="\n")
         return int(options.check and bool(stale))
-    if options.name in STUDIES:
+    if options.name in STUDIES and options.plot:
+        sys.modules[STUDIES[options.name].function.__module__].plot()
+    elif options.name in STUDIES:
         run(options.name, options.device, options.only)
     else:
         print(*STUDIES, sep="\n")

@@ -4,7 +4,7 @@ import math
 
 import pytest
 import torch
-from bench.problems.handheld import tripod, write_base
+from handheld_films import tripod, write_base
 
 from gaussian_swaying.fitting.background import Background
 from gaussian_swaying.gaussians.parts import Part, Parts

@@ -2,7 +2,7 @@
 
 import pytest
 import torch
-from bench.problems.handheld import drift, tripod, write_base
+from handheld_films import drift, tripod, write_base
 
 from gaussian_swaying.fitting.background import Background
 from gaussian_swaying.fitting.exposure import gain_of, gains, with_gains

@@ -6,7 +6,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from bench.problems.handheld import TRUTH, drift, off, shaken, tripod, write_base, write_film
+from bench.problems.films import shaken
+from handheld_films import TRUTH, drift, off, tripod, write_base, write_film
 
 from gaussian_swaying.fitting import registration
 from gaussian_swaying.fitting.background import Background

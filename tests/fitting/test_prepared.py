@@ -4,7 +4,8 @@ import math
 
 import pytest
 import torch
-from bench.problems.handheld import drift, shaken, tripod, write_base, write_film
+from bench.problems.films import shaken
+from handheld_films import drift, tripod, write_base, write_film
 
 from gaussian_swaying.fitting import prepared as module
 from gaussian_swaying.fitting.plan import read_plan

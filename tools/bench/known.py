@@ -42,7 +42,6 @@ from bench.problems import (
     vortex,
     wrinkles,
 )
-from bench.problems.filaments import flag, square_flag
 from bench.problems.granular.angles import plane_strain_angle, shear_angle, triaxial_angle
 from bench.problems.granular.columns import column_at_rest, column_collapse
 from bench.problems.granular.deposit import lube
@@ -199,10 +198,6 @@ def _both_ways(froude: float, **options: Any) -> Row:
 def _falls(froude: float, **options: Any) -> Row:
     found = tumbling.falling(froude, **options)
     return {name: found[name] for name in ("turns", "swing", "speed")}
-
-
-def _inverted(stiffness: float) -> Row:
-    return flag(1.0, stiffness, 200.0, held="tail", cells=20, until=40.0, before=3.0)
 
 
 def _soft_flag(dx: float, density: float, settings: Settings) -> Row:
@@ -561,15 +556,7 @@ KNOWN = [
         fine=[{"cells": 16, "length": 18, "width": 12}, {"cells": 24, "length": 18, "width": 12}], page="air.md",
     ),
     Known(
-        "inverted flag in computed air stays straight if stiff", _inverted, {"amplitude": within(0.1)},
-        fine=[{"stiffness": 0.5}], page="air.md",
-    ),
-    Known(
-        "inverted flag in computed air flaps at a stiffness of 0.2", _inverted, {"amplitude": (1.0, ANY)},
-        fine=[{"stiffness": 0.2}], page="air.md",
-    ),
-    Known(
-        "square flag: amplitude 0.78, frequency 0.26 (Huang and Sung 2010)", square_flag,
+        "square flag: amplitude 0.78, frequency 0.26 (Huang and Sung 2010)", air.square_flag,
         {"amplitude": near(0.78, 0.078), "frequency": near(0.26, 0.026)},
         fine=[{"cells": n, "width": 8} for n in (24, 32, 48)], page="air.md",
     ),

@@ -1,8 +1,8 @@
 """Blender's cloth solver in SI units, for ``make_flag_dataset.py``.
 
 This is the only file that runs the solver. ``bpy`` is imported when a cloth is solved. The relations between
-Blender's settings and SI units are measured (``make_flag_dataset.py --check`` measures them again), because Blender
-documents none of them. Blender's cloth counts time in frames: a stiffness in its units is one in N/m divided by fps².
+Blender's settings and SI units were measured on panels (commit a5a45c7), because Blender documents none of them.
+Blender's cloth counts time in frames: a stiffness in its units is one in N/m divided by fps².
 """
 
 from __future__ import annotations
@@ -22,9 +22,6 @@ BENDING = 0.0295
 """Bending stiffness D [N m] divided by ``bending_stiffness`` x edge² x fps², measured on a cantilever. The cantilever
 is modelled as a chain of stiff squares on hinges, the first at the clamp, because a square that bends across its sides
 does not bend along its diagonal."""
-
-POISSON_RATIO = 1 / 3
-"""Poisson's ratio of that lattice, whatever the settings; measured: 0.31 and 0.325 on cells of 2 and 1 cm."""
 
 BENDING_LIMIT = 1.25
 """Blender's bending is explicit: ``bending_number`` must stay below this. Compared with much shorter steps, the

@@ -77,21 +77,6 @@ class Cloth:
     rows: int
     settings: dict[str, Any]
 
-    def sample(self, uv: np.ndarray) -> np.ndarray:
-        """Points on the surface at each frame [m], for positions (P, 2) on the flag; bilinear; shape (F, P, 3)."""
-        i, s = _between(self.uv[:: self.rows + 1, 0], uv[:, 0])
-        j, t = _between(self.uv[: self.rows + 1, 1], uv[:, 1])
-        at = self.positions.reshape(len(self.positions), self.columns + 1, self.rows + 1, 3)
-        low = (1 - t) * at[:, i, j] + t * at[:, i, j + 1]
-        high = (1 - t) * at[:, i + 1, j] + t * at[:, i + 1, j + 1]
-        return (1 - s) * low + s * high
-
-
-def _between(nodes: np.ndarray, places: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The interval of ascending ``nodes`` that contains each place (P,), and the share of it, float32, (P, 1)."""
-    low = np.searchsorted(nodes[1:-1], places, side="right")
-    return low, ((places - nodes[low]) / np.diff(nodes)[low]).astype(np.float32)[:, None]
-
 
 def solve_pattern(pattern: FlagPattern, path: Path, report: Callable[[int], None] | None = None) -> bool:
     """Solve a flag and write its motion, unless the file exists.

@@ -229,10 +229,6 @@ def parse(argv: list[str] | None = None) -> argparse.Namespace:
     add("--cells", type=int, help="cells of the mesh along the longer side (120, 120, 140, 112, 100)")
     add("--quality", type=int, help="solver steps per frame, a power of two (default: what the mesh needs)")
     add("--frames", type=int, help="number of frames, the first being the rest shape (250)")
-    add("--flag-size", type=float, nargs=2, metavar=("WIDTH", "HEIGHT"), help="sides of the flag [m]")
-    add("--texture", help="white, stripes, or the path of an image")
-    add("--drag", type=float, help="C of the wind's pressure 1/2 rho C U^2 (0.8 in pattern 2, else 1.28)")
-    add("--damping", type=float, help="rate at which every velocity decays [1/s] (2 in pattern 1, else 1)")
     add("--self-collision", action="store_true", default=None, help="turn self-contact on")
     add("--self-distance", type=float, help="distance that the cloth then keeps from itself [m] (half a cell)")
     add("--size", type=_size, metavar="WIDTHxHEIGHT", help="size of the video [pixels] (1920x1080)")
@@ -259,10 +255,8 @@ def flags_of(options: argparse.Namespace) -> dict[str, FlagPattern]:
 
 def flag_of(flag: FlagPattern, options: argparse.Namespace) -> FlagPattern:
     """A flag with the options of the command line."""
-    names = ("frames", "texture", "drag", "damping", "self_collision", "self_distance", "cells")
+    names = ("frames", "self_collision", "self_distance", "cells")
     given = {name: getattr(options, name) for name in names if getattr(options, name) is not None}
-    if options.flag_size:
-        given["width"], given["height"] = options.flag_size
     if options.preview:
         given = {"cells": max(flag.cells // 4, 2)} | given
     flag = replace(flag, **given)

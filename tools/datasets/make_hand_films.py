@@ -52,8 +52,7 @@ from gaussian_swaying.scenes.procedural import both
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
 
-from bench.problems.films import opengl
-from bench.problems.handheld import shaken
+from bench.problems.films import opengl, shaken
 
 FPS, FRAMES, SHIFT = 30, 90, 6
 """Frames a second; frames of a film; and how many of them a film begins before or into the motion."""

@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import torch
 from torch import Tensor
 
+from gaussian_swaying.geometry.rotations import rotation_of
 from gaussian_swaying.rendering.cameras.camera import Camera
 from gaussian_swaying.simulation.simulation import Simulation
 
@@ -60,3 +63,37 @@ def opengl(camera: Camera) -> Tensor:
 
 
 __all__ = ["opengl", "write_video"]
+
+
+FPS = 30
+MIDDLE = (0.2, 0.05, 0.15)
+"""The point at which the hand aims [m]."""
+
+
+def shaken(
+    camera: Camera, frames: int, degrees: float, seed: int = 0, middle: Sequence[float] = MIDDLE
+) -> list[Camera]:
+    """The camera in a hand: it turns by as many degrees (root mean square) and moves by a hundredth of the distance.
+
+    Each of six numbers is a sum of waves of 0.4 to 2 Hz, as a hand sways, and one of 9 Hz, a tenth as large, as it
+    trembles.
+
+    Units: ``middle`` [m].
+    """
+    generator = torch.Generator().manual_seed(seed)
+    time = torch.arange(frames, dtype=torch.float64) / FPS
+    phase = 2 * math.pi * torch.rand(5, 6, generator=generator, dtype=torch.float64)
+    waves = zip((0.4, 0.8, 1.3, 2.0, 9.0), (1.0, 0.7, 0.5, 0.35, 0.1), strict=True)
+    own = sum(size * torch.sin(2 * math.pi * hz * time[:, None] + phase[n]) for n, (hz, size) in enumerate(waves))
+    assert isinstance(own, Tensor)
+    own = own - own[:1]
+    distance = float((camera.position - torch.tensor(middle, dtype=torch.float64)).norm())
+    turn, shift = (part / part.square().sum(1).mean().sqrt() for part in own.split(3, 1))
+    turned = rotation_of(math.radians(degrees) * turn)
+    found = []
+    for k in range(frames):
+        view = camera.world_to_camera.clone()
+        view[:3] = turned[k] @ view[:3]
+        view[:3, 3] += 0.01 * degrees * distance * shift[k]
+        found.append(replace(camera, world_to_camera=view))
+    return found

@@ -11,25 +11,21 @@ from typing import Any
 
 import torch
 import yaml
+from bench.problems.films import FPS, MIDDLE, opengl
 from torch import Tensor
 
-from bench.problems.films import opengl
 from gaussian_swaying.gaussians.harmonics import SH_DC
 from gaussian_swaying.gaussians.ply import write_ply
-from gaussian_swaying.geometry.rotations import rotation_of
 from gaussian_swaying.rendering.cameras.camera import Camera, look_at_camera
 from gaussian_swaying.scenes.printed_cloth import PERIOD, printed_colours
 from gaussian_swaying.scenes.procedural import FlagScene, both
 from gaussian_swaying.simulation.simulation import Simulation
 
 TRUTH: dict[str, Any] = {"flow": [4.0, 3.0, 0.0], "material.E": 1e4}
-FPS = 30
 WALLS = ((2.4, 1.6, 0.0, (-0.9, 0.6, -0.7)), (0.5, 1.6, 65.0, (0.75, 0.1, -0.7)))
 """Width, height [m], turn from the x axis [degrees] and lower corner [m] of the walls behind and beside the flag."""
 TEXELS = 400
 """Places along a period of the print at which it is photographed."""
-MIDDLE = (0.2, 0.05, 0.15)
-"""The point at which the hand aims [m]."""
 
 
 def write_base(folder: Path, spacing: float = 0.025, wall: float = 0.02, back: bool = True, worn: bool = False) -> Path:
@@ -69,35 +65,6 @@ def write_base(folder: Path, spacing: float = 0.025, wall: float = 0.02, back: b
 def tripod(width: int, height: int) -> Camera:
     """The camera of the first frame, without shake."""
     return look_at_camera((0.05, -0.95, 0.35), MIDDLE, (0, 0, 1), 38.0, width, height, dtype=torch.float64)
-
-
-def shaken(
-    camera: Camera, frames: int, degrees: float, seed: int = 0, middle: Sequence[float] = MIDDLE
-) -> list[Camera]:
-    """The camera in a hand: it turns by as many degrees (root mean square) and moves by a hundredth of the distance.
-
-    Each of six numbers is a sum of waves of 0.4 to 2 Hz, as a hand sways, and one of 9 Hz, a tenth as large, as it
-    trembles.
-
-    Units: ``middle`` [m].
-    """
-    generator = torch.Generator().manual_seed(seed)
-    time = torch.arange(frames, dtype=torch.float64) / FPS
-    phase = 2 * math.pi * torch.rand(5, 6, generator=generator, dtype=torch.float64)
-    waves = zip((0.4, 0.8, 1.3, 2.0, 9.0), (1.0, 0.7, 0.5, 0.35, 0.1), strict=True)
-    own = sum(size * torch.sin(2 * math.pi * hz * time[:, None] + phase[n]) for n, (hz, size) in enumerate(waves))
-    assert isinstance(own, Tensor)
-    own = own - own[:1]
-    distance = float((camera.position - torch.tensor(middle, dtype=torch.float64)).norm())
-    turn, shift = (part / part.square().sum(1).mean().sqrt() for part in own.split(3, 1))
-    turned = rotation_of(math.radians(degrees) * turn)
-    found = []
-    for k in range(frames):
-        view = camera.world_to_camera.clone()
-        view[:3] = turned[k] @ view[:3]
-        view[:3, 3] += 0.01 * degrees * distance * shift[k]
-        found.append(replace(camera, world_to_camera=view))
-    return found
 
 
 def drift(frames: int) -> Tensor:
@@ -181,4 +148,4 @@ def off(found: Camera, true: Camera) -> tuple[float, float]:
     return math.degrees(math.asin(min(1.0, float(sine)))), float(apart / distance)
 
 
-__all__ = ["TRUTH", "drift", "off", "shaken", "tripod", "write_base", "write_film"]
+__all__ = ["TRUTH", "drift", "off", "tripod", "write_base", "write_film"]
