@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from gaussian_swaying import AeroForce, Simulation, WindField
-from gaussian_swaying.aero.computed_air import BYTES, ComputedAir
+from gaussian_swaying.aero.computed_air import BYTES, ComputedAir, resolution
 from gaussian_swaying.aero.effects import LogProfile
 from gaussian_swaying.aero.obstacles import SphereObstacle
 from gaussian_swaying.aero.wind import FlowKey
@@ -268,6 +268,8 @@ def test_what_a_box_costs_and_resolves():
     eddies = 0.1**2 * 0.1 * 6.0  # of Smagorinsky's constant, the spacing and the speed
     assert found.resolved == pytest.approx(6.0 * 1.15 / (1.5e-5 + eddies), rel=0.05)
     assert "Reynolds number" in str(found)
+    unknown = resolution(ComputedAir(LOW, HIGH, 27), WindField([3.0, 4.0, 0.0]), 0.02, torch.eye(3))
+    assert unknown.reynolds == pytest.approx(1.5 * 5.0 * 1.0 / 1.5e-5)  # of half as much again as the wind
 
 
 @pytest.mark.parametrize(

@@ -21,7 +21,7 @@ CONFIGS = Path(__file__).parents[2] / "configs"
 SPACING, SPARSE = "scene.generator.init_args.spacing", "scene.generator.init_args.leaves"
 FLAG = {SPACING: 0.06, "solver.dx": 0.14}
 BENCH = {SPACING: 0.06, "scene.particle_spacing": 0.07, "solver.dx": 0.15}
-SOLID = {SPACING: 0.1, "solver.dx": 0.2}
+SOLID = {SPACING: 0.1, "solver.dx": 0.2, "material.E": 2e4}
 
 
 class Swirl(Force):

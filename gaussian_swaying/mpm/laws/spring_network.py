@@ -103,10 +103,10 @@ def spring_network_moduli(F: Tensor, mu: Tensor, lam: Tensor) -> tuple[Tensor, T
         others, turns = (x.sum(-1, keepdim=True) - x for x in (pull, turn))
         common = 3 / 35 * (whole + spread / 3 * a.square())
         own = 15 * least * (2 / 21 + 8 / 105 * (others + 0.5 * turns * a.square()) + common) + 2 * shear + bulk
-        i, j, k = (0, 0, 1), (1, 2, 2), (2, 1, 0)  # a pair of axes, and the normal of their plane
-        pairs = a[..., i] * a[..., j] * (4 / 105 * turn[..., k] + spread / 35)
         mixed = torch.zeros_like(F)
-        mixed[..., i, j] = mixed[..., j, i] = 15 * least * pairs + bulk
+        for i, j, k in ((0, 1, 2), (0, 2, 1), (1, 2, 0)):  # a pair of axes, and the normal of their plane
+            pair = a[..., i] * a[..., j] * (4 / 105 * turn[..., k] + spread[..., 0] / 35)
+            mixed[..., i, j] = mixed[..., j, i] = 15 * least[..., 0] * pair + bulk[..., 0]
         slope = _network_slope(a, mu, lam)
         return spectral_moduli(a, slope, lambda s: _network_slope(s, mu, lam), own, mixed, mu, lam)
 
