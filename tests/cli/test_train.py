@@ -7,7 +7,6 @@ import csv
 import json
 import logging
 import os
-import re
 import shlex
 import shutil
 import signal
@@ -23,14 +22,11 @@ from shared import contents
 
 from gaussian_swaying.captures.generated_capture import GeneratedCapture
 from gaussian_swaying.cli.errors import parser_sentence
-from gaussian_swaying.cli.preview import main as preview
-from gaussian_swaying.cli.simulate import main as simulate
 from gaussian_swaying.cli.train import main, make_cli
 from gaussian_swaying.gaussians.ply import read_ply
 from gaussian_swaying.runs.lock import FolderLock
 from gaussian_swaying.runs.seal import seal
 from gaussian_swaying.runs.signals import StoppedBySignal
-from gaussian_swaying.training.densification import PARAMETERS
 from gaussian_swaying.training.finite import TrainingDiverged
 from gaussian_swaying.training.module import SplatTrainer
 from gaussian_swaying.training.quiet import silence_advertisements
@@ -95,51 +91,6 @@ def test_the_recipe_for_photos_runs_on_a_capture(capture, tmp_path, capsys):
     assert "next: " in capsys.readouterr().out
     assert len(read_ply(tmp_path / "point_cloud.ply")) == 200
     assert (tmp_path / "panels" / "val_00_000004.png").exists()
-
-
-@pytest.mark.slow(twin="test_a_training_learns")
-def test_the_quick_training(tmp_path, monkeypatch, capsys):
-    """200 images of a generated flag on a CPU: 6 dB and more, and a splat that the simulation takes as it is."""
-    monkeypatch.chdir(tmp_path)
-    quiet = ["--trainer.enable_progress_bar", "false"]
-    monkeypatch.setenv("GAUSSIAN_SWAYING_DEBUG", "1")
-    start = make_cli(["validate", "--config", str(QUICK), *quiet]).trainer.callback_metrics
-    assert main(["fit", "--config", str(QUICK), *quiet]) == 0
-    printed = capsys.readouterr().out
-    assert "wrote outputs/train/quick_cpu/point_cloud.ply" in printed
-    assert "wrote outputs/train/quick_cpu/csv" in printed
-    command = re.search("^next: python tools/preview.py (.*)$", printed, re.MULTILINE)[1].split()
-    assert command == ["outputs/train/quick_cpu/point_cloud.ply", "--capture", "outputs/captures/flag_64"]
-    assert preview([*command, "--height", "96", "--device", "cpu", "--frames", "2"]) == 0
-    out = capsys.readouterr().out
-    starter = "outputs/preview/quick_cpu/starter.yaml"  # the folder of the training, not its point_cloud.ply
-    assert f"--config {starter} --output outputs/quick_cpu" in out
-    guessed = yaml.safe_load((tmp_path / starter).read_text())
-    assert guessed["scene"]["up"] == [0, 0, 1]  # the photos' cameras stand upright with z up
-    folder = tmp_path / "outputs/train/quick_cpu"
-    with (folder / "csv/metrics.csv").open() as file:
-        rows = list(csv.DictReader(file))
-    end = [float(row["val/psnr"]) for row in rows if row["val/psnr"]]
-    assert len(end) == 2
-    assert end[-1] >= float(start["val/psnr"]) + 6.0
-    assert sum(bool(row["train/loss"]) for row in rows) == 11
-    assert (folder / "panels/val_00_000200.png").stat().st_size > 0
-    cloud = read_ply(folder / "point_cloud.ply")
-    assert int(float(rows[-1]["val/gaussians"])) == len(cloud)
-    arguments = ["--config", starter, "--device", "cpu", "--recorder.video", "false", "--camera.init_args.width", "64"]
-    assert simulate([*arguments, "--camera.init_args.height", "36", "--output", str(tmp_path / "sim")]) == 0
-    assert json.loads((tmp_path / "sim/summary.json").read_text())["frames"] == 2
-
-
-def test_a_resumed_run_is_the_same_bit_for_bit(capture, tmp_path):
-    """Through files, validation and data of a folder: 20 images, or the second 10 from the checkpoint between."""
-    straight = make_cli(["fit", *_arguments(capture, tmp_path / "a", **{"trainer.val_check_interval": 6})]).model
-    path = tmp_path / "a/checkpoints/step_000010.ckpt"
-    resumed = make_cli(["fit", *_arguments(capture, tmp_path / "b", **{"ckpt_path": path})])
-    assert resumed.trainer.global_step == 20
-    assert len(resumed.model.splat) != 600
-    for name in PARAMETERS:
-        assert torch.equal(getattr(resumed.model.splat, name), getattr(straight.splat, name)), name
 
 
 def test_on_several_devices_numbers_still_count_images(capture, tmp_path):
