@@ -88,6 +88,26 @@ def test_leaves_that_cross_are_cut_where_they_do(monkeypatch):
     assert len(leaves) < 0.1 * len(before)
 
 
+def test_what_stays_attached_lies_near_the_planes_of_both():
+    """Leaves that cross at 45 degrees: of what is left, little is farther than 1.3 spacings above either of them."""
+    points, normals, number = book(-0.4)
+    pairs = attached_pairs(points, normals=normals)
+    a, b = across(number, pairs[(number[pairs] < 2).all(1)]).T
+    arm = (points[b] - points[a]) / STEP
+    above = torch.maximum(*((arm * normals[own]).sum(-1).abs() for own in (a, b)))
+    assert len(above) > 500
+    assert float((above > 1.3).double().mean()) < 0.1
+
+
+def test_pieces_are_joined_again_where_most_pairs_were_cut():
+    """Three pieces of five points: the contacts with five and four pairs are put back, that with one is not."""
+    k = torch.arange(5)
+    chains = torch.cat([torch.stack([5 * piece + k[:-1], 5 * piece + k[1:]], 1) for piece in range(3)])
+    most = torch.cat([torch.stack([k, k + 5], 1), torch.stack([k[:4] + 5, k[:4] + 10], 1)])
+    cut = torch.cat([torch.tensor([[0, 14]]), most])
+    assert sorted(connectivity._put_back(15, chains, cut).tolist()) == sorted(most.tolist())
+
+
 def test_what_hangs_together_is_never_taken_off():
     """A sheet that stands on another one, and is attached to nothing else."""
     upright = sheet(1) @ rotation(math.pi / 2).T
