@@ -19,7 +19,7 @@ from gaussian_swaying.mpm.state import MPMState
     "backward",
     lambda device: [{"asked": 10_000 if device == "cpu" else 100_000, "by": by} for by in ("auto", "torch")],
 )
-def backward(asked: int, by: str, device: str, steps: int = 48, long: int = 2000) -> Row:
+def backward(asked: int, by: str, device: str, steps: int = 480, long: int = 2000) -> Row:
     """Time of a substep of a sheet in gusts, held at an edge: plain, with a gradient wanted, and backward.
 
     Gradients of the mean square displacement by E, density and flow. ``memory_bytes`` is that of a rollout over
