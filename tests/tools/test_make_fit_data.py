@@ -1,8 +1,6 @@
 """Videos for finding wind and material: cases, cameras, noise, files. Only the last test needs Blender."""
 
-import json
 import math
-import sys
 from dataclasses import replace
 
 import numpy as np
@@ -11,16 +9,12 @@ import torch
 import yaml
 
 from gaussian_swaying import Simulation
-from gaussian_swaying.scenes.procedural import FlagScene
 
 from .conftest import beside
 
 TOOL = "make_fit_data"
 cases = beside("fit_cases")
 videos = beside("fit_video")
-
-
-# ---- cases
 
 
 def test_the_fit_starts_wrong_and_its_ranges_hold_the_truth(cases):
@@ -59,24 +53,6 @@ def test_scenes_can_be_simulated_and_hold_the_right_edge(cases, tmp_path):
         torch.testing.assert_close(held[:, axis], torch.full((len(held),), line), atol=1e-5, rtol=0)
 
 
-def test_the_texture_is_that_of_the_splat(cases):
-    pictures = sys.modules["flag_pictures"]
-    pattern = cases.CASES["flag_wind1_a"]
-    texture = pictures.draw_texture(pattern, 200)  # pixels of 5 mm
-    assert texture.shape == (140, 200, 3)
-    settings = cases.scene_settings(pattern, cases.FitVideo(), "projected", "data")["scene"]["generator"]["init_args"]
-    cloud = FlagScene(**(settings | {"height": pattern.height, "spacing": 0.005})).generate()  # one to each pixel
-    columns, rows = (cloud.means[:, 0] / 0.005).long(), 139 - (cloud.means[:, 2] / 0.005).long()
-    colours = 0.5 + 0.28209479177387814 * cloud.sh[:, 0]
-    torch.testing.assert_close(torch.from_numpy(texture)[rows, columns], colours, atol=1e-3, rtol=0)
-
-
-# ---- cameras
-
-
-# ---- pixels
-
-
 def test_noise_has_the_strength_that_is_asked_for_and_is_repeatable(cases, videos):
     video = cases.FitVideo(read_noise=0.01, shot_noise=4e-4, seed=3)
     for level in (0.2, 0.7):
@@ -91,27 +67,3 @@ def test_noise_has_the_strength_that_is_asked_for_and_is_repeatable(cases, video
             assert (noisy != videos.add_noise(picture, video, other)).mean() > 0.5
     without = videos.add_noise(picture, replace(video, read_noise=0.0, shot_noise=0.0), (0, 0))
     np.testing.assert_array_equal(without, np.full_like(without, round(0.7 * 255)))
-
-
-# ---- files
-
-
-def test_a_case_is_made_once_and_other_settings_are_refused(tool, tmp_path, capsys):
-    pytest.importorskip("bpy", reason="needs the extra [blender]")
-    from PIL import Image
-
-    small = ["--case", "flag_wind2_a", "--out", str(tmp_path), "--cells", "10", "--frames", "3", "--size", "64", "36"]
-    assert tool.main([*small, "--cameras", "1"]) == 0
-    folder = tmp_path / "flag_wind2_a"
-    fields = json.loads((folder / "transforms.json").read_text())
-    assert len(fields["frames"]) == 3
-    assert {"scene.yaml", "fit.yaml", "truth.json", "cloth.npz"} <= {path.name for path in folder.iterdir()}
-    first = (folder / fields["frames"][0]["file_path"]).read_bytes()
-    mask = np.asarray(Image.open(folder / fields["frames"][0]["mask_path"]))
-    assert 0.1 < (mask > 0).mean() < 0.9
-    capsys.readouterr()
-    assert tool.main([*small, "--cameras", "2"]) == 0  # one more camera
-    assert ": 3 pictures" in capsys.readouterr().out
-    assert (folder / fields["frames"][0]["file_path"]).read_bytes() == first
-    assert tool.main([*small, "--cameras", "2", "--noise", "2"]) == 1
-    assert "read_noise" in capsys.readouterr().err

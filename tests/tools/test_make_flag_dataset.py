@@ -24,9 +24,6 @@ flag_motion = beside("flag_motion")
 cloth = beside("blender_cloth")
 
 
-# ---- physics
-
-
 def _spring_lengths(grid):
     """Lengths [m] of the springs along the sides of the faces and along one diagonal of each."""
     faces, flat = grid.faces(), grid.flat()
@@ -56,19 +53,6 @@ def test_every_vertex_stands_for_the_same_share_of_the_cloth(cloth):
         np.testing.assert_allclose(rim[:, 2:-2].sum(0), 2)
         np.testing.assert_allclose(rim[:, :2].sum(), 4)
     assert grid.spring == pytest.approx(_spring_lengths(grid).mean())
-
-
-@pytest.mark.parametrize("held", ["left", "top"])
-def test_an_edge_that_is_held_carries_half_a_cell(cloth, held):
-    """Its vertices do not move, so their mass is none; the vertices beside it stand for one cell each."""
-    grid = cloth.Grid.of_cells(1.2, 0.8, 12, held)
-    share = _vertex_areas(grid) / grid.cell**2
-    edge = share if held == "left" else share.T[::-1]
-    np.testing.assert_allclose(edge[0, 2:-2], 0.5)
-    np.testing.assert_allclose(edge[1:-2, 2:-2], 1)
-    np.testing.assert_allclose(edge[-2:, 2:-2].sum(0), 2)
-    # as heavy as the cloth, apart from the half cell that is held
-    assert grid.cell**2 * (grid.count - len(edge[0])) == pytest.approx(0.96 - 0.5 * grid.cell**2 * len(edge[0]))
 
 
 def test_patterns_have_the_parameters_of_the_paper(reference):
@@ -124,25 +108,6 @@ def test_steps_follow_the_mesh(reference, cloth):
         cloth.solve_cloth(grid, grid.flat(), [], pattern.material(), rough)
 
 
-def test_rest_shape_has_its_true_normals_on_the_side_of_the_camera(reference):
-    for number in (1, 2, 3):
-        pattern = replace(reference.PATTERNS[number], ripple=0.01)
-        truth = pattern.truth()
-        corners = truth["vertices"][truth["faces"]]
-        facing = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-        area = 0.5 * np.linalg.norm(facing, axis=-1)
-        assert area.sum() == pytest.approx(pattern.width * pattern.height, rel=0.02)
-        facing /= 2 * area[:, None]
-        # the normal turns by ripple (3 pi / width)^2 cell within a square
-        turn = 0.01 * (3 * math.pi / pattern.width) ** 2 * pattern.grid().cell
-        assert np.abs(facing - truth["normals"][truth["faces"][:, 0]]).max() < turn
-        assert (facing @ pattern.normal()).min() > 0.9
-    assert reference.PATTERNS[3].normal() @ [2, 0, 0] == pytest.approx(-2 * math.sin(math.radians(35)))
-
-
-# ---- files
-
-
 def _fake_solver(monkeypatch, flag_motion, calls):
     def solve(grid, vertices, pins, material, run, report=None):
         calls.append(run.quality)
@@ -177,9 +142,6 @@ def test_motion_is_solved_once_and_says_what_changed(reference, flag_motion, mon
     assert calls == [8]
 
 
-# ---- cameras
-
-
 def _seen(fields_path, frame, points):
     """Pixels at which a camera of this package sees points."""
     camera = TransformsCamera(fields_path, frame)(0, 0.0, torch.zeros(3, dtype=torch.float64), torch.zeros(3), 1.0)
@@ -207,9 +169,6 @@ def test_training_views_hold_the_whole_flag_and_are_ours_too(reference, flag_pic
     rays = np.array(rays) / np.linalg.norm(rays, axis=1, keepdims=True)
     assert np.abs(rays.mean(0)).max() < 0.02  # even over the sphere
     assert np.linalg.eigvalsh(rays.T @ rays / 40) == pytest.approx([1 / 3] * 3, abs=0.03)
-
-
-# ---- pictures and resuming
 
 
 class _FakeStudio:
@@ -259,9 +218,6 @@ def test_training_views_are_a_capture_and_are_continued(tool, small, monkeypatch
         tool.make_train(pattern, folder / "train", replace(pictures, samples=2), lambda line: None)
 
 
-# ---- command line
-
-
 def test_without_blender_one_sentence_names_the_extra(tool, monkeypatch, tmp_path, capsys):
     monkeypatch.setitem(sys.modules, "bpy", None)
     assert tool.main(["--preview", "--out", str(tmp_path / "flags")]) == 1
@@ -270,8 +226,6 @@ def test_without_blender_one_sentence_names_the_extra(tool, monkeypatch, tmp_pat
     assert len(said.strip().splitlines()) == 1
     assert not (tmp_path / "flags").exists()
 
-
-# ---- flags of one's own
 
 FLAG = {"size": [1.0, 1.4], "E": 4e3, "density": 25, "flow": [1, 1.5, 0], "pins": "top", "yaw": 20, "drag": 1.0}
 
@@ -310,9 +264,6 @@ def test_a_bad_field_of_a_flag_is_one_sentence(tool, monkeypatch, tmp_path, caps
     (said,) = capsys.readouterr().err.strip().splitlines()
     assert f"`{field}`" in said
     assert not (tmp_path / "flags").exists()
-
-
-# ---- with Blender
 
 
 def test_blender_gives_the_same_motion_twice_and_falls_as_it_should(reference, cloth):

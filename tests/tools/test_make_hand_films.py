@@ -84,22 +84,3 @@ def test_films_that_begin_before_and_into_the_motion(tool, cases, motions, tmp_p
         assert len(pins) == 2
         held = sum(int(pin.region.contains(thing.cloud.means).sum()) for pin in pins)
         assert held == 2 * round(pattern.height / 0.05)
-
-
-def test_a_film_by_blender(tool, tmp_path, capsys):
-    pytest.importorskip("bpy", reason="needs the extra [blender]")
-    import imageio.v3 as iio
-
-    words = ["--preview", "--case", "banner", "--frames", "6", "--out", str(tmp_path)]
-    assert tool.main(words) == 0
-    first = iio.imread(tmp_path / "banner/pictures/0000.png").astype(float)
-    last = iio.imread(tmp_path / "banner/pictures/0017.png").astype(float)
-    assert first.shape == (192, 108, 3)
-    assert first.std() > 20  # lit, with a print
-    assert abs(first - last).mean() > 2
-    for name in tool.FILMS:
-        (film,) = read_videos(tmp_path / "banner" / name)
-        assert film.images.shape == (6, 192, 108, 3)
-    capsys.readouterr()
-    assert tool.main(words) == 0
-    assert ": 0 pictures" in capsys.readouterr().out

@@ -2,7 +2,6 @@
 
 import math
 import sys
-from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -17,9 +16,6 @@ from .conftest import beside
 TOOL = "make_fit_data"
 soft = beside("soft_case")
 newton = beside("newton_soft")
-
-
-# ---- the force of the air
 
 
 def _plate(angle):
@@ -41,9 +37,6 @@ def test_the_pressure_on_a_plate_is_that_of_the_closed_form(newton, angle, order
     np.testing.assert_allclose(forces.sum(0), expected, rtol=1e-12, atol=1e-15)
     np.testing.assert_allclose(forces[0], expected / 3, rtol=1e-12, atol=1e-15)  # two halves: a third of each
     np.testing.assert_allclose(forces[1], expected / 6, rtol=1e-12, atol=1e-15)
-
-
-# ---- the body
 
 
 def test_newtons_moduli_give_the_stress_of_hooke_at_small_strain(newton):
@@ -73,25 +66,6 @@ def test_places_follow_the_vertices(soft):
     np.testing.assert_allclose(found[1], expected, atol=1e-12)
 
 
-# ---- what is seen
-
-
-def test_the_skin_is_closed_and_faces_outwards(soft):
-    pattern = soft.SoftPattern(cells=2)
-    points, squares, places = soft.skin(pattern)
-    corners = pattern.block.vertices()[points][squares]
-    area = 0.5 * np.cross(corners[:, 2] - corners[:, 0], corners[:, 3] - corners[:, 1])
-    outwards = corners.mean(1) - [0.0, 0.0, 0.15]
-    assert np.linalg.norm(area, axis=1).sum() == pytest.approx(4 * 0.06 * 0.3 + 2 * 0.06**2)
-    assert (area * corners.mean(1)).sum() / 3 == pytest.approx(0.06**2 * 0.3)  # the volume, by Gauss
-    assert ((area * outwards).sum(1) > 0).all()
-    assert places.min() >= 0
-    assert places.max() <= 1
-
-
-# ---- files
-
-
 def test_the_scene_and_the_fit_can_be_read_and_start_wrong(soft, tool, tmp_path):
     cases = sys.modules["fit_cases"]
     pattern, folder = soft.SoftPattern(), tmp_path.as_posix()
@@ -111,22 +85,3 @@ def test_the_scene_and_the_fit_can_be_read_and_start_wrong(soft, tool, tmp_path)
         assert unknown.low < true[unknown.name] < unknown.high
     assert settings["material"]["E"] < 0.7 * truth["E"]
     assert np.linalg.norm(np.subtract(settings["wind"]["flow"], truth["flow"])) > 0.3 * truth["speed"]
-
-
-# ---- Newton
-
-
-def test_a_motion_is_solved_once_and_other_settings_are_refused(soft, tmp_path):
-    pytest.importorskip("newton")
-    pattern = soft.SoftPattern(cells=2, frames=3)
-    path = tmp_path / "motion.npz"
-    assert soft.solve_soft(pattern, path)
-    assert not soft.solve_soft(pattern, path)
-    positions, settings = soft.read_soft(path)
-    assert positions.shape == (3, 3 * 3 * 11, 3)
-    assert settings["steps"] == pattern.run.steps
-    with pytest.raises(ValueError, match="`density` was 60"):
-        soft.solve_soft(replace(pattern, density=70.0), path)
-    moved = (positions[-1] - positions[0])[-1]
-    assert moved[0] > 0.01  # with the wind
-    assert moved[1] / moved[0] == pytest.approx(2.6 / 4.4, rel=0.05)
