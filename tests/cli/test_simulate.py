@@ -97,13 +97,6 @@ def test_the_stored_configuration_makes_the_same_run(tmp_path):
         assert all(np.array_equal(a[name], b[name]) for name in a.files)
 
 
-def test_a_splat_from_a_file(tmp_path, capsys):
-    path = tmp_path / "flag.ply"
-    write_ply(path, FlagScene(spacing=0.1).generate())
-    assert main([*SMALL, "--scene.ply", str(path), "--output", str(tmp_path / "run")]) == 0
-    assert "96 of 96" in capsys.readouterr().out
-
-
 def test_cameras_and_renders_from_a_configuration(tmp_path, capsys):
     """Further cameras by name, a path with keys, and renders beside the colour; the stored configuration keeps them."""
     size = {"width": 16, "height": 8}
