@@ -83,13 +83,3 @@ def flags(splats: str, variant: str, flag: str, device: str) -> Row:
         factor = mass_of(arguments(flag, splats, "ours"))[0] / own
         words += [f"--material.E={factor * E!r}", f"--material.density={factor * density!r}"]
     return compared(words, flag, device)
-
-
-@study("refinement", [{"flag": flag, "cells": cells} for flag in FLAGS for cells in (20, 30, 40, 60, 80)])
-def refinement(flag: str, cells: int, device: str) -> Row:
-    """The first 100 frames of a flag on a grid with so many cells along its longer side, in the linear law."""
-    longer = {"3": 2.0, "4": 1.4, "curtain": 1.4, "pennant": 1.6}.get(flag, 1.2)
-    dx = longer / cells
-    words = [*arguments(flag, "made", "ours"), f"--solver.dx={dx}", f"--scene.particle_spacing={0.45 * dx}"]
-    found = compared([*words, "--aero.law=linear"], flag, device, 100)
-    return {"chamfer": found["chamfer_share"], "points": found["particles"]}

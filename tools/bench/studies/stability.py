@@ -17,20 +17,17 @@ from gaussian_swaying.scenes.patches import to_cloud, tube
 from gaussian_swaying.scenes.procedural import ProceduralScene
 from gaussian_swaying.scenes.solid import SolidScene
 
-SIZE = 0.4
-"""Longest side of each body [m]."""
-ENERGY, GRID, SEEN = 0.05, 0.25, 0.01
-"""Energy that may come from nowhere, difference from the finest grid, and what is too little to be seen, as shares."""
+SIZE, ENERGY, GRID, SEEN = 0.4, 0.05, 0.25, 0.01
+"""Longest side of each body [m]; shares: energy that may come from nowhere, difference from the finest grid that may
+be, and one that is too little to be seen."""
 
 
 class Rod(ProceduralScene):
     """An upright tube from the origin."""
 
-    spacing = 0.005
-
     def generate(self) -> GaussianCloud:
         """Make the tube."""
-        return to_cloud(tube([[0.0, 0.0, 0.0], [0.0, 0.0, SIZE]], [0.01, 0.01], self.spacing))
+        return to_cloud(tube([[0.0, 0.0, 0.0], [0.0, 0.0, SIZE]], [0.01, 0.01], 0.005))
 
 
 BODIES: dict[str, tuple[Any, list[float | None], tuple[float, ...]]] = {
@@ -42,9 +39,8 @@ BODIES: dict[str, tuple[Any, list[float | None], tuple[float, ...]]] = {
               [None, None, -0.08], (0.035, 0.08, 0.12, 0.2, 0.3)),
 }  # fmt: skip
 """Scene, upper corner of what is held, and grid spacings from fine to coarse; the finest is the reference."""
-NU, DENSITY, E = (0.0, 0.3, 0.45), (30.0, 300.0, 3000.0), (1e2, 1e3, 1e4, 1e5, 1e6)
 FLOW = ([0.0, 0.0, 0.0], [6.0, 2.0, 0.0], [15.0, 5.0, 0.0], [30.0, 10.0, 0.0])
-MAP = list(product(NU, DENSITY, E, FLOW))
+MAP = list(product((0.0, 0.3, 0.45), (30.0, 300.0, 3000.0), (1e2, 1e3, 1e4, 1e5, 1e6), FLOW))
 Frames = list[dict[str, float]]
 
 
