@@ -1,5 +1,6 @@
 """A run that stopped goes on to the same end, bit for bit, whatever its state holds."""
 
+import numpy as np
 import pytest
 import torch
 
@@ -50,7 +51,7 @@ def simulation(name):
 
 @pytest.mark.parametrize("name", CASES)
 def test_a_run_in_two_parts_is_the_whole_one(name, tmp_path):
-    """Numbers of all frames, the last picture, and the checkpoint at the end."""
+    """Numbers of all frames, the last picture, the motion, and the checkpoint at the end."""
     recorder = Recorder(video=False, trajectory=name != "copies", nodes=name != "copies")
     whole = simulation(name).run(tmp_path / "whole", 6, progress=False, recorder=recorder)
     simulation(name).run(tmp_path / "parts", 3, progress=False, recorder=recorder)
@@ -58,6 +59,10 @@ def test_a_run_in_two_parts_is_the_whole_one(name, tmp_path):
     assert rest["per_frame"] == whole["per_frame"]
     ends = [tmp_path / name for name in ("whole", "parts")]
     assert len({(end / "frames/00005.png").read_bytes() for end in ends}) == 1
+    for file in ("trajectory.npz", "nodes.npz"):
+        kept = [np.load(end / file) for end in ends if (end / file).exists()]
+        assert len(kept) == 2 or name in ("copies", "plastic")
+        assert all(np.array_equal(kept[0][key], kept[1][key]) for key in (kept[0] if kept else ()))
     states = [torch.load(end / "checkpoint.pt", weights_only=True)["state"] for end in ends]
     assert states[0].keys() == states[1].keys()
     for key, value in states[0].items():

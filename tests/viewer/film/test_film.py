@@ -256,16 +256,10 @@ def test_nodes_are_recorded_in_total_unless_switched_off(make_flag, tmp_path):
         assert not (tmp_path / name / "nodes").exists()
 
 
-def test_a_resumed_run_records_the_same(make_flag, run, tmp_path):
+def test_damaged_nodes_are_not_added_to(make_flag, tmp_path):
     folder = tmp_path / "run"
     make_flag().run(folder, 3, progress=False)
-    make_flag().run(folder, FRAMES, resume=True, progress=False)
-    whole, parts = load_nodes(run / "nodes.npz"), load_nodes(folder / "nodes.npz")
-    assert whole.dtype == torch.float32
-    assert whole.shape[0] == FRAMES
-    assert torch.equal(whole, parts)
-    assert float(whole[-1].abs().max()) > 0
-    assert not (folder / "nodes").exists()
+    assert load_nodes(folder / "nodes.npz").dtype == torch.float32
     content = (folder / "nodes.npz").read_bytes()
     (folder / "nodes.npz").write_bytes(content[:5000] + bytes([content[5000] ^ 1]) + content[5001:])
     with pytest.raises(ValueError, match=r"nodes\.npz is damaged \(.*start again without --resume"):
