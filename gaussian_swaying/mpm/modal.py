@@ -54,7 +54,7 @@ MOST_UNKNOWNS = 150_000
 """A body with more is refused: its factor would fill the memory."""
 KEPT = 32
 """Analyses in the cache."""
-_VERSION = 8  # of the analysis, in the name of the file
+_VERSION = 9  # of the analysis, in the name of the file
 
 
 @dataclass(frozen=True)
@@ -72,6 +72,7 @@ class Analysis:
         reaction: Force on each boundary by the amplitudes, shape (B, 3, M).
         direct: Share of the load on a site that each boundary takes directly, shape (B, S).
         first: Square of the first circular frequency [1/s²].
+        second: The main mode across the first one.
         dropped: Number of modes that were left out as loose bits.
     """
 
@@ -85,6 +86,7 @@ class Analysis:
     reaction: np.ndarray
     direct: np.ndarray
     first: float
+    second: int
     dropped: int
 
 
@@ -334,10 +336,14 @@ class Structure:
         blocks.append(solve(M @ np.linalg.qr(blocks[0])[0]))
         square, modes = reduced_modes(K, M, np.concatenate(blocks, 1))
         share = self._mass_share(S @ modes)
-        first = min(square[k] for k in _main(square, modes.T @ whole, first, share))
+        pull = modes.T @ whole
+        main = min(_main(square, pull, first, share), key=lambda k: square[k])
+        first = square[main]
         loose = (square < LOOSE**2 * first) | ((square < first) & (share < BITS))
         chosen = np.flatnonzero(~loose)[:most]
-        return self._result(square[chosen], S @ modes[:, chosen], float(first), int(loose.sum()))
+        across = (pull @ [-pull[main, 1], pull[main, 0]])[chosen] ** 2 / square[chosen]
+        second = int(np.where(chosen == main, 0.0, across).argmax())
+        return self._result(square[chosen], S @ modes[:, chosen], float(first), second, int(loose.sum()))
 
     def _first_guess(self) -> float:
         """A shift that is too large: the square of the frequency of a wave along the body."""
@@ -363,7 +369,7 @@ class Structure:
         square = (shape.reshape(self.nodes, 3, -1) ** 2).sum(1)
         return (self.mass @ square) ** 2 / np.maximum(self.mass.sum() * (self.mass @ square**2), 1e-300)
 
-    def _result(self, square: np.ndarray, shape: np.ndarray, first: float, dropped: int) -> Analysis:
+    def _result(self, square: np.ndarray, shape: np.ndarray, first: float, second: int, dropped: int) -> Analysis:
         modes, sites = shape.shape[1], int(self.site.max()) + 1
         turn_points = self.turn_at_points(shape)
         weighted = self.value.T @ (self.point_mass[:, None] * turn_points.reshape(self.count, -1))
@@ -399,6 +405,7 @@ class Structure:
             reaction=reaction,
             direct=direct,
             first=first,
+            second=second,
             dropped=dropped,
         )
 
@@ -515,7 +522,8 @@ def _read(path: Path, numbers: np.ndarray) -> Analysis | None:
             values = {f.name: file[f.name] for f in fields(Analysis)}
     except (OSError, ValueError, KeyError, EOFError, BadZipFile):
         return None
-    values["first"], values["dropped"] = float(values["first"]), int(values["dropped"])
+    values["first"] = float(values["first"])
+    values["second"], values["dropped"] = int(values["second"]), int(values["dropped"])
     return Analysis(**values)
 
 

@@ -64,6 +64,8 @@ class MPMSolver(Solver):
         mls: Stress term and update of F as in MLS-MPM (Hu et al. 2018); only in ``updated``.
         deterministic: On a GPU, sum in a fixed order, so that repeated runs give the same bits; slower. On a CPU the
             order is always fixed. Gradients on a GPU are not covered.
+        pivot: Whether the two main modes have the frequency of the softer one, as those of a thing that hangs or stands
+            on a pivot, whatever its shape; only in ``modes``.
         boundaries: Boundary conditions, applied in order, impulses first.
         transfer: Code that computes substeps. ``torch`` is the reference and works on any device and with all
             gradients; ``kernels`` runs a whole substep in a few compiled kernels, in float32 on a CUDA device and in
@@ -92,6 +94,7 @@ class MPMSolver(Solver):
         substep: float | None = None,
         mls: bool = False,
         deterministic: bool = False,
+        pivot: bool = False,
         boundaries: Sequence[Boundary] = (),
         transfer: Literal["auto", "torch", "kernels"] = "auto",
     ) -> None:
@@ -102,7 +105,7 @@ class MPMSolver(Solver):
         if substep is not None:
             check_positive("substep", substep)
         gravity = check_vector("gravity", gravity)
-        self.settings = Settings(dx, gravity, damping, stiffness_damping, mls, deterministic)
+        self.settings = Settings(dx, gravity, damping, stiffness_damping, mls, deterministic, pivot)
         self.formulation: Literal["total", "updated", "modes"] = formulation
         self.transfer: Literal["auto", "torch", "kernels"] = transfer
         self.cfl, self.substep = float(cfl), substep

@@ -38,6 +38,7 @@ class Kind:
         material: The known material of its surface.
         other: The known material of its stems or wood, or of its cord.
         leaf: First frequency of a leaf or twig on a stem that does not move [Hz], at least.
+        slender: Height over the diameter at breast height of a conifer, whose girth decides its frequency.
         source: Where the numbers are from.
     """
 
@@ -51,17 +52,24 @@ class Kind:
     other: str = "wood"
     mass_by_height: float = 0.0
     leaf: float = 3.0
+    slender: float | None = None
     source: str = ""
 
     def first_frequency(self, height: float) -> float | None:
         """First frequency [Hz] at a height, or length, [m]; None for cloth."""
         if self.frequency is None or self.words == KINDS["rigid"].words:
             return self.frequency
-        return self.frequency / math.sqrt(height)
+        found = self.frequency / math.sqrt(height)
+        return found if self.slender is None else min(GIRTH / (self.slender * height), found)
 
     def area_mass(self, height: float) -> float:
         """Mass per frontal area [kg/m²] at a height [m]."""
         return self.mass + self.mass_by_height * height
+
+    @property
+    def pivot(self) -> bool:
+        """True for what has a stem, a cord or ankles, which bend as easily along as across."""
+        return not self.cloth and self is not KINDS["rigid"]
 
     @property
     def cloth(self) -> bool:
@@ -70,6 +78,7 @@ class Kind:
 
 
 _TREES = "frequency: 844 trees of Jackson et al. 2021 (Biogeosciences 18:4059), k / sqrt(H); mass, drag: estimates"
+GIRTH = 386.0  # Hz m: frequency of a conifer times the square of its height over its diameter at breast height
 KINDS = {
     "plant": Kind("a plant in a pot", 1.0, 1.4, 0.9, 0.58, 0.04, "leaf", "stem", source=_TREES),
     "succulent": Kind("a succulent", 0.3, 2.7, 8.0, 0.8, 0.03, "succulent", "stem", leaf=8.0, source="estimates"),
@@ -77,7 +86,19 @@ KINDS = {
     "shrub": Kind("a shrub", 1.2, 1.75, 2.0, 0.57, 0.04, "leaf", "twig", source=_TREES),
     "tree": Kind("a tree", 8.0, 1.55, 0.0, 0.45, 0.05, "leaf", "bark", mass_by_height=0.8, source=_TREES),
     "sapling": Kind("a young tree", 2.5, 1.6, 2.0, 0.48, 0.04, "leaf", "bark", source=_TREES),
-    "conifer": Kind("a conifer", 8.0, 1.4, 0.0, 0.45, 0.04, "leaf", "bark", mass_by_height=0.8, source=_TREES),
+    "conifer": Kind(
+        "a conifer",
+        8.0,
+        1.98,
+        0.0,
+        0.45,
+        0.04,
+        "leaf",
+        "bark",
+        mass_by_height=0.8,
+        slender=53.0,
+        source=f"{_TREES}; for conifers 386 dbh / H², and at most k of the stiffest tenth",
+    ),
     "hanging": Kind("a hanging thing", 1.0, 0.5, 12.0, 0.6, 0.02, "wood", source="a pendulum; mass, drag: estimates"),
     "cloth": Kind("a hanging cloth", 1.0, None, 0.2, 1.0, 0.02, "fabric", source="fabric of 0.2 kg/m²"),
     "flag": Kind("a flag", 1.0, None, 0.12, 1.0, 0.02, "fabric", source="nylon of 0.12 kg/m²"),

@@ -32,6 +32,7 @@ from gaussian_swaying.preview.kinds import KINDS, Kind
 from gaussian_swaying.preview.shape import quantile
 from gaussian_swaying.preview.stretch import cloth_motion, linear_motion, rate_for, typical_start
 from gaussian_swaying.simulation.parameters import other_with
+from gaussian_swaying.simulation.simulated_scene import SimulatedScene
 from gaussian_swaying.simulation.simulation import Simulation
 
 FLAPS, HANGS, CLOTH_RATIO = 0.35, 0.6, 0.3
@@ -134,23 +135,20 @@ def natural(simulation: Simulation, kind: Kind, flow: Tensor, intensity: float) 
             top = 0.5 * aero.air_density * kind.drag * float(mean.square().sum())
             top /= TIP * kind.area_mass(height) * (2 * math.pi * frequency) ** 2
             little = math.sqrt(LITTLE * height / top)  # of the wind, in which the lean is linear
-            state = modes.leaning(WindForce(aero, WindField(mean * little), scene.patches))
-            moved = _top(state.position - points.position, points.position)[0] / little**2 / ratio
+            _, moved, _ = _top(scene, modes.leaning(WindForce(aero, WindField(mean * little), scene.patches)))
+            moved /= little**2 * ratio
             change = min(max(top / max(moved, 1e-30), 1 / MOST_CHANGE), MOST_CHANGE)
             aero, leans = _with_drag(aero, change), False
             drag, coefficient = drag * change, coefficient * change
     assert modes is not None
-    steady, lean = WindForce(aero, WindField(mean), scene.patches), 0.0
-    shift = modes.leaning(steady).position - points.position
+    lean, start = 0.0, 0.0
     if bool(flow.any()):
-        moved, side = _top(shift, points.position)
+        steady = WindForce(aero, WindField(mean), scene.patches)
+        highest, moved, side = _top(scene, modes.leaning(steady))
         lean = moved / side
-    shift = modes.at_sites(points.mass[:, None] * shift).norm(dim=-1) / modes.site_mass
-    top = (shift >= quantile(shift, 0.9)).nonzero()[:, 0].cpu().numpy()
-    assert isinstance(simulation.wind, WindField)
-    start = 0.0
-    if bool(flow.any()):
-        start = typical_start(linear_motion(modes, steady, simulation.wind, top, rate_for(frequency)), frequency)
+        share = torch.bincount(modes.site[scene.owner[highest]], minlength=modes.sites).double().cpu() / len(highest)
+        assert isinstance(simulation.wind, WindField)
+        start = typical_start(linear_motion(modes, steady, simulation.wind, share, rate_for(frequency)), frequency)
     return Natural(height, frequency, wanted, frontal, thicker, used, drag, coefficient, lean, start)
 
 
@@ -171,7 +169,7 @@ def cloth_start(simulation: Simulation, kind: Kind, size: Sequence[float]) -> fl
         frequency = HANGS / math.sqrt(size[2]) * math.sqrt(kind.mass / (kind.mass + carried))
     places = simulation.setup.points.position
     places = places[:: max(1, len(places) // 8)]
-    return typical_start(cloth_motion(wind, places, frequency, CLOTH_RATIO), frequency)
+    return typical_start(cloth_motion(wind, places, frequency, CLOTH_RATIO), frequency, tonal=False)
 
 
 def silhouette(place: Tensor, flow: Tensor) -> float:
@@ -289,13 +287,13 @@ def _with_drag(aero: AeroForce, factor: float) -> AeroForce:
     return other_with(aero, **{name: factor * getattr(aero, name) for name in ("C_D", "C_F", "C_L")})
 
 
-def _top(shift: Tensor, rest: Tensor) -> tuple[float, float]:
-    """Mean displacement of the tenth that moves most, and the longest side of what moves [m]."""
-    size = shift.norm(dim=-1)
-    moving = size > 0.1 * quantile(size, 0.98)
-    if not bool(moving.any()):
-        return 0.0, 1.0
-    some = rest[moving].double()
-    side = max(quantile(some[:, k], 0.99) - quantile(some[:, k], 0.01) for k in range(3))
-    top = size[moving]
-    return float(top[top >= quantile(top, 0.9)].mean()), max(side, 1e-30)
+def _top(scene: SimulatedScene, state: State) -> tuple[Tensor, float, float]:
+    """The tenth of the Gaussians that moves most, its mean displacement, and the longest side of what moves [m]."""
+    size = scene.follow.motion(state)[0].norm(dim=-1)
+    moving = (size > 0.1 * quantile(size, 0.98)).nonzero()[:, 0]
+    if len(moving) == 0:
+        return torch.arange(len(size), device=size.device), 0.0, 1.0
+    rest = scene.model.means.detach()[scene.moving[moving]].double() * scene.frame.metres_per_unit
+    side = max(quantile(rest[:, k], 0.99) - quantile(rest[:, k], 0.01) for k in range(3))
+    top = moving[size[moving] >= quantile(size[moving], 0.9)]
+    return top, float(size[top].mean()), max(side, 1e-30)

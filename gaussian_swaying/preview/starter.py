@@ -143,7 +143,7 @@ scene:
 solver:
   formulation: {"modes" if s.by_modes else "total":<17}# {s.why_formulation}
   dx: {s.dx:<26.6g}# m; quality {s.quality}: {s.longest_side / s.dx:.0f} cells along the longest side
-  cfl: 0.4
+  cfl: 0.4{_pivot(s)}
   gravity: {gravity}     # m/s^2, z up; {why}
 {_solver_damping(s)}  boundaries:{boundaries}
 
@@ -197,6 +197,12 @@ def _sway_words(s: Suggestion) -> str:
         f"It is taken for {kind.words}: {s.kind_reason}. First frequency in still air {n.frequency:.3g} Hz, for a "
         f"length of {n.height:.3g} m; mean lean of its top {n.lean:.2%} of its longest side.{still}"
     )
+
+
+def _pivot(s: Suggestion) -> str:
+    if not (s.by_modes and KINDS[s.kind].pivot):
+        return ""
+    return "\n  pivot: true                   # it sways as easily along as across"
 
 
 def _middle(s: Suggestion) -> float:

@@ -21,14 +21,14 @@ SAMPLES, RATE, LEAST_RATE, PER_PERIOD = 60_000, 25.0, 6.0, 10.0  # of a record; 
 PLACES, LINES = 96, 20  # at which the wind is taken; lines along the wind on which they lie
 SKIPPED, SHORTEST, PERIODS = 2.0, 10.0, 10.0  # s at the start; s, and periods, of a stretch
 FASTEST, RINGING = 3.0, 12  # frequency over the first above which a mode does not swing; modes that ring on
-STEP, COMPARED = 0.24, 700  # s between stretches; those with the best means whose fluctuation is compared
+STEP, TOGETHER = 0.32, 256  # s between stretches; stretches that are compared at once
 # what a typical stretch has, and how far off counts as a fault: over the mean, in the last three as a ratio or its log
 DRIFT, OFF, RESTLESS = (0.0, 0.03, 0.02), (0.0, 0.12, 0.08), (0.25, 0.68, 0.07)
-EVEN, ROUND, SHARE, LEAD = (0.0, 0.2, 0.2), (0.47, 0.85, 0.05), (0.2, 0.65, 0.1), (0.5, math.inf, 0.3)
+EVEN, ROUND, SHARE, LEAD = (0.0, 0.2, 0.2), (0.47, 0.85, 0.05), (0.2, 0.65, 0.1), (0.2, math.inf, 0.3)
 
 
-Motion = tuple[np.ndarray, Callable[[int, int], np.ndarray]]
-"""Displacement in a long record, (T, 3), and what remains of it from before a sample, in the samples after it."""
+Motion = tuple[np.ndarray, Callable[[np.ndarray, int], np.ndarray]]
+"""Displacement in a long record, (S, 3), and what is left of it in samples after some (W,), (W, T, 3)."""
 
 
 def rate_for(frequency: float) -> float:
@@ -50,7 +50,7 @@ class Response(NamedTuple):
     taken: np.ndarray
 
 
-def typical_start(motion: Motion, frequency: float) -> float:
+def typical_start(motion: Motion, frequency: float, tonal: bool = True) -> float:
     """Time at which a typical stretch begins [s].
 
     The stretch lasts ten seconds or ten periods, whichever is longer, after two seconds. In it the top has the mean and
@@ -59,33 +59,21 @@ def typical_start(motion: Motion, frequency: float) -> float:
     Args:
         motion: The motion at :func:`rate_for` the frequency.
         frequency: First frequency [Hz].
+        tonal: Whether the frequency must lead in the stretch.
     """
     rate, (moved, ringing) = rate_for(frequency), motion
     length = round(max(SHORTEST, PERIODS / frequency) * rate)
     skipped, settled = round(SKIPPED * rate), round(min(20 / frequency, 60.0) * rate)
     whole = moved[settled:]
-    mean, spread = np.linalg.norm(whole.mean(0)), float(np.linalg.norm(whole.std(0)))
     begin = np.arange(settled, len(moved) - length, max(1, round(STEP * rate)))
-    sums = np.concatenate([np.zeros((1, 3)), moved.cumsum(0)])
-    half = (length - skipped) // 2
-    first, second = (
-        (sums[begin + skipped + k * half + half] - sums[begin + skipped + k * half]) / half for k in range(2)
-    )
-    drift = np.linalg.norm(first - second, axis=1) / mean
-    off = np.linalg.norm(0.5 * (first + second) - whole.mean(0), axis=1) / mean
-    chosen = begin[(_fault(drift, DRIFT) + _fault(off, OFF)).argsort()[:COMPARED]]
     faults = []
-    for k in chosen:
-        part = (moved[k : k + length] - ringing(k, length))[skipped:]
-        apart = np.linalg.norm(part[:half].mean(0) - part[half:].mean(0)) / mean
-        away = np.linalg.norm(part.mean(0) - whole.mean(0)) / mean
-        restless = np.linalg.norm(part.std(0)) / mean
-        whole_of = _fault(apart, DRIFT) + _fault(away, OFF) + _fault(restless, RESTLESS)
-        faults.append(whole_of + _faults(part, spread, frequency / rate))
-    return float(chosen[int(np.argmin(faults))] / rate)
+    for some in np.array_split(begin, max(1, len(begin) // TOGETHER)):
+        part = moved[some[:, None] + np.arange(length)] - ringing(some, length)
+        faults.append(_faults(part[:, skipped:], whole, frequency / rate if tonal else math.inf))
+    return float(begin[int(np.argmin(np.concatenate(faults)))] / rate)
 
 
-def linear_motion(bound: Modes, force: WindForce, wind: WindField, top: np.ndarray, rate: float) -> Motion:
+def linear_motion(bound: Modes, force: WindForce, wind: WindField, top: torch.Tensor, rate: float) -> Motion:
     """Mean displacement of some sites in a long record of a wind, without turns [m].
 
     The air's damping is that in the mean wind, twice as strong along it as across.
@@ -94,7 +82,7 @@ def linear_motion(bound: Modes, force: WindForce, wind: WindField, top: np.ndarr
         bound: The modes of the body, of one scene.
         force: The force of the wind on it.
         wind: The turbulent wind.
-        top: The sites whose motion counts, shape (K,).
+        top: Share of each site in the top, shape (S,).
         rate: Samples in a second.
     """
     from scipy.cluster.vq import kmeans2
@@ -114,7 +102,7 @@ def linear_motion(bound: Modes, force: WindForce, wind: WindField, top: np.ndarr
     weight = pressed * flow.norm() @ (eye + torch.outer(along, along))
     damping = torch.diag(2 * bound.ratio.double().cpu() * square.sqrt())
     damping = damping + shape.flatten(0, 1).T @ (weight @ shape).flatten(0, 1)
-    tip = shape[torch.from_numpy(top)].mean(0)
+    tip = (top[:, None, None] * shape).sum(0)
     centre, label = kmeans2(place.numpy(), min(PLACES, len(place)), seed=0, minit="++")
     response = _response(square.numpy(), damping.numpy(), tip.numpy(), FASTEST * bound.first)
     pull = pull @ torch.from_numpy(response.taken)
@@ -200,10 +188,10 @@ def _motion(load: np.ndarray, response: Response, rate: float) -> Motion:
         free.append((float(amplitude.std() * np.linalg.norm(response.out[:, k])), root, amplitude, response.out[:, k]))
     free.sort(key=lambda mode: -mode[0])
 
-    def ringing(start: int, samples: int) -> np.ndarray:
-        time, left = np.arange(samples) * dt, np.zeros((samples, 3))
+    def ringing(start: np.ndarray, samples: int) -> np.ndarray:
+        time, left = np.arange(samples) * dt, np.zeros((len(start), samples, 3))
         for _, root, amplitude, way in free[:RINGING]:
-            left += (np.exp(root * time)[:, None] * (amplitude[start] * way)).real
+            left += ((amplitude[start][:, None] * np.exp(root * time))[..., None] * way).real
         return left
 
     return moved, ringing
@@ -213,28 +201,36 @@ def _fault(value: Any, allowed: tuple[float, float, float]) -> Any:
     """One for a value outside its range by the last number or more, and a little more the farther it is."""
     low, high, size = allowed
     apart = np.maximum(np.maximum(low - value, value - high), 0.0) / size
-    return np.minimum(apart, 1.0) + 0.25 * apart
+    return np.minimum(apart, 1.0) + 0.5 * apart
 
 
-def _faults(part: np.ndarray, spread: float, frequency: float) -> float:
-    """Faults of the fluctuation of a stretch (T, 3): its size, how round it is, and its spectrum.
+def _faults(part: np.ndarray, whole: np.ndarray, frequency: float) -> np.ndarray:
+    """Faults of stretches (W, T, 3) of a record (S, 3): means, size and roundness of the fluctuation, and its spectrum.
 
-    The frequency is that for each sample.
+    The frequency is that for each sample. The spectrum of a thing that follows the wind does not count.
     """
-    apart = part - part.mean(0)
-    left, sizes, _ = np.linalg.svd(apart, full_matrices=False)
-    uneven = abs(np.log(np.linalg.norm(apart.std(0)) / spread))
-    found = _fault(uneven, EVEN) + _fault(sizes[1] / sizes[0], ROUND)
-    if 1.15 * frequency > 0.5:  # it follows the wind: its own vibration is not in the record
-        return float(found)
-    line, time = left[:, 0], np.arange(len(part))
-    line = line - np.polyval(np.polyfit(time, line, 1), time)
-    power = np.abs(np.fft.rfft(line * np.hanning(len(line)), 4 * len(line))) ** 2
-    f = np.fft.rfftfreq(4 * len(line)) / frequency
-    own, below = (f > 0.85) & (f < 1.15), (f > 1.5 / len(line) / frequency) & (f <= 0.75)
-    lead = np.log(power[own].max() / max(power[below].max(initial=0.0), 1e-300))
-    share = power[(f > 2 / 3) & (f < 4 / 3)].sum() / power.sum()
-    return float(found + _fault(share, SHARE) + _fault(lead, LEAD))
+    count, half = part.shape[1], part.shape[1] // 2
+    mean, spread = np.linalg.norm(whole.mean(0)), np.linalg.norm(whole.std(0))
+    own_mean = part.mean(1)
+    apart = part - own_mean[:, None]
+    drift = np.linalg.norm(part[:, :half].mean(1) - part[:, half:].mean(1), axis=1) / mean
+    off = np.linalg.norm(own_mean - whole.mean(0), axis=1) / mean
+    square, axes = np.linalg.eigh(np.swapaxes(apart, 1, 2) @ apart / count)
+    size = np.sqrt(square.sum(1))
+    found = _fault(drift, DRIFT) + _fault(off, OFF) + _fault(size / mean, RESTLESS)
+    found = found + _fault(abs(np.log(size / spread)), EVEN)
+    found = found + _fault(np.sqrt(np.maximum(square[:, 1], 0) / square[:, 2]), ROUND)
+    if 1.15 * frequency > 0.5:  # its own vibration is not in the record
+        return found
+    time = np.linspace(-1.0, 1.0, count)
+    line = (apart @ axes[:, :, 2:])[..., 0]
+    line = line - (line @ time / (time @ time))[:, None] * time
+    power = np.abs(np.fft.rfft(line * np.hanning(count), 4 * count)) ** 2
+    f = np.fft.rfftfreq(4 * count) / frequency
+    own, seen = (f > 0.78) & (f < 1.22), f > 1.5 / count / frequency
+    lead = np.log(power[:, own].max(1) / power[:, seen & ((f <= 0.75) | (f >= 1.25))].max(1))
+    share = power[:, (f > 2 / 3) & (f < 4 / 3)].sum(1) / power.sum(1)
+    return found + _fault(share, SHARE) + _fault(lead, LEAD)
 
 
 __all__ = ["Motion", "cloth_motion", "linear_motion", "rate_for", "typical_start"]

@@ -190,7 +190,7 @@ def test_a_piece_that_nothing_holds_follows_the_nearest_that_is_held():
     assert len(structure.loose) == 3
     found = structure.analyse(40)
     alone = Structure(bound(post(nu=0.0)).bound).analyse(40)
-    assert found.dropped == alone.dropped
+    assert found.dropped <= alone.dropped
     # 8 of 328 points, at 0.85 of the height, where the first mode moves by some 0.78: its square is lower by
     # 1 + 8 / 320 x 4 x 0.78² = 1.06, as the effective mass of a cantilever is a quarter, and by what swings around it
     assert 0.8 < found.first / alone.first * 320 / 328 < 0.96  # for the same post, of 320 / 328 kg
@@ -203,15 +203,19 @@ def test_a_piece_that_nothing_holds_follows_the_nearest_that_is_held():
     np.testing.assert_allclose(shift[own:], rigid, atol=0.1 * abs(shift[own:]).max())  # ties are as stiff as the post
 
 
-def test_a_bit_that_hangs_by_a_thread_is_left_out():
+def test_a_bit_that_hangs_by_a_thread_is_left_out(monkeypatch):
     """A heavy bit on the corner of a cell, far softer than all else."""
     bit = lattice((0.2, 0, 0.9), (0.25, 0.05, 0.95), 0.05)
-    found = Structure(bound(post(extra=[bit], stiff=(slice(320, None), 1e-6))).bound).analyse(40)
-    alone = Structure(bound(post()).bound).analyse(40)
-    assert found.dropped > alone.dropped
+    structure = Structure(bound(post(extra=[bit], stiff=(slice(320, None), 1e-6))).bound)
+    found, alone = structure.analyse(40), Structure(bound(post()).bound).analyse(40)
     # one point of 321 at its end, where four times the mean of its square moves: it is lower by half of 4 / 321
     assert found.first == pytest.approx(alone.first * 321 / 320, rel=0.03)
     assert found.square[0] >= LOOSE**2 * found.first
+    monkeypatch.setattr(modal, "LOOSE", 0.0)
+    monkeypatch.setattr(modal, "BITS", 0.0)
+    every = structure.analyse(150)
+    assert every.dropped == 0
+    assert every.square[0] < LOOSE**2 * found.first
 
 
 def test_a_rigid_part_has_six_degrees_of_freedom():

@@ -366,3 +366,31 @@ def test_another_density_keeps_the_place():
     assert float((state.position - post().position).abs().max()) > 1e-3
     assert torch.allclose(moved.position, state.position, rtol=0, atol=1e-12)
     assert torch.allclose(moved.velocity, state.velocity, rtol=0, atol=1e-12)
+
+
+def test_on_a_pivot_it_sways_as_easily_along_as_across():
+    """A plank five times as wide as thick: pushed both ways, it swings with one frequency, that of the thin way."""
+    axes = [(torch.arange(n, dtype=torch.float64) + 0.5) * 0.05 for n in (2, 10, 20)]
+    plank = MaterialPoints.create(
+        torch.cartesian_prod(*axes), volume=0.05**3, density=100.0, youngs_modulus=1e6, poisson_ratio=0.3
+    )
+    pins = [PinnedRegion(Box([None] * 3, [None, None, 0.1]), kind="nodes")]
+    free, pivot = (solver_of(pins=pins, pivot=on) for on in (False, True))
+    free.init_state(plank)
+    velocity = torch.zeros_like(plank.position)
+    velocity[:, :2] = 0.01 * plank.position[:, 2:] ** 2
+    state = pivot.init_state(plank, velocity)
+    second = int(pivot.bound.square.isclose(pivot.bound.square.new_tensor(pivot.bound.first**2)).nonzero()[1])
+    assert float(free.bound.square[second]) > 4 * free.bound.first**2
+    assert pivot.bound.first == free.bound.first
+    top, along = plank.position[:, 2] > 0.9, []
+    for _ in range(40):
+        state = run(pivot, state)
+        along.append((state.position - plank.position)[top].mean(0))
+    x, y, _ = torch.stack(along).T
+    assert torch.corrcoef(torch.stack([x, y]))[0, 1] > 0.95  # on one line, which two frequencies would leave
+
+
+def test_a_pivot_without_modes_is_refused():
+    with pytest.raises(ValueError, match="`pivot`"):
+        solver_of("total", pivot=True)

@@ -136,6 +136,8 @@ def test_frequency_falls_with_the_root_of_the_height():
     assert tree.first_frequency(16.0) == pytest.approx(tree.first_frequency(4.0) / 2)
     assert tree.area_mass(10.0) == pytest.approx(8.0)
     assert KINDS["rigid"].first_frequency(9.0) == 40.0
+    assert KINDS["conifer"].first_frequency(20.0) == pytest.approx(386 * (20 / 53) / 20**2)
+    assert KINDS["conifer"].first_frequency(4.0) == pytest.approx(0.99)  # no stiffer than the stiffest tenth of all
     assert KINDS["flag"].first_frequency(1.0) is None
     assert KINDS["flag"].cloth
     assert not tree.cloth

@@ -42,6 +42,7 @@ class Settings:
     stiffness_damping: float
     mls: bool
     deterministic: bool
+    pivot: bool = False
 
     def __post_init__(self) -> None:
         for name in ("dx", "damping", "stiffness_damping"):
@@ -103,7 +104,8 @@ class Formulation(ABC):
     @classmethod
     def check_settings(cls, settings: Settings) -> None:
         """Raise ValueError if the formulation does not support a setting."""
-        return
+        if settings.pivot and cls.name != "modes":
+            raise ValueError("`pivot` joins two modes: set `formulation` to modes, or `pivot` to false.")
 
     # ---- state and grid
 

@@ -116,7 +116,11 @@ class Modes(Total):
         firsts = torch.tensor([one.first for one in found], dtype=torch.float64, device=unit.device)
         self.firsts = (firsts.reshape(batch) * unit).sqrt()
         self.first = float(self.firsts.amax())
-        self._square = in_double(stacked("square", torch.float64)) * unit[..., None]
+        square = stacked("square", torch.float64)
+        if self.settings.pivot:
+            second = torch.tensor([one.second for one in found], device=unit.device).reshape(*batch, 1)
+            square = square.scatter(-1, second, firsts.reshape(*batch, 1))
+        self._square = in_double(square) * unit[..., None]
         self._unlost = torch.zeros(self.site_mass.shape, dtype=torch.bool, device=like.device)
         self.dropped = max(one.dropped for one in found)
         self._site_forces: Any = None
