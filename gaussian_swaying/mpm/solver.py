@@ -22,7 +22,7 @@ from gaussian_swaying.mpm.followers import Followers, GridFollowers
 from gaussian_swaying.mpm.forces import Force, Forces, FunctionForce, added, as_forces, split, tensors_of
 from gaussian_swaying.mpm.formulations import FORMULATIONS
 from gaussian_swaying.mpm.formulations.formulation import Formulation, Settings
-from gaussian_swaying.mpm.formulations.modes import Modes
+from gaussian_swaying.mpm.formulations.modes import MOST_LEAN, Modes, why_not_modes
 from gaussian_swaying.mpm.formulations.total import Total
 from gaussian_swaying.mpm.guard import check_begin, check_end, check_load, check_rest
 from gaussian_swaying.mpm.protocol import Solver, WatchFunction
@@ -37,7 +37,7 @@ TRANSFERS = ("auto", "torch", "kernels")
 
 
 class MPMSolver(Solver):
-    """Material point method in two formulations over one set of transfers.
+    """Material point method in three formulations over one set of transfers.
 
     ``total`` (total Lagrangian MPM; de Vaucorbeil, Nguyen & Hutchinson 2020): stencils at the rest positions, computed
     once; nodal displacement and velocity are the state. Use it for elastic objects whose particles keep their
@@ -53,7 +53,8 @@ class MPMSolver(Solver):
 
     Args:
         dx: Grid spacing [m].
-        formulation: ``total``, ``updated`` or ``modes``.
+        formulation: ``total``, ``updated``, ``modes`` or ``auto``, which becomes ``modes`` where that will do,
+            ``updated`` where something flows, and ``total`` otherwise; ``why`` says why.
         gravity: Acceleration [m/s²], z up.
         damping: Rate at which velocities decay [1/s]; 0 for none.
         stiffness_damping: Time constant of the stiffness damping [s]. A vibration of circular frequency omega is damped
@@ -85,7 +86,7 @@ class MPMSolver(Solver):
     def __init__(
         self,
         dx: float = 0.02,
-        formulation: Literal["total", "updated", "modes"] = "total",
+        formulation: Literal["total", "updated", "modes", "auto"] = "total",
         *,
         gravity: Sequence[float] = (0.0, 0.0, -9.8),
         damping: float = 0.0,
@@ -100,16 +101,20 @@ class MPMSolver(Solver):
     ) -> None:
         super().__init__()
         check_choice("transfer", transfer, TRANSFERS)
-        check_choice("formulation", formulation, tuple(FORMULATIONS))
+        check_choice("formulation", formulation, (*FORMULATIONS, "auto"))
         check_positive("cfl", cfl)
         if substep is not None:
             check_positive("substep", substep)
         gravity = check_vector("gravity", gravity)
         self.settings = Settings(dx, gravity, damping, stiffness_damping, mls, deterministic, pivot)
-        self.formulation: Literal["total", "updated", "modes"] = formulation
+        self.automatic, self.why = formulation == "auto", ""
+        self.formulation: Literal["total", "updated", "modes", "auto"] = "total" if self.automatic else formulation
+        self._too_far: str | None = None
         self.transfer: Literal["auto", "torch", "kernels"] = transfer
         self.cfl, self.substep = float(cfl), substep
-        FORMULATIONS[formulation].check_settings(self.settings)
+        if pivot and formulation != "modes":
+            raise ValueError("`pivot` joins two modes: set `formulation` to modes, or `pivot` to false.")
+        FORMULATIONS[self.formulation].check_settings(self.settings)
         self.boundaries = nn.ModuleList(boundaries)
         # the same in metres; in a tuple, because these copies do not belong to the module's state
         self._framed: tuple[Boundary, ...] | None = None
@@ -190,7 +195,7 @@ class MPMSolver(Solver):
         """
         return MPMSolver(
             **dataclasses.asdict(settings),
-            formulation=self.formulation,
+            formulation="auto" if self.automatic else self.formulation,
             cfl=self.cfl,
             substep=self.substep,
             boundaries=self._conditions(),
@@ -236,7 +241,7 @@ class MPMSolver(Solver):
     def describe(self, state: MPMState) -> dict[str, Any]:
         """Formulation and grid, for the summary of a run."""
         grid = {"dx_m": self.dx, "resolution": list(state.grid.resolution)}
-        return {"formulation": self.formulation, "grid": grid}
+        return {"formulation": self.formulation} | ({"why": self.why} if self.automatic else {}) | {"grid": grid}
 
     def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> MPMSolver:
         super()._apply(fn, recurse)
@@ -252,9 +257,23 @@ class MPMSolver(Solver):
     def _bind(self, points: MaterialPoints, surface: Surface | None) -> None:
         """Bind the material and compute everything that stays constant."""
         self._bound = self._fused = None
-        bound = FORMULATIONS[self.formulation](Body(points, self._framed or self._conditions(), surface), self.settings)
+        body = Body(points, self._framed or self._conditions(), surface)
+        if self.automatic:
+            self.formulation, self.why = self._choice(body)
+        bound = FORMULATIONS[self.formulation](body, self.settings)
         self._fused_obstacle = self._why_not_kernels(bound)
         self._bound = bound
+
+    def _choice(self, body: Body) -> tuple[Literal["total", "updated", "modes"], str]:
+        """The formulation for a body, and why."""
+        if body.laws.plastic:
+            return "updated", f"the law {body.laws.plastic_names[0]} flows"
+        why = self._too_far or why_not_modes(body)
+        return ("modes", "it is held, and nothing touches or folds") if why is None else ("total", why.split(": ")[0])
+
+    def leans_too_far(self, lean: float) -> None:
+        """Let ``auto`` be ``total`` from the next :meth:`init_state` on, as a body leans by a share of its size."""
+        self._too_far = f"it leans by {lean:.0%} of its size, more than the {MOST_LEAN:.0%} that modes can show"
 
     def _why_not_kernels(self, bound: Formulation) -> str | None:
         """Return the reason why no kernels are used, if so; ValueError if none can be, but ``transfer`` is kernels."""

@@ -37,8 +37,6 @@ from gaussian_swaying.simulation.simulation import Simulation
 
 FLAPS, HANGS, CLOTH_RATIO = 0.35, 0.6, 0.3
 """Frequency of a flag times its length over the wind; of a hanging sheet times the root of its length; damping."""
-MOST_LEAN = 0.4
-"""Lean over the longest side above which modes will not do."""
 SILHOUETTE = 96
 """Cells along the longest side in which the silhouette is counted."""
 ABOVE = 1.5

@@ -24,8 +24,10 @@ from gaussian_swaying.aero.wind_force import WindForce
 from gaussian_swaying.geometry.patches import deform_patch
 from gaussian_swaying.kernels.graphs import fingerprint, tensors_in
 from gaussian_swaying.mpm.forces import Force
+from gaussian_swaying.mpm.formulations.modes import MOST_LEAN, Modes
 from gaussian_swaying.mpm.joints import Joints
 from gaussian_swaying.mpm.protocol import Solver
+from gaussian_swaying.mpm.solver import MPMSolver
 from gaussian_swaying.mpm.state import MaterialPoints, State
 from gaussian_swaying.mpm.timestep import MAX_CFL, rounding_speed, stable_limit
 from gaussian_swaying.simulation.copies import Copies
@@ -297,6 +299,11 @@ class Stepper:
         scene, self._bound = self.scene, self.materials
         points = MaterialPoints.stack(self._bound) if self.batched else self._bound[0]
         state: State = self.solver.init_state(points, frame=scene.frame, surface=scene.surface_places)
+        if isinstance(self.solver, MPMSolver) and self.solver.automatic and isinstance(self.solver.bound, Modes):
+            lean = self._lean(self.solver.bound)
+            if lean > MOST_LEAN:
+                self.solver.leans_too_far(lean)
+                state = self.solver.init_state(points, frame=scene.frame, surface=scene.surface_places)
         self.lift = None
         if any(setup.aero.carried for setup in self.setups) and any(self.solver.gravity):
             with torch.inference_mode(False), torch.no_grad():  # it outlives the call
@@ -304,6 +311,16 @@ class Stepper:
                 mass = torch.stack(air) if self.batched else air[0]
                 self.lift = AirLift(mass.to(points.mass), self.solver.gravity)
         return state
+
+    def _lean(self, bound: Modes) -> float:
+        """Mean displacement of the tenth that moves most in the strongest steady wind, over the longest side."""
+        first, flows = self.setup, self.flows().detach()
+        strongest = WindField(flows[flows.norm(dim=-1).argmax()])
+        state = bound.leaning(WindForce(first.aero, strongest, _repeated(first.scene.patches, len(self.setups))))
+        rest = bound.body.points.position
+        side = (rest.amax(-2) - rest.amin(-2)).amax()
+        moved = (state.position - rest).norm(dim=-1).flatten()
+        return float(moved.topk(max(1, len(moved) // 10)).values.mean() / side)
 
     def _check_rounding(self, state: State, dt: float) -> None:
         """Raise ValueError if rounding moves the material at rest nearly as fast as wind and gravity do."""

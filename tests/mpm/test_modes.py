@@ -22,6 +22,7 @@ from gaussian_swaying.mpm.formulations.modes import LONGEST, SHORTEST, Modes, wa
 from gaussian_swaying.mpm.laws.sand import Sand
 from gaussian_swaying.mpm.solver import MPMSolver
 from gaussian_swaying.mpm.state import MaterialPoints
+from gaussian_swaying.simulation.material import Material
 
 FOOT = Box([None] * 3, [None, None, 0.1])
 POINTS = 320
@@ -248,12 +249,12 @@ def test_gradients_are_those_of_differences(name):
 # ---- in a simulation
 
 
-def swaying(make_simulation):
+def swaying(make_simulation, formulation="modes", **more):
     """A slab of 0.2 m, four points thick."""
     axes = [(torch.arange(n) + 0.5) * 0.05 for n in (16, 4, 12)]
     cloud = plain_cloud(torch.cartesian_prod(*axes), -3.5, logit=3.0)
     scene = {"metres_per_unit": 1.0, "opacity_threshold": 0.0}
-    return make_simulation(cloud, scene=scene, formulation="modes", gravity=(0, 0, 0), dx=0.1)
+    return make_simulation(cloud, scene=scene, formulation=formulation, gravity=(0, 0, 0), dx=0.1, **more)
 
 
 def test_a_run_that_goes_on_is_the_same_to_the_bit(make_simulation, tmp_path):
@@ -394,3 +395,25 @@ def test_on_a_pivot_it_sways_as_easily_along_as_across():
 def test_a_pivot_without_modes_is_refused():
     with pytest.raises(ValueError, match="`pivot`"):
         solver_of("total", pivot=True)
+
+
+def test_auto_takes_modes_where_they_will_do_and_says_why(make_simulation):
+    """By the body alone in a solver, and by the lean in the wind in a simulation."""
+    held = solver_of("auto")
+    held.init_state(post())
+    assert (held.formulation, held.why) == ("modes", "it is held, and nothing touches or folds")
+    free = solver_of("auto", pins=[])
+    free.init_state(post())
+    assert (free.formulation, free.why) == ("total", "nothing holds it")
+    flows = solver_of("auto")
+    flows.init_state(post(law=Sand()))
+    assert flows.formulation == "updated"
+    assert "Sand" in flows.why
+    for E, formulation in ((1e7, "modes"), (300.0, "total")):
+        simulation = swaying(make_simulation, "auto", material=Material(E=E, density=30.0))
+        told = simulation.solver.describe(simulation.start())
+        assert told["formulation"] == formulation
+        assert told["why"] == simulation.solver.why
+        assert ("more than the 40%" in told["why"]) == (formulation == "total")
+        state, _ = simulation.advance(simulation.start())
+        assert bool(state.position.isfinite().all())

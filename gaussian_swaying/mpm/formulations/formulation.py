@@ -104,8 +104,7 @@ class Formulation(ABC):
     @classmethod
     def check_settings(cls, settings: Settings) -> None:
         """Raise ValueError if the formulation does not support a setting."""
-        if settings.pivot and cls.name != "modes":
-            raise ValueError("`pivot` joins two modes: set `formulation` to modes, or `pivot` to false.")
+        return
 
     # ---- state and grid
 

@@ -38,6 +38,7 @@ from gaussian_swaying.mpm.modal import Analysis, analysis_of
 from gaussian_swaying.mpm.state import MPMState, State
 from gaussian_swaying.mpm.transfer import gather, scatter
 
+MOST_LEAN = 0.4  # over the longest side, that modes can show
 MOST_MODES = 80
 LONGEST, SHORTEST = 0.01, 0.0025
 """Longest and shortest substep [s]: 4 and 16 in a frame of 0.04 s."""

@@ -309,7 +309,6 @@ class Total(Formulation):
     @classmethod
     def check_settings(cls, settings: Settings) -> None:
         """Raise ValueError for ``mls``, which is not supported."""
-        super().check_settings(settings)
         if settings.mls:
             raise ValueError(
                 "`mls` is a variant of the updated formulation: set `formulation` to updated, or `mls` to false."
