@@ -5,7 +5,7 @@ from bench.known import KNOWN, plain
 from bench.runner import read
 
 COARSE = [(one, run) for one in KNOWN for run in one.coarse]
-RECORDED = {str(run.parameters): run for run in read("known")}
+RECORDED = {str(run.parameters): run for run in read("known") if "CPU" in run.device}
 FINE = [
     (one, run, RECORDED[key])
     for one in KNOWN

@@ -3,7 +3,7 @@
 Parameters of the paper's flags are those of its table; values that it does not give are chosen here and marked.
 Nothing in this file needs Blender: ``blender_cloth.py`` solves, ``blender_images.py`` renders,
 ``make_flag_dataset.py`` combines them. Motions and their files are in ``flag_motion.py``, textures and cameras in
-``flag_pictures.py``, comparisons in ``flag_difference.py``.
+``flag_pictures.py``.
 """
 
 from __future__ import annotations
