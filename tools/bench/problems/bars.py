@@ -14,7 +14,6 @@ import torch
 from torch import Tensor
 
 from bench.problems.settings import Axial, Result, Settings, block, fit_sinusoid, follow
-from gaussian_swaying._checks import check_choice
 from gaussian_swaying.geometry.regions import Box
 from gaussian_swaying.mpm.boundaries.boundary import Boundary
 from gaussian_swaying.mpm.boundaries.pinned_points import PinnedPoints
@@ -65,8 +64,6 @@ def vibrating_bar(
         ``error`` (of the frequency, relative), ``frequency`` [Hz], ``loss`` (share of the amplitude lost per period),
         ``end_shift`` (by how many cells each fixed end appears farther out than it is) and the common quantities.
     """
-    check_choice("ends", ends, ("free", "fixed-free", "fixed"))
-    check_choice("hold", hold, ("nodes", "points"))
     nu, dx = poisson_ratio, LENGTH / cells
     speed = math.sqrt(YOUNG * (1 - nu) / ((1 + nu) * (1 - 2 * nu)) / DENSITY)
     wave = math.pi / LENGTH / (2 if ends == "fixed-free" else 1)
@@ -182,7 +179,6 @@ def hanging_bar(
         farther up than it is), ``residual`` (speed of the tip, relative to its displacement and frequency) and the
         common quantities.
     """
-    check_choice("clamp", clamp, ("mirror", "pin", "points"))
     dx, speed = LENGTH / cells, math.sqrt(YOUNG / DENSITY)
     gravity = strain * YOUNG / (DENSITY * LENGTH)
     first = {"mirror": -cells, "pin": -_CLAMP, "points": 0}[clamp]

@@ -15,7 +15,6 @@ from torch import Tensor
 
 from bench.problems.fabrics import FABRICS, GRAVITY, THICK
 from bench.problems.settings import Result, Settings, follow
-from gaussian_swaying._checks import check_choice
 from gaussian_swaying.gaussians.cloud import GaussianCloud
 from gaussian_swaying.geometry.regions import Cylinder
 from gaussian_swaying.mpm.boundaries.pinned_region import PinnedRegion
@@ -102,7 +101,6 @@ def drape(
         along the edge over that of the falling strip), ``points`` and the common quantities; ``error`` is relative to
         the shell with as many folds.
     """
-    check_choice("fabric", fabric, tuple(FABRICS))
     settings = Settings(dtype=torch.float32) if settings is None else settings
     mass, stiffness = FABRICS[fabric]
     width = FABRIC - DISC

@@ -12,7 +12,6 @@ import torch
 
 from bench.problems.beams import elastica
 from bench.problems.settings import Axial, Result, Settings, follow
-from gaussian_swaying._checks import check_choice
 from gaussian_swaying.geometry.regions import Box
 from gaussian_swaying.mpm.boundaries.pinned_region import PinnedRegion
 from gaussian_swaying.mpm.solver import MPMSolver
@@ -49,7 +48,6 @@ def hanging_strip(
         the outer layers [cells]), ``grams`` (mass [g/m²]), ``micro`` (D [µN m]), ``residual`` (speed of the tip,
         relative to its drop and frequency) and the common quantities.
     """
-    check_choice("fabric", fabric, tuple(FABRICS))
     settings = Settings(dtype=torch.float32) if settings is None else settings
     mass, stiffness = FABRICS[fabric]
     dx = length / cells

@@ -7,7 +7,6 @@ import math
 import torch
 
 from bench.problems.settings import Axial, Result, Settings, follow
-from gaussian_swaying._checks import check_choice
 from gaussian_swaying.geometry.regions import Box
 from gaussian_swaying.mpm.boundaries.boundary import Boundary
 from gaussian_swaying.mpm.boundaries.pinned_points import PinnedPoints
@@ -49,13 +48,11 @@ def hinged_strip(
         in the middle), ``residual`` (speed of the middle, relative to its deflection and frequency) and the common
         quantities.
     """
-    check_choice("hold", hold, ("hinge", "clamp", "nodes"))
     dx, thick = LENGTH / cells, LENGTH / slenderness
     like = torch.zeros((), dtype=settings.dtype, device=settings.device)
     beyond = _BEYOND if hold == "nodes" else 0
     count = per_cell * (cells + 2 * beyond)
     along = ((torch.arange(count, dtype=torch.float64) + 0.5) / per_cell - beyond + shift) * dx
-    check_choice("layers", layers, (1, 3))
     heights, shares = ([-0.5, 0.0, 0.5], [1 / 6, 2 / 3, 1 / 6]) if layers == 3 else ([0.0], [1.0])
     across = thick * torch.tensor(heights, dtype=torch.float64) + shift * dx
     rest = torch.cartesian_prod(along, torch.zeros(1, dtype=torch.float64), across)

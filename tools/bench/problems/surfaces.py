@@ -7,7 +7,6 @@ import math
 import torch
 
 from bench.problems.settings import Result
-from gaussian_swaying._checks import check_choice
 from gaussian_swaying.aero.force import AeroForce
 from gaussian_swaying.gaussians.cloud import GaussianCloud
 from gaussian_swaying.gaussians.model import GaussianSurfaceModel
@@ -54,7 +53,6 @@ def surface_drag(shape: str, count: int, overlap: float, area: str, law: str) ->
     Returns:
         ``error`` (relative), ``share`` of the exact force and ``gaussians``.
     """
-    check_choice("shape", shape, ("plate", "sphere"))
     wind = torch.tensor([0.0, 3.0, 0.0])
     pressure = 0.5 * 1.225 * 9.0
     if shape == "plate":

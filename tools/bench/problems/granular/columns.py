@@ -11,6 +11,7 @@ from torch import Tensor
 
 from bench.problems.granular.deposit import bulk, lajeunesse, lube, surface
 from bench.problems.granular.shared import (
+    COMPRESSION,
     DENSITY,
     FRAMES,
     GRAVITY,
@@ -21,7 +22,6 @@ from bench.problems.granular.shared import (
     updated,
 )
 from bench.problems.settings import Axial, Result, Settings, follow, lattice
-from gaussian_swaying._checks import check_positive
 from gaussian_swaying.mpm.boundaries.boundary import Boundary
 from gaussian_swaying.mpm.boundaries.plane import Plane
 from gaussian_swaying.mpm.laws.sand import Sand
@@ -66,8 +66,6 @@ def column_collapse(
     planar: bool = True,
     friction_angle: float = 30.0,
     volume_correction: bool = True,
-    floor_friction: float | None = None,
-    compression: float = 1e-2,
     duration: float = 5.0,
 ) -> Result:
     r"""Release a column of sand and let it spread over a rough floor.
@@ -96,12 +94,8 @@ def column_collapse(
         ``lube`` and ``lajeunesse``: run-outs in experiments, the latter for a round column only; ``error``: run-out
         relative to ``lube``; ``simulated_s``, ``substeps``, ``wall_s`` and ``particles``.
     """
-    check_positive("aspect", aspect)
-    check_positive("compression", compression)
     settings = updated(settings)
     high = round(aspect * cells)
-    if abs(high - aspect * cells) > 1e-9:
-        raise ValueError(f"Expected `aspect * cells` to be a whole number, but got {aspect * cells:g}.")
     dx, height = LENGTH / cells, aspect * LENGTH
     place = lattice(dx, (0, 0, 0), (cells, 0 if planar else cells, high), settings)
     place = place[torch.linalg.vector_norm(place[:, :2], dim=-1) < LENGTH]
@@ -113,8 +107,6 @@ def column_collapse(
         (1,) if planar else (),
         friction_angle,
         volume_correction=volume_correction,
-        floor_friction=floor_friction,
-        compression=compression,
     )
     scale = math.sqrt(height / GRAVITY)
 
@@ -155,20 +147,17 @@ def _column(
     *,
     walls: Sequence[Boundary] = (),
     volume_correction: bool = True,
-    floor_friction: float | None = None,
-    compression: float = 1e-2,
 ) -> tuple[MPMSolver, MaterialPoints, MPMState]:
     """Sand at ``place`` on a floor, with smooth walls at x = 0 and y = 0, consolidated under its weight."""
     points = MaterialPoints.create(
         place,
         volume=dx**3 / (4 if held else 8),
         density=DENSITY,
-        youngs_modulus=DENSITY * GRAVITY * height / compression,
+        youngs_modulus=DENSITY * GRAVITY * height / COMPRESSION,
         poisson_ratio=POISSON,
         law=Sand(friction_angle, volume_correction),
     )
-    kind = "sticky" if floor_friction is None else "separate"
-    floor = Plane((0, 0, 0), (0, 0, 1), kind, friction=floor_friction or 0.0)
+    floor = Plane((0, 0, 0), (0, 0, 1), "sticky")
     sides: list[Boundary] = [Plane((0, 0, 0), (1, 0, 0), "slip")]
     sides.append(Axial(held) if held else Plane((0, 0, 0), (0, 1, 0), "slip"))
     solver = settings.solver(dx, gravity=(0.0, 0.0, -GRAVITY), boundaries=[*sides, *walls, floor])

@@ -12,6 +12,7 @@ from torch import Tensor
 
 from bench.problems.granular.angles import shear_angle
 from bench.problems.granular.shared import (
+    COMPRESSION,
     DENSITY,
     FRAMES,
     GRAVITY,
@@ -56,7 +57,6 @@ def inclined_layer(
     friction_angle: float = 30.0,
     volume_correction: bool = False,
     seconds: float = 0.3,
-    compression: float = 1e-2,
 ) -> tuple[list[float], list[float], Result]:
     """Put sand on infinite rough inclines and measure how fast it accelerates.
 
@@ -72,7 +72,7 @@ def inclined_layer(
     """
     settings = updated(settings)
     tilt = torch.deg2rad(torch.tensor(list(angles), device=settings.device, dtype=settings.dtype))
-    solver, points, state = _layer(len(angles), settings, cells, friction_angle, volume_correction, compression)
+    solver, points, state = _layer(len(angles), settings, cells, friction_angle, volume_correction)
     weight = (points.mass * GRAVITY)[..., None]
     across = weight.new_tensor([0.0, 1.0, 1.0])
     frame, taken, speeds = seconds / FRAMES, 0, []
@@ -143,7 +143,6 @@ def tossed_layer(
     volume_correction: bool = True,
     rise: float = 0.3,
     seconds: float = 0.6,
-    compression: float = 1e-2,
 ) -> Result:
     """Throw an infinite layer up so that it is pulled apart, and let it fall back.
 
@@ -157,9 +156,7 @@ def tossed_layer(
         ``highest``: the same height at its largest; ``simulated_s``, ``substeps``, ``wall_s`` and ``particles``.
     """
     settings = updated(settings)
-    solver, points, state = _layer(
-        1, settings, cells, friction_angle, volume_correction, compression, gravity=(0.0, 0.0, -GRAVITY)
-    )
+    solver, points, state = _layer(1, settings, cells, friction_angle, volume_correction, gravity=(0.0, 0.0, -GRAVITY))
     up = math.sqrt(2 * GRAVITY * rise / LENGTH) * state.position[..., 2]
     state = state.replace(velocity=torch.stack([torch.zeros_like(up), torch.zeros_like(up), up], dim=-1))
     run = follow(solver, state, seconds / FRAMES, FRAMES, lambda s: s.position[..., 2].mean())
@@ -174,7 +171,6 @@ def _layer(
     cells: int,
     friction_angle: float,
     volume_correction: bool,
-    compression: float,
     **more: Any,
 ) -> tuple[MPMSolver, MaterialPoints, MPMState]:
     """Scenes with one column of a layer on a rough floor, consolidated under its weight."""
@@ -183,7 +179,7 @@ def _layer(
         lattice(dx, (0, 0, 0), (0, 0, cells), settings).expand(scenes, -1, -1),
         volume=dx**3 / 2,
         density=DENSITY,
-        youngs_modulus=DENSITY * GRAVITY * LENGTH / compression,
+        youngs_modulus=DENSITY * GRAVITY * LENGTH / COMPRESSION,
         poisson_ratio=POISSON,
         law=Sand(friction_angle, volume_correction),
     )

@@ -17,6 +17,7 @@ from gaussian_swaying.mpm.state import MaterialPoints, MPMState
 GRAVITY, DENSITY, POISSON = 9.81, 1600.0, 0.3
 LENGTH = 0.1  # half width or radius of the column, and depth of the layer [m]
 FRAMES = 50
+COMPRESSION = 1e-2  # weight over Young's modulus
 
 
 def updated(settings: Settings | None) -> Settings:
