@@ -19,9 +19,9 @@ from lightning.pytorch.loggers import Logger, TensorBoardLogger
 from lightning.pytorch.plugins.io import CheckpointIO
 from lightning.pytorch.utilities.exceptions import MisconfigurationException
 
-import gaussian_swaying.training.data.datamodule
-import gaussian_swaying.training.data.generated_datamodule
-import gaussian_swaying.training.densification
+import gaussian_swaying.training.data.datamodule  # noqa: F401
+import gaussian_swaying.training.data.generated_datamodule  # noqa: F401
+import gaussian_swaying.training.densification  # noqa: F401
 import gaussian_swaying.training.losses  # noqa: F401
 from gaussian_swaying import _program as program
 from gaussian_swaying._files import atomic

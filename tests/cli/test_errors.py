@@ -1,7 +1,4 @@
-"""One place turns errors into a sentence and an exit code, and no stream stops a command.
-
-Covers: cli.streams.
-"""
+"""One place turns errors into a sentence and an exit code, and no stream stops a command."""
 
 import errno
 import io

@@ -1,7 +1,4 @@
-"""``gaussian-swaying fit``: the one sentence it answers bad input with.
-
-Covers: fitting.plan.
-"""
+"""``gaussian-swaying fit``: the one sentence it answers bad input with."""
 
 import pytest
 import yaml

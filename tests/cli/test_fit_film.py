@@ -1,7 +1,4 @@
-"""``gaussian-swaying fit FILM --splat SPLAT``: what it writes before the fit, what it asks for, and the result.
-
-Covers: fitting.before, fitting.page.
-"""
+"""``gaussian-swaying fit FILM --splat SPLAT``: what it writes before the fit, what it asks for, and the result."""
 
 import dataclasses
 import math

@@ -1,7 +1,4 @@
-"""``gaussian-swaying live``: what it shows, and its life from the command line.
-
-Covers: viewer.scenes.
-"""
+"""``gaussian-swaying live``: what it shows, and its life from the command line."""
 
 import os
 import signal

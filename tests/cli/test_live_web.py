@@ -1,7 +1,4 @@
-"""``gaussian-swaying export --live-web``: what it writes, and what it says.
-
-Covers: cli.scene.
-"""
+"""``gaussian-swaying export --live-web``: what it writes, and what it says."""
 
 import re
 

@@ -1,7 +1,4 @@
-"""The installed program, and configurations by name.
-
-Covers: _program, cli.shipped.
-"""
+"""The installed program, and configurations by name."""
 
 import os
 import runpy

@@ -1,7 +1,4 @@
-"""tools/preview.py: what it writes, that the configuration runs unchanged, and its answers to bad input.
-
-Covers: preview.results.
-"""
+"""tools/preview.py: what it writes, that the configuration runs unchanged, and its answers to bad input."""
 
 import dataclasses
 import json

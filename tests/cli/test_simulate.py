@@ -1,7 +1,4 @@
-"""The command line: what it accepts, and the one sentence it answers bad input with.
-
-Covers: config.parser, config.parser.
-"""
+"""The command line: what it accepts, and the one sentence it answers bad input with."""
 
 import json
 import os

@@ -1,7 +1,4 @@
-"""tools/train.py: the shipped configurations, a whole run on a CPU, and bad input.
-
-Covers: training.quiet, training.random_stream.
-"""
+"""tools/train.py: the shipped configurations, a whole run on a CPU, and bad input."""
 
 import csv
 import json
@@ -365,7 +362,7 @@ def test_bad_settings(options, words, capture, tmp_path, capsys):
     assert error.count("\n") == 1
 
 
-@pytest.mark.slow(twin="test_bad_settings")
+@pytest.mark.slow
 def test_the_tool_as_a_program(tmp_path):
     environment = {**os.environ, "PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1"}
     command = [sys.executable, str(ROOT / "tools/train.py"), "fit", "--config", str(QUICK), "--trainer.max_steps=many"]

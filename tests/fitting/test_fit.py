@@ -1,7 +1,4 @@
-"""Whole fits of a small flag: own data with noise, stopped and continued, and refused where hopeless.
-
-Covers: fitting.held_out.
-"""
+"""Whole fits of a small flag: own data with noise, stopped and continued, and refused where hopeless."""
 
 import json
 import math
@@ -157,7 +154,7 @@ def test_a_fit_that_cannot_follow_has_failed(own, tmp_path):
     assert data["motion_explained"] == result.followed
 
 
-@pytest.mark.slow(twin="test_resume_needs_the_same_plan")
+@pytest.mark.slow
 def test_stopped_and_continued(own, tmp_path):
     """A fit that is stopped after some iterations and continued ends where an undisturbed one does, bit for bit."""
     sought = [read_unknown(name, SOUGHT[name]) for name in ("wind.speed", "wind.azimuth")]

@@ -1,7 +1,4 @@
-"""Least squares on problems whose answers are known.
-
-Covers: fitting.identifiability.
-"""
+"""Least squares on problems whose answers are known."""
 
 import pytest
 import torch

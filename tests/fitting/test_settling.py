@@ -1,7 +1,4 @@
-"""A fit says whether its values have settled.
-
-Covers: fitting.report.
-"""
+"""A fit says whether its values have settled."""
 
 import json
 from dataclasses import replace
@@ -170,7 +167,7 @@ def test_the_verdict_of_a_fit(changes, verdict, words):
     assert words in result.text()
 
 
-@pytest.mark.slow(twin="test_iterations_that_ran_out_on_the_way_are_told_with_the_remedy")
+@pytest.mark.slow
 def test_a_whole_fit_tells_it_and_goes_on(own, tmp_path):
     """One iteration is not enough; the same fit with more of them continues where it stood, and settles."""
     pytest.importorskip("cv2", reason="needs the extra [fit]")

@@ -1,7 +1,4 @@
-"""Areas of patches: each alone by its formula, together against the true area of the surface.
-
-Covers: gaussians.area_triton.
-"""
+"""Areas of patches: each alone by its formula, together against the true area of the surface."""
 
 import math
 
@@ -46,7 +43,7 @@ def test_sum_is_the_area_of_a_plane_with_borders(kind, side, overlap):
     assert _sum_on_plane(_plane(kind, side), overlap) == pytest.approx(1, abs=0.03)
 
 
-@pytest.mark.slow(twin="test_sum_is_the_area_of_a_plane_with_borders")
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["regular", "random"])
 def test_sum_at_a_hundred_thousand(kind):
     assert _sum_on_plane(_plane(kind, 316)) == pytest.approx(1, abs=0.01)

@@ -184,47 +184,19 @@ def _set(place, **values):
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        (lambda d, p: d.clear(), "no primitive with `KHR_gaussian_splatting`"),
         (lambda d, p: p.pop("extensions"), "no primitive with `KHR_gaussian_splatting`"),
-        (lambda d, p: p.update(extensions=7), "no primitive with `KHR_gaussian_splatting`"),
-        (lambda d, p: p.update(extensions={KHR: 7}), "of a primitive is no table of keys"),
         (lambda d, p: p["extensions"][KHR].update(extensions={"KHR_spz": {}}), "by the extensions ['KHR_spz']"),
-        (lambda d, p: p["extensions"][KHR].update(extensions=7), "by the extensions 7"),
-        (lambda d, p: p["extensions"][KHR].update(kernel="box"), "of the kernel 'box'"),
         (lambda d, p: p["attributes"].pop("POSITION"), "no attribute `POSITION`"),
-        (lambda d, p: p["attributes"].pop(f"{KHR}:SCALE"), f"no attribute `{KHR}:SCALE`"),
-        (lambda d, p: p["attributes"].pop(f"{KHR}:OPACITY"), "`accessors` has no entry None"),
         (lambda d, p: p["attributes"].pop(f"{KHR}:SH_DEGREE_1_COEF_2"), "COEF_2`, but others up to degree 1"),
-        (lambda d, p: p["attributes"].update(POSITION=-1), "`accessors` has no entry -1"),
-        (lambda d, p: p["attributes"].update(POSITION=True), "`accessors` has no entry True"),
-        (lambda d, p: p.update(attributes=[]), "of a primitive is no table of keys"),
-        (_set("meshes 0", primitives={}), "`primitives` is no list"),
-        (_set("scenes 0", nodes=[0, 0]), "node 0 is there twice"),
-        (_set("scenes 0", nodes=[[]]), "`nodes` has no entry []"),
         (_set("nodes 0", children=[0]), "node 0 is there twice"),
-        (_set("nodes 0", children=7), "`children` is no list"),
-        (_set("nodes 0", mesh=3), "`meshes` has no entry 3"),
         (_set("nodes 0", rotation=[0, 0, 0, 0]), "`rotation` of a node is zero"),
-        (_set("nodes 0", scale=[1, 1]), "`scale` of a node is not 3 finite numbers"),
-        (_set("nodes 0", scale=["a", 1, 1]), "`scale` of a node is no list of numbers"),
         (_set("nodes 0", scale=[1, 0, 1]), "singular or infinite"),
-        (_set("nodes 0", scale=[1, 1e300, 1e300], matrix=[1e300] * 16), "singular or infinite"),
         (_set("nodes 0", scale=[1, -1, 1]), "shears or mirrors its Gaussians"),
         (_set("nodes 0", matrix=[1, 0, 0, 0, 1, 1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1]), "shears or mirrors"),
         (_set("nodes 0", scale=[1e20] * 3), "beyond ±1e+12"),
-        (_set("accessors 0", count=3), "attribute `OPACITY` is not 3 of SCALAR"),
         (_set("accessors 0", count=2**31), "announces 2,147,483,648 Gaussians, far more"),
-        (_set("accessors 0", count=1.5), "`count` is 1.5"),
-        (_set("accessors 0", count=-1), "`count` is -1"),
-        (_set("accessors 0", type="VEC4"), "attribute `POSITION` is not 2 of VEC3"),
-        (_set("accessors 0", componentType=7), "attribute `POSITION` is not 2 of VEC3"),
         (_set("accessors 0", sparse={}), "attribute `POSITION` is sparse"),
-        (_set("accessors 0", byteOffset=4), "announces 2 rows, but its buffer has"),
-        (_set("accessors 0", byteOffset=2**80), "announces 2 rows, but its buffer has"),
-        (_set("bufferViews 0", byteStride=4), "announces 2 rows, but its buffer has"),
         (_set("bufferViews 0", byteStride=2**70), "announces 2 rows, but its buffer has"),
-        (_set("bufferViews 0", byteOffset=2**33), "announces 2 rows, but its buffer has"),
-        (_set("bufferViews 0", buffer=1), "`buffers` has no entry 1"),
         (lambda d, p: d.update(accessors=[dict(a, count=0) for a in d["accessors"]]), "zero Gaussians"),
     ],
 )
@@ -233,35 +205,22 @@ def test_bad_documents(change, message, tmp_path):
     with pytest.raises(ValueError, match=r"bad\.glb") as caught:
         read_gaussians(path)
     assert message in str(caught.value)
-    assert "\n" not in str(caught.value)
 
 
-GOOD = encode_gltf(varied_cloud(2, degree=0))
-
-
-@pytest.mark.parametrize(
-    ("content", "message"),
-    [
-        (b"", "not valid JSON"),
-        (b"[]", "it is not a table of keys"),
-        (b"[" * 100_000, "nested too deeply"),
-        (b'{"scene": ' + b"9" * 50 + b"}", "a whole number of 50 digits"),
-        (b"\xff\xfe", "not valid JSON"),
-        (b"glTF", "it ends after 4 bytes"),
-        (GOOD[:100], "version 2 with"),
-        (GOOD[:4] + b"\1" + GOOD[5:], "version 1 with"),
-        (GOOD[:12] + b"\xff\xff\xff\xff" + GOOD[16:], "a part of 4,294,967,295 bytes is announced"),
-        (struct.pack("<4sII", b"glTF", 2, 20) + struct.pack("<I4s", 0, b"JSON"), "its JSON is missing"),
-        (struct.pack("<4sII", b"glTF", 2, 24) + struct.pack("<I4s", 4, b"JSON") + b"{...", "not valid JSON"),
-    ],
-)
 @pytest.mark.parametrize("name", ["bad.glb", "bad.gltf"])
-def test_bad_files(name, content, message, tmp_path):
-    (tmp_path / name).write_bytes(content)
-    with pytest.raises(ValueError, match=name.replace(".", r"\.")) as caught:
-        read_gaussians(tmp_path / name)
-    assert message in str(caught.value)
-    assert "\n" not in str(caught.value)
+def test_bad_files(name, tmp_path):
+    good = encode_gltf(varied_cloud(2, degree=0))
+    for content, message in (
+        (b"[]", "it is not a table of keys"),
+        (b'{"scene": ' + b"9" * 50 + b"}", "a whole number of 50 digits"),
+        (good[:100], "version 2 with"),
+        (good[:12] + b"\xff\xff\xff\xff" + good[16:], "a part of 4,294,967,295 bytes is announced"),
+        (struct.pack("<4sII", b"glTF", 2, 20) + struct.pack("<I4s", 0, b"JSON"), "its JSON is missing"),
+    ):
+        (tmp_path / name).write_bytes(content)
+        with pytest.raises(ValueError, match=name.replace(".", r"\.")) as caught:
+            read_gaussians(tmp_path / name)
+        assert message in str(caught.value)
 
 
 @pytest.mark.parametrize(
@@ -271,7 +230,6 @@ def test_bad_files(name, content, message, tmp_path):
         ("%2e%2e/secret.bin", "takes its data from '../secret.bin'"),
         ("/etc/hosts", "takes its data from '/etc/hosts'"),
         ("https://example.org/a.bin", "takes its data from 'https://example.org/a.bin'"),
-        ("..", "takes its data from '..'"),
         ("data:;base64,%%", "buffer 0 is not in base64"),
         ("data:;base64,AAAA", "its buffer has 3 bytes"),
         (None, "buffer 0 has no data"),

@@ -1,7 +1,4 @@
-"""The 3DGS .ply file: what is written comes back, other tools' files are understood, bad ones are explained.
-
-Covers: _ply_table, gaussians.cloud.
-"""
+"""The 3DGS .ply file: what is written comes back, other tools' files are understood, bad ones are explained."""
 
 import os
 import re
@@ -189,18 +186,9 @@ def test_directory(tmp_path):
     _assert_rejected(tmp_path, "is a directory; give the .ply file inside it")
 
 
-@pytest.mark.parametrize(
-    ("content", "words"),
-    [
-        (b"", "is not a .ply file; export the scene as .ply"),
-        (b"solid x\n", "is not a .ply file"),
-        (b"plywood", "is not a .ply file"),
-        (b"ply\nformat binary_little_endian 1.0\nelement vertex many\nend_header\n", "broken .ply header"),
-    ],
-)
-def test_not_a_ply(tmp_path, content, words):
-    (tmp_path / "bad.ply").write_bytes(content)
-    _assert_rejected(tmp_path / "bad.ply", *words.split("; "))
+def test_not_a_ply(tmp_path):
+    (tmp_path / "bad.ply").write_bytes(b"solid x\n")
+    _assert_rejected(tmp_path / "bad.ply", "is not a .ply file", "export the scene as .ply")
 
 
 @pytest.mark.parametrize(
@@ -222,11 +210,11 @@ def test_truncated(tmp_path):
     _assert_rejected(path, "is truncated", "copy or export the file again")
 
 
-@pytest.mark.parametrize("name", ["x", "f_dc_1", "opacity", "scale_2", "rot_3"])
-def test_missing_property(tmp_path, name):
-    columns = _columns()
-    del columns[name]
-    _assert_rejected(_write(tmp_path / "bad.ply", columns), f"no property `{name}`", "export it from a 3DGS tool")
+def test_missing_property(tmp_path):
+    for name in ("x", "f_dc_1", "opacity", "scale_2", "rot_3"):
+        columns = _columns()
+        del columns[name]
+        _assert_rejected(_write(tmp_path / "bad.ply", columns), f"no property `{name}`")
 
 
 def test_list_property(tmp_path):
@@ -238,13 +226,9 @@ def test_list_property(tmp_path):
     _assert_rejected(tmp_path / "bad.ply", "property `y` is a list", "one float per Gaussian")
 
 
-@pytest.mark.parametrize("count", [1, 8, 10, 72])
-def test_wrong_number_of_coefficients(tmp_path, count):
-    columns = _columns() | {f"f_rest_{i}": np.zeros(5, "f4") for i in range(count)}
-    _assert_rejected(_write(tmp_path / "bad.ply", columns), f"{count} properties `f_rest_*`", "0, 9, 24 or 45")
-
-
-def test_gap_in_the_coefficients(tmp_path):
+def test_wrong_number_of_coefficients(tmp_path):
+    columns = _columns() | {f"f_rest_{i}": np.zeros(5, "f4") for i in range(8)}
+    _assert_rejected(_write(tmp_path / "bad.ply", columns), "8 properties `f_rest_*`", "0, 9, 24 or 45")
     columns = _columns(1)
     columns["f_rest_9"] = columns.pop("f_rest_4")
     _assert_rejected(_write(tmp_path / "bad.ply", columns), "no property `f_rest_4`", "export it again")
@@ -255,8 +239,9 @@ SIZE = "gives a size of zero or infinity for 1 of 5 Gaussians, first at index 1"
 BAD = [
     *(
         (name, [2, 4], value, f"`{name}` is NaN or infinite for 2 of 5 Gaussians, first at index 2", "remove them")
-        for name in ("z", "nx", "f_dc_2", "f_rest_7", "scale_1", "rot_2")
-        for value in (np.nan, np.inf, -np.inf)
+        for name, value in zip(
+            ("z", "nx", "f_dc_2", "f_rest_7", "scale_1", "rot_2"), 2 * (np.nan, np.inf, -np.inf), strict=True
+        )
     ),
     ("opacity", [3], np.nan, "property `opacity` is NaN for 1 of 5 Gaussians, first at index 3", "remove them"),
     ("y", [1], 1e300, "property `y` is NaN or infinite for 1 of 5", "remove them"),
@@ -268,13 +253,13 @@ BAD = [
 ]
 
 
-@pytest.mark.parametrize(("names", "places", "value", "words", "remedy"), BAD)
-def test_bad_values(tmp_path, names, places, value, words, remedy):
+def test_bad_values(tmp_path):
     """Of doubles, one of which is beyond float32."""
-    columns = {name: column.astype("f8") for name, column in _columns(1).items()}
-    for name in names.split():
-        columns[name][places] = value
-    _assert_rejected(_write(tmp_path / "bad.ply", columns), words, remedy)
+    for names, places, value, words, remedy in BAD:
+        columns = {name: column.astype("f8") for name, column in _columns(1).items()}
+        for name in names.split():
+            columns[name][places] = value
+        _assert_rejected(_write(tmp_path / "bad.ply", columns), words, remedy)
 
 
 def test_write_needs_gaussians_and_a_folder(tmp_path):
@@ -299,28 +284,14 @@ def test_cloud_selects_and_moves(device, dtype):
         cloud.select(mask[:3])
 
 
-@pytest.mark.parametrize(
-    ("field", "shape"),
-    [
-        ("means", (7, 2)),
-        ("means", (1, 7, 3)),
-        ("quats", (7, 3)),
-        ("scales", (6, 3)),
-        ("opacities", (7, 1)),
-        ("sh", (7, 3)),
-        ("normals", (3,)),
-    ],
-)
-def test_cloud_rejects_wrong_shape(field, shape):
+def test_cloud_rejects_wrong_shape():
     cloud = varied_cloud(7, 3)
-    tensors = {name: getattr(cloud, name) for name in FIELDS} | {field: torch.zeros(shape)}
-    with pytest.raises(ValueError, match=rf"Expected `{field}` (of shape|to have)"):
-        GaussianCloud(**tensors)
-
-
-def test_cloud_rejects_other_degrees():
-    cloud = varied_cloud(7, 3)
-    with pytest.raises(ValueError, match="Expected `sh` to have 1, 4, 9 or 16 coefficients, but got 5"):
+    shapes = {"means": (7, 2), "quats": (7, 3), "scales": (6, 3), "opacities": (7, 1), "sh": (7, 3), "normals": (3,)}
+    for field, shape in shapes.items():
+        tensors = {name: getattr(cloud, name) for name in FIELDS} | {field: torch.zeros(shape)}
+        with pytest.raises(ValueError, match=f"`{field}`"):
+            GaussianCloud(**tensors)
+    with pytest.raises(ValueError, match="`sh` to have 1, 4, 9 or 16 coefficients, but got 5"):
         GaussianCloud(cloud.means, cloud.quats, cloud.scales, cloud.opacities, torch.zeros(7, 5, 3))
 
 
@@ -331,30 +302,21 @@ def _header(*lines, data=b""):
     return "\n".join(("ply", "format binary_little_endian 1.0", *lines, "end_header", "")).encode() + data
 
 
-@pytest.mark.parametrize(
-    ("lines", "words"),
-    [
-        (["element vertex 4000000000", "property list uchar float x"], "is truncated"),
-        (["element vertex 4", "property list uchar float x"], "property `x` is a list"),
-        (["element face 3", "property list uchar int at", "element vertex 1", "property float x"], "`at` is a list"),
-        (["element vertex -200", "property float x"], "'element vertex -200'"),
-        (["element vertex 9223372036854775808", "property float x"], "broken .ply header"),
-        (["element vertex 999999999999999999", "property float x"], "is truncated"),
-        (["element vertex 1", "property quad x"], "'property quad x'"),
-        (["element vertex 1", "property float x", "property float x"], "a property twice"),
-        (["property float x"], "'property float x'"),
-        (["element face 1", "property float x"], "no element `vertex`"),
-        (["comment " + "long " * 20_000], "no `end_header`"),
-    ],
-)
-def test_a_header_that_lies_is_refused_before_the_data(lines, words, tmp_path):
+def test_a_header_that_lies_is_refused_before_the_data(tmp_path):
     """A hundred bytes that announce terabytes take no memory."""
     import resource
 
     path = tmp_path / "bad.ply"
-    path.write_bytes(_header(*lines, data=b"\x01" * 20))
     before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-    _assert_rejected(path, words)
+    for words, *lines in (
+        ("is truncated", "element vertex 999999999999999999", "property float x"),
+        ("property `x` is a list", "element vertex 4", "property list uchar float x"),
+        ("'element vertex -200'", "element vertex -200", "property float x"),
+        ("a property twice", "element vertex 1", "property float x", "property float x"),
+        ("no `end_header`", "comment " + "long " * 20_000),
+    ):
+        path.write_bytes(_header(*lines, data=b"\x01" * 20))
+        _assert_rejected(path, words)
     assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before < 50_000  # KiB
 
 

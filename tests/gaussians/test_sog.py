@@ -153,23 +153,15 @@ def _leaf(meta):
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        (lambda m: m.update(lodLevels="2"), "`lodLevels` or `filenames`"),
-        (lambda m: m.update(filenames=7), "`lodLevels` or `filenames`"),
         (lambda m: m.pop("tree"), "a part of its `tree` is not"),
-        (lambda m: m["tree"].update(children=7), "a part of its `tree` is not"),
-        (lambda m: m["tree"].update(lods=[]), "a part of its `tree` is not"),
         (lambda m: m["tree"].update(children=[]), "zero Gaussians at level 0"),
-        (lambda m: _leaf(m).update(file=3), "no range of Gaussians at level 0"),
         (lambda m: _leaf(m).update(count=-1), "no range of Gaussians at level 0"),
-        (lambda m: _leaf(m).update(count=None), "no range of Gaussians at level 0"),
-        (lambda m: m["tree"].update(lods={"0": 7}), "no range of Gaussians at level 0"),
         (lambda m: _leaf(m).update(count=15), "`tree` wants more Gaussians than"),
         (lambda m: _leaf(m).update(offset=19), "`tree` wants Gaussian 30 of the 20 in"),
         (lambda m: m.update(filenames=["../x/meta.json"] * 3), "names the file '../x/meta.json'; put all files"),
         (lambda m: m.update(filenames=["/meta.json"] * 3), "names the file '/meta.json'"),
         (lambda m: m.update(filenames=["http://a/b"] * 3), "names the file 'http://a/b'"),
         (lambda m: m.update(filenames=["C:\\b"] * 3), "names the file"),
-        (lambda m: m.update(filenames=[7] * 3), "names the file '7'"),
         (lambda m: m.update(filenames=["lod-meta.json"] * 3), "is SOG of version 1"),
     ],
 )
@@ -208,68 +200,25 @@ def _set(place, value):
     return change
 
 
-@pytest.mark.parametrize(
-    ("change", "message"),
-    [
-        (lambda f: f.pop("meta.json"), "it has no file `meta.json`"),
+def test_bad_files(tmp_path):
+    for change, message in (
         (lambda f: f.pop("quats.webp"), "it has no file `quats.webp`"),
-        (lambda f: f.update({"meta.json": b"{"}), "not valid JSON"),
-        (lambda f: f.update({"meta.json": b"[]"}), "is SOG of version unknown"),
         (_set("version", 1), "is SOG of version 1, not 2; convert it"),
-        (_set("count", 0), "`count` is 0"),
-        (_set("count", 2.5), "`count` is 2.5"),
         (_set("count", 10**9), "announces 1,000,000,000 Gaussians, far more than its"),
         (_set("count", 40), "has 4 x 4 pixels, but holds 40 values"),
-        (_set("means files", ["means_l.webp"]), "`means` does not name 2 files"),
-        (_set("quats files", "quats.webp"), "`quats` does not name 1 files"),
-        (_set("sh0", None), "`sh0` does not name 1 files"),
-        (_set("means mins", [0, 0]), "`mins` is not a list of 3 to 3 finite numbers"),
-        (_set("means maxs", [0, 0, math.nan]), "`maxs` is not a list of 3 to 3 finite numbers"),
-        (_set("means maxs", [1e3, 0, 0]), "`means` is NaN or infinite for"),
         (_set("means maxs", [30, 0, 0]), "beyond ±1e+12 for"),
         (_set("scales codebook", [1.0]), "of a code book of 1"),
-        (_set("scales codebook", [1.0] * 257), "`codebook` is not a list of 1 to 256 finite numbers"),
-        (_set("scales codebook", [True] * 256), "`codebook` is not a list"),
         (_set("scales codebook", [1e4] * 256), "gives a size of zero or infinity"),
-        (_set("shN bands", 4), "`shN` has 16 sets of 4 bands"),
         (_set("shN count", 70000), "`shN` has 70000 sets of 3 bands"),
-        (_set("shN count", 3), "of 3"),
-        (_set("shN bands", 2), "960 x 1 pixels"),
         (lambda f: f.update({"quats.webp": b"RIFF"}), "`quats.webp` is not a WebP picture"),
-        (lambda f: f.update({"quats.webp": f["quats.webp"][:60]}), "`quats.webp` is not a WebP picture"),
         (lambda f: f.update({"quats.webp": _picture(4, 4)}), "a pixel of `quats` does not say"),
-        (lambda f: f.update({"quats.webp": _picture(600, 600)}), "has 600 x 600 pixels, but holds 16 values"),
-    ],
-)
-@pytest.mark.parametrize("kind", ["bad.sog", "meta.json"])
-def test_bad_files(kind, change, message, tmp_path):
-    files = _files(FILES / "scene.sog")
-    change(files)
-    if kind == "meta.json":
-        _unpacked(tmp_path, files)
-    else:
-        _packed(tmp_path / kind, files)
-    with pytest.raises((ValueError, FileNotFoundError)) as caught:
-        read_gaussians(tmp_path / kind)
-    told = str(caught.value)
-    if "no file" in message and kind == "meta.json":
-        assert "no such file" in told or "does not exist" in told
-    else:
-        assert kind in told
-        assert message in told
-    assert "\n" not in told
-
-
-def test_bad_bundles(tmp_path):
-    good = (FILES / "scene.sog").read_bytes()
-    start = good.rindex(b"PK\5\6") + 16  # of the list of files, as the end of a zip file tells
-    moved = good[:start] + b"\xff\xff\0\0" + good[start + 4 :]
-    unnamed = good.replace(b"quats", b"qu\xffts")  # names are in UTF-8
-    broken = [good[:-30], good[: len(good) // 2], good.replace(b"RIFF", b"RAFF"), moved, unnamed]
-    for content in (b"", b"PK", *broken):
-        (tmp_path / "bad.sog").write_bytes(content)
-        with pytest.raises(ValueError, match=r"bad\.sog is not a usable SOG file \(.*\); export it again"):
-            read_gaussians(tmp_path / "bad.sog")
+    ):
+        files = _files(FILES / "scene.sog")
+        change(files)
+        for path in (_packed(tmp_path / "bad.sog", files), _unpacked(tmp_path, files)):
+            with pytest.raises((ValueError, FileNotFoundError)) as caught:
+                read_gaussians(path)
+            assert message in str(caught.value) or "no file" in message
 
 
 def test_nothing_swells(tmp_path):

@@ -30,13 +30,6 @@ def test_every_page_is_linked_and_every_link_leads_somewhere():
         assert any(page.name in text for other, text in texts.items() if other != page), f"{page.name} is not linked"
 
 
-def test_the_moving_picture_is_small():
-    picture = ROOT / "docs/pictures/swaying.webp"
-    assert picture.stat().st_size <= 2_000_000
-    image = pytest.importorskip("PIL.Image").open(picture)
-    assert image.n_frames > 20
-
-
 def test_the_package_index_gets_no_link_to_a_file_beside_the_readme():
     """The substitutions of pyproject.toml, which the build applies to the README of the package."""
     project = pytest.importorskip("tomllib").loads((ROOT / "pyproject.toml").read_text())

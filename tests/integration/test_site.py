@@ -69,20 +69,21 @@ def test_pages_ask_no_other_site(site):
         assert [html.unescape(url) for url in asked if "canonical" not in url] == [], path
 
 
-@pytest.mark.parametrize("name", NAMES)
-def test_a_public_name_is_described(name):
+def test_every_public_name_is_described():
     """A summary, and each argument of its own; those of a base class are described there."""
-    found = getattr(importlib.import_module(NAMES[name]), name)
-    text = inspect.getdoc(found) or ""
-    assert len(text.splitlines()[0]) > 10
-    assert getattr(gaussian_swaying, name) is found
-    if inspect.isclass(found) and "__init__" not in vars(found):
-        return
-    if inspect.isclass(found):
-        text = "\n".join(inspect.getdoc(base) or "" for base in found.__mro__)
-    arguments = inspect.signature(found.__init__ if inspect.isclass(found) else found).parameters
-    own = [name for name in arguments if name not in ("self", "args", "kwargs") and not name.startswith("_")]
-    missing = [name for name in own if not re.search(rf"^\s+\*{{0,2}}{name}: ", text, re.MULTILINE)]
+    missing = []
+    for name, home in NAMES.items():
+        found = getattr(importlib.import_module(home), name)
+        text = inspect.getdoc(found) or ""
+        assert len(text.splitlines()[0]) > 10, name
+        assert getattr(gaussian_swaying, name) is found
+        if inspect.isclass(found):
+            if "__init__" not in vars(found):
+                continue
+            text = "\n".join(inspect.getdoc(base) or "" for base in found.__mro__)
+        arguments = inspect.signature(found.__init__ if inspect.isclass(found) else found).parameters
+        own = [one for one in arguments if one not in ("self", "args", "kwargs") and not one.startswith("_")]
+        missing += [f"{name}.{one}" for one in own if not re.search(rf"^\s+\*{{0,2}}{one}: ", text, re.MULTILINE)]
     assert missing == [], "the docstring has no line for these in `Args:`"
 
 

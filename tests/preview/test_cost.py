@@ -185,7 +185,7 @@ def vase(device):
     )
 
 
-@pytest.mark.slow(twin="test_a_run_takes_as_many_substeps_as_it_has_frames_after_the_first")
+@pytest.mark.slow
 @pytest.mark.parametrize("make", [flag, vase])
 def test_the_estimate_is_within_a_factor_of_two_of_the_run(make, tmp_path):
     """By the processor's time, on one thread; without what other programs take of it. The median of three estimates."""

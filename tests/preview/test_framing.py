@@ -1,7 +1,4 @@
-"""Cameras that show the whole object, and coordinates on the preview's box.
-
-Covers: preview.ticks.
-"""
+"""Cameras that show the whole object, and coordinates on the preview's box."""
 
 import math
 

@@ -1,7 +1,4 @@
-"""Whether things stand or hang, on stand-ins made of a few tubes, balls and plates: surfaces only, z up.
-
-Covers: preview.report.
-"""
+"""Whether things stand or hang, on stand-ins made of a few tubes, balls and plates: surfaces only, z up."""
 
 import argparse
 import dataclasses

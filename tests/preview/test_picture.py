@@ -1,7 +1,4 @@
-"""What a preview draws, writes as a configuration, and expects of the cost.
-
-Covers: simulation.roles.
-"""
+"""What a preview draws, writes as a configuration, and expects of the cost."""
 
 import json
 import math

@@ -1,7 +1,4 @@
-"""Guesses about a splat, against scenes whose up axis, floor, object, pins and spacing are known.
-
-Covers: preview.shape, preview.starter.
-"""
+"""Guesses about a splat, against scenes whose up axis, floor, object, pins and spacing are known."""
 
 import dataclasses
 import itertools

@@ -1,7 +1,4 @@
-"""A checkpoint that is not what the run wrote is refused in one sentence, whatever has happened to it.
-
-Covers: runs.seal.
-"""
+"""A checkpoint that is not what the run wrote is refused in one sentence, whatever has happened to it."""
 
 import copy
 import io

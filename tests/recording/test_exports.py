@@ -1,7 +1,4 @@
-"""Formats in which a run leaves its Gaussians.
-
-Covers: recording.writer.
-"""
+"""Formats in which a run leaves its Gaussians."""
 
 import re
 from dataclasses import replace

@@ -1,7 +1,4 @@
-"""What a run leaves on disk, and what it leaves when something breaks.
-
-Covers: _provenance, recording.trajectory.
-"""
+"""What a run leaves on disk, and what it leaves when something breaks."""
 
 import csv
 import gc

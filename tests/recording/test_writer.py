@@ -1,7 +1,4 @@
-"""Jobs in the background: their order, their bound, what a failure leaves, and copies that do not wait for a GPU.
-
-Covers: .
-"""
+"""Jobs in the background: their order, their bound, what a failure leaves, and copies that do not wait for a GPU."""
 
 import os
 import signal

@@ -1,7 +1,4 @@
-"""Cameras against hand-computed geometry.
-
-Covers: rendering.cameras.camera.
-"""
+"""Cameras against hand-computed geometry."""
 
 import dataclasses
 import math

@@ -1,7 +1,4 @@
-"""The camera of each frame of a run.
-
-Covers: rendering.cameras.camera_path.
-"""
+"""The camera of each frame of a run."""
 
 import math
 

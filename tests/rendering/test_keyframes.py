@@ -1,7 +1,4 @@
-"""Camera paths given by keys.
-
-Covers: rendering.cameras.keyframes.
-"""
+"""Camera paths given by keys."""
 
 import math
 from itertools import pairwise

@@ -1,7 +1,4 @@
-"""The renderer in kernels against the torch renderer in float64, which is its definition.
-
-Covers: rendering.raster.
-"""
+"""The renderer in kernels against the torch renderer in float64, which is its definition."""
 
 import math
 

@@ -1,7 +1,4 @@
-"""The torch renderer against a loop over pixels and Gaussians written from the equations.
-
-Covers: rendering.protocol.
-"""
+"""The torch renderer against a loop over pixels and Gaussians written from the equations."""
 
 import math
 

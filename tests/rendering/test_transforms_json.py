@@ -1,7 +1,4 @@
-"""Cameras of a transforms.json.
-
-Covers: rendering.cameras.transforms_json.
-"""
+"""Cameras of a transforms.json."""
 
 import json
 import math

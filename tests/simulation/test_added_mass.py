@@ -1,7 +1,4 @@
-"""Air that a sheet carries along: inertia without weight in everything that a stepper does.
-
-Covers: aero.added_mass.
-"""
+"""Air that a sheet carries along: inertia without weight in everything that a stepper does."""
 
 import math
 from dataclasses import replace

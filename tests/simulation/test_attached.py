@@ -1,7 +1,4 @@
-"""Scenes in which only what is connected along its surface shares nodes.
-
-Covers: preview.apart.
-"""
+"""Scenes in which only what is connected along its surface shares nodes."""
 
 import dataclasses
 import types

@@ -1,7 +1,4 @@
-"""Contact and obstacles in the front door and in a configuration.
-
-Covers: scenes.cloths, simulation.touching, viewer.changes.
-"""
+"""Contact and obstacles in the front door and in a configuration."""
 
 import dataclasses
 import warnings

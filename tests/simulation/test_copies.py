@@ -1,7 +1,4 @@
-"""One object, many copies: each as a simulation of its own in its own wind, drawn from one splat.
-
-Covers: simulation.copies_painter.
-"""
+"""One object, many copies: each as a simulation of its own in its own wind, drawn from one splat."""
 
 import math
 import re

@@ -1,7 +1,4 @@
-"""Simulation as users meet it in Python and in a YAML: short forms, frames, what is given twice, custom forces.
-
-Covers: _turns, config.parser, simulation.defaults, simulation.material, simulation.run.
-"""
+"""Simulation as users meet it in Python and in a YAML: short forms, frames, what is given twice, custom forces."""
 
 import copy
 import dataclasses

@@ -1,7 +1,4 @@
-"""``scene.area: open``: what wind and mass of a capture are, and how it is turned off.
-
-Covers: preview.report.
-"""
+"""``scene.area: open``: what wind and mass of a capture are, and how it is turned off."""
 
 import math
 from pathlib import Path

@@ -1,7 +1,4 @@
-"""The configurations of the paper's scenes: its numbers, and their presets.
-
-Covers: .
-"""
+"""The configurations of the paper's scenes: its numbers, and their presets."""
 
 from pathlib import Path
 

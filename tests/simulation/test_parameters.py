@@ -1,7 +1,4 @@
-"""Parameters: each is read and written in one place, and a number of a user's own force is one line away from all uses.
-
-Covers: simulation.parameters.
-"""
+"""Parameters: each is read and written in one place, a number of a user's own force too."""
 
 import json
 import math

@@ -1,7 +1,4 @@
-"""``scene.points: grid``: as many points as the grid can use, and all Gaussians follow its nodes.
-
-Covers: mpm.followers_triton.
-"""
+"""``scene.points: grid``: as many points as the grid can use, and all Gaussians follow its nodes."""
 
 import dataclasses
 import math

@@ -1,7 +1,4 @@
-"""What a run shows: frames, progress within one that is slow, and why it is.
-
-Covers: simulation.painter, simulation.stepper.
-"""
+"""What a run shows: frames, progress within one that is slow, and why it is."""
 
 from pathlib import Path
 

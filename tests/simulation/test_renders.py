@@ -1,7 +1,4 @@
-"""Several cameras and several renders in one run.
-
-Covers: recording.layout.
-"""
+"""Several cameras and several renders in one run."""
 
 import imageio.v3 as iio
 import numpy as np

@@ -1,7 +1,4 @@
-"""The Gaussians that move, their weight, and how they follow the material.
-
-Covers: simulation.body, simulation.simulated_scene.
-"""
+"""The Gaussians that move, their weight, and how they follow the material."""
 
 import dataclasses
 import math

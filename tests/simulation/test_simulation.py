@@ -1,7 +1,4 @@
-"""Frames from components: substeps, wind, cameras, colours and pictures.
-
-Covers: simulation.frame.
-"""
+"""Frames from components: substeps, wind, cameras, colours and pictures."""
 
 import copy
 import dataclasses

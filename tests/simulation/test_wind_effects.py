@@ -1,7 +1,4 @@
-"""Winds with effects in a simulation: places in scene units, shelter in every frame, resuming, and the YAML.
-
-Covers: simulation.stepper.
-"""
+"""Winds with effects in a simulation: places in scene units, shelter in every frame, resuming, and the YAML."""
 
 import warnings
 

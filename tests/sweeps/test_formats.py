@@ -1,7 +1,4 @@
-"""The table as Parquet, and the runs as WebDataset shards, read back.
-
-Covers: sweeps.record, sweeps.shards.
-"""
+"""The table as Parquet, and the runs as WebDataset shards, read back."""
 
 import csv
 import io

@@ -1,7 +1,4 @@
-"""A sweep in parts, as in a SLURM array, and what decides how many jobs share a GPU.
-
-Covers: sweeps.backend, sweeps.pool.
-"""
+"""A sweep in parts, as in a SLURM array, and what decides how many jobs share a GPU."""
 
 import multiprocessing
 from concurrent.futures import ProcessPoolExecutor
@@ -13,7 +10,7 @@ from gaussian_swaying.sweeps.backend import Job, Outcome, drive
 from gaussian_swaying.sweeps.pool import Pool
 
 
-@pytest.mark.slow(twin="test_a_part_continues_and_the_last_one_finishes")
+@pytest.mark.slow
 def test_two_parts_at_the_same_time(undisturbed, tmp_path, sweep_file):
     """Both begin at once in a new folder; the one that ends last writes the table."""
     file, folder = sweep_file(tmp_path / "tiny.yaml"), tmp_path / "out"

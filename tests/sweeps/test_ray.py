@@ -1,7 +1,4 @@
-"""Sweeps on Ray: a local cluster of two nodes on one machine.
-
-Covers: sweeps.ray_backend.
-"""
+"""Sweeps on Ray: a local cluster of two nodes on one machine."""
 
 import csv
 import json

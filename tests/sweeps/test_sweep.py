@@ -1,7 +1,4 @@
-"""Whole sweeps with worker processes: disturbed ones end as undisturbed ones, and failures stop nothing.
-
-Covers: sweeps.contact_sheet, sweeps.worker.
-"""
+"""Whole sweeps with worker processes: disturbed ones end as undisturbed ones, and failures stop nothing."""
 
 import csv
 import errno
@@ -164,7 +161,7 @@ def test_killed_workers_change_nothing(undisturbed, tmp_path, sweep_file):
         _same_motion(undisturbed, tmp_path / "out", f"{number:05d}")
 
 
-@pytest.mark.slow(twin="test_killed_workers_change_nothing")
+@pytest.mark.slow
 @pytest.mark.timeout(1800)
 def test_forty_runs_and_five_killed_workers(tmp_path, sweep_file):
     file = sweep_file(tmp_path / "tiny.yaml", draws=10)
@@ -175,7 +172,7 @@ def test_forty_runs_and_five_killed_workers(tmp_path, sweep_file):
     assert (tmp_path / "out/sweep.csv").read_bytes() == (tmp_path / "whole/sweep.csv").read_bytes()
 
 
-@pytest.mark.slow(twin="test_a_stopped_sweep_ends_in_order")
+@pytest.mark.slow
 def test_a_killed_driver_loses_only_what_was_running(undisturbed, tmp_path, sweep_file, capsys):
     file, folder = sweep_file(tmp_path / "tiny.yaml"), tmp_path / "out"
     driver = _start(file, folder, "--device", "cpu")

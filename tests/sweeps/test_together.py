@@ -1,7 +1,4 @@
-"""Runs that are simulated together: as if each were alone, and done one by one where that fails.
-
-Covers: simulation.batch.
-"""
+"""Runs that are simulated together: as if each were alone, and done one by one where that fails."""
 
 import csv
 import json

@@ -1,7 +1,4 @@
-"""Trainings that learn, stop when something is not finite, and continue exactly.
-
-Covers: training.finite, training.optimizers.
-"""
+"""Trainings that learn, stop when something is not finite, and continue exactly."""
 
 import math
 import os

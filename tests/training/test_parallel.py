@@ -1,7 +1,4 @@
-"""Training on several devices: the images are shared, the gradients averaged, and there is one splat.
-
-Covers: training.data.datamodule, training.strategy.
-"""
+"""Training on several devices: the images are shared, the gradients averaged, and there is one splat."""
 
 import csv
 import os
@@ -148,7 +145,7 @@ def _train(folder, capture, *more):
     return subprocess.run(command, capture_output=True, text=True, timeout=800, cwd=folder.parent)
 
 
-@pytest.mark.slow(twin="test_gradients_are_averaged")
+@pytest.mark.slow
 @pytest.mark.timeout(1800)
 def test_two_processes_make_one_splat(tmp_path):
     """The quick training on one and two processes: as many images, half the steps, about the same picture."""

@@ -1,7 +1,4 @@
-"""Losses of the surface on views whose surface is known.
-
-Covers: captures.capture.
-"""
+"""Losses of the surface on views whose surface is known."""
 
 import math
 from functools import cache

@@ -1,7 +1,4 @@
-"""Who may open the live page.
-
-Covers: .
-"""
+"""Who may open the live page."""
 
 import contextlib
 import socket
@@ -130,7 +127,7 @@ def test_the_link_works_in_a_browser(browser, open_page):
     context.close()
 
 
-@pytest.mark.slow(twin="test_the_page_is_shown_in_no_frame")
+@pytest.mark.slow
 def test_a_link_cannot_lead_the_page_to_another_server(browser, page, until):
     """viser connects to the address after `?websocket=`, and does what that server says; the page forbids it."""
     asked, stop = [], threading.Event()

@@ -1,7 +1,4 @@
-"""The live page, in a real browser where there is one.
-
-Covers: viewer.controls, viewer.holding, viewer.screen.
-"""
+"""The live page, in a real browser where there is one."""
 
 import threading
 import time
@@ -94,7 +91,7 @@ def test_the_page_moves_pauses_and_steps(page, window, until):
     assert window.problems == []
 
 
-@pytest.mark.slow(twin="test_a_value_out_of_range_gets_a_sentence")
+@pytest.mark.slow
 def test_controls_change_the_wind_and_say_what_is_wrong(page, window, until):
     session = page.session
     before = session.simulation.wind.flows.clone()
@@ -111,7 +108,7 @@ def test_controls_change_the_wind_and_say_what_is_wrong(page, window, until):
     until(lambda: session.snapshot.health.time > 0.1 and not session.broken)
 
 
-@pytest.mark.slow(twin="test_streaks_of_air_are_those_of_the_render")
+@pytest.mark.slow
 def test_streaks_of_air_are_drawn_where_they_are_wanted(page, window, until, monkeypatch):
     """What a picture with them looks like is tested in test_pictures.py."""
     drawn = []
@@ -125,7 +122,7 @@ def test_streaks_of_air_are_drawn_where_they_are_wanted(page, window, until, mon
     assert window.problems == []
 
 
-@pytest.mark.slow(twin="test_a_film_is_as_long_as_the_simulated_time")
+@pytest.mark.slow
 def test_a_video_and_the_configuration_come_out(page, window, until, tmp_path):
     iio = pytest.importorskip("imageio.v3")
     window.get_by_role("button", name="Record a video").click()
@@ -144,7 +141,7 @@ def test_a_video_and_the_configuration_come_out(page, window, until, tmp_path):
     assert yaml.safe_load(file.read_text())["solver"]["dx"] == 0.1
 
 
-@pytest.mark.slow(twin="test_a_film_ends_at_its_greatest_length")
+@pytest.mark.slow
 def test_a_video_that_is_full_is_saved_and_the_page_says_so(page, window, monkeypatch):
     monkeypatch.setattr("gaussian_swaying.viewer.film_strip.LONGEST", 0.5)
     with window.expect_download(timeout=240_000):
@@ -154,7 +151,7 @@ def test_a_video_that_is_full_is_saved_and_the_page_says_so(page, window, monkey
     assert page.recording is None
 
 
-@pytest.mark.slow(twin="test_many_clients_at_once_are_served_in_turn")
+@pytest.mark.slow
 def test_two_browsers_see_the_same_scene_and_closing_one_ends_nothing(page, window, browser, until):
     second = browser.new_context(viewport={"width": 500, "height": 700})
     other = second.new_page()
@@ -169,7 +166,7 @@ def test_two_browsers_see_the_same_scene_and_closing_one_ends_nothing(page, wind
     assert page.session.problem is None
 
 
-@pytest.mark.slow(twin="test_a_splat_that_is_loaded_tells_how_far_it_is")
+@pytest.mark.slow
 def test_another_splat_is_loaded_from_the_page(page, window, until, tmp_path):
     path = tmp_path / "../flag.ply"
     write_ply(path, FlagScene(width=0.6, height=0.6, spacing=0.05).generate())
@@ -185,7 +182,7 @@ def test_another_splat_is_loaded_from_the_page(page, window, until, tmp_path):
     assert page.session.simulation.scene.source is not None  # the scene stays
 
 
-@pytest.mark.slow(twin="test_a_pull_moves_what_it_holds_and_lets_go")
+@pytest.mark.slow
 def test_a_click_takes_hold_of_the_flag(page, window, until):
     """Where it is clicked; the handle appears there, and lets go."""
     session, holding = page.session, page.controls.holding
@@ -230,7 +227,7 @@ def test_a_client_that_reads_slowly_slows_nobody(page, connect, until):
     until(lambda: page.session.snapshot.number > number + 2)
 
 
-@pytest.mark.slow(twin="test_a_client_that_reads_slowly_slows_nobody")
+@pytest.mark.slow
 @pytest.mark.timeout(900)
 def test_memory_does_not_grow_in_ten_minutes(page, connect):
     """Measured after a minute, when everything has been used once."""

@@ -135,7 +135,7 @@ def _is_tinted(now, before):
     return np.abs(now - (0.3 * before + 0.7 * np.array(TINTS["held"]))).max() < 40 < np.abs(now - before).max()
 
 
-@pytest.mark.slow(twin="test_a_double_click_takes_what_hangs_together")
+@pytest.mark.slow
 def test_a_double_click_takes_what_is_connected_and_shift_turns_the_view(page, window, until):
     session, painting = page.session, page.controls.painting
     _begin(page, window, until)
@@ -154,7 +154,7 @@ def test_a_double_click_takes_what_is_connected_and_shift_turns_the_view(page, w
     assert window.problems == []
 
 
-@pytest.mark.slow(twin="test_a_stroke_is_seen_undone_saved_and_applied")
+@pytest.mark.slow
 def test_a_browser_for_which_the_server_draws_paints_as_well(page, window, until):
     page.largest = 1000
     window.evaluate("wind.fail('of a test')")

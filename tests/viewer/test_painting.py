@@ -1,7 +1,4 @@
-"""Parts that are painted on the live page, as a browser asks for them without a browser.
-
-Covers: viewer.brushes, viewer.painting.
-"""
+"""Parts that are painted on the live page, as a browser asks for them without a browser."""
 
 import json
 

@@ -1,7 +1,4 @@
-"""The panel of the live page: what its controls show and do, asked by a client and read from the session.
-
-Covers: viewer.controls, viewer.files, viewer.gusts.
-"""
+"""The panel of the live page: what its controls show and do, asked by a client and read from the session."""
 
 import math
 import uuid

@@ -1,7 +1,4 @@
-"""Pictures from the camera of a browser, picking, and their size.
-
-Covers: viewer.controls, viewer.film_strip.
-"""
+"""Pictures from the camera of a browser, picking, and their size."""
 
 import math
 

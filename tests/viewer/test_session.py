@@ -1,7 +1,4 @@
-"""A simulation that goes on in a thread, and is changed there.
-
-Covers: viewer.pull.
-"""
+"""A simulation that goes on in a thread, and is changed there."""
 
 import dataclasses
 import math

@@ -1,10 +1,4 @@
-"""PhysGaussian's configurations against what its code does with them.
-
-Covers: cli.convert, interop.physgaussian.boundaries, interop.physgaussian.camera,
-interop.physgaussian.convert, interop.physgaussian.fields, interop.physgaussian.convert,
-interop.physgaussian.materials, interop.physgaussian.fields, interop.physgaussian.space, interop.physgaussian.convert,
-simulation.normalisation.
-"""
+"""PhysGaussian's configurations against what its code does with them."""
 
 import copy
 import json

@@ -179,7 +179,7 @@ def test_a_film_that_is_cut_short_says_so(show, large, tmp_path):
             page.wait_for_function("film.drawn() > 3")
 
 
-@pytest.mark.slow(twin="test_the_film_is_the_run")
+@pytest.mark.slow
 def test_controls_at_the_size_of_a_phone(show, film):
     """Slider, button and a drag; everything lies within the window."""
     page = show(film, 390, 844)

@@ -1,7 +1,4 @@
-"""What a film holds, against the Gaussians of the run; what is recorded for it; what cannot become a film.
-
-Covers: recording.nodes, viewer.film.page, viewer.film.recorded.
-"""
+"""What a film holds, against the Gaussians of the run; what is recorded for it; what cannot become a film."""
 
 import base64
 import hashlib

@@ -1,7 +1,4 @@
-"""The page without a server in a real browser: what it shows, what the visitor does, and damaged files.
-
-Covers: viewer.live_web.page.
-"""
+"""The page without a server in a real browser: what it shows, what the visitor does, and damaged files."""
 
 import re
 import time

@@ -1,7 +1,4 @@
-"""The solver in compute shaders, on an adapter in software, against the package's own run.
-
-Covers: viewer.live_web.block.
-"""
+"""The solver in compute shaders, on an adapter in software, against the package's own run."""
 
 import base64
 import time
