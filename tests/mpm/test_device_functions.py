@@ -11,22 +11,14 @@ import math
 
 import pytest
 import torch
+from catalogue import ELASTIC, PLASTIC
 
 from gaussian_swaying.geometry import linalg
 from gaussian_swaying.geometry.linalg_triton import polar_rotation, svd3
 from gaussian_swaying.kernels.language import tl, triton
 from gaussian_swaying.kernels.launch import lanes, launch
-from gaussian_swaying.mpm import laws
-from gaussian_swaying.mpm.laws.fixed_corotated import FixedCorotated
-from gaussian_swaying.mpm.laws.fluid import Fluid
-from gaussian_swaying.mpm.laws.foam import Foam
-from gaussian_swaying.mpm.laws.hencky import StVKHencky
-from gaussian_swaying.mpm.laws.metal import Metal
+from gaussian_swaying.mpm.laws import LAWS as KINDS
 from gaussian_swaying.mpm.laws.neo_hookean import NeoHookean
-from gaussian_swaying.mpm.laws.plasticine import Plasticine
-from gaussian_swaying.mpm.laws.sand import Sand
-from gaussian_swaying.mpm.laws.snow import Snow
-from gaussian_swaying.mpm.laws.spring_network import SpringNetwork
 from gaussian_swaying.mpm.laws.triton.body import BodyLaws, kirchhoff, pk1
 from gaussian_swaying.mpm.laws.triton.functions import LawFunctions, functions_of, shared
 from gaussian_swaying.mpm.twins import Numbers, Twin
@@ -165,23 +157,12 @@ def test_nearest_rotation(kernel_device):
     assert bool(torch.isfinite(_decomposed(_matrices(kernel_device))[0]).all())
 
 
-LAWS = [
-    FixedCorotated(),
-    NeoHookean(),
-    StVKHencky(),
-    SpringNetwork(),
-    Sand(),
-    Sand(35.0, volume_correction=True),
-    Metal(2e2),
-    Metal(2e2, 5e3),
-    Plasticine(1e3, 2e3, 1e2),
-    Plasticine(1e3, 5e4, 1e2),
-    Foam(1e2, 4.0),
-    Foam(1e2, 1e4),
-    Foam(0.0, 0.0),
-    Snow(),
-    Fluid(),
-]
+FLOWING = PLASTIC | {
+    "metal that hardens": KINDS["Metal"](2e2, 5e3),
+    "plasticine that softens at once": KINDS["Plasticine"](1e3, 5e4, 1e2),
+    "stiff foam": KINDS["Foam"](1e2, 1e4),
+    "foam of no strength": KINDS["Foam"](0.0, 0.0),
+}
 
 
 def _body(law, device):
@@ -197,8 +178,9 @@ def _close(found, exact, what):
     assert bool((error <= 2e-5 * (size + what)).all()), f"{float((error / (size + what)).max()):.1e}"
 
 
-@pytest.mark.parametrize("law", LAWS[:4], ids=lambda law: type(law).__name__)
-def test_elastic_stress(kernel_device, law):
+@pytest.mark.parametrize("name", ELASTIC)
+def test_elastic_stress(kernel_device, name):
+    law = ELASTIC[name]
     F = _matrices(kernel_device, unique=True)
     out = torch.empty_like(F)
     body, row = _body(law, kernel_device)
@@ -212,10 +194,10 @@ def test_elastic_stress(kernel_device, law):
     assert bool(torch.isfinite(out).all())
 
 
-@pytest.mark.parametrize("k", range(4, len(LAWS)), ids=lambda k: f"{type(LAWS[k]).__name__} {k}")
-def test_flow_and_stress(kernel_device, k):
+@pytest.mark.parametrize("name", FLOWING)
+def test_flow_and_stress(kernel_device, name):
     """Stretches, internal variable and Kirchhoff stress after the return map; all plastic kinds at once on a GPU."""
-    law = LAWS[k]
+    law = FLOWING[name]
     F = _matrices(kernel_device, unique=True)
     body, row = _body(law, kernel_device)
     generator = torch.Generator().manual_seed(1)
@@ -235,9 +217,9 @@ def test_flow_and_stress(kernel_device, k):
     assert float((F_out - F).abs().max()) > 1e-2
 
 
-ENERGIES = [FixedCorotated(), SpringNetwork(), StVKHencky()]
+ENERGIES = [ELASTIC[name] for name in ("corotated", "springs", "hencky")]
+HENCKY = type(ENERGIES[2])
 LAME = {"equal": (4e3, 4e3), "mu": (6e3, 2e3), "lambda": (2e3, 8e3), "auxetic": (5e3, -1e3), "steel": (8e10, 1.2e11)}
-CASES = [(law, ratio) for law in ENERGIES for ratio in LAME if (law, ratio) != (ENERGIES[0], "auxetic")]
 
 
 def _strained(device):
@@ -257,6 +239,9 @@ def _strained(device):
     return (turns[0] @ stretch.diag_embed() @ turns[1].mT).float().to(device)
 
 
+CASES = [(law, ratio) for law in ENERGIES for ratio in LAME if (law, ratio) != (ENERGIES[0], "auxetic")]
+
+
 @pytest.mark.parametrize(("law", "ratio"), CASES, ids=lambda x: x if isinstance(x, str) else type(x).__name__)
 def test_wave_modulus_and_energy(kernel_device, law, ratio):
     """Against float64, to what a hundred roundings (of 1.2e-7) change: roots and divisions of a GPU are of 2 ulp.
@@ -274,11 +259,11 @@ def test_wave_modulus_and_energy(kernel_device, law, ratio):
     values = linalg.svd3(wide)[1]
     expected = law.moduli(wide, *parameters)[0]
     rounding = 1.2e-5 + 5e-7 * values[:, 0] / (values[:, 1] + values[:, 2]).abs()
-    if not isinstance(law, StVKHencky):
+    if not isinstance(law, HENCKY):
         rounding = rounding.clamp(min=5e-4)
     error = (wave - expected).abs() / expected
     assert bool((error <= rounding).all()), f"{float((error / rounding).max()):.1e}"
-    if lam > 0 or isinstance(law, StVKHencky):  # otherwise there is no network, and nothing stiffens
+    if lam > 0 or isinstance(law, HENCKY):  # otherwise there is no network, and nothing stiffens
         assert int((expected > 1.01 * (2 * mu + lam)).sum()) > 500
     exact = law.energy(wide, *parameters)
     slope = (exact * expected).sqrt()
@@ -299,14 +284,15 @@ def test_what_is_not_finite_has_no_modulus(kernel_device, law):
 
 def test_which_energy_holds_for_a_body():
     """One kernel per energy: all laws based on Hencky's share it, with any plastic flow."""
+    snow, fluid = PLASTIC["snow"], PLASTIC["fluid"]
     for name in ("energy", "wave"):
         corotated, network, hencky = (shared([law], name) for law in ENERGIES)
         assert None is not corotated is not network is not hencky is not corotated
-        on_hencky = [law for law in LAWS if isinstance(law, StVKHencky)]
-        assert {type(law) for law in on_hencky} == {StVKHencky, Sand, Metal, Plasticine, Foam}
+        on_hencky = [law for law in (ELASTIC | FLOWING).values() if isinstance(law, HENCKY)]
+        assert {type(law).__name__ for law in on_hencky} == {"StVKHencky", "Sand", "Metal", "Plasticine", "Foam"}
         assert shared(on_hencky, name) is hencky
-        assert shared([SpringNetwork(), SpringNetwork()], name) is network
-        others = [[ENERGIES[0], ENERGIES[1]], [ENERGIES[1], ENERGIES[2]], *([law] for law in LAWS[-2:]), [LAWS[1]]]
+        assert shared([type(ENERGIES[1])() for _ in range(2)], name) is network
+        others = [ENERGIES[:2], ENERGIES[1:], [snow], [fluid], [ELASTIC["neo-hookean"]]]
         for body in [*others, [OwnLaw()], [OwnLaw(), ENERGIES[0]]]:
             assert shared(body, name) is None
 
@@ -315,29 +301,31 @@ class OwnLaw(NeoHookean):
     """It may have another stress than the law that it is derived from."""
 
 
-def test_every_twin_of_the_package_is_compared():
-    """Each law is in the list of this file, which the tests above use."""
-    assert {type(law) for law in LAWS} == set(laws.LAWS.values())
-    for law in LAWS:
+def test_laws_of_the_package_have_twins_and_others_have_none():
+    for law in (ELASTIC | FLOWING).values():
         assert (functions_of(law).flow is not None) == law.plastic
     assert functions_of(OwnLaw()) is None
 
 
 def test_what_a_body_asks_of_a_kernel():
     """No decomposition if none is needed, and shared parts of laws only once."""
-    direct = BodyLaws([FixedCorotated(), NeoHookean()])
+
+    def body(*names):
+        return BodyLaws([(ELASTIC | PLASTIC)[name] for name in names])
+
+    direct = body("corotated", "neo-hookean")
     assert (direct.spectral, len(direct.principals), len(direct.matrices), len(direct.flows)) == (False, 0, 2, 0)
     assert [row[:2] for row in direct.table] == [[0, -1], [1, -1]]
-    mixed = BodyLaws([NeoHookean(), Sand(), FixedCorotated(), StVKHencky(), Metal(5.0, 6.0), Plasticine(7.0, 8.0, 1.0)])
+    mixed = body("neo-hookean", "sand", "corotated", "hencky", "metal", "plasticine")
     assert (mixed.spectral, len(mixed.principals), len(mixed.matrices), len(mixed.flows)) == (True, 2, 1, 2)
     assert [row[:2] for row in mixed.table] == [[2, -1], [0, 0], [1, -1], [0, -1], [0, 1], [0, 1]]
-    assert mixed.table[4][2:] == [5.0, 6.0, 0.0, 0.0]
+    assert mixed.table[4][2:] == [100.0, 50.0, 0.0, 0.0]
     assert not mixed.all_flow
-    flowing = BodyLaws([Sand(), Fluid()])
+    flowing = body("sand", "fluid")
     assert flowing.all_flow
-    keys = {repr(body) for body in (direct, mixed, flowing, BodyLaws([Sand()]), BodyLaws([FixedCorotated()]))}
+    keys = {repr(one) for one in (direct, mixed, flowing, body("sand"), body("corotated"))}
     assert len(keys) == 5
-    assert repr(BodyLaws([Fluid(3.0)])) == repr(BodyLaws([Fluid()]))
+    assert repr(BodyLaws([KINDS["Fluid"](3.0)])) == repr(body("fluid"))
 
 
 def test_a_twin_needs_a_stress():
@@ -349,9 +337,9 @@ def test_a_twin_needs_a_stress():
 
 
 def test_a_table_row_has_room_for_four_numbers():
-    class Many(Sand):
+    class Many(KINDS["Sand"]):
         def twin(self):
-            return Twin(functions_of(Sand()), numbers=Numbers(5, lambda: (1.0, 2.0, 3.0, 4.0, 5.0)))
+            return Twin(functions_of(PLASTIC["sand"]), numbers=Numbers(5, lambda: (1.0, 2.0, 3.0, 4.0, 5.0)))
 
     with pytest.raises(ValueError, match="at most four `numbers` of Many, but got 5"):
         BodyLaws([Many()])
