@@ -53,7 +53,7 @@ def main():
     module.lanes, module.compiles = lambda device, gpu, cpu=8: gpu, lambda device: True
 
     from mpm.triton.bodies import DT, make_load, make_points, make_solver, set_going
-    from mpm.triton.test_boundaries import BOUNDARIES
+    from mpm.triton.test_agreement import BOUNDARIES
 
     for formulation, boundaries in (("updated", "walls and pins"), ("updated", "handle"), ("total", "two pins")):
         points = make_points("cpu", count=12, batch=(2,))

@@ -7,8 +7,8 @@ from pathlib import Path
 
 import pytest
 import torch
+from catalogue import OBSTACLES
 
-from gaussian_swaying.geometry.distance import DistanceGrid
 from gaussian_swaying.geometry.frame import SimFrame
 from gaussian_swaying.geometry.keyed_path import KeyedPath
 from gaussian_swaying.geometry.rotations import rotation_from_z
@@ -16,10 +16,8 @@ from gaussian_swaying.kernels.launch import lanes, launch
 from gaussian_swaying.mpm.boundaries.ball import BallObstacle
 from gaussian_swaying.mpm.boundaries.block import BoxObstacle
 from gaussian_swaying.mpm.boundaries.capsule import CapsuleObstacle
-from gaussian_swaying.mpm.boundaries.half_space import HalfSpaceObstacle
 from gaussian_swaying.mpm.boundaries.mesh import MeshObstacle
 from gaussian_swaying.mpm.boundaries.plane import Plane
-from gaussian_swaying.mpm.boundaries.still_gaussians import StillGaussians
 from gaussian_swaying.mpm.solver import MPMSolver
 from gaussian_swaying.mpm.state import MaterialPoints
 from gaussian_swaying.mpm.triton import obstacle_kernels as kernels
@@ -32,25 +30,6 @@ MESH = str(Path(__file__).parent / "boundaries" / "octahedron.obj")
 def _path():
     """Between two keys at DT and 30 DT, then at rest."""
     return KeyedPath([DT, 30 * DT], [[0.0, 0.0, 0.0], [0.2, -0.1, 0.05]], [[0.0, 10.0, 20.0], [50.0, -20.0, 90.0]])
-
-
-def _still():
-    found = StillGaussians()
-    axis = torch.linspace(-0.3, 0.3, 7, dtype=torch.float64)
-    place = torch.stack(torch.meshgrid(axis, axis, axis[:5], indexing="ij"), -1)
-    found.take(DistanceGrid(place.norm(dim=-1) - 0.2, place[0, 0, 0], 0.1))
-    return found
-
-
-SHAPES = {
-    "ball": lambda **more: BallObstacle([0.1, 0.0, 0.0], 0.2, **more),
-    "capsule": lambda **more: CapsuleObstacle([0.0, 0.0, 0.0], [0.2, 0.1, 0.1], 0.1, **more),
-    "capsule that is a ball": lambda **more: CapsuleObstacle([0.1, 0.0, 0.0], [0.1, 0.0, 0.0], 0.1, **more),
-    "box": lambda **more: BoxObstacle([-0.2, -0.1, -0.1], [0.2, 0.2, 0.1], [0.0, 20.0, 30.0], **more),
-    "half space": lambda **more: HalfSpaceObstacle([0.0, 0.0, 0.1], [0.2, 0.0, 1.0], **more),
-    "mesh": lambda **more: MeshObstacle(MESH, 12, [0.05, 0.0, 0.0], **more),
-    "still": lambda **more: _still(),
-}
 
 
 def _ask_kernel(obstacle, place, time, device):
@@ -71,24 +50,23 @@ def _ask_kernel(obstacle, place, time, device):
     return gap, facing, drive, valid, int(within)
 
 
-@pytest.mark.parametrize("moment", [0.0, 7.3 * DT, 40 * DT])
-@pytest.mark.parametrize("moves", [False, True])
-@pytest.mark.parametrize("name", SHAPES)
-def test_distance_normal_and_velocity(kernel_device, name, moves, moment):
-    more = {"path": _path()} if moves else {}
+@pytest.mark.parametrize("name", OBSTACLES)
+def test_distance_normal_and_velocity(kernel_device, name):
+    """Still and in motion; before, within and after its time, and beyond its last key."""
     frame = SimFrame(torch.tensor([0.02, 0.0, 0.01], dtype=torch.float64), rotation_from_z([0, -1, 0]).T, 1.2)
-    obstacle = SHAPES[name](gap=0.01, start=DT, end=39 * DT, **more) if name != "still" else _still()
-    obstacle = obstacle.in_frame(frame)
     place = (0.9 * torch.rand(40, 3, generator=torch.Generator().manual_seed(0)) - 0.45).to(kernel_device)
-    time = torch.tensor(moment, dtype=torch.float64, device=kernel_device)
-    gap, facing, drive, valid, within = _ask_kernel(obstacle, place, time, kernel_device)
-    distance, normal, own = obstacle.touch(place.double(), time, DT)
-    torch.testing.assert_close(gap.double(), distance - 0.01, rtol=0, atol=1e-6)
-    torch.testing.assert_close(facing.double(), normal, rtol=0, atol=2e-4)
-    torch.testing.assert_close(drive.double(), own, rtol=0, atol=2e-5)
-    assert bool((valid == float(obstacle.active(time))).all())
-    ahead = distance - DT * (own * normal).sum(-1)  # the places are at rest
-    assert within == int(bool(obstacle.active(time)) and float(torch.minimum(distance, ahead).min()) < 0.02)
+    for more in [{}] if name == "still" else [{}, {"path": _path()}]:
+        obstacle = OBSTACLES[name](gap=0.01, start=DT, end=39 * DT, **more).in_frame(frame)
+        for moment in (0.0, 7.3 * DT, 40 * DT):
+            time = torch.tensor(moment, dtype=torch.float64, device=kernel_device)
+            gap, facing, drive, valid, within = _ask_kernel(obstacle, place, time, kernel_device)
+            distance, normal, own = obstacle.touch(place.double(), time, DT)
+            torch.testing.assert_close(gap.double(), distance - 0.01, rtol=0, atol=1e-6)
+            torch.testing.assert_close(facing.double(), normal, rtol=0, atol=2e-4)
+            torch.testing.assert_close(drive.double(), own, rtol=0, atol=2e-5)
+            assert bool((valid == float(obstacle.active(time))).all())
+            ahead = distance - DT * (own * normal).sum(-1)  # the places are at rest
+            assert within == int(bool(obstacle.active(time)) and float(torch.minimum(distance, ahead).min()) < 0.02)
 
 
 def _bodies(device, boundaries):

@@ -12,16 +12,6 @@ from gaussian_swaying.aero.force import AeroForce
 from gaussian_swaying.aero.wind import WindField
 from gaussian_swaying.aero.wind_force import WindForce
 from gaussian_swaying.geometry.regions import Box
-from gaussian_swaying.mpm.laws.fixed_corotated import FixedCorotated
-from gaussian_swaying.mpm.laws.fluid import Fluid
-from gaussian_swaying.mpm.laws.foam import Foam
-from gaussian_swaying.mpm.laws.hencky import StVKHencky
-from gaussian_swaying.mpm.laws.metal import Metal
-from gaussian_swaying.mpm.laws.neo_hookean import NeoHookean
-from gaussian_swaying.mpm.laws.plasticine import Plasticine
-from gaussian_swaying.mpm.laws.sand import Sand
-from gaussian_swaying.mpm.laws.snow import Snow
-from gaussian_swaying.mpm.laws.spring_network import SpringNetwork
 from gaussian_swaying.mpm.solver import MPMSolver
 from gaussian_swaying.mpm.state import MaterialPoints
 
@@ -34,22 +24,6 @@ FORMULATIONS = ["total", "updated"]
 FIELDS = ["position", "velocity", "affine", "F_elastic", "F_total", "internal", "node_displacement", "node_velocity"]
 WIND = WindField([5.0, 2.0, -1.0])
 LEFT, TOP = Box([None] * 3, [0.12, None, None]), Box([None, None, 0.17], [None] * 3)
-ELASTIC = {
-    "corotated": FixedCorotated(),
-    "neo-hookean": NeoHookean(),
-    "springs": SpringNetwork(),
-    "hencky": StVKHencky(),
-}
-PLASTIC = {
-    "sand": Sand(),
-    "sand that swells": Sand(volume_correction=True),
-    "metal": Metal(5e2, 1e3),
-    "foam": Foam(2e2, 5.0),
-    "foam without viscosity": Foam(2e2, 0.0),
-    "plasticine": Plasticine(1e3, 2e4, 1e2),
-    "snow": Snow(),
-    "fluid": Fluid(),
-}
 
 
 def on_each(*everywhere, cpu=()):

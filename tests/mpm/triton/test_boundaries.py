@@ -1,7 +1,4 @@
-"""Boundaries in the fused substep, and how often `updated` sorts its particles.
-
-Covers: mpm.triton.fused_updated.
-"""
+"""Boundaries in the fused substep, and how often `updated` sorts its particles."""
 
 import pytest
 import torch
@@ -9,21 +6,15 @@ import torch
 from gaussian_swaying.aero.wind import WindField
 from gaussian_swaying.aero.wind_batch import WindBatch
 from gaussian_swaying.aero.wind_force import WindForce
-from gaussian_swaying.geometry.regions import Box, Everything
-from gaussian_swaying.mpm.boundaries.enclosing_box import EnclosingBox
-from gaussian_swaying.mpm.boundaries.handle import Handle
-from gaussian_swaying.mpm.boundaries.impulse import Impulse
-from gaussian_swaying.mpm.boundaries.pinned_points import PinnedPoints
+from gaussian_swaying.geometry.regions import Box
 from gaussian_swaying.mpm.boundaries.pinned_region import PinnedRegion
 from gaussian_swaying.mpm.boundaries.plane import Plane
-from gaussian_swaying.mpm.boundaries.sequential_release import SequentialRelease
 from gaussian_swaying.mpm.boundaries.velocity_box import VelocityBox
 from gaussian_swaying.mpm.triton import fused_updated
 
 from .bodies import (
     DT,
     DX,
-    FORMULATIONS,
     LEFT,
     TOP,
     check_agreement,
@@ -32,86 +23,9 @@ from .bodies import (
     make_solver,
     on_each,
     run_both,
-    run_in_wind,
     set_going,
 )
-
-WINDOW = {"start": 0.5 * DT, "end": 1.5 * DT}
-BOUNDARIES = {
-    "pin": lambda: [PinnedRegion(LEFT, "nodes")],
-    "hinge": lambda: [PinnedRegion(LEFT)],
-    "two pins": lambda: [PinnedRegion(LEFT, "nodes"), PinnedRegion(TOP, "nodes", held_share=0.4)],
-    "pin for some time": lambda: [PinnedRegion(LEFT, "nodes", **WINDOW)],
-    "hinge for some time": lambda: [PinnedRegion(LEFT, **WINDOW)],
-    "handle": lambda: [Handle(LEFT, [0.5, 0.0, 0.2], [0.0, 30.0, 9.0], [0.1, 0.1, 0.1], "nodes", **WINDOW)],
-    "hinged handle": lambda: [Handle(LEFT, [0.5, 0.0, 0.2], [0.0, 30.0, 9.0], [0.1, 0.1, 0.1], **WINDOW)],
-    "release": lambda: [SequentialRelease(LEFT, [0.0, 1.0, 0.0], start=0.5 * DT, end=1.5 * DT, kind="nodes")],
-    "release of points": lambda: [SequentialRelease(LEFT, [0.0, 1.0, 0.0], start=0.5 * DT, end=1.5 * DT)],
-    "impulse": lambda: [Impulse(TOP, [0.01, 0.0, 0.02], **WINDOW)],
-    "plane": lambda: [Plane([0.0, 0.0, 0.13], [0.1, 0.0, 1.0], "separate", 0.4, **WINDOW)],
-    "box": lambda: [EnclosingBox([0.1, 0.1, 0.1], [0.2, 0.2, 0.2], "slip", 0.2)],
-    "walls": lambda: [
-        Plane([0.0, 0.0, 0.13], [0.1, 0.0, 1.0], "sticky", **WINDOW),
-        EnclosingBox([0.11, 0.1, 0.1], [0.2, 0.2, 0.2], "separate", 0.1, end=1.5 * DT),
-    ],
-    "velocity box": lambda: [VelocityBox(TOP, [0.0, 1.0, 0.0], **WINDOW)],
-    "walls and pins": lambda: [
-        Plane([0.0, 0.0, 0.13], [0.1, 0.0, 1.0], "separate", 0.4),
-        PinnedRegion(LEFT, "nodes", **WINDOW),
-        EnclosingBox([0.1, 0.1, 0.1], [0.2, 0.2, 0.2], "slip", 0.2),
-        PinnedRegion(TOP, "nodes", start=0.5 * DT),
-    ],
-    "pin and plane": lambda: [PinnedRegion(LEFT, "nodes"), Plane([0.0, 0.0, 0.13], [0.0, 0.0, 1.0], "sticky")],
-    "knock and release": lambda: [SequentialRelease(LEFT, end=1.5 * DT), Impulse(Everything(), [0, 0, 0.02], end=DT)],
-}
-
-
-@pytest.mark.slow(
-    gate=[f"updated-cpu-{name}" for name in ("handle", "knock and release", "walls", "box", "two pins")]
-    + [f"total-cpu-{name}" for name in ("hinge", "hinged handle", "plane", "box", "two pins")]
-)
-@pytest.mark.parametrize(
-    ("kernel_device", "name"),
-    [
-        *(pytest.param("cuda", name, marks=pytest.mark.gpu) for name in BOUNDARIES),
-        *(
-            ("cpu", name)
-            for name in (
-                *("two pins", "hinge", "handle", "hinged handle", "knock and release", "plane", "box", "walls"),
-                "walls and pins",
-            )
-        ),
-    ],
-    indirect=["kernel_device"],
-)
-@pytest.mark.parametrize("formulation", FORMULATIONS)
-def test_boundaries(kernel_device, formulation, name):
-    """Over three substeps, of which the first and the last lie outside the window."""
-    _boundaries_case(kernel_device, formulation, BOUNDARIES[name])
-
-
-POINT_HOLDS = {
-    "clamp": lambda: [PinnedRegion(LEFT, "clamp")],
-    "points": lambda: [PinnedPoints([[0.1, 0.12, 0.11], [0.2, 0.17, 0.13]])],
-    "nodes, hinge and clamp": lambda: [
-        PinnedRegion(LEFT),
-        PinnedRegion(TOP, "nodes", held_share=0.4),
-        PinnedPoints([[0.2, 0.1, 0.1]], "clamp"),
-        PinnedRegion(LEFT, "nodes", held_share=0.5),
-    ],
-    "points and plane": lambda: [PinnedPoints([[0.2, 0.1, 0.1]]), Plane([0.0, 0.0, 0.13], [0.0, 0.0, 1.0], "sticky")],
-    "points one after the other": lambda: [
-        PinnedRegion(LEFT, end=1.5 * DT),
-        PinnedPoints([[0.2, 0.1, 0.1]], "clamp", start=0.5 * DT),
-        Handle(TOP, [0.5, 0.0, 0.2], [0.0, 30.0, 9.0], [0.1, 0.1, 0.1], "clamp", start=1.5 * DT),
-    ],
-}
-"""These are for `total` alone."""
-
-
-@pytest.mark.parametrize(("kernel_device", "name"), on_each(*POINT_HOLDS), indirect=["kernel_device"])
-def test_points_that_are_held(kernel_device, name):
-    _boundaries_case(kernel_device, "total", POINT_HOLDS[name])
+from .test_agreement import BOUNDARIES
 
 
 @pytest.mark.parametrize(
@@ -194,15 +108,6 @@ def test_a_fast_body_is_sorted_more_often_from_the_second_rollout_on(kernel_devi
     assert found[1] > 100 * found[0]
 
 
-def test_points_held_in_a_batch(kernel_device):
-    """The scenes have different rows."""
-    points = make_points(kernel_device, count=40, batch=(2,))
-    boundaries = [PinnedRegion(LEFT), PinnedRegion(TOP, "nodes", held_share=0.4)]
-    ends = run_in_wind(points, "total", steps=2, boundaries=boundaries)
-    check_agreement(ends)
-    assert ends[1].impulse.shape == (2, 2, 3)
-
-
 @pytest.mark.gpu
 def test_held_points_stay_where_they_are_and_give_the_same_bits():
     """Thousands of substeps in float32, from graphs."""
@@ -223,23 +128,6 @@ def test_held_points_stay_where_they_are_and_give_the_same_bits():
     assert float((rows - before).abs().max()) < 1e-5 * DX
 
 
-def _boundaries_case(kernel_device, formulation, make):
-    points = make_points(kernel_device, count=12)
-    load = make_load(points)
-
-    def run(solver, state):
-        state = solver.rollout(state, DT, 1, load)
-        return [state, solver.rollout(state, DT, 2, load)]
-
-    ends = run_both(points, run, formulation, boundaries=make())
-    check_agreement(ends)
-    assert float(ends[1][1].impulse.abs().max()) > 1e-4
-    free = make_solver("torch", formulation)
-    with torch.no_grad():
-        velocity = run(free, set_going(free, points))[1].velocity
-    assert not torch.allclose(velocity, ends[0][1].velocity, rtol=1e-3)
-
-
 def test_nodes_without_mass_are_let_go(kernel_device):
     """Boundaries see them at the origin, and so inside a region around it."""
     points = make_points(kernel_device, count=12)
@@ -247,13 +135,6 @@ def test_nodes_without_mass_are_let_go(kernel_device):
     check_agreement(
         run_both(points, lambda solver, state: solver.rollout(state, DT, 3), "total", boundaries=boundaries)
     )
-
-
-@pytest.mark.parametrize("formulation", FORMULATIONS)
-def test_boundaries_of_a_batch(kernel_device, formulation):
-    points = make_points(kernel_device, count=40, batch=(2,))
-    boundaries = [SequentialRelease(LEFT, [0.0, 1.0, 0.0], end=1.5 * DT), Plane([0.0, 0.0, 0.13], [0.0, 0.0, 1.0])]
-    check_agreement(run_in_wind(points, formulation, steps=2, boundaries=boundaries))
 
 
 def test_nodes_held_in_a_batch_of_winds(kernel_device):

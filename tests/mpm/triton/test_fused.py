@@ -202,26 +202,23 @@ class OwnLaw(FixedCorotated):
     """A custom law, which may do anything."""
 
 
-@pytest.mark.parametrize(
-    ("change", "reason"),
-    [
-        (lambda points: (points.map(torch.Tensor.double), {}), "computes in float32, but the material is float64"),
-        (lambda points: (dataclasses.replace(points, laws=(OwnLaw(),)), {}), "the law OwnLaw has no Triton twin"),
-    ],
-    ids=["float64 on a GPU", "custom law"],
-)
-def test_what_the_kernels_cannot_do(kernel_device, change, reason):
-    """``auto`` uses torch, ``triton`` raises an error with the reason."""
-    points, options = change(make_points(kernel_device))
-    if kernel_device.type == "cpu" and points.position.dtype == torch.float64:
+@pytest.mark.parametrize("what", ["float64 on a GPU", "custom law"])
+def test_what_the_kernels_cannot_do(kernel_device, what):
+    """``auto`` uses torch, ``kernels`` raises an error with the reason."""
+    points, reason = make_points(kernel_device), "the law OwnLaw has no Triton twin"
+    if what == "custom law":
+        points = dataclasses.replace(points, laws=(OwnLaw(),))
+    elif kernel_device.type == "cpu":
         pytest.skip("a CPU computes in float64, too: see test_double.py")
-    solver = MPMSolver(dx=DX, transfer="auto", **options)
+    else:
+        points, reason = points.map(torch.Tensor.double), "computes in float32, but the material is float64"
+    solver = MPMSolver(dx=DX)
     state = solver.init_state(points)
     assert solver.fused() is None
     assert bool(torch.isfinite(solver.step(state, DT).position).all())
     assert reason in solver._fused_obstacle
     with pytest.raises(ValueError, match=reason):
-        MPMSolver(dx=DX, transfer="kernels", **options).init_state(points)
+        MPMSolver(dx=DX, transfer="kernels").init_state(points)
 
 
 def test_sums_without_a_fixed_order_are_not_deterministic(kernel_device):
@@ -240,20 +237,16 @@ def test_sums_without_a_fixed_order_are_not_deterministic(kernel_device):
 
 
 @pytest.mark.parametrize("formulation", FORMULATIONS)
-def test_auto_takes_the_kernels(kernel_device, formulation):
-    solver = MPMSolver(dx=DX, formulation=formulation)
-    solver.init_state(make_points(kernel_device))
-    assert solver.fused() is not None
-    assert solver.deterministic is False
+def test_who_computes_a_substep(kernel_device, formulation):
+    points = make_points(kernel_device)
+    for transfer, has_kernels in (("auto", True), ("torch", False)):
+        solver = MPMSolver(dx=DX, formulation=formulation, transfer=transfer)
+        solver.init_state(points)
+        assert (solver.fused() is not None) == has_kernels
+        assert solver.deterministic is False
     solver = MPMSolver(dx=DX, deterministic=True)
-    solver.init_state(make_points(kernel_device))
+    solver.init_state(points)
     assert solver.fused() is not None
-
-
-def test_torch_means_torch(kernel_device):
-    solver = MPMSolver(dx=DX, transfer="torch")
-    solver.init_state(make_points(kernel_device))
-    assert solver.fused() is None
 
 
 def test_another_material_needs_other_buffers(kernel_device):

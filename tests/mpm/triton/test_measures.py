@@ -7,10 +7,11 @@ import math
 
 import pytest
 import torch
+from catalogue import ELASTIC, PLASTIC
 
 from gaussian_swaying.mpm.triton import measures
 
-from .bodies import DT, ELASTIC, FORMULATIONS, PLASTIC, make_points, make_solver, noise, set_going
+from .bodies import DT, FORMULATIONS, make_points, make_solver, noise, set_going
 
 
 @pytest.mark.parametrize("formulation", FORMULATIONS)

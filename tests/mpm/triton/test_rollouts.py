@@ -1,7 +1,4 @@
-"""Rollouts of the fused substep: changing substeps, looks on the way, graphs and their memory.
-
-Covers: mpm.triton.damping.
-"""
+"""Rollouts of the fused substep: changing substeps, looks on the way, graphs and their memory."""
 
 import gc
 import math
@@ -9,6 +6,7 @@ import weakref
 
 import pytest
 import torch
+from catalogue import ELASTIC, PLASTIC
 
 from gaussian_swaying.aero.wind import FlowKey, GaussianGust, SineSway, WindField
 from gaussian_swaying.geometry.regions import Box
@@ -26,11 +24,9 @@ from gaussian_swaying.simulation.diagnostics import SimulationDiverged, check_st
 from .bodies import (
     DT,
     DX,
-    ELASTIC,
     FIELDS,
     FORMULATIONS,
     LEFT,
-    PLASTIC,
     TOLERANCE,
     WIND,
     check_agreement,
@@ -44,39 +40,6 @@ from .bodies import (
     run_in_wind,
     set_going,
 )
-
-
-@pytest.mark.parametrize(
-    ("kernel_device", "case"),
-    on_each(("total", False), ("updated", True), cpu=[("updated", False)]),
-    indirect=["kernel_device"],
-    ids=str,
-)
-def test_gravity_damping_and_viscosity(kernel_device, case):
-    """Also with MLS-MPM."""
-    formulation, mls = case
-    options = {"gravity": (1.0, 2.0, -9.8), "damping": 20.0, "stiffness_damping": 2e-3}
-    check_agreement(run_in_wind(make_points(kernel_device), formulation, steps=2, mls=mls, **options))
-
-
-def test_damping_of_the_material(kernel_device):
-    """A rate at each point, beside that of the solver."""
-    rates = 40 * torch.rand(24, generator=torch.Generator().manual_seed(1)).to(kernel_device)
-    check_agreement(run_in_wind(make_points(kernel_device, damping=rates), "total", steps=2, damping=20.0))
-
-
-@pytest.mark.parametrize("kernel_device", ["cpu"], indirect=True)
-def test_mls(kernel_device):
-    check_agreement(run_in_wind(make_points(kernel_device), "updated", mls=True))
-
-
-@pytest.mark.parametrize("formulation", FORMULATIONS)
-def test_without_any_load(kernel_device, formulation):
-    """Also without damping."""
-    points = make_points(kernel_device)
-    ends = run_both(points, lambda solver, state: solver.rollout(state, DT, 2), formulation, damping=0.0)
-    check_agreement(ends)
-    assert float(ends[1].work) == 0.0
 
 
 @pytest.mark.parametrize("formulation", FORMULATIONS)

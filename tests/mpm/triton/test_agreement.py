@@ -1,0 +1,269 @@
+"""The fused substep against torch: scenes in which laws, boundaries, winds, damping and batches meet.
+
+Each law, boundary, wind and damping is in one scene at least of each formulation that has it; on a GPU all boundaries
+are in both.
+
+Covers: mpm.triton.damping, mpm.triton.fused_updated, mpm.triton.shared, mpm.triton.total_kernels,
+mpm.triton.updated_kernels.
+"""
+
+import dataclasses
+
+import pytest
+import torch
+from catalogue import ELASTIC, PLASTIC, conditions, made
+
+from gaussian_swaying.aero.force import AeroForce
+from gaussian_swaying.aero.patches import Patches
+from gaussian_swaying.aero.wind import WindField
+from gaussian_swaying.aero.wind_force import WindForce
+from gaussian_swaying.geometry.regions import Everything
+
+from .bodies import (
+    DT,
+    FORMULATIONS,
+    LEFT,
+    TOP,
+    WIND,
+    check_agreement,
+    make_load,
+    make_points,
+    make_solver,
+    noise,
+    on_each,
+    run_both,
+    run_in_wind,
+    set_going,
+)
+
+WINDOW = {"start": 0.5 * DT, "end": 1.5 * DT}  # of three substeps the first and the last lie outside
+HANDLE = made("Handle", LEFT, [0.5, 0.0, 0.2], [0.0, 30.0, 9.0], [0.1, 0.1, 0.1])
+RELEASE = made("SequentialRelease", LEFT, [0.0, 1.0, 0.0], end=1.5 * DT)
+HINGE, NODES = made("PinnedRegion", LEFT), made("PinnedRegion", LEFT, "nodes")
+TOP_NODES = made("PinnedRegion", TOP, "nodes", held_share=0.4)
+SLOPE = made("Plane", [0.0, 0.0, 0.13], [0.1, 0.0, 1.0])
+FLOOR = made("Plane", [0.0, 0.0, 0.13], [0.0, 0.0, 1.0], "sticky")
+BOX = made("EnclosingBox", [0.1, 0.1, 0.1], [0.2, 0.2, 0.2], "slip", 0.2)
+ONE = made("PinnedPoints", [[0.2, 0.1, 0.1]])
+BOUNDARIES = {
+    "none": list,
+    "pin": lambda: [NODES()],
+    "hinge": lambda: [HINGE()],
+    "two pins": lambda: [NODES(), TOP_NODES()],
+    "pin for some time": lambda: [NODES(**WINDOW)],
+    "hinge for some time": lambda: [HINGE(**WINDOW)],
+    "handle": lambda: [HANDLE(kind="nodes", **WINDOW)],
+    "hinged handle": lambda: [HANDLE(**WINDOW)],
+    "release": lambda: [RELEASE(kind="nodes", start=0.5 * DT)],
+    "release of points": lambda: [RELEASE(start=0.5 * DT)],
+    "impulse": lambda: [made("Impulse", TOP, [0.01, 0.0, 0.02])(**WINDOW)],
+    "plane": lambda: [SLOPE(kind="separate", friction=0.4, **WINDOW)],
+    "box": lambda: [BOX()],
+    "walls": lambda: [
+        SLOPE(kind="sticky", **WINDOW),
+        made("EnclosingBox", [0.11, 0.1, 0.1], [0.2, 0.2, 0.2], "separate", 0.1, end=1.5 * DT)(),
+    ],
+    "velocity box": lambda: [conditions(TOP)["velocity"](**WINDOW)],
+    "walls and pins": lambda: [
+        SLOPE(kind="separate", friction=0.4),
+        NODES(**WINDOW),
+        BOX(),
+        made("PinnedRegion", TOP, "nodes", start=0.5 * DT)(),
+    ],
+    "pin and plane": lambda: [NODES(), FLOOR()],
+    "knock and release": lambda: [
+        made("SequentialRelease", LEFT, end=1.5 * DT)(),
+        made("Impulse", Everything(), [0, 0, 0.02], end=DT)(),
+    ],
+    "release and plane": lambda: [RELEASE(), made("Plane", [0.0, 0.0, 0.13], [0.0, 0.0, 1.0])()],
+}
+POINT_HOLDS = {  # for `total` alone
+    "clamp": lambda: [HINGE(kind="clamp")],
+    "points": lambda: [made("PinnedPoints", [[0.1, 0.12, 0.11], [0.2, 0.17, 0.13]])()],
+    "hinge and nodes": lambda: [HINGE(), TOP_NODES()],
+    "nodes, hinge and clamp": lambda: [HINGE(), TOP_NODES(), ONE(kind="clamp"), NODES(held_share=0.5)],
+    "points and plane": lambda: [ONE(), FLOOR()],
+    "points one after the other": lambda: [
+        HINGE(end=1.5 * DT),
+        ONE(kind="clamp", start=0.5 * DT),
+        made("Handle", TOP, [0.5, 0.0, 0.2], [0.0, 30.0, 9.0], [0.1, 0.1, 0.1], "clamp", start=1.5 * DT)(),
+    ],
+}
+SEMI = {"drag_step": "semi_implicit"}
+LOSSES = {"gravity": (1.0, 2.0, -9.8), "damping": 20.0, "stiffness_damping": 2e-3}
+SCENES = [  # formulation, laws, boundaries, wind, other settings; `groups` are several patches on each point
+    ("total", "corotated", "hinge", SEMI, {}),
+    ("total", "neo-hookean", "hinged handle", {"law": "projected"}, LOSSES),
+    ("total", "springs", "two pins", {"max_area_ratio": 0.9}, {}),
+    ("total", "hencky", "plane", {"law": "linear", **SEMI}, {"damping": 20.0, "rates": True}),
+    ("total", "corotated, neo-hookean", "box", {"law": "cross_flow", **SEMI}, {}),
+    ("total", "neo-hookean, hencky", "clamp", {"law": "linear"}, {}),
+    ("total", "corotated", "points", {"max_area_ratio": 0.9, **SEMI}, {"groups": True}),
+    ("total", "corotated", "nodes, hinge and clamp", {"law": "projected"}, {"groups": True}),
+    ("total", "springs", "points and plane", {"law": "linear", **SEMI}, {"groups": True}),
+    ("total", "corotated", "points one after the other", {"law": "cross_flow"}, {"groups": True}),
+    ("total", "corotated", "none", None, {"damping": 0.0}),
+    ("total", "corotated", "release and plane", {}, {"batch": (2,)}),
+    ("total", "corotated", "hinge and nodes", {}, {"batch": (2,)}),
+    ("updated", "corotated", "handle", SEMI, {}),
+    ("updated", "neo-hookean", "knock and release", {"law": "projected"}, LOSSES),
+    ("updated", "hencky", "walls", {"max_area_ratio": 0.9}, LOSSES | {"mls": True}),
+    ("updated", "sand", "box", {"law": "linear", **SEMI}, {"groups": True}),
+    ("updated", "sand that swells", "two pins", {"law": "cross_flow", **SEMI}, {}),
+    ("updated", "snow", "none", {"law": "linear"}, {"mls": True}),
+    ("updated", "fluid", "walls and pins", {"max_area_ratio": 0.9, **SEMI}, {"groups": True}),
+    ("updated", ", ".join(ELASTIC), "none", {"law": "projected"}, {"groups": True}),
+    ("updated", "neo-hookean, fluid, snow", "none", {}, {}),
+    ("updated", "corotated", "none", {"law": "cross_flow"}, {"groups": True}),
+    ("updated", "corotated", "none", None, {"damping": 0.0}),
+    ("updated", "corotated", "release and plane", {}, {"batch": (2,)}),
+]
+ON_A_GPU = [
+    ("total", ", ".join(ELASTIC), "none", {}, {}),
+    ("updated", ", ".join(ELASTIC | PLASTIC), "none", {}, {"count": 60}),
+    *((formulation, "corotated", name, {}, {}) for formulation in FORMULATIONS for name in BOUNDARIES),
+]
+
+
+def _named(scenes, device, **more):
+    return [pytest.param(device, scene, id=f"{device}: {', '.join(scene[:3])}", **more) for scene in scenes]
+
+
+def _groups(points, count, aero):
+    """Up to a dozen patches for each point, none for some."""
+    normal = torch.nn.functional.normalize(noise(6, count, 3), dim=-1)
+    area = 0.01 * torch.rand(count, generator=torch.Generator().manual_seed(6))
+    which = torch.randint(0, points.count - 3, (count,), generator=torch.Generator().manual_seed(7))
+    return WindForce(AeroForce(**{"C_L": 0.3, **aero}), WIND, Patches(normal, area, which, points.count))
+
+
+@pytest.mark.parametrize(
+    ("kernel_device", "scene"),
+    _named(SCENES, "cpu") + _named(SCENES + ON_A_GPU, "cuda", marks=pytest.mark.gpu),
+    indirect=["kernel_device"],
+)
+def test_kernels_do_what_torch_does(kernel_device, scene):
+    """The second rollout has a longer list of patches, and scatters what the return map gave."""
+    formulation, laws, boundaries, aero, more = scene
+    more = dict(more)
+    groups, batch, count = more.pop("groups", False), more.pop("batch", ()), more.pop("count", 24)
+    laws = [(ELASTIC | PLASTIC)[law] for law in laws.split(", ")]
+    index = torch.randint(len(laws), (count,), generator=torch.Generator().manual_seed(6)) if len(laws) > 1 else None
+    rates = 40 * torch.rand(count, generator=torch.Generator().manual_seed(1)) if more.pop("rates", False) else None
+    points = make_points(kernel_device, laws, count, batch, law_index=index, damping=rates)
+
+    def load(patches):
+        if aero is None:
+            return None
+        return _groups(points, patches, aero).to(kernel_device) if groups else make_load(points, **aero)
+
+    def run(solver, state):
+        state = solver.rollout(state, DT, 1, load(90))
+        return [state, solver.rollout(state, DT, 1 if boundaries == "none" else 2, load(130))]
+
+    make = (BOUNDARIES | POINT_HOLDS)[boundaries]
+    ends = run_both(points, run, formulation, boundaries=make(), **more)
+    check_agreement(ends)
+    if laws[0].plastic and boundaries == "none":
+        assert float((ends[1][1].F_elastic - ends[1][1].F_total).abs().max()) > 0.01
+    if aero is None:
+        assert float(ends[1][1].work) == 0.0
+    if boundaries != "none":
+        assert float(ends[1][1].impulse.abs().max()) > 1e-4
+        free = make_solver("torch", formulation, **more)
+        with torch.no_grad():
+            velocity = run(free, set_going(free, points))[1].velocity
+        assert not torch.allclose(velocity, ends[0][1].velocity, rtol=1e-3)
+
+
+@pytest.mark.parametrize("formulation", FORMULATIONS)
+def test_crushed_and_inverted_particles(kernel_device, formulation):
+    """If the nearest rotation is not unique, as for a reflected ball, there is nothing to compare."""
+
+    def start(solver, points):
+        if solver.neighbours_fixed:
+            state = set_going(solver, points, strain=0.9)
+            assert bool((torch.linalg.det(state.F_elastic) < 0).any())
+            return state
+        state = set_going(solver, points)
+        F = state.F_elastic.clone()
+        for k, stretch in enumerate(
+            [(1e-3, 1, 1), (1, 2e-4, 0.5), (-0.5, 1, 1.2), (1.1, 1, -1e-3), (0, 1, 2), (2, 2, 2), (6, 0.3, 1)]
+        ):
+            turn = torch.linalg.qr(noise(20 + k, 3, 3))[0]
+            F[k] = (turn @ torch.diag(torch.tensor(stretch, dtype=torch.float32)) @ turn.mT).to(F)
+        return state.replace(F_elastic=F, F_total=F)
+
+    check_agreement(run_in_wind(make_points(kernel_device), formulation, start=start))
+
+
+@pytest.mark.parametrize("formulation", FORMULATIONS)
+def test_momentum(kernel_device, formulation):
+    """Linear and angular momentum of a free body, to float32; angular momentum about a point within the body."""
+    points = make_points(kernel_device)
+    solver = make_solver("kernels", formulation, gravity=(0, 0, 0), damping=0.0)
+    state = set_going(solver, points)
+    if formulation == "updated":  # a spin that belongs to the stretch of the nodes, as after any substep
+        state = solver.rollout(state, DT, 1)
+    end = solver.rollout(state, DT, 2)
+    scale = float((points.mass[:, None] * state.velocity).abs().sum())
+    before, after = (solver.momenta(s) for s in (state, end))
+    for name in before:
+        torch.testing.assert_close(after[name], before[name], rtol=0, atol=1e-6 * scale)
+    assert float((end.velocity - state.velocity).abs().max()) > 0.1
+
+
+@pytest.mark.parametrize(
+    ("kernel_device", "drag_step"), on_each("explicit", "semi_implicit"), indirect=["kernel_device"]
+)
+def test_the_work_is_what_the_energy_grows_by(kernel_device, drag_step):
+    """In a body that is too soft to store any; the energies are computed separately from the work."""
+    points = make_points(kernel_device)
+    points = dataclasses.replace(points, youngs_modulus=torch.full_like(points.mass, 1e-6))
+    solver = make_solver("kernels", "total", gravity=(0, 0, 0), damping=0.0)
+    state = set_going(solver, points)
+    end = solver.rollout(state, DT, 2, make_load(points, drag_step=drag_step))
+    growth = solver.energies(end)["kinetic"] - solver.energies(state)["kinetic"]
+    assert abs(float(growth)) > 1e-4
+    # a difference of two energies in float32
+    torch.testing.assert_close(end.work.float(), growth, rtol=0, atol=2e-6 * float(solver.energies(end)["kinetic"]))
+
+
+@pytest.mark.parametrize("formulation", FORMULATIONS)
+def test_wind_along_the_normal(kernel_device, formulation):
+    """Nothing of it is tangential."""
+    points = make_points(kernel_device)
+    up = torch.tensor([0.0, 0.0, 1.0], device=kernel_device).expand(*points.position.shape)
+    wind = WindField([0.0, 0.0, -50.0]).to(kernel_device)
+    load = WindForce(AeroForce().to(kernel_device), wind, up, 0.01 * torch.ones_like(points.mass))
+
+    def run(solver, state):
+        return solver.rollout(state, DT, 1, load)
+
+    ends = run_both(points, run, formulation, start=lambda solver, points: solver.init_state(points))
+    check_agreement(ends, names=["position", "velocity", "affine", "F_elastic"])
+
+
+def test_patches_without_flow_and_flat_ones(kernel_device):
+    """Air that moves with the patch, and a patch that is pressed to nothing."""
+
+    def start(solver, points):
+        state = set_going(solver, points)
+        state.velocity[:4] = torch.tensor(WIND.flows[0].tolist(), device=kernel_device)
+        F = state.F_total.clone()
+        F[2] = F[5] = 0.0
+        return state.replace(F_total=F)
+
+    check_agreement(run_in_wind(make_points(kernel_device, PLASTIC["sand"]), "updated", start=start))
+
+
+@pytest.mark.gpu
+def test_total_gives_the_same_bits_twice():
+    pytest.importorskip("triton")
+    points = make_points("cuda", count=2000)
+    ends = []
+    for _ in range(2):
+        solver = make_solver("kernels", "total")
+        ends.append(solver.rollout(set_going(solver, points), DT, 40, make_load(points)))
+    for name in ("position", "velocity", "F_elastic", "node_velocity", "work"):
+        assert torch.equal(getattr(ends[0], name), getattr(ends[1], name))
