@@ -48,7 +48,7 @@ OBSTACLES = {
 }
 
 
-def made(kind, *given, **settings):
+def made(kind, /, *given, **settings):
     """A function that makes a boundary condition, with more settings on request."""
     return lambda **more: BOUNDARIES[kind](*given, **settings | more)
 

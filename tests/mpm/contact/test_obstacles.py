@@ -184,19 +184,3 @@ def test_an_obstacle_that_turns_counts_at_the_farthest_place(sheet):
     turning, _, state = _flying_ball(sheet, 1.0, [[0, 0, 0], [0, 0, 0], [0, 0, 180]])
     far = math.hypot(0.1, 0.1, 0.2)
     assert turning.bound.obstacle_cells(state, 0.1) == pytest.approx((1.0 + math.pi / 0.4 * far) / 0.044)
-
-
-@pytest.mark.parametrize(
-    ("make", "message"),
-    [
-        (lambda: BallObstacle([0, 0, 0], 0.0), "`radius`"),
-        (lambda: BallObstacle([0, 0, 0], 1.0, friction=-1.0), "`friction`"),
-        (lambda: BallObstacle([0, 0, 0], 1.0, gap=-1.0), "`gap`"),
-        (lambda: CapsuleObstacle([0, 0, 0], [0, 0, 1], -1.0), "`radius`"),
-        (lambda: BoxObstacle([0, 0, 0], [0, 1, 1]), "`min` of the box"),
-        (lambda: HalfSpaceObstacle([0, 0, 0], [0, 0, 0]), "`normal` of the half space"),
-    ],
-)
-def test_bad_obstacles_are_refused(make, message):
-    with pytest.raises(ValueError, match=message):
-        make()
