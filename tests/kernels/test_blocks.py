@@ -13,16 +13,102 @@ NAN, INF = math.nan, math.inf
 
 
 @triton.jit
-def _apply(x_in, y_in, out, count, OPERATION: tl.constexpr, BLOCK: tl.constexpr):
+def _one(x, y, NAME: tl.constexpr):
+    """An operation by its name."""
+    if NAME == "add":
+        return x + y
+    if NAME == "subtract":
+        return x - y
+    if NAME == "multiply":
+        return x * y
+    if NAME == "divide":
+        return x / y
+    if NAME == "divide exactly":
+        return tl.div_rn(x, y)
+    if NAME == "quotient":
+        return x // y
+    if NAME == "remainder":
+        return x % y
+    if NAME == "and":
+        return x & y
+    if NAME == "or":
+        return x | y
+    if NAME == "xor":
+        return x ^ y
+    if NAME == "left":
+        return x << (y & 7)
+    if NAME == "right":
+        return x >> (y & 7)
+    if NAME == "negative":
+        return -x
+    if NAME == "inverted":
+        return ~x
+    if NAME == "absolute":
+        return tl.abs(x)
+    if NAME == "larger":
+        return tl.maximum(x, y)
+    if NAME == "smaller":
+        return tl.minimum(x, y)
+    if NAME == "larger or NaN":
+        return tl.maximum(x, y, propagate_nan=tl.PropagateNan.ALL)
+    if NAME == "smaller or NaN":
+        return tl.minimum(x, y, propagate_nan=tl.PropagateNan.ALL)
+    if NAME == "chosen":
+        return tl.where(x > 0, x, y)
+    if NAME == "root":
+        return tl.sqrt(tl.abs(x))
+    if NAME == "exponential":
+        return tl.exp(x)
+    if NAME == "logarithm":
+        return tl.log(tl.abs(x))
+    if NAME == "sine":
+        return tl.sin(x)
+    if NAME == "cosine":
+        return tl.cos(x)
+    if NAME == "floored":
+        return tl.floor(x)
+    if NAME == "int32":
+        return x.to(tl.int32)
+    if NAME == "int64":
+        return x.to(tl.int64)
+    if NAME == "float32":
+        return x.to(tl.float32)
+    if NAME == "float64":
+        return x.to(tl.float64)
+    if NAME == "truth":
+        return x.to(tl.int1)
+    if NAME == "signs":
+        found = tl.where(x < y, 1, 0) | tl.where(x <= y, 2, 0) | tl.where(x > y, 4, 0)
+        return found | tl.where(x >= y, 8, 0) | tl.where(x == y, 16, 0) | tl.where(x != y, 32, 0)
+    if NAME == "logic":
+        a, b = x > 0, y > 0
+        found = tl.where(a & b, 1, 0) | tl.where(a | b, 2, 0) | tl.where(a ^ b, 4, 0) | tl.where(~a, 8, 0)
+        found = found | tl.where(not b, 16, 0) | tl.where(a and b, 32, 0) | tl.where(a or b, 64, 0)
+        return found | ((a + b) << 7)
+    if NAME == "beside a float":
+        return x + 0.1
+    return x + 1099511627776
+
+
+@triton.jit
+def _apply(x_in, y_in, out, count, NAMES: tl.constexpr, BLOCK: tl.constexpr):
     k = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
     mask = k < count
-    tl.store(out + k, OPERATION(tl.load(x_in + k, mask), tl.load(y_in + k, mask, 1)), mask)
+    for row in tl.static_range(len(NAMES)):
+        value = _one(tl.load(x_in + k, mask), tl.load(y_in + k, mask, 1), NAMES[row])
+        tl.store(out + row * count + k, value, mask)
 
 
-def _applied(operation, x, y, kind, block):
-    out = torch.full((len(x),), 77, dtype=kind)
-    launch(_apply, (-(-len(x) // block),))(x, y, out, len(x), OPERATION=operation, BLOCK=block)
-    return out
+def _rows(names, x, y, kind, block):
+    """What each operation gives, all by one kernel."""
+    out = torch.full((len(names), len(x)), 77, dtype=kind)
+    launch(_apply, (-(-len(x) // block),))(x, y, out, len(x), NAMES=tuple(names), BLOCK=block)
+    return zip(out, names.values() if isinstance(names, dict) else names, strict=True)
+
+
+def _applied(name, x, y, kind, block):
+    ((found, _),) = _rows([name], x, y, kind, block)
+    return found
 
 
 @pytest.fixture(params=[1, 8])
@@ -49,238 +135,83 @@ def _same(found, expected):
     torch.testing.assert_close(found, expected, rtol=0, atol=0, equal_nan=True)
 
 
-# ---- integers
+# ---- numbers
 
 
-@triton.jit
-def _add(x, y):
-    return x + y
-
-
-@triton.jit
-def _subtract(x, y):
-    return x - y
-
-
-@triton.jit
-def _multiply(x, y):
-    return x * y
-
-
-@triton.jit
-def _quotient(x, y):
-    return x // y
-
-
-@triton.jit
-def _remainder(x, y):
-    return x % y
-
-
-@triton.jit
-def _and(x, y):
-    return x & y
-
-
-@triton.jit
-def _or(x, y):
-    return x | y
-
-
-@triton.jit
-def _xor(x, y):
-    return x ^ y
-
-
-@triton.jit
-def _left(x, y):
-    return x << (y & 7)
-
-
-@triton.jit
-def _right(x, y):
-    return x >> (y & 7)
-
-
-@triton.jit
-def _negative(x, y):
-    return -x
-
-
-@triton.jit
-def _inverted(x, y):
-    return ~x
-
-
-@triton.jit
-def _absolute(x, y):
-    return tl.abs(x)
-
-
-@triton.jit
-def _larger(x, y):
-    return tl.maximum(x, y)
-
-
-@triton.jit
-def _smaller(x, y):
-    return tl.minimum(x, y)
-
-
-WHOLE = {
-    _add: torch.add,
-    _subtract: torch.sub,
-    _multiply: torch.mul,
-    _quotient: lambda x, y: torch.div(x, y, rounding_mode="trunc"),  # as in C, and in Triton
-    _remainder: torch.fmod,
-    _and: torch.bitwise_and,
-    _or: torch.bitwise_or,
-    _xor: torch.bitwise_xor,
-    _left: lambda x, y: x << (y & 7),
-    _right: lambda x, y: x >> (y & 7),
-    _negative: lambda x, y: -x,
-    _inverted: lambda x, y: ~x,
-    _absolute: lambda x, y: x.abs(),
-    _larger: torch.maximum,
-    _smaller: torch.minimum,
+BOTH = {
+    "add": torch.add,
+    "subtract": torch.sub,
+    "multiply": torch.mul,
+    "negative": lambda x, y: -x,
+    "absolute": lambda x, y: x.abs(),
+}
+WHOLE = BOTH | {
+    "quotient": lambda x, y: torch.div(x, y, rounding_mode="trunc"),  # as in C, and in Triton
+    "remainder": torch.fmod,
+    "and": torch.bitwise_and,
+    "or": torch.bitwise_or,
+    "xor": torch.bitwise_xor,
+    "left": lambda x, y: x << (y & 7),
+    "right": lambda x, y: x >> (y & 7),
+    "inverted": lambda x, y: ~x,
+    "larger": torch.maximum,
+    "smaller": torch.minimum,
+}
+REAL = BOTH | {
+    "divide": torch.div,
+    "divide exactly": torch.div,
+    "larger": torch.fmax,
+    "smaller": torch.fmin,
+    "larger or NaN": torch.maximum,
+    "smaller or NaN": torch.minimum,
+    "chosen": lambda x, y: torch.where(x > 0, x, y),
 }
 
 
-@pytest.mark.parametrize("kind", [torch.int32, torch.int64], ids=str)
-@pytest.mark.parametrize("operation", WHOLE, ids=lambda one: one.__name__)
-def test_integers(operation, kind, block):
-    x, y = _whole(kind)
-    _same(_applied(operation, x, y, kind, block), WHOLE[operation](x, y))
+@pytest.mark.parametrize("kind", [torch.int32, torch.int64, torch.float32, torch.float64], ids=str)
+def test_operations(kind, block):
+    """Also of NaN and infinity."""
+    x, y = _real(kind) if kind.is_floating_point else _whole(kind)
+    for found, expected in _rows(REAL if kind.is_floating_point else WHOLE, x, y, kind, block):
+        _same(found, expected(x, y))
 
 
 def test_integers_wrap(block):
     x = torch.full((9,), 2**31 - 1, dtype=torch.int32)
-    _same(_applied(_add, x, x, torch.int32, block), torch.full_like(x, -2))
-    _same(_applied(_add, x, x, torch.int64, block), torch.full((9,), -2))  # converted afterwards
+    _same(_applied("add", x, x, torch.int32, block), torch.full_like(x, -2))
+    _same(_applied("add", x, x, torch.int64, block), torch.full((9,), -2))  # converted afterwards
     wide = x.long()
-    _same(_applied(_add, wide, x, torch.int64, block), torch.full((9,), 2**32 - 2))
-
-
-# ---- floating point numbers
-
-
-@triton.jit
-def _divide(x, y):
-    return x / y
-
-
-@triton.jit
-def _divide_exactly(x, y):
-    return tl.div_rn(x, y)
-
-
-@triton.jit
-def _larger_or_nan(x, y):
-    return tl.maximum(x, y, propagate_nan=tl.PropagateNan.ALL)
-
-
-@triton.jit
-def _smaller_or_nan(x, y):
-    return tl.minimum(x, y, propagate_nan=tl.PropagateNan.ALL)
-
-
-@triton.jit
-def _chosen(x, y):
-    return tl.where(x > 0, x, y)
-
-
-REAL = {
-    _add: torch.add,
-    _subtract: torch.sub,
-    _multiply: torch.mul,
-    _divide: torch.div,
-    _divide_exactly: torch.div,
-    _negative: lambda x, y: -x,
-    _absolute: lambda x, y: x.abs(),
-    _larger: torch.fmax,
-    _smaller: torch.fmin,
-    _larger_or_nan: torch.maximum,
-    _smaller_or_nan: torch.minimum,
-    _chosen: lambda x, y: torch.where(x > 0, x, y),
-}
-
-
-@pytest.mark.parametrize("kind", [torch.float32, torch.float64], ids=str)
-@pytest.mark.parametrize("operation", REAL, ids=lambda one: one.__name__)
-def test_floating_point_numbers(operation, kind, block):
-    """Also NaN and infinity."""
-    x, y = _real(kind)
-    _same(_applied(operation, x, y, kind, block), REAL[operation](x, y))
+    _same(_applied("add", wide, x, torch.int64, block), torch.full((9,), 2**32 - 2))
 
 
 def test_a_negative_zero_is_kept(block):
     zero = torch.zeros(9)
-    assert bool(torch.signbit(_applied(_negative, zero, zero, torch.float32, block)).all())
-
-
-@triton.jit
-def _root(x, y):
-    return tl.sqrt(tl.abs(x))
-
-
-@triton.jit
-def _exponential(x, y):
-    return tl.exp(x)
-
-
-@triton.jit
-def _logarithm(x, y):
-    return tl.log(tl.abs(x))
-
-
-@triton.jit
-def _sine(x, y):
-    return tl.sin(x)
-
-
-@triton.jit
-def _cosine(x, y):
-    return tl.cos(x)
-
-
-@triton.jit
-def _floored(x, y):
-    return tl.floor(x)
+    assert bool(torch.signbit(_applied("negative", zero, zero, torch.float32, block)).all())
 
 
 FUNCTIONS = {
-    _root: lambda x: x.abs().sqrt(),
-    _exponential: torch.exp,
-    _logarithm: lambda x: x.abs().log(),
-    _sine: torch.sin,
-    _cosine: torch.cos,
-    _floored: torch.floor,
+    "root": lambda x: x.abs().sqrt(),
+    "exponential": torch.exp,
+    "logarithm": lambda x: x.abs().log(),
+    "sine": torch.sin,
+    "cosine": torch.cos,
+    "floored": torch.floor,
 }
 
 
 @pytest.mark.parametrize("kind", [torch.float32, torch.float64], ids=str)
-@pytest.mark.parametrize("operation", FUNCTIONS, ids=lambda one: one.__name__)
-def test_functions(operation, kind, block):
+def test_functions(kind, block):
     """To two units in the last place; those of integers are floating point numbers."""
     x = torch.linspace(-20, 20, 43, dtype=torch.float64).to(kind)
-    exact = FUNCTIONS[operation](x.double())
-    torch.testing.assert_close(
-        _applied(operation, x, x, kind, block).double(), exact, rtol=2 * torch.finfo(kind).eps, atol=1e-300
-    )
+    for found, exact in _rows(FUNCTIONS, x, x, kind, block):
+        rtol = 2 * torch.finfo(kind).eps
+        torch.testing.assert_close(found.double(), exact(x.double()), rtol=rtol, atol=1e-300)
     whole = torch.arange(-9, 10, dtype=torch.int32)
-    exact = FUNCTIONS[operation](whole.double())
-    torch.testing.assert_close(
-        _applied(operation, whole, whole, torch.float32, block).double(), exact, rtol=3e-7, atol=1e-12
-    )
+    for found, exact in _rows(FUNCTIONS, whole, whole, torch.float32, block):
+        torch.testing.assert_close(found.double(), exact(whole.double()), rtol=3e-7, atol=1e-12)
 
 
 # ---- comparisons and truth
-
-
-@triton.jit
-def _signs(x, y):
-    found = tl.where(x < y, 1, 0) | tl.where(x <= y, 2, 0) | tl.where(x > y, 4, 0)
-    return found | tl.where(x >= y, 8, 0) | tl.where(x == y, 16, 0) | tl.where(x != y, 32, 0)
 
 
 @pytest.mark.parametrize("kind", [torch.int32, torch.int64, torch.float32, torch.float64], ids=str)
@@ -290,15 +221,7 @@ def test_comparisons(kind, block):
     x[7] = y[7]
     found = torch.stack([x < y, x <= y, x > y, x >= y, x == y, x != y])
     bits = 2 ** torch.arange(6, dtype=torch.int32)[:, None]
-    _same(_applied(_signs, x, y, torch.int32, block), (found * bits).sum(0, dtype=torch.int32))
-
-
-@triton.jit
-def _logic(x, y):
-    a, b = x > 0, y > 0
-    found = tl.where(a & b, 1, 0) | tl.where(a | b, 2, 0) | tl.where(a ^ b, 4, 0) | tl.where(~a, 8, 0)
-    found = found | tl.where(not b, 16, 0) | tl.where(a and b, 32, 0) | tl.where(a or b, 64, 0)
-    return found | ((a + b) << 7)
+    _same(_applied("signs", x, y, torch.int32, block), (found * bits).sum(0, dtype=torch.int32))
 
 
 def test_logic(block):
@@ -308,35 +231,10 @@ def test_logic(block):
     rows = torch.stack([a & b, a | b, a ^ b, ~a, ~b, a & b, a | b]).int()
     bits = 2 ** torch.arange(7, dtype=torch.int32)[:, None]
     expected = (rows * bits).sum(0, dtype=torch.int32) + 128 * (a.int() + b.int())
-    _same(_applied(_logic, x, y, torch.int32, block), expected)
+    _same(_applied("logic", x, y, torch.int32, block), expected)
 
 
 # ---- types
-
-
-@triton.jit
-def _to_int32(x, y):
-    return x.to(tl.int32)
-
-
-@triton.jit
-def _to_int64(x, y):
-    return x.to(tl.int64)
-
-
-@triton.jit
-def _to_float32(x, y):
-    return x.to(tl.float32)
-
-
-@triton.jit
-def _to_float64(x, y):
-    return x.to(tl.float64)
-
-
-@triton.jit
-def _to_truth(x, y):
-    return x.to(tl.int1)
 
 
 def test_floats_become_the_nearest_integers(block):
@@ -344,52 +242,37 @@ def test_floats_become_the_nearest_integers(block):
     x = torch.tensor([1.9, -1.9, 3e9, -3e9, 1e30, INF, -INF, NAN, 0.4])
     low, high = -(2**31), 2**31 - 1
     expected = torch.tensor([1, -1, high, low, high, high, low, 0, 0], dtype=torch.int32)
-    _same(_applied(_to_int32, x, x, torch.int32, block), expected)
+    _same(_applied("int32", x, x, torch.int32, block), expected)
     low, high = -(2**63), 2**63 - 1
     expected = torch.tensor([1, -1, 3_000_000_000, -3_000_000_000, high, high, low, 0, 0])
-    _same(_applied(_to_int64, x, x, torch.int64, block), expected)
+    _same(_applied("int64", x, x, torch.int64, block), expected)
 
 
 def test_conversions(block):
     whole = torch.tensor([0, 1, -1, 2**31 + 5, -(2**40) - 3, 7, 8, 9, 10])
-    _same(_applied(_to_int32, whole, whole, torch.int32, block), whole.int())
-    _same(_applied(_to_float32, whole, whole, torch.float32, block), whole.float())
-    _same(_applied(_to_float64, whole, whole, torch.float64, block), whole.double())
+    _same(_applied("int32", whole, whole, torch.int32, block), whole.int())
+    _same(_applied("float32", whole, whole, torch.float32, block), whole.float())
+    _same(_applied("float64", whole, whole, torch.float64, block), whole.double())
     real = torch.tensor([0.0, -0.0, NAN, INF, 0.1, 1e-40, -3.0, 2.0, 1e30])
-    _same(_applied(_to_float64, real, real, torch.float64, block), real.double())
-    _same(_applied(_to_float32, real.double() / 3, real, torch.float32, block), (real.double() / 3).float())
-    _same(_applied(_to_truth, real, real, torch.bool, block), real != 0)
+    _same(_applied("float64", real, real, torch.float64, block), real.double())
+    _same(_applied("float32", real.double() / 3, real, torch.float32, block), (real.double() / 3).float())
+    _same(_applied("truth", real, real, torch.bool, block), real != 0)
     truth = torch.tensor([True, False] * 5)
-    _same(_applied(_to_float32, truth, truth, torch.float32, block), truth.float())
-    _same(_applied(_to_int64, truth, truth, torch.int64, block), truth.long())  # 1, not -1
+    _same(_applied("float32", truth, truth, torch.float32, block), truth.float())
+    _same(_applied("int64", truth, truth, torch.int64, block), truth.long())  # 1, not -1
     small = torch.tensor([-3, 5, 127, -128, 0, 1, 2, 3, 4], dtype=torch.int8)
-    _same(_applied(_to_int32, small, small, torch.int32, block), small.int())
-
-
-@triton.jit
-def _beside_a_float(x, y):
-    return x + 0.1
-
-
-@triton.jit
-def _beside_a_large_integer(x, y):
-    return x + 1099511627776
-
-
-@triton.jit
-def _mixed(x, y):
-    return x * y
+    _same(_applied("int32", small, small, torch.int32, block), small.int())
 
 
 def test_a_number_takes_the_type_of_the_block(block):
     """So 0.1 is one of float64 beside such a block, and 2^40 no integer of 32 bits."""
     x = torch.arange(9)
-    _same(_applied(_beside_a_float, x.double(), x, torch.float64, block), x.double() + 0.1)
-    _same(_applied(_beside_a_float, x.int(), x, torch.float32, block), x.float() + 0.1)
-    _same(_applied(_beside_a_large_integer, x.int(), x, torch.int64, block), x + 2**40)
+    _same(_applied("beside a float", x.double(), x, torch.float64, block), x.double() + 0.1)
+    _same(_applied("beside a float", x.int(), x, torch.float32, block), x.float() + 0.1)
+    _same(_applied("beside a large integer", x.int(), x, torch.int64, block), x + 2**40)
     third = x.double() / 3
-    _same(_applied(_mixed, x.int(), third, torch.float64, block), x * third)
-    _same(_applied(_mixed, third.float(), third, torch.float64, block), third.float().double() * third)
+    _same(_applied("multiply", x.int(), third, torch.float64, block), x * third)
+    _same(_applied("multiply", third.float(), third, torch.float64, block), third.float().double() * third)
 
 
 # ---- over all lanes
