@@ -7,7 +7,7 @@ import re
 import subprocess
 import sys
 import warnings
-from argparse import ArgumentError, ArgumentParser
+from argparse import ArgumentError
 from pathlib import Path
 
 import numpy as np
@@ -192,12 +192,6 @@ def test_the_program_with_broken_streams(tmp_path, line, ended):
     assert shell(line, tmp_path)[:2] == ended
 
 
-def test_the_program_on_a_stream_of_ascii(tmp_path):
-    code, _, printed = shell("sim.py --help", tmp_path, PYTHONIOENCODING="ascii")
-    assert code == 0
-    assert "Density [kg/m3]" in printed
-
-
 # ---- guesses
 
 
@@ -216,20 +210,6 @@ def test_a_misspelt_option_is_guessed(arguments, guess):
     with pytest.raises(ArgumentError, match="did you mean") as caught, guessing(parser):
         parser.parse_args(arguments)
     assert guess in str(caught.value)
-
-
-def test_no_guess_where_nothing_is_close():
-    parser = Simulation.parser()
-    with pytest.raises(ArgumentError) as caught, guessing(parser):
-        parser.parse_args(["--quite_another_thing", "3"])
-    assert "did you mean" not in str(caught.value)
-
-
-def test_options_of_argparse_with_dashes():
-    parser = ArgumentParser(exit_on_error=False)
-    parser.add_argument("--longest-side")
-    with pytest.raises(ArgumentError, match=r"did you mean --longest-side\?"), guessing(parser):
-        raise ArgumentError(None, "unrecognized arguments: --longest-sid 3")
 
 
 def test_the_page_tells_how_to_complete(tmp_path):

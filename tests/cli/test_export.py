@@ -1,7 +1,6 @@
 """The command line of the converter."""
 
 import json
-import sys
 
 import pytest
 import torch
@@ -11,23 +10,6 @@ from gaussian_swaying.cli.export import main
 from gaussian_swaying.gaussians.formats import read_gaussians
 from gaussian_swaying.gaussians.ply import read_ply, write_ply
 from gaussian_swaying.scenes.procedural import FlagScene
-
-
-def test_a_file_and_a_sentence(tmp_path, capsys):
-    write_ply(tmp_path / "flag.ply", FlagScene(spacing=0.1).generate())
-    target = tmp_path / "flag.splat"
-    assert main([str(tmp_path / "flag.ply"), str(target)]) == 0
-    assert target.stat().st_size == 96 * 32
-    assert capsys.readouterr().out == f"wrote {target}\n"
-    refused(main, [str(tmp_path / "none.ply"), str(target)], capsys, "none.ply does not exist")
-
-
-def test_usd_without_its_library_is_not_called_a_bug(tmp_path, capsys, monkeypatch):
-    for name in ("pxr", "pxr.Usd"):
-        monkeypatch.setitem(sys.modules, name, None)
-    write_ply(tmp_path / "flag.ply", FlagScene(spacing=0.1).generate())
-    sentence = "error: USD files need usd-core: run pip install 'gaussian-swaying[usd]', or choose another format.\n"
-    refused(main, [str(tmp_path / "flag.ply"), str(tmp_path / "a.usdc")], capsys, sentence, folder=tmp_path)
 
 
 def _run(folder, **changes):

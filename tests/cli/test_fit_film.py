@@ -1,7 +1,6 @@
 """``gaussian-swaying fit FILM --splat SPLAT``: what it writes before the fit, what it asks for, and the result."""
 
 import dataclasses
-import math
 import subprocess
 from types import SimpleNamespace
 
@@ -16,7 +15,7 @@ from shared import refused
 
 from gaussian_swaying.cli import fit_film
 from gaussian_swaying.cli.fit import main
-from gaussian_swaying.cli.fit_film import Seen, extent, longest_side, plan_text, upright_in
+from gaussian_swaying.cli.fit_film import Seen, longest_side, plan_text, upright_in
 from gaussian_swaying.cli.preview import build_options, preview_scene
 from gaussian_swaying.cli.register import painter_of
 from gaussian_swaying.fitting.before import HELD, MOVING
@@ -130,14 +129,6 @@ def test_lengths_of_nothing(seen, name, told):
         longest_side(name, 2.0, *seen)
 
 
-def test_the_extent_does_not_depend_on_the_turn():
-    """A square cloth is as long as its side, however it is turned about the vertical, and not as its diagonal."""
-    share = torch.rand(4000, 2, generator=torch.Generator().manual_seed(0))
-    for angle in (0.0, 0.5, 0.785):
-        points = torch.stack([share[:, 0] * math.cos(angle), share[:, 0] * math.sin(angle), share[:, 1]], 1)
-        assert extent(points, [0.0, 0.0, 1.0]) == pytest.approx(1.0, abs=0.01)
-
-
 def test_a_fit_without_a_length_keeps_the_edited_file(case, checked, capsys):
     """A very small fit to its end: the page, and the sentences on what the values rest on."""
     edited = (checked / "fit.yaml").read_text() + "tracks: 30\n"
@@ -231,10 +222,3 @@ def test_a_film_is_not_upside_down():
     assert upright_in(level, [0.0, -1.0, 0.0]) == ["+z"]
     tilted = look_at_camera((0.0, -3.0, 0.0), (0.0, 0.0, 0.0), (0.7, 0.0, 0.7), 40.0, 20, 10)
     assert [float(part) for part in upright_in(tilted, [0.0, 0.0, -1.0])] == pytest.approx([0.707, 0, 0.707], abs=0.01)
-
-
-def test_a_film_that_may_begin_in_motion_is_doubted(seen, tmp_path):
-    text = plan_text(seen[1], [0.1, 0.2, 0.3], None, True, tmp_path)
-    plan = yaml.safe_load(text)
-    assert plan["assumed"] == ["mass", "camera"]
-    assert plan["unknowns"]["film.start"]["range"] == [-1.0, 0.1]

@@ -6,8 +6,6 @@ import pytest
 from shared import refused
 
 from gaussian_swaying.cli.export import main
-from gaussian_swaying.cli.scene import words_of
-from gaussian_swaying.simulation.simulation import Simulation
 
 SMALL = ["--scene.generator.init_args.spacing=0.05", "--solver.dx", "0.2", "--material.E=9e3"]
 
@@ -58,16 +56,3 @@ def test_a_target_says_that_it_takes_the_points_of_the_grid(tmp_path, capsys):
     page = str(tmp_path / "page.html")
     assert main(["--live-web", "flag", page, "--target", "phone", *SMALL, "--scene.points", "gaussian"]) == 0
     assert " grid, with `scene.points: grid`, for a phone: " in capsys.readouterr().out
-
-
-def test_a_folder_with_the_name_of_the_page(tmp_path, capsys):
-    page = tmp_path / "page.html"
-    page.mkdir()
-    assert main(["--live-web", "flag", str(page)]) == 2
-    assert "page.html to be a file, but it is a folder: move it away." in capsys.readouterr().err
-
-
-def test_words_and_options_in_any_order():
-    parser = Simulation.parser()
-    words, further = words_of(parser, ["a.yaml", "--solver.dx", "0.1", "b.html", "--material.E=3", "--print_config"])
-    assert (words, further) == (["a.yaml", "b.html"], ["--solver.dx", "0.1", "--material.E=3", "--print_config"])

@@ -16,7 +16,6 @@ from gaussian_swaying.cli.preview import main
 from gaussian_swaying.cli.simulate import main as simulate
 from gaussian_swaying.gaussians.ply import write_ply
 from gaussian_swaying.preview.cost import Cost
-from gaussian_swaying.preview.results import splat_name
 from gaussian_swaying.scenes.procedural import FlagScene
 
 ROOT = Path(__file__).parents[2]
@@ -222,16 +221,6 @@ def test_a_configuration_is_previewed_as_it_is(splat, tmp_path, capsys):
     assert not (tmp_path / "out/starter.yaml").exists()
 
 
-def test_normalised_space_is_honoured(splat, tmp_path):
-    """The pole side of the flag lies at x = 0.5 where the longest side is 1 and the centre at 1."""
-    pin = {"class_path": "PinnedRegion", "init_args": {"region": {"class_path": "Box", "init_args": {
-        "min": [0.49, 0, 0], "max": [0.52, 2, 2]}}}}  # fmt: skip
-    mine = tmp_path / "mine.yaml"
-    mine.write_text(yaml.safe_dump({"normalisation": {"scale": 1.0}, "solver": {"dx": 0.15, "boundaries": [pin]}}))
-    assert preview(splat, tmp_path / "out", "--config", str(mine)) == 0
-    assert json.loads((tmp_path / "out/preview.json").read_text())["run"]["held"] == 10
-
-
 def test_bad_input_is_one_sentence(splat, tmp_path, capsys):
     broken = tmp_path / "broken.ply"
     broken.write_text("not a splat")
@@ -268,28 +257,6 @@ def test_bad_input_is_one_sentence(splat, tmp_path, capsys):
         check_refused(scene, tmp_path, capsys, *options, words=words)
 
 
-def test_a_point_cloud_is_called_after_its_training():
-    assert splat_name("splats/guitar.ply") == "guitar"
-    assert splat_name("outputs/train/fox/point_cloud.ply") == "fox"
-    assert splat_name("/data/bonsai/point_cloud/iteration_30000/point_cloud.ply") == "bonsai"
-    assert [splat_name(f"/data/playbot/{name}.json") for name in ("meta", "lod-meta")] == ["playbot", "playbot"]
-
-
-def test_weak_guesses_print_their_commands(splat, tmp_path, capsys):
-    """A flag whose origin is far from its pole may hang from its top."""
-    cloud = FlagScene(spacing=0.08).generate()
-    cloud.means.add_(5.0)
-    write_ply(splat, cloud)
-    assert preview(splat, tmp_path / "out", "--up", "+z") == 0
-    report = capsys.readouterr().out
-    assert "warning: that it is held at the top is a weak guess" in report
-    again = f"python tools/preview.py {splat} --output {tmp_path / 'out'} --up +z --hold"
-    for end in ("top", "-x"):
-        assert f"{again} {end} --height 96 --device cpu" in report
-    assert preview(splat, tmp_path / "out", "--up", "+z", "--hold", "-x") == 0
-    assert "weak guess" not in capsys.readouterr().out
-
-
 def test_a_note_on_infinite_opacities_is_for_the_preview_alone(tmp_path, capsys):
     """Once, though the file is read again for the scene; a run of the splat does not repeat it."""
     cloud = FlagScene(spacing=0.1).generate()
@@ -304,18 +271,3 @@ def test_a_note_on_infinite_opacities_is_for_the_preview_alone(tmp_path, capsys)
     small = ["--camera.init_args.width=16", "--camera.init_args.height=9", "--device=cpu", "--frames=1"]
     assert simulate(["--config", str(tmp_path / "out/starter.yaml"), *small, f"--output={tmp_path / 'run'}"]) == 0
     assert "infinite logit" not in "".join(capsys.readouterr())
-
-
-def test_what_computed_air_costs_is_said(splat, tmp_path, capsys):
-    pin = {"class_path": "PinnedRegion", "init_args": {"region": {"class_path": "Box", "init_args": {
-        "min": [None] * 3, "max": [0.1, None, None]}}}}  # fmt: skip
-    mine = tmp_path / "mine.yaml"
-    mine.write_text(yaml.safe_dump({"frames": 2, "solver": {"dx": 0.2, "boundaries": [pin]},
-        "wind": {"flow": [1.0, 2.0, 0.0]}, "recorder": {"images": False, "video": False},
-        "air": {"low": [-2.0, -2.0, -2.0], "high": [3.0, 2.0, 2.0], "cells": 40}}))  # fmt: skip
-    assert preview(splat, tmp_path / "out", "--config", str(mine)) == 0
-    (line,) = [line for line in capsys.readouterr().out.splitlines() if line.startswith("  air  ")]
-    told = json.loads((tmp_path / "out/preview.json").read_text())["run"]["air"]
-    assert line.endswith(told)
-    assert "40 x 32 x 32 cells of 12.5 cm" in told
-    assert "Reynolds number" in told

@@ -7,7 +7,6 @@ import os
 import shlex
 import shutil
 import signal
-import subprocess
 import sys
 from pathlib import Path
 
@@ -18,11 +17,9 @@ from lightning.pytorch.utilities.rank_zero import rank_zero_info, rank_zero_warn
 from shared import contents
 
 from gaussian_swaying.captures.generated_capture import GeneratedCapture
-from gaussian_swaying.cli.errors import parser_sentence
 from gaussian_swaying.cli.train import main, make_cli
 from gaussian_swaying.gaussians.ply import read_ply
 from gaussian_swaying.runs.lock import FolderLock
-from gaussian_swaying.runs.seal import seal
 from gaussian_swaying.runs.signals import StoppedBySignal
 from gaussian_swaying.training.finite import TrainingDiverged
 from gaussian_swaying.training.module import SplatTrainer
@@ -74,11 +71,6 @@ def test_every_shipped_configuration_builds(config, tmp_path, monkeypatch):
 CONFIGS_DEFAULT = ROOT / "configs/train/default.yaml"
 
 
-def test_there_are_configurations():
-    assert {path.stem for path in CONFIGS} >= {"default", "7k", "flag", "fox", "photos_cpu", "quick_cpu"}
-    assert yaml.safe_load(CONFIGS_DEFAULT.read_text())["trainer"]["max_steps"] == 60_000
-
-
 def test_the_recipe_for_photos_runs_on_a_capture(capture, tmp_path, capsys):
     """A few images: points at which the photos agree, and a splat at the end."""
     given = ["--data.init_args.path", str(capture), "--data.init_args.downscale", "2"]
@@ -88,18 +80,6 @@ def test_the_recipe_for_photos_runs_on_a_capture(capture, tmp_path, capsys):
     assert "next: " in capsys.readouterr().out
     assert len(read_ply(tmp_path / "point_cloud.ply")) == 200
     assert (tmp_path / "panels" / "val_00_000004.png").exists()
-
-
-def test_on_several_devices_numbers_still_count_images(capture, tmp_path):
-    """Of which a step of Lightning takes one on each; the configuration that is kept is the one that was given."""
-    numbers = {"trainer.max_steps": 21, "trainer.val_check_interval": 8, "checkpoint.every_n_train_steps": 10}
-    cli = make_cli(_arguments(capture, tmp_path, **numbers, **{"trainer.devices": 2}), run=False)
-    assert cli.trainer.world_size == 2
-    assert (cli.trainer.max_steps, cli.trainer.val_check_interval) == (11, 4)
-    assert "'every_n_train_steps': 5" in cli.trainer.checkpoint_callback.state_key
-    cli.run_folder.save_config(tmp_path)
-    kept = yaml.safe_load((tmp_path / "config.yaml").read_text())
-    assert {name: kept[name.split(".")[0]][name.split(".")[1]] for name in numbers} == numbers
 
 
 def test_the_last_image_is_in_a_checkpoint(capture, tmp_path):
@@ -249,43 +229,6 @@ def test_a_second_training_moves_the_first_aside(capture, tmp_path, capsys):
     assert old.exists()
 
 
-class _Fuse:
-    """Executes code when it is unpickled."""
-
-    def __init__(self, path):
-        self.path = path
-
-    def __reduce__(self):
-        return open, (str(self.path), "w")
-
-
-@pytest.mark.slow(gate=[".ckpt-fit", "-validate"])
-@pytest.mark.parametrize("command", ["fit", "validate", "test"])
-@pytest.mark.parametrize("suffix", [".ckpt", ""])
-def test_a_checkpoint_executes_no_code(command, suffix, capture, tmp_path, capsys):
-    """Neither in the check before nor by Lightning, which is asked alone too."""
-    file, burnt = tmp_path / f"evil{suffix}", tmp_path / "burnt"
-    torch.save({"splat_training": {}, "state_dict": {}, "fuse": _Fuse(burnt)}, file)
-    for sealed in (False, True):
-        if sealed:
-            seal(file)
-        assert main([command, *_arguments(capture, tmp_path / "run"), f"--ckpt_path={file}"]) == 2
-        assert "cannot be read as a checkpoint" in capsys.readouterr().err
-        cli = make_cli([*_arguments(capture, tmp_path / "run")], run=False)
-        with pytest.raises(ValueError, match="cannot be read as a checkpoint"):
-            getattr(cli.trainer, command)(cli.model, datamodule=cli.datamodule, ckpt_path=file)
-    assert not burnt.exists()
-    assert not (tmp_path / "run").exists()
-
-
-@pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="needs named pipes")
-@pytest.mark.timeout(60)
-def test_a_pipe_as_checkpoint_keeps_nobody_waiting(capture, tmp_path, capsys):
-    os.mkfifo(tmp_path / "pipe.ckpt")
-    assert main(["fit", *_arguments(capture, tmp_path / "run"), f"--ckpt_path={tmp_path / 'pipe.ckpt'}"]) == 2
-    assert "is a named pipe" in capsys.readouterr().err
-
-
 def test_lightning_does_not_advertise(caplog):
     """Its tips are left out, what it has to say is not."""
     silence_advertisements()
@@ -299,11 +242,6 @@ def test_lightning_does_not_advertise(caplog):
     said = {record.getMessage() for record in caplog.records}
     assert "GPU available: False" in said
     assert not any("litlogger" in message for message in said)
-
-
-def test_the_message_of_a_worker_is_one_sentence():
-    text = 'Caught ValueError in DataLoader worker process 0.\nOriginal\n  File "x"\nValueError: The image is cut.\n'
-    assert parser_sentence(text) == "The image is cut."
 
 
 OWN = """
@@ -360,15 +298,3 @@ def test_bad_settings(options, words, capture, tmp_path, capsys):
     for word in words:
         assert word in error, error
     assert error.count("\n") == 1
-
-
-@pytest.mark.slow
-def test_the_tool_as_a_program(tmp_path):
-    environment = {**os.environ, "PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1"}
-    command = [sys.executable, str(ROOT / "tools/train.py"), "fit", "--config", str(QUICK), "--trainer.max_steps=many"]
-    done = subprocess.run(command, cwd=tmp_path, env=environment, capture_output=True, text=True, check=False)
-    assert done.returncode == 2
-    assert "error: " in done.stderr
-    assert "max_steps" in done.stderr
-    assert "Traceback" not in done.stderr
-    assert list(tmp_path.iterdir()) == []

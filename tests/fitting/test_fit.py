@@ -206,20 +206,6 @@ def test_resume_needs_the_same_plan(own, tmp_path):
         run_fit(other, tmp_path / "fit", resume=True, device="cpu", progress=False)
 
 
-def test_progress_of_another_version_is_refused(own, tmp_path):
-    sought = [read_unknown("wind.speed", SOUGHT["wind.speed"])]
-    known = {"wind.flow": (4.0, 3.0, 0.0)}  # JSON has lists
-    plan = Plan([str(own / "base.yaml")], [str(own / "video")], sought, known=known, search=0, iterations=1, tracks=40)
-    run_fit(plan, tmp_path / "fit", device="cpu", progress=False)
-    run_fit(plan, tmp_path / "fit", resume=True, device="cpu", progress=False)
-    file = tmp_path / "fit/fit.json"
-    kept = json.loads(file.read_text())
-    for broken in ({}, kept | {"course": {"step": 0}}):
-        file.write_text(json.dumps(broken))
-        with pytest.raises(ValueError, match="another version of the program: leave out --resume"):
-            run_fit(plan, tmp_path / "fit", resume=True, device="cpu", progress=False)
-
-
 def test_an_earlier_fit_beside_what_is_needed_is_not_moved(own, tmp_path):
     """Or the base would be gone, and the third time there is none."""
     shutil.copy(own / "base.yaml", tmp_path / "base.yaml")

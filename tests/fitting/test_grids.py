@@ -43,12 +43,6 @@ def test_points_count_by_how_far_another_grid_moves_them(own, simulation, left):
     torch.testing.assert_close(values["less"], expected[:, None] * values["own"], rtol=1e-3, atol=1e-4)
 
 
-def test_without_other_grids_or_points_nothing_changes(simulation, left):
-    assert trusted(simulation, [], [left], {}, left.video.times[:3]) == [left]
-    pictures = PictureEvidence(left.video, masks=True)
-    assert trusted(simulation, [simulation], [pictures], {}, left.video.times[:3]) == [pictures]
-
-
 def test_a_grid_on_which_the_scene_diverges_says_nothing(simulation, left, monkeypatch):
     from gaussian_swaying.fitting import grids
 

@@ -1,7 +1,5 @@
 """Films as a fit takes them: which of them are changed, and what is said of it."""
 
-import math
-
 import pytest
 import torch
 from bench.problems.films import shaken
@@ -57,16 +55,6 @@ def test_a_hand_is_noticed_unless_the_file_says_otherwise(folder, simulation):
     assert found.cameras is video.cameras
     (still,) = read_videos(folder / "tripod")
     assert prepared(simulation, [still], hand_held=True)[1][0].hand_held
-
-
-def test_without_a_background_nothing_changes(folder, tmp_path):
-    simulation = Simulation.from_yaml(write_base(tmp_path, wall=math.inf), device="cpu")
-    videos = read_videos(folder / "hand")
-    found, judged = prepared(simulation, videos)
-    assert found[0] is videos[0]
-    assert judged == []
-    with pytest.raises(ValueError, match="`hand_held` needs something that stands still"):
-        prepared(simulation, videos, hand_held=True)
 
 
 def test_without_opencv_nothing_changes(folder, simulation, monkeypatch):

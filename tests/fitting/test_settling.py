@@ -58,12 +58,6 @@ def test_iterations_that_ran_out_on_the_way_are_told_with_the_remedy():
     assert found.count(". ") == 0
 
 
-def test_a_last_step_that_was_rejected_is_told_with_another_remedy():
-    found = _told(_fitted(1), NO_STEP)
-    for words in ("not settled", "no step lowered the cost", "`pixels` last", "`start`"):
-        assert words in found
-
-
 def test_a_direction_that_nothing_shows_is_not_called_unsettled():
     """The step along it may be large, but it gains nothing; `not_determined` names such an unknown."""
 

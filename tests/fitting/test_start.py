@@ -12,7 +12,7 @@ from gaussian_swaying.fitting.evidence import TrackEvidence, compare, compare_st
 from gaussian_swaying.fitting.fit import Course, Fit, fit
 from gaussian_swaying.fitting.plan import Plan
 from gaussian_swaying.fitting.tracks import track
-from gaussian_swaying.fitting.unknowns import FILM_START, Unknown, default_scale
+from gaussian_swaying.fitting.unknowns import FILM_START, Unknown
 from gaussian_swaying.fitting.variants import states_of
 from gaussian_swaying.fitting.videos import read_videos
 
@@ -89,11 +89,6 @@ def test_variants_that_start_at_other_times(simulation):
     assert [float(state.time) for state in between] == pytest.approx([0, 0.5 / 24, 1.5 / 24, 2.5 / 24, 3.5 / 24])
 
 
-def test_a_start_has_a_linear_range_in_seconds():
-    assert default_scale(FILM_START, 0.1) == "linear"
-    assert Unknown(FILM_START, -0.1, 1.0).unit == "s"
-
-
 def test_a_film_that_begins_in_motion(own, cut, tmp_path):
     """The wind has blown for some frames; how long is found with the rest, and the note says that it is needed."""
     sought = {"wind.speed": [2.0, 12.0], "material.E": [2e3, 5e4], FILM_START: [-0.4, 0.2]}
@@ -103,16 +98,6 @@ def test_a_film_that_begins_in_motion(own, cut, tmp_path):
     assert result.values["wind.speed"] == pytest.approx(TRUTH["wind.speed"], rel=0.02)
     assert result.values["material.E"] == pytest.approx(TRUTH["material.E"], rel=0.03)
     assert json.loads((tmp_path / "fit/fit.json").read_text())["course"]["first"]
-
-
-def test_a_film_in_motion_begins_at_the_start_that_was_given(own, cut, simulation):
-    """Without a search, too, points are followed from where they are in the first frame."""
-    sought = [Unknown("wind.speed", 2.0, 12.0, start=5.0), Unknown(FILM_START, -0.3, 0.0, start=-CUT / 24)]
-    plan = Plan([str(own / "base.yaml")], [str(cut)], sought, search=0)
-    made = Fit(simulation, read_videos(cut), plan)
-    (place,) = made.search()
-    assert made.first == place
-    assert made.values(place)[FILM_START] == pytest.approx(-CUT / 24)
 
 
 def test_rivals_of_a_film_in_motion_are_judged_by_the_points_of_their_own_first_frames(
@@ -160,18 +145,6 @@ def test_the_place_that_a_film_in_motion_begins_from(own, cut, simulation, ends)
     azimuth, start = made.values(made.begin_from(places)).values()
     assert azimuth == pytest.approx(TRUTH["wind.azimuth"])
     assert start == pytest.approx(-CUT / 24, abs=0.05)
-
-
-def test_ends_whose_first_frames_show_no_points_have_no_rivals(own, cut, simulation):
-    sought = [Unknown("wind.azimuth", -60.0, 150.0), Unknown(FILM_START, -0.2, 0.0)]
-    made = Fit(simulation, read_videos(cut), Plan([str(own / "base.yaml")], [str(cut)], sought))
-    made.first = [0.5, 0.5]
-
-    def no_points(stage):
-        raise ValueError("Fewer than four points of the object can be followed.")
-
-    made.evidence = no_points
-    assert made._others([0.5, 0.5], [[0.1, 0.5]]) == ([], [])
 
 
 def test_a_changing_wind_in_a_film_in_motion_keeps_the_points(own, cut, simulation, monkeypatch):

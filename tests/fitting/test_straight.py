@@ -37,11 +37,6 @@ def test_a_step_is_straight_in_the_plane(size):
         assert not torch.allclose(moved, step, rtol=0.05)
 
 
-def test_without_speed_and_azimuth_a_step_is_added():
-    place = torch.tensor([0.2, 0.4], dtype=torch.float64)
-    assert torch.equal(straight(SOUGHT[:2])(place, place), place + place)
-
-
 def test_a_wind_across_a_sheet_is_found_in_few_steps():
     """The wind across is seen forty times as well as that along the sheet, so the valley is straight in the plane."""
     wanted, across = _components([0.5, 0.5, 0.7]), torch.tensor([math.cos(0.3), math.sin(0.3)], dtype=torch.float64)
@@ -77,12 +72,6 @@ def test_a_wind_does_not_blow_back():
     end = straight([Unknown("wind.speed", 0.5, 16.0), *SOUGHT[1:]])(place, torch.tensor([-1.0, 0.0, 0.1]).double())
     assert abs(float(end[2] - place[2])) <= REACH
     assert float(end[0]) < 0.5
-
-
-def test_without_wind_a_step_is_added():
-    place, step = torch.tensor([0.0, 0.5], dtype=torch.float64), torch.tensor([0.1, -0.2], dtype=torch.float64)
-    sought = [Unknown("wind.speed", 0.0, 10.0), SOUGHT[2]]
-    assert torch.equal(straight(sought)(place, step), place + step)
 
 
 def test_an_azimuth_with_a_logarithmic_scale_stays_in_its_range():

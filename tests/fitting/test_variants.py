@@ -9,7 +9,7 @@ from gaussian_swaying.aero.force import AeroForce
 from gaussian_swaying.aero.patches import Patches
 from gaussian_swaying.aero.wind import WindField
 from gaussian_swaying.aero.wind_force import WindForce
-from gaussian_swaying.fitting.variants import check_variants, states_of
+from gaussian_swaying.fitting.variants import states_of
 from gaussian_swaying.gaussians.parts import Part, Parts
 from gaussian_swaying.mpm.solver import MPMSolver
 from gaussian_swaying.mpm.state import MaterialPoints
@@ -119,13 +119,3 @@ def test_wind_on_patches_of_many_directions_in_a_batch():
         torch.testing.assert_close(one.position, alone.position)
         torch.testing.assert_close(one.work, alone.work)
         assert one.node_velocity.shape == alone.node_velocity.shape
-
-
-def test_what_cannot_be_a_batch_is_refused(tmp_path):
-    edit = [{"time": 0.5, "E": 1e3}]
-    (tmp_path / "edits.yaml").write_text(yaml.safe_dump(base(edits=edit)))
-    with pytest.raises(ValueError, match="edits"):
-        check_variants(Simulation.from_yaml(tmp_path / "edits.yaml", device="cpu"))
-    (tmp_path / "contact.yaml").write_text(yaml.safe_dump(base(contact={"thickness": 0.01})))
-    with pytest.raises(ValueError, match="contact"):
-        check_variants(Simulation.from_yaml(tmp_path / "contact.yaml", device="cpu"))

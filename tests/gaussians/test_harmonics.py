@@ -105,16 +105,6 @@ def test_what_an_inference_kept_serves_gradients(degree, device, monkeypatch):
         assert torch.isfinite(given.grad).all()
 
 
-@pytest.mark.parametrize("degree", [0, 3])
-def test_many_directions_of_one_gaussian(degree):
-    """The coefficients of one Gaussian seen from everywhere, and those of many seen from one side."""
-    sh, directions = torch.randn(4, (degree + 1) ** 2, 3), _directions("cpu", torch.float32, 6)
-    grid = evaluate_sh(sh[:, None], directions)
-    assert grid.shape == (4, 6, 3)
-    for i in range(4):
-        torch.testing.assert_close(evaluate_sh(sh[i], directions), grid[i])
-
-
 @pytest.mark.parametrize("degree", [0, 1, 2, 3])
 def test_rotated_coefficients_equal_turned_directions(device, dtype, degree):
     directions, rotation = _directions(device, dtype), _rotations(device, dtype)

@@ -62,11 +62,6 @@ def test_labels_that_do_not_fit_are_refused(labels, parts, message):
         Parts(labels, parts)
 
 
-def test_an_unknown_part_is_refused():
-    with pytest.raises(ValueError, match="no part 'stem': use one of 'pot'"):
-        Parts([0], PARTS).mask("stem")
-
-
 @pytest.mark.parametrize(
     ("change", "message"),
     [
@@ -87,11 +82,6 @@ def test_a_file_that_does_not_fit_together_is_refused(change, message, tmp_path)
     with pytest.raises(ValueError, match=message) as error:
         Parts.load(path)
     assert str(path) in str(error.value)
-
-
-def test_a_missing_file_is_refused(tmp_path):
-    with pytest.raises(ValueError, match="does not exist"):
-        Parts.load(tmp_path / "none.npz")
 
 
 def test_the_region_of_a_part_is_what_is_nearest_to_it():

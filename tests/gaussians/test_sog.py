@@ -17,7 +17,7 @@ from small_scenes import together, varied_cloud
 from gaussian_swaying.gaussians import sog
 from gaussian_swaying.gaussians.export import convert, export_cloud
 from gaussian_swaying.gaussians.formats import read_gaussians
-from gaussian_swaying.gaussians.sog import encode_sog, read_sog
+from gaussian_swaying.gaussians.sog import read_sog
 from gaussian_swaying.simulation.scene import Scene
 
 # a component has steps of sqrt(2) / 255, and three of them are off; the fourth, at least 1/2, follows from them
@@ -298,7 +298,3 @@ def test_too_many_for_a_picture(tmp_path, monkeypatch):
     with pytest.raises(ValueError, match=r"A \.sog file holds up to 64 Gaussians, but there are 65: choose spz"):
         export_cloud(tmp_path / "b.sog", varied_cloud(65, degree=0))
     assert [path.name for path in tmp_path.iterdir()] == ["a.sog"]
-
-
-def test_the_same_bytes_again():
-    assert encode_sog(scene()) == encode_sog(scene())

@@ -1,8 +1,6 @@
 """The estimate of a run's time: from one grid to another, the grid for a time, and against runs."""
 
 import dataclasses
-import statistics
-import time
 from types import SimpleNamespace
 
 import pytest
@@ -100,11 +98,6 @@ def test_another_grid_has_other_substeps_and_the_same_pictures(power):
     assert scaled_seconds(here, here, 0.04) == pytest.approx(here.total_seconds)
 
 
-def test_without_two_grids_a_surface_is_assumed():
-    here = cost(0.04, 1.0)
-    assert scaled_seconds(here, here, 0.02) == pytest.approx(5 + 10 * 2**3 + 10.1)
-
-
 @pytest.mark.parametrize("power", [0.0, 1.3, 3.0])
 @pytest.mark.parametrize("seconds", [22.0, 40.0, 300.0])
 def test_the_finest_grid_for_a_time_is_found(power, seconds):
@@ -130,10 +123,6 @@ def test_a_grid_that_is_too_fine_to_start_is_passed_over():
     assert 0.018 <= finest_within(measure, 1e6, cost(0.04), cost(0.06), 0.01, 0.06).dx < 0.04
     with pytest.raises(ValueError, match="too many nodes"):
         finest_within(measure, 1e-6, cost(0.012), cost(0.06), 0.01, 0.015)
-
-
-def test_the_coarsest_grid_is_the_answer_if_none_is_fast_enough():
-    assert finest_within(cost, 3.0, cost(0.04), cost(0.06), 0.01, 0.06).dx == 0.06
 
 
 def test_files_are_written_beside_the_simulation_where_there_are_cores(monkeypatch):
@@ -183,23 +172,6 @@ def vase(device):
         wind=[3.0, 0.0, 0.0],
         device=device,
     )
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("make", [flag, vase])
-def test_the_estimate_is_within_a_factor_of_two_of_the_run(make, tmp_path):
-    """By the processor's time, on one thread; without what other programs take of it. The median of three estimates."""
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)
-    try:
-        simulation, frames = make("cpu"), 60
-        estimates = [estimate_cost(simulation, frames).total_seconds for _ in range(3)]
-        begin = time.process_time()
-        simulation.run(tmp_path / "run", frames, progress=False)
-        taken = time.process_time() - begin
-    finally:
-        torch.set_num_threads(threads)
-    assert 0.5 < statistics.median(estimates) / taken < 2
 
 
 @pytest.mark.gpu

@@ -1,17 +1,13 @@
 """Whether things stand or hang, on stand-ins made of a few tubes, balls and plates: surfaces only, z up."""
 
-import argparse
 import dataclasses
 import math
-import shlex
 
 import pytest
 import torch
 from small_scenes import plain_cloud, together
 
-from gaussian_swaying.cli.preview import build_options, joined
 from gaussian_swaying.preview.hold import guess_hold, hanging_cord
-from gaussian_swaying.preview.report import doubts, preview_command
 from gaussian_swaying.preview.suggest import CELLS, suggest, visible_weight
 from gaussian_swaying.scenes.procedural import FlagScene
 
@@ -207,23 +203,6 @@ def test_photos_from_below_say_that_it_hangs():
     assert stands.scores["bottom"] == 1.0
     wall = guess_hold(points, weight, up, 0.05, wall=(0.0, 1.0, 0.0))
     assert (wall.end, wall.direction) == ("side", (0, 1, 0))
-
-
-def test_weak_guesses_print_the_commands_of_both():
-    defaults = build_options().parse_args([])
-    options = build_options().parse_args(shlex.split("'my ball.ply' --longest-side 0.3 --region -2 -2 -2 9 9 9"))
-    found = suggest(splat(ball([0.0, 0.0, 0.0], 1.0), move=AWAY))
-    lines = doubts(found, options, defaults)
-    commands = [shlex.split(line.partition("#")[0]) for line in lines if "python" in line]
-    told = [build_options().parse_args(joined(command[2:])) for command in commands]
-    assert {told[0].up[0], told[1].up[0]} == {"+z", "-y"}
-    assert [again.hold for again in told] == [None, None, "bottom", "top"]
-    for again in told:
-        assert (again.scene, again.longest_side, again.region) == ("my ball.ply", 0.3, [-2, -2, -2, 9, 9, 9])
-    assert sum(line.startswith("warning") for line in lines) == 2
-    sure = suggest(splat(*man()).select(torch.arange(0, 7400, 5)), "+z")
-    assert doubts(sure, options, defaults) == []
-    assert preview_command(argparse.Namespace(scene="a.ply"), defaults) == "python tools/preview.py a.ply"
 
 
 @pytest.mark.parametrize(

@@ -1,20 +1,17 @@
 """What a preview draws, writes as a configuration, and expects of the cost."""
 
 import json
-import math
 
 import numpy as np
 import pytest
 import torch
 import yaml
 
-from gaussian_swaying.aero.wind import FlowKey, WindField
 from gaussian_swaying.gaussians.ply import write_ply
 from gaussian_swaying.geometry.regions import Box, Cylinder, Everything, Not, Sphere, Union
 from gaussian_swaying.mpm.boundaries.impulse import Impulse
 from gaussian_swaying.mpm.boundaries.pinned_region import PinnedRegion
 from gaussian_swaying.mpm.boundaries.plane import Plane
-from gaussian_swaying.preview.cost import estimate_cost
 from gaussian_swaying.preview.picture import (
     PINNED,
     PUSHED,
@@ -27,7 +24,6 @@ from gaussian_swaying.preview.picture import (
 )
 from gaussian_swaying.preview.starter import region_dict, starter_yaml
 from gaussian_swaying.preview.suggest import suggest
-from gaussian_swaying.recording.recorder import Recorder
 from gaussian_swaying.rendering.cameras.camera import look_at_camera
 from gaussian_swaying.rendering.torch_renderer import render_torch
 from gaussian_swaying.scenes.procedural import FlagScene
@@ -112,45 +108,7 @@ def test_picture_shows_pinned_and_static_gaussians(make_simulation):
     assert PINNED[0] > PINNED[1] + 60
 
 
-@pytest.mark.gpu
-def test_picture_and_cost_on_a_gpu(make_simulation):
-    simulation = make_simulation()
-    here = preview_picture(simulation, height=96).astype(int)
-    simulation.to("cuda")
-    there = preview_picture(simulation, height=96).astype(int)
-    assert there.shape == here.shape
-    assert np.abs(there - here).mean() < 1  # of 255: lines may fall on other pixels by round-off
-    assert estimate_cost(simulation, 3).particles == 96
-
-
-def test_flow_is_the_strongest_of_a_schedule(make_simulation):
-    wind = WindField(schedule=[FlowKey(0.0, [0, 0, 0]), FlowKey(1.0, [0, 5, 0]), FlowKey(2.0, [1, 0, 0])])
-    assert mean_flow(make_simulation(wind=wind)).tolist() == [0, 5, 0]
-    assert mean_flow(make_simulation(wind=WindField([1.0, 2.0, 3.0]))).tolist() == [1, 2, 3]
-
-
 # ---- cost
-
-
-def test_cost_is_the_product_of_its_parts(make_simulation):
-    simulation = make_simulation(frame_dt=0.04)
-    cost = estimate_cost(simulation, frames=11)
-    # E = 3e3, nu = 0.3, 30 kg/m^3 by default of the fixture; c^2 = (lambda + 2 mu) / rho
-    speed = math.sqrt(3e3 * 0.7 / (1.3 * 0.4) / 30)
-    assert cost.wave_speed == pytest.approx(speed, rel=1e-5)
-    assert cost.substeps >= math.ceil(0.04 / (0.4 * 0.2 / speed) - 1e-6)
-    assert cost.substep == pytest.approx(0.04 / simulation.solver.substeps(simulation.start(), 0.04))
-    assert cost.substep <= cost.stable_substep
-    assert cost.particles == 96
-    assert cost.simulation_seconds == pytest.approx(10 * cost.substeps * cost.substep_seconds)
-    assert cost.total_seconds == pytest.approx(cost.simulation_seconds + 11 * cost.picture_seconds)
-    simulation.recorder = Recorder(images=False, video=False)
-    assert estimate_cost(simulation, 2).picture_seconds is None
-
-
-def test_cost_of_a_run_that_cannot_start_is_its_error(make_simulation):
-    with pytest.raises(ValueError, match="holds no particle"):
-        estimate_cost(make_simulation(pinned=False, boundaries=[PinnedRegion(Sphere([9, 9, 9], 0.1))]), 2)
 
 
 # ---- starter

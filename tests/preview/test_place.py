@@ -2,7 +2,6 @@
 
 import json
 import math
-from dataclasses import replace
 
 import pytest
 import torch
@@ -15,14 +14,11 @@ from gaussian_swaying.cli.preview import main
 from gaussian_swaying.gaussians.ply import write_ply
 from gaussian_swaying.geometry.rotations import quat_to_rotation
 from gaussian_swaying.preview.place import excerpt, survey
-from gaussian_swaying.preview.report import place_lines
 from gaussian_swaying.preview.suggest import suggest
 from gaussian_swaying.rendering.cameras.camera import look_at_camera
 from gaussian_swaying.scenes.alocasia import AlocasiaScene
 from gaussian_swaying.scenes.procedural import FlagScene
 from gaussian_swaying.simulation.simulation import Simulation
-
-from .test_photos import write_capture
 
 COUNT = 40_000
 
@@ -106,12 +102,6 @@ def test_what_the_photos_show_is_likelier(garden):
     assert plant.score == pytest.approx(own.score + 2, abs=0.011)
 
 
-def test_no_other_things_are_offered_where_there_are_none(garden):
-    found = survey(garden[0])
-    assert "--move" in "".join(place_lines(found, [1]))
-    assert "--move" not in "".join(place_lines(replace(found, things=found.things[:1]), [1]))
-
-
 @pytest.mark.parametrize("up", ["-y", [0.0, -1.0, 0.0], "+y"])
 def test_a_given_direction_is_the_only_one_that_is_tried(garden, up):
     """From below, the haze ends nowhere on a plane: there is no ground, and the splat is taken as one object."""
@@ -193,19 +183,6 @@ def test_a_thing_is_chosen_by_its_number(file, tmp_path, capsys, monkeypatch):
     assert data["gaussians"]["sh_degree"] is None
     box = data["run"]
     assert box["box_max"][0] - box["box_min"][0] == pytest.approx(4.0, abs=0.1)
-
-
-def test_things_of_a_place_are_chosen_with_the_cameras_of_the_photos(file, tmp_path, capsys, monkeypatch):
-    """They rank the things, and tell which way is up."""
-    monkeypatch.setattr("gaussian_swaying.preview.cost.MOST_FRAMES", 2)
-    eyes = [(math.cos(k), -0.5, math.sin(k)) for k in range(6)]
-    middle, up = (0.0, -0.2, 0.0), (0.0, -1.0, 0.0)
-    cameras = [look_at_camera(eye, middle, up, 50.0, 64, 64, dtype=torch.float64) for eye in eyes]
-    capture = write_capture(tmp_path / "photos", cameras)
-    assert _preview(file, tmp_path / "out", "--capture", str(capture), "--move", "1") == 0
-    assert "in the photos (+2)" in capsys.readouterr().out
-    data = json.loads((tmp_path / "out" / "preview.json").read_text())
-    assert data["place"]["moves"] == [1]
 
 
 @pytest.mark.parametrize(

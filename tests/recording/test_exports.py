@@ -1,6 +1,5 @@
 """Formats in which a run leaves its Gaussians."""
 
-import re
 from dataclasses import replace
 
 import numpy as np
@@ -46,18 +45,6 @@ def test_a_frame_saves_what_a_run_writes(format, suffix, make_simulation, tmp_pa
         expected = (tmp_path / "run" / format / f"{frame.index:05d}{suffix}").read_bytes()
         assert (tmp_path / f"{frame.index:05d}{suffix}").read_bytes() == expected
         assert (tmp_path / "other").read_bytes() == (tmp_path / f"again{suffix}").read_bytes() == expected
-
-
-@pytest.mark.parametrize("format", ["ply", "compressed_ply"])
-def test_supersplat_takes_the_frames_for_a_sequence(format, make_simulation, tmp_path):
-    """Its rule (isPlySequence in src/file-handler.ts): the same words before a number, and .ply after it."""
-    make_simulation().run(
-        tmp_path / "run", 3, progress=False, recorder=Recorder(ply_every=1, export_format=format, **QUIET)
-    )
-    names = [path.name for path in (tmp_path / "run" / format).iterdir()]
-    found = [re.search(r"(.*?)(\d+)(?:\.compressed)?\.ply$", name) for name in names]
-    assert {match[1] for match in found} == {""}
-    assert sorted(int(match[2]) for match in found) == [0, 1, 2]
 
 
 def test_a_frame_is_saved_as_usd_in_metres(make_simulation, tmp_path):

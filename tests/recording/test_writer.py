@@ -61,6 +61,8 @@ def test_jobs_are_done_side_by_side():
 
 def test_whoever_submits_too_much_waits_and_nothing_is_dropped(gate):
     writer, submitted, done, most = FrameWriter(limit=3, workers=2), [], [], []
+    hire, waits = writer._hire, threading.Event()
+    writer._hire = lambda: hire() or (len(submitted) == 3 and waits.set())
 
     def produce():
         for k in range(10):
@@ -69,11 +71,7 @@ def test_whoever_submits_too_much_waits_and_nothing_is_dropped(gate):
 
     producer = threading.Thread(target=produce, daemon=True)
     producer.start()
-    end = time.monotonic() + LONG
-    while len(submitted) < 3 and time.monotonic() < end:
-        time.sleep(0.01)
-    producer.join(0.5)
-    assert producer.is_alive()
+    assert waits.wait(LONG)
     assert submitted == [0, 1, 2]
     assert writer.pending == 3
     gate.set()
@@ -90,17 +88,16 @@ def test_ctrl_c_is_heard_while_the_queue_is_full(gate):
     for k in range(2):
         writer.submit(str(k), lambda k=k: (gate.wait(LONG), done.append(k)))
 
-    def submit():
-        threading.Timer(0.3, os.kill, (os.getpid(), signal.SIGINT)).start()
-        writer.submit("2", lambda: done.append(2))
+    writer._hire = lambda: os.kill(os.getpid(), signal.SIGINT)  # called by who waits
 
     # ignored where a script starts the tests in the background
     before = signal.signal(signal.SIGINT, signal.default_int_handler)
     try:
         with pytest.raises(KeyboardInterrupt):
-            submit()
+            writer.submit("2", lambda: done.append(2))
     finally:
         signal.signal(signal.SIGINT, before)
+        del writer._hire
     gate.set()
     writer.wait()
     assert done == [0, 1]
@@ -147,8 +144,8 @@ def test_after_a_failure_what_came_before_is_done_and_what_came_after_is_not(gat
 def test_a_failure_frees_whoever_waits_for_a_full_queue(gate):
     writer, done = FrameWriter(limit=1), []
     writer.submit("b", lambda: (gate.wait(LONG), _full()))
-    opener = threading.Timer(0.2, gate.set)
-    opener.start()
+    hire = writer._hire
+    writer._hire = lambda: hire() or gate.set()  # called by who waits
     with pytest.raises(OSError, match="b could not be written"):
         writer.submit("c", lambda: done.append("c"))
     writer.wait()

@@ -6,7 +6,7 @@ import math
 import pytest
 import torch
 
-from gaussian_swaying.rendering.brush import REACH, SOLID, Seen, seen, touched
+from gaussian_swaying.rendering.brush import REACH, SOLID, seen, touched
 from gaussian_swaying.rendering.cameras.camera import look_at_camera, project
 from gaussian_swaying.rendering.protocol import RenderOutput
 from gaussian_swaying.rendering.torch_renderer import render_torch
@@ -121,14 +121,6 @@ def test_a_slack_adds_layers_just_behind():
     assert bool(_view(both, slack=0.2).front[24**2 :].all())
 
 
-def test_the_picture_may_be_smaller_than_the_screen():
-    both = torch.cat([_sheet(-0.4), _sheet(0.5)])
-    view = _view(both, camera=_camera(480, 360), small=_camera(120, 90))
-    assert torch.equal(view.front, torch.arange(2 * 24**2) < 24**2)
-    wide = project(both, _camera(480, 360))[0].float()
-    assert torch.equal(torch.stack([view.column, view.row], -1), wide)
-
-
 def test_a_flat_gaussian_has_its_extent_along_the_line_of_sight():
     """The second one is hidden if it is flat, and not if it reaches to the first."""
     means = torch.tensor([[0.0, 0.0, 0.0], [0.0, 0.5, 0.0]])
@@ -136,13 +128,3 @@ def test_a_flat_gaussian_has_its_extent_along_the_line_of_sight():
     for depth, front in ((0.01, [True, False]), (0.3, [True, True])):
         covariances = torch.diag(torch.tensor([0.3, depth, 0.3]) ** 2).expand(2, 3, 3)
         assert seen(means, covariances, _camera(9, 9), picture).front.tolist() == front
-
-
-@pytest.mark.parametrize(
-    ("path", "radius", "words"),
-    [(torch.zeros(0, 2), 3.0, "corner"), (torch.zeros(2, 3), 3.0, "path"), (torch.zeros(1, 2), 0.0, "radius")],
-)
-def test_a_brush_that_cannot_be_is_refused(path, radius, words):
-    nothing = Seen(torch.zeros(1), torch.zeros(1), torch.ones(1).bool(), torch.ones(1).bool())
-    with pytest.raises(ValueError, match=words):
-        touched(nothing, path, radius)

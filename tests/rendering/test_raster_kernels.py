@@ -120,13 +120,6 @@ def test_near_and_far_gaussians_in_order():
     assert float(made.color[8, 8, 0]) < 1e-3
 
 
-def test_blur_and_background():
-    scene, camera = _scene(), _camera()
-    made = _agree(scene, camera, eps2d=2.0)
-    black = raster.render(*scene, camera, None, 2.0)
-    torch.testing.assert_close(made.color, black.color + (1 - black.alpha) * BACKGROUND, rtol=0, atol=1e-6)
-
-
 def test_any_three_values():
     """Normals and scalars are blended as colours are, also negative ones and one column repeated."""
     means, covariances, opacities, colors = _scene()
@@ -185,12 +178,6 @@ def test_gradients_and_float64_are_those_of_torch(drawn):
     renderer(*scene, camera, background).color.sum().backward()
     assert background.grad.abs().sum() > 0
     assert renderer(*[part.double() for part in scene], camera).color.dtype == torch.float64
-    assert drawn == []
-
-
-def test_without_a_compiler_torch_draws(drawn, monkeypatch):
-    monkeypatch.setattr(raster, "compiles", lambda device: False)
-    TorchRenderer()(*_scene(), _camera())
     assert drawn == []
 
 

@@ -8,9 +8,8 @@ import torch
 from gaussian_swaying.gaussians.harmonics import sh_to_color
 from gaussian_swaying.geometry import covariances
 from gaussian_swaying.rendering.cameras.camera import Camera, look_at_camera
-from gaussian_swaying.rendering.gsplat_renderer import make_renderer
 from gaussian_swaying.rendering.protocol import finite_gaussians
-from gaussian_swaying.rendering.torch_renderer import TorchRenderer, project_gaussians, render_torch
+from gaussian_swaying.rendering.torch_renderer import TorchRenderer, render_torch
 
 WIDTH, HEIGHT = 20, 14
 
@@ -132,13 +131,6 @@ def test_alpha_is_cut_at_both_ends():
     assert render_torch(means, covariances, torch.full((1,), 0.0039), torch.ones(1, 3), camera).alpha.max() == 0
 
 
-def test_background_fills_what_is_left():
-    background = torch.tensor([0.2, 0.5, 1.0], dtype=torch.float64)
-    black, coloured = render_torch(*_scene(), _camera()), render_torch(*_scene(), _camera(), background)
-    torch.testing.assert_close(coloured.color, black.color + (1 - black.alpha) * background)
-    torch.testing.assert_close(coloured.depth, black.depth)
-
-
 def test_order_of_the_input_does_not_matter():
     scene = _scene()
     permutation = torch.randperm(len(scene[0]))
@@ -193,14 +185,6 @@ def test_bad_gaussians_do_not_poison_the_picture():
     assert render_torch(*huge, _camera()).color.isfinite().all()
 
 
-def test_projection_is_sorted_and_keeps_what_is_seen():
-    projected = project_gaussians(*_scene()[:3], _camera())
-    assert (projected.depths.diff() >= 0).all()
-    kept = set(projected.index.tolist())
-    assert kept.isdisjoint({6, 10, 11})
-    assert {0, 7, 13} <= kept
-
-
 def test_gradcheck():
     means, covariances, opacities, colors = (item[[20, 21, 22, 23]].clone() for item in _scene())
     means *= 0.4  # inside the image
@@ -248,13 +232,6 @@ def test_gradients_are_finite_where_gaussians_are_dropped():
     assert scene[0].grad[0].eq(0).all()
 
 
-def test_make_renderer_without_cuda():
-    assert isinstance(make_renderer("cpu"), TorchRenderer)
-    assert isinstance(make_renderer(torch.device("cpu")), TorchRenderer)
-    if not torch.cuda.is_available():
-        assert isinstance(make_renderer("cuda"), TorchRenderer)
-
-
 @pytest.mark.parametrize(
     ("field", "name"), [(0, "means"), (1, "covariances"), (2, "opacities"), (3, "colors"), (4, "background")]
 )
@@ -266,13 +243,6 @@ def test_bad_shapes_are_named(field, name):
     scene[field] = [1.0]
     with pytest.raises(TypeError, match=f"`{name}`"):
         render_torch(*scene[:4], _camera(), scene[4])
-
-
-def test_bad_arguments():
-    with pytest.raises(ValueError, match="`eps2d`"):
-        TorchRenderer(eps2d=-0.1)
-    with pytest.raises(ValueError, match="`max_pairs`"):
-        TorchRenderer(max_pairs=0)
 
 
 def test_a_splat_as_it_is_stored():

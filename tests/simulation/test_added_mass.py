@@ -12,7 +12,6 @@ from gaussian_swaying.aero.wind import WindField
 from gaussian_swaying.geometry.regions import Box
 from gaussian_swaying.mpm.boundaries.pinned_region import PinnedRegion
 from gaussian_swaying.simulation.batch import batch_of
-from gaussian_swaying.simulation.edits import Edit
 from gaussian_swaying.simulation.material import Material
 
 BREADTH, SHEET = 1.0, 0.3  # m, kg/m²
@@ -166,14 +165,6 @@ def test_a_changed_breadth_binds_again_and_another_coefficient_does_not(hanging)
     assert torch.isfinite(simulation.advance(state)[0].position).all()
 
 
-def test_an_edit_keeps_the_air(hanging):
-    simulation = hanging(air())
-    state = simulation.edit(simulation.start(), Edit(density=60.0))
-    expected = simulation.setup.points.mass + added_mass_per_area(BREADTH, 1.225) * simulation.scene.patches.areas()
-    torch.testing.assert_close(simulation.solver.points.mass, expected)
-    assert torch.isfinite(simulation.advance(state)[0].position).all()
-
-
 def test_gradients_by_the_density_pass(hanging):
     """Compared with the difference of two runs."""
 
@@ -185,12 +176,6 @@ def test_gradients_by_the_density_pass(hanging):
     density = torch.tensor(30.0, dtype=torch.float64, requires_grad=True)
     (slope,) = torch.autograd.grad(end(density), density)
     assert float(slope) == pytest.approx(float(end(30.1) - end(29.9)) / 0.2, rel=1e-3)
-
-
-def test_without_gravity_no_force_is_added(hanging):
-    simulation = hanging(air(), gravity=(0.0, 0.0, 0.0))
-    simulation.start()
-    assert simulation.forces == []
 
 
 def test_the_lift_is_the_weight_of_the_air(hanging):

@@ -1,7 +1,6 @@
 """Scenes in which only what is connected along its surface shares nodes."""
 
 import dataclasses
-import types
 
 import pytest
 import torch
@@ -13,13 +12,11 @@ from gaussian_swaying.geometry.regions import Box
 from gaussian_swaying.mpm.boundaries.pinned_region import PinnedRegion
 from gaussian_swaying.mpm.solver import MPMSolver
 from gaussian_swaying.preview.apart import why_apart
-from gaussian_swaying.preview.picture import _pieces
 from gaussian_swaying.scenes.procedural import FlagScene, GivenScene
 from gaussian_swaying.simulation.attached import attached_points, homes, lies_apart, pieces_in_cells
 from gaussian_swaying.simulation.material import Material
 from gaussian_swaying.simulation.scene import Scene
 from gaussian_swaying.simulation.simulation import Simulation
-from gaussian_swaying.viewer.states import drawable
 
 DX, GAP = 0.2, 0.13
 
@@ -131,22 +128,6 @@ def test_it_needs_the_total_formulation_and_a_surface():
         simulation(cloud, formulation="updated")
     with pytest.raises(ValueError, match=r"`scene.connected` grid with `scene.filling`"):
         Scene(generator=GivenScene(cloud), connected="surface", filling=InteriorFilling())
-
-
-def test_a_browser_draws_it():
-    session = types.SimpleNamespace(simulation=simulation(two_flags()[0]), state=None)
-    session.state = session.simulation.start()
-    assert session.state.grid.virtual > 0
-    assert drawable(session)
-
-
-def test_the_preview_shows_pieces_as_colours():
-    cloud, number = two_flags()
-    pieces, beside = _pieces(simulation(cloud))
-    assert beside > 0.8
-    front, back = (torch.stack([mask[number == k] for _, mask, _ in pieces]).any(1) for k in (0, 1))
-    assert not (front & back).any()
-    assert _pieces(simulation(cloud, "grid")) == ([], 0.0)
 
 
 def test_nodes_of_their_own_help_what_lies_close_and_is_held():

@@ -43,13 +43,6 @@ def test_a_cloth_falls_onto_a_ball_and_stays_outside():
     assert float(means[:, 2].min()) < 0.6  # and hangs down beside it
 
 
-def test_without_obstacles_and_contact_nothing_is_prepared():
-    simulation = _ball(boundaries=[])
-    assert simulation.scene.surface_places is None
-    simulation.start()
-    assert simulation.solver.bound.contact is None
-
-
 def test_gaussians_that_stand_still_are_an_obstacle():
     """The ball of the splat stops the cloth as the exact one does, to the width of a cell of the distance grid."""
     simulation = _ball(boundaries=[StillGaussians(cells=48, margin=0.5)])
@@ -76,14 +69,6 @@ def test_the_distance_from_gaussians_is_that_of_the_ball_that_they_cover():
     assert float((normal * direction).sum(-1).min()) > 0.9
     with pytest.raises(ValueError, match=r"nowhere denser than 0\.5"):
         still_distance(*given[:3], centre + 9, centre + 10, 20, 0.5)
-
-
-def test_gaussians_that_stand_still_need_a_scene():
-    solver = MPMSolver(dx=0.06, boundaries=[StillGaussians()])
-    simulation = _ball(boundaries=[])
-    state = solver.init_state(simulation.scene.points)
-    with pytest.raises(RuntimeError, match="give them to a Simulation"):
-        solver.step(state, 1e-3)
 
 
 def _two_sheets(gap):
@@ -129,44 +114,3 @@ solver:
     file.write_text(text.replace("solver:", "solver:\n  formulation: updated"))
     with pytest.raises(ValueError, match=r"`contact` needs `solver\.formulation: total`"):
         Simulation.from_yaml(file, device="cpu")
-
-
-def test_a_thickness_cannot_change_while_a_simulation_runs(tmp_path):
-    """The surface that touches is made from it: an edit, an assignment and a changed Contact are refused."""
-    file = tmp_path / "cloth.yaml"
-    file.write_text("edits: [{time: 0.04, thickness: 0.02}]\n")
-    with pytest.raises(ValueError, match=r"(?s)\"edits\".*'thickness' is not accepted"):
-        Simulation.from_yaml(file, device="cpu")
-    contact = Contact(thickness=0.01)
-    simulation = _ball(contact)
-    with pytest.raises(AttributeError, match="cannot assign to field 'thickness'"):
-        contact.thickness = 0.02  # type: ignore[misc]
-    with pytest.raises(AttributeError, match="contact"):
-        simulation.contact = Contact(thickness=0.02)
-    surface = simulation.scene.surface_places
-    assert float(surface.thickness.amax()) == pytest.approx(0.01)
-
-
-@pytest.mark.parametrize("name", ["contact.thickness", "material.thickness", "contact.friction"])
-def test_the_live_page_makes_a_new_simulation_for_another_contact(tmp_path, name):
-    from gaussian_swaying.viewer.changes import changed_settings, take
-
-    file = tmp_path / "cloth.yaml"
-    file.write_text(
-        """
-scene:
-  generator: {class_path: ClothScene, init_args: {setting: ball, side: 0.4, spacing: 0.04}}
-  region: {class_path: Box, init_args: {min: [null, null, 0.67], max: [null, null, 0.69]}}
-  metres_per_unit: 1.0
-contact: {thickness: 0.007}
-solver: {dx: 0.1}
-"""
-    )
-    parser = Simulation.parser()
-    settings = parser.parse_args(["--config", str(file), "--device", "cpu"])
-    simulation = Simulation.from_settings(parser, settings)
-    changed = changed_settings(parser, settings, {name: 0.004})
-    assert take(simulation, simulation.start(), parser, changed, [name]) is None
-    if name == "contact.thickness":
-        again = Simulation.from_settings(parser, changed)
-        assert float(again.scene.surface_places.thickness.amax()) == pytest.approx(0.004)

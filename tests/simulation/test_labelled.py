@@ -11,15 +11,11 @@ import torch
 
 from gaussian_swaying.gaussians.parts import Part, Parts
 from gaussian_swaying.geometry.regions import Box
-from gaussian_swaying.mpm.boundaries.rigid_region import RigidRegion
 from gaussian_swaying.mpm.solver import MPMSolver
-from gaussian_swaying.recording.recorder import Recorder
 from gaussian_swaying.scenes.procedural import FlagScene, GivenScene
-from gaussian_swaying.simulation.edits import Edit
 from gaussian_swaying.simulation.material import Material, MaterialRegion
 from gaussian_swaying.simulation.scene import Scene
 from gaussian_swaying.simulation.simulation import Simulation
-from gaussian_swaying.viewer.changes import take
 
 CLOUD = FlagScene(spacing=0.04).generate()
 ROLES = [Part("wall", "still"), Part("pole", "held"), Part("cloth"), Part("hem", E=4e4, density=90.0, thickness=0.02)]
@@ -85,33 +81,6 @@ def test_a_rigid_part_keeps_its_shape_and_the_cloth_between_bends(formulation):
     assert float((points.mass / points.volume).amax()) == pytest.approx(200.0)
 
 
-def test_several_rigid_parts_move_each_in_its_way_and_a_run_goes_on(tmp_path):
-    label = torch.bucketize(CLOUD.means[:, 0].contiguous(), torch.tensor([0.15, 0.35, 0.55, 0.95]))
-    roles = [Part("pole", "held"), Part("cloth"), Part("one", "rigid"), Part("more"), Part("other", "rigid")]
-    parts = Parts(label, roles)
-    assert sum(isinstance(b, RigidRegion) for b in flag(parts).solver.boundaries) == 2
-
-    def run(name, frames, resume=False):
-        recorder = Recorder(images=False, video=False, trajectory=True)
-        flag(parts).run(tmp_path / name, frames, resume, progress=False, recorder=recorder)
-        return np.load(tmp_path / name / "trajectory.npz")
-
-    whole = run("whole", 6)
-    run("half", 3)
-    half = run("half", 6, resume=True)
-    for name in ("position_00005", "F_00005"):
-        assert np.array_equal(whole[name], half[name])
-
-
-def test_the_held_part_is_in_the_simulation_and_the_still_one_is_not():
-    scene = flag().scene
-    label = labels()
-    assert set(label[scene.simulated].tolist()) == {1, 2, 3}
-    assert set(label[scene.moving].tolist()) == {2, 3}
-    alone = Simulation(Scene(generator=GivenScene(CLOUD.select(label > 0))), solver=MPMSolver(dx=0.1), device="cpu")
-    assert scene.points.count == pytest.approx(alone.scene.points.count, rel=0.2)
-
-
 def test_a_part_has_its_own_material_and_regions_win():
     points = flag().scene.points
     place = flag().scene.frame.point_to_scene(points.position)[:, 0]
@@ -149,20 +118,9 @@ def test_faint_gaussians_of_a_held_part_and_those_that_follow_it_stay():
     assert len(simulation.scene.model.means) == len(cloud.means) - int(((cloud.opacities < -5) & (labels() > 0)).sum())
 
 
-def test_edits_may_change_a_soft_part():
-    edit = Edit(Box([0.9, None, None], [None, None, None]), time=0.04, E=9e4)
-    last = list(flag(edits=[edit]).frames(4))[-1]
-    assert bool(torch.isfinite(last.gaussians.means).all())
-
-
 def test_parts_of_another_splat_are_refused():
     with pytest.raises(ValueError, match="labels of 3 Gaussians, but the splat has 600"):
         flag(Parts([0, 0, 0], [Part("all")]))
-
-
-def test_parts_that_leave_nothing_to_move_are_refused():
-    with pytest.raises(ValueError, match="Nothing is left to move"):
-        flag(Parts(labels(), [Part("a", "still"), Part("b", "held"), Part("c", "held"), Part("d", "still")]))
 
 
 def test_a_yaml_names_the_file_and_a_changed_one_is_not_resumed(tmp_path):
@@ -206,15 +164,3 @@ def test_a_number_that_parts_give_is_not_changed_for_all():
         simulation.change(simulation.start(), {"material.E": 1e5})
     changed = simulation.change(simulation.start(), {"material.nu": 0.2})
     assert changed is not None
-
-
-def test_the_live_page_makes_a_simulation_with_such_parts_anew(tmp_path):
-    path = Parts(labels(), ROLES).save(tmp_path / "parts.npz")
-    parser = Simulation.parser()
-    generator = '{"class_path": "FlagScene", "init_args": {"spacing": 0.04}}'
-    given = [f"--scene.generator={generator}", f"--scene.parts={path}", "--solver.dx=0.1", "--device=cpu"]
-    settings = parser.parse_args([*given, "--material.E=2e4"])
-    simulation = Simulation.from_settings(parser, settings)
-    state = simulation.start()
-    assert take(simulation, state, parser, settings, ["material.E"]) is None
-    assert set(Simulation.from_settings(parser, settings).scene.points.youngs_modulus.tolist()) == {2e4, 4e4}

@@ -86,17 +86,3 @@ def test_what_further_points_join_is_not_loose(make_scene):
     scene = make_scene(together(few, speck), dx=0.06, particle_spacing=0.025, loose="carry")
     assert scene.loose == 1
     assert scene.points.count == filled.points.count  # its further points are gone with it
-
-
-def test_nothing_changes_where_nothing_is_loose(make_scene):
-    flag = FlagScene(spacing=0.04).generate()
-    for points in POINTS:
-        carry, plain = (make_scene(flag, dx=0.1, points=points, loose=loose) for loose in ("carry", "simulate"))
-        for name in ("simulated", "carried", "owner", "in_wind"):
-            assert torch.equal(getattr(carry, name), getattr(plain, name)), name
-        assert torch.equal(carry.points.position, plain.points.position)
-
-
-def test_bad_choice_is_refused(make_scene):
-    with pytest.raises(ValueError, match=r"`scene.loose`"):
-        make_scene(loose="drop")

@@ -1,28 +1,20 @@
 """``scene.area: open``: what wind and mass of a capture are, and how it is turned off."""
 
 import math
-from pathlib import Path
 
 import pytest
 import torch
-import yaml
 from bodies import cluttered_sphere
 from small_scenes import plain_cloud
 
 from gaussian_swaying.gaussians.filling import InteriorFilling
-from gaussian_swaying.gaussians.formats import read_gaussians
 from gaussian_swaying.gaussians.ply import write_ply
 from gaussian_swaying.geometry.rotations import rotation_to_quat
-from gaussian_swaying.preview.report import run_dict, run_lines
-from gaussian_swaying.preview.starter import starter_yaml
-from gaussian_swaying.preview.suggest import suggest
 from gaussian_swaying.scenes.procedural import FlagScene
 from gaussian_swaying.simulation.material import Material
 from gaussian_swaying.simulation.scene import Scene
 from gaussian_swaying.simulation.simulated_scene import SimulatedScene
 from gaussian_swaying.simulation.simulation import Simulation
-
-CONFIGS = Path(__file__).resolve().parents[2] / "configs" / "sim"
 
 
 @pytest.fixture(scope="module")
@@ -67,14 +59,6 @@ def test_null_is_open_for_files_only(capture):
     assert Scene(generator=flag, area="open").area_kind == "open"
 
 
-@pytest.mark.parametrize(("name", "kind"), [("hanging_object", "open"), ("vase", "open"), ("ficus", "coverage")])
-def test_shipped_configurations_with_a_capture(name, kind, capture):
-    """Objects with a skin take the default; the plants keep the leaves that others hide."""
-    parser = Simulation.parser()
-    settings = parser.parse_args(["--config", str(CONFIGS / f"{name}.yaml"), "--scene.ply", str(capture)])
-    assert parser.instantiate(settings).scene.area_kind == kind
-
-
 def test_flag_keeps_its_area():
     flags = [simulated(generator=FlagScene(spacing=0.05), area=area, dx=0.1) for area in ("open", "coverage")]
     torch.testing.assert_close(flags[0].patches.area, flags[1].patches.area)
@@ -91,20 +75,6 @@ def test_filled_solid_takes_its_mass_from_its_volume(capture):
 def test_open_area_with_wind_on_all_is_refused(capture):
     with pytest.raises(ValueError, match=r"Expected `scene\.wind_on` surface with `scene\.area`"):
         Scene(ply=capture, area="open", wind_on="all")
-
-
-def test_preview_tells_area_and_hull(capture):
-    simulation = Simulation(Scene(ply=capture, metres_per_unit=0.5))
-    run = run_dict(simulation)
-    assert run["area_m2"] == pytest.approx(math.pi, rel=0.05)
-    assert run["hull_area_m2"] == pytest.approx(math.pi, rel=0.01)
-    line = f"  area            {run['area_m2']:.3g} m^2 in the wind; the convex hull has {run['hull_area_m2']:.3g} m^2"
-    assert line in run_lines(run)
-
-
-def test_starter_of_a_capture_is_open(capture):
-    found = suggest(read_gaussians(capture), quality="draft")
-    assert yaml.safe_load(starter_yaml(found, capture))["scene"]["area"] == "open"
 
 
 def test_summary_has_area_and_hull(tmp_path, capture):

@@ -7,8 +7,6 @@ import torch
 import yaml
 
 from gaussian_swaying.cli.simulate import output_folder
-from gaussian_swaying.gaussians.ply import write_ply
-from gaussian_swaying.scenes.procedural import FlagScene
 from gaussian_swaying.simulation.simulation import Simulation
 
 CONFIGS = Path(__file__).parents[2] / "configs/sim"
@@ -59,17 +57,6 @@ def test_the_numbers_are_the_papers(name):
     assert (settings.camera.init_args.width, settings.camera.init_args.height) == (1920, 1080)
 
 
-@pytest.mark.parametrize("name", sorted(path.stem for path in CONFIGS.glob("*.yaml")))
-def test_what_flows_has_a_limit_on_its_area_and_all_have_one_on_what_is_drawn(name):
-    settings = Simulation.parser().parse_args(["--config", str(CONFIGS / f"{name}.yaml")])
-    law = settings.material.law
-    flows = law is not None and law.class_path.endswith("Sand")
-    assert settings.aero.max_area_ratio == (1.0 if flows else None)
-    assert settings.scene.max_stretch == (1.3 if name == "sand" else 2.0)  # grains that scatter
-    assert settings.solver.boundaries
-    assert settings.recorder.video
-
-
 def test_the_wind_of_the_vase_turns():
     parser = Simulation.parser()
     wind = parser.instantiate(parser.parse_args(files("vase"))).wind
@@ -114,25 +101,3 @@ def test_the_preset_is_a_small_version(name):
     assert 500 < simulation.scene.points.count < 5000
     with torch.inference_mode():
         simulation.start()
-
-
-def test_a_capture_takes_the_place_of_the_generated_splat(tmp_path):
-    path = tmp_path / "capture.ply"
-    write_ply(path, FlagScene(spacing=0.1).generate())
-    parser = Simulation.parser()
-    settings = parser.parse_args(["--config", str(CONFIGS / "flag2.yaml"), "--scene.ply", str(path), "--device", "cpu"])
-    simulation = Simulation.from_settings(parser, settings)
-    assert len(simulation.scene.simulated) == 96
-    assert simulation.scene.further > 1000  # its Gaussians are 5 cells apart
-    assert simulation.scene.points.count == 3 * simulation.scene.on_surface  # three layers
-
-
-@pytest.mark.parametrize("path", sorted(CONFIGS.glob("*.yaml")), ids=lambda path: path.stem)
-def test_each_scene_says_what_its_pins_hold(path):
-    """And why: the line has a comment."""
-    text = path.read_text(encoding="utf-8")
-    pins = text.count("PinnedRegion")
-    kinds = [line for line in text.splitlines() if line.strip().startswith("kind:")]
-    assert len(kinds) == pins
-    for line in kinds:
-        assert len(line.split("#", 1)[1].strip()) > 10

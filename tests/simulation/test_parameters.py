@@ -2,7 +2,6 @@
 
 import json
 import math
-from pathlib import Path
 
 import pytest
 import torch
@@ -20,12 +19,10 @@ from gaussian_swaying.simulation import parameters
 from gaussian_swaying.simulation.edits import Edit
 from gaussian_swaying.simulation.material import Material
 from gaussian_swaying.simulation.parameters import (
-    find,
     in_settings,
     of_settings,
     parameter,
     present,
-    register,
     value_of,
     with_values,
 )
@@ -231,14 +228,6 @@ def test_angles_are_set_together(config):
     _close(value_of(found, "wind.flow"), [0.0, math.sqrt(3), 1.0])
 
 
-def test_names_are_taken_once():
-    with pytest.raises(ValueError, match="registered already"):
-        register("material.E", unit="Pa")
-    with pytest.raises(ValueError, match=r"forces\.CLASS\.ATTRIBUTE"):
-        register("weather")
-    assert find("weather") is None
-
-
 def test_a_number_of_a_users_force_is_live_without_a_parse(breath, parser, monkeypatch):
     settings = parser.parse_args(["--config", str(breath), "--device=cpu"])
     session = Session(parser, settings)
@@ -303,16 +292,6 @@ def test_parameters_that_are_no_options_are_swept_too(backwards, config, parser,
     settings = parser.parse_args(["--config", str(tmp_path / "still.yaml"), "--device=cpu"])
     changed = changed_settings(parser, settings, {"wind.azimuth": 90.0, "wind.speed": 2.0})
     _close(changed.wind.flow, [0.0, 2.0, 0.0])
-
-
-def test_the_documentation_lists_them():
-    told = (Path(__file__).parents[2] / "docs" / "python.md").read_text()
-    kinds = {"vector": "three numbers", "whole": "a whole number"}
-    for name in parameters.names():
-        known = parameter(name.replace("*", "0"))
-        found = kinds.get(known.kind, known.range_in_words)
-        marks = " | ".join("yes" if mark else "" for mark in (known.batched, known.differentiable))
-        assert f"| `{name}` | {known.unit} | {found} | {marks} |" in told
 
 
 def test_a_variant_is_a_simulation_of_its_own(tmp_path):

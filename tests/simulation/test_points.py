@@ -17,15 +17,12 @@ from gaussian_swaying.kernels.language import INTERPRETED
 from gaussian_swaying.mpm import followers_triton
 from gaussian_swaying.mpm.laws.neo_hookean import NeoHookean
 from gaussian_swaying.mpm.solver import MPMSolver
-from gaussian_swaying.recording.recorder import Recorder
-from gaussian_swaying.recording.trajectory import load_trajectory
 from gaussian_swaying.scenes.leaves import LeavesScene
 from gaussian_swaying.scenes.procedural import FlagScene, GivenScene
 from gaussian_swaying.scenes.solid import SolidScene
 from gaussian_swaying.simulation.diagnostics import measure
 from gaussian_swaying.simulation.edits import Edit
 from gaussian_swaying.simulation.material import Material, MaterialRegion
-from gaussian_swaying.simulation.roles import classify
 from gaussian_swaying.simulation.sampling import matched_points
 from gaussian_swaying.simulation.scene import Scene
 from gaussian_swaying.simulation.simulated_scene import SimulatedScene
@@ -233,14 +230,6 @@ def test_a_solid_is_grouped_too():
     assert int(scene.patches.point.max()) < scene.on_surface
 
 
-def test_what_is_drawn_as_held_and_simulated_are_all_gaussians(make_simulation):
-    simulation = make_simulation(cloud=FlagScene(spacing=0.02).generate(), dx=0.2, scene={"points": "grid"})
-    parts = classify(simulation)
-    assert bool(parts.simulated.all())
-    assert not bool(parts.carried.any())
-    assert torch.equal(parts.pinned, simulation.scene.model.means[:, 0] <= 0.11)
-
-
 def test_the_force_is_known_for_every_gaussian(make_simulation):
     """The picture of the wind's pressure does not depend on which points carry the material."""
     found = {}
@@ -335,14 +324,6 @@ def test_a_single_gaussian():
     scene = SimulatedScene(Scene(generator=GivenScene(cloud)), Material(), 0.5)
     assert scene.points.count == 1
     assert torch.equal(scene.points.position.double(), scene.frame.point_to_sim(cloud.means.double()).float().double())
-
-
-def test_a_comparison_uses_all_recorded_gaussians(make_simulation, tmp_path):
-    """The trajectory has every Gaussian, however few points carry them, and the summary says so."""
-    simulation = make_simulation(cloud=FlagScene(spacing=0.02).generate(), dx=0.2, scene={"points": "grid"})
-    summary = simulation.run(tmp_path / "run", 1, progress=False, recorder=Recorder(images=False, video=False))
-    assert summary["recorded_surface"] == len(FlagScene(spacing=0.02).generate()) > 4 * summary["surface_particles"]
-    assert len(load_trajectory(tmp_path / "run" / "trajectory.npz", 0)[0]) == summary["recorded_surface"]
 
 
 @pytest.mark.gpu

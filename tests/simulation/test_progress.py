@@ -87,13 +87,6 @@ def test_a_frame_that_is_done_again_is_counted_anew(clock, capsys):
     assert "substep 40 of 40, 0 ms left" in capsys.readouterr().err
 
 
-def test_nothing_is_shown_where_nothing_is_wanted(clock, capsys):
-    progress = RunProgress(3, shown=False)
-    work(progress, clock, 1, 1000, 0.1)
-    progress.close()
-    assert capsys.readouterr().err == ""
-
-
 @pytest.mark.parametrize("formulation", ["total", "updated"])
 @pytest.mark.parametrize("looks", [1, 8])
 def test_watching_changes_no_bit(formulation, looks):

@@ -7,12 +7,10 @@ import torch
 
 from gaussian_swaying.aero.force import AeroForce
 from gaussian_swaying.aero.wind import WindField
-from gaussian_swaying.recording.layout import frame_folder, video_file
 from gaussian_swaying.recording.recorder import Recorder
 from gaussian_swaying.rendering.cameras.camera_path import LookAtCamera, OrbitCamera
 from gaussian_swaying.rendering.passes import colormap, mean_depth
 from gaussian_swaying.rendering.shading import DiffuseShader
-from gaussian_swaying.rendering.torch_renderer import TorchRenderer
 from gaussian_swaying.simulation.edits import Edit
 
 SIDE = OrbitCamera(width=24, height=20, azimuth=-90.0, elevation=0.1, radius=1.5)
@@ -22,14 +20,6 @@ ALL = ["color", "depth", "normal", "force", "wind"]
 def _cameras(simulation, **cameras):
     simulation.painter.cameras = cameras
     return simulation
-
-
-def test_names_of_folders_and_videos():
-    assert [frame_folder(r) for r in ALL] == ["frames", "depth", "normal", "force", "wind"]
-    assert frame_folder("color", "side") == "cameras/side/frames"
-    assert video_file("frames") == "video.mp4"
-    assert video_file("cameras/side/frames") == "cameras/side/video.mp4"
-    assert video_file("cameras/side/depth") == "cameras/side/depth.mp4"
 
 
 def test_files_of_a_run_with_two_cameras_and_all_renders(make_simulation, tmp_path):
@@ -131,15 +121,6 @@ def test_values_reach_every_gaussian_that_moves(make_cloud, make_scene):
     assert not found[static].any()
 
 
-def test_a_resumed_run_has_all_pictures(make_simulation, tmp_path):
-    folder, recorder = tmp_path / "run", {"renders": ["color", "normal"]}
-    _cameras(make_simulation(), side=SIDE).run(folder, 1, progress=False, recorder=Recorder(**recorder))
-    _cameras(make_simulation(), side=SIDE).run(folder, 3, resume=True, progress=False, recorder=Recorder(**recorder))
-    for place in ("frames", "normal", "cameras/side/frames", "cameras/side/normal"):
-        assert len(list((folder / place).glob("[0-9]*.png"))) == 3
-        assert len(iio.imread(folder / video_file(place))) == 3
-
-
 def test_bad_names_and_renders(make_cloud, make_simulation):
     with pytest.raises(ValueError, match=r"names of `cameras` .* but got '\.\./up'"):
         make_simulation(parts={"cameras": {"../up": SIDE}})
@@ -217,12 +198,3 @@ def test_motion_and_colours_are_those_of_the_scene_in_every_frame(make_simulatio
     assert not torch.equal(kept[5][0], kept[6][0])
     if device.type == "cuda":
         assert painter._moved.recorded
-
-
-def test_a_renderer_can_be_exchanged(make_simulation):
-    """Also one that is a module, as a painter is."""
-    painter = make_simulation().painter
-    first, other = painter.renderer, TorchRenderer(eps2d=0.5)
-    painter.renderer = other
-    assert painter.renderer is other is not first
-    assert "renderer" not in dict(painter.named_children())

@@ -68,15 +68,6 @@ def test_every_effect_can_be_named_in_a_configuration(tmp_path):
     assert bool(torch.isfinite(state.position).all())
 
 
-def test_a_typo_in_an_effect_is_an_error(tmp_path):
-    text = (
-        "scene: {generator: {class_path: FlagScene, init_args: {spacing: 0.1}}}\nsolver: {dx: 0.25}\nwind: {effects: "
-    )
-    (tmp_path / "wind.yaml").write_text(text + "[{class_path: LogProfile, init_args: {heigth: 3.0}}]}\n")
-    with pytest.raises(ValueError, match="heigth"):
-        Simulation.from_yaml(tmp_path / "wind.yaml", device="cpu")
-
-
 def test_the_next_frame_is_foreseen_in_its_own_shelter(make_simulation):
     """As it is at its start, and without a change of the shelter that pictures of this frame may still read."""
     simulation = make_simulation()

@@ -11,6 +11,7 @@ import sys
 import threading
 import time
 from contextlib import suppress
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -218,7 +219,13 @@ def test_ctrl_c_while_the_workers_start(tmp_path, sweep_file):
     folder = tmp_path / "out"
     driver = _start(sweep_file(tmp_path / "tiny.yaml"), folder, "--device", "cpu")
     _wait(lambda: (folder / "sweep.csv").exists())
-    time.sleep(0.5)
+
+    def importing():
+        """Processes of the sweep that have begun to load torch, the driver left out."""
+        children = " ".join(file.read_text() for file in Path(f"/proc/{driver.pid}/task").glob("*/children"))
+        return sum("libtorch" in Path(f"/proc/{child}/maps").read_text() for child in children.split())
+
+    _wait(lambda: importing() == 2)
     os.killpg(driver.pid, signal.SIGINT)
     _, error = driver.communicate(timeout=120)
     assert driver.returncode == 130, error

@@ -1,7 +1,6 @@
 """Trainings that learn, stop when something is not finite, and continue exactly."""
 
 import math
-import os
 
 import lightning
 import pytest
@@ -15,7 +14,6 @@ from gaussian_swaying.training.densification import (
     MCMCDensification,
 )
 from gaussian_swaying.training.finite import TrainingDiverged
-from gaussian_swaying.training.initial import gaussians_from_points
 from gaussian_swaying.training.losses import LossTerm, MeanOpacityLoss, MeanScaleLoss
 from gaussian_swaying.training.module import SplatTrainer
 from gaussian_swaying.training.optimizers import LearningRates, means_rate
@@ -260,15 +258,6 @@ def test_a_checkpoint_is_validated_as_it_was_in_training(data, make_trainer, tmp
     assert [path.name for path in (tmp_path / "run" / "panels").glob("*.png")] == ["val_00_000010.png"]
 
 
-def test_the_checkpoint_that_is_named_is_of_this_run(data, make_trainer, tmp_path):
-    (tmp_path / "step=99.ckpt").write_bytes(b"of a run before")
-    os.utime(tmp_path / "step=99.ckpt", ns=(0, 0))
-    module = _module(loss_terms={"breaks": Breaks(2)})
-    trainer = make_trainer(20, enable_checkpointing=True, callbacks=[_checkpoints(tmp_path, every=50)])
-    with pytest.raises(TrainingDiverged, match="there is no checkpoint yet"):
-        trainer.fit(module, data)
-
-
 def test_what_cannot_be_trained_is_refused(data, make_trainer):
     with pytest.raises(ValueError, match=r"`trainer\.precision` to be 32-true"):
         make_trainer(3, precision="bf16-mixed").fit(_module(), data)
@@ -357,11 +346,6 @@ def test_gaussians_from_a_file(data, make_trainer, tmp_path):
         assert module.splat.sh.shape[1] == (degree + 1) ** 2
 
 
-def test_nothing_to_start_from(data, make_trainer):
-    with pytest.raises(ValueError, match="`init_ply`"):
-        make_trainer(1).fit(_module(), data.train)
-
-
 @pytest.mark.parametrize(
     ("options", "words"),
     [
@@ -374,18 +358,3 @@ def test_nothing_to_start_from(data, make_trainer):
 def test_bad_settings(options, words):
     with pytest.raises(ValueError, match=words):
         SplatTrainer(**options)
-
-
-def test_bad_rates():
-    with pytest.raises(ValueError, match=r"`rates\.scales`"):
-        LearningRates(scales=-1.0)
-
-
-def test_a_view_without_gaussians(data, make_trainer):
-    """Nothing drawn: the step passes, losses of the Gaussians still count."""
-    module = _module()
-    cloud = gaussians_from_points(torch.rand(20, 3), torch.rand(20, 3), 1)
-    cloud.means.sub_(torch.tensor([0.0, 100.0, 0.0]))  # behind the cameras
-    data.initial_cloud = lambda degree: cloud
-    make_trainer(5).fit(module, data)
-    assert torch.isfinite(module.splat.means).all()

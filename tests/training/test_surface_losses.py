@@ -20,7 +20,6 @@ from gaussian_swaying.training.surface_losses import (
     chosen_pixels,
     cross_correlation,
     depth_normal_loss,
-    edge_weight,
     round_trip,
     sample,
     textured,
@@ -245,15 +244,6 @@ def test_normals_that_fit_their_depths_cost_nothing():
     assert float(term(_inputs(surface=mixed))) == pytest.approx(1 - math.cos(0.2), rel=1e-6)
 
 
-def test_weights_of_edges():
-    image = torch.zeros(9, 12, 3)
-    image[:, 6:] = 1.0
-    weight = edge_weight(image)
-    assert weight[4, 2] == 1.0
-    assert weight[4, 6] == 0.0
-    assert weight[0].eq(0).all()
-
-
 def test_correlations():
     one = torch.rand(4, 25)
     alike, fine = cross_correlation(one, 0.3 * one + 0.2)
@@ -357,12 +347,6 @@ def test_a_training_with_all_terms_on_a_gpu(data, make_trainer):
     last = [row for row in logged if "train/loss" in row][-1]
     assert {f"train/{name}" for name in TERMS} <= set(last)
     assert all(math.isfinite(value) for value in last.values())
-
-
-def test_a_datamodule_without_other_views_is_named(data, make_trainer):
-    module = SplatTrainer(loss_terms=TERMS, sh_degree=0, lpips=None)
-    with pytest.raises(ValueError, match="other_view"):
-        make_trainer(6).fit(module, data)
 
 
 @pytest.mark.parametrize(

@@ -56,12 +56,18 @@ def until(condition, seconds=60.0):
         time.sleep(0.01)
 
 
+def in_turn(session):
+    """Wait until the thread of a session has gone around twice: all that it was about to do is done."""
+    for _ in range(2):
+        done = threading.Event()
+        session._ask(done.set)
+        assert done.wait(60), "the session does nothing"
+
+
 def pause(session):
     """Pause a session that runs, and wait until the step that was under way is done."""
     session.pause()
-    done = threading.Event()
-    session._ask(done.set)
-    assert done.wait(60), "the session does nothing"
+    in_turn(session)
 
 
 def pictures_since(page, began):

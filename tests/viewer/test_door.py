@@ -1,9 +1,6 @@
 """Who may open the live page."""
 
-import contextlib
 import socket
-import threading
-import time
 import urllib.error
 import urllib.request
 
@@ -45,9 +42,12 @@ def test_other_websites_in_the_same_browser_are_refused(page):
 
 
 def test_the_page_is_shown_in_no_frame(page):
+    """And connects to its own server alone: viser would go to the address after `?websocket=`."""
     headers = _open(page.url)[1]
     assert headers["X-Frame-Options"] == "DENY"
-    assert "frame-ancestors 'none'" in headers["Content-Security-Policy"]
+    own = page.url.split("//")[1]
+    policy = f"frame-ancestors 'none'; connect-src 'self' ws://{own} wss://{own} blob: data:"
+    assert headers["Content-Security-Policy"] == policy
 
 
 @pytest.mark.parametrize(
@@ -113,7 +113,6 @@ def test_noise_is_no_traceback(page, capfd):
     for noise in (b"\x16\x03\x01\x00garbage\r\n\r\n", b"GET\r\n\r\n", b""):
         with socket.create_connection(("127.0.0.1", page.server.get_port()), timeout=5) as raw:
             raw.sendall(noise)
-    time.sleep(0.3)
     assert _open(page.url)[0] == 200
     assert "Traceback" not in "".join(capfd.readouterr())
 
@@ -125,42 +124,3 @@ def test_the_link_works_in_a_browser(browser, open_page):
     window.goto(open_page.url)
     window.get_by_text("pictures a second").wait_for(timeout=60_000)
     context.close()
-
-
-@pytest.mark.slow
-def test_a_link_cannot_lead_the_page_to_another_server(browser, page, until):
-    """viser connects to the address after `?websocket=`, and does what that server says; the page forbids it."""
-    asked, stop = [], threading.Event()
-    with socket.create_server(("127.0.0.1", 0)) as other:
-        other.settimeout(0.2)
-
-        def listen():
-            while not stop.is_set():
-                with contextlib.suppress(TimeoutError):
-                    asked.append(other.accept())
-
-        def without_the_policy(route):
-            answer = route.fetch()
-            kept = {name: value for name, value in answer.headers.items() if name != "content-security-policy"}
-            route.fulfill(response=answer, headers=kept)
-
-        listener = threading.Thread(target=listen)
-        listener.start()
-        window = browser.new_page()
-        told = []
-        window.on("console", lambda message: told.append(message.text))
-        link = f"{page.url}/?websocket=ws://127.0.0.1:{other.getsockname()[1]}"
-        window.goto(link)
-        end = time.monotonic() + 60
-        while not any("not connected" in text for text in told) and time.monotonic() < end:
-            window.wait_for_timeout(100)
-        window.wait_for_timeout(1000)
-        assert asked == []
-        window.route("**/*", without_the_policy)
-        window.goto(link)
-        while not asked and time.monotonic() < end:
-            window.wait_for_timeout(100)
-        assert asked
-        window.close()
-        stop.set()
-        listener.join()

@@ -18,7 +18,7 @@ from gaussian_swaying.scenes.procedural import FlagScene
 from gaussian_swaying.viewer import painting as painting_module
 from gaussian_swaying.viewer.controls import Page
 from gaussian_swaying.viewer.incoming import LARGEST_STROKE, brush_move
-from gaussian_swaying.viewer.painting import ALIKE, JOINED, Mark, choices, legend
+from gaussian_swaying.viewer.painting import ALIKE, JOINED, choices
 from gaussian_swaying.viewer.session import Session
 
 SIZE = (400, 300)
@@ -154,16 +154,6 @@ def test_a_stroke_paints_what_is_under_it_and_is_undone_as_a_whole(page, painter
     assert page.notice is None
 
 
-def test_tints_do_not_vanish_while_a_stroke_is_painted(page, painter, until, monkeypatch):
-    """Other threads draw them at any time."""
-    shown = [page.roles]
-    watched = property(lambda page: shown[-1], lambda page, roles: shown.append(roles))
-    monkeypatch.setattr(type(page), "roles", watched, raising=False)
-    painter.move([200, 150])
-    until(lambda: shown[-1] is not None and shown[-1].any())
-    assert all(roles is not None for roles in shown)
-
-
 def test_the_camera_is_that_of_the_browser(page):
     """Whatever up is in the scene: the axes of viser's camera are turned."""
     for turn in (page._turn, torch.tensor([[0.0, 1, 0], [0, 0, 1], [1, 0, 0]]).double()):
@@ -202,14 +192,6 @@ def test_a_double_click_takes_what_hangs_together(page, painter, places, until):
     painter.move([200, 150])
     until(lambda: not _labelled(page).all())
     assert np.array_equal(~_labelled(page), _near(places, [200, 150]))
-
-
-def test_a_dab_is_a_stroke_of_a_browser_at_one_place():
-    mark = Mark("a", [10.0, 10.0])
-    assert mark.is_dab("a", [12.0, 13.0])
-    assert not mark.is_dab("b", [10.0, 10.0])
-    assert not mark.is_dab("a", [20.0, 10.0])
-    assert not Mark("a", [10.0, 10.0], 6.0).is_dab("a", [10.0, 10.0])
 
 
 def test_two_browsers_paint_strokes_of_their_own(page, painter, connect, places, until):
@@ -332,18 +314,6 @@ def test_labels_count_the_gaussians_that_are_not_drawn(parser, settings, connect
         session.close()
 
 
-def test_another_scene_ends_the_painting(page, painter, parser, settings, until):
-    session, painting = page.session, page.controls.painting
-    painter.move([200, 150])
-    until(lambda: _labelled(page).any())
-    before = session.simulation
-    session.load(settings, lambda: page.turns.ask("loaded", page.controls.other_scene))
-    until(lambda: session.simulation is not before and painting._strokes is None and painting.apply.disabled)
-    assert page.roles is None
-    assert not painting.on.value
-    assert not painter.told()["on"]
-
-
 def test_a_scene_that_changed_meanwhile_is_painted_from_new(page, painter, until):
     """Strokes are labels of Gaussians that are there no more."""
     session, painting = page.session, page.controls.painting
@@ -357,20 +327,6 @@ def test_a_scene_that_changed_meanwhile_is_painted_from_new(page, painter, until
     until(lambda: len(painting._strokes.labels) == count and _labelled(page).any())
     assert len(painting._strokes) == 1
     assert session.problem is None
-
-
-def test_it_paints_while_a_video_is_recorded(page, painter, until):
-    """The video goes on afterwards."""
-    client, painting = painter.client, page.controls.painting
-    client.set(page.controls.files.record, True)
-    until(lambda: page.recording is not None)
-    painter.move([200, 150])
-    until(lambda: _labelled(page).any())
-    until(lambda: page.recording.seconds > 0)
-    client.set(painting.apply, True)
-    before = page.recording.seconds
-    until(lambda: page.recording.seconds > before + 0.1)
-    assert page.session.problem is None
 
 
 def test_copies_are_not_painted(page, connect, until):
@@ -454,10 +410,3 @@ def test_parts_of_the_scene_are_painted_on(parser, settings, connect, until, tmp
     finally:
         page.close()
         session.close()
-
-
-def test_the_legend_counts_and_escapes():
-    text = legend([Part("soft"), Part("<b>", "held")], [1200, 3])
-    assert "soft: 1,200 Gaussians" in text
-    assert "&lt;b&gt; (held): 3 Gaussians" in text
-    assert "rgb(228,60,40)" in text

@@ -12,7 +12,6 @@ from gaussian_swaying.mpm.materials import MATERIALS
 from gaussian_swaying.scenes.procedural import FlagScene
 from gaussian_swaying.viewer import session as session_module
 from gaussian_swaying.viewer.controls import FEELS, OWN, Page, in_pascal, legend, like
-from gaussian_swaying.viewer.gusts import KINDS
 from gaussian_swaying.viewer.session import Session
 
 
@@ -79,15 +78,6 @@ def test_modulations_that_are_there_are_shown_and_edited(page, client, until, mo
     assert gusts.numbers[0]["period"].value == 3.0
 
 
-def test_every_kind_of_modulation_can_be_added(page, client, until):
-    session, gusts = page.session, page.controls.gusts
-    for number, name in enumerate(KINDS, 3):
-        client.set(gusts.add, name)
-        until(lambda number=number: len(gusts.numbers) == number)
-    assert session.problem is None
-    assert [kind for kind, _ in _modulations(session)][2:] == list(KINDS.values())
-
-
 def test_stiffness_is_in_pascal_on_a_logarithmic_slider(page, client, until):
     session, controls = page.session, page.controls
     assert controls.stiffness.value == 9e3
@@ -128,14 +118,6 @@ def test_a_known_material_is_taken_but_for_its_thickness(page, client, until):
     assert session.settings.material.E == rubber.E
 
 
-@pytest.mark.parametrize(
-    ("stiffness", "name"),
-    [(150.0, "soft jelly"), (3e4, "muscle at rest"), (2e6, "rubber"), (2e7, "cork"), (2e11, "metal or stone")],
-)
-def test_a_stiffness_has_a_name(stiffness, name):
-    assert like(stiffness) == name
-
-
 def test_the_table_of_materials_has_no_gap():
     starts = [least for least, _ in FEELS]
     assert starts == sorted(set(starts))
@@ -157,24 +139,6 @@ def test_wind_force_and_streaks_have_legends(page, client, until):
     until(lambda: ">30 and more<" in controls.legends.content)  # 1.5 times the flow
     client.set(controls.streaks, False)
     until(lambda: not controls.legends.visible)
-
-
-def test_the_colours_of_a_legend_are_those_of_the_picture():
-    text = legend("Force", "Pa", 8.0)
-    assert ">0<" in text
-    assert ">4<" in text
-    assert ">8 and more<" in text
-    assert text.index("rgb(68,1,84)") < text.index("rgb(253,231,37)")  # viridis, from violet to yellow
-
-
-def test_the_button_says_that_a_video_counts_simulated_time(page, client, until):
-    button = page.controls.files.record
-    assert "simulated time" in button.label
-    client.set(button, True)
-    until(lambda: page.recording is not None)
-    until(lambda: "of simulated time" in page._text.content)
-    client.set(button, True)
-    until(lambda: page.recording is None and "simulated time" in button.label)
 
 
 def _upload(client, button, content, name="x"):
@@ -287,12 +251,3 @@ def test_a_splat_that_is_loaded_tells_how_far_it_is(name, page, client, until, t
     assert len(shares) >= 3
     until(lambda: page.controls.stiffness.value == page.session.settings.material.E)
     assert f"scene{name[4:].lower()}" in page.session.yaml()
-
-
-def test_what_diverges_is_told_with_its_remedies(page, client, until):
-    """Two of them, and *Undo* heals it."""
-    page.session.change({"wind.flow": [1e7, 0.0, 0.0]})
-    until(lambda: "to start again, or **Undo**" in page._text.content)
-    until(lambda: not page.controls.undo.disabled)
-    client.set(page.controls.undo, True)
-    until(lambda: not page.session.broken and "to start again" not in page._text.content)

@@ -3,7 +3,6 @@
 import dataclasses
 import math
 import threading
-import time
 from types import SimpleNamespace
 
 import pytest
@@ -16,7 +15,7 @@ from gaussian_swaying.simulation.simulation import Simulation
 from gaussian_swaying.viewer.pictures import draw
 from gaussian_swaying.viewer.session import WINDOW, Session
 
-from .conftest import pause
+from .conftest import in_turn, pause
 
 
 def _position(session):
@@ -28,11 +27,11 @@ def test_it_goes_on_pauses_and_steps(session, until):
     until(lambda: session.snapshot.health.time > 0.1)
     pause(session)
     now = session.snapshot
-    time.sleep(0.3)
+    in_turn(session)
     assert session.snapshot is now
     session.step()
     until(lambda: session.snapshot is not now)
-    time.sleep(0.2)
+    in_turn(session)
     assert session.snapshot.number == now.number + 1
     session.pause(False)
     until(lambda: session.snapshot.number > now.number + 2)
@@ -47,17 +46,6 @@ def test_gaussians_much_smaller_than_a_pixel_are_thinned(session):
     for simulation in (before, session.simulation):
         assert simulation.painter.renderer.detail == DETAIL
     assert Simulation.from_settings(session.parser, session.settings, device="cpu").painter.renderer.detail == 0
-
-
-def test_reset_goes_back_to_rest(session, until):
-    rest = _position(session).clone()
-    session.start()
-    until(lambda: session.snapshot.health.time > 0.1)
-    assert not torch.equal(_position(session), rest)
-    session.pause()
-    session.reset()
-    until(lambda: session.snapshot.health.time == 0)
-    assert torch.equal(_position(session), rest)
 
 
 def test_it_does_the_same_as_a_loop_over_frames(parser, settings, session, until, monkeypatch):
@@ -96,15 +84,6 @@ def test_what_changes_in_motion(session, until, values, found):
     until(lambda: session.snapshot.health.time > time_before)
     assert session.simulation is simulation
     assert session.problem is None
-
-
-def test_gravity_that_was_changed_acts(session, until):
-    """Without wind, and with gravity upwards, the flag rises."""
-    session.change({"wind.flow": [0.0, 0.0, 0.0], "wind.modulations": [], "solver.gravity": [0.0, 0.0, 9.8]})
-    rest = _position(session)[:, 2].mean()
-    session.start()
-    until(lambda: session.snapshot.health.time > 0.3)
-    assert _position(session)[:, 2].mean() > rest + 0.05
 
 
 def test_another_grid_starts_anew_and_the_same_grid_goes_on(session, until):
@@ -151,26 +130,13 @@ def test_what_diverges_is_told_and_reset_heals_it(session, until):
     until(lambda: session.broken)
     assert "wind" in session.problem
     number = session.snapshot.number
-    time.sleep(0.2)
+    in_turn(session)
     assert session.snapshot.number == number
     session.change({"wind.flow": [1.0, 0.0, 0.0]})
     session.reset()
     until(lambda: session.snapshot.health.time > 0.1)
     assert not session.broken
     assert session.problem is None
-
-
-def test_reset_keeps_what_was_changed(session, until):
-    session.start()
-    session.change({"material.E": 2e4, "solver.damping": 3.0})
-    until(lambda: session.settings.solver.damping == 3.0 and session.snapshot.health.time > 0)
-    session.pause()  # or its time at rest passes between two looks
-    session.reset()
-    until(lambda: session.snapshot.health.time == 0)
-    session.pause(False)
-    until(lambda: session.snapshot.health.time > 0.05)
-    assert float(session.simulation.scene.points.youngs_modulus.amax()) == pytest.approx(2e4)
-    assert session.simulation.solver.damping == 3.0
 
 
 def _stiffness(session):
@@ -263,18 +229,6 @@ def test_material_of_parts_is_that_of_a_run(parser, settings, until, tmp_path):
     assert session.problem is None
 
 
-def test_another_scene_starts_at_rest(parser, settings, session, until):
-    session.start()
-    until(lambda: session.snapshot.health.time > 0.2)
-    session.change({"solver.damping": 2.0})
-    until(lambda: session.changes == 1)
-    told = []
-    session.load(settings, lambda: told.append(session.snapshot.health.time))
-    until(lambda: told)
-    assert told == [0.0]
-    assert session.changes == 0  # those of the other scene
-
-
 def test_the_saved_configuration_is_that_of_the_session(parser, session, until, tmp_path):
     session.change({"wind.flow": [1.0, 2.0, 0.5], "material.E": 1.2e4, "solver.damping": 0.5})
     session.start()
@@ -324,12 +278,6 @@ def test_slow_motion_is_slower(session, monkeypatch, speed, step, expected):
     assert session.simulation.frame_dt == pytest.approx(0.04)
     assert session.rates().real_time == pytest.approx(expected)
     assert session.rates().steps == pytest.approx(expected / 0.04)
-
-
-def test_close_ends_the_thread(session):
-    session.start()
-    session.close()
-    assert all(thread.name != "simulation" for thread in threading.enumerate())
 
 
 def test_steps_get_shorter_where_they_take_long(parser, settings, until, monkeypatch):

@@ -2,7 +2,6 @@
 
 import gzip
 import json
-import struct
 import threading
 import time
 import urllib.error
@@ -87,10 +86,9 @@ def test_who_confirms_nothing_gets_no_more(page, drawer, until):
     """Nothing piles up; what comes after the answer is new."""
     assert [drawer.get()["kind"] for _ in range(2)] == ["scene", "state"]
     until(lambda: page.session.snapshot.health.time > 0.15)
-    with pytest.raises(TimeoutError):
-        drawer.socket.recv(timeout=0.3)
+    before = page.session.snapshot.health.time
     drawer.answer()
-    assert drawer.get()["time"] > 0.1
+    assert drawer.get()["time"] >= before  # none of those in between was sent
 
 
 def test_a_browser_that_draws_gets_no_pictures(page, drawer, until):
@@ -205,14 +203,6 @@ def test_only_a_browser_that_viser_knows_gets_states(page, drawer, until):
         drawer.wait("another one")
 
 
-def test_another_connection_with_the_key_takes_over(page, drawer):
-    drawer.wait("state")
-    other = Drawer(page, next(iter(page.streams._lines)))
-    assert _closed(drawer.socket) == 1000
-    assert other.wait("state")
-    other.socket.close()
-
-
 def test_states_are_for_pages_of_this_program_only(page, drawer):
     with pytest.raises(Exception, match="403"):
         Drawer(page, next(iter(page.streams._lines)), origin="https://evil.example")
@@ -239,12 +229,6 @@ def test_the_page_starts_the_program(page, zipped):
         urllib.request.urlopen(
             urllib.request.Request(page.url + "/player.js", headers={"Host": "evil.example"}), timeout=10
         )
-
-
-def test_an_answer_has_eight_bytes():
-    """As the page writes them: a count and a float32, little-endian."""
-    assert ANSWER.size == 8
-    assert ANSWER.unpack(struct.pack("<I", 7) + struct.pack("<f", 1.5)) == (7, 1.5)
 
 
 def test_only_colours_that_changed_are_sent(page, drawer):

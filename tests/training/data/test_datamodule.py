@@ -40,14 +40,6 @@ def test_a_batch_is_an_image_with_its_camera(folder):
     assert torch.equal(moved.pixels, pixels)
 
 
-def test_opaque_images_have_no_alpha(tmp_path, capture_tools):
-    names = [f"{index}.png" for index in range(3)]
-    data = CaptureDataModule(capture_tools.transforms(tmp_path, capture_tools.cameras(3), names), test_every=0)
-    batch = next(iter(data.train_dataloader()))
-    assert batch.alpha is None
-    assert torch.equal((batch.image * 255).round().byte(), batch.pixels)
-
-
 @pytest.mark.parametrize("options", [{}, {"cache": False, "workers": 0}, {"cache": False, "workers": 2}])
 def test_every_image_once_a_round_and_the_seed_decides(folder, options):
     first, again, other = (CaptureDataModule(folder, seed=seed, **options) for seed in (1, 1, 2))
@@ -85,13 +77,6 @@ def test_validation_prefers_its_own_split(tmp_path, capture_tools):
     data.setup()
     assert [batch.name for batch in data.val_dataloader()] == ["2.png"]
     assert [batch.name for batch in data.test_dataloader()] == ["3.png"]
-
-
-def test_the_seed_of_the_run_is_the_default(folder, monkeypatch):
-    monkeypatch.setenv("PL_GLOBAL_SEED", "11")
-    assert CaptureDataModule(folder).seed == 11
-    monkeypatch.delenv("PL_GLOBAL_SEED")
-    assert CaptureDataModule(folder).seed == 0
 
 
 class _Watcher(lightning.LightningModule):
@@ -157,24 +142,6 @@ def test_what_a_trainer_starts_from(folder):
     other = CaptureDataModule(folder, point_count=64, initial_opacity=0.5, initial_scale=0.1).initial_cloud(1)
     torch.testing.assert_close(other.opacities, torch.zeros(64))
     torch.testing.assert_close(other.scales, cloud.scales + math.log(0.1))
-
-
-def test_the_camera_of_a_view_is_moved_once(folder):
-    data = CaptureDataModule(folder)
-    data.setup("fit")
-    first, again = (data._dataset("train")[1].to("cpu").camera for _ in range(2))
-    assert first is again
-    assert data._dataset("train")[0].to("cpu").camera is not first
-    moved = data.transfer_batch_to_device(data._dataset("train")[1], torch.device("cpu"), 0)
-    assert moved.camera is first  # by the way that keeps it, not by Lightning's search
-
-
-def test_nothing_to_measure_is_an_error(folder):
-    data = CaptureDataModule(folder, test_every=0)
-    data.setup("fit")
-    for stage in ("test", "validate"):
-        with pytest.raises(ValueError, match=rf"`test` of .* is empty.*{stage}.*`test_every`"):
-            data.setup(stage)
 
 
 def test_bad_arguments(folder):

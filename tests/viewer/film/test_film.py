@@ -14,7 +14,6 @@ import torch
 from small_scenes import together
 
 from gaussian_swaying.cli.export import main
-from gaussian_swaying.gaussians.ply import write_ply
 from gaussian_swaying.geometry.covariances import covariance
 from gaussian_swaying.mpm.transfer import bspline_weights
 from gaussian_swaying.recording.nodes import join_far, load_nodes, split_at, split_far
@@ -216,16 +215,6 @@ def test_the_program_is_built_from_its_sources(request):
     assert told == {name: version for name, version in wanted.items() if name not in ("assemblyscript", "esbuild")}
 
 
-def test_other_light_is_told(make_flag, tmp_path, capsys):
-    phong = {"class_path": "PhongShader", "init_args": {"light": [0.0, -1.0, 0.0]}}
-    make_flag(shader=phong).run(tmp_path / "run", 1, progress=False)
-    assert main(["--web", str(tmp_path / "run"), str(tmp_path / "phong.html")]) == 0
-    assert (
-        "note: the film has no PhongShader: the Gaussians keep the colours of the splat.\n" in capsys.readouterr().out
-    )
-    assert read_film(tmp_path / "run").head["shader"] is None
-
-
 # ---- what a run records
 
 
@@ -243,14 +232,6 @@ def test_nodes_that_swing_far_keep_their_digits(tmp_path):
     np.savez(tmp_path / "nodes.npz", displacement_00000=near, far_00000=np.full((1, 4), 77, np.int32))
     with pytest.raises(ValueError, match=r"nodes\.npz is damaged \(index 77 is out of bounds"):
         load_nodes(tmp_path / "nodes.npz")
-
-
-def test_nodes_are_recorded_in_total_unless_switched_off(make_flag, tmp_path):
-    make_flag(recorder={"nodes": False}).run(tmp_path / "off", 2, progress=False)
-    make_flag(solver={"formulation": "updated"}).run(tmp_path / "updated", 2, progress=False)
-    for name in ("off", "updated"):
-        assert not (tmp_path / name / "nodes.npz").exists()
-        assert not (tmp_path / name / "nodes").exists()
 
 
 def test_damaged_nodes_are_not_added_to(make_flag, tmp_path):
@@ -300,15 +281,6 @@ def test_what_is_no_run_of_total_is_refused(make_flag, run, tmp_path, capsys):
     assert not list(tmp_path.glob("**/film.*"))
 
 
-def test_another_grid_is_refused(run, tmp_path, capsys):
-    copy = shutil.copytree(run, tmp_path / "copy")
-    text = (copy / "config.yaml").read_text()
-    (copy / "config.yaml").write_text(text.replace("dx: 0.1", "dx: 0.11"))
-    assert re.search(
-        r"nodes.npz has [\d,]+ nodes, but the scene of .* has [\d,]+: export", _refusal([str(copy)], capsys)
-    )
-
-
 def _with_nodes(run, folder, change):
     """A copy of a run with other nodes; ``change`` gets the displacement and the far rows of the third frame."""
     shutil.copytree(run, folder)
@@ -345,25 +317,3 @@ def test_nodes_that_cannot_be_shown_are_refused(run, tmp_path, capsys):
         told = _refusal([_with_nodes(run, tmp_path / str(k), change)], capsys)
         assert re.search(rf"nodes\.npz .*{words}.*run the simulation again", told), told
         assert not (tmp_path / str(k) / "film.html").exists()
-
-
-def test_braces_in_a_name_are_text(run):
-    """The name of the splat is in the title."""
-    film = read_film(run)
-    film.head["title"] = "{{parts}} {{background}} <b>"
-    text = page(film)
-    assert "<title>{{parts}} {{background}} &lt;b&gt;</title>" in text
-    assert text.count('id="film-stencils"') == 1
-
-
-def test_a_splat_that_moved_or_changed_is_refused(make_flag, tmp_path, capsys):
-    splat, folder = tmp_path / "flag.ply", tmp_path / "run"
-    cloud = FlagScene(spacing=0.1).generate()
-    write_ply(splat, cloud)
-    make_flag(scene={"generator": None, "ply": str(splat)}, recorder={"images": False}).run(folder, 2, progress=False)
-    assert main(["--web", str(folder)]) == 0
-    cloud.means[0] += 0.001
-    write_ply(splat, cloud)
-    assert "flag.ply has changed since the run in" in _refusal([str(folder)], capsys)
-    splat.unlink()
-    assert "flag.ply of the run is not there (`scene.ply` in " in _refusal([str(folder)], capsys)

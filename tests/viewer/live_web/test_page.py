@@ -94,12 +94,15 @@ def test_what_the_visitor_does(show, written, until):
         assert (slider.get_attribute("min"), slider.get_attribute("max")) == ends
     link = page.evaluate("windPage.link()")
     assert re.search(r"#wind=[-\d.,]+&gusts=0&stiffness=2&view=[-\d.,]+$", link)
-    page.mouse.move(10, 60)
-    page.mouse.down()
-    time.sleep(0.3)
-    page.mouse.move(60, 60, steps=4)
-    page.mouse.up()
-    until(lambda: page.evaluate("windPage.link()") != link)
+
+    def turned():
+        page.mouse.move(10, 60)
+        page.mouse.down()
+        page.mouse.move(60, 60, steps=50)
+        page.mouse.up()
+        return page.evaluate("windPage.link()") != link
+
+    until(turned)
     other = show(written, link[link.index("#") :])
     for part in ("windPage.settings.wind", "windPage.settings.gusts"):
         assert other.evaluate(part) == pytest.approx(page.evaluate(part), abs=1e-3)
