@@ -1,7 +1,4 @@
-"""Computed air around a sheet: momentum, energy, masses, what it costs, and what is refused.
-
-Covers: aero.computed_air_triton.
-"""
+"""Computed air around a sheet: momentum, energy, masses, what it costs, and what is refused."""
 
 import pytest
 import torch

@@ -1,7 +1,4 @@
-"""A wind with effects in the kernels against the same wind in torch.
-
-Covers: aero.effects, aero.effects_triton, aero.obstacles_triton, aero.wind_triton, mpm.twins.
-"""
+"""A wind with effects in the kernels against the same wind in torch."""
 
 import numpy as np
 import pytest

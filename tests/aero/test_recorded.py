@@ -1,7 +1,4 @@
-"""Winds from files: what is read, and that a file that does not fit is refused with a sentence.
-
-Covers: aero.wind_files.
-"""
+"""Winds from files: what is read, and that a file that does not fit is refused with a sentence."""
 
 import math
 import struct

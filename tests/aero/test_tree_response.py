@@ -50,7 +50,7 @@ def _sway(wind, seconds):
     return torch.stack(found), EVERY * dt, state.time, (solver, crown)
 
 
-@pytest.mark.slow(twin="test_turbulence_does_not_depend_on_the_substep")
+@pytest.mark.slow
 def test_the_response_spectrum_is_that_of_linear_theory():
     calm, step, _, (solver, crown) = _sway(WindField([SPEED, 0.0, 0.0]), 9.0)
     mean = calm[len(calm) // 2 :].mean()  # it has settled to e^-4

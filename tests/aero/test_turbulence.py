@@ -1,10 +1,7 @@
 """Turbulence against von Karman's closed forms: variance, length, spectrum, coherence, divergence, interpolation.
 
 A box holds the waves between its sides and its cells, and leaves the others out. So each number has two targets: the
-closed form of endless turbulence, where what is left out does not matter, and the sum over the waves of the box.
-
-Covers: aero.carried, aero.lookup, aero.spectra, aero.turbulence_box.
-"""
+closed form of endless turbulence, where what is left out does not matter, and the sum over the waves of the box."""
 
 import math
 
@@ -119,7 +116,7 @@ def test_correlation_and_integral_length_are_von_karmans(measured):
     assert length == pytest.approx(L, rel=0.05)
 
 
-@pytest.mark.slow(twin="test_spectra_are_von_karmans")
+@pytest.mark.slow
 def test_spectrum_falls_with_the_power_five_thirds():
     """A box of fine cells: von Karman's own slope is within 3 % of 5/3 from k L = 5 on, its cells hold up to 12."""
     cells, spacing = (512, 64, 64), L / 32
@@ -150,7 +147,7 @@ def test_coherence_is_that_of_the_waves_of_the_box(measured):
             assert float((found - turned)[first:last].mean()) == pytest.approx(0.0, abs=0.025)
 
 
-@pytest.mark.slow(twin="test_coherence_is_that_of_the_waves_of_the_box")
+@pytest.mark.slow
 def test_coherence_falls_with_the_distance_as_von_karmans():
     """Within 5 % where it is more than 0.2, with cells of L / 8, twice as wide as the default ones, in a box 12 L wide.
 

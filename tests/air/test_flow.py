@@ -1,9 +1,6 @@
 """The flow against exact and published ones, and its kernels against torch.
 
-The problems are those of tools/bench/problems/air.py; the bench records finer ones.
-
-Covers: air.flow_kernels.
-"""
+The problems are those of tools/bench/problems/air.py; the bench records finer ones."""
 
 import pytest
 import torch

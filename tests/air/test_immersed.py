@@ -1,7 +1,4 @@
-"""Surfaces in the air: momentum to rounding, no overshoot for any mass, and kernels against torch.
-
-Covers: air.immersed_kernels.
-"""
+"""Surfaces in the air: momentum to rounding, no overshoot for any mass, and kernels against torch."""
 
 import pytest
 import torch

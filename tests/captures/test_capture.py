@@ -1,7 +1,4 @@
-"""Captures in every format, against the cameras and pictures that were written.
-
-Covers: captures.colmap, captures.transforms.
-"""
+"""Captures in every format, against the cameras and pictures that were written."""
 
 import json
 import math

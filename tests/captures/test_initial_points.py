@@ -1,7 +1,4 @@
-"""Where training starts: points of the capture, of files, of meshes, and at random.
-
-Covers: captures.point_cloud.
-"""
+"""Where training starts: points of the capture, of files, of meshes, and at random."""
 
 import numpy as np
 import pytest

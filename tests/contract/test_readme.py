@@ -68,7 +68,7 @@ def test_the_faster_flag_holds_to_its_pole_and_ends_without_warnings(tmp_path, c
     assert stretched["value"] < 1.25
 
 
-@pytest.mark.slow(twin="test_the_faster_flag_holds_to_its_pole_and_ends_without_warnings")
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["", "windier"])
 def test_the_quick_start_ends_without_warnings(name, tmp_path, capsys, monkeypatch):
     monkeypatch.chdir(ROOT)

@@ -1,7 +1,4 @@
-"""Comparing folders whose differences are known.
-
-Covers: evaluation.compare.
-"""
+"""Comparing folders whose differences are known."""
 
 import json
 import math

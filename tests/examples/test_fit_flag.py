@@ -57,7 +57,7 @@ def _coarse(init):
     return lambda self, **given: init(self, **({"spacing": 0.1} | given))
 
 
-@pytest.mark.slow(twin="test_a_few_iterations_lead_towards_the_truth")
+@pytest.mark.slow
 def test_both_are_found_within_two_per_cent(tool, tmp_path):
     assert tool.main(["--json", str(tmp_path / "fit.json")]) == 0
     recorded = json.loads((tmp_path / "fit.json").read_text())

@@ -1,7 +1,4 @@
-"""A solver that the package does not know: through the simulation, the recorder, the live page and ``eval``.
-
-Covers: mpm.protocol.
-"""
+"""A solver that the package does not know: through the simulation, the recorder, the live page and ``eval``."""
 
 import importlib.util
 import json

@@ -1,7 +1,4 @@
-"""Signed distances of solids, against brute force and exact values.
-
-Covers: geometry.keyed_path, geometry.meshes.
-"""
+"""Signed distances of solids, against brute force and exact values."""
 
 import math
 import os

@@ -1,7 +1,4 @@
-"""Scene units to metres and back, against closed forms.
-
-Covers: _devices, simulation.frame.
-"""
+"""Scene units to metres and back, against closed forms."""
 
 import dataclasses
 

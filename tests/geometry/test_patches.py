@@ -1,7 +1,4 @@
-"""Normals and areas of patches against mapped planes and inverses, in torch and in the kernel.
-
-Covers: geometry.patches_triton.
-"""
+"""Normals and areas of patches against mapped planes and inverses, in torch and in the kernel."""
 
 import pytest
 import torch

@@ -1,7 +1,4 @@
-"""Regions and the choice of what is simulated.
-
-Covers: gaussians.selection.
-"""
+"""Regions and the choice of what is simulated."""
 
 import copy
 

@@ -1,7 +1,4 @@
-"""Chamfer distance against brute force and closed forms.
-
-Covers: metrics.nearest.
-"""
+"""Chamfer distance against brute force and closed forms."""
 
 import pytest
 import torch

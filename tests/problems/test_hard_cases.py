@@ -891,7 +891,7 @@ def _minutes(series, blocks=12):
     return means.mean(-1), means.std(-1) / math.sqrt(blocks)
 
 
-@pytest.mark.slow(twin="test_gusts_that_turn_round_every_frame")
+@pytest.mark.slow
 @pytest.mark.timeout(3600)
 @pytest.mark.parametrize("damping", DAMPINGS)
 def test_ten_minutes_of_a_gusty_flag(damping):
@@ -913,7 +913,7 @@ def test_ten_minutes_of_a_gusty_flag(damping):
     assert abs(float(mean[-1] - mean[1])) < 4 * math.hypot(float(error[-1]), float(error[1]))
 
 
-@pytest.mark.slow(twin="test_gusts_that_turn_round_every_frame")
+@pytest.mark.slow
 @pytest.mark.timeout(3600)
 def test_ten_minutes_do_not_heat_a_damped_flag():
     """The mean mechanical energy of the tenth minute is that of the second, within 4 standard errors.
@@ -927,7 +927,7 @@ def test_ten_minutes_do_not_heat_a_damped_flag():
     assert abs(float(mean[-1] - mean[1])) < 4 * math.hypot(float(error[-1]), float(error[1]))
 
 
-@pytest.mark.slow(twin="test_contrasts_within_one_body")
+@pytest.mark.slow
 @pytest.mark.skipif(TRANSFER == "torch", reason="this is that run")
 def test_the_hard_cases_hold_in_torch():
     """All that are in the gate, once more without kernels."""

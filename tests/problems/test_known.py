@@ -24,7 +24,7 @@ def test_a_known_answer_on_a_coarse_grid(one, run):
     assert one.missed(run | one.measure(**run), one.goal | one.loose) == []
 
 
-@pytest.mark.slow(twin="test_a_known_answer_on_a_coarse_grid")
+@pytest.mark.slow
 @pytest.mark.timeout(3600)
 @pytest.mark.parametrize(("one", "run", "recorded"), FINE, ids=[_name(one, run) for one, run, _ in FINE])
 def test_a_known_answer_on_a_fine_grid(one, run, recorded):

@@ -19,7 +19,7 @@ from torch.func import jacrev, vmap
 
 from gaussian_swaying.mpm.laws.fixed_corotated import fixed_corotated_pk1
 
-pytestmark = pytest.mark.slow(twin="test_a_known_answer_on_a_coarse_grid")
+pytestmark = pytest.mark.slow
 
 
 def test_elasticas():

@@ -300,7 +300,7 @@ def test_a_flat_flag_edge_on_to_a_steady_wind_stays_flat(formulation):
     assert float(state.velocity[:, 0].abs().max()) > 1e-3
 
 
-@pytest.mark.slow(twin="test_a_flat_flag_edge_on_to_a_steady_wind_stays_flat")
+@pytest.mark.slow
 def test_the_least_disturbance_of_a_limp_flag_edge_on_grows():
     """Pressure follows the slope, -q C w_x, and couples the bending modes as in panel flutter: D w_xxxx + q C w_x = 0.
 

@@ -1,7 +1,4 @@
-"""One writer per folder, however two of them meet.
-
-Covers: runs.folder.
-"""
+"""One writer per folder, however two of them meet."""
 
 import gc
 import os

@@ -1,7 +1,4 @@
-"""The building blocks of the generated scenes against shapes of known area and normal.
-
-Covers: scenes.plant_parts.
-"""
+"""The building blocks of the generated scenes against shapes of known area and normal."""
 
 import math
 

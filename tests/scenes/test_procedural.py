@@ -1,7 +1,4 @@
-"""The generated flag against the sheet it stands for.
-
-Covers: scenes.printed_cloth.
-"""
+"""The generated flag against the sheet it stands for."""
 
 import math
 

@@ -1,8 +1,4 @@
-"""The generated scenes: what they hold, that they repeat, and what they refuse.
-
-Covers: scenes.alocasia, scenes.ficus, scenes.flag_on_stand, scenes.leaves, scenes.sand, scenes.stage,
-scenes.telephone, scenes.vase, scenes.windbreaks.
-"""
+"""The generated scenes: what they hold, that they repeat, and what they refuse."""
 
 import math
 

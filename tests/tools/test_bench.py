@@ -58,7 +58,7 @@ def test_the_pages_say_what_is_recorded():
     assert [name for name in report.SECTIONS if f"<!-- begin: {name} -->" not in pages] == []
 
 
-@pytest.mark.slow(twin="test_a_run_adds_a_line_and_the_last_one_counts")
+@pytest.mark.slow
 def test_studies_run_at_their_smallest():
     studies.load()
     small = {

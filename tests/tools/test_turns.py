@@ -9,7 +9,7 @@ import pytest
 ROOT = Path(__file__).parents[2]
 
 
-@pytest.mark.slow(twin="test_two_checkouts_are_asked_for")
+@pytest.mark.slow
 def test_a_checkout_is_compared_with_itself():
     words = [sys.executable, "tools/bench/speed/turns.py", ".", "."]
     words += ["--runs", "1", "--cases", "flag", "--device", "cpu"]

@@ -11,7 +11,7 @@ pytest.importorskip("viser", reason="needs the extra [viewer]")
 from gaussian_swaying.viewer.film.page import PAGE
 from gaussian_swaying.viewer.film.recorded import order_of
 
-from .conftest import FLAGS, pause, pictures_since
+from .conftest import pause, pictures_since
 
 
 @pytest.fixture(scope="module")
@@ -271,13 +271,3 @@ def test_a_browser_that_cannot_draw_gets_pictures(page, open_window, until, way)
     before = _picture(window)
     until(lambda: np.abs(_picture(window) - before).max() > 20)
     assert window.problems == []
-
-
-def test_without_webgl_the_page_says_what_it_needs(page, chromium, browser):
-    started = browser.browser_type.launch(
-        executable_path=chromium, args=[*FLAGS[:2], "--disable-gpu", "--disable-3d-apis"]
-    )
-    window = started.new_page()
-    window.goto(page.url)
-    window.get_by_text("This page needs WebGL2").wait_for(timeout=60_000)
-    started.close()
