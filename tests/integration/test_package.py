@@ -9,7 +9,6 @@ from importlib import import_module
 from pathlib import Path
 
 import pytest
-import torch
 import yaml
 
 import gaussian_swaying
@@ -83,35 +82,6 @@ def test_a_run_imports_only_what_it_needs(tmp_path):
     done = _python("-c", f"{run}\nprint([name for name in {heavy} if name in sys.modules])", TRITON_INTERPRET="0")
     assert done.stdout.splitlines()[-1:] == ["[]"], done.stdout + done.stderr
     assert (tmp_path / "video.mp4").is_file()
-
-
-@pytest.mark.skipif(torch.cuda.is_available(), reason="shows what happens without a GPU")
-def test_gpu_tests_skip_without_a_gpu_and_fail_if_one_is_required():
-    command = ["-m", "pytest", "-q", "-p", "no:cacheprovider", "-m", "gpu", "tests/aero/test_wind.py"]
-    skipped = _python(*command, GS_REQUIRE_GPU="0")
-    assert skipped.returncode == 0
-    assert "skipped" in skipped.stdout
-    assert "passed" not in skipped.stdout
-    assert _python(*command, GS_REQUIRE_GPU="1").returncode == 1
-
-
-def test_pages_are_skipped_without_a_browser_and_fail_where_ci_is_set(tmp_path):
-    """A gate that cannot try the pages says so."""
-    command = [
-        "-m",
-        "pytest",
-        "-q",
-        "-p",
-        "no:cacheprovider",
-        "tests/viewer/film/test_browser.py",
-        "-k",
-        "film_is_the_run",
-    ]
-    skipped = _python(*command, CI="", PATH=str(tmp_path))
-    assert (skipped.returncode, "1 skipped" in skipped.stdout) == (0, True), skipped.stdout
-    failed = _python(*command, CI="true", PATH=str(tmp_path))
-    assert failed.returncode == 1
-    assert "Failed: needs an installed Chromium" in failed.stdout
 
 
 def test_every_dependency_is_pinned():
