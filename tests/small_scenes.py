@@ -15,6 +15,7 @@ from gaussian_swaying.geometry.regions import Box
 from gaussian_swaying.geometry.rotations import quat_to_rotation
 from gaussian_swaying.mpm.boundaries.pinned_region import PinnedRegion
 from gaussian_swaying.mpm.solver import MPMSolver
+from gaussian_swaying.preview.results import write
 from gaussian_swaying.rendering.cameras.camera_path import OrbitCamera
 from gaussian_swaying.scenes.procedural import FlagScene, GivenScene
 from gaussian_swaying.simulation.material import Material
@@ -66,11 +67,45 @@ def block(sides, color, count=3000):
     return dataclasses.replace(cloud, sh=sh[:, None])
 
 
+def blobs(centres, radius, color, count, seed=0):
+    """Thin discs that face anywhere, in balls around centres (N, 3)."""
+    draw = torch.Generator().manual_seed(seed)
+    own = torch.tensor(centres)[torch.randint(len(centres), (count,), generator=draw)]
+    place = own + radius * torch.randn(count, 3, generator=draw).clamp(-1.5, 1.5) / 1.5
+    turn = torch.nn.functional.normalize(torch.randn(count, 4, generator=draw), dim=-1)
+    cloud = plain_cloud(place, (-4.2, -4.2, -6.0), turn, logit=3.0)
+    return dataclasses.replace(cloud, sh=((torch.tensor(color) - 0.5) / SH_DC).expand(count, 1, 3))
+
+
+def shrub(count=4000):
+    """Nine leafy stems of 1 m that lean outwards from one foot."""
+    stems = [(0.0, 0.0)] + [(math.cos(a), math.sin(a)) for a in torch.arange(8.0).mul(math.pi / 4).tolist()]
+    at = [
+        (0.12 * x + 0.3 * h * h * x, 0.12 * y + 0.3 * h * h * y, h)
+        for x, y in stems
+        for h in torch.linspace(0, 1, 24).tolist()
+    ]
+    return blobs(at, 0.05, GREEN, count)
+
+
+def young_tree(count=4000):
+    """A trunk of 1.2 m below a round crown."""
+    trunk = blobs([(0.0, 0.0, h) for h in torch.linspace(0, 1.2, 60).tolist()], 0.03, (0.4, 0.3, 0.2), count // 4)
+    crown = [(0.25 * math.cos(a), 0.25 * math.sin(a), h) for a in torch.arange(6.0).tolist() for h in (1.2, 1.5, 1.8)]
+    return together(trunk, blobs(crown, 0.18, GREEN, 3 * count // 4, 1))
+
+
+def lamp(count=3000):
+    """A shade on a cord of 0.6 m."""
+    cord = blobs([(0.0, 0.0, h) for h in torch.linspace(0.3, 0.95, 60).tolist()], 0.012, (0.1, 0.1, 0.1), count // 3)
+    return together(cord, blobs([(0.0, 0.0, 0.15)], 0.17, (0.7, 0.2, 0.2), 2 * count // 3, 1))
+
+
 def previewed(cloud, folder, *options):
     write_ply(folder / "it.ply", cloud)
     given = [str(folder / "it.ply"), "--up", "+z", "--device", "cpu", "--quality", "draft", "--height", "96", *options]
     preview = preview_scene(build_options().parse_args(given), folder)
-    (folder / "starter.yaml").write_text(preview.configurations["starter"])
+    write(preview, folder)
     return preview, Simulation.from_yaml(folder / "starter.yaml", device="cpu")
 
 

@@ -59,7 +59,7 @@ def typical_start(motion: Motion, frequency: float, tonal: bool = True) -> float
     Args:
         motion: The motion at :func:`rate_for` the frequency.
         frequency: First frequency [Hz].
-        tonal: Whether the frequency must lead in the stretch.
+        tonal: Whether its vibration is that of the record; otherwise only the means count, as for a cloth that flaps.
     """
     rate, (moved, ringing) = rate_for(frequency), motion
     length = round(max(SHORTEST, PERIODS / frequency) * rate)
@@ -207,7 +207,7 @@ def _fault(value: Any, allowed: tuple[float, float, float]) -> Any:
 def _faults(part: np.ndarray, whole: np.ndarray, frequency: float) -> np.ndarray:
     """Faults of stretches (W, T, 3) of a record (S, 3): means, size and roundness of the fluctuation, and its spectrum.
 
-    The frequency is that for each sample. The spectrum of a thing that follows the wind does not count.
+    The frequency is that for each sample; where it is infinite, only the means count.
     """
     count, half = part.shape[1], part.shape[1] // 2
     mean, spread = np.linalg.norm(whole.mean(0)), np.linalg.norm(whole.std(0))
@@ -215,6 +215,8 @@ def _faults(part: np.ndarray, whole: np.ndarray, frequency: float) -> np.ndarray
     apart = part - own_mean[:, None]
     drift = np.linalg.norm(part[:, :half].mean(1) - part[:, half:].mean(1), axis=1) / mean
     off = np.linalg.norm(own_mean - whole.mean(0), axis=1) / mean
+    if math.isinf(frequency):
+        return drift / DRIFT[2] + off / OFF[2]
     square, axes = np.linalg.eigh(np.swapaxes(apart, 1, 2) @ apart / count)
     size = np.sqrt(square.sum(1))
     found = _fault(drift, DRIFT) + _fault(off, OFF) + _fault(size / mean, RESTLESS)
