@@ -2,20 +2,17 @@
 
 import pytest
 import torch
+from torch.testing import assert_close
 
-from gaussian_swaying import AeroForce, Simulation, WindField
+from gaussian_swaying import AeroForce, Box, Material, MPMSolver, Scene, Simulation, WindField
 from gaussian_swaying.aero.computed_air import BYTES, ComputedAir, resolution
 from gaussian_swaying.aero.effects import LogProfile
 from gaussian_swaying.aero.obstacles import SphereObstacle
 from gaussian_swaying.aero.wind import FlowKey
 from gaussian_swaying.air.flow import SOUND
 from gaussian_swaying.air.immersed import look
-from gaussian_swaying.geometry.regions import Box
 from gaussian_swaying.kernels.graphs import Replayed
-from gaussian_swaying.mpm.solver import MPMSolver
 from gaussian_swaying.scenes.procedural import FlagScene, GivenScene, both
-from gaussian_swaying.simulation.material import Material
-from gaussian_swaying.simulation.scene import Scene
 from gaussian_swaying.simulation.stepper import why_not_batched
 
 LOW, HIGH = [-1.2, -0.9, -0.9], [1.5, 0.9, 0.9]
@@ -66,9 +63,9 @@ def test_a_free_sheet_gets_the_momentum_that_the_air_loses(dtype):
     gained = stepper.solver.momenta(end)["linear"].double()
     tolerance = 1e-4 if dtype == "float32" else 1e-9
     taken = taken.double().sum(0)
-    torch.testing.assert_close(gained, taken, rtol=tolerance, atol=tolerance * float(gained.abs().max()))
+    assert_close(gained, taken, rtol=tolerance, atol=tolerance * float(gained.abs().max()))
     # the air is float32
-    torch.testing.assert_close(before - air.momentum(now), gained, rtol=1e-4, atol=2e-7 * float(before.abs().max()))
+    assert_close(before - air.momentum(now), gained, rtol=1e-4, atol=2e-7 * float(before.abs().max()))
     assert float(gained[0]) > 0
 
 
@@ -80,7 +77,7 @@ def test_the_kernels_push_as_torch_does():
     twin, _ = _together(stepper, state, state.air.clone())
     torch_alone = stepper.solver.rollout(state, dt, 4, [lambda now: air.push(now)])
     assert float(twin.velocity.norm(dim=-1).amax()) > 1e-3
-    torch.testing.assert_close(twin.velocity, torch_alone.velocity, rtol=1e-10, atol=1e-12)
+    assert_close(twin.velocity, torch_alone.velocity, rtol=1e-10, atol=1e-12)
 
 
 def test_a_frame_moves_the_sheet_and_bends_the_air():
@@ -139,8 +136,8 @@ def test_recorded_steps_are_those_that_are_not(force, monkeypatch):
     _, plain, _ = _run(_simulation(device="cuda", force=force), 4)
     scale = float(plain.velocity.abs().max())
     assert scale > 0.01
-    torch.testing.assert_close(replayed.velocity, plain.velocity, rtol=0, atol=1e-3 * scale)
-    torch.testing.assert_close(replayed.air, plain.air, rtol=0, atol=1e-4 * float(plain.air[1:4].abs().max()))
+    assert_close(replayed.velocity, plain.velocity, rtol=0, atol=1e-3 * scale)
+    assert_close(replayed.air, plain.air, rtol=0, atol=1e-4 * float(plain.air[1:4].abs().max()))
 
 
 def test_the_law_acts_in_the_air_at_the_patches():
@@ -152,7 +149,7 @@ def test_the_law_acts_in_the_air_at_the_patches():
         air, now = stepper.air, state.air.clone()
         before = air.momentum(now)
         taken = _together(stepper, state, now)[1].double().sum(0)
-        torch.testing.assert_close(before - air.momentum(now), taken, rtol=1e-3, atol=1e-6)
+        assert_close(before - air.momentum(now), taken, rtol=1e-3, atol=1e-6)
         lost[force] = float(taken[1])
     assert 0 < lost["law"] < lost["surface"]
 
@@ -168,7 +165,7 @@ def test_a_heavy_surface_stops_its_layer_of_air_however_short_the_substeps():
     wind = torch.tensor([3.0, 0.5, 0.0], dtype=torch.float64)
     # the layer of a point is some 1e-4 of its mass
     for taken in lost:
-        torch.testing.assert_close(taken, float(layer) * wind, rtol=1e-3, atol=1e-6 * float(layer))
+        assert_close(taken, float(layer) * wind, rtol=1e-3, atol=1e-6 * float(layer))
 
 
 def test_the_law_is_no_stronger_than_what_stops_the_surface():
@@ -181,8 +178,8 @@ def test_the_law_is_no_stronger_than_what_stops_the_surface():
     most = torch.where(torch.arange(len(rate)) % 2 == 0, 0.25, 4.0) * rate
     force, held = stepper.air._law(state, air, most)
     share = torch.where(torch.arange(len(rate)) % 2 == 0, 0.25, 1.0)
-    torch.testing.assert_close(force, share[:, None] * free)
-    torch.testing.assert_close(held, share * rate)
+    assert_close(force, share[:, None] * free)
+    assert_close(held, share * rate)
 
 
 def test_the_inflow_is_any_wind():
@@ -201,7 +198,7 @@ def test_the_inflow_has_the_wind_of_the_end_of_the_frame():
     found = moments[:, flow.held.long()[inlet]]
     assert int(inlet.sum()) > 100
     blown = (found[1] + SOUND * found[0]) * flow.units.speed
-    torch.testing.assert_close(blown, torch.full_like(blown, 4.0), rtol=1e-4, atol=0)
+    assert_close(blown, torch.full_like(blown, 4.0), rtol=1e-4, atol=0)
 
 
 def test_ground_and_walls_are_still():

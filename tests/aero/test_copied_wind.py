@@ -5,9 +5,9 @@ import math
 import pytest
 import torch
 
+from gaussian_swaying import GaussianGust, SineSway, SpatialWind, WindField
 from gaussian_swaying.aero.copied_wind import CopiedWind
 from gaussian_swaying.aero.effects import PowerProfile
-from gaussian_swaying.aero.wind import GaussianGust, SineSway, SpatialWind, WindField
 
 TIMES = torch.linspace(0.0, 3.0, 13, dtype=torch.float64)
 NONE = torch.zeros(3, dtype=torch.float64)

@@ -10,10 +10,8 @@ from pkgutil import iter_modules
 import pytest
 import torch
 
-from gaussian_swaying import aero
+from gaussian_swaying import SimFrame, WindField, aero
 from gaussian_swaying.aero.effects import LogProfile, Moment, Plume, PowerProfile, WindEffect
-from gaussian_swaying.aero.wind import WindField
-from gaussian_swaying.geometry.frame import SimFrame
 
 NOW = Moment(torch.zeros((), dtype=torch.float64), torch.zeros(3).double(), torch.zeros(3).double())
 

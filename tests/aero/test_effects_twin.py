@@ -3,19 +3,17 @@
 import numpy as np
 import pytest
 import torch
+from torch.testing import assert_close
 from torch.utils._python_dispatch import TorchDispatchMode
 
+from gaussian_swaying import AeroForce, MaterialPoints, MPMSolver, UniformGust, WindField, WindForce
 from gaussian_swaying.aero.carried import CarriedField, Turbulence
 from gaussian_swaying.aero.effects import LogProfile, Plume, PowerProfile
-from gaussian_swaying.aero.force import AeroForce
 from gaussian_swaying.aero.obstacles import CylinderObstacle, EllipsoidObstacle, SphereObstacle
 from gaussian_swaying.aero.patches import Patches
 from gaussian_swaying.aero.recorded import RecordedWind
 from gaussian_swaying.aero.shelter import Shelter
-from gaussian_swaying.aero.wind import FlowKey, UniformGust, WindField
-from gaussian_swaying.aero.wind_force import WindForce
-from gaussian_swaying.mpm.solver import MPMSolver
-from gaussian_swaying.mpm.state import MaterialPoints
+from gaussian_swaying.aero.wind import FlowKey
 from gaussian_swaying.mpm.twins import Composed, Tables
 
 DX, DT = 0.1, 1e-3
@@ -90,8 +88,8 @@ def _bodies(device, formulation, wind, batch=(), groups=False, transfer="kernels
 def _same(found, expected):
     for name in ("position", "velocity", "F_total"):
         a, b = getattr(found, name), getattr(expected, name)
-        torch.testing.assert_close(a, b, rtol=0, atol=TOLERANCE * float(b.abs().max()))
-    torch.testing.assert_close(found.work, expected.work, rtol=1e-4, atol=1e-7)
+        assert_close(a, b, rtol=0, atol=TOLERANCE * float(b.abs().max()))
+    assert_close(found.work, expected.work, rtol=1e-4, atol=1e-7)
 
 
 WINDS = ("log", "power", "plume", "turbulence", "all", "sheltered", "half", "held", *OBSTACLES)
@@ -145,7 +143,7 @@ def test_a_changed_effect_is_read_again_at_the_same_address(kernel_device):
         _same(ends[-1], reference.rollout(state, DT, 5, load))
         where = where or solver.fused().tables.buffer.data_ptr()
         assert solver.fused().tables.buffer.data_ptr() == where
-    torch.testing.assert_close(ends[0].position, ends[1].position, rtol=0, atol=1e-6)
+    assert_close(ends[0].position, ends[1].position, rtol=0, atol=1e-6)
     for one, other in ((1, 2), (2, 3)):
         assert float((ends[one].velocity - ends[other].velocity).abs().max()) > 1e-3
 

@@ -4,8 +4,10 @@ import math
 
 import pytest
 import torch
+from torch.testing import assert_close
 
-from gaussian_swaying.aero.force import LAWS, AeroForce, added_mass_per_area, aero_force, capped_area, drag_rate
+from gaussian_swaying import AeroForce, aero_force
+from gaussian_swaying.aero.force import LAWS, added_mass_per_area, capped_area, drag_rate
 
 RHO = 1.225
 
@@ -41,7 +43,7 @@ def test_resistance_is_half_the_slope_of_the_drag():
     wind, velocity = _vector(0, 0, 30.0), torch.tensor([[0.0, 0.0, -10.0]], dtype=torch.float64)
     aero = AeroForce(C_D=1.2, C_F=0.3, C_L=-0.1, air_density=RHO, drag_step="semi_implicit")
     expected = torch.tensor([0.5 * RHO * 2.0 * (1.2 + 0.3 + 0.1) * 40.0], dtype=torch.float64)
-    torch.testing.assert_close(aero.resistance(wind, velocity, area), expected)
+    assert_close(aero.resistance(wind, velocity, area), expected)
     assert AeroForce().resistance(wind, velocity, area) is None
     with pytest.raises(ValueError, match=r"`drag_step` to be one of explicit, semi_implicit"):
         AeroForce(drag_step="implicit")
@@ -51,14 +53,12 @@ def test_each_term_against_the_equation():
     """Wind of 2 m/s along x on a patch at 45 degrees: q = rho / 2 * 4."""
     q, root = 0.5 * RHO * 4, 0.5**0.5
     normal = (root, 0.0, root)
-    torch.testing.assert_close(_force((2.0, 0, 0), normal, drag=0.5), q * 0.5 * _vector(root, 0, root))
+    assert_close(_force((2.0, 0, 0), normal, drag=0.5), q * 0.5 * _vector(root, 0, root))
     # d - (d.n) n = (1/2, 0, -1/2)
-    torch.testing.assert_close(_force((2.0, 0, 0), normal, friction=0.4), q * 0.4 * _vector(0.5, 0, -0.5))
+    assert_close(_force((2.0, 0, 0), normal, friction=0.4), q * 0.4 * _vector(0.5, 0, -0.5))
     # d x n = (0, -root, 0)
-    torch.testing.assert_close(_force((2.0, 0, 0), normal, lift=0.1), q * 0.1 * _vector(0, -root, 0))
-    torch.testing.assert_close(
-        _force((2.0, 0, 0), normal, drag=0.5, law="projected"), q * 0.5 * root * _vector(root, 0, root)
-    )
+    assert_close(_force((2.0, 0, 0), normal, lift=0.1), q * 0.1 * _vector(0, -root, 0))
+    assert_close(_force((2.0, 0, 0), normal, drag=0.5, law="projected"), q * 0.5 * root * _vector(root, 0, root))
 
 
 @pytest.mark.parametrize("law", LAWS)
@@ -67,7 +67,7 @@ def test_sign_of_the_normal_does_not_matter(law):
     wind, velocity, normal, area = _random()
     options = {"drag": 0.5, "friction": 0.4, "lift": 0.01, "law": law}
     one = aero_force(wind, velocity, normal, area, **options)
-    torch.testing.assert_close(one, aero_force(wind, velocity, -normal, area, **options))
+    assert_close(one, aero_force(wind, velocity, -normal, area, **options))
     drag = aero_force(wind, velocity, normal, area, drag=0.5, friction=0.0, lift=0.0, law=law)
     assert bool(((drag * (wind - velocity)).sum(-1) >= 0).all())
 
@@ -78,10 +78,10 @@ def test_quadratic_linear_and_relative(law, device, dtype):
     aero = AeroForce(law=law)
     base = aero(wind, velocity, normal, area)
     tol = {"rtol": 1e2 * torch.finfo(dtype).eps, "atol": 1e2 * torch.finfo(dtype).eps}
-    torch.testing.assert_close(aero(3 * wind, 3 * velocity, normal, area), 9 * base, **tol)
-    torch.testing.assert_close(aero(wind, velocity, normal, 2 * area), 2 * base, **tol)
+    assert_close(aero(3 * wind, 3 * velocity, normal, area), 9 * base, **tol)
+    assert_close(aero(wind, velocity, normal, 2 * area), 2 * base, **tol)
     drift = torch.tensor([1.0, -2.0, 0.5], device=device, dtype=dtype)
-    torch.testing.assert_close(aero(wind + drift, velocity + drift, normal, area), base, rtol=1e-4, atol=1e-5)
+    assert_close(aero(wind + drift, velocity + drift, normal, area), base, rtol=1e-4, atol=1e-5)
     assert base.dtype == dtype
 
 
@@ -91,12 +91,12 @@ def test_linear_law():
     options = {"drag": 0.7, "friction": 0.0, "lift": 0.0}
     force = aero_force(wind, velocity, normal, area, law="linear", **options)
     pressure = 0.5 * RHO * 0.7 * wind.norm() * ((wind - velocity) * normal).sum(-1)
-    torch.testing.assert_close(force, (pressure * area)[:, None] * normal)
+    assert_close(force, (pressure * area)[:, None] * normal)
     rest = torch.zeros_like(velocity)
     at_rest = aero_force(wind, rest, normal, area, law="linear", **options)
-    torch.testing.assert_close(at_rest, aero_force(wind, rest, normal, area, law="projected", **options))
+    assert_close(at_rest, aero_force(wind, rest, normal, area, law="projected", **options))
     twice = aero_force(wind, 2 * velocity, normal, area, law="linear", **options)
-    torch.testing.assert_close(twice - at_rest, 2 * (force - at_rest))
+    assert_close(twice - at_rest, 2 * (force - at_rest))
     assert not bool(aero_force(torch.zeros(3).double(), velocity, normal, area, law="linear", **options).any())
 
 
@@ -106,13 +106,13 @@ def test_cross_flow_law():
     options = {"drag": 0.7, "friction": 0.0, "lift": 0.0}
     force = aero_force(wind, velocity, normal, area, law="cross_flow", **options)
     through = ((wind - velocity) * normal).sum(-1)
-    torch.testing.assert_close(force, (0.5 * RHO * 0.7 * through.abs() * through * area)[:, None] * normal)
+    assert_close(force, (0.5 * RHO * 0.7 * through.abs() * through * area)[:, None] * normal)
     tilted, across = _vector(0.5, 0.75**0.5, 0), _vector(1, 0, 0)
     for normal, share in ((across, 1.0), (tilted, 0.5)):
         found, projected = (
             _force((2.0, 0, 0), normal.tolist(), drag=0.5, law=law) for law in ("cross_flow", "projected")
         )
-        torch.testing.assert_close(found, share * projected)
+        assert_close(found, share * projected)
 
 
 def test_linear_drag_rate_and_resistance():
@@ -159,9 +159,7 @@ def test_rotation_turns_the_force(law):
     Q = torch.linalg.qr(torch.randn(3, 3, dtype=torch.float64))[0]
     Q = Q * torch.linalg.det(Q)
     aero = AeroForce(law=law)
-    torch.testing.assert_close(
-        aero(Q @ wind, velocity @ Q.T, normal @ Q.T, area), aero(wind, velocity, normal, area) @ Q.T
-    )
+    assert_close(aero(Q @ wind, velocity @ Q.T, normal @ Q.T, area), aero(wind, velocity, normal, area) @ Q.T)
 
 
 @pytest.mark.parametrize("law", LAWS)
@@ -185,7 +183,7 @@ def test_batches(batch):
     force = AeroForce()(wind, velocity, normal, area)
     assert force.shape == (*batch, 5, 3)
     first = (0,) * len(batch)
-    torch.testing.assert_close(force[first], AeroForce()(wind[first], velocity[first], normal[first], area[first]))
+    assert_close(force[first], AeroForce()(wind[first], velocity[first], normal[first], area[first]))
 
 
 def test_drag_rate_is_the_slope_of_the_force():

@@ -5,7 +5,7 @@ import math
 import pytest
 import torch
 
-from gaussian_swaying.aero.wind import GaussianGust, UniformGust, WindField
+from gaussian_swaying import GaussianGust, UniformGust, WindField
 
 T, STD, DELTA = 0.04, 0.3, 0.3  # s, m/s, share
 COARSE, FINE = 1e-2, 1e-3  # two substeps [s]

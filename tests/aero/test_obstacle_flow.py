@@ -4,6 +4,7 @@ import math
 
 import pytest
 import torch
+from torch.testing import assert_close
 
 from gaussian_swaying.aero.obstacle_flow import KARMAN_RATIO, carlson_rd, plane_wake, round_wake, vortex_street
 
@@ -35,7 +36,7 @@ def test_the_velocity_of_a_street_is_the_slope_of_its_stream_function(aside):
     found = vortex_street(x, torch.full_like(x, aside), width, torch.zeros((), dtype=DOUBLE), strouhal)
     assert float(expected.abs().max()) > 0.01
     # the rounded ratio moves each row by 0.0002 l, so that the phase 2 pi y / l changes by 1.4e-3
-    torch.testing.assert_close(found, expected, rtol=0, atol=1.5e-3)
+    assert_close(found, expected, rtol=0, atol=1.5e-3)
 
 
 def test_a_plane_wake_has_half_of_its_depth_where_it_was_measured():
@@ -45,7 +46,7 @@ def test_a_plane_wake_has_half_of_its_depth_where_it_was_measured():
     behind = torch.tensor([4.0, 9.0, 30.0], dtype=DOUBLE)
     middle = plane_wake(behind, torch.zeros_like(behind), width, drag)
     edge = plane_wake(behind, 0.29 * (theta * behind).sqrt(), width, drag)
-    torch.testing.assert_close(edge / middle, torch.full_like(behind, 0.5), rtol=0, atol=1e-14)
+    assert_close(edge / middle, torch.full_like(behind, 0.5), rtol=0, atol=1e-14)
 
 
 @pytest.mark.parametrize("behind", [1e-3, 0.1, 0.5])
@@ -62,7 +63,7 @@ def test_a_round_wake_widens_by_a_twentieth():
     behind, aside = torch.tensor([2.0, 6.0, 12.0], dtype=DOUBLE), torch.tensor(0.3, dtype=DOUBLE)
     ratio = round_wake(behind, aside, 0.5, 0.47) / round_wake(behind, 0 * aside, 0.5, 0.47)
     sigma = aside / (-2 * ratio.log()).sqrt()
-    torch.testing.assert_close(sigma.diff() / behind.diff(), torch.tensor([0.05, 0.05], dtype=DOUBLE))
+    assert_close(sigma.diff() / behind.diff(), torch.tensor([0.05, 0.05], dtype=DOUBLE))
 
 
 @pytest.mark.parametrize(("apart", "error"), [(0.5, 1e-14), (10, 1e-14), (1e12, 1e-14), (1e40, 1e-12)])

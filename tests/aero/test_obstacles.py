@@ -4,7 +4,9 @@ import math
 
 import pytest
 import torch
+from torch.testing import assert_close
 
+from gaussian_swaying import SimFrame, WindField
 from gaussian_swaying.aero.effects import Moment
 from gaussian_swaying.aero.obstacle_flow import (
     STREET_SPEED,
@@ -17,8 +19,6 @@ from gaussian_swaying.aero.obstacle_flow import (
     vortex_street,
 )
 from gaussian_swaying.aero.obstacles import CylinderObstacle, EllipsoidObstacle, SphereObstacle
-from gaussian_swaying.aero.wind import WindField
-from gaussian_swaying.geometry.frame import SimFrame
 
 DOUBLE = torch.float64
 FLOW = torch.tensor([2.0, -0.7, 0.4], dtype=DOUBLE)
@@ -69,29 +69,27 @@ def test_the_flow_has_neither_divergence_nor_rotation(name):
 @pytest.mark.parametrize("name", FLOWS)
 def test_far_away_and_inside(name):
     far = 1e4 * (_directions() + torch.tensor([2.0, 0.0, 0.0]))
-    torch.testing.assert_close(FLOWS[name](far), FLOW.expand(40, 3), rtol=0, atol=1e-6)
+    assert_close(FLOWS[name](far), FLOW.expand(40, 3), rtol=0, atol=1e-6)
     assert float(FLOWS[name](0.1 * _directions()).abs().max()) == 0.0
 
 
 def test_closed_forms():
     """Lamb: 1.5 times the flow at the side of a sphere, twice it at that of a cylinder, at rest in front."""
     x, y = torch.eye(3, dtype=DOUBLE)[:2]
-    torch.testing.assert_close(sphere_flow(x, 1.0 * y, 1.0), 1.5 * x)
-    torch.testing.assert_close(sphere_flow(x, -1.0 * x, 1.0), 0 * x)
-    torch.testing.assert_close(sphere_flow(x, -2.0 * x, 1.0), (1 - 1 / 8) * x)
+    assert_close(sphere_flow(x, 1.0 * y, 1.0), 1.5 * x)
+    assert_close(sphere_flow(x, -1.0 * x, 1.0), 0 * x)
+    assert_close(sphere_flow(x, -2.0 * x, 1.0), (1 - 1 / 8) * x)
     z = torch.tensor([0.0, 0.0, 1.0], dtype=DOUBLE)
-    torch.testing.assert_close(cylinder_flow(x + z, 1.0 * y, z, 1.0), 2 * x + z)
-    torch.testing.assert_close(cylinder_flow(x + z, -2.0 * x, z, 1.0), 0.75 * x + z)
+    assert_close(cylinder_flow(x + z, 1.0 * y, z, 1.0), 2 * x + z)
+    assert_close(cylinder_flow(x + z, -2.0 * x, z, 1.0), 0.75 * x + z)
 
 
 def test_ellipsoids_become_spheres_and_cylinders():
     place = 1.2 * _directions()
-    torch.testing.assert_close(
-        ellipsoid_flow(FLOW, place, (0.8,) * 3), sphere_flow(FLOW, place, 0.8), rtol=0, atol=1e-13
-    )
+    assert_close(ellipsoid_flow(FLOW, place, (0.8,) * 3), sphere_flow(FLOW, place, 0.8), rtol=0, atol=1e-13)
     z = torch.tensor([0.0, 0.0, 1.0], dtype=DOUBLE)
     long = ellipsoid_flow(FLOW, place, (0.8, 0.8, 8e5))
-    torch.testing.assert_close(long, cylinder_flow(FLOW, place, z, 0.8), rtol=0, atol=1e-9)
+    assert_close(long, cylinder_flow(FLOW, place, z, 0.8), rtol=0, atol=1e-9)
 
 
 def test_the_side_of_a_spheroid():
@@ -111,7 +109,7 @@ def test_carlsons_integral():
     assert float(carlson_rd(x, y, z)) == pytest.approx(1.7972103521033883, rel=1e-12)
     x, y, z = (torch.tensor(v, dtype=DOUBLE) for v in (2.0, 3.0, 4.0))
     assert float(carlson_rd(x, y, z)) == pytest.approx(0.16510527294261053, rel=1e-13)
-    torch.testing.assert_close(carlson_rd(4 * x, 4 * y, 4 * z), carlson_rd(x, y, z) / 8)
+    assert_close(carlson_rd(4 * x, 4 * y, 4 * z), carlson_rd(x, y, z) / 8)
 
 
 def test_wakes_take_the_momentum_of_the_drag():
@@ -159,7 +157,7 @@ def test_a_street_drifts_and_has_no_divergence_where_it_does_not_fade():
         slope = torch.func.jacrev(found)(x)
         assert float(slope[0, 0] + slope[1, 1]) == pytest.approx(0.0, abs=1e-9 * float(slope.abs().max()))
         length = STREET_SPEED * 1e-3 / 0.2
-        torch.testing.assert_close(found(x + torch.tensor([0.3 * length, 0.0]), 0.3), found(x))
+        assert_close(found(x + torch.tensor([0.3 * length, 0.0]), 0.3), found(x))
 
 
 @pytest.mark.parametrize("turn", [0.0, 30.0])
@@ -178,7 +176,7 @@ def test_obstacles_in_a_frame_are_those_of_the_scene(turn):
         expected = obstacle(flow, scene, here)
         moved = obstacle.in_frame(frame)
         found = moved(flow @ rotation.T, frame.point_to_sim(scene), there) @ rotation
-        torch.testing.assert_close(found, expected)
+        assert_close(found, expected)
         assert float((expected - flow).abs().max()) > 0.05
         assert torch.equal(obstacle.middle, torch.tensor([1.0, 2.5, 3.0], dtype=DOUBLE))
 

@@ -4,14 +4,13 @@ import math
 
 import pytest
 import torch
+from torch.testing import assert_close
 
-from gaussian_swaying.aero.force import AeroForce, aero_force, capped_area, grouped_force
+from gaussian_swaying import AeroForce, MaterialPoints, WindField, WindForce, aero_force
+from gaussian_swaying.aero.force import capped_area, grouped_force
 from gaussian_swaying.aero.patches import MOST, Patches, PatchSums
-from gaussian_swaying.aero.wind import WindField
-from gaussian_swaying.aero.wind_force import WindForce
 from gaussian_swaying.geometry.patches import deform_patch
 from gaussian_swaying.geometry.rotations import quat_to_rotation
-from gaussian_swaying.mpm.state import MaterialPoints
 
 LAWS = {
     "paper": {"drag": 0.5, "friction": 0.4, "lift": 0.01, "law": "paper"},
@@ -69,7 +68,7 @@ def test_force_is_the_sum_over_the_patches(law, spread):
         assert float((found - expected).norm(dim=-1).sum()) < 0.01 * float(expected.norm(dim=-1).sum())
         assert float((found - expected).sum(0).norm()) < 0.01 * float(expected.norm(dim=-1).sum())
         assert not bool(found[0].any())
-        torch.testing.assert_close(now.sum(), area.sum())
+        assert_close(now.sum(), area.sum())
 
 
 @pytest.mark.parametrize(
@@ -91,7 +90,7 @@ def test_one_direction_takes_the_path_of_single_patches():
     normal, area, point = random_patches(0.0)
     force = WindForce(AeroForce(), WindField([3.0, 1.0, 0.0]), Patches(normal, area, point, POINTS))
     assert force.sums is None
-    torch.testing.assert_close(force.area.sum(), area.sum())
+    assert_close(force.area.sum(), area.sum())
     assert float((force.normal[point] * normal).sum(-1).abs().min()) > 1 - 1e-12
     assert not bool(force.area[0])
     several = WindForce(AeroForce(), WindField([3.0, 1.0, 0.0]), Patches(*random_patches(0.1), POINTS))
@@ -120,8 +119,8 @@ def test_the_area_is_capped_and_resists():
     sums = PatchSums(Patches(normal, area, point, POINTS))
     expected = each_patch(wind, velocity, F, normal, area, point, cap=1.5, **LAWS["paper"])
     found, now = grouped_force(wind, velocity, F, sums, max_area_ratio=1.5, **LAWS["paper"])
-    torch.testing.assert_close(found, expected)
-    torch.testing.assert_close(now, 1.5 * sums.area)
+    assert_close(found, expected)
+    assert_close(now, 1.5 * sums.area)
 
 
 def test_a_state_in_wind(make_points):
@@ -140,7 +139,7 @@ def test_a_state_in_wind(make_points):
     expected = each_patch(wind, state.velocity, state.F_total, normal, area, point, **law)
     assert float((force - expected).norm(dim=-1).sum()) < 0.01 * float(expected.norm(dim=-1).sum())
     alone = aero.resistance(wind, state.velocity[point], area)
-    torch.testing.assert_close(resistance, torch.zeros_like(resistance).index_add(0, point, alone), rtol=1e-9, atol=0)
+    assert_close(resistance, torch.zeros_like(resistance).index_add(0, point, alone), rtol=1e-9, atol=0)
 
 
 @pytest.fixture
@@ -169,7 +168,7 @@ def test_directions_are_joined_up_to_a_number():
     assert int(sums.point.bincount().max()) <= MOST
     assert bool((sums.point.diff() >= 0).all())
     total = torch.zeros(POINTS, dtype=torch.float64).index_add(0, sums.point, sums.vector.norm(dim=-1))
-    torch.testing.assert_close(total, sums.area)
+    assert_close(total, sums.area)
     assert not PatchSums(Patches(normal, area, point, POINTS)).single
     nothing = PatchSums(Patches(normal[:0], area[:0], point[:0], 3))
     assert nothing.single

@@ -6,12 +6,12 @@ import struct
 import numpy as np
 import pytest
 import torch
+from torch.testing import assert_close
 
+from gaussian_swaying import SimFrame, WindField
 from gaussian_swaying.aero.effects import Moment
 from gaussian_swaying.aero.recorded import FrozenWind, RecordedWind
-from gaussian_swaying.aero.wind import WindField
 from gaussian_swaying.aero.wind_files import read_anemometer, read_bts, read_grid
-from gaussian_swaying.geometry.frame import SimFrame
 
 DOUBLE = torch.float64
 
@@ -47,7 +47,7 @@ def test_a_recorded_wind_is_exact_where_it_is_linear(tmp_path):
         expected = _linear(5 + time, x.numpy(), y.numpy(), z.numpy())
         np.testing.assert_allclose(wind.at(_at(time), place).numpy(), expected, atol=2e-6)  # the table is float32
     held = wind.at(_at(100.0), place)
-    torch.testing.assert_close(held, wind.at(_at(3.0), place))
+    assert_close(held, wind.at(_at(3.0), place))
     outside = wind.at(_at(1.0), torch.tensor([[50.0, -7.0, 9.0]], dtype=DOUBLE))
     np.testing.assert_allclose(outside[0].numpy(), _linear(6.0, 2.0, 0.0, 2.0), atol=2e-6)
 
@@ -58,9 +58,9 @@ def test_a_recorded_wind_repeats(tmp_path):
     wind = WindField(effects=[effect])
     place = torch.tensor([[0.3, 0.2, 1.7]], dtype=DOUBLE)
     assert effect.period == pytest.approx(4.5)
-    torch.testing.assert_close(wind.at(_at(0.7 + 4.5), place), wind.at(_at(0.7), place))
+    assert_close(wind.at(_at(0.7 + 4.5), place), wind.at(_at(0.7), place))
     between = wind.at(_at(2.75), place)  # 8.75: in the middle of the last step
-    torch.testing.assert_close(between, 0.5 * (wind.at(_at(2.0), place) + wind.at(_at(3.5), place)))
+    assert_close(between, 0.5 * (wind.at(_at(2.0), place) + wind.at(_at(3.5), place)))
 
 
 def test_places_of_the_file_are_in_metres_and_its_origin_in_scene_units(tmp_path):
@@ -273,8 +273,8 @@ def _csv(path, text):
 def test_an_anemometer(tmp_path):
     path = _csv(tmp_path / "a.csv", "time [s],u [m/s],v (m/s),note\n0,1,2,a\n\n2.0,3,-2,b\n")
     wind = WindField(schedule=path)
-    torch.testing.assert_close(wind(1.0), torch.tensor([2.0, 0.0, 0.0], dtype=DOUBLE))
-    torch.testing.assert_close(wind(9.0), torch.tensor([3.0, -2.0, 0.0], dtype=DOUBLE))
+    assert_close(wind(1.0), torch.tensor([2.0, 0.0, 0.0], dtype=DOUBLE))
+    assert_close(wind(9.0), torch.tensor([3.0, -2.0, 0.0], dtype=DOUBLE))
     times, flows = read_anemometer(_csv(tmp_path / "b.csv", "Direction [deg],Speed,time\n270,4,0\n360,2,1\n45,1,2\n"))
     assert times == [0.0, 1.0, 2.0]
     root = math.sqrt(0.5)  # from the west, north and north-east

@@ -4,14 +4,11 @@ import math
 
 import pytest
 import torch
+from torch.testing import assert_close
 
+from gaussian_swaying import AeroForce, MaterialPoints, MPMSolver, WindField, WindForce
 from gaussian_swaying.aero.effects import Moment
-from gaussian_swaying.aero.force import AeroForce
 from gaussian_swaying.aero.shelter import Shelter, deposited, extinction, wind_axes
-from gaussian_swaying.aero.wind import WindField
-from gaussian_swaying.aero.wind_force import WindForce
-from gaussian_swaying.mpm.solver import MPMSolver
-from gaussian_swaying.mpm.state import MaterialPoints
 
 DOUBLE = torch.float64
 
@@ -44,7 +41,7 @@ def test_a_slab_of_leaves_follows_the_exponential_law(depth, direction):
     along = torch.linspace(-0.3, 1.3, 33, dtype=DOUBLE)
     line = torch.stack([along, torch.full_like(along, 0.37), torch.full_like(along, 0.43)], dim=-1) @ axes
     air = load.wind.at(state.time, line)
-    torch.testing.assert_close(air - (air @ axes[0])[:, None] * axes[0], torch.zeros_like(air), rtol=0, atol=1e-12)
+    assert_close(air - (air @ axes[0])[:, None] * axes[0], torch.zeros_like(air), rtol=0, atol=1e-12)
     share = (air @ axes[0]) / 5
     expected = torch.exp(-depth * along.clamp(0, 1))
     assert float((share - expected).abs().max()) < 0.03
@@ -63,7 +60,7 @@ def test_the_drag_area_is_that_of_the_force():
     assert float(load.wind.at(state.time, behind)[0, 0]) / 5 == pytest.approx(once**2, rel=1e-6)
     load.normal = torch.tensor([0.0, 1.0, 0.0], dtype=DOUBLE).expand_as(load.normal)
     load.refresh(state)
-    torch.testing.assert_close(load.wind.at(state.time, behind)[0, 0], torch.tensor(5.0, dtype=DOUBLE))
+    assert_close(load.wind.at(state.time, behind)[0, 0], torch.tensor(5.0, dtype=DOUBLE))
 
 
 def test_the_wake_follows_the_body_and_the_wind():
@@ -99,16 +96,16 @@ def test_deposits_are_shared_and_do_not_depend_on_the_order():
 def test_extinction_is_the_trapezoidal_sum():
     density = torch.tensor([1.0, 3.0, 0.0, 2.0], dtype=DOUBLE).reshape(4, 1, 1)
     depth = 0.5 * torch.tensor([0.5, 2.5, 4.0, 5.0], dtype=DOUBLE)  # spacing 1
-    torch.testing.assert_close(extinction(density, torch.tensor(1.0)).flatten(), torch.exp(-depth))
+    assert_close(extinction(density, torch.tensor(1.0)).flatten(), torch.exp(-depth))
 
 
 def test_axes_of_a_wind():
     for flow in ([0.0, 0.0, 0.0], [0.0, 0.0, 3.0], [1.0, -2.0, 0.3]):
         flow = torch.tensor(flow, dtype=DOUBLE)
         axes = wind_axes(flow)
-        torch.testing.assert_close(axes @ axes.T, torch.eye(3, dtype=DOUBLE))
+        assert_close(axes @ axes.T, torch.eye(3, dtype=DOUBLE))
         if float(flow.norm()) > 0:
-            torch.testing.assert_close(axes[0], flow / flow.norm())
+            assert_close(axes[0], flow / flow.norm())
 
 
 @pytest.mark.parametrize("cells", [3, 300, 8.0, True])
@@ -121,4 +118,4 @@ def test_a_shelter_that_was_not_refreshed_changes_nothing():
     velocity = torch.tensor([[1.0, 2.0, 3.0]])
     still = torch.zeros(3, dtype=DOUBLE)
     found = Shelter(4)(velocity, torch.rand(5, 3), Moment(still[0], still, still))
-    torch.testing.assert_close(found, velocity.expand(5, 3))
+    assert_close(found, velocity.expand(5, 3))

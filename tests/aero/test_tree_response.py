@@ -11,14 +11,8 @@ from itertools import pairwise
 import pytest
 import torch
 
+from gaussian_swaying import AeroForce, Box, MaterialPoints, MPMSolver, PinnedRegion, WindField, WindForce
 from gaussian_swaying.aero.carried import Turbulence
-from gaussian_swaying.aero.force import AeroForce
-from gaussian_swaying.aero.wind import WindField
-from gaussian_swaying.aero.wind_force import WindForce
-from gaussian_swaying.geometry.regions import Box
-from gaussian_swaying.mpm.boundaries.pinned_region import PinnedRegion
-from gaussian_swaying.mpm.solver import MPMSolver
-from gaussian_swaying.mpm.state import MaterialPoints
 
 DOUBLE = torch.float64
 SPEED, DRAG, AREA, DAMPING, AIR = 8.0, 1.2, 0.15, 1.0, 1.225

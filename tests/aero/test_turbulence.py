@@ -1,12 +1,14 @@
 """Turbulence against von Karman's closed forms: variance, length, spectrum, coherence, divergence, interpolation.
 
 A box holds the waves between its sides and its cells, and leaves the others out. So each number has two targets: the
-closed form of endless turbulence, where what is left out does not matter, and the sum over the waves of the box."""
+closed form of endless turbulence, where what is left out does not matter, and the sum over the waves of the box.
+"""
 
 import math
 
 import pytest
 import torch
+from torch.testing import assert_close
 
 from gaussian_swaying.aero.carried import CarriedField, Turbulence, box_axes
 from gaussian_swaying.aero.effects import Moment
@@ -110,7 +112,7 @@ def test_correlation_and_integral_length_are_von_karmans(measured):
     correlation = (torch.fft.ifft(measured[1]).real * CELLS[0] * step)[: 4 * 6 + 1]
     x = H * torch.arange(1, 25, dtype=torch.float64) / (VON_KARMAN * L)
     closed = 2 ** (2 / 3) / math.gamma(1 / 3) * x ** (1 / 3) * _bessel_k(1 / 3, x)
-    torch.testing.assert_close(correlation[1:], closed, rtol=0, atol=0.03)
+    assert_close(correlation[1:], closed, rtol=0, atol=0.03)
     correlation[0] = 1.0
     length = float(torch.trapezoid(correlation, dx=H))
     assert length == pytest.approx(L, rel=0.05)
@@ -216,9 +218,9 @@ def test_trilinear_is_exact_for_a_linear_field():
     place = torch.tensor([[0.3, 3.2, 4.9], [2.99, 0.0, 5.0], [-1.0, 7.0, 2.5]], dtype=torch.float64)
     expected = place.clone()
     expected[2] = torch.tensor([0.0, 4.0, 2.5])
-    torch.testing.assert_close(trilinear(table, place), expected)
+    assert_close(trilinear(table, place), expected)
     around = trilinear(table, torch.tensor([[3.5, 0.0, -0.25]], dtype=torch.float64), (True, True, True))
-    torch.testing.assert_close(around, torch.tensor([[1.5, 0.0, 1.25]], dtype=torch.float64))
+    assert_close(around, torch.tensor([[1.5, 0.0, 1.25]], dtype=torch.float64))
 
 
 @pytest.mark.parametrize("wraps", [True, False])
@@ -266,7 +268,7 @@ def test_a_box_is_the_same_on_every_device():
     here = turbulence_box((64, 32, 32), [0.25] * 3, L, gamma=2.0, seed=5)
     there = turbulence_box((64, 32, 32), [0.25] * 3, L, gamma=2.0, seed=5, device="cuda")
     # transforms of 2^16 float32 numbers differ by some 1e-6 of their size
-    torch.testing.assert_close(there.cpu(), here, rtol=0, atol=2e-5)
+    assert_close(there.cpu(), here, rtol=0, atol=2e-5)
 
 
 @pytest.mark.parametrize("changes", [{"cells": [15, 8, 8]}, {"cells": [8, 8]}, {"length": 0.0}, {"spectrum": "x"}])
@@ -291,13 +293,13 @@ def test_turbulence_is_carried_by_the_mean_wind():
     place = torch.rand(50, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
     now, later = (torch.tensor(t, dtype=torch.float64) for t in (0.3, 7.9))
     first = wind.at(now, place)
-    torch.testing.assert_close(wind.at(later, place + (later - now) * flow), first, rtol=0, atol=1e-10)
+    assert_close(wind.at(later, place + (later - now) * flow), first, rtol=0, atol=1e-10)
     assert float((wind.at(later, place) - first).abs().max()) > 0.5
     moment = Moment(now, flow, wind.carried(now))
     still = wind.effects[0](torch.zeros(3), place, moment)
     twice = wind.effects[0](torch.zeros(3), place, Moment(now, 2 * flow, wind.carried(now)))
-    torch.testing.assert_close(first, flow + still)
-    torch.testing.assert_close(twice, 2 * still)
+    assert_close(first, flow + still)
+    assert_close(twice, 2 * still)
 
 
 def test_turbulence_has_its_intensity_at_places_and_times_anywhere():
@@ -320,13 +322,13 @@ def test_the_box_comes_back_at_another_place():
     flow = torch.tensor([1.0, 2.0, 0.0])
     tilted, straight = (box_axes(flow, sides, tilted) for tilted in (True, False))
     for axes in (tilted, straight):
-        torch.testing.assert_close(axes @ axes.T, torch.eye(3, dtype=torch.float64))
+        assert_close(axes @ axes.T, torch.eye(3, dtype=torch.float64))
         assert float(torch.linalg.det(axes)) == pytest.approx(1.0)
     direction = flow.double() / flow.norm()
-    torch.testing.assert_close(straight @ direction, torch.tensor([1.0, 0.0, 0.0], dtype=torch.float64))
+    assert_close(straight @ direction, torch.tensor([1.0, 0.0, 0.0], dtype=torch.float64))
     passed = tilted @ direction
     passed = passed * (sides[0] / passed[0])
-    torch.testing.assert_close(passed, torch.tensor([16.0, 0.382 * 8, 0.236 * 8], dtype=torch.float64))
+    assert_close(passed, torch.tensor([16.0, 0.382 * 8, 0.236 * 8], dtype=torch.float64))
     box_axes(torch.tensor([0.0, 0.0, -3.0]), sides, True)  # straight down
     assert torch.equal(box_axes(torch.zeros(3), sides, False)[0], torch.tensor([1.0, 0.0, 0.0], dtype=torch.float64))
 
@@ -338,10 +340,10 @@ def test_air_is_carried_by_a_changing_flow(interpolation):
     fine = torch.arange(0, 6, 1e-3, dtype=torch.float64)
     flows = wind.mean_flow(fine + 5e-4)
     sums = torch.cat([torch.zeros(1, 3), flows.cumsum(0) * 1e-3])
-    torch.testing.assert_close(wind.carried(fine), sums[:-1], rtol=0, atol=1e-9)
+    assert_close(wind.carried(fine), sums[:-1], rtol=0, atol=1e-9)
     one = torch.tensor(2.5, dtype=torch.float64)
-    torch.testing.assert_close(wind.carried(one), sums[2500], rtol=0, atol=1e-9)
-    torch.testing.assert_close(WindField([1.0, 2.0, 3.0]).carried(one), 2.5 * torch.tensor([1.0, 2.0, 3.0]).double())
+    assert_close(wind.carried(one), sums[2500], rtol=0, atol=1e-9)
+    assert_close(WindField([1.0, 2.0, 3.0]).carried(one), 2.5 * torch.tensor([1.0, 2.0, 3.0]).double())
 
 
 def test_a_field_that_does_not_repeat_goes_on_outside():
@@ -352,6 +354,6 @@ def test_a_field_that_does_not_repeat_goes_on_outside():
     still = torch.zeros(3, dtype=torch.float64)
     place = torch.tensor([[0.0, -3.0, 0.0], [100.3, 0.25, 9.0], [0.0, 3.0, 0.0]], dtype=torch.float64)
     found = field(torch.zeros(3), place, Moment(still[0], still, still))
-    torch.testing.assert_close(found[:, 0], torch.tensor([1.0, 3.0, 5.0], dtype=torch.float64))
+    assert_close(found[:, 0], torch.tensor([1.0, 3.0, 5.0], dtype=torch.float64))
     with pytest.raises(ValueError, match="Expected `table` of shape"):
         CarriedField(torch.zeros(4, 2, 2), [1.0] * 3)

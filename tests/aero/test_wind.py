@@ -4,16 +4,10 @@ import math
 
 import pytest
 import torch
+from torch.testing import assert_close
 
-from gaussian_swaying.aero.wind import (
-    FlowKey,
-    GaussianGust,
-    SineSway,
-    UniformGust,
-    WindField,
-    counter_normal,
-    counter_uniform,
-)
+from gaussian_swaying import GaussianGust, SineSway, UniformGust, WindField
+from gaussian_swaying.aero.wind import FlowKey, counter_normal, counter_uniform
 
 COUNT = 20000
 # five standard errors
@@ -25,10 +19,10 @@ def test_counter_generator_statistics():
     u = counter_uniform(7, 0, counter, 2)
     assert float(u.min()) > 0
     assert float(u.max()) < 1
-    torch.testing.assert_close(u.mean(0), torch.full((2,), 0.5).double(), rtol=0, atol=FIVE * math.sqrt(1 / 12))
+    assert_close(u.mean(0), torch.full((2,), 0.5).double(), rtol=0, atol=FIVE * math.sqrt(1 / 12))
     z = counter_normal(7, 0, counter, 3)
-    torch.testing.assert_close(z.mean(0), torch.zeros(3).double(), rtol=0, atol=FIVE)
-    torch.testing.assert_close(z.var(0), torch.ones(3).double(), rtol=0, atol=FIVE * math.sqrt(2))
+    assert_close(z.mean(0), torch.zeros(3).double(), rtol=0, atol=FIVE)
+    assert_close(z.var(0), torch.ones(3).double(), rtol=0, atol=FIVE * math.sqrt(2))
     # no correlation between lanes, neighbours in time, streams or seeds
     others = [counter_normal(7, 1, counter, 3), counter_normal(8, 0, counter, 3), z.roll(1, 0), z.roll(1, 1)]
     for other in others:
@@ -48,7 +42,7 @@ def test_same_seed_same_wind_on_any_device(device):
     wind = WindField([2.0, 0, 0], modulations=[GaussianGust(), UniformGust()], seed=3).to(device)
     times = torch.linspace(0, 1, 50, dtype=torch.float64)
     reference = WindField([2.0, 0, 0], modulations=[GaussianGust(), UniformGust()], seed=3)(times)
-    torch.testing.assert_close(wind(times.to(device)).cpu(), reference, rtol=0, atol=1e-12)
+    assert_close(wind(times.to(device)).cpu(), reference, rtol=0, atol=1e-12)
     other = WindField([2.0, 0, 0], modulations=[GaussianGust(), UniformGust()], seed=4)(times)
     assert float((other - reference).abs().max()) > 0.1
 
@@ -57,17 +51,17 @@ def test_sample_holds_for_its_interval_whatever_the_rounding():
     wind = WindField([1.0, 0, 0], modulations=[GaussianGust(interval=0.04)])
     frames = torch.arange(1, 500, dtype=torch.float64)
     exact = wind(frames * 0.04 + 0.02)
-    torch.testing.assert_close(wind(frames * 0.04 + 1e-9), exact, rtol=0, atol=0)
-    torch.testing.assert_close(wind(frames * 0.04 - 1e-9), exact, rtol=0, atol=0)
-    torch.testing.assert_close(wind(frames * 0.04 + 0.0399), exact, rtol=0, atol=0)
+    assert_close(wind(frames * 0.04 + 1e-9), exact, rtol=0, atol=0)
+    assert_close(wind(frames * 0.04 - 1e-9), exact, rtol=0, atol=0)
+    assert_close(wind(frames * 0.04 + 0.0399), exact, rtol=0, atol=0)
 
 
 def test_sine_sways_the_largest_component_by_half():
     wind = WindField([-1.0, 0.2, 4.0], modulations=[SineSway(amplitude=0.5, period=2.0)])
-    torch.testing.assert_close(wind(0.5), torch.tensor([-1.0, 0.2, 6.0], dtype=torch.float64))
-    torch.testing.assert_close(wind(1.5), torch.tensor([-1.0, 0.2, 2.0], dtype=torch.float64))
+    assert_close(wind(0.5), torch.tensor([-1.0, 0.2, 6.0], dtype=torch.float64))
+    assert_close(wind(1.5), torch.tensor([-1.0, 0.2, 2.0], dtype=torch.float64))
     samples = wind(torch.arange(2000, dtype=torch.float64) * 1e-3)
-    torch.testing.assert_close(samples.mean(0), torch.tensor([-1.0, 0.2, 4.0], dtype=torch.float64), rtol=0, atol=1e-9)
+    assert_close(samples.mean(0), torch.tensor([-1.0, 0.2, 4.0], dtype=torch.float64), rtol=0, atol=1e-9)
 
 
 def test_modulations_compose_in_order():
@@ -75,7 +69,7 @@ def test_modulations_compose_in_order():
     sine, gust = SineSway(period=2.0), UniformGust(0.3)
     both = WindField([2.0, 0, 0], modulations=[sine, gust])(0.5)
     only_gust = WindField([2.0, 0, 0], modulations=[SineSway(amplitude=0.0), gust])(0.5)
-    torch.testing.assert_close(both, 1.5 * only_gust)
+    assert_close(both, 1.5 * only_gust)
     assert float((both - 1.5 * flow).abs().max()) > 1e-3
 
 
@@ -105,7 +99,7 @@ def test_the_kernel_of_the_wind_is_its_definition(blow, case):
     wind = BLOWN[case]().to(device)
     times = torch.cat([torch.linspace(-0.2, 3, 90), torch.tensor([0.05, 0.1, 0.5, 1.3, 1e4])]).double().to(device)
     for _ in range(2):
-        torch.testing.assert_close(kernel(wind, times), wind(times), rtol=1e-11, atol=1e-12)
+        assert_close(kernel(wind, times), wind(times), rtol=1e-11, atol=1e-12)
         wind.seed += 1
         wind.flows *= 1.5
         for part in wind.modulations[:1]:

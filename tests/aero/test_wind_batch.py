@@ -3,10 +3,9 @@
 import pytest
 import torch
 
-from gaussian_swaying.aero.force import AeroForce
-from gaussian_swaying.aero.wind import FlowKey, GaussianGust, SineSway, UniformGust, WindField
+from gaussian_swaying import AeroForce, GaussianGust, SineSway, UniformGust, WindField, WindForce
+from gaussian_swaying.aero.wind import FlowKey
 from gaussian_swaying.aero.wind_batch import WindBatch
-from gaussian_swaying.aero.wind_force import WindForce
 
 TIMES = torch.linspace(-0.3, 4.0, 37, dtype=torch.float64)
 

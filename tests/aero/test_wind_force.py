@@ -4,15 +4,22 @@ import copy
 
 import pytest
 import torch
+from torch.testing import assert_close
 
+from gaussian_swaying import (
+    AeroForce,
+    GaussianGust,
+    MaterialPoints,
+    MPMSolver,
+    SineSway,
+    UniformGust,
+    WindField,
+    WindForce,
+)
 from gaussian_swaying.aero.carried import Turbulence
 from gaussian_swaying.aero.effects import PowerProfile
-from gaussian_swaying.aero.force import AeroForce
-from gaussian_swaying.aero.wind import FlowKey, GaussianGust, Modulation, SineSway, UniformGust, WindField
-from gaussian_swaying.aero.wind_force import WindForce
+from gaussian_swaying.aero.wind import FlowKey, Modulation
 from gaussian_swaying.geometry.patches import deform_patch
-from gaussian_swaying.mpm.solver import MPMSolver
-from gaussian_swaying.mpm.state import MaterialPoints
 
 DT = 1e-3
 GUSTS = WindField([3.0, 1.0, 0.0], modulations=[UniformGust(0.5, interval=1.5 * DT)])
@@ -81,10 +88,10 @@ def test_the_area_of_what_has_flowed_is_capped(drag_step):
     assert float(growth[:10].min()) > 1.5 > float(growth[10:].max())
     force, resistance = load.force(state, wind)
     capped = torch.cat([1.5 * free.area[:10], area[10:]])
-    torch.testing.assert_close(force, load.aero(wind, state.velocity, normal, capped))
+    assert_close(force, load.aero(wind, state.velocity, normal, capped))
     if drag_step == "semi_implicit":
-        torch.testing.assert_close(resistance, load.aero.resistance(wind, state.velocity, capped))
-    torch.testing.assert_close(force[10:], free.force(state, wind)[0][10:])
+        assert_close(resistance, load.aero.resistance(wind, state.velocity, capped))
+    assert_close(force[10:], free.force(state, wind)[0][10:])
     assert float((force[:10] - free.force(state, wind)[0][:10]).abs().max()) > 1.0
 
 
@@ -118,8 +125,8 @@ def test_a_rollout_in_the_wind_is_the_one_with_its_forces(formulation, drag_step
     called = solver.rollout(state, DT, 5, lambda s: load(s))
     calm = solver.rollout(state, DT, 5)
     for other in (step, called):
-        torch.testing.assert_close(whole.position, other.position, rtol=0, atol=1e-12)
-        torch.testing.assert_close(whole.work, other.work)
+        assert_close(whole.position, other.position, rtol=0, atol=1e-12)
+        assert_close(whole.work, other.work)
     assert float((whole.position - calm.position).abs().max()) > 1e-6
 
 
@@ -130,7 +137,7 @@ def test_a_batch_is_each_scene_by_itself(formulation):
     for k, wind in enumerate(load.wind):
         normal, area = deform_patch(state.F_total[k], load.normal[k], load.area[k])
         expected = load.aero(wind(state.time), state.velocity[k], normal, area)
-        torch.testing.assert_close(force[k], expected)
+        assert_close(force[k], expected)
     assert solver.rollout(state, DT, 2, load).work.shape == (2,)
 
 
@@ -210,7 +217,7 @@ def test_a_recorded_wind_blows_as_the_plain_one(scenes):
         dt = 1e-3 * (k + 1)
         given = dt if k % 2 else torch.full((), dt, dtype=torch.float64, device="cuda")
         found = load.winds(time, given, 20 + k)
-        torch.testing.assert_close(found, load._winds(time, dt, 20 + k), rtol=1e-12, atol=0)
+        assert_close(found, load._winds(time, dt, 20 + k), rtol=1e-12, atol=0)
     assert load._graph is not None
 
 
@@ -246,14 +253,14 @@ def test_a_wind_with_effects_is_asked_where_the_particles_are(batch):
     assert load.recordable
     found = load.air(state.time, state.position)
     own = shaped.at(state.time, state.position[0] if batch else state.position)
-    torch.testing.assert_close(found[0] if batch else found, own)
+    assert_close(found[0] if batch else found, own)
     if batch:
         assert torch.equal(found[1], GUSTS(state.time).expand(20, 3))
     assert float(own.std(0).min()) > 0.01
     each = load.during(state.time, DT, 3)
     for k in range(3):
         later = state.replace(time=state.time + k * DT)
-        torch.testing.assert_close(each(later, k)[0], load(later)[0])
+        assert_close(each(later, k)[0], load(later)[0])
 
 
 def test_turbulence_does_not_depend_on_the_substep():
@@ -272,7 +279,7 @@ def test_turbulence_does_not_depend_on_the_substep():
         found.append(forces.sum(0) * dt)
         kept.append(forces[:: round(4e-3 / dt)])
     for forces in kept[1:]:
-        torch.testing.assert_close(forces, kept[0], rtol=0, atol=1e-12)
+        assert_close(forces, kept[0], rtol=0, atol=1e-12)
     assert float(kept[0].std(0).max()) > 0.05 * float(kept[0].abs().max())  # it gusts
     size = float(found[2].abs().max())
     coarse, fine = (float((one - found[2]).abs().max()) / size for one in found[:2])

@@ -1,9 +1,11 @@
 """The flow against exact and published ones, and its kernels against torch.
 
-The problems are those of tools/bench/problems/air.py; the bench records finer ones."""
+The problems are those of tools/bench/problems/air.py; the bench records finer ones.
+"""
 
 import pytest
 import torch
+from torch.testing import assert_close
 
 from gaussian_swaying.air.flow import HELD, WALL, FlowState, LatticeFlow, hold
 from gaussian_swaying.air.lattice import LatticeUnits
@@ -39,7 +41,7 @@ def test_kernels_compute_the_step(name, walls, kernel_device):
     push = (0.1, 0.2, 0.3)
     expected = flow.step(state, wind, push).moments
     single = flow.to(kernel_device).step(FlowState(state.moments.float().to(kernel_device)), wind, push).moments
-    torch.testing.assert_close(single.cpu().double(), expected, rtol=0, atol=3e-7)
+    assert_close(single.cpu().double(), expected, rtol=0, atol=3e-7)
 
 
 def test_nothing_flows_back_in_where_the_wind_blows_out():
@@ -52,7 +54,7 @@ def test_nothing_flows_back_in_where_the_wind_blows_out():
     across = flow.outward / flow.outward.norm(dim=-1, keepdim=True)
     came, left = ((part[index.long()] * across).sum(-1) for part, index in ((before, flow.behind), (after, flow.held)))
     assert int((came < 0).sum()) > 20
-    torch.testing.assert_close(left, came.clamp(min=0).to(left), rtol=0, atol=1e-12)
+    assert_close(left, came.clamp(min=0).to(left), rtol=0, atol=1e-12)
 
 
 def _ball(place):
@@ -67,7 +69,7 @@ def test_kernels_compute_the_step_around_a_ball(kernel_device):
     state, wind = _random(flow)
     expected = flow.step(state, wind).moments
     single = flow.to(kernel_device).step(FlowState(state.moments.float().to(kernel_device)), wind).moments
-    torch.testing.assert_close(single.cpu().double(), expected, rtol=0, atol=5e-7)
+    assert_close(single.cpu().double(), expected, rtol=0, atol=5e-7)
 
 
 @pytest.mark.parametrize("shift", [0.3, 0.8])
@@ -88,7 +90,7 @@ def test_a_wall_between_cells_is_where_it_is(shift):
     for _ in range(600):
         state = flow.step(state, acceleration=(push, 0.0, 0.0))
     found = (flow.velocity(state)[0, 0, 0] - 0.5 * push * units.dt).double() * (flow.kind[0, 0] == 0)
-    torch.testing.assert_close(found, exact * (flow.kind[0, 0] == 0), rtol=0, atol=0.01)
+    assert_close(found, exact * (flow.kind[0, 0] == 0), rtol=0, atol=0.01)
 
 
 def test_mass_and_momentum_of_a_periodic_box_stay():
@@ -97,8 +99,8 @@ def test_mass_and_momentum_of_a_periodic_box_stay():
     mass, momentum = state.moments[0].sum(), flow.momentum(state)
     for _ in range(20):
         state = flow.step(state)
-    torch.testing.assert_close(state.moments[0].sum(), mass)
-    torch.testing.assert_close(flow.momentum(state), momentum)
+    assert_close(state.moments[0].sum(), mass)
+    assert_close(flow.momentum(state), momentum)
 
 
 def test_walls_get_the_momentum_that_the_air_loses():
@@ -108,7 +110,7 @@ def test_walls_get_the_momentum_that_the_air_loses():
     state, _ = _random(flow)
     before, force = flow.momentum(state), flow.force_on_walls(state, walls)
     after = flow.momentum(flow.step(state))
-    torch.testing.assert_close(before - after, force * UNITS.dt)
+    assert_close(before - after, force * UNITS.dt)
 
 
 def test_wind_blows_through_an_open_box_undisturbed():
@@ -117,7 +119,7 @@ def test_wind_blows_through_an_open_box_undisturbed():
     for _ in range(60):
         state = flow.step(state, torch.tensor([0.8, 0.3, -0.2]))
     expected = torch.tensor([0.8, 0.3, -0.2])[:, None, None, None].expand(3, 12, 8, 8)
-    torch.testing.assert_close(flow.velocity(state), expected, rtol=0, atol=1e-5)
+    assert_close(flow.velocity(state), expected, rtol=0, atol=1e-5)
     pressure = state.moments[0] * (UNITS.density * UNITS.speed**2 / 3)
     assert float(pressure.abs().max()) < 1e-4
 
@@ -127,7 +129,7 @@ def test_a_new_wind_fills_the_box():
     state = flow.start([0.5, 0.0, 0.0])
     for _ in range(400):
         state = flow.step(state, torch.tensor([1.0, 0.0, 0.0]))
-    torch.testing.assert_close(flow.velocity(state)[0].mean(), torch.tensor(1.0), rtol=0.02, atol=0)
+    assert_close(flow.velocity(state)[0].mean(), torch.tensor(1.0), rtol=0.02, atol=0)
 
 
 def test_vorticity_of_a_turning_flow():
@@ -137,7 +139,7 @@ def test_vorticity_of_a_turning_flow():
     spin = torch.tensor([0.2, -0.3, 0.5], dtype=torch.float64)
     turning = torch.linalg.cross(spin[:, None, None, None].expand_as(place), place, dim=0)
     found = flow.vorticity(flow.start(turning, dtype=torch.float64))
-    torch.testing.assert_close(found, 2 * spin[:, None, None, None].expand_as(found))
+    assert_close(found, 2 * spin[:, None, None, None].expand_as(found))
 
 
 def test_kinds_of_cells():

@@ -2,6 +2,7 @@
 
 import pytest
 import torch
+from torch.testing import assert_close
 
 from gaussian_swaying.air.flow import LatticeFlow
 from gaussian_swaying.air.immersed import Reach, exchange, look, velocity_at
@@ -56,7 +57,7 @@ def test_the_air_loses_what_the_points_take(cells):
     before = (1 + moments[0]) * moments[1:4]
     taken = exchange(moments, velocity, area, mass, place, flow.kind)
     lost = before - (1 + moments[0]) * moments[1:4]
-    torch.testing.assert_close(lost.sum((1, 2, 3)), taken.sum(0))
+    assert_close(lost.sum((1, 2, 3)), taken.sum(0))
     assert float(taken.abs().max()) > 0
     assert float(lost[:, flow.kind != 0].abs().max()) == 0  # walls and held faces give and take nothing
 
@@ -70,15 +71,15 @@ def test_kernels_compute_the_exchange(cells, kernel_device):
     single = [tensor.float().to(kernel_device) for tensor in (moments, velocity, area, mass, place)]
     expected = exchange(moments, velocity, area, mass, place, flow.kind)
     found = exchange(*single, flow.kind.to(kernel_device))
-    torch.testing.assert_close(found.cpu().double(), expected, rtol=0, atol=1e-6)
-    torch.testing.assert_close(single[0].cpu().double(), moments, rtol=0, atol=1e-6)
+    assert_close(found.cpu().double(), expected, rtol=0, atol=1e-6)
+    assert_close(single[0].cpu().double(), moments, rtol=0, atol=1e-6)
     assert float(expected[0].abs().max()) == 0
 
 
 def test_weights_of_a_point_add_up_to_one_beside_a_wall():
     flow, _ = _flow()
     place = torch.tensor([[5.0, 5.0, 0.8], [5.0, 5.0, 4.0]], dtype=torch.float64)
-    torch.testing.assert_close(Reach.around(place, flow.kind).weight.sum(0), torch.ones(2, dtype=torch.float64))
+    assert_close(Reach.around(place, flow.kind).weight.sum(0), torch.ones(2, dtype=torch.float64))
 
 
 def test_a_linear_flow_is_read_exactly():
@@ -87,7 +88,7 @@ def test_a_linear_flow_is_read_exactly():
     grid = torch.stack(torch.meshgrid(*axes, indexing="ij"), 0)
     moments[1:4] = 0.01 * grid + 0.02
     place = 2.5 + torch.rand(40, 3, dtype=torch.float64) * torch.tensor([6.0, 4.0, 3.0])
-    torch.testing.assert_close(velocity_at(moments, Reach.around(place, flow.kind)), 0.01 * place + 0.02)
+    assert_close(velocity_at(moments, Reach.around(place, flow.kind)), 0.01 * place + 0.02)
 
 
 @pytest.mark.parametrize("layers", [1, 5])
@@ -110,7 +111,7 @@ def test_a_heavy_sheet_stops_the_air_and_no_more(layers):
     weights.scatter_add_(1, reach.cell.T, reach.weight.T)
     near = weights[:, weights.sum(0) > 0]
     share = torch.linalg.eigvalsh(near.T @ (layer[:, None] * near))
-    torch.testing.assert_close(share[-1], torch.ones_like(share[-1]))
+    assert_close(share[-1], torch.ones_like(share[-1]))
     assert float(share[0]) > -1e-12
 
 
@@ -125,6 +126,6 @@ def test_sheet_and_air_meet_at_their_common_velocity(ratio):
     taken = exchange(moments, velocity, area, mass, place, flow.kind)
     moved = taken / mass[:, None]
     air = velocity_at(moments, Reach.around(place, flow.kind))
-    torch.testing.assert_close(moved[inner, 2], torch.full_like(moved[inner, 2], 0.1 / (1 + ratio)))
-    torch.testing.assert_close(air[inner], moved[inner])
+    assert_close(moved[inner, 2], torch.full_like(moved[inner, 2], 0.1 / (1 + ratio)))
+    assert_close(air[inner], moved[inner])
     assert float(0.5 * moments[1:4].square().sum() + 0.5 * (mass * moved.square().sum(-1)).sum()) <= float(energy)

@@ -2,6 +2,7 @@
 
 import pytest
 import torch
+from torch.testing import assert_close
 
 from gaussian_swaying.air.lattice import DIRECTIONS, FASTEST, OPPOSITE, SOUND, WEIGHTS, LatticeUnits
 
@@ -12,11 +13,11 @@ W = torch.tensor(WEIGHTS, dtype=torch.float64)
 def test_moments_of_the_weights_are_those_of_a_gas_at_rest():
     """Up to the fourth: sums of w c c = I / 3, and of w c c c c = (I I) / 9, without which viscosity has directions."""
     eye = torch.eye(3, dtype=torch.float64)
-    torch.testing.assert_close(W.sum(), torch.ones((), dtype=torch.float64))
-    torch.testing.assert_close(torch.einsum("i,ia,ib->ab", W, C, C), eye / 3)
+    assert_close(W.sum(), torch.ones((), dtype=torch.float64))
+    assert_close(torch.einsum("i,ia,ib->ab", W, C, C), eye / 3)
     fourth = sum(torch.einsum(f"{a},{b}->abcd", eye, eye) for a, b in (("ab", "cd"), ("ac", "bd"), ("ad", "bc")))
-    torch.testing.assert_close(torch.einsum("i,ia,ib,ic,id->abcd", W, C, C, C, C), fourth / 9)
-    torch.testing.assert_close(torch.einsum("i,ia,ib,ic->abc", W, C, C, C), torch.zeros(3, 3, 3, dtype=torch.float64))
+    assert_close(torch.einsum("i,ia,ib,ic,id->abcd", W, C, C, C, C), fourth / 9)
+    assert_close(torch.einsum("i,ia,ib,ic->abc", W, C, C, C), torch.zeros(3, 3, 3, dtype=torch.float64))
 
 
 def test_opposites():

@@ -3,6 +3,7 @@
 import pytest
 import torch
 from shared import gradients, unit
+from torch.testing import assert_close
 
 from gaussian_swaying.geometry.covariances import (
     covariance,
@@ -18,8 +19,8 @@ from gaussian_swaying.geometry.rotations import quat_to_rotation
 def test_covariance_has_the_axes_and_scales(device, dtype):
     quats, log_scales = torch.randn(9, 4, device=device, dtype=dtype), torch.randn(9, 3, device=device, dtype=dtype)
     a, rotation = covariance(quats, log_scales), quat_to_rotation(quats)
-    torch.testing.assert_close(a, a.mT)
-    torch.testing.assert_close(a @ rotation, rotation * (2 * log_scales).exp()[:, None])
+    assert_close(a, a.mT)
+    assert_close(a @ rotation, rotation * (2 * log_scales).exp()[:, None])
 
 
 def test_covariance_to_quat_scale_round_trip(device, dtype):
@@ -30,8 +31,8 @@ def test_covariance_to_quat_scale_round_trip(device, dtype):
     a = deform_covariance(gradients(1000, device, dtype)[:50], covariance(quats, log_scales))
     q, s = covariance_to_quat_scale(a)
     assert (q.dtype, s.dtype) == (dtype, dtype)
-    torch.testing.assert_close(torch.linalg.det(quat_to_rotation(q)), torch.ones(50, device=device, dtype=dtype))
-    torch.testing.assert_close(covariance(q, s), a, rtol=1e-4, atol=1e-6)
+    assert_close(torch.linalg.det(quat_to_rotation(q)), torch.ones(50, device=device, dtype=dtype))
+    assert_close(covariance(q, s), a, rtol=1e-4, atol=1e-6)
     assert (s.diff(dim=-1) >= 0).all()
 
 
@@ -41,9 +42,9 @@ def test_covariance_to_quat_scale_of_singular_and_equal_axes():
     assert torch.isfinite(q).all()
     assert torch.isfinite(s).all()
     assert (s.exp() > 0).all()
-    torch.testing.assert_close(covariance(q, s), singular)
+    assert_close(covariance(q, s), singular)
     again, _ = covariance_to_quat_scale(singular * (1 + 1e-6))
-    torch.testing.assert_close(again, q)
+    assert_close(again, q)
 
 
 def test_covariance_to_quat_scale_signs_follow_the_matrix():
@@ -51,7 +52,7 @@ def test_covariance_to_quat_scale_signs_follow_the_matrix():
     a = covariance(unit(100, 4), torch.tensor([0.0, -1.0, -2.0], dtype=torch.float64).expand(100, 3))
     q0, _ = covariance_to_quat_scale(a)
     q1, _ = covariance_to_quat_scale(a + 1e-9 * torch.eye(3, dtype=torch.float64))
-    torch.testing.assert_close(q1, q0, rtol=0, atol=1e-6)
+    assert_close(q1, q0, rtol=0, atol=1e-6)
 
 
 def test_deformed_covariance_is_that_of_mapped_samples(device, dtype):
@@ -59,7 +60,7 @@ def test_deformed_covariance_is_that_of_mapped_samples(device, dtype):
     quats = torch.randn(5, 4, device=device, dtype=dtype)
     axes = quat_to_rotation(quats) * scales.exp()[:, None]
     mapped = f @ axes
-    torch.testing.assert_close(deform_covariance(f, covariance(quats, scales)), mapped @ mapped.mT)
+    assert_close(deform_covariance(f, covariance(quats, scales)), mapped @ mapped.mT)
 
 
 def test_gaussians_are_drawn_out_to_a_limit(device, dtype):
@@ -75,8 +76,8 @@ def test_gaussians_are_drawn_out_to_a_limit(device, dtype):
     limited = limit_stretch(covariances, rest, 2.0)
     assert torch.equal(limited[[0, 1, 5]], covariances[[0, 1, 5]])
     size = limited.diagonal(dim1=-2, dim2=-1).sum(-1)
-    torch.testing.assert_close(size[2:5], 4 * rest.diagonal(dim1=-2, dim2=-1).sum(-1)[2:5])
-    torch.testing.assert_close(limited, limited.mT)
+    assert_close(size[2:5], 4 * rest.diagonal(dim1=-2, dim2=-1).sum(-1)[2:5])
+    assert_close(limited, limited.mT)
     values = torch.linalg.eigvalsh(limited[2:5])
     assert float(values.min()) > 0.5  # of a rest size of 5.01, shared by three directions: no needle
     assert float(values[1, 2]) == pytest.approx(3 * 5.01 + 5.01 / 3, rel=1e-2)  # what is drawn out points as before
@@ -90,7 +91,7 @@ def test_the_limit_on_stretch_is_reached_without_a_jump():
         limit_stretch(torch.diag(torch.tensor([a, 1.0, 1.0], dtype=torch.float64)), rest, 2.0)
         for a in (10.0 - 1e-9, 10.0 + 1e-9)
     ]
-    torch.testing.assert_close(close[0], close[1], rtol=0, atol=1e-7)
+    assert_close(close[0], close[1], rtol=0, atol=1e-7)
 
 
 def test_a_solid_beyond_the_limit_goes_back_to_its_own_shape(device, dtype):
@@ -104,14 +105,14 @@ def test_a_solid_beyond_the_limit_goes_back_to_its_own_shape(device, dtype):
     kept = limit_deformed(f, drawn, rest, 2.0, solid)
     assert torch.equal(kept[0], drawn[0])
     assert torch.equal(limit_deformed(f, drawn, rest, 2.0, ~solid)[2], kept[1])
-    torch.testing.assert_close(limit_deformed(f, drawn, rest, 2.0, solid, polar_rotation(f)), kept)
+    assert_close(limit_deformed(f, drawn, rest, 2.0, solid, polar_rotation(f)), kept)
     size, size_at_rest = kept.diagonal(dim1=-2, dim2=-1).sum(-1), rest.diagonal(dim1=-2, dim2=-1).sum(-1)
-    torch.testing.assert_close(size[1:], 4 * size_at_rest[1:])
+    assert_close(size[1:], 4 * size_at_rest[1:])
     # turned, x and y change places; the thin axis stays thin, and what was torn out is 3 sizes long, not a thousand
     own, grain = (kept[k].diagonal().cpu().double() for k in (1, 2))
-    torch.testing.assert_close(own, torch.tensor([3 * 5.01 + 1.0, 4.0, 0.01]).double(), rtol=1e-3, atol=1e-4)
-    torch.testing.assert_close(grain, torch.tensor([3 * 5.01 + 1.67, 1.67, 1.67]).double(), rtol=1e-3, atol=1e-4)
-    torch.testing.assert_close(kept[3], 4 * turn @ rest[3] @ turn.T, rtol=1e-5, atol=1e-6)
+    assert_close(own, torch.tensor([3 * 5.01 + 1.0, 4.0, 0.01]).double(), rtol=1e-3, atol=1e-4)
+    assert_close(grain, torch.tensor([3 * 5.01 + 1.67, 1.67, 1.67]).double(), rtol=1e-3, atol=1e-4)
+    assert_close(kept[3], 4 * turn @ rest[3] @ turn.T, rtol=1e-5, atol=1e-6)
     assert torch.equal(limit_deformed(f[:0], drawn[:0], rest[:0], 2.0, solid[:0]), drawn[:0])
 
 

@@ -4,6 +4,7 @@ import math
 
 import pytest
 import torch
+from torch.testing import assert_close
 
 from gaussian_swaying.geometry.directions import axes_across, hull_area, spread_lines
 from gaussian_swaying.geometry.rotations import quat_to_rotation
@@ -12,8 +13,8 @@ from gaussian_swaying.geometry.rotations import quat_to_rotation
 def test_lines_are_spread_evenly():
     """The second moment of directions is a third of the identity; a spiral of n points has it up to about 1 / n."""
     lines = spread_lines(100)
-    torch.testing.assert_close(lines.norm(dim=-1), torch.ones(100, dtype=torch.float64))
-    torch.testing.assert_close(lines.mT @ lines / 100, torch.eye(3, dtype=torch.float64) / 3, rtol=0, atol=0.01)
+    assert_close(lines.norm(dim=-1), torch.ones(100, dtype=torch.float64))
+    assert_close(lines.mT @ lines / 100, torch.eye(3, dtype=torch.float64) / 3, rtol=0, atol=0.01)
     assert float(lines[:, 2].min()) > 0
 
 
@@ -38,8 +39,8 @@ def test_axes_across_make_a_right_handed_frame():
     lines = torch.cat([spread_lines(50), torch.eye(3, dtype=torch.float64)])
     first, second = axes_across(lines)
     frame = torch.stack([first, second, lines], dim=-1)
-    torch.testing.assert_close(frame.mT @ frame, torch.eye(3, dtype=torch.float64).expand(53, 3, 3))
-    torch.testing.assert_close(torch.linalg.det(frame), torch.ones(53, dtype=torch.float64))
+    assert_close(frame.mT @ frame, torch.eye(3, dtype=torch.float64).expand(53, 3, 3))
+    assert_close(torch.linalg.det(frame), torch.ones(53, dtype=torch.float64))
 
 
 def test_hull_of_a_box_a_ball_and_a_sheet():

@@ -5,6 +5,7 @@ import os
 
 import pytest
 import torch
+from torch.testing import assert_close
 
 from gaussian_swaying.geometry import meshes
 from gaussian_swaying.geometry.distance import (
@@ -37,11 +38,11 @@ def test_the_gradient_is_that_of_the_distance(solid):
     place = _places().requires_grad_()
     distance, normal = SOLIDS[solid](place)
     (slope,) = torch.autograd.grad(distance.sum(), place)
-    torch.testing.assert_close(normal, slope)
-    torch.testing.assert_close(normal.norm(dim=-1), torch.ones(len(place), dtype=torch.float64))
+    assert_close(normal, slope)
+    assert_close(normal.norm(dim=-1), torch.ones(len(place), dtype=torch.float64))
     outside = distance > 0
     foot = (place - distance[:, None] * normal)[outside]
-    torch.testing.assert_close(SOLIDS[solid](foot)[0], torch.zeros(len(foot), dtype=torch.float64), atol=1e-12, rtol=0)
+    assert_close(SOLIDS[solid](foot)[0], torch.zeros(len(foot), dtype=torch.float64), atol=1e-12, rtol=0)
 
 
 def test_the_middle_of_a_solid_has_a_normal():
@@ -59,13 +60,13 @@ def test_a_grid_interpolates_and_extends():
     grid = DistanceGrid((nodes @ direction).reshape(5, 6, 7), torch.full((3,), -0.5, dtype=torch.float64), 0.25)
     place = _places(500) * torch.tensor([0.5, 0.5, 0.5])
     distance, normal = grid.at(place)
-    torch.testing.assert_close(distance, place @ direction)
-    torch.testing.assert_close(normal, direction.expand_as(normal))
+    assert_close(distance, place @ direction)
+    assert_close(normal, direction.expand_as(normal))
     beyond = torch.tensor([[3.5, 0.1, 0.1]], dtype=torch.float64)
     distance, normal = grid_distance(beyond, grid.values, grid.origin, 0.25)
     edge = torch.tensor([0.5, 0.1, 0.1], dtype=torch.float64)
-    torch.testing.assert_close(distance, (edge @ direction)[None] + 3.0)
-    torch.testing.assert_close(normal, torch.tensor([[1.0, 0, 0]], dtype=torch.float64))
+    assert_close(distance, (edge @ direction)[None] + 3.0)
+    assert_close(normal, torch.tensor([[1.0, 0, 0]], dtype=torch.float64))
 
 
 def test_a_grid_needs_two_nodes_on_each_axis():
@@ -105,7 +106,7 @@ def test_a_mesh_has_the_distance_of_the_box_that_it_is(tmp_path):
         *(grid.origin[k] + grid.spacing * torch.arange(n, dtype=torch.float64) for k, n in enumerate(grid.values.shape))
     )
     exact = box_distance(nodes, torch.ones(3, dtype=torch.float64))[0]
-    torch.testing.assert_close(grid.values.reshape(-1), exact, atol=1e-12, rtol=0)
+    assert_close(grid.values.reshape(-1), exact, atol=1e-12, rtol=0)
 
 
 def test_a_ply_is_read_as_the_obj(tmp_path):
@@ -223,16 +224,16 @@ def test_distances_of_triangles_agree_with_samples():
     share = torch.distributions.Dirichlet(torch.ones(3, dtype=torch.float64)).sample((20000,))
     sampled = (place[:, None] - share @ corners).norm(dim=-1).amin(-1)
     assert bool((found <= sampled + 1e-12).all())
-    torch.testing.assert_close(found, sampled, atol=0.02, rtol=0)
+    assert_close(found, sampled, atol=0.02, rtol=0)
 
 
 def test_the_distance_of_a_triangle_without_area_is_that_of_its_longest_side():
     a, c = torch.tensor([0.0, 0.0, 0.0]).double(), torch.tensor([2.0, 0.0, 0.0]).double()
     place = torch.tensor([[-3.0, 4.0, 0.0], [0.5, 0.0, 2.0], [2.0, -3.0, 4.0]], dtype=torch.float64)
     between = torch.stack([a, 0.25 * c, c]).expand(3, 3, 3)
-    torch.testing.assert_close(triangle_distance(place, between), torch.tensor([5.0, 2.0, 5.0], dtype=torch.float64))
+    assert_close(triangle_distance(place, between), torch.tensor([5.0, 2.0, 5.0], dtype=torch.float64))
     at_a_point = torch.zeros(3, 3, 3, dtype=torch.float64)
-    torch.testing.assert_close(triangle_distance(place, at_a_point), place.norm(dim=-1))
+    assert_close(triangle_distance(place, at_a_point), place.norm(dim=-1))
 
 
 def test_a_path_is_straight_between_its_keys():
@@ -242,10 +243,10 @@ def test_a_path_is_straight_between_its_keys():
     times, moves, turns = path.keys()
     for time, move, angle in ((-1, (0, 0, 0), 0), (0.5, (1, 0, 0), 45), (2.0, (2, 2, 0), 90), (9.0, (2, 4, 0), 90)):
         now = torch.tensor(time, dtype=torch.float64)
-        torch.testing.assert_close(between(times, moves, now), torch.tensor(move, dtype=torch.float64))
+        assert_close(between(times, moves, now), torch.tensor(move, dtype=torch.float64))
         x = rotation_of(between(times, turns, now)) @ torch.tensor([1.0, 0, 0], dtype=torch.float64)
         radians = torch.deg2rad(torch.tensor(float(angle), dtype=torch.float64))
-        torch.testing.assert_close(x[:2], torch.stack([radians.cos(), radians.sin()]))
+        assert_close(x[:2], torch.stack([radians.cos(), radians.sin()]))
     assert path.speed == 2.0
 
 

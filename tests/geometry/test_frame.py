@@ -4,6 +4,7 @@ import dataclasses
 
 import pytest
 import torch
+from torch.testing import assert_close
 
 from gaussian_swaying.geometry.frame import SimFrame
 from gaussian_swaying.geometry.rotations import rotation_from_z
@@ -19,10 +20,10 @@ def _points(dtype=torch.float64):
 def test_rotation_is_proper_and_takes_up_to_z(up):
     rotation = rotation_from_z(up).T
     direction = torch.tensor(up, dtype=torch.float64)
-    torch.testing.assert_close(rotation @ rotation.T, torch.eye(3, dtype=torch.float64), rtol=0, atol=1e-12)
+    assert_close(rotation @ rotation.T, torch.eye(3, dtype=torch.float64), rtol=0, atol=1e-12)
     assert float(torch.linalg.det(rotation)) == pytest.approx(1.0)
     expected = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)
-    torch.testing.assert_close(rotation @ direction / direction.norm(), expected, rtol=0, atol=1e-8)
+    assert_close(rotation @ direction / direction.norm(), expected, rtol=0, atol=1e-8)
 
 
 def test_up_is_minus_y_has_a_closed_form():
@@ -41,17 +42,17 @@ def test_longest_side_sets_the_box(up):
     placed = frame.point_to_sim(_points())
     low, high = placed.amin(0), placed.amax(0)
     assert float((high - low).amax()) == pytest.approx(1.5, rel=1e-12)
-    torch.testing.assert_close(low + high, torch.zeros(3, dtype=torch.float64), rtol=0, atol=1e-12)
+    assert_close(low + high, torch.zeros(3, dtype=torch.float64), rtol=0, atol=1e-12)
 
 
 @pytest.mark.parametrize("size", [{"longest_side": 1.0}, {"metres_per_unit": 0.01}, {}])
 @pytest.mark.parametrize("up", UPS)
 def test_there_and_back(up, size):
     frame = SimFrame.fit(_points(), up, **size)
-    torch.testing.assert_close(frame.point_to_scene(frame.point_to_sim(_points())), _points(), rtol=0, atol=1e-12)
-    torch.testing.assert_close(frame.direction_to_scene(frame.direction_to_sim(_points())), _points())
+    assert_close(frame.point_to_scene(frame.point_to_sim(_points())), _points(), rtol=0, atol=1e-12)
+    assert_close(frame.direction_to_scene(frame.direction_to_sim(_points())), _points())
     move = frame.point_to_sim(_points() + 0.5) - frame.point_to_sim(_points())
-    torch.testing.assert_close(frame.displacement_to_scene(move), torch.full_like(move, 0.5))
+    assert_close(frame.displacement_to_scene(move), torch.full_like(move, 0.5))
 
 
 def test_metres_per_unit_is_taken_as_it_is():
@@ -68,7 +69,7 @@ def test_covariances_follow_the_points(up):
     """Covariance of transformed samples = transformed covariance of samples."""
     frame = SimFrame.fit(_points(), up, longest_side=1.0)
     covariance = torch.cov(_points().T)
-    torch.testing.assert_close(frame.covariance_to_sim(covariance), torch.cov(frame.point_to_sim(_points()).T))
+    assert_close(frame.covariance_to_sim(covariance), torch.cov(frame.point_to_sim(_points()).T))
 
 
 @pytest.mark.parametrize("up", UPS)
@@ -79,7 +80,7 @@ def test_deforming_in_the_scene_is_deforming_in_metres(up):
     covariance, F = factor @ factor.mT, factor + torch.eye(3, dtype=torch.float64)
     in_scene = frame.gradient_to_scene(F)
     in_metres = F @ frame.covariance_to_sim(covariance) @ F.mT
-    torch.testing.assert_close(frame.covariance_to_sim(in_scene @ covariance @ in_scene.mT), in_metres)
+    assert_close(frame.covariance_to_sim(in_scene @ covariance @ in_scene.mT), in_metres)
 
 
 @pytest.mark.parametrize("up", UPS)
@@ -93,7 +94,7 @@ def test_a_gradient_is_turned_from_both_sides(up):
     frame = SimFrame.fit(_points(), up)
     assert frame.turns == (up != [0, 0, 1])
     F = torch.rand(2, 5, 3, 3, generator=torch.Generator().manual_seed(2), dtype=torch.float64)
-    torch.testing.assert_close(frame.gradient_to_scene(F), frame.rotation.T @ F @ frame.rotation)
+    assert_close(frame.gradient_to_scene(F), frame.rotation.T @ F @ frame.rotation)
     mirrored = frame.gradient_to_scene(F.mT.contiguous().mT)  # any strides
     assert torch.equal(mirrored, frame.gradient_to_scene(F))
 
@@ -106,10 +107,10 @@ def test_what_a_frame_keeps_is_its_own():
         frame.direction_to_sim(_points().float())
     other = dataclasses.replace(frame, origin=frame.origin.clone() + 1, rotation=rotation_from_z([1, 0, 0]).T)
     expected = (_points() - other.origin) @ other.rotation.T * 2.0
-    torch.testing.assert_close(other.point_to_sim(_points()), expected)
+    assert_close(other.point_to_sim(_points()), expected)
     points = _points().requires_grad_()
     other.direction_to_sim(points).sum().backward()
-    torch.testing.assert_close(points.grad, other.rotation.sum(0).expand(50, 3))
+    assert_close(points.grad, other.rotation.sum(0).expand(50, 3))
     assert frame.direction_to_sim(_points().float()).dtype == torch.float32
 
 
@@ -130,7 +131,7 @@ def test_a_second_conversion_copies_nothing(up):
     finally:
         torch.cuda.set_sync_debug_mode("default")
     for (name, value, _), result in zip(calls, found, strict=True):
-        torch.testing.assert_close(result.cpu(), getattr(frame, name)(value), rtol=1e-5, atol=1e-6)
+        assert_close(result.cpu(), getattr(frame, name)(value), rtol=1e-5, atol=1e-6)
 
 
 @pytest.mark.parametrize("up", [[0, 0, 1], [0.3, -0.7, 0.2]])
@@ -140,7 +141,7 @@ def test_a_scene_far_away_keeps_its_detail(up):
     frame = SimFrame.fit(stored, up, longest_side=1.0)
     near = frame.point_to_sim(stored)
     exact = (stored.double() - stored.double()[0]) @ rotation_from_z(up) * frame.metres_per_unit
-    torch.testing.assert_close((near - near[0]).double(), exact, rtol=0, atol=3e-7)
+    assert_close((near - near[0]).double(), exact, rtol=0, atol=3e-7)
     assert torch.equal(frame.point_to_scene(near.double()).float(), stored)
 
 

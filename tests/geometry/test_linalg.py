@@ -2,6 +2,7 @@
 
 import pytest
 import torch
+from torch.testing import assert_close
 
 from gaussian_swaying.geometry.linalg import (
     cofactor,
@@ -25,8 +26,8 @@ def test_cofactor_and_determinant(device, dtype):
     F = F[torch.linalg.det(F).abs() > 0.05]
     tol = 1e3 * torch.finfo(dtype).eps
     expected = torch.linalg.det(F)[:, None, None] * torch.linalg.inv(F).mT
-    torch.testing.assert_close(cofactor(F), expected, rtol=tol, atol=tol)
-    torch.testing.assert_close(determinant(F), torch.linalg.det(F), rtol=tol, atol=tol)
+    assert_close(cofactor(F), expected, rtol=tol, atol=tol)
+    assert_close(determinant(F), torch.linalg.det(F), rtol=tol, atol=tol)
 
 
 def test_polar_rotation_matches_svd(device, dtype):
@@ -38,26 +39,26 @@ def test_polar_rotation_matches_svd(device, dtype):
     # forward error of a polar factor: eps times the condition number
     tol = 100 * torch.finfo(dtype).eps
     proper = torch.linalg.det(F) > 0
-    torch.testing.assert_close(R[proper], (u @ vh).to(dtype)[proper], rtol=0, atol=tol)
+    assert_close(R[proper], (u @ vh).to(dtype)[proper], rtol=0, atol=tol)
     eye = torch.eye(3, dtype=dtype, device=device).expand_as(R)
-    torch.testing.assert_close(R.mT @ R, eye, rtol=0, atol=tol)
-    torch.testing.assert_close(torch.linalg.det(R), torch.ones(len(R), dtype=dtype, device=device), rtol=0, atol=tol)
+    assert_close(R.mT @ R, eye, rtol=0, atol=tol)
+    assert_close(torch.linalg.det(R), torch.ones(len(R), dtype=dtype, device=device), rtol=0, atol=tol)
     # the nearest rotation has tr(R^T F) = s1 + s2 - s3
     inverted = ~proper
     assert int(inverted.sum()) > 5, "the test should meet inverted matrices"
     best = s[inverted] @ torch.tensor([1.0, 1.0, -1.0], dtype=torch.float64, device=device)
     found = (R * F).double()[inverted].sum((-1, -2))
-    torch.testing.assert_close(found, best, rtol=0, atol=5e-3)
+    assert_close(found, best, rtol=0, atol=5e-3)
     clear = s[inverted][:, 1] > 1.5 * s[inverted][:, 2]
-    torch.testing.assert_close(found[clear], best[clear], rtol=0, atol=1e-4 if dtype == torch.float32 else 1e-5)
+    assert_close(found[clear], best[clear], rtol=0, atol=1e-4 if dtype == torch.float32 else 1e-5)
 
 
 def test_polar_rotation_is_objective(device):
     """R(Q F) = Q R(F), and R(Q) = Q."""
     F = _matrices(device, torch.float64, spread=0.2)
     Q = torch.linalg.qr(_matrices(device, torch.float64, spread=1.0))[0]
-    torch.testing.assert_close(polar_rotation(Q @ F, 8), Q @ polar_rotation(F, 8), rtol=0, atol=1e-12)
-    torch.testing.assert_close(polar_rotation(Q, 8), Q, rtol=0, atol=1e-12)
+    assert_close(polar_rotation(Q @ F, 8), Q @ polar_rotation(F, 8), rtol=0, atol=1e-12)
+    assert_close(polar_rotation(Q, 8), Q, rtol=0, atol=1e-12)
 
 
 def test_polar_gradient_at_identity():
@@ -66,7 +67,7 @@ def test_polar_gradient_at_identity():
     (gradient,) = torch.autograd.grad(polar_rotation(F)[0, 1], F)
     expected = torch.zeros(3, 3, dtype=torch.float64)
     expected[0, 1], expected[1, 0] = 0.5, -0.5
-    torch.testing.assert_close(gradient, expected)
+    assert_close(gradient, expected)
     G = _matrices("cpu", torch.float64, spread=0.2, count=3)
     G = torch.cat([G, G @ torch.diag(torch.tensor([1.0, 1.1, -0.5], dtype=torch.float64))]).requires_grad_()
     assert torch.autograd.gradcheck(polar_rotation, G)
@@ -84,7 +85,7 @@ def test_polar_rotation_of_degenerate_matrices_is_finite(matrix, dtype):
 def test_eigenvalues_are_squares_of_the_singular_values():
     F = _matrices("cpu", torch.float64, spread=0.5)
     expected = torch.linalg.svdvals(F)
-    torch.testing.assert_close(symmetric_eigenvalues(F.mT @ F), expected.square(), rtol=0, atol=1e-7)
+    assert_close(symmetric_eigenvalues(F.mT @ F), expected.square(), rtol=0, atol=1e-7)
 
 
 def _graded(device, dtype, decades, count=2000):
@@ -116,7 +117,7 @@ def test_svd3(device, dtype, decades):
     expected = torch.linalg.svdvals(F.double())
     largest = expected[:, :1, None]
     for rotation in (u, v):
-        torch.testing.assert_close(rotation.mT @ rotation, _eye(dtype, device).expand_as(u), rtol=0, atol=tol)
+        assert_close(rotation.mT @ rotation, _eye(dtype, device).expand_as(u), rtol=0, atol=tol)
         assert float((torch.linalg.det(rotation) - 1).abs().max()) < tol
     assert float(((u @ a.diag_embed() @ v.mT - F).double() / largest).abs().max()) < tol
     error = (a.double().abs() - expected) / expected[:, :1]
@@ -126,14 +127,14 @@ def test_svd3(device, dtype, decades):
     sure = expected[:, 2] > 10 * tol * expected[:, 0]
     assert bool(((a[:, 2] < 0) == inverted)[sure].all())
     assert bool((a[:, :2] > -tol).all())
-    torch.testing.assert_close(spectrum(F).rotation, u @ v.mT, rtol=0, atol=tol)
+    assert_close(spectrum(F).rotation, u @ v.mT, rtol=0, atol=tol)
 
 
 def test_spectrum_gives_the_polar_rotation(device):
     F = _matrices(device, torch.float64)
     F = F[(torch.linalg.cond(F) < 50) & (torch.linalg.det(F) > 0)]
     # both are limited by eps times the condition number
-    torch.testing.assert_close(spectrum(F).rotation, polar_rotation(F), rtol=0, atol=1e-12)
+    assert_close(spectrum(F).rotation, polar_rotation(F), rtol=0, atol=1e-12)
 
 
 @pytest.mark.parametrize("name", ["zero", "rank one", "rank two", "identity", "reflection", "tiny"])
@@ -144,11 +145,11 @@ def test_spectrum_of_degenerate_matrices(device, dtype, name):
     u, a, v = svd3(F)
     tol = JACOBI * torch.finfo(dtype).eps
     for rotation in (u, v, spectrum(F).rotation):
-        torch.testing.assert_close(rotation.mT @ rotation, eye, rtol=0, atol=tol)
+        assert_close(rotation.mT @ rotation, eye, rtol=0, atol=tol)
         assert abs(float(torch.linalg.det(rotation)) - 1) < tol
-    torch.testing.assert_close(u @ a.diag() @ v.mT, F, rtol=tol, atol=tol * float(F.abs().max()))
+    assert_close(u @ a.diag() @ v.mT, F, rtol=tol, atol=tol * float(F.abs().max()))
     if name in ("identity", "tiny"):
-        torch.testing.assert_close(spectrum(F).rotation, eye, rtol=0, atol=tol)
+        assert_close(spectrum(F).rotation, eye, rtol=0, atol=tol)
 
 
 def test_shapes():
@@ -207,13 +208,13 @@ def test_isotropic_functions_that_are_known(device, dtype):
     F = _matrices(device, dtype)
     tol = JACOBI * torch.finfo(dtype).eps * float(F.abs().max()) ** 2
     parts = spectrum(F)
-    torch.testing.assert_close(from_principal(parts, lambda a: a, rotated=True), F, rtol=0, atol=tol)
-    torch.testing.assert_close(from_principal(parts, lambda a: a.square()), F.mT @ F, rtol=0, atol=tol)
+    assert_close(from_principal(parts, lambda a: a, rotated=True), F, rtol=0, atol=tol)
+    assert_close(from_principal(parts, lambda a: a.square()), F.mT @ F, rtol=0, atol=tol)
     assert parts.spin is None
     with_gradient = spectrum(F.clone().requires_grad_())
     assert with_gradient.spin is not None
     for rotated in (False, True):
         values = [from_principal(p, lambda a: a.exp(), rotated=rotated) for p in (parts, with_gradient)]
-        torch.testing.assert_close(*values, rtol=0, atol=tol)
+        assert_close(*values, rtol=0, atol=tol)
     with torch.no_grad():
         assert spectrum(F.clone().requires_grad_()).spin is None

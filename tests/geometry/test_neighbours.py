@@ -2,6 +2,7 @@
 
 import pytest
 import torch
+from torch.testing import assert_close
 
 from gaussian_swaying.geometry.neighbours import nearest_neighbours
 
@@ -21,8 +22,8 @@ def test_among_themselves():
     points = _uneven(2000)
     distance, index = nearest_neighbours(points, 12)
     everything = _distances(points, points).fill_diagonal_(torch.inf)
-    torch.testing.assert_close(distance, everything.sort(dim=-1).values[:, :12])
-    torch.testing.assert_close(everything.gather(-1, index), distance)
+    assert_close(distance, everything.sort(dim=-1).values[:, :12])
+    assert_close(everything.gather(-1, index), distance)
 
 
 @pytest.mark.parametrize("count", [1, 5])
@@ -34,8 +35,8 @@ def test_from_other_places(count):
     )
     distance, index = nearest_neighbours(points, count, queries)
     everything = _distances(queries, points)
-    torch.testing.assert_close(distance, everything.sort(dim=-1).values[:, :count])
-    torch.testing.assert_close(everything.gather(-1, index), distance)
+    assert_close(distance, everything.sort(dim=-1).values[:, :count])
+    assert_close(everything.gather(-1, index), distance)
 
 
 def test_far_from_the_origin_and_degenerate():

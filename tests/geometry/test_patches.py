@@ -3,6 +3,7 @@
 import pytest
 import torch
 from shared import gradients, unit
+from torch.testing import assert_close
 
 from gaussian_swaying.geometry import patches_triton
 from gaussian_swaying.geometry.covariances import deform_covariance
@@ -30,11 +31,11 @@ def test_deformed_normal_and_area_match_a_mapped_plane():
     assert (torch.linalg.det(f) > 0).all()
     mapped = [(curved(points + step * t) - curved(points - step * t)) / (2 * step) for t in (first, second)]
     cross = torch.linalg.cross(*mapped)
-    torch.testing.assert_close(deform_normal(f, normal), cross / cross.norm(dim=-1, keepdim=True), rtol=0, atol=1e-8)
+    assert_close(deform_normal(f, normal), cross / cross.norm(dim=-1, keepdim=True), rtol=0, atol=1e-8)
     area = torch.rand(30, dtype=torch.float64)
     both = deform_patch(f, normal, area)
     assert torch.equal(both[0], deform_normal(f, normal))
-    torch.testing.assert_close(both[1], cross.norm(dim=-1) * area, rtol=1e-7, atol=0)
+    assert_close(both[1], cross.norm(dim=-1) * area, rtol=1e-7, atol=0)
 
 
 def test_deformed_normal_matches_the_inverse(device, dtype):
@@ -43,9 +44,7 @@ def test_deformed_normal_matches_the_inverse(device, dtype):
     normal = unit(len(f), 3, device=device, dtype=dtype)
     expected = (torch.linalg.inv(f).mT @ normal[..., None]).squeeze(-1)
     assert (torch.linalg.det(f) < 0).any()
-    torch.testing.assert_close(
-        deform_normal(f, normal), expected / expected.norm(dim=-1, keepdim=True), rtol=1e-4, atol=1e-5
-    )
+    assert_close(deform_normal(f, normal), expected / expected.norm(dim=-1, keepdim=True), rtol=1e-4, atol=1e-5)
 
 
 def test_deformed_normal_of_singulargradients(device, dtype):
@@ -55,7 +54,7 @@ def test_deformed_normal_of_singulargradients(device, dtype):
     tiny = 1e-12 * torch.eye(3, device=device, dtype=dtype)  # squares of cofactors underflow in float32
     f = torch.stack([flat, line, torch.zeros_like(flat), tiny]).requires_grad_()
     normal = deform_normal(f, up.expand(4, 3))
-    torch.testing.assert_close(normal.detach(), up.expand(4, 3))
+    assert_close(normal.detach(), up.expand(4, 3))
     normal.sum().backward()
     assert torch.isfinite(f.grad).all()
     area = torch.ones(4, device=device, dtype=dtype)
@@ -73,10 +72,10 @@ def test_everything_at_once_is_each_by_itself(device, dtype):
     rest, normal = factor @ factor.mT, unit(len(f), 3, device=device, dtype=dtype)
     normal[1] = UP.to(normal)
     covariances, normals, rotations = deform_all(f, rest, normal)
-    torch.testing.assert_close(covariances, deform_covariance(f, rest))
-    torch.testing.assert_close(normals, deform_normal(f, normal), rtol=1e-4, atol=1e-5)
+    assert_close(covariances, deform_covariance(f, rest))
+    assert_close(normals, deform_normal(f, normal), rtol=1e-4, atol=1e-5)
     stretched = [k for k in range(len(f)) if k not in (1, 2)]
-    torch.testing.assert_close(rotations[stretched], polar_rotation(f)[stretched], rtol=0, atol=1e-5)
+    assert_close(rotations[stretched], polar_rotation(f)[stretched], rtol=0, atol=1e-5)
     assert torch.isfinite(rotations).all()
     assert torch.equal(covariances[3], rest[3])
     *same, none = deform_all(f, rest, normal, rotations=False)
@@ -100,10 +99,10 @@ def test_the_kernel_keeps_to_the_limit_as_torch_does(device):
     for rotations in (True, False):
         made = patches_triton.deform_all(*given, rotations, 1.5, solid.to(device))
         drawn, _, turns = deform_all(*(part.double() for part in given), rotations, 1.5, solid.to(device))
-        torch.testing.assert_close(made[0].double(), drawn, rtol=1e-4, atol=1e-4)
+        assert_close(made[0].double(), drawn, rtol=1e-4, atol=1e-4)
         assert (made[2] is None) == (turns is None)
     free = patches_triton.deform_all(*given, False)[0]
-    torch.testing.assert_close(free, deform_covariance(*given[:2]))
+    assert_close(free, deform_covariance(*given[:2]))
     changed = (free != made[0]).any(-1).any(-1)
     assert 5 < int(changed.sum()) < 35
 
@@ -130,7 +129,7 @@ def test_smallest_axis(device, dtype):
     log_scales = torch.tensor([[-9.0, 0, 1], [0, -9, 1], [1, 0, -9]], device=device, dtype=dtype)
     rotation = quat_to_rotation(quats)
     expected = torch.stack([rotation[0, :, 0], rotation[1, :, 1], rotation[2, :, 2]])
-    torch.testing.assert_close(smallest_axis_normal(quats, log_scales), expected)
+    assert_close(smallest_axis_normal(quats, log_scales), expected)
 
 
 def test_gradcheck(device):

@@ -5,8 +5,9 @@ import copy
 import pytest
 import torch
 
+from gaussian_swaying import Box, Cylinder, Sphere
 from gaussian_swaying.gaussians.selection import select_simulated
-from gaussian_swaying.geometry.regions import Box, Cylinder, Everything, Not, Region, Sphere, Union
+from gaussian_swaying.geometry.regions import Everything, Not, Region, Union
 
 
 def _inside(region, *points):

@@ -2,6 +2,7 @@
 
 import pytest
 import torch
+from torch.testing import assert_close
 
 from gaussian_swaying.geometry.rigid import centre, fitted_gradient, rigid_velocity
 from gaussian_swaying.geometry.rotations import rotation_of
@@ -26,34 +27,34 @@ def test_momenta_and_distances_stay(dt):
     """Also in turns of several degrees in a substep: the velocity leads along the chord."""
     moved = rigid_velocity(PLACE, VELOCITY, MASS, dt)
     for found, given in zip(momenta(PLACE, moved), momenta(PLACE, VELOCITY), strict=True):
-        torch.testing.assert_close(found, given, rtol=0, atol=1e-11)
+        assert_close(found, given, rtol=0, atol=1e-11)
     after = PLACE + dt * moved
-    torch.testing.assert_close(distances(after), distances(PLACE), rtol=0, atol=1e-12)
+    assert_close(distances(after), distances(PLACE), rtol=0, atol=1e-12)
     for found, given in zip(momenta(after, moved), momenta(PLACE, VELOCITY), strict=True):
-        torch.testing.assert_close(found, given, rtol=0, atol=1e-11)
+        assert_close(found, given, rtol=0, atol=1e-11)
 
 
 def test_a_rigid_motion_stays_as_it_is():
     turn = 1e-3 * torch.tensor([1.0, 2.0, -0.5], dtype=torch.float64)
     middle = centre(PLACE, MASS)
     velocity = ((PLACE - middle) @ rotation_of(turn).mT + middle - PLACE) / 1e-3 + torch.tensor([0.3, 0.0, 1.0])
-    torch.testing.assert_close(rigid_velocity(PLACE, velocity, MASS, 1e-3), velocity, rtol=0, atol=1e-9)
+    assert_close(rigid_velocity(PLACE, velocity, MASS, 1e-3), velocity, rtol=0, atol=1e-9)
 
 
 def test_points_without_mass_are_taken_along_and_do_not_count():
     mass = torch.where(torch.arange(40) < 20, MASS, 0.0)
     moved = rigid_velocity(PLACE, VELOCITY, mass, 1e-3)
     alone = rigid_velocity(PLACE[:, :20], VELOCITY[:, :20], mass[:, :20], 1e-3)
-    torch.testing.assert_close(moved[:, :20], alone, rtol=0, atol=1e-12)
+    assert_close(moved[:, :20], alone, rtol=0, atol=1e-12)
     after = PLACE + 1e-3 * moved
-    torch.testing.assert_close(distances(after), distances(PLACE), rtol=0, atol=1e-12)
+    assert_close(distances(after), distances(PLACE), rtol=0, atol=1e-12)
     assert float(rigid_velocity(PLACE, VELOCITY, torch.zeros_like(mass), 1e-3).abs().max()) == 0.0
 
 
 def test_the_gradient_of_an_affine_field_is_found():
     gradient = torch.randn(2, 3, 3, generator=GENERATOR, dtype=torch.float64)
     field = PLACE @ gradient.mT + 4.0
-    torch.testing.assert_close(fitted_gradient(PLACE, field, MASS), gradient)
+    assert_close(fitted_gradient(PLACE, field, MASS), gradient)
 
 
 def test_it_has_gradients():

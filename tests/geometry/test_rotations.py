@@ -3,6 +3,7 @@
 import pytest
 import torch
 from shared import unit
+from torch.testing import assert_close
 
 from gaussian_swaying.geometry.rotations import quat_multiply, quat_to_rotation, rotation_of, rotation_to_quat, turn_of
 
@@ -12,7 +13,7 @@ def test_quaternion_rotates_as_hamilton_product(device, dtype):
     unit = quats / quats.norm(dim=-1, keepdim=True)
     w, u = unit[:, :1], unit[:, 1:]
     expected = v + 2 * torch.linalg.cross(u, torch.linalg.cross(u, v) + w * v)
-    torch.testing.assert_close((quat_to_rotation(quats) @ v[..., None]).squeeze(-1), expected)
+    assert_close((quat_to_rotation(quats) @ v[..., None]).squeeze(-1), expected)
 
 
 def test_rotation_to_quat_inverts(device, dtype):
@@ -21,8 +22,8 @@ def test_rotation_to_quat_inverts(device, dtype):
     quats = torch.where(quats[:, :1] < 0, -quats, quats)
     back = rotation_to_quat(quat_to_rotation(quats))
     assert (back[:, 0] >= 0).all()
-    torch.testing.assert_close(quat_to_rotation(back), quat_to_rotation(quats))
-    torch.testing.assert_close(back[4:], quats[4:], rtol=0, atol=1e-5 if dtype == torch.float32 else 1e-13)
+    assert_close(quat_to_rotation(back), quat_to_rotation(quats))
+    assert_close(back[4:], quats[4:], rtol=0, atol=1e-5 if dtype == torch.float32 else 1e-13)
 
 
 def test_a_product_of_quaternions_is_one_rotation_after_the_other():
@@ -30,7 +31,7 @@ def test_a_product_of_quaternions_is_one_rotation_after_the_other():
     first = torch.randn(4, generator=draw, dtype=torch.float64)
     second = torch.randn(5, 4, generator=draw, dtype=torch.float64)
     both = quat_to_rotation(quat_multiply(first, second))
-    torch.testing.assert_close(both, quat_to_rotation(first) @ quat_to_rotation(second))
+    assert_close(both, quat_to_rotation(first) @ quat_to_rotation(second))
 
 
 def test_a_turn_is_the_exponential_of_its_cross_product():
@@ -39,8 +40,8 @@ def test_a_turn_is_the_exponential_of_its_cross_product():
     x, y, z = turn.unbind(-1)
     zero = torch.zeros_like(x)
     cross = torch.stack([zero, -z, y, z, zero, -x, -y, x, zero], -1).reshape(-1, 3, 3)
-    torch.testing.assert_close(rotation_of(turn), torch.linalg.matrix_exp(cross), rtol=0, atol=1e-12)
-    torch.testing.assert_close(turn_of(1e-12 * turn), 1e-12 * cross, rtol=1e-9, atol=1e-21)
+    assert_close(rotation_of(turn), torch.linalg.matrix_exp(cross), rtol=0, atol=1e-12)
+    assert_close(turn_of(1e-12 * turn), 1e-12 * cross, rtol=1e-9, atol=1e-21)
     assert torch.autograd.gradcheck(turn_of, torch.zeros(1, 3, dtype=torch.float64, requires_grad=True))
 
 

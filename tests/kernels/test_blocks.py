@@ -4,6 +4,7 @@ import math
 
 import pytest
 import torch
+from torch.testing import assert_close
 
 from gaussian_swaying.kernels.blocks import TranslationError
 from gaussian_swaying.kernels.language import tl, triton
@@ -132,7 +133,7 @@ def _real(kind):
 
 
 def _same(found, expected):
-    torch.testing.assert_close(found, expected, rtol=0, atol=0, equal_nan=True)
+    assert_close(found, expected, rtol=0, atol=0, equal_nan=True)
 
 
 # ---- numbers
@@ -205,10 +206,10 @@ def test_functions(kind, block):
     x = torch.linspace(-20, 20, 43, dtype=torch.float64).to(kind)
     for found, exact in _rows(FUNCTIONS, x, x, kind, block):
         rtol = 2 * torch.finfo(kind).eps
-        torch.testing.assert_close(found.double(), exact(x.double()), rtol=rtol, atol=1e-300)
+        assert_close(found.double(), exact(x.double()), rtol=rtol, atol=1e-300)
     whole = torch.arange(-9, 10, dtype=torch.int32)
     for found, exact in _rows(FUNCTIONS, whole, whole, torch.float32, block):
-        torch.testing.assert_close(found.double(), exact(whole.double()), rtol=3e-7, atol=1e-12)
+        assert_close(found.double(), exact(whole.double()), rtol=3e-7, atol=1e-12)
 
 
 # ---- comparisons and truth
@@ -303,7 +304,7 @@ def test_sums_and_extremes(kind, block):
     _same(sums, halves[:, 0])
     _same(most, rows.amax(1))
     _same(least, rows.amin(1))
-    torch.testing.assert_close(running, rows.cumsum(1).reshape(-1).to(kind))
+    assert_close(running, rows.cumsum(1).reshape(-1).to(kind))
 
 
 @triton.jit
@@ -322,7 +323,7 @@ def test_sums_over_the_axis_of_one_change_nothing(block):
     x = torch.randn(8)[:block].contiguous()
     out = torch.zeros(1 + 3 * block)
     launch(_axes_without_items, (1,))(x, out, BLOCK=block)
-    torch.testing.assert_close(out[0], x.sum())
+    assert_close(out[0], x.sum())
     _same(out[1:].reshape(3, block), torch.stack([x, torch.arange(block).float(), x]))
 
 

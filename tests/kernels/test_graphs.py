@@ -7,12 +7,11 @@ import pytest
 import torch
 from torch import nn
 
-from gaussian_swaying.aero.wind import GaussianGust, Modulation, SineSway, UniformGust, WindField
-from gaussian_swaying.geometry.regions import Box, Everything, Not, Union
+from gaussian_swaying import Boundary, Box, GaussianGust, PinnedRegion, SineSway, UniformGust, WindField
+from gaussian_swaying.aero.wind import Modulation
+from gaussian_swaying.geometry.regions import Everything, Not, Union
 from gaussian_swaying.kernels.graphs import Repeater, Replayed, fingerprint, tensors_in
 from gaussian_swaying.mpm.boundaries import BOUNDARIES
-from gaussian_swaying.mpm.boundaries.boundary import Boundary
-from gaussian_swaying.mpm.boundaries.pinned_region import PinnedRegion
 from gaussian_swaying.mpm.boundaries.plane import Plane
 from gaussian_swaying.mpm.boundaries.velocity_box import VelocityBox
 

@@ -1,28 +1,29 @@
-"""Gradients from the kernels of the backward pass against torch's autograd in float64.
-
-Covers: aero.force_adjoint_triton, mpm.triton.adjoint_kernels, mpm.triton.total_adjoint,
-mpm.triton.twins.
-"""
+"""Gradients from the kernels of the backward pass against torch's autograd in float64."""
 
 import dataclasses
 
 import pytest
 import torch
 
+from gaussian_swaying import (
+    AeroForce,
+    Box,
+    MaterialPoints,
+    MPMSolver,
+    PinnedPoints,
+    PinnedRegion,
+    SineSway,
+    WindField,
+    WindForce,
+)
 from gaussian_swaying.aero.force import LAWS as WIND_LAWS
-from gaussian_swaying.aero.force import AeroForce
 from gaussian_swaying.aero.force_adjoint_triton import wind_force_adjoint, wind_on_groups_adjoint
 from gaussian_swaying.aero.patches import Patches, PatchSums
-from gaussian_swaying.aero.wind import SineSway, WindField
-from gaussian_swaying.aero.wind_force import WindForce
 from gaussian_swaying.geometry.linalg_triton import load3, load9, read, store3, store9
 from gaussian_swaying.geometry.patches import deform_patch
-from gaussian_swaying.geometry.regions import Box
 from gaussian_swaying.kernels.language import tl, triton
 from gaussian_swaying.kernels.launch import lanes, launch
 from gaussian_swaying.mpm.boundaries.ball import BallObstacle
-from gaussian_swaying.mpm.boundaries.pinned_points import PinnedPoints
-from gaussian_swaying.mpm.boundaries.pinned_region import PinnedRegion
 from gaussian_swaying.mpm.boundaries.plane import Plane
 from gaussian_swaying.mpm.damping import kelvin_voigt_pk1
 from gaussian_swaying.mpm.laws.fixed_corotated import FixedCorotated
@@ -30,8 +31,6 @@ from gaussian_swaying.mpm.laws.hencky import StVKHencky
 from gaussian_swaying.mpm.laws.neo_hookean import NeoHookean
 from gaussian_swaying.mpm.laws.spring_network import SpringNetwork
 from gaussian_swaying.mpm.laws.triton.body import BodyLaws, pk1_adjoint
-from gaussian_swaying.mpm.solver import MPMSolver
-from gaussian_swaying.mpm.state import MaterialPoints
 from gaussian_swaying.mpm.triton import fused_total
 from gaussian_swaying.mpm.triton.damping import kelvin_voigt_adjoint
 

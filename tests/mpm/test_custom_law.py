@@ -7,9 +7,8 @@ from pathlib import Path
 import pytest
 import torch
 
+from gaussian_swaying import MaterialPoints, MPMSolver
 from gaussian_swaying.mpm.laws.sand import Sand
-from gaussian_swaying.mpm.solver import MPMSolver
-from gaussian_swaying.mpm.state import MaterialPoints
 
 ROOT = Path(__file__).parents[2]
 

@@ -6,12 +6,10 @@ from itertools import pairwise
 
 import pytest
 import torch
+from torch.testing import assert_close
 
-from gaussian_swaying.geometry.regions import Box
-from gaussian_swaying.mpm.boundaries.pinned_region import PinnedRegion
+from gaussian_swaying import Box, MaterialPoints, MPMSolver, PinnedRegion
 from gaussian_swaying.mpm.damping import damped_substep, decay_rate, kelvin_voigt_pk1
-from gaussian_swaying.mpm.solver import MPMSolver
-from gaussian_swaying.mpm.state import MaterialPoints
 from gaussian_swaying.mpm.timestep import cfl_number, stable_limit, wave_speed
 from gaussian_swaying.mpm.transfer import bspline_stencil
 
@@ -51,14 +49,14 @@ def test_stress_is_the_rate_of_the_saint_venant_kirchhoff_stress():
         return 2 * mu[:, None, None] * E + (lam * E.diagonal(dim1=-2, dim2=-1).sum(-1))[:, None, None] * EYE
 
     expected = 0.07 * F @ (second(1e-4) - second(-1e-4)) / 2e-4
-    torch.testing.assert_close(kelvin_voigt_pk1(F, rate, mu, lam, 0.07), expected, rtol=1e-8, atol=1e-9)
+    assert_close(kelvin_voigt_pk1(F, rate, mu, lam, 0.07), expected, rtol=1e-8, atol=1e-9)
 
 
 def test_kirchhoff_stress_is_symmetric():
     """Otherwise the damping would remove angular momentum."""
     F, rate, mu, lam = _random()
     kirchhoff = kelvin_voigt_pk1(F, rate, mu, lam, 0.3) @ F.mT
-    torch.testing.assert_close(kirchhoff, kirchhoff.mT, rtol=0, atol=1e-13)
+    assert_close(kirchhoff, kirchhoff.mT, rtol=0, atol=1e-13)
     assert float(kirchhoff.abs().max()) > 0.1
 
 
@@ -72,7 +70,7 @@ def test_rigid_rotation_rate_gives_no_stress():
     """Also after any earlier deformation."""
     F, _, mu, lam = _random()
     rate = _skew(torch.tensor([0.3, -2.0, 1.0])) @ F
-    torch.testing.assert_close(kelvin_voigt_pk1(F, rate, mu, lam, 1.0), torch.zeros_like(F), rtol=0, atol=1e-13)
+    assert_close(kelvin_voigt_pk1(F, rate, mu, lam, 1.0), torch.zeros_like(F), rtol=0, atol=1e-13)
 
 
 def test_stress_turns_with_the_body():
@@ -82,7 +80,7 @@ def test_stress_turns_with_the_body():
     spin = _skew(torch.tensor([5.0, -3.0, 2.0]))
     seen = kelvin_voigt_pk1(turn @ F, turn @ (rate + spin @ F), mu, lam, 0.5)
     expected = turn @ kelvin_voigt_pk1(F, rate, mu, lam, 0.5)
-    torch.testing.assert_close(seen, expected, rtol=0, atol=1e-12)
+    assert_close(seen, expected, rtol=0, atol=1e-12)
 
 
 # ---- whole steps
@@ -111,15 +109,15 @@ def test_rigid_motion_is_not_damped(formulation, mls):
     assert not bool(state.lost.any())
     after = solver.momenta(state)
     for name in before:
-        torch.testing.assert_close(after[name], before[name], rtol=0, atol=1e-11 * float(before[name].norm()))
+        assert_close(after[name], before[name], rtol=0, atol=1e-11 * float(before[name].norm()))
     # the centrifugal strain is rho omega² L² / (8 E) = 4e-4
     rate = state.affine if formulation == "updated" else state.affine @ torch.linalg.inv(state.F_elastic)
     spin = 0.5 * (rate - rate.mT).mean(0)
-    torch.testing.assert_close(spin, _skew(omega), rtol=0, atol=1.5e-3)
+    assert_close(spin, _skew(omega), rtol=0, atol=1.5e-3)
     turn = torch.linalg.matrix_exp(0.25 * _skew(omega))
-    torch.testing.assert_close(state.F_elastic, turn.expand_as(state.F_elastic), rtol=0, atol=2e-3)
+    assert_close(state.F_elastic, turn.expand_as(state.F_elastic), rtol=0, atol=2e-3)
     fly = centre + 0.25 * drift
-    torch.testing.assert_close(
+    assert_close(
         state.position, fly + (points.position - centre) @ turn.T, rtol=0, atol=1e-3 * float(points.position.norm())
     )
 
@@ -130,7 +128,7 @@ def test_translation_is_not_damped_at_all(formulation):
     solver = MPMSolver(dx=0.1, formulation=formulation, gravity=(0, 0, 0), stiffness_damping=0.02)
     velocity = torch.tensor([0.4, 0.1, -0.3], dtype=torch.float64).expand_as(points.position)
     state = solver.rollout(solver.init_state(points, velocity), 1e-4, 100)
-    torch.testing.assert_close(state.velocity, velocity, rtol=0, atol=1e-12)
+    assert_close(state.velocity, velocity, rtol=0, atol=1e-12)
 
 
 def _ring(formulation, beta, dt=1e-3, steps=560):
@@ -333,7 +331,7 @@ def test_each_part_has_its_own_damping():
     velocity = torch.ones_like(points.position)
     state = solver.rollout(solver.init_state(points, velocity), 1e-3, 100)
     expected = torch.exp(-0.1 * points.damping)[:, None].expand(-1, 3)
-    torch.testing.assert_close(state.velocity, expected, rtol=1e-12, atol=1e-12)
+    assert_close(state.velocity, expected, rtol=1e-12, atol=1e-12)
     stacked = MaterialPoints.stack([one, replace(one, damping=torch.ones_like(one.mass))])
     assert stacked.damping.mean(-1).tolist() == [0.0, 1.0]
 

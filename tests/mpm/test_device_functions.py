@@ -1,10 +1,6 @@
 """The decompositions and materials of the kernels, one function at a time, against float64.
 
 A test of many matrices at once (also singular, inverted, tiny, with repeated stretches) costs almost nothing here.
-
-Covers: geometry.linalg_triton, mpm.laws.triton.body, mpm.laws.triton.fixed_corotated, mpm.laws.triton.fluid,
-mpm.laws.triton.foam, mpm.laws.triton.hencky, mpm.laws.triton.metal, mpm.laws.triton.neo_hookean, mpm.laws.triton.sand,
-mpm.laws.triton.shared, mpm.laws.triton.snow, mpm.laws.triton.spring_network, mpm.laws.triton.functions.
 """
 
 import math
@@ -12,6 +8,7 @@ import math
 import pytest
 import torch
 from catalogue import ELASTIC, PLASTIC
+from torch.testing import assert_close
 
 from gaussian_swaying.geometry import linalg
 from gaussian_swaying.geometry.linalg_triton import polar_rotation, svd3
@@ -132,8 +129,8 @@ def test_decomposition(kernel_device):
     _, left, stretch, axes = _decomposed(F)
     eye = torch.eye(3, device=kernel_device).expand_as(F)
     for turn in (left, axes):
-        torch.testing.assert_close(turn @ turn.mT, eye, rtol=0, atol=3e-6)
-        torch.testing.assert_close(torch.linalg.det(turn), torch.ones_like(stretch[:, 0]), rtol=0, atol=3e-6)
+        assert_close(turn @ turn.mT, eye, rtol=0, atol=3e-6)
+        assert_close(torch.linalg.det(turn), torch.ones_like(stretch[:, 0]), rtol=0, atol=3e-6)
     size = torch.linalg.matrix_norm(F)
     product = left @ stretch.diag_embed() @ axes.mT
     assert bool((torch.linalg.matrix_norm(product - F) <= 3e-6 * size + 1e-14).all())
@@ -153,7 +150,7 @@ def test_nearest_rotation(kernel_device):
     values = linalg.svd3(F.double())[1]
     easy = values[:, 2].abs() * 50 > values[:, 0]
     assert int(easy.sum()) > 900
-    torch.testing.assert_close(rotation[easy], exact[easy], rtol=0, atol=1e-5)
+    assert_close(rotation[easy], exact[easy], rtol=0, atol=1e-5)
     assert bool(torch.isfinite(_decomposed(_matrices(kernel_device))[0]).all())
 
 

@@ -3,11 +3,7 @@
 import pytest
 import torch
 
-from gaussian_swaying.aero.force import AeroForce
-from gaussian_swaying.geometry.regions import Box
-from gaussian_swaying.mpm.boundaries.pinned_region import PinnedRegion
-from gaussian_swaying.mpm.solver import MPMSolver
-from gaussian_swaying.mpm.state import MaterialPoints
+from gaussian_swaying import AeroForce, Box, MaterialPoints, MPMSolver, PinnedRegion
 
 FORMULATIONS = ["total", "updated"]
 AERO = AeroForce(C_D=1.2, C_F=0.0, C_L=0.0, drag_step="semi_implicit")

@@ -1,7 +1,4 @@
-"""Where Gaussians read the motion of the nodes.
-
-Covers: .
-"""
+"""Where Gaussians read the motion of the nodes."""
 
 import torch
 

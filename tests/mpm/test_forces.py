@@ -9,13 +9,10 @@ from pathlib import Path
 
 import pytest
 import torch
+from torch.testing import assert_close
 
-from gaussian_swaying.aero.force import AeroForce
-from gaussian_swaying.aero.wind import SpatialWind, WindField
-from gaussian_swaying.aero.wind_force import WindForce
-from gaussian_swaying.mpm.forces import Force, FunctionForce, as_forces, divide
-from gaussian_swaying.mpm.solver import MPMSolver
-from gaussian_swaying.mpm.state import MaterialPoints
+from gaussian_swaying import AeroForce, Force, MaterialPoints, MPMSolver, SpatialWind, WindField, WindForce
+from gaussian_swaying.mpm.forces import FunctionForce, as_forces, divide
 from gaussian_swaying.mpm.twins import Twin
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -79,8 +76,8 @@ def test_forces_add_up(formulation, batch):
     for _ in range(4):
         stepped = solver.step(stepped, DT, forces)
     for other in (several, watched, stepped):
-        torch.testing.assert_close(other.position, state.position, rtol=0, atol=1e-12)
-        torch.testing.assert_close(other.work, state.work)
+        assert_close(other.position, state.position, rtol=0, atol=1e-12)
+        assert_close(other.work, state.work)
     for k in range(len(forces)):  # each of them has an effect
         fewer = solver.rollout(start, DT, 4, forces[:k] + forces[k + 1 :])
         assert float((fewer.velocity - state.velocity).abs().max()) > 1e-5
@@ -119,7 +116,7 @@ def test_work_is_that_of_all_forces(formulation):
     assert float(end.work) > 1.01 * float(alone.work) > 0
     if formulation == "total":  # nothing dissipates
         growth = solver.energies(end)["kinetic"] - solver.energies(state)["kinetic"]
-        torch.testing.assert_close(end.work, growth, rtol=1e-6, atol=1e-12)
+        assert_close(end.work, growth, rtol=1e-6, atol=1e-12)
 
 
 @pytest.mark.parametrize("checkpoint", [0, 2])
@@ -157,9 +154,7 @@ def test_a_force_with_a_resistance_is_stable_however_light_the_body():
 
     # drag x dt / mass is 20
     carried = solver.rollout(start, DT, 40, Carried(True)).velocity
-    torch.testing.assert_close(
-        carried, torch.tensor([2.0, 0.0, 0.0], dtype=torch.float64).expand(20, 3), atol=0.05, rtol=0
-    )
+    assert_close(carried, torch.tensor([2.0, 0.0, 0.0], dtype=torch.float64).expand(20, 3), atol=0.05, rtol=0)
     assert not float(solver.rollout(start, DT, 40, Carried(False), check=False).velocity.abs().max()) < 1e3
 
 
@@ -233,7 +228,7 @@ class Everywhere(SpatialWind):
 def test_a_wind_may_depend_on_the_place(formulation):
     solver, start, wind = _setting(formulation)
     same = WindForce(wind.aero, Everywhere(), wind.normal, wind.area)
-    torch.testing.assert_close(
+    assert_close(
         solver.rollout(start, DT, 3, same).velocity, solver.rollout(start, DT, 3, wind).velocity, rtol=0, atol=1e-13
     )
     shear = WindForce(wind.aero, Shear(), wind.normal, wind.area)
@@ -245,7 +240,7 @@ def test_a_wind_may_depend_on_the_place(formulation):
         force, _drag = wind.force(state, Shear()(state.time, state.position))
         state = solver.step(state, DT, force=force)
     end = solver.rollout(start, DT, 3, shear)
-    torch.testing.assert_close(end.velocity, state.velocity, rtol=0, atol=1e-13)
+    assert_close(end.velocity, state.velocity, rtol=0, atol=1e-13)
     assert float((end.velocity - solver.rollout(start, DT, 3, wind).velocity).abs().max()) > 1e-4
 
 
@@ -254,7 +249,7 @@ def test_scenes_of_a_batch_may_mix_winds():
     solver, start, wind = _setting(batch=(2,))
     mixed = WindForce(wind.aero, [Shear(), WindField([1.0, 2.0, 3.0])], wind.normal, wind.area)
     air = mixed.air(start.time, start.position)
-    torch.testing.assert_close(air[0], Shear()(start.time, start.position[0]))
+    assert_close(air[0], Shear()(start.time, start.position[0]))
     assert air[1].unique(dim=0).tolist() == [[1.0, 2.0, 3.0]]
     assert bool(torch.isfinite(solver.rollout(start, DT, 2, mixed).position).all())
 
@@ -266,7 +261,7 @@ def test_samples_are_the_wind_at_several_times():
     shear = WindForce(wind.aero, Shear(), wind.normal, wind.area)
     found = shear.samples(start, 0.1, 3)
     for k in range(3):
-        torch.testing.assert_close(found[k], Shear()(start.time + 0.1 * k, start.position))
+        assert_close(found[k], Shear()(start.time + 0.1 * k, start.position))
 
 
 # ---- the page and the package

@@ -1,18 +1,15 @@
-"""The two formulations against each other, with every law, and what each of them does not support.
-
-Covers: mpm.body, mpm.dispatch, mpm.formulations.formulation, mpm.formulations.total, mpm.formulations.updated.
-"""
+"""The two formulations against each other, with every law, and what each of them does not support."""
 
 import pytest
 import torch
 from bench.problems.flags import flag
 from bench.problems.settings import Settings
+from torch.testing import assert_close
 
+from gaussian_swaying import Box, MaterialPoints, MPMSolver, PinnedRegion
 from gaussian_swaying.geometry import linalg
-from gaussian_swaying.geometry.regions import Box
 from gaussian_swaying.mpm import dispatch
 from gaussian_swaying.mpm import formulations as known
-from gaussian_swaying.mpm.boundaries.pinned_region import PinnedRegion
 from gaussian_swaying.mpm.formulations.formulation import Formulation
 from gaussian_swaying.mpm.laws import law as law_module
 from gaussian_swaying.mpm.laws.fixed_corotated import FixedCorotated
@@ -25,8 +22,6 @@ from gaussian_swaying.mpm.laws.plasticine import Plasticine
 from gaussian_swaying.mpm.laws.sand import Sand
 from gaussian_swaying.mpm.laws.snow import Snow
 from gaussian_swaying.mpm.laws.spring_network import SpringNetwork
-from gaussian_swaying.mpm.solver import MPMSolver
-from gaussian_swaying.mpm.state import MaterialPoints
 
 FORMULATIONS = ["total", "updated"]
 ELASTIC = [FixedCorotated, NeoHookean, SpringNetwork, StVKHencky]
@@ -179,10 +174,10 @@ def test_several_laws_in_one_run():
     end = solver.rollout(solver.init_state(mixed, torch.cat(velocities)[order]), 5e-4, 60)
     for name in ("position", "F_elastic", "F_total"):
         alone = torch.cat([getattr(e, name) for e in ends])[order]
-        torch.testing.assert_close(getattr(end, name), alone, rtol=0, atol=1e-11)
+        assert_close(getattr(end, name), alone, rtol=0, atol=1e-11)
     metal = torch.cat([torch.full((p.count,), float(k == 1)) for k, p in enumerate(parts)])[order].bool()
     assert float(ends[1].internal.max()) > 1e-3
-    torch.testing.assert_close(end.internal[metal].sort()[0], ends[1].internal.sort()[0], rtol=0, atol=1e-11)
+    assert_close(end.internal[metal].sort()[0], ends[1].internal.sort()[0], rtol=0, atol=1e-11)
     assert float((ends[0].position - parts[0].position).sub(ends[2].position - parts[2].position).abs().max()) > 1e-4
 
 
@@ -230,7 +225,7 @@ def test_total_keeps_a_soft_flag_whole(dx, density):
     assert _whole(dx, density, 25, "cpu")
 
 
-@pytest.mark.slow(twin="test_total_keeps_a_soft_flag_whole")
+@pytest.mark.slow
 @pytest.mark.parametrize("dx", [0.08, 0.04, 0.02, 0.01])
 @pytest.mark.parametrize("density", [20.0, 50.0])
 def test_total_keeps_a_soft_flag_whole_for_ten_seconds(dx, density):
@@ -312,7 +307,7 @@ def test_a_third_formulation_is_one_class(monkeypatch):
     end = solver.fit_grid(solver.rollout(state, dt, 20, lift), dt)
     height = 10.0 * dt * dt * 20 * 21 / 2
     rise = torch.tensor([0.0, 0.0, height], dtype=torch.float64).expand_as(points.position)
-    torch.testing.assert_close(end.position - points.position, rise)
+    assert_close(end.position - points.position, rise)
     assert float(end.work) == pytest.approx(float((mass * 19.8).sum()) * 10.0 * dt * dt * 20**2 / 2)
     growth = {name: float(value - solver.energies(state)[name]) for name, value in solver.energies(end).items()}
     assert growth["kinetic"] == pytest.approx(0.5 * float(mass.sum()) * (200 * dt) ** 2)

@@ -1,15 +1,13 @@
-"""Obstacles in the kernels against torch.
-
-Covers: geometry.distance_triton, mpm.triton.obstacle_kernels, mpm.triton.obstacles.
-"""
+"""Obstacles in the kernels against torch."""
 
 from pathlib import Path
 
 import pytest
 import torch
 from catalogue import OBSTACLES
+from torch.testing import assert_close
 
-from gaussian_swaying.geometry.frame import SimFrame
+from gaussian_swaying import MaterialPoints, MPMSolver, SimFrame
 from gaussian_swaying.geometry.keyed_path import KeyedPath
 from gaussian_swaying.geometry.rotations import rotation_from_z
 from gaussian_swaying.kernels.launch import lanes, launch
@@ -18,8 +16,6 @@ from gaussian_swaying.mpm.boundaries.block import BoxObstacle
 from gaussian_swaying.mpm.boundaries.capsule import CapsuleObstacle
 from gaussian_swaying.mpm.boundaries.mesh import MeshObstacle
 from gaussian_swaying.mpm.boundaries.plane import Plane
-from gaussian_swaying.mpm.solver import MPMSolver
-from gaussian_swaying.mpm.state import MaterialPoints
 from gaussian_swaying.mpm.triton import obstacle_kernels as kernels
 from gaussian_swaying.mpm.triton.obstacles import Solids
 
@@ -61,9 +57,9 @@ def test_distance_normal_and_velocity(kernel_device, name):
             time = torch.tensor(moment, dtype=torch.float64, device=kernel_device)
             gap, facing, drive, valid, within = _ask_kernel(obstacle, place, time, kernel_device)
             distance, normal, own = obstacle.touch(place.double(), time, DT)
-            torch.testing.assert_close(gap.double(), distance - 0.01, rtol=0, atol=1e-6)
-            torch.testing.assert_close(facing.double(), normal, rtol=0, atol=2e-4)
-            torch.testing.assert_close(drive.double(), own, rtol=0, atol=2e-5)
+            assert_close(gap.double(), distance - 0.01, rtol=0, atol=1e-6)
+            assert_close(facing.double(), normal, rtol=0, atol=2e-4)
+            assert_close(drive.double(), own, rtol=0, atol=2e-5)
             assert bool((valid == float(obstacle.active(time))).all())
             ahead = distance - DT * (own * normal).sum(-1)  # the places are at rest
             assert within == int(bool(obstacle.active(time)) and float(torch.minimum(distance, ahead).min()) < 0.02)
@@ -105,7 +101,7 @@ def test_nodes_are_stopped_as_in_torch(kernel_device, name):
     assert len(solver.fused().solids.parts) == len(SETS[name]())
     for field in ("position", "velocity", "F_total", "impulse"):
         a, b = getattr(found, field), getattr(expected, field)
-        torch.testing.assert_close(a, b, rtol=0, atol=5e-5 * float(b.abs().max()))
+        assert_close(a, b, rtol=0, atol=5e-5 * float(b.abs().max()))
     free = _bodies(kernel_device, list)[1][0]
     assert float((free.velocity - expected.velocity).abs().max()) > 0.05
     assert bool((expected.impulse.abs().amax(-1) > 1e-5).all())
@@ -119,4 +115,4 @@ def test_an_obstacle_of_a_user_runs_in_torch(kernel_device):
 
     solver, (expected, found) = _bodies(kernel_device, lambda: [Bumpy([0.1, 0.1, 0.05], 0.06)])
     assert solver.fused().solids.parts == []
-    torch.testing.assert_close(found.velocity, expected.velocity, rtol=0, atol=1e-4)
+    assert_close(found.velocity, expected.velocity, rtol=0, atol=1e-4)

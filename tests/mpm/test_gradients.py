@@ -1,24 +1,18 @@
-"""Gradients through whole substeps: every input against finite differences, and the memory of long rollouts.
-
-Covers: mpm.recompute.
-"""
+"""Gradients through whole substeps: every input against finite differences, and the memory of long rollouts."""
 
 import math
 import weakref
 
 import pytest
 import torch
+from torch.testing import assert_close
 from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils._pytree import tree_iter
 
-from gaussian_swaying.aero.force import aero_force
+from gaussian_swaying import Box, MaterialPoints, MPMSolver, PinnedRegion, aero_force
 from gaussian_swaying.geometry.patches import deform_patch
-from gaussian_swaying.geometry.regions import Box
-from gaussian_swaying.mpm.boundaries.pinned_region import PinnedRegion
 from gaussian_swaying.mpm.laws.fixed_corotated import FixedCorotated
 from gaussian_swaying.mpm.laws.neo_hookean import NeoHookean
-from gaussian_swaying.mpm.solver import MPMSolver
-from gaussian_swaying.mpm.state import MaterialPoints
 from gaussian_swaying.mpm.transfer import bspline_stencil, scatter
 
 STEPS, DT, DX, COUNT = 5, 8e-3, 0.15, 15
@@ -224,8 +218,8 @@ def test_checkpoints_find_what_is_used_late(checkpoint):
     assert not state.time.requires_grad
     # a uniform force on particles of 1 kg that are at rest: each moves by dt² for every substep that is left
     ways = [1e-6 * sum(20 - n for n in steps) for steps in (range(6), range(6, 20))]
-    torch.testing.assert_close(first.grad, torch.full((3,), 8 * ways[0], dtype=torch.float64))
-    torch.testing.assert_close(second.grad, torch.full((3,), 16 * ways[1], dtype=torch.float64))
+    assert_close(first.grad, torch.full((3,), 8 * ways[0], dtype=torch.float64))
+    assert_close(second.grad, torch.full((3,), 16 * ways[1], dtype=torch.float64))
 
 
 @pytest.mark.parametrize("setting", SETTINGS)
@@ -239,7 +233,7 @@ def test_checkpoints_leave_gradients_as_they_are(setting):
         found.append(_gradients(values, (state.position, state.F_total)) | {"end": state.position.detach()})
     plain, kept = found
     for name, gradient in plain.items():
-        torch.testing.assert_close(kept[name], gradient, rtol=1e-9, atol=1e-12 * float(gradient.abs().max()))
+        assert_close(kept[name], gradient, rtol=1e-9, atol=1e-12 * float(gradient.abs().max()))
         assert float(gradient.abs().max()) > 0, name
 
 

@@ -1,17 +1,11 @@
-"""What is given to a rollout and makes no sense is refused in one sentence, and so is an end that means nothing.
-
-Covers: _checks.
-"""
+"""What is given to a rollout and makes no sense is refused in one sentence, and so is an end that means nothing."""
 
 import math
 
 import pytest
 import torch
 
-from gaussian_swaying import _checks
-from gaussian_swaying.mpm.forces import Force
-from gaussian_swaying.mpm.solver import MPMSolver
-from gaussian_swaying.mpm.state import MaterialPoints
+from gaussian_swaying import Force, MaterialPoints, MPMSolver, _checks
 
 DX, DT = 0.1, 1e-3
 FORMULATIONS = ("total", "updated")

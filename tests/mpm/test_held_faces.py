@@ -1,22 +1,17 @@
-"""Clamps hold the face of a region: where it is, which bodies are sheets, and what a clamped solid does.
-
-Covers: mpm.held_rows.
-"""
+"""Clamps hold the face of a region: where it is, which bodies are sheets, and what a clamped solid does."""
 
 import math
 import warnings
 
 import pytest
 import torch
+from torch.testing import assert_close
 
-from gaussian_swaying.geometry.regions import Box, Everything, Region
+from gaussian_swaying import Box, MaterialPoints, MPMSolver, PinnedPoints, PinnedRegion
+from gaussian_swaying.geometry.regions import Everything, Region
 from gaussian_swaying.mpm.boundaries.handle import Handle
-from gaussian_swaying.mpm.boundaries.pinned_points import PinnedPoints
-from gaussian_swaying.mpm.boundaries.pinned_region import PinnedRegion
 from gaussian_swaying.mpm.held_faces import SOFTENED, along_face, face, thickness
 from gaussian_swaying.mpm.held_rows import MOST_ROWS
-from gaussian_swaying.mpm.solver import MPMSolver
-from gaussian_swaying.mpm.state import MaterialPoints
 
 DX = 0.1
 
@@ -54,8 +49,8 @@ def test_the_face_lies_between_held_and_free_points(turn):
     c, s = math.cos(turn), math.sin(turn)
     normal = torch.tensor([c, 0.0, s], dtype=torch.float64)
     assert len(place) == 4 * 8  # each held point of the last layer has its partner
-    torch.testing.assert_close(place @ normal, torch.full((32,), 0.2, dtype=torch.float64), rtol=0, atol=1e-12)
-    torch.testing.assert_close(across, normal.expand_as(across), rtol=0, atol=1e-12)
+    assert_close(place @ normal, torch.full((32,), 0.2, dtype=torch.float64), rtol=0, atol=1e-12)
+    assert_close(across, normal.expand_as(across), rtol=0, atol=1e-12)
 
 
 def test_what_is_far_apart_has_no_face():
@@ -69,8 +64,8 @@ def test_what_is_far_apart_has_no_face():
 def test_slopes_lie_along_the_face_or_are_all_three():
     normal = torch.tensor([[0.0, 0.6, 0.8], [0.1, 0.0, 0.0]], dtype=torch.float64)
     some, every = along_face(normal)
-    torch.testing.assert_close(some[:2] @ some[:2].T, torch.eye(2, dtype=torch.float64))
-    torch.testing.assert_close(some @ normal[0], torch.zeros(3, dtype=torch.float64), rtol=0, atol=1e-15)
+    assert_close(some[:2] @ some[:2].T, torch.eye(2, dtype=torch.float64))
+    assert_close(some @ normal[0], torch.zeros(3, dtype=torch.float64), rtol=0, atol=1e-15)
     assert bool((some[2] == 0).all())
     assert torch.equal(every, torch.eye(3, dtype=torch.float64))
 
@@ -153,12 +148,12 @@ def test_held_material_is_soft_and_takes_its_weight():
     state = solver.init_state(points)
     held = rest[:, 0] < 0.4
     mu = solver.laws.mu
-    torch.testing.assert_close(mu[held], SOFTENED * mu[~held][:1].expand(int(held.sum())))
+    assert_close(mu[held], SOFTENED * mu[~held][:1].expand(int(held.sum())))
     assert torch.equal(solver.points.youngs_modulus, points.youngs_modulus)
     after = solver.rollout(state, 1e-3, 60)
     weight = torch.tensor([0.0, 0.0, -9.8], dtype=torch.float64) * points.mass.sum()
     gained = solver.momenta(after)["linear"]
-    torch.testing.assert_close(gained, 0.06 * weight - after.impulse[0], rtol=0, atol=1e-12)
+    assert_close(gained, 0.06 * weight - after.impulse[0], rtol=0, atol=1e-12)
     assert float(after.impulse[0, 2]) < 0.5 * 0.06 * float(weight[2])  # at least what lies in the region
     assert float((after.position - rest)[rest[:, 0] < 0.05].norm(dim=-1).max()) < 1e-12
 

@@ -4,11 +4,11 @@ import math
 
 import pytest
 import torch
+from torch.testing import assert_close
 
+from gaussian_swaying import MaterialPoints, MPMSolver
 from gaussian_swaying.geometry.rotations import rotation_of
 from gaussian_swaying.mpm.joints import Joints, PointJoint, turn_between
-from gaussian_swaying.mpm.solver import MPMSolver
-from gaussian_swaying.mpm.state import MaterialPoints
 from gaussian_swaying.mpm.timestep import stable_limit
 
 DOUBLE = torch.float64
@@ -52,11 +52,11 @@ def test_springs_act_on_what_parts_and_turns(flat):
     force = joints(state)
     first, second = (force[own].sum(0) for own in sets)
     gap = torch.tensor(shift, dtype=DOUBLE)
-    torch.testing.assert_close(first, -30.0 * gap, rtol=1e-6, atol=1e-9)
-    torch.testing.assert_close(second, -first, rtol=0, atol=1e-12)
+    assert_close(first, -30.0 * gap, rtol=1e-6, atol=1e-9)
+    assert_close(second, -first, rtol=0, atol=1e-12)
     arm = state.position[sets[0]] - (AT + gap)
     torque = torch.linalg.cross(arm, force[sets[0]]).sum(0)
-    torch.testing.assert_close(torque, torch.tensor([0.0, 0.0, -2.1], dtype=DOUBLE), rtol=1e-6, atol=1e-8)
+    assert_close(torque, torch.tensor([0.0, 0.0, -2.1], dtype=DOUBLE), rtol=1e-6, atol=1e-8)
     batch = state.replace(position=state.position.expand(2, -1, -1), F_total=state.F_total.expand(2, -1, -1, -1))
     assert torch.equal(joints(batch)[1], force)
 
@@ -66,10 +66,10 @@ def test_a_joint_to_a_place_and_several_at_once():
     one, other = PointJoint(sets[0], None, [0.0, 0.0, 0.0], 5.0), PointJoint(*sets, AT.tolist(), 30.0)
     state = moved(points, sets, [[0.1, 0.2, 0.3], [0.0] * 3], [[0.1, 0.0, 0.0], [0.0, 0.3, 0.0]])
     each = [Joints(points, [joint], 1e-3)(state) for joint in (other, one)]
-    torch.testing.assert_close(Joints(points, [one, other], 1e-3)(state), sum(each), rtol=0, atol=1e-12)
+    assert_close(Joints(points, [one, other], 1e-3)(state), sum(each), rtol=0, atol=1e-12)
     anchor = AT - rotation_of(torch.tensor([0.1, 0.2, 0.3], dtype=DOUBLE)) @ AT
     anchor[0] += 0.1
-    torch.testing.assert_close(each[1][sets[0]].sum(0), -5.0 * anchor, rtol=1e-4, atol=1e-12)
+    assert_close(each[1][sets[0]].sum(0), -5.0 * anchor, rtol=1e-4, atol=1e-12)
     assert float(each[1][sets[1]].abs().max()) == 0.0
 
 
@@ -87,7 +87,7 @@ def test_momenta_stay_and_the_energy_does_not_grow():
         assert float(sum(solver.energies(state).values())) < 1.01 * energy
     after = solver.momenta(state)
     for name, value in before.items():
-        torch.testing.assert_close(after[name], value, rtol=0, atol=1e-6 * float(value.norm()))
+        assert_close(after[name], value, rtol=0, atol=1e-6 * float(value.norm()))
     gap = Joints(points, [PointJoint(*sets, AT.tolist(), 1.0)], 1e-9)(state)[sets[0]].sum(0)
     assert float(gap.norm()) < 0.02  # m
 
@@ -125,19 +125,19 @@ def test_a_joint_of_lines(turn):
     joints = Joints(points, [PointJoint(*sets, AT.tolist(), 30.0, 7.0)], 1e-6)
     state = moved(points, sets, [turn, [0.0] * 3], [[0.0] * 3] * 2)
     force = joints(state)
-    torch.testing.assert_close(force.sum(0), torch.zeros(3, dtype=DOUBLE), rtol=0, atol=1e-9)
+    assert_close(force.sum(0), torch.zeros(3, dtype=DOUBLE), rtol=0, atol=1e-9)
     for own, sign in zip(sets, (-1.0, 1.0), strict=True):
         along = torch.nn.functional.normalize(state.position[own[-1]] - state.position[own[0]], dim=0)
         torque = sign * 7.0 * torch.tensor(turn, dtype=DOUBLE)
         felt = torch.linalg.cross(state.position[own] - AT, force[own]).sum(0)
         across = torque - (torque @ along) * along
-        torch.testing.assert_close(felt, across, rtol=1e-6, atol=1e-6)  # a share of F decides the turn about it
+        assert_close(felt, across, rtol=1e-6, atol=1e-6)  # a share of F decides the turn about it
 
 
 def test_the_turn_between_two_rotations():
     turn = torch.tensor([[0.3, -1.0, 2.0], [1e-9, 0.0, 0.0], [0.0, 0.0, 0.0]], dtype=DOUBLE)
     other = rotation_of(torch.tensor([[1.0, 0.2, 0.3]], dtype=DOUBLE))
-    torch.testing.assert_close(turn_between(rotation_of(turn) @ other, other), turn, rtol=1e-12, atol=1e-15)
+    assert_close(turn_between(rotation_of(turn) @ other, other), turn, rtol=1e-12, atol=1e-15)
 
 
 def test_kernels_take_them_as_torch_does():
@@ -148,4 +148,4 @@ def test_kernels_take_them_as_torch_does():
         solver = MPMSolver(0.5, transfer=transfer)
         state = solver.rollout(solver.init_state(points, points.position.flip(-1)), 1e-3, 20, joints)
         ends.append(state.position)
-    torch.testing.assert_close(*ends, rtol=0, atol=1e-12)
+    assert_close(*ends, rtol=0, atol=1e-12)

@@ -1,9 +1,4 @@
-"""Laws: energy, stress, return maps and bounds on the stiffness of each, and closed forms of single ones.
-
-Covers: _folders, mpm.laws.fixed_corotated, mpm.laws.fluid, mpm.laws.foam, mpm.laws.hencky, mpm.laws.law,
-mpm.laws.metal, mpm.laws.neo_hookean, mpm.laws.plasticine, mpm.laws.sand, mpm.laws.shared, mpm.laws.snow,
-mpm.laws.spring_network.
-"""
+"""Laws: energy, stress, return maps and bounds on the stiffness of each, and closed forms of single ones."""
 
 import math
 import re
@@ -14,6 +9,7 @@ from pkgutil import iter_modules
 import pytest
 import torch
 from catalogue import ELASTIC, PLASTIC
+from torch.testing import assert_close
 
 from gaussian_swaying.geometry import linalg
 from gaussian_swaying.geometry.linalg import spectrum
@@ -134,7 +130,7 @@ def test_stress_is_the_derivative_of_the_energy(name):
     assert float(energy(EYE.expand_as(F)).abs().max()) < 1e-12 * E
     if name != "snow":
         mu, lam = _lame(len(F))
-        torch.testing.assert_close(LAWS[name].pk1(F, mu, lam), stress, rtol=0, atol=0)
+        assert_close(LAWS[name].pk1(F, mu, lam), stress, rtol=0, atol=0)
 
 
 @EACH
@@ -142,8 +138,8 @@ def test_objectivity_and_isotropy(name):
     F = _wide()
     Q, (energy, pk1, kirchhoff) = _rotations(len(F)), _parts(name, F)
     plain = energy(F)
-    torch.testing.assert_close(energy(Q @ F), plain, rtol=1e-9, atol=0)
-    torch.testing.assert_close(energy(F @ Q), plain, rtol=1e-9, atol=0)
+    assert_close(energy(Q @ F), plain, rtol=1e-9, atol=0)
+    assert_close(energy(F @ Q), plain, rtol=1e-9, atol=0)
     # the rotation of a nearly singular element is only known to eps over its least stretches
     _close(kirchhoff(Q @ F), Q @ kirchhoff(F) @ Q.mT, 1e-9)
     assert float(pk1(Q).abs().max()) < 1e-11 * E
@@ -157,7 +153,7 @@ def test_small_strain_is_hookes_law(name):
         mu, lam = 0 * MU, LAM + 2 / 3 * MU
     hooke = 2 * mu * strain + lam * strain[0].trace() * EYE
     # the next order of the stress is about 10 E times the square of the strain
-    torch.testing.assert_close(_parts(name, strain)[1](EYE + strain), hooke, rtol=0, atol=1e-10 * E)
+    assert_close(_parts(name, strain)[1](EYE + strain), hooke, rtol=0, atol=1e-10 * E)
 
 
 @STRESSES
@@ -181,7 +177,7 @@ def test_all_is_finite_everywhere(name, dtype, device):
     mu, lam = _lame(len(F), dtype=dtype, device=device)
     new, internal = LAWS[name].return_map(F, mu, lam, _internal(LAWS[name], F), DT)
     flown = LAWS[name].kirchhoff(new, mu, lam, internal)
-    torch.testing.assert_close(flown[0], 0 * flown[0], rtol=0, atol=90 * torch.finfo(dtype).eps * E)
+    assert_close(flown[0], 0 * flown[0], rtol=0, atol=90 * torch.finfo(dtype).eps * E)
     energy, *stresses = (part(F) for part in _parts(name, F))
     for value in (energy, *stresses, new, flown, flown.square()):
         assert value.dtype == dtype
@@ -243,13 +239,13 @@ def test_return_map_keeps_axes_and_rotation(name):
     new, internal = law.return_map(F, mu, lam, _internal(law, F), DT)
     trial, after = spectrum(F), spectrum(new)
     expected, _ = law.flow(trial.stretch, mu, lam, _internal(law, F), DT)
-    torch.testing.assert_close(trial.left.mT @ new @ trial.axes, expected.diag_embed(), rtol=0, atol=1e-13)
+    assert_close(trial.left.mT @ new @ trial.axes, expected.diag_embed(), rtol=0, atol=1e-13)
     assert float((new - F).abs().max()) > 0.01
-    torch.testing.assert_close(after.rotation, trial.rotation, rtol=0, atol=1e-12)
+    assert_close(after.rotation, trial.rotation, rtol=0, atol=1e-12)
     assert (internal is None) == (law.internal is None)
     Q = _rotations(50)
     turned, _ = law.return_map(Q @ F @ Q.mT, mu, lam, None, DT)
-    torch.testing.assert_close(turned, Q @ new @ Q.mT, rtol=0, atol=1e-11)
+    assert_close(turned, Q @ new @ Q.mT, rtol=0, atol=1e-11)
 
 
 @FLOWING
@@ -344,8 +340,8 @@ def test_moduli_of_stretches_are_those_of_the_hessian(name, nu):
     largest = torch.linalg.eigvalsh(hessian)[:, -1].maximum(2 * mu + 3 * lam)
     assert int((fastest > 1.1 * (2 * mu + lam)).sum()) > 30
     # stretches that are alike by chance: rounding over their difference, or a divided difference
-    torch.testing.assert_close(wave, fastest, rtol=1e-7, atol=0)
-    torch.testing.assert_close(bound, largest, rtol=1e-7, atol=0)
+    assert_close(wave, fastest, rtol=1e-7, atol=0)
+    assert_close(bound, largest, rtol=1e-7, atol=0)
 
 
 @EACH
@@ -355,16 +351,16 @@ def test_moduli_at_rest(name, dtype):
     expected = lam + 2 * mu if name != "fluid" else lam + 2 / 3 * mu
     # eigenvalues in closed form, and a divided difference: rounding over the cube root of eps
     tol = 1e-4 if dtype == torch.float32 else 1e-8
-    torch.testing.assert_close(wave, expected, rtol=tol, atol=0)
-    torch.testing.assert_close(bound, 3 * lam + 2 * mu, rtol=tol, atol=0)
+    assert_close(wave, expected, rtol=tol, atol=0)
+    assert_close(bound, 3 * lam + 2 * mu, rtol=tol, atol=0)
 
 
 def test_moduli_of_uniform_expansion_are_exact_for_fixed_corotated():
     """F = s I along I and e (x) e: mu |F - R|^2 gives 2 mu, lambda / 2 (J - 1)^2 gives 5 s^4 - 2 s and s^4."""
     for s in (1.05, 1.5, 3.0):
         wave, bound = ELASTIC["corotated"].moduli(s * EYE, MU, LAM)
-        torch.testing.assert_close(wave, 2 * MU + LAM * s**4)
-        torch.testing.assert_close(bound, 2 * MU + LAM * (5 * s**4 - 2 * s))
+        assert_close(wave, 2 * MU + LAM * s**4)
+        assert_close(bound, 2 * MU + LAM * (5 * s**4 - 2 * s))
 
 
 # ---- closed forms
@@ -380,7 +376,7 @@ def test_a_reflection_costs_energy_without_the_volume_term():
     F = torch.diag(torch.tensor([1.2, 1.1, -0.6], dtype=torch.float64))
     mu, lam = torch.tensor(1.0, dtype=torch.float64), torch.tensor(0.0, dtype=torch.float64)
     law = ELASTIC["corotated"]
-    torch.testing.assert_close(law.pk1(F, mu, lam), 2 * (F - EYE), rtol=0, atol=1e-9)
+    assert_close(law.pk1(F, mu, lam), 2 * (F - EYE), rtol=0, atol=1e-9)
     assert float(law.energy(F, mu, lam)) == pytest.approx(0.2**2 + 0.1**2 + 1.6**2)
 
 
@@ -388,7 +384,7 @@ def test_continued_log():
     x = torch.tensor([2.0, LOG_LIMIT, 0.0, -1.0], dtype=torch.float64)
     edge = math.log(LOG_LIMIT)
     expected = torch.tensor([math.log(2), edge, edge - 1, edge - 1 - 1 / LOG_LIMIT], dtype=torch.float64)
-    torch.testing.assert_close(continued_log(x), expected)
+    assert_close(continued_log(x), expected)
 
 
 def test_uniaxial_closed_forms():
@@ -433,16 +429,16 @@ def test_fluid_pressure():
     assert low == pytest.approx(high, rel=1e-6)
     F, law = 0.9 * EYE, PLASTIC["fluid"]
     sheared = F @ torch.tensor([[1.0, 0.7, 0], [0, 1, -0.2], [0, 0, 1]], dtype=torch.float64)
-    torch.testing.assert_close(law.energy(sheared, MU, LAM), law.energy(F, MU, LAM))
+    assert_close(law.energy(sheared, MU, LAM), law.energy(F, MU, LAM))
     stress = KINDS["Fluid"](3.0).pk1(F, MU, LAM)[0, 0]
-    torch.testing.assert_close(stress, -0.81 * fluid_pressure(torch.linalg.det(F), MU, LAM, 3))
+    assert_close(stress, -0.81 * fluid_pressure(torch.linalg.det(F), MU, LAM, 3))
 
 
 def test_fluid_forgets_shear():
     F, law = 0.98 * torch.tensor([[[1.0, 0.4, 0.0], [0, 1, 0], [0, 0, 1]]], dtype=torch.float64), PLASTIC["fluid"]
     new, _ = law.return_map(F, MU, LAM, None, DT)
-    torch.testing.assert_close(new.mT @ new, 0.98**2 * EYE[None], rtol=0, atol=1e-13)
-    torch.testing.assert_close(law.kirchhoff(new, MU, LAM), law.kirchhoff(F, MU, LAM), rtol=1e-10, atol=1e-10)
+    assert_close(new.mT @ new, 0.98**2 * EYE[None], rtol=0, atol=1e-13)
+    assert_close(law.kirchhoff(new, MU, LAM), law.kirchhoff(F, MU, LAM), rtol=1e-10, atol=1e-10)
 
 
 def test_snow_hardens_when_packed():
@@ -457,7 +453,7 @@ def test_snow_hardens_when_packed():
 def test_snow_packs_under_compression():
     law = PLASTIC["snow"]
     F, volume = law.return_map(0.95 * EYE[None], MU, LAM, None, DT)
-    torch.testing.assert_close(F[0], 0.975 * EYE, rtol=0, atol=1e-14)
+    assert_close(F[0], 0.975 * EYE, rtol=0, atol=1e-14)
     assert float(volume) == pytest.approx((0.95 / 0.975) ** 3)
     assert float(law.pk1(F, MU, LAM, volume)[0, 0, 0]) < float(law.pk1(F, MU, LAM)[0, 0, 0]) < 0
 

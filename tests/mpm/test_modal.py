@@ -5,17 +5,15 @@ import math
 import numpy as np
 import pytest
 import torch
+from torch.testing import assert_close
 
-from gaussian_swaying.geometry.regions import Box
+from gaussian_swaying import Box, MaterialPoints, MPMSolver, PinnedRegion
 from gaussian_swaying.mpm import modal
-from gaussian_swaying.mpm.boundaries.pinned_region import PinnedRegion
 from gaussian_swaying.mpm.boundaries.rigid_region import RigidRegion
 from gaussian_swaying.mpm.laws.fixed_corotated import FixedCorotated
 from gaussian_swaying.mpm.laws.hencky import StVKHencky
 from gaussian_swaying.mpm.laws.neo_hookean import NeoHookean
 from gaussian_swaying.mpm.modal import LOOSE, Structure, analysis_of
-from gaussian_swaying.mpm.solver import MPMSolver
-from gaussian_swaying.mpm.state import MaterialPoints
 
 FOOT = Box([None] * 3, [None, None, 0.1])
 
@@ -131,14 +129,14 @@ def test_a_factor_of_stiffness_or_mass_is_exact_and_needs_no_analysis(cache, mon
     assert len(list(cache.glob("modes_*.npz"))) == 1
     monkeypatch.setattr(Structure, "analyse", lambda *given: pytest.fail("it is in the cache"))
     stiffer = bound(post(E=8e5), boundaries=pin, formulation="modes").bound
-    torch.testing.assert_close(stiffer.square, 4 * first.square, rtol=1e-14, atol=0)
+    assert_close(stiffer.square, 4 * first.square, rtol=1e-14, atol=0)
     assert stiffer.first == pytest.approx(2 * first.first, rel=1e-14)
-    torch.testing.assert_close(stiffer.shape, first.shape, rtol=0, atol=0)
+    assert_close(stiffer.shape, first.shape, rtol=0, atol=0)
     for density in (100.001, 237.3):  # rounding is no other body
         bound(post(density=density), boundaries=pin, formulation="modes")
     heavier = bound(post(density=400.0), boundaries=pin, formulation="modes").bound
-    torch.testing.assert_close(heavier.square, first.square / 4, rtol=1e-14, atol=0)
-    torch.testing.assert_close(heavier.shape, first.shape / 2, rtol=1e-14, atol=0)
+    assert_close(heavier.square, first.square / 4, rtol=1e-14, atol=0)
+    assert_close(heavier.shape, first.shape / 2, rtol=1e-14, atol=0)
 
 
 def test_what_is_in_the_cache_is_the_same_to_the_bit_and_a_damaged_file_is_ignored(cache):
@@ -267,4 +265,4 @@ def test_a_batch_analyses_each_of_its_scenes():
     )  # fmt: skip
     found = bound(both, formulation="modes").bound
     alone = [bound(points, formulation="modes").bound for points in (one, other)]
-    torch.testing.assert_close(found.firsts, torch.stack([b.firsts for b in alone]), rtol=1e-12, atol=0)
+    assert_close(found.firsts, torch.stack([b.firsts for b in alone]), rtol=1e-12, atol=0)

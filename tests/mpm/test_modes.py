@@ -1,28 +1,28 @@
-"""The `modes` formulation against `total`, exact energies, and what it refuses.
-
-Covers: mpm.formulations.modes.
-"""
+"""The `modes` formulation against `total`, exact energies, and what it refuses."""
 
 import math
 
 import pytest
 import torch
 from small_scenes import plain_cloud
+from torch.testing import assert_close
 
-from gaussian_swaying.aero.force import AeroForce
-from gaussian_swaying.aero.wind import WindField
-from gaussian_swaying.aero.wind_force import WindForce
-from gaussian_swaying.geometry.regions import Box
+from gaussian_swaying import (
+    AeroForce,
+    Box,
+    Force,
+    Material,
+    MaterialPoints,
+    MPMSolver,
+    PinnedRegion,
+    WindField,
+    WindForce,
+)
 from gaussian_swaying.geometry.rotations import rotation_of
 from gaussian_swaying.mpm import modal
-from gaussian_swaying.mpm.boundaries.pinned_region import PinnedRegion
 from gaussian_swaying.mpm.damping import decay_rate
-from gaussian_swaying.mpm.forces import Force
 from gaussian_swaying.mpm.formulations.modes import LONGEST, SHORTEST, Modes, warped
 from gaussian_swaying.mpm.laws.sand import Sand
-from gaussian_swaying.mpm.solver import MPMSolver
-from gaussian_swaying.mpm.state import MaterialPoints
-from gaussian_swaying.simulation.material import Material
 
 FOOT = Box([None] * 3, [None, None, 0.1])
 POINTS = 320
@@ -107,7 +107,7 @@ def test_energy_is_constant_in_still_air():
     assert float(first) > 0
     for _ in range(10):
         state = run(solver, state, frames=10)
-        torch.testing.assert_close(energy(solver, state), first, rtol=1e-12, atol=0)
+        assert_close(energy(solver, state), first, rtol=1e-12, atol=0)
     assert float(state.work) == 0
 
 
@@ -195,8 +195,8 @@ def test_a_rigid_turn_is_exact():
     r = torch.randn(3, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
     found = warped(w, torch.linalg.cross(w, r))
     exact = (rotation_of(w) @ r[..., None])[..., 0] - r
-    torch.testing.assert_close(found, exact, rtol=1e-9, atol=1e-13)
-    torch.testing.assert_close(warped(0 * w, r), r, rtol=0, atol=0)
+    assert_close(found, exact, rtol=1e-9, atol=1e-13)
+    assert_close(warped(0 * w, r), r, rtol=0, atol=0)
 
 
 # ---- batches and gradients
@@ -219,8 +219,8 @@ def test_a_batch_is_its_scenes():
     for k in range(2):
         alone = solver_of()
         state = alone.rollout(alone.init_state(points[k]), 0.01, 40, wind(6.0))
-        torch.testing.assert_close(together.position[k], state.position, rtol=1e-9, atol=1e-12)
-        torch.testing.assert_close(together.work[k], state.work, rtol=1e-9, atol=1e-12)
+        assert_close(together.position[k], state.position, rtol=1e-9, atol=1e-12)
+        assert_close(together.work[k], state.work, rtol=1e-9, atol=1e-12)
 
 
 @pytest.mark.parametrize("name", ["flow", "E", "C_D", "density"])
@@ -289,8 +289,8 @@ def test_a_change_keeps_the_motion_continuous(make_simulation):
         state = simulation.change(state, values)
         q, p = simulation.solver.bound.amplitudes(state)
         shown = simulation.solver.bound.shown(state, q, p)
-        torch.testing.assert_close(shown.position, before.position, rtol=1e-5, atol=1e-6)
-        torch.testing.assert_close(shown.velocity, before.velocity, rtol=1e-4, atol=1e-5)
+        assert_close(shown.position, before.position, rtol=1e-5, atol=1e-6)
+        assert_close(shown.velocity, before.velocity, rtol=1e-4, atol=1e-5)
         state, _ = simulation.advance(state)
         moved = (state.position - before.position).norm(dim=-1).max()
         assert float(moved) < 0.04 * 3 * float(before.velocity.norm(dim=-1).max()) + 0.01

@@ -5,6 +5,7 @@ import math
 import pytest
 import torch
 from catalogue import ELASTIC, PLASTIC
+from torch.testing import assert_close
 
 from gaussian_swaying.geometry.linalg import from_principal, spectrum
 from gaussian_swaying.mpm.laws.fluid import fluid_flow
@@ -46,9 +47,9 @@ def test_return_maps_are_idempotent(name):
     once, internal = _map(name, trial)
     assert float((once - trial).abs().max()) > 0.01, "something should flow"
     twice, again = _map(name, once, internal)
-    torch.testing.assert_close(twice, once, rtol=0, atol=TOL)
+    assert_close(twice, once, rtol=0, atol=TOL)
     if again is not None:
-        torch.testing.assert_close(again, internal, rtol=0, atol=20 * TOL)
+        assert_close(again, internal, rtol=0, atol=20 * TOL)
 
 
 @pytest.mark.parametrize("name", ["sand", "metal", "plasticine", "foam", "snow"])
@@ -63,9 +64,9 @@ def test_states_inside_are_unchanged(name):
 def test_flow_of_solids_keeps_the_volume():
     trial = _stretches()
     for name in ("metal", "plasticine", "foam"):
-        torch.testing.assert_close(_map(name, trial)[0].prod(-1), trial.prod(-1), rtol=1e-13, atol=0)
+        assert_close(_map(name, trial)[0].prod(-1), trial.prod(-1), rtol=1e-13, atol=0)
     sheared = trial * (0.8 / trial.prod(-1, keepdim=True)) ** (1 / 3)
-    torch.testing.assert_close(_map("sand", sheared)[0].prod(-1), sheared.prod(-1), rtol=1e-13, atol=0)
+    assert_close(_map("sand", sheared)[0].prod(-1), sheared.prod(-1), rtol=1e-13, atol=0)
 
 
 def test_sand_ends_on_the_cone_or_at_its_tip():
@@ -78,7 +79,7 @@ def test_sand_ends_on_the_cone_or_at_its_tip():
     assert float((deviator - limit).max()) < 1e-12 * float(E)
     flowed = (new != trial).any(-1) & (trial.log().sum(-1) < 0)
     assert 10 < int(flowed.sum()) < 190
-    torch.testing.assert_close(deviator[flowed], limit[flowed], rtol=0, atol=1e-12 * float(E))
+    assert_close(deviator[flowed], limit[flowed], rtol=0, atol=1e-12 * float(E))
     assert bool((new[trial.log().sum(-1) > 0] == 1).all())
 
 
@@ -132,7 +133,7 @@ def test_volume_correction_conserves_the_sum():
     """log det F + v_c changes only by the deformation."""
     trial, before = _stretches(), 0.1 * torch.rand(200, dtype=torch.float64)
     new, after = drucker_prager(trial, MU.expand(200), LAM.expand(200), before, 30.0)
-    torch.testing.assert_close(new.log().sum(-1) + after, trial.log().sum(-1) + before, rtol=0, atol=TOL)
+    assert_close(new.log().sum(-1) + after, trial.log().sum(-1) + before, rtol=0, atol=TOL)
     assert float(after.min()) > -TOL
 
 
@@ -147,10 +148,10 @@ def test_metal_ends_on_its_new_yield_surface(hardening):
     assert float((deviator - radius).max()) < 1e-11 * float(E)
     flowed = after > before
     assert 10 < int(flowed.sum()) < 201
-    torch.testing.assert_close(deviator[flowed], radius[flowed], rtol=0, atol=1e-11 * float(E))
+    assert_close(deviator[flowed], radius[flowed], rtol=0, atol=1e-11 * float(E))
     # alpha grows by sqrt(2/3) of the plastic strain
     plastic = (_deviatoric(trial)[0] - deviator) / (2 * MU)
-    torch.testing.assert_close(after - before, ROOT * plastic, rtol=0, atol=1e-12)
+    assert_close(after - before, ROOT * plastic, rtol=0, atol=1e-12)
     if hardening == -500:
         at_floor = flowed & (YIELD + hardening * after < residual)
         assert 0 < int(at_floor.sum()) < int(flowed.sum()), "both branches should be met"
@@ -171,32 +172,32 @@ def test_foam_relaxes_exactly():
     trial = _stretches()
     one, _ = viscoplastic(trial, MU, LAM, None, YIELD, ETA, DT)
     half, _ = viscoplastic(trial, MU, LAM, None, YIELD, ETA, DT / 2)
-    torch.testing.assert_close(viscoplastic(half, MU, LAM, None, YIELD, ETA, DT / 2)[0], one, rtol=0, atol=TOL)
+    assert_close(viscoplastic(half, MU, LAM, None, YIELD, ETA, DT / 2)[0], one, rtol=0, atol=TOL)
     over = (_deviatoric(trial)[0] - ROOT * YIELD).clamp(min=0)
     left = (_deviatoric(one)[0] - ROOT * YIELD).clamp(min=0)
-    torch.testing.assert_close(left, over * torch.exp(-2 * MU * DT / ETA), rtol=0, atol=1e-11 * float(E))
+    assert_close(left, over * torch.exp(-2 * MU * DT / ETA), rtol=0, atol=1e-11 * float(E))
     slow, _ = viscoplastic(trial, MU, LAM, None, YIELD, 1e12, DT)
-    torch.testing.assert_close(slow, trial, rtol=0, atol=1e-10)
+    assert_close(slow, trial, rtol=0, atol=1e-10)
     fast, _ = viscoplastic(trial, MU, LAM, None, YIELD, 1e-6, DT)
-    torch.testing.assert_close(fast, viscoplastic(trial, MU, LAM, None, YIELD, 0.0, DT)[0], rtol=0, atol=TOL)
+    assert_close(fast, viscoplastic(trial, MU, LAM, None, YIELD, 0.0, DT)[0], rtol=0, atol=TOL)
 
 
 def test_snow_moves_volume_to_its_plastic_part():
     trial = torch.tensor([[1.0, 1.0, 0.9], [1.1, 1.0, 1.0], [0.99, 1.0, 1.005]], dtype=torch.float64)
     new, volume = snow_plasticity(trial, MU, LAM, torch.ones(3, dtype=torch.float64), 0.025, 0.0075)
     expected = torch.tensor([[1.0, 1.0, 0.975], [1.0075, 1.0, 1.0], [0.99, 1.0, 1.005]], dtype=torch.float64)
-    torch.testing.assert_close(new, expected)
-    torch.testing.assert_close(volume, torch.tensor([0.9 / 0.975, 1.1 / 1.0075, 1.0], dtype=torch.float64))
-    torch.testing.assert_close(volume * new.prod(-1), trial.prod(-1), rtol=1e-14, atol=0)
+    assert_close(new, expected)
+    assert_close(volume, torch.tensor([0.9 / 0.975, 1.1 / 1.0075, 1.0], dtype=torch.float64))
+    assert_close(volume * new.prod(-1), trial.prod(-1), rtol=1e-14, atol=0)
 
 
 def test_fluid_keeps_only_the_volume():
     trial = _stretches()
     new, _ = fluid_flow(trial, MU, LAM, None)
-    torch.testing.assert_close(new.prod(-1), trial.prod(-1), rtol=1e-13, atol=0)
+    assert_close(new.prod(-1), trial.prod(-1), rtol=1e-13, atol=0)
     assert bool((new == new[:, :1]).all())
     crushed, _ = fluid_flow(torch.tensor([1.0, 0.5, -0.5], dtype=torch.float64), MU, LAM, None)
-    torch.testing.assert_close(crushed.prod(), torch.tensor(0.05, dtype=torch.float64))
+    assert_close(crushed.prod(), torch.tensor(0.05, dtype=torch.float64))
 
 
 @pytest.mark.parametrize("name", PLASTIC)

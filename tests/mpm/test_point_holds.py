@@ -6,17 +6,24 @@ from itertools import pairwise
 
 import pytest
 import torch
+from torch.testing import assert_close
 
-from gaussian_swaying.geometry.frame import SimFrame
-from gaussian_swaying.geometry.regions import Box, Everything, Region
+from gaussian_swaying import (
+    Box,
+    MaterialPoints,
+    MPMSolver,
+    MPMState,
+    PinnedPoints,
+    PinnedRegion,
+    SimFrame,
+    support_force,
+)
+from gaussian_swaying.geometry.regions import Everything, Region
 from gaussian_swaying.mpm import held_rows, point_holds
 from gaussian_swaying.mpm.boundaries.handle import Handle
-from gaussian_swaying.mpm.boundaries.pinned_points import PinnedPoints
-from gaussian_swaying.mpm.boundaries.pinned_region import PinnedRegion
 from gaussian_swaying.mpm.boundaries.plane import Plane
 from gaussian_swaying.mpm.boundaries.sequential_release import SequentialRelease
-from gaussian_swaying.mpm.solver import MPMSolver
-from gaussian_swaying.mpm.state import GridSpec, MaterialPoints, MPMState, support_force
+from gaussian_swaying.mpm.state import GridSpec
 from gaussian_swaying.mpm.transfer import bspline_stencil, gather
 
 DX, STEP = 0.1, 0.045
@@ -121,7 +128,7 @@ def test_a_strip_across_the_border_of_cells_is_still_a_line(shift):
     solver.init_state(points)
     places = _own_places(solver.bound.point_holds)
     expected = torch.tensor([shift, shift - STEP], dtype=torch.float64).expand(len(places), 2)
-    torch.testing.assert_close(places[:, 1:], expected, rtol=0, atol=1e-12)
+    assert_close(places[:, 1:], expected, rtol=0, atol=1e-12)
     assert 8 <= len(places) <= 10
 
 
@@ -164,10 +171,10 @@ def test_groups_are_joined_until_they_are_apart():
     assert held_rows.groups(position[:0], mass[:0], cell[:0], 0.3).tolist() == []
     heavy = torch.tensor([1.0, 1, 1, 1, 3, 1], dtype=torch.float64)
     found = held_rows.means(position, heavy, torch.tensor([0, 0, 0, 1, 1, 2]))
-    torch.testing.assert_close(found[:, 0], torch.tensor([0.14, 0.975, 2.0], dtype=torch.float64))
+    assert_close(found[:, 0], torch.tensor([0.14, 0.975, 2.0], dtype=torch.float64))
 
 
-@pytest.mark.slow(twin="test_a_known_answer_on_a_coarse_grid")
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["hinge", "clamp", "nodes"])
 def test_a_hinge_turns_and_a_clamp_does_not(kind):
     """A side load of the weight: a hinged sheet hangs at 45 degrees."""
@@ -209,7 +216,7 @@ def test_a_place_just_outside_extends_the_nearest_cell(shift):
     seen = (holds.weight[0, 0, 0, :, None] * torch.where(massive[:, None], field, 1e6)[holds.node[0, 0, 0]]).sum(0)
     used = holds.weight[0, 0, 0] != 0
     assert bool(massive[holds.node[0, 0, 0][used]].all())
-    torch.testing.assert_close(seen, torch.tensor([0.2, 0.0, shift * DX], dtype=torch.float64), rtol=0, atol=1e-13)
+    assert_close(seen, torch.tensor([0.2, 0.0, shift * DX], dtype=torch.float64), rtol=0, atol=1e-13)
 
 
 def test_places_are_converted_from_scene_units():
@@ -220,7 +227,7 @@ def test_places_are_converted_from_scene_units():
     solver = MPMSolver(DX, boundaries=[PinnedPoints(at)])
     solver.init_state(points, frame=frame)
     expected = frame.point_to_sim(torch.tensor(at, dtype=torch.float64))
-    torch.testing.assert_close(_own_places(solver.bound.point_holds), expected, rtol=0, atol=1e-13)
+    assert_close(_own_places(solver.bound.point_holds), expected, rtol=0, atol=1e-13)
 
 
 # ---- which rows are kept
@@ -319,7 +326,7 @@ def test_a_handle_moves_its_points_exactly(kind):
         centre = torch.tensor(pivot, dtype=torch.float64)
         wanted = centre + time * torch.tensor(velocity, dtype=torch.float64) + (rest - centre) @ turn.T
         rows = _read(solver, rest, state.node_displacement, state)
-        torch.testing.assert_close(rest + rows[:, 0], wanted, rtol=0, atol=1e-11)
+        assert_close(rest + rows[:, 0], wanted, rtol=0, atol=1e-11)
         F = rows[:, 1:].mT + torch.eye(3, dtype=torch.float64)
         # the slope along the line of points is theirs up to the bending of the line between them, and that across the
         # face is free; the section turns as the handle does
@@ -336,7 +343,7 @@ def test_of_two_boundaries_at_the_same_place_the_last_one_counts():
         solver = MPMSolver(DX, boundaries=boundaries)
         state = _run(solver, points, 2)[-1]
         found = _read(solver, _own_places(solver.bound.point_holds), state.node_velocity, state)[:, 0]
-        torch.testing.assert_close(found, torch.tensor([[0.0, speed, 0.0]], dtype=torch.float64).expand_as(found))
+        assert_close(found, torch.tensor([[0.0, speed, 0.0]], dtype=torch.float64).expand_as(found))
 
 
 def test_a_pin_that_opens_lets_go():
@@ -391,7 +398,7 @@ def test_points_are_released_one_by_one():
     assert len(set(when.tolist())) == len(torch.unique(torch.floor(rest[:, 0] / DX - 0.5)))
     held = TOP.contains(points.position)
     low, high = points.position[held, 0].min(), points.position[held, 0].max()
-    torch.testing.assert_close(when, 0.02 + 0.1 * (rest[:, 0] - low) / (high - low), rtol=1e-12, atol=0)
+    assert_close(when, 0.02 + 0.1 * (rest[:, 0] - low) / (high - low), rtol=1e-12, atol=0)
     for state in states[1:]:
         time = float(state.time) - dt
         moved = _read(solver, rest, state.node_displacement, state)[:, 0].norm(dim=-1)
@@ -435,12 +442,12 @@ def test_supports_take_the_momentum_of_the_forces(formulation):
     for a, b in pairwise(states):
         gained = solver.momenta(b)["linear"] - solver.momenta(a)["linear"]
         taken = (b.impulse - a.impulse).sum(-2)
-        torch.testing.assert_close(gained, weight * 1e-3 - taken, rtol=0, atol=1e-14)
+        assert_close(gained, weight * 1e-3 - taken, rtol=0, atol=1e-14)
     assert states[-1].impulse.dtype == torch.float64
     assert float(states[-1].impulse[0, 2]) < 0
 
 
-@pytest.mark.slow(twin="test_held_points_stay_where_they_are")
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["hinge", "clamp", "nodes"])
 def test_two_pins_carry_weight_and_wind_at_rest(kind):
     points = _sheet(width=12, shift=(0.03, 0, 0))  # symmetric on the grid
@@ -454,8 +461,8 @@ def test_two_pins_carry_weight_and_wind_at_rest(kind):
     found, weight = support_force(state, later), 9.8 * float(points.mass.sum())
     assert found.shape == (2, 3)
     expected = torch.tensor([0.0, 0.3 * weight, -weight], dtype=torch.float64)
-    torch.testing.assert_close(found.sum(0), expected, rtol=0, atol=0.01 * weight)
-    torch.testing.assert_close(found[0, 1:], found[1, 1:], rtol=0, atol=0.01 * weight)
+    assert_close(found.sum(0), expected, rtol=0, atol=0.01 * weight)
+    assert_close(found[0, 1:], found[1, 1:], rtol=0, atol=0.01 * weight)
     assert float(found[0, 0]) == pytest.approx(-float(found[1, 0]), abs=0.01 * weight)
     assert torch.equal(support_force(state, state), torch.zeros(2, 3, dtype=torch.float64))
 
@@ -500,7 +507,7 @@ def test_gradients_pass_through_checkpoints():
         solver = MPMSolver(DX, boundaries=[Handle(TOP, [0.1, 0, 0], [0, 0, 1.0])])
         end = solver.rollout(solver.init_state(points, velocity), 1e-3, 6, checkpoint=checkpoint)
         found.append(torch.autograd.grad(end.position.square().sum(), velocity)[0])
-    torch.testing.assert_close(found[1], found[0], rtol=1e-12, atol=1e-18)
+    assert_close(found[1], found[0], rtol=1e-12, atol=1e-18)
     assert float(found[0].abs().max()) > 0
 
 
@@ -515,8 +522,8 @@ def test_scenes_of_a_batch_are_independent():
         state = solver.init_state(points)
         ends.append(solver.rollout(state, 1e-3, 60))
     for k in range(2):
-        torch.testing.assert_close(ends[2].position[k], ends[k].position, rtol=0, atol=1e-13)
-        torch.testing.assert_close(ends[2].impulse[k], ends[k].impulse, rtol=0, atol=1e-15)
+        assert_close(ends[2].position[k], ends[k].position, rtol=0, atol=1e-13)
+        assert_close(ends[2].impulse[k], ends[k].impulse, rtol=0, atol=1e-15)
     assert ends[2].impulse.shape == (2, 2, 3)
 
 
@@ -557,7 +564,7 @@ def test_a_subclass_with_its_own_forward_acts_on_nodes():
     assert solver.bound.kinds == ("nodes", "hinge")
     places = _own_places(solver.bound.point_holds)
     speed = _read(solver, places, state.node_velocity, state)[:, 0]
-    torch.testing.assert_close(speed, torch.ones_like(speed), rtol=0, atol=1e-13)
+    assert_close(speed, torch.ones_like(speed), rtol=0, atol=1e-13)
 
 
 @pytest.mark.parametrize("kind", [PinnedRegion, Handle, SequentialRelease])

@@ -1,24 +1,19 @@
-"""Sheets of one layer that bend by an energy of their own.
-
-Covers: mpm.triton.sheets.
-"""
+"""Sheets of one layer that bend by an energy of their own."""
 
 import dataclasses
 
 import pytest
 import torch
+from torch.testing import assert_close
 
+from gaussian_swaying import Box, MaterialPoints, MPMSolver, PinnedRegion
 from gaussian_swaying.geometry.linalg import polar_rotation
-from gaussian_swaying.geometry.regions import Box
-from gaussian_swaying.mpm.boundaries.pinned_region import PinnedRegion
 from gaussian_swaying.mpm.laws.fixed_corotated import FixedCorotated
 from gaussian_swaying.mpm.laws.hencky import StVKHencky
 from gaussian_swaying.mpm.laws.neo_hookean import NeoHookean
 from gaussian_swaying.mpm.laws.shared import lame_parameters
 from gaussian_swaying.mpm.laws.spring_network import SpringNetwork
 from gaussian_swaying.mpm.sheets import bending_of, director_energy, flattened, sheet_pk1
-from gaussian_swaying.mpm.solver import MPMSolver
-from gaussian_swaying.mpm.state import MaterialPoints
 
 NU = 0.3
 
@@ -79,7 +74,7 @@ def test_a_softened_point_bends_as_much_more_easily():
     moved = torch.randn(form.node_positions(points.position).shape, generator=torch.Generator().manual_seed(0)).double()
     share = torch.full((len(points.position),), 0.25, dtype=torch.float64)
     soft = bending_of(points, form.stencil, 1.0, share)
-    torch.testing.assert_close(soft.forces(moved), 0.25 * form.bending.forces(moved))
+    assert_close(soft.forces(moved), 0.25 * form.bending.forces(moved))
 
 
 def test_motion_without_curvature_has_no_force():
@@ -100,7 +95,7 @@ def test_forces_are_those_of_the_energy_and_keep_both_momenta():
     moved = torch.randn(nodes.shape, generator=generator, dtype=torch.float64).requires_grad_()
     (slope,) = torch.autograd.grad(form.bending.energy(moved) * 1.0, moved)
     force = form.bending.forces(moved.detach())
-    torch.testing.assert_close(force, -slope, rtol=1e-10, atol=1e-10)
+    assert_close(force, -slope, rtol=1e-10, atol=1e-10)
     assert float(force.sum(0).abs().max()) < 1e-10 * float(force.abs().sum())
     torque = torch.linalg.cross(nodes + moved.detach(), force).sum(0)
     assert float(torque.abs().max()) < 1e-10 * float(force.abs().sum())
@@ -150,7 +145,7 @@ def test_few_rows_make_the_matrix_of_a_cell(seed):
     """Those of four or five points, three for each; a level sheet has the same shapes in all of them."""
     bending = bound(sheet(turned(seed)))[0].bound.bending
     rows = bending.rows()
-    torch.testing.assert_close(rows.mT @ rows, bending.stiffness, rtol=1e-9, atol=1e-12)
+    assert_close(rows.mT @ rows, bending.stiffness, rtol=1e-9, atol=1e-12)
     assert rows.shape[1] <= 27
 
 
@@ -195,7 +190,7 @@ def test_kernels_do_what_torch_does(kernel_device, how, dtype):
     # forty sums of some hundred terms, of fields of the order of one; rows of a matrix are off by 27 eps
     atol = 2e-4 if dtype == torch.float32 else 1e-10
     for name in ("position", "velocity", "F_elastic"):
-        torch.testing.assert_close(*(getattr(end, name) for end in ends), rtol=0, atol=atol)
+        assert_close(*(getattr(end, name) for end in ends), rtol=0, atol=atol)
 
 
 def test_gradients_by_stiffness_and_motion_come_from_torch():
@@ -242,7 +237,7 @@ def test_the_stress_of_a_sheet_is_the_slope_of_its_energy(law):
     energy = law.energy(flattened(F, normal, mu, lam).F, mu, lam) + director_energy(F, normal, mu)
     (slope,) = torch.autograd.grad(energy.sum(), F)
     stress = sheet_pk1(F.detach(), normal, mu, lam, lambda own: law.pk1(own, mu, lam))
-    torch.testing.assert_close(stress, slope, rtol=1e-8, atol=1e-8)
+    assert_close(stress, slope, rtol=1e-8, atol=1e-8)
 
 
 def test_a_sheet_is_stretched_as_in_plane_stress():

@@ -1,17 +1,13 @@
-"""Whole steps of both formulations against exact solutions.
-
-Covers: mpm.state.
-"""
+"""Whole steps of both formulations against exact solutions."""
 
 import dataclasses
 
 import pytest
 import torch
+from torch.testing import assert_close
 
-from gaussian_swaying.geometry.regions import Box
-from gaussian_swaying.mpm.boundaries.pinned_region import PinnedRegion
-from gaussian_swaying.mpm.solver import MPMSolver
-from gaussian_swaying.mpm.state import GridSpec, MaterialPoints, MPMState
+from gaussian_swaying import Box, MaterialPoints, MPMSolver, MPMState, PinnedRegion
+from gaussian_swaying.mpm.state import GridSpec
 
 FORMULATIONS = ["total", "updated"]
 
@@ -45,7 +41,7 @@ def test_free_fall_follows_the_symplectic_sum(formulation, device, dtype):
     # round-off: each of the steps may err by a few ulp of the largest coordinate
     tol = 4 * steps * torch.finfo(dtype).eps
     expected = points.position + torch.tensor([0.0, 0.0, fall], dtype=dtype, device=device)
-    torch.testing.assert_close(state.position, expected, rtol=0, atol=tol)
+    assert_close(state.position, expected, rtol=0, atol=tol)
     assert float((state.F_elastic - torch.eye(3, dtype=dtype, device=device)).abs().max()) < 10 * tol / 0.1
     assert float(state.time) == pytest.approx(steps * dt)
 
@@ -82,7 +78,7 @@ def test_free_body_conserves_both_momenta(formulation):
     before = momenta(state)
     after = momenta(solver.rollout(state, 1e-3, 200))
     for a, b in zip(before, after, strict=True):
-        torch.testing.assert_close(a, b, rtol=1e-12, atol=1e-12 * float(before[0].norm() + before[1].norm()))
+        assert_close(a, b, rtol=1e-12, atol=1e-12 * float(before[0].norm() + before[1].norm()))
 
 
 @pytest.mark.parametrize("formulation", FORMULATIONS)
@@ -98,8 +94,8 @@ def test_uniform_strain_gives_uniform_motion(formulation):
         state = state.replace(node_velocity=state.grid.node_positions(points.position) @ a.T)
     end = solver.step(state, 1e-3)
     expected = torch.eye(3, dtype=torch.float64) + 1e-3 * a
-    torch.testing.assert_close(end.F_elastic, expected.expand_as(end.F_elastic), rtol=0, atol=1e-12)
-    torch.testing.assert_close(end.position, points.position @ expected.T, rtol=0, atol=1e-12)
+    assert_close(end.F_elastic, expected.expand_as(end.F_elastic), rtol=0, atol=1e-12)
+    assert_close(end.position, points.position @ expected.T, rtol=0, atol=1e-12)
 
 
 @pytest.mark.parametrize("formulation", FORMULATIONS)
@@ -109,7 +105,7 @@ def test_external_force_moves_the_centre_of_mass(formulation):
     force = torch.rand(200, 3, dtype=torch.float64) * 1e-2
     state = solver.rollout(solver.init_state(points), 1e-3, 20, lambda _: force)
     momentum = (points.mass[:, None] * state.velocity).sum(0)
-    torch.testing.assert_close(momentum, force.sum(0) * 0.02, rtol=1e-10, atol=0)
+    assert_close(momentum, force.sum(0) * 0.02, rtol=1e-10, atol=0)
 
 
 @pytest.mark.parametrize("formulation", FORMULATIONS)
@@ -119,7 +115,7 @@ def test_damping_is_a_rate_and_not_per_substep(formulation):
     velocity = torch.ones(200, 3, dtype=torch.float64)
     for steps in (10, 40):
         end = solver.rollout(solver.init_state(points, velocity), 0.1 / steps, steps)
-        torch.testing.assert_close(end.velocity, velocity * torch.exp(torch.tensor(-0.3, dtype=torch.float64)))
+        assert_close(end.velocity, velocity * torch.exp(torch.tensor(-0.3, dtype=torch.float64)))
 
 
 @pytest.mark.parametrize("formulation", FORMULATIONS)
@@ -139,8 +135,8 @@ def test_batch_equals_scenes_alone(formulation, device):
             alone = MPMSolver(dx=0.1, formulation=formulation, boundaries=pin)
             single = alone.init_state(points.map(lambda t, i=i, j=j: t[i, j]))
             end = alone.rollout(single, 1e-3, 10, lambda _, i=i, j=j: force[i, j])
-            torch.testing.assert_close(state.position[i, j], end.position, rtol=0, atol=1e-12)
-            torch.testing.assert_close(state.F_total[i, j], end.F_total, rtol=0, atol=1e-12)
+            assert_close(state.position[i, j], end.position, rtol=0, atol=1e-12)
+            assert_close(state.F_total[i, j], end.F_total, rtol=0, atol=1e-12)
 
 
 @pytest.mark.parametrize("formulation", FORMULATIONS)
@@ -157,7 +153,7 @@ def test_each_particle_has_its_own_material(formulation):
     together = MPMSolver(dx=0.1, formulation=formulation)
     velocity = torch.cat([0.5 * (part.position - part.position.mean(0)) for part in parts])
     end = together.rollout(together.init_state(MaterialPoints.join(parts), velocity), 5e-4, 40)
-    torch.testing.assert_close(end.F_elastic, torch.cat(ends), rtol=0, atol=1e-11)
+    assert_close(end.F_elastic, torch.cat(ends), rtol=0, atol=1e-11)
     assert float((ends[0] - ends[1]).abs().max()) > 1e-4
 
 
@@ -233,7 +229,7 @@ def test_grid_follows_the_object_without_changing_the_motion():
         fixed = solver.rollout(fixed, 2e-3, 20)
     assert following.grid != fixed.grid
     assert following.grid.node_count < 0.1 * fixed.grid.node_count
-    torch.testing.assert_close(following.position, fixed.position, rtol=0, atol=1e-13)
+    assert_close(following.position, fixed.position, rtol=0, atol=1e-13)
     assert not bool(following.lost.any())
 
 
@@ -328,7 +324,7 @@ def _watch(solver, tolerance):
         state = solver.rollout(state, 2e-4, 16)
         seen.append(float(solver.cfl_number(state, 2e-4)))
     end, largest = solver.watched_rollout(start, 2e-4, 160, looks=10)
-    torch.testing.assert_close(end.position, state.position, rtol=0, atol=tolerance)
+    assert_close(end.position, state.position, rtol=0, atol=tolerance)
     assert float(largest) == pytest.approx(max(seen), rel=tolerance, abs=0)
     assert max(seen) > 1.02 * max(seen[0], seen[-1])
 
@@ -343,7 +339,7 @@ def test_work_is_what_the_force_adds_to_the_energy(formulation):
     state = solver.rollout(solver.init_state(points), 1e-3, 20, lambda state: force)
     assert state.work.shape == (2,)
     assert state.work.dtype == torch.float64
-    torch.testing.assert_close(state.work, solver.energies(state)["kinetic"], rtol=1e-9, atol=0)
+    assert_close(state.work, solver.energies(state)["kinetic"], rtol=1e-9, atol=0)
 
 
 def test_particle_that_outruns_its_grid_is_marked_lost():

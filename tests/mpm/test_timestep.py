@@ -5,8 +5,7 @@ import math
 import pytest
 import torch
 
-from gaussian_swaying.mpm.solver import MPMSolver
-from gaussian_swaying.mpm.state import MaterialPoints
+from gaussian_swaying import MaterialPoints, MPMSolver
 from gaussian_swaying.mpm.timestep import stable_limit, substeps_per_frame, wave_speed
 from gaussian_swaying.mpm.transfer import bspline_stencil
 

@@ -5,10 +5,11 @@ import sys
 
 import pytest
 import torch
+from torch.testing import assert_close
 from torch.utils._python_dispatch import TorchDispatchMode
 
-from gaussian_swaying.mpm.solver import MPMSolver
-from gaussian_swaying.mpm.state import GridSpec, MaterialPoints, bounding_grid
+from gaussian_swaying import MaterialPoints, MPMSolver
+from gaussian_swaying.mpm.state import GridSpec, bounding_grid
 from gaussian_swaying.mpm.transfer import bspline_stencil, g2p, gather, scatter, scatter_momentum
 
 DX = 0.1
@@ -43,8 +44,8 @@ def test_p2g_conserves_mass_and_both_momenta(device, dtype, batch):
     grid_mass, momentum = p2g(mass, velocity, affine, bspline_stencil(position, GRID))
     assert grid_mass.shape == (*batch, GRID.node_count)
     tol = 1e3 * torch.finfo(dtype).eps
-    torch.testing.assert_close(grid_mass.sum(-1), mass.sum(-1), rtol=tol, atol=tol)
-    torch.testing.assert_close(momentum.sum(-2), (mass[..., None] * velocity).sum(-2), rtol=tol, atol=tol)
+    assert_close(grid_mass.sum(-1), mass.sum(-1), rtol=tol, atol=tol)
+    assert_close(momentum.sum(-2), (mass[..., None] * velocity).sum(-2), rtol=tol, atol=tol)
     spin = mass[..., None, None] * affine * DX**2 / 4
     spin = torch.stack(
         [
@@ -55,7 +56,7 @@ def test_p2g_conserves_mass_and_both_momenta(device, dtype, batch):
         dim=-1,
     ).sum(-2)
     expected = _moment(position, mass[..., None] * velocity) + spin
-    torch.testing.assert_close(_moment(GRID.node_positions(position), momentum), expected, rtol=tol, atol=tol)
+    assert_close(_moment(GRID.node_positions(position), momentum), expected, rtol=tol, atol=tol)
 
 
 def test_round_trip_reproduces_affine_field(device, dtype):
@@ -67,9 +68,9 @@ def test_round_trip_reproduces_affine_field(device, dtype):
     grid_mass, momentum = p2g(mass, expected, a.expand_as(affine), stencil)
     velocity, affine, gradient = g2p(momentum / grid_mass.clamp_min(1e-12)[:, None], stencil, DX)
     tol = 1e3 * torch.finfo(dtype).eps
-    torch.testing.assert_close(velocity, expected, rtol=tol, atol=tol)
-    torch.testing.assert_close(affine, a.expand_as(affine), rtol=tol, atol=10 * tol)
-    torch.testing.assert_close(gradient, a.expand_as(affine), rtol=tol, atol=10 * tol)
+    assert_close(velocity, expected, rtol=tol, atol=tol)
+    assert_close(affine, a.expand_as(affine), rtol=tol, atol=10 * tol)
+    assert_close(gradient, a.expand_as(affine), rtol=tol, atol=10 * tol)
 
 
 def test_basis_identities():
@@ -79,11 +80,11 @@ def test_basis_identities():
     total = stencil.basis.sum(-1)
     expected = torch.zeros_like(total)
     expected[:, 0] = 1
-    torch.testing.assert_close(total, expected, rtol=0, atol=1e-12)
+    assert_close(total, expected, rtol=0, atol=1e-12)
     offset = GRID.node_positions(position)[stencil.node].reshape(-1, 27, 3) - position[:, None]
     second = torch.einsum("pi,pia,pib->pab", stencil.basis[:, 0], offset, offset)
-    torch.testing.assert_close(second, (DX**2 / 4 * torch.eye(3, dtype=torch.float64)).expand_as(second))
-    torch.testing.assert_close(stencil.basis[:, 4:], (stencil.basis[:, :1] * offset.mT))
+    assert_close(second, (DX**2 / 4 * torch.eye(3, dtype=torch.float64)).expand_as(second))
+    assert_close(stencil.basis[:, 4:], (stencil.basis[:, :1] * offset.mT))
 
 
 def test_gather_is_the_adjoint_of_scatter(device):
@@ -92,7 +93,7 @@ def test_gather_is_the_adjoint_of_scatter(device):
     coefficients = torch.rand(64, 7, 2, dtype=torch.float64, device=device)
     field = torch.rand(GRID.node_count, 2, dtype=torch.float64, device=device)
     left = (scatter(stencil, coefficients) * field).sum()
-    torch.testing.assert_close(left, (gather(field, stencil) * coefficients).sum())
+    assert_close(left, (gather(field, stencil) * coefficients).sum())
 
 
 def test_gradient_rows_match_autograd():
@@ -100,7 +101,7 @@ def test_gradient_rows_match_autograd():
     field = torch.rand(GRID.node_count, 1, dtype=torch.float64)
     rows = gather(field, bspline_stencil(position, GRID))
     (gradient,) = torch.autograd.grad(rows[:, 0].sum(), position)
-    torch.testing.assert_close(rows[:, 1:4, 0], gradient)
+    assert_close(rows[:, 1:4, 0], gradient)
 
 
 def test_moved_grid_gives_the_same_weights():
@@ -115,8 +116,8 @@ def test_batch_scenes_do_not_touch():
     together = p2g(mass, velocity, affine, bspline_stencil(position, GRID))
     for b in range(3):
         alone = p2g(mass[b], velocity[b], affine[b], bspline_stencil(position[b], GRID))
-        torch.testing.assert_close(together[0][b], alone[0], rtol=0, atol=1e-14)
-        torch.testing.assert_close(together[1][b], alone[1], rtol=0, atol=1e-14)
+        assert_close(together[0][b], alone[0], rtol=0, atol=1e-14)
+        assert_close(together[1][b], alone[1], rtol=0, atol=1e-14)
 
 
 @pytest.mark.parametrize("outside", [[-0.2, 0.5, 0.5], [0.5, 0.5, 1.2], [0.5, 0.96, 0.5], [1e9, 0.5, 0.5]])
@@ -126,7 +127,7 @@ def test_particle_outside_is_reported_and_never_wrapped(device, outside):
     stencil = bspline_stencil(position, GRID)
     assert stencil.inside.tolist() == [False, True]
     mass, _ = p2g(torch.tensor([5.0, 1.0], device=device), position * 0, torch.zeros(2, 3, 3, device=device), stencil)
-    torch.testing.assert_close(mass.sum(), torch.tensor(1.0, device=device))
+    assert_close(mass.sum(), torch.tensor(1.0, device=device))
 
 
 def test_snap_leaves_no_vanishing_weight():
@@ -134,7 +135,7 @@ def test_snap_leaves_no_vanishing_weight():
     position = torch.tensor([[0.45, 0.5, 0.5 + 1e-9], [0.45 + 1e-9, 0.35 - 1e-9, 0.5]], dtype=torch.float64)
     weights = bspline_stencil(position, GRID, snap=1e-6).basis[:, 0]
     assert not bool(((weights > 0) & (weights < 1e-12)).any())
-    torch.testing.assert_close(weights.sum(-1), torch.ones(2, dtype=torch.float64))
+    assert_close(weights.sum(-1), torch.ones(2, dtype=torch.float64))
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
@@ -173,7 +174,7 @@ def test_what_is_not_finite_or_far_away_indexes_nothing_and_weighs_nothing(devic
     assert int(stencil.factors[..., :12].count_nonzero()) == 0
     coefficients = torch.rand(32, stencil.rows, 2, dtype=dtype, device=device)
     expected = scatter(bspline_stencil(good, grid, moments), coefficients[12:])
-    torch.testing.assert_close(scatter(stencil, coefficients), expected)
+    assert_close(scatter(stencil, coefficients), expected)
     assert int(gather(expected, stencil)[:12].count_nonzero()) == 0
 
 
@@ -208,12 +209,12 @@ def test_deterministic_sums_equal_the_plain_ones(device, dtype, batch):
     tol = 50 * torch.finfo(dtype).eps
     for a, b in zip(p2g(mass, velocity, affine, plain), p2g(mass, velocity, affine, fixed), strict=True):
         assert a.shape == b.shape
-        torch.testing.assert_close(b, a, rtol=tol, atol=tol)
+        assert_close(b, a, rtol=tol, atol=tol)
     empty = p2g(mass, velocity, affine, fixed)[0] == 0
     assert bool(empty.any())
     assert not bool(empty.all())
     coefficients = torch.rand(*batch, 200, 4, 5, device=device, dtype=dtype)
-    torch.testing.assert_close(scatter(fixed, coefficients), scatter(plain, coefficients), rtol=tol, atol=100 * tol)
+    assert_close(scatter(fixed, coefficients), scatter(plain, coefficients), rtol=tol, atol=100 * tol)
 
 
 def test_deterministic_sums_have_the_same_bits_every_time(device):
@@ -253,7 +254,7 @@ def test_deterministic_scatter_gradcheck(device):
     plain = torch.autograd.grad(p2g(*inputs[1:], bspline_stencil(inputs[0], GRID))[1].square().sum(), inputs)
     fixed = torch.autograd.grad(run(*inputs)[1].square().sum(), inputs)
     for a, b in zip(plain, fixed, strict=True):
-        torch.testing.assert_close(a, b, rtol=1e-12, atol=1e-12)
+        assert_close(a, b, rtol=1e-12, atol=1e-12)
 
 
 @pytest.mark.parametrize("formulation", ["total", "updated"])
@@ -267,7 +268,7 @@ def test_deterministic_runs_have_the_same_bits(formulation, device):
         ends.append(solver.rollout(solver.init_state(points, velocity), 5e-4, 20))
     for name in ("position", "velocity", "F_total", "affine"):
         assert torch.equal(getattr(ends[0], name), getattr(ends[1], name))
-    torch.testing.assert_close(ends[0].position, ends[2].position, rtol=0, atol=1e-5)
+    assert_close(ends[0].position, ends[2].position, rtol=0, atol=1e-5)
 
 
 # ---- stencils that are used many times
@@ -295,7 +296,7 @@ def test_sparse_products_equal_the_plain_sums(dtype, batch):
             second = torch.autograd.grad(sum(g.square().sum() for g in first), [coefficients, field])
             found.append([sums, values, *first, *second])
         for a, b in zip(*found, strict=True):
-            torch.testing.assert_close(b, a, rtol=tol, atol=tol * max(1.0, float(a.detach().abs().max())))
+            assert_close(b, a, rtol=tol, atol=tol * max(1.0, float(a.detach().abs().max())))
 
 
 def test_no_sparse_products_where_the_weights_have_a_gradient():
@@ -348,8 +349,8 @@ def test_stencil_without_gradients_keeps_value_and_moments(device, dtype):
     v, c, gradient = g2p(field, small, DX)
     reference = g2p(field, whole, DX)
     tol = 100 * torch.finfo(dtype).eps
-    torch.testing.assert_close(v, reference[0], rtol=tol, atol=tol)
-    torch.testing.assert_close(c, reference[1], rtol=tol, atol=tol / DX)
+    assert_close(v, reference[0], rtol=tol, atol=tol)
+    assert_close(c, reference[1], rtol=tol, atol=tol / DX)
     assert torch.equal(gradient, c)
 
 
@@ -378,7 +379,7 @@ def test_scatter_momentum_is_the_sum_that_it_says(mls):
             slope = w * d * 4 / DX**2 if mls else gradient
             expected[i, :3] += w * (mass[p] * (velocity[p] + affine[p] @ d) + impulse[p]) - stress[p] @ slope
             expected[i, 3] += w * mass[p]
-    torch.testing.assert_close(found, expected, rtol=0, atol=1e-12)
+    assert_close(found, expected, rtol=0, atol=1e-12)
 
 
 def _body(count=150):
@@ -400,7 +401,7 @@ def test_mls_steps_conserve_both_momenta(beta):
     scale = float(before["linear"].norm() + before["angular"].norm())
     after = solver.momenta(end)
     for name in before:
-        torch.testing.assert_close(after[name], before[name], rtol=0, atol=1e-12 * scale)
+        assert_close(after[name], before[name], rtol=0, atol=1e-12 * scale)
 
 
 @pytest.mark.parametrize("mls", [False, True])
@@ -414,7 +415,7 @@ def test_stress_changes_the_moment_of_momentum_by_the_virial(mls):
     mass = points.mass[:, None, None]
     moment = (mass * (end.velocity[:, :, None] * points.position[:, None, :] + 0.1**2 / 4 * end.affine)).sum(0)
     virial = (points.volume[:, None, None] * solver.laws.kirchhoff(F, None)).sum(0)
-    torch.testing.assert_close(moment, -dt * virial, rtol=0, atol=1e-12 * float(virial.abs().max()))
+    assert_close(moment, -dt * virial, rtol=0, atol=1e-12 * float(virial.abs().max()))
 
 
 def test_mls_free_fall_and_affine_motion_are_exact():
@@ -422,14 +423,14 @@ def test_mls_free_fall_and_affine_motion_are_exact():
     solver = MPMSolver(dx=0.1, formulation="updated", mls=True)
     end = solver.rollout(solver.init_state(points), dt, 50)
     fall = torch.tensor([0.0, 0.0, -9.8 * dt * dt * 50 * 51 / 2], dtype=torch.float64)
-    torch.testing.assert_close(end.position, points.position + fall, rtol=0, atol=1e-12)
-    torch.testing.assert_close(end.F_elastic, torch.eye(3).double().expand_as(end.F_elastic), rtol=0, atol=1e-12)
+    assert_close(end.position, points.position + fall, rtol=0, atol=1e-12)
+    assert_close(end.F_elastic, torch.eye(3).double().expand_as(end.F_elastic), rtol=0, atol=1e-12)
     a = torch.tensor([[0.1, 0.4, 0.0], [-0.3, 0.2, 0.1], [0.0, 0.2, -0.1]], dtype=torch.float64)
     solver = MPMSolver(dx=0.1, formulation="updated", mls=True, gravity=(0, 0, 0))
     state = solver.init_state(points, points.position @ a.T)
     end = solver.step(state.replace(affine=a.expand_as(state.affine)), dt)
     expected = torch.eye(3, dtype=torch.float64) + dt * a
-    torch.testing.assert_close(end.F_elastic, expected.expand_as(end.F_elastic), rtol=0, atol=1e-12)
+    assert_close(end.F_elastic, expected.expand_as(end.F_elastic), rtol=0, atol=1e-12)
 
 
 def test_mls_is_another_discretisation_of_the_same_body():

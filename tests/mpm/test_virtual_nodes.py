@@ -6,23 +6,28 @@ import math
 import pytest
 import torch
 
+from gaussian_swaying import (
+    AeroForce,
+    Box,
+    Contact,
+    MaterialPoints,
+    MPMSolver,
+    MPMState,
+    PinnedPoints,
+    PinnedRegion,
+    WindField,
+    WindForce,
+)
 from gaussian_swaying.aero.effects import LogProfile
-from gaussian_swaying.aero.force import AeroForce
-from gaussian_swaying.aero.wind import WindField
-from gaussian_swaying.aero.wind_force import WindForce
 from gaussian_swaying.geometry.linalg import polar_rotation
-from gaussian_swaying.geometry.regions import Box
 from gaussian_swaying.mpm.boundaries.ball import BallObstacle
 from gaussian_swaying.mpm.boundaries.handle import Handle
-from gaussian_swaying.mpm.boundaries.pinned_points import PinnedPoints
-from gaussian_swaying.mpm.boundaries.pinned_region import PinnedRegion
 from gaussian_swaying.mpm.boundaries.plane import Plane
 from gaussian_swaying.mpm.boundaries.rigid_region import RigidRegion
 from gaussian_swaying.mpm.boundaries.velocity_box import VelocityBox
-from gaussian_swaying.mpm.contact.surface import Contact, Surface
+from gaussian_swaying.mpm.contact.surface import Surface
 from gaussian_swaying.mpm.followers import GridFollowers, on_material
-from gaussian_swaying.mpm.solver import MPMSolver
-from gaussian_swaying.mpm.state import GridSpec, MaterialPoints, MPMState
+from gaussian_swaying.mpm.state import GridSpec
 from gaussian_swaying.mpm.virtual_nodes import coordinates, first_nodes, point_with_nodes, shifts, virtual_nodes
 
 EDGE = Box([None, None, None], [1.0, None, None])

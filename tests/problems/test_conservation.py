@@ -7,6 +7,7 @@ import pytest
 import torch
 from bench.problems.bars import free_block
 from bench.problems.settings import Settings, block
+from torch.testing import assert_close
 
 from gaussian_swaying.mpm.state import MaterialPoints
 
@@ -69,8 +70,8 @@ def test_affine_velocity_is_reproduced(settings):
     end = solver.step(state, 1e-3)
     rate = torch.tensor(RATE, dtype=torch.float64)
     expected = (points.position - points.position.mean(0)) @ rate.T + 0.2
-    torch.testing.assert_close(end.velocity, expected, rtol=0, atol=1e-13)
-    torch.testing.assert_close(end.affine, rate.expand_as(end.affine), rtol=0, atol=1e-12)
+    assert_close(end.velocity, expected, rtol=0, atol=1e-13)
+    assert_close(end.affine, rate.expand_as(end.affine), rtol=0, atol=1e-12)
 
 
 def _elsewhere(settings, shift, rate, steps):
@@ -84,7 +85,7 @@ def _elsewhere(settings, shift, rate, steps):
 @EACH
 def test_motion_does_not_depend_on_the_place_by_whole_cells(settings):
     a, b = (_elsewhere(settings, shift, RATE, 100) for shift in ((0.0, 0.0, 0.0), (7.0, -3.0, 12.0)))
-    torch.testing.assert_close(a, b, rtol=0, atol=1e-12)
+    assert_close(a, b, rtol=0, atol=1e-12)
 
 
 @pytest.mark.slow(gate=["total", "mls"])
@@ -92,7 +93,7 @@ def test_motion_does_not_depend_on_the_place_by_whole_cells(settings):
 def test_flight_without_stress_does_not_depend_on_the_place(settings):
     """Parts of a cell too, to round-off; with stress, to the error of the discretisation."""
     places, still = ((0.0, 0.0, 0.0), (0.3, 0.41, 0.77)), ((0.0,) * 3,) * 3
-    torch.testing.assert_close(*(_elsewhere(settings, at, still, 100) for at in places), rtol=0, atol=1e-13)
+    assert_close(*(_elsewhere(settings, at, still, 100) for at in places), rtol=0, atol=1e-13)
     a, b = (_elsewhere(settings, at, RATE, 100) for at in places)
     difference = float((a - b).norm() / a.norm())
     assert 1e-6 < difference < 0.05, difference

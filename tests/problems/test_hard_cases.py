@@ -12,14 +12,30 @@ from pathlib import Path
 import pytest
 import torch
 from small_scenes import plain_cloud
+from torch.testing import assert_close
 
-from gaussian_swaying.aero.force import AeroForce
-from gaussian_swaying.aero.wind import FlowKey, GaussianGust, Modulation, SineSway, UniformGust, WindField
+from gaussian_swaying import (
+    AeroForce,
+    Box,
+    GaussianGust,
+    Material,
+    MaterialPoints,
+    MPMSolver,
+    MPMState,
+    OrbitCamera,
+    PinnedRegion,
+    Scene,
+    Simulation,
+    SimulationDiverged,
+    SineSway,
+    UniformGust,
+    WindField,
+)
+from gaussian_swaying.aero.wind import FlowKey, Modulation
 from gaussian_swaying.geometry.linalg import determinant, matmul3
-from gaussian_swaying.geometry.regions import Box, Everything
+from gaussian_swaying.geometry.regions import Everything
 from gaussian_swaying.mpm.boundaries.enclosing_box import EnclosingBox
 from gaussian_swaying.mpm.boundaries.handle import Handle
-from gaussian_swaying.mpm.boundaries.pinned_region import PinnedRegion
 from gaussian_swaying.mpm.boundaries.plane import Plane
 from gaussian_swaying.mpm.boundaries.velocity_box import VelocityBox
 from gaussian_swaying.mpm.laws.fixed_corotated import FixedCorotated
@@ -31,14 +47,8 @@ from gaussian_swaying.mpm.laws.neo_hookean import NeoHookean
 from gaussian_swaying.mpm.laws.plasticine import Plasticine
 from gaussian_swaying.mpm.laws.sand import Sand
 from gaussian_swaying.mpm.laws.snow import Snow
-from gaussian_swaying.mpm.solver import MPMSolver
-from gaussian_swaying.mpm.state import MaterialPoints, MPMState
-from gaussian_swaying.rendering.cameras.camera_path import OrbitCamera
 from gaussian_swaying.scenes.procedural import FlagScene, GivenScene
-from gaussian_swaying.simulation.diagnostics import SimulationDiverged, check_state, diagnose
-from gaussian_swaying.simulation.material import Material
-from gaussian_swaying.simulation.scene import Scene
-from gaussian_swaying.simulation.simulation import Simulation
+from gaussian_swaying.simulation.diagnostics import check_state, diagnose
 
 FORMULATIONS = ["total", "updated"]
 UP = (0.0, 0.0, -9.8)
@@ -407,7 +417,7 @@ def test_particles_without_neighbours_fall(places, formulation):
     fallen = (state.position - simulation.solver.points.position)[:, 2].double()
     # position and velocity are rounded in each of the substeps
     steps = sum(health.substeps for health in log)
-    torch.testing.assert_close(fallen, torch.full_like(fallen, expected), rtol=steps * 2**-23, atol=steps * 2**-26)
+    assert_close(fallen, torch.full_like(fallen, expected), rtol=steps * 2**-23, atol=steps * 2**-26)
     assert torch.equal(state.position[0], state.position[-1])
     assert log[-1].stretch_max == pytest.approx(1.0, abs=steps * 2**-20)
 
@@ -426,7 +436,7 @@ def test_a_body_within_one_cell(side, formulation):
     # float32 rounds the velocity, near 1 m/s, and the place, within 0.25 m, in each substep
     steps = sum(health.substeps for health in log)
     expected = torch.tensor([0.1, 0.0, 0.0], dtype=torch.float64)
-    torch.testing.assert_close(moved, expected, rtol=0, atol=steps * 2**-24)
+    assert_close(moved, expected, rtol=0, atol=steps * 2**-24)
 
 
 @pytest.mark.slow(gate=["total"])
@@ -632,7 +642,7 @@ def test_a_body_in_free_flight_takes_its_grid_along():
     moved = (state.position - simulation.solver.points.position).double().mean(0)
     # float32 rounds a place of up to 4 m by 2^-23 in each substep, and as much a velocity that then acts for 0.1 s
     expected = torch.tensor([3.0, 0.0, 0.0], dtype=torch.float64)
-    torch.testing.assert_close(moved, expected, rtol=0, atol=2 * steps * 2**-22)
+    assert_close(moved, expected, rtol=0, atol=2 * steps * 2**-22)
     # twice the way of a frame and 3 cells on each side, and the 6 of the body and its stencils
     assert state.grid.node_count <= (2 * (6 + 3 + 1) + 6) ** 3
 
@@ -812,10 +822,10 @@ def test_a_scene_ten_kilometres_away_moves_the_same(formulation):
         ends.append(
             (simulation.solver.points.position, state.position, simulation.scene.deformed(state).means - offset)
         )
-    torch.testing.assert_close(ends[1][0], ends[0][0], rtol=0, atol=0)
+    assert_close(ends[1][0], ends[0][0], rtol=0, atol=0)
     assert float((ends[0][1] - ends[0][0]).norm(dim=-1).max()) > 4 * 2**-10
-    torch.testing.assert_close(ends[1][1], ends[0][1], rtol=0, atol=0)
-    torch.testing.assert_close(ends[1][2], ends[0][2], rtol=0, atol=1.01 * 2**-11)  # to the nearest
+    assert_close(ends[1][1], ends[0][1], rtol=0, atol=0)
+    assert_close(ends[1][2], ends[0][2], rtol=0, atol=1.01 * 2**-11)  # to the nearest
 
 
 @pytest.mark.parametrize("formulation", FORMULATIONS)
@@ -837,7 +847,7 @@ def test_the_solver_alone_ten_kilometres_away(formulation, dtype):
     check_state(solver, state)
     moved = (state.position - points.position).double().mean(0)
     rounding = 2**-10 if dtype == torch.float32 else 1e-9
-    torch.testing.assert_close(moved, torch.tensor([0.1, 0.0, 0.0], dtype=torch.float64), rtol=0, atol=rounding)
+    assert_close(moved, torch.tensor([0.1, 0.0, 0.0], dtype=torch.float64), rtol=0, atol=rounding)
 
 
 # ---- ten minutes

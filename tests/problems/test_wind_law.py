@@ -6,13 +6,10 @@ import pytest
 import torch
 from bench.problems.plates import Hinge
 from bench.problems.surfaces import sphere_of_gaussians, surface_drag
+from torch.testing import assert_close
 
-from gaussian_swaying.aero.force import AeroForce
+from gaussian_swaying import AeroForce, Box, MaterialPoints, MPMSolver, PinnedRegion
 from gaussian_swaying.geometry.patches import deform_patch
-from gaussian_swaying.geometry.regions import Box
-from gaussian_swaying.mpm.boundaries.pinned_region import PinnedRegion
-from gaussian_swaying.mpm.solver import MPMSolver
-from gaussian_swaying.mpm.state import MaterialPoints
 
 SIDE, SPACING, THICKNESS, DENSITY, AIR, C = 0.4, 0.05, 0.01, 20.0, 1.225, 1.2
 
@@ -201,7 +198,7 @@ def test_the_mirror_image_feels_the_mirrored_force(options, parity, axis):
     force = aero(wind, velocity, *deform_patch(F, normal, area))
     mirrored = mirror[:, None] * F * mirror
     image = aero(wind * mirror, velocity * mirror, *deform_patch(mirrored, normal * mirror, area))
-    torch.testing.assert_close(image, parity * force * mirror, rtol=1e-10, atol=1e-12)
+    assert_close(image, parity * force * mirror, rtol=1e-10, atol=1e-12)
     assert float((image - force * mirror).abs().max() > 0.1) == (parity < 0)
 
 
@@ -212,10 +209,10 @@ def test_force_grows_with_the_square_of_the_wind(law):
     patch = deform_patch(F, normal, area)
     one = aero(wind, still, *patch)
     for factor in (0.5, 2.0, 10.0):
-        torch.testing.assert_close(aero(factor * wind, still, *patch), factor**2 * one, rtol=1e-12, atol=0)
+        assert_close(aero(factor * wind, still, *patch), factor**2 * one, rtol=1e-12, atol=0)
     # turned round, the wind turns drag and friction, but not d x n, in which both factors turn
     straight = AeroForce(law=law, C_L=0.0)(wind, still, *patch)
-    torch.testing.assert_close(aero(-wind, still, *patch), one - 2 * straight)
+    assert_close(aero(-wind, still, *patch), one - 2 * straight)
 
 
 # ---- a sheet on the solver
@@ -273,7 +270,7 @@ def test_only_the_relative_wind_counts(law):
         ends.append(state.position - 250 * 2e-4 * torch.tensor(drift, dtype=torch.float64))
     moved = ends[0] - _sheet("total", bump=0.01)[1].position
     assert float(moved.abs().max()) > 1e-3
-    torch.testing.assert_close(ends[1], ends[0], rtol=0, atol=1e-10)
+    assert_close(ends[1], ends[0], rtol=0, atol=1e-10)
 
 
 @pytest.mark.parametrize("formulation", ["total", "updated"])
@@ -284,7 +281,7 @@ def test_the_mirror_image_moves_as_the_mirrored_sheet(formulation):
         solver, state, normal = _sheet(formulation, (0, 0, -9.8), pinned=True, bump=sign * 0.01)
         state = _blow(solver, state, normal, aero, (3.0, sign * 2.0, 0.5), 150)
         ends.append(state.position * torch.tensor([1.0, sign, 1.0], dtype=torch.float64))
-    torch.testing.assert_close(ends[1], ends[0], rtol=0, atol=1e-9)
+    assert_close(ends[1], ends[0], rtol=0, atol=1e-9)
 
 
 @pytest.mark.slow(gate=["total"])

@@ -5,8 +5,7 @@ import math
 import pytest
 import torch
 
-from gaussian_swaying.mpm.solver import MPMSolver
-from gaussian_swaying.mpm.state import MaterialPoints
+from gaussian_swaying import MaterialPoints, MPMSolver
 
 
 def _block(low=(0.0, 0.0, 0.0), side=0.4, e=2e4, per_side=6):

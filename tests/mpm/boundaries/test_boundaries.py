@@ -1,9 +1,4 @@
-"""Each boundary acts only where and when it should.
-
-Covers: mpm.boundaries.ball, mpm.boundaries.block, mpm.boundaries.boundary, mpm.boundaries.capsule,
-mpm.boundaries.enclosing_box, mpm.boundaries.half_space, mpm.boundaries.mesh, mpm.boundaries.obstacle,
-mpm.boundaries.pinned_points, mpm.boundaries.pinned_region, mpm.boundaries.still_gaussians.
-"""
+"""Each boundary acts only where and when it should."""
 
 import copy
 import dataclasses
@@ -15,14 +10,14 @@ from pkgutil import iter_modules
 import pytest
 import torch
 from catalogue import OBSTACLES, conditions, made
+from torch.testing import assert_close
 
-from gaussian_swaying.geometry.frame import SimFrame
+from gaussian_swaying import Box, Cylinder, MPMSolver, SimFrame, Sphere
 from gaussian_swaying.geometry.keyed_path import KeyedPath
-from gaussian_swaying.geometry.regions import Box, Cylinder, Everything, Not, Sphere, Union
+from gaussian_swaying.geometry.regions import Everything, Not, Union
 from gaussian_swaying.mpm import boundaries
 from gaussian_swaying.mpm.boundaries import BOUNDARIES
 from gaussian_swaying.mpm.boundaries.boundary import Nodes
-from gaussian_swaying.mpm.solver import MPMSolver
 
 FORMULATIONS = ["total", "updated"]
 MOVING = KeyedPath([0.0, 0.2], [[0, 0, 0], [0.1, 0.05, 0]], [[0, 0, 0], [10, 20, 30]])
@@ -114,9 +109,9 @@ def test_time_windows(name, formulation, block, run_for):
     assert float(run_for(formulation, [make(0.0, 0.1)], points, 0.1).velocity.abs().max()) == 0.0
     falling = torch.full((216,), -0.98, dtype=torch.float64)
     released = run_for(formulation, [make(0.0, 0.1)], points, 0.2)
-    torch.testing.assert_close(released.velocity[:, 2], falling, rtol=1e-6, atol=0)
+    assert_close(released.velocity[:, 2], falling, rtol=1e-6, atol=0)
     later = run_for(formulation, [make(0.1, None)], points, 0.1)
-    torch.testing.assert_close(later.velocity[:, 2], falling, rtol=1e-6, atol=0)
+    assert_close(later.velocity[:, 2], falling, rtol=1e-6, atol=0)
     assert float(run_for(formulation, [make(0.1, None)], points, 0.12).velocity.abs().max()) < 1e-14
 
 
@@ -132,7 +127,7 @@ def test_plane_and_box_leave_alone_what_is_near_but_free(formulation, kind, fric
         for sign in (1.0, -1.0):
             velocity = sign * torch.tensor([0.3, -0.2, 0.25], dtype=torch.float64).expand_as(points.position)
             state = run_for(formulation, [boundary], points, 0.04, velocity, gravity=(0, 0, 0))
-            torch.testing.assert_close(state.velocity, velocity, rtol=0, atol=1e-12)
+            assert_close(state.velocity, velocity, rtol=0, atol=1e-12)
 
 
 @pytest.mark.parametrize("formulation", FORMULATIONS)
@@ -145,8 +140,8 @@ def test_separate_lets_go_of_what_moves_away_and_slip_does_not(formulation, wall
         boundary = made(*wall, kind, friction)()
         return run_for(formulation, [boundary], points, 0.02, velocity, gravity=(0, 0, 0)).velocity
 
-    torch.testing.assert_close(run("separate"), velocity, rtol=0, atol=1e-12)
-    torch.testing.assert_close(run("separate", 0.8), velocity, rtol=0, atol=1e-12)
+    assert_close(run("separate"), velocity, rtol=0, atol=1e-12)
+    assert_close(run("separate", 0.8), velocity, rtol=0, atol=1e-12)
     slip = run("slip")
     assert float(slip[:, 2].mean()) < 0.8
     assert float(slip[:, 0].mean()) == pytest.approx(0.3, rel=1e-9)
@@ -161,7 +156,7 @@ def test_a_substep_may_be_a_tensor_and_constants_are_made_once(name, monkeypatch
         known = boundary(velocity, nodes)
         found = boundary(velocity, dataclasses.replace(nodes, dt=torch.tensor(nodes.dt, dtype=torch.float64)))
         assert found.dtype == dtype
-        torch.testing.assert_close(found, known, rtol=tolerance, atol=0)
+        assert_close(found, known, rtol=tolerance, atol=0)
         assert not torch.equal(found, velocity)
     if name in ("handle", "impulse", "impulse for each"):  # values that depend on the substep
         longer = boundary(velocity, dataclasses.replace(nodes, dt=torch.tensor(0.3, dtype=torch.float64)))
@@ -202,7 +197,7 @@ def test_a_recorded_condition_follows_time_and_substep(name, dtype):
         graph.replay()
         now = dataclasses.replace(nodes, time=torch.full_like(nodes.time, time), dt=dt)
         # the substep is a tensor here and a number there, so velocities of 1 m/s are rounded in another order
-        torch.testing.assert_close(recorded, boundary(velocity, now), rtol=1e-6, atol=4 * torch.finfo(dtype).eps)
+        assert_close(recorded, boundary(velocity, now), rtol=1e-6, atol=4 * torch.finfo(dtype).eps)
         seen.append(recorded.clone())
     assert not torch.equal(seen[0], velocity)
     if name not in ("release", "front", "rigid"):  # the solver ends the first two; a rigid body never ends
@@ -259,7 +254,7 @@ def test_conditions_can_be_copied_saved_and_narrowed(name, formulation, block, m
     narrow = loaded.to(torch.float32)
     end = march(narrow, points.map(lambda t: t.float()), 2e-3, 6, None if push is None else push.float())[-1]
     assert end.position.dtype == torch.float32
-    torch.testing.assert_close(end.position.double(), known.position, rtol=0, atol=2e-6)
+    assert_close(end.position.double(), known.position, rtol=0, atol=2e-6)
 
 
 @pytest.mark.parametrize("name", ["pin", "handle", "release", "front", "impulse", "impulse for each"])
@@ -362,7 +357,7 @@ def test_an_obstacle_stops_the_nodes_on_and_in_it_in_its_time(time, acts):
     found = ball(velocity, Nodes(torch.tensor(time, dtype=torch.float64), 1e-3, place))
     stopped = torch.tensor([0.0, 0.5, 0.0], dtype=torch.float64)
     expected = torch.where(torch.tensor([[True], [True], [False], [False]]) & acts, stopped, velocity)
-    torch.testing.assert_close(found, expected)
+    assert_close(found, expected)
 
 
 @pytest.mark.parametrize("path", [None, KeyedPath([0.0, 1.0], moves=[[0, 0, 0], [1, 2, 3]])])
@@ -379,6 +374,6 @@ def test_a_mesh_in_a_frame_is_as_far_as_in_the_scene(path):
     found = mesh.in_frame(frame).touch(frame.point_to_sim(place), now, 0.1)
     assert float(distance.amin()) < -2 * mesh.spacing
     assert float(distance.amax()) > 2 * mesh.spacing
-    torch.testing.assert_close(found[0], 3 * distance)
-    torch.testing.assert_close(found[1], normal @ turn.T)
-    torch.testing.assert_close(found[2], 3 * speed @ turn.T)
+    assert_close(found[0], 3 * distance)
+    assert_close(found[1], normal @ turn.T)
+    assert_close(found[2], 3 * speed @ turn.T)

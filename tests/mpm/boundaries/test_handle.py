@@ -4,13 +4,10 @@ import math
 
 import pytest
 import torch
+from torch.testing import assert_close
 
-from gaussian_swaying.geometry.frame import SimFrame
-from gaussian_swaying.geometry.regions import Box, Sphere
+from gaussian_swaying import Box, MaterialPoints, MPMSolver, PinnedRegion, SimFrame, Sphere
 from gaussian_swaying.mpm.boundaries.handle import Handle
-from gaussian_swaying.mpm.boundaries.pinned_region import PinnedRegion
-from gaussian_swaying.mpm.solver import MPMSolver
-from gaussian_swaying.mpm.state import MaterialPoints
 
 FORMULATIONS = ["total", "updated"]
 
@@ -31,8 +28,8 @@ def test_handle_carries_its_particles_and_the_others_follow(formulation, block, 
         assert float(states[k].velocity.abs().max()) == 0.0
     for k in (6, 15, 25):  # substeps 5 to 24 begin within the window
         expected = rest[top] + velocity * dt * (k - 5)
-        torch.testing.assert_close(states[k].position[top], expected, rtol=0, atol=1e-13)
-        torch.testing.assert_close(states[k].velocity[top], velocity.expand_as(rest[top]), rtol=0, atol=1e-13)
+        assert_close(states[k].position[top], expected, rtol=0, atol=1e-13)
+        assert_close(states[k].velocity[top], velocity.expand_as(rest[top]), rtol=0, atol=1e-13)
     first, last = (states[k].velocity[~top].mean(0) for k in (6, 25))
     assert float(last @ velocity) > max(2 * float(first @ velocity), 0.3 * float(velocity @ velocity))
     bottom = rest[:, 2] < 0.1
@@ -40,7 +37,7 @@ def test_handle_carries_its_particles_and_the_others_follow(formulation, block, 
     released = states[26:]
     assert float((released[0].velocity[top] - velocity).abs().max()) > 1e-3
     momenta = torch.stack([solver.momenta(state)["linear"] for state in released])
-    torch.testing.assert_close(momenta, momenta[:1].expand_as(momenta), rtol=1e-10, atol=1e-12)
+    assert_close(momenta, momenta[:1].expand_as(momenta), rtol=1e-10, atol=1e-12)
 
 
 @pytest.mark.parametrize("formulation", FORMULATIONS)
@@ -67,9 +64,9 @@ def test_handle_turns_twice_without_growing(formulation, block, march, rotation)
     arm = points.position - pivot
     for k in (20, 50, 160):  # a quarter turn, 225 degrees, two turns
         turn = rotation(axis, rate * dt * k)
-        torch.testing.assert_close(states[k].position, pivot + arm @ turn.T, rtol=0, atol=1e-12)
-        torch.testing.assert_close(states[k].F_elastic, turn.expand(27, 3, 3), rtol=0, atol=1e-11)
-    torch.testing.assert_close(states[160].position, points.position, rtol=0, atol=1e-12)
+        assert_close(states[k].position, pivot + arm @ turn.T, rtol=0, atol=1e-12)
+        assert_close(states[k].F_elastic, turn.expand(27, 3, 3), rtol=0, atol=1e-11)
+    assert_close(states[160].position, points.position, rtol=0, atol=1e-12)
     assert float((states[20].position - points.position).norm(dim=-1).max()) > 0.2
 
 
@@ -88,7 +85,7 @@ def test_handle_pivot_travels(formulation, block, march, rotation):
         seconds = dt * (k - first)
         turn = rotation([0.0, 0.0, -1.0], 5.0 * seconds)
         expected = pivot + velocity * seconds + (points.position - pivot) @ turn.T
-        torch.testing.assert_close(states[k].position, expected, rtol=0, atol=1e-12)
+        assert_close(states[k].position, expected, rtol=0, atol=1e-12)
     assert float(states[80].time) == pytest.approx(0.4)
 
 
@@ -110,7 +107,7 @@ def test_handle_in_a_frame_that_scales_and_turns(formulation, block, march, rota
     turn = rotation([0.0, 0.0, 1.0], 4.0 * dt * steps)
     centre = frame.point_to_sim(torch.tensor(pivot, dtype=torch.float64))
     expected = centre + velocity * dt * steps + (position[near] - centre) @ turn.T
-    torch.testing.assert_close(state.position[near], expected, rtol=0, atol=1e-12)
+    assert_close(state.position[near], expected, rtol=0, atol=1e-12)
     assert torch.equal(state.position[~near], position[~near])
 
 
@@ -121,5 +118,5 @@ def test_handle_without_any_motion_is_a_pin(formulation, block, run_for):
     for transfer, tolerance in (("torch", 0.0), ("kernels", 1e-12)):
         handle = run_for(formulation, [Handle(region)], points, 0.1, transfer=transfer)
         pin = run_for(formulation, [PinnedRegion(region)], points, 0.1, transfer=transfer)
-        torch.testing.assert_close(handle.position, pin.position, rtol=0, atol=tolerance)
-        torch.testing.assert_close(handle.F_elastic, pin.F_elastic, rtol=0, atol=tolerance)
+        assert_close(handle.position, pin.position, rtol=0, atol=tolerance)
+        assert_close(handle.F_elastic, pin.F_elastic, rtol=0, atol=tolerance)

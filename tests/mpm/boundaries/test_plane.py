@@ -4,6 +4,7 @@ import math
 
 import pytest
 import torch
+from torch.testing import assert_close
 
 from gaussian_swaying.mpm.boundaries.plane import Plane, plane_velocity
 
@@ -21,7 +22,7 @@ def test_plane_velocity_kinds():
     assert plane_velocity(into, UP, "separate", 0.0).tolist() == [[3, 0, 0]]
     assert plane_velocity(away, UP, "separate", 0.5).tolist() == [[3, 0, 2]]
     # Coulomb: the tangential speed loses mu times the normal speed taken away, and never turns round
-    torch.testing.assert_close(plane_velocity(into, UP, "separate", 0.5), torch.tensor([[2.0, 0, 0]]).double())
+    assert_close(plane_velocity(into, UP, "separate", 0.5), torch.tensor([[2.0, 0, 0]]).double())
     assert plane_velocity(into, UP, "separate", 5.0).tolist() == [[0, 0, 0]]
     assert plane_velocity(torch.zeros(1, 3), UP.float(), "separate", 0.5).tolist() == [[0, 0, 0]]
 
@@ -29,7 +30,7 @@ def test_plane_velocity_kinds():
 @pytest.mark.parametrize("length", [1e-3, 1.0, 50.0])
 def test_the_length_of_the_normal_does_not_matter(length):
     plane = Plane([0.0, 0.0, 0.0], [0.6 * length, 0.0, -0.8 * length])
-    torch.testing.assert_close(plane.normal, torch.tensor([0.6, 0.0, -0.8], dtype=torch.float64))
+    assert_close(plane.normal, torch.tensor([0.6, 0.0, -0.8], dtype=torch.float64))
 
 
 @pytest.mark.slow(gate=["sticky-total", "slip-updated", "separate-total"])
@@ -48,7 +49,7 @@ def test_plane_does_not_act_on_the_free_side(formulation, block, run_for):
     points = block(low=(0, 0, 1.0))
     state = run_for(formulation, [Plane([0, 0, -5], [0, 0, 1], "sticky")], points, 0.2)
     free = run_for(formulation, [], points, 0.2)
-    torch.testing.assert_close(state.position, free.position, rtol=0, atol=1e-12)
+    assert_close(state.position, free.position, rtol=0, atol=1e-12)
 
 
 @pytest.mark.slow(gate=["updated"])

@@ -6,15 +6,13 @@ import numpy as np
 import pytest
 import torch
 from scipy.optimize import curve_fit
+from torch.testing import assert_close
 
-from gaussian_swaying.geometry.regions import Box, Everything, Union
+from gaussian_swaying import Box, MaterialPoints, MPMSolver, PinnedPoints, PinnedRegion
+from gaussian_swaying.geometry.regions import Everything, Union
 from gaussian_swaying.mpm.boundaries.half_space import HalfSpaceObstacle
 from gaussian_swaying.mpm.boundaries.handle import Handle
-from gaussian_swaying.mpm.boundaries.pinned_points import PinnedPoints
-from gaussian_swaying.mpm.boundaries.pinned_region import PinnedRegion
 from gaussian_swaying.mpm.boundaries.rigid_region import RigidRegion
-from gaussian_swaying.mpm.solver import MPMSolver
-from gaussian_swaying.mpm.state import MaterialPoints
 
 FORMULATIONS = ["total", "updated"]
 TRANSFERS = ["torch", "kernels"]
@@ -69,7 +67,7 @@ def test_a_free_part_keeps_momenta_energy_and_shape(formulation, transfer):
         assert float(torch.linalg.det(state.F_total).min()) > 0
     assert max(errors) < 1e-13  # nor do they grow
     for name, value in solver.momenta(state).items():
-        torch.testing.assert_close(value, momenta[name], rtol=1e-10, atol=1e-10)
+        assert_close(value, momenta[name], rtol=1e-10, atol=1e-10)
     assert float(solver.energies(state)["kinetic"] / energy) == pytest.approx(1.0, abs=1e-6)
     assert float(solver.energies(state)["elastic"]) < 1e-12
 
@@ -85,7 +83,7 @@ def test_single_precision_drifts_by_rounding_only(formulation):
     assert strain(state.F_total) < 1e-6
     distance = torch.pdist(points.position.double())
     assert float((torch.pdist(state.position.double()) - distance).abs().max()) < 1e-5
-    torch.testing.assert_close(solver.momenta(state)["angular"], before, rtol=1e-4, atol=1e-6)
+    assert_close(solver.momenta(state)["angular"], before, rtol=1e-4, atol=1e-6)
 
 
 @pytest.mark.parametrize("formulation", FORMULATIONS)
@@ -98,7 +96,7 @@ def test_half_of_a_bar_pulls_at_the_other(formulation):
     before = solver.momenta(state)
     state = advance(solver, state, 0.2)
     for name, value in solver.momenta(state).items():
-        torch.testing.assert_close(value, before[name], rtol=1e-9, atol=1e-10)
+        assert_close(value, before[name], rtol=1e-9, atol=1e-10)
     assert strain(state.F_total[own]) < 1e-12
     assert strain(state.F_total[~own]) > 1e-3
     assert float(state.velocity[~own, 2].mean()) > 0.2  # it is taken along
@@ -133,10 +131,8 @@ def test_a_handle_leads_the_whole_part(formulation):
     turn = torch.tensor([[c, -s, 0], [s, c, 0], [0, 0, 1.0]], dtype=torch.float64)
     pivot = torch.tensor([0.4, 0, 0], dtype=torch.float64)
     wanted = pivot + (points.position - pivot) @ turn.mT
-    torch.testing.assert_close(state.position[right(points)], wanted[right(points)], rtol=0, atol=1e-5)
-    torch.testing.assert_close(
-        state.F_total[right(points)], turn.expand(int(right(points).sum()), 3, 3), rtol=0, atol=1e-4
-    )
+    assert_close(state.position[right(points)], wanted[right(points)], rtol=0, atol=1e-5)
+    assert_close(state.F_total[right(points)], turn.expand(int(right(points).sum()), 3, 3), rtol=0, atol=1e-4)
 
 
 @pytest.mark.parametrize("formulation", FORMULATIONS)
@@ -147,7 +143,7 @@ def test_kernels_do_as_torch_does(formulation):
         points, solver = bar(RigidRegion(RIGHT), pin, formulation=formulation, transfer=transfer)
         found.append(advance(solver, solver.init_state(points), 0.1, 4))
     for name in ("position", "velocity", "F_total", "impulse"):
-        torch.testing.assert_close(getattr(found[0], name), getattr(found[1], name), rtol=1e-9, atol=1e-9)
+        assert_close(getattr(found[0], name), getattr(found[1], name), rtol=1e-9, atol=1e-9)
 
 
 def test_scenes_of_a_batch_do_not_know_each_other():
@@ -167,7 +163,7 @@ def test_scenes_of_a_batch_do_not_know_each_other():
         count = together.substeps(together.init_state(MaterialPoints.stack([points, other])), 0.1 / 3)
         for _ in range(3):
             begin = single.rollout(begin, 0.1 / 3 / count, count)
-        torch.testing.assert_close(state.position[k], begin.position, rtol=0, atol=1e-10)
+        assert_close(state.position[k], begin.position, rtol=0, atol=1e-10)
 
 
 @pytest.mark.parametrize("formulation", FORMULATIONS)
@@ -279,12 +275,10 @@ def test_in_updated_parts_may_meet():
     state = solver.init_state(points, velocity, margin=4)
     before = solver.momenta(state)["linear"]
     state = advance(solver, state, 0.1)
-    torch.testing.assert_close(solver.momenta(state)["linear"], before, rtol=1e-9, atol=1e-10)
+    assert_close(solver.momenta(state)["linear"], before, rtol=1e-9, atol=1e-10)
     assert float(state.velocity[~right(points), 0].max()) < -0.3  # it is pushed
     for own in (right(points), ~right(points)):
-        torch.testing.assert_close(
-            torch.pdist(state.position[own]), torch.pdist(points.position[own]), rtol=0, atol=1e-12
-        )
+        assert_close(torch.pdist(state.position[own]), torch.pdist(points.position[own]), rtol=0, atol=1e-12)
 
 
 def test_a_part_that_becomes_rigid_on_the_way_takes_its_shape_again():
@@ -297,4 +291,4 @@ def test_a_part_that_becomes_rigid_on_the_way_takes_its_shape_again():
     assert strain(after.F_total[right(points)]) < 1e-12
     distance = torch.pdist(points.position[right(points)])
     found = torch.pdist(after.position[right(points)])
-    torch.testing.assert_close(found, distance, rtol=0, atol=1e-12)
+    assert_close(found, distance, rtol=0, atol=1e-12)

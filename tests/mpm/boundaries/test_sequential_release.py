@@ -2,13 +2,11 @@
 
 import pytest
 import torch
+from torch.testing import assert_close
 
-from gaussian_swaying.geometry.frame import SimFrame
-from gaussian_swaying.geometry.regions import Box, Sphere
+from gaussian_swaying import Box, MaterialPoints, MPMSolver, SimFrame, Sphere
 from gaussian_swaying.mpm.boundaries.impulse import Impulse
 from gaussian_swaying.mpm.boundaries.sequential_release import SequentialRelease
-from gaussian_swaying.mpm.solver import MPMSolver
-from gaussian_swaying.mpm.state import MaterialPoints
 
 FORMULATIONS = ["total", "updated"]
 
@@ -24,13 +22,13 @@ def test_scenes_of_a_batch_have_their_own_impulse_and_front(formulation, lone, m
     solver = MPMSolver(dx=0.1, formulation=formulation, boundaries=[Impulse(region, [1, 0, 0])], gravity=(0, 0, 0))
     states = march(solver, points, 0.01, 5)
     expected = torch.tensor([[1.0, 0, 0], [1, 0, 0], [0, 0, 0]], dtype=torch.float64)
-    torch.testing.assert_close(solver.momenta(states[-1])["linear"], expected, rtol=0, atol=1e-12)
+    assert_close(solver.momenta(states[-1])["linear"], expected, rtol=0, atol=1e-12)
     release = SequentialRelease(region, [1, 0, 0], 0.0, 0.04)
     solver = MPMSolver(dx=0.1, formulation=formulation, boundaries=[release])
     fall = march(solver, points, 0.01, 3)[-1].velocity[..., 2]
     # at 0.03 s the first of three has fallen for 3 substeps and the second, released at 0.02 s, for 1
     counts = torch.tensor([[3.0, 1, 0], [3, 1, 0], [3, 3, 3]], dtype=torch.float64)
-    torch.testing.assert_close(fall, -0.098 * counts, rtol=0, atol=1e-12)
+    assert_close(fall, -0.098 * counts, rtol=0, atol=1e-12)
 
 
 @pytest.mark.parametrize("formulation", FORMULATIONS)
@@ -47,7 +45,7 @@ def test_release_passes_over_lone_particles_in_order(formulation, direction, lon
     for k, state in enumerate(march(solver, points, dt, 45)):
         begins = dt * torch.arange(k, dtype=torch.float64)[:, None]
         falling = (begins >= times - 1e-9).sum(0).double()
-        torch.testing.assert_close(state.velocity[:, 2], -9.8 * dt * falling, rtol=0, atol=1e-10)
+        assert_close(state.velocity[:, 2], -9.8 * dt * falling, rtol=0, atol=1e-10)
     assert bool((falling > 0).all())
 
 
@@ -70,7 +68,7 @@ def test_release_lets_layers_of_a_block_fall_in_order(formulation, sign, block, 
     # past the end nothing is held: the whole gains momentum at the rate of its weight
     gained = solver.momenta(states[45])["linear"] - solver.momenta(states[28])["linear"]
     weight = torch.tensor([0.0, 0.0, -9.8], dtype=torch.float64) * points.mass.sum()
-    torch.testing.assert_close(gained, weight * dt * 17, rtol=1e-9, atol=1e-9)
+    assert_close(gained, weight * dt * 17, rtol=1e-9, atol=1e-9)
 
 
 @pytest.mark.parametrize("formulation", FORMULATIONS)
@@ -84,7 +82,7 @@ def test_release_turns_with_its_frame(formulation, lone, march):
     solver = MPMSolver(dx=0.1, formulation=formulation, boundaries=[release])
     end = march(solver, points, 0.01, 5, frame=frame)[-1]
     falling = torch.tensor([3.0, 1.0, 5.0], dtype=torch.float64)  # the third lies outside the region
-    torch.testing.assert_close(end.velocity[:, 2], -0.098 * falling, rtol=0, atol=1e-12)
+    assert_close(end.velocity[:, 2], -0.098 * falling, rtol=0, atol=1e-12)
 
 
 def test_release_of_a_single_layer_is_at_its_start():

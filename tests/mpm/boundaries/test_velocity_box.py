@@ -3,12 +3,9 @@
 import pytest
 import torch
 
-from gaussian_swaying.geometry.frame import SimFrame
-from gaussian_swaying.geometry.regions import Box
+from gaussian_swaying import Box, MaterialPoints, MPMSolver, SimFrame
 from gaussian_swaying.mpm.boundaries.boundary import Nodes
 from gaussian_swaying.mpm.boundaries.velocity_box import VelocityBox
-from gaussian_swaying.mpm.solver import MPMSolver
-from gaussian_swaying.mpm.state import MaterialPoints
 
 FORMULATIONS = ["total", "updated"]
 

@@ -3,9 +3,8 @@
 import pytest
 import torch
 
+from gaussian_swaying import MaterialPoints, MPMSolver
 from gaussian_swaying.mpm.contact.surface import Surface
-from gaussian_swaying.mpm.solver import MPMSolver
-from gaussian_swaying.mpm.state import MaterialPoints
 
 SPACING, THICKNESS = 0.02, 0.01
 DX = 2.2 * SPACING

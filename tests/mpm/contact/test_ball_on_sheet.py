@@ -6,11 +6,9 @@ import pytest
 import torch
 from contacts import crossings, gaps, sheet_triangles
 
-from gaussian_swaying.geometry.regions import Box, Not
-from gaussian_swaying.mpm.boundaries.pinned_region import PinnedRegion
-from gaussian_swaying.mpm.contact.surface import Contact, Surface
-from gaussian_swaying.mpm.solver import MPMSolver
-from gaussian_swaying.mpm.state import MaterialPoints
+from gaussian_swaying import Box, Contact, MaterialPoints, MPMSolver, PinnedRegion
+from gaussian_swaying.geometry.regions import Not
+from gaussian_swaying.mpm.contact.surface import Surface
 
 RADIUS, SPACING, THICKNESS, SIDE = 0.1, 0.02, 0.01, 26
 RINGS, AROUND = 11, 18
@@ -98,7 +96,7 @@ def test_a_ball_dropped_on_a_sheet_dents_it_and_bounces(march, seconds):
         assert max(heights[lowest:]) > heights[lowest] + 0.15  # and back up
 
 
-@pytest.mark.slow(twin="test_a_ball_dropped_on_a_sheet_dents_it_and_bounces")
+@pytest.mark.slow
 def test_a_ball_dropped_on_a_damped_sheet_comes_to_rest(march):
     """Motion decays at 4 per second. After 0.72 s energy no longer grows, and the ball stays where it lies."""
     solver, state, triangles = _drop(gravity=(0, 0, -9.8), damping=8.0)

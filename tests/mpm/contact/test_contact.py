@@ -1,7 +1,4 @@
-"""Sheets that touch each other and themselves: nothing passes through, momentum stays, piles rest.
-
-Covers: mpm.contact.stage, mpm.contact.surface.
-"""
+"""Sheets that touch each other and themselves: nothing passes through, momentum stays, piles rest."""
 
 from dataclasses import replace
 from functools import partial
@@ -9,14 +6,13 @@ from functools import partial
 import pytest
 import torch
 from contacts import crossings, gaps, sheet_triangles
+from torch.testing import assert_close
 
+from gaussian_swaying import Contact, MaterialPoints, MPMSolver, PinnedPoints
 from gaussian_swaying.mpm.boundaries.half_space import HalfSpaceObstacle
-from gaussian_swaying.mpm.boundaries.pinned_points import PinnedPoints
 from gaussian_swaying.mpm.contact.pairs import close_pairs
 from gaussian_swaying.mpm.contact.solve import Constraints, Rows, pair_gaps, resolve
-from gaussian_swaying.mpm.contact.surface import Contact, Surface
-from gaussian_swaying.mpm.solver import MPMSolver
-from gaussian_swaying.mpm.state import MaterialPoints
+from gaussian_swaying.mpm.contact.surface import Surface
 
 THICKNESS = 0.01
 GROUND = [0.0, 0.0, -0.005], [0.0, 0.0, 1.0]
@@ -49,7 +45,7 @@ def test_sheets_that_collide_do_not_pass_each_other(sheet, scene, march, speed, 
     assert len(found) > 500  # they touched
     assert float((found < 0.5).double().mean()) <= 1e-3
     after = solver.momenta(later)["linear"]
-    torch.testing.assert_close(after, momentum, rtol=0, atol=1e-14 * speed)
+    assert_close(after, momentum, rtol=0, atol=1e-14 * speed)
     if friction == 0:  # without friction nothing but the tilt of the sheets pulls sideways
         assert float(later.velocity[points.count - 100 :, 0].mean()) > 0.7 * 0.3 * speed
 
@@ -139,7 +135,7 @@ def test_a_pile_at_rest_stays_at_rest(sheet, scene, march, layers, seconds):
     assert moved < 0.01 * THICKNESS
 
 
-@pytest.mark.slow(twin="test_a_pile_at_rest_stays_at_rest")
+@pytest.mark.slow
 @pytest.mark.timeout(7200)
 @pytest.mark.parametrize(("dtype", "seconds"), [(torch.float64, 11.5), (torch.float32, 60.0)])
 def test_a_pile_rests_for_long(sheet, scene, march, dtype, seconds):
@@ -159,7 +155,7 @@ def test_the_lists_do_not_change_the_result(sheet, scene, march):
     other = scene(points, Contact(), velocity=velocity, gravity=(0, 0, 0))[0]
     again = march(other, middle, 0.02)[-1]
     assert solver.bound.contact.made > other.bound.contact.made > 0
-    torch.testing.assert_close(again.position, known.position, rtol=0, atol=1e-10)
+    assert_close(again.position, known.position, rtol=0, atol=1e-10)
 
 
 def test_gradients_flow_through_a_contact(sheet, scene, march):
@@ -226,8 +222,8 @@ def test_gaps_of_discs():
     first, second = torch.stack([up, side, up, up]), torch.stack([-up, -up, up, up])
     radius, thickness = torch.full((4,), 0.6), torch.full((4,), 0.1)
     normal, gap, above = pair_gaps(arm, (first, second), (radius, radius), thickness)
-    torch.testing.assert_close(normal[:2], torch.stack([up, -up]))
-    torch.testing.assert_close(gap[:2], torch.tensor([0.4, 0.4]))
+    assert_close(normal[:2], torch.stack([up, -up]))
+    assert_close(gap[:2], torch.tensor([0.4, 0.4]))
     assert above.tolist() == [True, True, False, True]
     assert bool(torch.isfinite(normal).all())  # also for places that coincide
 
@@ -252,9 +248,9 @@ def test_lone_and_joint_impulses_are_exact():
             torch.ones(count, dtype=torch.bool),
         )
         after, impulse = resolve(velocity, rows, held, 1e-3, 0.1, 1)
-        torch.testing.assert_close(impulse[:, 2], mass[:count])
-        torch.testing.assert_close(impulse[:, 0], -0.1 * mass[:count])  # sliding: Coulomb's bound
-        torch.testing.assert_close(after[:count, 2], torch.zeros(count, dtype=torch.float64))
+        assert_close(impulse[:, 2], mass[:count])
+        assert_close(impulse[:, 0], -0.1 * mass[:count])  # sliding: Coulomb's bound
+        assert_close(after[:count, 2], torch.zeros(count, dtype=torch.float64))
 
 
 @pytest.mark.parametrize("count", [2, 4, 8])
@@ -314,5 +310,5 @@ def test_pins_are_stronger_than_contact(sheet, scene, march):
     solver, state = scene(points, Contact(), [PinnedPoints(corners)], velocity=velocity)
     end = march(solver, state, 0.12)[-1]
     held = torch.tensor([0, 15, 15 * 16, 255])
-    torch.testing.assert_close(end.position[held], points.position[held], rtol=0, atol=1e-9)
+    assert_close(end.position[held], points.position[held], rtol=0, atol=1e-9)
     assert float(end.position[256:, 2].mean()) > float(end.position[:256, 2].min())

@@ -1,17 +1,13 @@
-"""Contact in the Triton substep against torch.
-
-Covers: mpm.triton.contact_kernels, mpm.triton.contact_list_kernels, mpm.triton.fused_contact.
-"""
+"""Contact in the Triton substep against torch."""
 
 import pytest
 import torch
+from torch.testing import assert_close
 
+from gaussian_swaying import Contact, MaterialPoints, PinnedPoints
 from gaussian_swaying.mpm.boundaries.ball import BallObstacle
 from gaussian_swaying.mpm.boundaries.half_space import HalfSpaceObstacle
-from gaussian_swaying.mpm.boundaries.pinned_points import PinnedPoints
 from gaussian_swaying.mpm.contact.pairs import close_pairs
-from gaussian_swaying.mpm.contact.surface import Contact
-from gaussian_swaying.mpm.state import MaterialPoints
 from gaussian_swaying.mpm.triton import fused_contact
 
 DT = 1.2e-3
@@ -48,12 +44,12 @@ def test_the_kernels_do_what_torch_does(sheet, scene, device, iterations):
     assert solver.fused().touching.rounds > 0
     changed = float((ends[0].velocity - middle).abs().max())
     assert changed > 5.0
-    torch.testing.assert_close(ends[1].position, ends[0].position, rtol=0, atol=2e-5)
-    torch.testing.assert_close(ends[1].velocity, ends[0].velocity, rtol=0, atol=1e-3 * changed)
-    torch.testing.assert_close(taken[1], taken[0], rtol=0, atol=1e-4 * float(taken[0].abs().max()) + 1e-6)
+    assert_close(ends[1].position, ends[0].position, rtol=0, atol=2e-5)
+    assert_close(ends[1].velocity, ends[0].velocity, rtol=0, atol=1e-3 * changed)
+    assert_close(taken[1], taken[0], rtol=0, atol=1e-4 * float(taken[0].abs().max()) + 1e-6)
 
 
-@pytest.mark.slow(twin="test_nodes_are_stopped_as_in_torch")
+@pytest.mark.slow
 def test_obstacles_alone_do_what_they_do_in_torch(sheet, scene, device):
     """One that the sheet falls onto, one that it does not reach, and one for a short time; there are no pairs."""
     points = sheet(5, 5, dtype=torch.float32).map(lambda t: t.to(device))
@@ -78,9 +74,9 @@ def test_obstacles_alone_do_what_they_do_in_torch(sheet, scene, device):
     assert solver.fused().touching.rounds > 0
     assert float((ends[0].velocity - velocity).abs().max()) > 3.0
     assert bool((taken[0].abs().amax(-1) > 1e-5).equal(torch.tensor([True, False, True], device=device)))
-    torch.testing.assert_close(ends[1].position, ends[0].position, rtol=0, atol=2e-5)
-    torch.testing.assert_close(ends[1].velocity, ends[0].velocity, rtol=0, atol=1e-2)
-    torch.testing.assert_close(taken[1], taken[0], rtol=0, atol=1e-4 * float(taken[0].abs().max()) + 1e-7)
+    assert_close(ends[1].position, ends[0].position, rtol=0, atol=2e-5)
+    assert_close(ends[1].velocity, ends[0].velocity, rtol=0, atol=1e-2)
+    assert_close(taken[1], taken[0], rtol=0, atol=1e-4 * float(taken[0].abs().max()) + 1e-7)
     assert float(taken[1][1].abs().max()) == 0.0
 
 
@@ -93,7 +89,7 @@ def test_iterations_are_counted_where_there_are_obstacles(sheet, scene, device):
     assert solver.fused().touching.rounds == 6
 
 
-@pytest.mark.slow(twin="test_the_lists_do_not_change_the_result")
+@pytest.mark.slow
 def test_many_substeps_use_the_lists_again(sheet, scene, device, monkeypatch):
     """A sheet that falls onto another is stopped as in torch, with lists that serve several substeps."""
     points, _, _ = _collision(sheet, device)
@@ -109,7 +105,7 @@ def test_many_substeps_use_the_lists_again(sheet, scene, device, monkeypatch):
         ends.append(state)
     assert 0 < solver.fused().touching.made < 12
     assert float((ends[0].velocity[25:, 2] + 10.0).abs().max()) > 0.5  # they touched
-    torch.testing.assert_close(ends[1].position, ends[0].position, rtol=0, atol=1e-4)
+    assert_close(ends[1].position, ends[0].position, rtol=0, atol=1e-4)
 
 
 def test_the_lists_are_those_of_close_pairs(sheet, scene, device):
@@ -153,7 +149,7 @@ def test_nodes_without_weight_do_not_widen_the_lists(sheet, scene, device):
     touching = solver.fused().touching
     assert touching.made == 1
     assert float(touching.margin) < 0.5 * dx
-    torch.testing.assert_close(ends[1].position, ends[0].position, rtol=0, atol=1e-6)
+    assert_close(ends[1].position, ends[0].position, rtol=0, atol=1e-6)
 
 
 def test_lists_that_do_not_fit_get_more_room(sheet, scene, device, monkeypatch):
@@ -207,7 +203,7 @@ def test_graphs_do_what_single_substeps_do(sheet, scene):
         ends.append(state)
     scale = float((ends[0].position - points.position).abs().max())
     assert scale > 0.05
-    torch.testing.assert_close(ends[1].position, ends[0].position, rtol=0, atol=0.02 * scale)
+    assert_close(ends[1].position, ends[0].position, rtol=0, atol=0.02 * scale)
 
 
 @pytest.mark.gpu

@@ -6,9 +6,7 @@ import pytest
 import torch
 from contacts import crossings, sheet_triangles
 
-from gaussian_swaying.mpm.contact.surface import Contact
-from gaussian_swaying.mpm.solver import MPMSolver
-from gaussian_swaying.mpm.state import MaterialPoints
+from gaussian_swaying import Contact, MaterialPoints, MPMSolver
 
 THICKNESS, APART = 0.01, 0.2
 

@@ -5,13 +5,12 @@ import math
 import pytest
 import torch
 
+from gaussian_swaying import MaterialPoints, MPMSolver
 from gaussian_swaying.geometry.keyed_path import KeyedPath
 from gaussian_swaying.mpm.boundaries.ball import BallObstacle
 from gaussian_swaying.mpm.boundaries.block import BoxObstacle
 from gaussian_swaying.mpm.boundaries.capsule import CapsuleObstacle
 from gaussian_swaying.mpm.boundaries.half_space import HalfSpaceObstacle
-from gaussian_swaying.mpm.solver import MPMSolver
-from gaussian_swaying.mpm.state import MaterialPoints
 
 FORMULATIONS = ["total", "updated"]
 
@@ -73,7 +72,7 @@ def test_what_an_obstacle_takes_is_what_the_body_loses(formulation):
     torch.testing.assert_close(momentum, weight * state.time - state.impulse[0], rtol=0, atol=1e-10)
 
 
-@pytest.mark.slow(twin="test_what_an_obstacle_takes_is_what_the_body_loses")
+@pytest.mark.slow
 @pytest.mark.parametrize("shape", ["ground", "block", "capsule"])
 @pytest.mark.parametrize("formulation", FORMULATIONS)
 def test_a_moving_obstacle_moves_what_lies_on_it(formulation, shape):

@@ -7,13 +7,9 @@ import math
 
 import pytest
 import torch
+from torch.testing import assert_close
 
-from gaussian_swaying.aero.force import AeroForce
-from gaussian_swaying.aero.wind import WindField
-from gaussian_swaying.aero.wind_force import WindForce
-from gaussian_swaying.geometry.regions import Box
-from gaussian_swaying.mpm.solver import MPMSolver
-from gaussian_swaying.mpm.state import MaterialPoints
+from gaussian_swaying import AeroForce, Box, MaterialPoints, MPMSolver, WindField, WindForce
 
 TOLERANCE = 2e-5
 """Relative to the largest value of a field. A substep rounds some hundred times (half of 1.2e-7 each): in the
@@ -106,18 +102,16 @@ def check_agreement(ends, tolerance=TOLERANCE, names=FIELDS):
         assert torch.equal(found.lost, expected.lost)
         assert found.grid == expected.grid
         assert found.substep == expected.substep
-        torch.testing.assert_close(found.time, expected.time)
+        assert_close(found.time, expected.time)
         assert found.work.dtype == torch.float64
         # a sum over particles with both signs: the sum of its absolute terms is some sqrt(P) larger
         scale = most * math.sqrt(expected.position.shape[-2])
-        torch.testing.assert_close(found.work, expected.work, rtol=0, atol=tolerance * scale, msg=lambda m: "work " + m)
+        assert_close(found.work, expected.work, rtol=0, atol=tolerance * scale, msg=lambda m: "work " + m)
         # what is taken is a part of the momentum of the body
         assert found.impulse.dtype == torch.float64
         scale = float(expected.velocity.abs().max()) * 0.01 * expected.position.shape[-2]
         scale = max([scale, *expected.impulse.abs().reshape(-1).tolist()])
-        torch.testing.assert_close(
-            found.impulse, expected.impulse, rtol=0, atol=tolerance * scale, msg=lambda m: "impulse " + m
-        )
+        assert_close(found.impulse, expected.impulse, rtol=0, atol=tolerance * scale, msg=lambda m: "impulse " + m)
         for name in names:
             a, b = getattr(expected, name), getattr(found, name)
             assert (a is None) == (b is None), name

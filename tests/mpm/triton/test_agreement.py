@@ -2,9 +2,6 @@
 
 Each law, boundary, wind and damping is in one scene at least of each formulation that has it; on a GPU all boundaries
 are in both.
-
-Covers: mpm.triton.damping, mpm.triton.fused_updated, mpm.triton.shared, mpm.triton.total_kernels,
-mpm.triton.updated_kernels.
 """
 
 import dataclasses
@@ -13,10 +10,8 @@ import pytest
 import torch
 from catalogue import ELASTIC, PLASTIC, conditions, made
 
-from gaussian_swaying.aero.force import AeroForce
+from gaussian_swaying import AeroForce, WindField, WindForce
 from gaussian_swaying.aero.patches import Patches
-from gaussian_swaying.aero.wind import WindField
-from gaussian_swaying.aero.wind_force import WindForce
 from gaussian_swaying.geometry.regions import Everything
 
 from .bodies import (

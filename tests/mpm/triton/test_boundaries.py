@@ -3,11 +3,8 @@
 import pytest
 import torch
 
-from gaussian_swaying.aero.wind import WindField
+from gaussian_swaying import Box, PinnedRegion, WindField, WindForce
 from gaussian_swaying.aero.wind_batch import WindBatch
-from gaussian_swaying.aero.wind_force import WindForce
-from gaussian_swaying.geometry.regions import Box
-from gaussian_swaying.mpm.boundaries.pinned_region import PinnedRegion
 from gaussian_swaying.mpm.boundaries.plane import Plane
 from gaussian_swaying.mpm.boundaries.velocity_box import VelocityBox
 from gaussian_swaying.mpm.triton import fused_updated

@@ -4,13 +4,7 @@ import pytest
 import torch
 from catalogue import ELASTIC, PLASTIC
 
-from gaussian_swaying.aero.force import AeroForce
-from gaussian_swaying.aero.wind import UniformGust, WindField
-from gaussian_swaying.aero.wind_force import WindForce
-from gaussian_swaying.geometry.regions import Box
-from gaussian_swaying.mpm.boundaries.pinned_region import PinnedRegion
-from gaussian_swaying.mpm.solver import MPMSolver
-from gaussian_swaying.mpm.state import MaterialPoints
+from gaussian_swaying import AeroForce, Box, MaterialPoints, MPMSolver, PinnedRegion, UniformGust, WindField, WindForce
 
 CASES = [
     ("total", "corotated", "hinge"),

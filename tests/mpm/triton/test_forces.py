@@ -1,18 +1,12 @@
-"""Wind, custom forces and their twins in the fused substep.
-
-Covers: aero.force_triton.
-"""
+"""Wind, custom forces and their twins in the fused substep."""
 
 import pytest
 import torch
 from catalogue import ELASTIC, PLASTIC
 
-from gaussian_swaying.aero.wind import SpatialWind, WindField
-from gaussian_swaying.aero.wind_force import WindForce
+from gaussian_swaying import Force, PinnedRegion, SpatialWind, WindField, WindForce
 from gaussian_swaying.kernels.language import tl, triton
-from gaussian_swaying.mpm.boundaries.pinned_region import PinnedRegion
 from gaussian_swaying.mpm.boundaries.plane import Plane
-from gaussian_swaying.mpm.forces import Force
 from gaussian_swaying.mpm.triton import fused, fused_updated
 from gaussian_swaying.mpm.twins import Numbers, Twin
 

@@ -7,16 +7,13 @@ import weakref
 import pytest
 import torch
 
-from gaussian_swaying.aero.wind_force import WindForce
-from gaussian_swaying.geometry.regions import Box, Everything
-from gaussian_swaying.mpm.boundaries.boundary import Boundary
+from gaussian_swaying import Boundary, Box, MPMSolver, PinnedRegion, WindForce
+from gaussian_swaying.geometry.regions import Everything
 from gaussian_swaying.mpm.boundaries.impulse import Impulse
-from gaussian_swaying.mpm.boundaries.pinned_region import PinnedRegion
 from gaussian_swaying.mpm.boundaries.plane import Plane
 from gaussian_swaying.mpm.boundaries.velocity_box import VelocityBox
 from gaussian_swaying.mpm.laws.fixed_corotated import FixedCorotated
 from gaussian_swaying.mpm.laws.metal import Metal
-from gaussian_swaying.mpm.solver import MPMSolver
 from gaussian_swaying.mpm.triton import fused
 
 from .bodies import (

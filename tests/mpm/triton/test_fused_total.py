@@ -5,10 +5,9 @@ import dataclasses
 import pytest
 import torch
 
-from gaussian_swaying.aero.wind import FlowKey, WindField
-from gaussian_swaying.aero.wind_force import WindForce
+from gaussian_swaying import MPMSolver, WindField, WindForce
+from gaussian_swaying.aero.wind import FlowKey
 from gaussian_swaying.kernels.launch import lanes
-from gaussian_swaying.mpm.solver import MPMSolver
 from gaussian_swaying.mpm.state import GridSpec
 from gaussian_swaying.mpm.triton import fused_total
 

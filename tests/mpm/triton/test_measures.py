@@ -1,7 +1,4 @@
-"""The Courant number and the elastic energy from the kernels.
-
-Covers: mpm.triton.measure_kernels.
-"""
+"""The Courant number and the elastic energy from the kernels."""
 
 import math
 

@@ -8,18 +8,16 @@ import pytest
 import torch
 from catalogue import ELASTIC, PLASTIC
 
-from gaussian_swaying.aero.wind import FlowKey, GaussianGust, SineSway, WindField
-from gaussian_swaying.geometry.regions import Box
+from gaussian_swaying import Box, GaussianGust, MPMSolver, PinnedRegion, SimulationDiverged, SineSway, WindField
+from gaussian_swaying.aero.wind import FlowKey
 from gaussian_swaying.kernels import graphs
 from gaussian_swaying.mpm.boundaries.enclosing_box import EnclosingBox
 from gaussian_swaying.mpm.boundaries.handle import Handle
-from gaussian_swaying.mpm.boundaries.pinned_region import PinnedRegion
 from gaussian_swaying.mpm.boundaries.plane import Plane
 from gaussian_swaying.mpm.boundaries.velocity_box import VelocityBox
-from gaussian_swaying.mpm.solver import MPMSolver
 from gaussian_swaying.mpm.state import GridSpec
 from gaussian_swaying.mpm.triton import fused, fused_total, fused_updated
-from gaussian_swaying.simulation.diagnostics import SimulationDiverged, check_state
+from gaussian_swaying.simulation.diagnostics import check_state
 
 from .bodies import (
     DT,

@@ -1,7 +1,4 @@
-"""The kernel of the forces on the sites of ``modes``, against torch.
-
-Covers: mpm.triton.site_kernels.
-"""
+"""The kernel of the forces on the sites of ``modes``, against torch."""
 
 import pytest
 import torch

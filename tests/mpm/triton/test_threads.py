@@ -3,13 +3,10 @@
 import pytest
 import torch
 
-from gaussian_swaying.aero.wind import UniformGust, WindField
-from gaussian_swaying.geometry.regions import Box
+from gaussian_swaying import Box, MPMSolver, PinnedRegion, UniformGust, WindField
 from gaussian_swaying.mpm.boundaries.ball import BallObstacle
-from gaussian_swaying.mpm.boundaries.pinned_region import PinnedRegion
 from gaussian_swaying.mpm.boundaries.plane import Plane
 from gaussian_swaying.mpm.laws.sand import Sand
-from gaussian_swaying.mpm.solver import MPMSolver
 
 from .bodies import DT, FIELDS, make_body, make_load, noise
 
