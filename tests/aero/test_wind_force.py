@@ -114,23 +114,6 @@ def test_gradients_through_a_capped_area_are_finite():
 
 
 @pytest.mark.parametrize("formulation", ["total", "updated"])
-@pytest.mark.parametrize("drag_step", ["explicit", "semi_implicit"])
-def test_a_rollout_in_the_wind_is_the_one_with_its_forces(formulation, drag_step):
-    solver, state, load = _setting(wind=RISING, formulation=formulation, drag_step=drag_step)
-    whole = solver.rollout(state, DT, 5, load)
-    step = state
-    for _ in range(5):
-        force, drag = load(step)
-        step = solver.step(step, DT, force=force, drag=drag)
-    called = solver.rollout(state, DT, 5, lambda s: load(s))
-    calm = solver.rollout(state, DT, 5)
-    for other in (step, called):
-        assert_close(whole.position, other.position, rtol=0, atol=1e-12)
-        assert_close(whole.work, other.work)
-    assert float((whole.position - calm.position).abs().max()) > 1e-6
-
-
-@pytest.mark.parametrize("formulation", ["total", "updated"])
 def test_a_batch_is_each_scene_by_itself(formulation):
     solver, state, load = _setting(batch=(2,), wind=[GUSTS, RISING], formulation=formulation)
     force, _ = load(state)

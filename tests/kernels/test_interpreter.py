@@ -20,7 +20,7 @@ TESTS = [
     "mpm/triton/test_fused_total.py::test_crowded_cells_are_cut_only_where_there_are_few[cpu]",
     "mpm/triton/test_agreement.py::test_kernels_do_what_torch_does[cpu: total, corotated, nodes, hinge and clamp]",
     "mpm/contact/test_fused_contact.py::test_the_kernels_do_what_torch_does[cpu-4]",
-    "mpm/test_adjoint.py::test_gradients_with_pins_of_both_kinds[cpu]",
+    "mpm/test_adjoint.py::test_gradients_of_a_rollout[cpu-pins of both kinds]",
 ]
 
 

@@ -4,6 +4,7 @@ import dataclasses
 
 import pytest
 import torch
+from catalogue import ELASTIC
 
 from gaussian_swaying import (
     AeroForce,
@@ -26,20 +27,10 @@ from gaussian_swaying.kernels.launch import lanes, launch
 from gaussian_swaying.mpm.boundaries.ball import BallObstacle
 from gaussian_swaying.mpm.boundaries.plane import Plane
 from gaussian_swaying.mpm.damping import kelvin_voigt_pk1
-from gaussian_swaying.mpm.laws.fixed_corotated import FixedCorotated
-from gaussian_swaying.mpm.laws.hencky import StVKHencky
-from gaussian_swaying.mpm.laws.neo_hookean import NeoHookean
-from gaussian_swaying.mpm.laws.spring_network import SpringNetwork
 from gaussian_swaying.mpm.laws.triton.body import BodyLaws, pk1_adjoint
 from gaussian_swaying.mpm.triton import fused_total
 from gaussian_swaying.mpm.triton.damping import kelvin_voigt_adjoint
 
-LAWS = {
-    "corotated": FixedCorotated(),
-    "neo-hookean": NeoHookean(),
-    "hencky": StVKHencky(),
-    "springs": SpringNetwork(),
-}
 WIDE = torch.float64
 
 
@@ -122,7 +113,7 @@ def _tolerance(device, double, single):
     return (WIDE, double) if device.type == "cpu" else (torch.float32, single)
 
 
-@pytest.mark.parametrize("name", LAWS)
+@pytest.mark.parametrize("name", ELASTIC)
 def test_derivative_of_a_stress(name, kernel_device):
     """By F in a random direction, and by mu and lambda; mu and lambda in either order."""
     # the kernels have the limit of the logarithm in float32
@@ -131,8 +122,8 @@ def test_derivative_of_a_stress(name, kernel_device):
     mu = (4e3 * (1.5 + _random(2, len(F)).tanh())).requires_grad_()
     lam = (4e3 * (1.5 + _random(3, len(F)).tanh())).requires_grad_()
     Q = _random(1, len(F), 3, 3)
-    expected = torch.autograd.grad((LAWS[name].pk1(F, mu, lam) * Q).sum(), [F, mu, lam])
-    laws = BodyLaws([LAWS[name]])
+    expected = torch.autograd.grad((ELASTIC[name].pk1(F, mu, lam) * Q).sum(), [F, mu, lam])
+    laws = BodyLaws([ELASTIC[name]])
     row = torch.tensor(laws.table, device=kernel_device, dtype=torch.float32)
     given = [t.detach().to(kernel_device, dtype).contiguous() for t in (F, Q, mu, lam)]
     change, scalars = torch.empty_like(given[0]), torch.empty(len(F), 2, device=kernel_device, dtype=dtype)
@@ -305,53 +296,47 @@ def _compare(device, law, tolerance=3e-4, left_out=(), **settings):
         pytest.fail(f"above {tolerance:.0e} of the largest value: " + ", ".join(rows))
 
 
-@pytest.mark.slow(gate=["cpu-corotated", "cpu-hencky"])
-@pytest.mark.parametrize("name", LAWS)
+def _pin(kind):
+    return PinnedRegion(Box([None, None, None], [0.12, None, None]), kind=kind)
+
+
+SEVERAL = [ELASTIC["corotated"], ELASTIC["neo-hookean"]]
+ROLLOUTS = {  # by everything that a fit may seek; with 5 substeps, segments of two and a shorter last one
+    **{name: lambda name=name: (ELASTIC[name], {"steps": 5, "damping": 0.5}) for name in ELASTIC},
+    "viscosity, rates and two laws": lambda: (SEVERAL, {"stiffness_damping": 2e-3, "damped": True}),
+    # held nodes, points and slopes; the gradient by the density goes through what held points weigh, too
+    **{kind: lambda kind=kind: (SEVERAL[0], {"boundaries": [_pin(kind)]}) for kind in ("nodes", "hinge", "clamp")},
+    # nodes that are held, and moved by a held point as well
+    "pins of both kinds": lambda: (
+        SEVERAL[0],
+        {
+            "boundaries": [
+                PinnedRegion(Box([None, None, None], [0.12, 0.12, None])),
+                PinnedPoints([[0.15, 0.15, 0.07]]),
+            ]
+        },
+    ),
+    "two scenes in one wind": lambda: (SEVERAL[0], {"batch": (2,), "boundaries": [_pin("hinge")]}),
+    "groups of patches": lambda: (SEVERAL[0], {"groups": True}),
+}
+
+
+@pytest.mark.slow(gate=[f"cpu-{name}" for name in ROLLOUTS if name not in ("neo-hookean", "springs", "hinge")])
+@pytest.mark.parametrize("name", ROLLOUTS)
 def test_gradients_of_a_rollout(name, kernel_device):
-    """A sheet in wind, by everything that a fit may seek, in segments of two substeps and a shorter last one."""
-    _compare(kernel_device, LAWS[name], steps=5, damping=0.5)
-
-
-def test_gradients_with_viscosity_and_two_laws(kernel_device):
-    """The viscous stress, a rate of damping at each point, and particles of two laws."""
-    _compare(kernel_device, [FixedCorotated(), NeoHookean()], stiffness_damping=2e-3, damped=True)
-
-
-@pytest.mark.slow(gate=["cpu-clamp", "cpu-nodes"])
-@pytest.mark.parametrize("kind", ["nodes", "hinge", "clamp"])
-def test_gradients_with_pins(kind, kernel_device):
-    """Held nodes, points and slopes; the gradient by the density goes through what held points weigh, too."""
-    pin = PinnedRegion(Box([None, None, None], [0.12, None, None]), kind=kind)
-    _compare(kernel_device, FixedCorotated(), boundaries=[pin])
-
-
-def test_gradients_with_pins_of_both_kinds(kernel_device):
-    """Nodes that are held, and moved by a held point as well."""
-    nodes = PinnedRegion(Box([None, None, None], [0.12, 0.12, None]))
-    points = PinnedPoints([[0.15, 0.15, 0.07]])
-    _compare(kernel_device, FixedCorotated(), boundaries=[nodes, points])
-
-
-def test_gradients_of_several_scenes(kernel_device):
-    """A batch in one wind."""
-    pin = PinnedRegion(Box([None, None, None], [0.12, None, None]), kind="hinge")
-    _compare(kernel_device, FixedCorotated(), batch=(2,), boundaries=[pin])
-
-
-def test_gradients_with_groups_of_patches(kernel_device):
-    """Points that carry several patches."""
-    _compare(kernel_device, FixedCorotated(), groups=True)
+    law, settings = ROLLOUTS[name]()
+    _compare(kernel_device, law, **settings)
 
 
 def test_gradients_without_wind(kernel_device):
     """No force at all: nothing is gathered but F."""
-    _compare(kernel_device, FixedCorotated(), wind=False, left_out=("volume",))
+    _compare(kernel_device, ELASTIC["corotated"], wind=False, left_out=("volume",))
 
 
 def test_gradients_where_cells_are_cut(kernel_device, monkeypatch):
     """Crowded cells are cut into pieces, whose sums are joined."""
     monkeypatch.setattr(fused_total, "_lanes", lambda sizes: 2)
-    _compare(kernel_device, FixedCorotated(), steps=3)
+    _compare(kernel_device, ELASTIC["corotated"], steps=3)
 
 
 # ---- what is left to torch

@@ -4,6 +4,7 @@ import pytest
 import torch
 from bench.problems.flags import flag
 from bench.problems.settings import Settings
+from catalogue import ELASTIC, PLASTIC
 from torch.testing import assert_close
 
 from gaussian_swaying import Box, MaterialPoints, MPMSolver, PinnedRegion
@@ -12,29 +13,8 @@ from gaussian_swaying.mpm import dispatch
 from gaussian_swaying.mpm import formulations as known
 from gaussian_swaying.mpm.formulations.formulation import Formulation
 from gaussian_swaying.mpm.laws import law as law_module
-from gaussian_swaying.mpm.laws.fixed_corotated import FixedCorotated
-from gaussian_swaying.mpm.laws.fluid import Fluid
-from gaussian_swaying.mpm.laws.foam import Foam
-from gaussian_swaying.mpm.laws.hencky import StVKHencky
-from gaussian_swaying.mpm.laws.metal import Metal
-from gaussian_swaying.mpm.laws.neo_hookean import NeoHookean
-from gaussian_swaying.mpm.laws.plasticine import Plasticine
-from gaussian_swaying.mpm.laws.sand import Sand
-from gaussian_swaying.mpm.laws.snow import Snow
-from gaussian_swaying.mpm.laws.spring_network import SpringNetwork
 
 FORMULATIONS = ["total", "updated"]
-ELASTIC = [FixedCorotated, NeoHookean, SpringNetwork, StVKHencky]
-PLASTIC = [
-    Sand,
-    lambda: Sand(volume_correction=True),
-    lambda: Metal(yield_stress=200.0, hardening=1e3),
-    lambda: Foam(yield_stress=100.0, viscosity=10.0),
-    lambda: Plasticine(yield_stress=200.0, softening=500.0, residual=50.0),
-    Snow,
-    Fluid,
-]
-PLASTIC_NAMES = ["Sand", "Sand_vc", "Metal", "Foam", "Plasticine", "Snow", "Fluid"]
 
 
 def _points(size, spacing, law=None, e=1e4, density=100.0, thickness=None):
@@ -42,9 +22,7 @@ def _points(size, spacing, law=None, e=1e4, density=100.0, thickness=None):
     axes = [(torch.arange(max(round(side / spacing), 1), dtype=torch.float64) + 0.5) * spacing for side in size]
     position = torch.stack(torch.meshgrid(*axes, indexing="ij"), -1).reshape(-1, 3)
     volume = spacing**3 if thickness is None else spacing**2 * thickness
-    return MaterialPoints.create(
-        position, volume=volume, density=density, youngs_modulus=e, poisson_ratio=0.3, law=law and law()
-    )
+    return MaterialPoints.create(position, volume=volume, density=density, youngs_modulus=e, poisson_ratio=0.3, law=law)
 
 
 def _bar():
@@ -97,8 +75,8 @@ def test_formulations_agree_within_their_discretisation_error(make, dxs):
 def test_every_elastic_law_vibrates_alike_at_small_strain(law, formulation, device):
     """All linearise to the same material; at a strain of 1e-3 they differ by about that."""
     ends = []
-    for kind in (FixedCorotated, law):
-        points = _points((0.2, 0.2, 0.4), 0.05, kind)
+    for kind in ("corotated", law):
+        points = _points((0.2, 0.2, 0.4), 0.05, ELASTIC[kind])
         points = points.map(lambda t: t.to(device))
         velocity = torch.zeros_like(points.position)
         velocity[:, 2] = 0.02 * torch.cos(torch.pi * points.position[:, 2] / 0.4)
@@ -111,12 +89,12 @@ def test_every_elastic_law_vibrates_alike_at_small_strain(law, formulation, devi
 
 
 @pytest.mark.parametrize("formulation", FORMULATIONS)
-@pytest.mark.parametrize("law", [NeoHookean, StVKHencky])
+@pytest.mark.parametrize("law", ["neo-hookean", "hencky"])
 def test_an_elastic_law_is_its_own_at_large_strain(law, formulation):
     """The selected law is really used: at a strain of 0.3 the stresses differ."""
     ends = []
-    for kind in (FixedCorotated, law):
-        points = _points((0.2, 0.2, 0.4), 0.05, kind)
+    for kind in ("corotated", law):
+        points = _points((0.2, 0.2, 0.4), 0.05, ELASTIC[kind])
         velocity = torch.zeros_like(points.position)
         velocity[:, 2] = 12.0 * (points.position[:, 2] - 0.2)
         solver = MPMSolver(0.1, formulation, gravity=(0, 0, 0))
@@ -124,19 +102,17 @@ def test_an_elastic_law_is_its_own_at_large_strain(law, formulation):
     assert float((ends[0] - ends[1]).abs().max()) > 5e-4
 
 
-@pytest.mark.parametrize("law", PLASTIC, ids=PLASTIC_NAMES)
-def test_what_flows_is_refused_by_total(law):
-    points = _points((0.2, 0.2, 0.2), 0.05, law)
-    name = type(points.laws[0]).__name__
-    with pytest.raises(ValueError, match=rf"law {name} flows.*set `solver.formulation` to updated"):
-        MPMSolver(0.1, "total").init_state(points)
+def test_what_flows_is_refused_by_total():
+    for law in PLASTIC.values():
+        with pytest.raises(ValueError, match=rf"law {type(law).__name__} flows.*set `solver.formulation` to"):
+            MPMSolver(0.1, "total").init_state(_points((0.2, 0.2, 0.2), 0.05, law))
 
 
-@pytest.mark.slow(gate=["cpu-Snow", "cpu-Fluid", "cpu-Metal"])
-@pytest.mark.parametrize("law", PLASTIC, ids=PLASTIC_NAMES)
+@pytest.mark.slow(gate=["cpu-snow", "cpu-fluid", "cpu-metal"])
+@pytest.mark.parametrize("law", PLASTIC)
 def test_what_flows_forgets_its_shape(law, device):
     """A block pulled and sheared beyond yield: the elastic part stays small, the total deformation grows."""
-    points = _points((0.3, 0.3, 0.3), 0.05, law).map(lambda t: t.to(device))
+    points = _points((0.3, 0.3, 0.3), 0.05, PLASTIC[law]).map(lambda t: t.to(device))
     rate = torch.tensor([[3.0, 9.0, 0.0], [0.0, -3.0, 0.0], [0.0, 0.0, -1.5]], dtype=torch.float64, device=device)
     solver = MPMSolver(0.1, "updated", gravity=(0, 0, 0))
     state = solver.init_state(points, (points.position - 0.15) @ rate.T)
@@ -154,7 +130,7 @@ def test_what_flows_forgets_its_shape(law, device):
 
 def test_several_laws_in_one_run():
     """Sand, metal and an elastic block far apart in one run move as each does alone, internal variables too."""
-    laws = [Sand, lambda: Metal(yield_stress=100.0), NeoHookean]
+    laws = [PLASTIC["sand"], PLASTIC["metal"], ELASTIC["neo-hookean"]]
     parts, ends = [], []
     for k, law in enumerate(laws):
         part = _points((0.2, 0.2, 0.2), 0.05, law)
@@ -185,14 +161,14 @@ def test_laws_and_indices_that_do_not_fit_are_refused():
     points = _points((0.2, 0.2, 0.2), 0.05)
     common = {"volume": 1e-3, "density": 1.0, "youngs_modulus": 1e3, "poisson_ratio": 0.3}
     with pytest.raises(ValueError, match=r"`law_index` to say which of the 2 `laws`"):
-        MaterialPoints.create(points.position, **common, law=[Sand(), NeoHookean()])
+        MaterialPoints.create(points.position, **common, law=[PLASTIC["sand"], ELASTIC["neo-hookean"]])
     index = torch.full((points.count,), 2)
     with pytest.raises(ValueError, match=r"`law_index` to lie in 0 to 1"):
-        MaterialPoints.create(points.position, **common, law=[Sand(), NeoHookean()], law_index=index)
+        MaterialPoints.create(points.position, **common, law=[PLASTIC["sand"], ELASTIC["neo-hookean"]], law_index=index)
 
 
 @pytest.mark.parametrize("formulation", FORMULATIONS)
-@pytest.mark.parametrize("law", [FixedCorotated, NeoHookean])
+@pytest.mark.parametrize("law", ["corotated", "neo-hookean"])
 def test_an_elastic_run_computes_no_svd_and_no_return_map(law, formulation, monkeypatch):
     """State fields exist only if a scene needs them."""
 
@@ -207,7 +183,7 @@ def test_an_elastic_run_computes_no_svd_and_no_return_map(law, formulation, monk
         (torch.linalg, "eigh"),
     ):
         monkeypatch.setattr(home, name, forbidden)
-    points = _points((0.2, 0.2, 0.2), 0.05, law)
+    points = _points((0.2, 0.2, 0.2), 0.05, ELASTIC[law])
     solver = MPMSolver(0.1, formulation)
     state = solver.init_state(points, 2.0 * points.position)
     steps = solver.substeps(state, 0.02)
@@ -247,19 +223,6 @@ def _whole(dx, density, frames, device):
     return result["torn"] == result["lost"] == 0 and result["stretch_min"] > 0 and result["stretch_max"] < 4
 
 
-@pytest.mark.gpu
-@pytest.mark.parametrize("formulation", FORMULATIONS)
-def test_deterministic_runs_give_the_same_bits_on_a_gpu(formulation):
-    ends = []
-    for _ in range(2):
-        points = _points((0.6, 0.6, 0.6), 0.0125).map(lambda t: t.to("cuda", torch.float32))
-        solver = MPMSolver(0.025, formulation, deterministic=True)
-        velocity = torch.sin(20 * points.position)
-        ends.append(solver.rollout(solver.init_state(points, velocity), 2e-4, 40))
-    for name in ("position", "velocity", "F_elastic"):
-        assert torch.equal(getattr(ends[0], name), getattr(ends[1], name)), name
-
-
 # ---- a custom formulation
 
 
@@ -292,7 +255,7 @@ class Loose(Formulation):
 
 def test_a_third_formulation_is_one_class(monkeypatch):
     """The solver runs it like its own formulations: forces and their work, energies, substeps and grid."""
-    with pytest.raises(ValueError, match="`formulation` to be one of modes, total, updated, but got 'loose'"):
+    with pytest.raises(ValueError, match="`formulation` to be one of .*, but got 'loose'"):
         MPMSolver(formulation="loose")
     monkeypatch.setitem(known.FORMULATIONS, "loose", Loose)
     points = _points((0.2, 0.2, 0.2), 0.05)

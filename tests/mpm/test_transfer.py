@@ -387,11 +387,10 @@ def _body(count=150):
     return MaterialPoints.create(position, volume=0.4**3 / count, density=100.0, youngs_modulus=1e4, poisson_ratio=0.3)
 
 
-@pytest.mark.parametrize("beta", [0.0, 2e-3])
-def test_mls_steps_conserve_both_momenta(beta):
-    """A body that deforms, spins and is stressed, with and without stiffness damping."""
+def test_mls_steps_conserve_both_momenta():
+    """A body that deforms, spins, is stressed and damped."""
     points = _body()
-    solver = MPMSolver(dx=0.1, formulation="updated", gravity=(0, 0, 0), mls=True, stiffness_damping=beta)
+    solver = MPMSolver(dx=0.1, formulation="updated", gravity=(0, 0, 0), mls=True, stiffness_damping=2e-3)
     a = torch.tensor([[0.5, -0.8, 0.3], [0.8, 0.5, -0.1], [-0.5, 0.2, -0.4]], dtype=torch.float64)
     state = solver.init_state(points, (points.position - 0.2) @ a.T + 0.3)
     state = state.replace(affine=a.expand_as(state.affine))
@@ -416,21 +415,6 @@ def test_stress_changes_the_moment_of_momentum_by_the_virial(mls):
     moment = (mass * (end.velocity[:, :, None] * points.position[:, None, :] + 0.1**2 / 4 * end.affine)).sum(0)
     virial = (points.volume[:, None, None] * solver.laws.kirchhoff(F, None)).sum(0)
     assert_close(moment, -dt * virial, rtol=0, atol=1e-12 * float(virial.abs().max()))
-
-
-def test_mls_free_fall_and_affine_motion_are_exact():
-    points, dt = _body(), 1e-3
-    solver = MPMSolver(dx=0.1, formulation="updated", mls=True)
-    end = solver.rollout(solver.init_state(points), dt, 50)
-    fall = torch.tensor([0.0, 0.0, -9.8 * dt * dt * 50 * 51 / 2], dtype=torch.float64)
-    assert_close(end.position, points.position + fall, rtol=0, atol=1e-12)
-    assert_close(end.F_elastic, torch.eye(3).double().expand_as(end.F_elastic), rtol=0, atol=1e-12)
-    a = torch.tensor([[0.1, 0.4, 0.0], [-0.3, 0.2, 0.1], [0.0, 0.2, -0.1]], dtype=torch.float64)
-    solver = MPMSolver(dx=0.1, formulation="updated", mls=True, gravity=(0, 0, 0))
-    state = solver.init_state(points, points.position @ a.T)
-    end = solver.step(state.replace(affine=a.expand_as(state.affine)), dt)
-    expected = torch.eye(3, dtype=torch.float64) + dt * a
-    assert_close(end.F_elastic, expected.expand_as(end.F_elastic), rtol=0, atol=1e-12)
 
 
 def test_mls_is_another_discretisation_of_the_same_body():

@@ -98,7 +98,10 @@ def test_two_sheets_each_move_as_alone(transfer, kind):
 
 
 def test_kernels_do_what_torch_does_on_each_device(kernel_device):
-    """In single precision: pins, wind that depends on the place, viscosity and followers, of two scenes."""
+    """Pins, wind that depends on the place and viscosity, of two scenes; on a GPU in single precision.
+
+    A virtual node lies where the node lies that it is a copy of.
+    """
     parts = sheet(3.1), sheet(3.3)
     position, number = together(*parts)
     batch = MaterialPoints.stack([material(position, number), material(position + 0.31, number)])
@@ -106,7 +109,8 @@ def test_kernels_do_what_torch_does_on_each_device(kernel_device):
     up[..., 2] = 1.0
     wind, pins = WindField([5.0, 2.0, -1.0], effects=[LogProfile(height=3.0)]), [PinnedRegion(EDGE, "hinge")]
     ends = []
-    for kind, where, transfer in ((torch.float64, "cpu", "torch"), (torch.float32, kernel_device, "kernels")):
+    own = torch.float64 if kernel_device.type == "cpu" else torch.float32
+    for kind, where, transfer in ((torch.float64, "cpu", "torch"), (own, kernel_device, "kernels")):
         points = batch.map(lambda t: t.to(where, kind))  # noqa: B023
         solver = MPMSolver(1.0, boundaries=pins, transfer=transfer, stiffness_damping=1e-3).to(where)
         state = solver.init_state(points)
@@ -115,7 +119,8 @@ def test_kernels_do_what_torch_does_on_each_device(kernel_device):
     assert state.grid.virtual > 0
     away = (ends[0] - batch.position).abs().amax()
     assert away > 1e-3
-    assert (ends[0] - ends[1]).abs().amax() < 1e-3 * away
+    # of its logarithm, and of rounding
+    assert (ends[0] - ends[1]).abs().amax() < (1e-6 if own == torch.float64 else 1e-3) * away
 
 
 def test_a_place_takes_the_nodes_of_a_point_of_its_cell_that_is_near():
@@ -162,7 +167,7 @@ def test_arms_share_nodes_only_where_the_base_is_near():
 
 
 @pytest.mark.parametrize("how", ["a point", "points in a cell", "a line", "a sheet", "a block"])
-@pytest.mark.parametrize("turn", [0, 1, 2])
+@pytest.mark.parametrize("turn", [0, 2])
 def test_small_pieces_in_any_orientation_move_as_alone(how, turn):
     """Among each other in the same cells: nothing is singular, whatever few points a piece has."""
     reach = torch.arange(-2.0, 2.1, 0.4)
@@ -287,22 +292,6 @@ def test_a_place_far_from_the_few_points_of_a_piece_is_read_at_one_of_them():
     assert torch.equal(nodes[:, 0], nodes[:, 1])
 
 
-def test_wind_that_depends_on_the_place_in_kernels():
-    """A virtual node lies where the node lies that it is a copy of."""
-    position, number = together(sheet(3.1), sheet(3.3))
-    wind = WindField([5.0, 2.0, -1.0], effects=[LogProfile(height=3.0)])
-    up, area = torch.zeros_like(position), torch.full((len(position),), 0.01, dtype=torch.float64)
-    up[:, 2] = 1.0
-    ends = []
-    for transfer in ("torch", "kernels"):
-        solver = MPMSolver(1.0, boundaries=[PinnedRegion(EDGE)], transfer=transfer, stiffness_damping=1e-3)
-        state = solver.init_state(material(position, number))
-        ends.append(solver.rollout(state, 1e-2, 10, [WindForce(AeroForce(), wind, up, area)]))
-    away = (ends[0].position - position).abs().amax()
-    assert away > 1e-3
-    assert (ends[0].position - ends[1].position).abs().amax() < 1e-6 * away  # of its logarithm
-
-
 def test_a_state_is_saved_and_read():
     position, number = together(sheet(3.1), sheet(3.3))
     solver, start, state = rolled(material(position, number), steps=2)
@@ -392,17 +381,10 @@ def test_copies_are_numbered_after_the_lattice():
     assert coordinates(torch.tensor(35), grid).tolist() == [3, 2, 2]
 
 
-@pytest.mark.parametrize(
-    ("attached", "what"),
-    [
-        (torch.zeros(7, dtype=torch.long), "with a number for each point or"),
-        (torch.zeros(8), "to be int64"),
-        (torch.tensor([[0, 8]]), "from 0 to 7"),
-    ],
-)
-def test_wrong_numbers_are_refused(attached, what):
-    with pytest.raises(ValueError, match=what):
-        material(torch.rand(8, 3), attached)
+def test_wrong_numbers_are_refused():
+    for attached in (torch.zeros(7, dtype=torch.long), torch.zeros(8), torch.tensor([[0, 8]])):
+        with pytest.raises(ValueError, match="`attached`"):
+            material(torch.rand(8, 3), attached)
 
 
 def test_joined_bodies_keep_their_pieces():

@@ -64,7 +64,7 @@ def test_without_the_affine_velocity_angular_momentum_is_lost(settings):
 
 @EACH
 def test_affine_velocity_is_reproduced(settings):
-    """The first step has no stress: velocities and their gradient come back as they were."""
+    """The first step has no stress: velocities and their gradient come back as they were, and F is I + dt A."""
     points = _scattered()
     solver, state = _affine(settings, points, RATE)
     end = solver.step(state, 1e-3)
@@ -72,6 +72,9 @@ def test_affine_velocity_is_reproduced(settings):
     expected = (points.position - points.position.mean(0)) @ rate.T + 0.2
     assert_close(end.velocity, expected, rtol=0, atol=1e-13)
     assert_close(end.affine, rate.expand_as(end.affine), rtol=0, atol=1e-12)
+    assert_close(end.position, points.position + 1e-3 * expected, rtol=0, atol=1e-12)
+    F = torch.eye(3, dtype=torch.float64) + 1e-3 * rate
+    assert_close(end.F_elastic, F.expand_as(end.F_elastic), rtol=0, atol=1e-12)
 
 
 def _elsewhere(settings, shift, rate, steps):

@@ -202,16 +202,15 @@ def test_the_mirror_image_feels_the_mirrored_force(options, parity, axis):
     assert float((image - force * mirror).abs().max() > 0.1) == (parity < 0)
 
 
-@pytest.mark.parametrize("law", ["paper", "projected", "linear"])
-def test_force_grows_with_the_square_of_the_wind(law):
+def test_force_of_the_linear_law_grows_with_the_square_of_the_wind():
     wind, _, F, normal, area = _patches()
-    aero, still = AeroForce(law=law), torch.zeros(len(area), 3, dtype=torch.float64)
+    aero, still = AeroForce(law="linear"), torch.zeros(len(area), 3, dtype=torch.float64)
     patch = deform_patch(F, normal, area)
     one = aero(wind, still, *patch)
     for factor in (0.5, 2.0, 10.0):
         assert_close(aero(factor * wind, still, *patch), factor**2 * one, rtol=1e-12, atol=0)
     # turned round, the wind turns drag and friction, but not d x n, in which both factors turn
-    straight = AeroForce(law=law, C_L=0.0)(wind, still, *patch)
+    straight = AeroForce(law="linear", C_L=0.0)(wind, still, *patch)
     assert_close(aero(-wind, still, *patch), one - 2 * straight)
 
 
