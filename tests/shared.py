@@ -1,6 +1,13 @@
-"""What tests of several rooms share: draws, the files of a folder, and how a command refuses."""
+"""What tests of several rooms share: draws, material, the files of a folder, and how a command refuses."""
 
 import torch
+
+from gaussian_swaying import MaterialPoints
+
+
+def solid(position, volume, density=100.0, E=1e4, nu=0.3, **more):
+    """Material at some places."""
+    return MaterialPoints.create(position, volume=volume, density=density, youngs_modulus=E, poisson_ratio=nu, **more)
 
 
 def unit(*shape, device="cpu", dtype=torch.float64):

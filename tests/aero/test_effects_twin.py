@@ -3,10 +3,11 @@
 import numpy as np
 import pytest
 import torch
+from shared import solid
 from torch.testing import assert_close
 from torch.utils._python_dispatch import TorchDispatchMode
 
-from gaussian_swaying import AeroForce, MaterialPoints, MPMSolver, UniformGust, WindField, WindForce
+from gaussian_swaying import AeroForce, MPMSolver, UniformGust, WindField, WindForce
 from gaussian_swaying.aero.carried import CarriedField, Turbulence
 from gaussian_swaying.aero.effects import LogProfile, Plume, PowerProfile
 from gaussian_swaying.aero.obstacles import CylinderObstacle, EllipsoidObstacle, SphereObstacle
@@ -73,9 +74,7 @@ def _bodies(device, formulation, wind, batch=(), groups=False, transfer="kernels
     normal = torch.nn.functional.normalize(torch.randn(*batch, 24, 3, generator=draw), dim=-1).to(device)
     area = (0.02 * torch.rand(*batch, 24, generator=draw)).to(device)
     velocity = torch.randn(*batch, 24, 3, generator=draw).to(device)
-    points = MaterialPoints.create(
-        position.to(device), volume=1e-4, density=50.0, youngs_modulus=1e4, poisson_ratio=0.3
-    )
+    points = solid(position.to(device), 1e-4, 50.0)
     patches = (normal, area)
     if groups:  # two patches on each particle
         owner = torch.arange(24, device=device).repeat(2)
@@ -215,21 +214,16 @@ class _NoReading(TorchDispatchMode):
         return function(*args, **(kwargs or {}))
 
 
-@pytest.mark.parametrize("interpolation", ["step", "linear"])
-@pytest.mark.parametrize("name", [*(name for name in WINDS if name != "sheltered"), "recorded"])
-def test_the_host_reads_nothing_of_a_wind(name, interpolation, tmp_path):
-    """So all of it can be recorded."""
-    effects = (_recorded(tmp_path) if name == "recorded" else _wind(name)).effects
-    wind = WindField(schedule=TURNING, interpolation=interpolation, effects=effects)
+def test_the_host_reads_nothing_of_a_wind(tmp_path):
+    """So all of it can be recorded, and the needs of the next frame of a shelter can be measured in a CUDA graph."""
     time, place = torch.tensor(0.003, dtype=torch.float64), torch.rand(20, 3)
-    expected = wind.at(time, place)
-    with _NoReading():
-        found = wind.at(time, place)
-    assert torch.equal(found, expected)
-
-
-def test_the_host_reads_nothing_of_a_shelter():
-    """So the needs of the next frame can be measured in a CUDA graph."""
+    for wind in (_recorded(tmp_path), *(_wind(name) for name in WINDS if name != "sheltered")):
+        for interpolation in ("step", "linear"):
+            wind = WindField(schedule=TURNING, interpolation=interpolation, effects=wind.effects)
+            expected = wind.at(time, place)
+            with _NoReading():
+                found = wind.at(time, place)
+            assert torch.equal(found, expected)
     _, state, load = _bodies("cpu", "total", _wind("sheltered"), transfer="torch")
     with _NoReading():
         load.foreseen(state).samples(state, DT, 5)

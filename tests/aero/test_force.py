@@ -45,8 +45,6 @@ def test_resistance_is_half_the_slope_of_the_drag():
     expected = torch.tensor([0.5 * RHO * 2.0 * (1.2 + 0.3 + 0.1) * 40.0], dtype=torch.float64)
     assert_close(aero.resistance(wind, velocity, area), expected)
     assert AeroForce().resistance(wind, velocity, area) is None
-    with pytest.raises(ValueError, match=r"`drag_step` to be one of explicit, semi_implicit"):
-        AeroForce(drag_step="implicit")
 
 
 def test_each_term_against_the_equation():
@@ -197,24 +195,19 @@ def test_drag_rate_is_the_slope_of_the_force():
     assert float(rate) == pytest.approx(-float(slope[0, 0]) / 0.5)
 
 
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        ({"law": "plate"}, "`law` to be one of paper, projected, linear, cross_flow"),
-        ({"C_D": -0.1}, "`C_D` to not be negative"),
-        ({"air_density": -1.0}, "`air_density` to not be negative"),
-        ({"C_L": float("nan")}, "`C_L` to be finite"),
-        ({"added_mass": -0.1}, "`added_mass` to not be negative"),
-        ({"added_mass": float("nan")}, "`added_mass` to not be negative"),
-        ({"added_mass": float("inf")}, "`added_mass` to not be negative and finite"),
-        ({"max_area_ratio": 0.0}, "`max_area_ratio` to be positive, or null"),
-        ({"max_area_ratio": -1.0}, "`max_area_ratio` to be positive, or null"),
-        ({"max_area_ratio": float("nan")}, "`max_area_ratio` to be positive, or null"),
-    ],
-)
-def test_bad_settings_are_refused(arguments, message):
-    with pytest.raises(ValueError, match=message):
-        AeroForce(**arguments)
+def test_bad_settings_are_refused():
+    for name, values in {
+        "law": ["plate"],
+        "C_D": [-0.1],
+        "air_density": [-1.0],
+        "C_L": [math.nan],
+        "added_mass": [-0.1, math.nan, math.inf],
+        "max_area_ratio": [0.0, -1.0, math.nan],
+        "drag_step": ["implicit"],
+    }.items():
+        for value in values:
+            with pytest.raises(ValueError, match=f"`{name}`"):
+                AeroForce(**{name: value})
 
 
 def test_a_plate_carries_the_air_of_a_cylinder_of_its_breadth():

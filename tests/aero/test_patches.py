@@ -4,9 +4,10 @@ import math
 
 import pytest
 import torch
+from shared import solid
 from torch.testing import assert_close
 
-from gaussian_swaying import AeroForce, MaterialPoints, WindField, WindForce, aero_force
+from gaussian_swaying import AeroForce, WindField, WindForce, aero_force
 from gaussian_swaying.aero.force import capped_area, grouped_force
 from gaussian_swaying.aero.patches import MOST, Patches, PatchSums
 from gaussian_swaying.geometry.patches import deform_patch
@@ -145,7 +146,7 @@ def test_a_state_in_wind(make_points):
 @pytest.fixture
 def make_points():
     position = torch.rand(POINTS, 3, generator=torch.Generator().manual_seed(3), dtype=torch.float64)
-    return MaterialPoints.create(position, volume=1e-5, density=100.0, youngs_modulus=1e4, poisson_ratio=0.3)
+    return solid(position, 1e-5)
 
 
 @pytest.mark.parametrize("law", ["projected with all terms", "linear with all terms"])

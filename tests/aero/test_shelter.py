@@ -4,9 +4,10 @@ import math
 
 import pytest
 import torch
+from shared import solid
 from torch.testing import assert_close
 
-from gaussian_swaying import AeroForce, MaterialPoints, MPMSolver, WindField, WindForce
+from gaussian_swaying import AeroForce, MPMSolver, WindField, WindForce
 from gaussian_swaying.aero.effects import Moment
 from gaussian_swaying.aero.shelter import Shelter, deposited, extinction, wind_axes
 
@@ -21,7 +22,7 @@ def _slab(depth, drag, direction, cells=32):
     axes = wind_axes(direction)
     place = place @ axes
     area = 2 * depth / drag * 0.64 / len(place)  # exp(-depth) behind: a half of C_D A per cross section
-    points = MaterialPoints.create(place, volume=1e-6, density=100.0, youngs_modulus=1e4, poisson_ratio=0.3)
+    points = solid(place, 1e-6)
     solver = MPMSolver(dx=0.2, transfer="torch")
     wind = WindField((5 * direction).tolist(), effects=[Shelter(cells)])
     normal = axes[0].expand(len(place), 3)

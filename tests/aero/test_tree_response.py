@@ -10,8 +10,9 @@ from itertools import pairwise
 
 import pytest
 import torch
+from shared import solid
 
-from gaussian_swaying import AeroForce, Box, MaterialPoints, MPMSolver, PinnedRegion, WindField, WindForce
+from gaussian_swaying import AeroForce, Box, MPMSolver, PinnedRegion, WindField, WindForce
 from gaussian_swaying.aero.carried import Turbulence
 
 DOUBLE = torch.float64
@@ -24,7 +25,7 @@ def _tree():
     place = torch.cartesian_prod(axis, axis, 0.1 * (torch.arange(12, dtype=DOUBLE) + 0.5))
     crown = place[:, 2] > 0.9
     density = torch.where(crown, 800.0, 300.0)
-    points = MaterialPoints.create(place, volume=1e-3, density=density, youngs_modulus=4e5, poisson_ratio=0.3)
+    points = solid(place, 1e-3, density, 4e5)
     foot = PinnedRegion(Box([None, None, None], [None, None, 0.15]), kind="nodes")
     solver = MPMSolver(dx=0.2, gravity=(0, 0, 0), damping=DAMPING, boundaries=[foot], transfer="torch")
     area = torch.where(crown, AREA / int(crown.sum()), 0.0).to(DOUBLE)

@@ -4,12 +4,12 @@ import copy
 
 import pytest
 import torch
+from shared import solid
 from torch.testing import assert_close
 
 from gaussian_swaying import (
     AeroForce,
     GaussianGust,
-    MaterialPoints,
     MPMSolver,
     SineSway,
     UniformGust,
@@ -31,7 +31,7 @@ def _setting(batch=(), wind=GUSTS, formulation="total", **settings):
     position = 0.3 * torch.rand(*batch, 20, 3, dtype=torch.float64, generator=generator)
     normal = torch.nn.functional.normalize(torch.randn(*batch, 20, 3, dtype=torch.float64, generator=generator), dim=-1)
     area = 0.02 * torch.rand(*batch, 20, dtype=torch.float64, generator=generator)
-    points = MaterialPoints.create(position, volume=1e-4, density=50.0, youngs_modulus=1e4, poisson_ratio=0.3)
+    points = solid(position, 1e-4, 50.0)
     solver = MPMSolver(dx=0.1, formulation=formulation, transfer="torch")
     velocity = torch.randn(*batch, 20, 3, dtype=torch.float64, generator=generator)
     state = solver.init_state(points, velocity)

@@ -5,11 +5,11 @@ import dataclasses
 import pytest
 import torch
 from catalogue import ELASTIC
+from shared import solid
 
 from gaussian_swaying import (
     AeroForce,
     Box,
-    MaterialPoints,
     MPMSolver,
     PinnedPoints,
     PinnedRegion,
@@ -245,12 +245,12 @@ def _gradients(
         "volume": torch.tensor(1e-4, dtype=WIDE),
     }
     values = {name: value.to(device, dtype).requires_grad_() for name, value in values.items()}
-    points = MaterialPoints.create(
+    points = solid(
         place.to(device, dtype),
-        volume=values["volume"],
-        density=values["density"],
-        youngs_modulus=values["youngs_modulus"],
-        poisson_ratio=values["poisson_ratio"],
+        values["volume"],
+        values["density"],
+        values["youngs_modulus"],
+        values["poisson_ratio"],
         law=law,
         law_index=torch.arange(place.shape[-2]) % len(law) if isinstance(law, list) else None,
         damping=30 * _random(9, *place.shape[:-1]).abs().to(device, dtype) if damped else None,
@@ -351,7 +351,7 @@ def _refused(solver, state, forces=(), match=""):
 def _free(device, **settings):
     """A solver of a sheet and its first state, whose nodal velocity requires a gradient."""
     place = _place().to(device, torch.float32)
-    points = MaterialPoints.create(place, volume=1e-4, density=80.0, youngs_modulus=1e4, poisson_ratio=0.3)
+    points = solid(place, 1e-4, 80.0)
     solver = MPMSolver(dx=DX, transfer="kernels", **settings)
     state = solver.init_state(points)
     return solver, state.replace(node_velocity=state.node_velocity.clone().requires_grad_())

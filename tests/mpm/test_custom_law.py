@@ -6,8 +6,9 @@ from pathlib import Path
 
 import pytest
 import torch
+from shared import solid
 
-from gaussian_swaying import MaterialPoints, MPMSolver
+from gaussian_swaying import MPMSolver
 from gaussian_swaying.mpm.laws.sand import Sand
 
 ROOT = Path(__file__).parents[2]
@@ -28,9 +29,7 @@ def test_its_twin_runs_in_the_kernels(kernel_device, case, saint):
     laws, index = saint(1.5), None
     if case == "beside sand":
         laws, index = [Sand(), saint(1.5), saint(0.5)], (torch.arange(12) % 3).to(kernel_device)
-    points = MaterialPoints.create(
-        position, volume=1e-4, density=100.0, youngs_modulus=1e4, poisson_ratio=0.3, law=laws, law_index=index
-    )
+    points = solid(position, 1e-4, law=laws, law_index=index)
     ends = []
     for transfer in ("torch", "kernels"):
         solver = MPMSolver(0.1, formulation="total" if case == "total" else "updated", transfer=transfer)

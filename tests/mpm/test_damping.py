@@ -6,6 +6,7 @@ from itertools import pairwise
 
 import pytest
 import torch
+from shared import solid
 from torch.testing import assert_close
 
 from gaussian_swaying import Box, MaterialPoints, MPMSolver, PinnedRegion
@@ -19,8 +20,8 @@ EYE = torch.eye(3, dtype=torch.float64)
 
 def _bar(counts, spacing, e=2e4, nu=0.0):
     axes = [(torch.arange(n, dtype=torch.float64) + 0.5) * spacing for n in counts]
-    position = torch.stack(torch.meshgrid(*axes, indexing="ij"), -1).reshape(-1, 3)
-    return MaterialPoints.create(position, volume=spacing**3, density=100.0, youngs_modulus=e, poisson_ratio=nu)
+    position = torch.cartesian_prod(*axes)
+    return solid(position, spacing**3, 100.0, e, nu)
 
 
 def _skew(omega):
@@ -206,7 +207,7 @@ def test_damping_in_proportion_to_frequency(formulation):
 def test_damped_limit_is_sharp_for_one_particle(ratio):
     """As without damping: the limit is sharp in the mode v_i = grad(w_i) / w_i near a plane where a weight vanishes."""
     position = torch.full((1, 3), 0.05001, dtype=torch.float64)
-    points = MaterialPoints.create(position, volume=1e-6, density=100.0, youngs_modulus=1e4, poisson_ratio=0.3)
+    points = solid(position, 1e-6)
     undamped = float(stable_limit(points, 0.1).amin())
     solver = MPMSolver(dx=0.1, gravity=(0, 0, 0), stiffness_damping=ratio * undamped)
     limit = damped_substep(undamped, solver.stiffness_damping)
@@ -225,7 +226,7 @@ def test_damped_limit_is_sharp_for_one_particle(ratio):
 @pytest.mark.parametrize("nu", [0.0, 0.45])
 def test_random_bodies_are_stable_below_the_damped_limit(formulation, nu):
     position = 0.15 * torch.rand(40, 3, dtype=torch.float64)
-    points = MaterialPoints.create(position, volume=1e-6, density=100.0, youngs_modulus=1e4, poisson_ratio=nu)
+    points = solid(position, 1e-6, 100.0, 1e4, nu)
     undamped = float(stable_limit(points, 0.05).amin())
     solver = MPMSolver(dx=0.05, formulation=formulation, gravity=(0, 0, 0), stiffness_damping=2 * undamped)
     kick = 1e-6 * torch.randn_like(position)

@@ -2,8 +2,9 @@
 
 import pytest
 import torch
+from shared import solid
 
-from gaussian_swaying import AeroForce, Box, MaterialPoints, MPMSolver, PinnedRegion
+from gaussian_swaying import AeroForce, Box, MPMSolver, PinnedRegion
 
 FORMULATIONS = ["total", "updated"]
 AERO = AeroForce(C_D=1.2, C_F=0.0, C_L=0.0, drag_step="semi_implicit")
@@ -15,9 +16,7 @@ def _sheet(areal, e=1e4):
     x = (torch.arange(8, dtype=torch.float64) + 0.5) * 0.05
     gx, gz = (g.reshape(-1) for g in torch.meshgrid(x, x, indexing="ij"))
     position = torch.stack([gx, torch.full_like(gx, 0.02), gz], dim=-1)
-    return MaterialPoints.create(
-        position, volume=0.05**2 * 0.01, density=areal / 0.01, youngs_modulus=e, poisson_ratio=0.0
-    )
+    return solid(position, 0.05**2 * 0.01, areal / 0.01, e, 0.0)
 
 
 def _run(solver, state, wind, dt, steps, aero=AERO):

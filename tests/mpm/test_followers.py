@@ -1,20 +1,14 @@
 """Where Gaussians read the motion of the nodes."""
 
 import torch
+from shared import solid
 
 from gaussian_swaying.mpm.followers import on_material
-from gaussian_swaying.mpm.state import MaterialPoints
 
 
 def test_places_without_all_their_nodes_are_read_at_a_material_point():
     """Cells end at halves: (1.6, 2.4) shares a cell with the point at (2, 2), (2.6, 2) reads nodes beyond it."""
-    points = MaterialPoints.create(
-        torch.tensor([[2.0, 2.0, 2.0], [9.25, 2.0, 2.0]]),
-        volume=1.0,
-        density=1.0,
-        youngs_modulus=1.0,
-        poisson_ratio=0.3,
-    )
+    points = solid(torch.tensor([[2.0, 2.0, 2.0], [9.25, 2.0, 2.0]]), 1.0, 1.0, 1.0)
     place = torch.tensor(
         [
             [1.6, 2.4, 2.1],  # its nodes are those of the first point

@@ -8,9 +8,10 @@ from pathlib import Path
 
 import pytest
 import torch
+from shared import solid
 from torch.testing import assert_close
 
-from gaussian_swaying import AeroForce, Force, MaterialPoints, MPMSolver, SpatialWind, WindField, WindForce
+from gaussian_swaying import AeroForce, Force, MPMSolver, SpatialWind, WindField, WindForce
 from gaussian_swaying.mpm.forces import FunctionForce, as_forces, divide
 from gaussian_swaying.mpm.twins import Twin
 
@@ -42,7 +43,7 @@ class Spring(Force):
 def _setting(formulation="total", batch=(), **options):
     generator = torch.Generator().manual_seed(0)
     position = 0.3 * torch.rand(*batch, 20, 3, dtype=torch.float64, generator=generator)
-    points = MaterialPoints.create(position, volume=1e-4, density=50.0, youngs_modulus=1e4, poisson_ratio=0.3)
+    points = solid(position, 1e-4, 50.0)
     solver = MPMSolver(dx=0.1, formulation=formulation, transfer="torch", **options)
     velocity = torch.randn(*batch, 20, 3, dtype=torch.float64, generator=generator)
     normal = torch.nn.functional.normalize(torch.randn(*batch, 20, 3, dtype=torch.float64, generator=generator), dim=-1)
@@ -108,7 +109,7 @@ def test_work_is_that_of_all_forces(formulation):
     """The gain in kinetic energy of a free body that is too soft to store energy."""
     solver, start, wind = _setting(formulation, gravity=(0, 0, 0))
     points = start.position.shape[0]
-    soft = MaterialPoints.create(start.position, volume=1e-4, density=50.0, youngs_modulus=1e-9, poisson_ratio=0.3)
+    soft = solid(start.position, 1e-4, 50.0, 1e-9)
     state = solver.init_state(soft, torch.tensor([0.3, 0.1, 0.0], dtype=torch.float64).expand(points, 3))
     end = solver.rollout(state, DT, 5, [wind, lambda s: 0.01 * torch.ones_like(s.position)])
     alone = solver.rollout(state, DT, 5, wind)

@@ -5,6 +5,7 @@ import torch
 from bench.problems.flags import flag
 from bench.problems.settings import Settings
 from catalogue import ELASTIC, PLASTIC
+from shared import solid
 from torch.testing import assert_close
 
 from gaussian_swaying import Box, MaterialPoints, MPMSolver, PinnedRegion
@@ -20,9 +21,9 @@ FORMULATIONS = ["total", "updated"]
 def _points(size, spacing, law=None, e=1e4, density=100.0, thickness=None):
     """Particles in a box of the given size; a side of zero is a single layer."""
     axes = [(torch.arange(max(round(side / spacing), 1), dtype=torch.float64) + 0.5) * spacing for side in size]
-    position = torch.stack(torch.meshgrid(*axes, indexing="ij"), -1).reshape(-1, 3)
+    position = torch.cartesian_prod(*axes)
     volume = spacing**3 if thickness is None else spacing**2 * thickness
-    return MaterialPoints.create(position, volume=volume, density=density, youngs_modulus=e, poisson_ratio=0.3, law=law)
+    return solid(position, volume, density, e, law=law)
 
 
 def _bar():
@@ -255,7 +256,7 @@ class Loose(Formulation):
 
 def test_a_third_formulation_is_one_class(monkeypatch):
     """The solver runs it like its own formulations: forces and their work, energies, substeps and grid."""
-    with pytest.raises(ValueError, match="`formulation` to be one of .*, but got 'loose'"):
+    with pytest.raises(ValueError, match=r"`formulation` to be one of .*, but got 'loose'"):
         MPMSolver(formulation="loose")
     monkeypatch.setitem(known.FORMULATIONS, "loose", Loose)
     points = _points((0.2, 0.2, 0.2), 0.05)

@@ -5,9 +5,10 @@ from pathlib import Path
 import pytest
 import torch
 from catalogue import OBSTACLES
+from shared import solid
 from torch.testing import assert_close
 
-from gaussian_swaying import MaterialPoints, MPMSolver, SimFrame
+from gaussian_swaying import MPMSolver, SimFrame
 from gaussian_swaying.geometry.keyed_path import KeyedPath
 from gaussian_swaying.geometry.rotations import rotation_from_z
 from gaussian_swaying.kernels.launch import lanes, launch
@@ -69,7 +70,7 @@ def _bodies(device, boundaries):
     """A small block of particles, in torch and in the kernels, after some substeps from the same start."""
     draw = torch.Generator().manual_seed(1)
     position = (0.06 + 0.18 * torch.rand(12, 3, generator=draw)).to(device)
-    points = MaterialPoints.create(position, volume=1e-4, density=50.0, youngs_modulus=1e4, poisson_ratio=0.3)
+    points = solid(position, 1e-4, 50.0)
     velocity = torch.randn(12, 3, generator=draw).to(device)
     ends = []
     for transfer in ("torch", "kernels"):

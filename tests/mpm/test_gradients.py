@@ -5,11 +5,12 @@ import weakref
 
 import pytest
 import torch
+from shared import solid
 from torch.testing import assert_close
 from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils._pytree import tree_iter
 
-from gaussian_swaying import Box, MaterialPoints, MPMSolver, PinnedRegion, aero_force
+from gaussian_swaying import Box, MPMSolver, PinnedRegion, aero_force
 from gaussian_swaying.geometry.patches import deform_patch
 from gaussian_swaying.mpm.laws.fixed_corotated import FixedCorotated
 from gaussian_swaying.mpm.laws.neo_hookean import NeoHookean
@@ -61,12 +62,12 @@ def _patches():
 
 def _start(values, law, **settings):
     """The solver, its state at rest and the force of the wind, all from tensors that may require gradients."""
-    points = MaterialPoints.create(
+    points = solid(
         values["position"],
-        volume=0.09**2 * 0.01,
-        density=values["density"],
-        youngs_modulus=values["youngs_modulus"],
-        poisson_ratio=values["poisson_ratio"],
+        0.09**2 * 0.01,
+        values["density"],
+        values["youngs_modulus"],
+        values["poisson_ratio"],
         law=law,
         law_index=None if isinstance(law, FixedCorotated | NeoHookean) else torch.arange(COUNT) % 2,
     )
@@ -202,9 +203,7 @@ def test_gradients_are_finite_beside_a_node_of_vanishing_mass(setting):
 @pytest.mark.parametrize("checkpoint", [0, 4, 30])
 def test_checkpoints_find_what_is_used_late(checkpoint):
     """A force of two parts, of which the second acts only after the first substeps."""
-    points = MaterialPoints.create(
-        torch.rand(8, 3, dtype=torch.float64), volume=0.1, density=10.0, youngs_modulus=1e3, poisson_ratio=0.3
-    )
+    points = solid(torch.rand(8, 3, dtype=torch.float64), 0.1, 10.0, 1e3)
     first, second = (torch.zeros(3, dtype=torch.float64, requires_grad=True) for _ in range(2))
     solver = MPMSolver(dx=0.5, gravity=(0, 0, 0))
     state = solver.rollout(

@@ -4,8 +4,9 @@ import math
 
 import pytest
 import torch
+from shared import solid
 
-from gaussian_swaying import Force, MaterialPoints, MPMSolver, _checks
+from gaussian_swaying import Force, MPMSolver, _checks
 
 DX, DT = 0.1, 1e-3
 FORMULATIONS = ("total", "updated")
@@ -19,9 +20,7 @@ def _as_users_run_it(monkeypatch):
 
 def _block(side=3, dtype=torch.float64, device="cpu"):
     axis = (torch.arange(side, dtype=dtype, device=device) + 0.5) * 0.05
-    return MaterialPoints.create(
-        torch.cartesian_prod(axis, axis, axis), volume=0.05**3, density=100.0, youngs_modulus=1e4, poisson_ratio=0.3
-    )
+    return solid(torch.cartesian_prod(axis, axis, axis), 0.05**3)
 
 
 def _solver(formulation, points=None, dx=DX):
@@ -161,7 +160,7 @@ def test_tensors_of_another_kind(formulation):
 
 @pytest.mark.parametrize("formulation", FORMULATIONS)
 def test_no_points(formulation):
-    empty = MaterialPoints.create(torch.zeros(0, 3), volume=1.0, density=1.0, youngs_modulus=1.0, poisson_ratio=0.3)
+    empty = solid(torch.zeros(0, 3), 1.0, 1.0, 1.0)
     with pytest.raises(ValueError, match="Expected `points` with at least one point, but got none"):
         MPMSolver(dx=DX, formulation=formulation).init_state(empty)
 

@@ -5,9 +5,10 @@ import warnings
 
 import pytest
 import torch
+from shared import solid
 from torch.testing import assert_close
 
-from gaussian_swaying import Box, MaterialPoints, MPMSolver, PinnedPoints, PinnedRegion
+from gaussian_swaying import Box, MPMSolver, PinnedPoints, PinnedRegion
 from gaussian_swaying.geometry.regions import Everything, Region
 from gaussian_swaying.mpm.boundaries.handle import Handle
 from gaussian_swaying.mpm.held_faces import SOFTENED, along_face, face, thickness
@@ -25,7 +26,7 @@ def _box(x, y, z, step=0.25, turn=0.0):
 
 
 def _material(rest):
-    return MaterialPoints.create(rest, volume=1e-5, density=100.0, youngs_modulus=1e4, poisson_ratio=0.3)
+    return solid(rest, 1e-5)
 
 
 class Chosen(Region):

@@ -5,9 +5,10 @@ import math
 import numpy as np
 import pytest
 import torch
+from shared import solid
 from torch.testing import assert_close
 
-from gaussian_swaying import Box, MaterialPoints, MPMSolver, PinnedRegion
+from gaussian_swaying import Box, MPMSolver, PinnedRegion
 from gaussian_swaying.mpm import modal
 from gaussian_swaying.mpm.boundaries.rigid_region import RigidRegion
 from gaussian_swaying.mpm.laws.fixed_corotated import FixedCorotated
@@ -37,9 +38,7 @@ def post(spacing=0.05, E=2e5, density=100.0, law=None, nu=0.3, extra=(), width=0
     position = torch.cat([lattice((0, 0, 0), (width, width, 1), spacing), *extra])
     E = torch.full((len(position),), E, dtype=torch.float64)
     E[stiff[0]] *= stiff[1]
-    return MaterialPoints.create(
-        position, volume=spacing**3, density=density, youngs_modulus=E, poisson_ratio=nu, law=law
-    )
+    return solid(position, spacing**3, density, E, nu, law=law)
 
 
 def bound(points, dx=0.1, boundaries=None, formulation="total"):
@@ -259,10 +258,12 @@ def test_too_many_unknowns_are_refused(monkeypatch):
 
 def test_a_batch_analyses_each_of_its_scenes():
     one, other = post(), post(E=1e5, stiff=(slice(40), 5))
-    both = MaterialPoints.create(
-        torch.stack([one.position, other.position]), volume=0.05**3, density=100.0,
-        youngs_modulus=torch.stack([one.youngs_modulus, other.youngs_modulus]), poisson_ratio=0.3,
-    )  # fmt: skip
+    both = solid(
+        torch.stack([one.position, other.position]),
+        0.05**3,
+        100.0,
+        torch.stack([one.youngs_modulus, other.youngs_modulus]),
+    )
     found = bound(both, formulation="modes").bound
     alone = [bound(points, formulation="modes").bound for points in (one, other)]
     assert_close(found.firsts, torch.stack([b.firsts for b in alone]), rtol=1e-12, atol=0)

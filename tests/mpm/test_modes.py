@@ -4,6 +4,7 @@ import math
 
 import pytest
 import torch
+from shared import solid
 from small_scenes import plain_cloud
 from torch.testing import assert_close
 
@@ -41,9 +42,15 @@ def post(E=1e6, density=100.0, ratio=0.0, law=None, **more):
     axes = [(torch.arange(n, dtype=torch.float64) + 0.5) * 0.05 for n in (4, 4, 20)]
     damping = decay_rate(ratio, 1.0) if ratio else None
     return MaterialPoints.create(
-        torch.cartesian_prod(*axes), volume=0.05**3, density=density, youngs_modulus=E, poisson_ratio=0.3, law=law,
-        damping=damping, **more,
-    )  # fmt: skip
+        torch.cartesian_prod(*axes),
+        volume=0.05**3,
+        density=density,
+        youngs_modulus=E,
+        poisson_ratio=0.3,
+        law=law,
+        damping=damping,
+        **more,
+    )
 
 
 def solver_of(formulation="modes", pins=None, **more):
@@ -205,11 +212,12 @@ def test_a_rigid_turn_is_exact():
 def test_a_batch_is_its_scenes():
     points = [post(E=1e5), post(E=3e5, density=150.0)]
     fields = ("youngs_modulus", "mass")
-    both = MaterialPoints.create(
-        torch.stack([one.position for one in points]), volume=0.05**3,
-        density=torch.stack([one.mass / 0.05**3 for one in points]),
-        youngs_modulus=torch.stack([one.youngs_modulus for one in points]), poisson_ratio=0.3,
-    )  # fmt: skip
+    both = solid(
+        torch.stack([one.position for one in points]),
+        0.05**3,
+        torch.stack([one.mass / 0.05**3 for one in points]),
+        torch.stack([one.youngs_modulus for one in points]),
+    )
     assert all(torch.equal(getattr(both, name)[0], getattr(points[0], name)) for name in fields)
     one = wind(6.0)
     twice = WindForce(one.aero, one.wind, one.normal.expand(2, POINTS, 3), one.area.expand(2, POINTS))
@@ -345,11 +353,14 @@ def test_any_force_acts():
     [
         ({}, [], "nothing holds it: pin a part of it, or set it to total"),
         ({"law": Sand()}, None, "the law Sand flows: set it to updated"),
-        ({"normal": torch.tensor([0.0, 1.0, 0.0]).double().expand(POINTS, 3), "bending": 1e-6}, None,
-         "`material.bending` makes it a sheet, which folds: set it to total"),
+        (
+            {"normal": torch.tensor([0.0, 1.0, 0.0]).double().expand(POINTS, 3), "bending": 1e-6},
+            None,
+            "`material.bending` makes it a sheet, which folds: set it to total",
+        ),
         ({}, [PinnedRegion(FOOT, end=2.0)], "does not hold it all the time: set it to total"),
     ],
-)  # fmt: skip
+)
 def test_what_modes_cannot_do_is_refused(points, pins, words):
     with pytest.raises(ValueError, match=r"`solver.formulation: modes` is for a held body") as error:
         solver_of(pins=pins).init_state(post(**points))
@@ -372,9 +383,7 @@ def test_another_density_keeps_the_place():
 def test_on_a_pivot_it_sways_as_easily_along_as_across():
     """A plank five times as wide as thick: pushed both ways, it swings with one frequency, that of the thin way."""
     axes = [(torch.arange(n, dtype=torch.float64) + 0.5) * 0.05 for n in (2, 10, 20)]
-    plank = MaterialPoints.create(
-        torch.cartesian_prod(*axes), volume=0.05**3, density=100.0, youngs_modulus=1e6, poisson_ratio=0.3
-    )
+    plank = solid(torch.cartesian_prod(*axes), 0.05**3, 100.0, 1e6)
     pins = [PinnedRegion(Box([None] * 3, [None, None, 0.1]), kind="nodes")]
     free, pivot = (solver_of(pins=pins, pivot=on) for on in (False, True))
     free.init_state(plank)

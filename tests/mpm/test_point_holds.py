@@ -6,6 +6,7 @@ from itertools import pairwise
 
 import pytest
 import torch
+from shared import solid
 from torch.testing import assert_close
 
 from gaussian_swaying import (
@@ -34,13 +35,11 @@ def _sheet(dtype=torch.float64, layers=1, width=8, height=10, turn=0.0, shift=(0
     x = STEP * (torch.arange(width, dtype=torch.float64) + 0.5)
     z = -STEP * (torch.arange(height, dtype=torch.float64) + 0.5)
     y = 0.01 * torch.tensor([0.0] if layers == 1 else [-1.0, 0.0, 1.0], dtype=torch.float64)
-    rest = torch.stack(torch.meshgrid(x, y, z, indexing="ij"), -1).reshape(-1, 3)
+    rest = torch.cartesian_prod(x, y, z)
     c, s = math.cos(turn), math.sin(turn)
     matrix = torch.tensor([[c, 0, -s], [0, 1, 0], [s, 0, c]], dtype=torch.float64)
     position = (rest @ matrix.T + torch.tensor(shift, dtype=torch.float64)).to(dtype)
-    return MaterialPoints.create(
-        position, volume=STEP**2 * 0.02 / layers, density=100.0, youngs_modulus=e, poisson_ratio=0.3
-    )
+    return solid(position, STEP**2 * 0.02 / layers, 100.0, e)
 
 
 class Chosen(Region):

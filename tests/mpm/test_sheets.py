@@ -5,6 +5,7 @@ import dataclasses
 import pytest
 import torch
 from catalogue import ELASTIC
+from shared import solid
 from torch.testing import assert_close
 
 from gaussian_swaying import Box, MaterialPoints, MPMSolver, PinnedRegion
@@ -107,9 +108,7 @@ def test_a_curved_sheet_feels_the_change_of_its_curvature_alone():
     s, y = torch.cartesian_prod(angle, along).T
     position = torch.stack([radius * s.sin(), y, radius * s.cos() - radius], -1)
     normal = torch.stack([s.sin(), 0 * s, s.cos()], -1)
-    points = MaterialPoints.create(
-        position, volume=0.01, density=1.0, youngs_modulus=100.0, poisson_ratio=0.0, normal=normal, bending=1.0
-    )
+    points = solid(position, 0.01, 1.0, 100.0, 0.0, normal=normal, bending=1.0)
     solver, state = bound(points)
     form = solver.bound
     assert float(form.bending.energy(state.node_displacement)) == 0

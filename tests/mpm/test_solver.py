@@ -4,6 +4,7 @@ import dataclasses
 
 import pytest
 import torch
+from shared import solid
 from torch.testing import assert_close
 
 from gaussian_swaying import Box, MaterialPoints, MPMSolver, MPMState, PinnedRegion
@@ -15,9 +16,7 @@ FORMULATIONS = ["total", "updated"]
 def _block(*batch, dtype=torch.float64, device="cpu", count=200, e=1e4, density=100.0):
     generator = torch.Generator().manual_seed(3)
     position = 0.4 * torch.rand(*batch, count, 3, generator=generator, dtype=torch.float64)
-    return MaterialPoints.create(
-        position.to(device, dtype), volume=0.4**3 / count, density=density, youngs_modulus=e, poisson_ratio=0.3
-    )
+    return solid(position.to(device, dtype), 0.4**3 / count, density, e)
 
 
 def _sheet(width=0.6, height=0.4, spacing=0.025, dtype=torch.float32, e=3e3, density=30.0):
@@ -25,9 +24,7 @@ def _sheet(width=0.6, height=0.4, spacing=0.025, dtype=torch.float32, e=3e3, den
     z = (torch.arange(round(height / spacing), dtype=dtype) + 0.5) * spacing
     gx, gz = (g.reshape(-1) for g in torch.meshgrid(x, z, indexing="ij"))
     position = torch.stack([gx, 0.003 * torch.sin(9 * gx), gz], dim=-1)
-    return MaterialPoints.create(
-        position, volume=spacing**2 * 0.01, density=density, youngs_modulus=e, poisson_ratio=0.3
-    )
+    return solid(position, spacing**2 * 0.01, density, e)
 
 
 @pytest.mark.parametrize("formulation", FORMULATIONS)
@@ -93,7 +90,7 @@ def test_each_particle_has_its_own_material(formulation):
     parts, ends = [], []
     for shift, e, nu, density in ((0.0, 1e4, 0.2, 50.0), (2.0, 4e4, 0.45, 200.0)):
         position = _block(count=60).position + torch.tensor([shift, 0.0, 0.0], dtype=torch.float64)
-        part = MaterialPoints.create(position, volume=1e-3, density=density, youngs_modulus=e, poisson_ratio=nu)
+        part = solid(position, 1e-3, density, e, nu)
         parts.append(part)
         alone = MPMSolver(dx=0.1, formulation=formulation)
         velocity = 0.5 * (position - position.mean(0))
@@ -108,8 +105,8 @@ def test_each_particle_has_its_own_material(formulation):
 def test_formulations_agree_on_a_vibrating_block():
     """A free block in its first stretching mode, over most of a period, within the discretisation error of either."""
     axis = (torch.arange(12, dtype=torch.float64) + 0.5) / 30
-    position = torch.stack(torch.meshgrid(axis, axis, axis, indexing="ij"), -1).reshape(-1, 3)
-    points = MaterialPoints.create(position, volume=1 / 27000, density=100.0, youngs_modulus=2e4, poisson_ratio=0.3)
+    position = torch.cartesian_prod(axis, axis, axis)
+    points = solid(position, 1 / 27000, 100.0, 2e4)
     velocity = torch.zeros_like(position)
     velocity[:, 0] = -torch.cos(torch.pi * position[:, 0] / 0.4)
     ends = []
@@ -149,9 +146,7 @@ def test_total_moves_with_particles_on_half_cell_planes():
     """A layer exactly on a half-cell plane creates nodes of zero mass; an unguarded division gives NaN."""
     x = torch.arange(8, dtype=torch.float64) * 0.05 + 0.05
     position = torch.stack(torch.meshgrid(x, torch.tensor([0.05], dtype=torch.float64), x, indexing="ij"), -1)
-    points = MaterialPoints.create(
-        position.reshape(-1, 3), volume=1e-5, density=30.0, youngs_modulus=3e3, poisson_ratio=0.3
-    )
+    points = solid(position.reshape(-1, 3), 1e-5, 30.0, 3e3)
     for dtype in (torch.float32, torch.float64):
         for shift in (0.0, 1e-9, -1e-8, 1e-5):
             moved = points.map(lambda t, dtype=dtype: t.to(dtype))

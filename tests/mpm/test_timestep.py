@@ -4,14 +4,15 @@ import math
 
 import pytest
 import torch
+from shared import solid
 
-from gaussian_swaying import MaterialPoints, MPMSolver
+from gaussian_swaying import MPMSolver
 from gaussian_swaying.mpm.timestep import stable_limit, substeps_per_frame, wave_speed
 from gaussian_swaying.mpm.transfer import bspline_stencil
 
 
 def _points(position, e=1e4, nu=0.3, density=100.0):
-    return MaterialPoints.create(position, volume=1e-6, density=density, youngs_modulus=e, poisson_ratio=nu)
+    return solid(position, 1e-6, density, e, nu)
 
 
 @pytest.mark.parametrize(

@@ -5,10 +5,11 @@ import sys
 
 import pytest
 import torch
+from shared import solid
 from torch.testing import assert_close
 from torch.utils._python_dispatch import TorchDispatchMode
 
-from gaussian_swaying import MaterialPoints, MPMSolver
+from gaussian_swaying import MPMSolver
 from gaussian_swaying.mpm.state import GridSpec, bounding_grid
 from gaussian_swaying.mpm.transfer import bspline_stencil, g2p, gather, scatter, scatter_momentum
 
@@ -261,7 +262,7 @@ def test_deterministic_scatter_gradcheck(device):
 def test_deterministic_runs_have_the_same_bits(formulation, device):
     """Whole steps, and equal to those in any order to round-off."""
     position, mass, velocity, _ = _particles(device, torch.float32, count=4000)
-    points = MaterialPoints.create(position, volume=5e-5, density=50 * mass, youngs_modulus=1e4, poisson_ratio=0.3)
+    points = solid(position, 5e-5, 50 * mass)
     ends = []
     for fixed in (True, True, False):
         solver = MPMSolver(dx=0.1, formulation=formulation, deterministic=fixed)
@@ -384,7 +385,7 @@ def test_scatter_momentum_is_the_sum_that_it_says(mls):
 
 def _body(count=150):
     position = 0.4 * torch.rand(count, 3, dtype=torch.float64)
-    return MaterialPoints.create(position, volume=0.4**3 / count, density=100.0, youngs_modulus=1e4, poisson_ratio=0.3)
+    return solid(position, 0.4**3 / count)
 
 
 def test_mls_steps_conserve_both_momenta():

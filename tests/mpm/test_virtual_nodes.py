@@ -5,6 +5,7 @@ import math
 
 import pytest
 import torch
+from shared import solid
 
 from gaussian_swaying import (
     AeroForce,
@@ -40,9 +41,7 @@ def sheet(height, width=4, length=8):
 
 
 def material(position, attached=None):
-    return MaterialPoints.create(
-        position, volume=0.01, density=1.0, youngs_modulus=100.0, poisson_ratio=0.3, attached=attached
-    )
+    return solid(position, 0.01, 1.0, 100.0, attached=attached)
 
 
 def together(*parts):

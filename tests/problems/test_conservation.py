@@ -7,9 +7,8 @@ import pytest
 import torch
 from bench.problems.bars import free_block
 from bench.problems.settings import Settings, block
+from shared import solid
 from torch.testing import assert_close
-
-from gaussian_swaying.mpm.state import MaterialPoints
 
 VARIANTS = [Settings(), Settings("updated"), Settings("updated", mls=True)]
 EACH = pytest.mark.parametrize("settings", VARIANTS, ids=["total", "updated", "mls"])
@@ -19,7 +18,7 @@ DX, RATE = 0.1, ((0.5, -0.8, -0.5), (0.8, 0.5, -0.3), (0.5, 0.3, 0.5))
 
 def _scattered(count=200):
     position = 0.4 * torch.rand(count, 3, dtype=torch.float64)
-    return MaterialPoints.create(position, volume=0.4**3 / count, density=100.0, youngs_modulus=1e4, poisson_ratio=0.3)
+    return solid(position, 0.4**3 / count)
 
 
 def _affine(settings, points, rate, velocity=(0.2, 0.2, 0.2)):

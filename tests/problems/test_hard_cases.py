@@ -74,7 +74,7 @@ class _Broken(Modulation):
 
 def _lattice(*counts, spacing=0.05, low=(0.0, 0.0, 0.0), dtype=torch.float32):
     axes = [(torch.arange(n, dtype=torch.float64) + 0.5) * spacing for n in counts]
-    position = torch.stack(torch.meshgrid(*axes, indexing="ij"), -1).reshape(-1, 3)
+    position = torch.cartesian_prod(*axes)
     return (position + torch.tensor(low, dtype=torch.float64)).to(dtype)
 
 

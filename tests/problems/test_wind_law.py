@@ -6,9 +6,10 @@ import pytest
 import torch
 from bench.problems.plates import Hinge
 from bench.problems.surfaces import sphere_of_gaussians, surface_drag
+from shared import solid
 from torch.testing import assert_close
 
-from gaussian_swaying import AeroForce, Box, MaterialPoints, MPMSolver, PinnedRegion
+from gaussian_swaying import AeroForce, Box, MPMSolver, PinnedRegion
 from gaussian_swaying.geometry.patches import deform_patch
 
 SIDE, SPACING, THICKNESS, DENSITY, AIR, C = 0.4, 0.05, 0.01, 20.0, 1.225, 1.2
@@ -18,13 +19,7 @@ def _plate(formulation, gravity):
     """A stiff square plate in the x-z plane, normal along y."""
     axis = (torch.arange(round(SIDE / SPACING), dtype=torch.float64) + 0.5) * SPACING
     x, z = (g.reshape(-1) for g in torch.meshgrid(axis, axis, indexing="ij"))
-    points = MaterialPoints.create(
-        torch.stack([x, torch.zeros_like(x), z], dim=-1),
-        volume=SPACING**2 * THICKNESS,
-        density=DENSITY,
-        youngs_modulus=1e4,
-        poisson_ratio=0.3,
-    )
+    points = solid(torch.stack([x, torch.zeros_like(x), z], dim=-1), SPACING**2 * THICKNESS, DENSITY)
     solver = MPMSolver(dx=0.1, formulation=formulation, gravity=gravity)
     return solver, points
 
@@ -100,13 +95,7 @@ def test_a_hinge_lets_turn_and_holds(formulation):
     """A plate that spins about the hinge without gravity keeps spinning, about the same point."""
     dx, rate = 0.1, 2.0
     axis = (torch.arange(8, dtype=torch.float64) - 3.5) * 0.5 * dx
-    points = MaterialPoints.create(
-        torch.cartesian_prod(axis[3:5], axis[3:5], axis),
-        volume=(0.5 * dx) ** 3,
-        density=20.0,
-        youngs_modulus=1e5,
-        poisson_ratio=0.3,
-    )
+    points = solid(torch.cartesian_prod(axis[3:5], axis[3:5], axis), (0.5 * dx) ** 3, 20.0, 1e5)
     hinge = Hinge(dx)
     solver = MPMSolver(dx=dx, formulation=formulation, gravity=(0, 0, 0), boundaries=[hinge])
     x, y, z = points.position.unbind(-1)
@@ -222,13 +211,7 @@ def _sheet(formulation, gravity=(0, 0, 0), pinned=False, velocity=None, bump=0.0
     across = (torch.arange(16, dtype=torch.float64) + 0.5) * 0.025
     up = (torch.arange(8, dtype=torch.float64) + 0.5) * 0.025
     x, z = (g.reshape(-1) for g in torch.meshgrid(across, up, indexing="ij"))
-    points = MaterialPoints.create(
-        torch.stack([x, bump * torch.sin(8 * x) * torch.cos(7 * z), z], dim=-1),
-        volume=0.025**2 * 0.01,
-        density=30.0,
-        youngs_modulus=6e3,
-        poisson_ratio=0.3,
-    )
+    points = solid(torch.stack([x, bump * torch.sin(8 * x) * torch.cos(7 * z), z], dim=-1), 0.025**2 * 0.01, 30.0, 6e3)
     boundaries = [PinnedRegion(Box([None, None, None], [0.05, None, None]))] if pinned else []
     solver = MPMSolver(dx=0.05, formulation=formulation, gravity=gravity, boundaries=boundaries)
     slope = 8 * bump * torch.cos(8 * x) * torch.cos(7 * z), -7 * bump * torch.sin(8 * x) * torch.sin(7 * z)

@@ -4,20 +4,15 @@ import math
 
 import pytest
 import torch
+from shared import solid
 
 from gaussian_swaying import MaterialPoints, MPMSolver
 
 
 def _block(low=(0.0, 0.0, 0.0), side=0.4, e=2e4, per_side=6):
     axis = (torch.arange(per_side, dtype=torch.float64) + 0.5) * side / per_side
-    position = torch.stack(torch.meshgrid(axis, axis, axis, indexing="ij"), -1).reshape(-1, 3)
-    return MaterialPoints.create(
-        position + torch.tensor(low, dtype=torch.float64),
-        volume=(side / per_side) ** 3,
-        density=100.0,
-        youngs_modulus=e,
-        poisson_ratio=0.3,
-    )
+    position = torch.cartesian_prod(axis, axis, axis)
+    return solid(position + torch.tensor(low, dtype=torch.float64), (side / per_side) ** 3, 100.0, e)
 
 
 def _run_for(

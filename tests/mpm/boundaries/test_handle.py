@@ -4,6 +4,7 @@ import math
 
 import pytest
 import torch
+from shared import solid
 from torch.testing import assert_close
 
 from gaussian_swaying import Box, MaterialPoints, MPMSolver, PinnedRegion, SimFrame, Sphere
@@ -96,7 +97,7 @@ def test_handle_in_a_frame_that_scales_and_turns(formulation, block, march, rota
     scene = scene.reshape(-1, 3) + 7.0
     frame = SimFrame.fit(scene, up=(0.0, 1.0, 0.0), metres_per_unit=0.5)
     position = frame.point_to_sim(scene)
-    points = MaterialPoints.create(position, volume=1e-3, density=100.0, youngs_modulus=1e4, poisson_ratio=0.3)
+    points = solid(position, 1e-3)
     pivot, velocity = [7.1, 7.2, 6.5], torch.tensor([0.2, 0.4, -0.6], dtype=torch.float64)
     handle = Handle(Box([6, 6, 6], [8, 8, 8]), velocity.tolist(), [0.0, 0.0, 4.0], pivot)
     solver = MPMSolver(dx=0.1, formulation=formulation, boundaries=[handle], gravity=(0, 0, 0))

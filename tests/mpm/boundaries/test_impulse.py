@@ -5,6 +5,7 @@ import math
 
 import pytest
 import torch
+from shared import solid
 from torch.testing import assert_close
 
 from gaussian_swaying import Box, MaterialPoints, MPMSolver, PinnedRegion, Sphere
@@ -93,7 +94,7 @@ def test_impulse_per_particle_grows_with_their_number(formulation, block, lone, 
         assert_close(solver.momenta(end)["linear"], count * impulse, rtol=1e-12, atol=0)
     one = lone([[0, 0, 0], [1, 0, 0.5], [2, 0, 1]])
     position = torch.stack([one.position, one.position + torch.tensor([0, 0, 5.0])])
-    points = MaterialPoints.create(position, volume=1e-3, density=100.0, youngs_modulus=1e3, poisson_ratio=0.3)
+    points = solid(position, 1e-3, 100.0, 1e3)
     end = march(solver, points, 2e-3, 3)[-1]
     expected = torch.stack([2 * impulse, 3 * impulse])
     assert_close(solver.momenta(end)["linear"], expected, rtol=1e-12, atol=0)

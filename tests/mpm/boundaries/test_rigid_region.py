@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import torch
 from scipy.optimize import curve_fit
+from shared import solid
 from torch.testing import assert_close
 
 from gaussian_swaying import Box, MaterialPoints, MPMSolver, PinnedPoints, PinnedRegion
@@ -148,13 +149,7 @@ def test_kernels_do_as_torch_does(formulation):
 
 def test_scenes_of_a_batch_do_not_know_each_other():
     points, solver = bar(RigidRegion(RIGHT))
-    other = MaterialPoints.create(
-        points.position * torch.tensor([1.0, 0.8, 1.0]),
-        volume=2e-5,
-        density=200.0,
-        youngs_modulus=1e4,
-        poisson_ratio=0.2,
-    )
+    other = solid(points.position * torch.tensor([1.0, 0.8, 1.0]), 2e-5, 200.0, 1e4, 0.2)
     together = solver.like(solver.settings)
     state = advance(together, together.init_state(MaterialPoints.stack([points, other])), 0.1, 3)
     for k, alone in enumerate((points, other)):
@@ -199,9 +194,7 @@ def pendulum(dx):
     sizes = [len(cord), len(box)]
     volume = torch.repeat_interleave(torch.tensor([width**2 / count / 4, (2 * half / side) ** 3]), torch.tensor(sizes))
     density = torch.repeat_interleave(torch.tensor([100.0, mass / (2 * half) ** 3]), torch.tensor(sizes))
-    points = MaterialPoints.create(
-        place, volume=volume.double(), density=density.double(), youngs_modulus=E, poisson_ratio=0.0
-    )
+    points = solid(place, volume.double(), density.double(), E, 0.0)
     wall, body = Box([None, None, 0.0], [None] * 3), Box([None] * 3, [None, None, -1.0])
     boundaries = [PinnedRegion(wall, "clamp"), RigidRegion(body)]
     hanging = MPMSolver(dx=dx, damping=8.0, boundaries=boundaries, gravity=(0, 0, -9.81))

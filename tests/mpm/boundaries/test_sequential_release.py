@@ -2,9 +2,10 @@
 
 import pytest
 import torch
+from shared import solid
 from torch.testing import assert_close
 
-from gaussian_swaying import Box, MaterialPoints, MPMSolver, SimFrame, Sphere
+from gaussian_swaying import Box, MPMSolver, SimFrame, Sphere
 from gaussian_swaying.mpm.boundaries.impulse import Impulse
 from gaussian_swaying.mpm.boundaries.sequential_release import SequentialRelease
 
@@ -17,7 +18,7 @@ def test_scenes_of_a_batch_have_their_own_impulse_and_front(formulation, lone, m
     one = lone([[0, 0, 0], [1, 0, 0], [2, 0, 0]])
     shifts = torch.tensor([[0, 0, 0], [3, 0, 0], [0, 0, 1]], dtype=torch.float64)
     position = torch.stack([k * one.position + shift for k, shift in zip((1, 2, 1), shifts, strict=True)])
-    points = MaterialPoints.create(position, volume=1e-3, density=100.0, youngs_modulus=1e3, poisson_ratio=0.3)
+    points = solid(position, 1e-3, 100.0, 1e3)
     region = Box([None, None, -0.5], [None, None, 0.5])
     solver = MPMSolver(dx=0.1, formulation=formulation, boundaries=[Impulse(region, [1, 0, 0])], gravity=(0, 0, 0))
     states = march(solver, points, 0.01, 5)

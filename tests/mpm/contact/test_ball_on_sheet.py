@@ -5,6 +5,7 @@ import math
 import pytest
 import torch
 from contacts import crossings, gaps, sheet_triangles
+from shared import solid
 
 from gaussian_swaying import Box, Contact, MaterialPoints, MPMSolver, PinnedRegion
 from gaussian_swaying.geometry.regions import Not
@@ -34,10 +35,8 @@ def _drop(friction=0.3, **settings):
     ball = inner + CENTRE
     points = MaterialPoints.join(
         [
-            MaterialPoints.create(
-                sheet, volume=SPACING**2 * THICKNESS, density=100.0, youngs_modulus=4e4, poisson_ratio=0.3
-            ),
-            MaterialPoints.create(ball, volume=SPACING**3, density=200.0, youngs_modulus=1e5, poisson_ratio=0.3),
+            solid(sheet, SPACING**2 * THICKNESS, 100.0, 4e4),
+            solid(ball, SPACING**3, 200.0, 1e5),
         ]
     )
     skin = CENTRE + RADIUS * out

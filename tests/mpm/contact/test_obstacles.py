@@ -4,8 +4,9 @@ import math
 
 import pytest
 import torch
+from shared import solid
 
-from gaussian_swaying import MaterialPoints, MPMSolver
+from gaussian_swaying import MPMSolver
 from gaussian_swaying.geometry.keyed_path import KeyedPath
 from gaussian_swaying.mpm.boundaries.ball import BallObstacle
 from gaussian_swaying.mpm.boundaries.block import BoxObstacle
@@ -19,9 +20,7 @@ def _block(side=0.3, per_side=6, bottom=0.0):
     axis = (torch.arange(per_side, dtype=torch.float64) + 0.5) * side / per_side - side / 2
     place = torch.cartesian_prod(axis, axis, axis)
     place[:, 2] += bottom - float(place[:, 2].min())
-    return MaterialPoints.create(
-        place, volume=(side / per_side) ** 3, density=500.0, youngs_modulus=2e5, poisson_ratio=0.3
-    )
+    return solid(place, (side / per_side) ** 3, 500.0, 2e5)
 
 
 def _mean_velocity(solver, state):

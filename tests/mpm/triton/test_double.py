@@ -3,8 +3,9 @@
 import pytest
 import torch
 from catalogue import ELASTIC, PLASTIC
+from shared import solid
 
-from gaussian_swaying import AeroForce, Box, MaterialPoints, MPMSolver, PinnedRegion, UniformGust, WindField, WindForce
+from gaussian_swaying import AeroForce, Box, MPMSolver, PinnedRegion, UniformGust, WindField, WindForce
 
 CASES = [
     ("total", "corotated", "hinge"),
@@ -21,7 +22,7 @@ def _moved(formulation, law, transfer, held=()):
     axis = (torch.arange(20, dtype=torch.float64) + 0.5) / 20 * 0.9
     x, y = (g.reshape(-1) for g in torch.meshgrid(axis, axis, indexing="ij"))
     position = torch.stack([x, y, 0.5 + 0.003 * torch.sin(9 * x)], dim=-1)
-    points = MaterialPoints.create(position, volume=2e-5, density=50.0, youngs_modulus=5e3, poisson_ratio=0.3, law=law)
+    points = solid(position, 2e-5, 50.0, 5e3, law=law)
     solver = MPMSolver(dx=0.1, formulation=formulation, transfer=transfer, boundaries=held)
     velocity = torch.stack([0 * x, 0 * x, 2 * torch.sin(6 * x) * torch.cos(6 * y)], dim=-1)
     state = solver.init_state(points, velocity)

@@ -2,6 +2,7 @@
 
 import pytest
 import torch
+from shared import solid
 
 from gaussian_swaying import AeroForce, Box, MaterialPoints, MPMSolver, WindField, WindForce
 from gaussian_swaying.aero.effects import LogProfile
@@ -16,11 +17,9 @@ DT, STEPS = 0.01, 4
 def post(device, scale=1.0):
     """A post of 0.2 x 0.2 x 1 m with two patches of random directions on each point."""
     axes = (torch.linspace(0, 0.2, 4), torch.linspace(0, 0.2, 4), torch.linspace(0, 1, 20))
-    place = torch.stack(torch.meshgrid(*axes, indexing="ij"), -1).reshape(-1, 3).to(device)
+    place = torch.cartesian_prod(*axes).to(device)
     count, generator = len(place), torch.Generator().manual_seed(0)
-    points = MaterialPoints.create(
-        place, volume=0.04 / count, density=100.0, youngs_modulus=2e5 * scale, poisson_ratio=0.3, damping=0.5
-    )
+    points = solid(place, 0.04 / count, 100.0, 2e5 * scale, damping=0.5)
     normal = torch.nn.functional.normalize(torch.randn(2 * count, 3, generator=generator), dim=-1).to(device)
     area = torch.full((2 * count,), 0.3 / count, device=device)
     return points, Patches(normal, area, torch.arange(count, device=device).repeat(2), count)
