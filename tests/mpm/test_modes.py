@@ -13,7 +13,6 @@ from gaussian_swaying import (
     Box,
     Force,
     Material,
-    MaterialPoints,
     MPMSolver,
     PinnedRegion,
     WindField,
@@ -41,16 +40,7 @@ def post(E=1e6, density=100.0, ratio=0.0, law=None, **more):
     """A square post of 1 m, four points and two cells wide."""
     axes = [(torch.arange(n, dtype=torch.float64) + 0.5) * 0.05 for n in (4, 4, 20)]
     damping = decay_rate(ratio, 1.0) if ratio else None
-    return MaterialPoints.create(
-        torch.cartesian_prod(*axes),
-        volume=0.05**3,
-        density=density,
-        youngs_modulus=E,
-        poisson_ratio=0.3,
-        law=law,
-        damping=damping,
-        **more,
-    )
+    return solid(torch.cartesian_prod(*axes), 0.05**3, density, E, law=law, damping=damping, **more)
 
 
 def solver_of(formulation="modes", pins=None, **more):

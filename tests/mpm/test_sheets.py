@@ -29,15 +29,8 @@ def sheet(rotation, size=6, per_cell=2.2, bending=0.7, heights=(0.0,), dtype=tor
     flat = torch.cartesian_prod(side, side, torch.tensor(heights, dtype=torch.float64))
     normal = rotation[:, 2].expand(len(flat), 3).to(dtype)
     area = per_cell**-2
-    return MaterialPoints.create(
-        (flat @ rotation.T + 0.21).to(dtype),
-        volume=0.1 * area,
-        density=1.0,
-        youngs_modulus=100.0,
-        poisson_ratio=NU,
-        normal=normal,
-        bending=bending * area,
-        **more,
+    return solid(
+        (flat @ rotation.T + 0.21).to(dtype), 0.1 * area, 1.0, 100.0, NU, normal=normal, bending=bending * area, **more
     )
 
 

@@ -25,9 +25,7 @@ def bar(*boundaries, formulation="total", transfer="auto", dx=0.05, dtype=torch.
     h = dx / 2
     count = [round(length / h) for length in (0.4, 0.1, 0.1)]
     place = torch.cartesian_prod(*[(torch.arange(n, dtype=torch.float64) + 0.5) * h for n in count])
-    points = MaterialPoints.create(
-        place.to(dtype), volume=h**3, density=300.0, youngs_modulus=2e4, poisson_ratio=0.3, **other
-    )
+    points = solid(place.to(dtype), h**3, 300.0, 2e4, **other)
     return points, MPMSolver(dx=dx, formulation=formulation, gravity=gravity, transfer=transfer, boundaries=boundaries)
 
 

@@ -7,9 +7,10 @@ import math
 
 import pytest
 import torch
+from shared import solid
 from torch.testing import assert_close
 
-from gaussian_swaying import AeroForce, Box, MaterialPoints, MPMSolver, WindField, WindForce
+from gaussian_swaying import AeroForce, Box, MPMSolver, WindField, WindForce
 
 TOLERANCE = 2e-5
 """Relative to the largest value of a field. A substep rounds some hundred times (half of 1.2e-7 each): in the
@@ -40,15 +41,7 @@ def make_points(device, law=None, count=24, batch=(), **more):
 
 def make_body(position, law=None, youngs_modulus=1e4, **more):
     mass = 0.5 + torch.rand(position.shape[:-1], generator=torch.Generator().manual_seed(5))
-    return MaterialPoints.create(
-        position,
-        volume=1e-4,
-        density=(100.0 * mass).to(position.device),
-        youngs_modulus=youngs_modulus,
-        poisson_ratio=0.3,
-        law=law,
-        **more,
-    )
+    return solid(position, 1e-4, (100.0 * mass).to(position.device), youngs_modulus, law=law, **more)
 
 
 def set_going(solver, points, strain=0.2):
