@@ -211,37 +211,38 @@ HEADER = {"kind": 7, "nz": 1, "ny": 2, "towers": 0, "nt": 2, "dz": 2.0, "dy": 1.
 }
 
 
-@pytest.mark.parametrize(
-    ("changes", "fits"),
-    [
-        ({}, True),  # the smallest: one row of two places at two times
-        ({"towers": 3, "letters": 5}, True),
-        ({"nz": 0}, False),
-        ({"ny": 1}, False),
-        ({"nt": 1}, False),
-        ({"towers": -1}, False),
-        ({"letters": -4}, False),
-        *(({name: value}, False) for name in ("dz", "dy", "dt", "speed") for value in (0.0, -1.0, math.nan)),
-        *(({name: value}, False) for name in ("slope_u", "slope_w", "slope_v") for value in (0.0, math.nan, math.inf)),
-        ({"shift_v": math.nan}, False),
-        ({"more": 2}, False),
-        ({"more": -2}, False),
-    ],
-)
-def test_headers_of_turbsim(tmp_path, changes, fits):
-    """Each file is as long as its header says, but the last two."""
-    own = HEADER | {"letters": 0, "more": 0} | changes
-    more = own.pop("more")
-    values = own["nt"] * (own["ny"] * own["nz"] + own["towers"]) * 3
-    size = 2 * values + own["letters"] + more  # may be below zero, as the header is longer
-    data = struct.pack("<h4i12fi", *own.values())
+BAD_FIELDS = {
+    "nz": [0],
+    "ny": [1],
+    "nt": [1],
+    "towers": [-1],
+    "letters": [-4],
+    **dict.fromkeys(("dz", "dy", "dt", "speed"), (0.0, -1.0, math.nan)),
+    **dict.fromkeys(("slope_u", "slope_v", "slope_w"), (0.0, math.nan, math.inf)),
+    "shift_v": [math.nan],
+    "more": [2, -2],
+}
+
+
+def test_headers_of_turbsim(tmp_path):
+    """Each file is as long as its header says, but the last two. The smallest has one row of two places, two times."""
     path = tmp_path / "w.bts"
-    path.write_bytes((data + bytes(max(size, 0)))[: len(data) + size])
-    if fits:
+
+    def write(more=0, **changes):
+        own = HEADER | {"letters": 0} | changes
+        values = own["nt"] * (own["ny"] * own["nz"] + own["towers"]) * 3
+        size = 2 * values + own["letters"] + more  # may be below zero, as the header is longer
+        data = struct.pack("<h4i12fi", *own.values())
+        path.write_bytes((data + bytes(max(size, 0)))[: len(data) + size])
+
+    for changes in ({}, {"towers": 3, "letters": 5}):
+        write(**changes)
         assert read_bts(path).velocity.shape == (2, 2, 1, 3)
-    else:
-        with pytest.raises(ValueError, match="is damaged"):
-            read_bts(path)
+    for name, values in BAD_FIELDS.items():
+        for value in values:
+            write(**{name: value})
+            with pytest.raises(ValueError, match="is damaged"):
+                read_bts(path)
 
 
 def test_planes_of_turbsim_pass_one_after_the_other(tmp_path):
@@ -281,21 +282,20 @@ def test_an_anemometer(tmp_path):
     np.testing.assert_allclose(flows, [[4, 0, 0], [0, -2, 0], [-root, -root, 0]], atol=1e-12)
 
 
-@pytest.mark.parametrize(
-    ("text", "words"),
-    [
-        ("time,u [km/h],v\n0,1,2\n", r"`u` in .* is in 'km/h', not in m/s"),
-        ("time [ms],u,v\n0,1,2\n", r"`time` in .* is in 'ms', not in s"),
-        ("time,u,v,u\n0,1,2,3\n", "has two columns `u`: remove or rename one"),
-        ("time,u,v,U [m/s]\n0,1,2,3\n", "has two columns `u`: remove or rename one"),
-        ("u,v\n1,2\n", r"has no column `time \[s\]`"),
-        ("time,speed\n1,2\n", r"has no column `direction \[deg\]`"),
-        ("time,u,v\n0,1,2\n1,,2\n", "Line 3 of .* has no number"),
-        ("time,u,v\n0,1,nan\n", "Line 2 of .* has no number"),
-        ("time,u,v\n", "has no measurements"),
-        ("time,u,v\n1,1,1\n0,1,1\n", "times of `schedule` to increase"),
-    ],
-)
-def test_an_anemometer_that_does_not_fit_is_refused(tmp_path, text, words):
-    with pytest.raises(ValueError, match=words):
-        WindField(schedule=_csv(tmp_path / "a.csv", text))
+BAD_LINES = {
+    "time,u [km/h],v\n0,1,2\n": r"`u` in .* is in 'km/h', not in m/s",
+    "time [ms],u,v\n0,1,2\n": r"`time` in .* is in 'ms', not in s",
+    "time,u,v,U [m/s]\n0,1,2,3\n": "has two columns `u`",
+    "u,v\n1,2\n": r"has no column `time \[s\]`",
+    "time,speed\n1,2\n": r"has no column `direction \[deg\]`",
+    "time,u,v\n0,1,2\n1,,2\n": "Line 3 of .* has no number",
+    "time,u,v\n0,1,nan\n": "Line 2 of .* has no number",
+    "time,u,v\n": "has no measurements",
+    "time,u,v\n1,1,1\n0,1,1\n": "times of `schedule` to increase",
+}
+
+
+def test_an_anemometer_that_does_not_fit_is_refused(tmp_path):
+    for text, words in BAD_LINES.items():
+        with pytest.raises(ValueError, match=words):
+            WindField(schedule=_csv(tmp_path / "a.csv", text))
