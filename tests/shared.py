@@ -3,11 +3,23 @@
 import torch
 
 from gaussian_swaying import MaterialPoints
+from gaussian_swaying.geometry.regions import Region
 
 
 def solid(position, volume, density=100.0, E=1e4, nu=0.3, **more):
     """Material at some places."""
     return MaterialPoints.create(position, volume=volume, density=density, youngs_modulus=E, poisson_ratio=nu, **more)
+
+
+class Chosen(Region):
+    """Points by their number."""
+
+    def __init__(self, mask):
+        super().__init__()
+        self.mask = mask
+
+    def contains(self, points):
+        return self.mask.to(points.device)
 
 
 def unit(*shape, device="cpu", dtype=torch.float64):

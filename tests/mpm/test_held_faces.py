@@ -5,11 +5,11 @@ import warnings
 
 import pytest
 import torch
-from shared import solid
+from shared import Chosen, solid
 from torch.testing import assert_close
 
 from gaussian_swaying import Box, MPMSolver, PinnedPoints, PinnedRegion
-from gaussian_swaying.geometry.regions import Everything, Region
+from gaussian_swaying.geometry.regions import Everything
 from gaussian_swaying.mpm.boundaries.handle import Handle
 from gaussian_swaying.mpm.held_faces import SOFTENED, along_face, face, thickness
 from gaussian_swaying.mpm.held_rows import MOST_ROWS
@@ -27,16 +27,6 @@ def _box(x, y, z, step=0.25, turn=0.0):
 
 def _material(rest):
     return solid(rest, 1e-5)
-
-
-class Chosen(Region):
-    """Particles by their number."""
-
-    def __init__(self, mask):
-        self.mask = mask
-
-    def contains(self, points):
-        return self.mask
 
 
 # ---- the face

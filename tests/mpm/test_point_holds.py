@@ -6,7 +6,7 @@ from itertools import pairwise
 
 import pytest
 import torch
-from shared import solid
+from shared import Chosen, solid
 from torch.testing import assert_close
 
 from gaussian_swaying import (
@@ -18,7 +18,7 @@ from gaussian_swaying import (
     SimFrame,
     support_force,
 )
-from gaussian_swaying.geometry.regions import Everything, Region
+from gaussian_swaying.geometry.regions import Everything
 from gaussian_swaying.mpm import held_rows, point_holds
 from gaussian_swaying.mpm.boundaries.handle import Handle
 from gaussian_swaying.mpm.boundaries.plane import Plane
@@ -40,20 +40,6 @@ def _sheet(dtype=torch.float64, layers=1, width=8, height=10, turn=0.0, shift=(0
     matrix = torch.tensor([[c, 0, -s], [0, 1, 0], [s, 0, c]], dtype=torch.float64)
     position = (rest @ matrix.T + torch.tensor(shift, dtype=torch.float64)).to(dtype)
     return solid(position, STEP**2 * 0.02 / layers, 100.0, e)
-
-
-class Chosen(Region):
-    """Particles by their number."""
-
-    def __init__(self, mask):
-        super().__init__()
-        self.mask = mask
-
-    def forward(self, points):
-        return self.mask
-
-    def contains(self, points):
-        return self.mask.to(points.device)
 
 
 def _read(solver, place, field, state):
