@@ -2,12 +2,8 @@
 
 from __future__ import annotations
 
-import atexit
-import os
 import sys
-import threading
 from pathlib import Path
-from typing import NoReturn
 
 INSTALLED = "gaussian-swaying"
 _called: list[str] = []  # the command, if it was started through the installed program
@@ -42,23 +38,3 @@ def this() -> list[str]:
         return [INSTALLED, *_called]
     program = sys.argv[0] or "python"
     return ["python", program] if program.endswith(".py") else [Path(program).name]
-
-
-def leave(code: int) -> NoReturn:
-    """End the process, once its threads have ended and its exit handlers have run.
-
-    Python would then take every module and object apart, which takes half a second with torch and changes nothing.
-
-    Args:
-        code: The exit code.
-    """
-    threading._shutdown()  # type: ignore[attr-defined]  # as multiprocessing ends its processes
-    atexit._run_exitfuncs()
-    for stream in (sys.stdout, sys.stderr):
-        try:
-            stream.flush()
-        except (AttributeError, ValueError, BrokenPipeError):  # there is none, or it is closed
-            pass
-        except OSError:  # its disk is full
-            code = code or 120  # as Python says it
-    os._exit(code)

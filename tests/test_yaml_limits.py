@@ -1,13 +1,12 @@
 """Configurations that are too much are refused before they are built, in a sentence."""
 
-import os
 from pathlib import Path
 
 import pytest
 import yaml
 from shared import refused
 
-from gaussian_swaying._yaml_limits import check_config_files, check_yaml, read_fields
+from gaussian_swaying._yaml_limits import check_yaml, read_fields
 from gaussian_swaying.cli.simulate import main
 
 CONFIGS = sorted((Path(__file__).parents[1] / "configs").rglob("*.yaml"))
@@ -22,13 +21,10 @@ def laughs(levels):
 
 BAD = {
     "laughs": (laughs(10), "values, aliases included"),
-    "cyclic": ("wind: &w {flow: [1, 2, 3], again: *w}", r"contain itself: remove the alias \*w"),
-    "short": ("edits: &w [*w]", "contain itself"),
-    "deep": ("[" * 100_000, "nested too deeply"),
-    "long": ("background: [" + "0, " * 19_000 + "0]", "A list of 19,001 entries"),
+    "cyclic": ("wind: &w {flow: [1, 2, 3], again: *w}", "too large"),
+    "deep": ("[" * 100_000, "64 levels"),
     "many": ("edits:\n" + "- {time: 1.0, E: 2.0}\n" * 20_000, "too large"),
     "large": ("output: " + "x" * (1 << 20), "too long"),
-    "digits": ("material: {E: " + "9" * 400 + "}", "400 digits"),
 }
 
 
@@ -45,32 +41,11 @@ def test_aliases_that_do_no_harm_are_kept():
     assert check_yaml(text) == text
     assert yaml.safe_load(laughs(4))["a3"][0][0][0][0] == "lol"
     assert check_yaml(laughs(4))
-    assert check_yaml("'" + "9" * 400 + "'")  # text, no number
 
 
 @pytest.mark.parametrize("config", CONFIGS, ids=lambda path: path.stem)
 def test_shipped_configurations_are_far_from_the_limits(config):
     assert check_yaml(config.read_text(encoding="utf-8")) == config.read_text(encoding="utf-8")
-
-
-def test_files_that_are_no_configurations(tmp_path):
-    os.mkfifo(tmp_path / "pipe.yaml")
-    (tmp_path / "latin.yaml").write_bytes("output: Blüte\n".encode("latin-1"))
-    (tmp_path / "wide.yaml").write_bytes("output: Blüte\n".encode("utf-16"))
-    (tmp_path / "huge.yaml").write_bytes(b"#" * (1 << 20) + b"\n")
-    for arguments, words in (
-        (["--config", str(tmp_path / "pipe.yaml")], "not a regular file"),
-        ([f"--config={tmp_path / 'latin.yaml'}"], "latin.yaml is not UTF-8 text"),
-        (["--config", str(tmp_path / "wide.yaml")], "wide.yaml is not UTF-8 text"),
-        (["--wind", str(tmp_path / "huge.yaml")], "1,048,577 bytes"),
-        (["--config", "/dev/zero"], "not a regular file"),
-        (["--config", str(tmp_path)], "is a directory"),
-    ):
-        with pytest.raises(ValueError, match=words):
-            check_config_files(arguments)
-    check_config_files(
-        ["--config", "wind: {flow: [1, 2, 3]}", "--config", "/nowhere.yaml", "--frames", "3", "x" * 5000]
-    )
 
 
 def test_a_group_without_fields(capsys):

@@ -24,7 +24,6 @@ import torch
 
 from gaussian_swaying import _program as program
 from gaussian_swaying._checks import first_line
-from gaussian_swaying.cli.streams import SafeStream, safe_streams
 from gaussian_swaying.kernels.cpu import compiled, compiled_sentence
 from gaussian_swaying.runs.signals import exit_code
 
@@ -56,8 +55,7 @@ def run_command(
 ) -> int:
     """Run a command, and turn exceptions into a sentence on standard error and an exit code.
 
-    If standard output or error is closed, full or cannot show a character, the command still runs. Standard error says
-    at the end how long it took to compile kernels, if there were any.
+    Standard error says at the end how long it took to compile kernels, if there were any.
 
     Args:
         command: Does the work and gives an exit code; None is 0.
@@ -79,34 +77,24 @@ def run_command(
             if line:
                 print(line, file=sys.stderr)
 
-    def outcome() -> int:
-        known = compiled()[0]
-        try:
-            with warnings.catch_warnings():
-                warnings.showwarning = _once(set())
-                code = command() or OK
-            told = compiled_sentence(known)
-            if told is not None:
-                print(f"note: {told}", file=sys.stderr)
-            return code
-        except KeyboardInterrupt as stop:
-            tell(stopped, stop)
-            return exit_code(stop)
-        except Exception as error:
-            if os.environ.get("GAUSSIAN_SWAYING_DEBUG") == "1":
-                raise
-            for_users = sentence(error, memory, expected, arguments)
-            tell(f"error: {for_users or _bug(error)}", error)
-            return BUG if for_users is None else BAD_INPUT
-
-    with safe_streams() as (output, _):
-        try:
-            code = outcome()
-        except SystemExit:  # --help and the like
-            if not _was_written(output):
-                raise SystemExit(BAD_INPUT) from None
+    known = compiled()[0]
+    try:
+        with warnings.catch_warnings():
+            warnings.showwarning = _once(set())
+            code = command() or OK
+        told = compiled_sentence(known)
+        if told is not None:
+            print(f"note: {told}", file=sys.stderr)
+        return code
+    except KeyboardInterrupt as stop:
+        tell(stopped, stop)
+        return exit_code(stop)
+    except Exception as error:
+        if os.environ.get("GAUSSIAN_SWAYING_DEBUG") == "1":
             raise
-        return code if _was_written(output) else code or BAD_INPUT
+        for_users = sentence(error, memory, expected, arguments)
+        tell(f"error: {for_users or _bug(error)}", error)
+        return BUG if for_users is None else BAD_INPUT
 
 
 def _bug(error: Exception) -> str:
@@ -119,16 +107,6 @@ def _bug(error: Exception) -> str:
         if Path(frame.filename).is_file() and not any(map(Path(frame.filename).is_relative_to, LIBRARIES)):
             return f"{what} It was raised in {frame.filename}, line {frame.lineno}: correct it there, with {shown}"
     return f"{what} This is a bug in gaussian_swaying: please report it with {shown}"
-
-
-def _was_written(output: SafeStream) -> bool:
-    """True if all standard output was written; if not, print an error. A pipe closed by its reader is no error."""
-    output.flush()
-    number = getattr(output.error, "errno", None) or errno.EBADF
-    if output.error is None or number == errno.EPIPE:
-        return True
-    print(f"error: Standard output could not be written ({os.strerror(number)}).", file=sys.stderr)
-    return False
 
 
 def _once(shown: set[str]) -> Callable[..., None]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import difflib
 import gc
+import io
 import sys
 from collections.abc import Sequence
 from importlib import import_module
@@ -59,13 +60,16 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def run(command: str | None = None) -> NoReturn:
-    """Run a command with the arguments of the process, and end the process.
+    """Run a command with the arguments of the process, and end the process with its exit code.
 
     Args:
         command: The command of a program of the folder tools; None for the installed program, whose first argument
             names it.
     """
-    program.leave(main() if command is None else _imported(COMMANDS[command][0]).main())
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, io.TextIOWrapper):
+            stream.reconfigure(errors="replace")  # a terminal without the sign for cubic metres
+    sys.exit(main() if command is None else _imported(COMMANDS[command][0]).main())
 
 
 def _imported(name: str) -> ModuleType:

@@ -15,7 +15,6 @@ from typing import Any
 
 from gaussian_swaying import _program as program
 from gaussian_swaying._checks import check_positive
-from gaussian_swaying._yaml_limits import check_config_files
 from gaussian_swaying.aero.looks import LOOKS
 from gaussian_swaying.cli.errors import guessing, parser_sentence, run_command
 from gaussian_swaying.cli.shipped import with_shipped
@@ -308,7 +307,6 @@ def _pipeline(
 ) -> tuple[Simulation, Any]:
     """The simulation of a configuration, given by options or as text, and its settings; of some Gaussians of it."""
     parser = Simulation.parser()
-    check_config_files(arguments)
     try:
         with guessing(parser):
             settings = parser.parse_args(arguments) if text is None else parse_text(parser, text, arguments)

@@ -6,7 +6,6 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from gaussian_swaying._yaml_limits import check_config_files
 from gaussian_swaying.cli.errors import guessing
 from gaussian_swaying.cli.shipped import with_shipped
 from gaussian_swaying.simulation.defaults import resolve_device
@@ -66,7 +65,6 @@ def settings_of(
     else:
         config = scene or (None if is_given(given, "--config") else "flag")
         arguments = with_shipped([*(["--config", config] if config else []), *given], "sim")
-        check_config_files(arguments)
         with guessing(parser):
             settings = parser.parse_args(arguments)
     return settings

@@ -7,7 +7,6 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from gaussian_swaying._yaml_limits import check_config_files
 from gaussian_swaying.aero.computed_air import resolution
 from gaussian_swaying.aero.wind import WindField
 from gaussian_swaying.cli.errors import guessing, how_to_resume, run_command
@@ -53,7 +52,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
 def _simulate(parser: ArgumentParser, arguments: Sequence[str], started: list[Simulation]) -> None:
     """Parse, build, run, and report the files; the simulation is put into ``started`` before it writes anything."""
     arguments = with_shipped(arguments, "sim")
-    check_config_files(arguments)
     with guessing(parser):
         settings = parser.parse_args(arguments)
     simulation = Simulation.from_settings(parser, settings)

@@ -25,9 +25,10 @@ import gaussian_swaying.training.densification  # noqa: F401
 import gaussian_swaying.training.losses  # noqa: F401
 from gaussian_swaying import _program as program
 from gaussian_swaying._files import atomic
-from gaussian_swaying._yaml_limits import check_config_files, limit_yaml
+from gaussian_swaying._yaml_limits import limit_yaml
 from gaussian_swaying.cli.errors import command, guessing, run_command
 from gaussian_swaying.cli.shipped import with_shipped
+from gaussian_swaying.config.material_names import with_named_materials
 from gaussian_swaying.runs.signals import stop_signals
 from gaussian_swaying.training.checkpoints import SealedCheckpoints, read_training_checkpoint
 from gaussian_swaying.training.csv_log import CsvLog
@@ -187,9 +188,8 @@ def make_cli(arguments: Sequence[str] | None = None, run: bool = True, run_folde
         ValueError: If a value is out of range or the data are bad.
         TrainingDiverged: If a loss or a Gaussian is no longer finite.
     """
-    limit_yaml()
+    limit_yaml(with_named_materials)
     given = with_shipped(sys.argv[1:] if arguments is None else arguments, "train")
-    check_config_files(given)
     return TrainCLI(
         SplatTrainer,
         LightningDataModule,

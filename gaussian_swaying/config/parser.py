@@ -21,7 +21,7 @@ from torch import Tensor, nn
 
 from gaussian_swaying import _program as program
 from gaussian_swaying._checks import check_frames
-from gaussian_swaying._yaml_limits import check_config_files, limit_yaml
+from gaussian_swaying._yaml_limits import limit_yaml
 from gaussian_swaying.aero.carried import Turbulence
 from gaussian_swaying.aero.obstacles import CylinderObstacle, EllipsoidObstacle, SphereObstacle
 from gaussian_swaying.aero.recorded import FrozenWind
@@ -225,7 +225,6 @@ def parse_file(parser: ArgumentParser, path: str | os.PathLike[str]) -> Namespac
         ValueError: If the file or a value in it is invalid; the message names the field.
     """
     arguments = ["--config", os.fspath(path)]
-    check_config_files(arguments)
     try:
         return parser.parse_args(arguments)
     except ArgumentError as error:

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from gaussian_swaying._checks import check_whole
-from gaussian_swaying._yaml_limits import check_config_files, read_fields
+from gaussian_swaying._yaml_limits import read_fields
 from gaussian_swaying.config.parser import check_settings, import_forces, option
 from gaussian_swaying.fitting.unknowns import Unknown, default_scale
 from gaussian_swaying.simulation.simulation import Simulation
@@ -169,7 +169,6 @@ def parse_base(plan: Plan, parser: ArgumentParser) -> Namespace:
         ValueError: If the settings do not fit together.
     """
     files = [word for name in plan.base for word in ("--config", name)]
-    check_config_files(files)
     settings = parser.parse_args([*files, *(option(name, value) for name, value in plan.known.items())])
     check_settings(Simulation, settings)
     return settings

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from gaussian_swaying._inputs import check_regular
-from gaussian_swaying._yaml_limits import check_config_files, read_fields
+from gaussian_swaying._yaml_limits import read_fields
 from gaussian_swaying.config.parser import check_settings, config_text, option, parse_text
 from gaussian_swaying.runs.seal import sha256
 from gaussian_swaying.simulation.parameters import POLAR, all_in_settings
@@ -119,7 +119,6 @@ def make_plan(sweep: Sweep, parser: ArgumentParser | None = None) -> Plan:
     """
     parser = parser or Simulation.parser()
     files = [word for name in sweep.base for word in ("--config", name)]
-    check_config_files(files)
     shared = parser.parse_args([*files, *(option(name, value) for name, value in sweep.settings.items())])
     check_settings(Simulation, shared)
     config, splats = config_text(parser, shared), set()

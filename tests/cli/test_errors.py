@@ -1,7 +1,5 @@
-"""One place turns errors into a sentence and an exit code, and no stream stops a command."""
+"""One place turns errors into a sentence and an exit code."""
 
-import errno
-import io
 import os
 import re
 import subprocess
@@ -16,7 +14,6 @@ import torch
 from shared import refused
 
 from gaussian_swaying.cli.errors import guessing, parser_sentence, run_command, sentence
-from gaussian_swaying.cli.streams import SafeStream
 from gaussian_swaying.geometry.patches import deform_all
 from gaussian_swaying.kernels import cpu
 from gaussian_swaying.kernels.language import INTERPRETED
@@ -134,62 +131,6 @@ def test_kernels_that_were_compiled_are_told_once_on_standard_error(tmp_path, mo
         rf"note: Compiled 1 kernel for this CPU in \d+\.\d s, once \(kept in {tmp_path}\)\.\n", told.err
     )
     assert [path.suffix for path in tmp_path.iterdir()] == [".o"]
-
-
-# ---- streams
-
-
-class Broken(io.StringIO):
-    """Fails as a full disk does."""
-
-    def write(self, text):
-        raise OSError(errno.ENOSPC, "No space left on device")
-
-
-def test_a_stream_that_fails_is_left_alone():
-    stream = SafeStream(Broken())
-    assert stream.write("one") == 3
-    assert stream.error.errno == errno.ENOSPC
-    stream.write("two")
-    stream.flush()
-    closed = io.StringIO()
-    closed.close()
-    SafeStream(closed).write("three")
-
-
-def test_letters_that_the_terminal_lacks():
-    raw = io.BytesIO()
-    stream = SafeStream(io.TextIOWrapper(raw, encoding="ascii"))
-    stream.write("5 kg/m³ é π")
-    stream.flush()
-    assert raw.getvalue() == b"5 kg/m3 e ?"
-
-
-def shell(line, tmp_path, **variables):
-    """Exit code of a line of a shell with ``sim.py`` in it, and what it said on standard error."""
-    environment = {**os.environ, "PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1", **variables}
-    line = "set -o pipefail; " + line.replace("sim.py", f"{sys.executable} {ROOT / 'tools/sim.py'}")
-    done = subprocess.run(["bash", "-c", line], cwd=tmp_path, env=environment, capture_output=True, text=True)
-    assert "Traceback" not in done.stderr
-    assert "Exception ignored" not in done.stderr
-    return done.returncode, done.stderr, done.stdout
-
-
-FULL = "error: Standard output could not be written (No space left on device).\n"
-
-
-@pytest.mark.slow(gate=["help-head", "help-full"])
-@pytest.mark.parametrize(
-    ("line", "ended"),
-    [
-        pytest.param("sim.py --help | head -1", (0, ""), id="help-head"),
-        pytest.param("sim.py --help >/dev/full", (2, FULL), id="help-full"),
-        pytest.param("sim.py --bad 2>/dev/full", (2, ""), id="bad-full"),
-        pytest.param("sim.py --bad 2>&-", (2, ""), id="bad-closed"),
-    ],
-)
-def test_the_program_with_broken_streams(tmp_path, line, ended):
-    assert shell(line, tmp_path)[:2] == ended
 
 
 # ---- guesses

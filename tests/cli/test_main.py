@@ -1,8 +1,6 @@
 """The installed program, and configurations by name."""
 
-import os
 import runpy
-import subprocess
 import sys
 from pathlib import Path
 
@@ -47,34 +45,6 @@ def test_each_tool_is_a_program(name, monkeypatch, capsys):
         runpy.run_path(str(ROOT / "tools" / f"{name}.py"), run_name="__main__")
     assert left.value.code in (0, None)
     assert capsys.readouterr().out.startswith(f"usage: {name.split('_')[0]}.py")
-
-
-def test_a_script_ends_at_once_after_its_threads_and_exit_handlers():
-    """What Python would take apart is left; the exit code and all that was printed arrive."""
-    code = """
-import atexit, sys, threading, time
-from gaussian_swaying.cli import main
-
-class Part:
-    def __del__(self):
-        print("taken apart")
-
-part = Part()
-atexit.register(print, "handler")
-threading.Thread(target=lambda: (time.sleep(0.2), print("thread"))).start()
-main.main = lambda: 3
-main.run()
-"""
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
-    assert (done.returncode, done.stdout, done.stderr) == (3, "thread\nhandler\n", "")
-
-
-@pytest.mark.skipif(not Path("/dev/full").exists(), reason="needs a file that is always full")
-def test_a_full_disk_is_no_success():
-    code = "import sys; sys.argv = ['gaussian-swaying', '--version']; from gaussian_swaying.cli.main import run; run()"
-    with open("/dev/full", "w") as full:
-        buffered = {**os.environ, "PYTHONUNBUFFERED": ""}
-        assert subprocess.run([sys.executable, "-c", code], stdout=full, cwd=ROOT, env=buffered).returncode == 120
 
 
 def test_commands_that_are_printed_can_be_pasted(monkeypatch):
