@@ -100,19 +100,12 @@ class FrameDiagnostics:
     support: tuple[tuple[float, float, float], ...] = ()
 
     def as_dict(self) -> dict[str, float | int]:
-        """The fields by name, with ``support`` as three numbers for each boundary (:func:`entry_names`)."""
+        """The fields by name, with ``support`` as three numbers for each boundary, ``support_0_x`` and so on."""
         values = asdict(self)
-        forces = [number for force in values.pop("support") for number in force]
-        return values | dict(zip(_support_names(len(self.support)), forces, strict=True))
-
-
-def _support_names(boundaries: int) -> list[str]:
-    return [f"support_{k}_{axis}" for k in range(boundaries) for axis in "xyz"]
-
-
-def entry_names(boundaries: int) -> list[str]:
-    """The names of the entries of ``FrameDiagnostics.as_dict`` for a number of boundaries."""
-    return [name for name in FrameDiagnostics.__dataclass_fields__ if name != "support"] + _support_names(boundaries)
+        forces = values.pop("support")
+        return values | {
+            f"support_{k}_{axis}": x for k, force in enumerate(forces) for axis, x in zip("xyz", force, strict=True)
+        }
 
 
 class TearingGauge:

@@ -1,7 +1,5 @@
 """A checkpoint that is not what the run wrote is refused in one sentence, whatever has happened to it."""
 
-import copy
-import io
 import json
 import math
 import pickle
@@ -10,7 +8,6 @@ import shutil
 import traceback
 
 import pytest
-import torch
 from damage import damaged
 from shared import contents
 
@@ -20,8 +17,6 @@ from gaussian_swaying.mpm.solver import MPMSolver
 from gaussian_swaying.recording.checkpoint import log_lines, read_checkpoint
 from gaussian_swaying.recording.recorder import Recorder
 from gaussian_swaying.runs.seal import check_seal, save_sealed, seal
-from gaussian_swaying.simulation.diagnostics import entry_names
-from gaussian_swaying.simulation.stepper import Stepper
 
 CONFIG = "material:\n  E: 3000.0\nwind:\n  flow:\n  - 6.0\n  - 1.5\n  - 0.0\n"
 
@@ -71,43 +66,6 @@ def _refused(resume, folder, case):
     raise AssertionError(f"{case} went on silently")
 
 
-JUNK = [None, True, -1, 2.5, "text", b"bytes", [], {}, torch.zeros(3), torch.zeros(()), float("nan")]
-
-
-def _variants(value):
-    """The value with another type, shape, precision, or something that is not finite."""
-    yield from (junk for junk in JUNK if type(junk) is not type(value))
-    if isinstance(value, torch.Tensor):
-        yield value[..., None]
-        yield value.to(torch.float16 if value.dtype != torch.float16 else torch.float32)
-        yield value.to(torch.complex64)
-        if value.ndim:
-            yield value[:-1]
-            yield value[..., :-1]
-        if value.is_floating_point():
-            for wrong in (float("nan"), float("inf")):
-                changed = value.clone()
-                changed[(-1,) * changed.ndim] = wrong
-                yield changed
-    if isinstance(value, tuple):
-        yield from (value[:-1], (*value, 1), (0.5,) * 3, (2**40,) * 3, ("a",) * 3)
-    if type(value) is float:
-        yield from (-value - 1.0, float("nan"), float("inf"))
-
-
-def _fields(checkpoint):
-    """Every dictionary in a checkpoint and how to find it in a copy."""
-    yield "", checkpoint, lambda copy: copy
-    yield "state.", checkpoint["state"], lambda copy: copy["state"]
-    yield "grid.", checkpoint["state"]["grid"], lambda copy: copy["state"]["grid"]
-    yield "log[1].", checkpoint["log"][1], lambda copy: copy["log"][1]
-    yield "wall_s.", checkpoint["wall_s"], lambda copy: copy["wall_s"]
-
-
-# none of these changes what the run computes
-HARMLESS = {("state.F_total", None), ("state.internal", None), ("splat", None)}
-
-
 def _with_lines(checkpoint):
     """As it is written: its log as lines, of whatever is in it."""
     if isinstance(checkpoint, dict) and isinstance(checkpoint.get("log"), list):
@@ -115,61 +73,7 @@ def _with_lines(checkpoint):
     return checkpoint
 
 
-def _broken_fields(file):
-    """A checkpoint with a right checksum for each field that is missing, renamed or of another kind."""
-
-    held = torch.load(file, weights_only=True)
-    held["log"] = [json.loads(line) for line in held["log"]]
-
-    def fresh():
-        return copy.deepcopy(held)
-
-    for prefix, fields, find in _fields(fresh()):
-        for name, value in fields.items():
-            if prefix + name != "splat" and not prefix.startswith("wall"):
-                other = fresh()
-                del find(other)[name]
-                yield f"{prefix}{name} missing", other
-                other = fresh()
-                find(other)[f"{name}s"] = find(other).pop(name)
-                yield f"{prefix}{name} renamed", other
-            for variant in _variants(value):
-                if variant is None and (prefix + name, None) in HARMLESS:
-                    continue
-                number = type(variant) in (int, float)
-                if number and (prefix == "log[1]." or (prefix == "wall_s." and 0 <= variant < float("inf"))):
-                    continue  # a number is a number
-                other = fresh()
-                find(other)[name] = variant
-                yield f"{prefix}{name} = {variant!r}"[:80], other
-    other = fresh()
-    other["log"].pop()
-    yield "a log of too few frames", other
-    other = fresh()
-    other["frame"] = 0
-    yield "the frame before", other
-    other = fresh()
-    other["state"]["time"] = other["state"]["time"] + 0.04
-    yield "the time of another frame", other
-    yield "a list", [1, 2]
-    yield "nothing", {}
-
-
-@pytest.fixture
-def _one_start(monkeypatch):
-    """The state at rest is the same for all that are refused, and making it takes most of the time."""
-    start, made = Stepper.start, {}
-
-    def once(self):
-        if self not in made:
-            made[self] = start(self)
-        return made[self]
-
-    monkeypatch.setattr(Stepper, "start", once)
-
-
-@pytest.mark.usefixtures("_one_start")
-def test_damaged_bytes_and_hundreds_of_other_fields(run):
+def test_damaged_bytes(run):
     """None goes on silently, none ends in anything but the one sentence; then the right one goes on."""
     folder, resume = run
     file = folder / "checkpoint.pt"
@@ -179,16 +83,6 @@ def test_damaged_bytes_and_hundreds_of_other_fields(run):
         assert changed != content
         file.write_bytes(changed)
         assert "checkpoint.pt cannot be read as a checkpoint" in _refused(resume, folder, case)
-    file.write_bytes(content)
-    broken = list(_broken_fields(file))
-    for case, checkpoint in broken:
-        save_sealed(file, _with_lines(checkpoint))
-        _refused(resume, folder, case)
-    assert len(broken) > 300
-    held = torch.load(io.BytesIO(content), weights_only=True)
-    for junk in (*JUNK, "[1", {"cfl": 0.1}):  # instead of a line
-        save_sealed(file, held | {"log": [held["log"][0], junk]})
-        _refused(resume, folder, f"log[1] = {junk!r}")
     file.write_bytes(content)
     assert resume()["status"] == "complete"
 
@@ -217,14 +111,6 @@ def test_no_advice_to_execute_the_code_in_a_file(tmp_path, bare):
         read_checkpoint(file)
     assert "weights_only" not in "".join(traceback.format_exception(caught.value, limit=0))
     assert not (tmp_path / "burnt").exists()
-
-
-def test_a_configuration_that_is_no_yaml(run):
-    folder, resume = run
-    held = read_checkpoint(folder / "checkpoint.pt")
-    for text in ("{", "a: [" * 5000, "x: !!python/object/apply:os.getcwd []"):
-        save_sealed(folder / "checkpoint.pt", _with_lines(held | {"config": text}))
-        assert "`config` is not valid YAML" in _refused(resume, folder, text[:20])
 
 
 def test_a_splat_that_was_exchanged(make_cloud, make_simulation, tmp_path):
@@ -267,17 +153,6 @@ def test_edits_that_bring_an_internal_variable(make_simulation, tmp_path, formul
     held = read_checkpoint(tmp_path / "run" / "checkpoint.pt")
     assert held["state"]["internal"] is not None
     make().run(tmp_path / "run", 4, resume=True, progress=False, recorder=recorder)
-    held["state"]["internal"] = torch.full_like(held["state"]["internal"], torch.nan)
-    save_sealed(tmp_path / "run" / "checkpoint.pt", _with_lines(held | {"frame": 2}))
-    with pytest.raises(ValueError, match="its `internal` is NaN"):
-        make().run(tmp_path / "run", 4, resume=True, progress=False, recorder=recorder)
-
-
-def test_the_diagnostics_of_a_frame_are_what_a_log_holds(run):
-    held = read_checkpoint(run[0] / "checkpoint.pt")
-    assert list(held["log"][0]) == entry_names(1)
-    assert entry_names(1)[-3:] == ["support_0_x", "support_0_y", "support_0_z"]
-    assert held["log"][-1]["support_0_z"] != 0.0 == held["log"][0]["support_0_z"]
 
 
 def test_the_lines_of_a_log_are_made_once():

@@ -19,7 +19,6 @@ from gaussian_swaying.simulation.diagnostics import (
     TearingGauge,
     check_state,
     diagnose,
-    entry_names,
     measure,
 )
 
@@ -70,7 +69,6 @@ def test_numbers_of_a_known_state():
     # c = sqrt(2 mu / rho) = 10 m/s, twice that in a cell stretched by 2, and 2 m/s of motion
     assert health.cfl == pytest.approx(1e-3 * (2 * 10.0 + 2.0) / 0.2)
     assert health.as_dict()["kinetic"] == health.kinetic
-    assert list(health.as_dict()) == entry_names(0)
 
 
 def test_forces_on_supports(make_simulation):
@@ -84,7 +82,6 @@ def test_forces_on_supports(make_simulation):
     assert health.support[1] == (0.0, 0.0, 0.0)
     assert health.support[0][2] < 0 < health.support[0][0]
     row = health.as_dict()
-    assert list(row) == entry_names(2)
     assert [row[f"support_0_{axis}"] for axis in "xyz"] == list(health.support[0])
     assert diagnose(simulation.solver, before, 0, 0.0).support == ((0.0, 0.0, 0.0),) * 2
 
