@@ -62,7 +62,6 @@ class MPMSolver(Solver):
         cfl: Courant number of the adaptive substep, ``dt = cfl dx / (c + |v|)``; up to 0.47 is stable near rest for any
             arrangement of particles and any Poisson's ratio.
         substep: Fixed substep [s] instead of the adaptive one; checked against the stable one.
-        mls: Stress term and update of F as in MLS-MPM (Hu et al. 2018); only in ``updated``.
         deterministic: On a GPU, sum in a fixed order, so that repeated runs give the same bits; slower. On a CPU the
             order is always fixed. Gradients on a GPU are not covered.
         pivot: Whether the two main modes have the frequency of the softer one, as those of a thing that hangs or stands
@@ -93,7 +92,6 @@ class MPMSolver(Solver):
         stiffness_damping: float = 0.0,
         cfl: float = 0.4,
         substep: float | None = None,
-        mls: bool = False,
         deterministic: bool = False,
         pivot: bool = False,
         boundaries: Sequence[Boundary] = (),
@@ -106,7 +104,7 @@ class MPMSolver(Solver):
         if substep is not None:
             check_positive("substep", substep)
         gravity = check_vector("gravity", gravity)
-        self.settings = Settings(dx, gravity, damping, stiffness_damping, mls, deterministic, pivot)
+        self.settings = Settings(dx, gravity, damping, stiffness_damping, deterministic, pivot)
         self.automatic, self.why = formulation == "auto", ""
         self.formulation: Literal["total", "updated", "modes", "auto"] = "total" if self.automatic else formulation
         self._too_far: str | None = None
@@ -114,7 +112,6 @@ class MPMSolver(Solver):
         self.cfl, self.substep = float(cfl), substep
         if pivot and formulation != "modes":
             raise ValueError("`pivot` joins two modes: set `formulation` to modes, or `pivot` to false.")
-        FORMULATIONS[self.formulation].check_settings(self.settings)
         self.boundaries = nn.ModuleList(boundaries)
         # the same in metres; in a tuple, because these copies do not belong to the module's state
         self._framed: tuple[Boundary, ...] | None = None
@@ -143,11 +140,6 @@ class MPMSolver(Solver):
     def stiffness_damping(self) -> float:
         """Time constant of the stiffness damping [s]."""
         return self.settings.stiffness_damping
-
-    @property
-    def mls(self) -> bool:
-        """True if the stress term and the update of F are those of MLS-MPM."""
-        return self.settings.mls
 
     @property
     def deterministic(self) -> bool:

@@ -90,7 +90,6 @@ def bspline_stencil(
     grid: GridSpec,
     moments: bool = True,
     snap: float = 0.0,
-    gradients: bool = True,
     deterministic: bool = False,
     fixed: bool = False,
     nodes: Tensor | None = None,
@@ -106,7 +105,6 @@ def bspline_stencil(
         moments: Also keep ``w (x_i - x_p)``, which APIC needs.
         snap: A particle within ``snap * dx`` of a plane where a weight vanishes is moved onto it for this stencil, so
             that no node is left with only a vanishing mass.
-        gradients: Also keep the gradients of the weights; MLS-MPM does not need them.
         deterministic: Also sort the nodes, so that sums over particles have the same order in every run on a GPU.
         fixed: The stencil will be used many times: on a CPU, and without a gradient in ``position``, also keep
             ``matrices``. They take 432 bytes for each row of each particle in float32, and transfers then take a third
@@ -144,9 +142,7 @@ def bspline_stencil(
         first = first + scene * grid.node_count
 
     w = w * inside
-    factors = [w]
-    if gradients:
-        factors.append(slope / dx * inside)
+    factors = [w, slope / dx * inside]
     if moments:
         reach = torch.arange(3, device=f.device, dtype=f.dtype)
         factors.append(w * ((reach[:, None] - f[:, None]) * dx))
@@ -338,7 +334,6 @@ def scatter_momentum(
     impulse: Tensor | None,
     stress_impulse: Tensor | None,
     stencil: Stencil,
-    mls_scale: float | None = None,
 ) -> Tensor:
     r"""One scatter of everything the ``updated`` grid update needs (paper, supplement, "MPM Algorithm"), with APIC.
 
@@ -353,9 +348,6 @@ def scatter_momentum(
         impulse: External impulse [N s], shape (..., P, 3), or None.
         stress_impulse: Stress times rest volume times time [N m s], shape (..., P, 3, 3), or None.
         stencil: Support of each particle, with moments.
-        mls_scale: 4 / dx² [1/m²] for the stress term of MLS-MPM (Hu et al. 2018), which uses
-            :math:`w_{ip} (x_i - x_p)\, 4 / \Delta x^2` instead of :math:`\nabla w_{ip}`; the stencil then needs no
-            gradients. None for the gradient itself.
 
     Returns:
         Momentum [kg m/s] in columns 0 to 2 and mass [kg] in column 3, shape (..., G, 4).
@@ -364,10 +356,6 @@ def scatter_momentum(
         ValueError: If a particle tensor does not have the shape above.
     """
     count = mass.shape[-1]
-    if (stencil.rows == 4) != (mls_scale is not None):
-        raise ValueError(
-            "Expected a `stencil` without gradients for `mls_scale`, and with gradients and moments otherwise."
-        )
     check_shape("velocity", velocity, count, 3)
     check_shape("affine", affine, count, 3, 3)
     momentum = mass[..., None] * velocity
@@ -377,7 +365,7 @@ def scatter_momentum(
     value = torch.cat([momentum, mass[..., None]], dim=-1)[..., None, :]
     gradient = torch.zeros_like(affine) if stress_impulse is None else -stress_impulse.mT
     moment = mass[..., None, None] * affine.mT
-    matrix = torch.cat([gradient, moment], dim=-2) if mls_scale is None else moment + mls_scale * gradient
+    matrix = torch.cat([gradient, moment], dim=-2)
     matrix = torch.cat([matrix, matrix.new_zeros(*matrix.shape[:-1], 1)], dim=-1)
     return scatter(stencil, torch.cat([value, matrix], dim=-2))
 
@@ -386,7 +374,7 @@ def g2p(node_velocity: Tensor, stencil: Stencil, dx: float) -> tuple[Tensor, Ten
     r"""Gather velocity, affine velocity and velocity gradient from the grid.
 
     :math:`C_p = \frac{4}{\Delta x^2} \sum_i w_{ip} v_i (x_i - x_p)^T` is the paper's :math:`12 / (\Delta x^2 (b + 1))`
-    for the degree b = 2. Where the stencil has no gradients, C_p is also the velocity gradient (MLS-MPM).
+    for the degree b = 2.
 
     Args:
         node_velocity: Node velocity [m/s], shape (..., G, 3).
@@ -398,4 +386,4 @@ def g2p(node_velocity: Tensor, stencil: Stencil, dx: float) -> tuple[Tensor, Ten
     """
     rows = gather(node_velocity, stencil)
     affine = (4.0 / dx**2) * rows[..., -3:, :].mT
-    return rows[..., 0, :], affine, affine if rows.shape[-2] == 4 else rows[..., 1:4, :].mT
+    return rows[..., 0, :], affine, rows[..., 1:4, :].mT

@@ -87,15 +87,11 @@ def test_stress_turns_with_the_body():
 # ---- whole steps
 
 
-@pytest.mark.slow(gate=["False-total", "True-updated"])
 @pytest.mark.parametrize("formulation", FORMULATIONS)
-@pytest.mark.parametrize("mls", [False, True])
-def test_rigid_motion_is_not_damped(formulation, mls):
+def test_rigid_motion_is_not_damped(formulation):
     """A free block that flies and spins, with damping so strong that every vibration is overdamped."""
-    if mls and formulation == "total":
-        pytest.skip("no such variant")
     points = _bar((6, 6, 6), 0.4 / 6, e=5e3, nu=0.3)
-    solver = MPMSolver(dx=0.1, formulation=formulation, gravity=(0, 0, 0), stiffness_damping=0.02, mls=mls)
+    solver = MPMSolver(dx=0.1, formulation=formulation, gravity=(0, 0, 0), stiffness_damping=0.02)
     centre = points.position.mean(0)
     omega, drift = torch.tensor([[0.3, -0.5, 0.8], [0.4, 0.1, -0.3]], dtype=torch.float64)
     state = solver.init_state(points, (points.position - centre) @ _skew(omega).T + drift, margin=6)

@@ -20,7 +20,6 @@ STEPS, DT, DX, COUNT = 5, 8e-3, 0.15, 15
 SETTINGS = {
     "total": {"formulation": "total"},
     "updated": {"formulation": "updated"},
-    "mls": {"formulation": "updated", "mls": True},
 }
 LAWS = {"fixed_corotated": FixedCorotated, "neo_hookean": NeoHookean}
 

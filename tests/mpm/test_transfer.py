@@ -336,32 +336,12 @@ def test_transfers_keep_fewer_than_27_values_of_each_particle_at_a_time():
     assert largest <= 21 * columns * count  # the coefficients and results are 7, a layer 9, both kinds of factors 18
 
 
-# ---- MLS-MPM
-
-
-def test_stencil_without_gradients_keeps_value_and_moments(device, dtype):
-    position = _particles(device, dtype)[0]
-    whole, small = bspline_stencil(position, GRID), bspline_stencil(position, GRID, gradients=False)
-    assert small.basis.shape == (64, 4, 27)
-    assert torch.equal(small.basis, whole.basis[:, [0, 4, 5, 6]])
-    assert torch.equal(small.node, whole.node)
-    assert bspline_stencil(position, GRID, moments=False, gradients=False).basis.shape == (64, 1, 27)
-    field = torch.rand(GRID.node_count, 3, device=device, dtype=dtype)
-    v, c, gradient = g2p(field, small, DX)
-    reference = g2p(field, whole, DX)
-    tol = 100 * torch.finfo(dtype).eps
-    assert_close(v, reference[0], rtol=tol, atol=tol)
-    assert_close(c, reference[1], rtol=tol, atol=tol / DX)
-    assert torch.equal(gradient, c)
-
-
-@pytest.mark.parametrize("mls", [False, True])
-def test_scatter_momentum_is_the_sum_that_it_says(mls):
-    """Written out with loops: sum over p of w (m (v + C d) + j) - S grad(w), in MLS-MPM with w d 4/dx² for grad(w)."""
+def test_scatter_momentum_is_the_sum_that_it_says():
+    """Written out with loops: sum over p of w (m (v + C d) + j) - S grad(w)."""
     position, mass, velocity, affine = _particles("cpu", torch.float64, count=6)
     impulse, stress = torch.randn(6, 3).double(), torch.randn(6, 3, 3).double()  # not symmetric, to notice transposes
-    stencil = bspline_stencil(position, GRID, gradients=not mls)
-    found = scatter_momentum(mass, velocity, affine, impulse, stress, stencil, 4 / DX**2 if mls else None)
+    stencil = bspline_stencil(position, GRID)
+    found = scatter_momentum(mass, velocity, affine, impulse, stress, stencil)
 
     def weight(x):
         x = x.abs()
@@ -377,8 +357,7 @@ def test_scatter_momentum_is_the_sum_that_it_says(mls):
             w = weight((node - place) / DX).prod()
             (gradient,) = torch.autograd.grad(w, place)
             w = w.detach()
-            slope = w * d * 4 / DX**2 if mls else gradient
-            expected[i, :3] += w * (mass[p] * (velocity[p] + affine[p] @ d) + impulse[p]) - stress[p] @ slope
+            expected[i, :3] += w * (mass[p] * (velocity[p] + affine[p] @ d) + impulse[p]) - stress[p] @ gradient
             expected[i, 3] += w * mass[p]
     assert_close(found, expected, rtol=0, atol=1e-12)
 
@@ -388,27 +367,10 @@ def _body(count=150):
     return solid(position, 0.4**3 / count)
 
 
-def test_mls_steps_conserve_both_momenta():
-    """A body that deforms, spins, is stressed and damped."""
-    points = _body()
-    solver = MPMSolver(dx=0.1, formulation="updated", gravity=(0, 0, 0), mls=True, stiffness_damping=2e-3)
-    a = torch.tensor([[0.5, -0.8, 0.3], [0.8, 0.5, -0.1], [-0.5, 0.2, -0.4]], dtype=torch.float64)
-    state = solver.init_state(points, (points.position - 0.2) @ a.T + 0.3)
-    state = state.replace(affine=a.expand_as(state.affine))
-    before = solver.momenta(state)
-    end = solver.rollout(state, 5e-4, 50)
-    assert float((end.F_elastic - state.F_elastic).abs().max()) > 1e-3
-    scale = float(before["linear"].norm() + before["angular"].norm())
-    after = solver.momenta(end)
-    for name in before:
-        assert_close(after[name], before[name], rtol=0, atol=1e-12 * scale)
-
-
-@pytest.mark.parametrize("mls", [False, True])
-def test_stress_changes_the_moment_of_momentum_by_the_virial(mls):
+def test_stress_changes_the_moment_of_momentum_by_the_virial():
     """In one step from rest, sum of m v x^T = -dt sum of V tau, for any stress: the scale of the stress term."""
     points, dt = _body(), 1e-3
-    solver = MPMSolver(dx=0.1, formulation="updated", gravity=(0, 0, 0), mls=mls)
+    solver = MPMSolver(dx=0.1, formulation="updated", gravity=(0, 0, 0))
     F = torch.eye(3).double() + 0.1 * torch.randn(150, 3, 3).double()
     state = solver.init_state(points).replace(F_elastic=F, F_total=F)
     end = solver.step(state, dt)
@@ -416,24 +378,6 @@ def test_stress_changes_the_moment_of_momentum_by_the_virial(mls):
     moment = (mass * (end.velocity[:, :, None] * points.position[:, None, :] + 0.1**2 / 4 * end.affine)).sum(0)
     virial = (points.volume[:, None, None] * solver.laws.kirchhoff(F, None)).sum(0)
     assert_close(moment, -dt * virial, rtol=0, atol=1e-12 * float(virial.abs().max()))
-
-
-def test_mls_is_another_discretisation_of_the_same_body():
-    """Close to the plain one if the motion is smooth, but not the same."""
-    points = _body(400)
-    velocity = torch.zeros_like(points.position)
-    velocity[:, 0] = -torch.cos(torch.pi * points.position[:, 0] / 0.4)
-    ends = []
-    for mls in (False, True):
-        solver = MPMSolver(dx=0.1, formulation="updated", gravity=(0, 0, 0), mls=mls)
-        ends.append(solver.rollout(solver.init_state(points, velocity), 5e-4, 40).position)
-    moved = float((ends[0] - points.position).norm(dim=-1).max())
-    assert 0 < float((ends[0] - ends[1]).norm(dim=-1).max()) < 0.3 * moved
-
-
-def test_mls_in_the_total_formulation_is_refused():
-    with pytest.raises(ValueError, match=r"`mls` is a variant of the updated formulation: set `formulation`"):
-        MPMSolver(formulation="total", mls=True)
 
 
 def test_fixed_order_is_restored_and_does_not_load_the_compiler_of_torch():

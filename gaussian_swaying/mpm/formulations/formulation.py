@@ -40,7 +40,6 @@ class Settings:
     gravity: tuple[float, ...]
     damping: float
     stiffness_damping: float
-    mls: bool
     deterministic: bool
     pivot: bool = False
 
@@ -100,11 +99,6 @@ class Formulation(ABC):
     def acts_on_nodes(self, k: int) -> bool:
         """True if the ``k``-th boundary acts on nodes."""
         return self.kinds[k] == "nodes"
-
-    @classmethod
-    def check_settings(cls, settings: Settings) -> None:
-        """Raise ValueError if the formulation does not support a setting."""
-        return
 
     # ---- state and grid
 

@@ -306,14 +306,6 @@ class Total(Formulation):
             surface, body.boundaries, self.kinds, self.grid, inverse, self.settings.deterministic, nodes
         )
 
-    @classmethod
-    def check_settings(cls, settings: Settings) -> None:
-        """Raise ValueError for ``mls``, which is not supported."""
-        if settings.mls:
-            raise ValueError(
-                "`mls` is a variant of the updated formulation: set `formulation` to updated, or `mls` to false."
-            )
-
     def _on_nodes(self, k: int, held: Held) -> Held:
         """Return the particles that the ``k``-th boundary holds, with their constant share of the mass of each node."""
         boundary, face = self.body.boundaries[k], self.has_face(k)

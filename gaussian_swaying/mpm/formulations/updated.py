@@ -27,7 +27,7 @@ from gaussian_swaying.mpm.transfer import bspline_stencil, g2p, scatter, scatter
 
 
 class Updated(Formulation):
-    """The paper's formulation: APIC (Jiang et al. 2015), with MLS-MPM (Hu et al. 2018) as a variant, on a moving grid.
+    """The paper's formulation: APIC (Jiang et al. 2015) on a moving grid.
 
     Args:
         body: The material with its laws and boundaries.
@@ -91,9 +91,7 @@ class Updated(Formulation):
         """One substep: momenta to the nodes, their new velocity, and back to the particles, which move with it."""
         body, settings = self.body, self.settings
         points, laws = body.points, body.laws
-        stencil = bspline_stencil(
-            state.position, state.grid, gradients=not settings.mls, deterministic=settings.deterministic
-        )
+        stencil = bspline_stencil(state.position, state.grid, deterministic=settings.deterministic)
         F = state.F_elastic
         stress = laws.kirchhoff(F, state.internal)
         if settings.stiffness_damping > 0:
@@ -115,7 +113,6 @@ class Updated(Formulation):
             impulse,
             kick * points.volume[..., None, None] * stress,
             stencil,
-            4.0 / settings.dx**2 if settings.mls else None,
         )
         inverse_mass = safe_inverse(nodes[..., 3])[..., None]
         velocity = nodes[..., :3] * inverse_mass

@@ -302,7 +302,7 @@ class FusedUpdated(Fused):
             self.momentum, self.velocity, self.schedule, self.vectors, self.scenes, self.tables.buffer,
             self.first_step, offset, self.law_table, self.force_in, *grid.offset, *grid.resolution, grid.dx,
             1 / grid.dx, settings.stiffness_damping, self.particles, self.parts, self.part_node,
-            **options, PLASTIC=self.plastic, MLS=settings.mls, WIDTH=self.momentum.shape[1], GATHER=gather,
+            **options, PLASTIC=self.plastic, WIDTH=self.momentum.shape[1], GATHER=gather,
             SCATTER=scatter, ATOMIC=self.atomic, WIDE=self.wide, BLOCK=block, num_warps=1,
         )  # fmt: skip
         if scatter and not self.atomic:
@@ -315,7 +315,7 @@ class FusedUpdated(Fused):
         spans = -(-nodes // SPAN)
         launch(kernels.updated_scatter, (SHARES,))(
             self.parts, self.part_node, self.windows, self.marks, self.count, spans, ny * nz, nz, dx, 1 / dx,
-            SHARES=SHARES, SPAN=SPAN, MLS=self.settings.mls, IMPLICIT=implicit, WIDTH=width, BLOCK=LANES,
+            SHARES=SHARES, SPAN=SPAN, IMPLICIT=implicit, WIDTH=width, BLOCK=LANES,
         )  # fmt: skip
         launch(kernels.updated_join, (-(-spans // CHUNK),))(
             self.windows, self.marks, self.occupied, self.momentum, nodes, spans,

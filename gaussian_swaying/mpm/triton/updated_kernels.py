@@ -37,9 +37,9 @@ PART = tl.constexpr(32)
 
 @triton.jit
 def _gather_affine(
-    field, node, sx, sy, f, wz, gz, mz, inverse_dx, dx, mask, SLOPES: tl.constexpr, WIDE: tl.constexpr
+    field, node, sx, sy, f, wz, gz, mz, inverse_dx, dx, mask, WIDE: tl.constexpr
 ):  # fmt: skip
-    """Interpolated vector, its moments about the particle and (SLOPES) its derivatives [component, axis]."""
+    """Interpolated vector, its moments about the particle and its derivatives [component, axis]."""
     zero = wz[0] * 0
     v0, v1, v2 = zero, zero, zero
     g00, g01, g02, g10, g11, g12, g20, g21, g22 = zero, zero, zero, zero, zero, zero, zero, zero, zero
@@ -62,10 +62,9 @@ def _gather_affine(
                 r0 += mz[k] * q0
                 r1 += mz[k] * q1
                 r2 += mz[k] * q2
-                if SLOPES:
-                    t0 += gz[k] * q0
-                    t1 += gz[k] * q1
-                    t2 += gz[k] * q2
+                t0 += gz[k] * q0
+                t1 += gz[k] * q1
+                t2 += gz[k] * q2
             w = wx * wy
             ex = mx * wy
             ey = wx * (wy * (j - f[1]) * dx)
@@ -81,18 +80,17 @@ def _gather_affine(
             c20 += ex * s2
             c21 += ey * s2
             c22 += w * r2
-            if SLOPES:
-                ax = gx * wy
-                ay = wx * gy
-                g00 += ax * s0
-                g01 += ay * s0
-                g02 += w * t0
-                g10 += ax * s1
-                g11 += ay * s1
-                g12 += w * t1
-                g20 += ax * s2
-                g21 += ay * s2
-                g22 += w * t2
+            ax = gx * wy
+            ay = wx * gy
+            g00 += ax * s0
+            g01 += ay * s0
+            g02 += w * t0
+            g10 += ax * s1
+            g11 += ay * s1
+            g12 += w * t1
+            g20 += ax * s2
+            g21 += ay * s2
+            g22 += w * t2
     return (v0, v1, v2), (c00, c01, c02, c10, c11, c12, c20, c21, c22), (g00, g01, g02, g10, g11, g12, g20, g21, g22)
 
 
@@ -130,7 +128,7 @@ def updated_particles(
     momentum, velocity, schedule, vectors, scenes, numbers, first_step, step_offset, law_table, force_in,
     ox, oy, oz, nx, ny, nz, dx, inverse_dx, viscous_time, scene_size, parts, part_node,
     LAWS: tl.constexpr, PLASTIC: tl.constexpr, MULTI: tl.constexpr, FORCES: tl.constexpr, FORCE: tl.constexpr,
-    IMPLICIT: tl.constexpr, VISCOUS: tl.constexpr, MLS: tl.constexpr, WIDTH: tl.constexpr, GATHER: tl.constexpr,
+    IMPLICIT: tl.constexpr, VISCOUS: tl.constexpr, WIDTH: tl.constexpr, GATHER: tl.constexpr,
     SCATTER: tl.constexpr, ATOMIC: tl.constexpr, WIDE: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
     """``updated``: the end of substep ``step`` - 1 (GATHER) and the start of substep ``step`` (SCATTER).
@@ -177,12 +175,8 @@ def updated_particles(
             wz = (tl.where(inside, wz[0], 0.0), tl.where(inside, wz[1], 0.0), tl.where(inside, wz[2], 0.0))
             gz = (tl.where(inside, gz[0], 0.0), tl.where(inside, gz[1], 0.0), tl.where(inside, gz[2], 0.0))
         mz = (-fz * wz[0] * dx, (1 - fz) * wz[1] * dx, (2 - fz) * wz[2] * dx)
-        v, C, L = _gather_affine(
-            velocity, node, sx, sy, (fx, fy, fz), wz, gz, mz, inverse_dx, dx, inside, SLOPES=not MLS, WIDE=WIDE
-        )
+        v, C, L = _gather_affine(velocity, node, sx, sy, (fx, fy, fz), wz, gz, mz, inverse_dx, dx, inside, WIDE=WIDE)
         C = scale9(4 * inverse_dx * inverse_dx, C)
-        if MLS:
-            L = C
         U = (1 + dt * L[0], dt * L[1], dt * L[2], dt * L[3], 1 + dt * L[4], dt * L[5], dt * L[6], dt * L[7],
              1 + dt * L[8])  # fmt: skip
         F = matmul(U, F)
@@ -241,12 +235,8 @@ def updated_particles(
         else:
             value = (mass * v[0] + kick * force[0], mass * v[1] + kick * force[1], mass * v[2] + kick * force[2], mass)
         # factor of w (x_i - x_p), and factor of the gradient of w
-        if MLS:
-            moment = axpy9(mass, C, 4 * inverse_dx * inverse_dx * pull, stress)
-            slope = moment
-        else:
-            moment = scale9(mass, C)
-            slope = scale9(pull, stress)
+        moment = scale9(mass, C)
+        slope = scale9(pull, stress)
         if ATOMIC:
             # neighbours in the order that share a cell form a segment
             lane = tl.arange(0, 32)
@@ -265,23 +255,21 @@ def updated_particles(
                     c0 = (value[0] + moment[0] * rx + moment[1] * ry) * w
                     c1 = (value[1] + moment[3] * rx + moment[4] * ry) * w
                     c2 = (value[2] + moment[6] * rx + moment[7] * ry) * w
-                    if not MLS:
-                        gw = gx * wy
-                        wg = wx * gy
-                        c0 += slope[0] * gw + slope[1] * wg
-                        c1 += slope[3] * gw + slope[4] * wg
-                        c2 += slope[6] * gw + slope[7] * wg
+                    gw = gx * wy
+                    wg = wx * gy
+                    c0 += slope[0] * gw + slope[1] * wg
+                    c1 += slope[3] * gw + slope[4] * wg
+                    c2 += slope[6] * gw + slope[7] * wg
                     for k in tl.static_range(3):
                         wr = wz[k] * w * ((k - fz) * dx)
                         a0 = wz[k] * c0 + wr * moment[2]
                         a1 = wz[k] * c1 + wr * moment[5]
                         a2 = wz[k] * c2 + wr * moment[8]
                         a3 = wz[k] * (w * mass)
-                        if not MLS:
-                            sw = gz[k] * w
-                            a0 += sw * slope[2]
-                            a1 += sw * slope[5]
-                            a2 += sw * slope[8]
+                        sw = gz[k] * w
+                        a0 += sw * slope[2]
+                        a1 += sw * slope[5]
+                        a2 += sw * slope[8]
                         a0 = _sum_segments(a0, lane, first)
                         a1 = _sum_segments(a1, lane, first)
                         a2 = _sum_segments(a2, lane, first)
@@ -317,7 +305,7 @@ def updated_particles(
 @triton.jit(do_not_specialize=VARIES)
 def updated_scatter(
     parts, part_node, windows, marks, count, spans, sx, sy, dx, inverse_dx,
-    SHARES: tl.constexpr, SPAN: tl.constexpr, MLS: tl.constexpr, IMPLICIT: tl.constexpr, WIDTH: tl.constexpr,
+    SHARES: tl.constexpr, SPAN: tl.constexpr, IMPLICIT: tl.constexpr, WIDTH: tl.constexpr,
     BLOCK: tl.constexpr,
 ):  # fmt: skip
     """``updated``, on a CPU: the sums of a share of the particles, in their order, on a grid of the share's own.
@@ -355,10 +343,9 @@ def updated_scatter(
             fy = tl.load(row + 30)
             fz = tl.load(row + 31)
             wz, gz = axis_weights(fz, inverse_dx)
-            if not MLS:
-                s0 = tl.load(row + 16 + column)
-                s1 = tl.load(row + 20 + column)
-                s2 = tl.load(row + 24 + column)
+            s0 = tl.load(row + 16 + column)
+            s1 = tl.load(row + 20 + column)
+            s2 = tl.load(row + 24 + column)
             if IMPLICIT:
                 resistance = tl.load(row + 28)
             for i in range(3):
@@ -367,12 +354,10 @@ def updated_scatter(
                     wy, gy = node_weight(fy, j, inverse_dx)
                     w = wx * wy
                     c = w * (value + ((i - fx) * dx) * m0 + ((j - fy) * dx) * m1)
-                    if not MLS:
-                        c += (gx * wy) * s0 + (wx * gy) * s1
+                    c += (gx * wy) * s0 + (wx * gy) * s1
                     for k in tl.static_range(3):
                         a = wz[k] * c + (wz[k] * w * ((k - fz) * dx)) * m2
-                        if not MLS:
-                            a += (gz[k] * w) * s2
+                        a += (gz[k] * w) * s2
                         to = window + (node + i * sx + j * sy + k) * WIDTH
                         tl.store(to + column, tl.load(to + column) + a)
                         if IMPLICIT:

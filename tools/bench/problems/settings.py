@@ -27,7 +27,6 @@ class Settings:
 
     Attributes:
         formulation: ``total`` or ``updated``.
-        mls: Whether ``updated`` is MLS-MPM.
         cfl: Courant number of the adaptive substep.
         substep: Fixed substep [s] instead, or None.
         dtype: Type of every field of the state.
@@ -35,7 +34,6 @@ class Settings:
     """
 
     formulation: str = "total"
-    mls: bool = False
     cfl: float = 0.4
     substep: float | None = None
     dtype: torch.dtype = torch.float64
@@ -46,7 +44,6 @@ class Settings:
         return MPMSolver(
             dx=dx,
             formulation=self.formulation,
-            mls=self.mls,
             cfl=self.cfl,
             substep=self.substep,
             **({"gravity": (0.0, 0.0, 0.0)} | more),
