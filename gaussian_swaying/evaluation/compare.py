@@ -34,23 +34,6 @@ if TYPE_CHECKING:
     from gaussian_swaying.metrics.frechet_video import FrechetVideoDistance
 
 
-def picture_errors(image: Tensor, target: Tensor) -> dict[str, float]:
-    """PSNR and SSIM as torchmetrics computes them, for values from 0 to 1.
-
-    Args:
-        image: Picture of the run, shape (H, W, 3).
-        target: Picture of the reference, of the same shape.
-
-    Returns:
-        ``psnr_db`` (infinite for equal pictures), ``ssim`` and ``mse``, the mean square of the differences.
-
-    Raises:
-        ValueError: If the shapes differ or the pictures are smaller than the window of SSIM, 11 pixels.
-    """
-    errors = {name: float(value) for name, value in _errors(image, target).items()}
-    return {"psnr_db": _psnr(errors["mse"]), **errors}
-
-
 def _errors(image: Tensor, target: Tensor) -> dict[str, Tensor]:
     """``ssim`` and ``mse`` on the device of the pictures, so that the host need not wait for each frame."""
     check_shape("target", target, "H", "W", 3)

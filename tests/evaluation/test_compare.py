@@ -9,7 +9,7 @@ import pytest
 import torch
 from torch import Tensor, nn
 
-from gaussian_swaying.evaluation.compare import compare_run, evaluate, picture_errors, table
+from gaussian_swaying.evaluation.compare import compare_run, evaluate, table
 from gaussian_swaying.geometry.frame import SimFrame
 from gaussian_swaying.metrics.frechet_video import FrechetVideoDistance
 
@@ -28,28 +28,6 @@ def network(tmp_path):
     path = tmp_path / "network.pt"
     torch.jit.script(Means()).save(str(path))
     return FrechetVideoDistance(path, clip_length=2, resize=8)
-
-
-# ---- pictures
-
-
-def test_psnr_of_a_known_difference():
-    """A constant difference of d has a PSNR of -20 log10 d; equal pictures an infinite one and an SSIM of 1."""
-    target = torch.rand(20, 30, 3) * 0.5
-    found = picture_errors(target + 0.1, target)
-    assert found["psnr_db"] == pytest.approx(20.0, abs=1e-4)
-    assert found["mse"] == pytest.approx(0.01, rel=1e-4)
-    assert found["ssim"] < 0.99
-    same = picture_errors(target, target)
-    assert same["psnr_db"] == math.inf
-    assert same["ssim"] == pytest.approx(1.0, abs=1e-3)
-
-
-def test_pictures_that_do_not_fit():
-    with pytest.raises(ValueError, match=r"Expected `image` of shape \(20, 30, 3\), but got \(20, 31, 3\)"):
-        picture_errors(torch.rand(20, 31, 3), torch.rand(20, 30, 3))
-    with pytest.raises(ValueError, match="at least 11 x 11 pixels, but got 30 x 10"):
-        picture_errors(torch.rand(10, 30, 3), torch.rand(10, 30, 3))
 
 
 # ---- runs
