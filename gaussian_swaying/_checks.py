@@ -29,11 +29,6 @@ def check_shape(name: str, tensor: Tensor, *shape: int | str | None, batches: bo
         tensor: Tensor to check.
         shape: Expected trailing sizes; a letter or None stands for any size.
         batches: Whether leading batch dimensions are allowed.
-
-    Raises:
-        TypeError: If ``tensor`` is not a tensor.
-        ValueError: If the trailing dimensions differ, for example
-            "Expected `velocity` of shape (64, 3), but got (64, 2).".
     """
     if not isinstance(tensor, Tensor):
         raise TypeError(f"Expected `{name}` to be a torch.Tensor, but got {type(tensor).__name__}.")
@@ -159,10 +154,6 @@ def check_like(name: str, tensor: Tensor, like: Tensor) -> None:
         name: Name of the argument, for the message.
         tensor: Tensor to check.
         like: A tensor of the material.
-
-    Raises:
-        TypeError: If its dtype is another one.
-        ValueError: If it lies on another device.
     """
     if tensor.dtype != like.dtype:
         found, wanted = (str(dtype).removeprefix("torch.") for dtype in (tensor.dtype, like.dtype))

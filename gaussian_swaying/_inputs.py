@@ -24,10 +24,6 @@ def check_regular(path: str | os.PathLike[str], what: str = "the file", largest:
         path: The path.
         what: Name of the kind of file, for the message.
         largest: Largest allowed size [bytes].
-
-    Raises:
-        FileNotFoundError: If the path does not exist.
-        ValueError: If it is not a regular file, or too large.
     """
     path = Path(path)
     try:
@@ -56,10 +52,6 @@ def read_json(path: str | os.PathLike[str], what: str, largest: int = LARGEST_JS
 
     Returns:
         The parsed content.
-
-    Raises:
-        ValueError: If the file cannot be read, is too large, is not UTF-8 or not JSON, is nested too deeply, or
-            contains a whole number of more than 32 digits.
     """
     try:
         content = check_regular(path, f"the {what}", largest).read_bytes()
@@ -77,10 +69,6 @@ def parse_json(content: bytes, what: str, path: str | os.PathLike[str]) -> Any:
         content: The JSON.
         what: Name of the file in the message.
         path: The file, for the message.
-
-    Raises:
-        ValueError: If it is not UTF-8 or not JSON, is nested too deeply, or contains a whole number of more than 32
-            digits.
     """
     try:
         return json.loads(content.decode(), parse_int=_whole)
@@ -98,10 +86,6 @@ def check_archive(path: str | os.PathLike[str], what: str) -> Path:
     Args:
         path: The path.
         what: Name of the kind of file, for the message.
-
-    Raises:
-        FileNotFoundError: If the path does not exist.
-        ValueError: If it is not a regular file, not a .npz file, or its arrays are far larger than the file.
     """
     path = check_regular(path, what)
     try:
@@ -122,9 +106,6 @@ def check_unpacked(path: Path, needed: int, what: str, size: int | None = None) 
         needed: Memory that its content will take [bytes].
         what: The announced content, for the message, for example "8,000 Gaussians".
         size: Size of all files that hold it [bytes]; that of the file if None.
-
-    Raises:
-        ValueError: If that is more than a gigabyte and a hundred times the size of the file.
     """
     size = path.stat().st_size if size is None else size
     if needed > (1 << 30) + 100 * size:
@@ -146,9 +127,6 @@ def read_arrays(
 
     Returns:
         The arrays found, by name.
-
-    Raises:
-        ValueError: If the file is missing or damaged, or lacks an array.
     """
     try:
         with np.load(check_archive(path, what)) as archive:

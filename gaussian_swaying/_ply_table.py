@@ -36,7 +36,6 @@ class PlyElement:
 
     @property
     def lists(self) -> tuple[str, ...]:
-        """Names of the properties that are lists."""
         return tuple(name for name, kind in self.fields if kind is None)
 
     @property
@@ -65,13 +64,6 @@ def read_header(path: str | os.PathLike[str]) -> PlyHeader:
 
     Args:
         path: The file.
-
-    Raises:
-        FileNotFoundError: If there is no such file.
-        ValueError: If it is not a regular file, has a broken header, or is too short for its rows.
-
-    Warns:
-        UserWarning: If it is longer than its rows.
     """
     path = check_regular(path, "the .ply file")
     with path.open("rb") as stream:
@@ -118,9 +110,6 @@ def read_element(path: str | os.PathLike[str], header: PlyHeader, name: str) -> 
 
     Returns:
         Structured array with a field for each property, shape (rows,).
-
-    Raises:
-        ValueError: If there is no such element, or if it or one before it contains lists.
     """
     kinds, count, start = layout(path, header, name)
     if count == 0:
@@ -157,7 +146,6 @@ def layout(path: str | os.PathLike[str], header: PlyHeader, name: str) -> tuple[
 
 
 def _check_size(path: Path, header: PlyHeader) -> None:
-    """Raise ValueError if a file is too short for the rows of its header."""
     size = path.stat().st_size - header.start
     if header.order == "":  # a digit and a separator for each number
         needed = sum(element.count * 2 * len(element.fields) for element in header.elements) - 1

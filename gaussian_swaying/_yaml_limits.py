@@ -15,12 +15,7 @@ MOST = 20_000  # values, including those that aliases repeat
 
 
 def check_yaml(text: str) -> str:
-    """Return a text if it is within the limits: aliases make a few lines a billion values, or a list its own entry.
-
-    Raises:
-        ValueError: If it is too long or too deep, has too many values, or contains itself.
-        yaml.YAMLError: If it is not valid YAML.
-    """
+    """Return a text if it is within the limits: aliases make a few lines a billion values, or a list its own entry."""
     import yaml
 
     if len(text) > LARGEST:
@@ -74,10 +69,6 @@ def read_fields(path: str | os.PathLike[str], what: str, fields: Sequence[str]) 
 
     Returns:
         The given values, by name.
-
-    Raises:
-        FileNotFoundError: If there is no such file.
-        ValueError: If it is not a regular file, too large, not YAML, or has another field.
     """
     import yaml
 

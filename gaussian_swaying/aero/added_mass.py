@@ -72,7 +72,6 @@ class AirLift(Force):
         return -(in_double(self.force) * in_double(state.position)).sum((-2, -1))
 
     def twin(self) -> Twin | None:
-        """See :class:`~gaussian_swaying.mpm.twins.Twin`."""
         from gaussian_swaying.aero.force_triton import steady_force
 
         return Twin(steady_force, per_point=Numbers(3, lambda: self.force), sources=(self.force,))

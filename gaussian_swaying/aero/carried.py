@@ -129,7 +129,6 @@ class CarriedField(WindEffect):
         return self.scale
 
     def forward(self, velocity: Tensor, position: Tensor, moment: Moment) -> Tensor:
-        """Add the velocity of the field."""
         axes = self.axes.to(position)
         place = position @ (axes / self.step[:, None].to(position)).T + self.offset(moment.carried).to(position)
         found = trilinear(self.table, place, self.wraps) @ axes
@@ -137,7 +136,6 @@ class CarriedField(WindEffect):
         return velocity.to(found) + (strength.to(found) if isinstance(strength, Tensor) else strength) * found
 
     def twin(self) -> Twin:
-        """See :class:`~gaussian_swaying.mpm.twins.Twin`."""
         from gaussian_swaying.aero.effects_triton import carried_field
 
         def now(moment: Moment) -> Tensor:

@@ -160,7 +160,6 @@ class AirPush(Force):
         return self.numbers[:, :3] - self.numbers[:, 3:] * state.velocity
 
     def twin(self) -> Twin:
-        """See :class:`~gaussian_swaying.mpm.twins.Twin`."""
         from gaussian_swaying.aero.computed_air_triton import air_push
 
         return Twin(air_push, per_point=Numbers(4, lambda: self.numbers), sources=(self.numbers,))
@@ -200,11 +199,7 @@ BYTES = 4 * 40 + 1 + 24
 
 
 def speed_of(settings: ComputedAir, wind: WindField) -> float:
-    """The speed [m/s] that is ``lattice_speed`` cells per step.
-
-    Raises:
-        ValueError: If it is not given, and the wind is still.
-    """
+    """The speed [m/s] that is ``lattice_speed`` cells per step."""
     speed = settings.speed or 1.5 * float(torch.linalg.vector_norm(wind.flows.detach(), dim=-1).amax())
     if not speed > 0:
         raise ValueError("Computed air in a still wind needs `air.speed`: the largest speed that is expected [m/s].")
@@ -225,9 +220,6 @@ def resolution(settings: ComputedAir, wind: WindField, frame_dt: float, position
         wind: The wind.
         frame_dt: Length of a frame [s].
         position: Points of the body at rest [m], shape (P, 3).
-
-    Raises:
-        ValueError: As :func:`speed_of`.
     """
     speed, length = speed_of(settings, wind), float((position.amax(0) - position.amin(0)).amax())
     counts, h, nu = settings.counts(), settings.spacing, settings.viscosity
@@ -380,7 +372,6 @@ class AirInBox:
         return self._reach(flat).read(field).to(place).reshape(place.shape)
 
     def take(self, load: WindForce) -> None:
-        """Go on with another wind, or other coefficients."""
         self.load = load
 
     @torch.no_grad()
@@ -407,9 +398,6 @@ class AirInBox:
 
         Returns:
             The state of the body, the moments of the air, and the largest Courant number.
-
-        Raises:
-            ValueError: If the wind is too fast for the steps, or points left the box.
         """
         units, each = self.flow.units, -(-substeps // self.steps)
         dt, acting = units.dt / each, [self.push, *forces]

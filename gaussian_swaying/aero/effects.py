@@ -127,11 +127,9 @@ class LogProfile(Profile):
         self.roughness = float(roughness)
 
     def factor(self, above: Tensor) -> Tensor:
-        """See :class:`Profile`."""
         return (above.clamp(min=self.roughness) / self.roughness).log() / math.log(self.height / self.roughness)
 
     def twin(self) -> Twin:
-        """See :class:`~gaussian_swaying.mpm.twins.Twin`."""
         from gaussian_swaying.aero.effects_triton import log_profile
 
         scale = 1 / math.log(self.height / self.roughness)
@@ -158,11 +156,9 @@ class PowerProfile(Profile):
         self.exponent = float(exponent)
 
     def factor(self, above: Tensor) -> Tensor:
-        """See :class:`Profile`."""
         return (above.clamp(min=0.0) / self.height).pow(self.exponent)
 
     def twin(self) -> Twin:
-        """See :class:`~gaussian_swaying.mpm.twins.Twin`."""
         from gaussian_swaying.aero.effects_triton import power_profile
 
         numbers = Numbers(3, lambda: [self.ground[2], 1 / self.height, self.exponent])
@@ -209,7 +205,6 @@ class Plume(WindEffect):
         return 3.4 * (2 / 7 * 9.81 * self.heat / 101325) ** (1 / 3)
 
     def forward(self, velocity: Tensor, position: Tensor, moment: Moment) -> Tensor:
-        """Add the plume to the velocity."""
         x, y, above = (part - at for part, at in zip(position.unbind(-1), self.source, strict=True))
         height = above.clamp(min=0.0) + math.sqrt(SPREAD) * self.radius
         off = (SPREAD * (x * x + y * y) / height.square()).clamp(min=1e-12)
@@ -225,7 +220,6 @@ class Plume(WindEffect):
         return other
 
     def twin(self) -> Twin:
-        """See :class:`~gaussian_swaying.mpm.twins.Twin`."""
         from gaussian_swaying.aero.effects_triton import plume
 
         numbers = Numbers(6, lambda: [*self.source, math.sqrt(SPREAD) * self.radius, self.speed, SPREAD])

@@ -408,7 +408,6 @@ class AeroForce(nn.Module):
 
     @property
     def _numbers(self) -> dict[str, Any]:
-        """The keyword arguments of the force on patches."""
         return {
             "drag": self.C_D,
             "friction": self.C_F,

@@ -45,7 +45,6 @@ def wind_terms(air, relative, facing, across, through, tangent, drag, friction, 
 
 @triton.jit
 def _changed_wind(m: tl.constexpr, EFFECTS: tl.constexpr, v, position, now, table):
-    """A wind changed by effect m."""
     OPTIONS: tl.constexpr = EFFECTS.options[m]
     numbers = read(table, EFFECTS.numbers[m][0], EFFECTS.numbers[m][1])
     own = chosen(now, 3 + EFFECTS.per_substep[m][0], EFFECTS.per_substep[m][1])

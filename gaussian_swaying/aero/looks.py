@@ -63,9 +63,6 @@ def look(
         speed: Another mean speed [m/s], with the intensity of the look.
         seed: Another seed is another turbulence.
 
-    Raises:
-        ValueError: If there is no such look, or a number is out of range.
-
     Example:
         >>> look("breeze").flows
         tensor([[3., 0., 0.]], dtype=torch.float64)

@@ -53,7 +53,6 @@ class Obstacle(WindEffect):
         """Velocity deficit as a share of the speed (..., P), and velocity of the vortices [m/s] (..., P, 3) or None."""
 
     def forward(self, velocity: Tensor, position: Tensor, moment: Moment) -> Tensor:
-        """See :class:`~gaussian_swaying.aero.effects.WindEffect`."""
         place = position - self.middle.to(position)
         found = self.around(velocity.to(position).expand_as(position), place)
         if self.drag == 0:
@@ -98,11 +97,9 @@ class SphereObstacle(Obstacle):
         self.radius = float(radius)
 
     def around(self, velocity: Tensor, place: Tensor) -> Tensor:
-        """See :class:`Obstacle`."""
         return sphere_flow(velocity, place, self.radius)
 
     def twin(self) -> Twin:
-        """See :class:`~gaussian_swaying.mpm.twins.Twin`."""
         from gaussian_swaying.aero.obstacles_triton import past_sphere
 
         numbers = (self.radius, self.drag, wake_start(self.drag))
@@ -115,7 +112,6 @@ class SphereObstacle(Obstacle):
         )
 
     def wake(self, place: Tensor, moment: Moment) -> tuple[Tensor, Tensor | None]:
-        """See :class:`Obstacle`."""
         direction, _ = _direction(moment, place)
         behind = (place * direction).sum(-1)
         aside = (place.square().sum(-1) - behind.square()).clamp(min=0).sqrt()
@@ -160,11 +156,9 @@ class CylinderObstacle(Obstacle):
         self.axis: Tensor
 
     def around(self, velocity: Tensor, place: Tensor) -> Tensor:
-        """See :class:`Obstacle`."""
         return cylinder_flow(velocity, place, self.axis.to(place), self.radius)
 
     def twin(self) -> Twin:
-        """See :class:`~gaussian_swaying.mpm.twins.Twin`."""
         from gaussian_swaying.aero.obstacles_triton import past_cylinder
 
         def now(moment: Moment) -> Tensor:
@@ -180,7 +174,6 @@ class CylinderObstacle(Obstacle):
         )
 
     def wake(self, place: Tensor, moment: Moment) -> tuple[Tensor, Tensor | None]:
-        """See :class:`Obstacle`."""
         axis = self.axis.to(place)
         across, speed = self._across(moment.flow)
         direction = across.to(place)
@@ -247,12 +240,10 @@ class EllipsoidObstacle(Obstacle):
         self.axes: Tensor
 
     def around(self, velocity: Tensor, place: Tensor) -> Tensor:
-        """See :class:`Obstacle`."""
         axes = self.axes.to(place)
         return ellipsoid_flow(velocity @ axes.T, place @ axes.T, self.radii) @ axes
 
     def twin(self) -> Twin:
-        """See :class:`~gaussian_swaying.mpm.twins.Twin`."""
         from gaussian_swaying.aero.obstacles_triton import past_ellipsoid
 
         def numbers() -> Tensor:

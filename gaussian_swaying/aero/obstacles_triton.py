@@ -27,7 +27,6 @@ def _direction(flow):
 
 @triton.jit
 def _only(where, v):
-    """Return a vector where a mask is true, and zero elsewhere."""
     return tl.where(where, v[0], 0.0), tl.where(where, v[1], 0.0), tl.where(where, v[2], 0.0)
 
 
@@ -171,7 +170,6 @@ def carlson_rd(x, y, z):
 
 @triton.jit
 def _over(x, a, root):
-    """Return coordinates divided by the squared half axes of the confocal ellipsoid through the place."""
     return x[0] / (a[0] + root), x[1] / (a[1] + root), x[2] / (a[2] + root)
 
 
@@ -234,7 +232,6 @@ def past_ellipsoid(v, x, numbers, now, table, OPTIONS: tl.constexpr):
 
 @triton.jit
 def _across(direction, first, second, third, r):
-    """Width of an ellipsoid in a direction."""
     a = dot3(first, direction) * r[0]
     b = dot3(second, direction) * r[1]
     c = dot3(third, direction) * r[2]

@@ -136,7 +136,6 @@ class RecordedWind(WindEffect):
         return other
 
     def forward(self, velocity: Tensor, position: Tensor, moment: Moment) -> Tensor:
-        """Add the velocity of the record."""
         last = len(self.times) - 1
         now = moment.time + self.begin
         now = now.remainder(self.period) if self.repeat else now

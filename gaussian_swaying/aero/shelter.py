@@ -137,7 +137,6 @@ class Shelter(WindEffect):
         return velocity * trilinear(self.table[..., None], place)
 
     def twin(self) -> Twin:
-        """See :class:`~gaussian_swaying.mpm.twins.Twin`."""
         from gaussian_swaying.aero.effects_triton import sheltered
 
         def numbers() -> Tensor:

@@ -46,9 +46,6 @@ def turbulence_box(
 
     Returns:
         Velocity per standard deviation, shape (*cells, 3), float32.
-
-    Raises:
-        ValueError: If the box is too large, or a number is impossible.
     """
     check_choice("spectrum", spectrum, SPECTRA)
     check_positive("length", length)

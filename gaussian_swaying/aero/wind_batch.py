@@ -115,7 +115,6 @@ def _wrapped(seed: int) -> int:
 
 
 def _joined(parts: list[Modulation], device: torch.device) -> nn.Module:
-    """A modulation whose numbers are tensors, with one value for each wind."""
     joined = copy(parts[0])
     joined._buffers = {}
     for name, vector in NUMBERS[type(joined)].items():

@@ -66,11 +66,7 @@ class TurbSimWind:
 
 
 def read_bts(path: str | os.PathLike[str]) -> TurbSimWind:
-    """Read a full-field file of TurbSim (Jonkman 2009, NREL/TP-500-46198, table E-1).
-
-    Raises:
-        ValueError: If the file is not one, or is incomplete.
-    """
+    """Read a full-field file of TurbSim (Jonkman 2009, NREL/TP-500-46198, table E-1)."""
     path = check_regular(path, "the wind", LARGEST)
     data = path.read_bytes()
     head = struct.Struct("<h4i12fi")
@@ -98,9 +94,6 @@ def read_grid(path: str | os.PathLike[str]) -> GridWind:
     A .npz has ``x``, ``y``, ``z`` [m] and ``velocity`` [m/s] of shape (X, Y, Z, 3), or ``time`` [s] as well and
     (T, X, Y, Z, 3). A .nc has coordinates with these names, of any order, and one variable with an axis ``uvw`` (as
     hipersim writes) or three: ``u``, ``v`` and ``w``. If units are given, they must be metres and seconds.
-
-    Raises:
-        ValueError: If something is missing, or the grid is not regular.
     """
     path = check_regular(path, "the wind", LARGEST)
     if path.suffix == ".npz":
@@ -216,7 +209,6 @@ def _read_netcdf(path: Path) -> tuple[dict[str, np.ndarray], np.ndarray]:
 
 
 def _turned(path: Path, variable: Any, order: list[str]) -> np.ndarray:
-    """A variable with its axes in an order."""
     units = _units(variable)
     if _plain(units) not in _SPEEDS:
         raise _unit(path, "velocity", units, "m/s")
@@ -247,9 +239,6 @@ def read_anemometer(path: str | os.PathLike[str]) -> tuple[list[float], list[lis
 
     Returns:
         Times [s] and velocities [m/s], z up.
-
-    Raises:
-        ValueError: If a column is missing or in other units, or a number is missing.
     """
     path = check_regular(path, "the time series", 1 << 28)
     try:

@@ -366,7 +366,6 @@ class WindForce(Force):
 
 
 def _air(wind: nn.Module, time: Tensor, position: Tensor) -> Tensor:
-    """Velocity of one wind at given places, broadcastable to them."""
     found: Tensor = wind.at(time, position) if isinstance(wind, WindField) else wind(time, position)
     return found
 

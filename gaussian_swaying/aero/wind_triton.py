@@ -30,7 +30,6 @@ def _mix(x):
 
 @triton.jit
 def _uniform(start, counter, lane):
-    """As ``wind.counter_uniform`` for one lane."""
     wide = start * 0 + lane  # 64 bits, so that the product wraps around
     bits = _mix(_mix(_mix(start) + counter * -7046029254386353131) + wide * -3335678366873096957)
     return (((bits >> 11) & ((1 << 53) - 1)).to(tl.float64) + 0.5) / 9007199254740992.0
@@ -38,7 +37,6 @@ def _uniform(start, counter, lane):
 
 @triton.jit
 def _normal(start, counter, lane):
-    """As ``wind.counter_normal`` for one lane of three."""
     first = tl.sqrt(-2 * tl.log(_uniform(start, counter, lane)))
     return first * tl.cos(6.283185307179586 * _uniform(start, counter, lane + 3))
 

@@ -134,7 +134,6 @@ class LatticeFlow(nn.Module):
 
     @property
     def has_walls(self) -> bool:
-        """True if there are wall cells."""
         return bool((self.kind == WALL).any())
 
     def start(
@@ -200,13 +199,7 @@ class LatticeFlow(nn.Module):
         return torch.stack(total) * self.units.cell_mass * self.units.speed / self.units.dt
 
     def _arrived(self, moments: Tensor, number: int, sent: Callable[[int, Tensor], Tensor]) -> tuple[Tensor, Tensor]:
-        """A population that arrives at special cells, and the flat index of the cells that it comes from, (S,) each.
-
-        Args:
-            moments: Those of all cells.
-            number: The number of the velocity.
-            sent: A population of some cells, by its number and their flat index.
-        """
+        """A population that arrives at special cells, and the flat index of the cells that it comes from, (S,) each."""
         flat, special, c = moments.reshape(MOMENTS, -1), self.special.long(), DIRECTIONS[number]
         source, away = (_neighbour(special, self.cells, step) for step in (tuple(-a for a in c), c))
         pushed = 6 * WEIGHTS[number] * sum(a * flat[1 + k, source] for k, a in enumerate(c))

@@ -37,7 +37,6 @@ def _weight(x, y, z):
 
 @triton.jit
 def _population(m, cx, cy, cz):
-    """``collision.population`` of the velocity (cx, cy, cz)."""
     rho = 1.0 + m[0]
     x = m[1]
     y = m[2]
@@ -59,7 +58,6 @@ def _population(m, cx, cy, cz):
 
 @triton.jit
 def _pushed(wall, cx, cy, cz):
-    """Population that a moving wall adds."""
     return _weight(cx, cy, cz) * (cx * wall[1] + cy * wall[2] + cz * wall[3])
 
 
@@ -74,7 +72,6 @@ def _interpolated(back, own, beyond, wall, gap, cx, cy, cz):
 
 @triton.jit
 def _gather(s, f, cx, cy, cz):
-    """Add a population to the ten sums."""
     a, x, y, z, xx, yy, zz, xy, xz, yz = s
     fx = cx * f
     fy = cy * f

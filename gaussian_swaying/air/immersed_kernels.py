@@ -16,7 +16,6 @@ CPU_BLOCK = 16
 
 @triton.jit
 def _axis(x):
-    """First of three cells along an axis, and their weights."""
     low = tl.floor(x - 0.5)
     f = x - low
     return low.to(tl.int32), (0.5 * (1.5 - f) * (1.5 - f), 0.75 - (f - 1.0) * (f - 1.0), 0.5 * (f - 0.5) * (f - 0.5))
@@ -44,7 +43,6 @@ def _cell(reach, kind, nx, ny, nz, mask, X: tl.constexpr, Y: tl.constexpr, Z: tl
 
 @triton.jit
 def _reach(place, p, kind, nx, ny, nz, mask):
-    """The cells around points, and the factor of their weights."""
     bx, wx = _axis(tl.load(place + 3 * p, mask, 0.0))
     by, wy = _axis(tl.load(place + 3 * p + 1, mask, 0.0))
     bz, wz = _axis(tl.load(place + 3 * p + 2, mask, 0.0))
@@ -151,7 +149,6 @@ def give(moments, taken, place, kind):
 
 
 def _scatter(place):
-    """Programs that add to cells, blocks of points for each, and their constants."""
     atomic = place.device.type == "cuda" or INTERPRETED
     count, block = len(place), BLOCK if atomic else 1
     programs, rounds = (triton.cdiv(count, block), 1) if atomic else (1, count)

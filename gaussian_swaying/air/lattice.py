@@ -44,11 +44,7 @@ class LatticeUnits:
     def at_speed(
         cls, spacing: float, speed: float, *, lattice_speed: float = 0.1, viscosity: float, density: float
     ) -> LatticeUnits:
-        """Units in which a speed [m/s] is ``lattice_speed`` cells per step.
-
-        Raises:
-            ValueError: If a number is not positive, or the lattice speed is above :data:`FASTEST`.
-        """
+        """Units in which a speed [m/s] is ``lattice_speed`` cells per step."""
         check_positive("spacing", spacing)
         check_positive("speed", speed)
         check_positive("viscosity", viscosity)

@@ -49,9 +49,6 @@ class View:
 
         Returns:
             Dtype uint8, shape (H, W, 3), or (H, W, 4) with premultiplied alpha.
-
-        Raises:
-            ValueError: If the image can no longer be read.
         """
         return load_image(self.image_path, self.lens, self.downscale)
 
@@ -284,9 +281,6 @@ def neighbouring_views(cameras: Sequence[Camera], count: int = 8, largest_angle:
 
     Returns:
         Lists of indices, one for each camera; empty where no view is close enough.
-
-    Raises:
-        ValueError: If ``count`` or ``largest_angle`` is not positive.
     """
     check_positive("count", count)
     check_positive("largest_angle", largest_angle)

@@ -35,9 +35,6 @@ def read_views(
     Returns:
         Name and camera of each view, sorted by name. Lens distortion is ignored: the cameras are pinhole cameras with
         the same focal lengths.
-
-    Raises:
-        ValueError: If there are no cameras, or a file is bad. The message names it and the remedy.
     """
     root = Path(path)
     model = root if any((root / f"images{end}").is_file() for end in (".bin", ".txt")) else colmap_model(root)

@@ -52,9 +52,6 @@ def read_colmap(model: Path, images: Path) -> tuple[list[PosedImage], list[str],
     Returns:
         The images that exist, the names of those that do not, and positions [scene units] and colours in 0 to 1 of
         the points, each float32 of shape (P, 3), or None.
-
-    Raises:
-        ValueError: If a file is missing or damaged, or the distortion of a camera model is not supported.
     """
     posed: list[PosedImage] = []
     missing: list[str] = []
@@ -83,9 +80,6 @@ def read_colmap_views(model: Path) -> list[tuple[str, Lens, Tensor]]:
 
     Returns:
         Name, lens and world-to-camera matrix (float64, shape (4, 4)) of each image, in the order of the file.
-
-    Raises:
-        ValueError: If a file is missing or damaged, or the distortion of a camera model is not supported.
     """
     lenses: dict[int, Lens] = _read(model, "cameras", _binary_cameras, _text_cameras)
     rows: list[tuple[str, tuple[float, ...], int]] = _read(model, "images", _binary_images, _text_images)
@@ -99,7 +93,6 @@ def read_colmap_views(model: Path) -> list[tuple[str, Lens, Tensor]]:
 
 
 def _pose(where: str, pose: tuple[float, ...]) -> Tensor:
-    """World-to-camera matrix from a quaternion wxyz and a translation."""
     length = math.hypot(*pose[:4])
     if not all(math.isfinite(item) for item in pose) or length < 1e-6:
         raise ValueError(f"{where} has the pose {list(pose)}, which is not rigid: export the model again.")
@@ -119,7 +112,6 @@ class _UnknownLensError(Exception):
 
 
 def _lens(identity: int, model: str, width: int, height: int, values: tuple[float, ...]) -> Lens:
-    """Lens of a COLMAP camera."""
     if model not in _READABLE:
         raise _UnknownLensError(
             f"camera {identity} has the model {model}, whose distortion is not supported (only "

@@ -294,9 +294,6 @@ class GeneratedCapture:
 
         Returns:
             The folder.
-
-        Raises:
-            ValueError: If the folder already contains files.
         """
         from imageio.v3 import imwrite
         from plyfile import PlyData, PlyElement

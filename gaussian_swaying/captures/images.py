@@ -39,11 +39,7 @@ class PosedImage:
 
 
 def image_size(path: str | Path) -> tuple[int, int]:
-    """Width and height of an image file [pixels], from its header.
-
-    Raises:
-        ValueError: If the file is missing, is not an image, or has far too many pixels for its file size.
-    """
+    """Width and height of an image file [pixels], from its header."""
     import imageio.v3 as iio
 
     _refuse_pipes(path)
@@ -68,9 +64,6 @@ def read_image(path: str | Path) -> Tensor:
 
     Returns:
         Pixels, dtype uint8, shape (H, W, 3), or (H, W, 4) if the image is not fully opaque.
-
-    Raises:
-        ValueError: If the file is missing or damaged, or its numbers are not colours.
     """
     import imageio.v3 as iio
 
@@ -118,9 +111,6 @@ def load_image(path: str | Path, lens: Lens, downscale: int = 1) -> Tensor:
     Returns:
         Pixels, dtype uint8, shape (H, W, 3), or (H, W, 4) with colours that are multiplied with alpha. Their lens is
         ``lens.undistorted().averaged(downscale)``.
-
-    Raises:
-        ValueError: If the file cannot be read or does not have the size of ``lens``.
     """
     pixels = read_image(path)
     check_image_size(path, (pixels.shape[1], pixels.shape[0]), lens)

@@ -43,9 +43,6 @@ def initial_points(
 
     Returns:
         The points.
-
-    Raises:
-        ValueError: If the source does not exist or is not usable, or the cameras look at no common point.
     """
     check_whole("count", count, 1)
     if source == "capture" or (source == "auto" and capture.points is not None):
@@ -123,9 +120,6 @@ def consistent_points(capture: Capture, count: int, seed: int = 0, half_side: fl
 
     Returns:
         The points, with the mean of their colours in the photos.
-
-    Raises:
-        ValueError: If fewer than ``count`` candidates are in three photos and not close to a camera.
     """
     center, reach = _view_cube(capture) if half_side is None else (_focus(capture), half_side)
     generator = torch.Generator().manual_seed(seed)
@@ -178,6 +172,5 @@ def _focus(capture: Capture) -> Tensor:
 
 
 def _view_cube(capture: Capture) -> tuple[Tensor, float]:
-    """Centre and half side of the cube that the median camera sees."""
     focus = _focus(capture)
     return focus, view_reach([view.camera for view in capture.split("train")], focus)

@@ -62,9 +62,6 @@ def undistort(points: Tensor, coefficients: tuple[float, ...], iterations: int =
 
     Returns:
         Pinhole points, shape (..., 2).
-
-    Raises:
-        ValueError: If no point of a pinhole image is seen there, because the coefficients fold the image.
     """
     solution = points.double()
     for _ in range(iterations):
@@ -120,7 +117,6 @@ class Lens:
 
     @property
     def distorted(self) -> bool:
-        """True if any distortion coefficient differs from zero."""
         return any(self.distortion)
 
     def resized(self, width: int, height: int) -> Lens:
@@ -132,9 +128,6 @@ class Lens:
         """The lens of the picture whose pixels are means over ``factor`` x ``factor`` pixels of this one.
 
         Rows and columns that do not fill a pixel are cut off at the lower and the right edge.
-
-        Raises:
-            ValueError: If nothing is left.
         """
         width, height = self.width // factor, self.height // factor
         if width == 0 or height == 0:
@@ -150,9 +143,6 @@ class Lens:
 
         Every pixel of the new picture is between pixel centres of the old one, so no pixel is made up at the edges.
         With barrel distortion the new picture may be larger than the old one, at most twice.
-
-        Raises:
-            ValueError: If the coefficients fold the image or leave less than a fifth of it.
         """
         return _undistorted(self) if self.distorted else self
 
@@ -200,9 +190,6 @@ def remap(image: Tensor, source: Lens, target: Lens) -> Tensor:
 
     Returns:
         The picture, shape (C, ``target.height``, ``target.width``).
-
-    Raises:
-        ValueError: If ``image`` does not have the size of ``source``.
     """
     check_shape("image", image, None, source.height, source.width)
     grid = _places(source, target, image.dtype).to(image.device)

@@ -50,9 +50,6 @@ def sample_mesh(vertices: PointCloud, faces: Tensor, count: int, seed: int = 0) 
         faces: Indices of vertices, shape (T, 3).
         count: Number of points.
         seed: Of the random numbers.
-
-    Raises:
-        ValueError: If the mesh has no area or a face refers to a vertex that does not exist.
     """
     if len(faces) == 0 or int(faces.min()) < 0 or int(faces.max()) >= len(vertices):
         raise ValueError(f"Expected faces with indices from 0 to {len(vertices) - 1}: export the mesh again.")
@@ -80,9 +77,6 @@ def read_ply_points(path: Path) -> tuple[PointCloud, Tensor | None]:
 
     Returns:
         The vertices, grey if they have no colours, and triangles (T, 3) as indices, or None if there are none.
-
-    Raises:
-        ValueError: If the file cannot be read or has no usable points.
     """
     from plyfile import PlyData, PlyParseError
 
@@ -118,9 +112,6 @@ def read_obj_mesh(path: Path) -> tuple[PointCloud, Tensor]:
 
     Returns:
         The vertices, grey if they have no colours, and triangles (T, 3) as indices.
-
-    Raises:
-        ValueError: If the file cannot be read or has no usable mesh.
     """
     try:
         text = check_regular(path, "the mesh").read_text(encoding="utf-8", errors="replace")

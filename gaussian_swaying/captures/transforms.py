@@ -46,9 +46,6 @@ def read_transforms(path: Path) -> tuple[list[PosedImage], list[str], Path | Non
 
     Returns:
         The images that exist, the names of those that do not, and a point cloud that belongs to the capture or None.
-
-    Raises:
-        ValueError: If a file or a field is bad. The message names it and the remedy.
     """
     images: list[PosedImage] = []
     missing: list[str] = []
@@ -143,9 +140,6 @@ def lens_of_transforms(where: str, data: dict[str, Any], frame: dict[str, Any], 
         data: Its fields.
         frame: Those of the frame.
         size: Width and height of the pictures, if the file does not say them [pixels].
-
-    Raises:
-        ValueError: If a field is bad, or the lens is of another kind.
     """
     fields = _merged(data, frame)
     model = "a fisheye lens" if fields.get("is_fisheye") else fields.get("camera_model", "OPENCV")

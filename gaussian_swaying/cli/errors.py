@@ -265,7 +265,6 @@ def _options(parser: Any) -> dict[str, str]:
 
 
 def _arguments(class_path: str) -> dict[str, str]:
-    """Names of the arguments of a class."""
     module, _, name = class_path.rpartition(".")
     try:
         parameters = inspect.signature(getattr(import_module(module), name)).parameters

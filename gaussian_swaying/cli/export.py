@@ -85,11 +85,7 @@ def still_of(source: Path) -> Path | None:
 
 
 def placement(options: argparse.Namespace) -> tuple[float, SimFrame, str]:
-    """Frames per second, frame and the source of both, for a USD or glTF file.
-
-    Raises:
-        ValueError: If an option is bad, or the summary of the run cannot be read.
-    """
+    """Frames per second, frame and the source of both, for a USD or glTF file."""
     if options.metres_per_unit is not None:
         check_positive("--metres-per-unit", options.metres_per_unit)
     fps, frame, origin = 25.0, SimFrame(torch.zeros(3), torch.eye(3, dtype=torch.float64), 1.0), "by default"
@@ -155,11 +151,7 @@ def export(options: argparse.Namespace) -> None:
 
 
 def export_web(options: argparse.Namespace) -> None:
-    """Write the film of a run, and report its size.
-
-    Raises:
-        ValueError: If an option of the other formats is given, or the run cannot become a film.
-    """
+    """Write the film of a run, and report its size."""
     given = {"--fps": options.fps, "--up": options.up, "--metres-per-unit": options.metres_per_unit}
     given["--spz-version"] = options.spz_version
     for name, value in given.items():

@@ -55,7 +55,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
     begun: list[str] = []
 
     def advice(error: BaseException) -> str | None:
-        """Return the command that continues the fit, if the user stopped it."""
         return f"To continue it:\n  {begun[0]}" if isinstance(error, KeyboardInterrupt) and begun else None
 
     return run_command(
@@ -105,7 +104,6 @@ def fit(options: argparse.Namespace, begun: list[str]) -> int:
 
 
 def _check(options: argparse.Namespace) -> None:
-    """Raise ValueError if options do not go together."""
     if (options.film is None) == (options.config is None):
         raise ValueError("Expected either a film, as in `fit film.mp4 --splat my.ply`, or `--config` with a fit file.")
     given = [name for name in ("splat", "length", "up", "hold", "focal") if getattr(options, name) is not None]

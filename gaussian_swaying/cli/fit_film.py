@@ -70,9 +70,6 @@ def prepare(options: argparse.Namespace, folder: Path) -> Path:
 
     Returns:
         The fit file.
-
-    Raises:
-        ValueError: If the film or the splat cannot be used; the message says what to do.
     """
     length, weighed = _length(options.length), options.length == [GRAVITY]
     if options.focal is not None and not 5 <= options.focal <= 1000:
@@ -144,7 +141,6 @@ def _length(given: Sequence[str] | None) -> tuple[str, float] | None:
 
 
 def _registered(options: argparse.Namespace, up: Sequence[float] | None) -> tuple[Seen, str]:
-    """The first frame with its camera, and a sentence on it."""
     from gaussian_swaying.fitting.registration import register
     from gaussian_swaying.gaussians.formats import read_gaussians
 
@@ -240,7 +236,6 @@ def upright_in(camera: Camera, guess: Sequence[float]) -> list[str] | None:
 
 
 def _previewed(options: argparse.Namespace, folder: Path, wanted: dict[str, Any]) -> Preview:
-    """The preview of the splat with some options of ``preview``."""
     given = build_options().parse_args([str(options.splat), f"--device={options.device}", "--quality=draft"])
     vars(given).update(wanted)
     return preview_scene(given, folder)
@@ -347,7 +342,6 @@ def plan_text(preview: Preview, background: Sequence[float], still: float | None
 
 
 def _guesses(preview: Preview, told: Sequence[str], scaled: str) -> list[str]:
-    """The guesses of the preview, as lines."""
     guess = preview.data["suggestion"]
     hold = guess["hold"]
     lines = list(told)

@@ -79,9 +79,6 @@ def split(parser: ArgumentParser, arguments: Sequence[str]) -> tuple[argparse.Na
     Args:
         parser: From :meth:`Simulation.parser`; it knows which options have a value.
         arguments: The command line.
-
-    Raises:
-        ValueError: If there are two scenes, or the number of pixels cannot be.
     """
     options, rest = build_options().parse_known_args(arguments)
     scenes, further = words_of(parser, rest)
@@ -100,9 +97,6 @@ def session_of(parser: ArgumentParser, settings: Namespace, real_time: bool) -> 
         parser: From :meth:`Simulation.parser`.
         settings: The settings as they were configured.
         real_time: Whether a trial chooses the grid; it then prints what it chose. A solver of one's own has no grid.
-
-    Raises:
-        ValueError: If the simulation cannot be made, or cannot start.
     """
     if settings.copies:
         raise ValueError("The live page shows one object: leave out `copies`, or record them with `sim`.")

@@ -65,9 +65,6 @@ def asked(arguments: Sequence[str]) -> Asked:
 
     Args:
         arguments: The command line.
-
-    Raises:
-        ValueError: If an option is bad, or a browser cannot simulate the scene.
     """
     options, rest = build_options().parse_known_args(arguments)
     parser = Simulation.parser()
@@ -98,9 +95,6 @@ def export_live_web(arguments: Sequence[str]) -> None:
 
     Args:
         arguments: The command line.
-
-    Raises:
-        ValueError: If an option is bad, or a browser cannot simulate the scene.
     """
     page = asked(arguments)
     if page.sentence is not None:

@@ -127,10 +127,6 @@ def preview_scene(options: argparse.Namespace, folder: Path) -> Preview:
 
     Returns:
         The preview.
-
-    Raises:
-        ValueError: If the splat or an option is bad, or the configuration does not run.
-        FileNotFoundError: If there is no such splat.
     """
     path = Path(options.scene).resolve()  # as in the YAML, so that it warns once
     reading = Stopwatch()
@@ -241,9 +237,6 @@ def preview_config(options: argparse.Namespace) -> Preview:
 
     Returns:
         The preview.
-
-    Raises:
-        ValueError: If the configuration is bad or does not run.
     """
     arguments = [*(item for file in options.config for item in ("--config", file)), "--device", options.device]
     if options.scene is not None:
@@ -272,7 +265,6 @@ def preview_config(options: argparse.Namespace) -> Preview:
 def _natural(
     suggestion: Suggestion, simulation: Simulation, build: Callable[[Suggestion], tuple[Simulation, Any]]
 ) -> tuple[Suggestion, Simulation]:
-    """The suggestion with the numbers of its kind, and its simulation, which has them."""
     suggestion = as_its_kind(suggestion, simulation)
     if suggestion.sways and not suggestion.by_modes:
         simulation = build(suggestion)[0]
@@ -291,7 +283,6 @@ def _tried(
 
 
 def _numbers(move: str | None, place: Place | None) -> list[int]:
-    """The things of a place that move, each once."""
     if move is None:
         return [1]
     if place is None:
@@ -357,7 +348,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def _preview(options: argparse.Namespace) -> None:
-    """Preview, print the report and write the files."""
     if options.scene is None and options.config is None:
         raise ValueError("There is nothing to preview: give SCENE.ply, or --config with a scene.")
     if options.capture is not None and options.config is not None:

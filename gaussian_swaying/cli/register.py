@@ -95,11 +95,7 @@ def register_film(options: argparse.Namespace) -> int:
 
 
 def first_frame(film: Path) -> Tensor:
-    """The first frame of a film, or a picture, dtype uint8, shape (H, W, 3).
-
-    Raises:
-        ValueError: If it cannot be read.
-    """
+    """The first frame of a film, or a picture, dtype uint8, shape (H, W, 3)."""
     from gaussian_swaying.captures.images import read_image
 
     if film.suffix.lower() in STILLS:

@@ -50,9 +50,6 @@ def settings_of(
         further: Options of ``gaussian-swaying sim``.
         folder: Gets a file with the parts of a splat, if it has any.
         tell: Called with the share that is done, from 0 to 1, and the name of the next task.
-
-    Raises:
-        ValueError: If a file or an option is bad.
     """
     given = list(further)
     if scene is not None:
@@ -71,11 +68,7 @@ def settings_of(
 
 
 def check_one_scene(options: Sequence[str]) -> None:
-    """Check that the options beside a scene do not name another one.
-
-    Raises:
-        ValueError: If there is a ``--config`` among them.
-    """
+    """Check that the options beside a scene do not name another one."""
     if is_given(options, "--config"):
         raise ValueError(
             "`SCENE` and `--config` both say what to show: leave out one of them, or give a splat with `--scene.ply`."

@@ -29,9 +29,6 @@ def with_shipped(arguments: Sequence[str], kind: str) -> list[str]:
     Args:
         arguments: The command line.
         kind: ``sim`` or ``train``.
-
-    Raises:
-        ValueError: If a name is neither a file nor a shipped configuration.
     """
     words: list[str] = []
     for argument in arguments:

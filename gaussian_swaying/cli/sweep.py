@@ -95,7 +95,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
     begun: list[Path] = []
 
     def advice(error: BaseException) -> str | None:
-        """Return the command that does the missing runs, if the sweep has begun."""
         return f"To do what is missing:\n  {command(arguments, '--resume')}" if begun else None
 
     return run_command(

@@ -61,7 +61,6 @@ def default_loggers(folder: Path) -> list[Logger]:
 
 
 def _may_be_several(trainer: Namespace) -> bool:
-    """True if the settings of a trainer ask for more than one device."""
     return trainer.get("devices") not in (None, 1, "1") or trainer.get("num_nodes") not in (None, 1)
 
 
@@ -78,7 +77,6 @@ class TrainCLI(LightningCLI):
         super().__init__(*settings, **more)
 
     def add_arguments_to_parser(self, parser: LightningArgumentParser) -> None:
-        """Add separate options for checkpoints."""
         parser.add_lightning_class_args(ModelCheckpoint, "checkpoint")
         parser.set_defaults(
             {
@@ -147,7 +145,6 @@ class TrainCLI(LightningCLI):
             self._parser(self.subcommand).save(config, temporary, skip_unset=False, overwrite=True, multifile=False)
 
     def parse_arguments(self, parser: LightningArgumentParser, args: Any) -> None:
-        """Parse, and refuse a checkpoint that cannot be read."""
         with guessing(parser):
             super().parse_arguments(parser, args)
         command = self.config.get("subcommand")
@@ -182,11 +179,6 @@ def make_cli(arguments: Sequence[str] | None = None, run: bool = True, run_folde
 
     Returns:
         The command line interface, with its ``model``, ``datamodule`` and ``trainer``.
-
-    Raises:
-        ArgumentError: If an option is unknown or a value has the wrong type.
-        ValueError: If a value is out of range or the data are bad.
-        TrainingDiverged: If a loss or a Gaussian is no longer finite.
     """
     limit_yaml(with_named_materials)
     given = with_shipped(sys.argv[1:] if arguments is None else arguments, "train")
@@ -246,7 +238,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def _train(arguments: Sequence[str] | None, run_folder: RunFolder) -> int:
-    """Parse and run, and report the files."""
     silence_warnings()
     silence_advertisements()
     try:

@@ -41,9 +41,6 @@ def warm(configs: Sequence[str]) -> None:
 
     Args:
         configs: Files or names of shipped configurations; if empty, all that need no splat.
-
-    Raises:
-        ValueError: If a configuration does not exist or is invalid.
     """
     from gaussian_swaying.simulation.simulation import Simulation
 

@@ -20,9 +20,6 @@ def with_named_materials(found: Any) -> Any:
 
     Args:
         found: What was read from YAML; anything but a mapping with a ``material`` stays as it is.
-
-    Raises:
-        ValueError: If there is no material of a name; the message lists the names.
     """
     if not isinstance(found, dict) or "material" not in found:
         return found

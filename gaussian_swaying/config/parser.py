@@ -144,7 +144,6 @@ def build_parser(schema: type) -> ArgumentParser:
 
 @cache
 def _parser_class() -> type[ArgumentParser]:
-    """A parser whose option ``--material`` also takes the name of a known material."""
     from jsonargparse import ArgumentParser
 
     class Parser(ArgumentParser):
@@ -163,9 +162,6 @@ def with_custom(parser: ArgumentParser, settings: Namespace, parts: Mapping[str,
         parser: From :func:`build_parser`.
         settings: The settings that it parsed.
         parts: What it made of them.
-
-    Raises:
-        ValueError: If both are given.
     """
     found = dict(parts)
     for name, (_, replaced) in CUSTOM.items():
@@ -220,9 +216,6 @@ def parse_file(parser: ArgumentParser, path: str | os.PathLike[str]) -> Namespac
     Args:
         parser: From :func:`build_parser`.
         path: The YAML file.
-
-    Raises:
-        ValueError: If the file or a value in it is invalid; the message names the field.
     """
     arguments = ["--config", os.fspath(path)]
     try:
@@ -238,9 +231,6 @@ def parse_text(parser: ArgumentParser, text: str, arguments: Sequence[str] = ())
         parser: From :func:`build_parser`.
         text: The YAML.
         arguments: Options that override it.
-
-    Raises:
-        ArgumentError: If a value is invalid.
     """
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "starter.yaml"
@@ -319,7 +309,6 @@ def describe(value: Any) -> Any:
 
 
 def _parts(value: Any) -> dict[str, Any]:
-    """The public attributes of an object, and the tensors and parts of a module."""
     if dataclasses.is_dataclass(value):
         parts = {field.name: getattr(value, field.name) for field in dataclasses.fields(value)}
     else:

@@ -276,10 +276,6 @@ def evaluate(
 
     Returns:
         The result of :func:`compare_run`.
-
-    Raises:
-        ValueError: As :func:`compare_run`, or if the folder cannot be made; nothing is written then.
-        OSError: If a file cannot be written.
     """
     folder = Path(output)
     _read_summary(Path(run))  # before the folder, which may be inside the run's, is made
@@ -306,8 +302,6 @@ def evaluate(
 
 
 class _Surface:
-    """Chamfer distances between the particles of a run and the surface of a reference."""
-
     def __init__(
         self,
         run: Path,
@@ -359,7 +353,6 @@ class _Surface:
 
 
 def _read_all(rows: list[dict[str, Any]]) -> None:
-    """Replace the tensors of the frames by numbers (one GPU synchronisation), and add ``psnr_db``."""
     names = [name for name, value in rows[0].items() if isinstance(value, Tensor)]
     table = torch.stack([torch.stack([row[name].double() for name in names]) for row in rows]).tolist()
     for row, values in zip(rows, table, strict=True):
@@ -395,7 +388,6 @@ def _common_count(
     first_reference: int,
     frames: int | None,
 ) -> int:
-    """The number of frames to compare."""
     left = [(of_run - first, of_reference - first_reference) for of_run, of_reference in counts.values()]
     shared = min(min(pair) for pair in left)
     told = ", ".join(

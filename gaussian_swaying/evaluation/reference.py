@@ -38,9 +38,6 @@ def read_cloth(path: str | os.PathLike[str]) -> Cloth:
 
     The longer side [m] is ``side``, or else the larger of ``width`` and ``height`` in the JSON text ``settings``, if
     these exist.
-
-    Raises:
-        ValueError: If the file or an array is missing, damaged, or has a wrong shape or value.
     """
     found = read_arrays(path, "the reference", ("positions", "faces"), ("side", "settings"))
     positions = torch.from_numpy(found["positions"].astype(np.float32))
@@ -81,19 +78,12 @@ def surface_points(vertices: Tensor, faces: Tensor, count: int, seed: int = 0) -
 
     Returns:
         Points [m], float32, shape (count, 3).
-
-    Raises:
-        ValueError: If the mesh has no area or a face refers to a vertex that does not exist.
     """
     return sample_mesh(PointCloud(vertices, torch.zeros_like(vertices)), faces, count, seed).points
 
 
 def frame_files(folder: Path) -> list[Path]:
-    """The pictures ``frames/<number>.png`` of a folder in order; their numbers must be consecutive.
-
-    Raises:
-        ValueError: If a name is not a number or a number is missing.
-    """
+    """The pictures ``frames/<number>.png`` of a folder in order; their numbers must be consecutive."""
     files = [path for path in (folder / "frames").glob("*.png") if not path.name.startswith(".")]
     for path in files:
         if not path.stem.isdecimal():

@@ -73,9 +73,6 @@ def sway_score(
 
     Returns:
         The score, without units but for ``peak`` [Hz] and ``side``. If nothing moves, all is 0 or NaN.
-
-    Raises:
-        ValueError: If shapes or times do not fit, or fewer than 8 frames are left after ``skip``.
     """
     rest, displacement, times = _numbers(rest), _numbers(displacement), _numbers(times)
     if rest.ndim != 2 or displacement.shape != (len(times), *rest.shape):
@@ -159,7 +156,6 @@ def _peak(line: np.ndarray, step: float) -> tuple[float, float]:
 
 
 def _together(rest: np.ndarray, lines: np.ndarray, least: float) -> float:
-    """Mean correlation between clusters of points, of the fluctuation (T, N) along one axis."""
     from scipy.cluster.vq import kmeans2
 
     if len(rest) < PARTS:
@@ -188,9 +184,6 @@ def natural_frequency(displacement: Array, times: Array) -> tuple[float, float]:
 
     Returns:
         The natural frequency [Hz] and the damping ratio.
-
-    Raises:
-        ValueError: If the shapes or times do not fit, or fewer than three swings to either side are seen.
     """
     from scipy.optimize import curve_fit
 
@@ -253,9 +246,6 @@ def contact_sheet(frames: Iterable[Array], columns: int) -> np.ndarray:
 
     Returns:
         The picture, uint8, shape (rows · H, columns · W, 3); places without a frame are black.
-
-    Raises:
-        ValueError: If there is no frame, or ``columns`` is not positive.
     """
     film = _film(frames)
     if columns < 1:
@@ -278,9 +268,6 @@ def space_time(frames: Iterable[Array], column: int | None = None, row: int | No
 
     Returns:
         The picture, uint8, shape (H, T, 3), or (T, W, 3) for a row.
-
-    Raises:
-        ValueError: If there is no frame, or both a column and a row are given, or one outside the picture.
     """
     film = _film(frames)
     if column is not None and row is not None:

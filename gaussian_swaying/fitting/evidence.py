@@ -71,7 +71,6 @@ class Evidence(ABC):
         self.video = video
 
     def frame_at(self, time: float) -> int | None:
-        """See :meth:`~gaussian_swaying.fitting.videos.Footage.frame_at`."""
         return self.video.frame_at(time)
 
     @abstractmethod
@@ -167,7 +166,6 @@ class PictureEvidence(Evidence):
         self.factor = max(1, round(video.size[0] / width))
 
     def shown(self, simulation: Simulation, states: Sequence[State]) -> tuple[Painter, list[DeformedGaussians]]:
-        """The painter, and the Gaussians of each state."""
         return simulation.painter, [simulation.painter.deformed(state) for state in states]
 
     def beside(self, shown: tuple[Painter, list[DeformedGaussians]], frame: int) -> tuple[Tensor, Tensor]:
@@ -277,7 +275,6 @@ def compare_starts(
 
 
 def _joined(parts: Parts) -> list[Block]:
-    """One block for each kind of residuals, with their clusters and moments."""
     found = []
     for kind, own in parts.items():
         values, cluster, moment = zip(*own, strict=True)

@@ -83,7 +83,6 @@ def _averaged(picture: Tensor) -> Tensor:
 
 
 def _median(values: Tensor, weights: Tensor) -> Tensor:
-    """Weighed median of values (N,)."""
     order = values.argsort()
     total = weights[order].cumsum(0)
     return values[order[int(torch.searchsorted(total, 0.5 * total[-1]))]]

@@ -64,12 +64,7 @@ class Film:
 
 
 def open_film(path: str | Path) -> Film:
-    """Read the head of a film.
-
-    Raises:
-        FileNotFoundError: If there is no such film.
-        ValueError: If it cannot be read, or has no frames.
-    """
+    """Read the head of a film."""
     file = check_regular(Path(path), "the film")
     with closing(frames_of(file)) as frames:
         head = next_of(frames, file)

@@ -232,7 +232,6 @@ class Fit:
 
     @property
     def tracks(self) -> list[Tracks]:
-        """Tracks of every camera."""
         if self._tracks is None:
             shown = self._first_shown() if self.first else None
             self._tracks = [track(self.simulation, video, self.plan.tracks, shown) for video in self.videos]
@@ -248,7 +247,6 @@ class Fit:
         return write_before(folder / BEFORE, self.simulation, self.videos, self.tracks if self.followed else None)
 
     def _first_shown(self) -> DeformedGaussians:
-        """Gaussians of the simulation from which the points are followed when the film begins."""
         states = next(self._run(torch.tensor([self.first], dtype=torch.float64), [0.0]))
         return self.simulation.painter.deformed(states[0])
 
@@ -304,11 +302,9 @@ class Fit:
         return [TrackEvidence(self.simulation, v, fitted_part(own), weighed=True) for v, own in pairs]
 
     def _trusted(self, evidence: Sequence[Evidence], place: Sequence[float]) -> list[Evidence]:
-        """The evidence, with less weight on what the grid changes at a place."""
         return trusted(self.simulation, self._grids(), evidence, self.values(place), self.fitted)
 
     def _grids(self) -> list[Simulation]:
-        """The same scene on other grids."""
         if self._other_grids is None:
             self._other_grids = []
             for ratio in GRIDS if self.on_grid else ():
@@ -533,9 +529,6 @@ class Fit:
             course: The resume state; a new one for a new fit.
             keep: Called after every iteration, to write the course.
             films: Folder for films beside the fit; None for none.
-
-        Raises:
-            ValueError: If the video cannot tell the unknowns apart.
         """
         clock = time.monotonic() - course.seconds
         if course.step < 0:
@@ -570,7 +563,6 @@ class Fit:
         return wider.result(course, places, evidence, films, others if wider is self else ())
 
     def _stepped(self, course: Course, keep: Callable[[Course], None], clock: float) -> list[Evidence]:
-        """Do the steps that are missing, and return the evidence of the last one."""
         steps = self.steps()
         while True:
             stage, share = steps[course.step]
@@ -790,11 +782,6 @@ def run_fit(
 
     Returns:
         The result.
-
-    Raises:
-        ImportError: If a stage follows points and OpenCV is not installed.
-        ValueError: If something does not fit together, the video cannot tell the unknowns apart, or the folder cannot
-            be used.
     """
     folder, parser = Path(output), Simulation.parser()
     settings = parse_base(plan, parser)
@@ -840,10 +827,6 @@ def check_fit(plan: Plan, output: str | os.PathLike[str], *, device: str = "auto
 
     Returns:
         The pictures.
-
-    Raises:
-        ImportError: As :func:`run_fit`.
-        ValueError: As :func:`run_fit`.
     """
     parser = Simulation.parser()
     fit_ = _ready(plan, parser, parse_base(plan, parser), device, progress)
@@ -853,7 +836,6 @@ def check_fit(plan: Plan, output: str | os.PathLike[str], *, device: str = "auto
 
 
 def _ready(plan: Plan, parser: Any, settings: Any, device: str, progress: bool) -> Fit:
-    """The fit of a plan, with everything read."""
     if {"tracks", "matches"} & set(plan.stages):
         opencv()  # before anything that takes time
     settings.device = device

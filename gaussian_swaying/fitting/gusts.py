@@ -48,12 +48,10 @@ class Gusts:
 
     @property
     def told(self) -> bool:
-        """True if the film tells the time scale."""
         _, low, high = self.time_scale
         return high < min(APART * low, self.seconds)
 
     def sentence(self) -> str:
-        """The spectrum in words."""
         mean, intensity, time = (
             "{:.2g} ({:.2g} to {:.2g})".format(*own) for own in (self.mean, self.intensity, self.time_scale)
         )

@@ -94,9 +94,6 @@ def follow_camera(video: Footage, background: Background) -> Motion:
     Args:
         video: The film. Its cameras may be those of the first frame, or rough ones of all frames.
         background: What stands still.
-
-    Raises:
-        ValueError: If more than half of the frames show too little of the background.
     """
     found: list[Registration | None] = []
     residuals: list[float] = []

@@ -125,9 +125,6 @@ def moving_points(video: Footage, picture: RenderOutput) -> tuple[Tensor, Tensor
     Returns:
         The places in the splat of those that are seen for half of the film, (T, 3), and how far each goes at most, (T,)
         [pixels].
-
-    Raises:
-        ImportError: Without OpenCV.
     """
     import numpy as np
 

@@ -193,9 +193,6 @@ def iterate(
         tolerance: Smallest step worth another iteration, as a share of the ranges.
         least_gain: Smallest share of the cost worth another iteration.
         retract: Takes a step.
-
-    Raises:
-        ValueError: If nothing is finite where it starts.
     """
     if progress.normal is None:
         progress.normal, progress.scales, _ = linearised(residuals, rescale, progress.place)

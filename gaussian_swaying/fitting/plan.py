@@ -95,10 +95,6 @@ def read_plan(path: str | os.PathLike[str], find: Callable[[str], str] = str) ->
         path: The file. Names in ``base`` and ``videos`` are relative to its folder if they exist there, else to the
             working directory.
         find: Gives the file of a name in ``base``.
-
-    Raises:
-        FileNotFoundError: If there is no such file.
-        ValueError: If the file is invalid; the message names the entry and the remedy.
     """
     file = Path(path)
     names = [entry.name for entry in fields(Plan)]
@@ -138,9 +134,6 @@ def read_plan(path: str | os.PathLike[str], find: Callable[[str], str] = str) ->
 def read_unknown(name: str, given: Any) -> Unknown:
     """An unknown from its entry: ``{range: [low, high], scale: log, start: 3}``; scale and start may be left out.
 
-    Raises:
-        ValueError: Naming the entry and the remedy.
-
     Example:
         >>> read_unknown("material.E", {"range": [1e3, 1e5]}).scale
         'log'
@@ -162,12 +155,7 @@ def read_unknown(name: str, given: Any) -> Unknown:
 
 
 def parse_base(plan: Plan, parser: ArgumentParser) -> Namespace:
-    """The settings of the base, with the known options.
-
-    Raises:
-        ArgumentError: If ``sim`` has no such option or does not accept a value.
-        ValueError: If the settings do not fit together.
-    """
+    """The settings of the base, with the known options."""
     files = [word for name in plan.base for word in ("--config", name)]
     settings = parser.parse_args([*files, *(option(name, value) for name, value in plan.known.items())])
     check_settings(Simulation, settings)

@@ -43,7 +43,6 @@ class Judged:
     gains: tuple[tuple[float, ...], ...] = ()
 
     def sentences(self) -> list[str]:
-        """Sentences on what was done to the film."""
         found = []
         if self.hand_held:
             found.append(
@@ -60,7 +59,6 @@ class Judged:
         return found
 
     def doubts(self) -> list[str]:
-        """Sentences that speak against the fit."""
         if self.unseen <= MANY * self.frames:
             return []
         return [
@@ -88,10 +86,6 @@ def prepared(
 
     Returns:
         The films, and what the background says of each; nothing if the splat has none.
-
-    Raises:
-        ImportError: With ``hand_held``, without OpenCV.
-        ValueError: If there is no such part, or a camera that moves shows too little of the background.
     """
     background = Background(simulation, also_moves)
     if not background.exists:

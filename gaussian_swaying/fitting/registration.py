@@ -317,7 +317,6 @@ def _lacking(world: Any, there: Any, beside: Any, camera: Camera, near: float) -
 
 
 def _agreeing(cv2: Any, world: Any, there: Any, K: Any, near: float, turn: Any, shift: Any) -> tuple[Any, Any, Any]:
-    """The points that agree on a pose, and the pose, refined on them."""
     import numpy as np
 
     index: Any = np.arange(0)

@@ -104,7 +104,6 @@ class Result:
 
     @property
     def values(self) -> dict[str, float]:
-        """Values of the unknowns that were found."""
         return {u.name: u.value(share) for u, share in zip(self.unknowns, self.place, strict=True)}
 
     @property
@@ -120,7 +119,6 @@ class Result:
 
     @property
     def vague(self) -> list[str]:
-        """Names of unknowns that the video does not determine."""
         values, errors, found = self.values, self.errors, []
         for u in self.unknowns:
             most = VAGUE * (abs(values[u.name]) if u.scale == "log" else u.high - u.low)
@@ -131,7 +129,6 @@ class Result:
 
     @property
     def at_an_end(self) -> list[str]:
-        """Names of unknowns at an end of their range."""
         return [u.name for u, p in zip(self.unknowns, self.place, strict=True) if p < 1e-3 or p > 1 - 1e-3]
 
     @property
@@ -195,7 +192,6 @@ class Result:
         ]
 
     def text(self) -> str:
-        """The table with warnings and remarks, for printing."""
         lines = [f"{'':<28}{'value':>12}{'error':>12}"]
         for row in self.rows():
             lines.append(f"{row['name']:<28}{row['value']:>12.5g}{row['standard_error']:>12.2g} {row['unit']}".rstrip())

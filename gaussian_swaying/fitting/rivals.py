@@ -131,6 +131,5 @@ def _turned(angle: float) -> float:
 
 
 def _within(azimuth: float, unknown: Unknown) -> float:
-    """The same direction within a range if it has it, nearest to the middle."""
     middle = 0.5 * (unknown.low + unknown.high)
     return middle + _turned(azimuth - middle)

@@ -21,9 +21,6 @@ def at_scale(setup: Setup, metres_per_unit: float) -> Setup:
     Args:
         setup: With the values that are meant in metres.
         metres_per_unit: The length of a scene unit [m].
-
-    Raises:
-        ValueError: If something in the setup has a length or speed of its own, or nothing has weight.
     """
     wind, scene = setup.wind, setup.scene
     gravity, sheet = value_of(setup, "solver.gravity"), not scene.filled

@@ -65,9 +65,6 @@ def track(simulation: Simulation, video: Footage, most: int = 400, first: Deform
         most: Largest number of tracks; those with the most texture are taken.
         first: What the first frame shows, about, if it is not the scene at rest. The Gaussians are followed from a
             picture of it to the first frame; those whose surroundings do not look alike there are not seen.
-
-    Raises:
-        ImportError: Without OpenCV.
     """
     if first is None:
         chosen, start = _chosen(simulation, video, _grey(video.images[0]), most)
@@ -295,11 +292,7 @@ def _grey(images: Tensor) -> Any:
 
 
 def opencv() -> Any:
-    """Import and return ``cv2`` (OpenCV), which tracks points.
-
-    Raises:
-        ImportError: If OpenCV is not installed.
-    """
+    """Import and return ``cv2`` (OpenCV), which tracks points."""
     try:
         import cv2
     except ImportError as error:

@@ -69,7 +69,6 @@ class Unknown:
 
     @property
     def unit(self) -> str:
-        """Its unit, empty for a pure number."""
         if is_change(self.name):
             return "" if self.name.startswith(CHANGES[0]) else "degrees"
         own = {FILM_START: "s", SCALE: "m"}

@@ -63,9 +63,6 @@ def states_of(
         times: Times [s], ascending, from 0 on.
         alike: Take the same substeps for all, those of the stiffest, so that differences come from the values alone. If
             not, variants that need more substeps are batches of their own, and a variant may end in NaN.
-
-    Raises:
-        SimulationDiverged: If a variant diverges, with ``alike``.
     """
     setups = [setup_of(simulation.setup, own) for own in values]
     groups = _groups(simulation, values, setups, alike)
@@ -137,7 +134,6 @@ def _advance(groups: Sequence[_Group], begin: float, end: float, alike: bool) ->
 
 
 def _bound(setup: Setup) -> MaterialPoints:
-    """The material as a stepper binds it."""
     return with_added_mass(setup.points, setup.scene.patches, setup.aero)
 
 

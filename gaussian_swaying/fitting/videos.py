@@ -70,8 +70,6 @@ class Footage:
 
 @dataclass
 class _Shot:
-    """One frame while it is read."""
-
     time: float
     camera: Camera
     image: Tensor
@@ -85,11 +83,9 @@ class _Room:
         self.frames, self.bytes = MOST_FRAMES, MOST_BYTES
 
     def holds(self, width: int, height: int) -> int:
-        """Return how many more frames of this size fit."""
         return min(self.frames, self.bytes // (3 * width * height))
 
     def check(self, path: Path, width: int, height: int, frames: int = 1) -> None:
-        """Raise ValueError if some frames of a file do not fit any more."""
         if frames > self.holds(width, height):
             raise ValueError(
                 f"The videos have more than {MOST_FRAMES:,} frames or {MOST_BYTES / 2**30:g} GiB of pixels together "
@@ -98,11 +94,7 @@ class _Room:
             )
 
     def take(self, path: Path, width: int, height: int) -> None:
-        """Count one more frame of a file.
-
-        Raises:
-            ValueError: If it does not fit any more.
-        """
+        """Count one more frame of a file."""
         self.check(path, width, height)
         self.frames -= 1
         self.bytes -= 3 * width * height
@@ -142,10 +134,6 @@ def read_videos(
 
     Returns:
         One for each camera, sorted by name. The earliest frame is at time zero.
-
-    Raises:
-        FileNotFoundError: If a path does not exist.
-        ValueError: If a file or a field is bad; the message names it and the remedy.
     """
     several = [paths] if isinstance(paths, str | os.PathLike) else list(paths)
     if not several:
@@ -248,7 +236,6 @@ def _camera_name(where: str, index: int, frame: dict[str, Any]) -> str:
 
 
 def _picture(item: PosedImage, cover: Path | None, time: float, room: _Room) -> list[_Shot]:
-    """One frame, from an image and perhaps a mask."""
     room.take(item.path, item.lens.width, item.lens.height)
     lens = item.lens.undistorted()
     camera = Camera(item.world_to_camera.float(), lens.intrinsics().float(), lens.width, lens.height)

@@ -32,9 +32,6 @@ def patch_area(log_scales: Tensor) -> Tensor:
     Returns:
         Areas [scene units^2], shape (...).
 
-    Raises:
-        ValueError: If ``log_scales`` has another shape.
-
     Example:
         >>> patch_area(torch.tensor([[2.0, 3.0, 0.1]]).log())
         tensor([18.8496])
@@ -74,9 +71,6 @@ def coverage_area(
 
     Returns:
         Areas [scene units^2], finite and above zero, shape (N,).
-
-    Raises:
-        ValueError: If a tensor does not have the shape above, ``means`` is not finite or ``neighbours`` is below 6.
     """
     check_shape("means", means, None, 3)
     count = means.shape[0]

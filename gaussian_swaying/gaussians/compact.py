@@ -31,10 +31,6 @@ def read_splat(path: str | os.PathLike[str]) -> GaussianCloud:
 
     Returns:
         The Gaussians as float32 tensors on the CPU, without normals.
-
-    Raises:
-        FileNotFoundError: If there is no such file.
-        ValueError: If the file is empty or truncated, or a Gaussian has no finite centre, no size or no rotation.
     """
     path = check_regular(path, "the .splat file")
     size = path.stat().st_size
@@ -61,10 +57,6 @@ def read_compressed_ply(path: str | os.PathLike[str]) -> GaussianCloud:
 
     Returns:
         The Gaussians as float32 tensors on the CPU, without normals.
-
-    Raises:
-        FileNotFoundError: If there is no such file.
-        ValueError: If the file is truncated or something in it is missing.
     """
     path = Path(path)
     header = read_binary_header(path)

@@ -47,9 +47,6 @@ def attached_pairs(
 
     Returns:
         Pairs of different Gaussians, each once, int64, shape (E, 2), on the CPU.
-
-    Raises:
-        ValueError: If a shape is not the one above.
     """
     check_shape("means", means, None, 3)
     where = means.detach().cpu().double()
@@ -132,7 +129,6 @@ def _strays(where: Tensor, pairs: Tensor, alone: Tensor | None) -> Tensor:
 
 
 def _allowed(pairs: Tensor, labels: Tensor, to: Sequence[int | None]) -> Tensor:
-    """Return a mask of the pairs that the parts allow."""
     only = torch.tensor([-1 if k is None else k for k in to])
     a, b = labels[pairs].unbind(1)
     fits = [(only[p] < 0) | (only[p] == q) for p, q in ((a, b), (b, a))]

@@ -134,11 +134,7 @@ def export_cloud(
 
 
 def format_of(path: str | os.PathLike[str]) -> str:
-    """The format that belongs to the ending of a file name.
-
-    Raises:
-        ValueError: If the ending is unknown.
-    """
+    """The format that belongs to the ending of a file name."""
     name = Path(path).name
     for format, suffix in sorted(SUFFIXES.items(), key=lambda item: -len(item[1])):  # .compressed.ply before .ply
         if name.endswith(suffix):
@@ -170,10 +166,6 @@ def convert(
         rotation: Rotation from scene directions to z up, shape (3, 3), for USD and glTF; the scene's z is up if None.
         spz_version: Version of SPZ.
         still: A splat that every frame of a folder gets as well, before its own Gaussians: what never moves.
-
-    Raises:
-        FileNotFoundError: If the source or the target's folder does not exist.
-        ValueError: If a file cannot be read or written; the message names it and the remedy.
     """
     source, target = Path(source), Path(target)
     format = format_of(target)
@@ -202,11 +194,7 @@ def convert(
 
 
 def joined(first: GaussianCloud, second: GaussianCloud) -> GaussianCloud:
-    """The Gaussians of two splats of the same scene, one after the other.
-
-    Raises:
-        ValueError: If their harmonics are of different degrees, or only one has normals.
-    """
+    """The Gaussians of two splats of the same scene, one after the other."""
     if first.sh_degree != second.sh_degree or (first.normals is None) != (second.normals is None):
         raise ValueError(
             "The file of what never moves and the frames do not belong together (harmonics of degree "
@@ -283,10 +271,6 @@ def write_usd(
         start: Number of the first frame.
         metres_per_unit: Length of a scene unit [m].
         rotation: Rotation from scene directions to z up, shape (3, 3); the scene's z is up if None.
-
-    Raises:
-        ImportError: If usd-core is not installed.
-        ValueError: If there is no frame, or the frames differ in size.
     """
     check_positive("fps", fps)
     check_positive("metres_per_unit", metres_per_unit)
@@ -368,11 +352,7 @@ class UsdFilm:
         self._end = 0
 
     def add(self, frame: int, arrays: dict[str, np.ndarray]) -> None:
-        """Add a frame as arrays from :func:`usd_arrays`; add frames in order.
-
-        Raises:
-            ValueError: If the number of Gaussians differs from that of the first frame.
-        """
+        """Add a frame as arrays from :func:`usd_arrays`; add frames in order."""
         if self._first is None:
             self._first = self._end = frame
             self._stage.SetStartTimeCode(frame)
@@ -393,7 +373,6 @@ class UsdFilm:
         self._end = frame
 
     def save(self, path: str | os.PathLike[str]) -> None:
-        """Write the film, whole or not at all."""
         with atomic(Path(path)) as temporary:
             self._stage.GetRootLayer().Export(str(temporary))
 
@@ -446,10 +425,6 @@ def read_usd_frame(path: str | os.PathLike[str], frame: int) -> dict[str, np.nda
     Args:
         path: The file.
         frame: Frame number; a frame without samples is interpolated.
-
-    Raises:
-        ImportError: If usd-core is not installed.
-        ValueError: If the file cannot be read or contains no Gaussians.
     """
     usd, geom = _pxr("Usd"), _pxr("UsdGeom")
     try:
@@ -473,7 +448,6 @@ _ATTRIBUTES = {"harmonics": _HARMONICS, "colors": "primvars:displayColor"}
 
 
 def _pxr(name: str) -> Any:
-    """A module of usd-core."""
     try:
         return import_module(f"pxr.{name}")
     except ImportError as error:
@@ -487,7 +461,6 @@ def _vec3(array: np.ndarray) -> Any:
 
 
 def _extent(arrays: dict[str, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
-    """Corners of a box around all Gaussians, up to three standard deviations."""
     axes = quat_to_rotation(torch.from_numpy(arrays["orientations"])).numpy()
     reach = 3 * np.sqrt(np.square(axes * arrays["scales"][:, None, :]).sum(-1))
     return (arrays["positions"] - reach).min(0), (arrays["positions"] + reach).max(0)

@@ -60,9 +60,6 @@ def density_grid(
 
     Returns:
         Density in float32, shape (nx, ny, nz).
-
-    Raises:
-        ValueError: If a tensor does not have the shape above.
     """
     check_shape("means", means, "N", 3)
     check_shape("covariances", covariances, len(means), 3, 3)
@@ -104,11 +101,7 @@ def density_grid(
 
 
 def ray_directions(count: int) -> list[tuple[int, int, int]]:
-    """The 6, 18 or 26 directions from a cell to its neighbours across faces, edges and corners.
-
-    Raises:
-        ValueError: If ``count`` is another number.
-    """
+    """The 6, 18 or 26 directions from a cell to its neighbours across faces, edges and corners."""
     if count not in (6, 18, 26):
         raise ValueError(f"Expected `directions` to be 6, 18 or 26, but got {count}.")
     every = sorted(itertools.product((-1, 0, 1), repeat=3), key=lambda d: sum(map(abs, d)))
@@ -347,10 +340,6 @@ class InteriorFilling:
 
         Returns:
             Points, volumes, and which Gaussians are on the surface.
-
-        Raises:
-            ValueError: If nothing is inside, the grid is too large, or a tensor does not have the shape above or is
-                not finite.
         """
         h = self.spacing if self.spacing is not None else spacing
         if h is None:
@@ -391,11 +380,7 @@ class InteriorFilling:
 
 
 def grid_around(means: Tensor, spacing: float) -> tuple[Tensor, tuple[int, int, int]]:
-    """Lower corner [m] (3,) and resolution of a grid around points (N, 3) with six cells to spare on each side.
-
-    Raises:
-        ValueError: If it would have more than ``MAX_CELLS`` cells.
-    """
+    """Lower corner [m] (3,) and resolution of a grid around points (N, 3) with six cells to spare on each side."""
     low, high = means.amin(0), means.amax(0)
     size = ((high - low) / spacing).ceil() + 1 + 2 * 6
     if float(size.prod()) > MAX_CELLS:

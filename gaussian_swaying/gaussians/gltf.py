@@ -46,14 +46,6 @@ def read_gltf(path: str | os.PathLike[str]) -> GaussianCloud:
 
     Returns:
         The Gaussians as float32 tensors on the CPU, without normals.
-
-    Raises:
-        FileNotFoundError: If there is no such file.
-        ValueError: If the file is broken, holds no Gaussians, or stores them in a way that is not supported (another
-            kernel, a compression, a sheared or mirrored node); the message says which.
-
-    Warns:
-        UserWarning: If the colours are in linear light.
     """
     path = check_regular(path, "the glTF file")
     document = _Document(path)
@@ -82,9 +74,6 @@ def encode_gltf(cloud: GaussianCloud, rotation: Tensor | None = None, metres_per
 
     Returns:
         The content of the file.
-
-    Raises:
-        ValueError: If it would be 4 GB or larger.
     """
     turn = _UPRIGHT if rotation is None else _UPRIGHT @ rotation.to("cpu", torch.float64)
     cloud = _moved(cloud.to("cpu", torch.float32), turn * metres_per_unit, torch.zeros(3, dtype=torch.float64))
@@ -139,11 +128,7 @@ def encode_gltf(cloud: GaussianCloud, rotation: Tensor | None = None, metres_per
 
 
 class _Document:
-    """A glTF document and its buffers; whatever is missing or wrong in it is a ValueError that names the file.
-
-    Args:
-        path: The file.
-    """
+    """A glTF document and its buffers; whatever is missing or wrong in it is a ValueError that names the file."""
 
     def __init__(self, path: Path) -> None:
         self.path = path
@@ -158,7 +143,6 @@ class _Document:
         return ValueError(f"{self.path} is not a usable glTF file ({what}); export it again.")
 
     def _chunks(self) -> Any:
-        """The JSON of a binary file, whose second chunk becomes the first buffer."""
         size = self.path.stat().st_size
         data = np.memmap(self.path, dtype=np.uint8, mode="r")
         if size < _GLB.size + _CHUNK.size:
@@ -183,7 +167,6 @@ class _Document:
     # ---- parts of the document
 
     def item(self, kind: str, index: Any) -> dict[str, Any]:
-        """Entry of one of the lists of the document."""
         entries = self.root.get(kind)
         if not isinstance(entries, list) or type(index) is not int or not 0 <= index < len(entries):
             raise self.broken(f"`{kind}` has no entry {str(index)[:20]}")
@@ -192,7 +175,6 @@ class _Document:
         return entries[index]
 
     def whole(self, holder: dict[str, Any], name: str, default: int | None = None) -> int:
-        """A whole number that is not negative."""
         value = holder.get(name, default)
         if type(value) is not int or value < 0:
             raise self.broken(f"`{name}` is {str(value)[:20]}")
@@ -269,11 +251,9 @@ class _Document:
     # ---- numbers
 
     def count(self, index: Any) -> int:
-        """Number of rows of an accessor."""
         return self.whole(self.item("accessors", index), "count")
 
     def gaussians(self, primitive: dict[str, Any], matrix: np.ndarray, width: int) -> GaussianCloud:
-        """The Gaussians of a primitive, in the axes of the scene, with so many harmonics."""
         names, path = primitive["attributes"], self.path
         count = self.count(names["POSITION"])
 
@@ -362,7 +342,6 @@ class _Document:
 
 
 def _harmonics(degree: int) -> list[str]:
-    """Names of the attributes with harmonics, in order."""
     return [f"{_EXTENSION}:SH_DEGREE_{band}_COEF_{k}" for band in range(degree + 1) for k in range(2 * band + 1)]
 
 

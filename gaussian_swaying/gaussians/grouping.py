@@ -49,9 +49,6 @@ def grid_groups(
 
     Returns:
         The group of each point, from 0 on, shape (N,).
-
-    Raises:
-        ValueError: If a shape is not the one above, or ``dx`` or ``per_cell`` is not positive.
     """
     check_shape("position", position, None, 3)
     check_shape("weight", weight, len(position))
@@ -97,9 +94,6 @@ def loose_points(points: Tensor, side: float) -> Tensor:
 
     Returns:
         Booleans, shape (N,); none if otherwise all would be loose.
-
-    Raises:
-        ValueError: If a shape is not the one above or ``side`` is not positive.
     """
     check_shape("points", points, None, 3)
     check_positive("side", side)
@@ -131,9 +125,6 @@ def connected_parts(points: Tensor, cell: float) -> Tensor:
 
     Returns:
         Numbers from 0, shape (N,).
-
-    Raises:
-        ValueError: If ``cell`` is not positive.
     """
     check_shape("points", points, None, 3)
     check_positive("cell", cell)

@@ -43,9 +43,6 @@ def sh_basis(directions: Tensor, degree: int) -> Tensor:
 
     Returns:
         Basis functions in the order (0, 0), (1, -1), (1, 0), (1, 1), (2, -2) ..., shape (..., (degree + 1)^2).
-
-    Raises:
-        ValueError: If ``directions`` has another shape or ``degree`` is not 0, 1, 2 or 3.
     """
     check_shape("directions", directions, 3)
     if degree not in (0, 1, 2, 3):
@@ -79,9 +76,6 @@ def evaluate_sh(sh: Tensor, directions: Tensor) -> Tensor:
 
     Returns:
         Values per channel, shape (..., 3).
-
-    Raises:
-        ValueError: If a tensor does not have the shape above.
     """
     check_shape("sh", sh, None, 3)
     check_shape("directions", directions, 3)
@@ -134,9 +128,6 @@ def sh_to_color(sh: Tensor, directions: Tensor) -> Tensor:
     Returns:
         RGB colour, at least 0, where 1 is white, shape (..., 3).
 
-    Raises:
-        ValueError: If a tensor does not have the shape above.
-
     Example:
         >>> sh_to_color(torch.zeros(1, 4, 3), torch.tensor([[0.0, 0.0, 1.0]]))
         tensor([[0.5000, 0.5000, 0.5000]])
@@ -157,9 +148,6 @@ def rotate_sh(sh: Tensor, rotation: Tensor) -> Tensor:
 
     Returns:
         Coefficients of the rotated object, shape (..., K, 3).
-
-    Raises:
-        ValueError: If a tensor does not have the shape above.
     """
     check_shape("sh", sh, None, 3)
     check_shape("rotation", rotation, 3, 3)

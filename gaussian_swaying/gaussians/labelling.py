@@ -27,9 +27,6 @@ def connected(cloud: GaussianCloud, seed: Sequence[float], reach: float | None =
         seed: A place [scene units]; its nearest Gaussian is the first.
         reach: Twice the side of a cell [scene units]; Gaussians in the same or in touching cells are connected. Four
             spacings if None (see :func:`~gaussian_swaying.geometry.neighbours.particle_spacing`).
-
-    Raises:
-        ValueError: If ``reach`` is not positive.
     """
     means = cloud.means.detach()
     part = connected_parts(means, 0.5 * _reach(means, reach))
@@ -47,9 +44,6 @@ def alike(
         color: Largest difference from the mean colour there, as a distance in red, green and blue from 0 to 1.
         angle: Largest angle between the normals of two neighbours, of either sign [degrees]; 90 to ignore them.
         reach: Neighbours farther apart than this are not connected [scene units]; four spacings if None.
-
-    Raises:
-        ValueError: If a number is out of range.
     """
     check_positive("color", color)
     if not 0 < angle <= 90:
@@ -71,13 +65,11 @@ def alike(
 
 
 def _nearest(means: Tensor, seed: Sequence[float]) -> Tensor:
-    """The Gaussian next to a place."""
     place = torch.tensor(check_vector("seed", seed), dtype=torch.float64, device=means.device)
     return (means.double() - place).square().sum(-1).argmin()
 
 
 def _reach(means: Tensor, reach: float | None) -> float:
-    """A given reach, or the default one."""
     if reach is None:
         return REACH * max(particle_spacing(means), 1e-30)
     check_positive("reach", reach)

@@ -46,9 +46,6 @@ class DeformedGaussians:
         """The Gaussians in storage form, detached, with harmonics rotated with the patches.
 
         Those that have not moved keep the numbers of the splat.
-
-        Raises:
-            ValueError: If ``model`` is not known, or there are several scenes.
         """
         model = self._known()
         check_shape("means", self.means, None, 3, batches=False)
@@ -66,9 +63,6 @@ class DeformedGaussians:
 
         Args:
             moving: Which of the two.
-
-        Raises:
-            ValueError: If ``model`` is not known, or there are several scenes.
         """
         model = self._known()
         check_shape("means", self.means, None, 3, batches=False)

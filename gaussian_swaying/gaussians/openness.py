@@ -83,9 +83,6 @@ def openness(
 
     Returns:
         Weights from :data:`LEAST` to 1, shape (N,).
-
-    Raises:
-        ValueError: If a tensor does not have the shape above, or ``means``, ``normals`` or ``areas`` are not finite.
     """
     check_shape("means", means, None, 3)
     count = len(means)

@@ -74,9 +74,6 @@ def cloud_of(path: Path, **columns: np.ndarray) -> GaussianCloud:
     Args:
         path: The file, for messages.
         columns: The fields of :class:`GaussianCloud` but normals, with their shapes and units.
-
-    Raises:
-        ValueError: If a value is NaN or infinite, a centre is far away, a size zero or infinite, or a quaternion zero.
     """
     with np.errstate(over="ignore"):
         columns = {name: np.ascontiguousarray(value, dtype=np.float32) for name, value in columns.items()}

@@ -109,7 +109,6 @@ class Part:
 
     @property
     def has_joint(self) -> bool:
-        """True if it is attached by a joint."""
         return any(getattr(self, name) is not None for name in JOINT)
 
     @property
@@ -178,11 +177,7 @@ class Parts:
         return f"Parts({', '.join(f'{p.name} ({p.role}): {n:,}' for p, n in zip(self.parts, count, strict=True))})"
 
     def mask(self, name: str | None = None, role: str | None = None) -> Tensor:
-        """The Gaussians of a part, or of all parts of a role, bool, shape (N,).
-
-        Raises:
-            ValueError: If no part has that name.
-        """
+        """The Gaussians of a part, or of all parts of a role, bool, shape (N,)."""
         if name is not None and name not in [part.name for part in self.parts]:
             raise ValueError(
                 f"There is no part {name!r}: use one of {', '.join(repr(part.name) for part in self.parts)}."
@@ -191,7 +186,6 @@ class Parts:
         return torch.tensor(wanted)[self.labels]
 
     def digest(self) -> str:
-        """A checksum of labels, roles and materials."""
         content = self.labels.numpy().tobytes() + repr(self.parts).encode()
         return hashlib.sha256(content).hexdigest()
 
@@ -226,11 +220,7 @@ class Parts:
 
     @classmethod
     def load(cls, path: str | os.PathLike[str]) -> Parts:
-        """Read a file.
-
-        Raises:
-            ValueError: If it cannot be read, or its arrays do not fit together.
-        """
+        """Read a file."""
         arrays = read_arrays(path, "the parts", ("count", "labels", "names", "roles"), (*NUMBERS, *JOINT, "attached"))
         labels, names = arrays["labels"], arrays["names"]
         expected = {

@@ -41,13 +41,6 @@ def read_ply(path: str | os.PathLike[str], sh_degree: int | None = None) -> Gaus
 
     Returns:
         The Gaussians as float32 tensors on the CPU.
-
-    Raises:
-        FileNotFoundError: If there is no such file.
-        ValueError: If the file is not a usable 3DGS file; the message names the file, the field and the remedy.
-
-    Warns:
-        UserWarning: Once, naming the properties that were ignored.
     """
     path = Path(path)
     header = read_binary_header(path)

@@ -29,9 +29,6 @@ def select_simulated(
 
     Returns:
         Booleans, shape (N,).
-
-    Raises:
-        ValueError: If no Gaussian is selected, or an argument does not have the shape or range above.
     """
     check_shape("means", means, None, 3)
     check_shape("opacities", opacities, means.shape[0])

@@ -51,14 +51,6 @@ def read_sog(path: str | os.PathLike[str], level: int = 0) -> GaussianCloud:
 
     Returns:
         The Gaussians as float32 tensors on the CPU, without normals, in the axes of the file.
-
-    Raises:
-        FileNotFoundError: If a file does not exist.
-        ValueError: If a file is damaged, of version 1, announces more than it can hold, or holds unusable Gaussians.
-
-    Warns:
-        UserWarning: If the splat was trained with antialiasing, or a streamed scene has an environment, which is left
-            out.
     """
     path = check_regular(path, "the SOG file")
     meta = read_json(path, "SOG file") if path.suffix.lower() == ".json" else None
@@ -77,9 +69,6 @@ def encode_sog(cloud: GaussianCloud) -> bytes:
 
     Returns:
         The content of the file.
-
-    Raises:
-        ValueError: If there are more Gaussians than a WebP picture has pixels (268 million).
     """
     count = len(cloud)
     width = -(-int(np.ceil(np.sqrt(count))) // 4) * 4
@@ -142,7 +131,6 @@ _Read = Callable[[str], bytes]
 
 
 def _single(path: Path) -> GaussianCloud:
-    """The Gaussians of a bundle or of a meta.json with the pictures beside it."""
     if path.suffix.lower() == ".json":
         meta = read_json(path, "SOG file")
         return _decoded(path, meta, lambda name: check_regular(_inside(path, name), "the picture").read_bytes())
@@ -172,7 +160,6 @@ def _archive(path: Path) -> Iterator[zipfile.ZipFile]:
 
 
 def _inside(path: Path, name: Any) -> Path:
-    """The path of a file that another names, within the folder of that."""
     steps = PurePosixPath(name).parts if isinstance(name, str) else ()
     if not steps or ".." in steps or name.startswith("/") or "\\" in name or ":" in name:
         raise ValueError(f"{path} names the file {str(name)[:80]!r}; put all files into its folder.")
@@ -180,7 +167,6 @@ def _inside(path: Path, name: Any) -> Path:
 
 
 def _streamed(path: Path, meta: dict[str, Any], level: int) -> GaussianCloud:
-    """One level of a streamed scene, whose tree refers to ranges of Gaussians in files."""
     levels, names = meta["lodLevels"], meta.get("filenames")
     if type(levels) is not int or not isinstance(names, list):
         raise _broken(path, "`lodLevels` or `filenames` is not as it should be")
@@ -225,7 +211,6 @@ def _broken(path: Path, what: str) -> ValueError:
 
 
 def _decoded(path: Path, meta: Any, read: _Read) -> GaussianCloud:
-    """The Gaussians that a meta.json describes."""
     if not isinstance(meta, dict) or meta.get("version", 1) != 2:
         version = meta.get("version", 1) if isinstance(meta, dict) else "unknown"
         raise ValueError(f"{path} is SOG of version {str(version)[:20]}, not 2; convert it with splat-transform.")
@@ -285,7 +270,6 @@ def _part(path: Path, meta: dict[str, Any], name: str) -> dict[str, Any]:
 
 
 def _numbers(path: Path, entry: dict[str, Any], name: str, least: int, most: int) -> np.ndarray:
-    """A list of finite numbers."""
     values = entry.get(name)
     if isinstance(values, list) and least <= len(values) <= most and all(type(v) in (int, float) for v in values):
         array = np.array(values, dtype=np.float64)
@@ -295,7 +279,6 @@ def _numbers(path: Path, entry: dict[str, Any], name: str, least: int, most: int
 
 
 def _looked_up(path: Path, entry: dict[str, Any], name: str, which: np.ndarray) -> np.ndarray:
-    """The numbers of a code book."""
     book = _numbers(path, entry, "codebook", 1, 256)
     if int(which.max()) >= len(book):
         raise _broken(path, f"a pixel of `{name}` wants number {int(which.max())} of a code book of {len(book)}")

@@ -38,14 +38,6 @@ def read_spz(path: str | os.PathLike[str]) -> GaussianCloud:
 
     Returns:
         The Gaussians as float32 tensors on the CPU, without normals.
-
-    Raises:
-        FileNotFoundError: If there is no such file.
-        ValueError: If the file is truncated, announces more than it can hold, or holds unusable Gaussians.
-        ImportError: If it has version 4 and zstandard is not installed.
-
-    Warns:
-        UserWarning: If the splat was trained with antialiasing, or has harmonics of degree 4.
     """
     path = check_regular(path, "the .spz file")
     data = path.read_bytes()
@@ -89,10 +81,6 @@ def encode_spz(cloud: GaussianCloud, version: int = 3) -> bytes:
 
     Returns:
         The content of the file.
-
-    Raises:
-        ValueError: If the version is unknown, or a centre is beyond ±8e6 (±65504 in version 1).
-        ImportError: If the version is 4 and zstandard is not installed.
     """
     if version not in VERSIONS:
         raise ValueError(f"Expected `spz_version` to be 1, 2, 3 or 4, but got {version}.")
@@ -204,7 +192,6 @@ def _truncated(path: Path, needed: int, found: int) -> ValueError:
 
 
 def _zstandard(path: Path | None = None) -> Any:
-    """The module zstandard."""
     try:
         import zstandard
     except ImportError as error:

@@ -56,10 +56,6 @@ def subdivide(means: Tensor, quats: Tensor, log_scales: Tensor, opacity: Tensor,
 
     Returns:
         The pieces, the same on every device. Gaussians with at most a quarter of full opacity stay whole.
-
-    Raises:
-        ValueError: If ``spacing`` is not above zero, a tensor does not have the shape above, or there would be more
-            than 5 million candidate points, and more than nine for each large Gaussian.
     """
     check_positive("spacing", spacing)
     count = len(means)
@@ -137,9 +133,6 @@ def split_large(means: Tensor, quats: Tensor, log_scales: Tensor, opacity: Tenso
 
     Returns:
         All Gaussians. Those with at most a quarter of full opacity do not change, whatever their size.
-
-    Raises:
-        ValueError: As :func:`subdivide`.
     """
     check_positive("size", size)
     large = log_scales.exp().amax(-1) > size

@@ -20,9 +20,6 @@ def covariance(quats: Tensor, log_scales: Tensor) -> Tensor:
 
     Returns:
         Symmetric matrices [scene units^2], shape (..., 3, 3).
-
-    Raises:
-        ValueError: If a tensor does not have the shape above.
     """
     check_shape("log_scales", log_scales, 3)
     axes = quat_to_rotation(quats) * log_scales.exp()[..., None, :]
@@ -41,9 +38,6 @@ def covariance_to_quat_scale(covariances: Tensor) -> tuple[Tensor, Tensor]:
     Returns:
         Quaternions wxyz of unit length, shape (N, 4), and logarithm of the standard deviations [scene units],
         shape (N, 3).
-
-    Raises:
-        ValueError: If ``covariances`` has another shape.
     """
     check_shape("covariances", covariances, 3, 3)
     values, axes = torch.linalg.eigh(in_double(covariances))
@@ -64,9 +58,6 @@ def deform_covariance(deformation_gradient: Tensor, covariances: Tensor) -> Tens
 
     Returns:
         Shape (..., 3, 3).
-
-    Raises:
-        ValueError: If a tensor does not have the shape above.
     """
     check_shape("deformation_gradient", deformation_gradient, 3, 3)
     check_shape("covariances", covariances, 3, 3)
@@ -94,9 +85,6 @@ def limit_stretch(covariances: Tensor, rest: Tensor, max_stretch: float, shape: 
 
     Returns:
         Shape (..., 3, 3).
-
-    Raises:
-        ValueError: If a tensor does not have the shape above.
     """
     check_shape("covariances", covariances, 3, 3)
     check_shape("rest", rest, 3, 3)
@@ -135,9 +123,6 @@ def limit_deformed(
 
     Returns:
         Shape (N, 3, 3).
-
-    Raises:
-        ValueError: If a tensor does not have the shape above.
     """
     check_shape("deformation_gradient", deformation_gradient, "N", 3, 3)
     check_shape("covariances", covariances, len(deformation_gradient), 3, 3)

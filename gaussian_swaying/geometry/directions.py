@@ -46,9 +46,6 @@ def hull_area(points: Tensor) -> float:
 
     Returns:
         Area [scene units^2]; 0 for fewer than three points.
-
-    Raises:
-        ValueError: If ``points`` has another shape or is not finite.
     """
     check_shape("points", points, None, 3, batches=False)
     if not bool(torch.isfinite(points).all()):

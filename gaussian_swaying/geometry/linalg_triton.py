@@ -290,7 +290,6 @@ def polar_change(F, R, x):
 
 @triton.jit
 def _angle(app, aqq, apq):
-    """Tangent, cosine and sine of the rotation that annihilates an entry (``linalg._jacobi_angle``)."""
     gap = aqq - app
     twice = 2 * apq
     root = tl.maximum(tl.sqrt(gap * gap + twice * twice), tl.abs(twice)) + TINY
@@ -301,7 +300,6 @@ def _angle(app, aqq, apq):
 
 @triton.jit
 def _turn(c, s, a, b):
-    """Two vectors turned into each other."""
     return (
         (c * a[0] - s * b[0], c * a[1] - s * b[1], c * a[2] - s * b[2]),
         (s * a[0] + c * b[0], s * a[1] + c * b[1], s * a[2] + c * b[2]),
@@ -310,7 +308,6 @@ def _turn(c, s, a, b):
 
 @triton.jit
 def _one_sided(bp, bq, vp, vq):
-    """One Jacobi rotation of two columns of F V and of V."""
     _t, c, s = _angle(dot3(bp, bp), dot3(bq, bq), dot3(bp, bq))
     bp, bq = _turn(c, s, bp, bq)
     vp, vq = _turn(c, s, vp, vq)
@@ -393,7 +390,6 @@ def svd3(F):
 
 @triton.jit
 def _combine(v, c0, c1, c2):
-    """A combination of three vectors."""
     return (
         v[0] * c0[0] + v[1] * c1[0] + v[2] * c2[0],
         v[0] * c0[1] + v[1] * c1[1] + v[2] * c2[1],
@@ -403,7 +399,6 @@ def _combine(v, c0, c1, c2):
 
 @triton.jit
 def _reject(a, unit):
-    """Return the part of a vector perpendicular to a unit vector."""
     along = dot3(a, unit)
     return (a[0] - along * unit[0], a[1] - along * unit[1], a[2] - along * unit[2])
 

@@ -39,11 +39,6 @@ def read_mesh(path: str | os.PathLike[str]) -> tuple[Tensor, Tensor]:
 
     Returns:
         Vertices, shape (V, 3), float64, and triangles, shape (T, 3), int64.
-
-    Raises:
-        FileNotFoundError: If there is no such file.
-        ValueError: If the file is neither, is not a regular file, is larger than :data:`LARGEST_MESH`, is damaged, has
-            no faces, or has vertices on one line.
     """
     file = Path(path)
     readers = {".ply": _read_ply, ".obj": _read_obj}
@@ -108,11 +103,7 @@ def _read_obj(file: Path) -> tuple[Tensor, list[list[int]]]:
 
 
 def parse_obj(text: str) -> tuple[list[list[float]], list[list[int]]]:
-    """The numbers of each vertex of a Wavefront .obj, with its colour if it has one, and polygons as their indices.
-
-    Raises:
-        ValueError: If a line is damaged; the message gives its number.
-    """
+    """The numbers of each vertex of a Wavefront .obj, with its colour if it has one, and polygons as their indices."""
     vertices: list[list[float]] = []
     polygons: list[list[int]] = []
     for number, line in enumerate(text.splitlines(), start=1):
@@ -147,10 +138,6 @@ def mesh_distance(vertices: Tensor, faces: Tensor, cells: int = 48) -> DistanceG
 
     Returns:
         The distances, on a grid that reaches three cells beyond the mesh.
-
-    Raises:
-        ValueError: If the mesh has no extent, is not closed, encloses none of the nodes, has far too many
-            triangles, or the grid is too large.
     """
     check_shape("vertices", vertices, None, 3, batches=False)
     corners = vertices.detach().double().cpu()[faces.cpu()]  # (T, 3 corners, 3)

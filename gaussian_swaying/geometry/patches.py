@@ -23,9 +23,6 @@ def smallest_axis_normal(quats: Tensor, log_scales: Tensor) -> Tensor:
 
     Returns:
         Shape (..., 3).
-
-    Raises:
-        ValueError: If a tensor does not have the shape above.
     """
     check_shape("log_scales", log_scales, 3)
     rotation = quat_to_rotation(quats)
@@ -45,9 +42,6 @@ def deform_normal(deformation_gradient: Tensor, normals: Tensor) -> Tensor:
 
     Returns:
         Shape (..., 3).
-
-    Raises:
-        ValueError: If a tensor does not have the shape above.
     """
     cof, vector = _cofactor_times(deformation_gradient, normals)
     return _unit_normal(vector, determinant(deformation_gradient, cof), normals)
@@ -65,9 +59,6 @@ def deform_patch(deformation_gradient: Tensor, normals: Tensor, areas: Tensor) -
 
     Returns:
         Shapes (..., 3) and (...).
-
-    Raises:
-        ValueError: If a tensor does not have the shape above.
     """
     cof, vector = _cofactor_times(deformation_gradient, normals)
     normal = _unit_normal(vector, determinant(deformation_gradient, cof), normals)
@@ -113,9 +104,6 @@ def deform_all(
     Returns:
         :func:`deform_covariance` within the limit, :func:`deform_normal` and
         :func:`~gaussian_swaying.geometry.linalg.polar_rotation`, or None in its place.
-
-    Raises:
-        ValueError: If a tensor does not have the shape above.
     """
     check_shape("deformation_gradient", deformation_gradient, 3, 3)
     check_shape("covariances", covariances, 3, 3)

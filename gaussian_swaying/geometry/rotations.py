@@ -19,9 +19,6 @@ def quat_to_rotation(quats: Tensor) -> Tensor:
 
     Returns:
         Shape (..., 3, 3); columns are the axes of the Gaussian.
-
-    Raises:
-        ValueError: If ``quats`` has another shape.
     """
     check_shape("quats", quats, 4)
     w, x, y, z = torch.nn.functional.normalize(quats, dim=-1).unbind(-1)
@@ -41,9 +38,6 @@ def rotation_to_quat(rotation: Tensor) -> Tensor:
 
     Returns:
         Quaternions wxyz with w >= 0, shape (..., 4).
-
-    Raises:
-        ValueError: If ``rotation`` has another shape.
     """
     check_shape("rotation", rotation, 3, 3)
     (a, b, c), (d, e, f), (g, h, i) = (row.unbind(-1) for row in rotation.unbind(-2))
@@ -72,9 +66,6 @@ def quat_multiply(first: Tensor, second: Tensor) -> Tensor:
 
     Returns:
         Quaternions wxyz, not normalised, shape (..., 4).
-
-    Raises:
-        ValueError: If a tensor has another shape.
     """
     check_shape("first", first, 4)
     check_shape("second", second, 4)
@@ -125,9 +116,6 @@ def rotation_from_z(up: Sequence[float] | Tensor) -> Tensor:
 
     Returns:
         Rotation matrix in float64 on the CPU, shape (3, 3).
-
-    Raises:
-        ValueError: If ``up`` is zero or not finite.
     """
     return torch.tensor(rows_from_z(check_direction("up", up)), dtype=torch.float64)
 

@@ -32,9 +32,6 @@ def neighbour_normals(points: Tensor, normals: Tensor, weights: Tensor | None = 
         Unit normals on the sides of ``normals``, of shape and precision of ``normals``. A point without a plane (with
         fewer than three others, or all on a line) keeps its own. Computed in float64 on the CPU, so the result is the
         same on every device; not differentiable.
-
-    Raises:
-        ValueError: If a tensor does not have the shape above, ``points`` is not finite or ``neighbours`` is below 3.
     """
     check_shape("points", points, None, 3)
     count = len(points)

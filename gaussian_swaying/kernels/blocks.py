@@ -53,7 +53,6 @@ class Block:
 
     @property
     def lanes(self) -> int:
-        """Number of entries."""
         return math.prod(self.shape)
 
     @property
@@ -114,11 +113,9 @@ class Emitter:
 
     @staticmethod
     def type_of(kind: str, lanes: int) -> ir.Type:
-        """The LLVM type of a block."""
         return TYPES[kind] if lanes == 1 else ir.VectorType(TYPES[kind], lanes)
 
     def constant(self, number: complex, kind: str, shape: Shape = ()) -> Block:
-        """A block of one number."""
         plain: Any = float(cast(float, number)) if kind[0] == "f" else int(cast(float, number))
         return _constant(plain, math.copysign(1, plain), kind, shape)  # 0.0 and -0.0 are equal
 
@@ -140,7 +137,6 @@ class Emitter:
         return self.constant(value, kind)
 
     def convert(self, block: Block, kind: str) -> Block:
-        """The same numbers as another type."""
         old, b = block.kind, self.builder
         if old == kind:
             return block
@@ -212,7 +208,6 @@ class Emitter:
     # ---- operations
 
     def intrinsic(self, name: str, arguments: Sequence[Any], to: ir.Type, types: Sequence[ir.Type]) -> Any:
-        """Call an LLVM intrinsic."""
         suffix = "".join(f".{_suffix(kind)}" for kind in types)
         function = self.module.globals.get(name + suffix)
         if function is None:
@@ -261,7 +256,6 @@ class Emitter:
         return self._with_stride(made, sign, a, b) if sign in "+-*" and a.lanes > 1 else made
 
     def _with_stride(self, made: Block, sign: str, a: Block, b: Block) -> Block:
-        """Note by how much neighbouring lanes differ, if that is known."""
         if a.first is None or b.first is None:
             return made
         builder = self.builder
@@ -285,7 +279,6 @@ class Emitter:
         return Block(make(sign, a.value, b.value), "i1", a.shape)
 
     def where(self, condition: Value, x: Value, y: Value) -> Value:
-        """X where a condition is true, else y."""
         chosen = self.convert(self.block(condition), "i1")
         a, b = self.matched(x, y)
         shape = self.common_shape(chosen.shape, a.shape)
@@ -356,7 +349,6 @@ class Emitter:
         return self.builder.gep(base, [offset], source_etype=TYPES["i8" if kind == "i1" else kind])
 
     def _nothing(self, kind: str) -> Any:
-        """The address of a number that nobody reads."""
         if kind not in self._dummy:
             stored = TYPES["i8" if kind == "i1" else kind]
             self._dummy[kind] = self.entry.alloca(stored)
@@ -477,7 +469,6 @@ def _bytes(kind: str) -> int:
 
 
 def _suffix(kind: ir.Type) -> str:
-    """As LLVM names a type in the name of an intrinsic."""
     if isinstance(kind, ir.VectorType):
         return f"v{kind.count}{_suffix(kind.element)}"
     if isinstance(kind, ir.PointerType):

@@ -95,7 +95,6 @@ end:
 
 @cache
 def _llvm() -> Any:
-    """The LLVM binding with the code generator of this processor."""
     import llvmlite.binding as llvm
 
     llvm.initialize_native_target()
@@ -105,7 +104,6 @@ def _llvm() -> Any:
 
 @cache
 def _machine() -> Any:
-    """The code generator of this processor."""
     llvm = _llvm()
     return _machine_for(llvm.get_default_triple(), llvm.get_host_cpu_name(), _features())
 
@@ -148,7 +146,6 @@ def _compiled(text: str, machine: Any = None) -> bytes:
 
 
 def _linked(code: bytes, symbol: str) -> tuple[int, Any]:
-    """The address of a function of an object file, and what keeps it in memory."""
     llvm = _llvm()
     name = f"kernel{next(_NAMES)}"  # never one that was tried before
     library = llvm.JITLibraryBuilder().add_object_img(code).add_current_process().export_symbol(symbol)
@@ -255,7 +252,6 @@ class _Crew:
             self._done.release()
 
     def run(self, rows: Any, launches: int) -> None:
-        """Run the launches of a table."""
         for k in range(launches):
             rows[_ROW * k + 3] = 1 if self.threads == 1 else min(rows[_ROW * k + 2], _SHARES * self.threads)
             rows[_ROW * k + 4] = rows[_ROW * k + 5] = 0
@@ -273,7 +269,6 @@ _SHARES = 4
 
 @cache
 def _pause() -> int:
-    """The address of the function that lets other threads run."""
     if os.name == "nt":
         return ctypes.cast(ctypes.windll.kernel32.SwitchToThread, ctypes.c_void_p).value or 0  # type: ignore[attr-defined]
     return ctypes.cast(ctypes.CDLL(None).sched_yield, ctypes.c_void_p).value or 0
@@ -309,18 +304,15 @@ class Recording:
         self._rows: dict[int, Any] = {}
 
     def add(self, address: int, arguments: Any, programs: int, tensors: Sequence[Tensor]) -> None:
-        """Append a launch."""
         if not self._parts or not isinstance(self._parts[-1], list):
             self._parts.append([])
         self._parts[-1].append((address, arguments, programs))  # type: ignore[union-attr]
         self._held.append((arguments, tensors))
 
     def call(self, change: Callable[[], object]) -> None:
-        """Append a function."""
         self._parts.append(change)
 
     def replay(self) -> None:
-        """Run everything in order."""
         for k, part in enumerate(self._parts):
             if not isinstance(part, list):
                 part()
@@ -332,7 +324,6 @@ class Recording:
             _run_rows(self._rows[k], len(part))
 
     def reset(self) -> None:
-        """Give up the tensors."""
         self._parts, self._held, self._rows = [], [], {}
 
 

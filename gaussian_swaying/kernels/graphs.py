@@ -90,9 +90,6 @@ def record(
 
     Returns:
         The graph; ``replay()`` runs it.
-
-    Raises:
-        RuntimeError: If the function does something that cannot be recorded.
     """
     graph, stream = torch.cuda.CUDAGraph(), torch.cuda.Stream(device) if stream is None else stream
     stream.wait_stream(torch.cuda.current_stream(device))
@@ -138,7 +135,6 @@ class Replayed:
 
     @property
     def recorded(self) -> bool:
-        """True if a graph has been recorded."""
         return self._graph is not None
 
     def __call__(
@@ -150,9 +146,6 @@ class Replayed:
             key: Identifies all else that the function depends on, besides its inputs.
             function: Takes the inputs and returns tensors; it must not make the host wait.
             inputs: All on one device; if that is no GPU, nothing is recorded.
-
-        Raises:
-            RuntimeError: If it cannot be recorded.
         """
         if not inputs[0].is_cuda or torch.is_grad_enabled():
             return list(function(*inputs))
@@ -208,10 +201,6 @@ class Repeater:
             recordable: Whether it may be recorded.
             launches: Whether it consists of launches of kernels, and of calls by ``kernels.launch.call``; only then is
                 it recorded on a CPU.
-
-        Raises:
-            RuntimeError: If it was declared recordable but is not.
-            torch.OutOfMemoryError: If there is no memory left to record it.
         """
         if times == 0:  # nothing runs, so nothing is compiled
             return

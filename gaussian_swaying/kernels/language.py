@@ -97,7 +97,6 @@ class Compiler:
 
     @staticmethod
     def jit(fn: Callable[..., Any] | None = None, **_: Any) -> Any:
-        """Declare a kernel or a device function."""
         return Function if fn is None else Function(fn)
 
     @staticmethod

@@ -36,14 +36,10 @@ _PYTHON = {"len": len, "float": float, "int": int, "min": min, "max": max, "bool
 
 @dataclass
 class _Returned:
-    """The value that a function returns."""
-
     value: Value
 
 
 class _Loop:
-    """A ``range`` of a loop that is not unrolled."""
-
     def __init__(self, start: Value, end: Value, step: Value) -> None:
         self.start, self.end, self.step = start, end, step
 
@@ -62,9 +58,6 @@ def translate(kernel: Any, constants: dict[str, Any], arguments: dict[str, str],
         constants: Its constant arguments.
         arguments: The kinds of the others, in order: ``i`` and ``f`` for a number, ``*`` and a type for a pointer.
         real: Type of floating point numbers: f32 or f64.
-
-    Raises:
-        TranslationError: If the kernel uses something that the translator does not know, with its line.
     """
     return _Translator(real).kernel(kernel, constants, arguments)
 
@@ -134,7 +127,6 @@ class _Translator(Emitter):
         return [b.srem(program, x.value), b.srem(rest, y.value), b.sdiv(rest, y.value)]
 
     def _next(self, place: list[Any]) -> list[Any]:
-        """The three numbers of the next program."""
         b, one, zero = self.builder, TYPES["i64"](1), TYPES["i64"](0)
         full, following = None, []
         for number, count in zip(place, self._grid, strict=True):
@@ -407,7 +399,6 @@ class _Translator(Emitter):
         return self._made(kind, iter(made))
 
     def _places(self, kind: Any) -> list[Any]:
-        """Memory for a value of a type."""
         if isinstance(kind, tuple):
             return [place for part in kind for place in self._places(part)]
         if isinstance(kind, _Address):
@@ -701,20 +692,17 @@ def _lanes(shape: tuple[int, ...]) -> int:
 
 
 def _all(propagate: Value) -> bool:
-    """True if NaN is passed on."""
     name = propagate.name if isinstance(propagate, Name) else str(propagate)
     return name.endswith("ALL")
 
 
 def _plain(value: Any) -> Any:
-    """A constant of the language as what it stands for."""
     while type(value).__name__ in ("Constant", "constexpr") and hasattr(value, "value"):
         value = value.value
     return value
 
 
 def _assigned(body: list[ast.stmt]) -> set[str]:
-    """The names that statements assign."""
     found = set()
     for statement in body:
         for node in ast.walk(statement):
@@ -725,7 +713,6 @@ def _assigned(body: list[ast.stmt]) -> set[str]:
 
 @lru_cache(maxsize=1024)
 def _source(function: Any) -> tuple[ast.FunctionDef, list[str], dict[str, Any], set[str]]:
-    """The tree of a function, its arguments, their defaults, and which are constants."""
     lines, first = inspect.getsourcelines(function.fn)
     source = ast.parse(textwrap.dedent("".join(lines)))
     tree = next(node for node in ast.increment_lineno(source, first - 1).body if isinstance(node, ast.FunctionDef))

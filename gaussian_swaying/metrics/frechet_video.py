@@ -77,9 +77,6 @@ def cut_clips(video: Tensor, length: int, stride: int) -> Tensor:
 
     Returns:
         A view of the video, shape (clips, length, 3, H, W).
-
-    Raises:
-        ValueError: If the video is shorter than a clip.
     """
     if len(video) < length:
         raise ValueError(
@@ -175,10 +172,6 @@ class FrechetVideoDistance(Metric):
         Args:
             video: Frames with values in ``value_range``, shape (T, 3, H, W) or (B, T, 3, H, W).
             real: Whether these videos are the reference.
-
-        Raises:
-            ValueError: If the shape or a value is wrong, a video is shorter than a clip, or the network does not return
-                features (clips, D).
         """
         check_shape("video", video, "T", 3, "H", "W")
         if video.dim() > 5:
@@ -211,11 +204,7 @@ class FrechetVideoDistance(Metric):
         return features.double()
 
     def compute(self) -> Tensor:
-        """The distance, float64.
-
-        Raises:
-            ValueError: If there are fewer than two real or two generated clips.
-        """
+        """The distance, float64."""
         moments = []
         for name, features in (("real", _joined(self.real_features)), ("generated", _joined(self.fake_features))):
             if len(features) < 2:
@@ -243,7 +232,6 @@ class FrechetVideoDistance(Metric):
         }
 
     def describe(self) -> str:
-        """The number and its protocol in one line."""
         parts = ", ".join(f"{name} {value}" for name, value in self.protocol().items())
         return f"FVD {float(self.compute()):.5g} ({parts})"
 

@@ -27,9 +27,6 @@ def nearest_distances(source: Tensor, target: Tensor, pairs: int | None = None) 
 
     Returns:
         Distances from ``source`` to ``target`` [m], shape (P,), and from ``target`` to ``source`` [m], shape (Q,).
-
-    Raises:
-        ValueError: If a set is empty, the shapes do not fit, or ``pairs`` is not positive.
     """
     if pairs is None:
         pairs = _PAIRS_CUDA if source.is_cuda else _PAIRS
@@ -45,7 +42,6 @@ def nearest_distances(source: Tensor, target: Tensor, pairs: int | None = None) 
 
 
 def _by_chunks(source: Tensor, target: Tensor, pairs: int) -> tuple[Tensor, Tensor]:
-    """Distances from all pairs, ``pairs`` at a time."""
     forward = source.new_empty(len(source))
     backward = target.new_full((len(target),), torch.inf)
     rows = max(1, int(pairs) // len(target))

@@ -32,9 +32,6 @@ def ssim_map(image: Tensor, target: Tensor, padding: str = "valid") -> Tensor:
 
     Returns:
         Similarity up to 1, shape (..., H - 10, W - 10, C) with ``valid``, else that of the pictures.
-
-    Raises:
-        ValueError: If the shapes differ, the picture is smaller than the window, or ``padding`` is none of these.
     """
     check_choice("padding", padding, PADDINGS)
     check_pictures(image, target)

@@ -39,7 +39,6 @@ class LawDispatch:
 
     @property
     def plastic_names(self) -> list[str]:
-        """Names of the laws with a return map."""
         return [type(law).__name__ for law, _ in self._groups if law.plastic]
 
     def initial_internal(self) -> Tensor | None:

@@ -132,12 +132,10 @@ class PointFollowers(Followers):
         return self.rest[self.source]
 
     def some(self, index: Tensor) -> PointFollowers:
-        """Some of them."""
         arm = None if self.arm is None else self.arm[index]
         return PointFollowers(self.source[index], arm, self.rest, self._attached)
 
     def table(self, grid: GridSpec) -> Tensor | None:
-        """See :meth:`Followers.table`."""
         virtual = virtual_nodes(first_nodes(self.rest, grid), grid, self._attached if grid.virtual else None)
         return None if virtual is None else virtual.node[:, self.source]
 
@@ -174,12 +172,10 @@ class GridFollowers(Followers):
         return self.place
 
     def some(self, index: Tensor) -> GridFollowers:
-        """Some of them."""
         nodes = None if self.own_nodes is None else self.own_nodes[:, index]
         return GridFollowers(self.place[index], None if self.arm is None else self.arm[index], nodes)
 
     def table(self, grid: GridSpec) -> Tensor | None:
-        """See :meth:`Followers.table`."""
         return self.own_nodes
 
     def stencil(self, grid: GridSpec) -> Stencil:
@@ -192,7 +188,6 @@ class GridFollowers(Followers):
         return known[2]
 
     def layout(self, state: MPMState) -> object:
-        """The grid."""
         return state.grid
 
     def _read(self, state: MPMState) -> tuple[Tensor, Tensor]:

@@ -104,7 +104,6 @@ class FunctionForce(Force):
         self.function = function
 
     def forward(self, state: State) -> Given:
-        """The result of the function."""
         return self.function(state)
 
 
@@ -113,11 +112,7 @@ Forces = Force | ForceFunction | Sequence[Force | ForceFunction]
 
 
 def as_forces(forces: Forces | None) -> tuple[Force, ...]:
-    """One force, several or none as a tuple.
-
-    Raises:
-        TypeError: If one of them is neither a Force nor a function.
-    """
+    """One force, several or none as a tuple."""
     if forces is None:
         return ()
     several = list(forces) if isinstance(forces, Sequence) else [forces]
@@ -131,12 +126,7 @@ def as_forces(forces: Forces | None) -> tuple[Force, ...]:
 
 
 def split(found: Given, force: Force, state: State) -> tuple[Tensor, Tensor | None]:
-    """Split the result of a force into the force and its resistance or None, in the dtype of the state.
-
-    Raises:
-        TypeError: If it returned no tensor, or one of complex numbers.
-        ValueError: If its shape or its device is wrong.
-    """
+    """Split the result of a force into the force and its resistance or None, in the dtype of the state."""
     value, drag = found if isinstance(found, tuple) else (found, None)
     name, like = type(force).__name__, state.position
     check_shape(f"force of {name}", value, like.shape[-2], 3)
@@ -147,7 +137,6 @@ def split(found: Given, force: Force, state: State) -> tuple[Tensor, Tensor | No
 
 
 def _converted(name: str, value: Tensor, like: Tensor) -> Tensor:
-    """Real numbers in the dtype of the state."""
     value = value if value.is_complex() else value.to(like.dtype)
     check_like(name, value, like)
     return value

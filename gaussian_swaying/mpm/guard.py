@@ -31,11 +31,6 @@ def check_begin(bound: Formulation, state: MPMState, dt: float, steps: int, limi
 
     Returns:
         The number of substeps as an integer of Python.
-
-    Raises:
-        TypeError: If the state is not an MPMState, ``dt`` is not a number or ``steps`` not a whole one.
-        ValueError: If ``dt`` is not positive, or so long that nothing is stable; if ``steps`` is negative; if the state
-            is not of this body.
     """
     check_state(bound, state)
     if isinstance(dt, bool) or not isinstance(dt, Real):
@@ -120,11 +115,6 @@ def check_end(
         forces: The forces that acted; called once more, for the first substep, if something is NaN.
         force: The force that was given to ``MPMSolver.step`` [N], shape (..., P, 3), or None.
         drag: Its resistance [kg/s], shape (..., P), or None.
-
-    Raises:
-        ValueError: If a value that was given is NaN or infinite, a particle left the grid, or an obstacle jumped over
-            nodes.
-        FloatingPointError: If a particle became NaN or infinite.
     """
     check_pace(dt, bound.obstacle_cells(before, steps * dt), "dt")
     fields = {"position": after.position, "velocity": after.velocity, "deformation": after.F_elastic.flatten(-2)}
@@ -157,7 +147,6 @@ def check_end(
 
 
 def _loads(forces: Sequence[Force], state: MPMState, dt: float, steps: int) -> list[tuple[str, Tensor | None]]:
-    """Forces and resistances of the first substep, and their names."""
     found: list[tuple[str, Tensor | None]] = []
     for force in forces:
         name = getattr(getattr(force, "function", None), "__name__", type(force).__name__)
@@ -167,5 +156,4 @@ def _loads(forces: Sequence[Force], state: MPMState, dt: float, steps: int) -> l
 
 
 def _first(bad: Tensor) -> int:
-    """Index of the first particle with a true value, in (..., P, n)."""
     return int(bad.flatten(0, -2).any(-1).int().argmax())

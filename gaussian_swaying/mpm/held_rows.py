@@ -66,7 +66,6 @@ class Rows:
     release: Tensor
 
     def select(self, index: Tensor) -> Rows:
-        """Some of the rows."""
         return Rows(*(getattr(self, f.name)[index] for f in fields(self)))
 
     @staticmethod

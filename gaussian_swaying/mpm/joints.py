@@ -155,7 +155,6 @@ class Joints(Force):
         return self._of(state.position, state.F_total)
 
     def _of(self, position: Tensor, F: Tensor) -> Tensor:
-        """The forces in one scene."""
         moved, joints = position[self.index], len(self.stiffness)
         centre = self._mean(moved, self.mass, self.whole, self.of)
         arm = moved - centre[self.of]

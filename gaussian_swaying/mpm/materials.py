@@ -111,11 +111,7 @@ MATERIALS: dict[str, KnownMaterial] = {
 
 
 def known_material(name: str, field: str = "material") -> KnownMaterial:
-    """The material of a name.
-
-    Raises:
-        ValueError: If there is none; the message lists the names. ``field`` is the option that it names.
-    """
+    """The material of a name."""
     check_choice(field, name, tuple(MATERIALS))
     return MATERIALS[name]
 

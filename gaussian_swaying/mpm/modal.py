@@ -305,9 +305,6 @@ class Structure:
         Args:
             most: Largest number of modes.
             guess: Square of the first circular frequency, if it is roughly known [1/s²]; it saves time.
-
-        Raises:
-            ValueError: If nothing holds the body, most of it hangs loose, or it is too large.
         """
         S = self.spread
         if S.shape[1] > MOST_UNKNOWNS:

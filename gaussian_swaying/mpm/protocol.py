@@ -149,7 +149,6 @@ class Solver(nn.Module, ABC):
         return state.position.amin(0).tolist(), state.position.amax(0).tolist()
 
     def describe(self, state: Any) -> dict[str, Any]:
-        """Entries for the summary of a run."""
         return {"formulation": self.formulation}
 
     # ---- time
@@ -165,9 +164,6 @@ class Solver(nn.Module, ABC):
             state: The state now.
             frame_dt: Length of the frame [s].
             cells: The result of :meth:`cells_per_second`, if it is known.
-
-        Raises:
-            ValueError: If the fixed substep is longer than the stable one.
         """
         if self.substep is not None:
             return fixed_substeps(frame_dt, self.substep, self.stable_substep(state), self.dx)

@@ -247,7 +247,6 @@ class MPMSolver(Solver):
         return [b for b in self.boundaries if isinstance(b, Boundary)]
 
     def _bind(self, points: MaterialPoints, surface: Surface | None) -> None:
-        """Bind the material and compute everything that stays constant."""
         self._bound = self._fused = None
         body = Body(points, self._framed or self._conditions(), surface)
         if self.automatic:
@@ -257,7 +256,6 @@ class MPMSolver(Solver):
         self._bound = bound
 
     def _choice(self, body: Body) -> tuple[Literal["total", "updated", "modes"], str]:
-        """The formulation for a body, and why."""
         if body.laws.plastic:
             return "updated", f"the law {body.laws.plastic_names[0]} flows"
         why = self._too_far or why_not_modes(body)
@@ -489,7 +487,6 @@ class MPMSolver(Solver):
         return end
 
     def _step(self, state: MPMState, dt: float, force: Tensor | None, drag: Tensor | None) -> MPMState:
-        """One substep with a given force and drag."""
         fused = self.fused(*state.tensors(), force, drag)
         if fused is not None:
             return fused.rollout(state, dt, 1, force=force, drag=drag)[0]

@@ -44,7 +44,6 @@ class GridSpec:
 
     @property
     def node_count(self) -> int:
-        """Number of nodes G of one scene."""
         return self.lattice_count + self.virtual
 
     def holds(self, other: GridSpec) -> bool:
@@ -317,7 +316,6 @@ def _optional(parts: Sequence[MaterialPoints]) -> dict[str, list[Tensor]]:
 
 
 def _join_attached(parts: Sequence[MaterialPoints]) -> Tensor | None:
-    """``attached`` of several bodies as one."""
     if all(part.attached is None for part in parts):
         return None
     if any(part.attached is not None and part.attached.dim() == 2 for part in parts):
@@ -366,11 +364,9 @@ class State:
     air: Tensor | None = None
 
     def replace(self, **changes: Any) -> Self:
-        """A copy with some fields changed."""
         return dataclasses.replace(self, **changes)
 
     def fields(self) -> dict[str, Any]:
-        """The fields by name."""
         return {f.name: getattr(self, f.name) for f in dataclasses.fields(self)}
 
     def scene(self, index: int) -> Self:

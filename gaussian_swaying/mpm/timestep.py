@@ -101,9 +101,6 @@ def substeps_per_frame(frame_dt: float, substep: float, *, exact: bool) -> int:
 
     Returns:
         At least 1.
-
-    Raises:
-        ValueError: If there are more than can be counted.
     """
     ratio = frame_dt / substep if substep > 0 else math.inf
     if not ratio < 2**53:
@@ -122,9 +119,6 @@ def fixed_substeps(frame_dt: float, substep: float, limit: float, dx: float) -> 
         substep: The fixed substep [s].
         limit: The stable one [s].
         dx: Grid spacing [m], for the message.
-
-    Raises:
-        ValueError: If it is longer than the stable one; the message gives the limit.
     """
     if substep > limit * (1 + 1e-6):
         raise ValueError(

@@ -114,9 +114,6 @@ def bspline_stencil(
     Returns:
         The support of each particle.
 
-    Raises:
-        ValueError: If ``position`` does not have the shape above.
-
     Example:
         >>> stencil = bspline_stencil(torch.full((1, 3), 0.5), GridSpec(0.1, (0, 0, 0), (10, 10, 10)))
         >>> bool(stencil.inside.all()), stencil.basis.shape
@@ -183,7 +180,6 @@ def _sparse_products(factors: Tensor) -> bool:
 
 
 def _matrices(stencil: Stencil) -> tuple[Tensor, Tensor]:
-    """See ``Stencil.matrices``."""
     rows, nodes = stencil.rows, math.prod(stencil.batch) * stencil.node_count
     basis = stencil.basis.mT.reshape(-1, rows)  # one row per entry of ``node``
     ranked, order = torch.sort(stencil.node, stable=True)
@@ -315,8 +311,6 @@ def _products(a: Sequence[Tensor] | Tensor, b: Sequence[Tensor] | Tensor) -> Ten
 
 
 class _Product(torch.autograd.Function):
-    """Product of a constant sparse matrix, whose transpose is given, with a dense one."""
-
     @staticmethod
     def forward(ctx: Any, matrix: Tensor, transpose: Tensor, dense: Tensor) -> Tensor:
         ctx.pair = (transpose, matrix)
@@ -351,9 +345,6 @@ def scatter_momentum(
 
     Returns:
         Momentum [kg m/s] in columns 0 to 2 and mass [kg] in column 3, shape (..., G, 4).
-
-    Raises:
-        ValueError: If a particle tensor does not have the shape above.
     """
     count = mass.shape[-1]
     check_shape("velocity", velocity, count, 3)

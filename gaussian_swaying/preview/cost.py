@@ -96,10 +96,6 @@ def estimate_cost(
 
     Returns:
         The estimate.
-
-    Raises:
-        ValueError: If the run cannot start, because a pin holds nothing, the grid is too large or a fixed substep is
-            too long.
     """
     solver = simulation.solver
     state = simulation.start()
@@ -260,9 +256,6 @@ def finest_within(
         draft: The same scene on another grid; its frames and pictures do not count.
         finest: Smallest grid spacing [m].
         coarsest: Largest grid spacing [m].
-
-    Raises:
-        ValueError: If the run cannot start on a grid that is coarser than the first; finer ones are passed over.
     """
     tried = {first.dx: first}
     for _ in range(3):
@@ -308,7 +301,6 @@ def _apart(dx: float, from_dx: float) -> float:
 
 
 def _rounded_up(value: float) -> float:
-    """A number rounded up to two digits."""
     unit = 10.0 ** (math.floor(math.log10(value)) - 1)
     return float(f"{math.ceil(value / unit - 1e-6) * unit:.2g}")
 
@@ -351,7 +343,6 @@ class Stopwatch:
 
     @property
     def wall(self) -> float:
-        """Wall-clock time."""
         return time.perf_counter() - compiled()[1] - self._wall
 
     @property

@@ -249,7 +249,6 @@ def _pole_side(points: Tensor, up: Tensor, normal: Sequence[float]) -> tuple[tup
 
 
 def _option(end: str, sideways: Sequence[float]) -> str:
-    """The value of ``--hold`` for an end."""
     if end != "side" or not sideways:
         return end
     return max(DIRECTIONS, key=lambda name: sum(a * b for a, b in zip(DIRECTIONS[name], sideways, strict=True)))

@@ -61,7 +61,6 @@ class FoundParts:
         return self.parts.mask(NAMES[AROUND]) if there else torch.zeros(len(self.parts), dtype=torch.bool)
 
     def words(self) -> str:
-        """Names, roles and numbers of Gaussians, in words."""
         count = torch.bincount(self.parts.labels, minlength=len(self.parts.parts)).tolist()
         named = zip(self.parts.parts, count, strict=True)
         return ", ".join(f"{part.name} {part.role} ({number:,} Gaussians)" for part, number in named)

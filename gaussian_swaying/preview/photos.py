@@ -113,9 +113,6 @@ def captured_from(path: str | Path) -> CapturedFrom:
 
     Returns:
         The cameras, and what follows from them.
-
-    Raises:
-        ValueError: If there are no cameras, or a file is bad.
     """
     cameras = [camera for _, camera in read_views(path)]
     up, confidence, reason = cameras_up(cameras)
@@ -175,11 +172,7 @@ def seen_share(points: Tensor, cameras: Sequence[Camera]) -> Tensor:
 
 
 def looked_at(points: Tensor, view: CapturedFrom) -> Tensor:
-    """Points that are in at least 60 % of the photos and within reach of their common point, shape (N,).
-
-    Raises:
-        ValueError: If the cameras do not look at a common point, or at hardly any Gaussian.
-    """
+    """Points that are in at least 60 % of the photos and within reach of their common point, shape (N,)."""
     if view.focus is None:
         raise ValueError(
             f"The cameras of {view.path} do not look at a common point, so the object is not known: set `--region`."
@@ -276,9 +269,6 @@ def shown_object(points: Tensor, opacity: Tensor, weight: Tensor, view: Captured
         opacity: Opacities, shape (N,).
         weight: Visible area, shape (N,).
         view: The cameras of the photos.
-
-    Raises:
-        ValueError: If the cameras do not look at a common point, or at hardly any Gaussian.
     """
     mask = looked_at(points, view)
     assert view.focus is not None

@@ -78,9 +78,6 @@ def preview_picture(
 
     Returns:
         8-bit RGB, shape (H, W, 3).
-
-    Raises:
-        ValueError: If a boundary condition holds nothing.
     """
     from PIL import Image, ImageDraw, ImageFont
 
@@ -175,7 +172,6 @@ def _whole(simulation: Simulation, parts: Roles) -> tuple[list[float], list[floa
 
 
 def _view(simulation: Simulation, parts: Roles, camera: Camera, normals: int, title: str, tints: Sequence[Tint]) -> Any:
-    """One view with annotations, as a PIL image."""
     from PIL import Image, ImageDraw, ImageFont
 
     scene = simulation.scene
@@ -210,7 +206,6 @@ def _view(simulation: Simulation, parts: Roles, camera: Camera, normals: int, ti
 
 
 def _soft(simulation: Simulation) -> list[Tint]:
-    """Names, Gaussians and colours of the soft parts, if there are several."""
     parts = simulation.scene.parts
     soft = [] if parts is None else [part.name for part in parts.parts if part.role == "soft"]
     if parts is None or len(soft) < 2:
@@ -238,7 +233,6 @@ def _pieces(simulation: Simulation) -> tuple[list[Tint], float]:
 
 
 def _tinted(colours: Tensor, parts: Roles, soft: Sequence[Tint] = ()) -> Tensor:
-    """Colours with soft parts, pinned and pushed Gaussians tinted and static ones grey and pale."""
     for _, mask, tint in soft:
         colours = torch.where(mask.to(colours.device)[:, None], tinted(colours, tint, 0.4), colours)
     still = (~(parts.simulated | parts.carried)).to(colours.device)
@@ -277,7 +271,6 @@ def _draw_arrow(
 
 
 def _draw_normals(draw: ImageDraw, scene: Any, parts: Roles, camera: Camera, count: int) -> None:
-    """Normals of an even sample of simulated patches, flipped to the eye."""
     index = parts.simulated.nonzero()[:, 0]
     # the largest visible patch of each cell of a coarse lattice over the picture, so that they are spread
     means = scene.model.means.detach().cpu()[index].double()
@@ -309,7 +302,6 @@ def _draw_normals(draw: ImageDraw, scene: Any, parts: Roles, camera: Camera, cou
 
 
 def _draw_wind(draw: ImageDraw, simulation: Simulation, camera: Camera) -> None:
-    """Arrows of the steady flow that end at the upwind side of the object's box."""
     scene, frame = simulation.scene, simulation.scene.frame
     flow = mean_flow(simulation)
     speed = float(flow.norm())
@@ -358,7 +350,6 @@ def _draw_up(draw: ImageDraw, font: Any, base: Tensor, up: Tensor, camera: Camer
 
 
 def _entries(parts: Roles, simulation: Simulation) -> list[tuple[tuple[int, ...], str]]:
-    """The colours of the views, and their meaning."""
     flow = mean_flow(simulation).tolist()
     entries: list[tuple[tuple[int, ...], str]] = [
         (REGION, f"box of the {int(parts.simulated.sum()):,} simulated Gaussians [scene units]"),
@@ -380,7 +371,6 @@ def _legend(
     top: int,
     width: int,
 ) -> None:
-    """The meaning of the colours, below the views."""
     for k, (colour, text) in enumerate(entries):
         x, y = 14 + (k % 2) * (width // 2), top + 12 + 24 * (k // 2)
         draw.rectangle([x, y + 2, x + 16, y + 14], fill=colour)

@@ -117,9 +117,6 @@ def survey(
 
     Returns:
         The parts, or None if it has no ground, or a single thing on it and no background: then it is an object.
-
-    Raises:
-        ValueError: If ``up`` is no direction.
     """
     means, opacity, weight = cloud.means, cloud.opacities.sigmoid(), visible_weight(cloud)
     step = max(1, len(cloud) // SAMPLE)
@@ -180,9 +177,6 @@ def excerpt(place: Place, cloud: GaussianCloud, chosen: Sequence[int]) -> tuple[
 
     Returns:
         The Gaussians at most one longest side away, and the guesses for them.
-
-    Raises:
-        ValueError: If there is no such thing.
     """
     mine, around = _members(place, cloud, chosen), near_things(place, cloud, chosen)
     part = torch.full((len(cloud),), -1)

@@ -164,7 +164,6 @@ def cost_lines(cost: Cost) -> list[str]:
 
 
 def _stable(cost: Cost) -> str:
-    """The limit of a substep, in words."""
     if math.isinf(cost.stable_substep):
         return "modes, which are stable with any"
     return f"stable up to {cost.stable_substep:.3g} s; waves of {cost.wave_speed:.3g} m/s"
@@ -220,7 +219,6 @@ def _numbers(values: Sequence[float]) -> str:
 
 
 def _kind(guess: Suggestion) -> str:
-    """Its kind, and how it sways."""
     words = f"{guess.kind} ({KINDS[guess.kind].words}): {guess.kind_reason}"
     n = guess.natural
     if n is None:
@@ -338,7 +336,6 @@ def suggestion_dict(guess: Suggestion) -> dict[str, Any]:
 
 
 def _natural_dict(found: Natural) -> dict[str, float]:
-    """Frequency, mass and lean of its kind."""
     return {
         "frequency_Hz": found.frequency,
         "length_m": found.height,
@@ -349,7 +346,6 @@ def _natural_dict(found: Natural) -> dict[str, float]:
 
 
 def _parts_dict(parts: FoundParts) -> dict[str, Any]:
-    """Parts as plain numbers."""
     of_part = {
         part.name: {"role": part.role, "gaussians": int(parts.parts.mask(part.name).sum())}
         for part in parts.parts.parts

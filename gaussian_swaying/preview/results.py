@@ -84,7 +84,6 @@ def keep_aside(path: Path, text: str) -> None:
 
 
 def _same(path: Path, parts: Parts) -> bool:
-    """Return whether a file has these parts."""
     try:
         return Parts.load(path).digest() == parts.digest()
     except ValueError:

@@ -69,11 +69,7 @@ material:                       # {s.material}; {kind.words}: {s.kind_reason}
 
 
 def region_dict(region: Region) -> dict[str, Any]:
-    """A region as ``class_path`` and ``init_args``, open sides as None.
-
-    Raises:
-        TypeError: If it is not a Box, Cylinder, Not or Union.
-    """
+    """A region as ``class_path`` and ``init_args``, open sides as None."""
     arguments: dict[str, Any]
     if isinstance(region, Box):
         corners = {"min": region.min, "max": region.max}
@@ -177,7 +173,6 @@ recorder:
 
 
 def _wind_words(s: Suggestion) -> str:
-    """Its wind, and why."""
     look, speed = LOOKS[s.look], math.hypot(*s.flow)
     other = f", at {speed:.3g} m/s as it was asked for" if abs(speed - look.speed) > 0.01 else ""
     return (
@@ -187,7 +182,6 @@ def _wind_words(s: Suggestion) -> str:
 
 
 def _sway_words(s: Suggestion) -> str:
-    """Its kind, and how it will sway."""
     kind = KINDS[s.kind]
     if s.real or s.natural is None:
         return f"It is taken for {kind.words}: {s.kind_reason}."
@@ -236,7 +230,6 @@ def _kind(s: Suggestion) -> str:
 
 
 def _parts(s: Suggestion) -> str:
-    """The line that names the file of the parts, if there are any."""
     if s.parts is None:
         return ""
     path = json.dumps(s.parts.path, ensure_ascii=False)
@@ -244,7 +237,6 @@ def _parts(s: Suggestion) -> str:
 
 
 def _connected(s: Suggestion) -> str:
-    """The line of ``scene.connected``, if it is not the default."""
     return "" if s.connected == "grid" else f"  connected: {s.connected:<19}# leaves closer than a cell move apart\n"
 
 

@@ -215,7 +215,6 @@ class Suggestion:
 
     @property
     def fixed(self) -> bool:
-        """True if something holds the object."""
         return self.pin is not None or self.parts is not None
 
 
@@ -250,9 +249,6 @@ def suggest(
 
     Returns:
         The suggestion.
-
-    Raises:
-        ValueError: If the splat has too few Gaussians, or an argument does not fit the splat.
     """
     if longest_side is not None:
         check_positive("--longest-side", longest_side)
@@ -404,11 +400,7 @@ def suggest(
 
 
 def of_material(suggestion: Suggestion, name: str) -> Suggestion:
-    """The suggestion with the numbers of a known material, in place of those of its kind.
-
-    Raises:
-        ValueError: If there is no material of that name; the message lists the names.
-    """
+    """The suggestion with the numbers of a known material, in place of those of its kind."""
     known = known_material(name, "--material")
     return replace(
         suggestion, material=name, real=True, youngs_modulus=known.E, density=known.density,
@@ -508,9 +500,6 @@ def suggest_region(
 
     Returns:
         The guess.
-
-    Raises:
-        ValueError: If hardly any Gaussian is left.
     """
     among = torch.ones_like(opacity, dtype=torch.bool) if shown is None else shown.mask
     threshold = suggest_threshold(opacity[among], weight[among])
@@ -598,11 +587,7 @@ def region_around(
 def given_region(
     points: Tensor, opacity: Tensor, weight: Tensor, low: Sequence[float], high: Sequence[float]
 ) -> RegionGuess:
-    """A region given by the corners of a box, with a suggested threshold.
-
-    Raises:
-        ValueError: If it contains hardly any Gaussian.
-    """
+    """A region given by the corners of a box, with a suggested threshold."""
     box = Box(low, high)
     inside = box.contains(points)
     if int(inside.sum()) < FEWEST:

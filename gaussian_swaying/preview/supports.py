@@ -259,7 +259,6 @@ def standing_parts(
 
 
 def _parts(labels: Tensor, parts: list[Part]) -> Parts:
-    """The parts that have Gaussians."""
     count = torch.bincount(labels, minlength=len(parts))
     used = [k for k in range(len(parts)) if int(count[k])]
     place = torch.zeros(len(parts), dtype=torch.long)

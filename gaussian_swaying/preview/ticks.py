@@ -104,7 +104,6 @@ def draw_ticks(
 def _label(
     draw: ImageDraw, font: Any, at: Tensor, text: str, anchor: str, size: tuple[int, int], weight: int = 0
 ) -> None:
-    """Text with a pale rim, if it fits into the picture."""
     x, y = at.tolist()
     box = draw.textbbox((x, y), text, font=font, anchor=anchor)
     if box[0] < 0 or box[1] < 0 or box[2] > size[0] or box[3] > size[1]:

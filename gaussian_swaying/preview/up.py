@@ -176,11 +176,7 @@ def guess_up(points: Tensor, normals: Tensor, weight: Tensor) -> UpGuess:
 
 
 def given_up(up: Sequence[float] | str, points: Tensor, normals: Tensor, weight: Tensor) -> UpGuess:
-    """A given up direction, as 3 numbers or as ``+x`` to ``-z``, with the floor below.
-
-    Raises:
-        ValueError: If it is not a direction.
-    """
+    """A given up direction, as 3 numbers or as ``+x`` to ``-z``, with the floor below."""
     if isinstance(up, str):
         if up not in DIRECTIONS:
             raise ValueError(f"Expected `--up` to be {', '.join(DIRECTIONS)} or 3 numbers, but got {up!r}.")

@@ -39,9 +39,6 @@ def read_checkpoint(path: Path, config: str = "") -> dict[str, Any]:
 
     Returns:
         Its fields.
-
-    Raises:
-        ValueError: If it does not exist or is damaged, or the configuration differs.
     """
     if not path.exists():
         raise ValueError(f"There is nothing to resume in {path.parent}: it has no {path.name}; leave out --resume.")

@@ -56,9 +56,6 @@ def load_nodes(path: str | os.PathLike[str]) -> Tensor:
 
     Args:
         path: ``nodes.npz`` of a run of ``total``.
-
-    Raises:
-        ValueError: If a frame is missing, the frames differ in their nodes, or a number is NaN or infinite.
     """
     with np.load(check_archive(path, "the run")) as arrays:
         count = len(arrays.files) // len(NODES)

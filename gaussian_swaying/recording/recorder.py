@@ -43,8 +43,6 @@ from gaussian_swaying.runs.seal import save_sealed
 
 
 class _Film:
-    """The video of one folder of frames, and the frames encoded so far."""
-
     def __init__(self) -> None:
         self.encoder: VideoEncoder | None = None
         self.encoded: list[int] = []

@@ -24,9 +24,6 @@ def check_pictures(folder: Path, place: str, frames: int, video: str | None = No
 
     Returns:
         A sentence if some are missing.
-
-    Raises:
-        ValueError: If one is damaged, or they differ in size or kind.
     """
     from PIL import Image
 

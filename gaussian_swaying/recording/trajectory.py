@@ -76,9 +76,6 @@ def check_trajectory(
 
     Returns:
         The frames that have all arrays.
-
-    Raises:
-        ValueError: If a file is damaged or not a regular file.
     """
     frames_of: dict[str, set[int]] = {name: set() for name in arrays}
     for source in _sources(shards, target):

@@ -38,11 +38,7 @@ class VideoEncoder:
         self._end: Callable[[], Any] = lambda: None
 
     def write(self, image: np.ndarray) -> None:
-        """Add a frame, uint8 (H, W, 3). Only one thread may call this at a time.
-
-        Raises:
-            OSError: If ffmpeg fails, with its last message, or the size of the frame differs from the first.
-        """
+        """Add a frame, uint8 (H, W, 3). Only one thread may call this at a time."""
         with self._lock:
             if self._closed:
                 raise OSError(f"{self.path.name} is closed")
@@ -62,11 +58,7 @@ class VideoEncoder:
             raise self._failure() from None
 
     def finish(self) -> None:
-        """Wait for ffmpeg and rename the file; without frames there is no file.
-
-        Raises:
-            OSError: If ffmpeg fails, with its last message.
-        """
+        """Wait for ffmpeg and rename the file; without frames there is no file."""
         if self._process is None:
             return
         assert self._process.stdin is not None
@@ -121,9 +113,6 @@ def encode_video(frames: list[Path], path: Path, fps: float) -> None:
         frames: PNG files in order.
         path: The .mp4 file.
         fps: Frames per second.
-
-    Raises:
-        OSError: If ffmpeg fails, with its last message, or the images differ in size.
     """
     import imageio.v3 as iio
 

@@ -117,10 +117,6 @@ class FrameWriter:
             name: Name of its file. Jobs with the same name run one after the other, in the order of submission.
             run: The job. It gets no arguments; its data must not change.
             after_all: Start only when everything submitted before is done.
-
-        Raises:
-            OSError: If an earlier job could not write, with its name; this job and later ones are not accepted.
-            BaseException: The error of an earlier job that failed in another way.
         """
         with self._changed:
             while len(self._jobs) >= self.limit and self._error is None:
@@ -133,12 +129,7 @@ class FrameWriter:
             self._hire()
 
     def wait(self) -> None:
-        """Wait until no job is pending.
-
-        Raises:
-            OSError: If a job could not write and no call has raised it yet.
-            BaseException: The error of a job that failed in another way, if no call has raised it yet.
-        """
+        """Wait until no job is pending."""
         with self._changed:
             while self._jobs:
                 self._hire()

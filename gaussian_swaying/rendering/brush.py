@@ -93,9 +93,6 @@ def touched(view: Seen, path: Tensor, radius: float, through: bool = False) -> T
         path: Corners of the path [pixels], shape (S, 2); the brush goes straight from one to the next.
         radius: Radius of the brush [pixels].
         through: Whether it touches those that are hidden, too.
-
-    Raises:
-        ValueError: If the path has no corner, or the radius is not positive.
     """
     check_shape("path", path, None, 2)
     check_positive("radius", radius)

@@ -50,9 +50,6 @@ def load_kernels() -> bool:
 
     Returns:
         Whether there are kernels: False if gsplat finds no compiler.
-
-    Raises:
-        Exception: The message of the compiler, if it fails.
     """
     with _LOADING:
         library = build_folder() / "gsplat_cuda.so"
@@ -108,12 +105,7 @@ def build_folder() -> Path:
 
 
 def _stamp(library: Path) -> str:
-    """All that a library of gsplat's kernels was compiled from, and its size and time.
-
-    Raises:
-        OSError: If there is no library.
-        ImportError: If there is no gsplat.
-    """
+    """All that a library of gsplat's kernels was compiled from, and its size and time."""
     from importlib.metadata import version
 
     found = importlib.util.find_spec("gsplat")
@@ -131,7 +123,6 @@ _OPTIONS = ("TORCH_CUDA_ARCH_LIST", "NO_FAST_MATH", "FAST_COMPILE", "USE_PRECOMP
 
 
 def _load(library: Path) -> None:
-    """Load a library as the kernels of gsplat."""
     spec = importlib.util.spec_from_file_location("gsplat_cuda", library)
     assert spec is not None
     assert spec.loader is not None
@@ -167,11 +158,6 @@ def render_gsplat(
 
     Returns:
         The picture, in the precision of ``means``.
-
-    Raises:
-        RuntimeError: If there is no CUDA device, or ``means`` is not on it.
-        TypeError: If an argument is not a tensor.
-        ValueError: If a tensor does not have the shape above.
     """
     check_gaussians(means, covariances, opacities, colors, background)
     if not torch.cuda.is_available():
@@ -328,7 +314,6 @@ def _rasterize(
 
 
 def _compose(pixels: Tensor, alpha: Tensor, background: Tensor | None, dtype: torch.dtype) -> RenderOutput:
-    """Split colour and depth, and put the background behind the colour."""
     color, depth = pixels[..., :3], pixels[..., 3:].clone()
     if background is not None:
         color = torch.addcmul(color, 1.0 - alpha, background.to(color))

@@ -51,9 +51,6 @@ def plane_channels(means: Tensor, quats: Tensor, log_scales: Tensor, camera: Cam
 
     Returns:
         Normals in the frame of the camera and n.x, shape (N, 4). Differentiable in ``means`` and ``quats``.
-
-    Raises:
-        ValueError: If a tensor does not have the shape above.
     """
     check_shape("means", means, None, 3)
     rotation, shift = camera.world_to_camera[:3, :3], camera.world_to_camera[:3, 3]
@@ -86,9 +83,6 @@ def surface_maps(channels: Tensor, alpha: Tensor, camera: Camera, least_alpha: f
 
     Returns:
         The maps, differentiable where a surface is.
-
-    Raises:
-        ValueError: If a tensor does not have the shape above.
     """
     check_shape("channels", channels, camera.height, camera.width, 4)
     check_shape("alpha", alpha, camera.height, camera.width, 1)
@@ -116,9 +110,6 @@ def depth_normals(depth: Tensor, known: Tensor, camera: Camera) -> tuple[Tensor,
     Returns:
         Unit normals towards the camera, shape (H, W, 3), and where they are defined, bool (H, W, 1): not at the border
         of the picture, and not beside pixels without a surface.
-
-    Raises:
-        ValueError: If a tensor does not have the shape above.
     """
     check_shape("depth", depth, camera.height, camera.width, 1)
     check_shape("known", known, camera.height, camera.width, 1)

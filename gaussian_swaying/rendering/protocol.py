@@ -154,9 +154,6 @@ class SplatRenderer(Renderer, Protocol):
 
         Returns:
             The picture, on the device and in the precision of ``means``.
-
-        Raises:
-            ValueError: If ``absgrad`` is set and the renderer does not support it.
         """
         ...
 

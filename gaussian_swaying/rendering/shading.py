@@ -57,10 +57,6 @@ def diffuse_shading(
     Returns:
         Shaded colours, not negative, shape (..., 3).
 
-    Raises:
-        TypeError: If an argument is not a tensor.
-        ValueError: If a tensor does not have the shape above.
-
     Example:
         >>> color, light = torch.ones(3), torch.tensor([0.0, 0.0, 1.0])
         >>> diffuse_shading(color, torch.tensor([0.6, 0.0, 0.8]), light)
@@ -112,10 +108,6 @@ def phong_shading(
 
     Returns:
         Shaded colours, not negative, shape (..., 3).
-
-    Raises:
-        TypeError: If an argument is not a tensor.
-        ValueError: If a tensor does not have the shape above.
     """
     check_shape("color", color, 3)
     check_shape("normal", normal, 3)

@@ -123,12 +123,7 @@ def _extent(covariances2d: Tensor, log_opacities: Tensor) -> Tensor:
 
 
 def _blocks(counts: Tensor, limit: int) -> tuple[Tensor, list[tuple[int, int]]]:
-    """Split consecutive items into blocks whose counts sum to about ``limit``.
-
-    Returns:
-        Inclusive running sum of the counts, and the first and last (excluded) item of each block. The sum of a block
-        exceeds ``limit`` by less than the largest count.
-    """
+    """Split consecutive items into blocks whose counts sum to about ``limit``."""
     running = counts.cumsum(0)
     total = int(running[-1]) if len(running) else 0
     marks = torch.arange(limit, total + limit, limit, device=counts.device)
@@ -288,10 +283,6 @@ def render_torch(
 
     Returns:
         The picture, on the device and in the precision of ``means``.
-
-    Raises:
-        TypeError: If an argument is not a tensor.
-        ValueError: If a tensor does not have the shape above.
     """
     check_gaussians(means, covariances, opacities, colors, background)
     camera = camera.to(means.device, means.dtype)

@@ -31,10 +31,6 @@ def claim_folder(folder: Path, ours: Iterable[str], remedy: str, in_use: Iterabl
 
     Returns:
         The lock, to be released at the end of the run.
-
-    Raises:
-        FolderLocked: If another run writes there.
-        ValueError: If the folder cannot be written or moved, or contains something else with a name in ``ours``.
     """
     try:
         real = _resolve(folder)
@@ -62,12 +58,7 @@ def claim_folder(folder: Path, ours: Iterable[str], remedy: str, in_use: Iterabl
 
 
 def hold_folder(folder: Path, remedy: str) -> FolderLock:
-    """Lock the folder of a run that is to be continued; nothing else changes.
-
-    Raises:
-        FolderLocked: If another run writes there.
-        ValueError: If the folder cannot be written.
-    """
+    """Lock the folder of a run that is to be continued; nothing else changes."""
     try:
         return FolderLock(_resolve(folder))
     except OSError as error:

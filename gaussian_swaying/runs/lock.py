@@ -48,7 +48,6 @@ class FolderLock:
         self._end = weakref.finalize(self, _release, lock, self._place, os.getpid())
 
     def moved(self, folder: Path) -> None:
-        """Tell the lock that the folder has been renamed."""
         self._place[0] = folder
 
     def release(self) -> None:
@@ -57,7 +56,6 @@ class FolderLock:
 
 
 def _who(path: Path) -> str:
-    """Who has a lock, if that can be read."""
     with suppress(OSError, ValueError, KeyError, TypeError, RecursionError):
         held = json.loads(path.read_bytes())
         place = "this host" if held["host"] == platform.node() else f"the host {held['host']!s:.100}"

@@ -44,12 +44,7 @@ def save_sealed(path: Path, value: Any) -> None:
 
 
 def check_seal(path: Path) -> None:
-    """Raise ValueError unless a file ends with the checksum of everything before it.
-
-    Raises:
-        FileNotFoundError: If there is no such file.
-        ValueError: If it is not a regular file, has no checksum, or its content has changed.
-    """
+    """Raise ValueError unless a file ends with the checksum of everything before it."""
     check_not_taken(path)
     size = max(os.path.getsize(path) - _LENGTH, 0)
     with path.open("rb") as file:
@@ -67,10 +62,6 @@ def load_sealed(path: Path, map_location: Any = "cpu") -> Any:
     Args:
         path: The file.
         map_location: Device of its tensors, as for ``torch.load``.
-
-    Raises:
-        FileNotFoundError: If there is no such file.
-        ValueError: As in :func:`check_seal`, and if the file contains anything but tensors, numbers and text.
     """
     check_seal(path)
     try:

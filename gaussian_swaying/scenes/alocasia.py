@@ -39,7 +39,6 @@ class AlocasiaScene(ProceduralScene):
         check_positive("generator.clear_floor", self.clear_floor, allow_zero=True)
 
     def generate(self) -> GaussianCloud:
-        """Make the plant."""
         h, draw = self.spacing, Draw(self.seed)
         shade = (cast((0.0, 0.0, 0.8), 0.50, 0.22), cast((0.0, 0.0, 0.1), 0.22, 0.5), (0.0, 0.0, 0.19, 0.55))
         flat = self.clear_floor
@@ -60,7 +59,6 @@ class AlocasiaScene(ProceduralScene):
         return to_cloud(join(parts))
 
     def _blade(self, top: torch.Tensor, way: torch.Tensor, up: torch.Tensor, size: float) -> Patches:
-        """A blade attached to its stalk at a fifth of its length from the back."""
         blade = leaf(
             0.38, 0.25, self.spacing / size, taper=(0.42, 0.95), droop=0.22, fold=0.22,
             colour=(0.12, 0.34, 0.16), vein=(0.62, 0.74, 0.50), veins=6,

@@ -45,7 +45,6 @@ class ClothScene(ProceduralScene):
         self.check("side")
 
     def generate(self) -> GaussianCloud:
-        """Make the splat."""
         made = {"ball": self._ball, "table": self._table, "drop": self._drop, "flags": self._flags}
         cloths, rest = made[self.setting]()
         shadows = [cast([0.0, 0.0, 0.3], 0.35, 0.3)] if self.setting != "flags" else []
@@ -53,7 +52,6 @@ class ClothScene(ProceduralScene):
         return to_cloud(join([*cloths, *rest, ground]))
 
     def _cloth(self, height: float, colour: tuple[float, ...]) -> Patches:
-        """A level square above the origin, with a checked pattern that shows folds."""
         count = steps(self.side, self.spacing)
 
         def level(v: Tensor, u: Tensor) -> Tensor:

@@ -35,7 +35,6 @@ class FicusScene(ProceduralScene):
         self.check("leaves", coarsest=0.2)
 
     def generate(self) -> GaussianCloud:
-        """Make the tree."""
         h, draw = self.spacing, Draw(self.seed)
         bark = (0.42, 0.33, 0.25)
         trunk = bezier([[0, 0, 0.28], [0.10, 0.02, 0.6], [-0.10, -0.03, 0.95], [0.02, 0.0, 1.25]])

@@ -77,7 +77,6 @@ class FlagOnStandScene(ProceduralScene):
         return [pole, hem, self._ball((-0.024, 0.0, 1.06 * height + 0.03), (0.034, 0.034, 0.034))]
 
     def _posts(self) -> list[Patches]:
-        """Two posts, and clips that hold three corners."""
         width, height = self.flag.width, self.flag.height
         parts = []
         for x, corners in ((-0.07, (height,)), (width + 0.07, (0.0, height))):
@@ -93,7 +92,6 @@ class FlagOnStandScene(ProceduralScene):
         return parts
 
     def _rod(self) -> list[Patches]:
-        """A rod along the top edge that hangs on two ropes."""
         width, level = self.flag.width, self.flag.height + 0.025
         parts = [self._bar((-0.08, 0.0, level), (width + 0.08, 0.0, level), 0.016, METAL)]
         for x in (-0.08, width + 0.08):

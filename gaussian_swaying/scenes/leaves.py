@@ -44,7 +44,6 @@ class LeavesScene(ProceduralScene):
             raise ValueError(f"Expected `generator.leaves` of at least {len(WOOD)}, one a twig, but got {self.leaves}.")
 
     def generate(self) -> GaussianCloud:
-        """Make the branch."""
         h, draw = self.spacing, Draw(self.seed)
         ends = torch.tensor([piece[:2] for piece in WOOD], dtype=torch.float64)
         parts = []

@@ -92,9 +92,6 @@ def to_cloud(
 
     Returns:
         Gaussians with constant colours; ``normals`` are the true normals.
-
-    Raises:
-        ValueError: If ``overlap`` is not positive.
     """
     check_positive("overlap", overlap)
     edges = torch.stack([patches.across, patches.along], dim=-1)

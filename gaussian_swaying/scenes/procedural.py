@@ -75,7 +75,6 @@ class GivenScene(ProceduralScene):
     cloud: GaussianCloud
 
     def generate(self) -> GaussianCloud:
-        """The Gaussians, as they are."""
         return self.cloud
 
 
@@ -119,7 +118,6 @@ class FlagScene(ProceduralScene):
             raise ValueError(f"Expected `generator.yaw` to be a finite angle in degrees, but got {self.yaw}.")
 
     def generate(self) -> GaussianCloud:
-        """Make the flag."""
         h = self.spacing
         columns, rows = round(self.width / h), round(self.height / h)
         u = (torch.arange(columns, dtype=torch.float64) + 0.5) * h

@@ -69,7 +69,6 @@ class SandScene(ProceduralScene):
         return top
 
     def generate(self) -> GaussianCloud:
-        """Make the bear."""
         h, draw = self.spacing, Draw(self.seed)
         xs = torch.arange(-1.05, 1.05, h, dtype=torch.float64) + 0.5 * h
         ys = torch.arange(-1.10, 1.40, h, dtype=torch.float64) + 0.5 * h

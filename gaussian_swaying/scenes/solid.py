@@ -99,7 +99,6 @@ class SolidScene(ProceduralScene):
         return lambda points: figure_distance(points, self.size)
 
     def generate(self) -> GaussianCloud:
-        """Make the solid."""
         h, draw = self.spacing, torch.Generator().manual_seed(self.seed)
         reach = 0.5 * self.size + h
         steps = torch.arange(-reach, reach + h, h, dtype=torch.float64)

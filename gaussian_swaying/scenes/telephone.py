@@ -45,7 +45,6 @@ class TelephoneScene(ProceduralScene):
         self.check("turns", coarsest=0.2)
 
     def generate(self) -> GaussianCloud:
-        """Make the telephone."""
         h = self.spacing
         coarse = min(max(h, 0.008), 0.04)
         parts = [self._wall(coarse), *self._body(coarse), *self.handset(coarse), self.cord()]

@@ -48,7 +48,6 @@ class VaseScene(ProceduralScene):
         self.check("flowers", coarsest=0.2)
 
     def generate(self) -> GaussianCloud:
-        """Make the vase."""
         h, draw = self.spacing, Draw(self.seed)
         profile = bezier([[0.055, 0, 0.0], [0.16, 0, 0.05], [0.13, 0, 0.20], [0.02, 0, 0.22], [0.065, 0, 0.30]])
         vase = revolution(profile[:, [0, 2]], max(h, 0.005), (0.25, 0.42, 0.62))

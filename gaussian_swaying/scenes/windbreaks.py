@@ -72,7 +72,6 @@ class PlantRowScene(ProceduralScene):
         self.check("count", "leaves", coarsest=0.1)
 
     def generate(self) -> GaussianCloud:
-        """Make the row."""
         draw = Draw(self.seed)
         places = [(k - 0.5 * (self.count - 1)) * 0.6 for k in range(self.count)]
         shade = [cast((x, 0.0, 0.5), 0.3, 0.35) for x in places]

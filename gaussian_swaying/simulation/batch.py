@@ -21,9 +21,6 @@ def batch_of(members: Sequence[Simulation]) -> Stepper:
 
     Args:
         members: A simulation, and variants of it (``Simulation.variant``) that differ in wind and material.
-
-    Raises:
-        ValueError: If they cannot be a batch.
     """
     first = members[0]
     if any(member.stepper.copies is not None for member in members):
@@ -50,10 +47,6 @@ def run_batch(
 
     Returns:
         The summaries.
-
-    Raises:
-        SimulationDiverged: If one of them diverges.
-        ValueError: If they cannot be a batch.
     """
     batch = batch_of(members)
     state = batch.start()

@@ -84,9 +84,6 @@ def body_of(
 
     Returns:
         The body.
-
-    Raises:
-        ValueError: If a region of the material contains nothing.
     """
     position = frame.point_to_sim(part.means.double())
     source = torch.arange(len(position))  # the Gaussian of each sample of the surface

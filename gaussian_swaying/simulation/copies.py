@@ -115,9 +115,6 @@ def copies_of(copies: Sequence[Copy], setup: Setup, solver: Solver) -> Copies:
         copies: The copies.
         setup: Scene, material and drivers of the object.
         solver: Its solver.
-
-    Raises:
-        ValueError: If it cannot have copies.
     """
     why = _why_not(copies, setup, solver)
     if why is not None:

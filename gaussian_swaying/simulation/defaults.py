@@ -52,11 +52,7 @@ CELLS = 32
 
 
 def resolve_device(device: DeviceLike) -> torch.device:
-    """The device of a name: ``auto`` (a CUDA GPU if there is one, else the CPU), ``cpu`` or ``cuda``.
-
-    Raises:
-        ValueError: If the machine does not have it.
-    """
+    """The device of a name: ``auto`` (a CUDA GPU if there is one, else the CPU), ``cpu`` or ``cuda``."""
     if isinstance(device, torch.device):
         return device
     if device != "auto" and not device.startswith("cuda"):
@@ -79,9 +75,6 @@ def as_scene(source: SceneLike, up: Sequence[float] | None = None) -> Scene:
 
     Returns:
         A :class:`Scene` as it is. Anything else is simulated as a whole.
-
-    Raises:
-        ValueError: If ``up`` is given twice.
     """
     if isinstance(source, Scene):
         if up is not None:
@@ -95,11 +88,7 @@ def as_scene(source: SceneLike, up: Sequence[float] | None = None) -> Scene:
 
 
 def as_material(material: MaterialLike | None) -> Material:
-    """Return the given material, that of a name, or the default.
-
-    Raises:
-        ValueError: If there is no material of that name; the message lists the names.
-    """
+    """Return the given material, that of a name, or the default."""
     return Material.named(material) if isinstance(material, str) else material or Material()
 
 
@@ -110,9 +99,6 @@ def as_solver(
 
     A held object then has no gravity, as in the starters of the preview: its captured shape is already in balance with
     its weight. An object that is not held falls. ``damping`` [1/s] is that of a solver that is made.
-
-    Raises:
-        ValueError: If ``hold`` is given together with a solver.
     """
     if solver is None:
         pins = [PinnedRegion(hold) if isinstance(hold, Region) else hold] if hold is not None else []

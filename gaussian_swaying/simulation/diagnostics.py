@@ -148,9 +148,6 @@ def check_spacing(solver: Solver) -> None:
 
     Args:
         solver: A solver with its material.
-
-    Raises:
-        ValueError: Naming the spacing and the remedy.
     """
     position = solver.points.position.detach().reshape(-1, *solver.points.position.shape[-2:])[0]
     if len(position) < 16:  # a few may be isolated on purpose
@@ -188,9 +185,6 @@ def diagnose(
 
     Returns:
         The measurements.
-
-    Raises:
-        SimulationDiverged: With ``check``, naming time, particle, cause and remedy.
     """
     return measure(solver, state, substeps, cfl, tearing, before).read(check)
 
@@ -211,7 +205,6 @@ class Measurement:
         return new
 
     def _wait(self) -> dict[str, list[Any]]:
-        """All numbers by name (one GPU synchronisation, the first time)."""
         if not self._found:
             values = iter(self.values.tolist())
             self._found = {name: [next(values) for _ in range(size)] for name, size in self._sizes.items()}
@@ -219,7 +212,6 @@ class Measurement:
 
     @property
     def cfl(self) -> float:
-        """Largest Courant number of the frame."""
         return float(self._wait()["cfl"][0])
 
     @property
@@ -409,9 +401,6 @@ def check_state(solver: Solver, state: State) -> None:
     Args:
         solver: The solver that made the state.
         state: The state to check (one GPU synchronisation).
-
-    Raises:
-        SimulationDiverged: Naming time, particle, cause and remedy.
     """
     moved = torch.linalg.vector_norm(state.position - solver.points.position, dim=-1)
     time, *verdict = torch.cat([state.time[None], _verdict(solver, state, moved)]).tolist()

@@ -163,11 +163,7 @@ class SceneEditor:
     # ---- with the stepper
 
     def start(self) -> State:
-        """The state at rest at time zero, with the edits of that time applied.
-
-        Raises:
-            ValueError: As ``Stepper.start``, now or after one of the edits.
-        """
+        """The state at rest at time zero, with the edits of that time applied."""
         self.reset()
         for later in (moment for moment in self.times if moment > 0):  # refuse impossible edits now
             self._apply_all(self.due(0.0))
@@ -229,15 +225,10 @@ class SceneEditor:
 
     @property
     def times(self) -> list[float]:
-        """The different times of the edits, in order."""
         return sorted({edit.time for edit in self.edits})
 
     def reach(self, edit: Edit) -> tuple[Tensor, Tensor]:
-        """Return masks of the particles (P,) and of the Gaussians (N,) that an edit changes.
-
-        Raises:
-            ValueError: If there are none.
-        """
+        """Return masks of the particles (P,) and of the Gaussians (N,) that an edit changes."""
         scene, region, means = self.scene, edit.region, self.scene.model.means.detach()
         given = (scene.points.youngs_modulus, scene.points.poisson_ratio, scene.points.mass)
         if edit.of_material and any(value.requires_grad for value in given):

@@ -27,12 +27,6 @@ def check_extent(means: Tensor, metres_per_unit: float, dx: float, index: Tensor
         metres_per_unit: Length of a scene unit [m].
         dx: Grid spacing [m].
         index: Indices of the Gaussians in the splat, for the message, shape (N,).
-
-    Raises:
-        ValueError: If a Gaussian lies a thousand sides away from the others, or the object is shorter than half a cell.
-
-    Warns:
-        UserWarning: If one lies 20 sides away, or the object is shorter than three cells.
     """
     if len(means) < _FEW:
         return

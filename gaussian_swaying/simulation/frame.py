@@ -113,9 +113,6 @@ def frames_from(
         drawn: A stream on which the frames are drawn and recorded. The next frame is then simulated at the same time,
             so that the GPU does not wait for the host, and what is assigned between two frames applies from the next
             but one on.
-
-    Raises:
-        RuntimeError: If the stepper is started again before the last frame.
     """
     stepper, started = editor.stepper, editor.stepper.starts
 

@@ -29,9 +29,6 @@ def joints_of(
         position: Rest positions of the material points [m]; of a sheet of three layers those of the layers one after
             the other, shape (P, 3).
         dx: Grid spacing [m].
-
-    Raises:
-        ValueError: If a part with a joint, or the one that it names, has no simulated Gaussian.
     """
     names, found = [part.name for part in parts.parts], []
     first_layer = int(owner.max()) + 1

@@ -99,9 +99,6 @@ class Normalisation:
 
         Returns:
             Copies of the first six arguments, the scene with ``metres_per_unit`` set.
-
-        Raises:
-            ValueError: If the scene already has a scale, or nothing is simulated.
         """
         if scene.longest_side is not None or scene.metres_per_unit is not None:
             raise ValueError(

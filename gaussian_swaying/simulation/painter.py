@@ -71,7 +71,6 @@ class Painter(nn.Module):
 
     @property
     def device(self) -> torch.device:
-        """Device of the Gaussians."""
         return self.background.device
 
     @property
@@ -86,7 +85,6 @@ class Painter(nn.Module):
 
     @property
     def renderer(self) -> Renderer:
-        """The renderer that draws the Gaussians."""
         if self._renderer is None:
             self._renderer = make_renderer(self.device)
         return self._renderer
@@ -199,7 +197,6 @@ class Painter(nn.Module):
         return colours.index_copy(0, index, self._shaded(colours[index], normals[index], view[index]))
 
     def _shaded(self, colours: Tensor, normals: Tensor, view: Tensor) -> Tensor:
-        """The colours of the Gaussians that move, with their shading."""
         if self.shader is None:
             return colours
         scene = self.scene
@@ -295,7 +292,6 @@ class Painter(nn.Module):
         return passes.scalar_colors(picture.color[..., 0], picture.alpha, largest, smooth)
 
     def _draw(self, gaussians: DeformedGaussians, values: Tensor, camera: Camera) -> RenderOutput:
-        """Blend any three values of each Gaussian."""
         return self.renderer(gaussians.means, gaussians.covariances, self.opacity(), values, camera)
 
     def opacity(self) -> Tensor:

@@ -111,10 +111,6 @@ class Parameter:
         Args:
             value: A number or tensor; three of them for a vector.
             name: Name of it in messages; its own if None.
-
-        Raises:
-            ValueError: If it is out of range.
-            TypeError: If it is no number.
         """
         name = name or self.name
         if requires_grad(value) and not self.differentiable:
@@ -136,7 +132,6 @@ class Parameter:
 
     @property
     def range_in_words(self) -> str:
-        """The range, for messages."""
         if self.low == -math.inf:
             return "finite"
         if self.high == math.inf:
@@ -193,11 +188,7 @@ def find(name: str) -> Parameter | None:
 
 
 def parameter(name: str) -> Parameter:
-    """As :func:`find`.
-
-    Raises:
-        ValueError: If there is none.
-    """
+    """As :func:`find`."""
     found = find(name)
     if found is None:
         raise ValueError(f"`{name}` is no parameter that may change: use one of {', '.join(names())}.")
@@ -218,11 +209,7 @@ def present(setup: Setup, start: str = "") -> list[str]:
 
 
 def value_of(setup: Setup, name: str) -> Any:
-    """The value of a parameter in a setup.
-
-    Raises:
-        ValueError: If there is no such parameter, or the setup has none.
-    """
+    """The value of a parameter in a setup."""
     return parameter(name).read(setup)
 
 
@@ -232,9 +219,6 @@ def with_values(setup: Setup, values: Mapping[str, Any]) -> Setup:
     Args:
         setup: The setup, which stays as it is.
         values: Values by the names of parameters; tensors keep their gradient where the parameter is differentiable.
-
-    Raises:
-        ValueError: If there is no such parameter, a value is out of range, or the setup has no place for it.
     """
     together: dict[Write, dict[str, Any]] = {}
     for name, value in values.items():
@@ -252,9 +236,6 @@ def in_settings(settings: Namespace, name: str, value: Any) -> None:
         settings: From the parser of a simulation.
         name: The parameter.
         value: Its value.
-
-    Raises:
-        ValueError: If the settings have no place for it.
     """
     value, parts = parameter(name).check(value), name.split(".")
     if name in POLAR:
@@ -277,11 +258,7 @@ def all_in_settings(settings: Namespace, values: Mapping[str, Any]) -> None:
 
 
 def of_settings(settings: Namespace, name: str) -> Any:
-    """The value of a parameter in parsed settings, as :func:`in_settings` sets it.
-
-    Raises:
-        ValueError: If the settings have no place for it.
-    """
+    """The value of a parameter in parsed settings, as :func:`in_settings` sets it."""
     parts = name.split(".")
     if name in POLAR:
         return _angles(settings.wind.flow)[POLAR.index(name)]
@@ -402,7 +379,6 @@ def _polar(setup: Setup) -> tuple[float, float, float]:
 
 
 def _angles(flow: Sequence[float]) -> tuple[float, float, float]:
-    """Speed, azimuth and elevation of a flow."""
     x, y, z = flow
     return math.hypot(x, y, z), math.degrees(math.atan2(y, x)), math.degrees(math.atan2(z, math.hypot(x, y)))
 
@@ -498,8 +474,6 @@ def _write_solver(setup: Setup, values: Mapping[str, Any]) -> Setup:
 
 
 def _of_force(kind: str, attribute: str) -> tuple[Read, Write]:
-    """Return the functions that read and write an attribute of the force of a class."""
-
     def read(setup: Setup) -> float:
         for force in setup.forces:
             if type(force).__name__ == kind:

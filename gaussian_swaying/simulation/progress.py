@@ -32,11 +32,9 @@ class RunProgress:
         self._began = self._looked = time.perf_counter()
 
     def begin(self, frame: int) -> None:
-        """Note that a frame begins."""
         self._frame, self._steps = frame, 0
 
     def substep(self, done: int, steps: int) -> None:
-        """Show how many substeps of the frame are done."""
         now = time.perf_counter()
         if steps != self._steps or done <= self._last:  # a new frame, or the same again with shorter substeps
             self._began = self._looked = now
@@ -52,7 +50,6 @@ class RunProgress:
         self._tell(steps, each * steps)
 
     def _tell(self, steps: int, whole: float) -> None:
-        """Report a slow frame once, and again if its substeps become four times as many."""
         many = self._usual is not None and steps > MANY_TIMES * self._usual
         if not self.shown or steps < 4 * self._told or not (many or (self._usual is None and whole > LONG_FRAME)):
             return
@@ -82,7 +79,6 @@ class RunProgress:
         self._bar.set_postfix_str(f"{substeps:,} substeps, {moved:.3f} m from rest on average")
 
     def close(self) -> None:
-        """Close the bar at the end of the run."""
         self._bar.close()
 
 

@@ -31,11 +31,7 @@ class Roles:
 
 
 def classify(simulation: Simulation) -> Roles:
-    """Sort the Gaussians into simulated, carried, held and pushed ones.
-
-    Raises:
-        ValueError: If a condition holds nothing.
-    """
+    """Sort the Gaussians into simulated, carried, held and pushed ones."""
     scene = simulation.scene
     simulated, carried, pinned, pushed = (torch.zeros(len(scene.model.means), dtype=torch.bool) for _ in range(4))
     index = scene.simulated.cpu()

@@ -118,11 +118,7 @@ def run_health(stepper: Stepper, log: Sequence[Mapping[str, Any]]) -> tuple[dict
 
 
 def written_once(recorder: Recorder, editor: SceneEditor) -> bool:
-    """True if the splat frames of a run are without the Gaussians that never move, see ``recorder.ply_still``.
-
-    Raises:
-        ValueError: If ``ply_still`` is ``once``, but none stands still, or an edit colours one during the run.
-    """
+    """True if the splat frames of a run are without the Gaussians that never move, see ``recorder.ply_still``."""
     moving, count = editor.scene.moving, len(editor.scene.model.means)
     still = torch.ones(count, dtype=torch.bool, device=moving.device).index_fill(0, moving, False)
     painted = any(bool((editor.reach(edit)[1] & still).any()) for edit in editor.edits if edit.time > 0)
@@ -313,9 +309,6 @@ class Run:
 
         Returns:
             The summary.
-
-        Raises:
-            OSError: If the run is complete and something could not be written.
         """
         recorder = self.recorder
         summary: dict[str, Any] = {"status": status, "reason": reason}
@@ -352,7 +345,6 @@ class Run:
         return torch.cuda.Stream(stepper.device)
 
     def keep(self, state: State, frame: int) -> None:
-        """Write a checkpoint, if one is due."""
         if self.recorder.checkpoint_every and (frame + 1) % self.recorder.checkpoint_every == 0:
             self.recorder.write_checkpoint(
                 {
@@ -482,5 +474,4 @@ class Run:
 
 
 def _count(nodes: Tensor | None) -> int | None:
-    """Number of nodes, if there are any."""
     return None if nodes is None else len(nodes)

@@ -78,7 +78,6 @@ class Samples:
         return layer_distance(self.bending, self.E, self.nu, self.thickness)
 
     def choose(self, index: Tensor) -> Samples:
-        """Some of the samples."""
         return Samples(**{f.name: getattr(self, f.name)[index] for f in fields(self)})
 
     def points(
@@ -136,9 +135,6 @@ def sample_object(
         frame: Conversion from scene units to metres.
         dx: Grid spacing [m], for ``material.volume = "cell"``.
         layers: Layers of points through the thickness of a sheet.
-
-    Raises:
-        ValueError: If a region of the material contains nothing.
     """
     surface = torch.ones(len(position), dtype=torch.bool)
     if filling is not None:

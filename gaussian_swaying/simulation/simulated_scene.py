@@ -200,7 +200,6 @@ class SimulatedScene(nn.Module):
 
     @staticmethod
     def _joints(scene: Scene, labels: Tensor | None, body: Body, dx: float) -> tuple[PointJoint, ...]:
-        """The joints of the parts of a scene."""
         if scene.parts is None or labels is None or not any(part.has_joint for part in scene.parts.parts):
             return ()
         if scene.connected != "surface":
@@ -241,9 +240,6 @@ class SimulatedScene(nn.Module):
             high: Upper corner of the box [m], shape (3,).
             cells: Cells along its longest side.
             level: Density of the surface, from 0 to 1.
-
-        Raises:
-            ValueError: If they are nowhere that dense.
         """
         still = torch.ones(len(self.model.means), dtype=torch.bool)
         still[self.moving.cpu()] = False
@@ -269,7 +265,6 @@ class SimulatedScene(nn.Module):
         return hull_area(self.model.means[self.simulated]) * self.frame.metres_per_unit**2
 
     def rest(self) -> DeformedGaussians:
-        """The Gaussians at rest."""
         means = self.model.means.detach()
         eye = self.identity.expand(len(means), 3, 3)
         moving = None if self.all_move else self.moving

@@ -117,7 +117,6 @@ class Stepper:
     # ---- what acts
 
     def _spread(self, setup: Setup) -> tuple[Setup, ...]:
-        """The setups of the scenes that one setup stands for."""
         return (setup,) if self.copies is None else self.copies.setups(setup)
 
     @property
@@ -127,7 +126,6 @@ class Stepper:
 
     @property
     def device(self) -> torch.device:
-        """Device of the scene."""
         return self.scene.identity.device
 
     @property
@@ -247,12 +245,7 @@ class Stepper:
 
     @in_turn
     def start(self) -> State:
-        """The state at rest at time zero.
-
-        Raises:
-            ValueError: If a pin holds nothing, the grid is too large or a fixed substep is too long; if the material is
-                so stiff that rounding shakes it.
-        """
+        """The state at rest at time zero."""
         self.starts += 1
         state = self.bind()
         self._idle = None  # coefficients may have changed
@@ -273,7 +266,6 @@ class Stepper:
         return self._with_air(state)
 
     def _with_air(self, state: State) -> State:
-        """The state at rest with computed air, if the setup has some."""
         setup = self.setup
         if setup.air is None:
             self._air = None
@@ -382,9 +374,6 @@ class Stepper:
 
         Returns:
             The state at its end, and its diagnostics.
-
-        Raises:
-            SimulationDiverged: If the simulation diverges in the frame.
         """
         return self.launch(state).finish()
 
@@ -435,7 +424,6 @@ class Stepper:
         return measure(self.solver, state, 0, 0.0, lift=self.lift)
 
     def give_up(self, state: State, cause: str, remedy: str | None = None) -> NoReturn:
-        """Raise SimulationDiverged, naming the particle with the largest deformation."""
         particle = int(state.F_elastic.square().sum((-1, -2)).reshape(-1).argmax())
         if remedy is None:
             field = "solver.cfl" if self.solver.substep is None else "solver.substep"
@@ -534,9 +522,6 @@ class Launched:
 
         Returns:
             The state at the end of the frame, and its diagnostics; those of the scenes of a batch are in :attr:`each`.
-
-        Raises:
-            SimulationDiverged: If the simulation diverged in the frame.
         """
         if self._error is not None:
             raise self._error
@@ -609,7 +594,6 @@ class Outlook:
 
 
 def _read(state: State) -> list[Tensor]:
-    """Return the fields of a state that the needs depend on."""
     found = (state.F_elastic, state.internal, state.velocity, state.time)
     return [tensor for tensor in found if tensor is not None]
 

@@ -113,9 +113,6 @@ def still_distance(
 
     Returns:
         The distance at the centres of the cells, negative where the density is higher; at most :data:`BAND` cells.
-
-    Raises:
-        ValueError: If no cell is that dense.
     """
     spacing = float((high - low).amax()) / cells
     size = ((high - low) / spacing).ceil().long().clamp(min=2)

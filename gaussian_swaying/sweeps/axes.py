@@ -38,9 +38,6 @@ def read_axis(name: str, given: Any) -> Axis:
             ratios; or a draw ``{draw, low, high}``, where ``draw`` is ``uniform``, ``log`` (the logarithm is uniform)
             or ``integer`` (both ends included), or ``{draw: choice, of: [...]}``.
 
-    Raises:
-        ValueError: Naming the axis, the entry and the remedy.
-
     Example:
         >>> read_axis("material.E", {"from": 100, "to": 10000, "count": 3, "scale": "log"}).values
         (100.0, 1000.0, 10000.0)
@@ -72,9 +69,6 @@ def runs_of(axes: list[Axis], draws: int = 1, seed: int = 0) -> list[dict[str, A
 
     Returns:
         For each run the value of every axis, in the order of the axes.
-
-    Raises:
-        ValueError: If there are too many runs, or nothing to draw.
 
     Example:
         >>> runs_of([Axis("a", (1, 2)), Axis("b", (3, 4))])

@@ -52,11 +52,9 @@ class Job:
         return tuple(name for name in self.names if name not in self.complete)
 
     def again(self, resume: bool) -> Job:
-        """The next attempt."""
         return replace(self, attempt=self.attempt + 1, resume=resume)
 
     def apart(self) -> list[Job]:
-        """A job for each run that is not complete."""
         pairs = zip(self.names, self.runs, strict=True)
         return [replace(self, names=(n,), runs=(r,), attempt=1) for n, r in pairs if n not in self.complete]
 
@@ -89,7 +87,6 @@ class Outcome:
 
     @property
     def complete(self) -> bool:
-        """True if all runs are complete."""
         return all(result["status"] == "complete" for result in self.results.values())
 
 

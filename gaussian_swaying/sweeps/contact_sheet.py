@@ -91,7 +91,6 @@ def _short(value: Any) -> str:
 
 
 def _fitted(text: str, draw: Any, font: Any) -> str:
-    """Text, shortened to the width of a picture."""
     while text and draw.textlength(text, font) > WIDTH - 6:
         text = text[:-2].rstrip("…") + "…" if len(text) > 2 else ""
     return text

@@ -72,12 +72,7 @@ class SweepDataset(Dataset[dict[str, Any]]):
         return len(self.runs)
 
     def __getitem__(self, index: int) -> dict[str, Any]:
-        """The run at a place.
-
-        Raises:
-            IndexError: If there are not so many.
-            ValueError: If the run did not record what is wanted, or a file is damaged.
-        """
+        """The run at a place."""
         place = self.folder / RUNS / self.runs[index]
         item = {"run": self.runs[index], "parameters": self._parameters[index], "summary": self._summary[index]}
         if self.frames:

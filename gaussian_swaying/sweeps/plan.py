@@ -63,7 +63,6 @@ class Plan:
 
     @property
     def axes(self) -> list[str]:
-        """Names of the axes."""
         return list(self.runs[0])
 
 
@@ -74,10 +73,6 @@ def read_sweep(path: str | os.PathLike[str], find: Callable[[str], str] = str) -
         path: YAML with ``base``, ``axes`` and, if needed, ``settings``, ``draws`` and ``seed``; docs/many.md describes
             them.
         find: Gives the file of a name in ``base``.
-
-    Raises:
-        ValueError: If the file is invalid; the message names the entry and the remedy.
-        FileNotFoundError: If there is no such file.
     """
     file = Path(path)
     given = read_fields(file, "the sweep file", FIELDS)
@@ -112,10 +107,6 @@ def make_plan(sweep: Sweep, parser: ArgumentParser | None = None) -> Plan:
     Args:
         sweep: The sweep.
         parser: From :meth:`Simulation.parser`; made here if None.
-
-    Raises:
-        ValueError: Naming the option and the run.
-        ArgumentError: If ``sim`` has no such option, or does not accept the value.
     """
     parser = parser or Simulation.parser()
     files = [word for name in sweep.base for word in ("--config", name)]
@@ -141,10 +132,6 @@ def parse_run(parser: ArgumentParser, config: str, frames: int, run: Mapping[str
         config: Configuration that all runs share, as YAML.
         frames: Frames, unless ``run`` has others.
         run: The value of every axis.
-
-    Raises:
-        ArgumentError: If a value is not accepted.
-        ValueError: If the settings do not fit together.
     """
     # parameters that are no options
     own = {n: v for n, v in run.items() if n in POLAR or n.startswith(("forces.", "wind.modulations."))}

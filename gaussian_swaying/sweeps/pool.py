@@ -22,8 +22,6 @@ PATIENCE_S = 300.0  # how long a worker may take to write what it has when the s
 
 @dataclass
 class _Worker:
-    """A process, the connection to it, and its job."""
-
     process: SpawnProcess
     connection: Connection
     place: int  # among those that run at the same time
@@ -146,7 +144,6 @@ def variables(place: int, threads: int, gpus: Sequence[str]) -> dict[str, str]:
 
 @contextmanager
 def _environment(**values: str) -> Iterator[None]:
-    """Set variables of the environment for the processes that are started in the block."""
     before = {name: os.environ.get(name) for name in values}
     os.environ.update(values)
     try:
@@ -160,7 +157,6 @@ def _environment(**values: str) -> Iterator[None]:
 
 
 def _receive(worker: _Worker, job: Job) -> tuple[Outcome, bool]:
-    """Return the outcome of a job, and True if the worker can do another one."""
     try:
         done = worker.connection.recv()
         return Outcome(done.results, share=done.share), done.ready
@@ -183,7 +179,6 @@ def _how_it_ended(code: int | None) -> str:
 
 
 def _dismiss(worker: _Worker) -> None:
-    """End a worker that has nothing to do."""
     worker.connection.close()
     worker.process.join(PATIENCE_S)
     if worker.process.is_alive():

@@ -117,7 +117,6 @@ class RayBackend:
             self._share, self.per_gpu = share, max(1, int(PACKED / share))
 
     def stop(self) -> None:
-        """Let all tasks end their runs at a frame."""
         try:
             for reference in self._running:
                 self._ray.cancel(reference)
@@ -138,7 +137,6 @@ def _parser() -> ArgumentParser:
 
 
 def _task(job: Job, threads: int, explain: Explain, folder: str, path: list[str]) -> Done:
-    """Do a job in a process of Ray."""
     import ray
 
     os.chdir(folder)

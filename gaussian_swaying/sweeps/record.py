@@ -63,10 +63,6 @@ def open_folder(
 
     Returns:
         The lock, to be released at the end.
-
-    Raises:
-        FolderLocked: If another sweep writes there.
-        ValueError: If the folder cannot be written, contains something else, or a sweep with other settings.
     """
     foreign = [name for name in OURS if os.path.lexists(folder / name)]  # before `held`, as another part may begin
     held = (folder / SWEEP).exists()
@@ -116,11 +112,7 @@ def _begin(folder: Path, own: Path, new: dict[str, Any]) -> None:
 
 
 def read_record(folder: Path) -> dict[str, Any]:
-    """``sweep.json`` of a folder: the shared configuration, frames, and the value of every axis in each run.
-
-    Raises:
-        ValueError: If there is none, or it is damaged.
-    """
+    """``sweep.json`` of a folder: the shared configuration, frames, and the value of every axis in each run."""
     if not (folder / SWEEP).is_file():
         raise ValueError(f"{folder} is not the folder of a sweep: it has no {SWEEP}; check the path.")
     record = read_json(folder / SWEEP, "record of the sweep")
@@ -163,11 +155,7 @@ def result_file(folder: Path, name: str) -> Path:
 
 
 def read_result(folder: Path, name: str) -> dict[str, Any] | None:
-    """The result of a run; None if it has not ended.
-
-    Raises:
-        ValueError: If the file is damaged; the message names the remedy.
-    """
+    """The result of a run; None if it has not ended."""
     path = result_file(folder, name)
     if not path.exists():
         return None

@@ -43,9 +43,6 @@ def write_shards(
 
     Returns:
         The files.
-
-    Raises:
-        ValueError: If no run is complete, or something that is wanted was not recorded.
     """
     check_positive("runs_per_shard", runs_per_shard)
     data = SweepDataset(folder, frames=False, positions=positions, nodes=nodes)

@@ -93,11 +93,6 @@ def run_sweep(
 
     Returns:
         The result of every run (of this part) by name, as in ``results/``.
-
-    Raises:
-        FolderLocked: If another sweep writes to the folder, or to this part of it.
-        ValueError: If the folder contains something else, or a sweep with other settings.
-        OSError: If a table could not be written, after all runs.
     """
     folder = Path(output).absolute()
     check_choice("picture", picture, PICTURES)
@@ -140,7 +135,6 @@ def run_sweep(
 
 
 def _jobs(folder: Path, plan: Plan, groups: list[list[str]], earlier: dict[str, Any], device: str) -> list[Job]:
-    """A job for each group with something left to do."""
     runs = dict(zip(plan.names, plan.runs, strict=True))
     jobs = []
     for names in groups:
@@ -171,7 +165,6 @@ def _backend(
 
 
 def _finish(folder: Path, plan: Plan, results: dict[str, dict[str, Any]], picture: str, parquet: bool) -> None:
-    """Write the tables and contact sheets at the end of a sweep."""
     if parquet:
         write_parquet(folder, plan.names, plan.runs, results)
     write_contact_sheets(folder, picture)
@@ -218,7 +211,6 @@ class _Keeper:
         self.write()
 
     def ended(self, name: str, result: dict[str, Any]) -> None:
-        """Record that a run is complete, or has failed for good."""
         self.results[name] = result
         if result["status"] != "complete":  # a complete run has written its own
             self.unwritten[name] = result
@@ -233,13 +225,11 @@ class _Keeper:
                     tqdm.write(f"warning: the table could not be written ({error.strerror or error}).", file=sys.stderr)
 
     def tick(self, running: int) -> None:
-        """Show the progress."""
         counts = Counter(result["status"] for result in self.results.values())
         shown = [f"{running} running", *(f"{counts[name]} {name}" for name in ("failed", "diverged") if counts[name])]
         self._bar.set_postfix_str(", ".join(shown), refresh=self._terminal)
 
     def write(self) -> None:
-        """Write the results of failed runs, and the tables."""
         self._written = time.monotonic()
         for name in list(self.unwritten):
             write_json(result_file(self.folder, name), self.unwritten[name])
@@ -248,7 +238,6 @@ class _Keeper:
             write_tables(self.folder, self.plan.names, self.plan.runs, self.results)
 
     def close(self) -> None:
-        """Write the last results when the sweep is over or was stopped."""
         self._bar.close()
         for name in self.names:  # runs that were completed while the sweep was being stopped
             result = read_result(self.folder, name)

@@ -58,9 +58,6 @@ def run_together(job: Job, parser: ArgumentParser) -> dict[str, dict[str, Any]]:
 
     Returns:
         The summaries of its runs by name, without those that are complete.
-
-    Raises:
-        ValueError: If they cannot be done together.
     """
     members, frames = members_of(job, parser)
     folders = [None if name in job.complete else job.folder / RUNS / name for name in job.names]

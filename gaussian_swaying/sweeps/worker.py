@@ -121,12 +121,10 @@ def _failed(job: Job, status: str, reason: str, ready: bool) -> Done:
 
 
 def _where() -> str:
-    """Name of this machine in ``times.csv``."""
     return os.environ.get(WHERE) or platform.node()
 
 
 def _share() -> float | None:
-    """Share of the GPU's memory that this process has taken, with what CUDA itself needs."""
     if not torch.cuda.is_initialized():
         return None
     return (torch.cuda.max_memory_reserved() + CONTEXT_BYTES) / torch.cuda.get_device_properties(0).total_memory

@@ -26,9 +26,6 @@ def read_training_checkpoint(path: Path, map_location: Any = "cpu") -> dict[str,
     Args:
         path: The file.
         map_location: Device of its tensors, as for ``torch.load``.
-
-    Raises:
-        ValueError: If it does not exist, is damaged, or is another kind of file.
     """
     if kind_of(path) is None:
         raise ValueError(f"The checkpoint {path} does not exist: give another `--ckpt_path`.")

@@ -19,9 +19,6 @@ def append_row(path: Path, row: dict[str, Any]) -> None:
     Args:
         path: The file; it is created, with its folder, if it does not exist.
         row: Values by column.
-
-    Raises:
-        ValueError: If the path is not a regular file.
     """
     check_not_taken(path)
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -62,7 +59,6 @@ class CsvLog(Logger):
 
     @property
     def name(self) -> str:
-        """Empty, as the folder already has a name."""
         return ""
 
     @property
@@ -72,12 +68,10 @@ class CsvLog(Logger):
 
     @property
     def save_dir(self) -> str:
-        """The folder."""
         return str(self.folder)
 
     @rank_zero_only
     def log_metrics(self, metrics: dict[str, float], step: int | None = None) -> None:
-        """Add a row."""
         append_row(
             self.folder / "metrics.csv", {name: float(value) for name, value in metrics.items()} | {"step": step}
         )

@@ -68,10 +68,6 @@ class Densification(ABC):
             scene_scale: Extent of the scene [scene units]; size thresholds are shares of it.
             devices: Number of devices that train together. A step takes so many images; the numbers of steps that the
                 densification was given count images.
-
-        Raises:
-            ValueError: If the optimiser has other groups, ``scene_scale`` is not positive, or the strategy does not run
-                on the model's device.
         """
         check_positive("scene_scale", scene_scale)
         groups = optimizer.param_groups
@@ -99,7 +95,6 @@ class Densification(ABC):
         return dict(self._strategy.initialize_state())
 
     def before_backward(self, step: int, screen: ScreenGaussians) -> None:
-        """Prepare the backward pass of a step."""
         if screen.means2d.requires_grad:
             screen.means2d.retain_grad()
 
@@ -123,11 +118,9 @@ class Densification(ABC):
         return self._state | sums
 
     def _in_steps(self, options: dict[str, Any]) -> dict[str, Any]:
-        """Options whose numbers of images became numbers of steps."""
         return {k: steps_of(v, self.devices) if k in _IN_IMAGES else v for k, v in options.items()}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Use a state when a model is attached next."""
         self._restored = dict(state)
 
 
@@ -223,12 +216,10 @@ class DefaultDensification(Densification):
         return dict(self._strategy.initialize_state(scene_scale=scene_scale))
 
     def before_backward(self, step: int, screen: ScreenGaussians) -> None:
-        """Keep the gradient of the centres on the screen."""
         if step < steps_of(self.stop, self.devices):
             super().before_backward(step, screen)
 
     def after_step(self, step: int, screen: ScreenGaussians) -> None:
-        """See :meth:`Densification.after_step`."""
         split_at = None if self.split_at is None else steps_of(self.split_at, self.devices)
         if step == split_at:
             self._split_large()

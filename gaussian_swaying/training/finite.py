@@ -43,7 +43,6 @@ class PendingLoss:
             self._arrived.record()
 
     def take(self) -> float:
-        """Wait for the loss, return it and forget it."""
         if self._arrived is not None:
             self._arrived.synchronize()
         self.step = None

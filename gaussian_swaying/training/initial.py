@@ -30,9 +30,6 @@ def gaussians_from_points(
 
     Returns:
         The Gaussians on the CPU in float32.
-
-    Raises:
-        ValueError: If there is no point, one is not finite, a tensor has another shape or a number is out of range.
     """
     check_shape("points", points, None, 3)
     check_shape("colors", colors, points.shape[0], 3)

@@ -32,9 +32,6 @@ def photometric_loss(image: Tensor, target: Tensor, ssim_weight: float = 0.2, pa
 
     Returns:
         A number.
-
-    Raises:
-        ValueError: If shapes or options are not those above.
     """
     check_pictures(image, target)
     difference = (image - target).abs().mean()
@@ -55,9 +52,6 @@ def anisotropy_loss(log_scales: Tensor, a: float = 1.1, ratio: str = "paper", re
 
     Returns:
         A number, 0 without Gaussians.
-
-    Raises:
-        ValueError: If ``log_scales`` has another shape or an option is none of those above.
 
     Example:
         >>> anisotropy_loss(torch.tensor([[3.0, 2.0, 0.5]]).log())
@@ -84,9 +78,6 @@ def opacity_entropy_loss(opacities: Tensor, reduction: str = "mean") -> Tensor:
 
     Returns:
         A number, 0 without Gaussians.
-
-    Raises:
-        ValueError: If ``reduction`` is none of those above.
     """
     check_choice("reduction", reduction, _REDUCTIONS)
     clamped = opacities.clamp_min(_MIN_OPACITY)
@@ -103,9 +94,6 @@ def size_loss(log_scales: Tensor, b: float = 0.008, reduction: str = "mean") -> 
 
     Returns:
         A number [scene units], 0 without Gaussians.
-
-    Raises:
-        ValueError: If ``log_scales`` has another shape or ``reduction`` is none of those above.
     """
     check_choice("reduction", reduction, _REDUCTIONS)
     check_shape("log_scales", log_scales, None, 3)
@@ -217,7 +205,6 @@ class PhotometricLoss(LossTerm):
         self.ssim_weight, self.padding = float(ssim_weight), padding
 
     def forward(self, inputs: LossInputs) -> Tensor:
-        """See :func:`photometric_loss`."""
         return photometric_loss(inputs.image, inputs.target, self.ssim_weight, self.padding)
 
 
@@ -242,7 +229,6 @@ class AnisotropyLoss(LossTerm):
         self.a, self.ratio, self.reduction = float(a), ratio, reduction
 
     def forward(self, inputs: LossInputs) -> Tensor:
-        """See :func:`anisotropy_loss`."""
         return anisotropy_loss(inputs.log_scales, self.a, self.ratio, self.reduction)
 
 
@@ -262,7 +248,6 @@ class OpacityEntropyLoss(LossTerm):
         self.reduction = reduction
 
     def forward(self, inputs: LossInputs) -> Tensor:
-        """See :func:`opacity_entropy_loss`."""
         return opacity_entropy_loss(inputs.opacities, self.reduction)
 
 
@@ -288,7 +273,6 @@ class SizeLoss(LossTerm):
         self.b, self.reduction = float(b), reduction
 
     def forward(self, inputs: LossInputs) -> Tensor:
-        """See :func:`size_loss`."""
         return size_loss(inputs.log_scales, self.b, self.reduction)
 
 
@@ -296,7 +280,6 @@ class MeanOpacityLoss(LossTerm):
     """Mean opacity. Kheradmand et al. 2024 ("3DGS as Markov Chain Monte Carlo") add it so that Gaussians can fade."""
 
     def forward(self, inputs: LossInputs) -> Tensor:
-        """The mean."""
         return _reduce(inputs.opacities, "mean")
 
 
@@ -304,7 +287,6 @@ class MeanScaleLoss(LossTerm):
     """Mean standard deviation [scene units], the other term of Kheradmand et al. 2024."""
 
     def forward(self, inputs: LossInputs) -> Tensor:
-        """The mean."""
         return _reduce(inputs.log_scales.exp(), "mean")
 
 
@@ -358,11 +340,7 @@ class TotalLoss(nn.Module):
         return wanted.union(*(term.needs for term in self.active(step).values()))
 
     def forward(self, inputs: LossInputs) -> tuple[Tensor, Mapping[str, Tensor]]:
-        """The sum, with its gradient, and each active term before its weight, detached.
-
-        Raises:
-            ValueError: If a term is not a number.
-        """
+        """The sum, with its gradient, and each active term before its weight, detached."""
         terms = self.active(inputs.step)
         values = {name: term(inputs) for name, term in terms.items()}
         for name, value in values.items():

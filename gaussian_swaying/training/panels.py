@@ -104,9 +104,6 @@ def lpips_metric(net: str = "alex") -> Any | None:
     Returns:
         The metric for pictures from 0 to 1, or None without torchvision or without the weights of the backbone in
         torch's folder of checkpoints. Nothing is downloaded.
-
-    Raises:
-        ValueError: If there is no such backbone.
     """
     check_choice("net", net, tuple(_BACKBONES))
     folder = Path(torch.hub.get_dir()) / "checkpoints"

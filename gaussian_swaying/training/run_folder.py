@@ -58,16 +58,13 @@ class RunFolder(Callback):
         self._mark(pl_module)
 
     def on_exception(self, trainer: Trainer, pl_module: LightningModule, exception: BaseException) -> None:
-        """Unlock the folder when training fails or is stopped."""
         self.release()
 
     def teardown(self, trainer: Trainer, pl_module: LightningModule, stage: str) -> None:
-        """Unlock the folder at the end."""
         if not self.keep:
             self.release()
 
     def release(self) -> None:
-        """Unlock the folder for other runs."""
         for lock in self._locks:
             lock.release()
         self._locks = []

@@ -250,7 +250,6 @@ class DepthNormalLoss(SurfaceTerm):
         self.edges = bool(edges)
 
     def forward(self, inputs: LossInputs) -> Tensor:
-        """See :func:`depth_normal_loss`."""
         maps, camera = surface_of(inputs)
         return depth_normal_loss(maps, camera, edge_weight(inputs.target) if self.edges else None)
 
@@ -382,11 +381,7 @@ def weighted_mean(values: Tensor, weight: Tensor) -> Tensor:
 
 
 def surface_of(inputs: LossInputs) -> tuple[SurfaceMaps, Camera]:
-    """The surface and the camera of a training step.
-
-    Raises:
-        ValueError: If the step has none.
-    """
+    """The surface and the camera of a training step."""
     if inputs.surface is None or inputs.camera is None:
         raise ValueError("This loss needs `LossInputs.surface` and `LossInputs.camera`: pass both.")
     return inputs.surface, inputs.camera

@@ -37,7 +37,6 @@ class Brushes:
             asyncio.run_coroutine_threadsafe(connection.send(self._told), loop)
 
     def forget(self, key: str) -> None:
-        """End the connection of a browser."""
         known = self._open.pop(key, None)
         if known is not None:
             asyncio.run_coroutine_threadsafe(known[0].close(), known[1])

@@ -29,10 +29,6 @@ def changed_settings(parser: ArgumentParser, settings: Namespace, values: Mappin
         parser: From :meth:`Simulation.parser`.
         settings: Settings from it.
         values: New values by the names of their fields, with dots, or of parameters.
-
-    Raises:
-        ArgumentError: If a value has the wrong type.
-        ValueError: If there is no such field, or a value is out of range.
     """
     numbers = {name: value for name, value in values.items() if find(name) is not None}
     shader = {name: value for name, value in values.items() if name.startswith(SHADER)}
@@ -75,9 +71,6 @@ def take(
 
     Returns:
         The state to go on from; None if another field has changed, so that the simulation has to be made anew.
-
-    Raises:
-        ValueError: If a value is out of range; the simulation then stays as it was.
     """
     numbers = ["wind.flow" if name in POLAR else name for name in names if find(name) is not None]
     heads = {name.split(".")[0] for name in names if find(name) is None}

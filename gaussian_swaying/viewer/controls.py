@@ -122,7 +122,6 @@ class Controls(Panel):
         self.on(self.grid.on_update, lambda: self._set("solver.dx", self._grids[self.grid.value]))
 
     def _forces(self) -> None:
-        """A control for each number that a force of the user's registered."""
         self.forces: dict[str, Any] = {}
         setup = self.session.simulation.setup
         for name in present(setup, "forces."):
@@ -161,7 +160,6 @@ class Controls(Panel):
     # ---- health
 
     def tell(self) -> None:
-        """Write the figures in the corner."""
         session = self.session
         rates, health = session.rates(), session.snapshot.health
         running = "paused" if session.paused else f"{rates.real_time:.2g} x real time"
@@ -256,7 +254,6 @@ class Controls(Panel):
         self.session.change(changed | {"solver.damping": known.damping})
 
     def _show_known(self) -> None:
-        """Show which known material the numbers are, and what of it cannot change in motion."""
         material = self._settings.material
         name = name_of(material.E, material.nu, material.density)
         self.known.value = name or OWN  # type: ignore[misc]
@@ -332,7 +329,6 @@ class Controls(Panel):
         )
 
     def _anchor(self) -> np.ndarray:
-        """Return the tip of the arrow of the wind, just above the object."""
         scene = self.session.simulation.scene
         low, high = (corner.double() for corner in scene.bounds)
         up = scene.frame.rotation[2].to(low)

@@ -97,7 +97,6 @@ class Door:
 
 
 def _tokens(path: str, headers: Mapping[str, str], port: int) -> list[str]:
-    """The tokens that a request gives, in its path or as a cookie."""
     found = parse_qs(urlsplit(path).query).get("token", [])
     try:
         cookie = SimpleCookie(headers.get("Cookie") or "").get(f"wind-{port}")

@@ -66,7 +66,6 @@ class Files:
             self.stop_recording(event.client)
 
     def stop_recording(self, client: viser.ClientHandle | None) -> None:
-        """End the video, and send it to a browser."""
         film, self.page.recording = self.page.recording, None
         self.record.label = RECORD
         if film is None:

@@ -60,12 +60,7 @@ class FilmStrip:
         self._last = picture
 
     def finish(self) -> bytes:
-        """The video as .mp4.
-
-        Raises:
-            ValueError: If there is no picture.
-            OSError: If ffmpeg fails.
-        """
+        """The video as .mp4."""
         with self._lock:
             self._done = True
         try:

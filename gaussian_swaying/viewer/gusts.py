@@ -40,7 +40,6 @@ class Gusts:
         self.show()
 
     def show(self) -> None:
-        """Show the modulations that are there."""
         there = self._there()
         if there == self._shown:
             return
@@ -98,11 +97,9 @@ class Gusts:
 
 
 def _plain(modulation: Any) -> dict[str, Any]:
-    """The class and the arguments of a modulation in the settings."""
     return {"class_path": modulation["class_path"], "init_args": dict(modulation.get("init_args") or {})}
 
 
 def _name(modulation: dict[str, Any]) -> str:
-    """Return the name of a modulation on the page."""
     kind = modulation["class_path"].rsplit(".", 1)[-1]
     return next((name for name, known in KINDS.items() if known == kind), kind)

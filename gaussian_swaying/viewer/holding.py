@@ -63,7 +63,6 @@ class Holding:
             self.session.drag([float(x) for x in self._handle.position])
 
     def let_go(self) -> None:
-        """Release the material that the mouse pulls."""
         handle, self._handle = self._handle, None
         if handle is not None:
             handle.remove()
@@ -90,7 +89,6 @@ class Holding:
         return self.session.simulation.scene.size * self.pin_size.value / 100
 
     def _hold_box(self) -> None:
-        """Add a pin that holds the material in the box at rest."""
         if self.session.settings.normalisation is not None:
             self.page.tell("Pins of this configuration are in normalised coordinates: write them into its file.")
             return

@@ -109,7 +109,6 @@ class Incoming:
     # ---- files
 
     def _arrived(self) -> int:
-        """Bytes of files that are in memory."""
         assert self.server is not None
         gui = self.server.gui
         kept = [getattr(handle.value, "content", b"") for handle in list(gui._gui_input_handle_from_uuid.values())]
@@ -230,7 +229,6 @@ def what_is_wrong(handle: Any, value: Any) -> str | None:
 
 
 def _numbers(values: Any, count: int) -> bool:
-    """True for a list of ``count`` finite numbers."""
     return (
         isinstance(values, (list, tuple))
         and len(values) == count

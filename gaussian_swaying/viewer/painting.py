@@ -124,7 +124,6 @@ class Painting:
             self.session.pause(self._paused)
 
     def forget(self) -> None:
-        """Forget what was painted, as there is another scene."""
         self.stop()
         self._strokes = self._view = self._mark = None
         self._show()
@@ -143,7 +142,6 @@ class Painting:
         self.page.brushes.tell(self._paints, 0.5 * self.size.value)
 
     def _show(self) -> None:
-        """Show tints, and what can be done."""
         strokes, scene = self._strokes, self.session.simulation.scene
         on = strokes is not None and self._paints
         roles = None
@@ -170,7 +168,6 @@ class Painting:
             self.page.turns.ask("brush", self._take)
 
     def _take(self) -> None:
-        """Paint what has come."""
         try:
             while self._waiting:
                 key, move = self._waiting.popleft()
@@ -251,7 +248,6 @@ class Painting:
     # ---- what comes of it
 
     def _apply(self) -> None:
-        """Make the simulation anew with the parts, in the size that it has."""
         strokes, session = self._strokes, self.session
         if strokes is None:
             return
@@ -291,7 +287,6 @@ class Painting:
 
 
 def _in_source(simulation: Simulation, index: Tensor) -> Tensor:
-    """Indices in the source of Gaussians that are drawn, from those among what is drawn."""
     drawn = simulation.scene.drawn
     return index if bool(drawn.all()) else drawn.nonzero()[:, 0][index]
 

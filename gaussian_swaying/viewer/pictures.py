@@ -151,7 +151,6 @@ class PictureSize:
         return max(2 * round(width * scale / 2), 2), max(2 * round(height * scale / 2), 2)
 
     def took(self, seconds: float) -> None:
-        """Tell how long a picture took."""
         while seconds > 1.3 * self.seconds and self._level < len(SIZES) - 1:
             seconds *= (SIZES[self._level + 1] / SIZES[self._level]) ** 2  # about as many pixels as it takes time
             self._level += 1

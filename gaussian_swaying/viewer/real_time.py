@@ -46,9 +46,6 @@ def in_real_time(parser: ArgumentParser, settings: Namespace, simulation: Simula
         parser: From :meth:`Simulation.parser`.
         settings: The settings as they were configured.
         simulation: Their simulation.
-
-    Raises:
-        ValueError: If the configured simulation cannot start.
     """
     configured = float(settings.solver.dx)
     made = {configured: (settings, simulation)}
@@ -80,9 +77,6 @@ def finest_in_real_time(
         seconds: Length of the motion whose cost it estimates [s].
         configured: Smallest grid spacing [m].
         coarsest: Largest grid spacing [m]; if it is less than ``configured``, that one is kept.
-
-    Raises:
-        ValueError: If the simulation cannot start on the configured grid; coarser ones are passed over.
     """
     wish, first = seconds / HEADROOM, measure(configured)
     if first.total_seconds <= wish or configured >= coarsest:

@@ -39,10 +39,6 @@ def settings_of_splat(
         further: Options that replace what is suggested.
         tell: Called with the share that is done, from 0 to 1, and the name of the next task.
         quick: Whether the grid is a coarser one than that of its starter.
-
-    Raises:
-        ValueError: If the file is not a splat, or nothing in it can move.
-        FileNotFoundError: If there is no such file.
     """
     file = Path(path).resolve()
     tell(0.05, "Reading the splat")

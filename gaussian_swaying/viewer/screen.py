@@ -52,10 +52,6 @@ def make_server(host: str, port: int, door: Door, incoming: Incoming, streams: S
         door: Checks who may open the page.
         incoming: Checks the messages of browsers.
         streams: Has the connections of those that draw themselves.
-
-    Raises:
-        ImportError: If viser is not installed.
-        ValueError: If nothing can listen there.
     """
     try:
         import viser
@@ -220,7 +216,6 @@ class Screen:
         return f"http://{f'[{host}]' if ':' in host else host}:{self.server.get_port()}{token}"
 
     def close(self) -> None:
-        """Stop serving."""
         self._closed.set()
         self.turns.close()
         for thread in self._threads:
@@ -229,12 +224,10 @@ class Screen:
         self._scratch.cleanup()
 
     def tell(self, notice: str, seconds: float = 15.0) -> None:
-        """Show a sentence on the page for some time."""
         self._notice = (notice, time.monotonic() + seconds)
 
     @property
     def notice(self) -> str | None:
-        """The sentence that is shown now."""
         return self._notice[0] if time.monotonic() < self._notice[1] else None
 
     def redraw(self) -> None:
@@ -271,7 +264,6 @@ class Screen:
         return pinhole(rotation, turn @ matrix[:3, 3], move.fov, *move.size, move.near)
 
     def pictures_per_second(self) -> float:
-        """Pictures that the fastest browser draws or gets."""
         now = time.perf_counter()
         sent = max((sum(now - t < 2.0 for t in list(times)) / 2.0 for times in self._drawn.values()), default=0.0)
         return max(sent, self.streams.rate())
@@ -293,7 +285,6 @@ class Screen:
             self.turns.ask("stop recording", lambda: self.stop_recording(None))
 
     def _serve(self, client: viser.ClientHandle, gone: threading.Event) -> None:
-        """Draw for a browser until it is gone."""
         while not self._shown.wait(0.1):
             if gone.is_set() or self._closed.is_set():
                 return
@@ -304,13 +295,7 @@ class Screen:
             self.streams.forget(key)
 
     def _keep_sending(self, client: viser.ClientHandle, gone: threading.Event, key: str) -> None:
-        """Send a browser states or pictures until it is gone.
-
-        Args:
-            client: The browser.
-            gone: Set once it is gone.
-            key: With which it may open a connection for states.
-        """
+        """Send a browser states or pictures until it is gone."""
         from viser._messages import RunJavascriptMessage
 
         join = RunJavascriptMessage(f"window.wind?.join({key!r})")
@@ -357,7 +342,6 @@ class Screen:
                 gone.wait(left)
 
     def _drawn_there(self, client: viser.ClientHandle, snapshot: Snapshot) -> bool:
-        """True if a browser draws a snapshot itself, provided that it can."""
         recorded = self.recording is not None and self.recorder == client.client_id
         plain = self.by_browser and self.shown == "colour" and not self.streaks
         return plain and not recorded and drawable(snapshot)
@@ -393,7 +377,6 @@ class Screen:
         """Write the figures in the corner, and whatever else follows the session."""
 
     def _keep_telling(self) -> None:
-        """Keep the figures in the corner up to date."""
         if not self._shown.is_set():
             return
         with suppress(Exception):  # the figures of a moment, while a scene is replaced

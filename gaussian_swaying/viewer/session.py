@@ -184,7 +184,6 @@ class Session:
         self._ask(take_scene)
 
     def reset(self) -> None:
-        """Go back to rest."""
         self._ask(self._reset)
 
     def undo(self) -> None:
@@ -197,7 +196,6 @@ class Session:
 
     @property
     def changes(self) -> int:
-        """Number of changes that can be undone."""
         return len(self._past)
 
     def reachable(self) -> list[Namespace]:
@@ -205,13 +203,11 @@ class Session:
         return [self.settings, self._first, *(past.settings for past in list(self._past))]
 
     def pause(self, paused: bool = True) -> None:
-        """Pause, or go on."""
         with self._wake:
             self.paused = paused
             self._wake.notify_all()
 
     def step(self) -> None:
-        """Make one step, if paused."""
         with self._wake:
             self._single = True
             self._wake.notify_all()
@@ -229,12 +225,10 @@ class Session:
         self._ask(lambda: None if self._pull is None else self._pull.aim(place))
 
     def let_go(self) -> None:
-        """Release the material that was grabbed."""
         self._ask(self._let_go)
 
     @property
     def pulls(self) -> bool:
-        """True while the user pulls at something."""
         return self._pull is not None
 
     @property
@@ -253,7 +247,6 @@ class Session:
         return config_text(self.parser, self.settings)
 
     def rates(self) -> Rates:
-        """Return the present speed."""
         steps, now = list(self._steps), time.perf_counter()
         steps = [step for step in steps if now - step[0] < WINDOW]
         health, simulation = self.snapshot.health, self.simulation
@@ -334,7 +327,6 @@ class Session:
             self._pace(health.time)
 
     def _pace(self, simulated: float) -> None:
-        """Wait while the simulation is ahead of the wanted speed."""
         now = time.perf_counter()
         anchor = self._anchor
         if anchor is None:
@@ -358,7 +350,6 @@ class Session:
             self._wake.notify_all()
 
     def _begin(self, state: State) -> None:
-        """Go on from a state at rest."""
         self._let_go()
         self._broken, self.problem, self._anchor = False, None, None
         self._steps.clear()
@@ -378,7 +369,6 @@ class Session:
             self._past.append(Past(before, list(values), now))
 
     def _apply(self, settings: Namespace, names: list[str]) -> None:
-        """Adopt settings in which some fields differ, and change the simulation accordingly."""
         if not self._broken:
             self.problem = None
         state = take(self.simulation, self.snapshot.state, self.parser, settings, names)

@@ -46,12 +46,10 @@ class Line:
 
     @property
     def free(self) -> bool:
-        """True if the browser can take another message."""
         return self._sent - self._taken < AHEAD
 
     @property
     def draws(self) -> bool:
-        """True once the browser draws."""
         return self._first is not None and self._taken >= self._first
 
     @property
@@ -134,7 +132,6 @@ class Line:
         return True
 
     def close(self) -> None:
-        """End the connection."""
         asyncio.run_coroutine_threadsafe(self._connection.close(), self._loop)
 
     def _put(self, data: bytes) -> None:
@@ -160,13 +157,11 @@ class Streams:
         self._failure: Exception | None = None
 
     def expect(self) -> str:
-        """A key for another browser."""
         key = secrets.token_urlsafe(16)
         self._lines[key] = None
         return key
 
     def forget(self, key: str) -> None:
-        """End what belongs to a key."""
         line = self._lines.pop(key, None)
         if line is not None:
             line.close()
@@ -177,7 +172,6 @@ class Streams:
         return self._lines.get(key)
 
     def rate(self) -> float:
-        """Pictures a second of the browser that draws most."""
         return max((line.rate for line in list(self._lines.values()) if line is not None), default=0.0)
 
     def scene(self, snapshot: Snapshot, turn: Tensor) -> tuple[tuple[Any, ...], bytes] | None:
@@ -226,7 +220,6 @@ class Streams:
         return handle
 
     async def _serve(self, key: str, connection: Any) -> None:
-        """Listen to a browser until it is gone, or sends what it cannot have sent."""
         from websockets.exceptions import ConnectionClosed
 
         connection.protocol.max_message_size = ANSWER.size
@@ -264,7 +257,6 @@ def with_program(process_request: Callable[[Any, Any], Any]) -> Callable[[Any, A
 
 
 def _filled(response: Any, body: bytes, kind: str, zipped: bool) -> Any:
-    """An answer with another content."""
     response.body = body
     for name in ("Content-Type", "Content-Length", "Content-Encoding"):
         if name in response.headers:

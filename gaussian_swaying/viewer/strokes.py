@@ -61,7 +61,6 @@ class Strokes:
         return self._past[-1] if self._past else None
 
     def parts(self) -> Parts:
-        """The parts as they are now."""
         return Parts(self.labels.clone(), self.known)
 
     def paint(self, part: Part, index: Tensor, mark: Hashable = None, goes_on: bool = False) -> None:

@@ -112,9 +112,6 @@ def read_model_camera(path: str | os.PathLike[str], index: int, near: float = 0.
 
     Returns:
         The camera in float64; the principal point is the image's centre.
-
-    Raises:
-        ValueError: If the file cannot be read, has no such camera, or a field of the camera is missing.
     """
     entries = read_json(path, "camera file")
     if not isinstance(entries, list) or not 0 <= index < len(entries):

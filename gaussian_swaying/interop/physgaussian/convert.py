@@ -45,10 +45,6 @@ def convert(
 
     Returns:
         The settings, without a splat (``scene.ply`` must be set), and sentences about everything whose meaning differs.
-
-    Raises:
-        ValueError: If a key is unknown, missing, out of range or not supported; the message names it.
-        TypeError: If a value has the wrong type.
     """
     take, notes = Fields(config, "PhysGaussian's configuration"), Notes()
     degrees = take.numbers("rotation_degree", [])

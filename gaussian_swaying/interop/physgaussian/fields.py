@@ -13,7 +13,6 @@ class Notes(list[str]):
     """Sentences on differences, each once."""
 
     def add(self, sentence: str) -> None:
-        """Add a sentence."""
         if sentence not in self:
             self.append(sentence)
 
@@ -27,7 +26,6 @@ class Fields:
         self._fields, self._where, self._asked = fields, where, set[str]()
 
     def given(self, name: str) -> bool:
-        """True if the key is there."""
         return name in self._fields
 
     def get(self, name: str, *default: Any) -> Any:
@@ -40,14 +38,12 @@ class Fields:
         return default[0]
 
     def number(self, name: str, *default: float) -> float:
-        """A finite number."""
         value = self.get(name, *default)
         if isinstance(value, bool) or not isinstance(value, (int, float)):
             raise TypeError(f"Expected `{name}` of {self._where} to be a number, but got {value!r}.")
         return check_vector(name, [value], 1)[0]
 
     def positive(self, name: str, *default: float) -> float:
-        """A positive number."""
         value = self.number(name, *default)
         check_positive(name, value)
         return value
@@ -62,21 +58,18 @@ class Fields:
         return int(value)
 
     def flag(self, name: str, default: bool) -> bool:
-        """True or false."""
         value = self.get(name, default)
         if not isinstance(value, bool):
             raise TypeError(f"Expected `{name}` of {self._where} to be true or false, but got {value!r}.")
         return value
 
     def list(self, name: str, *default: Any) -> Any:
-        """A list."""
         value = self.get(name, *default)
         if not isinstance(value, (list, tuple)):
             raise TypeError(f"Expected `{name}` of {self._where} to be a list, but got {value!r}.")
         return list(value)
 
     def numbers(self, name: str, *default: Any) -> Any:
-        """A list of finite numbers."""
         value = self.list(name, *default)
         return list(check_vector(name, value, len(value)))
 

@@ -24,9 +24,6 @@ def rotation_matrix(degrees: Sequence[float], axes: Sequence[int]) -> Tensor:
 
     Returns:
         Scene axes to turned axes in float64, shape (3, 3).
-
-    Raises:
-        ValueError: If there are not as many axes as angles, or an axis is not 0, 1 or 2.
     """
     if len(degrees) != len(axes):
         raise ValueError(

@@ -48,11 +48,9 @@ class BallObstacle(Obstacle):
         return self.in_metres(frame, radius=self.radius * frame.metres_per_unit)
 
     def distance(self, place: Tensor) -> tuple[Tensor, Tensor]:
-        """See :func:`~gaussian_swaying.geometry.distance.ball_distance`."""
         return ball_distance(place, self.radius.to(place))
 
     def twin(self) -> Twin:
-        """See :class:`~gaussian_swaying.mpm.twins.Twin`."""
         from gaussian_swaying.geometry.distance_triton import ball_distance
 
         return Twin(ball_distance, numbers=Numbers(1, lambda: self.radius), sources=(self,))

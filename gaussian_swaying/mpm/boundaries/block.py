@@ -59,13 +59,11 @@ class BoxObstacle(Obstacle):
         return self.in_metres(frame, half_sides=self.half_sides * frame.metres_per_unit, axes=axes)
 
     def distance(self, place: Tensor) -> tuple[Tensor, Tensor]:
-        """See :func:`~gaussian_swaying.geometry.distance.box_distance`."""
         axes = self.axes.to(place)  # its columns are the sides of the box
         distance, normal = box_distance(place @ axes, self.half_sides.to(place))
         return distance, normal @ axes.T
 
     def twin(self) -> Twin:
-        """See :class:`~gaussian_swaying.mpm.twins.Twin`."""
         from gaussian_swaying.geometry.distance_triton import box_distance
 
         numbers = Numbers(12, lambda: torch.cat([self.half_sides, self.axes.reshape(-1)]))

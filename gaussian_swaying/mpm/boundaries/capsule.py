@@ -56,11 +56,9 @@ class CapsuleObstacle(Obstacle):
         return self.in_metres(frame, radius=self.radius * frame.metres_per_unit, half_axis=half)
 
     def distance(self, place: Tensor) -> tuple[Tensor, Tensor]:
-        """See :func:`~gaussian_swaying.geometry.distance.capsule_distance`."""
         return capsule_distance(place, self.half_axis.to(place), self.radius.to(place))
 
     def twin(self) -> Twin:
-        """See :class:`~gaussian_swaying.mpm.twins.Twin`."""
         from gaussian_swaying.geometry.distance_triton import capsule_distance
 
         def numbers() -> Tensor:

@@ -57,7 +57,6 @@ class EnclosingBox(Boundary):
         return moved
 
     def forward(self, velocity: Tensor, nodes: Nodes) -> Tensor:
-        """Stop the nodes at or beyond each face."""
         for plane in self.planes:
             velocity = plane(velocity, nodes)
         return velocity

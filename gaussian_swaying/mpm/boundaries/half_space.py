@@ -49,12 +49,10 @@ class HalfSpaceObstacle(Obstacle):
         return self.in_metres(frame, normal=frame.direction_to_sim(self.normal).clone())
 
     def distance(self, place: Tensor) -> tuple[Tensor, Tensor]:
-        """Distance along the normal."""
         normal = self.normal.to(place)
         return (place * normal).sum(-1), normal.expand_as(place)
 
     def twin(self) -> Twin:
-        """See :class:`~gaussian_swaying.mpm.twins.Twin`."""
         from gaussian_swaying.geometry.distance_triton import half_space_distance
 
         return Twin(half_space_distance, numbers=Numbers(3, lambda: self.normal), sources=(self,))

@@ -70,11 +70,9 @@ class MeshObstacle(Obstacle):
         return moved
 
     def distance(self, place: Tensor) -> tuple[Tensor, Tensor]:
-        """Interpolated from the grid."""
         axes = self.axes.to(place)
         distance, normal = grid_distance(place @ axes, self.values, self.corner, self.spacing)
         return distance, normal @ axes.T
 
     def twin(self) -> Twin:
-        """See :class:`~gaussian_swaying.mpm.twins.Twin`."""
         return grid_twin(self, self.values, self.corner, self.axes, self.spacing)

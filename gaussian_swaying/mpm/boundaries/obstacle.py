@@ -118,7 +118,6 @@ class Obstacle(Boundary):
         return distance - self.gap, normal @ turn.T.to(place), (later - (place - here.to(place))) / dt
 
     def forward(self, velocity: Tensor, nodes: Nodes) -> Tensor:
-        """Stop the nodes inside."""
         assert nodes.position is not None
         distance, normal, own = self.touch(nodes.position, nodes.time, nodes.dt)
         stopped = own + plane_velocity(velocity - own, normal, "separate", self.friction)

@@ -83,7 +83,6 @@ class Plane(Boundary):
         return self.copy_in(frame, point=frame.point_to_sim(self.point), normal=normal)
 
     def forward(self, velocity: Tensor, nodes: Nodes) -> Tensor:
-        """Stop the nodes at or behind the plane."""
         assert nodes.position is not None
         normal = self.normal.to(velocity)
         behind = ((nodes.position - self.point.to(velocity)) * normal).sum(-1) <= 0
@@ -91,7 +90,6 @@ class Plane(Boundary):
         return torch.where((behind & self.active(nodes.time))[..., None], stopped, velocity)
 
     def twin(self) -> Twin:
-        """See :class:`~gaussian_swaying.mpm.twins.Twin`."""
         from gaussian_swaying.geometry.distance_triton import half_space_distance
 
         return Twin(half_space_distance, numbers=Numbers(3, lambda: self.normal), sources=(self,))

@@ -71,7 +71,6 @@ class SequentialRelease(PinnedRegion):
 
     @property
     def holds_from(self) -> float:
-        """It holds from the beginning."""
         return -math.inf
 
     def active(self, time: Tensor) -> Tensor:

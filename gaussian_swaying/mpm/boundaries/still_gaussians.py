@@ -69,7 +69,6 @@ class StillGaussians(Obstacle):
         return grid_distance(place, self.values, self.corner, self.spacing)
 
     def twin(self) -> Twin | None:
-        """See :class:`~gaussian_swaying.mpm.twins.Twin`."""
         if self.spacing == 0:
             return None
         return grid_twin(self, self.values, self.corner, torch.eye(3), self.spacing)

@@ -44,7 +44,6 @@ class VelocityBox(Boundary):
         return self.copy_in(frame)
 
     def forward(self, velocity: Tensor, nodes: Nodes) -> Tensor:
-        """Drive the nodes inside."""
         assert nodes.position is not None
         where = nodes.position
         if self.travels:

@@ -41,9 +41,6 @@ def close_pairs(
 
     Returns:
         Indices of the two samples of each pair, the smaller first, in rising order, shape (M,) each.
-
-    Raises:
-        ValueError: If there are too many pairs.
     """
     count, device = len(place), place.device
     if count < 2:

@@ -131,7 +131,6 @@ class Constraints:
     valid: Tensor
 
     def select(self, index: Tensor) -> Constraints:
-        """Some of them."""
         names = ("first", "second", "normal", "gap", "drive", "friction", "valid")
         return Constraints(*(getattr(self, name)[index] for name in names))
 

@@ -91,9 +91,6 @@ class Surface:
             spacing: Distance of neighbouring points [m]; discs reach 0.75 of it.
             thickness: Distance that two surfaces keep [m], unless ``contact`` has one.
             contact: Contact of the surface with itself.
-
-        Raises:
-            ValueError: If there is a contact but no normal or no spacing.
         """
         place = points.position.detach().reshape(-1, 3)
         if contact is not None and (normal is None or spacing <= 0 or points.position.dim() > 2):
@@ -107,7 +104,6 @@ class Surface:
         return cls(place, facing, 0.75 * spacing * full, h * full, place, contact, own)
 
     def map(self, function: Callable[[Tensor], Tensor]) -> Surface:
-        """Apply a function to every tensor."""
         place, normal, read = (function(field) for field in (self.place, self.normal, self.read))
         near = None if self.near is None else self.near.to(place.device)
         return Surface(place, normal, function(self.radius), function(self.thickness), read, self.contact, near)

@@ -146,10 +146,6 @@ class Formulation(ABC):
             position: Particle position [m], shape (..., P, 3).
             margin: Extra cells on each side.
             speed: Largest speed [m/s], for the error message.
-
-        Raises:
-            FloatingPointError: If a position is NaN or infinite.
-            ValueError: If the grid would be larger than :data:`MAX_NODES`, or too far away.
         """
         dx = self.settings.dx
         flat = position.detach().reshape(-1, 3)
@@ -324,7 +320,6 @@ class Formulation(ABC):
 
 
 def _turn(boundary: Boundary) -> int:
-    """When a boundary acts among those of a substep."""
     return 0 if isinstance(boundary, Impulse) else 2 if isinstance(boundary, RigidRegion) else 1
 
 

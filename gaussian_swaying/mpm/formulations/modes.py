@@ -413,12 +413,10 @@ class Modes(Total):
         return max(1, math.ceil(seconds / min(max(period / PER_PERIOD, SHORTEST), LONGEST) - 1e-9))
 
     def stable_substep(self, state: MPMState | None) -> float:
-        """No substep is unstable."""
         return math.inf
 
     @cached_property
     def longest_substep(self) -> float:
-        """No substep is unstable."""
         return math.inf
 
     def cells_per_second(self, state: MPMState) -> Tensor:
@@ -453,7 +451,6 @@ def why_not_modes(body: Body) -> str | None:
 
 
 def _holds_still(boundary: Boundary) -> bool:
-    """True for a pin that holds all the time and does not move."""
     still = type(boundary).forward is PinnedRegion.forward or isinstance(boundary, PinnedPoints)
     always = boundary.holds_from <= 0 and boundary.end == math.inf
     return still and always and not boundary.moves and boundary.release_time(torch.zeros(1, 3)) is None

@@ -275,7 +275,6 @@ class Total(Formulation):
         return holds
 
     def _body(self, k: int) -> _RigidNodes:
-        """The nodes of a rigid part."""
         held = self.held[k]
         assert held is not None
         assert held.share is not None
@@ -325,7 +324,6 @@ class Total(Formulation):
         return replace(held, share=share, threshold=threshold or 0.0, nodes=nodes)
 
     def first_grid(self, margin: int) -> GridSpec:
-        """The grid of the stencils."""
         return self.grid
 
     def first_state(self, velocity: Tensor, margin: int) -> MPMState:
@@ -336,7 +334,6 @@ class Total(Formulation):
         return self.read_particles(state, torch.zeros_like(node_velocity), node_velocity)
 
     def decay(self, velocity: Tensor, time: float) -> Tensor:
-        """Also with the damping of the material."""
         velocity = super().decay(velocity, time)
         return velocity if self.node_damping is None else velocity * torch.exp(-time * self.node_damping)[..., None]
 
@@ -465,7 +462,6 @@ class Total(Formulation):
         )
 
     def kinetic(self, state: MPMState) -> Tensor:
-        """Kinetic energy of the nodes."""
         assert state.node_velocity is not None
         return 0.5 * (self.node_mass * state.node_velocity.square().sum(-1)).sum(-1)
 
@@ -480,7 +476,6 @@ class Total(Formulation):
         return self.bending.energy(state.node_displacement) + own.sum(-1)
 
     def momenta(self, state: MPMState) -> tuple[Tensor, Tensor]:
-        """Momenta of the nodes."""
         assert state.node_velocity is not None
         assert state.node_displacement is not None
         momentum = self.node_mass[..., None] * state.node_velocity

@@ -173,7 +173,6 @@ class Updated(Formulation):
         return 0.5 * (self.body.points.mass * (state.velocity.square().sum(-1) + spread)).sum(-1)
 
     def momenta(self, state: MPMState) -> tuple[Tensor, Tensor]:
-        """Momenta of the particles."""
         mass = self.body.points.mass
         momentum = mass[..., None] * state.velocity
         # contribution of the affine velocity: the antisymmetric part of m C dx²/4 (Jiang et al. 2015)

@@ -74,19 +74,15 @@ class FixedCorotated(ConstitutiveLaw):
     least_nu = 0.0
 
     def energy(self, F: Tensor, mu: Tensor, lam: Tensor, internal: Tensor | None = None) -> Tensor:
-        """See :func:`fixed_corotated_energy`."""
         return fixed_corotated_energy(F, mu, lam)
 
     def pk1(self, F: Tensor, mu: Tensor, lam: Tensor, internal: Tensor | None = None) -> Tensor:
-        """See :func:`fixed_corotated_pk1`."""
         return fixed_corotated_pk1(F, mu, lam)
 
     def moduli(self, F: Tensor, mu: Tensor, lam: Tensor, internal: Tensor | None = None) -> tuple[Tensor, Tensor]:
-        """See :func:`fixed_corotated_moduli`."""
         return fixed_corotated_moduli(F, mu, lam)
 
     def twin(self) -> Twin:
-        """See :class:`~gaussian_swaying.mpm.twins.Twin`."""
         from gaussian_swaying.mpm.laws.triton.fixed_corotated import FUNCTIONS
 
         return Twin(FUNCTIONS)

@@ -114,29 +114,23 @@ class Fluid(PlasticLaw):
         self.gamma = float(gamma)
 
     def twin(self) -> Twin:
-        """See :class:`~gaussian_swaying.mpm.twins.Twin`."""
         from gaussian_swaying.mpm.laws.triton.fluid import FUNCTIONS
 
         return Twin(FUNCTIONS, numbers=Numbers(1, lambda: (self.gamma,)))
 
     def energy(self, F: Tensor, mu: Tensor, lam: Tensor, internal: Tensor | None = None) -> Tensor:
-        """See :func:`fluid_energy`."""
         return fluid_energy(F, mu, lam, self.gamma)
 
     def pk1(self, F: Tensor, mu: Tensor, lam: Tensor, internal: Tensor | None = None) -> Tensor:
-        """See :func:`fluid_pk1`."""
         return fluid_pk1(F, mu, lam, self.gamma)
 
     def kirchhoff(self, F: Tensor, mu: Tensor, lam: Tensor, internal: Tensor | None = None) -> Tensor:
-        """See :func:`fluid_kirchhoff`."""
         return fluid_kirchhoff(F, mu, lam, self.gamma)
 
     def moduli(self, F: Tensor, mu: Tensor, lam: Tensor, internal: Tensor | None = None) -> tuple[Tensor, Tensor]:
-        """See :func:`fluid_moduli`."""
         return fluid_moduli(F, mu, lam, self.gamma)
 
     def flow(
         self, stretch: Tensor, mu: Tensor, lam: Tensor, internal: Tensor | None, dt: float | Tensor
     ) -> tuple[Tensor, Tensor | None]:
-        """See :func:`fluid_flow`."""
         return fluid_flow(stretch, mu, lam, internal)

@@ -63,7 +63,6 @@ class Foam(PlasticLaw, StVKHencky):
         self.yield_stress, self.viscosity = float(yield_stress), float(viscosity)
 
     def twin(self) -> Twin:
-        """See :class:`~gaussian_swaying.mpm.twins.Twin`."""
         from gaussian_swaying.mpm.laws.triton.foam import FUNCTIONS
 
         return Twin(FUNCTIONS, numbers=Numbers(2, lambda: (self.yield_stress, self.viscosity)))
@@ -71,5 +70,4 @@ class Foam(PlasticLaw, StVKHencky):
     def flow(
         self, stretch: Tensor, mu: Tensor, lam: Tensor, internal: Tensor | None, dt: float | Tensor
     ) -> tuple[Tensor, Tensor | None]:
-        """See :func:`viscoplastic`."""
         return viscoplastic(stretch, mu, lam, internal, self.yield_stress, self.viscosity, dt)

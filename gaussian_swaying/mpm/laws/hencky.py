@@ -83,19 +83,15 @@ class StVKHencky(ConstitutiveLaw):
     """
 
     def energy(self, F: Tensor, mu: Tensor, lam: Tensor, internal: Tensor | None = None) -> Tensor:
-        """See :func:`stvk_hencky_energy`."""
         return stvk_hencky_energy(F, mu, lam)
 
     def pk1(self, F: Tensor, mu: Tensor, lam: Tensor, internal: Tensor | None = None) -> Tensor:
-        """See :func:`stvk_hencky_pk1`."""
         return stvk_hencky_pk1(F, mu, lam)
 
     def moduli(self, F: Tensor, mu: Tensor, lam: Tensor, internal: Tensor | None = None) -> tuple[Tensor, Tensor]:
-        """See :func:`stvk_hencky_moduli`."""
         return stvk_hencky_moduli(F, mu, lam)
 
     def twin(self) -> Twin:
-        """See :class:`~gaussian_swaying.mpm.twins.Twin`."""
         from gaussian_swaying.mpm.laws.triton.hencky import FUNCTIONS
 
         return Twin(FUNCTIONS)

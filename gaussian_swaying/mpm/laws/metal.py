@@ -32,7 +32,6 @@ class Metal(PlasticLaw, StVKHencky):
         self.yield_stress, self.hardening = float(yield_stress), float(hardening)
 
     def twin(self) -> Twin:
-        """See :class:`~gaussian_swaying.mpm.twins.Twin`."""
         from gaussian_swaying.mpm.laws.triton.metal import FUNCTIONS
 
         return Twin(FUNCTIONS, numbers=Numbers(3, lambda: (self.yield_stress, self.hardening, 0.0)))
@@ -40,6 +39,5 @@ class Metal(PlasticLaw, StVKHencky):
     def flow(
         self, stretch: Tensor, mu: Tensor, lam: Tensor, internal: Tensor | None, dt: float | Tensor
     ) -> tuple[Tensor, Tensor | None]:
-        """See :func:`von_mises`."""
         assert internal is not None
         return von_mises(stretch, mu, lam, internal, self.yield_stress, self.hardening)

@@ -61,19 +61,15 @@ class NeoHookean(ConstitutiveLaw):
     least_nu = 0.0
 
     def energy(self, F: Tensor, mu: Tensor, lam: Tensor, internal: Tensor | None = None) -> Tensor:
-        """See :func:`neo_hookean_energy`."""
         return neo_hookean_energy(F, mu, lam)
 
     def pk1(self, F: Tensor, mu: Tensor, lam: Tensor, internal: Tensor | None = None) -> Tensor:
-        """See :func:`neo_hookean_pk1`."""
         return neo_hookean_pk1(F, mu, lam)
 
     def moduli(self, F: Tensor, mu: Tensor, lam: Tensor, internal: Tensor | None = None) -> tuple[Tensor, Tensor]:
-        """See :func:`neo_hookean_moduli`."""
         return neo_hookean_moduli(F, mu, lam)
 
     def twin(self) -> Twin:
-        """See :class:`~gaussian_swaying.mpm.twins.Twin`."""
         from gaussian_swaying.mpm.laws.triton.neo_hookean import FUNCTIONS
 
         return Twin(FUNCTIONS)

@@ -34,7 +34,6 @@ class Plasticine(PlasticLaw, StVKHencky):
         self.yield_stress, self.softening, self.residual = float(yield_stress), float(softening), float(residual)
 
     def twin(self) -> Twin:
-        """See :class:`~gaussian_swaying.mpm.twins.Twin`."""
         from gaussian_swaying.mpm.laws.triton.metal import FUNCTIONS
 
         return Twin(FUNCTIONS, numbers=Numbers(3, lambda: (self.yield_stress, -self.softening, self.residual)))
@@ -42,6 +41,5 @@ class Plasticine(PlasticLaw, StVKHencky):
     def flow(
         self, stretch: Tensor, mu: Tensor, lam: Tensor, internal: Tensor | None, dt: float | Tensor
     ) -> tuple[Tensor, Tensor | None]:
-        """See :func:`von_mises`."""
         assert internal is not None
         return von_mises(stretch, mu, lam, internal, self.yield_stress, -self.softening, self.residual)

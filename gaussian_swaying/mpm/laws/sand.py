@@ -86,7 +86,6 @@ class Sand(PlasticLaw, StVKHencky):
         self.internal = 0.0 if volume_correction else None
 
     def twin(self) -> Twin:
-        """See :class:`~gaussian_swaying.mpm.twins.Twin`."""
         from gaussian_swaying.mpm.laws.triton.sand import FUNCTIONS
 
         numbers = (cone_slope(self.friction_angle), 0.0 if self.internal is None else 1.0)
@@ -95,6 +94,5 @@ class Sand(PlasticLaw, StVKHencky):
     def flow(
         self, stretch: Tensor, mu: Tensor, lam: Tensor, internal: Tensor | None, dt: float | Tensor
     ) -> tuple[Tensor, Tensor | None]:
-        """See :func:`drucker_prager`."""
         internal = None if self.internal is None else internal
         return drucker_prager(stretch, mu, lam, internal, self.friction_angle)

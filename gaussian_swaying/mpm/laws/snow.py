@@ -90,7 +90,6 @@ class Snow(PlasticLaw):
         self.hardening = float(hardening)
 
     def twin(self) -> Twin:
-        """See :class:`~gaussian_swaying.mpm.twins.Twin`."""
         from gaussian_swaying.mpm.laws.triton.snow import FUNCTIONS
 
         numbers = (self.critical_compression, self.critical_stretch, self.hardening)
@@ -114,6 +113,5 @@ class Snow(PlasticLaw):
     def flow(
         self, stretch: Tensor, mu: Tensor, lam: Tensor, internal: Tensor | None, dt: float | Tensor
     ) -> tuple[Tensor, Tensor | None]:
-        """See :func:`snow_plasticity`."""
         assert internal is not None
         return snow_plasticity(stretch, mu, lam, internal, self.critical_compression, self.critical_stretch)

@@ -119,19 +119,15 @@ class SpringNetwork(ConstitutiveLaw):
     """
 
     def energy(self, F: Tensor, mu: Tensor, lam: Tensor, internal: Tensor | None = None) -> Tensor:
-        """See :func:`spring_network_energy`."""
         return spring_network_energy(F, mu, lam)
 
     def pk1(self, F: Tensor, mu: Tensor, lam: Tensor, internal: Tensor | None = None) -> Tensor:
-        """See :func:`spring_network_pk1`."""
         return spring_network_pk1(F, mu, lam)
 
     def moduli(self, F: Tensor, mu: Tensor, lam: Tensor, internal: Tensor | None = None) -> tuple[Tensor, Tensor]:
-        """See :func:`spring_network_moduli`."""
         return spring_network_moduli(F, mu, lam)
 
     def twin(self) -> Twin:
-        """See :class:`~gaussian_swaying.mpm.twins.Twin`."""
         from gaussian_swaying.mpm.laws.triton.spring_network import FUNCTIONS
 
         return Twin(FUNCTIONS)

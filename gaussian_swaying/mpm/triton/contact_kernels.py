@@ -38,7 +38,6 @@ def _place(
     fields, base, fraction, arm, rest, facing, radius, thickness, places, row, moving, p, mask, sx, sy, inverse_dx,
     BOTH: tl.constexpr, ARMS: tl.constexpr, VIRTUAL: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
-    """Position, thickness, normal and radius of samples now, with BOTH also their velocity."""
     x, v, d0, d1, d2 = place_now(
         fields, base, fraction, arm, rest, places, p, mask, sx, sy, inverse_dx, True, BOTH, ARMS, VIRTUAL, BLOCK
     )
@@ -80,7 +79,6 @@ def _over(d0, d1, d2, squared, at, mask):
 
 @triton.jit
 def _keep(data, other, slots, places, p, many, acts, q, n0, n1, n2, target):
-    """Write a constraint to the next slot of each sample."""
     at = many * places + p
     acts = acts & (many < slots)
     tl.store(other + at, q, acts)
@@ -184,7 +182,6 @@ def _constrain_walls(
 
 @triton.jit
 def _mark_nodes(base, marked, places, p, mask, sx, sy, VIRTUAL: tl.constexpr):
-    """Mark the nodes around places."""
     one = tl.full(p.shape, 1, tl.int32)
     node = tl.load(base + p, mask, 0)
     for i in range(3):
@@ -197,7 +194,6 @@ def _mark_nodes(base, marked, places, p, mask, sx, sy, VIRTUAL: tl.constexpr):
 def _mobility(
     base, fraction, arm, total, moving, places, p, mask, sx, sy, inverse_dx, ARMS: tl.constexpr, VIRTUAL: tl.constexpr
 ):
-    """Bound of how much unit impulses at all constraints move each sample, as ``Rows.mobility``."""
     f = load3(fraction, places, p, mask)
     node = tl.load(base + p, mask, 0)
     wz, gz = axis_weights(f[2], inverse_dx)
@@ -353,7 +349,6 @@ def _push_nodes(
     entry_start, entry_place, entry_weight, total, touched, nodes, impulse, fields, programs,
     TALL: tl.constexpr,
 ):  # fmt: skip
-    """Give the impulses of the samples to the nodes."""
     ENTRIES: tl.constexpr = 32 if TALL > 1 else 1  # at a time
     entry = tl.arange(0, ENTRIES)[None, :]
     for first in range(tl.program_id(0) * TALL, nodes, programs * TALL):

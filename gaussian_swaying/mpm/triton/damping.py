@@ -34,7 +34,6 @@ def kelvin_voigt_adjoint(F, rate, Q, mu, lam, time):
 
 @triton.jit
 def _symmetric(a):
-    """The symmetric part."""
     s01 = 0.5 * (a[1] + a[3])
     s02 = 0.5 * (a[2] + a[6])
     s12 = 0.5 * (a[5] + a[7])

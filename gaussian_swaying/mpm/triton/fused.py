@@ -254,14 +254,12 @@ class Fused(ABC):
         options: dict[str, Any],
         looks: list[int],
     ) -> MPMState:
-        """Run a part of a rollout whose schedule fits in the buffers."""
         self.schedule[: steps + 2].copy_(self.table(kick_time(state, dt), dt, steps), non_blocking=True)
         self.time.copy_(state.time)
         self.dt.fill_(dt)
         loaded = len(twins) > 0 or options["FORCE"]
 
         def begin(count: int) -> None:
-            """Write the buffers that the substeps read besides the state and the schedule."""
             self.first_step.zero_()
             for k, (twin, (first, many)) in enumerate(zip(twins, self.forces.numbers, strict=True)):
                 if many:
@@ -300,7 +298,6 @@ class Fused(ABC):
     # ---- forces in torch
 
     def _fill(self, force: Tensor | None, drag: Tensor | None) -> None:
-        """Put a force and its resistance into the buffer that the kernels read."""
         points = self.body.points
         if force is not None:
             self.force_in[:, :3].copy_(force.expand_as(points.position).reshape(-1, 3))
@@ -308,7 +305,6 @@ class Fused(ABC):
             self.force_in[:, 3].copy_(drag.expand_as(points.mass).reshape(-1))
 
     def _ask(self, state: MPMState) -> tuple[Tensor | None, Tensor | None]:
-        """The sum of the forces in torch and the sum of their resistances."""
         return added([split(force(state), force, state) for force in self.asked])
 
     def _asked_key(self) -> tuple[object, ...]:
@@ -354,7 +350,6 @@ class Fused(ABC):
         return work.reshape(self.body.points.mass.shape[:-1])
 
     def pass_time(self) -> None:
-        """Move the time of the substep on."""
         time, dt = self.time, self.dt
         call(lambda: time.add_(dt), self.device)
 

@@ -148,7 +148,6 @@ class FusedContact:
 
     @property
     def key(self) -> tuple[object, ...]:
-        """Return the key that recorded substeps depend on."""
         return (self.room, self.slots, self.data.data_ptr(), self.candidates.data_ptr())
 
     @property
@@ -167,11 +166,7 @@ class FusedContact:
         return int(self.status[int(list_kernels.ROUNDS.value)])
 
     def fits(self) -> bool:
-        """True if the buffers were large enough for all lists so far; if not, enlarge them. The host waits.
-
-        Raises:
-            ValueError: If the lists are too long for any buffer.
-        """
+        """True if the buffers were large enough for all lists so far; if not, enlarge them. The host waits."""
         if self.stage.contact is None:  # the room is exact
             return True
         _, room, slots, *_ = self.status.tolist()

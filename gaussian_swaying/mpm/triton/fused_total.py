@@ -126,7 +126,6 @@ class FusedTotal(Fused):
 
     @property
     def launches(self) -> bool:
-        """True if the kernels apply all boundaries."""
         return self.plain and (self.touching is None or None not in self.touching.solids)
 
     def _take_sheets(self) -> None:
@@ -145,7 +144,6 @@ class FusedTotal(Fused):
         check_indices(self.curving.numel())
 
     def _bend(self, partial: Tensor, width: int) -> None:
-        """Add the forces of sheets that bend to the sums of the cells."""
         block = lanes(self.device, _BENT, 1)
         launch(kernels.total_bend, (-(-self.bent // block),))(
             self.bent_cell, self.bent_node, self.curving, self.fields, partial, self.bent, self.cells,
@@ -200,7 +198,6 @@ class FusedTotal(Fused):
         return self._partial[rows, width, use]
 
     def join_pieces(self, pieces: Tensor, cells: Tensor, width: int) -> None:
-        """Add the sums of the pieces of each cell."""
         block = lanes(self.device, 8, 1)
         launch(kernels.total_pieces, (-(-self.cells // block), 27))(
             pieces, cells, self.first_piece, self.cells, self.pieces, WIDTH=width, BLOCK=block, num_warps=1
@@ -336,7 +333,6 @@ class FusedTotal(Fused):
         return total.reshape(self.impulse.shape)
 
     def _constrain(self) -> None:
-        """Apply the boundary conditions that the kernels do not support, and update the displacements."""
         bound, inverse = self.bound, self.bound.node_inverse_mass
         shape = (*inverse.shape, 3)
         # nodes without mass keep no velocity from a boundary
@@ -365,7 +361,6 @@ class FusedTotal(Fused):
             self.taken_and_done[taken:].copy_(self._work().reshape(-1))
 
     def _views(self, found: Tensor) -> dict[str, Tensor]:
-        """The fields of a state in a buffer of ``room`` entries."""
         views, first = {}, 0
         for name, shape in self.shapes.items():
             views[name] = found[first : first + shape.numel()].view(shape)

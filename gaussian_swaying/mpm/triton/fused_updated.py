@@ -104,16 +104,13 @@ class FusedUpdated(Fused):
 
     @property
     def node_block(self) -> int:
-        """Nodes of a program."""
         return lanes(self.device, 256, SPAN)
 
     @property
     def launches(self) -> bool:
-        """True if no boundary acts in torch."""
         return not self._acting
 
     def _take_grid(self, grid: GridSpec, width: int) -> None:
-        """Allocate buffers for a grid, and drop the graphs of another one."""
         nodes = grid.node_count * self.scenes
         check_indices(nodes * width)
         if nodes > len(self.velocity) or width != self.momentum.shape[1]:
@@ -198,7 +195,6 @@ class FusedUpdated(Fused):
 
     @property
     def _acting(self) -> bool:
-        """True if boundary conditions act in torch."""
         return len(self.body.boundaries) > 0 and not self.turns
 
     def _pressed(self) -> Tensor:
@@ -258,7 +254,6 @@ class FusedUpdated(Fused):
         return key
 
     def _load(self, state: MPMState) -> None:
-        """Sort the particles by cell and copy their fields to the buffers."""
         self.momentum.zero_()  # an interrupted part may have left values
         self.marks.zero_()
         self.order.copy_(torch.argsort(self._keys(state.position.reshape(-1, 3), given=True), stable=not self.atomic))
@@ -274,7 +269,6 @@ class FusedUpdated(Fused):
         )  # fmt: skip
 
     def _several(self, steps: int, options: dict[str, Any]) -> None:
-        """Run substeps, from the start of one to the start of a later one."""
         key = (*options.values(), self.grid, self.moving.data_ptr())
         self.repeat(steps, key, lambda offset: self.substep(offset, options))
 
@@ -309,7 +303,6 @@ class FusedUpdated(Fused):
             self._scatter(options["IMPLICIT"])
 
     def _scatter(self, implicit: bool) -> None:
-        """Add the particles to the grid in a fixed order, whatever the number of threads."""
         nodes, width, dx = self.grid.node_count * self.scenes, self.momentum.shape[1], self.grid.dx
         _, ny, nz = self.grid.resolution
         spans = -(-nodes // SPAN)
@@ -348,7 +341,6 @@ class FusedUpdated(Fused):
             self.pass_time()
 
     def _constrain(self) -> None:
-        """Boundary conditions on the velocities of the nodes."""
         grid = self.grid
         nodes = grid.node_count * self.scenes
         shape = (*self.body.points.position.shape[:-2], grid.node_count)
@@ -393,7 +385,6 @@ class FusedUpdated(Fused):
         lost: Tensor,
         internal: Tensor | None,
     ) -> dict[str, Any]:
-        """The rows of the particles as fields of the state."""
         block = lanes(self.device, 128)
         launch(kernels.updated_read, (-(-self.count // block),))(
             self.order, self.moving, self.count, position, velocity, affine, F, F_total, lost,
@@ -422,7 +413,6 @@ class FusedUpdated(Fused):
 
 
 def _pins(boundary: Boundary, held: Held) -> bool:
-    """True if a boundary holds the nodes of some particles at rest, all at once."""
     return type(boundary) is PinnedRegion and held.release is None
 
 

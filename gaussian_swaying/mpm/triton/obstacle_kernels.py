@@ -63,7 +63,6 @@ def stop_nodes(
 
 @triton.jit
 def _at(keys, count, time):
-    """Return position and rotation at a time, interpolated between the keys."""
     last = 0
     for k in range(1, count):
         last += (tl.load(keys + k * KEY) <= time).to(tl.int32)
@@ -86,7 +85,6 @@ def _at(keys, count, time):
 
 @triton.jit
 def _rotation(turn):
-    """As ``geometry.rotations.rotation_of``."""
     angle = tl.sqrt(dot3(turn, turn))
     scale = 1 / tl.where(angle > 0, angle, 1.0)
     x = turn[0] * scale

@@ -81,7 +81,6 @@ def axis_weights(f, inverse_dx):
 
 @triton.jit
 def _columns(values, count, index, mask, FIRST: tl.constexpr, COUNT: tl.constexpr):
-    """COUNT values of some particles from row FIRST on, as a tuple."""
     found = ()
     for k in tl.static_range(COUNT):
         found = found + (tl.load(values + (FIRST + k) * count + index, mask, 0.0),)

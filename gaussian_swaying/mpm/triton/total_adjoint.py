@@ -74,7 +74,6 @@ class _Pass:
 
     @property
     def key(self) -> tuple[object, ...]:
-        """Return the key that its recorded graph depends on."""
         return (*self.options.values(), *self.flags.values())
 
 
@@ -225,7 +224,6 @@ class TotalAdjoint:
         return self._found(run, displacement, vectors, numbers, vector_bars, number_bar)
 
     def _segment(self, start: Tensor, count: int, asked: _Pass) -> None:
-        """Run the substeps of a segment again, keeping their states, and then backward."""
         fused = self.fused
         fused.fields.view(-1, 2, 4)[:, :, :3].index_copy_(0, self.active, start)
         fused.first_step.zero_()
@@ -267,7 +265,6 @@ class TotalAdjoint:
         return self.fused.sums(rows, width, "adjoint")
 
     def _find_multipliers(self, count: int) -> None:
-        """The forward multipliers of the held points in every substep of a segment."""
         holds = self.fused.bound.point_holds
         assert holds is not None
         W = holds.whitening[0]
@@ -287,7 +284,6 @@ class TotalAdjoint:
             )
 
     def _node_stages(self, offset: int, asked: _Pass) -> None:
-        """Backward pass through displacement, held points, pins and the new velocity."""
         fused = self.fused
         if fused.points is None:
             self._nodes(offset, asked, SUM=True, PUSH=True, FINISH=True)
@@ -468,7 +464,6 @@ def why_not(fused: FusedTotal, state: MPMState, forces: Sequence[Force]) -> str 
 
 
 def _twin(force: Force) -> Twin:
-    """The twin of a force that has one."""
     twin = force.twin()
     assert twin is not None
     return twin

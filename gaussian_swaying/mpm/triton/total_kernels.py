@@ -470,7 +470,6 @@ def total_hold(
 
 @triton.jit
 def _in_plane_stress(F, material, normals, count, index, mask):
-    """F of sheets of one layer in plane stress."""
     mu = tl.load(material + count + index, mask, 1.0)
     lam = tl.load(material + 2 * count + index, mask, 0.0)
     flat, _m, _area, _thickness, _thinning = flattened(F, load3(normals, count, index, mask), mu, lam)

@@ -572,7 +572,6 @@ def updated_count(
 
 @triton.jit
 def _cell(x, dx, o, n):
-    """First node of the stencil on one axis, within the grid."""
     first = tl.floor(tl.div_rn(x, dx + x * 0) - 0.5).to(tl.int32) - o
     return tl.minimum(tl.maximum(first, 0), n)
 

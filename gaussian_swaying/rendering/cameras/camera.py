@@ -135,11 +135,6 @@ def look_at_camera(
     Returns:
         The camera.
 
-    Raises:
-        TypeError: If an argument has the wrong type.
-        ValueError: If ``eye`` and ``target`` coincide, ``up`` is zero or along the line of sight, or a number is
-            out of range.
-
     Example:
         >>> look_at_camera((0, -2, 0), (0, 0, 0), (0, 0, 1), 40.0, 480, 270).position[1]
         tensor(-2.)
@@ -205,10 +200,6 @@ def orbit_camera(
 
     Returns:
         The camera.
-
-    Raises:
-        TypeError: If an argument has the wrong type.
-        ValueError: If a number is out of range.
     """
     check_positive("radius", radius)
     check_elevation("elevation_degrees", elevation_degrees)

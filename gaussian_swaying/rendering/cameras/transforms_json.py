@@ -36,11 +36,6 @@ def camera_from_transforms(
 
     Returns:
         The camera, in the default precision of torch.
-
-    Raises:
-        TypeError: If ``frame``, ``width`` or ``height`` is not an integer.
-        ValueError: If the file is missing or not JSON, or if a field is missing or bad. The message names the file, the
-            field and the remedy.
     """
     if isinstance(frame, bool) or not isinstance(frame, int):
         raise TypeError(f"Expected `frame` to be a whole number, but got {frame!r}.")
@@ -77,9 +72,6 @@ def load_transforms(path: str | Path) -> dict[str, Any]:
 
     Returns:
         Its fields; ``frames`` is a list of at least one dictionary.
-
-    Raises:
-        ValueError: If the file is missing, is not JSON or has no list ``frames``.
     """
     where = f"`{path}`"
     data = read_json(path, "camera file")

@@ -68,7 +68,6 @@ class TrainingImage:
             return default
 
     def to(self, device: torch.device | str, non_blocking: bool = False) -> TrainingImage:
-        """Copy on another device."""
         device = torch.device(device)
         if device not in self._cameras:
             self._cameras[device] = self.camera.to(device)
@@ -76,7 +75,6 @@ class TrainingImage:
         return replace(self, pixels=pixels, camera=self._cameras[device])
 
     def pin_memory(self) -> TrainingImage:
-        """Copy in page-locked memory, for DataLoader."""
         return replace(self, pixels=self.pixels.pin_memory())
 
 

@@ -62,9 +62,6 @@ class GeneratedDataModule(CaptureDataModule):
 
         Args:
             stage: ``fit``, ``validate``, ``test``, or None for all.
-
-        Raises:
-            ValueError: If the folder contains something else.
         """
         self._make()
         super().setup(stage)

@@ -47,10 +47,6 @@ def write_film(run: Path, target: Path) -> Film:
 
     Returns:
         The film.
-
-    Raises:
-        ValueError: If the run cannot become a film (see :func:`~gaussian_swaying.viewer.film.recorded.read_film`), or
-            the target has no folder or does not end in .html.
     """
     check_page(target, "film")
     film = read_film(run)
@@ -201,7 +197,6 @@ def unpack(blocks: dict[str, bytes]) -> Film:
 
 
 def _planes(values: np.ndarray) -> bytes:
-    """The lowest bytes of all numbers, then the next ones, and so on."""
     little = np.ascontiguousarray(values, values.dtype.newbyteorder("<"))
     return little.reshape(-1).view(np.uint8).reshape(-1, values.itemsize).T.tobytes()
 

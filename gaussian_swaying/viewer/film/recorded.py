@@ -81,10 +81,6 @@ def read_film(run: Path) -> Film:
 
     Args:
         run: The output folder of ``gaussian-swaying sim``.
-
-    Raises:
-        ValueError: If the folder is not of a run, the run is of ``updated`` or has no recorded nodes, the nodes are
-            damaged or move a Gaussian farther than any run does, or its splat has moved or changed.
     """
     summary = _summary(run)
     simulation, name = _rebuild(run, summary)
@@ -123,7 +119,6 @@ def _check_near(path: Path, scene: SimulatedScene, grid: GridSpec, nodes: Tensor
 
 
 def _summary(run: Path) -> dict[str, Any]:
-    """The summary of a run whose nodes were recorded."""
     if not (run / "summary.json").is_file() or not (run / "config.yaml").is_file():
         raise ValueError(f"{run} has no run: give the output folder of `gaussian-swaying sim`.")
     try:
@@ -142,7 +137,6 @@ def _summary(run: Path) -> dict[str, Any]:
 
 
 def _rebuild(run: Path, summary: dict[str, Any]) -> tuple[Simulation, str]:
-    """The simulation of a run, on the CPU, and a name for what it shows."""
     config = run / "config.yaml"
     parser = Simulation.parser()
     try:

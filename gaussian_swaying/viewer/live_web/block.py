@@ -51,9 +51,6 @@ def check(simulation: Simulation) -> None:
 
     Args:
         simulation: The simulation, not started.
-
-    Raises:
-        ValueError: If it cannot; the message names the field and the remedy.
     """
     solver, setup = simulation.solver, simulation.setup
     if not isinstance(solver, MPMSolver):

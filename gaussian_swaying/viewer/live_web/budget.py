@@ -51,9 +51,6 @@ def fitted(parser: ArgumentParser, settings: Namespace, target: str) -> Fitted:
         parser: From :meth:`Simulation.parser`.
         settings: The settings as they are configured.
         target: One of :data:`TARGETS`.
-
-    Raises:
-        ValueError: If a browser cannot simulate the scene, or it cannot start.
     """
     configured, budget = float(settings.solver.dx), TARGETS[target]
     made: dict[float, Simulation] = {}

@@ -44,10 +44,6 @@ def write_live_web(simulation: Simulation, name: str, target: Path) -> Written:
         simulation: The simulation; it is started.
         name: What it shows.
         target: The file; its name ends in .html.
-
-    Raises:
-        ValueError: If a browser cannot simulate it (:func:`~gaussian_swaying.viewer.live_web.block.check`), it cannot
-            start, or the target has no folder or does not end in .html.
     """
     check_page(target, "page")
     text, film = page(simulation, name)

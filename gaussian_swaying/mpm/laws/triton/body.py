@@ -67,12 +67,10 @@ class BodyLaws:
 
 
 def _once(functions: Any) -> tuple[Any, ...]:
-    """The distinct functions, in order of appearance."""
     return tuple(dict.fromkeys(functions))
 
 
 def _padded(law: ConstitutiveLaw, twin: Twin) -> list[float]:
-    """The four numbers of a law."""
     values = [float(value) for value in twin.numbers.take()]
     if len(values) > 4:
         raise ValueError(f"Expected at most four `numbers` of {type(law).__name__}, but got {len(values)}.")

@@ -51,14 +51,12 @@ def _pair(x, y, tau_x, tau_y, mu, lam):
 
 @triton.jit
 def _own(x, tau, mu, lam):
-    """H_ii."""
     g = 1.0 / tl.maximum(x, LOG_FLOOR)
     return (2 * mu + lam - tl.where(x < LOG_FLOOR, 0.0, tau)) * g * g
 
 
 @triton.jit
 def _hessian(a, mu, lam):
-    """H_ii, and H_ij, twist and flip of each pair of axes, from the principal stretches."""
     l0 = log(a[0])
     l1 = log(a[1])
     l2 = log(a[2])

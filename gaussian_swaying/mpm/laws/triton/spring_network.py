@@ -44,7 +44,6 @@ def principal(a, mu, lam, internal, p):
 
 @triton.jit
 def _root(x):
-    """``_continued_root``."""
     inside = tl.maximum(x, LOG_FLOOR * LOG_FLOOR)
     root = tl.sqrt(inside)
     return root + (x - inside) / (2 * root)
@@ -105,7 +104,6 @@ def _pair(x, y, plane_x, plane_y, plane, whole, spread, direct, network, bulk, t
 
 @triton.jit
 def _hessian(a, mu, lam):
-    """H_ii, and H_ij, twist and flip of each pair of axes, from the principal stretches."""
     least = tl.maximum(tl.minimum(mu, lam), 0.0)
     direct = 10.0 / 7 * least + 2 * (mu - least)
     network = 15 * least
