@@ -29,30 +29,6 @@ ROUND_GROWTH = 0.05
 """
 
 
-def sphere_flow(velocity: Tensor, place: Tensor, radius: float) -> Tensor:
-    r"""Potential flow round a sphere at the origin; zero inside.
-
-    .. math::
-        \mathbf{u} = \mathbf{v} + \frac{R^3}{2 r^3} \bigl(\mathbf{v} - 3 (\mathbf{v} \cdot \hat r) \hat r\bigr)
-
-    (Lamb 1932, Hydrodynamics, 92.)
-
-    Args:
-        velocity: Undisturbed velocity [m/s], broadcastable to (..., 3).
-        place: Places [m], shape (..., 3).
-        radius: R [m].
-
-    Returns:
-        Velocity [m/s], shape (..., 3).
-    """
-    square = place.square().sum(-1, keepdim=True)
-    outside = square >= radius**2
-    square = square.clamp(min=radius**2)
-    along = (velocity * place).sum(-1, keepdim=True)
-    share = 0.5 * radius**3 * square.pow(-1.5)
-    return torch.where(outside, velocity + share * (velocity - 3 * along / square * place), 0.0)
-
-
 def cylinder_flow(velocity: Tensor, place: Tensor, axis: Tensor, radius: float) -> Tensor:
     r"""Potential flow round an endless cylinder through the origin; zero inside. The part along its axis stays.
 
@@ -62,8 +38,8 @@ def cylinder_flow(velocity: Tensor, place: Tensor, axis: Tensor, radius: float) 
     (Lamb 1932, 68.)
 
     Args:
-        velocity: As in :func:`sphere_flow`.
-        place: As in :func:`sphere_flow`.
+        velocity: Undisturbed velocity [m/s], broadcastable to (..., 3).
+        place: Places [m], shape (..., 3).
         axis: Unit vector along the axis, shape (3,).
         radius: R [m].
     """
@@ -121,8 +97,8 @@ def ellipsoid_flow(velocity: Tensor, place: Tensor, radii: Sequence[float]) -> T
     :math:`\sum_i v_i x_i \bigl(1 + \alpha_i(\lambda) / (2 - \alpha_i(0))\bigr)` (Lamb 1932, 114).
 
     Args:
-        velocity: As in :func:`sphere_flow`.
-        place: As in :func:`sphere_flow`; computed in float64.
+        velocity: As in :func:`cylinder_flow`.
+        place: As in :func:`cylinder_flow`; computed in float64.
         radii: Half axes a, b and c [m].
     """
     given, place, velocity = place, in_double(place), in_double(velocity)

@@ -18,7 +18,6 @@ from gaussian_swaying.aero.obstacle_flow import (
     ellipsoid_strength,
     plane_wake,
     round_wake,
-    sphere_flow,
     vortex_street,
     wake_start,
 )
@@ -73,55 +72,6 @@ def _direction(moment: Moment, place: Tensor) -> tuple[Tensor, Tensor]:
     """Unit vector of the mean flow, zero in still air, and its speed, in the dtype of the places."""
     speed = torch.linalg.vector_norm(moment.flow)
     return (moment.flow / speed.clamp(min=1e-12)).to(place), speed.to(place)
-
-
-class SphereObstacle(Obstacle):
-    """A sphere in the wind.
-
-    Args:
-        center: Its centre, in scene units.
-        radius: In scene units.
-        drag: Drag coefficient of its wake; 0.47 for a sphere in wind, 0 for no wake.
-
-    Example:
-        >>> ball = SphereObstacle([0.0, 0.0, 0.0], 0.5, drag=0.0)
-        >>> ball.around(torch.tensor([[2.0, 0.0, 0.0]]), torch.tensor([[0.0, 0.5, 0.0]]))
-        tensor([[3., 0., 0.]])
-    """
-
-    def __init__(self, center: Sequence[float], radius: float, drag: float = 0.47) -> None:
-        super().__init__(center, drag)
-        check_positive("radius", radius)
-        if not drag < 1:
-            raise ValueError(f"Expected `drag` of a sphere to be below 1, but got {drag}: a sphere has 0.47.")
-        self.radius = float(radius)
-
-    def around(self, velocity: Tensor, place: Tensor) -> Tensor:
-        return sphere_flow(velocity, place, self.radius)
-
-    def twin(self) -> Twin:
-        from gaussian_swaying.aero.obstacles_triton import past_sphere
-
-        numbers = (self.radius, self.drag, wake_start(self.drag))
-        return Twin(
-            past_sphere,
-            options=(self.drag > 0,),
-            numbers=Numbers(6, lambda: torch.cat([self.middle, self.middle.new_tensor(numbers)])),
-            per_substep=Numbers(3, lambda moment: moment.flow),
-            sources=(self,),
-        )
-
-    def wake(self, place: Tensor, moment: Moment) -> tuple[Tensor, Tensor | None]:
-        direction, _ = _direction(moment, place)
-        behind = (place * direction).sum(-1)
-        aside = (place.square().sum(-1) - behind.square()).clamp(min=0).sqrt()
-        return round_wake(behind, aside, 2 * self.radius, self.drag), None
-
-    def in_frame(self, frame: SimFrame) -> WindEffect:
-        """In metres."""
-        other = self.moved(frame)
-        other.radius = self.radius * frame.metres_per_unit
-        return other
 
 
 class CylinderObstacle(Obstacle):

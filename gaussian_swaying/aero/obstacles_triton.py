@@ -75,31 +75,6 @@ def vortex_street(behind, aside, width, turns, strouhal):
 
 
 @triton.jit
-def past_sphere(v, x, numbers, now, table, OPTIONS: tl.constexpr):
-    """``SphereObstacle``; ``numbers``: middle (3), radius, drag, start of the wake; ``now``: the mean flow.
-
-    ``OPTIONS``: whether it has a wake.
-    """
-    radius = numbers[3]
-    p = (x[0] - numbers[0], x[1] - numbers[1], x[2] - numbers[2])
-    square = dot3(p, p)
-    outside = square >= radius * radius
-    away = tl.maximum(square, radius * radius)
-    along = 3 * dot3(v, p) / away
-    share = 0.5 * radius * radius * radius / (away * tl.sqrt(away))
-    v = (
-        v[0] + share * (v[0] - along * p[0]), v[1] + share * (v[1] - along * p[1]), v[2] + share * (v[2] - along * p[2])
-    )  # fmt: skip
-    v = _only(outside, v)
-    if OPTIONS[0]:
-        direction, _speed = _direction(now)
-        behind = dot3(p, direction)
-        aside = tl.sqrt(tl.maximum(square - behind * behind, 0.0))
-        v = scale3(1 - round_wake(behind, aside, 2 * radius, numbers[4], numbers[5]), v)
-    return v
-
-
-@triton.jit
 def past_cylinder(v, x, numbers, now, table, OPTIONS: tl.constexpr):
     """``CylinderObstacle``; ``numbers``: middle (3), axis (3), radius, drag, Strouhal number.
 

@@ -23,7 +23,7 @@ from gaussian_swaying import _program as program
 from gaussian_swaying._checks import check_frames
 from gaussian_swaying._yaml_limits import limit_yaml
 from gaussian_swaying.aero.carried import Turbulence
-from gaussian_swaying.aero.obstacles import CylinderObstacle, EllipsoidObstacle, SphereObstacle
+from gaussian_swaying.aero.obstacles import CylinderObstacle, EllipsoidObstacle
 from gaussian_swaying.aero.recorded import FrozenWind
 from gaussian_swaying.aero.shelter import Shelter
 from gaussian_swaying.aero.wind import SpatialWind
@@ -38,7 +38,7 @@ if TYPE_CHECKING:
 
 # imported so that a configuration can use their class names without the module
 CAMERA_PATHS = (CaptureCamera, KeyframedCamera)
-EFFECTS = (CylinderObstacle, EllipsoidObstacle, FrozenWind, Shelter, SphereObstacle, Turbulence)
+EFFECTS = (CylinderObstacle, EllipsoidObstacle, FrozenWind, Shelter, Turbulence)
 # options that a configuration file cannot contain; settings that may change when a run is resumed
 COMMAND_LINE_ONLY = ("preset", "physgaussian")
 RUN_ONLY = ("config", "output", "device", "frames", "resume")

@@ -7,7 +7,7 @@ from torch.testing import assert_close
 from gaussian_swaying import AeroForce, Box, Material, MPMSolver, Scene, Simulation, WindField
 from gaussian_swaying.aero.computed_air import BYTES, ComputedAir, resolution
 from gaussian_swaying.aero.effects import LogProfile
-from gaussian_swaying.aero.obstacles import SphereObstacle
+from gaussian_swaying.aero.obstacles import EllipsoidObstacle
 from gaussian_swaying.aero.wind import FlowKey
 from gaussian_swaying.air.flow import SOUND
 from gaussian_swaying.air.immersed import look
@@ -274,7 +274,7 @@ def test_what_a_box_costs_and_resolves():
         ({"density": 0.2}, "layer of air"),
         ({"wind": (0.0, 0.0, 0.0), "speed": None}, "air.speed"),
         ({"air": ComputedAir([-0.6, -0.9, -0.9], HIGH, 24, speed=6.0)}, "within two cells"),
-        ({"wind": WindField([3.0, 0.0, 0.0], effects=[SphereObstacle([0.0, 0.0, 0.0], 0.1)])}, "air.walls"),
+        ({"wind": WindField([3.0, 0.0, 0.0], effects=[EllipsoidObstacle([0.0, 0.0, 0.0], [0.1] * 3)])}, "air.walls"),
     ],
 )
 def test_what_cannot_be_right_is_refused(changes, message):

@@ -10,7 +10,7 @@ from torch.utils._python_dispatch import TorchDispatchMode
 from gaussian_swaying import AeroForce, MPMSolver, UniformGust, WindField, WindForce
 from gaussian_swaying.aero.carried import CarriedField, Turbulence
 from gaussian_swaying.aero.effects import LogProfile, Plume, PowerProfile
-from gaussian_swaying.aero.obstacles import CylinderObstacle, EllipsoidObstacle, SphereObstacle
+from gaussian_swaying.aero.obstacles import CylinderObstacle, EllipsoidObstacle
 from gaussian_swaying.aero.patches import Patches
 from gaussian_swaying.aero.recorded import RecordedWind
 from gaussian_swaying.aero.shelter import Shelter
@@ -29,7 +29,7 @@ def _field(wraps):
     )
 
 
-OBSTACLES = ("sphere", "cylinder", "ellipsoid", "wall", "several", "crowded")
+OBSTACLES = ("cylinder", "ellipsoid", "wall", "several", "crowded")
 MIDDLE = [0.1, 0.15, 0.1]
 GUSTS = [UniformGust(0.5, interval=2 * DT)]
 TURNING = [FlowKey(0.0, [4.0, 1.0, 0.5]), FlowKey(3 * DT, [-2.0, 3.0, 0.0])]
@@ -47,7 +47,6 @@ def _wind(name):
         "sheltered": [Turbulence(0.5, 0.1, cells=[8, 6, 4], spacing=0.03), Shelter(cells=8, strength=20.0)],
         "half": [PowerProfile(**low), _field((True, False, False))],
         "held": [_field((False, True, False))],
-        "sphere": [SphereObstacle(MIDDLE, 0.05)],
         "cylinder": [CylinderObstacle(MIDDLE, 0.05, axis=[0.0, 1.0, 1.0])],
         "ellipsoid": [EllipsoidObstacle(MIDDLE, [0.03, 0.08, 0.05], turn=20.0, drag=0.0)],
         "wall": [EllipsoidObstacle(MIDDLE, [0.01, 0.1, 0.05])],
@@ -61,7 +60,7 @@ def _wind(name):
             CylinderObstacle([0.02, 0.1, 0.1], 0.02, street=False),
             Turbulence(0.5, 0.1, cells=[8, 6, 4], spacing=0.03),
             CylinderObstacle([0.05, 0.15, 0.1], 0.01),
-            SphereObstacle(MIDDLE, 0.03, drag=0.0),
+            EllipsoidObstacle(MIDDLE, [0.03] * 3, drag=0.0),
             CylinderObstacle([0.1, 0.1, 0.1], 0.02, axis=[0.0, 1.0, 0.0]),
         ],
     }
@@ -242,6 +241,6 @@ def test_what_the_kernels_do_not_know_runs_in_torch():
 
     assert Doubled().twin() is None
     assert Same().twin().function is LogProfile().twin().function
-    for effects in ([Doubled()], [Same(), Doubled(), SphereObstacle(MIDDLE, 0.05)]):
+    for effects in ([Doubled()], [Same(), Doubled(), EllipsoidObstacle(MIDDLE, [0.05] * 3)]):
         wind = WindField([1.0, 0.0, 0.0], effects=effects)
         assert _bodies("cpu", "total", wind, transfer="torch")[2].twin() is None

@@ -7,7 +7,7 @@ import torch
 
 from gaussian_swaying.aero.carried import Turbulence
 from gaussian_swaying.aero.effects import LogProfile
-from gaussian_swaying.aero.obstacles import SphereObstacle
+from gaussian_swaying.aero.obstacles import EllipsoidObstacle
 from gaussian_swaying.aero.shelter import Shelter
 from gaussian_swaying.aero.wind import WindField
 from gaussian_swaying.simulation.simulation import Simulation
@@ -22,17 +22,19 @@ def _wind():
 def test_places_are_converted_once(make_simulation):
     """Scene units to metres from the object's centre; what was given stays as it was."""
     simulation = make_simulation(scene={"metres_per_unit": 2.0})
-    given = WindField([4.0, 0.0, 0.0], effects=[SphereObstacle([1.0, 2.0, 3.0], 0.5), LogProfile([0.0, 0.0, -1.0])])
+    given = WindField(
+        [4.0, 0.0, 0.0], effects=[EllipsoidObstacle([1.0, 2.0, 3.0], [0.5] * 3), LogProfile([0.0, 0.0, -1.0])]
+    )
     simulation.wind = given
     frame = simulation.scene.frame
     expected = 2.0 * (torch.tensor([1.0, 2.0, 3.0], dtype=torch.float64) - frame.origin)
     for _ in range(2):
         sphere, profile = simulation.wind.effects
         torch.testing.assert_close(sphere.middle, expected)
-        assert sphere.radius == 1.0
+        assert sphere.radii == [1.0] * 3
         assert profile.ground[2] == pytest.approx(2.0 * (-1.0 - float(frame.origin[2])))
         simulation.wind = simulation.wind
-    assert given.effects[0].radius == 0.5
+    assert given.effects[0].radii == [0.5] * 3
 
 
 def test_shelter_is_refreshed_in_every_frame(make_simulation):
@@ -52,7 +54,7 @@ def test_every_effect_can_be_named_in_a_configuration(tmp_path):
         "{class_path: LogProfile, init_args: {height: 3.0}}",
         "{class_path: PowerProfile}",
         "{class_path: Turbulence, init_args: {cells: [8, 8, 8]}}",
-        "{class_path: SphereObstacle, init_args: {center: [0, 0, 0], radius: 1.0}}",
+        "{class_path: EllipsoidObstacle, init_args: {center: [0, 0, 0], radii: [1.0, 1.0, 1.0]}}",
         "{class_path: CylinderObstacle, init_args: {center: [0, 0, 0], radius: 1.0, street: false}}",
         "{class_path: EllipsoidObstacle, init_args: {center: [0, 0, 0], radii: [1, 2, 3]}}",
         "{class_path: Shelter}",

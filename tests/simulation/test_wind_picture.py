@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from gaussian_swaying.aero.computed_air import ComputedAir
-from gaussian_swaying.aero.obstacles import SphereObstacle
+from gaussian_swaying.aero.obstacles import EllipsoidObstacle
 from gaussian_swaying.aero.wind import WindField
 from gaussian_swaying.recording.recorder import Recorder
 from gaussian_swaying.rendering.cameras.camera import look_at_camera, project
@@ -75,7 +75,7 @@ def test_the_object_hides_what_is_behind_it(make_simulation):
 def test_a_run_draws_the_wind(make_simulation, tmp_path, flow):
     """For flows along and across the view, with an obstacle."""
     simulation = make_simulation()
-    simulation.wind = WindField(flow, effects=[SphereObstacle([-1.0, 0.0, 0.4], 0.3)])
+    simulation.wind = WindField(flow, effects=[EllipsoidObstacle([-1.0, 0.0, 0.4], [0.3] * 3)])
     simulation.run(tmp_path / "run", 1, progress=False, recorder=Recorder(renders=["wind"]))
     picture = iio.imread(tmp_path / "run" / "wind" / "00000.png")
     assert picture.shape == (18, 32, 3)
