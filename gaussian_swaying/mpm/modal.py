@@ -312,6 +312,8 @@ class Structure:
                 f"`solver.formulation: modes` would have {S.shape[1]:,} unknowns (at most {MOST_UNKNOWNS:,}): raise "
                 "`solver.dx`, or set it to total."
             )
+        if S.shape[1] == 0:
+            raise ValueError("All of the body is held, so `solver.formulation: modes` has no modes: hold less of it.")
         K, M = self.reduced(self.stiffness)
         load = self.loads(CLUSTERS)
         whole = S.T @ load[:, :2]

@@ -250,6 +250,12 @@ def test_a_body_that_hangs_loose_is_refused():
         bound(post(width=0.1), formulation="modes")
 
 
+def test_a_body_that_is_held_as_a_whole_is_refused():
+    whole = [PinnedRegion(Box([None] * 3, [None] * 3))]
+    with pytest.raises(ValueError, match=r"`solver\.formulation: modes`"):
+        Structure(bound(post(), boundaries=whole).bound).analyse(10)
+
+
 def test_too_many_unknowns_are_refused(monkeypatch):
     monkeypatch.setattr(modal, "MOST_UNKNOWNS", 100)
     with pytest.raises(ValueError, match=r"unknowns \(at most 100\): raise `solver.dx`, or set it to total"):
