@@ -257,6 +257,44 @@ def _contact() -> str:
     return grid(" | ".join(["device", "points", "off [ms]", *cases]), rows) + "\n\n" + source(runs)
 
 
+# ---- nature.md
+
+SWAY = {
+    "plant": (7, 38, 70),
+    "shrub": (1.6, 11, 33),
+    "sapling": (2, 14, 39),
+    "tree": (0.8, 6, 19),
+    "conifer": (0.3, 2.3, 8),
+    "hanging": (3, 18, 54),
+    "rigid": (0, 0, 0),
+}
+"""Mean lean of a top in a breeze, gusts and a storm [% of the height], of the estimates that docs/nature.md names."""
+
+
+def _sway() -> str:
+    head = "splat, wind | lean, announced, expected [%] | sway / lean | peak, first [Hz] | its share | cross | drift"
+    rows = []
+    for run in read("sway"):
+        if hasattr(run, "failed"):
+            continue
+        expected = SWAY.get(run.kind, (None,) * 3)[("breeze", "gusts", "storm").index(run.look)]
+        lean = [
+            f"{100 * run.lean:.3g}",
+            *(DASH if x is None else f"{x:.3g}" for x in (_percent(run.announced), expected)),
+        ]
+        first = DASH if run.frequency_Hz is None else f"{run.frequency_Hz:.2f}"
+        rows.append(
+            f"{run.splat.split('.')[0]}, {run.look} | {', '.join(lean)} | {run.ratio:.2f} | {run.peak:.2f}, {first} "
+            f"| {run.peak_share:.2f} | {run.cross:.2f} | {run.drift:.3f}"
+        )
+    return grid(head, rows)
+
+
+def _percent(share: float | None) -> float | None:
+    return None if share is None else 100 * share
+
+
+SECTIONS["sway"] = _sway
 SECTIONS["speed.contact"] = _contact
 table(
     "speed.backward", "backward",
