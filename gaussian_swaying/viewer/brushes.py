@@ -4,12 +4,47 @@ from __future__ import annotations
 
 import asyncio
 import json
+import math
 from collections.abc import Callable
+from dataclasses import dataclass
 from typing import Any
 
-from gaussian_swaying.viewer.incoming import LARGEST_STROKE, BrushMove, brush_move
+import torch
 
 BRUSH = "/brush"  # path
+LARGEST = 16 << 10  # bytes of a message
+
+
+@dataclass(frozen=True)
+class BrushMove:
+    """A message of a browser about its brush.
+
+    Attributes:
+        kind: ``stroke`` for a piece of a stroke, ``part`` for a double click.
+        first: Whether a stroke begins with this piece.
+        path: Corners of its path in the window [pixels].
+        size: Width and height of the window [pixels].
+        fov: Vertical field of view [rad].
+        near: Nearest depth that is drawn, in the units of the scene.
+        matrix: From the axes of the browser's camera, y up and z backwards, to those of its scene, row by row.
+    """
+
+    kind: str
+    first: bool
+    path: list[list[float]]
+    size: tuple[int, int]
+    fov: float
+    near: float
+    matrix: list[list[float]]
+
+
+def brush_move(raw: str) -> BrushMove:
+    """The message of a browser about its brush, from JSON."""
+    told = json.loads(raw)
+    matrix = torch.tensor(told["matrix"], dtype=torch.float64).reshape(4, 4).T  # as WebGL has it
+    width, height = (round(side) for side in told["size"])
+    fov = math.radians(told["fov"])
+    return BrushMove(told["kind"], told["first"], told["path"], (width, height), fov, told["near"], matrix.tolist())
 
 
 class Brushes:
@@ -42,18 +77,17 @@ class Brushes:
             asyncio.run_coroutine_threadsafe(known[0].close(), known[1])
 
     async def serve(self, key: str, connection: Any) -> None:
-        """Listen to a browser until it is gone; what its program cannot have sent is dropped."""
+        """Listen to a browser until it is gone."""
         from websockets.exceptions import ConnectionClosed
 
-        connection.protocol.max_message_size = LARGEST_STROKE
+        connection.protocol.max_message_size = LARGEST
         self.forget(key)
         self._open[key] = connection, asyncio.get_running_loop()
         try:
             await connection.send(self._told)
             while True:
                 move = brush_move(await connection.recv())
-                if move is not None:
-                    self.take(key, move)
+                self.take(key, move)
         except ConnectionClosed:
             pass
         finally:

@@ -22,7 +22,7 @@ from gaussian_swaying.rendering.brush import Seen, seen, touched
 from gaussian_swaying.rendering.cameras.camera import Camera, resized_intrinsics
 from gaussian_swaying.rendering.tints import TINTS
 from gaussian_swaying.simulation.simulation import Simulation
-from gaussian_swaying.viewer.incoming import BrushMove
+from gaussian_swaying.viewer.brushes import BrushMove
 from gaussian_swaying.viewer.screen import Panel
 from gaussian_swaying.viewer.session import Snapshot
 from gaussian_swaying.viewer.strokes import Strokes

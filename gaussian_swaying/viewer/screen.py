@@ -24,10 +24,9 @@ from gaussian_swaying._checks import one_line
 from gaussian_swaying._devices import in_double
 from gaussian_swaying.geometry.rotations import quat_to_rotation
 from gaussian_swaying.rendering.cameras.camera import Camera
-from gaussian_swaying.viewer.brushes import Brushes
+from gaussian_swaying.viewer.brushes import Brushes, BrushMove
 from gaussian_swaying.viewer.door import ANY, Door, check_address
 from gaussian_swaying.viewer.film_strip import FilmStrip
-from gaussian_swaying.viewer.incoming import BrushMove, Incoming
 from gaussian_swaying.viewer.pictures import PictureSize, camera_of, draw, enlarged, pinhole
 from gaussian_swaying.viewer.session import Session, Snapshot
 from gaussian_swaying.viewer.states import drawable
@@ -39,18 +38,16 @@ if TYPE_CHECKING:
 
 MOST_PER_SECOND = 30  # pictures or states for a browser
 JPEG_QUALITY = 75
-FAR = 100.0  # longest sides of the object that a handle may be away from it
 BACK = 1.35  # the first view is from farther away than that of the configuration, as the controls cover a part of it
 
 
-def make_server(host: str, port: int, door: Door, incoming: Incoming, streams: Streams) -> viser.ViserServer:
+def make_server(host: str, port: int, door: Door, streams: Streams) -> viser.ViserServer:
     """A viser server that opens no tunnel to the internet, whoever asks.
 
     Args:
         host: Address to listen on.
         port: Port; the next free one if it is taken.
         door: Checks who may open the page.
-        incoming: Checks the messages of browsers.
         streams: Has the connections of those that draw themselves.
     """
     try:
@@ -66,17 +63,13 @@ def make_server(host: str, port: int, door: Door, incoming: Incoming, streams: S
     # a picture may be drawn while its browser goes away
     warnings.filterwarnings("ignore", message="Queued a .* on a closed connection", category=UserWarning)
     warnings.filterwarnings("ignore", message=r"\[viser\] .* does not match annotation", category=UserWarning)
-    with (
-        redirect_stdout(io.StringIO()),
-        checked_by(door, incoming, streams),
-    ):  # its banner; the caller tells the address
-        incoming.server = Server(host=host, port=port, label="Wind tunnel", verbose=False)
-    return incoming.server
+    with redirect_stdout(io.StringIO()), checked_by(door, streams):  # its banner; the caller tells the address
+        return Server(host=host, port=port, label="Wind tunnel", verbose=False)
 
 
 @contextmanager
-def checked_by(door: Door, incoming: Incoming, streams: Streams) -> Iterator[None]:
-    """Within the block, make new servers check requests and messages first, and serve the states, too."""
+def checked_by(door: Door, streams: Streams) -> Iterator[None]:
+    """Within the block, make new servers check requests first, and serve the states, too."""
     import websockets.asyncio.server as websockets
 
     serve = websockets.serve
@@ -85,9 +78,7 @@ def checked_by(door: Door, incoming: Incoming, streams: Streams) -> Iterator[Non
 
     def checked(handler: Any, *arguments: Any, process_request: Any = None, **options: Any) -> Any:
         process = partial(door.answer, with_program(process_request))
-        return serve(
-            streams.beside(incoming.guarded(handler)), *arguments, process_request=process, logger=logger, **options
-        )
+        return serve(streams.beside(handler), *arguments, process_request=process, logger=logger, **options)
 
     websockets.serve = checked  # type: ignore[assignment, misc]
     try:
@@ -165,9 +156,9 @@ class Screen:
         self._notice = ("", 0.0)
         self._version = 0  # of what is drawn besides snapshot and camera
         self._turn = torch.eye(3, dtype=torch.float64)  # from the scene to the axes of viser's camera
-        self.door, self.incoming, self.brushes = Door(host, names), Incoming(self.tell), Brushes()
+        self.door, self.brushes = Door(host, names), Brushes()
         self.streams = Streams(self.brushes)
-        self.server = make_server(host, port, self.door, self.incoming, self.streams)
+        self.server = make_server(host, port, self.door, self.streams)
         self.server.gui.configure_theme(
             control_layout="floating", control_width="medium", show_logo=False, show_share_button=False
         )
@@ -235,11 +226,10 @@ class Screen:
         self._version += 1
 
     def look_from_start(self) -> None:
-        """Set where a browser looks from at first, from the camera of the configuration, and how far it can drag."""
+        """Set where a browser looks from at first, from the camera of the configuration."""
         simulation = self.session.simulation
         camera = simulation.painter.camera_at(0)
         scene = simulation.scene
-        self.incoming.reach = float(scene.center.abs().amax()) + FAR * scene.size
         up = scene.frame.rotation[2].tolist()
         self.server.scene.set_up_direction(tuple(up))
         self._turn = turn_of(up, self._turn)

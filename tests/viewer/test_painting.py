@@ -16,8 +16,8 @@ from gaussian_swaying.gaussians.ply import write_ply
 from gaussian_swaying.rendering.cameras.camera import look_at_camera, project
 from gaussian_swaying.scenes.procedural import FlagScene
 from gaussian_swaying.viewer import painting as painting_module
+from gaussian_swaying.viewer.brushes import brush_move
 from gaussian_swaying.viewer.controls import Page
-from gaussian_swaying.viewer.incoming import LARGEST_STROKE, brush_move
 from gaussian_swaying.viewer.painting import ALIKE, JOINED, choices
 from gaussian_swaying.viewer.session import Session
 
@@ -338,22 +338,6 @@ def test_copies_are_not_painted(page, connect, until):
     assert not page.controls.painting.on.value
     page.session.settings.copies = []
     painter.socket.close()
-
-
-def test_what_a_program_cannot_have_sent_changes_nothing(page, painter, until):
-    """Each is dropped, and the next good one is taken."""
-    for raw in ("[]", "{", "[" * 5000, json.dumps(message(page._turn, [float("nan"), 3.0])), b"\xff\x00"):
-        painter.socket.send(raw)
-    painter.move(*[[1.0, 2.0]] * 100)
-    painter.move([200, 150], size=[1e9, 3])
-    painter.move([200, 150])
-    until(lambda: _labelled(page).any())
-    assert len(page.controls.painting._strokes) == 1
-    assert page.notice is None
-    painter.socket.send("x" * (LARGEST_STROKE + 1))
-    with pytest.raises(ConnectionClosed):
-        painter.socket.recv(timeout=20)
-    until(lambda: not page.brushes._open)
 
 
 def test_who_has_no_key_cannot_paint(page):

@@ -173,7 +173,7 @@ def test_a_configuration_is_loaded(page, client, until, monkeypatch):
         (b"wind: {flows: 3}", "flows"),
         (b"\xff\xfe", "UTF-8"),
         (b"scene: {ply: /none/there.ply}", "load it first"),
-        (b"a: " + b"[" * 100, "nested"),
+        (b"a: " + b"[" * 100, "64 levels"),
     ):
         page.tell("")
         _upload(client, files.load_settings, content)
