@@ -1,6 +1,7 @@
 """``gaussian-swaying fit FILM --splat SPLAT``: what it writes before the fit, what it asks for, and the result."""
 
 import dataclasses
+import math
 import subprocess
 from types import SimpleNamespace
 
@@ -15,7 +16,7 @@ from shared import refused
 
 from gaussian_swaying.cli import fit_film
 from gaussian_swaying.cli.fit import main
-from gaussian_swaying.cli.fit_film import Seen, longest_side, plan_text, upright_in
+from gaussian_swaying.cli.fit_film import Seen, extent, longest_side, plan_text, upright_in
 from gaussian_swaying.cli.preview import build_options, preview_scene
 from gaussian_swaying.cli.register import painter_of
 from gaussian_swaying.fitting.before import HELD, MOVING
@@ -127,6 +128,14 @@ def test_known_lengths(seen):
 def test_lengths_of_nothing(seen, name, told):
     with pytest.raises(ValueError, match=told):
         longest_side(name, 2.0, *seen)
+
+
+def test_the_extent_does_not_depend_on_the_turn():
+    """A square cloth is as long as its side, however it is turned about the vertical, and not as its diagonal."""
+    share = torch.rand(4000, 2, generator=torch.Generator().manual_seed(0))
+    for angle in (0.0, 0.5, 0.785):
+        points = torch.stack([share[:, 0] * math.cos(angle), share[:, 0] * math.sin(angle), share[:, 1]], 1)
+        assert extent(points, [0.0, 0.0, 1.0]) == pytest.approx(1.0, abs=0.01)
 
 
 def test_a_fit_without_a_length_keeps_the_edited_file(case, checked, capsys):

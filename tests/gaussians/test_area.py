@@ -200,6 +200,11 @@ def test_patch_area_takes_the_two_larger_scales(device, dtype):
     torch.testing.assert_close(patch_area(scales.log()), expected)
 
 
+def test_gradcheck_of_patch_area(device):
+    log_scales = torch.randn(4, 3, device=device, dtype=torch.float64, requires_grad=True)
+    assert torch.autograd.gradcheck(patch_area, (log_scales,))
+
+
 @pytest.mark.parametrize(
     ("call", "name"),
     [

@@ -243,6 +243,15 @@ def test_the_error_shrinks_with_the_cells():
         assert abs(_total_volume(filling) - math.pi / 6) < 0.15 * spacing * math.pi
 
 
+def test_scale_does_not_matter():
+    """A scene in millimetres and one in kilometres get the same points."""
+    points, normals, *_ = _bodies()["ball"]
+    small = _fill(points, normals)
+    large = _fill(1024 * points, normals, spacing=1024 * H, sigma=0.6 * 1024 * H)
+    torch.testing.assert_close(large.position, 1024 * small.position)
+    torch.testing.assert_close(large.volume, 1024**3 * small.volume)
+
+
 def test_points_lie_inside_and_holes_stay_empty():
     """Distance to the ball, the ring of the torus and the walls of the hollow ball; half a cell beyond is allowed."""
     bodies = _bodies()

@@ -27,6 +27,15 @@ def test_model_holds_storage_form_parameters(device, dtype):
     assert len(model) == 6
 
 
+@pytest.mark.parametrize("copy", [True, False])
+def test_tensors_are_copied_or_shared(copy):
+    cloud = varied_cloud(6, 2)
+    model = GaussianSurfaceModel.from_cloud(cloud, requires_grad=False, copy=copy)
+    assert all(torch.equal(getattr(model, name), getattr(cloud, name)) for name in ("means", "quats", "opacities"))
+    shared = {name: getattr(model, name).data_ptr() == getattr(cloud, name).data_ptr() for name in ("means", "scales")}
+    assert shared == {"means": not copy, "scales": not copy}
+
+
 @pytest.mark.parametrize("degree", [0, 3])
 @pytest.mark.parametrize("normals", [False, True])
 def test_model_round_trip_through_a_file(tmp_path, degree, normals):
@@ -39,6 +48,15 @@ def test_model_round_trip_through_a_file(tmp_path, degree, normals):
         assert not getattr(back, field).requires_grad
     assert torch.equal(back.normals, read_ply(tmp_path / "a.ply").normals)
     assert not any(parameter.requires_grad for parameter in model.parameters())
+
+
+def test_model_state_dict_round_trip():
+    cloud = varied_cloud(6, 2, normals=True)
+    state = GaussianSurfaceModel.from_cloud(cloud).state_dict()
+    other = GaussianSurfaceModel.from_cloud(varied_cloud(6, 2, seed=1, normals=True))
+    other.load_state_dict(state)
+    assert torch.equal(other.sh, cloud.sh)
+    assert torch.equal(other.to_cloud().normals, cloud.normals)
 
 
 def test_model_normals_take_the_side_of_the_file():

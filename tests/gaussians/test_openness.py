@@ -7,6 +7,7 @@ import pytest
 import torch
 
 from gaussian_swaying.gaussians.area import coverage_area
+from gaussian_swaying.gaussians.model import GaussianSurfaceModel
 from gaussian_swaying.gaussians.openness import LEAST, _split, openness
 from gaussian_swaying.geometry.rotations import quat_to_rotation
 from gaussian_swaying.scenes.ficus import FicusScene
@@ -69,6 +70,13 @@ def test_what_is_behind_the_skin_counts_for_little(name):
     assert float((weight * areas)[inner].sum() / areas[inner].sum()) < 0.15  # the skin itself lets some light through
 
 
+def test_what_is_faint_hides_little():
+    body = bodies.shell(6000) + bodies.shell(6000, 1.05, opacity=0.02, seed=9)
+    weight, areas = weights(body)
+    assert float((weight * areas)[:6000].sum() / areas[:6000].sum()) > 0.93
+    assert float((weight * areas)[6000:].sum() / areas[6000:].sum()) < 0.1
+
+
 @pytest.mark.parametrize("opacity", [0.98, 0.3])
 def test_free_sheets_keep_their_area(opacity):
     body = bodies.plate(8000, opacity)
@@ -78,6 +86,12 @@ def test_free_sheets_keep_their_area(opacity):
     cloud.opacities.fill_(math.log(opacity / (1 - opacity)))
     weight, _ = weights(bodies.of_cloud(cloud))
     assert float(weight.min()) > 0.99
+
+
+def test_areas_of_the_model_are_weighed():
+    cloud = FlagScene(spacing=0.1).generate()
+    model = GaussianSurfaceModel.from_cloud(cloud)
+    torch.testing.assert_close(model.areas("open"), model.areas("coverage"))
 
 
 @pytest.mark.slow(gate=["50-0.96"])
@@ -189,6 +203,14 @@ def test_wrong_shapes_are_named(name, shape):
     given = {"means": (4, 3), "normals": (4, 3), "log_scales": (4, 3), "areas": (4,), "opacity": (4,), name: shape}
     with pytest.raises(ValueError, match=rf"Expected `{name}` of shape .* but got"):
         openness(**{key: torch.ones(size) for key, size in given.items()})
+
+
+@pytest.mark.parametrize("name", ["means", "normals", "areas"])
+def test_openness_rejects_values_that_are_not_finite(name):
+    given = {"means": torch.rand(4, 3), "normals": torch.rand(4, 3), "areas": torch.rand(4)}
+    given[name][2] = torch.nan
+    with pytest.raises(ValueError, match=f"Expected `{name}` to be finite, but some are NaN or infinite"):
+        openness(log_scales=torch.zeros(4, 3), **given)
 
 
 def test_depths_around_a_place_are_sums_over_its_own_column():

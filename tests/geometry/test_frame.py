@@ -24,6 +24,8 @@ def test_rotation_is_proper_and_takes_up_to_z(up):
     assert float(torch.linalg.det(rotation)) == pytest.approx(1.0)
     expected = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)
     assert_close(rotation @ direction / direction.norm(), expected, rtol=0, atol=1e-8)
+    # by the least angle that does so, the one between up and z
+    assert float(rotation.trace()) == pytest.approx(1 + 2 * float(direction[2] / direction.norm()), abs=1e-8)
 
 
 def test_up_is_minus_y_has_a_closed_form():

@@ -1,6 +1,7 @@
 """The estimate of a run's time: from one grid to another, the grid for a time, and against runs."""
 
 import dataclasses
+import math
 from types import SimpleNamespace
 
 import pytest
@@ -13,6 +14,7 @@ from gaussian_swaying.mpm.boundaries.pinned_region import PinnedRegion
 from gaussian_swaying.mpm.solver import MPMSolver
 from gaussian_swaying.preview import cost as cost_module
 from gaussian_swaying.preview.cost import Cost, estimate_cost, finest_within, scaled_seconds, with_whole
+from gaussian_swaying.recording.recorder import Recorder
 from gaussian_swaying.scenes.procedural import FlagScene
 from gaussian_swaying.scenes.vase import VaseScene
 from gaussian_swaying.simulation.material import Material
@@ -98,6 +100,11 @@ def test_another_grid_has_other_substeps_and_the_same_pictures(power):
     assert scaled_seconds(here, here, 0.04) == pytest.approx(here.total_seconds)
 
 
+def test_without_two_grids_a_surface_is_assumed():
+    here = cost(0.04, 1.0)
+    assert scaled_seconds(here, here, 0.02) == pytest.approx(5 + 10 * 2**3 + 10.1)
+
+
 @pytest.mark.parametrize("power", [0.0, 1.3, 3.0])
 @pytest.mark.parametrize("seconds", [22.0, 40.0, 300.0])
 def test_the_finest_grid_for_a_time_is_found(power, seconds):
@@ -112,6 +119,10 @@ def test_the_finest_grid_for_a_time_is_found(power, seconds):
     assert len(tried) <= 3
     assert found.dx == 0.01 or cost(found.dx - 0.0021, power).total_seconds > seconds
     assert all(0.01 <= dx <= 0.06 and dx == float(f"{dx:.2g}") for dx in tried)
+
+
+def test_the_coarsest_grid_is_the_answer_if_none_is_fast_enough():
+    assert finest_within(cost, 3.0, cost(0.04), cost(0.06), 0.01, 0.06).dx == 0.06
 
 
 def test_a_grid_that_is_too_fine_to_start_is_passed_over():
@@ -148,6 +159,22 @@ def test_a_run_takes_as_many_substeps_as_it_has_frames_after_the_first(frames, m
     simulated = {1: 0.0, 2: 5003 * 2e-3, 101: 100 * 5003 * 2e-3}[frames]
     assert found.simulation_seconds == pytest.approx(simulated, rel=1e-12)
     assert found.total_seconds == pytest.approx(3.5 + simulated + 0.25 * frames)
+
+
+def test_cost_is_the_product_of_its_parts(make_simulation):
+    simulation = make_simulation(frame_dt=0.04)
+    cost = estimate_cost(simulation, frames=11)
+    # E = 3e3, nu = 0.3, 30 kg/m^3 by default of the fixture; c^2 = (lambda + 2 mu) / rho
+    speed = math.sqrt(3e3 * 0.7 / (1.3 * 0.4) / 30)
+    assert cost.wave_speed == pytest.approx(speed, rel=1e-5)
+    assert cost.substeps >= math.ceil(0.04 / (0.4 * 0.2 / speed) - 1e-6)
+    assert cost.substep == pytest.approx(0.04 / simulation.solver.substeps(simulation.start(), 0.04))
+    assert cost.substep <= cost.stable_substep
+    assert cost.particles == 96
+    assert cost.simulation_seconds == pytest.approx(10 * cost.substeps * cost.substep_seconds)
+    assert cost.total_seconds == pytest.approx(cost.simulation_seconds + 11 * cost.picture_seconds)
+    simulation.recorder = Recorder(images=False, video=False)
+    assert estimate_cost(simulation, 2).picture_seconds is None
 
 
 def flag(device):

@@ -59,6 +59,12 @@ def test_the_parts_of_a_plant(alocasia):
     assert "pot still" in plant.words()
 
 
+def test_any_axis_may_be_up(alocasia):
+    x, y, z = alocasia.means.unbind(-1)
+    turned = dataclasses.replace(alocasia, means=torch.stack([x, -z, y], -1) * 7 + torch.tensor([3.0, -2.0, 1.0]))
+    check_alocasia(found(turned, (0.0, -1.0, 0.0)).parts, alocasia.means)
+
+
 def test_a_tree_has_a_brown_stem(alocasia):
     cloud = FicusScene(spacing=0.01).generate()
     parts, (x, y, z) = found(cloud).parts, cloud.means.unbind(-1)

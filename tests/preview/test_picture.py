@@ -7,6 +7,7 @@ import pytest
 import torch
 import yaml
 
+from gaussian_swaying.aero.wind import FlowKey, WindField
 from gaussian_swaying.gaussians.ply import write_ply
 from gaussian_swaying.geometry.regions import Box, Cylinder, Everything, Not, Sphere, Union
 from gaussian_swaying.mpm.boundaries.impulse import Impulse
@@ -83,6 +84,12 @@ def test_parts_are_those_of_the_run(make_simulation):
     assert torch.equal(parts.pinned, (x < 0.11) & (z < 0.6))
     assert torch.equal(parts.pushed, (x > 0.8) & (x < 1.1) & (z < 0.6))
     assert parts.names == ["PinnedRegion: 6 particles", "Impulse: 18 particles", "Plane"]
+
+
+def test_flow_is_the_strongest_of_a_schedule(make_simulation):
+    wind = WindField(schedule=[FlowKey(0.0, [0, 0, 0]), FlowKey(1.0, [0, 5, 0]), FlowKey(2.0, [1, 0, 0])])
+    assert mean_flow(make_simulation(wind=wind)).tolist() == [0, 5, 0]
+    assert mean_flow(make_simulation(wind=WindField([1.0, 2.0, 3.0]))).tolist() == [1, 2, 3]
 
 
 def test_picture_shows_pinned_and_static_gaussians(make_simulation):

@@ -21,7 +21,7 @@ from gaussian_swaying.geometry.rotations import quat_to_rotation
 from gaussian_swaying.mpm.materials import MATERIALS
 from gaussian_swaying.preview.hold import end_region
 from gaussian_swaying.preview.kinds import KINDS
-from gaussian_swaying.preview.shape import sheet_normal
+from gaussian_swaying.preview.shape import bounds, sheet_normal
 from gaussian_swaying.preview.starter import starter_yaml
 from gaussian_swaying.preview.suggest import (
     CLOTH_E,
@@ -276,6 +276,17 @@ def test_connected_parts_against_a_search():
     assert torch.equal(part[:, None] == part, label[:, None] == label)
 
 
+def test_a_long_chain_is_one_part():
+    chain = torch.arange(3000.0)[:, None] * torch.tensor([1.0, 0.3, -0.2])
+    assert int(connected_parts(chain, 1.01).max()) == 0
+    assert int(connected_parts(chain, 0.45).max()) > 0
+
+
+def test_a_stray_point_far_away_does_not_join_the_parts():
+    points = torch.tensor([[0.0, 0, 0], [0.01, 0, 0], [1.0, 0, 0], [-1e5, 0, 0]])
+    assert connected_parts(points, 0.02).tolist() == [1, 1, 2, 0]
+
+
 # ---- pins
 
 
@@ -308,6 +319,15 @@ def test_statistics_of_known_gaussians():
     assert own["opacity"][1] == pytest.approx(0.5, abs=0.01)
     side = float(means[:, 1].max() - means[:, 1].min())
     assert own["size_share"][1] == pytest.approx(0.4 / side, rel=0.05)
+
+
+def test_robust_bounds_ignore_a_far_speck():
+    points = torch.rand(1000, 3)
+    points[0] = 1e6
+    corner = bounds(points)
+    assert corner["max"] == [1e6] * 3
+    assert max(corner["robust_max"]) <= 1
+    assert corner["min"] == points.amin(0).tolist()
 
 
 def test_spacing_of_a_lattice():

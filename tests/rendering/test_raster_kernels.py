@@ -127,6 +127,13 @@ def test_any_three_values():
     _agree((means, covariances, opacities, colors[:, :1].expand(-1, 3)), _camera())
 
 
+def test_blur_and_background():
+    scene, camera = _scene(), _camera()
+    made = _agree(scene, camera, eps2d=2.0)
+    black = raster.render(*scene, camera, None, 2.0)
+    torch.testing.assert_close(made.color, black.color + (1 - black.alpha) * BACKGROUND, rtol=0, atol=1e-6)
+
+
 def test_the_same_bits_for_any_number_of_threads():
     scene, camera, before = _scene(5000, size=0.02), _camera(300, 200), torch.get_num_threads()
     made = []

@@ -46,6 +46,12 @@ def test_ambient_blends_linearly():
     torch.testing.assert_close(diffuse_shading(color, -normal, light, ambient=1.0), color)
 
 
+def test_light_is_normalised_and_negative_colours_are_clamped():
+    color, normal, _ = _case(torch.float32)
+    torch.testing.assert_close(DiffuseShader((0, 0, 7.0))(color, normal), DiffuseShader()(color, normal))
+    assert DiffuseShader()(-color, normal).eq(0).all()
+
+
 def test_relative_diffuse_is_the_ratio_of_the_factors():
     color, normal, light = _case(torch.float64)
     rest = torch.tensor([math.sin(1.0), 0.0, math.cos(1.0)], dtype=torch.float64)

@@ -9,7 +9,7 @@ from gaussian_swaying.gaussians.harmonics import sh_to_color
 from gaussian_swaying.geometry import covariances
 from gaussian_swaying.rendering.cameras.camera import Camera, look_at_camera
 from gaussian_swaying.rendering.protocol import finite_gaussians
-from gaussian_swaying.rendering.torch_renderer import TorchRenderer, render_torch
+from gaussian_swaying.rendering.torch_renderer import TorchRenderer, project_gaussians, render_torch
 
 WIDTH, HEIGHT = 20, 14
 
@@ -137,6 +137,14 @@ def test_order_of_the_input_does_not_matter():
     expected, result = render_torch(*scene, _camera()), render_torch(*(s[permutation] for s in scene), _camera())
     torch.testing.assert_close(result.color, expected.color, atol=1e-12, rtol=0)
     torch.testing.assert_close(result.depth, expected.depth, atol=1e-12, rtol=0)
+
+
+def test_projection_is_sorted_and_keeps_what_is_seen():
+    projected = project_gaussians(*_scene()[:3], _camera())
+    assert (projected.depths.diff() >= 0).all()
+    kept = set(projected.index.tolist())
+    assert kept.isdisjoint({6, 10, 11})
+    assert {0, 7, 13} <= kept
 
 
 @pytest.mark.parametrize("max_pairs", [1, 7, 100, 1 << 20])

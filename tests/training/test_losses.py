@@ -55,6 +55,11 @@ def test_photometric_loss_is_the_weighted_sum():
     torch.testing.assert_close(padded.mean(), photometric_loss(x, y, padding="zeros"))
 
 
+def test_photometric_gradient():
+    x, y = _pictures(12, 13)
+    assert torch.autograd.gradcheck(lambda p: photometric_loss(p, y), x.requires_grad_(), fast_mode=True)
+
+
 def _of_each(loss, values):
     """The loss of each Gaussian alone."""
     return torch.stack([loss(one) for one in values.split(1)])
@@ -87,6 +92,12 @@ def test_size_by_hand():
     scales = torch.tensor([[0.001, 0.010, 0.002], [0.008, 0.001, 0.001]], dtype=torch.float64).log()
     torch.testing.assert_close(_of_each(size_loss, scales), torch.tensor([0.002, 0.0], dtype=torch.float64))
     assert size_loss(scales, b=0.0).item() == pytest.approx(0.009)
+
+
+def test_no_gaussians_cost_nothing():
+    assert anisotropy_loss(torch.zeros(0, 3)).item() == 0.0
+    assert opacity_entropy_loss(torch.zeros(0)).item() == 0.0
+    assert size_loss(torch.zeros(0, 3)).item() == 0.0
 
 
 def test_scale_gradients():

@@ -20,6 +20,7 @@ from gaussian_swaying.training.surface_losses import (
     chosen_pixels,
     cross_correlation,
     depth_normal_loss,
+    edge_weight,
     round_trip,
     sample,
     textured,
@@ -242,6 +243,15 @@ def test_normals_that_fit_their_depths_cost_nothing():
     assert float(depth_normal_loss(none, camera)) == 0.0
     term = DepthNormalLoss(0)
     assert float(term(_inputs(surface=mixed))) == pytest.approx(1 - math.cos(0.2), rel=1e-6)
+
+
+def test_weights_of_edges():
+    image = torch.zeros(9, 12, 3)
+    image[:, 6:] = 1.0
+    weight = edge_weight(image)
+    assert weight[4, 2] == 1.0
+    assert weight[4, 6] == 0.0
+    assert weight[0].eq(0).all()
 
 
 def test_correlations():
