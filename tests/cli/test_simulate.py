@@ -7,6 +7,7 @@ import subprocess
 import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 import yaml
@@ -158,6 +159,16 @@ def test_print_config_parses_back(tmp_path, capsys):
     second = parser.parse_args(["--config", str(tmp_path / "again.yaml")])
     assert config_text(parser, first) == config_text(parser, second)
     assert second.frames == 2
+
+
+def test_the_stored_configuration_makes_the_same_run(tmp_path):
+    """config.yaml of a run is a complete configuration: run again, it gives the same positions."""
+    one, two = tmp_path / "one", tmp_path / "two"
+    assert main([*SMALL, "--output", str(one)]) == 0
+    assert main(["--config", str(one / "config.yaml"), "--frames", "2", "--device", "cpu", "--output", str(two)]) == 0
+    with np.load(one / "trajectory.npz") as a, np.load(two / "trajectory.npz") as b:
+        assert a.files == b.files
+        assert all(np.array_equal(a[name], b[name]) for name in a.files)
 
 
 def _help(capsys, option):

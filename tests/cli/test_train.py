@@ -13,6 +13,7 @@ from pathlib import Path
 import pytest
 import torch
 import yaml
+from damage import Fuse
 from lightning.pytorch.utilities.rank_zero import rank_zero_info, rank_zero_warn
 from shared import contents
 
@@ -20,6 +21,7 @@ from gaussian_swaying.captures.generated_capture import GeneratedCapture
 from gaussian_swaying.cli.train import main, make_cli
 from gaussian_swaying.gaussians.ply import read_ply
 from gaussian_swaying.runs.lock import FolderLock
+from gaussian_swaying.runs.seal import seal
 from gaussian_swaying.runs.signals import StoppedBySignal
 from gaussian_swaying.training.finite import TrainingDiverged
 from gaussian_swaying.training.module import SplatTrainer
@@ -270,6 +272,21 @@ def test_a_loss_of_ones_own_from_a_yaml(capture, tmp_path, monkeypatch):
     assert loss.weights == {"rgb": 1.0, "anisotropy": 0.0, "entropy": 0.01, "size": 0.01, "flat": 3.0}
     assert loss.terms["flat"].share == 0.25
     assert set(loss.terms) == {"rgb", "entropy", "size", "flat"}
+
+
+@pytest.mark.parametrize("command", ["fit", "validate", "test"])
+def test_a_checkpoint_executes_no_code(command, capture, tmp_path, capsys):
+    """Neither in the check before nor by Lightning, which is asked alone too."""
+    file, burnt = tmp_path / "evil.ckpt", tmp_path / "burnt"
+    torch.save({"splat_training": {}, "state_dict": {}, "fuse": Fuse(burnt)}, file)
+    seal(file)
+    assert main([command, *_arguments(capture, tmp_path / "run"), f"--ckpt_path={file}"]) == 2
+    assert "more than tensors, numbers and text" in capsys.readouterr().err
+    cli = make_cli(_arguments(capture, tmp_path / "run"), run=False)
+    with pytest.raises(ValueError, match="more than tensors, numbers and text"):
+        getattr(cli.trainer, command)(cli.model, datamodule=cli.datamodule, ckpt_path=file)
+    assert not burnt.exists()
+    assert not (tmp_path / "run").exists()
 
 
 @pytest.mark.parametrize(

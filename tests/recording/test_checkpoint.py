@@ -8,7 +8,7 @@ import shutil
 import traceback
 
 import pytest
-from damage import damaged
+from damage import Fuse, damaged
 from shared import contents
 
 from gaussian_swaying.gaussians.ply import write_ply
@@ -19,16 +19,6 @@ from gaussian_swaying.recording.recorder import Recorder
 from gaussian_swaying.runs.seal import check_seal, save_sealed, seal
 
 CONFIG = "material:\n  E: 3000.0\nwind:\n  flow:\n  - 6.0\n  - 1.5\n  - 0.0\n"
-
-
-class Fuse:
-    """Executes code when it is unpickled."""
-
-    def __init__(self, path):
-        self.path = path
-
-    def __reduce__(self):
-        return open, (str(self.path), "w")
 
 
 @pytest.fixture(params=["total", "updated"])

@@ -27,6 +27,7 @@ from gaussian_swaying.recording.trajectory import load_trajectory
 from gaussian_swaying.recording.video import VideoEncoder
 from gaussian_swaying.rendering.cameras.camera_path import OrbitCamera
 from gaussian_swaying.simulation.diagnostics import SimulationDiverged
+from gaussian_swaying.simulation.run import Run
 
 
 def _names(folder):
@@ -395,6 +396,26 @@ def test_the_video_shows_the_frames_that_were_asked_for(order, frames, expected,
     assert _levels(tmp_path / "run") == expected
 
 
+def test_a_resumed_run_has_the_whole_video(tmp_path):
+    for first in (0, 2):
+        recorder = Recorder(trajectory=False)
+        checkpoint = recorder.open(tmp_path / "run", resume=first > 0)
+        assert (checkpoint is None) == (first == 0)
+        for k in range(first, first + 3):  # frame 2 is done again
+            recorder.write_image(k, _grey(k if first else 0))
+            recorder.write_checkpoint({"frame": 1, "state": {}, "log": [], "config": "", "wall_s": {}})
+        recorder.close(first + 3, {})
+    assert _levels(tmp_path / "run") == [0, 0, 2, 3, 4]
+
+
+def test_the_rate_may_be_given_at_the_end(tmp_path):
+    recorder = Recorder(trajectory=False)
+    recorder.open(tmp_path / "run", real_time_fps=10.0)
+    recorder.write_image(0, _grey(1))
+    recorder.close(1, {}, 50.0)
+    assert "50 fps" in _probe(tmp_path / "run" / "video.mp4")
+
+
 @pytest.mark.parametrize("how", ["forgotten", "opened again", "closed in vain"])
 def test_a_recorder_that_is_not_closed_leaves_its_frames_and_no_process(how, tmp_path):
     recorder = Recorder(trajectory=False)
@@ -523,6 +544,20 @@ def test_the_summary(make_simulation, tmp_path):
     assert summary["largest_cfl"] == pytest.approx(max(health.cfl for health in log))
     assert 0.2 < summary["largest_cfl"] <= 0.5
     assert len(summary["per_frame"]) == 3
+
+
+def test_kernels_are_loaded_without_a_trace(make_simulation, tmp_path):
+    """A run that did so first has the frames and the log of one that did not."""
+    runs = []
+    for load in (False, True):
+        simulation = make_simulation(wind=WindField([6.0, 1.5, 0.0], seed=7))
+        if load:
+            Run(simulation.painter, simulation.editor, simulation.recorder, 3).warm_up(simulation.start(), 0)
+        runs.append(_run(simulation, tmp_path / str(load), 3))
+    assert runs[0]["per_frame"] == runs[1]["per_frame"]
+    for name in ("00000", "00002"):
+        one, two = ((tmp_path / str(load) / "frames" / f"{name}.png").read_bytes() for load in (False, True))
+        assert one == two
 
 
 # ---- a run that ends badly

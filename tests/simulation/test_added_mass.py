@@ -12,6 +12,7 @@ from gaussian_swaying.aero.wind import WindField
 from gaussian_swaying.geometry.regions import Box
 from gaussian_swaying.mpm.boundaries.pinned_region import PinnedRegion
 from gaussian_swaying.simulation.batch import batch_of
+from gaussian_swaying.simulation.edits import Edit
 from gaussian_swaying.simulation.material import Material
 
 BREADTH, SHEET = 1.0, 0.3  # m, kg/m²
@@ -162,6 +163,14 @@ def test_a_changed_breadth_binds_again_and_another_coefficient_does_not(hanging)
     assert stepper.forces == [stepper.wind_force]  # C_D is not zero any more
     state = simulation.change(state, {"aero.added_mass": 0.0})
     assert simulation.solver.points is simulation.setup.points
+    assert torch.isfinite(simulation.advance(state)[0].position).all()
+
+
+def test_an_edit_keeps_the_air(hanging):
+    simulation = hanging(air())
+    state = simulation.edit(simulation.start(), Edit(density=60.0))
+    expected = simulation.setup.points.mass + added_mass_per_area(BREADTH, 1.225) * simulation.scene.patches.areas()
+    torch.testing.assert_close(simulation.solver.points.mass, expected)
     assert torch.isfinite(simulation.advance(state)[0].position).all()
 
 

@@ -264,6 +264,13 @@ def test_of_four_threads_that_loop_over_frames_one_goes_on():
     assert torch.equal(picture, last.render().color)
 
 
+def test_four_threads_that_run_a_simulation_take_turns(tmp_path):
+    simulation = _flag(recorder=Recorder(images=False, video=False))
+    found = _in_four_threads(lambda k: simulation.run(tmp_path / str(k), 2, progress=False))
+    assert [summary["status"] for summary in found] == ["complete"] * 4
+    assert len({(tmp_path / f"{k}/diagnostics.csv").read_bytes() for k in range(4)}) == 1
+
+
 def test_a_coefficient_changed_in_place_is_felt():
     simulation = _flag(aero=AeroForce(C_D=0.0, C_F=0.0, C_L=0.0))
     state = simulation.start()

@@ -7,6 +7,7 @@ import torch
 
 from gaussian_swaying.aero.force import AeroForce
 from gaussian_swaying.aero.wind import WindField
+from gaussian_swaying.recording.layout import video_file
 from gaussian_swaying.recording.recorder import Recorder
 from gaussian_swaying.rendering.cameras.camera_path import LookAtCamera, OrbitCamera
 from gaussian_swaying.rendering.passes import colormap, mean_depth
@@ -44,6 +45,15 @@ def test_files_of_a_run_with_two_cameras_and_all_renders(make_simulation, tmp_pa
         "force.mp4",
         "depth_raw",
     }
+
+
+def test_a_resumed_run_has_all_pictures(make_simulation, tmp_path):
+    folder, recorder = tmp_path / "run", {"renders": ["color", "normal"]}
+    _cameras(make_simulation(), side=SIDE).run(folder, 1, progress=False, recorder=Recorder(**recorder))
+    _cameras(make_simulation(), side=SIDE).run(folder, 3, resume=True, progress=False, recorder=Recorder(**recorder))
+    for place in ("frames", "normal", "cameras/side/frames", "cameras/side/normal"):
+        assert len(list((folder / place).glob("[0-9]*.png"))) == 3
+        assert len(iio.imread(folder / video_file(place))) == 3
 
 
 def test_the_depth_on_disk_is_in_metres(make_simulation, tmp_path):

@@ -78,6 +78,15 @@ def test_faint_gaussians(faint, make_cloud, make_scene):
     torch.testing.assert_close(means, expected[::2] if faint == "drop" else expected)
 
 
+def test_faint_gaussians_outside_the_region_stay(make_cloud, make_scene):
+    cloud = _faint_cloud(make_cloud)
+    outside = cloud.means[:, 0] > 0.5
+    for faint, count in (("carry", 40), ("drop", 40 - int((~outside)[1::2].sum()))):
+        scene = make_scene(cloud, faint=faint, region=LEFT)
+        assert len(scene.model.means) == count
+        assert not bool((scene.model.means[scene.carried, 0] > 0.5).any())
+
+
 def test_carried_gaussians_follow_their_nearest_particle(make_cloud, make_scene):
     """x' = x_a' + F_a (x - x_a), with a covariance and normal of F_a; every particle has its own F."""
     cloud = _faint_cloud(make_cloud)
@@ -416,6 +425,20 @@ def test_large_gaussians_get_further_points(make_scene):
     layered = make_scene(cloud, material, 0.1, particle_spacing=0.05, layers=3)
     assert layered.on_surface == full.points.count
     assert layered.points.count == 3 * full.points.count
+
+
+def test_spacing_of_the_particles_is_in_metres(make_scene):
+    cloud = _sheet_with_a_hole()
+    one, half = (make_scene(cloud, dx=0.1, particle_spacing=s, metres_per_unit=m) for s, m in ((0.05, 1.0), (0.1, 2.0)))
+    assert one.points.count == half.points.count
+
+
+def test_further_points_in_the_paper_s_areas(make_scene):
+    """Each Gaussian keeps pi s1 s2, shared among its points."""
+    cloud = _sheet_with_a_hole()
+    plain, full = (make_scene(cloud, dx=0.1, area="paper", particle_spacing=s) for s in (None, 0.05))
+    torch.testing.assert_close(full.patches.area.sum(), plain.patches.area.sum())
+    assert full.points.count > plain.points.count
 
 
 def test_three_layers_are_no_thicker_than_a_cell(make_scene):

@@ -451,6 +451,17 @@ def test_kept_colours_follow_a_change_in_place(changed, many_still):
     assert not torch.allclose(before, after)
 
 
+def test_harmonics_of_still_gaussians_have_gradients(many_still):
+    painter = many_still().painter
+    gaussians, camera, model = painter.scene.rest(), painter.camera_at(0), painter.scene.model
+    kept = painter.colors(gaussians, camera)
+    model.sh0.requires_grad_(True)
+    found = painter.colors(gaussians, camera)
+    found.sum().backward()
+    assert torch.equal(found, kept)
+    assert bool((model.sh0.grad != 0).any(-1).all())
+
+
 def test_colours_of_a_run_that_was_made_in_inference_mode(many_still):
     """Its tensors do not tell whether they were changed in place: nothing is kept."""
     with torch.inference_mode():

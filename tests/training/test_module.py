@@ -14,6 +14,7 @@ from gaussian_swaying.training.densification import (
     MCMCDensification,
 )
 from gaussian_swaying.training.finite import TrainingDiverged
+from gaussian_swaying.training.initial import gaussians_from_points
 from gaussian_swaying.training.losses import LossTerm, MeanOpacityLoss, MeanScaleLoss
 from gaussian_swaying.training.module import SplatTrainer
 from gaussian_swaying.training.optimizers import LearningRates, means_rate
@@ -197,6 +198,16 @@ def test_a_loss_that_is_not_finite_stops(data, make_trainer, tmp_path):
     assert sorted(path.name for path in tmp_path.glob("*.ckpt")) == ["step=3.ckpt", "step=6.ckpt"]
     state = torch.load(caught.value.checkpoint, weights_only=False)["state_dict"]
     assert all(torch.isfinite(value).all() for value in state.values())
+
+
+def test_a_view_without_gaussians(data, make_trainer):
+    """Nothing drawn: the step passes, losses of the Gaussians still count."""
+    module = _module()
+    cloud = gaussians_from_points(torch.rand(20, 3), torch.rand(20, 3), 1)
+    cloud.means.sub_(torch.tensor([0.0, 100.0, 0.0]))  # behind the cameras
+    data.initial_cloud = lambda degree: cloud
+    make_trainer(5).fit(module, data)
+    assert torch.isfinite(module.splat.means).all()
 
 
 def test_gaussians_that_are_not_finite_are_not_kept(data, make_trainer, tmp_path):

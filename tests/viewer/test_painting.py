@@ -208,6 +208,20 @@ def test_two_browsers_paint_strokes_of_their_own(page, painter, connect, places,
     other.socket.close()
 
 
+def test_it_paints_while_a_video_is_recorded(page, painter, until):
+    """The video goes on afterwards."""
+    client, painting = painter.client, page.controls.painting
+    client.set(page.controls.files.record, True)
+    until(lambda: page.recording is not None)
+    painter.move([200, 150])
+    until(lambda: _labelled(page).any())
+    until(lambda: page.recording.seconds > 0)
+    client.set(painting.apply, True)
+    before = page.recording.seconds
+    until(lambda: page.recording.seconds > before + 0.1)
+    assert page.session.problem is None
+
+
 def _join_on(page, connect, until):
     """Another browser on a page that paints already."""
     known = set(page.streams._lines)

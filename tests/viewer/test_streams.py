@@ -203,6 +203,14 @@ def test_only_a_browser_that_viser_knows_gets_states(page, drawer, until):
         drawer.wait("another one")
 
 
+def test_another_connection_with_the_key_takes_over(page, drawer):
+    drawer.wait("state")
+    other = Drawer(page, next(iter(page.streams._lines)))
+    assert _closed(drawer.socket) == 1000
+    assert other.wait("state")
+    other.socket.close()
+
+
 def test_states_are_for_pages_of_this_program_only(page, drawer):
     with pytest.raises(Exception, match="403"):
         Drawer(page, next(iter(page.streams._lines)), origin="https://evil.example")

@@ -14,6 +14,7 @@ import torch
 from small_scenes import together
 
 from gaussian_swaying.cli.export import main
+from gaussian_swaying.gaussians.ply import write_ply
 from gaussian_swaying.geometry.covariances import covariance
 from gaussian_swaying.mpm.transfer import bspline_weights
 from gaussian_swaying.recording.nodes import join_far, load_nodes, split_at, split_far
@@ -279,6 +280,19 @@ def test_what_is_no_run_of_total_is_refused(make_flag, run, tmp_path, capsys):
     (copy / "summary.json").write_text("{")
     assert "summary.json cannot be read" in _refusal([str(copy)], capsys)
     assert not list(tmp_path.glob("**/film.*"))
+
+
+def test_a_splat_that_moved_or_changed_is_refused(make_flag, tmp_path, capsys):
+    splat, folder = tmp_path / "flag.ply", tmp_path / "run"
+    cloud = FlagScene(spacing=0.1).generate()
+    write_ply(splat, cloud)
+    make_flag(scene={"generator": None, "ply": str(splat)}, recorder={"images": False}).run(folder, 2, progress=False)
+    assert main(["--web", str(folder)]) == 0
+    cloud.means[0] += 0.001
+    write_ply(splat, cloud)
+    assert "flag.ply has changed since the run in" in _refusal([str(folder)], capsys)
+    splat.unlink()
+    assert "flag.ply of the run is not there (`scene.ply` in " in _refusal([str(folder)], capsys)
 
 
 def _with_nodes(run, folder, change):
