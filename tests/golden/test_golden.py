@@ -5,8 +5,8 @@ grown. Others, on two more kinds of processor and a GPU, were up to 17 times as 
 energy, so 32 times are allowed, and 2^-29 of that in float64. The rest is four units in the last place of float32, to
 which records are rounded, and in float64 1e-6 of the largest number, as areas, masses and normals are found in float32
 in any case; 3e-3 for modes, where the linear algebra of the machine decides which of the weakest Ritz vectors are
-kept (one thread and two differ by 1.3e-3 in the elastic energy). Of a picture, 3 % may differ, as Gaussians at one depth
-are drawn in another order.
+kept (one thread and two differ by 1.3e-3 in the elastic energy). Of a picture, 3 % may differ, as Gaussians at one
+depth are drawn in another order.
 
 If a change of the physics is meant, ``python tests/golden/make.py`` with the names of the cases writes new records.
 """
