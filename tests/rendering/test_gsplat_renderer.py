@@ -50,6 +50,47 @@ def test_matches_the_torch_renderer():
 
 
 @pytest.mark.gpu
+def test_a_picture_is_that_of_gsplat_s_rasterization():
+    gsplat = pytest.importorskip("gsplat")
+    means, covariances, opacities, colors = _scene(3000)
+    view = _camera().to("cuda", torch.float32)
+    ours = render_gsplat(means, covariances, opacities, colors, view)
+    pixels, alpha, _ = gsplat.rasterization(
+        means=means,
+        quats=None,
+        scales=None,
+        opacities=opacities,
+        colors=colors,
+        viewmats=view.world_to_camera[None],
+        Ks=view.intrinsics[None],
+        width=view.width,
+        height=view.height,
+        near_plane=view.near,
+        packed=True,
+        render_mode="RGB+D",
+        covars=covariances,
+    )
+    assert float(alpha.mean()) > 0.05
+    for actual, expected in (
+        (ours.color, pixels[0, ..., :3]),
+        (ours.depth, pixels[0, ..., 3:]),
+        (ours.alpha, alpha[0]),
+    ):
+        assert float((actual - expected).abs().amax()) <= 1e-3  # Gaussians of equal depth in another order
+
+
+@pytest.mark.gpu
+def test_gradients_match_the_torch_renderer():
+    gradients = []
+    for render in (render_gsplat, render_torch):
+        scene = [item.clone().requires_grad_() for item in _scene(500)]
+        render(*scene, _camera()).color.square().sum().backward()
+        gradients.append([scene[0].grad, scene[2].grad, scene[3].grad])
+    for actual, expected in zip(*gradients, strict=True):
+        assert float((actual - expected).norm() / expected.norm()) < 0.02
+
+
+@pytest.mark.gpu
 def test_nothing_visible_and_bad_gaussians():
     background = torch.tensor([0.2, 0.5, 1.0], device="cuda")
     scene = _scene(100)

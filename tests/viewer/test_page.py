@@ -1,5 +1,6 @@
 """The live page, in a real browser where there is one."""
 
+import socket
 import threading
 import time
 import urllib.error
@@ -61,6 +62,29 @@ def test_closing_ends_all_threads(parser, settings, until):
     page.close()
     session.close()
     until(lambda: not {t.name for t in set(threading.enumerate()) - before} & {"turns", "simulation"})
+
+
+@pytest.mark.slow
+def test_a_client_that_reads_nothing_slows_nobody(page, connect, until):
+    """Another one gets its pictures; for the first one only the last picture waits, and it goes without a word."""
+    page.largest = 1000
+    narrow = socket.socket()
+    narrow.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)  # before it connects; the system takes no more in
+    narrow.connect(("127.0.0.1", page.server.get_port()))
+    connect(page, 1000, 500, sock=narrow)
+    quick = connect(page, 200, 100)
+    buffer, _ = (state.message_buffer for state in page.server._websock_server._client_state_from_id.values())
+    number, stuck = page.session.snapshot.number, 0
+    while stuck < 20 or page.session.snapshot.number < number + 6:
+        if len(quick.socket.recv(timeout=20)) > 500:  # a picture
+            stuck = stuck + 1 if buffer.message_from_id else 0
+    assert len(buffer.message_from_id) < 10
+    quick.close()
+    narrow.close()
+    until(lambda: not page.server.get_clients())
+    number = page.session.snapshot.number
+    until(lambda: page.session.snapshot.number > number + 2)
+    assert page.session.problem is None
 
 
 def test_the_page_moves_pauses_and_steps(page, window, until):
@@ -142,3 +166,18 @@ def test_a_click_takes_hold_of_the_flag(page, window, until):
     let_go.dispatch_event("click")
     until(lambda: not session.pulls and holding._handle is None, 60)
     assert window.problems == []
+
+
+@pytest.mark.slow
+def test_two_browsers_see_the_same_scene_and_closing_one_ends_nothing(page, window, browser, until):
+    second = browser.new_context(viewport={"width": 500, "height": 700})
+    other = second.new_page()
+    other.goto(page.url)
+    until(lambda: len(page.server.get_clients()) == 2, 240)
+    page.by_browser = False
+    until(lambda: sum(len(times) > 3 for times in list(page._drawn.values())) == 2, 240)
+    second.close()
+    until(lambda: len(page.server.get_clients()) == 1)
+    number = page.session.snapshot.number
+    until(lambda: page.session.snapshot.number > number + 3)
+    assert page.session.problem is None
