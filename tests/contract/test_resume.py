@@ -9,6 +9,7 @@ from gaussian_swaying.aero.carried import Turbulence
 from gaussian_swaying.aero.computed_air import ComputedAir
 from gaussian_swaying.aero.shelter import Shelter
 from gaussian_swaying.aero.wind import GaussianGust, SineSway
+from gaussian_swaying.gaussians.filling import InteriorFilling
 from gaussian_swaying.gaussians.parts import Part, Parts
 from gaussian_swaying.mpm.laws.neo_hookean import NeoHookean
 from gaussian_swaying.mpm.laws.sand import Sand
@@ -29,6 +30,10 @@ CASES = {
         "solver": MPMSolver(0.4, "modes", boundaries=[PinnedRegion(Box([None] * 3, [None, None, 0.2]))]),
     },
     "plastic": {"solver": FLOWS, "material": Material(E=3e3, density=30.0, law=Sand())},
+    "solid": {
+        "scene": Scene(generator=SolidScene("ball", 0.6, 0.06, gaussians="shell"), filling=InteriorFilling()),
+        "solver": MPMSolver(0.12, boundaries=[PinnedRegion(Box([None] * 3, [None, None, -0.2]))]),
+    },
     "edits": {
         "edits": [
             Edit(time=0.0, color=[0.0, 1.0, 0.0]),

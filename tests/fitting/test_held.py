@@ -82,3 +82,9 @@ def test_there_is_no_box_where_all_moves():
     video, picture = _filmed(lambda row, column: 12 * (column - 40) / 110)
     places, moved = moving_points(video, picture)
     assert moving_box(places, moved, plain_cloud(places.float(), -5.0)) is None
+
+
+def test_no_end_stands_still():
+    """Most of it moves; or nothing does."""
+    for shift in (lambda row, column: 4 + 8 * (abs(row - 80) < 20), lambda row, column: 1.0 * (column > 90)):
+        assert held_end(*moving_points(*_filmed(shift)), up=(0.0, 0.0, 1.0)) is None

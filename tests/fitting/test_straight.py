@@ -37,6 +37,12 @@ def test_a_step_is_straight_in_the_plane(size):
         assert not torch.allclose(moved, step, rtol=0.05)
 
 
+def test_a_step_is_added_without_an_azimuth_and_from_no_wind_on():
+    place, step = torch.tensor([0.0, 0.5], dtype=torch.float64), torch.tensor([0.1, -0.2], dtype=torch.float64)
+    for sought in (SOUGHT[:2], [Unknown("wind.speed", 0.0, 10.0), SOUGHT[2]]):
+        assert torch.equal(straight(sought)(place, step), place + step)
+
+
 def test_a_wind_across_a_sheet_is_found_in_few_steps():
     """The wind across is seen forty times as well as that along the sheet, so the valley is straight in the plane."""
     wanted, across = _components([0.5, 0.5, 0.7]), torch.tensor([math.cos(0.3), math.sin(0.3)], dtype=torch.float64)

@@ -139,6 +139,22 @@ def test_what_diverges_is_told_and_reset_heals_it(session, until):
     assert session.problem is None
 
 
+def test_reset_goes_back_to_rest_and_keeps_what_was_changed(session, until):
+    rest = _position(session).clone()
+    session.start()
+    session.change({"material.E": 2e4, "solver.damping": 3.0})
+    until(lambda: session.settings.solver.damping == 3.0 and session.snapshot.health.time > 0.1)
+    assert not torch.equal(_position(session), rest)
+    session.pause()  # or its time at rest passes between two looks
+    session.reset()
+    until(lambda: session.snapshot.health.time == 0)
+    assert torch.equal(_position(session), rest)
+    session.pause(False)
+    until(lambda: session.snapshot.health.time > 0.05)
+    assert float(session.simulation.scene.points.youngs_modulus.amax()) == pytest.approx(2e4)
+    assert session.simulation.solver.damping == 3.0
+
+
 def _stiffness(session):
     return float(session.simulation.scene.points.youngs_modulus.amax())
 
