@@ -14,6 +14,8 @@ import nightly
 import pytest
 import torch
 
+from gaussian_swaying import _program as program
+
 
 def pytest_collection_modifyitems(config, items):
     """Skip `gpu` tests without CUDA, unless GS_REQUIRE_GPU=1 asks for them; leave `slow` ones to the nightly run.
@@ -70,6 +72,13 @@ def dtype(request):
 @pytest.fixture(autouse=True)
 def _seed():
     torch.manual_seed(0)
+
+
+@pytest.fixture(autouse=True)
+def _not_called():
+    """Forget that a test started a command through the installed program."""
+    yield
+    program._called.clear()
 
 
 # now that the environment is set

@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 
 sys.path.append(str(Path(__file__).parents[1]))
-from golden.cases import CASES, picture, run
+from golden.small_runs import CASES, picture, run
 
 FILES = Path(__file__).parent / "files"
 TORCH = {"solver.transfer": "torch", "dtype": "float64"}

@@ -11,15 +11,10 @@ depth are drawn in another order.
 If a change of the physics is meant, ``python tests/golden/make.py`` with the names of the cases writes new records.
 """
 
-import sys
-from pathlib import Path
-
 import numpy as np
 import pytest
-
-sys.path.append(str(Path(__file__).parent))
-from golden.cases import CASES, CONFIGS, picture, run
 from golden.make import FILES, TORCH, scale
+from golden.small_runs import CASES, CONFIGS, picture, run
 
 GROWTH = 32.0
 QUANTUM = 2.0**-22
