@@ -142,7 +142,7 @@ def drawn_apart(page, simulation):
     values = page.evaluate("windPage.positions().then((found) => Array.from(found))")
     found = torch.tensor(values, dtype=torch.float64).reshape(-1, 3)
     state = simulation.start()
-    for _ in range(round(page.evaluate("windPage.time()") / simulation.frame_dt)):
+    for _ in range(round(page.evaluate("windPage.time() ?? 0") / simulation.frame_dt)):
         state, _ = simulation.advance(state)
     scene = simulation.scene
     size, order = scene.size * scene.frame.metres_per_unit, order_of(scene)[1]

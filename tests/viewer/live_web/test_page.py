@@ -24,7 +24,7 @@ def test_after_two_seconds_the_gaussians_are_where_a_run_puts_them(show, written
     told = page.evaluate("windPage.advance(50)")
     assert told["simulated"] == pytest.approx(2.0)
     assert told["lanes"]
-    assert page.evaluate("windPage.time()") == pytest.approx(2.0)
+    assert page.evaluate("windPage.time() ?? 0") == pytest.approx(2.0)
     error, motion = drawn_apart(page, make())
     assert motion > 0.1
     assert error < 0.01
@@ -47,11 +47,11 @@ def _grabbed(page):
 
 def _stops(page, until):
     """Wait until the motion stands still, and return its time."""
-    times = [page.evaluate("windPage.time()")]
+    times = [page.evaluate("windPage.time() ?? 0")]
 
     def stands_still():
         time.sleep(0.2)
-        times.append(page.evaluate("windPage.time()"))
+        times.append(page.evaluate("windPage.time() ?? 0"))
         return times[-1] == times[-2]
 
     until(stands_still)
@@ -74,18 +74,18 @@ def test_what_the_visitor_does(show, written, until):
     assert not page.evaluate("windPage.pulled()")
     assert page.evaluate("windPage.link()") == link  # the view stood still
     page.locator("#slow").click()
-    until(lambda: page.evaluate("windPage.time()") > 0.3)
+    until(lambda: page.evaluate("windPage.time() ?? 0") > 0.3)
     page.locator("#play").click()
     assert not page.evaluate("windPage.playing()")
     stopped = _stops(page, until)
     page.locator("#play").click()
-    until(lambda: page.evaluate("windPage.time()") > stopped)
+    until(lambda: page.evaluate("windPage.time() ?? 0") > stopped)
     hide = "(value) => { Object.defineProperty(document, 'hidden', { value, configurable: true }); "
     hide += "document.dispatchEvent(new Event('visibilitychange')); }"
     page.evaluate(hide, True)
     stopped = _stops(page, until)
     page.evaluate(hide, False)
-    until(lambda: page.evaluate("windPage.time()") > stopped)
+    until(lambda: page.evaluate("windPage.time() ?? 0") > stopped)
     box = page.locator("#dial").bounding_box()
     page.mouse.click(box["x"] + 0.9 * box["width"], box["y"] + 0.5 * box["height"])
     assert page.evaluate("Math.hypot(...windPage.settings.wind)") == pytest.approx(10 * 0.8 / 0.96, rel=0.05)
@@ -107,7 +107,7 @@ def test_what_the_visitor_does(show, written, until):
     for part in ("windPage.settings.wind", "windPage.settings.gusts"):
         assert other.evaluate(part) == pytest.approx(page.evaluate(part), abs=1e-3)
     page.locator("#reset").click()
-    until(lambda: page.evaluate("windPage.time()") < 0.3)
+    until(lambda: page.evaluate("windPage.time() ?? 0") < 0.3)
     assert page.told == other.told == []
 
 

@@ -136,7 +136,7 @@ def test_a_page_after_two_seconds_and_after_its_device_is_lost(show, written, ma
     told = page.evaluate("windPage.advance(10)")
     assert told["lanes"]
     assert page.evaluate("windPage.solver()") == "webassembly"
-    assert page.evaluate("windPage.time()") == pytest.approx(2.4)
+    assert page.evaluate("windPage.time() ?? 0") == pytest.approx(2.4)
     assert drawn_apart(page, make())[0] < 0.01
     assert page.locator("#note").inner_text() == LOST.format(page.evaluate("windPage.why()"))
     assert asked_of_a_network(page) == []
@@ -149,14 +149,14 @@ def test_chosen_by_hand(show, written, until):
     assert page.evaluate("windPage.solver()") == "webassembly"
     assert not page.locator("#note").is_visible()
     for name, solver in {"webgpu": "webgpu", "worker": "webassembly"}.items():
-        before = page.evaluate("windPage.time()")
+        before = page.evaluate("windPage.time() ?? 0")
         page.evaluate(f"location.hash = 'solver={name}'")
         until(lambda solver=solver: page.evaluate("windPage.solver()") == solver)
-        until(lambda before=before: page.evaluate("windPage.time()") > before)
+        until(lambda before=before: page.evaluate("windPage.time() ?? 0") > before)
         assert f"solver={name}" in page.evaluate("windPage.link()")
     assert page.told == []
     page = show(written, "#solver=worker")
-    until(lambda: page.evaluate("windPage.time()") > 0)
+    until(lambda: page.evaluate("windPage.time() ?? 0") > 0)
     assert [page.evaluate("windPage.solver()"), page.evaluate("windPage.why()")] == ["webassembly", None]
 
 
