@@ -108,6 +108,7 @@ class MPMSolver(Solver):
         self.automatic, self.why = formulation == "auto", ""
         self.formulation: Literal["total", "updated", "modes", "auto"] = "total" if self.automatic else formulation
         self._too_far: str | None = None
+        self._decided = False
         self.transfer: Literal["auto", "torch", "kernels"] = transfer
         self.cfl, self.substep = float(cfl), substep
         if pivot and formulation != "modes":
@@ -152,6 +153,11 @@ class MPMSolver(Solver):
         return FORMULATIONS[self.formulation].neighbours_fixed
 
     # ---- the object at rest
+
+    @property
+    def may_choose(self) -> bool:
+        """True if ``auto`` chooses a formulation with the next material."""
+        return self.automatic and not self._decided
 
     @property
     def bound(self) -> Formulation:
@@ -249,7 +255,7 @@ class MPMSolver(Solver):
     def _bind(self, points: MaterialPoints, surface: Surface | None) -> None:
         self._bound = self._fused = None
         body = Body(points, self._framed or self._conditions(), surface)
-        if self.automatic:
+        if self.may_choose:
             self.formulation, self.why = self._choice(body)
         bound = FORMULATIONS[self.formulation](body, self.settings)
         self._fused_obstacle = self._why_not_kernels(bound)
@@ -260,6 +266,11 @@ class MPMSolver(Solver):
             return "updated", f"the law {body.laws.plastic_names[0]} flows"
         why = self._too_far or why_not_modes(body)
         return ("modes", "it is held, and nothing touches or folds") if why is None else ("total", why.split(": ")[0])
+
+    def choose(self, *, anew: bool) -> None:
+        """Let ``auto`` choose anew with the next material, or keep its choice, as while a simulation runs."""
+        self._decided = not anew
+        self._too_far = None if anew else self._too_far
 
     def leans_too_far(self, lean: float) -> None:
         """Let ``auto`` be ``total`` from the next :meth:`init_state` on, as a body leans by a share of its size."""

@@ -247,7 +247,11 @@ class Stepper:
     def start(self) -> State:
         """The state at rest at time zero."""
         self.starts += 1
+        if isinstance(self.solver, MPMSolver):
+            self.solver.choose(anew=True)
         state = self.bind()
+        if isinstance(self.solver, MPMSolver):
+            self.solver.choose(anew=False)
         self._idle = None  # coefficients may have changed
         check_spacing(self.solver)
         self.solver.prepare()
@@ -291,7 +295,7 @@ class Stepper:
         scene, self._bound = self.scene, self.materials
         points = MaterialPoints.stack(self._bound) if self.batched else self._bound[0]
         state: State = self.solver.init_state(points, frame=scene.frame, surface=scene.surface_places)
-        if isinstance(self.solver, MPMSolver) and self.solver.automatic and isinstance(self.solver.bound, Modes):
+        if isinstance(self.solver, MPMSolver) and self.solver.may_choose and isinstance(self.solver.bound, Modes):
             lean = self._lean(self.solver.bound)
             if lean > MOST_LEAN:
                 self.solver.leans_too_far(lean)
