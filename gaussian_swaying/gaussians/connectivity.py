@@ -184,8 +184,7 @@ def shades(cell: Tensor, piece: Tensor, pairs: Tensor, count: int = 6) -> Tensor
     """
     many, size = int(piece.max()) + 1, piece.bincount()
     of = torch.zeros(many, dtype=torch.long).index_copy(0, piece, cell)
-    ends = torch.unique(piece[pairs].sort(1).values, dim=0)
-    ends = ends[ends[:, 0] != ends[:, 1]]
+    ends = once(piece[pairs], many)
     beside: list[list[int]] = [[] for _ in range(many)]
     for p, q in ends.tolist():
         beside[p].append(q)

@@ -16,6 +16,7 @@ from torch import Tensor
 from tqdm import tqdm
 
 from gaussian_swaying._checks import check_positive, check_shape
+from gaussian_swaying.geometry.groups import equal_rows
 from gaussian_swaying.geometry.neighbours import nearest_neighbours
 
 MAX_CELLS = 30_000_000  # of the density grid: 120 MB, and about ten times that while it is in use
@@ -81,12 +82,12 @@ def density_grid(
     grid = torch.zeros(int(padded.prod()))
     advance(int((~touches).sum()))
     kept = touches.nonzero()[:, 0]
-    kinds, kind = torch.unique(reach[kept], dim=0, return_inverse=True)
-    for k, radius in enumerate(kinds.tolist()):
-        cells = torch.cartesian_prod(*(torch.arange(-r, r + 1) for r in radius)).reshape(-1, 3)
+    kind = equal_rows(reach[kept])
+    for members in (kept[kind == k] for k in kind.unique()):
+        cells = torch.cartesian_prod(*(torch.arange(-r, r + 1) for r in reach[members[0]].tolist())).reshape(-1, 3)
         shift = (cells * stride).sum(-1)
         ox, oy, oz = cells.float().unbind(-1)
-        for rows in kept[kind == k].split(max(1, chunk // len(cells))):
+        for rows in members.split(max(1, chunk // len(cells))):
             fx, fy, fz = fraction[rows, :, None].unbind(1)
             m = inverse[rows]
             x, y, z = ox - fx, oy - fy, oz - fz

@@ -14,6 +14,7 @@ import math
 import torch
 from torch import Tensor
 
+from gaussian_swaying.geometry.groups import equal_rows
 from gaussian_swaying.geometry.neighbours import nearest_neighbours
 from gaussian_swaying.mpm.held_rows import LEAST_APART, MOST_ROWS, groups, means
 
@@ -110,7 +111,7 @@ def normals(points: Tensor, mass: Tensor, places: Tensor, dx: float) -> Tensor:
     They are the first ones in cubes of two cells, so that they do not depend on what lies elsewhere. The arguments are
     those of :func:`thickness`.
     """
-    cube = torch.unique((places / (2 * dx)).floor(), dim=0, return_inverse=True)[1]
+    cube = equal_rows((places / (2 * dx)).floor())
     order = torch.arange(len(places), device=places.device)
     some = places[torch.full_like(order, len(places)).scatter_reduce(0, cube, order, "amin")[: int(cube.max()) + 1]]
     found = []
@@ -194,7 +195,7 @@ def face_patches(points: Tensor, mass: Tensor, held: Tensor, dx: float) -> tuple
     place, across = face(points, held, dx)
     size, equal = PATCH * dx, torch.ones(len(place), dtype=place.dtype)
     while True:
-        cell = torch.unique((place.detach() / size).floor().long(), dim=0, return_inverse=True)[1]
+        cell = equal_rows((place.detach() / size).floor())
         if 4 * (int(cell.max()) + 1 if len(cell) else 0) <= MOST_ROWS:
             break
         size *= 2

@@ -160,10 +160,12 @@ class Structure:
         """The stiffness of Hooke's law, of all points or of some of them, bool (P,), for a mean modulus of 1 Pa."""
         import scipy.sparse as sparse
 
-        mu, lam = self._lame if some is None else [field * some for field in self._lame]
+        mu, lam = self._lame
         slope = self._basis
         order = np.argsort(self.site, kind="stable")
-        many = np.bincount(self.site)
+        order = order if some is None else order[some[order]]
+        many = np.bincount(self.site[order])
+        many = many[many > 0]
         first = np.cumsum(many) - many
         g = slope.transpose(0, 2, 1).reshape(len(slope), 81)  # node by axis
         keys, blocks = [], []

@@ -19,7 +19,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from gaussian_swaying.geometry.groups import equal_rows, joined
+from gaussian_swaying.geometry.groups import equal_rows, joined, once
 from gaussian_swaying.mpm.state import GridSpec
 
 
@@ -74,7 +74,7 @@ def _of_one_scene(first: Tensor, grid: GridSpec, attached: Tensor) -> tuple[Tens
     if attached.dim() == 1:
         component = equal_rows(torch.stack([node, attached[example].repeat_interleave(27)], 1))
     else:
-        component = joined(len(node), _common(cell, torch.unique(fragment[attached[a != b]], dim=0), grid))
+        component = joined(len(node), _common(cell, once(fragment[attached[a != b]], len(cell)), grid))
     leader = _first_of(component).sort().values  # in the order of the points, whatever the graph says
     of = node[leader]
     copy = _first_of(torch.unique(of, return_inverse=True)[1])

@@ -262,10 +262,10 @@ def _find_soil(across: Tensor, height: Tensor, share: Tensor, green: Tensor, pot
     soil |= (share < WALL) & (above < 0.5 * LEVEL) & (above > -2 * LEVEL)
     soil &= ~(green & (above > 0.5 * LEVEL))
     middle = soil & (share < OPENING)
-    cells = torch.unique((across[middle] / (0.25 * float(pot.radii[-1]))).floor(), dim=0)
+    cells = equal_rows((across[middle] / (0.25 * float(pot.radii[-1]))).floor())
     opening = torch.pi * (OPENING / 0.25) ** 2
     level = float((system[close] @ plane).mean())
-    return (soil, level) if len(cells) > INSIDE * opening else (torch.zeros_like(soil), None)
+    return (soil, level) if cells.unique().numel() > INSIDE * opening else (torch.zeros_like(soil), None)
 
 
 def _most_frequent(points: Tensor, label: Tensor) -> Tensor:

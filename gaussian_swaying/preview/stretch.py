@@ -18,7 +18,7 @@ from gaussian_swaying.aero.wind_force import WindForce
 from gaussian_swaying.mpm.formulations.modes import Modes
 
 SAMPLES, RATE, LEAST_RATE, PER_PERIOD = 60_000, 25.0, 6.0, 10.0  # of a record; in a second; in a period
-PLACES, LINES = 96, 20  # at which the wind is taken; lines along the wind on which they lie
+PLACES, LINES, BLOCK = 96, 20, 12  # at which the wind is taken; lines along it on which they lie; added at once
 SKIPPED, SHORTEST, PERIODS = 2.0, 10.0, 10.0  # s at the start; s, and periods, of a stretch
 FASTEST, RINGING = 3.0, 12  # frequency over the first above which a mode does not swing; modes that ring on
 STEP, TOGETHER = 0.32, 256  # s between stretches; stretches that are compared at once
@@ -144,11 +144,13 @@ def _push(wind: WindField, places: torch.Tensor, pull: torch.Tensor, rate: float
     air = _air(wind, torch.from_numpy(line), rate, SAMPLES + before - first, before)
     pressed = (air.norm(dim=-1, keepdim=True) * air).numpy()
     push = np.zeros((SAMPLES, pull.shape[-1]))
-    for k, own in enumerate(late):
-        n, here = math.floor(own), pressed[:, label[k]]
-        begin, share = before - n, own - n
-        at = (1 - share) * here[begin : begin + SAMPLES] + share * here[begin - 1 : begin - 1 + SAMPLES]
-        push += at @ pull[k].numpy()
+    for some in np.array_split(np.arange(len(late)), max(1, len(late) // BLOCK)):
+        at = []
+        for k in some:
+            n, here = math.floor(late[k]), pressed[:, label[k]]
+            begin, share = before - n, late[k] - n
+            at.append((1 - share) * here[begin : begin + SAMPLES] + share * here[begin - 1 : begin - 1 + SAMPLES])
+        push += np.concatenate(at, 1) @ pull[some].flatten(0, 1).numpy()
     return push
 
 
@@ -177,13 +179,11 @@ def _response(square: np.ndarray, damping: np.ndarray, tip: np.ndarray, fastest:
 
 def _motion(load: np.ndarray, response: Response, rate: float) -> Motion:
     """The motion of a tip under the loads of a response, (T, 2 K + 3)."""
-    from scipy.signal import lfilter
-
     count, dt = len(response.root), 1 / rate
     moved, free = load[:, 2 * count :].copy(), []
     for k, root in enumerate(response.root):
-        decay = np.exp(root * dt)  # exact for steps of the load
-        amplitude = lfilter([0.0, (decay - 1) / root], [1.0, -decay], load[:, k] + 1j * load[:, count + k])
+        decay = np.exp(root * dt * np.arange(len(load)))  # exact for steps of the load
+        amplitude = _convolved(load[:, k] + 1j * load[:, count + k], decay * (decay[1] - 1) / root)
         moved += (amplitude[:, None] * response.out[:, k]).real
         free.append((float(amplitude.std() * np.linalg.norm(response.out[:, k])), root, amplitude, response.out[:, k]))
     free.sort(key=lambda mode: -mode[0])
@@ -195,6 +195,13 @@ def _motion(load: np.ndarray, response: Response, rate: float) -> Motion:
         return left
 
     return moved, ringing
+
+
+def _convolved(load: np.ndarray, answer: np.ndarray) -> np.ndarray:
+    """The sum over past samples of a load (T,) times the answer (T,) to each, from the next sample on."""
+    samples = len(load)
+    both = np.fft.ifft(np.fft.fft(load, 2 * samples) * np.fft.fft(answer, 2 * samples))[: samples - 1]
+    return np.concatenate([np.zeros(1), both])
 
 
 def _fault(value: Any, allowed: tuple[float, float, float]) -> Any:
