@@ -1,4 +1,4 @@
-"""Measures of motion: does a thing sway, and at which frequency does it ring? And pictures that show motion."""
+"""Measures of motion: does a thing sway? And pictures that show motion."""
 
 from __future__ import annotations
 
@@ -168,72 +168,6 @@ def _together(rest: np.ndarray, lines: np.ndarray, least: float) -> float:
     return float(np.corrcoef(means)[np.triu_indices(len(means), k=1)].mean())
 
 
-# ---- a free decay
-
-
-def natural_frequency(displacement: Array, times: Array) -> tuple[float, float]:
-    """Natural frequency and damping ratio of a thing that was let go in still air.
-
-    The displacement is projected on its first principal component. There u = c + a exp(-δ f t) cos(2π f t + φ) is
-    fitted, where δ is the logarithmic decrement and f the frequency of the damped motion. Then ζ = δ / √(4π² + δ²) is
-    the damping ratio and f / √(1 - ζ²) the natural frequency.
-
-    Args:
-        displacement: Displacements in each frame, in any unit, shape (T, ...).
-        times: Times of the frames, evenly spaced [s], shape (T,).
-
-    Returns:
-        The natural frequency [Hz] and the damping ratio.
-    """
-    from scipy.optimize import curve_fit
-
-    displacement, times = _numbers(displacement), _numbers(times)
-    if len(displacement) != len(times) or len(times) < FEWEST:
-        raise ValueError(
-            f"Expected `displacement` (T, ...) and `times` (T,) of at least {FEWEST} frames, but got shapes "
-            f"{displacement.shape} and {times.shape}."
-        )
-    step = _step(times)
-    line, time = _main_component(displacement.reshape(len(times), -1)), times - times[0]
-    frequency, decrement, offset = _first_guess(line, step)
-
-    def decay(t: np.ndarray, f: float, delta: float, cosine: float, sine: float, level: float) -> np.ndarray:
-        turn = 2 * np.pi * f * t
-        return level + np.exp(-delta * f * t) * (cosine * np.cos(turn) + sine * np.sin(turn))
-
-    guess = (frequency, decrement, line[0] - offset, 0.0, offset)
-    found, _ = curve_fit(decay, time, line, p0=guess, maxfev=20_000)
-    f, delta = abs(float(found[0])), float(found[1]) * math.copysign(1.0, float(found[0]))
-    ratio = delta / math.hypot(2 * math.pi, delta)
-    return f / math.sqrt(1 - ratio**2), ratio
-
-
-def _main_component(rows: np.ndarray) -> np.ndarray:
-    """Rows (T, K) on their first principal component (T,), the largest value positive and of size 1."""
-    centred = rows - rows.mean(axis=0)
-    if not centred.any():
-        raise ValueError("Expected a `displacement` that changes, but it does not: nothing swings.")
-    line = np.linalg.eigh(centred @ centred.T)[1][:, -1]  # T by T, as K may be large
-    return line / line[np.abs(line).argmax()]
-
-
-def _first_guess(line: np.ndarray, step: float) -> tuple[float, float, float]:
-    """Frequency [Hz] by zero crossings, logarithmic decrement by the height of the swings between them, and level."""
-    level = float(line[len(line) // 2 :].mean())
-    swings = np.flatnonzero(np.diff(np.sign(line - level)))  # the last frames before a crossing
-    heights = np.array([np.abs(part - level).max() for part in np.split(line, swings + 1)[1:-1]])
-    if len(heights) < 2:
-        raise ValueError(
-            f"Expected at least three crossings of the resting place, but got {len(swings)}: give more frames, or a "
-            "thing with less damping."
-        )
-    # small swings at the end are noise, so each counts by its height
-    per_half = np.polyfit(np.arange(len(heights)), np.log(heights), deg=1, w=heights)[0]
-    large = swings[: 1 + max(2, int((heights > 0.2 * heights.max()).sum()))]
-    half_period = (large[-1] - large[0]) / (len(large) - 1) * step
-    return 0.5 / half_period, -2 * float(per_half), level
-
-
 # ---- pictures of motion
 
 
@@ -258,26 +192,20 @@ def contact_sheet(frames: Iterable[Array], columns: int) -> np.ndarray:
     return grid.transpose(0, 2, 1, 3, 4).reshape(rows * height, columns * width, 3)
 
 
-def space_time(frames: Iterable[Array], column: int | None = None, row: int | None = None) -> np.ndarray:
-    """One line of pixels over time: what stands still is a straight stripe, what sways a wave.
+def space_time(frames: Iterable[Array], row: int) -> np.ndarray:
+    """A row of pixels over time: what stands still is a straight stripe, what sways a wave.
 
     Args:
-        frames: Pictures of one size, uint8, each of shape (H, W, 3).
-        column: Column of pixels, whose T copies stand side by side; the middle one if neither is given.
-        row: Row of pixels instead, whose T copies lie one below the other.
+        frames: T pictures of one size, uint8, each of shape (H, W, 3).
+        row: Row of pixels, whose copies lie one below the other.
 
     Returns:
-        The picture, uint8, shape (H, T, 3), or (T, W, 3) for a row.
+        The picture, uint8, shape (T, W, 3).
     """
     film = _film(frames)
-    if column is not None and row is not None:
-        raise ValueError("Expected `column` or `row`, but got both: remove one.")
-    height, width = film.shape[1:3]
-    name, given, size = ("column", column, width) if row is None else ("row", row, height)
-    line = size // 2 if given is None else given
-    if not 0 <= line < size:
-        raise ValueError(f"Expected `{name}` from 0 to {size - 1}, but got {line}.")
-    return film[:, :, line].transpose(1, 0, 2).copy() if row is None else film[:, line].copy()
+    if not 0 <= row < film.shape[1]:
+        raise ValueError(f"Expected `row` from 0 to {film.shape[1] - 1}, but got {row}.")
+    return film[:, row].copy()
 
 
 def _film(frames: Iterable[Array]) -> np.ndarray:

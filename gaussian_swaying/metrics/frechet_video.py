@@ -8,7 +8,6 @@ on that network, on how clips are cut and on how frames are resized. So it is al
 from __future__ import annotations
 
 import hashlib
-import math
 import os
 from collections.abc import Sequence
 from pathlib import Path
@@ -23,6 +22,7 @@ from torchmetrics import Metric  # noqa: TID253 - a class of torchmetrics, impor
 from gaussian_swaying._checks import check_positive, check_shape
 
 # arguments of the TorchScript I3D of StyleGAN-V besides the clips: we resize and rescale ourselves
+BATCH = 8  # clips in a call of the network
 _OPTIONS = {"rescale": False, "resize": False, "return_features": True}
 
 
@@ -88,9 +88,9 @@ def cut_clips(video: Tensor, length: int, stride: int) -> Tensor:
 class FrechetVideoDistance(Metric):
     """Fréchet distance between the features of real and of generated clips, FVD (Unterthiner et al. 2018).
 
-    Frames are resized bilinearly (half-pixel centres, no prefilter, the aspect ratio is not kept), mapped from
-    ``value_range`` to -1 to 1, and given to the network as clips (B, 3, T, H, W). It must return features (B, D). The
-    TorchScript version of I3D that FVD is commonly computed with is called with ``rescale=False, resize=False,
+    Frames are resized bilinearly (half-pixel centres, no prefilter, the aspect ratio is not kept), mapped from 0 to 1
+    to -1 to 1, and given to the network as clips (B, 3, T, H, W). It must return features (B, D). The TorchScript
+    version of I3D that FVD is commonly computed with is called with ``rescale=False, resize=False,
     return_features=True``; networks without these arguments are called with the clips alone.
 
     Covariances are unbiased. With at most D clips they are singular. The number is still defined then, but it depends
@@ -102,9 +102,6 @@ class FrechetVideoDistance(Metric):
         stride: Frames from the start of one clip to the start of the next.
         resize: Height and width of the frames given to the network [pixels], or one number for both; None keeps the
             size.
-        value_range: Values of black and white in the videos.
-        batch_size: Clips per call of the network.
-        kwargs: Options of :class:`torchmetrics.Metric`.
 
     Raises:
         ValueError: If there is no such file, it is not TorchScript, or a number is out of range.
@@ -122,18 +119,11 @@ class FrechetVideoDistance(Metric):
         clip_length: int = 16,
         stride: int = 1,
         resize: int | Sequence[int] | None = 224,
-        value_range: tuple[float, float] = (0.0, 1.0),
-        batch_size: int = 8,
-        **kwargs: object,
     ) -> None:
-        super().__init__(**kwargs)
-        for name, value in (("clip_length", clip_length), ("stride", stride), ("batch_size", batch_size)):
+        super().__init__()
+        for name, value in (("clip_length", clip_length), ("stride", stride)):
             check_positive(name, value)
-        low, high = (float(value) for value in value_range)
-        if not (math.isfinite(low) and math.isfinite(high) and low < high):
-            raise ValueError(f"Expected `value_range` to be black and a larger white, but got {tuple(value_range)}.")
-        self.clip_length, self.stride, self.batch_size = int(clip_length), int(stride), int(batch_size)
-        self.value_range = (low, high)
+        self.clip_length, self.stride = int(clip_length), int(stride)
         size = (resize, resize) if isinstance(resize, int) else resize
         if size is not None:
             if len(size) != 2:
@@ -170,7 +160,7 @@ class FrechetVideoDistance(Metric):
         """Add the clips of one or more videos.
 
         Args:
-            video: Frames with values in ``value_range``, shape (T, 3, H, W) or (B, T, 3, H, W).
+            video: Frames with values from 0 to 1, shape (T, 3, H, W) or (B, T, 3, H, W).
             real: Whether these videos are the reference.
         """
         check_shape("video", video, "T", 3, "H", "W")
@@ -178,18 +168,16 @@ class FrechetVideoDistance(Metric):
             raise ValueError(
                 f"Expected `video` of shape (T, 3, H, W) or (B, T, 3, H, W), but got {tuple(video.shape)}."
             )
-        low, high = self.value_range
         smallest, largest = (float(value) for value in video.aminmax())
-        if not (low <= smallest and largest <= high):
+        if not (smallest >= 0 and largest <= 1):
             raise ValueError(
-                f"Expected `video` to have values from {low:g} to {high:g}, but they range from {smallest:g} to "
-                f"{largest:g}: set `value_range`."
+                f"Expected `video` to have values from 0 to 1, but they range from {smallest:g} to {largest:g}."
             )
         features = []
         for one in video if video.dim() == 5 else video[None]:
-            frames = (self.prepare(one) - low) * (2 / (high - low)) - 1
+            frames = self.prepare(one) * 2 - 1
             clips = cut_clips(frames, self.clip_length, self.stride)
-            features += [self._features(batch) for batch in clips.split(self.batch_size)]
+            features += [self._features(batch) for batch in clips.split(BATCH)]
         (self.real_features if real else self.fake_features).extend(features)
 
     def _features(self, clips: Tensor) -> Tensor:
@@ -226,7 +214,7 @@ class FrechetVideoDistance(Metric):
             "stride": self.stride,
             "resize": None if self.resize is None else list(self.resize),
             "interpolation": "bilinear, half-pixel centres, no prefilter",
-            "value_range": list(self.value_range),
+            "value_range": [0.0, 1.0],
             **{name: len(value) for name, value in counts.items()},
             "features": features,
         }

@@ -5,15 +5,13 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from gaussian_swaying._checks import check_positive, check_shape
-
-_PAIRS = 2**20  # on a CPU a chunk of distances should fit in the cache
-_PAIRS_CUDA = 2**24
+PAIRS = {"cpu": 2**20, "cuda": 2**24}
+"""Most distances in memory at a time, where all pairs are looked at; on a CPU they should fit in the cache."""
 
 
 @torch.no_grad()
-def nearest_distances(source: Tensor, target: Tensor, pairs: int | None = None) -> tuple[Tensor, Tensor]:
-    """Distance of every point to the nearest one of the other set, both ways.
+def nearest_distances(source: Tensor, target: Tensor) -> tuple[Tensor, Tensor]:
+    """Distance of every point to the nearest one of the other set, both ways; neither set may be empty.
 
     Exact on any device: a GPU looks at all pairs, a CPU searches a tree. Distances are computed from
     differences of coordinates, not from expanded squares, so they stay precise far from the origin. There is no
@@ -22,29 +20,19 @@ def nearest_distances(source: Tensor, target: Tensor, pairs: int | None = None) 
     Args:
         source: Points [m], shape (P, D).
         target: Points [m], shape (Q, D).
-        pairs: Largest number of distances in memory at a time, where all pairs are looked at, but at least Q; the
-            default suits the device.
 
     Returns:
         Distances from ``source`` to ``target`` [m], shape (P,), and from ``target`` to ``source`` [m], shape (Q,).
     """
-    if pairs is None:
-        pairs = _PAIRS_CUDA if source.is_cuda else _PAIRS
-    check_positive("pairs", pairs)
-    check_shape("source", source, "P", "D")
-    check_shape("target", target, "Q", source.shape[-1])
-    for name, points in (("source", source), ("target", target)):
-        if len(points) == 0:
-            raise ValueError(f"Expected `{name}` to hold at least one point, but it is empty.")
     if not source.is_cuda and bool(torch.isfinite(source).all()) and bool(torch.isfinite(target).all()):
         return _by_tree(source, target), _by_tree(target, source)
-    return _by_chunks(source, target, pairs)
+    return _by_chunks(source, target)
 
 
-def _by_chunks(source: Tensor, target: Tensor, pairs: int) -> tuple[Tensor, Tensor]:
+def _by_chunks(source: Tensor, target: Tensor) -> tuple[Tensor, Tensor]:
     forward = source.new_empty(len(source))
     backward = target.new_full((len(target),), torch.inf)
-    rows = max(1, int(pairs) // len(target))
+    rows = max(1, PAIRS[source.device.type] // len(target))
     for start in range(0, len(source), rows):
         part = slice(start, start + rows)
         distance = _distances(source[part], target)

@@ -8,8 +8,6 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from gaussian_swaying._checks import check_choice, check_shape
-
 SSIM_TAPS = 11
 """Width of the window of :func:`ssim_map` [pixels]."""
 PADDINGS = ("valid", "reflect", "zeros")
@@ -33,8 +31,6 @@ def ssim_map(image: Tensor, target: Tensor, padding: str = "valid") -> Tensor:
     Returns:
         Similarity up to 1, shape (..., H - 10, W - 10, C) with ``valid``, else that of the pictures.
     """
-    check_choice("padding", padding, PADDINGS)
-    check_pictures(image, target)
     height, width, channels = image.shape[-3:]
     if min(height, width) < SSIM_TAPS:
         raise ValueError(f"Expected pictures of at least {SSIM_TAPS} x {SSIM_TAPS} pixels, but got {width} x {height}.")
@@ -67,10 +63,3 @@ def _window(dtype: torch.dtype, device: torch.device) -> Tensor:
         offsets = torch.arange(SSIM_TAPS, dtype=dtype, device=device) - SSIM_TAPS // 2
         window = torch.exp(-0.5 * (offsets / _SIGMA).square())
         return window / window.sum()
-
-
-def check_pictures(image: Tensor, target: Tensor) -> None:
-    """Raise ValueError unless both are pictures (H, W, C) of the same shape."""
-    check_shape("image", image, "H", "W", "C")
-    if image.shape != target.shape:
-        raise ValueError(f"Expected `target` of shape {tuple(image.shape)}, but got {tuple(target.shape)}.")

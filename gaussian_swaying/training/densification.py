@@ -22,7 +22,7 @@ PARAMETERS = ("means", "scales", "quats", "opacities", "sh0", "shN")
 
 _SUMS = ("grad2d", "count")  # of gsplat's state, over the images since the last change
 
-_IN_IMAGES = ("refine_start_iter", "refine_stop_iter", "refine_every", "reset_every", "pause_refine_after_reset")
+_IN_IMAGES = ("refine_start_iter", "refine_stop_iter", "refine_every", "reset_every")
 
 
 def _check_steps(**values: int) -> None:
@@ -141,9 +141,7 @@ class DefaultDensification(Densification):
         prune_scale3d: Scale above which it is removed after ``reset_every``, as a share of the scene's extent.
         reset_every: Steps between resets of the opacities; large Gaussians are pruned after the first.
         reset_opacity: Whether a reset lowers opacities to twice ``prune_opacity``.
-        pause_after_reset: Steps after a reset without changes; 0 for none.
         absgrad: Use absolute gradients (Ye et al. 2024, "AbsGS"); CUDA only.
-        revised_opacity: Set opacities of split Gaussians as Rota Bulo et al. 2024 (arXiv 2404.06109).
         split_at: Step at which all large Gaussians are split, at ``stop`` or later (see
             :func:`~gaussian_swaying.gaussians.subdivision.split_large`); null for never. On a surface of one colour
             nothing else makes Gaussians small, and large ones blur the folds of moving cloth.
@@ -166,14 +164,12 @@ class DefaultDensification(Densification):
         prune_scale3d: float = 0.1,
         reset_every: int = 3000,
         reset_opacity: bool = False,
-        pause_after_reset: int = 0,
         absgrad: bool = False,
-        revised_opacity: bool = False,
         split_at: int | None = None,
         split_size: float = 0.008,
     ) -> None:
         super().__init__()
-        _check_steps(start=start, stop=stop, every=every, reset_every=reset_every, pause_after_reset=pause_after_reset)
+        _check_steps(start=start, stop=stop, every=every, reset_every=reset_every)
         check_positive("densification.split_size", split_size)
         if split_at is not None:
             _check_steps(split_at=split_at)
@@ -201,9 +197,7 @@ class DefaultDensification(Densification):
             "prune_opa": prune_opacity,
             "prune_scale3d": prune_scale3d,
             "reset_every": reset_every,
-            "pause_refine_after_reset": pause_after_reset,
             "absgrad": absgrad,
-            "revised_opacity": revised_opacity,
         }
 
     def make_strategy(self, device: torch.device) -> Any:
@@ -306,11 +300,9 @@ class MCMCDensification(Densification):
 
     Args:
         cap: Largest number of Gaussians.
-        noise_rate: Noise on the centres, as a multiple of their learning rate.
         start: Step after which Gaussians may move.
         stop: Step from which they no longer do.
         every: Steps between moves.
-        min_opacity: A Gaussian with at most this opacity counts as dead.
 
     Raises:
         ValueError: If an argument is negative, or ``cap`` or ``every`` is 0.
@@ -319,25 +311,19 @@ class MCMCDensification(Densification):
     def __init__(
         self,
         cap: int = 1_000_000,
-        noise_rate: float = 5e5,
         start: int = 500,
         stop: int = 25_000,
         every: int = 100,
-        min_opacity: float = 0.005,
     ) -> None:
         super().__init__()
         _check_steps(start=start, stop=stop, every=every)
         check_positive("densification.cap", cap)
         check_positive("densification.every", every)
-        check_positive("densification.noise_rate", noise_rate, allow_zero=True)
-        check_positive("densification.min_opacity", min_opacity)
         self._options: dict[str, Any] = {
             "cap_max": cap,
-            "noise_lr": noise_rate,
             "refine_start_iter": start,
             "refine_stop_iter": stop,
             "refine_every": every,
-            "min_opacity": min_opacity,
         }
 
     def make_strategy(self, device: torch.device) -> Any:

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 import torch
 
-from gaussian_swaying.evaluation.sway import contact_sheet, natural_frequency, space_time, sway_score
+from gaussian_swaying.evaluation.sway import contact_sheet, space_time, sway_score
 
 TIMES = np.arange(250) * 0.04
 ROOT = Path(__file__).parents[2]
@@ -115,32 +115,6 @@ def test_input_that_does_not_fit(rest, frames, times, says):
         sway_score(rest, bent(rest, x=0.1 * sine(1))[:frames], times)
 
 
-# ---- a free decay
-
-
-def decay(hertz, ratio, offset=0.0):
-    damped = 2 * np.pi * hertz * math.sqrt(1 - ratio**2)
-    return offset + np.exp(-2 * np.pi * hertz * ratio * TIMES) * np.cos(damped * TIMES)
-
-
-@pytest.mark.parametrize(("hertz", "ratio"), [(0.6, 0.05), (1.3, 0.02), (1.3, 0.2), (4.0, 0.01)])
-def test_a_known_decay_is_recovered(rest, hertz, ratio):
-    noise = 0.002 * np.random.default_rng(0).normal(size=(250, *rest[:300].shape))
-    moved = bent(rest[:300], x=0.2 * decay(hertz, ratio, offset=0.1), y=0.1 * decay(hertz, ratio)) + noise
-    found = natural_frequency(torch.from_numpy(moved), TIMES + 3)
-    assert found == (pytest.approx(hertz, rel=0.01), pytest.approx(ratio, rel=0.05))
-    assert natural_frequency(decay(hertz, ratio), TIMES) == pytest.approx((hertz, ratio), rel=1e-6)
-
-
-def test_a_decay_that_does_not_swing():
-    with pytest.raises(ValueError, match="at least three crossings of the resting place"):
-        natural_frequency(np.exp(-TIMES), TIMES)
-    with pytest.raises(ValueError, match="nothing swings"):
-        natural_frequency(np.zeros((250, 4, 3)), TIMES)
-    with pytest.raises(ValueError, match=r"but got shapes \(250,\) and \(249,\)"):
-        natural_frequency(TIMES, TIMES[1:])
-
-
 # ---- pictures
 
 
@@ -160,13 +134,9 @@ def test_a_contact_sheet_shows_frames_row_by_row():
 
 def test_one_line_of_pixels_over_time():
     frames = film(5)
-    column = space_time(frames, column=2)
-    assert column.shape == (4, 5, 3)
-    assert np.array_equal(column[:, 3], frames[3, :, 2])
     row = space_time(list(map(torch.from_numpy, frames)), row=1)
     assert row.shape == (5, 6, 3)
     assert np.array_equal(row[3], frames[3, 1])
-    assert np.array_equal(space_time(frames), space_time(frames, column=3))
 
 
 def test_pictures_that_do_not_fit():
@@ -175,9 +145,7 @@ def test_pictures_that_do_not_fit():
     with pytest.raises(ValueError, match="`columns` of at least 1, but got 0"):
         contact_sheet(film(2), 0)
     with pytest.raises(ValueError, match="but got float64"):
-        space_time(film(2) / 255)
-    with pytest.raises(ValueError, match="got both"):
-        space_time(film(2), 1, 1)
+        space_time(film(2) / 255, row=0)
     with pytest.raises(ValueError, match="`row` from 0 to 3, but got 4"):
         space_time(film(2), row=4)
 
