@@ -1,10 +1,12 @@
-"""One small scene in files that another program wrote, and how far two clouds may differ."""
+"""One small scene in files that another program wrote, how far two clouds may differ, and how a file is refused."""
 
 from dataclasses import replace
 from pathlib import Path
 
+import pytest
 import torch
 
+from gaussian_swaying.gaussians.formats import read_gaussians
 from gaussian_swaying.gaussians.harmonics import rotate_sh
 from gaussian_swaying.gaussians.ply import read_ply
 from gaussian_swaying.geometry.rotations import quat_to_rotation, rotation_to_quat
@@ -33,7 +35,7 @@ def angle(a, b):
     return float(2 * rotation_to_quat(a.mT @ b).abs().amax(-1).clamp(max=1).acos().max())
 
 
-def assert_close(found, expected, *, means, scales, opacities, colors, sh, quats):
+def assert_same(found, expected, *, means, scales, opacities, colors, sh, quats):
     """Each field within a tolerance: opacities from 0 to 1, harmonics of degree 0 and above, an angle."""
     assert found.sh.shape == expected.sh.shape
     for name, a, b, atol in (
@@ -45,3 +47,20 @@ def assert_close(found, expected, *, means, scales, opacities, colors, sh, quats
     ):
         torch.testing.assert_close(a, b, rtol=0, atol=atol, msg=lambda text, name=name: f"{name}: {text}")
     assert angle(found, expected) < quats
+
+
+def in_order(found, expected):
+    """The found Gaussians in the order of the expected ones, as some formats sort."""
+    order = torch.cdist(expected.means.double(), found.means.double()).argmin(1)
+    assert order.unique().numel() == len(expected) == len(found)
+    return found.select(order)
+
+
+def refused(path, *words, name=None):
+    """A file is refused in one sentence that names it, or what else is given, and has the words."""
+    with pytest.raises((ValueError, FileNotFoundError)) as caught:
+        read_gaussians(path)
+    told = str(caught.value)
+    assert "\n" not in told
+    for word in (name or str(path), *words):
+        assert word in told

@@ -23,7 +23,6 @@ from copy import copy
 import torch
 from torch import Tensor, nn
 
-from gaussian_swaying._checks import check_shape
 from gaussian_swaying.geometry.groups import equal_rows, sums
 
 MOST = 243
@@ -47,9 +46,6 @@ class Patches(nn.Module):
 
     def __init__(self, normal: Tensor, area: Tensor, point: Tensor, count: int) -> None:
         super().__init__()
-        check_shape("normal", normal, None, 3, batches=False)
-        check_shape("area", area, len(normal), batches=False)
-        check_shape("point", point, len(normal), batches=False)
         self.count = int(count)
         self.register_buffer("normal", normal, persistent=False)
         self.register_buffer("area", area, persistent=False)

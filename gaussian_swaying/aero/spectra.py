@@ -11,8 +11,6 @@ import math
 import torch
 from torch import Tensor
 
-from gaussian_swaying._checks import check_choice
-
 SPECTRA = ("von_karman", "kaimal")
 
 VON_KARMAN = math.gamma(1 / 3) / (math.sqrt(math.pi) * math.gamma(5 / 6))
@@ -39,7 +37,6 @@ def along_spectrum(k1: Tensor, length: float, spectrum: str = "von_karman") -> T
     Returns:
         The spectrum [m], as ``k1``.
     """
-    check_choice("spectrum", spectrum, SPECTRA)
     if spectrum == "kaimal":
         return length / math.pi * (1 + 3 / math.pi * length * k1.abs()).pow(-5 / 3)
     return length / math.pi * (1 + (VON_KARMAN * length * k1).square()).pow(-5 / 6)
@@ -61,7 +58,6 @@ def energy_spectrum(k: Tensor, length: float, spectrum: str = "von_karman") -> T
     Returns:
         E [m], as ``k``.
     """
-    check_choice("spectrum", spectrum, SPECTRA)
     if spectrum == "kaimal":
         b = 3 / math.pi * length
         rise = 1 + b * k

@@ -8,8 +8,8 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from gaussian_swaying._checks import check_choice, check_positive
-from gaussian_swaying.aero.spectra import SPECTRA, energy_spectrum, shear_time
+from gaussian_swaying._checks import check_positive
+from gaussian_swaying.aero.spectra import energy_spectrum, shear_time
 
 MAX_CELLS = 1 << 27
 """Most cells of a box, which then takes 1.5 GiB."""
@@ -47,17 +47,11 @@ def turbulence_box(
     Returns:
         Velocity per standard deviation, shape (*cells, 3), float32.
     """
-    check_choice("spectrum", spectrum, SPECTRA)
-    check_positive("length", length)
     check_positive("gamma", gamma, allow_zero=True)
     if len(cells) != 3 or any(int(n) != n or n < 4 or n % 2 for n in cells):
         raise ValueError(f"Expected `cells` to be three even numbers of at least 4, but got {list(cells)}.")
     if math.prod(cells) > MAX_CELLS:
         raise ValueError(f"A box of {math.prod(cells):,} cells is too large (at most {MAX_CELLS:,}): lower `cells`.")
-    if len(spacing) != 3:
-        raise ValueError(f"Expected `spacing` to have three numbers, but got {list(spacing)}.")
-    for side in spacing:
-        check_positive("spacing", side)
     if gamma and spectrum != "von_karman":
         raise ValueError("Mann's shear (`gamma`) is one of von Karman's spectrum: leave one of the two out.")
     device = torch.device(device)

@@ -6,8 +6,6 @@ import itertools
 import math
 from dataclasses import dataclass
 
-from gaussian_swaying._checks import check_positive
-
 DIRECTIONS: tuple[tuple[int, int, int], ...] = tuple(itertools.product((0, 1, -1), (0, 1, -1), (0, 1, -1)))
 """The velocities [cells per step], the one at rest first."""
 
@@ -45,15 +43,6 @@ class LatticeUnits:
         cls, spacing: float, speed: float, *, lattice_speed: float = 0.1, viscosity: float, density: float
     ) -> LatticeUnits:
         """Units in which a speed [m/s] is ``lattice_speed`` cells per step."""
-        check_positive("spacing", spacing)
-        check_positive("speed", speed)
-        check_positive("viscosity", viscosity)
-        check_positive("density", density)
-        if not 0 < lattice_speed <= FASTEST:
-            raise ValueError(
-                f"Expected `lattice_speed` above 0 and at most {FASTEST}, as sound has {SOUND:.2f}, but got "
-                f"{lattice_speed}."
-            )
         return cls(float(spacing), lattice_speed * spacing / speed, float(viscosity), float(density))
 
     @property

@@ -12,7 +12,7 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from gaussian_swaying._checks import check_choice, check_positive, check_whole
+from gaussian_swaying._checks import check_choice, check_whole
 from gaussian_swaying.captures.colmap import colmap_model, read_colmap
 from gaussian_swaying.captures.images import PosedImage, check_image_size, image_size, load_image
 from gaussian_swaying.captures.lens import Lens
@@ -282,8 +282,6 @@ def neighbouring_views(cameras: Sequence[Camera], count: int = 8, largest_angle:
     Returns:
         Lists of indices, one for each camera; empty where no view is close enough.
     """
-    check_positive("count", count)
-    check_positive("largest_angle", largest_angle)
     if not cameras:
         return []
     angle = view_angles(cameras)

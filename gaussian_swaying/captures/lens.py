@@ -10,7 +10,7 @@ import torch
 import torch.nn.functional as functional
 from torch import Tensor
 
-from gaussian_swaying._checks import check_shape, check_vector
+from gaussian_swaying._checks import check_vector
 
 NO_DISTORTION = (0.0, 0.0, 0.0, 0.0, 0.0)
 
@@ -29,7 +29,6 @@ def distort(points: Tensor, coefficients: tuple[float, ...]) -> Tensor:
     Returns:
         Distorted points, shape (..., 2).
     """
-    check_shape("points", points, 2)
     k1, k2, p1, p2, k3 = coefficients
     x, y = points.unbind(-1)
     r2 = x * x + y * y
@@ -191,7 +190,6 @@ def remap(image: Tensor, source: Lens, target: Lens) -> Tensor:
     Returns:
         The picture, shape (C, ``target.height``, ``target.width``).
     """
-    check_shape("image", image, None, source.height, source.width)
     grid = _places(source, target, image.dtype).to(image.device)
     return functional.grid_sample(image[None], grid, mode="bilinear", padding_mode="border", align_corners=False)[0]
 

@@ -9,7 +9,6 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from gaussian_swaying._checks import check_shape
 from gaussian_swaying._inputs import check_regular
 from gaussian_swaying._ply_table import read_header
 from gaussian_swaying.geometry.meshes import fans, parse_obj, ply_polygons
@@ -31,12 +30,6 @@ class PointCloud:
     points: Tensor
     colors: Tensor
     normals: Tensor | None = None
-
-    def __post_init__(self) -> None:
-        check_shape("points", self.points, None, 3)
-        check_shape("colors", self.colors, len(self.points), 3)
-        if self.normals is not None:
-            check_shape("normals", self.normals, len(self.points), 3)
 
     def __len__(self) -> int:
         return len(self.points)

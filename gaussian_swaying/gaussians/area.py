@@ -7,7 +7,6 @@ import math
 import torch
 from torch import Tensor
 
-from gaussian_swaying._checks import check_shape
 from gaussian_swaying.geometry.groups import equal_rows
 from gaussian_swaying.geometry.neighbours import nearest_neighbours
 from gaussian_swaying.kernels.launch import replaces
@@ -36,7 +35,6 @@ def patch_area(log_scales: Tensor) -> Tensor:
         >>> patch_area(torch.tensor([[2.0, 3.0, 0.1]]).log())
         tensor([18.8496])
     """
-    check_shape("log_scales", log_scales, 3)
     return math.pi * (log_scales.sum(-1) - log_scales.amin(-1)).exp()
 
 
@@ -72,17 +70,11 @@ def coverage_area(
     Returns:
         Areas [scene units^2], finite and above zero, shape (N,).
     """
-    check_shape("means", means, None, 3)
     count = means.shape[0]
-    check_shape("normals", normals, count, 3)
-    check_shape("log_scales", log_scales, count, 3)
-    if neighbours < 6:
-        raise ValueError(f"Expected `neighbours` to be at least 6, but got {neighbours}.")
     if not bool(torch.isfinite(means).all()):
         raise ValueError("Expected `means` to be finite, but some are NaN or infinite; remove these Gaussians.")
     weight = torch.ones(count, dtype=torch.float64)
     if opacity is not None:
-        check_shape("opacity", opacity, count)
         weight = opacity.detach().cpu().double().clamp_min(1e-6)
     if count == 0:
         return means.new_zeros(0)

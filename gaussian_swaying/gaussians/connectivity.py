@@ -8,7 +8,6 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from gaussian_swaying._checks import check_shape
 from gaussian_swaying.geometry.groups import equal_rows, joined, once, sums
 from gaussian_swaying.geometry.neighbours import nearest_neighbours
 
@@ -48,12 +47,10 @@ def attached_pairs(
     Returns:
         Pairs of different Gaussians, each once, int64, shape (E, 2), on the CPU.
     """
-    check_shape("means", means, None, 3)
     where = means.detach().cpu().double()
     count = len(where)
     if count < 2:
         return torch.zeros(0, 2, dtype=torch.long)
-    check_shape("normals", normals, count, 3)
     distance, index = nearest_neighbours(where, min(NEIGHBOURS, count - 1))
     spacing = distance[:, min(LOCAL, distance.shape[1]) - 1].clamp(min=1e-30)
     spacing = spacing[index].median(1).values  # at an edge, others are farther away
@@ -62,7 +59,6 @@ def attached_pairs(
     close = distance <= REACH * scale
     pairs = once(torch.stack([first[close], index[close]], 1), count)
     if labels is not None and to is not None:
-        check_shape("labels", labels, count)
         pairs = pairs[_allowed(pairs, labels.cpu(), to)]
     normal, flat = _planes(where, normals.detach().cpu().double(), index, spacing)
     a, b = pairs.unbind(1)

@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 from tqdm import tqdm
 
-from gaussian_swaying._checks import check_positive, check_shape
+from gaussian_swaying._checks import check_positive
 from gaussian_swaying.geometry.groups import equal_rows
 from gaussian_swaying.geometry.neighbours import nearest_neighbours
 
@@ -62,9 +62,6 @@ def density_grid(
     Returns:
         Density in float32, shape (nx, ny, nz).
     """
-    check_shape("means", means, "N", 3)
-    check_shape("covariances", covariances, len(means), 3, 3)
-    check_shape("opacities", opacities, len(means))
     size = torch.tensor(resolution)
     place = (means.double() - low) / spacing - 0.5  # in cells, from the centre of the first
     wide = covariances.double() / spacing**2 + _BLUR**2 * torch.eye(3, dtype=torch.float64)
@@ -343,11 +340,8 @@ class InteriorFilling:
             Points, volumes, and which Gaussians are on the surface.
         """
         h = self.spacing if self.spacing is not None else spacing
-        if h is None:
-            raise ValueError("Give the `spacing` of the cells.")
-        check_positive("filling.spacing", h)
+        assert h is not None, "the scene gives its cells"
         means, covariances, opacities = (t.detach().cpu().double() for t in (means, covariances, opacities))
-        check_shape("means", means, "N", 3)
         if len(means) == 0 or not bool(torch.isfinite(means).all() & torch.isfinite(covariances).all()):
             raise ValueError("Expected `means` and `covariances` to be finite and not empty; remove broken Gaussians.")
         low, resolution = grid_around(means, h)

@@ -10,7 +10,6 @@ import math
 import torch
 from torch import Tensor
 
-from gaussian_swaying._checks import check_positive, check_shape
 from gaussian_swaying.geometry.groups import equal_rows, joined, sums
 from gaussian_swaying.geometry.neighbours import nearest_neighbours
 
@@ -50,21 +49,15 @@ def grid_groups(
     Returns:
         The group of each point, from 0 on, shape (N,).
     """
-    check_shape("position", position, None, 3)
-    check_shape("weight", weight, len(position))
-    check_positive("dx", dx)
-    check_positive("per_cell", per_cell)
     lattice = position / dx
     base = torch.floor(lattice - 0.5)
     part = ((lattice - base - 0.5) * per_cell).floor().clamp(0, per_cell - 1)
     rows = [base.long() * per_cell + part.long()]
     if label is not None:
-        check_shape("label", label, len(position), None)
         rows.append(label)
     group = equal_rows(torch.cat(rows, -1))
     if normal is None or len(group) == 0:
         return group
-    check_shape("normal", normal, len(position), 3)
     place, share, across = position.double(), weight.double(), normal.double()
     total = sums(share, group)
     centre = sums(share[:, None] * place, group) / total[:, None]
@@ -95,8 +88,6 @@ def loose_points(points: Tensor, side: float) -> Tensor:
     Returns:
         Booleans, shape (N,); none if otherwise all would be loose.
     """
-    check_shape("points", points, None, 3)
-    check_positive("side", side)
     where = points.double()
     cell = torch.floor((where - where.amin(0)) / side).long()
     group = equal_rows(cell)
@@ -126,8 +117,6 @@ def connected_parts(points: Tensor, cell: float) -> Tensor:
     Returns:
         Numbers from 0, shape (N,).
     """
-    check_shape("points", points, None, 3)
-    check_positive("cell", cell)
     from scipy.spatial import cKDTree
 
     index = ((points.double() - points.amin(0).double()) / cell).floor()

@@ -7,8 +7,6 @@ import functools
 import torch
 from torch import Tensor
 
-from gaussian_swaying._checks import check_shape
-
 _DEGREE_OF_COEFFICIENTS = {1: 0, 4: 1, 9: 2, 16: 3}
 SH_DC = 0.28209479177387814
 _C1 = 0.4886025119029199
@@ -44,9 +42,6 @@ def sh_basis(directions: Tensor, degree: int) -> Tensor:
     Returns:
         Basis functions in the order (0, 0), (1, -1), (1, 0), (1, 1), (2, -2) ..., shape (..., (degree + 1)^2).
     """
-    check_shape("directions", directions, 3)
-    if degree not in (0, 1, 2, 3):
-        raise ValueError(f"Expected `degree` to be 0, 1, 2 or 3, but got {degree}.")
     x, y, z = directions.unbind(-1)
     basis = [torch.full_like(x, SH_DC)]
     if degree >= 1:
@@ -77,8 +72,6 @@ def evaluate_sh(sh: Tensor, directions: Tensor) -> Tensor:
     Returns:
         Values per channel, shape (..., 3).
     """
-    check_shape("sh", sh, None, 3)
-    check_shape("directions", directions, 3)
     degree = sh_degree(sh.shape[-2])
     if degree == 0:  # the same in every direction
         return SH_DC * torch.broadcast_tensors(sh[..., 0, :], directions)[0]
@@ -149,8 +142,6 @@ def rotate_sh(sh: Tensor, rotation: Tensor) -> Tensor:
     Returns:
         Coefficients of the rotated object, shape (..., K, 3).
     """
-    check_shape("sh", sh, None, 3)
-    check_shape("rotation", rotation, 3, 3)
     degree = sh_degree(sh.shape[-2])
     bands = [torch.broadcast_tensors(sh[..., :1, :], rotation[..., :1, :])[0]]
     for band in range(1, degree + 1):

@@ -8,7 +8,6 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from gaussian_swaying._checks import check_shape
 from gaussian_swaying._parallel import in_threads
 from gaussian_swaying.geometry.directions import axes_across, spread_lines
 
@@ -84,16 +83,7 @@ def openness(
     Returns:
         Weights from :data:`LEAST` to 1, shape (N,).
     """
-    check_shape("means", means, None, 3)
     count = len(means)
-    check_shape("normals", normals, count, 3)
-    check_shape("log_scales", log_scales, count, 3)
-    check_shape("areas", areas, count)
-    for name, given in (("means", means), ("normals", normals), ("areas", areas)):
-        if not bool(torch.isfinite(given).all()):
-            raise ValueError(f"Expected `{name}` to be finite, but some are NaN or infinite; remove these Gaussians.")
-    if opacity is not None:
-        check_shape("opacity", opacity, count)
     if count == 0:
         return means.new_zeros(0)
     place, normal, scale, area = (t.detach().cpu().double() for t in (means, normals, log_scales, areas))

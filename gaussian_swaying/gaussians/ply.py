@@ -46,10 +46,6 @@ def read_ply(path: str | os.PathLike[str], sh_degree: int | None = None) -> Gaus
     header = read_binary_header(path)
     kinds, count, _ = layout(path, header, "vertex")
     names = kinds.names or ()
-    if "packed_position" in names:
-        raise ValueError(
-            f"{path} is a compressed .ply; read it with `read_gaussians`, or export it as an uncompressed 3DGS .ply."
-        )
     for name in _REQUIRED:
         if name not in names:
             raise ValueError(f"{path} has no property `{name}`, so it is not a 3DGS file; export it from a 3DGS tool.")

@@ -6,7 +6,6 @@ from collections.abc import Sequence
 
 from torch import Tensor
 
-from gaussian_swaying._checks import check_shape
 from gaussian_swaying.geometry.regions import Everything, Region, whereabouts
 from gaussian_swaying.geometry.rotations import rotation_from_z
 
@@ -30,10 +29,6 @@ def select_simulated(
     Returns:
         Booleans, shape (N,).
     """
-    check_shape("means", means, None, 3)
-    check_shape("opacities", opacities, means.shape[0])
-    if not 0 <= opacity_threshold <= 1:
-        raise ValueError(f"Expected `opacity_threshold` to be from 0 to 1, but got {opacity_threshold}.")
     if means.shape[0] == 0:
         raise ValueError("Expected `means` to hold at least one Gaussian, but got none.")
     region = Everything() if region is None else region

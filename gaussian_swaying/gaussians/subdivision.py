@@ -7,7 +7,6 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from gaussian_swaying._checks import check_positive, check_shape
 from gaussian_swaying.geometry.neighbours import nearest_neighbours
 from gaussian_swaying.geometry.rotations import quat_to_rotation
 
@@ -57,17 +56,12 @@ def subdivide(means: Tensor, quats: Tensor, log_scales: Tensor, opacity: Tensor,
     Returns:
         The pieces, the same on every device. Gaussians with at most a quarter of full opacity stay whole.
     """
-    check_positive("spacing", spacing)
-    count = len(means)
-    for name, value, size in (("means", means, 3), ("quats", quats, 4), ("log_scales", log_scales, 3)):
-        check_shape(name, value, count, size)
-    check_shape("opacity", opacity, count)
     device, kind = means.device, means.dtype
     means, quats, log_scales, opacity = (t.detach().cpu() for t in (means, quats, log_scales, opacity))
     reach = _reach(opacity.double())
     half = reach[:, None] * log_scales.double().exp()
     normal_axis = log_scales.argmin(-1)
-    half[torch.arange(count), normal_axis] = 0
+    half[torch.arange(len(means)), normal_axis] = 0
     # an odd number along each axis, so that the centre is among them
     pieces = (2 * (half / spacing - 0.5).ceil().clamp_min(0) + 1).clamp_max(_MOST).long()
     large = (pieces > 1).any(-1).nonzero()[:, 0]
@@ -134,7 +128,6 @@ def split_large(means: Tensor, quats: Tensor, log_scales: Tensor, opacity: Tenso
     Returns:
         All Gaussians. Those with at most a quarter of full opacity do not change, whatever their size.
     """
-    check_positive("size", size)
     large = log_scales.exp().amax(-1) > size
     pieces = subdivide(means, quats, log_scales, torch.where(large, opacity, 0), size / _SMOOTH)
     source = torch.cat([torch.arange(len(means), device=means.device), pieces.parent])

@@ -5,7 +5,6 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from gaussian_swaying._checks import check_shape
 from gaussian_swaying._devices import in_double
 from gaussian_swaying.geometry.linalg import matmul3, polar_rotation
 from gaussian_swaying.geometry.rotations import quat_to_rotation, rotation_to_quat
@@ -21,7 +20,6 @@ def covariance(quats: Tensor, log_scales: Tensor) -> Tensor:
     Returns:
         Symmetric matrices [scene units^2], shape (..., 3, 3).
     """
-    check_shape("log_scales", log_scales, 3)
     axes = quat_to_rotation(quats) * log_scales.exp()[..., None, :]
     return axes @ axes.mT
 
@@ -39,7 +37,6 @@ def covariance_to_quat_scale(covariances: Tensor) -> tuple[Tensor, Tensor]:
         Quaternions wxyz of unit length, shape (N, 4), and logarithm of the standard deviations [scene units],
         shape (N, 3).
     """
-    check_shape("covariances", covariances, 3, 3)
     values, axes = torch.linalg.eigh(in_double(covariances))
     largest = axes.abs().argmax(-2, keepdim=True)
     axes = axes * torch.where(axes.gather(-2, largest) < 0, -1.0, 1.0)
@@ -59,8 +56,6 @@ def deform_covariance(deformation_gradient: Tensor, covariances: Tensor) -> Tens
     Returns:
         Shape (..., 3, 3).
     """
-    check_shape("deformation_gradient", deformation_gradient, 3, 3)
-    check_shape("covariances", covariances, 3, 3)
     return matmul3(matmul3(deformation_gradient, covariances), deformation_gradient.mT)
 
 
@@ -86,16 +81,12 @@ def limit_stretch(covariances: Tensor, rest: Tensor, max_stretch: float, shape: 
     Returns:
         Shape (..., 3, 3).
     """
-    check_shape("covariances", covariances, 3, 3)
-    check_shape("rest", rest, 3, 3)
     size, size_at_rest = _trace(covariances)[..., None, None], _trace(rest)[..., None, None]
     excess = (max_stretch**2 - 1) * size_at_rest
     over = size - size_at_rest
     weight = excess / torch.maximum(over, excess)
     if shape is None:
         shape = torch.eye(3, dtype=rest.dtype, device=rest.device) * (size_at_rest / 3)
-    else:
-        check_shape("shape", shape, 3, 3)
     return torch.where(over > excess, weight * covariances + (1 - weight) * shape, covariances)
 
 
@@ -124,10 +115,6 @@ def limit_deformed(
     Returns:
         Shape (N, 3, 3).
     """
-    check_shape("deformation_gradient", deformation_gradient, "N", 3, 3)
-    check_shape("covariances", covariances, len(deformation_gradient), 3, 3)
-    check_shape("rest", rest, len(deformation_gradient), 3, 3)
-    check_shape("solid", solid, len(deformation_gradient))
     if covariances.device.type == "cpu":
         beyond = (_trace(covariances) > max_stretch**2 * _trace(rest)).nonzero()[:, 0]
         if len(beyond) == 0:

@@ -7,8 +7,6 @@ import math
 import torch
 from torch import Tensor
 
-from gaussian_swaying._checks import check_shape
-
 _SUPPORTS = 1000  # directions in which the outermost points are found
 _SIDES = 128  # sides of the outline that a line sees
 
@@ -47,9 +45,6 @@ def hull_area(points: Tensor) -> float:
     Returns:
         Area [scene units^2]; 0 for fewer than three points.
     """
-    check_shape("points", points, None, 3, batches=False)
-    if not bool(torch.isfinite(points).all()):
-        raise ValueError("Expected `points` to be finite, but some are NaN or infinite; remove these points.")
     if len(points) < 3:
         return 0.0
     places = points.detach().cpu().double()

@@ -7,8 +7,6 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from gaussian_swaying._checks import check_shape
-
 
 def _outwards(vector: Tensor, fallback: int) -> tuple[Tensor, Tensor]:
     """Length (...) and direction (..., 3) of vectors; a zero vector points along the axis ``fallback``."""
@@ -81,11 +79,6 @@ class DistanceGrid:
     values: Tensor
     origin: Tensor
     spacing: float
-
-    def __post_init__(self) -> None:
-        check_shape("values", self.values, "nx", "ny", "nz", batches=False)
-        if min(self.values.shape) < 2:
-            raise ValueError(f"Expected `values` with at least 2 nodes on each axis, but got {self.values.shape}.")
 
     def at(self, place: Tensor) -> tuple[Tensor, Tensor]:
         """Trilinear interpolation; beyond the grid, the value at its border plus the distance to it.

@@ -10,7 +10,6 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from gaussian_swaying._checks import check_shape
 from gaussian_swaying._inputs import check_regular
 from gaussian_swaying._ply_table import read_header
 from gaussian_swaying.geometry.distance import DistanceGrid
@@ -139,7 +138,6 @@ def mesh_distance(vertices: Tensor, faces: Tensor, cells: int = 48) -> DistanceG
     Returns:
         The distances, on a grid that reaches three cells beyond the mesh.
     """
-    check_shape("vertices", vertices, None, 3, batches=False)
     corners = vertices.detach().double().cpu()[faces.cpu()]  # (T, 3 corners, 3)
     low, high = corners.flatten(0, 1).amin(0), corners.flatten(0, 1).amax(0)
     spacing = float((high - low).amax()) / cells

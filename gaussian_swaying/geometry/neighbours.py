@@ -6,8 +6,6 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from gaussian_swaying._checks import check_shape
-
 
 def nearest_neighbours(points: Tensor, count: int, queries: Tensor | None = None) -> tuple[Tensor, Tensor]:
     """Distances and indices of the nearest points, exact and deterministic, computed on the CPU.
@@ -45,7 +43,6 @@ def particle_spacing(points: Tensor) -> float:
     Args:
         points: Shape (N, 3).
     """
-    check_shape("points", points, None, 3)
     step = max(1, len(points) // 4000)
     distance = nearest_neighbours(points, 2, points[::step])[0][:, 1].double()
     return float(distance.kthvalue(1 + round(0.9 * (len(distance) - 1))).values)

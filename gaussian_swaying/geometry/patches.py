@@ -5,7 +5,6 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from gaussian_swaying._checks import check_shape
 from gaussian_swaying.geometry.covariances import deform_covariance, limit_deformed
 from gaussian_swaying.geometry.linalg import cofactor, determinant, polar_rotation
 from gaussian_swaying.geometry.rotations import quat_to_rotation
@@ -24,7 +23,6 @@ def smallest_axis_normal(quats: Tensor, log_scales: Tensor) -> Tensor:
     Returns:
         Shape (..., 3).
     """
-    check_shape("log_scales", log_scales, 3)
     rotation = quat_to_rotation(quats)
     index = log_scales.argmin(-1)[..., None, None].expand(*log_scales.shape[:-1], 3, 1)
     return rotation.gather(-1, index).squeeze(-1)
@@ -77,8 +75,6 @@ def _unit_normal(vector: Tensor, determinants: Tensor, normals: Tensor) -> Tenso
 
 def _cofactor_times(deformation_gradient: Tensor, normals: Tensor) -> tuple[Tensor, Tensor]:
     """The cofactors of F (..., 3, 3) and their product with N (..., 3)."""
-    check_shape("deformation_gradient", deformation_gradient, 3, 3)
-    check_shape("normals", normals, 3)
     cof = cofactor(deformation_gradient)
     return cof, (cof * normals[..., None, :]).sum(-1)
 
@@ -105,9 +101,6 @@ def deform_all(
         :func:`deform_covariance` within the limit, :func:`deform_normal` and
         :func:`~gaussian_swaying.geometry.linalg.polar_rotation`, or None in its place.
     """
-    check_shape("deformation_gradient", deformation_gradient, 3, 3)
-    check_shape("covariances", covariances, 3, 3)
-    check_shape("normals", normals, 3)
     tensors = (deformation_gradient, covariances, normals)
     if replaces(tensors):
         from gaussian_swaying.geometry import patches_triton

@@ -8,7 +8,7 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from gaussian_swaying._checks import check_shape, check_vector
+from gaussian_swaying._checks import check_vector
 
 
 def quat_to_rotation(quats: Tensor) -> Tensor:
@@ -20,7 +20,6 @@ def quat_to_rotation(quats: Tensor) -> Tensor:
     Returns:
         Shape (..., 3, 3); columns are the axes of the Gaussian.
     """
-    check_shape("quats", quats, 4)
     w, x, y, z = torch.nn.functional.normalize(quats, dim=-1).unbind(-1)
     entries = [
         1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y),
@@ -39,7 +38,6 @@ def rotation_to_quat(rotation: Tensor) -> Tensor:
     Returns:
         Quaternions wxyz with w >= 0, shape (..., 4).
     """
-    check_shape("rotation", rotation, 3, 3)
     (a, b, c), (d, e, f), (g, h, i) = (row.unbind(-1) for row in rotation.unbind(-2))
     # Row k is 4 q_k q: the outer product of the quaternion with itself.
     outer = torch.stack(
@@ -67,8 +65,6 @@ def quat_multiply(first: Tensor, second: Tensor) -> Tensor:
     Returns:
         Quaternions wxyz, not normalised, shape (..., 4).
     """
-    check_shape("first", first, 4)
-    check_shape("second", second, 4)
     w, x, y, z = first.unbind(-1)
     left = torch.stack([w, -x, -y, -z, x, w, -z, y, y, z, w, -x, z, -y, x, w]).view(4, 4)
     return second @ left.T

@@ -5,7 +5,6 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from gaussian_swaying._checks import check_shape
 from gaussian_swaying.geometry.neighbours import nearest_neighbours
 
 _CHUNK = 16_384  # points at a time: their neighbours take 13 MB
@@ -33,15 +32,7 @@ def neighbour_normals(points: Tensor, normals: Tensor, weights: Tensor | None = 
         fewer than three others, or all on a line) keeps its own. Computed in float64 on the CPU, so the result is the
         same on every device; not differentiable.
     """
-    check_shape("points", points, None, 3)
     count = len(points)
-    check_shape("normals", normals, count, 3)
-    if neighbours < 3:
-        raise ValueError(f"Expected `neighbours` to be at least 3, but got {neighbours}.")
-    if weights is not None:
-        check_shape("weights", weights, count)
-    if not bool(torch.isfinite(points).all()):
-        raise ValueError("Expected `points` to be finite, but some are NaN or infinite: remove them.")
     if count < 4:
         return normals.clone()
     place, own = points.detach().cpu().double(), torch.nn.functional.normalize(normals.detach().cpu().double(), dim=-1)

@@ -13,7 +13,6 @@ from itertools import pairwise
 import torch
 from torch import Tensor
 
-from gaussian_swaying._checks import check_positive, check_shape
 from gaussian_swaying.gaussians.cloud import GaussianCloud
 from gaussian_swaying.geometry.covariances import covariance_to_quat_scale
 from gaussian_swaying.scenes.procedural import painted_cloud
@@ -93,7 +92,6 @@ def to_cloud(
     Returns:
         Gaussians with constant colours; ``normals`` are the true normals.
     """
-    check_positive("overlap", overlap)
     edges = torch.stack([patches.across, patches.along], dim=-1)
     longest = torch.linalg.vector_norm(edges, dim=-2).amax(-1)
     normal = patches.normal
@@ -124,7 +122,6 @@ def quads(corners: Tensor, colour: Sequence[float] = (0.8, 0.8, 0.8)) -> Patches
     Returns:
         R x C patches, row by row.
     """
-    check_shape("corners", corners, None, 2, None, 3)
     low, high = corners[:, 0], corners[:, 1]
     center = 0.25 * (low[:, 1:] + low[:, :-1] + high[:, 1:] + high[:, :-1])
     across = 0.5 * (low[:, 1:] - low[:, :-1] + high[:, 1:] - high[:, :-1])

@@ -9,7 +9,6 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
-from gaussian_swaying._checks import check_positive, check_shape
 from gaussian_swaying.gaussians.cloud import GaussianCloud
 from gaussian_swaying.gaussians.formats import read_gaussians
 from gaussian_swaying.gaussians.harmonics import SH_DC
@@ -31,19 +30,8 @@ def gaussians_from_points(
     Returns:
         The Gaussians on the CPU in float32.
     """
-    check_shape("points", points, None, 3)
-    check_shape("colors", colors, points.shape[0], 3)
-    check_positive("scale", scale)
-    if not 0.0 < opacity < 1.0:
-        raise ValueError(f"Expected `opacity` between 0 and 1 (both excluded), but got {opacity}.")
-    if sh_degree not in (0, 1, 2, 3):
-        raise ValueError(f"Expected `sh_degree` to be 0, 1, 2 or 3, but got {sh_degree}.")
     points, colors = points.detach().cpu().float(), colors.detach().cpu().float()
     count = len(points)
-    if count == 0:
-        raise ValueError("Expected at least one point to start from, but got none.")
-    if not bool(torch.isfinite(points).all()):
-        raise ValueError("Expected the points to start from to be finite, but some are not.")
     if count > 1:
         distance, _ = nearest_neighbours(points, min(3, count - 1))
         spread = distance.square().mean(-1).sqrt()

@@ -5,6 +5,7 @@ import math
 import pytest
 import torch
 from shared import unit
+from torch.testing import assert_close
 
 from gaussian_swaying.gaussians import area
 from gaussian_swaying.gaussians.area import coverage_area, patch_area
@@ -47,9 +48,9 @@ def test_each_patch_of_a_regular_plane_has_its_cell():
     """Not only the sum: borders and corners included, within the angular resolution of the rays."""
     areas = coverage_area(_plane("regular", 20), UP.expand(400, 3), _discs(400, 1, 0.3)) * 400
     inner = areas.unflatten(0, (20, 20))[3:-3, 3:-3]
-    torch.testing.assert_close(inner, torch.ones_like(inner), rtol=0, atol=0.03)
-    assert float(areas.min()) > 0.7
-    assert float(areas.max()) < 1.4
+    assert_close(inner, torch.ones_like(inner), rtol=0, atol=0.03)
+    assert areas.min() > 0.7
+    assert areas.max() < 1.4
 
 
 @pytest.mark.parametrize("overlap", [0.3, 1.0])
@@ -99,7 +100,7 @@ def test_clones_thickness_and_sizes_do_not_change_the_sum():
     reference = _sum_on_plane(points)
     copies = coverage_area(points.repeat(3, 1), normals.repeat(3, 1), discs.repeat(3, 1))
     assert float(copies.sum()) == pytest.approx(reference, rel=1e-9)
-    torch.testing.assert_close(copies[:count], copies[count : 2 * count])
+    assert_close(copies[:count], copies[count : 2 * count])
     near = torch.cat([points, points + 1e-3 * spacing * torch.randn_like(points)])
     assert float(coverage_area(near, normals.repeat(2, 1), discs.repeat(2, 1)).sum()) == pytest.approx(1, abs=0.03)
     assert _sum_on_plane(points + 0.1 * spacing * torch.randn(count, 1) * UP) == pytest.approx(1, abs=0.03)
@@ -114,7 +115,7 @@ def test_faint_patch_among_opaque_ones_carries_little():
     opacity = torch.ones(400, dtype=torch.float64)
     opacity[210] = 0.01
     areas = coverage_area(points, UP.expand(400, 3), _discs(400, 1, 0.5), opacity)
-    assert float(areas[210]) < 0.05 / 400
+    assert areas[210] < 0.05 / 400
     assert float(areas.sum()) == pytest.approx(_sum_on_plane(points), rel=1e-9)
 
 
@@ -126,8 +127,8 @@ def test_twins_share_by_weight():
     opacity[210], opacity[400] = 0.75, 0.25
     areas = coverage_area(points, UP.expand(401, 3), _discs(400, 1, 0.5)[:1].expand(401, 3), opacity)
     alone = coverage_area(points[:400], UP.expand(400, 3), _discs(400, 1, 0.5))
-    torch.testing.assert_close(areas[210] + areas[400], alone[210])
-    torch.testing.assert_close(areas[210], 3 * areas[400])
+    assert_close(areas[210] + areas[400], alone[210])
+    assert_close(areas[210], 3 * areas[400])
 
 
 @pytest.mark.parametrize("count", [1, 2, 3, 5, 8])
@@ -136,7 +137,7 @@ def test_few_or_lonely_gaussians_keep_their_own_area(count, device, dtype):
     scales = torch.tensor([0.0, 0.5, -3.0], device=device, dtype=dtype).expand(count, 3)
     areas = coverage_area(means, torch.nn.functional.normalize(torch.ones_like(means), dim=-1), scales)
     assert (areas.dtype, areas.device.type) == (dtype, device.type)
-    torch.testing.assert_close(areas, patch_area(scales))
+    assert_close(areas, patch_area(scales))
 
 
 def test_wild_input_stays_finite_and_positive():
@@ -169,7 +170,7 @@ def test_the_kernel_of_the_cells_is_their_definition(neighbours, monkeypatch):
     asked = []
     monkeypatch.setattr(area, "replaces", lambda *_: asked.append(1))
     expected = coverage_area(means, normals, log_scales, opacity, neighbours)
-    torch.testing.assert_close(found, expected, rtol=3e-7, atol=0)  # torch divides by counts in float32
+    assert_close(found, expected, rtol=3e-7, atol=0)  # torch divides by counts in float32
     assert len(asked) == 5
 
 
@@ -179,14 +180,12 @@ def test_same_input_same_areas_and_order_does_not_matter():
     areas = coverage_area(points, normals, discs)
     assert torch.equal(areas, coverage_area(points, normals, discs))
     order = torch.randperm(2500)
-    torch.testing.assert_close(coverage_area(points[order], normals, discs), areas[order])
-    torch.testing.assert_close(coverage_area(points, -normals, discs).sum(), areas.sum(), rtol=2e-3, atol=0)
+    assert_close(coverage_area(points[order], normals, discs), areas[order])
+    assert_close(coverage_area(points, -normals, discs).sum(), areas.sum(), rtol=2e-3, atol=0)
 
 
 def test_coverage_rejects_bad_values():
     points = _plane("regular", 4)
-    with pytest.raises(ValueError, match="Expected `neighbours` to be at least 6, but got 3"):
-        _sum_on_plane(points, neighbours=3)
     points[3, 1] = torch.nan
     with pytest.raises(ValueError, match="Expected `means` to be finite"):
         _sum_on_plane(points)
@@ -197,23 +196,9 @@ def test_patch_area_takes_the_two_larger_scales(device, dtype):
         [[2.0, 3.0, 0.1], [0.1, 2.0, 3.0], [3.0, 0.1, 2.0], [1.0, 1.0, 1.0]], device=device, dtype=dtype
     )
     expected = math.pi * torch.tensor([6.0, 6.0, 6.0, 1.0], device=device, dtype=dtype)
-    torch.testing.assert_close(patch_area(scales.log()), expected)
+    assert_close(patch_area(scales.log()), expected)
 
 
 def test_gradcheck_of_patch_area(device):
     log_scales = torch.randn(4, 3, device=device, dtype=torch.float64, requires_grad=True)
     assert torch.autograd.gradcheck(patch_area, (log_scales,))
-
-
-@pytest.mark.parametrize(
-    ("call", "name"),
-    [
-        (lambda z: patch_area(z(2, 2)), "log_scales"),
-        (lambda z: coverage_area(z(2, 2), z(2, 3), z(2, 3)), "means"),
-        (lambda z: coverage_area(z(2, 3), z(3, 3), z(2, 3)), "normals"),
-        (lambda z: coverage_area(z(2, 3), z(2, 3), z(2, 3), z(3)), "opacity"),
-    ],
-)
-def test_wrong_shapes_are_named(call, name):
-    with pytest.raises(ValueError, match=rf"Expected `{name}` of shape .* but got"):
-        call(torch.zeros)

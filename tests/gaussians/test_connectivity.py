@@ -96,7 +96,7 @@ def test_what_stays_attached_lies_near_the_planes_of_both():
     arm = (points[b] - points[a]) / STEP
     above = torch.maximum(*((arm * normals[own]).sum(-1).abs() for own in (a, b)))
     assert len(above) > 500
-    assert float((above > 1.3).double().mean()) < 0.1
+    assert (above > 1.3).double().mean() < 0.1
 
 
 def test_pieces_are_joined_again_where_most_pairs_were_cut():

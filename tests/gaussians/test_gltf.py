@@ -9,8 +9,9 @@ import tracemalloc
 import numpy as np
 import pytest
 import torch
-from other_writers import FILES, assert_close, scene, turned
+from other_writers import FILES, assert_same, refused, scene, turned
 from small_scenes import varied_cloud
+from torch.testing import assert_close
 
 from gaussian_swaying.gaussians.export import export_cloud
 from gaussian_swaying.gaussians.formats import read_gaussians
@@ -34,17 +35,17 @@ def test_round_trip(degree, tmp_path):
     found = read_gaussians(tmp_path / "a.glb")
     upright = turned(found, turn.T.float() @ Y_TO_Z)
     back = upright.means * 2, upright.scales + math.log(2)
-    assert_close(type(found)(back[0], upright.quats, back[1], upright.opacities, upright.sh), cloud, **CLOSE)
+    assert_same(type(found)(back[0], upright.quats, back[1], upright.opacities, upright.sh), cloud, **CLOSE)
     heights = cloud.means @ torch.nn.functional.normalize(up, dim=0)
-    torch.testing.assert_close(found.means[:, 1], 0.5 * heights, rtol=0, atol=2e-6)
+    assert_close(found.means[:, 1], 0.5 * heights, rtol=0, atol=2e-6)
     export_cloud(tmp_path / "b.glb", cloud)  # z is up
-    torch.testing.assert_close(read_gaussians(tmp_path / "b.glb").means[:, 1], cloud.means[:, 2])
+    assert_close(read_gaussians(tmp_path / "b.glb").means[:, 1], cloud.means[:, 2])
 
 
 def test_as_splat_transform_writes_it():
     """It turns a .ply, whose y points down, by half a turn about z."""
     found = read_gltf(FILES / "scene.glb")
-    assert_close(turned(found, torch.diag(torch.tensor([-1.0, -1.0, 1.0]))), scene(), **CLOSE)
+    assert_same(turned(found, torch.diag(torch.tensor([-1.0, -1.0, 1.0]))), scene(), **CLOSE)
 
 
 def _parts(content):
@@ -111,12 +112,12 @@ def test_nodes_move_what_they_hold(tmp_path):
     expected = type(cloud)(
         2 * expected.means + shift, expected.quats, expected.scales + math.log(2), expected.opacities, expected.sh
     )
-    assert_close(first, expected, **CLOSE | {"means": 1e-5})
+    assert_same(first, expected, **CLOSE | {"means": 1e-5})
     stretch = torch.diag(torch.tensor([1.0, 3.0, 1.0]))
-    torch.testing.assert_close(second.means, cloud.means @ stretch + torch.tensor([5.0, 0, 0]), rtol=0, atol=1e-5)
+    assert_close(second.means, cloud.means @ stretch + torch.tensor([5.0, 0, 0]), rtol=0, atol=1e-5)
     wide = stretch @ covariance(cloud.quats, cloud.scales) @ stretch
-    torch.testing.assert_close(covariance(second.quats, second.scales), wide, rtol=1e-4, atol=1e-6)
-    torch.testing.assert_close(second.sh, cloud.sh, rtol=0, atol=1e-5)
+    assert_close(covariance(second.quats, second.scales), wide, rtol=1e-4, atol=1e-6)
+    assert_close(second.sh, cloud.sh, rtol=0, atol=1e-5)
     del document["scenes"], document["scene"]  # then all nodes that are nobody's children
     assert len(read_gaussians(_written(tmp_path / "b.glb", document, data))) == 10
 
@@ -155,11 +156,11 @@ def test_numbers_of_every_kind(tmp_path):
             cloud = read_gaussians(tmp_path / name)
         assert cloud.sh.shape == (6, 4, 3)
         assert cloud.sh[:3, 1:].abs().max() == 0
-        assert bool((cloud.sh[3:] == 0.25).all())
+        assert (cloud.sh[3:] == 0.25).all()
         assert torch.equal(cloud.means[:3], torch.eye(3))
-        torch.testing.assert_close(cloud.quats[1], torch.tensor([1.0, -1.0, 0.0, 0.0]))
-        torch.testing.assert_close(cloud.scales[0], torch.tensor([0.0, math.log(0.2), math.log(1e-7)]))
-        torch.testing.assert_close(cloud.opacities[:3].sigmoid(), torch.tensor([0.5 / 255, 0.2, 1 - 0.5 / 255]))
+        assert_close(cloud.quats[1], torch.tensor([1.0, -1.0, 0.0, 0.0]))
+        assert_close(cloud.scales[0], torch.tensor([0.0, math.log(0.2), math.log(1e-7)]))
+        assert_close(cloud.opacities[:3].sigmoid(), torch.tensor([0.5 / 255, 0.2, 1 - 0.5 / 255]))
 
 
 def _changed(change):
@@ -201,10 +202,7 @@ def _set(place, **values):
     ],
 )
 def test_bad_documents(change, message, tmp_path):
-    path = _written(tmp_path / "bad.glb", *_changed(change))
-    with pytest.raises(ValueError, match=r"bad\.glb") as caught:
-        read_gaussians(path)
-    assert message in str(caught.value)
+    refused(_written(tmp_path / "bad.glb", *_changed(change)), message)
 
 
 @pytest.mark.parametrize("name", ["bad.glb", "bad.gltf"])
@@ -218,9 +216,7 @@ def test_bad_files(name, tmp_path):
         (struct.pack("<4sII", b"glTF", 2, 20) + struct.pack("<I4s", 0, b"JSON"), "its JSON is missing"),
     ):
         (tmp_path / name).write_bytes(content)
-        with pytest.raises(ValueError, match=name.replace(".", r"\.")) as caught:
-            read_gaussians(tmp_path / name)
-        assert message in str(caught.value)
+        refused(tmp_path / name, message)
 
 
 @pytest.mark.parametrize(
@@ -233,6 +229,7 @@ def test_bad_files(name, tmp_path):
         ("data:;base64,%%", "buffer 0 is not in base64"),
         ("data:;base64,AAAA", "its buffer has 3 bytes"),
         (None, "buffer 0 has no data"),
+        ("none.bin", "none.bin does not exist"),
     ],
 )
 def test_data_elsewhere(uri, message, tmp_path):
@@ -241,15 +238,7 @@ def test_data_elsewhere(uri, message, tmp_path):
     (tmp_path / "in").mkdir()
     path = tmp_path / "in" / "bad.gltf"
     path.write_text(json.dumps(_changed(_set("buffers 0", uri=uri))[0]))
-    with pytest.raises(ValueError, match=r"bad\.gltf") as caught:
-        read_gaussians(path)
-    assert message in str(caught.value)
-
-
-def test_a_file_beside_it_that_is_missing(tmp_path):
-    (tmp_path / "a.gltf").write_text(json.dumps(_changed(_set("buffers 0", uri="none.bin"))[0]))
-    with pytest.raises(FileNotFoundError, match=r"none\.bin does not exist"):
-        read_gaussians(tmp_path / "a.gltf")
+    refused(path, message, name=str(path.parent))
 
 
 def test_one_mesh_many_times(tmp_path):
@@ -263,8 +252,7 @@ def test_one_mesh_many_times(tmp_path):
     document["accessors"] = [wide | {"type": a["type"]} for a in document["accessors"]]
     document["bufferViews"] = [{"buffer": 0, "byteLength": 4 * count}]
     tracemalloc.start()
-    with pytest.raises(ValueError, match="announces 20,000,000 Gaussians, far more"):
-        read_gaussians(_written(tmp_path / "b.glb", document, bytes(4 * count)))
+    refused(_written(tmp_path / "b.glb", document, bytes(4 * count)), "announces 20,000,000 Gaussians, far more")
     assert tracemalloc.get_traced_memory()[1] < 1 << 25
     tracemalloc.stop()
 
@@ -285,9 +273,7 @@ def test_bad_numbers(name, value, message, tmp_path):
     place = document["meshes"][0]["primitives"][0]["attributes"][name]
     data = bytearray(data)
     struct.pack_into("<f", data, document["bufferViews"][place]["byteOffset"], value)
-    with pytest.raises(ValueError, match=r"bad\.glb") as caught:
-        read_gaussians(_written(tmp_path / "bad.glb", document, bytes(data)))
-    assert message in str(caught.value)
+    refused(_written(tmp_path / "bad.glb", document, bytes(data)), message)
 
 
 def test_too_large_for_the_format(tmp_path, monkeypatch):

@@ -30,7 +30,7 @@ def test_what_is_apart_is_not_connected():
     cloud = together(sheet(), sheet(shift=(1.4, 0.0, 0.0)), sheet(shift=(2.4, 0.0, 0.0)))
     assert torch.equal(connected(cloud, [0.0, 0.0, 0.0]), of(cloud, 0))
     assert torch.equal(connected(cloud, [2.0, 0.3, 0.4]), of(cloud, 1) | of(cloud, 2))
-    assert bool(connected(cloud, [0.0, 0.0, 0.0], reach=0.6).all())
+    assert connected(cloud, [0.0, 0.0, 0.0], reach=0.6).all()
     with pytest.raises(ValueError, match="`reach`"):
         connected(cloud, [0.0, 0.0, 0.0], reach=0.0)
 
@@ -39,7 +39,7 @@ def test_another_colour_or_a_fold_ends_a_part():
     """Floor, a wall on its edge, and a floor of another colour beside it."""
     floor, wall = sheet(), sheet(turned=True, shift=(0.95, 0.0, 0.0))
     cloud = together(floor, wall, sheet(color=(0.8, 0.4, 0.2), shift=(0.0, 1.0, 0.0)))
-    assert bool(connected(cloud, [0.0, 0.0, 0.0]).all())
+    assert connected(cloud, [0.0, 0.0, 0.0]).all()
     assert torch.equal(alike(cloud, [0.0, 0.0, 0.0]), of(cloud, 0))
     assert torch.equal(alike(cloud, [0.0, 0.0, 0.0], angle=90.0), of(cloud, 0) | of(cloud, 1))
     assert torch.equal(alike(cloud, [0.5, 1.5, 0.0]), of(cloud, 2))

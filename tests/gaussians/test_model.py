@@ -4,6 +4,7 @@ import pytest
 import torch
 from shared import gradients
 from small_scenes import varied_cloud
+from torch.testing import assert_close
 
 from gaussian_swaying.gaussians.area import coverage_area, patch_area
 from gaussian_swaying.gaussians.harmonics import sh_to_color
@@ -64,7 +65,7 @@ def test_model_normals_take_the_side_of_the_file():
     normals = GaussianSurfaceModel.from_cloud(cloud).normals()
     axis = smallest_axis_normal(cloud.quats, cloud.scales)
     assert ((normals * cloud.normals).sum(-1) >= 0).all()
-    torch.testing.assert_close((normals * axis).sum(-1).abs(), torch.ones(200))
+    assert_close((normals * axis).sum(-1).abs(), torch.ones(200))
     assert not torch.equal(normals, axis)
     plain = GaussianSurfaceModel.from_cloud(varied_cloud(6, 2))
     assert torch.equal(plain.normals(), smallest_axis_normal(plain.quats, plain.scales))
@@ -74,12 +75,12 @@ def test_model_methods_agree_with_the_functions(device, dtype):
     cloud = varied_cloud(40, 2).to(device, dtype)
     model = GaussianSurfaceModel.from_cloud(cloud)
     directions = torch.randn(40, 3, device=device, dtype=dtype)
-    torch.testing.assert_close(model.covariance(), covariance(cloud.quats, cloud.scales))
-    torch.testing.assert_close(model.opacity(), 1 / (1 + (-cloud.opacities).exp()))
-    torch.testing.assert_close(model.colors(directions), sh_to_color(cloud.sh, directions))
-    torch.testing.assert_close(model.areas("paper"), patch_area(cloud.scales))
+    assert_close(model.covariance(), covariance(cloud.quats, cloud.scales))
+    assert_close(model.opacity(), 1 / (1 + (-cloud.opacities).exp()))
+    assert_close(model.colors(directions), sh_to_color(cloud.sh, directions))
+    assert_close(model.areas("paper"), patch_area(cloud.scales))
     expected = coverage_area(cloud.means, model.normals(), cloud.scales, model.opacity())
-    torch.testing.assert_close(model.areas("coverage"), expected)
+    assert_close(model.areas("coverage"), expected)
     assert not torch.allclose(expected, patch_area(cloud.scales))
     with pytest.raises(ValueError, match="Expected `mode` to be one of paper, coverage, open, but got 'disc'"):
         model.areas("disc")
@@ -91,8 +92,8 @@ def test_model_deforms_a_batch(device, dtype):
     position = torch.randn(2, 6, 3, device=device, dtype=dtype)
     deformed = model.deformed(position, f)
     assert deformed.means is position
-    torch.testing.assert_close(deformed.covariances, f @ model.covariance() @ f.mT)
-    torch.testing.assert_close(deformed.normals, deform_normal(f, model.normals().expand(2, 6, 3)))
+    assert_close(deformed.covariances, f @ model.covariance() @ f.mT)
+    assert_close(deformed.normals, deform_normal(f, model.normals().expand(2, 6, 3)))
     deformed.covariances.sum().backward()
     assert model.quats.grad.abs().sum() > 0
     with pytest.raises(ValueError, match=r"Expected `deformation_gradient` of shape \(6, 3, 3\)"):

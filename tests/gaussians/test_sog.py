@@ -2,7 +2,6 @@
 
 import io
 import json
-import math
 import tracemalloc
 import zipfile
 from dataclasses import replace
@@ -10,9 +9,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from other_writers import FILES, assert_close, scene
+from other_writers import FILES, assert_same, in_order, refused, scene
 from PIL import Image
 from small_scenes import together, varied_cloud
+from torch.testing import assert_close
 
 from gaussian_swaying.gaussians import sog
 from gaussian_swaying.gaussians.export import convert, export_cloud
@@ -27,13 +27,6 @@ ROUNDED = {"opacities": 0.501 / 255, "quats": QUATS}
 CUT_OFF = {"opacities": 1.01 / 255, "quats": 2 * QUATS}  # where a writer does not round
 
 
-def _in_order(found, expected):
-    """The found Gaussians in the order of the expected ones."""
-    order = torch.cdist(expected.means.double(), found.means.double()).argmin(1)
-    assert order.unique().numel() == len(expected) == len(found)
-    return found.select(order)
-
-
 def _files(path):
     with zipfile.ZipFile(path) as archive:
         return {name: archive.read(name) for name in archive.namelist()}
@@ -43,22 +36,18 @@ def _meta(path):
     return json.loads(_files(path)["meta.json"])
 
 
-@pytest.mark.parametrize("degree", [0, 1, 2, 3])
-def test_round_trip(degree, tmp_path):
-    """Centres within half of 2^-16 of the logarithmic range, the rest on the nearest entry of a code book."""
+@pytest.mark.parametrize("degree", [0, 1])
+def test_values_lie_on_the_nearest_entry_of_a_code_book(degree, tmp_path):
     cloud = varied_cloud(degree=degree)
     export_cloud(tmp_path / "a.sog", cloud)
-    found = _in_order(read_gaussians(tmp_path / "a.sog"), cloud)
-    step = 2 * math.log(4) / 65535 * 4  # from -1 to 3; the logarithm is steepest at 3
-    widest = {"scales": 2 / 255, "colors": 0.8 / 255, "sh": 0.8 / 255}  # steps of an even code book
-    assert_close(found, cloud, means=0.5 * step, **widest, **ROUNDED)
+    found = in_order(read_gaussians(tmp_path / "a.sog"), cloud)
     meta = _meta(tmp_path / "a.sog")
     assert meta["count"] == 300
     for name, before, after in (("scales", cloud.scales, found.scales), ("sh0", cloud.sh[:, 0], found.sh[:, 0])):
         book = torch.tensor(meta[name]["codebook"])
         assert len(book) == 256
         nearest = (before[..., None] - book).abs().amin(-1)
-        torch.testing.assert_close((before - after).abs(), nearest, rtol=0, atol=1e-6)
+        assert_close((before - after).abs(), nearest, rtol=0, atol=1e-6)
     assert ("shN" in meta) == (degree > 0)
 
 
@@ -68,18 +57,18 @@ def test_values_that_fit_into_a_code_book_are_exact(tmp_path):
     cloud.means[:, 2], cloud.sh[:], cloud.scales[:] = 0.25, 1.0, -3.0
     export_cloud(tmp_path / "a.sog", cloud)
     found = read_gaussians(tmp_path / "a.sog")
-    torch.testing.assert_close(found.means[:, 2], torch.full((20,), 0.25))
-    assert bool((found.scales == -3).all())
-    assert bool((found.sh == 1).all())
+    assert_close(found.means[:, 2], torch.full((20,), 0.25))
+    assert (found.scales == -3).all()
+    assert (found.sh == 1).all()
     one = cloud.select(torch.arange(1))
     export_cloud(tmp_path / "b.sog", one)
-    assert_close(read_gaussians(tmp_path / "b.sog"), one, means=1e-6, scales=0, colors=0, sh=0, **ROUNDED)
+    assert_same(read_gaussians(tmp_path / "b.sog"), one, means=1e-6, scales=0, colors=0, sh=0, **ROUNDED)
 
 
 def test_as_splat_transform_writes_it():
     """Axes are those of the .ply. It cuts values off, and its code books are for more Gaussians than these."""
-    found = _in_order(read_sog(FILES / "scene.sog"), scene())
-    assert_close(found, scene(), means=1.5e-4, scales=0.02, colors=0.01, sh=0.01, **CUT_OFF)
+    found = in_order(read_sog(FILES / "scene.sog"), scene())
+    assert_same(found, scene(), means=1.5e-4, scales=0.02, colors=0.01, sh=0.01, **CUT_OFF)
 
 
 def _unpacked(folder, files):
@@ -166,11 +155,7 @@ def _leaf(meta):
     ],
 )
 def test_bad_streams(change, message, tmp_path):
-    path, _ = _streamed(tmp_path, change)
-    with pytest.raises(ValueError, match=r"lod-meta\.json") as caught:
-        read_gaussians(path)
-    assert message in str(caught.value)
-    assert "\n" not in str(caught.value)
+    refused(_streamed(tmp_path, change)[0], message)
 
 
 def _packed(path, files):
@@ -215,10 +200,8 @@ def test_bad_files(tmp_path):
     ):
         files = _files(FILES / "scene.sog")
         change(files)
-        for path in (_packed(tmp_path / "bad.sog", files), _unpacked(tmp_path, files)):
-            with pytest.raises((ValueError, FileNotFoundError)) as caught:
-                read_gaussians(path)
-            assert message in str(caught.value) or "no file" in message
+        refused(_packed(tmp_path / "bad.sog", files), message)
+        refused(_unpacked(tmp_path, files), "" if "no file" in message else message, name=str(tmp_path))
 
 
 def test_nothing_swells(tmp_path):
@@ -234,8 +217,7 @@ def test_nothing_swells(tmp_path):
     for name, message in (("a.sog", "announces 9 files, far more than its"), ("b.sog", "has 8000 x 8000 pixels")):
         assert (tmp_path / name).stat().st_size < 1 << 21
         tracemalloc.start()
-        with pytest.raises(ValueError, match=message):
-            read_gaussians(tmp_path / name)
+        refused(tmp_path / name, message)
         assert tracemalloc.get_traced_memory()[1] < 1 << 23
         tracemalloc.stop()
 
@@ -244,8 +226,7 @@ def test_files_elsewhere_are_not_read(tmp_path):
     path = _unpacked(tmp_path / "in", _files(FILES / "scene.sog"))
     (tmp_path / "quats.webp").write_bytes((path.parent / "quats.webp").read_bytes())
     path.write_text(path.read_text().replace("quats.webp", "../quats.webp"))
-    with pytest.raises(ValueError, match=r"names the file '\.\./quats\.webp'; put all files into its folder"):
-        read_gaussians(path)
+    refused(path, "names the file '../quats.webp'; put all files into its folder")
 
 
 def test_the_mark_of_antialiasing(tmp_path):
@@ -265,12 +246,12 @@ def test_more_harmonics_than_a_file_can_hold(tmp_path, monkeypatch):
     cloud = replace(cloud, sh=(clean + 0.01 * torch.randn(4000, 9, 3, generator=draw)).clone())
     export_cloud(tmp_path / "a.sog", cloud)
     assert 256 < _meta(tmp_path / "a.sog")["shN"]["count"] <= 1024
-    found = _in_order(read_gaussians(tmp_path / "a.sog"), cloud)
+    found = in_order(read_gaussians(tmp_path / "a.sog"), cloud)
     off = (found.sh - cloud.sh)[:, 1:].square().mean().sqrt()
-    assert float(off) < 0.05  # of harmonics that vary by 1
+    assert off < 0.05  # of harmonics that vary by 1
     same = replace(cloud, sh=torch.ones_like(cloud.sh))
     export_cloud(tmp_path / "b.sog", same)
-    torch.testing.assert_close(read_gaussians(tmp_path / "b.sog").sh, same.sh)
+    assert_close(read_gaussians(tmp_path / "b.sog").sh, same.sh)
 
 
 def test_large_code_books_are_made_from_a_sample(monkeypatch):
@@ -289,7 +270,7 @@ def test_sorted_along_a_curve():
     both = together(cloud, far).select(torch.randperm(100, generator=torch.Generator().manual_seed(0)))
     order = sog._curve(both.means.double().numpy())
     assert sorted(order) == list(range(100))
-    assert bool((both.means[torch.from_numpy(order)][:50] < 50).all())
+    assert (both.means[torch.from_numpy(order)][:50] < 50).all()
 
 
 def test_too_many_for_a_picture(tmp_path, monkeypatch):

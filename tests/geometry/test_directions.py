@@ -15,7 +15,7 @@ def test_lines_are_spread_evenly():
     lines = spread_lines(100)
     assert_close(lines.norm(dim=-1), torch.ones(100, dtype=torch.float64))
     assert_close(lines.mT @ lines / 100, torch.eye(3, dtype=torch.float64) / 3, rtol=0, atol=0.01)
-    assert float(lines[:, 2].min()) > 0
+    assert lines[:, 2].min() > 0
 
 
 @pytest.mark.parametrize("count", [1, 7, 100])
@@ -65,10 +65,3 @@ def test_hull_of_a_body_with_holes_is_that_of_its_corners():
 @pytest.mark.parametrize("count", [0, 1, 2])
 def test_hull_of_few_points_has_no_area(count):
     assert hull_area(torch.rand(count, 3)) == 0.0
-
-
-def test_hull_rejects_bad_points():
-    with pytest.raises(ValueError, match=r"Expected `points` of shape .* but got"):
-        hull_area(torch.zeros(5, 2))
-    with pytest.raises(ValueError, match="Expected `points` to be finite"):
-        hull_area(torch.tensor([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [math.nan, 1.0, 0.0]]))

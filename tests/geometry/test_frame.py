@@ -82,7 +82,7 @@ def test_metres_per_unit_is_taken_as_it_is():
     distance = torch.linalg.vector_norm(frame.point_to_sim(_points())[0] - frame.point_to_sim(_points())[1])
     assert float(distance) == pytest.approx(0.25 * float((_points()[0] - _points()[1]).norm()))
     assert SimFrame.fit(_points()).metres_per_unit == 1.0
-    assert float(frame.area_to_sim(torch.tensor(16.0))) == 1.0
+    assert frame.area_to_sim(torch.tensor(16.0)) == 1.0
 
 
 def test_what_a_frame_keeps_is_its_own():

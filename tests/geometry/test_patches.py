@@ -138,15 +138,3 @@ def test_gradcheck(device):
     area = torch.rand(4, device=device, dtype=torch.float64, requires_grad=True)
     assert torch.autograd.gradcheck(deform_normal, (f, normal))
     assert torch.autograd.gradcheck(deform_patch, (f, normal, area))
-
-
-@pytest.mark.parametrize(
-    ("call", "name"),
-    [
-        (lambda z: deform_normal(z(2, 3, 3), z(2, 2)), "normals"),
-        (lambda z: deform_patch(z(2, 3), z(2, 3), z(2)), "deformation_gradient"),
-    ],
-)
-def test_wrong_shapes_are_named(call, name):
-    with pytest.raises(ValueError, match=rf"Expected `{name}` of shape .* but got"):
-        call(torch.zeros)

@@ -158,16 +158,9 @@ def test_empty_selection_says_what_to_change():
         select_simulated(means, torch.tensor([0.5, 0.6]), Sphere([9, 9, 9], 1), 0.1)
     for part in ("[0.0, 1.0, 2.0] and [3.0, 4.0, 5.0]", "0 are in Sphere(center=[9.0, 9.0, 9.0], radius=1.0)", "move"):
         assert part in str(error.value)
+    with pytest.raises(ValueError, match="at least one Gaussian"):
+        select_simulated(means[:0], torch.ones(0), None, 0.1)
     with pytest.raises(
         ValueError, match=r"2 are in Everything.*threshold 0\.9; .*lower the threshold .*opacity is 0\.6"
     ):
         select_simulated(means, torch.tensor([0.5, 0.6]), Everything(), 0.9)
-
-
-def test_selection_rejects_wrong_arguments():
-    with pytest.raises(ValueError, match="Expected `opacities` of shape"):
-        select_simulated(torch.zeros(3, 3), torch.ones(2), None, 0.1)
-    with pytest.raises(ValueError, match="Expected `opacity_threshold` to be from 0 to 1, but got 2"):
-        select_simulated(torch.zeros(3, 3), torch.ones(3), None, 2)
-    with pytest.raises(ValueError, match="at least one Gaussian"):
-        select_simulated(torch.zeros(0, 3), torch.ones(0), None, 0.1)

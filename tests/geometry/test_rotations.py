@@ -1,6 +1,5 @@
 """Quaternions and rotation matrices."""
 
-import pytest
 import torch
 from shared import unit
 from torch.testing import assert_close
@@ -43,17 +42,3 @@ def test_a_turn_is_the_exponential_of_its_cross_product():
     assert_close(rotation_of(turn), torch.linalg.matrix_exp(cross), rtol=0, atol=1e-12)
     assert_close(turn_of(1e-12 * turn), 1e-12 * cross, rtol=1e-9, atol=1e-21)
     assert torch.autograd.gradcheck(turn_of, torch.zeros(1, 3, dtype=torch.float64, requires_grad=True))
-
-
-@pytest.mark.parametrize(
-    ("call", "name"),
-    [
-        (lambda z: quat_to_rotation(z(2, 3)), "quats"),
-        (lambda z: quat_multiply(z(3), z(2, 4)), "first"),
-        (lambda z: quat_multiply(z(4), z(2, 3)), "second"),
-        (lambda z: rotation_to_quat(z(2, 3)), "rotation"),
-    ],
-)
-def test_wrong_shapes_are_named(call, name):
-    with pytest.raises(ValueError, match=rf"Expected `{name}` of shape .* but got"):
-        call(torch.zeros)
