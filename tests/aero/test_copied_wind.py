@@ -4,6 +4,7 @@ import math
 
 import pytest
 import torch
+from torch.testing import assert_close
 
 from gaussian_swaying import GaussianGust, SineSway, SpatialWind, WindField
 from gaussian_swaying.aero.copied_wind import CopiedWind
@@ -37,7 +38,7 @@ def test_without_values_it_is_the_wind():
 def test_a_turned_copy_feels_the_wind_from_its_other_side():
     """Turned by 90 degrees counterclockwise, its own x axis is y of the scene: wind along y is wind along its x."""
     found = CopiedWind(WindField([0.0, 2.0, 0.0]), _turn(90.0), NONE)(TIMES)
-    torch.testing.assert_close(found, torch.tensor([[2.0, 0.0, 0.0]], dtype=torch.float64).expand_as(found))
+    assert_close(found, torch.tensor([[2.0, 0.0, 0.0]], dtype=torch.float64).expand_as(found))
 
 
 def test_gusts_come_later_or_are_others():
@@ -53,7 +54,7 @@ def test_a_wind_that_varies_in_space_is_that_at_the_place_of_the_copy(wind):
     copied, place, now = CopiedWind(wind, turn, shift), torch.rand(5, 3, dtype=torch.float64), TIMES[2]
     there = (turn @ place.T).T + shift
     wanted = wind.at(now, there) if isinstance(wind, WindField) else wind(now, there)
-    torch.testing.assert_close((turn @ copied(now, place).T).T, wanted)
+    assert_close((turn @ copied(now, place).T).T, wanted)
     assert not copied.uniform
 
 

@@ -38,7 +38,7 @@ def test_a_long_record_has_the_mean_and_the_intensity(name):
     count = SEEDS * min(SECONDS * given.speed / (2 * turbulence_length(height)), math.prod(CELLS) / 16**3)
     sigma = given.intensity * given.speed
     flow = torch.tensor([0.0, given.speed, 0.0], dtype=torch.float64)
-    assert bool(((air.mean(0) - flow).abs() < 3 * sigma / math.sqrt(count)).all())
+    assert ((air.mean(0) - flow).abs() < 3 * sigma / math.sqrt(count)).all()
     for spread in air.std(0).tolist():  # isotropic
         assert spread == pytest.approx(0.87 * sigma, rel=3 * 0.05 / math.sqrt(SEEDS) + 0.05)
 

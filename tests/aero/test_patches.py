@@ -66,9 +66,9 @@ def test_force_is_the_sum_over_the_patches(law, spread):
     for wind in winds():
         expected = each_patch(wind, velocity, F, normal, area, point, **LAWS[law])
         found, now = grouped_force(wind, velocity, F, sums, **LAWS[law])
-        assert float((found - expected).norm(dim=-1).sum()) < 0.01 * float(expected.norm(dim=-1).sum())
-        assert float((found - expected).sum(0).norm()) < 0.01 * float(expected.norm(dim=-1).sum())
-        assert not bool(found[0].any())
+        assert (found - expected).norm(dim=-1).sum() < 0.01 * float(expected.norm(dim=-1).sum())
+        assert (found - expected).sum(0).norm() < 0.01 * float(expected.norm(dim=-1).sum())
+        assert not found[0].any()
         assert_close(now.sum(), area.sum())
 
 
@@ -84,7 +84,7 @@ def test_strain_costs_less_than_itself(law):
         for wind in winds(20):
             expected = each_patch(wind, velocity, F, normal, area, point, **LAWS[law])
             found, _ = grouped_force(wind, velocity, F, sums, **LAWS[law])
-            assert float((found - expected).norm(dim=-1).sum()) <= bound * float(expected.norm(dim=-1).sum())
+            assert (found - expected).norm(dim=-1).sum() <= bound * float(expected.norm(dim=-1).sum())
 
 
 def test_one_direction_takes_the_path_of_single_patches():
@@ -92,8 +92,8 @@ def test_one_direction_takes_the_path_of_single_patches():
     force = WindForce(AeroForce(), WindField([3.0, 1.0, 0.0]), Patches(normal, area, point, POINTS))
     assert force.sums is None
     assert_close(force.area.sum(), area.sum())
-    assert float((force.normal[point] * normal).sum(-1).abs().min()) > 1 - 1e-12
-    assert not bool(force.area[0])
+    assert (force.normal[point] * normal).sum(-1).abs().min() > 1 - 1e-12
+    assert not force.area[0]
     several = WindForce(AeroForce(), WindField([3.0, 1.0, 0.0]), Patches(*random_patches(0.1), POINTS))
     assert several.sums is not None
 
@@ -110,7 +110,7 @@ def test_a_small_lift_needs_few_directions(lift):
         law = {"drag": 0.5, "friction": 0.4, "lift": lift, "law": "projected"}
         expected = each_patch(wind, velocity, F, normal, area, point, **law)
         found = grouped_force(wind, velocity, F, few, **law)[0]
-        assert float((found - expected).norm(dim=-1).sum()) < 0.01 * float(expected.norm(dim=-1).sum())
+        assert (found - expected).norm(dim=-1).sum() < 0.01 * float(expected.norm(dim=-1).sum())
 
 
 def test_the_area_is_capped_and_resists():
@@ -138,7 +138,7 @@ def test_a_state_in_wind(make_points):
     )
     law = {"drag": 0.5, "friction": 0.4, "lift": 0.01}
     expected = each_patch(wind, state.velocity, state.F_total, normal, area, point, **law)
-    assert float((force - expected).norm(dim=-1).sum()) < 0.01 * float(expected.norm(dim=-1).sum())
+    assert (force - expected).norm(dim=-1).sum() < 0.01 * float(expected.norm(dim=-1).sum())
     alone = aero.resistance(wind, state.velocity[point], area)
     assert_close(resistance, torch.zeros_like(resistance).index_add(0, point, alone), rtol=1e-9, atol=0)
 
@@ -167,7 +167,7 @@ def test_directions_are_joined_up_to_a_number():
     normal, area, point = random_patches(3.0, each=400)
     sums = PatchSums(Patches(normal, area, point, POINTS))
     assert int(sums.point.bincount().max()) <= MOST
-    assert bool((sums.point.diff() >= 0).all())
+    assert (sums.point.diff() >= 0).all()
     total = torch.zeros(POINTS, dtype=torch.float64).index_add(0, sums.point, sums.vector.norm(dim=-1))
     assert_close(total, sums.area)
     assert not PatchSums(Patches(normal, area, point, POINTS)).single
@@ -177,8 +177,6 @@ def test_directions_are_joined_up_to_a_number():
 
 
 def test_bad_patches():
-    normal, area, point = random_patches(0.0)
-    with pytest.raises(ValueError, match="`area`"):
-        Patches(normal, area[:5], point, POINTS)
+    normal, *_ = random_patches(0.0)
     with pytest.raises(ValueError, match="`area`"):
         WindForce(AeroForce(), WindField([1.0, 0.0, 0.0]), normal)

@@ -83,10 +83,9 @@ def test_places_of_the_file_are_in_metres_and_its_origin_in_scene_units(tmp_path
         ({"velocity": np.full((3, 4, 3, 2, 3), "5")}, "not made of numbers"),
         ({"time": np.zeros(0), "velocity": np.zeros((0, 4, 3, 2, 3))}, "`time` in .* is empty: save at least one"),
         ({"time": np.array([0.0, 1.0, np.inf])}, "`time` in .* to rise, without NaN"),
+        ({"time": np.array([np.nan]), "velocity": np.zeros((1, 4, 3, 2, 3))}, "`time` in .* to rise, without NaN"),
         ({"x": np.array([0.0, 1.0, 2.0, np.inf])}, "`x` in .* to rise in equal steps"),
         ({"x": np.array([-1e308, 0.0, 1e308, np.inf])}, "`x` in .* to rise in equal steps"),
-        ({"z": np.array([-1e308, 1e308])}, "`z` in .* to rise in equal steps"),
-        ({"z": np.array([0.0, np.inf])}, "`z` in .* to rise in equal steps"),
         ({"x": 1e-300 * np.arange(4)}, "steps of `x` in .* are 1e-300 m: save its places in metres"),
         ({"x": 1e300 * np.arange(4)}, "steps of `x` in .* are 1e[+]300 m"),
         ({"y": np.zeros((3, 1))}, "`y` in .* to be a list of numbers"),
@@ -96,12 +95,6 @@ def test_places_of_the_file_are_in_metres_and_its_origin_in_scene_units(tmp_path
 def test_a_grid_that_does_not_fit_is_refused(tmp_path, changes, words):
     with pytest.raises(ValueError, match=words):
         read_grid(_npz(tmp_path / "w.npz", **changes))
-
-
-def test_a_single_time_that_is_nan_is_refused(tmp_path):
-    path = _npz(tmp_path / "w.npz", time=np.array([np.nan]), velocity=np.zeros((1, 4, 3, 2, 3)))
-    with pytest.raises(ValueError, match=r"`time` in .* to rise, without NaN"):
-        RecordedWind(path)
 
 
 @pytest.mark.parametrize("value", [math.nan, math.inf])
@@ -182,19 +175,17 @@ def test_a_box_of_hipersim(tmp_path):
     np.testing.assert_allclose(found.numpy(), [-0.5 * v, 5 + 0.5 * u, 0.5 * w], atol=1e-5)
 
 
-def _bts(path, kind=8, cut=0, **changes):
+def _bts(path, kind=8):
     """A file of TurbSim with 4 times, 3 points across and 2 up."""
     nt, ny, nz = 4, 3, 2
-    values = {"dz": 2.0, "dy": 1.0, "dt": 0.5, "speed": 8.0, "hub": 10.0, "bottom": 9.0} | changes
     velocity = np.random.default_rng(0).normal([8.0, 0.0, 0.0], 1.0, (nt, ny, nz, 3))
     slope, shift = np.array([2000.0, 4000.0, 4000.0]), np.array([-16000.0, 10.0, -20.0])
     raw = np.rint(velocity * slope + shift).astype("<i2")
     words = b"made by a test"
-    head = struct.pack("<h4i6f", kind, nz, ny, 1, nt, *values.values())
+    head = struct.pack("<h4i6f", kind, nz, ny, 1, nt, 2.0, 1.0, 0.5, 8.0, 10.0, 9.0)  # dz, dy, dt, speed, hub, bottom
     head += np.stack([slope, shift], 1).astype("<f4").tobytes() + struct.pack("<i", len(words)) + words
     body = b"".join(raw[t].transpose(1, 0, 2).tobytes() + bytes(6) for t in range(nt))
-    data = head + body
-    path.write_bytes(data[: len(data) - cut])
+    path.write_bytes(head + body)
     return path, velocity
 
 
@@ -217,7 +208,9 @@ BAD_FIELDS = {
     "nt": [1],
     "towers": [-1],
     "letters": [-4],
-    **dict.fromkeys(("dz", "dy", "dt", "speed"), (0.0, -1.0, math.nan)),
+    **dict.fromkeys(("dz", "dy"), (0.0, -1.0, math.nan, math.inf, 1e-30)),
+    **dict.fromkeys(("dt", "speed"), (0.0, -1.0, math.nan, math.inf)),
+    "bottom": [math.nan],
     **dict.fromkeys(("slope_u", "slope_v", "slope_w"), (0.0, math.nan, math.inf)),
     "shift_v": [math.nan],
     "more": [2, -2],
@@ -259,11 +252,8 @@ def test_turbsim_checks_its_wind(tmp_path):
     path, _ = _bts(tmp_path / "w.bts")
     with pytest.raises(ValueError, match=r"is 8 m/s, but `wind.flow` has 6 m/s: set it to 8 m/s"):
         WindField([6.0, 0.0, 0.0], effects=[FrozenWind(path)])
-    damaged = [{"cut": 2}, {"dt": 0.0}, {"dt": math.inf}, {"dz": math.inf}, {"dy": 1e-30}, {"bottom": math.nan}]
-    for changes, words in (*((change, "is damaged") for change in damaged), ({"kind": 3}, "not a full-field")):
-        path, _ = _bts(tmp_path / "bad.bts", **changes)
-        with pytest.raises(ValueError, match=words):
-            read_bts(path)
+    with pytest.raises(ValueError, match="not a full-field"):
+        read_bts(_bts(tmp_path / "bad.bts", kind=3)[0])
 
 
 def _csv(path, text):

@@ -93,4 +93,4 @@ def test_the_response_spectrum_is_that_of_linear_theory():
         ratio = float(spectra[0][band].sum() / spectra[1][band].sum())
         assert ratio == pytest.approx(1.0, abs=0.1), (low, high)
     assert float(found[late].var() / expected[late].var()) == pytest.approx(1.0, abs=0.1)
-    assert float(found[late].std()) < 0.02  # small, to one that is 1.2 m high
+    assert found[late].std() < 0.02  # small, to one that is 1.2 m high

@@ -194,8 +194,8 @@ def test_there_is_no_divergence(gamma):
     waves = torch.fft.fftn(box, dim=(0, 1, 2))
     gradient = torch.stack([k[i] * waves[..., j] for i in range(3) for j in range(3)])
     divergence = gradient[0] + gradient[4] + gradient[8]
-    assert float(divergence.norm() / gradient.norm()) < 1e-5
-    assert float(gradient[0].norm() / gradient.norm()) > 0.05  # not because nothing varies along x
+    assert divergence.norm() / gradient.norm() < 1e-5
+    assert gradient[0].norm() / gradient.norm() > 0.05  # not because nothing varies along x
 
 
 def test_interpolation_takes_the_smallest_waves():
@@ -230,7 +230,7 @@ def test_places_that_are_no_numbers_stay_in_the_table(wraps):
     place = torch.tensor([[float("nan"), 1.0, 1.0], [float("inf"), 1.0, 1.0], [1e30, -1e30, 1.0]])
     found = trilinear(table, place, (wraps,) * 3)
     assert found.shape == (3, 3)
-    assert bool(found[0].isnan().all())
+    assert found[0].isnan().all()
 
 
 def test_shear_has_the_variances_of_the_standard():
@@ -252,15 +252,15 @@ def test_shear_makes_gusts_down_the_wind_and_stress():
         found = found + box.T @ box / len(box) / 4
     whole = sheared_variances(3.9)
     for i in range(3):
-        assert 0.6 * whole[i] < float(found[i, i]) < whole[i]
-    assert float(found[0, 2]) < -0.3 * float(found[2, 2])
+        assert 0.6 * whole[i] < found[i, i] < whole[i]
+    assert found[0, 2] < -0.3 * float(found[2, 2])
     assert abs(float(found[0, 1])) < 0.15 * float(found[0, 0])
 
 
 def test_a_seed_is_a_turbulence():
     one = turbulence_box((16, 8, 8), [0.5] * 3, L, seed=5)
     assert torch.equal(one, turbulence_box((16, 8, 8), [0.5] * 3, L, seed=5))
-    assert float((one - turbulence_box((16, 8, 8), [0.5] * 3, L, seed=6)).abs().max()) > 0.5
+    assert (one - turbulence_box((16, 8, 8), [0.5] * 3, L, seed=6)).abs().max() > 0.5
 
 
 @pytest.mark.gpu
@@ -271,15 +271,20 @@ def test_a_box_is_the_same_on_every_device():
     assert_close(there.cpu(), here, rtol=0, atol=2e-5)
 
 
-@pytest.mark.parametrize("changes", [{"cells": [15, 8, 8]}, {"cells": [8, 8]}, {"length": 0.0}, {"spectrum": "x"}])
-def test_impossible_boxes_are_refused(changes):
-    (name,) = changes
-    with pytest.raises(ValueError, match=f"Expected `{name}`"):
-        turbulence_box(**{"cells": [16, 8, 8], "spacing": [0.5] * 3, "length": L} | changes)
-    with pytest.raises(ValueError, match="too large"):
-        turbulence_box([2048, 512, 512], [0.5] * 3, L)
-    with pytest.raises(ValueError, match="gamma"):
-        turbulence_box([16, 8, 8], [0.5] * 3, L, "kaimal", gamma=1.0)
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"cells": [15, 8, 8]}, "Expected `cells`"),
+        ({"cells": [8, 8]}, "Expected `cells`"),
+        ({"cells": [2048, 512, 512]}, "too large"),
+        ({"length": 0.0}, "Expected `length`"),
+        ({"spectrum": "x"}, "Expected `spectrum`"),
+        ({"spectrum": "kaimal", "gamma": 1.0}, "gamma"),
+    ],
+)
+def test_impossible_boxes_are_refused(changes, message):
+    with pytest.raises(ValueError, match=message):
+        _gusts(**changes)
 
 
 def _gusts(**changes):
@@ -294,7 +299,7 @@ def test_turbulence_is_carried_by_the_mean_wind():
     now, later = (torch.tensor(t, dtype=torch.float64) for t in (0.3, 7.9))
     first = wind.at(now, place)
     assert_close(wind.at(later, place + (later - now) * flow), first, rtol=0, atol=1e-10)
-    assert float((wind.at(later, place) - first).abs().max()) > 0.5
+    assert (wind.at(later, place) - first).abs().max() > 0.5
     moment = Moment(now, flow, wind.carried(now))
     still = wind.effects[0](torch.zeros(3), place, moment)
     twice = wind.effects[0](torch.zeros(3), place, Moment(now, 2 * flow, wind.carried(now)))

@@ -64,8 +64,8 @@ def _ball(place):
 def test_kernels_compute_the_step_around_a_ball(kernel_device):
     """With interpolated bounce-back; the wall lies where it is, not at the borders of cells."""
     flow = LatticeFlow((12, 10, 9), UNITS, walls=_ball)
-    assert float(flow.gaps.min()) < 0.2
-    assert float(flow.gaps.max()) > 0.8
+    assert flow.gaps.min() < 0.2
+    assert flow.gaps.max() > 0.8
     state, wind = _random(flow)
     expected = flow.step(state, wind).moments
     single = flow.to(kernel_device).step(FlowState(state.moments.float().to(kernel_device)), wind).moments
@@ -121,7 +121,7 @@ def test_wind_blows_through_an_open_box_undisturbed():
     expected = torch.tensor([0.8, 0.3, -0.2])[:, None, None, None].expand(3, 12, 8, 8)
     assert_close(flow.velocity(state), expected, rtol=0, atol=1e-5)
     pressure = state.moments[0] * (UNITS.density * UNITS.speed**2 / 3)
-    assert float(pressure.abs().max()) < 1e-4
+    assert pressure.abs().max() < 1e-4
 
 
 def test_a_new_wind_fills_the_box():
@@ -146,25 +146,14 @@ def test_kinds_of_cells():
     walls = torch.zeros(6, 5, 5, dtype=torch.bool)
     walls[2, 2, 2] = True
     flow = LatticeFlow((6, 5, 5), UNITS, faces=("open", "open", ("wall", "open")), walls=walls)
-    assert bool((flow.kind[:, :, 0] == WALL).all())
+    assert (flow.kind[:, :, 0] == WALL).all()
     assert int(flow.kind[2, 2, 2]) == WALL
-    assert bool((flow.kind[0, :, 1:] == HELD).all())
+    assert (flow.kind[0, :, 1:] == HELD).all()
     assert flow.has_walls
     assert set(flow.kind.reshape(-1)[flow.held.long()].tolist()) == {HELD}
 
 
-@pytest.mark.parametrize(
-    ("changes", "message"),
-    [
-        ({"cells": (3, 8, 8)}, "At least 4|at least 4"),
-        ({"cells": (8, 8)}, "three numbers"),
-        ({"faces": (("periodic", "open"), "open", "open")}, "periodic or none"),
-        ({"faces": ("shut", "open", "open")}, "faces"),
-        ({"walls": torch.zeros(2, 2, 2, dtype=torch.bool)}, "walls"),
-        ({"smagorinsky": -1.0}, "smagorinsky"),
-        ({"cells": (2000, 2000, 2000)}, "at most"),
-    ],
-)
-def test_bad_input(changes, message):
+@pytest.mark.parametrize(("cells", "message"), [((3, 8, 8), "at least 4"), ((2000, 2000, 2000), "at most")])
+def test_bad_numbers_of_cells(cells, message):
     with pytest.raises(ValueError, match=message):
-        LatticeFlow(**({"cells": (8, 8, 8), "units": UNITS} | changes))
+        LatticeFlow(cells, UNITS)

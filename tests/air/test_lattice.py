@@ -4,7 +4,7 @@ import pytest
 import torch
 from torch.testing import assert_close
 
-from gaussian_swaying.air.lattice import DIRECTIONS, FASTEST, OPPOSITE, SOUND, WEIGHTS, LatticeUnits
+from gaussian_swaying.air.lattice import DIRECTIONS, OPPOSITE, WEIGHTS, LatticeUnits
 
 C = torch.tensor(DIRECTIONS, dtype=torch.float64)
 W = torch.tensor(WEIGHTS, dtype=torch.float64)
@@ -30,9 +30,3 @@ def test_units_of_a_speed():
     assert units.speed == pytest.approx(100.0)
     assert units.relaxation == pytest.approx(0.5 + 3 * 1e-3 * 0.001 / 0.01)
     assert units.cell_mass == pytest.approx(1.2e-3)
-
-
-@pytest.mark.parametrize("speed", [0.0, FASTEST + 0.01, SOUND])
-def test_too_fast_for_the_lattice(speed):
-    with pytest.raises(ValueError, match="lattice_speed"):
-        LatticeUnits.at_speed(0.1, 1.0, lattice_speed=speed, viscosity=1e-3, density=1.2)

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import torch
 from plyfile import PlyData, PlyElement
+from torch.testing import assert_close
 
 from gaussian_swaying.captures.capture import nearest_to_axes, read_capture
 from gaussian_swaying.rendering.cameras.camera import look_at_camera
@@ -19,8 +20,8 @@ def _names(count, suffix=".png"):
 
 
 def _same_camera(found, expected, atol=1e-6):
-    torch.testing.assert_close(found.world_to_camera, expected.world_to_camera.float(), rtol=0, atol=atol)
-    torch.testing.assert_close(found.intrinsics, expected.intrinsics.float(), rtol=1e-6, atol=1e-5)
+    assert_close(found.world_to_camera, expected.world_to_camera.float(), rtol=0, atol=atol)
+    assert_close(found.intrinsics, expected.intrinsics.float(), rtol=1e-6, atol=1e-5)
     assert (found.width, found.height) == (expected.width, expected.height)
 
 
@@ -37,7 +38,7 @@ def test_one_transforms_file(tmp_path, capture_tools):
         _same_camera(view.camera, pose)
         assert torch.equal(view.load(), torch.from_numpy(capture_tools.picture(index)))
     train = torch.stack([pose.position for pose in poses[1:8]])
-    torch.testing.assert_close(capture.center, train.mean(0).float())
+    assert_close(capture.center, train.mean(0).float())
     assert capture.extent == pytest.approx(1.1 * float((train - train.mean(0)).norm(dim=-1).max()), rel=1e-5)
     assert capture.points is None
     assert len(read_capture(tmp_path / "transforms.json", test_every=3).split("test")) == 3
@@ -110,7 +111,7 @@ def test_distortion_is_taken_out(tmp_path, capture_tools):
     seen = view.lens.undistorted()
     assert (view.camera.width, view.camera.height) == (seen.width, seen.height) != (20, 16)
     assert view.load().shape == (seen.height, seen.width, 3)
-    torch.testing.assert_close(view.camera.intrinsics, seen.intrinsics().float())
+    assert_close(view.camera.intrinsics, seen.intrinsics().float())
 
 
 def test_points_of_a_transforms_capture(tmp_path, capture_tools):
@@ -141,8 +142,8 @@ def test_colmap(tmp_path, capture_tools, binary, sparse):
         _same_camera(view.camera, pose)
     assert torch.equal(capture.views[3].load(), torch.from_numpy(capture_tools.picture(0)))
     expected = torch.tensor([place for place, _ in capture_tools.points])
-    torch.testing.assert_close(capture.points, expected)
-    torch.testing.assert_close(capture.colors, torch.tensor([c for _, c in capture_tools.points]) / 255)
+    assert_close(capture.points, expected)
+    assert_close(capture.colors, torch.tensor([c for _, c in capture_tools.points]) / 255)
 
 
 @pytest.mark.parametrize("binary", [True, False], ids=["bin", "txt"])
@@ -195,10 +196,10 @@ def test_downscale_averages_or_reads_the_smaller_folder(tmp_path, capture_tools,
     view = read_capture(tmp_path, downscale=3).views[1]
     full = torch.from_numpy(capture_tools.picture(1)).float()
     mean = full[:15, :18].reshape(5, 3, 6, 3, 3).mean((1, 3))
-    torch.testing.assert_close(view.load().float(), mean, rtol=0, atol=0.51)
+    assert_close(view.load().float(), mean, rtol=0, atol=0.51)
     focal = float(poses[0].intrinsics[0, 0])
     expected = torch.tensor([[focal / 3, 0, 10 / 3], [0, focal / 3, 8 / 3], [0, 0, 1]])
-    torch.testing.assert_close(view.camera.intrinsics, expected)
+    assert_close(view.camera.intrinsics, expected)
     (tmp_path / "images_3").mkdir()
     for name in names:
         iio.imwrite(tmp_path / "images_3" / name, np.full((5, 7, 3), 77, dtype=np.uint8))
@@ -335,4 +336,4 @@ def test_the_point_nearest_to_all_axes():
     found = nearest_to_axes([look_at_camera(eye, target, (0, 0, 1), 40.0, 8, 8) for eye in eyes])
     assert found.tolist() == pytest.approx(list(target), abs=1e-5)
     parallel = [look_at_camera((x, -2, 0), (x, 0, 0), (0, 0, 1), 40.0, 8, 8) for x in (0.0, 1.0)]
-    assert bool(torch.isnan(nearest_to_axes(parallel)).all())
+    assert torch.isnan(nearest_to_axes(parallel)).all()

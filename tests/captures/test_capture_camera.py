@@ -5,6 +5,7 @@ import math
 
 import pytest
 import torch
+from torch.testing import assert_close
 
 from gaussian_swaying.captures.capture_camera import CaptureCamera, read_views
 from gaussian_swaying.geometry.rotations import rotation_to_quat
@@ -63,8 +64,8 @@ def capture(request, tmp_path):
 
 
 def _same(camera, expected):
-    torch.testing.assert_close(camera.world_to_camera, expected.world_to_camera, rtol=0, atol=1e-5)
-    torch.testing.assert_close(camera.intrinsics, expected.intrinsics, rtol=1e-6, atol=1e-4)
+    assert_close(camera.world_to_camera, expected.world_to_camera, rtol=0, atol=1e-5)
+    assert_close(camera.intrinsics, expected.intrinsics, rtol=1e-6, atol=1e-4)
     assert (camera.width, camera.height) == (expected.width, expected.height)
 
 
@@ -83,16 +84,16 @@ def test_a_journey_meets_every_view_in_the_order_of_names(capture):
     _same(path(0, 99.0, CENTER, UP, 1.0), _cameras()["c.png"])
     between = path(0, 1.0, CENTER, UP, 1.0)
     rotation = between.world_to_camera[:3, :3]
-    torch.testing.assert_close(rotation @ rotation.T, torch.eye(3, dtype=torch.float64), rtol=0, atol=1e-5)
+    assert_close(rotation @ rotation.T, torch.eye(3, dtype=torch.float64), rtol=0, atol=1e-5)
     seen = between.world_to_camera[:3] @ torch.tensor([0.0, 0.0, 0.0, 1.0], dtype=torch.float64)
     assert abs(float(seen[0] / seen[2])) < 0.05  # it still looks about where both neighbours look
-    assert 2.5 < float(between.position[:2].norm()) < 3.0
+    assert 2.5 < between.position[:2].norm() < 3.0
 
 
 def test_the_picture_can_have_another_size(capture):
     camera = CaptureCamera(capture, view=0, width=32)(0, 0.0, CENTER, UP, 1.0)
     assert (camera.width, camera.height) == (32, 24)
-    torch.testing.assert_close(camera.intrinsics[:2], 0.5 * _cameras()["a.png"].intrinsics[:2], rtol=1e-6, atol=1e-5)
+    assert_close(camera.intrinsics[:2], 0.5 * _cameras()["a.png"].intrinsics[:2], rtol=1e-6, atol=1e-5)
 
 
 def test_bad_views(capture, tmp_path):

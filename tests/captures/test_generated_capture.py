@@ -5,6 +5,7 @@ import math
 import numpy as np
 import pytest
 import torch
+from torch.testing import assert_close
 
 from gaussian_swaying.captures.capture import read_capture
 from gaussian_swaying.captures.generated_capture import GeneratedCapture
@@ -21,8 +22,8 @@ def test_slopes_are_the_derivatives_of_the_height(small):
     x, z = (torch.rand(50, dtype=torch.float64).requires_grad_() for _ in range(2))
     expected = torch.autograd.grad(small.elevation(x, z).sum(), (x, z))
     for found, gradient in zip(small.slopes(x, z), expected, strict=True):
-        torch.testing.assert_close(found.detach(), gradient)
-    assert float(expected[0].abs().max()) > 0.3  # a flag worth looking at
+        assert_close(found.detach(), gradient)
+    assert expected[0].abs().max() > 0.3  # a flag worth looking at
 
 
 def test_area_is_that_of_the_mesh(small):
@@ -33,7 +34,7 @@ def test_area_is_that_of_the_mesh(small):
     assert truth.area > 1.01 * 1.2 * 0.8
     assert GeneratedCapture(ripple=0.0).area() == pytest.approx(0.96)
     facing = torch.nn.functional.normalize(cross, dim=-1)
-    assert float((facing * truth.normals[truth.faces[:, 0]]).sum(-1).min()) > 0.99
+    assert (facing * truth.normals[truth.faces[:, 0]]).sum(-1).min() > 0.99
 
 
 def test_the_nearest_point_lies_below_along_the_normal(small):
@@ -43,11 +44,11 @@ def test_the_nearest_point_lies_below_along_the_normal(small):
     below = torch.stack([x, small.elevation(x, z), z], -1)
     lift = 0.05 * (2 * torch.rand(200, 1, generator=generator, dtype=torch.float64) - 1)
     found, normals = small.nearest(below + lift * small.normals(x, z))
-    torch.testing.assert_close(found, below, rtol=0, atol=1e-5)
-    torch.testing.assert_close(normals, small.normals(x, z), rtol=0, atol=1e-4)
+    assert_close(found, below, rtol=0, atol=1e-5)
+    assert_close(normals, small.normals(x, z), rtol=0, atol=1e-4)
     # beside the sheet its rim is nearest
     rim, _ = GeneratedCapture(ripple=0.0).nearest(torch.tensor([[1.5, 0.3, 0.4], [-1.0, 0.0, 2.0]]))
-    torch.testing.assert_close(rim, torch.tensor([[1.2, 0.0, 0.4], [0.0, 0.0, 0.8]], dtype=torch.float64))
+    assert_close(rim, torch.tensor([[1.2, 0.0, 0.4], [0.0, 0.0, 0.8]], dtype=torch.float64))
 
 
 def test_pictures_show_the_true_surface(small):
@@ -63,10 +64,10 @@ def test_pictures_show_the_true_surface(small):
         hit = torch.isfinite(view.depth)
         place = (rays * view.depth.double()[..., None])[hit] + pose[:3, 3]
         off = place[:, 1] - small.elevation(place[:, 0], place[:, 2])
-        assert float(off.abs().max()) < 5e-6
-        assert float((view.normals[hit].double() * (place - pose[:3, 3])).sum(-1).max()) <= 0
+        assert off.abs().max() < 5e-6
+        assert (view.normals[hit].double() * (place - pose[:3, 3])).sum(-1).max() <= 0
         normal = small.normals(place[:, 0], place[:, 2])
-        torch.testing.assert_close((normal * view.normals[hit]).sum(-1).abs(), torch.ones(len(place)).double())
+        assert_close((normal * view.normals[hit]).sum(-1).abs(), torch.ones(len(place)).double())
 
         t = torch.linspace(1.2, 3.2, 1501, dtype=torch.float64)[:, None, None]
         x, y, z = (pose[axis, 3] + t * rays[..., axis] for axis in range(3))
@@ -89,12 +90,12 @@ def test_pixels_average_what_is_covered():
     assert float(view.alpha.sum()) == pytest.approx(0.96 * scale**2, rel=0.01)
     covered = view.alpha == 1
     assert int(covered.sum()) > 500
-    assert float(view.colors[view.alpha == 0].abs().max()) == 0
-    torch.testing.assert_close(view.depth[covered], torch.full((int(covered.sum()),), 2.2))
-    torch.testing.assert_close(view.normals[covered].mean(0), torch.tensor([0.0, -1.0, 0.0]))
+    assert view.colors[view.alpha == 0].abs().max() == 0
+    assert_close(view.depth[covered], torch.full((int(covered.sum()),), 2.2))
+    assert_close(view.normals[covered].mean(0), torch.tensor([0.0, -1.0, 0.0]))
     top, bottom = view.colors[18, 32] / view.alpha[18, 32], view.colors[45, 32] / view.alpha[45, 32]
-    assert float(top[0]) > 2 * float(top[2])  # red above
-    assert float(bottom[2]) > 2 * float(bottom[0])  # blue below
+    assert top[0] > 2 * float(top[2])  # red above
+    assert bottom[2] > 2 * float(bottom[0])  # blue below
 
 
 def test_the_folder_is_a_capture_with_its_truth(tmp_path, small):
@@ -102,18 +103,18 @@ def test_the_folder_is_a_capture_with_its_truth(tmp_path, small):
     capture = read_capture(folder)
     assert (len(capture.split("train")), len(capture.split("test"))) == (10, 2)
     for view, camera in zip(capture.views, small.cameras(), strict=True):
-        torch.testing.assert_close(view.camera.world_to_camera, camera.world_to_camera.float(), rtol=0, atol=1e-6)
-        torch.testing.assert_close(view.camera.intrinsics, camera.intrinsics.float())
+        assert_close(view.camera.world_to_camera, camera.world_to_camera.float(), rtol=0, atol=1e-6)
+        assert_close(view.camera.intrinsics, camera.intrinsics.float())
     expected = small.render(small.cameras()[5])
     packed = torch.cat([expected.colors, expected.alpha[..., None]], -1)
-    torch.testing.assert_close(capture.views[5].load().float() / 255, packed, rtol=0, atol=0.009)
+    assert_close(capture.views[5].load().float() / 255, packed, rtol=0, atol=0.009)
     with np.load(folder / "truth.npz") as truth:
-        assert float(truth["area"]) == small.area()
+        assert truth["area"] == small.area()
         assert truth["normals"].shape == truth["vertices"].shape
         assert int(truth["faces"].max()) == len(truth["vertices"]) - 1
     cloud = initial_points(capture, folder / "mesh.ply", count=200)
     on_sheet = small.elevation(cloud.points[:, 0], cloud.points[:, 2])
-    torch.testing.assert_close(cloud.points[:, 1], on_sheet, rtol=0, atol=2e-4)
+    assert_close(cloud.points[:, 1], on_sheet, rtol=0, atol=2e-4)
     with pytest.raises(ValueError, match="not empty"):
         small.write(folder)
 
@@ -132,10 +133,10 @@ def test_cameras_are_all_around():
     cameras = GeneratedCapture(views=64).cameras()
     for some in (cameras, cameras[::8]):
         rays = torch.stack([camera.position - torch.tensor([0.6, 0.0, 0.4]) for camera in some])
-        torch.testing.assert_close(rays.norm(dim=-1), torch.full((len(some),), 2.2).double())
+        assert_close(rays.norm(dim=-1), torch.full((len(some),), 2.2).double())
         quarter = torch.atan2(rays[:, 1], rays[:, 0]) // (0.5 * math.pi)
         assert len(quarter.unique()) == 4
-        assert float(rays[:, 2].max()) > 0.6 * 2.2 > 0 > -0.2 * 2.2 > float(rays[:, 2].min())
+        assert rays[:, 2].max() > 0.6 * 2.2 > 0 > -0.2 * 2.2 > rays[:, 2].min()
 
 
 @pytest.mark.parametrize(

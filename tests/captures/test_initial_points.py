@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 import torch
 from plyfile import PlyData, PlyElement
+from torch.testing import assert_close
 
 from gaussian_swaying.captures.capture import read_capture
 from gaussian_swaying.captures.generated_capture import GeneratedCapture
@@ -31,13 +32,13 @@ def test_random_points_fill_what_the_cameras_see(capture):
     cloud = initial_points(capture, "auto", count=20_000, seed=3)
     reach = 2.0 * 10 / 8 * np.tan(np.radians(25))
     middle = 0.5 * (cloud.points.amax(0) + cloud.points.amin(0))
-    torch.testing.assert_close(middle, torch.tensor([0.0, 0.0, 0.2]), rtol=0, atol=0.01)
-    torch.testing.assert_close(cloud.points.amax(0) - middle, torch.full((3,), reach).float(), rtol=0.02, atol=0)
-    assert 0 <= float(cloud.colors.min()) < 0.01 < 0.99 < float(cloud.colors.max()) <= 1
+    assert_close(middle, torch.tensor([0.0, 0.0, 0.2]), rtol=0, atol=0.01)
+    assert_close(cloud.points.amax(0) - middle, torch.full((3,), reach).float(), rtol=0.02, atol=0)
+    assert 0 <= cloud.colors.min() < 0.01 < 0.99 < cloud.colors.max() <= 1
     assert torch.equal(initial_points(capture, count=20_000, seed=3).points, cloud.points)
     assert not torch.equal(initial_points(capture, count=20_000, seed=4).points, cloud.points)
     small = initial_points(capture, half_side=0.1, count=100)
-    assert float((small.points - torch.tensor([0.0, 0.0, 0.2])).abs().max()) <= 0.1 + 1e-6
+    assert (small.points - torch.tensor([0.0, 0.0, 0.2])).abs().max() <= 0.1 + 1e-6
 
 
 def test_random_points_keep_away_from_the_cameras(capture):
@@ -47,9 +48,9 @@ def test_random_points_keep_away_from_the_cameras(capture):
     assert len(cloud) == 20_000
     eyes = torch.stack([view.camera.position for view in capture.views])
     ratio = torch.cdist(cloud.points, eyes) / (eyes - middle).norm(dim=-1)
-    assert 0.5 <= float(ratio.min()) < 0.53
+    assert 0.5 <= ratio.min() < 0.53
     reach = (cloud.points - middle).abs().amax(0)
-    torch.testing.assert_close(reach, torch.full((3,), 4.0), rtol=0.01, atol=0)
+    assert_close(reach, torch.full((3,), 4.0), rtol=0.01, atol=0)
 
 
 def test_random_points_without_room(capture, monkeypatch):
@@ -85,10 +86,10 @@ def test_a_mesh_is_sampled_by_area(tmp_path, capture):
     upright = cloud.points[:, 2] > 4
     assert float(upright.float().mean()) == pytest.approx(0.25 / 2.25, abs=0.01)
     flat = cloud.points[~upright]
-    assert float(flat[:, 2].abs().max()) == 0
+    assert flat[:, 2].abs().max() == 0
     counts = torch.histogramdd(flat[:, :2], [4, 2], range=[0.0, 2.0, 0.0, 1.0]).hist
-    torch.testing.assert_close(counts / len(flat), torch.full((4, 2), 1 / 8), rtol=0.06, atol=0)
-    torch.testing.assert_close(cloud.colors[~upright][:, 2], flat[:, 1], rtol=0, atol=1e-5)  # red below, blue above
+    assert_close(counts / len(flat), torch.full((4, 2), 1 / 8), rtol=0.06, atol=0)
+    assert_close(cloud.colors[~upright][:, 2], flat[:, 1], rtol=0, atol=1e-5)  # red below, blue above
     assert cloud.normals[~upright][0].tolist() == [0, 0, 1]
     assert cloud.normals[upright][0].tolist() == [0, -1, 0]
 

@@ -4,6 +4,7 @@ import math
 
 import pytest
 import torch
+from torch.testing import assert_close
 
 from gaussian_swaying.gaussians.harmonics import SH_DC
 from gaussian_swaying.gaussians.model import GaussianSurfaceModel
@@ -16,12 +17,12 @@ def test_normals_are_perpendicular_to_the_rippled_sheet():
     cloud = FlagScene(spacing=0.05, ripple=0.05).generate()
     k = 2 * math.pi * 1.5 / 1.2
     x, y, _ = cloud.means.double().unbind(-1)
-    torch.testing.assert_close(y, 0.05 * torch.sin(k * x), rtol=0, atol=1e-7)
+    assert_close(y, 0.05 * torch.sin(k * x), rtol=0, atol=1e-7)
     expected = torch.stack([-0.05 * k * torch.cos(k * x), torch.ones_like(x), torch.zeros_like(x)], -1)
     expected = expected / expected.norm(dim=-1, keepdim=True)
     normals = GaussianSurfaceModel.from_cloud(cloud).normals().double()
-    assert float(expected[:, 0].abs().max()) > 0.3  # the ripple is steep enough to tell
-    torch.testing.assert_close((normals * expected).sum(-1).abs(), torch.ones_like(x), rtol=0, atol=1e-6)
+    assert expected[:, 0].abs().max() > 0.3  # the ripple is steep enough to tell
+    assert_close((normals * expected).sum(-1).abs(), torch.ones_like(x), rtol=0, atol=1e-6)
 
 
 @pytest.mark.parametrize("spacing", [0.1, 0.05])
@@ -35,9 +36,9 @@ def test_areas_add_up_to_the_flag(spacing):
 def test_size_and_place():
     cloud = FlagScene(width=0.6, height=0.4, spacing=0.1).generate()
     low, high = cloud.means.amin(0), cloud.means.amax(0)
-    torch.testing.assert_close(low[[0, 2]], torch.tensor([0.05, 0.05]))
-    torch.testing.assert_close(high[[0, 2]], torch.tensor([0.55, 0.35]))
-    assert float(cloud.means[:, 1].abs().max()) <= 0.003
+    assert_close(low[[0, 2]], torch.tensor([0.05, 0.05]))
+    assert_close(high[[0, 2]], torch.tensor([0.55, 0.35]))
+    assert cloud.means[:, 1].abs().max() <= 0.003
 
 
 def test_the_same_arguments_give_the_same_splat():
@@ -51,9 +52,9 @@ def test_yaw_turns_the_flag_about_its_pole():
     plain, turned = (FlagScene(spacing=0.1, ripple=0.03, yaw=yaw).generate() for yaw in (0.0, -35.0))
     c, s = math.cos(math.radians(35)), math.sin(math.radians(35))
     turn = torch.tensor([[c, s, 0.0], [-s, c, 0.0], [0.0, 0.0, 1.0]])
-    torch.testing.assert_close(turned.means, plain.means @ turn.T)
+    assert_close(turned.means, plain.means @ turn.T)
     before, after = (GaussianSurfaceModel.from_cloud(cloud, requires_grad=False).normals() for cloud in (plain, turned))
-    torch.testing.assert_close(after, before @ turn.T, atol=1e-6, rtol=0)
+    assert_close(after, before @ turn.T, atol=1e-6, rtol=0)
 
 
 def test_patterns():
@@ -86,19 +87,19 @@ def test_a_printed_flag_has_the_colours_of_its_print():
     scene = FlagScene(width=0.6, height=0.4, spacing=0.02, pattern="printed", yaw=20.0)
     plain = FlagScene(width=0.6, height=0.4, spacing=0.02, pattern="printed").generate()
     wanted = printed_colours(plain.means[:, 0], plain.means[:, 2])
-    torch.testing.assert_close((0.5 + SH_DC * scene.generate().sh[:, 0]).double(), wanted, atol=1e-5, rtol=0)
+    assert_close((0.5 + SH_DC * scene.generate().sh[:, 0]).double(), wanted, atol=1e-5, rtol=0)
 
 
 def test_a_print_can_be_told_everywhere():
     """In every square of 20 cm the colours vary; no two such squares are alike; the same place has the same colour."""
     x, z = torch.meshgrid(torch.arange(0.0, 1.6, 0.01), torch.arange(0.0, 1.6, 0.01), indexing="ij")
     colours = printed_colours(x, z)
-    assert float(colours.min()) >= 0
-    assert float(colours.max()) <= 1
-    torch.testing.assert_close(printed_colours(x[:5] + PERIOD, z[:5]), colours[:5], atol=1e-5, rtol=0)
+    assert colours.min() >= 0
+    assert colours.max() <= 1
+    assert_close(printed_colours(x[:5] + PERIOD, z[:5]), colours[:5], atol=1e-5, rtol=0)
     squares = colours.reshape(8, 20, 8, 20, 3).permute(0, 2, 1, 3, 4).reshape(64, -1)
     squares = squares - squares.mean(1, keepdim=True)
     size = squares.norm(dim=1) / squares.shape[1] ** 0.5
-    assert float(size.min()) > 0.1
+    assert size.min() > 0.1
     alike = squares @ squares.T / squares.norm(dim=1).outer(squares.norm(dim=1)) - torch.eye(64)
-    assert float(alike.max()) < 0.7
+    assert alike.max() < 0.7

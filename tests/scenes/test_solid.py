@@ -4,6 +4,7 @@ import math
 
 import pytest
 import torch
+from torch.testing import assert_close
 
 from gaussian_swaying.gaussians.model import GaussianSurfaceModel
 from gaussian_swaying.geometry.patches import smallest_axis_normal
@@ -18,7 +19,7 @@ def test_a_shell_lies_on_the_surface(shape):
     scene = SolidScene(shape, spacing=0.05, gaussians="shell")
     cloud = scene.generate()
     assert len(cloud) > 300
-    assert float(scene.distance(cloud.means.double()).abs().max()) < (1e-3 if shape == "figure" else 1e-6)
+    assert scene.distance(cloud.means.double()).abs().max() < (1e-3 if shape == "figure" else 1e-6)
 
 
 @pytest.mark.parametrize("shape", SHAPES)
@@ -28,21 +29,21 @@ def test_gaussians_throughout_are_the_shell_and_a_core(shape):
     assert torch.equal(solid.means[: len(shell)], shell.means)
     core = scene.distance(solid.means[len(shell) :].double())
     assert len(core) > 0
-    assert float(core.max()) < -0.4 * 0.05
+    assert core.max() < -0.4 * 0.05
     assert torch.equal(solid.scales[0], solid.scales[-1])  # as large as those of the surface
 
 
 def test_normals_are_true():
     """On the ball radial, on the torus away from the ring, and along the shortest axis of each Gaussian."""
     ball = SolidScene("ball", spacing=0.05, gaussians="shell").generate()
-    torch.testing.assert_close(ball.normals, torch.nn.functional.normalize(ball.means, dim=-1), rtol=0, atol=1e-4)
+    assert_close(ball.normals, torch.nn.functional.normalize(ball.means, dim=-1), rtol=0, atol=1e-4)
     torus = SolidScene("torus", spacing=0.05, gaussians="shell").generate()
     ring = torch.nn.functional.normalize(torus.means * torch.tensor([1.0, 1.0, 0.0]), dim=-1) * 0.5 / 1.3
     expected = torch.nn.functional.normalize(torus.means - ring, dim=-1)
-    torch.testing.assert_close(torus.normals, expected, rtol=0, atol=1e-4)
+    assert_close(torus.normals, expected, rtol=0, atol=1e-4)
     for cloud in (ball, torus, SolidScene(spacing=0.05).generate()):
         along = (smallest_axis_normal(cloud.quats, cloud.scales) * cloud.normals).sum(-1)
-        torch.testing.assert_close(along, torch.ones(len(cloud)), rtol=0, atol=1e-5)
+        assert_close(along, torch.ones(len(cloud)), rtol=0, atol=1e-5)
 
 
 def test_the_shell_covers_the_surface():

@@ -42,7 +42,7 @@ def test_a_row_of_gaussians_lies_on_each_held_edge(tool, name):
     found, line = ends[pattern.pinned]
     assert float(found) == pytest.approx(line, abs=1e-6)
     free = {"left": pattern.width - x.max(), "top": z.min(), "sides": z.min()}[pattern.pinned]
-    assert 0.02 < float(free) < 0.03  # half a patch
+    assert 0.02 < free < 0.03  # half a patch
 
 
 def test_films_that_begin_before_and_into_the_motion(tool, cases, motions, tmp_path):

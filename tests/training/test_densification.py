@@ -153,11 +153,11 @@ def test_large_ones_are_split_once():
     count = len(model)
     assert count > 10
     assert torch.equal(model.opacities.detach()[:3], opacities)
-    assert bool(torch.isfinite(model.opacities).all())
-    assert float(model.scales.detach().exp().max()) <= 0.05
+    assert torch.isfinite(model.opacities).all()
+    assert model.scales.detach().exp().max() <= 0.05
     offset = model.means.detach()[3:] - model.means.detach()[1]
-    assert bool((offset[:, 0].abs() < 0.6).all())
-    assert bool((offset[:, 2].abs() < 0.01).all())
+    assert (offset[:, 0].abs() < 0.6).all()
+    assert (offset[:, 2].abs() < 0.01).all()
     assert torch.equal(model.sh0.detach()[3:], model.sh0.detach()[1:2].expand(count - 3, 1, 3))
     for name in PARAMETERS:
         parameter = getattr(model, name)
@@ -166,7 +166,7 @@ def test_large_ones_are_split_once():
         state = optimizer.state[parameter]["exp_avg"]
         assert state.shape == parameter.shape
         assert torch.equal(state[:3], momenta[name])
-        assert not bool(state[3:].any())
+        assert not state[3:].any()
     before = {name: getattr(model, name).detach().clone() for name in PARAMETERS}
     for parameter in model.parameters():
         parameter.grad = torch.ones_like(parameter)
@@ -176,7 +176,7 @@ def test_large_ones_are_split_once():
         model.scales.add_(1.0)
     densification.after_step(8, _screen([0.0], [0]))
     assert len(model) == count
-    assert float(model.scales.detach().exp().max()) <= 0.05 * (1 + 1e-6)
+    assert model.scales.detach().exp().max() <= 0.05 * (1 + 1e-6)
 
 
 def test_sums_of_gradients_without_waiting_are_those_of_gsplat():

@@ -4,6 +4,7 @@ import math
 
 import pytest
 import torch
+from torch.testing import assert_close
 
 from gaussian_swaying.metrics.ssim import ssim_map
 from gaussian_swaying.training.losses import (
@@ -47,12 +48,12 @@ def _inputs(**changes):
 def test_photometric_loss_is_the_weighted_sum():
     x, y = _pictures()
     expected = 0.8 * (x - y).abs().mean() + 0.2 * (1 - ssim_map(x, y).mean())
-    torch.testing.assert_close(photometric_loss(x, y), expected)
-    torch.testing.assert_close(photometric_loss(x, y, ssim_weight=0.0), (x - y).abs().mean())
+    assert_close(photometric_loss(x, y), expected)
+    assert_close(photometric_loss(x, y, ssim_weight=0.0), (x - y).abs().mean())
     assert float(photometric_loss(x, x)) == pytest.approx(0.0, abs=1e-12)
     padded = 0.8 * (x - y).abs() + 0.2 * (1 - ssim_map(x, y, "zeros"))
     assert padded.shape == x.shape
-    torch.testing.assert_close(padded.mean(), photometric_loss(x, y, padding="zeros"))
+    assert_close(padded.mean(), photometric_loss(x, y, padding="zeros"))
 
 
 def test_photometric_gradient():
@@ -70,18 +71,18 @@ def test_anisotropy_by_hand(order):
     """The paper's ratio leaves discs alone, PhysGaussian's does not."""
     scales = torch.tensor([[0.3, 0.2, 0.001], [0.2, 0.2, 0.001], [0.21, 0.2, 0.2]], dtype=torch.float64)[:, order].log()
     literal = _of_each(anisotropy_loss, scales)
-    torch.testing.assert_close(literal, torch.tensor([0.4, 0.0, 0.0], dtype=torch.float64))
+    assert_close(literal, torch.tensor([0.4, 0.0, 0.0], dtype=torch.float64))
     spread = _of_each(lambda one: anisotropy_loss(one, ratio="max_min"), scales)
-    torch.testing.assert_close(spread, torch.tensor([298.9, 198.9, 0.0], dtype=torch.float64))
-    torch.testing.assert_close(anisotropy_loss(scales), literal.mean())
-    torch.testing.assert_close(anisotropy_loss(scales, reduction="sum"), literal.sum())
+    assert_close(spread, torch.tensor([298.9, 198.9, 0.0], dtype=torch.float64))
+    assert_close(anisotropy_loss(scales), literal.mean())
+    assert_close(anisotropy_loss(scales, reduction="sum"), literal.sum())
 
 
 def test_entropy_by_hand():
     values = torch.tensor([0.0, 1.0, 0.5, 1 / math.e], dtype=torch.float64, requires_grad=True)
     result = _of_each(opacity_entropy_loss, values)
     expected = torch.tensor([0.0, 0.0, 0.5 * math.log(2), 1 / math.e], dtype=torch.float64)
-    torch.testing.assert_close(result, expected, rtol=1e-9, atol=2e-6)
+    assert_close(result, expected, rtol=1e-9, atol=2e-6)
     result.sum().backward()
     assert torch.isfinite(values.grad).all()
     assert (values.grad[1:3] < 0).all()  # descent raises an opacity above 1/e
@@ -90,7 +91,7 @@ def test_entropy_by_hand():
 
 def test_size_by_hand():
     scales = torch.tensor([[0.001, 0.010, 0.002], [0.008, 0.001, 0.001]], dtype=torch.float64).log()
-    torch.testing.assert_close(_of_each(size_loss, scales), torch.tensor([0.002, 0.0], dtype=torch.float64))
+    assert_close(_of_each(size_loss, scales), torch.tensor([0.002, 0.0], dtype=torch.float64))
     assert size_loss(scales, b=0.0).item() == pytest.approx(0.009)
 
 
@@ -120,7 +121,7 @@ def test_modules_are_their_functions():
         (MeanScaleLoss(), torch.tensor(0.017)),
     ]
     for module, expected in pairs:
-        torch.testing.assert_close(module(inputs), expected)
+        assert_close(module(inputs), expected)
 
 
 def test_total_with_the_weights_of_the_paper():
@@ -128,7 +129,7 @@ def test_total_with_the_weights_of_the_paper():
     total, terms = TotalLoss()(inputs)
     assert list(terms) == ["rgb", "anisotropy", "entropy", "size"]
     expected = terms["rgb"] + 10 * terms["anisotropy"] + 0.01 * terms["entropy"] + 0.01 * terms["size"]
-    torch.testing.assert_close(total, expected)
+    assert_close(total, expected)
     assert terms["anisotropy"].item() == pytest.approx(0.4, abs=1e-6)
 
 

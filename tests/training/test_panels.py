@@ -1,6 +1,7 @@
 """Panels and the metric that needs weights."""
 
 import torch
+from torch.testing import assert_close
 
 from gaussian_swaying.gaussians.model import GaussianSurfaceModel
 from gaussian_swaying.rendering.cameras.camera import look_at_camera
@@ -17,9 +18,9 @@ def test_a_panel_shows_four_pictures():
     result = panel(model, TorchRenderer(), camera, photo)
     assert result.shape == (30, 160, 3)
     assert not result.requires_grad
-    torch.testing.assert_close(result[:, :40], photo)
+    assert_close(result[:, :40], photo)
     normals, areas = result[15, 100], result[15, 140]
-    torch.testing.assert_close(normals, torch.tensor([0.5, 0.5, 1.0]), atol=0.03, rtol=0.0)
+    assert_close(normals, torch.tensor([0.5, 0.5, 1.0]), atol=0.03, rtol=0.0)
     assert areas.std() > 0.05  # equal areas have one colour of the ramp, which is none of its greys
 
 

@@ -5,6 +5,7 @@ import math
 
 import pytest
 import torch
+from torch.testing import assert_close
 
 lightning = pytest.importorskip("lightning")
 
@@ -32,7 +33,7 @@ def test_a_batch_is_an_image_with_its_camera(folder):
     assert torch.equal(batch["pixels"], pixels)
     assert batch["image"].shape == (16, 20, 3)
     assert batch["alpha"].shape == (16, 20, 1)
-    torch.testing.assert_close(batch.image * batch.alpha, pixels[..., :3] / 255, rtol=0, atol=1e-6)
+    assert_close(batch.image * batch.alpha, pixels[..., :3] / 255, rtol=0, atol=1e-6)
     assert batch.get("mask") is None
     with pytest.raises(KeyError):
         batch["mask"]
@@ -140,8 +141,8 @@ def test_what_a_trainer_starts_from(folder):
     assert len(cloud) == 64
     assert cloud.sh.shape == (64, 4, 3)
     other = CaptureDataModule(folder, point_count=64, initial_opacity=0.5, initial_scale=0.1).initial_cloud(1)
-    torch.testing.assert_close(other.opacities, torch.zeros(64))
-    torch.testing.assert_close(other.scales, cloud.scales + math.log(0.1))
+    assert_close(other.opacities, torch.zeros(64))
+    assert_close(other.scales, cloud.scales + math.log(0.1))
 
 
 def test_bad_arguments(folder):
