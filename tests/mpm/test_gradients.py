@@ -46,7 +46,6 @@ INPUTS = {  # the scale of each input, so that a derivative gives the effect of 
     "C_F": (0.4, 0.4),
     "C_L": (0.2, 0.2),
 }
-FIELDS = ("position", "velocity", "youngs_modulus", "poisson_ratio", "density")
 
 
 def _leaf(name):
@@ -128,78 +127,52 @@ def test_gradient_with_damping_and_two_laws(name, setting):
     _check(name, [FixedCorotated(), NeoHookean()], damping=2.0, stiffness_damping=2e-3, **SETTINGS[setting])
 
 
-def _gradients(values, outputs):
-    """Gradients of the summed squares of the outputs by every input that requires one, by name."""
-    loss = sum(output.square().sum() for output in outputs)
-    wanted = {name: value for name, value in values.items() if value.requires_grad}
-    found = torch.autograd.grad(loss, list(wanted.values()))
-    return dict(zip(wanted, found, strict=True))
-
-
+@pytest.mark.parametrize("case", ["at rest", "inverted", "crushed", "light node"])
 @pytest.mark.parametrize("law", LAWS)
 @pytest.mark.parametrize("setting", SETTINGS)
-def test_gradients_are_finite_at_rest(setting, law):
-    """F = I exactly, no motion, no wind, no weight: roots of zero and repeated stretches."""
-    values = {name: value.clone().requires_grad_() for name, value in _values().items()}
-    still = torch.zeros_like(VELOCITY)
-    values["velocity"], values["wind"] = still.clone().requires_grad_(), still[0].clone().requires_grad_()
-    solver, state, force = _start(values, LAWS[law](), gravity=(0.0, 0.0, 0.0), **SETTINGS[setting])
-    state = solver.rollout(state, DT, STEPS, force)
-    assert float((state.F_total.detach() - torch.eye(3, dtype=torch.float64)).abs().max()) < 1e-14
-    gradients = _gradients(values, (state.position, state.F_total))
-    for name, gradient in gradients.items():
-        assert bool(torch.isfinite(gradient).all()), name
-    # the state at rest does not depend on the material, and follows the given position
-    assert float(gradients["position"].abs().min()) > 0
-    for name in ("youngs_modulus", "poisson_ratio", "density", "C_D", "C_F", "C_L"):
-        assert float(gradients[name].abs().max()) < 1e-12, name
-
-
-@pytest.mark.parametrize("shape", ["inverted", "crushed"])
-@pytest.mark.parametrize("law", LAWS)
-@pytest.mark.parametrize("setting", SETTINGS)
-def test_gradients_are_finite_for_an_inverted_element(setting, law, shape):
-    """The whole patch turned inside out along x, or pressed nearly flat."""
-    values = {name: value.clone().requires_grad_() for name, value in _values().items()}
-    solver, state, force = _start(values, LAWS[law](), **SETTINGS[setting])
-    stretch = torch.diag(torch.tensor([-0.7 if shape == "inverted" else 1e-3, 1.1, 0.9], dtype=torch.float64))
-    if setting == "total":
-        nodes = state.grid.node_positions(REST)
-        moved = nodes @ stretch - nodes + state.node_displacement
-        state = solver.bound.read_particles(state, moved, state.node_velocity)
-    else:
-        F = stretch @ state.F_elastic
-        state = state.replace(F_elastic=F, F_total=F)
-    det = torch.linalg.det(state.F_elastic)
-    assert bool((det < 0).all() if shape == "inverted" else (det < 2e-3).all())
+def test_gradients_are_finite(setting, law, case):
+    """F = I exactly, no motion, no wind, no weight; the patch turned inside out along x, or pressed nearly flat; and a
+    node whose mass is so small that the square of its inverse overflows in float32.
+    """
+    still, light = case == "at rest", case == "light node"
+    values = {name: 0 * value if still and name in ("velocity", "wind") else value for name, value in _values().items()}
+    if light:
+        values = {name: value.float() for name, value in values.items()}
+        values["position"] = values["position"].clone()
+        values["position"][0] = torch.tensor([0.075] * 3) - 1e-3 * DX  # its farthest node has half the cube of 1e-6
+    values = {name: value.clone().requires_grad_() for name, value in values.items()}
+    gravity = (0.0, 0.0, 0.0) if still else (0.0, 0.0, -9.8)
+    solver, state, force = _start(values, LAWS[law](), gravity=gravity, **SETTINGS[setting])
+    if light:
+        stencil = bspline_stencil(values["position"].detach(), state.grid)
+        mass = scatter(stencil, solver.points.mass.detach()[:, None, None])[:, 0]
+        assert 1e-32 < float(mass[mass > 0].min()) < 5e-20
+    elif not still:
+        stretch = torch.diag(torch.tensor([-0.7 if case == "inverted" else 1e-3, 1.1, 0.9], dtype=torch.float64))
+        if setting == "total":
+            nodes = state.grid.node_positions(REST)
+            moved = nodes @ stretch - nodes + state.node_displacement
+            state = solver.bound.read_particles(state, moved, state.node_velocity)
+        else:
+            F = stretch @ state.F_elastic
+            state = state.replace(F_elastic=F, F_total=F)
+        det = torch.linalg.det(state.F_elastic)
+        assert bool((det < 0).all() if case == "inverted" else (det < 2e-3).all())
     state = solver.rollout(state, 1e-3, STEPS, force)
-    for name, gradient in _gradients(values, (state.position, state.F_total)).items():
+    loss = state.position.square().sum() + state.F_total.square().sum()
+    for name, gradient in zip(values, torch.autograd.grad(loss, list(values.values())), strict=True):
         assert bool(torch.isfinite(gradient).all()), name
-        assert float(gradient.abs().max()) > 0, name
-
-
-@pytest.mark.parametrize("setting", SETTINGS)
-def test_gradients_are_finite_beside_a_node_of_vanishing_mass(setting):
-    """In float32 the square of 1 / mass overflows below 5e-20 kg; near a plane a node gets even less mass."""
-    values = {name: value.float() for name, value in _values().items()}
-    position = values["position"].clone()
-    position[0] = torch.tensor([0.075, 0.075, 0.075]) - 1e-3 * DX  # its farthest node has half the cube of 1e-6
-    values["position"] = position
-    values = {name: value.requires_grad_() for name, value in values.items()}
-    solver, state, force = _start(values, FixedCorotated(), **SETTINGS[setting])
-    stencil = bspline_stencil(position.detach(), state.grid)
-    mass = scatter(stencil, solver.points.mass.detach()[:, None, None])[:, 0]
-    assert 1e-32 < float(mass[mass > 0].min()) < 5e-20
-    state = solver.rollout(state, DT, STEPS, force)
-    for name, gradient in _gradients(values, (state.position, state.F_total)).items():
-        assert bool(torch.isfinite(gradient).all()), name
-        assert float(gradient.abs().max()) > 0, name
+        # the state at rest depends on place and velocity alone, as drag is quadratic
+        alike = still and name not in ("position", "velocity")
+        assert float(gradient.abs().max()) < 1e-12 if alike else float(gradient.abs().max()) > 0, name
+    if still:
+        assert float((state.F_total.detach() - torch.eye(3, dtype=torch.float64)).abs().max()) < 1e-14
 
 
 # ---- long rollouts
 
 
-@pytest.mark.parametrize("checkpoint", [0, 4, 30])
+@pytest.mark.parametrize("checkpoint", [0, 7, 30])
 def test_checkpoints_find_what_is_used_late(checkpoint):
     """A force of two parts, of which the second acts only after the first substeps."""
     points = solid(torch.rand(8, 3, dtype=torch.float64), 0.1, 10.0, 1e3)
@@ -218,21 +191,6 @@ def test_checkpoints_find_what_is_used_late(checkpoint):
     ways = [1e-6 * sum(20 - n for n in steps) for steps in (range(6), range(6, 20))]
     assert_close(first.grad, torch.full((3,), 8 * ways[0], dtype=torch.float64))
     assert_close(second.grad, torch.full((3,), 16 * ways[1], dtype=torch.float64))
-
-
-@pytest.mark.parametrize("setting", SETTINGS)
-def test_checkpoints_leave_gradients_as_they_are(setting):
-    """To round-off, because the gradients of the segments are added in another order; 20 is not a multiple of 7."""
-    found = []
-    for checkpoint in (0, 7):
-        values = {name: value.clone().requires_grad_() for name, value in _values().items()}
-        solver, state, force = _start(values, FixedCorotated(), **SETTINGS[setting])
-        state = solver.rollout(state, 2e-3, 20, force, checkpoint)
-        found.append(_gradients(values, (state.position, state.F_total)) | {"end": state.position.detach()})
-    plain, kept = found
-    for name, gradient in plain.items():
-        assert_close(kept[name], gradient, rtol=1e-9, atol=1e-12 * float(gradient.abs().max()))
-        assert float(gradient.abs().max()) > 0, name
 
 
 class _Held(TorchDispatchMode):

@@ -1,7 +1,5 @@
 """Small bodies, and short runs of them."""
 
-import math
-
 import pytest
 import torch
 from shared import solid
@@ -43,13 +41,6 @@ def _march(solver, points, dt, steps, velocity=None, frame=None):
     return states
 
 
-def _rotation(axis, angle):
-    """Rodrigues' rotation matrix."""
-    x, y, z = torch.tensor(axis, dtype=torch.float64) / math.sqrt(sum(c * c for c in axis))
-    cross = torch.tensor([[0, -z, y], [z, 0, -x], [-y, x, 0]], dtype=torch.float64)
-    return torch.eye(3, dtype=torch.float64) + math.sin(angle) * cross + (1 - math.cos(angle)) * cross @ cross
-
-
 @pytest.fixture
 def block():
     """A cube of particles."""
@@ -72,9 +63,3 @@ def lone():
 def march():
     """All states from the first to the last."""
     return _march
-
-
-@pytest.fixture
-def rotation():
-    """Rodrigues' rotation matrix."""
-    return _rotation

@@ -325,17 +325,6 @@ def test_bad_boundaries_are_refused():
             BOUNDARIES[kind](*given, **settings)
 
 
-@pytest.mark.slow(gate=["total"])
-@pytest.mark.parametrize("formulation", FORMULATIONS)
-def test_enclosing_box_keeps_everything_in(formulation, block, run_for):
-    points = block(low=(0.3, 0.3, 0.3))
-    velocity = torch.tensor([4.0, -3.0, 2.0], dtype=torch.float64).expand_as(points.position)
-    state = run_for(formulation, [made("EnclosingBox", [0, 0, 0], [1, 1, 1])()], points, 1.0, velocity)
-    # contact is resolved to one cell
-    assert float(state.position.min()) > -0.1
-    assert float(state.position.max()) < 1.1
-
-
 @pytest.mark.parametrize("formulation", FORMULATIONS)
 def test_pin_holds_only_its_end(formulation, block, run_for):
     points = block()
@@ -344,8 +333,9 @@ def test_pin_holds_only_its_end(formulation, block, run_for):
     held = points.position[:, 2] > 0.34
     moved = (state.position - points.position).norm(dim=-1)
     assert float(moved[held].max()) < 0.01
-    # the static sag of a rod this long is 2 to 4 mm; `updated` holds all nodes that the pinned layer touches
-    assert float(moved[~held].max()) > 0.001
+    # the static sag of a rod this long is 2 to 4 mm, and it swings to twice that; `updated` holds all nodes that the
+    # pinned layer touches. A pin that only resets its particles lets the rest fall at 70 % of free fall
+    assert 0.001 < float(moved[~held].max()) < 0.02
 
 
 @pytest.mark.parametrize(("time", "acts"), [(0.4, False), (0.5, True), (0.9, True), (1.0, False)])

@@ -4,10 +4,11 @@ import math
 
 import pytest
 import torch
+from scipy.spatial.transform import Rotation
 from shared import solid
 from torch.testing import assert_close
 
-from gaussian_swaying import Box, MaterialPoints, MPMSolver, PinnedRegion, SimFrame, Sphere
+from gaussian_swaying import Box, MPMSolver, PinnedRegion, SimFrame, Sphere
 from gaussian_swaying.mpm.boundaries.handle import Handle
 
 FORMULATIONS = ["total", "updated"]
@@ -42,29 +43,18 @@ def test_handle_carries_its_particles_and_the_others_follow(formulation, block, 
 
 
 @pytest.mark.parametrize("formulation", FORMULATIONS)
-def test_handle_holds_nothing_outside_its_region(formulation, block, run_for):
-    points = MaterialPoints.join([block(), block(low=(2, 0, 0))])
-    handle = Handle(Box([-1, -1, -1], [1, 1, 1]), [0.5, 0.0, 0.0], [0.0, 0.0, 2.0])
-    state = run_for(formulation, [handle], points, 0.1, gravity=(0, 0, 0))
-    far = points.position[:, 0] > 1
-    assert float(state.velocity[far].abs().max()) == 0.0
-    assert float((state.position - points.position)[~far].norm(dim=-1).min()) > 1e-3
-
-
-@pytest.mark.parametrize("formulation", FORMULATIONS)
-def test_handle_turns_twice_without_growing(formulation, block, march, rotation):
+def test_handle_turns_twice_without_growing(formulation, block, march):
     """720 degrees in 160 substeps. A tangent velocity would swell the block by (1 + 0.0785²)^80 = 1.64."""
     points = block(per_side=3, side=0.3, e=2e3)  # what is held does not deform
-    axis, pivot = [1.0, 2.0, -2.0], torch.tensor([0.1, 0.3, 0.2], dtype=torch.float64)
+    spin, pivot = torch.tensor([[1.0, 2.0, -2.0], [0.1, 0.3, 0.2]], dtype=torch.float64)
     rate, substeps = 3.0, 160
-    spin = [rate * c / 3 for c in axis]
-    handle = Handle(Sphere([0, 0, 0], 9.0), angular_velocity=spin, pivot=pivot.tolist(), kind="nodes")
+    handle = Handle(Sphere([0, 0, 0], 9.0), angular_velocity=spin.tolist(), pivot=pivot.tolist(), kind="nodes")
     solver = MPMSolver(dx=0.1, formulation=formulation, boundaries=[handle])
     dt = 4 * math.pi / rate / substeps
     states = march(solver, points, dt, substeps)
     arm = points.position - pivot
     for k in (20, 50, 160):  # a quarter turn, 225 degrees, two turns
-        turn = rotation(axis, rate * dt * k)
+        turn = torch.tensor(Rotation.from_rotvec(dt * k * spin.numpy()).as_matrix())
         assert_close(states[k].position, pivot + arm @ turn.T, rtol=0, atol=1e-12)
         assert_close(states[k].F_elastic, turn.expand(27, 3, 3), rtol=0, atol=1e-11)
     assert_close(states[160].position, points.position, rtol=0, atol=1e-12)
@@ -72,40 +62,24 @@ def test_handle_turns_twice_without_growing(formulation, block, march, rotation)
 
 
 @pytest.mark.parametrize("formulation", FORMULATIONS)
-def test_handle_pivot_travels(formulation, block, march, rotation):
-    """Turning and moving from a start later than zero: x = pivot + v t + R(t) (x0 - pivot)."""
-    points = block(per_side=3, side=0.3)
-    pivot, velocity = torch.tensor([[0.4, 0.0, 0.1], [0.5, -1.0, 0.25]], dtype=torch.float64)
-    handle = Handle(Sphere([0, 0, 0], 9.0), velocity.tolist(), [0.0, 0.0, -5.0], pivot.tolist(), start=0.1, end=9.0)
-    dt = 5e-3
-    solver = MPMSolver(dx=0.1, formulation=formulation, boundaries=[handle], gravity=(0, 0, 0))
-    states = march(solver, points, dt, 80)
-    first = next(k for k, state in enumerate(states) if float(state.time) >= 0.1)
-    assert torch.equal(states[first].position, points.position)
-    for k in (first + 1, 80):
-        seconds = dt * (k - first)
-        turn = rotation([0.0, 0.0, -1.0], 5.0 * seconds)
-        expected = pivot + velocity * seconds + (points.position - pivot) @ turn.T
-        assert_close(states[k].position, expected, rtol=0, atol=1e-12)
-    assert float(states[80].time) == pytest.approx(0.4)
-
-
-@pytest.mark.parametrize("formulation", FORMULATIONS)
-def test_handle_in_a_frame_that_scales_and_turns(formulation, block, march, rotation):
-    """Region and pivot in scene units and axes; velocities in m/s, z up, and unscaled."""
+def test_handle_in_a_frame_that_scales_and_turns(formulation, block, march):
+    """Region and pivot in scene units and axes; velocities in m/s, z up, and unscaled, from its start on."""
     scene = torch.stack([block(per_side=3, side=0.6).position, block((3, 0, 0), 0.6, per_side=3).position])
     scene = scene.reshape(-1, 3) + 7.0
     frame = SimFrame.fit(scene, up=(0.0, 1.0, 0.0), metres_per_unit=0.5)
     position = frame.point_to_sim(scene)
     points = solid(position, 1e-3)
     pivot, velocity = [7.1, 7.2, 6.5], torch.tensor([0.2, 0.4, -0.6], dtype=torch.float64)
-    handle = Handle(Box([6, 6, 6], [8, 8, 8]), velocity.tolist(), [0.0, 0.0, 4.0], pivot)
+    handle = Handle(Box([6, 6, 6], [8, 8, 8]), velocity.tolist(), [0.0, 0.0, 4.0], pivot, start=0.04)
     solver = MPMSolver(dx=0.1, formulation=formulation, boundaries=[handle], gravity=(0, 0, 0))
-    dt, steps = 4e-3, 50
-    state = march(solver, points, dt, steps, frame=frame)[-1]
+    dt = 4e-3
+    states = march(solver, points, dt, 60, frame=frame)
+    first, state = next(k for k, state in enumerate(states) if float(state.time) >= 0.04), states[-1]
+    assert torch.equal(states[first].position, position)
+    steps = 60 - first
     near = scene[:, 0] < 8
     assert int(near.sum()) == 27
-    turn = rotation([0.0, 0.0, 1.0], 4.0 * dt * steps)
+    turn = torch.tensor(Rotation.from_rotvec([0.0, 0.0, 4.0 * dt * steps]).as_matrix())
     centre = frame.point_to_sim(torch.tensor(pivot, dtype=torch.float64))
     expected = centre + velocity * dt * steps + (position[near] - centre) @ turn.T
     assert_close(state.position[near], expected, rtol=0, atol=1e-12)

@@ -8,7 +8,7 @@ import torch
 from shared import solid
 from torch.testing import assert_close
 
-from gaussian_swaying import Box, MaterialPoints, MPMSolver, PinnedRegion, Sphere
+from gaussian_swaying import Box, MaterialPoints, MPMSolver, PinnedRegion
 from gaussian_swaying.mpm.boundaries.impulse import Impulse
 
 FORMULATIONS = ["total", "updated"]
@@ -27,12 +27,13 @@ def test_an_impulse_does_not_move_what_is_pinned(formulation, block, run_for):
 
 
 @pytest.mark.parametrize("formulation", FORMULATIONS)
-@pytest.mark.parametrize("dt", [1e-3, 1.7e-3, 3e-3])
-def test_impulse_arrives_whole_whatever_the_substep(formulation, dt, block, march):
-    """In proportion to the time gone by within the window; substeps across its ends get their part."""
+@pytest.mark.parametrize(
+    ("dt", "start", "end"), [(1e-3, 0.0105, 0.0382), (3e-3, 0.0105, 0.0382), (2e-3, 0.0123, 0.0124)]
+)
+def test_impulse_arrives_whole_whatever_the_substep(formulation, dt, start, end, block, march):
+    """In proportion to the time gone by within the window; substeps across its ends get their part, or all of it."""
     points = block(per_side=4)
     impulse = torch.tensor([0.3, -0.2, 0.5], dtype=torch.float64)
-    start, end = 0.0105, 0.0382
     knock = Impulse(Box([None, None, 0.2], [None] * 3), impulse.tolist(), start, end)
     solver = MPMSolver(dx=0.1, formulation=formulation, boundaries=[knock], gravity=(0, 0, 0))
     for state in march(solver, points, dt, math.ceil(0.05 / dt)):
@@ -40,18 +41,6 @@ def test_impulse_arrives_whole_whatever_the_substep(formulation, dt, block, marc
         assert_close(solver.momenta(state)["linear"], part * impulse, rtol=0, atol=1e-13)
         if part == 0:
             assert float(state.velocity.abs().max()) == 0.0
-
-
-@pytest.mark.parametrize("formulation", FORMULATIONS)
-def test_impulse_shorter_than_a_substep(formulation, block, march):
-    points = block(per_side=4)
-    knock = Impulse(Sphere([0, 0, 0], 9.0), [0.0, 0.0, 1.5], start=0.0123, end=0.0124)
-    solver = MPMSolver(dx=0.1, formulation=formulation, boundaries=[knock], gravity=(0, 0, 0))
-    states = march(solver, points, 2e-3, 10)
-    assert float(states[6].velocity.abs().max()) == 0.0
-    speed = 1.5 / float(points.mass.sum())
-    for state in states[7:]:
-        assert_close(state.velocity[:, 2], torch.full((64,), speed).double(), rtol=1e-11, atol=0)
 
 
 @pytest.mark.parametrize("formulation", FORMULATIONS)

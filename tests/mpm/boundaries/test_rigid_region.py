@@ -45,44 +45,34 @@ def strain(F):
     return float((F.mT @ F - torch.eye(3, dtype=F.dtype)).abs().max())
 
 
-@pytest.mark.parametrize("transfer", TRANSFERS)
+@pytest.mark.parametrize(
+    ("transfer", "dtype"), [("torch", torch.float64), ("kernels", torch.float64), ("kernels", torch.float32)], ids=str
+)
 @pytest.mark.parametrize("formulation", FORMULATIONS)
-def test_a_free_part_keeps_momenta_energy_and_shape(formulation, transfer):
+def test_a_free_part_keeps_momenta_energy_and_shape(formulation, transfer, dtype):
     """It turns about no axis of its own, so that the axis of its rotation moves: 1,000 substeps, 1.4 turns.
 
-    Torch, which is slow, takes 300 of them.
+    Torch, which is slow, takes 300 of them. In single precision it drifts by rounding only.
     """
-    points, solver = bar(RigidRegion(Everything()), formulation=formulation, transfer=transfer, gravity=(0, 0, 0))
+    options = {"formulation": formulation, "transfer": transfer, "gravity": (0, 0, 0), "dtype": dtype}
+    points, solver = bar(RigidRegion(Everything()), **options)
     arm = points.position - points.position.mean(0)
-    spin = torch.tensor([3.0, 8.0, 1.0], dtype=torch.float64).expand_as(arm)
-    velocity = torch.tensor([1.0, 0.5, 0.0], dtype=torch.float64) + torch.linalg.cross(spin, arm, dim=-1)
+    spin = torch.tensor([3.0, 8.0, 1.0], dtype=dtype).expand_as(arm)
+    velocity = torch.tensor([1.0, 0.5, 0.0], dtype=dtype) + torch.linalg.cross(spin, arm, dim=-1)
     state = solver.rollout(solver.init_state(points, velocity, margin=2), 1e-3, 1)
     momenta, energy = solver.momenta(state), solver.energies(state)["kinetic"]
-    distance, errors = torch.pdist(points.position), []
+    distance, errors = torch.pdist(points.position.double()), []
+    rounding = 1.0 if dtype == torch.float64 else 1e7
     for _ in range(3 if transfer == "torch" else 10):
         state = solver.rollout(solver.fit_grid(state, 0.1), 1e-3, 100)
-        errors.append(float((torch.pdist(state.position) - distance).abs().max()))
-        assert strain(state.F_total) < 1e-12
+        errors.append(float((torch.pdist(state.position.double()) - distance).abs().max()))
+        assert strain(state.F_total) < 1e-13 * rounding
         assert float(torch.linalg.det(state.F_total).min()) > 0
-    assert max(errors) < 1e-13  # nor do they grow
+    assert max(errors) < (1e-13 if rounding == 1 else 1e-5)  # nor do they grow
     for name, value in solver.momenta(state).items():
-        assert_close(value, momenta[name], rtol=1e-10, atol=1e-10)
-    assert float(solver.energies(state)["kinetic"] / energy) == pytest.approx(1.0, abs=1e-6)
-    assert float(solver.energies(state)["elastic"]) < 1e-12
-
-
-@pytest.mark.parametrize("formulation", FORMULATIONS)
-def test_single_precision_drifts_by_rounding_only(formulation):
-    points, solver = bar(RigidRegion(Everything()), formulation=formulation, gravity=(0, 0, 0), dtype=torch.float32)
-    arm = points.position - points.position.mean(0)
-    velocity = torch.linalg.cross(torch.tensor([3.0, 8.0, 1.0]).expand_as(arm), arm, dim=-1)
-    state = solver.rollout(solver.init_state(points, velocity, margin=8), 1e-3, 1)
-    before = solver.momenta(state)["angular"]
-    state = solver.rollout(state, 1e-3, 1000)
-    assert strain(state.F_total) < 1e-6
-    distance = torch.pdist(points.position.double())
-    assert float((torch.pdist(state.position.double()) - distance).abs().max()) < 1e-5
-    assert_close(solver.momenta(state)["angular"], before, rtol=1e-4, atol=1e-6)
+        assert_close(value, momenta[name], rtol=1e-10 if rounding == 1 else 1e-4, atol=1e-10 if rounding == 1 else 1e-6)
+    assert float(solver.energies(state)["kinetic"] / energy) == pytest.approx(1.0, abs=1e-6 if rounding == 1 else 1e-4)
+    assert float(solver.energies(state)["elastic"]) < 1e-12 * rounding
 
 
 @pytest.mark.parametrize("formulation", FORMULATIONS)

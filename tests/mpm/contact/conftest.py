@@ -3,10 +3,10 @@
 import pytest
 import torch
 
-from gaussian_swaying import MaterialPoints, MPMSolver
+from gaussian_swaying import Contact, MaterialPoints, MPMSolver
 from gaussian_swaying.mpm.contact.surface import Surface
 
-SPACING, THICKNESS = 0.02, 0.01
+SPACING, THICKNESS, APART = 0.02, 0.01, 0.2
 DX = 2.2 * SPACING
 
 
@@ -31,6 +31,21 @@ def _scene(points, contact=None, boundaries=(), velocity=None, normal=(0.0, 0.0,
     return solver, solver.init_state(points, velocity, surface=_surface(points, contact, normal))
 
 
+def _layers(count, gap, side=6, shift=0.0, boundaries=(), change=None, dtype=torch.float64, **settings):
+    """Sheets that start ``gap`` above each other; at rest they are far apart, so that they share no nodes."""
+    points = MaterialPoints.join(
+        [_sheet(side, side, (shift * (k % 3), shift * (k % 2), APART * k), dtype) for k in range(count)]
+    )
+    solver, state = _scene(points, Contact(), boundaries, **{"gravity": (0, 0, 0)} | settings)
+    if change is not None:
+        state = solver.init_state(points, surface=change(solver.bound.contact.surface))
+    nodes = state.grid.node_positions(state.position)
+    layer = ((nodes[:, 2] + APART / 2) / APART).floor().clamp(0, count - 1)
+    moved = torch.zeros_like(nodes)
+    moved[:, 2] = layer * (gap - APART)
+    return solver, solver.bound.read_particles(state, moved, torch.zeros_like(moved))
+
+
 def _march(solver, state, seconds, frame=0.01):
     """The states at the end of some frames."""
     states = []
@@ -51,6 +66,12 @@ def sheet():
 def scene():
     """A solver with contact, and the first state."""
     return _scene
+
+
+@pytest.fixture
+def layers():
+    """Sheets above each other."""
+    return _layers
 
 
 @pytest.fixture

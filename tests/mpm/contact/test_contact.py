@@ -1,7 +1,6 @@
 """Sheets that touch each other and themselves: nothing passes through, momentum stays, piles rest."""
 
 from dataclasses import replace
-from functools import partial
 
 import pytest
 import torch
@@ -10,8 +9,6 @@ from torch.testing import assert_close
 
 from gaussian_swaying import Contact, MaterialPoints, MPMSolver, PinnedPoints
 from gaussian_swaying.mpm.boundaries.half_space import HalfSpaceObstacle
-from gaussian_swaying.mpm.contact.pairs import close_pairs
-from gaussian_swaying.mpm.contact.solve import Constraints, Rows, pair_gaps, resolve
 from gaussian_swaying.mpm.contact.surface import Surface
 
 THICKNESS = 0.01
@@ -81,37 +78,21 @@ def test_a_strip_that_falls_folds_and_does_not_cross_itself(sheet, scene, march,
     assert float((found < 0.5).double().mean()) <= 1e-3
 
 
-def _pile(sheet, scene, layers, gap, gravity, per_side=8, **settings):
-    """Layers on the ground, above each other; at rest they are far apart, so that they share no nodes."""
-    apart = 0.2
-    parts = [sheet(per_side, per_side, (0.003 * (k % 3), 0.002 * (k % 2), apart * k)) for k in range(layers)]
-    solver, state = scene(
-        MaterialPoints.join(parts),
-        Contact(),
-        [HalfSpaceObstacle(*GROUND)],
-        gravity=(0, 0, -gravity),
-        **settings,
-    )
-    nodes = state.grid.node_positions(state.position)
-    layer = ((nodes[:, 2] + apart / 2) / apart).floor().clamp(0, layers - 1)
-    moved = torch.zeros_like(nodes)
-    moved[:, 2] = layer * (gap - apart)
-    return solver, solver.bound.read_particles(state, moved, torch.zeros_like(moved))
-
-
-@pytest.mark.parametrize("layers", [8, *(pytest.param(n, marks=pytest.mark.slow) for n in (15, 50))])
-def test_layers_pressed_together_stay_in_order(sheet, scene, march, layers):
+@pytest.mark.parametrize("count", [8, *(pytest.param(n, marks=pytest.mark.slow) for n in (15, 50))])
+def test_layers_pressed_together_stay_in_order(layers, march, count):
     """They fall on each other with twice the weight; every layer stays above the one below it, everywhere."""
-    solver, state = _pile(sheet, scene, layers, 1.1 * THICKNESS, 20.0, per_side=6)
+    ground = [HalfSpaceObstacle(*GROUND)]
+    solver, state = layers(count, 1.1 * THICKNESS, shift=0.003, boundaries=ground, gravity=(0, 0, -20.0))
     for later in march(solver, state, 0.15, frame=0.03):
-        height = later.position[:, 2].reshape(layers, -1)
+        height = later.position[:, 2].reshape(count, -1)
         assert float((height[1:] - height[:-1]).min()) > 0.3 * THICKNESS
         assert float((gaps(solver.bound.contact, later) < 0.5).double().mean()) <= 1e-3
 
 
-def _rest(sheet, scene, march, layers, seconds):
+def _rest(layers, march, count, seconds, dtype=torch.float64):
     """Changes of the energy and of its elastic part after a pile has settled; how far a layer rises or sinks."""
-    solver, state = _pile(sheet, scene, layers, THICKNESS, 9.8, per_side=5, stiffness_damping=1e-3)
+    settings = {"gravity": (0, 0, -9.8), "stiffness_damping": 1e-3, "boundaries": [HalfSpaceObstacle(*GROUND)]}
+    solver, state = layers(count, THICKNESS, side=5, shift=0.003, dtype=dtype, **settings)
     settled = march(solver, state, 0.5, frame=0.1)[-1]
     later = march(solver, settled, seconds, frame=0.1)
     first = solver.energies(settled)
@@ -121,15 +102,15 @@ def _rest(sheet, scene, march, layers, seconds):
         assert float(energy["kinetic"]) < 1e-4 * weight * THICKNESS
     bent = float(energy["elastic"] - first["elastic"])
     change = float(energy["potential"] - first["potential"]) + bent
-    height = settled.position[:, 2].reshape(layers, -1).mean(1), end.position[:, 2].reshape(layers, -1).mean(1)
+    height = settled.position[:, 2].reshape(count, -1).mean(1), end.position[:, 2].reshape(count, -1).mean(1)
     scale = weight * THICKNESS
     return change / scale, bent / scale, float((height[1] - height[0]).abs().max())
 
 
-@pytest.mark.parametrize(("layers", "seconds"), [(2, 0.3), pytest.param(5, 0.5, marks=pytest.mark.slow)])
-def test_a_pile_at_rest_stays_at_rest(sheet, scene, march, layers, seconds):
+@pytest.mark.parametrize(("count", "seconds"), [(2, 0.3), pytest.param(5, 0.5, marks=pytest.mark.slow)])
+def test_a_pile_at_rest_stays_at_rest(layers, march, count, seconds):
     """No layer moves by more than 1 % of the thickness, energy does not grow, and no bending builds up."""
-    change, bent, moved = _rest(sheet, scene, march, layers, seconds)
+    change, bent, moved = _rest(layers, march, count, seconds)
     assert change < 1e-3
     assert bent < 5e-6  # 30e-6 if friction does not yield, and it then grows
     assert moved < 0.01 * THICKNESS
@@ -138,9 +119,9 @@ def test_a_pile_at_rest_stays_at_rest(sheet, scene, march, layers, seconds):
 @pytest.mark.slow
 @pytest.mark.timeout(7200)
 @pytest.mark.parametrize(("dtype", "seconds"), [(torch.float64, 11.5), (torch.float32, 60.0)])
-def test_a_pile_rests_for_long(sheet, scene, march, dtype, seconds):
+def test_a_pile_rests_for_long(layers, march, dtype, seconds):
     """It slides slowly, and so sinks a little; energy does not grow."""
-    change, bent, moved = _rest(partial(sheet, dtype=dtype), scene, march, 8, seconds)
+    change, bent, moved = _rest(layers, march, 8, seconds, dtype)
     assert change < 1e-3
     assert bent < 1e-4
     assert moved < 0.02 * THICKNESS
@@ -183,99 +164,6 @@ def test_gradients_flow_through_a_contact(sheet, scene, march):
         apart = free.rollout(touching, 1e-4, 3).velocity
         assert float((apart - solver.rollout(touching, 1e-4, 3).velocity).abs().max()) > 1e-3  # they touch
     assert abs(float(slope) - float(expected)) < 1e-5 * abs(float(expected))
-
-
-# ---- the parts
-
-
-def test_close_pairs_are_those_of_brute_force():
-    place = torch.rand(700, 3, dtype=torch.float64) * torch.tensor([1.0, 0.5, 0.2])
-    rest = torch.rand(700, 3, dtype=torch.float64)
-    first, second = close_pairs(place, 0.07, rest, 0.2)
-    near = (torch.cdist(place, place) < 0.07) & (torch.cdist(rest, rest) >= 0.2)
-    expected = near.triu(1).nonzero()
-    assert len(first) > 100
-    assert torch.equal(torch.stack([first, second], -1), expected)
-
-
-def test_close_pairs_in_chunks(monkeypatch):
-    place = torch.rand(500, 3)
-    whole = close_pairs(place, 0.2, 9 * place, 0.0)
-    monkeypatch.setattr("gaussian_swaying.mpm.contact.pairs._CHUNK", 300)
-    parts = close_pairs(place, 0.2, 9 * place, 0.0)
-    assert torch.equal(whole[0], parts[0])
-    assert torch.equal(whole[1], parts[1])
-
-
-def test_close_pairs_of_points_in_one_place_are_refused(monkeypatch):
-    monkeypatch.setattr("gaussian_swaying.mpm.contact.pairs.MOST_PAIRS", 1000)
-    with pytest.raises(ValueError, match="the material has collapsed"):
-        close_pairs(torch.zeros(100, 3), 0.1, torch.rand(100, 3), 0.0)
-    with pytest.raises(FloatingPointError, match="NaN or infinite"):
-        close_pairs(torch.full((3, 3), torch.nan), 0.1, torch.rand(3, 3), 0.0)
-
-
-def test_gaps_of_discs():
-    """Parallel discs: the distance along the normal. An edge above a face: the face's normal, whatever the signs."""
-    up, side = torch.tensor([0.0, 0, 1]), torch.tensor([1.0, 0, 0])
-    arm = torch.tensor([[0.2, 0.1, 0.5], [0.0, 0.1, -0.5], [2.0, 0.0, 0.5], [0.0, 0.0, 0.0]])
-    first, second = torch.stack([up, side, up, up]), torch.stack([-up, -up, up, up])
-    radius, thickness = torch.full((4,), 0.6), torch.full((4,), 0.1)
-    normal, gap, above = pair_gaps(arm, (first, second), (radius, radius), thickness)
-    assert_close(normal[:2], torch.stack([up, -up]))
-    assert_close(gap[:2], torch.tensor([0.4, 0.4]))
-    assert above.tolist() == [True, True, False, True]
-    assert bool(torch.isfinite(normal).all())  # also for places that coincide
-
-
-def test_lone_and_joint_impulses_are_exact():
-    """A lone place is stopped in one iteration with its own mass, and so is a whole row of them."""
-    nodes = torch.arange(4)[:, None].repeat(1, 27)
-    weight = torch.zeros(4, 27, dtype=torch.float64)
-    weight[:, 0] = 1.0
-    mass = torch.tensor([1.0, 2.0, 3.0, 4.0], dtype=torch.float64)
-    rows = Rows.of(nodes, weight, 1 / mass)
-    up = torch.tensor([[0.0, 0.0, 1.0]], dtype=torch.float64)
-    velocity = torch.tensor([[0.3, 0.0, -1.0]], dtype=torch.float64).repeat(4, 1)
-    for count in (1, 4):
-        held = Constraints(
-            torch.arange(count),
-            torch.full((count,), 4),
-            up.repeat(count, 1),
-            torch.zeros(count, dtype=torch.float64),
-            torch.zeros(count, 3, dtype=torch.float64),
-            torch.full((count,), 0.1, dtype=torch.float64),
-            torch.ones(count, dtype=torch.bool),
-        )
-        after, impulse = resolve(velocity, rows, held, 1e-3, 0.1, 1)
-        assert_close(impulse[:, 2], mass[:count])
-        assert_close(impulse[:, 0], -0.1 * mass[:count])  # sliding: Coulomb's bound
-        assert_close(after[:count, 2], torch.zeros(count, dtype=torch.float64))
-
-
-@pytest.mark.parametrize("count", [2, 4, 8])
-def test_unfinished_friction_does_not_push(count):
-    """A column of blocks that stick to each other, on a slope: however few iterations are made, none moves uphill."""
-    weight = torch.zeros(count, 27, dtype=torch.float64)
-    weight[:, 0] = 1.0
-    rows = Rows.of(torch.arange(count)[:, None].repeat(1, 27), weight, torch.ones(count, dtype=torch.float64))
-    held = Constraints(
-        torch.arange(count),
-        torch.cat([torch.tensor([count]), torch.arange(count - 1)]),
-        torch.tensor([[0.0, 0.0, 1.0]], dtype=torch.float64).repeat(count, 1),
-        torch.zeros(count, dtype=torch.float64),
-        torch.zeros(count, 3, dtype=torch.float64),
-        torch.full((count,), 10.0, dtype=torch.float64),
-        torch.ones(count, dtype=torch.bool),
-    )
-    velocity = torch.tensor([[0.3, 0.0, -1.0]], dtype=torch.float64).repeat(count, 1)
-    for iterations in (1, 2, 5, 10, 15, 20, 25, 30, 35, 40):
-        after, impulse = resolve(velocity, rows, held, 1e-3, 0.1, iterations)
-        moving = rows.read(after)
-        relative = moving[held.first] - moving[held.second]
-        assert float((impulse * relative)[:, 0].sum()) < 0.0  # the work of friction
-        assert float(after[:, 0].min()) > 0.0
-        assert float(after[:, 0].max()) < 0.3 + 1e-12
 
 
 @pytest.mark.parametrize(

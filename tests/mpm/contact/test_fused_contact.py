@@ -19,8 +19,13 @@ def _collision(sheet, device):
     points = MaterialPoints.join([below, above]).map(lambda t: t.to(device))
     velocity = torch.zeros_like(points.position)
     velocity[below.count :] = torch.tensor([6.0, 0.0, -20.0], device=device)
-    ball = BallObstacle([0.04, 0.04, -0.06], 0.05, 0.4)
-    return points, velocity, [PinnedPoints([[0.0, 0.0, 0.0], [0.08, 0.0, 0.0]]), ball]
+    pins = PinnedPoints([[0.0, 0.0, 0.0], [0.08, 0.0, 0.0]])
+    balls = [
+        BallObstacle([0.04, 0.04, -0.06], 0.05, 0.4),
+        BallObstacle([0.04, 0.04, -0.5], 0.05),  # out of reach
+        BallObstacle([0.0, 0.08, -0.045], 0.05, start=3.5 * DT, end=4.5 * DT),
+    ]
+    return points, velocity, [pins, *balls]
 
 
 @pytest.mark.parametrize(
@@ -47,37 +52,8 @@ def test_the_kernels_do_what_torch_does(sheet, scene, device, iterations):
     assert_close(ends[1].position, ends[0].position, rtol=0, atol=2e-5)
     assert_close(ends[1].velocity, ends[0].velocity, rtol=0, atol=1e-3 * changed)
     assert_close(taken[1], taken[0], rtol=0, atol=1e-4 * float(taken[0].abs().max()) + 1e-6)
-
-
-@pytest.mark.slow
-def test_obstacles_alone_do_what_they_do_in_torch(sheet, scene, device):
-    """One that the sheet falls onto, one that it does not reach, and one for a short time; there are no pairs."""
-    points = sheet(5, 5, dtype=torch.float32).map(lambda t: t.to(device))
-    velocity = torch.zeros_like(points.position)
-    velocity[:, 2] = -12.0
-    boundaries = [
-        BallObstacle([0.04, 0.04, -0.08], 0.05, 0.4),
-        BallObstacle([0.04, 0.04, -0.5], 0.05),
-        BallObstacle([0.0, 0.0, -0.06], 0.05, start=3 * DT, end=5 * DT),
-    ]
-    ends, taken = [], []
-    for transfer in ("torch", "kernels"):
-        solver, state = scene(points, None, boundaries, velocity=velocity, transfer=transfer)
-        if transfer == "kernels":
-            early = solver.rollout(state, DT / 8, 2)
-            assert solver.fused().touching.rounds == 0
-            assert float(early.impulse.abs().max()) == 0.0
-        for _ in range(3):
-            state = solver.rollout(state, DT, 3)
-        ends.append(state)
-        taken.append(state.impulse)
-    assert solver.fused().touching.rounds > 0
-    assert float((ends[0].velocity - velocity).abs().max()) > 3.0
-    assert bool((taken[0].abs().amax(-1) > 1e-5).equal(torch.tensor([True, False, True], device=device)))
-    assert_close(ends[1].position, ends[0].position, rtol=0, atol=2e-5)
-    assert_close(ends[1].velocity, ends[0].velocity, rtol=0, atol=1e-2)
-    assert_close(taken[1], taken[0], rtol=0, atol=1e-4 * float(taken[0].abs().max()) + 1e-7)
-    assert float(taken[1][1].abs().max()) == 0.0
+    for each in taken:
+        assert (each.abs().amax(-1) > 1e-7).tolist() == [True, True, False, True]
 
 
 def test_iterations_are_counted_where_there_are_obstacles(sheet, scene, device):
@@ -87,25 +63,6 @@ def test_iterations_are_counted_where_there_are_obstacles(sheet, scene, device):
     solver, state = scene(points, Contact(iterations=1), [ground], transfer="kernels", gravity=(0.0, 0.0, -9.8))
     solver.rollout(state, DT, 6)
     assert solver.fused().touching.rounds == 6
-
-
-@pytest.mark.slow
-def test_many_substeps_use_the_lists_again(sheet, scene, device, monkeypatch):
-    """A sheet that falls onto another is stopped as in torch, with lists that serve several substeps."""
-    points, _, _ = _collision(sheet, device)
-    monkeypatch.setattr(fused_contact, "SLOTS", 32)  # enough, so that nothing is done twice
-    velocity = torch.zeros_like(points.position)
-    velocity[25:, 2] = -10.0
-    ends = []
-    for transfer in ("torch", "kernels"):
-        solver, state = scene(
-            points, Contact(iterations=4), velocity=velocity, transfer=transfer, gravity=(0.0, 0.0, 0.0)
-        )
-        state = solver.rollout(state, DT, 12)
-        ends.append(state)
-    assert 0 < solver.fused().touching.made < 12
-    assert float((ends[0].velocity[25:, 2] + 10.0).abs().max()) > 0.5  # they touched
-    assert_close(ends[1].position, ends[0].position, rtol=0, atol=1e-4)
 
 
 def test_the_lists_are_those_of_close_pairs(sheet, scene, device):

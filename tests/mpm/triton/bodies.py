@@ -46,19 +46,18 @@ def make_body(position, law=None, youngs_modulus=1e4, **more):
 
 def set_going(solver, points, strain=0.2):
     """Deformed and in motion."""
-    device, shape = points.position.device, points.position.shape
+    shape = points.position.shape
     state = solver.init_state(points, noise(1, *shape).to(points.position))
     if solver.neighbours_fixed:
-        nodes = [
-            (size * noise(seed, *state.node_velocity.shape)).to(device) for seed, size in ((2, strain * DX), (3, 1.0))
-        ]
+        sizes = ((2, strain * DX), (3, 1.0))
+        nodes = [size * noise(seed, *state.node_velocity.shape).to(state.position) for seed, size in sizes]
         massive = (solver.bound.node_mass > 0)[..., None]  # others never move
         return solver.bound.read_particles(state, *(torch.where(massive, value, 0.0) for value in nodes))
-    F = (torch.eye(3) + strain * noise(2, *shape, 3)).to(device)
+    F = (torch.eye(3) + strain * noise(2, *shape, 3)).to(state.position)
     total = F.mT.contiguous() if solver.laws.plastic else F
-    state = state.replace(F_elastic=F, F_total=total, affine=noise(3, *shape, 3).to(device))
+    state = state.replace(F_elastic=F, F_total=total, affine=noise(3, *shape, 3).to(F))
     if state.internal is not None:
-        state = state.replace(internal=state.internal + (0.01 * noise(10, *shape[:-1]).abs()).to(device))
+        state = state.replace(internal=state.internal + 0.01 * noise(10, *shape[:-1]).abs().to(F))
     return state
 
 

@@ -4,8 +4,6 @@ Each law, boundary, wind and damping is in one scene at least of each formulatio
 are in both.
 """
 
-import dataclasses
-
 import pytest
 import torch
 from catalogue import ELASTIC, PLASTIC, conditions, made
@@ -18,6 +16,7 @@ from .bodies import (
     DT,
     FORMULATIONS,
     LEFT,
+    TOLERANCE,
     TOP,
     WIND,
     check_agreement,
@@ -25,7 +24,6 @@ from .bodies import (
     make_points,
     make_solver,
     noise,
-    on_each,
     run_both,
     run_in_wind,
     set_going,
@@ -109,6 +107,7 @@ SCENES = [  # formulation, laws, boundaries, wind, other settings; `groups` are 
     ("updated", "fluid", "walls and pins", {"max_area_ratio": 0.9, **SEMI}, {"groups": True}),
     ("updated", ", ".join(ELASTIC), "none", {"law": "projected"}, {"groups": True}),
     ("updated", "neo-hookean, fluid, snow", "none", {}, {}),
+    ("updated", "metal, foam, plasticine", "none", {}, {}),
     ("updated", "corotated", "none", {"law": "cross_flow"}, {"groups": True}),
     ("updated", "corotated", "none", None, {"damping": 0.0}),
     ("updated", "corotated", "release and plane", {}, {"batch": (2,)}),
@@ -138,7 +137,10 @@ def _groups(points, count, aero):
     indirect=["kernel_device"],
 )
 def test_kernels_do_what_torch_does(kernel_device, scene):
-    """The second rollout has a longer list of patches, and scatters what the return map gave."""
+    """The second rollout has a longer list of patches, and scatters what the return map gave.
+
+    On a CPU in double precision but for numbers like friction: both compute the same formulas.
+    """
     formulation, laws, boundaries, aero, more = scene
     more = dict(more)
     groups, batch, count = more.pop("groups", False), more.pop("batch", ()), more.pop("count", 24)
@@ -146,11 +148,14 @@ def test_kernels_do_what_torch_does(kernel_device, scene):
     index = torch.randint(len(laws), (count,), generator=torch.Generator().manual_seed(6)) if len(laws) > 1 else None
     rates = 40 * torch.rand(count, generator=torch.Generator().manual_seed(1)) if more.pop("rates", False) else None
     points = make_points(kernel_device, laws, count, batch, law_index=index, damping=rates)
+    if kernel_device.type == "cpu":
+        points = points.map(torch.Tensor.double)
 
     def load(patches):
         if aero is None:
             return None
-        return _groups(points, patches, aero).to(kernel_device) if groups else make_load(points, **aero)
+        force = _groups(points, patches, aero) if groups else make_load(points, **aero)
+        return force.to(kernel_device, points.position.dtype)
 
     def run(solver, state):
         state = solver.rollout(state, DT, 1, load(90))
@@ -158,7 +163,7 @@ def test_kernels_do_what_torch_does(kernel_device, scene):
 
     make = (BOUNDARIES | POINT_HOLDS)[boundaries]
     ends = run_both(points, run, formulation, boundaries=make(), **more)
-    check_agreement(ends)
+    check_agreement(ends, TOLERANCE if kernel_device.type == "cuda" else 1e-8)
     if laws[0].plastic and boundaries == "none":
         assert float((ends[1][1].F_elastic - ends[1][1].F_total).abs().max()) > 0.01
     if aero is None:
@@ -193,38 +198,6 @@ def test_crushed_and_inverted_particles(kernel_device, formulation):
 
 
 @pytest.mark.parametrize("formulation", FORMULATIONS)
-def test_momentum(kernel_device, formulation):
-    """Linear and angular momentum of a free body, to float32; angular momentum about a point within the body."""
-    points = make_points(kernel_device)
-    solver = make_solver("kernels", formulation, gravity=(0, 0, 0), damping=0.0)
-    state = set_going(solver, points)
-    if formulation == "updated":  # a spin that belongs to the stretch of the nodes, as after any substep
-        state = solver.rollout(state, DT, 1)
-    end = solver.rollout(state, DT, 2)
-    scale = float((points.mass[:, None] * state.velocity).abs().sum())
-    before, after = (solver.momenta(s) for s in (state, end))
-    for name in before:
-        torch.testing.assert_close(after[name], before[name], rtol=0, atol=1e-6 * scale)
-    assert float((end.velocity - state.velocity).abs().max()) > 0.1
-
-
-@pytest.mark.parametrize(
-    ("kernel_device", "drag_step"), on_each("explicit", "semi_implicit"), indirect=["kernel_device"]
-)
-def test_the_work_is_what_the_energy_grows_by(kernel_device, drag_step):
-    """In a body that is too soft to store any; the energies are computed separately from the work."""
-    points = make_points(kernel_device)
-    points = dataclasses.replace(points, youngs_modulus=torch.full_like(points.mass, 1e-6))
-    solver = make_solver("kernels", "total", gravity=(0, 0, 0), damping=0.0)
-    state = set_going(solver, points)
-    end = solver.rollout(state, DT, 2, make_load(points, drag_step=drag_step))
-    growth = solver.energies(end)["kinetic"] - solver.energies(state)["kinetic"]
-    assert abs(float(growth)) > 1e-4
-    # a difference of two energies in float32
-    torch.testing.assert_close(end.work.float(), growth, rtol=0, atol=2e-6 * float(solver.energies(end)["kinetic"]))
-
-
-@pytest.mark.parametrize("formulation", FORMULATIONS)
 def test_wind_along_the_normal(kernel_device, formulation):
     """Nothing of it is tangential."""
     points = make_points(kernel_device)
@@ -250,15 +223,3 @@ def test_patches_without_flow_and_flat_ones(kernel_device):
         return state.replace(F_total=F)
 
     check_agreement(run_in_wind(make_points(kernel_device, PLASTIC["sand"]), "updated", start=start))
-
-
-@pytest.mark.gpu
-def test_total_gives_the_same_bits_twice():
-    pytest.importorskip("triton")
-    points = make_points("cuda", count=2000)
-    ends = []
-    for _ in range(2):
-        solver = make_solver("kernels", "total")
-        ends.append(solver.rollout(set_going(solver, points), DT, 40, make_load(points)))
-    for name in ("position", "velocity", "F_elastic", "node_velocity", "work"):
-        assert torch.equal(getattr(ends[0], name), getattr(ends[1], name))

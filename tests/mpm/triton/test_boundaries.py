@@ -5,7 +5,6 @@ import torch
 
 from gaussian_swaying import Box, PinnedRegion, WindField, WindForce
 from gaussian_swaying.aero.wind_batch import WindBatch
-from gaussian_swaying.mpm.boundaries.plane import Plane
 from gaussian_swaying.mpm.boundaries.velocity_box import VelocityBox
 from gaussian_swaying.mpm.triton import fused_updated
 
@@ -58,19 +57,6 @@ def test_which_boundaries_are_a_part_of_the_kernel_of_the_nodes(kernel_device):
     assert turns["pin and plane"] == ((0, -1), (1, 0))
     assert turns["walls and pins"] == ((0, 0), (1, -1), *((2, 1 + n) for n in range(6)), (3, -2))
     assert turns["handle"] == ()
-
-
-def test_a_plane_that_is_moved_in_place(kernel_device):
-    """Between two rollouts, and without another buffer."""
-    points, ends = make_points(kernel_device, count=12), []
-    for transfer in ("torch", "kernels"):
-        plane = Plane([0.0, 0.0, -1.0], [0.0, 0.0, 1.0], "sticky")
-        solver = make_solver(transfer, "updated", boundaries=[plane])
-        state = solver.rollout(set_going(solver, points), DT, 1)
-        plane.point[2] = 0.13
-        ends.append(solver.rollout(state, DT, 1))
-    check_agreement(ends)
-    assert float(ends[1].impulse.abs().max()) > 1e-4
 
 
 def test_fast_particles_are_sorted_more_often_and_sheets_less():

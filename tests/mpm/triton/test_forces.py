@@ -4,7 +4,7 @@ import pytest
 import torch
 from catalogue import ELASTIC, PLASTIC
 
-from gaussian_swaying import Force, PinnedRegion, SpatialWind, WindField, WindForce
+from gaussian_swaying import Force, PinnedRegion, WindField
 from gaussian_swaying.kernels.language import tl, triton
 from gaussian_swaying.mpm.boundaries.plane import Plane
 from gaussian_swaying.mpm.triton import fused, fused_updated
@@ -58,20 +58,6 @@ def test_forces_and_drag_of_step(kernel_device, formulation):
     ends = run_both(points, run, formulation)
     check_agreement(ends)
     assert float(ends[1][2].work.abs()) > float(ends[1][0].work.abs()) == 0.0
-
-
-@pytest.mark.parametrize("formulation", FORMULATIONS)
-def test_a_force_function_is_called_each_substep(kernel_device, formulation):
-    points = make_points(kernel_device)
-    times = []
-
-    def force(state):
-        times.append(round(float(state.time), 9))
-        return -20.0 * points.mass[:, None] * state.velocity
-
-    ends = run_both(points, lambda solver, state: solver.rollout(state, DT, 2, force), formulation)
-    check_agreement(ends)
-    assert times == [0.0, DT] * 2
 
 
 class _Pull(Force):
@@ -184,21 +170,6 @@ def test_a_force_that_cannot_be_recorded_is_asked_by_the_host(kernel_device, for
         return end
 
     check_agreement(run_both(points, run, formulation))
-
-
-@pytest.mark.parametrize("formulation", FORMULATIONS)
-def test_a_wind_that_depends_on_the_place(kernel_device, formulation):
-    class Shear(SpatialWind):
-        recordable = True
-
-        def forward(self, time, position):
-            speed = (8.0 + 1e3 * time) * (1 + 3 * position[..., 2])
-            return torch.stack([speed, torch.zeros_like(speed), torch.ones_like(speed)], dim=-1)
-
-    points = make_points(kernel_device, count=12)
-    load = make_load(points)
-    shear = WindForce(load.aero, Shear(), load.normal, load.area)
-    check_agreement(run_both(points, lambda solver, state: solver.rollout(state, DT, 2, shear), formulation))
 
 
 @triton.jit
