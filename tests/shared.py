@@ -22,6 +22,11 @@ class Chosen(Region):
         return self.mask.to(points.device)
 
 
+def double(values):
+    """Numbers as a tensor of float64."""
+    return torch.tensor(values, dtype=torch.float64)
+
+
 def unit(*shape, device="cpu", dtype=torch.float64):
     """Random unit vectors or quaternions."""
     return torch.nn.functional.normalize(torch.randn(*shape, device=device, dtype=dtype), dim=-1)

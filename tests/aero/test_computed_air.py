@@ -2,6 +2,7 @@
 
 import pytest
 import torch
+from shared import double
 from torch.testing import assert_close
 
 from gaussian_swaying import AeroForce, Box, Material, MPMSolver, Scene, Simulation, WindField
@@ -162,7 +163,7 @@ def test_a_heavy_surface_stops_its_layer_of_air_however_short_the_substeps():
         lost.append(_together(stepper, state, state.air.clone(), substeps)[1].double().sum(0))
     air = stepper.air
     layer = air.flow.units.cell_mass * look(state.air, air._area, air._place(state.position), air.flow.kind)[1].sum()
-    wind = torch.tensor([3.0, 0.5, 0.0], dtype=torch.float64)
+    wind = double([3.0, 0.5, 0.0])
     # the layer of a point is some 1e-4 of its mass
     for taken in lost:
         assert_close(taken, float(layer) * wind, rtol=1e-3, atol=1e-6 * float(layer))
@@ -172,7 +173,7 @@ def test_the_law_is_no_stronger_than_what_stops_the_surface():
     """Its force is cut off at the given rate times the difference of velocities, and is its own below that."""
     stepper = _simulation(force="law", wind=(0.5, 3.0, 0.0), dtype="float64").stepper
     state = stepper.start()
-    air = torch.tensor([0.5, 3.0, 0.0], dtype=torch.float64).expand_as(state.velocity)
+    air = double([0.5, 3.0, 0.0]).expand_as(state.velocity)
     free, rate = stepper.air._law(state, air, torch.full(air.shape[:1], 1e9, dtype=torch.float64))
     assert rate.min() > 0
     most = torch.where(torch.arange(len(rate)) % 2 == 0, 0.25, 4.0) * rate

@@ -4,6 +4,7 @@ import math
 
 import pytest
 import torch
+from shared import double
 from torch.testing import assert_close
 
 from gaussian_swaying import GaussianGust, SineSway, SpatialWind, WindField
@@ -16,7 +17,7 @@ NONE = torch.zeros(3, dtype=torch.float64)
 
 def _turn(degrees):
     s, c = math.sin(math.radians(degrees)), math.cos(math.radians(degrees))
-    return torch.tensor([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]], dtype=torch.float64)
+    return double([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
 
 
 class Whirl(SpatialWind):
@@ -38,7 +39,7 @@ def test_without_values_it_is_the_wind():
 def test_a_turned_copy_feels_the_wind_from_its_other_side():
     """Turned by 90 degrees counterclockwise, its own x axis is y of the scene: wind along y is wind along its x."""
     found = CopiedWind(WindField([0.0, 2.0, 0.0]), _turn(90.0), NONE)(TIMES)
-    assert_close(found, torch.tensor([[2.0, 0.0, 0.0]], dtype=torch.float64).expand_as(found))
+    assert_close(found, double([[2.0, 0.0, 0.0]]).expand_as(found))
 
 
 def test_gusts_come_later_or_are_others():
@@ -50,7 +51,7 @@ def test_gusts_come_later_or_are_others():
 
 @pytest.mark.parametrize("wind", [Whirl(), WindField([4.0, 1.0, 0.0], effects=[PowerProfile(height=2.0)])])
 def test_a_wind_that_varies_in_space_is_that_at_the_place_of_the_copy(wind):
-    turn, shift = _turn(30.0), torch.tensor([2.0, -1.0, 0.5], dtype=torch.float64)
+    turn, shift = _turn(30.0), double([2.0, -1.0, 0.5])
     copied, place, now = CopiedWind(wind, turn, shift), torch.rand(5, 3, dtype=torch.float64), TIMES[2]
     there = (turn @ place.T).T + shift
     wanted = wind.at(now, there) if isinstance(wind, WindField) else wind(now, there)

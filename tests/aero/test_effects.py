@@ -9,6 +9,7 @@ from pkgutil import iter_modules
 
 import pytest
 import torch
+from shared import double
 
 from gaussian_swaying import SimFrame, WindField, aero
 from gaussian_swaying.aero.effects import LogProfile, Moment, Plume, PowerProfile, WindEffect
@@ -20,7 +21,7 @@ def speeds(profile, heights):
     """Speed at some heights above the origin, in a wind of 8 m/s."""
     place = torch.zeros(len(heights), 3, dtype=torch.float64)
     place[:, 2] = torch.tensor(heights)
-    wind = profile(torch.tensor([8.0, 0.0, 0.0], dtype=torch.float64), place, NOW)
+    wind = profile(double([8.0, 0.0, 0.0]), place, NOW)
     assert wind[:, 1:].abs().max() == 0
     return wind[:, 0].tolist()
 
@@ -83,7 +84,7 @@ def test_the_documented_effects_are_those_that_there_are():
 
 
 def plume_at(plume, place):
-    return plume(torch.zeros(3, dtype=torch.float64), torch.tensor(place, dtype=torch.float64), NOW)
+    return plume(torch.zeros(3, dtype=torch.float64), double(place), NOW)
 
 
 def test_a_plume_rises_as_fast_as_over_a_fire():

@@ -4,6 +4,7 @@ import math
 
 import pytest
 import torch
+from shared import double
 from torch.testing import assert_close
 
 from gaussian_swaying import GaussianGust, UniformGust, WindField
@@ -29,7 +30,7 @@ def _read(gust, dt, seconds=INTERVALS * T, seed=11, flow=None):
 
 def _gusts(gust, dt, **more):
     """The same without the mean flow that was set, first component."""
-    return (_read(gust, dt, **more) - torch.tensor(GUSTS[gust][1], dtype=torch.float64))[:, 0]
+    return (_read(gust, dt, **more) - double(GUSTS[gust][1]))[:, 0]
 
 
 @pytest.mark.parametrize("gust", GUSTS)
@@ -43,7 +44,7 @@ def test_two_substeps_read_the_same_samples(gust):
 def test_mean_and_variance(gust, dt):
     """Standard errors: s / sqrt(M) of the mean, s^2 sqrt((kurtosis - 1) / M) of the variance about a known mean."""
     _, mean, std, kurtosis = GUSTS[gust]
-    values = (_read(gust, dt) - torch.tensor(mean, dtype=torch.float64)).T
+    values = (_read(gust, dt) - double(mean)).T
     for one in values if gust == "gaussian" else values[:1]:
         assert abs(float(one.mean())) < FOUR * std
         assert float(one.square().mean()) == pytest.approx(std**2, abs=FOUR * std**2 * math.sqrt(kurtosis - 1))
@@ -72,7 +73,7 @@ def _uncorrelated(a, b):
 
 def test_components_are_independent():
     """Not only uncorrelated: neither are their squares."""
-    values = _read("gaussian", T) - torch.tensor([2.0, -1.0, 0.5], dtype=torch.float64)
+    values = _read("gaussian", T) - double([2.0, -1.0, 0.5])
     for i, j in ((0, 1), (0, 2), (1, 2)):
         assert _uncorrelated(values[:, i], values[:, j])
         assert _uncorrelated(values[:, i].square(), values[:, j].square())
@@ -80,7 +81,7 @@ def test_components_are_independent():
 
 def test_one_uniform_factor_scales_all_components():
     values = _read("uniform", T, flow=[2.0, -1.0, 0.5])
-    assert_close(values, values[:, :1] * torch.tensor([1.0, -0.5, 0.25], dtype=torch.float64))
+    assert_close(values, values[:, :1] * double([1.0, -0.5, 0.25]))
     factor = values[:, 0] / 2
     assert 1 - DELTA <= factor.min() < 1 - 0.998 * DELTA
     assert 1 + 0.998 * DELTA < factor.max() <= 1 + DELTA

@@ -5,6 +5,7 @@ from itertools import pairwise
 
 import pytest
 import torch
+from shared import double
 
 from gaussian_swaying.aero.carried import Turbulence
 from gaussian_swaying.aero.looks import CELLS, LOOKS, look, turbulence_length
@@ -37,7 +38,7 @@ def test_a_long_record_has_the_mean_and_the_intensity(name):
     air = torch.cat(records)[:, 0]
     count = SEEDS * min(SECONDS * given.speed / (2 * turbulence_length(height)), math.prod(CELLS) / 16**3)
     sigma = given.intensity * given.speed
-    flow = torch.tensor([0.0, given.speed, 0.0], dtype=torch.float64)
+    flow = double([0.0, given.speed, 0.0])
     assert ((air.mean(0) - flow).abs() < 3 * sigma / math.sqrt(count)).all()
     for spread in air.std(0).tolist():  # isotropic
         assert spread == pytest.approx(0.87 * sigma, rel=3 * 0.05 / math.sqrt(SEEDS) + 0.05)
@@ -107,8 +108,6 @@ def test_a_start_is_a_later_time():
     plain = WindField(flow, effects=[Turbulence(0.3, 1.5)])
     later = WindField(flow, effects=[Turbulence(0.3, 1.5, start=[7.0 * c for c in flow])])
     for time in (0.0, 1.3):
-        found, expected = (
-            wind.at(torch.tensor(t, dtype=torch.float64), places) for wind, t in ((later, time), (plain, time + 7.0))
-        )
+        found, expected = (wind.at(double(t), places) for wind, t in ((later, time), (plain, time + 7.0)))
         torch.testing.assert_close(found, expected, rtol=0, atol=1e-4)  # places of float32 in a box of some 100 cells
-    assert not torch.allclose(found, plain.at(torch.tensor(1.3, dtype=torch.float64), places), atol=0.1)
+    assert not torch.allclose(found, plain.at(double(1.3), places), atol=0.1)

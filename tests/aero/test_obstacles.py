@@ -4,6 +4,7 @@ import math
 
 import pytest
 import torch
+from shared import double
 from torch.testing import assert_close
 
 from gaussian_swaying import SimFrame, WindField
@@ -20,8 +21,8 @@ from gaussian_swaying.aero.obstacle_flow import (
 from gaussian_swaying.aero.obstacles import CylinderObstacle, EllipsoidObstacle
 
 DOUBLE = torch.float64
-FLOW = torch.tensor([2.0, -0.7, 0.4], dtype=DOUBLE)
-AXIS = torch.nn.functional.normalize(torch.tensor([0.3, 0.1, 1.0], dtype=DOUBLE), dim=0)
+FLOW = double([2.0, -0.7, 0.4])
+AXIS = torch.nn.functional.normalize(double([0.3, 0.1, 1.0]), dim=0)
 RADII = (0.7, 1.3, 0.4)
 FLOWS = {
     "cylinder": lambda x: cylinder_flow(FLOW, x, AXIS, 0.8),
@@ -38,8 +39,8 @@ def _surface(name):
     """Points of a surface just outside of it, and its normals."""
     direction = _directions()
     if name == "ellipsoid":
-        x = direction * torch.tensor(RADII, dtype=DOUBLE)
-        return x * (1 + 1e-15), torch.nn.functional.normalize(direction / torch.tensor(RADII, dtype=DOUBLE), dim=-1)
+        x = direction * double(RADII)
+        return x * (1 + 1e-15), torch.nn.functional.normalize(direction / double(RADII), dim=-1)
     direction = torch.nn.functional.normalize(direction - (direction @ AXIS)[:, None] * AXIS, dim=-1)
     return 0.8 * direction * (1 + 1e-15) + 3 * AXIS, direction
 
@@ -72,7 +73,7 @@ def test_far_away_and_inside(name):
 def test_closed_forms():
     """Lamb: twice the flow at the side of a cylinder."""
     x, y = torch.eye(3, dtype=DOUBLE)[:2]
-    z = torch.tensor([0.0, 0.0, 1.0], dtype=DOUBLE)
+    z = double([0.0, 0.0, 1.0])
     assert_close(cylinder_flow(x + z, 1.0 * y, z, 1.0), 2 * x + z)
     assert_close(cylinder_flow(x + z, -2.0 * x, z, 1.0), 0.75 * x + z)
 
@@ -82,7 +83,7 @@ def test_ellipsoids_become_spheres_and_cylinders():
     place, normal = 1.2 * _directions(), _directions()
     sphere = FLOW + 0.5 * (0.8 / 1.2) ** 3 * (FLOW - 3 * (normal @ FLOW)[:, None] * normal)
     assert_close(ellipsoid_flow(FLOW, place, (0.8,) * 3), sphere, rtol=0, atol=1e-13)
-    z = torch.tensor([0.0, 0.0, 1.0], dtype=DOUBLE)
+    z = double([0.0, 0.0, 1.0])
     long = ellipsoid_flow(FLOW, place, (0.8, 0.8, 8e5))
     assert_close(long, cylinder_flow(FLOW, place, z, 0.8), rtol=0, atol=1e-9)
 
@@ -100,9 +101,9 @@ def test_the_side_of_a_spheroid():
 
 def test_carlsons_integral():
     """Values of the paper, and scaling."""
-    x, y, z = (torch.tensor(v, dtype=DOUBLE) for v in (1e-300, 2.0, 1.0))
+    x, y, z = (double(v) for v in (1e-300, 2.0, 1.0))
     assert float(carlson_rd(x, y, z)) == pytest.approx(1.7972103521033883, rel=1e-12)
-    x, y, z = (torch.tensor(v, dtype=DOUBLE) for v in (2.0, 3.0, 4.0))
+    x, y, z = (double(v) for v in (2.0, 3.0, 4.0))
     assert float(carlson_rd(x, y, z)) == pytest.approx(0.16510527294261053, rel=1e-13)
     assert_close(carlson_rd(4 * x, 4 * y, 4 * z), carlson_rd(x, y, z) / 8)
 
@@ -128,8 +129,8 @@ def test_a_street_has_its_strouhal_number_and_no_mean():
     """The lift side of a pole of 0.1 m in 5 m/s sees vortices of each side at 0.2 x 5 / 0.1 = 10 per second."""
     pole = CylinderObstacle([0.0, 0.0, 0.0], 0.05, strouhal=0.2)
     wind = WindField([3.0, 4.0, 0.0], effects=[pole])
-    direction = torch.tensor([0.6, 0.8, 0.0], dtype=DOUBLE)
-    left = torch.tensor([-0.8, 0.6, 0.0], dtype=DOUBLE)
+    direction = double([0.6, 0.8, 0.0])
+    left = double([-0.8, 0.6, 0.0])
     place = (0.6 * direction)[None]
     times = torch.arange(2000, dtype=DOUBLE) / 500
     series = torch.stack([wind.at(t, place)[0] for t in times])
@@ -146,9 +147,9 @@ def test_a_street_has_its_strouhal_number_and_no_mean():
 
 def test_a_street_drifts_and_has_no_divergence_where_it_does_not_fade():
     def found(x, turns=0.0):
-        return vortex_street(x[0], x[1], 1e-3, torch.tensor(turns, dtype=DOUBLE), 0.2) * torch.exp(x[0] / 0.03)
+        return vortex_street(x[0], x[1], 1e-3, double(turns), 0.2) * torch.exp(x[0] / 0.03)
 
-    for x in (torch.tensor([0.0213, 3e-4], dtype=DOUBLE), torch.tensor([0.0224, -2e-3], dtype=DOUBLE)):
+    for x in (double([0.0213, 3e-4]), double([0.0224, -2e-3])):
         slope = torch.func.jacrev(found)(x)
         assert float(slope[0, 0] + slope[1, 1]) == pytest.approx(0.0, abs=1e-9 * float(slope.abs().max()))
         length = STREET_SPEED * 1e-3 / 0.2
@@ -158,10 +159,10 @@ def test_a_street_drifts_and_has_no_divergence_where_it_does_not_fade():
 @pytest.mark.parametrize("turn", [0.0, 30.0])
 def test_obstacles_in_a_frame_are_those_of_the_scene(turn):
     """Scaled by two, turned by a quarter about x and moved."""
-    rotation = torch.tensor([[1.0, 0, 0], [0, 0, -1.0], [0, 1.0, 0]], dtype=DOUBLE)
-    frame = SimFrame(torch.tensor([1.0, 2.0, 3.0], dtype=DOUBLE), rotation, 2.0)
-    scene = torch.tensor([[1.9, 2.6, 3.2], [0.4, 1.2, 2.4]], dtype=DOUBLE)
-    flow = torch.tensor([1.0, 0.3, -0.2], dtype=DOUBLE)
+    rotation = double([[1.0, 0, 0], [0, 0, -1.0], [0, 1.0, 0]])
+    frame = SimFrame(double([1.0, 2.0, 3.0]), rotation, 2.0)
+    scene = double([[1.9, 2.6, 3.2], [0.4, 1.2, 2.4]])
+    flow = double([1.0, 0.3, -0.2])
     here, there = Moment(flow[0], flow, flow), Moment(flow[0], flow @ rotation.T, 2 * flow @ rotation.T)
     for obstacle in (
         CylinderObstacle([1.0, 2.5, 3.0], 0.4, axis=[0.0, 1.0, 1.0]),
@@ -172,7 +173,7 @@ def test_obstacles_in_a_frame_are_those_of_the_scene(turn):
         found = moved(flow @ rotation.T, frame.point_to_sim(scene), there) @ rotation
         assert_close(found, expected)
         assert (expected - flow).abs().max() > 0.05
-        assert torch.equal(obstacle.middle, torch.tensor([1.0, 2.5, 3.0], dtype=DOUBLE))
+        assert torch.equal(obstacle.middle, double([1.0, 2.5, 3.0]))
 
 
 def test_a_wall_shelters_what_is_behind_it():
@@ -192,7 +193,7 @@ def test_still_air_stays_still():
         EllipsoidObstacle([0.0] * 3, [1, 1, 2]),
     ):
         wind = WindField([0.0, 0.0, 0.0], effects=[obstacle])
-        found = wind.at(torch.tensor(1.0, dtype=DOUBLE), 2 * _directions())
+        found = wind.at(double(1.0), 2 * _directions())
         assert torch.equal(found, torch.zeros_like(found))
 
 

@@ -4,7 +4,7 @@ import math
 
 import pytest
 import torch
-from shared import solid
+from shared import double, solid
 from torch.testing import assert_close
 
 from gaussian_swaying import AeroForce, WindField, WindForce, aero_force
@@ -116,7 +116,7 @@ def test_a_small_lift_needs_few_directions(lift):
 def test_the_area_is_capped_and_resists():
     normal, area, point = random_patches(0.0)
     F = 2 * torch.eye(3, dtype=torch.float64).expand(POINTS, 3, 3)
-    velocity, wind = torch.zeros(POINTS, 3, dtype=torch.float64), torch.tensor([4.0, 0.0, 0.0], dtype=torch.float64)
+    velocity, wind = torch.zeros(POINTS, 3, dtype=torch.float64), double([4.0, 0.0, 0.0])
     sums = PatchSums(Patches(normal, area, point, POINTS))
     expected = each_patch(wind, velocity, F, normal, area, point, cap=1.5, **LAWS["paper"])
     found, now = grouped_force(wind, velocity, F, sums, max_area_ratio=1.5, **LAWS["paper"])
@@ -132,7 +132,7 @@ def test_a_state_in_wind(make_points):
 
     state = MPMSolver(dx=0.1).init_state(make_points)
     state = state.replace(velocity=torch.randn_like(state.velocity), F_total=turned())
-    wind = torch.tensor([4.0, 1.0, 0.5], dtype=torch.float64)
+    wind = double([4.0, 1.0, 0.5])
     force, resistance = WindForce(aero, WindField([4.0, 1.0, 0.5]), Patches(normal, area, point, POINTS)).force(
         state, wind
     )

@@ -6,6 +6,7 @@ import struct
 import numpy as np
 import pytest
 import torch
+from shared import double
 from torch.testing import assert_close
 
 from gaussian_swaying import SimFrame, WindField
@@ -17,7 +18,7 @@ DOUBLE = torch.float64
 
 
 def _at(time):
-    return torch.tensor(time, dtype=DOUBLE)
+    return double(time)
 
 
 def _linear(t, x, y, z):
@@ -41,14 +42,14 @@ def _npz(path, **changes):
 
 def test_a_recorded_wind_is_exact_where_it_is_linear(tmp_path):
     wind = WindField(effects=[RecordedWind(_npz(tmp_path / "w.npz"), origin=[10.0, 0.0, 0.0])])
-    place = torch.tensor([[10.3, 0.2, 1.7], [9.1, 0.9, 0.1]], dtype=DOUBLE)
+    place = double([[10.3, 0.2, 1.7], [9.1, 0.9, 0.1]])
     for time in (0.0, 0.4, 1.0, 2.5, 3.0):
         x, y, z = (place - torch.tensor([10.0, 0.0, 0.0])).unbind(-1)
         expected = _linear(5 + time, x.numpy(), y.numpy(), z.numpy())
         np.testing.assert_allclose(wind.at(_at(time), place).numpy(), expected, atol=2e-6)  # the table is float32
     held = wind.at(_at(100.0), place)
     assert_close(held, wind.at(_at(3.0), place))
-    outside = wind.at(_at(1.0), torch.tensor([[50.0, -7.0, 9.0]], dtype=DOUBLE))
+    outside = wind.at(_at(1.0), double([[50.0, -7.0, 9.0]]))
     np.testing.assert_allclose(outside[0].numpy(), _linear(6.0, 2.0, 0.0, 2.0), atol=2e-6)
 
 
@@ -56,7 +57,7 @@ def test_a_recorded_wind_repeats(tmp_path):
     """After the last time the first follows, after a mean step."""
     effect = RecordedWind(_npz(tmp_path / "w.npz"), repeat=True, start=6.0)
     wind = WindField(effects=[effect])
-    place = torch.tensor([[0.3, 0.2, 1.7]], dtype=DOUBLE)
+    place = double([[0.3, 0.2, 1.7]])
     assert effect.period == pytest.approx(4.5)
     assert_close(wind.at(_at(0.7 + 4.5), place), wind.at(_at(0.7), place))
     between = wind.at(_at(2.75), place)  # 8.75: in the middle of the last step
@@ -64,10 +65,10 @@ def test_a_recorded_wind_repeats(tmp_path):
 
 
 def test_places_of_the_file_are_in_metres_and_its_origin_in_scene_units(tmp_path):
-    frame = SimFrame(torch.tensor([1.0, 0.0, 0.0], dtype=DOUBLE), torch.eye(3, dtype=DOUBLE), 2.0)
+    frame = SimFrame(double([1.0, 0.0, 0.0]), torch.eye(3, dtype=DOUBLE), 2.0)
     moved = RecordedWind(_npz(tmp_path / "w.npz"), origin=[2.0, 0.5, 0.0]).in_frame(frame)
     moment = Moment(_at(0.0), _at([0.0] * 3), _at([0.0] * 3))
-    found = moved(torch.zeros(3), torch.tensor([[2.5, 1.2, 0.4]], dtype=DOUBLE), moment)
+    found = moved(torch.zeros(3), double([[2.5, 1.2, 0.4]]), moment)
     np.testing.assert_allclose(found[0].numpy(), _linear(5.0, 0.5, 0.2, 0.4), atol=2e-6)
 
 
@@ -169,7 +170,7 @@ def test_a_box_of_hipersim(tmp_path):
     effect = FrozenWind(tmp_path / "box.nc", scale=0.5)
     wind = WindField([0.0, 5.0, 0.0], effects=[effect])  # its x axis is our y, its y is our -x
     middle = 0.5 * 7 * 3.0
-    place = torch.tensor([[middle - 2 * 3.0, 4 * 2.0, 3 * 4.0]], dtype=DOUBLE)
+    place = double([[middle - 2 * 3.0, 4 * 2.0, 3 * 4.0]])
     u, v, w = box.uvw[:, 4, 2, 3]
     found = wind.at(_at(0.0), place)[0]
     np.testing.assert_allclose(found.numpy(), [-0.5 * v, 5 + 0.5 * u, 0.5 * w], atol=1e-5)
@@ -243,7 +244,7 @@ def test_planes_of_turbsim_pass_one_after_the_other(tmp_path):
     wind = WindField([0.0, -8.0, 0.0], effects=[FrozenWind(path, origin=[1.0, 2.0, 3.0])])
     for time in range(6):
         # one metre to the left of the flow, -y, is +x; 11 m above the ground
-        found = wind.at(_at(0.5 * time), torch.tensor([[2.0, 2.0, 14.0]], dtype=DOUBLE))[0]
+        found = wind.at(_at(0.5 * time), double([[2.0, 2.0, 14.0]]))[0]
         u, v, w = velocity[time % 4, 2, 1]
         np.testing.assert_allclose(found.numpy(), [v, -u, w], atol=1e-3)
 
@@ -264,8 +265,8 @@ def _csv(path, text):
 def test_an_anemometer(tmp_path):
     path = _csv(tmp_path / "a.csv", "time [s],u [m/s],v (m/s),note\n0,1,2,a\n\n2.0,3,-2,b\n")
     wind = WindField(schedule=path)
-    assert_close(wind(1.0), torch.tensor([2.0, 0.0, 0.0], dtype=DOUBLE))
-    assert_close(wind(9.0), torch.tensor([3.0, -2.0, 0.0], dtype=DOUBLE))
+    assert_close(wind(1.0), double([2.0, 0.0, 0.0]))
+    assert_close(wind(9.0), double([3.0, -2.0, 0.0]))
     times, flows = read_anemometer(_csv(tmp_path / "b.csv", "Direction [deg],Speed,time\n270,4,0\n360,2,1\n45,1,2\n"))
     assert times == [0.0, 1.0, 2.0]
     root = math.sqrt(0.5)  # from the west, north and north-east

@@ -4,7 +4,7 @@ import math
 
 import pytest
 import torch
-from shared import solid
+from shared import double, solid
 from torch.testing import assert_close
 
 from gaussian_swaying import AeroForce, MPMSolver, WindField, WindForce
@@ -38,7 +38,7 @@ def _slab(depth, drag, direction, cells=32):
 @pytest.mark.parametrize("direction", [[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.6, -0.64, 0.48]])
 def test_a_slab_of_leaves_follows_the_exponential_law(depth, direction):
     """Within 3 % of the undisturbed wind, two cells or more from its sides, and exactly behind it."""
-    load, state, axes = _slab(depth, 1.3, torch.tensor(direction, dtype=DOUBLE))
+    load, state, axes = _slab(depth, 1.3, double(direction))
     along = torch.linspace(-0.3, 1.3, 33, dtype=DOUBLE)
     line = torch.stack([along, torch.full_like(along, 0.37), torch.full_like(along, 0.43)], dim=-1) @ axes
     air = load.wind.at(state.time, line)
@@ -52,29 +52,29 @@ def test_a_slab_of_leaves_follows_the_exponential_law(depth, direction):
 
 def test_the_drag_area_is_that_of_the_force():
     """Leaves edge-on take nothing with the projected law, and the wake of twice the leaves is the square."""
-    direction = torch.tensor([1.0, 0.0, 0.0], dtype=DOUBLE)
+    direction = double([1.0, 0.0, 0.0])
     load, state, _ = _slab(0.7, 1.0, direction)
-    behind = torch.tensor([[1.2, 0.4, 0.4]], dtype=DOUBLE)
+    behind = double([[1.2, 0.4, 0.4]])
     once = float(load.wind.at(state.time, behind)[0, 0]) / 5
     load.wind.effects[0].strength = 2.0
     load.refresh(state)
     assert float(load.wind.at(state.time, behind)[0, 0]) / 5 == pytest.approx(once**2, rel=1e-6)
-    load.normal = torch.tensor([0.0, 1.0, 0.0], dtype=DOUBLE).expand_as(load.normal)
+    load.normal = double([0.0, 1.0, 0.0]).expand_as(load.normal)
     load.refresh(state)
-    assert_close(load.wind.at(state.time, behind)[0, 0], torch.tensor(5.0, dtype=DOUBLE))
+    assert_close(load.wind.at(state.time, behind)[0, 0], double(5.0))
 
 
 def test_the_wake_follows_the_body_and_the_wind():
-    load, state, _ = _slab(1.0, 1.0, torch.tensor([1.0, 0.0, 0.0], dtype=DOUBLE))
+    load, state, _ = _slab(1.0, 1.0, double([1.0, 0.0, 0.0]))
     behind, beside = ([[1.2, 0.4, 0.4]], [[0.5, 1.2, 0.4]])
     moved = state.replace(position=state.position + torch.tensor([0.0, 0.0, 5.0]))
     load.refresh(moved)
-    assert float(load.wind.at(state.time, torch.tensor(behind, dtype=DOUBLE))[0].norm()) == pytest.approx(5.0)
-    load.wind.flows = torch.tensor([[0.0, 5.0, 0.0]], dtype=DOUBLE)
-    load.normal = torch.tensor([0.0, 1.0, 0.0], dtype=DOUBLE).expand_as(load.normal)
+    assert float(load.wind.at(state.time, double(behind))[0].norm()) == pytest.approx(5.0)
+    load.wind.flows = double([[0.0, 5.0, 0.0]])
+    load.normal = double([0.0, 1.0, 0.0]).expand_as(load.normal)
     load.refresh(state)
-    assert float(load.wind.at(state.time, torch.tensor(behind, dtype=DOUBLE))[0].norm()) == pytest.approx(5.0)
-    assert load.wind.at(state.time, torch.tensor(beside, dtype=DOUBLE))[0].norm() < 3.2
+    assert float(load.wind.at(state.time, double(behind))[0].norm()) == pytest.approx(5.0)
+    assert load.wind.at(state.time, double(beside))[0].norm() < 3.2
     load.wind.flows = torch.zeros(1, 3, dtype=DOUBLE)
     load.refresh(state)
     assert (load.wind.effects[0].table - 1).abs().max() == 0.0
@@ -95,14 +95,14 @@ def test_deposits_are_shared_and_do_not_depend_on_the_order():
 
 
 def test_extinction_is_the_trapezoidal_sum():
-    density = torch.tensor([1.0, 3.0, 0.0, 2.0], dtype=DOUBLE).reshape(4, 1, 1)
-    depth = 0.5 * torch.tensor([0.5, 2.5, 4.0, 5.0], dtype=DOUBLE)  # spacing 1
+    density = double([1.0, 3.0, 0.0, 2.0]).reshape(4, 1, 1)
+    depth = 0.5 * double([0.5, 2.5, 4.0, 5.0])  # spacing 1
     assert_close(extinction(density, torch.tensor(1.0)).flatten(), torch.exp(-depth))
 
 
 def test_axes_of_a_wind():
     for flow in ([0.0, 0.0, 0.0], [0.0, 0.0, 3.0], [1.0, -2.0, 0.3]):
-        flow = torch.tensor(flow, dtype=DOUBLE)
+        flow = double(flow)
         axes = wind_axes(flow)
         assert_close(axes @ axes.T, torch.eye(3, dtype=DOUBLE))
         if float(flow.norm()) > 0:

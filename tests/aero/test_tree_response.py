@@ -10,7 +10,7 @@ from itertools import pairwise
 
 import pytest
 import torch
-from shared import solid
+from shared import double, solid
 
 from gaussian_swaying import AeroForce, Box, MPMSolver, PinnedRegion, WindField, WindForce
 from gaussian_swaying.aero.carried import Turbulence
@@ -29,7 +29,7 @@ def _tree():
     foot = PinnedRegion(Box([None, None, None], [None, None, 0.15]), kind="nodes")
     solver = MPMSolver(dx=0.2, gravity=(0, 0, 0), damping=DAMPING, boundaries=[foot], transfer="torch")
     area = torch.where(crown, AREA / int(crown.sum()), 0.0).to(DOUBLE)
-    normal = torch.tensor([1.0, 0.0, 0.0], dtype=DOUBLE).expand_as(place)
+    normal = double([1.0, 0.0, 0.0]).expand_as(place)
     return solver, solver.init_state(points), crown, normal, area
 
 
@@ -82,7 +82,7 @@ def test_the_response_spectrum_is_that_of_linear_theory():
             pull = float(torch.lerp(force[k], after, (part + 0.5) / parts))
             v += step / parts * (pull / mass - omega**2 * x - 2 * rate * v)
             x += step / parts * v
-    expected = torch.tensor(expected, dtype=DOUBLE)
+    expected = double(expected)
     late = slice(round(6.0 / step), None)
     window = torch.hann_window(len(times[late]), dtype=DOUBLE)
     spectra = [torch.fft.rfft(window * (one[late] - one[late].mean())).abs().square() for one in (found, expected)]

@@ -8,6 +8,7 @@ import math
 
 import pytest
 import torch
+from shared import double
 from torch.testing import assert_close
 
 from gaussian_swaying.aero.carried import CarriedField, Turbulence, box_axes
@@ -215,12 +216,12 @@ def test_interpolation_takes_the_smallest_waves():
 
 def test_trilinear_is_exact_for_a_linear_field():
     table = torch.cartesian_prod(*[torch.arange(n, dtype=torch.float64) for n in (4, 5, 6)]).reshape(4, 5, 6, 3)
-    place = torch.tensor([[0.3, 3.2, 4.9], [2.99, 0.0, 5.0], [-1.0, 7.0, 2.5]], dtype=torch.float64)
+    place = double([[0.3, 3.2, 4.9], [2.99, 0.0, 5.0], [-1.0, 7.0, 2.5]])
     expected = place.clone()
     expected[2] = torch.tensor([0.0, 4.0, 2.5])
     assert_close(trilinear(table, place), expected)
-    around = trilinear(table, torch.tensor([[3.5, 0.0, -0.25]], dtype=torch.float64), (True, True, True))
-    assert_close(around, torch.tensor([[1.5, 0.0, 1.25]], dtype=torch.float64))
+    around = trilinear(table, double([[3.5, 0.0, -0.25]]), (True, True, True))
+    assert_close(around, double([[1.5, 0.0, 1.25]]))
 
 
 @pytest.mark.parametrize("wraps", [True, False])
@@ -293,10 +294,10 @@ def _gusts(**changes):
 
 def test_turbulence_is_carried_by_the_mean_wind():
     """Taylor: what is at x now is at x + U t later, whatever the modulations; the size follows from the speed."""
-    flow = torch.tensor([3.0, -4.0, 0.5], dtype=torch.float64)
+    flow = double([3.0, -4.0, 0.5])
     wind = WindField(flow.tolist(), effects=[_gusts()])
     place = torch.rand(50, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
-    now, later = (torch.tensor(t, dtype=torch.float64) for t in (0.3, 7.9))
+    now, later = (double(t) for t in (0.3, 7.9))
     first = wind.at(now, place)
     assert_close(wind.at(later, place + (later - now) * flow), first, rtol=0, atol=1e-10)
     assert (wind.at(later, place) - first).abs().max() > 0.5
@@ -313,7 +314,7 @@ def test_turbulence_has_its_intensity_at_places_and_times_anywhere():
     found = []
     for time in range(40):
         place = 8 * torch.rand(500, 3, dtype=torch.float64, generator=draw)
-        found.append(wind.at(torch.tensor(1.37 * time, dtype=torch.float64), place)[:, 1] - 6.0)
+        found.append(wind.at(double(1.37 * time), place)[:, 1] - 6.0)
     # one box of 8 x 4 x 4 lengths: its own variance, with its interpolation
     box = wind.effects[0]
     corners = trilinear(box.table, torch.rand(20_000, 3, dtype=torch.float64, generator=draw) * 128, (True,) * 3)
@@ -330,12 +331,12 @@ def test_the_box_comes_back_at_another_place():
         assert_close(axes @ axes.T, torch.eye(3, dtype=torch.float64))
         assert float(torch.linalg.det(axes)) == pytest.approx(1.0)
     direction = flow.double() / flow.norm()
-    assert_close(straight @ direction, torch.tensor([1.0, 0.0, 0.0], dtype=torch.float64))
+    assert_close(straight @ direction, double([1.0, 0.0, 0.0]))
     passed = tilted @ direction
     passed = passed * (sides[0] / passed[0])
-    assert_close(passed, torch.tensor([16.0, 0.382 * 8, 0.236 * 8], dtype=torch.float64))
+    assert_close(passed, double([16.0, 0.382 * 8, 0.236 * 8]))
     box_axes(torch.tensor([0.0, 0.0, -3.0]), sides, True)  # straight down
-    assert torch.equal(box_axes(torch.zeros(3), sides, False)[0], torch.tensor([1.0, 0.0, 0.0], dtype=torch.float64))
+    assert torch.equal(box_axes(torch.zeros(3), sides, False)[0], double([1.0, 0.0, 0.0]))
 
 
 @pytest.mark.parametrize("interpolation", ["step", "linear"])
@@ -346,7 +347,7 @@ def test_air_is_carried_by_a_changing_flow(interpolation):
     flows = wind.mean_flow(fine + 5e-4)
     sums = torch.cat([torch.zeros(1, 3), flows.cumsum(0) * 1e-3])
     assert_close(wind.carried(fine), sums[:-1], rtol=0, atol=1e-9)
-    one = torch.tensor(2.5, dtype=torch.float64)
+    one = double(2.5)
     assert_close(wind.carried(one), sums[2500], rtol=0, atol=1e-9)
     assert_close(WindField([1.0, 2.0, 3.0]).carried(one), 2.5 * torch.tensor([1.0, 2.0, 3.0]).double())
 
@@ -357,8 +358,8 @@ def test_a_field_that_does_not_repeat_goes_on_outside():
     field = CarriedField(table, [1.0, 0.5, 0.5], wraps=(True, False, False))
     field.along(torch.tensor([2.0, 0.0, 0.0]))
     still = torch.zeros(3, dtype=torch.float64)
-    place = torch.tensor([[0.0, -3.0, 0.0], [100.3, 0.25, 9.0], [0.0, 3.0, 0.0]], dtype=torch.float64)
+    place = double([[0.0, -3.0, 0.0], [100.3, 0.25, 9.0], [0.0, 3.0, 0.0]])
     found = field(torch.zeros(3), place, Moment(still[0], still, still))
-    assert_close(found[:, 0], torch.tensor([1.0, 3.0, 5.0], dtype=torch.float64))
+    assert_close(found[:, 0], double([1.0, 3.0, 5.0]))
     with pytest.raises(ValueError, match="Expected `table` of shape"):
         CarriedField(torch.zeros(4, 2, 2), [1.0] * 3)

@@ -4,6 +4,7 @@ import math
 
 import pytest
 import torch
+from shared import double
 from torch.testing import assert_close
 
 from gaussian_swaying import GaussianGust, SineSway, UniformGust, WindField
@@ -58,10 +59,10 @@ def test_sample_holds_for_its_interval_whatever_the_rounding():
 
 def test_sine_sways_the_largest_component_by_half():
     wind = WindField([-1.0, 0.2, 4.0], modulations=[SineSway(amplitude=0.5, period=2.0)])
-    assert_close(wind(0.5), torch.tensor([-1.0, 0.2, 6.0], dtype=torch.float64))
-    assert_close(wind(1.5), torch.tensor([-1.0, 0.2, 2.0], dtype=torch.float64))
+    assert_close(wind(0.5), double([-1.0, 0.2, 6.0]))
+    assert_close(wind(1.5), double([-1.0, 0.2, 2.0]))
     samples = wind(torch.arange(2000, dtype=torch.float64) * 1e-3)
-    assert_close(samples.mean(0), torch.tensor([-1.0, 0.2, 4.0], dtype=torch.float64), rtol=0, atol=1e-9)
+    assert_close(samples.mean(0), double([-1.0, 0.2, 4.0]), rtol=0, atol=1e-9)
 
 
 def test_modulations_compose_in_order():

@@ -4,7 +4,7 @@ import copy
 
 import pytest
 import torch
-from shared import solid
+from shared import double, solid
 from torch.testing import assert_close
 
 from gaussian_swaying import (
@@ -40,7 +40,7 @@ def _setting(batch=(), wind=GUSTS, formulation="total", **settings):
 
 def test_winds_are_those_of_the_start_of_each_substep():
     *_, load = _setting()
-    time = torch.tensor(0.01, dtype=torch.float64)
+    time = double(0.01)
     winds = load.winds(time, DT, 5)
     assert winds.shape == (5, 3)
     assert winds.dtype == torch.float64
@@ -51,7 +51,7 @@ def test_winds_are_those_of_the_start_of_each_substep():
 
 def test_each_scene_has_its_own_wind():
     *_, load = _setting(batch=(2,), wind=[GUSTS, RISING])
-    time = torch.tensor(DT, dtype=torch.float64)
+    time = double(DT)
     winds = load.winds(time, DT, 3)
     assert winds.shape == (3, 2, 1, 3)
     assert torch.equal(winds[:, 1, 0], torch.stack([RISING(time + k * DT) for k in range(3)]))
@@ -60,7 +60,7 @@ def test_each_scene_has_its_own_wind():
 @pytest.mark.parametrize("drag_step", ["explicit", "semi_implicit"])
 def test_force_is_that_on_the_deformed_patches(drag_step):
     _, state, load = _setting(drag_step=drag_step, C_L=0.4)
-    wind = torch.tensor([5.0, 0.0, 1.0], dtype=torch.float64)
+    wind = double([5.0, 0.0, 1.0])
     force, resistance = load.force(state, wind)
     normal, area = deform_patch(state.F_total, load.normal, load.area)
     assert (area / load.area - 1).abs().max() > 1e-4
@@ -78,7 +78,7 @@ def test_the_area_of_what_has_flowed_is_capped(drag_step):
     """Shear without end: the normal turns, the force stays that on so many times the area at rest."""
     _, state, free = _setting(drag_step=drag_step)
     load = WindForce(AeroForce(drag_step=drag_step, max_area_ratio=1.5), GUSTS, free.normal, free.area)
-    wind = torch.tensor([5.0, 0.0, 1.0], dtype=torch.float64)
+    wind = double([5.0, 0.0, 1.0])
     F = torch.eye(3, dtype=torch.float64).repeat(20, 1, 1)
     F[:10, 0, 1] = 3e4
     F[10:15, 0, 0] = 1.2
@@ -102,7 +102,7 @@ def test_gradients_through_a_capped_area_are_finite():
     F = torch.eye(3, dtype=torch.float64).repeat(20, 1, 1)
     F[:10, 0, 1] = 3e4
     F.requires_grad_()
-    force, _ = load.force(state.replace(F_total=F), torch.tensor([5.0, 0.0, 1.0], dtype=torch.float64))
+    force, _ = load.force(state.replace(F_total=F), double([5.0, 0.0, 1.0]))
     (found,) = torch.autograd.grad(force.square().sum(), F)
     assert torch.isfinite(found).all()
     assert found.abs().amax() > 0

@@ -2,6 +2,7 @@
 
 import pytest
 import torch
+from shared import double
 from torch.testing import assert_close
 
 from gaussian_swaying.air.collision import MOMENTS, collide, population, relaxation_time, sums
@@ -32,7 +33,7 @@ def test_populations_have_the_moments_that_made_them(moments):
 
 def test_third_moments_follow_the_recursion(moments):
     f = torch.stack([population(moments, k) for k in range(len(DIRECTIONS))])
-    c = torch.tensor(DIRECTIONS, dtype=DOUBLE)
+    c = double(DIRECTIONS)
     third = torch.einsum("ia,ib,ic,in->abcn", c, c, c, f)
     rho, u = 1 + moments[0], moments[1:4]
     xxy = rho * u[0] ** 2 * u[1] + u[1] * moments[4] + 2 * u[0] * moments[7]
@@ -48,7 +49,7 @@ def test_a_collision_keeps_mass_and_momentum_and_relaxes_the_stress(moments):
 
 
 def test_a_push_adds_momentum(moments):
-    push = torch.tensor([[0.01], [0.02], [-0.03]], dtype=DOUBLE)
+    push = double([[0.01], [0.02], [-0.03]])
     after = collide(*_split(moments), molecular=0.8, smagorinsky=0.0, push=push)
     assert_close(after[1:4], moments[1:4] + push)
 

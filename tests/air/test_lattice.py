@@ -2,12 +2,13 @@
 
 import pytest
 import torch
+from shared import double
 from torch.testing import assert_close
 
 from gaussian_swaying.air.lattice import DIRECTIONS, OPPOSITE, WEIGHTS, LatticeUnits
 
-C = torch.tensor(DIRECTIONS, dtype=torch.float64)
-W = torch.tensor(WEIGHTS, dtype=torch.float64)
+C = double(DIRECTIONS)
+W = double(WEIGHTS)
 
 
 def test_moments_of_the_weights_are_those_of_a_gas_at_rest():

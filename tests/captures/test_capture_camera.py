@@ -5,62 +5,32 @@ import math
 
 import pytest
 import torch
+from shared import double
 from torch.testing import assert_close
 
 from gaussian_swaying.captures.capture_camera import CaptureCamera, read_views
-from gaussian_swaying.geometry.rotations import rotation_to_quat
 from gaussian_swaying.rendering.cameras.camera import look_at_camera
 
-CENTER, UP = torch.zeros(3, dtype=torch.float64), torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)
-WIDTH, HEIGHT = 64, 48
-NAMES = ["c.png", "a.png", "b.png"]  # as the files have them, which is not their order
+CENTER, UP = torch.zeros(3, dtype=torch.float64), double([0.0, 0.0, 1.0])
+ANGLES = {"a.png": 0.0, "b.png": 0.25 * math.pi, "c.png": 0.5 * math.pi}
 
 
 def _cameras():
     """Camera of each name: a quarter of a circle."""
-    eyes = {"a.png": 0.0, "b.png": 45.0, "c.png": 90.0}
+    eyes = {name: (3 * math.cos(angle), 3 * math.sin(angle), 1) for name, angle in ANGLES.items()}
     return {
-        name: look_at_camera(
-            [3 * math.cos(math.radians(a)), 3 * math.sin(math.radians(a)), 1.0],
-            [0, 0, 0],
-            [0, 0, 1],
-            40.0,
-            WIDTH,
-            HEIGHT,
-            dtype=torch.float64,
-        )
-        for name, a in eyes.items()
+        name: look_at_camera(eye, (0, 0, 0), (0, 0, 1), 40.0, 64, 48, dtype=torch.float64) for name, eye in eyes.items()
     }
 
 
 @pytest.fixture(params=["transforms", "colmap"])
-def capture(request, tmp_path):
-    """A capture without its images."""
-    cameras = _cameras()
-    focal = float(cameras["a.png"].intrinsics[0, 0])
+def capture(request, tmp_path, capture_tools):
+    """A capture without its images, whose files have another order than the names."""
+    cameras = [_cameras()[name] for name in ("c.png", "a.png", "b.png")]
+    names, without = ["images/c.png", "images/a.png", "images/b.png"], {"images": False}
     if request.param == "transforms":
-        flip = torch.diag(torch.tensor([1.0, -1.0, -1.0, 1.0], dtype=torch.float64))
-        frames = [
-            {
-                "file_path": f"images/{name}",
-                "transform_matrix": (torch.linalg.inv(cameras[name].world_to_camera) @ flip).tolist(),
-            }
-            for name in NAMES
-        ]
-        (tmp_path / "transforms.json").write_text(
-            json.dumps({"fl_x": focal, "w": WIDTH, "h": HEIGHT, "frames": frames})
-        )
-        return tmp_path
-    model = tmp_path / "sparse" / "0"
-    model.mkdir(parents=True)
-    (model / "cameras.txt").write_text(f"1 PINHOLE {WIDTH} {HEIGHT} {focal} {focal} {WIDTH / 2} {HEIGHT / 2}\n")
-    lines = []
-    for k, name in enumerate(NAMES):
-        view = cameras[name].world_to_camera
-        pose = [*rotation_to_quat(view[:3, :3]).tolist(), *view[:3, 3].tolist()]
-        lines += [" ".join(map(str, [k + 1, *pose, 1, f"images/{name}"])), ""]
-    (model / "images.txt").write_text("\n".join(lines) + "\n")
-    return tmp_path
+        return capture_tools.transforms(tmp_path, cameras, names, **without)
+    return capture_tools.colmap(tmp_path, cameras, names, binary=False, **without)
 
 
 def _same(camera, expected):
@@ -85,7 +55,7 @@ def test_a_journey_meets_every_view_in_the_order_of_names(capture):
     between = path(0, 1.0, CENTER, UP, 1.0)
     rotation = between.world_to_camera[:3, :3]
     assert_close(rotation @ rotation.T, torch.eye(3, dtype=torch.float64), rtol=0, atol=1e-5)
-    seen = between.world_to_camera[:3] @ torch.tensor([0.0, 0.0, 0.0, 1.0], dtype=torch.float64)
+    seen = between.world_to_camera[:3] @ double([0.0, 0.0, 0.0, 1.0])
     assert abs(float(seen[0] / seen[2])) < 0.05  # it still looks about where both neighbours look
     assert 2.5 < between.position[:2].norm() < 3.0
 

@@ -4,7 +4,7 @@ import math
 
 import pytest
 import torch
-from shared import unit
+from shared import double, unit
 from torch.testing import assert_close
 
 from gaussian_swaying.gaussians import area
@@ -12,7 +12,7 @@ from gaussian_swaying.gaussians.area import coverage_area, patch_area
 from gaussian_swaying.geometry.rotations import quat_to_rotation
 from gaussian_swaying.kernels.launch import replaces
 
-UP = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)
+UP = double([0.0, 0.0, 1.0])
 
 
 def _plane(kind, side):
@@ -29,7 +29,7 @@ def _plane(kind, side):
 def _discs(count, area, overlap):
     """Flat splats of standard deviation overlap x spacing."""
     scale = math.log(overlap * math.sqrt(area / count))
-    return torch.tensor([scale, scale, scale - 3], dtype=torch.float64).expand(count, 3)
+    return double([scale, scale, scale - 3]).expand(count, 3)
 
 
 def _sum_on_plane(points, overlap=0.5, **kwargs):
@@ -156,10 +156,10 @@ def test_wild_input_stays_finite_and_positive():
 @pytest.mark.parametrize("neighbours", [6, 24])
 def test_the_kernel_of_the_cells_is_their_definition(neighbours, monkeypatch):
     """On a plane with borders, on several sheets, in clusters, on spikes, among stacked and lonely Gaussians."""
-    flat = torch.rand(300, 3, dtype=torch.float64) * torch.tensor([1.0, 0.6, 0.0], dtype=torch.float64)
+    flat = torch.rand(300, 3, dtype=torch.float64) * double([1.0, 0.6, 0.0])
     cluster = flat[:40] + 1e-3 * torch.randn(40, 3, dtype=torch.float64)
-    above = flat[100:200] + torch.tensor([0.0, 0.0, 0.03], dtype=torch.float64)
-    stack = flat[200:210] + torch.tensor([0.0, 0.0, 1e-9], dtype=torch.float64)
+    above = flat[100:200] + double([0.0, 0.0, 0.03])
+    stack = flat[200:210] + double([0.0, 0.0, 1e-9])
     means = torch.cat([flat, cluster, above, stack, 5 + 10 * torch.rand(7, 3, dtype=torch.float64)])
     normals = torch.tensor([0.0, 0.0, 1.0]) + 0.2 * torch.randn(len(means), 3, dtype=torch.float64)
     normals[-7:] = torch.eye(3)[torch.arange(7) % 3]

@@ -4,6 +4,7 @@ import math
 
 import pytest
 import torch
+from shared import double
 
 from gaussian_swaying.gaussians import connectivity
 from gaussian_swaying.gaussians.connectivity import pieces, shades
@@ -25,7 +26,7 @@ def sheet(seed, size=2.0, noise=0.15):
 
 def attached_pairs(points, *parts, normals=None):
     """The pairs, with noisy normals: by default those of horizontal sheets."""
-    own = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64).expand(len(points), 3) if normals is None else normals
+    own = double([0.0, 0.0, 1.0]).expand(len(points), 3) if normals is None else normals
     own = own + 0.3 * torch.randn(own.shape, generator=random(9), dtype=torch.float64)
     return connectivity.attached_pairs(points, own, *parts)
 
@@ -62,18 +63,18 @@ def book(angle):
     # the stem joins them below their edges
     z = torch.arange(0, 2.0, STEP / 2, dtype=torch.float64)
     stem = torch.stack([0 * z - STEP, z, 0 * z], -1)
-    around = torch.cat([stem + STEP * torch.tensor([0, 0, k], dtype=torch.float64) for k in range(-6, 7)])
-    shift = torch.tensor([0.0, 0.0, 6 * STEP], dtype=torch.float64)
+    around = torch.cat([stem + STEP * double([0, 0, k]) for k in range(-6, 7)])
+    shift = double([0.0, 0.0, 6 * STEP])
     points = torch.cat([turned[0] + shift, turned[1] - shift, around])
-    up = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)
+    up = double([0.0, 0.0, 1.0])
     facing = [(rotation(side * angle) @ up).expand(len(leaf), 3) for side in (-1, 1)]
-    normals = torch.cat([*facing, torch.tensor([[1.0, 0.0, 0.0]], dtype=torch.float64).expand(len(around), 3)])
+    normals = torch.cat([*facing, double([[1.0, 0.0, 0.0]]).expand(len(around), 3)])
     return points, normals, torch.tensor([0] * len(leaf) + [1] * len(leaf) + [2] * len(around))
 
 
 def rotation(angle):
     c, s = math.cos(angle), math.sin(angle)
-    return torch.tensor([[c, 0, s], [0, 1, 0], [-s, 0, c]], dtype=torch.float64)
+    return double([[c, 0, s], [0, 1, 0], [-s, 0, c]])
 
 
 def test_leaves_that_cross_are_cut_where_they_do(monkeypatch):
@@ -111,7 +112,7 @@ def test_pieces_are_joined_again_where_most_pairs_were_cut():
 def test_what_hangs_together_is_never_taken_off():
     """A sheet that stands on another one, and is attached to nothing else."""
     upright = sheet(1) @ rotation(math.pi / 2).T
-    points = torch.cat([sheet(0), upright + torch.tensor([1.0, 0.0, 2.1], dtype=torch.float64)])
+    points = torch.cat([sheet(0), upright + double([1.0, 0.0, 2.1])])
     normals = torch.eye(3, dtype=torch.float64)[[2, 0]].repeat_interleave(len(upright), 0)
     assert number_of_pieces(points, attached_pairs(points, normals=normals)) == 1
 

@@ -4,6 +4,7 @@ import math
 
 import pytest
 import torch
+from shared import double
 from torch.testing import assert_close
 
 from gaussian_swaying.gaussians.filling import (
@@ -76,7 +77,7 @@ def _bodies():
     """Points, normals, volume and area."""
     ball, hollow = _ball(0.5), _shell(_ball(0.5), _ball(0.25))
     torus = _torus(0.4, 0.15)
-    tilt = torch.tensor([[2.0, -1.0, 2.0], [2.0, 2.0, -1.0], [-1.0, 2.0, 2.0]], dtype=torch.float64) / 3
+    tilt = double([[2.0, -1.0, 2.0], [2.0, 2.0, -1.0], [-1.0, 2.0, 2.0]]) / 3
     box = _box((1.0, 0.8, 0.6))
     return {
         "ball": (*ball, math.pi / 6, math.pi),
@@ -100,8 +101,8 @@ def _fill(points, normals, spacing=H, sigma=0.6 * H, **settings):
 
 def test_density_of_one_gaussian_is_its_formula():
     """Also the blur, which keeps two of the three standard deviations."""
-    mean = torch.tensor([[0.31, 0.52, 0.47]], dtype=torch.float64)
-    scales = torch.tensor([0.08, 0.05, 0.002], dtype=torch.float64)
+    mean = double([[0.31, 0.52, 0.47]])
+    scales = double([0.08, 0.05, 0.002])
     q, _ = torch.linalg.qr(torch.rand(3, 3, dtype=torch.float64))
     cov = (q * scales**2) @ q.T
     low, n = torch.zeros(3, dtype=torch.float64), (20, 21, 22)

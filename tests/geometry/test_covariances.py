@@ -2,7 +2,7 @@
 
 import pytest
 import torch
-from shared import gradients, unit
+from shared import double, gradients, unit
 from torch.testing import assert_close
 
 from gaussian_swaying.geometry.covariances import (
@@ -49,7 +49,7 @@ def test_covariance_to_quat_scale_of_singular_and_equal_axes():
 
 def test_covariance_to_quat_scale_signs_follow_the_matrix():
     """A small change of the matrix may not flip an axis: frames of an animation would flicker."""
-    a = covariance(unit(100, 4), torch.tensor([0.0, -1.0, -2.0], dtype=torch.float64).expand(100, 3))
+    a = covariance(unit(100, 4), double([0.0, -1.0, -2.0]).expand(100, 3))
     q0, _ = covariance_to_quat_scale(a)
     q1, _ = covariance_to_quat_scale(a + 1e-9 * torch.eye(3, dtype=torch.float64))
     assert_close(q1, q0, rtol=0, atol=1e-6)
@@ -87,10 +87,7 @@ def test_gaussians_are_drawn_out_to_a_limit(device, dtype):
 
 def test_the_limit_on_stretch_is_reached_without_a_jump():
     rest = torch.eye(3, dtype=torch.float64)
-    close = [
-        limit_stretch(torch.diag(torch.tensor([a, 1.0, 1.0], dtype=torch.float64)), rest, 2.0)
-        for a in (10.0 - 1e-9, 10.0 + 1e-9)
-    ]
+    close = [limit_stretch(torch.diag(double([a, 1.0, 1.0])), rest, 2.0) for a in (10.0 - 1e-9, 10.0 + 1e-9)]
     assert_close(close[0], close[1], rtol=0, atol=1e-7)
 
 

@@ -5,6 +5,7 @@ import os
 
 import pytest
 import torch
+from shared import double
 from torch.testing import assert_close
 
 from gaussian_swaying.geometry import meshes
@@ -19,7 +20,7 @@ from gaussian_swaying.geometry.keyed_path import KeyedPath, between
 from gaussian_swaying.geometry.meshes import mesh_distance, read_mesh, triangle_distance
 from gaussian_swaying.geometry.rotations import rotation_of
 
-HALF = torch.tensor([0.3, 0.2, 0.5], dtype=torch.float64)
+HALF = double([0.3, 0.2, 0.5])
 SOLIDS = {
     "ball": lambda x: ball_distance(x, 0.4),
     "capsule": lambda x: capsule_distance(x, HALF, 0.1),
@@ -55,18 +56,18 @@ def test_the_middle_of_a_solid_has_a_normal():
 def test_a_grid_interpolates_and_extends():
     """A linear distance is exact within the grid; outside it grows with the distance from it."""
     axes = [torch.arange(n, dtype=torch.float64) * 0.25 - 0.5 for n in (5, 6, 7)]
-    direction = torch.tensor([0.48, 0.6, 0.64], dtype=torch.float64)
+    direction = double([0.48, 0.6, 0.64])
     nodes = torch.cartesian_prod(*axes)
     grid = DistanceGrid((nodes @ direction).reshape(5, 6, 7), torch.full((3,), -0.5, dtype=torch.float64), 0.25)
     place = _places(500) * torch.tensor([0.5, 0.5, 0.5])
     distance, normal = grid.at(place)
     assert_close(distance, place @ direction)
     assert_close(normal, direction.expand_as(normal))
-    beyond = torch.tensor([[3.5, 0.1, 0.1]], dtype=torch.float64)
+    beyond = double([[3.5, 0.1, 0.1]])
     distance, normal = grid_distance(beyond, grid.values, grid.origin, 0.25)
-    edge = torch.tensor([0.5, 0.1, 0.1], dtype=torch.float64)
+    edge = double([0.5, 0.1, 0.1])
     assert_close(distance, (edge @ direction)[None] + 3.0)
-    assert_close(normal, torch.tensor([[1.0, 0, 0]], dtype=torch.float64))
+    assert_close(normal, double([[1.0, 0, 0]]))
 
 
 CUBE_OBJ = """
@@ -204,7 +205,7 @@ def test_a_mesh_that_is_far_too_large(tmp_path, monkeypatch):
 def test_a_mesh_without_an_inside_is_refused(tmp_path):
     """Without a node inside, the material would pass through."""
     vertices, faces = read_mesh(_cube(tmp_path))
-    thin = torch.tensor([1.0, 1.0, 1e-3], dtype=torch.float64)
+    thin = double([1.0, 1.0, 1e-3])
     with pytest.raises(ValueError, match=r"encloses none of the nodes of its grid, 0\.125 apart"):
         mesh_distance(thin * vertices, faces, cells=16)
     for size, word in ((0.0, "no extent"), (1e308, "infinite")):
@@ -224,9 +225,9 @@ def test_distances_of_triangles_agree_with_samples():
 
 def test_the_distance_of_a_triangle_without_area_is_that_of_its_longest_side():
     a, c = torch.tensor([0.0, 0.0, 0.0]).double(), torch.tensor([2.0, 0.0, 0.0]).double()
-    place = torch.tensor([[-3.0, 4.0, 0.0], [0.5, 0.0, 2.0], [2.0, -3.0, 4.0]], dtype=torch.float64)
+    place = double([[-3.0, 4.0, 0.0], [0.5, 0.0, 2.0], [2.0, -3.0, 4.0]])
     between = torch.stack([a, 0.25 * c, c]).expand(3, 3, 3)
-    assert_close(triangle_distance(place, between), torch.tensor([5.0, 2.0, 5.0], dtype=torch.float64))
+    assert_close(triangle_distance(place, between), double([5.0, 2.0, 5.0]))
     at_a_point = torch.zeros(3, 3, 3, dtype=torch.float64)
     assert_close(triangle_distance(place, at_a_point), place.norm(dim=-1))
 
@@ -237,10 +238,10 @@ def test_a_path_is_straight_between_its_keys():
     )
     times, moves, turns = path.keys()
     for time, move, angle in ((-1, (0, 0, 0), 0), (0.5, (1, 0, 0), 45), (2.0, (2, 2, 0), 90), (9.0, (2, 4, 0), 90)):
-        now = torch.tensor(time, dtype=torch.float64)
-        assert_close(between(times, moves, now), torch.tensor(move, dtype=torch.float64))
-        x = rotation_of(between(times, turns, now)) @ torch.tensor([1.0, 0, 0], dtype=torch.float64)
-        radians = torch.deg2rad(torch.tensor(float(angle), dtype=torch.float64))
+        now = double(time)
+        assert_close(between(times, moves, now), double(move))
+        x = rotation_of(between(times, turns, now)) @ double([1.0, 0, 0])
+        radians = torch.deg2rad(double(float(angle)))
         assert_close(x[:2], torch.stack([radians.cos(), radians.sin()]))
     assert path.speed == 2.0
 

@@ -4,6 +4,7 @@ import dataclasses
 
 import pytest
 import torch
+from shared import double
 from torch.testing import assert_close
 
 from gaussian_swaying.geometry.frame import SimFrame
@@ -19,10 +20,10 @@ def _points(dtype=torch.float64):
 @pytest.mark.parametrize("up", UPS)
 def test_rotation_is_proper_and_takes_up_to_z(up):
     rotation = rotation_from_z(up).T
-    direction = torch.tensor(up, dtype=torch.float64)
+    direction = double(up)
     assert_close(rotation @ rotation.T, torch.eye(3, dtype=torch.float64), rtol=0, atol=1e-12)
     assert float(torch.linalg.det(rotation)) == pytest.approx(1.0)
-    expected = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)
+    expected = double([0.0, 0.0, 1.0])
     assert_close(rotation @ direction / direction.norm(), expected, rtol=0, atol=1e-8)
     # by the least angle that does so, the one between up and z
     assert float(rotation.trace()) == pytest.approx(1 + 2 * float(direction[2] / direction.norm()), abs=1e-8)

@@ -2,6 +2,7 @@
 
 import pytest
 import torch
+from shared import double
 from torch.testing import assert_close
 
 from gaussian_swaying.geometry.rigid import centre, fitted_gradient, rigid_velocity
@@ -22,7 +23,7 @@ def distances(place):
     return (place[:, :, None] - place[:, None]).norm(dim=-1)
 
 
-@pytest.mark.parametrize("dt", [1e-4, 1e-2, torch.tensor(0.03, dtype=torch.float64)])
+@pytest.mark.parametrize("dt", [1e-4, 1e-2, double(0.03)])
 def test_momenta_and_distances_stay(dt):
     """Also in turns of several degrees in a substep: the velocity leads along the chord."""
     moved = rigid_velocity(PLACE, VELOCITY, MASS, dt)
@@ -35,7 +36,7 @@ def test_momenta_and_distances_stay(dt):
 
 
 def test_a_rigid_motion_stays_as_it_is():
-    turn = 1e-3 * torch.tensor([1.0, 2.0, -0.5], dtype=torch.float64)
+    turn = 1e-3 * double([1.0, 2.0, -0.5])
     middle = centre(PLACE, MASS)
     velocity = ((PLACE - middle) @ rotation_of(turn).mT + middle - PLACE) / 1e-3 + torch.tensor([0.3, 0.0, 1.0])
     assert_close(rigid_velocity(PLACE, velocity, MASS, 1e-3), velocity, rtol=0, atol=1e-9)

@@ -3,6 +3,7 @@
 import math
 
 import torch
+from shared import double
 from torch.testing import assert_close
 
 from gaussian_swaying.geometry.surface_normals import neighbour_normals
@@ -15,7 +16,7 @@ def _sheet(count=6000, height=None):
     if height is not None:
         points[:, 2] = height(flat)
     noise = 0.1 * torch.randn(count, 3, generator=generator, dtype=torch.float64)
-    up = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)
+    up = double([0.0, 0.0, 1.0])
     return points, torch.nn.functional.normalize(up + noise, dim=-1)
 
 
@@ -48,7 +49,7 @@ def test_another_sheet_counts_little():
     points, _ = _sheet(4000)
     other = points[:, [2, 1, 0]]
     both = torch.cat([points, other])
-    up = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64).repeat(4000, 1)
+    up = double([0.0, 0.0, 1.0]).repeat(4000, 1)
     across = up[:, [2, 1, 0]]
     true = torch.cat([up, across])
     assert _degrees(neighbour_normals(both, true), true).max() < 1e-4

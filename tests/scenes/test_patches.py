@@ -4,6 +4,7 @@ import math
 
 import pytest
 import torch
+from shared import double
 from torch.testing import assert_close
 
 from gaussian_swaying.gaussians.model import GaussianSurfaceModel
@@ -79,7 +80,7 @@ def test_a_pot_holds_its_earth():
 def test_a_linear_map_keeps_edges_and_normals_true():
     """Stretched by a matrix M, areas of a plane grow by |cof(M) n| and normals follow M^-T n."""
     patches = disc((0.0, 0.0, 0.0), 1.0, 0.3)
-    matrix = torch.tensor([[1.0, 0.4, 0.0], [0.0, 2.0, 0.3], [0.5, 0.0, 1.0]], dtype=torch.float64)
+    matrix = double([[1.0, 0.4, 0.0], [0.0, 2.0, 0.3], [0.5, 0.0, 1.0]])
     mapped = patches.mapped(matrix, (1.0, 0.0, 0.0))
     cofactor = torch.linalg.det(matrix) * torch.linalg.inv(matrix).mT @ torch.tensor([0.0, 0.0, 1.0]).double()
     assert_close(mapped.area, patches.area * cofactor.norm())
@@ -88,10 +89,10 @@ def test_a_linear_map_keeps_edges_and_normals_true():
 
 def test_copies_turn_and_tint_the_template():
     template = disc((0.0, 0.0, 0.0), 0.1, 0.05, (0.5, 0.5, 0.5))
-    up = torch.tensor([[0.0, 0.0, 1.0], [0.0, -1.0, 0.0]], dtype=torch.float64)
-    axes = facing(torch.tensor([[0.0, 1.0, 0.0], [0.0, 0.0, 1.0]], dtype=torch.float64), up)
+    up = double([[0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
+    axes = facing(double([[0.0, 1.0, 0.0], [0.0, 0.0, 1.0]]), up)
     assert_close(torch.linalg.det(axes), torch.ones(2, dtype=torch.float64))
-    tint = torch.tensor([[1.0, 1.0, 1.0], [0.5, 1.0, 2.0]], dtype=torch.float64)
+    tint = double([[1.0, 1.0, 1.0], [0.5, 1.0, 2.0]])
     both = copies(template, axes, torch.tensor([1.0, 2.0]).double(), torch.zeros(2, 3).double(), tint)
     first, second = both.area.reshape(2, -1)
     assert_close(second, 4 * first)
@@ -125,8 +126,8 @@ def test_random_numbers_follow_the_seed():
 def test_a_curve_of_bezier_meets_its_ends():
     points = [[0.0, 0.0, 0.0], [1.0, 2.0, 0.0], [3.0, 0.0, 1.0]]
     curve = bezier(points, 11)
-    assert_close(curve[[0, -1]], torch.tensor(points, dtype=torch.float64)[[0, -1]])
-    assert_close(curve[5], torch.tensor([1.25, 1.0, 0.25], dtype=torch.float64))
+    assert_close(curve[[0, -1]], double(points)[[0, -1]])
+    assert_close(curve[5], double([1.25, 1.0, 0.25]))
 
 
 def test_revolution_of_a_slanted_line_is_a_cone():

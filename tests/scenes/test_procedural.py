@@ -41,12 +41,6 @@ def test_size_and_place():
     assert cloud.means[:, 1].abs().max() <= 0.003
 
 
-def test_the_same_arguments_give_the_same_splat():
-    one, two = (FlagScene(spacing=0.1).generate() for _ in range(2))
-    for name in ("means", "quats", "scales", "opacities", "sh"):
-        assert torch.equal(getattr(one, name), getattr(two, name)), name
-
-
 def test_yaw_turns_the_flag_about_its_pole():
     """Centres and normals turn by the same angle, counter-clockwise from above; the pole side stays."""
     plain, turned = (FlagScene(spacing=0.1, ripple=0.03, yaw=yaw).generate() for yaw in (0.0, -35.0))

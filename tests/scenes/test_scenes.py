@@ -28,18 +28,25 @@ FIELDS = ("means", "quats", "scales", "opacities", "sh", "normals")
 
 @pytest.mark.parametrize("scene", SCENES)
 def test_a_scene_is_a_usable_splat(scene):
-    """Of the promised number of Gaussians, finite, opaque, in colours, with unit normals along the smallest axes."""
+    """Of the promised number of Gaussians, finite, opaque, in colours, with unit normals along the smallest axes.
+
+    With the coarsest spacing that is allowed there are still Gaussians in every part.
+    """
     cloud = scene().generate()
     assert 20_000 <= len(cloud) <= 200_000
-    assert all(bool(torch.isfinite(getattr(cloud, name)).all()) for name in FIELDS)
+    assert all(torch.isfinite(getattr(cloud, name)).all() for name in FIELDS)
     assert_close(cloud.normals.norm(dim=-1), torch.ones(len(cloud)), atol=1e-5, rtol=0)
-    own = GaussianSurfaceModel.from_cloud(cloud, requires_grad=False).normals()
-    assert (own * cloud.normals).sum(-1).min() > 0.999
+    model = GaussianSurfaceModel.from_cloud(cloud, requires_grad=False)
+    assert (model.normals() * cloud.normals).sum(-1).min() > 0.999
     assert cloud.opacities.sigmoid().min() > 0.9
-    colours = GaussianSurfaceModel.from_cloud(cloud, requires_grad=False).colors(torch.tensor([0.0, 1.0, 0.0]))
+    colours = model.colors(torch.tensor([0.0, 1.0, 0.0]))
     assert colours.min() >= -1e-6
     assert colours.max() <= 1 + 1e-6
     assert colours.std(0).min() > 0.02
+    coarse = scene(spacing=0.2).generate().means
+    assert 1.3 * len(coarse) < len(cloud)
+    for side in (torch.amin, torch.amax):
+        assert (side(coarse, 0) - side(cloud.means, 0)).abs().max() < 0.25
 
 
 @pytest.mark.parametrize("scene", SCENES)
@@ -47,28 +54,9 @@ def test_the_same_arguments_give_the_same_splat(scene):
     one, two = (scene(spacing=0.05).generate() for _ in range(2))
     for name in FIELDS:
         assert torch.equal(getattr(one, name), getattr(two, name)), name
-
-
-@pytest.mark.parametrize("scene", [AlocasiaScene, FicusScene, LeavesScene, SandScene, VaseScene])
-def test_the_seed_changes_the_splat(scene):
-    one, two = (scene(spacing=0.05, seed=seed).generate() for seed in (0, 1))
-    assert len(one) != len(two) or not torch.equal(one.means, two.means)
-
-
-@pytest.mark.parametrize("scene", SCENES)
-def test_half_the_spacing_gives_up_to_eight_times_the_gaussians(scene):
-    """Four times on surfaces, eight inside; less where a leaf, a tube or a wall keeps its least number."""
-    coarse, fine = (len(scene(spacing=spacing).generate()) for spacing in (0.02, 0.01))
-    assert 1.3 < fine / coarse < 8.5
-
-
-@pytest.mark.parametrize("scene", SCENES)
-def test_even_a_coarse_scene_keeps_its_size(scene):
-    """With the coarsest spacing that is allowed there are still Gaussians in every part."""
-    low, high = (getattr(scene().generate().means, side)(0) for side in ("amin", "amax"))
-    coarse = scene(spacing=0.2).generate().means
-    assert (coarse.amin(0) - low).abs().max() < 0.25
-    assert (coarse.amax(0) - high).abs().max() < 0.25
+    if scene is not TelephoneScene:
+        other = scene(spacing=0.05, seed=1).generate()
+        assert len(one) != len(other) or not torch.equal(one.means, other.means)
 
 
 def test_the_leaves_cover_the_area_of_their_outlines(leaf_area):
@@ -157,8 +145,6 @@ def test_a_stand_lies_outside_the_box_of_its_flag(stand):
     assert (rest - free).norm(dim=-1).min() > 0.05
     turned = FlagOnStandScene(**sizes, stand=stand, yaw=90.0).generate().means
     assert_close(turned[:, 1], cloud.means[:, 0], atol=1e-5, rtol=0)
-    with pytest.raises(ValueError, match=r"generator\.stand"):
-        FlagOnStandScene(stand="hand")
 
 
 def test_a_floor_runs_into_the_sky_and_bears_a_shadow():
@@ -189,23 +175,19 @@ def test_ups_are_up():
     assert float(SandScene(spacing=0.05).generate().means[:, 2].min()) == pytest.approx(-0.08, abs=1e-6)
 
 
-@pytest.mark.parametrize("scene", SCENES)
-@pytest.mark.parametrize("value", [0.0, -1.0, float("nan"), 0.3])
-def test_a_bad_spacing_is_refused(scene, value):
-    with pytest.raises(ValueError, match=r"generator\.spacing"):
-        scene(spacing=value)
-
-
 @pytest.mark.parametrize(
     ("scene", "name", "value"),
     [
+        *((scene, "spacing", value) for scene in SCENES for value in (0.0, -1.0, math.nan, 0.3)),
         (FicusScene, "leaves", 0),
         (LeavesScene, "leaves", 2),
         (AlocasiaScene, "leaves", -1),
+        (AlocasiaScene, "clear_floor", -1.0),
         (VaseScene, "flowers", 0),
         (TelephoneScene, "turns", 0),
         (SandScene, "slope", 0.0),
         (SandScene, "slope", 80.0),
+        (FlagOnStandScene, "stand", "hand"),
     ],
 )
 def test_bad_arguments_are_refused(scene, name, value):
@@ -256,5 +238,3 @@ def test_a_clear_floor_is_fine_and_has_no_shadows():
     (shaded, wide), (plain, small) = found
     assert plain < 0.05 < 0.15 < shaded
     assert small < 0.04 < 0.08 < wide
-    with pytest.raises(ValueError, match=r"`generator\.clear_floor` to not be negative"):
-        AlocasiaScene(clear_floor=-1.0)

@@ -87,20 +87,6 @@ def test_opacities_are_reset_only_if_asked_for():
         assert float(model.opacity().detach().max()) == pytest.approx(0.01 if reset else 0.5, rel=0.01)
 
 
-def test_state_goes_through_a_dictionary():
-    model = _model()
-    optimizer = _optimizer(model)
-    one = DefaultDensification(start=0, every=100)
-    one.attach(model, optimizer, 1.0)
-    one.after_step(1, _screen([2.0], [3]))
-    two = DefaultDensification(start=0, every=100)
-    two.load_state_dict(one.state_dict())
-    two.attach(model, optimizer, 1.0)
-    for densification in (one, two):
-        densification.after_step(2, _screen([1.0], [3]))
-    assert torch.equal(one.state_dict()["grad2d"], two.state_dict()["grad2d"])
-
-
 def test_what_needs_cuda_says_so():
     model = _model()
     with pytest.raises(ValueError, match=r"MCMCDensification needs CUDA.*use DefaultDensification"):

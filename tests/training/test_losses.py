@@ -4,6 +4,7 @@ import math
 
 import pytest
 import torch
+from shared import double
 from torch.testing import assert_close
 
 from gaussian_swaying.metrics.ssim import ssim_map
@@ -69,11 +70,11 @@ def _of_each(loss, values):
 @pytest.mark.parametrize("order", [[0, 1, 2], [2, 0, 1], [1, 2, 0], [2, 1, 0]])
 def test_anisotropy_by_hand(order):
     """The paper's ratio leaves discs alone, PhysGaussian's does not."""
-    scales = torch.tensor([[0.3, 0.2, 0.001], [0.2, 0.2, 0.001], [0.21, 0.2, 0.2]], dtype=torch.float64)[:, order].log()
+    scales = double([[0.3, 0.2, 0.001], [0.2, 0.2, 0.001], [0.21, 0.2, 0.2]])[:, order].log()
     literal = _of_each(anisotropy_loss, scales)
-    assert_close(literal, torch.tensor([0.4, 0.0, 0.0], dtype=torch.float64))
+    assert_close(literal, double([0.4, 0.0, 0.0]))
     spread = _of_each(lambda one: anisotropy_loss(one, ratio="max_min"), scales)
-    assert_close(spread, torch.tensor([298.9, 198.9, 0.0], dtype=torch.float64))
+    assert_close(spread, double([298.9, 198.9, 0.0]))
     assert_close(anisotropy_loss(scales), literal.mean())
     assert_close(anisotropy_loss(scales, reduction="sum"), literal.sum())
 
@@ -81,7 +82,7 @@ def test_anisotropy_by_hand(order):
 def test_entropy_by_hand():
     values = torch.tensor([0.0, 1.0, 0.5, 1 / math.e], dtype=torch.float64, requires_grad=True)
     result = _of_each(opacity_entropy_loss, values)
-    expected = torch.tensor([0.0, 0.0, 0.5 * math.log(2), 1 / math.e], dtype=torch.float64)
+    expected = double([0.0, 0.0, 0.5 * math.log(2), 1 / math.e])
     assert_close(result, expected, rtol=1e-9, atol=2e-6)
     result.sum().backward()
     assert torch.isfinite(values.grad).all()
@@ -90,8 +91,8 @@ def test_entropy_by_hand():
 
 
 def test_size_by_hand():
-    scales = torch.tensor([[0.001, 0.010, 0.002], [0.008, 0.001, 0.001]], dtype=torch.float64).log()
-    assert_close(_of_each(size_loss, scales), torch.tensor([0.002, 0.0], dtype=torch.float64))
+    scales = double([[0.001, 0.010, 0.002], [0.008, 0.001, 0.001]]).log()
+    assert_close(_of_each(size_loss, scales), double([0.002, 0.0]))
     assert size_loss(scales, b=0.0).item() == pytest.approx(0.009)
 
 

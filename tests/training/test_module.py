@@ -161,19 +161,25 @@ class _StopAt(lightning.Callback):
         trainer.should_stop = trainer.should_stop or trainer.global_step >= self.step
 
 
-def test_a_checkpoint_can_be_read_alone_and_tested(data, make_trainer, tmp_path):
-    module = _module()
-    trainer = make_trainer(10, enable_checkpointing=True, callbacks=[_checkpoints(tmp_path)])
+def test_a_checkpoint_is_evaluated_as_it_was_in_training(data, make_trainer, tmp_path):
+    """With the harmonics that were in use, and panels that bear its step."""
+    path, on = tmp_path / "step=10.ckpt", {"limit_val_batches": 1.0, "val_check_interval": 10}
+    options = {"sh_every": 6, "panels": 1}
+    module = _module(**options)
+    trainer = make_trainer(10, "first", enable_checkpointing=True, callbacks=[_checkpoints(tmp_path)], **on)
     trainer.fit(module, data)
-    path = tmp_path / "step=10.ckpt"
+    trained = trainer.callback_metrics["val/psnr"]
     loaded = SplatTrainer.load_from_checkpoint(path, sh_degree=1, weights_only=False)
     assert torch.equal(loaded.splat.means, module.splat.means)
-    results = [
-        make_trainer(1, folder="test").test(_module(), data, ckpt_path=path, weights_only=False, verbose=False)[0],
-        make_trainer(1, folder="test").test(module, data, verbose=False)[0],
-    ]
-    assert results[0]["test/gaussians"] == len(module.splat)
-    assert results[0] == results[1]
+    again = _module(**options)
+    given = {"ckpt_path": path, "weights_only": False, "verbose": False}
+    (found,) = make_trainer(10, **on).validate(again, data, **given)
+    assert found["val/psnr"] == pytest.approx(float(trained), abs=1e-5)
+    assert again.active_degree(9) == 1
+    assert [path.name for path in (tmp_path / "run" / "panels").glob("*.png")] == ["val_00_000010.png"]
+    (tested,) = make_trainer(1).test(_module(**options), data, **given)
+    assert tested == make_trainer(1).test(module, data, verbose=False)[0]
+    assert tested["test/gaussians"] == len(module.splat)
     with pytest.raises(ValueError, match="`sh_degree` 1, but the configuration says 2"):
         SplatTrainer.load_from_checkpoint(path, sh_degree=2, weights_only=False)
 
@@ -252,22 +258,6 @@ def test_a_training_on_a_gpu(kind, data, make_trainer, tmp_path):
     path = tmp_path / "step=100.ckpt"
     make_trainer(200, **on_gpu).fit(again, data, ckpt_path=path, weights_only=False)
     assert again.trainer.global_step == 200
-
-
-def test_a_checkpoint_is_validated_as_it_was_in_training(data, make_trainer, tmp_path):
-    """With the harmonics that were in use, and panels that bear its step."""
-    options = {"sh_every": 6, "panels": 1}
-    on = {"limit_val_batches": 1.0, "val_check_interval": 10}
-    trainer = make_trainer(10, enable_checkpointing=True, callbacks=[_checkpoints(tmp_path, every=10)], **on)
-    trainer.fit(_module(**options), data)
-    trained = float(trainer.callback_metrics["val/psnr"])
-    again = _module(**options)
-    found = make_trainer(10, **on).validate(
-        again, data, ckpt_path=tmp_path / "step=10.ckpt", weights_only=False, verbose=False
-    )[0]
-    assert found["val/psnr"] == pytest.approx(trained, abs=1e-5)
-    assert again.active_degree(9) == 1
-    assert [path.name for path in (tmp_path / "run" / "panels").glob("*.png")] == ["val_00_000010.png"]
 
 
 def test_what_cannot_be_trained_is_refused(data, make_trainer):

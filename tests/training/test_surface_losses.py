@@ -6,6 +6,7 @@ from functools import cache
 import pytest
 import torch
 from lightning.pytorch.loggers import Logger
+from shared import double
 from torch.testing import assert_close
 
 from gaussian_swaying.captures.capture import neighbouring_views
@@ -107,7 +108,7 @@ def test_round_trips_end_where_they_began_on_the_true_surface_and_elsewhere_off_
     """Off by h along the view, a point comes back beside itself by about f h tan(angle) / z."""
     camera, other = _camera(0.6), _camera(0.9)
     beside = OtherView(_photo(0.9, 0.4), other, _plane(other))
-    pixel = torch.tensor([[96.0, 96.0], [90.3, 102.1]], dtype=torch.float64)
+    pixel = double([[96.0, 96.0], [90.3, 102.1]])
     depth = sample(_plane(camera).depth, pixel)
     apart, seen = round_trip(pixel, depth, camera, beside)
     assert seen.all()
@@ -147,7 +148,7 @@ def test_a_round_trip_needs_a_surface_at_every_neighbour_of_its_pixel(share):
     there = OtherView(
         _photo(0.6, 0.4), camera, SurfaceMaps(plane.normal, plane.unit, plane.distance, plane.depth, known)
     )
-    pixel = torch.tensor([[50.5 + share, 90.5]], dtype=torch.float64)
+    pixel = double([[50.5 + share, 90.5]])
     apart, seen = round_trip(pixel, sample(plane.depth, pixel), camera, there)
     assert bool(seen) == (share == 0.0)
     if share == 0.0:
@@ -155,7 +156,7 @@ def test_a_round_trip_needs_a_surface_at_every_neighbour_of_its_pixel(share):
 
 
 def test_a_round_trip_needs_a_pixel_of_the_other_picture():
-    camera, pixel = _camera(0.6), torch.tensor([[50.5, 90.5]], dtype=torch.float64)
+    camera, pixel = _camera(0.6), double([[50.5, 90.5]])
     aside = look_at_camera((0.8, -1.6, 0.4), (1.4, 0.0, 0.4), (0.0, 0.0, 1.0), 30.0, SIZE, SIZE, dtype=torch.float64)
     depth = sample(_plane(camera).depth, pixel)
     assert not round_trip(pixel, depth, camera, OtherView(_photo(0.6, 0.4), aside, _plane(aside)))[1]
@@ -179,7 +180,7 @@ def test_only_patches_that_both_pictures_show_are_compared():
     wide = torch.rand(48, 72, 1, generator=torch.Generator().manual_seed(0)).double().expand(48, 72, 3)
     own, moved = wide[:, :64], wide[:, 8:].clone()
     depth = torch.full((48, 64, 1), 2.0, dtype=torch.float64)
-    unit = torch.tensor([0.0, 0.0, -1.0], dtype=torch.float64).expand(48, 64, 3)
+    unit = double([0.0, 0.0, -1.0]).expand(48, 64, 3)
     wall = SurfaceMaps(unit, unit, -depth, depth, torch.ones_like(depth, dtype=torch.bool))
     term = MultiViewPhotometricLoss(start=0, samples=10_000)
 
@@ -197,7 +198,7 @@ def test_only_patches_that_both_pictures_show_are_compared():
 def test_derivatives_against_finite_differences():
     camera, inputs = _camera(0.6), _inputs()
     other = inputs.other
-    pixel = torch.tensor([[40.5, 47.5], [55.5, 41.5], [50.5, 60.5]], dtype=torch.float64)
+    pixel = double([[40.5, 47.5], [55.5, 41.5], [50.5, 60.5]])
 
     def trips(depth):
         return round_trip(pixel, depth, camera, other)[0]
