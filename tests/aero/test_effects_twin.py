@@ -83,6 +83,12 @@ def _bodies(device, formulation, wind, batch=(), groups=False, transfer="kernels
     return solver, solver.init_state(points, velocity), load
 
 
+def _pair(device, formulation, wind, **options):
+    """The solver with kernels and that in torch, a state, and the load of a wind that a function makes."""
+    solver, state, load = _bodies(device, formulation, wind(), **options)
+    return solver, _bodies(device, formulation, wind(), transfer="torch", **options)[0], state, load
+
+
 def _same(found, expected):
     for name in ("position", "velocity", "F_total"):
         a, b = getattr(found, name), getattr(expected, name)
@@ -103,9 +109,8 @@ WINDS = ("log", "power", "plume", "turbulence", "all", "sheltered", "half", "hel
     indirect=["kernel_device"],
 )
 def test_the_kernels_blow_as_torch_does(kernel_device, formulation, name):
-    solver, state, load = _bodies(kernel_device, formulation, _wind(name))
+    solver, reference, state, load = _pair(kernel_device, formulation, lambda: _wind(name))
     assert load.twin() is not None
-    reference, _, _ = _bodies(kernel_device, formulation, _wind(name), transfer="torch")
     load.refresh(state)
     found, expected = solver.rollout(state, DT, 6, load), reference.rollout(state, DT, 6, load)
     _same(found, expected)
@@ -120,8 +125,8 @@ def test_the_kernels_blow_as_torch_does(kernel_device, formulation, name):
 @pytest.mark.parametrize("formulation", ["total", "updated"])
 def test_the_kernels_blow_on_groups_of_patches_and_batches(kernel_device, formulation):
     for options in ({"groups": True}, {"batch": (2,)}):
-        solver, state, load = _bodies(kernel_device, formulation, _wind("all"), **options, drag_step="semi_implicit")
-        reference, _, _ = _bodies(kernel_device, formulation, _wind("all"), transfer="torch", **options)
+        options |= {"drag_step": "semi_implicit"}
+        solver, reference, state, load = _pair(kernel_device, formulation, lambda: _wind("all"), **options)
         assert load.twin() is not None
         assert (load.sums is not None) == ("groups" in options)
         _same(solver.rollout(state, DT, 4, load), reference.rollout(state, DT, 4, load))
@@ -129,8 +134,7 @@ def test_the_kernels_blow_on_groups_of_patches_and_batches(kernel_device, formul
 
 def test_a_changed_effect_is_read_again_at_the_same_address(kernel_device):
     """A table changed in place, another flow, and rollouts that are replayed from graphs on a GPU."""
-    solver, state, load = _bodies(kernel_device, "total", _wind("half"))
-    reference, _, _ = _bodies(kernel_device, "total", _wind("half"), transfer="torch")
+    solver, reference, state, load = _pair(kernel_device, "total", lambda: _wind("half"))
     ends, where = [], None
     for change in range(4):
         if change == 2:
@@ -175,8 +179,7 @@ def test_the_last_place_of_a_table_that_repeats(kernel_device):
     """Places just below zero round up to the length of the table in float32."""
     table = torch.arange(4.0).repeat_interleave(12).reshape(4, 2, 2, 3)
     wind = WindField([0.0, 0.0, 0.0], effects=[CarriedField(table, [1.0] * 3, anchor=[-1e-9, 0.0, 0.0])])
-    solver, state, load = _bodies(kernel_device, "total", wind)
-    reference, _, _ = _bodies(kernel_device, "total", wind, transfer="torch")
+    solver, reference, state, load = _pair(kernel_device, "total", lambda: wind)
     _same(solver.rollout(state, DT, 2, load), reference.rollout(state, DT, 2, load))
 
 
@@ -191,8 +194,7 @@ def _recorded(tmp_path):
 def test_winds_at_later_times(kernel_device, name, tmp_path):
     """On a GPU inside the recorded graphs: the third rollout is replayed. A recorded wind runs in torch."""
     wind = _recorded(tmp_path) if name == "recorded" else _wind(name)
-    solver, state, load = _bodies(kernel_device, "total", wind)
-    reference, _, _ = _bodies(kernel_device, "total", wind, transfer="torch")
+    solver, reference, state, load = _pair(kernel_device, "total", lambda: wind)
     assert (load.twin() is not None) == (name != "recorded")
     assert load.recordable
     for _ in range(3):
