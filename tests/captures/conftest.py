@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import torch
 
+from gaussian_swaying.geometry.rotations import rotation_to_quat
 from gaussian_swaying.rendering.cameras.camera import look_at_camera
 
 MODELS = {"SIMPLE_PINHOLE": 0, "PINHOLE": 1, "SIMPLE_RADIAL": 2, "RADIAL": 3, "OPENCV": 4, "OPENCV_FISHEYE": 5}
@@ -49,22 +50,6 @@ def write_transforms(folder, poses, names, channels=3, file="transforms.json", i
     return folder
 
 
-def quaternion(matrix):
-    """Unit quaternion wxyz of a rotation, by the eigenvector of the largest eigenvalue (Bar-Itzhack 2000)."""
-    m = matrix.numpy()
-    k = np.array(
-        [
-            [m[0, 0] - m[1, 1] - m[2, 2], 0, 0, 0],
-            [m[1, 0] + m[0, 1], m[1, 1] - m[0, 0] - m[2, 2], 0, 0],
-            [m[2, 0] + m[0, 2], m[2, 1] + m[1, 2], m[2, 2] - m[0, 0] - m[1, 1], 0],
-            [m[2, 1] - m[1, 2], m[0, 2] - m[2, 0], m[1, 0] - m[0, 1], m[0, 0] + m[1, 1] + m[2, 2]],
-        ]
-    )
-    _, vectors = np.linalg.eigh(k)  # reads the lower triangle
-    x, y, z, w = vectors[:, -1]
-    return [w, x, y, z]
-
-
 POINTS = [((0.5, -0.25, 1.5), (255, 0, 51)), ((0.0, 0.1, 0.2), (0, 102, 255)), ((1.0, 2.0, 3.0), (9, 8, 7))]
 
 
@@ -77,7 +62,7 @@ def write_colmap(
     width, height = poses[0].width, poses[0].height
     fx, fy = (float(poses[0].intrinsics[i, i]) for i in range(2))
     parameters = [fx, fy, 0.5 * width, 0.5 * height] if parameters is None else parameters
-    rows = [[*quaternion(c.world_to_camera[:3, :3]), *c.world_to_camera[:3, 3].tolist()] for c in poses]
+    rows = [[*rotation_to_quat(c.world_to_camera[:3, :3]).tolist(), *c.world_to_camera[:3, 3].tolist()] for c in poses]
     if binary:
         data = struct.pack("<QiiQQ", 1, 7, MODELS[model], width, height) + struct.pack(
             f"<{len(parameters)}d", *parameters

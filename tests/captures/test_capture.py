@@ -25,6 +25,16 @@ def _same_camera(found, expected, atol=1e-6):
     assert (found.width, found.height) == (expected.width, expected.height)
 
 
+@pytest.fixture
+def written(tmp_path, capture_tools):
+    """A folder with a transforms.json of some cameras and their images."""
+
+    def write(count=3, **fields):
+        return capture_tools.transforms(tmp_path, capture_tools.cameras(count), _names(count), **fields)
+
+    return write
+
+
 # ---- transforms.json
 
 
@@ -63,8 +73,8 @@ def test_blender_files_without_extensions_and_sizes(tmp_path, capture_tools):
     assert capture.split("val")[0].load().shape == (16, 20, 4)
 
 
-def test_intrinsics_of_a_frame_win_and_the_principal_point_is_kept(tmp_path, capture_tools):
-    capture_tools.transforms(tmp_path, capture_tools.cameras(3), _names(3), fl_x=18.0, fl_y=19.0, w=20, h=16, cx=9.0)
+def test_intrinsics_of_a_frame_win_and_the_principal_point_is_kept(tmp_path, written):
+    written(fl_x=18.0, fl_y=19.0, w=20, h=16, cx=9.0)
     data = json.loads((tmp_path / "transforms.json").read_text())
     data["frames"][1] |= {"fl_x": 30.0, "cy": 7.0}
     (tmp_path / "transforms.json").write_text(json.dumps(data))
@@ -77,8 +87,8 @@ def test_intrinsics_of_a_frame_win_and_the_principal_point_is_kept(tmp_path, cap
     assert [float(zoomed[0, 0]), float(zoomed[1, 1])] == pytest.approx([40.0, 40.0])
 
 
-def test_frames_without_an_image_are_counted_once(tmp_path, capture_tools):
-    capture_tools.transforms(tmp_path, capture_tools.cameras(6), _names(6))
+def test_frames_without_an_image_are_counted_once(tmp_path, written):
+    written(6)
     for index in (1, 4):
         (tmp_path / f"images/{index:03d}.png").unlink()
     with warnings.catch_warnings(record=True) as caught:
@@ -89,8 +99,8 @@ def test_frames_without_an_image_are_counted_once(tmp_path, capture_tools):
     assert [view.name[-7:-4] for view in capture.views] == ["000", "002", "003", "005"]
 
 
-def test_an_image_with_another_extension_is_found(tmp_path, capture_tools):
-    capture_tools.transforms(tmp_path, capture_tools.cameras(2), _names(2))
+def test_an_image_with_another_extension_is_found(tmp_path, written):
+    written(2)
     data = (tmp_path / "transforms.json").read_text().replace(".png", ".jpg").replace("images/", "images\\\\")
     (tmp_path / "transforms.json").write_text(data)
     assert [view.image_path.name for view in read_capture(tmp_path, test_every=0).views] == ["000.png", "001.png"]
@@ -103,9 +113,9 @@ def test_lists_of_file_names_are_the_split(tmp_path, capture_tools):
     assert [view.split for view in read_capture(tmp_path).views] == ["train", "train", "val", "test"]
 
 
-def test_distortion_is_taken_out(tmp_path, capture_tools):
+def test_distortion_is_taken_out(tmp_path, written):
     lens = {"fl_x": 20.0, "w": 20, "h": 16, "k1": 0.3, "p2": 0.01}
-    capture_tools.transforms(tmp_path, capture_tools.cameras(2), _names(2), **lens)
+    written(2, **lens)
     view = read_capture(tmp_path, test_every=0).views[0]
     assert view.lens.distortion == (0.3, 0.0, 0.0, 0.01, 0.0)
     seen = view.lens.undistorted()
@@ -114,8 +124,8 @@ def test_distortion_is_taken_out(tmp_path, capture_tools):
     assert_close(view.camera.intrinsics, seen.intrinsics().float())
 
 
-def test_points_of_a_transforms_capture(tmp_path, capture_tools):
-    capture_tools.transforms(tmp_path, capture_tools.cameras(3), _names(3))
+def test_points_of_a_transforms_capture(tmp_path, written):
+    written()
     rows = np.array([(1, 2, 3, 255, 0, 51)], dtype=[(n, "<f4") for n in "xyz"] + [(n, "u1") for n in _RGB])
     PlyData([PlyElement.describe(rows, "vertex")]).write(str(tmp_path / "points3d.ply"))
     capture = read_capture(tmp_path)
@@ -255,22 +265,22 @@ def _mirror(data):
         (lambda d: [f.update(transform_matrix=d["frames"][0]["transform_matrix"]) for f in d["frames"]], "same place"),
     ],
 )
-def test_bad_transforms_are_named(tmp_path, capture_tools, change, message):
-    capture_tools.transforms(tmp_path, capture_tools.cameras(3), _names(3))
+def test_bad_transforms_are_named(tmp_path, change, message, written):
+    written()
     _edit(tmp_path, change)
     with pytest.raises(ValueError, match=message):
         read_capture(tmp_path)
 
 
-def test_an_unreadable_image_is_named_before_anything_is_loaded(tmp_path, capture_tools):
-    capture_tools.transforms(tmp_path, capture_tools.cameras(3), _names(3))
+def test_an_unreadable_image_is_named_before_anything_is_loaded(tmp_path, written):
+    written()
     (tmp_path / "images/001.png").write_text("no image")
     with pytest.raises(ValueError, match=r"images/001\.png cannot be read"):
         read_capture(tmp_path)
 
 
-def test_an_empty_split_and_bad_arguments(tmp_path, capture_tools):
-    capture_tools.transforms(tmp_path, capture_tools.cameras(3), _names(3))
+def test_an_empty_split_and_bad_arguments(tmp_path, written):
+    written()
     with pytest.raises(ValueError, match=r"train split.*empty.*set it to 0"):
         read_capture(tmp_path, test_every=1)
     for name, value in (("downscale", 0), ("downscale", 1.5), ("test_every", -1)):

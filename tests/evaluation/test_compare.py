@@ -30,12 +30,22 @@ def network(tmp_path):
     return FrechetVideoDistance(path, clip_length=2, resize=8)
 
 
+@pytest.fixture
+def compared(make_run, make_reference):
+    """The comparison of a new run with a new reference, each with changes."""
+
+    def compare(run=None, reference=None, **options):
+        return compare_run(make_run(**(run or {})), make_reference(**(reference or {})), **{"points": POINTS} | options)
+
+    return compare
+
+
 # ---- runs
 
 
-def test_a_run_that_is_the_reference(make_run, make_reference):
+def test_a_run_that_is_the_reference(compared):
     """Pictures are equal, and the Chamfer distance is that of two samples of one surface."""
-    found = compare_run(make_run(), make_reference(), points=POINTS)
+    found = compared()
     assert found["frames"] == 4
     assert found["mean"]["mse"] == 0.0
     assert found["mean"]["psnr_db"] is None  # JSON has no infinity
@@ -49,19 +59,19 @@ def test_a_run_that_is_the_reference(make_run, make_reference):
     json.dumps(found, allow_nan=False)
 
 
-def test_a_run_with_known_errors(make_run, make_reference):
+def test_a_run_with_known_errors(compared):
     """Particles 0.5 m beside the sheet and pixels that are 5 brighter."""
-    found = compare_run(make_run(above=0.5, change=5), make_reference(side=2.0), points=POINTS)
-    assert found["mean"]["psnr_db"] == pytest.approx(-20 * math.log10(5 / 255), abs=1e-3)
-    assert found["psnr_of_mean_db"] == pytest.approx(-20 * math.log10(5 / 255), abs=1e-3)
+    found = compared({"above": 0.5, "change": 5}, {"side": 2.0})
+    for psnr in (found["mean"]["psnr_db"], found["psnr_of_mean_db"]):
+        assert psnr == pytest.approx(-20 * math.log10(5 / 255), abs=1e-3)
     # nearest points are beside by 0.5 sqrt(A / n) = 0.016: sqrt(0.5^2 + 0.016^2) is at most 0.1 % more than 0.5
-    assert found["mean"]["run_to_reference_m"] == pytest.approx(0.5, rel=2e-3)
-    assert found["mean"]["reference_to_run_m"] == pytest.approx(0.5, rel=2e-3)
+    for name in ("run_to_reference_m", "reference_to_run_m"):
+        assert found["mean"][name] == pytest.approx(0.5, rel=2e-3)
     assert found["chamfer_share"] == pytest.approx(found["mean"]["chamfer_m"] / 2.0)
     assert [row["frame"] for row in found["per_frame"]] == [0, 1, 2, 3]
-    mean = np.mean([row["chamfer_m"] for row in found["per_frame"]])
-    assert found["mean"]["chamfer_m"] == pytest.approx(mean)
-    assert found["worst"]["chamfer_m"] == max(row["chamfer_m"] for row in found["per_frame"])
+    chamfer = [row["chamfer_m"] for row in found["per_frame"]]
+    assert found["mean"]["chamfer_m"] == pytest.approx(np.mean(chamfer))
+    assert found["worst"]["chamfer_m"] == max(chamfer)
     assert found["worst"]["ssim"] == min(row["ssim"] for row in found["per_frame"])
 
 
@@ -84,39 +94,34 @@ def test_points_without_a_gaussian_are_not_compared(make_run, make_reference):
     assert compare_run(run, reference)["mean"]["chamfer_m"] > 10.0
 
 
-def test_the_side_given_holds(make_run, make_reference):
-    run, reference = make_run(), make_reference()
-    assert compare_run(run, reference, points=100)["chamfer_share"] is None
-    found = compare_run(run, reference, points=100, side=4.0)
+def test_the_side_given_holds(compared):
+    assert compared(points=100)["chamfer_share"] is None
+    found = compared({"name": "other"}, {"name": "another"}, points=100, side=4.0)
     assert found["chamfer_share"] == pytest.approx(found["mean"]["chamfer_m"] / 4)
     assert found["side_m"] == 4.0
 
 
-def test_scene_units_that_are_not_metres(make_run, make_reference):
+def test_scene_units_that_are_not_metres(compared):
     """The reference is in metres from the origin of the scene, whatever a scene unit is."""
-    found = compare_run(make_run(scale=0.5), make_reference(), points=POINTS)
-    assert found["mean"]["chamfer_m"] < 0.02
+    assert compared({"scale": 0.5})["mean"]["chamfer_m"] < 0.02
 
 
 def test_a_turned_frame(make_run, make_reference):
     """Turned axes: the particles are where the rotation puts them back."""
     turn = [[0.0, 1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, 1.0]]
-    exact = {"origin": [1.0, 2.0, 3.0], "rotation": turn, "metres_per_unit": 1.0}
-    run = make_run(sim_frame=exact)
+    run = make_run(sim_frame={"origin": [1.0, 2.0, 3.0], "rotation": turn, "metres_per_unit": 1.0})
     with np.load(run / "trajectory.npz") as arrays:
         turned = {n: a @ np.array(turn, np.float32).T if n.startswith("position") else a for n, a in arrays.items()}
     np.savez(run / "trajectory.npz", **turned)
-    found = compare_run(run, make_reference(), points=POINTS)
-    assert found["mean"]["chamfer_m"] < 0.02
+    assert compare_run(run, make_reference(), points=POINTS)["mean"]["chamfer_m"] < 0.02
 
 
-def test_the_frame_that_a_run_writes_is_understood(make_run, make_reference):
+def test_the_frame_that_a_run_writes_is_understood(compared):
     frame = SimFrame.fit(torch.tensor([[0.0, 1.5, 2.5], [2.0, 2.5, 3.5]]), metres_per_unit=1.0)
     place = {"origin": frame.origin.tolist(), "rotation": frame.rotation.tolist(), "metres_per_unit": 1.0}
-    found = compare_run(make_run(sim_frame=place), make_reference(), points=POINTS)
-    assert found["mean"]["chamfer_m"] < 0.02
+    assert compared({"sim_frame": place})["mean"]["chamfer_m"] < 0.02
     with pytest.raises(ValueError, match="has no `sim_frame`: run the simulation again"):
-        compare_run(make_run("other", sim_frame=None), make_reference("another"))
+        compared({"name": "other", "sim_frame": None}, {"name": "another"})
 
 
 def test_offsets(make_run, make_reference):
@@ -309,7 +314,7 @@ def test_fvd_without_what_it_needs(make_run, make_reference, network):
         compare_run(run, make_reference("other"), frames=2, fvd=network)
 
 
-@pytest.mark.parametrize("option", [{"points": 0}, {"frames": 0}, {"side": 0.0}])
-def test_bad_options(make_run, make_reference, option):
-    with pytest.raises(ValueError, match=f"Expected `{next(iter(option))}` to be positive"):
-        compare_run(make_run(), make_reference(), **option)
+@pytest.mark.parametrize("option", ["points", "frames", "side"])
+def test_bad_options(compared, option):
+    with pytest.raises(ValueError, match=f"Expected `{option}` to be positive"):
+        compared(**{option: 0})
