@@ -32,8 +32,10 @@ def _discs(count, area, overlap):
     return double([scale, scale, scale - 3]).expand(count, 3)
 
 
-def _sum_on_plane(points, overlap=0.5, **kwargs):
-    return float(coverage_area(points, UP.expand(len(points), 3), _discs(len(points), 1, overlap), **kwargs).sum())
+def _areas(points, normals=UP, overlap=0.5, opacity=None, area=1):
+    """Of flat splats that share an area."""
+    count = len(points)
+    return coverage_area(points, normals.expand(count, 3), _discs(count, area, overlap), opacity)
 
 
 @pytest.mark.parametrize("overlap", [0.3, 0.5, 1.0])
@@ -41,12 +43,12 @@ def _sum_on_plane(points, overlap=0.5, **kwargs):
 @pytest.mark.parametrize("side", [32, 100])
 def test_sum_is_the_area_of_a_plane_with_borders(kind, side, overlap):
     """The paper's pi s1 s2 gives 0.28 to 3.1 here."""
-    assert _sum_on_plane(_plane(kind, side), overlap) == pytest.approx(1, abs=0.03)
+    assert float(_areas(_plane(kind, side), overlap=overlap).sum()) == pytest.approx(1, abs=0.03)
 
 
 def test_each_patch_of_a_regular_plane_has_its_cell():
     """Not only the sum: borders and corners included, within the angular resolution of the rays."""
-    areas = coverage_area(_plane("regular", 20), UP.expand(400, 3), _discs(400, 1, 0.3)) * 400
+    areas = _areas(_plane("regular", 20), overlap=0.3) * 400
     inner = areas.unflatten(0, (20, 20))[3:-3, 3:-3]
     assert_close(inner, torch.ones_like(inner), rtol=0, atol=0.03)
     assert areas.min() > 0.7
@@ -64,17 +66,15 @@ def test_sum_is_the_area_of_a_sphere(kind, count, overlap):
         points = torch.stack([radius * angle.cos(), radius * angle.sin(), z], dim=-1)
     else:
         points = unit(count, 3)
-    total = float(coverage_area(points, points, _discs(count, 4 * math.pi, overlap)).sum())
-    assert total == pytest.approx(4 * math.pi, rel=0.03)
+    assert float(_areas(points, points, overlap, area=4 * math.pi).sum()) == pytest.approx(4 * math.pi, rel=0.03)
 
 
 def test_sum_scales_and_moves_with_the_scene():
     points, scale = _plane("random", 40), 250.0
     rotation = quat_to_rotation(unit(4))
     moved = scale * points @ rotation.T + 1e3
-    normals = (rotation @ UP).expand(len(points), 3)
-    total = float(coverage_area(moved, normals, _discs(len(points), scale**2, 0.5)).sum())
-    assert total / scale**2 == pytest.approx(_sum_on_plane(points), rel=2e-3)
+    total = float(_areas(moved, rotation @ UP, area=scale**2).sum())
+    assert total / scale**2 == pytest.approx(float(_areas(points).sum()), rel=2e-3)
 
 
 @pytest.mark.slow(gate=["1-regular", "-1-random"])
@@ -97,26 +97,26 @@ def test_clones_thickness_and_sizes_do_not_change_the_sum():
     """What captures have: copies, centres off the surface, sizes and opacities that vary, noisy normals."""
     points, count = _plane("random", 60), 3600
     normals, discs, spacing = UP.expand(count, 3), _discs(count, 1, 0.5), 1 / 60
-    reference = _sum_on_plane(points)
     copies = coverage_area(points.repeat(3, 1), normals.repeat(3, 1), discs.repeat(3, 1))
-    assert float(copies.sum()) == pytest.approx(reference, rel=1e-9)
+    assert float(copies.sum()) == pytest.approx(float(_areas(points).sum()), rel=1e-9)
     assert_close(copies[:count], copies[count : 2 * count])
     near = torch.cat([points, points + 1e-3 * spacing * torch.randn_like(points)])
     assert float(coverage_area(near, normals.repeat(2, 1), discs.repeat(2, 1)).sum()) == pytest.approx(1, abs=0.03)
-    assert _sum_on_plane(points + 0.1 * spacing * torch.randn(count, 1) * UP) == pytest.approx(1, abs=0.03)
+    lifted = points + 0.1 * spacing * torch.randn(count, 1) * UP
+    assert float(_areas(lifted).sum()) == pytest.approx(1, abs=0.03)
     sizes, opacity = discs + 0.7 * torch.randn(count, 1), torch.rand(count)
     assert float(coverage_area(points, normals, sizes, opacity).sum()) == pytest.approx(1, abs=0.03)
     tilted = torch.nn.functional.normalize(normals + 0.1 * torch.randn(count, 3), dim=-1)
-    assert float(coverage_area(points, tilted, discs).sum()) == pytest.approx(1, abs=0.03)
+    assert float(_areas(points, tilted).sum()) == pytest.approx(1, abs=0.03)
 
 
 def test_faint_patch_among_opaque_ones_carries_little():
     points = _plane("regular", 20)
     opacity = torch.ones(400, dtype=torch.float64)
     opacity[210] = 0.01
-    areas = coverage_area(points, UP.expand(400, 3), _discs(400, 1, 0.5), opacity)
+    areas = _areas(points, opacity=opacity)
     assert areas[210] < 0.05 / 400
-    assert float(areas.sum()) == pytest.approx(_sum_on_plane(points), rel=1e-9)
+    assert float(areas.sum()) == pytest.approx(float(_areas(points).sum()), rel=1e-9)
 
 
 def test_twins_share_by_weight():
@@ -126,7 +126,7 @@ def test_twins_share_by_weight():
     opacity = torch.ones(401, dtype=torch.float64)
     opacity[210], opacity[400] = 0.75, 0.25
     areas = coverage_area(points, UP.expand(401, 3), _discs(400, 1, 0.5)[:1].expand(401, 3), opacity)
-    alone = coverage_area(points[:400], UP.expand(400, 3), _discs(400, 1, 0.5))
+    alone = _areas(points[:400])
     assert_close(areas[210] + areas[400], alone[210])
     assert_close(areas[210], 3 * areas[400])
 
@@ -175,20 +175,19 @@ def test_the_kernel_of_the_cells_is_their_definition(neighbours, monkeypatch):
 
 
 def test_same_input_same_areas_and_order_does_not_matter():
-    points, normals = _plane("random", 50), UP.expand(2500, 3)
-    discs = _discs(2500, 1, 0.5)
-    areas = coverage_area(points, normals, discs)
-    assert torch.equal(areas, coverage_area(points, normals, discs))
+    points = _plane("random", 50)
+    areas = _areas(points)
+    assert torch.equal(areas, _areas(points))
     order = torch.randperm(2500)
-    assert_close(coverage_area(points[order], normals, discs), areas[order])
-    assert_close(coverage_area(points, -normals, discs).sum(), areas.sum(), rtol=2e-3, atol=0)
+    assert_close(_areas(points[order]), areas[order])
+    assert_close(_areas(points, -UP).sum(), areas.sum(), rtol=2e-3, atol=0)
 
 
 def test_coverage_rejects_bad_values():
     points = _plane("regular", 4)
     points[3, 1] = torch.nan
     with pytest.raises(ValueError, match="Expected `means` to be finite"):
-        _sum_on_plane(points)
+        _areas(points)
 
 
 def test_patch_area_takes_the_two_larger_scales(device, dtype):

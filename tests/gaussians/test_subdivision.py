@@ -22,11 +22,13 @@ def _sheet(side, spacing, size, opacity=0.99):
 
 
 def test_small_gaussians_stay_whole():
-    means, quats, scales, opacity = _sheet(1.0, 0.1, 0.02)
-    found = subdivide(means, quats, scales, opacity, 0.1)
+    sheet = means, _, scales, opacity = _sheet(1.0, 0.1, 0.02)
+    found, split = subdivide(*sheet, 0.1), split_large(*sheet, 0.02)
     assert len(found.parent) == len(found.means) == 0
-    assert torch.equal(found.log_scales, scales)
-    assert torch.equal(found.opacity, opacity)
+    assert torch.equal(split.means, means)
+    for same in (found, split):
+        assert torch.equal(same.log_scales, scales)
+        assert torch.equal(same.opacity, opacity)
 
 
 def test_points_of_one_gaussian():
@@ -117,11 +119,3 @@ def test_split_gaussians_look_like_the_large_one():
     assert before.min() > 0.5
     assert (after - before).abs().mean() < 0.2
     assert after.min() > 0.5
-
-
-def test_small_ones_are_not_split():
-    means, quats, scales, opacity = _sheet(1.0, 0.1, 0.02)
-    found = split_large(means, quats, scales, opacity, 0.02)
-    assert torch.equal(found.means, means)
-    assert torch.equal(found.log_scales, scales)
-    assert torch.equal(found.opacity, opacity)
