@@ -115,7 +115,7 @@ def test_a_plume_is_as_wide_as_its_source_there():
 
 
 def test_a_plume_in_scene_units():
-    frame = SimFrame(torch.tensor([1.0, 0.0, 0.0]).double(), torch.eye(3).double(), 2.0)
+    frame = SimFrame(double([1.0, 0.0, 0.0]), torch.eye(3).double(), 2.0)
     moved = Plume(source=(1.5, 0.0, 0.0), radius=0.1, heat=500.0).in_frame(frame)
     place = [[1.1, 0.2, 0.7]]
     torch.testing.assert_close(plume_at(moved, place), plume_at(Plume((1.0, 0.0, 0.0), 0.2, 500.0), place))

@@ -85,9 +85,7 @@ def test_the_side_of_a_spheroid():
     e = math.sqrt(1 - 0.25)
     alpha = 2 * (1 - e * e) / e**3 * (0.5 * math.log((1 + e) / (1 - e)) - e)
     k = alpha / (2 - alpha)
-    found = ellipsoid_flow(
-        torch.tensor([1.0, 0, 0]).double(), torch.tensor([[0.0, 0.5 + 1e-13, 0.0]]).double(), (1, 0.5, 0.5)
-    )
+    found = ellipsoid_flow(double([1.0, 0, 0]), double([[0.0, 0.5 + 1e-13, 0.0]]), (1, 0.5, 0.5))
     assert found[0].tolist() == pytest.approx([1 + k, 0.0, 0.0], abs=1e-11)
 
 

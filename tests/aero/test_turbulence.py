@@ -349,7 +349,7 @@ def test_air_is_carried_by_a_changing_flow(interpolation):
     assert_close(wind.carried(fine), sums[:-1], rtol=0, atol=1e-9)
     one = double(2.5)
     assert_close(wind.carried(one), sums[2500], rtol=0, atol=1e-9)
-    assert_close(WindField([1.0, 2.0, 3.0]).carried(one), 2.5 * torch.tensor([1.0, 2.0, 3.0]).double())
+    assert_close(WindField([1.0, 2.0, 3.0]).carried(one), 2.5 * double([1.0, 2.0, 3.0]))
 
 
 def test_a_field_that_does_not_repeat_goes_on_outside():

@@ -66,7 +66,7 @@ def test_sine_sways_the_largest_component_by_half():
 
 
 def test_modulations_compose_in_order():
-    flow = torch.tensor([2.0, 0.0, 0.0]).double()
+    flow = double([2.0, 0.0, 0.0])
     sine, gust = SineSway(period=2.0), UniformGust(0.3)
     both = WindField([2.0, 0, 0], modulations=[sine, gust])(0.5)
     only_gust = WindField([2.0, 0, 0], modulations=[SineSway(amplitude=0.0), gust])(0.5)

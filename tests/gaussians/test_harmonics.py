@@ -4,16 +4,13 @@ import math
 
 import pytest
 import torch
+from shared import unit
 from torch.testing import assert_close
 
 from gaussian_swaying.gaussians import harmonics
 from gaussian_swaying.gaussians.harmonics import evaluate_sh, rotate_sh, sh_basis, sh_to_color
 
 TOLERANCE = {torch.float32: 1e-5, torch.float64: 1e-12}
-
-
-def _directions(device, dtype, count=50):
-    return torch.nn.functional.normalize(torch.randn(count, 3, device=device, dtype=dtype), dim=-1)
 
 
 def _rotations(device, dtype, count=50):
@@ -47,13 +44,6 @@ def _reference_basis(directions, degree):
     return torch.stack(columns, dim=-1)
 
 
-@pytest.mark.parametrize("degree", [0, 1, 2, 3])
-def test_basis_matches_legendre_polynomials(device, dtype, degree):
-    directions = _directions(device, dtype)
-    expected = _reference_basis(directions, degree)
-    assert_close(sh_basis(directions, degree), expected, rtol=0, atol=TOLERANCE[dtype])
-
-
 def test_signs_of_the_first_band():
     """The convention of 3DGS files: -y, z, -x."""
     basis = sh_basis(torch.eye(3), 1)[:, 1:]
@@ -62,9 +52,11 @@ def test_signs_of_the_first_band():
 
 @pytest.mark.parametrize("degree", [0, 1, 2, 3])
 def test_evaluation(device, dtype, degree):
-    directions = _directions(device, dtype)
+    directions = unit(50, 3, device=device, dtype=dtype)
     sh = torch.randn(50, (degree + 1) ** 2, 3, device=device, dtype=dtype)
-    expected = torch.einsum("nk,nkc->nc", _reference_basis(directions, degree), sh)
+    basis = _reference_basis(directions, degree)
+    assert_close(sh_basis(directions, degree), basis, rtol=0, atol=TOLERANCE[dtype])
+    expected = torch.einsum("nk,nkc->nc", basis, sh)
     tolerance = 10 * TOLERANCE[dtype]
     assert_close(evaluate_sh(sh, directions), expected, rtol=0, atol=tolerance)
     assert_close(evaluate_sh(sh, 7 * directions), expected, rtol=0, atol=tolerance)
@@ -75,7 +67,7 @@ def test_evaluation(device, dtype, degree):
 @pytest.mark.parametrize("degree", [1, 2, 3])
 def test_the_basis_as_one_product(device, dtype, degree):
     """What a GPU does is what the basis is, with its gradient."""
-    directions = _directions(device, dtype).requires_grad_()
+    directions = unit(50, 3, device=device, dtype=dtype).requires_grad_()
     found, known = harmonics._basis_by_product(directions, degree), sh_basis(directions, degree)
     assert_close(found, known, rtol=0, atol=TOLERANCE[dtype])
     weights = torch.randn_like(known)
@@ -91,7 +83,7 @@ def test_what_an_inference_kept_serves_gradients(degree, device, monkeypatch):
     harmonics._sampling.cache_clear()
     harmonics._coefficients.cache_clear()
     sh = torch.randn(5, (degree + 1) ** 2, 3, device=device)
-    directions, turn = _directions(device, torch.float32, 5), torch.eye(3, device=device).repeat(5, 1, 1)
+    directions, turn = unit(5, 3, device=device, dtype=torch.float32), torch.eye(3, device=device).repeat(5, 1, 1)
     with torch.inference_mode():
         harmonics._basis_by_product(directions, degree)
         known = evaluate_sh(sh, directions), rotate_sh(sh, turn)
@@ -108,7 +100,7 @@ def test_what_an_inference_kept_serves_gradients(degree, device, monkeypatch):
 
 @pytest.mark.parametrize("degree", [0, 1, 2, 3])
 def test_rotated_coefficients_equal_turned_directions(device, dtype, degree):
-    directions, rotation = _directions(device, dtype), _rotations(device, dtype)
+    directions, rotation = unit(50, 3, device=device, dtype=dtype), _rotations(device, dtype)
     sh = torch.randn(50, (degree + 1) ** 2, 3, device=device, dtype=dtype)
     turned = (rotation.mT @ directions[..., None]).squeeze(-1)
     actual = evaluate_sh(rotate_sh(sh, rotation), directions)
@@ -128,7 +120,7 @@ def test_gradients(device):
     sh = torch.randn(2, 16, 3, device=device, dtype=torch.float64, requires_grad=True)
     rotation = _rotations(device, torch.float64, 2).requires_grad_()
     assert torch.autograd.gradcheck(rotate_sh, (sh, rotation), fast_mode=True)
-    assert torch.autograd.gradcheck(evaluate_sh, (sh, _directions(device, torch.float64, 2)), fast_mode=True)
+    assert torch.autograd.gradcheck(evaluate_sh, (sh, unit(2, 3, device=device)), fast_mode=True)
 
 
 def test_wrong_arguments():

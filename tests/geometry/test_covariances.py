@@ -107,8 +107,8 @@ def test_a_solid_beyond_the_limit_goes_back_to_its_own_shape(device, dtype):
     assert_close(size[1:], 4 * size_at_rest[1:])
     # turned, x and y change places; the thin axis stays thin, and what was torn out is 3 sizes long, not a thousand
     own, grain = (kept[k].diagonal().cpu().double() for k in (1, 2))
-    assert_close(own, torch.tensor([3 * 5.01 + 1.0, 4.0, 0.01]).double(), rtol=1e-3, atol=1e-4)
-    assert_close(grain, torch.tensor([3 * 5.01 + 1.67, 1.67, 1.67]).double(), rtol=1e-3, atol=1e-4)
+    assert_close(own, double([3 * 5.01 + 1.0, 4.0, 0.01]), rtol=1e-3, atol=1e-4)
+    assert_close(grain, double([3 * 5.01 + 1.67, 1.67, 1.67]), rtol=1e-3, atol=1e-4)
     assert_close(kept[3], 4 * turn @ rest[3] @ turn.T, rtol=1e-5, atol=1e-6)
     assert torch.equal(limit_deformed(f[:0], drawn[:0], rest[:0], 2.0, solid[:0]), drawn[:0])
 

@@ -224,7 +224,7 @@ def test_distances_of_triangles_agree_with_samples():
 
 
 def test_the_distance_of_a_triangle_without_area_is_that_of_its_longest_side():
-    a, c = torch.tensor([0.0, 0.0, 0.0]).double(), torch.tensor([2.0, 0.0, 0.0]).double()
+    a, c = double([0.0, 0.0, 0.0]), double([2.0, 0.0, 0.0])
     place = double([[-3.0, 4.0, 0.0], [0.5, 0.0, 2.0], [2.0, -3.0, 4.0]])
     between = torch.stack([a, 0.25 * c, c]).expand(3, 3, 3)
     assert_close(triangle_distance(place, between), double([5.0, 2.0, 5.0]))

@@ -39,9 +39,12 @@ def test_combinations():
     assert _inside(Everything(), (0, 0, 0), (1e9, 0, 0)) == [True, True]
 
 
-@pytest.mark.parametrize(
-    "region", [Everything(), Box([0, 0, 0], [1, 1, 1]), Sphere([0, 0, 0], 1), Cylinder([0, 0, 0], [0, 1, 0], 1, 1)]
-)
+REGIONS = [
+    Everything(), Box([0, None, 0], [1, 1, None]), Sphere([0, 0, 0], 1), Cylinder([0, 0, 0], [0, 1, 0], 1, 1)
+]  # fmt: skip
+
+
+@pytest.mark.parametrize("region", REGIONS)
 def test_batches_and_devices(region, device, dtype):
     for wrapped in (region, Not(region), Union([region, region])):
         inside = wrapped.contains(torch.rand(4, 5, 3, device=device, dtype=dtype))
@@ -73,10 +76,7 @@ def test_constants_of_an_inference_serve_gradients():
 
 
 @pytest.mark.gpu
-@pytest.mark.parametrize(
-    "region",
-    [Everything(), Box([0, None, 0], [1, 1, None]), Sphere([0, 0, 0], 1), Cylinder([0, 0, 0], [0, 1, 0], 1, 1)],
-)
+@pytest.mark.parametrize("region", REGIONS)
 def test_asking_a_second_time_copies_nothing(region):
     points = torch.rand(40, 3, device="cuda")
     wrapped = Not(Union([region, Sphere([1, 1, 1], 0.1)]))

@@ -5,6 +5,7 @@ import math
 
 import pytest
 import torch
+from shared import double
 from torch import Tensor, nn
 from torch.testing import assert_close
 
@@ -77,7 +78,7 @@ def test_diagonal_gaussians():
 
 def test_covariances_that_do_not_commute():
     """In two dimensions tr sqrt(A B) = sqrt(tr(A B) + 2 sqrt(det(A B)))."""
-    a, b = torch.tensor([[2.0, 0.6], [0.6, 1.0]]).double(), torch.tensor([[1.0, -0.8], [-0.8, 3.0]]).double()
+    a, b = double([[2.0, 0.6], [0.6, 1.0]]), double([[1.0, -0.8], [-0.8, 3.0]])
     product = a @ b
     root = math.sqrt(float(product.trace()) + 2 * math.sqrt(float(torch.linalg.det(product))))
     expected = float(a.trace() + b.trace()) - 2 * root

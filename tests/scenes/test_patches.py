@@ -19,7 +19,7 @@ def test_a_tube_has_the_area_and_the_normals_of_a_cylinder():
     for spacing in (0.5, 0.05):
         patches = tube([[0, 0, 0], [0, 0, 2.0]], [0.3, 0.3], spacing)
         assert float(patches.area.sum()) == pytest.approx(2 * math.pi * 0.3 * 2.0, rel=EXACT)
-        radial = torch.nn.functional.normalize(patches.center * torch.tensor([1.0, 1.0, 0.0]).double(), dim=-1)
+        radial = torch.nn.functional.normalize(patches.center * double([1.0, 1.0, 0.0]), dim=-1)
         assert_close(patches.normal, radial)
 
 
@@ -29,7 +29,7 @@ def test_a_bent_tube_keeps_the_area_of_a_torus_piece():
     path = torch.stack([angle.cos(), angle.sin(), torch.zeros_like(angle)], dim=-1)
     patches = tube(path, torch.full((200,), 0.1), 0.05)
     assert float(patches.area.sum()) == pytest.approx(math.pi / 2 * 2 * math.pi * 0.1, rel=0.01)
-    ring = torch.nn.functional.normalize(patches.center * torch.tensor([1.0, 1.0, 0.0]).double(), dim=-1)
+    ring = torch.nn.functional.normalize(patches.center * double([1.0, 1.0, 0.0]), dim=-1)
     outside = ((patches.center - ring) * patches.normal).sum(-1)
     assert outside.min() > 0
 
@@ -38,10 +38,10 @@ def test_an_ellipsoid_faces_outwards_and_a_sphere_has_its_area():
     sphere = ellipsoid((1.0, 2.0, 3.0), (0.5, 0.5, 0.5), 0.05)
     # frustums of height h = 0.05 in a sphere of radius 0.5 lack (h / r)^2 / 8 = 1.3e-3
     assert float(sphere.area.sum()) == pytest.approx(4 * math.pi * 0.25, rel=2e-3)
-    offset = sphere.center - torch.tensor([1.0, 2.0, 3.0]).double()
+    offset = sphere.center - double([1.0, 2.0, 3.0])
     assert (torch.nn.functional.normalize(offset, dim=-1) * sphere.normal).sum(-1).min() > 0.99
     long = ellipsoid((0.0, 0.0, 0.0), (0.5, 0.2, 0.1), 0.05)
-    gradient = long.center / torch.tensor([0.25, 0.04, 0.01]).double()
+    gradient = long.center / double([0.25, 0.04, 0.01])
     assert (torch.nn.functional.normalize(gradient, dim=-1) * long.normal).sum(-1).min() > 0.95
 
 
@@ -56,7 +56,7 @@ def test_a_box_is_closed():
 def test_a_disc_faces_up():
     patches = disc((1.0, 0.0, 2.0), 0.3, 0.02)
     assert float(patches.area.sum()) == pytest.approx(math.pi * 0.09, rel=1e-9)
-    assert_close(patches.normal, torch.tensor([0.0, 0.0, 1.0]).double().expand(len(patches), 3))
+    assert_close(patches.normal, double([0.0, 0.0, 1.0]).expand(len(patches), 3))
     assert (patches.center[:, 2] - 2.0).abs().max() == 0
 
 
@@ -65,7 +65,7 @@ def test_a_flat_leaf_has_the_area_of_its_outline(spacing, leaf_area):
     """Rows are as wide as the blade on average, so the area is the outline's even with a single Gaussian."""
     patches = leaf(0.1, 0.05, spacing, droop=0.0, fold=0.0)
     assert float(patches.area.sum()) == pytest.approx(leaf_area(0.1, 0.05), rel=1e-3)
-    assert_close(patches.normal, torch.tensor([0.0, 0.0, 1.0]).double().expand(len(patches), 3))
+    assert_close(patches.normal, double([0.0, 0.0, 1.0]).expand(len(patches), 3))
     assert len(patches) == 1 or spacing < 0.1
 
 
@@ -82,7 +82,7 @@ def test_a_linear_map_keeps_edges_and_normals_true():
     patches = disc((0.0, 0.0, 0.0), 1.0, 0.3)
     matrix = double([[1.0, 0.4, 0.0], [0.0, 2.0, 0.3], [0.5, 0.0, 1.0]])
     mapped = patches.mapped(matrix, (1.0, 0.0, 0.0))
-    cofactor = torch.linalg.det(matrix) * torch.linalg.inv(matrix).mT @ torch.tensor([0.0, 0.0, 1.0]).double()
+    cofactor = torch.linalg.det(matrix) * torch.linalg.inv(matrix).mT @ double([0.0, 0.0, 1.0])
     assert_close(mapped.area, patches.area * cofactor.norm())
     assert_close(mapped.normal, (cofactor / cofactor.norm()).expand(len(patches), 3))
 
@@ -93,12 +93,12 @@ def test_copies_turn_and_tint_the_template():
     axes = facing(double([[0.0, 1.0, 0.0], [0.0, 0.0, 1.0]]), up)
     assert_close(torch.linalg.det(axes), torch.ones(2, dtype=torch.float64))
     tint = double([[1.0, 1.0, 1.0], [0.5, 1.0, 2.0]])
-    both = copies(template, axes, torch.tensor([1.0, 2.0]).double(), torch.zeros(2, 3).double(), tint)
+    both = copies(template, axes, double([1.0, 2.0]), torch.zeros(2, 3).double(), tint)
     first, second = both.area.reshape(2, -1)
     assert_close(second, 4 * first)
     normals = both.normal.reshape(2, -1, 3)
     assert_close(normals, up[:, None].expand_as(normals))
-    assert_close(both.colour[-1], torch.tensor([0.25, 0.5, 1.0]).double())
+    assert_close(both.colour[-1], double([0.25, 0.5, 1.0]))
 
 
 def test_the_cloud_has_the_patches_normals_sizes_and_light():
