@@ -138,14 +138,3 @@ def test_the_turn_between_two_rotations():
     turn = torch.tensor([[0.3, -1.0, 2.0], [1e-9, 0.0, 0.0], [0.0, 0.0, 0.0]], dtype=DOUBLE)
     other = rotation_of(torch.tensor([[1.0, 0.2, 0.3]], dtype=DOUBLE))
     assert_close(turn_between(rotation_of(turn) @ other, other), turn, rtol=1e-12, atol=1e-15)
-
-
-def test_kernels_take_them_as_torch_does():
-    points, sets = blocks()
-    joints = Joints(points, [PointJoint(*sets, AT.tolist(), 30.0, 7.0)], 1e-3)
-    ends = []
-    for transfer in ("torch", "kernels"):
-        solver = MPMSolver(0.5, transfer=transfer)
-        state = solver.rollout(solver.init_state(points, points.position.flip(-1)), 1e-3, 20, joints)
-        ends.append(state.position)
-    assert_close(*ends, rtol=0, atol=1e-12)

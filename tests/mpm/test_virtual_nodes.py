@@ -1,7 +1,6 @@
 """Copies of nodes for parts that only lie close to each other."""
 
 import dataclasses
-import math
 
 import pytest
 import torch
@@ -88,38 +87,16 @@ def test_two_sheets_each_move_as_alone(transfer, kind):
     glued = rolled(material(position), push=torch.cat(pushes), **how)[2]
     assert start.grid.virtual > 0
     assert solver.has_kernels == (transfer == "kernels")
+    energy = float(solver.bound.kinetic(both) + solver.elastic_energy(both))
     for k, (part, push) in enumerate(zip(parts, pushes, strict=True)):
-        alone = rolled(material(part), push=push, **how)[2].position
+        lone, _, end = rolled(material(part), push=push, **how)
+        energy -= float(lone.bound.kinetic(end) + lone.elastic_energy(end))
+        alone = end.position
         far = (alone - part).norm(dim=-1).amax()
         assert far > 0.1
         assert (both.position[number == k] - alone).norm(dim=-1).amax() < 1e-9 * far
         assert (glued.position[number == k] - alone).norm(dim=-1).amax() > 0.1 * far
-
-
-def test_kernels_do_what_torch_does_on_each_device(kernel_device):
-    """Pins, wind that depends on the place and viscosity, of two scenes; on a GPU in single precision.
-
-    A virtual node lies where the node lies that it is a copy of.
-    """
-    parts = sheet(3.1), sheet(3.3)
-    position, number = together(*parts)
-    batch = MaterialPoints.stack([material(position, number), material(position + 0.31, number)])
-    up, area = torch.zeros_like(batch.position), torch.full(batch.mass.shape, 0.01, dtype=torch.float64)
-    up[..., 2] = 1.0
-    wind, pins = WindField([5.0, 2.0, -1.0], effects=[LogProfile(height=3.0)]), [PinnedRegion(EDGE, "hinge")]
-    ends = []
-    own = torch.float64 if kernel_device.type == "cpu" else torch.float32
-    for kind, where, transfer in ((torch.float64, "cpu", "torch"), (own, kernel_device, "kernels")):
-        points = batch.map(lambda t: t.to(where, kind))  # noqa: B023
-        solver = MPMSolver(1.0, boundaries=pins, transfer=transfer, stiffness_damping=1e-3).to(where)
-        state = solver.init_state(points)
-        load = WindForce(AeroForce(), wind, up.to(where, kind), area.to(where, kind)).to(where)
-        ends.append(solver.rollout(state, 1e-2, 20, [load]).position.cpu().double())
-    assert state.grid.virtual > 0
-    away = (ends[0] - batch.position).abs().amax()
-    assert away > 1e-3
-    # of its logarithm, and of rounding
-    assert (ends[0] - ends[1]).abs().amax() < (1e-6 if own == torch.float64 else 1e-3) * away
+    assert abs(energy) < 1e-9
 
 
 def test_a_place_takes_the_nodes_of_a_point_of_its_cell_that_is_near():
@@ -189,17 +166,13 @@ def test_small_pieces_in_any_orientation_move_as_alone(how, turn):
         rate = 0.05 * torch.randn(3, 3, generator=random, dtype=torch.float64)
         speeds.append((parts[-1] - parts[-1].mean(0)) @ rate + torch.randn(3, generator=random, dtype=torch.float64))
     position, number = together(*parts)
-    both = rolled(material(position, number), torch.cat(speeds), transfer="kernels")[2]
-    bound = MPMSolver(1.0)
-    bound.init_state(material(position, number))
-    assert torch.isfinite(bound.bound.node_inverse_mass).all()
+    solver, _, both = rolled(material(position, number), torch.cat(speeds), transfer="kernels")
+    assert torch.isfinite(solver.bound.node_inverse_mass).all()
     for k, (part, speed) in enumerate(zip(parts, speeds, strict=True)):
         alone = rolled(material(part), speed, transfer="torch")[2]
         for name in ("position", "velocity", "F_elastic"):
             mine, expected = getattr(both, name)[number == k], getattr(alone, name)
             assert (mine - expected).abs().amax() < 1e-9 * max(1.0, float(expected.abs().amax()))
-        start = MPMSolver(1.0, gravity=(0, 0, 0)).init_state(material(part), speed)
-        assert both.velocity[number == k].norm(dim=-1).amax() < 1.5 * start.velocity.norm(dim=-1).amax() + 1.0
 
 
 BOUNDARIES = {
@@ -225,10 +198,9 @@ def test_boundaries_act_on_each_piece(name):
     for field in ("position", "velocity", "node_displacement", "impulse"):
         one, other = getattr(both, field), getattr(fused, field)
         assert (one - other).abs().amax() < 1e-9 * max(1.0, float(one.abs().amax()))
-    far = sheet(3.3) + torch.tensor([0.0, 50.0, 0.0], dtype=torch.float64)
     if name in ("points", "clamped points", "a rigid part", "a ball"):
         return
-    apart, _ = together(parts[0], far)
+    apart, _ = together(parts[0], parts[1] + torch.tensor([0.0, 50.0, 0.0], dtype=torch.float64))
     distant = rolled(material(apart), boundaries=[BOUNDARIES[name]()])[2]
     away = (both.position[number == 0] - distant.position[number == 0]).abs().amax()
     assert away < 1e-9
@@ -245,20 +217,33 @@ def test_held_points_hold_the_piece_that_they_lie_on():
     assert (both.position[number == 1] - alone.position).abs().amax() < 1e-9
 
 
-def test_scenes_of_a_batch_have_their_own_copies():
-    parts = sheet(3.1), sheet(3.3)
-    position, number = together(*parts)
-    moved = position + torch.tensor([0.31, 0.22, 0.47], dtype=torch.float64)
-    one, two = material(position, number), material(moved, number)
-    batch = MaterialPoints.stack([one, two])
-    for transfer in ("torch", "kernels"):
-        both = rolled(batch, transfer=transfer, boundaries=[PinnedRegion(EDGE, "nodes")], steps=20)
-        assert both[1].grid.virtual > 0
-        for k, points in enumerate((one, two)):
-            solver = MPMSolver(1.0, gravity=(0, 0, -0.1), boundaries=[PinnedRegion(EDGE, "nodes")], transfer="torch")
-            state = solver.init_state(points)
-            alone = solver.rollout(state, 0.8 * both[0].stable_substep(both[1]), 20)
-            assert (both[2].position[k] - alone.position).abs().amax() < 1e-9
+def test_scenes_of_a_batch_have_their_own_copies(kernel_device):
+    """Pins, wind that depends on the place and viscosity, in the kernels, beside each scene alone in torch.
+
+    On a GPU in single precision. A virtual node lies where the node lies that it is a copy of.
+    """
+    position, number = together(sheet(3.1), sheet(3.3))
+    scenes = [material(position, number), material(position + 0.31, number)]
+    own = torch.float64 if kernel_device.type == "cpu" else torch.float32
+
+    def end(points, transfer):
+        up, area = torch.zeros_like(points.position), torch.full_like(points.mass, 0.01)
+        up[..., 2] = 1.0
+        wind = WindField([5.0, 2.0, -1.0], effects=[LogProfile(height=3.0)])
+        pins = [PinnedRegion(EDGE, "hinge")]
+        solver = MPMSolver(1.0, boundaries=pins, transfer=transfer, stiffness_damping=1e-3).to(up.device)
+        state = solver.init_state(points)
+        assert state.grid.virtual > 0
+        load = WindForce(AeroForce(), wind, up, area).to(up.device)
+        return solver.rollout(state, 1e-2, 20, [load]).position.cpu().double()
+
+    both = end(MaterialPoints.stack(scenes).map(lambda t: t.to(kernel_device, own)), "kernels")
+    for k, points in enumerate(scenes):
+        alone = end(points, "torch")
+        away = (alone - points.position).abs().amax()
+        assert away > 1e-3
+        # of the logarithm of the wind, and of rounding
+        assert (both[k] - alone).abs().amax() < (1e-6 if own == torch.float64 else 1e-3) * away
 
 
 def test_places_follow_their_own_piece():
@@ -299,18 +284,6 @@ def test_a_state_is_saved_and_read():
     end, other = (solver.rollout(s, 1e-3, 2).position for s in (state, again))
     assert torch.equal(end, other)
     assert solver.continued(solver, state, start) is not None
-
-
-def test_energy_and_momentum_are_kept():
-    position, number = together(sheet(3.1), sheet(3.3))
-    velocity = torch.stack([position[:, 1] - 2, 2 - position[:, 0], number - 0.5], -1) * 0.1
-    solver = MPMSolver(1.0, gravity=(0, 0, 0), transfer="kernels")
-    state = solver.init_state(material(position, number), velocity)
-    end = solver.rollout(state, 0.3 * solver.stable_substep(state), 200)
-    before, after = solver.bound.momenta(state), solver.bound.momenta(end)
-    assert all((a - b).abs().amax() < 1e-9 for a, b in zip(before, after, strict=True))
-    first, last = (float(solver.bound.kinetic(s) + solver.elastic_energy(s)) for s in (state, end))
-    assert math.isclose(first, last, rel_tol=1e-3)
 
 
 def test_gradients_come_from_torch():

@@ -19,6 +19,8 @@ from gaussian_swaying.mpm import boundaries
 from gaussian_swaying.mpm.boundaries import BOUNDARIES
 from gaussian_swaying.mpm.boundaries.boundary import Nodes
 
+from .bodies import block, march, run_for
+
 FORMULATIONS = ["total", "updated"]
 MOVING = KeyedPath([0.0, 0.2], [[0, 0, 0], [0.1, 0.05, 0]], [[0, 0, 0], [10, 20, 30]])
 UPPER = Box([None, None, 0.23], [None] * 3)
@@ -80,44 +82,9 @@ def test_the_documented_boundaries_are_those_that_there_are():
     assert set(re.findall("`([A-Z][A-Za-z]+)`", row)) == set(boundaries.BOUNDARIES)
 
 
-SPHERE = Sphere([0.2, 0.2, 0.2], 2.0)
-STOPS = {
-    "pin": made("PinnedRegion", SPHERE, "nodes"),
-    "handle": made("Handle", SPHERE, kind="nodes"),
-    "sticky": made("Plane", [0, 0, 5], [0, 0, 1], "sticky"),
-    "slip": made("Plane", [0, 0, 5], [0, 0, 1], "slip"),
-    "friction": made("Plane", [0, 0, 5], [0, 0, 1], "separate", 0.4),
-    "velocity": made("VelocityBox", Box([-9, -9, -9], [9, 9, 9]), [0, 0, 0]),
-    "box-sticky": made("EnclosingBox", [-9, -9, 5], [9, 9, 9], "sticky"),
-    "box-slip": made("EnclosingBox", [-9, -9, 5], [9, 9, 9], "slip", 0.4),
-    "box-separate": made("EnclosingBox", [-9, -9, 5], [9, 9, 9], "separate"),
-}
-
-
-@pytest.mark.parametrize(
-    ("name", "formulation"),
-    [(name, FORMULATIONS[k % 2]) for k, name in enumerate(STOPS)]
-    + [pytest.param(name, FORMULATIONS[(k + 1) % 2], marks=pytest.mark.slow) for k, name in enumerate(STOPS)],
-)
-def test_time_windows(name, formulation, block, run_for):
-    """Each of these stops everything, so the block falls only outside the time window."""
-    points = block()
-
-    def make(start, end):
-        return STOPS[name](start=start, end=end)
-
-    assert float(run_for(formulation, [make(0.0, 0.1)], points, 0.1).velocity.abs().max()) == 0.0
-    falling = torch.full((216,), -0.98, dtype=torch.float64)
-    released = run_for(formulation, [make(0.0, 0.1)], points, 0.2)
-    assert_close(released.velocity[:, 2], falling, rtol=1e-6, atol=0)
-    later = run_for(formulation, [make(0.1, None)], points, 0.1)
-    assert_close(later.velocity[:, 2], falling, rtol=1e-6, atol=0)
-    assert float(run_for(formulation, [make(0.1, None)], points, 0.12).velocity.abs().max()) < 1e-14
-
-
 @pytest.mark.parametrize("formulation", FORMULATIONS)
 @pytest.mark.parametrize(("kind", "friction"), [("sticky", 0.0), ("slip", 0.7), ("separate", 0.7)])
-def test_plane_and_box_leave_alone_what_is_near_but_free(formulation, kind, friction, block, run_for):
+def test_plane_and_box_leave_alone_what_is_near_but_free(formulation, kind, friction):
     """Less than 1.5 cells away and coming closer, yet no node at or behind the plane: a rigid flight."""
     points = block(low=(0.16, 0.16, 0.16), per_side=4)
     low, high = 0.05, 0.65
@@ -132,7 +99,7 @@ def test_plane_and_box_leave_alone_what_is_near_but_free(formulation, kind, fric
 
 @pytest.mark.parametrize("formulation", FORMULATIONS)
 @pytest.mark.parametrize("wall", [("Plane", [0, 0, 0.11], [0, 0, 1]), ("EnclosingBox", [-9, -9, 0.11], [9] * 3)])
-def test_separate_lets_go_of_what_moves_away_and_slip_does_not(formulation, wall, block, run_for):
+def test_separate_lets_go_of_what_moves_away_and_slip_does_not(formulation, wall):
     points = block(low=(0, 0, 0.05))  # behind the wall lie the lowest nodes of either formulation
     velocity = torch.tensor([0.3, 0.0, 1.0], dtype=torch.float64).expand_as(points.position)
 
@@ -151,6 +118,7 @@ def test_separate_lets_go_of_what_moves_away_and_slip_does_not(formulation, wall
 
 @pytest.mark.parametrize("name", ACTING)
 def test_a_substep_may_be_a_tensor_and_constants_are_made_once(name, monkeypatch):
+    """And it acts until its end alone; the solver ends a release, and a rigid body never ends."""
     for dtype, tolerance in ((torch.float32, 1e-6), (torch.float64, 1e-12)):
         boundary, velocity, nodes = _acting(name, "cpu", dtype)
         known = boundary(velocity, nodes)
@@ -161,6 +129,10 @@ def test_a_substep_may_be_a_tensor_and_constants_are_made_once(name, monkeypatch
     if name in ("handle", "impulse", "impulse for each"):  # values that depend on the substep
         longer = boundary(velocity, dataclasses.replace(nodes, dt=torch.tensor(0.3, dtype=torch.float64)))
         assert float((longer - known).abs().max()) > 1e-3
+
+    for time, acts in ((0.499, True), (0.5, False)):
+        now = dataclasses.replace(nodes, time=torch.full_like(nodes.time, time))
+        assert torch.equal(boundary(velocity, now), velocity) == (not acts) or name in ("release", "front", "rigid")
 
     def refuse(*_, **__):
         raise AssertionError("made from numbers of the host")
@@ -205,7 +177,7 @@ def test_a_recorded_condition_follows_time_and_substep(name, dtype):
 
 
 @pytest.mark.parametrize("name", [name for name in NAMES if name != "still"])  # which is in metres
-def test_in_frame_leaves_the_original_alone(name, block):
+def test_in_frame_leaves_the_original_alone(name):
     """A second frame, or a dtype change of the original, does not change the copy in metres either."""
     scene = block().position
     frame = SimFrame.fit(scene, up=(0.0, 1.0, 0.0), metres_per_unit=3.0)
@@ -234,7 +206,7 @@ def test_in_frame_leaves_the_original_alone(name, block):
 
 @pytest.mark.parametrize("formulation", FORMULATIONS)
 @pytest.mark.parametrize("name", [name for name in NAMES if name not in ("points", "still")])
-def test_conditions_can_be_copied_saved_and_narrowed(name, formulation, block, march):
+def test_conditions_can_be_copied_saved_and_narrowed(name, formulation):
     """A deep copy and a copy from the state dict give the same bits; float32 gives the same to round-off."""
     points = block(per_side=5)
     boundary = _made(name)
@@ -259,7 +231,7 @@ def test_conditions_can_be_copied_saved_and_narrowed(name, formulation, block, m
 
 @pytest.mark.parametrize("name", ["pin", "handle", "release", "front", "impulse", "impulse for each"])
 @pytest.mark.parametrize("framed", [False, True])
-def test_region_that_holds_nothing_names_its_condition(name, framed, block):
+def test_region_that_holds_nothing_names_its_condition(name, framed):
     boundary, points = _made(name, Sphere([9, 9, 9], 0.1)), block(low=(0.2, 0.2, 0.2), side=0.2)
     frame = SimFrame.fit(points.position, metres_per_unit=2.0) if framed else None
     if framed:
@@ -273,7 +245,7 @@ def test_region_that_holds_nothing_names_its_condition(name, framed, block):
 
 
 @pytest.mark.parametrize("kind", ["PinnedRegion", "Handle", "SequentialRelease"])
-def test_share_that_no_node_reaches_names_its_condition(kind, block):
+def test_share_that_no_node_reaches_names_its_condition(kind):
     """One particle among many at a node: it holds less than the share."""
     pin = BOUNDARIES[kind](Sphere([0.2333, 0.2333, 0.2333], 0.03), kind="nodes", held_share=0.9)
     with pytest.raises(ValueError, match=rf"no grid node.*`region` of the {kind} or lower its `held_share`"):
@@ -326,7 +298,7 @@ def test_bad_boundaries_are_refused():
 
 
 @pytest.mark.parametrize("formulation", FORMULATIONS)
-def test_pin_holds_only_its_end(formulation, block, run_for):
+def test_pin_holds_only_its_end(formulation):
     points = block()
     pin = made("PinnedRegion", Box([None, None, 0.34], [None, None, None]))()
     state = run_for(formulation, [pin], points, 0.3)

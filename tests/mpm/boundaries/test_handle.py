@@ -11,11 +11,13 @@ from torch.testing import assert_close
 from gaussian_swaying import Box, MPMSolver, PinnedRegion, SimFrame, Sphere
 from gaussian_swaying.mpm.boundaries.handle import Handle
 
+from .bodies import block, march, run_for
+
 FORMULATIONS = ["total", "updated"]
 
 
 @pytest.mark.parametrize("formulation", FORMULATIONS)
-def test_handle_carries_its_particles_and_the_others_follow(formulation, block, march):
+def test_handle_carries_its_particles_and_the_others_follow(formulation):
     """At rest before the window; then exactly velocity * t; released after it."""
     points = block()
     rest, velocity = points.position, torch.tensor([0.4, -0.2, 0.3], dtype=torch.float64)
@@ -43,7 +45,7 @@ def test_handle_carries_its_particles_and_the_others_follow(formulation, block, 
 
 
 @pytest.mark.parametrize("formulation", FORMULATIONS)
-def test_handle_turns_twice_without_growing(formulation, block, march):
+def test_handle_turns_twice_without_growing(formulation):
     """720 degrees in 160 substeps. A tangent velocity would swell the block by (1 + 0.0785²)^80 = 1.64."""
     points = block(per_side=3, side=0.3, e=2e3)  # what is held does not deform
     spin, pivot = torch.tensor([[1.0, 2.0, -2.0], [0.1, 0.3, 0.2]], dtype=torch.float64)
@@ -62,7 +64,7 @@ def test_handle_turns_twice_without_growing(formulation, block, march):
 
 
 @pytest.mark.parametrize("formulation", FORMULATIONS)
-def test_handle_in_a_frame_that_scales_and_turns(formulation, block, march):
+def test_handle_in_a_frame_that_scales_and_turns(formulation):
     """Region and pivot in scene units and axes; velocities in m/s, z up, and unscaled, from its start on."""
     scene = torch.stack([block(per_side=3, side=0.6).position, block((3, 0, 0), 0.6, per_side=3).position])
     scene = scene.reshape(-1, 3) + 7.0
@@ -87,7 +89,7 @@ def test_handle_in_a_frame_that_scales_and_turns(formulation, block, march):
 
 
 @pytest.mark.parametrize("formulation", FORMULATIONS)
-def test_handle_without_any_motion_is_a_pin(formulation, block, run_for):
+def test_handle_without_any_motion_is_a_pin(formulation):
     """To the bit in torch; the kernels of `total` hold a pin themselves, and leave a handle to torch."""
     points, region = block(), Box([None, None, 0.3], [None] * 3)
     for transfer, tolerance in (("torch", 0.0), ("kernels", 1e-12)):

@@ -11,11 +11,13 @@ from torch.testing import assert_close
 from gaussian_swaying import Box, MaterialPoints, MPMSolver, PinnedRegion
 from gaussian_swaying.mpm.boundaries.impulse import Impulse
 
+from .bodies import block, lone, march, run_for
+
 FORMULATIONS = ["total", "updated"]
 
 
 @pytest.mark.parametrize("formulation", FORMULATIONS)
-def test_an_impulse_does_not_move_what_is_pinned(formulation, block, run_for):
+def test_an_impulse_does_not_move_what_is_pinned(formulation):
     """In either order of the two."""
     points, ends = block(), []
     pin = PinnedRegion(Box([None, None, 0.34], [None, None, None]))
@@ -30,7 +32,7 @@ def test_an_impulse_does_not_move_what_is_pinned(formulation, block, run_for):
 @pytest.mark.parametrize(
     ("dt", "start", "end"), [(1e-3, 0.0105, 0.0382), (3e-3, 0.0105, 0.0382), (2e-3, 0.0123, 0.0124)]
 )
-def test_impulse_arrives_whole_whatever_the_substep(formulation, dt, start, end, block, march):
+def test_impulse_arrives_whole_whatever_the_substep(formulation, dt, start, end):
     """In proportion to the time gone by within the window; substeps across its ends get their part, or all of it."""
     points = block(per_side=4)
     impulse = torch.tensor([0.3, -0.2, 0.5], dtype=torch.float64)
@@ -44,7 +46,7 @@ def test_impulse_arrives_whole_whatever_the_substep(formulation, dt, start, end,
 
 
 @pytest.mark.parametrize("formulation", FORMULATIONS)
-def test_impulse_pushes_by_mass_and_only_its_region(formulation, block, march):
+def test_impulse_pushes_by_mass_and_only_its_region(formulation):
     """A far body is not affected. The others get the same change of velocity at any mass, so the moment is that of the
     impulse at the region's centre of mass."""
     near, far = block(per_side=4), block(low=(2, 0, 0), per_side=4)
@@ -73,7 +75,7 @@ def test_impulse_pushes_by_mass_and_only_its_region(formulation, block, march):
 
 
 @pytest.mark.parametrize("formulation", FORMULATIONS)
-def test_impulse_per_particle_grows_with_their_number(formulation, block, lone, march):
+def test_impulse_per_particle_grows_with_their_number(formulation):
     """It also grows with the number in each scene of a batch, for any mass; counted again for another material."""
     knock = Impulse(Box([None, None, 0.2], [None] * 3), [0.01, -0.02, 0.03], end=2e-3, per_particle=True)
     solver = MPMSolver(dx=0.1, formulation=formulation, boundaries=[knock], gravity=(0, 0, 0))

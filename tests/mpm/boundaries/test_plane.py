@@ -8,6 +8,8 @@ from torch.testing import assert_close
 
 from gaussian_swaying.mpm.boundaries.plane import Plane, plane_velocity
 
+from .bodies import block, run_for
+
 FORMULATIONS = ["total", "updated"]
 UP = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)
 
@@ -34,7 +36,7 @@ def test_the_length_of_the_normal_does_not_matter(length):
 
 
 @pytest.mark.parametrize("formulation", FORMULATIONS)
-def test_block_slides_down_an_incline_with_coulombs_acceleration(formulation, block, run_for):
+def test_block_slides_down_an_incline_with_coulombs_acceleration(formulation):
     """Static below the friction angle; a = g (sin - mu cos) above. Gravity is tilted instead of the plane."""
     angle, points = math.radians(30), block()
     gravity = (9.8 * math.sin(angle), 0.0, -9.8 * math.cos(angle))

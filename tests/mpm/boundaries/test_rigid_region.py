@@ -16,7 +16,6 @@ from gaussian_swaying.mpm.boundaries.handle import Handle
 from gaussian_swaying.mpm.boundaries.rigid_region import RigidRegion
 
 FORMULATIONS = ["total", "updated"]
-TRANSFERS = ["torch", "kernels"]
 RIGHT = Box([0.2, None, None], [None] * 3)
 
 
@@ -122,17 +121,6 @@ def test_a_handle_leads_the_whole_part(formulation):
     wanted = pivot + (points.position - pivot) @ turn.mT
     assert_close(state.position[right(points)], wanted[right(points)], rtol=0, atol=1e-5)
     assert_close(state.F_total[right(points)], turn.expand(int(right(points).sum()), 3, 3), rtol=0, atol=1e-4)
-
-
-@pytest.mark.parametrize("formulation", FORMULATIONS)
-def test_kernels_do_as_torch_does(formulation):
-    found = []
-    for transfer in TRANSFERS:
-        pin = PinnedRegion(Box([None] * 3, [0.1, None, None]), "nodes")
-        points, solver = bar(RigidRegion(RIGHT), pin, formulation=formulation, transfer=transfer)
-        found.append(advance(solver, solver.init_state(points), 0.1, 4))
-    for name in ("position", "velocity", "F_total", "impulse"):
-        assert_close(getattr(found[0], name), getattr(found[1], name), rtol=1e-9, atol=1e-9)
 
 
 def test_scenes_of_a_batch_do_not_know_each_other():

@@ -9,11 +9,13 @@ from gaussian_swaying import Box, MPMSolver, SimFrame, Sphere
 from gaussian_swaying.mpm.boundaries.impulse import Impulse
 from gaussian_swaying.mpm.boundaries.sequential_release import SequentialRelease
 
+from .bodies import block, lone, march
+
 FORMULATIONS = ["total", "updated"]
 
 
 @pytest.mark.parametrize("formulation", FORMULATIONS)
-def test_scenes_of_a_batch_have_their_own_impulse_and_front(formulation, lone, march):
+def test_scenes_of_a_batch_have_their_own_impulse_and_front(formulation):
     """The impulse is on each scene; a scene without a particle in it gets none. Each front starts at its scene."""
     one = lone([[0, 0, 0], [1, 0, 0], [2, 0, 0]])
     shifts = torch.tensor([[0, 0, 0], [3, 0, 0], [0, 0, 1]], dtype=torch.float64)
@@ -34,7 +36,7 @@ def test_scenes_of_a_batch_have_their_own_impulse_and_front(formulation, lone, m
 
 @pytest.mark.parametrize("formulation", FORMULATIONS)
 @pytest.mark.parametrize("direction", [(2.0, 0.0, 0.0), (-1.0, 0.0, 0.0), (1.0, 2.5, 0.0)])
-def test_release_passes_over_lone_particles_in_order(formulation, direction, lone, march):
+def test_release_passes_over_lone_particles_in_order(formulation, direction):
     """Each falls for exactly the substeps since the front met it; the others fall from the beginning."""
     points = lone([[0, 0, 0], [1, 0, 0], [2, 0, 0], [3, 0, 0], [1, 1, 0], [0, 9, 0]])
     release = SequentialRelease(Box([None] * 3, [None, 5, None]), direction, start=0.055, end=0.355)
@@ -52,7 +54,7 @@ def test_release_passes_over_lone_particles_in_order(formulation, direction, lon
 
 @pytest.mark.parametrize("formulation", FORMULATIONS)
 @pytest.mark.parametrize("sign", [1.0, -1.0])
-def test_release_lets_layers_of_a_block_fall_in_order(formulation, sign, block, march):
+def test_release_lets_layers_of_a_block_fall_in_order(formulation, sign):
     points = block(e=2e3)
     rest = points.position
     release = SequentialRelease(Sphere([0, 0, 0], 9.0), [sign, 0, 0], start=0.03, end=0.13, kind="nodes")

@@ -7,11 +7,13 @@ from gaussian_swaying import Box, MPMSolver, SimFrame
 from gaussian_swaying.mpm.boundaries.boundary import Nodes
 from gaussian_swaying.mpm.boundaries.velocity_box import VelocityBox
 
+from .bodies import block, lone, march
+
 FORMULATIONS = ["total", "updated"]
 
 
 @pytest.mark.parametrize("formulation", FORMULATIONS)
-def test_velocity_box_drives_only_its_side(formulation, lone, march):
+def test_velocity_box_drives_only_its_side(formulation):
     """Two lone particles on either side of a face: the nodes inside are driven, the others are not."""
     points = lone([[0.0, 0.0, 0.05], [0.0, 0.0, -0.25]])
     drive = VelocityBox(Box([-9, -9, -0.05], [9, 9, 9]), [0.5, 0.0, -0.3], start=0.02, end=0.05)
@@ -22,7 +24,7 @@ def test_velocity_box_drives_only_its_side(formulation, lone, march):
     torch.testing.assert_close(speed[3, 0], torch.tensor([0.5, 0.0, -0.3], dtype=torch.float64))
 
 
-def test_a_travelling_box_takes_its_nodes_from_where_it_is(block):
+def test_a_travelling_box_takes_its_nodes_from_where_it_is():
     """It moves from its start on, in the metres of a frame that scales and rotates; a fixed box does not move."""
     frame = SimFrame.fit(block().position, up=(0.0, 1.0, 0.0), metres_per_unit=0.5)
     box = Box([0.0, 0.0, 0.0], [0.2, 0.4, 0.4])

@@ -11,11 +11,13 @@ from gaussian_swaying import Contact, MaterialPoints, MPMSolver, PinnedPoints
 from gaussian_swaying.mpm.boundaries.half_space import HalfSpaceObstacle
 from gaussian_swaying.mpm.contact.surface import Surface
 
+from .bodies import layers, march, scene, sheet
+
 THICKNESS = 0.01
 GROUND = [0.0, 0.0, -0.005], [0.0, 0.0, 1.0]
 
 
-def _two(sheet, speed, angle=0.0, dtype=torch.float64):
+def _two(speed, angle=0.0, dtype=torch.float64):
     """A sheet that flies onto a larger one, and the triangles of both."""
     below, above = sheet(16, 16, dtype=dtype), sheet(10, 10, (0.053, 0.047, 0.13), dtype=dtype)
     points = MaterialPoints.join([below, above])
@@ -27,9 +29,9 @@ def _two(sheet, speed, angle=0.0, dtype=torch.float64):
 @pytest.mark.slow(gate=["0.0-50.0", "0.5-2.0"])
 @pytest.mark.parametrize("speed", [2.0, 50.0])
 @pytest.mark.parametrize("friction", [0.0, 0.5])
-def test_sheets_that_collide_do_not_pass_each_other(sheet, scene, march, speed, friction):
+def test_sheets_that_collide_do_not_pass_each_other(speed, friction):
     """At 50 m/s a substep would carry them five thicknesses. Momentum stays to round-off, energy does not grow."""
-    points, velocity, triangles = _two(sheet, speed, 0.3)
+    points, velocity, triangles = _two(speed, 0.3)
     solver, state = scene(points, Contact(friction=friction), velocity=velocity, gravity=(0, 0, 0))
     before, momentum = solver.energies(state), solver.momenta(state)["linear"]
     shares = []
@@ -47,9 +49,9 @@ def test_sheets_that_collide_do_not_pass_each_other(sheet, scene, march, speed, 
         assert float(later.velocity[points.count - 100 :, 0].mean()) > 0.7 * 0.3 * speed
 
 
-def test_without_contact_they_do_pass(sheet, scene, march):
+def test_without_contact_they_do_pass():
     """The same collision without contact: the test above can fail."""
-    points, velocity, triangles = _two(sheet, 2.0)
+    points, velocity, triangles = _two(2.0)
     solver, state = scene(points, None, velocity=velocity, gravity=(0, 0, 0))
     assert solver.bound.contact is None  # off costs nothing
     crossed = [crossings(later.position, triangles) for later in march(solver, state, 0.09)]
@@ -58,7 +60,7 @@ def test_without_contact_they_do_pass(sheet, scene, march):
 
 
 @pytest.mark.parametrize("seconds", [0.46, pytest.param(0.8, marks=pytest.mark.slow)])
-def test_a_strip_that_falls_folds_and_does_not_cross_itself(sheet, scene, march, seconds):
+def test_a_strip_that_falls_folds_and_does_not_cross_itself(seconds):
     """Upright on the ground, with a slight bend, it buckles into layers of one sheet."""
     points = sheet(40, 8, axes=(2, 1), youngs_modulus=5e3)
     solver, state = scene(
@@ -79,7 +81,7 @@ def test_a_strip_that_falls_folds_and_does_not_cross_itself(sheet, scene, march,
 
 
 @pytest.mark.parametrize("count", [8, *(pytest.param(n, marks=pytest.mark.slow) for n in (15, 50))])
-def test_layers_pressed_together_stay_in_order(layers, march, count):
+def test_layers_pressed_together_stay_in_order(count):
     """They fall on each other with twice the weight; every layer stays above the one below it, everywhere."""
     ground = [HalfSpaceObstacle(*GROUND)]
     solver, state = layers(count, 1.1 * THICKNESS, shift=0.003, boundaries=ground, gravity=(0, 0, -20.0))
@@ -89,7 +91,7 @@ def test_layers_pressed_together_stay_in_order(layers, march, count):
         assert float((gaps(solver.bound.contact, later) < 0.5).double().mean()) <= 1e-3
 
 
-def _rest(layers, march, count, seconds, dtype=torch.float64):
+def _rest(count, seconds, dtype=torch.float64):
     """Changes of the energy and of its elastic part after a pile has settled; how far a layer rises or sinks."""
     settings = {"gravity": (0, 0, -9.8), "stiffness_damping": 1e-3, "boundaries": [HalfSpaceObstacle(*GROUND)]}
     solver, state = layers(count, THICKNESS, side=5, shift=0.003, dtype=dtype, **settings)
@@ -108,9 +110,9 @@ def _rest(layers, march, count, seconds, dtype=torch.float64):
 
 
 @pytest.mark.parametrize(("count", "seconds"), [(2, 0.3), pytest.param(5, 0.5, marks=pytest.mark.slow)])
-def test_a_pile_at_rest_stays_at_rest(layers, march, count, seconds):
+def test_a_pile_at_rest_stays_at_rest(count, seconds):
     """No layer moves by more than 1 % of the thickness, energy does not grow, and no bending builds up."""
-    change, bent, moved = _rest(layers, march, count, seconds)
+    change, bent, moved = _rest(count, seconds)
     assert change < 1e-3
     assert bent < 5e-6  # 30e-6 if friction does not yield, and it then grows
     assert moved < 0.01 * THICKNESS
@@ -119,17 +121,17 @@ def test_a_pile_at_rest_stays_at_rest(layers, march, count, seconds):
 @pytest.mark.slow
 @pytest.mark.timeout(7200)
 @pytest.mark.parametrize(("dtype", "seconds"), [(torch.float64, 11.5), (torch.float32, 60.0)])
-def test_a_pile_rests_for_long(layers, march, dtype, seconds):
+def test_a_pile_rests_for_long(dtype, seconds):
     """It slides slowly, and so sinks a little; energy does not grow."""
-    change, bent, moved = _rest(layers, march, 8, seconds, dtype)
+    change, bent, moved = _rest(8, seconds, dtype)
     assert change < 1e-3
     assert bent < 1e-4
     assert moved < 0.02 * THICKNESS
 
 
-def test_the_lists_do_not_change_the_result(sheet, scene, march):
+def test_the_lists_do_not_change_the_result():
     """They are a cache: a solver that has just been made continues from a state as the one that made it."""
-    points, velocity, _ = _two(sheet, 2.0, 0.3)
+    points, velocity, _ = _two(2.0, 0.3)
     solver, state = scene(points, Contact(), velocity=velocity, gravity=(0, 0, 0))
     middle = march(solver, state, 0.07)[-1]
     known = march(solver, middle, 0.02)[-1]
@@ -139,9 +141,9 @@ def test_the_lists_do_not_change_the_result(sheet, scene, march):
     assert_close(again.position, known.position, rtol=0, atol=1e-10)
 
 
-def test_gradients_flow_through_a_contact(sheet, scene, march):
+def test_gradients_flow_through_a_contact():
     """Of a few substeps in contact, against a difference in a random direction; no contact begins or ends in them."""
-    points, velocity, _ = _two(sheet, 2.0, 0.3)
+    points, velocity, _ = _two(2.0, 0.3)
     solver, state = scene(points, Contact(iterations=3), velocity=velocity, gravity=(0, 0, 0))
     touching = march(solver, state, 0.062, frame=0.002)[-1]
     ways = [torch.randn_like(touching.node_displacement) for _ in range(2)]
@@ -179,7 +181,7 @@ def test_bad_settings_are_refused(make, message):
         make()
 
 
-def test_contact_needs_normals_and_fixed_neighbours(sheet):
+def test_contact_needs_normals_and_fixed_neighbours():
     points = sheet(4, 4)
     with pytest.raises(ValueError, match="`normal` and `spacing`"):
         Surface.of_points(points, contact=Contact())
@@ -191,9 +193,9 @@ def test_contact_needs_normals_and_fixed_neighbours(sheet):
         MPMSolver(dx=0.05).init_state(points, surface=astray)
 
 
-def test_pins_are_stronger_than_contact(sheet, scene, march):
+def test_pins_are_stronger_than_contact():
     """A sheet held at its corners catches another one; the corners do not move."""
-    points, velocity, _ = _two(sheet, 2.0)
+    points, velocity, _ = _two(2.0)
     corners = [[0.0, 0.0, 0.0], [0.3, 0.0, 0.0], [0.0, 0.3, 0.0], [0.3, 0.3, 0.0]]
     solver, state = scene(points, Contact(), [PinnedPoints(corners)], velocity=velocity)
     end = march(solver, state, 0.12)[-1]

@@ -10,10 +10,12 @@ from gaussian_swaying.mpm.boundaries.half_space import HalfSpaceObstacle
 from gaussian_swaying.mpm.contact.pairs import close_pairs
 from gaussian_swaying.mpm.triton import fused_contact
 
+from .bodies import scene, sheet
+
 DT = 1.2e-3
 
 
-def _collision(sheet, device):
+def _collision(device):
     """A small sheet that flies onto one that is held at two corners, beside a moving ball."""
     below, above = sheet(5, 5, dtype=torch.float32), sheet(3, 3, (0.023, 0.017, 0.1), dtype=torch.float32)
     points = MaterialPoints.join([below, above]).map(lambda t: t.to(device))
@@ -33,9 +35,9 @@ def _collision(sheet, device):
     [("cpu", 4), *(pytest.param("cuda", number, marks=pytest.mark.gpu) for number in (1, 4))],
     indirect=["device"],
 )
-def test_the_kernels_do_what_torch_does(sheet, scene, device, iterations):
+def test_the_kernels_do_what_torch_does(device, iterations):
     """Four substeps of free flight and two of collision; round-off grows in it, but not to a thousandth of it."""
-    points, velocity, boundaries = _collision(sheet, device)
+    points, velocity, boundaries = _collision(device)
     ends, taken = [], []
     for transfer in ("torch", "kernels"):
         contact = Contact(friction=0.1, iterations=iterations)  # they slide
@@ -56,7 +58,7 @@ def test_the_kernels_do_what_torch_does(sheet, scene, device, iterations):
         assert (each.abs().amax(-1) > 1e-7).tolist() == [True, True, False, True]
 
 
-def test_iterations_are_counted_where_there_are_obstacles(sheet, scene, device):
+def test_iterations_are_counted_where_there_are_obstacles(device):
     """One in every substep of a sheet that presses on the ground."""
     points = sheet(5, 5, dtype=torch.float32).map(lambda t: t.to(device))
     ground = HalfSpaceObstacle([0.0, 0.0, -0.004], [0.0, 0.0, 1.0])
@@ -65,7 +67,7 @@ def test_iterations_are_counted_where_there_are_obstacles(sheet, scene, device):
     assert solver.fused().touching.rounds == 6
 
 
-def test_the_lists_are_those_of_close_pairs(sheet, scene, device):
+def test_the_lists_are_those_of_close_pairs(device):
     """Sheets that lie across each other in many cells of the grid: both sides of all pairs, in a fixed order."""
     low = sheet(9, 9, dtype=torch.float32)
     points = MaterialPoints.join([low, sheet(9, 9, (0.0, 0.0, 0.4), dtype=torch.float32)]).map(lambda t: t.to(device))
@@ -88,7 +90,7 @@ def test_the_lists_are_those_of_close_pairs(sheet, scene, device):
     assert torch.equal((found[0] * width + found[1]).sort()[0], (expected[0] * width + expected[1]).sort()[0])
 
 
-def test_nodes_without_weight_do_not_widen_the_lists(sheet, scene, device):
+def test_nodes_without_weight_do_not_widen_the_lists(device):
     """A node that reaches a sheet by a thousandth of a cell may fly at 1000 m/s, as stress makes it: no place moves."""
     low = sheet(5, 5, dtype=torch.float32)
     dx = 0.044
@@ -109,9 +111,9 @@ def test_nodes_without_weight_do_not_widen_the_lists(sheet, scene, device):
     assert_close(ends[1].position, ends[0].position, rtol=0, atol=1e-6)
 
 
-def test_lists_that_do_not_fit_get_more_room(sheet, scene, device, monkeypatch):
+def test_lists_that_do_not_fit_get_more_room(device, monkeypatch):
     """The rollout is done again from its start, and ends where it would have with enough room."""
-    points, velocity, _ = _collision(sheet, device)
+    points, velocity, _ = _collision(device)
     ends, rooms = [], []
     for room, slots in ((64, 32), (2, 1)):
         monkeypatch.setattr(fused_contact, "ROOM", room)
@@ -129,10 +131,10 @@ def test_lists_that_do_not_fit_get_more_room(sheet, scene, device, monkeypatch):
     assert float(ends[0].time) == float(ends[1].time)
 
 
-def test_material_that_has_collapsed_is_refused(sheet, scene, device, monkeypatch):
+def test_material_that_has_collapsed_is_refused(device, monkeypatch):
     """More candidates than any buffer holds: a sentence, not wrong lists, and another rollout is possible."""
     monkeypatch.setattr(fused_contact, "ROOM", 2)
-    points, velocity, _ = _collision(sheet, device)
+    points, velocity, _ = _collision(device)
     solver, state = scene(points, Contact(iterations=1), velocity=velocity, transfer="kernels")
     monkeypatch.setattr(fused_contact, "MOST_ENTRIES", 1000 * points.count)
     solver.fused()
@@ -148,10 +150,10 @@ def test_material_that_has_collapsed_is_refused(sheet, scene, device, monkeypatc
 
 
 @pytest.mark.gpu
-def test_graphs_do_what_single_substeps_do(sheet, scene):
+def test_graphs_do_what_single_substeps_do():
     """On a GPU: substeps of a collision from graphs, and a new list in the middle, against torch."""
     device = torch.device("cuda")
-    points, velocity, boundaries = _collision(sheet, device)
+    points, velocity, boundaries = _collision(device)
     ends = []
     for transfer in ("torch", "kernels"):
         solver, state = scene(points, Contact(), boundaries, velocity=0.1 * velocity, transfer=transfer)
@@ -164,9 +166,9 @@ def test_graphs_do_what_single_substeps_do(sheet, scene):
 
 
 @pytest.mark.gpu
-def test_deterministic_contact_gives_the_same_bits(sheet, scene):
+def test_deterministic_contact_gives_the_same_bits():
     device = torch.device("cuda")
-    points, velocity, boundaries = _collision(sheet, device)
+    points, velocity, boundaries = _collision(device)
     ends = []
     for _ in range(2):
         solver, state = scene(points, Contact(), boundaries, velocity=velocity, transfer="auto", deterministic=True)

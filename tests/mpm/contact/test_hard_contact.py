@@ -8,6 +8,8 @@ from contacts import crossings, sheet_triangles
 
 from gaussian_swaying import Contact, MaterialPoints
 
+from .bodies import layers, march, scene, sheet
+
 THICKNESS = 0.01
 
 
@@ -15,7 +17,7 @@ def _finite(state):
     return bool(torch.isfinite(state.position).all() & torch.isfinite(state.velocity).all())
 
 
-def test_sheets_in_the_same_place_come_apart(layers, march):
+def test_sheets_in_the_same_place_come_apart():
     """Three sheets exactly in one place: the impulses are finite, momentum stays, and no speed is above the bound."""
     solver, state = layers(3, 0.0)
     for later in march(solver, state, 0.02, frame=0.005):
@@ -24,7 +26,7 @@ def test_sheets_in_the_same_place_come_apart(layers, march):
     torch.testing.assert_close(solver.momenta(later)["linear"], torch.zeros(3, dtype=torch.float64), rtol=0, atol=1e-12)
 
 
-def test_everything_in_contact_at_half_the_thickness(layers, march):
+def test_everything_in_contact_at_half_the_thickness():
     """Every place of five sheets overlaps its neighbours: the pile opens in order, at bounded speeds."""
     solver, state = layers(5, 0.5 * THICKNESS, stiffness_damping=1e-3)
     later = march(solver, state, 0.1, frame=0.02)[-1]
@@ -34,7 +36,7 @@ def test_everything_in_contact_at_half_the_thickness(layers, march):
     assert float(later.velocity.norm(dim=-1).max()) < 2.0
 
 
-def test_a_thickness_above_the_spacing_is_kept(sheet, scene, march):
+def test_a_thickness_above_the_spacing_is_kept():
     """Three times the distance of the points: two sheets stop that far from each other, and leave themselves alone."""
     below, above = sheet(14, 14), sheet(8, 8, (0.053, 0.047, 0.2))
     points = MaterialPoints.join([below, above])
@@ -54,7 +56,7 @@ def test_a_thickness_above_the_spacing_is_kept(sheet, scene, march):
 
 
 @pytest.mark.parametrize("broken", ["normal", "radius", "both"])
-def test_patches_without_a_normal_or_a_size_end_finite(layers, march, broken):
+def test_patches_without_a_normal_or_a_size_end_finite(broken):
     """A disc without a normal or a radius touches nothing, or by the normal of the other; nothing becomes NaN."""
 
     def change(surface):

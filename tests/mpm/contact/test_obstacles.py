@@ -13,6 +13,8 @@ from gaussian_swaying.mpm.boundaries.block import BoxObstacle
 from gaussian_swaying.mpm.boundaries.capsule import CapsuleObstacle
 from gaussian_swaying.mpm.boundaries.half_space import HalfSpaceObstacle
 
+from .bodies import march, scene, sheet
+
 FORMULATIONS = ["total", "updated"]
 
 
@@ -93,7 +95,7 @@ def test_a_block_that_rests_stays_where_it_is(frames):
 @pytest.mark.slow(gate=["12-0.01"])
 @pytest.mark.parametrize("thickness", [0.0, 0.01])
 @pytest.mark.parametrize("per_side", [12, 30])
-def test_a_sheet_over_a_ball_stays_outside(sheet, scene, march, per_side, thickness):
+def test_a_sheet_over_a_ball_stays_outside(per_side, thickness):
     """Every point keeps half the thickness, but for the overlap that a substep leaves (2 % of a cell)."""
     centre = torch.tensor([0.31, 0.29, -0.26], dtype=torch.float64)
     ball = BallObstacle(centre.tolist(), 0.25)
@@ -108,7 +110,7 @@ def test_a_sheet_over_a_ball_stays_outside(sheet, scene, march, per_side, thickn
     assert -0.02 * solver.dx < nearest < 1e-3
 
 
-def test_a_fast_sheet_does_not_pass_a_thin_rod(sheet, scene, march):
+def test_a_fast_sheet_does_not_pass_a_thin_rod():
     """50 m/s onto a rod of 4 cm: three times its width in a frame."""
     points = sheet(16, 16)
     velocity = torch.tensor([0.0, 0.0, -50.0], dtype=torch.float64).expand(points.count, 3)
@@ -121,7 +123,7 @@ def test_a_fast_sheet_does_not_pass_a_thin_rod(sheet, scene, march):
         assert float(arm.norm(dim=-1).min()) > 0.02
 
 
-def _flying_ball(sheet, speed=1e4, turns=(), **settings):
+def _flying_ball(speed=1e4, turns=(), **settings):
     """A ball that crosses a free sheet within one frame of 4e-5 s, in ``updated``; it was still before."""
     times, moves = [0.0, 1.0, 1.0 + 0.4 / speed], [[0, 0, -0.2], [0, 0, -0.2], [0, 0, 0.2]]
     ball = BallObstacle([0.1, 0.1, 0.0], 0.18, friction=0.0, path=KeyedPath(times, moves, list(turns)))
@@ -131,9 +133,9 @@ def _flying_ball(sheet, speed=1e4, turns=(), **settings):
     return solver, state, state.replace(time=state.time + 1.0)
 
 
-def test_a_ball_at_ten_kilometres_a_second_does_not_pass_a_sheet(sheet):
+def test_a_ball_at_ten_kilometres_a_second_does_not_pass_a_sheet():
     """The sheet flies before it; with the substep of the material, at rest, it was on the other side at once."""
-    solver, still, state = _flying_ball(sheet)
+    solver, still, state = _flying_ball()
     frame = 4e-5
     assert solver.substeps(still, frame) == 1  # no obstacle moves yet
     assert solver.bound.obstacle_cells(still, frame) == 0.0
@@ -150,23 +152,23 @@ def test_a_ball_at_ten_kilometres_a_second_does_not_pass_a_sheet(sheet):
     assert solver.bound.obstacle_cells(end.replace(time=end.time + frame), frame) == 0.0  # its motion is over
 
 
-def test_substeps_in_which_an_obstacle_would_jump_are_refused(sheet):
-    solver, still, state = _flying_ball(sheet)
+def test_substeps_in_which_an_obstacle_would_jump_are_refused():
+    solver, still, state = _flying_ball()
     solver.rollout(still, 4e-5, 2)
     for call in (lambda: solver.step(state, 4e-5), lambda: solver.rollout(state, 4e-5, 2)):
         with pytest.raises(
             ValueError, match=r"moves by 9.09 cells in a substep of 4e-05 s.* lower `dt` to at most 4.4e-06"
         ):
             call()
-    fixed, _, state = _flying_ball(sheet, substep=4e-5)
+    fixed, _, state = _flying_ball(substep=4e-5)
     with pytest.raises(
         ValueError, match=r"An obstacle moves by 9.09 cells .* lower `solver.substep` to at most 4.4e-06"
     ):
         fixed.substeps(state, 4e-4)
 
 
-def test_an_obstacle_that_turns_counts_at_the_farthest_place(sheet):
+def test_an_obstacle_that_turns_counts_at_the_farthest_place():
     """180 degrees in 0.4 s, at the corner of the sheet, and the way of its centre."""
-    turning, _, state = _flying_ball(sheet, 1.0, [[0, 0, 0], [0, 0, 0], [0, 0, 180]])
+    turning, _, state = _flying_ball(1.0, [[0, 0, 0], [0, 0, 0], [0, 0, 180]])
     far = math.hypot(0.1, 0.1, 0.2)
     assert turning.bound.obstacle_cells(state, 0.1) == pytest.approx((1.0 + math.pi / 0.4 * far) / 0.044)

@@ -110,47 +110,35 @@ FORCES = {
 )
 @pytest.mark.parametrize("formulation", FORMULATIONS)
 def test_forces_in_torch_among_the_kernels(kernel_device, formulation, case, monkeypatch):
-    """Across the end of a part, with particles sorted again, and with a batch; all forces and their work."""
+    """Across the end of a part, with particles sorted again, boundaries, and with a batch; all forces and their work.
+
+    The time passed to forces and boundaries advances once per substep; the internal variable is passed too.
+    """
     name, resistance = case
+    plane = Plane([0.0, 0.0, 0.13], [0.1, 0.0, 1.0], "separate")
+    held = {"boundaries": [PinnedRegion(LEFT, start=1.5 * DT), plane]}
     monkeypatch.setattr(fused, "MAX_STEPS", 3)
     monkeypatch.setattr(fused_updated, "sorted_for", lambda *known: 2)
-    points = make_points(kernel_device, count=6, batch=(2,))
+    law = ELASTIC["corotated"] if formulation == "total" else PLASTIC["sand that swells"]
+    points = make_points(kernel_device, law, count=6, batch=(2,))
     pull = _Pull(kernel_device, resistance)
+    seen = []
 
     def run(solver, state):
         monkeypatch.setattr(solver, "_step", None if solver.transfer == "kernels" else solver._step)
         forces = FORCES[name](points, pull)
         states = [solver.rollout(state, DT, 1, forces)]
-        states.append(solver.rollout(states[-1], 0.7 * DT, 4, forces))
-        return states
+        state, cells = solver.watched_rollout(states[-1], 0.7 * DT, 4, forces, 2)
+        seen.append(float(cells))
+        return [*states, state]
 
-    ends = run_both(points, run, formulation)
+    ends = run_both(points, run, formulation, **held)
     check_agreement(ends)
-    free = make_solver("torch", formulation)
+    assert seen[1] == pytest.approx(seen[0], rel=2 * TOLERANCE)
+    free = make_solver("torch", formulation, **held)
     with torch.no_grad():
         calm = free.rollout(set_going(free, points), DT, 1, FORCES[name](points, pull)[:-1])
     assert not torch.allclose(calm.velocity, ends[0][0].velocity, rtol=1e-3)
-
-
-@pytest.mark.parametrize(
-    ("kernel_device", "case"),
-    on_each(("total", "corotated"), ("updated", "sand that swells")),
-    indirect=["kernel_device"],
-    ids=str,
-)
-def test_forces_in_torch_with_boundaries_looks_and_flow(kernel_device, case):
-    """The time passed to forces and boundaries advances once per substep; the internal variable is passed too."""
-    formulation, law = case
-    points = make_points(kernel_device, (ELASTIC | PLASTIC)[law], count=12)
-    forces = [_Pull(kernel_device, 1.0), make_load(points)]
-    found = run_both(
-        points,
-        lambda solver, state: solver.watched_rollout(state, DT, 3, forces, 2),
-        formulation,
-        boundaries=[PinnedRegion(LEFT, start=1.5 * DT), Plane([0.0, 0.0, 0.13], [0.1, 0.0, 1.0], "separate")],
-    )
-    check_agreement([state for state, _ in found])
-    assert float(found[1][1]) == pytest.approx(float(found[0][1]), rel=2 * TOLERANCE)
 
 
 @pytest.mark.parametrize("kernel_device", ["cpu"], indirect=True)

@@ -14,7 +14,6 @@ from gaussian_swaying.mpm.triton import fused_total
 from .bodies import (
     DT,
     DX,
-    FIELDS,
     FORMULATIONS,
     TOLERANCE,
     check_agreement,
@@ -22,6 +21,7 @@ from .bodies import (
     make_load,
     make_points,
     make_solver,
+    noise,
     on_each,
     run_both,
     run_in_wind,
@@ -134,35 +134,19 @@ def test_what_leaves_the_grid_is_lost(kernel_device):
 @pytest.mark.parametrize("formulation", FORMULATIONS)
 def test_a_batch_is_each_scene_by_itself(kernel_device, formulation):
     points = make_points(kernel_device, count=10, batch=(2,))
-    winds = [
-        WindField([0.0, -8.0, 0.0]),
-        WindField(schedule=[FlowKey(0.0, [1.0, 0, 0]), FlowKey(DT, [9.0, 0, 0])]),
-    ]
-    load = make_load(points, winds)
-    ends = run_both(points, lambda solver, state: solver.rollout(state, DT, 2, load), formulation)
-    check_agreement(ends)
-    assert ends[1].work.shape == (2,)
-    solver = make_solver("torch", formulation)
-    whole = set_going(solver, points)
-    for k, wind in enumerate(winds):
-        alone = points.map(lambda value, k=k: value[k])
+    winds = [WindField([0.0, -8.0, 0.0]), WindField(schedule=[FlowKey(0.0, [1.0, 0, 0]), FlowKey(DT, [9.0, 0, 0])])]
+    load, velocity = make_load(points, winds), 10 * noise(1, 2, 10, 3).to(kernel_device)
+
+    def end(points, velocity, load):
         solver = make_solver("kernels", formulation)
-        state = solver.init_state(alone)
-        fields = {name: None if getattr(whole, name) is None else getattr(whole, name)[k] for name in FIELDS}
-        if formulation == "total":
-            nodes = state.grid.node_count
-            offset = [a - b for a, b in zip(state.grid.offset, whole.grid.offset, strict=True)]
-            index = torch.arange(whole.grid.node_count).reshape(whole.grid.resolution)
-            for axis, (start, size) in enumerate(zip(offset, state.grid.resolution, strict=True)):
-                index = index.narrow(axis, start, size)
-            index = index.reshape(-1).to(kernel_device)
-            assert len(index) == nodes
-            fields |= {name: fields[name][index] for name in ("node_displacement", "node_velocity")}
-        else:
-            state = state.replace(grid=whole.grid)
-        state = state.replace(**fields)
-        end = solver.rollout(state, DT, 2, WindForce(load.aero, wind, load.normal[k], load.area[k]))
+        return solver.rollout(solver.init_state(points, velocity), DT, 4, load)
+
+    both = end(points, velocity, load)
+    assert both.work.shape == (2,)
+    for k, wind in enumerate(winds):
+        own = WindForce(load.aero, wind, load.normal[k], load.area[k])
+        alone = end(points.map(lambda value, k=k: value[k]), velocity[k], own)
         for name in ("position", "velocity", "affine", "F_elastic"):
-            error = (getattr(end, name) - getattr(ends[1], name)[k]).abs().max()
-            assert float(error) <= TOLERANCE * float(getattr(end, name).abs().max()), name
-        torch.testing.assert_close(end.work, ends[1].work[k], rtol=1e-4, atol=0)
+            error = (getattr(alone, name) - getattr(both, name)[k]).abs().max()
+            assert float(error) <= TOLERANCE * float(getattr(alone, name).abs().max()), name
+        torch.testing.assert_close(alone.work, both.work[k], rtol=1e-4, atol=0)

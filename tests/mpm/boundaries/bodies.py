@@ -1,19 +1,18 @@
 """Small bodies, and short runs of them."""
 
-import pytest
 import torch
 from shared import solid
 
 from gaussian_swaying import MaterialPoints, MPMSolver
 
 
-def _block(low=(0.0, 0.0, 0.0), side=0.4, e=2e4, per_side=6):
+def block(low=(0.0, 0.0, 0.0), side=0.4, e=2e4, per_side=6):
     axis = (torch.arange(per_side, dtype=torch.float64) + 0.5) * side / per_side
     position = torch.cartesian_prod(axis, axis, axis)
     return solid(position + torch.tensor(low, dtype=torch.float64), (side / per_side) ** 3, 100.0, e)
 
 
-def _run_for(
+def run_for(
     formulation, boundaries, points, seconds, velocity=None, gravity=(0, 0, -9.8), dx=0.1, damping=0.0, transfer="auto"
 ):
     solver = MPMSolver(dx, formulation, boundaries=boundaries, gravity=gravity, damping=damping, transfer=transfer)
@@ -25,41 +24,17 @@ def _run_for(
     return state
 
 
-def _lone(places, **material):
+def lone(places, **material):
     """Particles without neighbours: stencils do not overlap."""
     position = torch.tensor(places, dtype=torch.float64)
     given = {"volume": 1e-3, "density": 100.0, "youngs_modulus": 1e3, "poisson_ratio": 0.3}
     return MaterialPoints.create(position, **(given | material))
 
 
-def _march(solver, points, dt, steps, velocity=None, frame=None):
+def march(solver, points, dt, steps, velocity=None, frame=None):
     """All states from the first to the last, on a grid that is large enough."""
     states = [solver.init_state(points, velocity, margin=12, frame=frame)]
     for _ in range(steps):
         states.append(solver.step(states[-1], dt))
     assert not bool(states[-1].lost.any())
     return states
-
-
-@pytest.fixture
-def block():
-    """A cube of particles."""
-    return _block
-
-
-@pytest.fixture
-def run_for():
-    """The state after some seconds, on a grid that follows."""
-    return _run_for
-
-
-@pytest.fixture
-def lone():
-    """Particles without neighbours."""
-    return _lone
-
-
-@pytest.fixture
-def march():
-    """All states from the first to the last."""
-    return _march

@@ -1,6 +1,5 @@
 """Sheets that touch."""
 
-import pytest
 import torch
 
 from gaussian_swaying import Contact, MaterialPoints, MPMSolver
@@ -10,7 +9,7 @@ SPACING, THICKNESS, APART = 0.02, 0.01, 0.2
 DX = 2.2 * SPACING
 
 
-def _sheet(nx, ny, low=(0.0, 0.0, 0.0), dtype=torch.float64, spacing=SPACING, axes=(0, 1), **material):
+def sheet(nx, ny, low=(0.0, 0.0, 0.0), dtype=torch.float64, spacing=SPACING, axes=(0, 1), **material):
     """A flat sheet of nx times ny points from a corner on, along two axes."""
     place = torch.zeros(nx * ny, 3, dtype=dtype)
     x, y = (torch.arange(n, dtype=dtype) * spacing for n in (nx, ny))
@@ -24,19 +23,19 @@ def _surface(points, contact, normal=(0.0, 0.0, 1.0), spacing=SPACING):
     return Surface.of_points(points, facing, spacing, THICKNESS, contact)
 
 
-def _scene(points, contact=None, boundaries=(), velocity=None, normal=(0.0, 0.0, 1.0), **settings):
+def scene(points, contact=None, boundaries=(), velocity=None, normal=(0.0, 0.0, 1.0), **settings):
     """A solver in `total` with its contact, and the first state."""
     settings = {"dx": DX, "transfer": "torch"} | settings
     solver = MPMSolver(boundaries=boundaries, **settings)
     return solver, solver.init_state(points, velocity, surface=_surface(points, contact, normal))
 
 
-def _layers(count, gap, side=6, shift=0.0, boundaries=(), change=None, dtype=torch.float64, **settings):
+def layers(count, gap, side=6, shift=0.0, boundaries=(), change=None, dtype=torch.float64, **settings):
     """Sheets that start ``gap`` above each other; at rest they are far apart, so that they share no nodes."""
     points = MaterialPoints.join(
-        [_sheet(side, side, (shift * (k % 3), shift * (k % 2), APART * k), dtype) for k in range(count)]
+        [sheet(side, side, (shift * (k % 3), shift * (k % 2), APART * k), dtype) for k in range(count)]
     )
-    solver, state = _scene(points, Contact(), boundaries, **{"gravity": (0, 0, 0)} | settings)
+    solver, state = scene(points, Contact(), boundaries, **{"gravity": (0, 0, 0)} | settings)
     if change is not None:
         state = solver.init_state(points, surface=change(solver.bound.contact.surface))
     nodes = state.grid.node_positions(state.position)
@@ -46,7 +45,7 @@ def _layers(count, gap, side=6, shift=0.0, boundaries=(), change=None, dtype=tor
     return solver, solver.bound.read_particles(state, moved, torch.zeros_like(moved))
 
 
-def _march(solver, state, seconds, frame=0.01):
+def march(solver, state, seconds, frame=0.01):
     """The states at the end of some frames."""
     states = []
     for _ in range(round(seconds / frame)):
@@ -54,27 +53,3 @@ def _march(solver, state, seconds, frame=0.01):
         state = solver.rollout(state, frame / steps, steps)
         states.append(state)
     return states
-
-
-@pytest.fixture
-def sheet():
-    """A flat sheet."""
-    return _sheet
-
-
-@pytest.fixture
-def scene():
-    """A solver with contact, and the first state."""
-    return _scene
-
-
-@pytest.fixture
-def layers():
-    """Sheets above each other."""
-    return _layers
-
-
-@pytest.fixture
-def march():
-    """The states at the end of some frames."""
-    return _march
