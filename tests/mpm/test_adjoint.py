@@ -162,7 +162,7 @@ ROLLOUTS = {  # by everything that a fit may seek; with 5 substeps, segments of 
 }
 
 
-@pytest.mark.slow(gate=[f"cpu-{name}" for name in ROLLOUTS if name not in ("neo-hookean", "springs", "hinge")])
+@pytest.mark.slow(gate=[f"cpu-{name}" for name in ROLLOUTS if "paper" not in name and name != "hinge"])
 @pytest.mark.parametrize("name", ROLLOUTS)
 def test_gradients_of_a_rollout(name, kernel_device):
     law, settings = ROLLOUTS[name]()
