@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import hashlib
 import json
 import math
 import os
@@ -57,20 +58,21 @@ def kind_of(path: Path) -> str | None:
         return "link to itself"
 
 
-def check_not_taken(path: Path) -> None:
-    """Raise ValueError if a path that a run writes or reads exists but is not a regular file."""
-    kind = kind_of(path)
-    if kind not in (None, "file"):
-        raise ValueError(f"Expected {path} to be a file, but it is a {kind}: move it away.")
-
-
 def check_page(path: Path, what: str) -> None:
     """Raise ValueError if a page cannot be written to a path: its name ends in .html, and its folder exists."""
     if path.suffix.lower() != ".html":
         raise ValueError(f"Expected the name of a {what} to end in .html, but got {path}.")
     if not path.parent.is_dir():
         raise ValueError(f"The folder {path.parent} of the {what} does not exist: make it, or name another one.")
-    check_not_taken(path)
+
+
+def sha256(path: Path) -> str:
+    """SHA-256 of a file in hexadecimal."""
+    digest = hashlib.sha256()
+    with path.open("rb") as file:
+        while block := file.read(1 << 20):
+            digest.update(block)
+    return digest.hexdigest()
 
 
 @contextmanager

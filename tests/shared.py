@@ -1,9 +1,35 @@
-"""What tests of several rooms share: draws, material, the files of a folder, and how a command refuses."""
+"""What tests of several rooms share: draws, material, a small flag, the files of a folder, how a command refuses."""
 
 import torch
 
 from gaussian_swaying import MaterialPoints
+from gaussian_swaying.config.parser import option
 from gaussian_swaying.geometry.regions import Region
+
+POLE = {"class_path": "Box", "init_args": {"min": [None] * 3, "max": [0.11, None, None]}}
+PIN = {"class_path": "PinnedRegion", "init_args": {"region": POLE}}
+SMALL = {
+    "scene.generator.init_args.spacing": 0.1,
+    "solver.dx": 0.2,
+    "solver.boundaries": [PIN],
+    "camera.init_args.width": 32,
+    "camera.init_args.height": 18,
+}
+"""Settings that make the shipped flag a small one."""
+
+
+def words(settings):
+    """Settings as options of a command line."""
+    return [option(name, value) for name, value in settings.items()]
+
+
+def advanced(simulation, frames, state=None):
+    """The state after some frames, from rest if none is given, and the diagnostics of each."""
+    state, log = simulation.start() if state is None else state, []
+    for _ in range(frames):
+        state, health = simulation.advance(state)
+        log.append(health)
+    return state, log
 
 
 def solid(position, volume, density=100.0, E=1e4, nu=0.3, **more):

@@ -2,6 +2,7 @@
 
 import csv
 import json
+import math
 
 import pytest
 
@@ -24,6 +25,12 @@ def test_a_file_appears_whole_or_not_at_all(tmp_path):
         fail_half_way()
     assert json.loads(path.read_text()) == {"a": 1}
     assert [file.name for file in tmp_path.iterdir()] == ["value.json"]
+
+
+def test_numbers_that_json_does_not_have_are_null(tmp_path):
+    write_json(tmp_path / "a.json", {"a": [math.nan, -math.inf, 1.5, None], "b": (1, "x"), "c": {"d": math.inf}})
+    held = json.loads((tmp_path / "a.json").read_text(), parse_constant=lambda name: pytest.fail(name))
+    assert held == {"a": [None, None, 1.5, None], "b": [1, "x"], "c": {"d": None}}
 
 
 def test_rows_of_an_older_run_leave_their_gaps(tmp_path):

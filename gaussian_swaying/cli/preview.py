@@ -350,17 +350,14 @@ def main(arguments: Sequence[str] | None = None) -> int:
 def _preview(options: argparse.Namespace) -> None:
     if options.scene is None and options.config is None:
         raise ValueError("There is nothing to preview: give SCENE.ply, or --config with a scene.")
-    if options.capture is not None and options.config is not None:
-        raise ValueError("`--capture` is for suggestions, and `--config` is shown unchanged: leave out one of them.")
+    given = [name for name in ("capture", "move", "quality", "minutes") if getattr(options, name) is not None]
+    given += ["connected"] if options.connected != "auto" else []
+    if options.config is not None and given:
+        raise ValueError(
+            f"`--{given[0]}` is for suggestions, and `--config` is shown unchanged: leave out one of them."
+        )
     if options.quality is not None and options.minutes is not None:
         raise ValueError("`--quality` and `--minutes` both choose the grid of the starter: leave out one of them.")
-    if options.move is not None and options.config is not None:
-        raise ValueError("`--move` is for suggestions, and `--config` is shown unchanged: leave out one of them.")
-    if options.config is not None and (options.quality is not None or options.minutes is not None):
-        one = "--quality" if options.minutes is None else "--minutes"
-        raise ValueError(f"`{one}` is for suggestions, and `--config` is shown unchanged: leave out one of them.")
-    if options.config is not None and options.connected != "auto":
-        raise ValueError("`--connected` is for suggestions, and `--config` is shown unchanged: leave out one of them.")
     if options.minutes is not None:
         check_positive("--minutes", options.minutes)
     if options.frames < 1:

@@ -30,7 +30,7 @@ from gaussian_swaying.cli.errors import command, guessing, run_command
 from gaussian_swaying.cli.shipped import with_shipped
 from gaussian_swaying.config.material_names import with_named_materials
 from gaussian_swaying.runs.signals import stop_signals
-from gaussian_swaying.training.checkpoints import SealedCheckpoints, read_training_checkpoint
+from gaussian_swaying.training.checkpoints import PlainCheckpoints, read_training_checkpoint
 from gaussian_swaying.training.csv_log import CsvLog
 from gaussian_swaying.training.finite import TrainingDiverged
 from gaussian_swaying.training.module import SplatTrainer
@@ -130,7 +130,7 @@ class TrainCLI(LightningCLI):
         plugins = settings.get("plugins") or []
         plugins = list(plugins) if isinstance(plugins, (list, tuple)) else [plugins]
         if not any(isinstance(plugin, CheckpointIO) for plugin in plugins):
-            kwargs["plugins"] = [*plugins, SealedCheckpoints()]
+            kwargs["plugins"] = [*plugins, PlainCheckpoints()]
         if _may_be_several(settings):
             if settings.get("strategy") in (None, "auto", "ddp"):
                 kwargs["strategy"] = SplatParallel()

@@ -7,7 +7,8 @@ from pathlib import Path
 
 from gaussian_swaying.gaussians.export import SUFFIXES
 
-FILES = [
+# names that a run writes; a folder that was not made by a run must not contain them
+OURS = [
     "run.json",
     "config.yaml",
     "checkpoint.pt",
@@ -18,8 +19,7 @@ FILES = [
     "animation.usdc",
     *(f"still{suffix}" for name, suffix in SUFFIXES.items() if name != "usd"),
 ]
-# names that a run writes; a folder that was not made by a run must not contain them
-OURS = [*FILES, "frames", "ply", "trajectory", "nodes", "video.mp4", "cameras", "depth", "depth_raw", "normal", "force"]
+OURS += ["frames", "ply", "trajectory", "nodes", "video.mp4", "cameras", "depth", "depth_raw", "normal", "force"]
 OURS += ["wind", "wind.mp4"]
 OURS += [*(name for name in SUFFIXES if name != "ply"), "depth.mp4", "normal.mp4", "force.mp4", "film.html"]
 

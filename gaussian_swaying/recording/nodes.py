@@ -14,11 +14,8 @@ from torch import Tensor
 
 from gaussian_swaying._inputs import check_archive
 
-NODES: dict[str, tuple[tuple[int, ...], type, bool]] = {
-    "displacement": ((3,), np.float16, True),
-    "far": ((4,), np.int32, False),
-}
-"""The arrays of a frame in ``nodes.npz``, as ``TRAJECTORY`` in :mod:`.trajectory`."""
+NODES: dict[str, tuple[tuple[int, ...], type]] = {"displacement": ((3,), np.float16), "far": ((4,), np.int32)}
+"""The arrays of a frame in ``nodes.npz``: shape of a row, and type."""
 
 
 def split_far(displacement: np.ndarray, limit: float) -> tuple[np.ndarray, np.ndarray]:
@@ -78,7 +75,7 @@ def load_nodes(path: str | os.PathLike[str]) -> Tensor:
 
 def _joined(near: np.ndarray, far: np.ndarray) -> np.ndarray:
     """:func:`join_far` of arrays from a file."""
-    for array, (shape, kind, _) in zip((near, far), NODES.values(), strict=True):
+    for array, (shape, kind) in zip((near, far), NODES.values(), strict=True):
         if array.dtype != kind or array.shape[1:] != shape:
             raise ValueError(f"an array of {array.dtype} has the shape {array.shape}")
     if len(far) and int(far[:, 0].min()) < 0:

@@ -25,21 +25,16 @@ from gaussian_swaying.gaussians.cloud import GaussianCloud
 from gaussian_swaying.gaussians.export import SUFFIXES, Format, export_cloud
 from gaussian_swaying.geometry.frame import SimFrame
 from gaussian_swaying.recording.checkpoint import read_checkpoint
-from gaussian_swaying.recording.layout import FILES, OURS, frame_folder, raw_folder, video_file
+from gaussian_swaying.recording.layout import OURS, frame_folder, raw_folder, video_file
 from gaussian_swaying.recording.nodes import NODES, split_far
-from gaussian_swaying.recording.resume import (
-    check_arrays,
-    check_frames,
-    check_pictures,
-    check_shards,
-)
+from gaussian_swaying.recording.resume import packed_frames, tell_missing
 from gaussian_swaying.recording.trajectory import pack_trajectory
 from gaussian_swaying.recording.video import VideoEncoder, encode_video
 from gaussian_swaying.recording.writer import FrameWriter, HostCopy, pack_usd, write_usd_frame
 from gaussian_swaying.rendering.passes import PASSES
-from gaussian_swaying.runs.folder import MARKER, check_names, claim_folder, hold_folder, mark
+from gaussian_swaying.runs.folder import MARKER, claim_folder, hold_folder, mark
 from gaussian_swaying.runs.lock import FolderLock
-from gaussian_swaying.runs.seal import save_sealed
+from gaussian_swaying.runs.saved import save_whole
 
 
 class _Film:
@@ -236,7 +231,7 @@ class Recorder:
         checkpoint = read_checkpoint(path / "checkpoint.pt", config)
         if check is not None:
             check(checkpoint)
-        told = self._check_kept(path, checkpoint)
+        told = self._missing(path, checkpoint)
         for folder in (path, path / "nodes", *(path / name for name in self._folders())):
             remove_temporaries(folder)  # of a run that was killed while writing
         if not (path / MARKER).exists():
@@ -246,27 +241,23 @@ class Recorder:
         self.checkpoint_frame = checkpoint["frame"]
         return checkpoint
 
-    def _check_kept(self, path: Path, checkpoint: dict[str, Any]) -> list[str]:
-        """Sentences about missing files of the frames so far; ValueError if something is damaged."""
-        frames = checkpoint["frame"] + 1
-        videos = [video_file(place) for place in self._films] if self.video else []
-        arrays = ["nodes"] if self.nodes else []
-        check_names(path, [*FILES, *videos], [*self._folders(), *arrays])
-        told = []
+    def _missing(self, path: Path, checkpoint: dict[str, Any]) -> list[str]:
+        """Sentences about missing files of the frames so far."""
+        frames, told = range(checkpoint["frame"] + 1), []
         for place in self._picture_folders():
             film = video_file(place) if self.video and place in self._films else None
-            told += check_pictures(path, place, frames, film)
-        if self.trajectory:
-            tracked = checkpoint.get("tracked")
-            told += check_arrays(path, "trajectory", frames, tracked if isinstance(tracked, int) else None)
-        if self.nodes and isinstance(checkpoint.get("nodes"), int):
-            told += check_arrays(path, "nodes", frames, checkpoint["nodes"])
-        if self.ply_every and self.export_format == "usd":
-            told += check_shards(path, range(0, frames, self.ply_every))
-        elif self.ply_every:
-            wanted = range(0, frames, self.ply_every)
-            told += check_frames(path, self.export_format, SUFFIXES[self.export_format], wanted)
+            told += tell_missing(path / place, ".png", frames, film)
+        for name, kept in (("trajectory", self.trajectory), ("nodes", self.nodes and checkpoint["nodes"])):
+            if kept:
+                film = f"{name}.npz"
+                told += tell_missing(path / name, ".npz", {*frames} - packed_frames(path / film), film)
+        if self.ply_every and not (self.export_format == "usd" and (path / "animation.usdc").exists()):
+            told += tell_missing(path / self.export_format, self._splat_suffix, frames[:: self.ply_every])
         return told
+
+    @property
+    def _splat_suffix(self) -> str:
+        return ".npz" if self.export_format == "usd" else SUFFIXES[self.export_format]
 
     def release(self) -> None:
         """Unlock the folder for other runs."""
@@ -359,8 +350,7 @@ class Recorder:
             write: Called later with the path, in another thread, so its data must not change. On a GPU, earlier work of
                 the current stream is finished by then. It must write the file completely or not at all.
         """
-        suffix = ".npz" if self.export_format == "usd" else SUFFIXES[self.export_format]
-        path = self.folder / self.export_format / f"{index:05d}{suffix}"
+        path = self.folder / self.export_format / f"{index:05d}{self._splat_suffix}"
         ready = torch.cuda.Event(blocking=True) if torch.cuda.is_initialized() else None
         if ready is not None:
             ready.record()
@@ -412,7 +402,7 @@ class Recorder:
         path, copy = self.folder / "checkpoint.pt", HostCopy(checkpoint)
 
         def write() -> None:
-            save_sealed(path, copy.get())
+            save_whole(path, copy.get())
             self.checkpoint_frame = checkpoint["frame"]
 
         self._submit(path, write, after_all=True)
@@ -433,15 +423,12 @@ class Recorder:
         files = [self.folder / place / f"{index:05d}.png" for index in range(count)]
         return [file for file in files if file.exists()]
 
-    def close(
-        self, frames: int, summary: dict[str, Any], real_time_fps: float | None = None, release: bool = True
-    ) -> list[Path]:
+    def close(self, frames: int, summary: dict[str, Any], release: bool = True) -> list[Path]:
         """Wait for all files, pack the trajectory, finish the video and write the summary of the frames so far.
 
         Args:
             frames: Number of frames recorded.
             summary: Content of ``summary.json``.
-            real_time_fps: Frames per second at which the video shows the simulated time, if not as in :meth:`open`.
             release: Unlock the folder at the end.
 
         Returns:
@@ -476,7 +463,7 @@ class Recorder:
                 for place in self._films:
                     files = self.frame_files(frames, place)
                     if self.video and files:  # last, as it needs another program
-                        self._finish_video(place, files, self.fps or real_time_fps or self._real_time_fps)
+                        self._finish_video(place, files)
                         made.append(self.folder / video_file(place))
         finally:
             self._give_up_video()
@@ -486,15 +473,15 @@ class Recorder:
             raise failure
         return made
 
-    def _finish_video(self, place: str, files: list[Path], fps: float) -> None:
-        """Finish the video if it has these frames at this rate, or else encode the files."""
+    def _finish_video(self, place: str, files: list[Path]) -> None:
+        """Finish the video if it has these frames, or else encode the files."""
         film = self._films[place]
         encoder = film.encoder
-        if encoder is not None and encoder.fps == fps and film.encoded == [int(file.stem) for file in files]:
+        if encoder is not None and film.encoded == [int(file.stem) for file in files]:
             with suppress(OSError):
                 return encoder.finish()
         film.give_up()  # before a new one with the same name is made
-        encode_video(files, self.folder / video_file(place), fps)
+        encode_video(files, self.folder / video_file(place), self.fps or self._real_time_fps)
 
     def _give_up_video(self) -> None:
         for film in self._films.values():

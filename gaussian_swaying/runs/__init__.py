@@ -1,1 +1,1 @@
-"""The folder of a run: locked by one process, files with checksums, and signals that end a run in order."""
+"""The folder of a run: locked by one process, files of tensors, and signals that end a run in order."""

@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 import os
-import re
 from collections.abc import Iterable
 from pathlib import Path
 
-from gaussian_swaying._files import check_not_taken, kind_of, write_json
+from gaussian_swaying._files import write_json
 from gaussian_swaying.runs.lock import FolderLock
 
 MARKER = "run.json"
@@ -113,25 +112,3 @@ def _free_name(path: Path) -> Path:
     while os.path.lexists(candidate := path.with_name(f"{path.name}.{number}")):
         number += 1
     return candidate
-
-
-_FRAME = re.compile(r"\d{5,}(\.[a-z]+)+")
-
-
-def check_names(folder: Path, files: Iterable[str], folders: Iterable[str]) -> None:
-    """Raise ValueError if a name that the run will write belongs to something of another kind.
-
-    Args:
-        folder: The folder of the run.
-        files: Names of its files.
-        folders: Names of its folders; their entries are files.
-    """
-    for name in folders:
-        kind = kind_of(folder / name)
-        if kind not in (None, "folder"):
-            raise ValueError(f"Expected {folder / name} to be a folder, but it is a {kind}: move it away.")
-        for path in (folder / name).iterdir() if kind else ():
-            if _FRAME.fullmatch(path.name):
-                check_not_taken(path)
-    for name in files:
-        check_not_taken(folder / name)

@@ -11,8 +11,6 @@ from pathlib import Path
 
 from filelock import FileLock, Timeout
 
-from gaussian_swaying._files import check_not_taken
-
 LOCK = ".gaussian_swaying.lock"
 
 
@@ -33,7 +31,6 @@ class FolderLock:
 
     def __init__(self, folder: Path) -> None:
         path = folder / LOCK
-        check_not_taken(path)
         lock = FileLock(path, blocking=False, thread_local=False)
         try:
             lock.acquire()

@@ -14,6 +14,7 @@ import torch
 from torch import Tensor
 
 from gaussian_swaying._checks import check_positive
+from gaussian_swaying._files import sha256
 from gaussian_swaying._provenance import describe_device, peak_memory, versions
 from gaussian_swaying.gaussians.model import DeformedGaussians
 from gaussian_swaying.mpm.state import State
@@ -21,7 +22,6 @@ from gaussian_swaying.recording.checkpoint import log_lines
 from gaussian_swaying.recording.recorder import Recorder, frame_folder
 from gaussian_swaying.rendering import passes
 from gaussian_swaying.runs import signals
-from gaussian_swaying.runs.seal import sha256
 from gaussian_swaying.simulation.copies import check_recorder
 from gaussian_swaying.simulation.diagnostics import SimulationDiverged
 from gaussian_swaying.simulation.edits import SceneEditor
@@ -48,22 +48,16 @@ def parts_checksum(scene: SimulatedScene) -> str | None:
 
 
 def _check_checkpoint(
-    scene: SimulatedScene,
-    checkpoint: dict[str, Any],
-    start: State,
-    output: Path,
-    frames: int,
-    splat: str | None,
-    once: bool,
+    scene: SimulatedScene, checkpoint: dict[str, Any], output: Path, frames: int, splat: str | None, once: bool
 ) -> None:
     """Raise ValueError unless the run can continue from a checkpoint as if it had never stopped."""
     held = checkpoint["state"].get("position")
-    if checkpoint.get("splat") != splat:
+    if checkpoint["splat"] != splat:
         raise ValueError(
             f"The splat {scene.source} has changed since the run in {output} began: restore the old file, or "
             "start again without --resume."
         )
-    if checkpoint.get("parts", "unknown") != parts_checksum(scene):
+    if checkpoint["parts"] != parts_checksum(scene):
         raise ValueError(
             f"The parts of the scene (`scene.parts`) have changed since the run in {output} began: restore the old "
             "file, or start again without --resume."
@@ -73,23 +67,10 @@ def _check_checkpoint(
             f"The checkpoint in {output} holds {len(held)} particles, but the scene has "
             f"{scene.points.count}: resume with the same splat, or start again without --resume."
         )
-    tracked = checkpoint.get("tracked")
-    if tracked != scene.tracked:
-        raise ValueError(
-            f"The trajectory in {output} is of {tracked} places, but the scene has {scene.tracked}: "
-            "resume with the same splat, or start again without --resume."
-        )
-    if checkpoint.get("still_once") is not once:
+    if checkpoint["still_once"] is not once:
         raise ValueError(
             f"The splat frames in {output} are {'with' if once else 'without'} what never moves: resume with the same "
             "`recorder.ply_still`, or start again without --resume."
-        )
-    followed = _count(scene.follow.nodes(start))
-    nodes = checkpoint.get("nodes", "unknown")
-    if nodes != followed:
-        raise ValueError(
-            f"The Gaussians in {output} follow {nodes} nodes, but those of the scene follow {followed}: resume with "
-            "the same splat, or start again without --resume."
         )
     if checkpoint["frame"] >= frames:
         raise ValueError(
@@ -231,7 +212,7 @@ class Run:
         state = self.editor.start()  # errors are raised before anything is written
 
         def check(checkpoint: dict[str, Any]) -> None:
-            _check_checkpoint(self.editor.scene, checkpoint, state, output, frames, self.splat, self.still_once)
+            _check_checkpoint(self.editor.scene, checkpoint, output, frames, self.splat, self.still_once)
 
         fps, cameras = 1 / self.stepper.frame_dt, tuple(painter.cameras)
         checkpoint = recorder.open(output, self.config, resume, fps, cameras, check)
@@ -355,9 +336,8 @@ class Run:
                     "wall_s": self.walls.read(),
                     "splat": self.splat,
                     "parts": parts_checksum(self.scene),
-                    "tracked": self.scene.tracked,
                     "still_once": self.still_once,
-                    "nodes": _count(self.scene.follow.nodes(state)),
+                    "nodes": self.scene.follow.nodes(state) is not None,
                 }
             )
 
@@ -471,7 +451,3 @@ class Run:
             "warnings": sentences,
             "per_frame": log,
         }
-
-
-def _count(nodes: Tensor | None) -> int | None:
-    return None if nodes is None else len(nodes)

@@ -1,4 +1,4 @@
-"""Checkpoints of a training run: written with a checksum, and read without executing any code in them."""
+"""Checkpoints of a training run: written whole or not at all, and read without executing any code in them."""
 
 from __future__ import annotations
 
@@ -10,9 +10,8 @@ import torch
 from lightning.pytorch.plugins.io import TorchCheckpointIO
 from torch import Tensor
 
-from gaussian_swaying._files import kind_of
 from gaussian_swaying.gaussians.cloud import GaussianCloud
-from gaussian_swaying.runs.seal import load_sealed, save_sealed
+from gaussian_swaying.runs.saved import load_plain, save_whole
 from gaussian_swaying.training.densification import PARAMETERS
 
 _FIELDS = {"densification", "kind", "scene_scale", "sh_degree", "seed", "random", "seen"}
@@ -27,10 +26,10 @@ def read_training_checkpoint(path: Path, map_location: Any = "cpu") -> dict[str,
         path: The file.
         map_location: Device of its tensors, as for ``torch.load``.
     """
-    if kind_of(path) is None:
+    if not path.exists():
         raise ValueError(f"The checkpoint {path} does not exist: give another `--ckpt_path`.")
     try:
-        held = load_sealed(path, map_location)
+        held = load_plain(path, map_location)
         if not isinstance(held, dict) or not isinstance(held.get("splat_training"), dict):
             raise ValueError("it is not a checkpoint of this package")
         missing = _FIELDS - set(held["splat_training"])
@@ -93,14 +92,14 @@ def newest_checkpoint(trainer: Any, begun: int) -> str | None:
     return None if trainer.ckpt_path is None else str(trainer.ckpt_path)
 
 
-class SealedCheckpoints(TorchCheckpointIO):
+class PlainCheckpoints(TorchCheckpointIO):
     """Lightning's reading and writing of checkpoints, in every subcommand."""
 
     def save_checkpoint(self, checkpoint: dict[str, Any], path: Any, storage_options: Any = None) -> None:
-        """Write a checkpoint with its checksum, completely or not at all."""
+        """Write a checkpoint, completely or not at all."""
         file = Path(path)
         file.parent.mkdir(parents=True, exist_ok=True)
-        save_sealed(file, checkpoint)
+        save_whole(file, checkpoint)
 
     def load_checkpoint(
         self,

@@ -10,7 +10,7 @@ from typing import Any
 from lightning.pytorch.loggers import Logger
 from lightning.pytorch.utilities.rank_zero import rank_zero_only
 
-from gaussian_swaying._files import check_not_taken, write_table
+from gaussian_swaying._files import write_table
 
 
 def append_row(path: Path, row: dict[str, Any]) -> None:
@@ -20,7 +20,6 @@ def append_row(path: Path, row: dict[str, Any]) -> None:
         path: The file; it is created, with its folder, if it does not exist.
         row: Values by column.
     """
-    check_not_taken(path)
     path.parent.mkdir(parents=True, exist_ok=True)
     names: list[str] = []
     whole = True

@@ -12,10 +12,9 @@ from lightning.pytorch.callbacks import Callback
 from lightning.pytorch.loggers import Logger
 
 from gaussian_swaying._files import remove_temporaries
-from gaussian_swaying.runs.folder import MARKER, check_names, claim_folder, hold_folder, mark
+from gaussian_swaying.runs.folder import MARKER, claim_folder, hold_folder, mark
 from gaussian_swaying.runs.lock import FolderLock
 
-_FILES = ["run.json", "point_cloud.ply", "csv/metrics.csv", "csv/config.yaml"]
 _FOLDERS = ["checkpoints", "panels", "csv", "tensorboard"]
 _OURS = ["point_cloud.ply", *_FOLDERS]
 
@@ -120,11 +119,6 @@ def _take(folder: Path, option: str, continued: Path | None, in_use: Sequence[Pa
     if continued is None or not continued.resolve().is_relative_to(folder.resolve()):
         return claim_folder(folder, _OURS, remedy, in_use)
     lock = hold_folder(folder, remedy)
-    try:
-        check_names(folder, _FILES, _FOLDERS)
-        for name in (".", *_FOLDERS):
-            remove_temporaries(folder / name)
-    except BaseException:
-        lock.release()
-        raise
+    for name in (".", *_FOLDERS):
+        remove_temporaries(folder / name)
     return lock

@@ -2,12 +2,11 @@
 
 import json
 import shutil
-from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
-from shared import refused
+from shared import SMALL, refused, words
 from torch import Tensor, nn
 
 from gaussian_swaying.cli.evaluate import main
@@ -15,11 +14,8 @@ from gaussian_swaying.cli.simulate import main as simulate
 from gaussian_swaying.recording.trajectory import load_trajectory
 
 pytestmark = pytest.mark.filterwarnings("ignore:.*torch.jit:DeprecationWarning")
-ROOT = Path(__file__).parents[2]
 SIDE = 1.2
 CENTRE = torch.tensor([0.6, 0.0, 0.4])  # of the flag's box, where the simulation has its origin
-POLE = [{"class_path": "PinnedRegion", "init_args": {"region": {"class_path": "Box", "init_args": {}}}}]
-POLE[0]["init_args"]["region"]["init_args"] = {"min": [None, None, None], "max": [0.11, None, None]}
 
 
 class Means(nn.Module):
@@ -28,11 +24,8 @@ class Means(nn.Module):
 
 
 def _simulate(folder, gravity):
-    command = ["--config", str(ROOT / "configs/sim/flag.yaml"), "--frames", "4", "--device", "cpu"]
-    command += ["--scene.generator.init_args.spacing", "0.1", "--solver.dx", "0.2", "--recorder.video", "false"]
-    command += ["--solver.boundaries", json.dumps(POLE), "--solver.gravity", f"[0, 0, {gravity}]"]
-    command += ["--camera.init_args.width", "32", "--camera.init_args.height", "18", "--output", str(folder)]
-    assert simulate(command) == 0
+    settings = SMALL | {"solver.gravity": [0, 0, gravity], "recorder.video": False, "frames": 4}
+    assert simulate(["--config=flag", "--device=cpu", f"--output={folder}", *words(settings)]) == 0
 
 
 @pytest.fixture(scope="module")
@@ -88,21 +81,16 @@ def test_options(folders, tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("arguments", "words"),
+    ("arguments", "told"),
     [
         (["nowhere", "REFERENCE"], ["The run folder nowhere does not exist", "folder of a simulation"]),
         (["RUN", "nowhere"], ["The reference folder nowhere does not exist"]),
         (["RUN", "REFERENCE", "--reference-offset", "1"], ["4 pictures in", "--frames 3"]),
         (["RUN", "REFERENCE", "--i3d", "i3d.pt"], ["There is no file i3d.pt", "none is downloaded"]),
         (["RUN", "REFERENCE", "--points", "0"], ["`points`", "positive"]),
-        pytest.param(
-            ["RUN", "REFERENCE", "--device", "cuda"],
-            ["needs a CUDA GPU"],
-            marks=pytest.mark.skipif(torch.cuda.is_available(), reason="shows what happens without a GPU"),
-        ),
     ],
 )
-def test_bad_input_is_one_sentence(folders, tmp_path, capsys, arguments, words):
+def test_bad_input_is_one_sentence(folders, tmp_path, capsys, arguments, told):
     names = {"RUN": str(folders[0]), "REFERENCE": str(folders[1])}
     arguments = [names.get(argument, argument) for argument in arguments]
-    refused(main, [*arguments, "--output", str(tmp_path / "a/out")], capsys, *words, folder=tmp_path)
+    refused(main, [*arguments, "--output", str(tmp_path / "a/out")], capsys, *told, folder=tmp_path)

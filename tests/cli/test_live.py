@@ -33,7 +33,6 @@ def parser():
     [
         "my.ply --port 9000 --device cpu --no-browser --wind.flow [1,-2,3] --solver.damping -3 --resume",
         "--port 9000 --resume my.ply --device cpu --wind.flow [1,-2,3] --no-browser --solver.damping -3",
-        "--device cpu --no-browser --wind.flow [1,-2,3] --solver.damping -3 --resume --port 9000 my.ply",
         "--no-browser --device cpu my.ply --wind.flow [1,-2,3] --solver.damping -3 --port=9000 --resume",
     ],
 )

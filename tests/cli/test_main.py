@@ -5,7 +5,6 @@ import sys
 from pathlib import Path
 
 import pytest
-import yaml
 from shared import refused
 
 import gaussian_swaying
@@ -13,7 +12,6 @@ from gaussian_swaying import _program as program
 from gaussian_swaying.cli import shipped
 from gaussian_swaying.cli.errors import command
 from gaussian_swaying.cli.main import COMMANDS, main
-from gaussian_swaying.cli.simulate import main as simulate
 from gaussian_swaying.cli.train import make_cli
 
 ROOT = Path(__file__).parents[2]
@@ -54,18 +52,6 @@ def test_commands_that_are_printed_can_be_pasted(monkeypatch):
     program.called("sim")
     assert program.words("preview") == ["gaussian-swaying", "preview"]
     assert command(["--frames", "3"], "--resume") == "gaussian-swaying sim --frames 3 --resume"
-
-
-def test_a_configuration_by_name(tmp_path, monkeypatch, capsys):
-    monkeypatch.chdir(tmp_path)
-    small = ["--scene.generator.init_args.spacing=0.05", "--solver.dx=0.1", "--solver.boundaries=[]", "--frames=2"]
-    small += ["--camera.init_args.width=32", "--camera.init_args.height=18", "--recorder.video=false", "--device=cpu"]
-    assert main(["sim", "--config", "flag", *small]) == 0
-    assert "wrote outputs/flag/summary.json" in capsys.readouterr().out
-    kept = yaml.safe_load((tmp_path / "outputs/flag/config.yaml").read_text())
-    assert kept["wind"]["flow"] == [6.0, 1.5, 0.0]
-    words = "no file and no configuration 'flga' (did you mean flag", "ficus"
-    refused(simulate, ["--config=flga", *small], capsys, *words)
 
 
 def test_a_file_comes_before_a_name(tmp_path, monkeypatch):

@@ -6,7 +6,7 @@ import shlex
 import pytest
 import torch
 import yaml
-from shared import refused
+from shared import SMALL, refused, words
 
 from gaussian_swaying import read_gaussians, write_ply
 from gaussian_swaying.cli.main import main
@@ -14,23 +14,11 @@ from gaussian_swaying.gaussians.export import SUFFIXES
 from gaussian_swaying.scenes import FlagScene
 
 FLAG = FlagScene(spacing=0.1).generate()
-POLE = {"class_path": "Box", "init_args": {"min": [None] * 3, "max": [0.11, None, None]}}
-SMALL = {
-    "scene.generator.init_args.spacing": 0.1,
-    "solver.dx": 0.2,
-    "solver.boundaries": [{"class_path": "PinnedRegion", "init_args": {"region": POLE}}],
-    "camera.init_args.width": 64,
-    "camera.init_args.height": 36,
-}
 PHYSGAUSSIAN = {
     "material": "jelly", "E": 2e6, "nu": 0.4, "density": 200, "substep_dt": 1e-4, "frame_dt": 0.04, "frame_num": 3,
     "g": [0, 0, 0], "grid_v_damping_scale": 0.9999, "n_grid": 10, "additional_material_params": [],
     "boundary_conditions": [{"type": "bounding_box"}],
 }  # fmt: skip
-
-
-def words(settings):
-    return [f"--{name}={json.dumps(value)}" for name, value in settings.items()]
 
 
 @pytest.fixture(scope="module")

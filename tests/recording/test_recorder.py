@@ -7,7 +7,6 @@ import os
 import subprocess
 import sys
 import threading
-from functools import partial
 from pathlib import Path
 
 import imageio.v3 as iio
@@ -15,6 +14,8 @@ import imageio_ffmpeg
 import numpy as np
 import pytest
 import torch
+from plyfile import PlyData
+from shared import advanced
 
 from gaussian_swaying.aero.wind import WindField
 from gaussian_swaying.gaussians.harmonics import sh_to_color
@@ -24,10 +25,13 @@ from gaussian_swaying.recording import recorder as recorder_module
 from gaussian_swaying.recording import trajectory
 from gaussian_swaying.recording.recorder import Recorder
 from gaussian_swaying.recording.trajectory import load_trajectory
-from gaussian_swaying.recording.video import VideoEncoder
+from gaussian_swaying.recording.video import VideoEncoder, encode_video
 from gaussian_swaying.rendering.cameras.camera_path import OrbitCamera
+from gaussian_swaying.scenes.procedural import FlagScene
 from gaussian_swaying.simulation.diagnostics import SimulationDiverged
 from gaussian_swaying.simulation.run import Run
+
+FLAG = FlagScene(spacing=0.3).generate()
 
 
 def _names(folder):
@@ -41,52 +45,30 @@ def _run(simulation, folder, frames=3, recorder=None, **settings):
 # ---- files
 
 
-def _failing(monkeypatch, target, name):
-    """Make a writer fail after it has written half a file."""
-
-    def fail(path, *_, **__):
-        assert not str(path).endswith("00001.png")  # never under its own name
+@pytest.mark.parametrize(
+    ("target", "write"),
+    [
+        ((recorder_module, "save_png"), lambda recorder: recorder.write_image(1, torch.zeros(2, 2, 3))),
+        ((np, "savez"), lambda recorder: recorder.write_trajectory(1, torch.zeros(2, 3), torch.zeros(2, 3, 3))),
+        ((torch, "save"), lambda recorder: recorder.write_checkpoint({"frame": 1})),
+        ((PlyData, "write"), lambda recorder: recorder.write_ply(1, lambda path: write_ply(path, FLAG))),
+    ],
+    ids=["image", "trajectory", "checkpoint", "ply"],
+)
+def test_a_failing_write_leaves_no_half_file(target, write, tmp_path, monkeypatch):
+    def fail(*given, **_):
+        path = next(Path(part) for part in given if isinstance(part, str | Path))
+        assert path.name.startswith(".")  # never under its own name
         path.write_bytes(b"half")
         raise OSError("No space left on device")
 
-    monkeypatch.setattr(target, name, fail)
-
-
-@pytest.mark.parametrize("what", ["image", "trajectory", "checkpoint", "ply", "summary"])
-def test_a_failing_write_leaves_no_half_file(what, make_simulation, tmp_path, monkeypatch):
+    monkeypatch.setattr(*target, fail)
     recorder = Recorder(ply_every=1, video=False)
     recorder.open(tmp_path / "run")
     before = _names(tmp_path)
-    if what == "image":
-        _failing(monkeypatch, recorder_module, "save_png")
-        write = lambda: recorder.write_image(1, torch.zeros(2, 2, 3))  # noqa: E731
-    elif what == "trajectory":
-        _failing(monkeypatch, np, "savez")
-        write = lambda: recorder.write_trajectory(1, torch.zeros(2, 3), torch.zeros(2, 3, 3))  # noqa: E731
-    elif what == "checkpoint":
-        monkeypatch.setattr(torch, "save", lambda _, path: (path.write_bytes(b"half"), 1 / 0))
-        write = lambda: recorder.write_checkpoint({"frame": 1})  # noqa: E731
-    elif what == "ply":
-        import plyfile
-
-        simulation = make_simulation()
-
-        def fail(self, path):
-            with open(path, "wb") as stream:
-                stream.write(b"half")
-            raise OSError("No space left on device")
-
-        monkeypatch.setattr(plyfile.PlyData, "write", fail)
-        write = lambda: recorder.write_ply(1, lambda p: write_ply(p, simulation.scene.rest().to_cloud()))  # noqa: E731
-    else:
-        write = lambda: recorder.write_summary({"a": object()})  # noqa: E731
-
-    def write_and_wait():
-        write()
+    write(recorder)
+    with pytest.raises(OSError, match="could not be written: No space"):
         recorder.wait()
-
-    with pytest.raises((OSError, ZeroDivisionError, TypeError)):
-        write_and_wait()
     assert _names(tmp_path) == before
 
 
@@ -169,11 +151,9 @@ def test_exported_gaussians_are_the_deformed_ones(make_cloud, make_simulation, t
     settings = {"pinned": False, "scene": {"up": [0.0, -1.0, 0.0], "longest_side": 0.7}}
     simulation = make_simulation(cloud, wind=WindField([0.0, 9.0, 0.0]), **settings)
     _run(simulation, tmp_path / "run", recorder=Recorder(ply_every=1))
-    state = simulation.start()
     rest = read_ply(tmp_path / "run" / "ply" / "00000.ply")
     torch.testing.assert_close(rest.sh, cloud.sh, rtol=0, atol=1e-5)
-    for _ in range(2):
-        state, _ = simulation.advance(state)
+    state, _ = advanced(simulation, 2)
     deformed = simulation.scene.deformed(state)
     found = read_ply(tmp_path / "run" / "ply" / "00002.ply")
     assert float((deformed.means - cloud.means).abs().max()) > 0.01
@@ -221,6 +201,15 @@ def test_a_video_that_cannot_be_made_loses_nothing_else(make_simulation, tmp_pat
     assert not [name for name in _names(tmp_path / "run") if "mp4" in name]
 
 
+def test_frames_of_different_sizes_are_no_video(tmp_path):
+    files = [tmp_path / "0.png", tmp_path / "1.png"]
+    for file, width in zip(files, (16, 32), strict=True):
+        iio.imwrite(file, np.zeros((16, width, 3), dtype=np.uint8))
+    with pytest.raises(OSError, match=r"out\.mp4: a frame is 32 x 16, the first one is 16 x 16"):
+        encode_video(files, tmp_path / "out.mp4", 10.0)
+    assert _names(tmp_path) == ["0.png", "1.png"]
+
+
 # ---- in the background
 
 
@@ -250,19 +239,6 @@ def _before_png(monkeypatch, action):
     monkeypatch.setattr(recorder_module, "save_png", wrapped)
 
 
-def _full_disk(monkeypatch):
-    """The disk is full for the PNG of frame 1, once the event has been set."""
-    fail = threading.Event()
-
-    def disk_full(frame):
-        if frame == 1:
-            assert fail.wait(LONG)
-            raise OSError(28, "No space left on device")
-
-    _before_png(monkeypatch, disk_full)
-    return fail
-
-
 def test_the_video_is_in_order_though_the_pngs_are_not(tmp_path, monkeypatch):
     """Frame 0 is compressed after frame 4; the video is encoded while the run goes on, and not a second time."""
     later, finished = threading.Event(), []
@@ -289,8 +265,16 @@ def test_the_video_is_in_order_though_the_pngs_are_not(tmp_path, monkeypatch):
 
 
 def test_what_is_changed_after_the_call_is_written_as_it_was(tmp_path, monkeypatch):
-    gate = threading.Event()
+    """The checkpoint after what it promises, however slow that is."""
+    gate, save = threading.Event(), torch.save
     _before_png(monkeypatch, lambda _: gate.wait(LONG))
+
+    def check(held, path):
+        assert (path.parent / "frames/00000.png").exists()
+        assert (path.parent / "trajectory/00000.npz").exists()
+        save(held, path)
+
+    monkeypatch.setattr(torch, "save", check)
     recorder = Recorder()
     recorder.open(tmp_path / "run")
     image, position, F, log = _grey(2), torch.ones(4, 3), torch.ones(4, 3, 3).half(), [1]
@@ -313,28 +297,6 @@ def test_what_is_changed_after_the_call_is_written_as_it_was(tmp_path, monkeypat
     assert checkpoint["log"] == [1]
 
 
-def test_a_frame_that_cannot_be_written_is_in_no_checkpoint(tmp_path, monkeypatch):
-    """What came before it is kept, with its video; nothing is half-written; the error comes once, in one sentence."""
-    fail = _full_disk(monkeypatch)
-    recorder = Recorder()
-    recorder.open(tmp_path / "run")
-    for k in range(2):
-        recorder.write_image(k, _grey(k))
-        recorder.write_trajectory(k, torch.zeros(4, 3), torch.zeros(4, 3, 3))
-        recorder.write_checkpoint({"frame": k})
-    fail.set()
-    with pytest.raises(OSError, match=r"^frames/00001\.png could not be written: No space left on device$"):
-        recorder.wait()
-    with pytest.raises(OSError, match=r"frames/00001\.png"):
-        recorder.write_image(2, _grey(2))
-    recorder.close(2, {})
-    assert torch.load(tmp_path / "run" / "checkpoint.pt", weights_only=True) == {"frame": 0}
-    assert _levels(tmp_path / "run") == [0]
-    load_trajectory(tmp_path / "run" / "trajectory.npz", 0)
-    assert _names(tmp_path / "run" / "frames") == ["00000.png"]
-    assert not [name for name in _names(tmp_path / "run") if name.split("/")[-1].startswith(".")]
-
-
 @pytest.mark.parametrize("frame", [2, 3])
 def test_a_run_whose_disk_is_full_can_be_resumed(frame, make_simulation, tmp_path, monkeypatch):
     """Also if the last frame is the one that cannot be written, and that shows only after the simulation."""
@@ -355,6 +317,7 @@ def test_a_run_whose_disk_is_full_can_be_resumed(frame, make_simulation, tmp_pat
     assert summary["status"] == "failed"
     assert "No space left" in summary["reason"]
     assert torch.load(tmp_path / "run" / "checkpoint.pt", weights_only=True)["frame"] < frame
+    assert not [name for name in _names(tmp_path / "run") if name.split("/")[-1].startswith(".")]
     _run(make_simulation(), tmp_path / "run", 4, resume=True)
     _run(make_simulation(), tmp_path / "whole", 4)
     videos = [iio.imread(tmp_path / name / "video.mp4") for name in ("run", "whole")]
@@ -396,26 +359,6 @@ def test_the_video_shows_the_frames_that_were_asked_for(order, frames, expected,
     assert _levels(tmp_path / "run") == expected
 
 
-def test_a_resumed_run_has_the_whole_video(tmp_path):
-    for first in (0, 2):
-        recorder = Recorder(trajectory=False)
-        checkpoint = recorder.open(tmp_path / "run", resume=first > 0)
-        assert (checkpoint is None) == (first == 0)
-        for k in range(first, first + 3):  # frame 2 is done again
-            recorder.write_image(k, _grey(k if first else 0))
-            recorder.write_checkpoint({"frame": 1, "state": {}, "log": [], "config": "", "wall_s": {}})
-        recorder.close(first + 3, {})
-    assert _levels(tmp_path / "run") == [0, 0, 2, 3, 4]
-
-
-def test_the_rate_may_be_given_at_the_end(tmp_path):
-    recorder = Recorder(trajectory=False)
-    recorder.open(tmp_path / "run", real_time_fps=10.0)
-    recorder.write_image(0, _grey(1))
-    recorder.close(1, {}, 50.0)
-    assert "50 fps" in _probe(tmp_path / "run" / "video.mp4")
-
-
 @pytest.mark.parametrize("how", ["forgotten", "opened again", "closed in vain"])
 def test_a_recorder_that_is_not_closed_leaves_its_frames_and_no_process(how, tmp_path):
     recorder = Recorder(trajectory=False)
@@ -453,25 +396,6 @@ def test_a_program_that_ends_without_closing_loses_no_frame(tmp_path):
     assert subprocess.run([sys.executable, "-c", code], env=environment, timeout=LONG).returncode == 7
     assert _names(tmp_path / "run" / "frames") == ["00000.png", "00001.png", "00002.png"]
     assert not [name for name in _names(tmp_path / "run") if "mp4" in name]
-
-
-def test_a_run_holds_no_more_than_the_queue(make_simulation, tmp_path, monkeypatch):
-    most, full = [], threading.Event()
-
-    class Watched(recorder_module.FrameWriter):
-        def submit(self, *arguments, **settings):
-            super().submit(*arguments, **settings)
-            most.append(self.pending)
-            if self.pending == 3:
-                full.set()
-
-    monkeypatch.setattr(recorder_module, "FrameWriter", partial(Watched, limit=3, workers=1))
-    _before_png(monkeypatch, lambda _: full.wait(LONG))
-    _not_again(monkeypatch)
-    _run(make_simulation(), tmp_path / "run", 5)
-    assert max(most) == 3
-    assert len(most) == 25
-    assert len(iio.imread(tmp_path / "run" / "video.mp4")) == 5
 
 
 @pytest.mark.gpu
@@ -531,11 +455,8 @@ def test_the_summary(make_simulation, tmp_path):
     assert all(seconds > 0 for seconds in summary["wall_s"].values())
     assert summary["peak_memory_bytes"]["host"] > 2**20
     assert summary["peak_memory_bytes"]["device"] is None
-    state, log = simulation.start(), []
-    start = simulation.solver.energies(state)
-    for _ in range(2):
-        state, health = simulation.advance(state)
-        log.append(health)
+    start = simulation.solver.energies(simulation.start())
+    state, log = advanced(simulation, 2)
     end = simulation.solver.energies(state)
     for name in ("kinetic", "elastic", "potential"):
         assert summary["energy_start_J"][name] == pytest.approx(float(start[name]), abs=1e-9)
@@ -601,43 +522,15 @@ def test_what_was_recorded_before_the_end_is_kept(error, status, make_simulation
 # ---- the folder
 
 
-def test_an_earlier_run_is_moved_aside(make_simulation, tmp_path, capsys):
-    _run(make_simulation(), tmp_path / "run", 2)
-    (tmp_path / "run" / "mine.txt").write_text("precious")
-    _run(make_simulation(), tmp_path / "run", 1)
-    _run(make_simulation(), tmp_path / "run", 1)
-    assert len(list((tmp_path / "run.1" / "frames").glob("*.png"))) == 2
-    assert (tmp_path / "run.1" / "mine.txt").read_text() == "precious"
-    assert len(list((tmp_path / "run.2" / "frames").glob("*.png"))) == 1
-    assert "run.1" in capsys.readouterr().out
-
-
-def test_a_folder_behind_a_link(make_simulation, tmp_path):
-    """A run through it, one that continues there, and one that moves both aside."""
-    disk, link = tmp_path / "disk", tmp_path / "link"
-    disk.mkdir()
-    link.symlink_to(disk / "flag")
-    recorder = Recorder(video=False, ply_every=1)
-    _run(make_simulation(), link, 2, recorder)
-    _run(make_simulation(), link, 3, recorder, resume=True)
-    _run(make_simulation(), link, 1, recorder)
-    assert link.is_symlink()
-    assert len(list((disk / "flag.1" / "frames").iterdir())) == 3
-    assert len(list((disk / "flag" / "frames").iterdir())) == 1
-    assert sorted(path.name for path in disk.iterdir()) == ["flag", "flag.1"]
-    load_trajectory(disk / "flag.1" / "trajectory.npz", 2)
-
-
-@pytest.mark.parametrize("name", ["summary.json", "frames/00000.png", "trajectory/walk.npz", "config.yaml"])
-def test_foreign_files_are_not_overwritten(name, make_simulation, tmp_path):
+def test_foreign_files_are_not_overwritten(make_simulation, tmp_path):
     """They bear a name that the run would write, but no run made them."""
-    file = tmp_path / "mine" / name
+    file = tmp_path / "mine/frames/00000.png"
     file.parent.mkdir(parents=True)
     file.write_text("precious")
-    with pytest.raises(ValueError, match=r"mine contains \w+.* choose another with --output"):
+    with pytest.raises(ValueError, match=r"mine contains frames of .* choose another with --output"):
         _run(make_simulation(), tmp_path / "mine", 1)
     assert file.read_text() == "precious"
-    assert len([path for path in (tmp_path / "mine").rglob("*") if path.is_file()]) == 1
+    assert _names(tmp_path / "mine") == ["frames", "frames/00000.png"]
 
 
 def test_headers_of_arrays_are_parsed_by_one_thread_at_a_time(tmp_path, monkeypatch):

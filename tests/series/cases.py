@@ -13,14 +13,12 @@ from pathlib import Path
 
 import yaml
 from damage import changed, damaged
+from shared import PIN, SMALL, words
 
 ROOT = Path(__file__).parents[2]
 FLAG = ROOT / "configs/sim/flag.yaml"
-PIN = [{"class_path": "PinnedRegion", "init_args": {"region": {
-    "class_path": "Box", "init_args": {"min": [None, None, None], "max": [0.11, None, None]}}}}]  # fmt: skip
-SMALL = ["--config", str(FLAG), "--frames", "2", "--device", "cpu", "--scene.generator.init_args.spacing", "0.1"]
-SMALL += ["--solver.dx", "0.2", "--solver.boundaries", json.dumps(PIN), "--output", "run"]
-SMALL += ["--camera.init_args.width", "32", "--camera.init_args.height", "18", "--recorder.checkpoint_every", "1"]
+RUN = ["--config", str(FLAG), "--frames", "2", "--device", "cpu", "--output", "run", *words(SMALL)]
+RUN += ["--recorder.checkpoint_every", "1"]
 TAGS = ("!!python/object/apply:os.system ['true']", "!!binary aGVsbG8=", "!!set {a, b}", "!!float x", "!unknown 3")
 NUMBERS = ("0", "-1", "1e-30", "1e-9", "1e-3", "0.4999999", "1e3", "1e6", "1e9", "1e12", "1e30", "1e300", "nan", "inf")
 NUMBERS += ("-inf", "1000000000", "60000", "9223372036854775808", "9" * 400, "-0.0", "1e-320")
@@ -30,15 +28,15 @@ CLASSES = (  # numbers of parts that are no options of their own; not the spacin
 )  # fmt: skip
 
 
-def unusable(rng, path):
-    """What stood there is missing, or a folder or a pipe has its name."""
+def unusable(rng, path, *more):
+    """What stood there is missing, or a folder has its name."""
     path.unlink()
-    rng.choice((lambda path: None, Path.mkdir, os.mkfifo))(path)
+    rng.choice((lambda path: None, Path.mkdir, *more))(path)
 
 
 def _tree():
     tree = yaml.safe_load(FLAG.read_text(encoding="utf-8"))
-    tree["frames"], tree["solver"]["dx"], tree["solver"]["boundaries"] = 2, 0.2, PIN
+    tree["frames"], tree["solver"]["dx"], tree["solver"]["boundaries"] = 2, 0.2, [PIN]
     tree["scene"]["generator"]["init_args"]["spacing"] = 0.1
     tree["camera"]["init_args"] |= {"width": 32, "height": 18}
     return tree
@@ -115,22 +113,16 @@ def capture_case(rng, folder):
     elif kind < 0.9:
         path.write_bytes(damaged(rng, path.read_bytes()))
     else:
-        unusable(rng, path)
+        unusable(rng, path, os.mkfifo)
     if rng.random() < 0.1:
         count, kind = rng.choice(("3", "-1", "4000000000", "9" * 30)), rng.choice(("float", "list uchar float"))
         head = f"ply\nformat ascii 1.0\nelement vertex {count}\nproperty {kind} x\nproperty float y\nproperty float z\n"
         (folder / "points3d.ply").write_bytes(head.encode() + b"end_header\n" + b"1 2 3\n" * 3)
     if rng.random() > 0.08:
         return ["look", str(folder)]
-    given = [
-        "--config",
-        str(ROOT / "configs/train/quick_cpu.yaml"),
-        "--trainer.max_steps",
-        "1",
-        "--data.init_args.workers",
-    ]
-    given += ["0", "--trainer.default_root_dir", "out", "--data.init_args.point_count", "50"]
-    return ["train", "fit", "--data", "CaptureDataModule", *given, "--data.init_args.path", str(folder)]
+    given = {"trainer.max_steps": 1, "trainer.default_root_dir": "out", "data": "CaptureDataModule"}
+    given |= {"data.init_args.workers": 0, "data.init_args.point_count": 50, "data.init_args.path": str(folder)}
+    return ["train", "fit", "--config", "quick_cpu", *words(given)]
 
 
 @functools.cache
@@ -139,39 +131,24 @@ def _run():
     from gaussian_swaying.cli.simulate import main
 
     folder = Path(tempfile.mkdtemp(prefix="series-run-")) / "run"
-    assert main([*SMALL, "--output", str(folder)]) == 0
+    assert main([*RUN, "--output", str(folder)]) == 0
     return folder
 
 
 def folder_case(rng, folder):
     """Only what a user can do: commands on a folder that was spoiled."""
-    import torch
-
     run = shutil.copytree(_run(), folder.parent / "run")
-    names = (
-        "checkpoint.pt",
-        "config.yaml",
-        "diagnostics.csv",
-        "run.json",
-        "summary.json",
-        "trajectory.npz",
-        "video.mp4",
-    )
-    path = run / rng.choices((*names, "frames/00001.png"), (8, 2, 1, 2, 3, 4, 1, 3))[0]
-    if rng.random() < 0.3:  # a checkpoint that torch loads
-        held = torch.load(run / "checkpoint.pt", weights_only=True)
-        place = rng.choice((held, held["state"]))
-        place[rng.choice(list(place))] = rng.choice(
-            (None, "x", -1, 1e30, [], {}, torch.zeros(3), torch.full((96, 3), torch.nan))
-        )
-        torch.save(held, run / "checkpoint.pt")
-    elif rng.random() < 0.8:
-        path.write_bytes(damaged(rng, path.read_bytes()))
+    names = ("checkpoint.pt", "trajectory.npz", "frames/00001.png", "summary.json", "config.yaml", "run.json")
+    path = run / rng.choices(names, (8, 4, 3, 3, 2, 2))[0]
+    if rng.random() < 0.8:
+        content = path.read_bytes()
+        cut = path.suffix in (".pt", ".npz")  # bits that change within them are not looked for
+        path.write_bytes(content[: rng.randrange(len(content))] if cut else damaged(rng, content))
     else:
         unusable(rng, path)
     if rng.random() < 0.2:
         return ["eval", str(run), str(_run()), "--output", "out", "--device", "cpu", "--points", "100", "--no-video"]
-    return ["sim", *SMALL, *(["--frames", "3", "--resume"] if rng.random() < 0.9 else [])]
+    return ["sim", *RUN, *(["--frames", "3", "--resume"] if rng.random() < 0.9 else [])]
 
 
 @functools.cache
@@ -197,7 +174,7 @@ def disk_case(rng, folder):
     places = ["/dev/full", "/dev/null", "/proc/x", "", "a\0b", "x" * 300]
     places += [str(folder / name) for name in ("file", "link", "pipe", "full", "file/below")]
     out = rng.choice(["out", *places]) if rng.random() < 0.5 else "out.splat"
-    given = ["sim", *SMALL, "--output", out], ["export", splat, out]
+    given = ["sim", *RUN, "--output", out], ["export", splat, out]
     return rng.choice((*given, ["preview", splat, "--device", "cpu", "--height", "64", "--output", out]))
 
 
@@ -224,7 +201,7 @@ def extreme_case(rng, folder):
     for name in rng.sample(sorted(_fields()), rng.choice((1, 1, 1, 2))):
         values = [rng.choice(NUMBERS) for _ in range(_fields()[name])]
         given += [f"--{name}={values[0] if len(values) == 1 else '[' + ', '.join(values) + ']'}"]
-    return ["sim", *SMALL, *given]
+    return ["sim", *RUN, *given]
 
 
 SERIES = {

@@ -1,32 +1,17 @@
-"""Sweeps of tiny flags: as a file, and done once without disturbance."""
+"""Sweeps of tiny flags: as a file, done once without disturbance, and with workers that are killed."""
 
-import json
+import csv
 import multiprocessing
-import os
-import signal
-import time
-from contextlib import suppress
 from pathlib import Path
 
 import pytest
 import yaml
+from shared import SMALL
 
 from gaussian_swaying.cli.sweep import main
-from gaussian_swaying.runs.lock import LOCK
 from gaussian_swaying.sweeps import pool
 
 FLAG = Path(__file__).parents[2] / "configs/sim/flag.yaml"
-_POLE = {"class_path": "Box", "init_args": {"min": [None, None, None], "max": [0.11, None, None]}}
-
-SETTINGS = {
-    "frames": 12,
-    "scene.generator.init_args.spacing": 0.1,
-    "solver.dx": 0.2,
-    "solver.boundaries": [{"class_path": "PinnedRegion", "init_args": {"region": _POLE}}],
-    "camera.init_args.width": 32,
-    "camera.init_args.height": 18,
-}
-"""Options of all runs."""
 AXES = {
     "wind.flow": [[4.0, 1.0, 0.0], [8.0, 2.0, 0.0]],
     "material.E": {"from": 3e3, "to": 3e4, "count": 2, "scale": "log"},
@@ -37,35 +22,14 @@ AXES = {
 
 def write_sweep(path, axes=AXES, draws=2, settings=None, **more):
     """A sweep file of tiny flags; ``settings`` are added to those that make them tiny."""
-    fields = {"base": str(FLAG), "settings": SETTINGS | (settings or {}), "axes": axes, "draws": draws}
+    fields = {"base": str(FLAG), "settings": SMALL | {"frames": 12} | (settings or {}), "axes": axes, "draws": draws}
     path.write_text(yaml.safe_dump(fields | more, sort_keys=False))
     return path
 
 
-def holders(folder):
-    """The process that writes to each run, by the name of the run."""
-    found = {}
-    for lock in sorted((folder / "runs").glob(f"*/{LOCK}")):
-        with suppress(OSError, ValueError):  # it has just ended
-            found[lock.parent.name] = json.loads(lock.read_bytes())["pid"]
-    return found
-
-
-def kill_in_a_run(folder, process):
-    """Kill a process while it writes to a run; the name of the run, or None if it writes to none now.
-
-    It is stopped first, as otherwise it might end the run between the look and the kill; and it is waited for, as its
-    lock stays, and a zombie could be killed once more.
-    """
-    name, end = None, time.monotonic() + 60
-    with suppress(ProcessLookupError):
-        os.kill(process, signal.SIGSTOP)
-        name = next((name for name, holder in holders(folder).items() if holder == process), None)
-        os.kill(process, signal.SIGCONT if name is None else signal.SIGKILL)
-        while name is not None and time.monotonic() < end:
-            os.kill(process, 0)
-            time.sleep(0.005)
-    return name
+def rows(path):
+    with path.open(newline="") as file:
+        return list(csv.DictReader(file))
 
 
 @pytest.fixture(scope="session")
@@ -76,7 +40,7 @@ def sweep_file():
 
 @pytest.fixture(scope="session")
 def _workers():
-    """Workers that have imported everything: forks of one process. Sweeps in a process of their own spawn theirs."""
+    """Workers that have imported everything: forks of one process."""
     if "forkserver" not in multiprocessing.get_all_start_methods():
         yield
         return
@@ -92,6 +56,24 @@ def _workers():
 @pytest.fixture(autouse=True)
 def _quick_workers(_workers):
     """For every test of this folder."""
+
+
+@pytest.fixture
+def kill(monkeypatch):
+    """Lets so many jobs be the last of their workers, which are killed when they have got them."""
+
+    def begin(jobs):
+        submit, left = pool.Pool.submit, list(range(jobs))
+
+        def submitting(self, job):
+            submit(self, job)
+            if left:
+                left.pop()
+                next(worker for worker in self._workers if worker.job is job).process.kill()
+
+        monkeypatch.setattr(pool.Pool, "submit", submitting)
+
+    return begin
 
 
 @pytest.fixture(scope="session")

@@ -1,6 +1,5 @@
 """The table as Parquet, and the runs as WebDataset shards, read back."""
 
-import csv
 import io
 import json
 import tarfile
@@ -12,8 +11,10 @@ from PIL import Image
 from gaussian_swaying.cli.sweep import main
 from gaussian_swaying.sweeps import record
 from gaussian_swaying.sweeps.dataset import SweepDataset
-from gaussian_swaying.sweeps.record import check_parquet, write_parquet
+from gaussian_swaying.sweeps.record import write_parquet
 from gaussian_swaying.sweeps.shards import write_shards
+
+from .conftest import rows
 
 
 def test_parquet(tmp_path):
@@ -40,17 +41,10 @@ def test_the_parquet_of_a_sweep(undisturbed, tmp_path, sweep_file):
     file = sweep_file(tmp_path / "tiny.yaml")
     assert main([str(file), "--output", str(undisturbed), "--resume", "--parquet"]) == 0
     table = parquet.read_table(undisturbed / "sweep.parquet").to_pydict()
-    with (undisturbed / "sweep.csv").open(newline="") as text:
-        rows = list(csv.DictReader(text))
-    assert list(table) == list(rows[0])
-    assert table["wind_work_J"] == [float(row["wind_work_J"]) for row in rows]
+    expected = rows(undisturbed / "sweep.csv")
+    assert list(table) == list(expected[0])
+    assert table["wind_work_J"] == [float(row["wind_work_J"]) for row in expected]
     (undisturbed / "sweep.parquet").unlink()
-
-
-def test_without_pyarrow(monkeypatch):
-    monkeypatch.setattr(record, "find_spec", lambda name: None)
-    with pytest.raises(ValueError, match=r"gaussian-swaying\[parquet\]"):
-        check_parquet()
 
 
 def test_shards(undisturbed, tmp_path):
@@ -81,15 +75,11 @@ def test_shards(undisturbed, tmp_path):
     assert [a.read_bytes() for a in files] == [b.read_bytes() for b in again]
     (larger,) = write_shards(undisturbed, 100, tmp_path / "shards", frames=False)
     assert [file.name for file in (tmp_path / "shards").iterdir()] == [larger.name]
-
-
-def test_webdataset_reads_the_shards(undisturbed, tmp_path):
     webdataset = pytest.importorskip("webdataset")
-    write_shards(undisturbed, 4, tmp_path / "shards", positions=True)
-    read = webdataset.WebDataset(str(tmp_path / "shards/{000000..000001}.tar"), shardshuffle=False).decode("rgb8")
+    read = webdataset.WebDataset(str(tmp_path / "again/{000000..000002}.tar"), shardshuffle=False).decode("rgb8")
     samples = list(read)
-    assert [sample["__key__"] for sample in samples] == SweepDataset(undisturbed).runs
-    assert samples[0]["positions.npy"].shape == SweepDataset(undisturbed, positions=True)[0]["positions"].shape
+    assert [sample["__key__"] for sample in samples] == data.runs
+    assert samples[0]["positions.npy"].shape == data[0]["positions"].shape
     assert samples[0]["00011.png"].shape == (18, 32, 3)
     assert samples[0]["json"]["summary"]["frames"] == 12
 

@@ -1,10 +1,13 @@
 """Runs that are simulated together on a GPU, and sweeps on one and several GPUs."""
 
-import csv
+import subprocess
+import sys
+from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
+from shared import advanced
 
 from gaussian_swaying.cli.sweep import main
 from gaussian_swaying.simulation.batch import batch_of
@@ -13,30 +16,30 @@ from gaussian_swaying.sweeps.backend import Job
 from gaussian_swaying.sweeps.plan import make_plan, read_sweep
 from gaussian_swaying.sweeps.together import members_of
 
+from .conftest import rows
+
 pytestmark = pytest.mark.gpu
 
 
-def _rows(path):
-    with path.open(newline="") as file:
-        return list(csv.DictReader(file))
+def _batch(tmp_path, file):
+    plan = make_plan(read_sweep(file))
+    job = Job(tmp_path, tuple(plan.names), plan.config, plan.frames, tuple(plan.runs), "cuda")
+    members, _ = members_of(job, Simulation.parser())
+    return batch_of(members), members
 
 
 def test_together_is_as_alone(tmp_path, sweep_file):
     """The kernels with a batch of scenes against one scene after the other, with the same substeps."""
     settings = {"solver.substep": 2e-3, "frames": 5}
-    plan = make_plan(read_sweep(sweep_file(tmp_path / "tiny.yaml", settings=settings)))
-    job = Job(tmp_path, tuple(plan.names), plan.config, plan.frames, tuple(plan.runs), "cuda")
-    members, _ = members_of(job, Simulation.parser())
-    together = batch_of(members)
+    together, members = _batch(tmp_path, sweep_file(tmp_path / "tiny.yaml", settings=settings))
     state = together.start()
     assert together.solver.fused() is not None
     for _ in range(4):
         frame = together.launch(state)
         state, _ = frame.finish()
     for number, member in enumerate(members):
-        alone = member.start()
-        for _ in range(4):
-            alone, own = member.advance(alone)
+        alone, log = advanced(member, 4)
+        own = log[-1]
         moved = float((alone.position - member.solver.points.position).abs().amax())
         assert float((state.scene(number).position - alone.position).abs().amax()) < 1e-4 * moved
         shared = frame.each[number]
@@ -47,10 +50,7 @@ def test_together_is_as_alone(tmp_path, sweep_file):
 
 def test_together_foresees(tmp_path, sweep_file):
     """Without a fixed substep the host waits once in a frame."""
-    plan = make_plan(read_sweep(sweep_file(tmp_path / "tiny.yaml")))
-    job = Job(tmp_path, tuple(plan.names), plan.config, plan.frames, tuple(plan.runs), "cuda")
-    members, _ = members_of(job, Simulation.parser())
-    together = batch_of(members)
+    together, _ = _batch(tmp_path, sweep_file(tmp_path / "tiny.yaml"))
     state, _ = together.advance(together.start())
     assert together.foresees
     assert together.outlook is not None
@@ -64,8 +64,8 @@ def test_a_sweep_on_all_gpus(tmp_path, sweep_file):
     settings = {"solver.deterministic": True, "recorder.video": False}
     file, folder = sweep_file(tmp_path / "tiny.yaml", settings=settings), tmp_path / "out"
     assert main([str(file), "--output", str(folder), "--together", "4", "--device", "cuda"]) == 0
-    assert {row["status"] for row in _rows(folder / "sweep.csv")} == {"complete"}
-    assert all(int(row["device_bytes"]) > 0 for row in _rows(folder / "times.csv"))
+    assert {row["status"] for row in rows(folder / "sweep.csv")} == {"complete"}
+    assert all(int(row["device_bytes"]) > 0 for row in rows(folder / "times.csv"))
     again = tmp_path / "again"
     assert main([str(file), "--output", str(again), "--together", "4", "--device", "cuda", "--per-gpu", "auto"]) == 0
     assert (again / "sweep.csv").read_bytes() == (folder / "sweep.csv").read_bytes()
@@ -74,10 +74,6 @@ def test_a_sweep_on_all_gpus(tmp_path, sweep_file):
 @pytest.mark.timeout(600)
 @pytest.mark.skipif(torch.cuda.device_count() < 2, reason="needs two GPUs")
 def test_training_on_two_gpus(tmp_path):
-    import subprocess
-    import sys
-    from pathlib import Path
-
     tool = Path(__file__).parents[2] / "tools/train.py"
     command = [sys.executable, str(tool), "fit", "--config", "quick_cpu", "--trainer.accelerator", "gpu"]
     command += ["--trainer.devices", "2", "--trainer.default_root_dir", str(tmp_path / "two")]
@@ -85,6 +81,5 @@ def test_training_on_two_gpus(tmp_path):
     done = subprocess.run(command, capture_output=True, text=True, timeout=500)
     assert done.returncode == 0, done.stderr[-2000:]
     assert len(list((tmp_path / "two").rglob("*.ply"))) == 1
-    with (tmp_path / "two/csv/metrics.csv").open(newline="") as file:
-        rows = [row for row in csv.DictReader(file) if row.get("val/psnr")]
-    assert float(rows[-1]["val/psnr"]) > 18
+    log = [row for row in rows(tmp_path / "two/csv/metrics.csv") if row.get("val/psnr")]
+    assert float(log[-1]["val/psnr"]) > 18

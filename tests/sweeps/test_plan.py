@@ -119,19 +119,13 @@ def test_files_that_are_no_sweep(tmp_path, text):
 @pytest.mark.parametrize(
     ("axes", "words"),
     [
-        ({"wind.flwo": [[1, 0, 0]]}, ("wind.flwo",)),
         ({"material.E": [1e3, 2e3, "stiff"]}, ("Run 00002 (material.E: stiff)", "material.E")),
         ({"frames": [3, 0]}, ("Run 00001", "`frames`")),
     ],
 )
-def test_values_that_sim_does_not_accept(tmp_path, sweep_file, parser, axes, words):
-    settings = {}
-    path = sweep_file(tmp_path / "a.yaml", axes, 1, settings)
-    if "frames" in axes:
-        fields = yaml.safe_load(path.read_text())
-        del fields["settings"]["frames"]
-        path.write_text(yaml.safe_dump(fields))
+def test_values_that_sim_does_not_accept(parser, axes, words):
+    runs = [dict(zip(axes, values, strict=True)) for values in zip(*axes.values(), strict=True)]
     with pytest.raises((ValueError, ArgumentError)) as error:
-        make_plan(read_sweep(path), parser)
+        make_plan(Sweep([str(ROOT / "configs/sim/flag.yaml")], runs, {}), parser)
     for word in words:
         assert word in str(error.value)

@@ -1,6 +1,5 @@
 """Sweeps on Ray: a local cluster of two nodes on one machine."""
 
-import csv
 import json
 import os
 import signal
@@ -10,6 +9,8 @@ import time
 import pytest
 
 from gaussian_swaying.cli.sweep import main
+
+from .conftest import rows
 
 ray = pytest.importorskip("ray")
 pytestmark = pytest.mark.timeout(900)
@@ -28,16 +29,11 @@ def cluster():
     made.shutdown()
 
 
-def _rows(path):
-    with path.open(newline="") as file:
-        return list(csv.DictReader(file))
-
-
 def test_a_sweep_on_two_nodes(cluster, undisturbed, tmp_path, sweep_file):
     file, folder = sweep_file(tmp_path / "tiny.yaml"), tmp_path / "out"
     assert main([str(file), "--output", str(folder), "--ray", cluster, "--threads", "1", "--device", "cpu"]) == 0
     assert (folder / "sweep.csv").read_bytes() == (undisturbed / "sweep.csv").read_bytes()
-    assert len({row["where"] for row in _rows(folder / "times.csv")}) == 2
+    assert len({row["where"] for row in rows(folder / "times.csv")}) == 2
 
 
 def test_a_killed_process_and_failures(cluster, tmp_path, sweep_file):
@@ -63,9 +59,8 @@ def test_a_killed_process_and_failures(cluster, tmp_path, sweep_file):
     assert main([str(file), "--output", str(folder), "--ray", cluster, "--device", "cpu"]) == 2
     killer.join()
     assert killed, "no run that can end well was met alive"
-    rows = _rows(folder / "sweep.csv")
-    assert [row["status"] for row in rows] == ["complete", "diverged", "complete"]
-    attempts = [int(row["attempts"]) for row in _rows(folder / "times.csv")]
+    assert [row["status"] for row in rows(folder / "sweep.csv")] == ["complete", "diverged", "complete"]
+    attempts = [int(row["attempts"]) for row in rows(folder / "times.csv")]
     assert attempts[1] == 2
     assert attempts[int(killed[0])] >= 2
     done = {path: path.stat().st_mtime_ns for path in (folder / "results").glob("0000[02].json")}

@@ -1,9 +1,6 @@
 """Runs that are simulated together: as if each were alone, and done one by one where that fails."""
 
-import csv
 import json
-import threading
-import time
 
 import numpy as np
 import pytest
@@ -18,15 +15,10 @@ from gaussian_swaying.sweeps.backend import Job
 from gaussian_swaying.sweeps.plan import make_plan, parse_run, read_sweep
 from gaussian_swaying.sweeps.together import grouped, members_of, texts
 
-from .conftest import holders, kill_in_a_run
+from .conftest import rows
 
 FIXED = {"solver.substep": 2e-3, "frames": 5}
 OPTIONS = ("--workers", "2", "--device", "cpu")
-
-
-def _rows(path):
-    with path.open(newline="") as file:
-        return list(csv.DictReader(file))
 
 
 def _motion(folder, name):
@@ -46,7 +38,7 @@ def test_together_as_alone(tmp_path, sweep_file):
     alone, together = tmp_path / "alone", tmp_path / "together"
     assert main([str(file), "--output", str(alone), *OPTIONS]) == 0
     assert main([str(file), "--output", str(together), *OPTIONS, "--together", "5"]) == 0
-    for one, other in zip(_rows(alone / "sweep.csv"), _rows(together / "sweep.csv"), strict=True):
+    for one, other in zip(rows(alone / "sweep.csv"), rows(together / "sweep.csv"), strict=True):
         for name in one.keys() - {"largest_cfl"}:  # that of all
             try:
                 assert float(other[name]) == pytest.approx(float(one[name]), rel=2e-4, abs=1e-7), name
@@ -115,7 +107,7 @@ def test_a_diverged_run_is_done_alone(tmp_path, sweep_file, capsys):
     axes = {"wind.flow": [[4.0, 1.0, 0.0], [2e6, 0.0, 0.0], [5.0, 1.0, 0.0]]}
     file, folder = sweep_file(tmp_path / "bad.yaml", axes, 1, {"frames": 3}), tmp_path / "out"
     assert main([str(file), "--output", str(folder), *OPTIONS, "--together", "3"]) == 2
-    assert [row["status"] for row in _rows(folder / "sweep.csv")] == ["complete", "diverged", "complete"]
+    assert [row["status"] for row in rows(folder / "sweep.csv")] == ["complete", "diverged", "complete"]
     assert "1 of 3 runs failed" in capsys.readouterr().err
 
 
@@ -126,25 +118,13 @@ def test_what_cannot_be_together_is_done_alone(tmp_path, sweep_file):
     assert "cannot be simulated as a batch" in (folder / "logs/00000.txt").read_text()
 
 
-def test_a_killed_job_of_several_runs(tmp_path, sweep_file):
+def test_a_killed_job_of_several_runs(tmp_path, sweep_file, kill):
     """The table is that of an undisturbed sweep, bit for bit, and another number of runs together is refused."""
     file = sweep_file(tmp_path / "tiny.yaml")
     whole, out = tmp_path / "whole", tmp_path / "out"
     assert main([str(file), "--output", str(whole), *OPTIONS, "--together", "4"]) == 0
-    killed = []
-
-    def kill():
-        end = time.monotonic() + 120
-        while not killed and time.monotonic() < end:
-            found = [kill_in_a_run(out, process) for process in list(holders(out).values())[:1]]
-            killed.extend(name for name in found if name is not None)
-            time.sleep(0.01)
-
-    killer = threading.Thread(target=kill, daemon=True)
-    killer.start()
+    kill(1)
     assert main([str(file), "--output", str(out), *OPTIONS, "--together", "4"]) == 0
-    killer.join()
-    assert killed
     assert (out / "sweep.csv").read_bytes() == (whole / "sweep.csv").read_bytes()
     # one result is lost: its group is simulated again, and the others are left alone
     before = {path: path.stat().st_mtime_ns for path in (out / "results").glob("*.json")}

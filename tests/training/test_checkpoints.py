@@ -6,7 +6,7 @@ import traceback
 import pytest
 import torch
 
-from gaussian_swaying.training.checkpoints import SealedCheckpoints, read_training_checkpoint
+from gaussian_swaying.training.checkpoints import PlainCheckpoints, read_training_checkpoint
 from gaussian_swaying.training.densification import PARAMETERS
 
 FIELDS = ("densification", "kind", "scene_scale", "sh_degree", "seed", "random", "seen")
@@ -20,37 +20,30 @@ def _held():
 @pytest.fixture
 def file(tmp_path):
     path = tmp_path / "checkpoints" / "step.ckpt"
-    SealedCheckpoints().save_checkpoint(_held(), str(path))
+    PlainCheckpoints().save_checkpoint(_held(), str(path))
     return path
 
 
 def _refused(file, case):
     with pytest.raises(ValueError, match=r"^[^\n]*step\.ckpt [^\n]*give another `--ckpt_path`\.$"):
-        SealedCheckpoints().load_checkpoint(str(file))
+        PlainCheckpoints().load_checkpoint(str(file))
     return case
 
 
 def test_damaged_ones(file):
-    content, generator = file.read_bytes(), random.Random(0)
+    content = file.read_bytes()
     assert read_training_checkpoint(file)["global_step"] == 5
     assert torch.load(file, weights_only=True)["global_step"] == 5  # for others it is as any
-    for _ in range(40):
-        changed = bytearray(content)
-        changed[generator.randrange(len(content))] ^= 1 << generator.randrange(8)
-        file.write_bytes(changed)
-        _refused(file, "a bit")
-    for broken in (b"", b"hello", content[:-1], content[: len(content) // 2], content[:-90], content + b"\n"):
+    for broken in (b"", b"hello", content[: len(content) // 2]):
         file.write_bytes(broken)
         _refused(file, "cut")
     file.unlink()
     _refused(file, "missing")
-    file.mkdir()
-    _refused(file, "a folder")
 
 
-def test_something_else_with_a_right_checksum(file):
+def test_something_else(file):
     def save(held):
-        SealedCheckpoints().save_checkpoint(held, str(file))
+        PlainCheckpoints().save_checkpoint(held, str(file))
         return file
 
     for name in FIELDS:
@@ -69,7 +62,7 @@ def test_something_else_with_a_right_checksum(file):
 
 def test_no_advice_to_execute_the_code_in_a_file(file):
     """PyTorch's own message names the argument that would."""
-    SealedCheckpoints().save_checkpoint(_held() | {"hyper_parameters": random.Random(0)}, str(file))
+    PlainCheckpoints().save_checkpoint(_held() | {"hyper_parameters": random.Random(0)}, str(file))
     with pytest.raises(ValueError, match=r"more than tensors, numbers and text, which is never loaded") as caught:
-        SealedCheckpoints().load_checkpoint(str(file))
+        PlainCheckpoints().load_checkpoint(str(file))
     assert "weights_only" not in "".join(traceback.format_exception(caught.value, limit=0))

@@ -1,7 +1,6 @@
 """Rows of a log are added, never taken away."""
 
 import csv
-import os
 
 import pytest
 
@@ -39,11 +38,3 @@ def test_a_log_that_was_cut_off_goes_on(start, tmp_path):
     rows = _rows(path)
     assert {name: rows[-1][name] for name in ("step", "loss")} == {"step": "3", "loss": "1.0"}
     assert len(rows) == max(len(start.splitlines()), 1)
-
-
-@pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="needs named pipes")
-@pytest.mark.timeout(30)
-def test_a_pipe_keeps_nobody_waiting(tmp_path):
-    os.mkfifo(tmp_path / "metrics.csv")
-    with pytest.raises(ValueError, match="is a named pipe"):
-        append_row(tmp_path / "metrics.csv", {"step": 1})

@@ -13,6 +13,7 @@ import torch
 from torch import Tensor
 
 from gaussian_swaying._devices import in_double
+from gaussian_swaying._files import sha256
 from gaussian_swaying.config.parser import parse_file
 from gaussian_swaying.gaussians.harmonics import sh_to_color
 from gaussian_swaying.geometry.groups import equal_rows
@@ -24,7 +25,6 @@ from gaussian_swaying.mpm.virtual_nodes import coordinates
 from gaussian_swaying.recording.nodes import load_nodes
 from gaussian_swaying.rendering.cameras.camera import Camera
 from gaussian_swaying.rendering.shading import DiffuseShader
-from gaussian_swaying.runs.seal import sha256
 from gaussian_swaying.simulation.diagnostics import FARTHEST
 from gaussian_swaying.simulation.painter import Painter
 from gaussian_swaying.simulation.simulated_scene import SimulatedScene

@@ -239,9 +239,8 @@ def test_damaged_nodes_are_not_added_to(make_flag, tmp_path):
     folder = tmp_path / "run"
     make_flag().run(folder, 3, progress=False)
     assert load_nodes(folder / "nodes.npz").dtype == torch.float32
-    content = (folder / "nodes.npz").read_bytes()
-    (folder / "nodes.npz").write_bytes(content[:5000] + bytes([content[5000] ^ 1]) + content[5001:])
-    with pytest.raises(ValueError, match=r"nodes\.npz is damaged \(.*start again without --resume"):
+    (folder / "nodes.npz").write_bytes((folder / "nodes.npz").read_bytes()[:5000])
+    with pytest.raises(ValueError, match=r"nodes\.npz is not a \.npz file, or is incomplete"):
         make_flag().run(folder, FRAMES + 1, resume=True, progress=False)
 
 
