@@ -374,6 +374,7 @@ def test_a_region_in_the_axes_of_the_wind_says_so(what, far, make_simulation):
                 ({"area": "disc"}, "scene.area"),
                 ({"opacity_threshold": 1.0}, "scene.opacity_threshold"),
                 ({"up": [0.0, 1.0]}, "scene.up"),
+                ({"up": [0.0, 0.0, 0.0]}, "scene.up"),
                 ({"max_stretch": 1.0}, "scene.max_stretch"),
                 ({"loose": "drop"}, "scene.loose"),
                 ({"normals": "random"}, "scene.normals"),
