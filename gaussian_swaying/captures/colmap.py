@@ -15,6 +15,7 @@ from torch import Tensor
 from gaussian_swaying._inputs import check_regular
 from gaussian_swaying.captures.images import PosedImage
 from gaussian_swaying.captures.lens import NO_DISTORTION, Lens
+from gaussian_swaying.geometry.rotations import quat_to_rotation
 
 # name and number of parameters of each camera model, in the order of COLMAP's numbers
 _MODELS = (
@@ -93,18 +94,11 @@ def read_colmap_views(model: Path) -> list[tuple[str, Lens, Tensor]]:
 
 
 def _pose(where: str, pose: tuple[float, ...]) -> Tensor:
-    length = math.hypot(*pose[:4])
-    if not all(math.isfinite(item) for item in pose) or length < 1e-6:
+    if not all(map(math.isfinite, pose)) or math.hypot(*pose[:4]) < 1e-6:
         raise ValueError(f"{where} has the pose {list(pose)}, which is not rigid: export the model again.")
-    w, x, y, z = (item / length for item in pose[:4])
-    tx, ty, tz = pose[4:]
-    rows = [
-        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y), tx],
-        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x), ty],
-        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y), tz],
-        [0.0, 0.0, 0.0, 1.0],
-    ]
-    return torch.tensor(rows, dtype=torch.float64)
+    found, given = torch.eye(4, dtype=torch.float64), torch.tensor(pose, dtype=torch.float64)
+    found[:3, :3], found[:3, 3] = quat_to_rotation(given[:4]), given[4:]
+    return found
 
 
 class _UnknownLensError(Exception):

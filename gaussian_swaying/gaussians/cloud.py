@@ -39,17 +39,14 @@ class GaussianCloud:
     normals: Tensor | None = None
 
     def __post_init__(self) -> None:
-        check_shape("means", self.means, None, 3)
+        check_shape("means", self.means, None, 3, batches=False)
         count = self.means.shape[0]
-        sizes: dict[str, tuple[int | None, ...]] = {"means": (count, 3), "quats": (count, 4), "scales": (count, 3)}
-        sizes |= {"opacities": (count,), "sh": (count, None, 3)}
+        sizes: dict[str, tuple[int | None, ...]] = {"quats": (count, 4), "scales": (count, 3), "opacities": (count,)}
+        sizes["sh"] = (count, None, 3)
         if self.normals is not None:
             sizes["normals"] = (count, 3)
         for name, size in sizes.items():
-            tensor = getattr(self, name)
-            check_shape(name, tensor, *size)
-            if tensor.ndim != len(size):
-                raise ValueError(f"Expected `{name}` to have {len(size)} dimensions, but got {tuple(tensor.shape)}.")
+            check_shape(name, getattr(self, name), *size, batches=False)
         sh_degree(self.sh.shape[1])
 
     def __len__(self) -> int:
@@ -74,3 +71,13 @@ class GaussianCloud:
         fields = {field.name: getattr(self, field.name) for field in dataclasses.fields(self)}
         changed: dict[str, Any] = {name: None if t is None else function(t) for name, t in fields.items()}
         return GaussianCloud(**changed)
+
+
+def joined(*clouds: GaussianCloud) -> GaussianCloud:
+    """Several splats of one degree, one after the other; without normals unless all have them."""
+    names = [field.name for field in dataclasses.fields(GaussianCloud)]
+    parts = {name: [getattr(cloud, name) for cloud in clouds] for name in names}
+    whole: dict[str, Any] = {
+        name: None if any(p is None for p in part) else torch.cat(part) for name, part in parts.items()
+    }
+    return GaussianCloud(**whole)

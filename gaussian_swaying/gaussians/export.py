@@ -6,7 +6,7 @@ import os
 import re
 import warnings
 from collections.abc import Iterable
-from dataclasses import fields, replace
+from dataclasses import replace
 from importlib import import_module
 from pathlib import Path
 from typing import Any, Literal
@@ -17,7 +17,7 @@ from torch import Tensor
 
 from gaussian_swaying._checks import check_choice, check_positive
 from gaussian_swaying._files import atomic
-from gaussian_swaying.gaussians.cloud import GaussianCloud
+from gaussian_swaying.gaussians.cloud import GaussianCloud, joined
 from gaussian_swaying.gaussians.formats import read_gaussians
 from gaussian_swaying.gaussians.gltf import encode_gltf
 from gaussian_swaying.gaussians.harmonics import sh_to_color
@@ -179,7 +179,15 @@ def convert(
     kept = None if still is None else read_gaussians(still)
 
     def frame_of(file: Path) -> GaussianCloud:
-        return read_gaussians(file) if kept is None else joined(kept, read_gaussians(file))
+        frame = read_gaussians(file)
+        if kept is None:
+            return frame
+        if kept.sh_degree != frame.sh_degree or (kept.normals is None) != (frame.normals is None):
+            raise ValueError(
+                "The file of what never moves and the frames do not belong together (harmonics of degree "
+                f"{kept.sh_degree} and {frame.sh_degree}): give the folder of a run as the run wrote it."
+            )
+        return joined(kept, frame)
 
     if format == "usd":
         return write_usd(target, map(frame_of, files), **place)
@@ -191,20 +199,6 @@ def convert(
     for index, file in enumerate(files):
         name = re.sub("#+", lambda digits: f"{index:0{len(digits[0])}d}", target.name)  # noqa: B023  # called at once
         export_cloud(target.with_name(name), frame_of(file), format=format, spz_version=spz_version, **place)
-
-
-def joined(first: GaussianCloud, second: GaussianCloud) -> GaussianCloud:
-    """The Gaussians of two splats of the same scene, one after the other."""
-    if first.sh_degree != second.sh_degree or (first.normals is None) != (second.normals is None):
-        raise ValueError(
-            "The file of what never moves and the frames do not belong together (harmonics of degree "
-            f"{first.sh_degree} and {second.sh_degree}): give the folder of a run as the run wrote it."
-        )
-    pairs = {field.name: (getattr(first, field.name), getattr(second, field.name)) for field in fields(GaussianCloud)}
-    whole: dict[str, Any] = {
-        name: None if one is None else torch.cat([one, other]) for name, (one, other) in pairs.items()
-    }
-    return GaussianCloud(**whole)
 
 
 def _kept(path: Path, cloud: GaussianCloud) -> GaussianCloud:

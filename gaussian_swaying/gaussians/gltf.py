@@ -18,9 +18,9 @@ import torch
 from torch import Tensor
 
 from gaussian_swaying._inputs import LARGEST_JSON, check_regular, check_unpacked, parse_json, read_json
-from gaussian_swaying.gaussians.cloud import GaussianCloud
+from gaussian_swaying.gaussians.cloud import GaussianCloud, joined
 from gaussian_swaying.gaussians.harmonics import SH_DC, rotate_sh
-from gaussian_swaying.gaussians.packed import FIELDS, cloud_of, joined, logits
+from gaussian_swaying.gaussians.packed import FIELDS, cloud_of, logits
 from gaussian_swaying.gaussians.ply import reject
 from gaussian_swaying.geometry.covariances import covariance, covariance_to_quat_scale, deform_covariance
 from gaussian_swaying.geometry.rotations import quat_to_rotation, rotation_to_quat
@@ -59,7 +59,7 @@ def read_gltf(path: str | os.PathLike[str]) -> GaussianCloud:
     if not sum(counts):
         raise ValueError(f"{path} holds zero Gaussians; export the scene again.")
     parts = [document.gaussians(*what, width) for what, count in zip(found, counts, strict=True) if count]
-    return joined(parts)
+    return joined(*parts)
 
 
 def encode_gltf(cloud: GaussianCloud, rotation: Tensor | None = None, metres_per_unit: float = 1.0) -> bytes:

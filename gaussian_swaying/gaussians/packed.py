@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -61,11 +60,6 @@ def warn_antialiased(path: Path) -> None:
         UserWarning,
         stacklevel=3,
     )
-
-
-def joined(clouds: Sequence[GaussianCloud]) -> GaussianCloud:
-    """Several clouds with the same degree of harmonics, and without normals, as one."""
-    return GaussianCloud(*(torch.cat([getattr(cloud, name) for cloud in clouds]) for name in FIELDS))
 
 
 def cloud_of(path: Path, **columns: np.ndarray) -> GaussianCloud:

@@ -19,11 +19,10 @@ import torch
 from torch import Tensor
 
 from gaussian_swaying._inputs import LARGEST_JSON, check_regular, check_unpacked, parse_json, read_json
-from gaussian_swaying.gaussians.cloud import GaussianCloud
+from gaussian_swaying.gaussians.cloud import GaussianCloud, joined
 from gaussian_swaying.gaussians.packed import (
     cloud_of,
     floats,
-    joined,
     logits,
     smallest_three,
     warn_antialiased,
@@ -200,7 +199,7 @@ def _streamed(path: Path, meta: dict[str, Any], level: int) -> GaussianCloud:
             parts.append(cloud if count == len(cloud) else cloud.select(torch.arange(first, first + count)))
     if not sum(map(len, parts)):
         raise ValueError(f"{path} holds zero Gaussians at level {level}; export the scene again.")
-    return joined(parts)
+    return joined(*parts)
 
 
 def _broken(path: Path, what: str) -> ValueError:

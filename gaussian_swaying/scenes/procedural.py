@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import math
 from abc import ABC, abstractmethod
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import torch
 from torch import Tensor
 
 from gaussian_swaying._checks import check_literals, check_positive
-from gaussian_swaying.gaussians.cloud import GaussianCloud
+from gaussian_swaying.gaussians.cloud import GaussianCloud, joined
 from gaussian_swaying.gaussians.harmonics import SH_DC
 from gaussian_swaying.geometry.patches import smallest_axis_normal
 from gaussian_swaying.scenes.printed_cloth import printed_colours
@@ -61,7 +61,7 @@ def both(first: GaussianCloud, second: GaussianCloud) -> GaussianCloud:
         replace(part, normals=smallest_axis_normal(part.quats, part.scales)) if part.normals is None else part
         for part in (first, second)
     ]
-    return GaussianCloud(**{f.name: torch.cat([getattr(part, f.name) for part in parts]) for f in fields(first)})
+    return joined(*parts)
 
 
 @dataclass(eq=False)

@@ -7,7 +7,8 @@ import pytest
 import torch
 
 from gaussian_swaying.cli.export import main as export
-from gaussian_swaying.gaussians.export import SUFFIXES, export_cloud, joined, read_usd_frame
+from gaussian_swaying.gaussians.cloud import joined
+from gaussian_swaying.gaussians.export import SUFFIXES, export_cloud, read_usd_frame
 from gaussian_swaying.gaussians.formats import read_gaussians
 from gaussian_swaying.gaussians.ply import read_ply
 from gaussian_swaying.geometry.covariances import covariance
