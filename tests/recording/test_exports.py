@@ -8,7 +8,7 @@ import torch
 
 from gaussian_swaying.cli.export import main as export
 from gaussian_swaying.gaussians.cloud import joined
-from gaussian_swaying.gaussians.export import SUFFIXES, export_cloud, read_usd_frame
+from gaussian_swaying.gaussians.export import SUFFIXES, convert, export_cloud, read_usd_frame
 from gaussian_swaying.gaussians.formats import read_gaussians
 from gaussian_swaying.gaussians.ply import read_ply
 from gaussian_swaying.geometry.covariances import covariance
@@ -241,7 +241,10 @@ def test_a_run_does_not_change_where_its_still_part_is(recorded):
     assert len(read_ply(folder / "still.ply")) + len(read_ply(folder / "ply/00002.ply")) == 96
 
 
-def test_parts_that_do_not_belong_together(recorded):
+def test_parts_that_do_not_belong_together(tmp_path):
     cloud = FlagScene(spacing=0.1).generate()
+    (tmp_path / "ply").mkdir()
+    export_cloud(tmp_path / "still.ply", cloud)
+    export_cloud(tmp_path / "ply/00000.ply", replace(cloud, sh=cloud.sh.repeat(1, 4, 1)))
     with pytest.raises(ValueError, match=r"harmonics of degree 0 and 1\): give the folder of a run"):
-        joined(cloud, replace(cloud, sh=cloud.sh.repeat(1, 4, 1)))
+        convert(tmp_path / "ply", tmp_path / "#.spz", still=tmp_path / "still.ply")
