@@ -1,8 +1,8 @@
 """Blender's cloth solver in SI units, for ``make_flag_dataset.py``.
 
-This is the only file that runs the solver. ``bpy`` is imported when a cloth is solved. The relations between
-Blender's settings and SI units were measured on panels (commit a5a45c7), because Blender documents none of them.
-Blender's cloth counts time in frames: a stiffness in its units is one in N/m divided by fps².
+``bpy`` is imported when a cloth is solved. The relations between Blender's settings and SI units were measured on
+panels (commit a5a45c7), because Blender documents none of them. Blender's cloth counts time in frames: a stiffness in
+its units is one in N/m divided by fps².
 """
 
 from __future__ import annotations

@@ -1,9 +1,7 @@
 """The three flags of the paper's benchmark, and two more, as an independent cloth solver sees them.
 
-Parameters of the paper's flags are those of its table; values that it does not give are chosen here and marked.
 Nothing in this file needs Blender: ``blender_cloth.py`` solves, ``blender_images.py`` renders,
-``make_flag_dataset.py`` combines them. Motions and their files are in ``flag_motion.py``, textures and cameras in
-``flag_pictures.py``.
+``make_flag_dataset.py`` combines them.
 """
 
 from __future__ import annotations
@@ -28,33 +26,35 @@ class FlagPattern:
     Seen from the -y side, the flag spans ``width`` to the right (x) and ``height`` upwards (z) from the origin. Then
     ``yaw`` turns it about z. Its initial normal, towards the reference camera, is -y turned by ``yaw``.
 
+    Of patterns 1 to 3 the paper gives E, nu, density, flow, pins, gravity, frames, their rate and the white of pattern
+    1, but not thickness, size and density of the air.
+
     Attributes:
-        youngs_modulus: E [Pa]; paper, as is all that is marked so below (in patterns 1 to 3).
-        poisson_ratio: nu; paper. Blender's springs have 0.32 to 0.33.
-        density: [kg/m³]; paper.
-        flow: Velocity of the air [m/s], constant and uniform; paper.
-        pinned: ``left`` edge, ``top`` edge, both ``sides``, or three ``corners`` with the lower left one free; paper.
-        texture: ``white``, ``stripes``, or the path of an image. White for pattern 1: paper.
-        paper_drag: C_D, C_F and C_L of the paper's table, for the paper's force law. Kept for the record: Blender's
-            wind follows another law.
-        thickness: [m]; not given in the paper.
-        width: [m]; not given in the paper, like ``height``.
+        youngs_modulus: E [Pa].
+        poisson_ratio: nu; Blender's springs have 0.32 to 0.33.
+        density: [kg/m³].
+        flow: Velocity of the air [m/s].
+        pinned: ``left`` edge, ``top`` edge, both ``sides``, or three ``corners`` with the lower left one free.
+        texture: ``white``, ``stripes``, or the path of an image.
+        paper_drag: C_D, C_F and C_L of the paper's table; Blender's wind follows another law.
+        thickness: [m].
+        width: [m].
         height: [m].
         yaw: Angle about z [degrees].
         ripple: Amplitude of one and a half waves along x in the rest shape [m]. Without it, a flat flag under gravity
             alone would buckle only by rounding errors.
         corner: Side of the square in which all vertices are held at a pinned corner [m].
-        gravity: Along -z [m/s²]; paper.
-        air_density: [kg/m³]; not given in the paper.
+        gravity: Along -z [m/s²].
+        air_density: [kg/m³].
         damping: Rate at which every velocity decays [1/s].
         drag: C of the pressure ½ ρ C U² of the wind on a face at rest across the flow; default: a square plate.
-        cells: Cells along the longer side, each with a vertex.
+        cells: Cells along the longer side.
         quality: Steps of Blender's solver per frame; a power of two.
-        frames: Number of frames, the first being the rest shape; paper.
-        fps: Frames per second; paper.
+        frames: Number of frames, the first being the rest shape.
+        fps: Frames per second.
         self_collision: Whether self-contact is on.
         self_distance: Distance that the cloth then keeps from itself [m]; null: half a cell.
-        bending: Bending stiffness as a share of that of a plate of this thickness.
+        bending: Bending stiffness as a share of that of a plate.
     """
 
     youngs_modulus: float

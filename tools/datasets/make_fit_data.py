@@ -8,12 +8,8 @@
 Needs Blender as a Python module: ``pip install 'gaussian-swaying[blender]'``, Python 3.11; ``soft`` also needs the
 extra ``peers``. Everything runs on the CPU.
 
-Blender's cloth solver makes the motion, that of ``soft`` Newton's soft body, and Blender's path tracer the pictures, so
-neither shares anything with this package.
-The folder of each case holds ``transforms.json`` with ``images/`` and ``masks/``, ``scene.yaml`` and ``fit.yaml`` with
-wrong values for what is sought, ``truth.json``, and the true motion, ``cloth.npz`` or ``motion.npz``. docs/fit_data.md
-describes them. The same settings give the same files; what is there is not made again, and where settings changed, the
-run stops and names them.
+docs/fit_data.md describes the cases and their files. What is there is not made again; where settings changed, the run
+stops and names them.
 """
 
 from __future__ import annotations

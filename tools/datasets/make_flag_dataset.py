@@ -7,11 +7,8 @@
 
 Needs Blender as a Python module: ``pip install 'gaussian-swaying[blender]'``, Python 3.11. Everything runs on the CPU.
 
-For each flag a folder, ``pattern1`` and so on or the name of the YAML file, holds ``cloth.npz`` (the motion, see
-``flag_motion.py``), ``mesh.ply`` and ``truth.npz`` (the rest shape with its normals), ``train/`` (photographs of the
-rest shape from all around, with ``transforms.json``) and ``video/`` (``frames/``, ``camera.json``, ``reference.mp4``).
-The same settings give the same files. What is there is not made again, so an interrupted run is continued by the same
-command; where settings changed, the run stops and names them.
+docs/flag_dataset.md describes the files. What is there is not made again; where settings changed, the run stops and
+names them.
 """
 
 from __future__ import annotations

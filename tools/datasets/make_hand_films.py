@@ -6,11 +6,10 @@
 Needs Blender as a Python module: ``pip install 'gaussian-swaying[blender]'``, Python 3.11; ``post`` also needs the
 extra ``peers``. Everything runs on the CPU.
 
-Blender's cloth moves the cloth, Newton the post, and Blender draws both in a room. Each motion makes two films of the
-same length: ``still`` begins 0.2 s before it, ``moving`` 0.2 s into it. Each has a folder with ``film.mp4``;
-``transforms.json``, with the camera as it was aimed, but not how it shakes; ``splat.ply``, of the thing at rest and the
-room; ``scene.yaml`` and ``fit.yaml``, with start values that are three times and 60 degrees off; and ``truth.json``,
-with the true cameras. docs/fit_data.md describes them. Pictures that are there are not made again.
+Each motion makes two films of the same length: ``still`` begins 0.2 s before it, ``moving`` 0.2 s into it. Each has a
+folder with ``film.mp4``; ``transforms.json``, with the camera as it was aimed, but not how it shakes; ``splat.ply``, of
+the thing at rest and the room; ``scene.yaml`` and ``fit.yaml``, with start values far off; and ``truth.json``, with the
+true cameras. Pictures that are there are not made again.
 """
 
 from __future__ import annotations

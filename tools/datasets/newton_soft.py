@@ -1,9 +1,8 @@
 """A soft body in wind by Newton: tetrahedra of a Neo-Hookean material, and the wind as pressure on its skin.
 
-This is the only file that runs it. ``newton`` and ``warp-lang`` (the extra ``peers``) are imported when a body is
-solved, and run on a CPU. Newton computes the elastic forces and the motion (``SolverSemiImplicit``: symplectic Euler
-with small steps, so there is neither an iteration that may not have converged nor the damping of an implicit step). The
-force of the air is computed here, in numpy.
+``newton`` and ``warp-lang`` (the extra ``peers``) are imported when a body is solved, and run on a CPU. Newton computes
+the elastic forces and the motion (``SolverSemiImplicit``: symplectic Euler with small steps, so there is neither an
+iteration that may not have converged nor the damping of an implicit step), numpy the force of the air.
 """
 
 from __future__ import annotations
@@ -84,14 +83,8 @@ def newton_moduli(youngs_modulus: float, poisson_ratio: float) -> tuple[float, f
 class Block:
     """An upright block of square section, its lower end held.
 
-    Attributes:
-        side: Side of the section [m].
-        height: Height [m].
-        held: Height of the part that does not move [m].
-        cells: Cells along a side; five tetrahedra each.
-        youngs_modulus: Young's modulus at small strain [Pa].
-        poisson_ratio: Poisson's ratio at small strain.
-        density: [kg/m³].
+    Lengths are in m, ``density`` in kg/m³, the moduli those at small strain [Pa]. ``held`` is the height of what does
+    not move; ``cells`` lie along a side, of five tetrahedra each.
     """
 
     side: float

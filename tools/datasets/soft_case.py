@@ -44,22 +44,10 @@ SOUGHT = {
 class SoftPattern:
     """A post of soft foam in steady wind, held at its foot.
 
-    Attributes:
-        flow: Velocity of the air [m/s], z up.
-        youngs_modulus: [Pa].
-        poisson_ratio: Poisson's ratio.
-        density: [kg/m³].
-        side: Side of its square section [m].
-        height: Height [m].
-        held: Height of the part that does not move, at the foot [m].
-        drag: Coefficient of each face; a prism across the wind has two, together 2.
-        air_density: [kg/m³].
-        gravity: [m/s²].
-        damping: Rate at which velocities decay, besides what the air takes [1/s].
-        cells: Cells of Newton's mesh along a side of the section.
-        steps: Steps of a frame; 0 for as many as the mesh needs.
-        frames: Number of frames, the first at rest.
-        fps: Frames per second.
+    Lengths are in m, ``density`` in kg/m³, moduli in Pa, ``flow`` in m/s; ``damping`` is the rate at which velocities
+    decay besides what the air takes [1/s]. ``side`` is that of the square section, ``held`` the height of the foot that
+    does not move. ``drag`` is the coefficient of each face: a prism across the wind has two. ``cells`` of Newton's mesh
+    lie along a side; 0 ``steps`` of a frame stand for as many as the mesh needs.
     """
 
     flow: tuple[float, float, float] = (4.4, 2.6, 0.0)

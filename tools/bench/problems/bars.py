@@ -48,17 +48,10 @@ def vibrating_bar(
     :math:`\omega`; ``fixed-free``: :math:`\varphi = \sin(\pi X / 2L),\ \omega = \pi c / 2L` (textbook wave equation).
     The middle of the free bar is at rest, so each half is a fixed-free bar with an ideal clamp.
 
-    Args:
-        cells: Cells along the bar.
-        settings: The numerics.
-        ends: ``free``, ``fixed-free`` or ``fixed``.
-        confined: Prevent all motion across the bar; needed unless ``poisson_ratio`` is 0.
-        poisson_ratio: Poisson's ratio.
-        periods: Number of periods to simulate.
-        strain: Amplitude of the strain.
-        shift: How far the bar is moved off the planes of the nodes [cells].
-        hold: A fixed end is a :class:`PinnedRegion` of two cells beyond it (``nodes``), or :class:`PinnedPoints` at it
-            (``points``).
+    The bar must be ``confined``, without motion across, unless ``poisson_ratio`` is 0. A fixed end is a
+    :class:`PinnedRegion` of two cells beyond it (``hold`` is ``nodes``), or :class:`PinnedPoints` at it (``points``).
+
+    Units: ``shift`` of the bar off the planes of the nodes [cells].
 
     Returns:
         ``error`` (of the frequency, relative), ``frequency`` [Hz], ``loss`` (share of the amplitude lost per period),
@@ -129,10 +122,6 @@ def kept_by_transfers(theta: float) -> float:
 def losses(cells: int = 16, periods: int = 2) -> Result:
     """Share of the amplitude that a free bar loses per period.
 
-    Args:
-        cells: Cells along the bar.
-        periods: Number of periods.
-
     Returns:
         With an ``adaptive`` and with a ``fixed`` substep in ``total``, and the ``ratio`` of the loss in ``updated``, at
         so small a strain that points keep their places in their cells, to what the transfers smooth of the kinetic half
@@ -163,15 +152,12 @@ def hanging_bar(
     Exact at finite strain for fixed corotated elasticity with :math:`\nu = 0` (equilibrium in the rest configuration).
     The full load acts from the start, and critical damping of the lowest mode brings the bar to rest.
 
-    Args:
-        cells: Cells along the bar.
-        settings: The numerics.
-        clamp: ``mirror`` pulls both halves of a bar of twice the length away from its middle, which is at rest by
-            symmetry: an ideal clamp. ``pin`` is a :class:`PinnedRegion` of two cells beyond the end that holds nodes,
-            ``points`` are :class:`PinnedPoints` at the end.
-        strain: Strain at the top, rho g L / E; twice the stretch of the bar as a whole.
-        settle: Time to simulate, in units of 1 / circular frequency of the lowest mode.
-        shift: How far the bar is moved off the planes of the nodes [cells].
+    The ``clamp`` ``mirror`` pulls both halves of a bar of twice the length away from its middle, which is at rest by
+    symmetry: an ideal clamp. ``pin`` is a :class:`PinnedRegion` of two cells beyond the end that holds nodes,
+    ``points`` are :class:`PinnedPoints` at the end.
+
+    Units: ``strain`` at the top, rho g L / E; ``settle`` [1 / circular frequency of the lowest mode]; ``shift`` off
+    the planes of the nodes [cells].
 
     Returns:
         ``error`` (of the displacement of the lowest points, relative to the closed form there), ``profile`` (root mean
@@ -229,12 +215,8 @@ def free_block(
     :math:`\omega \Delta t / 2`, relative, about a constant mean. A cube has many modes without a common period, so the
     mean is taken over several periods 2 L / c of the wave that crosses the cube and returns.
 
-    Args:
-        settings: The numerics.
-        periods: Number of periods 2 L / c to simulate.
-        cells: Cells along an edge of 1 m.
-        strain: Amplitude of the strain rate in units of the circular frequency of that wave.
-        window: Periods of a mean; ``periods`` must be a multiple of it.
+    Units: ``periods`` [2 L / c], a multiple of ``window``, the periods of a mean; ``strain`` rate [circular frequency
+    of that wave].
 
     Returns:
         ``error`` (the largest change of the mean energy, relative to the first mean), ``kept`` (last mean over the

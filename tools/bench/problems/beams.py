@@ -21,9 +21,7 @@ def elastica(b: float, steps: int = 400) -> tuple[float, float, float]:
     Solves :math:`\theta'' = -b\,(1 - s) \cos \theta,\ \theta(0) = 0,\ \theta'(1) = 0` (Euler's elastica with a
     distributed load; Rohde 1953) from the tip, by bisection for its slope and the classical Runge-Kutta rule.
 
-    Args:
-        b: Weight per length times length cubed over bending stiffness, w L³ / (E I).
-        steps: Steps along the beam.
+    With ``b`` = w L³ / (E I), w the weight per length.
 
     Returns:
         Drop of the tip and its shortening (how far it moves back), both over the length, and its slope [rad].
@@ -73,16 +71,10 @@ def cantilever(
     - Quadrature: splines represent bending exactly, but m equal layers of points have the second moment of area
       :math:`(1 - 1 / m^2)\, I`, so the discrete beam is the elastica of a larger b.
 
-    One cell with two layers is not a beam: a quadratic spline across it can have the value 0 and the slope 1 at both
-    layers, which is bending without strain. With three layers per cell there is no such motion.
+    One cell with two layers bends without strain: a quadratic spline across it can have the value 0 and the slope 1 at
+    both layers.
 
-    Args:
-        cells: Cells n through the thickness.
-        settings: The numerics.
-        b: Weight over stiffness.
-        slenderness: Length over thickness.
-        settle: Time to simulate, in units of 1 / circular frequency of the lowest bending mode.
-        per_cell: Points per cell and axis.
+    Units: ``cells`` through the thickness; ``settle`` [1 / circular frequency of the lowest bending mode].
 
     Returns:
         ``error`` (of the drop of the tip against the elastica, relative), ``drop`` and ``shortening`` over the length,
@@ -148,14 +140,7 @@ def timoshenko_mode(
     r"""Lowest bending mode of a clamped-free beam of unit width, with E = rho = 1 and G = 1/2.
 
     Timoshenko's beam (1921; shear coefficient 5/6) in linear elements with reduced integration of the shear (Hughes,
-    Taylor & Kanoknukulchai 1977); 200 elements are within 1e-4 of the limit. For a slender beam the frequency is
-    Euler's :math:`3.516\,\sqrt{I / h} / L^2`.
-
-    Args:
-        length: Length L.
-        thickness: Thickness h.
-        second_moment: Second moment of area I.
-        elements: Elements along the beam.
+    Taylor & Kanoknukulchai 1977); 200 elements are within 1e-4 of the limit.
 
     Returns:
         The circular frequency, and displacement and rotation at the nodes of the elements, scaled to a displacement of
@@ -193,16 +178,11 @@ def held_cantilever(
     Equal layers have the second moment of area :math:`(1 - 1 / m^2)\, I`; a strip thinner than a cell has three layers
     with the weights of Simpson's rule, which have I.
 
-    Args:
-        settings: The numerics.
-        thickness: Thickness of the beam [cells].
-        depth: Length of the region [cells].
-        place: How far the beam is moved off the planes of the nodes, along x and z [cells].
-        angle: Angle between the beam and the x axis, in the x-z plane [rad].
-        length: Free length [cells]; ten thicknesses, and at least 20, if None.
-        kind: Kind of the pin.
-        per_cell: Points per cell along the beam, and of a thick one across. With two, a beam of one or two cells that
-            lies obliquely on the grid is too soft by up to 5 % in its frequency, also without any pin.
+    With two points ``per_cell``, a beam of one or two cells that lies obliquely on the grid is too soft by up to 5 % in
+    its frequency, also without any pin.
+
+    Units: ``thickness``, ``depth`` of the region, ``place`` off the planes of the nodes along x and z, free ``length``
+    (ten thicknesses, and at least 20, if None) [cells]; ``angle`` to the x axis, in the x-z plane [rad].
 
     Returns:
         ``ratio`` (frequency over that of Timoshenko's beam), ``error`` (its distance from one) and the common

@@ -22,10 +22,9 @@ _FRAME = 0.04
 class Hinge(Boundary):
     r"""Lets the material rotate about the x axis: the material on the axis does not move.
 
-    A pinned row of particles would hold up to three rows of nodes and prevent rotation. Here only the interpolated
-    velocity on the axis is held, :math:`\sum_i w_i v_i = 0`, by subtracting it from the nodes around; a rotation about
-    the axis does not change. The reaction passes through the axis, without a moment, if the material around is
-    symmetric about it, and all motion is in the y-z plane, the same along x.
+    Only the interpolated velocity on the axis is held, :math:`\sum_i w_i v_i = 0`, by subtracting it from the nodes
+    around. The reaction passes through the axis, without a moment, if the material around is symmetric about it, and
+    all motion is in the y-z plane, the same along x.
 
     Units: ``dx``, ``rest`` [m].
     """

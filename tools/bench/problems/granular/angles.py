@@ -21,11 +21,7 @@ from gaussian_swaying.mpm.laws.shared import lame_parameters
 def _steady(law: ConstitutiveLaw, gradient: Sequence[Sequence[float]], steps: int, pressure: float) -> Tensor:
     """Kirchhoff stress over E, shape (3, 3), after ``steps`` increments of a velocity gradient that keeps the volume.
 
-    Args:
-        law: The law under test.
-        gradient: Increment of strain, shape (3, 3), without trace.
-        steps: Number of increments.
-        pressure: Pressure at the start, over Young's modulus.
+    ``pressure`` is that at the start, over Young's modulus.
     """
     mu, lam = lame_parameters(torch.ones(1, dtype=torch.float64), torch.full((1,), POISSON, dtype=torch.float64))
     increment = torch.linalg.matrix_exp(torch.tensor(gradient, dtype=torch.float64))
@@ -43,14 +39,7 @@ def shear_angle(law: ConstitutiveLaw, steps: int = 100, increment: float = 1e-3,
     With Klar's return map the flow is coaxial and deviatoric, so in the steady state
     :math:`\tan = 6 \sin\phi / (\sqrt3 (3 - \sin\phi))`: 34.7 degrees for phi = 30.
 
-    Args:
-        law: The law under test.
-        steps: Number of increments.
-        increment: Shear of each increment.
-        pressure: Confining pressure over Young's modulus.
-
-    Returns:
-        The angle.
+    ``pressure`` is the confining one, over Young's modulus.
     """
     stress = _steady(law, [[0, 0, increment], [0, 0, 0], [0, 0, 0]], steps, pressure)
     return math.degrees(math.atan2(float(stress[0, 2].abs()), -float(stress[2, 2])))
@@ -65,7 +54,7 @@ def _mobilised(stress: Tensor) -> float:
 def triaxial_angle(law: ConstitutiveLaw, steps: int = 100, increment: float = 1e-3, pressure: float = 1e-3) -> float:
     r"""Angle :math:`\arcsin((\sigma_1 - \sigma_3) / (\sigma_1 + \sigma_3))` in triaxial compression [degrees].
 
-    Arguments as :func:`shear_angle`; the volume is kept. The cone is fitted to phi here.
+    The volume is kept. The cone is fitted to phi here.
     """
     half = increment / 2
     return _mobilised(_steady(law, [[half, 0, 0], [0, half, 0], [0, 0, -increment]], steps, pressure))

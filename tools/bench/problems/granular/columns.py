@@ -40,7 +40,7 @@ def column_at_rest(
     Returns:
         ``error``: the largest displacement of a particle, over the width; ``settlement``: how far the surface sinks in
         equilibrium if the sand starts without stress, over the same; ``kinetic``: kinetic energy at the end over the
-        weight times the depth; ``simulated_s``, ``substeps``, ``wall_s`` and ``particles``.
+        weight times the depth; and the common quantities.
     """
     settings = updated(settings)
     dx = LENGTH / cells
@@ -78,10 +78,9 @@ def column_collapse(
     than half of the density at rest: gaps inside and spray do not matter. The surface is the thickness of the bulk over
     each point of the floor.
 
-    Coarse grids stop the sand too early: the transfers smooth the flow within a cell in every substep, so the run-out
-    grows with the cells and falls with the substeps. At a = 1, planar: 0.57, 0.68, 0.77, 0.88 and 0.95 with 4, 8, 16,
-    32 and 64 cells, and 0.68 with 16 cells and a third of the Courant number. Experiments with sand, which mobilises
-    less friction in plane strain than this cone, gave 1.2; 20 degrees on 32 cells give 1.64.
+    The transfers smooth the flow within a cell in every substep, so the run-out grows with the cells and falls with the
+    substeps. At a = 1, planar: 0.57, 0.77 and 0.95 with 4, 16 and 64 cells. Experiments with sand, which mobilises less
+    friction in plane strain than this cone, gave 1.2.
 
     Units: ``friction_angle`` [degrees].
 
@@ -92,7 +91,7 @@ def column_collapse(
         value [s], and ``stop``, the same over :math:`\sqrt{H_0 / g}`; ``volume_ratio``: bulk at the end over that at
         the start; ``kinetic``: kinetic energy at the end over its largest value; ``lost``: particles off the grid;
         ``lube`` and ``lajeunesse``: run-outs in experiments, the latter for a round column only; ``error``: run-out
-        relative to ``lube``; ``simulated_s``, ``substeps``, ``wall_s`` and ``particles``.
+        relative to ``lube``; and the common quantities.
     """
     settings = updated(settings)
     high = round(aspect * cells)
