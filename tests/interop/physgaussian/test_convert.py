@@ -38,6 +38,25 @@ PARSER = Simulation.parser()
 REST = {"start_time": 0.0, "end_time": 1e3}
 STILL = [0.0, 0.0, 0.0]
 
+
+def _box(kind, point, size, velocity=STILL, **more):
+    return {"type": kind, "point": point, "size": size, "velocity": velocity, **REST, **more}
+
+
+def _pulled(point, size, velocity=STILL, **more):
+    return _box("enforce_particle_translation", point, size, velocity, **more)
+
+
+def _turning(point, normal, sizes, scale, along=0.0, **times):
+    shape = {"point": point, "normal": normal, "half_height_and_radius": sizes}
+    speeds = {"rotation_scale": scale, "translation_scale": along}
+    return {"type": "enforce_particle_velocity_rotation", **shape, **speeds, **REST, **times}
+
+
+def _filled(n_grid, density, search=1, **more):
+    return {"n_grid": n_grid, "density_threshold": density, "search_threshold": search, **more}
+
+
 # Values that PhysGaussian published for its six example scenes. Where its boxes stand matters to none of these tests,
 # and is ours for plane, tear_bread, vasedeck (but for the height of its pin) and pillow2sofa.
 PUBLISHED = {
@@ -55,7 +74,7 @@ PUBLISHED = {
             {"point": [1, 1, 1.5], "size": [1, 1, 0.5], "E": 2e6, "nu": 0.4, "density": 70},
         ],
         "boundary_conditions": [
-            {"type": "cuboid", "point": [1, 1, 0.5], "size": [0.5, 0.5, 0.28], "velocity": STILL, "reset": 1, **REST},
+            _box("cuboid", [1, 1, 0.5], [0.5, 0.5, 0.28], reset=1),
             {"type": "particle_impulse", "force": [-0.18, 0, 0], "num_dt": 1, "start_time": 0},
         ],
     },
@@ -70,13 +89,7 @@ PUBLISHED = {
         "frame_dt": 0.04,
         "frame_num": 50,
         "g": [0, 0, -9.8],
-        "particle_filling": {
-            "n_grid": 100,
-            "density_threshold": 100,
-            "search_threshold": 1,
-            "smooth": True,
-            "visualize": True,
-        },
+        "particle_filling": _filled(100, 100, smooth=True, visualize=True),
         "boundary_conditions": [
             {"type": "bounding_box"},
             {
@@ -113,35 +126,12 @@ PUBLISHED = {
         "rotation_axis": [1, 2],
         "sim_area": [-2, 0, -1, 1, -1, 1],
         "grid_v_damping_scale": 0.9999,
-        "particle_filling": {"n_grid": 50, "density_threshold": 40},
+        "particle_filling": _filled(50, 40),
         "boundary_conditions": [
-            {
-                "type": "enforce_particle_translation",
-                "point": [1, 1, 0.5],
-                "size": [0.2, 0.2, 0.5],
-                "velocity": STILL,
-                **REST,
-            },
-            {
-                "type": "enforce_particle_translation",
-                "point": [1.4, 1, 1],
-                "size": [0.1, 0.5, 0.5],
-                "velocity": STILL,
-                **REST,
-            },
-            *(
-                {
-                    "type": "enforce_particle_velocity_rotation",
-                    "point": [0.7, 1, 1],
-                    "normal": [1, 0, 0],
-                    "half_height_and_radius": [0.1, 0.5],
-                    "rotation_scale": scale,
-                    "translation_scale": 0.0,
-                    "start_time": start,
-                    "end_time": end,
-                }
-                for scale, start, end in ((1.0, 0.0, 0.5), (-1.0, 1.0, 2.0))
-            ),
+            _pulled([1, 1, 0.5], [0.2, 0.2, 0.5]),
+            _pulled([1.4, 1, 1], [0.1, 0.5, 0.5]),
+            _turning([0.7, 1, 1], [1, 0, 0], [0.1, 0.5], 1.0, end_time=0.5),
+            _turning([0.7, 1, 1], [1, 0, 0], [0.1, 0.5], -1.0, start_time=1.0, end_time=2.0),
         ],
     },
     "tear_bread": {
@@ -159,23 +149,8 @@ PUBLISHED = {
         "scale": 0.6,
         "rpic_damping": 0.5,
         "grid_v_damping_scale": 0.9995,
-        "particle_filling": {
-            "n_grid": 100,
-            "density_threshold": 100,
-            "search_threshold": 0.2,
-            "smooth": True,
-            "visualize": True,
-        },
-        "boundary_conditions": [
-            {
-                "type": "enforce_particle_translation",
-                "point": [1, 1 + side * 0.25, 1],
-                "size": [1, 0.1, 1],
-                "velocity": [0, side * 0.2, 0],
-                **REST,
-            }
-            for side in (1, -1)
-        ],
+        "particle_filling": _filled(100, 100, 0.2, smooth=True, visualize=True),
+        "boundary_conditions": [_pulled([1, 1 + side * 0.25, 1], [1, 0.1, 1], [0, side * 0.2, 0]) for side in (1, -1)],
     },
     "vasedeck": {
         "material": "jelly",
@@ -194,25 +169,10 @@ PUBLISHED = {
         "default_camera_index": 0,
         "boundary_conditions": [
             *(
-                {
-                    "type": "enforce_particle_velocity_rotation",
-                    "point": [1, 0.7, 1],
-                    "normal": [0, 1, 0],
-                    "half_height_and_radius": [0.2, 0.1],
-                    "rotation_scale": scale,
-                    "translation_scale": 0.0,
-                    "start_time": round(0.3 * phase, 1),
-                    "end_time": round(0.3 * (phase + 1), 1),
-                }
-                for phase, scale in enumerate((1.9, 0.0, -1.9, 0.0))
+                _turning([1, 0.7, 1], [0, 1, 0], [0.2, 0.1], scale, start_time=start, end_time=end)
+                for scale, start, end in ((1.9, 0.0, 0.3), (0.0, 0.3, 0.6), (-1.9, 0.6, 0.9), (0.0, 0.9, 1.2))
             ),
-            {
-                "type": "enforce_particle_translation",
-                "point": [1, 1.44, 1],
-                "size": [1, 0.1, 1],
-                "velocity": STILL,
-                **REST,
-            },
+            _pulled([1, 1.44, 1], [1, 0.1, 1]),
         ],
     },
     "pillow2sofa": {
@@ -226,17 +186,12 @@ PUBLISHED = {
         "frame_num": 300,
         "g": [0, 0, -5],
         "sim_area": [-1, 1, -1, 1, -1, 1],
-        "particle_filling": {
-            "n_grid": 128,
-            "density_threshold": 40,
-            "search_threshold": 0.5,
-            "max_partciels_per_cell": 4,
-        },
+        "particle_filling": _filled(128, 40, 0.5, max_partciels_per_cell=4),
         "boundary_conditions": [
             {"type": "bounding_box"},
-            {"type": "cuboid", "point": [1, 1, 0.5], "size": [1, 1, 0.05], "velocity": STILL, "reset": 1, **REST},
-            {"type": "cuboid", "point": [1, 1, 1.2], "size": [1, 1, 0.1], "velocity": STILL, "end_time": 0.5},
-            {"type": "cuboid", "point": [1, 1, 1.4], "size": [1, 1, 0.1], "velocity": STILL, "end_time": 1.0},
+            _box("cuboid", [1, 1, 0.5], [1, 1, 0.05], reset=1),
+            _box("cuboid", [1, 1, 1.2], [1, 1, 0.1], end_time=0.5),
+            _box("cuboid", [1, 1, 1.4], [1, 1, 0.1], end_time=1.0),
         ],
     },
 }
@@ -268,6 +223,13 @@ def _bar(per_side=(9, 7, 15), spacing=0.06):
     """A bar of particles, (N, 3), its longest side along z, far from the origin."""
     axes = [torch.arange(n, dtype=torch.float64) * spacing for n in per_side]
     return torch.stack(torch.meshgrid(*axes, indexing="ij"), -1).reshape(-1, 3) + torch.tensor([3.0, -2.0, 1.0])
+
+
+def _of_bar(config, tmp_path, *arguments, points=None):
+    """The simulation of a converted configuration on a splat, the bar if no points are given."""
+    write_ply(tmp_path / "bar.ply", plain_cloud(_bar() if points is None else points))
+    settings = _settings(BASE | config, "--scene.ply", str(tmp_path / "bar.ply"), *arguments, tmp_path=tmp_path)
+    return Simulation.from_settings(PARSER, settings)
 
 
 def _normalised(points, rotation, scale):
@@ -408,8 +370,7 @@ def test_boxes_mean_the_particles_that_physgaussian_selects(degrees, axes, tmp_p
     area = [-0.9, 1.1, -0.6, 0.8, -1.0, 0.7]
     inside = ((turned > torch.tensor(area[0::2])) & (turned < torch.tensor(area[1::2]))).all(-1)
     place = _normalised(points[inside], rotation, 1.0)
-    write_ply(tmp_path / "cube.ply", plain_cloud(points))
-    config = BASE | {
+    config = {
         "rotation_degree": degrees,
         "rotation_axis": axes,
         "sim_area": area,
@@ -418,26 +379,11 @@ def test_boxes_mean_the_particles_that_physgaussian_selects(degrees, axes, tmp_p
             {"point": [1, 1, 1.3], "size": [1, 0.2, 0.3], "E": 3e5, "nu": 0.2, "density": 33.0}
         ],
         "boundary_conditions": [
-            {
-                "type": "enforce_particle_translation",
-                "point": [0.7, 1, 1],
-                "size": [0.1, 1, 0.2],
-                "velocity": STILL,
-                **REST,
-            },
-            {
-                "type": "enforce_particle_velocity_rotation",
-                "point": [1.3, 1.1, 0.9],
-                "normal": [0, 2, 0],
-                "half_height_and_radius": [0.15, 0.25],
-                "rotation_scale": 1.0,
-                "translation_scale": 0.0,
-                **REST,
-            },
+            _pulled([0.7, 1, 1], [0.1, 1, 0.2]),
+            _turning([1.3, 1.1, 0.9], [0, 2, 0], [0.15, 0.25], 1.0),
         ],
     }
-    arguments = ["--scene.ply", str(tmp_path / "cube.ply")]
-    simulation = Simulation.from_settings(PARSER, _settings(config, *arguments, tmp_path=tmp_path))
+    simulation = _of_bar(config, tmp_path, points=points)
     scene, solver = simulation.scene, simulation.solver
     assert torch.equal(scene.simulated, inside.nonzero()[:, 0])
     soft = ((place - torch.tensor([1, 1, 1.3])).abs() < torch.tensor([1, 0.2, 0.3])).all(-1)
@@ -458,27 +404,16 @@ def test_boxes_mean_the_particles_that_physgaussian_selects(degrees, axes, tmp_p
 def test_gravity_and_the_turn_point_where_physgaussian_has_them(degrees, axes, tmp_path):
     """A free body falls along the g of the normalised space, whatever the scene's axes; a handle turns as there."""
     rotation = rotation_matrix(degrees, axes)
-    write_ply(tmp_path / "bar.ply", plain_cloud(_bar((4, 4, 6), 0.2)))
     gravity, center, normal = torch.tensor([1.0, -2.0, 3.0]).double(), [1.0, 1.1, 0.9], [0.6, 0.0, 0.8]
-    turning = {
-        "type": "enforce_particle_velocity_rotation",
-        "point": center,
-        "normal": normal,
-        "half_height_and_radius": [9.0, 9.0],
-        "rotation_scale": 1.5,
-        "translation_scale": 0.25,
-        **REST,
-    }
     config = {"g": gravity.tolist(), "rotation_degree": degrees, "rotation_axis": axes, "n_grid": 12, "E": 1e3}
-    arguments = ["--scene.ply", str(tmp_path / "bar.ply"), "--frame_dt", "0.01"]
-    arguments += ["--dtype", "float64", "--camera", "OrbitCamera"]
-    simulation = Simulation.from_settings(PARSER, _settings(config, *arguments, tmp_path=tmp_path))
+    arguments, bar = ["--frame_dt", "0.01", "--dtype", "float64", "--camera", "OrbitCamera"], _bar((4, 4, 6), 0.2)
+    simulation = _of_bar(config, tmp_path, *arguments, points=bar)
     state, _ = simulation.advance(simulation.start())
     unit = simulation.scene.frame.metres_per_unit
     velocity = simulation.scene.frame.direction_to_scene(state.velocity).mean(0)
     torch.testing.assert_close(velocity, rotation.T @ gravity * 0.01, rtol=1e-9, atol=1e-12)
-    config |= {"g": STILL, "boundary_conditions": [turning]}
-    simulation = Simulation.from_settings(PARSER, _settings(config, *arguments, tmp_path=tmp_path))
+    config |= {"g": STILL, "boundary_conditions": [_turning(center, normal, [9.0, 9.0], 1.5, 0.25)]}
+    simulation = _of_bar(config, tmp_path, *arguments, points=bar)
     start = simulation.start()
     state = simulation.solver.rollout(simulation.solver.fit_grid(start, 1e-3), 1e-7, 2)
     moved = simulation.scene.frame.direction_to_scene(state.velocity) @ rotation.T
@@ -502,51 +437,30 @@ def _turned(place, center, normal, rotation_scale, translation_scale):
     return rotation_scale * distance[:, None] * along + translation_scale * normal
 
 
-def test_a_pin_that_holds_nothing_says_where_the_particles_are_in_its_own_units(tmp_path):
-    write_ply(tmp_path / "bar.ply", plain_cloud(_bar()))
-    pin = {
-        "type": "enforce_particle_translation",
-        "point": [3, 3, 3],
-        "size": [0.1, 0.1, 0.1],
-        "velocity": STILL,
-        **REST,
-    }
-    config = BASE | {"rotation_degree": [135.0], "rotation_axis": [0], "boundary_conditions": [pin]}
-    settings = _settings(config, "--scene.ply", str(tmp_path / "bar.ply"), tmp_path=tmp_path)
-    simulation = Simulation.from_settings(PARSER, settings)
-    place = _normalised(_bar(), rotation_matrix([135.0], [0]), 1.0)
-    low, high = (corner.tolist() for corner in (place.amin(0), place.amax(0)))
-    with pytest.raises(ValueError, match="holds no particle") as caught:
-        simulation.start()
-    found = [float(v) for v in re.findall(r"-?\d+\.\d+", str(caught.value).split("lie between")[1])]
-    assert found == pytest.approx([*low, *high], abs=1e-4)
-
-
-def test_a_region_that_selects_nothing_says_where_the_splat_is_in_its_own_axes(tmp_path):
-    write_ply(tmp_path / "bar.ply", plain_cloud(_bar()))
-    turned = _bar() @ rotation_matrix([135.0], [0]).T
-    low, high = (corner.tolist() for corner in (turned.amin(0), turned.amax(0)))
-    config = BASE | {"rotation_degree": [135.0], "rotation_axis": [0], "sim_area": [90, 91, 90, 91, 90, 91]}
-    settings = _settings(config, "--scene.ply", str(tmp_path / "bar.ply"), tmp_path=tmp_path)
-    with pytest.raises(ValueError, match=r"No Gaussian is selected.*in the axes of the region, 0 are in Box") as caught:
-        Simulation.from_settings(PARSER, settings)
-    found = [float(v) for v in re.findall(r"-?\d+\.\d+", str(caught.value).split("between")[1].split(" in ")[0])]
-    assert found == pytest.approx([*low, *high], abs=1e-4)
-    far = {"E": 1e5, "nu": 0.3, "density": 100, "point": [9, 9, 9], "size": [0.1, 0.1, 0.1]}
-    config = BASE | {"rotation_degree": [135.0], "rotation_axis": [0], "additional_material_params": [far]}
-    settings = _settings(config, "--scene.ply", str(tmp_path / "bar.ply"), tmp_path=tmp_path)
-    with pytest.raises(ValueError, match="regions` holds no simulated Gaussian: they lie between") as caught:
-        Simulation.from_settings(PARSER, settings)
-    place = _normalised(_bar(), rotation_matrix([135.0], [0]), 1.0)
-    found = [float(v) for v in re.findall(r"-?\d+\.\d+", str(caught.value).split("between")[1])]
-    assert found == pytest.approx([*place.amin(0).tolist(), *place.amax(0).tolist()], abs=1e-4)
+def test_what_holds_nothing_says_where_the_splat_is_in_its_own_axes(tmp_path):
+    """The region of the scene in the turned axes, a material and a pin in the normalised space."""
+    rotation = rotation_matrix([135.0], [0])
+    far = {"point": [9, 9, 9], "size": [0.1, 0.1, 0.1]}
+    place = _normalised(_bar(), rotation, 1.0)
+    for config, points, told in (
+        (
+            {"sim_area": [90, 91, 90, 91, 90, 91]},
+            _bar() @ rotation.T,
+            r"No .* between (?=.* in the axes of the region)",
+        ),
+        ({"additional_material_params": [far | {"E": 1e5, "nu": 0.3}]}, place, "regions` holds no .* lie between "),
+        ({"boundary_conditions": [_pulled(**far)]}, place, "holds no particle.* lie between "),
+    ):
+        with pytest.raises(ValueError, match=told) as caught:
+            _of_bar(config | {"rotation_degree": [135.0], "rotation_axis": [0]}, tmp_path).start()
+        found = re.findall(r"-?\d+\.\d+", re.split(told, str(caught.value))[1])[:6]
+        corners = [*points.amin(0).tolist(), *points.amax(0).tolist()]
+        assert [float(number) for number in found] == pytest.approx(corners, abs=1e-4)
 
 
 def test_normalisation_sets_the_scale_alone(tmp_path):
-    write_ply(tmp_path / "bar.ply", plain_cloud(_bar()))
-    settings = _settings(BASE, "--scene.ply", str(tmp_path / "bar.ply"), "--scene.longest_side", "2", tmp_path=tmp_path)
     with pytest.raises(ValueError, match="`normalisation` sets the scale"):
-        Simulation.from_settings(PARSER, settings)
+        _of_bar({}, tmp_path, "--scene.longest_side", "2")
     with pytest.raises(ValueError, match="no extent"):
         Normalisation().fit(torch.ones(2, 3))
     with pytest.raises(ValueError, match=r"`normalisation.scale`"):
@@ -557,8 +471,7 @@ def test_normalisation_sets_the_scale_alone(tmp_path):
 
 
 def test_a_moving_cuboid_travels_and_its_reset_keeps_everything_at_rest(tmp_path):
-    condition = {"type": "cuboid", "point": [1, 1, 1], "size": [0.1, 0.2, 0.3], "velocity": [0, 0.5, 0]}
-    condition |= {"start_time": 0.2, "end_time": 0.4, "reset": 1}
+    condition = _box("cuboid", [1, 1, 1], [0.1, 0.2, 0.3], [0, 0.5, 0], start_time=0.2, end_time=0.4, reset=1)
     drive, before, after = _one(condition, tmp_path, substep_dt=1e-3)
     assert (drive.travels, drive.velocity.tolist()) == (True, [0, 0.5, 0])
     assert (drive.start, drive.end) == (0.2, 0.4)
@@ -628,8 +541,7 @@ def test_the_front_follows_physgaussians_layers(first, last, tmp_path):
 
 
 def test_a_pull_becomes_a_handle(tmp_path):
-    pull = {"type": "enforce_particle_translation", "point": [1, 1.25, 1], "size": [1, 0.1, 1], "velocity": [0, 0.2, 0]}
-    (handle,) = _one(pull | {"start_time": 0.0, "end_time": 2.2}, tmp_path)
+    (handle,) = _one(_pulled([1, 1.25, 1], [1, 0.1, 1], [0, 0.2, 0], end_time=2.2), tmp_path)
     assert isinstance(handle, Handle)
     assert isinstance(handle.region, Box)
     assert handle.velocity.tolist() == [0, 0.2, 0]
