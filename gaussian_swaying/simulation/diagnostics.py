@@ -162,33 +162,6 @@ def check_spacing(solver: Solver) -> None:
         )
 
 
-def diagnose(
-    solver: Solver,
-    state: State,
-    substeps: int,
-    cfl: Tensor | float,
-    tearing: TearingGauge | None = None,
-    check: bool = False,
-    before: State | None = None,
-) -> FrameDiagnostics:
-    """Measure the health of a state (one GPU synchronisation).
-
-    Args:
-        solver: The solver that made the state.
-        state: The state at the end of the frame, of one scene or of a batch of shape (B,).
-        substeps: Substeps of the frame.
-        cfl: Largest Courant number of the frame.
-        tearing: Counts torn particles; none are counted without it.
-        check: Also run :func:`check_state`, within the same synchronisation.
-        before: The state at the start of the frame, for the work of the wind and the forces on supports; they are zero
-            without it.
-
-    Returns:
-        The measurements.
-    """
-    return measure(solver, state, substeps, cfl, tearing, before).read(check)
-
-
 class Measurement:
     """Results of :func:`measure` on the device, which the host has not waited for yet."""
 
@@ -225,7 +198,11 @@ class Measurement:
         return self._wait()["more"]
 
     def read(self, check: bool = False) -> FrameDiagnostics:
-        """Wait for the measurements (one GPU synchronisation); see :func:`diagnose`."""
+        """Wait for the measurements (one GPU synchronisation), of a batch as one.
+
+        Args:
+            check: Raise SimulationDiverged if a particle is NaN, infinite, outside the grid or extremely far away.
+        """
         found = self._wait()
         if check:
             _raise_if_bad(self._solver, found["verdict"], found["time"][0])
@@ -279,10 +256,19 @@ def measure(
     more: Tensor | None = None,
     lift: AirLift | None = None,
 ) -> Measurement:
-    """Start the measurements of :func:`diagnose`, with the same arguments, without waiting for the device.
+    """Measure the health of a state, without waiting for the device.
 
-    ``more`` are further numbers to read with them, float64, shape (n,). ``lift`` is the force that takes off the weight
-    of carried air: its potential energy is part of that of gravity, and its work none of the wind's.
+    Args:
+        solver: The solver that made the state.
+        state: The state at the end of the frame, of one scene or of a batch of shape (B,).
+        substeps: Substeps of the frame.
+        cfl: Largest Courant number of the frame.
+        tearing: Counts torn particles; none are counted without it.
+        before: The state at the start of the frame, for the work of the wind and the forces on supports; they are zero
+            without it.
+        more: Further numbers to read with them, float64, shape (n,).
+        lift: The force that takes off the weight of carried air: its potential energy is part of that of gravity, and
+            its work none of the wind's.
     """
     start = state if before is None else before
     moved = torch.linalg.vector_norm(state.position - solver.points.position, dim=-1)
@@ -393,18 +379,6 @@ def _outran(before: State, after: State) -> Tensor:
     """Return 1 if a particle with a finite position left the grid between two states, else 0; float64, shape (1,)."""
     new = after.lost & ~before.lost & torch.isfinite(after.position).all(-1)
     return in_double(new.any()).reshape(1)
-
-
-def check_state(solver: Solver, state: State) -> None:
-    """Raise SimulationDiverged if a particle is NaN, infinite, outside the grid or extremely far away.
-
-    Args:
-        solver: The solver that made the state.
-        state: The state to check (one GPU synchronisation).
-    """
-    moved = torch.linalg.vector_norm(state.position - solver.points.position, dim=-1)
-    time, *verdict = torch.cat([state.time[None], _verdict(solver, state, moved)]).tolist()
-    _raise_if_bad(solver, verdict, time)
 
 
 FARTHEST = 1000  # a run ends when a particle is so many sizes of the object away from where it started

@@ -32,7 +32,7 @@ def extremes(log: Sequence[Mapping[str, Any]], where: Tensor, size: float, elast
         ("compressed", "stretch_min", "compressed_particle", -1),
         ("stretched", "stretch_max", "stretched_particle", 1),
     ):
-        told = [entry for entry in log if entry.get(particle) is not None and entry[particle] < len(where)]
+        told = [entry for entry in log if entry[particle] < len(where)]
         if elastic is not None and name != "moved":
             told = [entry for entry in told if bool(elastic.reshape(-1)[entry[particle]])]
         if not told:

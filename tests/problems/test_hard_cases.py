@@ -37,7 +37,7 @@ from gaussian_swaying.mpm.boundaries.plane import Plane
 from gaussian_swaying.mpm.boundaries.velocity_box import VelocityBox
 from gaussian_swaying.mpm.laws import LAWS as KINDS
 from gaussian_swaying.scenes.procedural import FlagScene, GivenScene
-from gaussian_swaying.simulation.diagnostics import check_state, diagnose
+from gaussian_swaying.simulation.diagnostics import measure
 
 FORMULATIONS = ["total", "updated"]
 UP = (0.0, 0.0, -9.8)
@@ -156,7 +156,7 @@ def _advance(simulation, frames, state=None):
     """The state after some frames and the health of all, the first one included; whatever diverges is raised."""
     state = simulation.start() if state is None else state
     log = _Log()
-    _add(log, simulation, state, diagnose(simulation.solver, state, 0, 0.0))
+    _add(log, simulation, state, measure(simulation.solver, state, 0, 0.0).read())
     for _ in range(frames):
         state, health = simulation.advance(state)
         _add(log, simulation, state, health)
@@ -633,7 +633,7 @@ def test_many_steps_of_nothing(formulation, steps):
     state = solver.init_state(points)
     dt = 0.5 * solver.stable_substep()
     state = solver.rollout(state, dt, steps)
-    check_state(solver, state)
+    measure(solver, state, 0, 0.0).read(check=True)
     assert float((state.position - points.position).abs().max()) < 1e-10 * steps
     assert float(solver.energies(state)["kinetic"]) < 1e-12
 
@@ -724,7 +724,7 @@ def test_the_solver_alone_ten_kilometres_away(formulation, dtype):
         return
     state = solver.init_state(points, velocity)
     state = solver.rollout(solver.fit_grid(state, 0.1), 2e-4, 500)
-    check_state(solver, state)
+    measure(solver, state, 0, 0.0).read(check=True)
     moved = (state.position - points.position).double().mean(0)
     rounding = 2**-10 if dtype == torch.float32 else 1e-9
     assert_close(moved, torch.tensor([0.1, 0.0, 0.0], dtype=torch.float64), rtol=0, atol=rounding)
@@ -749,7 +749,7 @@ def _long_flag(damping):
     )
     state, visible = simulation.start(), []
     scene = simulation.scene
-    log = [diagnose(solver, state, 0, 0.0)]
+    log = [measure(solver, state, 0, 0.0).read()]
     for _ in range(round(minutes * 60 / frame_dt)):
         state, health = simulation.advance(state)
         log.append(health)

@@ -30,7 +30,7 @@ def test_the_worst_of_all_frames_with_place_and_time():
     # particles that flow are not asked for their stretch
     flowing = extremes(log, WHERE, 2.0, torch.tensor([True, True, False]))
     assert flowing["compressed"]["value"] == 0.9
-    nothing = extremes([{"time": 0.0, "stretch_min": 0.1}], WHERE, 2.0, None)  # of an earlier version
+    nothing = extremes([], WHERE, 2.0, None)
     assert set(nothing.values()) == {None}
     assert advice(nothing, 1e5) == []
 

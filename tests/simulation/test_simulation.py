@@ -22,7 +22,7 @@ from gaussian_swaying.rendering.gsplat_renderer import GsplatRenderer, make_rend
 from gaussian_swaying.rendering.shading import DiffuseShader, PhongShader
 from gaussian_swaying.rendering.torch_renderer import render_torch
 from gaussian_swaying.scenes.procedural import FlagScene
-from gaussian_swaying.simulation.diagnostics import SimulationDiverged, diagnose
+from gaussian_swaying.simulation.diagnostics import SimulationDiverged, measure
 from gaussian_swaying.simulation.edits import Edit
 from gaussian_swaying.simulation.material import Material
 from gaussian_swaying.simulation.scene import Scene
@@ -162,7 +162,7 @@ def test_the_work_of_the_wind_is_what_the_energy_gains(make_simulation):
     """Kinetic, elastic and gravitational energy of a flag that no pin holds, against the work, over 5 frames."""
     simulation = make_simulation(pinned=False, dtype=torch.float64, cfl=0.1)
     _, log = _advance(simulation, 5)
-    start = diagnose(simulation.solver, simulation.start(), 0, 0.0)
+    start = measure(simulation.solver, simulation.start(), 0, 0.0).read()
     gained = sum(getattr(log[-1], n) - getattr(start, n) for n in ("kinetic", "elastic", "potential"))
     work = sum(health.wind_work for health in log)
     assert work > 0.01

@@ -17,7 +17,7 @@ from gaussian_swaying.mpm.boundaries.plane import Plane
 from gaussian_swaying.mpm.boundaries.velocity_box import VelocityBox
 from gaussian_swaying.mpm.state import GridSpec
 from gaussian_swaying.mpm.triton import fused, fused_total, fused_updated
-from gaussian_swaying.simulation.diagnostics import check_state
+from gaussian_swaying.simulation.diagnostics import measure
 
 from .bodies import (
     DT,
@@ -414,7 +414,7 @@ def test_a_broken_particle_is_reported_and_breaks_nothing_else(kernel_device, tr
     with pytest.raises((FloatingPointError, ValueError), match=r"NaN or infinite|left the grid"):
         solver.rollout(start.replace(**{name: broken}), DT, steps)
     with pytest.raises(SimulationDiverged, match=r"particle .* (NaN or infinite|left the grid|object sizes)") as found:
-        check_state(solver, end)
+        measure(solver, end, 0, 0.0).read(check=True)
     if name == "position":  # it has affected no other particle
         assert found.value.particle == 5
         assert end.lost.tolist() == [k == 5 for k in range(24)]
