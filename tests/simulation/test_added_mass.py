@@ -5,6 +5,7 @@ from dataclasses import replace
 
 import pytest
 import torch
+from shared import advanced
 
 from gaussian_swaying.aero.added_mass import AirLift
 from gaussian_swaying.aero.force import AeroForce, added_mass_per_area
@@ -24,17 +25,6 @@ def air(breadth=BREADTH, drag=0.0, **settings):
     return AeroForce(drag, drag, C_L=0.0, added_mass=breadth, **settings)
 
 
-def run(simulation, frames, state=None):
-    """The states and the diagnostics of some frames."""
-    state = simulation.start() if state is None else state
-    states, log = [state], []
-    for _ in range(frames):
-        state, health = simulation.advance(state)
-        states.append(state)
-        log.append(health)
-    return states, log
-
-
 @pytest.fixture
 def hanging(make_simulation):
     """A sheet that hangs from its upper edge; gravity is slanted, so that it starts to swing."""
@@ -52,7 +42,7 @@ def test_still_air_slows_a_hanging_sheet(formulation, hanging):
     """All forces are the same, so the motion is that without air, in slower time: by sqrt(sigma / (sigma + m))."""
     without = hanging(air(0.0), formulation=formulation)
     carrying = hanging(air(), formulation=formulation, frame_dt=0.04 / SLOWER)
-    slow, fast = (run(simulation, 15)[0][-1].position for simulation in (carrying, without))
+    slow, fast = (advanced(simulation, 15)[0].position for simulation in (carrying, without))
     assert float((fast - without.setup.points.position).abs().amax()) > 0.02
     torch.testing.assert_close(slow, fast, rtol=0, atol=1e-9)
 
@@ -61,8 +51,8 @@ def test_its_frequency_is_that_of_the_plate_with_its_air(hanging):
     """From the time of the first turn of the swing, with the same frames; 2 %."""
 
     def turn(aero):
-        states, _ = run(hanging(aero, frame_dt=0.02), 90)
-        swing = torch.stack([state.position[:, 1].mean() for state in states])
+        frames = hanging(aero, frame_dt=0.02).frames(91)
+        swing = torch.stack([frame.state.position[:, 1].mean() for frame in frames])
         k = int((swing[1:-1] > torch.maximum(swing[:-2], swing[2:])).nonzero()[0]) + 1
         before, at, after = swing[k - 1 : k + 2].tolist()
         return 0.02 * (k + 0.5 * (before - after) / (before - 2 * at + after))
@@ -77,8 +67,8 @@ def test_a_sheet_falls_slower_as_it_has_to_move_air(formulation, transfer, make_
     simulation = make_simulation(
         aero=air(), material=STIFF, wind=WindField(), pinned=False, formulation=formulation, transfer=transfer
     )
-    states, _ = run(simulation, 5)
-    speed = -float(states[-1].velocity[:, 2].mean())
+    state, _ = advanced(simulation, 5)
+    speed = -float(state.velocity[:, 2].mean())
     assert speed == pytest.approx(9.8 * SLOWER**2 * 0.2, rel=1e-4)
     assert simulation.stepper.idle  # no wind, but air
 
@@ -89,7 +79,7 @@ def test_energy_is_kept_in_still_air_without_drag(hanging):
     logs = []
     for simulation in (without, carrying):
         first = simulation.stepper.at_first(simulation.start()).read()
-        logs.append([first, *run(simulation, 25)[1]])
+        logs.append([first, *advanced(simulation, 25)[1]])
     mass, position = without.setup.points.mass, without.setup.points.position
     weight = mass[:, None] * torch.tensor([0.0, 0.5, -9.8], dtype=torch.float64)
     assert logs[1][0].potential == pytest.approx(-float((weight * position).sum()))
@@ -104,7 +94,7 @@ def test_the_air_that_is_lifted_is_no_work_of_the_wind(hanging):
     """To first order in the substep, as forces act between the times of the positions; the sum does not grow."""
     worst = []
     for cfl in (0.1, 0.05):
-        _, log = run(hanging(air(), cfl=cfl), 25)
+        _, log = advanced(hanging(air(), cfl=cfl), 25)
         worst.append(max(abs(sum(health.wind_work for health in log[:k])) for k in range(1, 26)))
         assert worst[-1] < 0.1 * max(health.kinetic for health in log)
     assert worst[1] < 0.6 * worst[0]
@@ -117,8 +107,8 @@ def test_kernels_and_torch_agree(formulation, hanging):
     for transfer in ("torch", "kernels"):
         wind = WindField([1.0, 5.0, 0.0])
         simulation = hanging(air(drag=0.5), wind=wind, transfer=transfer, formulation=formulation)
-        states, log = run(simulation, 5)
-        ends.append((states[-1].position, log[-1]))
+        state, log = advanced(simulation, 5)
+        ends.append((state.position, log[-1]))
     torch.testing.assert_close(ends[0][0], ends[1][0], rtol=0, atol=1e-10)
     for name in ("kinetic", "potential", "wind_work"):
         assert getattr(ends[0][1], name) == pytest.approx(getattr(ends[1][1], name), rel=1e-7)
@@ -132,9 +122,9 @@ def test_a_batch_is_as_each_alone(hanging):
     state = batch.start()
     for _ in range(3):
         state, health = batch.advance(state)
-    assert health.potential == pytest.approx(sum(run(one, 3)[1][-1].potential for one in (first, other)))
+    assert health.potential == pytest.approx(sum(advanced(one, 3)[1][-1].potential for one in (first, other)))
     for k, one in enumerate((first, other)):
-        torch.testing.assert_close(state.scene(k).position, run(one, 3)[0][-1].position, rtol=0, atol=1e-10)
+        torch.testing.assert_close(state.scene(k).position, advanced(one, 3)[0].position, rtol=0, atol=1e-10)
 
 
 def test_a_changed_breadth_binds_again_and_another_coefficient_does_not(hanging):
@@ -208,10 +198,10 @@ def test_a_gpu_does_the_same_with_recorded_frames(formulation, hanging):
     for device in ("cpu", "cuda"):
         settings = {"formulation": formulation, "dtype": torch.float32, "wind": WindField([1.0, 5.0, 0.0])}
         simulation = hanging(air(drag=0.5), **settings).to(device)
-        states, log = run(simulation, 3)
-        state = simulation.change(states[-1], {"aero.added_mass": 0.3})
-        states, more = run(simulation, 4, state)
-        found.append((states[-1].position.cpu(), [*log, *more]))
+        state, log = advanced(simulation, 3)
+        state = simulation.change(state, {"aero.added_mass": 0.3})
+        state, more = advanced(simulation, 4, state)
+        found.append((state.position.cpu(), [*log, *more]))
     torch.testing.assert_close(found[0][0], found[1][0], rtol=0, atol=1e-4)
     largest = max(health.kinetic for health in found[0][1])
     for name in ("kinetic", "potential", "wind_work"):

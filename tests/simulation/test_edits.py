@@ -34,13 +34,7 @@ def _with(simulation, *edits):
 
 
 def _frames(simulation, frames):
-    state, states = simulation.start(), []
-    states.append(state)
-    for _ in range(frames):
-        state, _ = simulation.advance(state)
-        state = simulation.editor.edit_due(state)
-        states.append(state)
-    return states
+    return [frame.state for frame in simulation.frames(frames + 1)]
 
 
 # ---- functions

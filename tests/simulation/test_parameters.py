@@ -2,17 +2,18 @@
 
 import json
 import math
+import sys
 
 import pytest
 import torch
 import yaml
+from small_films import base
 
 from gaussian_swaying.fitting.plan import read_plan
 from gaussian_swaying.fitting.report import scene_text
 from gaussian_swaying.fitting.unknowns import Unknown, check_unknowns
 from gaussian_swaying.fitting.variants import states_of
 from gaussian_swaying.geometry.regions import Box
-from gaussian_swaying.mpm.forces import Force
 from gaussian_swaying.mpm.solver import MPMSolver
 from gaussian_swaying.scenes.procedural import FlagScene
 from gaussian_swaying.simulation import parameters
@@ -33,50 +34,12 @@ from gaussian_swaying.sweeps.together import grouped
 from gaussian_swaying.viewer.changes import changed_settings
 from gaussian_swaying.viewer.session import Session
 
-CONFIG = {
-    "frames": 3,
-    "scene": {
-        "generator": {"class_path": "FlagScene", "init_args": {"width": 0.4, "height": 0.3, "spacing": 0.05}},
-        "metres_per_unit": 1.0,
-    },
-    "material": {"E": 1e4, "nu": 0.3, "density": 25.0, "thickness": 0.01},
-    "solver": {
-        "dx": 0.1,
-        "damping": 0.5,
-        "boundaries": [
-            {
-                "class_path": "PinnedRegion",
-                "init_args": {
-                    "kind": None,
-                    "region": {"class_path": "Box", "init_args": {"min": [None] * 3, "max": [0.06, None, None]}},
-                },
-            }
-        ],
-    },
-    "wind": {
-        "flow": [4.0, 3.0, 0.0],
-        "modulations": [
-            {"class_path": "SineSway"},
-            {"class_path": "UniformGust"},
-            {"class_path": "GaussianGust"},
-        ],
-    },
-    "aero": {"C_D": 0.1, "C_F": 0.3, "C_L": 0.005},
-}
+CONFIG = base(frames=3)
+CONFIG["solver"]["damping"] = 0.5
+CONFIG["wind"]["modulations"] = [{"class_path": name} for name in ("SineSway", "UniformGust", "GaussianGust")]
 OTHERS = {"wind.flow": [1.0, 2.0, 0.5], "wind.seed": 7, "solver.gravity": [0.0, 0.0, -1.0], "material.nu": 0.1}
 PLACES = {"amplitude": 0, "period": 0, "phase": 0, "delta": 1, "std": 2, "interval": 1}
 NAMES = [name.replace("*", str(PLACES.get(name.split(".")[-1], 0))) for name in parameters.names()]
-
-
-class Breath(Force):
-    """Lifts every point."""
-
-    def __init__(self, strength: float = 0.1) -> None:
-        super().__init__()
-        self.strength = strength
-
-    def forward(self, state):
-        return self.strength * state.position.new_tensor([0.0, 0.0, 1e-3]).expand_as(state.position)
 
 
 @pytest.fixture
@@ -112,8 +75,6 @@ def breath(tmp_path, monkeypatch):
     path.write_text(yaml.safe_dump(CONFIG | {"forces": [{"class_path": "users_breath.Breath"}]}))
     yield path
     parameters._KNOWN.pop("forces.Breath.strength", None)
-    import sys
-
     sys.modules.pop("users_breath", None)
 
 
@@ -157,6 +118,9 @@ def test_what_is_written_is_read_and_is_that_of_the_configuration(name, config, 
         ("material.stiffness", 1.0, "no parameter"),
         ("wind.modulations.7.period", 1.0, "add the modulation"),
         ("forces.Nothing.strength", 1.0, "no parameter"),
+        ("wind.seed", 1.5, "wind.seed"),
+        ("material.E", "soft", "material.E"),
+        ("material.E", True, "material.E"),
     ],
 )
 def test_what_is_out_of_range_or_not_there_is_refused_and_nothing_changes(name, value, words, config):
@@ -167,12 +131,6 @@ def test_what_is_out_of_range_or_not_there_is_refused_and_nothing_changes(name, 
         simulation.change(state, {"material.density": 30.0, name: value})
     after = simulation.setup
     assert all(getattr(after, part) is getattr(before, part) for part in ("points", "wind", "aero", "solver"))
-
-
-@pytest.mark.parametrize(("name", "value"), [("wind.seed", 1.5), ("material.E", "soft"), ("material.E", True)])
-def test_what_is_no_number_is_refused(name, value):
-    with pytest.raises(TypeError, match=name):
-        parameter(name).check(value)
 
 
 @pytest.mark.parametrize("name", ["material.E", "material.nu"])

@@ -8,6 +8,7 @@ from dataclasses import replace
 
 import pytest
 import torch
+from shared import advanced
 
 from gaussian_swaying.aero.force import AeroForce
 from gaussian_swaying.aero.wind import GaussianGust, SineSway, WindField
@@ -28,15 +29,6 @@ from gaussian_swaying.simulation.material import Material
 from gaussian_swaying.simulation.scene import Scene
 from gaussian_swaying.simulation.simulation import Simulation
 
-
-def _advance(simulation, frames):
-    state, log = simulation.start(), []
-    for _ in range(frames):
-        state, health = simulation.advance(state)
-        log.append(health)
-    return state, log
-
-
 # ---- time
 
 
@@ -47,8 +39,8 @@ def test_the_substep_does_not_depend_on_the_frame(formulation, make_simulation):
     for frame_dt, frames in ((0.04, 4), (0.08, 2), (0.16, 1)):
         wind = WindField([6.0, 1.5, 0.0], modulations=[SineSway(period=0.3), GaussianGust(1.0)])
         settings = {"frame_dt": frame_dt, "formulation": formulation, "substep": 0.004, "dtype": torch.float64}
-        state, log = _advance(make_simulation(wind=wind, **settings), frames)
-        assert sum(health.substeps for health in log) == 40
+        state, log = advanced(make_simulation(wind=wind, **settings), frames)
+        assert [health.substeps for health in log] == [round(frame_dt / 0.004)] * frames
         assert float(state.time) == pytest.approx(0.16)
         ends.append(state.position)
     moved = float((ends[0] - make_simulation(dtype=torch.float64).start().position).abs().max())
@@ -63,7 +55,7 @@ def test_the_adaptive_substep_follows_the_courant_number(make_simulation):
     for frame_dt in (0.04, 0.1):
         for cfl in (0.4, 0.1):
             simulation = make_simulation(wind=WindField(), frame_dt=frame_dt, cfl=cfl, gravity=(0.0, 0.0, 0.0))
-            _, (health,) = _advance(simulation, 1)
+            _, (health,) = advanced(simulation, 1)
             assert health.substeps == math.ceil(frame_dt * speed / (cfl * 0.2))
             assert health.cfl == pytest.approx(frame_dt / health.substeps * speed / 0.2, rel=1e-5)
 
@@ -74,7 +66,7 @@ def test_strong_drag_on_light_patches_shortens_the_substep(make_simulation):
     wind = WindField([30.0, 0.0, 0.0])
     aero = AeroForce(C_D=1.0, C_F=0.0, C_L=0.0)
     simulation = make_simulation(wind=wind, material=light, aero=aero, frame_dt=0.01)
-    _, (health,) = _advance(simulation, 1)
+    _, (health,) = advanced(simulation, 1)
     areal = 1.0 * 1e-3
     assert health.substeps > 0.01 * 1.225 * 1.0 * 30.0 / areal / 2
     assert math.isfinite(health.kinetic)
@@ -86,10 +78,10 @@ def test_aerodynamics_are_asked_only_where_they_can_push(make_simulation, monkey
     monkeypatch.setattr(AeroForce, "forward", lambda self, *a: calls.append(1) or forward(self, *a))
     for aero in (AeroForce(C_D=0.0, C_F=0.0, C_L=0.0), AeroForce(air_density=0.0)):
         assert aero.idle
-        _, (health,) = _advance(make_simulation(aero=aero, transfer="torch"), 1)
+        _, (health,) = advanced(make_simulation(aero=aero, transfer="torch"), 1)
         assert calls == []
         assert health.kinetic > 0
-    _, (health,) = _advance(make_simulation(transfer="torch"), 1)
+    _, (health,) = advanced(make_simulation(transfer="torch"), 1)
     assert len(calls) == health.substeps
 
 
@@ -100,7 +92,7 @@ def test_still_air_resists_a_fall(make_simulation):
     for air in (0.0, 1.225):
         aero = AeroForce(C_D=1.0, C_F=1.0, air_density=air)
         simulation = make_simulation(wind=WindField(), aero=aero, material=light, pinned=False)
-        state, _ = _advance(simulation, 5)
+        state, _ = advanced(simulation, 5)
         speed.append(-float(state.velocity[:, 2].mean()))
     assert speed[0] == pytest.approx(9.8 * 0.2, rel=1e-4)
     assert speed[1] < 0.9 * speed[0]
@@ -122,7 +114,7 @@ def test_a_solver_can_serve_two_simulations(make_simulation):
 def test_a_grid_that_was_outrun_is_enlarged(make_simulation):
     """A strong wind takes an unpinned flag farther in one frame than its speed at the start foretells."""
     simulation = make_simulation(wind=WindField([0.0, 25.0, 0.0]), pinned=False, formulation="updated")
-    state, _ = _advance(simulation, 3)
+    state, _ = advanced(simulation, 3)
     assert not bool(state.lost.any())
     assert float((state.position - simulation.scene.points.position).norm(dim=-1).max()) > 0.1
 
@@ -131,7 +123,7 @@ def test_a_frame_whose_substep_was_too_long_is_done_again(make_simulation, monke
     """The first try ends with a Courant number of 2, so more substeps are taken, from the same start."""
     simulation = make_simulation(wind=WindField())
     state = simulation.start()
-    _, expected = _advance(make_simulation(wind=WindField()), 1)
+    _, expected = advanced(make_simulation(wind=WindField()), 1)
     tries = []
     roll = simulation.stepper.roll
 
@@ -150,18 +142,13 @@ def test_a_frame_whose_substep_was_too_long_is_done_again(make_simulation, monke
     assert float(end.time) == pytest.approx(0.04)
 
 
-def test_a_fixed_substep_is_kept(make_simulation):
-    _, log = _advance(make_simulation(substep=0.004), 3)
-    assert [health.substeps for health in log] == [10, 10, 10]
-
-
 # ---- energy, tearing, light things
 
 
 def test_the_work_of_the_wind_is_what_the_energy_gains(make_simulation):
     """Kinetic, elastic and gravitational energy of a flag that no pin holds, against the work, over 5 frames."""
     simulation = make_simulation(pinned=False, dtype=torch.float64, cfl=0.1)
-    _, log = _advance(simulation, 5)
+    _, log = advanced(simulation, 5)
     start = measure(simulation.solver, simulation.start(), 0, 0.0).read()
     gained = sum(getattr(log[-1], n) - getattr(start, n) for n in ("kinetic", "elastic", "potential"))
     work = sum(health.wind_work for health in log)
@@ -172,12 +159,12 @@ def test_the_work_of_the_wind_is_what_the_energy_gains(make_simulation):
 
 def test_a_sheet_that_tears_is_reported(make_simulation):
     """A soft flag on a grid finer than its particles: `updated` falls apart and says so, `total` cannot."""
-    _, log = _advance(make_simulation(formulation="updated", dx=0.08), 6)
+    _, log = advanced(make_simulation(formulation="updated", dx=0.08), 6)
     assert log[0].torn == 0
     assert log[-1].torn > 5
-    _, log = _advance(make_simulation(formulation="updated", dx=0.2), 6)
+    _, log = advanced(make_simulation(formulation="updated", dx=0.2), 6)
     assert log[-1].torn == 0
-    _, log = _advance(make_simulation(formulation="total", dx=0.08), 6)
+    _, log = advanced(make_simulation(formulation="total", dx=0.08), 6)
     assert log[-1].torn == 0
 
 
@@ -189,7 +176,7 @@ def test_semi_implicit_drag_needs_no_shorter_substep(make_simulation):
     for step in ("explicit", "semi_implicit"):
         aero = AeroForce(C_D=1.2, C_F=0.0, C_L=0.0, law="projected", drag_step=step)
         simulation = make_simulation(wind=storm, aero=aero, material=light, pinned=False, gravity=(0.0, 0.0, 0.0))
-        state, log = _advance(simulation, 2)
+        state, log = advanced(simulation, 2)
         substeps[step] = log[0].substeps
         assert float(state.velocity[:, 1].mean()) == pytest.approx(100.0, rel=0.05)
     assert substeps["explicit"] > 2 * substeps["semi_implicit"]
@@ -203,7 +190,7 @@ def test_a_courant_number_beyond_any_stability_is_a_divergence(make_simulation):
     with pytest.raises(
         SimulationDiverged, match=r"t = 0.04 s, particle \d+: the Courant number .*`solver.cfl`"
     ) as info:
-        _advance(simulation, 1)
+        advanced(simulation, 1)
     assert info.value.particle is not None
 
 
@@ -338,8 +325,6 @@ def test_colours_turn_with_the_object(make_cloud, make_simulation):
 
 
 def test_only_moving_gaussians_are_shaded(make_cloud, make_simulation):
-    from gaussian_swaying.geometry.regions import Box
-
     cloud = make_cloud(degree=0)
     opacities = cloud.opacities.clone()
     opacities[::4] = -4.0  # faint: carried inside the region
@@ -387,7 +372,7 @@ def test_the_first_picture_is_that_of_the_splat(flag_ply, make_simulation):
     assert float(direct.alpha.mean()) > 0.1  # the flag is in the picture
     error = float((picture.color - direct.color).square().mean())
     assert -10 * math.log10(max(error, 1e-12)) >= 35
-    state, _ = _advance(simulation, 3)
+    state, _ = advanced(simulation, 3)
     moved = simulation.painter.render(state, 0)
     assert float((moved.color - direct.color).square().mean()) > 100 * max(error, 1e-12)
 
