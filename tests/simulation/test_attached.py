@@ -4,9 +4,9 @@ import dataclasses
 
 import pytest
 import torch
+from shared import advanced
+from small_scenes import together
 
-from gaussian_swaying.gaussians.cloud import GaussianCloud
-from gaussian_swaying.gaussians.filling import InteriorFilling
 from gaussian_swaying.gaussians.parts import Part, Parts
 from gaussian_swaying.geometry.regions import Box
 from gaussian_swaying.mpm.boundaries.pinned_region import PinnedRegion
@@ -25,9 +25,7 @@ def two_flags(gap=GAP):
     """Two flags one in front of the other, nearer than a cell, and which of them each Gaussian belongs to."""
     flag = FlagScene(spacing=0.03, width=0.9, height=0.6).generate()
     far = dataclasses.replace(flag, means=flag.means + torch.tensor([0.0, gap, 0.0]))
-    fields = {f.name: [getattr(c, f.name) for c in (flag, far)] for f in dataclasses.fields(GaussianCloud)}
-    both = {name: None if values[0] is None else torch.cat(values) for name, values in fields.items()}
-    return GaussianCloud(**both), torch.arange(2).repeat_interleave(len(flag.means))
+    return together(flag, far), torch.arange(2).repeat_interleave(len(flag.means))
 
 
 def simulation(cloud, connected="surface", dx=DX, formulation="total", **scene):
@@ -43,9 +41,7 @@ def simulation(cloud, connected="surface", dx=DX, formulation="total", **scene):
 
 
 def ends(run, frames=4):
-    state = run.start()
-    for _ in range(frames):
-        state, _ = run.advance(state)
+    state, _ = advanced(run, frames)
     return run.scene.deformed(state).means, state
 
 
@@ -122,12 +118,10 @@ def test_what_is_connected_within_each_node_lies_nowhere_apart():
     assert lies_apart(place, 1.0, torch.tensor([[0, 1]]))
 
 
-def test_it_needs_the_total_formulation_and_a_surface():
+def test_it_needs_the_total_formulation():
     cloud, _ = two_flags()
     with pytest.raises(ValueError, match=r"`scene.connected: surface` needs `solver.formulation: total`"):
         simulation(cloud, formulation="updated")
-    with pytest.raises(ValueError, match=r"`scene.connected` grid with `scene.filling`"):
-        Scene(generator=GivenScene(cloud), connected="surface", filling=InteriorFilling())
 
 
 def test_nodes_of_their_own_help_what_lies_close_and_is_held():

@@ -7,6 +7,7 @@ import pytest
 import torch
 from small_scenes import together
 
+from gaussian_swaying.gaussians.model import GaussianSurfaceModel
 from gaussian_swaying.geometry.regions import Box
 from gaussian_swaying.mpm.boundaries.ball import BallObstacle
 from gaussian_swaying.mpm.boundaries.still_gaussians import StillGaussians
@@ -56,8 +57,6 @@ def test_gaussians_that_stand_still_are_an_obstacle():
 def test_the_distance_from_gaussians_is_that_of_the_ball_that_they_cover():
     cloud = ClothScene("ball", 0.6, 0.03).generate()
     ball = cloud.select((cloud.means - torch.tensor([0.0, 0.0, 0.35])).norm(dim=-1) < 0.31)
-    from gaussian_swaying.gaussians.model import GaussianSurfaceModel
-
     model = GaussianSurfaceModel.from_cloud(ball, requires_grad=False)
     corner = torch.tensor([0.5, 0.5, 0.5], dtype=torch.float64)
     centre = torch.tensor([0.0, 0.0, 0.35], dtype=torch.float64)

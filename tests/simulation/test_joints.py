@@ -4,8 +4,9 @@ import dataclasses
 
 import pytest
 import torch
+from shared import advanced
+from small_scenes import together
 
-from gaussian_swaying.gaussians.cloud import GaussianCloud
 from gaussian_swaying.gaussians.parts import Part, Parts
 from gaussian_swaying.mpm.solver import MPMSolver
 from gaussian_swaying.scenes.procedural import FlagScene, GivenScene
@@ -22,9 +23,7 @@ def flags():
     """A beam of cloth that is held, and one that continues it along x; which of them each Gaussian belongs to."""
     flag = FlagScene(spacing=0.04, width=0.6, height=0.2).generate()
     other = dataclasses.replace(flag, means=flag.means + torch.tensor([0.6, 0.0, 0.0]))
-    fields = {f.name: [getattr(c, f.name) for c in (flag, other)] for f in dataclasses.fields(GaussianCloud)}
-    both = {name: None if values[0] is None else torch.cat(values) for name, values in fields.items()}
-    return GaussianCloud(**both), torch.arange(2).repeat_interleave(len(flag.means))
+    return together(flag, other), torch.arange(2).repeat_interleave(len(flag.means))
 
 
 def simulation(connected="surface", **joint):
@@ -41,9 +40,7 @@ def simulation(connected="surface", **joint):
 
 
 def end(run, frames=8):
-    state = run.start()
-    for _ in range(frames):
-        state, _ = run.advance(state)
+    state, _ = advanced(run, frames)
     return run.scene.deformed(state).means - run.scene.rest().means
 
 

@@ -4,6 +4,7 @@ import dataclasses
 
 import pytest
 import torch
+from shared import advanced
 from small_scenes import together
 
 from gaussian_swaying.mpm.solver import MPMSolver
@@ -61,9 +62,7 @@ def test_the_wind_blows_specks_away_unless_they_are_carried(points, make_simulat
     for loose in ("simulate", "carry"):
         simulation = make_simulation(cloud=speckled(), dx=0.1, scene={"points": points, "loose": loose})
         with torch.inference_mode():
-            state = simulation.start()
-            for _ in range(12):
-                state, _ = simulation.advance(state)
+            state, _ = advanced(simulation, 12)
             moved[loose] = (simulation.scene.deformed(state).means - simulation.scene.rest().means).norm(dim=-1)
     flag, specks = moved["simulate"][:FLAG], moved["simulate"][FLAG:]
     assert float(specks.min()) > 2 * float(flag.max())

@@ -72,11 +72,6 @@ def test_filled_solid_takes_its_mass_from_its_volume(capture):
     assert float(found[0].patches.area.sum()) < float(found[1].patches.area.sum())
 
 
-def test_open_area_with_wind_on_all_is_refused(capture):
-    with pytest.raises(ValueError, match=r"Expected `scene\.wind_on` surface with `scene\.area`"):
-        Scene(ply=capture, area="open", wind_on="all")
-
-
 def test_summary_has_area_and_hull(tmp_path, capture):
     simulation = Simulation(Scene(ply=capture, metres_per_unit=0.5))
     summary = simulation.run(tmp_path, 1, progress=False)

@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 import torch
-from shared import refused
+from shared import SMALL, refused, words
 
 from gaussian_swaying.cli.simulate import main
 from gaussian_swaying.mpm.solver import MPMSolver
@@ -16,9 +16,7 @@ from gaussian_swaying.simulation.progress import RunProgress
 from gaussian_swaying.simulation.run import MAX_LOOKS
 
 FLAG = Path(__file__).parents[2] / "configs/sim/flag.yaml"
-SMALL = ["--config", str(FLAG), "--device", "cpu", "--scene.generator.init_args.spacing", "0.1", "--material.E", "9e3"]
-SMALL += ["--solver.dx", "0.2", "--camera.init_args.width", "32", "--camera.init_args.height", "18"]
-SMALL += ["--solver.boundaries", "[]", "--frames", "3"]
+RUN = [f"--config={FLAG}", "--device=cpu", *words(SMALL | {"solver.boundaries": [], "material.E": 9e3, "frames": 3})]
 
 
 @pytest.fixture
@@ -123,12 +121,12 @@ def test_watching_changes_no_bit(formulation, looks):
 )
 def test_what_has_no_end_or_place_is_refused(arguments, words, tmp_path, capsys):
     """Substeps without end, pictures and scenes for which there is no memory, colours beyond white."""
-    refused(main, [*SMALL, *arguments, "--output", str(tmp_path / "run")], capsys, *words, folder=tmp_path)
+    refused(main, [*RUN, *arguments, "--output", str(tmp_path / "run")], capsys, *words, folder=tmp_path)
 
 
 def test_a_frame_that_gets_too_many_substeps_ends_the_run(tmp_path, capsys, monkeypatch):
     monkeypatch.setattr(stepper, "MAX_SUBSTEPS", 20)
-    assert main([*SMALL, "--wind.flow", "[300, 0, 0]", "--output", str(tmp_path / "run")]) == 2
+    assert main([*RUN, "--wind.flow", "[300, 0, 0]", "--output", str(tmp_path / "run")]) == 2
     said = capsys.readouterr().err
     assert "substeps, more than the limit of 20" in said
     assert (tmp_path / "run/frames/00000.png").exists()
@@ -143,9 +141,9 @@ def test_the_cameras_of_as_many_frames_as_there_may_be(tmp_path, monkeypatch):
         raise KeyboardInterrupt
 
     monkeypatch.setattr(stepper.Stepper, "start", stop)
-    assert main([*SMALL, "--frames", "10000000", "--output", str(tmp_path / "run")]) == 130
+    assert main([*RUN, "--frames", "10000000", "--output", str(tmp_path / "run")]) == 130
     assert len(seen) == MAX_LOOKS
     assert (seen[0], seen[-1]) == (0, 9_999_999)
     seen.clear()
-    assert main([*SMALL, "--frames", "7", "--output", str(tmp_path / "run")]) == 130
+    assert main([*RUN, "--frames", "7", "--output", str(tmp_path / "run")]) == 130
     assert seen == list(range(7))

@@ -7,6 +7,8 @@ import torch
 
 from gaussian_swaying.aero.force import AeroForce
 from gaussian_swaying.aero.wind import WindField
+from gaussian_swaying.gaussians.ply import read_ply
+from gaussian_swaying.geometry.regions import Box
 from gaussian_swaying.recording.layout import video_file
 from gaussian_swaying.recording.recorder import Recorder
 from gaussian_swaying.rendering.cameras.camera_path import LookAtCamera, OrbitCamera
@@ -38,13 +40,8 @@ def test_files_of_a_run_with_two_cameras_and_all_renders(make_simulation, tmp_pa
         assert raw.shape == size
         assert raw.dtype == np.uint16
     assert summary["force_scale_Pa"] == pytest.approx(0.5 * 1.225 * (6.0**2 + 1.5**2) * 0.91)
-    assert {path.name for path in simulation.files} >= {
-        "video.mp4",
-        "depth.mp4",
-        "normal.mp4",
-        "force.mp4",
-        "depth_raw",
-    }
+    told = {path.name for path in simulation.files}
+    assert told >= {"video.mp4", "depth.mp4", "normal.mp4", "force.mp4", "depth_raw"}
 
 
 def test_a_resumed_run_has_all_pictures(make_simulation, tmp_path):
@@ -80,17 +77,10 @@ def test_normals_of_a_flat_flag(make_simulation):
 
 
 def test_normals_in_world_axes_are_those_of_the_z_up_frame(flag_ply, make_simulation):
-    from gaussian_swaying.gaussians.ply import read_ply
-
     simulation = _cameras(make_simulation(read_ply(flag_ply), pinned=False, scene={"up": [0.0, 1.0, 0.0]}), side=SIDE)
-    found = (
-        2
-        * simulation.painter.draw_normals(simulation.scene.rest(), simulation.painter.camera_at(0, "side"), "world")[
-            10, 12
-        ]
-        - 1
-    )
-    expected = simulation.scene.patches.normal[len(simulation.scene.patches.normal) // 2]
+    painter, normals = simulation.painter, simulation.scene.patches.normal
+    found = 2 * painter.draw_normals(painter.scene.rest(), painter.camera_at(0, "side"), "world")[10, 12] - 1
+    expected = normals[len(normals) // 2]
     assert abs(float(found @ expected)) > 0.95
     assert abs(float(found[2])) < 0.1  # the flag hangs, so no normal points up
 
@@ -116,8 +106,6 @@ def test_the_force_is_that_of_the_wind(make_simulation):
 
 def test_values_reach_every_gaussian_that_moves(make_cloud, make_scene):
     """Faint ones take that of the neighbour that carries them; those outside the region have none."""
-    from gaussian_swaying.geometry.regions import Box
-
     cloud = make_cloud()
     cloud.opacities[5] = -6.0
     scene = make_scene(cloud, region=Box([None, None, None], [0.5, None, None]))

@@ -71,7 +71,7 @@ def test_the_object_hides_what_is_behind_it(make_simulation):
     assert bool(torch.isfinite(still).all())
 
 
-@pytest.mark.parametrize("flow", [[5.0, 0.0, 0.0], [0.0, 0.0, -5.0], [0.0, 0.0, 0.0], [0.0, 5.0, 0.0]])
+@pytest.mark.parametrize("flow", [[5.0, 0.0, 0.0], [0.0, 5.0, 0.0]])
 def test_a_run_draws_the_wind(make_simulation, tmp_path, flow):
     """For flows along and across the view, with an obstacle."""
     simulation = make_simulation()
