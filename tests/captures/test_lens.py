@@ -27,14 +27,10 @@ def test_distortion_of_a_point_by_hand():
 
 
 @pytest.mark.parametrize("distortion", [FOX, BARREL, PINCUSHION])
-def test_undistort_is_the_inverse(distortion):
-    points = 1.2 * torch.rand(500, 2, dtype=torch.float64) - 0.6
-    assert_close(undistort(distort(points, distortion), distortion), points, rtol=0, atol=1e-10)
-
-
-@pytest.mark.parametrize("distortion", [FOX, BARREL, PINCUSHION])
 def test_the_undistorted_picture_is_that_of_a_pinhole(distortion):
     """The scene is a plane at depth 1 whose brightness is linear in place: no interpolation error to hide behind."""
+    points = 1.2 * torch.rand(500, 2, dtype=torch.float64) - 0.6
+    assert_close(undistort(distort(points, distortion), distortion), points, rtol=0, atol=1e-10)
     lens = _lens(distortion)
     columns, rows = torch.arange(90) + 0.5, torch.arange(60) + 0.5
     v, u = torch.meshgrid((rows - lens.cy) / lens.fy, (columns - lens.cx) / lens.fx, indexing="ij")

@@ -2,6 +2,7 @@
 
 import math
 import warnings
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -9,7 +10,6 @@ import torch
 from small_scenes import varied_cloud
 from torch.testing import assert_close
 
-from gaussian_swaying.gaussians.cloud import GaussianCloud
 from gaussian_swaying.gaussians.export import (
     SUFFIXES,
     UsdFilm,
@@ -78,8 +78,7 @@ def test_what_cannot_be_written_leaves_nothing(tmp_path):
 
 
 def _moved(cloud, shift, turn=False):
-    quats = cloud.quats[:, [1, 0, 3, 2]] if turn else cloud.quats
-    return GaussianCloud(cloud.means + shift, quats, cloud.scales, cloud.opacities, cloud.sh)
+    return replace(cloud, means=cloud.means + shift, quats=cloud.quats[:, [1, 0, 3, 2]] if turn else cloud.quats)
 
 
 @pytest.mark.parametrize("schema", ["splat", "points"])
@@ -93,7 +92,7 @@ def test_usd_round_trip(schema, tmp_path, monkeypatch):
     elif not hasattr(UsdVol, "ParticleField3DGaussianSplat"):
         pytest.skip("this usd-core has no schema of splats")
     cloud = varied_cloud(20)
-    white = GaussianCloud(cloud.means, cloud.quats, cloud.scales, cloud.opacities, torch.ones_like(cloud.sh))
+    white = replace(cloud, sh=torch.ones_like(cloud.sh))
     clouds = [_moved(cloud, 0.0), _moved(cloud, 0.1), _moved(cloud, 0.4), _moved(white, 0.5, turn=True)]
     path = tmp_path / "film.usdc"
     quarter = torch.tensor([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])  # y to z

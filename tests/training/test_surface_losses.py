@@ -1,6 +1,7 @@
 """Losses of the surface on views whose surface is known."""
 
 import math
+from dataclasses import replace
 from functools import cache
 
 import pytest
@@ -128,11 +129,9 @@ def test_the_geometric_term_grows_with_the_distance_between_two_surfaces():
 
 def test_what_the_other_view_does_not_show_does_not_count():
     inputs = _inputs()
-    hidden = _plane(inputs.other.camera)
-    hidden = SurfaceMaps(
-        hidden.normal, hidden.unit, hidden.distance, torch.zeros_like(hidden.depth), torch.zeros_like(hidden.known)
-    )
-    other = OtherView(inputs.other.image, inputs.other.camera, hidden)
+    seen = inputs.other.surface
+    hidden = replace(seen, depth=torch.zeros_like(seen.depth), known=torch.zeros_like(seen.known))
+    other = replace(inputs.other, surface=hidden)
     for term in (MultiViewGeometricLoss(0), MultiViewPhotometricLoss(0)):
         assert term(_inputs(other=other)) == 0.0
         assert term(_inputs(other=None)) == 0.0
@@ -145,9 +144,7 @@ def test_a_round_trip_needs_a_surface_at_every_neighbour_of_its_pixel(share):
     camera, plane = _camera(0.6), _plane(_camera(0.6))
     known = plane.known.clone()
     known[:, 51:] = False
-    there = OtherView(
-        _photo(0.6, 0.4), camera, SurfaceMaps(plane.normal, plane.unit, plane.distance, plane.depth, known)
-    )
+    there = OtherView(_photo(0.6, 0.4), camera, replace(plane, known=known))
     pixel = double([[50.5 + share, 90.5]])
     apart, seen = round_trip(pixel, sample(plane.depth, pixel), camera, there)
     assert bool(seen) == (share == 0.0)
@@ -219,8 +216,7 @@ def test_derivatives_against_finite_differences():
     )
 
     def consistency(depth, unit):
-        maps = SurfaceMaps(unit, unit, plane.distance, depth, plane.known)
-        return depth_normal_loss(maps, camera)
+        return depth_normal_loss(replace(plane, normal=unit, unit=unit, depth=depth), camera)
 
     crop = torch.linspace(0, 1, SIZE, dtype=torch.float64)
     bumpy = plane.depth + 0.002 * torch.sin(9 * crop)[:, None, None]
@@ -239,9 +235,9 @@ def test_normals_that_fit_their_depths_cost_nothing():
     camera = _camera(0.6)
     assert depth_normal_loss(_plane(camera), camera) < 1e-12
     tilted = _plane(camera, tilt=0.2)
-    mixed = SurfaceMaps(tilted.unit, tilted.unit, tilted.distance, _plane(camera).depth, tilted.known)
+    mixed = replace(tilted, depth=_plane(camera).depth)
     assert float(depth_normal_loss(mixed, camera)) == pytest.approx(1 - math.cos(0.2), rel=1e-6)
-    none = SurfaceMaps(tilted.unit, tilted.unit, tilted.distance, tilted.depth, torch.zeros_like(tilted.known))
+    none = replace(tilted, known=torch.zeros_like(tilted.known))
     assert depth_normal_loss(none, camera) == 0.0
     term = DepthNormalLoss(0)
     assert float(term(_inputs(surface=mixed))) == pytest.approx(1 - math.cos(0.2), rel=1e-6)
