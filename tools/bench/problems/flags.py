@@ -21,9 +21,6 @@ def flag_points(spacing: float, settings: Settings, youngs_modulus: float, densi
     """A sheet of one layer of particles in the x-z plane, 1.2 m by 0.8 m and 0.01 m thick, with a slight ripple.
 
     Units: ``spacing`` [m]; ``youngs_modulus`` [Pa]; ``density`` [kg/m³].
-
-    Returns:
-        The material points.
     """
     x, z = (
         (torch.arange(round(side / spacing), dtype=torch.float64) + 0.5) * side / round(side / spacing)

@@ -63,9 +63,6 @@ def hinged_plate_angle(k: float, law: str) -> float:
     For k >= 1 the ``paper`` law has no equilibrium below the horizontal. At the horizontal its force changes sides, as
     the normal is flipped along the flow: the plate is driven up from below and down from above, and stays edge-on (a
     sliding mode).
-
-    Returns:
-        The angle.
     """
     return math.degrees(math.asin(min(k, 1.0)) if law == "paper" else math.atan(k))
 
@@ -90,8 +87,8 @@ def hinged_plate(
 
     Returns:
         ``error`` [degrees] with its sign, ``angle`` and ``exact`` [degrees], ``drift``: change of the angle in the last
-        fifth of the time [degrees], ``slip``: relative change of the distance between the centre and the hinge,
-        ``particles``, ``simulated_s``, ``substeps`` and ``wall_s``.
+        fifth of the time [degrees], ``slip``: relative change of the distance between the centre and the hinge, and
+        the common quantities.
     """
     settings = Settings() if settings is None else settings
     exact = hinged_plate_angle(k, law)

@@ -95,9 +95,6 @@ def block(
     """A block of fixed corotated material in a box of whole cells; a single layer counts as ``dx`` thick.
 
     Units: ``dx`` [m]; ``low``, ``high``, ``shift`` [cells]; ``density`` [kg/m³]; ``youngs_modulus`` [Pa].
-
-    Returns:
-        The material points.
     """
     volume = math.prod(dx / per_cell if b > a else dx for a, b in zip(low, high, strict=True))
     position = lattice(dx, low, high, settings, per_cell)

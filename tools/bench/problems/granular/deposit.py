@@ -58,9 +58,6 @@ def lube(aspect: float, planar: bool = True) -> float:
 
     Planar: Lube et al. 2005, "Collapses of two-dimensional granular columns", 1.2 a, and 1.9 a^(2/3) where a > 2.3.
     Round: Lube et al. 2004, "Axisymmetric collapses of granular columns", 1.24 a, and 1.6 a^(1/2) where a > 1.7.
-
-    Returns:
-        The run-out.
     """
     if planar:
         return 1.2 * aspect if aspect <= 2.3 else 1.9 * aspect ** (2 / 3)
@@ -71,8 +68,5 @@ def lajeunesse(aspect: float) -> float:
     """Run-out over the radius of a round column of glass beads: a, and 2 a^(1/2) where a > 0.74.
 
     Lajeunesse et al. 2004, "Spreading of a granular mass on a horizontal plane".
-
-    Returns:
-        The run-out.
     """
     return aspect if aspect <= 0.74 else 2 * math.sqrt(aspect)

@@ -68,7 +68,7 @@ def inclined_layer(
 
     Returns:
         For each angle the acceleration of the layer down the slope, over g, in the second half of the time, and its
-        mean velocity at the end [m/s]; and ``simulated_s``, ``substeps``, ``wall_s`` and ``particles``.
+        mean velocity at the end [m/s]; and the common quantities.
     """
     settings = updated(settings)
     tilt = torch.deg2rad(torch.tensor(list(angles), device=settings.device, dtype=settings.dtype))
@@ -115,7 +115,7 @@ def angle_of_repose(
         ``stands`` and ``flows``: the steepest angle at rest, and the gentlest that flows [degrees]; ``friction_deg``:
         where the acceleration vanishes, extrapolated from the two gentlest that flow [degrees]; ``exact``:
         :func:`shear_angle`; ``error`` of ``friction_deg`` relative to it; ``acceleration_error`` on the steepest
-        incline, relative to theory; ``simulated_s``, ``substeps``, ``wall_s`` and ``particles``.
+        incline, relative to theory; and the common quantities.
     """
     found, _, numbers = inclined_layer(angles, settings, cells, friction_angle, **more)
     flows = [k for k, gain in enumerate(found) if gain > 2e-3]
@@ -153,7 +153,7 @@ def tossed_layer(
 
     Returns:
         ``volume_ratio``: height of the centre of mass at the end, over that at the start; ``error``: that less one;
-        ``highest``: the same height at its largest; ``simulated_s``, ``substeps``, ``wall_s`` and ``particles``.
+        ``highest``: the same height at its largest; and the common quantities.
     """
     settings = updated(settings)
     solver, points, state = _layer(1, settings, cells, friction_angle, volume_correction, gravity=(0.0, 0.0, -GRAVITY))
