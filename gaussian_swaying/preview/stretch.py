@@ -24,7 +24,8 @@ FASTEST, RINGING = 3.0, 12  # frequency over the first above which a mode does n
 STEP, TOGETHER = 0.32, 256  # s between stretches; stretches that are compared at once
 # what a typical stretch has, and how far off counts as a fault: over the mean, in the last three as a ratio or its log
 DRIFT, OFF, RESTLESS = (0.0, 0.03, 0.02), (0.0, 0.12, 0.08), (0.25, 0.68, 0.07)
-EVEN, ROUND, SHARE, LEAD = (0.0, 0.2, 0.2), (0.47, 0.85, 0.05), (0.2, 0.65, 0.1), (0.2, math.inf, 0.3)
+EVEN, ROUND, SHARE, LEAD = (0.0, 0.2, 0.2), (0.47, 0.85, 0.05), (0.2, 0.65, 0.1), (0.5, math.inf, 0.3)
+ALIKE = 0.8  # minor over major axis of a motion, above which the two may be exchanged
 
 
 Motion = tuple[np.ndarray, Callable[[np.ndarray, int], np.ndarray]]
@@ -232,12 +233,15 @@ def _faults(part: np.ndarray, whole: np.ndarray, frequency: float) -> np.ndarray
     if 1.15 * frequency > 0.5:  # its own vibration is not in the record
         return found
     time = np.linspace(-1.0, 1.0, count)
-    line = (apart @ axes[:, :, 2:])[..., 0]
-    line = line - (line @ time / (time @ time))[:, None] * time
+    line = np.swapaxes(axes[:, :, 1:], 1, 2) @ np.swapaxes(apart, 1, 2)
+    line = line - (line @ time / (time @ time))[..., None] * time
     power = np.abs(np.fft.rfft(line * np.hanning(count), 4 * count)) ** 2
     f = np.fft.rfftfreq(4 * count) / frequency
     own, seen = (f > 0.78) & (f < 1.22), f > 1.5 / count / frequency
-    lead = np.log(power[:, own].max(1) / power[:, seen & ((f <= 0.75) | (f >= 1.25))].max(1))
+    lead = np.log(power[..., own].max(-1) / power[..., seen & ((f <= 0.75) | (f >= 1.25))].max(-1))
+    # of a round motion either axis may be the major one in the run
+    lead = np.where(square[:, 1] > ALIKE**2 * square[:, 2], lead.min(1), lead[:, 1])
+    power = power[:, 1]
     share = power[:, (f > 2 / 3) & (f < 4 / 3)].sum(1) / power.sum(1)
     return found + _fault(share, SHARE) + _fault(lead, LEAD)
 

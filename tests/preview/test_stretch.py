@@ -44,6 +44,18 @@ def test_the_own_frequency_leads_where_it_should():
     assert lead(round(typical_start(motion, 2.0) * 20)) > 1.0
 
 
+@pytest.mark.parametrize(("minor", "any_stretch"), [(0.83, False), (0.6, True)])
+def test_both_axes_of_a_round_motion_have_its_frequency(minor, any_stretch):
+    """Where one is nearly as large as the other, either may be the major one in the run."""
+    time = np.arange(4000) / 10  # its frequency is 1 Hz; whole periods of 4 s have the same mean in both halves
+    early = time < 300  # a later stretch has another mean, which is less of a fault
+    slow = np.where(early, np.sin(0.5 * np.pi * time), np.cos(2 * np.pi * time))
+    along = np.where(early, 1.0, 1.5) + 0.4 * np.sin(2 * np.pi * time)
+    moved = np.stack([along, 0.4 * minor * slow, 0 * time], 1)
+    start = typical_start((moved, lambda begin, samples: np.zeros((len(begin), samples, 3))), 1.0)
+    assert (start < 290) == any_stretch
+
+
 def test_the_motion_is_that_of_an_oscillator():
     """In a constant load it comes to rest at load / omega², and the load acts in the step after it."""
     square, alpha, tip = np.array([(2 * math.pi) ** 2]), 0.9, np.array([[2.0], [0.0], [0.0]])
