@@ -134,6 +134,20 @@ def shared_truth(pattern: Any, video: FitVideo) -> dict[str, Any]:
     }
 
 
+def shared_scene(pattern: Any, video: FitVideo, law: str, folder: str) -> dict[str, Any]:
+    """What configurations of a flag (``FlagPattern``) and of a soft post (``SoftPattern``) have in common."""
+    shader = {"light": list(video.light), "two_sided": True, "ambient": video.ambient}
+    return {
+        "frames": pattern.frames,
+        "frame_dt": 1 / pattern.fps,
+        "background": list(video.background),
+        "wind": {"flow": START["flow"], "modulations": []},
+        "aero": {"C_D": pattern.drag, "C_F": 0.0, "C_L": 0.0, "air_density": pattern.air_density, "law": law},
+        "shader": {"class_path": "DiffuseShader", "init_args": shader},
+        "camera": {"class_path": "TransformsCamera", "init_args": {"path": f"{folder}/transforms.json", "frame": 0}},
+    }
+
+
 def truth_fields(pattern: FlagPattern, video: FitVideo) -> dict[str, Any]:
     """What ``truth.json`` says: the wind, the material, and what else a simulation needs to be comparable."""
     return shared_truth(pattern, video) | {
@@ -165,10 +179,7 @@ def scene_settings(
         edge = {"min": [None, None, round(height - 0.3 * spacing, 6)], "max": [None, None, None]}
         height = rows * spacing
     held = {"class_path": "Box", "init_args": edge}
-    return {
-        "frames": pattern.frames,
-        "frame_dt": 1 / pattern.fps,
-        "background": list(video.background),
+    return shared_scene(pattern, video, law, folder) | {
         "scene": {
             "generator": {
                 "class_path": "FlagScene",
@@ -203,13 +214,6 @@ def scene_settings(
             "stiffness_damping": SPRING_TIME,
             "boundaries": [{"class_path": "PinnedRegion", "init_args": {"kind": None, "region": held}}],
         },
-        "wind": {"flow": START["flow"], "modulations": []},
-        "aero": {"C_D": pattern.drag, "C_F": 0.0, "C_L": 0.0, "air_density": pattern.air_density, "law": law},
-        "shader": {
-            "class_path": "DiffuseShader",
-            "init_args": {"light": list(video.light), "two_sided": True, "ambient": video.ambient},
-        },
-        "camera": {"class_path": "TransformsCamera", "init_args": {"path": f"{folder}/transforms.json", "frame": 0}},
     }
 
 

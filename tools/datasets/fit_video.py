@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from blender_images import View, look_at
 from fit_cases import FitVideo
-from flag_pictures import view_of_all
+from flag_pictures import lens_fields, view_of_all
 
 from gaussian_swaying._files import atomic
 
@@ -107,7 +107,6 @@ def mask_name(camera: int, frame: int) -> str:
 
 def video_fields(views: list[View], frames: int, fps: float) -> dict[str, Any]:
     """The fields of ``transforms.json``: all pictures of all cameras with times [s], ordered by camera and time."""
-    view = views[0]
     rows = [
         {
             "file_path": frame_name(camera, frame),
@@ -119,13 +118,4 @@ def video_fields(views: list[View], frames: int, fps: float) -> dict[str, Any]:
         for camera in range(len(views))
         for frame in range(frames)
     ]
-    return {
-        "fl_x": view.focal,
-        "fl_y": view.focal,
-        "cx": 0.5 * view.width,
-        "cy": 0.5 * view.height,
-        "w": view.width,
-        "h": view.height,
-        "fps": fps,
-        "frames": rows,
-    }
+    return lens_fields(views[0]) | {"fps": fps, "frames": rows}

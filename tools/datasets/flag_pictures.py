@@ -100,17 +100,13 @@ def frame_order(count: int, stride: int = 10) -> list[int]:
     return sorted(range(count), key=lambda frame: (frame % stride != 0, frame))
 
 
+def lens_fields(view: View) -> dict[str, Any]:
+    """The fields of a ``transforms.json`` that all cameras of one lens share."""
+    w, h = view.width, view.height
+    return {"fl_x": view.focal, "fl_y": view.focal, "cx": 0.5 * w, "cy": 0.5 * h, "w": w, "h": h}
+
+
 def transforms_fields(views: list[View], names: list[str]) -> dict[str, Any]:
     """The fields of a ``transforms.json`` for cameras that differ only in pose."""
-    view = views[0]
     frames = [{"file_path": name, "transform_matrix": v.pose.tolist()} for v, name in zip(views, names, strict=True)]
-    return {
-        "camera_angle_x": view.angle_x,
-        "fl_x": view.focal,
-        "fl_y": view.focal,
-        "cx": 0.5 * view.width,
-        "cy": 0.5 * view.height,
-        "w": view.width,
-        "h": view.height,
-        "frames": frames,
-    }
+    return {"camera_angle_x": views[0].angle_x} | lens_fields(views[0]) | {"frames": frames}

@@ -23,9 +23,11 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
+import imageio.v3 as iio
 import numpy as np
 from blender_cloth import require_bpy
 from blender_images import TRANSFERS, Studio
+from fit_video import write_h264
 from flag_file import read_flag
 from flag_motion import check_settings, read_cloth, settings_hash, solve_pattern
 from flag_pictures import draw_texture, frame_order, lamp_position, reference_view, sphere_views, transforms_fields
@@ -161,24 +163,9 @@ def make_video(pattern: FlagPattern, cloth: Path, folder: Path, pictures: Pictur
             report(f"frame {done}/{len(wanted)}")
     whole = pictures.every == 1
     if whole and (wanted or not (folder / "reference.mp4").exists()):
-        write_film(folder / "reference.mp4", [folder / name for name in sorted(names)], pattern.fps)
+        drawn = (iio.imread(folder / name)[..., :3] for name in sorted(names))
+        write_h264(folder / "reference.mp4", drawn, pictures.size, pattern.fps, crf=5)
     return len(wanted)
-
-
-def write_film(path: Path, frames: list[Path], fps: int) -> bool:
-    """Join pictures into an mp4; returns False, and writes nothing, if imageio is not installed."""
-    try:
-        import imageio.v2 as imageio
-        import imageio_ffmpeg  # noqa: F401
-    except ImportError:
-        return False
-    with (
-        atomic(path) as temporary,
-        imageio.get_writer(temporary, format="FFMPEG", fps=fps, quality=9, macro_block_size=1) as writer,
-    ):
-        for frame in frames:
-            writer.append_data(imageio.imread(frame))
-    return True
 
 
 def _every_25th(report: Report, what: str, frames: int) -> Callable[[int], None]:

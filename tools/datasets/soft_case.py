@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 import torch
-from fit_cases import START, FitVideo, shared_truth
+from fit_cases import FitVideo, shared_scene, shared_truth
 from flag_motion import check_settings
 from newton_soft import Air, Block, SoftRun, solve_block
 
@@ -229,10 +229,7 @@ def truth_fields(pattern: SoftPattern, video: FitVideo) -> dict[str, Any]:
 def scene_settings(pattern: SoftPattern, video: FitVideo, folder: str) -> dict[str, Any]:
     """A configuration of ``gaussian-swaying sim`` for the case in a folder, with wrong values for what is sought."""
     foot = {"class_path": "Box", "init_args": {"min": [None] * 3, "max": [None, None, pattern.held]}}
-    return {
-        "frames": pattern.frames,
-        "frame_dt": 1 / pattern.fps,
-        "background": list(video.background),
+    return shared_scene(pattern, video, "projected", folder) | {
         "scene": {
             "ply": f"{folder}/rest.ply",
             "metres_per_unit": 1.0,
@@ -249,11 +246,4 @@ def scene_settings(pattern: SoftPattern, video: FitVideo, folder: str) -> dict[s
             "damping": pattern.damping,
             "boundaries": [{"class_path": "PinnedRegion", "init_args": {"kind": "nodes", "region": foot}}],
         },
-        "wind": {"flow": START["flow"], "modulations": []},
-        "aero": {"C_D": pattern.drag, "C_F": 0.0, "C_L": 0.0, "air_density": pattern.air_density, "law": "projected"},
-        "shader": {
-            "class_path": "DiffuseShader",
-            "init_args": {"light": list(video.light), "two_sided": True, "ambient": video.ambient},
-        },
-        "camera": {"class_path": "TransformsCamera", "init_args": {"path": f"{folder}/transforms.json", "frame": 0}},
     }
