@@ -8,7 +8,6 @@ import json
 import math
 import os
 import re
-import stat
 import zlib
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -21,14 +20,6 @@ PNG: dict[str, Any] = {"compress_level": 1, "compress_type": zlib.Z_RLE}
 """Options with which pictures are compressed: in two thirds of the time of zlib's level 3, and smaller."""
 
 _TEMPORARY = re.compile(r"\..+\.gs-writing-\d+(\.[A-Za-z0-9_]+)?")
-_KINDS = {
-    stat.S_IFREG: "file",
-    stat.S_IFDIR: "folder",
-    stat.S_IFIFO: "named pipe",
-    stat.S_IFSOCK: "socket",
-    stat.S_IFCHR: "device",
-    stat.S_IFBLK: "device",
-}
 
 
 def temporary_name(path: Path) -> Path:
@@ -41,21 +32,6 @@ def remove_temporaries(folder: Path) -> None:
     for path in folder.glob(".*"):
         if _TEMPORARY.fullmatch(path.name) and path.is_file():
             path.unlink()
-
-
-def kind_of(path: Path) -> str | None:
-    """Return the kind of a path, links followed: ``file``, ``folder``, ``named pipe``, ...; None if nothing is there.
-
-    Nothing is opened, so this never waits for a pipe that nobody writes to.
-    """
-    try:
-        return _KINDS.get(stat.S_IFMT(os.stat(path).st_mode), "special file")
-    except (FileNotFoundError, NotADirectoryError):
-        return "link to nothing" if os.path.islink(path) else None
-    except OSError as error:
-        if isinstance(error, PermissionError) or not os.path.islink(path):
-            raise
-        return "link to itself"
 
 
 def check_page(path: Path, what: str) -> None:

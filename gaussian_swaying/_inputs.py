@@ -4,14 +4,13 @@ from __future__ import annotations
 
 import json
 import os
+import stat
 import zipfile
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-
-from gaussian_swaying._files import kind_of
 
 LARGEST_JSON = 1 << 28  # bytes; a capture of 10,000 images takes 10 MB
 LONGEST_NUMBER = 32  # digits of a whole number
@@ -27,16 +26,16 @@ def check_regular(path: str | os.PathLike[str], what: str = "the file", largest:
     """
     path = Path(path)
     try:
-        kind = kind_of(path)
+        found = path.stat()
     except ValueError as error:  # a zero byte
         raise ValueError(f"{str(path)!r} is not a valid path ({error}); check the path of {what}.") from None
-    if kind in (None, "link to nothing"):
-        raise FileNotFoundError(f"{path} does not exist; check the path of {what}.")
-    if kind == "folder":
+    except (FileNotFoundError, NotADirectoryError):
+        raise FileNotFoundError(f"{path} does not exist; check the path of {what}.") from None
+    if stat.S_ISDIR(found.st_mode):
         raise ValueError(f"{path} is a directory; give {what} inside it.")
-    if kind != "file":
-        raise ValueError(f"{path} is not a regular file but a {kind}; save {what} to a file first and give that.")
-    size = path.stat().st_size
+    if not stat.S_ISREG(found.st_mode):
+        raise ValueError(f"{path} is not a regular file; save {what} to a file first and give that.")
+    size = found.st_size
     if largest is not None and size > largest:
         raise ValueError(f"{path} has {size:,} bytes, more than the {largest:,} that {what} may have; check the path.")
     return path

@@ -16,7 +16,7 @@ from gaussian_swaying.captures.images import image_size
 def test_a_pipe_and_a_device_are_no_files(tmp_path):
     os.mkfifo(tmp_path / "pipe")
     for path in (tmp_path / "pipe", "/dev/zero"):
-        with pytest.raises(ValueError, match=r"not a regular file .* save the splat to a file first"):
+        with pytest.raises(ValueError, match=r"not a regular file; save the splat to a file first"):
             check_regular(path, "the splat")
     with pytest.raises(ValueError, match="is a directory; give the splat inside it"):
         check_regular(tmp_path, "the splat")
@@ -37,7 +37,7 @@ def test_links_are_followed(tmp_path):
     assert check_regular(tmp_path / "good", largest=5) == tmp_path / "good"
     with pytest.raises(FileNotFoundError, match="nowhere does not exist"):
         check_regular(tmp_path / "nowhere")
-    with pytest.raises(ValueError, match="not a regular file but a link to itself"):
+    with pytest.raises(OSError, match="round"):
         check_regular(tmp_path / "round")
 
 

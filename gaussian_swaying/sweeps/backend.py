@@ -79,11 +79,13 @@ class Outcome:
         results: The result of each of its runs, by name.
         killed: Whether its process was killed, so that the reason may be outside of it.
         share: Share of the memory of its GPU that it took; None on a CPU, or if it is not known.
+        ready: Whether its process can do another job. It should not after lack of memory, a bug or a signal.
     """
 
     results: dict[str, dict[str, Any]] = field(default_factory=dict)
     killed: bool = False
     share: float | None = None
+    ready: bool = True
 
     @property
     def complete(self) -> bool:
@@ -171,4 +173,4 @@ def lost(job: Job, reason: str) -> Outcome:
         name: result if result and result["status"] == "complete" else failure("failed", reason, job.attempt)
         for name, result in written.items()
     }
-    return Outcome(results, killed=True)
+    return Outcome(results, killed=True, ready=False)

@@ -70,8 +70,8 @@ class Pool:
         for worker in (worker for worker in busy if worker.connection in ready):
             job, worker.job = worker.job, None
             assert job is not None
-            outcome, again = _receive(worker, job)
-            if not again:
+            outcome = _receive(worker, job)
+            if not outcome.ready:
                 _dismiss(worker)
                 self._workers.remove(worker)
             ended.append((job, outcome))
@@ -156,13 +156,13 @@ def _environment(**values: str) -> Iterator[None]:
                 os.environ[name] = value
 
 
-def _receive(worker: _Worker, job: Job) -> tuple[Outcome, bool]:
+def _receive(worker: _Worker, job: Job) -> Outcome:
     try:
-        done = worker.connection.recv()
-        return Outcome(done.results, share=done.share), done.ready
+        outcome: Outcome = worker.connection.recv()
+        return outcome
     except (EOFError, OSError):
         worker.process.join(PATIENCE_S)
-        return lost(job, _how_it_ended(worker.process.exitcode)), False
+        return lost(job, _how_it_ended(worker.process.exitcode))
 
 
 def _how_it_ended(code: int | None) -> str:

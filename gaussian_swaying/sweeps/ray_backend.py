@@ -15,7 +15,7 @@ import torch
 from gaussian_swaying._checks import first_line
 from gaussian_swaying.simulation.simulation import Simulation
 from gaussian_swaying.sweeps.backend import PACKED, Job, Outcome, lost
-from gaussian_swaying.sweeps.worker import WHERE, Done, Explain, do
+from gaussian_swaying.sweeps.worker import WHERE, Explain, do
 
 if TYPE_CHECKING:
     from jsonargparse import ArgumentParser
@@ -100,8 +100,8 @@ class RayBackend:
     def _outcome(self, reference: Any, job: Job) -> Outcome:
         errors = self._ray.exceptions
         try:
-            done: Done = self._ray.get(reference)
-            return Outcome(done.results, share=done.share)
+            outcome: Outcome = self._ray.get(reference)
+            return outcome
         except errors.OutOfMemoryError:
             return lost(
                 job, "Its process was ended by Ray as memory ran out: use fewer `--workers`, or a smaller scene."
@@ -136,7 +136,7 @@ def _parser() -> ArgumentParser:
     return Simulation.parser()
 
 
-def _task(job: Job, threads: int, explain: Explain, folder: str, path: list[str]) -> Done:
+def _task(job: Job, threads: int, explain: Explain, folder: str, path: list[str]) -> Outcome:
     import ray
 
     os.chdir(folder)

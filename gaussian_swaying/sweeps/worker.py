@@ -11,7 +11,6 @@ import threading
 import traceback
 from collections.abc import Callable
 from contextlib import redirect_stderr, redirect_stdout, suppress
-from dataclasses import dataclass
 from multiprocessing import connection as connections
 from multiprocessing import parent_process
 from multiprocessing.connection import Connection
@@ -25,7 +24,7 @@ from gaussian_swaying.runs.lock import FolderLocked
 from gaussian_swaying.runs.signals import stop_signals
 from gaussian_swaying.simulation.diagnostics import SimulationDiverged
 from gaussian_swaying.simulation.simulation import Simulation
-from gaussian_swaying.sweeps.backend import Job, unlocked
+from gaussian_swaying.sweeps.backend import Job, Outcome, unlocked
 from gaussian_swaying.sweeps.plan import parse_run
 from gaussian_swaying.sweeps.record import LOGS, RUNS, failure, result_file, result_of
 from gaussian_swaying.sweeps.together import run_together
@@ -38,21 +37,6 @@ WHERE = "GAUSSIAN_SWAYING_WHERE"
 """Variable of the environment with a name for the place of a worker; the host if it is not set."""
 
 Explain = Callable[[BaseException], str]
-
-
-@dataclass(frozen=True)
-class Done:
-    """The results of a job, as a worker sends them.
-
-    Attributes:
-        results: The result of each run, by name.
-        ready: Whether the process can do another job. It should not after lack of memory, a bug or a signal.
-        share: Share of the memory of the GPU that the process took; None on a CPU.
-    """
-
-    results: dict[str, dict[str, Any]]
-    ready: bool
-    share: float | None = None
 
 
 def work(connection: Connection, threads: int, explain: Explain = first_line) -> None:
@@ -83,7 +67,7 @@ def _end_with_parent() -> None:
         os.kill(os.getpid(), signal.SIGTERM)
 
 
-def do(job: Job, parser: ArgumentParser, explain: Explain) -> Done:
+def do(job: Job, parser: ArgumentParser, explain: Explain) -> Outcome:
     """Do a job and write the results of its complete runs.
 
     Args:
@@ -101,7 +85,7 @@ def do(job: Job, parser: ArgumentParser, explain: Explain) -> Done:
             results = {name: result_of(summary, job.attempt, _where()) for name, summary in summaries.items()}
             for name, result in results.items():
                 write_json(result_file(job.folder, name), result)
-        return Done(results, True, _share())
+        return Outcome(results, share=_share())
     except KeyboardInterrupt as stop:
         return _failed(job, "failed", f"It was stopped ({stop or 'Ctrl-C'}).", False)
     except SimulationDiverged as error:
@@ -116,8 +100,8 @@ def do(job: Job, parser: ArgumentParser, explain: Explain) -> Done:
                     file.write(told.getvalue())
 
 
-def _failed(job: Job, status: str, reason: str, ready: bool) -> Done:
-    return Done({name: failure(status, reason, job.attempt) for name in job.wanted}, ready)
+def _failed(job: Job, status: str, reason: str, ready: bool) -> Outcome:
+    return Outcome({name: failure(status, reason, job.attempt) for name in job.wanted}, ready=ready)
 
 
 def _where() -> str:

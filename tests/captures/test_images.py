@@ -101,5 +101,5 @@ def test_bad_images_are_named(tmp_path, pixels):
 def test_a_pipe_keeps_nobody_waiting(tmp_path):
     os.mkfifo(tmp_path / "a.png")
     for read in (image_size, read_image):
-        with pytest.raises(ValueError, match=r"a\.png is not a regular file but a named pipe"):
+        with pytest.raises(ValueError, match=r"a\.png is not a regular file"):
             read(tmp_path / "a.png")

@@ -1,11 +1,14 @@
 """``gaussian-swaying fit``: the one sentence it answers bad input with."""
 
+import sys
+
 import pytest
 import yaml
 from shared import refused
 
 from gaussian_swaying.cli import shipped
 from gaussian_swaying.cli.fit import main
+from gaussian_swaying.fitting.plan import read_plan
 
 
 def _file(path, **fields):
@@ -39,14 +42,12 @@ def test_bad_input(fields, words, tmp_path, monkeypatch, capsys):
 @pytest.mark.parametrize("stage", ["tracks", "matches"])
 def test_without_opencv(stage, tmp_path, monkeypatch, capsys):
     """Before the videos are read; the other stages need no extra."""
-    monkeypatch.setitem(__import__("sys").modules, "cv2", None)
+    monkeypatch.setitem(sys.modules, "cv2", None)
     for stages, words in (([stage], "pip install 'gaussian-swaying[fit]'"), (["pixels"], "video does not exist")):
         refused(main, ["--config", _file(tmp_path / "fit.yaml", stages=stages)], capsys, words)
 
 
 def test_the_shipped_fit_is_a_plan():
-    from gaussian_swaying.fitting.plan import read_plan
-
     assert "printed_flag" in shipped.names("fit")
     file = shipped.with_shipped(["--config", "printed_flag"], "fit")[1]
     plan = read_plan(file, lambda name: shipped.with_shipped(["--config", name], "sim")[1])

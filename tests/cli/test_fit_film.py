@@ -39,23 +39,17 @@ def case(tmp_path_factory):
     return folder
 
 
+def _check(case, output, *more, film="film.mp4"):
+    """The code of the command that writes the files before a fit of a film in the folder of the case."""
+    given = [str(case / film), "--splat", str(case / "my.ply"), "--up", "+z", "--output", str(output)]
+    return main([*given, *more, "--device", "cpu", "--check"])
+
+
 @pytest.fixture(scope="module")
 def checked(case):
     """The files before a fit, with the pole's length."""
     folder = case / "out"
-    given = [
-        str(case / "film.mp4"),
-        "--splat",
-        str(case / "my.ply"),
-        "--length",
-        "pole",
-        "2.5",
-        "--up",
-        "+z",
-        "--focal",
-        "36.2",
-    ]
-    assert main([*given, "--output", str(folder), "--device", "cpu", "--check"]) == 0
+    assert _check(case, folder, "--length", "pole", "2.5", "--focal", "36.2") == 0
     return folder
 
 
@@ -94,12 +88,10 @@ def test_the_pictures_before_the_fit(checked):
 
 def test_a_film_that_does_not_say_its_length(case, checked, tmp_path):
     """As those that browsers record: all of it is used."""
-    path = tmp_path / "film.mkv"
-    with path.open("wb") as file:  # ffmpeg cannot go back to write the length
+    with (case / "film.mkv").open("wb") as file:  # ffmpeg cannot go back to write the length
         words = ["-v", "error", "-i", str(case / "film.mp4"), "-c", "copy", "-f", "matroska", "-"]
         subprocess.run([imageio_ffmpeg.get_ffmpeg_exe(), *words], check=True, stdout=file)
-    given = [str(path), "--splat", str(case / "my.ply"), "--up", "+z", "--focal", "36.2", "--device", "cpu", "--check"]
-    assert main([*given, "--output", str(tmp_path / "out")]) == 0
+    assert _check(case, tmp_path / "out", "--focal", "36.2", film="film.mkv") == 0
     (video,), (same,) = (read_videos(folder / "transforms.json") for folder in (tmp_path / "out", checked))
     assert video.times == pytest.approx(same.times, abs=2e-3)
 
@@ -142,8 +134,7 @@ def test_a_fit_without_a_length_keeps_the_edited_file(case, checked, capsys):
     """A very small fit to its end: the page, and the sentences on what the values rest on."""
     edited = (checked / "fit.yaml").read_text() + "tracks: 30\n"
     (checked / "fit.yaml").write_text(edited)
-    given = [str(case / "film.mp4"), "--splat", str(case / "my.ply"), "--up", "+z", "--output", str(checked)]
-    assert main([*given, "--check"]) == 0
+    assert _check(case, checked) == 0
     assert "nobody measured" in capsys.readouterr().out
     assert (checked / "fit.1.yaml").read_text() == edited
     plan = yaml.safe_load((checked / "fit.yaml").read_text())
@@ -173,8 +164,7 @@ def test_the_weight_as_a_ruler(case, checked, capsys, monkeypatch):
         return dataclasses.replace(preview, configurations={"starter": yaml.safe_dump(starter)})
 
     monkeypatch.setattr(fit_film, "_previewed", weightless)
-    given = [str(case / "film.mp4"), "--splat", str(case / "my.ply"), "--up", "+z", "--length", "gravity"]
-    assert main([*given, "--output", str(case / "weighed"), "--check"]) == 2
+    assert _check(case, case / "weighed", "--length", "gravity") == 2
     assert "captured in balance" in capsys.readouterr().err
     starter = (checked / "preview/starter.yaml").read_text()
     guess = {"metres_per_unit": 0.5, "hold": {"end": "top"}, "flow": [1.0, 0.0, 0.0]}
@@ -188,22 +178,25 @@ def test_the_weight_as_a_ruler(case, checked, capsys, monkeypatch):
     assert plan.assumed == ["mass"]
 
 
+FILM = ["film.mp4", "--splat", "a.ply"]
+
+
 @pytest.mark.parametrize(
     ("words", "told"),
     [
         ([], "either a film"),
         (["film.mp4"], "add --splat"),
-        (["film.mp4", "--splat", "a.ply", "--config", "b.yaml"], "either a film"),
+        ([*FILM, "--config", "b.yaml"], "either a film"),
         (["--config", "b.yaml", "--up", "+z"], "`--up` is for a film"),
-        (["film.mp4", "--splat", "a.ply", "--resume"], "`--resume`"),
-        (["film.mp4", "--splat", "a.ply", "--length", "pole", "long"], "a length in metres"),
-        (["film.mp4", "--splat", "a.ply", "--length", "pole"], "but got nothing"),
-        (["film.mp4", "--splat", "a.ply", "--focal", "0.03"], "`--focal` from 5 to 1000 mm"),
-        (["film.mp4", "--splat", "a.ply", "--up", "north"], "`--up` to be +x"),
-        (["film.mp4", "--splat", "a.ply", "--up", "0", "1"], "or 3 numbers, but got 0 1"),
-        (["film.mp4", "--splat", "a.ply", "--hold", "left"], "`--hold`"),
+        ([*FILM, "--resume"], "`--resume`"),
+        ([*FILM, "--length", "pole", "long"], "a length in metres"),
+        ([*FILM, "--length", "pole"], "but got nothing"),
+        ([*FILM, "--focal", "0.03"], "`--focal` from 5 to 1000 mm"),
+        ([*FILM, "--up", "north"], "`--up` to be +x"),
+        ([*FILM, "--up", "0", "1"], "or 3 numbers, but got 0 1"),
+        ([*FILM, "--hold", "left"], "`--hold`"),
         (["film.png", "--splat", "a.ply"], "is a picture"),
-        (["film.mp4", "--splat", "a.ply"], "film.mp4"),
+        (FILM, "film.mp4"),
     ],
 )
 def test_bad_options(words, told, tmp_path, monkeypatch, capsys):

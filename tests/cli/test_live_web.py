@@ -18,7 +18,7 @@ def test_a_page_from_the_name_of_a_configuration(tmp_path, capsys, monkeypatch):
     assert re.fullmatch(told, capsys.readouterr().out)
     assert "customElements.define" in (tmp_path / "gaussian-swaying.js").read_text()
     assert (tmp_path / "flag.html").read_text().startswith("<!doctype html>")
-    fine = ["--scene.generator.init_args.spacing=0.05", "--solver.dx=0.1", "--material.E=2e6"]
+    fine = [SMALL[0], "--solver.dx=0.1", "--material.E=2e6"]
     assert main(["--live-web", "flag", "phone.html", "--target", "phone", *fine]) == 0
     told = capsys.readouterr().out
     assert re.match(r"Chose a grid of [\d.]+ m instead of 0\.1 m for a phone: \d+ points, real time expected\.\n", told)

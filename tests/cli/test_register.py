@@ -33,8 +33,10 @@ def _off(camera):
     return math.degrees(math.acos(min(1.0, float(((a @ b.T).trace() - 1) / 2))))
 
 
-def test_the_camera_of_a_picture(flag, capsys):
+def test_the_camera_of_a_picture_and_its_field_of_view(flag, capsys):
     given = [str(flag / "first.png"), str(flag / "flag.ply"), "--up", "0", "0", "1", "--output", str(flag / "out")]
+    assert main(given) == 0
+    assert fov_of(camera_from_transforms(flag / "out/transforms.json", 0)) == pytest.approx(42, abs=1.5)
     assert main([*given, "--fov", "42"]) == 0
     assert "points agree on the camera" in capsys.readouterr().out
     found = camera_from_transforms(flag / "out/transforms.json", 0)
@@ -42,13 +44,6 @@ def test_the_camera_of_a_picture(flag, capsys):
     assert float((found.position - CAMERA.position).norm()) < 0.02
     assert json.loads((flag / "out/transforms.json").read_text())["frames"][0]["file_path"] == "../first.png"
     assert Image.open(flag / "out/registration.png").size == (3 * 320, 240)
-
-
-def test_the_field_of_view_is_found(flag):
-    given = [str(flag / "first.png"), str(flag / "flag.ply"), "--up", "0", "0", "1", "--output", str(flag / "out")]
-    assert main(given) == 0
-    found = camera_from_transforms(flag / "out/transforms.json", 0)
-    assert fov_of(found) == pytest.approx(42, abs=1.5)
 
 
 def test_what_cannot_be_is_refused_and_writes_nothing(flag, capsys):

@@ -183,7 +183,7 @@ def test_a_list_that_claims_four_billion_corners(tmp_path):
 def test_a_pipe_is_no_mesh(tmp_path, name):
     """Reading one waits for ever."""
     os.mkfifo(tmp_path / name)
-    with pytest.raises(ValueError, match="not a regular file but a named pipe"):
+    with pytest.raises(ValueError, match="not a regular file"):
         read_mesh(tmp_path / name)
 
 
