@@ -301,7 +301,7 @@ class Emitter:
         value = ir.Constant(ir.VectorType(TYPES["i32"], end - start), list(range(start, end)))
         return Block(value, "i32", shape, ir.Constant(TYPES["i32"], start), 1)
 
-    def reduce(self, which: str, x: Block, axis: int | None) -> Block:
+    def reduce(self, which: str, x: Block, axis: int | None = None) -> Block:
         """``sum``, ``max`` or ``min`` over an axis, or over all."""
         if x.kind == "i1":
             x = self.convert(x, "i32")
@@ -355,13 +355,17 @@ class Emitter:
             self.entry.store(ir.Constant(stored, 0), self._dummy[kind])
         return self._dummy[kind]
 
+    def _where(self, pointer: Pointer, mask: Value, *blocks: Block) -> tuple[Block | None, Shape]:
+        """A mask, if it is not all true, and the shape of a pointer, the mask and some blocks."""
+        mask = None if mask is None or mask is True else self.convert(self.block(mask), "i1")
+        return mask, self.common_shape(*(each.shape for each in (pointer.offset, *blocks, mask) if each is not None))
+
     def load(self, pointer: Pointer, mask: Value = None, other: Value = None) -> Block:
         """The numbers at some addresses; ``other`` (or zero) where a mask is false."""
         kind = pointer.kind
         stored = "i8" if kind == "i1" else kind
         offset = pointer.offset
-        mask = None if mask is None or mask is True else self.convert(self.block(mask), "i1")
-        shape = offset.shape if mask is None else self.common_shape(offset.shape, mask.shape)
+        mask, shape = self._where(pointer, mask)
         lanes, b = math.prod(shape), self.builder
         fill = self.splat(self.convert(self.block(0 if other is None else other), stored), shape)
         if lanes == 1:
@@ -401,9 +405,7 @@ class Emitter:
         if kind == "i1":
             block = self.convert(block, "i1")
         block = self.convert(block, stored)
-        mask = None if mask is None or mask is True else self.convert(self.block(mask), "i1")
-        shapes = [offset.shape, block.shape, *([] if mask is None else [mask.shape])]
-        shape = self.common_shape(*shapes)
+        mask, shape = self._where(pointer, mask, block)
         lanes, b = math.prod(shape), self.builder
         if lanes == 1:
             address = self._address(pointer.base, kind, offset.value)
@@ -444,9 +446,7 @@ class Emitter:
     def atomic(self, operation: str, pointer: Pointer, value: Value, mask: Value = None) -> Block:
         """Add to a number in memory, or make it as large, one lane after the other; returns what it was before."""
         block = self.convert(self.block(value), pointer.kind)
-        mask = None if mask is None or mask is True else self.convert(self.block(mask), "i1")
-        shapes = [pointer.offset.shape, block.shape, *([] if mask is None else [mask.shape])]
-        shape = self.common_shape(*shapes)
+        mask, shape = self._where(pointer, mask, block)
         b, index = self.builder, ir.IntType(32)
         names = {("add", True): "fadd", ("add", False): "add", ("max", True): "fmax", ("max", False): "max"}
         name = names[operation, block.floating]

@@ -11,10 +11,12 @@ from __future__ import annotations
 import ast
 import builtins
 import inspect
+import math
+import operator
 import textwrap
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import lru_cache, partial
 from typing import Any
 
 from llvmlite import ir
@@ -26,11 +28,14 @@ from gaussian_swaying.kernels.language import Language, Name
 UNROLLED = 4
 """Longest loop of a constant length that is unrolled; the language's ``static_range`` always is."""
 
-_SIGNS = {
-    ast.Add: "+", ast.Sub: "-", ast.Mult: "*", ast.Div: "/", ast.FloorDiv: "//", ast.Mod: "%", ast.BitAnd: "&",
-    ast.BitOr: "|", ast.BitXor: "^", ast.LShift: "<<", ast.RShift: ">>",
+_OPERATIONS: dict[type, tuple[str, Callable[[Any, Any], Any]]] = {
+    ast.Add: ("+", operator.add), ast.Sub: ("-", operator.sub), ast.Mult: ("*", operator.mul),
+    ast.Div: ("/", operator.truediv), ast.FloorDiv: ("//", operator.floordiv), ast.Mod: ("%", operator.mod),
+    ast.BitAnd: ("&", operator.and_), ast.BitOr: ("|", operator.or_), ast.BitXor: ("^", operator.xor),
+    ast.LShift: ("<<", operator.lshift), ast.RShift: (">>", operator.rshift), ast.Lt: ("<", operator.lt),
+    ast.LtE: ("<=", operator.le), ast.Gt: (">", operator.gt), ast.GtE: (">=", operator.ge), ast.Eq: ("==", operator.eq),
+    ast.NotEq: ("!=", operator.ne),
 }  # fmt: skip
-_COMPARES = {ast.Lt: "<", ast.LtE: "<=", ast.Gt: ">", ast.GtE: ">=", ast.Eq: "==", ast.NotEq: "!="}
 _PYTHON = {"len": len, "float": float, "int": int, "min": min, "max": max, "bool": bool, "abs": abs}
 
 
@@ -405,7 +410,7 @@ class _Translator(Emitter):
             return self._places(kind.offset)
         if isinstance(kind, _Same):
             return []
-        to = self.type_of(kind.kind, _lanes(kind.shape))
+        to = self.type_of(kind.kind, math.prod(kind.shape))
         return [(self.entry.alloca(to), to)]
 
     def _keep(self, places: list[Any], value: Value) -> None:
@@ -461,18 +466,12 @@ class _Translator(Emitter):
     def _binary(self, op: ast.operator, x: Value, y: Value) -> Value:
         if isinstance(x, tuple) and isinstance(y, tuple) and isinstance(op, ast.Add):
             return x + y
-        sign = _SIGNS.get(type(op))
-        if sign is None:
+        if type(op) not in _OPERATIONS:
             if isinstance(op, ast.Pow) and is_number(x) and is_number(y):
                 return x**y
             raise TranslationError(f"no operation {type(op).__name__}")
-        if is_number(x) and is_number(y):
-            return {
-                "+": lambda: x + y, "-": lambda: x - y, "*": lambda: x * y, "/": lambda: x / y, "//": lambda: x // y,
-                "%": lambda: x % y, "&": lambda: x & y, "|": lambda: x | y, "^": lambda: x ^ y, "<<": lambda: x << y,
-                ">>": lambda: x >> y,
-            }[sign]()  # fmt: skip
-        return self.arithmetic(sign, x, y)
+        sign, plain = _OPERATIONS[type(op)]
+        return plain(x, y) if is_number(x) and is_number(y) else self.arithmetic(sign, x, y)
 
     def _one(self, op: ast.unaryop, x: Value) -> Value:
         if isinstance(op, ast.Not):
@@ -488,13 +487,8 @@ class _Translator(Emitter):
     def _compare(self, op: ast.cmpop, x: Value, y: Value) -> Value:
         if isinstance(op, (ast.Is, ast.IsNot)):
             return (x is y) == isinstance(op, ast.Is)
-        sign = _COMPARES[type(op)]
-        if isinstance(x, Block) or isinstance(y, Block):
-            return self.compare(sign, x, y)
-        return {
-            "<": lambda: x < y, "<=": lambda: x <= y, ">": lambda: x > y, ">=": lambda: x >= y, "==": lambda: x == y,
-            "!=": lambda: x != y,
-        }[sign]()  # fmt: skip
+        sign, plain = _OPERATIONS[type(op)]
+        return self.compare(sign, x, y) if isinstance(x, Block) or isinstance(y, Block) else plain(x, y)
 
     def _logic(self, op: ast.boolop, values: list[ast.expr], scope: Scope) -> Value:
         """``and`` and ``or``; after a constant that decides, the rest is not looked at."""
@@ -554,10 +548,7 @@ class _Translator(Emitter):
 
     def _invoke(self, function: Any, arguments: tuple[Value, ...], named: Scope) -> Value:
         if isinstance(function, Name):
-            made = getattr(self, f"_tl_{function.name}", None)
-            if made is None:
-                raise TranslationError(f"`tl.{function.name}` is not translated")
-            return made(*arguments, **named)
+            return self._named(function.name)(*arguments, **named)
         if hasattr(function, "fn"):
             return self._call(function, arguments, named)
         if function is range:
@@ -574,62 +565,48 @@ class _Translator(Emitter):
 
     # ---- the language
 
-    def _tl_static_range(self, *limits: int) -> range:
-        return range(*limits)
+    def _named(self, name: str) -> Callable[..., Value]:
+        """A function of the language."""
+        match name:
+            case "load" | "store" | "where" | "arange":
+                return getattr(self, name)
+            case "sqrt" | "sin" | "cos" | "floor":
+                return partial(self.unary, name)
+            case "sum" | "max" | "min":
+                return partial(self.reduce, name)
+            case "maximum" | "minimum":
+                return partial(self._extreme, name[:3])
+            case "atomic_add" | "atomic_max":
+                return lambda pointer, x, mask=None, **_: self.atomic(name[7:], pointer, x, mask)
+            case "exp" | "log":
+                return partial(self._function, name)
+            case "static_range":
+                return range
+            case "program_id":
+                return self._program.__getitem__
+            case "num_programs":
+                return lambda axis: self.convert(self._grid[axis], "i32")
+            case "zeros":
+                return lambda shape, dtype: self.constant(0, self._kind(dtype), tuple(shape))
+            case "full":
+                return lambda shape, x, dtype: self.splat(self.convert(self.block(x), self._kind(dtype)), tuple(shape))
+            case "zeros_like":
+                return lambda x: self.constant(0, x.kind, x.shape)
+            case "abs":
+                return lambda x: abs(x) if is_number(x) else self.absolute(x)
+            case "cumsum":
+                return lambda x, axis=0: self.running_sum(x) if x.shape[axis] == x.lanes else x
+            case "div_rn":
+                return self._exact_quotient
+            case "debug_barrier":  # the lanes of a program need not wait for each other here
+                return lambda: None
+        raise TranslationError(f"`tl.{name}` is not translated")
 
-    def _tl_load(self, pointer: Pointer, mask: Value = None, other: Value = None, **_: Value) -> Block:
-        return self.load(pointer, mask, other)
-
-    def _tl_store(self, pointer: Pointer, value: Value, mask: Value = None, **_: Value) -> None:
-        self.store(pointer, value, mask)
-
-    def _tl_atomic_add(self, pointer: Pointer, value: Value, mask: Value = None, **_: Value) -> Block:
-        return self.atomic("add", pointer, value, mask)
-
-    def _tl_atomic_max(self, pointer: Pointer, value: Value, mask: Value = None, **_: Value) -> Block:
-        return self.atomic("max", pointer, value, mask)
-
-    def _tl_debug_barrier(self) -> None:
-        """The lanes of a program need not wait for each other here."""
-
-    def _tl_program_id(self, axis: int) -> Block:
-        return self._program[axis]
-
-    def _tl_num_programs(self, axis: int) -> Block:
-        return self.convert(self._grid[axis], "i32")
-
-    def _tl_arange(self, start: int, end: int) -> Block:
-        return self.arange(start, end)
-
-    def _tl_zeros(self, shape: tuple[int, ...], dtype: Value) -> Block:
-        return self.constant(0, self._kind(dtype), tuple(shape))
-
-    def _tl_full(self, shape: tuple[int, ...], value: Value, dtype: Value) -> Block:
-        return self.splat(self.convert(self.block(value), self._kind(dtype)), tuple(shape))
-
-    def _tl_zeros_like(self, x: Block) -> Block:
-        return self.constant(0, x.kind, x.shape)
-
-    def _tl_where(self, condition: Value, x: Value, y: Value) -> Value:
-        return self.where(condition, x, y)
-
-    def _tl_maximum(self, x: Value, y: Value, propagate_nan: Value = None) -> Value:
-        return max(x, y) if is_number(x) and is_number(y) else self.extreme("max", x, y, _all(propagate_nan))
-
-    def _tl_minimum(self, x: Value, y: Value, propagate_nan: Value = None) -> Value:
-        return min(x, y) if is_number(x) and is_number(y) else self.extreme("min", x, y, _all(propagate_nan))
-
-    def _tl_abs(self, x: Value) -> Value:
-        return abs(x) if is_number(x) else self.absolute(x)
-
-    def _tl_sqrt(self, x: Value) -> Block:
-        return self.unary("sqrt", x)
-
-    def _tl_exp(self, x: Value) -> Block:
-        return self._function("exp", x)
-
-    def _tl_log(self, x: Value) -> Block:
-        return self._function("log", x)
+    def _extreme(self, which: str, x: Value, y: Value, propagate_nan: Value = None) -> Value:
+        if is_number(x) and is_number(y):
+            return max(x, y) if which == "max" else min(x, y)
+        name = propagate_nan.name if isinstance(propagate_nan, Name) else str(propagate_nan)
+        return self.extreme(which, x, y, name.endswith("ALL"))
 
     def _function(self, name: str, x: Value) -> Block:
         block = self.block(x)
@@ -637,30 +614,9 @@ class _Translator(Emitter):
             return self.unary(name, block)
         return (elementary.exp if name == "exp" else elementary.log)(self, block)
 
-    def _tl_sin(self, x: Value) -> Block:
-        return self.unary("sin", x)
-
-    def _tl_cos(self, x: Value) -> Block:
-        return self.unary("cos", x)
-
-    def _tl_floor(self, x: Value) -> Block:
-        return self.unary("floor", x)
-
-    def _tl_div_rn(self, x: Value, y: Value) -> Block:
+    def _exact_quotient(self, x: Value, y: Value) -> Block:
         a, b = self.matched(x, y)
         return Block(self.builder.fdiv(a.value, b.value), a.kind, a.shape)
-
-    def _tl_sum(self, x: Block, axis: int | None = None) -> Block:
-        return self.reduce("sum", x, axis)
-
-    def _tl_max(self, x: Block, axis: int | None = None) -> Block:
-        return self.reduce("max", x, axis)
-
-    def _tl_min(self, x: Block, axis: int | None = None) -> Block:
-        return self.reduce("min", x, axis)
-
-    def _tl_cumsum(self, x: Block, axis: int = 0) -> Block:
-        return self.running_sum(x) if x.shape[axis] == x.lanes else x
 
 
 @dataclass(frozen=True)
@@ -682,18 +638,6 @@ class _Address:
 @dataclass(frozen=True)
 class _Same:
     value: Any
-
-
-def _lanes(shape: tuple[int, ...]) -> int:
-    lanes = 1
-    for size in shape:
-        lanes *= size
-    return lanes
-
-
-def _all(propagate: Value) -> bool:
-    name = propagate.name if isinstance(propagate, Name) else str(propagate)
-    return name.endswith("ALL")
 
 
 def _plain(value: Any) -> Any:
