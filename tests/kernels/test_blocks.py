@@ -2,6 +2,7 @@
 
 import math
 
+import numpy as np
 import pytest
 import torch
 from torch.testing import assert_close
@@ -62,6 +63,8 @@ def _one(x, y, NAME: tl.constexpr):
         return tl.exp(x)
     if NAME == "logarithm":
         return tl.log(tl.abs(x))
+    if NAME == "plain logarithm":
+        return tl.log(x)
     if NAME == "sine":
         return tl.sin(x)
     if NAME == "cosine":
@@ -210,6 +213,33 @@ def test_functions(kind, block):
     whole = torch.arange(-9, 10, dtype=torch.int32)
     for found, exact in _rows(FUNCTIONS, whole, whole, torch.float32, block):
         assert_close(found.double(), exact(whole.double()), rtol=3e-7, atol=1e-12)
+
+
+def _off(name, x):
+    """The error of a function of float32, in units of the last place of the exact value."""
+    found, exact = _applied(name, x, x, torch.float32, 8).numpy(), FUNCTIONS[name](x.double()).numpy()
+    return np.abs(found - exact) / np.spacing(np.abs(exact).astype(np.float32)).astype(np.float64)
+
+
+def test_exp_and_log_are_within_two_units_of_the_last_place():
+    """Of denormal numbers, too."""
+    x = torch.cat([torch.linspace(-104, 88.72, 400_001), torch.linspace(-1, 1, 100_001), torch.tensor([1e-30, -1e-30])])
+    assert _off("exponential", x).max() < 2
+    draw = torch.Generator().manual_seed(1)
+    wide, near, nearest = (torch.rand(n, generator=draw, dtype=torch.float64) for n in (400_000, 200_000, 1000))
+    x = torch.cat([(191.7 * wide - 103).exp(), 0.5 + 1.5 * near, 1 + 1e-6 * nearest.mul(6).sub(3)]).float()
+    x = x[x > 0]
+    assert int((x < 2.0**-126).sum()) > 1000
+    assert _off("logarithm", x).max() < 2
+
+
+def test_special_numbers_of_exp_and_log(block):
+    x = torch.tensor([0.0, -0.0, INF, -INF, NAN, 1.0, 100.0, -110.0, 3e38, -3e38, -1.0])
+    expected = torch.tensor([1, 1, INF, 0, NAN, math.e, INF, 0, INF, 0, 1 / math.e])
+    _same(_applied("exponential", x, x, torch.float32, block), expected)
+    x = torch.tensor([0.0, -0.0, INF, -INF, NAN, 1.0, 100.0, 3e38, -1.0])
+    expected = torch.tensor([-INF, -INF, INF, NAN, NAN, 0, math.log(100), math.log(x[7]), NAN])
+    _same(_applied("plain logarithm", x, x, torch.float32, block), expected)
 
 
 # ---- comparisons and truth

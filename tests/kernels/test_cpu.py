@@ -205,37 +205,6 @@ def test_where_the_folder_is(given, expected, monkeypatch):
 
 
 @triton.jit
-def _walk(x, y, turns, BLOCK: tl.constexpr):
-    """Every number depends on all before it, so a program of a launch takes a while."""
-    k = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
-    found = tl.load(x + k)
-    for _turn in range(turns):
-        found = tl.sin(3.0 * found) + 0.1
-    tl.store(y + k, found)
-
-
-def _walked(n=1000):
-    x = torch.linspace(-1, 1, 8 * n)
-    y, z = torch.zeros(2, 8 * n)
-    with cpu.recording() as made:
-        launch(_walk, (n,))(x, y, 20, BLOCK=8)
-        launch(_walk, (n,))(y.flip(0), z, 5, BLOCK=8)
-    made.replay()
-    return y, z
-
-
-def test_threads_change_no_bit(use_threads):
-    ends = []
-    for number in (1, 2, 3, 1):
-        use_threads(number)
-        assert cpu.threads() == number
-        ends.append(_walked())
-    for y, z in ends[1:]:
-        assert torch.equal(y, ends[0][0])
-        assert torch.equal(z, ends[0][1])
-
-
-@triton.jit
 def _note_thread(out, turns):
     found = 0.0
     for k in range(turns):
