@@ -8,7 +8,7 @@ from gaussian_swaying.geometry.distance import DistanceGrid
 from gaussian_swaying.mpm.boundaries import BOUNDARIES
 from gaussian_swaying.mpm.laws import LAWS
 
-_MESH = str(Path(__file__).parent / "mpm" / "boundaries" / "octahedron.obj")
+MESH = str(Path(__file__).parent / "mpm" / "boundaries" / "octahedron.obj")
 
 ELASTIC = {
     "corotated": LAWS["FixedCorotated"](),
@@ -43,7 +43,7 @@ OBSTACLES = {
     "capsule that is a ball": lambda **more: BOUNDARIES["CapsuleObstacle"](*[[0.1, 0.2, 0.2]] * 2, 0.11, **more),
     "block": lambda **more: BOUNDARIES["BoxObstacle"]([0.0, 0.1, 0.2], [0.3, 0.3, 0.4], [20, 0, 40], **more),
     "ground": lambda **more: BOUNDARIES["HalfSpaceObstacle"]([0.1, 0.2, 0.2], [0.0, 0.3, 1.0], **more),
-    "mesh": lambda **more: BOUNDARIES["MeshObstacle"](_MESH, 12, [0.113, 0.207, 0.181], **more),
+    "mesh": lambda **more: BOUNDARIES["MeshObstacle"](MESH, 12, [0.113, 0.207, 0.181], **more),
     "still": _still,
 }
 

@@ -84,17 +84,6 @@ def test_forces_add_up(formulation, batch):
 
 
 @torch.no_grad()
-def test_one_force_several_or_none():
-    solver, start, wind = _setting()
-    alone = solver.rollout(start, DT, 2, wind)
-    assert torch.equal(solver.rollout(start, DT, 2, [wind]).velocity, alone.velocity)
-    assert torch.equal(solver.rollout(start, DT, 2, _push).velocity, solver.rollout(start, DT, 2, (_push,)).velocity)
-    calm = solver.rollout(start, DT, 2)
-    assert torch.equal(solver.rollout(start, DT, 2, []).velocity, calm.velocity)
-    assert not torch.equal(alone.velocity, calm.velocity)
-
-
-@torch.no_grad()
 def test_a_force_that_is_given_to_a_step_is_added_to_the_others():
     solver, start, wind = _setting()
     given = torch.randn_like(start.position)

@@ -1,27 +1,18 @@
 """Obstacles in the kernels against torch."""
 
-from pathlib import Path
-
 import pytest
 import torch
 from catalogue import OBSTACLES
-from shared import solid
 from torch.testing import assert_close
 
-from gaussian_swaying import MPMSolver, SimFrame
+from gaussian_swaying import SimFrame
 from gaussian_swaying.geometry.keyed_path import KeyedPath
 from gaussian_swaying.geometry.rotations import rotation_from_z
 from gaussian_swaying.kernels.launch import lanes, launch
-from gaussian_swaying.mpm.boundaries.ball import BallObstacle
-from gaussian_swaying.mpm.boundaries.block import BoxObstacle
-from gaussian_swaying.mpm.boundaries.capsule import CapsuleObstacle
-from gaussian_swaying.mpm.boundaries.mesh import MeshObstacle
-from gaussian_swaying.mpm.boundaries.plane import Plane
 from gaussian_swaying.mpm.triton import obstacle_kernels as kernels
 from gaussian_swaying.mpm.triton.obstacles import Solids
 
 DT = 1e-3
-MESH = str(Path(__file__).parent / "boundaries" / "octahedron.obj")
 
 
 def _path():
@@ -64,56 +55,3 @@ def test_distance_normal_and_velocity(kernel_device, name):
             assert bool((valid == float(obstacle.active(time))).all())
             ahead = distance - DT * (own * normal).sum(-1)  # the places are at rest
             assert within == int(bool(obstacle.active(time)) and float(torch.minimum(distance, ahead).min()) < 0.02)
-
-
-def _bodies(device, boundaries):
-    """A small block of particles, in torch and in the kernels, after some substeps from the same start."""
-    draw = torch.Generator().manual_seed(1)
-    position = (0.06 + 0.18 * torch.rand(12, 3, generator=draw)).to(device)
-    points = solid(position, 1e-4, 50.0)
-    velocity = torch.randn(12, 3, generator=draw).to(device)
-    ends = []
-    for transfer in ("torch", "kernels"):
-        solver = MPMSolver(dx=0.1, formulation="updated", transfer=transfer, boundaries=boundaries())
-        solver = solver.to(device)
-        state = solver.init_state(points, velocity)
-        for _ in range(3):  # on a GPU the last one is replayed
-            state = solver.rollout(state, DT, 2)
-        ends.append(state)
-    return solver, ends
-
-
-SETS = {
-    "at rest": lambda: [
-        BallObstacle([0.1, 0.1, 0.05], 0.06, 0.4),
-        Plane([0.0, 0.0, 0.13], [0.1, 0.0, 1.0], "separate", 0.2, end=3.5 * DT),
-        BoxObstacle([0.2, 0.05, 0.05], [0.3, 0.25, 0.15], [0.0, 0.0, 20.0], 0.3),
-    ],
-    "moving": lambda: [
-        CapsuleObstacle([0.05, 0.05, 0.1], [0.1, 0.2, 0.1], 0.05, path=_path(), start=1.5 * DT),
-        MeshObstacle(MESH, 8, [0.25, 0.25, 0.1], 0.5, path=_path()),
-    ],
-}
-
-
-@pytest.mark.parametrize("name", SETS)
-def test_nodes_are_stopped_as_in_torch(kernel_device, name):
-    solver, (expected, found) = _bodies(kernel_device, SETS[name])
-    assert len(solver.fused().solids.parts) == len(SETS[name]())
-    for field in ("position", "velocity", "F_total", "impulse"):
-        a, b = getattr(found, field), getattr(expected, field)
-        assert_close(a, b, rtol=0, atol=5e-5 * float(b.abs().max()))
-    free = _bodies(kernel_device, list)[1][0]
-    assert float((free.velocity - expected.velocity).abs().max()) > 0.05
-    assert bool((expected.impulse.abs().amax(-1) > 1e-5).all())
-
-
-def test_an_obstacle_of_a_user_runs_in_torch(kernel_device):
-    class Bumpy(BallObstacle):
-        def distance(self, place):
-            distance, normal = super().distance(place)
-            return distance - 0.01 * torch.sin(40 * place[..., 0]), normal
-
-    solver, (expected, found) = _bodies(kernel_device, lambda: [Bumpy([0.1, 0.1, 0.05], 0.06)])
-    assert solver.fused().solids.parts == []
-    assert_close(found.velocity, expected.velocity, rtol=0, atol=1e-4)

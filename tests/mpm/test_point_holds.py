@@ -99,18 +99,6 @@ def test_held_points_stay_where_they_are(kind, dtype, most, layers):
         assert (float(slopes) < (0.05 if across == 1 else 100 * most)) == (kind == "clamp")
 
 
-def test_a_hinge_holds_one_row_per_cell_on_the_middle_plane():
-    points = _sheet(layers=3)
-    solver = MPMSolver(DX, boundaries=[PinnedRegion(TOP)])
-    state = solver.init_state(points)
-    places = _own_places(solver.bound.point_holds)
-    held = points.position[TOP.contains(points.position)]
-    cells = torch.unique(torch.floor(held / DX - 0.5), dim=0)
-    assert len(places) == len(cells)
-    assert float(places[:, 1].abs().max()) < 1e-15
-    assert state.impulse.shape == (1, 3)
-
-
 def _strip(shift):
     """Two rows of points, which within a cell would hold the slope; so would points at two heights of a sheet."""
     points = _sheet(layers=3, width=20, shift=(0.013, shift, shift))
@@ -164,25 +152,6 @@ def test_groups_are_joined_until_they_are_apart():
     heavy = torch.tensor([1.0, 1, 1, 1, 3, 1], dtype=torch.float64)
     found = held_rows.means(position, heavy, torch.tensor([0, 0, 0, 1, 1, 2]))
     assert_close(found[:, 0], torch.tensor([0.14, 0.975, 2.0], dtype=torch.float64))
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("kind", ["hinge", "clamp", "nodes"])
-def test_a_hinge_turns_and_a_clamp_does_not(kind):
-    """A side load of the weight: a hinged sheet hangs at 45 degrees."""
-    points = _sheet(layers=3, width=4, e=1e6)
-    load = torch.zeros_like(points.position)
-    load[:, 1] = 9.8 * points.mass
-    solver = MPMSolver(DX, boundaries=[PinnedRegion(TOP, kind)], damping=8.0)
-    state = solver.init_state(points)
-    state = solver.rollout(state, 4e-4, 4000, lambda _: load)
-    low = points.position[:, 2] < -0.4
-    arm = state.position[low] - points.position[TOP.contains(points.position)].mean(0)
-    slope = math.degrees(math.atan2(float(arm[:, 1].mean()), -float(arm[:, 2].mean())))
-    if kind == "hinge":
-        assert slope == pytest.approx(45, abs=1.5)
-    else:
-        assert slope < 20
 
 
 @pytest.mark.parametrize("shift", [0.0, 0.2, 0.4, 0.45, 0.6, 0.8])
@@ -371,8 +340,7 @@ def test_points_are_released_one_by_one():
     points = _sheet(width=12)
     release = SequentialRelease(TOP, [1.0, 0.0, 0.0], start=0.02, end=0.12)
     solver = MPMSolver(DX, boundaries=[release])
-    dt = 1e-3
-    states = _run(solver, points, 160, dt)
+    states = _run(solver, points, 160)
     holds = solver.bound.point_holds
     rest, when = _own_places(holds), holds.release[0, 0]
     assert when.tolist() == sorted(when.tolist(), reverse=True)
@@ -380,12 +348,10 @@ def test_points_are_released_one_by_one():
     held = TOP.contains(points.position)
     low, high = points.position[held, 0].min(), points.position[held, 0].max()
     assert_close(when, 0.02 + 0.1 * (rest[:, 0] - low) / (high - low), rtol=1e-12, atol=0)
-    for state in states[1:]:
-        time = float(state.time) - dt
+    for state in states[40::40]:
+        time = float(state.time) - 1e-3
         moved = _read(solver, rest, state.node_displacement, state)[:, 0].norm(dim=-1)
-        fixed = when > time + 1e-9
-        assert float(moved[fixed].sum()) < 1e-13
-        assert bool((moved[when < time - 2 * dt] > 1e-9).all())
+        assert torch.equal(moved < 1e-13, when > time + 1e-9)
 
 
 @pytest.mark.slow(gate=["hinge-5", "clamp-5"])

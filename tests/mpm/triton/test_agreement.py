@@ -6,11 +6,13 @@ are in both.
 
 import pytest
 import torch
-from catalogue import ELASTIC, PLASTIC, conditions, made
+from catalogue import ELASTIC, MESH, PLASTIC, conditions, made
 
 from gaussian_swaying import AeroForce, WindField, WindForce
 from gaussian_swaying.aero.patches import Patches
+from gaussian_swaying.geometry.keyed_path import KeyedPath
 from gaussian_swaying.geometry.regions import Everything
+from gaussian_swaying.mpm.boundaries import BOUNDARIES as KINDS
 
 from .bodies import (
     DT,
@@ -38,6 +40,7 @@ SLOPE = made("Plane", [0.0, 0.0, 0.13], [0.1, 0.0, 1.0])
 FLOOR = made("Plane", [0.0, 0.0, 0.13], [0.0, 0.0, 1.0], "sticky")
 BOX = made("EnclosingBox", [0.1, 0.1, 0.1], [0.2, 0.2, 0.2], "slip", 0.2)
 ONE = made("PinnedPoints", [[0.2, 0.1, 0.1]])
+PATH = KeyedPath([DT, 30 * DT], [[0.0, 0.0, 0.0], [0.2, -0.1, 0.05]], [[0.0, 10.0, 20.0], [50.0, -20.0, 90.0]])
 BOUNDARIES = {
     "none": list,
     "pin": lambda: [NODES()],
@@ -83,6 +86,17 @@ POINT_HOLDS = {  # for `total` alone
         made("Handle", TOP, [0.5, 0.0, 0.2], [0.0, 30.0, 9.0], [0.1, 0.1, 0.1], "clamp", start=1.5 * DT)(),
     ],
 }
+OBSTACLES = {  # for `updated` alone, where they stop nodes
+    "obstacles": lambda: [
+        made("BallObstacle", [0.1, 0.1, 0.05], 0.06, 0.4)(),
+        SLOPE(kind="separate", friction=0.2, end=1.5 * DT),
+        made("BoxObstacle", [0.2, 0.05, 0.05], [0.3, 0.25, 0.15], [0.0, 0.0, 20.0], 0.3)(),
+    ],
+    "moving obstacles": lambda: [
+        made("CapsuleObstacle", [0.05, 0.05, 0.1], [0.1, 0.2, 0.1], 0.05, path=PATH, start=0.5 * DT)(),
+        made("MeshObstacle", MESH, 8, [0.25, 0.25, 0.1], 0.5, path=PATH)(),
+    ],
+}
 SEMI = {"drag_step": "semi_implicit"}
 LOSSES = {"gravity": (1.0, 2.0, -9.8), "damping": 20.0, "stiffness_damping": 2e-3}
 SCENES = [  # formulation, laws, boundaries, wind, other settings; `groups` are several patches on each point
@@ -113,7 +127,8 @@ SCENES = [  # formulation, laws, boundaries, wind, other settings; `groups` are 
     ("updated", ", ".join(ELASTIC), "none", {"law": "projected"}, {"groups": True}),
     ("updated", "neo-hookean, fluid, snow", "none", {}, {}),
     ("updated", "metal, foam, plasticine", "none", {}, {}),
-    ("updated", "corotated", "none", {"law": "cross_flow"}, {"groups": True}),
+    ("updated", "corotated", "obstacles", {"law": "cross_flow"}, {"groups": True}),
+    ("updated", "corotated", "moving obstacles", None, {}),
     ("updated", "corotated", "rigid part", None, {}),
     ("updated", "corotated", "none", None, {"damping": 0.0}),
     ("updated", "corotated", "release and plane", {}, {"batch": (2,)}),
@@ -178,7 +193,7 @@ def test_kernels_do_what_torch_does(kernel_device, scene):
         state = solver.rollout(state, DT, 1, load(90))
         return [state, solver.rollout(state, DT, 1 if boundaries == "none" else 2, load(130))]
 
-    make = (BOUNDARIES | POINT_HOLDS)[boundaries]
+    make = (BOUNDARIES | POINT_HOLDS | OBSTACLES)[boundaries]
     start = _settled if bends or boundaries == "rigid part" else set_going
     ends = run_both(points, run, formulation, start, boundaries=make(), **more)
     check_agreement(ends, TOLERANCE if kernel_device.type == "cuda" else 1e-8)
@@ -192,6 +207,22 @@ def test_kernels_do_what_torch_does(kernel_device, scene):
         with torch.no_grad():
             velocity = run(free, start(free, points))[1].velocity
         assert not torch.allclose(velocity, ends[0][1].velocity, rtol=1e-3)
+
+
+def test_an_obstacle_of_a_user_runs_in_torch(kernel_device):
+    class Bumpy(KINDS["BallObstacle"]):
+        def distance(self, place):
+            distance, normal = super().distance(place)
+            return distance - 0.01 * torch.sin(40 * place[..., 0]), normal
+
+    def run(solver, state):
+        assert solver.transfer == "torch" or solver.fused().solids.parts == []
+        return solver.rollout(state, DT, 3)
+
+    points = make_points(kernel_device, count=12)
+    ends = run_both(points, run, boundaries=[Bumpy([0.1, 0.1, 0.05], 0.06)])
+    check_agreement(ends)
+    assert float(ends[1].impulse.abs().max()) > 1e-4
 
 
 @pytest.mark.parametrize("formulation", FORMULATIONS)
