@@ -85,30 +85,30 @@ def _scalars(F_in, wave, energy, mu, lam, count, WAVE: tl.constexpr, ENERGY: tl.
     tl.store(energy + place, ENERGY(F, mu, lam), mask)
 
 
+def _turned(stretch, generator, device):
+    """Stretches (N, 3) between random rotations, in float32."""
+    turns = torch.linalg.qr(torch.randn(2, len(stretch), 3, 3, dtype=torch.float64, generator=generator))[0]
+    turns = turns * torch.linalg.det(turns)[..., None, None]
+    return (turns[0] @ stretch.diag_embed() @ turns[1].mT).float().to(device)
+
+
 def _matrices(device, unique=False):
     """Deformation gradients; with ``unique`` only those with a unique nearest rotation, far from others."""
     generator = torch.Generator().manual_seed(0)
-    turns = torch.linalg.qr(torch.randn(2, 900, 3, 3, dtype=torch.float64, generator=generator))[0]
-    turns = turns * torch.linalg.det(turns)[..., None, None]
-    special = torch.tensor(
-        [
-            [1.0, 1.0, 1.0], [2.0, 2.0, 1.0], [2.0, 1.0, 1.0], [1.0, 1.0 - 1e-6, 1.0 - 2e-6], [1.5, 0.7, 1e-3],
-            [1.5, 0.7, 1e-6], [3.0, 1e-2, 5e-3], [1.2, 1.0, -0.3], [1.2, 1.1, -0.02], [20.0, 1.0, 0.4],
-            [1.0001, 1.0, 0.9999], [0.051, 0.05, 0.049], [3.0, 0.9, -0.5], [1.5, 0.7, 0.0],
-        ],
-        dtype=torch.float64,
-    )  # fmt: skip
+    special = [
+        [1.0, 1.0, 1.0], [2.0, 2.0, 1.0], [2.0, 1.0, 1.0], [1.0, 1.0 - 1e-6, 1.0 - 2e-6], [1.5, 0.7, 1e-3],
+        [1.5, 0.7, 1e-6], [3.0, 1e-2, 5e-3], [1.2, 1.0, -0.3], [1.2, 1.1, -0.02], [20.0, 1.0, 0.4],
+        [1.0001, 1.0, 0.9999], [0.051, 0.05, 0.049], [3.0, 0.9, -0.5], [1.5, 0.7, 0.0],
+    ]  # fmt: skip
     if not unique:
-        more = [[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [1e-8, 1e-9, 1e-9], [1e4, 1e3, 1.0], [1.0, 1.0, -1.0]]
-        special = torch.cat([special, torch.tensor(more, dtype=torch.float64)])
-    stretch = special[torch.arange(900) % len(special)]
-    F = turns[0] @ stretch.diag_embed() @ turns[1].mT
+        special += [[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [1e-8, 1e-9, 1e-9], [1e4, 1e3, 1.0], [1.0, 1.0, -1.0]]
+    F = _turned(torch.tensor(special, dtype=torch.float64)[torch.arange(900) % len(special)], generator, device)
     random = torch.eye(3, dtype=torch.float64) + 0.4 * torch.randn(900, 3, 3, dtype=torch.float64, generator=generator)
     if unique:
-        values = torch.linalg.svdvals(random) * torch.tensor([1, 1, 1.0])
+        values = torch.linalg.svdvals(random)
         values[:, 2] *= torch.linalg.det(random).sign()
         random = random[values[:, 1] + values[:, 2] > 0.05]
-    return torch.cat([F, random]).float().to(device)
+    return torch.cat([F, random.to(F)])
 
 
 def _launch(kernel, count, *arguments, **options):
@@ -231,12 +231,16 @@ def _strained(device):
     stretch = torch.cat([free, thin, two, three, near, small])
     inverted = stretch.sort(-1, descending=True)[0] * torch.tensor([1.0, 1.0, -0.9], dtype=torch.float64)
     stretch = torch.cat([stretch, inverted])
-    turns = torch.linalg.qr(torch.randn(2, len(stretch), 3, 3, dtype=torch.float64, generator=generator))[0]
-    turns = turns * torch.linalg.det(turns)[..., None, None]
-    return (turns[0] @ stretch.diag_embed() @ turns[1].mT).float().to(device)
+    return _turned(stretch, generator, device)
 
 
 CASES = [(law, ratio) for law in ENERGIES for ratio in LAME if (law, ratio) != (ENERGIES[0], "auxetic")]
+
+
+def _wave_and_energy(law, F, mu, lam):
+    found, functions = F.new_empty(2, len(F)), functions_of(law)
+    _launch(_scalars, len(F), F, *found, mu, lam, WAVE=functions.wave, ENERGY=functions.energy)
+    return found
 
 
 @pytest.mark.parametrize(("law", "ratio"), CASES, ids=lambda x: x if isinstance(x, str) else type(x).__name__)
@@ -249,8 +253,7 @@ def test_wave_modulus_and_energy(kernel_device, law, ratio):
     """
     mu, lam = LAME[ratio]
     F = _strained(kernel_device)
-    wave, energy = F.new_empty(len(F)), F.new_empty(len(F))
-    _launch(_scalars, len(F), F, wave, energy, mu, lam, WAVE=functions_of(law).wave, ENERGY=functions_of(law).energy)
+    wave, energy = _wave_and_energy(law, F, mu, lam)
     wide = F.double()
     parameters = [torch.full_like(wide[:, 0, 0], value) for value in (mu, lam)]
     values = linalg.svd3(wide)[1]
@@ -274,9 +277,7 @@ def test_what_is_not_finite_has_no_modulus(kernel_device, law):
     F = torch.eye(3, device=kernel_device).repeat(18, 1, 1)
     F.view(18, 9)[range(9), range(9)] = math.nan
     F.view(18, 9)[range(9, 18), range(9)] = math.inf
-    wave, energy = F.new_zeros(len(F)), F.new_zeros(len(F))
-    _launch(_scalars, len(F), F, wave, energy, MU, LAM, WAVE=functions_of(law).wave, ENERGY=functions_of(law).energy)
-    assert not bool(torch.isfinite(wave).any())
+    assert not bool(torch.isfinite(_wave_and_energy(law, F, MU, LAM)[0]).any())
 
 
 def test_which_energy_holds_for_a_body():

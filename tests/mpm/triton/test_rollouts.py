@@ -3,6 +3,7 @@
 import gc
 import math
 import weakref
+from functools import partial
 
 import pytest
 import torch
@@ -184,17 +185,20 @@ def test_replayed_rollouts_give_the_same_bits(kernel_device, case, monkeypatch):
         assert torch.equal(getattr(again, name), value), name
 
 
-@pytest.mark.slow(gate=["cpu-played"])
+@pytest.mark.slow(gate=["total-cpu-played", "updated-cpu-played"])
 @pytest.mark.parametrize("kind", ["as on the device", "played"])
-def test_a_replayed_rollout_follows_what_changes(kernel_device, kind, monkeypatch):
-    """Numbers of the wind and patches that change in place, and a force that is another one.
+@pytest.mark.parametrize("formulation", FORMULATIONS)
+def test_a_replayed_rollout_follows_what_changes(kernel_device, formulation, kind, monkeypatch):
+    """Numbers of the wind and patches that change in place, a force that is another one, the substep, time and grid.
 
     A played graph runs what was recorded, with what the recording knew of its first rollout.
     """
     if kind == "played" and kernel_device.type == "cuda":
         pytest.skip("on this device graphs are real")
     points = make_points(kernel_device, count=12)
-    load, other = make_load(points), make_load(points, seed=7)
+    schedule = WindField(schedule=[FlowKey(0.005, [30.0, 0.0, 0.0])])
+    load, other = make_load(points), make_load(points, schedule, seed=7, C_D=2.0)
+    turning = Handle(LEFT, [0.5, 0.0, 0.2], [0.0, 9.0, 3.0], [0.1, 0.1, 0.1], start=1e-4, end=5.5 * DT)
     if kind == "played":
         monkeypatch.setattr(graphs, "record", lambda device, work, pool, stream: _Played(work))
         monkeypatch.setattr(torch.cuda, "Stream", lambda device: None)
@@ -213,51 +217,19 @@ def test_a_replayed_rollout_follows_what_changes(kernel_device, kind, monkeypatc
         states += [solver.rollout(state, DT, 2, load) for _ in range(3)]
         states += [solver.rollout(state, DT, 2, other) for _ in range(3)]
         states += [solver.rollout(states[-1], 0.7 * DT, steps, load) for steps in (5, 3, 1, 4)]
+        last = states[-1]
+        if formulation == "updated":
+            last = last.replace(grid=GridSpec(DX, (-2, -2, -2), (8, 8, 9)))
+        states += [solver.rollout(last, DT, 2, forces) for forces in (load, None, load)]
         load.area /= 2
         load.aero.C_D -= 1.0
         load.wind.seed = 0
         load.wind.flows *= 2
         return states
 
-    check_agreement(run_both(points, run, "total"))
-
-
-@pytest.mark.parametrize(
-    ("kernel_device", "boundary"),
-    [*on_each("handle"), pytest.param("cuda", None, marks=pytest.mark.gpu)],
-    indirect=["kernel_device"],
-)
-@pytest.mark.parametrize("formulation", FORMULATIONS)
-def test_nothing_is_left_of_former_rollouts(kernel_device, formulation, boundary):
-    """Rollouts of the same kind share a recorded graph: the wind, its coefficients, patches, substep and time are new.
-
-    The second of a kind is recorded, the third is replayed. If nothing is compiled there are buffers but no graphs.
-    """
-    count = 23 if kernel_device.type == "cuda" else 1
-    points = make_points(kernel_device, count=12)
-    turning = Handle(LEFT, [0.5, 0.0, 0.2], [0.0, 9.0, 3.0], [0.1, 0.1, 0.1], start=1e-4, end=2.5e-4 * count)
-    solvers = [
-        make_solver(transfer, formulation, boundaries=[] if boundary is None else [turning])
-        for transfer in ("torch", "kernels")
-    ]
-    state = set_going(solvers[0], points, strain=0.02)
-    set_going(solvers[1], points)
-    winds = [WIND, WIND, WIND, WindField([0.0, -40.0, 5.0]), WindField(schedule=[FlowKey(0.005, [30.0, 0.0, 0.0])])]
-    for k, wind in enumerate(winds):
-        if k in (1, 2) and kernel_device.type == "cpu":
-            continue
-        load = make_load(points, wind, seed=4 if k < 4 else 11, C_D=0.5 + k)
-        dt = [1e-4, 1e-4, 5e-5, 1e-4, 7e-5][k]
-        if formulation == "updated":
-            state = state.replace(grid=GridSpec(DX, (-2, -2, -2), (8, 8, 8 if k < 4 else 9)))
-        expected, found = (solver.rollout(state, dt, count, load) for solver in solvers)
-        check_agreement([expected, found], tolerance=1e-4)
-        state = expected  # or the errors add up
-        if k == 3 and kernel_device.type == "cuda":
-            assert any(solvers[1].fused().repeater._graphs.values())
-    # a rollout without wind is another kind
-    check_agreement([solver.rollout(state, 1e-4, 2) for solver in solvers])
-    check_agreement([solver.rollout(state, 1e-4, 2, load) for solver in solvers])
+    start = partial(set_going, strain=0.02)
+    ends = run_both(points, run, formulation, start, boundaries=[turning] if formulation == "updated" else [])
+    check_agreement(ends, tolerance=1e-4)
 
 
 def test_a_grid_that_comes_back(kernel_device):
