@@ -189,10 +189,10 @@ def _refused(solver, state, forces=(), match=""):
         solver.rollout(state, DT, 1, list(forces))
 
 
-def _free(device, **settings):
+def _free(device, material=(), **settings):
     """A solver of a sheet and its first state, whose nodal velocity requires a gradient."""
     place = _place().to(device, torch.float32)
-    points = solid(place, 1e-4, 80.0)
+    points = solid(place, 1e-4, 80.0, **dict(material))
     solver = MPMSolver(dx=DX, transfer="kernels", **settings)
     state = solver.init_state(points)
     return solver, state.replace(node_velocity=state.node_velocity.clone().requires_grad_())
@@ -224,6 +224,11 @@ def test_kernels_refuse_what_they_do_not_cover(kernel_device):
     ball = BallObstacle([0.2, 0.15, -0.1], 0.05)
     for boundary in (floor, ball):
         _refused(*_free(kernel_device, boundaries=[boundary]), match="pins that hold all the time, and contact")
+    for material, match in (
+        ({"normal": normal, "bending": 1e-4}, "sheets of one layer that bend"),
+        ({"attached": torch.arange(count, device=kernel_device) % 2}, "virtual nodes"),
+    ):
+        _refused(*_free(kernel_device, material), match=match)
     place = solver.points.position.clone().requires_grad_()
     solver.init_state(dataclasses.replace(solver.points, position=place))
     _refused(solver, state, match="rest positions")
