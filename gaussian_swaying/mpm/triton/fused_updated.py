@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from typing import Any
 
 import torch
@@ -139,7 +140,7 @@ class FusedUpdated(Fused):
                 self.node_position = grid.node_positions(self.velocity)
 
     def _run(self, state: MPMState, part: Part) -> dict[str, Any]:
-        steps, options, looks = part.steps, part.options, part.looks
+        steps, options, looks, real = part.steps, part.options, part.looks, self.like["dtype"]
         part.begin(steps)
         self._take_grid(state.grid, 8 if options["IMPLICIT"] else 4)
         self.impulse.zero_()
@@ -169,7 +170,8 @@ class FusedUpdated(Fused):
         self._measure_crossing()
         if self.turns:
             self.impulse.add_(self._pressed().view_as(self.impulse))
-        return {**self._read(state), "impulse": self.impulse, **({"work": self._work()} if part.loaded else {})}
+        found = self._read(lambda name, *shape, dtype=None: torch.empty(shape, **self.like | {"dtype": dtype or real}))
+        return {**found, "impulse": self.impulse, **({"work": self._work()} if part.loaded else {})}
 
     def _sorted_for(self) -> int:
         """Return the number of substeps between sorts, from the speed at the end of the last finished rollout.
@@ -367,49 +369,24 @@ class FusedUpdated(Fused):
         shape = (*mass.shape[:-1], grid.node_count)
         return (weight * self.inverse_mass[:nodes]).reshape(shape)
 
-    def _read(self, state: MPMState) -> dict[str, Any]:
-        position, velocity = (torch.empty(state.position.shape, **self.like) for _ in range(2))
-        affine, F = (torch.empty(state.F_elastic.shape, **self.like) for _ in range(2))
-        F_total = torch.empty_like(F) if self.plastic else F
-        lost = torch.empty(state.lost.shape, dtype=torch.bool, device=self.device)
-        internal = None if state.internal is None else torch.empty(state.internal.shape, **self.like)
-        return self._read_into(position, velocity, affine, F, F_total, lost, internal)
-
-    def _read_into(
-        self,
-        position: Tensor,
-        velocity: Tensor,
-        affine: Tensor,
-        F: Tensor,
-        F_total: Tensor,
-        lost: Tensor,
-        internal: Tensor | None,
-    ) -> dict[str, Any]:
+    def _read(self, room: Callable[..., Tensor]) -> dict[str, Any]:
+        """Particle fields, in tensors that ``room`` makes for a name and a shape."""
+        shape = self.body.points.position.shape
+        fields: dict[str, Any] = {name: room(name, *shape) for name in ("position", "velocity")}
+        fields |= {name: room(name, *shape, 3) for name in ("affine", "F_elastic")}
+        fields["F_total"] = room("F_total", *shape, 3) if self.plastic else fields["F_elastic"]
+        fields["lost"] = room("lost", *shape[:-1], dtype=torch.bool)
+        fields["internal"] = room("internal", *shape[:-1]) if self.internal else None
         block = lanes(self.device, 128)
         launch(kernels.updated_read, (-(-self.count // block),))(
-            self.order, self.moving, self.count, position, velocity, affine, F, F_total, lost,
-            self.load if internal is None else internal,
-            PLASTIC=self.plastic, INTERNAL=internal is not None, BLOCK=block, num_warps=4,
+            self.order, self.moving, self.count, *list(fields.values())[:-1],
+            fields["internal"] if self.internal else self.load,
+            PLASTIC=self.plastic, INTERNAL=self.internal, BLOCK=block, num_warps=4,
         )  # fmt: skip
-        return {
-            "position": position,
-            "velocity": velocity,
-            "affine": affine,
-            "F_elastic": F,
-            "F_total": F_total,
-            "lost": lost,
-            "internal": internal,
-        }
+        return fields
 
     def _look_at(self) -> MPMState:
-        shape = self.body.points.position.shape
-        position, velocity = (self._room(name, *shape) for name in ("position", "velocity"))
-        affine, F = (self._room(name, *shape, 3) for name in ("affine", "F"))
-        F_total = self._room("F_total", *shape, 3) if self.plastic else F
-        lost = self._room("lost", *shape[:-1], dtype=torch.bool)
-        internal = self._room("internal", *shape[:-1]) if self.internal else None
-        fields = self._read_into(position, velocity, affine, F, F_total, lost, internal)
-        return MPMState(**fields, time=self.time, grid=self.grid)
+        return MPMState(**self._read(self._room), time=self.time, grid=self.grid)
 
 
 def _pins(boundary: Boundary, held: Held) -> bool:

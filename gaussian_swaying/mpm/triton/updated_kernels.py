@@ -122,6 +122,16 @@ def _locate(x, dx, o, n):
     return first, tl.where(fits, f, 1.0), fits
 
 
+@triton.jit
+def _stencil(x, mask, scene, ox, oy, oz, nx, ny, nz, dx):
+    """First node around some places, their place in its cell, and whether the grid has all of their nodes."""
+    bx, fx, okx = _locate(x[0], dx, ox, nx)
+    by, fy, oky = _locate(x[1], dx, oy, ny)
+    bz, fz, okz = _locate(x[2], dx, oz, nz)
+    inside = mask & okx & oky & okz
+    return tl.where(inside, (bx * ny + by) * nz + bz, 0) + scene * (nx * ny * nz), fx, fy, fz, inside
+
+
 @triton.jit(do_not_specialize=VARIES)
 def updated_particles(
     moving, order, load, count,
@@ -165,11 +175,7 @@ def updated_particles(
         F_total = F
     stress = F
     if GATHER:
-        bx, fx, okx = _locate(x[0], dx, ox, nx)
-        by, fy, oky = _locate(x[1], dx, oy, ny)
-        bz, fz, okz = _locate(x[2], dx, oz, nz)
-        inside = mask & okx & oky & okz
-        node = tl.where(inside, (bx * ny + by) * nz + bz, 0) + scene * (nx * ny * nz)
+        node, fx, fy, fz, inside = _stencil(x, mask, scene, ox, oy, oz, nx, ny, nz, dx)
         wz, gz = axis_weights(fz, inverse_dx)
         if WIDE:  # it reads under no mask
             wz = (tl.where(inside, wz[0], 0.0), tl.where(inside, wz[1], 0.0), tl.where(inside, wz[2], 0.0))
@@ -218,11 +224,8 @@ def updated_particles(
         if VISCOUS:
             viscous = kelvin_voigt_pk1(F, matmul(C, F), mu, lam, viscous_time)
             stress = axpy9(1.0, stress, 1.0, matmul(viscous, transpose(F)))
-        bx, fx, okx = _locate(x[0], dx, ox, nx)
-        by, fy, oky = _locate(x[1], dx, oy, ny)
-        bz, fz, okz = _locate(x[2], dx, oz, nz)
-        inside = mask & okx & oky & okz
-        node = tl.where(inside, (bx * ny + by) * nz + bz + scene * (nx * ny * nz), -1)
+        first, fx, fy, fz, inside = _stencil(x, mask, scene, ox, oy, oz, nx, ny, nz, dx)
+        node = tl.where(inside, first, -1)
         wz, gz = axis_weights(fz, inverse_dx)
         pull = -kick * volume
         if IMPLICIT:
@@ -505,7 +508,8 @@ def updated_pin(
     where = tl.load(order + index, mask, 0)
     held = mask & (tl.load(pinned + where, mask, 0) > 0)
     if tl.sum(held.to(tl.int32)) > 0:
-        node, fx, fy, fz, inside = _stencil(moving, index, count, where, held, ox, oy, oz, nx, ny, nz, dx, scene_size)
+        x = load3(moving, count, index, held)
+        node, fx, fy, fz, inside = _stencil(x, held, where // scene_size, ox, oy, oz, nx, ny, nz, dx)
         number = tl.zeros([BLOCK], tl.int32) + tl.load(first_step) + step_offset + 1
         wz, _gz = axis_weights(fz, 1.0)
         for i in range(3):
@@ -515,17 +519,6 @@ def updated_pin(
                 to = marks + node + (i * ny + j) * nz
                 for k in tl.static_range(3):
                     tl.store(to + k, number, inside & (wx * wy * wz[k] > 0))
-
-
-@triton.jit
-def _stencil(moving, index, count, where, mask, ox, oy, oz, nx, ny, nz, dx, scene_size):
-    """First node around some particles, their place in its cell, and whether the grid has all of their nodes."""
-    bx, fx, okx = _locate(tl.load(moving + index, mask, 0.0), dx, ox, nx)
-    by, fy, oky = _locate(tl.load(moving + count + index, mask, 0.0), dx, oy, ny)
-    bz, fz, okz = _locate(tl.load(moving + 2 * count + index, mask, 0.0), dx, oz, nz)
-    inside = mask & okx & oky & okz
-    node = tl.where(inside, (bx * ny + by) * nz + bz, 0) + (where // scene_size) * (nx * ny * nz)
-    return node, fx, fy, fz, inside
 
 
 @triton.jit(do_not_specialize=VARIES)
@@ -620,7 +613,8 @@ def pin_mass(moving, order, pinned, weight, count, ox, oy, oz, nx, ny, nz, dx, s
         where = tl.load(order + index, mask, 0)
         mass = tl.load(pinned + where, mask, 0.0)
         mask = mask & (mass > 0)
-        node, fx, fy, fz, inside = _stencil(moving, index, count, where, mask, ox, oy, oz, nx, ny, nz, dx, scene_size)
+        x = load3(moving, count, index, mask)
+        node, fx, fy, fz, inside = _stencil(x, mask, where // scene_size, ox, oy, oz, nx, ny, nz, dx)
         wz, _gz = axis_weights(fz, 1.0)
         for i in range(3):
             wx, _gx = node_weight(fx, i, 1.0)
