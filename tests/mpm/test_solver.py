@@ -168,13 +168,6 @@ def test_work_is_what_the_force_adds_to_the_energy(formulation):
     assert_close(state.velocity, (0.02 * pull).expand_as(state.velocity), rtol=1e-9, atol=1e-12)
 
 
-def test_grid_that_grows_too_large_is_refused(monkeypatch):
-    monkeypatch.setattr("gaussian_swaying.mpm.formulations.formulation.MAX_NODES", 100)
-    points = _block(count=20)
-    with pytest.raises(ValueError, match=r"more than 100:"):
-        MPMSolver(dx=0.05).init_state(points)
-
-
 @pytest.mark.parametrize("formulation", FORMULATIONS)
 def test_state_dict_round_trip(formulation, tmp_path):
     solver = MPMSolver(dx=0.1, formulation=formulation, boundaries=[PinnedRegion(Box([None, None, 0.35], [None] * 3))])

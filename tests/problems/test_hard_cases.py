@@ -365,14 +365,6 @@ def test_a_sheet_coarser_than_its_grid_is_reported():
         _advance(_flag(WindField(), "updated", dx=0.025, width=0.4, gravity=UP), 3)
 
 
-def test_a_sheet_coarser_than_its_grid_is_filled():
-    """In `total` extra points fill the holes, and the same sheet hangs on its pole."""
-    simulation = _flag(WindField(), "total", dx=0.025, width=0.4, gravity=UP)
-    assert simulation.scene.further > 100
-    _, log = _advance(simulation, 3)
-    assert log[-1].stretch_max < 1.5
-
-
 @pytest.mark.parametrize("formulation", FORMULATIONS)
 @pytest.mark.parametrize("side", [0.08, 1e-3, 1e-6])
 def test_a_body_within_one_cell(side, formulation):
@@ -592,16 +584,6 @@ def test_a_body_that_spreads_beyond_the_largest_grid_is_reported(monkeypatch):
     assert 0 < info.value.time < 0.1
 
 
-def test_a_grid_too_large_for_the_speed_names_the_speed():
-    """A small body at 10 km/s needs a grid for where it may go: its own span is not to blame."""
-    simulation = _simulation(_points(_lattice(2, 2, 2)), formulation="updated", frame_dt=0.04)
-    with pytest.raises(
-        SimulationDiverged,
-        match=r"may fly .* m in any direction within a frame, at 1e\+04 m/s, .* more than 64,000,000",
-    ):
-        _advance(simulation, 1, _throw(simulation, [1e4, 0.0, 0.0]))
-
-
 @pytest.mark.slow(gate=["FixedCorotated-total", "NeoHookean-updated"])
 @pytest.mark.parametrize(
     ("law", "formulation"),
@@ -639,11 +621,9 @@ def test_many_steps_of_nothing(formulation, steps):
 
 
 @pytest.mark.parametrize("formulation", FORMULATIONS)
-def test_a_huge_fixed_substep_is_refused(formulation):
-    """At the start with a ValueError, and when the material stiffens on the way with a divergence that names it."""
+def test_a_fixed_substep_that_becomes_too_long_is_refused(formulation):
+    """When the material stiffens on the way, with a divergence that names it."""
     points = _points(_lattice(3, 3, 3), law=KINDS["NeoHookean"]())
-    with pytest.raises(ValueError, match=r"`substep` of 10 s is longer than the stable one of 0.00\d+ s"):
-        _simulation(points, formulation=formulation, substep=10.0).start()
     simulation = _simulation(points, formulation=formulation, substep=2.5e-3)
     state = simulation.start()
     F = state.F_elastic.clone()

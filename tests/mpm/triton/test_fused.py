@@ -3,6 +3,7 @@
 import dataclasses
 import gc
 import weakref
+from contextlib import nullcontext
 
 import pytest
 import torch
@@ -196,32 +197,22 @@ def test_what_the_kernels_cannot_do(kernel_device, what):
         MPMSolver(dx=DX, transfer="kernels").init_state(points)
 
 
-def test_sums_without_a_fixed_order_are_not_deterministic(kernel_device):
-    """On a GPU; on a CPU they always have one."""
-    points = make_points(kernel_device)
-    solver = MPMSolver(dx=DX, formulation="updated", deterministic=True)
-    solver.init_state(points)
-    assert (solver.fused() is None) == (kernel_device.type == "cuda")
-    solver = MPMSolver(dx=DX, formulation="updated", deterministic=True, transfer="kernels")
-    if kernel_device.type == "cuda":
-        with pytest.raises(ValueError, match="sums have no fixed order"):
-            solver.init_state(points)
-    else:
-        solver.init_state(points)
-        assert solver.fused() is not None
-
-
-@pytest.mark.parametrize("formulation", FORMULATIONS)
-def test_who_computes_a_substep(kernel_device, formulation):
-    points = make_points(kernel_device)
-    for transfer, has_kernels in (("auto", True), ("torch", False)):
-        solver = MPMSolver(dx=DX, formulation=formulation, transfer=transfer)
+def test_who_computes_a_substep(kernel_device):
+    """On a GPU sums of ``updated`` have no fixed order; on a CPU they always have one."""
+    points, ordered = make_points(kernel_device), kernel_device.type == "cpu"
+    for formulation, settings, has_kernels in (
+        *((formulation, {}, True) for formulation in FORMULATIONS),
+        *((formulation, {"transfer": "torch"}, False) for formulation in FORMULATIONS),
+        ("total", {"deterministic": True}, True),
+        ("updated", {"deterministic": True}, ordered),
+    ):
+        solver = MPMSolver(dx=DX, formulation=formulation, **settings)
         solver.init_state(points)
         assert (solver.fused() is not None) == has_kernels
-        assert solver.deterministic is False
-    solver = MPMSolver(dx=DX, deterministic=True)
-    solver.init_state(points)
-    assert solver.fused() is not None
+        assert solver.deterministic == ("deterministic" in settings)
+    solver = MPMSolver(dx=DX, formulation="updated", deterministic=True, transfer="kernels")
+    with nullcontext() if ordered else pytest.raises(ValueError, match="sums have no fixed order"):
+        solver.init_state(points)
 
 
 def test_another_material_needs_other_buffers(kernel_device):
