@@ -1,5 +1,8 @@
 """What tests of several rooms share: draws, material, a small flag, the files of a folder, how a command refuses."""
 
+import warnings
+from contextlib import contextmanager
+
 import torch
 
 from gaussian_swaying import MaterialPoints
@@ -30,6 +33,28 @@ def advanced(simulation, frames, state=None):
         state, health = simulation.advance(state)
         log.append(health)
     return state, log
+
+
+@contextmanager
+def without_waits():
+    """Raise an error where the host waits for the GPU."""
+    torch.cuda.set_sync_debug_mode("error")
+    try:
+        yield
+    finally:
+        torch.cuda.set_sync_debug_mode("default")
+
+
+def waits(work):
+    """How often the host waits for the GPU in some work."""
+    torch.cuda.set_sync_debug_mode("warn")
+    try:
+        with warnings.catch_warnings(record=True) as told:
+            warnings.simplefilter("always")
+            work()
+    finally:
+        torch.cuda.set_sync_debug_mode("default")
+    return sum("synchroniz" in str(warning.message) for warning in told)
 
 
 def solid(position, volume, density=100.0, E=1e4, nu=0.3, **more):

@@ -5,6 +5,7 @@ import math
 
 import pytest
 import torch
+from shared import without_waits
 
 from gaussian_swaying.rendering.cameras.camera import Camera, look_at_camera, orbit_camera
 
@@ -31,13 +32,10 @@ def test_a_camera_goes_to_the_gpu_without_a_wait():
     """Matrices and eye in one copy; the eye, computed in float64 before, is as near as float32 can hold it."""
     camera = look_at_camera((1e3, -3, 2), (0.5, 0.2, 0.1), (0, 0, 1), 35.0, 64, 48, dtype=torch.float64)
     camera.to("cuda", torch.float32)
-    torch.cuda.set_sync_debug_mode("error")
-    try:
+    with without_waits():
         moved = camera.to("cuda", torch.float32)
         assert moved.to(moved.intrinsics.device, torch.float32) is moved
         eye = moved.position
-    finally:
-        torch.cuda.set_sync_debug_mode("default")
     assert torch.equal(eye.cpu(), camera.position.float())
     for name in ("world_to_camera", "intrinsics"):
         assert torch.equal(getattr(moved, name).cpu(), getattr(camera, name).float())
