@@ -157,9 +157,9 @@ def kind_of(
         if tall < STANDS_LOW * wide:
             return "succulent", "it stands in a pot, wider than high"
         return "plant", "it stands in a pot"
-    if "cloth" in names or (sheet and end == "side"):
+    if "pole" in names or (sheet and end == "side"):
         return "flag", "a sheet that is held at one side"
-    if sheet:
+    if sheet or "cloth" in names:
         return "cloth", "a sheet"
     if end == "top":
         return "hanging", "it is held at its top"

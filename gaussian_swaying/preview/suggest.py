@@ -41,7 +41,14 @@ from gaussian_swaying.preview.shape import (
     rounded,
     sheet_normal,
 )
-from gaussian_swaying.preview.supports import flag_on_pole, hanging_parts, potted_parts, standing_parts, swinging_parts
+from gaussian_swaying.preview.supports import (
+    flag_on_pole,
+    hanging_parts,
+    potted_parts,
+    sheet_between_posts,
+    standing_parts,
+    swinging_parts,
+)
 from gaussian_swaying.preview.up import UpGuess, given_up, guess_up
 from gaussian_swaying.simulation.extent import suggest_spacing
 from gaussian_swaying.simulation.simulation import Simulation
@@ -53,6 +60,7 @@ CLOTH_E, CLOTH_THICKNESS = 6e3, 0.01  # Pa, m; a sheet: the cloth of the paper's
 SHELL_E = 1e6  # Pa; of everything else, until its frequency is known
 THRESHOLDS = (0.1, 0.05, 0.02, 0.01, 0.0)  # of opacity; the first is the paper's
 KEPT_AREA = 0.95  # share of the visible area that the threshold must keep
+POSTS = 2.5  # usual length of a washing line with its posts [m]
 MAX_BOXES = 8  # largest number of boxes that cut specks out of the region
 
 
@@ -294,11 +302,13 @@ def suggest(
         chosen = given_region(means, opacity, weight, *region)
     plant = plant_parts(cloud, chosen.simulated, upward.direction, weight) if hold is None else None
     flag = flag_on_pole(cloud, chosen.simulated, upward.direction) if hold is None and plant is None else None
+    alone = hold is None and plant is None and flag is None
+    laundry = sheet_between_posts(cloud, chosen.simulated, upward.direction) if alone else None
     frame = SimFrame.fit(means[chosen.simulated], upward.direction, longest_side)
     if plant is not None and upward.confidence in ("low", "medium"):
         why = [*upward.reasons, "a plant stands in a pot at the lower end"]
         upward = replace(upward, confidence="high", reasons=why)
-    found_parts = plant if flag is None else flag.found
+    found_parts = plant or laundry if flag is None else flag.found
     if found_parts is not None:  # the length is that of the whole, with pot or pole and without the ground around it
         frame = SimFrame.fit(means[chosen.simulated & ~found_parts.around], upward.direction, longest_side)
         chosen = replace(chosen, simulated=chosen.simulated & ~found_parts.still)
@@ -314,6 +324,8 @@ def suggest(
         held = HoldGuess("bottom", down, "medium", f"a plant in a pot: {plant.reason}")
     elif flag is not None:
         held = HoldGuess("side", flag.side, "high", f"a flag on its pole: {flag.found.reason}")
+    elif laundry is not None:
+        held = HoldGuess("top", tuple(upward.direction), "high", f"on a line: {laundry.reason}")
     elif hold is None:
         rest = means[~chosen.simulated & (opacity >= chosen.opacity_threshold)]
         eyes = None if capture is None else capture.eyes
@@ -346,7 +358,7 @@ def suggest(
         )
         pin = None
     if unscaled:
-        ratio = KINDS[name].side
+        ratio = KINDS[name].side if laundry is None else POSTS
         frame = SimFrame.fit(means[chosen.simulated], upward.direction, None, frame.metres_per_unit * ratio)
         metres, spacing, longest_side = metres * ratio, spacing * ratio, longest_side * ratio
         dx = suggest_spacing(longest_side, spacing, CELLS)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import groupby
 
 import torch
 from torch import Tensor
@@ -21,6 +22,8 @@ BARE = 0.08  # share of the slices in which a pole is to be seen alone
 CLOTH = 0.3  # width of a slice with cloth, as a share of the widest
 OUTSIDE = 0.02  # share of the Gaussians of a flag that may lie on the other side of its pole
 RIPPLED = 0.35  # depth of a flag over its length, seen from above
+COLUMNS, LEVELS = 50, 20  # in which the posts of a washing line are looked for
+THICK, ARM, HEM = 0.12, 0.1, 0.05  # width of a post and of its foot and arms beside it; height of the hem, as shares
 FOOT = 5  # slices in which the ground around a trunk may be wide
 RIM, POT = (0.25, 0.8), 0.15  # height of the rim of a pot, as a share of all; green share of what is below it
 TRUNK, CROWN = 0.12, 0.5  # height of a bare trunk, as a share of that of the tree; green share of what is above
@@ -56,19 +59,9 @@ def flag_on_pole(cloud: GaussianCloud, simulated: Tensor, up: Sequence[float]) -
     index = simulated.nonzero()[:, 0]
     means = cloud.means.detach()[index].double()
     axis = torch.tensor(list(up), dtype=torch.float64)
-    normal = sheet_normal(means)
-    if normal is None:  # a foot makes the whole no sheet, and ripples the cloth
-        upper = means @ axis
-        cloth = means[upper > 0.5 * (quantile(upper, 0.01) + quantile(upper, 0.99))]
-        level = cloth - cloth.mean(0)
-        level = level - (level @ axis)[:, None] * axis
-        values, axes = torch.linalg.eigh(torch.cov(level.T))  # the first is upright
-        if float(values[1].clamp(min=0) / values[2].clamp(min=1e-30)) < RIPPLED**2:
-            normal = tuple(axes[:, 1].tolist())
-    if normal is None or abs(float(torch.tensor(normal, dtype=torch.float64) @ axis)) > 0.3:
+    aside = _along_sheet(means, axis)
+    if aside is None:
         return None
-    aside = torch.linalg.cross(axis, torch.tensor(normal, dtype=torch.float64))
-    aside = aside / aside.norm()
     height, along = means @ axis, means @ aside
     low, high = float(height.amin()), float(height.amax())
     limit = SLIM * (high - low)
@@ -102,6 +95,66 @@ def flag_on_pole(cloud: GaussianCloud, simulated: Tensor, up: Sequence[float]) -
     share = len(slim) / SLICES
     reason = f"a slim upright pole, alone over {share:.2f} of its height, with a sheet on one side of it"
     return OnPole(FoundParts(parts, reason), tuple(float(-toward * c) + 0.0 for c in aside))
+
+
+def sheet_between_posts(cloud: GaussianCloud, simulated: Tensor, up: Sequence[float]) -> FoundParts | None:
+    """Find the posts of a washing line: slim columns from below the hem of an upright sheet to above it.
+
+    Args:
+        cloud: The splat.
+        simulated: The Gaussians of the object, bool, shape (N,).
+        up: Up direction, a unit vector.
+
+    Returns:
+        The parts: posts with their feet and arms are still, line and cloth are soft; None without two posts.
+    """
+    index = simulated.nonzero()[:, 0]
+    means = cloud.means.detach()[index].double()
+    axis = torch.tensor(list(up), dtype=torch.float64)
+    aside = _along_sheet(means, axis)
+    if aside is None:
+        return None
+    height, along = means @ axis, means @ aside
+    low, high = quantile(height, 0.005), quantile(height, 0.995)
+    left, right = float(along.amin()), float(along.amax())
+    if high <= low or right <= left:
+        return None
+    column = ((along - left) / (right - left) * COLUMNS).long().clamp(max=COLUMNS - 1)
+    level = ((height - low) / (high - low) * LEVELS).long().clamp(0, LEVELS - 1)
+    there = torch.zeros(COLUMNS, LEVELS).index_put_((column, level), torch.ones(1)) > 0
+    whole = there.double().mean(1) > 0.9  # from the ground to the top
+    runs = [list(own) for full, own in groupby(range(COLUMNS), lambda k: bool(whole[k])) if full]
+    if len(runs) < 2 or max(map(len, runs)) > COLUMNS * THICK:
+        return None
+    place = [torch.isin(column, torch.tensor([run[0] - 1, *run, run[-1] + 1])) for run in runs]
+    near = [(column >= run[0] - ARM * COLUMNS) & (column <= run[-1] + ARM * COLUMNS) for run in runs]
+    between = ~torch.stack(near).any(0)
+    if int(between.sum()) < FEWEST:
+        return None
+    hem, line = quantile(height[between], 0.01), quantile(height[between], 0.99)
+    if hem < low + HEM * (high - low):
+        return None
+    post = torch.stack(place).any(0) | (torch.stack(near).any(0) & ((height < hem) | (height > line)))
+    labels = labels_for_all(cloud.means.detach(), index, post.long(), high - low, 2)
+    parts = _parts(labels, [Part("cloth"), Part("post", "still"), Part("surroundings", "still")])
+    return FoundParts(parts, f"a sheet that ends above the ground between {len(runs)} slim posts")
+
+
+def _along_sheet(means: Tensor, axis: Tensor) -> Tensor | None:
+    """The level direction in an upright sheet, a unit vector; None if most of its upper half is no such sheet."""
+    normal = sheet_normal(means)
+    if normal is None:  # a foot makes the whole no sheet, and ripples the cloth
+        upper = means @ axis
+        cloth = means[upper > 0.5 * (quantile(upper, 0.01) + quantile(upper, 0.99))]
+        level = cloth - cloth.mean(0)
+        level = level - (level @ axis)[:, None] * axis
+        values, axes = torch.linalg.eigh(torch.cov(level.T))  # the first is upright
+        if float(values[1].clamp(min=0) / values[2].clamp(min=1e-30)) < RIPPLED**2:
+            normal = tuple(axes[:, 1].tolist())
+    if normal is None or abs(float(torch.tensor(normal, dtype=torch.float64) @ axis)) > 0.3:
+        return None
+    aside = torch.linalg.cross(axis, torch.tensor(normal, dtype=torch.float64))
+    return aside / aside.norm()
 
 
 def hanging_parts(

@@ -11,7 +11,7 @@ from gaussian_swaying.gaussians.harmonics import SH_DC
 from gaussian_swaying.gaussians.ply import write_ply
 from gaussian_swaying.preview.starter import starter_yaml
 from gaussian_swaying.preview.suggest import suggest, visible_weight
-from gaussian_swaying.preview.supports import flag_on_pole, hanging_parts, standing_parts
+from gaussian_swaying.preview.supports import flag_on_pole, hanging_parts, sheet_between_posts, standing_parts
 from gaussian_swaying.scenes.ficus import FicusScene
 from gaussian_swaying.scenes.flag_on_stand import FlagOnStandScene
 from gaussian_swaying.scenes.procedural import FlagScene
@@ -72,13 +72,12 @@ def test_any_axis_may_be_up_and_the_pole_may_be_below_only():
     assert found.side == pytest.approx((-1.0, 0.0, 0.0))
 
 
-def test_a_flag_without_its_pole_or_with_two_or_on_a_rod_has_no_parts():
-    for cloud in (
-        FlagScene().generate(),
-        *(FlagOnStandScene(stand=kind).generate() for kind in ("posts", "rod", "none")),
-    ):
+def test_a_flag_without_its_pole_or_with_two_or_on_a_rod_has_no_pole():
+    for kind in ("posts", "rod", "none"):
+        cloud = FlagOnStandScene(stand=kind).generate()
         assert flag_on_pole(cloud, all_of(cloud), UP) is None
-        assert suggest(cloud).parts is None
+        assert (suggest(cloud).parts is None) == (kind != "posts")
+    assert suggest(FlagScene().generate()).parts is None
 
 
 def test_the_starter_moves_the_cloth_and_not_the_pole(tmp_path):
@@ -110,6 +109,46 @@ def test_the_starter_moves_the_cloth_and_not_the_pole(tmp_path):
     edge = parts.mask("cloth") & (cloud.means[:, 0] < 0.02)
     assert float(moved[edge].max()) < 0.2 * float(moved.max())
     assert suggest(cloud, up="+z", hold="-x").parts is None
+
+
+def washing_line(posts=(0.0, 2.0)):
+    """A towel on a line of 2 m between posts of 1.8 m with feet and arms."""
+    draw = torch.Generator().manual_seed(0)
+
+    def box(count, low, high):
+        low, high = torch.tensor(low), torch.tensor(high)
+        return low + (high - low) * torch.rand(count, 3, generator=draw)
+
+    towel = box(6000, [0.6, -0.005, 0.6], [1.4, 0.005, 1.65])
+    line = box(400, [0.0, -0.005, 1.65], [2.0, 0.005, 1.67])
+    rest = []
+    for x in posts:
+        rest.append(box(900, [x - 0.03, -0.03, 0.0], [x + 0.03, 0.03, 1.8]))
+        rest.append(box(200, [x - 0.15, -0.15, 0.0], [x + 0.15, 0.15, 0.05]))  # foot
+        rest.append(box(200, [x - 0.03, -0.3, 1.75], [x + 0.03, 0.3, 1.8]))  # arm
+    return torch.cat([towel, line]), torch.cat([towel, line, *rest])
+
+
+def test_posts_of_a_washing_line_stand():
+    moving, means = washing_line()
+    cloud = plain_cloud(means, -4.0, logit=2.0)
+    found = sheet_between_posts(cloud, all_of(cloud), UP)
+    assert [(part.name, part.role) for part in found.parts.parts] == [("cloth", "soft"), ("post", "still")]
+    label = found.parts.labels
+    assert bool((label[:6000] == 0).all())
+    assert float((label[6000 : len(moving)] == 0).double().mean()) > 0.8  # the line, but for its ends
+    assert bool((label[len(moving) :] == 1).all())
+    suggestion = suggest(cloud, UP)
+    assert (suggestion.kind, suggestion.hold.end) == ("cloth", "top")
+    assert suggestion.metres_per_unit == pytest.approx(2.5 / 2.3, rel=0.05)  # with the feet
+
+
+def test_a_sheet_without_two_posts_has_none():
+    moving, one = washing_line((0.0,))
+    curtain = moving * torch.tensor([1.0, 1.0, 2.0])  # down to the ground
+    for means in (moving, one, curtain):
+        cloud = plain_cloud(means, -4.0, logit=2.0)
+        assert sheet_between_posts(cloud, all_of(cloud), UP) is None
 
 
 def test_what_hangs_from_a_cord():
