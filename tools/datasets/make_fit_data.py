@@ -158,10 +158,7 @@ def studio_of(
 
 def make_case(name: str, pattern: FlagPattern, folder: Path, video: FitVideo, law: str) -> None:
     """Make what is missing of one case."""
-
-    def report(line: str) -> None:
-        print(f"{name}: {line}", flush=True)
-
+    report = partial(print, f"{name}:", flush=True)
     started = time.time()
     if solve_pattern(pattern, folder / "cloth.npz"):
         report(f"cloth solved in {time.time() - started:.0f} s")
@@ -173,10 +170,7 @@ def make_case(name: str, pattern: FlagPattern, folder: Path, video: FitVideo, la
 
 def make_soft(pattern: SoftPattern, folder: Path, video: FitVideo) -> None:
     """Make what is missing of the soft post."""
-
-    def report(line: str) -> None:
-        print(f"{SOFT}: {line}", flush=True)
-
+    report = partial(print, f"{SOFT}:", flush=True)
     started = time.time()
     if solve_soft(pattern, folder / "motion.npz"):
         report(f"soft body solved in {time.time() - started:.0f} s")

@@ -20,6 +20,7 @@ import sys
 import time
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -136,7 +137,7 @@ def make_train(pattern: FlagPattern, folder: Path, pictures: Pictures, report: R
 def make_video(pattern: FlagPattern, cloth: Path, folder: Path, pictures: Pictures, report: Report) -> int:
     """Render the motion from one camera along the initial normal, with one lamp behind the camera.
 
-    Every tenth frame is made first. The video itself is written once all frames exist, if imageio is installed.
+    Every tenth frame is made first. The video itself is written once all frames exist.
 
     Returns:
         Number of pictures made.
@@ -263,9 +264,7 @@ def make(name: str, pattern: FlagPattern, options: argparse.Namespace) -> None:
     pictures = pictures_of(options)
     folder = options.out / name
 
-    def report(line: str) -> None:
-        print(f"{name}: {line}", flush=True)
-
+    report = partial(print, f"{name}:", flush=True)
     started = time.time()
     if "cloth" in options.only:
         solve_pattern(pattern, folder / "cloth.npz", _every_25th(report, "cloth", pattern.frames))

@@ -18,28 +18,28 @@ import argparse
 import math
 import sys
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import partial
 from pathlib import Path
 from typing import Any
 
 import fit_cases
+import make_fit_data
 import numpy as np
 import soft_case
 import torch
 from blender_cloth import require_bpy
-from blender_images import Studio, View, look_at
+from blender_images import View, look_at
 from fit_cases import CASES, FitVideo, flag
 from fit_video import add_noise, view_of_all, write_h264
-from flag_motion import read_cloth, settings_hash, solve_pattern
-from flag_pictures import draw_texture
+from flag_motion import solve_pattern
+from flag_pictures import lens_fields
 from flag_reference import FlagPattern, least_quality
-from make_fit_data import studio_of, write_yaml
+from make_fit_data import Filmed, write_yaml
 from make_flag_dataset import claim, missing_pictures
 from newton_soft import require_newton
 from room import Square, block, mesh, splat, squares, tile
-from soft_case import SoftPattern, read_soft, skin, solve_soft
+from soft_case import SoftPattern, solve_soft
 
 from gaussian_swaying._files import write_json
 from gaussian_swaying.gaussians.cloud import GaussianCloud
@@ -92,9 +92,7 @@ class Thing:
     """Something that moves, and what a fit is to know of it.
 
     Attributes:
-        positions: The vertices that are drawn, at each frame [m], shape (F, V, 3).
-        studio: Makes the studio.
-        hash: Of the settings of the motion.
+        motion: What is drawn.
         cloud: The splat of it at rest.
         region: Box around it, of which the room has nothing: lower and upper corner [m].
         supports: What holds it, as surfaces.
@@ -105,9 +103,7 @@ class Thing:
         ranges: Of the unknowns.
     """
 
-    positions: np.ndarray
-    studio: Callable[[], Studio]
-    hash: str
+    motion: Filmed
     cloud: GaussianCloud
     region: tuple[list[float], list[float]]
     supports: list[Square]
@@ -120,13 +116,13 @@ class Thing:
     @property
     def room(self) -> list[Square]:
         """The still surfaces."""
-        low, high = self.positions.min((0, 1)), self.positions.max((0, 1))
+        low, high = self.motion.positions.min((0, 1)), self.motion.positions.max((0, 1))
         return [*squares(low.astype(float), high.astype(float), self.ground), *self.supports]
 
     @property
     def size(self) -> float:
         """Longest side of the box around the motion [m]."""
-        return float(np.ptp(self.positions, (0, 1)).max())
+        return float(np.ptp(self.motion.positions, (0, 1)).max())
 
 
 # ---- cloth
@@ -162,13 +158,7 @@ def cloth_cloud(pattern: FlagPattern, spacing: float) -> GaussianCloud:
 
 def filmed_cloth(pattern: FlagPattern, folder: Path, video: FitVideo, spacing: float, dx: float) -> Thing:
     """A cloth whose motion is ``cloth.npz`` of a folder."""
-    motion = read_cloth(folder / "cloth.npz")
-    grid = pattern.grid()
-
-    def studio() -> Studio:
-        print_ = draw_texture(pattern, 640)
-        return studio_of(grid.faces(), grid.uv(), print_, pattern.center(), pattern.longer_side, video)
-
+    motion = make_fit_data.filmed_cloth(pattern, folder, video)
     size = float(np.ptp(motion.positions, (0, 1)).max())
     ground = float(motion.positions[..., 2].min()) - 0.25 * size
     scene = fit_cases.scene_settings(pattern, video, "linear", "")
@@ -187,9 +177,7 @@ def filmed_cloth(pattern: FlagPattern, folder: Path, video: FitVideo, spacing: f
         "boundaries": [{"class_path": "PinnedRegion", "init_args": {"kind": None, "region": pin}} for pin in pins],
     }
     return Thing(
-        motion.positions,
-        studio,
-        settings_hash(motion.settings),
+        motion,
         cloth_cloud(pattern, spacing),
         ([-0.005, -0.03, -0.01], [width + 0.005, 0.03, height + 0.005]),
         supports(pattern, ground),
@@ -216,24 +204,18 @@ def supports(pattern: FlagPattern, ground: float) -> list[Square]:
 
 def filmed_post(pattern: SoftPattern, folder: Path, video: FitVideo, spacing: float, dx: float) -> Thing:
     """A soft post whose motion is ``motion.npz`` of a folder."""
-    positions, settings = read_soft(folder / "motion.npz")
-    points, faces, uv = skin(pattern)
-    middle = np.array([0.0, 0.0, 0.5 * pattern.height])
-    drawn = partial(studio_of, faces, uv, soft_case.texture(pattern), middle, pattern.height, video)
-    shown = positions[:, points]
+    motion = make_fit_data.filmed_soft(pattern, folder, video)
     half = 0.5 * pattern.side + 0.003
     scene = soft_case.scene_settings(pattern, video, "")
     scene["scene"]["filling"] = {"spacing": 0.25 * dx}
     scene["solver"]["dx"] = dx
     return Thing(
-        shown,
-        drawn,
-        settings_hash(settings),
+        motion,
         soft_case.splat(pattern, spacing),
         ([-half, -half, -0.002], [half, half, pattern.height + 0.003]),
         [],
         -0.006,
-        FINE * float(np.ptp(shown, (0, 1)).max()),
+        FINE * float(np.ptp(motion.positions, (0, 1)).max()),
         soft_case.truth_fields(pattern, video),
         scene,
         RANGES | {"material.E": (1e4, 4e5)},
@@ -247,9 +229,9 @@ def aimed(thing: Thing, video: FitVideo) -> View:
     """The camera as it is aimed: from the side of a cloth that the wind does not blow to, and above."""
     turn, rise = math.radians(ASIDE - 90), math.radians(ABOVE)
     ray = np.array([math.cos(turn) * math.cos(rise), math.sin(turn) * math.cos(rise), math.sin(rise)])
-    low, high = thing.positions.min((0, 1)).astype(float), thing.positions.max((0, 1)).astype(float)
+    low, high = thing.motion.positions.min((0, 1)).astype(float), thing.motion.positions.max((0, 1)).astype(float)
     middle = 0.5 * (low + high)
-    around = middle + AROUND * (thing.positions.reshape(-1, 3) - middle)
+    around = middle + AROUND * (thing.motion.positions.reshape(-1, 3) - middle)
     return view_of_all(look_at(ray, np.zeros(3))[:3, :3], around, *video.size, math.radians(video.angle))
 
 
@@ -262,7 +244,7 @@ def camera_of(view: View) -> Camera:
 
 def in_hand(thing: Thing, view: View, pictures: int, seed: int) -> list[View]:
     """The cameras of all pictures."""
-    middle = thing.positions.reshape(-1, 3).mean(0).tolist()
+    middle = thing.motion.positions.reshape(-1, 3).mean(0).tolist()
     cameras = shaken(camera_of(view), EARLIER + pictures, SHAKE, seed, middle)[EARLIER:]
     return [replace(view, pose=opengl(camera).numpy()) for camera in cameras]
 
@@ -270,15 +252,15 @@ def in_hand(thing: Thing, view: View, pictures: int, seed: int) -> list[View]:
 def make_pictures(thing: Thing, folder: Path, video: FitVideo, views: Sequence[View]) -> int:
     """Draw what each camera sees, the thing at rest and then in motion; returns the number of pictures made."""
     settings = {name: getattr(video, name) for name in ("size", "angle", "samples", "light", "ambient", "seed")}
-    claim(folder / "pictures", settings | {"motion": thing.hash, "pictures": len(views), "shake": SHAKE})
+    claim(folder / "pictures", settings | {"motion": thing.motion.hash, "pictures": len(views), "shake": SHAKE})
     names = [f"pictures/{number:04d}.png" for number in range(len(views))]
     missing = missing_pictures(folder, names)
     if missing:
-        studio = thing.studio()
+        studio = thing.motion.studio()
         studio.add_room(*mesh(thing.room, thing.size), tile())
         for name in missing:
             number = names.index(name)
-            studio.move(thing.positions[max(0, number - SHIFT)])
+            studio.move(thing.motion.positions[max(0, number - SHIFT)])
             studio.photograph(views[number], folder / name)
     return len(missing)
 
@@ -293,7 +275,6 @@ def write_film(thing: Thing, case: Path, folder: Path, video: FitVideo, view: Vi
     pictures = (iio.imread(case / f"pictures/{k:04d}.png")[..., :3] / 255.0 for k in frames)
     noisy = (add_noise(picture, video, (k,)) for k, picture in zip(frames, pictures, strict=True))
     write_h264(folder / "film.mp4", noisy, video.size, FPS)
-    lens = {"fl_x": view.focal, "fl_y": view.focal, "cx": 0.5 * view.width, "cy": 0.5 * view.height}
     start = sign * SHIFT / FPS
     entry = {
         "video_path": "film.mp4",
@@ -301,7 +282,7 @@ def write_film(thing: Thing, case: Path, folder: Path, video: FitVideo, view: Vi
         "seconds": 0.3 + _until(sign),
         "transform_matrix": view.pose.tolist(),
     }
-    write_json(folder / "transforms.json", lens | {"w": view.width, "h": view.height, "frames": [entry]})
+    write_json(folder / "transforms.json", lens_fields(view) | {"frames": [entry]})
     place = folder.resolve().as_posix()
     write_ply(folder / "splat.ply", both(thing.cloud, _seen(thing, video, view)))
     scene = dict(thing.scene)

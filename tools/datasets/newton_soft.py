@@ -112,49 +112,30 @@ class Block:
         return grid - [0.5 * self.side, 0.5 * self.side, 0.0]
 
 
-@dataclass(frozen=True)
-class SoftRun:
-    """How long a body is followed.
-
-    Attributes:
-        frames: Their number, the first at rest.
-        fps: Frames per second.
-        steps: Steps of a frame.
-        gravity: [m/s²], downwards.
-        damping: Rate at which velocities decay [1/s].
-        push: An acceleration on all of the body [m/s²], for checks.
-    """
-
-    frames: int
-    fps: float
-    steps: int
-    gravity: float = 9.81
-    damping: float = 0.0
-    push: tuple[float, float, float] = (0.0, 0.0, 0.0)
-
-
-def solve_block(block: Block, air: Air | None, run: SoftRun, report: Any = None) -> np.ndarray:
+def solve_block(
+    block: Block, air: Air, frames: int, fps: float, steps: int, gravity: float, damping: float
+) -> np.ndarray:
     """Simulate a block with Newton, from rest.
+
+    Units: ``fps`` [1/s]; ``gravity``, downwards [m/s²]; ``damping``, the rate at which velocities decay [1/s].
 
     Returns:
         Positions of :meth:`Block.vertices` at each frame [m], float32, shape (F, V, 3).
     """
     newton, warp = require_newton()
     with warp.ScopedDevice("cpu"):
-        model, triangles = _model(newton, warp, block, run)
+        model, triangles = _model(newton, warp, block, gravity)
         solver = newton.solvers.SolverSemiImplicit(model, enable_tri_contact=False)
         now, after, control = model.state(), model.state(), model.control()
-        step = 1 / (run.fps * run.steps)
-        slower = math.exp(-run.damping * step)
-        positions = np.empty((run.frames, model.particle_count, 3), dtype=np.float32)
+        step = 1 / (fps * steps)
+        slower = math.exp(-damping * step)
+        positions = np.empty((frames, model.particle_count, 3), dtype=np.float32)
         positions[0] = now.particle_q.numpy()
-        for frame in range(1, run.frames):
-            for _ in range(run.steps):
+        for frame in range(1, frames):
+            for _ in range(steps):
                 now.clear_forces()
-                if air is not None:  # memory of the host: not a copy
-                    now.particle_f.numpy()[:] = skin_forces(
-                        now.particle_q.numpy(), now.particle_qd.numpy(), triangles, air
-                    )
+                forces = skin_forces(now.particle_q.numpy(), now.particle_qd.numpy(), triangles, air)
+                now.particle_f.numpy()[:] = forces  # memory of the host: not a copy
                 solver.step(now, after, control, None, step)
                 now, after = after, now
                 now.particle_qd.numpy()[:] *= slower
@@ -162,16 +143,13 @@ def solve_block(block: Block, air: Air | None, run: SoftRun, report: Any = None)
             reach = np.abs(positions[frame] - positions[0]).max()
             if not reach < 2 * block.height:
                 raise ArithmeticError(f"Newton's body blew up in frame {frame + 1}: raise `steps`.")
-            if report:
-                report(frame + 1)
     return positions
 
 
-def _model(newton: Any, warp: Any, block: Block, run: SoftRun) -> tuple[Any, np.ndarray]:
+def _model(newton: Any, warp: Any, block: Block, gravity: float) -> tuple[Any, np.ndarray]:
     """The model, and the triangles of its skin."""
     mu, lam = newton_moduli(block.youngs_modulus, block.poisson_ratio)
-    pull = (run.push[0], run.push[1], run.push[2] - run.gravity)
-    builder = newton.ModelBuilder(gravity=pull)
+    builder = newton.ModelBuilder(gravity=(0.0, 0.0, -gravity))
     across, along, up = block.counts
     builder.add_soft_grid(
         pos=warp.vec3(-0.5 * block.side, -0.5 * block.side, 0.0),

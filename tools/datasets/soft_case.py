@@ -15,7 +15,7 @@ import numpy as np
 import torch
 from fit_cases import FitVideo, shared_scene, shared_truth
 from flag_motion import check_settings
-from newton_soft import Air, Block, SoftRun, solve_block
+from newton_soft import Air, Block, solve_block
 
 from gaussian_swaying._files import atomic
 from gaussian_swaying._inputs import read_arrays
@@ -83,21 +83,15 @@ class SoftPattern:
         )
 
     @property
-    def run(self) -> SoftRun:
-        """Frames, and as many steps as the mesh needs."""
+    def least_steps(self) -> int:
+        """Steps of a frame, as many as the mesh needs where none are given."""
         e, nu = self.youngs_modulus, self.poisson_ratio
         wave = math.sqrt(e * (1 - nu) / ((1 + nu) * (1 - 2 * nu)) / self.density)
-        steps = self.steps or math.ceil(wave / (STEP * self.block.cell * self.fps))
-        return SoftRun(self.frames, self.fps, steps, self.gravity, self.damping)
-
-    @property
-    def air(self) -> Air:
-        """The wind."""
-        return Air(self.flow, self.air_density, self.drag)
+        return self.steps or math.ceil(wave / (STEP * self.block.cell * self.fps))
 
     def motion_settings(self) -> dict[str, Any]:
         """Everything that the motion depends on."""
-        return asdict(self) | {"steps": self.run.steps, "solver": "newton, SolverSemiImplicit"}
+        return asdict(self) | {"steps": self.least_steps, "solver": "newton, SolverSemiImplicit"}
 
 
 def solve_soft(pattern: SoftPattern, path: Path) -> bool:
@@ -110,7 +104,9 @@ def solve_soft(pattern: SoftPattern, path: Path) -> bool:
     if path.exists():
         check_settings(path, read_soft(path)[1], settings)
         return False
-    positions = solve_block(pattern.block, pattern.air, pattern.run)
+    air = Air(pattern.flow, pattern.air_density, pattern.drag)
+    steps, fps = pattern.least_steps, pattern.fps
+    positions = solve_block(pattern.block, air, pattern.frames, fps, steps, pattern.gravity, pattern.damping)
     path.parent.mkdir(parents=True, exist_ok=True)
     with atomic(path) as temporary:
         np.savez_compressed(temporary, positions=positions, settings=json.dumps(settings))
