@@ -7,7 +7,6 @@ import pytest
 import torch
 from shared import advanced
 
-from gaussian_swaying.aero.added_mass import AirLift
 from gaussian_swaying.aero.force import AeroForce, added_mass_per_area
 from gaussian_swaying.aero.wind import WindField
 from gaussian_swaying.geometry.regions import Box
@@ -175,17 +174,6 @@ def test_gradients_by_the_density_pass(hanging):
     density = torch.tensor(30.0, dtype=torch.float64, requires_grad=True)
     (slope,) = torch.autograd.grad(end(density), density)
     assert float(slope) == pytest.approx(float(end(30.1) - end(29.9)) / 0.2, rel=1e-3)
-
-
-def test_the_lift_is_the_weight_of_the_air(hanging):
-    simulation = hanging(air())
-    state = simulation.start()
-    (lift,) = simulation.forces
-    assert isinstance(lift, AirLift)
-    mass = simulation.solver.points.mass - simulation.setup.points.mass
-    expected = mass[:, None] * torch.tensor([0.0, -0.5, 9.8], dtype=torch.float64)
-    torch.testing.assert_close(lift(state), expected, rtol=1e-9, atol=1e-12)
-    assert float(lift.potential(state)) == pytest.approx(-float((expected * state.position).sum()))
 
 
 @pytest.mark.gpu

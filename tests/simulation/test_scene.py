@@ -166,14 +166,6 @@ def test_normals_of_a_shear_are_not_those_of_its_rotation(make_scene):
     torch.testing.assert_close((normals @ expected).abs(), torch.ones(len(normals)))
 
 
-def test_pictures_follow_the_total_deformation(make_scene):
-    scene = make_scene()
-    state = _rest_state(scene)
-    F = 2 * torch.eye(3).expand_as(state.F_total)
-    torch.testing.assert_close(scene.deformed(state.replace(F_total=F)).covariances, 4 * scene.rest_covariances)
-    assert torch.equal(scene.deformed(state.replace(F_elastic=F)).covariances, scene.rest_covariances)
-
-
 @pytest.mark.parametrize("settings", [{}, {"region": LEFT}])
 def test_gaussians_keep_to_the_stretch_of_the_scene(settings, make_cloud, make_scene):
     """Whether all of them move or some, carried ones included; without a limit they follow F however far."""
@@ -429,18 +421,15 @@ def test_large_gaussians_get_further_points(make_scene):
     assert layered.points.count == 3 * full.points.count
 
 
-def test_spacing_of_the_particles_is_in_metres(make_scene):
+def test_the_spacing_of_further_points_is_in_metres_and_they_share_the_papers_areas(make_scene):
+    """Each Gaussian keeps pi s1 s2."""
     cloud = _sheet_with_a_hole()
-    one, half = (make_scene(cloud, dx=0.1, particle_spacing=s, metres_per_unit=m) for s, m in ((0.05, 1.0), (0.1, 2.0)))
-    assert one.points.count == half.points.count
-
-
-def test_further_points_in_the_paper_s_areas(make_scene):
-    """Each Gaussian keeps pi s1 s2, shared among its points."""
-    cloud = _sheet_with_a_hole()
-    plain, full = (make_scene(cloud, dx=0.1, area="paper", particle_spacing=s) for s in (None, 0.05))
+    plain, full, half = (
+        make_scene(cloud, dx=0.1, area="paper", particle_spacing=spacing, metres_per_unit=unit)
+        for spacing, unit in ((None, 1.0), (0.05, 1.0), (0.1, 2.0))
+    )
+    assert half.points.count == full.points.count > plain.points.count
     torch.testing.assert_close(full.patches.area.sum(), plain.patches.area.sum())
-    assert full.points.count > plain.points.count
 
 
 def test_three_layers_are_no_thicker_than_a_cell(make_scene):
