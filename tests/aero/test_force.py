@@ -135,13 +135,17 @@ def test_gradcheck(law):
     assert torch.autograd.gradcheck(run, inputs, fast_mode=True)
 
 
-@pytest.mark.parametrize(("law", "speed"), [("paper", 0.0), ("linear", 5.0)])
-def test_the_rate_is_the_slope_of_the_drag(law, speed):
-    """Across the flow; a patch faster than the wind is slowed, and the resistance to ``linear`` is all of its slope."""
-    aero = AeroForce(0.7, 0.0, C_L=0.0, air_density=RHO, law=law, drag_step="semi_implicit")
+@pytest.mark.parametrize(
+    ("law", "speed", "part"), [("paper", 0.0, "C_D"), ("paper", 0.0, "C_F"), ("linear", 5.0, "C_D")]
+)
+def test_the_rate_is_the_slope_of_the_force(law, speed, part):
+    """Across the flow, or along it; a patch that is faster is slowed, and ``linear`` resists by all of its slope."""
+    coefficients = {"C_D": 0.0, "C_F": 0.0, "C_L": 0.0, part: 0.7}
+    aero = AeroForce(**coefficients, air_density=RHO, law=law, drag_step="semi_implicit")
     wind, area = _vector(3, 0, 0), _vector(0.2)
     velocity = _vector(speed, 0, 0)[None].requires_grad_()
-    force = aero(wind, velocity, _vector(1, 0, 0)[None], area)[0, 0]
+    normal = _vector(1, 0, 0) if part == "C_D" else _vector(0, 1, 0)
+    force = aero(wind, velocity, normal[None], area)[0, 0]
     (slope,) = torch.autograd.grad(force, velocity)
     assert (force < 0) == (speed > 3)
     assert float(aero.rate(wind.norm()[None], area, _vector(0.5))) == pytest.approx(-float(slope[0, 0]) / 0.5)

@@ -263,10 +263,10 @@ def _csv(path, text):
 
 
 def test_an_anemometer(tmp_path):
-    path = _csv(tmp_path / "a.csv", "time [s],u [m/s],v (m/s),note\n0,1,2,a\n\n2.0,3,-2,b\n")
+    path = _csv(tmp_path / "a.csv", "time [s],u [m/s],v (m/s),note,w\n0,1,2,a,1\n\n2.0,3,-2,b,-3\n")
     wind = WindField(schedule=path)
-    assert_close(wind(1.0), double([2.0, 0.0, 0.0]))
-    assert_close(wind(9.0), double([3.0, -2.0, 0.0]))
+    assert_close(wind(1.0), double([2.0, 0.0, -1.0]))
+    assert_close(wind(9.0), double([3.0, -2.0, -3.0]))
     times, flows = read_anemometer(_csv(tmp_path / "b.csv", "Direction [deg],Speed,time\n270,4,0\n360,2,1\n45,1,2\n"))
     assert times == [0.0, 1.0, 2.0]
     root = math.sqrt(0.5)  # from the west, north and north-east
