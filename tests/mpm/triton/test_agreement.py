@@ -71,7 +71,6 @@ BOUNDARIES = {
         made("SequentialRelease", LEFT, end=1.5 * DT)(),
         made("Impulse", Everything(), [0, 0, 0.02], end=DT)(),
     ],
-    "rigid part": lambda: [made("RigidRegion", TOP)(), NODES()],
     "release and plane": lambda: [RELEASE(), made("Plane", [0.0, 0.0, 0.13], [0.0, 0.0, 1.0])()],
 }
 POINT_HOLDS = {  # for `total` alone
@@ -86,7 +85,8 @@ POINT_HOLDS = {  # for `total` alone
         made("Handle", TOP, [0.5, 0.0, 0.2], [0.0, 30.0, 9.0], [0.1, 0.1, 0.1], "clamp", start=1.5 * DT)(),
     ],
 }
-OBSTACLES = {  # for `updated` alone, where they stop nodes
+OTHERS = {  # obstacles for `updated` alone, where they stop nodes; wind on a rigid part differs
+    "rigid part": lambda: [made("RigidRegion", TOP)(), NODES()],
     "obstacles": lambda: [
         made("BallObstacle", [0.1, 0.1, 0.05], 0.06, 0.4)(),
         SLOPE(kind="separate", friction=0.2, end=1.5 * DT),
@@ -176,7 +176,7 @@ def test_kernels_do_what_torch_does(kernel_device, scene):
     bends = {}
     if more.pop("sheet", False):
         normal = torch.tensor([0.36, 0.48, 0.8]).expand(*batch, count, 3)
-        bends = {"normal": normal, "bending": 1e-4 * (1 + noise(12, *batch, count).abs())}
+        bends = {"normal": normal.to(kernel_device), "bending": 1e-4 * (1 + noise(12, *batch, count).abs())}
     if more.pop("apart", False):
         bends["attached"] = torch.arange(count) % 2
     points = make_points(kernel_device, laws, count, batch, law_index=index, damping=rates, **bends)
@@ -193,7 +193,7 @@ def test_kernels_do_what_torch_does(kernel_device, scene):
         state = solver.rollout(state, DT, 1, load(90))
         return [state, solver.rollout(state, DT, 1 if boundaries == "none" else 2, load(130))]
 
-    make = (BOUNDARIES | POINT_HOLDS | OBSTACLES)[boundaries]
+    make = (BOUNDARIES | POINT_HOLDS | OTHERS)[boundaries]
     start = _settled if bends or boundaries == "rigid part" else set_going
     ends = run_both(points, run, formulation, start, boundaries=make(), **more)
     check_agreement(ends, TOLERANCE if kernel_device.type == "cuda" else 1e-8)
