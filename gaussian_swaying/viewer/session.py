@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from jsonargparse import ArgumentParser, Namespace
 
 SLOW, FAST = 0.09, 0.025  # s: steps that take longer are halved, and shorter ones doubled again
-SHORTEST = 32  # a step is at least this part of `frame_dt`
+SHORTEST, FEW = 32, 4  # a step is at least this part of `frame_dt`; substeps of one that would take as long if shorter
 WINDOW = 2.0  # s, over which rates are averaged
 BEHIND = 0.25  # s that a session may be late before it stops trying to catch up
 ONE_CHANGE = 1.0  # s: changes of the same fields that follow each other sooner are one, as when a slider is dragged
@@ -316,7 +316,7 @@ class Session:
         self._publish(state, health)
         took, wanted = time.perf_counter() - began, float(self.settings.frame_dt)
         shortest = wanted if simulation.setup.air is not None else wanted / SHORTEST  # computed air has one length
-        if took > SLOW and simulation.frame_dt > 1.01 * shortest:
+        if took > SLOW and health.substeps > FEW and simulation.frame_dt > 1.01 * shortest:
             simulation.frame_dt = simulation.frame_dt / 2
         elif took < FAST and simulation.frame_dt < 0.99 * wanted:
             simulation.frame_dt = min(2 * simulation.frame_dt, wanted)

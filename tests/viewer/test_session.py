@@ -304,6 +304,14 @@ def test_steps_get_shorter_where_they_take_long(parser, settings, until, monkeyp
     assert session.simulation.frame_dt >= settings.frame_dt / 32
 
 
+def test_steps_of_few_substeps_stay_as_long(session, settings, monkeypatch):
+    """As those of modes, which take as long for a shorter step."""
+    monkeypatch.setattr("gaussian_swaying.viewer.session.SLOW", 0.0)
+    monkeypatch.setattr("gaussian_swaying.viewer.session.FEW", 10**6)
+    session._advance(single=True)
+    assert session.simulation.frame_dt == settings.frame_dt
+
+
 @pytest.mark.gpu
 def test_on_a_gpu_it_is_changed_and_drawn_at_the_same_time(parser, settings, until):
     """Graphs are recorded and replayed in the thread of the session while others draw."""
