@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 
 import torch
+from shared import unit
 from torch import Tensor
 
 from gaussian_swaying.gaussians.cloud import GaussianCloud
@@ -51,7 +52,7 @@ def place(count: int, seed: int = 0, sh_degree: int = 3) -> tuple[GaussianCloud,
     parts.append(_cloud(means, torch.randn(n, 4, generator=draw), leaf, 0.8, tint * torch.tensor([0.20, 0.38, 0.14])))
 
     n = sizes["haze"]
-    way = torch.nn.functional.normalize(torch.randn(n, 3, generator=draw), dim=-1)
+    way = unit(n, 3, generator=draw, dtype=torch.float32)
     way[:, 2] = way[:, 2].abs()
     means = way * uniform(n, FAR)
     tint = torch.tensor([0.62, 0.72, 0.86]) + 0.1 * torch.randn(n, 1, generator=draw)

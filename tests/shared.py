@@ -78,9 +78,9 @@ def double(values):
     return torch.tensor(values, dtype=torch.float64)
 
 
-def unit(*shape, device="cpu", dtype=torch.float64):
-    """Random unit vectors or quaternions."""
-    return torch.nn.functional.normalize(torch.randn(*shape, device=device, dtype=dtype), dim=-1)
+def unit(*shape, **options):
+    """Random unit vectors or quaternions, in float64 unless told otherwise."""
+    return torch.nn.functional.normalize(torch.randn(*shape, **{"dtype": torch.float64} | options), dim=-1)
 
 
 def gradients(count, device="cpu", dtype=torch.float64):

@@ -5,6 +5,7 @@ import math
 
 import pytest
 import torch
+from shared import unit
 
 from gaussian_swaying.aero.wind import WindField
 from gaussian_swaying.cli.preview import build_options, preview_scene
@@ -72,7 +73,7 @@ def blobs(centres, radius, color, count, seed=0):
     draw = torch.Generator().manual_seed(seed)
     own = torch.tensor(centres)[torch.randint(len(centres), (count,), generator=draw)]
     place = own + radius * torch.randn(count, 3, generator=draw).clamp(-1.5, 1.5) / 1.5
-    turn = torch.nn.functional.normalize(torch.randn(count, 4, generator=draw), dim=-1)
+    turn = unit(count, 4, generator=draw, dtype=torch.float32)
     cloud = plain_cloud(place, (-4.2, -4.2, -6.0), turn, logit=3.0)
     return dataclasses.replace(cloud, sh=((torch.tensor(color) - 0.5) / SH_DC).expand(count, 1, 3))
 

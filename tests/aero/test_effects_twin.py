@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 import torch
-from shared import solid
+from shared import solid, unit
 from torch.testing import assert_close
 from torch.utils._python_dispatch import TorchDispatchMode
 
@@ -70,7 +70,7 @@ def _wind(name):
 def _bodies(device, formulation, wind, batch=(), groups=False, transfer="kernels", **aero):
     draw = torch.Generator().manual_seed(0)
     position = 0.06 + 0.18 * torch.rand(*batch, 24, 3, generator=draw)
-    normal = torch.nn.functional.normalize(torch.randn(*batch, 24, 3, generator=draw), dim=-1).to(device)
+    normal = unit(*batch, 24, 3, generator=draw, dtype=torch.float32).to(device)
     area = (0.02 * torch.rand(*batch, 24, generator=draw)).to(device)
     velocity = torch.randn(*batch, 24, 3, generator=draw).to(device)
     points = solid(position.to(device), 1e-4, 50.0)

@@ -4,7 +4,7 @@ import math
 
 import pytest
 import torch
-from shared import double, solid
+from shared import double, solid, unit
 from torch.testing import assert_close
 
 from gaussian_swaying import AeroForce, WindField, WindForce, aero_force
@@ -27,7 +27,7 @@ POINTS = 40
 def random_patches(spread, each=30, seed=0):
     """Patches of random areas whose normals spread around that of their point; one point has none."""
     generator = torch.Generator().manual_seed(seed)
-    main = torch.nn.functional.normalize(torch.randn(POINTS, 3, generator=generator, dtype=torch.float64), dim=-1)
+    main = unit(POINTS, 3, generator=generator)
     point = torch.randint(1, POINTS, (each * POINTS,), generator=generator)
     noise = spread * torch.randn(len(point), 3, generator=generator, dtype=torch.float64)
     normal = torch.nn.functional.normalize(main[point] + noise, dim=-1)
@@ -50,7 +50,7 @@ def off(found, expected):
 
 def winds(count=60):
     generator = torch.Generator().manual_seed(1)
-    return 5 * torch.nn.functional.normalize(torch.randn(count, 3, generator=generator, dtype=torch.float64), dim=-1)
+    return 5 * unit(count, 3, generator=generator)
 
 
 def turned(stretch=0.0):

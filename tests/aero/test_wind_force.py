@@ -4,7 +4,7 @@ import copy
 
 import pytest
 import torch
-from shared import double, solid
+from shared import double, solid, unit
 from torch.testing import assert_close
 
 from gaussian_swaying import (
@@ -29,7 +29,7 @@ RISING = WindField(schedule=[FlowKey(0.0, [0.0] * 3), FlowKey(4 * DT, [0.0, 20.0
 def _setting(batch=(), wind=GUSTS, formulation="total", **settings):
     generator = torch.Generator().manual_seed(0)
     position = 0.3 * torch.rand(*batch, 20, 3, dtype=torch.float64, generator=generator)
-    normal = torch.nn.functional.normalize(torch.randn(*batch, 20, 3, dtype=torch.float64, generator=generator), dim=-1)
+    normal = unit(*batch, 20, 3, generator=generator)
     area = 0.02 * torch.rand(*batch, 20, dtype=torch.float64, generator=generator)
     points = solid(position, 1e-4, 50.0)
     solver = MPMSolver(dx=0.1, formulation=formulation, transfer="torch")

@@ -3,6 +3,7 @@
 import pytest
 import torch
 import yaml
+from shared import unit
 from small_films import base
 
 from gaussian_swaying.aero.force import AeroForce
@@ -98,7 +99,7 @@ def test_what_leaves_the_grid_of_updated_gets_a_larger_one(tmp_path, monkeypatch
 
 def test_wind_on_patches_of_many_directions_in_a_batch():
     generator = torch.Generator().manual_seed(0)
-    normal = torch.nn.functional.normalize(torch.randn(40, 3, generator=generator), dim=-1)
+    normal = unit(40, 3, generator=generator, dtype=torch.float32)
     point = torch.randint(0, 6, (40,), generator=generator)
     area = torch.rand(40, generator=generator) * 0.01
     position = torch.rand(6, 3, generator=generator)

@@ -6,6 +6,7 @@ import math
 import bodies
 import pytest
 import torch
+from shared import unit
 from torch.testing import assert_close
 
 from gaussian_swaying.gaussians.area import coverage_area
@@ -150,7 +151,7 @@ def test_size_and_place_do_not_matter_and_rotation_hardly():
     moved = body.turned(eye, 64.0, 1000.0)
     same = openness(moved.means, moved.normals, moved.log_scales, areas * 64.0**2, moved.opacity)
     assert_close((same * areas).sum(), (weight * areas).sum(), rtol=1e-3, atol=0)
-    rotation = quat_to_rotation(torch.nn.functional.normalize(torch.randn(4, dtype=torch.float64), dim=0))
+    rotation = quat_to_rotation(unit(4))
     turned = body.turned(rotation)
     other = openness(turned.means, turned.normals, turned.log_scales, areas, turned.opacity)
     assert_close((other * areas).sum(), (weight * areas).sum(), rtol=0.02, atol=0)
@@ -170,7 +171,7 @@ def test_same_input_same_weights_and_neither_order_nor_sign_matters():
 @pytest.mark.parametrize("count", [0, 1, 2, 3])
 def test_few_patches_are_open(count, device, dtype):
     means = 1e3 * torch.rand(count, 3, device=device, dtype=dtype)
-    normals = torch.nn.functional.normalize(torch.randn(count, 3, device=device, dtype=dtype), dim=-1)
+    normals = unit(count, 3, device=device, dtype=dtype)
     weight = openness(means, normals, torch.zeros_like(means), torch.ones(count, device=device, dtype=dtype))
     assert (weight.shape, weight.dtype, weight.device.type) == ((count,), dtype, device.type)
     assert_close(weight, torch.ones_like(weight))
@@ -180,7 +181,7 @@ def test_wild_input_stays_between_the_limits():
     """Floaters, needles, clusters, coincident points, opacities of 0 and 1, areas of any size."""
     means = torch.cat([torch.rand(2000, 3), 1e-7 * torch.randn(300, 3), torch.full((60, 3), 0.5), torch.eye(3) * 1e6])
     count = len(means)
-    normals = torch.nn.functional.normalize(torch.randn(count, 3), dim=-1)
+    normals = unit(count, 3, dtype=torch.float32)
     opacity = torch.rand(count).round(decimals=1)
     areas = (5 * torch.randn(count)).exp() * 1e-3
     areas[5] = torch.finfo(torch.float32).tiny

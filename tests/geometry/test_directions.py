@@ -4,7 +4,7 @@ import math
 
 import pytest
 import torch
-from shared import double
+from shared import double, unit
 from torch.testing import assert_close
 
 from gaussian_swaying.geometry.directions import axes_across, hull_area, spread_lines
@@ -46,13 +46,13 @@ def test_axes_across_make_a_right_handed_frame():
 
 def test_hull_of_a_box_a_ball_and_a_sheet():
     """Exact up to the outline with 128 sides and 100 directions: a percent."""
-    rotation, scale = quat_to_rotation(torch.nn.functional.normalize(torch.randn(4, dtype=torch.float64), dim=0)), 30.0
+    rotation, scale = quat_to_rotation(unit(4)), 30.0
     box = torch.rand(5000, 3, dtype=torch.float64)
     corners = torch.cartesian_prod(*(double([0.0, 1.0]),) * 3)
     sides = double([1.0, 0.5, 0.2])
     found = hull_area(torch.cat([box, corners]) * sides @ rotation.mT * scale + 100)
     assert found == pytest.approx(2 * (0.5 + 0.2 + 0.1) * scale**2, rel=0.01)
-    ball = torch.nn.functional.normalize(torch.randn(20_000, 3, dtype=torch.float64), dim=-1)
+    ball = unit(20_000, 3)
     assert hull_area(ball) == pytest.approx(4 * math.pi, rel=0.01)
     assert hull_area(corners * torch.tensor([1.0, 1.0, 0.0])) == pytest.approx(2.0, rel=0.01)
 

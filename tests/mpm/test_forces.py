@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 import torch
-from shared import solid
+from shared import solid, unit
 from torch.testing import assert_close
 
 from gaussian_swaying import AeroForce, Force, MPMSolver, SpatialWind, WindField, WindForce
@@ -46,7 +46,7 @@ def _setting(formulation="total", batch=(), **options):
     points = solid(position, 1e-4, 50.0)
     solver = MPMSolver(dx=0.1, formulation=formulation, transfer="torch", **options)
     velocity = torch.randn(*batch, 20, 3, dtype=torch.float64, generator=generator)
-    normal = torch.nn.functional.normalize(torch.randn(*batch, 20, 3, dtype=torch.float64, generator=generator), dim=-1)
+    normal = unit(*batch, 20, 3, generator=generator)
     wind = WindForce(AeroForce(), WindField([4.0, 0.0, 1.0]), normal, torch.full(position.shape[:-1], 0.01))
     return solver, solver.init_state(points, velocity), wind
 

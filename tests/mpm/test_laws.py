@@ -8,6 +8,7 @@ from pkgutil import iter_modules
 import pytest
 import torch
 from catalogue import ELASTIC, PLASTIC
+from shared import unit
 from torch.testing import assert_close
 
 from gaussian_swaying.geometry.linalg import spectrum
@@ -411,7 +412,7 @@ def test_moduli_bound_the_hessian(name, nu):
     wave, bound = law.moduli(F, mu, lam)
     exact = torch.linalg.eigvalsh(hessian)[:, -1]
     assert float((exact / bound).max()) < 1 + 1e-6
-    direction = torch.nn.functional.normalize(torch.randn(300, 3, dtype=torch.float64), dim=-1)
+    direction = unit(300, 3)
     acoustic = torch.einsum("pijkl,nj,nl->pnik", hessian.reshape(-1, 3, 3, 3, 3), direction, direction)
     speed = torch.linalg.eigvalsh(acoustic)[..., -1].amax(-1)
     assert float((speed / wave).max()) < 1 + 1e-6
@@ -504,7 +505,7 @@ def test_uniaxial_closed_forms():
 
 def test_a_network_is_a_mean_over_springs():
     """For Cauchy's solid, which has no other terms, against the mean over many directions; and a lattice's tension."""
-    direction = torch.nn.functional.normalize(torch.randn(400_000, 3, dtype=torch.float64), dim=-1)
+    direction = unit(400_000, 3)
     F = torch.diag(torch.tensor([1.25, 0.9, 1.05], dtype=torch.float64))
     mean = ((direction @ F.mT).norm(dim=-1) - 1).square().mean()
     energy = ELASTIC["springs"].energy(F, MU, MU)

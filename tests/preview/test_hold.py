@@ -5,6 +5,7 @@ import math
 
 import pytest
 import torch
+from shared import unit
 from small_scenes import plain_cloud, together
 
 from gaussian_swaying.preview.hold import guess_hold, hanging_cord
@@ -33,7 +34,7 @@ def tube(low, high, radius, count=600, end=None, seed=0):
 def ball(center, radius, count=600, seed=0):
     """Points on a sphere."""
     draw = torch.Generator().manual_seed(seed)
-    return torch.tensor(center) + radius * torch.nn.functional.normalize(torch.randn(count, 3, generator=draw), dim=-1)
+    return torch.tensor(center) + radius * unit(count, 3, generator=draw, dtype=torch.float32)
 
 
 def block(low, high, count=1500, seed=0):

@@ -7,6 +7,7 @@ import math
 import pytest
 import torch
 import yaml
+from shared import unit
 from small_scenes import plain_cloud, together, turned_cloud
 
 from gaussian_swaying.aero.looks import LOOKS
@@ -76,7 +77,7 @@ def tree(floor=True, offset=5.0):
     ground = torch.stack([x.reshape(-1), y.reshape(-1), torch.zeros(1681)], -1)
     draw = torch.Generator().manual_seed(0)
     trunk = (torch.rand(300, 3, generator=draw) - 0.5) * torch.tensor([0.1, 0.1, 0.76]) + torch.tensor([0, 0, 0.43])
-    ball = torch.nn.functional.normalize(torch.randn(800, 3, generator=draw), dim=-1)
+    ball = unit(800, 3, generator=draw, dtype=torch.float32)
     crown = 0.35 * ball * torch.rand(800, 1, generator=draw) ** (1 / 3) + torch.tensor([0, 0, 1.1])
     scales = torch.tensor([0.03, 0.03, 0.003]).log()
     quats = torch.cat([torch.tensor([[1.0, 0, 0, 0]]).expand(1681, 4), torch.randn(1100, 4, generator=draw)])

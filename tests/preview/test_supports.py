@@ -5,6 +5,7 @@ import dataclasses
 import pytest
 import torch
 import yaml
+from shared import unit
 from small_scenes import plain_cloud
 
 from gaussian_swaying.gaussians.harmonics import SH_DC
@@ -30,7 +31,7 @@ def lamp(radius=0.006):
     angle, share = 6.2832 * torch.rand(600, generator=draw), torch.rand(600, generator=draw)
     cord = torch.stack([radius * angle.cos(), radius * angle.sin(), 0.24 + 0.66 * share], -1)
     plate = torch.stack([0.04 * angle.sin(), 0.04 * angle.cos() * share, 0.9 + 0.02 * share], -1)
-    ball = torch.nn.functional.normalize(torch.randn(1200, 3, generator=draw), dim=-1) * 0.12
+    ball = unit(1200, 3, generator=draw, dtype=torch.float32) * 0.12
     ball[:, 2] += 0.12
     return plain_cloud(torch.cat([cord, plate, ball]) + torch.tensor([3.0, 4.0, 5.0]), -4.0, logit=2.0)
 

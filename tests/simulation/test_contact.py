@@ -5,6 +5,7 @@ import warnings
 
 import pytest
 import torch
+from shared import unit
 from small_scenes import together
 
 from gaussian_swaying.gaussians.model import GaussianSurfaceModel
@@ -62,7 +63,7 @@ def test_the_distance_from_gaussians_is_that_of_the_ball_that_they_cover():
     centre = torch.tensor([0.0, 0.0, 0.35], dtype=torch.float64)
     given = (ball.means.double(), model.covariance().double(), model.opacity(), centre - corner, centre + corner)
     found = still_distance(*given, 50, 0.5)
-    direction = torch.nn.functional.normalize(torch.randn(400, 3, dtype=torch.float64), dim=-1)
+    direction = unit(400, 3)
     distance, normal = found.at(centre + 0.34 * direction)
     assert float((distance - 0.04).abs().max()) < found.spacing  # the Gaussians themselves are some millimetres thick
     assert float((normal * direction).sum(-1).min()) > 0.9

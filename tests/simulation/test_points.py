@@ -5,7 +5,7 @@ import math
 
 import pytest
 import torch
-from shared import advanced
+from shared import advanced, unit
 
 from gaussian_swaying.aero.force import AeroForce
 from gaussian_swaying.aero.wind import WindField
@@ -355,7 +355,7 @@ def test_wind_on_the_groups_of_a_scene_is_that_on_its_patches(law, scene, make_c
     force = WindForce(aero, WindField([0.0, 0.0, 0.0]), patches)
     state = MPMSolver(dx=dx).init_state(scene.points).replace(F_total=turn, velocity=velocity)
     normal, area = deform_patch(turn[patches.point], patches.normal, patches.area)
-    for wind in torch.nn.functional.normalize(torch.randn(10, 3, generator=generator, dtype=torch.float64), dim=-1):
+    for wind in unit(10, 3, generator=generator):
         each = aero(6 * wind, velocity[patches.point], normal, area)
         expected = torch.zeros_like(velocity).index_add(0, patches.point, each)
         found = force.force(state, 6 * wind)[0]

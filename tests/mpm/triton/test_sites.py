@@ -2,7 +2,7 @@
 
 import pytest
 import torch
-from shared import solid
+from shared import solid, unit
 
 from gaussian_swaying import AeroForce, Box, MaterialPoints, MPMSolver, WindField, WindForce
 from gaussian_swaying.aero.effects import LogProfile
@@ -20,7 +20,7 @@ def post(device, scale=1.0):
     place = torch.cartesian_prod(*axes).to(device)
     count, generator = len(place), torch.Generator().manual_seed(0)
     points = solid(place, 0.04 / count, 100.0, 2e5 * scale, damping=0.5)
-    normal = torch.nn.functional.normalize(torch.randn(2 * count, 3, generator=generator), dim=-1).to(device)
+    normal = unit(2 * count, 3, generator=generator, dtype=torch.float32).to(device)
     area = torch.full((2 * count,), 0.3 / count, device=device)
     return points, Patches(normal, area, torch.arange(count, device=device).repeat(2), count)
 
