@@ -22,7 +22,7 @@ from gaussian_swaying.mpm.followers import Followers, GridFollowers
 from gaussian_swaying.mpm.forces import Force, Forces, FunctionForce, added, as_forces, split, tensors_of
 from gaussian_swaying.mpm.formulations import FORMULATIONS
 from gaussian_swaying.mpm.formulations.formulation import Formulation, Settings
-from gaussian_swaying.mpm.formulations.modes import MOST_LEAN, Modes, why_not_modes
+from gaussian_swaying.mpm.formulations.modes import Modes, why_not_modes
 from gaussian_swaying.mpm.formulations.total import Total
 from gaussian_swaying.mpm.guard import check_begin, check_end, check_load, check_rest
 from gaussian_swaying.mpm.protocol import Solver, WatchFunction
@@ -107,7 +107,7 @@ class MPMSolver(Solver):
         self.settings = Settings(dx, gravity, damping, stiffness_damping, deterministic, pivot)
         self.automatic, self.why = formulation == "auto", ""
         self.formulation: Literal["total", "updated", "modes", "auto"] = "total" if self.automatic else formulation
-        self._too_far: str | None = None
+        self._no_modes: str | None = None
         self._decided = False
         self.transfer: Literal["auto", "torch", "kernels"] = transfer
         self.cfl, self.substep = float(cfl), substep
@@ -264,17 +264,17 @@ class MPMSolver(Solver):
     def _choice(self, body: Body) -> tuple[Literal["total", "updated", "modes"], str]:
         if body.laws.plastic:
             return "updated", f"the law {body.laws.plastic_names[0]} flows"
-        why = self._too_far or why_not_modes(body)
+        why = self._no_modes or why_not_modes(body)
         return ("modes", "it is held, and nothing touches or folds") if why is None else ("total", why.split(": ")[0])
 
     def choose(self, *, anew: bool) -> None:
         """Let ``auto`` choose anew with the next material, or keep its choice, as while a simulation runs."""
         self._decided = not anew
-        self._too_far = None if anew else self._too_far
+        self._no_modes = None if anew else self._no_modes
 
-    def leans_too_far(self, lean: float) -> None:
-        """Let ``auto`` be ``total`` from the next :meth:`init_state` on, as a body leans by a share of its size."""
-        self._too_far = f"it leans by {lean:.0%} of its size, more than the {MOST_LEAN:.0%} that modes can show"
+    def rule_out_modes(self, why: str) -> None:
+        """Let ``auto`` be ``total`` from the next :meth:`init_state` on."""
+        self._no_modes = why
 
     def _why_not_kernels(self, bound: Formulation) -> str | None:
         """Return the reason why no kernels are used, if so; ValueError if none can be, but ``transfer`` is kernels."""

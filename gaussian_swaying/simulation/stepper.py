@@ -295,10 +295,10 @@ class Stepper:
         scene, self._bound = self.scene, self.materials
         points = MaterialPoints.stack(self._bound) if self.batched else self._bound[0]
         state: State = self.solver.init_state(points, frame=scene.frame, surface=scene.surface_places)
-        if isinstance(self.solver, MPMSolver) and self.solver.may_choose and isinstance(self.solver.bound, Modes):
-            lean = self._lean(self.solver.bound)
-            if lean > MOST_LEAN:
-                self.solver.leans_too_far(lean)
+        if isinstance(self.solver, MPMSolver) and isinstance(self.solver.bound, Modes):
+            why = self._why_not_modes(self.solver.bound)
+            if why is not None:
+                self.solver.rule_out_modes(why)
                 state = self.solver.init_state(points, frame=scene.frame, surface=scene.surface_places)
         self.lift = None
         if any(setup.aero.carried for setup in self.setups) and any(self.solver.gravity):
@@ -307,6 +307,15 @@ class Stepper:
                 mass = torch.stack(air) if self.batched else air[0]
                 self.lift = AirLift(mass.to(points.mass), self.solver.gravity)
         return state
+
+    def _why_not_modes(self, bound: Modes) -> str | None:
+        """Why ``auto`` cannot take the modes that it chose; ValueError if they were given and cannot move the scene."""
+        if self.scene.joints:
+            if not self.solver.automatic:
+                raise ValueError("Modes know no joints of parts: set `solver.formulation` to total.")
+            return "parts are joined"
+        lean = self._lean(bound) if self.solver.may_choose else 0.0
+        return f"it leans by {lean:.0%} of its size, more than modes can show" if lean > MOST_LEAN else None
 
     def _lean(self, bound: Modes) -> float:
         """Mean displacement of the tenth that moves most in the strongest steady wind, over the longest side."""

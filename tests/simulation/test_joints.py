@@ -26,13 +26,13 @@ def flags():
     return together(flag, other), torch.arange(2).repeat_interleave(len(flag.means))
 
 
-def simulation(connected="surface", **joint):
+def simulation(connected="surface", formulation="total", **joint):
     cloud, number = flags()
     parts = Parts(number, [Part("pole", "held"), Part("vane", attached="pole", **joint)])
     run = Simulation(
         Scene(generator=GivenScene(cloud), parts=parts, connected=connected, metres_per_unit=1.0, layers=3),
         Material(E=1e6, density=100.0, thickness=0.05),
-        solver=MPMSolver(DX, gravity=(0.0, 0.0, 0.0)),
+        solver=MPMSolver(DX, gravity=(0.0, 0.0, 0.0), formulation=formulation),
         wind=[0.0, 6.0, 0.0],
         device="cpu",
     )
@@ -42,6 +42,14 @@ def simulation(connected="surface", **joint):
 def end(run, frames=8):
     state, _ = advanced(run, frames)
     return run.scene.deformed(state).means - run.scene.rest().means
+
+
+def test_modes_have_no_joints():
+    with pytest.raises(ValueError, match=r"`solver\.formulation`"):
+        simulation(formulation="modes", joint_turning=0.0)[0].start()
+    run, _ = simulation(formulation="auto", joint_turning=0.0)
+    run.start()
+    assert (run.solver.formulation, run.solver.why) == ("total", "parts are joined")
 
 
 def test_a_vane_turns_about_its_hinge_and_a_spring_holds_it():
