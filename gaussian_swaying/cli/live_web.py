@@ -5,7 +5,6 @@ from __future__ import annotations
 import argparse
 import tempfile
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
 
 from gaussian_swaying import _program as program
@@ -41,27 +40,8 @@ def build_options() -> argparse.ArgumentParser:
     return parser
 
 
-@dataclass(frozen=True, eq=False)
-class Asked:
-    """The page that a command line asks for.
-
-    Attributes:
-        simulation: What runs in it.
-        name: What it shows.
-        target: The file.
-        sentence: The grid that was chosen, or None.
-        element: Whether the script for other pages is asked for, too.
-    """
-
-    simulation: Simulation
-    name: str
-    target: Path
-    sentence: str | None
-    element: bool
-
-
-def asked(arguments: Sequence[str]) -> Asked:
-    """The page that a command line asks for.
+def export_live_web(arguments: Sequence[str]) -> None:
+    """Write the page that a command line asks for, and report its size.
 
     Args:
         arguments: The command line.
@@ -83,30 +63,20 @@ def asked(arguments: Sequence[str]) -> Asked:
         settings.device = "cpu"
         splat = settings.scene.ply
         made = getattr(settings.scene.generator, "class_path", "scene").rsplit(".", 1)[-1].removesuffix("Scene")
-        name = made if splat is None else Path(splat).stem
         if options.target is None:
-            return Asked(Simulation.from_settings(parser, settings), name, target, None, options.element)
-        found = fitted(parser, settings, options.target)
-        return Asked(found.simulation, name, target, found.sentence, options.element)
-
-
-def export_live_web(arguments: Sequence[str]) -> None:
-    """Write the page, and report its size.
-
-    Args:
-        arguments: The command line.
-    """
-    page = asked(arguments)
-    if page.sentence is not None:
-        print(page.sentence)
-    written = write_live_web(page.simulation, page.name, page.target)
+            simulation = Simulation.from_settings(parser, settings)
+        else:
+            found = fitted(parser, settings, options.target)
+            simulation = found.simulation
+            print(found.sentence)
+    written = write_live_web(simulation, made if splat is None else Path(splat).stem, target)
     if written.notes:
         print("\n".join(f"note: {note.replace('the film', 'the page')}" for note in written.notes))
     print(f"{written.gaussians:,} Gaussians, {written.points:,} material points")
-    if page.element:
-        write_element(page.target.parent)
-        print(f"wrote {page.target.with_name(ELEMENT)}")
-    print(f"wrote {page.target} ({page.target.stat().st_size / 1e6:.1f} MB)")
+    if options.element:
+        write_element(target.parent)
+        print(f"wrote {target.with_name(ELEMENT)}")
+    print(f"wrote {target} ({target.stat().st_size / 1e6:.1f} MB)")
 
 
 def default_target(scene: str) -> Path:

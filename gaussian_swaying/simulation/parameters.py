@@ -386,9 +386,6 @@ def _angles(flow: Sequence[float]) -> tuple[float, float, float]:
 def _write_material(setup: Setup, values: Mapping[str, Any]) -> Setup:
     points, material = setup.points, setup.material
 
-    def everywhere(like: Tensor, value: Any) -> Tensor:
-        return torch.zeros_like(like) + value  # keeps a gradient
-
     for name in values:
         if any(getattr(part, name[9:]) is not None for part in material.regions):
             raise ValueError(
@@ -408,12 +405,12 @@ def _write_material(setup: Setup, values: Mapping[str, Any]) -> Setup:
         material = replace(material, thickness=values["material.thickness"])
     if points.bending is not None and setup.material.bending == PLATE:
         points = replace(points, bending=points.bending * _stiffer(setup, values))
-    if "material.E" in values:
-        points = replace(points, youngs_modulus=everywhere(points.youngs_modulus, values["material.E"]))
-        material = replace(material, E=values["material.E"])
-    if "material.nu" in values:
-        points = replace(points, poisson_ratio=everywhere(points.poisson_ratio, values["material.nu"]))
-        material = replace(material, nu=values["material.nu"])
+    for name, field in (("E", "youngs_modulus"), ("nu", "poisson_ratio")):
+        if f"material.{name}" in values:
+            value = values[f"material.{name}"]
+            # a sum keeps a gradient
+            points = replace(points, **{field: torch.zeros_like(getattr(points, field)) + value})
+            material = replace(material, **{name: value})
     if "material.density" in values:
         points = replace(points, mass=points.volume * values["material.density"])
         material = replace(material, density=values["material.density"])

@@ -13,7 +13,6 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from gaussian_swaying._checks import check_positive
 from gaussian_swaying._files import sha256
 from gaussian_swaying._provenance import describe_device, peak_memory, versions
 from gaussian_swaying.gaussians.model import DeformedGaussians
@@ -206,7 +205,6 @@ class Run:
             The summary.
         """
         frames, recorder, painter = self.frames, self.recorder, self.painter
-        check_positive("frames", frames)
         for look in range(min(frames, MAX_LOOKS)):  # all of them, unless there are very many
             painter.check_camera(look * (frames - 1) // max(min(frames, MAX_LOOKS) - 1, 1))
         state = self.editor.start()  # errors are raised before anything is written
@@ -441,9 +439,9 @@ class Run:
             "energy_start_J": energy[0] if energy else None,
             "energy_end_J": energy[-1] if energy else None,
             "largest_cfl": max((entry["cfl"] for entry in log), default=None),
-            "wind_work_J": sum(entry.get("wind_work", 0.0) for entry in log),
+            "wind_work_J": sum(entry["wind_work"] for entry in log),
             "lost_particles": int(log[-1]["lost"]) if log else 0,
-            "torn_particles": int(log[-1].get("torn", 0)) if log else 0,
+            "torn_particles": int(log[-1]["torn"]) if log else 0,
             "stretch_min": min((entry["stretch_min"] for entry in log), default=None),
             "stretch_max": max((entry["stretch_max"] for entry in log), default=None),
             "displacement_mean_max_m": max(moved, default=None),

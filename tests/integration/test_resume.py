@@ -108,7 +108,7 @@ def test_a_run_that_is_told_to_end(whole, tmp_path, monkeypatch, capsys):
     def end(run):
         run.recorder.wait()
         for more in ([], ["--resume"]):
-            refused(main, _arguments(folder, *more), capsys, f"process {os.getpid()} on this host", folder=folder)
+            refused(main, _arguments(folder, *more), capsys, f"process {os.getpid()} on this host")
         os.kill(os.getpid(), signal.SIGTERM)
 
     before = signal.signal(signal.SIGTERM, signal.SIG_DFL)
