@@ -36,7 +36,7 @@ def test_the_file_keeps_labels_roles_and_materials(tmp_path):
         (lambda: Part("a", "rigid", nu=0.2), "rigid and does not bend"),
         (lambda: Part("", "soft"), "has no name"),
         (lambda: Part("a", "still", E=1e5), "still and has no material"),
-        (lambda: Part("a", density=-1.0), "density of the part 'a'"),
+        (lambda: Part("a", density=0.0), "density of the part 'a'"),
         (lambda: Part("a", nu=0.5), "nu of the part 'a'"),
         (lambda: Parts([0, 3], PARTS), "labels from 0 to 2"),
         (lambda: Parts([-1, 0], PARTS), "labels from 0 to 2"),
