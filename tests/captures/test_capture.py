@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import torch
 from plyfile import PlyData, PlyElement
+from small_captures import POINTS, arc, picture, write_colmap, write_transforms
 from torch.testing import assert_close
 
 from gaussian_swaying.captures.capture import nearest_to_axes, read_capture
@@ -26,11 +27,11 @@ def _same_camera(found, expected, atol=1e-6):
 
 
 @pytest.fixture
-def written(tmp_path, capture_tools):
+def written(tmp_path):
     """A folder with a transforms.json of some cameras and their images."""
 
     def write(count=3, **fields):
-        return capture_tools.transforms(tmp_path, capture_tools.cameras(count), _names(count), **fields)
+        return write_transforms(tmp_path, arc(count), _names(count), **fields)
 
     return write
 
@@ -38,15 +39,15 @@ def written(tmp_path, capture_tools):
 # ---- transforms.json
 
 
-def test_one_transforms_file(tmp_path, capture_tools):
-    poses = capture_tools.cameras(9)
-    capture_tools.transforms(tmp_path, poses, _names(9))
+def test_one_transforms_file(tmp_path):
+    poses = arc(9)
+    write_transforms(tmp_path, poses, _names(9))
     capture = read_capture(tmp_path)
     assert [view.name for view in capture.views] == _names(9)
     assert [view.split for view in capture.views] == ["test", *["train"] * 7, "test"]
     for index, (view, pose) in enumerate(zip(capture.views, poses, strict=True)):
         _same_camera(view.camera, pose)
-        assert torch.equal(view.load(), torch.from_numpy(capture_tools.picture(index)))
+        assert torch.equal(view.load(), torch.from_numpy(picture(index)))
     train = torch.stack([pose.position for pose in poses[1:8]])
     assert_close(capture.center, train.mean(0).float())
     assert capture.extent == pytest.approx(1.1 * float((train - train.mean(0)).norm(dim=-1).max()), rel=1e-5)
@@ -55,13 +56,13 @@ def test_one_transforms_file(tmp_path, capture_tools):
     assert read_capture(tmp_path, test_every=0).split("test") == ()
 
 
-def test_blender_files_without_extensions_and_sizes(tmp_path, capture_tools):
-    poses = capture_tools.cameras(4)
+def test_blender_files_without_extensions_and_sizes(tmp_path):
+    poses = arc(4)
     angle = 2 * float(torch.atan(10 / poses[0].intrinsics[0, 0]))
     for split, some in (("train", poses[:2]), ("val", poses[2:3]), ("test", poses[3:])):
         names = [f"./{split}/r_{index}" for index in range(len(some))]
         file = f"transforms_{split}.json"
-        capture_tools.transforms(tmp_path, some, names, channels=4, file=file, camera_angle_x=angle)
+        write_transforms(tmp_path, some, names, channels=4, file=file, camera_angle_x=angle)
     capture = read_capture(tmp_path)
     assert {view.name: view.split for view in capture.views} == {
         "test/r_0": "test",
@@ -106,10 +107,10 @@ def test_an_image_with_another_extension_is_found(tmp_path, written):
     assert [view.image_path.name for view in read_capture(tmp_path, test_every=0).views] == ["000.png", "001.png"]
 
 
-def test_lists_of_file_names_are_the_split(tmp_path, capture_tools):
+def test_lists_of_file_names_are_the_split(tmp_path):
     names = _names(4)
     lists = {"train_filenames": names[:2], "val_filenames": names[2:3], "test_filenames": [f"./{names[3]}"]}
-    capture_tools.transforms(tmp_path, capture_tools.cameras(4), names, **lists)
+    write_transforms(tmp_path, arc(4), names, **lists)
     assert [view.split for view in read_capture(tmp_path).views] == ["train", "train", "val", "test"]
 
 
@@ -141,19 +142,19 @@ _RGB = ("red", "green", "blue")
 
 @pytest.mark.parametrize("binary", [True, False], ids=["bin", "txt"])
 @pytest.mark.parametrize("sparse", ["sparse/0", "sparse"])
-def test_colmap(tmp_path, capture_tools, binary, sparse):
-    poses, names = capture_tools.cameras(9), [f"left eye/{index:03d}.png" for index in range(9)]
+def test_colmap(tmp_path, binary, sparse):
+    poses, names = arc(9), [f"left eye/{index:03d}.png" for index in range(9)]
     order = [3, 0, 8, 1, 2, 7, 4, 5, 6]
-    capture_tools.colmap(tmp_path, [poses[i] for i in order], [names[i] for i in order], binary=binary, sparse=sparse)
+    write_colmap(tmp_path, [poses[i] for i in order], [names[i] for i in order], binary=binary, sparse=sparse)
     capture = read_capture(tmp_path)
     assert [view.name for view in capture.views] == names
     assert [view.split for view in capture.views] == ["test", *["train"] * 7, "test"]
     for view, pose in zip(capture.views, poses, strict=True):
         _same_camera(view.camera, pose)
-    assert torch.equal(capture.views[3].load(), torch.from_numpy(capture_tools.picture(0)))
-    expected = torch.tensor([place for place, _ in capture_tools.points])
+    assert torch.equal(capture.views[3].load(), torch.from_numpy(picture(0)))
+    expected = torch.tensor([place for place, _ in POINTS])
     assert_close(capture.points, expected)
-    assert_close(capture.colors, torch.tensor([c for _, c in capture_tools.points]) / 255)
+    assert_close(capture.colors, torch.tensor([c for _, c in POINTS]) / 255)
 
 
 @pytest.mark.parametrize("binary", [True, False], ids=["bin", "txt"])
@@ -171,24 +172,24 @@ def test_colmap(tmp_path, capture_tools, binary, sparse):
         ),
     ],
 )
-def test_colmap_camera_models(tmp_path, capture_tools, binary, model, parameters, expected):
-    capture_tools.colmap(tmp_path, capture_tools.cameras(2), ["a.png", "b.png"], model, parameters, binary)
+def test_colmap_camera_models(tmp_path, binary, model, parameters, expected):
+    write_colmap(tmp_path, arc(2), ["a.png", "b.png"], model, parameters, binary)
     lens = read_capture(tmp_path, test_every=0).views[0].lens
     assert (lens.fx, lens.fy, lens.cx, lens.cy, lens.distortion) == expected
 
 
 @pytest.mark.parametrize("binary", [True, False], ids=["bin", "txt"])
-def test_other_camera_models_are_refused(tmp_path, capture_tools, binary):
+def test_other_camera_models_are_refused(tmp_path, binary):
     fisheye = [19.0, 18.0, 9.5, 8.25, 0.1, -0.02, 0.003, 0.004]
-    capture_tools.colmap(tmp_path, capture_tools.cameras(2), ["a.png", "b.png"], "OPENCV_FISHEYE", fisheye, binary)
+    write_colmap(tmp_path, arc(2), ["a.png", "b.png"], "OPENCV_FISHEYE", fisheye, binary)
     with pytest.raises(ValueError, match=r"cameras\.(bin|txt).*camera 7.*OPENCV_FISHEYE.*image_undistorter"):
         read_capture(tmp_path)
 
 
-def test_colmap_comes_before_transforms_unless_told(tmp_path, capture_tools):
-    poses = capture_tools.cameras(3)
-    capture_tools.colmap(tmp_path, poses, ["000.png", "001.png", "002.png"])
-    capture_tools.transforms(tmp_path, poses[:2], _names(2))
+def test_colmap_comes_before_transforms_unless_told(tmp_path):
+    poses = arc(3)
+    write_colmap(tmp_path, poses, ["000.png", "001.png", "002.png"])
+    write_transforms(tmp_path, poses[:2], _names(2))
     assert len(read_capture(tmp_path).views) == 3
     assert len(read_capture(tmp_path, "transforms", test_every=0).views) == 2
 
@@ -197,14 +198,14 @@ def test_colmap_comes_before_transforms_unless_told(tmp_path, capture_tools):
 
 
 @pytest.mark.parametrize("kind", ["transforms", "colmap"])
-def test_downscale_averages_or_reads_the_smaller_folder(tmp_path, capture_tools, kind):
-    poses, names = capture_tools.cameras(3), ["000.png", "001.png", "002.png"]
+def test_downscale_averages_or_reads_the_smaller_folder(tmp_path, kind):
+    poses, names = arc(3), ["000.png", "001.png", "002.png"]
     if kind == "colmap":
-        capture_tools.colmap(tmp_path, poses, names)
+        write_colmap(tmp_path, poses, names)
     else:
-        capture_tools.transforms(tmp_path, poses, _names(3))
+        write_transforms(tmp_path, poses, _names(3))
     view = read_capture(tmp_path, downscale=3).views[1]
-    full = torch.from_numpy(capture_tools.picture(1)).float()
+    full = torch.from_numpy(picture(1)).float()
     mean = full[:15, :18].reshape(5, 3, 6, 3, 3).mean((1, 3))
     assert_close(view.load().float(), mean, rtol=0, atol=0.51)
     focal = float(poses[0].intrinsics[0, 0])
@@ -300,12 +301,10 @@ def test_an_empty_split_and_bad_arguments(tmp_path, written):
 
 
 @pytest.mark.parametrize("binary", [True, False], ids=["bin", "txt"])
-def test_bad_colmap_models_are_named(tmp_path, capture_tools, binary):
+def test_bad_colmap_models_are_named(tmp_path, binary):
     def write(**changes):
         folder = tmp_path / str(len(list(tmp_path.iterdir())))
-        return capture_tools.colmap(
-            folder, capture_tools.cameras(3), ["a.png", "b.png", "c.png"], binary=binary, **changes
-        )
+        return write_colmap(folder, arc(3), ["a.png", "b.png", "c.png"], binary=binary, **changes)
 
     suffix = "bin" if binary else "txt"
     folder = write()
@@ -327,8 +326,8 @@ def test_bad_colmap_models_are_named(tmp_path, capture_tools, binary):
         read_capture(write(), images="photos")
 
 
-def test_a_zero_quaternion_and_an_unknown_camera_are_named(tmp_path, capture_tools):
-    capture_tools.colmap(tmp_path, capture_tools.cameras(2), ["a.png", "b.png"], binary=False)
+def test_a_zero_quaternion_and_an_unknown_camera_are_named(tmp_path):
+    write_colmap(tmp_path, arc(2), ["a.png", "b.png"], binary=False)
     file = tmp_path / "sparse/0/images.txt"
     good = file.read_text()
     words = good.splitlines()[1].split()

@@ -6,6 +6,7 @@ import math
 import pytest
 import torch
 from shared import double
+from small_captures import write_colmap, write_transforms
 from torch.testing import assert_close
 
 from gaussian_swaying.captures.capture_camera import CaptureCamera, read_views
@@ -24,13 +25,13 @@ def _cameras():
 
 
 @pytest.fixture(params=["transforms", "colmap"])
-def capture(request, tmp_path, capture_tools):
+def capture(request, tmp_path):
     """A capture without its images, whose files have another order than the names."""
     cameras = [_cameras()[name] for name in ("c.png", "a.png", "b.png")]
     names, without = ["images/c.png", "images/a.png", "images/b.png"], {"images": False}
     if request.param == "transforms":
-        return capture_tools.transforms(tmp_path, cameras, names, **without)
-    return capture_tools.colmap(tmp_path, cameras, names, binary=False, **without)
+        return write_transforms(tmp_path, cameras, names, **without)
+    return write_colmap(tmp_path, cameras, names, binary=False, **without)
 
 
 def _same(camera, expected):

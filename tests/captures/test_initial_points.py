@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 import torch
 from plyfile import PlyData, PlyElement
+from small_captures import arc, write_colmap, write_transforms
 from torch.testing import assert_close
 
 from gaussian_swaying.captures.capture import read_capture
@@ -15,13 +16,13 @@ SQUARE = "# a square and its colours\nv 0 0 0 1 0 0\nv 2 0 0 1 0 0\nv 2 1 0 0 0 
 
 
 @pytest.fixture
-def capture(tmp_path, capture_tools):
+def capture(tmp_path):
     names = [f"images/{index}.png" for index in range(4)]
-    return read_capture(capture_tools.transforms(tmp_path / "capture", capture_tools.cameras(4), names), test_every=0)
+    return read_capture(write_transforms(tmp_path / "capture", arc(4), names), test_every=0)
 
 
-def test_points_of_the_capture_come_first(tmp_path, capture_tools):
-    capture = read_capture(capture_tools.colmap(tmp_path, capture_tools.cameras(2), ["a.png", "b.png"]), test_every=0)
+def test_points_of_the_capture_come_first(tmp_path):
+    capture = read_capture(write_colmap(tmp_path, arc(2), ["a.png", "b.png"]), test_every=0)
     for source in ("auto", "capture"):
         assert torch.equal(initial_points(capture, source).points, capture.points)
     assert len(initial_points(capture, "random", count=50)) == 50
@@ -107,7 +108,7 @@ def test_ply_with_and_without_faces(tmp_path, capture):
     assert len(initial_points(capture, tmp_path / "mesh.ply", count=7)) == 7
 
 
-def test_bad_sources_are_named(tmp_path, capture, capture_tools):
+def test_bad_sources_are_named(tmp_path, capture):
     with pytest.raises(ValueError, match="has no points"):
         initial_points(capture, "capture")
     with pytest.raises(ValueError, match=r"points\.xyz.*\.ply or \.obj"):
@@ -132,11 +133,11 @@ def test_bad_sources_are_named(tmp_path, capture, capture_tools):
         random_points(torch.zeros(3), 0.0, 5)
 
 
-def test_cameras_that_look_apart_need_points(tmp_path, capture_tools):
+def test_cameras_that_look_apart_need_points(tmp_path):
     from gaussian_swaying.rendering.cameras.camera import look_at_camera
 
     eyes = [(1, 0, 0), (-1, 0, 0), (0, 1, 0), (0, -1, 0)]
     outward = [look_at_camera(eye, [2 * v for v in eye], (0, 0, 1), 40.0, 20, 16, dtype=torch.float64) for eye in eyes]
-    capture = read_capture(capture_tools.transforms(tmp_path, outward, [f"{i}.png" for i in range(4)]), test_every=0)
+    capture = read_capture(write_transforms(tmp_path, outward, [f"{i}.png" for i in range(4)]), test_every=0)
     with pytest.raises(ValueError, match="do not look at a common point"):
         initial_points(capture)

@@ -4,7 +4,6 @@ import functools
 import json
 import os
 import random
-import runpy
 import shutil
 import struct
 import tempfile
@@ -14,6 +13,7 @@ from pathlib import Path
 import yaml
 from damage import changed, damaged
 from shared import PIN, SMALL, words
+from small_captures import arc, write_colmap, write_transforms
 
 ROOT = Path(__file__).parents[2]
 FLAG = ROOT / "configs/sim/flag.yaml"
@@ -77,11 +77,6 @@ def yaml_case(rng, folder):
     return ["sim", "--config", str(folder / "bad.yaml"), "--device", "cpu", "--output", "run"]
 
 
-@functools.cache
-def _captures():
-    return runpy.run_path(str(ROOT / "tests/captures/conftest.py"))
-
-
 def _png(side):
     """A picture of a few bytes that announces any size."""
 
@@ -94,12 +89,12 @@ def _png(side):
 
 def capture_case(rng, folder):
     """Most are read with all pictures, some trained for a step."""
-    poses, names = _captures()["cameras"](4), [f"images/{k}.png" for k in range(4)]
+    poses, names = arc(4), [f"images/{k}.png" for k in range(4)]
     if rng.random() < 0.4:
-        _captures()["write_colmap"](folder, poses, [Path(name).name for name in names], binary=rng.random() < 0.6)
+        write_colmap(folder, poses, [Path(name).name for name in names], binary=rng.random() < 0.6)
         texts = sorted((folder / "sparse/0").iterdir())
     else:
-        _captures()["write_transforms"](folder, poses, names)
+        write_transforms(folder, poses, names)
         texts = [folder / "transforms.json"]
     path = rng.choice([*texts, *texts, rng.choice(sorted(folder.rglob("*.png")))])
     kind = rng.random()

@@ -5,6 +5,7 @@ import math
 
 import pytest
 import torch
+from small_captures import arc, write_transforms
 from torch.testing import assert_close
 
 lightning = pytest.importorskip("lightning")
@@ -13,10 +14,10 @@ from gaussian_swaying.training.data.datamodule import CaptureDataModule  # noqa:
 
 
 @pytest.fixture
-def folder(tmp_path, capture_tools):
+def folder(tmp_path):
     """Nine images with alpha, of which two are for testing."""
     names = [f"images/{index:03d}.png" for index in range(9)]
-    return capture_tools.transforms(tmp_path / "capture", capture_tools.cameras(9), names, channels=4)
+    return write_transforms(tmp_path / "capture", arc(9), names, channels=4)
 
 
 def _indices(data, count):
@@ -71,10 +72,10 @@ def test_only_the_images_of_the_stage_are_read(folder):
         data.setup("fit")
 
 
-def test_validation_prefers_its_own_split(tmp_path, capture_tools):
+def test_validation_prefers_its_own_split(tmp_path):
     names = [f"{index}.png" for index in range(4)]
     lists = {"train_filenames": names[:2], "val_filenames": names[2:3], "test_filenames": names[3:]}
-    data = CaptureDataModule(capture_tools.transforms(tmp_path, capture_tools.cameras(4), names, **lists))
+    data = CaptureDataModule(write_transforms(tmp_path, arc(4), names, **lists))
     data.setup()
     assert [batch.name for batch in data.val_dataloader()] == ["2.png"]
     assert [batch.name for batch in data.test_dataloader()] == ["3.png"]

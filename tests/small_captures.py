@@ -1,11 +1,10 @@
-"""Tiny captures, written as the tools of the field write them."""
+"""Small captures, written as the tools of the field write them."""
 
 import json
 import struct
 
 import imageio.v3 as iio
 import numpy as np
-import pytest
 import torch
 
 from gaussian_swaying.geometry.rotations import rotation_to_quat
@@ -14,7 +13,7 @@ from gaussian_swaying.rendering.cameras.camera import look_at_camera
 MODELS = {"SIMPLE_PINHOLE": 0, "PINHOLE": 1, "SIMPLE_RADIAL": 2, "RADIAL": 3, "OPENCV": 4, "OPENCV_FISHEYE": 5}
 
 
-def cameras(count, width=20, height=16):
+def arc(count, width=20, height=16):
     """Cameras on an arc that look at (0, 0, 0.2), in float64."""
     eyes = [(2 * np.sin(0.4 * i), -2 * np.cos(0.4 * i), 0.1 * i) for i in range(count)]
     return [
@@ -93,13 +92,3 @@ def write_colmap(
             (folder / "images" / name).parent.mkdir(parents=True, exist_ok=True)
             iio.imwrite(folder / "images" / name, picture(index))
     return folder
-
-
-@pytest.fixture
-def capture_tools():
-    """The writers of this file, as a namespace."""
-    import types
-
-    return types.SimpleNamespace(
-        cameras=cameras, picture=picture, transforms=write_transforms, colmap=write_colmap, points=POINTS
-    )
