@@ -92,13 +92,22 @@ def gradients(count, device="cpu", dtype=torch.float64):
     return f.to(device, dtype)
 
 
+def merged(settings, changes):
+    """Settings with some changed; a dictionary with a class replaces the one before."""
+    both = dict(settings)
+    for name, value in changes.items():
+        inner = isinstance(value, dict) and "class_path" not in value and isinstance(both.get(name), dict)
+        both[name] = merged(both[name], value) if inner else value
+    return both
+
+
 def contents(folder):
     """The bytes of each file of a folder, None for what is none."""
     return {path: path.read_bytes() if path.is_file() else None for path in folder.rglob("*")}
 
 
 def refused(main, arguments, capsys, *words, folder=None):
-    """A command ends with code 2 and one sentence that has the words, and changes nothing in a folder."""
+    """The one sentence, which has the words, with which a command ends with code 2; nothing in a folder changes."""
     capsys.readouterr()
     before = folder and contents(folder)
     try:
@@ -112,3 +121,4 @@ def refused(main, arguments, capsys, *words, folder=None):
     for word in words:
         assert word in error, error
     assert (folder and contents(folder)) == before
+    return error

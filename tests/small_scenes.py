@@ -16,7 +16,9 @@ from gaussian_swaying.geometry.regions import Box
 from gaussian_swaying.geometry.rotations import quat_to_rotation
 from gaussian_swaying.mpm.boundaries.pinned_region import PinnedRegion
 from gaussian_swaying.mpm.solver import MPMSolver
+from gaussian_swaying.preview.cost import Cost
 from gaussian_swaying.preview.results import write
+from gaussian_swaying.preview.starter import starter_yaml
 from gaussian_swaying.rendering.cameras.camera_path import OrbitCamera
 from gaussian_swaying.scenes.procedural import FlagScene, GivenScene
 from gaussian_swaying.simulation.material import Material
@@ -52,6 +54,13 @@ def plain_cloud(means, log_scales=-4.0, quats=(1.0, 0.0, 0.0, 0.0), logit=3.0):
     )
 
 
+def coloured(cloud, color, where=slice(None)):
+    """The same Gaussians, some of them with one colour from all sides."""
+    sh = cloud.sh.clone()
+    sh[where, 0] = (torch.tensor(color) - 0.5) / SH_DC
+    return dataclasses.replace(cloud, sh=sh)
+
+
 GREEN = (0.2, 0.5, 0.15)
 
 
@@ -63,9 +72,7 @@ def block(sides, color, count=3000):
     face = torch.randint(6, (count,), generator=draw)
     for k in range(6):
         place[face == k, k // 2] = (low if k % 2 else high)[k // 2]
-    cloud = plain_cloud(place + torch.tensor([3.0, 4.0, 0.0]), -4.0, logit=3.0)
-    sh = ((torch.tensor(color) - 0.5) / SH_DC).expand(count, 3)
-    return dataclasses.replace(cloud, sh=sh[:, None])
+    return coloured(plain_cloud(place + torch.tensor([3.0, 4.0, 0.0])), color)
 
 
 def blobs(centres, radius, color, count, seed=0):
@@ -74,8 +81,7 @@ def blobs(centres, radius, color, count, seed=0):
     own = torch.tensor(centres)[torch.randint(len(centres), (count,), generator=draw)]
     place = own + radius * torch.randn(count, 3, generator=draw).clamp(-1.5, 1.5) / 1.5
     turn = unit(count, 4, generator=draw, dtype=torch.float32)
-    cloud = plain_cloud(place, (-4.2, -4.2, -6.0), turn, logit=3.0)
-    return dataclasses.replace(cloud, sh=((torch.tensor(color) - 0.5) / SH_DC).expand(count, 1, 3))
+    return coloured(plain_cloud(place, (-4.2, -4.2, -6.0), turn), color)
 
 
 def shrub(count=4000):
@@ -100,6 +106,23 @@ def lamp(count=3000):
     """A shade on a cord of 0.6 m."""
     cord = blobs([(0.0, 0.0, h) for h in torch.linspace(0.3, 0.95, 60).tolist()], 0.012, (0.1, 0.1, 0.1), count // 3)
     return together(cord, blobs([(0.0, 0.0, 0.15)], 0.17, (0.7, 0.2, 0.2), 2 * count // 3, 1))
+
+
+def run_cost(dx, **numbers):
+    """A cost of a run on a grid, of which some numbers matter."""
+    ones = dict.fromkeys(("wave_speed", "stable_substep", "substep", "substep_seconds", "simulation_seconds"), 1.0)
+    found = {"device": "", "particles": 1, "grid": (1, 1, 1), "frames": 51, "substeps": 1, "picture_seconds": None}
+    return Cost(dx=dx, **(found | ones | numbers))
+
+
+def started(found, cloud, folder):
+    """The simulation of the starter of a suggestion."""
+    write_ply(folder / "it.ply", cloud)
+    if found.parts is not None:
+        path = found.parts.parts.save(folder / "parts.npz")
+        found = dataclasses.replace(found, parts=dataclasses.replace(found.parts, path=str(path)))
+    (folder / "starter.yaml").write_text(starter_yaml(found, folder / "it.ply", 2))
+    return Simulation.from_yaml(folder / "starter.yaml", device="cpu")
 
 
 def previewed(cloud, folder, *options):

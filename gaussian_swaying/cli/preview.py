@@ -48,11 +48,10 @@ from gaussian_swaying.preview.report import (
     splat_lines,
     suggestion_dict,
     suggestion_lines,
-    video_length,
 )
 from gaussian_swaying.preview.results import Preview, splat_name, write
 from gaussian_swaying.preview.shape import DIRECTIONS, bounds
-from gaussian_swaying.preview.starter import starter_yaml
+from gaussian_swaying.preview.starter import FRAME_DT, PICTURE, starter_yaml
 from gaussian_swaying.preview.suggest import (
     QUALITIES,
     Suggestion,
@@ -187,7 +186,7 @@ def preview_scene(options: argparse.Namespace, folder: Path) -> Preview:
     chosen_quality = suggestion.quality
     if options.minutes is not None:
         wish, finest = 60 * options.minutes, finest_spacing(suggestion)
-        cost = finest_within(measure, wish, cost, cost, finest, grids["draft"])
+        cost = finest_within(measure, wish, cost, finest, grids["draft"])
         chosen_quality = f"--minutes {options.minutes:g}"
     suggestion, simulation = made[cost.dx]
     suggestion = replace(suggestion, quality=chosen_quality)
@@ -222,11 +221,12 @@ def preview_scene(options: argparse.Namespace, folder: Path) -> Preview:
     report += cost_lines(cost)
     report += quality_lines(suggestion, cost, options.minutes, grids, others)
     where = Path("outputs") / splat_name(options.scene)
-    report += ["", f"the starter ({video_length(text)}, {duration(cost.total_seconds)} here):"]
+    film = f"{options.frames * FRAME_DT:.3g} s at {PICTURE[0]} x {PICTURE[1]}"
+    report += ["", f"the starter ({film}, {duration(cost.total_seconds)} here):"]
     report.append(f"  {shlex.join(program.words('sim'))} --config {folder / 'starter'}.yaml --output {where}")
     picture = preview_picture(simulation, options.height, whole=suggestion.whole)
     labels = None if suggestion.parts is None else suggestion.parts.parts
-    return Preview("\n".join(report), data, picture, {"starter": text}, things, labels)
+    return Preview("\n".join(report), data, picture, text, things, labels)
 
 
 def preview_config(options: argparse.Namespace) -> Preview:
@@ -259,7 +259,7 @@ def preview_config(options: argparse.Namespace) -> Preview:
         *run_lines(data["run"]),
         *cost_lines(cost),
     ]
-    return Preview("\n".join(report), data, preview_picture(simulation, options.height), {})
+    return Preview("\n".join(report), data, preview_picture(simulation, options.height))
 
 
 def _natural(

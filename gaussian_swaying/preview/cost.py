@@ -245,7 +245,7 @@ def scaled_seconds(cost: Cost, other: Cost, dx: float) -> float:
 
 
 def finest_within(
-    measure: Callable[[float], Cost], seconds: float, first: Cost, draft: Cost, finest: float, coarsest: float
+    measure: Callable[[float], Cost], seconds: float, first: Cost, finest: float, coarsest: float
 ) -> Cost:
     """The cost of a run on the finest grid that takes at most some time; on the coarsest one if none does.
 
@@ -253,13 +253,12 @@ def finest_within(
         measure: Function that estimates the cost of the run for a grid spacing [m].
         seconds: Longest time of the run [s].
         first: Its result for one spacing.
-        draft: The same scene on another grid; its frames and pictures do not count.
         finest: Smallest grid spacing [m].
         coarsest: Largest grid spacing [m].
     """
     tried = {first.dx: first}
     for _ in range(3):
-        dx = predicted_spacing(tried.values(), draft, seconds, finest, coarsest)
+        dx = predicted_spacing(tried.values(), seconds, finest, coarsest)
         if dx in tried:
             break
         try:
@@ -274,19 +273,17 @@ def finest_within(
     return tried[coarsest] if coarsest in tried else measure(coarsest)
 
 
-def predicted_spacing(tried: Collection[Cost], draft: Cost, seconds: float, finest: float, coarsest: float) -> float:
+def predicted_spacing(tried: Collection[Cost], seconds: float, finest: float, coarsest: float) -> float:
     """The finest grid spacing on which a run should take at most some time [m], rounded up to two digits.
 
     Args:
         tried: The run on some grids.
-        draft: The same scene on another grid, or one of ``tried``; its frames and pictures do not count.
         seconds: Longest time of the run [s].
         finest: Smallest grid spacing [m].
         coarsest: Largest grid spacing [m]; the result if none is coarse enough.
     """
     nearest = min(tried, key=lambda cost: abs(math.log(cost.total_seconds / seconds)))
-    others = [draft, *(cost for cost in tried if cost is not nearest)]
-    other = min(others, key=lambda cost: _apart(cost.dx, nearest.dx))
+    other = min(tried, key=lambda cost: _apart(cost.dx, nearest.dx))
     low, high = finest, coarsest
     for _ in range(30):  # the time falls as dx grows
         middle = math.sqrt(low * high)

@@ -14,6 +14,7 @@ from gaussian_swaying.geometry.regions import Box, Cylinder, Region
 from gaussian_swaying.preview.shape import (
     DIRECTIONS,
     FEWEST,
+    breadth,
     plane_axes,
     quantile,
     rounded,
@@ -112,9 +113,10 @@ def guess_hold(
         base = standing_base(where, weight, axis)
         if base is not None:
             found["bottom"].append((1.0, base))
-        cord = hanging_cord(where, weight, axis)
+        cord = cord_heights(where, weight, axis)
         if cord is not None:
-            found["top"].append((2.5, cord))
+            long = f"{cord[1] - cord[0]:.2g} long, as thin as a cord"
+            found["top"].append((2.5, f"it would hang in balance from something {long}"))
         found["bottom"].append((0.5, "most things stand"))
     if eyes is not None and len(eyes):
         seen = eyes.double() @ axis
@@ -156,11 +158,6 @@ def standing_base(points: Tensor, weight: Tensor, up: Tensor) -> str | None:
     """Describe what an object would stand on: a wide base (:func:`balanced_base`) or a stalk; None if neither.
 
     A stalk is a lower end that is at most two thirds as wide as the upper one.
-
-    Args:
-        points: Centres, float64, shape (N, 3).
-        weight: Visible area, shape (N,).
-        up: Up direction, float64, shape (3,).
     """
     base = balanced_base(points, weight, up)
     if base is not None:
@@ -174,27 +171,11 @@ def standing_base(points: Tensor, weight: Tensor, up: Tensor) -> str | None:
     return None
 
 
-def hanging_cord(points: Tensor, weight: Tensor, up: Tensor) -> str | None:
-    """Describe the cord that an object would hang from, right above its centre; None if there is none.
-
-    See :func:`cord_heights`.
-    """
-    found = cord_heights(points, weight, up)
-    if found is None:
-        return None
-    return f"it would hang in balance from something {found[1] - found[0]:.2g} long, as thin as a cord"
-
-
 def cord_heights(points: Tensor, weight: Tensor, up: Tensor) -> tuple[float, float] | None:
     """Lower and upper end of the cord that an object would hang from [scene units along up]; None if there is none.
 
     A cord is an upright stretch of at least 15 % of the length, at most 15 % from the top, that is thinner than 0.04 of
     the length and than a quarter of the widest part.
-
-    Args:
-        points: Centres, float64, shape (N, 3).
-        weight: Visible area, shape (N,).
-        up: Up direction, float64, shape (3,).
     """
     height = points @ up
     low, high = quantile(height, 0.001), float(height.amax())
@@ -204,9 +185,7 @@ def cord_heights(points: Tensor, weight: Tensor, up: Tensor) -> tuple[float, flo
     which = ((high - height) / length * slices).long().clamp(max=slices - 1)
     parts = [points[which == k] for k in range(slices)]
     across = plane_axes(up)  # one of the two widths of a plate is nearly zero
-    wide = [
-        max(quantile(part @ a, 0.97) - quantile(part @ a, 0.03) for a in across) if len(part) else 0.0 for part in parts
-    ]
+    wide = [breadth(part, across, 0.03) for part in parts]
     limit = min(0.04 * length, 0.25 * max(wide))
     thin = [bool(len(part)) and value < limit for part, value in zip(parts, wide, strict=True)]
     start = next((k for k in range(4) if thin[k]), None)

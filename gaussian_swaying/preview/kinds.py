@@ -10,15 +10,14 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
-import torch
 from torch import Tensor
 
 from gaussian_swaying.gaussians.cloud import GaussianCloud
 from gaussian_swaying.gaussians.harmonics import SH_DC
 from gaussian_swaying.gaussians.parts import Parts
 from gaussian_swaying.mpm.materials import known_material
-from gaussian_swaying.preview.parts import FoundParts, greenish
-from gaussian_swaying.preview.shape import plane_axes, quantile
+from gaussian_swaying.preview.parts import FoundParts, greenish, object_of
+from gaussian_swaying.preview.shape import breadth, extent, plane_axes, quantile
 
 
 @dataclass(frozen=True)
@@ -142,18 +141,17 @@ def kind_of(
         The name of the kind, and why, in words.
     """
     names = set() if parts is None else {part.name for part in parts.parts.parts}
-    index = simulated.nonzero()[:, 0]
-    means, axis = cloud.means.detach()[index].double(), torch.tensor(list(up), dtype=torch.float64)
+    index, means, axis = object_of(cloud, simulated, up)
     visible = weight[index].double()
     height = means @ axis
     low, high = quantile(height, 0.005), quantile(height, 0.995)
-    wide = max(quantile(means @ a, 0.98) - quantile(means @ a, 0.02) for a in plane_axes(axis))
+    wide = breadth(means, plane_axes(axis), 0.02)
     red, leaf_green, _ = (0.5 + SH_DC * cloud.sh.detach()[index, 0].double()).clamp(0, 1).unbind(-1)
     green = greenish(cloud.sh.detach()[index]) & (leaf_green > 0.97 * red)  # gold is no leaf
     leafy = float((visible * green).sum() / visible.sum().clamp(min=1e-30))
     if "pot" in names:
         plant = means if parts is None else means[(parts.parts.labels[index] == _label(parts, "leaf"))]
-        tall = quantile(plant @ axis, 0.98) - quantile(plant @ axis, 0.02)
+        tall = extent(plant @ axis, 0.02)
         if tall < STANDS_LOW * wide:
             return "succulent", "it stands in a pot, wider than high"
         return "plant", "it stands in a pot"
@@ -224,7 +222,7 @@ def _width(means: Tensor, height: Tensor, up: Tensor, first: float, last: float)
     for k in range(round(20 * first), round(20 * last)):
         part = means[(share >= k / 20) & (share < (k + 1) / 20)]
         if len(part) >= 8:
-            found.append(max(quantile(part @ a, 0.95) - quantile(part @ a, 0.05) for a in plane_axes(up)))
+            found.append(breadth(part, plane_axes(up), 0.05))
     return sum(found) / max(len(found), 1)
 
 

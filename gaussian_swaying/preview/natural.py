@@ -29,7 +29,7 @@ from gaussian_swaying.mpm.modal import SHIFT, Structure, analysis_of, factor, ra
 from gaussian_swaying.mpm.solver import MPMSolver
 from gaussian_swaying.mpm.state import State
 from gaussian_swaying.preview.kinds import KINDS, Kind
-from gaussian_swaying.preview.shape import quantile
+from gaussian_swaying.preview.shape import extent, quantile
 from gaussian_swaying.preview.stretch import cloth_motion, linear_motion, rate_for, typical_start
 from gaussian_swaying.simulation.parameters import other_with
 from gaussian_swaying.simulation.simulated_scene import SimulatedScene
@@ -292,6 +292,6 @@ def _top(scene: SimulatedScene, state: State) -> tuple[Tensor, float, float]:
     if len(moving) == 0:
         return torch.arange(len(size), device=size.device), 0.0, 1.0
     rest = scene.model.means.detach()[scene.moving[moving]].double() * scene.frame.metres_per_unit
-    side = max(quantile(rest[:, k], 0.99) - quantile(rest[:, k], 0.01) for k in range(3))
+    side = max(extent(rest[:, k], 0.01) for k in range(3))
     top = moving[size[moving] >= quantile(size[moving], 0.9)]
     return top, float(size[top].mean()), max(side, 1e-30)

@@ -114,9 +114,7 @@ def plant_parts(cloud: GaussianCloud, simulated: Tensor, up: Sequence[float], we
         The parts: the pot is still, or held if no soil is seen in it; the soil is held, stems and leaves are soft, and
         everything else is still. None if there is no such pot.
     """
-    index = simulated.nonzero()[:, 0]
-    axis = torch.tensor(list(up), dtype=torch.float64)
-    means = cloud.means.detach()[index].double()
+    index, means, axis = object_of(cloud, simulated, up)
     across, height = torch.stack([means @ a for a in plane_axes(axis)], -1), means @ axis
     low, high = quantile(height, 0.002), quantile(height, 0.998)
     if high <= low:
@@ -156,16 +154,17 @@ def plant_parts(cloud: GaussianCloud, simulated: Tensor, up: Sequence[float], we
     if int(plant.sum()) < FEWEST:
         return None
     label[plant] = torch.where(woody(means[plant], green[plant], high - low), STEM, LEAF)
-    labels = labels_for_all(cloud.means.detach(), index, label, high - low, AROUND)
-    count = torch.bincount(labels, minlength=len(NAMES))
-    role = {POT_LABEL: "held" if level is None else "still", SOIL: "held", AROUND: "still"}
-    used = [k for k in range(len(NAMES)) if int(count[k])]
-    place = torch.zeros(len(NAMES), dtype=torch.long)
-    place[used] = torch.arange(len(used))
-    parts = Parts(place[labels], [Part(NAMES[k], role.get(k, "soft")) for k in used])
+    role = {POT_LABEL: "held" if level is None else "still", SOIL: "held"}
     inside = "no soil is seen in it" if level is None else f"with soil at {level:.2f}"
     reason = f"a round wall up to {pot.rim:.2f} of the height, {inside}, and green above"
-    return FoundParts(parts, reason)
+    parts = [Part(NAMES[k], role.get(k, "soft")) for k in range(AROUND)]
+    return labelled(cloud, index, label, high - low, parts, reason)
+
+
+def object_of(cloud: GaussianCloud, simulated: Tensor, up: Sequence[float]) -> tuple[Tensor, Tensor, Tensor]:
+    """Indices of the Gaussians of an object, their centres, and the up direction, both float64."""
+    index = simulated.nonzero()[:, 0]
+    return index, cloud.means.detach()[index].double(), torch.tensor(list(up), dtype=torch.float64)
 
 
 def greenish(sh: Tensor) -> Tensor:
@@ -304,16 +303,20 @@ def woody(points: Tensor, green: Tensor, size: float) -> Tensor:
     return stem[of_point]
 
 
-def labels_for_all(means: Tensor, index: Tensor, label: Tensor, size: float, around: int) -> Tensor:
-    """Labels of all Gaussians: faint ones near the object have that of their neighbour, the others are around it.
+def labelled(
+    cloud: GaussianCloud, index: Tensor, label: Tensor, size: float, parts: list[Part], reason: str
+) -> FoundParts:
+    """The parts of a splat that have Gaussians: faint ones near the object go with their neighbour, others are around.
 
     Args:
-        means: Centres [scene units], shape (N, 3).
+        cloud: The splat.
         index: The Gaussians of the object, shape (M,).
         label: Their labels, shape (M,).
         size: Height of the object [scene units].
-        around: The label of what is around it.
+        parts: The parts of the object, by their labels; the next label is that of what is around it.
+        reason: What was found, in words.
     """
+    means, around = cloud.means.detach(), len(parts)
     labels = torch.full((len(means),), around)
     labels[index] = label
     rest = (labels == around).nonzero()[:, 0]
@@ -321,4 +324,6 @@ def labels_for_all(means: Tensor, index: Tensor, label: Tensor, size: float, aro
         distance, near = nearest_neighbours(means[index].double(), 1, means[rest].double())
         close = distance[:, 0] < NEAR * size
         labels[rest[close]] = label[near[close, 0]]
-    return labels
+    used, place = labels.unique(return_inverse=True)
+    every = [*parts, Part(NAMES[AROUND], "still")]
+    return FoundParts(Parts(place, [every[k] for k in used.tolist()]), reason)

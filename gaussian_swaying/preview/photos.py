@@ -14,7 +14,7 @@ from torch import Tensor
 from gaussian_swaying.captures.capture import common_focus, view_reach
 from gaussian_swaying.captures.capture_camera import read_views
 from gaussian_swaying.geometry.regions import Cylinder
-from gaussian_swaying.preview.shape import DIRECTIONS, FEWEST, bounds, largest_plane, plane_axes, quantile, rounded
+from gaussian_swaying.preview.shape import DIRECTIONS, FEWEST, bounds, extent, largest_plane, plane_axes, rounded
 from gaussian_swaying.rendering.cameras.camera import Camera
 
 SEEN = 0.6  # share of the photos in which the object lies
@@ -232,7 +232,8 @@ def backdrops(points: Tensor, weight: Tensor, eyes: Tensor, reach: float, cell: 
         if float(weight[front].sum()) < 0.05 * float(weight[layer | front].sum()):
             continue
         axes = plane_axes(normal)
-        if not all(_wide(where[layer] @ a) > max(0.8 * reach, 1.2 * _wide(where[front] @ a)) for a in axes):
+        wide = [[extent(where[part] @ a, 0.05) for part in (layer, front)] for a in axes]
+        if not all(own > max(0.8 * reach, 1.2 * other) for own, other in wide):
             continue
         depth = 4 * side + 2 * half
         center = where[layer].mean(0)
@@ -280,7 +281,3 @@ def shown_object(points: Tensor, opacity: Tensor, weight: Tensor, view: Captured
         found.append(dataclasses.replace(backdrop, mask=everywhere))
         mask = mask & ~everywhere
     return ShownObject(mask, found, view.focus, view.reach)
-
-
-def _wide(values: Tensor) -> float:
-    return quantile(values, 0.95) - quantile(values, 0.05)

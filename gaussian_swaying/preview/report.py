@@ -205,15 +205,6 @@ def quality_lines(
     return lines
 
 
-def video_length(text: str) -> str:
-    """Length and picture size of a configuration's video, in words."""
-    import yaml
-
-    given = yaml.safe_load(text)
-    size = given["camera"]["init_args"]
-    return f"{given['frames'] * given['frame_dt']:.3g} s at {size['width']} x {size['height']}"
-
-
 def _numbers(values: Sequence[float]) -> str:
     return "[" + ", ".join(f"{value + 0.0:.3g}" for value in values) + "]"
 

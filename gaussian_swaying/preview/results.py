@@ -20,7 +20,7 @@ class Preview:
         report: Text for the user.
         data: The same as plain numbers, for preview.json.
         picture: 8-bit RGB, shape (H, W, 3).
-        configurations: Their names and YAML, ``starter``; none with ``--config``.
+        starter: The first configuration, as YAML; empty with ``--config``.
         things: What may move in a capture of a place, 8-bit RGB, shape (H, W, 3); None for an object.
         parts: The parts of the object; None if there is only one.
     """
@@ -28,7 +28,7 @@ class Preview:
     report: str
     data: dict[str, Any]
     picture: np.ndarray
-    configurations: dict[str, str]
+    starter: str = ""
     things: np.ndarray | None = None
     parts: Parts | None = None
 
@@ -69,10 +69,10 @@ def write(preview: Preview, folder: Path) -> list[Path]:
         if path.exists() and not _same(path, preview.parts):
             path.rename(_unused(folder, "parts", "npz"))
         files.append(preview.parts.save(path))
-    for name, text in preview.configurations.items():
-        path = folder / f"{name}.yaml"
-        keep_aside(path, text)
-        path.write_text(text, encoding="utf-8")
+    if preview.starter:
+        path = folder / "starter.yaml"
+        keep_aside(path, preview.starter)
+        path.write_text(preview.starter, encoding="utf-8")
         files.append(path)
     return files
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 
 import torch
 from torch import Tensor
@@ -54,6 +55,16 @@ def sheet_normal(points: Tensor) -> tuple[float, ...] | None:
 def quantile(values: Tensor, share: float) -> float:
     """Quantile without torch.quantile's limit of 2^24 values."""
     return float(values.double().kthvalue(1 + round(share * (len(values) - 1))).values)
+
+
+def extent(values: Tensor, share: float) -> float:
+    """The range of values (N,) without a share of them at each end."""
+    return quantile(values, 1 - share) - quantile(values, share)
+
+
+def breadth(points: Tensor, axes: Sequence[Tensor], share: float) -> float:
+    """The larger of the extents of points (N, 3) along some axes, see :func:`extent`; 0 for none."""
+    return max(extent(points @ axis, share) for axis in axes) if len(points) else 0.0
 
 
 def largest_plane(
@@ -113,7 +124,7 @@ def plane_axes(axis: Tensor) -> tuple[Tensor, Tensor]:
 def width(points: Tensor, axis: Tensor) -> float:
     """Geometric mean of the widths of points perpendicular to an axis, robust."""
     sides = [points.double() @ across for across in plane_axes(axis)]
-    return math.sqrt(math.prod(max(quantile(s, 0.97) - quantile(s, 0.03), 1e-9) for s in sides))
+    return math.sqrt(math.prod(max(extent(s, 0.03), 1e-9) for s in sides))
 
 
 def snapped(direction: Tensor) -> tuple[float, ...]:

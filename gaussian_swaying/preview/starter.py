@@ -18,6 +18,7 @@ from gaussian_swaying.preview.suggest import Suggestion
 from gaussian_swaying.preview.up import wind_words
 
 PICTURE = (960, 540)
+FRAME_DT = 0.04  # s
 
 
 def _aero(s: Suggestion) -> str:
@@ -119,8 +120,8 @@ def starter_yaml(suggestion: Suggestion, ply: str | Path, frames: int = 250) -> 
 {_comment(_sway_words(s), 0)}
 # Guessed from the splat; every number may be changed. Quality: {s.quality}.
 #   {shlex.join(program.words("sim"))} --config THIS_FILE
-frames: {frames:<24}# {frames * 0.04:.3g} s at 25 frames a second
-frame_dt: 0.04                  # s
+frames: {frames:<24}# {frames * FRAME_DT:.3g} s at 25 frames a second
+frame_dt: {FRAME_DT}                  # s
 background: [0.93, 0.94, 0.96]
 
 scene:

@@ -244,6 +244,3 @@ def _faults(part: np.ndarray, whole: np.ndarray, frequency: float) -> np.ndarray
     power = power[:, 1]
     share = power[:, (f > 2 / 3) & (f < 4 / 3)].sum(1) / power.sum(1)
     return found + _fault(share, SHARE) + _fault(lead, LEAD)
-
-
-__all__ = ["Motion", "cloth_motion", "linear_motion", "rate_for", "typical_start"]

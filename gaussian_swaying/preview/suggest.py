@@ -43,7 +43,6 @@ from gaussian_swaying.preview.shape import (
 )
 from gaussian_swaying.preview.supports import (
     flag_on_pole,
-    hanging_parts,
     potted_parts,
     sheet_between_posts,
     standing_parts,
@@ -308,7 +307,7 @@ def suggest(
     if plant is not None and upward.confidence in ("low", "medium"):
         why = [*upward.reasons, "a plant stands in a pot at the lower end"]
         upward = replace(upward, confidence="high", reasons=why)
-    found_parts = plant or laundry if flag is None else flag.found
+    found_parts = plant or laundry if flag is None else flag[0]
     if found_parts is not None:  # the length is that of the whole, with pot or pole and without the ground around it
         frame = SimFrame.fit(means[chosen.simulated & ~found_parts.around], upward.direction, longest_side)
         chosen = replace(chosen, simulated=chosen.simulated & ~found_parts.still)
@@ -323,7 +322,7 @@ def suggest(
         down = tuple(0.0 - c for c in upward.direction)
         held = HoldGuess("bottom", down, "medium", f"a plant in a pot: {plant.reason}")
     elif flag is not None:
-        held = HoldGuess("side", flag.side, "high", f"a flag on its pole: {flag.found.reason}")
+        held = HoldGuess("side", flag[1], "high", f"a flag on its pole: {flag[0].reason}")
     elif laundry is not None:
         held = HoldGuess("top", tuple(upward.direction), "high", f"on a line: {laundry.reason}")
     elif hold is None:
@@ -338,20 +337,17 @@ def suggest(
         if held.end == "none" or plant is not None
         else end_region(points, held.direction, dx / frame.metres_per_unit)
     )
-    if hold is None and found_parts is None and pin is not None and held.confidence in ("high", "medium"):
-        if held.end == "top":
-            ending = pin.contains(means) & chosen.simulated
-            found_parts = hanging_parts(cloud, chosen.simulated, upward.direction, weight, ending)
-        elif held.end == "bottom":
-            depth = max(PIN_DEPTH * float(metres[:, 2].amax() - metres[:, 2].amin()), 1.5 * dx) / frame.metres_per_unit
-            found_parts = potted_parts(cloud, chosen.simulated, upward.direction, weight)
-            found_parts = found_parts or standing_parts(cloud, chosen.simulated, upward.direction, weight, depth)
+    sure = held.confidence in ("high", "medium")
+    if hold is None and found_parts is None and pin is not None and sure and held.end == "bottom":
+        depth = max(PIN_DEPTH * float(metres[:, 2].amax() - metres[:, 2].amin()), 1.5 * dx) / frame.metres_per_unit
+        found_parts = potted_parts(cloud, chosen.simulated, upward.direction, weight)
+        found_parts = found_parts or standing_parts(cloud, chosen.simulated, upward.direction, weight, depth)
         pin = pin if found_parts is None else None
     flat = sheet_normal(points)
     name, why_kind = kind_of(cloud, chosen.simulated, upward.direction, weight, held.end, flat is not None, found_parts)
     if kind is not None:
         name, why_kind = kind, "given"
-    if name == "hanging" and held.end == "top" and (found_parts is None or "cord" in _names(found_parts)):
+    if name == "hanging" and held.end == "top" and laundry is None:
         ends = end_region(points, held.direction, dx / frame.metres_per_unit)
         found_parts = swinging_parts(
             cloud, chosen.simulated, upward.direction, weight, ends, dx / frame.metres_per_unit
@@ -470,10 +466,6 @@ def with_natural(suggestion: Suggestion, found: Natural) -> Suggestion:
         s, youngs_modulus=found.stiffer.get(s.youngs_modulus, s.youngs_modulus), thickness=s.thickness * found.thicker,
         drag=s.drag * found.drag, parts=parts, natural=found, start=found.start,
     )  # fmt: skip
-
-
-def _names(found: FoundParts) -> list[str]:
-    return [part.name for part in found.parts.parts]
 
 
 def _across_picture(azimuth: float, speed: float) -> tuple[float, ...]:

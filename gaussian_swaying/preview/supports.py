@@ -3,18 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from itertools import groupby
 
 import torch
 from torch import Tensor
 
 from gaussian_swaying.gaussians.cloud import GaussianCloud
-from gaussian_swaying.gaussians.parts import Part, Parts
+from gaussian_swaying.gaussians.parts import Part
 from gaussian_swaying.geometry.regions import Region
 from gaussian_swaying.preview.hold import cord_heights
-from gaussian_swaying.preview.parts import FoundParts, greenish, labels_for_all, woody
-from gaussian_swaying.preview.shape import FEWEST, plane_axes, quantile, sheet_normal
+from gaussian_swaying.preview.parts import FoundParts, greenish, labelled, object_of, woody
+from gaussian_swaying.preview.shape import FEWEST, breadth, plane_axes, quantile, sheet_normal
 
 SLICES = 40  # of the height
 SLIM = 0.04  # width of a pole, as a share of the height
@@ -32,20 +31,9 @@ NECK, NECK_SHARE = 3.0, 0.1  # cells, share of the height: what bends above a ha
 POST, SLENDER = 0.25, 0.08  # height of a post, as a share of that of the object, and its width, as a share of the same
 
 
-@dataclass(frozen=True)
-class OnPole:
-    """A flag and its pole.
-
-    Attributes:
-        found: The parts: the pole is still, the cloth is soft.
-        side: Unit vector from the cloth to its pole.
-    """
-
-    found: FoundParts
-    side: tuple[float, ...]
-
-
-def flag_on_pole(cloud: GaussianCloud, simulated: Tensor, up: Sequence[float]) -> OnPole | None:
+def flag_on_pole(
+    cloud: GaussianCloud, simulated: Tensor, up: Sequence[float]
+) -> tuple[FoundParts, tuple[float, ...]] | None:
     """Find the pole of a flag: a slim upright part that is seen alone below or above a cloth, which is on one side.
 
     Args:
@@ -54,11 +42,10 @@ def flag_on_pole(cloud: GaussianCloud, simulated: Tensor, up: Sequence[float]) -
         up: Up direction, a unit vector.
 
     Returns:
-        The parts; None if it is not such a flag.
+        The parts, a soft cloth and a still pole, and the unit vector from the cloth to its pole; None if it is not such
+        a flag.
     """
-    index = simulated.nonzero()[:, 0]
-    means = cloud.means.detach()[index].double()
-    axis = torch.tensor(list(up), dtype=torch.float64)
+    index, means, axis = object_of(cloud, simulated, up)
     aside = _along_sheet(means, axis)
     if aside is None:
         return None
@@ -90,27 +77,20 @@ def flag_on_pole(cloud: GaussianCloud, simulated: Tensor, up: Sequence[float]) -
     cloth = beside & (toward * (along - middle) > 1.4 * radius)
     if int(cloth.sum()) < FEWEST or int((~cloth).sum()) < FEWEST:
         return None
-    labels = labels_for_all(cloud.means.detach(), index, (~cloth).long(), high - low, 2)
-    parts = _parts(labels, [Part("cloth"), Part("pole", "still"), Part("surroundings", "still")])
     share = len(slim) / SLICES
     reason = f"a slim upright pole, alone over {share:.2f} of its height, with a sheet on one side of it"
-    return OnPole(FoundParts(parts, reason), tuple(float(-toward * c) + 0.0 for c in aside))
+    parts = [Part("cloth"), Part("pole", "still")]
+    found = labelled(cloud, index, (~cloth).long(), high - low, parts, reason)
+    return found, tuple(float(-toward * c) + 0.0 for c in aside)
 
 
 def sheet_between_posts(cloud: GaussianCloud, simulated: Tensor, up: Sequence[float]) -> FoundParts | None:
     """Find the posts of a washing line: slim columns from below the hem of an upright sheet to above it.
 
-    Args:
-        cloud: The splat.
-        simulated: The Gaussians of the object, bool, shape (N,).
-        up: Up direction, a unit vector.
-
     Returns:
         The parts: posts with their feet and arms are still, line and cloth are soft; None without two posts.
     """
-    index = simulated.nonzero()[:, 0]
-    means = cloud.means.detach()[index].double()
-    axis = torch.tensor(list(up), dtype=torch.float64)
+    index, means, axis = object_of(cloud, simulated, up)
     aside = _along_sheet(means, axis)
     if aside is None:
         return None
@@ -135,9 +115,8 @@ def sheet_between_posts(cloud: GaussianCloud, simulated: Tensor, up: Sequence[fl
     if hem < low + HEM * (high - low):
         return None
     post = torch.stack(place).any(0) | (torch.stack(near).any(0) & ((height < hem) | (height > line)))
-    labels = labels_for_all(cloud.means.detach(), index, post.long(), high - low, 2)
-    parts = _parts(labels, [Part("cloth"), Part("post", "still"), Part("surroundings", "still")])
-    return FoundParts(parts, f"a sheet that ends above the ground between {len(runs)} slim posts")
+    reason = f"a sheet that ends above the ground between {len(runs)} slim posts"
+    return labelled(cloud, index, post.long(), high - low, [Part("cloth"), Part("post", "still")], reason)
 
 
 def _along_sheet(means: Tensor, axis: Tensor) -> Tensor | None:
@@ -157,49 +136,13 @@ def _along_sheet(means: Tensor, axis: Tensor) -> Tensor | None:
     return aside / aside.norm()
 
 
-def hanging_parts(
-    cloud: GaussianCloud, simulated: Tensor, up: Sequence[float], weight: Tensor, held: Tensor
-) -> FoundParts | None:
-    """Find the cord that an object hangs from.
-
-    Args:
-        cloud: The splat.
-        simulated: The Gaussians of the object, bool, shape (N,).
-        up: Up direction, a unit vector.
-        weight: Visible area of each Gaussian, shape (N,).
-        held: Its upper end, bool, shape (N,).
-
-    Returns:
-        The parts: what it hangs by is held, cord and body are soft; None if there is no cord.
-    """
-    index = simulated.nonzero()[:, 0]
-    axis, means = torch.tensor(list(up), dtype=torch.float64), cloud.means.detach()[index].double()
-    ends = cord_heights(means, weight[index].double(), axis)
-    if ends is None:
-        return None
-    height = means @ axis
-    label = torch.where(height > ends[0], 1, 2)
-    label[held[index]] = 0
-    size = float(height.amax() - height.amin())
-    labels = labels_for_all(cloud.means.detach(), index, label, size, 3)
-    parts = _parts(labels, [Part("hook", "held"), Part("cord"), Part("body"), Part("surroundings", "still")])
-    return FoundParts(parts, f"a cord {ends[1] - ends[0]:.2g} long, right above the middle of what hangs on it")
-
-
 def potted_parts(cloud: GaussianCloud, simulated: Tensor, up: Sequence[float], weight: Tensor) -> FoundParts | None:
     """The parts of a plant in a pot by colour alone: the lower part is not green and as wide as the plant.
-
-    Args:
-        cloud: The splat.
-        simulated: The Gaussians of the object, bool, shape (N,).
-        up: Up direction, a unit vector.
-        weight: Visible area of each Gaussian, shape (N,).
 
     Returns:
         The parts: the pot is held, leaves are soft; None if there is no such pot.
     """
-    index = simulated.nonzero()[:, 0]
-    axis, means = torch.tensor(list(up), dtype=torch.float64), cloud.means.detach()[index].double()
+    index, means, axis = object_of(cloud, simulated, up)
     height, visible, green = means @ axis, weight[index].double(), greenish(cloud.sh.detach()[index])
     low, high = quantile(height, 0.005), quantile(height, 0.995)
     if high <= low:
@@ -209,23 +152,15 @@ def potted_parts(cloud: GaussianCloud, simulated: Tensor, up: Sequence[float], w
     for k in range(SLICES):
         own = (which == k).nonzero()[:, 0]
         leafy.append(float((visible * green)[own].sum() / visible[own].sum().clamp(min=1e-30)))
-        spread = (
-            [quantile(means[own] @ a, 0.95) - quantile(means[own] @ a, 0.05) for a in plane_axes(axis)]
-            if len(own)
-            else [0.0]
-        )
-        wide.append(max(spread))
+        wide.append(breadth(means[own], plane_axes(axis), 0.05))
     rim = next((k for k in range(SLICES) if leafy[k] > 0.5), SLICES)
     if not RIM[0] * SLICES <= rim < RIM[1] * SLICES:
         return None
     if sum(leafy[:rim]) > POT * rim or min(wide[:rim]) < 0.4 * max(wide) or sum(leafy[rim:]) < 0.5 * (SLICES - rim):
         return None
     label = torch.where(which < rim, 0, 1)
-    labels = labels_for_all(cloud.means.detach(), index, label, high - low, 2)
-    parts = _parts(labels, [Part("pot", "held"), Part("leaf"), Part("surroundings", "still")])
-    return FoundParts(
-        parts, f"not green and as wide as the rest up to {rim / SLICES:.2f} of the height, and green above"
-    )
+    reason = f"not green and as wide as the rest up to {rim / SLICES:.2f} of the height, and green above"
+    return labelled(cloud, index, label, high - low, [Part("pot", "held"), Part("leaf")], reason)
 
 
 def swinging_parts(
@@ -233,16 +168,10 @@ def swinging_parts(
 ) -> FoundParts:
     """The parts of a thing that hangs: its upper end is held, a cord or neck below it bends, and the rest is rigid.
 
-    Args:
-        cloud: The splat.
-        simulated: The Gaussians of the object, bool, shape (N,).
-        up: Up direction, a unit vector.
-        weight: Visible area of each Gaussian, shape (N,).
-        hook: Its upper end.
-        cell: Grid spacing [scene units].
+    See :func:`~gaussian_swaying.preview.parts.plant_parts`; ``hook`` is the upper end, ``cell`` the grid spacing [scene
+    units].
     """
-    index = simulated.nonzero()[:, 0]
-    axis, means = torch.tensor(list(up), dtype=torch.float64), cloud.means.detach()[index].double()
+    index, means, axis = object_of(cloud, simulated, up)
     height = means @ axis
     size = float(height.amax() - height.amin())
     held = hook.contains(cloud.means.detach())[index]
@@ -251,10 +180,9 @@ def swinging_parts(
     bends = lowest - max(NECK * cell, NECK_SHARE * size) if ends is None else min(ends[0], lowest - NECK * cell)
     label = torch.where(height > bends, 1, 2)
     label[held] = 0
-    labels = labels_for_all(cloud.means.detach(), index, label, size, 3)
-    parts = _parts(labels, [Part("hook", "held"), Part("cord"), Part("body", "rigid"), Part("surroundings", "still")])
     what = f"a neck of {(lowest - bends) / size:.2f} of the height" if ends is None else "a cord"
-    return FoundParts(parts, f"it hangs from its upper end by {what}")
+    parts = [Part("hook", "held"), Part("cord"), Part("body", "rigid")]
+    return labelled(cloud, index, label, size, parts, f"it hangs from its upper end by {what}")
 
 
 def standing_parts(
@@ -262,18 +190,12 @@ def standing_parts(
 ) -> FoundParts | None:
     """Find the trunk of a tree, narrow and not green, below a crown that is green; or the post of another thing.
 
-    Args:
-        cloud: The splat.
-        simulated: The Gaussians of the object, bool, shape (N,).
-        up: Up direction, a unit vector.
-        weight: Visible area of each Gaussian, shape (N,).
-        depth: How much of the trunk is its foot [scene units].
+    Its foot has a depth [scene units].
 
     Returns:
         The parts: the foot is held, wood and leaves are soft, or post and head; None if there is no such trunk or post.
     """
-    index = simulated.nonzero()[:, 0]
-    axis, means = torch.tensor(list(up), dtype=torch.float64), cloud.means.detach()[index].double()
+    index, means, axis = object_of(cloud, simulated, up)
     height, visible = means @ axis, weight[index].double()
     low, high = quantile(height, 0.002), quantile(height, 0.998)
     if high <= low:
@@ -281,11 +203,7 @@ def standing_parts(
     share = (height - low) / (high - low)
     green = greenish(cloud.sh.detach()[index])
     which = (share * SLICES).long().clamp(0, SLICES - 1)
-    across = plane_axes(axis)
-    wide = [
-        max(quantile(means[own] @ a, 0.95) - quantile(means[own] @ a, 0.05) for a in across) if len(own) else 0.0
-        for own in ((which == k).nonzero()[:, 0] for k in range(SLICES))
-    ]
+    wide = [breadth(means[which == k], plane_axes(axis), 0.05) for k in range(SLICES)]
     most = max(wide)
     start = next((k for k in range(FOOT) if 0 < wide[k] < NARROW * most), 0)  # above a lawn or a disc of soil
     bare = next((k for k in range(start, SLICES) if not 0 < wide[k] < NARROW * most), SLICES)
@@ -303,17 +221,8 @@ def standing_parts(
     label[ground | (trunk & (height < quantile(height[trunk], 0.01) + depth))] = 0
     if int((label == 2).sum()) < FEWEST:
         return None
-    labels = labels_for_all(cloud.means.detach(), index, label, high - low, 3)
     names = ("wood", "leaf") if tree else ("post", "head")
-    parts = _parts(labels, [Part("foot", "held"), *map(Part, names), Part("surroundings", "still")])
     what = "a trunk, bare" if tree else "a post, slim"
     above = "green" if tree else "something wider"
-    return FoundParts(parts, f"{what} up to {bare / SLICES:.2f} of the height, and {above} above")
-
-
-def _parts(labels: Tensor, parts: list[Part]) -> Parts:
-    count = torch.bincount(labels, minlength=len(parts))
-    used = [k for k in range(len(parts)) if int(count[k])]
-    place = torch.zeros(len(parts), dtype=torch.long)
-    place[used] = torch.arange(len(used))
-    return Parts(place[labels], [parts[k] for k in used])
+    reason = f"{what} up to {bare / SLICES:.2f} of the height, and {above} above"
+    return labelled(cloud, index, label, high - low, [Part("foot", "held"), *map(Part, names)], reason)

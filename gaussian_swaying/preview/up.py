@@ -16,8 +16,8 @@ from gaussian_swaying.preview.shape import (
     DIRECTIONS,
     FEWEST,
     bounds,
+    extent,
     plane_axes,
-    quantile,
     sheet_normal,
 )
 
@@ -104,7 +104,7 @@ def floor_mask(points: Tensor, normals: Tensor, weight: Tensor, up: Sequence[flo
         return none
     for across in plane_axes(axis):
         along = where @ across
-        wide, object_wide = (quantile(along[m], 0.98) - quantile(along[m], 0.02) for m in (layer, above))
+        wide, object_wide = (extent(along[m], 0.02) for m in (layer, above))
         if wide < 0.9 * object_wide:
             return none
     return layer | below
@@ -114,8 +114,8 @@ def _floor_score(points: Tensor, floor: Tensor, up: Sequence[float]) -> float:
     """Score of a floor: 3 if what stands on it is at least 0.3 times as tall as the floor is wide, less if flatter."""
     axis = torch.tensor(up, dtype=torch.float64)
     rest = points[~floor].double() @ axis
-    width = min(quantile(c, 0.98) - quantile(c, 0.02) for c in (points[floor].double() @ a for a in plane_axes(axis)))
-    return 3 * min(1.0, (quantile(rest, 0.98) - quantile(rest, 0.02)) / max(0.3 * width, 1e-30))
+    width = min(extent(points[floor].double() @ a, 0.02) for a in plane_axes(axis))
+    return 3 * min(1.0, extent(rest, 0.02) / max(0.3 * width, 1e-30))
 
 
 def guess_up(points: Tensor, normals: Tensor, weight: Tensor) -> UpGuess:

@@ -6,6 +6,7 @@ from types import SimpleNamespace
 
 import pytest
 import torch
+from small_scenes import run_cost
 
 from gaussian_swaying.geometry.regions import Box
 from gaussian_swaying.kernels import cpu
@@ -13,10 +14,9 @@ from gaussian_swaying.kernels.language import INTERPRETED
 from gaussian_swaying.mpm.boundaries.pinned_region import PinnedRegion
 from gaussian_swaying.mpm.solver import MPMSolver
 from gaussian_swaying.preview import cost as cost_module
-from gaussian_swaying.preview.cost import Cost, estimate_cost, finest_within, scaled_seconds, with_whole
+from gaussian_swaying.preview.cost import estimate_cost, finest_within, scaled_seconds, with_whole
 from gaussian_swaying.recording.recorder import Recorder
 from gaussian_swaying.scenes.procedural import FlagScene
-from gaussian_swaying.scenes.vase import VaseScene
 from gaussian_swaying.simulation.material import Material
 from gaussian_swaying.simulation.simulation import Simulation
 
@@ -26,21 +26,8 @@ FRAMES = 101
 def cost(dx, power=2.0, picture=0.1):
     """A substep of 1 ms at dx = 0.04 that takes longer with a power of 1 / dx; 100 of them in a frame there."""
     substep, steps = 1e-3 * (0.04 / dx) ** power, round(100 * 0.04 / dx)
-    return Cost(
-        device="",
-        particles=1,
-        dx=dx,
-        grid=(1, 1, 1),
-        frames=FRAMES,
-        wave_speed=1.0,
-        stable_substep=1.0,
-        substep=0.04 / steps,
-        substeps=steps,
-        substep_seconds=substep,
-        simulation_seconds=substep * steps * (FRAMES - 1),
-        picture_seconds=picture,
-        startup_seconds=5.0,
-    )
+    seconds = {"substep_seconds": substep, "simulation_seconds": substep * steps * (FRAMES - 1)}
+    return run_cost(dx, frames=FRAMES, substeps=steps, picture_seconds=picture, startup_seconds=5.0, **seconds)
 
 
 def test_a_trial_is_long_enough_to_time_substeps(monkeypatch, make_simulation):
@@ -114,7 +101,7 @@ def test_the_finest_grid_for_a_time_is_found(power, seconds):
         tried.append(dx)
         return cost(dx, power)
 
-    found = finest_within(measure, seconds, cost(0.04, power), cost(0.06, power), 0.01, 0.06)
+    found = finest_within(measure, seconds, cost(0.04, power), 0.01, 0.06)
     assert found.total_seconds <= seconds
     assert len(tried) <= 3
     assert found.dx == 0.01 or cost(found.dx - 0.0021, power).total_seconds > seconds
@@ -122,7 +109,7 @@ def test_the_finest_grid_for_a_time_is_found(power, seconds):
 
 
 def test_the_coarsest_grid_is_the_answer_if_none_is_fast_enough():
-    assert finest_within(cost, 3.0, cost(0.04), cost(0.06), 0.01, 0.06).dx == 0.06
+    assert finest_within(cost, 3.0, cost(0.04), 0.01, 0.06).dx == 0.06
 
 
 def test_a_grid_that_is_too_fine_to_start_is_passed_over():
@@ -131,9 +118,9 @@ def test_a_grid_that_is_too_fine_to_start_is_passed_over():
             raise ValueError("too many nodes")
         return cost(dx)
 
-    assert 0.018 <= finest_within(measure, 1e6, cost(0.04), cost(0.06), 0.01, 0.06).dx < 0.04
+    assert 0.018 <= finest_within(measure, 1e6, cost(0.04), 0.01, 0.06).dx < 0.04
     with pytest.raises(ValueError, match="too many nodes"):
-        finest_within(measure, 1e-6, cost(0.012), cost(0.06), 0.01, 0.015)
+        finest_within(measure, 1e-6, cost(0.012), 0.01, 0.015)
 
 
 def test_files_are_written_beside_the_simulation_where_there_are_cores(monkeypatch):
@@ -185,18 +172,6 @@ def flag(device):
         Material(E=6e3, density=30.0, thickness=0.01),
         solver=MPMSolver(dx=0.05, boundaries=[pole], damping=0.2),
         wind=[5.0, 1.0, 0.0],
-        device=device,
-    )
-
-
-def vase(device):
-    """Flowers in a vase."""
-    foot = PinnedRegion(Box([None] * 3, [None, None, 0.3]), kind="nodes")
-    return Simulation(
-        VaseScene(spacing=0.025),
-        Material(E=1e5, density=400.0, thickness=0.006),
-        solver=MPMSolver(dx=0.04, boundaries=[foot], damping=1.0, gravity=(0.0, 0.0, 0.0)),
-        wind=[3.0, 0.0, 0.0],
         device=device,
     )
 

@@ -6,19 +6,16 @@ import numpy as np
 import pytest
 import torch
 from PIL import Image, ImageDraw, ImageFont
-from small_scenes import plain_cloud, together
+from small_scenes import plain_cloud, started, together
 
-from gaussian_swaying.gaussians.ply import write_ply
 from gaussian_swaying.geometry.regions import Box
 from gaussian_swaying.preview.framing import RADIUS, orbit_frame, whole_box
 from gaussian_swaying.preview.picture import _whole
-from gaussian_swaying.preview.starter import starter_yaml
 from gaussian_swaying.preview.suggest import suggest
 from gaussian_swaying.preview.ticks import COLOUR, draw_ticks, nice_ticks
 from gaussian_swaying.rendering.cameras.camera import look_at_camera, project
 from gaussian_swaying.scenes.procedural import FlagScene
 from gaussian_swaying.simulation.roles import classify
-from gaussian_swaying.simulation.simulation import Simulation
 
 
 def column(count=3000, side=0.3, height=2.0):
@@ -97,15 +94,10 @@ def test_whole_object_has_what_does_not_move_and_no_floor_nor_specks():
 
 def test_camera_of_the_starter_shows_all_of_it(tmp_path):
     cloud = plain_cloud(column())
-    path = tmp_path / "column.ply"
-    write_ply(path, cloud)
     for region, below in ((None, 0.0), (([-1.0, -1.0, 1.1], [1.0, 1.0, 3.0]), 0.2)):
         found = suggest(cloud, "+z", region=region)
         assert found.whole[0][2] == pytest.approx(below, abs=0.05)
-        config = tmp_path / "starter.yaml"
-        config.write_text(starter_yaml(found, path, 2))
-        parser = Simulation.parser()
-        simulation = Simulation.from_settings(parser, parser.parse_args(["--config", str(config), "--device", "cpu"]))
+        simulation = started(found, cloud, tmp_path)
         camera = simulation.painter.camera_at(0)
         shown = cloud.means[cloud.means[:, 2] >= below]
         pixel, depth = project(shown, camera)

@@ -8,7 +8,7 @@ import torch
 from shared import unit
 from small_scenes import plain_cloud, together
 
-from gaussian_swaying.preview.hold import guess_hold, hanging_cord
+from gaussian_swaying.preview.hold import cord_heights, guess_hold
 from gaussian_swaying.preview.suggest import CELLS, suggest, visible_weight
 from gaussian_swaying.scenes.procedural import FlagScene
 
@@ -222,5 +222,5 @@ def test_a_cord_is_thin_for_the_length_and_for_what_hangs_on_it(body, cord, is_c
     width = 3 * torch.where(height > 1.2, cord, body)
     points = torch.cat([(width[:, None, None] * corners), height[:, None, None].expand(-1, 4, 1)], -1).reshape(-1, 3)
     up = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)
-    found = hanging_cord(points, torch.ones(len(points), dtype=torch.float64), up)
+    found = cord_heights(points, torch.ones(len(points), dtype=torch.float64), up)
     assert (found is not None) == is_cord

@@ -5,9 +5,8 @@ import math
 
 import pytest
 import torch
-from small_scenes import plain_cloud, together
+from small_scenes import GREEN, coloured, plain_cloud, together
 
-from gaussian_swaying.gaussians.harmonics import SH_DC
 from gaussian_swaying.mpm.materials import MATERIALS
 from gaussian_swaying.preview.kinds import KINDS, STEM_E
 from gaussian_swaying.preview.suggest import suggest
@@ -16,14 +15,12 @@ from gaussian_swaying.scenes.ficus import FicusScene
 from gaussian_swaying.scenes.flag_on_stand import FlagOnStandScene
 from gaussian_swaying.scenes.procedural import FlagScene
 
-GREEN, BROWN, GREY, SKIN, BLUE = (0.2, 0.5, 0.15), (0.4, 0.3, 0.2), (0.5,) * 3, (0.8, 0.6, 0.45), (0.2, 0.25, 0.6)
+GREY, SKIN, BLUE = (0.5,) * 3, (0.8, 0.6, 0.45), (0.2, 0.25, 0.6)
 AWAY = torch.tensor([3.0, 4.0, 0.0])  # an origin far from the thing says nothing about its ends
 
 
 def painted(means, color, scales=-4.0):
-    cloud = plain_cloud(means, scales, logit=3.0)
-    color = torch.tensor(color).expand(len(means), 3)
-    return dataclasses.replace(cloud, sh=((color - 0.5) / SH_DC)[:, None])
+    return coloured(plain_cloud(means, scales), color)
 
 
 def draws(*shape, seed=0):

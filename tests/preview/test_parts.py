@@ -5,13 +5,12 @@ import dataclasses
 import pytest
 import torch
 import yaml
+from small_scenes import coloured, started
 
 from gaussian_swaying.cli.preview import main
-from gaussian_swaying.gaussians.harmonics import SH_DC
 from gaussian_swaying.gaussians.parts import Parts
 from gaussian_swaying.gaussians.ply import write_ply
 from gaussian_swaying.preview.parts import plant_parts
-from gaussian_swaying.preview.starter import starter_yaml
 from gaussian_swaying.preview.suggest import suggest, visible_weight
 from gaussian_swaying.scenes.alocasia import AlocasiaScene
 from gaussian_swaying.scenes.ficus import FicusScene
@@ -19,7 +18,6 @@ from gaussian_swaying.scenes.procedural import FlagScene
 from gaussian_swaying.scenes.solid import SolidScene
 from gaussian_swaying.scenes.telephone import TelephoneScene
 from gaussian_swaying.scenes.vase import VaseScene
-from gaussian_swaying.simulation.simulation import Simulation
 
 
 @pytest.fixture(scope="module")
@@ -89,12 +87,6 @@ def test_a_pot_without_soil_is_held(alocasia):
     assert "soil" not in [part.name for part in parts.parts]
 
 
-def dark(cloud, color, where):
-    sh = cloud.sh.clone()
-    sh[where, 0] = (torch.tensor(color) - 0.5) / SH_DC
-    return dataclasses.replace(cloud, sh=sh)
-
-
 @pytest.mark.parametrize("scene", [VaseScene, TelephoneScene, SolidScene, FlagScene])
 def test_other_objects_have_no_parts(scene):
     assert found(scene().generate()) is None
@@ -104,7 +96,7 @@ def test_a_pot_alone_and_a_plant_alone_have_no_parts(alocasia):
     high = alocasia.means[:, 2] > 0.24
     assert found(alocasia.select(~high)) is None
     assert found(alocasia.select(high)) is None
-    assert found(dark(alocasia, (0.7, 0.2, 0.2), high)) is None  # not a plant, by its colour
+    assert found(coloured(alocasia, (0.7, 0.2, 0.2), high)) is None  # not a plant, by its colour
 
 
 def test_the_suggestion_and_its_configuration(alocasia, tmp_path):
@@ -120,11 +112,7 @@ def test_the_suggestion_and_its_configuration(alocasia, tmp_path):
     assert guess.metres_per_unit == pytest.approx(1 / float(size.amax()), rel=1e-3)
     moving = cloud.means[guess.region.simulated]
     assert guess.longest_side == pytest.approx(float((moving.amax(0) - moving.amin(0)).amax() / size.amax()), rel=1e-3)
-    path = guess.parts.parts.save(tmp_path / "parts.npz")
-    guess = dataclasses.replace(guess, parts=dataclasses.replace(guess.parts, path=str(path)))
-    write_ply(tmp_path / "plant.ply", cloud)
-    (tmp_path / "starter.yaml").write_text(starter_yaml(guess, tmp_path / "plant.ply"))
-    simulation = Simulation.from_yaml(tmp_path / "starter.yaml", device="cpu")
+    simulation = started(guess, cloud, tmp_path)
     assert simulation.scene.frame.metres_per_unit == pytest.approx(guess.metres_per_unit, rel=1e-4)
     assert simulation.solver.gravity == (0.0, 0.0, 0.0)
     last = list(simulation.frames(9))[-1]

@@ -1,17 +1,16 @@
 """What cameras tell about a splat: up, the object, a wall or floor behind it."""
 
-import json
 import math
 
 import pytest
 import torch
 from shared import refused
+from small_captures import write_colmap, write_transforms
 from small_scenes import plain_cloud
 
 from gaussian_swaying.captures.capture_camera import photo_azimuth
 from gaussian_swaying.cli.preview import main
 from gaussian_swaying.gaussians.ply import write_ply
-from gaussian_swaying.geometry.rotations import rotation_to_quat
 from gaussian_swaying.preview.photos import (
     Backdrop,
     CapturedFrom,
@@ -53,16 +52,7 @@ def ring(count=12, radius=4.0, height=1.0, first=0.0, last=360.0):
 
 def write_capture(folder, made):
     """A transforms.json without images."""
-    flip = torch.diag(torch.tensor([1.0, -1.0, -1.0, 1.0], dtype=torch.float64))
-    frames = [
-        {"file_path": f"{k:03d}.png", "transform_matrix": (torch.linalg.inv(c.world_to_camera) @ flip).tolist()}
-        for k, c in enumerate(made)
-    ]
-    folder.mkdir(exist_ok=True)
-    first = made[0]
-    text = {"fl_x": float(first.intrinsics[0, 0]), "w": first.width, "h": first.height, "frames": frames}
-    (folder / "transforms.json").write_text(json.dumps(text))
-    return folder
+    return write_transforms(folder, made, [f"{k:03d}.png" for k in range(len(made))], images=False)
 
 
 def uniform(low, high, count, seed=0):
@@ -210,17 +200,9 @@ def test_cameras_that_look_elsewhere_are_refused(tmp_path, capsys):
 
 def test_a_colmap_model_tells_the_same(tmp_path):
     made = cameras(ring(10, 3.0, 1.0), turn=TILT)
-    model = tmp_path / "colmap/sparse/0"
-    model.mkdir(parents=True)
-    focal = float(made[0].intrinsics[0, 0])
-    (model / "cameras.txt").write_text(f"1 PINHOLE 64 48 {focal} {focal} 32 24\n")
-    lines = []
-    for k, camera in enumerate(made):
-        view = camera.world_to_camera
-        pose = [*rotation_to_quat(view[:3, :3]).tolist(), *view[:3, 3].tolist()]
-        lines += [" ".join(map(str, [k + 1, *pose, 1, f"{k}.png"])), ""]
-    (model / "images.txt").write_text("\n".join(lines) + "\n")
-    one, other = captured_from(tmp_path / "colmap"), captured_from(write_capture(tmp_path / "json", made))
+    names = [f"{k}.png" for k in range(len(made))]
+    colmap = write_colmap(tmp_path / "colmap", made, names, binary=False, images=False)
+    one, other = captured_from(colmap), captured_from(write_capture(tmp_path / "json", made))
     assert isinstance(one, CapturedFrom)
     assert list(one.up) == pytest.approx(list(other.up), abs=1e-5)
     assert one.focus.tolist() == pytest.approx(other.focus.tolist(), abs=1e-4)

@@ -8,21 +8,19 @@ import pytest
 import torch
 import yaml
 from shared import unit
-from small_scenes import plain_cloud, together, turned_cloud
+from small_scenes import plain_cloud, started, together, turned_cloud
 
 from gaussian_swaying.aero.looks import LOOKS
 from gaussian_swaying.config.parser import parse_text
 from gaussian_swaying.gaussians.cloud import GaussianCloud
 from gaussian_swaying.gaussians.grouping import connected_parts
-from gaussian_swaying.gaussians.ply import write_ply
 from gaussian_swaying.geometry.neighbours import particle_spacing
 from gaussian_swaying.geometry.patches import smallest_axis_normal
 from gaussian_swaying.geometry.regions import Box, Cylinder
-from gaussian_swaying.geometry.rotations import quat_to_rotation
 from gaussian_swaying.mpm.materials import MATERIALS
 from gaussian_swaying.preview.hold import end_region
 from gaussian_swaying.preview.kinds import KINDS
-from gaussian_swaying.preview.shape import bounds, sheet_normal
+from gaussian_swaying.preview.shape import DIRECTIONS, bounds, sheet_normal
 from gaussian_swaying.preview.starter import starter_yaml
 from gaussian_swaying.preview.suggest import (
     CLOTH_E,
@@ -44,14 +42,13 @@ from gaussian_swaying.scenes.procedural import FlagScene
 from gaussian_swaying.simulation.extent import suggest_spacing
 from gaussian_swaying.simulation.simulation import Simulation
 
-AXES = {"+x": [1, 0, 0], "-x": [-1, 0, 0], "+y": [0, 1, 0], "-y": [0, -1, 0], "+z": [0, 0, 1], "-z": [0, 0, -1]}
 VISIBLE = math.log(9.0)
 """Logit of an opacity of 0.9."""
 FLOOR, TRUNK, CROWN = slice(0, 1681), slice(1681, 1981), slice(1981, 2781)
 
 
-def turn_to(name):
-    """Rotation that takes z to an axis by a permutation of axes and signs, and its quaternion wxyz."""
+def turned(cloud, name):
+    """A splat with z up turned so that an axis is up, by a permutation of axes and signs."""
     half = math.sqrt(0.5)
     turns = {
         "+z": [1.0, 0, 0, 0],
@@ -61,13 +58,7 @@ def turn_to(name):
         "+y": [half, -half, 0, 0],
         "-y": [half, half, 0, 0],
     }
-    quat = torch.tensor(turns[name])
-    return quat_to_rotation(quat), quat
-
-
-def turned(cloud, name):
-    """A splat with z up turned so that an axis is up."""
-    return turned_cloud(cloud, turn_to(name)[1])
+    return turned_cloud(cloud, torch.tensor(turns[name]))
 
 
 def tree(floor=True, offset=5.0):
@@ -118,11 +109,8 @@ def test_holes_between_large_gaussians_are_filled_without_asking(tmp_path):
     cloud = FlagScene(spacing=0.05).generate()
     few = torch.arange(len(cloud)) % 5 == 0
     sparse = dataclasses.replace(cloud, scales=cloud.scales + math.log(4)).select(few)
-    write_ply(tmp_path / "flag.ply", sparse)
-    found = dataclasses.replace(suggest(sparse), dx=0.06)
-    (tmp_path / "starter.yaml").write_text(starter_yaml(found, tmp_path / "flag.ply"))
+    scene = started(dataclasses.replace(suggest(sparse), dx=0.06), sparse, tmp_path).scene
     assert "particle_spacing" not in (tmp_path / "starter.yaml").read_text()
-    scene = Simulation.from_yaml(tmp_path / "starter.yaml", device="cpu").scene
     assert scene.further > 0.5 * len(sparse)
 
 
@@ -163,11 +151,11 @@ def test_given_values_replace_guesses():
 # ---- up and floor
 
 
-@pytest.mark.parametrize("name", AXES)
+@pytest.mark.parametrize("name", DIRECTIONS)
 def test_floor_tells_up_whatever_the_axes(name):
     cloud = turned(tree(), name)
     found = up_of(cloud)
-    assert found.direction == tuple(AXES[name])
+    assert found.direction == DIRECTIONS[name]
     assert found.confidence != "low"
     assert bool(found.ground[FLOOR].all())
     assert not bool(found.ground[CROWN].any())
