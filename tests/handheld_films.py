@@ -4,61 +4,42 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
+from functools import cache
 from pathlib import Path
-from typing import Any
 
 import torch
 import yaml
 from bench.problems.films import FPS, MIDDLE, opengl
+from small_films import base
 from torch import Tensor
 
-from gaussian_swaying.gaussians.harmonics import SH_DC
 from gaussian_swaying.gaussians.ply import write_ply
 from gaussian_swaying.rendering.cameras.camera import Camera, look_at_camera
 from gaussian_swaying.scenes.printed_cloth import PERIOD, printed_colours
 from gaussian_swaying.scenes.procedural import FlagScene, both
 from gaussian_swaying.simulation.simulation import Simulation
 
-TRUTH: dict[str, Any] = {"flow": [4.0, 3.0, 0.0], "material.E": 1e4}
 WALLS = ((2.4, 1.6, 0.0, (-0.9, 0.6, -0.7)), (0.5, 1.6, 65.0, (0.75, 0.1, -0.7)))
 """Width, height [m], turn from the x axis [degrees] and lower corner [m] of the walls behind and beside the flag."""
 TEXELS = 400
 """Places along a period of the print at which it is photographed."""
 
 
-def write_base(folder: Path, spacing: float = 0.025, wall: float = 0.02, back: bool = True, worn: bool = False) -> Path:
+def write_base(folder: Path, wall: float = 0.02) -> Path:
     """Write the splat of a flag before two walls, ``room.ply``, and the configuration of its simulation.
 
-    Units: ``spacing`` [m].
+    Units: ``wall`` [m], the distance of the Gaussians of the walls; infinite for none.
     """
-    folder.mkdir(parents=True, exist_ok=True)
-    flag = cloud = FlagScene(0.4, 0.3, spacing, ripple=0.01, pattern="printed").generate()
-    if math.isfinite(wall):
-        for width, height, yaw, corner in WALLS if back else WALLS[1:]:
-            part = FlagScene(width, height, wall, ripple=0.0, pattern="printed", yaw=yaw).generate()
-            cloud = both(cloud, replace(part, means=part.means + torch.tensor(corner)))
-    if worn:
-        generator = torch.Generator().manual_seed(0)
-        colour, place = (torch.randn(shape, generator=generator) for shape in (cloud.sh.shape, cloud.means.shape))
-        place[: len(flag.means)] = 0
-        cloud = replace(cloud, sh=cloud.sh + 0.05 / SH_DC * colour, means=cloud.means + 0.003 * place)
+    cloud = FlagScene(0.4, 0.3, 0.025, ripple=0.01, pattern="printed").generate()
+    for width, height, yaw, corner in WALLS if math.isfinite(wall) else ():
+        part = FlagScene(width, height, wall, ripple=0.0, pattern="printed", yaw=yaw).generate()
+        cloud = both(cloud, replace(part, means=part.means + torch.tensor(corner)))
     write_ply(folder / "room.ply", cloud)
     sheet = {"class_path": "Box", "init_args": {"min": [None, -0.06, None], "max": [0.5, 0.06, None]}}
-    pole = {"class_path": "Box", "init_args": {"min": [None] * 3, "max": [0.06, None, None]}}
-    settings = {
-        "frame_dt": 1 / FPS,
-        "scene": {"ply": str(folder / "room.ply"), "region": sheet, "area": "coverage", "metres_per_unit": 1.0},
-        "material": {"E": TRUTH["material.E"], "nu": 0.3, "density": 25.0, "thickness": 0.01},
-        "solver": {
-            "dx": 0.1,
-            "boundaries": [{"class_path": "PinnedRegion", "init_args": {"kind": None, "region": pole}}],
-        },
-        "wind": {"flow": TRUTH["flow"]},
-        "aero": {"C_D": 0.1, "C_F": 0.3, "C_L": 0.005},
-    }
-    (folder / "base.yaml").write_text(yaml.safe_dump(settings), encoding="utf-8")
+    scene = {"generator": None, "ply": str(folder / "room.ply"), "region": sheet, "area": "coverage"}
+    (folder / "base.yaml").write_text(yaml.safe_dump(base(frame_dt=1 / FPS, scene=scene)), encoding="utf-8")
     return folder / "base.yaml"
 
 
@@ -74,14 +55,31 @@ def drift(frames: int) -> Tensor:
     return 1 + way * torch.tensor([-0.15, -0.25, -0.35], dtype=torch.float64) + ripple
 
 
-def photographed(camera: Camera, texture: Tensor, finer: int = 2) -> Tensor:
-    """The walls themselves, by rays and not as Gaussians, black elsewhere, float64, shape (H, W, 3)."""
+@cache
+def _texture() -> Tensor:
+    step = (torch.arange(TEXELS) + 0.5) * (PERIOD / TEXELS)
+    return printed_colours(*torch.meshgrid(step, step, indexing="ij"))
+
+
+def _roughly(x: Tensor, z: Tensor) -> Tensor:
+    """Colours of the print to a texel, shape (N, 3), which take less time than exact ones."""
+    texel = (torch.stack([x, z]) * (TEXELS / PERIOD)).long() % TEXELS
+    return _texture()[texel[0], texel[1]]
+
+
+def photographed(
+    camera: Camera,
+    sheets: Sequence[tuple[float, float, float, tuple[float, ...]]] = WALLS,
+    finer: int = 2,
+    colours: Callable[[Tensor, Tensor], Tensor] = _roughly,
+) -> Tensor:
+    """Printed sheets themselves, by rays and not as Gaussians, black elsewhere, float64, shape (H, W, 3)."""
     rows, columns = ((torch.arange(n * finer) + 0.5).double() / finer for n in (camera.height, camera.width))
     row, column = torch.meshgrid(rows, columns, indexing="ij")
     local = torch.stack([column, row, torch.ones_like(row)], -1) @ camera.intrinsics.double().inverse().T
     ray, eye = local @ camera.world_to_camera[:3, :3].double(), camera.position.double()
     near, colour = torch.full_like(row, math.inf), torch.zeros_like(ray)
-    for width, height, yaw, corner in WALLS:
+    for width, height, yaw, corner in sheets:
         turn, origin = math.radians(yaw), eye.new_tensor(corner)
         along = eye.new_tensor([math.cos(turn), math.sin(turn), 0])
         normal = eye.new_tensor([-math.sin(turn), math.cos(turn), 0])
@@ -89,8 +87,7 @@ def photographed(camera: Camera, texture: Tensor, finer: int = 2) -> Tensor:
         place = eye + far[..., None] * ray - origin
         x, z = place @ along, place[..., 2]
         seen = (far > 0) & (far < near) & (x > 0) & (x < width) & (z > 0) & (z < height)
-        texel = (torch.stack([x, z], -1)[seen] * (len(texture) / PERIOD)).long() % len(texture)
-        near[seen], colour[seen] = far[seen], texture[texel[:, 0], texel[:, 1]]
+        near[seen], colour[seen] = far[seen], colours(x[seen], z[seen]).double()
     return colour.unflatten(0, (-1, finer)).unflatten(2, (-1, finer)).mean((1, 3))
 
 
@@ -99,7 +96,6 @@ def write_film(
     folder: Path,
     cameras: Sequence[Camera],
     gains: Tensor | None = None,
-    crf: int = 28,
     real: bool = False,
 ) -> None:
     """Simulate, and write what a moving camera sees as ``film.mp4`` with the camera of its first frame alone."""
@@ -114,20 +110,18 @@ def write_film(
         fps=1 / simulation.frame_dt,
         macro_block_size=2,
         quality=None,
-        output_params=["-crf", str(crf)],
+        output_params=["-crf", "23"],
     )
     film.send(None)
     moving = simulation.scene.moving if real else torch.arange(len(simulation.scene.model.means))
-    step = (torch.arange(TEXELS) + 0.5) * (PERIOD / TEXELS)
-    texture = printed_colours(*torch.meshgrid(step, step, indexing="ij")) if real else None
     for frame in simulation.frames(len(cameras)):
         gaussians = painter.deformed(frame.state)
         own = cameras[frame.index].to(painter.device, torch.float32)
         parts = gaussians.means, gaussians.covariances, painter.opacity(), painter.colors(gaussians, own)
         drawn = painter.renderer(*(part[moving] for part in parts), own)
         colour = drawn.color.cpu().double()
-        if texture is not None:
-            colour += (1 - drawn.alpha.cpu().double()) * photographed(cameras[frame.index], texture)
+        if real:
+            colour += (1 - drawn.alpha.cpu().double()) * photographed(cameras[frame.index])
         colour = colour * (1 if gains is None else gains[frame.index])
         colour = 255 * colour + 2.0 * torch.randn(colour.shape, generator=generator)
         film.send(colour.round().clamp(0, 255).to(torch.uint8).numpy().tobytes())
@@ -146,6 +140,3 @@ def off(found: Camera, true: Camera) -> tuple[float, float]:
     distance = (true.position.double() - torch.tensor(MIDDLE, dtype=torch.float64)).norm()
     apart = (found.position.double() - true.position.double()).norm()
     return math.degrees(math.asin(min(1.0, float(sine)))), float(apart / distance)
-
-
-__all__ = ["TRUTH", "drift", "off", "tripod", "write_base", "write_film"]

@@ -2,6 +2,7 @@
 
 import pytest
 import yaml
+from shared import merged
 
 from gaussian_swaying.rendering.cameras.camera import look_at_camera
 from gaussian_swaying.simulation.simulation import Simulation
@@ -14,7 +15,7 @@ def base(**changes):
     """Settings of the flag: 48 Gaussians."""
     pole = {"class_path": "PinnedRegion", "init_args": {"kind": None, "region": _box(0.06)}}
     flag = {"width": 0.4, "height": 0.3, "spacing": 0.05, "ripple": 0.01, "pattern": "printed"}
-    return {
+    settings = {
         "frames": FRAMES,
         "frame_dt": 1 / 24,
         "scene": {"generator": {"class_path": "FlagScene", "init_args": flag}, "metres_per_unit": 1.0},
@@ -22,11 +23,18 @@ def base(**changes):
         "solver": {"dx": 0.1, "boundaries": [pole]},
         "wind": {"flow": [4.0, 3.0, 0.0]},
         "aero": {"C_D": 0.1, "C_F": 0.3, "C_L": 0.005},
-    } | changes
+    }
+    return merged(settings, changes)
 
 
 def _box(x):
     return {"class_path": "Box", "init_args": {"min": [None, None, None], "max": [x, None, None]}}
+
+
+def changed(folder, **changes):
+    """The simulation of the flag, with some settings changed."""
+    (folder / "made.yaml").write_text(yaml.safe_dump(base(**changes)))
+    return Simulation.from_yaml(folder / "made.yaml", device="cpu")
 
 
 def cameras(width=200, height=120):

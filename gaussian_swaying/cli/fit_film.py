@@ -108,7 +108,7 @@ def prepare(options: argparse.Namespace, folder: Path) -> Path:
     if length is not None:
         longest = longest_side(*length, seen, preview)
         preview = _previewed(options, look, wanted | shown | {"longest_side": longest})
-    if weighed and not any(yaml.safe_load(preview.configurations["starter"])["solver"]["gravity"]):
+    if weighed and not any(yaml.safe_load(preview.starter)["solver"]["gravity"]):
         raise ValueError(
             "`--length gravity` is for a sheet alone, or for what nothing holds: anything else was captured in balance "
             "with its weight. Give a length that you know."
@@ -307,7 +307,7 @@ def plan_text(preview: Preview, background: Sequence[float], still: float | None
         folder: Of the fit file.
     """
     guess = preview.data["suggestion"]
-    material = yaml.safe_load(preview.configurations["starter"])["material"]
+    material = yaml.safe_load(preview.starter)["material"]
     assumed = ["mass", *(() if scaled else ("length",)), *(() if still is not None else ("camera",))]
     low, high = (float(f"{material['E'] * factor:.1e}") for factor in (SOFTER, STIFFER))
     middle, half = 0.0, 200.0  # more than all ways round, so that none is at an end of the range

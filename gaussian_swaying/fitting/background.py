@@ -52,7 +52,7 @@ class Background:
         painter, rest = self._painter, self._rest
         camera = camera.to(painter.device)
         with torch.no_grad():
-            picture = painter.draw(rest, painter.colors(rest, camera), camera)
+            picture = painter.picture(rest, camera)
             drawn = painter.renderer(rest.means, rest.covariances, painter.opacity(), self._moves, camera).color
         simulated, named, _ = (drawn > SHARE).cpu().unbind(-1)
         return picture, (picture.alpha[..., 0].cpu() > SOLID) & ~_widened(simulated) & ~named
@@ -70,6 +70,3 @@ def _widened(moving: Tensor) -> Tensor:
         return moving
     side = 1 + max(int(rows.max() - rows.min()), int(columns.max() - columns.min()))
     return torch.from_numpy(cv2.distanceTransform((~moving).byte().numpy(), cv2.DIST_L2, 5)) <= REACH * side
-
-
-__all__ = ["Background"]

@@ -68,7 +68,7 @@ def at_rest(simulation: Simulation, video: Footage) -> Any:
     camera: Camera = video.cameras[0].to(painter.device)
     with torch.no_grad():
         rest = scene.rest()
-        picture = painter.draw(rest, painter.colors(rest, camera), camera)
+        picture = painter.picture(rest, camera)
         roles = painter.draw(rest, role_colours(simulation).to(painter.device), camera)
     panels = side_by_side(video.images[0], picture.color, picture.alpha)
     panels.append(("red: held, green: moves, grey: still", roles.color.detach().float().cpu().clamp(0, 1)))
@@ -118,6 +118,3 @@ def titled(panels: Sequence[tuple[str, Tensor]]) -> Any:
     for number, (title, _) in enumerate(panels):
         draw.text((number * width // len(panels) + 6, 3), title, fill=(0, 0, 0), font=font)
     return np.asarray(picture)
-
-
-__all__ = ["at_rest", "side_by_side", "titled", "tracks_picture", "write_before"]

@@ -180,7 +180,7 @@ class PictureEvidence(Evidence):
         target = self._averaged(wanted.to(painter.device).float() / 255)
         found = []
         for gaussians in several:
-            picture = painter.draw(gaussians, painter.colors(gaussians, camera), camera)
+            picture = painter.picture(gaussians, camera)
             seen = picture.alpha if self.masks else picture.color
             found.append((self._averaged(seen.float()) - target).flatten(0, 1))
         rows, columns = target.shape[:2]

@@ -86,6 +86,3 @@ def _median(values: Tensor, weights: Tensor) -> Tensor:
     order = values.argsort()
     total = weights[order].cumsum(0)
     return values[order[int(torch.searchsorted(total, 0.5 * total[-1]))]]
-
-
-__all__ = ["gain_of", "gains", "with_gains"]

@@ -8,6 +8,7 @@ from __future__ import annotations
 import math
 import re
 import subprocess
+from collections.abc import Callable
 from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
@@ -122,8 +123,8 @@ def begins_to_move(film: Film, picture: RenderOutput, camera: Camera) -> float |
         while (frame := next_of(frames, film.path)) is not None:
             grey = np.frombuffer(frame, dtype=np.uint8).reshape(height, width)
             if first is None:
-                first, steady = grey, _Room(grey, picture, camera) if full else _Steady(grey, inside)
-            moves = _differs(first, grey, inside) and steady.differs(grey)
+                first, steady = grey, _in_a_room(grey, picture, camera) if full else _steady(grey, inside)
+            moves = _differs(first, grey, inside) and steady(grey)
             in_a_row = in_a_row + 1 if moves else 0
             if in_a_row == (IN_A_ROW if full else 1):
                 return (number + 1 - in_a_row) / film.fps
@@ -138,66 +139,56 @@ def _differs(first: Any, grey: Any, where: Any) -> bool:
     return bool((abs(level - before) > DIFFERENT).mean() > MOVED)
 
 
-class _Steady:
-    """Takes the shake of a hand off a frame, by points of the background in the first one.
+def _steady(first: Any, inside: Any) -> Callable[[Any], bool]:
+    """Tells whether the object is not as in the first frame once the shake of a hand is off, by the background.
 
     Args:
         first: The first frame, uint8 (H, W).
         inside: Where the object is, bool (H, W).
     """
+    import numpy as np
 
-    def __init__(self, first: Any, inside: Any) -> None:
-        import numpy as np
+    cv2 = opencv()
+    around = 255 * (cv2.dilate(inside.astype(np.uint8), np.ones((15, 15), np.uint8)) == 0).astype(np.uint8)
+    points = cv2.goodFeaturesToTrack(first, 200, 0.05, 5, mask=around)
 
-        cv2 = opencv()
-        around = 255 * (cv2.dilate(inside.astype(np.uint8), np.ones((15, 15), np.uint8)) == 0).astype(np.uint8)
-        self._first, self._inside = first, inside
-        self._points = cv2.goodFeaturesToTrack(first, 200, 0.05, 5, mask=around)
-
-    def differs(self, grey: Any) -> bool:
-        """Return whether the object is not as in the first frame, once the shake is off."""
-        return _differs(self._first, self._aligned(grey), self._inside)
-
-    def _aligned(self, grey: Any) -> Any:
-        """The frame, moved and turned onto the first one; as it is if the background has too few points."""
-        cv2 = opencv()
-        if self._points is None or len(self._points) < LEAST:
+    def aligned(grey: Any) -> Any:
+        """A frame, moved and turned onto the first one; as it is if the background has too few points."""
+        if points is None or len(points) < LEAST:
             return grey
-        there, found, _ = cv2.calcOpticalFlowPyrLK(self._first, grey, self._points, None)
+        there, found, _ = cv2.calcOpticalFlowPyrLK(first, grey, points, None)
         kept = found[:, 0] > 0
         if kept.sum() < LEAST:
             return grey
-        turn, _ = cv2.estimateAffinePartial2D(there[kept], self._points[kept])
+        turn, _ = cv2.estimateAffinePartial2D(there[kept], points[kept])
         return grey if turn is None else cv2.warpAffine(grey, turn, grey.shape[::-1], borderMode=cv2.BORDER_REPLICATE)
 
+    return lambda grey: _differs(first, aligned(grey), inside)
 
-class _Room:
-    """Tells what moves in a splat that fills the picture, most of which stands still.
+
+def _in_a_room(first: Any, picture: RenderOutput, camera: Camera) -> Callable[[Any], bool]:
+    """Tells whether points are not where a camera sees those that stand still, most of a splat that fills the picture.
 
     Args:
         first: The first frame, uint8 (H, W).
         picture: The splat, drawn from its camera, which may be larger.
         camera: That camera.
     """
+    import numpy as np
 
-    def __init__(self, first: Any, picture: RenderOutput, camera: Camera) -> None:
-        import numpy as np
+    scale = np.array([camera.width / first.shape[1], camera.height / first.shape[0]])
+    corners = opencv().goodFeaturesToTrack(first, 500, 0.01, 4)
+    start = np.zeros((0, 2)) if corners is None else corners.reshape(-1, 2) + 0.5
+    world, known = in_space(picture, camera, start * scale)
+    intrinsics = camera.intrinsics.double().numpy() / np.array([[scale[0]], [scale[1]], [1.0]])
 
-        scale = np.array([camera.width / first.shape[1], camera.height / first.shape[0]])
-        corners = opencv().goodFeaturesToTrack(first, 500, 0.01, 4)
-        self._first = first
-        self._start = np.zeros((0, 2)) if corners is None else corners.reshape(-1, 2) + 0.5
-        self._world, self._known = in_space(picture, camera, self._start * scale)
-        self._intrinsics = camera.intrinsics.double().numpy() / np.array([[scale[0]], [scale[1]], [1.0]])
-
-    def differs(self, grey: Any) -> bool:
-        """Return whether some points are not where a camera sees those that stand still."""
-        import numpy as np
-
-        (_, there), (_, seen) = follow(np.stack([self._first, grey])[..., None].repeat(3, -1), self._start)
-        used = seen & self._known
-        off = off_camera(self._world[used], there[used], self._intrinsics, STRAY)
+    def differs(grey: Any) -> bool:
+        (_, there), (_, seen) = follow(np.stack([first, grey])[..., None].repeat(3, -1), start)
+        used = seen & known
+        off = off_camera(world[used], there[used], intrinsics, STRAY)
         return off is not None and bool((off > STRAY).sum() >= max(LEAST, MOVED * len(off)))
+
+    return differs
 
 
 def off_camera(world: Any, there: Any, intrinsics: Any, near: float) -> Any:
@@ -237,6 +228,3 @@ def _focal(path: Path) -> float | None:
     found = _FOCAL.search(told.stderr.decode(errors="replace"))
     value = float(found[1]) if found else 0.0
     return value if 5 <= value <= 1000 else None
-
-
-__all__ = ["Film", "begins_to_move", "first_frame", "off_camera", "open_film", "pixels_of_focal"]

@@ -62,7 +62,7 @@ from gaussian_swaying.fitting.report import (
 from gaussian_swaying.fitting.rivals import apart_by, bent_alike, is_mirrored, rivals_of
 from gaussian_swaying.fitting.straight import straight
 from gaussian_swaying.fitting.tracks import Tracks, beside_rest, match, opencv, still_until, track
-from gaussian_swaying.fitting.unknowns import FILM_START, check_unknowns
+from gaussian_swaying.fitting.unknowns import FILM_START, check_unknowns, values_at
 from gaussian_swaying.fitting.variants import check_variants, states_of
 from gaussian_swaying.fitting.videos import Footage, frame_times, read_videos
 from gaussian_swaying.gaussians.model import DeformedGaussians
@@ -223,7 +223,16 @@ class Fit:
     @property
     def followed(self) -> bool:
         """True if points are followed from frame to frame; otherwise the videos may have too little texture."""
-        return "tracks" in self.stages or self.stages[0] == "matches"
+        return "tracks" in (*self.stages, self.first_stage)
+
+    @property
+    def first_stage(self) -> str:
+        """The stage that needs no place to begin from."""
+        return "tracks" if self.stages[0] == "matches" else self.stages[0]
+
+    def _until(self, share: float) -> list[float]:
+        """Times of a share of the fitted frames."""
+        return self.fitted[: max(3, round(share * len(self.fitted)))]
 
     @property
     def moving(self) -> bool:
@@ -322,7 +331,7 @@ class Fit:
 
     def values(self, place: Tensor | Sequence[float]) -> dict[str, float]:
         """Values of the unknowns at a place, given as shares of the ranges."""
-        return {u.name: u.value(float(share)) for u, share in zip(self.plan.unknowns, place, strict=True)}
+        return values_at(self.plan.unknowns, place)
 
     def residuals(self, evidence: Sequence[Evidence], times: Sequence[float]) -> Callable[[Tensor], list[Block]]:
         """The residuals of some evidence up to a horizon, as a function of places (B, U)."""
@@ -375,9 +384,8 @@ class Fit:
         places[:, moving] = sobol.draw(len(places)).double()
         if self.moving and self.followed:
             self.first, self._tracks = self.begin_from(places[:BEGUN]), None
-        first = self.stages[0]
-        evidence = self.evidence("tracks" if first == "matches" else first)
-        times = self.fitted[: max(3, round(SEARCHED * len(self.fitted)))]
+        evidence = self.evidence(self.first_stage)
+        times = self._until(SEARCHED)
         places = torch.cat([torch.tensor([begin] * given, dtype=torch.float64).reshape(-1, len(begin)), places])
         places, costs = self._coarse(places, evidence, times)
         if others := bent_alike(unknowns, places[int(costs.argmin())].tolist()):
@@ -406,10 +414,10 @@ class Fit:
         """
         if len(places) < 2:
             return [list(place) for place in places]
-        evidence = self.evidence("tracks" if self.stages[0] == "matches" else self.stages[0])
+        evidence = self.evidence(self.first_stage)
         kept, left = [list(place) for place in places], len(places)
         for share in HORIZONS:
-            times = self.fitted[: max(3, round(share * len(self.fitted)))]
+            times = self._until(share)
             ended, costs = self._brief(kept, evidence, times)
             for place, cost in zip(ended, costs, strict=True):
                 self.say(f"start to {times[-1]:.3g} s: cost {cost:.3g}, {self._shown(place)}")
@@ -483,14 +491,15 @@ class Fit:
         tried = [*map(list, rivals), *rivals_of(setup, unknowns, place)]
         if not tried:
             return [], []
-        stage = "tracks" if self.stages[0] == "matches" else self.stages[0]
         if self.moving and self.followed:
             try:
-                ended, costs = self._each_from_its_own([place, *tried], stage)
+                ended, costs = self._each_from_its_own([place, *tried], self.first_stage)
             except DivergedError:
                 return [], []
         else:
-            ended, costs = self._brief([place, *tried], self._trusted(self.evidence(stage), place), self.fitted)
+            ended, costs = self._brief(
+                [place, *tried], self._trusted(self.evidence(self.first_stage), place), self.fitted
+            )
         for end, cost in zip(ended, costs, strict=True):
             self.say(f"rival: cost {cost:.5g}, {self._shown(end)}")
         away = [apart_by(unknowns, end, place) for end in ended]
@@ -566,7 +575,7 @@ class Fit:
         steps = self.steps()
         while True:
             stage, share = steps[course.step]
-            times = self.fitted[: max(3, round(share * len(self.fitted)))]
+            times = self._until(share)
             course.matched = course.matched or list(course.place)
             evidence = self.evidence(stage, course.matched)
             if share >= HORIZONS[-1]:
@@ -579,7 +588,13 @@ class Fit:
                 course.place, course.damping = progress.place.tolist(), progress.damping
                 course.iteration, course.ended = progress.iteration, progress.done
                 course.seconds = time.monotonic() - clock
-                row = {"stage": stage, "horizon_s": times[-1], "iteration": progress.iteration, "cost": _cost(progress)}
+                assert progress.normal is not None
+                row = {
+                    "stage": stage,
+                    "horizon_s": times[-1],
+                    "iteration": progress.iteration,
+                    "cost": progress.normal.cost,
+                }
                 row |= {"damping": progress.damping, "ended": progress.done}
                 course.history.append(
                     row | {f"scale_{k}": v for k, v in progress.scales.items()} | self.values(course.place)
@@ -597,8 +612,8 @@ class Fit:
 
         Both are fitted to the first four fifths of the fitted frames, and compared in the others.
         """
-        known = max(3, round((1 - LATER) * len(self.fitted)))
-        early, late = self.fitted[:known], self.fitted[known:]
+        early = self._until(1 - LATER)
+        late = self.fitted[len(early) :]
         unknowns = changes_of(self.plan.unknowns, self.fitted[-1])
         wider = Fit(
             self.simulation,
@@ -728,9 +743,8 @@ class Fit:
         return []
 
     def _check_apart(self, course: Course) -> None:
-        first = self.stages[0]
         place = torch.tensor(course.place, dtype=torch.float64)
-        normal = self._normal(place, self.evidence("tracks" if first == "matches" else first), self.fitted)
+        normal = self._normal(place, self.evidence(self.first_stage), self.fitted)
         found = directions(normal.matrix, self.plan.unknowns, place)
         course.directions = [{"strength": d.strength, "parts": d.parts, "sentence": d.sentence} for d in found]
         for direction in found:
@@ -750,10 +764,6 @@ def _scaled(evidence: Sequence[Evidence]) -> Callable[..., dict[str, float]]:
         return scales_of(known, floors, member) | dict.fromkeys((b.kind for b in blocks if b.kind == PRIOR), 1.0)
 
     return scales
-
-
-def _cost(progress: Progress) -> float:
-    return math.nan if progress.normal is None else progress.normal.cost
 
 
 _NOTHING = Tracks(torch.zeros(0, dtype=torch.long), torch.zeros(0, 0, 2), torch.zeros(0, 0, dtype=torch.bool))

@@ -229,6 +229,3 @@ def _probes(camera: Camera, background: Background) -> Tensor:
     view, around = camera.world_to_camera.double().cpu(), torch.tensor([0.3, 0.3, -0.3], dtype=torch.float64)
     middle = camera.position.double().cpu() + far * view[2, :3]
     return torch.cat([middle[None], middle + far * around[:, None] * view[:3, :3]])
-
-
-__all__ = ["Motion", "follow_camera", "moves_by", "smooth", "smoothed", "stands_still"]

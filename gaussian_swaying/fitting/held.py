@@ -155,6 +155,3 @@ def moving_points(video: Footage, picture: RenderOutput) -> tuple[Tensor, Tensor
             gone[used] = np.maximum(gone[used], far)
     kept = known & (seen.mean(0) > 0.5)
     return torch.from_numpy(world[kept]), torch.from_numpy(gone[kept])
-
-
-__all__ = ["HeldEnd", "held_end", "moving_box", "moving_points"]

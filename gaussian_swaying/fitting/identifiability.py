@@ -78,13 +78,12 @@ def check_apart(found: Sequence[Direction], unknowns: Sequence[Unknown], limit: 
 
 def _sentence(parts: Sequence[float], unknowns: Sequence[Unknown], place: Tensor) -> str:
     """Describe a step along a direction in words, scaled so that its largest change is about 10 %."""
-    turn = 1.0 if parts[max(range(len(parts)), key=lambda k: abs(parts[k]))] > 0 else -1.0
-    # how far along the direction until the largest part has changed by a tenth of its value, or of its range
     lead = max(range(len(parts)), key=lambda k: abs(parts[k]))
     unknown = unknowns[lead]
     slope, value = unknown.slope(float(place[lead])), unknown.value(float(place[lead]))
-    far = 0.1 * abs(value) / abs(slope * parts[lead]) if value and unknown.scale == "log" else 0.1 / abs(parts[lead])
-    return changes([turn * far * part for part in parts], unknowns, place)
+    # how far along the direction until the largest part has changed by a tenth of its value, or of its range
+    far = 0.1 * abs(value) / abs(slope) if value and unknown.scale == "log" else 0.1
+    return changes([far / parts[lead] * part for part in parts], unknowns, place)
 
 
 def changes(step: Sequence[float], unknowns: Sequence[Unknown], place: Tensor) -> str:

@@ -90,6 +90,3 @@ def _picture(path: Path) -> str:
 
 def _packed(data: bytes) -> str:
     return base64.b64encode(data).decode("ascii")
-
-
-__all__ = ["write_page"]

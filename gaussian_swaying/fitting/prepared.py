@@ -117,6 +117,3 @@ def prepared(
         found.append(video)
         judged.append(one)
     return found, judged
-
-
-__all__ = ["Judged", "prepared"]

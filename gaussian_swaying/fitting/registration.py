@@ -347,6 +347,3 @@ def _slope(places: Tensor, camera: Camera) -> Tensor:
     by_place = by_place.unflatten(1, (2, 3))
     by_turn = torch.linalg.cross(local[:, None].expand_as(by_place), by_place)
     return torch.cat([by_turn, by_place], 2).flatten(0, 1)
-
-
-__all__ = ["Registration", "cameras_around", "grey_of", "refine", "register"]

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -13,13 +14,13 @@ from torch import Tensor
 
 from gaussian_swaying._files import write_json, write_table, write_text
 from gaussian_swaying.config.parser import config_text
-from gaussian_swaying.fitting.before import titled
+from gaussian_swaying.fitting.before import BAND, titled
 from gaussian_swaying.fitting.changing import changing
 from gaussian_swaying.fitting.gusts import Gusts, gusts_of
 from gaussian_swaying.fitting.identifiability import Direction
 from gaussian_swaying.fitting.prepared import Judged
 from gaussian_swaying.fitting.scale import SCALE
-from gaussian_swaying.fitting.unknowns import Unknown, is_change, of_simulation
+from gaussian_swaying.fitting.unknowns import Unknown, is_change, of_simulation, values_at
 from gaussian_swaying.fitting.variants import setup_of
 from gaussian_swaying.fitting.videos import Footage
 from gaussian_swaying.gaussians.model import DeformedGaussians
@@ -104,7 +105,7 @@ class Result:
 
     @property
     def values(self) -> dict[str, float]:
-        return {u.name: u.value(share) for u, share in zip(self.unknowns, self.place, strict=True)}
+        return values_at(self.unknowns, self.place)
 
     @property
     def errors(self) -> dict[str, float]:
@@ -231,19 +232,19 @@ def predictions(
     squares: list[tuple[list[float], list[float]]] = [([], []) for _ in videos]
     rows: list[list[tuple[str, Tensor]]] = [[] for _ in videos]
     painter = simulation.painter
-    with Films(films, videos) as beside:
+    with _films(films, videos) as add:
         for k, (time, gaussians) in enumerate(zip(times, moved, strict=True)):
             for number, video in enumerate(videos):
                 frame = video.frame_at(time)
                 if frame is None:
                     continue
                 camera = video.cameras[frame].to(painter.device)
-                drawn = painter.draw(gaussians, painter.colors(gaussians, camera), camera)
+                drawn = painter.picture(gaussians, camera)
                 shown = drawn.color.clamp(0, 1).float().cpu()
                 real = video.images[frame].float() / 255
                 squares[number][k >= fitted].append(float((shown - real).square().mean()))
                 part = "predicted" if k >= fitted else "fitted"
-                beside.add(number, [(f"film, {time:.2f} s", real), (part, shown)])
+                add(number, [(f"film, {time:.2f} s", real), (part, shown)])
                 if k in chosen[number]:
                     difference = (0.5 + 0.5 * (shown - real)).clamp(0, 1)
                     rows[number].append((f"{time:.3g} s, {part}", torch.cat([real, shown, difference], 1)))
@@ -256,35 +257,34 @@ def predictions(
     return found
 
 
-class Films:
-    """Writes ``film_CAMERA.mp4``, a video beside its fit, for each camera, within a ``with``.
+@contextmanager
+def _films(folder: Path | None, videos: Sequence[Footage]) -> Iterator[Callable[[int, list[tuple[str, Tensor]]], None]]:
+    """Writes ``film_CAMERA.mp4``, a video beside its fit, for each camera.
 
     Args:
         folder: Where to write; None to write nothing.
         videos: The videos.
-    """
 
-    def __init__(self, folder: Path | None, videos: Sequence[Footage]) -> None:
-        self._encoders: list[VideoEncoder] = []
-        if folder is None:
-            return
+    Yields:
+        Adds a frame to that of a camera, by its number: titles and pictures (H, W, 3), colours in [0, 1].
+    """
+    encoders = []
+    if folder is not None:
         folder.mkdir(exist_ok=True)
         for video in videos:
             rate = (len(video.times) - 1) / (video.times[-1] - video.times[0])
-            self._encoders.append(VideoEncoder(folder / f"film_{video.name}.mp4", rate))
+            encoders.append(VideoEncoder(folder / f"film_{video.name}.mp4", rate))
 
-    def add(self, number: int, panels: Sequence[tuple[str, Tensor]]) -> None:
-        """Add a frame of a camera: titles and pictures (H, W, 3), colours in [0, 1]."""
-        if self._encoders:
-            self._encoders[number].write(titled(panels))
+    def add(number: int, panels: list[tuple[str, Tensor]]) -> None:
+        if encoders:
+            encoders[number].write(titled(panels))
 
-    def __enter__(self) -> Films:
-        return self
-
-    def __exit__(self, kind: Any, error: Any, trace: Any) -> None:
-        for encoder in self._encoders:
-            if kind is None:
-                encoder.finish()
+    try:
+        yield add
+        for encoder in encoders:
+            encoder.finish()
+    finally:
+        for encoder in encoders:
             encoder.abort()
 
 
@@ -355,7 +355,7 @@ def scene_text(values: Mapping[str, float], parser: ArgumentParser, settings: Na
         setup = setup_of(simulation.setup, values)
         for name in ("material.E", "material.density", "solver.gravity"):
             in_settings(found, name, value_of(setup, name))
-        found.wind.flow = [part / ratio for part in found.wind.flow]
+        found.wind.flow = found.wind.flow and [part / ratio for part in found.wind.flow]
         if found.material.bending is not None:
             found.material.bending /= ratio**5
     told = "".join(f"# {name}: {value:.6g}\n" for name, value in values.items()) + remark
@@ -421,15 +421,13 @@ def _labelled(shown: Shown) -> Any:
     import numpy as np
     from PIL import Image, ImageDraw, ImageFont
 
-    height, width = shown.picture.shape[:2]
-    band, row = 22, height // max(len(shown.rows), 1)
-    picture = Image.new("RGB", (width, height + band), (255, 255, 255))
-    picture.paste(Image.fromarray(shown.picture.numpy()), (0, band))
+    width, row = shown.picture.shape[1] // 3, len(shown.picture) // max(len(shown.rows), 1)
+    names = ("video", "simulation", "difference (grey: none)")
+    panels = zip(names, (shown.picture.float() / 255).split(width, 1), strict=True)
+    picture = Image.fromarray(titled(list(panels)))
     draw, font = ImageDraw.Draw(picture), ImageFont.load_default(13)
-    for column, name in enumerate(("video", "simulation", "difference (grey: none)")):
-        draw.text((column * width // 3 + 6, 3), name, fill=(0, 0, 0), font=font)
     for number, told in enumerate(shown.rows):
-        where = (6, band + number * row + 3)
+        where = (6, BAND + number * row + 3)
         draw.text(where, told, fill=(255, 255, 255), font=font, stroke_width=1, stroke_fill=(0, 0, 0))
     return np.asarray(picture)
 

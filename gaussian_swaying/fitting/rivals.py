@@ -13,7 +13,7 @@ from collections.abc import Mapping, Sequence
 
 import torch
 
-from gaussian_swaying.fitting.unknowns import Unknown
+from gaussian_swaying.fitting.unknowns import Unknown, values_at
 from gaussian_swaying.simulation.parameters import Setup, flow_of
 
 SHAKEN = 0.12
@@ -46,8 +46,7 @@ def rivals_of(setup: Setup, unknowns: Sequence[Unknown], place: Sequence[float])
     names = [unknown.name for unknown in unknowns]
     if "wind.azimuth" in names:
         k = names.index("wind.azimuth")
-        values = {u.name: u.value(share) for u, share in zip(unknowns, place, strict=True)}
-        azimuth = mirrored(setup, values)
+        azimuth = mirrored(setup, values_at(unknowns, place))
         share = unknowns[k].share(_within(azimuth, unknowns[k])) if azimuth is not None else -1.0
         if 0 <= share <= 1:
             found.append([*place[:k], share, *place[k + 1 :]])
@@ -120,7 +119,7 @@ def mirrored(setup: Setup, values: Mapping[str, float]) -> float | None:
 
 def is_mirrored(setup: Setup, unknowns: Sequence[Unknown], place: Sequence[float], end: Sequence[float]) -> bool:
     """True if the wind at the end of another start is about the mirror image of that at a place, both as shares."""
-    values, there = ({u.name: u.value(share) for u, share in zip(unknowns, one, strict=True)} for one in (place, end))
+    values, there = values_at(unknowns, place), values_at(unknowns, end)
     other = mirrored(setup, values) if "wind.azimuth" in values else None
     return other is not None and abs(_turned(there["wind.azimuth"] - other)) < MIRROR
 

@@ -48,6 +48,3 @@ def straight(unknowns: Sequence[Unknown]) -> Retract:
         return end
 
     return moved
-
-
-__all__ = ["straight"]

@@ -85,7 +85,7 @@ def drawn_by(simulation: Simulation, gaussians: DeformedGaussians, camera: Camer
     painter = simulation.painter
     own = camera.to(painter.device)
     with torch.no_grad():
-        colour = painter.draw(gaussians, painter.colors(gaussians, own), own).color
+        colour = painter.picture(gaussians, own).color
     return (colour.clamp(0, 1) * 255).round().to(torch.uint8).cpu()
 
 
@@ -175,7 +175,7 @@ def match(
         camera = video.cameras[k].to(painter.device)
         with torch.no_grad():
             gaussians = painter.deformed(state)
-            picture = painter.draw(gaussians, painter.colors(gaussians, camera), camera)
+            picture = painter.picture(gaussians, camera)
         pixel, depth = project(gaussians.means[index], video.cameras[k])
         there = _inside(pixel, picture, _in_sight(pixel, depth, picture, BEHIND * scene.size))
         shown = (picture.color.clamp(0, 1) * 255).round().to(torch.uint8).cpu().numpy()
@@ -247,7 +247,7 @@ def _chosen(
     with torch.no_grad():
         first, own = first or scene.rest(), camera.to(painter.device)
         pixel, depth = project(first.means[scene.moving], camera)
-        picture = painter.draw(first, painter.colors(first, own), own)
+        picture = painter.picture(first, own)
     opaque = scene.model.opacity().cpu()[scene.moving.cpu()] > OPAQUE
     place = (_in_sight(pixel, depth, picture, BEHIND * scene.size) & opaque).nonzero()[:, 0]
     column, row = pixel[place].long().unbind(-1)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
 from gaussian_swaying._checks import check_choice
@@ -55,7 +55,8 @@ class Unknown:
         known = find(self.name)
         own = self.name in (FILM_START, SCALE) or is_change(self.name)
         if not own and (known is None or known.kind != "number"):
-            sought = [FILM_START, SCALE, *(name for name in parameters.names() if parameter_kind(name) == "number")]
+            numbers = (name for name in parameters.names() if parameter(name.replace("*", "0")).kind == "number")
+            sought = [FILM_START, SCALE, *numbers]
             raise ValueError(f"`{self.name}` cannot be sought: use {', '.join(sought)}, or put it into `known`.")
         if not (math.isfinite(self.low) and math.isfinite(self.high) and self.low < self.high):
             raise ValueError(f"Expected `{where}.range` to be [low, high], but got [{self.low}, {self.high}].")
@@ -96,15 +97,15 @@ def of_simulation(values: Mapping[str, float]) -> dict[str, float]:
     return {n: value for n, value in values.items() if n not in (FILM_START, SCALE) and not is_change(n)}
 
 
-def parameter_kind(name: str) -> str:
-    """``number``, ``whole`` or ``vector``."""
-    return parameter(name.replace("*", "0")).kind
-
-
 def default_scale(name: str, low: float) -> str:
     """``log`` for positive sizes, ``linear`` for angles, Poisson's ratio and ranges that reach zero."""
     known = find(name)
     return "log" if low > 0 and name != FILM_START and (known is None or known.scale == "log") else "linear"
+
+
+def values_at(unknowns: Sequence[Unknown], place: Iterable[float]) -> dict[str, float]:
+    """Values of unknowns at a place, given as shares of their ranges."""
+    return {u.name: u.value(float(share)) for u, share in zip(unknowns, place, strict=True)}
 
 
 def check_unknowns(simulation: Simulation, unknowns: Sequence[Unknown]) -> None:

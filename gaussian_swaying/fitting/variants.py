@@ -13,7 +13,7 @@ from gaussian_swaying.aero.wind import WindField
 from gaussian_swaying.fitting.changing import changing
 from gaussian_swaying.fitting.scale import SCALE, at_scale
 from gaussian_swaying.fitting.unknowns import FILM_START, is_change, of_simulation
-from gaussian_swaying.mpm.state import MaterialPoints, State
+from gaussian_swaying.mpm.state import State
 from gaussian_swaying.simulation.diagnostics import SimulationDiverged
 from gaussian_swaying.simulation.parameters import Setup, parameter, with_values
 from gaussian_swaying.simulation.simulation import Simulation
@@ -94,7 +94,7 @@ def _groups(simulation: Simulation, values: Sequence[Values], setups: Sequence[S
             for name, value in sorted(own.items())
             if name in (FILM_START, SCALE) or not (is_change(name) or parameter(name).batched)
         ]
-        shared.setdefault((*apart, 0 if alike else _stiffness_class(_bound(setup))), []).append(number)
+        shared.setdefault((*apart, 0 if alike else _stiffness_class(setup)), []).append(number)
     found = []
     for members in shared.values():
         part = [setups[k] for k in members]
@@ -133,11 +133,8 @@ def _advance(groups: Sequence[_Group], begin: float, end: float, alike: bool) ->
         group.state = state
 
 
-def _bound(setup: Setup) -> MaterialPoints:
-    return with_added_mass(setup.points, setup.scene.patches, setup.aero)
-
-
-def _stiffness_class(points: MaterialPoints) -> int:
+def _stiffness_class(setup: Setup) -> int:
     """A number that is equal for materials whose fastest waves differ by less than a fifth or so."""
+    points = with_added_mass(setup.points, setup.scene.patches, setup.aero)
     squared = (points.youngs_modulus * points.volume / points.mass).amax()
     return round(2 * math.log2(float(squared)))

@@ -158,17 +158,17 @@ def test_the_weight_as_a_ruler(case, checked, capsys, monkeypatch):
 
     def weightless(*given):
         preview = previewed(*given)
-        starter = yaml.safe_load(preview.configurations["starter"])
+        starter = yaml.safe_load(preview.starter)
         assert starter["solver"]["gravity"][2] == -9.8  # a flag is not in balance
         starter["solver"]["gravity"] = [0.0, 0.0, 0.0]
-        return dataclasses.replace(preview, configurations={"starter": yaml.safe_dump(starter)})
+        return dataclasses.replace(preview, starter=yaml.safe_dump(starter))
 
     monkeypatch.setattr(fit_film, "_previewed", weightless)
     assert _check(case, case / "weighed", "--length", "gravity") == 2
     assert "captured in balance" in capsys.readouterr().err
     starter = (checked / "preview/starter.yaml").read_text()
     guess = {"metres_per_unit": 0.5, "hold": {"end": "top"}, "flow": [1.0, 0.0, 0.0]}
-    preview = SimpleNamespace(data={"suggestion": guess}, configurations={"starter": starter})
+    preview = SimpleNamespace(data={"suggestion": guess}, starter=starter)
     (checked / "weighed.yaml").write_text(plan_text(preview, [0.5, 0.5, 0.5], 0.1, "gravity", checked))
     plan = read_plan(checked / "weighed.yaml")
     (scale,) = [u for u in plan.unknowns if u.name == SCALE]

@@ -7,10 +7,9 @@ import pytest
 import torch
 import yaml
 from bench.problems.films import write_video
-from small_films import TRUTH, base, cameras
+from small_films import TRUTH, cameras, changed
 
 from gaussian_swaying.fitting.changing import KNOTS, WALK, changes_of, knots_of, prior_of, steady_share
-from gaussian_swaying.fitting.fit import fit
 from gaussian_swaying.fitting.plan import Plan, read_plan
 from gaussian_swaying.fitting.unknowns import FILM_START, Unknown
 from gaussian_swaying.fitting.variants import states_of
@@ -50,8 +49,7 @@ def test_variants_in_winds_that_change(own, simulation):
     changes = {"wind.speed@0.1": 2.0, "wind.azimuth@0.1": 30.0}
     times, flows = knots_of([4.0, 3.0, 0.0], changes)
     schedule = [{"time": time, "flow": flow} for time, flow in zip(times, flows, strict=True)]
-    (own / "schedule.yaml").write_text(yaml.safe_dump(base(wind={"schedule": schedule, "interpolation": "linear"})))
-    other = Simulation.from_yaml(own / "schedule.yaml", device="cpu")
+    other = changed(own, wind={"flow": None, "schedule": schedule, "interpolation": "linear"})
     frames = [k / 24 for k in range(4)]
     values = [{}, changes, changes | {FILM_START: -1 / 24}]
     steady, found, before = zip(*states_of(simulation, values, frames, alike=False), strict=True)
@@ -63,16 +61,15 @@ def test_variants_in_winds_that_change(own, simulation):
 
 
 @pytest.mark.parametrize("ramp", [2.0, 1.0])
-def test_it_is_taken_where_it_predicts_better(own, tmp_path, ramp, capsys):
+def test_it_is_taken_where_it_predicts_better(fitted, tmp_path, ramp, capsys):
     pytest.importorskip("cv2", reason="needs the extra [fit]")
     flow = [4.0, 3.0, 0.0]
     ends = [{"time": 0.0, "flow": flow}, {"time": 0.75, "flow": [ramp * part for part in flow]}]
-    (tmp_path / "film.yaml").write_text(yaml.safe_dump(base(wind={"schedule": ends, "interpolation": "linear"})))
-    simulation = Simulation.from_yaml(tmp_path / "film.yaml", device="cpu")
+    simulation = changed(tmp_path, wind={"flow": None, "schedule": ends, "interpolation": "linear"})
     write_video(simulation, tmp_path / "video", {"left": cameras()["left"]}, 19, noise=2.0)
     sought = {"wind.speed": [2.0, 12.0], "material.E": [2e3, 5e4]}
-    options = {"device": "cpu", "search": 8, "starts": 1, "fit_share": 1.0, "wind_changes": True, "stages": ["tracks"]}
-    result = fit(own / "base.yaml", tmp_path / "video", sought, tmp_path / "fit", **options)
+    options = {"search": 8, "starts": 1, "fit_share": 1.0, "wind_changes": True, "stages": ["tracks"]}
+    result = fitted(sought, tmp_path / "video", progress=True, **options)
     assert "a wind that changes is" in capsys.readouterr().err
     if ramp == 1:
         assert set(result.values) == set(sought)

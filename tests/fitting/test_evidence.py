@@ -17,8 +17,6 @@ from gaussian_swaying.fitting.evidence import (
     facing,
     scales_of,
 )
-from gaussian_swaying.fitting.fit import Fit
-from gaussian_swaying.fitting.plan import Plan, read_unknown
 from gaussian_swaying.fitting.tracks import Tracks
 from gaussian_swaying.fitting.variants import states_of
 from gaussian_swaying.fitting.videos import Footage, read_videos
@@ -70,11 +68,10 @@ def test_weighed_tracks_are_those_times_their_weight(own, simulation):
     torch.testing.assert_close(weighed, plain * expected[:, None])
 
 
-def test_silhouettes_need_masks(own, simulation):
+def test_silhouettes_need_masks(own, fit_of):
     videos = [dataclasses.replace(video, masks=None) for video in read_videos(own / "video")]
-    plan = Plan(["base"], ["video"], [read_unknown("wind.speed", [1, 9])], stages=("silhouettes",))
     with pytest.raises(ValueError, match="no silhouettes"):
-        Fit(simulation, videos, plan)
+        fit_of({"wind.speed": [1, 9]}, videos=videos, stages=("silhouettes",))
 
 
 def test_tracks_share_their_clusters_over_cameras_and_pictures_do_not(monkeypatch):

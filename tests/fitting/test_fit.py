@@ -7,29 +7,26 @@ from dataclasses import replace
 
 import pytest
 import torch
-import yaml
-from small_films import TRUTH, base
+from small_films import TRUTH, changed
 
-from gaussian_swaying.fitting.fit import GRIDS, ROUNDS, Course, Fit, fit, run_fit
+from gaussian_swaying.fitting.fit import GRIDS, ROUNDS, Course, run_fit
 from gaussian_swaying.fitting.held_out import HELD
-from gaussian_swaying.fitting.plan import Plan, read_unknown
 from gaussian_swaying.fitting.rivals import SHAKEN
 from gaussian_swaying.fitting.videos import read_videos
-from gaussian_swaying.simulation.simulation import Simulation
 
 pytest.importorskip("cv2", reason="needs the extra [fit]")
 
-SOUGHT = {"wind.speed": [2.0, 12.0], "wind.azimuth": [-20.0, 100.0], "material.E": [2e3, 5e4]}
+SPEED, AZIMUTH = {"wind.speed": [2.0, 12.0]}, {"wind.azimuth": [-20.0, 100.0]}
 
 
-def test_starts_that_are_far_off(own, tmp_path, capsys):
+def test_starts_that_are_far_off(fitted, tmp_path, capsys):
     """Three times the speed and 60 degrees off: other starts are tried as well, and the best goes on."""
     sought = {
         "wind.speed": {"range": [1.0, 20.0], "start": 15.0},
         "wind.azimuth": {"range": [-60.0, 140.0], "start": 97.0},
         "material.E": {"range": [2e3, 5e4], "start": 3e4},
     }
-    result = fit(own / "base.yaml", own / "video", sought, tmp_path / "fit", device="cpu", search=16)
+    result = fitted(sought, search=16, progress=True)
     assert result.values["wind.speed"] == pytest.approx(TRUTH["wind.speed"], rel=0.01)
     assert result.values["wind.azimuth"] == pytest.approx(TRUTH["wind.azimuth"], abs=1.0)
     assert capsys.readouterr().err.count("] start to ") >= 2
@@ -37,11 +34,9 @@ def test_starts_that_are_far_off(own, tmp_path, capsys):
     assert [len(place) for place in course["rivals"]] == [3] * len(course["rivals"])
 
 
-def test_another_end_that_fits_as_well_is_a_rival(own, simulation):
+def test_another_end_that_fits_as_well_is_a_rival(fit_of):
     """And one that is the same, or fits worse, is none. One that fits better is to go on from."""
-    sought = [read_unknown("wind.speed", [2.0, 12.0])]
-    plan = Plan([str(own / "base.yaml")], [str(own / "video")], sought)
-    made = Fit(simulation, read_videos(own / "video"), plan)
+    made = fit_of(SPEED)
     here, near, far = [0.5], [0.51], [0.9]
 
     def others(*ended):
@@ -58,11 +53,9 @@ def test_another_end_that_fits_as_well_is_a_rival(own, simulation):
     assert made._others(here, []) == ([], [])  # nothing else is tried
 
 
-def test_a_softer_and_a_stiffer_material_are_tried_at_the_end(own, simulation):
+def test_a_softer_and_a_stiffer_material_are_tried_at_the_end(fit_of):
     """One of them fits better, so the end is a local minimum."""
-    sought = [read_unknown("wind.speed", [2.0, 12.0]), read_unknown("material.E", [2e3, 5e4])]
-    plan = Plan([str(own / "base.yaml")], [str(own / "video")], sought)
-    made = Fit(simulation, read_videos(own / "video"), plan)
+    made = fit_of(SPEED | {"material.E": [2e3, 5e4]})
     tried = []
 
     def brief(places, evidence, times):
@@ -78,10 +71,9 @@ def test_a_softer_and_a_stiffer_material_are_tried_at_the_end(own, simulation):
 
 
 @pytest.mark.parametrize(("better", "rounds"), [(1, 1), (9, ROUNDS)])
-def test_a_fit_goes_on_from_a_better_end_but_not_for_ever(own, simulation, better, rounds):
+def test_a_fit_goes_on_from_a_better_end_but_not_for_ever(fit_of, better, rounds):
     """Each time with all fitted frames, and the end that it left is compared with the next one."""
-    plan = Plan([str(own / "base.yaml")], [str(own / "video")], [read_unknown("wind.speed", [2.0, 12.0])])
-    made = Fit(simulation, read_videos(own / "video"), replace(plan, search=0, iterations=1, tracks=40))
+    made = fit_of(SPEED, search=0, iterations=1, tracks=40)
     asked, said, course = [], [], Course()
 
     def others(place, rivals):
@@ -99,20 +91,17 @@ def test_a_fit_goes_on_from_a_better_end_but_not_for_ever(own, simulation, bette
     assert sum(line.endswith(f"goes on from there: {made._shown([0.9])}") for line in said) == rounds
 
 
-def test_a_drag_that_is_sought_with_the_speed_is_remarked_on(own, simulation):
-    videos = read_videos(own / "video")
-    sought = [read_unknown("wind.speed", [2.0, 12.0]), read_unknown("aero.C_D", [0.02, 0.5])]
-    plan = Plan([str(own / "base.yaml")], [str(own / "video")], sought)
-    (note,) = Fit(simulation, videos, plan).notes()
+def test_a_drag_that_is_sought_with_the_speed_is_remarked_on(fit_of):
+    drag = {"aero.C_D": [0.02, 0.5]}
+    (note,) = fit_of(SPEED | drag).notes()
     assert note.startswith("wind.speed and aero.C_D move the object in nearly the same way")
-    assert Fit(simulation, videos, replace(plan, unknowns=sought[1:])).notes() == []
-    (note,) = Fit(simulation, videos, replace(plan, unknowns=sought[1:], assumed=["mass", "camera"])).notes()
+    assert fit_of(drag).notes() == []
+    (note,) = fit_of(drag, assumed=["mass", "camera"]).notes()
     assert "The camera was found from a frame in which the object may move already" in note
 
 
-def test_some_tracks_are_held_out_and_judge_the_fit(own, simulation):
-    plan = Plan([str(own / "base.yaml")], [str(own / "video")], [read_unknown("wind.speed", [2.0, 12.0])])
-    made = Fit(simulation, read_videos(own / "video"), plan)
+def test_some_tracks_are_held_out_and_judge_the_fit(fit_of):
+    made = fit_of(SPEED)
     (first, _) = made.evidence("tracks")
     (all_of_it, _) = made.tracks
     held = all_of_it.seen[0] & ~first.tracks.seen[0]
@@ -120,13 +109,11 @@ def test_some_tracks_are_held_out_and_judge_the_fit(own, simulation):
     assert (all_of_it.index[held] % HELD == 0).all()
 
 
-def test_the_error_of_the_grid_is_in_the_standard_errors(own, simulation):
+def test_the_error_of_the_grid_is_in_the_standard_errors(own, simulation, fit_of):
     """None if the other grids show the same; if they show the flag in another wind, as far off as that wind."""
-    plan = Plan([str(own / "base.yaml")], [str(own / "video")], [read_unknown("wind.speed", [2.0, 12.0])])
-    videos = read_videos(own / "video")
-    made = Fit(simulation, videos, plan)
+    made = fit_of(SPEED)
     evidence = made.evidence("tracks")
-    place = torch.tensor([plan.unknowns[0].share(5.0)], dtype=torch.float64)
+    place = torch.tensor([made.plan.unknowns[0].share(5.0)], dtype=torch.float64)
     for _ in range(3):
         place = torch.tensor(made.solved(place.tolist(), evidence, made.fitted), dtype=torch.float64)
 
@@ -135,17 +122,14 @@ def test_the_error_of_the_grid_is_in_the_standard_errors(own, simulation):
         return float(made._at_the_end(place, evidence)[1])
 
     assert model(simulation) ** 0.5 < 5e-3
-    settings = base(material={"E": 1e4, "nu": 0.3, "density": 27.0, "thickness": 0.01})
-    (own / "denser.yaml").write_text(yaml.safe_dump(settings))
-    denser = Simulation.from_yaml(own / "denser.yaml", device="cpu")
+    denser = changed(own, material={"density": 27.0})
     share = math.log((27 / 25) ** 0.5) / math.log(6)  # the pressure of a faster wind for the mass
     assert model(denser) ** 0.5 == pytest.approx(math.sqrt(len(GRIDS)) * share, rel=0.6)
 
 
-def test_a_fit_that_cannot_follow_has_failed(own, tmp_path):
+def test_a_fit_that_cannot_follow_has_failed(fitted, tmp_path):
     """The wind is sought on the wrong side only; the pictures alone would hardly tell."""
-    sought = {"wind.azimuth": [-100.0, -60.0], "material.E": [2e3, 5e4]}
-    result = fit(own / "base.yaml", own / "video", sought, tmp_path / "fit", device="cpu", search=8, progress=False)
+    result = fitted({"wind.azimuth": [-100.0, -60.0], "material.E": [2e3, 5e4]}, search=8)
     assert result.verdict == "failed"
     assert max(result.followed.values()) < 0.5
     data = json.loads((tmp_path / "fit/result.json").read_text())
@@ -155,18 +139,13 @@ def test_a_fit_that_cannot_follow_has_failed(own, tmp_path):
 
 
 @pytest.mark.slow
-def test_stopped_and_continued(own, tmp_path):
+def test_stopped_and_continued(fit_of, tmp_path):
     """A fit that is stopped after some iterations and continued ends where an undisturbed one does, bit for bit."""
-    sought = [read_unknown(name, SOUGHT[name]) for name in ("wind.speed", "wind.azimuth")]
-    plan = Plan([str(own / "base.yaml")], [str(own / "video")], sought, search=8, iterations=2, tracks=40)
-    simulation = Simulation.from_yaml(own / "base.yaml", device="cpu")
-    settings = base()
-    settings["solver"]["dx"] *= 1.25
-    (tmp_path / "coarser.yaml").write_text(yaml.safe_dump(settings))
-    coarser = Simulation.from_yaml(tmp_path / "coarser.yaml", device="cpu")
+    coarser = changed(tmp_path, solver={"dx": 0.125})
 
     def made():
-        return Fit(simulation, read_videos(own / "video"), plan, on_grid=lambda ratio: coarser)
+        further = {"on_grid": lambda ratio: coarser}
+        return fit_of(SPEED | AZIMUTH, search=8, iterations=2, tracks=40, further=further)
 
     whole = made().run(Course(), lambda course: None)
 
@@ -192,36 +171,31 @@ def test_stopped_and_continued(own, tmp_path):
     assert [row["cost"] for row in result.history] == [row["cost"] for row in whole.history]
 
 
-def test_resume_needs_the_same_plan(own, tmp_path):
-    sought = [read_unknown("wind.speed", SOUGHT["wind.speed"])]
-    given = {"stages": ["tracks"], "search": 0, "iterations": 1}
-    plan = Plan([str(own / "base.yaml")], [str(own / "video")], sought, tracks=40, **given)
+def test_resume_needs_the_same_plan(plan_of, tmp_path):
+    plan = plan_of(SPEED, tracks=40, stages=["tracks"], search=0, iterations=1)
     with pytest.raises(ValueError, match="nothing to resume"):
         run_fit(plan, tmp_path / "fit", resume=True, device="cpu", progress=False)
     first = run_fit(plan, tmp_path / "fit", device="cpu", progress=False)
     again = run_fit(plan, tmp_path / "fit", resume=True, device="cpu", progress=False)
     assert again.place == first.place
-    other = Plan([str(own / "base.yaml")], [str(own / "video")], sought, tracks=50, **given)
     with pytest.raises(ValueError, match="another `tracks`"):
-        run_fit(other, tmp_path / "fit", resume=True, device="cpu", progress=False)
+        run_fit(replace(plan, tracks=50), tmp_path / "fit", resume=True, device="cpu", progress=False)
 
 
-def test_an_earlier_fit_beside_what_is_needed_is_not_moved(own, tmp_path):
+def test_an_earlier_fit_beside_what_is_needed_is_not_moved(own, plan_of, tmp_path):
     """Or the base would be gone, and the third time there is none."""
     shutil.copy(own / "base.yaml", tmp_path / "base.yaml")
-    sought = [read_unknown("wind.speed", SOUGHT["wind.speed"])]
-    plan = Plan([str(tmp_path / "base.yaml")], [str(own / "video")], sought, search=0, iterations=1, tracks=40)
+    other = plan_of(SPEED, search=0, iterations=1, tracks=40)
+    plan = replace(other, base=[str(tmp_path / "base.yaml")])
     run_fit(plan, tmp_path, device="cpu", progress=False)
     with pytest.raises(ValueError, match=r"base\.yaml is in it and is needed now: choose another with --output"):
         run_fit(plan, tmp_path, device="cpu", progress=False)
     assert (tmp_path / "base.yaml").exists()
-    other = replace(plan, base=[str(own / "base.yaml")])
     with pytest.raises(ValueError, match=r"base\.yaml is in it"):
         run_fit(other, tmp_path, device="cpu", progress=False, in_use=[tmp_path / "base.yaml"])
 
 
-def test_another_grid_that_the_scene_refuses_is_left_out_and_said(own, simulation):
-    plan = Plan([str(own / "base.yaml")], [str(own / "video")], [read_unknown("wind.speed", [2.0, 12.0])])
+def test_another_grid_that_the_scene_refuses_is_left_out_and_said(simulation, fit_of):
     said, asked = [], []
 
     def on_grid(ratio):
@@ -230,7 +204,7 @@ def test_another_grid_that_the_scene_refuses_is_left_out_and_said(own, simulatio
             raise ValueError("`solver.dx` is too small.")
         return simulation
 
-    made = Fit(simulation, read_videos(own / "video"), plan, said.append, on_grid=on_grid)
+    made = fit_of(SPEED, further={"say": said.append, "on_grid": on_grid})
     assert made._grids() == made._grids() == [simulation]
     assert asked == list(GRIDS)
     (line,) = said
@@ -239,27 +213,23 @@ def test_another_grid_that_the_scene_refuses_is_left_out_and_said(own, simulatio
     )
 
 
-def test_cameras_begin_together(own, simulation):
+def test_cameras_begin_together(own, fit_of):
     """Unless nothing moves until then."""
     left, right = read_videos(own / "video")
-    cut = {name: getattr(right, name)[5:] for name in ("times", "cameras", "images", "masks")}
-    sought = [read_unknown("wind.speed", [2.0, 12.0])]
-    plan = Plan([str(own / "base.yaml")], [str(own / "video")], sought)
+    cut = replace(right, **{name: getattr(right, name)[5:] for name in ("times", "cameras", "images", "masks")})
     with pytest.raises(ValueError, match=r"camera right begin at 0\.208 s.*cut all videos to the same beginning"):
-        Fit(simulation, [left, replace(right, **cut)], plan)
-    later = read_unknown("film.start", [0.25, 0.5])
-    assert Fit(simulation, [left, replace(right, **cut)], replace(plan, unknowns=[*sought, later])).videos
+        fit_of(SPEED, videos=[left, cut])
+    assert fit_of(SPEED | {"film.start": [0.25, 0.5]}, videos=[left, cut]).videos
     shift = tuple(time + 0.03 for time in right.times)  # by less than a frame
-    assert Fit(simulation, [left, replace(right, times=shift)], plan).videos
+    assert fit_of(SPEED, videos=[left, replace(right, times=shift)]).videos
 
 
-def test_what_cannot_be_told_apart_is_refused(own, tmp_path):
+def test_what_cannot_be_told_apart_is_refused(fitted, tmp_path):
     """A membrane has E times thickness and density times thickness, and nothing that tells the three."""
     sought = {"material.E": [2e3, 5e4], "material.density": [5, 100], "material.thickness": [0.002, 0.05]}
-    options = {"device": "cpu", "search": 0, "progress": False}
-    options["limit"] = 100.0  # the weakest direction is noise, a two hundredth of the strongest or less
+    limit = 100.0  # the weakest direction is noise, a two hundredth of the strongest or less
     with pytest.raises(ValueError, match="cannot tell") as error:
-        fit(own / "base.yaml", own / "video", sought, tmp_path / "fit", **options)
+        fitted(sought, search=0, limit=limit)
     for name in sought:
         assert f"`{name}`" in str(error.value)
     assert [path.name for path in (tmp_path / "fit").iterdir()] == ["before"]  # pictures, which may tell why

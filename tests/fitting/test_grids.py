@@ -4,15 +4,13 @@ import math
 
 import pytest
 import torch
-import yaml
-from small_films import base
+from small_films import changed
 
 from gaussian_swaying.fitting.evidence import PictureEvidence, TrackEvidence, compare
 from gaussian_swaying.fitting.grids import distrust, trusted
 from gaussian_swaying.fitting.held_out import NOISE
 from gaussian_swaying.fitting.tracks import track
 from gaussian_swaying.fitting.videos import read_videos
-from gaussian_swaying.simulation.simulation import Simulation
 
 pytest.importorskip("cv2", reason="needs the extra [fit]")
 
@@ -25,10 +23,7 @@ def left(own, simulation):
 
 def test_points_count_by_how_far_another_grid_moves_them(own, simulation, left):
     """By 1 / sqrt(1 + d^2 / n^2), with the distance d in each coordinate; at rest they count as before."""
-    settings = base()
-    settings["solver"]["dx"] = 0.08
-    (own / "finer.yaml").write_text(yaml.safe_dump(settings))
-    finer = Simulation.from_yaml(own / "finer.yaml", device="cpu")
+    finer = changed(own, solver={"dx": 0.08})
     times, pictures = left.video.times[:7], PictureEvidence(left.video, masks=False)
     (part, same) = trusted(simulation, [finer], [left, pictures], {}, times)
     assert same is pictures

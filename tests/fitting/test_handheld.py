@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 import torch
 from bench.problems.films import shaken
-from handheld_films import TRUTH, drift, off, tripod, write_base, write_film
+from handheld_films import drift, off, tripod, write_base, write_film
+from small_films import TRUTH
 
 from gaussian_swaying.fitting import registration
 from gaussian_swaying.fitting.background import Background
@@ -34,9 +35,9 @@ def folder(tmp_path_factory):
     simulation = Simulation.from_yaml(folder / "base.yaml", device="cpu")
     still = tripod(WIDTH, HEIGHT)
     hand = shaken(still, FRAMES, 1.0)
-    write_film(simulation, folder / "tripod", [still] * FRAMES, crf=23)
-    write_film(simulation, folder / "hand", hand, crf=23)
-    write_film(simulation, folder / "drift", hand, drift(FRAMES), crf=23)
+    write_film(simulation, folder / "tripod", [still] * FRAMES)
+    write_film(simulation, folder / "hand", hand)
+    write_film(simulation, folder / "drift", hand, drift(FRAMES))
     return folder
 
 
@@ -45,8 +46,8 @@ def walls(tmp_path_factory):
     """A film of the walls themselves, and one of what the splat shows."""
     folder = tmp_path_factory.mktemp("walls")
     simulation = Simulation.from_yaml(write_base(folder), device="cpu")
-    write_film(simulation, folder / "real", shaken(tripod(WIDTH, HEIGHT), 6, 1.0), crf=23, real=True)
-    write_film(simulation, folder / "drawn", shaken(tripod(WIDTH, HEIGHT), 6, 1.0), crf=23)
+    write_film(simulation, folder / "real", shaken(tripod(WIDTH, HEIGHT), 6, 1.0), real=True)
+    write_film(simulation, folder / "drawn", shaken(tripod(WIDTH, HEIGHT), 6, 1.0))
     return folder, simulation
 
 
@@ -177,7 +178,7 @@ def test_a_still_object_is_still_in_a_film_from_a_hand(folder, simulation):
     painter, rest = simulation.painter, simulation.scene.rest()
     for k, camera in enumerate(true):
         camera = camera.to(dtype=torch.float32)
-        colour = painter.draw(rest, painter.colors(rest, camera), camera).color.detach()
+        colour = painter.picture(rest, camera).color.detach()
         video.images[k] = (255 * colour.clamp(0, 1)).round().to(torch.uint8)
     steadied = replace(video, cameras=follow_camera(video, Background(simulation)).cameras)
     assert still_until(simulation, video, track(simulation, video)) < 3 / 30

@@ -97,14 +97,14 @@ def test_sensitivities_are_exact_to_second_order_and_stay_in_the_range():
     assert sensitivities(squares, torch.tensor([0.0, 1.0], dtype=torch.float64))[1].min() > 0
 
 
-def test_the_lowest_place_of_a_narrow_valley_is_found():
+def valley(places):
     """Along the valley y = 0.9 x**2 the residuals change by a thirtieth of what they change across it."""
+    x, y = places.T
+    values = torch.stack([x - 0.7, 30 * (y - 0.9 * x.square())], -1)[:, :, None]
+    return [Block("tracks", values, torch.arange(2))]
 
-    def valley(places):
-        x, y = places.T
-        values = torch.stack([x - 0.7, 30 * (y - 0.9 * x.square())], -1)[:, :, None]
-        return [Block("tracks", values, torch.arange(2))]
 
+def test_the_lowest_place_of_a_narrow_valley_is_found():
     progress = Progress(torch.tensor([0.3, 0.081], dtype=torch.float64))
     while not progress.done and progress.iteration < 60:
         iterate(valley, lambda blocks: {"tracks": 0.1}, progress, 1e-5)

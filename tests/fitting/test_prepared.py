@@ -22,8 +22,8 @@ def folder(tmp_path_factory):
     write_base(folder, wall=0.04)
     simulation = Simulation.from_yaml(folder / "base.yaml", device="cpu")
     still = tripod(200, 120)
-    write_film(simulation, folder / "tripod", [still] * FRAMES, drift(FRAMES), crf=18)
-    write_film(simulation, folder / "hand", shaken(still, FRAMES, 2.0), crf=18)
+    write_film(simulation, folder / "tripod", [still] * FRAMES, drift(FRAMES))
+    write_film(simulation, folder / "hand", shaken(still, FRAMES, 2.0))
     return folder
 
 

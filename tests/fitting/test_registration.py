@@ -25,7 +25,7 @@ def draw():
 
     def picture(camera):
         with torch.no_grad():
-            return painter.draw(gaussians, painter.colors(gaussians, camera), camera)
+            return painter.picture(gaussians, camera)
 
     return picture
 

@@ -7,10 +7,8 @@ import pytest
 import torch
 from small_films import TRUTH
 
-from gaussian_swaying.fitting.fit import Fit
-from gaussian_swaying.fitting.plan import Plan, read_unknown
+from gaussian_swaying.fitting.plan import read_unknown
 from gaussian_swaying.fitting.rivals import SCANNED, SHAKEN, apart_by, bent_alike, mirrored, rivals_of
-from gaussian_swaying.fitting.videos import read_videos
 from gaussian_swaying.simulation.parameters import flow_of
 
 pytest.importorskip("cv2", reason="needs the extra [fit]")
@@ -65,22 +63,19 @@ def test_rivals_lie_within_the_ranges(simulation):
     assert around[0].value(again[0]) == pytest.approx(210.0, abs=3.0)
 
 
-def test_a_fit_tries_them_at_its_end(own, simulation):
+def test_a_fit_tries_them_at_its_end(simulation, fit_of):
     """The mirror image fits better, so the fit goes on there."""
-    sought = [read_unknown("wind.azimuth", [0.0, 180.0])]
-    plan = Plan([str(own / "base.yaml")], [str(own / "video")], sought)
-    made = Fit(simulation, read_videos(own / "video"), plan)
+    made = fit_of({"wind.azimuth": [0.0, 180.0]})
     made._brief = lambda places, evidence, times: (places[::-1], [1.0, 2.0])
     others, better = made._others([0.3], [])
-    assert better == rivals_of(simulation.setup, sought, [0.3])[0]
+    assert better == rivals_of(simulation.setup, made.plan.unknowns, [0.3])[0]
     assert made.values(better)["wind.azimuth"] == pytest.approx(180 - 54, abs=3.0)
     assert others == [made.values(better)]
 
 
-def test_the_mirrored_wind_is_a_rival_for_longer(own, simulation):
+def test_the_mirrored_wind_is_a_rival_for_longer(fit_of):
     """It differs by less than a model's errors."""
-    sought = [read_unknown("wind.azimuth", [0.0, 180.0])]
-    made = Fit(simulation, read_videos(own / "video"), Plan([str(own / "base.yaml")], [str(own / "video")], sought))
+    made = fit_of({"wind.azimuth": [0.0, 180.0]})
     for end, cost, told in ((0.7, 1.2, True), (0.65, 1.2, True), (0.7, 1.3, False), (0.95, 1.2, False)):
         made._brief = lambda places, evidence, times, end=end, cost=cost: ([places[0], [end]], [1.0, cost])
         others, better = made._others([0.3], [])
@@ -99,14 +94,12 @@ def test_other_stiffnesses_bend_as_far():
     assert bent_alike(sought[:1], start[:1]) == bent_alike(sought[1:], start[1:]) == []
 
 
-def test_the_search_finds_the_stiffness_although_its_start_is_three_times_off(own, simulation):
+def test_the_search_finds_the_stiffness_although_its_start_is_three_times_off(fit_of):
     """The start stays the first, and is not the best."""
-    sought = [
-        read_unknown("wind.speed", {"range": [1.0, 20.0], "start": 15.0}),
-        read_unknown("material.E", {"range": [1e3, 1e5], "start": 3e4}),
-    ]
-    plan = Plan([str(own / "base.yaml")], [str(own / "video")], sought, search=16, starts=2)
-    made = Fit(simulation, read_videos(own / "video"), plan)
+    sought = {
+        "wind.speed": {"range": [1.0, 20.0], "start": 15.0}, "material.E": {"range": [1e3, 1e5], "start": 3e4}
+    }  # fmt: skip
+    made = fit_of(sought, search=16, starts=2)
     begin, best = (made.values(place) for place in made.search())
     assert begin == pytest.approx({"wind.speed": 15.0, "material.E": 3e4})
     assert best["material.E"] == pytest.approx(TRUTH["material.E"], rel=0.6)

@@ -19,25 +19,19 @@ from gaussian_swaying.fitting.least_squares import (
     step_from,
     unsettled,
 )
-from gaussian_swaying.fitting.plan import Plan, read_unknown
 from gaussian_swaying.fitting.report import Result, Shown
 from gaussian_swaying.fitting.unknowns import Unknown
+
+from .test_least_squares import valley
 
 UNKNOWNS = [Unknown("wind.speed", 1.0, 10.0, "log"), Unknown("material.E", 1e3, 1e5, "log")]
 SCALES = {"tracks": 0.1}
 
 
-def _valley(places):
-    """Residuals that change thirty times less along the valley y = 0.9 x**2 than across it."""
-    x, y = places.T
-    values = torch.stack([x - 0.7, 30 * (y - 0.9 * x.square())], -1)[:, :, None]
-    return [Block("tracks", values, torch.arange(2))]
-
-
 def _fitted(iterations):
     progress = Progress(torch.tensor([0.3, 0.081], dtype=torch.float64))
     while not progress.done and progress.iteration < iterations:
-        iterate(_valley, lambda blocks: SCALES, progress, 1e-5)
+        iterate(valley, lambda blocks: SCALES, progress, 1e-5)
     return progress
 
 
@@ -162,23 +156,18 @@ def test_the_verdict_of_a_fit(changes, verdict, words):
 
 
 @pytest.mark.slow
-def test_a_whole_fit_tells_it_and_goes_on(own, tmp_path):
+def test_a_whole_fit_tells_it_and_goes_on(plan_of, tmp_path):
     """One iteration is not enough; the same fit with more of them continues where it stood, and settles."""
     pytest.importorskip("cv2", reason="needs the extra [fit]")
-    sought = [
-        read_unknown("wind.speed", {"range": [2.0, 12.0], "start": 11.0}),
-        read_unknown("material.E", {"range": [2e3, 5e4], "start": 4e4}),
-    ]
-
-    def plan(iterations):
-        base, videos = [str(own / "base.yaml")], [str(own / "video")]
-        return Plan(base, videos, sought, stages=["tracks"], search=0, iterations=iterations, tracks=40)
-
-    first = run_fit(plan(1), tmp_path / "fit", device="cpu", progress=False)
+    sought = {
+        "wind.speed": {"range": [2.0, 12.0], "start": 11.0}, "material.E": {"range": [2e3, 5e4], "start": 4e4}
+    }  # fmt: skip
+    plan = plan_of(sought, stages=["tracks"], search=0, iterations=1, tracks=40)
+    first = run_fit(plan, tmp_path / "fit", device="cpu", progress=False)
     assert "not settled" in first.unsettled
     assert first.unsettled in first.text()
     assert json.loads((tmp_path / "fit/result.json").read_text())["not_settled"] == first.unsettled
-    again = run_fit(plan(8), tmp_path / "fit", resume=True, device="cpu", progress=False)
+    again = run_fit(replace(plan, iterations=8), tmp_path / "fit", resume=True, device="cpu", progress=False)
     assert again.history[: len(first.history)] == first.history
     assert len(again.history) > len(first.history)
     assert again.unsettled == ""

@@ -9,16 +9,16 @@ import torch
 from small_films import TRUTH
 
 from gaussian_swaying.fitting.evidence import TrackEvidence, compare, compare_starts
-from gaussian_swaying.fitting.fit import Course, Fit, fit
-from gaussian_swaying.fitting.plan import Plan
+from gaussian_swaying.fitting.fit import Course, Fit
 from gaussian_swaying.fitting.tracks import track
-from gaussian_swaying.fitting.unknowns import FILM_START, Unknown
+from gaussian_swaying.fitting.unknowns import FILM_START
 from gaussian_swaying.fitting.variants import states_of
 from gaussian_swaying.fitting.videos import read_videos
 
 pytest.importorskip("cv2", reason="needs the extra [fit]")
 
 STILL, CUT = 4, 3  # frames
+SPEED, AZIMUTH = {"wind.speed": [2.0, 12.0]}, {"wind.azimuth": [-60.0, 150.0]}
 
 
 @pytest.fixture
@@ -54,10 +54,8 @@ def cut(own, tmp_path):
     return tmp_path / "cut"
 
 
-def test_the_start_of_the_motion_is_found(own, late, tmp_path):
-    sought = {"wind.speed": [2.0, 12.0], "material.E": [2e3, 5e4], FILM_START: [0.0, 0.4]}
-    options = {"device": "cpu", "search": 16, "progress": False}
-    result = fit(own / "base.yaml", late, sought, tmp_path / "fit", **options)
+def test_the_start_of_the_motion_is_found(late, fitted, tmp_path):
+    result = fitted(SPEED | {"material.E": [2e3, 5e4], FILM_START: [0.0, 0.4]}, late, search=16)
     assert result.values[FILM_START] == pytest.approx(STILL / 24, abs=0.004)
     assert result.values["wind.speed"] == pytest.approx(TRUTH["wind.speed"], rel=0.02)
     assert result.values["material.E"] == pytest.approx(TRUTH["material.E"], rel=0.02)
@@ -65,15 +63,12 @@ def test_the_start_of_the_motion_is_found(own, late, tmp_path):
     assert FILM_START in (tmp_path / "fit/scene.yaml").read_text()
 
 
-def test_a_start_that_is_missing_is_said(own, late, simulation):
+def test_a_start_that_is_missing_is_said(late, fit_of):
     """And only there: the video that starts at once has no such note."""
-    plan = Plan([str(own / "base.yaml")], [str(late)], [Unknown("wind.speed", 2.0, 12.0)])
-    (note,) = Fit(simulation, read_videos(late), plan).notes()
+    (note,) = fit_of(SPEED, late).notes()
     assert note.startswith("Nothing moves in the first 0.17 s of the film")
     assert "film.start: {range: [0, 0.4]}" in note
-    assert Fit(simulation, read_videos(own / "video"), plan).notes() == []
-    known = Plan(plan.base, plan.videos, [*plan.unknowns, Unknown(FILM_START, 0.0, 0.4)])
-    assert Fit(simulation, read_videos(late), known).notes() == []
+    assert fit_of(SPEED).notes() == fit_of(SPEED | {FILM_START: [0.0, 0.4]}, late).notes() == []
 
 
 def test_variants_that_start_at_other_times(simulation):
@@ -89,26 +84,21 @@ def test_variants_that_start_at_other_times(simulation):
     assert [float(state.time) for state in between] == pytest.approx([0, 0.5 / 24, 1.5 / 24, 2.5 / 24, 3.5 / 24])
 
 
-def test_a_film_that_begins_in_motion(own, cut, tmp_path):
+def test_a_film_that_begins_in_motion(cut, fitted, tmp_path):
     """The wind has blown for some frames; how long is found with the rest, and the note says that it is needed."""
-    sought = {"wind.speed": [2.0, 12.0], "material.E": [2e3, 5e4], FILM_START: [-0.4, 0.2]}
-    options = {"device": "cpu", "search": 16, "progress": False}
-    result = fit(own / "base.yaml", cut, sought, tmp_path / "fit", fit_share=0.8, **options)
+    result = fitted(SPEED | {"material.E": [2e3, 5e4], FILM_START: [-0.4, 0.2]}, cut, search=16, fit_share=0.8)
     assert result.values[FILM_START] == pytest.approx(-CUT / 24, abs=0.004)
     assert result.values["wind.speed"] == pytest.approx(TRUTH["wind.speed"], rel=0.02)
     assert result.values["material.E"] == pytest.approx(TRUTH["material.E"], rel=0.03)
     assert json.loads((tmp_path / "fit/fit.json").read_text())["course"]["first"]
 
 
-def test_rivals_of_a_film_in_motion_are_judged_by_the_points_of_their_own_first_frames(
-    own, cut, simulation, monkeypatch
-):
+def test_rivals_of_a_film_in_motion_are_judged_by_the_points_of_their_own_first_frames(cut, fit_of, monkeypatch):
     """Points that are followed from where a wrong wind has them speak for that wind; a fit goes on with the better."""
-    sought = [Unknown("wind.azimuth", -60.0, 150.0), Unknown(FILM_START, -0.2, 0.0)]
-    plan = Plan([str(own / "base.yaml")], [str(cut)], sought, search=0, iterations=1)
+    made, seen = fit_of(AZIMUTH | {FILM_START: [-0.2, 0.0]}, cut, search=0, iterations=1), []
+    sought = made.plan.unknowns
     wrong = [sought[0].share(90.0), sought[1].share(-CUT / 24)]
     true = [sought[0].share(TRUTH["wind.azimuth"]), wrong[1]]
-    made, seen = Fit(simulation, read_videos(cut), plan), []
     shown = Fit._first_shown
 
     def first_shown(self):
@@ -136,22 +126,20 @@ def test_rivals_of_a_film_in_motion_are_judged_by_the_points_of_their_own_first_
 
 
 @pytest.mark.parametrize("ends", [(-0.2, 0.0), (-0.2, 0.1), (-0.2, -0.05)])
-def test_the_place_that_a_film_in_motion_begins_from(own, cut, simulation, ends):
+def test_the_place_that_a_film_in_motion_begins_from(cut, fit_of, ends):
     """The wind whose simulation looks most like the first frame, and when it was so; not another wind's, nor rest."""
-    sought = [Unknown("wind.azimuth", -60.0, 150.0), Unknown(FILM_START, *ends)]
-    made = Fit(simulation, read_videos(cut), Plan([str(own / "base.yaml")], [str(cut)], sought))
+    made = fit_of(AZIMUTH | {FILM_START: ends}, cut)
     winds = (110.0, TRUTH["wind.azimuth"], -50.0)
-    places = torch.tensor([[sought[0].share(wind), 0.5] for wind in winds], dtype=torch.float64)
+    places = torch.tensor([[made.plan.unknowns[0].share(wind), 0.5] for wind in winds], dtype=torch.float64)
     azimuth, start = made.values(made.begin_from(places)).values()
     assert azimuth == pytest.approx(TRUTH["wind.azimuth"])
     assert start == pytest.approx(-CUT / 24, abs=0.05)
 
 
-def test_a_changing_wind_in_a_film_in_motion_keeps_the_points(own, cut, simulation, monkeypatch):
+def test_a_changing_wind_in_a_film_in_motion_keeps_the_points(cut, fit_of, monkeypatch):
     """Also of a fit that was continued: its own were not followed yet, and its place has no changes."""
-    sought = [Unknown("wind.speed", 2.0, 12.0), Unknown(FILM_START, -0.2, 0.0)]
-    made = Fit(simulation, read_videos(cut), Plan([str(own / "base.yaml")], [str(cut)], sought))
-    made.first = [0.5, sought[1].share(-CUT / 24)]
+    made = fit_of(SPEED | {FILM_START: [-0.2, 0.0]}, cut)
+    made.first = [0.5, made.plan.unknowns[1].share(-CUT / 24)]
     evidence = made.evidence("tracks")
     made._tracks = None
     monkeypatch.setattr(Fit, "solved", lambda self, place, evidence, times: list(place))
@@ -161,13 +149,11 @@ def test_a_changing_wind_in_a_film_in_motion_keeps_the_points(own, cut, simulati
     assert wider.tracks is made.tracks
 
 
-def test_a_film_in_motion_is_said(own, cut, simulation):
+def test_a_film_in_motion_is_said(cut, fit_of):
     """And nothing once the unknown is there."""
-    plan = Plan([str(own / "base.yaml")], [str(cut)], [Unknown("wind.speed", 2.0, 12.0)])
-    (note,) = Fit(simulation, read_videos(cut), plan).notes()
+    (note,) = fit_of(SPEED, cut).notes()
     assert note.endswith("film.start: {range: [-1, 0]} to `unknowns`, or give a film that begins at rest.")
-    known = Plan(plan.base, plan.videos, [*plan.unknowns, Unknown(FILM_START, -0.4, 0.0)])
-    assert Fit(simulation, read_videos(cut), known).notes() == []
+    assert fit_of(SPEED | {FILM_START: [-0.4, 0.0]}, cut).notes() == []
 
 
 def test_variants_that_started_before_the_film(simulation):

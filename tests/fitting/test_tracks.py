@@ -5,8 +5,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-import yaml
-from small_films import base
+from handheld_films import photographed
+from small_films import changed
 
 from gaussian_swaying.fitting.evidence import TrackEvidence
 from gaussian_swaying.fitting.overlap import drawn_beside, window_of
@@ -16,7 +16,6 @@ from gaussian_swaying.fitting.videos import Footage, read_videos
 from gaussian_swaying.rendering.cameras.camera import look_at_camera, project
 from gaussian_swaying.rendering.protocol import RenderOutput
 from gaussian_swaying.scenes.printed_cloth import printed_colours
-from gaussian_swaying.simulation.simulation import Simulation
 
 cv2 = pytest.importorskip("cv2", reason="needs the extra [fit]")
 
@@ -91,24 +90,13 @@ def test_a_shift_that_is_there_at_rest_is_taken_off_matches(own, simulation):
 def _printed(folder, spacing):
     """Simulation of a printed flag, 0.4 m x 0.3 m."""
     flag = {"width": 0.4, "height": 0.3, "spacing": spacing, "ripple": 0.0, "pattern": "printed", "overlap": 0.5}
-    scene = {"generator": {"class_path": "FlagScene", "init_args": flag}, "metres_per_unit": 1.0}
-    file = folder / f"{spacing}.yaml"
-    file.write_text(yaml.safe_dump(base(scene=scene)))
-    return Simulation.from_yaml(file, device="cpu")
+    return changed(folder, scene={"generator": {"class_path": "FlagScene", "init_args": flag}})
 
 
-def _photographed(camera, finer=3):
-    """A picture of the printed sheet itself, by rays through its plane, uint8, (H, W, 3)."""
-    rows, columns = (torch.arange(n * finer).add(0.5).div(finer).double() for n in (camera.height, camera.width))
-    pixel = torch.cartesian_prod(rows, columns).flip(-1)
-    ray = torch.cat([pixel, torch.ones(len(pixel), 1)], 1) @ camera.intrinsics.double().inverse().T
-    ray = ray @ camera.world_to_camera[:3, :3].double()
-    eye = camera.position.double()
-    x, _, z = (eye - ray * (eye[1] / ray[:, 1:2])).unbind(-1)
-    on = (x > 0) & (x < 0.4) & (z > 0) & (z < 0.3)
-    colour = torch.where(on[:, None], printed_colours(x, z).double(), 0.0)
-    fine = colour.reshape(camera.height, finer, camera.width, finer, 3)
-    return (255 * fine.mean((1, 3))).round().to(torch.uint8)
+def _photographed(camera):
+    """A picture of the printed sheet itself, uint8, (H, W, 3)."""
+    sheet = (0.4, 0.3, 0.0, (0.0, 0.0, 0.0))
+    return (255 * photographed(camera, [sheet], 3, printed_colours)).round().to(torch.uint8)
 
 
 @pytest.mark.slow(gate=["False"])
@@ -121,7 +109,7 @@ def test_matches_are_not_shifted_where_the_print_of_a_splat_is(real, tmp_path):
     simulation = _printed(tmp_path, 0.01)
     painter, gaussians = simulation.painter, simulation.scene.rest()
     views = [look_at_camera((0.2 + x, -0.5, 0.35), (0.2, 0.0, 0.15), (0, 0, 1), 45.0, 240, 180) for x in (-0.5, 0.5)]
-    drawn = [painter.draw(gaussians, painter.colors(gaussians, view), view).color.detach() for view in views]
+    drawn = [painter.picture(gaussians, view).color.detach() for view in views]
     own = [(255 * picture.clamp(0, 1)).round().to(torch.uint8) for picture in drawn]
     images = [_photographed(view) for view in views] if real else own
     rest = next(iter(states_of(simulation, [{}], [0.0])))[0]

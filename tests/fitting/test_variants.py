@@ -2,9 +2,8 @@
 
 import pytest
 import torch
-import yaml
 from shared import unit
-from small_films import base
+from small_films import base, changed
 
 from gaussian_swaying.aero.force import AeroForce
 from gaussian_swaying.aero.patches import Patches
@@ -16,7 +15,6 @@ from gaussian_swaying.mpm.solver import MPMSolver
 from gaussian_swaying.mpm.state import MaterialPoints
 from gaussian_swaying.scenes.procedural import FlagScene
 from gaussian_swaying.simulation import stepper
-from gaussian_swaying.simulation.simulation import Simulation
 
 TIMES = [0.0, 1 / 24, 2 / 24, 4 / 24]
 
@@ -29,22 +27,18 @@ def test_each_variant_moves_as_its_own_simulation(simulation, tmp_path):
         {"aero.C_D": 0.4},
         {"solver.damping": 3.0},
     ]
-    own = base(material={"E": 5e3, "nu": 0.3, "density": 40.0, "thickness": 0.01})
-    damped = base()
-    damped["solver"] = damped["solver"] | {"damping": 3.0}
     angle = torch.deg2rad(torch.tensor(10.0))
     changes = [
-        base(),
-        base(wind={"flow": [float(7 * angle.cos()), float(7 * angle.sin()), 0.0]}),
-        own,
-        base(aero={"C_D": 0.4, "C_F": 0.3, "C_L": 0.005}),
-        damped,
+        {},
+        {"wind": {"flow": [float(7 * angle.cos()), float(7 * angle.sin()), 0.0]}},
+        {"material": {"E": 5e3, "density": 40.0}},
+        {"aero": {"C_D": 0.4}},
+        {"solver": {"damping": 3.0}},
     ]
     found = list(states_of(simulation, values, TIMES))
     still = found[0][0].position
     for number, settings in enumerate(changes):
-        (tmp_path / f"{number}.yaml").write_text(yaml.safe_dump(settings))
-        alone = list(states_of(Simulation.from_yaml(tmp_path / f"{number}.yaml", device="cpu"), [{}], TIMES))
+        alone = list(states_of(changed(tmp_path, **settings), [{}], TIMES))
         moved = (alone[-1][0].position - still).norm(dim=-1).max()
         off = (found[-1][number].position - alone[-1][0].position).norm(dim=-1).max()
         assert moved > 0.05
@@ -55,18 +49,14 @@ def test_each_variant_moves_as_its_own_simulation(simulation, tmp_path):
 @pytest.mark.parametrize("formulation", ["total", "updated"])
 def test_variants_of_a_scene_with_parts(formulation, tmp_path):
     """A pole that is held, cloth, and a rigid board at its end, as a batch and each on its own."""
-    scene = base()["scene"]
-    x = FlagScene(**scene["generator"]["init_args"]).generate().means[:, 0].contiguous()
+    x = FlagScene(**base()["scene"]["generator"]["init_args"]).generate().means[:, 0].contiguous()
     labels = torch.bucketize(x, torch.tensor([0.06, 0.25]))
     roles = [Part("pole", "held"), Part("cloth"), Part("board", "rigid", density=60.0)]
     path = Parts(labels, roles).save(tmp_path / "parts.npz")
 
     def made(E):
-        material = base()["material"] | {"E": E}
-        solver = {"dx": 0.1, "formulation": formulation}
-        settings = base(scene=scene | {"parts": str(path)}, material=material, solver=solver)
-        (tmp_path / "base.yaml").write_text(yaml.safe_dump(settings))
-        return Simulation.from_yaml(tmp_path / "base.yaml", device="cpu")
+        solver = {"boundaries": [], "formulation": formulation}
+        return changed(tmp_path, scene={"parts": str(path)}, material={"E": E}, solver=solver)
 
     values = [{}, {"material.E": 3e3}]
     found = list(states_of(made(1e4), values, TIMES))
@@ -84,10 +74,8 @@ def test_variants_of_a_scene_with_parts(formulation, tmp_path):
 
 def test_what_leaves_the_grid_of_updated_gets_a_larger_one(tmp_path, monkeypatch):
     """A free flag in a storm; its first grid knows nothing of the wind, and stopped it without a word."""
-    material = {"E": 1e5, "nu": 0.3, "density": 25.0, "thickness": 0.01}
-    settings = base(material=material, wind={"flow": [40.0, 0.0, 0.0]}, solver={"dx": 0.1, "formulation": "updated"})
-    (tmp_path / "base.yaml").write_text(yaml.safe_dump(settings))
-    simulation = Simulation.from_yaml(tmp_path / "base.yaml", device="cpu")
+    solver = {"boundaries": [], "formulation": "updated"}
+    simulation = changed(tmp_path, material={"E": 1e5}, wind={"flow": [40.0, 0.0, 0.0]}, solver=solver)
     times = [0.0, 0.05]
     (first,), (last,) = states_of(simulation, [{}], times)
     assert not bool(last.lost.any())

@@ -29,7 +29,7 @@ def write_video(
         for name, camera in cameras.items():
             gaussians = painter.deformed(frame.state)
             own = camera.to(painter.device)
-            picture = painter.draw(gaussians, painter.colors(gaussians, own), own)
+            picture = painter.picture(gaussians, own)
             colour = picture.color.cpu() * 255
             colour = colour + noise * torch.randn(colour.shape, generator=generator)
             stem = f"{name}_{frame.index:04d}"
