@@ -66,13 +66,12 @@ def export_live_web(arguments: Sequence[str]) -> None:
         if options.target is None:
             simulation = Simulation.from_settings(parser, settings)
         else:
-            found = fitted(parser, settings, options.target)
-            simulation = found.simulation
-            print(found.sentence)
-    written = write_live_web(simulation, made if splat is None else Path(splat).stem, target)
-    if written.notes:
-        print("\n".join(f"note: {note.replace('the film', 'the page')}" for note in written.notes))
-    print(f"{written.gaussians:,} Gaussians, {written.points:,} material points")
+            simulation, sentence = fitted(parser, settings, options.target)
+            print(sentence)
+    film = write_live_web(simulation, made if splat is None else Path(splat).stem, target)
+    for note in film.notes:
+        print(f"note: {note.replace('the film', 'the page')}")
+    print(f"{film.head['count']:,} Gaussians, {simulation.setup.points.count:,} material points")
     if options.element:
         write_element(target.parent)
         print(f"wrote {target.with_name(ELEMENT)}")

@@ -247,8 +247,10 @@ class Painter(nn.Module):
             frame: Frame number.
             name: Which of ``cameras``; empty for ``camera``.
         """
-        camera = self.camera_at(frame, name)
-        gaussians = self.deformed(state)
+        return self.picture(self.deformed(state), self.camera_at(frame, name))
+
+    def picture(self, gaussians: DeformedGaussians, camera: Camera) -> RenderOutput:
+        """The picture of Gaussians in scene units with their own colours, from a camera on their device."""
         return self.draw(gaussians, self.colors(gaussians, camera), camera)
 
     def draw_normals(

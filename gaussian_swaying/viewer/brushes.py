@@ -12,7 +12,6 @@ from typing import Any
 import torch
 
 BRUSH = "/brush"  # path
-LARGEST = 16 << 10  # bytes of a message
 
 
 @dataclass(frozen=True)
@@ -80,7 +79,6 @@ class Brushes:
         """Listen to a browser until it is gone."""
         from websockets.exceptions import ConnectionClosed
 
-        connection.protocol.max_message_size = LARGEST
         self.forget(key)
         self._open[key] = connection, asyncio.get_running_loop()
         try:

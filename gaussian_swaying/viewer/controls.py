@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -202,7 +202,7 @@ class Controls(Panel):
             (self.stiffness_log, (log_place(stiffness),)),
             (self.damping, min(float(settings.solver.damping), 10.0)),
             (self.gravity, min(max(-float(settings.solver.gravity[2]), 0.0), 20.0)),
-            (self.grid, nearest_grid(self._grids, float(settings.solver.dx))),
+            (self.grid, min(self._grids, key=lambda name: abs(self._grids[name] - float(settings.solver.dx)))),
             (self.light, self._light_azimuth()),
             (self.shading, self.session.simulation.painter.shader is not None),
         ]
@@ -388,11 +388,6 @@ class Page(Screen):
 def log_place(stiffness: float) -> float:
     """Return the slider's value for a stiffness [Pa]: its logarithm to base 10, within the range."""
     return round(min(max(math.log10(stiffness), float(LEAST_LOG)), float(MOST_LOG)), 2)
-
-
-def nearest_grid(grids: Mapping[str, float], dx: float) -> str:
-    """The name of the grid whose spacing is nearest to ``dx`` [m]."""
-    return min(grids, key=lambda name: abs(grids[name] - dx))
 
 
 CORNERS = [[i, j, k] for i in (0, 1) for j in (0, 1) for k in (0, 1)]

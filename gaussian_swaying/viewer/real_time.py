@@ -83,7 +83,7 @@ def finest_in_real_time(
         return first, first
     tried = [first]
     for _ in range(TRIALS):
-        dx = predicted_spacing(tried, first, wish / MARGIN, configured, coarsest)
+        dx = predicted_spacing(tried, wish / MARGIN, configured, coarsest)
         if any(dx == cost.dx or (cost.total_seconds <= wish and abs(dx / cost.dx - 1) < CLOSE) for cost in tried):
             break
         try:

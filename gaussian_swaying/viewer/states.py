@@ -5,9 +5,7 @@ A message is the length of its head (uint32, little-endian), the head in JSON, a
 
 from __future__ import annotations
 
-import json
 from contextlib import AbstractContextManager, nullcontext
-from typing import Any
 
 import torch
 from torch import Tensor
@@ -18,8 +16,8 @@ from gaussian_swaying.rendering.shading import DiffuseShader
 from gaussian_swaying.rendering.tints import by_role
 from gaussian_swaying.simulation.simulated_scene import SimulatedScene
 from gaussian_swaying.simulation.simulation import Simulation
-from gaussian_swaying.viewer.film.page import pack_splats
-from gaussian_swaying.viewer.film.recorded import film_of, look_of
+from gaussian_swaying.viewer.film.page import message, pack_splats
+from gaussian_swaying.viewer.film.recorded import film_without_frames, look_of
 from gaussian_swaying.viewer.session import Snapshot
 
 
@@ -39,11 +37,9 @@ def scene_message(snapshot: Snapshot, turn: Tensor) -> bytes:
         snapshot: A snapshot of the scene; see :func:`drawable`.
         turn: Rotation from the scene to the axes of the browser's camera, shape (3, 3), float64.
     """
-    simulation, state = snapshot.simulation, snapshot.state
+    simulation = snapshot.simulation
     with _turn(simulation):
-        nodes = simulation.scene.follow.nodes(state)
-        assert nodes is not None
-        film = film_of(simulation, getattr(state, "grid"), nodes, torch.zeros(0, len(nodes), 3), "scene")  # noqa: B009
+        film = film_without_frames(simulation, snapshot.state, "scene")
         world = film_from(simulation.scene, turn)
     moving, still = pack_splats(film, moving=True), pack_splats(film, moving=False)
     sizes = {"moving": len(moving), "still": len(still)}
@@ -117,12 +113,6 @@ def state_message(snapshot: Snapshot, ended: bool) -> bytes:
 def _turn(simulation: Simulation) -> AbstractContextManager[None]:
     """On a GPU the turn of the thread that reads it, as another may record a graph; a CPU does not have to wait."""
     return simulation.turn if simulation.device.type == "cuda" else nullcontext()
-
-
-def message(head: dict[str, Any], *blocks: bytes) -> bytes:
-    """A message with its head and its bytes."""
-    text = json.dumps(head).encode()
-    return b"".join([len(text).to_bytes(4, "little"), text, *blocks])
 
 
 OFF = message({"kind": "off"})

@@ -5,7 +5,6 @@ from __future__ import annotations
 import asyncio
 import gzip
 import http
-import math
 import secrets
 import struct
 import threading
@@ -121,15 +120,10 @@ class Line:
             self._first = self._scene = None
             self._put(OFF)
 
-    def take(self, raw: Any) -> bool:
-        """Take an answer of the browser; False if it is none."""
-        if not isinstance(raw, bytes) or len(raw) != ANSWER.size:
-            return False
-        taken, rate = ANSWER.unpack(raw)
-        if not (self._taken < taken <= self._sent and math.isfinite(rate) and 0 <= rate <= 1000):
-            return False
-        self._taken, self._rate = taken, (rate, time.monotonic())
-        return True
+    def take(self, answer: bytes) -> None:
+        """Take an answer of the browser."""
+        self._taken, rate = ANSWER.unpack(answer)
+        self._rate = (rate, time.monotonic())
 
     def close(self) -> None:
         asyncio.run_coroutine_threadsafe(self._connection.close(), self._loop)
@@ -222,15 +216,13 @@ class Streams:
     async def _serve(self, key: str, connection: Any) -> None:
         from websockets.exceptions import ConnectionClosed
 
-        connection.protocol.max_message_size = ANSWER.size
         before = self._lines[key]
         line = self._lines[key] = Line(connection, asyncio.get_running_loop())
         if before is not None:
             before.close()
         try:
-            while key in self._lines and line.take(await connection.recv()):
-                pass
-            await connection.close(1008, "not an answer")
+            while True:
+                line.take(await connection.recv())
         except ConnectionClosed:
             pass
         finally:

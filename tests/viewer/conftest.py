@@ -1,9 +1,9 @@
 """A small flag, and a session of it."""
 
 import threading
-import time
 
 import pytest
+from browsers import listened, until
 
 from gaussian_swaying.simulation.simulation import Simulation
 from gaussian_swaying.viewer.session import Session
@@ -16,17 +16,10 @@ SMALL = [
     "--device=cpu",
 ]
 
-FLAGS = [
-    "--no-sandbox",
-    "--disable-quic",
-    "--no-first-run",
-    "--disable-background-networking",
-    "--disable-component-update",
-    "--disable-sync",
-    "--use-gl=angle",
-    "--use-angle=swiftshader",
-    "--enable-unsafe-swiftshader",
-]
+
+FLAGS = ["--no-sandbox", "--disable-quic", "--no-first-run", "--disable-background-networking"]
+FLAGS += ["--disable-component-update", "--disable-sync"]
+DRAWN = ["--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"]
 
 
 @pytest.fixture(scope="session")
@@ -48,14 +41,6 @@ def session(parser, settings):
     made.close()
 
 
-def until(condition, seconds=60.0):
-    """Wait until a condition holds."""
-    end = time.monotonic() + seconds
-    while not condition():
-        assert time.monotonic() < end, "it did not happen"
-        time.sleep(0.01)
-
-
 def in_turn(session):
     """Wait until the thread of a session has gone around twice: all that it was about to do is done."""
     for _ in range(2):
@@ -73,11 +58,6 @@ def pause(session):
 def pictures_since(page, began):
     """Pictures that the server has drawn for its browsers from a time on; a page remembers its last 120 only."""
     return sum(start > began for times in list(page._drawn.values()) for start in list(times))
-
-
-@pytest.fixture(name="until")
-def _until():
-    return until
 
 
 POSE = {"wxyz": [0.7071, -0.7071, 0, 0], "position": [0.6, -2, 0.4], "look_at": [0.6, 0, 0.4], "fov": 0.8}
@@ -118,7 +98,7 @@ class Client:
 
 
 @pytest.fixture
-def connect(until):
+def connect():
     """Connects to a page, which knows of it then; what is open at the end is closed."""
     opened = []
 
@@ -135,35 +115,90 @@ def connect(until):
 
 
 @pytest.fixture
-def page(parser, settings):
-    """A page with a small flag, and its session, which runs."""
+def join(connect):
+    """Connects to a page: the client, and the key with which its program opens connections of its own."""
+
+    def join(page):
+        known = set(page.streams._lines)
+        client = connect(page)
+        until(lambda: set(page.streams._lines) - known)
+        return client, *(set(page.streams._lines) - known)
+
+    return join
+
+
+@pytest.fixture
+def show(parser, settings):
+    """Shows a session, which is that of a small flag unless it is given, on a page; both are closed at the end."""
     pytest.importorskip("viser", reason="needs the extra [viewer]")
     from gaussian_swaying.viewer.controls import Page
 
-    session = Session(parser, settings)
-    made = Page(port=8400, largest=320).show(session)
-    session.start()
-    yield made
-    made.close()
-    session.close()
+    shown = []
+
+    def show(session=None, page=None, **options):
+        page = page or Page(**{"port": 8400, "largest": 320, **options})
+        shown.append(page.show(session or Session(parser, settings)))
+        page.session.start()
+        return page
+
+    yield show
+    for page in shown:
+        page.close()
+        page.session.close()
+
+
+@pytest.fixture
+def page(show):
+    """A page with a small flag, and its session, which runs."""
+    return show()
 
 
 @pytest.fixture(scope="module")
-def browser(chromium):
+def launch(chromium):
+    """Starts browsers with some flags; they are closed at the end."""
     from playwright.sync_api import sync_playwright
 
     with sync_playwright() as driver:
-        started = driver.chromium.launch(executable_path=chromium, args=FLAGS)
-        yield started
-        started.close()
+        started = []
+
+        def launch(*flags):
+            started.append(driver.chromium.launch(executable_path=chromium, args=[*FLAGS, *flags]))
+            return started[-1]
+
+        yield launch
+        for browser in started:
+            browser.close()
 
 
 @pytest.fixture(scope="module")
-def shading_browser(chromium):
+def browser(launch):
+    return launch(*DRAWN)
+
+
+@pytest.fixture(scope="module")
+def shading_browser(launch):
     """As ``browser``, with WebGPU on an adapter in software where this Chromium has one."""
-    from playwright.sync_api import sync_playwright
+    return launch(*DRAWN, "--enable-unsafe-webgpu")
 
-    with sync_playwright() as driver:
-        started = driver.chromium.launch(executable_path=chromium, args=[*FLAGS, "--enable-unsafe-webgpu"])
-        yield started
-        started.close()
+
+READY = "wind.on && wind.drawing.ready"
+PATIENT = "addEventListener('DOMContentLoaded', () => (wind.patience = 1e9))"
+
+
+@pytest.fixture
+def open_window(browser, page):
+    """Opens a window with the live page, after some scripts."""
+    opened = []
+
+    def open_window(width=1100, height=900, scripts=(PATIENT,)):
+        opened.append(browser.new_context(viewport={"width": width, "height": height}, accept_downloads=True))
+        opened[-1].set_default_timeout(90_000)  # a browser that draws without a GPU is slow on a busy machine
+        window = listened(opened[-1].new_page())
+        for script in scripts:
+            window.add_init_script(script)
+        window.goto(page.url)
+        return window
+
+    yield open_window
+    for context in opened:
+        context.close()

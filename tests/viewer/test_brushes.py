@@ -1,21 +1,19 @@
 """What a browser sends to the live page."""
 
-import json
-import math
 import threading
 
 import pytest
+from browsers import until
 
 pytest.importorskip("viser", reason="needs the extra [viewer]")
 
 from gaussian_swaying.viewer import screen
-from gaussian_swaying.viewer.brushes import brush_move
 from gaussian_swaying.viewer.pictures import draw
 
 from .conftest import pause
 
 
-def test_no_camera_makes_a_picture_larger_than_the_limit(page, connect, until, monkeypatch):
+def test_no_camera_makes_a_picture_larger_than_the_limit(page, connect, monkeypatch):
     sizes = []
     monkeypatch.setattr(screen, "draw", lambda *args: sizes.append((args[1].width, args[1].height)) or draw(*args))
     client = connect(page, 1, 2_000_000)
@@ -48,15 +46,3 @@ def test_what_is_held_is_drawn_between_changes(page):
         solver._bound = bound
     drawing.join()
     assert len(drawn[0]) > 0
-
-
-STROKE = {"kind": "stroke", "first": True, "path": [[3.0, 4.5]], "size": [640, 480.0], "fov": 40.0, "near": 0.01}
-STROKE |= {"matrix": [1, 0, 0, 0, 0, 0, -1, 0, 0, 1, 0, 0, 7, 8, 9, 1]}
-
-
-def test_a_stroke_is_read():
-    move = brush_move(json.dumps(STROKE))
-    assert (move.kind, move.first, move.path, move.size) == ("stroke", True, [[3.0, 4.5]], (640, 480))
-    assert move.fov == pytest.approx(math.radians(40))
-    assert [row[3] for row in move.matrix] == [7, 8, 9, 1]  # the columns come one after another
-    assert brush_move(json.dumps(STROKE | {"kind": "part"})).kind == "part"

@@ -7,9 +7,7 @@ import urllib.request
 import pytest
 
 pytest.importorskip("viser", reason="needs the extra [viewer]")
-from gaussian_swaying.viewer.controls import Page
 from gaussian_swaying.viewer.door import Door, check_address
-from gaussian_swaying.viewer.session import Session
 
 
 def _open(address, **headers):
@@ -22,14 +20,9 @@ def _open(address, **headers):
 
 
 @pytest.fixture
-def open_page(parser, settings):
+def open_page(show):
     """A page that listens for other computers, too."""
-    session = Session(parser, settings)
-    made = Page(host="0.0.0.0", port=8460, largest=320, names=["Wind.Example"]).show(session)
-    session.start()
-    yield made
-    made.close()
-    session.close()
+    return show(host="0.0.0.0", names=["Wind.Example"])
 
 
 def test_other_websites_in_the_same_browser_are_refused(page):

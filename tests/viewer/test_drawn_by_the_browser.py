@@ -1,17 +1,17 @@
 """The live page draws in a real browser, from the states that it gets."""
 
-import io
 import time
 
 import numpy as np
 import pytest
 import torch
+from browsers import picture_of, until
 
 pytest.importorskip("viser", reason="needs the extra [viewer]")
 from gaussian_swaying.viewer.film.page import PAGE
 from gaussian_swaying.viewer.film.recorded import order_of
 
-from .conftest import pause, pictures_since
+from .conftest import PATIENT, READY, pause, pictures_since
 
 
 @pytest.fixture(scope="module")
@@ -24,27 +24,11 @@ def blank(browser):
 
 
 @pytest.fixture
-def open_window(browser, page):
-    """Opens the live page; what it logs is in ``problems``."""
-    opened = []
-
-    def open_window(before="", wait=True):
-        window = browser.new_page(viewport={"width": 640, "height": 480})
-        opened.append(window)
-        window.set_default_timeout(90_000)  # a browser that draws without a GPU is slow on a busy machine
-        window.problems = []
-        window.on("pageerror", lambda error: window.problems.append(str(error)))
-        if before:
-            window.add_init_script(before)
-        window.add_init_script("addEventListener('DOMContentLoaded', () => (wind.patience = 1e9))")
-        window.goto(page.url)
-        if wait:
-            window.wait_for_function("wind.on && wind.drawing.ready")
-        return window
-
-    yield open_window
-    for window in opened:
-        window.close()
+def drawing(open_window):
+    """A window in which the browser draws."""
+    window = open_window(640, 480)
+    window.wait_for_function(READY)
+    return window
 
 
 PLAY = """([arrivals, until, ended]) => {
@@ -168,15 +152,12 @@ def _centres(window):
 
 
 def _picture(window):
-    import imageio.v3 as iio
-
-    clip = {"x": 0, "y": 200, "width": 300, "height": 280}  # beside the controls and below what viser tells
-    return iio.imread(io.BytesIO(window.screenshot(clip=clip)))[..., :3].astype(float)
+    return picture_of(window, x=0, y=200, width=300, height=280)  # beside the controls and below what viser tells
 
 
-def test_the_canvas_shows_the_state_as_the_server_draws_it(page, open_window, until):
+def test_the_canvas_shows_the_state_as_the_server_draws_it(page, drawing):
     """Centres from the GPU, and the picture, of a paused flag, from another side than at first."""
-    session, window = page.session, open_window()
+    session, window = page.session, drawing
     until(lambda: session.snapshot.health.time > 0.2)
     pause(session)
     (client,) = page.server.get_clients().values()
@@ -206,9 +187,9 @@ def test_the_canvas_shows_the_state_as_the_server_draws_it(page, open_window, un
     assert window.problems == []
 
 
-def test_pictures_change_between_states_and_never_show_the_future(page, open_window, until):
+def test_pictures_change_between_states_and_never_show_the_future(page, drawing):
     """The simulation gives few states a second; the time that is shown rises from picture to picture."""
-    session, window = page.session, open_window()
+    session, window = page.session, drawing
     session.pace(0.02)
     until(lambda: session.rates().real_time < 0.05)
     window.evaluate("""() => {
@@ -256,13 +237,14 @@ SMALL_TEXTURES = """
 
 
 @pytest.mark.parametrize("way", ["small textures", "slow"])
-def test_a_browser_that_cannot_draw_gets_pictures(page, open_window, until, way):
+def test_a_browser_that_cannot_draw_gets_pictures(page, open_window, way):
     if way == "slow":
-        window = open_window()
+        window = open_window(640, 480)
+        window.wait_for_function(READY)
         window.evaluate("Object.assign(wind, { slow: 1e9, patience: 0.5 })")
         window.wait_for_function("wind.failed?.startsWith('this browser draws slowly') && !wind.on")
     else:
-        window = open_window(SMALL_TEXTURES, wait=False)
+        window = open_window(640, 480, [SMALL_TEXTURES, PATIENT])
         window.wait_for_function("wind.failed === 'the scene is too large for the textures of this browser'")
     until(lambda: len(page.server.get_clients()) == 1)
     now = time.perf_counter()

@@ -9,6 +9,7 @@ import urllib.request
 import pytest
 import torch
 import yaml
+from browsers import until
 
 from gaussian_swaying.rendering.cameras.camera import project
 from gaussian_swaying.viewer.session import Session
@@ -21,17 +22,10 @@ from .conftest import pause
 
 
 @pytest.fixture
-def window(browser, page):
-    """A browser window with the page, and the errors that it logs."""
-    context = browser.new_context(viewport={"width": 1100, "height": 900}, accept_downloads=True)
-    context.set_default_timeout(90_000)  # a browser that draws without a GPU is slow on a busy machine
-    opened = context.new_page()
-    opened.problems = []
-    opened.on("pageerror", lambda error: opened.problems.append(str(error)))
-    opened.goto(page.url)
-    opened.get_by_text("pictures a second").wait_for(timeout=90_000)
-    yield opened
-    context.close()
+def window(open_window):
+    opened = open_window(scripts=())
+    opened.get_by_text("pictures a second").wait_for()
+    return opened
 
 
 def _seen(window):
@@ -48,13 +42,7 @@ def test_it_listens_on_this_computer_only_and_serves_no_files(page):
     assert page.server.request_share_url() is None  # no tunnel, whoever asks
 
 
-def test_what_is_held_is_shown(page):
-    held = page.controls.holding.places()
-    assert len(held) > 5
-    assert abs(held[:, 0]).max() < 0.03  # the pole
-
-
-def test_closing_ends_all_threads(parser, settings, until):
+def test_closing_ends_all_threads(parser, settings):
     before = set(threading.enumerate())
     session = Session(parser, settings)
     page = Page(port=8450).show(session)
@@ -65,7 +53,7 @@ def test_closing_ends_all_threads(parser, settings, until):
 
 
 @pytest.mark.slow
-def test_a_client_that_reads_nothing_slows_nobody(page, connect, until):
+def test_a_client_that_reads_nothing_slows_nobody(page, connect):
     """Another one gets its pictures; for the first one only the last picture waits, and it goes without a word."""
     page.largest = 1000
     narrow = socket.socket()
@@ -87,7 +75,7 @@ def test_a_client_that_reads_nothing_slows_nobody(page, connect, until):
     assert page.session.problem is None
 
 
-def test_the_page_moves_pauses_and_steps(page, window, until):
+def test_the_page_moves_pauses_and_steps(page, window):
     session = page.session
     first = _seen(window)
     until(lambda: session.snapshot.health.time > 0.2)
@@ -109,7 +97,7 @@ def test_the_page_moves_pauses_and_steps(page, window, until):
 
 
 @pytest.mark.slow
-def test_controls_change_the_wind_and_say_what_is_wrong(page, window, until):
+def test_controls_change_the_wind_and_say_what_is_wrong(page, window):
     session = page.session
     before = session.simulation.wind.flows.clone()
     field = window.get_by_text("Speed [m/s]").locator("xpath=ancestor::*[.//input][1]").locator("input").last
@@ -126,7 +114,7 @@ def test_controls_change_the_wind_and_say_what_is_wrong(page, window, until):
 
 
 @pytest.mark.slow
-def test_a_video_and_the_configuration_come_out(page, window, until, tmp_path):
+def test_a_video_and_the_configuration_come_out(page, window, tmp_path):
     iio = pytest.importorskip("imageio.v3")
     window.get_by_role("button", name="Record a video").click()
     until(lambda: page.recording is not None and page.recording.seconds > 0.3, 240)
@@ -145,7 +133,7 @@ def test_a_video_and_the_configuration_come_out(page, window, until, tmp_path):
 
 
 @pytest.mark.slow
-def test_a_click_takes_hold_of_the_flag(page, window, until):
+def test_a_click_takes_hold_of_the_flag(page, window):
     """Where it is clicked; the handle appears there, and lets go."""
     session, holding = page.session, page.controls.holding
     client = next(iter(page.server.get_clients().values()))
@@ -169,7 +157,7 @@ def test_a_click_takes_hold_of_the_flag(page, window, until):
 
 
 @pytest.mark.slow
-def test_two_browsers_see_the_same_scene_and_closing_one_ends_nothing(page, window, browser, until):
+def test_two_browsers_see_the_same_scene_and_closing_one_ends_nothing(page, window, browser):
     second = browser.new_context(viewport={"width": 500, "height": 700})
     other = second.new_page()
     other.goto(page.url)

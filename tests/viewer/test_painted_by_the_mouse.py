@@ -1,10 +1,9 @@
 """Parts are painted with the mouse in a real browser, saved, and taken by the simulation."""
 
-import io
-
 import numpy as np
 import pytest
 import torch
+from browsers import picture_of, until
 
 from gaussian_swaying.gaussians.parts import ROLES, Parts
 from gaussian_swaying.rendering.cameras.camera import project
@@ -13,31 +12,24 @@ from gaussian_swaying.rendering.tints import TINTS
 pytest.importorskip("viser", reason="needs the extra [viewer]")
 from gaussian_swaying.viewer.pictures import camera_of
 
+from .conftest import READY
+
 CLIP = {"x": 0, "y": 200, "width": 750, "height": 600}  # beside the controls and below what viser tells
 
 
 @pytest.fixture
-def window(browser, page):
-    """A browser window with the page, whose folder for painting is open, and the errors that it logs."""
-    context = browser.new_context(viewport={"width": 1100, "height": 900}, accept_downloads=True)
-    context.set_default_timeout(90_000)  # a browser that draws without a GPU is slow on a busy machine
-    opened = context.new_page()
-    opened.problems = []
-    opened.on("pageerror", lambda error: opened.problems.append(str(error)))
-    opened.add_init_script("addEventListener('DOMContentLoaded', () => (wind.patience = 1e9))")
-    opened.goto(page.url)
-    opened.wait_for_function("wind.on && wind.drawing.ready")
+def window(open_window):
+    """A window whose folder for painting is open."""
+    opened = open_window()
+    opened.wait_for_function(READY)
     opened.get_by_text("Paint parts", exact=True).click()
-    yield opened
-    context.close()
+    return opened
 
 
 def _picture(window):
-    import imageio.v3 as iio
-
     window.wait_for_function("wind.left === 0 && wind.drawing.sorted")
     window.mouse.move(20, 880)  # the ring of the brush follows it
-    return iio.imread(io.BytesIO(window.screenshot(clip=CLIP)))[..., :3].astype(float)
+    return picture_of(window, **CLIP)
 
 
 def _click(window, name):
@@ -46,7 +38,7 @@ def _click(window, name):
     button.dispatch_event("click")
 
 
-def _begin(page, window, until):
+def _begin(page, window):
     """Switch painting on: the object goes back to rest."""
     window.get_by_label("Paint", exact=True).dispatch_event("click")
     window.wait_for_function("wind.brush.on && wind.playback.shown === 0")
@@ -74,13 +66,13 @@ def _stroke(window, a, b):
     window.mouse.up()
 
 
-def test_a_stroke_is_seen_undone_saved_and_applied(page, window, until, tmp_path):
+def test_a_stroke_is_seen_undone_saved_and_applied(page, window, tmp_path):
     """What was painted as held stays exactly where it is in the wind, while the rest moves."""
     session, painting = page.session, page.controls.painting
     until(lambda: session.snapshot.health.time > 0.1)
     page.controls.arrow.value = False  # what viser draws above the object is made again with each simulation
     page.controls.draw_handles()
-    _begin(page, window, until)
+    _begin(page, window)
     plain = _picture(window)
     places = _places(page, window)
     middle = places[np.abs(places - [550, 450]).sum(1).argmin()]

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import torch
 import yaml
+from browsers import until
 
 pytest.importorskip("viser", reason="needs the extra [viewer]")
 from websockets.exceptions import ConnectionClosed
@@ -17,7 +18,6 @@ from gaussian_swaying.rendering.cameras.camera import look_at_camera, project
 from gaussian_swaying.scenes.procedural import FlagScene
 from gaussian_swaying.viewer import painting as painting_module
 from gaussian_swaying.viewer.brushes import brush_move
-from gaussian_swaying.viewer.controls import Page
 from gaussian_swaying.viewer.painting import ALIKE, JOINED, choices
 from gaussian_swaying.viewer.session import Session
 
@@ -37,7 +37,7 @@ class Painter:
     def told(self):
         return json.loads(self.socket.recv(timeout=20))
 
-    def choose(self, control, value, until):
+    def choose(self, control, value):
         """Set a control; a stroke comes by another connection, so that it might be there first."""
         self.client.set(control, value)
         until(lambda: control.value == value)
@@ -56,31 +56,29 @@ def message(turn, *path, camera=CAMERA, **fields):
     return told | {"fov": 40.0, "near": 0.01, "matrix": matrix.T.flatten().tolist()} | fields
 
 
-def _join(page, connect, until):
-    known = set(page.streams._lines)
-    client = connect(page)
-    until(lambda: set(page.streams._lines) - known)
-    painter = Painter(page, *(set(page.streams._lines) - known))
-    assert painter.told() == {"on": False}
-    return client, painter
+def _joined(page, join):
+    client, key = join(page)
+    made = Painter(page, key)
+    made.client = client
+    return made
 
 
 @pytest.fixture
-def painter(page, connect, until):
+def painter(page, join):
     """One whose page paints, and its browser as viser knows it."""
-    made = _painting(page, connect, until)
+    made = _painting(page, join)
     yield made
     made.socket.close()
 
 
-def _painting(page, connect, until):
-    client, made = _join(page, connect, until)
+def _painting(page, join):
+    made = _joined(page, join)
+    assert made.told() == {"on": False}
     motion = page.session.snapshot.motion
-    client.set(page.controls.painting.on, True)
+    made.client.set(page.controls.painting.on, True)
     assert made.told() == {"on": True, "radius": 20.0}
     until(lambda: page.session.paused and page.session.snapshot.motion > motion)  # which begins at rest
     assert page.session.snapshot.health.time == 0
-    made.client = client
     return made
 
 
@@ -98,9 +96,11 @@ def _near(places, place, radius=20.0):
     return np.linalg.norm(places - np.array(place), axis=1) <= radius
 
 
-def test_while_it_is_painted_the_object_is_at_rest_and_then_it_goes_on(page, connect, until):
+def test_while_it_is_painted_the_object_is_at_rest_and_then_it_goes_on(page, join):
     session, painting = page.session, page.controls.painting
-    client, painter = _join(page, connect, until)
+    painter = _joined(page, join)
+    client = painter.client
+    assert painter.told() == {"on": False}
     until(lambda: session.snapshot.health.time > 0.05)
     came, take = [], page.brushes.take
     page.brushes.take = lambda key, move: (take(key, move), came.append(move))
@@ -128,14 +128,14 @@ def test_while_it_is_painted_the_object_is_at_rest_and_then_it_goes_on(page, con
     assert session.problem is None
 
 
-def test_a_stroke_paints_what_is_under_it_and_is_undone_as_a_whole(page, painter, places, until):
+def test_a_stroke_paints_what_is_under_it_and_is_undone_as_a_whole(page, painter, places):
     painting = page.controls.painting
     first, second = _near(places, [150, 140]), _near(places, [230, 170])
     painter.move([150, 140])
     until(lambda: np.array_equal(_labelled(page), first))
     assert first.any()
     version = page._version
-    painter.choose(painting.part, "still", until)
+    painter.choose(painting.part, "still")
     painter.move([230, 165])
     painter.move([230, 165], [230, 170], first=False)
     until(lambda: np.array_equal(_labelled(page, "still"), second | _near(places, [230, 165])))
@@ -165,14 +165,14 @@ def test_the_camera_is_that_of_the_browser(page):
         assert (camera.width, camera.height, camera.near) == (*SIZE, 0.01)
 
 
-def test_a_double_click_takes_what_hangs_together(page, painter, places, until):
+def test_a_double_click_takes_what_hangs_together(page, painter, places):
     """And not what its two clicks painted before; beside the object it takes nothing."""
     painting, count = page.controls.painting, len(places)
-    painter.choose(painting.part, "still", until)
+    painter.choose(painting.part, "still")
     painter.move([150, 140])
     until(lambda: _labelled(page, "still").any())
-    painter.choose(painting.part, "held", until)
-    painter.choose(painting.double, ALIKE, until)
+    painter.choose(painting.part, "held")
+    painter.choose(painting.double, ALIKE)
     colours = page.session.simulation.scene.model.sh0[:, 0]
     nearest = np.linalg.norm(places - [200, 150], axis=1).argmin()
     same = ((colours - colours[nearest]).norm(dim=-1) < 0.1).numpy()
@@ -184,18 +184,19 @@ def test_a_double_click_takes_what_hangs_together(page, painter, places, until):
     assert 0 < same.sum() < count / 2
     assert len(painting._strokes) == 2  # of which the first is left
     assert page._bar.visible is False
-    painter.choose(painting.double, JOINED, until)
+    painter.choose(painting.double, JOINED)
     painter.move([200, 150], kind="part")
     until(lambda: _labelled(page).all())
-    painter.choose(painting.part, "soft", until)
+    painter.choose(painting.part, "soft")
     painter.move([5, 5], kind="part")
     painter.move([200, 150])
     until(lambda: not _labelled(page).all())
     assert np.array_equal(~_labelled(page), _near(places, [200, 150]))
 
 
-def test_two_browsers_paint_strokes_of_their_own(page, painter, connect, places, until):
-    _, other = _join_on(page, connect, until)
+def test_two_browsers_paint_strokes_of_their_own(page, painter, join, places):
+    other = _joined(page, join)
+    assert other.told()["on"]
     for place in ([120, 140], [130, 140]):
         painter.move(place, first=place[0] == 120)
         until(lambda: _labelled(page).any())
@@ -208,7 +209,7 @@ def test_two_browsers_paint_strokes_of_their_own(page, painter, connect, places,
     other.socket.close()
 
 
-def test_it_paints_while_a_video_is_recorded(page, painter, until):
+def test_it_paints_while_a_video_is_recorded(page, painter):
     """The video goes on afterwards."""
     client, painting = painter.client, page.controls.painting
     client.set(page.controls.files.record, True)
@@ -222,25 +223,15 @@ def test_it_paints_while_a_video_is_recorded(page, painter, until):
     assert page.session.problem is None
 
 
-def _join_on(page, connect, until):
-    """Another browser on a page that paints already."""
-    known = set(page.streams._lines)
-    client = connect(page)
-    until(lambda: set(page.streams._lines) - known)
-    made = Painter(page, *(set(page.streams._lines) - known))
-    assert made.told()["on"]
-    return client, made
-
-
-def test_parts_are_applied_with_the_size_that_the_object_has(page, painter, places, until):
+def test_parts_are_applied_with_the_size_that_the_object_has(page, painter, places):
     """What becomes still does not count for `scene.longest_side`; the change is undone as any other."""
     session, painting = page.session, page.controls.painting
     session.change({"scene.longest_side": 2.4, "scene.metres_per_unit": None})
     until(lambda: session.settings.scene.longest_side == 2.4)
     metres = session.simulation.scene.frame.metres_per_unit
     right = places[:, 0] > 240
-    painter.choose(painting.part, "still", until)
-    painter.choose(painting.size, 400, until)
+    painter.choose(painting.part, "still")
+    painter.choose(painting.size, 400)
     painter.move([440, 150])  # which reaches to 240
     until(lambda: _labelled(page, "still").any())
     still = _labelled(page, "still").copy()
@@ -262,7 +253,7 @@ def test_parts_are_applied_with_the_size_that_the_object_has(page, painter, plac
     assert session.problem is None
 
 
-def test_what_cannot_move_is_refused_and_what_was_painted_is_kept(page, painter, until):
+def test_what_cannot_move_is_refused_and_what_was_painted_is_kept(page, painter):
     session, painting = page.session, page.controls.painting
     painter.move([200, 150], kind="part")
     until(lambda: _labelled(page).all())
@@ -275,7 +266,7 @@ def test_what_cannot_move_is_refused_and_what_was_painted_is_kept(page, painter,
     assert not painting.apply.disabled
 
 
-def test_a_saved_configuration_names_the_parts_beside_it(page, painter, until):
+def test_a_saved_configuration_names_the_parts_beside_it(page, painter):
     session, painting = page.session, page.controls.painting
     assert painting.as_saved(session.yaml()) == session.yaml()
     painter.move([200, 150])
@@ -287,7 +278,7 @@ def test_a_saved_configuration_names_the_parts_beside_it(page, painter, until):
     assert yaml.safe_load(text)["scene"]["parts"] == "parts.npz"
 
 
-def test_files_of_parts_stay_while_a_change_can_be_undone(page, painter, until, monkeypatch):
+def test_files_of_parts_stay_while_a_change_can_be_undone(page, painter, monkeypatch):
     session, painting = page.session, page.controls.painting
     monkeypatch.setattr(session, "_past", type(session._past)(maxlen=2))
     for k in range(5):
@@ -302,7 +293,7 @@ def test_files_of_parts_stay_while_a_change_can_be_undone(page, painter, until, 
     assert len(there) <= 4
 
 
-def test_labels_count_the_gaussians_that_are_not_drawn(parser, settings, connect, until, tmp_path):
+def test_labels_count_the_gaussians_that_are_not_drawn(parser, settings, show, join, tmp_path):
     """With `scene.faint: drop` the file has more than the page draws."""
     cloud = FlagScene(spacing=0.05).generate()
     faint = torch.arange(len(cloud.means)) % 3 == 0
@@ -310,25 +301,20 @@ def test_labels_count_the_gaussians_that_are_not_drawn(parser, settings, connect
     write_ply(tmp_path / "flag.ply", cloud)
     values = ["--scene.faint=drop", f"--scene.ply={tmp_path / 'flag.ply'}", "--solver.dx=0.1", "--device=cpu"]
     session = Session(parser, parser.parse_args([f"--config={settings.config[0]}", *values]))
-    page = Page(port=8510, largest=320).show(session)
-    session.start()
-    try:
-        painter = _painting(page, connect, until)
-        assert len(page.roles) == (~faint).sum()
-        painter.move([200, 150])
-        until(lambda: _labelled(page).any())
-        places = project(cloud.means, CAMERA)[0].numpy()
-        assert np.array_equal(_labelled(page), _near(places, [200, 150]) & ~faint.numpy())
-        painter.client.set(page.controls.painting.apply, True)
-        until(lambda: session.simulation.scene.parts is not None)
-        assert session.problem is None
-        assert len(session.simulation.scene.parts) == len(cloud.means)
-    finally:
-        page.close()
-        session.close()
+    page = show(session)
+    painter = _painting(page, join)
+    assert len(page.roles) == (~faint).sum()
+    painter.move([200, 150])
+    until(lambda: _labelled(page).any())
+    places = project(cloud.means, CAMERA)[0].numpy()
+    assert np.array_equal(_labelled(page), _near(places, [200, 150]) & ~faint.numpy())
+    painter.client.set(page.controls.painting.apply, True)
+    until(lambda: session.simulation.scene.parts is not None)
+    assert session.problem is None
+    assert len(session.simulation.scene.parts) == len(cloud.means)
 
 
-def test_a_scene_that_changed_meanwhile_is_painted_from_new(page, painter, until):
+def test_a_scene_that_changed_meanwhile_is_painted_from_new(page, painter):
     """Strokes are labels of Gaussians that are there no more."""
     session, painting = page.session, page.controls.painting
     painter.move([200, 150])
@@ -343,15 +329,13 @@ def test_a_scene_that_changed_meanwhile_is_painted_from_new(page, painter, until
     assert session.problem is None
 
 
-def test_copies_are_not_painted(page, connect, until):
-    client, painter = _join(page, connect, until)
+def test_copies_are_not_painted(page, connect):
     page.session.settings.copies = [{}]
-    client.set(page.controls.painting.on, True)
+    connect(page).set(page.controls.painting.on, True)
     until(lambda: page.notice is not None)
     assert "leave out `copies`" in page.notice
     assert not page.controls.painting.on.value
     page.session.settings.copies = []
-    painter.socket.close()
 
 
 def test_who_has_no_key_cannot_paint(page):
@@ -371,7 +355,7 @@ def test_no_more_moves_wait_than_there_is_room_for(page, painter, monkeypatch):
     painting._waiting.clear()
 
 
-def test_a_browser_that_goes_is_forgotten(page, painter, until):
+def test_a_browser_that_goes_is_forgotten(page, painter):
     painter.client.close()
     with pytest.raises(ConnectionClosed):
         painter.socket.recv(timeout=20)
@@ -388,23 +372,17 @@ def test_choices_are_the_parts_and_a_new_one_of_each_role():
     assert list(choices([Part("soft")])) == ["soft", *(role for role in ROLES if role != "soft")]
 
 
-def test_parts_of_the_scene_are_painted_on(parser, settings, connect, until, tmp_path):
+def test_parts_of_the_scene_are_painted_on(settings, show, join, tmp_path):
     given = Parts(torch.arange(1536) % 2, [Part("<cloth>", E=5e3), Part("pole", "held")])
     given.save(tmp_path / "parts.npz")
     settings.scene.parts = str(tmp_path / "parts.npz")
-    session = Session(parser, settings)
-    page = Page(port=8520, largest=320).show(session)
-    session.start()
-    try:
-        painter = _painting(page, connect, until)
-        assert page.controls.painting.part.options[:2] == ("<cloth> (soft)", "pole (held)")
-        assert page.roles.tolist() == [ROLES.index(given.parts[k].role) for k in given.labels]
-        painter.choose(page.controls.painting.part, "<cloth> (soft)", until)
-        painter.move([200, 150])
-        strokes = page.controls.painting._strokes
-        until(lambda: strokes.parts().mask("<cloth>").sum() > given.mask("<cloth>").sum())
-        assert len(strokes) == 1
-        assert strokes.parts().parts == given.parts
-    finally:
-        page.close()
-        session.close()
+    page = show()
+    painter = _painting(page, join)
+    assert page.controls.painting.part.options[:2] == ("<cloth> (soft)", "pole (held)")
+    assert page.roles.tolist() == [ROLES.index(given.parts[k].role) for k in given.labels]
+    painter.choose(page.controls.painting.part, "<cloth> (soft)")
+    painter.move([200, 150])
+    strokes = page.controls.painting._strokes
+    until(lambda: strokes.parts().mask("<cloth>").sum() > given.mask("<cloth>").sum())
+    assert len(strokes) == 1
+    assert strokes.parts().parts == given.parts

@@ -1,29 +1,13 @@
 """The grid on which the live page keeps up with real time, with made-up costs and with a flag."""
 
-from dataclasses import replace
-
 import pytest
+from small_scenes import run_cost
 
-from gaussian_swaying.preview.cost import Cost
 from gaussian_swaying.simulation.simulation import Simulation
 from gaussian_swaying.viewer import real_time
 from gaussian_swaying.viewer.real_time import HEADROOM, finest_in_real_time, in_real_time, sentence
 
 CONFIGURED, COARSEST = 0.032, 0.075
-NOTHING = Cost(
-    device="",
-    particles=1,
-    dx=CONFIGURED,
-    grid=(1, 1, 1),
-    frames=51,
-    wave_speed=1.0,
-    stable_substep=1.0,
-    substep=1.0,
-    substeps=1,
-    substep_seconds=1.0,
-    simulation_seconds=1.0,
-    picture_seconds=None,
-)
 
 
 def machine(speed, power):
@@ -33,9 +17,7 @@ def machine(speed, power):
     def measure(dx):
         tried.append(dx)
         seconds, finer = 2.0 / speed, CONFIGURED / dx
-        return replace(
-            NOTHING, dx=dx, simulation_seconds=seconds * finer**power, substep_seconds=1e-3 * finer ** (power - 1)
-        )
+        return run_cost(dx, simulation_seconds=seconds * finer**power, substep_seconds=1e-3 * finer ** (power - 1))
 
     return measure, tried
 
@@ -117,7 +99,7 @@ def test_a_scene_gets_the_chosen_grid_and_its_settings_stay(parser, settings, mo
     def estimate(simulation, frames, budget, pictures):
         asked.append((simulation.solver.dx, frames, budget, pictures))
         seconds = 2.0 / 0.7 * (0.05 / simulation.solver.dx) ** 3
-        return replace(NOTHING, dx=simulation.solver.dx, simulation_seconds=seconds, startup_seconds=9.0)
+        return run_cost(simulation.solver.dx, simulation_seconds=seconds, startup_seconds=9.0)
 
     monkeypatch.setattr(real_time, "estimate_cost", estimate)
     choice = in_real_time(parser, settings, Simulation.from_settings(parser, settings))

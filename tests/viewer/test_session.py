@@ -8,6 +8,7 @@ from types import SimpleNamespace
 import pytest
 import torch
 import yaml
+from browsers import until
 
 from gaussian_swaying.config.parser import config_text
 from gaussian_swaying.rendering.thinning import DETAIL
@@ -22,7 +23,7 @@ def _position(session):
     return session.snapshot.state.position
 
 
-def test_it_goes_on_pauses_and_steps(session, until):
+def test_it_goes_on_pauses_and_steps(session):
     session.start()
     until(lambda: session.snapshot.health.time > 0.1)
     pause(session)
@@ -48,7 +49,7 @@ def test_gaussians_much_smaller_than_a_pixel_are_thinned(session):
     assert Simulation.from_settings(session.parser, session.settings, device="cpu").painter.renderer.detail == 0
 
 
-def test_it_does_the_same_as_a_loop_over_frames(parser, settings, session, until, monkeypatch):
+def test_it_does_the_same_as_a_loop_over_frames(parser, settings, session, monkeypatch):
     """Not paced or shortened, a session computes the frames of the simulation, bit for bit."""
     monkeypatch.setattr("gaussian_swaying.viewer.session.SLOW", math.inf)
     session.pause()
@@ -74,7 +75,7 @@ def test_it_does_the_same_as_a_loop_over_frames(parser, settings, session, until
         ({"background": [0.0, 0.5, 0.0]}, lambda s: s.painter.background.tolist() == [0, 0.5, 0]),
     ],
 )
-def test_what_changes_in_motion(session, until, values, found):
+def test_what_changes_in_motion(session, values, found):
     """The simulation stays the same object, and the state goes on."""
     session.start()
     until(lambda: session.snapshot.health.time > 0.05)
@@ -86,7 +87,7 @@ def test_what_changes_in_motion(session, until, values, found):
     assert session.problem is None
 
 
-def test_another_grid_starts_anew_and_the_same_grid_goes_on(session, until):
+def test_another_grid_starts_anew_and_the_same_grid_goes_on(session):
     session.start()
     until(lambda: session.snapshot.health.time > 0.1)
     session.pause()
@@ -112,7 +113,7 @@ def test_another_grid_starts_anew_and_the_same_grid_goes_on(session, until):
         ({"wind.flow": "fast"}, "flow"),
     ],
 )
-def test_what_cannot_be_is_told_and_changes_nothing(session, until, values, message):
+def test_what_cannot_be_is_told_and_changes_nothing(session, values, message):
     session.start()
     before = session.yaml()
     session.change(values)
@@ -124,7 +125,7 @@ def test_what_cannot_be_is_told_and_changes_nothing(session, until, values, mess
     until(lambda: session.snapshot.number > number)  # it goes on
 
 
-def test_what_diverges_is_told_and_reset_heals_it(session, until):
+def test_what_diverges_is_told_and_reset_heals_it(session):
     session.start()
     session.change({"wind.flow": [1e7, 0.0, 0.0]})
     until(lambda: session.broken)
@@ -139,7 +140,7 @@ def test_what_diverges_is_told_and_reset_heals_it(session, until):
     assert session.problem is None
 
 
-def test_reset_goes_back_to_rest_and_keeps_what_was_changed(session, until):
+def test_reset_goes_back_to_rest_and_keeps_what_was_changed(session):
     rest = _position(session).clone()
     session.start()
     session.change({"material.E": 2e4, "solver.damping": 3.0})
@@ -159,7 +160,7 @@ def _stiffness(session):
     return float(session.simulation.scene.points.youngs_modulus.amax())
 
 
-def test_restore_brings_pins_and_material_back(session, until):
+def test_restore_brings_pins_and_material_back(session):
     """All that was changed, and the motion starts at rest; that can be undone, too."""
     first, rest, stiffness = session.yaml(), _position(session).clone(), _stiffness(session)
     session.start()
@@ -183,7 +184,7 @@ def test_restore_brings_pins_and_material_back(session, until):
     assert _stiffness(session) == pytest.approx(2e4)
 
 
-def test_undo_takes_the_last_change_back_in_motion(session, until, monkeypatch):
+def test_undo_takes_the_last_change_back_in_motion(session, monkeypatch):
     monkeypatch.setattr("gaussian_swaying.viewer.session.ONE_CHANGE", 100.0)
     session.start()
     first, stiffness = session.yaml(), _stiffness(session)
@@ -211,7 +212,7 @@ def test_undo_takes_the_last_change_back_in_motion(session, until, monkeypatch):
     until(lambda: session.changes == 2)
 
 
-def test_undo_heals_what_diverged_and_forgets_what_was_refused(session, until):
+def test_undo_heals_what_diverged_and_forgets_what_was_refused(session):
     session.start()
     session.change({"material.E": -1.0})
     until(lambda: session.revision == 1)
@@ -225,7 +226,7 @@ def test_undo_heals_what_diverged_and_forgets_what_was_refused(session, until):
     assert float(session.simulation.wind.flows.norm()) < 100
 
 
-def test_material_of_parts_is_that_of_a_run(parser, settings, until, tmp_path):
+def test_material_of_parts_is_that_of_a_run(parser, settings, tmp_path):
     """Edits act at their time, and another stiffness leaves them what they are."""
     file = tmp_path / "edited.yaml"
     edit = {"time": 0.06, "E": 5e4}
@@ -245,7 +246,7 @@ def test_material_of_parts_is_that_of_a_run(parser, settings, until, tmp_path):
     assert session.problem is None
 
 
-def test_the_saved_configuration_is_that_of_the_session(parser, session, until, tmp_path):
+def test_the_saved_configuration_is_that_of_the_session(parser, session, tmp_path):
     session.change({"wind.flow": [1.0, 2.0, 0.5], "material.E": 1.2e4, "solver.damping": 0.5})
     session.start()
     until(lambda: session.settings.solver.damping == 0.5)
@@ -258,7 +259,7 @@ def test_the_saved_configuration_is_that_of_the_session(parser, session, until, 
     assert yaml.safe_load(file.read_text())["solver"]["dx"] == 0.1
 
 
-def test_a_pull_moves_what_it_holds_and_lets_go(session, until):
+def test_a_pull_moves_what_it_holds_and_lets_go(session):
     session.change({"wind.flow": [0.0, 0.0, 0.0], "wind.modulations": [], "solver.gravity": [0.0, 0.0, 0.0]})
     session.start()
     session.grab([1.2, 0.0, 0.4])
@@ -296,7 +297,7 @@ def test_slow_motion_is_slower(session, monkeypatch, speed, step, expected):
     assert session.rates().steps == pytest.approx(expected / 0.04)
 
 
-def test_steps_get_shorter_where_they_take_long(parser, settings, until, monkeypatch):
+def test_steps_get_shorter_where_they_take_long(parser, settings, monkeypatch):
     monkeypatch.setattr("gaussian_swaying.viewer.session.SLOW", 0.0)
     session = Session(parser, settings).start()
     until(lambda: session.simulation.frame_dt < 0.01)
@@ -313,7 +314,7 @@ def test_steps_of_few_substeps_stay_as_long(session, settings, monkeypatch):
 
 
 @pytest.mark.gpu
-def test_on_a_gpu_it_is_changed_and_drawn_at_the_same_time(parser, settings, until):
+def test_on_a_gpu_it_is_changed_and_drawn_at_the_same_time(parser, settings):
     """Graphs are recorded and replayed in the thread of the session while others draw."""
     settings.device = "cuda"
     session = Session(parser, settings).start()
@@ -357,7 +358,7 @@ def test_on_a_gpu_it_is_changed_and_drawn_at_the_same_time(parser, settings, unt
     assert torch.isfinite(session.snapshot.state.position).all()
 
 
-def test_computed_air_keeps_the_length_of_its_frames(parser, request, until, monkeypatch):
+def test_computed_air_keeps_the_length_of_its_frames(parser, request, monkeypatch):
     """Where steps take long they stay as long, another wind blows in at once, and another length starts anew."""
     monkeypatch.setattr("gaussian_swaying.viewer.session.SLOW", 0.0)
     config = request.config.rootpath / "configs/sim/flag_in_air.yaml"

@@ -5,21 +5,21 @@ from dataclasses import replace
 
 import numpy as np
 import torch
+from browsers import until
 
 from gaussian_swaying.gaussians.parts import ROLES
 from gaussian_swaying.gaussians.ply import write_ply
 from gaussian_swaying.recording.nodes import join_far
 from gaussian_swaying.rendering.tints import by_role
 from gaussian_swaying.scenes.procedural import FlagScene
-from gaussian_swaying.viewer.film.page import pack_splats
-from gaussian_swaying.viewer.film.recorded import film_of
+from gaussian_swaying.viewer.film.page import message, pack_splats
+from gaussian_swaying.viewer.film.recorded import film_without_frames
 from gaussian_swaying.viewer.session import Session
 from gaussian_swaying.viewer.states import (
     colour_message,
     drawable,
     film_from,
     look_message,
-    message,
     scene_message,
     state_message,
 )
@@ -38,7 +38,7 @@ def nodal(raw):
     return join_far(near, np.frombuffer(rest[6 * head["nodes"] :], "<i4").reshape(-1, 4))
 
 
-def test_a_state_is_the_displacement_of_the_nodes(session, until):
+def test_a_state_is_the_displacement_of_the_nodes(session):
     session.start()
     until(lambda: session.snapshot.health.time > 0.1)
     session.pause()
@@ -61,9 +61,7 @@ def test_a_state_is_the_displacement_of_the_nodes(session, until):
 
 def test_a_scene_is_a_film_without_frames(session):
     snapshot = session.snapshot
-    simulation, state = snapshot.simulation, snapshot.state
-    nodes = simulation.scene.follow.nodes(state)
-    film = film_of(simulation, state.grid, nodes, torch.zeros(0, len(nodes), 3), "scene")
+    film = film_without_frames(snapshot.simulation, snapshot.state, "scene")
     head, rest = read(scene_message(snapshot, torch.eye(3).double()))
     moving, still = pack_splats(film, moving=True), pack_splats(film, moving=False)
     assert head["head"] == film.head
@@ -82,8 +80,7 @@ def test_the_camera_finds_the_gaussians_in_any_scene(parser, settings, tmp_path)
     session = Session(parser, parser.parse_args(given))
     snapshot = session.snapshot
     simulation = snapshot.simulation
-    nodes = simulation.scene.follow.nodes(snapshot.state)
-    film = film_of(simulation, snapshot.state.grid, nodes, torch.zeros(0, len(nodes), 3), "scene")
+    film = film_without_frames(simulation, snapshot.state, "scene")
     turn = torch.tensor([[0.0, 0, -1], [0, -1, 0], [-1, 0, 0]], dtype=torch.float64)
     world = film_from(simulation.scene, turn)
     seen = simulation.scene.model.means.double()[film.order] @ turn.T
@@ -126,10 +123,8 @@ def test_a_gpu_is_read_in_turn(session, monkeypatch):
 
 def test_other_colours_are_those_of_the_film_with_the_tints_of_roles(session):
     """What became soft again has the colour that the scene brought."""
-    snapshot = session.snapshot
-    simulation, state = snapshot.simulation, snapshot.state
-    nodes = simulation.scene.follow.nodes(state)
-    film = film_of(simulation, state.grid, nodes, torch.zeros(0, len(nodes), 3), "scene")
+    simulation = session.simulation
+    film = film_without_frames(simulation, session.snapshot.state, "scene")
     own = film.color[np.argsort(film.order), :3]
     index, roles = torch.tensor([7, 900, 3]), torch.tensor([ROLES.index(role) for role in ("soft", "held", "still")])
     head, rest = read(colour_message(simulation, index, roles))

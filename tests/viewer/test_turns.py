@@ -2,10 +2,12 @@
 
 import threading
 
+from browsers import until
+
 from gaussian_swaying.viewer.turns import Turns
 
 
-def test_what_is_asked_is_done_in_order_and_of_the_same_only_the_last(until):
+def test_what_is_asked_is_done_in_order_and_of_the_same_only_the_last():
     done, failed, begun, go_on = [], [], threading.Event(), threading.Event()
     turns = Turns(lambda: None, 0.01, failed.append)
 
@@ -30,7 +32,7 @@ def test_what_is_asked_is_done_in_order_and_of_the_same_only_the_last(until):
     assert done[-1] == "good"
 
 
-def test_something_is_done_regularly_however_much_is_asked(until):
+def test_something_is_done_regularly_however_much_is_asked():
     times = []
     turns = Turns(lambda: times.append(1), 0.02, print)
     until(lambda: turns.ask("busy", lambda: None) or len(times) >= 5)

@@ -85,6 +85,12 @@ def filled(template: Path, head: dict[str, Any], blocks: dict[str, bytes]) -> st
     return re.sub(r"{{(\w+)}}", lambda slot: words[slot[1]], text)  # once: what is put in may have braces of its own
 
 
+def message(head: dict[str, Any], *blocks: bytes) -> bytes:
+    """A message for a page: the length of its head (uint32, little-endian), the head in JSON, and its bytes."""
+    text = json.dumps(head, allow_nan=False).encode()
+    return b"".join([len(text).to_bytes(4, "little"), text, *blocks])
+
+
 def parts_of(head: dict[str, Any]) -> list[list[Any]]:
     """The parts of the file, each as its kind and the first and last (excluded) of its Gaussians or frames.
 

@@ -18,14 +18,12 @@ from gaussian_swaying.config.parser import parse_file
 from gaussian_swaying.gaussians.harmonics import sh_to_color
 from gaussian_swaying.geometry.groups import equal_rows
 from gaussian_swaying.geometry.rotations import quat_multiply, rotation_to_quat
-from gaussian_swaying.mpm.followers import follower_stencil
 from gaussian_swaying.mpm.state import GridSpec
-from gaussian_swaying.mpm.transfer import Stencil, gather
+from gaussian_swaying.mpm.transfer import Stencil
 from gaussian_swaying.mpm.virtual_nodes import coordinates
 from gaussian_swaying.recording.nodes import load_nodes
 from gaussian_swaying.rendering.cameras.camera import Camera
 from gaussian_swaying.rendering.shading import DiffuseShader
-from gaussian_swaying.simulation.diagnostics import FARTHEST
 from gaussian_swaying.simulation.painter import Painter
 from gaussian_swaying.simulation.simulated_scene import SimulatedScene
 from gaussian_swaying.simulation.simulation import Simulation
@@ -95,27 +93,7 @@ def read_film(run: Path) -> Film:
             f"{len(nodes):,}: export with the version of this program that made the run, or run it again."
         )
     with torch.inference_mode():
-        _check_near(run / "nodes.npz", scene, grid, nodes, displacement)
         return film_of(simulation, grid, nodes, displacement, name)
-
-
-def _check_near(path: Path, scene: SimulatedScene, grid: GridSpec, nodes: Tensor, displacement: Tensor) -> None:
-    """Raise ValueError if a place of the material is moved farther than any run lets it go.
-
-    A node with almost no mass may swing farther. As the weights of a place are positive and add up to one, no place is
-    moved farther than the farthest node, so only frames with such a node are looked at closely.
-    """
-    most = FARTHEST * scene.size * scene.frame.metres_per_unit
-    stencil = follower_stencil(in_double(scene.follow.places), grid, scene.follow.table(grid))
-    for k in (displacement.norm(dim=-1) > most).any(1).nonzero()[:, 0].tolist():
-        field = torch.zeros(grid.node_count, 3, dtype=torch.float64)
-        field[nodes] = displacement[k].double()
-        farthest = float(gather(field, stencil)[..., 0, :].norm(dim=-1).max())
-        if not farthest <= most:
-            raise ValueError(
-                f"{path} moves a Gaussian by {farthest:.3g} m in frame {k}, but a run ends at {most:.3g} m: it is "
-                "damaged, so run the simulation again, without --resume."
-            )
 
 
 def _summary(run: Path) -> dict[str, Any]:
@@ -154,6 +132,13 @@ def _rebuild(run: Path, summary: dict[str, Any]) -> tuple[Simulation, str]:
             raise ValueError(f"The splat {splat} has changed since the run in {run}: restore it, or run again.")
     made = getattr(settings.scene.generator, "class_path", "scene").rsplit(".", 1)[-1].removesuffix("Scene")
     return Simulation.from_settings(parser, settings, device="cpu"), made if splat is None else Path(splat).stem
+
+
+def film_without_frames(simulation: Simulation, state: Any, name: str) -> Film:
+    """The Gaussians of a simulation at rest and the nodes that move them; its state has a grid."""
+    nodes = simulation.scene.follow.nodes(state)
+    assert nodes is not None  # the solver is `total` or `modes`
+    return film_of(simulation, state.grid, nodes, torch.zeros(0, len(nodes), 3), name)
 
 
 def film_of(simulation: Simulation, grid: GridSpec, nodes: Tensor, displacement: Tensor, name: str) -> Film:

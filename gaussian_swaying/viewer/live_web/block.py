@@ -7,7 +7,6 @@ are :mod:`~gaussian_swaying.mpm.formulations.total` and :mod:`~gaussian_swaying.
 
 from __future__ import annotations
 
-import json
 import math
 from typing import Any
 
@@ -37,6 +36,7 @@ from gaussian_swaying.mpm.laws.neo_hookean import NeoHookean
 from gaussian_swaying.mpm.laws.spring_network import SpringNetwork
 from gaussian_swaying.mpm.solver import MPMSolver
 from gaussian_swaying.simulation.simulation import Simulation
+from gaussian_swaying.viewer.film.page import message
 from gaussian_swaying.viewer.live_web.longest import longest_courant
 
 LAWS = (FixedCorotated, NeoHookean, StVKHencky, SpringNetwork)
@@ -253,8 +253,7 @@ def _joined(head: dict[str, Any], arrays: dict[str, Tensor]) -> bytes:
         kind = "f4" if values.is_floating_point() else {torch.int8: "i1", torch.int16: "i2"}.get(values.dtype, "i4")
         listed.append([name, kind, values.numel()])
         blocks.append(values.detach().cpu().contiguous().numpy().astype(np.dtype("<" + kind)).tobytes())
-    text = json.dumps(head | {"arrays": listed}, allow_nan=False).encode()
-    return b"".join([len(text).to_bytes(4, "little"), text, *blocks])
+    return message(head | {"arrays": listed}, *blocks)
 
 
 def _plane(plane: Boundary) -> dict[str, Any]:

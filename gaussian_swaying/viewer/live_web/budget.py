@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 from gaussian_swaying.simulation.simulation import Simulation
@@ -24,19 +23,6 @@ CLOSE = 0.8  # share of the budget that is good enough
 POWER = 3.5  # of the cost in the spacing: 3 for a sheet, 4 for a solid
 
 
-@dataclass(frozen=True, eq=False)
-class Fitted:
-    """A simulation that fits a budget.
-
-    Attributes:
-        simulation: The simulation.
-        sentence: What was chosen.
-    """
-
-    simulation: Simulation
-    sentence: str
-
-
 def load_of(simulation: Simulation) -> float:
     """Material points times substeps in a second of a simulation at rest [1/s], in those of the fast pass."""
     slower = 1.0 if in_webassembly(simulation) else IN_JAVASCRIPT
@@ -44,13 +30,16 @@ def load_of(simulation: Simulation) -> float:
     return slower * simulation.setup.points.count * steps / simulation.frame_dt
 
 
-def fitted(parser: ArgumentParser, settings: Namespace, target: str) -> Fitted:
+def fitted(parser: ArgumentParser, settings: Namespace, target: str) -> tuple[Simulation, str]:
     """Choose the points and the grid for a kind of machine.
 
     Args:
         parser: From :meth:`Simulation.parser`.
         settings: The settings as they are configured.
         target: One of :data:`TARGETS`.
+
+    Returns:
+        The simulation, and what was chosen in words.
     """
     configured, budget = float(settings.solver.dx), TARGETS[target]
     made: dict[float, Simulation] = {}
@@ -69,7 +58,7 @@ def fitted(parser: ArgumentParser, settings: Namespace, target: str) -> Fitted:
     if settings.scene.points == "gaussian":
         what += ", with `scene.points: grid`,"
     fast = f"about {speed:.2g} x real time" if speed < 1 else "real time"
-    return Fitted(made[dx], f"{what} for a {target}: {points:,} points, {fast} expected.")
+    return made[dx], f"{what} for a {target}: {points:,} points, {fast} expected."
 
 
 def finest_within(load: Callable[[float], float], configured: float, budget: float) -> tuple[float, float]:

@@ -5,6 +5,7 @@ import dataclasses
 import pytest
 import torch
 import yaml
+from shared import merged
 from small_scenes import together
 
 from gaussian_swaying.gaussians.ply import write_ply
@@ -42,24 +43,13 @@ SETTINGS = {
 }
 
 
-def _merged(settings, changes):
-    both = dict(settings)
-    for name, value in changes.items():
-        both[name] = (
-            _merged(both[name], value)
-            if isinstance(value, dict) and name in both and "class_path" not in value
-            else value
-        )
-    return both
-
-
 @pytest.fixture(scope="session")
 def make_flag(tmp_path_factory):
     """The simulation of the flag, with some settings changed, from its file."""
 
     def make(**changes):
         path = tmp_path_factory.mktemp("flag") / "flag.yaml"
-        path.write_text(yaml.safe_dump(_merged(SETTINGS, changes)))
+        path.write_text(yaml.safe_dump(merged(SETTINGS, changes)))
         return Simulation.from_yaml(path, device="cpu")
 
     return make

@@ -1,19 +1,16 @@
 """A film in a real browser."""
 
 import base64
-import time
 
 import numpy as np
 import pytest
 import torch
+from browsers import asked_of_a_network, listened, picture_of, until
 
 from gaussian_swaying.viewer.film import page as film_page
 from gaussian_swaying.viewer.film.page import write_film
 from gaussian_swaying.viewer.film.recorded import order_of
 
-SOFTWARE = ["--no-sandbox", "--disable-quic", "--no-first-run", "--disable-background-networking"]
-SOFTWARE += ["--disable-component-update", "--disable-sync"]
-DRAWN = ["--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"]
 SHOWN = "!!window.film || !document.getElementById('message').textContent.startsWith('Loading')"
 
 
@@ -41,39 +38,25 @@ def film(run, tmp_path_factory):
 
 
 @pytest.fixture
-def show(chromium):
-    """Opens a page of a size; what it tells and asks for is kept in ``page.told`` and ``page.asked``."""
-    from playwright.sync_api import sync_playwright
+def show(browser):
+    """Opens a film in a window of a size."""
+    opened = []
 
-    with sync_playwright() as driver:
-        opened = []
+    def show(path, width=320, height=180, browser=browser):
+        opened.append(listened(browser.new_page(viewport={"width": width, "height": height})))
+        opened[-1].goto(path.as_uri())
+        until(lambda: opened[-1].evaluate(SHOWN))
+        return opened[-1]
 
-        def show(path, width=320, height=180, arguments=DRAWN):
-            browser = driver.chromium.launch(executable_path=chromium, args=SOFTWARE + arguments)
-            opened.append(browser)
-            page = browser.new_page(viewport={"width": width, "height": height})
-            page.told, page.asked = [], []
-            page.on("console", lambda message: page.told.append(message.text))
-            page.on("pageerror", lambda error: page.told.append(str(error)))
-            page.on("request", lambda request: page.asked.append(request.url))
-            page.goto(path.as_uri())
-            end = time.monotonic() + 60
-            while not page.evaluate(SHOWN):
-                assert time.monotonic() < end, page.told
-                time.sleep(0.1)
-            return page
-
-        yield show
-        for browser in opened:
-            browser.close()
+    yield show
+    for page in opened:
+        page.close()
 
 
 def _picture(page):
-    """The canvas as it is shown, without the controls, shape (H, W, 3)."""
-    import imageio.v3 as iio
-
+    """The canvas as it is shown, without the controls."""
     page.add_style_tag(content="header, footer { display: none !important; }")
-    return iio.imread(page.screenshot())[..., :3].astype(float)
+    return picture_of(page)
 
 
 def _psnr(one, other):
@@ -103,13 +86,9 @@ def test_the_film_is_the_run(show, film, run, make_flag, stretched):
     assert float((expected - scene.frame.point_to_sim(scene.rest().means.double()) / size).abs().max()) > 0.02
     before = page.evaluate("film.drawn()")
     page.evaluate("film.play()")
-    end = time.monotonic() + 20
-    while page.evaluate("film.drawn()") < before + 5:
-        assert time.monotonic() < end
-        time.sleep(0.1)
+    until(lambda: page.evaluate("film.drawn()") >= before + 5)
     page.evaluate("film.pause()")
-    assert page.told == []
-    assert [url for url in page.asked if not url.startswith(("file:", "data:", "blob:"))] == []
+    assert page.told == asked_of_a_network(page) == []
 
 
 def test_gaussians_are_sorted_from_far_to_near(show, film):
@@ -210,13 +189,11 @@ def test_controls_at_the_size_of_a_phone(show, film):
 
 
 def _whole(page):
-    import imageio.v3 as iio
-
-    return iio.imread(page.screenshot(clip={"x": 0, "y": 100, "width": 390, "height": 600}))[..., :3].astype(float)
+    return picture_of(page, x=0, y=100, width=390, height=600)
 
 
-def test_a_browser_without_webgl2_says_so(show, film):
-    page = show(film, arguments=["--disable-gpu", "--disable-3d-apis"])
+def test_a_browser_without_webgl2_says_so(show, film, launch):
+    page = show(film, browser=launch("--disable-gpu", "--disable-3d-apis"))
     message = page.locator("#message")
     assert message.is_visible()
     assert message.inner_text() == (

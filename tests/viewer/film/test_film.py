@@ -11,6 +11,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from shared import refused
 from small_scenes import together
 
 from gaussian_swaying.cli.export import main
@@ -249,35 +250,28 @@ def test_a_resumed_run_without_earlier_nodes_says_so(make_flag, tmp_path, capsys
     make_flag().run(folder, 2, progress=False, recorder=Recorder(video=False, nodes=False))
     make_flag().run(folder, 3, resume=True, progress=False)
     assert "so nodes.npz will be without them; start again without --resume to have them." in capsys.readouterr().err
-    assert _refusal([str(folder)], capsys).endswith("lacks frames: run the simulation again, without --resume.\n")
+    _refused(capsys, "lacks frames: run the simulation again, without --resume.\n", folder)
 
 
 # ---- what cannot become a film
 
 
-def _refusal(arguments, capsys):
-    """The one sentence of a film that cannot be made."""
-    capsys.readouterr()
-    assert main(["--web", *arguments]) == 2
-    told = capsys.readouterr()
-    assert told.err.startswith("error: ")
-    assert told.err.count("\n") == 1
-    assert told.out == ""
-    return told.err
+def _refused(capsys, words, *arguments):
+    return refused(lambda given: main(["--web", *map(str, given)]), arguments, capsys, words)
 
 
 def test_what_is_no_run_of_total_is_refused(make_flag, run, tmp_path, capsys):
-    assert "has no run: give the output folder of `gaussian-swaying sim`" in _refusal([str(tmp_path)], capsys)
-    assert "to end in .html, but got " in _refusal([str(run), str(tmp_path / "film.mp4")], capsys)
-    assert "--fps is not for --web" in _refusal([str(run), "--fps", "25"], capsys)
+    _refused(capsys, "has no run: give the output folder of `gaussian-swaying sim`", tmp_path)
+    _refused(capsys, "to end in .html, but got ", run, tmp_path / "film.mp4")
+    _refused(capsys, "--fps is not for --web", run, "--fps", "25")
     copy = shutil.copytree(run, tmp_path / "copy")
     (copy / "nodes.npz").unlink()
-    assert "run it again with `recorder.nodes: true`." in _refusal([str(copy)], capsys)
+    _refused(capsys, "run it again with `recorder.nodes: true`.", copy)
     summary = json.loads((copy / "summary.json").read_text())
     (copy / "summary.json").write_text(json.dumps(summary | {"formulation": "updated"}))
-    assert "`solver.formulation: updated`" in _refusal([str(copy)], capsys)
+    _refused(capsys, "`solver.formulation: updated`", copy)
     (copy / "summary.json").write_text("{")
-    assert "summary.json cannot be read" in _refusal([str(copy)], capsys)
+    _refused(capsys, "summary.json cannot be read", copy)
     assert not list(tmp_path.glob("**/film.*"))
 
 
@@ -289,9 +283,9 @@ def test_a_splat_that_moved_or_changed_is_refused(make_flag, tmp_path, capsys):
     assert main(["--web", str(folder)]) == 0
     cloud.means[0] += 0.001
     write_ply(splat, cloud)
-    assert "flag.ply has changed since the run in" in _refusal([str(folder)], capsys)
+    _refused(capsys, "flag.ply has changed since the run in", folder)
     splat.unlink()
-    assert "flag.ply of the run is not there (`scene.ply` in " in _refusal([str(folder)], capsys)
+    _refused(capsys, "flag.ply of the run is not there (`scene.ply` in ", folder)
 
 
 def _with_nodes(run, folder, change):
@@ -321,12 +315,11 @@ def test_nodes_that_cannot_be_shown_are_refused(run, tmp_path, capsys):
         (
             (_set(np.nan), r"frame 2 has a displacement that is NaN or infinite"),
             (_set(np.inf), r"frame 2 has a displacement that is NaN or infinite"),
-            (_set(1e30), r"moves a Gaussian by \S+ m in frame 2, but a run ends at 1\.15e\+03 m"),
             (lambda near, far: (near.astype("f8"), far), r"an array of float64 has the shape"),
             (lambda near, far: (near[:, :2], far), r"an array of float16 has the shape \(\d+, 2\)"),
             (lambda near, far: (near, np.full((1, 4), -1, np.int32)), r"there is no node -1"),
         )
     ):
-        told = _refusal([_with_nodes(run, tmp_path / str(k), change)], capsys)
+        told = _refused(capsys, "nodes.npz", _with_nodes(run, tmp_path / str(k), change))
         assert re.search(rf"nodes\.npz .*{words}.*run the simulation again", told), told
         assert not (tmp_path / str(k) / "film.html").exists()

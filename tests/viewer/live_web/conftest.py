@@ -7,6 +7,8 @@ import numpy as np
 import pytest
 import torch
 import yaml
+from browsers import listened, until
+from shared import merged
 from small_scenes import GREEN, block, previewed
 
 from gaussian_swaying.simulation.simulation import Simulation
@@ -38,15 +40,6 @@ CALM = {
 }
 
 
-def merged(settings, changes):
-    """Settings with some changed; a dictionary with a class replaces the one before."""
-    both = dict(settings)
-    for name, value in changes.items():
-        inner = isinstance(value, dict) and "class_path" not in value and isinstance(both.get(name), dict)
-        both[name] = merged(both[name], value) if inner else value
-    return both
-
-
 SHOWN = "!!window.windPage || !document.getElementById('message').textContent.startsWith('Loading')"
 
 
@@ -74,7 +67,7 @@ def sway(tmp_path_factory):
     preview, _ = previewed(
         block([0.5, 0.4, 1.0], GREEN), folder, "--hold", "bottom", "--kind", "shrub", "--look", "gusts"
     )
-    return maker(yaml.safe_load(preview.configurations["starter"]), tmp_path_factory)
+    return maker(yaml.safe_load(preview.starter), tmp_path_factory)
 
 
 @pytest.fixture(scope="session")
@@ -120,21 +113,12 @@ def apart(simulation, state, moved):
     return float(error / motion), float(motion)
 
 
-def opened(context, path, settings, until):
-    """A page; what it tells and asks for is kept in ``page.told`` and ``page.asked``."""
-    page = context.new_page()
-    page.told, page.asked = [], []
-    page.on("console", lambda message: page.told.append(message.text))
-    page.on("pageerror", lambda error: page.told.append(str(error)))
-    page.on("request", lambda request: page.asked.append(request.url))
+def opened(context, path, settings):
+    """A page, which is loaded or says why not."""
+    page = listened(context.new_page())
     page.goto(path.as_uri() + settings)
     until(lambda: page.evaluate(SHOWN))
     return page
-
-
-def asked_of_a_network(page):
-    """Addresses that a page asked for outside its file."""
-    return [url for url in page.asked if not url.startswith(("file:", "data:", "blob:"))]
 
 
 def drawn_apart(page, simulation):

@@ -4,16 +4,17 @@ import re
 import time
 
 import pytest
+from browsers import asked_of_a_network, until
 
 from gaussian_swaying.viewer.live_web.page import write_element, write_live_web
 
-from .conftest import asked_of_a_network, drawn_apart, opened
+from .conftest import drawn_apart, opened
 
 
 @pytest.fixture
-def show(browser, until):
+def show(browser):
     context = browser.new_context(viewport={"width": 600, "height": 400})
-    yield lambda path, settings="": opened(context, path, settings, until)
+    yield lambda path, settings="": opened(context, path, settings)
     context.close()
 
 
@@ -45,7 +46,7 @@ def _grabbed(page):
     return False
 
 
-def _stops(page, until):
+def _stops(page):
     """Wait until the motion stands still, and return its time."""
     times = [page.evaluate("windPage.time() ?? 0")]
 
@@ -58,7 +59,7 @@ def _stops(page, until):
     return times[-1]
 
 
-def test_what_the_visitor_does(show, written, until):
+def test_what_the_visitor_does(show, written):
     """The clock, pause, wind, link, a pull and a turn of the view."""
     page = show(written, "#wind=0,0,0&gusts=0&stiffness=2&speed=0.25")
     assert page.evaluate("[windPage.settings.wind, windPage.settings.gusts, windPage.settings.stiffness]") == [
@@ -77,13 +78,13 @@ def test_what_the_visitor_does(show, written, until):
     until(lambda: page.evaluate("windPage.time() ?? 0") > 0.3)
     page.locator("#play").click()
     assert not page.evaluate("windPage.playing()")
-    stopped = _stops(page, until)
+    stopped = _stops(page)
     page.locator("#play").click()
     until(lambda: page.evaluate("windPage.time() ?? 0") > stopped)
     hide = "(value) => { Object.defineProperty(document, 'hidden', { value, configurable: true }); "
     hide += "document.dispatchEvent(new Event('visibilitychange')); }"
     page.evaluate(hide, True)
-    stopped = _stops(page, until)
+    stopped = _stops(page)
     page.evaluate(hide, False)
     until(lambda: page.evaluate("windPage.time() ?? 0") > stopped)
     box = page.locator("#dial").bounding_box()
@@ -135,7 +136,7 @@ def test_a_file_that_is_cut_short_or_damaged_says_so(show, written, tmp_path):
     message.filter(has_text=re.compile(r"^This page cannot be shown \([^()]+\)\.$")).wait_for()
 
 
-def test_a_page_within_another_page(browser, written, until):
+def test_a_page_within_another_page(browser, written):
     """``<gaussian-swaying>`` passes its attributes on, also when they change."""
     write_element(written.parent)
     outer = written.parent / "outer.html"

@@ -4,11 +4,13 @@ import base64
 
 import pytest
 import torch
+from browsers import asked_of_a_network, until
+from shared import merged
 
 from gaussian_swaying.viewer.live_web.block import check, pack_solver
 from gaussian_swaying.viewer.live_web.page import PAGE
 
-from .conftest import apart, asked_of_a_network, drawn_apart, merged, opened
+from .conftest import apart, drawn_apart, opened
 from .test_block import CASES, OBSTACLES, PLANE, run
 
 LOST = "WebGPU is not used, as {}: the processor computes the motion."
@@ -67,11 +69,11 @@ def on_gpu(context):
 
 
 @pytest.fixture
-def show(context, until):
+def show(context):
     pages = []
 
     def show(path, settings=""):
-        pages.append(opened(context, path, settings, until))
+        pages.append(opened(context, path, settings))
         return pages[-1]
 
     yield show
@@ -121,7 +123,7 @@ def test_contact_with_what_stands_still(make, on_gpu, name, law):
     assert abs(told[-1]["substeps"] - steps) <= 0.02 * steps
 
 
-def test_a_page_after_two_seconds_and_after_its_device_is_lost(show, written, make, until):
+def test_a_page_after_two_seconds_and_after_its_device_is_lost(show, written, make):
     """Within 1 % of the motion. Then the processor goes on with the motion, and the page says so."""
     page = show(written, "#solver=webgpu")
     page.evaluate("windPage.complete.then(() => windPage.pause())")
@@ -142,7 +144,7 @@ def test_a_page_after_two_seconds_and_after_its_device_is_lost(show, written, ma
     assert asked_of_a_network(page) == []
 
 
-def test_chosen_by_hand(show, written, until):
+def test_chosen_by_hand(show, written):
     """By itself a page takes no adapter in software, and says nothing; another solver goes on with the motion."""
     page = show(written, "")
     until(lambda: page.evaluate("windPage.why()") == "it would run on the processor")
