@@ -211,20 +211,7 @@ class DiffuseShader(Shader):
         rest_normal: Tensor | None = None,
         view_direction: Tensor | None = None,
     ) -> Tensor:
-        """Shade colours.
-
-        Args:
-            color: Colours, shape (..., 3).
-            normal: Unit normals in the metric frame, shape (..., 3).
-            rest_normal: Unit normals of the rest shape, shape (..., 3); needed when the shading is relative.
-            view_direction: Not used.
-
-        Returns:
-            Shaded colours, shape (..., 3).
-
-        Raises:
-            ValueError: If ``rest_normal`` is missing although the shading is relative, or a shape is wrong.
-        """
+        """See :class:`Shader`."""
         rest = _check_rest(self.relative, rest_normal)
         return diffuse_shading(color, normal, self.light.to(normal), self.two_sided, self.ambient, rest)
 
@@ -275,21 +262,7 @@ class PhongShader(Shader):
         rest_normal: Tensor | None = None,
         view_direction: Tensor | None = None,
     ) -> Tensor:
-        """Shade colours.
-
-        Args:
-            color: Colours, shape (..., 3).
-            normal: Unit normals in the metric frame, shape (..., 3).
-            rest_normal: Unit normals of the rest shape, shape (..., 3); needed when the shading is relative.
-            view_direction: Unit vectors from the surface to the eye in the metric frame, shape (..., 3).
-
-        Returns:
-            Shaded colours, shape (..., 3).
-
-        Raises:
-            ValueError: If ``view_direction`` is missing, ``rest_normal`` is missing although the shading is relative,
-                or a shape is wrong.
-        """
+        """See :class:`Shader`."""
         if view_direction is None:
             raise ValueError("Expected `view_direction` to be given, because the highlight depends on it.")
         return phong_shading(

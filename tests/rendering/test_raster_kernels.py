@@ -7,19 +7,17 @@ import torch
 
 from gaussian_swaying.kernels.launch import compiles
 from gaussian_swaying.rendering import raster, torch_renderer
-from gaussian_swaying.rendering.cameras.camera import Camera, look_at_camera
+from gaussian_swaying.rendering.cameras.camera import Camera
 from gaussian_swaying.rendering.torch_renderer import TorchRenderer, render_torch
+
+from .conftest import oblique
 
 pytestmark = pytest.mark.skipif(not compiles("cpu") or raster.INTERPRETED, reason="needs kernels compiled for the CPU")
 BACKGROUND = torch.tensor([0.9, 0.1, 0.4])
 
 
-def _camera(width=61, height=43, near=0.2):
-    camera = look_at_camera((0.1, -2.5, 0.2), (0, 0, 0), (0, 0, 1), 50.0, width, height, near, dtype=torch.float32)
-    intrinsics = camera.intrinsics.clone()
-    intrinsics[0, 2] += 1.3  # principal point off the centre
-    intrinsics[0, 0] *= 1.1  # pixels that are not square
-    return Camera(camera.world_to_camera, intrinsics, width, height, near)
+def _camera(width=61, height=43):
+    return oblique(width, height, 2.5, torch.float32)
 
 
 def _scene(count=300, seed=3, size=0.08):
