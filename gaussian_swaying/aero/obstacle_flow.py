@@ -1,4 +1,4 @@
-"""Flow round bodies in closed form: potential flow, wakes, and the street of vortices behind a cylinder."""
+"""Flow round bodies in closed form: potential flow and wakes."""
 
 from __future__ import annotations
 
@@ -10,15 +10,6 @@ import torch
 from torch import Tensor
 
 from gaussian_swaying._devices import in_double
-
-STREET_SPEED = 0.86
-"""Speed of the vortices of a street per speed of the flow (Roshko 1954, NACA report 1191)."""
-
-KARMAN_RATIO = 0.281
-"""Distance of the two rows of a street per distance of the vortices in a row (von Karman 1911; Lamb 1932, 156)."""
-
-CORE = 0.3
-"""Width of the cores of the vortices: delta in :func:`vortex_street`."""
 
 PLANE_GROWTH = 0.29 / math.sqrt(2 * math.log(2))
 """Standard deviation of a plane wake per root of thickness times distance (Wygnanski and others 1986)."""
@@ -177,43 +168,3 @@ def plane_wake(behind: Tensor, aside: Tensor, width: float, drag: float) -> Tens
     sigma = sigma.clamp(min=2 * thickness / math.sqrt(math.pi))  # nearer, no wake of this shape takes the momentum
     depth = (1 - (1 - 2 * thickness / (math.sqrt(math.pi) * sigma)).clamp(min=0).sqrt()) / math.sqrt(2)
     return torch.where(behind > 0, depth * torch.exp(-0.5 * (aside / sigma).square()), 0.0)
-
-
-def vortex_street(behind: Tensor, aside: Tensor, width: float, turns: Tensor, strouhal: float) -> Tensor:
-    r"""Velocity of a street of vortices along and across the flow, per speed of the flow, without its mean.
-
-    Two rows of vortices of opposite sign, staggered, a distance l apart in each, at a distance of 0.281 l (von Karman;
-    Lamb 1932, 156). One row at y = 0 has the stream function
-    :math:`\psi = -\tfrac{\Gamma}{4 \pi} \ln\bigl(\cosh \tfrac{2 \pi y}{l} - \cos \tfrac{2 \pi x}{l} + \delta\bigr)`,
-    where delta = 0.3 gives each vortex a core. They drift at 0.86 of the flow (Roshko 1954) and are shed at the
-    frequency St U / d, so that l = 0.86 d / St, and a street that drifts so slowly has the circulation
-    :math:`\Gamma = 0.14 \sqrt8\, U l`. The street forms within two widths and fades over thirty (both ours). The mean
-    velocity deficit is part of the wake, not of the street.
-
-    Args:
-        behind: Distance downwind of the centre [m], any shape.
-        aside: Distance from the plane behind the axis [m], with its sign, as ``behind``.
-        width: Width d of the body [m].
-        turns: Number of vortices that each row has shed since time zero, scalar: the distance that the flow was carried
-            times St / d.
-        strouhal: St.
-
-    Returns:
-        Shape (..., 2).
-    """
-    length = STREET_SPEED * width / strouhal
-    half = 0.5 * KARMAN_RATIO * length
-    strength = 0.5 * (1 - STREET_SPEED) * math.sqrt(8)  # Gamma / (2 l U)
-    phase = 2 * math.pi * (behind / length - turns)
-    u, v = torch.zeros_like(phase), torch.zeros_like(phase)
-    for sign in (1.0, -1.0):
-        y = (2 * math.pi / length) * (aside - sign * half)
-        x = phase if sign > 0 else phase + math.pi
-        rise = torch.cosh(y.clamp(-20, 20)) + CORE
-        bottom = rise - torch.cos(x)
-        steep = torch.sinh(y.clamp(-20, 20))
-        u = u + sign * steep * (1 / bottom - 1 / (rise.square() - 1).sqrt())  # the mean over a length is taken off
-        v = v - sign * torch.sin(x) / bottom
-    along = (behind / (2 * width)).clamp(0, 1)
-    fade = along.square() * (3 - 2 * along) * torch.exp(-behind.clamp(min=0) / (30 * width))
-    return strength * torch.stack([u, v], dim=-1) * fade[..., None]

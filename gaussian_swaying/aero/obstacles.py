@@ -18,7 +18,6 @@ from gaussian_swaying.aero.obstacle_flow import (
     ellipsoid_strength,
     plane_wake,
     round_wake,
-    vortex_street,
     wake_start,
 )
 from gaussian_swaying.geometry.frame import SimFrame
@@ -48,17 +47,15 @@ class Obstacle(WindEffect):
         """Potential flow at places from the centre [m], shape (..., P, 3)."""
 
     @abstractmethod
-    def wake(self, place: Tensor, moment: Moment) -> tuple[Tensor, Tensor | None]:
-        """Velocity deficit as a share of the speed (..., P), and velocity of the vortices [m/s] (..., P, 3) or None."""
+    def wake(self, place: Tensor, moment: Moment) -> Tensor:
+        """Velocity deficit as a share of the speed, shape (..., P)."""
 
     def forward(self, velocity: Tensor, position: Tensor, moment: Moment) -> Tensor:
         place = position - self.middle.to(position)
         found = self.around(velocity.to(position).expand_as(position), place)
         if self.drag == 0:
             return found
-        missing, swirl = self.wake(place, moment)
-        found = found * (1 - missing[..., None])
-        return found if swirl is None else found + swirl
+        return found * (1 - self.wake(place, moment)[..., None])
 
     def moved(self: AnyObstacle, frame: SimFrame) -> AnyObstacle:
         """A copy with its centre in metres, z up."""
@@ -75,15 +72,13 @@ def _direction(moment: Moment, place: Tensor) -> tuple[Tensor, Tensor]:
 
 
 class CylinderObstacle(Obstacle):
-    """A long pole in the wind, with the street of vortices that makes a flag behind it flap.
+    """A long pole in the wind.
 
     Args:
         center: A point on its axis, in scene units.
         radius: In scene units.
         axis: Direction of its axis.
-        drag: Drag coefficient of its wake; 1.2 for a pole in wind, 0 for no wake and no street.
-        street: Whether it sheds vortices.
-        strouhal: Their frequency times the width per speed of the flow: 0.2 for poles in wind.
+        drag: Drag coefficient of its wake; 1.2 for a pole in wind, 0 for no wake.
     """
 
     def __init__(
@@ -92,13 +87,10 @@ class CylinderObstacle(Obstacle):
         radius: float,
         axis: Sequence[float] = (0.0, 0.0, 1.0),
         drag: float = 1.2,
-        street: bool = True,
-        strouhal: float = 0.2,
     ) -> None:
         super().__init__(center, drag)
         check_positive("radius", radius)
-        check_positive("strouhal", strouhal)
-        self.radius, self.street, self.strouhal = float(radius), bool(street), float(strouhal)
+        self.radius = float(radius)
         given = torch.tensor(check_vector("axis", axis), dtype=torch.float64)
         if not float(given.norm()) > 0:
             raise ValueError("Expected `axis` to have a direction, but it is zero.")
@@ -111,52 +103,23 @@ class CylinderObstacle(Obstacle):
     def twin(self) -> Twin:
         from gaussian_swaying.aero.obstacles_triton import past_cylinder
 
-        def now(moment: Moment) -> Tensor:
-            return torch.cat([moment.flow, self.turns(moment.flow, moment.carried)[..., None]], dim=-1)
-
-        wake, numbers = self.drag > 0, (self.radius, self.drag, self.strouhal)
         return Twin(
             past_cylinder,
-            options=(wake, wake and self.street),
-            numbers=Numbers(9, lambda: torch.cat([self.middle, self.axis, self.middle.new_tensor(numbers)])),
-            per_substep=Numbers(4, now),
+            options=(self.drag > 0,),
+            numbers=Numbers(
+                8, lambda: torch.cat([self.middle, self.axis, self.middle.new_tensor([self.radius, self.drag])])
+            ),
+            per_substep=Numbers(3, lambda moment: moment.flow),
             sources=(self,),
         )
 
-    def wake(self, place: Tensor, moment: Moment) -> tuple[Tensor, Tensor | None]:
+    def wake(self, place: Tensor, moment: Moment) -> Tensor:
         axis = self.axis.to(place)
-        across, speed = self._across(moment.flow)
-        direction = across.to(place)
-        speed = speed[0]
+        flow = moment.flow.to(place)
+        across = flow - (flow * axis).sum() * axis  # what flows along it meets nothing
+        direction = across / torch.linalg.vector_norm(across).clamp(min=1e-12)
         left = torch.linalg.cross(axis, direction)
-        behind, aside, width = (place * direction).sum(-1), (place * left).sum(-1), 2 * self.radius
-        missing = plane_wake(behind, aside, width, self.drag)
-        if not self.street:
-            return missing, None
-        turns = self.turns(moment.flow, moment.carried).to(place)
-        u, v = vortex_street(behind, aside, width, turns, self.strouhal).unbind(-1)
-        outside = behind.square() + aside.square() >= self.radius**2
-        swirl = (u[..., None] * direction + v[..., None] * left) * speed.to(place)
-        return missing, torch.where(outside[..., None], swirl, 0.0)
-
-    def _across(self, flow: Tensor) -> tuple[Tensor, Tensor]:
-        """Unit vectors of the flow (..., 3) across the axis, zero without one, and its speed, shape (..., 1)."""
-        across = flow - (flow * self.axis).sum(-1, keepdim=True) * self.axis  # what flows along it meets nothing
-        speed = torch.linalg.vector_norm(across, dim=-1, keepdim=True)
-        return across / speed.clamp(min=1e-12), speed
-
-    def turns(self, flow: Tensor, carried: Tensor) -> Tensor:
-        """Return the phase of the vortex street: the share of the way to the next vortex, from 0 to 1.
-
-        Args:
-            flow: The mean flow [m/s], shape (..., 3), float64.
-            carried: Displacement of the air by it since time zero [m], shape (..., 3), float64.
-
-        Returns:
-            Shape (...).
-        """
-        way = (carried * self._across(flow)[0]).sum(-1)
-        return (way * (self.strouhal / (2 * self.radius))).remainder(1.0)
+        return plane_wake((place * direction).sum(-1), (place * left).sum(-1), 2 * self.radius, self.drag)
 
     def in_frame(self, frame: SimFrame) -> WindEffect:
         """In metres, z up."""
@@ -211,7 +174,7 @@ class EllipsoidObstacle(Obstacle):
             sources=(self,),
         )
 
-    def wake(self, place: Tensor, moment: Moment) -> tuple[Tensor, Tensor | None]:
+    def wake(self, place: Tensor, moment: Moment) -> Tensor:
         """See :class:`Obstacle`: the Gaussian is as wide, and as high, as the body is across the flow."""
         direction, _ = _direction(moment, place)
         side = torch.stack([-direction[1], direction[0], torch.zeros_like(direction[0])])
@@ -223,7 +186,7 @@ class EllipsoidObstacle(Obstacle):
         behind, left, above = ((place * part).sum(-1) for part in (direction, side, up))
         narrow = [mean / size.clamp(min=1e-12) for size in (wide, high)]
         aside = ((left * narrow[0]).square() + (above * narrow[1]).square()).sqrt()
-        return round_wake(behind / mean, aside / mean, 1.0, self.drag), None
+        return round_wake(behind / mean, aside / mean, 1.0, self.drag)
 
     def in_frame(self, frame: SimFrame) -> WindEffect:
         """In metres, z up."""

@@ -7,11 +7,7 @@ from gaussian_swaying.aero import obstacle_flow
 from gaussian_swaying.geometry.linalg_triton import chosen, cross3, dot3, scale3
 from gaussian_swaying.kernels.language import tl, triton
 
-PI = tl.constexpr(3.141592653589793)
-STREET_SPEED = tl.constexpr(obstacle_flow.STREET_SPEED)
-KARMAN_RATIO = tl.constexpr(obstacle_flow.KARMAN_RATIO)
 PLANE_GROWTH = tl.constexpr(obstacle_flow.PLANE_GROWTH)
-CORE = tl.constexpr(obstacle_flow.CORE)
 ROUND_GROWTH = tl.constexpr(obstacle_flow.ROUND_GROWTH)
 NEWTON = tl.constexpr(7)  # steps to the root for an ellipsoid: from two thirds of its distance to float32
 DUPLICATIONS = tl.constexpr(5)  # of Carlson's integral, to float32
@@ -51,34 +47,10 @@ def plane_wake(behind, aside, width, drag):
 
 
 @triton.jit
-def vortex_street(behind, aside, width, turns, strouhal):
-    """As ``obstacle_flow.vortex_street``."""
-    length = STREET_SPEED * width / strouhal
-    strength = 0.5 * (1 - STREET_SPEED) * 2.8284271247461903
-    phase = 2 * PI * (behind / length - turns)
-    u = behind * 0
-    v = behind * 0
-    for row in tl.static_range(2):
-        sign = 1.0 - 2.0 * row
-        y = (2 * PI / length) * aside - sign * (PI * KARMAN_RATIO)
-        y = tl.minimum(tl.maximum(y, -20.0), 20.0)
-        up = tl.exp(y)
-        down = 1 / up
-        rise = 0.5 * (up + down) + CORE
-        steep = 0.5 * (up - down)
-        bottom = rise - sign * tl.cos(phase)
-        u += sign * steep * (1 / bottom - 1 / tl.sqrt(rise * rise - 1))
-        v -= tl.sin(phase) / bottom  # the other row has the opposite sign and half a turn more
-    along = tl.minimum(tl.maximum(behind / (2 * width), 0.0), 1.0)
-    fade = strength * along * along * (3 - 2 * along) * tl.exp(-tl.maximum(behind, 0.0) / (30 * width))
-    return u * fade, v * fade
-
-
-@triton.jit
 def past_cylinder(v, x, numbers, now, table, OPTIONS: tl.constexpr):
-    """``CylinderObstacle``; ``numbers``: middle (3), axis (3), radius, drag, Strouhal number.
+    """``CylinderObstacle``; ``numbers``: middle (3), axis (3), radius, drag; ``now``: the mean flow.
 
-    ``now``: the mean flow, and the phase of the vortex street. ``OPTIONS``: whether it has a wake, and a street.
+    ``OPTIONS``: whether it has a wake.
     """
     radius = numbers[6]
     axis = (numbers[3], numbers[4], numbers[5])
@@ -101,21 +73,11 @@ def past_cylinder(v, x, numbers, now, table, OPTIONS: tl.constexpr):
     if OPTIONS[0]:
         rising = dot3(now, axis)
         flow = (now[0] - rising * axis[0], now[1] - rising * axis[1], now[2] - rising * axis[2])
-        direction, speed = _direction(flow)
+        direction, _ = _direction(flow)
         left = cross3(axis, direction)
         behind = dot3(p, direction)
         aside = dot3(p, left)
         v = scale3(1 - plane_wake(behind, aside, 2 * radius, numbers[7]), v)
-        if OPTIONS[1]:
-            a, b = vortex_street(behind, aside, 2 * radius, now[3], numbers[8])
-            swirls = behind * behind + aside * aside >= radius * radius
-            a = tl.where(swirls, a, 0.0) * speed
-            b = tl.where(swirls, b, 0.0) * speed
-            v = (
-                v[0] + a * direction[0] + b * left[0],
-                v[1] + a * direction[1] + b * left[1],
-                v[2] + a * direction[2] + b * left[2],
-            )
     return v
 
 

@@ -10,14 +10,13 @@ from gaussian_swaying.scenes.sand import SandScene
 from gaussian_swaying.scenes.solid import SolidScene
 from gaussian_swaying.scenes.telephone import TelephoneScene
 from gaussian_swaying.scenes.vase import VaseScene
-from gaussian_swaying.scenes.windbreaks import FicusBehindWallScene, FlagBehindPoleScene, PlantRowScene
+from gaussian_swaying.scenes.windbreaks import FicusBehindWallScene, PlantRowScene
 
 __all__ = [
     "AlocasiaScene",
     "ClothScene",
     "FicusBehindWallScene",
     "FicusScene",
-    "FlagBehindPoleScene",
     "FlagOnStandScene",
     "FlagScene",
     "GivenScene",

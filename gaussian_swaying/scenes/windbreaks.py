@@ -1,4 +1,4 @@
-"""Scenes that show wind with a shape: a flag behind a pole, a row of plants, and a ficus behind a wall."""
+"""Scenes that show wind with a shape: a row of plants, and a ficus behind a wall."""
 
 from __future__ import annotations
 
@@ -8,46 +8,10 @@ import torch
 
 from gaussian_swaying.gaussians.cloud import GaussianCloud
 from gaussian_swaying.scenes.ficus import FicusScene
-from gaussian_swaying.scenes.flag_on_stand import METAL, FlagOnStandScene
-from gaussian_swaying.scenes.patches import Patches, box, copies, disc, facing, join, to_cloud, tube
+from gaussian_swaying.scenes.patches import Patches, box, copies, facing, join, to_cloud, tube
 from gaussian_swaying.scenes.plant_parts import Draw, bezier, leaf, tints
 from gaussian_swaying.scenes.procedural import ProceduralScene, both
 from gaussian_swaying.scenes.stage import cast, floor
-
-
-@dataclass(eq=False)
-class FlagBehindPoleScene(ProceduralScene):
-    """A :class:`FlagOnStandScene` on a thin pole, and a thick pole upwind of it, at negative x.
-
-    The flag is in the x-z plane from x = 0 on, with its lower edge at z = 0; only it is meant to move.
-
-    Args:
-        width: Length of the flag along x [m].
-        height: Length along z [m].
-        spacing: Distance between Gaussians of the flag [m].
-        radius: Radius of the thick pole [m].
-        distance: Distance of its axis from the edge of the flag [m].
-    """
-
-    width: float = 1.2
-    height: float = 0.8
-    spacing: float = 0.0125
-    radius: float = 0.09
-    distance: float = 0.45
-
-    def __post_init__(self) -> None:
-        self.check("radius")
-        least = self.radius + 0.05
-        if not self.distance > least:
-            raise ValueError(f"Expected `generator.distance` of more than {least:g} m, but got {self.distance} m.")
-        self.flag = FlagOnStandScene(self.width, self.height, self.spacing)
-
-    def generate(self) -> GaussianCloud:
-        """Make all; the flag comes first."""
-        ends = [[-self.distance, 0.0, -2.0 * self.height], [-self.distance, 0.0, 1.45 * self.height]]
-        pole = tube(ends, [self.radius] * 2, min(0.02, 0.4 * self.radius), METAL)
-        top = disc((-self.distance, 0.0, 1.45 * self.height), self.radius, 0.02, METAL)
-        return both(self.flag.generate(), to_cloud(join([pole, top]), two_sided=False))
 
 
 @dataclass(eq=False)

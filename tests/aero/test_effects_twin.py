@@ -57,7 +57,7 @@ def _wind(name):
         ],
         "several": [
             LogProfile(**low, roughness=0.02),
-            CylinderObstacle([0.02, 0.1, 0.1], 0.02, street=False),
+            CylinderObstacle([0.02, 0.1, 0.1], 0.02),
             Turbulence(0.5, 0.1, cells=[8, 6, 4], spacing=0.03),
             CylinderObstacle([0.05, 0.15, 0.1], 0.01),
             EllipsoidObstacle(MIDDLE, [0.03] * 3, drag=0.0),

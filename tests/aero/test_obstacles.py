@@ -10,13 +10,11 @@ from torch.testing import assert_close
 from gaussian_swaying import SimFrame, WindField
 from gaussian_swaying.aero.effects import Moment
 from gaussian_swaying.aero.obstacle_flow import (
-    STREET_SPEED,
     carlson_rd,
     cylinder_flow,
     ellipsoid_flow,
     plane_wake,
     round_wake,
-    vortex_street,
 )
 from gaussian_swaying.aero.obstacles import CylinderObstacle, EllipsoidObstacle
 
@@ -113,37 +111,6 @@ def test_wakes_take_the_momentum_of_the_drag():
         assert share[:20].abs().max() == 0.0
         assert 0.3 < share.max() < 1
         assert (share[100:].diff() < 0).all()
-
-
-def test_a_street_has_its_strouhal_number_and_no_mean():
-    """The lift side of a pole of 0.1 m in 5 m/s sees vortices of each side at 0.2 x 5 / 0.1 = 10 per second."""
-    pole = CylinderObstacle([0.0, 0.0, 0.0], 0.05, strouhal=0.2)
-    wind = WindField([3.0, 4.0, 0.0], effects=[pole])
-    direction = double([0.6, 0.8, 0.0])
-    left = double([-0.8, 0.6, 0.0])
-    place = (0.6 * direction)[None]
-    times = torch.arange(2000, dtype=DOUBLE) / 500
-    series = torch.stack([wind.at(t, place)[0] for t in times])
-    across = series @ left
-    power = torch.fft.rfft(across).abs()
-    assert float(torch.fft.rfftfreq(2000, 1 / 500)[int(power[1:].argmax()) + 1]) == pytest.approx(10.0, abs=0.26)
-    assert across.mean().abs() < 1e-3 * float(across.std())
-    assert 0.3 < across.std() < 2.5  # a tenth to a half of the wind
-    along = (series @ direction).mean()
-    calm = CylinderObstacle([0.0, 0.0, 0.0], 0.05, street=False)
-    still = WindField([3.0, 4.0, 0.0], effects=[calm]).at(times[0], place)[0] @ direction
-    assert float(along) == pytest.approx(float(still), abs=0.02)
-
-
-def test_a_street_drifts_and_has_no_divergence_where_it_does_not_fade():
-    def found(x, turns=0.0):
-        return vortex_street(x[0], x[1], 1e-3, double(turns), 0.2) * torch.exp(x[0] / 0.03)
-
-    for x in (double([0.0213, 3e-4]), double([0.0224, -2e-3])):
-        slope = torch.func.jacrev(found)(x)
-        assert float(slope[0, 0] + slope[1, 1]) == pytest.approx(0.0, abs=1e-9 * float(slope.abs().max()))
-        length = STREET_SPEED * 1e-3 / 0.2
-        assert_close(found(x + torch.tensor([0.3 * length, 0.0]), 0.3), found(x))
 
 
 @pytest.mark.parametrize("turn", [0.0, 30.0])

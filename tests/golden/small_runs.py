@@ -88,7 +88,6 @@ SMALLER = {
     "sand": {SPACING: 0.11, "solver.dx": 0.11, "material.E": 2e4},
     "plant_row": {SPACING: 0.05, "solver.dx": 0.13},
     "ficus_behind_wall": {SPACING: 0.1, SPARSE: 200, "solver.dx": 0.2},
-    "flag_behind_pole": {SPACING: 0.025, "solver.dx": 0.11},
     "alocasia": {SPACING: 0.05, "solver.dx": 0.11},
     "flag1": {SPACING: 0.04, "solver.dx": 0.09},
     "flag2": {SPACING: 0.04, "solver.dx": 0.09},

@@ -11,7 +11,6 @@ from gaussian_swaying.scenes import (
     AlocasiaScene,
     FicusBehindWallScene,
     FicusScene,
-    FlagBehindPoleScene,
     FlagOnStandScene,
     LeavesScene,
     PlantRowScene,
@@ -193,21 +192,6 @@ def test_ups_are_up():
 def test_bad_arguments_are_refused(scene, name, value):
     with pytest.raises(ValueError, match=rf"generator\.{name}"):
         scene(**{name: value})
-
-
-def test_the_flag_behind_a_pole_stands_behind_it():
-    """The flag first, then its stand, then the thick pole, whose patches face away from its axis."""
-    scene = FlagBehindPoleScene(spacing=0.1, radius=0.1, distance=0.5)
-    cloud, flag = scene.generate(), FlagOnStandScene(spacing=0.1).generate()
-    assert torch.equal(cloud.means[: len(flag)], flag.means)
-    pole = cloud.means[len(flag) :]
-    assert (torch.hypot(pole[:, 0] + 0.5, pole[:, 1]) - 0.1).amax() < 1e-3
-    normals = cloud.normals[len(flag) :]
-    side = pole[:, 2] < 1.45 * 0.8 - 1e-3
-    spokes = torch.stack([pole[:, 0] + 0.5, pole[:, 1], torch.zeros(len(pole))], dim=-1)[side]
-    assert_close((normals[side] * spokes).sum(-1).abs(), spokes.norm(dim=-1), rtol=1e-3, atol=0)
-    with pytest.raises(ValueError, match=r"`generator.distance` of more than 0\.15 m"):
-        FlagBehindPoleScene(radius=0.1, distance=0.1)
 
 
 def test_plants_stand_in_a_row():

@@ -24,7 +24,7 @@ PAPER = {
 }
 
 
-SHAPED = ("flag_behind_pole", "plant_row", "ficus_behind_wall")
+SHAPED = ("plant_row", "ficus_behind_wall")
 """Scenes of docs/wind.md, which are not the paper's."""
 
 

@@ -54,7 +54,7 @@ def test_every_effect_can_be_named_in_a_configuration(tmp_path):
         "{class_path: PowerProfile}",
         "{class_path: Turbulence, init_args: {cells: [8, 8, 8]}}",
         "{class_path: EllipsoidObstacle, init_args: {center: [0, 0, 0], radii: [1.0, 1.0, 1.0]}}",
-        "{class_path: CylinderObstacle, init_args: {center: [0, 0, 0], radius: 1.0, street: false}}",
+        "{class_path: CylinderObstacle, init_args: {center: [0, 0, 0], radius: 1.0}}",
         "{class_path: EllipsoidObstacle, init_args: {center: [0, 0, 0], radii: [1, 2, 3]}}",
         "{class_path: Shelter}",
     ]
