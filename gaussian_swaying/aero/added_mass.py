@@ -75,6 +75,3 @@ class AirLift(Force):
         from gaussian_swaying.aero.force_triton import steady_force
 
         return Twin(steady_force, per_point=Numbers(3, lambda: self.force), sources=(self.force,))
-
-
-__all__ = ["AirLift", "carried_mass", "with_added_mass"]

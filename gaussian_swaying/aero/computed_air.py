@@ -503,6 +503,3 @@ class AirInBox:
 
 def _rounded(values: Sequence[float]) -> str:
     return "(" + ", ".join(f"{value:.3g}" for value in values) + ")"
-
-
-__all__ = ["AirInBox", "AirPush", "ComputedAir", "Resolution", "resolution"]

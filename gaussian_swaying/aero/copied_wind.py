@@ -79,6 +79,3 @@ class CopiedWind(SpatialWind):
             velocity = self.wind.at(when, place) if isinstance(self.wind, WindField) else self.wind(when, place)
         found: Tensor = velocity @ self.turn.to(velocity)
         return found
-
-
-__all__ = ["CopiedWind"]

@@ -78,6 +78,3 @@ def look(
     flow = (given.speed if speed is None else speed) * along / along.norm()
     gusts = Turbulence(given.intensity, turbulence_length(height), cells=CELLS, seed=seed)
     return WindField(flow, effects=[gusts], seed=seed)
-
-
-__all__ = ["LOOKS", "Look", "look"]

@@ -122,6 +122,3 @@ def _joined(parts: list[Modulation], device: torch.device) -> nn.Module:
         delattr(joined, name)
         joined.register_buffer(name, values[:, None] if vector else values)
     return joined
-
-
-__all__ = ["WindBatch", "why_apart"]

@@ -383,6 +383,3 @@ def _blow(wind: nn.Module, times: Tensor) -> Tensor:
             return found
     velocity: Tensor = wind(times)
     return velocity.to(times.device)
-
-
-__all__ = ["WindForce"]

@@ -133,6 +133,3 @@ def collide(
     )
     kept = 1 - 1 / relaxation_time(stress, rho, molecular, smagorinsky)
     return torch.cat([excess[None], u if push is None else u + push, kept * stress])
-
-
-__all__ = ["MOMENTS", "PAIRS", "collide", "population", "relaxation_time", "sums"]

@@ -316,6 +316,3 @@ def _special(kind: Tensor) -> Tensor:
             found.select(axis, 0).fill_(True)
             found.select(axis, count - 1).fill_(True)
     return (found & (kind == FLUID)).reshape(-1).nonzero()[:, 0].int()
-
-
-__all__ = ["FLUID", "HELD", "MOST_CELLS", "WALL", "Face", "FlowState", "LatticeFlow", "hold"]

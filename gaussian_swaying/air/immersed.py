@@ -154,6 +154,3 @@ def exchange(moments: Tensor, velocity: Tensor, area: Tensor, mass: Tensor, plac
     taken = together(mass, layer)[:, None] * (air - velocity)
     give(moments, taken, place, kind)
     return taken
-
-
-__all__ = ["Reach", "exchange", "give", "look", "together", "velocity_at"]

@@ -59,6 +59,3 @@ class LatticeUnits:
     def cell_mass(self) -> float:
         """Mass of the air in a cell [kg]."""
         return self.density * self.spacing**3
-
-
-__all__ = ["DIRECTIONS", "FASTEST", "OPPOSITE", "SOUND", "WEIGHTS", "LatticeUnits"]

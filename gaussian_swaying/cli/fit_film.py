@@ -360,6 +360,3 @@ def _guesses(preview: Preview, told: Sequence[str], scaled: str) -> list[str]:
     }
     lines.append(f"size of what moves: {size} m, {known[scaled]}")
     return lines
-
-
-__all__ = ["Seen", "extent", "longest_side", "plan_text", "prepare"]

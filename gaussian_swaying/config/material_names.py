@@ -71,5 +71,3 @@ def with_material_option(arguments: Sequence[str]) -> list[str]:
 
 NAMES = ", ".join(MATERIALS)
 """The names, for help."""
-
-__all__ = ["NAMES", "with_material_option", "with_named_materials"]

@@ -175,6 +175,3 @@ def cells(
         REACH=reach, PI=torch.pi, BLOCK=block,
     )  # fmt: skip
     return out, same.mT.bool()
-
-
-__all__ = ["cells"]

@@ -401,15 +401,3 @@ def launch(kernel: Any, grid: Sequence[int], *given: Any, **named: Any) -> None:
     if _current.recording is not None:
         _current.recording.add(address, arguments, programs, tensors)
     _run_rows((ctypes.c_int64 * _ROW)(address, ctypes.addressof(arguments), programs, 0, 0, 0), 1)
-
-
-__all__ = [
-    "Recording",
-    "call",
-    "compiled",
-    "compiled_sentence",
-    "device_source",
-    "launch",
-    "recording",
-    "threads",
-]

@@ -77,6 +77,3 @@ def _bits(emit: Emitter, x: Block) -> Block:
 def _float(emit: Emitter, bits: Block) -> Block:
     value = emit.builder.bitcast(bits.value, emit.type_of("f32", bits.lanes))
     return Block(value, "f32", bits.shape)
-
-
-__all__ = ["exp", "log"]

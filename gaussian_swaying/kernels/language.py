@@ -125,5 +125,3 @@ if ON_GPU:
 else:
     triton = Compiler()
     tl = triton.language
-
-__all__ = ["INTERPRETED", "ON_GPU", "Constant", "Function", "Language", "Name", "tl", "triton"]

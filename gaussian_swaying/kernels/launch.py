@@ -97,6 +97,3 @@ def call(change: Callable[[], object], device: torch.device) -> None:
     from gaussian_swaying.kernels import cpu
 
     cpu.call(change)
-
-
-__all__ = ["LANES", "call", "compiles", "lanes", "launch", "replaces", "wide"]

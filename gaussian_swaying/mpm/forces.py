@@ -164,6 +164,3 @@ def divide(forces: Sequence[Force]) -> tuple[tuple[Force, ...], list[Twin], tupl
     fused = tuple(force for force, twin in zip(forces, twins, strict=True) if twin is not None)
     asked = tuple(force for force, twin in zip(forces, twins, strict=True) if twin is None)
     return fused, [twin for twin in twins if twin is not None], asked
-
-
-__all__ = ["Force", "ForceFunction", "Forces", "FunctionForce", "as_forces"]

@@ -190,6 +190,3 @@ def turn_between(first: Tensor, second: Tensor) -> Tensor:
     cosine = 0.5 * (change.diagonal(dim1=-2, dim2=-1).sum(-1, keepdim=True) - 1)
     small = sine < 1e-6
     return torch.where(small, 1.0, torch.atan2(sine, cosine) / torch.where(small, 1.0, sine)) * axial
-
-
-__all__ = ["Joints", "PointJoint"]

@@ -120,6 +120,3 @@ def name_of(E: float, nu: float, density: float) -> str | None:
     """The name of the material with these numbers; None if there is none."""
     found = (name for name, known in MATERIALS.items() if (known.E, known.nu, known.density) == (E, nu, density))
     return next(found, None)
-
-
-__all__ = ["MATERIALS", "KnownMaterial", "known_material", "name_of"]

@@ -231,6 +231,3 @@ class Solver(nn.Module, ABC):
         """The boundaries in metres."""
         given = [part for part in self.boundaries if isinstance(part, Boundary)]
         return given if frame is None else [part.in_frame(frame) for part in given]
-
-
-__all__ = ["Solver", "WatchFunction"]

@@ -225,6 +225,3 @@ def _pieces(
         entries = [(start + first, twin.numbers)] if numbers else []
         entries += [(start + table + part.size, twin.table)]
         yield twin.sources, [(place, values) for place, values in entries if values.count]
-
-
-__all__ = ["Numbers", "Twin"]

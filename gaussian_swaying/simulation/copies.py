@@ -168,6 +168,3 @@ def _foot(scene: SimulatedScene, boundaries: Iterable[nn.Module]) -> Tensor:
         return torch.zeros(3, dtype=torch.float64)
     low, high = found.aminmax(dim=0)
     return 0.5 * (low + high)
-
-
-__all__ = ["Copies", "Copy", "check_recorder", "copies_of"]

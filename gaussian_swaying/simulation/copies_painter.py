@@ -103,6 +103,3 @@ class CopiesPainter(Painter):
         opacity = self.scene.model.opacity()
         own = torch.cat([opacity[self.scene.moving], opacity[self.held]])
         return torch.cat([opacity[self.still], own.repeat(len(self.copies))])
-
-
-__all__ = ["CopiesPainter"]

@@ -58,6 +58,3 @@ def classify(simulation: Simulation) -> Roles:
 def conditions(simulation: Simulation) -> list[Boundary]:
     """The boundary conditions of a run, in scene units."""
     return [b for b in simulation.solver.boundaries if isinstance(b, Boundary)]
-
-
-__all__ = ["Roles", "classify", "conditions"]

@@ -94,15 +94,3 @@ def scaled_adam(rate: float, devices: int) -> dict[str, Any]:
 def steps_of(images: int, devices: int) -> int:
     """Steps that take so many images, rounded up."""
     return -(-images // devices)
-
-
-__all__ = [
-    "check_alike",
-    "scaled_adam",
-    "seen_by_any",
-    "several_devices",
-    "share_gradients",
-    "steps_of",
-    "sum_over_devices",
-    "this_device",
-]

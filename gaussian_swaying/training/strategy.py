@@ -24,6 +24,3 @@ def check_strategy(trainer: Any) -> None:
             "Expected `trainer.strategy` to be auto, or SplatParallel in Python, for several devices, but got "
             f"{type(trainer.strategy).__name__}: Lightning's own ones keep the Gaussians of the start."
         )
-
-
-__all__ = ["SplatParallel", "check_strategy"]

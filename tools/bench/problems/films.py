@@ -62,9 +62,6 @@ def opengl(camera: Camera) -> Tensor:
     return torch.linalg.inv(camera.world_to_camera.cpu().double()) * torch.tensor([1.0, -1.0, -1.0, 1.0])
 
 
-__all__ = ["opengl", "write_video"]
-
-
 FPS = 30
 MIDDLE = (0.2, 0.05, 0.15)
 """The point at which the hand aims [m]."""
