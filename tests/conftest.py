@@ -3,6 +3,7 @@
 import importlib.util
 import os
 import shutil
+import signal
 import sys
 from pathlib import Path
 
@@ -67,6 +68,15 @@ def kernel_device(request):
 def dtype(request):
     """Each supported precision in turn."""
     return request.param
+
+
+@pytest.fixture
+def default_signals():
+    """Handlers as a shell starts programs with, whatever started the tests."""
+    before = {number: signal.signal(number, signal.SIG_DFL) for number in (signal.SIGTERM, signal.SIGHUP)}
+    yield
+    for number, handler in before.items():
+        signal.signal(number, handler)
 
 
 @pytest.fixture(autouse=True)

@@ -101,6 +101,7 @@ def test_a_killed_run_continues_bit_for_bit(whole, tmp_path, monkeypatch):
 
 
 @pytest.mark.skipif(os.name == "nt", reason="sends SIGTERM")
+@pytest.mark.usefixtures("default_signals")
 def test_a_run_that_is_told_to_end(whole, tmp_path, monkeypatch, capsys):
     """It holds its folder while it lives; then it ends in order, with its video, and names the command to go on."""
     folder = tmp_path / "run"
@@ -111,13 +112,9 @@ def test_a_run_that_is_told_to_end(whole, tmp_path, monkeypatch, capsys):
             refused(main, _arguments(folder, *more), capsys, f"process {os.getpid()} on this host")
         os.kill(os.getpid(), signal.SIGTERM)
 
-    before = signal.signal(signal.SIGTERM, signal.SIG_DFL)
-    try:
-        with monkeypatch.context() as patch:
-            _at(patch, 4, end)
-            assert main(_arguments(folder)) == 143
-    finally:
-        signal.signal(signal.SIGTERM, before)
+    with monkeypatch.context() as patch:
+        _at(patch, 4, end)
+        assert main(_arguments(folder)) == 143
     error = capsys.readouterr().err
     assert f"{folder}/checkpoint.pt contains the run up to frame 3; to continue:\n" in error
     assert error.endswith(" --resume\n")

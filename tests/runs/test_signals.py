@@ -11,16 +11,10 @@ import pytest
 from gaussian_swaying.cli.errors import command, how_to_resume
 from gaussian_swaying.runs.signals import StoppedBySignal, exit_code, reason, stop_signals
 
-pytestmark = pytest.mark.skipif(os.name == "nt", reason="sends signals to itself")
-
-
-@pytest.fixture(autouse=True)
-def _defaults():
-    """Handlers as a shell starts programs with, whatever started the tests."""
-    before = {number: signal.signal(number, signal.SIG_DFL) for number in (signal.SIGTERM, signal.SIGHUP)}
-    yield
-    for number, handler in before.items():
-        signal.signal(number, handler)
+pytestmark = [
+    pytest.mark.skipif(os.name == "nt", reason="sends signals to itself"),
+    pytest.mark.usefixtures("default_signals"),
+]
 
 
 @pytest.mark.parametrize("name", ["SIGTERM", "SIGHUP"])

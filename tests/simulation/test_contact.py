@@ -34,12 +34,16 @@ def _ball(contact=None, boundaries=None, **more):
     )
 
 
+def _fallen(simulation, frames):
+    """Where the cloth is after some frames, and how far outside the ball."""
+    *_, frame = simulation.frames(frames)
+    means = frame.gaussians.means[simulation.scene.simulated]
+    return means, (means - torch.tensor([0.0, 0.0, 0.35])).norm(dim=-1) - 0.3
+
+
 def test_a_cloth_falls_onto_a_ball_and_stays_outside():
     """In scene units, and the places of the surface are Gaussians: they keep half the thickness."""
-    simulation = _ball(Contact())
-    *_, frame = simulation.frames(10)
-    means = frame.gaussians.means[simulation.scene.simulated]
-    away = (means - torch.tensor([0.0, 0.0, 0.35])).norm(dim=-1) - 0.3
+    means, away = _fallen(_ball(Contact()), 10)
     assert float(away.min()) > 0.005
     assert float(away.min()) < 0.02  # it has arrived
     assert float(means[:, 2].min()) < 0.6  # and hangs down beside it
@@ -47,10 +51,7 @@ def test_a_cloth_falls_onto_a_ball_and_stays_outside():
 
 def test_gaussians_that_stand_still_are_an_obstacle():
     """The ball of the splat stops the cloth as the exact one does, to the width of a cell of the distance grid."""
-    simulation = _ball(boundaries=[StillGaussians(cells=48, margin=0.5)])
-    *_, frame = simulation.frames(8)
-    means = frame.gaussians.means[simulation.scene.simulated]
-    away = (means - torch.tensor([0.0, 0.0, 0.35])).norm(dim=-1) - 0.3
+    _, away = _fallen(_ball(boundaries=[StillGaussians(cells=48, margin=0.5)]), 8)
     cell = 1.2 / 48
     assert -0.5 * cell < float(away.min()) - 0.01 < 1.5 * cell
 

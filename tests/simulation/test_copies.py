@@ -66,6 +66,11 @@ def _coloured(degree=1):
     return replace(both, sh=torch.cat([both.sh, more], dim=1))
 
 
+def _along(*borders):
+    """The part of each Gaussian, by borders along x."""
+    return torch.bucketize(_coloured().means[:, 0].contiguous(), torch.tensor(borders))
+
+
 def _simulation(copies=(), wind=None, cloud=None, solver=None, scene=None, **more):
     solver = {"dx": 0.2, "boundaries": [PinnedRegion(POLE)], "gravity": (0.0, 0.0, 0.0)} | (solver or {})
     scene = {"region": Box([None, None, -2.0], [None, None, None]), "points": "gaussian"} | (scene or {})
@@ -235,8 +240,7 @@ def test_metres_and_the_up_direction_of_the_scene():
 
 @pytest.mark.parametrize("formulation", ["total", "updated"])
 def test_a_rigid_part_is_a_body_of_each_copy(formulation):
-    label = torch.bucketize(_coloured().means[:, 0].contiguous(), torch.tensor([0.25, 0.75]))
-    parts = Parts(label, [Part("pole", "held"), Part("cloth"), Part("board", "rigid", density=60.0)])
+    parts = Parts(_along(0.25, 0.75), [Part("pole", "held"), Part("cloth"), Part("board", "rigid", density=60.0)])
     more = {
         "scene": {"parts": parts},
         "solver": {"boundaries": [], "formulation": formulation, "substep": 0.002},
@@ -254,11 +258,12 @@ def test_a_rigid_part_is_a_body_of_each_copy(formulation):
 
 def test_a_held_part_belongs_to_the_copy_and_a_still_one_does_not():
     """A pot with its plant: drawn in each copy where it is held, which is what a copy turns about."""
-    labels = torch.bucketize(_coloured().means[:, 0].contiguous(), torch.tensor([0.25]))
+    labels = _along(0.25)
     labels[96:] = 2
     parts = Parts(labels, [Part("pole", "held"), Part("cloth"), Part("floor", "still")])
     more = {"scene": {"parts": parts, "region": None}, "solver": {"boundaries": []}}
-    one, copies = _end(_simulation([], **more)), _end(_simulation([Copy(), Copy([0.0, 2.0, 0.0], 180.0)], **more))
+    row = _simulation([Copy(), Copy([0.0, 2.0, 0.0], 180.0)], **more)
+    one, copies = _end(_simulation([], **more)), _end(row)
     held, rest = labels == 0, _coloured().means
     means, colours = (getattr(copies.gaussians, name)[10:].reshape(2, 96, 3) for name in ("means", "colors"))
     assert torch.equal(copies.gaussians.means[:10], rest[96:])
@@ -269,7 +274,7 @@ def test_a_held_part_belongs_to_the_copy_and_a_still_one_does_not():
     middle = 0.5 * (rest[held].amin(0) + rest[held].amax(0))
     turned = (rest[held] - middle) * torch.tensor([-1.0, -1.0, 1.0]) + middle + torch.tensor([0.0, 2.0, 0.0])
     torch.testing.assert_close(means[1, -int(held.sum()) :], turned, rtol=0, atol=1e-5)
-    view = turned - _simulation([Copy(), Copy([0.0, 2.0, 0.0], 180.0)], **more).painter.camera_at(0).position
+    view = turned - row.painter.camera_at(0).position
     seen = sh_to_color(rotate_sh(_coloured().sh[held], _turn(180.0).float()), view)
     torch.testing.assert_close(colours[1, -int(held.sum()) :], seen, rtol=0, atol=2e-5)
 

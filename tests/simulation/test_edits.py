@@ -33,6 +33,10 @@ def _with(simulation, *edits):
     return simulation
 
 
+def _white(simulation):
+    return (simulation.scene.model.sh0[:, 0] * SH_DC + 0.5 - 0.95).abs().amax(-1) < 1e-6
+
+
 def _frames(simulation, frames):
     return [frame.state for frame in simulation.frames(frames + 1)]
 
@@ -129,8 +133,7 @@ def test_no_region_is_all_that_moves(make_cloud, make_simulation):
     moves = cloud.means[:, 0] <= 0.5
     for region, expected in ((None, moves), (Box([0.3, None, None], [None] * 3), cloud.means[:, 0] >= 0.3)):
         _with(simulation, Edit(region, color=WHITE)).start()
-        white = (simulation.scene.model.sh0[:, 0] * SH_DC + 0.5 - 0.95).abs().amax(-1) < 1e-6
-        assert torch.equal(white, expected)
+        assert torch.equal(_white(simulation), expected)
         simulation.editor.reset()
     particles, gaussians = simulation.editor.reach(Edit(E=1.0))
     assert bool(particles.all())
@@ -150,8 +153,7 @@ def test_nothing_but_the_stress_changes_at_once(formulation, make_simulation):
         assert torch.equal(found[k].position, plain[k].position)
         assert torch.equal(found[k].velocity, plain[k].velocity)
     assert float((found[4].position - plain[4].position).abs().max()) > 1e-4
-    white = (edited.scene.model.sh0[:, 0] * SH_DC + 0.5 - 0.95).abs().amax(-1) < 1e-6
-    assert torch.equal(white, edited.scene.model.means[:, 0] >= 0.55)
+    assert torch.equal(_white(edited), edited.scene.model.means[:, 0] >= 0.55)
     # a second run of the same simulation begins anew, with all as it was
     again = _frames(edited, 4)
     assert all(torch.equal(a.position, b.position) for a, b in zip(again, found, strict=True))

@@ -26,8 +26,9 @@ def labels():
     return torch.bucketize(CLOUD.means[:, 0].contiguous(), torch.tensor([0.15, 0.35, 0.9]))
 
 
-def flag(parts=None, formulation="total", **settings):
-    scene = Scene(generator=GivenScene(CLOUD), parts=Parts(labels(), ROLES) if parts is None else parts)
+def flag(parts=None, formulation="total", cloud=CLOUD, faint="carry", **settings):
+    parts = Parts(labels(), ROLES) if parts is None else parts
+    scene = Scene(generator=GivenScene(cloud), parts=parts, faint=faint)
     settings.setdefault("material", Material(E=5e3, density=30.0, thickness=0.01))
     solver = MPMSolver(dx=0.1, formulation=formulation, gravity=[0, 0, -9.8])
     return Simulation(scene, solver=solver, wind=[2.0, 3.0, 0.0], device="cpu", **settings)
@@ -107,15 +108,12 @@ def test_one_soft_part_is_the_object_without_parts():
 def test_faint_gaussians_of_a_held_part_and_those_that_follow_it_stay():
     cloud = FlagScene(spacing=0.04).generate()
     cloud.opacities[::5] = -6.0
-    scene = Scene(generator=GivenScene(cloud), parts=Parts(labels(), ROLES))
-    simulation = Simulation(scene, solver=MPMSolver(dx=0.1), wind=[2.0, 3.0, 0.0], device="cpu")
-    last = list(simulation.frames(6))[-1]
+    last = list(flag(cloud=cloud).frames(6))[-1]
     moved = (last.gaussians.means - cloud.means).norm(dim=-1)
     assert float(moved[labels() <= 1].max()) == 0.0
     assert float(moved[labels() == 3].min()) > 0.0
-    dropped = Scene(generator=GivenScene(cloud), parts=Parts(labels(), ROLES), faint="drop")
-    simulation = Simulation(dropped, solver=MPMSolver(dx=0.1), wind=[2.0, 3.0, 0.0], device="cpu")
-    assert len(simulation.scene.model.means) == len(cloud.means) - int(((cloud.opacities < -5) & (labels() > 0)).sum())
+    dropped = flag(cloud=cloud, faint="drop").scene.model.means
+    assert len(dropped) == len(cloud.means) - int(((cloud.opacities < -5) & (labels() > 0)).sum())
 
 
 def test_parts_of_another_splat_are_refused():

@@ -108,6 +108,7 @@ def test_a_run_goes_on_where_its_worker_was_killed(undisturbed, tmp_path, sweep_
     assert [path.name for path in (tmp_path / "runs").iterdir()] == ["00005"]  # no earlier run was moved aside
 
 
+@pytest.mark.usefixtures("default_signals")
 def test_a_stopped_sweep_ends_in_order(undisturbed, tmp_path, sweep_file, monkeypatch, capsys):
     file, folder, ended = sweep_file(tmp_path / "tiny.yaml"), tmp_path / "out", sweep._Keeper.ended
 
@@ -115,13 +116,9 @@ def test_a_stopped_sweep_ends_in_order(undisturbed, tmp_path, sweep_file, monkey
         ended(self, name, result)
         os.kill(os.getpid(), signal.SIGTERM)
 
-    before = signal.signal(signal.SIGTERM, signal.SIG_DFL)
-    try:
-        with monkeypatch.context() as patch:
-            patch.setattr(sweep._Keeper, "ended", stop)
-            assert main([str(file), "--output", str(folder), *QUICK]) == 143
-    finally:
-        signal.signal(signal.SIGTERM, before)
+    with monkeypatch.context() as patch:
+        patch.setattr(sweep._Keeper, "ended", stop)
+        assert main([str(file), "--output", str(folder), *QUICK]) == 143
     error = capsys.readouterr().err
     assert "Stopped; complete runs are kept" in error
     assert "--resume" in error
