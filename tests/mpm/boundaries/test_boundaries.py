@@ -19,8 +19,10 @@ from gaussian_swaying.geometry.regions import Everything, Not, Union
 from gaussian_swaying.mpm import boundaries
 from gaussian_swaying.mpm.boundaries import BOUNDARIES
 from gaussian_swaying.mpm.boundaries.boundary import Nodes
+from gaussian_swaying.mpm.boundaries.plane import Plane, plane_velocity
+from gaussian_swaying.mpm.boundaries.velocity_box import VelocityBox
 
-from .bodies import block, march, run_for
+from .bodies import block, lone, march, run_for
 
 FORMULATIONS = ["total", "updated"]
 MOVING = KeyedPath([0.0, 0.2], [[0, 0, 0], [0.1, 0.05, 0]], [[0, 0, 0], [10, 20, 30]])
@@ -333,3 +335,83 @@ def test_a_mesh_in_a_frame_is_as_far_as_in_the_scene(path):
     assert_close(found[0], 3 * distance)
     assert_close(found[1], normal @ turn.T)
     assert_close(found[2], 3 * speed @ turn.T)
+
+
+# ---- planes: contact, friction, and nothing on the free side
+
+
+UP = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)
+
+
+def test_plane_velocity_kinds():
+    into = torch.tensor([[3.0, 0.0, -2.0]], dtype=torch.float64)
+    away = torch.tensor([[3.0, 0.0, 2.0]], dtype=torch.float64)
+    assert plane_velocity(into, UP, "sticky", 0.0).tolist() == [[0, 0, 0]]
+    assert plane_velocity(away, UP, "sticky", 0.0).tolist() == [[0, 0, 0]]
+    assert plane_velocity(into, UP, "slip", 0.0).tolist() == [[3, 0, 0]]
+    assert plane_velocity(away, UP, "slip", 0.0).tolist() == [[3, 0, 0]]
+    assert plane_velocity(into, UP, "separate", 0.0).tolist() == [[3, 0, 0]]
+    assert plane_velocity(away, UP, "separate", 0.5).tolist() == [[3, 0, 2]]
+    # Coulomb: the tangential speed loses mu times the normal speed taken away, and never turns round
+    assert_close(plane_velocity(into, UP, "separate", 0.5), torch.tensor([[2.0, 0, 0]]).double())
+    assert plane_velocity(into, UP, "separate", 5.0).tolist() == [[0, 0, 0]]
+    assert plane_velocity(torch.zeros(1, 3), UP.float(), "separate", 0.5).tolist() == [[0, 0, 0]]
+
+
+@pytest.mark.parametrize("length", [1e-3, 1.0, 50.0])
+def test_the_length_of_the_normal_does_not_matter(length):
+    plane = Plane([0.0, 0.0, 0.0], [0.6 * length, 0.0, -0.8 * length])
+    assert_close(plane.normal, torch.tensor([0.6, 0.0, -0.8], dtype=torch.float64))
+
+
+@pytest.mark.parametrize("formulation", FORMULATIONS)
+def test_block_slides_down_an_incline_with_coulombs_acceleration(formulation):
+    """Static below the friction angle; a = g (sin - mu cos) above. Gravity is tilted instead of the plane."""
+    angle, points = math.radians(30), block()
+    gravity = (9.8 * math.sin(angle), 0.0, -9.8 * math.cos(angle))
+    seconds = 0.4
+    # the lowest nodes are in contact from the start, so nothing bounces
+    plane = Plane([0, 0, 0.06], [0, 0, 1], "separate", 0.2)
+    x, _, z = run_for(formulation, [plane], points, seconds, gravity=gravity).velocity.mean(0).tolist()
+    # mu times the momentum that the plane gave upwards, less what bulging turns aside, more at the slow start
+    lost = 9.8 * seconds * math.sin(angle) - x
+    assert lost == pytest.approx(0.2 * (9.8 * seconds * math.cos(angle) + z), rel=0.03)
+    assert abs(z) < 0.05 * 9.8 * seconds
+    # damped, so that it does not hop: with mu = 1 it leans by less than twice the static g sin m c, c as above
+    plane = Plane([0, 0, 0.06], [0, 0, 1], "separate", 1.0)
+    held = run_for(formulation, [plane], points, seconds, gravity=gravity, damping=30.0)
+    leans = 9.8 * math.sin(angle) * (0.4 * 2.6 + 0.6) * 0.4**2 * 100 / 2e4
+    assert float((held.position - points.position)[:, 0].mean()) < 2 * leans
+
+
+# ---- velocity boxes, at rest and travelling
+
+
+@pytest.mark.parametrize("formulation", FORMULATIONS)
+def test_velocity_box_drives_only_its_side(formulation):
+    """Two lone particles on either side of a face: the nodes inside are driven, the others are not."""
+    points = lone([[0.0, 0.0, 0.05], [0.0, 0.0, -0.25]])
+    drive = VelocityBox(Box([-9, -9, -0.05], [9, 9, 9]), [0.5, 0.0, -0.3], start=0.02, end=0.05)
+    ends = march(MPMSolver(dx=0.1, formulation=formulation, gravity=(0, 0, 0), boundaries=[drive]), points, 0.01, 8)
+    speed = torch.stack([state.velocity for state in ends])
+    assert float(speed[:, 1].abs().max()) == 0.0
+    assert float(speed[:3, 0].abs().max()) == 0.0  # states 0 to 2 lie before the window
+    torch.testing.assert_close(speed[3, 0], torch.tensor([0.5, 0.0, -0.3], dtype=torch.float64))
+
+
+def test_a_travelling_box_takes_its_nodes_from_where_it_is():
+    """It moves from its start on, in the metres of a frame that scales and rotates; a fixed box does not move."""
+    frame = SimFrame.fit(block().position, up=(0.0, 1.0, 0.0), metres_per_unit=0.5)
+    box = Box([0.0, 0.0, 0.0], [0.2, 0.4, 0.4])
+    drift = frame.direction_to_sim(torch.tensor([1.0, 0.0, 0.0], dtype=torch.float64))
+    move = (0.3 * drift).tolist()
+    boxes = [VelocityBox(box, move, start=0.1, end=9.0, travels=travels).in_frame(frame) for travels in (True, False)]
+    place = torch.rand(500, 3, dtype=torch.float64) * torch.tensor([1.0, 0.6, 0.6])
+    for time in (0.1, 0.4):
+        nodes = Nodes(torch.tensor(time, dtype=torch.float64), 1e-3, frame.point_to_sim(place))
+        driven = [(b(torch.zeros_like(place), nodes) != 0).any(-1) for b in boxes]
+        # 0.3 m/s are 0.6 scene units a second
+        gone = place - torch.tensor([0.6 * (time - 0.1), 0, 0], dtype=torch.float64)
+        assert torch.equal(driven[0], box.contains(gone))
+        assert torch.equal(driven[1], box.contains(place))
+        assert torch.equal(driven[0], driven[1]) == (time == 0.1)
