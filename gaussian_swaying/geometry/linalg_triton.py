@@ -201,6 +201,18 @@ def axpy3(s, a, t, b):
 
 
 @triton.jit
+def add3(a, t, b):
+    """A + t b for vectors."""
+    return (a[0] + t * b[0], a[1] + t * b[1], a[2] + t * b[2])
+
+
+@triton.jit
+def columns9(a, b, c):
+    """The matrix of three columns."""
+    return (a[0], b[0], c[0], a[1], b[1], c[1], a[2], b[2], c[2])
+
+
+@triton.jit
 def where3(condition, a, b):
     """Choose between vectors."""
     return (tl.where(condition, a[0], b[0]), tl.where(condition, a[1], b[1]), tl.where(condition, a[2], b[2]))

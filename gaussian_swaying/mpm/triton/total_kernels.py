@@ -9,7 +9,7 @@ Rows of node arrays: displacement and velocity, each in four columns of eight, a
 columns, or eight if boundaries need positions.
 """
 
-from gaussian_swaying.geometry.linalg_triton import axpy9, load3, scale9
+from gaussian_swaying.geometry.linalg_triton import add3, axpy9, columns9, load3, scale9
 from gaussian_swaying.kernels.language import tl, triton
 from gaussian_swaying.mpm.laws.triton.body import ROW, pk1
 from gaussian_swaying.mpm.triton.damping import kelvin_voigt_pk1
@@ -38,59 +38,33 @@ def gather(
     ``node`` is the first node on the lattice, or with VIRTUAL a column of a ``table`` of nodes, shape (27, columns).
     With WIDE rows are loaded by :func:`load_four`, whatever the mask says; all nodes must be in the field.
     """
-    zero = wz[0] * 0
-    u0, u1, u2, v0, v1, v2 = zero, zero, zero, zero, zero, zero
-    g00, g01, g02, g10, g11, g12, g20, g21, g22 = zero, zero, zero, zero, zero, zero, zero, zero, zero
+    zero = (wz[0] * 0, wz[0] * 0, wz[0] * 0)
+    u, v, by_x, by_y, by_z = zero, zero, zero, zero, zero
     for i in range(3):
         wx, gx = node_weight(f[0], i, inverse_dx)
         for j in tl.static_range(3):
             wy, gy = node_weight(f[1], j, inverse_dx)
             if not VIRTUAL:
                 row = field + (node + i * sx + j * sy) * 8
-            s0, s1, s2, t0, t1, t2, r0, r1, r2 = zero, zero, zero, zero, zero, zero, zero, zero, zero
+            s, t, r = zero, zero, zero
             for k in tl.static_range(3):
                 if VIRTUAL:
                     at = field + tl.load(table + ((i * 3 + j) * 3 + k) * columns + node) * 8
                 else:
                     at = row + k * 8
-                if WIDE:
-                    q0, q1, q2, _q = load_four(at)
-                else:
-                    q0, q1, q2 = vector(at, mask)
-                s0 += wz[k] * q0
-                s1 += wz[k] * q1
-                s2 += wz[k] * q2
-                t0 += gz[k] * q0
-                t1 += gz[k] * q1
-                t2 += gz[k] * q2
+                q = load_four(at) if WIDE else vector(at, mask)
+                s = add3(s, wz[k], q)
+                t = add3(t, gz[k], q)
                 if BOTH:
-                    if WIDE:
-                        p0, p1, p2, _p = load_four(at + 4)
-                    else:
-                        p0, p1, p2 = vector(at + 4, mask)
-                    r0 += wz[k] * p0
-                    r1 += wz[k] * p1
-                    r2 += wz[k] * p2
+                    r = add3(r, wz[k], load_four(at + 4) if WIDE else vector(at + 4, mask))
             w = wx * wy
-            dx = gx * wy
-            dy = wx * gy
-            u0 += w * s0
-            u1 += w * s1
-            u2 += w * s2
+            u = add3(u, w, s)
             if BOTH:
-                v0 += w * r0
-                v1 += w * r1
-                v2 += w * r2
-            g00 += dx * s0
-            g01 += dy * s0
-            g02 += w * t0
-            g10 += dx * s1
-            g11 += dy * s1
-            g12 += w * t1
-            g20 += dx * s2
-            g21 += dy * s2
-            g22 += w * t2
-    return (u0, u1, u2), (g00, g01, g02, g10, g11, g12, g20, g21, g22), (v0, v1, v2)
+                v = add3(v, w, r)
+            by_x = add3(by_x, gx * wy, s)
+            by_y = add3(by_y, wx * gy, s)
+            by_z = add3(by_z, w, t)
+    return u, columns9(by_x, by_y, by_z), v
 
 
 @triton.jit

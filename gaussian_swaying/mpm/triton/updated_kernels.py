@@ -8,7 +8,18 @@ Rows of node arrays: velocity, or momentum and mass, in four columns. The sums a
 drag.
 """
 
-from gaussian_swaying.geometry.linalg_triton import axpy9, load3, load9, matmul, scale9, store3, store9, transpose
+from gaussian_swaying.geometry.linalg_triton import (
+    add3,
+    axpy9,
+    columns9,
+    load3,
+    load9,
+    matmul,
+    scale9,
+    store3,
+    store9,
+    transpose,
+)
 from gaussian_swaying.kernels.language import tl, triton
 from gaussian_swaying.mpm.laws.triton.body import ROW, kirchhoff
 from gaussian_swaying.mpm.triton.damping import kelvin_voigt_pk1
@@ -40,58 +51,29 @@ def _gather_affine(
     field, node, sx, sy, f, wz, gz, mz, inverse_dx, dx, mask, WIDE: tl.constexpr
 ):  # fmt: skip
     """Interpolated vector, its moments about the particle and its derivatives [component, axis]."""
-    zero = wz[0] * 0
-    v0, v1, v2 = zero, zero, zero
-    g00, g01, g02, g10, g11, g12, g20, g21, g22 = zero, zero, zero, zero, zero, zero, zero, zero, zero
-    c00, c01, c02, c10, c11, c12, c20, c21, c22 = zero, zero, zero, zero, zero, zero, zero, zero, zero
+    zero = (wz[0] * 0, wz[0] * 0, wz[0] * 0)
+    v, by_x, by_y, by_z, about_x, about_y, about_z = zero, zero, zero, zero, zero, zero, zero
     for i in range(3):
         wx, gx = node_weight(f[0], i, inverse_dx)
         mx = wx * (i - f[0]) * dx
         for j in range(3):
             wy, gy = node_weight(f[1], j, inverse_dx)
             row = field + (node + i * sx + j * sy) * 4
-            s0, s1, s2, t0, t1, t2, r0, r1, r2 = zero, zero, zero, zero, zero, zero, zero, zero, zero
+            s, t, r = zero, zero, zero
             for k in tl.static_range(3):
-                if WIDE:
-                    q0, q1, q2, _rest = load_four(row + k * 4)
-                else:
-                    q0, q1, q2 = vector(row + k * 4, mask)
-                s0 += wz[k] * q0
-                s1 += wz[k] * q1
-                s2 += wz[k] * q2
-                r0 += mz[k] * q0
-                r1 += mz[k] * q1
-                r2 += mz[k] * q2
-                t0 += gz[k] * q0
-                t1 += gz[k] * q1
-                t2 += gz[k] * q2
+                q = load_four(row + k * 4) if WIDE else vector(row + k * 4, mask)
+                s = add3(s, wz[k], q)
+                r = add3(r, mz[k], q)
+                t = add3(t, gz[k], q)
             w = wx * wy
-            ex = mx * wy
-            ey = wx * (wy * (j - f[1]) * dx)
-            v0 += w * s0
-            v1 += w * s1
-            v2 += w * s2
-            c00 += ex * s0
-            c01 += ey * s0
-            c02 += w * r0
-            c10 += ex * s1
-            c11 += ey * s1
-            c12 += w * r1
-            c20 += ex * s2
-            c21 += ey * s2
-            c22 += w * r2
-            ax = gx * wy
-            ay = wx * gy
-            g00 += ax * s0
-            g01 += ay * s0
-            g02 += w * t0
-            g10 += ax * s1
-            g11 += ay * s1
-            g12 += w * t1
-            g20 += ax * s2
-            g21 += ay * s2
-            g22 += w * t2
-    return (v0, v1, v2), (c00, c01, c02, c10, c11, c12, c20, c21, c22), (g00, g01, g02, g10, g11, g12, g20, g21, g22)
+            v = add3(v, w, s)
+            about_x = add3(about_x, mx * wy, s)
+            about_y = add3(about_y, wx * (wy * (j - f[1]) * dx), s)
+            about_z = add3(about_z, w, r)
+            by_x = add3(by_x, gx * wy, s)
+            by_y = add3(by_y, wx * gy, s)
+            by_z = add3(by_z, w, t)
+    return v, columns9(about_x, about_y, about_z), columns9(by_x, by_y, by_z)
 
 
 @triton.jit
