@@ -9,11 +9,11 @@ number of substeps that it has done. Rows of ``bars``, one per active node: grad
 each in four columns of eight. Rows of ``history``: displacement and velocity at the start of each substep, likewise.
 """
 
-from gaussian_swaying.geometry.linalg_triton import axpy9, scale9
+from gaussian_swaying.geometry.linalg_triton import add3, axpy9, dot3, scale3, scale9, store3
 from gaussian_swaying.kernels.language import tl, triton
 from gaussian_swaying.mpm.laws.triton.body import pk1_adjoint
 from gaussian_swaying.mpm.triton.damping import kelvin_voigt_adjoint
-from gaussian_swaying.mpm.triton.shared import VARIES, axis_weights, node_weight, twin_data
+from gaussian_swaying.mpm.triton.shared import VARIES, axis_weights, node_weight, twin_data, vector
 from gaussian_swaying.mpm.triton.total_kernels import cells_of, gather, law_row, load_particles, motion
 
 
@@ -109,32 +109,32 @@ def particles_adjoint(
                 w = wx * wy
                 ax = gx * wy
                 ay = wx * gy
-                a0 = by_F[0] * ax + by_F[1] * ay
-                a1 = by_F[3] * ax + by_F[4] * ay
-                a2 = by_F[6] * ax + by_F[7] * ay
+                a = _across(by_F, ax, ay)
                 if VISCOUS:
-                    b0 = by_rate[0] * ax + by_rate[1] * ay
-                    b1 = by_rate[3] * ax + by_rate[4] * ay
-                    b2 = by_rate[6] * ax + by_rate[7] * ay
+                    b = _across(by_rate, ax, ay)
                     if LOADED:
-                        b0 += by_v[0] * w
-                        b1 += by_v[1] * w
-                        b2 += by_v[2] * w
+                        b = add3(b, w, by_v)
                 for k in tl.static_range(3):
                     out = partial + (((i * 3 + j) * 3 + k) * (cells + 1) + cell) * WIDTH
                     gw = gz[k] * w
-                    _add(out, tl.sum(wz[k] * a0 + gw * by_F[2], 1), real, chunk)
-                    _add(out + 1, tl.sum(wz[k] * a1 + gw * by_F[5], 1), real, chunk)
-                    _add(out + 2, tl.sum(wz[k] * a2 + gw * by_F[8], 1), real, chunk)
-                    if VISCOUS:
-                        _add(out + 4, tl.sum(wz[k] * b0 + gw * by_rate[2], 1), real, chunk)
-                        _add(out + 5, tl.sum(wz[k] * b1 + gw * by_rate[5], 1), real, chunk)
-                        _add(out + 6, tl.sum(wz[k] * b2 + gw * by_rate[8], 1), real, chunk)
-                    elif LOADED:
-                        ww = wz[k] * w
-                        _add(out + 4, tl.sum(ww * by_v[0], 1), real, chunk)
-                        _add(out + 5, tl.sum(ww * by_v[1], 1), real, chunk)
-                        _add(out + 6, tl.sum(ww * by_v[2], 1), real, chunk)
+                    for c in tl.static_range(3):
+                        _add(out + c, tl.sum(wz[k] * a[c] + gw * by_F[3 * c + 2], 1), real, chunk)
+                        if VISCOUS:
+                            _add(out + 4 + c, tl.sum(wz[k] * b[c] + gw * by_rate[3 * c + 2], 1), real, chunk)
+                        elif LOADED:
+                            _add(out + 4 + c, tl.sum(wz[k] * w * by_v[c], 1), real, chunk)
+
+
+@triton.jit
+def _across(m, x, y):
+    """The first two columns of a matrix times two numbers."""
+    return (m[0] * x + m[1] * y, m[3] * x + m[4] * y, m[6] * x + m[7] * y)
+
+
+@triton.jit
+def _with_sums(a, x, AXIS: tl.constexpr):
+    """A vector and the sums of another one over an axis."""
+    return (a[0] + tl.sum(x[0], AXIS), a[1] + tl.sum(x[1], AXIS), a[2] + tl.sum(x[2], AXIS))
 
 
 @triton.jit(do_not_specialize=VARIES)
@@ -155,31 +155,17 @@ def nodes_adjoint(
     k = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
     mask = k < nodes
     own = bars + k * 8
-    u0 = tl.load(own, mask, 0.0)
-    u1 = tl.load(own + 1, mask, 0.0)
-    u2 = tl.load(own + 2, mask, 0.0)
-    v0 = tl.load(own + 4, mask, 0.0)
-    v1 = tl.load(own + 5, mask, 0.0)
-    v2 = tl.load(own + 6, mask, 0.0)
+    u, v = vector(own, mask), vector(own + 4, mask)
     if SUM:
         o = tl.arange(0, SOURCES)[:, None]  # all at once
         known = mask[None, :] & (o < sources)
         row = partial + tl.load(source + o * nodes + k[None, :], known, 0) * WIDTH
-        u0 += tl.sum(tl.load(row, known, 0.0), 0)
-        u1 += tl.sum(tl.load(row + 1, known, 0.0), 0)
-        u2 += tl.sum(tl.load(row + 2, known, 0.0), 0)
+        u = _with_sums(u, vector(row, known), 0)
         if VELOCITY:
-            v0 += tl.sum(tl.load(row + 4, known, 0.0), 0)
-            v1 += tl.sum(tl.load(row + 5, known, 0.0), 0)
-            v2 += tl.sum(tl.load(row + 6, known, 0.0), 0)
-        tl.store(own, u0, mask)
-        tl.store(own + 1, u1, mask)
-        tl.store(own + 2, u2, mask)
+            v = _with_sums(v, vector(row + 4, known), 0)
+        store3(own, 1, 0, u, mask)
     if PUSH:
-        dt = tl.load(schedule + (step + 1) * 4 + 1)
-        v0 += dt * u0
-        v1 += dt * u1
-        v2 += dt * u2
+        v = add3(v, tl.load(schedule + (step + 1) * 4 + 1), u)
     if FINISH:
         kick = tl.load(schedule + (step + 1) * 4)
         decay = tl.load(schedule + (step + 1) * 4 + 2)
@@ -188,39 +174,23 @@ def nodes_adjoint(
         inverse = tl.load(inverse_mass + k, mask, 0.0)
         node = tl.load(active + k, mask, 0)
         before = history + (step.to(tl.int64) * nodes + k) * 8
-        w0 = tl.load(before + 4, mask, 0.0)
-        w1 = tl.load(before + 5, mask, 0.0)
-        w2 = tl.load(before + 6, mask, 0.0)
-        at = fields + node * 8
-        for c in tl.static_range(3):
-            tl.store(at + c, tl.load(before + c, mask, 0.0), mask)
-        tl.store(at + 4, w0, mask)
-        tl.store(at + 5, w1, mask)
-        tl.store(at + 6, w2, mask)
+        w = vector(before + 4, mask)
+        store3(fields + node * 8, 1, 0, vector(before, mask), mask)
+        store3(fields + node * 8 + 4, 1, 0, w, mask)
         if MASS:
             # what forces and held points added to the velocity is proportional to the inverse mass
             after = before + nodes.to(tl.int64) * 8
             rest = decay
             if HELD:
                 rest = tl.where(tl.load(held + k, mask, 0) == 0, decay, 0.0)
-            gain0 = tl.load(after + 4, mask, 0.0) - rest * (w0 + kick * gravity_x)
-            gain1 = tl.load(after + 5, mask, 0.0) - rest * (w1 + kick * gravity_y)
-            gain2 = tl.load(after + 6, mask, 0.0) - rest * (w2 + kick * gravity_z)
-            gain = (v0 * gain0 + v1 * gain1 + v2 * gain2) / tl.where(mask, inverse, 1.0)
+            free = add3(w, kick, (gravity_x, gravity_y, gravity_z))
+            gain = dot3(v, add3(vector(after + 4, mask), -rest, free)) / tl.where(mask, inverse, 1.0)
             tl.store(mass_bar + k, tl.load(mass_bar + k, mask, 0.0) + gain, mask)
         if HELD:
             decay = tl.where(tl.load(held + k, mask, 0) == 0, decay, 0.0)
-        v0 *= decay
-        v1 *= decay
-        v2 *= decay
-        push = kick * inverse
-        to = force_bar + node * 8
-        tl.store(to, push * v0, mask)
-        tl.store(to + 1, push * v1, mask)
-        tl.store(to + 2, push * v2, mask)
-    tl.store(own + 4, v0, mask)
-    tl.store(own + 5, v1, mask)
-    tl.store(own + 6, v2, mask)
+        v = scale3(decay, v)
+        store3(force_bar + node * 8, 1, 0, scale3(kick * inverse, v), mask)
+    store3(own + 4, 1, 0, v, mask)
 
 
 @triton.jit(do_not_specialize=VARIES)
@@ -228,21 +198,17 @@ def rows_adjoint(affected, scene, push, bars, residual, nodes, rows, BLOCK: tl.c
     """The multiplier of each held row: the transpose of what rows push, shape (rows, nodes), times the gradient."""
     row = tl.program_id(0)
     own = row // rows
-    a0 = tl.zeros([BLOCK], tl.float32)
-    a1 = tl.zeros([BLOCK], tl.float32)
-    a2 = tl.zeros([BLOCK], tl.float32)
+    zero = tl.zeros([BLOCK], tl.float32)
+    a = (zero, zero, zero)
     for start in range(0, nodes, BLOCK):
         n = start + tl.arange(0, BLOCK)
         mask = n < nodes
         mask = mask & (tl.load(scene + n, mask, -1) == own)
         b = tl.load(push + (row - own * rows) * nodes + n, mask, 0.0)
         place = bars + tl.load(affected + n, mask, 0) * 8 + 4
-        a0 += b * tl.load(place, mask, 0.0)
-        a1 += b * tl.load(place + 1, mask, 0.0)
-        a2 += b * tl.load(place + 2, mask, 0.0)
-    tl.store(residual + row * 4, tl.sum(a0, 0))
-    tl.store(residual + row * 4 + 1, tl.sum(a1, 0))
-    tl.store(residual + row * 4 + 2, tl.sum(a2, 0))
+        a = add3(a, b, vector(place, mask))
+    for c in tl.static_range(3):
+        tl.store(residual + row * 4 + c, tl.sum(a[c], 0))
 
 
 @triton.jit(do_not_specialize=VARIES)
@@ -259,42 +225,33 @@ def hold_adjoint(
     n = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
     mask = n < nodes
     first = tl.load(scene + n, mask, 0) * rows
-    a0 = tl.zeros([BLOCK], tl.float32)
-    a1 = tl.zeros([BLOCK], tl.float32)
-    a2 = tl.zeros([BLOCK], tl.float32)
+    zero = tl.zeros([BLOCK], tl.float32)
+    a = (zero, zero, zero)
     for start in range(0, rows, ROWS):
         k = start + tl.arange(0, ROWS)
         known = mask[:, None] & (k < rows)[None, :]
         b = tl.load(weight + n[:, None] * rows + k[None, :], known, 0.0)
         place = residual + (first[:, None] + k[None, :]) * 4
-        a0 += tl.sum(b * tl.load(place, known, 0.0), 1)
-        a1 += tl.sum(b * tl.load(place + 1, known, 0.0), 1)
-        a2 += tl.sum(b * tl.load(place + 2, known, 0.0), 1)
+        a = _with_sums(a, scale3(b, vector(place, known)), 1)
     own = tl.load(affected + n, mask, 0)
     at = bars + own * 8 + 4
-    a0 = tl.load(at, mask, 0.0) - a0
-    a1 = tl.load(at + 1, mask, 0.0) - a1
-    a2 = tl.load(at + 2, mask, 0.0) - a2
-    tl.store(at, a0, mask)
-    tl.store(at + 1, a1, mask)
-    tl.store(at + 2, a2, mask)
+    a = add3(vector(at, mask), -1.0, a)
+    store3(at, 1, 0, a, mask)
     if WEIGHTS:
         step = tl.load(last) - tl.load(first_step) - step_offset
         inverse = tl.load(inverse_mass + own, mask, 0.0)
         after = history + ((step + 1).to(tl.int64) * active_count + own) * 8 + 4
-        v0 = tl.load(after, mask, 0.0)
-        v1 = tl.load(after + 1, mask, 0.0)
-        v2 = tl.load(after + 2, mask, 0.0)
+        v = vector(after, mask)
         pushed = multipliers + step * all_rows * 4
         for start in range(0, rows, ROWS):
             k = start + tl.arange(0, ROWS)
             known = mask[:, None] & (k < rows)[None, :]
             place = (first[:, None] + k[None, :]) * 4
-            bar = v0[:, None] * tl.load(residual + place, known, 0.0)
-            bar += v1[:, None] * tl.load(residual + place + 1, known, 0.0)
-            bar += v2[:, None] * tl.load(residual + place + 2, known, 0.0)
-            bar += (inverse * a0)[:, None] * tl.load(pushed + place, known, 0.0)
-            bar += (inverse * a1)[:, None] * tl.load(pushed + place + 1, known, 0.0)
-            bar += (inverse * a2)[:, None] * tl.load(pushed + place + 2, known, 0.0)
+            held, moved = vector(residual + place, known), vector(pushed + place, known)
             to = weight_bar + n[:, None] * rows + k[None, :]
+            bar = v[0][:, None] * held[0]
+            for c in tl.static_range(1, 3):
+                bar += v[c][:, None] * held[c]
+            for c in tl.static_range(3):
+                bar += (inverse * a[c])[:, None] * moved[c]
             tl.store(to, tl.load(to, known, 0.0) - bar, known)
