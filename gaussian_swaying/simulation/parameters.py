@@ -261,7 +261,7 @@ def of_settings(settings: Namespace, name: str) -> Any:
     """The value of a parameter in parsed settings, as :func:`in_settings` sets it."""
     parts = name.split(".")
     if name in POLAR:
-        return _angles(settings.wind.flow)[POLAR.index(name)]
+        return angles_of(settings.wind.flow)[POLAR.index(name)]
     if parts[0] == "forces":
         return _arguments(settings.forces, parts[1], name)[parts[2]]
     if parts[:2] == ["wind", "modulations"]:
@@ -375,10 +375,11 @@ def _of_modulation(name: str) -> Read:
 
 
 def _polar(setup: Setup) -> tuple[float, float, float]:
-    return _angles(_steady(setup, POLAR[0]).flows[0].tolist())
+    return angles_of(_steady(setup, POLAR[0]).flows[0].tolist())
 
 
-def _angles(flow: Sequence[float]) -> tuple[float, float, float]:
+def angles_of(flow: Sequence[float]) -> tuple[float, float, float]:
+    """Speed [m/s], azimuth from x towards y and elevation [degrees] of a flow."""
     x, y, z = flow
     return math.hypot(x, y, z), math.degrees(math.atan2(y, x)), math.degrees(math.atan2(z, math.hypot(x, y)))
 

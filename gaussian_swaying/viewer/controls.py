@@ -11,7 +11,7 @@ import torch
 
 from gaussian_swaying.mpm.materials import MATERIALS, name_of
 from gaussian_swaying.rendering.passes import colormap
-from gaussian_swaying.simulation.parameters import parameter, present, value_of
+from gaussian_swaying.simulation.parameters import POLAR, angles_of, flow_of, parameter, present, value_of
 from gaussian_swaying.simulation.wind_picture import speed_scale
 from gaussian_swaying.viewer.files import Files
 from gaussian_swaying.viewer.gusts import Gusts
@@ -193,7 +193,7 @@ class Controls(Panel):
         self.gusts.show()
         if not everything:
             return
-        speed, azimuth, elevation = (round(x, 1) for x in to_angles(self._flow()))
+        speed, azimuth, elevation = (round(x, 1) for x in angles_of(self._flow()))
         shown: list[tuple[Any, Any]] = [
             (self.wind_speed, min(speed, MOST_SPEED)),
             (self.azimuth, azimuth),
@@ -277,7 +277,8 @@ class Controls(Panel):
         return [float(x) for x in self.session.simulation.stepper.flows()[0].tolist()]
 
     def _blow(self) -> None:
-        flow = from_angles(self.wind_speed.value, self.azimuth.value, self.elevation.value)
+        angles = self.wind_speed.value, self.azimuth.value, self.elevation.value
+        flow = flow_of((0.0, 0.0, 0.0), dict(zip(POLAR, angles, strict=True)))
         self.session.change({"wind.flow": [round(x, 4) for x in flow], "wind.schedule": None})
         self._draw_arrow(flow)
 
@@ -290,7 +291,7 @@ class Controls(Panel):
     def _light_azimuth(self) -> float:
         shader = self.session.simulation.painter.shader
         light = getattr(shader, "light", None)
-        return 0.0 if light is None else round(to_angles(light.tolist())[1])
+        return 0.0 if light is None else round(angles_of(light.tolist())[1])
 
     def _shade(self) -> None:
         given = self.session.settings.shader
@@ -301,7 +302,7 @@ class Controls(Panel):
             return
         shader = self._shader or {"class_path": "DiffuseShader", "init_args": {"two_sided": True}}
         old = shader["init_args"].get("light", [0.0, -1.0, 0.8])
-        light = [round(x, 4) for x in from_angles(1.0, self.light.value, to_angles(old)[2])]
+        light = [round(x, 4) for x in flow_of(old, {"wind.speed": 1.0, "wind.azimuth": self.light.value})]
         if given is not None:
             self.session.change({"shader.init_args.light": light})
         else:
@@ -353,7 +354,7 @@ class Controls(Panel):
         scene = self.session.simulation.scene
         along = torch.tensor(self._anchor() - np.array(self._tip.position), dtype=torch.float64)
         flow = scene.frame.direction_to_sim(along / (ARROW * scene.size)).tolist()
-        speed, azimuth, elevation = to_angles(flow)
+        speed, azimuth, elevation = angles_of(flow)
         self.wind_speed.value = round(min(speed, MOST_SPEED), 1)  # type: ignore[misc]
         self.azimuth.value = round(azimuth, 1)  # type: ignore[misc]
         self.elevation.value = round(elevation, 1)  # type: ignore[misc]
@@ -392,21 +393,6 @@ def log_place(stiffness: float) -> float:
 
 CORNERS = [[i, j, k] for i in (0, 1) for j in (0, 1) for k in (0, 1)]
 EDGES = [[a, b] for a in range(8) for b in range(a) if sum(map(abs, np.subtract(CORNERS[a], CORNERS[b]))) == 1]
-
-
-def to_angles(flow: list[float]) -> tuple[float, float, float]:
-    """Speed, direction about up [degrees] and elevation [degrees] of a vector, z up."""
-    speed = math.sqrt(sum(x * x for x in flow))
-    if speed == 0:
-        return 0.0, 0.0, 0.0
-    upwards = math.asin(max(-1.0, min(1.0, flow[2] / speed)))
-    return speed, math.degrees(math.atan2(flow[1], flow[0])), math.degrees(upwards)
-
-
-def from_angles(speed: float, azimuth: float, elevation: float) -> list[float]:
-    """The vector of :func:`to_angles`."""
-    a, e = math.radians(azimuth), math.radians(elevation)
-    return [speed * math.cos(e) * math.cos(a), speed * math.cos(e) * math.sin(a), speed * math.sin(e)]
 
 
 def legend(name: str, unit: str, largest: float) -> str:

@@ -9,7 +9,6 @@ from PIL import Image
 
 from gaussian_swaying.geometry.rotations import rotation_to_quat
 from gaussian_swaying.simulation.wind_picture import draw_wind
-from gaussian_swaying.viewer.controls import from_angles, to_angles
 from gaussian_swaying.viewer.film_strip import FilmStrip
 from gaussian_swaying.viewer.pictures import SHOWN, PictureSize, camera_of, draw, enlarged, under_cursor
 
@@ -106,11 +105,6 @@ def test_pictures_get_smaller_where_they_take_long():
     for _ in range(10):
         size.took(0.01)
     assert size.fit(400, 300) == (400, 300)
-
-
-@pytest.mark.parametrize("flow", [[3.0, 4.0, 0.0], [0.0, -2.0, 1.0], [0.0, 0.0, 5.0], [0.0, 0.0, 0.0]])
-def test_angles_of_the_wind(flow):
-    assert from_angles(*to_angles(flow)) == pytest.approx(flow, abs=1e-9)
 
 
 def test_a_film_is_as_long_as_the_simulated_time():
