@@ -1,6 +1,5 @@
 // The solver with its passes over points and nodes in WebAssembly, four points at a time, in single precision as in the package.
-import { NEO_HOOKEAN } from "./laws.js";
-import { singular } from "./matrices.js";
+import { NEO_HOOKEAN, unreflected } from "./laws.js";
 import code from "./points.wasm"; // build.js makes both from points.ts
 import fused from "./points.fused.wasm";
 import { Solver } from "./solver.js";
@@ -29,7 +28,7 @@ export class LanesSolver extends Solver {
   constructor(block) {
     super(block);
     const { head, arrays: a } = block;
-    const env = { unreflected: (at) => this.unreflected(at), log: Math.log, cos: Math.cos, acos: Math.acos };
+    const env = { unreflected: (at) => this.unreflect(at), log: Math.log, cos: Math.cos, acos: Math.acos };
     const { exports } = new WebAssembly.Instance(new WebAssembly.Module(WebAssembly.validate(fused) ? fused : code), { env });
     this.code = /** @type {any} */ (exports);
     const starts = Int32Array.from({ length: this.cells + 1 });
@@ -107,12 +106,9 @@ export class LanesSolver extends Solver {
   }
 
   /** The nearest rotation of an inverted F, for points.ts. */
-  unreflected(at) {
+  unreflect(at) {
     const numbers = new Float32Array(this.code.memory.buffer, at, 9);
-    const [F, U, V] = [Float64Array.from(numbers), new Float64Array(9), new Float64Array(9)];
-    singular(F, U, new Float64Array(3), V);
-    for (let i = 0; i < 9; i += 3)
-      for (let k = 0; k < 3; k++) numbers[i + k] = U[i] * V[3 * k] + U[i + 1] * V[3 * k + 1] + U[i + 2] * V[3 * k + 2];
+    unreflected(Float64Array.from(numbers), numbers);
   }
 
   /** See Solver. */

@@ -7,7 +7,6 @@ import { largestEigenvalues, singular } from "./matrices.js";
 export const COROTATED = 0;
 export const NEO_HOOKEAN = 1;
 export const HENCKY = 2;
-export const SPRINGS = 3;
 
 const LEAST = 0.05; // stretch, or volume ratio, below which logarithms are continued by their tangent
 const SETTLED = 1e-10; // squared last change of Newton's iteration: the next one is below 1e-10
@@ -50,12 +49,17 @@ function principal(law, x, mu, lam, out) {
   }
 }
 
-/** The nearest rotation of a matrix whose Newton iteration ends at a reflection. */
-function unreflected(/** @type {Matrix} */ F, /** @type {Matrix} */ R) {
-  singular(F, U, a, V);
-  for (let i = 0; i < 3; i++)
+/** U diag(x) V^T, into `out`. */
+function composed(x, out) {
+  for (let i = 0; i < 9; i += 3)
     for (let k = 0; k < 3; k++)
-      R[3 * i + k] = U[3 * i] * V[3 * k] + U[3 * i + 1] * V[3 * k + 1] + U[3 * i + 2] * V[3 * k + 2];
+      out[i + k] = U[i] * x[0] * V[3 * k] + U[i + 1] * x[1] * V[3 * k + 1] + U[i + 2] * x[2] * V[3 * k + 2];
+}
+
+/** The nearest rotation of a matrix whose Newton iteration ends at a reflection, into `R`. */
+export function unreflected(/** @type {Matrix} */ F, R) {
+  singular(F, U, a, V);
+  composed([1, 1, 1], R);
 }
 
 const R = new Float64Array(9);
@@ -80,14 +84,14 @@ function corotated(/** @type {Matrix} */ F, mu, lam, /** @type {Matrix} */ P) {
     const d3 = own * x3 + other * c3 - x3, d4 = own * x4 + other * c4 - x4, d5 = own * x5 + other * c5 - x5;
     const d6 = own * x6 + other * c6 - x6, d7 = own * x7 + other * c7 - x7, d8 = own * x8 + other * c8 - x8;
     x0 += d0, x1 += d1, x2 += d2, x3 += d3, x4 += d4, x5 += d5, x6 += d6, x7 += d7, x8 += d8;
+    c0 = x4 * x8 - x5 * x7, c1 = x5 * x6 - x3 * x8, c2 = x3 * x7 - x4 * x6;
+    det = x0 * c0 + x1 * c1 + x2 * c2;
     const change = d0 * d0 + d1 * d1 + d2 * d2 + d3 * d3 + d4 * d4 + d5 * d5 + d6 * d6 + d7 * d7 + d8 * d8;
     if (change < SETTLED) break;
-    c0 = x4 * x8 - x5 * x7, c1 = x5 * x6 - x3 * x8, c2 = x3 * x7 - x4 * x6;
     c3 = x2 * x7 - x1 * x8, c4 = x0 * x8 - x2 * x6, c5 = x1 * x6 - x0 * x7;
     c6 = x1 * x5 - x2 * x4, c7 = x2 * x3 - x0 * x5, c8 = x0 * x4 - x1 * x3;
-    det = x0 * c0 + x1 * c1 + x2 * c2;
   }
-  if (x0 * (x4 * x8 - x5 * x7) + x1 * (x5 * x6 - x3 * x8) + x2 * (x3 * x7 - x4 * x6) < 0) {
+  if (det < 0) {
     unreflected(F, R);
     x0 = R[0], x1 = R[1], x2 = R[2], x3 = R[3], x4 = R[4], x5 = R[5], x6 = R[6], x7 = R[7], x8 = R[8];
   }
@@ -117,9 +121,7 @@ export function stress(law, F, mu, lam, P) {
   if (law === NEO_HOOKEAN) return neoHookean(F, mu, lam, P);
   singular(F, U, a, V);
   principal(law, a, mu, lam, y);
-  for (let i = 0; i < 9; i += 3)
-    for (let k = 0; k < 3; k++)
-      P[i + k] = U[i] * y[0] * V[3 * k] + U[i + 1] * y[1] * V[3 * k + 1] + U[i + 2] * y[2] * V[3 * k + 2];
+  composed(y, P);
 }
 
 /** Second derivatives of the energies of `principal`, by differences that are exact to eight digits. */

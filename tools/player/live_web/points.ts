@@ -151,11 +151,8 @@ function neoHookean(mu: v128, lam: v128): void {
 
 /** A bound of how much an area of the material grows, squared: the largest sum of a row of cof(FᵀF) (Gershgorin). */
 function largestArea(): v128 {
-  const c0 = cross(F4, F8, F5, F7), c1 = cross(F5, F6, F3, F8), c2 = cross(F3, F7, F4, F6);
-  const c3 = cross(F2, F7, F1, F8), c4 = cross(F0, F8, F2, F6), c5 = cross(F1, F6, F0, F7);
-  const c6 = cross(F1, F5, F2, F4), c7 = cross(F2, F3, F0, F5), c8 = cross(F0, F4, F1, F3);
-  const xy = f32x4.abs(dot(c0, c3, c6, c1, c4, c7)), xz = f32x4.abs(dot(c0, c3, c6, c2, c5, c8)), yz = f32x4.abs(dot(c1, c4, c7, c2, c5, c8));
-  const x = dot(c0, c3, c6, c0, c3, c6), y = dot(c1, c4, c7, c1, c4, c7), z = dot(c2, c5, c8, c2, c5, c8);
+  const xy = f32x4.abs(dot(C0, C3, C6, C1, C4, C7)), xz = f32x4.abs(dot(C0, C3, C6, C2, C5, C8)), yz = f32x4.abs(dot(C1, C4, C7, C2, C5, C8));
+  const x = dot(C0, C3, C6, C0, C3, C6), y = dot(C1, C4, C7, C1, C4, C7), z = dot(C2, C5, C8, C2, C5, C8);
   return f32x4.max(f32x4.max(add(x, add(xy, xz)), add(y, add(xy, yz))), add(z, add(xz, yz)));
 }
 
@@ -285,6 +282,9 @@ export function particles(
         }
       }
       F0 = g0, F1 = g1, F2 = g2, F3 = g3, F4 = g4, F5 = g5, F6 = g6, F7 = g7, F8 = g8;
+      C0 = cross(g4, g8, g5, g7), C1 = cross(g5, g6, g3, g8), C2 = cross(g3, g7, g4, g6);
+      C3 = cross(g2, g7, g1, g8), C4 = cross(g0, g8, g2, g6), C5 = cross(g1, g6, g0, g7);
+      C6 = cross(g1, g5, g2, g4), C7 = cross(g2, g3, g0, g5), C8 = cross(g0, g4, g1, g3);
       const mu = get(at, 4), lam = get(at, 5), laws = get(at, 13);
       if (looked) {
         v128.store(speeds + VECTOR * q, f32x4.sqrt(dot(v0, v1, v2, v0, v1, v2)));
@@ -298,9 +298,6 @@ export function particles(
         }
         if (!pushed) continue;
       }
-      C0 = cross(g4, g8, g5, g7), C1 = cross(g5, g6, g3, g8), C2 = cross(g3, g7, g4, g6);
-      C3 = cross(g2, g7, g1, g8), C4 = cross(g0, g8, g2, g6), C5 = cross(g1, g6, g0, g7);
-      C6 = cross(g1, g5, g2, g4), C7 = cross(g2, g3, g0, g5), C8 = cross(g0, g4, g1, g3);
       const mixed = f32x4.gt(laws, all(0.5));
       if (!v128.any_true(mixed)) {
         corotated(mu, lam);

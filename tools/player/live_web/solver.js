@@ -176,7 +176,7 @@ export class Solver extends Body {
    */
   particles(looked, pushed) {
     const { a, aero, idle, stiffness, head } = this;
-    const { displacement: U, velocity: V, force: A } = this;
+    const { force: A } = this;
     const { fraction, volume, mass, law, mu, lam, area, cellStart, cellNodes } = a;
     const viscous = head.viscous;
     let fastest = 0;
@@ -185,12 +185,7 @@ export class Solver extends Body {
     const inverse = 1 / head.dx;
     for (let c = 0; c < this.cells; c++) {
       const first = 27 * c;
-      for (let k = 0; k < 27; k++) {
-        const at = WIDE * cellNodes[first + k];
-        const to = 3 * k;
-        u27[to] = U[at], u27[to + 1] = U[at + 1], u27[to + 2] = U[at + 2];
-        v27[to] = V[at], v27[to + 1] = V[at + 1], v27[to + 2] = V[at + 2];
-      }
+      this.gather(first);
       a27.fill(0);
       for (let p = cellStart[c]; p < cellStart[c + 1]; p++) {
         weights(fraction, 3 * p, w, g, inverse);
@@ -304,18 +299,22 @@ export class Solver extends Body {
     }
   }
 
-  /** Makes a point the one that is worked on: fields of its nodes, weights, and its displacement. */
-  at(p, first) {
+  /** The fields of the nodes of a cell, into `u27` and `v27`. */
+  gather(first) {
     const { displacement: U, velocity: V } = this;
-    const { cellNodes, fraction } = this.a;
+    const { cellNodes } = this.a;
     for (let k = 0; k < 27; k++) {
       const at = WIDE * cellNodes[first + k];
-      for (let m = 0; m < 3; m++) {
-        u27[3 * k + m] = U[at + m];
-        v27[3 * k + m] = V[at + m];
-      }
+      const to = 3 * k;
+      u27[to] = U[at], u27[to + 1] = U[at + 1], u27[to + 2] = U[at + 2];
+      v27[to] = V[at], v27[to + 1] = V[at + 1], v27[to + 2] = V[at + 2];
     }
-    weights(fraction, 3 * p, w, g, 1 / this.head.dx);
+  }
+
+  /** Makes a point the one that is worked on: fields of its nodes, weights, and its displacement. */
+  at(p, first) {
+    this.gather(first);
+    weights(this.a.fraction, 3 * p, w, g, 1 / this.head.dx);
     interpolate(u27, place);
   }
 
