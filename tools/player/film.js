@@ -1,5 +1,5 @@
 // A film of Gaussians: splats once, the displacement of grid nodes per frame. See docs/web.md.
-import { halves, reader } from "./gaussians.js";
+import { reader, writeNodes } from "./gaussians.js";
 import { View } from "./view.js";
 
 // ---- the parts of the file, see gaussian_swaying/viewer/film/page.py
@@ -62,15 +62,7 @@ export async function play(read, tell) {
     if (frame === state.frame) return;
     const { row } = frames;
     const from = frames.near.subarray(frame * row, (frame + 1) * row);
-    const { rows, values } = frames.far[frame];
-    drawing.move((data) => {
-      for (let i = 0, at = 0; i < row; i += 3, at += 4) {
-        data[at] = halves[from[i]];
-        data[at + 1] = halves[from[i + 1]];
-        data[at + 2] = halves[from[i + 2]];
-      }
-      for (let i = 0; i < rows.length; i += 4) data.set(values.subarray(i + 1, i + 4), 4 * rows[i]);
-    });
+    drawing.move((data) => writeNodes(data, from, frames.far[frame]));
     state.frame = frame;
     slider.value = String(frame);
     const seconds = (count) => (count * head.frame_dt).toFixed(2);

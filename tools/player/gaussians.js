@@ -20,7 +20,17 @@ export function reader(bytes) {
 }
 
 // The numbers of float16, by their bits.
-export const halves = Float32Array.from({ length: 65536 }, (_, bits) => THREE.DataUtils.fromHalfFloat(bits));
+const halves = Float32Array.from({ length: 65536 }, (_, bits) => THREE.DataUtils.fromHalfFloat(bits));
+
+// Writes the displacements of all nodes, four numbers each: `near` has float16, `far` index and displacement of the few that swing far.
+export function writeNodes(data, near, far) {
+  for (let i = 0, at = 0; i < near.length; i += 3, at += 4) {
+    data[at] = halves[near[i]];
+    data[at + 1] = halves[near[i + 1]];
+    data[at + 2] = halves[near[i + 2]];
+  }
+  for (let i = 0; i < far.rows.length; i += 4) data.set(far.values.subarray(i + 1, i + 4), 4 * far.rows[i]);
+}
 
 // Bytes of a Gaussian, in the texels of each of its textures, as RECORD in page.py lists them: position and colour; rotation,
 // size and growth; for those that move also their place in the grid, their stencil, and their normal.

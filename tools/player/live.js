@@ -1,7 +1,7 @@
 // The live page: draws the states of a running simulation on a canvas below that of viser. See docs/live.md.
 import * as THREE from "three";
 import { Brush } from "./brush.js";
-import { Drawing, halves } from "./gaussians.js";
+import { Drawing, writeNodes } from "./gaussians.js";
 import { Playback } from "./playback.js";
 
 const SLOW = 3; // pictures a second; a browser that draws fewer gets pictures from the server
@@ -20,16 +20,10 @@ function unpack(data) {
 // The displacement of all nodes, four numbers each.
 function readState(head, rest) {
   const near = new Uint16Array(rest.buffer, 0, 3 * head.nodes);
-  const out = new Float32Array(4 * head.nodes);
-  for (let i = 0, at = 0; i < near.length; i += 3, at += 4) {
-    out[at] = halves[near[i]];
-    out[at + 1] = halves[near[i + 1]];
-    out[at + 2] = halves[near[i + 2]];
-  }
+  const moved = new Float32Array(4 * head.nodes);
   const far = rest.slice(near.byteLength).buffer;
-  const [rows, values] = [new Int32Array(far), new Float32Array(far)];
-  for (let i = 0; i < rows.length; i += 4) out.set(values.subarray(i + 1, i + 4), 4 * rows[i]);
-  return { time: head.time, moved: out };
+  writeNodes(moved, near, { rows: new Int32Array(far), values: new Float32Array(far) });
+  return { time: head.time, moved };
 }
 
 // ---- the canvas
@@ -184,10 +178,7 @@ class Stage {
     playback.advance(now);
     if (this.stale || playback.shown !== before) {
       this.stale = false;
-      const [from, to, weight] = playback.between();
-      drawing.move((data) => {
-        for (let i = 0; i < from.moved.length; i++) data[i] = from.moved[i] + weight * (to.moved[i] - from.moved[i]);
-      });
+      drawing.move((data) => playback.write(data));
       this.moving = now;
     }
     const still = now - (this.moving ?? 0) > 0.3;

@@ -82,4 +82,10 @@ export class Playback {
     const way = to.time - from.time;
     return [from, to, way > 0 ? Math.min(Math.max((this.shown - from.time) / way, 0), 1) : 0];
   }
+
+  // Write the displacements of the nodes that are shown.
+  write(data) {
+    const [from, to, weight] = this.between();
+    for (let i = 0; i < from.moved.length; i++) data[i] = from.moved[i] + weight * (to.moved[i] - from.moved[i]);
+  }
 }

@@ -274,10 +274,7 @@ export async function sway(read, tell) {
     state.shown = playback.shown;
     if (playback.newest !== null && (state.stale || before !== state.shown)) {
       state.stale = false;
-      const [from, to, weight] = playback.between();
-      drawing.move((data) => {
-        for (let i = 0; i < from.moved.length; i++) data[i] = from.moved[i] + weight * (to.moved[i] - from.moved[i]);
-      });
+      drawing.move((data) => playback.write(data));
     }
     const turn = azimuth();
     if (Math.abs(turn - dial.turn) > 1e-3) dial.show(dial.flow, turn);
