@@ -39,6 +39,21 @@ def test_streaks_follow_the_wind(make_simulation):
     torch.testing.assert_close(drift[kept], (short * torch.tensor([3.0, 0.0, 4.0])).double().expand_as(drift[kept]))
 
 
+def test_streaks_of_air_that_turns_are_circles(make_simulation, monkeypatch):
+    """Steps of the second order, of at most 0.1 rad: the radius grows by 0.1^4 / 8 in each."""
+    simulation = make_simulation()
+    simulation.wind = WindField([3.0, 0.0, 0.0])
+    state, camera = simulation.start(), simulation.painter.camera_at(0)
+    seconds = float((streaks(simulation.stepper, state, camera)[0].diff(dim=1).norm(dim=-1).sum(1) / 3.0)[0])
+    rate = 0.1 * STEPS / seconds
+    monkeypatch.setattr(
+        simulation.stepper, "air_at", lambda _, x: rate * torch.stack([-x[:, 2], 0 * x[:, 1], x[:, 0]], 1)
+    )
+    places = simulation.scene.frame.point_to_sim(streaks(simulation.stepper, state, camera)[0].reshape(-1, 3))
+    radius = places[:, [0, 2]].norm(dim=-1).view(-1, STEPS + 1)
+    torch.testing.assert_close(radius[:, -1], radius[:, 0], rtol=2 * STEPS * 0.1**4 / 8, atol=1e-6)
+
+
 @pytest.mark.parametrize(("distance", "angle", "height"), [(3.0, 40.0, 90), (7.0, 25.0, 300)])
 def test_streaks_fill_the_picture_and_are_an_eighth_of_it_long(make_simulation, distance, angle, height):
     """Seen from the side, in a plane through the middle: an eighth of 1.15 widths, which leave no edge without air."""
@@ -104,6 +119,10 @@ def test_vorticity_is_red_where_air_turns_against_the_clock(spin):
     seen = simulation.painter.draw(gaussians, simulation.painter.colors(gaussians, camera), camera)
     found = draw_vorticity(stepper, state, camera, seen)
     change = found - (0.5 * seen.color.clamp(0, 1) + 0.5)
+    size = float((state.position.amax(0) - state.position.amin(0)).amax())
+    colour = torch.tensor([0.70, 0.09, 0.17] if spin > 0 else [0.13, 0.40, 0.67])
+    under = 0.5 * seen.color[32, 62] + 0.5
+    torch.testing.assert_close(found[32, 62], torch.lerp(under, colour, 20.0 * size / (8 * 3.0)), rtol=0, atol=2e-3)
     red_less_blue = change[..., 0] - change[..., 2]
     assert float(red_less_blue[32, 62]) * spin > 1.0  # behind the flag
     assert float(change[2, 2].abs().max()) == 0
