@@ -1,5 +1,6 @@
 """Malformed configurations, captures and run folders, faults of the disk, and extreme numbers, each from a seed."""
 
+import copy
 import functools
 import json
 import os
@@ -12,7 +13,7 @@ from pathlib import Path
 
 import yaml
 from damage import changed, damaged
-from shared import PIN, SMALL, words
+from shared import SMALL, words
 from small_captures import arc, write_colmap, write_transforms
 
 ROOT = Path(__file__).parents[2]
@@ -36,7 +37,8 @@ def unusable(rng, path, *more):
 
 def _tree():
     tree = yaml.safe_load(FLAG.read_text(encoding="utf-8"))
-    tree["frames"], tree["solver"]["dx"], tree["solver"]["boundaries"] = 2, 0.2, [PIN]
+    tree["frames"], tree["solver"]["dx"] = 2, 0.2
+    tree["solver"]["boundaries"] = copy.deepcopy(SMALL["solver.boundaries"])  # it will be changed
     tree["scene"]["generator"]["init_args"]["spacing"] = 0.1
     tree["camera"]["init_args"] |= {"width": 32, "height": 18}
     return tree
