@@ -259,12 +259,14 @@ def _contact() -> str:
 
 # ---- nature.md
 
+# the estimate is for 20 m, 12 kg/m² and 0.364 Hz; that of 6.2 m has 4.9 kg/m² and 0.80 Hz, and the lean goes as 1 / (H M f²)
+LOW_CONIFER = 20 * 12 * 0.364**2 / (6.2 * 4.9 * 0.80**2)
 SWAY = {
     "plant": (7, 38, 70),
     "shrub": (1.6, 11, 33),
     "sapling": (2, 14, 39),
     "tree": (0.8, 6, 19),
-    "conifer": (0.3, 2.3, 8),
+    "conifer": tuple(LOW_CONIFER * lean for lean in (0.3, 2.3, 8)),
     "hanging": (3, 18, 54),
     "rigid": (0, 0, 0),
 }
