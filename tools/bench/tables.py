@@ -259,7 +259,7 @@ def _contact() -> str:
 
 # ---- nature.md
 
-# the estimate is for 20 m, 12 kg/m² and 0.364 Hz; that of 6.2 m has 4.9 kg/m² and 0.80 Hz, and the lean goes as 1 / (H M f²)
+# 6.2 m high with 4.9 kg/m² and 0.80 Hz, by the estimate for 20 m, 12 kg/m² and 0.364 Hz: it goes as 1 / (H M f²)
 LOW_CONIFER = 20 * 12 * 0.364**2 / (6.2 * 4.9 * 0.80**2)
 SWAY = {
     "plant": (7, 38, 70),
