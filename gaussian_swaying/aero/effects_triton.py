@@ -1,6 +1,6 @@
 """Effects of the wind as Triton functions; the references are in ``aero.effects``, ``carried`` and ``shelter``."""
 
-from gaussian_swaying.geometry.linalg_triton import chosen, matvec
+from gaussian_swaying.geometry.linalg_triton import add3, chosen, matvec
 from gaussian_swaying.kernels.language import tl, triton
 
 
@@ -104,11 +104,10 @@ def carried_field(v, x, numbers, now, table, OPTIONS: tl.constexpr):
 
     ``now``: place of the object's centre [cells] (3), strength. ``OPTIONS``: whether it repeats along each axis.
     """
-    p = matvec(numbers, x)
-    p = (p[0] + now[0], p[1] + now[1], p[2] + now[2])
+    p = add3(matvec(numbers, x), 1.0, now)
     found = _look_up(table, chosen(numbers, 18, 3), p, OPTIONS[0], OPTIONS[1], OPTIONS[2], 3)
     found = matvec(chosen(numbers, 9, 9), found)
-    return v[0] + now[3] * found[0], v[1] + now[3] * found[1], v[2] + now[3] * found[2]
+    return add3(v, now[3], found)
 
 
 @triton.jit

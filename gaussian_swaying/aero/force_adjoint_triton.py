@@ -2,6 +2,7 @@
 
 from gaussian_swaying.aero.force_triton import sums_over_patches
 from gaussian_swaying.geometry.linalg_triton import (
+    add3,
     axpy3,
     axpy9,
     cofactor,
@@ -52,13 +53,13 @@ def wind_terms_adjoint(air, r, facing, across, through, tangent, a, drag, fricti
         pressure = blow * ac
         by_across = scale3(drag * blow, a)
     shear = speed * at
-    by_r = axpy3(1.0, by_r, friction * at * inverse, r)
+    by_r = add3(by_r, friction * at * inverse, r)
     by_tangent = scale3(friction * speed, a)
     turn = cross3(facing, a)
     product = dot3(r, turn)
     side = speed * product
-    by_r = axpy3(1.0, by_r, lift, axpy3(product * inverse, r, speed, turn))
-    by_facing = axpy3(1.0, by_facing, lift * speed, cross3(a, r))
+    by_r = add3(by_r, lift, axpy3(product * inverse, r, speed, turn))
+    by_facing = add3(by_facing, lift * speed, cross3(a, r))
     return by_air, by_r, by_facing, by_across, by_through, by_tangent, (pressure, shear, side)
 
 
@@ -76,22 +77,22 @@ def wind_force_adjoint(F, velocity, patch, numbers, air, table, a, OPTIONS: tl.c
         tl.where(flat, rest[2], vector[2] * scale),
     )
     drag, friction, lift, half_density, widest = numbers
-    relative = (air[0] - velocity[0], air[1] - velocity[1], air[2] - velocity[2])
+    relative = add3(air, -1.0, velocity)
     along = dot3(relative, n)
     sign = tl.where(along < 0, -1.0, 1.0)
-    tangent = axpy3(1.0, relative, -along, n)
+    tangent = add3(relative, -along, n)
     by_air, by_r, by_facing, by_across, by_through, by_tangent, parts = wind_terms_adjoint(
         air, relative, scale3(sign, n), scale3(along, n), scale3(sign * along * along, n), tangent, a,
         drag, friction, lift, OPTIONS[0],
     )  # fmt: skip
-    by_across = axpy3(1.0, by_across, -1.0, by_tangent)
+    by_across = add3(by_across, -1.0, by_tangent)
     by_along = dot3(by_across, n)
     by_n = axpy3(sign, by_facing, along, by_across)
     if OPTIONS[0] == 3:
         by_along += 2 * sign * along * dot3(by_through, n)
-        by_n = axpy3(1.0, by_n, sign * along * along, by_through)
-    by_r = axpy3(1.0, axpy3(1.0, by_r, 1.0, by_tangent), by_along, n)
-    by_n = axpy3(1.0, by_n, by_along, relative)
+        by_n = add3(by_n, sign * along * along, by_through)
+    by_r = add3(add3(by_r, 1.0, by_tangent), by_along, n)
+    by_n = add3(by_n, by_along, relative)
     whole = drag * parts[0] + friction * parts[1] + lift * parts[2]
     half = half_density * patch[3]
     area = half * tl.minimum(size, widest)
@@ -99,15 +100,11 @@ def wind_force_adjoint(F, velocity, patch, numbers, air, table, a, OPTIONS: tl.c
     growth = tl.where(size < widest, half * whole, 0.0) * tl.where(det < 0, -1.0, 1.0)
     turn = area * scale
     normal_part = dot3(by_n, n)
-    v = (
-        turn * (by_n[0] - normal_part * n[0]) + growth * n[0],
-        turn * (by_n[1] - normal_part * n[1]) + growth * n[1],
-        turn * (by_n[2] - normal_part * n[2]) + growth * n[2],
-    )
-    by_wind = (area * by_r[0], area * by_r[1], area * by_r[2])
-    by_velocity = (-by_wind[0], -by_wind[1], -by_wind[2])
+    v = axpy3(turn, add3(by_n, -normal_part, n), growth, n)
+    by_wind = scale3(area, by_r)
+    by_velocity = scale3(-1.0, by_wind)
     if OPTIONS[0] == 2:
-        by_wind = axpy3(1.0, by_wind, area, by_air)
+        by_wind = add3(by_wind, area, by_air)
     by_F = cofactor_change(F, outer3(v, rest))
     return by_F, by_velocity, by_wind, scale3(area, parts)
 
@@ -121,7 +118,7 @@ def flow_adjoint(table, first, count, w, by_q):
         known = k < count
         b = load3(table, 1, first + 8 + 4 * k, known)
         share = 2 * tl.abs(dot3(b, w)) * dot3(b, by_q) / tl.maximum(dot3(b, b), 1.2e-38)
-        by_w = axpy3(1.0, by_w, tl.where(known, share, 0.0), b)
+        by_w = add3(by_w, tl.where(known, share, 0.0), b)
     return by_w
 
 
@@ -134,7 +131,7 @@ def wind_on_groups_adjoint(F, velocity, place, numbers, air, table, a, OPTIONS: 
     first = 4 * place[0].to(tl.int32)
     count = place[1].to(tl.int32)
     real = count > 0
-    r = (air[0] - velocity[0], air[1] - velocity[1], air[2] - velocity[2])
+    r = add3(air, -1.0, velocity)
     drag, friction, lift, half, widest = numbers
     c = cofactor(F)
     w = matvec(transpose(c), r)
@@ -158,8 +155,8 @@ def wind_on_groups_adjoint(F, velocity, place, numbers, air, table, a, OPTIONS: 
     by_air, by_r, by_facing, by_across, by_through, by_tangent, parts = wind_terms_adjoint(
         air, r, facing, across, through, tangent, a, drag, friction, lift, OPTIONS[0]
     )
-    by_r = axpy3(1.0, by_r, area, by_tangent)
-    by_across = axpy3(1.0, by_across, -1.0, by_tangent)
+    by_r = add3(by_r, area, by_tangent)
+    by_across = add3(by_across, -1.0, by_tangent)
     by_area = dot3(by_tangent, r)
     total = drag * parts[0] + friction * parts[1] + lift * parts[2]
     cap = tl.minimum(widest / growth, 1.0)
@@ -169,8 +166,8 @@ def wind_on_groups_adjoint(F, velocity, place, numbers, air, table, a, OPTIONS: 
     by_pressed = scale3(1.0 / (growth * growth), by_through)
     if OPTIONS[0] == 3:
         by_growth -= 2 * dot3(by_through, through) / growth
-        by_w = axpy3(1.0, by_w, 1.0, flow_adjoint(table, first, count, w, matvec(transpose(c), by_pressed)))
-    by_r = axpy3(1.0, by_r, 1.0, matvec(c, by_w))
+        by_w = add3(by_w, 1.0, flow_adjoint(table, first, count, w, matvec(transpose(c), by_pressed)))
+    by_r = add3(by_r, 1.0, matvec(c, by_w))
     by_grown = by_growth / (2 * growth * whole)
     by_turned = axpy9(1.0, outer3(scaled, w), by_grown, c)
     by_c = axpy9(1.0, outer3(by_facing, s), 1.0, matmul(by_turned, tensor))
@@ -180,8 +177,8 @@ def wind_on_groups_adjoint(F, velocity, place, numbers, air, table, a, OPTIONS: 
     by_c = axpy9(1.0, by_c, by_grown, turned)
     scale = tl.where(real, half * cap, 0.0)
     by_c = axpy9(scale, by_c, 0.0, c)
-    by_wind = (scale * by_r[0], scale * by_r[1], scale * by_r[2])
-    by_velocity = (-by_wind[0], -by_wind[1], -by_wind[2])
+    by_wind = scale3(scale, by_r)
+    by_velocity = scale3(-1.0, by_wind)
     if OPTIONS[0] == 2:
-        by_wind = axpy3(1.0, by_wind, scale, by_air)
+        by_wind = add3(by_wind, scale, by_air)
     return cofactor_change(F, by_c), by_velocity, by_wind, scale3(scale, parts)

@@ -1,6 +1,7 @@
 """The force of the wind as a Triton function, for the fused substep. The reference is ``aero.wind_force``."""
 
 from gaussian_swaying.geometry.linalg_triton import (
+    add3,
     axpy3,
     chosen,
     cofactor,
@@ -35,11 +36,7 @@ def wind_terms(air, relative, facing, across, through, tangent, drag, friction, 
     shear = friction * speed
     side = cross3(relative, facing)
     lifting = lift * speed
-    force = (
-        pressure * pressed[0] + shear * tangent[0] + lifting * side[0],
-        pressure * pressed[1] + shear * tangent[1] + lifting * side[1],
-        pressure * pressed[2] + shear * tangent[2] + lifting * side[2],
-    )
+    force = add3(axpy3(pressure, pressed, shear, tangent), lifting, side)
     return force, drag * blow + (friction + tl.abs(lift)) * speed
 
 
@@ -73,10 +70,10 @@ def wind_force(F, velocity, position, patch, numbers, now, table, OPTIONS: tl.co
     EFFECTS: tl.constexpr = OPTIONS[2]
     air = shaped_wind(position, now, table, EFFECTS)
     normal, area = deform_patch(F, (patch[0], patch[1], patch[2]), patch[3], numbers[4])
-    relative = (air[0] - velocity[0], air[1] - velocity[1], air[2] - velocity[2])
+    relative = add3(air, -1.0, velocity)
     along = dot3(relative, normal)
     sign = tl.where(along < 0, -1.0, 1.0)
-    tangent = axpy3(1.0, relative, -along, normal)
+    tangent = add3(relative, -along, normal)
     force, yielding = wind_terms(
         air, relative, scale3(sign, normal), scale3(along, normal), scale3(sign * along * along, normal), tangent,
         numbers[0], numbers[1], numbers[2], OPTIONS[0],
@@ -144,7 +141,7 @@ def wind_on_groups(F, velocity, position, place, numbers, now, table, OPTIONS: t
     first = EFFECTS.size + 4 * place[0].to(tl.int32)
     count = place[1].to(tl.int32)
     real = count > 0
-    relative = (air[0] - velocity[0], air[1] - velocity[1], air[2] - velocity[2])
+    relative = add3(air, -1.0, velocity)
     drag, friction, lift, half_density, widest = numbers
     c = cofactor(F)
     w = matvec(transpose(c), relative)

@@ -4,7 +4,7 @@ The references are ``aero.obstacle_flow`` and ``aero.obstacles``. They compute i
 """
 
 from gaussian_swaying.aero import obstacle_flow
-from gaussian_swaying.geometry.linalg_triton import chosen, cross3, dot3, scale3
+from gaussian_swaying.geometry.linalg_triton import add3, chosen, cross3, dot3, matvec, scale3, transpose
 from gaussian_swaying.kernels.language import tl, triton
 
 PLANE_GROWTH = tl.constexpr(obstacle_flow.PLANE_GROWTH)
@@ -54,26 +54,21 @@ def past_cylinder(v, x, numbers, now, table, OPTIONS: tl.constexpr):
     """
     radius = numbers[6]
     axis = (numbers[3], numbers[4], numbers[5])
-    p = (x[0] - numbers[0], x[1] - numbers[1], x[2] - numbers[2])
+    p = add3(x, -1.0, numbers)
     height = dot3(p, axis)
-    away = (p[0] - height * axis[0], p[1] - height * axis[1], p[2] - height * axis[2])
+    away = add3(p, -height, axis)
     rising = dot3(v, axis)
-    across = (v[0] - rising * axis[0], v[1] - rising * axis[1], v[2] - rising * axis[2])
+    across = add3(v, -rising, axis)
     square = dot3(away, away)
     outside = square >= radius * radius
     square = tl.maximum(square, radius * radius)
     along = 2 * dot3(across, away) / square
     share = radius * radius / square
-    v = (
-        v[0] + share * (across[0] - along * away[0]),
-        v[1] + share * (across[1] - along * away[1]),
-        v[2] + share * (across[2] - along * away[2]),
-    )
+    v = add3(v, share, add3(across, -along, away))
     v = _only(outside, v)
     if OPTIONS[0]:
         rising = dot3(now, axis)
-        flow = (now[0] - rising * axis[0], now[1] - rising * axis[1], now[2] - rising * axis[2])
-        direction, _ = _direction(flow)
+        direction, _ = _direction(add3(now, -rising, axis))
         left = cross3(axis, direction)
         behind = dot3(p, direction)
         aside = dot3(p, left)
@@ -117,14 +112,13 @@ def past_ellipsoid(v, x, numbers, now, table, OPTIONS: tl.constexpr):
     ``numbers``: middle (3), axes (9), size (its longest half axis), drag, start of the wake, the half axes per size
     (3), and ``ellipsoid_strength`` along each axis (3).
     """
-    first = chosen(numbers, 3, 3)
-    second = chosen(numbers, 6, 3)
-    third = chosen(numbers, 9, 3)
+    axes = chosen(numbers, 3, 9)
     size = numbers[12]
     r = chosen(numbers, 15, 3)
-    p = (x[0] - numbers[0], x[1] - numbers[1], x[2] - numbers[2])
-    q = (dot3(first, p) / size, dot3(second, p) / size, dot3(third, p) / size)
-    w = (dot3(first, v), dot3(second, v), dot3(third, v))
+    p = add3(x, -1.0, numbers)
+    q = matvec(axes, p)
+    q = (q[0] / size, q[1] / size, q[2] / size)
+    w = matvec(axes, v)
     a = (r[0] * r[0], r[1] * r[1], r[2] * r[2])
     outside = q[0] * q[0] / a[0] + q[1] * q[1] / a[1] + q[2] * q[2] / a[2] >= 1
     q = (tl.where(outside, q[0], r[0]), tl.where(outside, q[1], r[1]), tl.where(outside, q[2], r[2]))
@@ -145,19 +139,14 @@ def past_ellipsoid(v, x, numbers, now, table, OPTIONS: tl.constexpr):
         w[1] + strong[1] * third_of * carlson_rd(s[2], s[0], s[1]) + steep * n[1],
         w[2] + strong[2] * third_of * carlson_rd(s[0], s[1], s[2]) + steep * n[2],
     )
-    w = _only(outside, w)
-    v = (
-        first[0] * w[0] + second[0] * w[1] + third[0] * w[2],
-        first[1] * w[0] + second[1] * w[1] + third[1] * w[2],
-        first[2] * w[0] + second[2] * w[1] + third[2] * w[2],
-    )
+    v = matvec(transpose(axes), _only(outside, w))
     if OPTIONS[0]:
         direction, _speed = _direction(now)
         flat = tl.maximum(tl.sqrt(direction[0] * direction[0] + direction[1] * direction[1]), 1e-12)
         side = (-direction[1] / flat, direction[0] / flat, 0.0)
         up = cross3(direction, side)
-        wide = _across(side, first, second, third, r) * size
-        high = _across(up, first, second, third, r) * size
+        wide = _across(side, axes, r) * size
+        high = _across(up, axes, r) * size
         mean = tl.sqrt(tl.maximum(wide * high, 1e-12))
         left = dot3(p, side) * (mean / tl.maximum(wide, 1e-12))
         above = dot3(p, up) * (mean / tl.maximum(high, 1e-12))
@@ -168,8 +157,7 @@ def past_ellipsoid(v, x, numbers, now, table, OPTIONS: tl.constexpr):
 
 
 @triton.jit
-def _across(direction, first, second, third, r):
-    a = dot3(first, direction) * r[0]
-    b = dot3(second, direction) * r[1]
-    c = dot3(third, direction) * r[2]
-    return 2 * tl.sqrt(a * a + b * b + c * c)
+def _across(direction, axes, r):
+    along = matvec(axes, direction)
+    half = (along[0] * r[0], along[1] * r[1], along[2] * r[2])
+    return 2 * tl.sqrt(dot3(half, half))

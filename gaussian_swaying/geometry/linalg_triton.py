@@ -158,18 +158,15 @@ def dot3(a, b):
 
 
 @triton.jit
-def cross3(a, b):
-    """Cross product of two vectors."""
-    return (a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0])
+def determinant(a, cof):
+    """The determinant of a matrix with this cofactor matrix."""
+    return dot3(a, cof)
 
 
 @triton.jit
-def square9(a):
-    """Sum of the squares of a matrix."""
-    return (
-        a[0] * a[0] + a[1] * a[1] + a[2] * a[2] + a[3] * a[3] + a[4] * a[4] + a[5] * a[5] + a[6] * a[6]
-        + a[7] * a[7] + a[8] * a[8]
-    )  # fmt: skip
+def cross3(a, b):
+    """Cross product of two vectors."""
+    return (a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0])
 
 
 @triton.jit
@@ -242,10 +239,10 @@ def scaled_product(u, d, v):
 def _polar_step(x):
     """A step of Newton's iteration with Higham's scaling."""
     cof = cofactor(x)
-    det = x[0] * cof[0] + x[1] * cof[1] + x[2] * cof[2]
+    det = determinant(x, cof)
     size = tl.maximum(tl.abs(det), 1e-9)
     inverse = 1.0 / tl.where(det < 0, -size, size)
-    ratio = square9(cof) * inverse * inverse / tl.maximum(square9(x), 1e-9)
+    ratio = dot9(cof, cof) * inverse * inverse / tl.maximum(dot9(x, x), 1e-9)
     zeta = tl.sqrt(tl.sqrt(tl.maximum(ratio, 1e-37)))
     return axpy9(0.5 * zeta, x, 0.5 * inverse / zeta, cof)
 
@@ -264,9 +261,9 @@ def polar_rotation(F):
             last = x
             x = _polar_step(x)
             change = axpy9(1.0, x, -1.0, last)
-            k = tl.where(tl.max(square9(change)) > settled, k + 1, 5)  # changes square
+            k = tl.where(tl.max(dot9(change, change)) > settled, k + 1, 5)  # changes square
     cof = cofactor(x)
-    reflected = x[0] * cof[0] + x[1] * cof[1] + x[2] * cof[2] < 0
+    reflected = determinant(x, cof) < 0
     if tl.max(reflected.to(tl.int32)) > 0:
         u, _a, v = svd3(F)
         x = where9(reflected, matmul(u, transpose(v)), x)
@@ -286,14 +283,10 @@ def polar_change(F, R, x):
     size = tl.maximum(tl.abs(system[0]), tl.maximum(tl.abs(system[4]), tl.abs(system[8])))
     size = tl.maximum(size, tl.maximum(tl.abs(m01), tl.maximum(tl.abs(m02), tl.abs(m12))))
     least = 3.4526698e-4 * tl.maximum(size * size * size, 1.0842022e-19)  # as in the reference
-    scale = 1.0 / tl.maximum(system[0] * cof[0] + m01 * cof[1] + m02 * cof[2], least)
+    scale = 1.0 / tl.maximum(determinant(system, cof), least)
     turn = matmul(transpose(R), x)
     k = (turn[7] - turn[5], turn[2] - turn[6], turn[3] - turn[1])
-    spin = (
-        scale * (cof[0] * k[0] + cof[1] * k[1] + cof[2] * k[2]),
-        scale * (cof[3] * k[0] + cof[4] * k[1] + cof[5] * k[2]),
-        scale * (cof[6] * k[0] + cof[7] * k[1] + cof[8] * k[2]),
-    )
+    spin = scale3(scale, matvec(cof, k))
     r0 = cross3((R[0], R[1], R[2]), spin)
     r1 = cross3((R[3], R[4], R[5]), spin)
     r2 = cross3((R[6], R[7], R[8]), spin)
@@ -432,10 +425,10 @@ def largest_eigenvalue(m):
     """Largest eigenvalue of a symmetric matrix, as ``linalg.symmetric_eigenvalues``."""
     mean = (m[0] + m[4] + m[8]) / 3
     d = (m[0] - mean, m[1], m[2], m[3], m[4] - mean, m[5], m[6], m[7], m[8] - mean)
-    radius = tl.sqrt(square9(d) / 6)
+    radius = tl.sqrt(dot9(d, d) / 6)
     cof = cofactor(d)
     scale = 1.0 / tl.maximum(radius, 1e-19)
-    half = 0.5 * (d[0] * cof[0] + d[1] * cof[1] + d[2] * cof[2]) * scale * scale * scale
+    half = 0.5 * determinant(d, cof) * scale * scale * scale
     # 2 cos(acos(h) / 3) = 1 + e with e² (3 + e) = 2 (1 + h): Newton from above, good to round-off at a double root too
     target = 2 * (1 + clamp(half, -1.0, 1.0))
     e = tl.sqrt(target / 3)

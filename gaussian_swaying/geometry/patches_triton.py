@@ -8,11 +8,14 @@ from torch import Tensor
 from gaussian_swaying.geometry.linalg_triton import (
     axpy9,
     cofactor,
+    determinant,
     dot3,
     load3,
     load9,
     matmul,
+    matvec,
     polar_rotation,
+    scale3,
     store3,
     store9,
     transpose,
@@ -29,12 +32,7 @@ BLOCK = 128
 def area_vector(F, n):
     """cof(F) N, which is as long as the area has grown (Nanson's formula), and det F."""
     c = cofactor(F)
-    vector = (
-        c[0] * n[0] + c[1] * n[1] + c[2] * n[2],
-        c[3] * n[0] + c[4] * n[1] + c[5] * n[2],
-        c[6] * n[0] + c[7] * n[1] + c[8] * n[2],
-    )
-    return vector, F[0] * c[0] + F[1] * c[1] + F[2] * c[2]
+    return matvec(c, n), determinant(F, c)
 
 
 @triton.jit
@@ -44,7 +42,7 @@ def deform_patch(F, n, area, max_ratio):
     size = tl.sqrt(dot3(vector, vector))
     flat = size == 0
     scale = tl.where(det < 0, -1.0, 1.0) / tl.where(flat, 1.0, size)
-    normal = where3(flat, n, (vector[0] * scale, vector[1] * scale, vector[2] * scale))
+    normal = where3(flat, n, scale3(scale, vector))
     return normal, tl.minimum(size, max_ratio) * area
 
 

@@ -1,6 +1,6 @@
 """Kernels that measure a state: energy and wave speed."""
 
-from gaussian_swaying.geometry.linalg_triton import load3, load9
+from gaussian_swaying.geometry.linalg_triton import dot3, load3, load9
 from gaussian_swaying.kernels.language import tl, triton
 from gaussian_swaying.mpm.triton.shared import VARIES, keep_largest, wave_speed
 
@@ -29,5 +29,5 @@ def largest_speed(
     speed = wave_speed(F, tl.load(density + index, mask, 1.0), mu, lam, WAVE, SPATIAL)
     if SPATIAL:
         v = load3(velocity, 1, index * 3, mask)
-        speed += tl.sqrt(v[0] * v[0] + v[1] * v[1] + v[2] * v[2])
+        speed += tl.sqrt(dot3(v, v))
     keep_largest(out, speed, mask)

@@ -7,7 +7,7 @@ of the centre (3), rotation (9), and the velocity of what is at an offset from t
 of the centre (3).
 """
 
-from gaussian_swaying.geometry.linalg_triton import dot3, matmul, matvec, read, transpose
+from gaussian_swaying.geometry.linalg_triton import add3, dot3, matmul, matvec, read, transpose
 from gaussian_swaying.kernels.language import tl, triton
 from gaussian_swaying.mpm.triton.shared import VARIES
 
@@ -54,8 +54,8 @@ def stop_nodes(
     friction = tl.load(row + 1)
     distance, n, own = touch(x, row, pose, numbers, mask, SOLIDS, w, MOVES)
     if MOVES:
-        held = stopped((v[0] - own[0], v[1] - own[1], v[2] - own[2]), n, KIND, friction)
-        held = (held[0] + own[0], held[1] + own[1], held[2] + own[2])
+        held = stopped(add3(v, -1.0, own), n, KIND, friction)
+        held = add3(held, 1.0, own)
     else:
         held = stopped(v, n, KIND, friction)
     return held, distance <= 0

@@ -5,7 +5,7 @@ of :mod:`~gaussian_swaying.mpm.formulations`; the kernels follow them and are te
 stay loops in Triton's intermediate code: if they are unrolled, its passes take minutes.
 """
 
-from gaussian_swaying.geometry.linalg_triton import largest, largest_eigenvalue, load3, matmul, read, transpose
+from gaussian_swaying.geometry.linalg_triton import add3, largest, largest_eigenvalue, load3, matmul, read, transpose
 from gaussian_swaying.kernels.language import tl, triton
 
 SCHEDULE = 4
@@ -122,7 +122,7 @@ def twin_forces(
             force = more
             resistance = drag
         else:
-            force = (force[0] + more[0], force[1] + more[1], force[2] + more[2])
+            force = add3(force, 1.0, more)
             resistance += drag
     return force, resistance
 
@@ -132,7 +132,7 @@ def add_given(force, resistance, force_in, where, mask):
     """Add the force and the resistance in the rows of ``force_in``."""
     more = load3(force_in, 1, where * 4, mask)
     resistance += tl.load(force_in + where * 4 + 3, mask, 0.0)
-    return (force[0] + more[0], force[1] + more[1], force[2] + more[2]), resistance
+    return add3(force, 1.0, more), resistance
 
 
 @triton.jit

@@ -1,6 +1,7 @@
 """Sheets of one layer as Triton functions; the reference is :mod:`~gaussian_swaying.mpm.sheets`."""
 
 from gaussian_swaying.geometry.linalg_triton import (
+    add3,
     axpy3,
     axpy9,
     cofactor,
@@ -53,7 +54,7 @@ def sheet_pk1(F, n, mu, lam, row, LAWS: tl.constexpr):
     out = matvec(F, n)
     c = matvec(transpose(F), out)
     along = dot3(n, c)
-    shear = axpy3(1.0, c, -along, n)
-    side = axpy3(1.0, matvec(F, shear), along - 1, out)
+    shear = add3(c, -along, n)
+    side = add3(matvec(F, shear), along - 1, out)
     own = axpy9(1.0, outer3(out, shear), 1.0, outer3(side, n))
     return axpy9(1.0, P, _DIRECTOR * mu, own), flat

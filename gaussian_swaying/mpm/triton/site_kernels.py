@@ -1,6 +1,6 @@
 """The forces on the sites of the ``modes`` formulation, in one kernel for each substep."""
 
-from gaussian_swaying.geometry.linalg_triton import axpy3, cross3, load3, matvec, store3, transpose
+from gaussian_swaying.geometry.linalg_triton import add3, axpy3, cross3, load3, matvec, store3, transpose
 from gaussian_swaying.kernels.language import tl, triton
 from gaussian_swaying.mpm.triton.shared import VARIES, twin_forces
 
@@ -35,7 +35,7 @@ def site_forces(
     )  # fmt: skip
     bend = cross3((x, y, z), shift)
     start = load3(rest, 1, 3 * index, mask)
-    place = axpy3(1.0, start, 1.0, axpy3(0.5, bend, 1.0, shift))
+    place = add3(start, 1.0, axpy3(0.5, bend, 1.0, shift))
     force, resistance = twin_forces(
         FORCES, R, matvec(R, speed), place, index, mask, scene, values, count, vectors, scenes, step_offset, numbers
     )

@@ -9,7 +9,7 @@ Rows of node arrays: displacement and velocity, each in four columns of eight, a
 columns, or eight if boundaries need positions.
 """
 
-from gaussian_swaying.geometry.linalg_triton import add3, axpy9, columns9, load3, scale9
+from gaussian_swaying.geometry.linalg_triton import add3, axpy9, columns9, load3, scale3, scale9
 from gaussian_swaying.kernels.language import tl, triton
 from gaussian_swaying.mpm.laws.triton.body import ROW, pk1
 from gaussian_swaying.mpm.triton.damping import kelvin_voigt_pk1
@@ -195,7 +195,7 @@ def total_particles(
             account(value, resistance, v, kick, before, IMPLICIT, load, count, index, mask)
         if POSITION:
             mass = tl.load(material + 3 * count + index, mask, 0.0)
-            moved = (mass * u[0], mass * u[1], mass * u[2])
+            moved = scale3(mass, u)
         for i in range(3):
             wx, gx = node_weight(f[0], i, inverse_dx)
             for j in tl.static_range(3):

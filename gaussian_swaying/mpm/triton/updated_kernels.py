@@ -12,6 +12,7 @@ from gaussian_swaying.geometry.linalg_triton import (
     add3,
     axpy9,
     columns9,
+    dot3,
     load3,
     load9,
     matmul,
@@ -617,5 +618,5 @@ def updated_look(moving, count, out, WAVE: tl.constexpr, BLOCK: tl.constexpr):
     lam = tl.load(moving + 29 * count + index, mask, 0.0)
     density = tl.load(moving + 26 * count + index, mask, 1.0) / tl.load(moving + 27 * count + index, mask, 1.0)
     v = load3(moving + 12 * count, count, index, mask)
-    speed = wave_speed(F, density, mu, lam, WAVE, True) + tl.sqrt(v[0] * v[0] + v[1] * v[1] + v[2] * v[2])
+    speed = wave_speed(F, density, mu, lam, WAVE, True) + tl.sqrt(dot3(v, v))
     keep_largest(out, speed, mask)

@@ -4,13 +4,13 @@ from gaussian_swaying.geometry.linalg_triton import (
     axpy9,
     cofactor,
     cofactor_change,
+    determinant,
     dot9,
     largest,
     largest_eigenvalue,
     matmul,
     polar_change,
     polar_rotation,
-    square9,
     transpose,
 )
 from gaussian_swaying.kernels.language import tl, triton  # noqa: F401  (Triton's interpreter looks for tl)
@@ -38,7 +38,7 @@ def principal(a, mu, lam, internal, p):
 def pk1(F, mu, lam, internal, p):
     """``fixed_corotated_pk1``."""
     cof = cofactor(F)
-    pressure = lam * (F[0] * cof[0] + F[1] * cof[1] + F[2] * cof[2] - 1)
+    pressure = lam * (determinant(F, cof) - 1)
     return axpy9(2 * mu, axpy9(1.0, F, -1.0, polar_rotation(F)), pressure, cof)
 
 
@@ -52,8 +52,9 @@ def kirchhoff(F, mu, lam, internal, p):
 def energy(F, mu, lam):
     """``fixed_corotated_energy``."""
     cof = cofactor(F)
-    change = F[0] * cof[0] + F[1] * cof[1] + F[2] * cof[2] - 1
-    return mu * square9(axpy9(1.0, F, -1.0, polar_rotation(F))) + 0.5 * lam * change * change
+    change = determinant(F, cof) - 1
+    off = axpy9(1.0, F, -1.0, polar_rotation(F))
+    return mu * dot9(off, off) + 0.5 * lam * change * change
 
 
 @triton.jit
@@ -68,7 +69,7 @@ def wave(F, mu, lam):
 def adjoint(F, Q, mu, lam):
     """Derivative of :func:`pk1` in the direction Q, and of Q : P by mu and lam."""
     cof = cofactor(F)
-    change = F[0] * cof[0] + F[1] * cof[1] + F[2] * cof[2] - 1
+    change = determinant(F, cof) - 1
     R = polar_rotation(F)
     growth = dot9(cof, Q)
     bend = axpy9(2 * mu, axpy9(1.0, Q, -1.0, polar_change(F, R, Q)), lam * growth, cof)

@@ -1,6 +1,6 @@
 """A weakly compressible fluid."""
 
-from gaussian_swaying.geometry.linalg_triton import cofactor
+from gaussian_swaying.geometry.linalg_triton import cofactor, determinant
 from gaussian_swaying.kernels.language import tl, triton
 from gaussian_swaying.mpm.laws.shared import FLUID_LIMIT
 from gaussian_swaying.mpm.laws.triton.functions import LawFunctions
@@ -14,7 +14,7 @@ def kirchhoff(F, mu, lam, internal, p):
     """``fluid_kirchhoff``; ``p`` is the exponent."""
     gamma = p[0]
     cof = cofactor(F)
-    det = F[0] * cof[0] + F[1] * cof[1] + F[2] * cof[2]
+    det = determinant(F, cof)
     bulk = lam + 2.0 / 3.0 * mu
     inside = tl.maximum(det, FLUID_FLOOR)
     power = tl.exp(-gamma * tl.log(inside))

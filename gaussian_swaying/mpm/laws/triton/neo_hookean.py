@@ -1,6 +1,14 @@
 """Neo-Hookean elasticity."""
 
-from gaussian_swaying.geometry.linalg_triton import axpy9, cofactor, cofactor_change, dot9, matmul, transpose
+from gaussian_swaying.geometry.linalg_triton import (
+    axpy9,
+    cofactor,
+    cofactor_change,
+    determinant,
+    dot9,
+    matmul,
+    transpose,
+)
 from gaussian_swaying.kernels.language import tl, triton
 from gaussian_swaying.mpm.laws.triton.functions import LawFunctions
 from gaussian_swaying.mpm.laws.triton.shared import LOG_FLOOR, log
@@ -10,7 +18,7 @@ from gaussian_swaying.mpm.laws.triton.shared import LOG_FLOOR, log
 def pk1(F, mu, lam, internal, p):
     """``neo_hookean_pk1``."""
     cof = cofactor(F)
-    det = F[0] * cof[0] + F[1] * cof[1] + F[2] * cof[2]
+    det = determinant(F, cof)
     return axpy9(mu, F, (lam * log(det) - mu) / tl.maximum(det, LOG_FLOOR), cof)
 
 
@@ -24,7 +32,7 @@ def kirchhoff(F, mu, lam, internal, p):
 def adjoint(F, Q, mu, lam):
     """Derivative of :func:`pk1` in the direction Q, and of Q : P by mu and lam."""
     cof = cofactor(F)
-    det = F[0] * cof[0] + F[1] * cof[1] + F[2] * cof[2]
+    det = determinant(F, cof)
     slope = 1.0 / tl.maximum(det, LOG_FLOOR)
     volume = log(det)
     pressure = (lam * volume - mu) * slope
