@@ -13,7 +13,7 @@ from gaussian_swaying.geometry.linalg_triton import add3, axpy9, dot3, scale3, s
 from gaussian_swaying.kernels.language import tl, triton
 from gaussian_swaying.mpm.laws.triton.body import pk1_adjoint
 from gaussian_swaying.mpm.triton.damping import kelvin_voigt_adjoint
-from gaussian_swaying.mpm.triton.shared import VARIES, axis_weights, node_weight, twin_data, vector
+from gaussian_swaying.mpm.triton.shared import VARIES, axis_weights, node_weight, sums, twin_data, vector
 from gaussian_swaying.mpm.triton.total_kernels import cells_of, gather, law_row, load_particles, motion
 
 
@@ -131,12 +131,6 @@ def _across(m, x, y):
     return (m[0] * x + m[1] * y, m[3] * x + m[4] * y, m[6] * x + m[7] * y)
 
 
-@triton.jit
-def _with_sums(a, x, AXIS: tl.constexpr):
-    """A vector and the sums of another one over an axis."""
-    return (a[0] + tl.sum(x[0], AXIS), a[1] + tl.sum(x[1], AXIS), a[2] + tl.sum(x[2], AXIS))
-
-
 @triton.jit(do_not_specialize=VARIES)
 def nodes_adjoint(
     active, source, sources, inverse_mass, rates, held, nodes, partial, fields, force_bar, history, bars, mass_bar,
@@ -160,9 +154,9 @@ def nodes_adjoint(
         o = tl.arange(0, SOURCES)[:, None]  # all at once
         known = mask[None, :] & (o < sources)
         row = partial + tl.load(source + o * nodes + k[None, :], known, 0) * WIDTH
-        u = _with_sums(u, vector(row, known), 0)
+        u = add3(u, 1.0, sums(vector(row, known), 0))
         if VELOCITY:
-            v = _with_sums(v, vector(row + 4, known), 0)
+            v = add3(v, 1.0, sums(vector(row + 4, known), 0))
         store3(own, 1, 0, u, mask)
     if PUSH:
         v = add3(v, tl.load(schedule + (step + 1) * 4 + 1), u)
@@ -232,7 +226,7 @@ def hold_adjoint(
         known = mask[:, None] & (k < rows)[None, :]
         b = tl.load(weight + n[:, None] * rows + k[None, :], known, 0.0)
         place = residual + (first[:, None] + k[None, :]) * 4
-        a = _with_sums(a, scale3(b, vector(place, known)), 1)
+        a = add3(a, 1.0, sums(scale3(b, vector(place, known)), 1))
     own = tl.load(affected + n, mask, 0)
     at = bars + own * 8 + 4
     a = add3(vector(at, mask), -1.0, a)

@@ -37,6 +37,12 @@ def vector(place, mask):
 
 
 @triton.jit
+def sums(x, AXIS: tl.constexpr):
+    """Sums over an axis for a vector."""
+    return (tl.sum(x[0], AXIS), tl.sum(x[1], AXIS), tl.sum(x[2], AXIS))
+
+
+@triton.jit
 def load_four(place):
     """Four numbers in a row, of which the first is at a multiple of 16 bytes, by one instruction of an NVIDIA GPU."""
     return tl.inline_asm_elementwise(

@@ -9,7 +9,7 @@ Rows of node arrays: displacement and velocity, each in four columns of eight, a
 columns, or eight if boundaries need positions.
 """
 
-from gaussian_swaying.geometry.linalg_triton import add3, axpy9, columns9, load3, scale3, scale9
+from gaussian_swaying.geometry.linalg_triton import add3, axpy9, columns9, load3, scale3, scale9, store3, where3
 from gaussian_swaying.kernels.language import tl, triton
 from gaussian_swaying.mpm.laws.triton.body import ROW, pk1
 from gaussian_swaying.mpm.triton.damping import kelvin_voigt_pk1
@@ -21,6 +21,7 @@ from gaussian_swaying.mpm.triton.shared import (
     keep_largest,
     load_four,
     node_weight,
+    sums,
     twin_forces,
     vector,
     wave_speed,
@@ -216,9 +217,7 @@ def total_particles(
                         s0 += tl.load(out, real, 0.0)
                         s1 += tl.load(out + 1, real, 0.0)
                         s2 += tl.load(out + 2, real, 0.0)
-                    tl.store(out, s0, real)
-                    tl.store(out + 1, s1, real)
-                    tl.store(out + 2, s2, real)
+                    store3(out, 1, 0, (s0, s1, s2), real)
                     if IMPLICIT:
                         s3 = tl.sum(wz[k] * (w * resistance), 1)
                         if chunk > 0:
@@ -264,16 +263,13 @@ def total_bend(
     o = tl.arange(0, 32)[None, :]
     real = known[:, None] & (o < 27)
     out = partial + (o * (cells + 1) + tl.load(bent_cell + k, known, 0)[:, None]) * WIDTH
-    f0, f1, f2 = vector(out, real)
-    u0, u1, u2 = vector(fields + tl.load(bent_node + k[:, None] * 27 + o, real, 0) * 8, real)
+    f = vector(out, real)
+    u = vector(fields + tl.load(bent_node + k[:, None] * 27 + o, real, 0) * 8, real)
     for r in range(RANK):
         v = tl.load(curving + (k[:, None] * RANK + r) * 32 + o, known[:, None], 0.0)
-        f0 -= v * tl.sum(v * u0, 1)[:, None]
-        f1 -= v * tl.sum(v * u1, 1)[:, None]
-        f2 -= v * tl.sum(v * u2, 1)[:, None]
-    tl.store(out, f0, real)
-    tl.store(out + 1, f1, real)
-    tl.store(out + 2, f2, real)
+        bent0, bent1, bent2 = sums(scale3(v, u), 1)
+        f = (f[0] - v * bent0[:, None], f[1] - v * bent1[:, None], f[2] - v * bent2[:, None])
+    store3(out, 1, 0, f, real)
 
 
 @triton.jit(do_not_specialize=VARIES)
@@ -288,29 +284,20 @@ def total_join(source, counts, nodes, partial, joined, WIDTH: tl.constexpr):
 
 
 @triton.jit
-def _end(
-    node, k, mask, v0, v1, v2, d0, d1, d2, inverse, held, taken, fields, dt, HELD: tl.constexpr, MOVE: tl.constexpr
-):
+def _end(node, k, mask, v, d, inverse, held, taken, fields, dt, HELD: tl.constexpr, MOVE: tl.constexpr):
     """Stop the held nodes and sum the reaction impulses, write the velocities, and move the nodes from ``d``."""
     if HELD:
         free = tl.load(held + k, mask, 0) == 0
         stopped = mask & (free == 0)
         mass = 1.0 / tl.where(stopped, inverse, 1.0)
         to = taken + k * 4
-        tl.store(to, tl.load(to, stopped, 0.0) + mass * v0, stopped)
-        tl.store(to + 1, tl.load(to + 1, stopped, 0.0) + mass * v1, stopped)
-        tl.store(to + 2, tl.load(to + 2, stopped, 0.0) + mass * v2, stopped)
-        v0 = tl.where(free, v0, 0.0)
-        v1 = tl.where(free, v1, 0.0)
-        v2 = tl.where(free, v2, 0.0)
+        for c in tl.static_range(3):
+            tl.store(to + c, tl.load(to + c, stopped, 0.0) + mass * v[c], stopped)
+        v = where3(free, v, (0.0, 0.0, 0.0))
     to = fields + node * 8
-    tl.store(to + 4, v0, mask)
-    tl.store(to + 5, v1, mask)
-    tl.store(to + 6, v2, mask)
+    store3(to + 4, 1, 0, v, mask)
     if MOVE:
-        tl.store(to, d0 + dt * v0, mask)
-        tl.store(to + 1, d1 + dt * v1, mask)
-        tl.store(to + 2, d2 + dt * v2, mask)
+        store3(to, 1, 0, add3(d, dt, v), mask)
 
 
 @triton.jit(do_not_specialize=VARIES)
@@ -334,37 +321,28 @@ def total_nodes(
     inverse = tl.load(inverse_mass + k, mask, 0.0)
     step = tl.load(first_step) + step_offset
     place = fields + node * 8
-    v0, v1, v2 = vector(place + 4, mask)
-    d0, d1, d2 = v0, v1, v2
+    v = vector(place + 4, mask)
+    d = v
     if MOVE:
-        d0, d1, d2 = vector(place, mask)
+        d = vector(place, mask)
     kick = tl.load(schedule + (step + 1) * 4)
     dt = tl.load(schedule + (step + 1) * 4 + 1)
     decay = tl.load(schedule + (step + 1) * 4 + 2)
     if DAMPED:
         decay *= tl.exp(-kick * tl.load(rates + k, mask, 0.0))
-    f0 = tl.sum(tl.load(row, known, 0.0), 0)
-    f1 = tl.sum(tl.load(row + 1, known, 0.0), 0)
-    f2 = tl.sum(tl.load(row + 2, known, 0.0), 0)
+    f = sums(vector(row, known), 0)
     if IMPLICIT:
         drag = tl.sum(tl.load(row + 3, known, 0.0), 0)
     if POSITION:
-        m0 = tl.sum(tl.load(row + 4, known, 0.0), 0)
-        m1 = tl.sum(tl.load(row + 5, known, 0.0), 0)
-        m2 = tl.sum(tl.load(row + 6, known, 0.0), 0)
+        moved = sums(vector(row + 4, known), 0)
     if IMPLICIT:
         push = kick / (1 + kick * drag * inverse)
     else:
         push = kick
-    v0 = (v0 + push * (f0 * inverse + gravity_x)) * decay
-    v1 = (v1 + push * (f1 * inverse + gravity_y)) * decay
-    v2 = (v2 + push * (f2 * inverse + gravity_z)) * decay
-    _end(node, k, mask, v0, v1, v2, d0, d1, d2, inverse, held, taken, fields, dt, HELD, MOVE)
+    v = scale3(decay, add3(v, push, add3((gravity_x, gravity_y, gravity_z), inverse, f)))
+    _end(node, k, mask, v, d, inverse, held, taken, fields, dt, HELD, MOVE)
     if POSITION:
-        out = shift + node * 4
-        tl.store(out, m0 * inverse, mask)
-        tl.store(out + 1, m1 * inverse, mask)
-        tl.store(out + 2, m2 * inverse, mask)
+        store3(shift + node * 4, 1, 0, scale3(inverse, moved), mask)
 
 
 @triton.jit(do_not_specialize=VARIES)
@@ -379,10 +357,9 @@ def total_end(
     inverse = tl.load(inverse_mass + k, mask, 0.0)
     step = tl.load(first_step) + step_offset
     place = fields + node * 8
-    v0, v1, v2 = vector(place + 4, mask)
-    d0, d1, d2 = vector(place, mask)
+    v, d = vector(place + 4, mask), vector(place, mask)
     dt = tl.load(schedule + (step + 1) * 4 + 1)
-    _end(node, k, mask, v0, v1, v2, d0, d1, d2, inverse, held, taken, fields, dt, HELD, True)
+    _end(node, k, mask, v, d, inverse, held, taken, fields, dt, HELD, True)
 
 
 @triton.jit(do_not_specialize=VARIES)
@@ -397,16 +374,9 @@ def total_rows(node, weight, rows, fields, residual, BLOCK: tl.constexpr):
     w = tl.load(weight + each, known, 0.0)
     out = residual + k * 4
     total = out + rows * 4
-    t0, t1, t2 = vector(total, mask)
-    r0 = tl.sum(w * tl.load(place, known, 0.0), 1)
-    r1 = tl.sum(w * tl.load(place + 1, known, 0.0), 1)
-    r2 = tl.sum(w * tl.load(place + 2, known, 0.0), 1)
-    tl.store(out, r0, mask)
-    tl.store(out + 1, r1, mask)
-    tl.store(out + 2, r2, mask)
-    tl.store(total, t0 + r0, mask)
-    tl.store(total + 1, t1 + r1, mask)
-    tl.store(total + 2, t2 + r2, mask)
+    before, now = vector(total, mask), sums(scale3(w, vector(place, known)), 1)
+    store3(out, 1, 0, now, mask)
+    store3(total, 1, 0, add3(before, 1.0, now), mask)
 
 
 @triton.jit(do_not_specialize=VARIES)
@@ -420,26 +390,18 @@ def total_hold(
     first = tl.load(scene + n, mask, 0) * rows
     at = fields + tl.load(affected + n, mask, 0) * 8
     step = tl.load(first_step) + step_offset
-    d0, d1, d2 = vector(at, mask)
-    v0, v1, v2 = vector(at + 4, mask)
+    d, v = vector(at, mask), vector(at + 4, mask)
     dt = tl.load(schedule + (step + 1) * 4 + 1)
-    a0 = tl.zeros([BLOCK], tl.float32)
-    a1 = tl.zeros([BLOCK], tl.float32)
-    a2 = tl.zeros([BLOCK], tl.float32)
+    zero = tl.zeros([BLOCK], tl.float32)
+    a = (zero, zero, zero)
     for start in range(0, rows, ROWS):
         k = start + tl.arange(0, ROWS)
         known = mask[:, None] & (k < rows)[None, :]
         b = tl.load(push + n[:, None] * rows + k[None, :], known, 0.0)
         place = residual + (first[:, None] + k[None, :]) * 4
-        a0 += tl.sum(b * tl.load(place, known, 0.0), 1)
-        a1 += tl.sum(b * tl.load(place + 1, known, 0.0), 1)
-        a2 += tl.sum(b * tl.load(place + 2, known, 0.0), 1)
-    tl.store(at, d0 - dt * a0, mask)
-    tl.store(at + 1, d1 - dt * a1, mask)
-    tl.store(at + 2, d2 - dt * a2, mask)
-    tl.store(at + 4, v0 - a0, mask)
-    tl.store(at + 5, v1 - a1, mask)
-    tl.store(at + 6, v2 - a2, mask)
+        a = add3(a, 1.0, sums(scale3(b, vector(place, known)), 1))
+    store3(at, 1, 0, add3(d, -dt, a), mask)
+    store3(at + 4, 1, 0, add3(v, -1.0, a), mask)
 
 
 @triton.jit
