@@ -24,7 +24,7 @@ FASTEST, RINGING = 3.0, 12  # frequency over the first above which a mode does n
 STEP, TOGETHER = 0.32, 256  # s between stretches; stretches that are compared at once
 # what a typical stretch has, and how far off counts as a fault: over the mean, in the last three as a ratio or its log
 DRIFT, OFF, RESTLESS = (0.0, 0.03, 0.02), (0.0, 0.12, 0.08), (0.25, 0.68, 0.07)
-EVEN, ROUND, SHARE, LEAD = (0.0, 0.2, 0.2), (0.47, 0.85, 0.05), (0.2, 0.65, 0.1), (0.5, math.inf, 0.3)
+EVEN, ROUND, SHARE, LEAD = (0.0, 0.2, 0.2), (0.47, 0.85, 0.05), (0.2, 0.65, 0.1), (0.2, math.inf, 0.3)
 ALIKE = 0.8  # minor over major axis of a motion, above which the two may be exchanged
 
 
