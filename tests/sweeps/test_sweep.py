@@ -127,7 +127,9 @@ def test_a_stopped_sweep_ends_in_order(undisturbed, tmp_path, sweep_file, monkey
     table = rows(folder / "sweep.csv")
     assert {row["run"] for row in table if row["status"] == "complete"} == {path.stem for path in _done(folder)}
     assert {row["status"] for row in table} == {"complete", "missing"}
+    begun = len(_done(folder))
     assert main([str(file), "--output", str(folder), *QUICK, "--resume"]) == 0
+    assert f" {begun}/8 " in capsys.readouterr().err
     assert (folder / "sweep.csv").read_bytes() == (undisturbed / "sweep.csv").read_bytes()
 
 
