@@ -65,10 +65,9 @@ class Obstacle(WindEffect):
         return other
 
 
-def _direction(moment: Moment, place: Tensor) -> tuple[Tensor, Tensor]:
-    """Unit vector of the mean flow, zero in still air, and its speed, in the dtype of the places."""
-    speed = torch.linalg.vector_norm(moment.flow)
-    return (moment.flow / speed.clamp(min=1e-12)).to(place), speed.to(place)
+def _direction(flow: Tensor) -> Tensor:
+    """Unit vector of a flow, zero in still air."""
+    return flow / torch.linalg.vector_norm(flow).clamp(min=1e-12)
 
 
 class CylinderObstacle(Obstacle):
@@ -117,7 +116,7 @@ class CylinderObstacle(Obstacle):
         axis = self.axis.to(place)
         flow = moment.flow.to(place)
         across = flow - (flow * axis).sum() * axis  # what flows along it meets nothing
-        direction = across / torch.linalg.vector_norm(across).clamp(min=1e-12)
+        direction = _direction(across)
         left = torch.linalg.cross(axis, direction)
         return plane_wake((place * direction).sum(-1), (place * left).sum(-1), 2 * self.radius, self.drag)
 
@@ -176,9 +175,9 @@ class EllipsoidObstacle(Obstacle):
 
     def wake(self, place: Tensor, moment: Moment) -> Tensor:
         """See :class:`Obstacle`: the Gaussian is as wide, and as high, as the body is across the flow."""
-        direction, _ = _direction(moment, place)
+        direction = _direction(moment.flow).to(place)
         side = torch.stack([-direction[1], direction[0], torch.zeros_like(direction[0])])
-        side = side / torch.linalg.vector_norm(side).clamp(min=1e-12)
+        side = _direction(side)
         up = torch.linalg.cross(direction, side)
         scaled = torch.stack([axis * size for axis, size in zip(self.axes.to(place), self.radii, strict=True)])
         wide, high = (2 * torch.linalg.vector_norm(scaled @ part) for part in (side, up))
