@@ -1,23 +1,24 @@
-"""Convert a splat for viewers: ``gaussian-swaying export scene.ply scene.splat``, or the ``ply`` folder of a run.
+"""Convert a splat for other programs, or write the frames of a run: ``gaussian-swaying export outputs/flag flag.usdc``.
 
 With ``--web``, a recorded run becomes a film that a browser plays: ``gaussian-swaying export --web outputs/flag``. With
 ``--live-web``, a configuration becomes a page that simulates it: ``gaussian-swaying export --live-web flag``.
 """
 
 import argparse
-import json
 import sys
 from pathlib import Path
+from typing import Any
 
 import torch
 
 from gaussian_swaying import _program as program
 from gaussian_swaying._checks import check_positive
 from gaussian_swaying.cli.errors import run_command  # first, as it sets up threads
-from gaussian_swaying.gaussians.export import SUFFIXES, convert, format_of
-from gaussian_swaying.gaussians.formats import READABLE
+from gaussian_swaying.gaussians.export import SUFFIXES, export_cloud, export_frames, format_of, numbered
+from gaussian_swaying.gaussians.formats import READABLE, read_gaussians
 from gaussian_swaying.gaussians.spz import VERSIONS
 from gaussian_swaying.geometry.frame import SimFrame
+from gaussian_swaying.simulation.recorded import RecordedRun
 from gaussian_swaying.viewer.film.page import write_film
 
 
@@ -26,15 +27,14 @@ def build_options() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(prog=program.name("export"), description=__doc__)
     parser.add_argument(
         "source",
-        help=f"A {READABLE}; or a folder of .ply for an animated USD or numbered files; with --web the folder of a"
-        " run.",
+        help=f"A {READABLE}; or the folder of a run, for its frames as splats or, with --web, as a page.",
     )
     parser.add_argument(
         "target",
         nargs="?",
-        help=f"File to write; its name ends in one of {', '.join(SUFFIXES.values())}, for a folder with # for the "
-        "digits of the frame, as in frame_####.spz; or with --web in .html (default: film.html in the folder of the "
-        "run).",
+        help=f"File to write; its name ends in one of {', '.join(SUFFIXES.values())}, for a run, unless it is USD, "
+        "with # for the digits of the frame, as in frame_####.spz; or with --web in .html (default: film.html in the "
+        "folder of the run).",
     )
     parser.add_argument(
         "--web",
@@ -47,19 +47,23 @@ def build_options() -> argparse.ArgumentParser:
         help="Write the scene `source` as a page that simulates it in a browser; `export --live-web --help` has its "
         "options.",
     )
-    parser.add_argument("--fps", type=float, help="Frames per second of a folder; default: those of its run, or 25.")
+    parser.add_argument(
+        "--apart",
+        action="store_true",
+        help="Write the Gaussians of a run that never move once, with `still` for the number, and the others for each "
+        "frame.",
+    )
     parser.add_argument(
         "--up",
         nargs=3,
         type=float,
         metavar=("X", "Y", "Z"),
-        help="Direction in the scene that points up, for USD and glTF; default: that of the run that wrote the source,"
-        " or z.",
+        help="Direction in the scene that points up, for USD and glTF; default: that of the run, or z.",
     )
     parser.add_argument(
         "--metres-per-unit",
         type=float,
-        help="Length of a scene unit [m], for USD and glTF; default: that of the run that wrote the source, or 1.",
+        help="Length of a scene unit [m], for USD and glTF; default: that of the run, or 1.",
     )
     parser.add_argument(
         "--spz-version",
@@ -68,44 +72,6 @@ def build_options() -> argparse.ArgumentParser:
         help="Version of an .spz file; default: 3, which most programs read.",
     )
     return parser
-
-
-def run_of(source: Path) -> Path | None:
-    """The summary of the run that wrote a splat or a folder of splats; None if they are not from a run."""
-    for folder in (source.parent, source.parent.parent):
-        if (folder / "summary.json").is_file() and (folder / "run.json").is_file():
-            return folder / "summary.json"
-    return None
-
-
-def still_of(source: Path) -> Path | None:
-    """The file with what never moves, beside a folder of frames that a run wrote; None if there is none."""
-    file = source.parent / f"still{SUFFIXES.get(source.name)}"
-    return file if source.is_dir() and run_of(source) is not None and file.is_file() else None
-
-
-def placement(options: argparse.Namespace) -> tuple[float, SimFrame, str]:
-    """Frames per second, frame and the source of both, for a USD or glTF file."""
-    if options.metres_per_unit is not None:
-        check_positive("--metres-per-unit", options.metres_per_unit)
-    fps, frame, origin = 25.0, SimFrame(torch.zeros(3), torch.eye(3, dtype=torch.float64), 1.0), "by default"
-    summary = run_of(Path(options.source).resolve())
-    given = [options.up is not None, options.metres_per_unit is not None]
-    if summary is not None and not (all(given) and options.fps is not None):
-        try:
-            known = json.loads(summary.read_text(encoding="utf-8"))
-            frame, fps = SimFrame.from_summary(known), 1 / float(known["frame_dt_s"])
-        except (OSError, ValueError, KeyError, TypeError, ZeroDivisionError) as error:
-            raise ValueError(
-                f"{summary} cannot be used ({error}): set --up, --metres-per-unit and --fps instead."
-            ) from error
-        origin = f"from {summary.name} of the run"
-    metres = frame.metres_per_unit if options.metres_per_unit is None else options.metres_per_unit
-    if options.up is not None:
-        frame = SimFrame.fit(torch.zeros(1, 3), options.up, metres_per_unit=metres)
-    if any(given):
-        origin = "as given" if all(given) else f"as given, the rest {origin}"
-    return options.fps or fps, SimFrame(frame.origin, frame.rotation, metres), origin
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -125,38 +91,68 @@ def main(arguments: list[str] | None = None) -> int:
 
 def export(options: argparse.Namespace) -> None:
     """Convert, and report the file."""
-    if options.fps is not None:
-        check_positive("--fps", options.fps)
+    given = {"--up": options.up, "--metres-per-unit": options.metres_per_unit}
     if options.web:
-        export_web(options)
-        return
+        refuse("--web", given | {"--spz-version": options.spz_version, "--apart": options.apart or None})
+        return export_web(options)
     if options.target is None:
         raise ValueError(f"Expected a file to write, whose name ends in one of {', '.join(SUFFIXES.values())}.")
-    format, still = format_of(options.target), still_of(Path(options.source).resolve())
+    format = format_of(options.target)
     if format != "spz" and options.spz_version is not None:
         raise ValueError("--spz-version is only for .spz files: leave it out.")
-    if format not in ("usd", "glb"):
-        if options.up is not None or options.metres_per_unit is not None:
-            raise ValueError(
-                "--up and --metres-per-unit are only for USD and glTF, as other formats have no up direction: leave "
-                "them out, or use a target that ends in .usdc or .glb."
-            )
-        convert(options.source, options.target, spz_version=options.spz_version or 3, still=still)
-    else:
-        fps, frame, origin = placement(options)
-        convert(options.source, options.target, fps, frame.metres_per_unit, frame.rotation, still=still)
+    if Path(options.source).is_dir():
+        refuse("a run", given)
+        return export_run(options)
+    if options.apart:
+        raise ValueError("--apart is only for the frames of a run: leave it out.")
+    if format not in ("usd", "glb") and any(value is not None for value in given.values()):
+        raise ValueError(
+            "--up and --metres-per-unit are only for USD and glTF, as other formats have no up direction: leave them "
+            "out, or use a target that ends in .usdc or .glb."
+        )
+    metres = 1.0 if options.metres_per_unit is None else options.metres_per_unit
+    check_positive("--metres-per-unit", metres)
+    frame = SimFrame.fit(torch.zeros(1, 3), options.up or (0.0, 0.0, 1.0), metres_per_unit=metres)
+    place: dict[str, Any] = {"metres_per_unit": metres, "rotation": frame.rotation}
+    export_cloud(options.target, read_gaussians(options.source), spz_version=options.spz_version or 3, **place)
+    tell(format, frame, "as given" if any(given.values()) else "by default")
+    print(f"wrote {options.target}")
+
+
+def refuse(what: str, given: dict[str, Any]) -> None:
+    """Raise ValueError if an option was given that only other exports have."""
+    for name, value in given.items():
+        if value is not None:
+            raise ValueError(f"{name} is not for {what}, which needs none: leave it out.")
+
+
+def tell(format: str, frame: SimFrame, origin: str) -> None:
+    """Print the frame of a file in metres."""
+    if format in ("usd", "glb"):
         up = [round(v, 3) + 0.0 for v in frame.rotation[2].tolist()]
         print(f"up {up}, 1 scene unit = {frame.metres_per_unit:.6g} m ({origin})")
-    print(f"wrote {options.target}")
+
+
+def export_run(options: argparse.Namespace) -> None:
+    """Write the frames of a run, and report the files."""
+    target, format = Path(options.target), format_of(options.target)
+    run = RecordedRun(Path(options.source))
+    frame, fps = run.simulation.scene.frame, 1 / run.simulation.frame_dt
+    place: dict[str, Any] = {"metres_per_unit": frame.metres_per_unit, "rotation": frame.rotation}
+    place["spz_version"] = options.spz_version or 3
+    still = target.with_name(numbered(target.name, "still"))
+    apart = options.apart and format != "usd" and not run.simulation.scene.all_move
+    frames = (moved.part_to_cloud(moving=True) if apart else moved.to_cloud() for moved in run.frames())
+    files = export_frames(target, frames, fps, **place)
+    if apart:
+        export_cloud(still, run.simulation.scene.rest().part_to_cloud(moving=False), **place)
+        print(f"wrote {still}, which never moves")
+    tell(format, frame, "from the run")
+    print(f"wrote {target}, {len(files)} files" if len(files) > 1 else f"wrote {target}")
 
 
 def export_web(options: argparse.Namespace) -> None:
     """Write the film of a run, and report its size."""
-    given = {"--fps": options.fps, "--up": options.up, "--metres-per-unit": options.metres_per_unit}
-    given["--spz-version"] = options.spz_version
-    for name, value in given.items():
-        if value is not None:
-            raise ValueError(f"{name} is not for --web, which takes it from the run: leave it out.")
     run = Path(options.source)
     target = run / "film.html" if options.target is None else Path(options.target)
     film = write_film(run, target)

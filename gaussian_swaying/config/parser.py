@@ -326,7 +326,7 @@ COMMON = {
         "material", "material.E", "material.density", "material.thickness", "solver.dx", "solver.boundaries"
     ),
     "The wind": ("wind.flow", "wind.modulations"),
-    "The pictures": ("camera", "recorder.renders", "recorder.ply_every"),
+    "The pictures": ("camera", "recorder.renders"),
 }  # fmt: skip
 """The options that ``--help`` shows, by what they are about."""
 

@@ -17,8 +17,7 @@ from torch import Tensor
 
 from gaussian_swaying._checks import check_choice, check_positive
 from gaussian_swaying._files import atomic
-from gaussian_swaying.gaussians.cloud import GaussianCloud, joined
-from gaussian_swaying.gaussians.formats import read_gaussians
+from gaussian_swaying.gaussians.cloud import GaussianCloud
 from gaussian_swaying.gaussians.gltf import encode_gltf
 from gaussian_swaying.gaussians.harmonics import sh_to_color
 from gaussian_swaying.gaussians.model import DeformedGaussians
@@ -145,60 +144,51 @@ def format_of(path: str | os.PathLike[str]) -> str:
     raise ValueError(f"Cannot tell the format of {path}: give it a name that ends in one of {endings}.")
 
 
-def convert(
-    source: str | os.PathLike[str],
-    target: str | os.PathLike[str],
+def export_frames(
+    path: str | os.PathLike[str],
+    clouds: Iterable[GaussianCloud],
     fps: float = 25.0,
     metres_per_unit: float = 1.0,
     rotation: Tensor | None = None,
     spz_version: int = 3,
-    still: str | os.PathLike[str] | None = None,
-) -> None:
-    """Write a splat, or the .ply sequence of a run, in the format given by the ending of the target's name.
+) -> list[Path]:
+    """Write the frames of a motion in the format given by the ending of a name, see :func:`format_of`.
 
     Args:
-        source: A file that :func:`~gaussian_swaying.gaussians.formats.read_gaussians` reads, or a folder of .ply files,
-            whose frames are sorted by name.
-        target: File to write, see :func:`format_of`. For a folder it is USD, or its name has ``#`` in place of the
-            digits of the frame, counted from 0: ``frame_####.spz`` makes frame_0000.spz, frame_0001.spz, ...
-        fps: Frames per second of a folder.
+        path: File to write: for USD one with all frames, see :func:`write_usd`; otherwise its name has ``#`` in place
+            of the digits of the frame, counted from 0: ``frame_####.spz`` makes frame_0000.spz, frame_0001.spz, ... Its
+            folder is made.
+        clouds: One for each frame; read one by one.
+        fps: Frames per second, for USD.
         metres_per_unit: Length of a scene unit [m], for USD and glTF.
         rotation: Rotation from scene directions to z up, shape (3, 3), for USD and glTF; the scene's z is up if None.
         spz_version: Version of SPZ.
-        still: A splat that every frame of a folder gets as well, before its own Gaussians: what never moves.
+
+    Returns:
+        The files.
     """
-    source, target = Path(source), Path(target)
+    target = Path(path)
     format = format_of(target)
-    check_folder(target)
-    place: dict[str, Any] = {"fps": fps, "metres_per_unit": metres_per_unit, "rotation": rotation}
-    if not source.is_dir():
-        return export_cloud(target, read_gaussians(source), format=format, spz_version=spz_version, **place)
-    files = sorted(source.glob("*.ply"))
-    if not files:
-        raise ValueError(f"{source} contains no .ply: give one .ply, or a folder of them.")
-    kept = None if still is None else read_gaussians(still)
-
-    def frame_of(file: Path) -> GaussianCloud:
-        frame = read_gaussians(file)
-        if kept is None:
-            return frame
-        if kept.sh_degree != frame.sh_degree or (kept.normals is None) != (frame.normals is None):
-            raise ValueError(
-                "The file of what never moves and the frames do not belong together (harmonics of degree "
-                f"{kept.sh_degree} and {frame.sh_degree}): give the folder of a run as the run wrote it."
-            )
-        return joined(kept, frame)
-
-    if format == "usd":
-        return write_usd(target, map(frame_of, files), **place)
-    if "#" not in target.name:
+    if format != "usd" and "#" not in target.name:
         raise ValueError(
-            f"{source} is a folder of {len(files)} frames: give a target that ends in .usdc, or one with # for their "
-            f"numbers, such as frame_####{SUFFIXES[format]}."
+            f"The frames of a run need a file each: give a target with # for their numbers, such as "
+            f"frame_####{SUFFIXES[format]}, or one that ends in .usdc."
         )
-    for index, file in enumerate(files):
-        name = re.sub("#+", lambda digits: f"{index:0{len(digits[0])}d}", target.name)  # noqa: B023  # called at once
-        export_cloud(target.with_name(name), frame_of(file), format=format, spz_version=spz_version, **place)
+    target.parent.mkdir(parents=True, exist_ok=True)
+    place: dict[str, Any] = {"metres_per_unit": metres_per_unit, "rotation": rotation}
+    if format == "usd":
+        write_usd(target, clouds, fps, **place)
+        return [target]
+    files = []
+    for index, cloud in enumerate(clouds):
+        files.append(target.with_name(numbered(target.name, str(index))))
+        export_cloud(files[-1], cloud, format=format, spz_version=spz_version, **place)
+    return files
+
+
+def numbered(name: str, number: str) -> str:
+    """A name with a number, filled up with zeros, in place of each row of ``#``."""
+    return re.sub("#+", lambda digits: number.rjust(len(digits[0]), "0"), name)
 
 
 def _kept(path: Path, cloud: GaussianCloud) -> GaussianCloud:
@@ -413,32 +403,8 @@ class UsdFilm:
                 self._prim.GetWidthsAttr().Set(Vt.FloatArray.FromNumpy(2 * array.max(1)), frame)
 
 
-def read_usd_frame(path: str | os.PathLike[str], frame: int) -> dict[str, np.ndarray]:
-    """The arrays of one frame of a file that :class:`UsdFilm` wrote, as :func:`usd_arrays` gives them.
-
-    Args:
-        path: The file.
-        frame: Frame number; a frame without samples is interpolated.
-    """
-    usd, geom = _pxr("Usd"), _pxr("UsdGeom")
-    try:
-        stage = usd.Stage.Open(str(path))
-        prim = stage.GetPrimAtPath(_PRIM)
-        attributes = {name: prim.GetAttribute(_ATTRIBUTES.get(name, name)).Get(frame) for name in _ARRAYS}
-        normals = prim.GetAttribute("normals") or geom.PrimvarsAPI(prim).GetPrimvar("normals").GetAttr()
-        arrays = {name: np.array(value, dtype=np.float32) for name, value in attributes.items()}
-        arrays["normals"] = np.array(normals.Get(frame), dtype=np.float32)
-    except Exception as error:  # errors of USD, and those for missing attributes
-        raise ValueError(f"{path} cannot be read as a USD file of Gaussians: export it again.") from error
-    arrays["orientations"] = arrays["orientations"][:, [3, 0, 1, 2]]
-    arrays["harmonics"] = arrays["harmonics"].reshape(len(arrays["positions"]), -1, 3)
-    return arrays
-
-
 _HARMONICS = "radiance:sphericalHarmonicsCoefficients"
 _DEGREE = "radiance:sphericalHarmonicsDegree"
-_ARRAYS = ("positions", "orientations", "scales", "opacities", "harmonics", "colors")
-_ATTRIBUTES = {"harmonics": _HARMONICS, "colors": "primvars:displayColor"}
 
 
 def _pxr(name: str) -> Any:

@@ -5,8 +5,6 @@ from __future__ import annotations
 import re
 from pathlib import Path
 
-from gaussian_swaying.gaussians.export import SUFFIXES
-
 # names that a run writes; a folder that was not made by a run must not contain them
 OURS = [
     "run.json",
@@ -16,12 +14,10 @@ OURS = [
     "nodes.npz",
     "summary.json",
     "diagnostics.csv",
-    "animation.usdc",
-    *(f"still{suffix}" for name, suffix in SUFFIXES.items() if name != "usd"),
 ]
-OURS += ["frames", "ply", "trajectory", "nodes", "video.mp4", "cameras", "depth", "depth_raw", "normal", "force"]
+OURS += ["frames", "trajectory", "nodes", "video.mp4", "cameras", "depth", "depth_raw", "normal", "force"]
 OURS += ["wind", "wind.mp4"]
-OURS += [*(name for name in SUFFIXES if name != "ply"), "depth.mp4", "normal.mp4", "force.mp4", "film.html"]
+OURS += ["depth.mp4", "normal.mp4", "force.mp4", "film.html"]
 
 
 def frame_folder(render: str = "color", camera: str = "") -> str:

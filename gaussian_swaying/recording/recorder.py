@@ -11,9 +11,8 @@ import sys
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import KW_ONLY, dataclass
-from importlib.util import find_spec
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 import torch
@@ -21,16 +20,13 @@ from torch import Tensor
 
 from gaussian_swaying._checks import check_choice, check_literals, check_positive
 from gaussian_swaying._files import atomic, remove_temporaries, save_png, write_json, write_table, write_text
-from gaussian_swaying.gaussians.cloud import GaussianCloud
-from gaussian_swaying.gaussians.export import SUFFIXES, Format, export_cloud
-from gaussian_swaying.geometry.frame import SimFrame
 from gaussian_swaying.recording.checkpoint import read_checkpoint
 from gaussian_swaying.recording.layout import OURS, frame_folder, raw_folder, video_file
 from gaussian_swaying.recording.nodes import NODES, split_far
 from gaussian_swaying.recording.resume import packed_frames, tell_missing
 from gaussian_swaying.recording.trajectory import pack_trajectory
 from gaussian_swaying.recording.video import VideoEncoder, encode_video
-from gaussian_swaying.recording.writer import FrameWriter, HostCopy, pack_usd, write_usd_frame
+from gaussian_swaying.recording.writer import FrameWriter, HostCopy
 from gaussian_swaying.rendering.passes import PASSES
 from gaussian_swaying.runs.folder import MARKER, claim_folder, hold_folder, mark
 from gaussian_swaying.runs.lock import FolderLock
@@ -57,7 +53,7 @@ def _write_png(path: Path, pixels: np.ndarray) -> None:
 class Recorder:
     """Writes frames, trajectory, checkpoint, summary and video of a run to one folder.
 
-    Layout: ``frames/00000.png``, ``ply/00000.ply``, ``still.ply``, ``trajectory.npz`` (arrays ``position_00000`` and
+    Layout: ``frames/00000.png``, ``trajectory.npz`` (arrays ``position_00000`` and
     ``F_00000``), ``nodes.npz`` (arrays ``displacement_00000`` and ``far_00000``), ``checkpoint.pt``, ``summary.json``,
     ``diagnostics.csv`` (a row per frame), ``config.yaml``, ``video.mp4``.
 
@@ -77,44 +73,34 @@ class Recorder:
     - ``vorticity``: the colour picture, paler, with the vorticity of computed air across the same plane: blue turns
       clockwise as the camera sees it, red the other way.
 
-    Images, trajectory, .ply and checkpoint are written in the background: the methods make a copy and return. They wait
+    Images, trajectory and checkpoint are written in the background: the methods make a copy and return. They wait
     only if the disk or ffmpeg is so slow that the queue is full. If something cannot be written, the next method call,
     :meth:`wait` or :meth:`close` raises the error.
 
     Args:
         images: Write a PNG per frame.
         video: Encode the frames; needs ``images``.
-        ply_every: Write the deformed Gaussians in ``export_format`` every ``ply_every`` frames; 0 for never.
         trajectory: Write position (float32, metres, z up) and F (float16) of the simulated particles for each frame.
         checkpoint_every: Write the state for ``--resume`` every ``checkpoint_every`` frames; 0 for never.
         fps: Frames per second of the video; null for real time, 1 / frame_dt.
         renders: Pictures of each frame: ``color``, ``depth``, ``normal``, ``force``, ``wind``, ``vorticity``.
-        export_format: Format of the Gaussians: ``ply`` (3DGS, with normals), ``compressed_ply`` (for SuperSplat),
-            ``splat``, ``spz``, ``sog``, ``glb`` (glTF, in metres with y up), or ``usd`` (all frames in one
-            animation.usdc, in metres; needs usd-core). See ``gaussian_swaying.gaussians.export``.
-        ply_still: Where the Gaussians that never move are written: ``once`` in one file beside the folder of the frames
-            (still.ply), which then have only what moves; in all ``frames``; or ``auto``, which is ``once`` if they are
-            more than half of the scene, no edit colours them during the run, and the format is not ``usd``.
         nodes: In ``total``, write the displacement (metres, z up; float16, or float32 where it is long) of the nodes
-            that the Gaussians follow for each frame; ``gaussian-swaying export --web`` needs it. Runs of ``updated``
-            have nothing to write.
+            that the Gaussians follow for each frame, for ``gaussian-swaying export``. Runs of ``updated`` have
+            nothing to write.
     """
 
     images: bool = True
     video: bool = True
     _: KW_ONLY
-    ply_every: int = 0
     trajectory: bool = True
     checkpoint_every: int = 1
     fps: float | None = None
     renders: Sequence[str] = ("color",)
-    export_format: Format = "ply"
     nodes: bool = True
-    ply_still: Literal["auto", "once", "frames"] = "auto"
 
     def __post_init__(self) -> None:
         check_literals(type(self).__init__, vars(self), "recorder.")
-        for name in ("ply_every", "checkpoint_every", "fps"):
+        for name in ("checkpoint_every", "fps"):
             if (value := getattr(self, name)) is not None:
                 check_positive(f"recorder.{name}", value, allow_zero=name.endswith("every"))
         renders = self.renders
@@ -125,15 +111,6 @@ class Recorder:
             )
         for render in renders:
             check_choice("recorder.renders", render, PASSES)
-        if self.export_format == "usd" and self.ply_every and find_spec("pxr") is None:
-            raise ValueError(
-                "The USD file needs usd-core: install gaussian-swaying[usd], or set another `recorder.export_format`."
-            )
-        if self.export_format == "usd" and self.ply_every and self.ply_still == "once":
-            raise ValueError(
-                "A USD file has all Gaussians in every frame: set `recorder.ply_still` to auto, or another "
-                "`recorder.export_format`."
-            )
         if self.video and not self.images:
             raise ValueError("The video is made from the images: set `recorder.images` to true or `video` to false.")
         self._folder: Path | None = None
@@ -251,13 +228,7 @@ class Recorder:
             if kept:
                 film = f"{name}.npz"
                 told += tell_missing(path / name, ".npz", {*frames} - packed_frames(path / film), film)
-        if self.ply_every and not (self.export_format == "usd" and (path / "animation.usdc").exists()):
-            told += tell_missing(path / self.export_format, self._splat_suffix, frames[:: self.ply_every])
         return told
-
-    @property
-    def _splat_suffix(self) -> str:
-        return ".npz" if self.export_format == "usd" else SUFFIXES[self.export_format]
 
     def release(self) -> None:
         """Unlock the folder for other runs."""
@@ -266,8 +237,7 @@ class Recorder:
             self._lock = None
 
     def _folders(self) -> list[str]:
-        wanted = {self.export_format: self.ply_every > 0, "trajectory": self.trajectory}
-        return [*self._picture_folders(), *(name for name, needed in wanted.items() if needed)]
+        return [*self._picture_folders(), *(["trajectory"] if self.trajectory else [])]
 
     def _make_folders(self) -> None:
         for name in self._folders():
@@ -342,58 +312,6 @@ class Recorder:
 
         self._submit(path, write)
 
-    def write_ply(self, index: int, write: Callable[[Path], None]) -> None:
-        """Write one frame's Gaussians.
-
-        Args:
-            index: Frame number.
-            write: Called later with the path, in another thread, so its data must not change. On a GPU, earlier work of
-                the current stream is finished by then. It must write the file completely or not at all.
-        """
-        path = self.folder / self.export_format / f"{index:05d}{self._splat_suffix}"
-        ready = torch.cuda.Event(blocking=True) if torch.cuda.is_initialized() else None
-        if ready is not None:
-            ready.record()
-
-        def work() -> None:
-            if ready is not None:
-                ready.synchronize()
-            write(path)
-
-        self._submit(path, work)
-
-    def write_splat(self, index: int, cloud: GaussianCloud, frame: SimFrame) -> None:
-        """Write one frame's Gaussians in the recorder's format; for USD :meth:`close` joins the frames.
-
-        Args:
-            index: Frame number.
-            cloud: The Gaussians, in scene units; they must not change.
-            frame: Scene units to metres with z up, for USD and glTF.
-        """
-        if self.export_format == "usd":
-            self.write_ply(index, lambda path: write_usd_frame(path, cloud, frame))
-        else:
-            place: dict[str, Any] = {"metres_per_unit": frame.metres_per_unit, "rotation": frame.rotation}
-            self.write_ply(index, lambda path: export_cloud(path, cloud, format=self.export_format, **place))
-
-    @property
-    def still_file(self) -> Path:
-        """The file of the Gaussians that never move."""
-        return self.folder / f"still{SUFFIXES[self.export_format]}"
-
-    def write_still(self, cloud: Callable[[], GaussianCloud], frame: SimFrame) -> None:
-        """Write the Gaussians that never move in the recorder's format, if the run does not have them yet.
-
-        Args:
-            cloud: Makes the Gaussians, in scene units.
-            frame: Scene units to metres with z up, for glTF.
-        """
-        path = self.still_file
-        if not path.exists():
-            place: dict[str, Any] = {"metres_per_unit": frame.metres_per_unit, "rotation": frame.rotation}
-            made, format = cloud().to("cpu"), self.export_format
-            self._submit(path, lambda: export_cloud(path, made, format=format, **place))
-
     def write_checkpoint(self, checkpoint: dict[str, Any]) -> None:
         """Write the checkpoint for a resumed run.
 
@@ -446,13 +364,6 @@ class Recorder:
                 self.wait()
             except Exception as error:
                 failure = error
-            if self.ply_every and frames and self.export_format == "usd":
-                made.append(self.folder / "animation.usdc")
-                wanted = range(0, frames, self.ply_every)
-                pack_usd(self.folder / "usd", made[-1], wanted, self.fps or self._real_time_fps)
-            elif self.ply_every and frames:
-                made.append(self.folder / self.export_format)
-                made += [self.still_file] if self.still_file.exists() else []
             moved = self.nodes and ((self.folder / "nodes").exists() or (self.folder / "nodes.npz").exists())
             for name, kept in (("trajectory", self.trajectory), ("nodes", moved)):
                 if kept and frames:

@@ -139,10 +139,10 @@ def _why_not(copies: Sequence[Copy], setup: Setup, solver: Solver) -> str | None
 
 def check_recorder(recorder: Recorder) -> None:
     """Raise ValueError if a recorder writes what runs with copies do not have."""
-    wrong = [name for name in ("trajectory", "nodes", "ply_every") if getattr(recorder, name)]
+    wrong = [name for name in ("trajectory", "nodes") if getattr(recorder, name)]
     if wrong:
         names = " and ".join(f"`recorder.{name}`" for name in wrong)
-        raise ValueError(f"`copies` are recorded as pictures only: set {names} to false or 0.")
+        raise ValueError(f"`copies` are recorded as pictures only: set {names} to false.")
     wrong = [render for render in recorder.renders if render not in RENDERS]
     if wrong:
         raise ValueError(f"`copies` have no pictures of {' and '.join(wrong)} yet: remove it from `recorder.renders`.")

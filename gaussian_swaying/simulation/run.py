@@ -47,7 +47,7 @@ def parts_checksum(scene: SimulatedScene) -> str | None:
 
 
 def _check_checkpoint(
-    scene: SimulatedScene, checkpoint: dict[str, Any], output: Path, frames: int, splat: str | None, once: bool
+    scene: SimulatedScene, checkpoint: dict[str, Any], output: Path, frames: int, splat: str | None
 ) -> None:
     """Raise ValueError unless the run can continue from a checkpoint as if it had never stopped."""
     held = checkpoint["state"].get("position")
@@ -65,11 +65,6 @@ def _check_checkpoint(
         raise ValueError(
             f"The checkpoint in {output} holds {len(held)} particles, but the scene has "
             f"{scene.points.count}: resume with the same splat, or start again without --resume."
-        )
-    if checkpoint["still_once"] is not once:
-        raise ValueError(
-            f"The splat frames in {output} are {'with' if once else 'without'} what never moves: resume with the same "
-            "`recorder.ply_still`, or start again without --resume."
         )
     if checkpoint["frame"] >= frames:
         raise ValueError(
@@ -95,21 +90,6 @@ def run_health(stepper: Stepper, log: Sequence[Mapping[str, Any]]) -> tuple[dict
     if scene.filled == 0 and found["moved"] is not None:
         told += narrow(points.position.reshape(-1, 3).cpu(), stepper.solver.dx, found["moved"]["share"])
     return found, told
-
-
-def written_once(recorder: Recorder, editor: SceneEditor) -> bool:
-    """True if the splat frames of a run are without the Gaussians that never move, see ``recorder.ply_still``."""
-    moving, count = editor.scene.moving, len(editor.scene.model.means)
-    still = torch.ones(count, dtype=torch.bool, device=moving.device).index_fill(0, moving, False)
-    painted = any(bool((editor.reach(edit)[1] & still).any()) for edit in editor.edits if edit.time > 0)
-    if recorder.ply_still == "once" and len(moving) == count:
-        raise ValueError("All Gaussians of the scene move: set `recorder.ply_still` to auto.")
-    if recorder.ply_still == "once" and painted:
-        raise ValueError(
-            "One of the `edits` colours Gaussians that never move, after the start: set `recorder.ply_still` to frames."
-        )
-    wanted = recorder.ply_still == "auto" and 2 * len(moving) < count and not painted
-    return recorder.ply_still == "once" or (wanted and recorder.export_format != "usd")
 
 
 class WallClock:
@@ -189,7 +169,6 @@ class Run:
             torch.cuda.reset_peak_memory_stats(painter.device)
         self.splat = splat_checksum(self.scene)
         self.force_end = self.stepper.force_scale()
-        self.still_once = recorder.ply_every > 0 and written_once(recorder, editor)
 
     @torch.inference_mode()
     def whole(self, output: Path, resume: bool, settings: dict[str, Any], progress: bool) -> dict[str, Any]:
@@ -210,7 +189,7 @@ class Run:
         state = self.editor.start()  # errors are raised before anything is written
 
         def check(checkpoint: dict[str, Any]) -> None:
-            _check_checkpoint(self.editor.scene, checkpoint, output, frames, self.splat, self.still_once)
+            _check_checkpoint(self.editor.scene, checkpoint, output, frames, self.splat)
 
         fps, cameras = 1 / self.stepper.frame_dt, tuple(painter.cameras)
         checkpoint = recorder.open(output, self.config, resume, fps, cameras, check)
@@ -230,8 +209,6 @@ class Run:
             state = self.editor.edit_due(restored, resumed=True)
             first, self.log = checkpoint["frame"] + 1, checkpoint["log"]
             walls.seconds.update(checkpoint["wall_s"])
-        if self.still_once:
-            recorder.write_still(lambda: self.scene.rest().part_to_cloud(moving=False), self.scene.frame)
         status, reason, done = "complete", None, first
         bar = stepper.progress = RunProgress(self.frames, first, progress)
         try:
@@ -334,7 +311,6 @@ class Run:
                     "wall_s": self.walls.read(),
                     "splat": self.splat,
                     "parts": parts_checksum(self.scene),
-                    "still_once": self.still_once,
                     "nodes": self.scene.follow.nodes(state) is not None,
                 }
             )
@@ -343,22 +319,17 @@ class Run:
     def recording(self) -> bool:
         """True if anything is written in a frame."""
         recorder = self.recorder
-        return recorder.images or recorder.ply_every > 0 or recorder.trajectory or recorder.nodes
+        return recorder.images or recorder.trajectory or recorder.nodes
 
     def record(self, state: State, frame: int) -> None:
-        """Draw, export and record the requested outputs of a frame."""
+        """Draw and record the requested outputs of a frame."""
         recorder, walls = self.recorder, self.walls
-        exporting = recorder.ply_every > 0 and frame % recorder.ply_every == 0
-        if recorder.images or exporting:
+        if recorder.images:
             with walls("shading"):
                 gaussians = self.painter.deformed(state)
-        if recorder.images:
             for name in ("", *self.painter.cameras):
                 self.picture(state, gaussians, frame, name)
         with walls("writing"):
-            if exporting:
-                cloud = gaussians.part_to_cloud(moving=True) if self.still_once else gaussians.to_cloud()
-                recorder.write_splat(frame, cloud, self.scene.frame)
             if recorder.trajectory:
                 recorder.write_trajectory(frame, *self.scene.surface(state))
             moved = self.scene.follow.nodal(state) if recorder.nodes else None

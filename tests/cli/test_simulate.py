@@ -87,12 +87,12 @@ def test_cameras_and_renders_from_a_configuration(tmp_path, capsys):
 def test_the_blocks_of_the_page_on_recording_are_configurations(tmp_path):
     """Each parses after the flag's, and makes its cameras, recorder and edits."""
     blocks = (ROOT / "docs/recording.md").read_text(encoding="utf-8").split("```yaml\n")[1:]
-    assert len(blocks) == 6
+    assert len(blocks) == 4
     parser = Simulation.parser()
     for block in blocks:
         (tmp_path / "block.yaml").write_text(block.split("```")[0])
         parts = parser.instantiate(parser.parse_args(["--config", str(FLAG), "--config", str(tmp_path / "block.yaml")]))
-        assert parts.cameras or parts.edits or parts.recorder.renders[1:] or parts.recorder.ply_every
+        assert parts.cameras or parts.edits or parts.recorder.renders[1:]
 
 
 def test_print_config_parses_back(tmp_path, capsys):
@@ -116,7 +116,7 @@ def _help(capsys, option):
 
 
 def test_help_shows_the_options_that_people_use(capsys):
-    """Twenty-one of them, in the words of the help on all; the parser is as before, for a page that goes on."""
+    """Twenty of them, in the words of the help on all; the parser is as before, for a page that goes on."""
     parser = Simulation.parser()
     before = parser.format_help()
     with pytest.raises(SystemExit):
@@ -125,7 +125,7 @@ def test_help_shows_the_options_that_people_use(capsys):
     (text, common), (whole, every) = _help(capsys, "--help"), _help(capsys, "--help-all")
     assert _help(capsys, "-h") == (text, common)
     assert common[:2] == ["--help", "--help-all"]
-    assert len(common) == len(set(common)) == 2 + 21
+    assert len(common) == len(set(common)) == 2 + 20
     needed = {
         "--config",
         "--output",

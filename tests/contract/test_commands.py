@@ -72,6 +72,14 @@ def test_export(place, suffix):
     assert float(apart.amin(1).max()) < 1.2e-3  # formats may sort
 
 
+def test_export_of_a_run(place):
+    """Its frames as splats, in a folder that is made."""
+    works("export run frames/flag_###.spz")
+    assert sorted(path.name for path in (place / "frames").iterdir()) == [f"flag_{k:03d}.spz" for k in range(4)]
+    moved = [read_gaussians(place / f"frames/flag_{k:03d}.spz").means for k in (0, 3)]
+    assert float((moved[1] - moved[0]).abs().max()) > 1e-3
+
+
 def test_preview(place, capsys):
     """Its starter is simulated as it is."""
     works("preview flag.ply --hold=-x --frames=3 --height=96 --device=cpu --output=look")

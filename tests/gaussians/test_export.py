@@ -9,20 +9,19 @@ import pytest
 import torch
 from small_scenes import varied_cloud
 from torch.testing import assert_close
+from usd_files import read_usd_frame
 
 from gaussian_swaying.gaussians.export import (
     SUFFIXES,
     UsdFilm,
     cleaned,
-    convert,
     export_cloud,
+    export_frames,
     format_of,
-    read_usd_frame,
     usd_arrays,
     write_usd,
 )
 from gaussian_swaying.gaussians.formats import read_gaussians
-from gaussian_swaying.gaussians.ply import write_ply
 from gaussian_swaying.geometry.rotations import quat_to_rotation
 
 
@@ -150,11 +149,8 @@ def test_bad_films(tmp_path):
     (tmp_path / "sparse.usdc").unlink()
     with pytest.raises(ValueError, match="Frame 6 has another number of Gaussians than frame 0"):
         film.add(6, usd_arrays(varied_cloud(5)))
-    (tmp_path / "b.usda").write_text("no usd")
-    with pytest.raises(ValueError, match="cannot be read as a USD file"):
-        read_usd_frame(tmp_path / "b.usda", 0)
     export_cloud(tmp_path / "one.usdc", varied_cloud(4), format="usd")
-    assert sorted(path.name for path in tmp_path.iterdir()) == ["b.usda", "one.usdc"]
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["one.usdc"]
 
 
 def test_usd_without_its_library_is_one_sentence(tmp_path, monkeypatch):
@@ -176,46 +172,30 @@ def test_the_name_says_the_format(tmp_path):
         format_of("a.ksplat")
 
 
-def test_files_are_converted(tmp_path):
-    cloud = varied_cloud(20)
-    write_ply(tmp_path / "a.ply", cloud)
-    convert(tmp_path / "a.ply", tmp_path / "a.splat")
-    assert len(read_gaussians(tmp_path / "a.splat")) == 20
-    frames = tmp_path / "ply"
-    frames.mkdir()
-    with pytest.raises(ValueError, match=r"contains no \.ply"):
-        convert(frames, tmp_path / "film.usdc")
-    for k in range(3):
-        write_ply(frames / f"{k:05d}.ply", _moved(cloud, 0.1 * k))
-    with pytest.raises(ValueError, match=r"folder of 3 frames: give a target .* or one with # .* frame_####\.splat"):
-        convert(frames, tmp_path / "b.splat")
-    with pytest.raises(FileNotFoundError, match="is not a folder"):
-        convert(tmp_path / "a.ply", tmp_path / "no" / "a.splat")
-
-
-def test_a_sequence_becomes_numbered_files(tmp_path):
-    """From 0, whatever the numbers were, with as many digits as there are places."""
+@pytest.mark.parametrize(
+    ("name", "last"),
+    [
+        ("point_cloud_#.ply", "point_cloud_11.ply"),
+        ("frame####.compressed.ply", "frame0011.compressed.ply"),
+        ("##.spz", "11.spz"),
+        ("a_#.sog", "a_11.sog"),
+    ],
+)
+def test_a_sequence_becomes_numbered_files(name, last, tmp_path):
+    """From 0, with as many digits as there are places; their folder is made."""
     cloud = varied_cloud(20, degree=0)
-    (tmp_path / "in").mkdir()
-    for k in range(12):
-        write_ply(tmp_path / "in" / f"{2 * k:05d}.ply", _moved(cloud, 0.1 * k))
-    wanted = {"point_cloud_#.ply": "point_cloud_11.ply", "frame####.compressed.ply": "frame0011.compressed.ply"}
-    wanted |= {"##.spz": "11.spz", "a_#.sog": "a_11.sog"}
-    for number, (name, last) in enumerate(wanted.items()):
-        out = tmp_path / str(number)
-        out.mkdir()
-        convert(tmp_path / "in", out / name)
-        assert len(list(out.iterdir())) == 12
-        found = read_gaussians(out / last)
-        assert_close(found.means.mean(0), cloud.means.mean(0) + 1.1, rtol=0, atol=1e-3)
+    clouds = (_moved(cloud, 0.1 * k) for k in range(12))
+    files = export_frames(tmp_path / "new" / name, clouds)
+    assert sorted(files) == sorted((tmp_path / "new").iterdir())
+    assert (len(files), files[-1].name) == (12, last)
+    found = read_gaussians(files[-1])
+    assert_close(found.means.mean(0), cloud.means.mean(0) + 1.1, rtol=0, atol=1e-3)
 
 
 def test_a_sequence_becomes_a_film(tmp_path):
     pytest.importorskip("pxr")
     cloud = varied_cloud(20)
-    for k in range(3):
-        write_ply(tmp_path / f"{k:05d}.ply", _moved(cloud, 0.1 * k))
-    convert(tmp_path, tmp_path / "film.usdc", fps=10.0)
+    assert export_frames(tmp_path / "film.usdc", (_moved(cloud, 0.1 * k) for k in range(3))) == [tmp_path / "film.usdc"]
     for k in range(3):
         found = read_usd_frame(tmp_path / "film.usdc", k)
         np.testing.assert_allclose(found["positions"], (cloud.means + 0.1 * k).numpy(), atol=1e-6)

@@ -15,7 +15,7 @@ from small_scenes import together, varied_cloud
 from torch.testing import assert_close
 
 from gaussian_swaying.gaussians import sog
-from gaussian_swaying.gaussians.export import convert, export_cloud
+from gaussian_swaying.gaussians.export import export_cloud
 from gaussian_swaying.gaussians.formats import read_gaussians
 from gaussian_swaying.gaussians.sog import read_sog
 from gaussian_swaying.simulation.scene import Scene
@@ -83,7 +83,7 @@ def test_a_folder_is_what_a_bundle_holds(tmp_path):
     bundle, folder = read_sog(FILES / "scene.sog"), read_gaussians(path)
     for name in ("means", "quats", "scales", "opacities", "sh"):
         assert torch.equal(getattr(folder, name), getattr(bundle, name))
-    convert(path, tmp_path / "again.sog")
+    export_cloud(tmp_path / "again.sog", read_gaussians(path))
     assert len(Scene(ply=tmp_path / "again.sog").cloud()) == 16
 
 

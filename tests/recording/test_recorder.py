@@ -14,12 +14,11 @@ import imageio_ffmpeg
 import numpy as np
 import pytest
 import torch
-from plyfile import PlyData
 from shared import advanced, without_waits
 
 from gaussian_swaying.aero.wind import WindField
 from gaussian_swaying.gaussians.harmonics import sh_to_color
-from gaussian_swaying.gaussians.ply import read_ply, write_ply
+from gaussian_swaying.gaussians.ply import read_ply
 from gaussian_swaying.geometry.covariances import covariance
 from gaussian_swaying.recording import recorder as recorder_module
 from gaussian_swaying.recording import trajectory
@@ -51,9 +50,8 @@ def _run(simulation, folder, frames=3, recorder=None, **settings):
         ((recorder_module, "save_png"), lambda recorder: recorder.write_image(1, torch.zeros(2, 2, 3))),
         ((np, "savez"), lambda recorder: recorder.write_trajectory(1, torch.zeros(2, 3), torch.zeros(2, 3, 3))),
         ((torch, "save"), lambda recorder: recorder.write_checkpoint({"frame": 1})),
-        ((PlyData, "write"), lambda recorder: recorder.write_ply(1, lambda path: write_ply(path, FLAG))),
     ],
-    ids=["image", "trajectory", "checkpoint", "ply"],
+    ids=["image", "trajectory", "checkpoint"],
 )
 def test_a_failing_write_leaves_no_half_file(target, write, tmp_path, monkeypatch):
     def fail(*given, **_):
@@ -63,7 +61,7 @@ def test_a_failing_write_leaves_no_half_file(target, write, tmp_path, monkeypatc
         raise OSError("No space left on device")
 
     monkeypatch.setattr(*target, fail)
-    recorder = Recorder(ply_every=1, video=False)
+    recorder = Recorder(video=False)
     recorder.open(tmp_path / "run")
     before = _names(tmp_path)
     write(recorder)
@@ -75,7 +73,7 @@ def test_a_failing_write_leaves_no_half_file(target, write, tmp_path, monkeypatc
 def test_files_of_a_run(make_simulation, tmp_path):
     simulation = make_simulation()
     simulation.config = "frames: 3\n"
-    _run(simulation, tmp_path / "run", recorder=Recorder(ply_every=2))
+    _run(simulation, tmp_path / "run", recorder=Recorder())
     assert _names(tmp_path / "run") == [
         "checkpoint.pt",
         "config.yaml",
@@ -85,9 +83,6 @@ def test_files_of_a_run(make_simulation, tmp_path):
         "frames/00001.png",
         "frames/00002.png",
         "nodes.npz",
-        "ply",
-        "ply/00000.ply",
-        "ply/00002.ply",
         "run.json",
         "summary.json",
         "trajectory.npz",
@@ -113,7 +108,7 @@ def test_what_is_switched_off_is_not_written(make_simulation, tmp_path):
     assert _names(tmp_path / "run") == ["config.yaml", "diagnostics.csv", "run.json", "summary.json"]
     with pytest.raises(ValueError, match=r"`recorder.images`"):
         Recorder(images=False)
-    for name, value in (("ply_every", -1), ("checkpoint_every", -1), ("fps", 0.0)):
+    for name, value in (("checkpoint_every", -1), ("fps", 0.0)):
         with pytest.raises(ValueError, match=name):
             Recorder(**{name: value})
 
@@ -150,12 +145,13 @@ def test_exported_gaussians_are_the_deformed_ones(make_cloud, make_simulation, t
     cloud = make_cloud()
     settings = {"pinned": False, "scene": {"up": [0.0, -1.0, 0.0], "longest_side": 0.7}}
     simulation = make_simulation(cloud, wind=WindField([0.0, 9.0, 0.0]), **settings)
-    _run(simulation, tmp_path / "run", recorder=Recorder(ply_every=1))
-    rest = read_ply(tmp_path / "run" / "ply" / "00000.ply")
+    for frame in simulation.frames(3):
+        frame.save(tmp_path / f"{frame.index}.ply")
+    rest = read_ply(tmp_path / "0.ply")
     torch.testing.assert_close(rest.sh, cloud.sh, rtol=0, atol=1e-5)
     state, _ = advanced(simulation, 2)
     deformed = simulation.scene.deformed(state)
-    found = read_ply(tmp_path / "run" / "ply" / "00002.ply")
+    found = read_ply(tmp_path / "2.ply")
     assert float((deformed.means - cloud.means).abs().max()) > 0.01
     torch.testing.assert_close(found.means, deformed.means)
     torch.testing.assert_close(found.quats.norm(dim=-1), torch.ones(40), rtol=0, atol=1e-5)
@@ -505,9 +501,8 @@ def test_what_was_recorded_before_the_end_is_kept(error, status, make_simulation
     simulation, folder = make_simulation(), tmp_path / "run"
     _fail_at(simulation, monkeypatch, 3, error)
     with pytest.raises(type(error)):
-        _run(simulation, folder, 10, Recorder(ply_every=1))
+        _run(simulation, folder, 10)
     assert len(list((folder / "frames").glob("*.png"))) == 3
-    assert len(list((folder / "ply").glob("*.ply"))) == 3
     assert len(iio.imread(folder / "video.mp4")) == 3
     load_trajectory(folder / "trajectory.npz", 2)
     summary = json.loads((folder / "summary.json").read_text())

@@ -16,7 +16,7 @@ FRAMES = 3
 def run(make_simulation, tmp_path):
     """A complete run of three frames, and how to go on to a fourth."""
     simulation, folder = make_simulation(), tmp_path / "run"
-    recorder = Recorder(renders=["color", "depth"], ply_every=1)
+    recorder = Recorder(renders=["color", "depth"])
     simulation.run(folder, FRAMES, progress=False, recorder=recorder)
     return folder, lambda: simulation.run(folder, FRAMES + 1, resume=True, progress=False, recorder=recorder)
 
@@ -24,7 +24,7 @@ def run(make_simulation, tmp_path):
 def test_missing_files_are_told(run, capsys):
     """The run goes on without them: they may have been removed on purpose."""
     folder, resume = run
-    for name in ("frames/00000.png", "frames/00001.png", "depth_raw/00001.png", "ply/00000.ply", "trajectory.npz"):
+    for name in ("frames/00000.png", "frames/00001.png", "depth_raw/00001.png", "trajectory.npz"):
         (folder / name).unlink()
     (folder / "summary.json").unlink()
     (folder / "run.json").unlink()
@@ -35,10 +35,9 @@ def test_missing_files_are_told(run, capsys):
         "frames/00000.png and 1 more are missing, so video.mp4 will be without them; start again",
         "depth_raw/00001.png is missing; start again",
         "trajectory/00000.npz and 2 more are missing, so trajectory.npz will be without them",
-        "ply/00000.ply is missing",
     ):
         assert sum(words in line for line in warnings) == 1, (words, warnings)
-    assert len(warnings) == 4
+    assert len(warnings) == 3
     assert summary["status"] == "complete"
     assert len(iio.imread(folder / "video.mp4")) == 2
     assert json.loads((folder / "summary.json").read_text())["frames"] == FRAMES + 1

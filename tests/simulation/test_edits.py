@@ -114,7 +114,7 @@ def test_an_edit_at_load_is_a_region_of_the_material(formulation, make_simulatio
 
 def test_a_colour_at_load_is_that_of_the_first_picture(make_simulation, tmp_path):
     simulation = _with(make_simulation(), Edit(color=[1.0, 0.0, 1.0]))
-    summary = simulation.run(tmp_path / "run", 1, progress=False, recorder=Recorder(ply_every=1))
+    summary = simulation.run(tmp_path / "run", 1, progress=False)
     assert summary["edits"] == 1
     color = simulation.painter.render(simulation.start(), 0)
     solid = color.alpha[..., 0] > 0.9

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,18 +12,16 @@ import torch
 from torch import Tensor
 
 from gaussian_swaying._devices import in_double
-from gaussian_swaying._files import sha256
-from gaussian_swaying.config.parser import parse_file
 from gaussian_swaying.gaussians.harmonics import sh_to_color
 from gaussian_swaying.geometry.groups import equal_rows
 from gaussian_swaying.geometry.rotations import quat_multiply, rotation_to_quat
 from gaussian_swaying.mpm.state import GridSpec
 from gaussian_swaying.mpm.transfer import Stencil
 from gaussian_swaying.mpm.virtual_nodes import coordinates
-from gaussian_swaying.recording.nodes import load_nodes
 from gaussian_swaying.rendering.cameras.camera import Camera
 from gaussian_swaying.rendering.shading import DiffuseShader
 from gaussian_swaying.simulation.painter import Painter
+from gaussian_swaying.simulation.recorded import RecordedRun
 from gaussian_swaying.simulation.simulated_scene import SimulatedScene
 from gaussian_swaying.simulation.simulation import Simulation
 
@@ -80,58 +77,10 @@ def read_film(run: Path) -> Film:
     Args:
         run: The output folder of ``gaussian-swaying sim``.
     """
-    summary = _summary(run)
-    simulation, name = _rebuild(run, summary)
-    displacement = load_nodes(run / "nodes.npz")
-    start: Any = simulation.start()
-    grid, scene = start.grid, simulation.scene
-    nodes = scene.follow.nodes(start)
-    assert nodes is not None  # the run is of `total`
-    if displacement.shape[1] != len(nodes):
-        raise ValueError(
-            f"{run / 'nodes.npz'} has {displacement.shape[1]:,} nodes, but the scene of {run / 'config.yaml'} has "
-            f"{len(nodes):,}: export with the version of this program that made the run, or run it again."
-        )
+    played = RecordedRun(run)
+    nodes, displacement = played.nodes()
     with torch.inference_mode():
-        return film_of(simulation, grid, nodes, displacement, name)
-
-
-def _summary(run: Path) -> dict[str, Any]:
-    if not (run / "summary.json").is_file() or not (run / "config.yaml").is_file():
-        raise ValueError(f"{run} has no run: give the output folder of `gaussian-swaying sim`.")
-    try:
-        summary: dict[str, Any] = json.loads((run / "summary.json").read_text(encoding="utf-8"))
-        formulation = summary["formulation"]
-    except (OSError, ValueError, KeyError, TypeError) as error:
-        raise ValueError(f"{run / 'summary.json'} cannot be read ({error}): run the simulation again.") from error
-    if formulation not in ("total", "modes"):
-        raise ValueError(
-            f"The run in {run} is of `solver.formulation: {formulation}`, where nodes do not move with the material: "
-            "a film needs a run of `total`."
-        )
-    if not (run / "nodes.npz").is_file():
-        raise ValueError(f"The run in {run} has no nodes.npz: run it again with `recorder.nodes: true`.")
-    return summary
-
-
-def _rebuild(run: Path, summary: dict[str, Any]) -> tuple[Simulation, str]:
-    config = run / "config.yaml"
-    parser = Simulation.parser()
-    try:
-        settings = parse_file(parser, config)
-    except ValueError as error:
-        raise ValueError(f"{config} cannot be read, as a run made from Python cannot be repeated ({error})") from error
-    splat = settings.scene.ply
-    if splat is not None:
-        if not Path(splat).is_file():
-            raise ValueError(
-                f"The splat {splat} of the run is not there (`scene.ply` in {config}): put it back, or export from the "
-                "folder in which the run was started."
-            )
-        if summary.get("splat_sha256") not in (None, sha256(Path(splat))):
-            raise ValueError(f"The splat {splat} has changed since the run in {run}: restore it, or run again.")
-    made = getattr(settings.scene.generator, "class_path", "scene").rsplit(".", 1)[-1].removesuffix("Scene")
-    return Simulation.from_settings(parser, settings, device="cpu"), made if splat is None else Path(splat).stem
+        return film_of(played.simulation, played.start.grid, nodes, displacement, played.name)
 
 
 def film_without_frames(simulation: Simulation, state: Any, name: str) -> Film:

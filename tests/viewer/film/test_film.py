@@ -263,7 +263,7 @@ def _refused(capsys, words, *arguments):
 def test_what_is_no_run_of_total_is_refused(make_flag, run, tmp_path, capsys):
     _refused(capsys, "has no run: give the output folder of `gaussian-swaying sim`", tmp_path)
     _refused(capsys, "to end in .html, but got ", run, tmp_path / "film.mp4")
-    _refused(capsys, "--fps is not for --web", run, "--fps", "25")
+    _refused(capsys, "--metres-per-unit is not for --web", run, "--metres-per-unit", "2")
     copy = shutil.copytree(run, tmp_path / "copy")
     (copy / "nodes.npz").unlink()
     _refused(capsys, "run it again with `recorder.nodes: true`.", copy)
