@@ -53,11 +53,18 @@ def sha256(path: Path) -> str:
 
 @contextmanager
 def atomic(path: Path) -> Iterator[Path]:
-    """Yield a temporary path in the same folder; it becomes ``path`` if the block succeeds and is removed if not."""
+    """Yield a temporary path in the same folder; it becomes ``path`` if the block succeeds and is removed if not.
+
+    An error of the system names the path that was asked for.
+    """
     temporary = temporary_name(path)
     try:
         yield temporary
         os.replace(temporary, path)
+    except OSError as error:
+        if error.filename == str(temporary):
+            error.filename = str(path)
+        raise
     finally:
         temporary.unlink(missing_ok=True)
 

@@ -23,6 +23,9 @@ def test_a_file_appears_whole_or_not_at_all(tmp_path):
 
     with pytest.raises(RuntimeError, match="half way"):
         fail_half_way()
+    with pytest.raises(IsADirectoryError) as caught, atomic(tmp_path) as temporary:
+        temporary.write_text("{")
+    assert caught.value.filename == str(tmp_path)
     assert json.loads(path.read_text()) == {"a": 1}
     assert [file.name for file in tmp_path.iterdir()] == ["value.json"]
 

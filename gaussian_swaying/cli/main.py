@@ -5,6 +5,7 @@ from __future__ import annotations
 import difflib
 import gc
 import io
+import os
 import sys
 from collections.abc import Sequence
 from importlib import import_module
@@ -37,7 +38,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
         arguments: Its name and its arguments; those of the process if None.
 
     Returns:
-        The exit code of the command; 2 if there is no such command.
+        The exit code of the command.
+
+    Raises:
+        SystemExit: With code 2 if there is no such command, or none can be loaded here.
     """
     given = sys.argv[1:] if arguments is None else list(arguments)
     if not given or given[0] in ("-h", "--help"):
@@ -52,8 +56,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     if given[0] not in COMMANDS:
         close = difflib.get_close_matches(given[0], COMMANDS, 1)
         hint = f" (did you mean {close[0]}?)" if close else ""
-        print(f"error: There is no command {given[0]!r}{hint}: use one of {', '.join(COMMANDS)}.", file=sys.stderr)
-        return 2
+        _end(f"There is no command {given[0]!r}{hint}: use one of {', '.join(COMMANDS)}.")
     program.called(given[0])
     code: int = _imported(COMMANDS[given[0]][0]).main(given[1:])
     return code
@@ -72,8 +75,23 @@ def run(command: str | None = None) -> NoReturn:
     sys.exit(main() if command is None else _imported(COMMANDS[command][0]).main())
 
 
+def _end(message: str) -> NoReturn:
+    print(f"error: {message}", file=sys.stderr)
+    sys.exit(2)
+
+
 def _imported(name: str) -> ModuleType:
-    """A module; while it is imported, and later within it, Python looks for no garbage, which would take 0.3 s."""
+    """A module; while it is imported, and later within it, Python looks for no garbage, which would take 0.3 s.
+
+    What torch and numpy would not explain while they are loaded is checked before.
+    """
+    try:
+        os.getcwd()
+        int(os.environ.get("SOURCE_DATE_EPOCH", 0))
+    except FileNotFoundError:
+        _end("The working directory no longer exists: change to another one.")
+    except ValueError:
+        _end("The environment variable SOURCE_DATE_EPOCH is not a whole number of seconds: correct or unset it.")
     if name not in sys.modules:
         gc.disable()
         try:

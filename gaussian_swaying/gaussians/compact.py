@@ -71,9 +71,10 @@ def read_compressed_ply(path: str | os.PathLike[str]) -> GaussianCloud:
         if vertices.dtype[name].kind not in "iu":
             raise ValueError(f"{path}: property `{name}` is not a whole number; export the file again.")
     chunks: Any = read_element(path, header, "chunk") if "chunk" in held else np.empty(0)
-    if len(chunks) < -(-count // CHUNK):
+    if len(chunks) != -(-count // CHUNK):
         raise ValueError(
-            f"{path} has {len(chunks)} chunks, too few for {count} Gaussians in chunks of {CHUNK}; export it again."
+            f"{path} has {len(chunks)} chunks, which are not those of {count} Gaussians (element `vertex`) in chunks "
+            f"of {CHUNK}; export it again."
         )
     chunk_of = np.arange(count) // CHUNK
 

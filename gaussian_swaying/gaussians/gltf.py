@@ -29,6 +29,7 @@ _EXTENSION = "KHR_gaussian_splatting"
 LARGEST = 1 << 32  # bytes of a .glb file
 _GLB = struct.Struct("<4sII")  # magic, version, length; then chunks of a length, a kind and data
 _CHUNK = struct.Struct("<I4s")
+_UNDERSTOOD = (_EXTENSION, "KHR_mesh_quantization")
 _TYPES = {5120: np.int8, 5121: np.uint8, 5122: np.int16, 5123: np.uint16, 5125: np.uint32, 5126: np.float32}
 _WIDTHS = {"SCALAR": 1, "VEC3": 3, "VEC4": 4}
 _UPRIGHT = torch.tensor([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]], dtype=torch.float64)  # z up to y up
@@ -138,6 +139,11 @@ class _Document:
         self.root = self._chunks() if binary else read_json(path, "glTF file")
         if not isinstance(self.root, dict):
             raise self.broken("it is not a table of keys")
+        needed = [name for name in self._list(self.root, "extensionsRequired") if name not in _UNDERSTOOD]
+        if needed:
+            raise ValueError(
+                f"{path} requires the extensions {str(needed)[:80]} (`extensionsRequired`); export without."
+            )
 
     def broken(self, what: str) -> ValueError:
         return ValueError(f"{self.path} is not a usable glTF file ({what}); export it again.")
@@ -148,8 +154,8 @@ class _Document:
         if size < _GLB.size + _CHUNK.size:
             raise self.broken(f"it ends after {size} bytes")
         _, version, length = _GLB.unpack(data[: _GLB.size].tobytes())
-        if version != 2 or length > size:
-            raise self.broken(f"version {version} with {length:,} bytes announced, of which there are {size:,}")
+        if version != 2 or length != size:
+            raise self.broken(f"`version` {version} with a `length` of {length:,} bytes, but there are {size:,}")
         start, chunks = _GLB.size, dict[bytes, np.ndarray]()
         while start + _CHUNK.size <= length:
             count, kind = _CHUNK.unpack(data[start : start + _CHUNK.size].tobytes())
@@ -158,6 +164,8 @@ class _Document:
                 raise self.broken(f"a part of {count:,} bytes is announced, but {length - start:,} follow")
             chunks.setdefault(kind, data[start : start + count])
             start += count
+        if start < length:
+            raise self.broken(f"{length - start} bytes follow its last part")
         if len(chunks.get(b"JSON", ())) == 0 or len(chunks[b"JSON"]) > LARGEST_JSON:
             raise self.broken("its JSON is missing or too large")
         if b"BIN\0" in chunks:
@@ -236,6 +244,9 @@ class _Document:
     def _check_primitive(self, primitive: dict[str, Any], kind: Any) -> None:
         if not isinstance(kind, dict) or not isinstance(primitive.get("attributes"), dict):
             raise self.broken(f"`{_EXTENSION}` or `attributes` of a primitive is no table of keys")
+        mode = primitive.get("mode", 4)
+        if mode != 0 or "indices" in primitive:
+            raise self.broken(f"`mode` {str(mode)[:20]} of a primitive with Gaussians is not 0, or it has `indices`")
         if kind.get("extensions"):
             names = str(list(kind["extensions"]) if isinstance(kind["extensions"], dict) else kind["extensions"])[:80]
             raise ValueError(f"{self.path} stores its Gaussians by the extensions {names}; export it without them.")
@@ -312,6 +323,13 @@ class _Document:
         needed = inner + (stride * (count - 1) + row if count else 0)
         if stride < row or needed > length or first + length > len(buffer):
             raise self.broken(f"attribute `{name}` announces {count:,} rows, but its buffer has {len(buffer):,} bytes")
+        shared = [
+            a for a in self.root["accessors"] if isinstance(a, dict) and a.get("bufferView") == accessor["bufferView"]
+        ]
+        if length >= needed + stride and len(shared) == 1:
+            raise self.broken(
+                f"attribute `{name}` has a `count` of {count:,}, but its view has a `byteLength` for more"
+            )
         rows = np.ndarray((count, width), dtype, buffer, first + inner, (stride, dtype.itemsize))
         values = rows.astype(np.float32)
         if not accessor.get("normalized") or number == 5126:
@@ -322,6 +340,7 @@ class _Document:
     def _buffer(self, index: int) -> np.ndarray:
         """The bytes of a buffer: in the file itself, in a data URI, or in a file of the same folder."""
         entry = self.item("buffers", index)
+        announced = self.whole(entry, "byteLength")
         if index not in self._buffers:
             uri = entry.get("uri")
             if not isinstance(uri, str):
@@ -338,7 +357,10 @@ class _Document:
                     raise ValueError(f"{self.path} takes its data from {name[:80]!r}; put that file beside it.")
                 beside = check_regular(self.path.with_name(name), "the buffer")
                 self._buffers[index] = np.fromfile(beside, dtype=np.uint8)
-        return self._buffers[index]
+        found = self._buffers[index]
+        if not announced <= len(found) < announced + 4:  # padding
+            raise self.broken(f"buffer {index} has a `byteLength` of {announced:,}, but its data {len(found):,} bytes")
+        return found[:announced]
 
 
 def _harmonics(degree: int) -> list[str]:

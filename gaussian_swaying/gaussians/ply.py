@@ -127,7 +127,9 @@ def write_ply(path: str | os.PathLike[str], cloud: GaussianCloud) -> None:
 
 
 def check_folder(path: Path) -> None:
-    """Raise FileNotFoundError if the folder of a file that is to be written does not exist."""
+    """Raise an error if the folder of a file that is to be written does not exist, or the file is a folder itself."""
+    if path.is_dir():
+        raise ValueError(f"{path} is a folder: name a file inside it.")
     if not path.parent.is_dir():
         raise FileNotFoundError(f"{path} cannot be written because {path.parent} is not a folder; create it first.")
 

@@ -18,6 +18,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from gaussian_swaying._checks import one_line
 from gaussian_swaying._inputs import LARGEST_JSON, check_regular, check_unpacked, parse_json, read_json
 from gaussian_swaying.gaussians.cloud import GaussianCloud, joined
 from gaussian_swaying.gaussians.packed import (
@@ -135,6 +136,9 @@ def _single(path: Path) -> GaussianCloud:
         return _decoded(path, meta, lambda name: check_regular(_inside(path, name), "the picture").read_bytes())
     with _archive(path) as archive:
         sizes = {entry.filename: entry.file_size for entry in archive.infolist()}
+        for entry in archive.infolist():
+            if entry.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
+                raise NotImplementedError(f"`{entry.filename[:40]}` is compressed by other means than deflate")
     check_unpacked(path, sum(sizes.values()), f"{len(sizes)} files")
 
     def read(name: str) -> bytes:
@@ -154,8 +158,8 @@ def _archive(path: Path) -> Iterator[zipfile.ZipFile]:
     try:
         with zipfile.ZipFile(path) as archive:
             yield archive
-    except (zipfile.BadZipFile, zlib.error, EOFError, OSError, RuntimeError, UnicodeDecodeError) as error:
-        raise _broken(path, str(error)) from error
+    except (zipfile.BadZipFile, zlib.error, EOFError, OSError, RuntimeError, ValueError) as error:
+        raise _broken(path, one_line(error)) from error
 
 
 def _inside(path: Path, name: Any) -> Path:
@@ -233,9 +237,13 @@ def _decoded(path: Path, meta: Any, read: _Read) -> GaussianCloud:
 
     low, high = (_numbers(path, part["means"], end, 3, 3) for end in ("mins", "maxs"))
     logs = low + (high - low) * (pixels("means")[:, :3] + 256.0 * pixels("means", 1)[:, :3]) / 65535
-    packed = pixels("quats")
-    if bool((packed[:, 3] < _LARGEST_TAG).any()):
+    packed = _picture(path, read, part["quats"]["files"], 0, count).reshape(-1, 4)
+    small, good = (packed[:, :3] / 255 - 0.5) * np.sqrt(2), packed[:, 3] >= _LARGEST_TAG
+    if not good[:count].all():
         raise _broken(path, "a pixel of `quats` does not say which component is the largest")
+    more = good[count:] & (np.square(small[count:]).sum(1) < 1) & (packed[count:] != packed[count - 1]).any(1)
+    if more.any():
+        raise _broken(path, f"`count` is {count:,}, but its pictures hold {int(more.sum()):,} Gaussians more")
     colors = pixels("sh0")
     sh = _looked_up(path, part["sh0"], "sh0", colors[:, :3])[:, None, :]
     if bands:
@@ -252,7 +260,7 @@ def _decoded(path: Path, meta: Any, read: _Read) -> GaussianCloud:
     return cloud_of(
         path,
         means=means,
-        quats=with_largest((packed[:, :3] / 255 - 0.5) * np.sqrt(2), packed[:, 3] - _LARGEST_TAG),
+        quats=with_largest(small[:count], packed[:count, 3] - _LARGEST_TAG),
         scales=_looked_up(path, part["scales"], "scales", pixels("scales")[:, :3]),
         opacities=logits(colors[:, 3] / 255, 255),
         sh=sh,
@@ -294,7 +302,7 @@ def _picture(path: Path, read: _Read, files: Sequence[str], number: int, least: 
         with Image.open(io.BytesIO(read(name)), formats=["WEBP"]) as picture:
             columns, rows = picture.size
             if columns * rows < least or columns * rows > 2 * least + (1 << 17) or (width and columns != width):
-                raise _broken(path, f"`{name[:40]}` has {columns} x {rows} pixels, but holds {least:,} values")
+                raise _broken(path, f"`{name[:40]}` has {columns} x {rows} pixels, but `count` asks for {least:,}")
             return np.asarray(picture.convert("RGBA"))
     except (OSError, SyntaxError, Image.DecompressionBombError) as error:
         if isinstance(error, FileNotFoundError):

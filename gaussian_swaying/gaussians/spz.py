@@ -23,6 +23,7 @@ _TABLE = 32  # offset of the table of streams in a file of version 4 without ext
 _ANTIALIASED, _EXTENDED = 1, 2  # flags
 _AXES = 0xADBE0003  # the extension SPZ_ADOBE_coordinate_system
 _COLOR_SCALE = 0.15  # wider than that of the harmonics, as colours may be beyond 0 and 1
+_LARGEST_EXTENSIONS = 1 << 24  # bytes
 _BITS = (5, 4)  # of harmonics of band 1 and above, as Niantic's writer keeps by default
 
 
@@ -40,11 +41,12 @@ def read_spz(path: str | os.PathLike[str]) -> GaussianCloud:
         The Gaussians as float32 tensors on the CPU, without normals.
     """
     path = check_regular(path, "the .spz file")
-    data = path.read_bytes()
-    if data[:2] == b"\x1f\x8b":
-        head, parts, extensions = _unzipped(path, data)
-    elif data[:4] == _MAGIC:
-        head, parts, extensions = _streams(path, data)
+    with path.open("rb") as stream:
+        start = stream.read(4)
+    if start[:2] == b"\x1f\x8b":
+        head, parts, extensions = _unzipped(path)
+    elif start == _MAGIC:
+        head, parts, extensions = _streams(path, path.read_bytes())
     else:
         raise ValueError(f"{path} is not an .spz file (it starts neither as gzip nor with `NGSP`); export it again.")
     _, version, count, degree, fraction, flags, _ = head
@@ -53,7 +55,7 @@ def read_spz(path: str | os.PathLike[str]) -> GaussianCloud:
         warn_antialiased(path)
     if degree == 4:
         warnings.warn(f"{path}: ignored the harmonics of degree 4; those up to 3 are used.", UserWarning, stacklevel=2)
-    positions, alphas, colors, scales, rotations, rest = (np.frombuffer(part, dtype=np.uint8) for part in parts)
+    positions, alphas, colors, scales, rotations, rest = parts
     sh = np.empty((count, (min(degree, 3) + 1) ** 2, 3), dtype=np.float32)
     sh[:, 0] = ((colors / 255 - 0.5) / _COLOR_SCALE).reshape(count, 3)
     sh[:, 1:] = rest.reshape(count, -1, 3)[:, :15]
@@ -121,74 +123,102 @@ def _sizes(path: Path, data: bytes) -> tuple[tuple[Any, ...], list[int]]:
     if len(data) < _HEAD.size:
         raise _truncated(path, _HEAD.size, len(data))
     head = _HEAD.unpack_from(data)
-    magic, version, count, degree = head[:4]
+    magic, version, count, degree, fraction = head[:5]
     if magic != _MAGIC or version not in VERSIONS:
-        raise ValueError(f"{path} is not an .spz file of version 1 to 4; export it as one of these.")
+        raise ValueError(f"{path} is not an .spz file of `version` 1 to 4; export it as one of these.")
     if count == 0:
         raise ValueError(f"{path} holds zero Gaussians; export the scene again.")
     if degree > 4:
         raise ValueError(f"{path} has harmonics of degree {degree}, but they end at 4; export it again.")
+    if fraction > 24:
+        raise ValueError(f"{path} has centres of 24 bits with `fractional_bits` {fraction}; copy or export it again.")
     check_unpacked(path, count * (56 + 12 * ((degree + 1) ** 2 - 1)), f"{count:,} Gaussians")
     rows = (6 if version == 1 else 9, 1, 3, 3, 3 if version < 3 else 4, 3 * ((degree + 1) ** 2 - 1))
     return head, [count * row for row in rows]
 
 
-def _unzipped(path: Path, data: bytes) -> tuple[tuple[Any, ...], list[bytes], bytes]:
+def _unzipped(path: Path) -> tuple[tuple[Any, ...], list[np.ndarray], bytes]:
     """The header, the parts and the extensions of a file of version 1 to 3; decompresses only what it announces."""
-    stream = zlib.decompressobj(wbits=31)
     try:
-        head, sizes = _sizes(path, stream.decompress(data, _HEAD.size))
-        body = stream.decompress(stream.unconsumed_tail, sum(sizes))
-        tail = stream.decompress(stream.unconsumed_tail, 1 << 12) if head[5] & _EXTENDED else b""
-    except zlib.error as error:
+        with gzip.open(path) as stream:
+            head, sizes = _sizes(path, stream.read(_HEAD.size))
+            if head[1] == 4:
+                raise ValueError(f"{path} has `version` 4, but is compressed by gzip; copy or export it again.")
+            body = np.empty(sum(sizes), dtype=np.uint8)
+            found = stream.readinto(memoryview(body))
+            if found < len(body):
+                raise _truncated(path, len(body), found)
+            extensions = stream.read(_LARGEST_EXTENSIONS) if head[5] & _EXTENDED else b""
+            more = stream.read(1)  # at the end this compares the checksum
+    except (zlib.error, EOFError, gzip.BadGzipFile) as error:
         raise ValueError(f"{path} cannot be decompressed ({error}); copy or export it again.") from error
-    if len(body) < sum(sizes):
-        raise _truncated(path, sum(sizes), len(body))
-    ends = np.cumsum(sizes)
-    return head, [body[end - size : end] for size, end in zip(sizes, ends, strict=True)], tail
+    if more:
+        raise _longer(path, head)
+    return head, np.split(body, np.cumsum(sizes)[:-1]), extensions
 
 
-def _streams(path: Path, data: bytes) -> tuple[tuple[Any, ...], list[bytes], bytes]:
+def _streams(path: Path, data: bytes) -> tuple[tuple[Any, ...], list[np.ndarray], bytes]:
     """The header, the parts and the extensions of a file of version 4."""
     head, sizes = _sizes(path, data)
     if head[1] != 4:
-        raise ValueError(f"{path} is of version {head[1]}, but not compressed by gzip; export it again.")
+        raise ValueError(f"{path} has `version` {head[1]}, but is not compressed by gzip; copy or export it again.")
     zstandard = _zstandard(path)
     wanted = [size for size in sizes if size]
     if len(data) < _TABLE:
         raise _truncated(path, _TABLE, len(data))
     table = struct.unpack_from("<I", data, _HEAD.size)[0]
     start = table + 16 * len(wanted)
-    if head[6] != len(wanted) or table < _TABLE or start > len(data):
+    longest = len(data) - 16 * len(wanted) if head[5] & _EXTENDED else _TABLE
+    if head[6] != len(wanted) or not _TABLE <= table <= longest:
         raise ValueError(f"{path} has a broken table of {head[6]} streams at byte {table}; copy or export it again.")
     parts = []
     for index, size in enumerate(wanted):
         length, announced = struct.unpack_from("<QQ", data, table + 16 * index)
         if announced != size or start + length > len(data):
             raise ValueError(f"{path}: stream {index} does not fit its table; copy or export it again.")
+        packed = data[start : start + length]
         try:
-            part = zstandard.ZstdDecompressor().stream_reader(data[start : start + length]).read(size)
+            if zstandard.frame_content_size(packed) not in (-1, size):
+                raise _longer(path, head)
+            part = zstandard.ZstdDecompressor().decompress(packed, max_output_size=size, allow_extra_data=False)
         except zstandard.ZstdError as error:
             raise ValueError(f"{path}: stream {index} cannot be decompressed ({error}); export it again.") from error
         if len(part) < size:
             raise _truncated(path, size, len(part))
-        parts.append(part)
+        parts.append(np.frombuffer(part, dtype=np.uint8))
         start += length
-    extensions = data[_TABLE:table] if head[5] & _EXTENDED else b""
-    return head, [*parts, *([b""] * (len(sizes) - len(parts)))], extensions
+    if start < len(data):
+        raise _longer(path, head)
+    return head, [*parts, *([np.empty(0, dtype=np.uint8)] * (len(sizes) - len(parts)))], data[_TABLE:table]
 
 
 def _check_axes(path: Path, extensions: bytes) -> None:
-    """Raise ValueError if the extensions say that the axes are left-handed, which would mirror the scene."""
-    while len(extensions) >= 12:
-        kind, length, axes = struct.unpack_from("<III", extensions)
+    """Raise ValueError if the axes are left-handed, which would mirror the scene, or an extension is cut off."""
+    left = memoryview(extensions)
+    while left:
+        kind, length = struct.unpack_from("<II", left) if len(left) >= 8 else (0, len(left))
+        if 8 + length > len(left):
+            raise ValueError(
+                f"{path}: extension {kind:#x} announces a `length` of {length:,} bytes, but {max(len(left) - 8, 0):,} "
+                "follow; copy or export it again."
+            )
+        axes = int.from_bytes(left[8:12], "little")
         if kind == _AXES and 0 < axes <= 16 and ((axes - 1 & 7) ^ 3).bit_count() % 2:  # 4 stands for right, up, back
             raise ValueError(f"{path} has left-handed axes (number {axes}); export it with others, such as RUB.")
-        extensions = extensions[8 + length :]
+        left = left[8 + length :]
+
+
+def _longer(path: Path, head: tuple[Any, ...]) -> ValueError:
+    return ValueError(
+        f"{path} goes on behind what its header announces (`version` {head[1]}, `count` {head[2]:,}, `degree` "
+        f"{head[3]}); copy or export it again."
+    )
 
 
 def _truncated(path: Path, needed: int, found: int) -> ValueError:
-    return ValueError(f"{path} is truncated: {needed:,} bytes are announced, but {found:,} follow; copy it again.")
+    return ValueError(
+        f"{path} is truncated: {needed:,} bytes are announced, but {found:,} follow; copy or export it again."
+    )
 
 
 def _zstandard(path: Path | None = None) -> Any:

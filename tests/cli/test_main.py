@@ -27,6 +27,18 @@ def test_what_there_is(capsys):
     refused(main, ["exprot"], capsys, "error: There is no command 'exprot' (did you mean export?)")
 
 
+def test_what_torch_would_not_explain(tmp_path, monkeypatch, capsys):
+    """Before it is loaded; no module is needed for the version."""
+    monkeypatch.setenv("SOURCE_DATE_EPOCH", "abc")
+    refused(main, ["export"], capsys, "The environment variable SOURCE_DATE_EPOCH is not a whole number")
+    monkeypatch.setenv("SOURCE_DATE_EPOCH", "0")
+    (tmp_path / "gone").mkdir()
+    monkeypatch.chdir(tmp_path / "gone")
+    (tmp_path / "gone").rmdir()
+    refused(main, ["export"], capsys, "The working directory no longer exists")
+    assert main(["--version"]) == 0
+
+
 @pytest.mark.parametrize("name", list(COMMANDS))
 def test_each_command_has_its_own_help(name, capsys):
     with pytest.raises(SystemExit) as left:

@@ -56,7 +56,8 @@ def _compressed(path, change):
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        (lambda e: e.update(chunk=e["chunk"][:1]), "has 1 chunks, too few for 300 Gaussians in chunks of 256"),
+        (lambda e: e.update(chunk=e["chunk"][:1]), "has 1 chunks, which are not those of 300 Gaussians"),
+        (lambda e: e.update(chunk=e["chunk"][[0, 1, 1]]), "has 3 chunks, which are not those of 300 Gaussians"),
         (lambda e: e.update(vertex=drop_fields(e["vertex"], "packed_scale")), "no property `packed_scale`"),
         (lambda e: e.update(chunk=drop_fields(e["chunk"], "max_y")), "no property `max_y` in its chunks"),
         (lambda e: e.update(sh=e["sh"][:7]), "the element `sh` does not hold 9, 24 or 45"),

@@ -64,6 +64,8 @@ def test_what_cannot_be_written_leaves_nothing(tmp_path):
         export_cloud(tmp_path / "a.obj", cloud, format="obj")
     with pytest.raises(FileNotFoundError, match="is not a folder"):
         export_cloud(tmp_path / "no" / "a.splat", cloud, format="splat")
+    with pytest.raises(ValueError, match="is a folder: name a file inside it"):
+        export_cloud(tmp_path, cloud, format="splat")
     cloud.opacities[:] = -9.0
     with pytest.raises(ValueError, match="all Gaussians are fainter than 1/255"):
         export_cloud(tmp_path / "a.compressed.ply", cloud, format="compressed_ply")

@@ -138,7 +138,7 @@ def test_numbers_of_every_kind(tmp_path):
     names = ["POSITION", *(f"{KHR}:{name}" for name in ("ROTATION", "SCALE", "OPACITY", "SH_DEGREE_0_COEF_0"))]
     attributes = {name: index for index, name in enumerate(names)}
     higher = attributes | {f"{KHR}:SH_DEGREE_1_COEF_{k}": 4 for k in range(3)}
-    kind = {"extensions": {KHR: {"kernel": "ellipse", "colorSpace": "lin_rec709_display"}}}
+    kind = {"mode": 0, "extensions": {KHR: {"kernel": "ellipse", "colorSpace": "lin_rec709_display"}}}
     document = {
         "scenes": [{"nodes": [0]}],
         "nodes": [{"mesh": 0}],
@@ -196,6 +196,13 @@ def _set(place, **values):
         (_set("nodes 0", matrix=[1, 0, 0, 0, 1, 1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1]), "shears or mirrors"),
         (_set("nodes 0", scale=[1e20] * 3), "beyond ±1e+12"),
         (_set("accessors 0", count=2**31), "announces 2,147,483,648 Gaussians, far more"),
+        (lambda d, p: d.update(extensionsRequired=[KHR, "EXT_meshopt"]), "requires the extensions ['EXT_meshopt']"),
+        (lambda d, p: p.update(mode=4), "`mode` 4 of a primitive with Gaussians is not 0"),
+        (lambda d, p: p.pop("mode"), "`mode` 4 of a primitive with Gaussians is not 0"),
+        (lambda d, p: p.update(indices=0), "or it has `indices`"),
+        (lambda d, p: d.update(accessors=[dict(a, count=1) for a in d["accessors"]]), "has a `count` of 1, but its"),
+        (_set("buffers 0", byteLength=100), "buffer 0 has a `byteLength` of 100, but its data"),
+        (_set("buffers 0", byteLength=2**40), "`byteLength` of 1,099,511,627,776, but its data"),
         (_set("accessors 0", sparse={}), "attribute `POSITION` is sparse"),
         (_set("bufferViews 0", byteStride=2**70), "announces 2 rows, but its buffer has"),
         (lambda d, p: d.update(accessors=[dict(a, count=0) for a in d["accessors"]]), "zero Gaussians"),
@@ -211,7 +218,8 @@ def test_bad_files(name, tmp_path):
     for content, message in (
         (b"[]", "it is not a table of keys"),
         (b'{"scene": ' + b"9" * 50 + b"}", "a whole number of 50 digits"),
-        (good[:100], "version 2 with"),
+        (good[:100], "`version` 2 with a `length` of"),
+        (good + b"more", "`version` 2 with a `length` of"),
         (good[:12] + b"\xff\xff\xff\xff" + good[16:], "a part of 4,294,967,295 bytes is announced"),
         (struct.pack("<4sII", b"glTF", 2, 20) + struct.pack("<I4s", 0, b"JSON"), "its JSON is missing"),
     ):
@@ -227,7 +235,7 @@ def test_bad_files(name, tmp_path):
         ("/etc/hosts", "takes its data from '/etc/hosts'"),
         ("https://example.org/a.bin", "takes its data from 'https://example.org/a.bin'"),
         ("data:;base64,%%", "buffer 0 is not in base64"),
-        ("data:;base64,AAAA", "its buffer has 3 bytes"),
+        ("data:;base64,AAAA", "but its data 3 bytes"),
         (None, "buffer 0 has no data"),
         ("none.bin", "none.bin does not exist"),
     ],

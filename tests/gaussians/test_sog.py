@@ -190,7 +190,8 @@ def test_bad_files(tmp_path):
         (lambda f: f.pop("quats.webp"), "it has no file `quats.webp`"),
         (_set("version", 1), "is SOG of version 1, not 2; convert it"),
         (_set("count", 10**9), "announces 1,000,000,000 Gaussians, far more than its"),
-        (_set("count", 40), "has 4 x 4 pixels, but holds 40 values"),
+        (_set("count", 40), "has 4 x 4 pixels, but `count` asks for 40"),
+        (_set("count", 1), "`count` is 1, but its pictures hold 15 Gaussians more"),
         (_set("means maxs", [30, 0, 0]), "beyond ±1e+12 for"),
         (_set("scales codebook", [1.0]), "of a code book of 1"),
         (_set("scales codebook", [1e4] * 256), "gives a size of zero or infinity"),
@@ -202,6 +203,14 @@ def test_bad_files(tmp_path):
         change(files)
         refused(_packed(tmp_path / "bad.sog", files), message)
         refused(_unpacked(tmp_path, files), "" if "no file" in message else message, name=str(tmp_path))
+
+
+@pytest.mark.parametrize("method", [zipfile.ZIP_LZMA, zipfile.ZIP_BZIP2])
+def test_only_what_programs_write_is_unpacked(method, tmp_path):
+    """A damaged stream of another kind can end in any error, or ask for any memory."""
+    with zipfile.ZipFile(tmp_path / "bad.sog", "w", method) as archive:
+        archive.writestr("meta.json", b"{}")
+    refused(tmp_path / "bad.sog", "`meta.json` is compressed by other means than deflate")
 
 
 def test_nothing_swells(tmp_path):

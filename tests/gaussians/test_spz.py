@@ -117,8 +117,13 @@ def test_flags_and_extensions_are_told(tmp_path):
     data = _body(_put(14, "B", 2), version=4)
     struct.pack_into("<I", longer := bytearray(data), 16, 32 + axes.size)
     path.write_bytes(longer[:32] + axes.pack(7, 4, 0, 0xADBE0003, 4, 8) + longer[32:])
-    with pytest.raises(ValueError, match="left-handed"):
-        read_gaussians(path)
+    refused(path, "left-handed")
+    far = struct.pack("<II5000xIII", 7, 5000, 0xADBE0003, 4, 8)
+    path.write_bytes(gzip.compress(_body(_put(14, "B", 2)) + far))
+    refused(path, "left-handed")
+    for cut, words in ((-1, "0xadbe0003 announces a `length` of 4 bytes, but 3 follow"), (-9, "but 0 follow")):
+        path.write_bytes(gzip.compress(_body(_put(14, "B", 2)) + far[:cut]))
+        refused(path, words)
 
 
 def test_harmonics_of_degree_4(tmp_path):
@@ -136,11 +141,27 @@ def test_harmonics_of_degree_4(tmp_path):
 
 def test_bad_files(tmp_path):
     path = tmp_path / "bad.spz"
+    good, behind = (
+        gzip.compress(_body(degree=1)),
+        "goes on behind what its header announces (`version` {}, `count` {}, ",
+    )
     for data, message in (
+        (gzip.compress(_body(_put(8, "<I", 1))), behind.format(3, 1)),
+        (gzip.compress(_body(_put(12, "B", 0), degree=1)), behind.format(3, 2)),
+        (gzip.compress(_body(_put(4, "<I", 2))), behind.format(2, 2)),
+        (gzip.compress(_body(_put(4, "<I", 4))), "has `version` 4, but is compressed by gzip"),
+        (_body(_put(4, "<I", 3), version=4), "has `version` 3, but is not compressed by gzip"),
+        (gzip.compress(_body(_put(13, "B", 25))), "24 bits with `fractional_bits` 25"),
+        (good[:-8], "ended before the end-of-stream marker"),
+        (good[:-3], "ended before the end-of-stream marker"),
+        (good[:-8] + bytes(8), "CRC check failed"),
+        (good + b"more", "cannot be decompressed (Not a gzipped file"),
+        (_body(version=4) + b"\0", behind.format(4, 2)),
+        (_body(_put(16, "<I", 40), version=4), "broken table of 5 streams at byte 40"),
         (b"ply\n", "starts neither as gzip nor with `NGSP`"),
         (b"\x1f\x8b" + bytes(40), "cannot be decompressed"),
         (gzip.compress(_body()[:-3]), "40 bytes are announced, but 37 follow"),
-        (gzip.compress(_body(_put(4, "<I", 9))), "not an .spz file of version 1 to 4"),
+        (gzip.compress(_body(_put(4, "<I", 9))), "not an .spz file of `version` 1 to 4"),
         (gzip.compress(_body(_put(8, "<I", 0))), "zero Gaussians"),
         (gzip.compress(_body(_put(8, "<I", 2**32 - 1))), "announces 4,294,967,295 Gaussians, far more than its"),
         (gzip.compress(_body(_put(12, "B", 5))), "harmonics of degree 5, but they end at 4"),
@@ -152,7 +173,7 @@ def test_bad_files(tmp_path):
 
 
 def test_no_more_is_decompressed_than_announced(tmp_path):
-    """A few bytes of gzip or Zstandard can stand for gigabytes."""
+    """A few bytes of gzip or Zstandard can stand for gigabytes, in what is announced and behind it."""
     (tmp_path / "a.spz").write_bytes(gzip.compress(_body() + bytes(1 << 26)))
     data = _body(version=4)
     bomb = needs_zstandard.ZstdCompressor().compress(bytes(1 << 26))
@@ -161,7 +182,7 @@ def test_no_more_is_decompressed_than_announced(tmp_path):
     (tmp_path / "b.spz").write_bytes(longer[:112] + bomb + longer[112 + old :])
     for name in ("a.spz", "b.spz"):
         tracemalloc.start()
-        assert len(read_gaussians(tmp_path / name)) == 2
+        refused(tmp_path / name, "goes on behind")
         assert tracemalloc.get_traced_memory()[1] < 1 << 22
         tracemalloc.stop()
 
