@@ -85,6 +85,11 @@ def save_png(path: Path, pixels: np.ndarray) -> None:
     Image.fromarray(pixels).save(path, "PNG", **PNG)
 
 
+def is_blank(pixels: np.ndarray) -> bool:
+    """True if all pixels of a picture (H, W, ...) are the same."""
+    return all(bool((part == pixels[0, 0]).all()) for part in (pixels[::16, ::16], pixels))
+
+
 def write_text(path: Path, text: str) -> None:
     """Write text in UTF-8, completely or not at all."""
     with atomic(path) as temporary:

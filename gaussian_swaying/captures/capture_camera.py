@@ -30,7 +30,7 @@ def read_views(
             with ``sparse/0`` or ``sparse``, which is preferred.
         width: Width of the images to render [pixels]; by default that of the capture.
         height: Height of the images to render [pixels]; by default that of the capture.
-        near: Near plane [scene units].
+        near: Near plane [scene units]; a hundredth of the distance or of the object's size when None.
 
     Returns:
         Name and camera of each view, sorted by name. Lens distortion is ignored: the cameras are pinhole cameras with
@@ -73,7 +73,7 @@ class CaptureCamera(CameraPath):
         interpolation: Between views: ``smooth`` or ``linear``, as for KeyframedCamera.
         width: Image width [pixels]; by default that of the capture.
         height: Image height [pixels]; by default that of the capture.
-        near: Near plane [scene units].
+        near: Near plane [scene units]; a hundredth of the distance or of the object's size when None.
 
     Raises:
         TypeError: If an argument has the wrong type.
@@ -90,7 +90,7 @@ class CaptureCamera(CameraPath):
     interpolation: Interpolation = "smooth"
     width: int | None = None
     height: int | None = None
-    near: float = 0.01
+    near: float | None = None
 
     def __post_init__(self) -> None:
         check_positive("seconds_per_view", self.seconds_per_view)
@@ -102,7 +102,7 @@ class CaptureCamera(CameraPath):
     def __call__(self, frame: int, time: float, center: Tensor, up: Tensor, size: float) -> Camera:
         """Camera of a frame, see :meth:`CameraPath.__call__`."""
         if not self._cameras:
-            self._read()
+            self._read(self.near_of(size))
         if len(self._cameras) == 1:
             return self._cameras[0].to(center.device, center.dtype)
         times = [k * self.seconds_per_view for k in range(len(self._cameras))]
@@ -113,11 +113,11 @@ class CaptureCamera(CameraPath):
         world_to_camera[:3, 3] = -world_to_camera[:3, :3] @ eye
         intrinsics = torch.tensor([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]], dtype=torch.float64)
         first = self._cameras[0]
-        camera = Camera(world_to_camera, intrinsics, first.width, first.height, self.near)
+        camera = Camera(world_to_camera, intrinsics, first.width, first.height, first.near)
         return camera.to(center.device, center.dtype)
 
-    def _read(self) -> None:
-        views = read_views(self.path, self.width, self.height, self.near)
+    def _read(self, near: float) -> None:
+        views = read_views(self.path, self.width, self.height, near)
         if self.view is not None:
             self._cameras = [views[self._index([name for name, _ in views])][1]]
             return

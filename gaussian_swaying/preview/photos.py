@@ -167,7 +167,7 @@ def seen_share(points: Tensor, cameras: Sequence[Camera]) -> Tensor:
         pixel = local @ intrinsics.T
         place = pixel[:, :2] / local[:, 2:].clamp(min=1e-9)
         size = torch.tensor([camera.width, camera.height])
-        count += (local[:, 2] > camera.near) & (place >= 0).all(-1) & (place < size).all(-1)
+        count += (local[:, 2] > 0) & (place >= 0).all(-1) & (place < size).all(-1)
     return count / len(cameras)
 
 

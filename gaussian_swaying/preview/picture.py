@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import warnings
 from collections.abc import Iterable, Sequence
 from typing import TYPE_CHECKING, Any
 
@@ -10,6 +11,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from gaussian_swaying._files import is_blank
 from gaussian_swaying.gaussians.area import patch_area
 from gaussian_swaying.gaussians.cloud import GaussianCloud
 from gaussian_swaying.gaussians.connectivity import shades
@@ -184,6 +186,8 @@ def _view(simulation: Simulation, parts: Roles, camera: Camera, normals: int, ti
     renderer = make_renderer(colours.device, detail=DETAIL)
     image = renderer(rest.means, rest.covariances, opacity, colours, camera, plain).color
     pixels = (image.detach().clamp(0, 1) * 255 + 0.5).to(torch.uint8).cpu().numpy()
+    if is_blank(pixels):
+        warnings.warn(f"The preview at {title} shows nothing: check that the Gaussians are opaque.", stacklevel=2)
     picture = Image.fromarray(pixels)
     draw = ImageDraw.Draw(picture)
     _draw_normals(draw, scene, parts, camera, normals)

@@ -19,7 +19,7 @@ import torch
 from torch import Tensor
 
 from gaussian_swaying._checks import check_choice, check_literals, check_positive
-from gaussian_swaying._files import atomic, remove_temporaries, save_png, write_json, write_table, write_text
+from gaussian_swaying._files import atomic, is_blank, remove_temporaries, save_png, write_json, write_table, write_text
 from gaussian_swaying.recording.checkpoint import read_checkpoint
 from gaussian_swaying.recording.layout import OURS, frame_folder, raw_folder, video_file
 from gaussian_swaying.recording.nodes import NODES, split_far
@@ -119,10 +119,11 @@ class Recorder:
         self._lock: FolderLock | None = None
         self.checkpoint_frame: int | None = None
         self._real_time_fps = 25.0
+        self._blank: list[tuple[str, int]] = []
 
     def __getstate__(self) -> dict[str, Any]:
         """The settings: a copy has no folder, no open files and nothing that waits to be written."""
-        closed: dict[str, Any] = {"_folder": None, "_writer": None, "_films": {}, "_lock": None}
+        closed: dict[str, Any] = {"_folder": None, "_writer": None, "_films": {}, "_lock": None, "_blank": []}
         return vars(self) | closed | {"checkpoint_frame": None}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
@@ -177,7 +178,7 @@ class Recorder:
         path = Path(folder)
         places = [frame_folder(render, camera) for camera in ("", *cameras) for render in self.renders]
         self._films = {place: _Film() for place in places} if self.images else {}
-        self.checkpoint_frame = None
+        self.checkpoint_frame, self._blank = None, []
         try:
             checkpoint = self._continue(path, config, check) if resume else None
             if not resume:
@@ -260,7 +261,14 @@ class Recorder:
         """
         path = self.folder / place / f"{index:05d}.png"
         copy = HostCopy((image.detach().clamp(0, 1) * 255 + 0.5).to(torch.uint8))
-        self._submit(path, lambda: _write_png(path, copy.get().numpy()))
+
+        def write() -> None:
+            pixels = copy.get().numpy()
+            _write_png(path, pixels)
+            if is_blank(pixels):
+                self._blank.append((place, index))
+
+        self._submit(path, write)
         film = self._films.get(place)
         if film is not None and film.encoder is not None:
             encoder, encoded = film.encoder, film.encoded
@@ -273,6 +281,15 @@ class Recorder:
                     encoder.abort()  # `close` notices the missing frame, encodes the PNGs and reports errors
 
             self._submit(encoder.path, encode)
+
+    def told(self) -> list[str]:
+        """A sentence for each folder of pictures in which some show nothing; of those written so far."""
+        found = {place: sorted(index for other, index in self._blank if other == place) for place, _ in self._blank}
+        return [
+            f"{len(frames)} pictures in {place} show nothing, the first in frame {frames[0]}: check `near` and the "
+            "place of the camera, and that the Gaussians are opaque."
+            for place, frames in sorted(found.items())
+        ]
 
     def write_depth(self, index: int, steps: Tensor, place: str = "depth") -> None:
         """Write one frame's depth as 16-bit PNG, beside the frames of ``place``.

@@ -243,7 +243,7 @@ class Run:
             with suppress(OSError):  # the terminal may be closed
                 bar.close()
                 if progress:
-                    for sentence in run_health(stepper, self.log[:done])[1]:
+                    for sentence in run_health(stepper, self.log[:done])[1] + recorder.told():
                         print(f"warning: {sentence}", file=sys.stderr)
             stepper.progress = None
             summary = self.close(status, reason, state, done, settings)
@@ -417,6 +417,6 @@ class Run:
             "stretch_max": max((entry["stretch_max"] for entry in log), default=None),
             "displacement_mean_max_m": max(moved, default=None),
             "extremes": found,
-            "warnings": sentences,
+            "warnings": sentences + self.recorder.told(),
             "per_frame": log,
         }

@@ -25,7 +25,7 @@ from gaussian_swaying.recording import trajectory
 from gaussian_swaying.recording.recorder import Recorder
 from gaussian_swaying.recording.trajectory import load_trajectory
 from gaussian_swaying.recording.video import VideoEncoder, encode_video
-from gaussian_swaying.rendering.cameras.camera_path import OrbitCamera
+from gaussian_swaying.rendering.cameras.camera_path import LookAtCamera, OrbitCamera
 from gaussian_swaying.scenes.procedural import FlagScene
 from gaussian_swaying.simulation.diagnostics import SimulationDiverged
 from gaussian_swaying.simulation.run import Run
@@ -111,6 +111,16 @@ def test_what_is_switched_off_is_not_written(make_simulation, tmp_path):
     for name, value in (("checkpoint_every", -1), ("fps", 0.0)):
         with pytest.raises(ValueError, match=name):
             Recorder(**{name: value})
+
+
+def test_pictures_that_show_nothing_are_told(make_simulation, tmp_path, capsys):
+    away = LookAtCamera((0.0, -2.0, 0.0), (0.0, -4.0, 0.0), width=32, height=18)
+    simulation = make_simulation(parts={"cameras": {"away": away}})
+    summary = simulation.run(tmp_path / "run", 3, recorder=Recorder())
+    words = "3 pictures in cameras/away/frames show nothing, the first in frame 0: check `near`"
+    assert [words in sentence for sentence in summary["warnings"]].count(True) == 1
+    assert f"warning: {words}" in capsys.readouterr().err
+    assert not any("in frames show nothing" in sentence for sentence in summary["warnings"])
 
 
 def test_images_are_the_pictures_rounded_to_8_bits(make_simulation, tmp_path):

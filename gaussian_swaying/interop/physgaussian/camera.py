@@ -39,7 +39,7 @@ class PhysGaussianCamera(PinholePath):
         width: Image width [pixels].
         height: Image height [pixels].
         fov_y: Vertical field of view [degrees].
-        near: Near plane [scene units].
+        near: Near plane [scene units]; a hundredth of the distance or of the object's size when None.
 
     Raises:
         ValueError: If a number is out of range; at the first frame, if the file is bad.
@@ -91,7 +91,7 @@ class PhysGaussianCamera(PinholePath):
     def __call__(self, frame: int, time: float, center: Tensor, up: Tensor, size: float) -> Camera:
         """Camera of a frame, see :meth:`CameraPath.__call__`."""
         if self._model is None and self.cameras is not None:
-            self._model = read_model_camera(self.cameras, max(self.index, 0), self.near)
+            self._model = read_model_camera(self.cameras, max(self.index, 0), self.near_of(size))
         if self._model is not None and self.index >= 0:
             return self._model.to(center.device, center.dtype)
         width, height = (self.width, self.height) if self._model is None else (self._model.width, self._model.height)
@@ -108,7 +108,7 @@ def read_model_camera(path: str | os.PathLike[str], index: int, near: float = 0.
         path: The file: a list of cameras with ``position``, ``rotation`` (camera to world, OpenCV axes), ``fx``, ``fy``
             [pixels], ``width`` and ``height``.
         index: Index of the camera, from 0.
-        near: Near plane [scene units].
+        near: Near plane [scene units]; a hundredth of the distance or of the object's size when None.
 
     Returns:
         The camera in float64; the principal point is the image's centre.

@@ -11,6 +11,9 @@ from torch import Tensor
 from gaussian_swaying._checks import check_positive, check_shape, check_vector
 from gaussian_swaying.geometry.rotations import check_direction, rows_from_z
 
+NEAR = 0.01
+"""Near plane, in distances to what the camera looks at, or in sizes of it."""
+
 
 def check_pixels(name: str, value: Any) -> int:
     """Return ``value`` if it is a positive integer, or raise an error that names the field."""
@@ -46,7 +49,8 @@ class Camera:
         intrinsics: Matrix with fx, fy, cx, cy [pixels], shape (3, 3). Skew is ignored.
         width: Image width [pixels].
         height: Image height [pixels].
-        near: Gaussians whose centre has a smaller depth are not drawn [scene units].
+        near: Gaussians whose centre has a smaller depth are not drawn [scene units]; the default is for objects of
+            about 1 unit.
 
     Raises:
         TypeError: If a matrix is not a tensor or the image size is not an integer.
@@ -114,7 +118,7 @@ def look_at_camera(
     fov_y_degrees: float,
     width: int,
     height: int,
-    near: float = 0.01,
+    near: float | None = None,
     *,
     device: torch.device | str | None = None,
     dtype: torch.dtype | None = None,
@@ -128,7 +132,7 @@ def look_at_camera(
         fov_y_degrees: Vertical field of view [degrees]. Pixels are square.
         width: Image width [pixels].
         height: Image height [pixels].
-        near: Near plane [scene units].
+        near: Near plane [scene units]; :data:`NEAR` of the distance when None.
         device: Device of the matrices.
         dtype: Precision of the matrices; the default precision of torch when None.
 
@@ -144,7 +148,7 @@ def look_at_camera(
     eye_point, up_axis = check_vector("eye", eye), check_direction("up", up)
     forward = [a - b for a, b in zip(check_vector("target", target), eye_point, strict=True)]
     distance = math.hypot(*forward)
-    if distance < 1e-12:
+    if not distance > 0:
         raise ValueError(f"Expected `eye` and `target` to differ, but both are {list(eye_point)}.")
     forward = [item / distance for item in forward]
     right = _cross(forward, up_axis)
@@ -159,7 +163,7 @@ def look_at_camera(
     intrinsics = torch.tensor(
         [[focal, 0.0, 0.5 * width], [0.0, focal, 0.5 * height], [0.0, 0.0, 1.0]], dtype=torch.float64
     )
-    camera = Camera(world_to_camera, intrinsics, width, height, near)
+    camera = Camera(world_to_camera, intrinsics, width, height, NEAR * distance if near is None else near)
     object.__setattr__(camera, "_eye", torch.tensor(eye_point, dtype=torch.float64))  # known without an inverse
     return camera.to(device, dtype or torch.get_default_dtype())
 
@@ -173,7 +177,7 @@ def orbit_camera(
     fov_y_degrees: float,
     width: int,
     height: int,
-    near: float = 0.01,
+    near: float | None = None,
     *,
     device: torch.device | str | None = None,
     dtype: torch.dtype | None = None,
@@ -194,7 +198,7 @@ def orbit_camera(
         fov_y_degrees: Vertical field of view [degrees].
         width: Image width [pixels].
         height: Image height [pixels].
-        near: Near plane [scene units].
+        near: Near plane [scene units]; :data:`NEAR` of the distance when None.
         device: Device of the matrices.
         dtype: Precision of the matrices; the default precision of torch when None.
 

@@ -12,6 +12,7 @@ from torch import Tensor
 
 from gaussian_swaying._checks import check_positive, check_vector, check_whole
 from gaussian_swaying.rendering.cameras.camera import (
+    NEAR,
     Camera,
     check_direction,
     check_elevation,
@@ -33,6 +34,12 @@ class CameraPath(ABC):
 
     captured: bool = False
     still: bool = False
+
+    near: float | None = None
+
+    def near_of(self, size: float) -> float:
+        """Near plane for an object of a size [scene units]."""
+        return NEAR * size if self.near is None else self.near
 
     @abstractmethod
     def __call__(self, frame: int, time: float, center: Tensor, up: Tensor, size: float) -> Camera:
@@ -58,7 +65,8 @@ def check_picture(camera: CameraPath) -> None:
             check_pixels(name, given[name])
     if "fov_y" in given:
         check_fov("fov_y", given["fov_y"])
-    check_positive("near", given["near"])
+    if given["near"] is not None:
+        check_positive("near", given["near"])
 
 
 @dataclass(eq=False, kw_only=True)
@@ -69,13 +77,13 @@ class PinholePath(CameraPath):
         width: Image width [pixels].
         height: Image height [pixels].
         fov_y: Vertical field of view [degrees].
-        near: Near plane [scene units].
+        near: Near plane [scene units]; a hundredth of the distance or of the object's size when None.
     """
 
     width: int = 960
     height: int = 540
     fov_y: float = 40.0
-    near: float = 0.01
+    near: float | None = None
 
     def __post_init__(self) -> None:
         check_picture(self)
@@ -102,7 +110,7 @@ class OrbitCamera(PinholePath):
         degrees_per_second: Speed of the azimuth [degrees/s].
         target_offset: Vector from the object's centre to the target, along the scene's axes, in multiples of the
             object's longest side.
-        near: Near plane [scene units].
+        near: Near plane [scene units]; a hundredth of the distance or of the object's size when None.
 
     Raises:
         TypeError: If an argument has the wrong type.
@@ -150,7 +158,7 @@ class LookAtCamera(PinholePath):
         width: Image width [pixels].
         height: Image height [pixels].
         fov_y: Vertical field of view [degrees].
-        near: Near plane [scene units].
+        near: Near plane [scene units]; a hundredth of the distance or of the object's size when None.
 
     Raises:
         TypeError: If an argument has the wrong type.
@@ -184,7 +192,7 @@ class TransformsCamera(CameraPath):
         frame: Index of the camera in the file, from 0. It is the same camera in every frame of the video.
         width: Image width [pixels]; by default that of the file.
         height: Image height [pixels]; by default that of the file.
-        near: Near plane [scene units].
+        near: Near plane [scene units]; a hundredth of the distance or of the object's size when None.
 
     Raises:
         TypeError: If an argument has the wrong type.
@@ -199,7 +207,7 @@ class TransformsCamera(CameraPath):
     _: KW_ONLY
     width: int | None = None
     height: int | None = None
-    near: float = 0.01
+    near: float | None = None
 
     def __post_init__(self) -> None:
         check_whole("frame", self.frame, 0)
@@ -209,5 +217,6 @@ class TransformsCamera(CameraPath):
     def __call__(self, frame: int, time: float, center: Tensor, up: Tensor, size: float) -> Camera:
         """Camera of a frame, see :meth:`CameraPath.__call__`."""
         if self._camera is None:
-            self._camera = camera_from_transforms(self.path, self.frame, self.width, self.height, self.near)
+            near = self.near_of(size)
+            self._camera = camera_from_transforms(self.path, self.frame, self.width, self.height, near)
         return self._camera.to(center.device, center.dtype)

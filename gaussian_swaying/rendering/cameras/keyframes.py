@@ -104,7 +104,7 @@ class KeyframedCamera(PinholePath):
         width: Image width [pixels].
         height: Image height [pixels].
         fov_y: Vertical field of view [degrees].
-        near: Near plane [scene units].
+        near: Near plane [scene units]; a hundredth of the distance or of the object's size when None.
 
     Raises:
         TypeError: If an argument has the wrong type.
