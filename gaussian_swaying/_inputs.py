@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import codecs
 import json
 import os
 import stat
@@ -61,6 +62,12 @@ def read_json(path: str | os.PathLike[str], what: str, largest: int = LARGEST_JS
     return parse_json(content, what, path)
 
 
+def decoded(content: bytes) -> str:
+    """The text of a file in UTF-8, or in UTF-16 if it begins with the mark of that, without its byte order mark."""
+    wide = content[:2] in (codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)
+    return content.decode("utf-16" if wide else "utf-8-sig")
+
+
 def parse_json(content: bytes, what: str, path: str | os.PathLike[str]) -> Any:
     """Parse JSON from a file or a part of one.
 
@@ -70,7 +77,7 @@ def parse_json(content: bytes, what: str, path: str | os.PathLike[str]) -> Any:
         path: The file, for the message.
     """
     try:
-        return json.loads(content.decode(), parse_int=_whole)
+        return json.loads(decoded(content), parse_int=_whole)
     except (json.JSONDecodeError, UnicodeDecodeError) as error:
         raise ValueError(f"The {what} `{path}` is not valid JSON ({error}): export it again.") from error
     except RecursionError as error:

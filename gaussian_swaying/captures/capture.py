@@ -6,18 +6,20 @@ import math
 import os
 import warnings
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import torch
 from torch import Tensor
 
 from gaussian_swaying._checks import check_choice, check_whole
-from gaussian_swaying.captures.colmap import colmap_model, read_colmap
-from gaussian_swaying.captures.images import PosedImage, check_image_size, image_size, load_image
+from gaussian_swaying.captures.agreement import TURNED_AXES, cameras_that_see, turned_as_points
+from gaussian_swaying.captures.colmap import colmap_models, read_colmap_points, read_colmap_views
+from gaussian_swaying.captures.images import PosedImage, check_image_size, image_head, load_image
 from gaussian_swaying.captures.lens import Lens
-from gaussian_swaying.captures.point_cloud import read_ply_points
-from gaussian_swaying.captures.transforms import find_image, read_transforms, transforms_files
+from gaussian_swaying.captures.photos import Photos, is_turned, photos_beside, turned_size
+from gaussian_swaying.captures.point_cloud import PointCloud, read_ply_points
+from gaussian_swaying.captures.transforms import read_transforms, transforms_files
 from gaussian_swaying.rendering.cameras.camera import Camera
 
 FORMATS = ("auto", "colmap", "transforms")
@@ -35,6 +37,8 @@ class View:
         split: ``train``, ``val`` or ``test``.
         lens: Lens of the image on disk.
         downscale: Factor by which width and height of the undistorted image are reduced.
+        turned: Whether the pixels on disk are turned as their EXIF tag says.
+        mask: Picture that is black where the image is to be empty, or None.
     """
 
     name: str
@@ -43,6 +47,8 @@ class View:
     split: str
     lens: Lens
     downscale: int = 1
+    turned: bool = False
+    mask: Path | None = None
 
     def load(self) -> Tensor:
         """Read the pixels, undistorted and downscaled, see :func:`~gaussian_swaying.captures.images.load_image`.
@@ -50,7 +56,7 @@ class View:
         Returns:
             Dtype uint8, shape (H, W, 3), or (H, W, 4) with premultiplied alpha.
         """
-        return load_image(self.image_path, self.lens, self.downscale)
+        return load_image(self.image_path, self.lens, self.downscale, self.turned, self.mask)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -65,6 +71,7 @@ class Capture:
             thresholds of 3DGS scale with it.
         points: Points of the capture [scene units], float32, shape (P, 3), or None.
         colors: Their colours in 0 to 1, float32, shape (P, 3), or None.
+        found: One line that says what was found, and what was not.
     """
 
     path: Path
@@ -73,6 +80,7 @@ class Capture:
     extent: float
     points: Tensor | None = None
     colors: Tensor | None = None
+    found: str = ""
 
     def split(self, name: str) -> tuple[View, ...]:
         """Views of ``train``, ``val`` or ``test``, sorted by name."""
@@ -94,8 +102,8 @@ def read_capture(
     folder ``images_2``, ``images_4`` ... of the wanted size beside the images, it is read instead.
 
     Args:
-        path: Folder with ``sparse/0`` or ``sparse`` (COLMAP), with ``transforms.json`` or with
-            ``transforms_train.json``; or a transforms.json itself.
+        path: Folder with ``sparse/0``, ``sparse`` or ``colmap/sparse/0`` (of several COLMAP models that with most
+            images is read), with ``transforms.json`` or with ``transforms_train.json``; or a transforms.json itself.
         format: ``colmap``, ``transforms``, or ``auto`` for the first of these that exists.
         downscale: Factor by which width and height are reduced.
         test_every: Every n-th image, sorted by name and starting with the first, is used for testing; 0 for none. Not
@@ -111,7 +119,7 @@ def read_capture(
             problem and the remedy.
 
     Warns:
-        UserWarning: Once, with the number of frames left out because they have no image.
+        UserWarning: Once, with what was left out, and what the files do not tell.
     """
     root = Path(path)
     check_choice("format", format, FORMATS)
@@ -119,32 +127,18 @@ def read_capture(
     check_whole("test_every", test_every, 0)
     if not root.exists():
         raise FileNotFoundError(f"{root} does not exist; check the path of the capture.")
-    model = colmap_model(root) if format != "transforms" and root.is_dir() else None
-    points: Tensor | None = None
-    colors: Tensor | None = None
-    if model is not None:
-        folder = root / images
-        if not folder.is_dir():
-            raise ValueError(f"{root} has no folder {images}/ with the images of its COLMAP model: set `images`.")
-        posed, missing, cloud = read_colmap(model, folder)
-        points, colors = (None, None) if cloud is None else cloud
-    elif format != "colmap" and transforms_files(root):
-        folder = root if root.is_dir() else root.parent
-        posed, missing, file = read_transforms(root)
-        if file is not None:
-            cloud_of_file, _ = read_ply_points(file)
-            points, colors = cloud_of_file.points, cloud_of_file.colors
-    else:
-        wanted = {"colmap": "sparse/0 or sparse", "transforms": "transforms.json or transforms_train.json"}
-        names = " or ".join(wanted.values()) if format == "auto" else wanted[format]
-        raise ValueError(f"{root} is not a capture: it has no {names}; give the folder that contains it.")
+    files = _read(root, format, images)
+    posed, missing = files.posed, files.missing
     if not posed:
         first = f", the first of them {missing[0]}" if missing else ""
         raise ValueError(f"{root} has no images: all {len(missing)} are missing{first}; put them beside its cameras.")
-    posed = sorted(posed, key=lambda item: item.name)
+    posed.sort(key=lambda item: item.name)
+    _check_once(root, posed)
     splits = _splits(root, posed, test_every)
-    views = tuple(_view(root, item, split, downscale) for item, split in zip(posed, splits, strict=True))
-    eyes = torch.stack([view.camera.position.double() for view in views if view.split == "train"])
+    both = [_view(root, item, split, downscale) for item, split in zip(posed, splits, strict=True)]
+    views = [view for view, _ in both]
+    train = [view.camera for view in views if view.split == "train"]
+    eyes = torch.stack([camera.position.double() for camera in train])
     center = eyes.mean(0)
     extent = 1.1 * float((eyes - center).norm(dim=-1).max())
     if not extent > 0:
@@ -152,14 +146,115 @@ def read_capture(
             f"All {len(eyes)} training cameras of {root} are at the same place, so its depth cannot be learned: "
             "add images from elsewhere, or lower `test_every` to 0."
         )
+    if files.points is not None:
+        _check_sight(root, views, files.points.points, read_axes=files.source.startswith("transforms"))
+    unsure = [k for k, (_, told) in enumerate(both) if not told]
+    turned = _turned(views, unsure, files.points)
+    for k in unsure if turned else ():
+        views[k] = replace(views[k], turned=True)
+
+    masks = [item.mask for item in posed if item.mask is not None]
+    beside = photos_beside(files.folder, [item.path for item in posed], masks)
+    found = [
+        f"{len(posed)} of {len(posed) + len(beside)} photos have a camera in {files.source}",
+        f"{len(missing) or 'no'} cameras without a photo",
+        "no points" if files.points is None else f"{len(files.points):,} points",
+        f"{len(masks)} masks, in whose black parts nothing is to be" if masks else "no masks",
+    ]
+    if any(view.turned for view in views):
+        found.append(f"{sum(view.turned for view in views)} photos turned as their EXIF tags say")
+    lacks = []
     if missing:
-        warnings.warn(
-            f"{root}: left out {len(missing)} of {len(missing) + len(posed)} frames that have no image, the first of "
-            f"them {missing[0]}.",
-            UserWarning,
-            stacklevel=2,
+        lacks.append(
+            f"left out {len(missing)} of {len(missing) + len(posed)} cameras that have no photo on disk, the first of "
+            f"them that of {missing[0]}"
         )
-    return Capture(root, views, center.float(), extent, points, colors)
+    if beside:
+        lacks.append(
+            f"left out {len(beside)} of {len(beside) + len(posed)} photos on disk that have no camera in {files.source}"
+            f", the first of them {beside[0]}: find their cameras, or remove them"
+        )
+    if unsure and turned is None:
+        lacks.append(
+            f"{len(unsure)} photos have an EXIF tag that turns them, the first of them {views[unsure[0]].image_path}, "
+            "and nothing tells whether their cameras know: they are read as they are stored; turn their pixels, or "
+            "remove the tag"
+        )
+    if not masks and (files.folder / "masks").is_dir():
+        lacks.append(f"not used are the masks in {files.folder / 'masks'}: name them in a transforms.json, `mask_path`")
+    if files.points is None and axes_meet_behind(train):
+        lacks.append(f"the optical axes meet behind the cameras: {TURNED_AXES}")
+    if lacks:
+        warnings.warn(f"{root}: {'; '.join(lacks)}.", UserWarning, stacklevel=2)
+    points, colors = (None, None) if files.points is None else (files.points.points, files.points.colors)
+    return Capture(root, tuple(views), center.float(), extent, points, colors, f"{root}: {'; '.join(found)}.")
+
+
+@dataclass(frozen=True, eq=False)
+class _Files:
+    """What the files of a capture say; ``missing`` are the names of photos that do not exist."""
+
+    posed: list[PosedImage]
+    missing: list[str]
+    points: PointCloud | None
+    folder: Path
+    source: str
+
+
+def _read(root: Path, format: str, images: str) -> _Files:
+    models = colmap_models(root) if format != "transforms" and root.is_dir() else []
+    if models:
+        folder = root / images
+        if not folder.is_dir():
+            raise ValueError(f"{root} has no folder {images}/ with the images of its COLMAP model: set `images`.")
+        model, photos = models[0][0], Photos(folder)
+        named = [(photos.find(name), name, lens, pose) for name, lens, pose in read_colmap_views(model)]
+        (source, count), *less = ((f"the COLMAP model {os.path.relpath(path, root)}", count) for path, count in models)
+        if less:
+            source += f" with {count} images ({', '.join(f'{other} has {count}' for other, count in less)})"
+        posed = [PosedImage(name, path, lens, pose) for path, name, lens, pose in named if path is not None]
+        missing = [name for path, name, _, _ in named if path is None]
+        return _Files(posed, missing, read_colmap_points(model), folder.parent, source)
+    if format != "colmap" and transforms_files(root):
+        posed, missing, file = read_transforms(root)
+        source = " and ".join(file.name for file, _ in transforms_files(root))
+        points = None if file is None else read_ply_points(file)[0]
+        return _Files(posed, missing, points, root if root.is_dir() else root.parent, source)
+    wanted = {"colmap": "sparse/0 or sparse", "transforms": "transforms.json or transforms_train.json"}
+    names = " or ".join(wanted.values()) if format == "auto" else wanted[format]
+    raise ValueError(f"{root} is not a capture: it has no {names}; give the folder that contains it.")
+
+
+def _check_once(root: Path, posed: Sequence[PosedImage]) -> None:
+    """Raise ValueError if a photo has two cameras."""
+    first: dict[Path, PosedImage] = {}
+    for item in posed:
+        other = first.setdefault(item.path, item)
+        if not torch.allclose(item.world_to_camera, other.world_to_camera):
+            raise ValueError(
+                f"The cameras of {other.name} and {item.name} of {root} have the same photo {item.path}: correct the "
+                "names, or restore the photo that is missing."
+            )
+
+
+def _check_sight(root: Path, views: Sequence[View], points: Tensor, read_axes: bool) -> None:
+    """Raise ValueError if most cameras see no point."""
+    seen, turned = cameras_that_see(points, [view.camera for view in views])
+    if 2 * seen < len(views):
+        cause = "they are not of the same reconstruction as the points: export both again, or remove the points"
+        raise ValueError(
+            f"Only {seen} of {len(views)} cameras of {root} see any of its points: "
+            f"{TURNED_AXES if read_axes and 2 * turned >= len(views) else cause}."
+        )
+
+
+def _turned(views: Sequence[View], unsure: Sequence[int], points: PointCloud | None) -> bool | None:
+    """Whether photos whose sizes do not tell are to be turned as their EXIF tags say; None if points do not tell."""
+    if points is None or not unsure:
+        return None
+    some = [views[k] for k in unsure]
+    cameras = [view.camera for view in some]
+    return turned_as_points(cameras, lambda k, on: replace(some[k], turned=on).load(), points.points, points.colors)
 
 
 def nearest_to_axes(cameras: Sequence[Camera]) -> Tensor:
@@ -178,6 +273,13 @@ def nearest_to_axes(cameras: Sequence[Camera]) -> Tensor:
     if float(torch.linalg.eigvalsh(matrix)[0]) < 1e-6 * len(cameras):
         return torch.full((3,), float("nan"), dtype=torch.float64)
     return torch.linalg.solve(matrix, (across @ eyes[..., None]).sum(0)[:, 0])
+
+
+def axes_meet_behind(cameras: Sequence[Camera]) -> bool:
+    """Whether the optical axes meet in one point that is behind all cameras."""
+    focus = nearest_to_axes(cameras)
+    local = [camera.world_to_camera[:3].double() @ torch.cat([focus, focus.new_ones(1)]) for camera in cameras]
+    return all(bool(place[:2].norm() < -0.1 * place[2]) for place in local)
 
 
 def common_focus(cameras: Sequence[Camera]) -> Tensor | None:
@@ -220,39 +322,43 @@ def _splits(root: Path, posed: list[PosedImage], test_every: int) -> list[str]:
     return splits
 
 
-def _view(root: Path, item: PosedImage, split: str, downscale: int) -> View:
-    """Check the size of an image on disk against its lens, and make the downscaled view."""
+def _view(root: Path, item: PosedImage, split: str, downscale: int) -> tuple[View, bool]:
+    """Check the size of an image on disk against its lens, and make the downscaled view.
+
+    Returns:
+        The view, and whether it is known if its pixels have to be turned.
+    """
     path, lens, factor = item.path, item.lens, downscale
     small = _made_smaller(root, path, downscale) if downscale > 1 else None
+    width, height = (lens.width, lens.height) if small is None else (lens.width / downscale, lens.height / downscale)
+    size, orientation = image_head(small or path)
+    turned = is_turned(size, orientation, (width, height))
+    size = turned_size(size, orientation) if turned else size
     if small is not None:
-        width, height = image_size(small)
-        if max(abs(width - lens.width / downscale), abs(height - lens.height / downscale)) >= 1:
+        if max(abs(size[0] - width), abs(size[1] - height)) >= 1:
             raise ValueError(
-                f"The image {small} has {width} x {height} pixels, but {downscale} times smaller than its camera is "
-                f"{lens.width / downscale:g} x {lens.height / downscale:g}: remove the folder, or make it again."
+                f"The image {small} has {size[0]} x {size[1]} pixels, but {downscale} times smaller than its camera is "
+                f"{width:g} x {height:g}: remove the folder, or make it again."
             )
-        path, lens, factor = small, lens.resized(width, height), 1
+        path, lens, factor = small, lens.resized(*size), 1
     else:
-        check_image_size(path, image_size(path), lens)
+        check_image_size(path, size, lens)
     try:
         seen = lens.undistorted().averaged(factor)
     except ValueError as error:
         raise ValueError(f"The image {path} of {root}: {error}") from error
+    if item.mask is not None:
+        image_head(item.mask)
     world_to_camera = item.world_to_camera.float()
     camera = Camera(world_to_camera, seen.intrinsics().float(), seen.width, seen.height)
-    return View(item.name, path, camera, split, lens, factor)
+    return View(item.name, path, camera, split, lens, factor, bool(turned), item.mask), turned is not None
 
 
 def _made_smaller(root: Path, path: Path, downscale: int) -> Path | None:
     """The same image in the folder ``<folder>_<downscale>`` beside the folder of the images, or None."""
     top = root if root.is_dir() else root.parent
-    try:
-        parts = path.relative_to(top).parts
-    except ValueError:
-        return None
-    if len(parts) < 2:
-        return None
-    return find_image(top / f"{parts[0]}_{downscale}", "/".join(parts[1:]))
+    parts = path.relative_to(top).parts if path.is_relative_to(top) else ()
+    return Photos(top / f"{parts[0]}_{downscale}").find("/".join(parts[1:])) if len(parts) > 1 else None
 
 
 _BEST = math.radians(5.0)

@@ -11,7 +11,8 @@ import torch
 from torch import Tensor
 
 from gaussian_swaying._checks import check_literals, check_positive
-from gaussian_swaying.captures.colmap import colmap_model, read_colmap_views
+from gaussian_swaying.captures.colmap import colmap_models, read_colmap_views
+from gaussian_swaying.captures.photos import clean_name
 from gaussian_swaying.captures.transforms import transforms_files
 from gaussian_swaying.geometry.rotations import quat_to_rotation, rotation_to_quat
 from gaussian_swaying.rendering.cameras.camera import Camera, resized_intrinsics
@@ -27,7 +28,7 @@ def read_views(
 
     Args:
         path: A transforms.json, a folder with one (or with ``transforms_train.json`` ...), a COLMAP model, or a folder
-            with ``sparse/0`` or ``sparse``, which is preferred.
+            with one, such as ``sparse/0``, which is preferred; of several that with most images is read.
         width: Width of the images to render [pixels]; by default that of the capture.
         height: Height of the images to render [pixels]; by default that of the capture.
         near: Near plane [scene units]; a hundredth of the distance or of the object's size when None.
@@ -37,10 +38,10 @@ def read_views(
         the same focal lengths.
     """
     root = Path(path)
-    model = root if any((root / f"images{end}").is_file() for end in (".bin", ".txt")) else colmap_model(root)
+    models = colmap_models(root)
     views: list[tuple[str, Camera]] = []
-    if model is not None:
-        for name, lens, world_to_camera in read_colmap_views(model):
+    if models:
+        for name, lens, world_to_camera in read_colmap_views(models[0][0]):
             numbers = (lens.width, lens.height, lens.fx, lens.fy, lens.cx, lens.cy)
             intrinsics, columns, rows = resized_intrinsics(*numbers, width, height)
             camera = Camera(world_to_camera, intrinsics, columns, rows, near)
@@ -49,7 +50,7 @@ def read_views(
         for file, _ in transforms_files(root):
             data = load_transforms(file)
             for index, frame in enumerate(data["frames"]):
-                name = str(frame.get("file_path", index)).replace("\\", "/").removeprefix("./")
+                name = clean_name(str(frame.get("file_path", index)))
                 views.append((name, camera_of_transforms(file, data, index, width, height, near)))
     if not views:
         raise ValueError(

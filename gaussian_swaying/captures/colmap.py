@@ -12,9 +12,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from gaussian_swaying._inputs import check_regular
-from gaussian_swaying.captures.images import PosedImage
+from gaussian_swaying._inputs import check_regular, decoded
 from gaussian_swaying.captures.lens import NO_DISTORTION, Lens
+from gaussian_swaying.captures.photos import clean_name
+from gaussian_swaying.captures.point_cloud import PointCloud
 from gaussian_swaying.geometry.rotations import quat_to_rotation
 
 # name and number of parameters of each camera model, in the order of COLMAP's numbers
@@ -35,42 +36,45 @@ _MODELS = (
 _READABLE = ("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV")
 
 
-def colmap_model(path: Path) -> Path | None:
-    """The folder with the sparse model of a capture: ``sparse/0``, then ``sparse``; None if there is none."""
-    for folder in (path / "sparse" / "0", path / "sparse"):
-        if any((folder / f"images{suffix}").is_file() for suffix in (".bin", ".txt")):
-            return folder
-    return None
+def colmap_models(path: Path) -> list[tuple[Path, int]]:
+    """The folders below a capture with sparse models, and the number of images of each; that with most comes first.
+
+    Models are in ``sparse`` or ``colmap/sparse``, in numbered folders there, or in the folder itself.
+
+    Args:
+        path: Folder of the capture, or of a model.
+    """
+    folders = []
+    for top in (path / "sparse", path / "colmap" / "sparse"):
+        folders += [*sorted(top.glob("*"), key=lambda folder: (len(folder.name), folder.name)), top]
+    found = [folder for folder in folders if _has(folder, "images")]
+    if _has(path, "images") and _has(path, "cameras"):
+        found.append(path)
+    counted = [(folder, len(_read(folder, "images", _binary_images, _text_images))) for folder in found]
+    return sorted(counted, key=lambda item: -item[1])
 
 
-def read_colmap(model: Path, images: Path) -> tuple[list[PosedImage], list[str], tuple[Tensor, Tensor] | None]:
-    """Read a sparse model: ``cameras``, ``images`` and optionally ``points3D``, each as .bin or else .txt.
+def _has(folder: Path, name: str) -> bool:
+    return any((folder / f"{name}{suffix}").is_file() for suffix in (".bin", ".txt"))
+
+
+def read_colmap_points(model: Path) -> PointCloud | None:
+    """Read ``points3D`` of a model.
 
     Args:
         model: Folder of the model.
-        images: Folder that the names of the images are relative to.
 
     Returns:
-        The images that exist, the names of those that do not, and positions [scene units] and colours in 0 to 1 of
-        the points, each float32 of shape (P, 3), or None.
+        The points; None if there are none.
     """
-    posed: list[PosedImage] = []
-    missing: list[str] = []
-    for name, lens, world_to_camera in read_colmap_views(model):
-        path = images / name
-        if path.is_file():
-            posed.append(PosedImage(name, path, lens, world_to_camera))
-        else:
-            missing.append(name)
-    if not any((model / f"points3D{suffix}").is_file() for suffix in (".bin", ".txt")):
-        return posed, missing, None
+    if not _has(model, "points3D"):
+        return None
     table: np.ndarray = _read(model, "points3D", _binary_points, _text_points)
     if not np.isfinite(table).all():
         raise ValueError(f"The COLMAP model {model} has points3D that are NaN or infinite: export the model again.")
     if len(table) == 0:
-        return posed, missing, None
-    points, colors = torch.from_numpy(table[:, :3]).float(), torch.from_numpy(table[:, 3:]).float() / 255
-    return posed, missing, (points, colors)
+        return None
+    return PointCloud(torch.from_numpy(table[:, :3]).float(), torch.from_numpy(table[:, 3:]).float() / 255)
 
 
 def read_colmap_views(model: Path) -> list[tuple[str, Lens, Tensor]]:
@@ -89,7 +93,7 @@ def read_colmap_views(model: Path) -> list[tuple[str, Lens, Tensor]]:
         where = f"The image {name} of the COLMAP model {model}"
         if camera not in lenses:
             raise ValueError(f"{where} names camera {camera}, which is not in `cameras`: export the model again.")
-        views.append((name, lenses[camera], _pose(where, pose)))
+        views.append((clean_name(name), lenses[camera], _pose(where, pose)))
     return views
 
 
@@ -122,7 +126,7 @@ def _lens(identity: int, model: str, width: int, height: int, values: tuple[floa
     return Lens(fx, fy, cx, cy, width, height, distortion)
 
 
-def _read(model: Path, name: str, binary: Callable[[bytes], Any], text: Callable[[Iterator[list[str]]], Any]) -> Any:
+def _read(model: Path, name: str, binary: Callable[[bytes], Any], text: Callable[[Iterator[str]], Any]) -> Any:
     """Parse one file of the model, or raise an error that names it."""
     file = model / f"{name}.bin"
     if not file.is_file():
@@ -131,8 +135,8 @@ def _read(model: Path, name: str, binary: Callable[[bytes], Any], text: Callable
         check_regular(file, name)
         if file.suffix == ".bin":
             return binary(file.read_bytes())
-        lines = file.read_text(encoding="utf-8").splitlines()
-        return text(line.split() for line in lines if not line.lstrip().startswith("#"))
+        lines = decoded(file.read_bytes()).replace("\r", "\n").split("\n")
+        return text(line for line in lines if line.strip() and not line.lstrip().startswith("#"))
     except OSError as error:
         raise ValueError(
             f"Cannot read {name} of the COLMAP model {model} ({error.strerror}): give cameras, images and points3D, "
@@ -172,18 +176,20 @@ def _binary_cameras(data: bytes) -> dict[int, Lens]:
     for _ in range(source.take("Q")[0]):
         identity, model, width, height = source.take("iiQQ")
         if not 0 <= model < len(_MODELS):
-            raise _UnknownLensError(f"camera {identity} has the unknown model {model}: use one of {_READABLE}")
+            raise _UnknownLensError(
+                f"camera {identity} has the unknown model {model} (only {', '.join(_READABLE)} are supported): run "
+                "`colmap image_undistorter` and give its output"
+            )
         name, count = _MODELS[model]
         result[identity] = _lens(identity, name, width, height, source.take(f"{count}d"))
     return result
 
 
-def _text_cameras(lines: Iterator[list[str]]) -> dict[int, Lens]:
+def _text_cameras(lines: Iterator[str]) -> dict[int, Lens]:
     result = {}
-    for words in lines:
-        if words:
-            values = tuple(float(word) for word in words[4:])
-            result[int(words[0])] = _lens(int(words[0]), words[1], int(words[2]), int(words[3]), values)
+    for words in map(str.split, lines):
+        values = tuple(float(word) for word in words[4:])
+        result[int(words[0])] = _lens(int(words[0]), words[1], int(words[2]), int(words[3]), values)
     return result
 
 
@@ -196,15 +202,27 @@ def _binary_images(data: bytes) -> list[tuple[str, tuple[float, ...], int]]:
     return result
 
 
-def _text_images(lines: Iterator[list[str]]) -> list[tuple[str, tuple[float, ...], int]]:
+def _text_images(lines: Iterator[str]) -> list[tuple[str, tuple[float, ...], int]]:
+    """Lines of images; a second line with points that the image sees may be empty, and then it may be missing."""
     result = []
-    for words in lines:
-        if words:
-            result.append((" ".join(words[9:]), tuple(float(word) for word in words[1:8]), int(words[8])))
+    image = False  # whether the line before was that of an image
+    for line in lines:
+        words = line.split(maxsplit=9)
+        image = not (image and _sees(line))
+        if image:
             if not words[9:]:
                 raise ValueError(f"image {words[0]} has no name")
-            next(lines, None)  # the line of points that it sees, which may be empty
+            result.append((words[9].rstrip(), tuple(float(word) for word in words[1:8]), int(words[8])))
     return result
+
+
+def _sees(line: str) -> bool:
+    """Whether a line has triples of numbers, of which that of an image has only the first ones."""
+    words = line.split()
+    try:
+        return len([float(word) for word in words[:12]]) % 3 == len(words) % 3 == 0
+    except ValueError:
+        return False
 
 
 def _binary_points(data: bytes) -> np.ndarray:
@@ -216,6 +234,6 @@ def _binary_points(data: bytes) -> np.ndarray:
     return np.array(result, dtype=np.float64).reshape(-1, 6)
 
 
-def _text_points(lines: Iterator[list[str]]) -> np.ndarray:
-    rows = [[float(word) for word in words[1:7]] for words in lines if words]
+def _text_points(lines: Iterator[str]) -> np.ndarray:
+    rows = [[float(word) for word in words[1:7]] for words in map(str.split, lines)]
     return np.array(rows, dtype=np.float64).reshape(-1, 6)

@@ -14,8 +14,10 @@ from torch import Tensor
 
 from gaussian_swaying._inputs import check_regular
 from gaussian_swaying.captures.lens import Lens, remap
+from gaussian_swaying.captures.photos import UNREADABLE
 
 _PIXELS = 80_000_000  # plus one for each byte of the file: reading takes about 12 bytes per pixel
+_ORIENTATION = 0x112  # number of the EXIF tag
 _WITH_ALPHA = ("RGBA", "LA", "PA", "P", "La", "RGBa")
 
 
@@ -29,6 +31,7 @@ class PosedImage:
         lens: Its intrinsics and size.
         world_to_camera: Pose with OpenCV axes, float64, shape (4, 4).
         split: ``train``, ``val`` or ``test`` if the files define it, else None.
+        mask: Picture that is white on the object and black where the photo is to be empty, or None.
     """
 
     name: str
@@ -36,15 +39,24 @@ class PosedImage:
     lens: Lens
     world_to_camera: Tensor
     split: str | None = None
+    mask: Path | None = None
 
 
 def image_size(path: str | Path) -> tuple[int, int]:
     """Width and height of an image file [pixels], from its header."""
-    import imageio.v3 as iio
+    return image_head(path)[0]
+
+
+def image_head(path: str | Path) -> tuple[tuple[int, int], int]:
+    """Width and height of an image file [pixels], and its EXIF orientation, 1 to 8; 1 without one."""
+    from PIL import Image
 
     _refuse_pipes(path)
     try:
-        height, width = iio.improps(path, plugin="pillow", index=0).shape[:2]
+        with Image.open(path) as image:
+            width, height = image.size
+            # without such a block at its head, a PNG would be decoded to look for one at its end
+            tags = {} if image.format == "PNG" and "exif" not in image.info else image.getexif()
     except Exception as error:  # the readers of the formats raise many kinds of errors
         raise _unreadable(path, error) from error
     if width * height > _PIXELS + Path(path).stat().st_size:
@@ -52,15 +64,16 @@ def image_size(path: str | Path) -> tuple[int, int]:
             f"The image {path} claims {width:,} x {height:,} pixels, too many for its file size: make it smaller, or "
             "delete it to leave it out."
         )
-    return int(width), int(height)
+    orientation = tags.get(_ORIENTATION, 1)
+    return (width, height), orientation if orientation in range(1, 9) else 1
 
 
-def read_image(path: str | Path) -> Tensor:
+def read_image(path: str | Path, turned: bool = False) -> Tensor:
     """Read an image of 8 or 16 bits, grey or colour, with or without alpha.
 
     Args:
-        path: File in any format that Pillow reads; the first picture of an animation. Rotation tags are ignored, as
-            tools for camera poses do.
+        path: File in any format that Pillow reads; the first picture of an animation.
+        turned: Whether to turn the pixels as the EXIF tag says, as viewers do, and most tools for camera poses do not.
 
     Returns:
         Pixels, dtype uint8, shape (H, W, 3), or (H, W, 4) if the image is not fully opaque.
@@ -82,6 +95,13 @@ def read_image(path: str | Path) -> Tensor:
         pixels = np.repeat((pixels.astype(np.int64) // 257).clip(0, 255).astype(np.uint8)[..., None], 3, axis=-1)
     if pixels.shape[-1] == 4 and bool((pixels[..., 3] == 255).all()):
         pixels = pixels[..., :3]
+    orientation = image_head(path)[1] if turned else 1
+    if orientation >= 5:
+        pixels = pixels.swapaxes(0, 1)
+    if orientation in (2, 3, 6, 7):
+        pixels = pixels[:, ::-1]
+    if orientation in (3, 4, 7, 8):
+        pixels = pixels[::-1]
     return torch.from_numpy(np.array(pixels, dtype=np.uint8))
 
 
@@ -94,11 +114,18 @@ def _refuse_pipes(path: str | Path) -> None:
 def _unreadable(path: str | Path, error: Exception) -> ValueError:
     if not Path(path).is_file():
         return ValueError(f"The image {path} does not exist: restore it, or remove its entry.")
+    if Path(path).suffix.lower() in UNREADABLE:
+        return ValueError(
+            f"The image {path} is in a format that cannot be read here: convert all such photos to JPEG or PNG beside "
+            "it; the camera file may keep their names."
+        )
     first = str(error).strip().split("\n")[0] or type(error).__name__
     return ValueError(f"The image {path} cannot be read ({first}): copy it again, or delete it to leave it out.")
 
 
-def load_image(path: str | Path, lens: Lens, downscale: int = 1) -> Tensor:
+def load_image(
+    path: str | Path, lens: Lens, downscale: int = 1, turned: bool = False, mask: Path | None = None
+) -> Tensor:
     """Read an image, undistort it and average it down.
 
     Colours are premultiplied with alpha first, so that transparent pixels do not bleed into others.
@@ -107,16 +134,21 @@ def load_image(path: str | Path, lens: Lens, downscale: int = 1) -> Tensor:
         path: The file.
         lens: Its lens.
         downscale: Each pixel of the result is the mean of a square of this many pixels on a side.
+        turned: Whether to turn the pixels as the EXIF tag says.
+        mask: Picture of the same proportions that is multiplied with the alpha.
 
     Returns:
         Pixels, dtype uint8, shape (H, W, 3), or (H, W, 4) with colours that are multiplied with alpha. Their lens is
         ``lens.undistorted().averaged(downscale)``.
     """
-    pixels = read_image(path)
+    pixels = read_image(path, turned)
     check_image_size(path, (pixels.shape[1], pixels.shape[0]), lens)
-    if downscale == 1 and not lens.distorted and pixels.shape[-1] == 3:
+    if downscale == 1 and not lens.distorted and pixels.shape[-1] == 3 and mask is None:
         return pixels
     image = rearrange(pixels, "h w c -> c h w").float()
+    if mask is not None:
+        cover = read_mask(mask, path, lens)[None].float()
+        image = torch.cat([image[:3], cover if len(image) == 3 else cover * image[3:] / 255])
     if len(image) == 4:
         image[:3] *= image[3:] / 255
     if lens.distorted:
@@ -124,6 +156,22 @@ def load_image(path: str | Path, lens: Lens, downscale: int = 1) -> Tensor:
     if downscale > 1:
         image = average_down(image, downscale)
     return _pixels_of(image)
+
+
+def read_mask(mask: Path, path: str | Path, lens: Lens) -> Tensor:
+    """Read the mask of a photo, in the size of its lens: dtype uint8, shape (H, W)."""
+    pixels = read_image(mask).float()
+    found = pixels[..., 0] if pixels.shape[-1] == 3 else pixels[..., 0] * pixels[..., 3] / 255
+    if float(found.max()) == 1:  # numbers of labels
+        found = 255 * found
+    height, width = found.shape
+    if abs(width * lens.height - height * lens.width) > max(width, height, lens.width, lens.height):
+        raise ValueError(
+            f"The mask {mask} has {width} x {height} pixels, but its photo {path} has {lens.width} x {lens.height}: "
+            "make it in the proportions of the photo."
+        )
+    size = (lens.height, lens.width)
+    return functional.interpolate(found[None, None], size, mode="area")[0, 0].round().to(torch.uint8)
 
 
 def _pixels_of(image: Tensor) -> Tensor:

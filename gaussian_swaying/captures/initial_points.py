@@ -11,7 +11,8 @@ from einops import rearrange
 from torch import Tensor
 
 from gaussian_swaying._checks import check_positive, check_vector, check_whole
-from gaussian_swaying.captures.capture import Capture, common_focus, view_reach
+from gaussian_swaying.captures.agreement import TURNED_AXES, places_in_picture
+from gaussian_swaying.captures.capture import Capture, axes_meet_behind, common_focus, view_reach
 from gaussian_swaying.captures.point_cloud import PointCloud, read_obj_mesh, read_ply_points, sample_mesh
 
 _ATTEMPTS = 100
@@ -135,14 +136,10 @@ def consistent_points(capture: Capture, count: int, seed: int = 0, half_side: fl
         pixels = rearrange(view.load()[..., :3], "h w c -> 1 c h w").float() / 255
         height = max(round(_WIDTH * pixels.shape[2] / pixels.shape[3]), 1)
         photo = torch.nn.functional.interpolate(pixels, (height, _WIDTH), mode="area")[0]
-        camera = view.camera
-        local = points @ camera.world_to_camera[:3, :3].T + camera.world_to_camera[:3, 3]
-        depth = local[:, 2]
-        scale = local[:, :2] / depth.clamp_min(1e-6)[:, None]
-        column = ((scale[:, 0] * camera.intrinsics[0, 0] + camera.intrinsics[0, 2]) * (_WIDTH / camera.width)).floor()
-        row = ((scale[:, 1] * camera.intrinsics[1, 1] + camera.intrinsics[1, 2]) * (height / camera.height)).floor()
-        inside = (depth > camera.near) & (column >= 0) & (column < _WIDTH) & (row >= 0) & (row < height)
-        color = photo[:, row[inside].long(), column[inside].long()].T
+        place, inside = places_in_picture(points, view.camera)
+        size = place.new_tensor([_WIDTH / view.camera.width, height / view.camera.height])
+        column, row = (place[inside] * size).long().unbind(-1)
+        color = photo[:, row.clamp_max(height - 1), column.clamp_max(_WIDTH - 1)].T
         seen[inside] += 1
         total[inside] += color
         squares[inside] += color.square().sum(-1)
@@ -153,20 +150,28 @@ def consistent_points(capture: Capture, count: int, seed: int = 0, half_side: fl
     chosen = torch.cat([begin + part.topk(number, largest=False).indices for part, begin, number in parts])
     missing = int(spread[chosen].isinf().sum())
     if missing:
+        photos = len(capture.split("train"))
+        cause = "there are too few photos (`test_every`)"
+        if photos >= 3:
+            cause = "the cameras overlap too little, or are not those of the photos"
         raise ValueError(
-            f"Only {count - missing} of {count} consistent points are in three photos or more: set a smaller "
-            "`point_count`, or the initial points to random."
+            f"Only {count - missing} of {count} consistent points were found: of the places tried, "
+            f"{float((seen < 3).float().mean()):.0%} are in fewer than three of the {photos} training photos, and "
+            f"{float((~clear).float().mean()):.0%} close to a camera: {cause}. Correct this, or set "
+            "a smaller `point_count` or the initial points to random."
         )
     return PointCloud(points[chosen], mean[chosen].clamp(0.0, 1.0))
 
 
 def _focus(capture: Capture) -> Tensor:
     """The point nearest to all optical axes, or an error if the cameras do not look at it."""
-    focus = common_focus([view.camera for view in capture.split("train")])
+    cameras = [view.camera for view in capture.split("train")]
+    focus = common_focus(cameras)
     if focus is None:
+        behind = f", but away from one ({TURNED_AXES})" if axes_meet_behind(cameras) else ""
         raise ValueError(
-            f"The cameras of {capture.path} do not look at a common point, so no random initial points can be placed: "
-            "set the initial points to a .ply or .obj file."
+            f"The cameras of {capture.path} look at no common point{behind}, so no random initial points can be placed:"
+            " set the initial points to a .ply or .obj file."
         )
     return focus
 

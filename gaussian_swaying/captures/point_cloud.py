@@ -107,7 +107,7 @@ def read_obj_mesh(path: Path) -> tuple[PointCloud, Tensor]:
         The vertices, grey if they have no colours, and triangles (T, 3) as indices.
     """
     try:
-        text = check_regular(path, "the mesh").read_text(encoding="utf-8", errors="replace")
+        text = check_regular(path, "the mesh").read_text(encoding="utf-8-sig", errors="replace")
         vertices, polygons = parse_obj(text)
         points = np.array([row[:3] for row in vertices], dtype=np.float32).reshape(-1, 3)
     except OSError as error:

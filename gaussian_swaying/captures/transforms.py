@@ -9,9 +9,9 @@ import torch
 
 from gaussian_swaying.captures.images import PosedImage, image_size
 from gaussian_swaying.captures.lens import Lens
+from gaussian_swaying.captures.photos import Photos, clean_name
 from gaussian_swaying.rendering.cameras.transforms_json import load_transforms, read_intrinsics, read_number, read_pose
 
-_SUFFIXES = (".png", ".jpg", ".jpeg", ".PNG", ".JPG", ".JPEG")
 _SPLITS = ("train", "val", "test")
 _PINHOLE_MODELS = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "PERSPECTIVE")
 _OTHER_COEFFICIENTS = ("k4", "k5", "k6", "s1", "s2", "s3", "s4")
@@ -38,8 +38,8 @@ def read_transforms(path: Path) -> tuple[list[PosedImage], list[str], Path | Non
     Intrinsics come from the frame or from the top of the file, as in
     :func:`~gaussian_swaying.rendering.cameras.transforms_json.camera_from_transforms`; if ``w`` and ``h`` are missing,
     the size of the image is used. ``file_path`` may have no extension. Distortion is ``k1``, ``k2``, ``k3``, ``p1`` and
-    ``p2``. The splits come from one file per split, or from the lists ``train_filenames``, ``val_filenames`` and
-    ``test_filenames``.
+    ``p2``. ``mask_path`` names the mask of an image. The splits come from one file per split, or from the lists
+    ``train_filenames``, ``val_filenames`` and ``test_filenames``.
 
     Args:
         path: Folder or file, see :func:`transforms_files`.
@@ -52,20 +52,22 @@ def read_transforms(path: Path) -> tuple[list[PosedImage], list[str], Path | Non
     points: Path | None = None
     for file, split in transforms_files(path):
         data, where = load_transforms(file), f"`{file}`"
-        listed = _listed_splits(where, data)
+        listed, photos = _listed_splits(where, data), Photos(file.parent)
         for index, frame in enumerate(data["frames"]):
             if "video_path" in frame:  # a film, see fitting.videos
                 continue
             name = _file_path(where, index, frame)
-            pose = read_pose(where, index, frame)
+            pose = read_pose(where, data, index)
             check_rigid(f"The field `frames[{index}].transform_matrix` of the camera file {where}", pose)
-            image = find_image(file.parent, name)
+            image = photos.find(name)
             if image is None:
                 missing.append(name)
                 continue
             lens = lens_of_transforms(where, data, frame, image_size(image))
             own = split if listed is None else listed.get(name)
-            images.append(PosedImage(name, image, lens, torch.linalg.inv(pose), own))
+            mask = None if frame.get("mask_path") is None else _file_path(where, index, frame, "mask_path")
+            cover = None if mask is None else photos.find(mask) or file.parent / mask
+            images.append(PosedImage(name, image, lens, torch.linalg.inv(pose), own, cover))
         for candidate in (data.get("ply_file_path"), "points3d.ply"):
             if points is None and isinstance(candidate, str) and (file.parent / candidate).is_file():
                 points = file.parent / candidate
@@ -98,25 +100,13 @@ def check_rigid(what: str, pose: torch.Tensor, tolerance: float = 1e-3) -> None:
         raise ValueError(f"{what} is a reflection: make the axes of the camera right-handed and export it again.")
 
 
-def find_image(folder: Path, name: str) -> Path | None:
-    """The image for a file path with or without extension; None if there is none."""
-    base = folder / name
-    if base.is_file():
-        return base
-    for stem in (name, str(Path(name).with_suffix(""))) if Path(name).suffix.lower() in _SUFFIXES else (name,):
-        for suffix in _SUFFIXES:
-            if (folder / f"{stem}{suffix}").is_file():
-                return folder / f"{stem}{suffix}"
-    return None
-
-
-def _file_path(where: str, index: int, frame: dict[str, Any]) -> str:
-    value = frame.get("file_path")
+def _file_path(where: str, index: int, frame: dict[str, Any], field: str = "file_path") -> str:
+    value = frame.get(field)
     if not isinstance(value, str) or not value:
         raise ValueError(
-            f"The field `frames[{index}].file_path` of the camera file {where} is {value!r}: set it to an image."
+            f"The field `frames[{index}].{field}` of the camera file {where} is {value!r}: set it to an image."
         )
-    return value.replace("\\", "/").removeprefix("./")
+    return clean_name(value)
 
 
 def _listed_splits(where: str, data: dict[str, Any]) -> dict[str, str] | None:
@@ -128,7 +118,7 @@ def _listed_splits(where: str, data: dict[str, Any]) -> dict[str, str] | None:
             continue
         if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
             raise ValueError(f"The field `{split}_filenames` of the camera file {where} must be a list of file paths.")
-        result |= {name.replace("\\", "/").removeprefix("./"): split for name in names}
+        result |= {clean_name(name): split for name in names}
     return result or None
 
 

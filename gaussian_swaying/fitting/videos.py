@@ -19,7 +19,8 @@ import torch
 from torch import Tensor
 
 from gaussian_swaying._inputs import check_regular
-from gaussian_swaying.captures.images import PosedImage, load_image, read_image, remapped
+from gaussian_swaying.captures.images import PosedImage, image_head, load_image, read_mask, remapped
+from gaussian_swaying.captures.photos import clean_name, is_turned
 from gaussian_swaying.captures.transforms import check_rigid, lens_of_transforms, read_transforms, transforms_files
 from gaussian_swaying.rendering.cameras.camera import Camera
 from gaussian_swaying.rendering.cameras.transforms_json import load_transforms, read_number, read_pose
@@ -208,16 +209,14 @@ def _read(path: Path) -> dict[str, list[_Part]]:
             continue
         posed = {item.name: item for item in read_transforms(file)[0]}
         for k, frame in enumerate(frames):
-            name = str(frame.get("file_path", "")).replace("\\", "/").removeprefix("./")
+            name = clean_name(str(frame.get("file_path", "")))
             if "video_path" in frame:
                 continue
             time = read_number(where, frame, "time")
             if time is None:
                 raise ValueError(f"The field `frames[{k}].time` of the camera file {where} is missing: add it [s].")
-            mask = frame.get("mask_path")
-            cover = file.parent / mask if isinstance(mask, str) else None
             if name in posed:
-                part = _Part(time, partial(_picture, posed[name], cover, time))
+                part = _Part(time, partial(_picture, posed[name], time))
             else:
                 part = _Part(time, lambda room: [], lost=file.parent / name)
             parts.setdefault(_camera_name(where, k, frame), []).append(part)
@@ -235,16 +234,15 @@ def _camera_name(where: str, index: int, frame: dict[str, Any]) -> str:
     return name
 
 
-def _picture(item: PosedImage, cover: Path | None, time: float, room: _Room) -> list[_Shot]:
+def _picture(item: PosedImage, time: float, room: _Room) -> list[_Shot]:
     room.take(item.path, item.lens.width, item.lens.height)
     lens = item.lens.undistorted()
     camera = Camera(item.world_to_camera.float(), lens.intrinsics().float(), lens.width, lens.height)
-    pixels = load_image(item.path, item.lens)
+    turned = is_turned(*image_head(item.path), (item.lens.width, item.lens.height))
+    pixels = load_image(item.path, item.lens, turned=bool(turned))
     mask = pixels[..., 3].clone() if pixels.shape[-1] == 4 else None
-    if cover is not None:
-        found = read_image(cover)[..., :1]
-        if found.shape[:2] != (item.lens.height, item.lens.width):
-            raise ValueError(f"The mask {cover} is not as large as its frame {item.path}.")
+    if item.mask is not None:
+        found = read_mask(item.mask, item.path, item.lens)[..., None]
         mask = (remapped(found, item.lens) if item.lens.distorted else found)[..., 0].clone()
     return [_Shot(time, camera, pixels[..., :3].contiguous(), mask)]
 
@@ -277,7 +275,7 @@ def _film(file: Path, where: str, data: dict[str, Any], index: int, begin: float
         if (lens.width, lens.height) != size:
             raise ValueError(f"The video {path} is not {lens.width} x {lens.height} as its camera in {where} says.")
         seen = lens.undistorted()
-        pose = read_pose(where, index, entry)
+        pose = read_pose(where, data, index)
         check_rigid(f"The field `frames[{index}].transform_matrix` of the camera file {where}", pose)
         camera = Camera(torch.linalg.inv(pose).float(), seen.intrinsics().float(), seen.width, seen.height)
         rate = fps or head["fps"]

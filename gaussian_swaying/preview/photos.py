@@ -11,6 +11,7 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
+from gaussian_swaying.captures.agreement import places_in_picture
 from gaussian_swaying.captures.capture import common_focus, view_reach
 from gaussian_swaying.captures.capture_camera import read_views
 from gaussian_swaying.geometry.regions import Cylinder
@@ -160,15 +161,7 @@ def cameras_up(cameras: Sequence[Camera]) -> tuple[tuple[float, ...], str, str]:
 
 def seen_share(points: Tensor, cameras: Sequence[Camera]) -> Tensor:
     """Share of the pictures that contain each point (N, 3), ignoring occlusion; shape (N,)."""
-    count = torch.zeros(len(points))
-    for camera in cameras:
-        view, intrinsics = camera.world_to_camera.cpu().float(), camera.intrinsics.cpu().float()
-        local = points.float() @ view[:3, :3].T + view[:3, 3]
-        pixel = local @ intrinsics.T
-        place = pixel[:, :2] / local[:, 2:].clamp(min=1e-9)
-        size = torch.tensor([camera.width, camera.height])
-        count += (local[:, 2] > 0) & (place >= 0).all(-1) & (place < size).all(-1)
-    return count / len(cameras)
+    return torch.stack([places_in_picture(points.float(), c)[1] for c in cameras]).float().mean(0)
 
 
 def looked_at(points: Tensor, view: CapturedFrom) -> Tensor:

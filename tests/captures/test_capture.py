@@ -2,17 +2,20 @@
 
 import json
 import math
-import warnings
+from contextlib import nullcontext
 
 import imageio.v3 as iio
 import numpy as np
 import pytest
 import torch
+from PIL import Image
 from plyfile import PlyData, PlyElement
 from small_captures import POINTS, arc, picture, write_colmap, write_transforms
 from torch.testing import assert_close
 
 from gaussian_swaying.captures.capture import nearest_to_axes, read_capture
+from gaussian_swaying.captures.capture_camera import read_views
+from gaussian_swaying.captures.initial_points import initial_points
 from gaussian_swaying.rendering.cameras.camera import look_at_camera
 
 
@@ -24,6 +27,12 @@ def _same_camera(found, expected, atol=1e-6):
     assert_close(found.world_to_camera, expected.world_to_camera.float(), rtol=0, atol=atol)
     assert_close(found.intrinsics, expected.intrinsics.float(), rtol=1e-6, atol=1e-5)
     assert (found.width, found.height) == (expected.width, expected.height)
+
+
+def write_points(path, places):
+    dtype = [(n, "<f4") for n in "xyz"] + [(n, "u1") for n in ("red", "green", "blue")]
+    rows = np.array([(*place, 255, 0, 51) for place in places], dtype=dtype)
+    PlyData([PlyElement.describe(rows, "vertex")]).write(str(path))
 
 
 @pytest.fixture
@@ -92,19 +101,15 @@ def test_frames_without_an_image_are_counted_once(tmp_path, written):
     written(6)
     for index in (1, 4):
         (tmp_path / f"images/{index:03d}.png").unlink()
-    with warnings.catch_warnings(record=True) as caught:
-        warnings.simplefilter("always")
+    message = r"left out 2 of 6 cameras that have no photo on disk, the first of them that of images/001\.png\."
+    with pytest.warns(UserWarning, match=message) as caught:
         capture = read_capture(tmp_path)
     assert len(caught) == 1
-    assert "left out 2 of 6 frames that have no image, the first of them images/001.png" in str(caught[0].message)
     assert [view.name[-7:-4] for view in capture.views] == ["000", "002", "003", "005"]
-
-
-def test_an_image_with_another_extension_is_found(tmp_path, written):
-    written(2)
-    data = (tmp_path / "transforms.json").read_text().replace(".png", ".jpg").replace("images/", "images\\\\")
-    (tmp_path / "transforms.json").write_text(data)
-    assert [view.image_path.name for view in read_capture(tmp_path, test_every=0).views] == ["000.png", "001.png"]
+    assert (
+        "4 of 4 photos have a camera in transforms.json; 2 cameras without a photo; no points; no masks"
+        in capture.found
+    )
 
 
 def test_lists_of_file_names_are_the_split(tmp_path):
@@ -127,14 +132,10 @@ def test_distortion_is_taken_out(tmp_path, written):
 
 def test_points_of_a_transforms_capture(tmp_path, written):
     written()
-    rows = np.array([(1, 2, 3, 255, 0, 51)], dtype=[(n, "<f4") for n in "xyz"] + [(n, "u1") for n in _RGB])
-    PlyData([PlyElement.describe(rows, "vertex")]).write(str(tmp_path / "points3d.ply"))
+    write_points(tmp_path / "points3d.ply", [(0, 0.125, 0.25)])
     capture = read_capture(tmp_path)
-    assert capture.points.tolist() == [[1, 2, 3]]
+    assert capture.points.tolist() == [[0, 0.125, 0.25]]
     assert capture.colors[0].tolist() == pytest.approx([1.0, 0.0, 0.2])
-
-
-_RGB = ("red", "green", "blue")
 
 
 # ---- COLMAP
@@ -191,7 +192,153 @@ def test_colmap_comes_before_transforms_unless_told(tmp_path):
     write_colmap(tmp_path, poses, ["000.png", "001.png", "002.png"])
     write_transforms(tmp_path, poses[:2], _names(2))
     assert len(read_capture(tmp_path).views) == 3
-    assert len(read_capture(tmp_path, "transforms", test_every=0).views) == 2
+    with pytest.warns(UserWarning, match=r"left out 1 of 3 photos.*no camera in transforms\.json.*002\.png"):
+        assert len(read_capture(tmp_path, "transforms", test_every=0).views) == 2
+
+
+@pytest.mark.parametrize(
+    ("models", "read", "found"),
+    [
+        ({"sparse/0": 2, "sparse/1": 6}, 6, "COLMAP model sparse/1 with 6 images (the COLMAP model sparse/0 has 2)"),
+        ({"sparse/2": 3, "sparse/10": 3}, 3, "3 of 6 photos have a camera in the COLMAP model sparse/2 with 3"),
+        ({"sparse": 2}, 2, "2 of 6 photos have a camera in the COLMAP model sparse;"),
+        ({"colmap/sparse/0": 6}, 6, "6 of 6 photos have a camera in the COLMAP model colmap/sparse/0;"),
+        ({".": 6}, 6, "in the COLMAP model .; no cameras without a photo; 3 points; no masks."),
+    ],
+)
+def test_the_model_with_most_images_is_read(tmp_path, models, read, found):
+    names = _names(6)
+    for sparse, count in models.items():
+        write_colmap(tmp_path, arc(count), names[:count], sparse=sparse, images=False)
+    write_transforms(tmp_path, arc(6), names)
+    (tmp_path / "images/000_depth_1.png").write_bytes(b"made of 000.png")
+    with pytest.warns(UserWarning, match=f"left out {6 - read} of 6 photos") if read < 6 else nullcontext():
+        capture = read_capture(tmp_path, test_every=0)
+    assert len(capture.views) == len(read_views(tmp_path)) == read
+    assert found in capture.found
+
+
+def test_images_without_their_second_lines(tmp_path):
+    """Lines of points that were empty may be missing; a name may consist of numbers."""
+    names = ["1", "2 3.5 4.png", "7  8.png", "9"]
+    write_colmap(tmp_path, arc(4), [f"{name.removesuffix('.png')}.png" for name in names], binary=False)
+    file = tmp_path / "sparse/0/images.txt"
+    lines = [line.replace(" 1.png", " 1").replace(" 9.png", " 9") for line in file.read_text().split("\n") if line]
+    for kept in (lines, [line for line in lines if not line.startswith("1.0")]):
+        file.write_text("\r\n".join(kept))
+        assert [view.name for view in read_capture(tmp_path, test_every=0).views] == sorted(names)
+
+
+@pytest.mark.parametrize("encoding", ["utf-8-sig", "utf-16"])
+def test_byte_order_marks(tmp_path, encoding, written):
+    write_colmap(tmp_path, arc(3), _names(3), binary=False, images=False)
+    written()
+    for file in (*(tmp_path / "sparse/0").glob("*.txt"), tmp_path / "transforms.json"):
+        file.write_bytes(file.read_text().encode(encoding))
+    for kind in ("colmap", "transforms"):
+        assert len(read_capture(tmp_path, kind).views) == 3
+
+
+# ---- turns and masks
+
+
+def _turned(index, orientation, size):
+    """A picture that has to be turned as its tag says."""
+    image, tags = Image.fromarray(picture(index, *size)), Image.Exif()
+    tags[0x112] = orientation
+    back = {3: Image.ROTATE_180, 5: Image.TRANSPOSE, 6: Image.ROTATE_90, 8: Image.ROTATE_270}
+    return image.transpose(back[orientation]), tags
+
+
+@pytest.mark.parametrize("told", [True, False], ids=["turned cameras", "stored cameras"])
+@pytest.mark.parametrize(
+    ("orientation", "size"), [(6, (20, 16)), (8, (20, 16)), (6, (18, 18)), (3, (20, 16)), (5, (18, 18))]
+)
+def test_photos_are_turned_as_their_cameras_are(tmp_path, orientation, size, told):
+    """Sizes tell, or else the colours of points, or else a warning says that nothing does."""
+    names, files = ["0.png", "1.png", "2.png"], []
+    for index, name in enumerate(names):
+        (tmp_path / "images").mkdir(exist_ok=True)
+        image, tags = _turned(index, orientation, size)
+        image.save(tmp_path / "images" / name, exif=tags)
+        files.append(picture(index, *size) if told else np.asarray(image))
+    poses = arc(3, *files[0].shape[1::-1])
+    points = []
+    for pose, pixels in zip(poses, files, strict=True):
+        for row, column in ((2, 3), (4, 12), (13, 5)):
+            ray = torch.tensor([column + 0.5, row + 0.5, 1.0], dtype=torch.float64) @ pose.intrinsics.inverse().T
+            place = pose.world_to_camera[:3, :3].T @ (0.05 * ray - pose.world_to_camera[:3, 3])
+            points.append((place.tolist(), pixels[row, column].tolist()))
+    write_colmap(tmp_path, poses, names, points=points, images=False)
+    views = read_capture(tmp_path, test_every=0).views
+    assert [view.turned for view in views] == [told] * 3
+    assert all(
+        torch.equal(view.load(), torch.from_numpy(pixels.copy())) for view, pixels in zip(views, files, strict=True)
+    )
+    (tmp_path / "sparse/0/points3D.bin").unlink()
+    sure = size[0] != size[1] and orientation >= 5
+    with nullcontext() if sure else pytest.warns(UserWarning, match="3 photos have an EXIF tag.*remove the tag"):
+        views = read_capture(tmp_path, test_every=0).views
+    assert [view.turned for view in views] == [told and sure] * 3
+
+
+@pytest.mark.parametrize("white", [255, 1])
+def test_masks_are_alpha(tmp_path, white, written):
+    written()
+    mask = np.zeros((16, 20), dtype=np.uint8)
+    mask[:, :10] = white
+    (tmp_path / "masks").mkdir()
+    Image.fromarray(mask).save(tmp_path / "masks/all.png")
+    with pytest.warns(UserWarning, match="not used are the masks in .*masks: name them.*`mask_path`"):
+        read_capture(tmp_path)
+    _edit(tmp_path, lambda d: [frame.update(mask_path=".\\masks\\ALL.jpg") for frame in d["frames"]])
+    capture = read_capture(tmp_path)
+    assert "3 masks, in whose black parts nothing is to be" in capture.found
+    loaded = capture.views[1].load()
+    assert torch.equal(loaded[:, :10, :3], torch.from_numpy(picture(1))[:, :10])
+    assert loaded[:, :10, 3].unique().tolist() == [255]
+    assert loaded[:, 10:].unique().tolist() == [0]
+    assert read_capture(tmp_path, downscale=2).views[1].load().shape == (8, 10, 4)
+    Image.fromarray(mask[:8]).save(tmp_path / "masks/all.png")
+    with pytest.raises(ValueError, match=r"mask .*all\.png has 20 x 8 pixels.*proportions of the photo"):
+        capture.views[1].load()
+    (tmp_path / "masks/all.png").unlink()
+    with pytest.raises(ValueError, match=r"masks/ALL\.jpg does not exist"):
+        read_capture(tmp_path)
+
+
+# ---- what does not belong together
+
+
+def _opencv(data):
+    for frame in data["frames"]:
+        frame["transform_matrix"] = [[row[0], -row[1], -row[2], row[3]] for row in frame["transform_matrix"]]
+
+
+def test_axes_of_opencv(tmp_path, written):
+    written()
+    expected = [view.camera.world_to_camera for view in read_capture(tmp_path).views]
+    _edit(tmp_path, _opencv)
+    with pytest.warns(UserWarning, match="optical axes meet behind.*set `axes` of the transforms.json to opencv"):
+        capture = read_capture(tmp_path)
+    with pytest.raises(ValueError, match=r"look at no common point.*set `axes`"):
+        initial_points(capture)
+    write_points(tmp_path / "points3d.ply", [(0, 0.125, 0.25)])
+    with pytest.raises(ValueError, match=r"Only 0 of 3 cameras .* see any of its points: y and z.*set `axes`"):
+        read_capture(tmp_path)
+    _edit(tmp_path, lambda data: data.update(axes="opencv"))
+    for view, (_, other), pose in zip(read_capture(tmp_path).views, read_views(tmp_path), expected, strict=True):
+        assert_close(view.camera.world_to_camera, pose)
+        assert_close(other.world_to_camera, pose)
+    _edit(tmp_path, lambda data: data.update(axes="OpenCV"))
+    with pytest.raises(ValueError, match=r"`axes`.*'OpenCV': set it to opengl or opencv"):
+        read_capture(tmp_path)
+
+
+def test_points_of_something_else(tmp_path):
+    write_colmap(tmp_path, arc(3), ["a.png", "b.png", "c.png"], points=[((0.0, 0.0, 5000.0), (1, 2, 3))])
+    with pytest.raises(ValueError, match=r"Only 0 of 3 cameras .* not of the same reconstruction.*remove the points"):
+        read_capture(tmp_path)
 
 
 # ---- sizes
@@ -324,6 +471,15 @@ def test_bad_colmap_models_are_named(tmp_path, binary):
         read_capture(folder)
     with pytest.raises(ValueError, match=r"no folder photos/.*`images`"):
         read_capture(write(), images="photos")
+
+
+def test_one_photo_with_two_cameras(tmp_path):
+    names = ["left/0.png", "right/0.png", "0.png"]
+    write_colmap(tmp_path, arc(3), names)
+    for name in names[:2]:
+        (tmp_path / "images" / name).unlink()
+    with pytest.raises(ValueError, match=r"cameras of 0\.png and left/0\.png .* the same photo .*correct the names"):
+        read_capture(tmp_path)
 
 
 def test_a_zero_quaternion_and_an_unknown_camera_are_named(tmp_path):

@@ -1,5 +1,7 @@
 """Where training starts: points of the capture, of files, of meshes, and at random."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
@@ -76,8 +78,12 @@ def test_consistent_points_lie_where_the_photos_agree(tmp_path):
 
     assert off_black.any()
     assert typical(chosen.points[off_black]) < 0.5 * typical(around.points)
-    with pytest.raises(ValueError, match="`point_count`"):
+    cause = "in fewer than three of the 21 training photos.*cameras overlap too little.*`point_count`"
+    with pytest.raises(ValueError, match=cause):
         consistent_points(capture, 400, half_side=1e3)
+    few = replace(capture, views=capture.split("train")[:2])
+    with pytest.raises(ValueError, match=r"100% are in fewer than three of the 2 .*too few photos \(`test_every`\)"):
+        consistent_points(few, 400)
 
 
 def test_a_mesh_is_sampled_by_area(tmp_path, capture):
@@ -138,6 +144,8 @@ def test_cameras_that_look_apart_need_points(tmp_path):
 
     eyes = [(1, 0, 0), (-1, 0, 0), (0, 1, 0), (0, -1, 0)]
     outward = [look_at_camera(eye, [2 * v for v in eye], (0, 0, 1), 40.0, 20, 16, dtype=torch.float64) for eye in eyes]
-    capture = read_capture(write_transforms(tmp_path, outward, [f"{i}.png" for i in range(4)]), test_every=0)
-    with pytest.raises(ValueError, match="do not look at a common point"):
+    folder = write_transforms(tmp_path, outward, [f"{i}.png" for i in range(4)])
+    with pytest.warns(UserWarning, match="axes meet behind the cameras"):
+        capture = read_capture(folder, test_every=0)
+    with pytest.raises(ValueError, match="look at no common point, but away from one"):
         initial_points(capture)

@@ -73,8 +73,8 @@ def test_a_mask_is_undistorted_as_its_frame(own, tmp_path):
     for video in read_videos(tmp_path):
         assert video.size != (200, 120)
         assert torch.equal(video.masks, video.images[..., 1])
-    iio.imwrite(tmp_path / frames[0]["mask_path"], np.zeros((120, 199), np.uint8))
-    with pytest.raises(ValueError, match="is not as large as its frame"):
+    iio.imwrite(tmp_path / frames[0]["mask_path"], np.zeros((120, 190), np.uint8))
+    with pytest.raises(ValueError, match=r"mask .* has 190 x 120 pixels, but its photo .* has 200 x 120"):
         read_videos(tmp_path)
 
 

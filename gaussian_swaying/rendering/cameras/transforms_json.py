@@ -10,6 +10,8 @@ from torch import Tensor
 from gaussian_swaying._inputs import read_json
 from gaussian_swaying.rendering.cameras.camera import Camera, check_pixels, resized_intrinsics
 
+_AXES = {"opengl": [1.0, -1.0, -1.0, 1.0], "opencv": [1.0, 1.0, 1.0, 1.0]}  # signs of their x, y, z in those of OpenCV
+
 
 def camera_from_transforms(
     path: str | Path,
@@ -20,7 +22,8 @@ def camera_from_transforms(
 ) -> Camera:
     """Read one camera of a ``transforms.json`` in the NeRF, Blender or instant-ngp style.
 
-    ``transform_matrix`` is camera-to-world with OpenGL axes (x right, y up, z backward). The intrinsics come from
+    ``transform_matrix`` is camera-to-world with OpenGL axes (x right, y up, z backward), or with those of OpenCV (x
+    right, y down, z forward) if the file has ``"axes": "opencv"`` at its top. The intrinsics come from
     ``fl_x``, ``fl_y``, ``cx``, ``cy``, ``w`` and ``h`` [pixels], or from ``camera_angle_x`` [radians]; a value inside
     the frame takes precedence over one at the top of the file. If ``cx`` and ``cy`` are missing, the image centre is
     used. If ``fl_y`` is missing, it comes from ``camera_angle_y``, or pixels are square. Lens distortion (``k1``,
@@ -60,7 +63,7 @@ def camera_of_transforms(
             check_pixels(name, size)
     pixels = read_intrinsics(where, {**data, **frames[frame]}, width, height)
     intrinsics, width, height = resized_intrinsics(*pixels, width, height)
-    world_to_camera = torch.linalg.inv(read_pose(where, frame, frames[frame]))
+    world_to_camera = torch.linalg.inv(read_pose(where, data, frame))
     return Camera(world_to_camera, intrinsics, width, height, near).to(dtype=torch.get_default_dtype())
 
 
@@ -78,6 +81,10 @@ def load_transforms(path: str | Path) -> dict[str, Any]:
     frames = data.get("frames") if isinstance(data, dict) else None
     if not isinstance(frames, list) or not frames or not all(isinstance(item, dict) for item in frames):
         raise ValueError(f"The camera file {where} has no list `frames`: give a transforms.json of NeRF or Blender.")
+    if data.get("axes", "opengl") not in list(_AXES):
+        raise ValueError(
+            f"The field `axes` of the camera file {where} is {data['axes']!r}: set it to opengl or opencv."
+        )
     return data
 
 
@@ -123,8 +130,9 @@ def read_intrinsics(
     return w, h, fx, fy, 0.5 * w if cx is None else cx, 0.5 * h if cy is None else cy
 
 
-def read_pose(where: str, frame: int, fields: dict[str, Any]) -> Tensor:
+def read_pose(where: str, data: dict[str, Any], frame: int) -> Tensor:
     """Return the camera-to-world matrix of a frame with OpenCV axes, in float64, shape (4, 4)."""
+    fields = data["frames"][frame]
     name = f"frames[{frame}].transform_matrix"
     if "transform_matrix" not in fields:
         raise ValueError(f"The camera file {where} has no `{name}`: add the camera-to-world matrix, 4 rows of 4.")
@@ -139,4 +147,4 @@ def read_pose(where: str, frame: int, fields: dict[str, Any]) -> Tensor:
         )
     if abs(float(torch.linalg.det(matrix))) < 1e-9:
         raise ValueError(f"The field `{name}` of the camera file {where} is singular: export the camera again.")
-    return matrix * torch.tensor([1.0, -1.0, -1.0, 1.0], dtype=torch.float64)  # OpenGL y, z -> OpenCV y, z
+    return matrix * torch.tensor(_AXES[data.get("axes", "opengl")], dtype=torch.float64)

@@ -222,6 +222,8 @@ class CaptureDataModule(LightningDataModule):
         Raises:
             ValueError: If the capture or one of these images is bad.
         """
+        if self.trainer is None or self.trainer.is_global_zero:
+            print(self.capture.found)
         wanted = {"fit": ("train", self.validation_split), "validate": (self.validation_split,), "test": ("test",)}
         for split in wanted.get(stage or "", ("train", self.validation_split, "test")):
             if stage in ("validate", "test") and not self.capture.split(split):

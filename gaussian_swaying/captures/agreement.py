@@ -1,0 +1,74 @@
+"""Whether the cameras, points and photos of a capture belong together."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+
+from torch import Tensor
+
+from gaussian_swaying.rendering.cameras.camera import Camera
+
+TURNED_AXES = (
+    "y and z of the camera axes seem to be turned round; if so, set `axes` of the transforms.json to opencv (y down, "
+    "z forward) or opengl (y up, z backward, as without it)"
+)
+_SAMPLE = 1000  # points that are looked at
+_PHOTOS = 8
+
+
+def places_in_picture(points: Tensor, camera: Camera) -> tuple[Tensor, Tensor]:
+    """Where a camera sees points, ignoring what hides them.
+
+    Args:
+        points: Points [scene units], on the CPU, shape (N, 3).
+        camera: The camera.
+
+    Returns:
+        Column and row of each [pixels], shape (N, 2), and which are in the picture, shape (N,).
+    """
+    view, intrinsics = camera.world_to_camera.to(points), camera.intrinsics.to(points)
+    local = points @ view[:3, :3].T + view[:3, 3]
+    depth = local[:, 2:]
+    place = local[:, :2] / depth.clamp_min(1e-30) * intrinsics.diagonal()[:2] + intrinsics[:2, 2]
+    inside = (place >= 0) & (place < place.new_tensor([camera.width, camera.height])) & (depth > 0)
+    return place, inside.all(-1)
+
+
+def cameras_that_see(points: Tensor, cameras: Sequence[Camera]) -> tuple[int, int]:
+    """How many cameras see any of the points (N, 3): as they are, and with y and z of their axes turned round."""
+    some = points[:: -(-len(points) // _SAMPLE)].double()
+    turned = [replace(camera, world_to_camera=turned_axes(camera.world_to_camera)) for camera in cameras]
+    as_given, other = (sum(bool(places_in_picture(some, c)[1].any()) for c in kind) for kind in (cameras, turned))
+    return as_given, other
+
+
+def turned_axes(world_to_camera: Tensor) -> Tensor:
+    """A pose (4, 4) with y and z of the camera turned round: axes of OpenGL in place of those of OpenCV, or back."""
+    return world_to_camera * world_to_camera.new_tensor([1.0, -1.0, -1.0, 1.0])[:, None]
+
+
+def turned_as_points(
+    cameras: Sequence[Camera], load: Callable[[int, bool], Tensor], points: Tensor, colors: Tensor
+) -> bool | None:
+    """Whether photos agree better with the colours of points if they are turned as their EXIF tags say.
+
+    Args:
+        cameras: The cameras of the photos.
+        load: Reads the photo of an index as it is stored, or turned: dtype uint8, shape (H, W, 3 or 4).
+        points: Points of the capture [scene units], shape (P, 3).
+        colors: Their colours in 0 to 1, shape (P, 3).
+
+    Returns:
+        The answer; None if the colours do not tell.
+    """
+    step = -(-len(points) // _SAMPLE)
+    errors = [0.0, 0.0]
+    for index, camera in enumerate(cameras[:_PHOTOS]):
+        place, inside = places_in_picture(points[::step], camera)
+        if bool(inside.any()):
+            column, row = place[inside].long().unbind(-1)
+            for turned in (False, True):
+                seen = load(index, turned)[row, column, :3].float() / 255
+                errors[turned] += float((seen - colors[::step][inside]).abs().mean())
+    return errors[1] < errors[0] if min(errors) < 0.8 * max(errors) else None
