@@ -27,9 +27,9 @@ def build_options() -> argparse.ArgumentParser:
         prog=program.name("live"),
         allow_abbrev=False,
         usage=f"{program.name('live')} [SCENE] [options]",
-        description="Open a page on which the wind can be changed while a scene moves. SCENE is a splat or a "
-        "configuration (.yaml); without it, a flag. Further options are those of `gaussian-swaying sim`, for example "
-        "--solver.dx 0.04.",
+        description="Open a page on which the wind can be changed while a scene moves. SCENE is a splat, a "
+        "configuration (.yaml), the name of a shipped one, or the folder of a run; without it, a flag. Further options "
+        "are those of `gaussian-swaying sim`, for example --solver.dx 0.04.",
     )
     add = parser.add_argument
     add("--host", default="127.0.0.1", help="address to listen on; 0.0.0.0 lets other computers in (default: this one)")

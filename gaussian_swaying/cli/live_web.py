@@ -9,8 +9,7 @@ from pathlib import Path
 
 from gaussian_swaying import _program as program
 from gaussian_swaying._files import check_page
-from gaussian_swaying.cli.scene import check_one_scene, settings_of, words_of
-from gaussian_swaying.cli.shipped import names
+from gaussian_swaying.cli.scene import settings_of, words_of
 from gaussian_swaying.simulation.simulation import Simulation
 from gaussian_swaying.viewer.live_web.budget import TARGETS, fitted
 from gaussian_swaying.viewer.live_web.page import ELEMENT, write_element, write_live_web
@@ -53,13 +52,8 @@ def export_live_web(arguments: Sequence[str]) -> None:
         raise ValueError(f"Expected a SCENE, and perhaps a FILE that ends in .html, but got {words or 'neither'}.")
     scene, target = words[0], default_target(words[0]) if len(words) == 1 else Path(words[1])
     check_page(target, "page")
-    check_one_scene(further)
-    config = Path(scene) / "config.yaml"
     with tempfile.TemporaryDirectory() as folder:
-        if scene in names("sim") and not Path(scene).exists():
-            settings = settings_of(parser, None, ["--config", scene, *further], Path(folder))
-        else:
-            settings = settings_of(parser, str(config) if config.is_file() else scene, further, Path(folder))
+        settings = settings_of(parser, scene, further, Path(folder))
         settings.device = "cpu"
         splat = settings.scene.ply
         made = getattr(settings.scene.generator, "class_path", "scene").rsplit(".", 1)[-1].removesuffix("Scene")

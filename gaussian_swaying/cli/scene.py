@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from gaussian_swaying.cli.errors import guessing
-from gaussian_swaying.cli.shipped import with_shipped
+from gaussian_swaying.cli.shipped import names, with_shipped
 from gaussian_swaying.simulation.defaults import resolve_device
 from gaussian_swaying.viewer.scenes import settings_of_splat
 
@@ -46,33 +46,38 @@ def settings_of(
 
     Args:
         parser: From :meth:`Simulation.parser`.
-        scene: A splat, a configuration, or None for the flag or the ``--config`` among the further options.
+        scene: A splat, a configuration or the name of a shipped one, the folder of a run, or None for the flag or the
+            ``--config`` among the further options.
         further: Options of ``gaussian-swaying sim``.
         folder: Gets a file with the parts of a splat, if it has any.
         tell: Called with the share that is done, from 0 to 1, and the name of the next task.
     """
     given = list(further)
-    if scene is not None:
-        check_one_scene(given)
-    if scene is not None and Path(scene).suffix.lower() not in (".yaml", ".yml"):
+    if scene is not None and is_given(given, "--config"):
+        raise ValueError(
+            "`SCENE` and `--config` both say what to show: leave out one of them, or give a splat with `--scene.ply`."
+        )
+    config = None if scene is None else _configuration(scene)
+    if scene is not None and config is None:
         with guessing(parser):
             device = parser.parse_args([*given, "--scene.ply", scene]).device
         print(f"Looking at {scene} for a first configuration, which takes up to a minute.", flush=True)
         settings = settings_of_splat(parser, scene, resolve_device(device), folder, given, tell)
     else:
-        config = scene or (None if is_given(given, "--config") else "flag")
+        config = config or (None if is_given(given, "--config") else "flag")
         arguments = with_shipped([*(["--config", config] if config else []), *given], "sim")
         with guessing(parser):
             settings = parser.parse_args(arguments)
     return settings
 
 
-def check_one_scene(options: Sequence[str]) -> None:
-    """Check that the options beside a scene do not name another one."""
-    if is_given(options, "--config"):
-        raise ValueError(
-            "`SCENE` and `--config` both say what to show: leave out one of them, or give a splat with `--scene.ply`."
-        )
+def _configuration(scene: str) -> str | None:
+    """The configuration that a scene is, or None for a splat."""
+    path = Path(scene)
+    if (path / "config.yaml").is_file():
+        return str(path / "config.yaml")
+    shipped = scene in names("sim") and not path.exists()
+    return scene if shipped or path.suffix.lower() in (".yaml", ".yml") else None
 
 
 def is_given(options: Sequence[str], name: str) -> bool:

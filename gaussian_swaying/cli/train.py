@@ -29,6 +29,7 @@ from gaussian_swaying._yaml_limits import limit_yaml
 from gaussian_swaying.cli.errors import command, guessing, run_command
 from gaussian_swaying.cli.shipped import with_shipped
 from gaussian_swaying.config.material_names import with_named_materials
+from gaussian_swaying.config.parser import with_lists
 from gaussian_swaying.runs.signals import stop_signals
 from gaussian_swaying.training.checkpoints import PlainCheckpoints, read_training_checkpoint
 from gaussian_swaying.training.csv_log import CsvLog
@@ -181,7 +182,7 @@ def make_cli(arguments: Sequence[str] | None = None, run: bool = True, run_folde
         The command line interface, with its ``model``, ``datamodule`` and ``trainer``.
     """
     limit_yaml(with_named_materials)
-    given = with_shipped(sys.argv[1:] if arguments is None else arguments, "train")
+    given = with_lists(with_shipped(sys.argv[1:] if arguments is None else arguments, "train"))
     return TrainCLI(
         SplatTrainer,
         LightningDataModule,

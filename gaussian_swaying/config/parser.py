@@ -8,6 +8,7 @@ import importlib
 import inspect
 import json
 import os
+import re
 import sys
 import tempfile
 from argparse import SUPPRESS, Action, ArgumentError, _ArgumentGroup
@@ -150,9 +151,21 @@ def _parser_class() -> type[ArgumentParser]:
         def parse_args(  # type: ignore[override]
             self, args: Sequence[str] | None = None, *more: Any, **options: Any
         ) -> Any:
-            return super().parse_args(with_material_option(sys.argv[1:] if args is None else args), *more, **options)
+            words = with_lists(sys.argv[1:] if args is None else args)
+            return super().parse_args(with_material_option(words), *more, **options)
 
     return Parser
+
+
+def with_lists(arguments: Sequence[str]) -> list[str]:
+    """A command line with brackets round numbers with commas between them, as a shell such as zsh eats brackets.
+
+    Example:
+        >>> with_lists(["--wind.flow", "-8,0,0", "--region.min=null,0,1e-1"])
+        ['--wind.flow', '[-8,0,0]', '--region.min=[null,0,1e-1]']
+    """
+    number = r"(?:[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?|null)"
+    return [re.sub(rf"^(--[\w.]+=)?({number}(?:,{number})+)$", r"\1[\2]", argument) for argument in arguments]
 
 
 def with_custom(parser: ArgumentParser, settings: Namespace, parts: Mapping[str, Any]) -> dict[str, Any]:

@@ -12,6 +12,8 @@ from shared import refused
 
 from gaussian_swaying.cli import live, scene
 from gaussian_swaying.cli.preview import main as preview
+from gaussian_swaying.cli.shipped import with_shipped
+from gaussian_swaying.config.parser import config_text
 from gaussian_swaying.gaussians.export import export_cloud
 from gaussian_swaying.gaussians.ply import write_ply
 from gaussian_swaying.preview.cost import Cost
@@ -53,6 +55,16 @@ def test_a_configuration_and_a_shipped_one(parser, tmp_path):
     file.write_text("scene: {generator: {class_path: FlagScene}}\nsolver: {dx: 0.3}\n")
     assert scene.settings_of(parser, str(file), [], tmp_path).solver.dx == 0.3
     assert scene.settings_of(parser, None, ["--config", str(file), "--solver.dx=0.4"], tmp_path).solver.dx == 0.4
+    folder = tmp_path / "run"
+    folder.mkdir()
+    file.rename(folder / "config.yaml")
+    assert scene.settings_of(parser, str(folder), [], tmp_path).solver.dx == 0.3
+    options = ["--preset=preview", "--wind.flow", "-7,0,0"]
+    found = scene.settings_of(parser, "two_flags", options, tmp_path)
+    assert found.wind.flow == [-7, 0, 0]
+    assert config_text(parser, found) == config_text(
+        parser, parser.parse_args(with_shipped(["--config=two_flags", *options], "sim"))
+    )
     with pytest.raises(ValueError, match="`SCENE` and `--config`"):
         scene.settings_of(parser, "my.ply", ["--config", str(file)], tmp_path)
 
