@@ -13,8 +13,9 @@ from gaussian_swaying._inputs import check_regular
 from gaussian_swaying._ply_table import read_element
 from gaussian_swaying.gaussians.cloud import GaussianCloud
 from gaussian_swaying.gaussians.harmonics import SH_DC
-from gaussian_swaying.gaussians.packed import cloud_of, logits, with_largest
+from gaussian_swaying.gaussians.packed import logits, with_largest
 from gaussian_swaying.gaussians.ply import read_binary_header
+from gaussian_swaying.gaussians.repair import cloud_of
 
 CHUNK = 256  # number of Gaussians with a common range of values in a compressed .ply
 _SPLAT = np.dtype([("means", "<f4", 3), ("sizes", "<f4", 3), ("rgba", "u1", 4), ("quats", "u1", 4)])
@@ -88,7 +89,7 @@ def read_compressed_ply(path: str | os.PathLike[str]) -> GaussianCloud:
             for end in ("min", "max")
         )
         with np.errstate(invalid="ignore", over="ignore"):
-            return low + share * (high - low)
+            return np.where(np.isneginf(low), low, low + share * (high - low))
 
     position, rotation, scale, color = (vertices[name].astype(np.int64) & 0xFFFFFFFF for name in _PACKED)
     means = within(_three(position, (11, 10, 11)), ("x", "y", "z"))

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 import re
-import warnings
 from collections.abc import Iterable
 from dataclasses import replace
 from importlib import import_module
@@ -22,6 +21,7 @@ from gaussian_swaying.gaussians.gltf import encode_gltf
 from gaussian_swaying.gaussians.harmonics import sh_to_color
 from gaussian_swaying.gaussians.model import DeformedGaussians
 from gaussian_swaying.gaussians.ply import check_folder, write_ply
+from gaussian_swaying.gaussians.repair import OPAQUE_LOGIT, faults, repaired
 from gaussian_swaying.gaussians.sog import encode_sog
 from gaussian_swaying.gaussians.spz import encode_spz
 from gaussian_swaying.geometry.patches import smallest_axis_normal
@@ -38,34 +38,30 @@ SUFFIXES: dict[str, str] = {
     "usd": ".usdc",
 }
 """Formats, and the endings of their file names."""
-LARGEST_LOGIT = 16.0  # its sigmoid is 1 - 1.1e-7, the largest opacity below 1 in float32
 LARGEST_LOG_SCALE = 20.0  # the compressed format has no larger numbers
 _GSPLAT = {"compressed_ply": "ply_compressed", "splat": "splat"}
 _PRIM = "/World/Gaussians"
 
 
-def cleaned(cloud: GaussianCloud) -> GaussianCloud:
+def cleaned(path: Path, cloud: GaussianCloud) -> GaussianCloud:
     """Return a splat that every format can store.
 
-    Gaussians with a NaN, an infinite centre or colour, or a zero quaternion are left out. Opacities and sizes beyond
-    the useful range of float32 are clamped: logits to ±16, logarithms of the size to ±20.
+    What has no meaning is left out with a warning, see :func:`~gaussian_swaying.gaussians.repair.repaired`. Opacities
+    and sizes beyond the useful range of float32 are clamped: logits to ±16, logarithms of the size to ±20.
 
     Args:
+        path: The file, for messages.
         cloud: The Gaussians.
 
     Returns:
         The same, or a smaller cloud, with quaternions of unit length.
     """
-    length = torch.linalg.vector_norm(cloud.quats, dim=-1)
-    good = torch.isfinite(cloud.means).all(-1) & torch.isfinite(cloud.sh).flatten(1).all(-1)
-    good &= torch.isfinite(length) & (length > 0)
-    good &= ~cloud.scales.isnan().any(-1) & ~cloud.opacities.isnan()
-    kept = cloud if bool(good.all()) else cloud.select(good)
+    kept = repaired(path, cloud, most=1)
     return replace(
         kept,
         quats=torch.nn.functional.normalize(kept.quats, dim=-1),
         scales=kept.scales.clamp(-LARGEST_LOG_SCALE, LARGEST_LOG_SCALE),
-        opacities=kept.opacities.clamp(-LARGEST_LOGIT, LARGEST_LOGIT),
+        opacities=kept.opacities.clamp(-OPAQUE_LOGIT, OPAQUE_LOGIT),
     )
 
 
@@ -114,7 +110,7 @@ def export_cloud(
     check_choice("format", format, tuple(SUFFIXES))
     path = Path(path)
     check_folder(path)
-    kept = _kept(path, cloud.to_cloud() if isinstance(cloud, DeformedGaussians) else cloud)
+    kept = cleaned(path, cloud.to_cloud() if isinstance(cloud, DeformedGaussians) else cloud)
     if format == "usd":
         write_usd(path, [kept], fps, metres_per_unit=metres_per_unit, rotation=rotation)
     elif format == "ply":
@@ -191,21 +187,6 @@ def numbered(name: str, number: str) -> str:
     return re.sub("#+", lambda digits: number.rjust(len(digits[0]), "0"), name)
 
 
-def _kept(path: Path, cloud: GaussianCloud) -> GaussianCloud:
-    kept = cleaned(cloud)
-    if len(kept) == 0:
-        raise ValueError(
-            f"{path} was not written because none of its {len(cloud)} Gaussians is finite; check the run that made it."
-        )
-    if len(kept) < len(cloud):
-        warnings.warn(
-            f"{path}: left out {len(cloud) - len(kept)} of {len(cloud)} Gaussians that are not finite.",
-            UserWarning,
-            stacklevel=3,
-        )
-    return kept
-
-
 def _gsplat_bytes(path: Path, cloud: GaussianCloud, format: str) -> bytes:
     """The file as gsplat's exporter makes it, from float32 tensors on the CPU."""
     from gsplat.exporter import export_splats
@@ -280,9 +261,7 @@ def usd_arrays(cloud: GaussianCloud) -> dict[str, np.ndarray]:
         ``harmonics`` (N, K, 3), ``normals`` (N, 3) and ``colors`` (N, 3), those of harmonics of degree 0.
     """
     host = cloud.to("cpu", torch.float32)
-    numbers = (host.means, host.quats, host.scales, host.opacities[:, None], host.sh.flatten(1))
-    bad = ~torch.isfinite(torch.cat([part.clamp(-1e30, 1e30) for part in numbers], dim=1)).all(-1)
-    bad |= torch.linalg.vector_norm(host.quats, dim=-1) == 0
+    bad = torch.stack([*faults(host).values()]).any(0)
     neutral = torch.tensor([1.0, 0.0, 0.0, 0.0])
     quats = torch.nn.functional.normalize(torch.where(bad[:, None], neutral, host.quats), dim=-1)
     scales = torch.where(bad[:, None], 0.0, host.scales).clamp(-LARGEST_LOG_SCALE, LARGEST_LOG_SCALE)

@@ -20,8 +20,8 @@ from torch import Tensor
 from gaussian_swaying._inputs import LARGEST_JSON, check_regular, check_unpacked, parse_json, read_json
 from gaussian_swaying.gaussians.cloud import GaussianCloud, joined
 from gaussian_swaying.gaussians.harmonics import SH_DC, rotate_sh
-from gaussian_swaying.gaussians.packed import FIELDS, cloud_of, logits
-from gaussian_swaying.gaussians.ply import reject
+from gaussian_swaying.gaussians.packed import logits
+from gaussian_swaying.gaussians.repair import cloud_of, repaired
 from gaussian_swaying.geometry.covariances import covariance, covariance_to_quat_scale, deform_covariance
 from gaussian_swaying.geometry.rotations import quat_to_rotation, rotation_to_quat
 
@@ -33,7 +33,6 @@ _UNDERSTOOD = (_EXTENSION, "KHR_mesh_quantization")
 _TYPES = {5120: np.int8, 5121: np.uint8, 5122: np.int16, 5123: np.uint16, 5125: np.uint32, 5126: np.float32}
 _WIDTHS = {"SCALAR": 1, "VEC3": 3, "VEC4": 4}
 _UPRIGHT = torch.tensor([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]], dtype=torch.float64)  # z up to y up
-_FLAT = 1e-7  # of the largest size: a size of zero, which is allowed, becomes this
 _STEPS = 1 << 22  # opacities in float32 end half of such a step before 0 and 1
 
 
@@ -274,18 +273,21 @@ class _Document:
             return self._accessor(names[name], kind, count, name)[0]
 
         opacity, steps = self._accessor(names.get(f"{_EXTENSION}:OPACITY"), "SCALAR", count, "OPACITY")
-        outside = ~(np.abs(opacity[:, 0] - 0.5) <= 0.501)  # and what is not a number
-        reject(path, outside, "attribute `OPACITY` is not from 0 to 1", "store the opacity itself, not its logit")
         sizes = column(f"{_EXTENSION}:SCALE", "VEC3")
-        negative: np.ndarray = np.any(sizes < 0, axis=1)
-        reject(path, negative, "attribute `SCALE` is negative", "store the size itself, not its logarithm")
+        others = {
+            "attribute `OPACITY` is not from 0 to 1 (store the opacity itself, not its logit)": ~(
+                np.abs(opacity[:, 0] - 0.5) <= 0.501
+            ),
+            "attribute `SCALE` is negative (store the size itself, not its logarithm)": (sizes < 0).any(1),
+        }
         with np.errstate(divide="ignore", invalid="ignore"):
-            scales = np.log(np.maximum(sizes, _FLAT * sizes.max(axis=1, keepdims=True, initial=0.0)))
+            scales = np.log(sizes)
         sh = np.zeros((count, width, 3), dtype=np.float32)
         for place, name in enumerate(_harmonics(_degree(path, names))):
             sh[:, place] = column(name, "VEC3")
         cloud = cloud_of(
             path,
+            {what: torch.from_numpy(mask) for what, mask in others.items()},
             means=column("POSITION", "VEC3"),
             quats=column(f"{_EXTENSION}:ROTATION", "VEC4")[:, [3, 0, 1, 2]],
             scales=scales,
@@ -294,7 +296,7 @@ class _Document:
         )
         self._check_turn(matrix)
         moved = _moved(cloud, *map(torch.from_numpy, (matrix[:3, :3].copy(), matrix[:3, 3].copy())))
-        return moved if moved is cloud else cloud_of(path, **{name: getattr(moved, name).numpy() for name in FIELDS})
+        return moved if moved is cloud else repaired(path, moved)
 
     def _check_turn(self, matrix: np.ndarray) -> None:
         """Raise ValueError unless a transformation is a rotation, a shift and positive scales along the axes."""

@@ -1,19 +1,14 @@
-"""Common to the small formats: quaternions without their largest component, opacities in steps, the last checks."""
+"""Common to the small formats: quaternions without their largest component, opacities in steps."""
 
 from __future__ import annotations
 
 import warnings
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from gaussian_swaying.gaussians.cloud import GaussianCloud
-from gaussian_swaying.gaussians.ply import check_places, check_sizes_and_rotations, reject
-
-FIELDS = ("means", "quats", "scales", "opacities", "sh")
 _OTHERS = np.array([[1, 2, 3], [0, 2, 3], [0, 1, 3], [0, 1, 2]])  # places of the small ones for each of the largest
 _PLACES = np.array([[3, 0, 1, 2], [0, 3, 1, 2], [0, 1, 3, 2], [0, 1, 2, 3]])  # where 3 stands for the largest
 
@@ -60,22 +55,3 @@ def warn_antialiased(path: Path) -> None:
         UserWarning,
         stacklevel=3,
     )
-
-
-def cloud_of(path: Path, **columns: np.ndarray) -> GaussianCloud:
-    """The Gaussians of a file as float32 tensors.
-
-    Args:
-        path: The file, for messages.
-        columns: The fields of :class:`GaussianCloud` but normals, with their shapes and units.
-    """
-    with np.errstate(over="ignore"):
-        columns = {name: np.ascontiguousarray(value, dtype=np.float32) for name, value in columns.items()}
-    for name, value in columns.items():
-        if name != "scales":
-            bad = ~np.isfinite(value).reshape(len(value), -1).all(-1)
-            reject(path, bad, f"property `{name}` is NaN or infinite", "remove them or export the scene again")
-    check_places(path, columns["means"])
-    check_sizes_and_rotations(path, columns["scales"], columns["quats"])
-    tensors: dict[str, Any] = {name: torch.from_numpy(value) for name, value in columns.items()}
-    return GaussianCloud(**tensors)

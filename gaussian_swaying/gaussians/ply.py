@@ -6,6 +6,7 @@ import os
 import re
 import warnings
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -14,6 +15,7 @@ from einops import rearrange
 from gaussian_swaying._files import atomic
 from gaussian_swaying._ply_table import PlyHeader, element_parts, layout, read_header
 from gaussian_swaying.gaussians.cloud import GaussianCloud
+from gaussian_swaying.gaussians.repair import FLAT, cloud_of
 from gaussian_swaying.geometry.patches import smallest_axis_normal
 
 _MEANS = ("x", "y", "z")
@@ -21,10 +23,7 @@ _NORMALS = ("nx", "ny", "nz")
 _DC = ("f_dc_0", "f_dc_1", "f_dc_2")
 _SCALES = ("scale_0", "scale_1", "scale_2")
 _QUATS = ("rot_0", "rot_1", "rot_2", "rot_3")
-_REQUIRED = (*_MEANS, *_DC, "opacity", *_SCALES, *_QUATS)
-FARTHEST = 1e12
-"""Largest coordinate of a centre [scene units]: its square is finite in float32, and a grid can count its cells."""
-OPAQUE_LOGIT = 16.0  # of an opacity of 1: its sigmoid is 1 - 1.1e-7, the largest opacity below 1 in float32
+_REQUIRED = (*_MEANS, *_DC, "opacity", *_SCALES[:2], *_QUATS)
 
 
 def read_ply(path: str | os.PathLike[str], sh_degree: int | None = None) -> GaussianCloud:
@@ -33,7 +32,8 @@ def read_ply(path: str | os.PathLike[str], sh_degree: int | None = None) -> Gaus
     The layout is that of Kerbl et al. 2023 ("3D Gaussian Splatting for Real-Time Radiance Field Rendering"). Properties
     may be in any order, in either byte order, with or without normals, and with spherical harmonics of degree 0 to 3.
     Normals that are all zero, as most tools write them, are ignored. An opacity of exactly 0 or 1, stored as an
-    infinite logit, becomes a logit of -16 or 16; the preview says how many there are.
+    infinite logit, becomes a logit of -16 or 16; the preview says how many there are. Without ``scale_2``, as 2DGS
+    writes it, Gaussians are flat.
 
     Args:
         path: File to read.
@@ -51,7 +51,8 @@ def read_ply(path: str | os.PathLike[str], sh_degree: int | None = None) -> Gaus
             raise ValueError(f"{path} has no property `{name}`, so it is not a 3DGS file; export it from a 3DGS tool.")
     rest = _rest_names(path, names)
     has_normals = all(name in names for name in _NORMALS)
-    known = {*_REQUIRED, *rest, *(_NORMALS if has_normals else ())}
+    scales = [name for name in _SCALES if name in names]
+    known = {*_REQUIRED, *scales, *rest, *(_NORMALS if has_normals else ())}
     ignored = [name for name in names if name not in known]
     if ignored:
         warnings.warn(f"{path}: ignored the properties {', '.join(ignored)}.", UserWarning, stacklevel=2)
@@ -60,7 +61,7 @@ def read_ply(path: str | os.PathLike[str], sh_degree: int | None = None) -> Gaus
     per_channel = len(rest) // 3
     kept = per_channel if sh_degree is None else min(per_channel, (sh_degree + 1) ** 2 - 1)
     columns = {"opacity": ("opacities", 0)}  # of each property: a table, and a column of it
-    for table, fields in (("means", _MEANS), ("quats", _QUATS), ("scales", _SCALES), ("normals", _NORMALS)):
+    for table, fields in (("means", _MEANS), ("quats", _QUATS), ("scales", scales), ("normals", _NORMALS)):
         if table != "normals" or has_normals:
             columns |= {field: (table, k) for k, field in enumerate(fields)}
     columns |= {field: ("sh", k) for k, field in enumerate(_DC)}
@@ -74,24 +75,14 @@ def read_ply(path: str | os.PathLike[str], sh_degree: int | None = None) -> Gaus
             for field, (table, k) in columns.items():
                 tables[table][first : first + len(part), k] = part[field]
             first += len(part)
-    opacities = _finite_opacities(path, tables["opacities"][:, 0])
-    for field, (table, k) in columns.items():
-        if table != "opacities":
-            bad = ~np.isfinite(tables[table][:, k])
-            reject(path, bad, f"property `{field}` is NaN or infinite", "remove them or train again")
-    check_places(path, tables["means"])
-    check_sizes_and_rotations(path, tables["scales"], tables["quats"])
-    normals = tables.get("normals")
-    if normals is not None and not normals.any():
-        normals = None
-    return GaussianCloud(
-        means=torch.from_numpy(tables["means"]),
-        quats=torch.from_numpy(tables["quats"]),
-        scales=torch.from_numpy(tables["scales"]),
-        opacities=torch.from_numpy(opacities),
-        sh=torch.from_numpy(tables["sh"].reshape(count, 1 + kept, 3)),
-        normals=None if normals is None else torch.from_numpy(normals),
-    )
+    if "scale_2" not in names:
+        thin = tables["scales"].max(1, keepdims=True) + np.float32(FLAT)
+        tables["scales"] = np.concatenate([tables["scales"], thin], 1)
+    if has_normals and not tables["normals"].any():
+        del tables["normals"]
+    shaped: dict[str, Any] = tables | {"opacities": tables["opacities"][:, 0]}
+    shaped["sh"] = tables["sh"].reshape(count, 1 + kept, 3)
+    return cloud_of(path, **shaped)
 
 
 def write_ply(path: str | os.PathLike[str], cloud: GaussianCloud) -> None:
@@ -134,27 +125,6 @@ def check_folder(path: Path) -> None:
         raise FileNotFoundError(f"{path} cannot be written because {path.parent} is not a folder; create it first.")
 
 
-def check_places(path: Path, means: np.ndarray) -> None:
-    """Raise ValueError if a finite centre (N, 3) is too far away to compute with."""
-    far = (np.abs(means) > FARTHEST).any(axis=1)
-    reject(path, far, f"property `x`, `y` or `z` is beyond ±{FARTHEST:g}", "remove them or train again")
-
-
-def check_sizes_and_rotations(path: Path, scales: np.ndarray, quats: np.ndarray) -> None:
-    """Raise ValueError if the logarithm of a size (N, 3) is out of range, or a quaternion (N, 4) is zero."""
-    with np.errstate(over="ignore", under="ignore"):
-        size = np.exp(scales)
-    reject(
-        path,
-        ((size == 0) | ~np.isfinite(size)).any(axis=1),
-        "property `scale_0`, `scale_1` or `scale_2` (a logarithm) gives a size of zero or infinity",
-        "remove them or store the logarithm of the size",
-    )
-    with np.errstate(under="ignore"):
-        zero_quats = np.square(quats).sum(axis=1) == 0
-    reject(path, zero_quats, "the quaternion `rot_0` to `rot_3` is zero", "remove them or store 1 0 0 0")
-
-
 def read_binary_header(path: Path) -> PlyHeader:
     """The header from :func:`~gaussian_swaying._ply_table.read_header`; ValueError if the file is text."""
     header = read_header(path)
@@ -176,20 +146,3 @@ def _rest_names(path: Path, names: tuple[str, ...]) -> tuple[str, ...]:
         if name not in found:
             raise ValueError(f"{path} has no property `{name}` among its {len(found)} `f_rest_*`; export it again.")
     return rest
-
-
-def _finite_opacities(path: Path, logits: np.ndarray) -> np.ndarray:
-    """Opacity logits (N,); infinite ones, for opacities of exactly 0 or 1, are made finite."""
-    reject(path, np.isnan(logits), "property `opacity` is NaN", "remove them or train again")
-    infinite = np.isinf(logits)
-    logits[infinite] = np.copysign(np.float32(OPAQUE_LOGIT), logits[infinite])
-    return np.ascontiguousarray(logits)
-
-
-def reject(path: Path, bad: np.ndarray, what: str, remedy: str) -> None:
-    """Raise ValueError if any Gaussian of the mask (N,) is bad."""
-    if bad.any():
-        raise ValueError(
-            f"{path}: {what} for {int(bad.sum())} of {len(bad)} Gaussians, first at index {int(bad.argmax())}; "
-            f"{remedy}."
-        )

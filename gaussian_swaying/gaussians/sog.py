@@ -21,14 +21,8 @@ from torch import Tensor
 from gaussian_swaying._checks import one_line
 from gaussian_swaying._inputs import LARGEST_JSON, check_regular, check_unpacked, parse_json, read_json
 from gaussian_swaying.gaussians.cloud import GaussianCloud, joined
-from gaussian_swaying.gaussians.packed import (
-    cloud_of,
-    floats,
-    logits,
-    smallest_three,
-    warn_antialiased,
-    with_largest,
-)
+from gaussian_swaying.gaussians.packed import floats, logits, smallest_three, warn_antialiased, with_largest
+from gaussian_swaying.gaussians.repair import cloud_of
 
 LARGEST_SIDE = 16383  # pixels of a WebP picture
 PALETTE = 1 << 16  # number of different sets of harmonics beyond degree 0; a pixel has 16 bits for it

@@ -14,7 +14,8 @@ import numpy as np
 
 from gaussian_swaying._inputs import check_regular, check_unpacked
 from gaussian_swaying.gaussians.cloud import GaussianCloud
-from gaussian_swaying.gaussians.packed import cloud_of, floats, logits, smallest_three, warn_antialiased, with_largest
+from gaussian_swaying.gaussians.packed import floats, logits, smallest_three, warn_antialiased, with_largest
+from gaussian_swaying.gaussians.repair import cloud_of
 
 VERSIONS = (1, 2, 3, 4)
 _MAGIC = b"NGSP"
@@ -144,8 +145,8 @@ def _unzipped(path: Path) -> tuple[tuple[Any, ...], list[np.ndarray], bytes]:
             head, sizes = _sizes(path, stream.read(_HEAD.size))
             if head[1] == 4:
                 raise ValueError(f"{path} has `version` 4, but is compressed by gzip; copy or export it again.")
-            body = np.empty(sum(sizes), dtype=np.uint8)
-            found = stream.readinto(memoryview(body))
+            body = bytearray(sum(sizes))
+            found = stream.readinto(body)
             if found < len(body):
                 raise _truncated(path, len(body), found)
             extensions = stream.read(_LARGEST_EXTENSIONS) if head[5] & _EXTENDED else b""
@@ -154,7 +155,7 @@ def _unzipped(path: Path) -> tuple[tuple[Any, ...], list[np.ndarray], bytes]:
         raise ValueError(f"{path} cannot be decompressed ({error}); copy or export it again.") from error
     if more:
         raise _longer(path, head)
-    return head, np.split(body, np.cumsum(sizes)[:-1]), extensions
+    return head, np.split(np.frombuffer(body, dtype=np.uint8), np.cumsum(sizes)[:-1]), extensions
 
 
 def _streams(path: Path, data: bytes) -> tuple[tuple[Any, ...], list[np.ndarray], bytes]:

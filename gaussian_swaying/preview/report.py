@@ -14,7 +14,7 @@ from gaussian_swaying import _program as program
 from gaussian_swaying.aero.computed_air import resolution
 from gaussian_swaying.aero.wind import WindField
 from gaussian_swaying.gaussians.cloud import GaussianCloud
-from gaussian_swaying.gaussians.ply import OPAQUE_LOGIT
+from gaussian_swaying.gaussians.repair import OPAQUE_LOGIT
 from gaussian_swaying.preview.cost import Cost
 from gaussian_swaying.preview.kinds import KINDS
 from gaussian_swaying.preview.natural import Natural

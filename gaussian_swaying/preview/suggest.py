@@ -21,7 +21,7 @@ from gaussian_swaying.gaussians.area import patch_area
 from gaussian_swaying.gaussians.cloud import GaussianCloud
 from gaussian_swaying.gaussians.grouping import connected_parts
 from gaussian_swaying.gaussians.parts import Part, Parts
-from gaussian_swaying.gaussians.ply import OPAQUE_LOGIT
+from gaussian_swaying.gaussians.repair import OPAQUE_LOGIT
 from gaussian_swaying.geometry.frame import SimFrame
 from gaussian_swaying.geometry.neighbours import particle_spacing
 from gaussian_swaying.geometry.patches import smallest_axis_normal

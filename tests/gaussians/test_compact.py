@@ -26,6 +26,16 @@ def test_compressed_ply(degree, tmp_path):
     assert found.sh.shape == (299, (degree + 1) ** 2, 3)
 
 
+def test_flat_ones_of_other_programs(tmp_path):
+    """A range of sizes that begins at the logarithm of zero."""
+    path = tmp_path / "flat.ply"
+    _compressed(path, lambda elements: elements["chunk"]["min_scale_z"].put(0, -np.inf))
+    with pytest.warns(UserWarning, match=r"of 300 Gaussians have a size of zero, and become flat"):
+        cloud = read_gaussians(path)
+    assert len(cloud) == 300
+    assert cloud.scales.isfinite().all()
+
+
 def test_files_of_other_programs(tmp_path):
     """Opacity bytes of 0 and 255 stay finite; older files have no range of colours."""
     names = ("packed_position", "packed_rotation", "packed_scale", "packed_color")
@@ -61,9 +71,12 @@ def _compressed(path, change):
         (lambda e: e.update(vertex=drop_fields(e["vertex"], "packed_scale")), "no property `packed_scale`"),
         (lambda e: e.update(chunk=drop_fields(e["chunk"], "max_y")), "no property `max_y` in its chunks"),
         (lambda e: e.update(sh=e["sh"][:7]), "the element `sh` does not hold 9, 24 or 45"),
-        (lambda e: e["chunk"]["min_x"].fill(np.nan), "`means` is NaN or infinite for 300 of 300 Gaussians"),
+        (
+            lambda e: e["chunk"]["min_x"].fill(np.nan),
+            "NaN, infinite or beyond ±1e+12 for 300, first",
+        ),
         (lambda e: e["chunk"]["min_x"].fill(-9e37), "beyond ±1e+12 for"),
-        (lambda e: e["chunk"]["max_scale_z"].fill(1e5), "gives a size of zero or infinity"),
+        (lambda e: e["chunk"]["max_scale_z"].fill(1e5), "`scale_2` is NaN or infinite"),
         (lambda e: e.update(vertex=e["vertex"][:0]), "zero Gaussians"),
     ],
 )

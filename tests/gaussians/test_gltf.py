@@ -159,7 +159,7 @@ def test_numbers_of_every_kind(tmp_path):
         assert (cloud.sh[3:] == 0.25).all()
         assert torch.equal(cloud.means[:3], torch.eye(3))
         assert_close(cloud.quats[1], torch.tensor([1.0, -1.0, 0.0, 0.0]))
-        assert_close(cloud.scales[0], torch.tensor([0.0, math.log(0.2), math.log(1e-7)]))
+        assert_close(cloud.scales[0], torch.tensor([0.0, math.log(0.2), math.log(1e-3)]))
         assert_close(cloud.opacities[:3].sigmoid(), torch.tensor([0.5 / 255, 0.2, 1 - 0.5 / 255]))
 
 
@@ -268,12 +268,12 @@ def test_one_mesh_many_times(tmp_path):
 @pytest.mark.parametrize(
     ("name", "value", "message"),
     [
-        ("POSITION", math.nan, "`means` is NaN or infinite for 1 of 2"),
-        (f"{KHR}:SCALE", -3.0, "attribute `SCALE` is negative for 1 of 2 Gaussians, first at index 0; store the size"),
-        (f"{KHR}:SCALE", math.inf, "gives a size of zero or infinity"),
-        (f"{KHR}:OPACITY", 4.0, "attribute `OPACITY` is not from 0 to 1 for 1 of 2 Gaussians"),
+        ("POSITION", math.nan, "`x`, `y` or `z` is NaN, infinite or beyond ±1e+12 for 1, first"),
+        (f"{KHR}:SCALE", -3.0, "attribute `SCALE` is negative (store the size itself, not its logarithm) for 1, first"),
+        (f"{KHR}:SCALE", math.inf, "`scale_2` is NaN or infinite"),
+        (f"{KHR}:OPACITY", 4.0, "attribute `OPACITY` is not from 0 to 1 (store the opacity itself, not its logit)"),
         (f"{KHR}:OPACITY", math.nan, "attribute `OPACITY` is not from 0 to 1"),
-        (f"{KHR}:SH_DEGREE_0_COEF_0", math.inf, "`sh` is NaN or infinite"),
+        (f"{KHR}:SH_DEGREE_0_COEF_0", math.inf, "`f_dc_*` or `f_rest_*` is NaN or infinite"),
     ],
 )
 def test_bad_numbers(name, value, message, tmp_path):

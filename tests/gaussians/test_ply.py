@@ -185,7 +185,7 @@ def _without(name):
         (_columns(), {"text": True}, ["ASCII", "export as binary"]),
         (_columns(), {"name": "face"}, ["no element `vertex` (elements: face)", "export it from a 3DGS tool"]),
         (_columns(count=0), {}, ["zero Gaussians", "export the scene again"]),
-        *((_without(name), {}, [f"no property `{name}`"]) for name in ("x", "f_dc_1", "opacity", "scale_2", "rot_3")),
+        *((_without(name), {}, [f"no property `{name}`"]) for name in ("x", "f_dc_1", "opacity", "scale_1", "rot_3")),
         (
             _columns() | {f"f_rest_{i}": np.zeros(5, "f4") for i in range(8)},
             {},
@@ -207,32 +207,53 @@ def test_cut_off_or_another_kind(tmp_path):
     refused(path, "is not a .ply file", "export the scene as .ply")
 
 
-FAR = "`x`, `y` or `z` is beyond ±1e+12 for 2 of 5 Gaussians, first at index 1"  # their squares overflow
-SIZE = "gives a size of zero or infinity for 1 of 5 Gaussians, first at index 1"
 BAD = [
-    *(
-        (name, [2, 4], value, f"`{name}` is NaN or infinite for 2 of 5 Gaussians, first at index 2", "remove them")
-        for name, value in zip(
-            ("z", "nx", "f_dc_2", "f_rest_7", "scale_1", "rot_2"), 2 * (np.nan, np.inf, -np.inf), strict=True
-        )
-    ),
-    ("opacity", [3], np.nan, "property `opacity` is NaN for 1 of 5 Gaussians, first at index 3", "remove them"),
-    ("y", [1], 1e300, "property `y` is NaN or infinite for 1 of 5", "remove them"),
-    ("x", [1, 3], 9e37, FAR, "remove them"),
-    ("z", [1, 3], -1e13, FAR, "remove them"),
-    ("scale_1", [1], -200.0, SIZE, "logarithm"),
-    ("scale_1", [1], 100.0, SIZE, "logarithm"),
-    ("rot_0 rot_1 rot_2 rot_3", [2], 0.0, "is zero for 1 of 5 Gaussians, first at index 2", "store 1 0 0 0"),
+    ("z", np.nan, "`x`, `y` or `z` is NaN, infinite or beyond ±1e+12"),
+    ("y", 1e300, "`x`, `y` or `z` is NaN, infinite or beyond ±1e+12"),
+    ("x", -1e13, "`x`, `y` or `z` is NaN, infinite or beyond ±1e+12"),  # its square would overflow
+    ("nx", np.inf, "`nx`, `ny` or `nz` is NaN or infinite"),
+    ("f_dc_2", -np.inf, "`f_dc_*` or `f_rest_*` is NaN or infinite"),
+    ("f_rest_7", np.nan, "`f_dc_*` or `f_rest_*` is NaN or infinite"),
+    ("scale_1", np.inf, "`scale_0`, `scale_1` or `scale_2` is NaN or infinite, or not a logarithm of a size"),
+    ("scale_0", 100.0, "`scale_0`, `scale_1` or `scale_2` is NaN or infinite, or not a logarithm of a size"),
+    ("scale_0 scale_1 scale_2", -np.inf, "`scale_0`, `scale_1` or `scale_2` is NaN or infinite, or not a logarithm"),
+    ("rot_2", np.inf, "the quaternion `rot_0` to `rot_3` is zero, NaN or infinite"),
+    ("rot_0 rot_1 rot_2 rot_3", 0.0, "the quaternion `rot_0` to `rot_3` is zero, NaN or infinite"),
+    ("opacity", np.nan, "`opacity` is NaN"),
 ]
 
 
-def test_bad_values(tmp_path):
-    """Of doubles, one of which is beyond float32."""
-    for names, places, value, words, remedy in BAD:
-        columns = {name: column.astype("f8") for name, column in _columns(1).items()}
-        for name in names.split():
-            columns[name][places] = value
-        refused(_write(tmp_path / "bad.ply", columns), words, remedy)
+@pytest.mark.parametrize(("names", "value", "words"), BAD)
+def test_what_has_no_meaning_is_left_out(tmp_path, names, value, words):
+    """With a count in one warning, up to a quarter; of doubles, one of which is beyond float32."""
+    columns = {name: column.astype("f8") for name, column in _columns(1, count=40).items()}
+    whole = read_ply(_write(tmp_path / "a.ply", columns))
+    for name in names.split():
+        columns[name][[3, 9]] = value
+    with pytest.warns(UserWarning, match=r"a\.ply: left out 2 of 40 .* for 2, first at index 3\.") as told:
+        found = read_ply(_write(tmp_path / "a.ply", columns))
+    assert [words in str(warning.message) for warning in told] == [True]
+    _assert_equal(found, whole.select(torch.tensor([k for k in range(40) if k not in (3, 9)])))
+    for name in names.split():
+        columns[name][:11] = value
+    refused(_write(tmp_path / "a.ply", columns), words, "11 of 40 Gaussians mean nothing", "for 11, first at index 0")
+
+
+def test_flat_ones_become_a_thousandth_of_their_width(tmp_path):
+    """Of a size of zero by any number; a file of 2DGS has two sizes, which is told to nobody."""
+    columns = _columns(1, count=9)
+    whole = read_ply(_write(tmp_path / "a.ply", columns))
+    columns["scale_2"][:3] = -np.inf, -1000.0, -50.0
+    with pytest.warns(UserWarning, match=r"a\.ply: 3 of 9 Gaussians have a size of zero, and become flat\."):
+        some = read_ply(_write(tmp_path / "a.ply", columns))
+    del columns["scale_2"]
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        surfels = read_ply(_write(tmp_path / "b.ply", columns))
+    thin = whole.scales[:, :2].amax(1) + np.log(1e-3)
+    assert_close(some.scales[:3, 2], thin[:3])
+    assert torch.equal(some.scales[3:], whole.scales[3:])
+    assert_close(surfels.scales, torch.cat([whole.scales[:, :2], thin[:, None]], 1))
 
 
 def test_write_needs_gaussians_and_a_folder(tmp_path):

@@ -1,0 +1,98 @@
+"""What becomes of Gaussians that cannot be drawn, wherever they come from: the one rule of readers and writers."""
+
+from __future__ import annotations
+
+import math
+import warnings
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from gaussian_swaying.gaussians.cloud import GaussianCloud
+
+FARTHEST = 1e12
+"""Largest coordinate and size [scene units]: its square is finite in float32, and a grid can count its cells."""
+OPAQUE_LOGIT = 16.0  # of an opacity of 1: its sigmoid is 1 - 1.1e-7, the largest opacity below 1 in float32
+FLAT = math.log(1e-3)
+"""Logarithm of the thickness of a flat Gaussian, as a share of its largest size."""
+_ZERO = -43.0  # logarithm of a size whose square is zero in float32
+_MOST = 0.25  # share of the Gaussians that may be left out
+
+
+def faults(cloud: GaussianCloud) -> dict[str, Tensor]:
+    """What is wrong with Gaussians that have no meaning, by the properties of a .ply, and a mask (N,) for each kind."""
+    turn, size = cloud.quats.square().sum(-1), cloud.scales.amax(-1)
+    found = {
+        f"`x`, `y` or `z` is NaN, infinite or beyond ±{FARTHEST:g}": ~(cloud.means.abs() <= FARTHEST).all(-1),
+        "the quaternion `rot_0` to `rot_3` is zero, NaN or infinite": ~((turn > 0) & turn.isfinite()),
+        "`scale_0`, `scale_1` or `scale_2` is NaN or infinite, or not a logarithm of a size": ~(
+            (size > _ZERO) & (size <= math.log(FARTHEST))
+        ),
+        "`opacity` is NaN": cloud.opacities.isnan(),
+        "`f_dc_*` or `f_rest_*` is NaN or infinite": ~cloud.sh.isfinite().flatten(1).all(-1),
+    }
+    if cloud.normals is not None:
+        found["`nx`, `ny` or `nz` is NaN or infinite"] = ~cloud.normals.isfinite().all(-1)
+    return found
+
+
+def repaired(
+    path: Path, cloud: GaussianCloud, most: float = _MOST, others: dict[str, Tensor] | None = None
+) -> GaussianCloud:
+    """The Gaussians that have a meaning.
+
+    A size of zero becomes a thousandth of the largest one of its Gaussian. An infinite logit of the opacity becomes
+    ±16.
+
+    Args:
+        path: The file, for messages.
+        cloud: Gaussians, as they are stored there.
+        most: Share of them that may be left out.
+        others: Further faults, as :func:`faults` gives them.
+
+    Raises:
+        ValueError: If more have none.
+
+    Warns:
+        UserWarning: If Gaussians were left out or were flat.
+    """
+    found, count, told = (others or {}) | faults(cloud), len(cloud), []
+    gone = torch.stack([*found.values()]).any(0)
+    left_out = int(gone.sum())
+    if left_out:
+        kinds = [(what, where.nonzero()[:, 0].tolist()) for what, where in found.items() if bool(where.any())]
+        what = ", ".join(f"{what} for {len(where):,}, first at index {where[0]}" for what, where in kinds)
+        told.append(f"left out {left_out:,} of {count:,} Gaussians: {what}")
+        if left_out > most * count or left_out == count:
+            raise ValueError(f"{path}: {left_out:,} of {count:,} Gaussians mean nothing: {what}; make the scene again.")
+        cloud = cloud.select(~gone)
+    flat = cloud.scales < _ZERO
+    if bool(flat.any()):
+        thin = cloud.scales.amax(-1, keepdim=True) + FLAT
+        cloud = replace(cloud, scales=torch.where(flat, thin, cloud.scales))
+        told.append(f"{int(flat.any(-1).sum()):,} of {count:,} Gaussians have a size of zero, and become flat")
+    if told:
+        warnings.warn(f"{path}: {'; '.join(told)}.", UserWarning, stacklevel=4)
+    infinite = cloud.opacities.isinf()
+    if bool(infinite.any()):
+        finite = torch.where(infinite, cloud.opacities.clamp(-OPAQUE_LOGIT, OPAQUE_LOGIT), cloud.opacities)
+        cloud = replace(cloud, opacities=finite)
+    return cloud
+
+
+def cloud_of(path: Path, others: dict[str, Tensor] | None = None, **columns: np.ndarray) -> GaussianCloud:
+    """The Gaussians of a file as float32 tensors, :func:`repaired`.
+
+    Args:
+        path: The file, for messages.
+        others: Further faults, as :func:`faults` gives them.
+        columns: The fields of :class:`GaussianCloud`, with their shapes and units.
+    """
+    with np.errstate(over="ignore"):
+        columns = {name: np.ascontiguousarray(value, dtype=np.float32) for name, value in columns.items()}
+    tensors: dict[str, Any] = {name: torch.from_numpy(value) for name, value in columns.items()}
+    return repaired(path, GaussianCloud(**tensors), others=others)
