@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from copy import copy
 from functools import lru_cache
 
 import torch
 from torch import Tensor
 
 from gaussian_swaying._checks import check_choice, check_positive, check_vector
+from gaussian_swaying._fixed import assign, changed
 from gaussian_swaying.aero.effects import Moment, WindEffect, placed
 from gaussian_swaying.aero.lookup import trilinear
 from gaussian_swaying.aero.spectra import SPECTRA, resolved_share
@@ -107,14 +107,12 @@ class CarriedField(WindEffect):
 
     def along(self, flow: Tensor) -> None:
         """Turn the x axis of the field into the flow."""
-        self.axes = box_axes(flow.detach().cpu(), self.sides.tolist(), self.tilted).to(self.axes.device)
+        axes = box_axes(flow.detach().cpu(), self.sides.tolist(), self.tilted)
+        assign(self, axes=axes.to(self.axes.device))
 
     def in_frame(self, frame: SimFrame) -> WindEffect:
         """The origin in metres."""
-        other = copy(self)
-        other._buffers = dict(self._buffers)
-        other.place = torch.tensor(placed(frame, self.origin), dtype=torch.float64, device=self.place.device)
-        return other
+        return changed(self, place=torch.tensor(placed(frame, self.origin), dtype=torch.float64))
 
     def offset(self, carried: Tensor) -> Tensor:
         """Place of the object's centre in the field, in cells, when the flow has ``carried`` it [m], shape (..., 3).

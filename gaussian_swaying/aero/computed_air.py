@@ -12,6 +12,7 @@ import torch
 from torch import Tensor, nn
 
 from gaussian_swaying._checks import check_choice, check_plain, check_positive, check_vector, check_whole
+from gaussian_swaying._fixed import Fixed
 from gaussian_swaying.aero.obstacles import Obstacle
 from gaussian_swaying.aero.shelter import Shelter
 from gaussian_swaying.aero.wind import WindField
@@ -37,7 +38,7 @@ LIGHTEST = 0.02
 """Smallest ratio of the mass of a point to that of the layer of air that it moves."""
 
 
-class ComputedAir(nn.Module):
+class ComputedAir(Fixed, nn.Module):
     r"""A box in which the air is computed, by a lattice Boltzmann flow, instead of given by the wind.
 
     The wind of the simulation blows in through the faces of the box. The surface of the body stops the air as an

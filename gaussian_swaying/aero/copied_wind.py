@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-from copy import copy
-
 from torch import Tensor, nn
 
+from gaussian_swaying._fixed import changed
 from gaussian_swaying.aero.wind import SpatialWind, WindField
 
 
@@ -41,8 +40,7 @@ class CopiedWind(SpatialWind):
         if seed is not None:
             if not isinstance(wind, WindField):
                 raise ValueError("Expected `copies.seed` null with a wind of your own, which has no seed: use `delay`.")
-            wind = copy(wind)
-            wind.seed = int(seed)
+            wind = changed(wind, seed=int(seed))
         self.wind: nn.Module = wind
         self.delay = float(delay)
         self.register_buffer("turn", turn, persistent=False)

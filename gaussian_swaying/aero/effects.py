@@ -5,13 +5,13 @@ from __future__ import annotations
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
-from copy import copy
 from dataclasses import dataclass
 
 import torch
 from torch import Tensor, nn
 
 from gaussian_swaying._checks import check_positive, check_vector
+from gaussian_swaying._fixed import changed
 from gaussian_swaying.geometry.frame import SimFrame
 from gaussian_swaying.kernels.graphs import Recordable
 from gaussian_swaying.mpm.twins import Numbers, Twin, Twinned
@@ -96,9 +96,7 @@ class Profile(WindEffect):
 
     def in_frame(self, frame: SimFrame) -> WindEffect:
         """The ground in metres."""
-        other = copy(self)
-        other.ground = placed(frame, self.ground)
-        return other
+        return changed(self, ground=placed(frame, self.ground))
 
 
 class LogProfile(Profile):
@@ -215,9 +213,7 @@ class Plume(WindEffect):
 
     def in_frame(self, frame: SimFrame) -> WindEffect:
         """The source in metres."""
-        other = copy(self)
-        other.source, other.radius = placed(frame, self.source), self.radius * frame.metres_per_unit
-        return other
+        return changed(self, source=placed(frame, self.source), radius=self.radius * frame.metres_per_unit)
 
     def twin(self) -> Twin:
         from gaussian_swaying.aero.effects_triton import plume

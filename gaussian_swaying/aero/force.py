@@ -9,6 +9,7 @@ import torch
 from torch import Tensor, nn
 
 from gaussian_swaying._checks import Number, check_choice, check_plain, check_positive, check_shape, number_of
+from gaussian_swaying._fixed import Fixed
 from gaussian_swaying.aero.patches import PatchSums
 from gaussian_swaying.geometry.groups import sums
 from gaussian_swaying.geometry.linalg import cofactor
@@ -267,7 +268,7 @@ def added_mass_per_area(breadth: float, air_density: float) -> float:
     return 0.25 * math.pi * air_density * breadth
 
 
-class AeroForce(nn.Module):
+class AeroForce(Fixed, nn.Module):
     """Wind on surface patches: stores the coefficients and calls :func:`aero_force`.
 
     The paper's coefficients are visual parameters. For comparison, a flat plate across the flow has a C_D of about 1.2,
@@ -295,6 +296,8 @@ class AeroForce(nn.Module):
         >>> aero(torch.tensor([0.0, 0.0, -3.0]), torch.zeros(1, 3), up, torch.ones(1))[0, 2]
         tensor(-9.)
     """
+
+    live_as = "aero"
 
     def __init__(
         self,

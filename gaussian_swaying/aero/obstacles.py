@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from abc import abstractmethod
 from collections.abc import Sequence
-from copy import copy
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import torch
 from torch import Tensor
 
 from gaussian_swaying._checks import check_positive, check_vector
+from gaussian_swaying._fixed import changed
 from gaussian_swaying.aero.effects import Moment, WindEffect, placed
 from gaussian_swaying.aero.obstacle_flow import (
     cylinder_flow,
@@ -57,12 +57,9 @@ class Obstacle(WindEffect):
             return found
         return found * (1 - self.wake(place, moment)[..., None])
 
-    def moved(self: AnyObstacle, frame: SimFrame) -> AnyObstacle:
-        """A copy with its centre in metres, z up."""
-        other = copy(self)
-        other._buffers = dict(self._buffers)
-        other.middle = torch.tensor(placed(frame, self.center), dtype=torch.float64, device=self.middle.device)
-        return other
+    def moved(self: AnyObstacle, frame: SimFrame, **values: Any) -> AnyObstacle:
+        """A copy with its centre in metres, z up, and other values."""
+        return changed(self, middle=torch.tensor(placed(frame, self.center), dtype=torch.float64), **values)
 
 
 def _direction(flow: Tensor) -> Tensor:
@@ -122,10 +119,7 @@ class CylinderObstacle(Obstacle):
 
     def in_frame(self, frame: SimFrame) -> WindEffect:
         """In metres, z up."""
-        other = self.moved(frame)
-        other.radius = self.radius * frame.metres_per_unit
-        other.axis = frame.direction_to_sim(self.axis)
-        return other
+        return self.moved(frame, radius=self.radius * frame.metres_per_unit, axis=frame.direction_to_sim(self.axis))
 
 
 class EllipsoidObstacle(Obstacle):
@@ -189,7 +183,5 @@ class EllipsoidObstacle(Obstacle):
 
     def in_frame(self, frame: SimFrame) -> WindEffect:
         """In metres, z up."""
-        other = self.moved(frame)
-        other.radii = [radius * frame.metres_per_unit for radius in self.radii]
-        other.axes = frame.direction_to_sim(self.axes)
-        return other
+        radii = [radius * frame.metres_per_unit for radius in self.radii]
+        return self.moved(frame, radii=radii, axes=frame.direction_to_sim(self.axes))

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import os
 from collections.abc import Sequence
-from copy import copy
 from pathlib import Path
 
 import torch
 from torch import Tensor
 
 from gaussian_swaying._checks import check_positive, check_vector
+from gaussian_swaying._fixed import changed
 from gaussian_swaying.aero.carried import CarriedField
 from gaussian_swaying.aero.effects import Moment, WindEffect, placed
 from gaussian_swaying.aero.lookup import picked, trilinear
@@ -130,10 +130,7 @@ class RecordedWind(WindEffect):
 
     def in_frame(self, frame: SimFrame) -> WindEffect:
         """The origin in metres, z up."""
-        other = copy(self)
-        other._buffers = dict(self._buffers)
-        other.place = torch.tensor(placed(frame, self.origin), dtype=torch.float64, device=self.place.device)
-        return other
+        return changed(self, place=torch.tensor(placed(frame, self.origin), dtype=torch.float64))
 
     def forward(self, velocity: Tensor, position: Tensor, moment: Moment) -> Tensor:
         last = len(self.times) - 1

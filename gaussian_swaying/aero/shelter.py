@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-from copy import copy
-
 import torch
 from torch import Tensor
 
 from gaussian_swaying._checks import check_positive
 from gaussian_swaying._devices import in_double
+from gaussian_swaying._fixed import changed
 from gaussian_swaying.aero.effects import Moment, WindEffect
 from gaussian_swaying.aero.lookup import trilinear
 from gaussian_swaying.geometry.frame import SimFrame
@@ -109,9 +108,7 @@ class Shelter(WindEffect):
 
     def in_frame(self, frame: SimFrame) -> WindEffect:
         """A copy, which a simulation refreshes; the given one stays as it is, for the comparison before a resume."""
-        other = copy(self)
-        other._buffers = {name: None if held is None else held.clone() for name, held in self._buffers.items()}
-        return other
+        return changed(self, **{name: held.clone() for name, held in self.named_buffers()})
 
     def refresh(self, position: Tensor, drag_area: Tensor, axes: Tensor) -> None:
         """Compute the share of the wind that is left, from the present shape of the body.

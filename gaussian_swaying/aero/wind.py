@@ -9,7 +9,6 @@ from __future__ import annotations
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
-from copy import copy
 from dataclasses import dataclass
 from itertools import pairwise
 from typing import Literal
@@ -27,6 +26,7 @@ from gaussian_swaying._checks import (
     number_of,
     requires_grad,
 )
+from gaussian_swaying._fixed import Fixed, FixedList, changed, fixed
 from gaussian_swaying.aero.effects import Moment, WindEffect
 from gaussian_swaying.aero.lookup import picked
 from gaussian_swaying.aero.wind_files import read_anemometer
@@ -90,6 +90,8 @@ def sample_index(time: Tensor, interval: float | Tensor) -> Tensor:
 
 class Modulation(Recordable, nn.Module, ABC):
     """Base of all modulations, which change the wind velocity at a given time."""
+
+    live_as = "wind.modulations.*"
 
     @abstractmethod
     def forward(self, velocity: Tensor, time: Tensor, seed: int, stream: int) -> Tensor:
@@ -172,6 +174,7 @@ class GaussianGust(Modulation):
         return velocity + self.std * counter_normal(seed, stream, sample_index(time, self.interval), 3)
 
 
+@fixed
 @dataclass
 class FlowKey:
     """One entry of a schedule.
@@ -231,7 +234,7 @@ def _row(name: str, flow: VectorLike) -> Tensor | tuple[float, ...]:
     return check_vector(name, flow)
 
 
-class WindField(nn.Module):
+class WindField(Fixed, nn.Module):
     """Air velocity over time; the same everywhere in the scene, unless it has effects.
 
     Args:
@@ -250,6 +253,8 @@ class WindField(nn.Module):
         >>> wind(0.5)
         tensor([2., 0., 0.], dtype=torch.float64)
     """
+
+    live_as = "wind"
 
     def __init__(
         self,
@@ -276,8 +281,8 @@ class WindField(nn.Module):
         self.times: Tensor
         self.flows: Tensor
         self.interpolation, self.seed = interpolation, int(seed)
-        self.modulations = nn.ModuleList(modulations)
-        self.effects = nn.ModuleList(effects)
+        self.modulations = FixedList(modulations)
+        self.effects = FixedList(effects)
         self._in_metres = False  # whether `in_frame` made it
         moving = [row.detach() for row in flows if bool(row.any())]
         for effect in effects:
@@ -297,25 +302,17 @@ class WindField(nn.Module):
         """The same wind with its places converted from scene units to metres, z up; itself if it has none."""
         if self.uniform or self._in_metres:
             return self
-        other = copy(self)
-        other._in_metres = True
-        other._modules = dict(self._modules)
-        other.effects = nn.ModuleList(effect.in_frame(frame) for effect in self.effects)  # type: ignore[operator]
-        return other
+        effects = FixedList(effect.in_frame(frame) for effect in self.effects)  # type: ignore[operator]
+        return changed(self, effects=effects, _in_metres=True)
 
     def with_flow(self, flow: VectorLike) -> WindField:
         """The same wind with another steady flow [m/s], in place of a schedule, too; a tensor keeps its gradient."""
-        other = copy(self)
-        flows = flow_rows("flow", [flow]).to(self.flows.device)
-        other._buffers = self._buffers | {"flows": flows, "times": self.times.new_zeros(1)}
-        return other
+        return changed(self, flows=flow_rows("flow", [flow]), times=self.times.new_zeros(1))
 
     def with_schedule(self, times: Sequence[float], flows: Sequence[VectorLike]) -> WindField:
         """The same wind with other flows [m/s] at some times [s], ascending, and linear between them."""
-        other, rows = copy(self), flow_rows("flow", flows).to(self.flows.device)
-        other._buffers = self._buffers | {"flows": rows, "times": self.times.new_tensor(times)}
-        other.interpolation = "linear"
-        return other
+        rows = flow_rows("flow", flows)
+        return changed(self, flows=rows, times=self.times.new_tensor(times), interpolation="linear")
 
     def mean_flow(self, time: Tensor) -> Tensor:
         """The flow without modulations [m/s] at times [s] of shape (...); shape (..., 3), float64."""

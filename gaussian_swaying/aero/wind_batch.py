@@ -116,6 +116,7 @@ def _wrapped(seed: int) -> int:
 
 def _joined(parts: list[Modulation], device: torch.device) -> nn.Module:
     joined = copy(parts[0])
+    vars(joined).pop("_made")
     joined._buffers = {}
     for name, vector in NUMBERS[type(joined)].items():
         values = torch.tensor([getattr(part, name) for part in parts], dtype=torch.float64, device=device)

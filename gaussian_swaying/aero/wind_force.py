@@ -11,6 +11,7 @@ import torch
 from torch import Tensor, nn
 
 from gaussian_swaying._checks import check_shape
+from gaussian_swaying._fixed import FixedList, changed
 from gaussian_swaying.aero.effects import Moment
 from gaussian_swaying.aero.force import LAWS, AeroForce, capped_area
 from gaussian_swaying.aero.patches import Patches, PatchSums
@@ -238,15 +239,15 @@ class WindForce(Force):
         """
         if not self._shelters():
             return self
-        other, wind = copy(self), copy(self._fields[0])
+        wind = self._fields[0]
         assert isinstance(wind, WindField)
-        wind._modules = dict(wind._modules)
-        effects: list[nn.Module] = [copy(effect) for effect in wind.effects]
-        for effect in effects:
-            if isinstance(effect, Shelter):
-                effect._buffers = {name: held.clone() for name, held in effect._buffers.items() if held is not None}
-        wind.effects = nn.ModuleList(effects)
-        other._modules = {**self._modules, "_fields": nn.ModuleList([wind])}
+        effects = [
+            changed(effect, **{name: held.clone() for name, held in effect.named_buffers()})
+            if isinstance(effect, Shelter)
+            else copy(effect)
+            for effect in wind.effects
+        ]
+        other = changed(self, _fields=nn.ModuleList([changed(wind, effects=FixedList(effects))]))
         other.refresh(state)
         return other
 
@@ -292,17 +293,14 @@ class WindForce(Force):
         scenes = max(1, site.shape[:-1].numel())
         shift = count * torch.arange(scenes, device=site.device)[:, None]
         group = (site.reshape(scenes, -1) + shift).reshape(-1)
-        other, aero = copy(self), copy(self.aero)
-        aero.drag_step = "semi_implicit"
-        other._modules = {**self._modules, "aero": aero}
+        aero = changed(self.aero, drag_step="semi_implicit")
         if self.sums is not None:
-            other.sums = self.sums.grouped(group, scenes * count, aero.mostly_linear)
+            sums = self.sums.grouped(group, scenes * count, aero.mostly_linear)
         else:
             normal, area = self.normal.expand(*site.shape, 3).reshape(-1, 3), self.area.expand(site.shape).reshape(-1)
-            other.sums = PatchSums(Patches(normal, area, group, scenes * count), coarse=aero.mostly_linear)
-        area = other.sums.area.reshape(*site.shape[:-1], count)
-        other._buffers = {**self._buffers, "area": area, "normal": area.new_zeros(*area.shape, 3)}
-        return other
+            sums = PatchSums(Patches(normal, area, group, scenes * count), coarse=aero.mostly_linear)
+        area = sums.area.reshape(*site.shape[:-1], count)
+        return changed(self, aero=aero, sums=sums, area=area, normal=area.new_zeros(*area.shape, 3))
 
     def twin(self) -> Twin | None:
         """See :class:`~gaussian_swaying.mpm.twins.Twin`; None if an effect has none, or the lists are too long."""

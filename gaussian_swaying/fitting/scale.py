@@ -9,8 +9,9 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+from gaussian_swaying._fixed import changed
 from gaussian_swaying.aero.wind import WindField
-from gaussian_swaying.simulation.parameters import Setup, other_with, value_of, with_values
+from gaussian_swaying.simulation.parameters import Setup, value_of, with_values
 
 SCALE = "scene.metres_per_unit"
 
@@ -49,5 +50,5 @@ def at_scale(setup: Setup, metres_per_unit: float) -> Setup:
     if setup.points.bending is not None:
         found = replace(found, points=replace(found.points, bending=setup.points.bending / ratio**5))
     if setup.aero.added_mass:
-        found = replace(found, aero=other_with(setup.aero, added_mass=setup.aero.added_mass / ratio))
-    return replace(found, wind=other_with(wind, flows=wind.flows / ratio))
+        found = replace(found, aero=changed(setup.aero, added_mass=setup.aero.added_mass / ratio))
+    return replace(found, wind=changed(wind, flows=wind.flows / ratio))

@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 
 import torch
 
+from gaussian_swaying._fixed import assign
 from gaussian_swaying.aero.added_mass import with_added_mass
 from gaussian_swaying.aero.wind import WindField
 from gaussian_swaying.fitting.changing import changing
@@ -99,7 +100,7 @@ def _groups(simulation: Simulation, values: Sequence[Values], setups: Sequence[S
     for members in shared.values():
         part = [setups[k] for k in members]
         solver = simulation.solver.like(part[0].solver)
-        solver.substep = None  # a stiffer variant may need a shorter one
+        assign(solver, substep=None)  # a stiffer variant may need a shorter one
         stepper = Stepper(solver, part, simulation.frame_dt, lenient=not alike)
         found.append(_Group(members, stepper, stepper.bind(), values[members[0]].get(FILM_START, 0.0)))
     return found

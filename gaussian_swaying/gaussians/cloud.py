@@ -11,9 +11,11 @@ import torch
 from torch import Tensor
 
 from gaussian_swaying._checks import check_shape
+from gaussian_swaying._fixed import fixed
 from gaussian_swaying.gaussians.harmonics import sh_degree
 
 
+@fixed
 @dataclass(frozen=True, slots=True)
 class GaussianCloud:
     """3D Gaussians in storage form, as a 3DGS .ply file stores them.

@@ -16,6 +16,7 @@ from torch import Tensor
 from tqdm import tqdm
 
 from gaussian_swaying._checks import check_positive
+from gaussian_swaying._fixed import fixed
 from gaussian_swaying.geometry.groups import equal_rows
 from gaussian_swaying.geometry.neighbours import nearest_neighbours
 
@@ -264,6 +265,7 @@ def share_volume(owner: Tensor, filled: Tensor, element: float) -> tuple[Tensor,
     return each[filled], torch.where(owner >= 0, each[owner.clamp_min(0)] if len(each) else 0.0, 0.0)
 
 
+@fixed
 @dataclass
 class InteriorFilling:
     """Fills the inside of solids with points that carry mass, feel no wind and are not drawn.

@@ -9,6 +9,7 @@ import torch
 from torch import Tensor, nn
 
 from gaussian_swaying._checks import check_choice, check_shape
+from gaussian_swaying._fixed import Fixed, fixed
 from gaussian_swaying.gaussians.area import coverage_area, patch_area
 from gaussian_swaying.gaussians.cloud import GaussianCloud
 from gaussian_swaying.gaussians.formats import read_gaussians
@@ -19,6 +20,7 @@ from gaussian_swaying.geometry.covariances import covariance, covariance_to_quat
 from gaussian_swaying.geometry.patches import deform_all, smallest_axis_normal
 
 
+@fixed
 @dataclass(frozen=True, slots=True)
 class DeformedGaussians:
     """The properties of deformed Gaussians that renderers and shaders need.
@@ -85,7 +87,7 @@ class DeformedGaussians:
         return {"quats": quats, "scales": scales, "sh": rotate_sh(sh, rotations)}
 
 
-class GaussianSurfaceModel(nn.Module):
+class GaussianSurfaceModel(Fixed, nn.Module):
     """3D Gaussians as surface patches (Gaussian Swaying, "Surface Formulation").
 
     Parameters in storage form, with the names of gsplat: ``means`` (N, 3), ``quats`` (N, 4) wxyz, ``scales`` (N, 3) as
@@ -97,6 +99,7 @@ class GaussianSurfaceModel(nn.Module):
         copy: Whether the tensors of the cloud are copied; else they are shared.
     """
 
+    assignable = ("means", "quats", "scales", "opacities", "sh0", "shN", "reference_normals")
     reference_normals: Tensor | None
 
     def __init__(self, cloud: GaussianCloud, requires_grad: bool = True, *, copy: bool = True) -> None:

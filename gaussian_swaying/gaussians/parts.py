@@ -33,6 +33,7 @@ from torch import Tensor
 
 from gaussian_swaying._checks import check_choice, check_plain, check_poisson_ratio, check_positive, check_shape
 from gaussian_swaying._files import atomic
+from gaussian_swaying._fixed import Fixed, fixed
 from gaussian_swaying._inputs import read_arrays
 from gaussian_swaying.geometry.regions import Region
 
@@ -45,6 +46,7 @@ JOINT = ("joint_stiffness", "joint_turning")
 MOST = 1 << 16  # parts of a file: labels are uint16
 
 
+@fixed
 @dataclass(frozen=True)
 class Part:
     """A part of a splat.
@@ -117,7 +119,7 @@ class Part:
         return any(getattr(self, name) is not None for name in NUMBERS)
 
 
-class Parts:
+class Parts(Fixed):
     """The parts of a splat.
 
     Args:

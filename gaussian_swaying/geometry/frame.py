@@ -11,9 +11,11 @@ from torch import Tensor
 
 from gaussian_swaying._checks import check_positive, check_shape
 from gaussian_swaying._devices import in_double
+from gaussian_swaying._fixed import fixed
 from gaussian_swaying.geometry.rotations import rotation_from_z
 
 
+@fixed
 @dataclass(frozen=True, slots=True)
 class SimFrame:
     """Similarity between scene coordinates and the simulation's: metres, z up, origin at the object's centre.

@@ -11,9 +11,11 @@ import torch
 from torch import Tensor
 
 from gaussian_swaying._checks import check_vector
+from gaussian_swaying._fixed import fixed
 from gaussian_swaying.geometry.frame import SimFrame
 
 
+@fixed
 @dataclass
 class KeyedPath:
     """A rigid motion given at some times, and linear in between.

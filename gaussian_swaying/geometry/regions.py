@@ -9,10 +9,11 @@ import torch
 from torch import Tensor
 
 from gaussian_swaying._checks import check_positive, check_shape, check_vector
+from gaussian_swaying._fixed import Fixed
 from gaussian_swaying.geometry.frame import SimFrame
 
 
-class Region(ABC):
+class Region(Fixed, ABC):
     """A part of space. Subclasses can be named in a configuration.
 
     Attributes:

@@ -11,6 +11,7 @@ from typing import Any
 import torch
 from torch import nn
 
+from gaussian_swaying._fixed import Fixed
 from gaussian_swaying.kernels.language import INTERPRETED
 
 RECORDED = 200_000
@@ -20,7 +21,7 @@ _RECORDING = threading.Lock()
 """Held while a graph is recorded: PyTorch cannot give memory back to the driver during that time."""
 
 
-class Recordable:
+class Recordable(Fixed):
     """Base of modules that may be recorded in a CUDA graph.
 
     Attributes:

@@ -11,9 +11,11 @@ import math
 from dataclasses import dataclass
 
 from gaussian_swaying._checks import check_choice
+from gaussian_swaying._fixed import fixed
 from gaussian_swaying.mpm.damping import decay_rate
 
 
+@fixed
 @dataclass(frozen=True, slots=True)
 class KnownMaterial:
     """Numbers of a material.

@@ -9,9 +9,10 @@ from itertools import pairwise
 from typing import Any, Literal
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
 from gaussian_swaying._checks import check_choice, check_positive, check_vector
+from gaussian_swaying._fixed import Fixed, FixedList, assign
 from gaussian_swaying.geometry.frame import SimFrame
 from gaussian_swaying.mpm.body import Body
 from gaussian_swaying.mpm.boundaries.boundary import Boundary
@@ -36,7 +37,7 @@ Fused = Any
 TRANSFERS = ("auto", "torch", "kernels")
 
 
-class MPMSolver(Solver):
+class MPMSolver(Fixed, Solver):
     """Material point method in three formulations over one set of transfers.
 
     ``total`` (total Lagrangian MPM; de Vaucorbeil, Nguyen & Hutchinson 2020): stencils at the rest positions, computed
@@ -82,6 +83,8 @@ class MPMSolver(Solver):
         -0.0098
     """
 
+    live_as = "solver"
+
     def __init__(
         self,
         dx: float = 0.02,
@@ -113,7 +116,7 @@ class MPMSolver(Solver):
         self.cfl, self.substep = float(cfl), substep
         if pivot and formulation != "modes":
             raise ValueError("`pivot` joins two modes: set `formulation` to modes, or `pivot` to false.")
-        self.boundaries = nn.ModuleList(boundaries)
+        self.boundaries = FixedList(boundaries)
         # the same in metres; in a tuple, because these copies do not belong to the module's state
         self._framed: tuple[Boundary, ...] | None = None
         self._bound: Formulation | None = None
@@ -256,7 +259,8 @@ class MPMSolver(Solver):
         self._bound = self._fused = None
         body = Body(points, self._framed or self._conditions(), surface)
         if self.may_choose:
-            self.formulation, self.why = self._choice(body)
+            formulation, why = self._choice(body)
+            assign(self, formulation=formulation, why=why)
         bound = FORMULATIONS[self.formulation](body, self.settings)
         self._fused_obstacle = self._why_not_kernels(bound)
         self._bound = bound

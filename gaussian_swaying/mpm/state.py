@@ -12,6 +12,7 @@ import torch
 from torch import Tensor
 
 from gaussian_swaying._checks import check_finite, check_shape
+from gaussian_swaying._fixed import fixed
 from gaussian_swaying.mpm.laws.fixed_corotated import FixedCorotated
 from gaussian_swaying.mpm.laws.law import ConstitutiveLaw
 
@@ -107,6 +108,7 @@ _OPTIONAL = ("damping", "bending")
 _OPTIONAL_FIELDS = (*_OPTIONAL, "normal")
 
 
+@fixed
 @dataclass(frozen=True, slots=True)
 class MaterialPoints:
     """The material at rest, which the solver moves but never changes.
@@ -328,6 +330,7 @@ def _join_attached(parts: Sequence[MaterialPoints]) -> Tensor | None:
     return torch.cat(found)
 
 
+@fixed
 @dataclass(frozen=True, slots=True, kw_only=True)
 class State:
     """Everything that changes in a run, of any solver. A step returns a new one; nothing is changed in place.
@@ -394,6 +397,7 @@ class State:
         return cls(**moved)
 
 
+@fixed
 @dataclass(frozen=True, slots=True, kw_only=True)
 class MPMState(State):
     """The state of an :class:`~gaussian_swaying.mpm.solver.MPMSolver`.

@@ -26,6 +26,7 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
+from gaussian_swaying._fixed import Fixed
 from gaussian_swaying.kernels.graphs import fingerprint, tensors_in
 
 
@@ -77,7 +78,7 @@ class Twin:
     parts: tuple[Twin, ...] = ()
 
 
-class Twinned:
+class Twinned(Fixed):
     """Base of components that may have a twin; a subclass does not inherit it, because it may compute something else.
 
     A subclass that computes the same says ``twin = Base.twin``.

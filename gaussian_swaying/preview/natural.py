@@ -18,6 +18,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from gaussian_swaying._fixed import changed
 from gaussian_swaying.aero.force import AeroForce, added_mass_per_area
 from gaussian_swaying.aero.wind import WindField
 from gaussian_swaying.aero.wind_force import WindForce
@@ -31,7 +32,6 @@ from gaussian_swaying.mpm.state import State
 from gaussian_swaying.preview.kinds import KINDS, Kind
 from gaussian_swaying.preview.shape import extent, quantile
 from gaussian_swaying.preview.stretch import cloth_motion, linear_motion, rate_for, typical_start
-from gaussian_swaying.simulation.parameters import other_with
 from gaussian_swaying.simulation.simulated_scene import SimulatedScene
 from gaussian_swaying.simulation.simulation import Simulation
 
@@ -282,7 +282,7 @@ def _drag(simulation: Simulation, frontal: float, flow: Tensor, kind: Kind) -> f
 
 def _with_drag(aero: AeroForce, factor: float) -> AeroForce:
     """The same force with other coefficients."""
-    return other_with(aero, **{name: factor * getattr(aero, name) for name in ("C_D", "C_F", "C_L")})
+    return changed(aero, **{name: factor * getattr(aero, name) for name in ("C_D", "C_F", "C_L")})
 
 
 def _top(scene: SimulatedScene, state: State) -> tuple[Tensor, float, float]:

@@ -20,6 +20,7 @@ from torch import Tensor
 
 from gaussian_swaying._checks import check_choice, check_literals, check_positive
 from gaussian_swaying._files import atomic, is_blank, remove_temporaries, save_png, write_json, write_table, write_text
+from gaussian_swaying._fixed import fixed
 from gaussian_swaying.recording.checkpoint import read_checkpoint
 from gaussian_swaying.recording.layout import OURS, frame_folder, raw_folder, video_file
 from gaussian_swaying.recording.nodes import NODES, split_far
@@ -49,6 +50,7 @@ def _write_png(path: Path, pixels: np.ndarray) -> None:
         save_png(temporary, pixels)
 
 
+@fixed
 @dataclass(eq=False)
 class Recorder:
     """Writes frames, trajectory, checkpoint, summary and video of a run to one folder.
@@ -117,18 +119,23 @@ class Recorder:
         self._writer = FrameWriter()
         self._films: dict[str, _Film] = {}  # by the folder of their frames
         self._lock: FolderLock | None = None
-        self.checkpoint_frame: int | None = None
+        self._checkpoint_frame: int | None = None
         self._real_time_fps = 25.0
         self._blank: list[tuple[str, int]] = []
 
     def __getstate__(self) -> dict[str, Any]:
         """The settings: a copy has no folder, no open files and nothing that waits to be written."""
         closed: dict[str, Any] = {"_folder": None, "_writer": None, "_films": {}, "_lock": None, "_blank": []}
-        return vars(self) | closed | {"checkpoint_frame": None}
+        return vars(self) | closed | {"_checkpoint_frame": None}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         """Take the settings."""
         vars(self).update(state, _writer=FrameWriter())
+
+    @property
+    def checkpoint_frame(self) -> int | None:
+        """The frame of the last checkpoint."""
+        return self._checkpoint_frame
 
     @property
     def folder(self) -> Path:
@@ -178,7 +185,7 @@ class Recorder:
         path = Path(folder)
         places = [frame_folder(render, camera) for camera in ("", *cameras) for render in self.renders]
         self._films = {place: _Film() for place in places} if self.images else {}
-        self.checkpoint_frame, self._blank = None, []
+        self._checkpoint_frame, self._blank = None, []
         try:
             checkpoint = self._continue(path, config, check) if resume else None
             if not resume:
@@ -216,7 +223,7 @@ class Recorder:
             mark(path)
         for sentence in told:
             print(f"warning: {sentence}", file=sys.stderr)
-        self.checkpoint_frame = checkpoint["frame"]
+        self._checkpoint_frame = checkpoint["frame"]
         return checkpoint
 
     def _missing(self, path: Path, checkpoint: dict[str, Any]) -> list[str]:
@@ -338,7 +345,7 @@ class Recorder:
 
         def write() -> None:
             save_whole(path, copy.get())
-            self.checkpoint_frame = checkpoint["frame"]
+            self._checkpoint_frame = checkpoint["frame"]
 
         self._submit(path, write, after_all=True)
 

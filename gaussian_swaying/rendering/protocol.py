@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from gaussian_swaying._checks import check_shape
+from gaussian_swaying._fixed import fixed
 from gaussian_swaying.rendering.cameras.camera import Camera
 
 MIN_ALPHA = 1.0 / 255.0
@@ -20,6 +21,7 @@ SLACK = 0.01
 """Added to pixel extents [pixels] because of round-off; the exact test is on alpha."""
 
 
+@fixed
 @dataclass(frozen=True, slots=True, eq=False)
 class RenderOutput:
     r"""Picture of a Gaussian scene.

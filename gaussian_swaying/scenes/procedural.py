@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 
 from gaussian_swaying._checks import check_literals, check_positive
+from gaussian_swaying._fixed import Fixed
 from gaussian_swaying.gaussians.cloud import GaussianCloud, joined
 from gaussian_swaying.gaussians.harmonics import SH_DC
 from gaussian_swaying.geometry.patches import smallest_axis_normal
@@ -19,7 +20,7 @@ from gaussian_swaying.scenes.printed_cloth import printed_colours
 _MOST = 50_000_000  # Gaussians, about 100 GB
 
 
-class ProceduralScene(ABC):
+class ProceduralScene(Fixed, ABC):
     """Base of all generated scenes."""
 
     @abstractmethod

@@ -11,6 +11,7 @@ from torch import Tensor, nn
 
 from gaussian_swaying._checks import check_vector, check_whole
 from gaussian_swaying._devices import in_double
+from gaussian_swaying._fixed import fixed
 from gaussian_swaying.aero.copied_wind import CopiedWind
 from gaussian_swaying.aero.shelter import Shelter
 from gaussian_swaying.aero.wind import WindField
@@ -25,6 +26,7 @@ RENDERS = ("color", "depth", "normal")
 """Renders of a run with copies."""
 
 
+@fixed
 @dataclass
 class Copy:
     """One of several copies of the object. Without values it is the object itself, at its own place.

@@ -12,6 +12,7 @@ import torch
 from torch import Tensor
 
 from gaussian_swaying._devices import in_double
+from gaussian_swaying._fixed import fixed
 from gaussian_swaying.aero.added_mass import AirLift
 from gaussian_swaying.geometry.linalg import determinant, matmul3, symmetric_eigenvalues
 from gaussian_swaying.geometry.neighbours import nearest_neighbours
@@ -39,6 +40,7 @@ class SimulationDiverged(RuntimeError):  # noqa: N818  (it ends a run the way St
         super().__init__(f"The simulation diverged at t = {time:.4g} s{who}: {cause}. Remedy: {remedy}.")
 
 
+@fixed
 @dataclass(frozen=True)
 class FrameDiagnostics:
     """Health of the state at the end of a frame; of a batch sums and extremes over its scenes.

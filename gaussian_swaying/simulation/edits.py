@@ -12,6 +12,7 @@ import torch
 from torch import Tensor, nn
 
 from gaussian_swaying._checks import check_plain, check_positive, check_vector
+from gaussian_swaying._fixed import fixed
 from gaussian_swaying.gaussians.harmonics import SH_DC
 from gaussian_swaying.geometry.regions import Region, whereabouts
 from gaussian_swaying.mpm.laws.law import ConstitutiveLaw
@@ -22,6 +23,7 @@ from gaussian_swaying.simulation.stepper import Stepper
 LUMINANCE = (0.2126, 0.7152, 0.0722)  # ITU-R BT.709
 
 
+@fixed
 @dataclass
 class Edit:
     """A change to a part of the object.

@@ -9,6 +9,7 @@ from functools import cached_property
 
 import torch
 
+from gaussian_swaying._fixed import fixed
 from gaussian_swaying.gaussians.export import export_cloud
 from gaussian_swaying.gaussians.model import DeformedGaussians
 from gaussian_swaying.mpm.state import State
@@ -19,6 +20,7 @@ from gaussian_swaying.simulation.painter import Painter
 from gaussian_swaying.simulation.stepper import Launched
 
 
+@fixed
 @dataclass(frozen=True, eq=False)
 class Frame:
     """A frame of a simulation.

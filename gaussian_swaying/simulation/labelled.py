@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import copy
 import dataclasses
 
-from torch import nn
-
+from gaussian_swaying._fixed import FixedList, changed
 from gaussian_swaying.gaussians.cloud import GaussianCloud
 from gaussian_swaying.gaussians.parts import NUMBERS, PartRegion
 from gaussian_swaying.mpm.boundaries.boundary import Boundary
@@ -51,6 +49,5 @@ def with_parts(scene: Scene, cloud: GaussianCloud, material: Material, solver: S
         names = [part.name for k, part in enumerate(parts.parts) if part.role == "held" and bool((labels == k).any())]
         acting.append(PinnedRegion(PartRegion(", ".join(names), means, held), "nodes"))
     if acting:
-        solver = copy.copy(solver)
-        solver._modules = solver._modules | {"boundaries": nn.ModuleList([*solver.boundaries, *acting])}  # of the copy
+        solver = changed(solver, boundaries=FixedList([*solver.boundaries, *acting]))
     return material, solver

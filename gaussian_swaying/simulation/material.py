@@ -16,12 +16,14 @@ from gaussian_swaying._checks import (
     number_of,
     requires_grad,
 )
+from gaussian_swaying._fixed import fixed
 from gaussian_swaying.geometry.regions import Region
 from gaussian_swaying.mpm.laws.law import ConstitutiveLaw
 from gaussian_swaying.mpm.materials import known_material
 from gaussian_swaying.mpm.state import MaterialPoints
 
 
+@fixed
 @dataclass
 class MaterialRegion:
     """Different material in a part of the object.
@@ -47,6 +49,7 @@ class MaterialRegion:
     law: ConstitutiveLaw | None = None
 
 
+@fixed
 @dataclass
 class Material:
     """The material of the object.
@@ -72,6 +75,8 @@ class Material:
 
     In Python, ``E``, ``nu`` and ``density`` may be tensors of one number that require a gradient.
     """
+
+    live_as = "material"
 
     E: Number = 1e5
     nu: Number = 0.3

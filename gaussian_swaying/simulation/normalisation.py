@@ -5,15 +5,15 @@ Boxes and planes of a PhysGaussian configuration are in this space; :class:`Norm
 
 from __future__ import annotations
 
-import copy
 import dataclasses
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
 from gaussian_swaying._checks import check_positive
+from gaussian_swaying._fixed import FixedList, changed, fixed
 from gaussian_swaying.gaussians.cloud import GaussianCloud
 from gaussian_swaying.geometry.frame import SimFrame
 from gaussian_swaying.geometry.regions import RegionInFrame
@@ -27,6 +27,7 @@ from gaussian_swaying.simulation.material import Material
 from gaussian_swaying.simulation.scene import Scene
 
 
+@fixed
 @dataclass
 class Normalisation:
     """PhysGaussian's normalised space. With it, boundaries and regions of the material are given in this space.
@@ -105,15 +106,14 @@ class Normalisation:
                 "`normalisation` sets the scale of the scene: remove `scene.longest_side` and "
                 "`scene.metres_per_unit`, or `normalisation`."
             )
-        scene, solver = copy.copy(scene), copy.copy(solver)
         turned = SimFrame(torch.zeros(3, dtype=torch.float64), self.rotation.T.contiguous(), 1.0)
-        scene.region = RegionInFrame(scene.region, turned)
+        scene = changed(scene, region=RegionInFrame(scene.region, turned))
         cloud = scene.cloud() if cloud is None else cloud
         frame = self.fit(cloud.means[scene.select(cloud)])
-        scene.metres_per_unit = 1 / frame.metres_per_unit
+        scene = changed(scene, metres_per_unit=1 / frame.metres_per_unit)
         regions = [dataclasses.replace(e, region=RegionInFrame(e.region, frame)) for e in material.regions]
         conditions = [b.in_frame(frame) for b in solver.boundaries if isinstance(b, Boundary)]
-        solver._modules = solver._modules | {"boundaries": nn.ModuleList(conditions)}  # of the copy alone
+        solver = changed(solver, boundaries=FixedList(conditions))
         material, first = dataclasses.replace(material, regions=regions), camera and _seen(camera, frame)
         further = {name: _seen(path, frame) for name, path in (cameras or {}).items()}
         changes = [dataclasses.replace(e, region=e.region and RegionInFrame(e.region, frame)) for e in edits]
@@ -122,7 +122,4 @@ class Normalisation:
 
 def _seen(camera: CameraPath, frame: SimFrame) -> CameraPath:
     """A camera path in scene units."""
-    if isinstance(camera, PhysGaussianCamera):
-        camera = copy.copy(camera)
-        camera.frame = frame
-    return camera
+    return changed(camera, frame=frame) if isinstance(camera, PhysGaussianCamera) else camera

@@ -9,6 +9,7 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
+from gaussian_swaying._fixed import Fixed
 from gaussian_swaying._turns import Turn, in_turn
 from gaussian_swaying.gaussians.harmonics import sh_to_color
 from gaussian_swaying.gaussians.model import DeformedGaussians
@@ -26,7 +27,7 @@ from gaussian_swaying.simulation.simulated_scene import SimulatedScene
 MAX_PIXELS = 1 << 26  # per picture: twice as many as 8K
 
 
-class Painter(nn.Module):
+class Painter(Fixed, nn.Module):
     """Draws a simulated scene from its cameras.
 
     Args:
@@ -42,6 +43,8 @@ class Painter(nn.Module):
     Raises:
         ValueError: If the background or the name of a camera is invalid.
     """
+
+    assignable = ("shader", "camera", "cameras", "background", "frame_dt")
 
     def __init__(
         self,
@@ -93,12 +96,6 @@ class Painter(nn.Module):
     def renderer(self, renderer: Renderer) -> None:
         self._renderer = renderer
 
-    def __setattr__(self, name: str, value: Any) -> None:
-        if name == "renderer":  # a Module would become a part of this one without passing the setter
-            object.__setattr__(self, name, value)
-        else:
-            super().__setattr__(name, value)
-
     @in_turn
     def camera_at(self, frame: int, name: str = "") -> Camera:
         """The camera of a frame, on the device and in the precision of the Gaussians; one copy, without waiting for it.
@@ -110,9 +107,7 @@ class Painter(nn.Module):
         means, path = self.scene.model.means, self.cameras[name] if name else self.camera
         if not path.still:
             return self._camera(frame, name).to(means.device, means.dtype)
-        # its numbers may be changed between two frames, also within a list, an array or a tensor
-        numbers = [_fixed(value) for value in vars(path).values()]
-        key = (path, *numbers, means.device, means.dtype)
+        key = (path, means.device, means.dtype)
         if self._still.get(name, ((), None))[0] != key:
             with torch.inference_mode(False):  # it outlives the call
                 self._still[name] = (key, self._camera(frame, name).to(means.device, means.dtype))
@@ -311,9 +306,3 @@ def seen_from(sh: Tensor, eye: Tensor, means: Tensor, rotations: Tensor | None) 
     view = torch.nn.functional.normalize(means - eye, dim=-1)
     at_rest = view if rotations is None else (view[..., None] * rotations).sum(-2)
     return view, sh_to_color(sh, at_rest)
-
-
-def _fixed(value: Any) -> object:
-    """An attribute of a camera path as it is now; vectors become tuples."""
-    value = value.tolist() if hasattr(value, "tolist") else value
-    return tuple(value) if isinstance(value, list) else value

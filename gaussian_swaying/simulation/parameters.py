@@ -11,7 +11,6 @@ page, and can be an unknown of a fit and an axis of a sweep.
 
 from __future__ import annotations
 
-import copy
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import KW_ONLY, dataclass, replace
@@ -22,6 +21,7 @@ from torch import Tensor, nn
 
 from gaussian_swaying._checks import check_literals, check_vector, number_of, requires_grad
 from gaussian_swaying._devices import in_double
+from gaussian_swaying._fixed import LIVE, FixedList, changed, fixed
 from gaussian_swaying.aero.computed_air import ComputedAir
 from gaussian_swaying.aero.force import AeroForce
 from gaussian_swaying.aero.wind import SpatialWind, WindField
@@ -39,6 +39,7 @@ POLAR = ("wind.speed", "wind.azimuth", "wind.elevation")
 """Three numbers that together are ``wind.flow``."""
 
 
+@fixed
 @dataclass(frozen=True, eq=False)
 class Setup:
     """Scene, material and drivers of a simulation. Never changed in place: another value makes another setup.
@@ -68,6 +69,7 @@ Read = Callable[[Setup], Any]
 Write = Callable[[Setup, Mapping[str, Any]], Setup]
 
 
+@fixed
 @dataclass(frozen=True, eq=False)
 class Parameter:
     """A number, or three, that may change.
@@ -166,6 +168,7 @@ def register(name: str, read: Read | None = None, *, write: Write | None = None,
     if read is None or write is None:
         raise ValueError(f"Expected `{name}` to be forces.CLASS.ATTRIBUTE, or to come with `read` and `write`.")
     _KNOWN[name] = Parameter(name, read, write, **settings)
+    LIVE.add(name)
     return _KNOWN[name]
 
 
@@ -297,24 +300,6 @@ def flow_of(base: Sequence[float], values: Mapping[str, float]) -> list[float]:
 # ---- how they are set
 
 
-def other_with(module: M, **values: Any) -> M:
-    """A copy of a module with other attributes or buffers; its other parts are shared."""
-    other = copy.copy(module)
-    for part in ("_parameters", "_buffers", "_modules"):
-        vars(other)[part] = dict(vars(module)[part])
-    for name, value in values.items():
-        old = getattr(module, name)
-        if name in other._buffers:
-            given = value.to(old) if isinstance(value, Tensor) else torch.full_like(old, value)
-            other._buffers[name] = given.reshape(old.shape)
-        elif name in other._parameters:
-            given = value.detach().to(old) if isinstance(value, Tensor) else torch.full_like(old, value)
-            other._parameters[name] = nn.Parameter(given.reshape(old.shape), old.requires_grad)
-        else:
-            setattr(other, name, value)
-    return other
-
-
 def _uniform_wind(setup: Setup) -> WindField:
     if not isinstance(setup.wind, WindField):
         raise ValueError("Expected `wind` to be a WindField: a custom wind has no numbers that could be changed.")
@@ -341,7 +326,7 @@ def _write_wind(setup: Setup, values: Mapping[str, Any]) -> Setup:
     if "wind.flow" in values:
         wind = wind.with_flow(values["wind.flow"])
     if "wind.seed" in values:
-        wind = other_with(wind, seed=values["wind.seed"])
+        wind = changed(wind, seed=values["wind.seed"])
     return replace(setup, wind=wind)
 
 
@@ -351,14 +336,8 @@ def _write_modulation(setup: Setup, values: Mapping[str, Any]) -> Setup:
     for name, value in values.items():
         _of_modulation(name)(setup)  # it is there
         _, _, place, field = name.split(".")
-        parts[int(place)] = other_with(parts[int(place)], **{field: value})
-    return replace(setup, wind=_with_parts(wind, modulations=nn.ModuleList(parts)))
-
-
-def _with_parts(module: M, **parts: nn.Module) -> M:
-    other = other_with(module)
-    other._modules.update(parts)
-    return other
+        parts[int(place)] = changed(parts[int(place)], **{field: value})
+    return replace(setup, wind=changed(wind, modulations=FixedList(parts)))
 
 
 def _of_modulation(name: str) -> Read:
@@ -448,7 +427,7 @@ def _thickness(setup: Setup) -> float:
 
 
 def _write_aero(setup: Setup, values: Mapping[str, Any]) -> Setup:
-    return replace(setup, aero=other_with(setup.aero, **{name[5:]: value for name, value in values.items()}))
+    return replace(setup, aero=changed(setup.aero, **{name[5:]: value for name, value in values.items()}))
 
 
 def _of_aero(name: str) -> Read:
@@ -481,7 +460,7 @@ def _of_force(kind: str, attribute: str) -> tuple[Read, Write]:
     def write(setup: Setup, values: Mapping[str, Any]) -> Setup:
         read(setup)
         (value,) = values.values()
-        forces = tuple(other_with(f, **{attribute: value}) if type(f).__name__ == kind else f for f in setup.forces)
+        forces = tuple(changed(f, **{attribute: value}) if type(f).__name__ == kind else f for f in setup.forces)
         return replace(setup, forces=forces)
 
     return read, write

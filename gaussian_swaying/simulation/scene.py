@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from gaussian_swaying._checks import check_literals, check_positive, check_vector
+from gaussian_swaying._fixed import Fixed
 from gaussian_swaying.gaussians.cloud import GaussianCloud
 from gaussian_swaying.gaussians.filling import InteriorFilling
 from gaussian_swaying.gaussians.formats import read_gaussians
@@ -23,7 +24,7 @@ else:  # what a YAML file can contain
     PartsLike = str | os.PathLike[str]
 
 
-class Scene:
+class Scene(Fixed):
     """The source of the Gaussians, and the choice of those that are simulated.
 
     Args:

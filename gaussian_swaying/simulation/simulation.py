@@ -10,8 +10,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 import torch
+from torch import Tensor, nn
 
 from gaussian_swaying._checks import check_choice, check_frames, check_positive, check_vector
+from gaussian_swaying._fixed import Fixed, changed
 from gaussian_swaying._turns import Turn, in_turn
 from gaussian_swaying.aero.computed_air import ComputedAir
 from gaussian_swaying.aero.force import AeroForce
@@ -28,6 +30,7 @@ from gaussian_swaying.config.parser import (
 )
 from gaussian_swaying.gaussians.cloud import GaussianCloud
 from gaussian_swaying.geometry.regions import Region
+from gaussian_swaying.kernels.graphs import tensors_in
 from gaussian_swaying.mpm.boundaries.obstacle import Obstacle
 from gaussian_swaying.mpm.contact.surface import Contact
 from gaussian_swaying.mpm.forces import Force, as_forces
@@ -63,7 +66,7 @@ from gaussian_swaying.simulation.labelled import with_parts
 from gaussian_swaying.simulation.material import Material
 from gaussian_swaying.simulation.normalisation import Normalisation
 from gaussian_swaying.simulation.painter import Painter
-from gaussian_swaying.simulation.parameters import Setup, other_with, with_values
+from gaussian_swaying.simulation.parameters import Setup, with_values
 from gaussian_swaying.simulation.run import Run
 from gaussian_swaying.simulation.simulated_scene import SimulatedScene
 from gaussian_swaying.simulation.stepper import Stepper
@@ -73,7 +76,7 @@ if TYPE_CHECKING:
     from typing_extensions import Self
 
 
-class Simulation:
+class Simulation(Fixed):
     """A splat in the wind. The constructor is the schema of the YAML; every component also works on its own.
 
     Positions and regions are given in scene units and axes; velocities, gravity and light in metres, z up. Threads that
@@ -131,10 +134,7 @@ class Simulation:
         [0.0, 0.04, 0.08]
     """
 
-    __slots__ = (
-        "__weakref__", "_changed", "_editor", "_given", "_painter", "_recorder", "_stepper", "_text", "files",
-        "frames_wanted", "resumable",
-    )  # fmt: skip
+    assignable = ("frames_wanted",)
 
     def __init__(
         self,
@@ -204,9 +204,9 @@ class Simulation:
         self._editor = SceneEditor(self._stepper, edits)
         self._recorder = self._recorder_or(recorder)
         self.frames_wanted = 250  # of a run; those of the file, if there is one
-        self.files: list[Path] = []  # what the last run wrote
-        self.resumable: tuple[Path, int] | None = None  # the checkpoint of the last run, and its frame
-        self._text, self._changed, self._given = "", set(given), given
+        self._files: list[Path] = []
+        self._resumable: tuple[Path, int] | None = None
+        self._text, self._given, self._first = "", given, self._running()
 
     # ---- parts
 
@@ -229,6 +229,16 @@ class Simulation:
     def scene(self) -> SimulatedScene:
         """Gaussians, material points and patches."""
         return self._painter.scene
+
+    @property
+    def files(self) -> list[Path]:
+        """The files that the last run wrote."""
+        return self._files
+
+    @property
+    def resumable(self) -> tuple[Path, int] | None:
+        """The checkpoint of the last run, and its frame."""
+        return self._resumable
 
     @property
     def solver(self) -> Solver:
@@ -307,8 +317,7 @@ class Simulation:
     @frame_dt.setter
     def frame_dt(self, frame_dt: float) -> None:
         check_positive("frame_dt", frame_dt)
-        self._stepper.frame_dt = float(frame_dt)
-        self._note(frame_dt=float(frame_dt))
+        self._stepper.frame_dt = self._painter.frame_dt = float(frame_dt)
 
     @property
     def recorder(self) -> Recorder:
@@ -366,13 +375,7 @@ class Simulation:
             if setup.points is not before.points:
                 self.scene.points = setup.points
                 self._editor.rebase(setup.points)
-            state = self._stepper.take(setup, state)
-        for name in ("wind", "aero", "forces", "material"):
-            if getattr(setup, name) is not getattr(before, name):
-                self._note(**{name: getattr(setup, name)})
-        if setup.solver is not before.solver:
-            self._note(solver=self.solver)
-        return state
+            return self._stepper.take(setup, state)
 
     def variant(self, values: Mapping[str, Any], recorder: Recorder | None = None, config: str = "") -> Simulation:
         """Another simulation of the same scene with other numbers; it shares Gaussians, cameras and pins.
@@ -388,29 +391,45 @@ class Simulation:
         points, sh0, shN = self._editor.unedited
         other, setup = copy.copy(self), with_values(replace(self.setup, points=points), values)
         solver = self.solver.like(setup.solver)
-        scene = other_with(self.scene, points=setup.points, model=other_with(self.scene.model, sh0=sh0, shN=shN))
-        other._painter = other_with(self._painter, scene=scene)
+        scene = changed(self.scene, points=setup.points, model=changed(self.scene.model, sh0=sh0, shN=shN))
+        other._painter = changed(self._painter, scene=scene)
         setup = replace(setup, scene=scene, wind=setup.wind.to(self.device))
         other._stepper = Stepper(solver, setup, self.frame_dt, turn=self.turn, copies=self._stepper.copies)
         other._editor = SceneEditor(other._stepper, self._editor.edits)
-        other._recorder, other.files, other._given = self._recorder_or(recorder), [], dict(self._given)
+        other._recorder, other._files = self._recorder_or(recorder), []
         other.config = config
         return other
 
-    def _note(self, **given: Any) -> None:
-        """Remember what has changed, so that a run with other values is not resumed."""
-        self._given.update(given)
-        self._changed.update(given)
+    def _running(self) -> dict[str, tuple[object, list[object]]]:
+        """What runs now by its names: each with the objects and versions of tensors that change if it does."""
+        setup, painter = self.setup, self._painter
+        parts = {name: getattr(setup, name) for name in ("material", "wind", "aero", "forces", "air")}
+        parts |= {name: getattr(painter, name) for name in ("shader", "camera", "cameras", "background")}
+        parts |= {"solver": self.solver, "frame_dt": self._stepper.frame_dt}
+        found: dict[str, tuple[object, list[object]]] = {}
+        for name, part in parts.items():
+            held = list(part.items()) if isinstance(part, dict) else [part]
+            held = list(part) if isinstance(part, tuple) else held
+            tensors = (
+                [part] if isinstance(part, Tensor) else tensors_in(one for one in held if isinstance(one, nn.Module))
+            )
+            marks = [*held, *([setup.solver] if name == "solver" else [])]
+            found[name] = part, [*marks, *(0 if one.is_inference() else one._version for one in tensors)]
+        return found
 
     @property
     def config(self) -> str:
-        """The resume key of a run as YAML: the configuration file, and the arguments given in Python."""
-        heading = "changed_in_python" if self._text else "made_in_python"
-        return self._text + python_text(heading, {name: self._given[name] for name in self._changed})
+        """The resume key of a run as YAML: the configuration file, the arguments given in Python, and what changed."""
+        given, heading = dict(self._given), "changed_in_python" if self._text else "made_in_python"
+        for name, (part, marks) in self._running().items():
+            first = self._first[name][1]
+            if len(first) != len(marks) or not all(map(_same, first, marks)):
+                given[name] = part
+        return self._text + python_text(heading, given)
 
     @config.setter
     def config(self, text: str) -> None:
-        self._text, self._changed = text, set()
+        self._text, self._given, self._first = text, {}, self._running()
 
     # ---- from a YAML file
 
@@ -451,7 +470,7 @@ class Simulation:
         parts: Any = with_custom(parser, settings, parser.instantiate(settings))
         simulation = cls(**{name: parts.get(name) for name in arguments_of(cls)} | changes)
         simulation.config = text
-        simulation._changed |= set(changes) - set(NOT_COMPARED)
+        simulation._given = {name: value for name, value in changes.items() if name not in NOT_COMPARED}
         simulation.frames_wanted = settings.frames
         return simulation
 
@@ -542,10 +561,14 @@ class Simulation:
         """
         self._recorder = recorder or self._recorder
         count = self.frames_wanted if frames is None else check_frames("frames", frames)
-        run, self.resumable = Run(self._painter, self._editor, self._recorder, count, self.config), None
+        run, self._resumable = Run(self._painter, self._editor, self._recorder, count, self.config), None
         try:
             return run.whole(Path(output), resume, dict(settings or {}), progress)
         finally:
-            self.files, frame = run.files, self._recorder.checkpoint_frame
+            self._files, frame = run.files, self._recorder.checkpoint_frame
             if frame is not None:
-                self.resumable = (self._recorder.folder / "checkpoint.pt", frame)
+                self._resumable = (self._recorder.folder / "checkpoint.pt", frame)
+
+
+def _same(before: object, now: object) -> bool:
+    return before is now or (isinstance(now, int | float) and before == now)

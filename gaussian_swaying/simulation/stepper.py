@@ -13,6 +13,7 @@ import torch
 from torch import Tensor
 
 from gaussian_swaying._devices import in_double
+from gaussian_swaying._fixed import assign
 from gaussian_swaying._turns import Turn, in_turn
 from gaussian_swaying.aero.added_mass import AirLift, carried_mass, with_added_mass
 from gaussian_swaying.aero.computed_air import AirInBox
@@ -169,7 +170,7 @@ class Stepper:
                 longest = min(float(stable_limit(points, self.solver.dx).amin()) for points in key)
                 made = [Joints(points, joints, longest) for points in {id(points): points for points in key}.values()]
                 for name in ("stiffness", "turning"):  # as soft as the lightest scene of a batch needs it
-                    setattr(made[0], name, torch.stack([getattr(one, name) for one in made]).amin(0))
+                    assign(made[0], **{name: torch.stack([getattr(one, name) for one in made]).amin(0)})
                 self._joints = key, made[0]
         return [self._joints[1]]
 
@@ -357,7 +358,7 @@ class Stepper:
         """
         before, self.setup, self.setups = self.setup, setup, self._spread(setup)
         if setup.solver is not before.solver:
-            self.solver.settings = setup.solver
+            assign(self.solver, settings=setup.solver)
         kept = len(self._bound) == len(self.setups) and all(map(operator.is_, self._bound, self.materials))
         if state is None or (kept and setup.solver is before.solver):
             return state

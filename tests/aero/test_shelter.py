@@ -8,6 +8,7 @@ from shared import double, solid
 from torch.testing import assert_close
 
 from gaussian_swaying import AeroForce, MPMSolver, WindField, WindForce
+from gaussian_swaying._fixed import assign
 from gaussian_swaying.aero.effects import Moment
 from gaussian_swaying.aero.shelter import Shelter, deposited, extinction, wind_axes
 
@@ -61,9 +62,9 @@ def test_the_drag_area_is_that_of_the_force():
     load, state, _ = _slab(0.7, 1.0, double([1.0, 0.0, 0.0]))
     behind = 1.2, 0.4, 0.4
     once = _speed(load, state, *behind) / 5
-    load.wind.effects[0].strength = 2.0
+    assign(load.wind.effects[0], strength=2.0)
     assert _speed(load, state, *behind) / 5 == pytest.approx(once**2, rel=1e-6)
-    load.normal = double([0.0, 1.0, 0.0]).expand_as(load.normal)
+    assign(load, normal=double([0.0, 1.0, 0.0]).expand_as(load.normal))
     assert _speed(load, state, *behind) == pytest.approx(5.0, rel=1e-7)
 
 
@@ -71,11 +72,11 @@ def test_the_wake_follows_the_body_and_the_wind():
     load, state, _ = _slab(1.0, 1.0, double([1.0, 0.0, 0.0]))
     moved = state.replace(position=state.position + torch.tensor([0.0, 0.0, 5.0]))
     assert _speed(load, moved, 1.2, 0.4, 0.4) == pytest.approx(5.0)
-    load.wind.flows = double([[0.0, 5.0, 0.0]])
-    load.normal = double([0.0, 1.0, 0.0]).expand_as(load.normal)
+    assign(load.wind, flows=double([[0.0, 5.0, 0.0]]))
+    assign(load, normal=double([0.0, 1.0, 0.0]).expand_as(load.normal))
     assert _speed(load, state, 1.2, 0.4, 0.4) == pytest.approx(5.0)
     assert _speed(load, state, 0.5, 1.2, 0.4) < 3.2
-    load.wind.flows = torch.zeros(1, 3, dtype=DOUBLE)
+    assign(load.wind, flows=torch.zeros(1, 3, dtype=DOUBLE))
     load.refresh(state)
     assert (load.wind.effects[0].table - 1).abs().max() == 0.0
 

@@ -8,6 +8,7 @@ from shared import double
 from torch.testing import assert_close
 
 from gaussian_swaying import GaussianGust, SineSway, UniformGust, WindField
+from gaussian_swaying._fixed import assign
 from gaussian_swaying.aero.wind import FlowKey, counter_normal, counter_uniform
 
 COUNT = 20000
@@ -101,10 +102,10 @@ def test_the_kernel_of_the_wind_is_its_definition(blow, case):
     times = torch.cat([torch.linspace(-0.2, 3, 90), torch.tensor([0.05, 0.1, 0.5, 1.3, 1e4])]).double().to(device)
     for _ in range(2):
         assert_close(kernel(wind, times), wind(times), rtol=1e-11, atol=1e-12)
-        wind.seed += 1
+        assign(wind, seed=wind.seed + 1)
         wind.flows *= 1.5
         for part in wind.modulations[:1]:
-            part.amplitude = part.delta = part.std = 0.1
+            assign(part, amplitude=0.1, delta=0.1, std=0.1)
 
 
 def test_the_kernel_refuses_a_wind_that_it_does_not_know(blow):

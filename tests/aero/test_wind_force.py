@@ -16,6 +16,7 @@ from gaussian_swaying import (
     WindField,
     WindForce,
 )
+from gaussian_swaying._fixed import assign
 from gaussian_swaying.aero.carried import Turbulence
 from gaussian_swaying.aero.effects import PowerProfile
 from gaussian_swaying.aero.wind import FlowKey, Modulation
@@ -140,7 +141,7 @@ def test_what_asks_for_a_gradient_is_not_left_to_the_kernels(name, monkeypatch):
     owner = {"C_D": load.aero, "flows": load.wind}.get(name, load)
     getattr(owner, name).requires_grad_()
     asked = []
-    monkeypatch.setattr(solver, "fused", lambda *tensors: asked.append(tensors))
+    monkeypatch.setattr(MPMSolver, "fused", lambda solver, *tensors: asked.append(tensors))
     solver.rollout(state, DT, 1, load)
     assert any(tensor.requires_grad for tensor in asked[0])
     asked.clear()
@@ -186,12 +187,12 @@ def test_a_recorded_wind_blows_as_the_plain_one(scenes):
     changes = [
         lambda: None,
         lambda: None,
-        lambda: setattr(first, "seed", 7),
+        lambda: assign(first, seed=7),
         lambda: None,
-        lambda: setattr(first.modulations[0], "amplitude", 0.1),
+        lambda: assign(first.modulations[0], amplitude=0.1),
         lambda: None,
         lambda: first.flows.fill_(2.0),
-        lambda: setattr(first, "flows", torch.full((1, 3), 4.0, dtype=torch.float64, device="cuda")),
+        lambda: assign(first, flows=torch.full((1, 3), 4.0, dtype=torch.float64, device="cuda")),
         lambda: None,
     ]
     for k, change in enumerate(changes):

@@ -8,6 +8,7 @@ import torch
 from torch import nn
 
 from gaussian_swaying import Boundary, Box, GaussianGust, PinnedRegion, SineSway, UniformGust, WindField
+from gaussian_swaying._fixed import assign
 from gaussian_swaying.aero.wind import Modulation
 from gaussian_swaying.geometry.regions import Everything, Not, Union
 from gaussian_swaying.kernels.graphs import Repeater, Replayed, fingerprint, tensors_in
@@ -48,11 +49,11 @@ def test_fingerprint_sees_what_was_replaced():
     seen = [fingerprint(parts)]
     kept = [wind.modulations[0], wind.flows, region]
     for change in (
-        lambda: setattr(wind, "seed", 3),
-        lambda: setattr(wind, "modulations", nn.ModuleList([GaussianGust(0.3, 0.04)])),
-        lambda: setattr(wind, "flows", wind.flows.clone()),
-        lambda: setattr(parts[1], "kind", "slip"),
-        lambda: setattr(parts[2], "region", Box([0.0] * 3, [1.0] * 3)),
+        lambda: assign(wind, seed=3),
+        lambda: assign(wind, modulations=nn.ModuleList([GaussianGust(0.3, 0.04)])),
+        lambda: assign(wind, flows=wind.flows.clone()),
+        lambda: assign(parts[1], kind="slip"),
+        lambda: assign(parts[2], region=Box([0.0] * 3, [1.0] * 3)),
     ):
         assert fingerprint(parts) == seen[-1]
         change()

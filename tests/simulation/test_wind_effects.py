@@ -30,10 +30,10 @@ def test_places_are_converted_once(make_simulation):
     for _ in range(2):
         sphere, profile = simulation.wind.effects
         torch.testing.assert_close(sphere.middle, expected)
-        assert sphere.radii == [1.0] * 3
+        assert list(sphere.radii) == [1.0] * 3
         assert profile.ground[2] == pytest.approx(2.0 * (-1.0 - float(frame.origin[2])))
         simulation.wind = simulation.wind
-    assert given.effects[0].radii == [0.5] * 3
+    assert list(given.effects[0].radii) == [0.5] * 3
 
 
 def test_shelter_is_refreshed_in_every_frame(make_simulation):

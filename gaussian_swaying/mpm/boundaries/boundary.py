@@ -10,7 +10,6 @@ A condition that holds particles either holds the nodes that carry them (in ``up
 
 from __future__ import annotations
 
-import copy
 import math
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
@@ -19,6 +18,7 @@ from typing import TypeVar
 import torch
 from torch import Tensor, nn
 
+from gaussian_swaying._fixed import changed
 from gaussian_swaying.geometry.frame import SimFrame
 from gaussian_swaying.geometry.regions import Region, RegionInFrame, whereabouts
 from gaussian_swaying.kernels.graphs import Recordable
@@ -98,11 +98,8 @@ class Boundary(Recordable, Twinned, nn.Module, ABC):
 
     def copy_in(self: _Kind, frame: SimFrame, **tensors: Tensor) -> _Kind:
         """A copy with its ``region``, if it has one, evaluated in metres, and with some tensors replaced."""
-        moved = copy.copy(self)
-        moved._buffers = {**self._buffers, **tensors}
-        if "region" in vars(self):
-            vars(moved)["region"] = RegionInFrame(vars(self)["region"], frame)
-        return moved
+        held = vars(self).get("region")
+        return changed(self, **tensors, **({} if held is None else {"region": RegionInFrame(held, frame)}))
 
     def hold_kind(self, neighbours_fixed: bool) -> str:
         """Return what it acts on: ``nodes`` (:meth:`forward`), points as a ``hinge`` or ``clamp``, or the ``surface``.

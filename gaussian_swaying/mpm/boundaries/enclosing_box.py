@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import copy
 from collections.abc import Sequence
 
-from torch import Tensor, nn
+from torch import Tensor
 
 from gaussian_swaying._checks import check_vector
+from gaussian_swaying._fixed import FixedList, changed
 from gaussian_swaying.geometry.frame import SimFrame
 from gaussian_swaying.mpm.boundaries.boundary import Boundary, Nodes
 from gaussian_swaying.mpm.boundaries.plane import Plane
@@ -48,13 +48,11 @@ class EnclosingBox(Boundary):
             direction[axis] = 1.0
             planes.append(Plane(low, direction, kind, friction, start, end))
             planes.append(Plane(high, [-d for d in direction], kind, friction, start, end))
-        self.planes = nn.ModuleList(planes)
+        self.planes = FixedList(planes)
 
     def in_frame(self, frame: SimFrame) -> EnclosingBox:
         """The box in metres, z up."""
-        moved = copy.copy(self)
-        moved._modules = {"planes": nn.ModuleList([p.in_frame(frame) for p in self.planes])}  # type: ignore[operator]
-        return moved
+        return changed(self, planes=FixedList(p.in_frame(frame) for p in self.planes))  # type: ignore[operator]
 
     def forward(self, velocity: Tensor, nodes: Nodes) -> Tensor:
         for plane in self.planes:

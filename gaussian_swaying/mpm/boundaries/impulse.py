@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from gaussian_swaying._checks import check_vector
+from gaussian_swaying._fixed import assign
 from gaussian_swaying.geometry.regions import Region
 from gaussian_swaying.mpm.boundaries.boundary import Nodes, ParticleBoundary
 
@@ -51,7 +52,7 @@ class Impulse(ParticleBoundary):
         """Particles inside the region at rest, which are also counted; ValueError if there are none."""
         mask = super().particle_mask(rest_position)
         if self.per_particle:
-            self.count = mask.sum(-1).to(self.impulse)
+            assign(self, count=mask.sum(-1).to(self.impulse))
         return mask
 
     def forward(self, velocity: Tensor, nodes: Nodes) -> Tensor:

@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from gaussian_swaying._checks import check_vector
+from gaussian_swaying._fixed import changed
 from gaussian_swaying.geometry.distance import grid_distance
 from gaussian_swaying.geometry.frame import SimFrame
 from gaussian_swaying.geometry.keyed_path import KeyedPath
@@ -65,9 +66,7 @@ class MeshObstacle(Obstacle):
         unit = frame.metres_per_unit
         axes = frame.direction_to_sim(torch.eye(3, dtype=torch.float64)).T.contiguous()
         moved = self.in_metres(frame, values=self.values * unit, corner=self.corner * unit, axes=axes)
-        assert isinstance(moved, MeshObstacle)
-        moved.spacing = self.spacing * unit
-        return moved
+        return changed(moved, spacing=self.spacing * unit)
 
     def distance(self, place: Tensor) -> tuple[Tensor, Tensor]:
         axes = self.axes.to(place)

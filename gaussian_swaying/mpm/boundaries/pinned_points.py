@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import copy
 from collections.abc import Sequence
 
 import torch
 from torch import Tensor
 
 from gaussian_swaying._checks import check_choice, check_vector
+from gaussian_swaying._fixed import changed
 from gaussian_swaying.geometry.frame import SimFrame
 from gaussian_swaying.mpm.boundaries.boundary import Boundary, Nodes, refuse_points
 
@@ -46,9 +46,7 @@ class PinnedPoints(Boundary):
 
     def in_frame(self, frame: SimFrame) -> PinnedPoints:
         """The same places in metres."""
-        moved = copy.copy(self)
-        moved._buffers = {"at": frame.point_to_sim(self.at)}
-        return moved
+        return changed(self, at=frame.point_to_sim(self.at))
 
     def hold_kind(self, neighbours_fixed: bool) -> str:
         """The ``kind``."""

@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from gaussian_swaying._checks import check_positive
+from gaussian_swaying._fixed import assign
 from gaussian_swaying.geometry.distance import DistanceGrid, grid_distance
 from gaussian_swaying.geometry.frame import SimFrame
 from gaussian_swaying.mpm.boundaries.obstacle import Obstacle, grid_twin
@@ -54,7 +55,7 @@ class StillGaussians(Obstacle):
 
     def take(self, found: DistanceGrid) -> None:
         """Set the grid of distances from the Gaussians, in metres, z up."""
-        self.values, self.corner, self.spacing = found.values, found.origin, found.spacing
+        assign(self, values=found.values, corner=found.origin, spacing=found.spacing)
 
     def in_frame(self, frame: SimFrame) -> Obstacle:
         """Itself: it is in metres."""

@@ -9,9 +9,11 @@ import torch
 from torch import Tensor
 
 from gaussian_swaying._checks import check_positive, check_shape
+from gaussian_swaying._fixed import fixed
 from gaussian_swaying.mpm.state import MaterialPoints
 
 
+@fixed
 @dataclass(frozen=True)
 class Contact:
     """Contact of the material with itself: between the layers of a sheet, and between objects.

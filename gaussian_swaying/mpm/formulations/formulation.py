@@ -13,6 +13,7 @@ import torch
 from torch import Tensor
 
 from gaussian_swaying._checks import check_positive
+from gaussian_swaying._fixed import fixed
 from gaussian_swaying.geometry.linalg import symmetric_eigenvalues
 from gaussian_swaying.mpm.body import Body, Held
 from gaussian_swaying.mpm.boundaries.boundary import Boundary, Nodes
@@ -32,6 +33,7 @@ MAX_NODES = 64_000_000
 """Largest grid; a larger one raises an error instead of filling the memory."""
 
 
+@fixed
 @dataclass(frozen=True, slots=True)
 class Settings:
     """The solver settings that a formulation needs; ``MPMSolver`` explains the fields."""

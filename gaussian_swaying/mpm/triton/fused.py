@@ -392,4 +392,4 @@ def _nothing() -> None:
 
 def _made_from(body: Body) -> tuple[object, ...]:
     """Return the key of the buffers and graphs of a body, without its points; they are invalid once it changes."""
-    return fingerprint([*body.boundaries, *body.points.laws])
+    return fingerprint(body.boundaries)

@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from gaussian_swaying._checks import check_positive, check_shape, check_vector
+from gaussian_swaying._fixed import fixed
 from gaussian_swaying.geometry.rotations import check_direction, rows_from_z
 
 NEAR = 0.01
@@ -38,6 +39,7 @@ def check_elevation(name: str, value: float) -> float:
     return float(value)
 
 
+@fixed
 @dataclass(frozen=True, slots=True, eq=False)
 class Camera:
     """Pinhole camera in the OpenCV convention: x to the right, y down, z forward.

@@ -11,6 +11,7 @@ from typing import Any
 from torch import Tensor
 
 from gaussian_swaying._checks import check_positive, check_vector, check_whole
+from gaussian_swaying._fixed import Fixed
 from gaussian_swaying.rendering.cameras.camera import (
     NEAR,
     Camera,
@@ -24,12 +25,12 @@ from gaussian_swaying.rendering.cameras.camera import (
 from gaussian_swaying.rendering.cameras.transforms_json import camera_from_transforms
 
 
-class CameraPath(ABC):
+class CameraPath(Fixed, ABC):
     """Base class of the camera paths that a configuration can name.
 
     Attributes:
         captured: Whether the cameras are those of photographs. Such cameras may be inside the object's box.
-        still: Whether the camera is the same in every frame, as long as no attribute of the path changes.
+        still: Whether the camera is the same in every frame.
     """
 
     captured: bool = False

@@ -11,6 +11,7 @@ from typing import Any, Literal
 from torch import Tensor
 
 from gaussian_swaying._checks import check_literals, check_positive, check_vector
+from gaussian_swaying._fixed import fixed
 from gaussian_swaying.rendering.cameras.camera import Camera, check_elevation, check_fov, look_at_camera, orbit_camera
 from gaussian_swaying.rendering.cameras.camera_path import PinholePath
 
@@ -69,6 +70,7 @@ def _slope(times: Sequence[float], values: Sequence[float], k: int) -> float:
     return (first + second) / (first / before + second / after)
 
 
+@fixed
 @dataclass
 class CameraKey:
     """A camera at one time; null values stay as in the key before.

@@ -10,6 +10,7 @@ import yaml
 from shared import refused
 from small_scenes import plain_cloud
 
+from gaussian_swaying._fixed import changed
 from gaussian_swaying.cli.convert import main as convert_main
 from gaussian_swaying.cli.simulate import main
 from gaussian_swaying.gaussians.parts import Part, Parts
@@ -754,8 +755,7 @@ def test_the_camera_stands_where_physgaussians_does():
 def test_the_camera_looks_at_a_point_of_the_normalised_space():
     """Its distance is in scene units, its target and up direction are turned and scaled with the object."""
     points, space = _bar(), Normalisation([135.0], [0], 1.0)
-    camera = PhysGaussianCamera(radius=4.0, viewpoint=[1.1, 0.9, 1.2], up=[0, 1, 0])
-    camera.frame = space.fit(points)
+    camera = changed(PhysGaussianCamera(radius=4.0, viewpoint=[1.1, 0.9, 1.2], up=[0, 1, 0]), frame=space.fit(points))
     eye, target, up = camera.eye(0)
     torch.testing.assert_close(camera.frame.point_to_scene(target), torch.tensor([1.1, 0.9, 1.2]).double())
     torch.testing.assert_close(up, space.rotation.T[:, 1])

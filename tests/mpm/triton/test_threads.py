@@ -4,6 +4,7 @@ import pytest
 import torch
 
 from gaussian_swaying import Box, MPMSolver, PinnedRegion, UniformGust, WindField
+from gaussian_swaying._fixed import assign
 from gaussian_swaying.mpm.boundaries.ball import BallObstacle
 from gaussian_swaying.mpm.boundaries.plane import Plane
 from gaussian_swaying.mpm.laws.sand import Sand
@@ -36,7 +37,7 @@ def _end(case, dtype):
     solver = MPMSolver(0.1, case.split()[0] if "total" in case else "updated", damping=0.3, **CASES[case]())
     state = solver.init_state(points, noise(1, *place.shape).to(dtype))
     load = make_load(points, WindField([5.0, 2.0, -1.0], modulations=[UniformGust()], seed=3))
-    load.normal, load.area = load.normal.to(dtype), load.area.to(dtype)
+    assign(load, normal=load.normal.to(dtype), area=load.area.to(dtype))
     if "total" not in case:
         state = solver.fit_grid(state, 40 * DT / 4)
     for _ in range(2):

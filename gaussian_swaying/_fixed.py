@@ -1,0 +1,183 @@
+"""Settings stay as they were made, so that the record of a run says what ran: assigning to them is an error.
+
+A class of the package refuses every public name; one of a user's own those that it has from the package.
+"""
+
+from __future__ import annotations
+
+import copy
+import inspect
+from collections.abc import Callable
+from dataclasses import is_dataclass
+from functools import wraps
+from typing import Any, NoReturn, TypeVar
+
+import torch
+from torch import nn
+
+T = TypeVar("T")
+LIVE: set[str] = set()
+"""Names of the numbers that ``Simulation.change`` changes."""
+
+
+class Fixed:
+    """Base of settings: once an object is made, its public names cannot be assigned.
+
+    Attributes:
+        assignable: Names that can.
+        live_as: Where a simulation has it, for example ``wind``.
+    """
+
+    __slots__ = ()
+    assignable: tuple[str, ...] = ()
+    live_as: str = ""
+
+    def __init_subclass__(cls, **options: Any) -> None:
+        super().__init_subclass__(**options)
+        for name in ("__init__", "__post_init__"):
+            if name in vars(cls):
+                setattr(cls, name, _closing(name, vars(cls)[name]))
+
+    def __post_init__(self) -> None:
+        """Close a dataclass."""
+        _close(self, "__post_init__", Fixed.__post_init__)
+
+    def __setattr__(self, name: str, value: Any) -> None:
+        _check(self, name, value)
+        if _settable(self, name):  # a module would become a part of another without passing the setter
+            object.__setattr__(self, name, value)
+        else:
+            super().__setattr__(name, value)
+
+    def __delattr__(self, name: str) -> None:
+        _check(self, name)
+        super().__delattr__(name)
+
+
+def fixed(kind: type[T]) -> type[T]:
+    """Let a dataclass without such a base refuse as well."""
+
+    def assign_to(self: Any, name: str, value: Any) -> None:
+        _check(self, name, value)
+        object.__setattr__(self, name, value)
+
+    def delete(self: Any, name: str) -> None:
+        _check(self, name)
+        object.__delattr__(self, name)
+
+    if not _frozen(kind):
+        kind.__init__ = _closing("__init__", kind.__init__)  # type: ignore[method-assign]
+    kind.__setattr__, kind.__delattr__ = assign_to, delete  # type: ignore[method-assign]
+    return kind
+
+
+def _closing(name: str, method: Callable[..., None]) -> Callable[..., None]:
+    """An ``__init__`` or ``__post_init__`` after which an object is made, unless it belongs to a base of its class."""
+
+    @wraps(method)
+    def whole(self: Any, *args: Any, **given: Any) -> None:
+        method(self, *args, **given)
+        _close(self, name, whole)
+
+    return whole
+
+
+def _close(thing: Any, name: str, method: Callable[..., None]) -> None:
+    kind = type(thing)
+    outer = name == "__init__" or not hasattr(kind.__init__, "__wrapped__")  # else that of a subclass goes on
+    if getattr(kind, name) is method and outer:
+        held = vars(thing)
+        held["_made"] = True
+        for own in [own for own, value in held.items() if type(value) is list and _refuses(thing, own)]:
+            held[own] = tuple(held[own])
+
+
+def _frozen(kind: type) -> bool:
+    return is_dataclass(kind) and bool(kind.__dataclass_params__.frozen)  # type: ignore[attr-defined]
+
+
+def _ours(kind: type) -> bool:
+    return kind.__module__.startswith("gaussian_swaying.")
+
+
+def _settable(thing: Any, name: str) -> bool:
+    return getattr(getattr(type(thing), name, None), "fset", None) is not None
+
+
+def _refuses(thing: Any, name: str) -> bool:
+    kind = type(thing)
+    if _frozen(kind):
+        return True
+    if name[0] == "_" or "_made" not in vars(thing) or name in ("training", *getattr(kind, "assignable", ())):
+        return False
+    return not _settable(thing, name) and (_ours(kind) or name in fields_of(kind))
+
+
+def _check(thing: Any, name: str, *value: object) -> None:
+    """Refuse a value, unless it is there, as after an operation in place; or that the name is deleted."""
+    fresh = not value or isinstance(getattr(type(thing), name, None), property)
+    if _refuses(thing, name) and (fresh or getattr(thing, name, LIVE) is not value[0]):
+        _refuse(thing, name)
+
+
+def fields_of(kind: type) -> list[str]:
+    """The arguments of the constructor of a class, or for a user's own class of that of the package below it."""
+    ours = next(c for c in kind.__mro__ if _ours(c) or c is object)
+    return list(inspect.signature(ours.__init__).parameters)[1:]  # type: ignore[misc]
+
+
+def _refuse(thing: Any, name: str) -> NoReturn:
+    kind, fields = type(thing), fields_of(type(thing))
+    text = f"`{name}` of {kind.__name__} cannot be assigned, as what runs would not be what is recorded"
+    given = f"{name}=..." if name in fields else ", ".join(f"{field}=..." for field in fields)
+    text += f": make another {kind.__name__}({given})"
+    place = getattr(thing, "live_as", "")
+    live = {f"{place}.{name}", f"forces.{kind.__name__}.{name}"} & LIVE
+    if live:
+        number = min(live).replace("*", "0")
+        text += f", or between two frames `state = simulation.change(state, {{{number!r}: ...}})`"
+    raise AttributeError(f"{text}.")
+
+
+def assign(thing: Any, **values: Any) -> None:
+    """Assign to a fixed object, for the code that answers for it."""
+    made = getattr(thing, "__dict__", {}).pop("_made", None)
+    try:
+        for name, value in values.items():
+            setattr(thing, name, value)
+    finally:
+        if made:
+            vars(thing)["_made"] = True
+
+
+def changed(thing: T, **values: Any) -> T:
+    """A copy with other attributes; its other parts are shared. Numbers replace the content of a buffer."""
+    other = copy.copy(thing)
+    if isinstance(thing, nn.Module):
+        for part in ("_parameters", "_buffers", "_modules"):
+            vars(other)[part] = dict(vars(thing)[part])
+        for name, old in (*thing.named_parameters(recurse=False), *thing.named_buffers(recurse=False)):
+            if name in values:
+                given = torch.as_tensor(values[name]).to(old)
+                given = given.reshape(old.shape) if given.numel() == old.numel() else given
+                kept = isinstance(old, nn.Parameter)
+                values[name] = nn.Parameter(given.detach(), old.requires_grad) if kept else given
+    assign(other, **values)
+    return other
+
+
+class FixedList(Fixed, nn.ModuleList):
+    """Modules in an order that stays."""
+
+    def __init__(self, modules: Any = ()) -> None:
+        super().__init__(modules)
+
+    def add_module(self, name: str, module: nn.Module | None) -> None:
+        """Add a module while the list is made."""
+        if "_made" in vars(self):
+            _refuse(self, name)
+        super().add_module(name, module)
+
+    def insert(self, index: int, module: nn.Module) -> None:
+        """Refuse."""
+        _refuse(self, str(index))

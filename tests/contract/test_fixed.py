@@ -1,0 +1,152 @@
+"""What a run is made of stays as it was made, and the record of a run says what ran."""
+
+import inspect
+
+import pytest
+import torch
+import yaml
+
+import gaussian_swaying
+from gaussian_swaying import (
+    AeroForce,
+    Box,
+    Contact,
+    Copy,
+    Cylinder,
+    DiffuseShader,
+    Edit,
+    Force,
+    GaussianGust,
+    GaussianSurfaceModel,
+    LookAtCamera,
+    Material,
+    MPMSolver,
+    OrbitCamera,
+    PhongShader,
+    PinnedPoints,
+    PinnedRegion,
+    Recorder,
+    Scene,
+    SineSway,
+    Sphere,
+    UniformGust,
+    WindField,
+    WindForce,
+)
+from gaussian_swaying._fixed import fields_of
+from gaussian_swaying.aero.carried import Turbulence
+from gaussian_swaying.aero.computed_air import ComputedAir
+from gaussian_swaying.gaussians.filling import InteriorFilling
+from gaussian_swaying.gaussians.parts import Part, Parts
+from gaussian_swaying.mpm.laws.sand import Sand
+from gaussian_swaying.scenes.procedural import FlagScene
+from gaussian_swaying.simulation.material import MaterialRegion
+
+POLE = Box([None] * 3, [0.11, None, None])
+FLAG = FlagScene(spacing=0.1)
+APART = {"CaptureDataModule", "SimulationDiverged", "SpatialWind", "SplatTrainer"}
+"""An abstract class, an error, and those that Lightning assigns to."""
+
+
+def _simulation(**given):
+    return gaussian_swaying.Simulation(FLAG, hold=POLE, wind=[0.0, 4.0, 1.0], device="cpu", **given)
+
+
+def _made():
+    simulation = _simulation()
+    cloud, state = FLAG.generate(), simulation.start()
+    normal = torch.tensor([[0.0, 0.0, 1.0]])
+    return [
+        *(simulation, simulation.painter, simulation.setup, next(simulation.frames(1)), simulation.scene.frame),
+        *(cloud, state, simulation.solver.points, GaussianSurfaceModel(cloud), FLAG, Scene(generator=FLAG)),
+        *(Material(), MaterialRegion(POLE), Sand(), Contact(), Copy(), Edit(E=1.0), Recorder(), InteriorFilling(0.1)),
+        *(WindField(), SineSway(), UniformGust(), GaussianGust(), Turbulence(), ComputedAir([0.0] * 3, [1.0] * 3)),
+        *(AeroForce(), WindForce(AeroForce(), WindField(), normal, torch.ones(1)), MPMSolver(0.1)),
+        *(PinnedRegion(POLE), PinnedPoints([[0.0, 0.0, 0.0]]), POLE, Sphere([0.0] * 3, 1.0)),
+        *(Cylinder([0.0] * 3, [0.0, 0.0, 1.0], 1.0, 1.0), Part("leaf"), Parts([0] * 4, [Part("leaf")])),
+        *(OrbitCamera(), LookAtCamera([0.0, -3.0, 0.0], [0.0] * 3), DiffuseShader(), PhongShader()),
+    ]
+
+
+def test_nothing_that_is_public_can_be_assigned_or_deleted():
+    made = _made()
+    public = {name for name in dir(gaussian_swaying) if inspect.isclass(getattr(gaussian_swaying, name))}
+    assert public - {base.__name__ for thing in made for base in type(thing).__mro__} == APART
+    for thing in made:
+        kind = type(thing)
+        free = {"training", *getattr(kind, "assignable", ())}
+        free |= {name for name in dir(kind) if getattr(getattr(kind, name), "fset", None)}
+        for name in ({name for name in dir(thing) if name[0] != "_"} | {*fields_of(kind), "mispelt"}) - free:
+            with pytest.raises(AttributeError, match=f"`{name}` of {kind.__name__} cannot be assigned"):
+                setattr(thing, name, object())
+            with pytest.raises(AttributeError, match=f"`{name}`"):
+                delattr(thing, name)
+        assert not [
+            name for name, value in getattr(thing, "__dict__", {}).items() if isinstance(value, list) and name[0] != "_"
+        ]
+    wind = WindField(modulations=[SineSway()])
+    for change in (wind.modulations.append, lambda gust: wind.modulations.insert(0, gust)):
+        with pytest.raises(AttributeError, match="cannot be assigned"):
+            change(UniformGust())
+    with pytest.raises(AttributeError, match="cannot be assigned"):
+        wind.modulations.pop(0)
+
+
+@pytest.mark.parametrize(
+    ("assign", "remedy"),
+    [
+        (lambda s: setattr(s.material, "E", 3e4), r"Material\(E=\.\.\.\).*change\(state, {'material.E': \.\.\.}"),
+        (lambda s: setattr(s.wind, "flow", [0.0, 9.0, 0.0]), r"WindField\(flow=\.\.\.\).*{'wind.flow': \.\.\.}"),
+        (lambda s: setattr(s.aero, "law", "projected"), r"make another AeroForce\(law=\.\.\.\)\."),
+        (lambda s: setattr(s, "material", Material()), r"make another Simulation\(material=\.\.\.\)\."),
+    ],
+)
+def test_the_error_names_the_call_that_works(assign, remedy):
+    with pytest.raises(AttributeError, match=remedy):
+        assign(_simulation())
+
+
+@pytest.mark.parametrize("from_file", [True, False])
+def test_the_record_says_what_runs(tmp_path, from_file):
+    """What was assigned, and tensors that were changed in place, as an optimizer does."""
+    simulation = _simulation()
+    if from_file:
+        simulation.config = "frames: 250\n"
+    before = simulation.config
+    assert ("changed_in_python" in before, "made_in_python" in before) == (False, not from_file)
+    simulation.aero = AeroForce(law="projected")
+    simulation.painter.shader = DiffuseShader(ambient=0.25)
+    simulation.frame_dt = 0.02
+    with torch.no_grad():
+        simulation.wind.flows.mul_(2.0)
+    simulation.run(tmp_path / "run", 2, recorder=Recorder(video=False), progress=False)
+    found = yaml.safe_load((tmp_path / "run" / "config.yaml").read_text())
+    found = found["changed_in_python" if from_file else "made_in_python"]
+    assert found["aero"]["law"] == "projected"
+    assert found["shader"]["ambient"] == 0.25
+    assert found["frame_dt"] == simulation.painter.frame_dt == 0.02
+    assert found["wind"]["flows"]["sha256"] != WindField([0.0, 4.0, 1.0]).flows
+    assert set(found) >= {"aero", "shader", "wind"}
+    assert ("material" in found, "camera" in found) == (not from_file, not from_file)
+
+
+def test_a_class_of_ones_own_keeps_its_own_names():
+    class Counting(Force):
+        def __init__(self) -> None:
+            super().__init__()
+            self.calls = 0
+
+        def forward(self, state):
+            return torch.zeros_like(state.position)
+
+    class Wide(OrbitCamera):
+        def __init__(self, lens: str) -> None:
+            super().__init__(fov_y=90.0)
+            self.lens = lens
+
+    force, camera = Counting(), Wide("fish")
+    force.calls += 1
+    camera.lens = "flat"
+    assert (force.calls, camera.lens) == (1, "flat")
+    with pytest.raises(AttributeError, match="`fov_y` of Wide cannot be assigned"):
+        camera.fov_y = 30.0
