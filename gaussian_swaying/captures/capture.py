@@ -20,7 +20,7 @@ from gaussian_swaying.captures.lens import Lens
 from gaussian_swaying.captures.photos import Photos, is_turned, photos_beside, turned_size
 from gaussian_swaying.captures.point_cloud import PointCloud, read_ply_points
 from gaussian_swaying.captures.transforms import read_transforms, transforms_files
-from gaussian_swaying.rendering.cameras.camera import Camera
+from gaussian_swaying.rendering.cameras.camera import NEAR, Camera
 
 FORMATS = ("auto", "colmap", "transforms")
 SPLITS = ("train", "val", "test")
@@ -33,7 +33,8 @@ class View:
     Attributes:
         name: Path of the image as written in the capture's files.
         image_path: The image on disk.
-        camera: Pinhole camera of the pixels that :meth:`load` returns, float32.
+        camera: Pinhole camera of the pixels that :meth:`load` returns, float32; its near plane is at a hundredth of the
+            extent of the capture.
         split: ``train``, ``val`` or ``test``.
         lens: Lens of the image on disk.
         downscale: Factor by which width and height of the undistorted image are reduced.
@@ -146,6 +147,7 @@ def read_capture(
             f"All {len(eyes)} training cameras of {root} are at the same place, so its depth cannot be learned: "
             "add images from elsewhere, or lower `test_every` to 0."
         )
+    views = [replace(view, camera=replace(view.camera, near=NEAR * extent)) for view in views]
     if files.points is not None:
         _check_sight(root, views, files.points.points, read_axes=files.source.startswith("transforms"))
     unsure = [k for k, (_, told) in enumerate(both) if not told]

@@ -22,7 +22,7 @@ from gaussian_swaying._inputs import check_regular
 from gaussian_swaying.captures.images import PosedImage, image_head, load_image, read_mask, remapped
 from gaussian_swaying.captures.photos import clean_name, is_turned
 from gaussian_swaying.captures.transforms import check_rigid, lens_of_transforms, read_transforms, transforms_files
-from gaussian_swaying.rendering.cameras.camera import Camera
+from gaussian_swaying.rendering.cameras.camera import NEAR, Camera
 from gaussian_swaying.rendering.cameras.transforms_json import load_transforms, read_number, read_pose
 
 MOST_FRAMES = 10_000
@@ -78,10 +78,10 @@ class _Shot:
 
 
 class _Room:
-    """The number of frames and bytes that the videos of a fit may still decode."""
+    """The number of frames and bytes that the videos of a fit may still decode, and the near plane of their cameras."""
 
-    def __init__(self) -> None:
-        self.frames, self.bytes = MOST_FRAMES, MOST_BYTES
+    def __init__(self, near: float) -> None:
+        self.frames, self.bytes, self.near = MOST_FRAMES, MOST_BYTES, near
 
     def holds(self, width: int, height: int) -> int:
         return min(self.frames, self.bytes // (3 * width * height))
@@ -117,7 +117,9 @@ class _Part:
 
 
 def read_videos(
-    paths: str | os.PathLike[str] | Sequence[str | os.PathLike[str]], cameras: Sequence[str] | None = None
+    paths: str | os.PathLike[str] | Sequence[str | os.PathLike[str]],
+    cameras: Sequence[str] | None = None,
+    size: float = 1.0,
 ) -> list[Footage]:
     """Read the videos of one motion.
 
@@ -132,6 +134,7 @@ def read_videos(
     Args:
         paths: A folder or a transforms.json, or several. Their times belong to the same clock.
         cameras: Names of the cameras that are wanted; None for all.
+        size: Size of what they show [scene units], which the near plane of the cameras follows.
 
     Returns:
         One for each camera, sorted by name. The earliest frame is at time zero.
@@ -154,7 +157,7 @@ def read_videos(
             f"{len(lost)} of the pictures of `videos` do not exist, the first of them {lost[0]}: put them there, or "
             "remove their frames from transforms.json."
         )
-    room = _Room()
+    room = _Room(NEAR * size)
     return [
         _footage(name, [shot for part in parts[name] for shot in part.read(room)], begin)
         for name in sorted(cameras or parts)
@@ -237,7 +240,7 @@ def _camera_name(where: str, index: int, frame: dict[str, Any]) -> str:
 def _picture(item: PosedImage, time: float, room: _Room) -> list[_Shot]:
     room.take(item.path, item.lens.width, item.lens.height)
     lens = item.lens.undistorted()
-    camera = Camera(item.world_to_camera.float(), lens.intrinsics().float(), lens.width, lens.height)
+    camera = Camera(item.world_to_camera.float(), lens.intrinsics().float(), lens.width, lens.height, room.near)
     turned = is_turned(*image_head(item.path), (item.lens.width, item.lens.height))
     pixels = load_image(item.path, item.lens, turned=bool(turned))
     mask = pixels[..., 3].clone() if pixels.shape[-1] == 4 else None
@@ -277,7 +280,7 @@ def _film(file: Path, where: str, data: dict[str, Any], index: int, begin: float
         seen = lens.undistorted()
         pose = read_pose(where, data, index)
         check_rigid(f"The field `frames[{index}].transform_matrix` of the camera file {where}", pose)
-        camera = Camera(torch.linalg.inv(pose).float(), seen.intrinsics().float(), seen.width, seen.height)
+        camera = Camera(torch.linalg.inv(pose).float(), seen.intrinsics().float(), seen.width, seen.height, room.near)
         rate = fps or head["fps"]
         if not rate > 0:
             raise ValueError(f"The video {path} does not say its frame rate: add `fps` to its entry in {where}.")

@@ -10,6 +10,8 @@ from torch.testing import assert_close
 
 lightning = pytest.importorskip("lightning")
 
+from gaussian_swaying.gaussians.model import GaussianSurfaceModel  # noqa: E402
+from gaussian_swaying.rendering.torch_renderer import TorchRenderer  # noqa: E402
 from gaussian_swaying.training.data.datamodule import CaptureDataModule  # noqa: E402
 
 
@@ -144,6 +146,25 @@ def test_what_a_trainer_starts_from(folder):
     other = CaptureDataModule(folder, point_count=64, initial_opacity=0.5, initial_scale=0.1).initial_cloud(1)
     assert_close(other.opacities, torch.zeros(64))
     assert_close(other.scales, cloud.scales + math.log(0.1))
+
+
+def test_a_capture_of_another_unit_looks_the_same(tmp_path):
+    pictures = []
+    for number, scale in enumerate([1.0, 2.0**-9, 2.0**9]):  # powers of two round alike
+        poses = arc(9)
+        for pose in poses:
+            pose.world_to_camera[:3, 3] *= scale
+        data = CaptureDataModule(write_transforms(tmp_path / str(number), poses, [f"{i}.png" for i in range(9)]))
+        data.point_count = 300
+        model, camera = GaussianSurfaceModel(data.initial_cloud()), data.capture.views[4].camera
+        assert camera.near == pytest.approx(0.01 * data.scene_scale)
+        with torch.no_grad():
+            colors = torch.linspace(0, 1, 900).view(300, 3)
+            drawn = TorchRenderer()(model.means, model.covariance(), model.opacity(), colors, camera)
+        pictures.append(drawn.color)
+    assert pictures[0].std() > 0.01
+    for picture in pictures[1:]:
+        torch.testing.assert_close(picture, pictures[0], rtol=0, atol=1e-4)
 
 
 def test_bad_arguments(folder):
