@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from gaussian_swaying._checks import check_choice, check_positive, check_vector
-from gaussian_swaying._fixed import assign, changed
+from gaussian_swaying._fixed import changed
 from gaussian_swaying.aero.effects import Moment, WindEffect, placed
 from gaussian_swaying.aero.lookup import trilinear
 from gaussian_swaying.aero.spectra import SPECTRA, resolved_share
@@ -105,10 +105,9 @@ class CarriedField(WindEffect):
         self.start: Tensor
         self.repeats: Tensor
 
-    def along(self, flow: Tensor) -> None:
-        """Turn the x axis of the field into the flow."""
-        axes = box_axes(flow.detach().cpu(), self.sides.tolist(), self.tilted)
-        assign(self, axes=axes.to(self.axes.device))
+    def along(self, flow: Tensor) -> WindEffect:
+        """The field with its x axis turned into the flow."""
+        return changed(self, axes=box_axes(flow.detach().cpu(), self.sides.tolist(), self.tilted))
 
     def in_frame(self, frame: SimFrame) -> WindEffect:
         """The origin in metres."""

@@ -61,8 +61,9 @@ class WindEffect(Recordable, Twinned, nn.Module, ABC):
         """The same effect with its places converted from scene units to metres, z up; itself if it has none."""
         return self
 
-    def along(self, flow: Tensor) -> None:
-        """Take the flow at the start [m/s], shape (3,), on the CPU; called once, when the wind is made."""
+    def along(self, flow: Tensor) -> WindEffect:
+        """The same effect in a flow at the start [m/s], shape (3,), on the CPU; called when a wind is made."""
+        return self
 
 
 def placed(frame: SimFrame, point: Sequence[float]) -> list[float]:

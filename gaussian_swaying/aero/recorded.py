@@ -67,15 +67,15 @@ class FrozenWind(CarriedField):
         anchor = (0.0, middle, -grid.first[2])
         super().__init__(table.contiguous(), grid.spacing, origin, anchor, (True, False, False), scale)
 
-    def along(self, flow: Tensor) -> None:
-        """Turn the x axis of the field into the flow, which must be that of the file."""
+    def along(self, flow: Tensor) -> WindEffect:
+        """The field with its x axis turned into the flow, which must be that of the file."""
         speed = float(flow.norm())
         if self.speed is not None and abs(speed - self.speed) > 0.01 * self.speed:
             raise ValueError(
                 f"The mean wind of {self.path} is {self.speed:.4g} m/s, but `wind.flow` has {speed:.4g} m/s: set it to "
                 f"{self.speed:.4g} m/s in the direction that you want."
             )
-        super().along(flow)
+        return super().along(flow)
 
 
 class RecordedWind(WindEffect):

@@ -282,11 +282,10 @@ class WindField(Fixed, nn.Module):
         self.flows: Tensor
         self.interpolation, self.seed = interpolation, int(seed)
         self.modulations = FixedList(modulations)
-        self.effects = FixedList(effects)
         self._in_metres = False  # whether `in_frame` made it
         moving = [row.detach() for row in flows if bool(row.any())]
-        for effect in effects:
-            effect.along(moving[0] if moving else torch.zeros(3, dtype=torch.float64))
+        first = moving[0] if moving else torch.zeros(3, dtype=torch.float64)
+        self.effects = FixedList(effect.along(first) for effect in effects)
 
     @property
     def uniform(self) -> bool:

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any, Literal
 import torch
 
 from gaussian_swaying._checks import VectorLike, check_choice, check_vector
+from gaussian_swaying._fixed import FixedList, changed
 from gaussian_swaying.aero.force import AeroForce
 from gaussian_swaying.aero.looks import LOOKS, look
 from gaussian_swaying.aero.wind import SpatialWind, WindField, flow_rows
@@ -95,7 +96,7 @@ def as_material(material: MaterialLike | None) -> Material:
 def as_solver(
     solver: Solver | None, hold: HoldLike | None, scene: Scene, cloud: GaussianCloud, damping: float = 0.0
 ) -> Solver:
-    """Return the given solver, or make one whose grid suits the size of the scene.
+    """Return a copy of the given solver, which may be another simulation's, or make one that suits the scene.
 
     A held object then has no gravity, as in the starters of the preview: its captured shape is already in balance with
     its weight. An object that is not held falls. ``damping`` [1/s] is that of a solver that is made.
@@ -112,7 +113,7 @@ def as_solver(
         raise ValueError(
             "`hold` only works without a solver: add the pin to the `boundaries` of the solver, and leave out `hold`."
         )
-    return solver
+    return changed(solver, boundaries=FixedList(map(changed, solver.boundaries)))
 
 
 def as_wind(wind: WindLike | None, frame: SimFrame) -> WindField | SpatialWind:

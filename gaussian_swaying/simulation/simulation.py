@@ -330,10 +330,10 @@ class Simulation(Fixed):
         self._recorder = self._recorder_or(recorder)
 
     def _recorder_or(self, recorder: Recorder | None) -> Recorder:
-        """A recorder, or one by default: with copies, of pictures."""
+        """A recorder of its own like the given one, or by default: with copies, of pictures."""
         if recorder is None and self._stepper.copies is not None:
             return Recorder(trajectory=False, nodes=False)
-        return recorder or Recorder()
+        return copy.copy(recorder or Recorder())
 
     @in_turn
     def change(self, state: State, values: Mapping[str, Any]) -> State:
@@ -559,7 +559,7 @@ class Simulation(Fixed):
             SimulationDiverged: If the simulation diverges; everything recorded so far is saved first.
             ValueError: If the output cannot be written or resumed, or the camera lies inside the object.
         """
-        self._recorder = recorder or self._recorder
+        self._recorder = self._recorder if recorder is None else self._recorder_or(recorder)
         count = self.frames_wanted if frames is None else check_frames("frames", frames)
         run, self._resumable = Run(self._painter, self._editor, self._recorder, count, self.config), None
         try:

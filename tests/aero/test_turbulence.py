@@ -356,7 +356,7 @@ def test_a_field_that_does_not_repeat_goes_on_outside():
     table = torch.zeros(4, 2, 2, 3)
     table[:, 0, :, 0], table[:, 1, :, 0] = 1.0, 5.0
     field = CarriedField(table, [1.0, 0.5, 0.5], wraps=(True, False, False))
-    field.along(torch.tensor([2.0, 0.0, 0.0]))
+    field = field.along(torch.tensor([2.0, 0.0, 0.0]))
     still = torch.zeros(3, dtype=torch.float64)
     place = double([[0.0, -3.0, 0.0], [100.3, 0.25, 9.0], [0.0, 3.0, 0.0]])
     found = field(torch.zeros(3), place, Moment(still[0], still, still))

@@ -1,5 +1,6 @@
 """What a run is made of stays as it was made, and the record of a run says what ran."""
 
+import copy
 import inspect
 
 import pytest
@@ -36,8 +37,10 @@ from gaussian_swaying import (
 from gaussian_swaying._fixed import fields_of
 from gaussian_swaying.aero.carried import Turbulence
 from gaussian_swaying.aero.computed_air import ComputedAir
+from gaussian_swaying.aero.shelter import Shelter
 from gaussian_swaying.gaussians.filling import InteriorFilling
 from gaussian_swaying.gaussians.parts import Part, Parts
+from gaussian_swaying.mpm.boundaries.impulse import Impulse
 from gaussian_swaying.mpm.laws.sand import Sand
 from gaussian_swaying.scenes.procedural import FlagScene
 from gaussian_swaying.simulation.material import MaterialRegion
@@ -150,3 +153,42 @@ def test_a_class_of_ones_own_keeps_its_own_names():
     assert (force.calls, camera.lens) == (1, "flat")
     with pytest.raises(AttributeError, match="`fov_y` of Wide cannot be assigned"):
         camera.fov_y = 30.0
+
+
+def _turns(make, count=6):
+    """The last states of two simulations, each alone and both in turns."""
+    alone = [list(make(which).frames(count))[-1].state.position for which in (0, 1)]
+    both = [make(which).frames(count) for which in (0, 1)]
+    for _ in range(count):
+        together = [next(frames).state.position for frames in both]
+    return alone, together
+
+
+def _with_solver(shared):
+    return lambda which: gaussian_swaying.Simulation(
+        FlagScene(spacing=0.1 + 0.02 * which), Material(E=[3e3, 3e5][which]), solver=shared, wind=[0.0, 4.0, 1.0]
+    )
+
+
+def _with_effect(shared):
+    winds = [WindField(flow, effects=[shared]) for flow in ([0.0, 4.0, 0.0], [0.0, 0.0, 4.0])]
+    return lambda which: gaussian_swaying.Simulation(FLAG, hold=POLE, wind=winds[which])
+
+
+@pytest.mark.parametrize(
+    ("make", "shared"),
+    [
+        (_with_solver, MPMSolver(0.2, boundaries=[PinnedRegion(POLE)])),
+        (_with_solver, MPMSolver(0.2, boundaries=[Impulse(POLE, [0.0, 0.001, 0.0], end=0.1, per_particle=True)])),
+        (_with_effect, Turbulence(0.5, 1.0, cells=[16, 16, 16])),
+        (_with_effect, Shelter()),
+    ],
+)
+def test_simulations_share_no_part(make, shared):
+    """One part given to two simulations: each moves as it does alone."""
+    alone, together = _turns(make(shared))
+    fresh, _ = _turns(lambda which: make(copy.deepcopy(shared))(which))
+    for first, other, third in zip(alone, together, fresh, strict=True):
+        assert torch.equal(first, other)
+        assert torch.equal(first, third)
+    assert alone[0].shape != alone[1].shape or not torch.equal(*alone)

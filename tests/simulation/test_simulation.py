@@ -98,19 +98,6 @@ def test_still_air_resists_a_fall(make_simulation):
     assert speed[1] < 0.9 * speed[0]
 
 
-def test_a_solver_can_serve_two_simulations(make_simulation):
-    """Boundaries stay as they were given, in scene units."""
-    one = make_simulation()
-    given = list(one.solver.boundaries)
-    one.start()
-    source = Scene(generator=FlagScene(spacing=0.1))
-    two = Simulation(
-        source, Material(E=3e3, density=30.0), solver=one.solver, wind=one.wind, aero=one.aero, device="cpu"
-    )
-    two.start()
-    assert list(two.solver.boundaries) == given
-
-
 def test_a_grid_that_was_outrun_is_enlarged(make_simulation):
     """A strong wind takes an unpinned flag farther in one frame than its speed at the start foretells."""
     simulation = make_simulation(wind=WindField([0.0, 25.0, 0.0]), pinned=False, formulation="updated")
