@@ -11,6 +11,7 @@ from gaussian_swaying.aero.computed_air import resolution
 from gaussian_swaying.aero.wind import WindField
 from gaussian_swaying.cli.errors import guessing, how_to_resume, run_command
 from gaussian_swaying.cli.shipped import with_shipped
+from gaussian_swaying.geometry.origin import counted_from
 from gaussian_swaying.runs.signals import stop_signals
 from gaussian_swaying.simulation.diagnostics import SimulationDiverged
 from gaussian_swaying.simulation.simulation import Simulation
@@ -66,6 +67,8 @@ def _simulate(parser: ArgumentParser, arguments: Sequence[str], started: list[Si
     if scene.filled:
         print(f"{scene.filled:,} points fill the inside")
     print(scene.frame.describe())
+    if any(scene.model.origin):
+        print(counted_from(scene.model.origin))
     if simulation.setup.air is not None and isinstance(simulation.wind, WindField):
         print(resolution(simulation.setup.air, simulation.wind, simulation.frame_dt, scene.points.position))
     extra: dict[str, Any] = {"config": [str(file) for file in settings.config or []]}

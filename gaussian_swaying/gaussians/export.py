@@ -24,6 +24,7 @@ from gaussian_swaying.gaussians.ply import check_folder, write_ply
 from gaussian_swaying.gaussians.repair import OPAQUE_LOGIT, faults, repaired
 from gaussian_swaying.gaussians.sog import encode_sog
 from gaussian_swaying.gaussians.spz import encode_spz
+from gaussian_swaying.geometry.origin import NO_ORIGIN, Origin
 from gaussian_swaying.geometry.patches import smallest_axis_normal
 from gaussian_swaying.geometry.rotations import quat_to_rotation
 
@@ -239,10 +240,12 @@ def write_usd(
     """
     check_positive("fps", fps)
     check_positive("metres_per_unit", metres_per_unit)
-    film, frame = UsdFilm(fps, metres_per_unit, rotation), None
+    film, origin = None, NO_ORIGIN
     for frame, cloud in enumerate(clouds, start):
-        film.add(frame, usd_arrays(cloud))
-    if frame is None:
+        if film is None:
+            film, origin = UsdFilm(fps, metres_per_unit, rotation, cloud.origin), cloud.origin
+        film.add(frame, usd_arrays(cloud.rebased(origin)))
+    if film is None:
         raise ValueError(f"{path} was not written because there are no frames; give at least one cloud.")
     film.save(path)
 
@@ -289,12 +292,15 @@ class UsdFilm:
         fps: Frames per second.
         metres_per_unit: Length of a scene unit [m].
         rotation: Rotation from scene directions to z up, shape (3, 3); the scene's z is up if None.
+        origin: Point that the centres count from, see :class:`~gaussian_swaying.gaussians.cloud.GaussianCloud`.
 
     Raises:
         ImportError: If usd-core is not installed.
     """
 
-    def __init__(self, fps: float, metres_per_unit: float = 1.0, rotation: Tensor | None = None) -> None:
+    def __init__(
+        self, fps: float, metres_per_unit: float = 1.0, rotation: Tensor | None = None, origin: Origin = NO_ORIGIN
+    ) -> None:
         usd, geom = _pxr("Usd"), _pxr("UsdGeom")
         self._splat = getattr(_pxr("UsdVol"), "ParticleField3DGaussianSplat", None)
         self._stage = usd.Stage.CreateInMemory()
@@ -304,10 +310,12 @@ class UsdFilm:
         self._stage.SetFramesPerSecond(fps)
         world = geom.Xform.Define(self._stage, "/World")
         self._stage.SetDefaultPrim(world.GetPrim())
-        if rotation is not None:
+        if rotation is not None or any(origin):
             Gf = _pxr("Gf")
+            turn = torch.eye(3, dtype=torch.float64) if rotation is None else rotation.double()
             matrix = Gf.Matrix4d(1.0)
-            matrix.SetRotateOnly(Gf.Matrix3d(*rotation.double().T.flatten().tolist()))  # USD multiplies rows
+            matrix.SetRotateOnly(Gf.Matrix3d(*turn.T.flatten().tolist()))  # USD multiplies rows
+            matrix.SetTranslateOnly(Gf.Vec3d(*(turn @ torch.tensor(origin, dtype=torch.float64)).tolist()))
             world.AddTransformOp().Set(matrix)
         self._prim = (self._splat or geom.Points).Define(self._stage, _PRIM)
         self._last: dict[str, tuple[int, np.ndarray]] = {}

@@ -23,6 +23,7 @@ from gaussian_swaying.gaussians.harmonics import SH_DC, rotate_sh
 from gaussian_swaying.gaussians.packed import logits
 from gaussian_swaying.gaussians.repair import cloud_of, repaired
 from gaussian_swaying.geometry.covariances import covariance, covariance_to_quat_scale, deform_covariance
+from gaussian_swaying.geometry.origin import origin_of
 from gaussian_swaying.geometry.rotations import quat_to_rotation, rotation_to_quat
 
 _EXTENSION = "KHR_gaussian_splatting"
@@ -63,7 +64,7 @@ def read_gltf(path: str | os.PathLike[str]) -> GaussianCloud:
 
 
 def encode_gltf(cloud: GaussianCloud, rotation: Tensor | None = None, metres_per_unit: float = 1.0) -> bytes:
-    """A .glb file in metres with y up.
+    """A .glb file in metres with y up; a node moves the Gaussians to the origin that they count from.
 
     Programs that do not know the extension show points in the colours of degree 0.
 
@@ -110,7 +111,7 @@ def encode_gltf(cloud: GaussianCloud, rotation: Tensor | None = None, metres_per
         "extensionsUsed": [_EXTENSION],
         "scene": 0,
         "scenes": [{"nodes": [0]}],
-        "nodes": [{"mesh": 0}],
+        "nodes": [{"mesh": 0, "translation": cloud.origin} if any(cloud.origin) else {"mesh": 0}],
         "meshes": [{"primitives": [primitive]}],
         "accessors": accessors,
         "bufferViews": views,
@@ -386,7 +387,9 @@ def _moved(cloud: GaussianCloud, matrix: Tensor, shift: Tensor) -> GaussianCloud
         return cloud
     sizes = matrix.norm(dim=0)
     turn = matrix / sizes
-    means = (cloud.means.double() @ matrix.T + shift).float()
+    places = cloud.means.double() @ matrix.T + (matrix @ torch.tensor(cloud.origin, dtype=torch.float64) + shift)
+    origin = origin_of(places.numpy())
+    means = (places - torch.tensor(origin)).float()
     if float(sizes.max() / sizes.min()) < 1 + 1e-6:
         quats = rotation_to_quat(turn @ quat_to_rotation(cloud.quats.double()))
         scales = cloud.scales + sizes.mean().log()
@@ -394,4 +397,4 @@ def _moved(cloud: GaussianCloud, matrix: Tensor, shift: Tensor) -> GaussianCloud
         still = covariance(cloud.quats.double(), cloud.scales.double())
         quats, scales = covariance_to_quat_scale(deform_covariance(matrix, still))
     sh = rotate_sh(cloud.sh.double(), turn)
-    return GaussianCloud(means, quats.float(), scales.float(), cloud.opacities, sh.float())
+    return GaussianCloud(means, quats.float(), scales.float(), cloud.opacities, sh.float(), origin=origin)

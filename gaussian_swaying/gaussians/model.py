@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 from dataclasses import dataclass, replace
+from typing import Any
 
 import torch
 from torch import Tensor, nn
@@ -53,7 +54,7 @@ class DeformedGaussians:
         check_shape("means", self.means, None, 3, batches=False)
         rest, index = model.to_cloud(), self.moving
         if index is None:
-            moved = self._moved(self.covariances, rest.sh, self.rotations)
+            moved: dict[str, Any] = self._moved(self.covariances, rest.sh, self.rotations)
         else:
             own = self._moved(self.covariances[index], rest.sh[index], self.rotations[index])
             moved = {name: getattr(rest, name).index_copy(0, index, part) for name, part in own.items()}
@@ -73,7 +74,7 @@ class DeformedGaussians:
             still = torch.ones(len(self.means), dtype=torch.bool, device=self.means.device)
             index = still.index_fill(0, index, False).nonzero()[:, 0]
         rest = model.part_to_cloud(index)
-        changed = self._moved(self.covariances[index], rest.sh, self.rotations[index]) if moving else {}
+        changed: dict[str, Any] = self._moved(self.covariances[index], rest.sh, self.rotations[index]) if moving else {}
         return replace(rest, means=self.means.detach()[index], normals=self.normals.detach()[index], **changed)
 
     def _known(self) -> GaussianSurfaceModel:
@@ -114,6 +115,7 @@ class GaussianSurfaceModel(Fixed, nn.Module):
         self.opacities = parameter(cloud.opacities)
         self.sh0 = parameter(cloud.sh[:, :1])
         self.shN = parameter(cloud.sh[:, 1:])
+        self.origin = cloud.origin
         self.register_buffer("reference_normals", None if cloud.normals is None else cloud.normals.detach().clone())
 
     @classmethod
@@ -135,6 +137,7 @@ class GaussianSurfaceModel(Fixed, nn.Module):
             opacities=self.opacities.detach(),
             sh=self.sh.detach(),
             normals=self.reference_normals,
+            origin=self.origin,
         )
 
     def part_to_cloud(self, index: Tensor) -> GaussianCloud:
@@ -147,6 +150,7 @@ class GaussianSurfaceModel(Fixed, nn.Module):
             opacities=self.opacities.detach()[index],
             sh=torch.cat([self.sh0.detach()[index], self.shN.detach()[index]], dim=1),
             normals=None if normals is None else normals[index],
+            origin=self.origin,
         )
 
     def save_ply(self, path: str | os.PathLike[str]) -> None:

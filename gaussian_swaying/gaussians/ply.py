@@ -68,7 +68,11 @@ def read_ply(path: str | os.PathLike[str], sh_degree: int | None = None) -> Gaus
     for channel in range(3):
         columns |= {rest[channel * per_channel + k]: ("sh", 3 + 3 * k + channel) for k in range(kept)}
     of_table = [table for table, _ in columns.values()]
-    tables = {name: np.empty((count, of_table.count(name)), dtype=np.float32) for name in dict.fromkeys(of_table)}
+    doubles = {table for field, (table, _) in columns.items() if table == "means" and kinds[field].itemsize > 4}
+    tables: dict[str, Any] = {
+        name: np.empty((count, of_table.count(name)), dtype=np.float64 if name in doubles else np.float32)
+        for name in dict.fromkeys(of_table)
+    }
     first = 0
     with np.errstate(over="ignore"):
         for part in element_parts(path, header, "vertex"):
@@ -80,16 +84,16 @@ def read_ply(path: str | os.PathLike[str], sh_degree: int | None = None) -> Gaus
         tables["scales"] = np.concatenate([tables["scales"], thin], 1)
     if has_normals and not tables["normals"].any():
         del tables["normals"]
-    shaped: dict[str, Any] = tables | {"opacities": tables["opacities"][:, 0]}
-    shaped["sh"] = tables["sh"].reshape(count, 1 + kept, 3)
-    return cloud_of(path, **shaped)
+    tables |= {"opacities": tables["opacities"][:, 0], "sh": tables["sh"].reshape(count, 1 + kept, 3)}
+    return cloud_of(path, **tables)
 
 
 def write_ply(path: str | os.PathLike[str], cloud: GaussianCloud) -> None:
     """Write Gaussians as a binary little-endian 3DGS .ply file, with the properties in their usual order.
 
     The file gets its name only when it is complete. Values are stored as float32, so a float32 cloud is read back
-    exactly. If the cloud has no normals, those of the smallest axes are written.
+    exactly; centres that count from an origin are stored as doubles. If the cloud has no normals, those of the smallest
+    axes are written.
 
     Args:
         path: File to write; an existing one is replaced.
@@ -113,6 +117,10 @@ def write_ply(path: str | os.PathLike[str], cloud: GaussianCloud) -> None:
     rest = tuple(f"f_rest_{index}" for index in range(rest_count))
     names = (*_MEANS, *_NORMALS, *_DC, *rest, "opacity", *_SCALES, *_QUATS)
     rows = table.astype("<f4", copy=False).view([(name, "<f4") for name in names]).reshape(count)
+    if any(cloud.origin):
+        rows = rows.astype([(name, "<f8" if name in _MEANS else "<f4") for name in names])
+        for axis, shift in zip(_MEANS, cloud.origin, strict=True):
+            rows[axis] += shift
     with atomic(path) as temporary:
         PlyData([PlyElement.describe(rows, "vertex")], byte_order="<").write(str(temporary))
 

@@ -13,6 +13,7 @@ import torch
 from torch import Tensor
 
 from gaussian_swaying.gaussians.cloud import GaussianCloud
+from gaussian_swaying.geometry.origin import origin_of
 
 FARTHEST = 1e12
 """Largest coordinate and size [scene units]: its square is finite in float32, and a grid can count its cells."""
@@ -90,9 +91,12 @@ def cloud_of(path: Path, others: dict[str, Tensor] | None = None, **columns: np.
     Args:
         path: The file, for messages.
         others: Further faults, as :func:`faults` gives them.
-        columns: The fields of :class:`GaussianCloud`, with their shapes and units.
+        columns: The fields of :class:`GaussianCloud` but its origin, with their shapes and units.
     """
-    with np.errstate(over="ignore"):
+    origin = origin_of(columns["means"])
+    with np.errstate(over="ignore", invalid="ignore"):
+        if any(origin):
+            columns["means"] = columns["means"] - np.array(origin)
         columns = {name: np.ascontiguousarray(value, dtype=np.float32) for name, value in columns.items()}
     tensors: dict[str, Any] = {name: torch.from_numpy(value) for name, value in columns.items()}
-    return repaired(path, GaussianCloud(**tensors), others=others)
+    return repaired(path, GaussianCloud(**tensors, origin=origin), others=others)

@@ -10,6 +10,13 @@ _FAR = 256  # of the extent; float32 has steps of 1.5e-5 of the extent there
 _SAMPLE = 1 << 17  # places that are looked at
 
 
+def counted_from(origin: Origin) -> str:
+    """A sentence for users who place something in a scene whose origin was taken off; empty if none was."""
+    if not any(origin):
+        return ""
+    return f"coordinates count from {list(origin)} of the file, as float32 is too coarse so far from zero"
+
+
 def origin_of(places: np.ndarray) -> Origin:
     """The origin to take off places, in float64, so that float32 can hold them; zero unless they are far away.
 

@@ -15,6 +15,7 @@ from gaussian_swaying.aero.computed_air import resolution
 from gaussian_swaying.aero.wind import WindField
 from gaussian_swaying.gaussians.cloud import GaussianCloud
 from gaussian_swaying.gaussians.repair import OPAQUE_LOGIT
+from gaussian_swaying.geometry.origin import counted_from
 from gaussian_swaying.preview.cost import Cost
 from gaussian_swaying.preview.kinds import KINDS
 from gaussian_swaying.preview.natural import Natural
@@ -42,6 +43,7 @@ def splat_lines(name: str, cloud: GaussianCloud, data: dict[str, Any]) -> list[s
     return [
         f"{name}: {len(cloud):,} Gaussians, {degree}, {normals}",
         f"  bounds        {_numbers(corner['min'])} to {_numbers(corner['max'])} (scene units)",
+        *([f"  origin        {counted_from(cloud.origin)}"] if any(cloud.origin) else []),
         f"  without 1 %   {_numbers(corner['robust_min'])} to {_numbers(corner['robust_max'])}",
         "  5, 50 and 95 % of the Gaussians have at most",
         f"    opacity     {_numbers(own['opacity'])}; {below}",

@@ -398,6 +398,7 @@ class Run:
                 "rotation": scene.frame.rotation.tolist(),
                 "metres_per_unit": scene.frame.metres_per_unit,
             },
+            "file_origin": scene.model.origin,
             "size_m": scene.size * scene.frame.metres_per_unit,
             "frames": len(log),
             "frames_wanted": self.frames,

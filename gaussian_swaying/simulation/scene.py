@@ -15,6 +15,7 @@ from gaussian_swaying.gaussians.filling import InteriorFilling
 from gaussian_swaying.gaussians.formats import read_gaussians
 from gaussian_swaying.gaussians.parts import Parts
 from gaussian_swaying.gaussians.selection import select_simulated
+from gaussian_swaying.geometry.origin import counted_from
 from gaussian_swaying.geometry.regions import Everything, Region
 from gaussian_swaying.scenes.procedural import ProceduralScene
 
@@ -174,7 +175,12 @@ class Scene(Fixed):
             ValueError: If there are none, or ``parts`` are those of another splat.
         """
         opacity = torch.sigmoid(cloud.opacities)
-        chosen = select_simulated(cloud.means, opacity, self.region, self.opacity_threshold, self.up)
+        try:
+            chosen = select_simulated(cloud.means, opacity, self.region, self.opacity_threshold, self.up)
+        except ValueError as error:
+            if any(cloud.origin):
+                raise ValueError(f"{str(error)[:-1]}; {counted_from(cloud.origin)}.") from error
+            raise
         if self.parts is None:
             return chosen
         self.parts.check_count(len(cloud.means))

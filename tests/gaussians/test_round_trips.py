@@ -1,14 +1,20 @@
 """Every format, written and read again: as it was within the bits of each field."""
 
 import math
+from dataclasses import replace
 
+import numpy as np
 import pytest
+import torch
 from other_writers import assert_same, in_order
 from small_scenes import varied_cloud
 
+from gaussian_swaying.gaussians.cloud import joined
 from gaussian_swaying.gaussians.export import export_cloud
 from gaussian_swaying.gaussians.formats import read_gaussians
 from gaussian_swaying.gaussians.harmonics import SH_DC
+from gaussian_swaying.gaussians.model import GaussianSurfaceModel
+from gaussian_swaying.geometry.regions import Box
 from gaussian_swaying.simulation.scene import Scene
 
 # half a step of 8 bits each: the logarithm of the size, opacities, colours; harmonics are rounded once more, to 4 bits
@@ -50,3 +56,74 @@ def test_round_trip(kind, degree, tmp_path):
     path.rename(tmp_path / f"A.{kind.rpartition('.')[2].upper()}")
     (renamed,) = tmp_path.iterdir()
     assert len(Scene(ply=renamed).cloud()) == len(cloud)
+
+
+# ---- map coordinates
+
+UTM = (500123.0, 4649776.5, 312.25)
+HALF_A_STEP = 2.0**-24 * 8  # of float32 within the cloud
+
+
+def _places(cloud):
+    return cloud.means.double().numpy() + cloud.origin
+
+
+def _assert_same_places(found, expected):
+    np.testing.assert_allclose(found, expected, rtol=0, atol=HALF_A_STEP)
+
+
+def _far(**kinds):
+    return replace(varied_cloud(**kinds), origin=UTM)
+
+
+@pytest.mark.parametrize("kind", ["ply", "glb"])
+def test_map_coordinates_survive(kind, tmp_path):
+    """As doubles, or by a node; also what is moved, chosen and joined counts from the origin of the file."""
+    cloud, path = _far(), tmp_path / f"a.{kind}"
+    export_cloud(path, cloud, rotation=torch.eye(3))
+    found = read_gaussians(path)
+    assert max(map(abs, found.origin)) > 4e6
+    assert found.means.abs().max() < 8
+    x, y, z = _places(found).T
+    _assert_same_places(np.stack([x, -z, y] if kind == "glb" else [x, y, z], 1), _places(cloud))
+    model = GaussianSurfaceModel(found.select(torch.arange(7)))
+    model.save_ply(tmp_path / "b.ply")
+    some = model.deformed(model.means, torch.eye(3).expand(7, 3, 3)).to_cloud()
+    near = (found.origin[0] + 1, found.origin[1], found.origin[2])
+    for again in (some, read_gaussians(tmp_path / "b.ply"), model.part_to_cloud(torch.arange(7)), some.rebased(near)):
+        _assert_same_places(_places(again), _places(found)[:7])
+
+
+def test_float32_map_coordinates_are_read_exactly(tmp_path):
+    cloud = _far()
+    far = replace(cloud, means=torch.from_numpy(_places(cloud)).float(), origin=(0.0, 0.0, 0.0))
+    export_cloud(tmp_path / "a.ply", far)
+    assert (_places(read_gaussians(tmp_path / "a.ply")) == far.means.double().numpy()).all()
+
+
+def test_splats_with_different_origins_are_joined():
+    """In the origin of all of them, which is none where one of two lies elsewhere."""
+    cloud = _far(count=20)
+    shifted = cloud.rebased((500120.0, 4649770.0, 300.0))
+    both = joined(cloud, shifted)
+    _assert_same_places(_places(both)[:20], _places(cloud))
+    _assert_same_places(_places(both)[20:], _places(shifted))
+    assert joined(cloud, varied_cloud(20)).origin == (0.0, 0.0, 0.0)
+
+
+def test_a_film_is_moved_to_its_origin(tmp_path):
+    usd = pytest.importorskip("pxr.Usd")
+    geom = pytest.importorskip("pxr.UsdGeom")
+    cloud = _far(count=5)
+    export_cloud(tmp_path / "a.usda", cloud, rotation=torch.tensor([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]]))
+    stage = usd.Stage.Open(str(tmp_path / "a.usda"))
+    place = geom.Xformable(stage.GetPrimAtPath("/World/Gaussians")).ComputeLocalToWorldTransform(0)
+    x, y, z = _places(cloud)[3]
+    assert place.Transform(tuple(cloud.means[3].double().tolist())) == pytest.approx((x, -z, y), rel=0, abs=HALF_A_STEP)
+
+
+def test_a_scene_says_where_its_coordinates_begin(tmp_path):
+    export_cloud(tmp_path / "a.ply", _far())
+    scene = Scene(ply=tmp_path / "a.ply", region=Box([500120.0, 4649770.0, 300.0], [500130.0, 4649780.0, 330.0]))
+    with pytest.raises(ValueError, match=r"No Gaussian is .*; coordinates count from \[50012\d\.\d, 464977\d\.\d, 31"):
+        scene.select(scene.cloud())
