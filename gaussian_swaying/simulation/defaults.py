@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import warnings
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -18,8 +19,10 @@ from gaussian_swaying.gaussians.cloud import GaussianCloud
 from gaussian_swaying.geometry.frame import SimFrame
 from gaussian_swaying.geometry.neighbours import particle_spacing
 from gaussian_swaying.geometry.regions import Region
+from gaussian_swaying.mpm.boundaries.impulse import Impulse
 from gaussian_swaying.mpm.boundaries.pinned_points import PinnedPoints
 from gaussian_swaying.mpm.boundaries.pinned_region import PinnedRegion
+from gaussian_swaying.mpm.boundaries.rigid_region import RigidRegion
 from gaussian_swaying.mpm.contact.surface import Contact
 from gaussian_swaying.mpm.forces import Force
 from gaussian_swaying.mpm.protocol import Solver
@@ -98,8 +101,8 @@ def as_solver(
 ) -> Solver:
     """Return a copy of the given solver, which may be another simulation's, or make one that suits the scene.
 
-    A held object then has no gravity, as in the starters of the preview: its captured shape is already in balance with
-    its weight. An object that is not held falls. ``damping`` [1/s] is that of a solver that is made.
+    An object that ``hold`` or a part of the scene holds then has no gravity, as in the starters of the preview: its
+    captured shape is already in balance with its weight. ``damping`` [1/s] is that of a solver that is made.
     """
     if solver is None:
         pins = [PinnedRegion(hold) if isinstance(hold, Region) else hold] if hold is not None else []
@@ -107,13 +110,26 @@ def as_solver(
         frame = SimFrame.fit(means, scene.up, scene.longest_side, scene.metres_per_unit)
         side = float((means.amax(0) - means.amin(0)).amax()) * frame.metres_per_unit
         spacing = particle_spacing(means) * frame.metres_per_unit
-        gravity = (0.0, 0.0, -9.8) if hold is None else (0.0, 0.0, 0.0)  # what is held was captured in balance
+        held = hold is not None or (scene.parts is not None and bool(scene.parts.mask(role="held").any()))
+        gravity = (0.0, 0.0, 0.0 if held else -9.8)
         return MPMSolver(dx=suggest_spacing(side, spacing, CELLS), gravity=gravity, boundaries=pins, damping=damping)
     if hold is not None:
         raise ValueError(
             "`hold` only works without a solver: add the pin to the `boundaries` of the solver, and leave out `hold`."
         )
     return changed(solver, boundaries=FixedList(map(changed, solver.boundaries)))
+
+
+def warn_falling(solver: Solver) -> None:
+    """Warn if gravity acts on an object that nothing holds or stops."""
+    falls = isinstance(solver, MPMSolver) and any(solver.gravity)
+    if falls and all(isinstance(part, Impulse | RigidRegion) for part in solver.boundaries):
+        warnings.warn(
+            "Nothing holds the object and nothing lies below it, so it falls: add a pin to `solver.boundaries` (in "
+            "Python `hold`), or a HalfSpaceObstacle as the ground, or set `solver.gravity` to [0, 0, 0].",
+            UserWarning,
+            stacklevel=3,
+        )
 
 
 def as_wind(wind: WindLike | None, frame: SimFrame) -> WindField | SpatialWind:

@@ -6,6 +6,7 @@ import inspect
 import subprocess
 import sys
 import threading
+import warnings
 
 import pytest
 import torch
@@ -29,6 +30,9 @@ from gaussian_swaying import (
     WindField,
 )
 from gaussian_swaying.config.parser import CUSTOM, PYTHON_ONLY, arguments_of
+from gaussian_swaying.gaussians.parts import Part, Parts
+from gaussian_swaying.mpm.boundaries.half_space import HalfSpaceObstacle
+from gaussian_swaying.mpm.boundaries.impulse import Impulse
 from gaussian_swaying.mpm.laws.sand import Sand
 from gaussian_swaying.scenes import FlagScene
 from gaussian_swaying.simulation.normalisation import Normalisation
@@ -274,6 +278,34 @@ def test_what_is_held_has_a_kind(hold, kind):
     assert list(simulation.solver.bound.kinds) == [kind]
     assert tuple(simulation.solver.gravity) == (0.0, 0.0, 0.0)
     assert ("clamp" in simulation.config) == (kind == "clamp")  # a run is resumed with the same pins
+
+
+FALLS = "Nothing holds the object"
+
+
+@pytest.mark.parametrize(
+    ("given", "down", "told"),
+    [
+        ({"hold": POLE}, 0.0, 0),
+        ({"held": True}, 0.0, 0),  # by a part
+        ({}, -9.8, 1),
+        ({"solver": MPMSolver(0.2, boundaries=[Impulse(POLE, [0.0, 0.0, 1.0])])}, -9.8, 1),
+        ({"solver": MPMSolver(0.2, gravity=[0.0, 0.0, 0.0])}, 0.0, 0),
+        ({"solver": MPMSolver(0.2, boundaries=[HalfSpaceObstacle([0.0] * 3, [0.0, 0.0, 1.0])])}, -9.8, 0),
+    ],
+)
+def test_gravity_of_what_is_held_and_of_what_falls(given, down, told):
+    """However it is held, its shape was captured in balance; what falls is told."""
+    flag = FlagScene(spacing=0.1)
+    given = dict(given)
+    held = given.pop("held", False)
+    labels = (flag.generate().means[:, 0] < 0.11).long()
+    parts = Parts(labels, [Part("cloth"), Part("pole", "held")]) if held else None
+    with warnings.catch_warnings(record=True) as found:
+        warnings.simplefilter("always")
+        simulation = Simulation(Scene(generator=flag, parts=parts), device="cpu", **given)
+    assert tuple(simulation.solver.gravity) == (0.0, 0.0, down)
+    assert sum(FALLS in str(one.message) for one in found) == told
 
 
 def test_a_copy_goes_its_own_way(tmp_path):
