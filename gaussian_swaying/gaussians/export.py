@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import re
+import warnings
 from collections.abc import Iterable
 from dataclasses import replace
 from importlib import import_module
@@ -19,6 +20,7 @@ from gaussian_swaying._files import atomic
 from gaussian_swaying.gaussians.cloud import GaussianCloud
 from gaussian_swaying.gaussians.gltf import encode_gltf
 from gaussian_swaying.gaussians.harmonics import sh_to_color
+from gaussian_swaying.gaussians.losses import losses
 from gaussian_swaying.gaussians.model import DeformedGaussians
 from gaussian_swaying.gaussians.ply import check_folder, write_ply
 from gaussian_swaying.gaussians.repair import OPAQUE_LOGIT, faults, repaired
@@ -39,7 +41,6 @@ SUFFIXES: dict[str, str] = {
     "usd": ".usdc",
 }
 """Formats, and the endings of their file names."""
-LARGEST_LOG_SCALE = 20.0  # the compressed format has no larger numbers
 _GSPLAT = {"compressed_ply": "ply_compressed", "splat": "splat"}
 _PRIM = "/World/Gaussians"
 
@@ -47,8 +48,8 @@ _PRIM = "/World/Gaussians"
 def cleaned(path: Path, cloud: GaussianCloud) -> GaussianCloud:
     """Return a splat that every format can store.
 
-    What has no meaning is left out with a warning, see :func:`~gaussian_swaying.gaussians.repair.repaired`. Opacities
-    and sizes beyond the useful range of float32 are clamped: logits to ±16, logarithms of the size to ±20.
+    What has no meaning is left out with a warning, see :func:`~gaussian_swaying.gaussians.repair.repaired`. Logits of
+    opacities are clamped to ±16, where float32 ends.
 
     Args:
         path: The file, for messages.
@@ -61,7 +62,6 @@ def cleaned(path: Path, cloud: GaussianCloud) -> GaussianCloud:
     return replace(
         kept,
         quats=torch.nn.functional.normalize(kept.quats, dim=-1),
-        scales=kept.scales.clamp(-LARGEST_LOG_SCALE, LARGEST_LOG_SCALE),
         opacities=kept.opacities.clamp(-OPAQUE_LOGIT, OPAQUE_LOGIT),
     )
 
@@ -105,7 +105,8 @@ def export_cloud(
         ImportError: If the format is ``usd`` and usd-core is not installed, or SPZ of version 4 and zstandard is not.
 
     Warns:
-        UserWarning: If Gaussians were left out because they are not finite.
+        UserWarning: If Gaussians were left out because they are not finite, and once with what the format cannot hold,
+            counted (see :func:`~gaussian_swaying.gaussians.losses.losses`).
     """
     format = format_of(path) if format is None else format
     check_choice("format", format, tuple(SUFFIXES))
@@ -127,6 +128,9 @@ def export_cloud(
             content = _gsplat_bytes(path, kept, format)
         with atomic(path) as temporary:
             temporary.write_bytes(content)
+    told = losses(kept, format, spz_version)
+    if told:
+        warnings.warn(f"{path}: {'; '.join(told)}.", UserWarning, stacklevel=2)
 
 
 def format_of(path: str | os.PathLike[str]) -> str:
@@ -177,9 +181,14 @@ def export_frames(
         write_usd(target, clouds, fps, **place)
         return [target]
     files = []
-    for index, cloud in enumerate(clouds):
-        files.append(target.with_name(numbered(target.name, str(index))))
-        export_cloud(files[-1], cloud, format=format, spz_version=spz_version, **place)
+    with warnings.catch_warnings(record=True) as told:
+        warnings.simplefilter("always")
+        for index, cloud in enumerate(clouds):
+            files.append(target.with_name(numbered(target.name, str(index))))
+            export_cloud(files[-1], cloud, format=format, spz_version=spz_version, **place)
+    if told:
+        more = f" {len(told)} warnings like this in {len(files)} files." if len(told) > 1 else ""
+        warnings.warn(f"{told[0].message}{more}", UserWarning, stacklevel=2)
     return files
 
 
@@ -267,7 +276,7 @@ def usd_arrays(cloud: GaussianCloud) -> dict[str, np.ndarray]:
     bad = torch.stack([*faults(host).values()]).any(0)
     neutral = torch.tensor([1.0, 0.0, 0.0, 0.0])
     quats = torch.nn.functional.normalize(torch.where(bad[:, None], neutral, host.quats), dim=-1)
-    scales = torch.where(bad[:, None], 0.0, host.scales).clamp(-LARGEST_LOG_SCALE, LARGEST_LOG_SCALE)
+    scales = torch.where(bad[:, None], 0.0, host.scales)
     sh = torch.where(bad[:, None, None], 0.0, host.sh)
     normals = smallest_axis_normal(quats, scales) if host.normals is None else host.normals
     arrays = {

@@ -23,7 +23,7 @@ _HEAD = struct.Struct("<4sIIBBBB")  # magic, version, count, degree, fractional 
 _TABLE = 32  # offset of the table of streams in a file of version 4 without extensions
 _ANTIALIASED, _EXTENDED = 1, 2  # flags
 _AXES = 0xADBE0003  # the extension SPZ_ADOBE_coordinate_system
-_COLOR_SCALE = 0.15  # wider than that of the harmonics, as colours may be beyond 0 and 1
+COLOR_SCALE = 0.15  # wider than that of the harmonics, as colours may be beyond 0 and 1
 _LARGEST_EXTENSIONS = 1 << 24  # bytes
 _BITS = (5, 4)  # of harmonics of band 1 and above, as Niantic's writer keeps by default
 
@@ -58,7 +58,7 @@ def read_spz(path: str | os.PathLike[str]) -> GaussianCloud:
         warnings.warn(f"{path}: ignored the harmonics of degree 4; those up to 3 are used.", UserWarning, stacklevel=2)
     positions, alphas, colors, scales, rotations, rest = parts
     sh = np.empty((count, (min(degree, 3) + 1) ** 2, 3), dtype=np.float32)
-    sh[:, 0] = ((colors / 255 - 0.5) / _COLOR_SCALE).reshape(count, 3)
+    sh[:, 0] = ((colors / 255 - 0.5) / COLOR_SCALE).reshape(count, 3)
     sh[:, 1:] = rest.reshape(count, -1, 3)[:, :15]
     sh[:, 1:] = (sh[:, 1:] - 128) / 128
     return cloud_of(
@@ -97,11 +97,11 @@ def encode_spz(cloud: GaussianCloud, version: int = 3) -> bytes:
             f"An .spz file holds centres up to ±8e6 (version 1: ±65504) but one is at {farthest:g}: remove what is far "
             "away, or choose another format."
         )
-    fraction = 24 if farthest == 0 else min(24, int(np.floor(np.log2((2**23 - 1) / farthest))))
+    fraction = fraction_bits(farthest)
     parts = (
         means.astype("<f2") if version == 1 else _int24(means * np.float64(2.0**fraction)),
         _byte(255 / (1 + np.exp(-opacities))),
-        _byte(sh[:, 0] * _COLOR_SCALE * 255 + 127.5),
+        _byte(sh[:, 0] * COLOR_SCALE * 255 + 127.5),
         _byte((scales + 10) * 16),
         _to_three(quats) if version < 3 else _to_smallest(quats),
         np.concatenate([_coarse(sh[:, 1:4], _BITS[0]), _coarse(sh[:, 4:], _BITS[1])], axis=1),
@@ -114,6 +114,11 @@ def encode_spz(cloud: GaussianCloud, version: int = 3) -> bytes:
     small = [compress(part) for part in packed]
     table = b"".join(struct.pack("<QQ", len(out), len(part)) for out, part in zip(small, packed, strict=True))
     return head + struct.pack("<I12x", _TABLE) + table + b"".join(small)
+
+
+def fraction_bits(farthest: float) -> int:
+    """Bits behind the binary point of a centre, of which the largest coordinate allows so many."""
+    return 24 if farthest == 0 else min(24, int(np.floor(np.log2((2**23 - 1) / farthest))))
 
 
 # ---- the container

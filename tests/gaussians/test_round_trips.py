@@ -1,6 +1,8 @@
 """Every format, written and read again: as it was within the bits of each field."""
 
 import math
+import re
+import warnings
 from dataclasses import replace
 
 import numpy as np
@@ -49,13 +51,70 @@ def test_round_trip(kind, degree, tmp_path):
     if kind == "4.spz":
         pytest.importorskip("zstandard")
     cloud, path = varied_cloud(degree=degree), tmp_path / f"a.{kind}"
-    export_cloud(path, cloud, **({"spz_version": int(kind[0])} if "spz" in kind else {}))
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")  # nothing is cut off
+        export_cloud(path, cloud, **({"spz_version": int(kind[0])} if "spz" in kind else {}))
     found = read_gaussians(path)
     assert_same(in_order(found, cloud), cloud, **FORMATS[kind])
     assert found.normals is None
     path.rename(tmp_path / f"A.{kind.rpartition('.')[2].upper()}")
     (renamed,) = tmp_path.iterdir()
     assert len(Scene(ply=renamed).cloud()) == len(cloud)
+
+
+THIN = {"scales": -11.0}
+STRONG, BRIGHT, FAINT = {"sh": 5.0}, {"sh": 20.0}, {"opacities": -7.0}
+WIDE, TINY = {"scales": 7.0}, {"scales": -19.0}
+
+
+@pytest.mark.parametrize(
+    ("kind", "changes", "words"),
+    [
+        ("spz", THIN, "3 of 300 Gaussians have a size below 4.5e-05, which becomes that: up to 2.72 times as thick"),
+        ("spz", WIDE, "3 of 300 Gaussians have a size above 379, which becomes that: the largest is 1.1e+03"),
+        ("spz", STRONG, "3 of 300 Gaussians have harmonics up to ±5, which are cut off at ±1"),
+        ("spz", STRONG, "3 of 300 Gaussians have a colour that is cut off"),
+        ("splat", BRIGHT, "3 of 300 Gaussians have a colour that is cut off; harmonics of degree 1 and above are left"),
+        ("compressed.ply", STRONG, "3 of 300 Gaussians have harmonics up to ±5, which are cut off at ±4"),
+        ("compressed.ply", FAINT, "3 of 300 Gaussians are fainter than 0.0039 and left out"),
+        ("compressed.ply", {"scales": -21.0}, "a size below 2.1e-09, which becomes that: up to 2.72 times as thick"),
+        ("sog", TINY, "3 of 300 Gaussians are smaller than the steps of their centres"),
+        (
+            "spz",
+            {"origin": (5e5, 4e6, 3e2)},
+            "centres count from [500000.0, 4000000.0, 300.0], which the file does not",
+        ),
+    ],
+)
+def test_what_a_format_cannot_hold_is_counted(kind, changes, words, tmp_path):
+    """In one warning; files that hold any number have none."""
+    cloud = varied_cloud()
+    for name, value in changes.items():
+        if name == "origin":
+            cloud = replace(cloud, origin=value)
+        else:
+            getattr(cloud, name)[[3, 50, 99]] = value
+    with pytest.warns(UserWarning, match=re.escape(words)) as told:
+        export_cloud(tmp_path / f"a.{kind}", cloud)
+    assert len(told) == 1
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        for whole in ("ply", "glb"):
+            export_cloud(tmp_path / f"a.{whole}", cloud)
+
+
+def test_steps_of_centres_are_those_of_the_file(tmp_path):
+    """One far Gaussian takes the bits of all others in SPZ."""
+    cloud = varied_cloud(300, degree=0)
+    cloud.means[7] = 1e6
+    with pytest.warns(
+        UserWarning, match=r"(\d+) of 300 Gaussians are smaller than the steps of their centres, 0.125"
+    ) as told:
+        export_cloud(tmp_path / "a.spz", cloud)
+    found = read_gaussians(tmp_path / "a.spz")
+    assert (found.means * 8 == (found.means * 8).round()).all()
+    small = int((cloud.scales.amax(1).exp() < 0.125).sum())
+    assert f": {small} of 300 Gaussians are smaller" in str(told[0].message)
 
 
 # ---- map coordinates
