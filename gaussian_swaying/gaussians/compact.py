@@ -13,7 +13,7 @@ from gaussian_swaying._inputs import check_regular
 from gaussian_swaying._ply_table import read_element
 from gaussian_swaying.gaussians.cloud import GaussianCloud
 from gaussian_swaying.gaussians.harmonics import SH_DC
-from gaussian_swaying.gaussians.packed import logits, with_largest
+from gaussian_swaying.gaussians.packed import logits, size_logarithms, with_largest
 from gaussian_swaying.gaussians.ply import read_binary_header
 from gaussian_swaying.gaussians.repair import cloud_of
 
@@ -40,10 +40,9 @@ def read_splat(path: str | os.PathLike[str]) -> GaussianCloud:
             f"{path} has {size} bytes, but a .splat file holds 32 for each Gaussian; copy or export it again."
         )
     rows = np.fromfile(path, dtype=_SPLAT)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        scales = np.log(rows["sizes"])
+    scales, others = size_logarithms(rows["sizes"], "the size")
     quats = (rows["quats"].astype(np.float32) - 128) / 128
-    return _colored(path, rows["means"], scales, quats, rows["rgba"] / np.float32(255))
+    return _colored(path, rows["means"], scales, quats, rows["rgba"] / np.float32(255), others=others)
 
 
 def read_compressed_ply(path: str | os.PathLike[str]) -> GaussianCloud:
@@ -135,8 +134,9 @@ def _colored(
     quats: np.ndarray,
     rgba: np.ndarray,
     rest: np.ndarray | None = None,
+    others: dict[str, np.ndarray] | None = None,
 ) -> GaussianCloud:
     """A cloud from colours and opacities (N, 4) as displayed, from 0 to 1 in steps of 1/255."""
     base = (rgba[:, None, :3] - 0.5) / SH_DC
     sh = base if rest is None else np.concatenate([base, rest], 1)
-    return cloud_of(path, means=means, quats=quats, scales=scales, opacities=logits(rgba[:, 3], 255), sh=sh)
+    return cloud_of(path, others, means=means, quats=quats, scales=scales, opacities=logits(rgba[:, 3], 255), sh=sh)

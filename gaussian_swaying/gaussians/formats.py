@@ -7,6 +7,7 @@ from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
+from gaussian_swaying._inputs import check_regular
 from gaussian_swaying._ply_table import read_header
 from gaussian_swaying.gaussians.cloud import GaussianCloud
 from gaussian_swaying.gaussians.compact import read_compressed_ply, read_splat
@@ -14,6 +15,31 @@ from gaussian_swaying.gaussians.gltf import read_gltf
 from gaussian_swaying.gaussians.ply import read_ply
 from gaussian_swaying.gaussians.sog import read_sog
 from gaussian_swaying.gaussians.spz import read_spz
+
+_BEGINNINGS = {
+    b"ply\n": (".ply",),
+    b"ply\r": (".ply",),
+    b"ngsp": (".spz",),
+    b"\x1f\x8b": (".spz",),
+    b"pk\3\4": (".sog",),
+    b"gltf": (".glb", ".gltf"),
+}
+"""What a file begins with, in small letters, and the endings of its name."""
+_PAGES = (b"<!doctype", b"<html", b"<?xml")
+
+
+def _check_beginning(path: Path) -> None:
+    """Raise ValueError if the content is plainly another than the name says."""
+    with check_regular(path, "the splat").open("rb") as stream:
+        start = stream.read(64).removeprefix(b"\xef\xbb\xbf").lstrip().lower()
+    if start.startswith(_PAGES):
+        raise ValueError(f"{path} is a web page, such as an error of a server, and no splat: download the file again.")
+    if start.startswith(b"version https://git-lfs"):
+        raise ValueError(f"{path} is a pointer of Git LFS, not the splat itself: run `git lfs pull` in its repository.")
+    for begins, endings in _BEGINNINGS.items():
+        other = path.suffix.lower() not in endings and (path.suffix.lower() in READERS or endings != (".ply",))
+        if start.startswith(begins) and other:
+            raise ValueError(f"{path} begins as a {endings[0]} file: if it is one, rename it to end in {endings[0]}.")
 
 
 def _read_any_ply(path: Path, sh_degree: int | None = None) -> GaussianCloud:
@@ -54,6 +80,7 @@ def read_gaussians(path: str | os.PathLike[str], sh_degree: int | None = None) -
         ImportError: If a package is missing that the format needs; the message says how to install it.
     """
     path = Path(path)
+    _check_beginning(path)
     reader = READERS.get(path.suffix.lower(), _read_any_ply)
     cloud = _read_any_ply(path, sh_degree) if reader is _read_any_ply else reader(path)
     if sh_degree is not None and cloud.sh_degree > sh_degree:

@@ -20,7 +20,7 @@ from torch import Tensor
 from gaussian_swaying._inputs import LARGEST_JSON, check_regular, check_unpacked, parse_json, read_json
 from gaussian_swaying.gaussians.cloud import GaussianCloud, joined
 from gaussian_swaying.gaussians.harmonics import SH_DC, rotate_sh
-from gaussian_swaying.gaussians.packed import logits
+from gaussian_swaying.gaussians.packed import logits, size_logarithms
 from gaussian_swaying.gaussians.repair import cloud_of, repaired
 from gaussian_swaying.geometry.covariances import covariance, covariance_to_quat_scale, deform_covariance
 from gaussian_swaying.geometry.origin import origin_of
@@ -275,20 +275,15 @@ class _Document:
 
         opacity, steps = self._accessor(names.get(f"{_EXTENSION}:OPACITY"), "SCALAR", count, "OPACITY")
         sizes = column(f"{_EXTENSION}:SCALE", "VEC3")
-        others = {
-            "attribute `OPACITY` is not from 0 to 1 (store the opacity itself, not its logit)": ~(
-                np.abs(opacity[:, 0] - 0.5) <= 0.501
-            ),
-            "attribute `SCALE` is negative (store the size itself, not its logarithm)": (sizes < 0).any(1),
-        }
-        with np.errstate(divide="ignore", invalid="ignore"):
-            scales = np.log(sizes)
+        scales, others = size_logarithms(sizes, "attribute `SCALE`")
+        outside = ~(np.abs(opacity[:, 0] - 0.5) <= 0.501)  # and what is not a number
+        others["attribute `OPACITY` is not from 0 to 1 (store the opacity itself, not its logit)"] = outside
         sh = np.zeros((count, width, 3), dtype=np.float32)
         for place, name in enumerate(_harmonics(_degree(path, names))):
             sh[:, place] = column(name, "VEC3")
         cloud = cloud_of(
             path,
-            {what: torch.from_numpy(mask) for what, mask in others.items()},
+            others,
             means=column("POSITION", "VEC3"),
             quats=column(f"{_EXTENSION}:ROTATION", "VEC4")[:, [3, 0, 1, 2]],
             scales=scales,

@@ -48,6 +48,13 @@ def logits(opacities: np.ndarray, steps: int) -> np.ndarray:
     return values
 
 
+def size_logarithms(sizes: np.ndarray, name: str) -> tuple[np.ndarray, dict[str, np.ndarray]]:
+    """Logarithms of sizes (N, 3), and the fault of those that are negative (see ``faults`` in ``repair.py``)."""
+    what = f"{name} is negative (store the size itself, not its logarithm)"
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return np.log(sizes), {what: sizes.min(axis=1) < 0}
+
+
 def warn_antialiased(path: Path) -> None:
     """Warn that a splat was trained with antialiasing, called by what a reader calls."""
     warnings.warn(

@@ -15,7 +15,7 @@ from einops import rearrange
 from gaussian_swaying._files import atomic
 from gaussian_swaying._ply_table import PlyHeader, element_parts, layout, read_header
 from gaussian_swaying.gaussians.cloud import GaussianCloud
-from gaussian_swaying.gaussians.repair import FLAT, cloud_of
+from gaussian_swaying.gaussians.repair import FLAT, check_units, cloud_of
 from gaussian_swaying.geometry.patches import smallest_axis_normal
 
 _MEANS = ("x", "y", "z")
@@ -47,6 +47,11 @@ def read_ply(path: str | os.PathLike[str], sh_degree: int | None = None) -> Gaus
     kinds, count, _ = layout(path, header, "vertex")
     names = kinds.names or ()
     for name in _REQUIRED:
+        if name not in names and "x" in names and not {"scale_0", "f_dc_0", "opacity"} & {*names}:
+            raise ValueError(
+                f"{path} is a point cloud or a mesh, not a splat (no property `scale_0`, `f_dc_0` or `opacity`): train "
+                "one from photos with `gaussian-swaying train`."
+            )
         if name not in names:
             raise ValueError(f"{path} has no property `{name}`, so it is not a 3DGS file; export it from a 3DGS tool.")
     rest = _rest_names(path, names)
@@ -85,7 +90,9 @@ def read_ply(path: str | os.PathLike[str], sh_degree: int | None = None) -> Gaus
     if has_normals and not tables["normals"].any():
         del tables["normals"]
     tables |= {"opacities": tables["opacities"][:, 0], "sh": tables["sh"].reshape(count, 1 + kept, 3)}
-    return cloud_of(path, **tables)
+    cloud = cloud_of(path, **tables)
+    check_units(path, cloud, 0 if doubles else float(np.spacing(np.abs(cloud.origin).max().astype(np.float32))))
+    return cloud
 
 
 def write_ply(path: str | os.PathLike[str], cloud: GaussianCloud) -> None:

@@ -22,6 +22,8 @@ FLAT = math.log(1e-3)
 """Logarithm of the thickness of a flat Gaussian, as a share of its largest size."""
 _ZERO = -43.0  # logarithm of a size whose square is zero in float32
 _MOST = 0.25  # share of the Gaussians that may be left out
+_FEW = 10  # Gaussians whose units nobody can doubt
+_SAMPLE = 1 << 17  # centres that are looked at
 
 
 def faults(cloud: GaussianCloud) -> dict[str, Tensor]:
@@ -65,8 +67,13 @@ def repaired(
     gone = torch.stack([*found.values()]).any(0)
     left_out = int(gone.sum())
     if left_out:
-        kinds = [(what, where.nonzero()[:, 0].tolist()) for what, where in found.items() if bool(where.any())]
-        what = ", ".join(f"{what} for {len(where):,}, first at index {where[0]}" for what, where in kinds)
+        kinds, seen = list[str](), torch.zeros_like(gone)
+        for why, where in found.items():
+            own = (where & ~seen).nonzero()[:, 0]
+            if len(own):
+                kinds.append(f"{why} for {len(own):,}, first at index {int(own[0])}")
+            seen |= where
+        what = ", ".join(kinds)
         told.append(f"left out {left_out:,} of {count:,} Gaussians: {what}")
         if left_out > most * count or left_out == count:
             raise ValueError(f"{path}: {left_out:,} of {count:,} Gaussians mean nothing: {what}; make the scene again.")
@@ -85,7 +92,40 @@ def repaired(
     return cloud
 
 
-def cloud_of(path: Path, others: dict[str, Tensor] | None = None, **columns: np.ndarray) -> GaussianCloud:
+def check_units(path: Path, cloud: GaussianCloud, step: float) -> None:
+    """Warn of numbers that no scene has, as in a file without logarithms or logits; ValueError if none is possible.
+
+    Args:
+        path: The file, for messages.
+        cloud: Its Gaussians.
+        step: Distance between the places that a centre can have in the file [scene units].
+    """
+    wide, told = cloud.scales.amax(-1), list[str]()
+    if len(cloud) < _FEW:
+        return
+    if bool(wide.amin() >= 0):
+        low, high = np.quantile(cloud.means.numpy()[:: -(-len(cloud) // _SAMPLE)], (0.05, 0.95), axis=0)
+        extent, least = float((high - low).max()), math.exp(float(wide.amin()))
+        told.append(
+            f"the smallest size of a Gaussian is {least:.3g}, while the centres lie within {extent:.3g}: `scale_0` to "
+            "`scale_2` should be the logarithm of the size"
+        )
+        if least > extent > 0:
+            raise ValueError(f"{path}: {told[0]}.")
+        if float(wide.amax()) > 1 and math.exp(float(wide.median())) * len(cloud) ** (1 / 3) < 3 * extent:
+            told.clear()
+    low, high = torch.aminmax(cloud.opacities)
+    if low >= 0 and high <= 1:
+        told.append(
+            f"opacities are {float(low.sigmoid()):.0%} to {float(high.sigmoid()):.0%}: `opacity` should be their logit"
+        )
+    if step > math.exp(float(wide.median())):
+        told.append(f"centres so far from zero have steps of {step:.3g} in float32: export them as double")
+    for what in told:
+        warnings.warn(f"{path}: {what}.", UserWarning, stacklevel=4)
+
+
+def cloud_of(path: Path, others: dict[str, np.ndarray] | None = None, **columns: np.ndarray) -> GaussianCloud:
     """The Gaussians of a file as float32 tensors, :func:`repaired`.
 
     Args:
@@ -99,4 +139,5 @@ def cloud_of(path: Path, others: dict[str, Tensor] | None = None, **columns: np.
             columns["means"] = columns["means"] - np.array(origin)
         columns = {name: np.ascontiguousarray(value, dtype=np.float32) for name, value in columns.items()}
     tensors: dict[str, Any] = {name: torch.from_numpy(value) for name, value in columns.items()}
-    return repaired(path, GaussianCloud(**tensors, origin=origin), others=others)
+    further = {what: torch.from_numpy(mask) for what, mask in (others or {}).items()}
+    return repaired(path, GaussianCloud(**tensors, origin=origin), others=further)

@@ -36,6 +36,14 @@ def test_flat_ones_of_other_programs(tmp_path):
     assert cloud.scales.isfinite().all()
 
 
+def test_logarithms_in_place_of_sizes(tmp_path):
+    export_cloud(tmp_path / "a.splat", varied_cloud(20, degree=0))
+    rows = np.fromfile(tmp_path / "a.splat", np.dtype([("means", "<f4", 3), ("sizes", "<f4", 3), ("rest", "u1", 8)]))
+    rows["sizes"] = np.log(rows["sizes"])
+    rows.tofile(tmp_path / "a.splat")
+    refused(tmp_path / "a.splat", "the size is negative (store the size itself, not its logarithm) for 20, first")
+
+
 def test_files_of_other_programs(tmp_path):
     """Opacity bytes of 0 and 255 stay finite; older files have no range of colours."""
     names = ("packed_position", "packed_rotation", "packed_scale", "packed_color")

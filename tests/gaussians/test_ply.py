@@ -1,6 +1,7 @@
 """The 3DGS .ply file: what is written comes back, other tools' files are understood, bad ones are explained."""
 
 import os
+import re
 import warnings
 
 import numpy as np
@@ -170,18 +171,23 @@ def test_infinite_opacity_is_read_as_opaque(tmp_path):
 
 def test_what_is_no_file(tmp_path):
     refused(tmp_path / "none.ply", "none.ply does not exist; check the path")
-    refused(tmp_path, "is a directory; give the .ply file inside it")
+    refused(tmp_path, "is a directory; give the splat inside it")
     os.mkfifo(tmp_path / "pipe.ply")  # reading it would wait for ever
     refused(tmp_path / "pipe.ply", "not a regular file")
 
 
-def _without(name):
-    return {key: column for key, column in _columns().items() if key != name}
+def _without(*names):
+    return {key: column for key, column in _columns().items() if key not in names}
 
 
 @pytest.mark.parametrize(
     ("columns", "options", "words"),
     [
+        (
+            _without("opacity", *(f"scale_{k}" for k in range(3)), "f_dc_0"),
+            {},
+            ["is a point cloud or a mesh, not a splat"],
+        ),
         (_columns(), {"text": True}, ["ASCII", "export as binary"]),
         (_columns(), {"name": "face"}, ["no element `vertex` (elements: face)", "export it from a 3DGS tool"]),
         (_columns(count=0), {}, ["zero Gaussians", "export the scene again"]),
@@ -199,12 +205,10 @@ def test_not_a_scene(tmp_path, columns, options, words):
     refused(_write(tmp_path / "bad.ply", columns, **options), *words)
 
 
-def test_cut_off_or_another_kind(tmp_path):
+def test_cut_off(tmp_path):
     path = _write(tmp_path / "bad.ply", _columns())
     path.write_bytes(path.read_bytes()[:-30])
     refused(path, "is truncated", "copy or export the file again")
-    path.write_bytes(b"solid x\n")
-    refused(path, "is not a .ply file", "export the scene as .ply")
 
 
 BAD = [
@@ -254,6 +258,67 @@ def test_flat_ones_become_a_thousandth_of_their_width(tmp_path):
     assert_close(some.scales[:3, 2], thin[:3])
     assert torch.equal(some.scales[3:], whole.scales[3:])
     assert_close(surfels.scales, torch.cat([whole.scales[:, :2], thin[:, None]], 1))
+
+
+def _changed(**functions):
+    return {name: column if name not in functions else functions[name](column) for name, column in _scene().items()}
+
+
+def _scene():
+    """Sixty Gaussians of a hundredth of the scene, in doubles."""
+    columns = {name: column.astype("f8") for name, column in _columns(count=60).items()}
+    return columns | {f"scale_{k}": -4 + 0.3 * columns[f"scale_{k}"] for k in range(3)}
+
+
+LOGARITHM = "`scale_0` to `scale_2` should be the logarithm of the size"
+LINEAR = {f"scale_{k}": np.exp for k in range(3)}
+UTM = {"x": lambda x: x + 5e5, "y": lambda y: y + 4649776.5}
+
+
+@pytest.mark.parametrize(
+    ("columns", "refusal", "words"),
+    [
+        (_changed(**{name: lambda s: s + 8 for name in LINEAR}), True, LOGARITHM),  # as large as the scene
+        (_changed(**LINEAR, x=lambda x: 100 * x), False, LOGARITHM),
+        (_changed(opacity=lambda logit: 1 / (1 + np.exp(-logit))), False, "`opacity` should be its logit"),
+        (
+            {k: v.astype("f4") for k, v in _changed(**UTM).items()},
+            False,
+            "steps of 0.5 in float32: export them as double",
+        ),
+    ],
+    ids=["sizes", "doubtful sizes", "opacities", "places"],
+)
+def test_other_units_are_named(columns, refusal, words, tmp_path):
+    """What is impossible is refused, what is doubtful is warned of; doubles far away are neither."""
+    path = _write(tmp_path / "a.ply", columns)
+    if refusal:
+        refused(path, words)
+    else:
+        with pytest.warns(UserWarning, match=re.escape(words)) as told:
+            assert len(read_ply(path)) == 60
+        assert len(told) == 1
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        read_ply(_write(path, _changed(**UTM)))
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "words"),
+    [
+        ("a.ply", b"\n<!DOCTYPE html><html>404</html>", "a web page, such as an error of a server"),
+        ("a.splat", b"<?xml version='1.0'?><Error/>", "a web page"),
+        ("a.spz", b"version https://git-lfs.github.com/spec/v1\noid sha256:0123\n", "run `git lfs pull`"),
+        ("a.ply", b"PK\3\4" + bytes(100), "begins as a .sog file: if it is one, rename it to end in .sog"),
+        ("a.splat", b"ply\nformat ascii 1.0\n" + bytes(11), "begins as a .ply file"),
+        ("a.sog", b"\x1f\x8b" + bytes(9), "begins as a .spz file"),
+        ("a.other", b"glTF" + bytes(9), "begins as a .glb file"),
+        ("a.other", b"solid x\n", "is not a .ply file (it does not start with `ply`); export the scene as .ply"),
+    ],
+)
+def test_a_file_of_another_kind_is_named(name, content, words, tmp_path):
+    (tmp_path / name).write_bytes(content)
+    refused(tmp_path / name, words)
 
 
 def test_write_needs_gaussians_and_a_folder(tmp_path):
