@@ -242,9 +242,9 @@ def preview_config(options: argparse.Namespace) -> Preview:
     if options.scene is not None:
         arguments += ["--scene.ply", options.scene]
     begin = Stopwatch()
-    simulation, settings = _pipeline(arguments)
+    simulation, _ = _pipeline(arguments)
     startup = LOADED + begin.quiet
-    cost = estimate_cost(simulation, settings.frames, startup)
+    cost = estimate_cost(simulation, simulation.frames_wanted, startup)
     cloud = simulation.scene.model.to_cloud().to("cpu")
     data: dict[str, Any] = {
         "config": options.config,

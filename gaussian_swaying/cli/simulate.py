@@ -74,7 +74,7 @@ def _simulate(parser: ArgumentParser, arguments: Sequence[str], started: list[Si
     extra: dict[str, Any] = {"config": [str(file) for file in settings.config or []]}
     started.append(simulation)
     with stop_signals():
-        summary = simulation.run(folder, settings.frames, settings.resume, extra)
+        summary = simulation.run(folder, resume=settings.resume, settings=extra)
     seconds = ", ".join(f"{part} {value:.1f} s" for part, value in summary["wall_s"].items())
     print(f"{summary['frames']} frames, {summary['substeps']:,} substeps: {seconds}")
     if summary["torn_particles"]:

@@ -21,7 +21,7 @@ from typing import TYPE_CHECKING, Any, Optional, get_args, get_type_hints
 from torch import Tensor, nn
 
 from gaussian_swaying import _program as program
-from gaussian_swaying._checks import check_frames
+from gaussian_swaying._checks import check_frames, check_positive
 from gaussian_swaying._yaml_limits import limit_yaml
 from gaussian_swaying.aero.carried import Turbulence
 from gaussian_swaying.aero.obstacles import CylinderObstacle, EllipsoidObstacle
@@ -42,7 +42,7 @@ CAMERA_PATHS = (CaptureCamera, KeyframedCamera)
 EFFECTS = (CylinderObstacle, EllipsoidObstacle, FrozenWind, Shelter, Turbulence)
 # options that a configuration file cannot contain; settings that may change when a run is resumed
 COMMAND_LINE_ONLY = ("preset", "physgaussian")
-RUN_ONLY = ("config", "output", "device", "frames", "resume")
+RUN_ONLY = ("config", "output", "device", "frames", "resume", "slow", "loop")
 # constructor arguments that a YAML file sets within a component instead; components that may be null
 PYTHON_ONLY = ("up", "hold", "renderer", "cloud")
 NULLABLE = ("air", "contact", "normalisation")
@@ -129,6 +129,18 @@ def build_parser(schema: type) -> ArgumentParser:
         action=ActionYesNo(no_prefix=None),  # type: ignore[arg-type]
         default=False,
         help="Continue the run found in the output folder.",
+    )
+    parser.add_argument(
+        "--slow", type=float, default=1.0, help="Slow motion: each second of the wind takes SLOW seconds."
+    )
+    parser.add_argument(
+        "--loop",
+        type=float,
+        nargs="?",
+        const=1.0,
+        default=0.0,
+        help="A film that closes: its last second, or LOOP seconds, become its beginning. It has as many frames "
+        "as asked for; more are simulated.",
     )
     groups = _groups(schema)
     for name, component in groups.items():
@@ -269,6 +281,22 @@ def check_settings(schema: type, settings: Namespace) -> None:
                 f"Expected `{name}` to contain fields, such as those that --help-all lists, but got {settings[name]!r}."
             )
     check_frames("frames", settings.frames)
+
+
+def as_filmed(settings: Namespace) -> Namespace:
+    """Settings in which ``slow`` and ``loop`` are those of the frames and of the recorder."""
+    filmed, slow = settings.clone(), settings.slow
+    check_positive("slow", slow)
+    check_positive("loop", settings.loop, allow_zero=True)
+    if slow != 1:
+        filmed.recorder.fps = filmed.recorder.fps or 1 / filmed.frame_dt
+        filmed.frames = round((filmed.frames - 1) * slow) + 1
+        filmed.frame_dt = filmed.frame_dt / slow
+    if settings.loop:
+        filmed.recorder.loop = settings.loop / slow
+        filmed.frames += round(filmed.recorder.loop / filmed.frame_dt)
+    filmed.slow, filmed.loop = 1.0, 0.0
+    return filmed
 
 
 def config_text(parser: ArgumentParser, settings: Namespace) -> str:

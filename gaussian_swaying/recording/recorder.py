@@ -85,6 +85,8 @@ class Recorder:
         trajectory: Write position (float32, metres, z up) and F (float16) of the simulated particles for each frame.
         checkpoint_every: Write the state for ``--resume`` every ``checkpoint_every`` frames; 0 for never.
         fps: Frames per second of the video; null for real time, 1 / frame_dt.
+        loop: Time [s] in which the end of the motion becomes its beginning, so that a film closes; 0 for none. The
+            first frames, as many as that takes, are recorded only as that end.
         renders: Pictures of each frame: ``color``, ``depth``, ``normal``, ``force``, ``wind``, ``vorticity``.
         nodes: In ``total``, write the displacement (metres, z up; float16, or float32 where it is long) of the nodes
             that the Gaussians follow for each frame, for ``gaussian-swaying export``. Runs of ``updated`` have
@@ -97,14 +99,15 @@ class Recorder:
     trajectory: bool = True
     checkpoint_every: int = 1
     fps: float | None = None
+    loop: float = 0.0
     renders: Sequence[str] = ("color",)
     nodes: bool = True
 
     def __post_init__(self) -> None:
         check_literals(type(self).__init__, vars(self), "recorder.")
-        for name in ("checkpoint_every", "fps"):
+        for name in ("checkpoint_every", "fps", "loop"):
             if (value := getattr(self, name)) is not None:
-                check_positive(f"recorder.{name}", value, allow_zero=name.endswith("every"))
+                check_positive(f"recorder.{name}", value, allow_zero=name != "fps")
         renders = self.renders
         if isinstance(renders, str) or not renders or len(set(renders)) < len(renders):
             raise ValueError(
@@ -228,7 +231,7 @@ class Recorder:
 
     def _missing(self, path: Path, checkpoint: dict[str, Any]) -> list[str]:
         """Sentences about missing files of the frames so far."""
-        frames, told = range(checkpoint["frame"] + 1), []
+        frames, told = range(checkpoint["recorded"]), []
         for place in self._picture_folders():
             film = video_file(place) if self.video and place in self._films else None
             told += tell_missing(path / place, ".png", frames, film)

@@ -3,15 +3,19 @@
 from __future__ import annotations
 
 import os
+import warnings
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from functools import cached_property
+from pathlib import Path
 
 import torch
 
+from gaussian_swaying._files import atomic, is_blank, save_png
 from gaussian_swaying._fixed import fixed
 from gaussian_swaying.gaussians.export import export_cloud
 from gaussian_swaying.gaussians.model import DeformedGaussians
+from gaussian_swaying.gaussians.ply import check_folder
 from gaussian_swaying.mpm.state import State
 from gaussian_swaying.rendering.protocol import RenderOutput
 from gaussian_swaying.simulation.diagnostics import FrameDiagnostics
@@ -76,10 +80,12 @@ class Frame:
         return painter.draw(gaussians, gaussians.colors, painter.camera_at(self.index, camera))
 
     def save(self, path: str | os.PathLike[str], format: str | None = None) -> None:
-        """Write the Gaussians of the frame as a splat, in scene units; USD in metres with z up, glTF with y up.
+        """Write the picture of the frame (.png), or its Gaussians as a splat.
+
+        A splat is in scene units; USD in metres with z up, glTF with y up.
 
         Args:
-            path: File to write, such as 0001.ply; an existing one is replaced.
+            path: File to write, such as 0001.ply or 0001.png; an existing one is replaced.
             format: As in :func:`~gaussian_swaying.gaussians.export.export_cloud`; by default that of the ending: .ply,
                 .compressed.ply, .splat, .spz, .sog, .glb, or .usdc, .usd and .usda.
 
@@ -88,6 +94,14 @@ class Frame:
             ValueError: If the ending or the format is unknown, no Gaussian is finite, or the simulation has copies.
             ImportError: If the format is USD and usd-core is not installed.
         """
+        if format is None and Path(path).suffix.lower() == ".png":
+            check_folder(Path(path))
+            pixels = (self.render().color.detach().clamp(0, 1) * 255 + 0.5).to(torch.uint8).cpu().numpy()
+            if is_blank(pixels):
+                warnings.warn(f"{path} shows nothing: check the place of the camera and its `near`.", stacklevel=2)
+            with atomic(Path(path)) as temporary:
+                save_png(temporary, pixels)
+            return
         if self.editor.stepper.copies is not None:
             raise ValueError("`copies` cannot be written as a splat yet: write the object alone, without them.")
         place, fps = self.painter.scene.frame, 1 / self.editor.stepper.frame_dt

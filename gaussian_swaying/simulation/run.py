@@ -135,6 +135,72 @@ class WallClock:
         return dict(self.seconds)
 
 
+NODAL = "node_displacement"
+
+
+class Closing:
+    """Makes the end of a recorded motion its beginning, see ``recorder.loop``.
+
+    Args:
+        scene: The scene.
+        recorder: The outputs.
+        frames: Number of frames of the run.
+        frame_dt: Time from one to the next [s].
+
+    Attributes:
+        count: Number of frames at the beginning that are not recorded by themselves.
+    """
+
+    def __init__(self, scene: SimulatedScene, recorder: Recorder, frames: int, frame_dt: float) -> None:
+        self.scene, self.frames, self.count = scene, frames, round(recorder.loop / frame_dt)
+        self._first: list[dict[str, Tensor]] = []
+        if self.count and frames <= 2 * self.count:
+            raise ValueError(
+                f"`recorder.loop` of {recorder.loop:g} s is {self.count} frames, and the run has {frames}: raise "
+                f"`frames` to more than {2 * self.count}, or shorten `recorder.loop`."
+            )
+        if self.count and not {"color", "depth", "normal"}.issuperset(recorder.renders):
+            raise ValueError(
+                "With `recorder.loop`, `recorder.renders` can be color, depth and normal: leave out others."
+            )
+
+    def __call__(self, state: State, frame: int) -> State:
+        """The state to record in place of that of a frame."""
+        late = frame - (self.frames - self.count)
+        if frame < self.count:
+            self._first.append({name: part.clone() for name, part in self._motion(state).items()})
+        if not self.count or late < 0:
+            return state
+        share = (late + 1) / (self.count + 1)
+        share *= share * (3 - 2 * share)
+        motion = {name: part.lerp(self._first[late][name], share) for name, part in self._motion(state).items()}
+        nodes = self.scene.follow.nodes(state)
+        if nodes is not None:
+            rest: Any = state
+            motion[NODAL] = rest.node_displacement.index_copy(0, nodes, motion[NODAL])
+        return state.replace(**motion)
+
+    def _motion(self, state: State) -> dict[str, Tensor]:
+        """What the Gaussians follow, and what is recorded of the nodes."""
+        follow = self.scene.follow
+        motion, nodal = {name: getattr(state, name) for name in follow.reads}, follow.nodal(state)
+        return motion if nodal is None else motion | {NODAL: nodal}
+
+    def kept(self) -> dict[str, Any]:
+        """What a run needs to be resumed."""
+        return {"frames": self.frames if self.count else None, "count": self.count, "first": list(self._first)}
+
+    def resume(self, kept: dict[str, Any]) -> None:
+        """Go on with what :meth:`kept` returned."""
+        if (kept["frames"], kept["count"]) != (self.kept()["frames"], self.count):
+            raise ValueError(
+                "A motion that closes has a length: resume with the `frames` and the `recorder.loop` of the run, or "
+                "start again without --resume."
+            )
+        device = self.scene.model.means.device
+        self._first = [{name: part.to(device) for name, part in frame.items()} for frame in kept["first"]]
+
+
 class Run:
     """A run: simulate, draw and record.
 
@@ -167,6 +233,7 @@ class Run:
         self.walls = WallClock(painter.device)
         if painter.device.type == "cuda":
             torch.cuda.reset_peak_memory_stats(painter.device)
+        self.closing = Closing(self.scene, recorder, frames, self.stepper.frame_dt)
         self.splat = splat_checksum(self.scene)
         self.force_end = self.stepper.force_scale()
 
@@ -207,6 +274,7 @@ class Run:
         if checkpoint is not None:
             restored = type(state).from_state_dict(checkpoint["state"], stepper.device)
             state = self.editor.edit_due(restored, resumed=True)
+            self.closing.resume(checkpoint["closing"])
             first, self.log = checkpoint["frame"] + 1, checkpoint["log"]
             walls.seconds.update(checkpoint["wall_s"])
         status, reason, done = "complete", None, first
@@ -275,7 +343,7 @@ class Run:
         self.files = []
         try:
             with self.walls("writing"):
-                self.files = recorder.close(done, summary, release=False)
+                self.files = recorder.close(max(done - self.closing.count, 0), summary, release=False)
         except OSError as error:
             if status == "complete":
                 raise
@@ -309,6 +377,8 @@ class Run:
                     "log": log_lines(self.log, self._lines),
                     "config": self.config,
                     "wall_s": self.walls.read(),
+                    "recorded": max(frame + 1 - self.closing.count, 0),
+                    "closing": self.closing.kept(),
                     "splat": self.splat,
                     "parts": parts_checksum(self.scene),
                     "nodes": self.scene.follow.nodes(state) is not None,
@@ -324,6 +394,9 @@ class Run:
     def record(self, state: State, frame: int) -> None:
         """Draw and record the requested outputs of a frame."""
         recorder, walls = self.recorder, self.walls
+        state, frame = self.closing(state, frame), frame - self.closing.count
+        if frame < 0:
+            return
         if recorder.images:
             with walls("shading"):
                 gaussians = self.painter.deformed(state)

@@ -21,6 +21,7 @@ from gaussian_swaying.aero.wind import SpatialWind, WindField
 from gaussian_swaying.config.parser import (
     NOT_COMPARED,
     arguments_of,
+    as_filmed,
     build_parser,
     check_settings,
     config_text,
@@ -468,6 +469,7 @@ class Simulation(Fixed):
             changes: As in :meth:`from_yaml`.
         """
         check_settings(cls, settings)
+        settings = as_filmed(settings)
         text = config_text(parser, settings)
         parts: Any = with_custom(parser, settings, parser.instantiate(settings))
         simulation = cls(**{name: parts.get(name) for name in arguments_of(cls)} | changes)

@@ -126,11 +126,11 @@ def _run(job: Job, parser: ArgumentParser) -> dict[str, dict[str, Any]]:
     def once() -> dict[str, Any]:
         if job.resume and (folder / "checkpoint.pt").exists():
             try:
-                return simulation.run(folder, settings.frames, True, extra, progress=False)
+                return simulation.run(folder, None, True, extra, progress=False)
             except FolderLocked:
                 raise
             except ValueError as error:  # it was killed after the last frame, or a file is damaged
                 print(f"{error} The run starts again.")
-        return simulation.run(folder, settings.frames, False, extra, progress=False)
+        return simulation.run(folder, None, False, extra, progress=False)
 
     return {name: unlocked(once)}

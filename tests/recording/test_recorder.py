@@ -17,11 +17,13 @@ import torch
 from shared import advanced, without_waits
 
 from gaussian_swaying.aero.wind import WindField
+from gaussian_swaying.config.parser import as_filmed
 from gaussian_swaying.gaussians.harmonics import sh_to_color
 from gaussian_swaying.gaussians.ply import read_ply
 from gaussian_swaying.geometry.covariances import covariance
 from gaussian_swaying.recording import recorder as recorder_module
 from gaussian_swaying.recording import trajectory
+from gaussian_swaying.recording.nodes import load_nodes
 from gaussian_swaying.recording.recorder import Recorder
 from gaussian_swaying.recording.trajectory import load_trajectory
 from gaussian_swaying.recording.video import VideoEncoder, encode_video
@@ -29,6 +31,7 @@ from gaussian_swaying.rendering.cameras.camera_path import LookAtCamera, OrbitCa
 from gaussian_swaying.scenes.procedural import FlagScene
 from gaussian_swaying.simulation.diagnostics import SimulationDiverged
 from gaussian_swaying.simulation.run import Run
+from gaussian_swaying.simulation.simulation import Simulation
 
 FLAG = FlagScene(spacing=0.3).generate()
 
@@ -519,6 +522,55 @@ def test_what_was_recorded_before_the_end_is_kept(error, status, make_simulation
     assert (summary["status"], summary["frames"], summary["frames_wanted"]) == (status, 3, 10)
     assert status == "interrupted" or str(error) == summary["reason"]
     assert not [name for name in _names(folder) if "/." in name or name.startswith(".")]
+
+
+# ---- films that close
+
+
+def test_the_end_of_a_motion_becomes_its_beginning(make_simulation, tmp_path):
+    """Frames 3 to 9; the last three go over into those before the first; also from the middle of it, resumed."""
+    simulation = make_simulation()
+    states = [frame.state.node_displacement.clone() for frame in simulation.frames(10)]
+    nodes = simulation.scene.follow.nodes(simulation.start())
+    for folder, parts in (("whole", [10]), ("first", [2, 10]), ("late", [8, 10])):
+        for part in parts:
+            if part < 10:
+                with pytest.MonkeyPatch.context() as patch:
+                    _fail_at(simulation, patch, part, KeyboardInterrupt())
+                    with pytest.raises(KeyboardInterrupt):
+                        _run(simulation, tmp_path / folder, 10, Recorder(loop=0.12))
+            else:
+                _run(simulation, tmp_path / folder, 10, Recorder(loop=0.12), resume=len(parts) > 1)
+        found = load_nodes(tmp_path / folder / "nodes.npz")
+        assert len(found) == len(list((tmp_path / folder / "frames").iterdir())) == 7
+        for k in range(7):
+            share = max(0, k - 3) / 4
+            share *= share * (3 - 2 * share)
+            expected = torch.lerp(states[k + 3], states[max(0, k - 4)], share)[nodes]
+            torch.testing.assert_close(found[k], expected, rtol=1e-3, atol=1e-6)
+    assert float((found[6] - found[0]).norm()) < 0.4 * float((states[9] - states[3])[nodes].norm())
+    with pytest.raises(ValueError, match=r"resume with the `frames` and the `recorder.loop` of the run"):
+        _run(simulation, tmp_path / "whole", 12, Recorder(loop=0.12), resume=True)
+
+
+def test_what_cannot_close(make_simulation, tmp_path):
+    with pytest.raises(ValueError, match=r"`frames` to more than 10, or shorten `recorder.loop`"):
+        _run(make_simulation(), tmp_path / "run", 10, Recorder(loop=0.2))
+    with pytest.raises(ValueError, match=r"With `recorder.loop`, `recorder.renders` can be color, depth and normal"):
+        _run(make_simulation(), tmp_path / "run", 10, Recorder(loop=0.04, renders=("color", "force")))
+
+
+def test_slow_motion_and_loops_of_the_command_line():
+    """A film of as many frames of the same speed, from finer steps of time, and more frames before one that closes."""
+    parser = Simulation.parser()
+    plain = parser.parse_args(["--frames=51", "--frame_dt=0.04"])
+    found = as_filmed(parser.parse_args(["--frames=51", "--frame_dt=0.04", "--slow=4", "--loop=2"]))
+    assert (found.frames, found.frame_dt) == (201 + 50, 0.01)
+    assert (found.recorder.fps, found.recorder.loop) == (25.0, 0.5)
+    assert as_filmed(plain).recorder == plain.recorder
+    assert as_filmed(parser.parse_args(["--loop", "--frames=51"])).recorder.loop == 1.0
+    with pytest.raises(ValueError, match="`slow` to be positive"):
+        as_filmed(parser.parse_args(["--slow=0"]))
 
 
 # ---- the folder

@@ -4,6 +4,7 @@ import json
 import shutil
 from dataclasses import replace
 
+import imageio.v3 as iio
 import numpy as np
 import pytest
 import torch
@@ -161,6 +162,9 @@ def test_a_frame_saves_its_gaussians(recorded, tmp_path):
             frame.save(tmp_path / "b", format=format)
             assert (tmp_path / f"a{suffix}").read_bytes() == (tmp_path / "b").read_bytes()
             assert len(read_gaussians(tmp_path / f"a{suffix}")) == 96
+    frame.save(tmp_path / "a.png")
+    shown = (frame.render().color.clamp(0, 1) * 255).round().numpy()
+    assert np.abs(iio.imread(tmp_path / "a.png") - shown).max() <= 1
     up = read_gaussians(tmp_path / "a.glb").means - 2 * frame.gaussians.means  # in metres, y up as in the scene
     torch.testing.assert_close(up, torch.zeros_like(up), rtol=0, atol=1e-5)
     before = sorted(tmp_path.iterdir())
