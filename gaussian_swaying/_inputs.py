@@ -7,14 +7,20 @@ import json
 import os
 import stat
 import zipfile
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from contextvars import ContextVar
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 LARGEST_JSON = 1 << 28  # bytes; a capture of 10,000 images takes 10 MB
+LARGEST_HEAD = 1 << 24  # bytes of the JSON in a binary file
+MOST_ENTRIES = 1 << 22  # in a JSON file; each takes up to 100 bytes of memory
 LONGEST_NUMBER = 32  # digits of a whole number
+_SPARE = ContextVar("_SPARE", default=1 << 29)  # bytes of memory that any compressed file may take
+_SHARE = 100  # and so many times its size
 
 
 def check_regular(path: str | os.PathLike[str], what: str = "the file", largest: int | None = None) -> Path:
@@ -76,6 +82,11 @@ def parse_json(content: bytes, what: str, path: str | os.PathLike[str]) -> Any:
         what: Name of the file in the message.
         path: The file, for the message.
     """
+    entries = sum(map(content.count, (b",", b"[", b"{")))
+    if entries > MOST_ENTRIES:
+        raise ValueError(
+            f"The {what} `{path}` has {entries:,} entries, more than the {MOST_ENTRIES:,} that it may have."
+        )
     try:
         return json.loads(decoded(content), parse_int=_whole)
     except (json.JSONDecodeError, UnicodeDecodeError) as error:
@@ -104,17 +115,27 @@ def check_archive(path: str | os.PathLike[str], what: str) -> Path:
     return path
 
 
+@contextmanager
+def spare_memory(amount: int) -> Iterator[None]:
+    """Let compressed files take so many bytes of memory within the block, besides a multiple of their size."""
+    token = _SPARE.set(amount)
+    try:
+        yield
+    finally:
+        _SPARE.reset(token)
+
+
 def check_unpacked(path: Path, needed: int, what: str, size: int | None = None) -> None:
     """Check what a compressed file announces before it is decompressed.
 
     Args:
         path: The file.
-        needed: Memory that its content will take [bytes].
-        what: The announced content, for the message, for example "8,000 Gaussians".
+        needed: Memory that reading it takes at the most [bytes].
+        what: The announced content, for the message, for example "a `count` of 8,000 Gaussians".
         size: Size of all files that hold it [bytes]; that of the file if None.
     """
     size = path.stat().st_size if size is None else size
-    if needed > (1 << 30) + 100 * size:
+    if needed > _SPARE.get() + _SHARE * size:
         raise ValueError(
             f"{path} announces {what}, far more than its {size:,} bytes can hold; copy or export it again."
         )

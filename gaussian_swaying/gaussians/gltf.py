@@ -17,10 +17,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from gaussian_swaying._inputs import LARGEST_JSON, check_regular, check_unpacked, parse_json, read_json
+from gaussian_swaying._inputs import LARGEST_HEAD, check_regular, parse_json, read_json
 from gaussian_swaying.gaussians.cloud import GaussianCloud, joined
 from gaussian_swaying.gaussians.harmonics import SH_DC, rotate_sh
-from gaussian_swaying.gaussians.packed import logits, size_logarithms
+from gaussian_swaying.gaussians.packed import check_count, logits, size_logarithms
 from gaussian_swaying.gaussians.repair import cloud_of, repaired
 from gaussian_swaying.geometry.covariances import covariance, covariance_to_quat_scale, deform_covariance
 from gaussian_swaying.geometry.origin import origin_of
@@ -56,7 +56,7 @@ def read_gltf(path: str | os.PathLike[str]) -> GaussianCloud:
     degrees = [_degree(path, primitive["attributes"]) for primitive, _ in found]
     counts = [document.count(primitive["attributes"]["POSITION"]) for primitive, _ in found]
     width = (max(degrees) + 1) ** 2
-    check_unpacked(path, sum(counts) * (44 + 12 * width), f"{sum(counts):,} Gaussians")
+    check_count(path, sum(counts), width)
     if not sum(counts):
         raise ValueError(f"{path} holds zero Gaussians; export the scene again.")
     parts = [document.gaussians(*what, width) for what, count in zip(found, counts, strict=True) if count]
@@ -166,7 +166,7 @@ class _Document:
             start += count
         if start < length:
             raise self.broken(f"{length - start} bytes follow its last part")
-        if len(chunks.get(b"JSON", ())) == 0 or len(chunks[b"JSON"]) > LARGEST_JSON:
+        if len(chunks.get(b"JSON", ())) == 0 or len(chunks[b"JSON"]) > LARGEST_HEAD:
             raise self.broken("its JSON is missing or too large")
         if b"BIN\0" in chunks:
             self._buffers[0] = chunks[b"BIN\0"]

@@ -9,6 +9,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from gaussian_swaying._inputs import check_unpacked
+
+_PEAK = 5  # memory while a file is read, in sizes of its Gaussians
 _OTHERS = np.array([[1, 2, 3], [0, 2, 3], [0, 1, 3], [0, 1, 2]])  # places of the small ones for each of the largest
 _PLACES = np.array([[3, 0, 1, 2], [0, 3, 1, 2], [0, 1, 3, 2], [0, 1, 2, 3]])  # where 3 stands for the largest
 
@@ -46,6 +49,18 @@ def logits(opacities: np.ndarray, steps: int) -> np.ndarray:
     inside = np.clip(opacities.astype(np.float64), 0.5 / steps, 1 - 0.5 / steps)
     values: np.ndarray = np.log(inside / (1 - inside))
     return values
+
+
+def check_count(path: Path, count: int, harmonics: int, size: int | None = None) -> None:
+    """Raise ValueError if a file announces more Gaussians than it can hold, by the memory that reading them takes.
+
+    Args:
+        path: The file.
+        count: Number of Gaussians.
+        harmonics: Number of harmonics of each, with the constant.
+        size: Size of all files that hold them [bytes]; that of the file if None.
+    """
+    check_unpacked(path, _PEAK * count * (44 + 12 * harmonics), f"a `count` of {count:,} Gaussians", size)
 
 
 def size_logarithms(sizes: np.ndarray, name: str) -> tuple[np.ndarray, dict[str, np.ndarray]]:

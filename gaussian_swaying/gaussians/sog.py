@@ -19,9 +19,16 @@ import torch
 from torch import Tensor
 
 from gaussian_swaying._checks import one_line
-from gaussian_swaying._inputs import LARGEST_JSON, check_regular, check_unpacked, parse_json, read_json
+from gaussian_swaying._inputs import LARGEST_HEAD, check_regular, check_unpacked, parse_json, read_json
 from gaussian_swaying.gaussians.cloud import GaussianCloud, joined
-from gaussian_swaying.gaussians.packed import floats, logits, smallest_three, warn_antialiased, with_largest
+from gaussian_swaying.gaussians.packed import (
+    check_count,
+    floats,
+    logits,
+    smallest_three,
+    warn_antialiased,
+    with_largest,
+)
 from gaussian_swaying.gaussians.repair import cloud_of
 
 LARGEST_SIDE = 16383  # pixels of a WebP picture
@@ -141,7 +148,7 @@ def _single(path: Path) -> GaussianCloud:
         with _archive(path) as archive:
             return archive.read(name)
 
-    if sizes.get("meta.json", 0) > LARGEST_JSON:
+    if sizes.get("meta.json", 0) > LARGEST_HEAD:
         raise _broken(path, "its meta.json is too large")
     return _decoded(path, parse_json(read("meta.json"), "SOG file", path), read)
 
@@ -223,7 +230,7 @@ def _decoded(path: Path, meta: Any, read: _Read) -> GaussianCloud:
     if type(bands) is not int or not 0 <= bands <= 3 or type(sets) is not int or not 0 <= sets <= PALETTE:
         raise _broken(path, f"`shN` has {str(sets)[:20]} sets of {str(bands)[:20]} bands")
     size = sum(len(read(name)) for entry in (*part.values(), rest) for name in entry.get("files", []))
-    check_unpacked(path, count * (56 + 12 * _REST[bands]), f"{count:,} Gaussians", size)
+    check_count(path, count, 1 + _REST[bands], size)
 
     def pixels(name: str, number: int = 0) -> np.ndarray:
         """The first pixels of a picture, one for each Gaussian, shape (count, 4)."""

@@ -12,9 +12,16 @@ from typing import Any
 
 import numpy as np
 
-from gaussian_swaying._inputs import check_regular, check_unpacked
+from gaussian_swaying._inputs import check_regular
 from gaussian_swaying.gaussians.cloud import GaussianCloud
-from gaussian_swaying.gaussians.packed import floats, logits, smallest_three, warn_antialiased, with_largest
+from gaussian_swaying.gaussians.packed import (
+    check_count,
+    floats,
+    logits,
+    smallest_three,
+    warn_antialiased,
+    with_largest,
+)
 from gaussian_swaying.gaussians.repair import cloud_of
 
 VERSIONS = (1, 2, 3, 4)
@@ -24,6 +31,7 @@ _TABLE = 32  # offset of the table of streams in a file of version 4 without ext
 _ANTIALIASED, _EXTENDED = 1, 2  # flags
 _AXES = 0xADBE0003  # the extension SPZ_ADOBE_coordinate_system
 COLOR_SCALE = 0.15  # wider than that of the harmonics, as colours may be beyond 0 and 1
+_DEFLATED = 1032  # bytes that one of gzip stands for at the most
 _LARGEST_EXTENSIONS = 1 << 24  # bytes
 _BITS = (5, 4)  # of harmonics of band 1 and above, as Niantic's writer keeps by default
 
@@ -138,7 +146,7 @@ def _sizes(path: Path, data: bytes) -> tuple[tuple[Any, ...], list[int]]:
         raise ValueError(f"{path} has harmonics of degree {degree}, but they end at 4; export it again.")
     if fraction > 24:
         raise ValueError(f"{path} has centres of 24 bits with `fractional_bits` {fraction}; copy or export it again.")
-    check_unpacked(path, count * (56 + 12 * ((degree + 1) ** 2 - 1)), f"{count:,} Gaussians")
+    check_count(path, count, (degree + 1) ** 2)
     rows = (6 if version == 1 else 9, 1, 3, 3, 3 if version < 3 else 4, 3 * ((degree + 1) ** 2 - 1))
     return head, [count * row for row in rows]
 
@@ -150,6 +158,8 @@ def _unzipped(path: Path) -> tuple[tuple[Any, ...], list[np.ndarray], bytes]:
             head, sizes = _sizes(path, stream.read(_HEAD.size))
             if head[1] == 4:
                 raise ValueError(f"{path} has `version` 4, but is compressed by gzip; copy or export it again.")
+            if sum(sizes) > _DEFLATED * path.stat().st_size:
+                raise _truncated(path, sum(sizes), _DEFLATED * path.stat().st_size)
             body = bytearray(sum(sizes))
             found = stream.readinto(body)
             if found < len(body):
@@ -223,7 +233,7 @@ def _longer(path: Path, head: tuple[Any, ...]) -> ValueError:
 
 def _truncated(path: Path, needed: int, found: int) -> ValueError:
     return ValueError(
-        f"{path} is truncated: {needed:,} bytes are announced, but {found:,} follow; copy or export it again."
+        f"{path} is truncated: `count` asks for {needed:,} bytes, but {found:,} follow; copy or export it again."
     )
 
 

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 
 import torch
 
+from gaussian_swaying._inputs import spare_memory
 from gaussian_swaying.config.parser import parse_text
 from gaussian_swaying.gaussians.formats import read_gaussians
 from gaussian_swaying.preview.starter import starter_yaml
@@ -18,6 +19,9 @@ from gaussian_swaying.simulation.simulation import Simulation
 
 if TYPE_CHECKING:
     from jsonargparse import ArgumentParser, Namespace
+
+SPARE = 1 << 26
+"""Memory that a splat may take besides a multiple of its size [bytes]: less than elsewhere, as others may upload it."""
 
 
 def settings_of_splat(
@@ -42,7 +46,8 @@ def settings_of_splat(
     """
     file = Path(path).resolve()
     tell(0.05, "Reading the splat")
-    gaussians = read_gaussians(file)
+    with spare_memory(SPARE):
+        gaussians = read_gaussians(file)
     tell(0.15, "Looking for a region, pins and a grid")
     found = suggest(gaussians, quality="draft" if quick else "normal")
     if found.parts is not None:

@@ -195,7 +195,7 @@ def _set(place, **values):
         (_set("nodes 0", scale=[1, -1, 1]), "shears or mirrors its Gaussians"),
         (_set("nodes 0", matrix=[1, 0, 0, 0, 1, 1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1]), "shears or mirrors"),
         (_set("nodes 0", scale=[1e20] * 3), "beyond ±1e+12"),
-        (_set("accessors 0", count=2**31), "announces 2,147,483,648 Gaussians, far more"),
+        (_set("accessors 0", count=2**31), "announces a `count` of 2,147,483,648 Gaussians, far more"),
         (lambda d, p: d.update(extensionsRequired=[KHR, "EXT_meshopt"]), "requires the extensions ['EXT_meshopt']"),
         (lambda d, p: p.update(mode=4), "`mode` 4 of a primitive with Gaussians is not 0"),
         (lambda d, p: p.pop("mode"), "`mode` 4 of a primitive with Gaussians is not 0"),
@@ -260,7 +260,10 @@ def test_one_mesh_many_times(tmp_path):
     document["accessors"] = [wide | {"type": a["type"]} for a in document["accessors"]]
     document["bufferViews"] = [{"buffer": 0, "byteLength": 4 * count}]
     tracemalloc.start()
-    refused(_written(tmp_path / "b.glb", document, bytes(4 * count)), "announces 20,000,000 Gaussians, far more")
+    refused(
+        _written(tmp_path / "b.glb", document, bytes(4 * count)),
+        "announces a `count` of 20,000,000 Gaussians, far more",
+    )
     assert tracemalloc.get_traced_memory()[1] < 1 << 25
     tracemalloc.stop()
 

@@ -280,11 +280,11 @@ UTM = {"x": lambda x: x + 5e5, "y": lambda y: y + 4649776.5}
     [
         (_changed(**{name: lambda s: s + 8 for name in LINEAR}), True, LOGARITHM),  # as large as the scene
         (_changed(**LINEAR, x=lambda x: 100 * x), False, LOGARITHM),
-        (_changed(opacity=lambda logit: 1 / (1 + np.exp(-logit))), False, "`opacity` should be its logit"),
+        (_changed(opacity=lambda logit: 1 / (1 + np.exp(-logit))), False, "`opacity` should be their logit"),
         (
             {k: v.astype("f4") for k, v in _changed(**UTM).items()},
             False,
-            "steps of 0.5 in float32: export them as double",
+            "steps of 0.5 in float32",
         ),
     ],
     ids=["sizes", "doubtful sizes", "opacities", "places"],

@@ -189,7 +189,7 @@ def test_bad_files(tmp_path):
     for change, message in (
         (lambda f: f.pop("quats.webp"), "it has no file `quats.webp`"),
         (_set("version", 1), "is SOG of version 1, not 2; convert it"),
-        (_set("count", 10**9), "announces 1,000,000,000 Gaussians, far more than its"),
+        (_set("count", 10**9), "announces a `count` of 1,000,000,000 Gaussians, far"),
         (_set("count", 40), "has 4 x 4 pixels, but `count` asks for 40"),
         (_set("count", 1), "`count` is 1, but its pictures hold 15 Gaussians more"),
         (_set("means maxs", [30, 0, 0]), "beyond ±1e+12 for"),

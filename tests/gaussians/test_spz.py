@@ -1,5 +1,6 @@
 """SPZ of all versions: as it was within the bits of each field, as others write it, and what is refused."""
 
+import contextlib
 import gzip
 import math
 import struct
@@ -13,6 +14,7 @@ from other_writers import FILES, assert_same, refused, scene, turned
 from small_scenes import varied_cloud
 from torch.testing import assert_close
 
+from gaussian_swaying._inputs import spare_memory
 from gaussian_swaying.gaussians.export import export_cloud
 from gaussian_swaying.gaussians.formats import read_gaussians
 from gaussian_swaying.gaussians.spz import encode_spz, read_spz
@@ -159,12 +161,13 @@ def test_bad_files(tmp_path):
         (good + b"more", "cannot be decompressed (Not a gzipped file"),
         (_body(version=4) + b"\0", behind.format(4, 2)),
         (_body(_put(16, "<I", 40), version=4), "broken table of 5 streams at byte 40"),
-        (b"ply\n", "starts neither as gzip nor with `NGSP`"),
+        (b"#\n", "starts neither as gzip nor with `NGSP`"),
         (b"\x1f\x8b" + bytes(40), "cannot be decompressed"),
-        (gzip.compress(_body()[:-3]), "40 bytes are announced, but 37 follow"),
+        (gzip.compress(_body()[:-3]), "`count` asks for 40 bytes, but 37 follow"),
         (gzip.compress(_body(_put(4, "<I", 9))), "not an .spz file of `version` 1 to 4"),
         (gzip.compress(_body(_put(8, "<I", 0))), "zero Gaussians"),
-        (gzip.compress(_body(_put(8, "<I", 2**32 - 1))), "announces 4,294,967,295 Gaussians, far more than its"),
+        (gzip.compress(_body(_put(8, "<I", 2**32 - 1))), "announces a `count` of 4,294,967,295 Gaussians, far more"),
+        (gzip.compress(_body(_put(8, "<I", 100_000))), "`count` asks for 2,000,000 bytes, but"),
         (gzip.compress(_body(_put(12, "B", 5))), "harmonics of degree 5, but they end at 4"),
         (_body(_put(15, "B", 6), version=4), "broken table of 6 streams"),
         (_body(_put(32, "<Q", 2**63), version=4), "stream 0 does not fit its table"),
@@ -186,6 +189,29 @@ def test_no_more_is_decompressed_than_announced(tmp_path):
         refused(tmp_path / name, "goes on behind")
         assert tracemalloc.get_traced_memory()[1] < 1 << 22
         tracemalloc.stop()
+
+
+def _bomb(count):
+    """A file of version 4 whose Gaussians are all the same: 10 kB for each gigabyte."""
+    whole = needs_zstandard.ZstdCompressor(level=19)
+    parts = [whole.compress(bytes([144]) * (count * size)) for size in (9, 1, 3, 3, 4)]
+    table = [struct.pack("<QQ", len(part), count * size) for part, size in zip(parts, (9, 1, 3, 3, 4), strict=True)]
+    head = struct.pack("<4sIIBBBBI12x", b"NGSP", 4, count, 0, 12, 0, 5, 32)
+    return b"".join([head, *table, *parts])
+
+
+@pytest.mark.parametrize(("count", "spare"), [(10_000_000, None), (400_000, 1 << 26)])
+def test_few_bytes_cannot_take_much_memory(count, spare, tmp_path):
+    """Less where others can send a file."""
+    (tmp_path / "a.spz").write_bytes(_bomb(count))
+    assert (tmp_path / "a.spz").stat().st_size < 20_000
+    tracemalloc.start()
+    with spare_memory(spare) if spare else contextlib.nullcontext():
+        refused(tmp_path / "a.spz", f"announces a `count` of {count:,} Gaussians, far more than its")
+    assert tracemalloc.get_traced_memory()[1] < 1 << 20
+    tracemalloc.stop()
+    if spare:
+        assert len(read_gaussians(tmp_path / "a.spz")) == count
 
 
 def test_values_that_cannot_be_used(tmp_path):
