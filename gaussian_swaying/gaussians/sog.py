@@ -157,7 +157,11 @@ def _single(path: Path) -> GaussianCloud:
 def _archive(path: Path) -> Iterator[zipfile.ZipFile]:
     """The zip file of a bundle; whatever is wrong with it is a ValueError that names it."""
     try:
-        with zipfile.ZipFile(path) as archive:
+        with zipfile.ZipFile(path) as archive, path.open("rb") as stream:
+            begins = stream.read(4)
+            stream.seek(-22 - len(archive.comment), os.SEEK_END)
+            if begins != b"PK\3\4" or stream.read(4) != b"PK\5\6":
+                raise zipfile.BadZipFile("bytes precede or follow it that do not belong to it")
             yield archive
     except (zipfile.BadZipFile, zlib.error, EOFError, OSError, RuntimeError, ValueError) as error:
         raise _broken(path, one_line(error)) from error
@@ -239,12 +243,13 @@ def _decoded(path: Path, meta: Any, read: _Read) -> GaussianCloud:
     low, high = (_numbers(path, part["means"], end, 3, 3) for end in ("mins", "maxs"))
     logs = low + (high - low) * (pixels("means")[:, :3] + 256.0 * pixels("means", 1)[:, :3]) / 65535
     packed = _picture(path, read, part["quats"]["files"], 0, count).reshape(-1, 4)
-    small, good = (packed[:, :3] / 255 - 0.5) * np.sqrt(2), packed[:, 3] >= _LARGEST_TAG
+    small = (packed[:, :3] / 255 - 0.5) * np.sqrt(2)
+    good = (packed[:, 3] >= _LARGEST_TAG) & (np.square(small).sum(1) < 1)  # 3/4 at the most
     if not good[:count].all():
-        raise _broken(path, "a pixel of `quats` does not say which component is the largest")
-    more = good[count:] & (np.square(small[count:]).sum(1) < 1) & (packed[count:] != packed[count - 1]).any(1)
-    if more.any():
-        raise _broken(path, f"`count` is {count:,}, but its pictures hold {int(more.sum()):,} Gaussians more")
+        raise _broken(path, f"`count` is {count:,}, but a pixel of `quats` among these is no rotation")
+    more = int((good[count:] & (packed[count:] != packed[count - 1]).any(1)).sum())
+    if more:
+        raise _broken(path, f"`count` is {count:,}, but its pictures hold {more:,} Gaussians more")
     colors = pixels("sh0")
     sh = _looked_up(path, part["sh0"], "sh0", colors[:, :3])[:, None, :]
     if bands:
@@ -280,10 +285,8 @@ def _part(path: Path, meta: dict[str, Any], name: str) -> dict[str, Any]:
 def _numbers(path: Path, entry: dict[str, Any], name: str, least: int, most: int) -> np.ndarray:
     values = entry.get(name)
     if isinstance(values, list) and least <= len(values) <= most and all(type(v) in (int, float) for v in values):
-        array = np.array(values, dtype=np.float64)
-        if np.isfinite(array).all():
-            return array
-    raise _broken(path, f"`{name}` is not a list of {least} to {most} finite numbers")
+        return np.array(values, dtype=np.float64)
+    raise _broken(path, f"`{name}` is not a list of {least} to {most} numbers")
 
 
 def _looked_up(path: Path, entry: dict[str, Any], name: str, which: np.ndarray) -> np.ndarray:

@@ -60,6 +60,8 @@ def read_spz(path: str | os.PathLike[str]) -> GaussianCloud:
         raise ValueError(f"{path} is not an .spz file (it starts neither as gzip nor with `NGSP`); export it again.")
     _, version, count, degree, fraction, flags, _ = head
     _check_axes(path, extensions)
+    if flags > _ANTIALIASED | _EXTENDED:
+        warnings.warn(f"{path}: ignored the unknown `flags` {flags:#x} of its header.", UserWarning, stacklevel=2)
     if flags & _ANTIALIASED:
         warn_antialiased(path)
     if degree == 4:
@@ -166,10 +168,13 @@ def _unzipped(path: Path) -> tuple[tuple[Any, ...], list[np.ndarray], bytes]:
                 raise _truncated(path, len(body), found)
             extensions = stream.read(_LARGEST_EXTENSIONS) if head[5] & _EXTENDED else b""
             more = stream.read(1)  # at the end this compares the checksum
+            size = stream.tell()
     except (zlib.error, EOFError, gzip.BadGzipFile) as error:
         raise ValueError(f"{path} cannot be decompressed ({error}); copy or export it again.") from error
-    if more:
-        raise _longer(path, head)
+    with path.open("rb") as raw:
+        raw.seek(-4, os.SEEK_END)
+        if more or raw.read() != struct.pack("<I", size & 0xFFFFFFFF):  # zeros may follow
+            raise _longer(path, head)
     return head, np.split(np.frombuffer(body, dtype=np.uint8), np.cumsum(sizes)[:-1]), extensions
 
 
@@ -184,8 +189,8 @@ def _streams(path: Path, data: bytes) -> tuple[tuple[Any, ...], list[np.ndarray]
         raise _truncated(path, _TABLE, len(data))
     table = struct.unpack_from("<I", data, _HEAD.size)[0]
     start = table + 16 * len(wanted)
-    longest = len(data) - 16 * len(wanted) if head[5] & _EXTENDED else _TABLE
-    if head[6] != len(wanted) or not _TABLE <= table <= longest:
+    misplaced = table < _TABLE if head[5] & _EXTENDED else table != _TABLE
+    if head[6] != len(wanted) or misplaced or start > len(data):
         raise ValueError(f"{path} has a broken table of {head[6]} streams at byte {table}; copy or export it again.")
     parts = []
     for index, size in enumerate(wanted):

@@ -2,6 +2,8 @@
 
 import io
 import json
+import math
+import re
 import tracemalloc
 import zipfile
 from dataclasses import replace
@@ -197,7 +199,7 @@ def test_bad_files(tmp_path):
         (_set("scales codebook", [1e4] * 256), "`scale_2` is NaN or infinite"),
         (_set("shN count", 70000), "`shN` has 70000 sets of 3 bands"),
         (lambda f: f.update({"quats.webp": b"RIFF"}), "`quats.webp` is not a WebP picture"),
-        (lambda f: f.update({"quats.webp": _picture(4, 4)}), "a pixel of `quats` does not say"),
+        (lambda f: f.update({"quats.webp": _picture(4, 4)}), "a pixel of `quats` among these is no rotation"),
     ):
         files = _files(FILES / "scene.sog")
         change(files)
@@ -211,6 +213,37 @@ def test_only_what_programs_write_is_unpacked(method, tmp_path):
     with zipfile.ZipFile(tmp_path / "bad.sog", "w", method) as archive:
         archive.writestr("meta.json", b"{}")
     refused(tmp_path / "bad.sog", "`meta.json` is compressed by other means than deflate")
+
+
+def test_the_count_is_that_of_the_pictures(tmp_path):
+    """Of 290 Gaussians in 300 pixels, the others of which this program makes white and others black."""
+    export_cloud(tmp_path / "a.sog", varied_cloud(290))
+    for count, words in ((289, "hold 1 Gaussians more"), (291, "no rotation"), (300, "no rotation")):
+        files = _files(tmp_path / "a.sog")
+        _set("count", count)(files)
+        refused(_packed(tmp_path / "bad.sog", files), f"`count` is {count}, but", words)
+
+
+def test_nothing_precedes_or_follows_a_bundle(tmp_path):
+    whole = (FILES / "scene.sog").read_bytes()
+    for content in (whole + b"\0", b"more" + whole):
+        (tmp_path / "bad.sog").write_bytes(content)
+        refused(tmp_path / "bad.sog", "bytes precede or follow it")
+
+
+def test_a_code_book_may_hold_what_is_no_number(tmp_path):
+    """What has it is left out, or flat."""
+    export_cloud(tmp_path / "a.sog", varied_cloud())
+    for place, value, words, left in (
+        ("sh0 codebook", math.nan, "`f_dc_*` or `f_rest_*` is NaN or infinite", 0),
+        ("scales codebook", -math.inf, "have a size of zero, and become flat", 300),
+    ):
+        files = _files(tmp_path / "a.sog")
+        book = json.loads(files["meta.json"])[place.split()[0]]["codebook"]
+        _set(place, [value, *book[1:]])(files)
+        with pytest.warns(UserWarning, match=re.escape(words)):
+            found = read_gaussians(_packed(tmp_path / "b.sog", files))
+        assert left <= len(found) <= 300
 
 
 def test_nothing_swells(tmp_path):

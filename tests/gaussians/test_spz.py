@@ -98,6 +98,9 @@ def test_flags_and_extensions_are_told(tmp_path):
     path.write_bytes(gzip.compress(_body(_put(14, "B", 1))))
     with pytest.warns(UserWarning, match="trained with antialiasing"):
         read_gaussians(path)
+    path.write_bytes(gzip.compress(_body(_put(14, "B", 0x84))))
+    with pytest.warns(UserWarning, match="ignored the unknown `flags` 0x84"):
+        read_gaussians(path)
     axes = struct.Struct("<IIIIII")  # an extension that is not known, and that of the axes
     for number, good in (
         (6, True),
@@ -159,8 +162,11 @@ def test_bad_files(tmp_path):
         (good[:-3], "ended before the end-of-stream marker"),
         (good[:-8] + bytes(8), "CRC check failed"),
         (good + b"more", "cannot be decompressed (Not a gzipped file"),
+        (good + bytes(3), behind.format(3, 2)),
+        (good + gzip.compress(b""), behind.format(3, 2)),
         (_body(version=4) + b"\0", behind.format(4, 2)),
         (_body(_put(16, "<I", 40), version=4), "broken table of 5 streams at byte 40"),
+        (_body(version=4)[:37], "broken table of 5 streams at byte 32"),
         (b"#\n", "starts neither as gzip nor with `NGSP`"),
         (b"\x1f\x8b" + bytes(40), "cannot be decompressed"),
         (gzip.compress(_body()[:-3]), "`count` asks for 40 bytes, but 37 follow"),
