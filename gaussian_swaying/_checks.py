@@ -11,6 +11,8 @@ from typing import TYPE_CHECKING, Any, Literal, get_args, get_origin, get_type_h
 import torch
 from torch import Tensor
 
+from gaussian_swaying._numbers import Sense, sense_of
+
 if TYPE_CHECKING:
     Number = float | Tensor
     VectorLike = Sequence[Number] | Tensor
@@ -72,7 +74,23 @@ def check_vector(name: str, value: Any, length: int = 3) -> tuple[float, ...]:
     result = tuple(float(item) for item in items)
     if any(item != item or item in (float("inf"), float("-inf")) for item in result):
         raise ValueError(f"Expected `{name}` to be finite, but got {list(result)}.")
+    for item in result:
+        check_sense(name, item, 0.0)
     return result
+
+
+def check_sense(name: str, value: float, least: float = 1e-12) -> None:
+    """Raise ValueError unless a finite number lies in the range in which a setting of its name makes sense.
+
+    Args:
+        name: The name.
+        value: Its value; zero is left to other checks.
+        least: Smallest size where the name is not known.
+    """
+    sense = sense_of(name)
+    known = sense or Sense(low=least)
+    if value and not known.low <= (value if sense else abs(value)) <= known.high:
+        raise ValueError(f"Expected `{name}` {known.words}, but got {value:g}.")
 
 
 def check_choice(name: str, value: str, choices: tuple[str, ...]) -> None:
@@ -105,12 +123,14 @@ def check_positive(name: str, value: float, *, allow_zero: bool = False) -> None
     wanted = "not be negative" if allow_zero else "be positive"
     if not (value >= 0 if allow_zero else value > 0) or value == float("inf"):
         raise ValueError(f"Expected `{name}` to {wanted} and finite, but got {value}.")
+    check_sense(name, value)
 
 
-def check_whole(name: str, value: Any, least: int) -> None:
-    """Raise ValueError unless ``value`` is a whole number of at least ``least``."""
-    if isinstance(value, bool) or not isinstance(value, int) or value < least:
-        raise ValueError(f"Expected `{name}` to be a whole number of at least {least}, but got {value!r}.")
+def check_whole(name: str, value: Any, least: int, most: int = 1 << 63) -> None:
+    """Raise ValueError unless ``value`` is a whole number of at least ``least`` and at most ``most``."""
+    if isinstance(value, bool) or not isinstance(value, int) or not least <= value <= most:
+        limit = f" and at most {most:,}" if most < 1 << 63 else ""
+        raise ValueError(f"Expected `{name}` to be a whole number of at least {least}{limit}, but got {value!r:.60}.")
 
 
 def check_frames(name: str, count: Any) -> int:

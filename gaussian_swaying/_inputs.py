@@ -142,7 +142,7 @@ def check_unpacked(path: Path, needed: int, what: str, size: int | None = None) 
 
 
 def read_arrays(
-    path: str | os.PathLike[str], what: str, needed: Sequence[str], optional: Sequence[str] = ()
+    path: str | os.PathLike[str], what: str, needed: Sequence[str], optional: Sequence[str] = (), only: bool = False
 ) -> dict[str, np.ndarray]:
     """Read arrays from a .npz file; no code in it is executed.
 
@@ -151,6 +151,7 @@ def read_arrays(
         what: Name of the kind of file, for the message, for example "the reference".
         needed: Names of the required arrays.
         optional: Names of optional arrays.
+        only: Whether others are an error.
 
     Returns:
         The arrays found, by name.
@@ -158,8 +159,11 @@ def read_arrays(
     try:
         with np.load(check_archive(path, what)) as archive:
             found = {name: archive[name] for name in (*needed, *optional) if name in archive}
+            unknown = sorted(set(archive.files) - {*needed, *optional})
     except Exception as error:  # missing, not a zip, pickled, ...
         raise ValueError(f"{path} cannot be read ({error}): make {what} again.") from error
+    if only and unknown:
+        raise ValueError(f"{path} has the array `{unknown[0]}`, which {what} cannot have: remove or rename it.")
     for name in needed:
         if name not in found:
             raise ValueError(f"{path} has no array `{name}`: make {what} again.")

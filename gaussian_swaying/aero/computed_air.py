@@ -11,14 +11,14 @@ from typing import Any, Literal
 import torch
 from torch import Tensor, nn
 
-from gaussian_swaying._checks import check_choice, check_plain, check_positive, check_vector, check_whole
+from gaussian_swaying._checks import check_choice, check_positive, check_vector, check_whole
 from gaussian_swaying._fixed import Fixed
 from gaussian_swaying.aero.obstacles import Obstacle
 from gaussian_swaying.aero.shelter import Shelter
 from gaussian_swaying.aero.wind import WindField
 from gaussian_swaying.aero.wind_force import WindForce
 from gaussian_swaying.air.collision import MOMENTS
-from gaussian_swaying.air.flow import WALL, Face, FlowState, LatticeFlow
+from gaussian_swaying.air.flow import MOST_CELLS, WALL, Face, FlowState, LatticeFlow
 from gaussian_swaying.air.immersed import Reach, give, look, together, velocity_at
 from gaussian_swaying.air.lattice import FASTEST, LatticeUnits
 from gaussian_swaying.geometry.distance import DistanceGrid
@@ -84,20 +84,19 @@ class ComputedAir(Fixed, nn.Module):
         self.low, self.high = check_vector("low", low), check_vector("high", high)
         if not all(a < b for a, b in zip(self.low, self.high, strict=True)):
             raise ValueError(f"Expected `low` of the air below `high` along each axis, but got {low} and {high}.")
-        check_whole("cells", cells, LEAST_CELLS)
+        check_whole("air.cells", cells, LEAST_CELLS)
         check_choice("force", force, ("surface", "law"))
-        check_positive("viscosity", viscosity)
-        check_positive("smagorinsky", smagorinsky, allow_zero=True)
-        check_positive("lattice_speed", lattice_speed)
-        if lattice_speed > FASTEST:
-            raise ValueError(f"Expected `lattice_speed` of at most {FASTEST}, but got {lattice_speed}.")
-        check_plain("speed", speed)
+        check_positive("air.viscosity", viscosity)
+        check_positive("air.smagorinsky", smagorinsky, allow_zero=True)
+        check_positive("air.lattice_speed", lattice_speed)
         if speed is not None:
-            check_positive("speed", speed)
+            check_positive("air.speed", speed)
         self.cells, self.force, self.ground, self.walls = cells, force, bool(ground), list(walls)
         self.still_walls = bool(still_walls)
         self.viscosity, self.smagorinsky = float(viscosity), float(smagorinsky)
         self.speed, self.lattice_speed = speed, float(lattice_speed)
+        if math.prod(self.counts()) > MOST_CELLS:
+            raise ValueError(f"`air.cells` of {cells:,} makes more than {MOST_CELLS:,} cells in all: lower it.")
 
     @property
     def spacing(self) -> float:

@@ -8,7 +8,15 @@ from typing import Any, Literal
 import torch
 from torch import Tensor, nn
 
-from gaussian_swaying._checks import Number, check_choice, check_plain, check_positive, check_shape, number_of
+from gaussian_swaying._checks import (
+    Number,
+    check_choice,
+    check_plain,
+    check_positive,
+    check_shape,
+    check_vector,
+    number_of,
+)
 from gaussian_swaying._fixed import Fixed
 from gaussian_swaying.aero.patches import PatchSums
 from gaussian_swaying.geometry.groups import sums
@@ -317,8 +325,7 @@ class AeroForce(Fixed, nn.Module):
         numbers = {"C_D": number_of(C_D), "C_F": number_of(C_F), "air_density": air_density, "added_mass": added_mass}
         for name, value in numbers.items():
             check_positive(name, value, allow_zero=True)
-        if not abs(number_of(C_L)) < float("inf"):
-            raise ValueError(f"Expected `C_L` to be finite, but got {C_L}.")
+        check_vector("C_L", [number_of(C_L)], 1)
         check_plain("max_area_ratio", max_area_ratio)
         if max_area_ratio is not None and not max_area_ratio > 0:
             raise ValueError(

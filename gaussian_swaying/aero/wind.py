@@ -19,7 +19,6 @@ from torch import Tensor, nn
 from gaussian_swaying._checks import (
     VectorLike,
     check_choice,
-    check_plain,
     check_positive,
     check_shape,
     check_vector,
@@ -120,7 +119,7 @@ class SineSway(Modulation):
         super().__init__()
         check_positive("amplitude", amplitude, allow_zero=True)
         check_positive("period", period)
-        check_plain("phase", phase)
+        check_vector("phase", [phase], 1)
         self.amplitude, self.period, self.phase = float(amplitude), float(period), float(phase)
 
     def forward(self, velocity: Tensor, time: Tensor, seed: int, stream: int) -> Tensor:

@@ -255,18 +255,7 @@ def _film(file: Path, where: str, data: dict[str, Any], index: int, begin: float
     entry = data["frames"][index]
     path = check_regular(file.parent / str(entry["video_path"]), "the video")
     fps = read_number(where, entry, "fps")
-    if fps is not None and not fps > 0:
-        raise ValueError(f"The field `frames[{index}].fps` of the camera file {where} is {fps:g}: set it above 0.")
     begun, seconds = (read_number(where, entry, name) for name in ("begin", "seconds"))
-    for name, value, good in (
-        ("begin", begun, (begun or 0) >= 0),
-        ("seconds", seconds, seconds is None or seconds > 0),
-    ):
-        if not good:
-            raise ValueError(
-                f"The field `frames[{index}].{name}` of the camera file {where} is {value:g}: set it to a time in the "
-                "film [s]."
-            )
     wanted = [read_number(where, {name: data.get(name)} | entry, name) for name in ("w", "h")]
     shots: list[_Shot] = []
     taken = [] if not begun else ["-ss", f"{begun:.6f}"]

@@ -223,7 +223,8 @@ class Parts(Fixed):
     @classmethod
     def load(cls, path: str | os.PathLike[str]) -> Parts:
         """Read a file."""
-        arrays = read_arrays(path, "the parts", ("count", "labels", "names", "roles"), (*NUMBERS, *JOINT, "attached"))
+        needed, more = ("count", "labels", "names", "roles"), (*NUMBERS, *JOINT, "attached")
+        arrays = read_arrays(path, "the parts", needed, more, only=True)
         labels, names = arrays["labels"], arrays["names"]
         expected = {
             "count": arrays["count"].shape == () and arrays["count"].dtype.kind in "iu",

@@ -22,6 +22,7 @@ from torch import Tensor, nn
 from gaussian_swaying._checks import check_literals, check_vector, number_of, requires_grad
 from gaussian_swaying._devices import in_double
 from gaussian_swaying._fixed import LIVE, FixedList, changed, fixed
+from gaussian_swaying._numbers import sense_of
 from gaussian_swaying.aero.computed_air import ComputedAir
 from gaussian_swaying.aero.force import AeroForce
 from gaussian_swaying.aero.wind import SpatialWind, WindField
@@ -82,7 +83,6 @@ class Parameter:
         unit: Its unit; empty for a pure number.
         low: Smallest value.
         high: Largest value.
-        open: Whether the range lies between ``low`` and ``high``, without them.
         scale: ``log`` for sizes of any order of magnitude, else ``linear``.
         kind: ``number``, ``whole`` or ``vector`` (three numbers).
         batched: Whether simulations that differ in it are steps of one rollout.
@@ -97,7 +97,6 @@ class Parameter:
     unit: str = ""
     low: float = -math.inf
     high: float = math.inf
-    open: bool = False
     scale: Literal["linear", "log"] = "linear"
     kind: Literal["number", "whole", "vector"] = "number"
     batched: bool = False
@@ -125,8 +124,7 @@ class Parameter:
         if self.kind == "whole" and value != int(value):
             raise TypeError(f"Expected `{name}` to be a whole number, but got {value!r:.60}.")
         plain_number = float(number_of(value))
-        inside = self.low < plain_number < self.high if self.open else self.low <= plain_number <= self.high
-        if not inside or not math.isfinite(plain_number):
+        if not self.low <= plain_number <= self.high or not math.isfinite(plain_number):
             raise ValueError(f"Expected `{name}` to be {self.range_in_words}, but got {plain_number:g}.")
         if isinstance(value, Tensor) and value.requires_grad:
             return value
@@ -136,9 +134,7 @@ class Parameter:
     def range_in_words(self) -> str:
         if self.low == -math.inf:
             return "finite"
-        if self.high == math.inf:
-            return f"{'above' if self.open else 'at least'} {self.low:g}"
-        return f"{'between' if self.open else 'from'} {self.low:g} {'and' if self.open else 'to'} {self.high:g}"
+        return f"at least {self.low:g}" if self.high == math.inf else f"from {self.low:g} to {self.high:g}"
 
 
 _KNOWN: dict[str, Parameter] = {}
@@ -167,7 +163,8 @@ def register(name: str, read: Read | None = None, *, write: Write | None = None,
         read, write = _of_force(parts[1], parts[2])
     if read is None or write is None:
         raise ValueError(f"Expected `{name}` to be forces.CLASS.ATTRIBUTE, or to come with `read` and `write`.")
-    _KNOWN[name] = Parameter(name, read, write, **settings)
+    sense = sense_of(name)
+    _KNOWN[name] = Parameter(name, read, write, **((sense._asdict() if sense else {}) | settings))
     LIVE.add(name)
     return _KNOWN[name]
 
@@ -185,7 +182,7 @@ def find(name: str) -> Parameter | None:
     if parts[:2] == ["wind", "modulations"] and len(parts) == 4 and parts[2].isdecimal():
         like = _KNOWN.get(f"wind.modulations.*.{parts[3]}", _KNOWN["wind.modulations.*.amplitude"])
         known = like.name.endswith(f".{parts[3]}")
-        more: dict[str, Any] = {} if known else {"unit": "", "low": -math.inf, "open": False, "scale": "linear"}
+        more: dict[str, Any] = {} if known else {"unit": "", "low": -math.inf, "high": math.inf, "scale": "linear"}
         return replace(like, name=name, read=_of_modulation(name), **more)
     return None
 
@@ -479,33 +476,23 @@ def _density(setup: Setup) -> float:
     return float((in_double(setup.points.mass).sum() / in_double(setup.points.volume).sum()).detach())
 
 
-_SIZE: dict[str, Any] = {"low": 0.0, "scale": "log"}
-_MATERIAL: dict[str, Any] = {"open": True, "batched": True, "differentiable": True}
-register("wind.flow", _steady_flow, write=_write_wind, unit="m/s", kind="vector", batched=True, differentiable=True)
+_SIZE: dict[str, Any] = {"scale": "log"}
+_MATERIAL: dict[str, Any] = {"batched": True, "differentiable": True}
+register("wind.flow", _steady_flow, write=_write_wind, kind="vector", batched=True, differentiable=True)
 register("wind.seed", lambda setup: _uniform_wind(setup).seed, write=_write_wind, kind="whole", batched=True)
-register("wind.speed", lambda setup: _polar(setup)[0], write=_write_polar, unit="m/s", batched=True, **_SIZE)
-register("wind.azimuth", lambda setup: _polar(setup)[1], write=_write_polar, unit="degrees", batched=True)
-register("wind.elevation", lambda setup: _polar(setup)[2], write=_write_polar, unit="degrees", batched=True)
-for _name, _rest in {
-    "amplitude": _SIZE,
-    "delta": _SIZE,
-    "std": {"unit": "m/s", **_SIZE},
-    "period": {"unit": "s", "open": True, **_SIZE},
-    "interval": {"unit": "s", "open": True, **_SIZE},
-    "phase": {"unit": "rad"},
-}.items():
-    _reader = _of_modulation(f"wind.modulations.0.{_name}")
+register("wind.speed", lambda setup: _polar(setup)[0], write=_write_polar, batched=True, **_SIZE)
+register("wind.azimuth", lambda setup: _polar(setup)[1], write=_write_polar, batched=True)
+register("wind.elevation", lambda setup: _polar(setup)[2], write=_write_polar, batched=True)
+for _name in ("amplitude", "delta", "std", "period", "interval", "phase"):
+    _reader, _rest = _of_modulation(f"wind.modulations.0.{_name}"), {} if _name == "phase" else _SIZE
     register(f"wind.modulations.*.{_name}", _reader, write=_write_modulation, batched=True, **_rest)
-register("material.E", _mean("youngs_modulus"), write=_write_material, unit="Pa", **_SIZE, **_MATERIAL)
-register("material.nu", _mean("poisson_ratio"), write=_write_material, low=-1.0, high=0.5, **_MATERIAL)
-register("material.density", _density, write=_write_material, unit="kg/m³", **_SIZE, **_MATERIAL)
-_ONE_LAYER: dict[str, Any] = {"open": True, "batched": True, "same_points": False}
-register("material.thickness", _thickness, write=_write_material, unit="m", **_SIZE, **_ONE_LAYER)
-for _name, _low in (("C_D", 0.0), ("C_F", 0.0), ("C_L", -math.inf)):
-    register(f"aero.{_name}", _of_aero(_name), write=_write_aero, low=_low, scale="log", differentiable=True)
-register("aero.added_mass", _of_aero("added_mass"), write=_write_aero, unit="m", **_SIZE)
-register(
-    "solver.gravity", lambda setup: list(_of_solver("gravity")(setup)), write=_write_solver, unit="m/s²", kind="vector"
-)
-for _name, _unit in (("damping", "1/s"), ("stiffness_damping", "s")):
-    register(f"solver.{_name}", _of_solver(_name), write=_write_solver, unit=_unit, **_SIZE)
+register("material.E", _mean("youngs_modulus"), write=_write_material, **_SIZE, **_MATERIAL)
+register("material.nu", _mean("poisson_ratio"), write=_write_material, **_MATERIAL)
+register("material.density", _density, write=_write_material, **_SIZE, **_MATERIAL)
+register("material.thickness", _thickness, write=_write_material, batched=True, same_points=False, **_SIZE)
+for _name in ("C_D", "C_F", "C_L"):
+    register(f"aero.{_name}", _of_aero(_name), write=_write_aero, differentiable=True, **_SIZE)
+register("aero.added_mass", _of_aero("added_mass"), write=_write_aero, **_SIZE)
+register("solver.gravity", lambda setup: list(_of_solver("gravity")(setup)), write=_write_solver, kind="vector")
+for _name in ("damping", "stiffness_damping"):
+    register(f"solver.{_name}", _of_solver(_name), write=_write_solver, **_SIZE)

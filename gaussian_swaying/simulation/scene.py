@@ -141,6 +141,12 @@ class Scene(Fixed):
         self.connected = connected
         self.ply, self.generator, self.region = ply, generator, region or Everything()
         self.parts = Parts.load(parts) if isinstance(parts, str | os.PathLike) else parts
+        alone = connected != "surface" and self.parts is not None and self.parts.attached_to() is not None
+        if alone:
+            raise ValueError(
+                "A part of `scene.parts` is `attached` to one other, which has no effect with `scene.connected: grid`: "
+                "set that to surface, or remove `attached`."
+            )
         self.opacity_threshold, self.faint, self.up = float(opacity_threshold), faint, list(up)
         self.longest_side, self.metres_per_unit, self.area = longest_side, metres_per_unit, area
         self.filling, self.wind_on = filling, wind_on

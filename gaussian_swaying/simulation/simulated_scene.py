@@ -202,10 +202,6 @@ class SimulatedScene(nn.Module):
     def _joints(scene: Scene, labels: Tensor | None, body: Body, dx: float) -> tuple[PointJoint, ...]:
         if scene.parts is None or labels is None or not any(part.has_joint for part in scene.parts.parts):
             return ()
-        if scene.connected != "surface":
-            raise ValueError(
-                "Joints of parts need `scene.connected: surface`, as a grid joins what lies within a cell."
-            )
         place, owner = body.samples.position[: len(labels)], body.owner[: len(labels)]
         return joints_of(scene.parts, labels, place, owner, body.points.position.detach(), dx)
 

@@ -29,8 +29,8 @@ def test_flow_in_polar_form():
     [
         ("material.stiffness", 1, 2, "cannot be sought"),
         ("material.E", 2, 1, "[low, high]"),
-        ("material.E", 0, 1, "above 0"),
-        ("aero.C_D", -1, 1, "at least 0"),
+        ("material.E", 0, 1, "from 0.001"),
+        ("aero.C_D", -1, 1, "from 0 to"),
         ("material.nu", 0.1, 0.6, "range"),
     ],
 )

@@ -68,7 +68,7 @@ GOOD = {"camera_angle_x": 0.8, "w": 8, "h": 6, "frames": [{"transform_matrix": P
         ({"w": None}, 0, "no image size"),
         ({"w": None, "fl_x": 5.0}, 0, "`fl_x` but no `w`"),
         ({"fl_x": -5.0}, 0, "`fl_x`.*positive"),
-        ({"h": 0}, 0, "`h`.*positive"),
+        ({"h": 0}, 0, "`h`.*from 1 to"),
     ],
 )
 def test_bad_transforms_are_named(tmp_path, change, frame, message):

@@ -80,7 +80,7 @@ def test_a_batch_has_joints_as_soft_as_its_lightest_scene_needs():
 
 
 def test_a_joint_needs_parts_that_are_apart():
-    with pytest.raises(ValueError, match=r"Joints of parts need `scene.connected: surface`"):
+    with pytest.raises(ValueError, match=r"no effect with `scene.connected: grid`"):
         simulation(connected="grid", joint_turning=0.0)
     with pytest.raises(ValueError, match=r"part 'leaf' has a joint to nothing: name the other part as `attached`"):
         Part("leaf", joint_stiffness=3.0)

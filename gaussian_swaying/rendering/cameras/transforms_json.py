@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from gaussian_swaying._inputs import read_json
+from gaussian_swaying._numbers import sense_of
 from gaussian_swaying.rendering.cameras.camera import Camera, check_pixels, resized_intrinsics
 
 _AXES = {"opengl": [1.0, -1.0, -1.0, 1.0], "opencv": [1.0, 1.0, 1.0, 1.0]}  # signs of their x, y, z in those of OpenCV
@@ -95,6 +96,9 @@ def read_number(where: str, fields: dict[str, Any], name: str) -> float | None:
         return None
     if isinstance(value, bool) or not isinstance(value, (int, float)) or not math.isfinite(value):
         raise ValueError(f"The field `{name}` of the camera file {where} is {value!r}: set it to a number.")
+    sense = sense_of(name)
+    if sense is not None and not sense.low <= value <= sense.high:
+        raise ValueError(f"The field `{name}` of the camera file {where} is {value:g}: set it {sense.words}.")
     return float(value)
 
 
