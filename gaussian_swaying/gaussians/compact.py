@@ -65,6 +65,9 @@ def read_compressed_ply(path: str | os.PathLike[str]) -> GaussianCloud:
     count = len(vertices)
     if count == 0:
         raise ValueError(f"{path} holds zero Gaussians (element vertex 0); export the scene again.")
+    others = ", ".join(sorted({*(vertices.dtype.names or ())} - {*_PACKED}))
+    if others:
+        raise ValueError(f"{path} has the properties {others[:80]}, which no compressed .ply has; export it again.")
     for name in _PACKED:
         if name not in (vertices.dtype.names or ()):
             raise ValueError(f"{path} has no property `{name}`, so it is not a compressed .ply; export it again.")

@@ -31,7 +31,7 @@ LARGEST = 1 << 32  # bytes of a .glb file
 _GLB = struct.Struct("<4sII")  # magic, version, length; then chunks of a length, a kind and data
 _CHUNK = struct.Struct("<I4s")
 _UNDERSTOOD = (_EXTENSION, "KHR_mesh_quantization")
-_TYPES = {5120: np.int8, 5121: np.uint8, 5122: np.int16, 5123: np.uint16, 5125: np.uint32, 5126: np.float32}
+_TYPES = {5120: np.int8, 5121: np.uint8, 5122: np.int16, 5123: np.uint16, 5126: np.float32}
 _WIDTHS = {"SCALAR": 1, "VEC3": 3, "VEC4": 4}
 _UPRIGHT = torch.tensor([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]], dtype=torch.float64)  # z up to y up
 _STEPS = 1 << 22  # opacities in float32 end half of such a step before 0 and 1
@@ -134,6 +134,7 @@ class _Document:
     def __init__(self, path: Path) -> None:
         self.path = path
         self._buffers: dict[int, np.ndarray] = {}
+        self._spans: dict[int, tuple[int, int, int]] = {}  # buffer, first byte and end of each view
         with path.open("rb") as stream:
             binary = stream.read(4) == b"glTF"
         self.root = self._chunks() if binary else read_json(path, "glTF file")
@@ -308,7 +309,7 @@ class _Document:
         accessor = self.item("accessors", index)
         number = self.whole(accessor, "componentType")
         if accessor.get("type") != kind or number not in _TYPES or self.count(index) != count:
-            raise self.broken(f"attribute `{name}` is not {count:,} of {kind}")
+            raise self.broken(f"attribute `{name}` is not {count:,} of {kind} in a `componentType` that it may have")
         if "sparse" in accessor or "bufferView" not in accessor:
             raise ValueError(f"{self.path}: attribute `{name}` is sparse; export the Gaussians without `sparse`.")
         view = self.item("bufferViews", accessor["bufferView"])
@@ -321,6 +322,14 @@ class _Document:
         needed = inner + (stride * (count - 1) + row if count else 0)
         if stride < row or needed > length or first + length > len(buffer):
             raise self.broken(f"attribute `{name}` announces {count:,} rows, but its buffer has {len(buffer):,} bytes")
+        if (first + inner) % dtype.itemsize or stride % dtype.itemsize:
+            raise self.broken(f"attribute `{name}` has a `byteOffset` or a `byteStride` between two numbers")
+        if "byteStride" not in view:
+            place = accessor["bufferView"]
+            self._spans[place] = (view["buffer"], first, first + length)
+            for index, (other, start, end) in self._spans.items():
+                if other == view["buffer"] and index != place and start < first + length and first < end:
+                    raise self.broken(f"attribute `{name}` has a `byteOffset` within the numbers of another one")
         shared = [
             a for a in self.root["accessors"] if isinstance(a, dict) and a.get("bufferView") == accessor["bufferView"]
         ]

@@ -61,6 +61,9 @@ def read_ply(path: str | os.PathLike[str], sh_degree: int | None = None) -> Gaus
     ignored = [name for name in names if name not in known]
     if ignored:
         warnings.warn(f"{path}: ignored the properties {', '.join(ignored)}.", UserWarning, stacklevel=2)
+    for name in known:
+        if kinds[name].kind != "f":
+            raise ValueError(f"{path}: property `{name}` is a whole number; export it as float.")
     if count == 0:
         raise ValueError(f"{path} holds zero Gaussians (element vertex 0); export the scene again.")
     per_channel = len(rest) // 3

@@ -142,15 +142,22 @@ def _single(path: Path) -> GaussianCloud:
                 raise NotImplementedError(f"`{entry.filename[:40]}` is compressed by other means than deflate")
     check_unpacked(path, sum(sizes.values()), f"{len(sizes)} files")
 
+    used = set()
+
     def read(name: str) -> bytes:
         if name not in sizes:
             raise _broken(path, f"it has no file `{name[:40]}`")
+        used.add(name)
         with _archive(path) as archive:
             return archive.read(name)
 
     if sizes.get("meta.json", 0) > LARGEST_HEAD:
         raise _broken(path, "its meta.json is too large")
-    return _decoded(path, parse_json(read("meta.json"), "SOG file", path), read)
+    cloud = _decoded(path, parse_json(read("meta.json"), "SOG file", path), read)
+    if len(used) < len(sizes):
+        ignored = ", ".join(sorted(set(sizes) - used))[:200]
+        warnings.warn(f"{path}: ignored the files {ignored}, which its meta.json does not name.", stacklevel=3)
+    return cloud
 
 
 @contextmanager
@@ -229,9 +236,9 @@ def _decoded(path: Path, meta: Any, read: _Read) -> GaussianCloud:
         warn_antialiased(path)
     read = functools.cache(read)
     part = {name: _part(path, meta, name) for name in ("means", "scales", "quats", "sh0")}
-    rest = _part(path, meta, "shN") if meta.get("shN") else {}
+    rest = _part(path, meta, "shN") if "shN" in meta else {}
     bands, sets = rest.get("bands", 0), rest.get("count", 0)
-    if type(bands) is not int or not 0 <= bands <= 3 or type(sets) is not int or not 0 <= sets <= PALETTE:
+    if rest and (type(bands) is not int or not 1 <= bands <= 3 or type(sets) is not int or not 1 <= sets <= PALETTE):
         raise _broken(path, f"`shN` has {str(sets)[:20]} sets of {str(bands)[:20]} bands")
     size = sum(len(read(name)) for entry in (*part.values(), rest) for name in entry.get("files", []))
     check_count(path, count, 1 + _REST[bands], size)

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 import torch
-from numpy.lib.recfunctions import drop_fields
+from numpy.lib.recfunctions import append_fields, drop_fields
 from other_writers import in_order, refused
 from plyfile import PlyData, PlyElement
 from small_scenes import varied_cloud
@@ -85,6 +85,10 @@ def _compressed(path, change):
         ),
         (lambda e: e["chunk"]["min_x"].fill(-9e37), "beyond ±1e+12 for"),
         (lambda e: e["chunk"]["max_scale_z"].fill(1e5), "`scale_2` is NaN or infinite"),
+        (
+            lambda e: e.update(vertex=append_fields(e["vertex"], "f_rest_0", np.zeros(300))),
+            "has the properties f_rest_0",
+        ),
         (lambda e: e.update(vertex=e["vertex"][:0]), "zero Gaussians"),
     ],
 )

@@ -188,6 +188,7 @@ def _without(*names):
             {},
             ["is a point cloud or a mesh, not a splat"],
         ),
+        (_columns() | {"x": np.arange(5, dtype="i4")}, {}, ["property `x` is a whole number; export it as float"]),
         (_columns(), {"text": True}, ["ASCII", "export as binary"]),
         (_columns(), {"name": "face"}, ["no element `vertex` (elements: face)", "export it from a 3DGS tool"]),
         (_columns(count=0), {}, ["zero Gaussians", "export the scene again"]),

@@ -198,6 +198,8 @@ def test_bad_files(tmp_path):
         (_set("scales codebook", [1.0]), "of a code book of 1"),
         (_set("scales codebook", [1e4] * 256), "`scale_2` is NaN or infinite"),
         (_set("shN count", 70000), "`shN` has 70000 sets of 3 bands"),
+        (_set("shN bands", 0), "`shN` has 16 sets of 0 bands"),
+        (_set("shN", []), "`shN` does not name 2 files"),
         (lambda f: f.update({"quats.webp": b"RIFF"}), "`quats.webp` is not a WebP picture"),
         (lambda f: f.update({"quats.webp": _picture(4, 4)}), "a pixel of `quats` among these is no rotation"),
     ):
@@ -222,6 +224,14 @@ def test_the_count_is_that_of_the_pictures(tmp_path):
         files = _files(tmp_path / "a.sog")
         _set("count", count)(files)
         refused(_packed(tmp_path / "bad.sog", files), f"`count` is {count}, but", words)
+
+
+def test_files_without_a_name_are_told(tmp_path):
+    files = _files(FILES / "scene.sog")
+    meta = json.loads(files["meta.json"])
+    del meta["shN"]
+    with pytest.warns(UserWarning, match=r"ignored the files shN_centroids\.webp, shN_labels\.webp, which its meta"):
+        read_gaussians(_packed(tmp_path / "a.sog", files | {"meta.json": json.dumps(meta)}))
 
 
 def test_nothing_precedes_or_follows_a_bundle(tmp_path):
