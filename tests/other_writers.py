@@ -1,5 +1,8 @@
 """One small scene in files that another program wrote, how far two clouds may differ, and how a file is refused."""
 
+import json
+import struct
+import zipfile
 from dataclasses import replace
 from pathlib import Path
 
@@ -54,6 +57,34 @@ def in_order(found, expected):
     order = torch.cdist(expected.means.double(), found.means.double()).argmin(1)
     assert order.unique().numel() == len(expected) == len(found)
     return found.select(order)
+
+
+def glb_parts(content):
+    """The document and the data of a .glb file."""
+    size = struct.unpack_from("<I", content, 12)[0]
+    return json.loads(content[20 : 20 + size]), content[28 + size :]
+
+
+def glb(document, data):
+    """The .glb file of a document and its data."""
+    text = json.dumps(document).encode()
+    text += b" " * (-len(text) % 4)
+    head = struct.pack("<4sII", b"glTF", 2, 28 + len(text) + len(data)) + struct.pack("<I4s", len(text), b"JSON")
+    return head + text + struct.pack("<I4s", len(data), b"BIN\0") + data
+
+
+def members(path):
+    """The files of a bundle by name."""
+    with zipfile.ZipFile(path) as archive:
+        return {name: archive.read(name) for name in archive.namelist()}
+
+
+def packed(path, files):
+    """A bundle of files by name, at a path, which is returned."""
+    with zipfile.ZipFile(path, "w") as archive:
+        for name, content in files.items():
+            archive.writestr(name, content)
+    return path
 
 
 def refused(path, *words, name=None):

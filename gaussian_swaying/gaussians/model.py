@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -130,27 +131,22 @@ class GaussianSurfaceModel(Fixed, nn.Module):
 
     def to_cloud(self) -> GaussianCloud:
         """The Gaussians in storage form, detached; they share memory with the parameters except for ``sh``."""
-        return GaussianCloud(
-            means=self.means.detach(),
-            quats=self.quats.detach(),
-            scales=self.scales.detach(),
-            opacities=self.opacities.detach(),
-            sh=self.sh.detach(),
-            normals=self.reference_normals,
-            origin=self.origin,
-        )
+        return self._stored(lambda tensor: tensor.detach())
 
     def part_to_cloud(self, index: Tensor) -> GaussianCloud:
         """The Gaussians with these indices (M,) in storage form, detached."""
+        return self._stored(lambda tensor: tensor.detach()[index])
+
+    def _stored(self, part: Callable[[Tensor], Tensor]) -> GaussianCloud:
         normals = self.reference_normals
         return GaussianCloud(
-            means=self.means.detach()[index],
-            quats=self.quats.detach()[index],
-            scales=self.scales.detach()[index],
-            opacities=self.opacities.detach()[index],
-            sh=torch.cat([self.sh0.detach()[index], self.shN.detach()[index]], dim=1),
-            normals=None if normals is None else normals[index],
-            origin=self.origin,
+            part(self.means),
+            part(self.quats),
+            part(self.scales),
+            part(self.opacities),
+            torch.cat([part(self.sh0), part(self.shN)], dim=1),
+            None if normals is None else part(normals),
+            self.origin,
         )
 
     def save_ply(self, path: str | os.PathLike[str]) -> None:

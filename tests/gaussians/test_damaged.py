@@ -8,12 +8,11 @@ import re
 import struct
 import tracemalloc
 import warnings
-import zipfile
 
 import pytest
 import torch
 from damage import changed, damaged
-from other_writers import FILES, scene
+from other_writers import FILES, glb, glb_parts, members, packed, scene
 
 from gaussian_swaying.gaussians.export import export_cloud
 from gaussian_swaying.gaussians.formats import read_gaussians
@@ -49,25 +48,18 @@ def _numbers(rng):
 
 
 def _glb(rng):
-    content = _read("scene.glb")
-    end = 20 + struct.unpack_from("<I", content, 12)[0]
-    text = json.dumps(changed(rng, json.loads(content[20:end]))).encode()
-    size = 12 + 8 + len(text) + len(content) - end
-    return struct.pack("<4sII", b"glTF", 2, size) + struct.pack("<I4s", len(text), b"JSON") + text + content[end:]
+    document, data = glb_parts(_read("scene.glb"))
+    return glb(changed(rng, document), data)
 
 
 def _sog(rng):
-    with zipfile.ZipFile(FILES / "scene.sog") as archive:
-        files = {name: archive.read(name) for name in archive.namelist()}
-    name, content = rng.choice(["meta.json", "meta.json", *files]), io.BytesIO()
+    files = members(FILES / "scene.sog")
+    name = rng.choice(["meta.json", "meta.json", *files])
     if name == "meta.json":
         files[name] = json.dumps(changed(rng, json.loads(files[name]))).encode()
     else:
         files[name] = damaged(rng, files[name])
-    with zipfile.ZipFile(content, "w") as archive:
-        for name, data in files.items():
-            archive.writestr(name, data)
-    return content.getvalue()
+    return packed(io.BytesIO(), files).getvalue()
 
 
 DAMAGES = {

@@ -11,7 +11,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from other_writers import FILES, assert_same, in_order, refused, scene
+from other_writers import FILES, assert_same, in_order, members, packed, refused, scene
 from PIL import Image
 from small_scenes import together, varied_cloud
 from torch.testing import assert_close
@@ -29,13 +29,8 @@ ROUNDED = {"opacities": 0.501 / 255, "quats": QUATS}
 CUT_OFF = {"opacities": 1.01 / 255, "quats": 2 * QUATS}  # where a writer does not round
 
 
-def _files(path):
-    with zipfile.ZipFile(path) as archive:
-        return {name: archive.read(name) for name in archive.namelist()}
-
-
 def _meta(path):
-    return json.loads(_files(path)["meta.json"])
+    return json.loads(members(path)["meta.json"])
 
 
 @pytest.mark.parametrize("degree", [0, 1])
@@ -81,7 +76,7 @@ def _unpacked(folder, files):
 
 
 def test_a_folder_is_what_a_bundle_holds(tmp_path):
-    path = _unpacked(tmp_path / "in", _files(FILES / "scene.sog"))
+    path = _unpacked(tmp_path / "in", members(FILES / "scene.sog"))
     bundle, folder = read_sog(FILES / "scene.sog"), read_gaussians(path)
     for name in ("means", "quats", "scales", "opacities", "sh"):
         assert torch.equal(getattr(folder, name), getattr(bundle, name))
@@ -100,7 +95,7 @@ def _streamed(folder, change=lambda meta: None):
     for name, cloud in parts.items():
         (folder / name).mkdir(parents=True)
         export_cloud(folder / name / "a.sog", cloud)
-        _unpacked(folder / name, _files(folder / name / "a.sog"))
+        _unpacked(folder / name, members(folder / name / "a.sog"))
 
     def leaf(file, offset, count, **others):
         return {"lods": {"0": {"file": file, "offset": offset, "count": count}, **others}}
@@ -160,13 +155,6 @@ def test_bad_streams(change, message, tmp_path):
     refused(_streamed(tmp_path, change)[0], message)
 
 
-def _packed(path, files):
-    with zipfile.ZipFile(path, "w") as archive:
-        for name, content in files.items():
-            archive.writestr(name, content)
-    return path
-
-
 def _picture(width, height, value=0):
     content = io.BytesIO()
     Image.fromarray(np.full((height, width, 4), value, np.uint8)).save(content, "WEBP", lossless=True, exact=True)
@@ -187,7 +175,7 @@ def _set(place, value):
     return change
 
 
-def test_bad_files(tmp_path):
+def test_badmembers(tmp_path):
     for change, message in (
         (lambda f: f.pop("quats.webp"), "it has no file `quats.webp`"),
         (_set("version", 1), "is SOG of version 1, not 2; convert it"),
@@ -203,9 +191,9 @@ def test_bad_files(tmp_path):
         (lambda f: f.update({"quats.webp": b"RIFF"}), "`quats.webp` is not a WebP picture"),
         (lambda f: f.update({"quats.webp": _picture(4, 4)}), "a pixel of `quats` among these is no rotation"),
     ):
-        files = _files(FILES / "scene.sog")
+        files = members(FILES / "scene.sog")
         change(files)
-        refused(_packed(tmp_path / "bad.sog", files), message)
+        refused(packed(tmp_path / "bad.sog", files), message)
         refused(_unpacked(tmp_path, files), "" if "no file" in message else message, name=str(tmp_path))
 
 
@@ -221,17 +209,17 @@ def test_the_count_is_that_of_the_pictures(tmp_path):
     """Of 290 Gaussians in 300 pixels, the others of which this program makes white and others black."""
     export_cloud(tmp_path / "a.sog", varied_cloud(290))
     for count, words in ((289, "hold 1 Gaussians more"), (291, "no rotation"), (300, "no rotation")):
-        files = _files(tmp_path / "a.sog")
+        files = members(tmp_path / "a.sog")
         _set("count", count)(files)
-        refused(_packed(tmp_path / "bad.sog", files), f"`count` is {count}, but", words)
+        refused(packed(tmp_path / "bad.sog", files), f"`count` is {count}, but", words)
 
 
 def test_files_without_a_name_are_told(tmp_path):
-    files = _files(FILES / "scene.sog")
+    files = members(FILES / "scene.sog")
     meta = json.loads(files["meta.json"])
     del meta["shN"]
     with pytest.warns(UserWarning, match=r"ignored the files shN_centroids\.webp, shN_labels\.webp, which its meta"):
-        read_gaussians(_packed(tmp_path / "a.sog", files | {"meta.json": json.dumps(meta)}))
+        read_gaussians(packed(tmp_path / "a.sog", files | {"meta.json": json.dumps(meta)}))
 
 
 def test_nothing_precedes_or_follows_a_bundle(tmp_path):
@@ -248,24 +236,24 @@ def test_a_code_book_may_hold_what_is_no_number(tmp_path):
         ("sh0 codebook", math.nan, "`f_dc_*` or `f_rest_*` is NaN or infinite", 0),
         ("scales codebook", -math.inf, "have a size of zero, and become flat", 300),
     ):
-        files = _files(tmp_path / "a.sog")
+        files = members(tmp_path / "a.sog")
         book = json.loads(files["meta.json"])[place.split()[0]]["codebook"]
         _set(place, [value, *book[1:]])(files)
         with pytest.warns(UserWarning, match=re.escape(words)):
-            found = read_gaussians(_packed(tmp_path / "b.sog", files))
+            found = read_gaussians(packed(tmp_path / "b.sog", files))
         assert left <= len(found) <= 300
 
 
 def test_nothing_swells(tmp_path):
     """A bundle of a few kilobytes can hold gigabytes of zeros, and a small picture millions of pixels."""
     with zipfile.ZipFile(tmp_path / "a.sog", "w", zipfile.ZIP_DEFLATED) as archive:
-        for name, content in _files(FILES / "scene.sog").items():
+        for name, content in members(FILES / "scene.sog").items():
             archive.writestr(name, content)
         with archive.open("more", "w", force_zip64=True) as entry:
             for _ in range(1300):
                 entry.write(bytes(1 << 20))
-    files = _files(FILES / "scene.sog") | {"sh0.webp": _picture(8000, 8000)}
-    _packed(tmp_path / "b.sog", files)
+    files = members(FILES / "scene.sog") | {"sh0.webp": _picture(8000, 8000)}
+    packed(tmp_path / "b.sog", files)
     for name, message in (("a.sog", "announces 9 files, far more than its"), ("b.sog", "has 8000 x 8000 pixels")):
         assert (tmp_path / name).stat().st_size < 1 << 21
         tracemalloc.start()
@@ -275,17 +263,17 @@ def test_nothing_swells(tmp_path):
 
 
 def test_files_elsewhere_are_not_read(tmp_path):
-    path = _unpacked(tmp_path / "in", _files(FILES / "scene.sog"))
+    path = _unpacked(tmp_path / "in", members(FILES / "scene.sog"))
     (tmp_path / "quats.webp").write_bytes((path.parent / "quats.webp").read_bytes())
     path.write_text(path.read_text().replace("quats.webp", "../quats.webp"))
     refused(path, "names the file '../quats.webp'; put all files into its folder")
 
 
 def test_the_mark_of_antialiasing(tmp_path):
-    files = _files(FILES / "scene.sog")
+    files = members(FILES / "scene.sog")
     _set("model", "antialiased")(files)
     with pytest.warns(UserWarning, match="trained with antialiasing"):
-        read_gaussians(_packed(tmp_path / "a.sog", files))
+        read_gaussians(packed(tmp_path / "a.sog", files))
 
 
 def test_more_harmonics_than_a_file_can_hold(tmp_path, monkeypatch):

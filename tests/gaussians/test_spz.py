@@ -222,13 +222,10 @@ def test_few_bytes_cannot_take_much_memory(count, spare, tmp_path):
 
 def test_values_that_cannot_be_used(tmp_path):
     """Half precision of version 1 can hold what is not a number; what a run leaves behind is left out on writing."""
-    for count, words in ((2, "1 of 2 Gaussians mean nothing"), (20, "left out 1 of 20")):
-        data = bytearray(gzip.decompress(encode_spz(varied_cloud(count, degree=0), 1)))
-        data[16:18] = np.float16([np.nan]).tobytes()
-        (tmp_path / "a.spz").write_bytes(gzip.compress(bytes(data)))
-        if count == 2:
-            refused(tmp_path / "a.spz", words)
-    with pytest.warns(UserWarning, match=words):
+    data = bytearray(gzip.decompress(encode_spz(varied_cloud(20, degree=0), 1)))
+    data[16:18] = np.float16([np.nan]).tobytes()
+    (tmp_path / "a.spz").write_bytes(gzip.compress(bytes(data)))
+    with pytest.warns(UserWarning, match="left out 1 of 20"):
         assert len(read_gaussians(tmp_path / "a.spz")) == 19
     cloud = varied_cloud(20)
     cloud.means[3, 0], cloud.sh[4, 0, 0], cloud.opacities[5] = math.nan, math.inf, math.inf
