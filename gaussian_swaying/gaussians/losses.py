@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from gaussian_swaying.gaussians.cloud import GaussianCloud
+from gaussian_swaying.gaussians.compact import CHUNK
 from gaussian_swaying.gaussians.harmonics import SH_DC
 from gaussian_swaying.gaussians.sog import PALETTE
 from gaussian_swaying.gaussians.spz import COLOR_SCALE, fraction_bits
@@ -31,7 +32,7 @@ def losses(cloud: GaussianCloud, format: str, spz_version: int = 3) -> list[str]
         format: As in :func:`~gaussian_swaying.gaussians.export.export_cloud`.
         spz_version: Version of SPZ.
     """
-    told, count = list[str](), len(cloud)
+    told, count, cloud = list[str](), len(cloud), cloud.to("cpu", torch.float32)
     low, high, color, most = _RANGES.get(format, (-_ANY, _ANY, _ANY, _ANY))
     thin, wide = cloud.scales.amin(-1), cloud.scales.amax(-1)
     rest = cloud.sh.new_zeros(count, 1) if cloud.sh_degree == 0 or not most else cloud.sh[:, 1:].flatten(1).abs()
@@ -69,4 +70,18 @@ def _steps(cloud: GaussianCloud, format: str, spz_version: int) -> Tensor:
     if format == "sog":
         logs = cloud.means.double().sign() * places.log1p()
         return ((logs.amax(0) - logs.amin(0)) / 65535 * (1 + places)).amax(-1)
+    if format == "compressed_ply":
+        return _steps_of_chunks(cloud.means, cloud.opacities.sigmoid() > _FAINTEST)
     return torch.zeros_like(places[:, 0])
+
+
+def _steps_of_chunks(means: Tensor, kept: Tensor) -> Tensor:
+    """The same of a compressed .ply: a chunk holds 256 Gaussians of its order, with 10 or 11 bits for their range."""
+    from gsplat.exporter import sort_centers
+
+    (index,) = kept.nonzero(as_tuple=True)
+    order = index[sort_centers(means[index], torch.arange(len(index)))]
+    steps = torch.zeros_like(means[:, 0])
+    for chunk in order.split(CHUNK):
+        steps[chunk] = ((means[chunk].amax(0) - means[chunk].amin(0)) / 1023).max()
+    return steps

@@ -36,7 +36,7 @@ def faults(cloud: GaussianCloud) -> dict[str, Tensor]:
             (size > _ZERO) & (size <= math.log(FARTHEST))
         ),
         "`opacity` is NaN": cloud.opacities.isnan(),
-        "`f_dc_*` or `f_rest_*` is NaN or infinite": ~cloud.sh.isfinite().flatten(1).all(-1),
+        "`f_dc_*` or `f_rest_*` is NaN or infinite": ~cloud.sh.flatten(1).sum(-1).isfinite(),
     }
     if cloud.normals is not None:
         found["`nx`, `ny` or `nz` is NaN or infinite"] = ~cloud.normals.isfinite().all(-1)
