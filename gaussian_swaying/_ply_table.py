@@ -157,7 +157,13 @@ def _check_size(path: Path, header: PlyHeader) -> None:
             f"{path} is truncated: its header announces {rows}, at least {needed:,} bytes, but {size:,} follow; copy "
             "or export the file again."
         )
-    if header.order and size > needed and not any(element.lists for element in header.elements):
+    whole = header.order and not any(element.lists for element in header.elements)
+    if whole and size - needed >= max([1, *(element.row for element in header.elements)]):
+        raise ValueError(
+            f"{path}: {size - needed:,} bytes follow the rows that `element` and `property` of its header announce; "
+            "export the file again."
+        )
+    if whole and size > needed:
         warnings.warn(
             f"{path}: {size - needed:,} bytes follow that its header does not mention, so its numbers may be shifted; "
             "export the file again if they look odd.",

@@ -94,7 +94,7 @@ def read_ply(path: str | os.PathLike[str], sh_degree: int | None = None) -> Gaus
         del tables["normals"]
     tables |= {"opacities": tables["opacities"][:, 0], "sh": tables["sh"].reshape(count, 1 + kept, 3)}
     cloud = cloud_of(path, **tables)
-    check_units(path, cloud, 0 if doubles else float(np.spacing(np.abs(cloud.origin).max().astype(np.float32))))
+    check_units(path, cloud)
     return cloud
 
 

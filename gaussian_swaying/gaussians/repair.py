@@ -92,13 +92,12 @@ def repaired(
     return cloud
 
 
-def check_units(path: Path, cloud: GaussianCloud, step: float) -> None:
+def check_units(path: Path, cloud: GaussianCloud) -> None:
     """Warn of numbers that no scene has, as in a file without logarithms or logits; ValueError if none is possible.
 
     Args:
         path: The file, for messages.
         cloud: Its Gaussians.
-        step: Distance between the places that a centre can have in the file [scene units].
     """
     wide, told = cloud.scales.amax(-1), list[str]()
     if len(cloud) < _FEW:
@@ -119,8 +118,6 @@ def check_units(path: Path, cloud: GaussianCloud, step: float) -> None:
         told.append(
             f"opacities are {float(low.sigmoid()):.0%} to {float(high.sigmoid()):.0%}: `opacity` should be their logit"
         )
-    if step > math.exp(float(wide.median())):
-        told.append(f"centres so far from zero have steps of {step:.3g} in float32: export them as double")
     for what in told:
         warnings.warn(f"{path}: {what}.", UserWarning, stacklevel=4)
 
@@ -134,10 +131,18 @@ def cloud_of(path: Path, others: dict[str, np.ndarray] | None = None, **columns:
         columns: The fields of :class:`GaussianCloud` but its origin, with their shapes and units.
     """
     origin = origin_of(columns["means"])
+    step = np.spacing(np.abs(origin).max().astype(np.float32)) if columns["means"].dtype == np.float32 else 0
     with np.errstate(over="ignore", invalid="ignore"):
         if any(origin):
             columns["means"] = columns["means"] - np.array(origin)
         columns = {name: np.ascontiguousarray(value, dtype=np.float32) for name, value in columns.items()}
     tensors: dict[str, Any] = {name: torch.from_numpy(value) for name, value in columns.items()}
     further = {what: torch.from_numpy(mask) for what, mask in (others or {}).items()}
-    return repaired(path, GaussianCloud(**tensors, origin=origin), others=further)
+    cloud = repaired(path, GaussianCloud(**tensors, origin=origin), others=further)
+    if step > math.exp(float(cloud.scales.amax(-1).median())):
+        warnings.warn(
+            f"{path}: centres so far from zero have steps of {step:.3g} in float32: export them as double.",
+            UserWarning,
+            stacklevel=3,
+        )
+    return cloud

@@ -402,3 +402,8 @@ def test_a_file_that_is_longer_than_its_header_says_is_warned_of(tmp_path):
         file.write(bytes(28))
     with pytest.warns(UserWarning, match="28 bytes follow that its header does not mention"):
         assert len(read_ply(tmp_path / "flag.ply")) == 7
+    for line, other in ((b"vertex 7", b"vertex 5"), (b"property float rot_3\n", b"")):
+        write_ply(tmp_path / "a.ply", varied_cloud(700 if other == b"" else 7, 3))
+        content = (tmp_path / "a.ply").read_bytes()
+        (tmp_path / "a.ply").write_bytes(content.replace(line, other, 1))
+        refused(tmp_path / "a.ply", "bytes follow the rows that `element` and `property` of its header announce")

@@ -175,7 +175,7 @@ def _set(place, value):
     return change
 
 
-def test_badmembers(tmp_path):
+def test_bad_files(tmp_path):
     for change, message in (
         (lambda f: f.pop("quats.webp"), "it has no file `quats.webp`"),
         (_set("version", 1), "is SOG of version 1, not 2; convert it"),
