@@ -13,6 +13,8 @@ POLE = {"class_path": "Box", "init_args": {"min": [None] * 3, "max": [0.11, None
 PIN = {"class_path": "PinnedRegion", "init_args": {"region": POLE}}
 SMALL = {
     "scene.generator.init_args.spacing": 0.1,
+    "scene.generator.init_args.overlap": 0.6,
+    "contact": None,
     "solver.dx": 0.2,
     "solver.boundaries": [PIN],
     "camera.init_args.width": 32,

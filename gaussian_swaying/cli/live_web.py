@@ -55,6 +55,10 @@ def export_live_web(arguments: Sequence[str]) -> None:
     with tempfile.TemporaryDirectory() as folder:
         settings = settings_of(parser, scene, further, Path(folder))
         settings.device = "cpu"
+        notes = []
+        if settings.contact is not None:
+            settings.contact = None
+            notes.append("the page has no `contact` of the material with itself: layers may pass through each other.")
         splat = settings.scene.ply
         made = getattr(settings.scene.generator, "class_path", "scene").rsplit(".", 1)[-1].removesuffix("Scene")
         if options.target is None:
@@ -63,7 +67,7 @@ def export_live_web(arguments: Sequence[str]) -> None:
             simulation, sentence = fitted(parser, settings, options.target)
             print(sentence)
     film = write_live_web(simulation, made if splat is None else Path(splat).stem, target)
-    for note in film.notes:
+    for note in (*notes, *film.notes):
         print(f"note: {note.replace('the film', 'the page')}")
     print(f"{film.head['count']:,} Gaussians, {simulation.setup.points.count:,} material points")
     if options.element:

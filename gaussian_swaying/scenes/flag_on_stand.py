@@ -27,6 +27,7 @@ class FlagOnStandScene(ProceduralScene):
         height: Length along z [m].
         spacing: Distance between Gaussians of the flag [m]; on the stand at most 2 cm.
         pattern: Of the flag, as there.
+        overlap: Of the flag, as there.
         yaw: Angle by which flag and stand are turned about the pole side, counter-clockwise seen from above [degrees].
         stand: ``pole`` along the left edge, ``posts`` with clips at all corners but the lower left, ``rod`` along the
             top edge, on ropes, or ``none``.
@@ -36,12 +37,13 @@ class FlagOnStandScene(ProceduralScene):
     height: float = 0.8
     spacing: float = 0.0125
     pattern: Literal["stripes", "white", "printed"] = "stripes"
+    overlap: float = 0.6
     yaw: float = 0.0
     stand: Literal["pole", "posts", "rod", "none"] = "pole"
 
     def __post_init__(self) -> None:
         self.check()
-        self.flag = FlagScene(self.width, self.height, self.spacing, pattern=self.pattern, yaw=self.yaw)
+        self.flag = FlagScene(self.width, self.height, self.spacing, self.overlap, pattern=self.pattern, yaw=self.yaw)
 
     def generate(self) -> GaussianCloud:
         """Make both; the flag comes first."""

@@ -144,8 +144,12 @@ class FlagScene(ProceduralScene):
         if self.pattern == "printed":
             return printed_colours(x, z)
         bands = torch.tensor([[0.83, 0.30, 0.18], [0.95, 0.92, 0.85], [0.13, 0.33, 0.55]], dtype=torch.float64)
-        band = ((1 - z / self.height) * 3).long().clamp(0, 2)
-        colours = bands[band].clone()
-        distance = torch.hypot(x - 0.5 * self.width, z - 0.5 * self.height)
-        colours[distance < 0.2 * self.height] = torch.tensor([0.93, 0.68, 0.20], dtype=torch.float64)
-        return colours
+        colours = bands[0].repeat(len(x), 1)
+        for k in (1, 2):
+            colours = self._inside(colours, bands[k], self.height * (1 - k / 3) - z)
+        disc = 0.2 * self.height - torch.hypot(x - 0.5 * self.width, z - 0.5 * self.height)
+        return self._inside(colours, torch.tensor([0.93, 0.68, 0.20], dtype=torch.float64), disc)
+
+    def _inside(self, colours: Tensor, other: Tensor, depth: Tensor) -> Tensor:
+        """Another colour up to an edge, which is as wide as the spacing, so that it shows no steps."""
+        return torch.lerp(colours, other, (0.5 + depth / self.spacing).clamp(0, 1)[:, None])

@@ -39,7 +39,7 @@ def works(line, *more):
 def test_sim(place, capsys):
     works("sim --config=flag --device=cpu --frames=2 --output=again", *words(SMALL))
     out = capsys.readouterr().out
-    assert "96 of 96 Gaussians simulated on cpu" in out
+    assert "96 of 2,056 Gaussians simulated on cpu" in out
     assert "1 scene unit = 1 m" in out
     for name in ("video.mp4", "trajectory.npz", "summary.json", "frames", "diagnostics.csv", "checkpoint.pt"):
         assert f"wrote again/{name}\n" in out

@@ -96,7 +96,8 @@ def run(tmp_path, monkeypatch):
         folder = tmp_path / name
         folder.mkdir()
         changes |= {
-            "scene": {"generator": {"class_path": "FlagScene", "init_args": {"spacing": 0.1}}},
+            "scene": {"generator": {"class_path": "FlagScene", "init_args": {"spacing": 0.1, "overlap": 0.6}}},
+            "contact": None,
             "solver": {"dx": 0.2, "boundaries": list(boundaries)},
             "camera": {"class_path": "OrbitCamera", "init_args": {"width": 32, "height": 18}},
         }

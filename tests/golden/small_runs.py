@@ -20,6 +20,17 @@ from gaussian_swaying.simulation.batch import batch_of
 CONFIGS = Path(__file__).parents[2] / "configs"
 SPACING, SPARSE = "scene.generator.init_args.spacing", "scene.generator.init_args.leaves"
 FLAG = {SPACING: 0.06, "solver.dx": 0.14}
+CLOTH = {
+    "scene.generator": {"class_path": "FlagScene", "init_args": {"overlap": 0.6}},
+    "scene.region": {"class_path": "Box", "init_args": {"min": [None] * 3, "max": [None] * 3}},
+    "contact": None,
+    "material.E": 5e4,
+    "camera.init_args.elevation": 8.0,
+    "camera.init_args.radius": 1.9,
+    "camera.init_args.target_offset": [0.0, 0.0, 0.0],
+}
+"""The flag without its pole, and without contact."""
+ALONE = CLOTH | FLAG
 BENCH = {SPACING: 0.06, "scene.particle_spacing": 0.07, "solver.dx": 0.15}
 SOLID = {SPACING: 0.1, "solver.dx": 0.2, "material.E": 2e4}
 
@@ -60,12 +71,16 @@ def labelled(*parts, **more):
     def settings(folder):
         x = FlagScene(spacing=0.05).generate().means[:, 0].contiguous()
         Parts(torch.bucketize(x, torch.tensor([0.16, 0.46, 0.76])), parts).save(folder / "parts.npz")
-        return {
-            SPACING: 0.05,
-            "solver.dx": 0.12,
-            "solver.boundaries": [],
-            "scene.parts": str(folder / "parts.npz"),
-        } | more
+        return (
+            CLOTH
+            | {
+                SPACING: 0.05,
+                "solver.dx": 0.12,
+                "solver.boundaries": [],
+                "scene.parts": str(folder / "parts.npz"),
+            }
+            | more
+        )
 
     return settings
 
@@ -141,7 +156,7 @@ CASES = {
     "modes": (["sim/ficus", "sim/preview/ficus"], {"solver.formulation": "modes"}),
     "laws": (
         ["sim/flag"],
-        FLAG
+        ALONE
         | {
             "material.law": "NeoHookean",
             "material.bending": 0.02,
@@ -155,7 +170,7 @@ CASES = {
     ),
     "flows": (
         ["sim/flag"],
-        FLAG
+        ALONE
         | {
             "solver.formulation": "updated",
             "aero.max_area_ratio": 1.0,
@@ -177,7 +192,7 @@ CASES = {
     ),
     "boundaries": (
         ["sim/flag"],
-        FLAG
+        ALONE
         | {
             "solver.gravity": [0.0, 0.0, -3.0],
             "solver.stiffness_damping": 1e-3,
@@ -192,7 +207,7 @@ CASES = {
     ),
     "effects": (
         ["sim/flag"],
-        FLAG
+        ALONE
         | {
             "aero.law": "projected",
             "wind.modulations": [named("UniformGust", delta=0.3)],
@@ -206,13 +221,13 @@ CASES = {
     ),
     "edited": (
         ["sim/flag"],
-        FLAG
+        ALONE
         | {
             "forces": [named(f"{__name__}.Swirl")],
             "edits": [{"region": box(0.5, None), "time": 0.04, "E": 5e5, "density": 60.0, "color": [0.1, 0.6, 0.2]}],
         },
     ),
-    "batch": (["sim/flag"], FLAG),
+    "batch": (["sim/flag"], ALONE),
 }
 FRAMES = {"ball_on_cloth": 8, "cloth_over_ball": 7, "cloth_over_table": 5}  # until something touches
 ENERGIES = ("kinetic", "elastic", "potential", "wind_work")

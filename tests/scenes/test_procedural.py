@@ -52,10 +52,17 @@ def test_yaw_turns_the_flag_about_its_pole():
 
 
 def test_patterns():
-    stripes, white = (FlagScene(spacing=0.1, pattern=name).generate() for name in ("stripes", "white"))
-    assert len(stripes.sh.unique(dim=0)) == 4  # three bands and the disc
+    stripes, white = (FlagScene(spacing=0.01, pattern=name).generate() for name in ("stripes", "white"))
+    colours, counts = stripes.sh[:, 0].unique(dim=0, return_counts=True)
+    pure = colours[counts.argsort(descending=True)[:4]]  # three bands and the disc
+    apart = torch.cdist(stripes.sh[:, 0], pure).amin(1)
+    assert 0.9 < float((apart < 1e-6).float().mean()) < 1  # the others lie on an edge, and have a colour in between
+    a, b = torch.triu_indices(4, 4, 1)
+    share = ((stripes.sh - pure[a]) * (pure[b] - pure[a])).sum(-1) / (pure[b] - pure[a]).square().sum(-1)
+    between = torch.lerp(pure[a], pure[b], share.clamp(0, 1)[..., None])
+    assert float((stripes.sh - between).norm(dim=-1).amin(1).quantile(0.999)) < 1e-5  # but for where three meet
     assert len(white.sh.unique(dim=0)) == 1
-    assert white.sh.shape == (96, 1, 3)
+    assert white.sh.shape == (9600, 1, 3)
 
 
 @pytest.mark.parametrize(

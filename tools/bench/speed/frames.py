@@ -74,7 +74,7 @@ def frames(case: str, dx_m: float, device: str, main: bool = False, small: bool 
 @study(
     "runs",
     lambda device: [
-        {"name": "flag, 75 frames at 480x270"},
+        {"name": "flag, 75 frames at 960x540"},
         {"name": "guitar, 960x540" if device == "cpu" else "guitar, 1920x1080"},
     ],
 )
