@@ -16,7 +16,7 @@ def read_usd_frame(path: Path, frame: int) -> dict[str, np.ndarray]:
     prim = stage.GetPrimAtPath("/World/Gaussians")
     names = {"harmonics": HARMONICS, "colors": "primvars:displayColor"}
     found = {name: prim.GetAttribute(names.get(name, name)).Get(frame) for name in NAMES}
-    normals = prim.GetAttribute("normals") or UsdGeom.PrimvarsAPI(prim).GetPrimvar("normals").GetAttr()
+    normals = UsdGeom.PrimvarsAPI(prim).GetPrimvar("normals")
     arrays = {name: np.array(value, dtype=np.float32) for name, value in found.items()}
     arrays["normals"] = np.array(normals.Get(frame), dtype=np.float32)
     arrays["orientations"] = arrays["orientations"][:, [3, 0, 1, 2]]

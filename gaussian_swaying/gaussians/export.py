@@ -234,9 +234,8 @@ def write_usd(
 ) -> None:
     """Write static or moving Gaussians as USD (.usd, .usdc or .usda).
 
-    The prim is a ``ParticleField3DGaussianSplat`` where usd-core has that schema (26.03), with positions, orientations,
-    scales, opacities and harmonics, with values after exponential and sigmoid. With older versions it is a ``Points``
-    prim with the same attributes, plus normals and widths. Each number that changes has a sample for every frame. For
+    The prim is a ``ParticleField3DGaussianSplat`` with positions, orientations, scales, opacities and harmonics, with
+    values after exponential and sigmoid, and normals. Each number that changes has a sample for every frame. For
     programs that cannot draw splats there are ``displayColor`` and ``displayOpacity``.
 
     Args:
@@ -304,14 +303,16 @@ class UsdFilm:
         origin: Point that the centres count from, see :class:`~gaussian_swaying.gaussians.cloud.GaussianCloud`.
 
     Raises:
-        ImportError: If usd-core is not installed.
+        ImportError: If usd-core is not installed, or has no splats yet.
     """
 
     def __init__(
         self, fps: float, metres_per_unit: float = 1.0, rotation: Tensor | None = None, origin: Origin = NO_ORIGIN
     ) -> None:
         usd, geom = _pxr("Usd"), _pxr("UsdGeom")
-        self._splat = getattr(_pxr("UsdVol"), "ParticleField3DGaussianSplat", None)
+        splat = getattr(_pxr("UsdVol"), "ParticleField3DGaussianSplat", None)
+        if splat is None:
+            raise ImportError("usd-core before 26.3 has no splats: run pip install -U usd-core.", name="pxr")
         self._stage = usd.Stage.CreateInMemory()
         geom.SetStageUpAxis(self._stage, geom.Tokens.z)
         geom.SetStageMetersPerUnit(self._stage, metres_per_unit)
@@ -326,7 +327,7 @@ class UsdFilm:
             matrix.SetRotateOnly(Gf.Matrix3d(*turn.T.flatten().tolist()))  # USD multiplies rows
             matrix.SetTranslateOnly(Gf.Vec3d(*(turn @ torch.tensor(origin, dtype=torch.float64)).tolist()))
             world.AddTransformOp().Set(matrix)
-        self._prim = (self._splat or geom.Points).Define(self._stage, _PRIM)
+        self._prim = splat.Define(self._stage, _PRIM)
         self._last: dict[str, tuple[int, np.ndarray]] = {}
         self._first: int | None = None
         self._end = 0
@@ -357,25 +358,12 @@ class UsdFilm:
             self._stage.GetRootLayer().Export(str(temporary))
 
     def _create(self, arrays: dict[str, np.ndarray]) -> None:
-        Sdf, UsdGeom = _pxr("Sdf"), _pxr("UsdGeom")
-        prim, types = self._prim.GetPrim(), Sdf.ValueTypeNames
-        degree = round(arrays["harmonics"].shape[1] ** 0.5) - 1
-        if self._splat is None:
-            for name, kind in (
-                ("positions", types.Point3fArray),
-                ("orientations", types.QuatfArray),
-                ("scales", types.Float3Array),
-                ("opacities", types.FloatArray),
-                (_HARMONICS, types.Float3Array),
-            ):
-                prim.CreateAttribute(name, kind)
-            prim.CreateAttribute(_DEGREE, types.Int).Set(degree)
-        else:
-            prim.GetAttribute(_DEGREE).Set(degree)
-            primvar = UsdGeom.PrimvarsAPI(prim).CreatePrimvar("normals", types.Normal3fArray, UsdGeom.Tokens.vertex)
-            self._normals = primvar.GetAttr()
+        geom, prim = _pxr("UsdGeom"), self._prim.GetPrim()
+        prim.GetAttribute("radiance:sphericalHarmonicsDegree").Set(round(arrays["harmonics"].shape[1] ** 0.5) - 1)
+        kind = _pxr("Sdf").ValueTypeNames.Normal3fArray
+        self._normals = geom.PrimvarsAPI(prim).CreatePrimvar("normals", kind, geom.Tokens.vertex).GetAttr()
         for primvar in (self._prim.CreateDisplayColorPrimvar(), self._prim.CreateDisplayOpacityPrimvar()):
-            primvar.SetInterpolation(UsdGeom.Tokens.vertex)
+            primvar.SetInterpolation(geom.Tokens.vertex)
 
     def _set(self, name: str, array: np.ndarray, frame: int) -> None:
         Vt, prim = _pxr("Vt"), self._prim.GetPrim()
@@ -386,21 +374,13 @@ class UsdFilm:
             prim.GetAttribute(name).Set(values, frame)
             self._prim.GetDisplayOpacityAttr().Set(values, frame)
         elif name == "harmonics":
-            prim.GetAttribute(_HARMONICS).Set(_vec3(array.reshape(-1, 3)), frame)
+            prim.GetAttribute("radiance:sphericalHarmonicsCoefficients").Set(_vec3(array.reshape(-1, 3)), frame)
         elif name == "colors":
             self._prim.GetDisplayColorAttr().Set(_vec3(array), frame)
         elif name == "normals":
-            (self._normals if self._splat else self._prim.GetNormalsAttr()).Set(_vec3(array), frame)
+            self._normals.Set(_vec3(array), frame)
         else:
             prim.GetAttribute(name).Set(_vec3(array), frame)
-            if self._splat is None and name == "positions":
-                self._prim.GetPointsAttr().Set(_vec3(array), frame)
-            if self._splat is None and name == "scales":  # drawn as discs of one standard deviation
-                self._prim.GetWidthsAttr().Set(Vt.FloatArray.FromNumpy(2 * array.max(1)), frame)
-
-
-_HARMONICS = "radiance:sphericalHarmonicsCoefficients"
-_DEGREE = "radiance:sphericalHarmonicsDegree"
 
 
 def _pxr(name: str) -> Any:
