@@ -34,7 +34,7 @@ from gaussian_swaying.preview.cost import (
 from gaussian_swaying.preview.kinds import KINDS
 from gaussian_swaying.preview.photos import captured_from
 from gaussian_swaying.preview.picture import preview_picture, things_picture
-from gaussian_swaying.preview.place import Place, excerpt, near_things, survey
+from gaussian_swaying.preview.place import Place, excerpt, near_things, sky, survey
 from gaussian_swaying.preview.report import (
     area_line,
     cost_dict,
@@ -145,13 +145,15 @@ def preview_scene(options: argparse.Namespace, folder: Path) -> Preview:
         place = survey(cloud, up or capture.up, capture.cameras)
     chosen = _numbers(options.move, place)
     part: GaussianCloud = cloud
-    found = None
+    found, around = None, None
     if place is not None:
-        part, upward, around = excerpt(place, cloud, chosen)
-        found = upward, around
+        part, upward, guess = excerpt(place, cloud, chosen)
+        found, around = (upward, guess), near_things(place, cloud, chosen)
+    elif region is None and capture is None and bool((far := sky(cloud)).any()):
+        part, around = cloud.select(~far), ~far
     suggestion = suggest(
         part, up, options.hold, region, options.longest_side, options.wind, capture, quality, found, options.look,
-        options.kind,
+        options.kind, around is not None,
     )  # fmt: skip
     if options.material is not None:
         suggestion = of_material(suggestion, options.material)
@@ -192,8 +194,8 @@ def preview_scene(options: argparse.Namespace, folder: Path) -> Preview:
     suggestion = replace(suggestion, quality=chosen_quality)
     parts = suggestion.parts
     if parts is not None:
-        if place is not None:
-            parts = parts.within(near_things(place, cloud, chosen))
+        if around is not None:
+            parts = parts.within(around)
         suggestion = replace(suggestion, parts=replace(parts, path=str((folder / "parts.npz").resolve())))
     text = starter_yaml(suggestion, options.scene, options.frames)
     others = {name: scaled_seconds(cost, cost, dx) for name, dx in grids.items() if name != suggestion.quality}

@@ -20,9 +20,11 @@ from gaussian_swaying.preview.framing import nearby
 from gaussian_swaying.preview.photos import seen_share
 from gaussian_swaying.preview.shape import (
     DIRECTIONS,
+    FAR,
+    breadth,
+    dense_part,
     largest_plane,
     plane_axes,
-    quantile,
     rounded,
     sheet_normal,
 )
@@ -31,7 +33,6 @@ from gaussian_swaying.preview.up import CONVENTION, UpGuess, given_up
 from gaussian_swaying.rendering.cameras.camera import Camera
 
 SAMPLE = 300_000  # Gaussians from which up, ground and extent are guessed
-FAR = 1.5  # extents of the fine detail from its middle, beyond which a Gaussian is background
 SPACINGS, CELLS = 3.0, 512  # a cell of connected parts: so many spacings, and at most so many along the extent
 FEWEST, SMALLEST = 64, 0.02  # Gaussians of a thing, and its longest side as a share of the extent
 MOST = 8  # things that are listed
@@ -39,6 +40,9 @@ MEMBERS = 1000  # Gaussians of a thing that are looked for in the photos
 WIDE = 0.5  # share of the extent beyond which a thing is a part of the surroundings
 SPARSE = 0.3  # share of the cells of its box that a thing fills which is not thin
 COLUMNS = 64  # columns along the extent, whose lower ends are the ground
+FULL = 8  # points of a column that counts
+LARGE, VERY_FAR = 0.25, 20.0  # size and distance of a sky, in extents of the fine detail
+OPEN = 3.0  # a ground so many times as wide as the one thing on it is a place, not what an object stands on
 EVEN = 0.01  # of the extent: how uneven a ground may be
 GROUND = 0.5  # share of the columns that end on it
 ALONE = "on its own"
@@ -116,15 +120,12 @@ def survey(
         cameras: Those of the photos.
 
     Returns:
-        The parts, or None if it has no ground, or a single thing on it and no background: then it is an object.
+        The parts, or None if it has no ground, or a single thing on a small one and no background: then it is an
+        object.
     """
     means, opacity, weight = cloud.means, cloud.opacities.sigmoid(), visible_weight(cloud)
     step = max(1, len(cloud) // SAMPLE)
-    sample = means[::step].double()
-    size = cloud.scales[::step].amax(-1)
-    fine = sample[size <= size.median()]
-    middle = torch.stack([column.median() for column in fine.unbind(-1)])
-    extent = max(quantile(column, 0.9) - quantile(column, 0.1) for column in fine.unbind(-1))
+    middle, extent = dense_part(means[::step], cloud.scales[::step])
     if extent <= 0:
         return None
     far = (means - middle.to(means)).norm(dim=-1) > FAR * extent
@@ -152,7 +153,10 @@ def survey(
     axes = torch.stack([*plane_axes(normal), normal])
     things = _things(cloud, solid, part, weight, middle, extent, cell, axes, cameras)
     alone = sum(len(thing.members) for thing in things[1:]) < 0.05 * int(solid.sum())
-    if not things or ALONE not in things[0].reasons or (alone and int(far.sum()) < 0.01 * len(cloud)):
+    if not things or ALONE not in things[0].reasons:
+        return None
+    wide = breadth(means[ground].double(), plane_axes(normal), 0.02) > OPEN * max(things[0].size)
+    if alone and not wide and int(far.sum()) < 0.01 * len(cloud):
         return None
     low = float(height[ground].amin())
     deep = max(-low, extent) + half
@@ -165,6 +169,15 @@ def survey(
         rounded(deep, 0.1 * cell),
     )
     return Place(upward, far, solid, threshold, cell, below, part, things)
+
+
+def sky(cloud: GaussianCloud) -> Tensor:
+    """Gaussians that are far from the fine detail and as large as a quarter of it, or very far: a mask, shape (N,)."""
+    step = max(1, len(cloud) // SAMPLE)
+    middle, extent = dense_part(cloud.means[::step], cloud.scales[::step])
+    away = (cloud.means - middle.to(cloud.means)).norm(dim=-1)
+    large = cloud.scales.median(-1).values.exp() > LARGE * extent
+    return ((away > FAR * extent) & large | (away > VERY_FAR * extent)) & (extent > 0)
 
 
 def excerpt(place: Place, cloud: GaussianCloud, chosen: Sequence[int]) -> tuple[GaussianCloud, UpGuess, RegionGuess]:
@@ -309,14 +322,21 @@ def _ground(
 
 
 def _lowest(points: Tensor, axis: Tensor, side: float) -> Tensor:
-    """The lowest point, but one of twenty, of each column with at least 8 points; shape (C, 3)."""
+    """The lowest point, but one of twenty, of each column with at least 8 points; shape (C, 3).
+
+    Columns are wider than ``side`` where most of them would have fewer points.
+    """
     height = points @ axis
-    column = equal_rows(torch.stack([points @ across for across in plane_axes(axis)], -1).div(side).floor())
+    for _ in range(4):
+        column = equal_rows(torch.stack([points @ across for across in plane_axes(axis)], -1).div(side).floor())
+        if float(column.bincount().median()) >= FULL:
+            break
+        side *= 1.5
     order = torch.argsort(height, stable=True)
     order = order[torch.argsort(column[order], stable=True)]
     count = column.bincount()
     start = count.cumsum(0) - count
-    return points[order[(start + count // 20)[count >= 8]]]
+    return points[order[(start + count // 20)[count >= FULL]]]
 
 
 def _plane(points: Tensor, axis: Tensor) -> tuple[Tensor, float, float]:

@@ -271,6 +271,10 @@ def doubts(guess: Suggestion, options: argparse.Namespace, defaults: argparse.Na
         Lines of text; none if all guesses are good.
     """
     lines: list[str] = []
+    if guess.region.confidence == "low" and guess.region.box is not None:
+        count, box = int(guess.region.simulated.sum()), [f"{c:g}" for corner in guess.region.box for c in corner]
+        lines.append(f"warning: that these {count:,} Gaussians are the object is a weak guess; check the picture:")
+        lines.append(f"  {preview_command(options, defaults, region=box)}   # as guessed: give another box")
     if guess.up.confidence == "low":
         lines.append("warning: the up axis is a weak guess; check the picture, and set it:")
         for name, words in zip(guess.up.options, ("as guessed", "the next best"), strict=False):

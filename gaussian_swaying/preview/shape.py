@@ -11,6 +11,7 @@ from torch import Tensor
 from gaussian_swaying._checks import check_shape
 
 SHEET = 0.1  # smallest over middle standard deviation of the centres of a sheet
+FAR = 1.5  # extents of the fine detail from its middle, beyond which a Gaussian is background
 FEWEST = 16  # smallest number of Gaussians in an object
 DIRECTIONS = {
     "+x": (1.0, 0.0, 0.0),
@@ -55,6 +56,22 @@ def sheet_normal(points: Tensor) -> tuple[float, ...] | None:
 def quantile(values: Tensor, share: float) -> float:
     """Quantile without torch.quantile's limit of 2^24 values."""
     return float(values.double().kthvalue(1 + round(share * (len(values) - 1))).values)
+
+
+def dense_part(points: Tensor, log_scales: Tensor) -> tuple[Tensor, float]:
+    """The middle and the extent of the fine half of Gaussians, which tell where the cameras were near.
+
+    Args:
+        points: Centres [scene units], shape (N, 3).
+        log_scales: Logarithms of the standard deviations, shape (N, 3).
+
+    Returns:
+        The middle, float64, shape (3,), and the longest side without a tenth at each end [scene units].
+    """
+    size = log_scales.amax(-1)
+    fine = points[size <= size.median()].double()
+    middle = torch.stack([column.median() for column in fine.unbind(-1)])
+    return middle, max(extent(column, 0.1) for column in fine.unbind(-1))
 
 
 def extent(values: Tensor, share: float) -> float:

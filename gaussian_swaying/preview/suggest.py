@@ -60,6 +60,7 @@ SHELL_E = 1e6  # Pa; of everything else, until its frequency is known
 THRESHOLDS = (0.1, 0.05, 0.02, 0.01, 0.0)  # of opacity; the first is the paper's
 KEPT_AREA = 0.95  # share of the visible area that the threshold must keep
 POSTS = 2.5  # usual length of a washing line with its posts [m]
+SURE = 0.1  # share of the Gaussians of an object that is no weak guess
 MAX_BOXES = 8  # largest number of boxes that cut specks out of the region
 
 
@@ -75,6 +76,7 @@ class RegionGuess:
         specks: Number of Gaussians above the threshold that are not part of the object, floor or surroundings.
         reason: In words.
         cuts: Further regions inside it that are left out: walls and everything behind them.
+        confidence: ``low`` if few of the Gaussians are in it, else ``high``.
     """
 
     simulated: Tensor
@@ -84,6 +86,7 @@ class RegionGuess:
     specks: int
     reason: str
     cuts: tuple[Region, ...] = ()
+    confidence: str = "high"
 
     def region(self) -> Region | None:
         """The region for a run; None for all of space."""
@@ -237,6 +240,7 @@ def suggest(
     found: tuple[UpGuess, RegionGuess] | None = None,
     look: str = "breeze",
     kind: str | None = None,
+    more: bool = False,
 ) -> Suggestion:
     """Guess a first configuration.
 
@@ -253,6 +257,7 @@ def suggest(
             not used for them.
         look: ``breeze``, ``gusts`` or ``storm``.
         kind: One of :data:`~gaussian_swaying.preview.kinds.KINDS`; guessed if None.
+        more: Whether the splat has more Gaussians, far away, so that the region must not be all of space.
 
     Returns:
         The suggestion.
@@ -296,7 +301,7 @@ def suggest(
         cell = max(side / CELLS, 2 * particle_spacing(means if shown is None else means[shown.mask]))
         if shown is not None:  # the rest of a backdrop must not count as a part of the object
             cell = 0.5 * cell
-        chosen = suggest_region(means, opacity, weight, upward.ground, cell, shown)
+        chosen = suggest_region(means, opacity, weight, upward.ground, cell, shown, more)
     else:
         chosen = given_region(means, opacity, weight, *region)
     plant = plant_parts(cloud, chosen.simulated, upward.direction, weight) if hold is None else None
@@ -487,12 +492,18 @@ def suggest_threshold(opacity: Tensor, weight: Tensor) -> float:
 
 
 def suggest_region(
-    points: Tensor, opacity: Tensor, weight: Tensor, ground: Tensor, cell: float, shown: ShownObject | None = None
+    points: Tensor,
+    opacity: Tensor,
+    weight: Tensor,
+    ground: Tensor,
+    cell: float,
+    shown: ShownObject | None = None,
+    more: bool = False,
 ) -> RegionGuess:
     """The main object without floor, surroundings and specks.
 
-    The object is the connected part (:func:`connected_parts`) with the largest visible area. Specks inside its box are
-    cut out by smaller boxes, the largest first.
+    The object is the connected part (:func:`connected_parts`) with the largest visible area; one with few Gaussians
+    counts less. Specks inside its box are cut out by smaller boxes, the largest first.
 
     Args:
         points: Centres [scene units], shape (N, 3).
@@ -501,6 +512,7 @@ def suggest_region(
         ground: The floor, shape (N,).
         cell: Points farther apart than two such cells are not connected [scene units].
         shown: The object in photos, to which the result is limited; the part nearest to their common point counts most.
+        more: Whether there are more Gaussians far away.
 
     Returns:
         The guess.
@@ -517,7 +529,9 @@ def suggest_region(
     part = connected_parts(points[index], cell)
     counted = weight[index].double() if shown is None else weight[index].double() * shown.nearness(points[index])
     area = torch.zeros(int(part.max()) + 1, dtype=torch.float64).index_add_(0, part, counted)
-    main = int(area.argmax())
+    count = part.bincount()
+    main = int((area * (count / (SURE * len(index))).clamp(max=1)).argmax())
+    sure = shown is not None or int(count[main]) >= SURE * len(index)
     words = [f"{int((part == main).sum()):,} Gaussians of opacity {threshold:g} and more form one connected part"]
     if bool(ground.any()):
         words.append(f"a floor of {int(ground.sum()):,} lies below it")
@@ -526,7 +540,8 @@ def suggest_region(
         if shown.backdrops:
             words.append("everything in or behind a wall or floor is left out")
     cuts = () if shown is None else tuple(backdrop.behind for backdrop in shown.backdrops)
-    return region_around(points, opacity, index, part, main, threshold, ground, cell, cuts, words)
+    guess = region_around(points, opacity, index, part, main, threshold, ground, cell, cuts, words, more)
+    return guess if sure else replace(guess, confidence="low")
 
 
 def region_around(
@@ -540,6 +555,7 @@ def region_around(
     cell: float,
     cuts: tuple[Region, ...],
     words: list[str],
+    more: bool = False,
 ) -> RegionGuess:
     """The box around a connected part, without the floor and specks in it.
 
@@ -554,6 +570,7 @@ def region_around(
         cell: The box is half a cell larger [scene units].
         cuts: Further regions that are left out.
         words: Why it is this part.
+        more: Whether there are more Gaussians far away.
     """
     chosen = torch.zeros(len(points), dtype=torch.bool)
     chosen[index[part == main]] = True
@@ -576,7 +593,7 @@ def region_around(
     region = guess.region()
     assert region is not None
     simulated = region.contains(points) & (opacity >= threshold)
-    everything = bool(region.contains(points).all())
+    everything = not more and bool(region.contains(points).all())
     words = list(words)
     if guess.specks:
         words.append(f"{guess.specks:,} float apart from it")

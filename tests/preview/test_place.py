@@ -7,13 +7,14 @@ import pytest
 import torch
 import yaml
 from places import place
-from shared import refused
-from small_scenes import turned_cloud
+from shared import refused, unit
+from small_scenes import plain_cloud, previewed, together, turned_cloud
 
-from gaussian_swaying.cli.preview import main
+from gaussian_swaying.cli.preview import build_options, main
 from gaussian_swaying.gaussians.ply import write_ply
 from gaussian_swaying.geometry.rotations import quat_to_rotation
 from gaussian_swaying.preview.place import excerpt, survey
+from gaussian_swaying.preview.report import doubts
 from gaussian_swaying.preview.suggest import suggest
 from gaussian_swaying.rendering.cameras.camera import look_at_camera
 from gaussian_swaying.scenes.alocasia import AlocasiaScene
@@ -118,6 +119,62 @@ def test_a_given_direction_is_the_only_one_that_is_tried(garden, up):
 def test_an_object_is_no_place(scene):
     """Even on a floor of its own: there is a single thing, and nothing far away."""
     assert survey(scene.generate()) is None
+
+
+def _shrub():
+    """A crown on a stem, 1 high, of 2,000 fine Gaussians."""
+    stem = torch.rand(500, 3) * torch.tensor([0.04, 0.04, 0.6])
+    crown = 0.3 * unit(1500, 3, dtype=torch.float32) * torch.rand(1500, 1) ** (1 / 3) + torch.tensor([0.0, 0.0, 0.75])
+    return plain_cloud(torch.cat([stem, crown]), torch.tensor([0.02, 0.02, 0.002]).log())
+
+
+def _dome(count, size, away=60.0):
+    return plain_cloud(away * unit(count, 3, dtype=torch.float32), math.log(size), logit=5.0)
+
+
+@pytest.mark.parametrize(
+    ("count", "size", "away", "ground"),
+    [
+        (30, 8.0, 60.0, False),
+        (300, 8.0, 60.0, False),
+        (1200, 2.0, 20.0, False),
+        (300, 0.05, 60.0, False),
+        (300, 8.0, 60.0, True),
+    ],
+)
+def test_a_sky_is_no_object(tmp_path, count, size, away, ground):
+    """A shrub inside a dome, with specks around it, in the air or on a ground with a few Gaussians to a column."""
+    torch.manual_seed(0)
+    specks = plain_cloud(4 * torch.rand(100, 3) - 2, math.log(0.05), logit=-1.0)
+    level = torch.cat([6 * torch.rand(6000, 2) - 3, 0.005 * torch.randn(6000, 1)], 1)
+    level = plain_cloud(level, torch.tensor([0.06, 0.06, 0.004]).log(), logit=4.0)
+    cloud = together(_shrub(), level if ground else specks, _dome(count, size, away))
+    preview, simulation = previewed(cloud, tmp_path)
+    assert ("place" in preview.data) == ground
+    chosen = _mask(simulation.scene.simulated, len(cloud))
+    assert _overlap(chosen, torch.arange(len(cloud)) < 2000) > 0.97
+    assert "these" not in preview.report
+
+
+def test_one_thing_on_a_wide_ground_is_a_place():
+    torch.manual_seed(0)
+    level = torch.cat([6 * torch.rand(6000, 2) - 3, 0.005 * torch.randn(6000, 1)], 1)
+    found = survey(together(_shrub(), plain_cloud(level, torch.tensor([0.06, 0.06, 0.004]).log(), logit=4.0)))
+    (thing,) = found.things
+    assert _overlap(_mask(thing.members, 8000), torch.arange(8000) < 2000) > 0.97
+    assert int(found.up.ground.sum()) == pytest.approx(6000, rel=0.01)
+
+
+def test_few_gaussians_are_a_weak_guess():
+    """Clusters of a dozen: none of them is known to be the object."""
+    torch.manual_seed(0)
+    places = (100 * torch.rand(200, 3)).repeat_interleave(12, 0) + 0.1 * torch.randn(2400, 3)
+    found = suggest(plain_cloud(places, math.log(0.05)), up="+z", hold="bottom")
+    assert found.region.confidence == "low"
+    count, defaults = int(found.region.simulated.sum()), build_options().parse_args([])
+    first, second = doubts(found, build_options().parse_args(["a b.ply"]), defaults)
+    assert f"warning: that these {count} Gaussians are the object is a weak guess" in first
+    assert "'a b.ply' --region" in second
 
 
 def test_several_things_move_as_one_object(garden):
