@@ -9,6 +9,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -20,7 +21,8 @@ from gaussian_swaying.captures.lens import Lens
 from gaussian_swaying.captures.photos import Photos, is_turned, photos_beside, turned_size
 from gaussian_swaying.captures.point_cloud import PointCloud, read_ply_points
 from gaussian_swaying.captures.transforms import read_transforms, transforms_files
-from gaussian_swaying.rendering.cameras.camera import NEAR, Camera
+from gaussian_swaying.geometry.origin import NO_ORIGIN, Origin, counted_from, origin_of
+from gaussian_swaying.rendering.cameras.camera import NEAR, Camera, counted_pose
 
 FORMATS = ("auto", "colmap", "transforms")
 SPLITS = ("train", "val", "test")
@@ -73,6 +75,7 @@ class Capture:
         points: Points of the capture [scene units], float32, shape (P, 3), or None.
         colors: Their colours in 0 to 1, float32, shape (P, 3), or None.
         found: One line that says what was found, and what was not.
+        origin: Point of the files from which places count, in float64: zero unless they are far from zero.
     """
 
     path: Path
@@ -82,6 +85,7 @@ class Capture:
     points: Tensor | None = None
     colors: Tensor | None = None
     found: str = ""
+    origin: Origin = NO_ORIGIN
 
     def split(self, name: str) -> tuple[View, ...]:
         """Views of ``train``, ``val`` or ``test``, sorted by name."""
@@ -165,6 +169,8 @@ def read_capture(
     ]
     if any(view.turned for view in views):
         found.append(f"{sum(view.turned for view in views)} photos turned as their EXIF tags say")
+    if any(files.origin):
+        found.append(counted_from(files.origin))
     lacks = []
     if missing:
         lacks.append(
@@ -189,7 +195,9 @@ def read_capture(
     if lacks:
         warnings.warn(f"{root}: {'; '.join(lacks)}.", UserWarning, stacklevel=2)
     points, colors = (None, None) if files.points is None else (files.points.points, files.points.colors)
-    return Capture(root, tuple(views), center.float(), extent, points, colors, f"{root}: {'; '.join(found)}.")
+    return Capture(
+        root, tuple(views), center.float(), extent, points, colors, f"{root}: {'; '.join(found)}.", files.origin
+    )
 
 
 @dataclass(frozen=True, eq=False)
@@ -201,6 +209,7 @@ class _Files:
     points: PointCloud | None
     folder: Path
     source: str
+    origin: Origin
 
 
 def _read(root: Path, format: str, images: str) -> _Files:
@@ -216,15 +225,24 @@ def _read(root: Path, format: str, images: str) -> _Files:
             source += f" with {count} images ({', '.join(f'{other} has {count}' for other, count in less)})"
         posed = [PosedImage(name, path, lens, pose) for path, name, lens, pose in named if path is not None]
         missing = [name for path, name, _, _ in named if path is None]
-        return _Files(posed, missing, read_colmap_points(model), folder.parent, source)
+        posed, origin = _counted(posed)
+        return _Files(posed, missing, read_colmap_points(model, origin), folder.parent, source, origin)
     if format != "colmap" and transforms_files(root):
         posed, missing, file = read_transforms(root)
         source = " and ".join(file.name for file, _ in transforms_files(root))
-        points = None if file is None else read_ply_points(file)[0]
-        return _Files(posed, missing, points, root if root.is_dir() else root.parent, source)
+        posed, origin = _counted(posed)
+        points = None if file is None else read_ply_points(file, origin)[0]
+        return _Files(posed, missing, points, root if root.is_dir() else root.parent, source, origin)
     wanted = {"colmap": "sparse/0 or sparse", "transforms": "transforms.json or transforms_train.json"}
     names = " or ".join(wanted.values()) if format == "auto" else wanted[format]
     raise ValueError(f"{root} is not a capture: it has no {names}; give the folder that contains it.")
+
+
+def _counted(posed: list[PosedImage]) -> tuple[list[PosedImage], Origin]:
+    """The images with poses that count from an origin near their cameras."""
+    poses = [item.world_to_camera for item in posed]
+    origin = origin_of(np.array([(-pose[:3, :3].T @ pose[:3, 3]).tolist() for pose in poses]).reshape(-1, 3))
+    return [replace(item, world_to_camera=counted_pose(item.world_to_camera, origin)) for item in posed], origin
 
 
 def _check_once(root: Path, posed: Sequence[PosedImage]) -> None:

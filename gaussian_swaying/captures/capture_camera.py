@@ -14,15 +14,20 @@ from gaussian_swaying._checks import check_literals, check_positive
 from gaussian_swaying.captures.colmap import colmap_models, read_colmap_views
 from gaussian_swaying.captures.photos import clean_name
 from gaussian_swaying.captures.transforms import transforms_files
+from gaussian_swaying.geometry.origin import NO_ORIGIN, Origin
 from gaussian_swaying.geometry.rotations import quat_to_rotation, rotation_to_quat
-from gaussian_swaying.rendering.cameras.camera import Camera, resized_intrinsics
+from gaussian_swaying.rendering.cameras.camera import Camera, counted_pose, resized_intrinsics
 from gaussian_swaying.rendering.cameras.camera_path import CameraPath, check_picture
 from gaussian_swaying.rendering.cameras.keyframes import Interpolation, interpolate_keys
 from gaussian_swaying.rendering.cameras.transforms_json import camera_of_transforms, load_transforms
 
 
 def read_views(
-    path: str | Path, width: int | None = None, height: int | None = None, near: float = 0.01
+    path: str | Path,
+    width: int | None = None,
+    height: int | None = None,
+    near: float = 0.01,
+    origin: Origin = NO_ORIGIN,
 ) -> list[tuple[str, Camera]]:
     """Read the cameras of a capture; its images need not exist.
 
@@ -32,6 +37,7 @@ def read_views(
         width: Width of the images to render [pixels]; by default that of the capture.
         height: Height of the images to render [pixels]; by default that of the capture.
         near: Near plane [scene units]; a hundredth of the distance or of the object's size when None.
+        origin: Point of the file from which places count.
 
     Returns:
         Name and camera of each view, sorted by name. Lens distortion is ignored: the cameras are pinhole cameras with
@@ -44,14 +50,14 @@ def read_views(
         for name, lens, world_to_camera in read_colmap_views(models[0][0]):
             numbers = (lens.width, lens.height, lens.fx, lens.fy, lens.cx, lens.cy)
             intrinsics, columns, rows = resized_intrinsics(*numbers, width, height)
-            camera = Camera(world_to_camera, intrinsics, columns, rows, near)
+            camera = Camera(counted_pose(world_to_camera, origin), intrinsics, columns, rows, near)
             views.append((name, camera.to(dtype=torch.get_default_dtype())))
     else:
         for file, _ in transforms_files(root):
             data = load_transforms(file)
             for index, frame in enumerate(data["frames"]):
                 name = clean_name(str(frame.get("file_path", index)))
-                views.append((name, camera_of_transforms(file, data, index, width, height, near)))
+                views.append((name, camera_of_transforms(file, data, index, width, height, near, origin)))
     if not views:
         raise ValueError(
             f"`{path}` has no cameras: give a transforms.json, a COLMAP model (cameras and images, .bin or .txt), or "
@@ -118,7 +124,7 @@ class CaptureCamera(CameraPath):
         return camera.to(center.device, center.dtype)
 
     def _read(self, near: float) -> None:
-        views = read_views(self.path, self.width, self.height, near)
+        views = read_views(self.path, self.width, self.height, near, self._origin)
         if self.view is not None:
             self._cameras = [views[self._index([name for name, _ in views])][1]]
             return

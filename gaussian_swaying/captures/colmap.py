@@ -16,6 +16,7 @@ from gaussian_swaying._inputs import check_regular, decoded
 from gaussian_swaying.captures.lens import NO_DISTORTION, Lens
 from gaussian_swaying.captures.photos import clean_name
 from gaussian_swaying.captures.point_cloud import PointCloud
+from gaussian_swaying.geometry.origin import NO_ORIGIN, Origin
 from gaussian_swaying.geometry.rotations import quat_to_rotation
 
 # name and number of parameters of each camera model, in the order of COLMAP's numbers
@@ -58,11 +59,12 @@ def _has(folder: Path, name: str) -> bool:
     return any((folder / f"{name}{suffix}").is_file() for suffix in (".bin", ".txt"))
 
 
-def read_colmap_points(model: Path) -> PointCloud | None:
+def read_colmap_points(model: Path, origin: Origin = NO_ORIGIN) -> PointCloud | None:
     """Read ``points3D`` of a model.
 
     Args:
         model: Folder of the model.
+        origin: Point of the model from which they count.
 
     Returns:
         The points; None if there are none.
@@ -74,7 +76,7 @@ def read_colmap_points(model: Path) -> PointCloud | None:
         raise ValueError(f"The COLMAP model {model} has points3D that are NaN or infinite: export the model again.")
     if len(table) == 0:
         return None
-    return PointCloud(torch.from_numpy(table[:, :3]).float(), torch.from_numpy(table[:, 3:]).float() / 255)
+    return PointCloud(torch.from_numpy(table[:, :3] - origin).float(), torch.from_numpy(table[:, 3:]).float() / 255)
 
 
 def read_colmap_views(model: Path) -> list[tuple[str, Lens, Tensor]]:

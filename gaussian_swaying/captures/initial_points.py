@@ -59,9 +59,9 @@ def initial_points(
         return consistent_points(capture, count, seed, half_side)
     path = Path(source)
     if path.suffix.lower() == ".obj":
-        return sample_mesh(*read_obj_mesh(path), count=count, seed=seed)
+        return sample_mesh(*read_obj_mesh(path, capture.origin), count=count, seed=seed)
     if path.suffix.lower() == ".ply":
-        vertices, faces = read_ply_points(path)
+        vertices, faces = read_ply_points(path, capture.origin)
         return vertices if faces is None else sample_mesh(vertices, faces, count, seed)
     raise ValueError(
         f"Initial points cannot come from {source!s}: set auto, capture, random, consistent, or a .ply or .obj file."

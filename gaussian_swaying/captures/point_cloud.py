@@ -12,6 +12,7 @@ from torch import Tensor
 from gaussian_swaying._inputs import check_regular
 from gaussian_swaying._ply_table import read_header
 from gaussian_swaying.geometry.meshes import fans, parse_obj, ply_polygons
+from gaussian_swaying.geometry.origin import NO_ORIGIN, Origin
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -62,11 +63,12 @@ def sample_mesh(vertices: PointCloud, faces: Tensor, count: int, seed: int = 0) 
     return PointCloud(points, shade, normals)
 
 
-def read_ply_points(path: Path) -> tuple[PointCloud, Tensor | None]:
+def read_ply_points(path: Path, origin: Origin = NO_ORIGIN) -> tuple[PointCloud, Tensor | None]:
     """Read the vertices of a .ply file, ASCII or binary, and its faces.
 
     Args:
         path: The file.
+        origin: Point of the file from which the vertices count.
 
     Returns:
         The vertices, grey if they have no colours, and triangles (T, 3) as indices, or None if there are none.
@@ -77,7 +79,8 @@ def read_ply_points(path: Path) -> tuple[PointCloud, Tensor | None]:
         read_header(path)  # checks that the file is long enough for its header
         ply = PlyData.read(str(path))
         table = ply["vertex"].data
-        points = np.stack([np.asarray(table[axis], dtype=np.float32) for axis in ("x", "y", "z")], -1)
+        columns = [np.asarray(table[axis], dtype=np.float64) for axis in ("x", "y", "z")]
+        points = (np.stack(columns, -1) - origin).astype(np.float32)
     except OSError as error:
         raise ValueError(f"Cannot read the points {path} ({error.strerror}): check the path.") from error
     except (PlyParseError, KeyError, ValueError, UnicodeDecodeError) as error:
@@ -97,11 +100,12 @@ def read_ply_points(path: Path) -> tuple[PointCloud, Tensor | None]:
     ) else None
 
 
-def read_obj_mesh(path: Path) -> tuple[PointCloud, Tensor]:
+def read_obj_mesh(path: Path, origin: Origin = NO_ORIGIN) -> tuple[PointCloud, Tensor]:
     """Read a mesh from a Wavefront .obj file.
 
     Args:
         path: The file. Polygons are cut into triangles; textures are not read, but vertex colours are.
+        origin: Point of the file from which the vertices count.
 
     Returns:
         The vertices, grey if they have no colours, and triangles (T, 3) as indices.
@@ -109,7 +113,7 @@ def read_obj_mesh(path: Path) -> tuple[PointCloud, Tensor]:
     try:
         text = check_regular(path, "the mesh").read_text(encoding="utf-8-sig", errors="replace")
         vertices, polygons = parse_obj(text)
-        points = np.array([row[:3] for row in vertices], dtype=np.float32).reshape(-1, 3)
+        points = (np.array([row[:3] for row in vertices]).reshape(-1, 3) - origin).astype(np.float32)
     except OSError as error:
         raise ValueError(f"Cannot read the mesh {path} ({error.strerror}): check the path.") from error
     except ValueError as error:

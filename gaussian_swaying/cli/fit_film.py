@@ -97,12 +97,12 @@ def prepare(options: argparse.Namespace, folder: Path) -> Path:
     begin = max(0.0, moves - LEAD)
     seconds = min(1.5 * SECONDS + moves - begin, seen.film.seconds - begin)
     where = os.path.relpath(seen.film.path.resolve(), folder.resolve())
-    data = transforms(seen.camera, where)
+    data = transforms(seen.camera, where, seen.cloud.origin)
     data["frames"][0] |= {"begin": round(begin, 4), "seconds": round(seconds, 4)}
     write_json(folder / CAMERAS, data)
     look, wanted = folder / LOOK, {"up": options.up, "hold": options.hold}
     preview = _previewed(options, look, wanted)
-    shown, told = _shown(seen, read_videos(folder / CAMERAS)[0], preview, wanted)
+    shown, told = _shown(seen, read_videos(folder / CAMERAS, origin=seen.cloud.origin)[0], preview, wanted)
     if shown:
         preview = _previewed(options, look, wanted | shown)
     if length is not None:

@@ -134,7 +134,7 @@ def preview_scene(options: argparse.Namespace, folder: Path) -> Preview:
     read = reading.quiet
     up = None if options.up is None else up_of(options.up)
     region = None if options.region is None else (options.region[:3], options.region[3:])
-    capture = None if options.capture is None else captured_from(options.capture)
+    capture = None if options.capture is None else captured_from(options.capture, cloud.origin)
     quality = options.quality or "normal"
     if options.move is not None and region is not None:
         raise ValueError("`--move` and `--region` both choose what moves: leave out one of them.")

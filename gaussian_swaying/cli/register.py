@@ -20,6 +20,7 @@ from gaussian_swaying._inputs import check_regular
 from gaussian_swaying.cli.errors import run_command
 from gaussian_swaying.gaussians.cloud import GaussianCloud
 from gaussian_swaying.gaussians.harmonics import SH_DC
+from gaussian_swaying.geometry.origin import Origin
 from gaussian_swaying.rendering.cameras.camera import Camera
 from gaussian_swaying.rendering.protocol import RenderOutput
 
@@ -83,7 +84,7 @@ def register_film(options: argparse.Namespace) -> int:
     shown = (draw(found.camera).color.clamp(0, 1) * 255).round().to(torch.uint8)
     half = ((frame.float() + shown.float()) / 2).round().to(torch.uint8)
     Image.fromarray(torch.cat([frame, half, shown], 1).numpy()).save(folder / PICTURE)
-    write_json(folder / CAMERAS, transforms(found.camera, os.path.relpath(film, folder)))
+    write_json(folder / CAMERAS, transforms(found.camera, os.path.relpath(film, folder), cloud.origin))
     print(
         f"{found.agreeing} of {found.matches} points agree on the camera, {found.residual:.2f} pixels off; its "
         f"vertical field of view is {fov_of(found.camera):.1f} degrees"
@@ -151,9 +152,10 @@ def fov_of(camera: Camera) -> float:
     return 2 * math.degrees(math.atan(0.5 * camera.height / float(camera.intrinsics[1, 1])))
 
 
-def transforms(camera: Camera, film: str) -> dict[str, Any]:
-    """The content of a transforms.json with one film, or one picture, at time 0."""
+def transforms(camera: Camera, film: str, origin: Origin) -> dict[str, Any]:
+    """The content of a transforms.json with one film, or one picture, at time 0; ``origin`` is that of the splat."""
     pose = torch.linalg.inv(camera.world_to_camera.double()) @ torch.diag(torch.tensor([1.0, -1.0, -1.0, 1.0]).double())
+    pose[:3, 3] += torch.tensor(origin, dtype=torch.float64)
     K = camera.intrinsics.double()
     kind = "file_path" if Path(film).suffix.lower() in STILLS else "video_path"
     return {

@@ -858,7 +858,7 @@ def _ready(plan: Plan, parser: Any, settings: Any, device: str, progress: bool) 
         if progress:
             print(f"[{time.monotonic() - begin:6.0f} s] {line}", file=sys.stderr, flush=True)
 
-    videos = read_videos(list(plan.videos), plan.cameras, simulation.scene.size)
+    videos = read_videos(list(plan.videos), plan.cameras, simulation.scene.size, simulation.scene.model.origin)
     videos, judged = prepared(simulation, videos, plan.hand_held, plan.also_moves, say)
 
     def on_grid(ratio: float) -> Simulation:

@@ -20,9 +20,11 @@ from torch import Tensor
 
 from gaussian_swaying._inputs import check_regular
 from gaussian_swaying.captures.images import PosedImage, image_head, load_image, read_mask, remapped
+from gaussian_swaying.captures.lens import Lens
 from gaussian_swaying.captures.photos import clean_name, is_turned
 from gaussian_swaying.captures.transforms import check_rigid, lens_of_transforms, read_transforms, transforms_files
-from gaussian_swaying.rendering.cameras.camera import NEAR, Camera
+from gaussian_swaying.geometry.origin import NO_ORIGIN, Origin
+from gaussian_swaying.rendering.cameras.camera import NEAR, Camera, counted_pose
 from gaussian_swaying.rendering.cameras.transforms_json import load_transforms, read_number, read_pose
 
 MOST_FRAMES = 10_000
@@ -78,10 +80,14 @@ class _Shot:
 
 
 class _Room:
-    """The number of frames and bytes that the videos of a fit may still decode, and the near plane of their cameras."""
+    """How many frames and bytes the videos of a fit may still decode, and near plane and origin of their cameras."""
 
-    def __init__(self, near: float) -> None:
-        self.frames, self.bytes, self.near = MOST_FRAMES, MOST_BYTES, near
+    def __init__(self, near: float, origin: Origin) -> None:
+        self.frames, self.bytes, self.near, self.origin = MOST_FRAMES, MOST_BYTES, near, origin
+
+    def camera(self, world_to_camera: Tensor, lens: Lens) -> Camera:
+        pose = counted_pose(world_to_camera, self.origin).float()
+        return Camera(pose, lens.intrinsics().float(), lens.width, lens.height, self.near)
 
     def holds(self, width: int, height: int) -> int:
         return min(self.frames, self.bytes // (3 * width * height))
@@ -120,6 +126,7 @@ def read_videos(
     paths: str | os.PathLike[str] | Sequence[str | os.PathLike[str]],
     cameras: Sequence[str] | None = None,
     size: float = 1.0,
+    origin: Origin = NO_ORIGIN,
 ) -> list[Footage]:
     """Read the videos of one motion.
 
@@ -135,6 +142,7 @@ def read_videos(
         paths: A folder or a transforms.json, or several. Their times belong to the same clock.
         cameras: Names of the cameras that are wanted; None for all.
         size: Size of what they show [scene units], which the near plane of the cameras follows.
+        origin: Point of the files from which the places of the splat count.
 
     Returns:
         One for each camera, sorted by name. The earliest frame is at time zero.
@@ -157,7 +165,7 @@ def read_videos(
             f"{len(lost)} of the pictures of `videos` do not exist, the first of them {lost[0]}: put them there, or "
             "remove their frames from transforms.json."
         )
-    room = _Room(NEAR * size)
+    room = _Room(NEAR * size, origin)
     return [
         _footage(name, [shot for part in parts[name] for shot in part.read(room)], begin)
         for name in sorted(cameras or parts)
@@ -240,7 +248,7 @@ def _camera_name(where: str, index: int, frame: dict[str, Any]) -> str:
 def _picture(item: PosedImage, time: float, room: _Room) -> list[_Shot]:
     room.take(item.path, item.lens.width, item.lens.height)
     lens = item.lens.undistorted()
-    camera = Camera(item.world_to_camera.float(), lens.intrinsics().float(), lens.width, lens.height, room.near)
+    camera = room.camera(item.world_to_camera, lens)
     turned = is_turned(*image_head(item.path), (item.lens.width, item.lens.height))
     pixels = load_image(item.path, item.lens, turned=bool(turned))
     mask = pixels[..., 3].clone() if pixels.shape[-1] == 4 else None
@@ -269,7 +277,7 @@ def _film(file: Path, where: str, data: dict[str, Any], index: int, begin: float
         seen = lens.undistorted()
         pose = read_pose(where, data, index)
         check_rigid(f"The field `frames[{index}].transform_matrix` of the camera file {where}", pose)
-        camera = Camera(torch.linalg.inv(pose).float(), seen.intrinsics().float(), seen.width, seen.height, room.near)
+        camera = room.camera(torch.linalg.inv(pose), seen)
         rate = fps or head["fps"]
         if not rate > 0:
             raise ValueError(f"The video {path} does not say its frame rate: add `fps` to its entry in {where}.")

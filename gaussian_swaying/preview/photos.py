@@ -14,6 +14,7 @@ from torch import Tensor
 from gaussian_swaying.captures.agreement import places_in_picture
 from gaussian_swaying.captures.capture import common_focus, view_reach
 from gaussian_swaying.captures.capture_camera import read_views
+from gaussian_swaying.geometry.origin import NO_ORIGIN, Origin
 from gaussian_swaying.geometry.regions import Cylinder
 from gaussian_swaying.preview.shape import DIRECTIONS, FEWEST, bounds, extent, largest_plane, plane_axes, rounded
 from gaussian_swaying.rendering.cameras.camera import Camera
@@ -106,16 +107,17 @@ def _dot(a: Sequence[float], b: Sequence[float]) -> float:
     return sum(x * y for x, y in zip(a, b, strict=True))
 
 
-def captured_from(path: str | Path) -> CapturedFrom:
+def captured_from(path: str | Path, origin: Origin = NO_ORIGIN) -> CapturedFrom:
     """Read the cameras of a capture; its photos need not exist.
 
     Args:
         path: A transforms.json, a COLMAP model, or a folder that contains one.
+        origin: Point from which the places of the splat count.
 
     Returns:
         The cameras, and what follows from them.
     """
-    cameras = [camera for _, camera in read_views(path)]
+    cameras = [camera for _, camera in read_views(path, origin=origin)]
     up, confidence, reason = cameras_up(cameras)
     eyes = torch.stack([camera.position.double() for camera in cameras])
     focus = common_focus(cameras)

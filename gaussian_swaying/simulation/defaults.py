@@ -164,7 +164,7 @@ def as_camera(
     captured = next((path for path in (cameras or {}).values() if isinstance(path, CaptureCamera)), None)
     azimuth = None
     if captured is not None:
-        eyes = torch.stack([seen.position for _, seen in read_views(captured.path)])
+        eyes = torch.stack([seen.position for _, seen in read_views(captured.path, origin=scene.model.origin)])
         azimuth = photo_azimuth(eyes, scene.center.cpu(), scene.frame.rotation)
     if azimuth is None and isinstance(wind, WindField):
         azimuth = azimuth_beside(wind.flows[int(wind.flows.norm(dim=-1).argmax())].tolist())

@@ -60,7 +60,9 @@ class Painter(Fixed, nn.Module):
         if not all(0 <= value <= 1 for value in background):
             raise ValueError(f"Expected `background` within [0, 1], but got {list(background)}: 1 is white, not 255.")
         self.scene, self.shader, self.frame_dt = scene, shader, float(frame_dt)
-        self.camera, self.cameras = camera or OrbitCamera(), dict(cameras or {})
+        origin = scene.model.origin
+        self.camera = (camera or OrbitCamera()).counted_from(origin)
+        self.cameras = {name: path.counted_from(origin) for name, path in (cameras or {}).items()}
         for name in self.cameras:
             check_camera_name(name)
         self.register_buffer("background", torch.tensor(background, dtype=torch.float32))

@@ -11,6 +11,7 @@ from lightning.pytorch.plugins.io import TorchCheckpointIO
 from torch import Tensor
 
 from gaussian_swaying.gaussians.cloud import GaussianCloud
+from gaussian_swaying.geometry.origin import NO_ORIGIN, Origin
 from gaussian_swaying.runs.saved import load_plain, save_whole
 from gaussian_swaying.training.densification import PARAMETERS
 
@@ -71,10 +72,10 @@ def check_settings(stored: dict[str, Any], sh_degree: int, devices: int | None) 
         )
 
 
-def stored_gaussians(state: dict[str, Tensor]) -> GaussianCloud:
-    """The Gaussians in the entry ``state_dict`` of a checkpoint."""
+def stored_gaussians(state: dict[str, Tensor], origin: Origin = NO_ORIGIN) -> GaussianCloud:
+    """The Gaussians in the entry ``state_dict`` of a checkpoint, which count from a point."""
     means, scales, quats, opacities, sh0, rest = (state[f"model.{name}"] for name in PARAMETERS)
-    return GaussianCloud(means, quats, scales, opacities, torch.cat([sh0, rest], 1))
+    return GaussianCloud(means, quats, scales, opacities, torch.cat([sh0, rest], 1), origin=origin)
 
 
 def newest_checkpoint(trainer: Any, begun: int) -> str | None:

@@ -17,6 +17,7 @@ from torchmetrics.functional.image import peak_signal_noise_ratio
 
 from gaussian_swaying._checks import check_choice, check_positive, check_vector
 from gaussian_swaying.gaussians.model import GaussianSurfaceModel
+from gaussian_swaying.geometry.origin import NO_ORIGIN
 from gaussian_swaying.rendering.cameras.camera import Camera
 from gaussian_swaying.rendering.gsplat_renderer import make_renderer
 from gaussian_swaying.rendering.planes import SurfaceMaps, plane_channels, surface_maps
@@ -160,7 +161,7 @@ class SplatTrainer(lightning.LightningModule):
                 cloud = datamodule.initial_cloud(self.sh_degree)
             else:
                 raise ValueError("Expected initial Gaussians: set `init_ply`, or use data with points.")
-            self.model = GaussianSurfaceModel.from_cloud(cloud)
+            self.model = GaussianSurfaceModel.from_cloud(cloud.rebased(getattr(datamodule, "origin", NO_ORIGIN)))
         # normals of a file cannot follow splits
         self.model.reference_normals = None
 
@@ -373,6 +374,7 @@ class SplatTrainer(lightning.LightningModule):
             "scene_scale": self.scene_scale,
             "sh_degree": self.sh_degree,
             "seed": self.seed,
+            "origin": self.splat.origin,
             "random": dict(self._random),
             "seen": self.global_step * self.devices,
         }
@@ -389,7 +391,7 @@ class SplatTrainer(lightning.LightningModule):
                 "continued: start a new run, from its splat with `init_ply`."
             )
         device = self.device if self.model is None else self.model.means.device
-        cloud = stored_gaussians(checkpoint["state_dict"])
+        cloud = stored_gaussians(checkpoint["state_dict"], stored.get("origin", NO_ORIGIN))
         self.model = GaussianSurfaceModel.from_cloud(cloud).to(device)
         self.scene_scale, self.seed = stored["scene_scale"], stored["seed"]
         self._random.update({name: state.cpu() for name, state in stored["random"].items()})

@@ -16,7 +16,9 @@ from torch.testing import assert_close
 from gaussian_swaying.captures.capture import nearest_to_axes, read_capture
 from gaussian_swaying.captures.capture_camera import read_views
 from gaussian_swaying.captures.initial_points import initial_points
+from gaussian_swaying.geometry.origin import NO_ORIGIN
 from gaussian_swaying.rendering.cameras.camera import look_at_camera
+from gaussian_swaying.training.data.datamodule import CaptureDataModule
 
 
 def _names(count, suffix=".png"):
@@ -29,8 +31,8 @@ def _same_camera(found, expected, atol=1e-6):
     assert (found.width, found.height) == (expected.width, expected.height)
 
 
-def write_points(path, places):
-    dtype = [(n, "<f4") for n in "xyz"] + [(n, "u1") for n in ("red", "green", "blue")]
+def write_points(path, places, kind="<f4"):
+    dtype = [(n, kind) for n in "xyz"] + [(n, "u1") for n in ("red", "green", "blue")]
     rows = np.array([(*place, 255, 0, 51) for place in places], dtype=dtype)
     PlyData([PlyElement.describe(rows, "vertex")]).write(str(path))
 
@@ -305,6 +307,42 @@ def test_masks_are_alpha(tmp_path, white, written):
     (tmp_path / "masks/all.png").unlink()
     with pytest.raises(ValueError, match=r"masks/ALL\.jpg does not exist"):
         read_capture(tmp_path)
+
+
+# ---- map coordinates
+
+FAR_AWAY = torch.tensor([500123.25, 4649776.5, 312.0], dtype=torch.float64)
+
+
+@pytest.mark.parametrize("kind", ["bin", "txt", "transforms"])
+def test_map_coordinates_keep_their_detail(tmp_path, kind):
+    """Cameras, points and extent are those of the same capture near zero, counted from the origin."""
+    captures, views = [], []
+    for folder, offset in ((tmp_path / "near", 0 * FAR_AWAY), (tmp_path / "far", FAR_AWAY)):
+        poses, names = arc(5), _names(5)
+        for pose in poses:
+            pose.world_to_camera[:3, 3] -= pose.world_to_camera[:3, :3] @ offset
+        points = [((offset + torch.tensor(place)).tolist(), color) for place, color in POINTS]
+        if kind == "transforms":
+            write_transforms(folder, poses, names)
+            write_points(folder / "points3d.ply", [place for place, _ in points], "<f8")
+        else:
+            write_colmap(folder, poses, names, binary=kind == "bin", points=points, images=False)
+            write_transforms(folder, poses, names)
+        captures.append(read_capture(folder, "transforms" if kind == "transforms" else "colmap", images="."))
+        views.append(read_views(folder, origin=captures[-1].origin))
+    near, far = captures
+    assert near.origin == NO_ORIGIN
+    shift = (torch.tensor(far.origin, dtype=torch.float64) - FAR_AWAY).float()
+    assert float(shift.abs().max()) < 4
+    assert_close(far.points, near.points - shift, rtol=0, atol=1e-6)
+    assert far.extent == pytest.approx(near.extent, rel=1e-6)
+    for a, b, (_, c) in zip(near.views, far.views, views[1], strict=True):
+        assert_close(b.camera.position, a.camera.position - shift, rtol=0, atol=2e-6)
+        assert_close(c.world_to_camera, b.camera.world_to_camera, rtol=0, atol=1e-6)
+    assert f"coordinates count from {list(far.origin)} of the file" in far.found
+    data = CaptureDataModule(far.path, "transforms")
+    assert data.initial_cloud(0).origin == far.origin
 
 
 # ---- what does not belong together

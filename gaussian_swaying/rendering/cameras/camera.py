@@ -10,10 +10,18 @@ from torch import Tensor
 
 from gaussian_swaying._checks import check_positive, check_shape, check_vector
 from gaussian_swaying._fixed import fixed
+from gaussian_swaying.geometry.origin import Origin
 from gaussian_swaying.geometry.rotations import check_direction, rows_from_z
 
 NEAR = 0.01
 """Near plane, in distances to what the camera looks at, or in sizes of it."""
+
+
+def counted_pose(world_to_camera: Tensor, origin: Origin) -> Tensor:
+    """The same pose (4, 4), float64, for places that count from an origin."""
+    moved = world_to_camera.clone()
+    moved[:3, 3] += moved[:3, :3] @ torch.tensor(origin, dtype=moved.dtype)
+    return moved
 
 
 def check_pixels(name: str, value: Any) -> int:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
-from dataclasses import KW_ONLY, dataclass
+from dataclasses import KW_ONLY, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +12,7 @@ from torch import Tensor
 
 from gaussian_swaying._checks import check_positive, check_vector, check_whole
 from gaussian_swaying._fixed import Fixed
+from gaussian_swaying.geometry.origin import NO_ORIGIN, Origin
 from gaussian_swaying.rendering.cameras.camera import (
     NEAR,
     Camera,
@@ -37,6 +38,15 @@ class CameraPath(Fixed, ABC):
     still: bool = False
 
     near: float | None = None
+    _origin: Origin = NO_ORIGIN
+
+    def counted_from(self, origin: Origin) -> CameraPath:
+        """The path for a splat whose places count from a point of its file; another one if its places are in a file."""
+        if not self.captured or origin == self._origin:
+            return self
+        path = replace(self)  # type: ignore[type-var]
+        path._origin = origin
+        return path
 
     def near_of(self, size: float) -> float:
         """Near plane for an object of a size [scene units]."""
@@ -219,5 +229,5 @@ class TransformsCamera(CameraPath):
         """Camera of a frame, see :meth:`CameraPath.__call__`."""
         if self._camera is None:
             near = self.near_of(size)
-            self._camera = camera_from_transforms(self.path, self.frame, self.width, self.height, near)
+            self._camera = camera_from_transforms(self.path, self.frame, self.width, self.height, near, self._origin)
         return self._camera.to(center.device, center.dtype)

@@ -9,7 +9,8 @@ from torch import Tensor
 
 from gaussian_swaying._inputs import read_json
 from gaussian_swaying._numbers import sense_of
-from gaussian_swaying.rendering.cameras.camera import Camera, check_pixels, resized_intrinsics
+from gaussian_swaying.geometry.origin import NO_ORIGIN, Origin
+from gaussian_swaying.rendering.cameras.camera import Camera, check_pixels, counted_pose, resized_intrinsics
 
 _AXES = {"opengl": [1.0, -1.0, -1.0, 1.0], "opencv": [1.0, 1.0, 1.0, 1.0]}  # signs of their x, y, z in those of OpenCV
 
@@ -20,6 +21,7 @@ def camera_from_transforms(
     width: int | None = None,
     height: int | None = None,
     near: float = 0.01,
+    origin: Origin = NO_ORIGIN,
 ) -> Camera:
     """Read one camera of a ``transforms.json`` in the NeRF, Blender or instant-ngp style.
 
@@ -37,13 +39,14 @@ def camera_from_transforms(
             the one that keeps the file's aspect ratio when only ``height`` is given.
         height: Height of the image to render [pixels], with the same defaults.
         near: Near plane [scene units].
+        origin: Point of the file from which places count.
 
     Returns:
         The camera, in the default precision of torch.
     """
     if isinstance(frame, bool) or not isinstance(frame, int):
         raise TypeError(f"Expected `frame` to be a whole number, but got {frame!r}.")
-    return camera_of_transforms(path, load_transforms(path), frame, width, height, near)
+    return camera_of_transforms(path, load_transforms(path), frame, width, height, near, origin)
 
 
 def camera_of_transforms(
@@ -53,6 +56,7 @@ def camera_of_transforms(
     width: int | None = None,
     height: int | None = None,
     near: float = 0.01,
+    origin: Origin = NO_ORIGIN,
 ) -> Camera:
     """One camera of a ``transforms.json`` that :func:`load_transforms` has read; see :func:`camera_from_transforms`."""
     where = f"`{path}`"
@@ -64,7 +68,7 @@ def camera_of_transforms(
             check_pixels(name, size)
     pixels = read_intrinsics(where, {**data, **frames[frame]}, width, height)
     intrinsics, width, height = resized_intrinsics(*pixels, width, height)
-    world_to_camera = torch.linalg.inv(read_pose(where, data, frame))
+    world_to_camera = counted_pose(torch.linalg.inv(read_pose(where, data, frame)), origin)
     return Camera(world_to_camera, intrinsics, width, height, near).to(dtype=torch.get_default_dtype())
 
 

@@ -19,6 +19,7 @@ from gaussian_swaying.captures.capture import Capture, View, neighbouring_views,
 from gaussian_swaying.captures.images import straight_colors
 from gaussian_swaying.captures.initial_points import initial_points
 from gaussian_swaying.gaussians.cloud import GaussianCloud
+from gaussian_swaying.geometry.origin import Origin
 from gaussian_swaying.rendering.cameras.camera import Camera
 from gaussian_swaying.training.initial import gaussians_from_points
 from gaussian_swaying.training.parallel import this_device
@@ -196,6 +197,11 @@ class CaptureDataModule(LightningDataModule):
         """``extent`` of the capture [scene units]."""
         return self.capture.extent
 
+    @property
+    def origin(self) -> Origin:
+        """``origin`` of the capture."""
+        return self.capture.origin
+
     def initial_cloud(self, sh_degree: int = 3) -> GaussianCloud:
         """The initial Gaussians.
 
@@ -206,7 +212,8 @@ class CaptureDataModule(LightningDataModule):
             ValueError: If this capture cannot provide ``points``.
         """
         cloud = initial_points(self.capture, self.points, self.point_count, self.seed)
-        return gaussians_from_points(cloud.points, cloud.colors, sh_degree, self.initial_opacity, self.initial_scale)
+        settings = (sh_degree, self.initial_opacity, self.initial_scale)
+        return replace(gaussians_from_points(cloud.points, cloud.colors, *settings), origin=self.origin)
 
     @property
     def validation_split(self) -> str:
