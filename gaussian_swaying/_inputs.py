@@ -157,10 +157,16 @@ def read_arrays(
         The arrays found, by name.
     """
     try:
-        with np.load(check_archive(path, what)) as archive:
+        path = check_archive(path, what)
+    except OSError as error:
+        raise ValueError(str(error)) from error
+    try:
+        with np.load(path) as archive:
             found = {name: archive[name] for name in (*needed, *optional) if name in archive}
             unknown = sorted(set(archive.files) - {*needed, *optional})
-    except Exception as error:  # missing, not a zip, pickled, ...
+    except MemoryError:
+        raise ValueError(f"{path} announces more than it contains: make {what} again.") from None
+    except Exception as error:  # pickled, ...
         raise ValueError(f"{path} cannot be read ({error}): make {what} again.") from error
     if only and unknown:
         raise ValueError(f"{path} has the array `{unknown[0]}`, which {what} cannot have: remove or rename it.")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 import sys
 from pathlib import Path
 
@@ -25,6 +26,20 @@ def words(command: str) -> list[str]:
         ['python', 'tools/sim.py']
     """
     return [INSTALLED, command] if _called else ["python", f"tools/{command}.py"]
+
+
+def command(*given: object) -> str:
+    """A command line, quoted for a shell.
+
+    Args:
+        given: The command, and its arguments.
+
+    Example:
+        >>> command("sim", "--config", "my scan/#1.yaml")
+        "python tools/sim.py --config 'my scan/#1.yaml'"
+    """
+    first, *more = map(str, given)
+    return shlex.join([*words(first), *more])
 
 
 def name(command: str) -> str:

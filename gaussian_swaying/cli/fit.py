@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import shlex
 import sys
 from collections.abc import Sequence
 from pathlib import Path
@@ -81,7 +80,7 @@ def fit(options: argparse.Namespace, begun: list[str]) -> int:
         whole = Path(options.output or Path("outputs") / "fits" / Path(options.film).stem)
         file, folder = prepare(options, whole), whole / RESULT
         print(f"wrote {file}", flush=True)
-    again = shlex.join([*program.words("fit"), "--config", str(options.config or file), "--output", str(folder)])
+    again = program.command("fit", "--config", options.config or file, "--output", folder)
     plan = read_plan(file, lambda name: with_shipped(["--config", name], "sim")[1])
     with guessing(Simulation.parser()), stop_signals():
         if options.check:

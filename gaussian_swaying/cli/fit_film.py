@@ -5,7 +5,6 @@ from __future__ import annotations
 import argparse
 import math
 import os
-import shlex
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -318,7 +317,7 @@ def plan_text(preview: Preview, background: Sequence[float], still: float | None
     still = still or 0.0
     metres = guess["metres_per_unit"]
     sizes = [float(f"{metres * factor:.2g}") for factor in (SHORTER, LONGER)]
-    again = shlex.join([*program.words("fit"), "--config", str(folder / PLAN), "--output", str(folder / RESULT)])
+    again = program.command("fit", "--config", folder / PLAN, "--output", folder / RESULT)
     lines = [
         (f"base: {LOOK}/starter.yaml", "the splat, what holds it, its material: guesses, on a coarse grid"),
         (f"videos: {CAMERAS}", "the part of the film that is used, and its camera"),

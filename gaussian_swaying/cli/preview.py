@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import shlex
 import sys
 import time
 from argparse import ArgumentError
@@ -45,6 +44,7 @@ from gaussian_swaying.preview.report import (
     quality_lines,
     run_dict,
     run_lines,
+    shortened,
     splat_lines,
     suggestion_dict,
     suggestion_lines,
@@ -112,6 +112,7 @@ def build_options() -> argparse.ArgumentParser:
     add("--frames", type=int, default=250, help="frames of the configuration")
     add("--quality", metavar="Q", help=f"grid of the starter: {', '.join(QUALITIES)}; default: normal")
     add("--minutes", type=float, metavar="N", help="instead: the finest grid whose run takes at most this long here")
+    add("--verbose", action="store_true", help="print all numbers and reasons, not only what was guessed")
     add("--height", type=int, default=540, help="height of the picture [pixels]")
     add("--device", default="auto", choices=("auto", "cpu", "cuda"), help="auto takes a GPU if there is one")
     return parser
@@ -225,7 +226,7 @@ def preview_scene(options: argparse.Namespace, folder: Path) -> Preview:
     where = Path("outputs") / splat_name(options.scene)
     film = f"{options.frames * FRAME_DT:.3g} s at {PICTURE[0]} x {PICTURE[1]}"
     report += ["", f"the starter ({film}, {duration(cost.total_seconds)} here):"]
-    report.append(f"  {shlex.join(program.words('sim'))} --config {folder / 'starter'}.yaml --output {where}")
+    report.append("  " + program.command("sim", "--config", folder / "starter.yaml", "--output", where))
     picture = preview_picture(simulation, options.height, whole=suggestion.whole)
     labels = None if suggestion.parts is None else suggestion.parts.parts
     return Preview("\n".join(report), data, picture, text, things, labels)
@@ -368,6 +369,6 @@ def _preview(options: argparse.Namespace) -> None:
         raise ValueError(f"Expected `--height` from 64 to 4320 pixels, but got {options.height}.")
     folder = Path(options.output or Path("outputs/preview") / splat_name(options.scene or options.config[-1]))
     preview = preview_scene(options, folder) if options.config is None else preview_config(options)
-    print(preview.report)
-    for path in write(preview, folder):
-        print(f"wrote {path}")
+    print(preview.report if options.verbose else shortened(preview.report))
+    files = write(preview, folder)
+    print(f"wrote {', '.join(map(str, files))}" + ("" if options.verbose else "; --verbose says more"))

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import importlib.util
 import os
-import shlex
 import sys
 from collections.abc import Sequence
 from pathlib import Path
@@ -208,9 +207,8 @@ def next_step(folder: Path, data: object) -> str:
         folder: Folder of the training run.
         data: The training data; its ``path`` is the folder of the photos.
     """
-    words = [*program.words("preview"), str(folder / "point_cloud.ply")]
     path = getattr(data, "path", None)
-    return shlex.join(words if path is None else [*words, "--capture", str(path)])
+    return program.command("preview", folder / "point_cloud.ply", *([] if path is None else ["--capture", path]))
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

@@ -20,7 +20,7 @@ from torch import Tensor
 from gaussian_swaying._inputs import check_regular
 from gaussian_swaying.fitting.registration import in_space
 from gaussian_swaying.fitting.tracks import follow, opencv
-from gaussian_swaying.fitting.videos import frames_of, next_of, scaled
+from gaussian_swaying.fitting.videos import check_wide, frames_of, next_of, scaled
 from gaussian_swaying.rendering.cameras.camera import Camera
 from gaussian_swaying.rendering.protocol import RenderOutput
 
@@ -75,7 +75,7 @@ def open_film(path: str | Path) -> Film:
     factor = max(1.0, max(width, height) / SIDE)
     if not head["fps"] > 0:
         raise ValueError(f"The film {file} does not say its frame rate: convert it to mp4.")
-    size = round(width / factor), round(height / factor)
+    size = check_wide(file, round(width / factor), round(height / factor))
     return Film(file, *size, factor, head["fps"], float(head["duration"]) or math.inf, _focal(file))
 
 

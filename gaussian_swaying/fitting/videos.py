@@ -36,6 +36,9 @@ MOST_BYTES = 2 << 30
 CLOSE = 2e-6
 """Times of frames of several cameras that are the same [s]."""
 
+NARROWEST = 16
+"""Fewest pixels of a frame of a film on its shorter side."""
+
 MOST_PIXELS = 40_000_000
 """Most pixels of a frame of a film; 8K has 33 million. ffmpeg itself refuses larger ones."""
 
@@ -262,15 +265,14 @@ def _film(file: Path, where: str, data: dict[str, Any], index: int, begin: float
     """The frames of a video file, decoded one by one as long as there is room."""
     entry = data["frames"][index]
     path = check_regular(file.parent / str(entry["video_path"]), "the video")
-    fps = read_number(where, entry, "fps")
-    begun, seconds = (read_number(where, entry, name) for name in ("begin", "seconds"))
+    fps, begun, seconds = (read_number(where, entry, name) for name in ("fps", "begin", "seconds"))
     wanted = [read_number(where, {name: data.get(name)} | entry, name) for name in ("w", "h")]
     shots: list[_Shot] = []
     taken = [] if not begun else ["-ss", f"{begun:.6f}"]
     taken += [] if seconds is None else ["-t", f"{seconds:.6f}"]
     with closing(frames_of(path, taken, ["-frames:v", str(room.frames + 1), *scaled(*wanted)])) as film:
         head = next_of(film, path)
-        size = (0, 0) if head is None else tuple(head["size"])
+        size = (0, 0) if head is None else check_wide(path, *head["size"])
         lens = lens_of_transforms(where, data, entry, size)
         if (lens.width, lens.height) != size:
             raise ValueError(f"The video {path} is not {lens.width} x {lens.height} as its camera in {where} says.")
@@ -289,7 +291,22 @@ def _film(file: Path, where: str, data: dict[str, Any], index: int, begin: float
             if lens.distorted:
                 picture = remapped(picture, lens)
             shots.append(_Shot(begin + len(shots) / rate, camera, picture, None))
+    if not shots and 0 < head["duration"] <= (begun or 0):
+        raise ValueError(
+            f"The field `frames[{index}].begin` of the camera file {where} is {begun:g} s, behind the end of the film "
+            f"{path} at {head['duration']:g} s: set it to a time in the film."
+        )
     return shots
+
+
+def check_wide(path: Path, width: int, height: int) -> tuple[int, int]:
+    """Return the size of the frames of a film, or raise ValueError if they are too narrow for an object."""
+    if min(width, height) < NARROWEST:
+        raise ValueError(
+            f"The frames of {path} are read with {width} x {height} pixels, and an object needs {NARROWEST} each way: "
+            "give a film that is less wide or less tall, or a larger one."
+        )
+    return width, height
 
 
 def frames_of(

@@ -43,6 +43,7 @@ if TYPE_CHECKING:
 ROLES = ("soft", "rigid", "held", "still")
 NUMBERS = ("E", "nu", "density", "thickness", "damping_ratio")
 JOINT = ("joint_stiffness", "joint_turning")
+LONGEST_NAME = 100
 MOST = 1 << 16  # parts of a file: labels are uint16
 
 
@@ -85,8 +86,9 @@ class Part:
     joint_turning: float | None = None
 
     def __post_init__(self) -> None:
-        if not self.name:
-            raise ValueError("A part has no name: give it one.")
+        if not 0 < len(self.name) <= LONGEST_NAME:
+            words = f"a name of {len(self.name):,} letters" if self.name else "no name"
+            raise ValueError(f"A part has {words}: give it one of at most {LONGEST_NAME}.")
         check_choice(f"role of the part {self.name!r}", self.role, ROLES)
         if self.role == "still" and self.has_material:
             raise ValueError(f"The part {self.name!r} is still and has no material: remove its numbers, or its role.")

@@ -5,7 +5,6 @@ from __future__ import annotations
 import argparse
 import json
 import math
-import shlex
 from collections.abc import Sequence
 from dataclasses import asdict
 from typing import Any
@@ -28,6 +27,10 @@ from gaussian_swaying.preview.up import wind_words
 from gaussian_swaying.simulation.progress import duration
 from gaussian_swaying.simulation.roles import classify, conditions
 from gaussian_swaying.simulation.simulation import Simulation
+
+SHORT = ("up", "region", "held", "size", "kind", "wind", "simulated", "conditions", "the run")
+"""Labels of the lines that are printed without ``--verbose``."""
+NEXT_BEST = "the next best"
 
 
 def splat_lines(name: str, cloud: GaussianCloud, data: dict[str, Any]) -> list[str]:
@@ -52,6 +55,25 @@ def splat_lines(name: str, cloud: GaussianCloud, data: dict[str, Any]) -> list[s
         f"    S1 / side   {_numbers(own['size_share'])}   (of the longest side; haze is above 0.1)",
         *([note] if infinite else []),
     ]
+
+
+def shortened(report: str) -> str:
+    """The lines of a report that a user needs first: what is simulated and how, each without its further reasons.
+
+    Warnings are whole, with the command of the next best guess. ``--verbose`` prints the rest.
+    """
+    first, *lines = report.split("\n")
+    kept = [first.split(", SH degree")[0]]
+    said = {"region"} if "moves  " in report else set()
+    said |= {"the run"} if "\nthe starter (" in report else set()
+    whole = ("warning:", "the starter (", program.command("sim"))
+    for line in lines:
+        label = line[2:16].strip()
+        if label in SHORT and label not in said:
+            kept.append(line.split(";")[0])
+        elif label.endswith("moves") or line.strip().startswith(whole) or line.endswith(NEXT_BEST):
+            kept.append(line)
+    return "\n".join(kept)
 
 
 def place_lines(place: Place, chosen: Sequence[int]) -> list[str]:
@@ -246,7 +268,7 @@ def preview_command(options: argparse.Namespace, defaults: argparse.Namespace, *
         defaults: Default values, which are left out.
         changes: Options to change, by their names in ``options``.
     """
-    words = [*program.words("preview"), str(options.scene)]
+    words = ["preview", options.scene]
     for name, default in vars(defaults).items():
         value = changes.get(name, getattr(options, name, default))
         if name == "scene" or value is None or value == default:
@@ -256,7 +278,7 @@ def preview_command(options: argparse.Namespace, defaults: argparse.Namespace, *
             continue
         listed = isinstance(value, Sequence) and not isinstance(value, str)
         words += [f"{v:g}" if isinstance(v, float) else str(v) for v in (value if listed else [value])]
-    return shlex.join(words)
+    return program.command(*words)
 
 
 def doubts(guess: Suggestion, options: argparse.Namespace, defaults: argparse.Namespace) -> list[str]:
@@ -277,13 +299,13 @@ def doubts(guess: Suggestion, options: argparse.Namespace, defaults: argparse.Na
         lines.append(f"  {preview_command(options, defaults, region=box)}   # as guessed: give another box")
     if guess.up.confidence == "low":
         lines.append("warning: the up axis is a weak guess; check the picture, and set it:")
-        for name, words in zip(guess.up.options, ("as guessed", "the next best"), strict=False):
+        for name, words in zip(guess.up.options, ("as guessed", NEXT_BEST), strict=False):
             lines.append(f"  {preview_command(options, defaults, up=name.split())}   # {words}")
     if guess.hold.confidence == "low":
         lines.append(
             f"warning: that it is held at the {guess.hold.end} is a weak guess; check the picture, and set it:"
         )
-        for name, words in zip(guess.hold.options, ("as guessed", "the next best"), strict=False):
+        for name, words in zip(guess.hold.options, ("as guessed", NEXT_BEST), strict=False):
             lines.append(f"  {preview_command(options, defaults, hold=name)}   # {words}")
     return lines
 

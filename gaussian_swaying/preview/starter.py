@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import math
-import shlex
 import textwrap
 from pathlib import Path
 from typing import Any
@@ -119,7 +118,7 @@ def starter_yaml(suggestion: Suggestion, ply: str | Path, frames: int = 250) -> 
 {_comment(_wind_words(s), 0)}
 {_comment(_sway_words(s), 0)}
 # Guessed from the splat; every number may be changed. Quality: {s.quality}.
-#   {shlex.join(program.words("sim"))} --config THIS_FILE
+#   {program.command("sim", "--config", "THIS_FILE")}
 frames: {frames:<24}# {frames * FRAME_DT:.3g} s at 25 frames a second
 frame_dt: {FRAME_DT}                  # s
 background: [0.93, 0.94, 0.96]
@@ -222,9 +221,9 @@ def _solver_damping(s: Suggestion) -> str:
 
 
 def _kind(s: Suggestion) -> str:
-    """Return the kind of a pin, with the reason as a comment: hinge for a sheet, whose edge can turn, nodes else."""
+    """Return the kind of a pin, with the reason as a comment: that of its shape for a sheet, nodes else."""
     if s.sheet:
-        return "hinge             # points: cloth turns where it is held; `updated` needs nodes"
+        return "null              # points: a hinge, or a clamp if it is too thick there; `updated` needs nodes"
     return (
         "nodes             # all of the grid in the region, which cannot turn; hinge: points, for the edge of a sheet"
     )

@@ -3,6 +3,7 @@
 import dataclasses
 import json
 import math
+import shlex
 import struct
 from pathlib import Path
 
@@ -37,7 +38,7 @@ def splat(tmp_path):
 
 def preview(splat, output, *options):
     scene = [] if splat is None else [str(splat)]
-    return main([*scene, "--output", str(output), "--device", "cpu", "--height", "96", *options])
+    return main([*scene, "--output", str(output), "--device", "cpu", "--height", "96", "--verbose", *options])
 
 
 def check_refused(splat, tmp_path, capsys, *options, words):
@@ -60,6 +61,24 @@ def test_the_report_and_its_files(splat, tmp_path, capsys):
     for words in ("150 Gaussians", "confidence medium", "dx = 0.14 m", f"--config {out / 'starter.yaml'}"):
         assert words in report
     assert "a floor" not in report
+
+
+def test_ten_lines_and_a_command_for_a_shell(splat, tmp_path, capsys):
+    """Warnings come on top, of no pin that the preview chose; names with blanks and # are quoted."""
+    folder = tmp_path / "my scan #1"
+    folder.mkdir()
+    splat.rename(folder / "flag.ply")
+    assert preview(folder / "flag.ply", folder / "out", "--frames", "3") == 0
+    whole = capsys.readouterr().out
+    options = [str(folder / "flag.ply"), "--output", str(folder / "out"), "--height", "96", "--frames", "3"]
+    assert main([*options, "--device", "cpu"]) == 0
+    told, said = capsys.readouterr()
+    lines = [line for line in told.splitlines() if "warning" not in line and "# the next best" not in line]
+    assert len(lines) == 10 < len(whole.splitlines()) / 3
+    assert told.splitlines()[1].split(";")[0] in whole
+    assert shlex.split(lines[-2])[2:4] == ["--config", str(folder / "out/starter.yaml")]
+    assert lines[-1].endswith("starter.yaml; --verbose says more")
+    assert "PinnedRegion" not in said
 
 
 def test_specks_are_noted_and_follow(splat, tmp_path, capsys):

@@ -100,6 +100,9 @@ def test_a_hand_that_shakes_in_a_room(tmp_path):
 
 def test_a_large_film_is_read_in_reduced_size(tmp_path, monkeypatch):
     monkeypatch.setattr(films, "SIDE", 80)
+    narrow = _film(tmp_path / "narrow.mp4", [np.zeros((16, 1600, 3), np.uint8)] * 2)
+    with pytest.raises(ValueError, match=r"narrow\.mp4 are read with 80 x 1 pixels, and an object needs 16"):
+        open_film(narrow)
     film = open_film(_film(tmp_path / "a.mp4", [_square(60)] * 5))
     assert (film.width, film.height, film.full, film.fps) == (80, 48, 2.0, 25.0)
     frame = first_frame(film)

@@ -190,6 +190,31 @@ def _variable(path):
     subprocess.run([imageio_ffmpeg.get_ffmpeg_exe(), *words, "-pix_fmt", "yuv420p", str(path)], check=True)
 
 
+@pytest.mark.parametrize(
+    ("size", "fields", "words"),
+    [
+        ((64, 32), {"fps": 1e9}, r"`frames\[0\].fps`.* 1e\+09: set it from 0.001 to 100000 frames per second"),
+        ((64, 32), {"fps": 0}, r"`frames\[0\].fps`.*frames per second"),
+        ((64, 32), {"time": 1e308}, r"`frames\[0\].time`.* 1e\+308: set it from -1e\+06 to 1e\+06 seconds"),
+        ((64, 32), {"begin": 1e308}, r"`frames\[0\].begin`.*set it from 0 to"),
+        ((64, 32), {"begin": -1}, r"`frames\[0\].begin`.*set it from 0 to"),
+        ((64, 32), {"begin": 5}, r"`frames\[0\].begin`.* 5 s, behind the end of the film .* at 1 s"),
+        ((64, 32), {"seconds": 1e308}, r"`frames\[0\].seconds`.*set it from 0.001"),
+        ((64, 32), {"seconds": 0}, r"`frames\[0\].seconds`.*set it from 0.001"),
+        ((64, 32), {"w": 1e308}, r"`frames\[0\].w`.* 1e\+308: set it from 16 to 32768 pixels"),
+        (
+            (4096, 2),
+            {"h": None, "w": None, "fl_x": None, "camera_angle_x": 1},
+            "4096 x 2 pixels, and an object needs 16",
+        ),
+    ],
+)
+def test_fields_of_a_film_are_named(tmp_path, size, fields, words):
+    _film(tmp_path, size, 30, **fields)
+    with pytest.raises(ValueError, match=words):
+        read_videos(tmp_path)
+
+
 @pytest.mark.parametrize(("begin", "rate"), [(0.0, None), (1.0, None), (0.0, 10.0)])
 def test_a_film_with_a_variable_frame_rate(tmp_path, begin, rate):
     """A frame is seen at its time, until the next one; ``fps`` spreads the same frames over another time."""

@@ -1,5 +1,7 @@
 """Labels of a splat: the file, its refusals, and the region of a part."""
 
+import zipfile
+
 import numpy as np
 import pytest
 import torch
@@ -35,6 +37,7 @@ def test_the_file_keeps_labels_roles_and_materials(tmp_path):
         (lambda: Part("a", "rigid", E=1e5), "rigid and does not bend"),
         (lambda: Part("a", "rigid", nu=0.2), "rigid and does not bend"),
         (lambda: Part("", "soft"), "has no name"),
+        (lambda: Part("a" * 1_000_000), "^A part has a name of 1,000,000 letters: give it one of at most 100.$"),
         (lambda: Part("a", "still", E=1e5), "still and has no material"),
         (lambda: Part("a", density=0.0), "density of the part 'a'"),
         (lambda: Part("a", nu=0.5), "nu of the part 'a'"),
@@ -61,12 +64,23 @@ def test_what_makes_no_sense_is_refused(make, message):
         ({"E": np.array([np.nan, -3.0, 1.0])}, "E of the part"),
         ({"names": np.array([b"a", b"b", b"c"])}, "array `names`"),
         ({"names": None}, "no array `names`"),
+        (
+            b"no zip",
+            r"^\S*parts.npz is not a .npz file, or is incomplete \(File is not a zip file\); make the parts again.$",
+        ),
+        (1 << 60, "announces more than it contains: make the parts again"),
     ],
 )
 def test_a_file_that_does_not_fit_together_is_refused(change, message, tmp_path):
     path = Parts([0, 1, 2], PARTS).save(tmp_path / "parts.npz")
-    arrays = dict(np.load(path)) | change
-    np.savez(path, **{name: value for name, value in arrays.items() if value is not None})
+    if isinstance(change, bytes):
+        path.write_bytes(change)
+    elif isinstance(change, int):
+        with zipfile.ZipFile(path, "w") as archive, archive.open("count.npy", "w") as file:
+            np.lib.format.write_array_header_1_0(file, {"descr": "<i8", "fortran_order": False, "shape": (change,)})
+    else:
+        arrays = dict(np.load(path)) | change
+        np.savez(path, **{name: value for name, value in arrays.items() if value is not None})
     with pytest.raises(ValueError, match=message) as error:
         Parts.load(path)
     assert str(path) in str(error.value)

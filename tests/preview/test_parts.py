@@ -130,7 +130,17 @@ def test_the_preview_writes_the_parts_that_its_configurations_name(alocasia, tmp
     cloud = alocasia.select((alocasia.means[:, :2].norm(dim=-1) < 0.6) & (alocasia.means[:, 2] > 0.005))
     write_ply(tmp_path / "plant.ply", cloud)
     out = tmp_path / "out"
-    options = [str(tmp_path / "plant.ply"), "--output", str(out), "--device", "cpu", "--height", "96", "--quality"]
+    options = [
+        str(tmp_path / "plant.ply"),
+        "--output",
+        str(out),
+        "--device",
+        "cpu",
+        "--height",
+        "96",
+        "--verbose",
+        "--quality",
+    ]
     monkeypatch.setattr("gaussian_swaying.cli.preview.why_apart", lambda scene, dx, held: f"{int(held.sum()) > 50}")
     assert main([*options, "draft"]) == 0
     told = capsys.readouterr().out

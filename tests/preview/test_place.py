@@ -195,7 +195,9 @@ def file(garden, tmp_path):
 
 
 def _preview(file, out, *options):
-    return main([str(file), "--output", str(out), "--device", "cpu", "--height", "96", "--frames", "2", *options])
+    return main(
+        [str(file), "--output", str(out), "--device", "cpu", "--height", "96", "--frames", "2", "--verbose", *options]
+    )
 
 
 def test_the_preview_of_a_place(file, garden, tmp_path, capsys, monkeypatch):
