@@ -444,7 +444,7 @@ def _mirror(data):
         (lambda d: d.update(camera_model="OPENCV_FISHEYE"), "asks for OPENCV_FISHEYE"),
         (lambda d: d.update(is_fisheye=True), "asks for a fisheye lens"),
         (lambda d: d.update(w=21), r"images/000\.png has 20 x 16 pixels, but its camera has 21 x 16"),
-        (lambda d: d.update(w=0), "`w`.*positive"),
+        (lambda d: d.update(w=0), "`w`.*set it from 1 to 32768 pixels"),
         (lambda d: d.update(test_filenames=_names(3)), "train split.*empty.*train split"),
         (lambda d: d.update(train_filenames=5), "`train_filenames`.*list of file paths"),
         (lambda d: [f.update(file_path=f"gone/{i}") for i, f in enumerate(d["frames"])], "no images: all 3.*gone/0"),

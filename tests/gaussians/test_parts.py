@@ -66,7 +66,7 @@ def test_what_makes_no_sense_is_refused(make, message):
         ({"names": None}, "no array `names`"),
         (
             b"no zip",
-            r"^\S*parts.npz is not a .npz file, or is incomplete \(File is not a zip file\); make the parts again.$",
+            r"^\S*parts.npz is not a .npz file, or is incomplete \([a-zF ]*\); make the parts again.$",
         ),
         (1 << 60, "announces more than it contains: make the parts again"),
     ],
@@ -77,7 +77,7 @@ def test_a_file_that_does_not_fit_together_is_refused(change, message, tmp_path)
         path.write_bytes(change)
     elif isinstance(change, int):
         with zipfile.ZipFile(path, "w") as archive, archive.open("count.npy", "w") as file:
-            np.lib.format.write_array_header_1_0(file, {"descr": "<i8", "fortran_order": False, "shape": (change,)})
+            np.lib.format.write_array_header_1_0(file, {"descr": "|u1", "fortran_order": False, "shape": (change,)})
     else:
         arrays = dict(np.load(path)) | change
         np.savez(path, **{name: value for name, value in arrays.items() if value is not None})
