@@ -192,6 +192,12 @@ def test_a_sequence_becomes_numbered_files(name, last, tmp_path):
     assert_close(found.means.mean(0), cloud.means.mean(0) + 1.1, rtol=0, atol=1e-3)
 
 
+def test_what_files_of_a_sequence_cannot_hold_is_told_once(tmp_path):
+    with pytest.warns(UserWarning, match=r"0\.splat: harmonics .* 3 warnings like this in 3 files\.") as told:
+        export_frames(tmp_path / "#.splat", [varied_cloud(20)] * 3)
+    assert len(told) == 1
+
+
 def test_a_sequence_becomes_a_film(tmp_path):
     pytest.importorskip("pxr")
     cloud = varied_cloud(20)
