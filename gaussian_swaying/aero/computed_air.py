@@ -18,7 +18,7 @@ from gaussian_swaying.aero.shelter import Shelter
 from gaussian_swaying.aero.wind import WindField
 from gaussian_swaying.aero.wind_force import WindForce
 from gaussian_swaying.air.collision import MOMENTS
-from gaussian_swaying.air.flow import MOST_CELLS, WALL, Face, FlowState, LatticeFlow
+from gaussian_swaying.air.flow import FLUID, MOST_CELLS, WALL, Face, FlowState, LatticeFlow
 from gaussian_swaying.air.immersed import Reach, give, look, together, velocity_at
 from gaussian_swaying.air.lattice import FASTEST, LatticeUnits
 from gaussian_swaying.geometry.distance import DistanceGrid
@@ -294,6 +294,11 @@ class AirInBox:
         faces: list[Face | tuple[Face, Face]] = ["open", "open", ("wall", "open") if settings.ground else "open"]
         walls = solid if settings.walls or still is not None else None
         self.flow = LatticeFlow(cells, units, faces=faces, walls=walls, smagorinsky=settings.smagorinsky).to(device)
+        if not len(self.flow.held) or not bool((self.flow.kind == FLUID).any()):
+            raise ValueError(
+                "The walls leave no way for the wind through the box of air: make `air.walls` smaller (or set "
+                "`air.still_walls` to false), or move `air.low` and `air.high` apart."
+            )
         self._inflow = centres.reshape(-1, 3)[self.flow.held.long().cpu()].to(device)
         self.push = AirPush(state.position.shape[-2], state.position)
         self._pair: list[Tensor] = []  # on a GPU, where recorded steps go to and fro between them

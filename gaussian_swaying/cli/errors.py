@@ -40,7 +40,6 @@ _MEMORY = re.compile(
     re.IGNORECASE,
 )
 _NUMBER = re.compile(r"overflow|out of range|too large to convert|int too big", re.IGNORECASE)
-_WRITER = re.compile(r"PytorchStreamWriter|inline_container|file write failed|iostream error", re.IGNORECASE)
 _FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 
 
@@ -149,8 +148,6 @@ def sentence(
         return f"A number is too large or too small to compute with ({text}): check the given values."
     if isinstance(error, OSError):
         return _of_the_system(error)
-    if isinstance(error, RuntimeError) and _WRITER.search(text):
-        return f"A file could not be written ({text}): the disk may be full."
     if isinstance(error, ArgumentError):
         return f"{parser_sentence(str(error), arguments).rstrip('.')}; --help lists the options."
     if isinstance(error, (ValueError, TypeError, *expected)):
@@ -177,10 +174,12 @@ def parser_sentence(message: str, arguments: Sequence[str] = ()) -> str:
         files = [b for a, b in pairwise(arguments) if a == "--config"]
         files += [a.removeprefix("--config=") for a in arguments if a.startswith("--config=")]
         kept[0] = f"{', '.join(files)} is not valid YAML{kept[0].removeprefix('Problems parsing config')}"
-    return _CHOICES.sub(lambda found: f"Expected one of {found[1].replace(chr(39), '')}", " ".join(kept))
+    text = _CHOICES.sub(lambda found: f"Expected one of {found[1].replace(chr(39), '')}", " ".join(kept))
+    return _NO_CLASS.sub(r"`\1` has values but no class: put --\1 and the name of a class before them", text)
 
 
 _CHOICES = re.compile(r"Expected a typing\.Literal\[([^\]]*)\]")
+_NO_CLASS = re.compile(r'Parser key "([\w.]+)": Expected an instantiatable class, but [\w.]+ is abstract')
 
 
 def _asked_for(text: str) -> str:

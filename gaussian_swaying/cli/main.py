@@ -6,7 +6,10 @@ import difflib
 import gc
 import io
 import os
+import re
+import signal
 import sys
+import threading
 from collections.abc import Sequence
 from importlib import import_module
 from types import ModuleType
@@ -72,12 +75,21 @@ def run(command: str | None = None) -> NoReturn:
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):
             stream.reconfigure(errors="replace")  # a terminal without the sign for cubic metres
-    sys.exit(main() if command is None else _imported(COMMANDS[command][0]).main())
+    try:
+        sys.exit(main() if command is None else _imported(COMMANDS[command][0]).main())
+    except KeyboardInterrupt:  # while options are read
+        _stop(signal.SIGINT, None)
 
 
 def _end(message: str) -> NoReturn:
     print(f"error: {message}", file=sys.stderr)
     sys.exit(2)
+
+
+def _stop(number: int, frame: object) -> NoReturn:
+    """End at once: libraries that are being loaded turn KeyboardInterrupt into errors of their own."""
+    os.write(2, b"Stopped.\n")
+    os._exit(128 + number)
 
 
 def _imported(name: str) -> ModuleType:
@@ -93,10 +105,20 @@ def _imported(name: str) -> ModuleType:
     except ValueError:
         _end("The environment variable SOURCE_DATE_EPOCH is not a whole number of seconds: correct or unset it.")
     if name not in sys.modules:
+        main_thread = threading.current_thread() is threading.main_thread()
+        stops = main_thread and signal.getsignal(signal.SIGINT) is signal.default_int_handler
+        if stops:
+            signal.signal(signal.SIGINT, _stop)
         gc.disable()
         try:
             import_module(name)
             gc.freeze()
+        except (ImportError, OSError, MemoryError) as error:
+            if isinstance(error, MemoryError) or re.search("failed to map|allocate memory", str(error)):
+                _end("There is not enough memory to load PyTorch: close other programs, or raise the limit.")
+            raise
         finally:
             gc.enable()
+            if stops:
+                signal.signal(signal.SIGINT, signal.default_int_handler)
     return sys.modules[name]

@@ -2,19 +2,24 @@
 
 from __future__ import annotations
 
+import errno
 import pickle
 from pathlib import Path
 from typing import Any
 
 import torch
 
+from gaussian_swaying._checks import first_line
 from gaussian_swaying._files import atomic
 
 
 def save_whole(path: Path, value: Any) -> None:
     """Write what ``torch.load`` reads, whole or not at all."""
-    with atomic(path) as temporary:
-        torch.save(value, temporary)
+    try:
+        with atomic(path) as temporary:
+            torch.save(value, temporary)
+    except RuntimeError as error:  # PyTorch's writer names neither the file nor the cause
+        raise OSError(errno.ENOSPC, f"the disk may be full: {first_line(error)}", str(path)) from error
 
 
 def load_plain(path: Path, map_location: Any = "cpu") -> Any:

@@ -61,9 +61,9 @@ class RecordedRun:
         try:
             settings = parse_file(parser, config)
         except ValueError as error:
-            raise ValueError(
-                f"{config} cannot be read, as a run made from Python cannot be repeated ({error})"
-            ) from error
+            python = "made_in_python" in config.read_text(encoding="utf-8", errors="replace")
+            why = "the run was made from Python" if python else str(error).rstrip(".")
+            raise ValueError(f"{config} cannot be read ({why}): run the simulation again from a file.") from error
         splat = settings.scene.ply
         if splat is not None:
             if not Path(splat).is_file():

@@ -469,6 +469,11 @@ class Stepper:
             return self._steps  # of the frame before, as one of the scenes has diverged
         steps = self.solver.substeps(state, self.frame_dt, cells)
         if not (math.isfinite(rate) and blowing < MAX_WIND):
+            aero = self.setup.aero
+            bad = [name for name in ("C_D", "C_F", "C_L") if not bool(getattr(aero, name).isfinite())]
+            if bad:
+                value = float(getattr(aero, bad[0]).detach())
+                self.give_up(state, f"`aero.{bad[0]}` is {value:g}", "set it to a finite number")
             cause = f"the wind of {blowing:.3g} m/s, or its drag, is NaN or infinite or beyond {MAX_WIND:g} m/s"
             self.give_up(state, cause, "check the flow and the modulations of the wind")
         explicit = self.setup.aero.drag_step != "semi_implicit" and self.setup.air is None
@@ -585,7 +590,8 @@ class Launched:
         except (FloatingPointError, ValueError) as error:
             if not _raised_here(error):  # by a custom wind, force or boundary
                 raise
-            self._stepper.give_up(self._before, str(error).rstrip("."))
+            cause, own, remedy = str(error).rstrip(".").rpartition(": ")
+            self._stepper.give_up(self._before, cause if own else remedy, remedy if own else None)
 
 
 class Outlook:

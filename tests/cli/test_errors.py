@@ -57,9 +57,8 @@ def nested(depth=100_000):
         (Path("/nowhere/at/all").read_bytes, ["/nowhere/at/all does not exist", "check the path"]),
         (Path("/").read_bytes, ["/ cannot be used", "directory"]),
         (lambda: os.write(os.open("/dev/full", os.O_WRONLY), b"x"), ["could not be written", "make room"]),
-        (lambda: torch.save({"a": torch.ones(99999)}, "/dev/full"), ["could not be written", "disk may be full"]),
     ],
-    ids=["count", "memory", "product", "numpy", "float", "fill", "text", "depth", "missing", "folder", "full", "save"],
+    ids=["count", "memory", "product", "numpy", "float", "fill", "text", "depth", "missing", "folder", "full"],
 )
 def test_what_input_and_machine_cause_is_a_sentence(error, words, capsys):
     error = caught(error)

@@ -1,6 +1,8 @@
 """The installed program, and configurations by name."""
 
+import os
 import runpy
+import subprocess
 import sys
 from pathlib import Path
 
@@ -25,6 +27,30 @@ def test_what_there_is(capsys):
     assert main(["--version"]) == 0
     assert capsys.readouterr().out == f"gaussian-swaying {gaussian_swaying.__version__}\n"
     refused(main, ["exprot"], capsys, "error: There is no command 'exprot' (did you mean export?)")
+
+
+@pytest.mark.parametrize(
+    ("body", "code", "told"),
+    [
+        ("os.kill(os.getpid(), signal.SIGINT)\nos.getpid()", 130, "Stopped.\n"),
+        ("def main(given): os.kill(os.getpid(), signal.SIGINT); os.getpid()", 130, "Stopped.\n"),
+        (
+            "raise ImportError('lib.so: failed to map segment from shared object')",
+            2,
+            "error: There is not enough memory",
+        ),
+        ("raise MemoryError", 2, "error: There is not enough memory to load PyTorch"),
+    ],
+)
+def test_what_ends_a_command_before_it_runs(tmp_path, body, code, told):
+    """Ctrl-C and a lack of memory while modules are loaded or options are read; no traceback."""
+    (tmp_path / "loads.py").write_text(f"import os, signal\n{body}\n")
+    run = "import sys; from gaussian_swaying.cli import main; main.COMMANDS['sim'] = ('loads', ''); main.run()"
+    env = os.environ | {"PYTHONPATH": os.pathsep.join([str(tmp_path), str(ROOT)])}
+    done = subprocess.run([sys.executable, "-c", run, "sim"], env=env, capture_output=True, text=True)
+    assert done.returncode == code
+    assert done.stderr.startswith(told)
+    assert done.stderr.count("\n") == 1
 
 
 def test_what_torch_would_not_explain(tmp_path, monkeypatch, capsys):

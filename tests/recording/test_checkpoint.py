@@ -7,6 +7,7 @@ import shutil
 import traceback
 
 import pytest
+import torch
 from damage import Fuse
 from shared import contents
 
@@ -41,6 +42,16 @@ def test_what_is_no_checkpoint_changes_nothing(make_simulation, tmp_path):
         assert contents(folder) == before
     file.write_bytes(content)
     assert go(3, True)["status"] == "complete"
+
+
+def test_a_disk_that_is_full_is_named_with_the_file(make_simulation, tmp_path, monkeypatch):
+    def fail(*given):
+        raise RuntimeError("[enforce fail at inline_container.cc:672] . unexpected pos 128 vs 0")
+
+    monkeypatch.setattr(torch, "save", fail)
+    with pytest.raises(OSError, match=r"^checkpoint\.pt could not be written: the disk may be full"):
+        make_simulation().run(tmp_path / "run", 2, progress=False, recorder=Recorder(**QUIET))
+    assert not list((tmp_path / "run").glob("*checkpoint*"))
 
 
 @pytest.mark.filterwarnings("ignore:Detected pickle protocol")

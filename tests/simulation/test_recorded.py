@@ -148,6 +148,9 @@ def test_a_run_without_its_motion_is_refused(recorded, tmp_path, capsys):
     refused(export, [str(copy), str(tmp_path / "f_#.ply")], capsys, words)
     (copy / "summary.json").write_text(json.dumps({}))
     refused(export, [str(copy), str(tmp_path / "f_#.ply")], capsys, "summary.json cannot be read ('formulation')")
+    shutil.copy(run / "summary.json", copy)
+    (copy / "config.yaml").write_text((run / "config.yaml").read_text()[:40] + "\n  E: [")
+    refused(export, [str(copy), str(tmp_path / "f_#.ply")], capsys, "config.yaml cannot be read (", "from a file")
     refused(export, [str(tmp_path), str(tmp_path / "f_#.ply")], capsys, "has no run: give the output folder")
     assert not list(tmp_path.glob("f_*"))
 

@@ -98,6 +98,15 @@ def test_still_air_resists_a_fall(make_simulation):
     assert speed[1] < 0.9 * speed[0]
 
 
+@pytest.mark.parametrize("name", ["C_D", "C_F", "C_L"])
+def test_a_coefficient_that_became_nan_is_named(make_simulation, name):
+    simulation = make_simulation()
+    with torch.no_grad():
+        getattr(simulation.aero, name).fill_(torch.nan)
+    with pytest.raises(SimulationDiverged, match=rf"`aero\.{name}` is nan\. Remedy: set it to a finite number\.$"):
+        advanced(simulation, 1)
+
+
 def test_a_grid_that_was_outrun_is_enlarged(make_simulation):
     """A strong wind takes an unpinned flag farther in one frame than its speed at the start foretells."""
     simulation = make_simulation(wind=WindField([0.0, 25.0, 0.0]), pinned=False, formulation="updated")
