@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any, Literal, get_args, get_origin, get_type_h
 import torch
 from torch import Tensor
 
+from gaussian_swaying._arguments import is_number, shown
 from gaussian_swaying._numbers import Sense, sense_of
 
 if TYPE_CHECKING:
@@ -68,9 +69,11 @@ def check_vector(name: str, value: Any, length: int = 3) -> tuple[float, ...]:
     check_plain(name, value)
     items = value.tolist() if isinstance(value, Tensor) else value
     if isinstance(items, (str, bytes)) or not hasattr(items, "__len__"):
-        raise TypeError(f"Expected `{name}` to be a list of {length} numbers, but got {value!r}.")
+        raise TypeError(f"Expected `{name}` to be a list of {length} numbers, but got {shown(value)}.")
     if len(items) != length:
-        raise ValueError(f"Expected `{name}` to have {length} numbers, but got {len(items)}: {list(items)}.")
+        raise ValueError(f"Expected `{name}` to have {length} numbers, but got {len(items)}: {shown(value)}.")
+    if not all(map(is_number, items)):
+        raise TypeError(f"Expected `{name}` to be a list of {length} numbers, but got {shown(value)}.")
     result = tuple(float(item) for item in items)
     if any(item != item or item in (float("inf"), float("-inf")) for item in result):
         raise ValueError(f"Expected `{name}` to be finite, but got {list(result)}.")
@@ -95,8 +98,8 @@ def check_sense(name: str, value: float, least: float = 1e-12) -> None:
 
 def check_choice(name: str, value: str, choices: tuple[str, ...]) -> None:
     """Raise ValueError unless ``value`` is one of ``choices``."""
-    if value not in choices:
-        raise ValueError(f"Expected `{name}` to be one of {', '.join(choices)}, but got {value!r}.")
+    if not isinstance(value, str) or value not in choices:
+        raise ValueError(f"Expected `{name}` to be one of {', '.join(choices)}, but got {shown(value)}.")
 
 
 def check_literals(function: Callable[..., Any], values: Mapping[str, Any], where: str = "") -> None:
@@ -120,6 +123,8 @@ def check_literals(function: Callable[..., Any], values: Mapping[str, Any], wher
 def check_positive(name: str, value: float, *, allow_zero: bool = False) -> None:
     """Raise ValueError unless ``value`` is a finite number above zero (or at least zero, with ``allow_zero``)."""
     check_plain(name, value)
+    if not is_number(value):
+        raise TypeError(f"Expected `{name}` to be a number, but got {shown(value)}.")
     wanted = "not be negative" if allow_zero else "be positive"
     if not (value >= 0 if allow_zero else value > 0) or value == float("inf"):
         raise ValueError(f"Expected `{name}` to {wanted} and finite, but got {value}.")

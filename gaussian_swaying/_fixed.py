@@ -15,6 +15,8 @@ from typing import Any, NoReturn, TypeVar
 import torch
 from torch import nn
 
+from gaussian_swaying._arguments import check_arguments
+
 T = TypeVar("T")
 LIVE: set[str] = set()
 """Names of the numbers that ``Simulation.change`` changes."""
@@ -26,11 +28,13 @@ class Fixed:
     Attributes:
         assignable: Names that can.
         live_as: Where a simulation has it, for example ``wind``.
+        of_a_file: Whether its annotations are what a file can say, and Python more.
     """
 
     __slots__ = ()
     assignable: tuple[str, ...] = ()
     live_as: str = ""
+    of_a_file: bool = False
 
     def __init_subclass__(cls, **options: Any) -> None:
         super().__init_subclass__(**options)
@@ -65,7 +69,7 @@ def fixed(kind: type[T]) -> type[T]:
         _check(self, name)
         object.__delattr__(self, name)
 
-    if not _frozen(kind):
+    if "__slots__" not in vars(kind):  # those with slots are made in loops
         kind.__init__ = _closing("__init__", kind.__init__)  # type: ignore[method-assign]
     kind.__setattr__, kind.__delattr__ = assign_to, delete  # type: ignore[method-assign]
     return kind
@@ -73,11 +77,17 @@ def fixed(kind: type[T]) -> type[T]:
 
 def _closing(name: str, method: Callable[..., None]) -> Callable[..., None]:
     """An ``__init__`` or ``__post_init__`` after which an object is made, unless it belongs to a base of its class."""
+    parameters, ours = inspect.signature(method), (method.__module__ or "").startswith("gaussian_swaying.")
 
     @wraps(method)
     def whole(self: Any, *args: Any, **given: Any) -> None:
+        if ours and name == "__init__" and not getattr(type(self), "of_a_file", False):
+            check_arguments(method, parameters.bind(self, *args, **given).arguments, type(self).__name__)
+        elif ours:
+            check_arguments(type(self).__init__, vars(self), type(self).__name__)
         method(self, *args, **given)
-        _close(self, name, whole)
+        if not _frozen(type(self)):
+            _close(self, name, whole)
 
     return whole
 

@@ -8,7 +8,7 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from gaussian_swaying._checks import check_positive
+from gaussian_swaying._checks import check_positive, check_vector
 from gaussian_swaying.aero.spectra import energy_spectrum, shear_time
 
 MAX_CELLS = 1 << 27
@@ -48,7 +48,7 @@ def turbulence_box(
         Velocity per standard deviation, shape (*cells, 3), float32.
     """
     check_positive("gamma", gamma, allow_zero=True)
-    if len(cells) != 3 or any(int(n) != n or n < 4 or n % 2 for n in cells):
+    if any(int(n) != n or n < 4 or n % 2 for n in check_vector("cells", cells)):
         raise ValueError(f"Expected `cells` to be three even numbers of at least 4, but got {list(cells)}.")
     if math.prod(cells) > MAX_CELLS:
         raise ValueError(f"A box of {math.prod(cells):,} cells is too large (at most {MAX_CELLS:,}): lower `cells`.")

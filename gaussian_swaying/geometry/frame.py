@@ -9,6 +9,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from gaussian_swaying._arguments import checked
 from gaussian_swaying._checks import check_positive, check_shape
 from gaussian_swaying._devices import in_double
 from gaussian_swaying._fixed import fixed
@@ -51,6 +52,7 @@ class SimFrame:
         return self._turns[0]
 
     @classmethod
+    @checked
     def fit(
         cls,
         points: Tensor,

@@ -184,12 +184,8 @@ class Union(Region):
     """
 
     def __init__(self, regions: list[Region]) -> None:
-        if not isinstance(regions, (list, tuple)):
-            raise TypeError(f"Expected `regions` to be a list of regions, but got {type(regions).__name__}.")
         if not regions:
             raise ValueError("Expected `regions` to hold at least one region, but got an empty list.")
-        for region in regions:
-            _check_region("regions", region)
         self.regions = list(regions)
         self.recordable = all(region.recordable for region in self.regions)
 
@@ -215,7 +211,6 @@ class Not(Region):
     """
 
     def __init__(self, region: Region) -> None:
-        _check_region("region", region)
         self.region, self.recordable = region, region.recordable
 
     def __repr__(self) -> str:
@@ -234,11 +229,6 @@ def _corner(name: str, values: Sequence[float | None], unbounded: float) -> tupl
         raise TypeError(f"Expected `{name}` to be a list of 3 numbers or nulls, but got {values!r}.")
     finite = check_vector(name, [0.0 if value is None else value for value in values])
     return tuple(unbounded if value is None else item for value, item in zip(values, finite, strict=True))
-
-
-def _check_region(name: str, region: Region) -> None:
-    if not isinstance(region, Region) or isinstance(region, type):
-        raise TypeError(f"Expected `{name}` to be a Region, but got {region!r}.")
 
 
 def whereabouts(region: Region, points: Tensor, rotation: Tensor) -> tuple[str, str]:

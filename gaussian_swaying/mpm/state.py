@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 import torch
 from torch import Tensor
 
+from gaussian_swaying._arguments import checked
 from gaussian_swaying._checks import check_finite, check_shape
 from gaussian_swaying._fixed import fixed
 from gaussian_swaying.mpm.laws.fixed_corotated import FixedCorotated
@@ -169,6 +170,7 @@ class MaterialPoints:
             )
 
     @classmethod
+    @checked
     def create(
         cls,
         position: Tensor,
@@ -218,7 +220,17 @@ class MaterialPoints:
                 worst = tensor.detach().reshape(-1)
                 worst = worst[~((worst > low) & (worst < high))][0]
                 raise ValueError(f"Expected `{name}` {remedy}, but got {float(worst):g}.")
-            return tensor.expand(position.shape[:-1])
+            return expanded(name, tensor)
+
+        def expanded(name: str, tensor: Tensor) -> Tensor:
+            shape = position.shape[:-1]
+            if tensor.dim() > len(shape) or any(
+                a not in (1, b) for a, b in zip(tensor.shape[::-1], shape[::-1], strict=False)
+            ):
+                raise ValueError(
+                    f"Expected `{name}` to be a number, or of shape {tuple(shape)}, but got {tuple(tensor.shape)}."
+                )
+            return tensor.expand(shape)
 
         inf = float("inf")
         v = field("volume", volume, 0.0, inf, "to be positive and finite [m³]")
@@ -227,7 +239,7 @@ class MaterialPoints:
         nu = field("nu", poisson_ratio, -1.0, 0.5, "(Poisson's ratio) to lie between -1 and 0.5, both excluded")
         laws = _DEFAULT if law is None else (law,) if isinstance(law, ConstitutiveLaw) else tuple(law)
         if law_index is not None:
-            law_index = law_index.to(position.device, torch.long).expand(position.shape[:-1])
+            law_index = expanded("law_index", law_index.to(position.device, torch.long))
             if not bool(((law_index >= 0) & (law_index < len(laws))).all()):
                 raise ValueError(f"Expected `law_index` to lie in 0 to {len(laws) - 1}, the last index of `laws`.")
         if damping is not None:

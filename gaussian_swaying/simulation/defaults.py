@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any, Literal
 
 import torch
 
+from gaussian_swaying._arguments import shown
 from gaussian_swaying._checks import VectorLike, check_choice, check_vector
 from gaussian_swaying._fixed import FixedList, changed
 from gaussian_swaying.aero.force import AeroForce
@@ -180,10 +181,10 @@ def check_types(given: Mapping[str, Any]) -> None:
     for name, value in given.items():
         if name in _KINDS and value is not None and not isinstance(value, _KINDS[name]):
             words = " or ".join(kind.__name__ for kind in _KINDS[name])
-            raise TypeError(f"Expected `{name}` to be a {words}, but got {value!r}.")
+            raise TypeError(f"Expected `{name}` to be a {words}, but got {shown(value)}.")
         for part in value if name in _LISTS and isinstance(value, list | tuple) else ():
             if not isinstance(part, _LISTS[name]) and not (name == "forces" and callable(part)):
-                raise TypeError(f"Expected `{name}` to be a list of {_LISTS[name].__name__}, but it has {part!r}.")
+                raise TypeError(f"Expected `{name}` to be a list of {_LISTS[name].__name__}, but it has {shown(part)}.")
 
 
 _KINDS: dict[str, tuple[type, ...]] = {

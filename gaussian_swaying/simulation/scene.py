@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Literal
 import torch
 from torch import Tensor
 
+from gaussian_swaying._arguments import shown
 from gaussian_swaying._checks import check_literals, check_positive, check_vector
 from gaussian_swaying._fixed import Fixed
 from gaussian_swaying.gaussians.cloud import GaussianCloud
@@ -141,6 +142,8 @@ class Scene(Fixed):
         self.connected = connected
         self.ply, self.generator, self.region = ply, generator, region or Everything()
         self.parts = Parts.load(parts) if isinstance(parts, str | os.PathLike) else parts
+        if not isinstance(self.parts, Parts | None):
+            raise TypeError(f"Expected `scene.parts` to be Parts or a file, but got {shown(parts)}.")
         alone = connected != "surface" and self.parts is not None and self.parts.attached_to() is not None
         if alone:
             raise ValueError(

@@ -136,7 +136,7 @@ class Simulation(Fixed):
         [0.0, 0.04, 0.08]
     """
 
-    assignable = ("frames_wanted",)
+    assignable, of_a_file = ("frames_wanted",), True
 
     def __init__(
         self,

@@ -173,7 +173,10 @@ GUST = '[{"class_path": "SineSway", "init_args": {"amplitud": 1.0}}]'
         (["--scene.generator.init_args.spacng", "0.1"], ["spacng", "scene.generator", "--help"]),
         (["--wind.modulations", GUST], ["amplitud", "wind.modulations"]),
         (["--shader.class_path", "NoSuchShader"], ["NoSuchShader"]),
-        (["--shader", "null", "--shader.init_args.ambient", "1"], ["`shader` has values but no class: put --shader and"]),
+        (
+            ["--shader", "null", "--shader.init_args.ambient", "1"],
+            ["`shader` has values but no class: put --shader"],
+        ),
         (["--frames", "many"], ["frames", "many"]),
         (["--frames", "0"], ["`frames`", "from 1 to"]),
         (["--material.volume", "cube"], ['"material.volume": Expected one of patch, cell']),

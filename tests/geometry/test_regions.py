@@ -101,8 +101,8 @@ REFUSED = [
     (Cylinder, (ZERO, UNIT, -1, 1), ValueError, "`radius`"),
     (Cylinder, (ZERO, UNIT, 1, 0), ValueError, "`height`"),
     (Union, ([],), ValueError, "`regions`"),
-    (Union, ([3],), TypeError, "`regions` to be a Region, but got 3"),
-    (Union, (Everything(),), TypeError, "`regions` to be a list"),
+    (Union, ([3],), TypeError, "`regions` of Union to be a list of Regions, but got"),
+    (Union, (Everything(),), TypeError, "`regions` of Union to be a list"),
     (Not, (Everything,), TypeError, "`region`"),
 ]
 
