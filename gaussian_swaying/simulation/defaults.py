@@ -191,6 +191,7 @@ _KINDS: dict[str, tuple[type, ...]] = {
     "scene": (Scene, ProceduralScene, GaussianCloud, str, os.PathLike),
     "material": (Material, str),
     "solver": (Solver,),
+    "cloud": (GaussianCloud,),
     "contact": (Contact,),
     "aero": (AeroForce,),
     "forces": (list, tuple),

@@ -93,11 +93,6 @@ class Material:
         check_literals(type(self).__init__, vars(self), "material.")
         for name in DIFFERENTIABLE:
             value = getattr(self, name)
-            if isinstance(value, Tensor) and value.numel() != 1:
-                raise ValueError(
-                    f"Expected `material.{name}` to be one number, but got a tensor of shape {tuple(value.shape)}: use "
-                    "`material.regions` for parts, or MaterialPoints with an MPMSolver for a value at every point."
-                )
             if requires_grad(value) and any(getattr(entry, name) is not None for entry in self.regions):
                 raise ValueError(
                     f"`material.{name}` requires a gradient, but `material.regions` gives it too: remove it there."

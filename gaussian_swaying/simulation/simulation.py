@@ -167,7 +167,7 @@ class Simulation(Fixed):
     ) -> None:
         given = {name: value for name, value in locals().items() if name not in ("self", *NOT_COMPARED)}
         check_positive("frame_dt", frame_dt)
-        check_types(given | {"recorder": recorder})
+        check_types(given | {"recorder": recorder, "cloud": cloud})
         check_choice("dtype", dtype, ("float32", "float64"))
         colour = check_vector("background", background)
         target = resolve_device(device)
