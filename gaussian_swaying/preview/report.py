@@ -28,7 +28,7 @@ from gaussian_swaying.simulation.progress import duration
 from gaussian_swaying.simulation.roles import classify, conditions
 from gaussian_swaying.simulation.simulation import Simulation
 
-SHORT = ("up", "region", "held", "size", "kind", "wind", "simulated", "conditions", "the run")
+SHORT = ("origin", "up", "region", "held", "size", "kind", "wind", "simulated", "conditions", "the run")
 """Labels of the lines that are printed without ``--verbose``."""
 NEXT_BEST = "the next best"
 

@@ -14,7 +14,10 @@ def test_a_page_from_the_name_of_a_configuration(tmp_path, capsys, monkeypatch):
     """Beside where the command runs, with options of sim; for a phone the grid becomes coarser."""
     monkeypatch.chdir(tmp_path)
     assert main(["--live-web", "flag", "--element", *SMALL]) == 0
-    told = r"note: the page has no `contact` of the material with itself: .*\n2,344 Gaussians, \d+ material points\nwrote gaussian-swaying\.js\nwrote flag\.html \(0\.\d MB\)\n"
+    told = (
+        r"note: the page has no `contact` of the material with itself: .*\n2,344 Gaussians, \d+ material points\n"
+        r"wrote gaussian-swaying\.js\nwrote flag\.html \(0\.\d MB\)\n"
+    )
     assert re.fullmatch(told, capsys.readouterr().out)
     assert "customElements.define" in (tmp_path / "gaussian-swaying.js").read_text()
     assert (tmp_path / "flag.html").read_text().startswith("<!doctype html>")

@@ -15,7 +15,7 @@ from small_scenes import together
 
 from gaussian_swaying.cli.preview import main
 from gaussian_swaying.cli.simulate import main as simulate
-from gaussian_swaying.gaussians.ply import write_ply
+from gaussian_swaying.gaussians.ply import read_ply, write_ply
 from gaussian_swaying.preview.cost import Cost
 from gaussian_swaying.scenes.procedural import FlagScene
 
@@ -27,6 +27,20 @@ FLAG = ROOT / "configs/sim/flag.yaml"
 def _few_frames(monkeypatch):
     """Of those that are timed, which is tested in test_cost.py."""
     monkeypatch.setattr("gaussian_swaying.preview.cost.MOST_FRAMES", 2)
+
+
+def test_where_map_coordinates_begin(tmp_path, capsys):
+    """In the short preview and where the starter runs, which place nothing in the coordinates of the file."""
+    flag, out = FlagScene(spacing=0.08).generate(), str(tmp_path / "out")
+    write_ply(tmp_path / "a.ply", dataclasses.replace(flag, origin=(500123.0, 4649776.0, 312.0)))
+    given = ["--device", "cpu", "--frames", "2"]
+    assert main([str(tmp_path / "a.ply"), "--output", out, "--height", "96", *given]) == 0
+    begin = list(read_ply(tmp_path / "a.ply").origin)
+    words = f"coordinates count from {begin} of the file"
+    assert words in capsys.readouterr().out
+    assert simulate(["--config", f"{out}/starter.yaml", "--output", str(tmp_path / "run"), *given]) == 0
+    assert words in capsys.readouterr().out
+    assert json.loads((tmp_path / "run/summary.json").read_text())["file_origin"] == begin
 
 
 @pytest.fixture
