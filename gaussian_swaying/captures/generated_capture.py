@@ -23,42 +23,6 @@ _STEPS = 24  # samples along a ray, to find the interval of the first crossing
 _LIGHT = (0.4, -0.8, 0.45)
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class TrueSurface:
-    """A surface as triangles.
-
-    Attributes:
-        vertices: Points on the surface [m], float64, shape (V, 3).
-        faces: Triangles as indices of vertices, shape (T, 3).
-        normals: Unit normals at the vertices, on the -y side, float64, shape (V, 3).
-        colors: Colours as seen by a camera, in 0 to 1, shape (V, 3).
-        area: Area of one side of the smooth surface [m²].
-    """
-
-    vertices: Tensor
-    faces: Tensor
-    normals: Tensor
-    colors: Tensor
-    area: float
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class TrueView:
-    """The exact picture of a camera: colour and alpha averaged over each pixel, depth and normals at its centre.
-
-    Attributes:
-        colors: Colours in 0 to 1, multiplied with alpha, shape (H, W, 3).
-        alpha: Share of the pixel that the surface covers, shape (H, W).
-        depth: Depth along the optical axis [m], infinite where the ray misses, shape (H, W).
-        normals: Unit normal towards the camera, zero where the ray misses, shape (H, W, 3).
-    """
-
-    colors: Tensor
-    alpha: Tensor
-    depth: Tensor
-    normals: Tensor
-
-
 @dataclass(eq=False)
 class GeneratedCapture:
     """Photographs of a rippled, patterned flag from all around, with its true normals and area.
@@ -145,46 +109,19 @@ class GeneratedCapture:
         shade = 0.4 + 0.6 * (self.normals(x, z) @ light).abs()
         return (pattern * ((0.8 + 0.2 * checks + 0.12 * weave) * shade)[..., None]).clamp(0, 1)
 
-    def surface(self, columns: int = 240, rows: int = 160) -> TrueSurface:
-        """The sheet as a mesh of ``columns`` x ``rows`` squares, cut into triangles."""
+    def mesh(self, columns: int = 240, rows: int = 160) -> tuple[Tensor, Tensor, Tensor]:
+        """The sheet as ``columns`` x ``rows`` squares, cut into triangles.
+
+        Returns:
+            Vertices [m], float64, shape (V, 3), their colours in 0 to 1, shape (V, 3), and triangles, shape (T, 3).
+        """
         x = torch.linspace(0, self.width, columns + 1, dtype=torch.float64)
         z = torch.linspace(0, self.height, rows + 1, dtype=torch.float64)
         gx, gz = (grid.reshape(-1) for grid in torch.meshgrid(x, z, indexing="ij"))
         corner = (torch.arange(columns)[:, None] * (rows + 1) + torch.arange(rows)).reshape(-1)
         across, above, both = corner + rows + 1, corner + 1, corner + rows + 2
         faces = torch.cat([torch.stack([corner, across, both], -1), torch.stack([corner, both, above], -1)])
-        vertices = torch.stack([gx, self.elevation(gx, gz), gz], -1)
-        return TrueSurface(vertices, faces, self.normals(gx, gz), self.colors(gx, gz).float(), self.area())
-
-    def area(self, cells: int = 1000) -> float:
-        """Area of one side of the sheet [m²], by the midpoint rule."""
-        x = (torch.arange(cells, dtype=torch.float64) + 0.5) * (self.width / cells)
-        z = (torch.arange(cells, dtype=torch.float64) + 0.5) * (self.height / cells)
-        along, upward = self.slopes(*torch.meshgrid(x, z, indexing="ij"))
-        return float((1 + along**2 + upward**2).sqrt().mean()) * self.width * self.height
-
-    def nearest(self, points: Tensor, iterations: int = 20) -> tuple[Tensor, Tensor]:
-        """Nearest points on the sheet, by Gauss-Newton steps in its tangent plane from the point straight below.
-
-        Args:
-            points: Points [m], shape (N, 3). For a point farther away than the sheet's radius of curvature, the result
-                may not be the nearest point.
-            iterations: Number of steps.
-
-        Returns:
-            The points on the sheet [m] and the unit normals there, both float64, shape (N, 3).
-        """
-        points = points.detach().double()
-        x, z = points[:, 0].clamp(0, self.width), points[:, 2].clamp(0, self.height)
-        for _ in range(iterations):
-            along, upward = self.slopes(x, z)
-            dx, dy, dz = points[:, 0] - x, points[:, 1] - self.elevation(x, z), points[:, 2] - z
-            right, up = dx + along * dy, dz + upward * dy
-            xx, xz, zz = 1 + along.square(), along * upward, 1 + upward.square()
-            determinant = xx * zz - xz.square()
-            x = (x + (zz * right - xz * up) / determinant).clamp(0, self.width)
-            z = (z + (xx * up - xz * right) / determinant).clamp(0, self.height)
-        return torch.stack([x, self.elevation(x, z), z], -1), self.normals(x, z)
+        return torch.stack([gx, self.elevation(gx, gz), gz], -1), self.colors(gx, gz).float(), faces
 
     # ---- the pictures
 
@@ -205,38 +142,25 @@ class GeneratedCapture:
             cameras.append(look_at_camera(eye, center, up, self.fov, self.size, self.size, dtype=torch.float64))
         return cameras
 
-    def render(self, camera: Camera) -> TrueView:
+    def render(self, camera: Camera) -> Tensor:
         """Draw the sheet by ray casting.
 
         Args:
             camera: Any pinhole camera.
 
         Returns:
-            The view, float32.
+            Colours in 0 to 1, multiplied with alpha, and alpha, each averaged over the pixel, shape (H, W, 4).
         """
-        packed = self._pixels(camera)
-        column = torch.arange(camera.width, dtype=torch.float64) + 0.5
-        row = torch.arange(camera.height, dtype=torch.float64) + 0.5
-        hit, distance, x, z = self._cast(camera, row, column)
-        facing = self.normals(x, z)
-        eye = camera.position.float()
-        seen = torch.stack([x, self.elevation(x, z), z], -1) - eye
-        facing = torch.where((facing * seen).sum(-1, keepdim=True) > 0, -facing, facing) * hit[..., None]
-        depth = torch.where(hit, distance, torch.full_like(distance, math.inf))
-        return TrueView(packed[..., :3].contiguous(), packed[..., 3].contiguous(), depth, facing)
-
-    def _pixels(self, camera: Camera) -> Tensor:
-        """Colours multiplied with alpha, and alpha, shape (H, W, 4)."""
         n = self.samples
         column = (torch.arange(camera.width * n, dtype=torch.float64) + 0.5) / n
         row = (torch.arange(camera.height * n, dtype=torch.float64) + 0.5) / n
-        hit, _, x, z = self._cast(camera, row, column)
+        hit, x, z = self._cast(camera, row, column)
         packed = torch.zeros(*hit.shape, 4)
         packed[hit] = functional.pad(self.colors(x[hit], z[hit]), (0, 1), value=1.0)
         return rearrange(functional.avg_pool2d(rearrange(packed, "h w c -> 1 c h w"), n), "1 c h w -> h w c")
 
-    def _cast(self, camera: Camera, row: Tensor, column: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        """Cast rays at the sheet; return hit or not, and depth, x and z of the hit, each of shape (rows, columns)."""
+    def _cast(self, camera: Camera, row: Tensor, column: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Cast rays at the sheet; return hit or not, and x and z of the hit, each of shape (rows, columns)."""
         intrinsics, view = camera.intrinsics.double(), camera.world_to_camera.double()
         v, u = torch.meshgrid(
             (row - intrinsics[1, 2]) / intrinsics[1, 1], (column - intrinsics[0, 2]) / intrinsics[0, 0], indexing="ij"
@@ -251,14 +175,13 @@ class GeneratedCapture:
         enter, leave = bounds.amin(0).amax(-1).clamp_min(camera.near), bounds.amax(0).amin(-1)
         inside = (enter < leave).nonzero()[:, 0]
         hit = torch.zeros(len(rays), dtype=torch.bool)
-        depth, x, z = (torch.zeros(len(rays)) for _ in range(3))
+        x, z = torch.zeros(2, len(rays))
         for chunk in inside.split(1 << 17):
             crosses, t = self._first_crossing(eye, rays[chunk], enter[chunk], leave[chunk])
             met = chunk[crosses]
             place = eye + t[:, None] * rays[met]
-            hit[met], depth[met], x[met], z[met] = True, t, place[:, 0], place[:, 2]
-        shape = v.shape
-        return hit.reshape(shape), depth.reshape(shape), x.reshape(shape), z.reshape(shape)
+            hit[met], x[met], z[met] = True, place[:, 0], place[:, 2]
+        return hit.view_as(v), x.view_as(v), z.view_as(v)
 
     def _first_crossing(self, eye: Tensor, rays: Tensor, enter: Tensor, leave: Tensor) -> tuple[Tensor, Tensor]:
         """Return a mask of the rays that cross the sheet between two depths, and the first depth of these crossings."""
@@ -283,10 +206,9 @@ class GeneratedCapture:
     # ---- files
 
     def write(self, folder: str | os.PathLike[str], threads: int = 2) -> Path:
-        """Write the capture: ``images/``, ``transforms.json``, ``mesh.ply`` and ``truth.npz``.
+        """Write the capture: ``images/``, ``transforms.json`` and ``mesh.ply``.
 
-        ``truth.npz`` contains ``vertices``, ``faces``, ``normals`` and ``area`` of :class:`TrueSurface`. Images are PNG
-        with alpha; colours are not multiplied with it. ``transforms.json`` is written last.
+        Images are PNG with alpha; colours are not multiplied with it. ``transforms.json`` is written last.
 
         Args:
             folder: Folder to write, new or empty.
@@ -306,7 +228,7 @@ class GeneratedCapture:
 
         def draw(index: int) -> dict[str, object]:
             camera = cameras[index]
-            packed = self._pixels(camera)
+            packed = self.render(camera)
             packed[..., :3] = (packed[..., :3] / packed[..., 3:].clamp_min(1e-6)).clamp(0, 1)
             pixels = packed.mul(255).round().to(torch.uint8)
             imwrite(folder / "images" / f"{index:04d}.png", pixels.numpy(), **PNG)
@@ -315,15 +237,13 @@ class GeneratedCapture:
 
         with ThreadPoolExecutor(max(threads, 1)) as pool:
             frames = list(pool.map(draw, range(self.views)))
-        truth = self.surface()
-        arrays = {name: getattr(truth, name).numpy() for name in ("vertices", "faces", "normals")}
-        np.savez_compressed(folder / "truth.npz", area=np.float64(truth.area), **arrays)
-        rows = np.zeros(len(truth.vertices), dtype=[(n, "<f4") for n in "xyz"] + [(n, "u1") for n in _RGB])
-        shades = (truth.colors * 255).round().to(torch.uint8)
+        vertices, colors, faces = self.mesh()
+        rows = np.zeros(len(vertices), dtype=[(n, "<f4") for n in "xyz"] + [(n, "u1") for n in _RGB])
+        shades = (colors * 255).round().to(torch.uint8)
         for column, axis in enumerate("xyz"):
-            rows[axis], rows[_RGB[column]] = truth.vertices[:, column].numpy(), shades[:, column].numpy()
-        triangles = np.zeros(len(truth.faces), dtype=[("vertex_indices", "<i4", (3,))])
-        triangles["vertex_indices"] = truth.faces.numpy()
+            rows[axis], rows[_RGB[column]] = vertices[:, column].numpy(), shades[:, column].numpy()
+        triangles = np.zeros(len(faces), dtype=[("vertex_indices", "<i4", (3,))])
+        triangles["vertex_indices"] = faces.numpy()
         elements = [PlyElement.describe(rows, "vertex"), PlyElement.describe(triangles, "face")]
         PlyData(elements, byte_order="<").write(str(folder / "mesh.ply"))
         focal = float(cameras[0].intrinsics[0, 0])

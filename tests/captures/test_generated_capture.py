@@ -2,7 +2,6 @@
 
 import math
 
-import numpy as np
 import pytest
 import torch
 from torch.testing import assert_close
@@ -26,59 +25,42 @@ def test_slopes_are_the_derivatives_of_the_height(small):
     assert expected[0].abs().max() > 0.3  # a flag worth looking at
 
 
-def test_area_is_that_of_the_mesh(small):
-    truth = small.surface()
-    corners = truth.vertices[truth.faces]
+def test_the_mesh_faces_one_side_and_has_the_area_of_the_sheet(small):
+    vertices, _, faces = small.mesh()
+    corners = vertices[faces]
     cross = torch.linalg.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    assert 0.5 * float(cross.norm(dim=-1).sum()) == pytest.approx(truth.area, rel=1e-4)
-    assert truth.area > 1.01 * 1.2 * 0.8
-    assert GeneratedCapture(ripple=0.0).area() == pytest.approx(0.96)
     facing = torch.nn.functional.normalize(cross, dim=-1)
-    assert (facing * truth.normals[truth.faces[:, 0]]).sum(-1).min() > 0.99
-
-
-def test_the_nearest_point_lies_below_along_the_normal(small):
-    """Points lifted off the sheet along its normal, by less than its radius of curvature (0.2 m), come back."""
-    generator = torch.Generator().manual_seed(1)
-    x, z = torch.rand(2, 200, generator=generator, dtype=torch.float64) * torch.tensor([[1.0], [0.6]]) + 0.1
-    below = torch.stack([x, small.elevation(x, z), z], -1)
-    lift = 0.05 * (2 * torch.rand(200, 1, generator=generator, dtype=torch.float64) - 1)
-    found, normals = small.nearest(below + lift * small.normals(x, z))
-    assert_close(found, below, rtol=0, atol=1e-5)
-    assert_close(normals, small.normals(x, z), rtol=0, atol=1e-4)
-    # beside the sheet its rim is nearest
-    rim, _ = GeneratedCapture(ripple=0.0).nearest(torch.tensor([[1.5, 0.3, 0.4], [-1.0, 0.0, 2.0]]))
-    assert_close(rim, torch.tensor([[1.2, 0.0, 0.4], [0.0, 0.0, 0.8]], dtype=torch.float64))
+    middle = corners.mean(1)
+    assert (facing * small.normals(middle[:, 0], middle[:, 2])).sum(-1).min() > 0.99
+    along, upward = small.slopes(middle[:, 0], middle[:, 2])
+    area = 0.5 * float(cross.norm(dim=-1).sum())
+    assert area == pytest.approx(0.96 * float((1 + along**2 + upward**2).sqrt().mean()), rel=1e-4)
+    assert area > 1.01 * 0.96
 
 
 def test_pictures_show_the_true_surface(small):
-    """Rays end on the sheet, where a march in 1500 small steps first crosses it, and normals look at the camera."""
+    """Colours are those of the place where a march in 1500 small steps first crosses the sheet."""
+    single = GeneratedCapture(views=12, size=64, samples=1)
     missed = several = total = 0
     grazing = look_at_camera((2.4, -0.5, 0.5), (0.6, 0, 0.4), (0, 0, 1), 40.0, 64, 64)
     for camera in [*small.cameras()[::3], grazing]:
-        view = small.render(camera)
+        view = single.render(camera)
         v, u = torch.meshgrid(torch.arange(64) + 0.5, torch.arange(64) + 0.5, indexing="ij")
         intrinsics, pose = camera.intrinsics.double(), torch.linalg.inv(camera.world_to_camera.double())
         rays = torch.stack([(u - intrinsics[0, 2]) / intrinsics[0, 0], (v - intrinsics[1, 2]) / intrinsics[1, 1]], -1)
         rays = torch.nn.functional.pad(rays.double(), (0, 1), value=1.0) @ pose[:3, :3].T
-        hit = torch.isfinite(view.depth)
-        place = (rays * view.depth.double()[..., None])[hit] + pose[:3, 3]
-        off = place[:, 1] - small.elevation(place[:, 0], place[:, 2])
-        assert off.abs().max() < 5e-6
-        assert (view.normals[hit].double() * (place - pose[:3, 3])).sum(-1).max() <= 0
-        normal = small.normals(place[:, 0], place[:, 2])
-        assert_close((normal * view.normals[hit]).sum(-1).abs(), torch.ones(len(place)).double())
-
         t = torch.linspace(1.2, 3.2, 1501, dtype=torch.float64)[:, None, None]
         x, y, z = (pose[axis, 3] + t * rays[..., axis] for axis in range(3))
         above = y > small.elevation(x, z)
         crossed = (above[1:] != above[:-1]) & (x[1:] > 0) & (x[1:] < 1.2) & (z[1:] > 0) & (z[1:] < 0.8)
-        nearest = t[crossed.int().argmax(0)][..., 0, 0]
-        agree = (hit == crossed.any(0)) & (~hit | ((view.depth - nearest).abs() < 0.002))
+        first = crossed.int().argmax(0)[None]
+        expected = small.colors(x.gather(0, first)[0], z.gather(0, first)[0])
+        hit = view[..., 3] == 1
+        agree = (hit == crossed.any(0)) & (~hit | ((view[..., :3] - expected).abs().amax(-1) < 0.05))
         missed, several = missed + int((~agree).sum()), several + int((crossed.sum(0) > 1).sum())
         total += int(hit.sum())
     assert several > 100  # the ripple hides a part of itself in some views
-    assert missed < 0.005 * total  # rays that touch the sheet or its edges within a step
+    assert missed < 0.015 * total  # rays that touch the sheet, its edges or those of its pattern within a step
 
 
 def test_pixels_average_what_is_covered():
@@ -87,31 +69,24 @@ def test_pixels_average_what_is_covered():
     camera = look_at_camera((0.6, -2.2, 0.4), (0.6, 0.0, 0.4), (0.0, 0.0, 1.0), 40.0, 64, 64)
     view = flat.render(camera)
     scale = float(camera.intrinsics[0, 0]) / 2.2
-    assert float(view.alpha.sum()) == pytest.approx(0.96 * scale**2, rel=0.01)
-    covered = view.alpha == 1
-    assert int(covered.sum()) > 500
-    assert view.colors[view.alpha == 0].abs().max() == 0
-    assert_close(view.depth[covered], torch.full((int(covered.sum()),), 2.2))
-    assert_close(view.normals[covered].mean(0), torch.tensor([0.0, -1.0, 0.0]))
-    top, bottom = view.colors[18, 32] / view.alpha[18, 32], view.colors[45, 32] / view.alpha[45, 32]
+    colors, alpha = view[..., :3], view[..., 3]
+    assert float(alpha.sum()) == pytest.approx(0.96 * scale**2, rel=0.01)
+    assert int((alpha == 1).sum()) > 500
+    assert colors[alpha == 0].abs().max() == 0
+    top, bottom = colors[18, 32] / alpha[18, 32], colors[45, 32] / alpha[45, 32]
     assert top[0] > 2 * float(top[2])  # red above
     assert bottom[2] > 2 * float(bottom[0])  # blue below
 
 
-def test_the_folder_is_a_capture_with_its_truth(tmp_path, small):
+def test_the_folder_is_a_capture(tmp_path, small):
     folder = small.write(tmp_path / "flag")
     capture = read_capture(folder)
     assert (len(capture.split("train")), len(capture.split("test"))) == (10, 2)
     for view, camera in zip(capture.views, small.cameras(), strict=True):
         assert_close(view.camera.world_to_camera, camera.world_to_camera.float(), rtol=0, atol=1e-6)
         assert_close(view.camera.intrinsics, camera.intrinsics.float())
-    expected = small.render(small.cameras()[5])
-    packed = torch.cat([expected.colors, expected.alpha[..., None]], -1)
+    packed = small.render(small.cameras()[5])
     assert_close(capture.views[5].load().float() / 255, packed, rtol=0, atol=0.009)
-    with np.load(folder / "truth.npz") as truth:
-        assert truth["area"] == small.area()
-        assert truth["normals"].shape == truth["vertices"].shape
-        assert int(truth["faces"].max()) == len(truth["vertices"]) - 1
     cloud = initial_points(capture, folder / "mesh.ply", count=200)
     on_sheet = small.elevation(cloud.points[:, 0], cloud.points[:, 2])
     assert_close(cloud.points[:, 1], on_sheet, rtol=0, atol=2e-4)
@@ -122,11 +97,9 @@ def test_the_folder_is_a_capture_with_its_truth(tmp_path, small):
 def test_the_seed_decides_everything(tmp_path):
     for name, seed in (("a", 1), ("b", 1), ("c", 2)):
         GeneratedCapture(views=2, size=16, seed=seed).write(tmp_path / name, threads=1 if name == "a" else 2)
-    for file in ("transforms.json", "images/0001.png", "truth.npz", "mesh.ply"):
+    for file in ("transforms.json", "images/0001.png", "mesh.ply"):
         one, two, three = ((tmp_path / name / file).read_bytes() for name in "abc")
-        assert three != one, file
-        if file != "truth.npz":  # an archive holds the time
-            assert one == two, file
+        assert one == two != three, file
 
 
 def test_cameras_are_all_around():

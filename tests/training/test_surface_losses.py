@@ -56,7 +56,7 @@ def _plane(camera, tilt=0.0, shift=0.0):
 
 @cache
 def _photo(x, z):
-    return FLAT.render(_camera(x, z)).colors.double()
+    return FLAT.render(_camera(x, z))[..., :3].double()
 
 
 def _inputs(tilt=0.0, shift=0.0, apart=0.4, **changes):
