@@ -215,9 +215,14 @@ class _Files:
 def _read(root: Path, format: str, images: str) -> _Files:
     models = colmap_models(root) if format != "transforms" and root.is_dir() else []
     if models:
-        folder = root / images
-        if not folder.is_dir():
-            raise ValueError(f"{root} has no folder {images}/ with the images of its COLMAP model: set `images`.")
+        folders = [folder for folder in sorted(root.iterdir()) if folder.is_dir()]
+        alike = (folder for folder in folders if folder.name.casefold() == images.casefold())
+        folder = root / images if (root / images).is_dir() else next(alike, None)
+        if folder is None:
+            raise ValueError(
+                f"{root} has no folder {images}/ with the images of its COLMAP model: set `images` to one of "
+                f"{', '.join(f.name for f in folders)}."
+            )
         model, photos = models[0][0], Photos(folder)
         named = [(photos.find(name), name, lens, pose) for name, lens, pose in read_colmap_views(model)]
         (source, count), *less = ((f"the COLMAP model {os.path.relpath(path, root)}", count) for path, count in models)

@@ -435,7 +435,7 @@ def _mirror(data):
         (_scale, r"frames\[1\].transform_matrix.*transforms\.json.*not rigid.*apply the scale"),
         (_mirror, r"frames\[1\].transform_matrix.*transforms\.json.*reflection"),
         (lambda d: d["frames"][1].update(transform_matrix=[[0.0] * 4] * 4), r"frames\[1\].*singular"),
-        (lambda d: d["frames"][1]["transform_matrix"][0].__setitem__(0, float("nan")), "finite numbers"),
+        (lambda d: d["frames"][1]["transform_matrix"][0].__setitem__(0, float("nan")), "finite numbers, but has NaN"),
         (lambda d: d["frames"][2].pop("transform_matrix"), r"no `frames\[2\].transform_matrix`"),
         (lambda d: d["frames"][0].update(file_path=7), r"`frames\[0\].file_path`.*set it to an image"),
         (lambda d: d.update(k4=0.1), "`k4`.*undistort the images first"),
@@ -507,8 +507,14 @@ def test_bad_colmap_models_are_named(tmp_path, binary):
     (folder / "images").mkdir()
     with pytest.raises(ValueError, match=r"all 3 are missing, the first of them a\.png"):
         read_capture(folder)
-    with pytest.raises(ValueError, match=r"no folder photos/.*`images`"):
+    with pytest.raises(ValueError, match=r"no folder photos/.*`images` to one of images, sparse\."):
         read_capture(write(), images="photos")
+
+
+def test_the_folder_of_photos_may_have_another_case(tmp_path):
+    write_colmap(tmp_path, arc(3), ["a.png", "b.png", "c.png"])
+    (tmp_path / "images").rename(tmp_path / "Images")
+    assert read_capture(tmp_path).views[0].image_path == tmp_path / "Images/a.png"
 
 
 def test_one_photo_with_two_cameras(tmp_path):

@@ -148,10 +148,11 @@ def read_pose(where: str, data: dict[str, Any], frame: int) -> Tensor:
         matrix = torch.tensor(fields["transform_matrix"], dtype=torch.float64)
     except (TypeError, ValueError, RuntimeError) as error:
         raise ValueError(f"The field `{name}` of the camera file {where} must be 4 rows of 4 numbers.") from error
-    if tuple(matrix.shape) != (4, 4) or not bool(torch.isfinite(matrix).all()):
+    shape = tuple(matrix.shape)
+    if shape != (4, 4) or not bool(torch.isfinite(matrix).all()):
+        found = "NaN or infinite ones" if shape == (4, 4) else f"shape {shape}"
         raise ValueError(
-            f"The field `{name}` of the camera file {where} must be 4 rows of 4 finite numbers, "
-            f"but has shape {tuple(matrix.shape)}."
+            f"The field `{name}` of the camera file {where} must be 4 rows of 4 finite numbers, but has {found}."
         )
     if abs(float(torch.linalg.det(matrix))) < 1e-9:
         raise ValueError(f"The field `{name}` of the camera file {where} is singular: export the camera again.")
