@@ -6,7 +6,7 @@
 ``count``          int64, ()                   N, so that the parts of another splat are noticed
 ``labels``         uint8, or uint16, (N,)      the part of each Gaussian, in the order of the splat
 ``names``          text, (P,)                  the names of the parts
-``roles``          text, (P,)                  ``soft``, ``rigid``, ``held`` or ``still``
+``roles``          text, (P,)                  ``soft``, ``rigid``, ``held``, ``still`` or ``hidden``
 ``E``              float64, (P,)               Young's modulus [Pa]; NaN for that of the object, here and below
 ``nu``             float64, (P,)               Poisson's ratio
 ``density``        float64, (P,)               density [kg/m³]
@@ -40,7 +40,7 @@ from gaussian_swaying.geometry.regions import Region
 if TYPE_CHECKING:
     from scipy.spatial import cKDTree
 
-ROLES = ("soft", "rigid", "held", "still")
+ROLES = ("soft", "rigid", "held", "still", "hidden")
 NUMBERS = ("E", "nu", "density", "thickness", "damping_ratio")
 JOINT = ("joint_stiffness", "joint_turning")
 LONGEST_NAME = 100
@@ -55,8 +55,8 @@ class Part:
     Args:
         name: Its name, which no other part has.
         role: ``soft`` (it moves), ``rigid`` (it moves as one body, and what is attached to it bends there), ``held``
-            (it is simulated and drawn, but stays where it is, and what is attached to it bends there) or ``still`` (it
-            is drawn, and the simulation does not know it).
+            (it is simulated and drawn, but stays where it is, and what is attached to it bends there), ``still`` (it is
+            drawn, and the simulation does not know it) or ``hidden`` (it is taken away).
         E: Young's modulus [Pa]; that of the object if None. A rigid part has none.
         nu: Poisson's ratio; that of the object if None. A rigid part has none.
         density: Density [kg/m³]; that of the object if None.
@@ -69,8 +69,8 @@ class Part:
             ``joint_stiffness`` is given.
 
     Raises:
-        ValueError: If a value is out of range, a part that is ``still`` has a material, a ``rigid`` one E or nu, or one
-            with a joint names no other.
+        ValueError: If a value is out of range, a part that is ``still`` or ``hidden`` has a material, a ``rigid`` one E
+            or nu, or one with a joint names no other.
     """
 
     name: str
@@ -90,8 +90,10 @@ class Part:
             words = f"a name of {len(self.name):,} letters" if self.name else "no name"
             raise ValueError(f"A part has {words}: give it one of at most {LONGEST_NAME}.")
         check_choice(f"role of the part {self.name!r}", self.role, ROLES)
-        if self.role == "still" and self.has_material:
-            raise ValueError(f"The part {self.name!r} is still and has no material: remove its numbers, or its role.")
+        if self.role in ("still", "hidden") and self.has_material:
+            raise ValueError(
+                f"The part {self.name!r} is {self.role} and has no material: remove its numbers, or its role."
+            )
         if self.role == "rigid" and (self.E is not None or self.nu is not None):
             raise ValueError(
                 f"The part {self.name!r} is rigid and does not bend: remove its `E` and `nu`, or its role."

@@ -29,6 +29,7 @@ LEVEL = 0.015  # of the height: how far above its plane soil may lie
 NEIGHBOURS = 12  # whose most frequent label a Gaussian near the pot gets
 CELL, NEAR = 0.006, 0.03  # of the height: cells in which shapes are looked at, and how far around
 SEEN = 8  # cells around that show a shape
+HAZE, TOUCHES = 0.1, 2.0  # opacity below which a Gaussian lies on what it touches; standard deviations that it reaches
 THIN, LONG, THREAD = 0.25, 0.5, 0.12  # third over second variance of the places around, and second over first (twice)
 
 POT_LABEL, SOIL, STEM, LEAF, AROUND = range(5)
@@ -306,7 +307,9 @@ def woody(points: Tensor, green: Tensor, size: float) -> Tensor:
 def labelled(
     cloud: GaussianCloud, index: Tensor, label: Tensor, size: float, parts: list[Part], reason: str
 ) -> FoundParts:
-    """The parts of a splat that have Gaussians: faint ones near the object go with their neighbour, others are around.
+    """The parts of a splat that have Gaussians.
+
+    What is near the object, or faint and touches it, goes with it; others are around.
 
     Args:
         cloud: The splat.
@@ -322,7 +325,9 @@ def labelled(
     rest = (labels == around).nonzero()[:, 0]
     if len(rest):
         distance, near = nearest_neighbours(means[index].double(), 1, means[rest].double())
-        close = distance[:, 0] < NEAR * size
+        reach = torch.where(torch.sigmoid(cloud.opacities.detach()[rest]) < HAZE, TOUCHES, 0.0)
+        reach = reach * cloud.scales.detach()[rest].exp().amax(-1)
+        close = distance[:, 0] < NEAR * size + reach
         labels[rest[close]] = label[near[close, 0]]
     used, place = labels.unique(return_inverse=True)
     every = [*parts, Part(NAMES[AROUND], "still")]

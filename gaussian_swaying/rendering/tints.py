@@ -11,7 +11,8 @@ from gaussian_swaying.gaussians.parts import ROLES
 
 HELD = (228, 60, 40)
 RIGID = (30, 110, 220)
-TINTS = {"held": HELD, "rigid": RIGID}  # of 255; what is soft keeps its colours, and what is still becomes grey
+TINTS = {"held": HELD, "rigid": RIGID, "hidden": (20, 20, 20)}
+"""Of 255; what is soft keeps its colours, and what is still becomes grey."""
 
 
 def tinted(colours: Tensor, tint: Sequence[int], share: float = 0.7) -> Tensor:

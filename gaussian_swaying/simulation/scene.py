@@ -172,7 +172,7 @@ class Scene(Fixed):
         return self.generator.generate()
 
     def select(self, cloud: GaussianCloud) -> Tensor:
-        """The Gaussians that are simulated: in the region, opaque enough, and in no part that is still.
+        """The Gaussians that are simulated: in the region, opaque enough, and in no part that is still or hidden.
 
         Args:
             cloud: All Gaussians.
@@ -193,10 +193,10 @@ class Scene(Fixed):
         if self.parts is None:
             return chosen
         self.parts.check_count(len(cloud.means))
-        left = chosen & ~self.parts.mask(role="still")
+        left = chosen & ~self.parts.mask(role="still") & ~self.parts.mask(role="hidden")
         if not bool((left & ~self.parts.mask(role="held")).any()):
             raise ValueError(
-                f"Nothing is left to move: all simulated Gaussians belong to parts of `scene.parts` that are still or "
-                f"held, {self.parts!r}. Make one of them soft, or change `scene.region`."
+                f"Nothing is left to move: all simulated Gaussians belong to parts of `scene.parts` that are still, "
+                f"held or hidden, {self.parts!r}. Make one of them soft, or change `scene.region`."
             )
         return left

@@ -72,7 +72,7 @@ class SimulatedScene(nn.Module):
         further: Number of extra points on large Gaussians.
         tracked: Number of points that :meth:`surface` returns.
         surface_places: Contact samples, which touch obstacles and each other, or None.
-        drawn: Which Gaussians of the source are here: all but those that ``faint: drop`` leaves out, bool.
+        drawn: Which Gaussians of the source are here, bool: all but hidden parts and what ``faint: drop`` leaves out.
         joints: The joints of parts.
         pairs: Simulated Gaussians that are attached, as places in ``simulated``, shape (E, 2), with
             ``scene.connected: surface``; else None.
@@ -106,13 +106,15 @@ class SimulatedScene(nn.Module):
                 "`scene.connected` to grid."
             )
         chosen = scene.select(cloud)
-        still, held = torch.zeros_like(chosen), torch.zeros_like(chosen)
-        if scene.parts is not None:
-            still, held = scene.parts.mask(role="still"), scene.parts.mask(role="held")
-        faint = scene.region.contains(cloud.means) & ~chosen & ~still
-        self.drawn = ~faint if scene.faint == "drop" else torch.ones_like(faint)
-        if scene.faint == "drop" and bool(faint.any()):
-            cloud, chosen, held, faint = cloud.select(~faint), chosen[~faint], held[~faint], faint[~faint]
+        still, held, hidden = (
+            torch.zeros_like(chosen) if scene.parts is None else scene.parts.mask(role=role)
+            for role in ("still", "held", "hidden")
+        )
+        faint = scene.region.contains(cloud.means) & ~chosen & ~still & ~hidden
+        self.drawn = ~(hidden | faint) if scene.faint == "drop" else ~hidden
+        if not bool(self.drawn.all()):
+            cloud = cloud.select(self.drawn)
+            chosen, held, faint = (mask[self.drawn] for mask in (chosen, held, faint))
         self.model = GaussianSurfaceModel.from_cloud(cloud, requires_grad=False, copy=scene.ply is None)
         simulated = chosen.nonzero()[:, 0]
         self.frame = SimFrame.fit(cloud.means[simulated], scene.up, scene.longest_side, scene.metres_per_unit)

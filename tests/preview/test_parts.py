@@ -1,6 +1,8 @@
 """Pot, soil, stems and leaves of a plant, by shape and colour."""
 
 import dataclasses
+import math
+from dataclasses import replace
 
 import pytest
 import torch
@@ -8,6 +10,7 @@ import yaml
 from small_scenes import coloured, started
 
 from gaussian_swaying.cli.preview import main
+from gaussian_swaying.gaussians.cloud import joined
 from gaussian_swaying.gaussians.parts import Parts
 from gaussian_swaying.gaussians.ply import write_ply
 from gaussian_swaying.preview.parts import plant_parts
@@ -55,6 +58,19 @@ def test_the_parts_of_a_plant(alocasia):
     check_alocasia(plant.parts, alocasia.means)
     assert "with soil at 0.2" in plant.reason
     assert "pot still" in plant.words()
+
+
+def test_haze_goes_with_what_it_lies_on(alocasia):
+    """Large and faint above a leaf it moves with it; the same, opaque or out of reach, is something else."""
+    leaf = int(alocasia.means[:, 2].argmax())
+    haze = alocasia.select(torch.full((3,), leaf))
+    means = haze.means + torch.tensor([[0.0, 0.0, 0.1], [0.0, 0.0, 0.1], [0.0, 0.0, 0.4]])
+    haze = replace(haze, means=means, scales=torch.full((3, 3), math.log(0.06)), normals=None)
+    haze = replace(haze, opacities=torch.tensor([0.05, 0.9, 0.05]).logit())
+    cloud = joined(replace(alocasia, normals=None), haze)
+    simulated = torch.arange(len(cloud)) < len(alocasia)
+    parts = plant_parts(cloud, simulated, (0.0, 0.0, 1.0), visible_weight(cloud)).parts
+    assert [parts.parts[k].name for k in parts.labels[-3:]] == ["leaf", "surroundings", "surroundings"]
 
 
 def test_any_axis_may_be_up(alocasia):

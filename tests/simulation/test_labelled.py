@@ -116,6 +116,21 @@ def test_faint_gaussians_of_a_held_part_and_those_that_follow_it_stay():
     assert len(dropped) == len(cloud.means) - int(((cloud.opacities < -5) & (labels() > 0)).sum())
 
 
+def test_hidden_parts_are_taken_away():
+    """The rest moves as that splat alone; nothing of the hidden part is drawn."""
+    hidden = Parts(labels(), [ROLES[0], ROLES[1], Part("cloth"), Part("hem", "hidden")])
+    rest = labels() < 3
+    alone = CLOUD.select(rest)
+    found, expected = (
+        list(flag(parts, cloud=cloud).frames(3))[-1]
+        for parts, cloud in ((hidden, CLOUD), (Parts(labels()[rest], ROLES[:3]), alone))
+    )
+    assert torch.equal(found.gaussians.means, expected.gaussians.means)
+    assert torch.equal(found.render().color, expected.render().color)
+    with pytest.raises(ValueError, match="that are still, held or hidden"):
+        flag(Parts(labels(), [Part("a", "hidden"), Part("b", "still"), Part("c", "held"), Part("d", "hidden")]))
+
+
 def test_parts_of_another_splat_are_refused():
     with pytest.raises(ValueError, match="labels of 3 Gaussians, but the splat has 600"):
         flag(Parts([0, 0, 0], [Part("all")]))

@@ -11,7 +11,10 @@ from gaussian_swaying.viewer.session import Session
 SMALL = [
     "--config=configs/sim/flag.yaml",
     "--solver.dx=0.1",
-    "--scene.generator.init_args.spacing=0.025",
+    "--scene.generator=FlagScene",  # without its pole
+    "--scene.generator.init_args={spacing: 0.025, overlap: 0.6}",
+    "--scene.region=Everything",
+    "--contact=null",
     "--material.E=9e3",  # soft, for few substeps
     "--device=cpu",
 ]
