@@ -30,16 +30,18 @@ def checked(function: F) -> F:
 
 
 def check_arguments(function: Callable[..., Any], given: Mapping[str, Any], where: str) -> None:
-    """Raise TypeError unless arguments have the types of a function's annotations.
+    """Raise TypeError unless arguments have the types of a function's annotations; ValueError for an unknown word.
 
     Args:
         function: The function.
         given: Its arguments by name; others are ignored.
-        where: Its name in the message.
+        where: Its name in the message, or what comes before that of an argument, as in ``material.``.
     """
     for name, kind in _hints(function).items():
         if name in given and not _fits(given[name], kind):
-            raise TypeError(f"Expected `{name}` of {where} to be {_words(kind)}, but got {shown(given[name])}.")
+            error = ValueError if isinstance(given[name], str) and "one of" in _words(kind) else TypeError
+            named = f"`{where}{name}`" if where.endswith(".") else f"`{name}` of {where}"
+            raise error(f"Expected {named} to be {_words(kind)}, but got {shown(given[name])}.")
 
 
 @cache
@@ -51,8 +53,8 @@ def _fits(value: Any, kind: Any) -> bool:
     origin, parts = get_origin(kind), get_args(kind)
     if origin in (Union, UnionType):
         return any(_fits(value, part) for part in parts)
-    if origin is Literal:  # which of them is checked elsewhere
-        return isinstance(value, type(parts[0]))
+    if origin is Literal:
+        return isinstance(value, str | int) and value in parts
     if origin in (list, tuple, collections.abc.Sequence):
         if isinstance(value, Tensor | np.ndarray):
             return value.ndim > 0 and all(_of_numbers(part) for part in parts)

@@ -5,8 +5,8 @@ they run only when the environment variable ``GAUSSIAN_SWAYING_CHECKS`` is 1 (th
 """
 
 import os
-from collections.abc import Callable, Iterable, Mapping, Sequence
-from typing import TYPE_CHECKING, Any, Literal, get_args, get_origin, get_type_hints
+from collections.abc import Iterable, Sequence
+from typing import TYPE_CHECKING, Any
 
 import torch
 from torch import Tensor
@@ -100,24 +100,6 @@ def check_choice(name: str, value: str, choices: tuple[str, ...]) -> None:
     """Raise ValueError unless ``value`` is one of ``choices``."""
     if not isinstance(value, str) or value not in choices:
         raise ValueError(f"Expected `{name}` to be one of {', '.join(choices)}, but got {shown(value)}.")
-
-
-def check_literals(function: Callable[..., Any], values: Mapping[str, Any], where: str = "") -> None:
-    """Raise ValueError if an argument is none of the choices that its type, a ``Literal``, lists.
-
-    Numbers may be others where the type is also that of a number.
-
-    Args:
-        function: The function, or the ``__init__`` of a class.
-        values: Its arguments by name; others are ignored.
-        where: Begins the names in the message, for example ``scene.``.
-    """
-    for name, kind in get_type_hints(function).items():
-        value, kinds = values.get(name), get_args(kind)
-        other = (value is None and type(None) in kinds) or (not isinstance(value, str) and float in kinds)
-        for part in (kind, *kinds):
-            if get_origin(part) is Literal and not other:
-                check_choice(f"{where}{name}", values[name], get_args(part))
 
 
 def check_positive(name: str, value: float, *, allow_zero: bool = False) -> None:

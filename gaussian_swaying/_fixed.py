@@ -82,14 +82,19 @@ def _closing(name: str, method: Callable[..., None]) -> Callable[..., None]:
     @wraps(method)
     def whole(self: Any, *args: Any, **given: Any) -> None:
         if ours and name == "__init__" and not getattr(type(self), "of_a_file", False):
-            check_arguments(method, parameters.bind(self, *args, **given).arguments, type(self).__name__)
+            check_arguments(method, parameters.bind(self, *args, **given).arguments, _prefix(self))
         elif ours:
-            check_arguments(type(self).__init__, vars(self), type(self).__name__)
+            check_arguments(type(self).__init__, vars(self), _prefix(self))
         method(self, *args, **given)
         if not _frozen(type(self)):
             _close(self, name, whole)
 
     return whole
+
+
+def _prefix(thing: Any) -> str:
+    place = getattr(thing, "live_as", "*")
+    return type(thing).__name__ if "*" in place or not place else f"{place}."
 
 
 def _close(thing: Any, name: str, method: Callable[..., None]) -> None:

@@ -11,7 +11,7 @@ from typing import Any, Literal
 import torch
 from torch import Tensor, nn
 
-from gaussian_swaying._checks import check_choice, check_positive, check_vector, check_whole
+from gaussian_swaying._checks import check_positive, check_vector, check_whole
 from gaussian_swaying._fixed import Fixed
 from gaussian_swaying.aero.obstacles import Obstacle
 from gaussian_swaying.aero.shelter import Shelter
@@ -85,7 +85,6 @@ class ComputedAir(Fixed, nn.Module):
         if not all(a < b for a, b in zip(self.low, self.high, strict=True)):
             raise ValueError(f"Expected `low` of the air below `high` along each axis, but got {low} and {high}.")
         check_whole("air.cells", cells, LEAST_CELLS)
-        check_choice("force", force, ("surface", "law"))
         check_positive("air.viscosity", viscosity)
         check_positive("air.smagorinsky", smagorinsky, allow_zero=True)
         check_positive("air.lattice_speed", lattice_speed)

@@ -320,8 +320,6 @@ class AeroForce(Fixed, nn.Module):
         added_mass: float = 0.0,
     ) -> None:
         super().__init__()
-        check_choice("law", law, LAWS)
-        check_choice("drag_step", drag_step, ("explicit", "semi_implicit"))
         numbers = {"C_D": number_of(C_D), "C_F": number_of(C_F), "air_density": air_density, "added_mass": added_mass}
         for name, value in numbers.items():
             check_positive(name, value, allow_zero=True)

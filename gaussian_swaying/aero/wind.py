@@ -18,7 +18,6 @@ from torch import Tensor, nn
 
 from gaussian_swaying._checks import (
     VectorLike,
-    check_choice,
     check_positive,
     check_shape,
     check_vector,
@@ -266,7 +265,6 @@ class WindField(Fixed, nn.Module):
         effects: Sequence[WindEffect] = (),
     ) -> None:
         super().__init__()
-        check_choice("interpolation", interpolation, ("step", "linear"))
         if isinstance(schedule, str):
             schedule, interpolation = list(map(FlowKey, *read_anemometer(schedule))), "linear"
         keys = schedule or [FlowKey(0.0, flow)]  # type: ignore[arg-type]

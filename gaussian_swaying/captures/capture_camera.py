@@ -10,7 +10,7 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from gaussian_swaying._checks import check_literals, check_positive
+from gaussian_swaying._checks import check_positive
 from gaussian_swaying.captures.colmap import colmap_models, read_colmap_views
 from gaussian_swaying.captures.photos import clean_name
 from gaussian_swaying.captures.transforms import transforms_files
@@ -101,7 +101,6 @@ class CaptureCamera(CameraPath):
 
     def __post_init__(self) -> None:
         check_positive("seconds_per_view", self.seconds_per_view)
-        check_literals(type(self).__init__, vars(self))
         check_picture(self)
         self._cameras: list[Camera] = []
         self._rows: list[list[float]] = []

@@ -11,7 +11,7 @@ from typing import Any, Literal
 import torch
 from torch import Tensor
 
-from gaussian_swaying._checks import check_choice, check_positive, check_vector
+from gaussian_swaying._checks import check_positive, check_vector
 from gaussian_swaying._fixed import Fixed, FixedList, assign
 from gaussian_swaying.geometry.frame import SimFrame
 from gaussian_swaying.mpm.body import Body
@@ -33,8 +33,6 @@ from gaussian_swaying.mpm.timestep import check_pace, fixed_substeps, look_marks
 
 Fused = Any
 """A ``mpm.triton.fused.Fused``; not imported even for its type, as the parser resolves types and Triton takes 0.1 s."""
-
-TRANSFERS = ("auto", "torch", "kernels")
 
 
 class MPMSolver(Fixed, Solver):
@@ -101,8 +99,6 @@ class MPMSolver(Fixed, Solver):
         transfer: Literal["auto", "torch", "kernels"] = "auto",
     ) -> None:
         super().__init__()
-        check_choice("transfer", transfer, TRANSFERS)
-        check_choice("formulation", formulation, (*FORMULATIONS, "auto"))
         check_positive("cfl", cfl)
         if substep is not None:
             check_positive("substep", substep)

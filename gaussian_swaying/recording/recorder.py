@@ -18,7 +18,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from gaussian_swaying._checks import check_choice, check_literals, check_positive
+from gaussian_swaying._checks import check_choice, check_positive
 from gaussian_swaying._files import atomic, is_blank, remove_temporaries, save_png, write_json, write_table, write_text
 from gaussian_swaying._fixed import fixed
 from gaussian_swaying.recording.checkpoint import read_checkpoint
@@ -93,6 +93,8 @@ class Recorder:
             nothing to write.
     """
 
+    live_as = "recorder"
+
     images: bool = True
     video: bool = True
     _: KW_ONLY
@@ -104,12 +106,11 @@ class Recorder:
     nodes: bool = True
 
     def __post_init__(self) -> None:
-        check_literals(type(self).__init__, vars(self), "recorder.")
         for name in ("checkpoint_every", "fps", "loop"):
             if (value := getattr(self, name)) is not None:
                 check_positive(f"recorder.{name}", value, allow_zero=name != "fps")
         renders = self.renders
-        if isinstance(renders, str) or not renders or len(set(renders)) < len(renders):
+        if not renders or len(set(renders)) < len(renders):
             raise ValueError(
                 f"Expected `recorder.renders` to be a list of different ones of {', '.join(PASSES)}, but got "
                 f"{renders!r}."

@@ -10,7 +10,7 @@ from typing import Literal
 import torch
 from torch import Tensor
 
-from gaussian_swaying._checks import check_literals, check_positive
+from gaussian_swaying._checks import check_positive
 from gaussian_swaying._fixed import Fixed
 from gaussian_swaying.gaussians.cloud import GaussianCloud, joined
 from gaussian_swaying.gaussians.harmonics import SH_DC
@@ -23,19 +23,20 @@ _MOST = 50_000_000  # Gaussians, about 100 GB
 class ProceduralScene(Fixed, ABC):
     """Base of all generated scenes."""
 
+    live_as = "generator"
+
     @abstractmethod
     def generate(self) -> GaussianCloud:
         """Make the splat; the same arguments give the same splat."""
 
     def check(self, *positive: str, coarsest: float = math.inf) -> None:
-        """Raise ValueError unless choices are those of their types, and ``spacing`` and the named numbers positive.
+        """Raise ValueError unless ``spacing`` and the named numbers are positive.
 
         Args:
             positive: Names of the numbers.
             coarsest: Largest spacing that resolves the scene [m].
         """
         given = vars(self)
-        check_literals(type(self).__init__, given, "generator.")
         for name in ("spacing", *positive):
             check_positive(f"generator.{name}", given[name])
         if given["spacing"] > coarsest:

@@ -9,7 +9,6 @@ from torch import Tensor
 
 from gaussian_swaying._checks import (
     Number,
-    check_literals,
     check_plain,
     check_poisson_ratio,
     check_positive,
@@ -90,7 +89,6 @@ class Material:
     regions: list[MaterialRegion] = field(default_factory=list)
 
     def __post_init__(self) -> None:
-        check_literals(type(self).__init__, vars(self), "material.")
         for name in DIFFERENTIABLE:
             value = getattr(self, name)
             if requires_grad(value) and any(getattr(entry, name) is not None for entry in self.regions):

@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, Any, Literal, TypeVar
 import torch
 from torch import Tensor, nn
 
-from gaussian_swaying._checks import check_literals, check_vector, number_of, requires_grad
+from gaussian_swaying._checks import check_vector, number_of, requires_grad
 from gaussian_swaying._devices import in_double
 from gaussian_swaying._fixed import LIVE, FixedList, changed, fixed
 from gaussian_swaying._numbers import sense_of
@@ -102,9 +102,6 @@ class Parameter:
     batched: bool = False
     same_points: bool = True
     differentiable: bool = False
-
-    def __post_init__(self) -> None:
-        check_literals(type(self).__init__, vars(self))
 
     def check(self, value: Any, name: str | None = None) -> Any:
         """A value as plain numbers, or as the tensor that it is if a gradient is required.

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from gaussian_swaying._arguments import shown
-from gaussian_swaying._checks import check_literals, check_positive, check_vector
+from gaussian_swaying._checks import check_positive, check_vector
 from gaussian_swaying._fixed import Fixed
 from gaussian_swaying.gaussians.cloud import GaussianCloud
 from gaussian_swaying.gaussians.filling import InteriorFilling
@@ -86,6 +86,8 @@ class Scene(Fixed):
             surfaces whose Gaussians have good positions but bad orientations.
     """
 
+    live_as = "scene"
+
     def __init__(
         self,
         ply: str | os.PathLike[str] | None = None,
@@ -110,7 +112,6 @@ class Scene(Fixed):
         connected: Literal["grid", "surface"] = "grid",
         normals: Literal["smallest_axis", "neighbours"] = "smallest_axis",
     ) -> None:
-        check_literals(Scene.__init__, locals(), "scene.")
         if points_per_cell not in range(1, 9):
             raise ValueError(
                 f"Expected `scene.points_per_cell` to be a whole number from 1 to 8, but got {points_per_cell}."

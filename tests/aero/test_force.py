@@ -164,7 +164,7 @@ def test_bad_settings_are_refused():
         "drag_step": ["implicit"],
     }.items():
         for value in values:
-            with pytest.raises(ValueError, match=f"`{name}`"):
+            with pytest.raises(ValueError, match=f"{name}`"):
                 AeroForce(**{name: value})
 
 

@@ -146,5 +146,5 @@ def test_bad_settings_are_refused():
         (UniformGust, {"delta": -0.1}, "delta"),
         (SineSway, {"period": 0}, "period"),
     ):
-        with pytest.raises(ValueError, match=f"`{field}`"):
+        with pytest.raises(ValueError, match=f"{field}`"):
             kind(**given)

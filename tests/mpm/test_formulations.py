@@ -10,6 +10,7 @@ from shared import solid
 from torch.testing import assert_close
 
 from gaussian_swaying import Box, MaterialPoints, MPMSolver, PinnedRegion
+from gaussian_swaying._fixed import changed
 from gaussian_swaying.geometry import linalg
 from gaussian_swaying.mpm import dispatch, laws
 from gaussian_swaying.mpm import formulations as known
@@ -192,11 +193,11 @@ class Loose(Formulation):
 
 def test_a_third_formulation_is_one_class(monkeypatch):
     """The solver runs it like its own formulations: forces and their work, energies, substeps and grid."""
-    with pytest.raises(ValueError, match=r"`formulation` to be one of .*, but got 'loose'"):
+    with pytest.raises(ValueError, match=r"`solver.formulation` to be one of .*, but got 'loose'"):
         MPMSolver(formulation="loose")
     monkeypatch.setitem(known.FORMULATIONS, "loose", Loose)
     points = _points((0.2, 0.2, 0.2), 0.05)
-    solver = MPMSolver(0.1, "loose")
+    solver = changed(MPMSolver(0.1), formulation="loose")
     assert not solver.neighbours_fixed
     state = solver.init_state(points)
     dt, mass = 0.01 / solver.substeps(state, 0.01), points.mass[:, None]
@@ -219,7 +220,7 @@ def test_a_formulation_without_kernels_says_so(monkeypatch):
     monkeypatch.setitem(known.FORMULATIONS, "loose", Loose)
     points = _points((0.2, 0.2, 0.2), 0.05)
     with pytest.raises(ValueError, match="because the loose formulation has no kernels: set it to auto or torch"):
-        MPMSolver(0.1, "loose", transfer="kernels").init_state(points)
+        changed(MPMSolver(0.1, transfer="kernels"), formulation="loose").init_state(points)
 
 
 @pytest.mark.parametrize("formulation", FORMULATIONS)

@@ -214,7 +214,7 @@ def test_bad_settings_are_refused():
         {"transfer": "tritn"},
     ):
         (name,) = arguments
-        with pytest.raises(ValueError, match=f"`{name}` to "):
+        with pytest.raises(ValueError, match=f"{name}` to "):
             MPMSolver(**arguments)
 
 

@@ -128,8 +128,8 @@ def test_bad_names_and_renders(make_cloud, make_simulation):
     )
     with pytest.raises(ValueError, match=r"lies inside the object.*`cameras\.near\.init_args\.radius`"):
         inside.painter.check_camera(0)
-    for renders, word in ((["colour"], "recorder.renders"), ([], "list of different ones"), ("color", "list")):
-        with pytest.raises(ValueError, match=word):
+    for renders, word in ((["colour"], "recorder.renders"), ([], "list of different ones"), ("color", "list of texts")):
+        with pytest.raises((TypeError, ValueError), match=word):
             Recorder(renders=renders)
 
 

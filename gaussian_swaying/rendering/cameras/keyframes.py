@@ -10,7 +10,7 @@ from typing import Any, Literal
 
 from torch import Tensor
 
-from gaussian_swaying._checks import check_literals, check_positive, check_vector
+from gaussian_swaying._checks import check_positive, check_vector
 from gaussian_swaying._fixed import fixed
 from gaussian_swaying.rendering.cameras.camera import Camera, check_elevation, check_fov, look_at_camera, orbit_camera
 from gaussian_swaying.rendering.cameras.camera_path import PinholePath
@@ -128,7 +128,6 @@ class KeyframedCamera(PinholePath):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        check_literals(type(self).__init__, vars(self))
         keys = self.keys
         if not keys:
             raise ValueError("Expected `keys` to hold at least one key with a time and a position.")
