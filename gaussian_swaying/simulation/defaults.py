@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import warnings
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -20,10 +19,8 @@ from gaussian_swaying.gaussians.cloud import GaussianCloud
 from gaussian_swaying.geometry.frame import SimFrame
 from gaussian_swaying.geometry.neighbours import particle_spacing
 from gaussian_swaying.geometry.regions import Region
-from gaussian_swaying.mpm.boundaries.impulse import Impulse
 from gaussian_swaying.mpm.boundaries.pinned_points import PinnedPoints
 from gaussian_swaying.mpm.boundaries.pinned_region import PinnedRegion
-from gaussian_swaying.mpm.boundaries.rigid_region import RigidRegion
 from gaussian_swaying.mpm.contact.surface import Contact
 from gaussian_swaying.mpm.forces import Force
 from gaussian_swaying.mpm.protocol import Solver
@@ -119,18 +116,6 @@ def as_solver(
             "`hold` only works without a solver: add the pin to the `boundaries` of the solver, and leave out `hold`."
         )
     return changed(solver, boundaries=FixedList(map(changed, solver.boundaries)))
-
-
-def warn_falling(solver: Solver) -> None:
-    """Warn if gravity acts on an object that nothing holds or stops."""
-    falls = isinstance(solver, MPMSolver) and any(solver.gravity)
-    if falls and all(isinstance(part, Impulse | RigidRegion) for part in solver.boundaries):
-        warnings.warn(
-            "Nothing holds the object and nothing lies below it, so it falls: add a pin to `solver.boundaries` (in "
-            "Python `hold`), or a HalfSpaceObstacle as the ground, or set `solver.gravity` to [0, 0, 0].",
-            UserWarning,
-            stacklevel=3,
-        )
 
 
 def as_wind(wind: WindLike | None, frame: SimFrame) -> WindField | SpatialWind:

@@ -59,7 +59,6 @@ from gaussian_swaying.simulation.defaults import (
     as_wind,
     check_types,
     resolve_device,
-    warn_falling,
 )
 from gaussian_swaying.simulation.diagnostics import FrameDiagnostics
 from gaussian_swaying.simulation.edits import Edit, SceneEditor
@@ -182,7 +181,6 @@ class Simulation(Fixed):
             parts = settings, material, solver, camera, cameras, edits
             settings, material, solver, camera, cameras, edits = normalisation.place(*parts, cloud)
         material, solver = with_parts(settings, cloud, material, solver)
-        warn_falling(solver)
         apart = [
             part.region for part in (*solver.boundaries, *edits) if isinstance(getattr(part, "region", None), Region)
         ]

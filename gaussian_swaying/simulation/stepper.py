@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import operator
+import warnings
 import weakref
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
@@ -24,6 +25,8 @@ from gaussian_swaying.aero.wind_batch import WindBatch, why_apart
 from gaussian_swaying.aero.wind_force import WindForce
 from gaussian_swaying.geometry.patches import deform_patch
 from gaussian_swaying.kernels.graphs import fingerprint, tensors_in
+from gaussian_swaying.mpm.boundaries.impulse import Impulse
+from gaussian_swaying.mpm.boundaries.rigid_region import RigidRegion
 from gaussian_swaying.mpm.forces import Force
 from gaussian_swaying.mpm.formulations.modes import MOST_LEAN, Modes
 from gaussian_swaying.mpm.joints import Joints
@@ -268,7 +271,9 @@ class Stepper:
         self._check_rounding(state, self.frame_dt / at_rest)
         self.most_substeps = min(MAX_GROWTH * at_rest, MAX_SUBSTEPS)
         self._tearing = None if self.solver.neighbours_fixed else TearingGauge(self.solver)
-        return self._with_air(state)
+        state = self._with_air(state)
+        _warn_falling(self.solver)
+        return state
 
     def _with_air(self, state: State) -> State:
         setup = self.setup
@@ -684,3 +689,15 @@ def _raised_here(error: BaseException) -> bool:
     while place is not None and place.tb_next is not None:
         place = place.tb_next
     return place is not None and str(place.tb_frame.f_globals.get("__name__")).startswith("gaussian_swaying.")
+
+
+def _warn_falling(solver: Solver) -> None:
+    """Warn if gravity acts on an object that nothing holds or stops."""
+    falls = isinstance(solver, MPMSolver) and any(solver.gravity)
+    if falls and all(isinstance(part, Impulse | RigidRegion) for part in solver.boundaries):
+        warnings.warn(
+            "Nothing holds the object and nothing lies below it, so it falls: add a pin to `solver.boundaries` (in "
+            "Python `hold`), or a HalfSpaceObstacle as the ground, or set `solver.gravity` to [0, 0, 0].",
+            UserWarning,
+            stacklevel=3,
+        )

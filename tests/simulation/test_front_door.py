@@ -304,6 +304,7 @@ def test_gravity_of_what_is_held_and_of_what_falls(given, down, told):
     with warnings.catch_warnings(record=True) as found:
         warnings.simplefilter("always")
         simulation = Simulation(Scene(generator=flag, parts=parts), device="cpu", **given)
+        simulation.start()
     assert tuple(simulation.solver.gravity) == (0.0, 0.0, down)
     assert sum(FALLS in str(one.message) for one in found) == told
 

@@ -107,9 +107,6 @@ def test_watching_changes_no_bit(formulation, looks):
     [
         (["--solver.substep", "1e-9"], ["40,000,000 substeps", "raise `solver.substep`"]),
         (["--material.E", "1e16"], ["substeps", "`material.E`", "`frame_dt`"]),
-        (["--material.E", "1e30"], ["substeps", "`material.E`"]),
-        (["--frame_dt", "1e9"], ["substeps", "`frame_dt`"]),
-        (["--material.density", "1e-30"], ["substeps"]),
         (
             ["--camera.init_args.width", "60000", "--camera.init_args.height", "60000"],
             ["60,000 x 60,000 pixels is too"],
