@@ -236,7 +236,8 @@ class WindField(Fixed, nn.Module):
     """Air velocity over time; the same everywhere in the scene, unless it has effects.
 
     Args:
-        flow: Steady air velocity [m/s], z up. In Python also a tensor of shape (3,), which keeps its gradient.
+        flow: Steady air velocity [m/s], z up; null with a ``schedule``. In Python also a tensor of shape (3,), which
+            keeps its gradient.
         schedule: Flow that changes over time, used instead of ``flow``; the first entry also applies before its time.
             Or the CSV of an anemometer (:func:`~gaussian_swaying.aero.wind_files.read_anemometer`), with linear
             interpolation.
@@ -256,7 +257,7 @@ class WindField(Fixed, nn.Module):
 
     def __init__(
         self,
-        flow: VectorLike = (0.0, 0.0, 0.0),
+        flow: VectorLike | None = (0.0, 0.0, 0.0),
         schedule: list[FlowKey] | str | None = None,
         *,
         interpolation: Literal["step", "linear"] = "step",
