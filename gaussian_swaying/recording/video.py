@@ -80,7 +80,7 @@ class VideoEncoder:
 
         command = [imageio_ffmpeg.get_ffmpeg_exe(), "-y", "-loglevel", "error", "-f", "rawvideo", "-pix_fmt", "rgb24"]
         command += ["-s", f"{width}x{height}", "-r", str(self.fps), "-i", "-", "-an", "-vcodec", "libx264"]
-        command += ["-vf", "pad=ceil(iw/2)*2:ceil(ih/2)*2", "-pix_fmt", "yuv420p", "-crf", "18"]
+        command += ["-vf", "pad=ceil(iw/2)*2:ceil(ih/2)*2", "-pix_fmt", "yuv420p", "-preset", "veryfast", "-crf", "18"]
         command += ["-movflags", "+faststart", str(self._temporary.resolve())]
         self._size = (height, width)
         self._messages = tempfile.TemporaryFile()  # noqa: SIM115 - unlike a pipe, never full
