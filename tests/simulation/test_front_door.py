@@ -237,8 +237,14 @@ def test_four_threads_that_step_a_new_simulation_take_turns():
 
 def test_of_four_threads_that_loop_over_frames_one_goes_on():
     """The others are told so: a loop that was started later ended theirs."""
-    simulation = _flag()
-    found = _in_four_threads(lambda _: [frame.render().color for frame in simulation.frames(3)][-1])
+    simulation, started = _flag(), threading.Barrier(4)
+
+    def last_picture(_):
+        frames = simulation.frames(3)
+        started.wait(60)
+        return [frame.render().color for frame in frames][-1]
+
+    found = _in_four_threads(last_picture)
     refused = [error for error in found if isinstance(error, RuntimeError)]
     assert len(refused) == 3
     assert all("was started again" in str(error) for error in refused)
