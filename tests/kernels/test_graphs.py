@@ -65,7 +65,9 @@ def test_fingerprint_sees_what_was_replaced():
 
 
 def test_tensors_of_modules():
-    wind = WindField(modulations=[UniformGust(), nn.Linear(2, 3)])
+    gust = UniformGust()
+    gust.add_module("learned", nn.Linear(2, 3))
+    wind = WindField(modulations=[gust])
     expected = [*wind.parameters(), *wind.buffers()]
     assert {id(tensor) for tensor in tensors_in([wind])} == {id(tensor) for tensor in expected}
     assert len(tensors_in([wind, WindField()])) == len(expected) + 2
