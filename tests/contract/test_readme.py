@@ -8,6 +8,8 @@ import pytest
 import torch
 
 from gaussian_swaying.cli.simulate import main
+from gaussian_swaying.rendering.cameras.camera import project
+from gaussian_swaying.simulation.simulation import Simulation
 
 ROOT = Path(__file__).resolve().parents[2]
 README = (ROOT / "README.md").read_text()
@@ -66,6 +68,19 @@ def test_the_faster_flag_holds_to_its_pole_and_ends_without_warnings(tmp_path, c
     assert summary["particles"] == 24 * 16 + 4  # more where Gaussians are large for the grid
     stretched = summary["extremes"]["stretched"]
     assert stretched["value"] < 1.25
+
+
+def test_the_first_flag_has_a_pole_contact_and_fills_its_picture():
+    simulation = Simulation.from_yaml(ROOT / "configs/sim/flag.yaml", device="cpu")
+    scene, camera = simulation.scene, simulation.painter.camera_at(0)
+    assert (camera.width, camera.height) == (960, 540)
+    assert scene.surface_places.contact is not None
+    pixel, _ = project(scene.model.means.detach(), camera)
+    flag = torch.zeros(len(pixel), dtype=torch.bool).index_fill(0, scene.simulated, True)
+    share = (pixel[flag].amax(0) - pixel[flag].amin(0)) / torch.tensor([camera.width, camera.height])
+    assert float(share.amax()) > 0.6
+    assert float(pixel[~flag, 1].min()) > 0 > float(pixel[flag, 1].max()) - 0.85 * camera.height  # room to droop
+    assert float(pixel[~flag, 0].max()) < float(pixel[flag, 0].median())  # the pole is on the left
 
 
 @pytest.mark.slow

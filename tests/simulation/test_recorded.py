@@ -16,6 +16,8 @@ from gaussian_swaying.gaussians.cloud import joined
 from gaussian_swaying.gaussians.export import SUFFIXES, export_cloud
 from gaussian_swaying.gaussians.formats import read_gaussians
 from gaussian_swaying.gaussians.ply import read_ply, write_ply
+from gaussian_swaying.geometry.regions import Box
+from gaussian_swaying.rendering.cameras.camera_path import LookAtCamera
 from gaussian_swaying.scenes.procedural import FlagScene
 from gaussian_swaying.simulation.recorded import RecordedRun
 from gaussian_swaying.simulation.simulation import Simulation
@@ -168,6 +170,12 @@ def test_a_frame_saves_its_gaussians(recorded, tmp_path):
     frame.save(tmp_path / "a.png")
     shown = (frame.render().color.clamp(0, 1) * 255).round().numpy()
     assert np.abs(iio.imread(tmp_path / "a.png") - shown).max() <= 1
+    away = LookAtCamera((0.0, -9.0, 0.0), (0.0, -99.0, 0.0), width=32, height=18)
+    (unseen,) = Simulation(
+        FlagScene(spacing=0.1), camera=away, hold=Box([None] * 3, [0.2, None, None]), device="cpu"
+    ).frames(1)
+    with pytest.warns(UserWarning, match="shows nothing: check the place of the camera and its `near`"):
+        unseen.save(tmp_path / "a.png")
     up = read_gaussians(tmp_path / "a.glb").means - 2 * frame.gaussians.means  # in metres, y up as in the scene
     torch.testing.assert_close(up, torch.zeros_like(up), rtol=0, atol=1e-5)
     before = sorted(tmp_path.iterdir())
