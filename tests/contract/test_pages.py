@@ -1,13 +1,12 @@
 """Pages that a user can put on any website, in a browser: the film of a run, and a simulation."""
 
-import io
 import json
 
-import imageio.v3 as iio
 import numpy as np
 import pytest
 
 from gaussian_swaying.cli.main import main
+from tests.browsers import picture_of, until
 
 POLE = {"class_path": "Box", "init_args": {"min": [None] * 3, "max": [0.11, None, None]}}
 PIN = {"class_path": "PinnedRegion", "init_args": {"region": POLE}}
@@ -40,12 +39,18 @@ def show(chromium):
 def picture(page):
     """The canvas without the controls, shape (H, W, 3)."""
     page.add_style_tag(content="header, footer { display: none !important; }")
-    return iio.imread(io.BytesIO(page.screenshot()))[..., :3].astype(float)
+    return picture_of(page)
+
+
+def drawn(page):
+    """The picture as soon as it shows more than the sky."""
+    until(lambda: np.abs(picture(page) - picture(page)[0, 0]).max() > 20)
+    return picture(page)
 
 
 def check_motion(page, before):
-    """The picture has changed, nothing went wrong, and nothing was asked of a network."""
-    assert np.abs(picture(page) - before).max() > 20
+    """The picture changes, nothing went wrong, and nothing was asked of a network."""
+    until(lambda: np.abs(picture(page) - before).max() > 20)
     assert page.told == []
     assert [url for url in page.asked if not url.startswith(("file:", "data:", "blob:"))] == []
 
@@ -58,7 +63,7 @@ def test_a_film(show, tmp_path, monkeypatch):
     page = show(tmp_path / "run/film.html", "!!window.film")
     page.evaluate("film.seek(0)")
     assert page.evaluate("film.frame()") == 0
-    before = picture(page)
+    before = drawn(page)
     page.evaluate("film.seek(5)")
     check_motion(page, before)
 
@@ -69,6 +74,6 @@ def test_a_simulation(show, tmp_path, monkeypatch):
     assert main(["export", "--live-web", "flag", *SMALL, "--material.E=9e3"]) == 0
     page = show(tmp_path / "flag.html", "!!window.windPage")
     page.evaluate("windPage.complete.then(() => { windPage.pause(); windPage.reset(); })")
-    before = picture(page)
+    before = drawn(page)
     assert page.evaluate("windPage.advance(25)")["simulated"] == pytest.approx(1.0)
     check_motion(page, before)
