@@ -27,7 +27,6 @@ os.environ.setdefault("GOMP_SPINCOUNT", "3000")  # as in tools/sim.py; must be s
 import torch
 from torch import Tensor
 
-from gaussian_swaying.aero.force import AeroForce
 from gaussian_swaying.gaussians.model import GaussianSurfaceModel
 from gaussian_swaying.geometry.patches import deform_patch
 from gaussian_swaying.geometry.regions import Box
@@ -35,6 +34,7 @@ from gaussian_swaying.mpm.boundaries.pinned_region import PinnedRegion
 from gaussian_swaying.mpm.solver import MPMSolver
 from gaussian_swaying.mpm.state import MaterialPoints, MPMState
 from gaussian_swaying.scenes.procedural import FlagScene
+from gaussian_swaying.wind.force import AeroForce
 
 NAMES = ("wind speed", "Young's modulus")
 TRUTH = (6.0, 4.0e3)  # m/s, Pa

@@ -1,13 +1,5 @@
 """The public names of the package; everything else is imported from its room."""
 
-from .aero.force import AeroForce as AeroForce
-from .aero.force import aero_force as aero_force
-from .aero.wind import GaussianGust as GaussianGust
-from .aero.wind import SineSway as SineSway
-from .aero.wind import SpatialWind as SpatialWind
-from .aero.wind import UniformGust as UniformGust
-from .aero.wind import WindField as WindField
-from .aero.wind_force import WindForce as WindForce
 from .captures.capture import read_capture as read_capture
 from .evaluation.compare import compare_run as compare_run
 from .fitting.fit import fit as fit
@@ -48,5 +40,13 @@ from .simulation.scene import Scene as Scene
 from .simulation.simulation import Simulation as Simulation
 from .training.data.datamodule import CaptureDataModule as CaptureDataModule
 from .training.module import SplatTrainer as SplatTrainer
+from .wind.field import GaussianGust as GaussianGust
+from .wind.field import SineSway as SineSway
+from .wind.field import SpatialWind as SpatialWind
+from .wind.field import UniformGust as UniformGust
+from .wind.field import WindField as WindField
+from .wind.force import AeroForce as AeroForce
+from .wind.force import aero_force as aero_force
+from .wind.wind_force import WindForce as WindForce
 
 __version__: str

@@ -7,7 +7,6 @@ import pytest
 import torch
 from shared import unit
 
-from gaussian_swaying.aero.wind import WindField
 from gaussian_swaying.cli.preview import build_options, preview_scene
 from gaussian_swaying.gaussians.cloud import GaussianCloud
 from gaussian_swaying.gaussians.harmonics import SH_DC
@@ -25,6 +24,7 @@ from gaussian_swaying.simulation.material import Material
 from gaussian_swaying.simulation.scene import Scene
 from gaussian_swaying.simulation.simulated_scene import SimulatedScene
 from gaussian_swaying.simulation.simulation import Simulation
+from gaussian_swaying.wind.field import WindField
 
 
 def _make_cloud(count=40, degree=1, opacity=0.9, seed=0, offset=0.0):

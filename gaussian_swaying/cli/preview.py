@@ -14,7 +14,6 @@ from typing import Any
 
 from gaussian_swaying import _program as program
 from gaussian_swaying._checks import check_positive
-from gaussian_swaying.aero.looks import LOOKS
 from gaussian_swaying.cli.errors import guessing, parser_sentence, run_command
 from gaussian_swaying.cli.shipped import with_shipped
 from gaussian_swaying.config.material_names import NAMES
@@ -65,6 +64,7 @@ from gaussian_swaying.preview.suggest import (
 from gaussian_swaying.simulation.progress import duration
 from gaussian_swaying.simulation.roles import classify
 from gaussian_swaying.simulation.simulation import Simulation
+from gaussian_swaying.wind.looks import LOOKS
 
 LARGE = 256_000_000  # bytes of a file of which only the constant colours are read
 LOADED = time.process_time()  # s; for the interpreter and the imports so far, which a run needs too

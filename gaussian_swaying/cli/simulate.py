@@ -7,14 +7,14 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from gaussian_swaying.aero.computed_air import resolution
-from gaussian_swaying.aero.wind import WindField
 from gaussian_swaying.cli.errors import guessing, how_to_resume, run_command
 from gaussian_swaying.cli.shipped import with_shipped
 from gaussian_swaying.geometry.origin import counted_from
 from gaussian_swaying.runs.signals import stop_signals
 from gaussian_swaying.simulation.diagnostics import SimulationDiverged
 from gaussian_swaying.simulation.simulation import Simulation
+from gaussian_swaying.wind.computed_air import resolution
+from gaussian_swaying.wind.field import WindField
 
 if TYPE_CHECKING:
     from jsonargparse import ArgumentParser, Namespace

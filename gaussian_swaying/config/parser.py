@@ -23,16 +23,16 @@ from torch import Tensor, nn
 from gaussian_swaying import _program as program
 from gaussian_swaying._checks import check_frames, check_positive
 from gaussian_swaying._yaml_limits import limit_yaml
-from gaussian_swaying.aero.carried import Turbulence
-from gaussian_swaying.aero.obstacles import CylinderObstacle, EllipsoidObstacle
-from gaussian_swaying.aero.recorded import FrozenWind
-from gaussian_swaying.aero.shelter import Shelter
-from gaussian_swaying.aero.wind import SpatialWind
 from gaussian_swaying.captures.capture_camera import CaptureCamera
 from gaussian_swaying.config.material_names import NAMES, with_material_option, with_named_materials
 from gaussian_swaying.interop.physgaussian.convert import convert, read_config, to_yaml
 from gaussian_swaying.mpm.protocol import Solver
 from gaussian_swaying.rendering.cameras.keyframes import KeyframedCamera
+from gaussian_swaying.wind.carried import Turbulence
+from gaussian_swaying.wind.field import SpatialWind
+from gaussian_swaying.wind.obstacles import CylinderObstacle, EllipsoidObstacle
+from gaussian_swaying.wind.recorded import FrozenWind
+from gaussian_swaying.wind.shelter import Shelter
 
 if TYPE_CHECKING:
     from jsonargparse import ArgumentParser, Namespace

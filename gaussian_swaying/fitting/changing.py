@@ -14,9 +14,9 @@ from itertools import pairwise
 import torch
 from torch import Tensor
 
-from gaussian_swaying.aero.wind import WindField
 from gaussian_swaying.fitting.unknowns import CHANGES, FILM_START, Unknown, is_change
 from gaussian_swaying.simulation.parameters import flow_of
+from gaussian_swaying.wind.field import WindField
 
 KNOTS, EVERY = 3, 0.4
 """Fewest times after the first frame at which the wind is sought, and the longest time between two of them [s]."""

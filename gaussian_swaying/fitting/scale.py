@@ -10,8 +10,8 @@ from __future__ import annotations
 from dataclasses import replace
 
 from gaussian_swaying._fixed import changed
-from gaussian_swaying.aero.wind import WindField
 from gaussian_swaying.simulation.parameters import Setup, value_of, with_values
+from gaussian_swaying.wind.field import WindField
 
 SCALE = "scene.metres_per_unit"
 

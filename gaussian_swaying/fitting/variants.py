@@ -9,8 +9,6 @@ from dataclasses import dataclass, replace
 import torch
 
 from gaussian_swaying._fixed import assign
-from gaussian_swaying.aero.added_mass import with_added_mass
-from gaussian_swaying.aero.wind import WindField
 from gaussian_swaying.fitting.changing import changing
 from gaussian_swaying.fitting.scale import SCALE, at_scale
 from gaussian_swaying.fitting.unknowns import FILM_START, is_change, of_simulation
@@ -19,6 +17,8 @@ from gaussian_swaying.simulation.diagnostics import SimulationDiverged
 from gaussian_swaying.simulation.parameters import Setup, parameter, with_values
 from gaussian_swaying.simulation.simulation import Simulation
 from gaussian_swaying.simulation.stepper import Stepper, why_not_batched
+from gaussian_swaying.wind.added_mass import with_added_mass
+from gaussian_swaying.wind.field import WindField
 
 Values = Mapping[str, float]
 

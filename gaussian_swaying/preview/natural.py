@@ -19,9 +19,6 @@ import torch
 from torch import Tensor
 
 from gaussian_swaying._fixed import changed
-from gaussian_swaying.aero.force import AeroForce, added_mass_per_area
-from gaussian_swaying.aero.wind import WindField
-from gaussian_swaying.aero.wind_force import WindForce
 from gaussian_swaying.geometry.groups import equal_rows
 from gaussian_swaying.mpm.body import Body
 from gaussian_swaying.mpm.formulations.modes import MOST_MODES, Modes
@@ -34,6 +31,9 @@ from gaussian_swaying.preview.shape import extent, quantile
 from gaussian_swaying.preview.stretch import cloth_motion, linear_motion, rate_for, typical_start
 from gaussian_swaying.simulation.simulated_scene import SimulatedScene
 from gaussian_swaying.simulation.simulation import Simulation
+from gaussian_swaying.wind.field import WindField
+from gaussian_swaying.wind.force import AeroForce, added_mass_per_area
+from gaussian_swaying.wind.wind_force import WindForce
 
 FLAPS, HANGS, CLOTH_RATIO = 0.35, 0.6, 0.3
 """Frequency of a flag times its length over the wind; of a hanging sheet times the root of its length; damping."""

@@ -10,8 +10,6 @@ from dataclasses import asdict
 from typing import Any
 
 from gaussian_swaying import _program as program
-from gaussian_swaying.aero.computed_air import resolution
-from gaussian_swaying.aero.wind import WindField
 from gaussian_swaying.gaussians.cloud import GaussianCloud
 from gaussian_swaying.gaussians.repair import OPAQUE_LOGIT
 from gaussian_swaying.geometry.origin import counted_from
@@ -27,6 +25,8 @@ from gaussian_swaying.preview.up import wind_words
 from gaussian_swaying.simulation.progress import duration
 from gaussian_swaying.simulation.roles import classify, conditions
 from gaussian_swaying.simulation.simulation import Simulation
+from gaussian_swaying.wind.computed_air import resolution
+from gaussian_swaying.wind.field import WindField
 
 SHORT = ("origin", "up", "region", "held", "size", "kind", "wind", "simulated", "conditions", "the run")
 """Labels of the lines that are printed without ``--verbose``."""

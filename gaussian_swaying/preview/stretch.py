@@ -13,9 +13,9 @@ from typing import Any, NamedTuple
 import numpy as np
 import torch
 
-from gaussian_swaying.aero.wind import WindField
-from gaussian_swaying.aero.wind_force import WindForce
 from gaussian_swaying.mpm.formulations.modes import Modes
+from gaussian_swaying.wind.field import WindField
+from gaussian_swaying.wind.wind_force import WindForce
 
 SAMPLES, RATE, LEAST_RATE, PER_PERIOD = 60_000, 25.0, 6.0, 10.0  # of a record; in a second; in a period
 PLACES, LINES, BLOCK = 96, 20, 12  # at which the wind is taken; lines along it on which they lie; added at once

@@ -9,7 +9,6 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from gaussian_swaying.aero.patches import Patches
 from gaussian_swaying.gaussians.area import coverage_area, patch_area
 from gaussian_swaying.gaussians.cloud import GaussianCloud
 from gaussian_swaying.gaussians.filling import Filling
@@ -25,6 +24,7 @@ from gaussian_swaying.simulation.attached import attached_points, attached_sampl
 from gaussian_swaying.simulation.material import Material, with_gradients
 from gaussian_swaying.simulation.sampling import Samples, grouped, sample_object, shared_wind
 from gaussian_swaying.simulation.scene import Scene
+from gaussian_swaying.wind.patches import Patches
 
 HOLE = 0.6
 """Distance from all Gaussians [cells] at which ``points: grid`` puts extra points on large ones by itself."""

@@ -12,15 +12,15 @@ from torch import Tensor, nn
 from gaussian_swaying._checks import check_vector, check_whole
 from gaussian_swaying._devices import in_double
 from gaussian_swaying._fixed import fixed
-from gaussian_swaying.aero.copied_wind import CopiedWind
-from gaussian_swaying.aero.shelter import Shelter
-from gaussian_swaying.aero.wind import WindField
 from gaussian_swaying.mpm.boundaries.pinned_points import PinnedPoints
 from gaussian_swaying.mpm.boundaries.pinned_region import PinnedRegion
 from gaussian_swaying.mpm.protocol import Solver
 from gaussian_swaying.recording.recorder import Recorder
 from gaussian_swaying.simulation.parameters import Setup
 from gaussian_swaying.simulation.simulated_scene import SimulatedScene
+from gaussian_swaying.wind.copied_wind import CopiedWind
+from gaussian_swaying.wind.field import WindField
+from gaussian_swaying.wind.shelter import Shelter
 
 RENDERS = ("color", "depth", "normal")
 """Renders of a run with copies."""

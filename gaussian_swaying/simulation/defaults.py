@@ -11,9 +11,6 @@ import torch
 from gaussian_swaying._arguments import shown
 from gaussian_swaying._checks import VectorLike, check_choice, check_vector
 from gaussian_swaying._fixed import FixedList, changed
-from gaussian_swaying.aero.force import AeroForce
-from gaussian_swaying.aero.looks import LOOKS, look
-from gaussian_swaying.aero.wind import SpatialWind, WindField, flow_rows
 from gaussian_swaying.captures.capture_camera import CaptureCamera, photo_azimuth, read_views
 from gaussian_swaying.gaussians.cloud import GaussianCloud
 from gaussian_swaying.geometry.frame import SimFrame
@@ -37,6 +34,9 @@ from gaussian_swaying.simulation.material import Material
 from gaussian_swaying.simulation.normalisation import Normalisation
 from gaussian_swaying.simulation.scene import Scene
 from gaussian_swaying.simulation.simulated_scene import SimulatedScene
+from gaussian_swaying.wind.field import SpatialWind, WindField, flow_rows
+from gaussian_swaying.wind.force import AeroForce
+from gaussian_swaying.wind.looks import LOOKS, look
 
 if TYPE_CHECKING:
     SceneLike = Scene | ProceduralScene | GaussianCloud | str | os.PathLike[str]

@@ -13,12 +13,12 @@ from torch import Tensor
 
 from gaussian_swaying._devices import in_double
 from gaussian_swaying._fixed import fixed
-from gaussian_swaying.aero.added_mass import AirLift
 from gaussian_swaying.geometry.linalg import determinant, matmul3, symmetric_eigenvalues
 from gaussian_swaying.geometry.neighbours import nearest_neighbours
 from gaussian_swaying.kernels.graphs import RECORDED, Replayed
 from gaussian_swaying.mpm.protocol import Solver
 from gaussian_swaying.mpm.state import State, support_force
+from gaussian_swaying.wind.added_mass import AirLift
 
 _PARTICLES = ("moved_particle", "compressed_particle", "stretched_particle")
 _SAMPLE = 4096  # particles whose nearest neighbour is searched

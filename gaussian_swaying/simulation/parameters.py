@@ -23,13 +23,13 @@ from gaussian_swaying._checks import check_vector, number_of, requires_grad
 from gaussian_swaying._devices import in_double
 from gaussian_swaying._fixed import LIVE, FixedList, changed, fixed
 from gaussian_swaying._numbers import sense_of
-from gaussian_swaying.aero.computed_air import ComputedAir
-from gaussian_swaying.aero.force import AeroForce
-from gaussian_swaying.aero.wind import SpatialWind, WindField
 from gaussian_swaying.mpm.forces import Force
 from gaussian_swaying.mpm.state import MaterialPoints
 from gaussian_swaying.simulation.material import PLATE, Material
 from gaussian_swaying.simulation.simulated_scene import SimulatedScene
+from gaussian_swaying.wind.computed_air import ComputedAir
+from gaussian_swaying.wind.field import SpatialWind, WindField
+from gaussian_swaying.wind.force import AeroForce
 
 if TYPE_CHECKING:
     from jsonargparse import Namespace

@@ -12,7 +12,6 @@ import torch
 from torch import Tensor
 
 from gaussian_swaying._checks import number_of
-from gaussian_swaying.aero.patches import joined_directions, second_moments
 from gaussian_swaying.gaussians.filling import Filling
 from gaussian_swaying.gaussians.grouping import grid_groups
 from gaussian_swaying.geometry.frame import SimFrame
@@ -23,6 +22,7 @@ from gaussian_swaying.mpm.laws.fixed_corotated import FixedCorotated
 from gaussian_swaying.mpm.laws.law import ConstitutiveLaw
 from gaussian_swaying.mpm.state import MaterialPoints
 from gaussian_swaying.simulation.material import PLATE, Material, layer_distance, plate_stiffness
+from gaussian_swaying.wind.patches import joined_directions, second_moments
 
 _FLAT = 0.01  # standard deviation [cubes] below which a group has no extent in a direction
 SHARED = 4

@@ -15,9 +15,6 @@ from torch import Tensor, nn
 from gaussian_swaying._checks import check_choice, check_frames, check_positive, check_vector
 from gaussian_swaying._fixed import Fixed, changed
 from gaussian_swaying._turns import Turn, in_turn
-from gaussian_swaying.aero.computed_air import ComputedAir
-from gaussian_swaying.aero.force import AeroForce
-from gaussian_swaying.aero.wind import SpatialWind, WindField
 from gaussian_swaying.config.parser import (
     NOT_COMPARED,
     arguments_of,
@@ -71,6 +68,9 @@ from gaussian_swaying.simulation.parameters import Setup, with_values
 from gaussian_swaying.simulation.run import Run
 from gaussian_swaying.simulation.simulated_scene import SimulatedScene
 from gaussian_swaying.simulation.stepper import Stepper
+from gaussian_swaying.wind.computed_air import ComputedAir
+from gaussian_swaying.wind.field import SpatialWind, WindField
+from gaussian_swaying.wind.force import AeroForce
 
 if TYPE_CHECKING:
     from jsonargparse import ArgumentParser, Namespace

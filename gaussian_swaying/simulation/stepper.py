@@ -16,13 +16,6 @@ from torch import Tensor
 from gaussian_swaying._devices import in_double
 from gaussian_swaying._fixed import assign
 from gaussian_swaying._turns import Turn, in_turn
-from gaussian_swaying.aero.added_mass import AirLift, carried_mass, with_added_mass
-from gaussian_swaying.aero.computed_air import AirInBox
-from gaussian_swaying.aero.patches import Patches
-from gaussian_swaying.aero.shelter import Shelter
-from gaussian_swaying.aero.wind import WindField
-from gaussian_swaying.aero.wind_batch import WindBatch, why_apart
-from gaussian_swaying.aero.wind_force import WindForce
 from gaussian_swaying.geometry.patches import deform_patch
 from gaussian_swaying.kernels.graphs import fingerprint, tensors_in
 from gaussian_swaying.mpm.boundaries.impulse import Impulse
@@ -47,6 +40,13 @@ from gaussian_swaying.simulation.diagnostics import (
 from gaussian_swaying.simulation.parameters import Setup
 from gaussian_swaying.simulation.progress import RunProgress
 from gaussian_swaying.simulation.simulated_scene import SimulatedScene
+from gaussian_swaying.wind.added_mass import AirLift, carried_mass, with_added_mass
+from gaussian_swaying.wind.computed_air import AirInBox
+from gaussian_swaying.wind.field import WindField
+from gaussian_swaying.wind.patches import Patches
+from gaussian_swaying.wind.shelter import Shelter
+from gaussian_swaying.wind.wind_batch import WindBatch, why_apart
+from gaussian_swaying.wind.wind_force import WindForce
 
 CFL_SAMPLES = 8  # checks per frame, as material may stiffen and soften again within it
 MAX_WIND = 1e6  # m/s; anything above is a mistake and would overflow positions

@@ -8,12 +8,12 @@ import torch
 from torch import Tensor
 
 from gaussian_swaying._devices import in_double
-from gaussian_swaying.aero.wind import WindField
 from gaussian_swaying.mpm.state import State
 from gaussian_swaying.rendering.cameras.camera import Camera, project
 from gaussian_swaying.rendering.passes import colormap, mean_depth
 from gaussian_swaying.rendering.protocol import RenderOutput
 from gaussian_swaying.simulation.stepper import Stepper
+from gaussian_swaying.wind.field import WindField
 
 ACROSS = 26
 """Streaks along the longer side of the picture."""

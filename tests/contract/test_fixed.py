@@ -35,15 +35,15 @@ from gaussian_swaying import (
     WindForce,
 )
 from gaussian_swaying._fixed import fields_of
-from gaussian_swaying.aero.carried import Turbulence
-from gaussian_swaying.aero.computed_air import ComputedAir
-from gaussian_swaying.aero.shelter import Shelter
 from gaussian_swaying.gaussians.filling import InteriorFilling
 from gaussian_swaying.gaussians.parts import Part, Parts
 from gaussian_swaying.mpm.boundaries.impulse import Impulse
 from gaussian_swaying.mpm.laws.sand import Sand
 from gaussian_swaying.scenes.procedural import FlagScene
 from gaussian_swaying.simulation.material import MaterialRegion
+from gaussian_swaying.wind.carried import Turbulence
+from gaussian_swaying.wind.computed_air import ComputedAir
+from gaussian_swaying.wind.shelter import Shelter
 
 POLE = Box([None] * 3, [0.11, None, None])
 FLAG = FlagScene(spacing=0.1)

@@ -22,7 +22,7 @@ import math
 import torch
 
 from gaussian_swaying import Boundary, Force, PinnedRegion
-from gaussian_swaying.aero.effects import WindEffect
+from gaussian_swaying.wind.effects import WindEffect
 from gaussian_swaying.geometry.regions import Region
 
 

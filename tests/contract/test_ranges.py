@@ -20,9 +20,9 @@ from gaussian_swaying import (
     WindField,
 )
 from gaussian_swaying._numbers import SENSE
-from gaussian_swaying.aero.computed_air import ComputedAir
 from gaussian_swaying.gaussians.parts import Part, Parts
 from gaussian_swaying.scenes.procedural import FlagScene
+from gaussian_swaying.wind.computed_air import ComputedAir
 
 FAR, NEAR = [0.0] * 3, [1.0] * 3
 

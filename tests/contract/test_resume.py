@@ -5,10 +5,6 @@ import pytest
 import torch
 
 from gaussian_swaying import Box, Copy, Edit, Material, PinnedRegion, Recorder, Simulation, WindField
-from gaussian_swaying.aero.carried import Turbulence
-from gaussian_swaying.aero.computed_air import ComputedAir
-from gaussian_swaying.aero.shelter import Shelter
-from gaussian_swaying.aero.wind import GaussianGust, SineSway
 from gaussian_swaying.gaussians.filling import InteriorFilling
 from gaussian_swaying.gaussians.parts import Part, Parts
 from gaussian_swaying.mpm.laws.neo_hookean import NeoHookean
@@ -17,6 +13,10 @@ from gaussian_swaying.mpm.laws.snow import Snow
 from gaussian_swaying.mpm.solver import MPMSolver
 from gaussian_swaying.scenes import FlagScene, GivenScene, SolidScene
 from gaussian_swaying.simulation.scene import Scene
+from gaussian_swaying.wind.carried import Turbulence
+from gaussian_swaying.wind.computed_air import ComputedAir
+from gaussian_swaying.wind.field import GaussianGust, SineSway
+from gaussian_swaying.wind.shelter import Shelter
 
 FLAG = FlagScene(spacing=0.1).generate()
 PIN = PinnedRegion(Box([None] * 3, [0.11, None, None]))

@@ -5,16 +5,16 @@ import torch
 from shared import unit
 from small_films import base, changed
 
-from gaussian_swaying.aero.force import AeroForce
-from gaussian_swaying.aero.patches import Patches
-from gaussian_swaying.aero.wind import WindField
-from gaussian_swaying.aero.wind_force import WindForce
 from gaussian_swaying.fitting.variants import states_of
 from gaussian_swaying.gaussians.parts import Part, Parts
 from gaussian_swaying.mpm.solver import MPMSolver
 from gaussian_swaying.mpm.state import MaterialPoints
 from gaussian_swaying.scenes.procedural import FlagScene
 from gaussian_swaying.simulation import stepper
+from gaussian_swaying.wind.field import WindField
+from gaussian_swaying.wind.force import AeroForce
+from gaussian_swaying.wind.patches import Patches
+from gaussian_swaying.wind.wind_force import WindForce
 
 TIMES = [0.0, 1 / 24, 2 / 24, 4 / 24]
 

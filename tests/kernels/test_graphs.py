@@ -9,12 +9,12 @@ from torch import nn
 
 from gaussian_swaying import Boundary, Box, GaussianGust, PinnedRegion, SineSway, UniformGust, WindField
 from gaussian_swaying._fixed import assign
-from gaussian_swaying.aero.wind import Modulation
 from gaussian_swaying.geometry.regions import Everything, Not, Union
 from gaussian_swaying.kernels.graphs import Repeater, Replayed, fingerprint, tensors_in
 from gaussian_swaying.mpm.boundaries import BOUNDARIES
 from gaussian_swaying.mpm.boundaries.plane import Plane
 from gaussian_swaying.mpm.boundaries.velocity_box import VelocityBox
+from gaussian_swaying.wind.field import Modulation
 
 
 def test_what_is_here_can_be_recorded():

@@ -17,11 +17,11 @@ from gaussian_swaying import (
     WindField,
     WindForce,
 )
-from gaussian_swaying.aero.force import LAWS as WIND_LAWS
-from gaussian_swaying.aero.patches import Patches
 from gaussian_swaying.mpm.boundaries.ball import BallObstacle
 from gaussian_swaying.mpm.boundaries.plane import Plane
 from gaussian_swaying.mpm.triton import fused_total
+from gaussian_swaying.wind.force import LAWS as WIND_LAWS
+from gaussian_swaying.wind.patches import Patches
 
 WIDE = torch.float64
 

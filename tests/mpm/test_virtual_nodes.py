@@ -18,7 +18,6 @@ from gaussian_swaying import (
     WindField,
     WindForce,
 )
-from gaussian_swaying.aero.effects import LogProfile
 from gaussian_swaying.geometry.linalg import polar_rotation
 from gaussian_swaying.mpm.boundaries.ball import BallObstacle
 from gaussian_swaying.mpm.boundaries.handle import Handle
@@ -29,6 +28,7 @@ from gaussian_swaying.mpm.contact.surface import Surface
 from gaussian_swaying.mpm.followers import GridFollowers, on_material
 from gaussian_swaying.mpm.state import GridSpec
 from gaussian_swaying.mpm.virtual_nodes import coordinates, first_nodes, point_with_nodes, shifts, virtual_nodes
+from gaussian_swaying.wind.effects import LogProfile
 
 EDGE = Box([None, None, None], [1.0, None, None])
 

@@ -7,7 +7,6 @@ import pytest
 import torch
 import yaml
 
-from gaussian_swaying.aero.wind import FlowKey, WindField
 from gaussian_swaying.gaussians.ply import write_ply
 from gaussian_swaying.geometry.regions import Box, Cylinder, Everything, Not, Sphere, Union
 from gaussian_swaying.mpm.boundaries.impulse import Impulse
@@ -30,6 +29,7 @@ from gaussian_swaying.rendering.torch_renderer import render_torch
 from gaussian_swaying.scenes.procedural import FlagScene
 from gaussian_swaying.simulation.roles import Roles, classify
 from gaussian_swaying.simulation.simulation import Simulation
+from gaussian_swaying.wind.field import FlowKey, WindField
 
 POLE = Box([None, None, None], [0.11, None, None])
 

@@ -10,7 +10,6 @@ import yaml
 from shared import unit
 from small_scenes import plain_cloud, started, together, turned_cloud
 
-from gaussian_swaying.aero.looks import LOOKS
 from gaussian_swaying.config.parser import parse_text
 from gaussian_swaying.gaussians.cloud import GaussianCloud
 from gaussian_swaying.gaussians.grouping import connected_parts
@@ -41,6 +40,7 @@ from gaussian_swaying.scenes.leaves import LeavesScene
 from gaussian_swaying.scenes.procedural import FlagScene
 from gaussian_swaying.simulation.extent import suggest_spacing
 from gaussian_swaying.simulation.simulation import Simulation
+from gaussian_swaying.wind.looks import LOOKS
 
 VISIBLE = math.log(9.0)
 """Logit of an opacity of 0.9."""

@@ -29,7 +29,6 @@ from gaussian_swaying import (
     UniformGust,
     WindField,
 )
-from gaussian_swaying.aero.wind import FlowKey, Modulation
 from gaussian_swaying.geometry.linalg import determinant, matmul3
 from gaussian_swaying.mpm.boundaries.enclosing_box import EnclosingBox
 from gaussian_swaying.mpm.boundaries.handle import Handle
@@ -38,6 +37,7 @@ from gaussian_swaying.mpm.boundaries.velocity_box import VelocityBox
 from gaussian_swaying.mpm.laws import LAWS as KINDS
 from gaussian_swaying.scenes.procedural import FlagScene, GivenScene
 from gaussian_swaying.simulation.diagnostics import measure
+from gaussian_swaying.wind.field import FlowKey, Modulation
 
 FORMULATIONS = ["total", "updated"]
 UP = (0.0, 0.0, -9.8)

@@ -16,7 +16,6 @@ import pytest
 import torch
 from shared import advanced, without_waits
 
-from gaussian_swaying.aero.wind import WindField
 from gaussian_swaying.config.parser import as_filmed
 from gaussian_swaying.gaussians.harmonics import sh_to_color
 from gaussian_swaying.gaussians.ply import read_ply
@@ -32,6 +31,7 @@ from gaussian_swaying.scenes.procedural import FlagScene
 from gaussian_swaying.simulation.diagnostics import SimulationDiverged
 from gaussian_swaying.simulation.run import Run
 from gaussian_swaying.simulation.simulation import Simulation
+from gaussian_swaying.wind.field import WindField
 
 FLAG = FlagScene(spacing=0.3).generate()
 

@@ -7,13 +7,13 @@ import pytest
 import torch
 from shared import advanced
 
-from gaussian_swaying.aero.force import AeroForce, added_mass_per_area
-from gaussian_swaying.aero.wind import WindField
 from gaussian_swaying.geometry.regions import Box
 from gaussian_swaying.mpm.boundaries.pinned_region import PinnedRegion
 from gaussian_swaying.simulation.batch import batch_of
 from gaussian_swaying.simulation.edits import Edit
 from gaussian_swaying.simulation.material import Material
+from gaussian_swaying.wind.field import WindField
+from gaussian_swaying.wind.force import AeroForce, added_mass_per_area
 
 BREADTH, SHEET = 1.0, 0.3  # m, kg/m²
 SLOWER = math.sqrt(SHEET / (SHEET + added_mass_per_area(BREADTH, 1.225)))

@@ -10,8 +10,6 @@ import torch
 import yaml
 from small_scenes import together
 
-from gaussian_swaying.aero.shelter import Shelter
-from gaussian_swaying.aero.wind import FlowKey, GaussianGust, SpatialWind, UniformGust, WindField
 from gaussian_swaying.cli.live import session_of
 from gaussian_swaying.fitting.variants import check_variants
 from gaussian_swaying.gaussians.harmonics import rotate_sh, sh_to_color
@@ -32,6 +30,8 @@ from gaussian_swaying.simulation.edits import Edit
 from gaussian_swaying.simulation.material import Material
 from gaussian_swaying.simulation.scene import Scene
 from gaussian_swaying.simulation.simulation import Simulation
+from gaussian_swaying.wind.field import FlowKey, GaussianGust, SpatialWind, UniformGust, WindField
+from gaussian_swaying.wind.shelter import Shelter
 
 POLE = Box([None, None, None], [0.11, None, None])
 AXIS = FlagScene(spacing=0.1).generate().means[0]  # the middle of the particles that POLE holds; only x and y count

@@ -6,8 +6,6 @@ import numpy as np
 import pytest
 import torch
 
-from gaussian_swaying.aero.force import AeroForce
-from gaussian_swaying.aero.wind import WindField
 from gaussian_swaying.gaussians.harmonics import SH_DC
 from gaussian_swaying.geometry.regions import Box
 from gaussian_swaying.mpm.laws.fixed_corotated import FixedCorotated
@@ -19,6 +17,8 @@ from gaussian_swaying.mpm.state import MaterialPoints
 from gaussian_swaying.recording.recorder import Recorder
 from gaussian_swaying.simulation.edits import Edit, edited_points, recolored
 from gaussian_swaying.simulation.material import Material, MaterialRegion
+from gaussian_swaying.wind.field import WindField
+from gaussian_swaying.wind.force import AeroForce
 
 FREE_HALF = [0.55, None, None], [None, None, None]
 WHITE = [0.95, 0.95, 0.95]

@@ -7,9 +7,6 @@ import pytest
 import torch
 from shared import advanced, unit
 
-from gaussian_swaying.aero.force import AeroForce
-from gaussian_swaying.aero.wind import WindField
-from gaussian_swaying.aero.wind_force import WindForce
 from gaussian_swaying.gaussians.cloud import GaussianCloud
 from gaussian_swaying.gaussians.filling import InteriorFilling
 from gaussian_swaying.geometry.patches import deform_all, deform_patch
@@ -27,6 +24,9 @@ from gaussian_swaying.simulation.material import Material, MaterialRegion
 from gaussian_swaying.simulation.sampling import matched_points
 from gaussian_swaying.simulation.scene import Scene
 from gaussian_swaying.simulation.simulated_scene import SimulatedScene
+from gaussian_swaying.wind.field import WindField
+from gaussian_swaying.wind.force import AeroForce
+from gaussian_swaying.wind.wind_force import WindForce
 
 HALF = Box([0.0451, None, None], [None] * 3)
 

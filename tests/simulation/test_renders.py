@@ -6,8 +6,6 @@ import pytest
 import torch
 
 from gaussian_swaying._fixed import changed
-from gaussian_swaying.aero.force import AeroForce
-from gaussian_swaying.aero.wind import WindField
 from gaussian_swaying.gaussians.ply import read_ply
 from gaussian_swaying.geometry.regions import Box
 from gaussian_swaying.recording.layout import video_file
@@ -16,6 +14,8 @@ from gaussian_swaying.rendering.cameras.camera_path import LookAtCamera, OrbitCa
 from gaussian_swaying.rendering.passes import colormap, mean_depth
 from gaussian_swaying.rendering.shading import DiffuseShader
 from gaussian_swaying.simulation.edits import Edit
+from gaussian_swaying.wind.field import WindField
+from gaussian_swaying.wind.force import AeroForce
 
 SIDE = OrbitCamera(width=24, height=20, azimuth=-90.0, elevation=0.1, radius=1.5)
 ALL = ["color", "depth", "normal", "force", "wind"]

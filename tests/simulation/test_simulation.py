@@ -10,8 +10,6 @@ import pytest
 import torch
 from shared import advanced, without_waits
 
-from gaussian_swaying.aero.force import AeroForce
-from gaussian_swaying.aero.wind import GaussianGust, SineSway, WindField
 from gaussian_swaying.captures.capture_camera import CaptureCamera
 from gaussian_swaying.gaussians.model import GaussianSurfaceModel
 from gaussian_swaying.gaussians.ply import read_ply
@@ -28,6 +26,8 @@ from gaussian_swaying.simulation.edits import Edit
 from gaussian_swaying.simulation.material import Material
 from gaussian_swaying.simulation.scene import Scene
 from gaussian_swaying.simulation.simulation import Simulation
+from gaussian_swaying.wind.field import GaussianGust, SineSway, WindField
+from gaussian_swaying.wind.force import AeroForce
 
 # ---- time
 

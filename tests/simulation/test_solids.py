@@ -7,7 +7,6 @@ from pathlib import Path
 import pytest
 import torch
 
-from gaussian_swaying.aero.wind import WindField
 from gaussian_swaying.gaussians.filling import InteriorFilling
 from gaussian_swaying.geometry.regions import Box, Not, Sphere
 from gaussian_swaying.mpm.boundaries.pinned_region import PinnedRegion
@@ -21,6 +20,7 @@ from gaussian_swaying.simulation.sampling import cell_volume
 from gaussian_swaying.simulation.scene import Scene
 from gaussian_swaying.simulation.simulated_scene import SimulatedScene
 from gaussian_swaying.simulation.simulation import Simulation
+from gaussian_swaying.wind.field import WindField
 
 ROOT = Path(__file__).parents[2]
 DX = 0.12  # m

@@ -4,13 +4,13 @@ import pytest
 import torch
 from shared import waits
 
-from gaussian_swaying.aero.carried import Turbulence
-from gaussian_swaying.aero.effects import LogProfile
-from gaussian_swaying.aero.obstacles import EllipsoidObstacle
-from gaussian_swaying.aero.shelter import Shelter
-from gaussian_swaying.aero.wind import WindField
 from gaussian_swaying.simulation.simulation import Simulation
 from gaussian_swaying.simulation.stepper import parts_of
+from gaussian_swaying.wind.carried import Turbulence
+from gaussian_swaying.wind.effects import LogProfile
+from gaussian_swaying.wind.field import WindField
+from gaussian_swaying.wind.obstacles import EllipsoidObstacle
+from gaussian_swaying.wind.shelter import Shelter
 
 
 def _wind():

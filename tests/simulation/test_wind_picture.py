@@ -6,15 +6,15 @@ import imageio.v3 as iio
 import pytest
 import torch
 
-from gaussian_swaying.aero.computed_air import ComputedAir
-from gaussian_swaying.aero.obstacles import EllipsoidObstacle
-from gaussian_swaying.aero.wind import WindField
 from gaussian_swaying.recording.recorder import Recorder
 from gaussian_swaying.rendering.cameras.camera import look_at_camera, project
 from gaussian_swaying.rendering.passes import mean_depth
 from gaussian_swaying.scenes.procedural import FlagScene
 from gaussian_swaying.simulation.simulation import Simulation
 from gaussian_swaying.simulation.wind_picture import STEPS, draw_vorticity, draw_wind, streaks
+from gaussian_swaying.wind.computed_air import ComputedAir
+from gaussian_swaying.wind.field import WindField
+from gaussian_swaying.wind.obstacles import EllipsoidObstacle
 
 
 def test_streaks_follow_the_wind(make_simulation):

@@ -14,10 +14,6 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from gaussian_swaying.aero.carried import Turbulence
-from gaussian_swaying.aero.force import LAWS as AERO_LAWS
-from gaussian_swaying.aero.wind import GaussianGust, SineSway, UniformGust, WindField, stream_start
-from gaussian_swaying.aero.wind_force import WindForce
 from gaussian_swaying.geometry.groups import equal_rows
 from gaussian_swaying.mpm.boundaries.ball import BallObstacle
 from gaussian_swaying.mpm.boundaries.block import BoxObstacle
@@ -38,6 +34,10 @@ from gaussian_swaying.mpm.solver import MPMSolver
 from gaussian_swaying.simulation.simulation import Simulation
 from gaussian_swaying.viewer.film.page import message
 from gaussian_swaying.viewer.live_web.longest import longest_courant
+from gaussian_swaying.wind.carried import Turbulence
+from gaussian_swaying.wind.field import GaussianGust, SineSway, UniformGust, WindField, stream_start
+from gaussian_swaying.wind.force import LAWS as AERO_LAWS
+from gaussian_swaying.wind.wind_force import WindForce
 
 LAWS = (FixedCorotated, NeoHookean, StVKHencky, SpringNetwork)
 """The laws that a browser knows, by their number in the block."""

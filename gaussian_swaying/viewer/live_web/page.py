@@ -7,12 +7,12 @@ from pathlib import Path
 import torch
 
 from gaussian_swaying._files import check_page, write_text
-from gaussian_swaying.aero.wind import WindField
 from gaussian_swaying.simulation.simulation import Simulation
 from gaussian_swaying.viewer.film.page import PAGE as FILM_PAGE
 from gaussian_swaying.viewer.film.page import filled, pack_head, pack_splats, parts_of
 from gaussian_swaying.viewer.film.recorded import Film, film_without_frames
 from gaussian_swaying.viewer.live_web.block import check, pack_solver
+from gaussian_swaying.wind.field import WindField
 
 PAGE = Path(__file__).parent / "page"
 

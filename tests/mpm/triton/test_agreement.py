@@ -9,10 +9,10 @@ import torch
 from catalogue import ELASTIC, MESH, PLASTIC, conditions, made
 
 from gaussian_swaying import AeroForce, WindField, WindForce
-from gaussian_swaying.aero.patches import Patches
 from gaussian_swaying.geometry.keyed_path import KeyedPath
 from gaussian_swaying.geometry.regions import Everything
 from gaussian_swaying.mpm.boundaries import BOUNDARIES as KINDS
+from gaussian_swaying.wind.patches import Patches
 
 from .bodies import (
     DT,

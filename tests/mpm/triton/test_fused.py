@@ -12,13 +12,13 @@ from catalogue import ELASTIC, PLASTIC
 
 from gaussian_swaying import Boundary, Box, MPMSolver, PinnedRegion, WindField, WindForce
 from gaussian_swaying._fixed import assign
-from gaussian_swaying.aero.wind_batch import WindBatch
 from gaussian_swaying.geometry.regions import Everything
 from gaussian_swaying.mpm.boundaries.impulse import Impulse
 from gaussian_swaying.mpm.boundaries.plane import Plane
 from gaussian_swaying.mpm.boundaries.velocity_box import VelocityBox
 from gaussian_swaying.mpm.laws.fixed_corotated import FixedCorotated
 from gaussian_swaying.mpm.triton import fused, fused_updated, measures
+from gaussian_swaying.wind.wind_batch import WindBatch
 
 from .bodies import (
     DT,

@@ -6,10 +6,10 @@ import pytest
 import torch
 
 from gaussian_swaying import MPMSolver, WindField, WindForce
-from gaussian_swaying.aero.wind import FlowKey
 from gaussian_swaying.kernels.launch import lanes
 from gaussian_swaying.mpm.state import GridSpec
 from gaussian_swaying.mpm.triton import fused_total
+from gaussian_swaying.wind.field import FlowKey
 
 from .bodies import (
     DT,

@@ -11,7 +11,6 @@ from catalogue import ELASTIC, PLASTIC
 
 from gaussian_swaying import Box, GaussianGust, MPMSolver, PinnedRegion, SimulationDiverged, SineSway, WindField
 from gaussian_swaying._fixed import assign
-from gaussian_swaying.aero.wind import FlowKey
 from gaussian_swaying.kernels import graphs
 from gaussian_swaying.mpm.boundaries.enclosing_box import EnclosingBox
 from gaussian_swaying.mpm.boundaries.handle import Handle
@@ -20,6 +19,7 @@ from gaussian_swaying.mpm.boundaries.velocity_box import VelocityBox
 from gaussian_swaying.mpm.state import GridSpec
 from gaussian_swaying.mpm.triton import fused, fused_total, fused_updated
 from gaussian_swaying.simulation.diagnostics import measure
+from gaussian_swaying.wind.field import FlowKey
 
 from .bodies import (
     DT,

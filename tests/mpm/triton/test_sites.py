@@ -5,11 +5,11 @@ import torch
 from shared import solid, unit
 
 from gaussian_swaying import AeroForce, Box, MaterialPoints, MPMSolver, WindField, WindForce
-from gaussian_swaying.aero.effects import LogProfile
-from gaussian_swaying.aero.looks import look
-from gaussian_swaying.aero.patches import Patches
 from gaussian_swaying.mpm.boundaries.pinned_region import PinnedRegion
 from gaussian_swaying.mpm.formulations.modes import Modes
+from gaussian_swaying.wind.effects import LogProfile
+from gaussian_swaying.wind.looks import look
+from gaussian_swaying.wind.patches import Patches
 
 DT, STEPS = 0.01, 4
 

@@ -11,9 +11,6 @@ import math
 import torch
 from torch import Tensor
 
-from gaussian_swaying.aero.computed_air import ComputedAir
-from gaussian_swaying.aero.force import AeroForce
-from gaussian_swaying.aero.wind import FlowKey, WindField
 from gaussian_swaying.air.flow import WALL, FlowState, LatticeFlow
 from gaussian_swaying.air.immersed import exchange
 from gaussian_swaying.air.lattice import LatticeUnits
@@ -25,6 +22,9 @@ from gaussian_swaying.scenes.procedural import FlagScene
 from gaussian_swaying.simulation.material import Material
 from gaussian_swaying.simulation.scene import Scene
 from gaussian_swaying.simulation.simulation import Simulation
+from gaussian_swaying.wind.computed_air import ComputedAir
+from gaussian_swaying.wind.field import FlowKey, WindField
+from gaussian_swaying.wind.force import AeroForce
 
 GHIA = {
     0.0547: -0.03717, 0.1016: -0.06434, 0.1719: -0.10150, 0.2813: -0.15662, 0.4531: -0.21090, 0.5: -0.20581,

@@ -18,11 +18,11 @@ import torch
 from bench.problems.beams import Chosen
 from bench.problems.rods import section
 from bench.problems.settings import Result, Settings, follow
-from gaussian_swaying.aero.force import AeroForce
-from gaussian_swaying.aero.wind import WindField
-from gaussian_swaying.aero.wind_force import WindForce
 from gaussian_swaying.mpm.boundaries.pinned_region import PinnedRegion
 from gaussian_swaying.mpm.state import MaterialPoints, MPMState
+from gaussian_swaying.wind.field import WindField
+from gaussian_swaying.wind.force import AeroForce
+from gaussian_swaying.wind.wind_force import WindForce
 
 AIR, C_D = 1.225, 1.0  # kg/m³
 WOOD_E = 8e9  # Pa; green wood

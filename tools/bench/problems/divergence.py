@@ -14,11 +14,11 @@ import torch
 
 from bench.problems.reconfiguration import AIR, HELD, LENGTH, YOUNG, plate
 from bench.problems.settings import Result, Settings, follow
-from gaussian_swaying.aero.force import AeroForce
-from gaussian_swaying.aero.wind import WindField
-from gaussian_swaying.aero.wind_force import WindForce
 from gaussian_swaying.mpm.boundaries.pinned_region import PinnedRegion
 from gaussian_swaying.mpm.state import MPMState
+from gaussian_swaying.wind.field import WindField
+from gaussian_swaying.wind.force import AeroForce
+from gaussian_swaying.wind.wind_force import WindForce
 
 BESIDE = 0.1
 """The plate is watched in winds whose pressure is so much below and above that at which it should diverge, relative."""

@@ -6,13 +6,13 @@ import torch
 from torch import Tensor
 
 from bench.problems.settings import Result, Run, Settings, follow
-from gaussian_swaying.aero.force import AeroForce
-from gaussian_swaying.aero.wind import SineSway, WindField
 from gaussian_swaying.geometry.patches import deform_patch
 from gaussian_swaying.geometry.regions import Box
 from gaussian_swaying.mpm.boundaries.pinned_region import PinnedRegion
 from gaussian_swaying.mpm.state import MaterialPoints, MPMState
 from gaussian_swaying.simulation.diagnostics import TearingGauge
+from gaussian_swaying.wind.field import SineSway, WindField
+from gaussian_swaying.wind.force import AeroForce
 
 WIDTH, HEIGHT, FRAME = 1.2, 0.8, 0.04  # m, m, s
 

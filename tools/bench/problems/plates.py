@@ -8,10 +8,10 @@ import torch
 from torch import Tensor
 
 from bench.problems.settings import Axial, Result, Settings, follow, lattice
-from gaussian_swaying.aero.force import AeroForce
 from gaussian_swaying.geometry.patches import deform_patch
 from gaussian_swaying.mpm.boundaries.boundary import Boundary, Nodes
 from gaussian_swaying.mpm.state import MaterialPoints, MPMState
+from gaussian_swaying.wind.force import AeroForce
 
 HEIGHT, MASS, GRAVITY, AIR, DRAG = 0.5, 2.0, 9.8, 1.225, 1.2  # m below the hinge, kg/m², m/s², kg/m³, C_D
 _STRETCH = 0.008  # how much a strip of the plate would stretch under its own weight

@@ -7,11 +7,11 @@ import math
 import torch
 
 from bench.problems.settings import Result
-from gaussian_swaying.aero.force import AeroForce
 from gaussian_swaying.gaussians.cloud import GaussianCloud
 from gaussian_swaying.gaussians.model import GaussianSurfaceModel
 from gaussian_swaying.geometry.rotations import rotation_to_quat
 from gaussian_swaying.scenes.procedural import FlagScene
+from gaussian_swaying.wind.force import AeroForce
 
 RADIUS, SIDE = 0.5, 0.8  # [m]
 

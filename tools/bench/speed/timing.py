@@ -11,11 +11,11 @@ import torch
 from torch import Tensor
 
 from bench.runner import Row
-from gaussian_swaying.aero.force import AeroForce
-from gaussian_swaying.aero.wind import UniformGust, WindField
-from gaussian_swaying.aero.wind_batch import WindBatch
-from gaussian_swaying.aero.wind_force import WindForce
 from gaussian_swaying.mpm.state import GridSpec, MaterialPoints
+from gaussian_swaying.wind.field import UniformGust, WindField
+from gaussian_swaying.wind.force import AeroForce
+from gaussian_swaying.wind.wind_batch import WindBatch
+from gaussian_swaying.wind.wind_force import WindForce
 
 CUBE = GridSpec(0.01, (0, 0, 0), (100, 100, 100))
 """Grid of ``updated`` around the sheet."""

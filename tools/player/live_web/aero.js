@@ -1,4 +1,4 @@
-// The force of the wind on the patches of a point; the definition is gaussian_swaying/aero/force.py.
+// The force of the wind on the patches of a point; the definition is gaussian_swaying/wind/force.py.
 
 /** Laws by their number in the file. */
 const PAPER = 0;
@@ -63,7 +63,7 @@ export function onPatch(aero, wind, v0, v1, v2, F, patch, at, out) {
 }
 
 /**
- * The force on the patches of a point that has several directions, see gaussian_swaying/aero/patches.py.
+ * The force on the patches of a point that has several directions, see gaussian_swaying/wind/patches.py.
  * @param {Aero} aero @param {Float64Array} wind @param {number} v0 @param {number} v1 @param {number} v2 @param {Float64Array} F
  * @param {Float64Array} tensor six numbers of the sum of A N N^T for each point @param {number} at index of those of the point
  * @param {Float64Array} vectors area vectors, three numbers each @param {number} first of the point @param {number} last excluded

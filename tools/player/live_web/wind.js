@@ -1,4 +1,4 @@
-// The wind over time: a flow, sway and gusts; the definition is WindField in gaussian_swaying/aero/wind.py.
+// The wind over time: a flow, sway and gusts; the definition is WindField in gaussian_swaying/wind/field.py.
 
 /**
  * @typedef {{kind: "sway", amplitude: number, period: number, phase: number}} Sway
@@ -83,7 +83,7 @@ export class Wind {
     this.mean(time).forEach((flow, i) => (this.carried[i] += dt * flow));
   }
 
-  /** Adds the turbulence at a place [m] to an air velocity; see CarriedField in gaussian_swaying/aero/carried.py. */
+  /** Adds the turbulence at a place [m] to an air velocity; see CarriedField in gaussian_swaying/wind/carried.py. */
   stir(/** @type {number} */ time, /** @type {Float64Array} */ place, /** @type {Float64Array} */ out) {
     const { cells, axes, side, offset, scale } = this.turbulence;
     for (let i = 0; i < 3; i++) {

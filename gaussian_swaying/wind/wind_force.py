@@ -1,0 +1,383 @@
+"""The wind on the patches of a body, as a force for ``MPMSolver.rollout``."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from copy import copy
+from functools import partial
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+
+from gaussian_swaying._checks import check_shape
+from gaussian_swaying._fixed import FixedList, changed
+from gaussian_swaying.geometry.patches import deform_patch
+from gaussian_swaying.kernels.graphs import fingerprint, record, tensors_in
+from gaussian_swaying.kernels.launch import replaces
+from gaussian_swaying.mpm.forces import MOST_STEPS, Force, Given
+from gaussian_swaying.mpm.state import State
+from gaussian_swaying.mpm.twins import Numbers, Twin
+from gaussian_swaying.wind.effects import Moment
+from gaussian_swaying.wind.field import SpatialWind, WindField
+from gaussian_swaying.wind.force import LAWS, AeroForce, capped_area
+from gaussian_swaying.wind.patches import Patches, PatchSums
+from gaussian_swaying.wind.shelter import Shelter, wind_axes
+from gaussian_swaying.wind.wind_batch import WindBatch
+
+Wind = WindField | SpatialWind
+
+
+class WindForce(Force):
+    """Wind on surface patches that deform with their particles.
+
+    Pass it to ``MPMSolver.rollout`` as one of its ``forces``. A uniform wind has a Triton twin, so on a GPU the force
+    is computed inside the kernels of the substep.
+
+    Args:
+        aero: Coefficients and law of the force.
+        wind: The wind; or one for each scene of a batch, as a list or a
+            :class:`~gaussian_swaying.wind.wind_batch.WindBatch`, which is faster for many.
+        normal: Unit normals of the patches at rest, one for each particle, shape (..., P, 3); or any number of
+            :class:`~gaussian_swaying.wind.patches.Patches`, those of the scenes of a batch one after the other.
+        area: Their areas at rest [m²], shape (..., P); zero for particles that feel no wind. None with ``Patches``.
+
+    Attributes:
+        normal: Unit normals at rest, shape (..., P, 3).
+        area: Area of the patches of each particle at rest [m²], shape (..., P).
+        sums: The sums over patches, if a particle has patches of several directions; else None, and ``normal`` is the
+            direction of each particle.
+
+    Raises:
+        ValueError: If the shapes do not agree, or the numbers of winds and scenes differ.
+
+    Example:
+        >>> up = torch.tensor([[0.0, 0.0, 1.0]])
+        >>> force = WindForce(AeroForce(C_F=0.0, C_L=0.0), WindField([0.0, 0.0, 2.0]), up, torch.ones(1))
+        >>> force.winds(torch.zeros((), dtype=torch.float64), dt=1e-3, steps=4).shape
+        torch.Size([4, 3])
+    """
+
+    def __init__(
+        self,
+        aero: AeroForce,
+        wind: Wind | WindBatch | Sequence[Wind],
+        normal: Tensor | Patches,
+        area: Tensor | None = None,
+    ) -> None:
+        super().__init__()
+        self.sums: PatchSums | None = None
+        patches = normal if isinstance(normal, Patches) else None
+        if isinstance(normal, Patches):
+            found = PatchSums(normal, coarse=aero.mostly_linear)
+            self.sums = None if found.single else found
+            normal, area = found.normals(), found.area
+        if area is None:
+            raise ValueError("Expected `area` of the patches, one for each `normal`.")
+        check_shape("normal", normal, "P", 3)
+        check_shape("area", area, normal.shape[-2])
+        if patches is not None and not isinstance(wind, nn.Module) and len(area) % max(len(wind), 1) == 0:
+            normal, area = normal.reshape(len(wind), -1, 3), area.reshape(len(wind), -1)
+        self.aero = aero
+        self.register_buffer("normal", normal, persistent=False)
+        self.register_buffer("area", area, persistent=False)
+        self.normal: Tensor
+        self.area: Tensor
+        self._shared = isinstance(wind, nn.Module) and not isinstance(wind, WindBatch)
+        self._fields = nn.ModuleList([wind] if isinstance(wind, nn.Module) else wind)
+        if not self._shared:
+            winds, scenes = len(wind), tuple(normal.shape[:-2])  # type: ignore[arg-type]
+            if scenes != (winds,) and not (isinstance(wind, WindBatch) and scenes == ()):  # () for all scenes alike
+                raise ValueError(f"Expected one `wind` for each of the {scenes} scenes, but got {winds}.")
+            if self.sums is not None and isinstance(wind, WindBatch):
+                raise ValueError(
+                    "Patches of several directions on a point need a list of winds: pass it, not a WindBatch."
+                )
+        self._key: tuple[tuple[object, ...], ...] = ()
+        self._graph: torch.cuda.CUDAGraph | None = None
+
+    def __getstate__(self) -> dict[str, object]:
+        """The state without the CUDA graph, which cannot be copied."""
+        kept = {name: value for name, value in vars(self).items() if name not in ("_now", "_dt", "_table")}
+        return kept | {"_key": (), "_graph": None}
+
+    @property
+    def wind(self) -> nn.Module | tuple[nn.Module, ...]:
+        """The wind, or one wind for each scene of a batch."""
+        return self._fields[0] if self._shared or isinstance(self._fields[0], WindBatch) else tuple(self._fields)
+
+    @property
+    def uniform(self) -> bool:
+        """True if the wind is the same everywhere in a scene."""
+        return all(bool(wind.uniform) for wind in self._fields)
+
+    @property
+    def recordable(self) -> bool:  # type: ignore[override]
+        """True if a CUDA graph can record all winds, that is, spatial winds and modulations are ``recordable``."""
+        return all(
+            wind.recordable and (isinstance(wind, (SpatialWind, WindBatch)) or type(wind) is WindField)
+            for wind in self._fields
+        )
+
+    @property
+    def device(self) -> torch.device | None:
+        """Device of the wind; None if its parts are on several devices."""
+        found = {tensor.device for tensor in self._wind_tensors()}
+        return found.pop() if len(found) == 1 else None
+
+    def _wind_tensors(self) -> list[Tensor]:
+        return tensors_in([self._fields])
+
+    def winds(self, time: Tensor, dt: float | Tensor, steps: int) -> Tensor:
+        """Velocity of a uniform wind [m/s] at the start of ``steps`` substeps of ``dt`` [s] from ``time`` [s] on.
+
+        Gusts take about seventy small kernels. On a GPU, if all modulations are ``recordable``, they are recorded in a
+        CUDA graph at the second call, and again when a number or buffer of the wind is replaced. Two threads must then
+        not use the same force at once.
+
+        Args:
+            time: Scalar float64 tensor.
+            dt: Number, or scalar float64 tensor on the same device.
+            steps: Number of substeps.
+
+        Returns:
+            Shape (steps, 3), or (steps, B, 1, 3) with one wind for each scene; float64, on the device of ``time``.
+        """
+        if time.is_cuda and torch.cuda.is_current_stream_capturing():  # a part of another graph
+            return self._winds(time, dt, steps)
+        on_gpu = time.is_cuda and self.device == time.device
+        if not (on_gpu and self.recordable and steps <= MOST_STEPS) or (
+            torch.is_grad_enabled() and any(t.requires_grad for t in self._wind_tensors())
+        ):
+            return self._winds(time, dt, steps)
+        key = fingerprint(self._fields)
+        new = self._key != key
+        if new:
+            self._key, self._graph = key, None
+            with torch.inference_mode(False):  # they must be writable inside and outside inference mode
+                self._now, self._dt = (torch.zeros((), dtype=torch.float64, device=time.device) for _ in range(2))
+        elif self._graph is None:
+            self._graph = record(time.device, self._tabulate)
+        self._now.copy_(time)
+        self._dt.copy_(dt) if isinstance(dt, Tensor) else self._dt.fill_(dt)
+        if self._graph is None:  # the first time without a graph, so that all kernels are loaded before recording
+            self._tabulate()
+        else:
+            self._graph.replay()
+        return self._table[:steps].clone()
+
+    def _tabulate(self) -> None:
+        self._table = self._winds(self._now, self._dt, MOST_STEPS)
+
+    def _winds(self, time: Tensor, dt: float | Tensor, steps: int) -> Tensor:
+        times = time + torch.arange(steps, dtype=torch.float64, device=time.device) * dt
+        if self._shared:
+            return _blow(self._fields[0], times)
+        if isinstance(self._fields[0], WindBatch):
+            return self._fields[0](times)[:, :, None]
+        return torch.stack([_blow(wind, times) for wind in self._fields], dim=1)[:, :, None]
+
+    def air(self, time: Tensor, position: Tensor) -> Tensor:
+        """Air velocity at given positions [m/s].
+
+        Args:
+            time: Time [s], scalar float64 tensor.
+            position: Positions [m], shape (..., P, 3).
+
+        Returns:
+            Broadcastable to (..., P, 3).
+        """
+        if self.uniform:
+            return self._winds(time, 0.0, 1)[0]
+        if self._shared:
+            return _air(self._fields[0], time, position)
+        parts = [_air(wind, time, place) for wind, place in zip(self._fields, position, strict=True)]
+        return torch.stack([part.to(position).expand_as(position[0]) for part in parts])
+
+    def samples(self, state: State, dt: float, steps: int) -> Tensor:
+        """Air velocity [m/s] at the particles of a state, at ``steps`` times, ``dt`` [s] apart, starting at its time.
+
+        Returns:
+            Shape (steps, ...), broadcastable to (steps, ..., P, 3) from its second axis on.
+        """
+        if self.uniform:
+            return self.winds(state.time, dt, steps)
+        return torch.stack([self.air(state.time + k * dt, state.position) for k in range(steps)])
+
+    def force(self, state: State, wind: Tensor) -> tuple[Tensor, Tensor | None]:
+        """Force on every particle [N] (..., P, 3), and the resistance of a semi-implicit drag [kg/s] (..., P) or None.
+
+        Args:
+            state: The state at the start of the substep.
+            wind: Air velocity [m/s], broadcastable to (..., P, 3).
+        """
+        if self.sums is not None:
+            shape = state.velocity.shape
+            flat, F = state.velocity.reshape(-1, 3), state.F_total.reshape(-1, 3, 3)
+            blown = wind if wind.ndim == 1 else wind.expand(shape).reshape(-1, 3)
+            force, area = self.aero.on_groups(blown, flat, F, self.sums)
+            resistance = self.aero.resistance(blown, flat, area)
+            return force.reshape(shape), None if resistance is None else resistance.reshape(shape[:-1])
+        normal, area = deform_patch(state.F_total, self.normal, self.area)
+        area = capped_area(area, self.area, self.aero.max_area_ratio)
+        return self.aero(wind, state.velocity, normal, area), self.aero.resistance(wind, state.velocity, area)
+
+    def forward(self, state: State) -> tuple[Tensor, Tensor | None]:
+        """:meth:`force` in the wind of ``state.time``."""
+        return self.force(state, self.air(state.time, state.position))
+
+    def _shelters(self) -> list[Shelter]:
+        wind = self._fields[0]
+        if not (self._shared and isinstance(wind, WindField)):
+            return []
+        return [effect for effect in wind.effects if isinstance(effect, Shelter)]
+
+    def foreseen(self, state: State) -> WindForce:
+        """The same force as it will be in the frame that starts with a state; this one does not change.
+
+        Shelters of the result have tables of their own, as this one may be in use on another stream.
+        """
+        if not self._shelters():
+            return self
+        wind = self._fields[0]
+        assert isinstance(wind, WindField)
+        effects = [
+            changed(effect, **{name: held.clone() for name, held in effect.named_buffers()})
+            if isinstance(effect, Shelter)
+            else copy(effect)
+            for effect in wind.effects
+        ]
+        other = changed(self, _fields=nn.ModuleList([changed(wind, effects=FixedList(effects))]))
+        other.refresh(state)
+        return other
+
+    def refreshed(self) -> list[Tensor]:
+        """The tensors that :meth:`refresh` writes."""
+        return tensors_in(self._shelters())
+
+    def refresh(self, state: State) -> None:
+        """Update each :class:`~gaussian_swaying.wind.shelter.Shelter` from the body's present shape; once in a frame.
+
+        Args:
+            state: The state at the start of the frame.
+        """
+        wind, shelters = self._fields[0], self._shelters()
+        if not shelters or state.position.ndim > 2:
+            return
+        assert isinstance(wind, WindField)
+        with torch.no_grad():
+            flow = wind.mean_flow(state.time)
+            axes = wind_axes(flow)
+            still = state.replace(velocity=torch.zeros_like(state.velocity))
+            force, _ = self.force(still, axes[0].to(still.velocity))  # in a wind of 1 m/s
+            area = (force * axes[0].to(force)).sum(-1).clamp(min=0) / max(0.5 * self.aero.air_density, 1e-30)
+            area = area * (flow.square().sum() > 0)
+            for shelter in shelters:
+                shelter.refresh(state.position, area, axes)
+
+    def during(self, time: Tensor, dt: float, steps: int) -> Callable[[State, int], Given]:
+        """See ``Force.during``: a uniform wind is computed for all substeps at once."""
+        if self.uniform:
+            winds = self.winds(time, dt, steps)
+            return lambda state, k: self.force(state, winds[k])
+        wind = self._fields[0]
+        if not (self._shared and isinstance(wind, WindField)):
+            return super().during(time, dt, steps)
+        times = time + torch.arange(steps, dtype=torch.float64, device=time.device) * dt
+        moments = list(map(Moment, times, wind.mean_flow(times), wind.carried(times)))
+        blown = _blow(wind, times)
+        return lambda state, k: self.force(state, wind.shaped(blown[k], state.position, moments[k]))
+
+    def on_sites(self, site: Tensor, count: int) -> WindForce:
+        """The wind on the patches of groups of points, with a drag that is semi-implicit; see ``Force.on_sites``."""
+        scenes = max(1, site.shape[:-1].numel())
+        shift = count * torch.arange(scenes, device=site.device)[:, None]
+        group = (site.reshape(scenes, -1) + shift).reshape(-1)
+        aero = changed(self.aero, drag_step="semi_implicit")
+        if self.sums is not None:
+            sums = self.sums.grouped(group, scenes * count, aero.mostly_linear)
+        else:
+            normal, area = self.normal.expand(*site.shape, 3).reshape(-1, 3), self.area.expand(site.shape).reshape(-1)
+            sums = PatchSums(Patches(normal, area, group, scenes * count), coarse=aero.mostly_linear)
+        area = sums.area.reshape(*site.shape[:-1], count)
+        return changed(self, aero=aero, sums=sums, area=area, normal=area.new_zeros(*area.shape, 3))
+
+    def twin(self) -> Twin | None:
+        """See :class:`~gaussian_swaying.mpm.twins.Twin`; None if an effect has none, or the lists are too long."""
+        wind, aero, sums = self._fields[0], self.aero, self.sums
+        if sums is not None and sums.rows >= 2**24:  # rows are counted in float32
+            return None
+        parts: tuple[Twin, ...] = ()
+        if not self.uniform:
+            if not (self._shared and type(wind) is WindField):
+                return None
+            found = [effect.twin() for effect in wind.effects]  # type: ignore[operator]
+            parts = tuple(part for part in found if part is not None)
+            if len(parts) < len(found):
+                return None
+        from gaussian_swaying.wind.force_adjoint_triton import wind_force_adjoint, wind_on_groups_adjoint
+        from gaussian_swaying.wind.force_triton import wind_force, wind_on_groups
+
+        def numbers() -> Tensor:
+            half, widest = (torch.full_like(aero.C_D, v) for v in (0.5 * aero.air_density, aero.max_area_ratio))
+            return torch.stack([aero.C_D, aero.C_F, aero.C_L, half, widest])
+
+        implicit = aero.drag_step == "semi_implicit"
+        smooth = self.uniform and not implicit
+        width = 3 + sum(part.per_substep.count for part in parts)
+        patches: dict[str, Any] = {
+            "function": wind_force,
+            "per_point": Numbers(
+                4, lambda: torch.cat([self.normal.expand(*self.area.shape, 3), self.area[..., None]], dim=-1)
+            ),
+            "sources": (self.normal, self.area),
+            "adjoint": wind_force_adjoint if smooth else None,
+        }
+        if sums is not None:
+            patches = {
+                "function": wind_on_groups,
+                "per_point": Numbers(2, lambda: sums.lists().reshape(*self.area.shape, 2)),
+                "table": Numbers(4 * sums.rows, sums.table),
+                "sources": (sums.tensor, sums.vector),
+                "adjoint": wind_on_groups_adjoint if smooth else None,
+            }
+        return Twin(
+            options=(LAWS.index(aero.law), implicit),
+            numbers=Numbers(5, numbers),
+            per_substep=Numbers(width, partial(self._with_effects, parts) if parts else self.winds),
+            implicit=implicit,
+            parts=parts,
+            **patches,
+        )
+
+    def _with_effects(self, parts: Sequence[Twin], time: Tensor, dt: float | Tensor, steps: int) -> Tensor:
+        """As :meth:`winds`, and the numbers of the twins of the effects at these times, shape (steps, n)."""
+        wind = self._fields[0]
+        assert isinstance(wind, WindField)
+        times = time + torch.arange(steps, dtype=torch.float64, device=time.device) * dt
+        asked = [part.per_substep for part in parts if part.per_substep.count]
+        rows = [_blow(wind, times)]
+        if asked:
+            moment = Moment(times, wind.mean_flow(times), wind.carried(times))
+            rows += [torch.as_tensor(numbers.take(moment)) for numbers in asked]
+        return torch.cat(rows, dim=-1)
+
+
+def _air(wind: nn.Module, time: Tensor, position: Tensor) -> Tensor:
+    found: Tensor = wind.at(time, position) if isinstance(wind, WindField) else wind(time, position)
+    return found
+
+
+def _blow(wind: nn.Module, times: Tensor) -> Tensor:
+    """Velocity of a uniform wind at times (n,) [s], on their device; on a GPU in one kernel. Shape (n, 3).
+
+    A CPU saves little by it, and a batch of winds has the bits of each wind.
+    """
+    if times.is_cuda and replaces((times, *tensors_in([wind])), dtype=None):
+        from gaussian_swaying.wind.wind_triton import blow
+
+        found = blow(wind, times)
+        if found is not None:
+            return found
+    velocity: Tensor = wind(times)
+    return velocity.to(times.device)
