@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Sequence
-from dataclasses import KW_ONLY, dataclass, field, replace
+from dataclasses import KW_ONLY, dataclass, field
 
 import torch
 from torch import Tensor, nn
@@ -18,9 +18,9 @@ from gaussian_swaying.mpm.protocol import Solver
 from gaussian_swaying.recording.recorder import Recorder
 from gaussian_swaying.simulation.parameters import Setup
 from gaussian_swaying.simulation.simulated_scene import SimulatedScene
-from gaussian_swaying.wind.copied_wind import CopiedWind
 from gaussian_swaying.wind.field import WindField
 from gaussian_swaying.wind.shelter import Shelter
+from gaussian_swaying.wind.wind_force import Places, Wind
 
 RENDERS = ("color", "depth", "normal")
 """Renders of a run with copies."""
@@ -63,8 +63,7 @@ class Copies(nn.Module):
         boundaries: The boundaries of the solver; the turns are about what its pins hold.
 
     Attributes:
-        turn: Rotation of each copy, z up, shape (B, 3, 3), float64.
-        shift: Places are turned by it and then moved by this [m], shape (B, 3), float64.
+        places: Their places in the wind.
         rotation: ``A``, the rotation along the axes of the scene, shape (B, 3, 3), float64.
         offset: ``b`` [scene units], shape (B, 3), float64.
     """
@@ -78,27 +77,25 @@ class Copies(nn.Module):
         shift = shift + (eye - turn) @ _foot(scene, boundaries)
         rotation = eye + axes.T @ (turn - eye) @ axes  # exactly I where the copy is not turned
         offset = (eye - rotation) @ frame.origin + shift @ axes / frame.metres_per_unit
-        for name, value in {"turn": turn, "shift": shift, "rotation": rotation, "offset": offset}.items():
+        delay = torch.tensor([copy.delay for copy in copies], dtype=torch.float64)
+        self.places = Places(turn, shift, delay)
+        for name, value in {"rotation": rotation, "offset": offset}.items():
             self.register_buffer(name, value, persistent=False)
-        self.turn: Tensor
-        self.shift: Tensor
         self.rotation: Tensor
         self.offset: Tensor
 
     def __len__(self) -> int:
         return len(self.copies)
 
-    def setups(self, setup: Setup) -> tuple[Setup, ...]:
-        """The setups of a batch: that of the object, each with the wind of a copy."""
-        home = setup.scene.identity.device
-        found = []
-        for number, copy in enumerate(self.copies):
-            seed = copy.seed
-            if seed is None and copy.delay == 0 and isinstance(setup.wind, WindField):
-                seed = setup.wind.seed + number
-            place = (self.turn[number].to(home), self.shift[number].to(home))
-            found.append(replace(setup, wind=CopiedWind(setup.wind, *place, copy.delay, seed)))
-        return tuple(found)
+    def winds(self, wind: Wind) -> Wind | Sequence[Wind]:
+        """The wind of the object with the gusts of each copy."""
+        if not isinstance(wind, WindField):
+            return [wind] * len(self)
+        own = int(wind.seed)
+        return wind.with_seeds([
+            copy.seed if copy.seed is not None else own + number * (copy.delay == 0)
+            for number, copy in enumerate(self.copies)
+        ])  # fmt: skip
 
     def place(self, copy: int, points: Tensor) -> Tensor:
         """Points (..., 3) of the object as they lie in a copy [scene units]; computed in float64, for far copies."""
@@ -134,6 +131,8 @@ def _why_not(copies: Sequence[Copy], setup: Setup, solver: Solver) -> str | None
         return "`copies` cannot have `forces` yet, as these act on one object: remove them."
     if isinstance(wind, WindField) and any(isinstance(effect, Shelter) for effect in wind.effects):
         return "`copies` cannot have a Shelter yet, which belongs to one object: remove it from `wind.effects`."
+    if any(copy.seed is not None for copy in copies) and not isinstance(wind, WindField):
+        return "Expected `copies.seed` null with a wind of your own, which has no seed: use `delay`."
     if any(copy.turn for copy in copies) and any(solver.gravity[:2]):
         return "`copies` with a `turn` need `solver.gravity` along z: each is simulated in its own turned axes."
     return None

@@ -45,8 +45,7 @@ from gaussian_swaying.wind.computed_air import AirInBox
 from gaussian_swaying.wind.field import WindField
 from gaussian_swaying.wind.patches import Patches
 from gaussian_swaying.wind.shelter import Shelter
-from gaussian_swaying.wind.wind_batch import WindBatch, why_apart
-from gaussian_swaying.wind.wind_force import WindForce
+from gaussian_swaying.wind.wind_force import Wind, WindForce
 
 CFL_SAMPLES = 8  # checks per frame, as material may stiffen and soften again within it
 MAX_WIND = 1e6  # m/s; anything above is a mistake and would overflow positions
@@ -121,7 +120,7 @@ class Stepper:
     # ---- what acts
 
     def _spread(self, setup: Setup) -> tuple[Setup, ...]:
-        return (setup,) if self.copies is None else self.copies.setups(setup)
+        return (setup,) * (1 if self.copies is None else len(self.copies))
 
     @property
     def scene(self) -> SimulatedScene:
@@ -139,9 +138,21 @@ class Stepper:
         parts = (first.aero, first.scene.patches, *(setup.wind for setup in self.setups))
         if self._wind_force is None or any(a is not b for a, b in zip(self._wind_force[0], parts, strict=True)):
             with torch.inference_mode(False), torch.no_grad():  # it outlives the call
-                alone = WindForce(first.aero, first.wind, first.scene.patches)
-                self._wind_force = parts, _wind_on(self.setups, alone) if self.batched else alone
+                self._wind_force = parts, self._wind_on()
         return self._wind_force[1]
+
+    def _wind_on(self) -> WindForce:
+        """The wind on the patches of all scenes, computed together where it can be."""
+        first, winds, places = self.setups[0], [setup.wind for setup in self.setups], None
+        alone = WindForce(first.aero, first.wind, first.scene.patches)
+        if not self.batched:
+            return alone
+        wind: Wind | Sequence[Wind] = WindField.together(winds) or winds
+        if self.copies is not None:
+            wind, places = self.copies.winds(first.wind), self.copies.places.to(self.device)
+        if alone.sums is None:
+            return WindForce(first.aero, wind, alone.normal, alone.area, places)
+        return WindForce(first.aero, wind, _repeated(first.scene.patches, len(winds)), places=places)
 
     @property
     def materials(self) -> tuple[MaterialPoints, ...]:
@@ -665,15 +676,6 @@ def why_not_batched(setup: Setup) -> str | None:
     if setup.scene.surface_places is not None:
         return "the object touches itself or an obstacle; set `contact` to null, and remove the obstacles"
     return None
-
-
-def _wind_on(setups: Sequence[Setup], one: WindForce) -> WindForce:
-    """The winds of a batch on the patches of its scenes, computed together where they can be; ``one`` is the first."""
-    first, winds = setups[0], [setup.wind for setup in setups]
-    if one.sums is None and why_apart(winds) is None:
-        joined = WindBatch([wind for wind in winds if isinstance(wind, WindField)])
-        return WindForce(first.aero, joined, one.normal, one.area)
-    return WindForce(first.aero, winds, _repeated(first.scene.patches, len(winds)))
 
 
 def _repeated(patches: Patches, count: int) -> Patches:

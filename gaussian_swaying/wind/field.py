@@ -11,7 +11,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
-from typing import Literal
+from typing import Literal, TypeVar
 
 import torch
 from torch import Tensor, nn
@@ -30,6 +30,8 @@ from gaussian_swaying.kernels.graphs import Recordable
 from gaussian_swaying.wind.effects import Moment, WindEffect
 from gaussian_swaying.wind.lookup import picked
 from gaussian_swaying.wind.wind_files import read_anemometer
+
+M = TypeVar("M", bound=nn.Module)
 
 
 def _signed(value: int) -> int:
@@ -90,15 +92,17 @@ class Modulation(Recordable, nn.Module, ABC):
     """Base of all modulations, which change the wind velocity at a given time."""
 
     live_as = "wind.modulations.*"
+    numbers: tuple[str, ...] = ()
+    """Names of its numbers, if those of several scenes can be tensors of shape (B,)."""
 
     @abstractmethod
-    def forward(self, velocity: Tensor, time: Tensor, seed: int, stream: int) -> Tensor:
+    def forward(self, velocity: Tensor, time: Tensor, seed: int | Tensor, stream: int) -> Tensor:
         """Return the modulated velocity.
 
         Args:
             velocity: Air velocity [m/s], shape (..., 3), float64.
             time: Time [s], shape (...), float64.
-            seed: Seed of the run.
+            seed: Seed of the run; of several scenes, one for each, shape (B,).
             stream: Position of this modulation in the list of its WindField.
         """
 
@@ -113,6 +117,7 @@ class SineSway(Modulation):
     """
 
     recordable = True
+    numbers = ("amplitude", "period", "phase")
 
     def __init__(self, amplitude: float = 0.5, period: float = 2.0, phase: float = 0.0) -> None:
         super().__init__()
@@ -121,7 +126,7 @@ class SineSway(Modulation):
         check_vector("phase", [phase], 1)
         self.amplitude, self.period, self.phase = float(amplitude), float(period), float(phase)
 
-    def forward(self, velocity: Tensor, time: Tensor, seed: int, stream: int) -> Tensor:
+    def forward(self, velocity: Tensor, time: Tensor, seed: int | Tensor, stream: int) -> Tensor:
         """Scale the largest component by ``1 + amplitude sin(2 pi t / period + phase)``."""
         largest = nn.functional.one_hot(velocity.detach().abs().argmax(-1), 3)
         sway = self.amplitude * torch.sin(2 * math.pi * time / self.period + self.phase)
@@ -137,6 +142,7 @@ class UniformGust(Modulation):
     """
 
     recordable = True
+    numbers = ("delta", "interval")
 
     def __init__(self, delta: float = 0.3, interval: float = 0.04) -> None:
         super().__init__()
@@ -144,10 +150,10 @@ class UniformGust(Modulation):
         check_positive("interval", interval)
         self.delta, self.interval = float(delta), float(interval)
 
-    def forward(self, velocity: Tensor, time: Tensor, seed: int, stream: int) -> Tensor:
+    def forward(self, velocity: Tensor, time: Tensor, seed: int | Tensor, stream: int) -> Tensor:
         """Scale all components by one random factor."""
-        u = counter_uniform(seed, stream, sample_index(time, self.interval), 1)
-        return velocity * (1 + self.delta * (2 * u - 1))
+        u = counter_uniform(seed, stream, sample_index(time, self.interval), 1)[..., 0]
+        return velocity * (1 + self.delta * (2 * u - 1))[..., None]
 
 
 class GaussianGust(Modulation):
@@ -160,6 +166,7 @@ class GaussianGust(Modulation):
     """
 
     recordable = True
+    numbers = ("std", "interval")
 
     def __init__(self, std: float = 0.3, interval: float = 0.04) -> None:
         super().__init__()
@@ -167,9 +174,10 @@ class GaussianGust(Modulation):
         check_positive("interval", interval)
         self.std, self.interval = float(std), float(interval)
 
-    def forward(self, velocity: Tensor, time: Tensor, seed: int, stream: int) -> Tensor:
+    def forward(self, velocity: Tensor, time: Tensor, seed: int | Tensor, stream: int) -> Tensor:
         """Add independent noise to the three components."""
-        return velocity + self.std * counter_normal(seed, stream, sample_index(time, self.interval), 3)
+        noise = counter_normal(seed, stream, sample_index(time, self.interval), 3)
+        return velocity + (self.std * noise.movedim(-1, 0)).movedim(0, -1)
 
 
 @fixed
@@ -235,6 +243,9 @@ def _row(name: str, flow: VectorLike) -> Tensor | tuple[float, ...]:
 class WindField(Fixed, nn.Module):
     """Air velocity over time; the same everywhere in the scene, unless it has effects.
 
+    :meth:`together` makes one of the winds of several scenes: ``flows`` and the numbers of the modulations then have an
+    axis of B scenes, and so has every velocity.
+
     Args:
         flow: Steady air velocity [m/s], z up; null with a ``schedule``. In Python also a tensor of shape (3,), which
             keeps its gradient.
@@ -278,12 +289,56 @@ class WindField(Fixed, nn.Module):
         self.register_buffer("flows", flows)
         self.times: Tensor
         self.flows: Tensor
-        self.interpolation, self.seed = interpolation, int(seed)
+        self.interpolation = interpolation
+        self.seed: int | Tensor = int(seed)
         self.modulations = FixedList(modulations)
         self._in_metres = False  # whether `in_frame` made it
         moving = [row.detach() for row in flows if bool(row.any())]
         first = moving[0] if moving else torch.zeros(3, dtype=torch.float64)
         self.effects = FixedList(effect.along(first) for effect in effects)
+
+    @staticmethod
+    def together(winds: Sequence[nn.Module]) -> WindField | None:
+        """Uniform winds of the same kind, one for each scene of a batch, as one; None if they cannot be.
+
+        A list of winds does the same, but the host then goes through all of them before every rollout. Their numbers
+        are copied: later changes of the winds have no effect.
+
+        Example:
+            >>> both = WindField.together([WindField([2.0, 0.0, 0.0]), WindField([3.0, 0.0, 0.0])])
+            >>> both(0.0)
+            tensor([[2., 0., 0.],
+                    [3., 0., 0.]], dtype=torch.float64)
+        """
+        fields = [wind for wind in winds if isinstance(wind, WindField) and wind._known]
+        kinds = {(wind.interpolation, *map(type, wind.modulations)) for wind in fields}
+        if len(fields) < len(winds) or len(kinds) != 1:
+            return None
+        times = torch.cat([wind.times for wind in fields]).unique()
+        seeds = _seeds([int(wind.seed) for wind in fields], times)
+        flows = torch.stack([wind.mean_flow(times) for wind in fields], dim=1)
+        parts = []
+        for same in zip(*[wind.modulations for wind in fields], strict=True):
+            numbers = {name: times.new_tensor([getattr(part, name) for part in same]) for name in same[0].numbers}
+            parts.append(_with_buffers(same[0], **numbers))
+        return changed(_with_buffers(fields[0], times=times, flows=flows, seed=seeds), modulations=FixedList(parts))
+
+    def with_seeds(self, seeds: Sequence[int]) -> WindField | list[WindField]:
+        """The same wind with other gusts for each of several scenes; as one wind if it can be."""
+        if self._known:
+            return _with_buffers(self, seed=_seeds(seeds, self.times))
+        return [changed(self, seed=seed) for seed in seeds]
+
+    @property
+    def _known(self) -> bool:
+        """Whether its numbers can be those of several scenes."""
+        parts = all("numbers" in vars(type(part)) for part in self.modulations)
+        return type(self) is WindField and self.uniform and isinstance(self.seed, int) and parts
+
+    @property
+    def scenes(self) -> int | None:
+        """Number of scenes with winds of their own; None for one wind."""
+        return self.flows.shape[1] if self.flows.ndim > 2 else None
 
     @property
     def uniform(self) -> bool:
@@ -311,19 +366,26 @@ class WindField(Fixed, nn.Module):
         rows = flow_rows("flow", flows)
         return changed(self, flows=rows, times=self.times.new_tensor(times), interpolation="linear")
 
+    def _keys(self, time: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """The entries of the schedule before and after times (...), and the time since the former [s]."""
+        last = self.times.numel() - 1
+        key = (torch.searchsorted(self.times, time.contiguous(), right=True) - 1).clamp(0, last)
+        return key, (key + 1).clamp(max=last), self._wide(time - picked(self.times, key))
+
+    def _wide(self, value: Tensor) -> Tensor:
+        """Numbers (...) as factors of flows (..., 3) or (..., B, 3)."""
+        return value.reshape(*value.shape, *[1] * (self.flows.ndim - 1))
+
     def mean_flow(self, time: Tensor) -> Tensor:
         """The flow without modulations [m/s] at times [s] of shape (...); shape (..., 3), float64."""
-        last = self.times.numel() - 1
-        if last == 0:
-            return self.flows[0].expand(*time.shape, 3)
-        key = (torch.searchsorted(self.times, time.contiguous(), right=True) - 1).clamp(0, last)
+        if self.times.numel() == 1:
+            return self.flows[0].expand(*time.shape, *self.flows.shape[1:])
+        key, after, past = self._keys(time)
         before = picked(self.flows, key)
         if self.interpolation == "step":
             return before
-        after, begin = (key + 1).clamp(max=last), picked(self.times, key)
-        span = (picked(self.times, after) - begin).clamp(min=1e-12)
-        share = ((time - begin) / span).clamp(0, 1)[..., None]
-        return torch.lerp(before, picked(self.flows, after), share)
+        span = (picked(self.times, after) - picked(self.times, key)).clamp(min=1e-12)
+        return torch.lerp(before, picked(self.flows, after), (past / self._wide(span)).clamp(0, 1))
 
     def carried(self, time: Tensor) -> Tensor:
         """Return the displacement of the air by the flow without modulations since time zero [m].
@@ -335,18 +397,14 @@ class WindField(Fixed, nn.Module):
             Shape (..., 3), float64.
         """
         if self.times.numel() == 1:
-            return time[..., None] * self.flows[0]
-        span = (self.times[1:] - self.times[:-1])[:, None]
+            return self._wide(time) * self.flows[0]
+        span = self._wide(self.times[1:] - self.times[:-1])
         mean = self.flows[:-1] if self.interpolation == "step" else 0.5 * (self.flows[:-1] + self.flows[1:])
         sums = torch.cat([torch.zeros_like(self.flows[:1]), (span * mean).cumsum(0)])
-        both = torch.stack([torch.zeros_like(time), time])
-        last = self.times.numel() - 1
-        key = (torch.searchsorted(self.times, both, right=True) - 1).clamp(0, last)
-        past = (both - self.times[key])[..., None]
+        key, after, past = self._keys(torch.stack([torch.zeros_like(time), time]))
         found = sums[key] + past * self.flows[key]
         if self.interpolation == "linear":
-            after = (key + 1).clamp(max=last)
-            length = (self.times[after] - self.times[key]).clamp(min=1e-12)[..., None]
+            length = self._wide((self.times[after] - self.times[key]).clamp(min=1e-12))
             found = found + 0.5 * past.clamp(min=0) ** 2 / length * (self.flows[after] - self.flows[key])
         return found[1] - found[0]
 
@@ -394,10 +452,25 @@ class WindField(Fixed, nn.Module):
             time: Time [s], shape (...), or a number.
 
         Returns:
-            Velocity [m/s], z up, shape (..., 3), float64.
+            Velocity [m/s], z up, shape (..., 3) or, of several scenes, (..., B, 3); float64.
         """
         time = torch.as_tensor(time, dtype=torch.float64, device=self.times.device)
         velocity = self.mean_flow(time)
+        time = self._wide(time)[..., 0].expand(velocity.shape[:-1])
         for stream, modulation in enumerate(self.modulations):
             velocity = modulation(velocity, time, self.seed, stream)
         return velocity
+
+
+def _seeds(seeds: Sequence[int], like: Tensor) -> Tensor:
+    """Seeds as signed numbers of 64 bits on the device of a tensor: the generator only uses these."""
+    return torch.tensor(list(map(_signed, seeds)), device=like.device)
+
+
+def _with_buffers(module: M, **tensors: Tensor) -> M:
+    """A copy of a module with tensors in place of numbers."""
+    other = changed(module)
+    for name in tensors:
+        vars(other).pop(name, None)
+    other._buffers.update(tensors)
+    return other

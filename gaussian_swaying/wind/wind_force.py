@@ -13,9 +13,9 @@ from torch import Tensor, nn
 from gaussian_swaying._checks import check_shape
 from gaussian_swaying._fixed import FixedList, changed
 from gaussian_swaying.geometry.patches import deform_patch
-from gaussian_swaying.kernels.graphs import fingerprint, record, tensors_in
+from gaussian_swaying.kernels.graphs import tensors_in
 from gaussian_swaying.kernels.launch import replaces
-from gaussian_swaying.mpm.forces import MOST_STEPS, Force, Given
+from gaussian_swaying.mpm.forces import Force, Given
 from gaussian_swaying.mpm.state import State
 from gaussian_swaying.mpm.twins import Numbers, Twin
 from gaussian_swaying.wind.effects import Moment
@@ -23,9 +23,26 @@ from gaussian_swaying.wind.field import SpatialWind, WindField
 from gaussian_swaying.wind.force import LAWS, AeroForce, capped_area
 from gaussian_swaying.wind.patches import Patches, PatchSums
 from gaussian_swaying.wind.shelter import Shelter, wind_axes
-from gaussian_swaying.wind.wind_batch import WindBatch
 
 Wind = WindField | SpatialWind
+
+
+class Places(nn.Module):
+    """Where copies of an object stand in one wind: each is simulated as if it stood at the place of the original.
+
+    Args:
+        turn: Rotation from the axes of the original to those of the scene, shape (B, 3, 3), float64.
+        shift: Places are turned by it and then moved by this [m], shape (B, 3), float64.
+        delay: Time by which the wind comes later [s], shape (B,), float64.
+    """
+
+    def __init__(self, turn: Tensor, shift: Tensor, delay: Tensor) -> None:
+        super().__init__()
+        for name, value in {"turn": turn, "shift": shift, "delay": delay}.items():
+            self.register_buffer(name, value, persistent=False)
+        self.turn: Tensor
+        self.shift: Tensor
+        self.delay: Tensor
 
 
 class WindForce(Force):
@@ -36,11 +53,12 @@ class WindForce(Force):
 
     Args:
         aero: Coefficients and law of the force.
-        wind: The wind; or one for each scene of a batch, as a list or a
-            :class:`~gaussian_swaying.wind.wind_batch.WindBatch`, which is faster for many.
+        wind: The wind; or one for each scene of a batch, as a list or by ``WindField.together``, which is faster for
+            many.
         normal: Unit normals of the patches at rest, one for each particle, shape (..., P, 3); or any number of
             :class:`~gaussian_swaying.wind.patches.Patches`, those of the scenes of a batch one after the other.
         area: Their areas at rest [m²], shape (..., P); zero for particles that feel no wind. None with ``Patches``.
+        places: The places of the scenes in one wind that they share.
 
     Attributes:
         normal: Unit normals at rest, shape (..., P, 3).
@@ -61,9 +79,10 @@ class WindForce(Force):
     def __init__(
         self,
         aero: AeroForce,
-        wind: Wind | WindBatch | Sequence[Wind],
+        wind: Wind | Sequence[Wind],
         normal: Tensor | Patches,
         area: Tensor | None = None,
+        places: Places | None = None,
     ) -> None:
         super().__init__()
         self.sums: PatchSums | None = None
@@ -76,35 +95,27 @@ class WindForce(Force):
             raise ValueError("Expected `area` of the patches, one for each `normal`.")
         check_shape("normal", normal, "P", 3)
         check_shape("area", area, normal.shape[-2])
-        if patches is not None and not isinstance(wind, nn.Module) and len(area) % max(len(wind), 1) == 0:
-            normal, area = normal.reshape(len(wind), -1, 3), area.reshape(len(wind), -1)
+        self._fields = nn.ModuleList([wind] if isinstance(wind, nn.Module) else wind)
+        self.places = places
+        several = None if places is None else len(places.delay)
+        scenes = several or (wind.scenes if isinstance(wind, WindField) else None)
+        scenes = scenes if isinstance(wind, nn.Module) else len(wind)
+        if patches is not None and scenes and len(area) % scenes == 0:
+            normal, area = normal.reshape(scenes, -1, 3), area.reshape(scenes, -1)
         self.aero = aero
         self.register_buffer("normal", normal, persistent=False)
         self.register_buffer("area", area, persistent=False)
         self.normal: Tensor
         self.area: Tensor
-        self._shared = isinstance(wind, nn.Module) and not isinstance(wind, WindBatch)
-        self._fields = nn.ModuleList([wind] if isinstance(wind, nn.Module) else wind)
-        if not self._shared:
-            winds, scenes = len(wind), tuple(normal.shape[:-2])  # type: ignore[arg-type]
-            if scenes != (winds,) and not (isinstance(wind, WindBatch) and scenes == ()):  # () for all scenes alike
-                raise ValueError(f"Expected one `wind` for each of the {scenes} scenes, but got {winds}.")
-            if self.sums is not None and isinstance(wind, WindBatch):
-                raise ValueError(
-                    "Patches of several directions on a point need a list of winds: pass it, not a WindBatch."
-                )
-        self._key: tuple[tuple[object, ...], ...] = ()
-        self._graph: torch.cuda.CUDAGraph | None = None
-
-    def __getstate__(self) -> dict[str, object]:
-        """The state without the CUDA graph, which cannot be copied."""
-        kept = {name: value for name, value in vars(self).items() if name not in ("_now", "_dt", "_table")}
-        return kept | {"_key": (), "_graph": None}
+        self._shared = scenes is None
+        given = tuple(normal.shape[:-2])
+        if scenes is not None and given not in ((scenes,), ()):  # () for all scenes alike
+            raise ValueError(f"Expected one `wind` for each of the {given} scenes, but got {scenes}.")
 
     @property
     def wind(self) -> nn.Module | tuple[nn.Module, ...]:
-        """The wind, or one wind for each scene of a batch."""
-        return self._fields[0] if self._shared or isinstance(self._fields[0], WindBatch) else tuple(self._fields)
+        """The wind, or a list with one wind for each scene of a batch."""
+        return self._fields[0] if len(self._fields) == 1 else tuple(self._fields)
 
     @property
     def uniform(self) -> bool:
@@ -115,25 +126,11 @@ class WindForce(Force):
     def recordable(self) -> bool:  # type: ignore[override]
         """True if a CUDA graph can record all winds, that is, spatial winds and modulations are ``recordable``."""
         return all(
-            wind.recordable and (isinstance(wind, (SpatialWind, WindBatch)) or type(wind) is WindField)
-            for wind in self._fields
+            wind.recordable and (isinstance(wind, SpatialWind) or type(wind) is WindField) for wind in self._fields
         )
-
-    @property
-    def device(self) -> torch.device | None:
-        """Device of the wind; None if its parts are on several devices."""
-        found = {tensor.device for tensor in self._wind_tensors()}
-        return found.pop() if len(found) == 1 else None
-
-    def _wind_tensors(self) -> list[Tensor]:
-        return tensors_in([self._fields])
 
     def winds(self, time: Tensor, dt: float | Tensor, steps: int) -> Tensor:
         """Velocity of a uniform wind [m/s] at the start of ``steps`` substeps of ``dt`` [s] from ``time`` [s] on.
-
-        Gusts take about seventy small kernels. On a GPU, if all modulations are ``recordable``, they are recorded in a
-        CUDA graph at the second call, and again when a number or buffer of the wind is replaced. Two threads must then
-        not use the same force at once.
 
         Args:
             time: Scalar float64 tensor.
@@ -143,39 +140,16 @@ class WindForce(Force):
         Returns:
             Shape (steps, 3), or (steps, B, 1, 3) with one wind for each scene; float64, on the device of ``time``.
         """
-        if time.is_cuda and torch.cuda.is_current_stream_capturing():  # a part of another graph
-            return self._winds(time, dt, steps)
-        on_gpu = time.is_cuda and self.device == time.device
-        if not (on_gpu and self.recordable and steps <= MOST_STEPS) or (
-            torch.is_grad_enabled() and any(t.requires_grad for t in self._wind_tensors())
-        ):
-            return self._winds(time, dt, steps)
-        key = fingerprint(self._fields)
-        new = self._key != key
-        if new:
-            self._key, self._graph = key, None
-            with torch.inference_mode(False):  # they must be writable inside and outside inference mode
-                self._now, self._dt = (torch.zeros((), dtype=torch.float64, device=time.device) for _ in range(2))
-        elif self._graph is None:
-            self._graph = record(time.device, self._tabulate)
-        self._now.copy_(time)
-        self._dt.copy_(dt) if isinstance(dt, Tensor) else self._dt.fill_(dt)
-        if self._graph is None:  # the first time without a graph, so that all kernels are loaded before recording
-            self._tabulate()
-        else:
-            self._graph.replay()
-        return self._table[:steps].clone()
-
-    def _tabulate(self) -> None:
-        self._table = self._winds(self._now, self._dt, MOST_STEPS)
-
-    def _winds(self, time: Tensor, dt: float | Tensor, steps: int) -> Tensor:
         times = time + torch.arange(steps, dtype=torch.float64, device=time.device) * dt
+        at = times if self.places is None else times[:, None] - self.places.delay
+        if len(self._fields) == 1:
+            found = _blow(self._fields[0], at)
+        else:
+            each = [times] * len(self._fields) if self.places is None else at.unbind(1)
+            found = torch.stack(list(map(_blow, self._fields, each)), dim=1)
         if self._shared:
-            return _blow(self._fields[0], times)
-        if isinstance(self._fields[0], WindBatch):
-            return self._fields[0](times)[:, :, None]
-        return torch.stack([_blow(wind, times) for wind in self._fields], dim=1)[:, :, None]
+            return found
+        return found[:, :, None] if self.places is None else found[:, :, None] @ self.places.turn
 
     def air(self, time: Tensor, position: Tensor) -> Tensor:
         """Air velocity at given positions [m/s].
@@ -188,11 +162,16 @@ class WindForce(Force):
             Broadcastable to (..., P, 3).
         """
         if self.uniform:
-            return self._winds(time, 0.0, 1)[0]
+            return self.winds(time, 0.0, 1)[0]
         if self._shared:
             return _air(self._fields[0], time, position)
-        parts = [_air(wind, time, place) for wind, place in zip(self._fields, position, strict=True)]
-        return torch.stack([part.to(position).expand_as(position[0]) for part in parts])
+        when, place = time.expand(len(position)), position
+        if self.places is not None:
+            when = time - self.places.delay
+            place = position @ self.places.turn.to(position).mT + self.places.shift.to(position)[:, None]
+        parts = map(_air, self._fields, when, place)
+        found = torch.stack([part.to(position).expand_as(position[0]) for part in parts])
+        return found if self.places is None else found @ self.places.turn.to(position)
 
     def samples(self, state: State, dt: float, steps: int) -> Tensor:
         """Air velocity [m/s] at the particles of a state, at ``steps`` times, ``dt`` [s] apart, starting at its time.

@@ -106,6 +106,8 @@ def blow(wind: nn.Module, times: Tensor) -> Tensor | None:
     Returns:
         Velocity [m/s], float64, shape (n, 3).
     """
+    if times.ndim > 1 or wind.scenes is not None or isinstance(wind.seed, Tensor):
+        return None
     if type(wind) is not WindField or wind.flows.device != times.device or wind.flows.dtype != torch.float64:
         return None
     rows = [_row(part) for part in wind.modulations]

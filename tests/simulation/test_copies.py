@@ -175,7 +175,7 @@ def test_each_has_gusts_of_its_own():
     """Seeds are those of the wind and the next ones, unless they are given; with a delay those of the wind."""
     copies = [Copy(), Copy(), Copy(seed=40), Copy(delay=0.5), Copy(delay=0.5, seed=7)]
     simulation = _simulation(copies, _gusty(5))
-    assert [setup.wind.wind.seed for setup in simulation.stepper.setups] == [5, 6, 40, 5, 7]
+    assert simulation.stepper.wind_force.wind.seed.tolist() == [5, 6, 40, 5, 7]
     state = _end(simulation).state
     assert float((state.position[0] - state.position[1]).abs().max()) > 0.001
 

@@ -9,6 +9,7 @@ from torch.testing import assert_close
 
 from gaussian_swaying import GaussianGust, SineSway, UniformGust, WindField
 from gaussian_swaying._fixed import assign
+from gaussian_swaying.wind.effects import LogProfile
 from gaussian_swaying.wind.field import FlowKey, counter_normal, counter_uniform
 
 COUNT = 20000
@@ -119,6 +120,52 @@ def test_the_kernel_refuses_a_wind_that_it_does_not_know(blow):
     times = torch.zeros(3, dtype=torch.float64, device=device)
     for wind in (WindField([1.0, 0, 0], modulations=[Own()]), Other([1.0, 0, 0]), WindField([1.0, 0, 0]).float()):
         assert kernel(wind.to(device), times) is None
+
+
+def _gusty(k):
+    modulations = [
+        SineSway(0.3 + 0.1 * k, 1.0 + k, 0.2 * k),
+        UniformGust(0.1 * k, 0.04 + 0.01 * k),
+        GaussianGust(0.3 * k, 0.05),
+    ]
+    return WindField([3.0 + k, 0.5 * k, 0.0], modulations=modulations, seed=7**k * (-1) ** k)
+
+
+def _scheduled(k, interpolation):
+    keys = [FlowKey(0.5 * j + 0.1 * k, [1.0 * j + k, 2.0, -j]) for j in range(1 + k)]
+    return WindField(schedule=keys, interpolation=interpolation, modulations=[GaussianGust()], seed=k)
+
+
+@pytest.mark.parametrize(
+    "winds",
+    [
+        [_gusty(k) for k in range(4)],
+        [_scheduled(k, "step") for k in range(3)],
+        [_scheduled(k, "linear") for k in range(3)],
+        [WindField([2.0, 0.0, 0.0], seed=2**70)],
+    ],
+    ids=["gusts", "steps", "lines", "steady"],
+)
+def test_winds_of_several_scenes_together(winds):
+    """As each by itself; a schedule takes the times of all, between which the flow is rounded anew."""
+    times = torch.linspace(-0.3, 4.0, 37, dtype=torch.float64)
+    both = WindField.together(winds)
+    assert_close(both(times), torch.stack([wind(times) for wind in winds], dim=1), rtol=0, atol=1e-14)
+    assert_close(both.carried(times), torch.stack([wind.carried(times) for wind in winds], dim=1), rtol=0, atol=1e-14)
+    assert both.scenes == len(winds)
+
+
+def test_winds_of_other_kinds_are_not_joined():
+    assert WindField.together([_gusty(1), WindField([1.0, 0.0, 0.0])]) is None
+    assert WindField.together([WindField([1.0, 0.0, 0.0], effects=[LogProfile()])]) is None
+
+
+def test_seeds_of_several_scenes():
+    times = torch.linspace(0.0, 1.0, 9, dtype=torch.float64)
+    wind, own = _gusty(2), [_gusty(2).with_seeds([seed]) for seed in (3, 4)]
+    found = wind.with_seeds([3, 4])(times[:, None].expand(-1, 2))
+    assert torch.equal(found, torch.cat([one(times[:, None]) for one in own], dim=1))
+    assert torch.equal(wind.with_seeds([wind.seed])(times[:, None])[:, 0], wind(times))
 
 
 def test_schedule_steps_and_ramps():

@@ -1,6 +1,6 @@
 """The wind as a load: what it gives at each substep, and that a rollout in it is the one with its forces."""
 
-import copy
+import math
 
 import pytest
 import torch
@@ -9,18 +9,18 @@ from torch.testing import assert_close
 
 from gaussian_swaying import (
     AeroForce,
-    GaussianGust,
     MPMSolver,
-    SineSway,
+    SpatialWind,
     UniformGust,
     WindField,
     WindForce,
 )
-from gaussian_swaying._fixed import assign
+from gaussian_swaying._fixed import changed
 from gaussian_swaying.geometry.patches import deform_patch
 from gaussian_swaying.wind.carried import Turbulence
 from gaussian_swaying.wind.effects import PowerProfile
-from gaussian_swaying.wind.field import FlowKey, Modulation
+from gaussian_swaying.wind.field import FlowKey
+from gaussian_swaying.wind.wind_force import Places
 
 DT = 1e-3
 GUSTS = WindField([3.0, 1.0, 0.0], modulations=[UniformGust(0.5, interval=1.5 * DT)])
@@ -149,15 +149,6 @@ def test_what_asks_for_a_gradient_is_not_left_to_the_kernels(name, monkeypatch):
     assert any(tensor.requires_grad for tensor in asked[0])
 
 
-def test_a_copy_leaves_the_graph_behind():
-    _, state, load = _setting()
-    load._graph = (value for value in ())  # like a graph, it cannot be copied
-    expected = load.winds(state.time, DT, 3)
-    for found in (copy.deepcopy(load), copy.copy(load)):
-        assert found._graph is None
-        assert torch.equal(found.winds(state.time, DT, 3), expected)
-
-
 def test_shapes_are_checked():
     up = torch.tensor([[0.0, 0.0, 1.0]]).expand(4, 3)
     with pytest.raises(ValueError, match="normal"):
@@ -166,59 +157,61 @@ def test_shapes_are_checked():
         WindForce(AeroForce(), GUSTS, up, torch.ones(3))
     with pytest.raises(ValueError, match=r"one `wind` for each of the \(2,\) scenes, but got 3"):
         WindForce(AeroForce(), [GUSTS] * 3, up.expand(2, 4, 3), torch.ones(2, 4))
-    with pytest.raises(ValueError, match=r"one `wind` for each of the \(\) scenes, but got 1"):
-        WindForce(AeroForce(), [GUSTS], up, torch.ones(4))
+    with pytest.raises(ValueError, match=r"one `wind` for each of the \(3,\) scenes, but got 1"):
+        WindForce(AeroForce(), WindField.together([GUSTS]), torch.ones(3, 5, 3), torch.ones(3, 5))
 
 
-@pytest.mark.gpu
-@pytest.mark.parametrize("scenes", [0, 3])
-def test_a_recorded_wind_blows_as_the_plain_one(scenes):
-    """From the second call on a graph is replayed: another time, substep, seed, amplitude or flow still counts."""
-
-    def field(seed):
-        gusts = [SineSway(period=0.7), UniformGust(0.2), GaussianGust(0.4)]
-        return WindField([3.0, 1.0, 0.0], modulations=gusts, seed=seed).cuda()
-
-    wind = [field(seed) for seed in range(scenes)] if scenes else field(0)
-    first = wind[0] if scenes else wind
-    shape = (*((scenes,) if scenes else ()), 5, 3)
-    normal = torch.nn.functional.normalize(torch.ones(shape, device="cuda"), dim=-1)
-    load = WindForce(AeroForce().cuda(), wind, normal, torch.ones(shape[:-1], device="cuda"))
-    changes = [
-        lambda: None,
-        lambda: None,
-        lambda: assign(first, seed=7),
-        lambda: None,
-        lambda: assign(first.modulations[0], amplitude=0.1),
-        lambda: None,
-        lambda: first.flows.fill_(2.0),
-        lambda: assign(first, flows=torch.full((1, 3), 4.0, dtype=torch.float64, device="cuda")),
-        lambda: None,
-    ]
-    for k, change in enumerate(changes):
-        change()
-        time = torch.full((), 0.13 * k, dtype=torch.float64, device="cuda")
-        dt = 1e-3 * (k + 1)
-        given = dt if k % 2 else torch.full((), dt, dtype=torch.float64, device="cuda")
-        found = load.winds(time, given, 20 + k)
-        assert_close(found, load._winds(time, dt, 20 + k), rtol=1e-12, atol=0)
-    assert load._graph is not None
+def _turn(degrees):
+    s, c = math.sin(math.radians(degrees)), math.cos(math.radians(degrees))
+    return double([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
 
 
-@pytest.mark.gpu
-def test_a_wind_that_cannot_be_recorded_is_asked_each_time():
-    class Waiting(Modulation):
-        """Makes the host wait."""
+class Whirl(SpatialWind):
+    """Air that turns about the origin."""
 
-        def forward(self, velocity, time, seed, stream):
-            return velocity * (1.0 if float(time.max()) < 1 else 2.0)
+    def forward(self, time, position):
+        return torch.stack([-position[..., 1], position[..., 0], torch.zeros_like(position[..., 0])], dim=-1)
 
-    wind = WindField([1.0, 0.0, 0.0], modulations=[Waiting()]).cuda()
-    normal = torch.tensor([[1.0, 0.0, 0.0]], device="cuda")
-    load = WindForce(AeroForce().cuda(), wind, normal, torch.ones(1, device="cuda"))
-    for time in (0.0, 0.5, 2.0, 0.5):
-        found = load.winds(torch.full((), time, dtype=torch.float64, device="cuda"), 1e-3, 4)
-        assert found[0, 0] == (2.0 if time > 1 else 1.0)
+
+def _blown(winds, turn, shift, delay):
+    """The wind at five points of two copies, and its force."""
+    places = Places(torch.stack([_turn(0.0), turn]), double([[0.0] * 3, shift]), double([0.0, delay]))
+    load = WindForce(AeroForce(), winds, torch.eye(3, dtype=torch.float64)[2:].expand(5, 3), torch.ones(5), places)
+    return load, torch.rand(2, 5, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(1))
+
+
+def test_copies_feel_one_wind_turned_and_later():
+    """Turned by 90 degrees counterclockwise, their own x axis is y of the scene: wind along y is wind along x."""
+    wind = WindField([0.0, 2.0, 0.0], modulations=[UniformGust(0.5)], seed=5)
+    load, _ = _blown(wind.with_seeds([5, 6]), _turn(90.0), [0.0] * 3, 0.7)
+    found, times = load.winds(double(1.0), 0.3, 4), double(1.0) + 0.3 * torch.arange(4)
+    assert found.shape == (4, 2, 1, 3)
+    assert torch.equal(found[:, 0, 0], wind(times))
+    later = changed(wind, seed=6)(times - 0.7)
+    assert_close(found[:, 1, 0], later @ _turn(90.0), rtol=0, atol=1e-15)
+    assert float(later[:, 0].abs().max()) < 1e-12 < 0.9 < float(found[:, 1, 0, 0].min())
+
+
+@pytest.mark.parametrize("wind", [Whirl(), WindField([4.0, 1.0, 0.0], effects=[PowerProfile(height=2.0)])])
+def test_copies_feel_the_wind_at_their_places(wind):
+    turn, shift = _turn(30.0), double([2.0, -1.0, 0.5])
+    load, position = _blown([wind] * 2, turn, shift.tolist(), 0.0)
+    now, there = double(2.0), position[1] @ turn.T + shift
+    wanted = [wind.at(now, p) if isinstance(wind, WindField) else wind(now, p) for p in (position[0], there)]
+    found = load.air(now, position)
+    assert_close(found[0], wanted[0])
+    assert_close(found[1] @ turn.T, wanted[1])
+
+
+def test_a_force_in_many_winds():
+    winds = [WindField([3.0 + k, 0.0, 0.0], modulations=[UniformGust(0.5)], seed=k) for k in range(3)]
+    normal, area = unit(5, 3, generator=torch.Generator().manual_seed(0)), torch.full((5,), 0.1)
+    batch = WindForce(AeroForce(), WindField.together(winds), normal, area)
+    listed = WindForce(AeroForce(), winds, normal.expand(3, 5, 3), area.expand(3, 5))
+    assert torch.equal(batch.winds(double(0.7), 1e-3, 6), listed.winds(double(0.7), 1e-3, 6))
+    assert batch.uniform
+    assert batch.recordable
+    assert batch.twin() is not None
 
 
 def _shaped():

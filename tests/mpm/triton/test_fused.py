@@ -18,7 +18,6 @@ from gaussian_swaying.mpm.boundaries.plane import Plane
 from gaussian_swaying.mpm.boundaries.velocity_box import VelocityBox
 from gaussian_swaying.mpm.laws.fixed_corotated import FixedCorotated
 from gaussian_swaying.mpm.triton import fused, fused_updated, measures
-from gaussian_swaying.wind.wind_batch import WindBatch
 
 from .bodies import (
     DT,
@@ -409,9 +408,9 @@ def test_nodes_without_mass_are_let_go(kernel_device):
 def test_nodes_held_in_a_batch_of_winds(kernel_device):
     """The momentum that pins take is summed for each scene, and all scenes share their patches."""
     points = make_points(kernel_device, count=40, batch=(2,))
-    winds = WindBatch([WindField([0.0, -8.0, 0.0]), WindField([3.0, 9.0, 0.0])]).to(kernel_device)
-    listed = make_load(points, [WindField([0.0, -8.0, 0.0]), WindField([3.0, 9.0, 0.0])])
-    load = WindForce(listed.aero, winds, listed.normal[0], listed.area[0])
+    winds = [WindField([0.0, -8.0, 0.0]), WindField([3.0, 9.0, 0.0])]
+    listed = make_load(points, winds)
+    load = WindForce(listed.aero, WindField.together(listed.wind), listed.normal[0], listed.area[0])
     boundaries = [PinnedRegion(LEFT, kind="nodes")]
     ends = run_both(points, lambda solver, state: solver.rollout(state, DT, 2, load), "total", boundaries=boundaries)
     check_agreement(ends)

@@ -14,7 +14,6 @@ from bench.runner import Row
 from gaussian_swaying.mpm.state import GridSpec, MaterialPoints
 from gaussian_swaying.wind.field import UniformGust, WindField
 from gaussian_swaying.wind.force import AeroForce
-from gaussian_swaying.wind.wind_batch import WindBatch
 from gaussian_swaying.wind.wind_force import WindForce
 
 CUBE = GridSpec(0.01, (0, 0, 0), (100, 100, 100))
@@ -77,7 +76,7 @@ def wind(number: int, gusts: bool, device: str) -> WindField:
     return WindField([2.0, 0.0, 1.0 + 0.01 * number], modulations=modulations, seed=number).to(device)
 
 
-def load(points: MaterialPoints, winds: WindField | WindBatch) -> WindForce:
+def load(points: MaterialPoints, winds: WindField) -> WindForce:
     """Wind on every point of one or several sheets."""
     slope = 0.027 * torch.cos(9 * points.position[..., 0])
     normal = torch.stack([-slope, torch.zeros_like(slope), torch.ones_like(slope)], dim=-1)

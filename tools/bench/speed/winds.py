@@ -14,7 +14,6 @@ from gaussian_swaying.wind.effects import LogProfile, WindEffect
 from gaussian_swaying.wind.field import UniformGust, WindField
 from gaussian_swaying.wind.obstacles import CylinderObstacle
 from gaussian_swaying.wind.shelter import Shelter
-from gaussian_swaying.wind.wind_batch import WindBatch
 
 
 def effects() -> dict[str, list[WindEffect]]:
@@ -69,7 +68,7 @@ def batches(case: str, formulation: str, gusts: bool, device: str) -> Row:
 
     took = {}
     for name, points, forces in (
-        ("together", many, [load(many, WindBatch(blown))]),
+        ("together", many, [load(many, WindField.together(blown))]),
         ("apart", one, [load(one, own) for own in blown]),
         ("large", wide, [load(wide, blown[0])]),
     ):
