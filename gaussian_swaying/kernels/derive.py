@@ -6,8 +6,8 @@ its definition in torch, with autograd. :func:`device_function` writes a new one
 transpose and :func:`difference` a divided difference without cancellation; :func:`vjp` is the adjoint of a whole
 function. A :class:`Primitive` is not looked into: its derivatives are given.
 
-Tuples of numbers may be nested. Conditions of ``if`` and lengths of loops must be constants; loads from memory cannot
-be traced. What cannot is refused with its line.
+Tuples of numbers may be nested. Conditions of ``if`` and lengths of loops must be constants. On tensors a pointer is a
+:class:`Memory`; loads cannot be traced on symbols. What cannot is refused with its line.
 """
 
 from __future__ import annotations
@@ -55,6 +55,23 @@ class Primitive:
     on_tensors: Callable[..., Any] | None = None
     vjp: Callable[..., Any] | None = None
     difference: Callable[..., Any] | None = None
+
+
+class Memory:
+    """A pointer to the numbers of a tensor, of which functions on tensors load some."""
+
+    def __init__(self, tensor: Tensor, place: Any = 0) -> None:
+        self.tensor, self.place = tensor.reshape(-1), place
+
+    def __add__(self, step: Any) -> Memory:
+        return Memory(self.tensor, self.place + step)
+
+    def load(self, mask: Any, other: Any) -> Tensor:
+        """The numbers at its places, in the type of the others; without making the host wait."""
+        place = torch.as_tensor(self.place, device=self.tensor.device)
+        place = place if mask is None else torch.where(mask, place, 0)
+        found = self.tensor.index_select(0, place.reshape(-1).long()).reshape(place.shape).to(_REAL.get())
+        return found if mask is None else torch.where(mask, found, other)
 
 
 _PRIMITIVES: dict[Any, Primitive] = {}
@@ -170,7 +187,7 @@ def _to(value: Any, kind: Any) -> Any:
         return value.to(_REAL.get() if kind is torch.float32 else kind)
     if isinstance(value, Symbol):
         raise TraceError("a change of type cannot be traced")
-    return value
+    return int(value) if kind in (torch.int32, torch.int64) else value
 
 
 class _TorchLanguage:
@@ -192,6 +209,12 @@ class _TorchLanguage:
         if not isinstance(yes, Tensor) and not isinstance(no, Tensor):
             yes = torch.tensor(float(yes), dtype=_REAL.get(), device=condition.device)
         return torch.where(condition, yes, no)
+
+    @staticmethod
+    def load(pointer: Any, mask: Any = None, other: Any = 0.0) -> Any:
+        if not isinstance(pointer, Memory):
+            raise TraceError("`tl.load` cannot be traced")
+        return pointer.load(mask, other)
 
     @staticmethod
     def maximum(x: Any, y: Any, propagate_nan: Any = None) -> Any:
@@ -224,6 +247,8 @@ _BINARY: dict[str, Callable[[Any, Any], Any]] = {
 def _unary(name: str, x: Any) -> Any:
     if isinstance(x, Symbol):
         return x.graph.make(name, x)
+    if name == "sqrt" and isinstance(x, Tensor) and x.requires_grad:  # its gradient is zero at zero
+        return torch.where(x == 0, 0.0, torch.where(x == 0, 1.0, x).sqrt())
     return getattr(torch, name)(x) if isinstance(x, Tensor) else _UNARY[name](x)
 
 
@@ -662,6 +687,6 @@ def text_of(function: Any) -> str:
 
 
 __all__ = [
-    "Primitive", "Symbol", "TraceError", "device_function", "difference", "gradient", "on_tensors", "primitive",
+    "Memory", "Primitive", "Symbol", "TraceError", "device_function", "difference", "gradient", "on_tensors", "primitive",
     "tangent", "text_of", "vjp",
 ]  # fmt: skip

@@ -4,6 +4,7 @@ import pytest
 import torch
 
 from gaussian_swaying.kernels.derive import (
+    Memory,
     TraceError,
     device_function,
     difference,
@@ -152,6 +153,31 @@ def test_a_divided_difference_does_not_cancel():
     by = torch.func.grad(lambda x, y: f(x, y).sum(), (0, 1))(x, y)
     expected = torch.where((x - y).abs() < 1e-6, by[0] - by[1], quotient)
     torch.testing.assert_close(function(x, y), expected, rtol=1e-7, atol=1e-9)
+
+
+@triton.jit
+def looked_up(table, x, mask, STEP: tl.constexpr):
+    """Two numbers of a table in a row."""
+    first = table + tl.floor(x).to(tl.int32) * STEP
+    return tl.load(first, mask, -1.0), tl.load(first + 1, mask, -1.0)
+
+
+def test_tables_are_looked_up():
+    x, table = torch.tensor([0.5, 1.2, 7.0], dtype=torch.float64), torch.arange(5)
+    found = torch.stack(on_tensors(looked_up)(Memory(table), x, x < 3, 2))
+    assert torch.equal(found, torch.tensor([[0.0, 2.0, -1.0], [1.0, 3.0, -1.0]], dtype=torch.float64))
+
+
+def test_the_gradient_of_a_length_is_zero_at_zero():
+    x = torch.tensor([0.0, 4.0], requires_grad=True)
+    (found,) = torch.autograd.grad(on_tensors(length)(x).sum(), x)
+    assert found.tolist() == [0.0, 1.0]
+
+
+@triton.jit
+def length(x):
+    """Of a vector of one number."""
+    return tl.sqrt(x * x)
 
 
 def test_what_cannot_be_traced_is_refused_with_its_line():
