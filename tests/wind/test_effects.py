@@ -11,7 +11,7 @@ import pytest
 import torch
 from shared import double
 
-from gaussian_swaying import SimFrame, WindField, aero
+from gaussian_swaying import SimFrame, WindField, wind
 from gaussian_swaying.wind.effects import LogProfile, Moment, Plume, PowerProfile, WindEffect
 
 NOW = Moment(torch.zeros((), dtype=torch.float64), torch.zeros(3).double(), torch.zeros(3).double())
@@ -70,9 +70,9 @@ def test_an_effect_that_returns_another_shape_is_named(kind, error, message):
 def test_the_documented_effects_are_those_that_there_are():
     """All that a YAML can name; a ``CarriedField`` takes a tensor."""
     kinds = []
-    for found in iter_modules(aero.__path__):
+    for found in iter_modules(wind.__path__):
         if not found.name.endswith("_triton"):
-            module = import_module(f"{aero.__name__}.{found.name}")
+            module = import_module(f"{wind.__name__}.{found.name}")
             kinds += [kind for kind in vars(module).values() if isinstance(kind, type) and issubclass(kind, WindEffect)]
     names = {kind.__name__ for kind in kinds if not isabstract(kind)} - {"CarriedField"}
     docs = Path(__file__).parents[2] / "docs"
