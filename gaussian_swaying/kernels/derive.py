@@ -687,6 +687,7 @@ def text_of(function: Any) -> str:
 
 
 __all__ = [
-    "Memory", "Primitive", "Symbol", "TraceError", "device_function", "difference", "gradient", "on_tensors", "primitive",
+    "Memory", "Primitive", "Symbol", "TraceError", "device_function", "difference", "gradient", "on_tensors",
+    "primitive",
     "tangent", "text_of", "vjp",
 ]  # fmt: skip
