@@ -171,6 +171,11 @@ class _Calls(ast.NodeTransformer):
 
     visit_If = visit_While = visit_IfExp = _decided  # noqa: N815
 
+    def visit_AugAssign(self, node: ast.AugAssign) -> Any:  # not in place, as another name may be the same tensor
+        self.generic_visit(node)
+        assert isinstance(node.target, ast.Name)
+        return ast.Assign([node.target], ast.BinOp(ast.Name(node.target.id, ast.Load()), node.op, node.value))
+
     def visit_AnnAssign(self, node: ast.AnnAssign) -> Any:
         self.generic_visit(node)
         return node if node.value is None else ast.Assign([node.target], node.value)

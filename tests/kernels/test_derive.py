@@ -36,14 +36,15 @@ root_of = on_tensors(root)
 @triton.jit
 def formula(a, s, p, SQUARED: tl.constexpr):
     """Everything that formulas are made of."""
-    total = 0.0 * s
+    zero = 0.0 * s
+    total = zero
     for k in tl.static_range(3):
         total += tl.maximum(a[k], LEAST) * tl.exp(-a[k])
     if SQUARED:
         total = total * total
     chosen = tl.where((s > 0) & (a[0] < 2.0), tl.log(tl.abs(s) + 1), tl.minimum(s, a[1]))
     wave = tl.sin(a[2]) - tl.cos(s / p[0])
-    return total + root(a[0] * a[0] + 1), (chosen, wave)
+    return total + zero + root(a[0] * a[0] + 1), (chosen, wave)
 
 
 @triton.jit
