@@ -17,7 +17,7 @@ from .metrics.frechet_video import frechet_distance as frechet_distance
 from .mpm.boundaries.boundary import Boundary as Boundary
 from .mpm.boundaries.pinned_points import PinnedPoints as PinnedPoints
 from .mpm.boundaries.pinned_region import PinnedRegion as PinnedRegion
-from .mpm.contact.surface import Contact as Contact
+from .mpm.contact import Contact as Contact
 from .mpm.forces import Force as Force
 from .mpm.laws.law import ConstitutiveLaw as ConstitutiveLaw
 from .mpm.solver import MPMSolver as MPMSolver

@@ -3,36 +3,49 @@
 from __future__ import annotations
 
 import torch
+from scipy.spatial import cKDTree
 from torch import Tensor
 
-from gaussian_swaying.mpm.contact.pairs import close_pairs
-from gaussian_swaying.mpm.contact.solve import pair_gaps
-from gaussian_swaying.mpm.contact.stage import ContactStage
+from gaussian_swaying.mpm.contact import ContactStage
 from gaussian_swaying.mpm.state import MPMState
+from gaussian_swaying.mpm.transfer import bspline_stencil, gather
 
 _CHUNK = 20_000_000
+
+
+def samples(stage: ContactStage, state: MPMState) -> tuple[Tensor, Tensor]:
+    """Positions of the contact samples now [m], shape (C, 3), and their unit normals."""
+    surface, moved = stage.surface, state.node_displacement
+    assert moved is not None
+    rows = gather(moved, bspline_stencil(surface.read, state.grid, False))
+    F = torch.eye(3).to(moved) + rows[:, 1:4].mT
+    position = surface.read + rows[:, 0] + (F @ (surface.place - surface.read)[..., None])[..., 0]
+    normal = (torch.linalg.inv(F).mT @ surface.normal[..., None])[..., 0]
+    return position, torch.nn.functional.normalize(normal, dim=-1)
+
+
+def pairs(stage: ContactStage, position: Tensor, reach: float) -> Tensor:
+    """Pairs of samples closer than a reach now and not at rest, the smaller number first, shape (2, M)."""
+    found = torch.from_numpy(cKDTree(position.cpu().numpy()).query_pairs(reach, output_type="ndarray")).long().T
+    first, second = stage.surface.place.cpu()[found]
+    return found[:, (first - second).norm(dim=-1) >= stage.apart].to(position.device)
 
 
 def gaps(stage: ContactStage, state: MPMState) -> Tensor:
     """Distances of all surfaces that lie above each other and were no neighbours at rest, in units of the thickness.
 
     Returns:
-        One for each pair of places whose discs lie above each other, shape (M,); none farther than the reach of a disc.
+        One for each pair of samples whose discs lie above each other, shape (M,); none farther than the reach of a
+        disc. It is the distance along the mean of the normals of the discs, weighted with the heights above them.
     """
-    surface, moved = stage.surface, state.node_displacement
-    assert moved is not None
-    position = stage.positions(moved)
-    first, second = close_pairs(position, stage.reach, surface.place, stage.apart)
-    everything = torch.arange(len(position), device=position.device)
-    normals = stage.normals(everything, moved.reshape(-1, 3))
-    thickness = 0.5 * (surface.thickness[first] + surface.thickness[second])
-    _, gap, above = pair_gaps(
-        position[first] - position[second],
-        (normals[first], normals[second]),
-        (surface.radius[first], surface.radius[second]),
-        thickness,
-    )
-    return (gap / thickness + 1)[above]
+    position, normal = samples(stage, state)
+    both = pairs(stage, position, stage.reach)
+    arm = position[both[0]] - position[both[1]]
+    height = (arm * normal[both]).sum(-1)
+    over = arm.square().sum(-1) - height.square() < stage.surface.radius[both].square()
+    along = ((height * over)[..., None] * normal[both]).sum(0)
+    along = torch.nn.functional.normalize(along, dim=-1, eps=1e-18)
+    return ((arm * along).sum(-1) / stage.surface.thickness[both].mean(0))[over.any(0)]
 
 
 def sheet_triangles(nx: int, ny: int, first: int = 0) -> Tensor:

@@ -12,7 +12,7 @@ from torch import Tensor
 from gaussian_swaying.geometry.groups import joined
 from gaussian_swaying.mpm.boundaries.boundary import CLOCK, Boundary
 from gaussian_swaying.mpm.boundaries.rigid_region import RigidRegion
-from gaussian_swaying.mpm.contact.surface import Surface
+from gaussian_swaying.mpm.contact import Surface
 from gaussian_swaying.mpm.dispatch import LawDispatch
 from gaussian_swaying.mpm.state import MaterialPoints
 

@@ -12,7 +12,7 @@ from torch import Tensor, nn
 
 from gaussian_swaying.geometry.frame import SimFrame
 from gaussian_swaying.mpm.boundaries.boundary import Boundary
-from gaussian_swaying.mpm.contact.surface import Surface
+from gaussian_swaying.mpm.contact import Surface
 from gaussian_swaying.mpm.followers import Followers
 from gaussian_swaying.mpm.forces import Forces
 from gaussian_swaying.mpm.state import MaterialPoints

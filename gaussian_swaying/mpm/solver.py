@@ -16,7 +16,7 @@ from gaussian_swaying._fixed import Fixed, FixedList, assign
 from gaussian_swaying.geometry.frame import SimFrame
 from gaussian_swaying.mpm.body import Body
 from gaussian_swaying.mpm.boundaries.boundary import Boundary
-from gaussian_swaying.mpm.contact.surface import Surface
+from gaussian_swaying.mpm.contact import Surface
 from gaussian_swaying.mpm.damping import damped_substep
 from gaussian_swaying.mpm.dispatch import LawDispatch
 from gaussian_swaying.mpm.followers import Followers, GridFollowers

@@ -12,8 +12,7 @@ from gaussian_swaying.gaussians.grouping import grid_groups
 from gaussian_swaying.geometry.distance import DistanceGrid
 from gaussian_swaying.geometry.groups import sums
 from gaussian_swaying.geometry.neighbours import nearest_neighbours
-from gaussian_swaying.mpm.contact.pairs import close_pairs
-from gaussian_swaying.mpm.contact.surface import Contact, Surface
+from gaussian_swaying.mpm.contact import Contact, Surface
 from gaussian_swaying.mpm.followers import on_material
 from gaussian_swaying.mpm.state import MaterialPoints
 from gaussian_swaying.simulation.sampling import Samples
@@ -74,8 +73,11 @@ def surface_of(samples: Samples, owner: Tensor, points: MaterialPoints, dx: floa
 @torch.no_grad()
 def close_at_rest(surface: Surface) -> int:
     """Count pairs of contact samples closer at rest than the thickness, one above the other: they are pushed apart."""
-    thickest = float(surface.thickness.amax())
-    first, second = close_pairs(surface.place, thickest, surface.place, 0.0)
+    from scipy.spatial import cKDTree
+
+    tree = cKDTree(surface.place.double().cpu().numpy())
+    pairs = torch.from_numpy(tree.query_pairs(float(surface.thickness.amax()), output_type="ndarray"))
+    first, second = pairs.to(surface.place.device).unbind(1)
     arm = surface.place[first] - surface.place[second]
     distance = arm.norm(dim=-1)
     along = torch.stack([(arm * surface.normal[k]).sum(-1).abs() for k in (first, second)]).amax(0)

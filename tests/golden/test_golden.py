@@ -1,4 +1,4 @@
-"""Small runs end where they ended before: kernels in float32, torch in float64, and kernels of a GPU.
+"""Small runs end where they ended before: kernels in float32, torch in float64 (kernels for contact), and a GPU.
 
 A record has the distance between its run in float32 and the same run in float64: one sample of the rounding as it has
 grown. Others, on two more kinds of processor and a GPU, were up to 17 times as large for single numbers such as an
@@ -13,7 +13,7 @@ If a change of the physics is meant, ``python tests/golden/make.py`` with the na
 
 import numpy as np
 import pytest
-from golden.make import FILES, TORCH, scale
+from golden.make import FILES, in_double, scale
 from golden.small_runs import CASES, CONFIGS, picture, run
 
 GROWTH = 32.0
@@ -54,7 +54,7 @@ def test_kernels(name, folder, kernel_device):
 
 @pytest.mark.parametrize("name", CASES)
 def test_torch(name, folder):
-    found, _ = run(name, folder, 2, device="cpu", **TORCH)
+    found, _ = run(name, folder, 2, device="cpu", **in_double(name))
     check(name, "torch", found, GROWTH * 2.0**-29, 3e-3 if name == "modes" else 1e-6)
 
 

@@ -12,7 +12,7 @@ from gaussian_swaying.gaussians.model import GaussianSurfaceModel
 from gaussian_swaying.geometry.regions import Box
 from gaussian_swaying.mpm.boundaries.ball import BallObstacle
 from gaussian_swaying.mpm.boundaries.still_gaussians import StillGaussians
-from gaussian_swaying.mpm.contact.surface import Contact
+from gaussian_swaying.mpm.contact import Contact
 from gaussian_swaying.mpm.solver import MPMSolver
 from gaussian_swaying.scenes.cloths import ClothScene
 from gaussian_swaying.scenes.procedural import FlagScene, GivenScene

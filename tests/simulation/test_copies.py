@@ -17,7 +17,7 @@ from gaussian_swaying.gaussians.parts import Part, Parts
 from gaussian_swaying.geometry.regions import Box
 from gaussian_swaying.mpm.boundaries.pinned_points import PinnedPoints
 from gaussian_swaying.mpm.boundaries.pinned_region import PinnedRegion
-from gaussian_swaying.mpm.contact.surface import Contact
+from gaussian_swaying.mpm.contact import Contact
 from gaussian_swaying.mpm.forces import Force
 from gaussian_swaying.mpm.solver import MPMSolver
 from gaussian_swaying.recording.recorder import Recorder

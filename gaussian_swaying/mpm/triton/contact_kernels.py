@@ -1,36 +1,240 @@
-"""Kernels of contact; the reference is :mod:`~gaussian_swaying.mpm.contact.solve`.
+"""Kernels of contact; :mod:`~gaussian_swaying.mpm.contact` has the equations.
 
-One launch does a whole substep: its programs run all at once and wait for each other between the parts, so that the
-number of iterations is not fixed when it is recorded. Each contact sample has its own constraints, so a pair is kept at
-both of its samples; the sums at samples and nodes have the same order in every run.
+One launch does a whole substep: its programs run all at once and wait for each other between the parts (:func:`meet`),
+so that the number of iterations is not fixed when it is recorded. Each contact sample has its own constraints, so a
+pair is kept at both of its samples; the sums at samples and nodes have the same order in every run. Between substeps
+``contact_lists`` lists the samples that may touch in the next ones.
 """
 
-from gaussian_swaying.geometry.linalg_triton import load3
-from gaussian_swaying.kernels.language import tl, triton
-from gaussian_swaying.mpm.contact.solve import CREEP
-from gaussian_swaying.mpm.triton.contact_list_kernels import (
-    ACTING,
-    CHANGES,
-    LISTED,
-    MOST_PROGRAMS,
-    NEEDED_SLOTS,
-    ROUNDS,
-    WITHIN,
-    largest_of,
-    meet,
-    node_at,
-    place_now,
-    store_velocity,
-    three,
-    velocity_now,
-)
-from gaussian_swaying.mpm.triton.shared import axis_weights, node_weight
+from gaussian_swaying.geometry.linalg_triton import add3, dot3, load3
+from gaussian_swaying.kernels.language import ON_GPU, tl, triton
+from gaussian_swaying.mpm.triton.shared import VARIES, axis_weights, node_weight, vector
+
+CHANGES = (*VARIES, "places", "touched_nodes", "active_nodes", "last", "iterations")
+
+MOST_PROGRAMS = tl.constexpr(1024 if ON_GPU else 8)
+"""Most programs that meet; a row of ``peak`` has as many entries."""
+
+LISTED, NEEDED_ROOM, NEEDED_SLOTS, ROUNDS, ACTING, WITHIN = (tl.constexpr(k) for k in range(6))
+"""Entries of ``status``: candidates of all samples; room that is needed for the candidates of a sample, and for its
+constraints; iterations of all substeps; constraints of this substep; whether an obstacle is within reach in it."""
+
+
+@triton.jit
+def meet(gate, programs):
+    """Barrier: wait until all programs arrive, and make their writes visible.
+
+    Each adds one and the first one adds what is missing to 2^31, so that the sign changes when all have come.
+    """
+    tl.debug_barrier()
+    if programs > 1:
+        mine = tl.where(tl.program_id(0) == 0, 2147483647 - (programs - 2), 1)
+        before = tl.atomic_add(gate, mine, sem="release", scope="gpu")
+        now = before
+        while (before ^ now) >= 0:
+            now = tl.atomic_add(gate, 0, sem="acquire", scope="gpu")
+        tl.debug_barrier()
+
+
+@triton.jit
+def largest_of(peak, programs):
+    """The largest of the entries that the programs wrote."""
+    o = tl.arange(0, MOST_PROGRAMS)
+    return tl.max(tl.load(peak + o, o < programs, 0.0))
+
+
+@triton.jit
+def node_at(base, node, p, mask, places, i, j, k, sx, sy, VIRTUAL: tl.constexpr):
+    """One of the 27 nodes of samples, whose first node on the lattice is ``node``."""
+    if VIRTUAL:
+        found = tl.load(base + ((i * 3 + j) * 3 + k) * places + p, mask, 0)
+    else:
+        found = node + i * sx + j * sy + k
+    return found
+
+
+@triton.jit
+def interpolate(
+    field, base, fraction, arm, places, p, mask, sx, sy, inverse_dx, DERIVATIVES: tl.constexpr, BOTH: tl.constexpr,
+    ARMS: tl.constexpr, VIRTUAL: tl.constexpr, BLOCK: tl.constexpr,
+):  # fmt: skip
+    """Four columns of the nodes at samples, of shape (BLOCK, 4), with BOTH also the next four; with ARMS at their ends.
+
+    Then the derivatives of the first four along the axes [1/m], of the same shape, zero without DERIVATIVES. As
+    ``total_kernels.gather``, but a row of four columns is one load. ``base`` is the first node of each sample, or
+    with VIRTUAL the table of their nodes, shape (27, places).
+    """
+    column = tl.arange(0, 4)[None, :]
+    f = load3(fraction, places, p, mask)
+    a = f
+    if ARMS:
+        a = load3(arm, places, p, mask)
+    node = tl.load(base + p, mask, 0)
+    wz, gz = axis_weights(f[2], inverse_dx)
+    value = tl.zeros([BLOCK, 4], tl.float32)
+    following, d0, d1, d2 = value, value, value, value
+    for i in range(3):
+        wx, gx = node_weight(f[0], i, inverse_dx)
+        for j in tl.static_range(3):
+            wy, gy = node_weight(f[1], j, inverse_dx)
+            s = tl.zeros([BLOCK, 4], tl.float32)
+            t, m, n = s, s, s
+            for k in tl.static_range(3):
+                at = field + node_at(base, node, p, mask, places, i, j, k, sx, sy, VIRTUAL)[:, None] * 8 + column
+                q = tl.load(at, mask[:, None], 0.0)
+                s += wz[k][:, None] * q
+                if DERIVATIVES or ARMS:
+                    t += gz[k][:, None] * q
+                if BOTH:
+                    q = tl.load(at + 4, mask[:, None], 0.0)
+                    m += wz[k][:, None] * q
+                    if ARMS:
+                        n += gz[k][:, None] * q
+            w = wx * wy
+            e = w
+            if ARMS:
+                e += gx * wy * a[0] + wx * gy * a[1]
+                value += (w * a[2])[:, None] * t
+                following += (w * a[2])[:, None] * n
+            value += e[:, None] * s
+            following += e[:, None] * m
+            if DERIVATIVES:
+                d0 += (gx * wy)[:, None] * s
+                d1 += (wx * gy)[:, None] * s
+                d2 += w[:, None] * t
+    return value, following, d0, d1, d2
+
+
+@triton.jit
+def three(x):
+    """The first three columns of a tile of four."""
+    column = tl.arange(0, 4)[None, :]
+    return (
+        tl.sum(tl.where(column == 0, x, 0.0), 1),
+        tl.sum(tl.where(column == 1, x, 0.0), 1),
+        tl.sum(tl.where(column == 2, x, 0.0), 1),
+    )
+
+
+@triton.jit
+def store_velocity(moving, p, mask, v):
+    """Write the velocities of samples, the first three columns of a tile."""
+    column = tl.arange(0, 4)[None, :]
+    tl.store(moving + p[:, None] * 4 + column, v, mask[:, None] & (column < 3))
+
+
+@triton.jit
+def place_now(
+    fields, base, fraction, arm, rest, places, p, mask, sx, sy, inverse_dx, DERIVATIVES: tl.constexpr,
+    BOTH: tl.constexpr, ARMS: tl.constexpr, VIRTUAL: tl.constexpr, BLOCK: tl.constexpr,
+):  # fmt: skip
+    """Return the positions of contact samples now, with BOTH their velocities, and the slopes of the displacement."""
+    u, v, d0, d1, d2 = interpolate(
+        fields, base, fraction, arm, places, p, mask, sx, sy, inverse_dx, DERIVATIVES, BOTH, ARMS, VIRTUAL, BLOCK
+    )
+    x = load3(rest, places, p, mask)
+    u0, u1, u2 = three(u)
+    return (x[0] + u0, x[1] + u1, x[2] + u2), v, d0, d1, d2
+
+
+@triton.jit
+def velocity_now(
+    fields, base, fraction, arm, moving, places, p, mask, sx, sy, inverse_dx, ARMS: tl.constexpr,
+    VIRTUAL: tl.constexpr, BLOCK: tl.constexpr,
+):  # fmt: skip
+    """Read the velocity of places."""
+    v, _n, _a, _b, _c = interpolate(
+        fields + 4, base, fraction, arm, places, p, mask, sx, sy, inverse_dx, False, False, ARMS, VIRTUAL, BLOCK
+    )
+    store_velocity(moving, p, mask, v)
+
+
+@triton.jit(do_not_specialize=CHANGES)
+def contact_positions(
+    fields, base, fraction, arm, rest, places, position, moving, status, sx, sy, inverse_dx, ARMS: tl.constexpr,
+    VIRTUAL: tl.constexpr, BLOCK: tl.constexpr,
+):  # fmt: skip
+    """Write positions (C, 3) and velocities of all contact samples; reset the flag that something is in reach."""
+    p = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
+    mask = p < places
+    x, v, _a, _b, _c = place_now(
+        fields, base, fraction, arm, rest, places, p, mask, sx, sy, inverse_dx, False, True, ARMS, VIRTUAL, BLOCK
+    )
+    for c in tl.static_range(3):
+        tl.store(position + p * 3 + c, x[c], mask)
+    store_velocity(moving, p, mask, v)
+    if tl.program_id(0) == 0:
+        tl.store(status + ACTING, 0)
+        tl.store(status + WITHIN, 0)
+
+
+COLUMNS = tl.constexpr(1024)
+"""Most cells of the grid along an axis; farther samples count to the last one."""
+
+
+@triton.jit(do_not_specialize=CHANGES)
+def contact_lists(
+    position, rest, base, corner, cell, start, ordered, sorted_, column, candidates, near, places, room, limit, apart,
+    beside, last, VIRTUAL: tl.constexpr, BLOCK: tl.constexpr, WIDE: tl.constexpr,
+):  # fmt: skip
+    """List the samples closer than ``limit`` to each that were at least ``apart`` from it at rest, and count them.
+
+    ``start`` is where the samples of a cell begin in their order, in a table of hashed columns of cells: the three
+    cells of a column around a sample follow each other. Another column may have the same entry. With VIRTUAL also
+    those that were at least ``beside`` from it, and have another copy of a node that both reach.
+    """
+    wide = tl.arange(0, WIDE)[None, :]
+    p = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
+    mask = p < places
+    x = tl.load(position + p * 3, mask, 0.0)[:, None]
+    y = tl.load(position + p * 3 + 1, mask, 0.0)[:, None]
+    z = tl.load(position + p * 3 + 2, mask, 0.0)[:, None]
+    r = load3(rest, places, p, mask)
+    found = tl.zeros([BLOCK], tl.int32)
+    for beside_it in range(9):
+        cx = tl.load(cell + p * 3, mask, 1) + beside_it // 3 - 1
+        cy = tl.load(cell + p * 3 + 1, mask, 1) + beside_it % 3 - 1
+        at = start + (((cx * 73856093) ^ (cy * 19349663)) & last) + tl.load(cell + p * 3 + 2, mask, 1)
+        begin = tl.load(at - 1, mask, 0)
+        many = tl.load(at + 2, mask, 0) - begin
+        for k in range(0, tl.max(many), WIDE):
+            known = (k + wide) < many[:, None]
+            e = begin[:, None] + k + wide
+            known = known & (tl.load(column + e, known, -1) == (cx * COLUMNS + cy)[:, None])
+            q0 = tl.load(sorted_ + e * 3, known, 0.0) - x
+            q1 = tl.load(sorted_ + e * 3 + 1, known, 0.0) - y
+            q2 = tl.load(sorted_ + e * 3 + 2, known, 0.0) - z
+            known = known & (q0 * q0 + q1 * q1 + q2 * q2 < limit * limit)
+            q = tl.load(ordered + e, known, 0)
+            q0 = tl.load(rest + q, known, 0.0) - r[0][:, None]
+            q1 = tl.load(rest + places + q, known, 0.0) - r[1][:, None]
+            q2 = tl.load(rest + 2 * places + q, known, 0.0) - r[2][:, None]
+            square = q0 * q0 + q1 * q1 + q2 * q2
+            far = square >= apart * apart
+            if VIRTUAL:
+                c0 = tl.load(corner + q, known, 0) - tl.load(corner + p, mask, 0)[:, None]
+                c1 = tl.load(corner + places + q, known, 0) - tl.load(corner + places + p, mask, 0)[:, None]
+                c2 = tl.load(corner + 2 * places + q, known, 0) - tl.load(corner + 2 * places + p, mask, 0)[:, None]
+                both = known & (c0 >= -2) & (c0 <= 2) & (c1 >= -2) & (c1 <= 2) & (c2 >= -2) & (c2 <= 2)
+                one = (tl.maximum(c0, 0) * 3 + tl.maximum(c1, 0)) * 3 + tl.maximum(c2, 0)
+                other = (tl.maximum(-c0, 0) * 3 + tl.maximum(-c1, 0)) * 3 + tl.maximum(-c2, 0)
+                mine = tl.load(base + one * places + p[:, None], both, 0)
+                theirs = tl.load(base + other * places + q, both, 1)
+                far = far | ((square >= beside * beside) & (mine != theirs))
+            known = known & (q != p[:, None]) & far
+            hit = known.to(tl.int32)
+            to = found[:, None] + tl.cumsum(hit, 1) - hit
+            tl.store(candidates + p[:, None] * room + to, q, known & (to < room))
+            found += tl.sum(hit, 1)
+    tl.store(near + p, found, mask)
+
 
 PLANES = tl.constexpr(10)
 """Numbers of a constraint: normal, wanted velocity, and its impulse with and without the momentum of the iteration."""
 
-KEPT = tl.constexpr(1 - CREEP)
-"""Share of the friction of the last iteration that stays."""
+KEPT = tl.constexpr(0.99)
+"""Share of sticking friction that stays in an iteration; the rest is CREEP: the share of the free slip of a substep
+that a single contact sample keeps."""
 
 
 @triton.jit
@@ -65,16 +269,20 @@ def _place(
 
 
 @triton.jit
-def _over(d0, d1, d2, squared, at, mask):
-    """Return the height of the other above a disc times its normal (zero beside the disc), and whether it is above."""
-    n0 = tl.load(at + 4, mask, 0.0)
-    n1 = tl.load(at + 5, mask, 0.0)
-    n2 = tl.load(at + 6, mask, 0.0)
-    r = tl.load(at + 7, mask, 0.0)
-    height = d0 * n0 + d1 * n1 + d2 * n2
-    over = squared - height * height < r * r
-    height = tl.where(over, height, 0.0)
-    return height * n0, height * n1, height * n2, over, n0, n1, n2
+def discs(d, a, ra, b, rb):
+    """Normal between two discs, and whether one lies above the other: with normals a and b, d from b to a."""
+    squared = dot3(d, d)
+    p = dot3(d, a)
+    q = dot3(d, b)
+    over = squared - p * p < ra * ra
+    also = squared - q * q < rb * rb
+    p = tl.where(over, p, 0.0)
+    q = tl.where(also, q, 0.0)
+    n = (p * a[0] + q * b[0], p * a[1] + q * b[1], p * a[2] + q * b[2])
+    size = tl.sqrt(tl.maximum(dot3(n, n), 1.2e-38))
+    sure = size > 1.1e-19
+    n = (tl.where(sure, n[0] / size, b[0]), tl.where(sure, n[1] / size, b[1]), tl.where(sure, n[2] / size, b[2]))
+    return n, over | also
 
 
 @triton.jit
@@ -101,7 +309,7 @@ def _constrain_pairs(
     row, moving, candidates, near, room, data, other, slots, places, p, mask, dt, limit, slack, push, most,
     BLOCK: tl.constexpr, WIDE: tl.constexpr,
 ):  # fmt: skip
-    """Write the constraints of pairs of samples that come close in this substep, as ``pair_gaps`` and ``acting``.
+    """Write the constraints of pairs of samples that come close in this substep, as the discs say (``mpm.contact``).
 
     Returns how many there are for each sample, and how many slots it needed.
     """
@@ -131,29 +339,17 @@ def _constrain_pairs(
         # in the order of their numbers, so that both samples of a pair find the same, to the last bit
         low = row + tl.minimum(p, q) * 8
         high = row + tl.maximum(p, q) * 8
-        d0 = tl.load(low, real, 0.0) - tl.load(high, real, 0.0)
-        d1 = tl.load(low + 1, real, 0.0) - tl.load(high + 1, real, 0.0)
-        d2 = tl.load(low + 2, real, 0.0) - tl.load(high + 2, real, 0.0)
-        squared = d0 * d0 + d1 * d1 + d2 * d2
-        a0, a1, a2, over_a, _x, _y, _z = _over(d0, d1, d2, squared, low, real)
-        b0, b1, b2, over_b, f0, f1, f2 = _over(d0, d1, d2, squared, high, real)
-        a0 += b0
-        a1 += b1
-        a2 += b2
-        size = tl.sqrt(tl.maximum(a0 * a0 + a1 * a1 + a2 * a2, 1.2e-38))
-        sure = size > 1.1e-19
-        a0 = tl.where(sure, a0 / size, f0)
-        a1 = tl.where(sure, a1 / size, f1)
-        a2 = tl.where(sure, a2 / size, f2)
+        d = add3(vector(low, real), -1.0, vector(high, real))
+        a = vector(low + 4, real)
+        b = vector(high + 4, real)
+        n, above = discs(d, a, tl.load(low + 7, real, 0.0), b, tl.load(high + 7, real, 0.0))
         keep = 0.5 * (tl.load(low + 3, real, 0.0) + tl.load(high + 3, real, 0.0))
-        gap = d0 * a0 + d1 * a1 + d2 * a2 - keep
+        gap = dot3(d, n) - keep
         low = moving + tl.minimum(p, q) * 4
         high = moving + tl.maximum(p, q) * 4
-        along = (tl.load(low, real, 0.0) - tl.load(high, real, 0.0)) * a0
-        along += (tl.load(low + 1, real, 0.0) - tl.load(high + 1, real, 0.0)) * a1
-        along += (tl.load(low + 2, real, 0.0) - tl.load(high + 2, real, 0.0)) * a2
-        acts = real & (over_a | over_b) & (tl.minimum(gap, gap + dt * along) < slack)
-        many = _keep(data, other, slots, places, p, many, acts, q, a0, a1, a2, _target(gap, push, most, dt))
+        along = dot3(add3(vector(low, real), -1.0, vector(high, real)), n)
+        acts = real & above & (tl.minimum(gap, gap + dt * along) < slack)
+        many = _keep(data, other, slots, places, p, many, acts, q, n[0], n[1], n[2], _target(gap, push, most, dt))
     return many, close
 
 
@@ -219,7 +415,7 @@ def _impulses(
     friction, later, final,
     WALLS: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
-    """One iteration of ``resolve``: the impulses of the constraints of each sample, and their change summed there.
+    """One iteration: the impulses of the constraints of each sample, and their change summed there.
 
     It also sums the change that applies if the iterations end here: from the point extrapolated by the momentum back to
     the last iterate.
@@ -314,12 +510,11 @@ def _impulses(
 
 @triton.jit
 def _count_nodes(
-    entry_start, entry_place, entry_weight, reached, marked, total, touched, nodes, many, WALLS: tl.constexpr,
-    programs, TALL: tl.constexpr,
+    entry_start, entry_place, entry_weight, marked, total, touched, nodes, many, programs, TALL: tl.constexpr,
 ):  # fmt: skip
     """Sum the weights of all constraints at each node: the most that unit impulses at them move it; zero without any.
 
-    Nodes far from all constraints are not summed: they are not marked, or without obstacles have no pairs around them.
+    Nodes far from all constraints are not marked.
     """
     ENTRIES: tl.constexpr = 32 if TALL > 1 else 1  # at a time
     entry = tl.arange(0, ENTRIES)[None, :]
@@ -329,12 +524,9 @@ def _count_nodes(
         begin = tl.load(entry_start + n, mask, 0)
         length = tl.load(entry_start + n + 1, mask, 0) - begin
         node = tl.load(touched + n, mask, 0)
-        if WALLS > 0:
-            length = tl.where(tl.load(marked + node, mask, 0) > 0, length, 0)
-            tl.debug_barrier()  # several threads have read it
-            tl.store(marked + node, tl.zeros([TALL], tl.int32), mask)
-        else:
-            length = tl.where(tl.load(reached + n, mask, 0) > 0, length, 0)
+        length = tl.where(tl.load(marked + node, mask, 0) > 0, length, 0)
+        tl.debug_barrier()  # several threads have read it
+        tl.store(marked + node, tl.zeros([TALL], tl.int32), mask)
         found = tl.zeros([TALL, ENTRIES], tl.float32)
         for k in range(0, tl.max(length), ENTRIES):
             real = (k + entry) < length[:, None]
@@ -373,29 +565,55 @@ def contact_solve(
     fields, base, fraction, arm, rest, facing, radius, thickness, places, candidates, near, room,
     wall_gap, wall_normal, wall_drive, wall_valid, wall_friction, pressed,
     pressed_sum, row, moving, many, other, data, slots, impulse,
-    touched, entry_start, entry_place, entry_weight, reached, marked, total, touched_nodes,
-    peak, gate, status,
+    touched, entry_start, entry_place, entry_weight, marked, total, touched_nodes,
+    active, carries, before, active_nodes, motion, peak, gate, status,
     schedule, first_step, step_offset, sx, sy, inverse_dx, reach, slack, push, most, tolerance, friction,
     iterations,
     PAIRS: tl.constexpr, WALLS: tl.constexpr, ARMS: tl.constexpr, VIRTUAL: tl.constexpr, BLOCK: tl.constexpr,
     WIDE: tl.constexpr, TALL: tl.constexpr,
 ):  # fmt: skip
-    """The impulses of a substep, added to the velocities of the nodes; see ``resolve``.
+    """The impulses of a substep, added to the velocities of the nodes.
 
-    Nothing is done if no pairs are listed and no obstacle is within reach. With obstacles, ``contact_positions`` has
-    read the velocities. The reaction impulse on obstacles is added to ``pressed_sum``, float64.
+    Nothing is done if no pairs are listed and no obstacle is within reach. ``contact_positions`` has read the
+    velocities if there are obstacles. The reaction impulse on them is added to ``pressed_sum``, float64.
+
+    Samples that come close in this substep must be listed. No sample moves farther than the largest motion of a node
+    times its entry of ``carries``, so lists of samples closer than the reach of a contact, ``slack`` and a margin are
+    complete while twice that, with the motion of this substep, is less than the margin: ``motion`` is the most of it.
     """
     pid = tl.program_id(0)
     programs = tl.num_programs(0)
     lane = tl.arange(0, BLOCK)
     dt = tl.load(schedule + (tl.load(first_step) + step_offset + 1) * 4 + 1)
     listed = 0
-    limit = reach
+    limit = reach + slack
     if WALLS > 0:
         listed = tl.load(status + WITHIN)
     if PAIRS:
         listed += tl.load(status + LISTED)
-        limit += slack + 2 * largest_of(peak + MOST_PROGRAMS, programs)  # see `contact_lists`
+        moved = tl.zeros([BLOCK], tl.float32)
+        fast = tl.zeros([BLOCK], tl.float32)
+        for first in range(pid * BLOCK, active_nodes, programs * BLOCK):
+            n = first + lane
+            mask = n < active_nodes
+            at = fields + tl.load(active + n, mask, 0) * 8
+            far = tl.zeros([BLOCK], tl.float32)
+            speed = tl.zeros([BLOCK], tl.float32)
+            for c in tl.static_range(3):
+                u = tl.load(at + c, mask, 0.0) - tl.load(before + n * 3 + c, mask, 0.0)
+                v = tl.load(at + 4 + c, mask, 0.0)
+                far += u * u
+                speed += v * v
+            share = tl.load(carries + n, mask, 0.0)
+            speed = share * dt * tl.sqrt(speed)
+            moved = tl.maximum(moved, share * tl.sqrt(far) + speed)
+            fast = tl.maximum(fast, speed)
+        tl.store(peak + pid, tl.max(moved))
+        tl.store(peak + MOST_PROGRAMS + pid, tl.max(fast))
+        meet(gate, programs)
+        limit += 2 * largest_of(peak + MOST_PROGRAMS, programs)
+        if pid == 0:
+            tl.store(motion, tl.maximum(tl.load(motion), 2 * largest_of(peak, programs)))
     if listed > 0:
         if PAIRS:
             if pid == 0:
@@ -428,8 +646,8 @@ def contact_solve(
                         moving, wall_gap, wall_normal, wall_drive, wall_valid, pressed, data, other, slots, places, p,
                         mask, count, dt, slack, push, most, WALLS, BLOCK,
                     )  # fmt: skip
-                    if tl.max(count) > 0:
-                        _mark_nodes(base, marked, places, p, mask & (count > 0), sx, sy, VIRTUAL)
+                if tl.max(count) > 0:
+                    _mark_nodes(base, marked, places, p, mask & (count > 0), sx, sy, VIRTUAL)
                 tl.store(many + p, count, mask)
                 for c in tl.static_range(8):
                     tl.store(impulse + p * 8 + c, tl.zeros([BLOCK], tl.float32), mask)
@@ -438,9 +656,8 @@ def contact_solve(
         meet(gate, programs)
         if tl.load(status + ACTING) > 0:
             _count_nodes(
-                entry_start, entry_place, entry_weight, reached, marked, total, touched, touched_nodes, many, WALLS,
-                programs, TALL,
-            )  # fmt: skip
+                entry_start, entry_place, entry_weight, marked, total, touched, touched_nodes, many, programs, TALL
+            )
             meet(gate, programs)
             for first in range(pid * BLOCK, places, programs * BLOCK):
                 p = first + lane

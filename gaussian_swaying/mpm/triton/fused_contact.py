@@ -1,4 +1,4 @@
-"""Runs contact in the substep of ``total`` with its kernels; the lists are made on the device."""
+"""Runs contact in the substep of ``total``; the lists of samples that may touch are made between substeps."""
 
 from __future__ import annotations
 
@@ -8,10 +8,8 @@ import torch
 from torch import Tensor
 
 from gaussian_swaying.kernels.launch import lanes, launch
-from gaussian_swaying.mpm.contact.solve import PUSH, PUSH_CELLS, SLACK
-from gaussian_swaying.mpm.contact.stage import TOLERANCE, ContactStage
+from gaussian_swaying.mpm.contact import ContactStage
 from gaussian_swaying.mpm.triton import contact_kernels as kernels
-from gaussian_swaying.mpm.triton import contact_list_kernels as list_kernels
 from gaussian_swaying.mpm.triton import obstacle_kernels
 from gaussian_swaying.mpm.triton.fused import INTERPRETED, MAX_INDEX
 from gaussian_swaying.mpm.triton.obstacles import Solids
@@ -25,11 +23,18 @@ ROOM, SLOTS = 64, 16
 MOST_ENTRIES = MAX_INDEX // 2
 """Most entries of a buffer of candidates or constraints."""
 
-LEAST_MARGIN = 0.1
-"""Least distance beyond contact within which pairs are listed [cells]."""
+PUSH, PUSH_CELLS = 0.01, 0.004
+"""Share of an overlap that a substep removes, and the most of it [cells]."""
 
-AHEAD = 8.0
-"""Substeps of the fastest node for which lists stay complete, unless that is more than the reach of contact."""
+SLACK = 0.02
+"""Gap up to which a constraint counts as acting [cells]."""
+
+TOLERANCE = 5e-5
+"""Violation of a constraint within a substep at which the impulses are good enough [cells]."""
+
+REACHES, SURE, LONGEST = 3.0, 1.5, 64
+"""Least margin of the lists, in reaches of a contact; motion for which they are made, relative to that of the rollout
+before; most substeps for which they are used."""
 
 BLOCK, TALL = 64, 16
 """Samples, and nodes, of a program at a time: small ones, so that few places in contact keep many programs busy."""
@@ -50,8 +55,8 @@ _LAUNCH: dict[str, Any] = {"num_warps": 2, "maxnreg": 128}
 class FusedContact:
     """Contact of a body with buffers at fixed addresses, so that substeps can be recorded.
 
-    The lists are made on the device when they are too old. If the buffers are too small, :meth:`fits` finds that after
-    the rollout, and enlarges them.
+    If the buffers were too small, or the nodes moved farther than the lists are good for, :meth:`fits` finds that after
+    the rollout, and the next one has larger buffers, or makes lists more often.
 
     Args:
         bound: The formulation, bound to its material, with a contact.
@@ -61,6 +66,9 @@ class FusedContact:
     Attributes:
         room: Number of entries for the candidates of each sample.
         slots: Number of entries for the constraints of each sample.
+        margin: Distance beyond contact within which pairs are listed [m].
+        interval: Substeps after which lists are made again.
+        used: Most substeps for which they are used in this rollout.
     """
 
     def __init__(self, bound: Total, fields: Tensor, active: Tensor) -> None:
@@ -91,25 +99,21 @@ class FusedContact:
         many, walls = self.places, len(stage.obstacles)
         self.walls = walls
         whole: dict[str, Any] = {"dtype": torch.int32}
-        self.before = self._zeros(len(active), 4)
+        self.before, self.motion = self._zeros(len(active), 3), self._zeros(1)
         self.last = (1 << max(many - 1, 0).bit_length()) - 1
-        self.counts, self.rank = self._zeros(self.last + 1, **whole), self._zeros(many, **whole)
-        self.start = torch.full((self.last + 2,), many, device=self.device, dtype=torch.int32)
-        self.item, self.ordered = self._zeros(many, **whole), self._zeros(many, **whole)
-        self.now, self.sorted = self._zeros(many, 4), self._zeros(many, 4)
+        self.table = torch.arange(self.last + int(kernels.COLUMNS.value) + 2, device=self.device)
         self.near, self.many = self._zeros(many, **whole), self._zeros(many, **whole)
-        self.reached, self.total = self._zeros(len(self.touched), **whole), self._zeros(len(fields))
+        self.total = self._zeros(len(fields))
         self.row, self.moving, self.impulse = self._zeros(many, 8), self._zeros(many, 4), self._zeros(many, 8)
-        most = int(list_kernels.MOST_PROGRAMS.value)
-        self.peak, self.sums = self._zeros(4, most), self._zeros(most, **whole)
+        self.peak = self._zeros(4, int(kernels.MOST_PROGRAMS.value))
         self.gate, self.status = self._zeros(1, **whole), self._zeros(8, **whole)
-        self.margin = torch.full((1,), -1.0, dtype=fields.dtype, device=self.device)
+        self.margin, self.interval, self.used = REACHES * stage.reach, 4, 1
         self.wall_gap, self.wall_valid = self._zeros(max(walls, 1), many), self._zeros(max(walls, 1), many)
         self.wall_normal, self.wall_drive = self._zeros(max(walls, 1), many, 3), self._zeros(max(walls, 1), many, 3)
         self.pressed = self._zeros(max(walls, 1), many, 3)
         self.pressed_sum = self._zeros(max(walls, 1), many, 3, dtype=torch.float64)
         self.marked = self._zeros(len(fields), **whole)
-        self.within = self.status[int(list_kernels.WITHIN.value)]
+        self.within = self.status[int(kernels.WITHIN.value)]
         self.friction = fields.new_tensor([float(b.friction) for _, b in stage.obstacles] or [0.0])
         self.solids = [
             None if obstacle.twin() is None else Solids([(obstacle, 0)], fields, steps=1)
@@ -128,14 +132,13 @@ class FusedContact:
             return 1
         room = PER_PROCESSOR * torch.cuda.get_device_properties(self.device).multi_processor_count
         needed = max(-(-max(self.places, len(self.active)) // BLOCK), -(-len(self.touched) // TALL))
-        return max(1, min(room, needed, int(list_kernels.MOST_PROGRAMS.value)))
+        return max(1, min(room, needed, int(kernels.MOST_PROGRAMS.value)))
 
     def _take_room(self, room: int, slots: int) -> None:
         """Make the buffers whose size depends on how crowded the surface is; if they are refused, the old ones stay."""
         places, planes = self.places, int(kernels.PLANES.value)
-        for needed in (list_kernels.NEEDED_ROOM, list_kernels.NEEDED_SLOTS):
+        for needed in (kernels.NEEDED_ROOM, kernels.NEEDED_SLOTS):
             self.status[int(needed.value)] = 0  # what a refused rollout needed says nothing about the next one
-        self.margin.fill_(-1.0)
         if max(room, planes * slots) * places > MOST_ENTRIES:
             raise ValueError(
                 f"A contact sample is close to {max(room, slots):,} others: the material has collapsed; lower "
@@ -153,30 +156,69 @@ class FusedContact:
     @property
     def pairs(self) -> int:
         """Pairs that are listed; the host waits."""
-        return int(self.status[int(list_kernels.LISTED.value)]) // 2
-
-    @property
-    def made(self) -> int:
-        """Number of times that the lists were made; the host waits."""
-        return int(self.status[int(list_kernels.MADE.value)])
+        return int(self.status[int(kernels.LISTED.value)]) // 2
 
     @property
     def rounds(self) -> int:
         """Iterations of all substeps so far; the host waits."""
-        return int(self.status[int(list_kernels.ROUNDS.value)])
+        return int(self.status[int(kernels.ROUNDS.value)])
 
     def fits(self) -> bool:
-        """True if the buffers were large enough for all lists so far; if not, enlarge them. The host waits."""
+        """True if lists were complete and buffers large enough since :meth:`take`; if not, they will. The host waits.
+
+        Lists are made for the motion of the substeps before, and a bit more.
+        """
         if self.stage.contact is None:  # the room is exact
             return True
         _, room, slots, *_ = self.status.tolist()
+        moved, fits = float(self.motion), True
+        if moved < 1e9:  # a run that diverges is not repeated
+            fits, step = moved <= self.margin, SURE * max(moved / self.used, 1e-9)
+            self.margin = max(REACHES * self.stage.reach, step)
+            self.interval = min(LONGEST, int(self.margin / step))
         if room <= self.room and slots <= self.slots:
-            return True
+            return fits
         self._take_room(max(self.room, 1 << (room - 1).bit_length()), max(self.slots, 1 << (slots - 1).bit_length()))
         return False
 
+    def due(self, steps: int) -> range:
+        """The substeps of a rollout before which lists are made."""
+        self.used = min(steps, self.interval)
+        return range(0, steps if self.stage.contact is not None and self.places else 0, self.interval)
+
+    def make_lists(self, _: int = 1) -> None:
+        """List the samples that may touch before a node moves by half the margin; can be recorded."""
+        stage, places, block = self.stage, self.places, lanes(self.device, BLOCK, 1)
+        self.before.copy_(self.fields[self.active.long(), :3])
+        self._read()
+        limit = stage.reach + SLACK * stage.dx + self.margin
+        columns, cell = int(kernels.COLUMNS.value), (self.position - self.position.amin(0)) / limit
+        x, y, z = (cell.nan_to_num(0.0).clamp(max=columns - 3.0) + 1).long().unbind(1)
+        table, order = ((((x * 73856093) ^ (y * 19349663)) & self.last) + z).sort(stable=True)
+        start = torch.searchsorted(table, self.table, out_int32=True)
+        launch(kernels.contact_lists, (-(-places // block),))(
+            self.position, self.rest, self.base, self.corner, torch.stack([x, y, z], 1).int(), start, order.int(),
+            self.position[order], (x * columns + y)[order].int(), self.candidates, self.near, places,
+            self.room, limit, stage.apart, stage.reach, self.last, VIRTUAL=self.virtual, BLOCK=block,
+            WIDE=lanes(self.device, WIDE_SEARCH), **_LAUNCH,
+        )  # fmt: skip
+        self.status[:2].copy_(torch.stack([self.near.sum(), self.near.amax().maximum(self.status[1])]))
+        self.near.clamp_(max=self.room)
+        self.many.zero_()
+        self.impulse.zero_()
+
+    def _read(self) -> None:
+        """Read the positions and velocities of all contact samples from the nodes."""
+        stage, block = self.stage, lanes(self.device, BLOCK, 1)
+        _, ny, nz = stage.grid.resolution
+        launch(kernels.contact_positions, (-(-self.places // block),))(
+            self.fields, self.base, self.fraction, self.arm, self.rest, self.places, self.position, self.moving,
+            self.status, ny * nz, nz, 1 / stage.dx, ARMS=self.arms, VIRTUAL=self.virtual, BLOCK=block, num_warps=4,
+        )  # fmt: skip
+
     def take(self) -> None:
-        """Bring the tables of the obstacles up to date before a rollout; not recorded."""
+        """Begin a rollout: bring the tables of the obstacles up to date; not recorded."""
+        self.motion.zero_()
         for solid in self.solids:
             if solid is not None:
                 solid.take()
@@ -211,21 +253,8 @@ class FusedContact:
         }  # fmt: skip
         if self.programs > 1:
             options["launch_cooperative_grid"] = True
-        if pairs:
-            chunk = -(-(self.last + 1) // self.programs)
-            launch(list_kernels.contact_lists, (self.programs,))(
-                self.active, self.carries, self.before, len(self.active), *where, self.places, self.corner,
-                self.now, self.counts, self.start, self.rank, self.item, self.ordered, self.sorted, self.candidates,
-                self.near, self.room, self.many, self.impulse, self.entry_start, self.entry_place, self.reached,
-                len(self.touched), self.peak, self.sums, self.gate, self.status, self.margin, *now, stage.reach,
-                stage.apart, SLACK * dx, LEAST_MARGIN * dx, AHEAD, self.last, -(-chunk // block) * block,
-                WIDE=lanes(self.device, WIDE_SEARCH), **options,
-            )  # fmt: skip
         if walls:
-            launch(list_kernels.contact_positions, (-(-self.places // block),))(
-                *where, self.places, self.position, self.moving, self.status, *strides,
-                ARMS=self.arms, VIRTUAL=self.virtual, BLOCK=block, num_warps=4,
-            )  # fmt: skip
+            self._read()
             for k, (solid, (_, obstacle)) in enumerate(zip(self.solids, stage.obstacles, strict=True)):
                 if solid is not None:
                     solid.prepare(time, dt, 1)
@@ -246,8 +275,9 @@ class FusedContact:
             *where, self.facing, self.radius, self.thickness, self.places, self.candidates, self.near, self.room,
             self.wall_gap, self.wall_normal, self.wall_drive, self.wall_valid, self.friction, self.pressed,
             self.pressed_sum, self.row, self.moving, self.many, self.other, self.data, self.slots, self.impulse,
-            self.touched, self.entry_start, self.entry_place, self.entry_weight, self.reached, self.marked, self.total,
-            len(self.touched), self.peak, self.gate, self.status, *now, stage.reach, SLACK * dx, PUSH,
+            self.touched, self.entry_start, self.entry_place, self.entry_weight, self.marked, self.total,
+            len(self.touched), self.active, self.carries, self.before, len(self.active), self.motion, self.peak,
+            self.gate, self.status, *now, stage.reach, SLACK * dx, PUSH,
             PUSH_CELLS * dx, TOLERANCE * dx, 0.0 if stage.contact is None else stage.contact.friction,
             stage.iterations, PAIRS=pairs, WALLS=walls, WIDE=WIDE, **options,
         )  # fmt: skip

@@ -233,11 +233,16 @@ class FusedTotal(Fused):
         self.repeater.run(1, ("begin", *key), begin, part.key is not None)
         same = (*options.values(), *(() if self.touching is None else self.touching.key))
         done = 0
-        for mark in sorted({*part.looks, part.steps}):
+        due, touching = range(0), self.touching
+        if touching is not None:
+            due = touching.due(part.steps)
+        for mark in sorted({*part.looks, part.steps, *due}):
             self.repeat(mark - done, same, lambda offset: self.substep(offset, options))
             done = mark
             if mark in part.looks:
                 self.repeater.run(1, "look", lambda _: self._look(), launches=True)
+            if mark in due and touching is not None:
+                self.repeater.run(1, ("lists", *touching.key, touching.margin), touching.make_lists)
         if self.count > RECORDED:
             found = torch.empty(self.room, **self.like)
             self._read(found, part)

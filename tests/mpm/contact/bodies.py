@@ -3,7 +3,7 @@
 import torch
 
 from gaussian_swaying import Contact, MaterialPoints, MPMSolver
-from gaussian_swaying.mpm.contact.surface import Surface
+from gaussian_swaying.mpm.contact import Surface
 
 SPACING, THICKNESS, APART = 0.02, 0.01, 0.2
 DX = 2.2 * SPACING
@@ -25,7 +25,7 @@ def _surface(points, contact, normal=(0.0, 0.0, 1.0), spacing=SPACING):
 
 def scene(points, contact=None, boundaries=(), velocity=None, normal=(0.0, 0.0, 1.0), **settings):
     """A solver in `total` with its contact, and the first state."""
-    settings = {"dx": DX, "transfer": "torch"} | settings
+    settings = {"dx": DX} | settings
     solver = MPMSolver(boundaries=boundaries, **settings)
     return solver, solver.init_state(points, velocity, surface=_surface(points, contact, normal))
 

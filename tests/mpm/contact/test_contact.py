@@ -9,7 +9,7 @@ from torch.testing import assert_close
 
 from gaussian_swaying import Contact, MaterialPoints, MPMSolver, PinnedPoints
 from gaussian_swaying.mpm.boundaries.half_space import HalfSpaceObstacle
-from gaussian_swaying.mpm.contact.surface import Surface
+from gaussian_swaying.mpm.contact import Surface
 
 from .bodies import layers, march, scene, sheet
 
@@ -129,43 +129,29 @@ def test_a_pile_rests_for_long(dtype, seconds):
     assert moved < 0.02 * THICKNESS
 
 
-def test_the_lists_do_not_change_the_result():
-    """They are a cache: a solver that has just been made continues from a state as the one that made it."""
+def test_the_lists_do_not_change_the_result(monkeypatch):
+    """Lists that were made for sheets at rest are noticed when the sheets fly: the rollout is made again."""
     points, velocity, _ = _two(2.0, 0.3)
     solver, state = scene(points, Contact(), velocity=velocity, gravity=(0, 0, 0))
-    middle = march(solver, state, 0.07)[-1]
-    known = march(solver, middle, 0.02)[-1]
-    other = scene(points, Contact(), velocity=velocity, gravity=(0, 0, 0))[0]
-    again = march(other, middle, 0.02)[-1]
-    assert solver.bound.contact.made > other.bound.contact.made > 0
+    still = state.replace(velocity=0 * velocity, node_velocity=0 * state.node_velocity)
+    solver.rollout(still, 1e-4, 8)
+    assert solver.fused().touching.interval == 64
+    known = solver.rollout(state, 5e-4, 160)
+    assert 1 < solver.fused().touching.interval < 64
+    monkeypatch.setattr("gaussian_swaying.mpm.triton.fused_contact.LONGEST", 1)
+    other, state = scene(points, Contact(), velocity=velocity, gravity=(0, 0, 0))
+    other.rollout(still, 1e-4, 1)
+    again = other.rollout(state, 5e-4, 160)
+    assert other.fused().touching.interval == 1
     assert_close(again.position, known.position, rtol=0, atol=1e-10)
+    assert float((known.velocity - velocity).abs().max()) > 1.0  # they touched
 
 
-def test_gradients_flow_through_a_contact():
-    """Of a few substeps in contact, against a difference in a random direction; no contact begins or ends in them."""
-    points, velocity, _ = _two(2.0, 0.3)
-    solver, state = scene(points, Contact(iterations=3), velocity=velocity, gravity=(0, 0, 0))
-    touching = march(solver, state, 0.062, frame=0.002)[-1]
-    ways = [torch.randn_like(touching.node_displacement) for _ in range(2)]
-
-    def result(scale):
-        start = touching.replace(
-            node_displacement=touching.node_displacement + 1e-4 * scale * ways[0],
-            node_velocity=touching.node_velocity + 1e-2 * scale * ways[1],
-        )
-        start = solver.bound.read_particles(start, start.node_displacement, start.node_velocity)
-        end = solver.rollout(start, 1e-4, 3)
-        return (end.velocity * weights).sum()
-
-    weights = torch.randn_like(touching.velocity)
-    at = torch.zeros((), dtype=torch.float64, requires_grad=True)
-    (slope,) = torch.autograd.grad(result(at), at)
-    with torch.no_grad():
-        expected = (result(at + 1e-6) - result(at - 1e-6)) / 2e-6
-        free = scene(points, None, velocity=velocity, gravity=(0, 0, 0))[0]
-        apart = free.rollout(touching, 1e-4, 3).velocity
-        assert float((apart - solver.rollout(touching, 1e-4, 3).velocity).abs().max()) > 1e-3  # they touch
-    assert abs(float(slope) - float(expected)) < 1e-5 * abs(float(expected))
+@pytest.mark.parametrize("transfer", ["auto", "torch"])
+def test_contact_without_kernels_is_refused(transfer):
+    solver, state = scene(_two(2.0)[0], Contact(), transfer=transfer)
+    with pytest.raises(ValueError, match=r"no gradients through contact: leave `solver.transfer` on auto"):
+        solver.rollout(state.replace(node_velocity=state.node_velocity.requires_grad_()), 1e-4, 1)
 
 
 def test_bad_settings_are_refused():

@@ -1,26 +1,47 @@
-"""Contact in the Triton substep against torch."""
+"""The kernels of contact: float32 against float64, lists and their buffers, recordings."""
 
 import pytest
 import torch
+from contacts import pairs, samples
 from torch.testing import assert_close
 
 from gaussian_swaying import Contact, MaterialPoints, PinnedPoints
+from gaussian_swaying.kernels.derive import on_tensors
 from gaussian_swaying.mpm.boundaries.ball import BallObstacle
 from gaussian_swaying.mpm.boundaries.half_space import HalfSpaceObstacle
-from gaussian_swaying.mpm.contact.pairs import close_pairs
-from gaussian_swaying.mpm.triton import fused_contact
+from gaussian_swaying.mpm.triton import contact_kernels, fused_contact
 
 from .bodies import scene, sheet
 
 DT = 1.2e-3
 
 
-def _collision(device):
+@pytest.mark.parametrize(
+    ("arm", "normal"),
+    [
+        ((0.05, 0.28, 2.0), (0.0, 0.0, 1.0)),  # 0.284 from the axis of the first, high above it
+        ((0.05, 0.31, -2.0), None),
+        ((-2.0, 0.38, 0.05), (-1.0, 0.0, 0.0)),  # 0.383 from that of the second
+        ((2.0, 0.41, 0.05), None),
+        ((0.1, 0.05, 0.1), (0.5**0.5, 0.0, 0.5**0.5)),  # near both
+        ((0.0, 0.0, 0.0), (1.0, 0.0, 0.0)),  # in one place: the normal of one of them
+    ],
+)
+def test_a_disc_counts_if_the_centre_of_the_other_is_above_it(arm, normal):
+    """A disc of radius 0.3 that faces z, and one of 0.4 that faces x."""
+    d, first, second = torch.tensor([arm, [0, 0, 1], [1, 0, 0]], dtype=torch.float64)
+    found, above = on_tensors(contact_kernels.discs)(tuple(d), tuple(first), 0.3, tuple(second), 0.4)
+    assert bool(above) == (normal is not None)
+    if normal is not None:
+        assert [float(number) for number in found] == pytest.approx(normal)
+
+
+def _collision(device, dtype=torch.float32):
     """A small sheet that flies onto one that is held at two corners, beside a moving ball."""
-    below, above = sheet(5, 5, dtype=torch.float32), sheet(3, 3, (0.023, 0.017, 0.1), dtype=torch.float32)
+    below, above = sheet(5, 5, dtype=dtype), sheet(3, 3, (0.023, 0.017, 0.1), dtype=dtype)
     points = MaterialPoints.join([below, above]).map(lambda t: t.to(device))
     velocity = torch.zeros_like(points.position)
-    velocity[below.count :] = torch.tensor([6.0, 0.0, -20.0], device=device)
+    velocity[below.count :] = torch.tensor([6.0, 0.0, -20.0]).to(velocity)
     pins = PinnedPoints([[0.0, 0.0, 0.0], [0.08, 0.0, 0.0]])
     balls = [
         BallObstacle([0.04, 0.04, -0.06], 0.05, 0.4),
@@ -30,32 +51,39 @@ def _collision(device):
     return points, velocity, [pins, *balls]
 
 
-@pytest.mark.parametrize(
-    ("device", "iterations"),
-    [("cpu", 4), *(pytest.param("cuda", number, marks=pytest.mark.gpu) for number in (1, 4))],
-    indirect=["device"],
-)
-def test_the_kernels_do_what_torch_does(device, iterations):
+def _ends(device, contact, *parts, speed=1.0):
+    """Positions, velocities and impulses after parts of a rollout, on a device and in float64; the first solver."""
+    ends, solvers = [], []
+    for place, dtype in ((device, torch.float32), ("cpu", torch.float64)):
+        points, velocity, boundaries = _collision(place, dtype)
+        solver, state = scene(points, contact, boundaries, velocity=speed * velocity)
+        states = []
+        for steps in parts:
+            state = solver.rollout(state, DT, steps)
+            fields = (state.position, state.velocity, state.impulse)
+            states.append([field.cpu().double() for field in fields])
+        ends.append(states)
+        solvers.append(solver)
+    return *ends, solvers[0]
+
+
+@pytest.mark.parametrize("iterations", [1, 4])
+def test_a_collision_is_the_same_in_float32_and_float64(device, iterations):
     """Four substeps of free flight and two of collision; round-off grows in it, but not to a thousandth of it."""
-    points, velocity, boundaries = _collision(device)
-    ends, taken = [], []
-    for transfer in ("torch", "kernels"):
-        contact = Contact(friction=0.1, iterations=iterations)  # they slide
-        solver, state = scene(points, contact, boundaries, velocity=velocity, transfer=transfer)
-        assert solver.has_kernels == (transfer == "kernels")
-        state = solver.rollout(state, DT, 4)
-        middle = state.velocity.clone()
-        state = solver.rollout(state, DT, 2)
-        ends.append(state)
-        taken.append(state.impulse)
+    single, double, solver = _ends(device, Contact(friction=0.1, iterations=iterations), 4, 2)  # they slide
     assert solver.fused().touching.rounds > 0
-    changed = float((ends[0].velocity - middle).abs().max())
+    (position, speed, taken), (expected, speeds, impulse) = single[1], double[1]
+    changed = float((speed - single[0][1]).abs().max())
     assert changed > 5.0
-    assert_close(ends[1].position, ends[0].position, rtol=0, atol=2e-5)
-    assert_close(ends[1].velocity, ends[0].velocity, rtol=0, atol=1e-3 * changed)
-    assert_close(taken[1], taken[0], rtol=0, atol=1e-4 * float(taken[0].abs().max()) + 1e-6)
-    for each in taken:
+    assert_close(position, expected, rtol=0, atol=2e-5)
+    assert_close(speed, speeds, rtol=0, atol=1e-3 * changed)
+    assert_close(taken, impulse, rtol=0, atol=1e-4 * float(impulse.abs().max()) + 1e-6)
+    for each in (taken, impulse):
         assert (each.abs().amax(-1) > 1e-7).tolist() == [True, True, False, True]
+    points, velocity, _boundaries = _collision("cpu", torch.float64)
+    momentum = (points.mass[:, None] * (speeds - velocity)).sum(0) + impulse.sum(0)
+    gravity = points.mass.sum() * 6 * DT * torch.tensor([0.0, 0.0, -9.8], dtype=torch.float64)
+    assert_close(momentum, gravity, rtol=0, atol=1e-12)  # what the boundaries took is what the sheets lost
 
 
 def test_iterations_are_counted_where_there_are_obstacles(device):
@@ -67,7 +95,7 @@ def test_iterations_are_counted_where_there_are_obstacles(device):
     assert solver.fused().touching.rounds == 6
 
 
-def test_the_lists_are_those_of_close_pairs(device):
+def test_the_lists_are_those_of_a_tree(device):
     """Sheets that lie across each other in many cells of the grid: both sides of all pairs, in a fixed order."""
     low = sheet(9, 9, dtype=torch.float32)
     points = MaterialPoints.join([low, sheet(9, 9, (0.0, 0.0, 0.4), dtype=torch.float32)]).map(lambda t: t.to(device))
@@ -78,14 +106,14 @@ def test_the_lists_are_those_of_close_pairs(device):
     state = solver.bound.read_particles(state, moved, 0 * moved)
     solver.rollout(state, 1e-5, 1)
     touching, stage = solver.fused().touching, solver.bound.contact
-    limit = stage.reach + float(touching.margin)
-    first, second = close_pairs(stage.positions(moved), limit, stage.surface.place, stage.apart)
-    assert len(first) > 200
-    assert touching.pairs == len(first)
+    limit = stage.reach + fused_contact.SLACK * stage.dx + touching.margin
+    both = pairs(stage, samples(stage, state)[0], limit)
+    assert both.shape[1] > 200
+    assert touching.pairs == both.shape[1]
     near = touching.near.long()
     known = torch.arange(touching.room, device=device) < near[:, None]
     found = torch.stack([known.nonzero()[:, 0], touching.candidates.long()[known]])
-    expected = torch.cat([torch.stack([first, second]), torch.stack([second, first])], dim=1)
+    expected = torch.cat([both, both.flip(0)], dim=1)
     width = len(near)
     assert torch.equal((found[0] * width + found[1]).sort()[0], (expected[0] * width + expected[1]).sort()[0])
 
@@ -96,19 +124,16 @@ def test_nodes_without_weight_do_not_widen_the_lists(device):
     dx = 0.044
     points = MaterialPoints.join([low, sheet(3, 3, (0.023, 0.017, 2.501 * dx), dtype=torch.float32)])
     points = points.map(lambda t: t.to(device))
-    ends = []
-    for transfer in ("torch", "kernels"):
-        solver, state = scene(points, Contact(iterations=4), transfer=transfer, gravity=(0.0, 0.0, 0.0))
-        mass = solver.bound.node_mass
-        light = (mass > 0) & (mass < 1e-5 * mass.amax())
-        assert int(light.sum()) > 4
-        velocity = torch.where(light[:, None], 1000.0, 0.0).expand(-1, 3)
-        state = solver.bound.read_particles(state, torch.zeros_like(velocity), velocity)
-        ends.append(solver.rollout(state, 1e-5, 3))
+    solver, state = scene(points, Contact(iterations=4), gravity=(0.0, 0.0, 0.0))
+    mass = solver.bound.node_mass
+    light = (mass > 0) & (mass < 1e-5 * mass.amax())
+    assert int(light.sum()) > 4
+    velocity = torch.where(light[:, None], 1000.0, 0.0).expand(-1, 3)
+    state = solver.bound.read_particles(state, torch.zeros_like(velocity), velocity)
+    solver.rollout(state, 1e-5, 3)
     touching = solver.fused().touching
-    assert touching.made == 1
-    assert float(touching.margin) < 0.5 * dx
-    assert_close(ends[1].position, ends[0].position, rtol=0, atol=1e-6)
+    assert touching.margin == fused_contact.REACHES * solver.bound.contact.reach
+    assert touching.interval > 1
 
 
 def test_lists_that_do_not_fit_get_more_room(device, monkeypatch):
@@ -151,18 +176,10 @@ def test_material_that_has_collapsed_is_refused(device, monkeypatch):
 
 @pytest.mark.gpu
 def test_graphs_do_what_single_substeps_do():
-    """On a GPU: substeps of a collision from graphs, and a new list in the middle, against torch."""
-    device = torch.device("cuda")
-    points, velocity, boundaries = _collision(device)
-    ends = []
-    for transfer in ("torch", "kernels"):
-        solver, state = scene(points, Contact(), boundaries, velocity=0.1 * velocity, transfer=transfer)
-        for _ in range(4):
-            state = solver.rollout(state, DT / 4, 80)
-        ends.append(state)
-    scale = float((ends[0].position - points.position).abs().max())
-    assert scale > 0.05
-    assert_close(ends[1].position, ends[0].position, rtol=0, atol=0.02 * scale)
+    """On a GPU: substeps of a collision from graphs, and new lists in the middle, against a CPU in float64."""
+    single, double, _ = _ends("cuda", Contact(), 20, 20, 20, speed=0.1)
+    scale = float((double[-1][0] - double[0][0]).abs().max())
+    assert_close(single[-1][0], double[-1][0], rtol=0, atol=0.02 * scale)
 
 
 @pytest.mark.gpu

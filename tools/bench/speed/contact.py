@@ -6,7 +6,7 @@ import torch
 
 from bench.runner import Row, study
 from bench.speed.timing import timed
-from gaussian_swaying.mpm.contact.surface import Contact, Surface
+from gaussian_swaying.mpm.contact import Contact, Surface
 from gaussian_swaying.mpm.solver import MPMSolver
 from gaussian_swaying.mpm.state import MaterialPoints
 

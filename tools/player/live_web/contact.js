@@ -1,4 +1,4 @@
-// Contact with obstacles that stand still; the definition is gaussian_swaying/mpm/contact/solve.py, with no pairs.
+// Contact with obstacles that stand still; the definition is gaussian_swaying/mpm/contact.py, with no pairs.
 
 const PUSH = 0.01; // share of an overlap that a substep removes
 const PUSH_CELLS = 0.004; // most of it [cells]

@@ -1,1 +1,0 @@
-"""Contact of the surface with obstacles and with itself, in the ``total`` formulation."""
