@@ -212,7 +212,7 @@ class _TorchLanguage:
         if not isinstance(condition, Tensor):
             return yes if condition else no
         if not isinstance(yes, Tensor) and not isinstance(no, Tensor):
-            yes = torch.tensor(float(yes), dtype=_REAL.get(), device=condition.device)
+            yes = torch.full((), float(yes), dtype=_REAL.get(), device=condition.device)
         return torch.where(condition, yes, no)
 
     @staticmethod

@@ -12,10 +12,9 @@ from torch import Tensor
 from gaussian_swaying._checks import check_choice, check_positive, check_vector
 from gaussian_swaying._fixed import changed
 from gaussian_swaying.geometry.frame import SimFrame
-from gaussian_swaying.mpm.twins import Numbers, Twin
 from gaussian_swaying.wind.effects import Moment, WindEffect, placed
-from gaussian_swaying.wind.lookup import trilinear
 from gaussian_swaying.wind.spectra import SPECTRA, resolved_share
+from gaussian_swaying.wind.tables import Tabulated, wind_axes
 from gaussian_swaying.wind.turbulence_box import sheared_variances, turbulence_box
 
 
@@ -34,14 +33,7 @@ def box_axes(flow: Tensor, sides: Sequence[float], tilted: bool) -> Tensor:
     Returns:
         Orthonormal, shape (3, 3), float64.
     """
-    flow = flow.double()
-    speed = float(flow.norm())
-    x = flow / speed if speed > 0 else torch.tensor([1.0, 0.0, 0.0], dtype=torch.float64)
-    up = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)
-    if float(x[2].abs()) > 0.99:
-        up = torch.tensor([1.0, 0.0, 0.0], dtype=torch.float64)
-    y = torch.nn.functional.normalize(torch.linalg.cross(up, x), dim=0)
-    axes = torch.stack([x, y, torch.linalg.cross(x, y)])
+    axes = wind_axes(flow.double())
     if not tilted:
         return axes
     first = torch.tensor([sides[0], 0.382 * sides[1], 0.236 * sides[2]], dtype=torch.float64)
@@ -51,7 +43,7 @@ def box_axes(flow: Tensor, sides: Sequence[float], tilted: bool) -> Tensor:
     return turn.T @ axes
 
 
-class CarriedField(WindEffect):
+class CarriedField(Tabulated):
     """Adds a frozen field that the mean flow carries along (Taylor 1938), by linear interpolation.
 
     Args:
@@ -67,8 +59,6 @@ class CarriedField(WindEffect):
         ValueError: If the table has the wrong shape.
     """
 
-    recordable = True
-
     def __init__(
         self,
         table: Tensor,
@@ -79,78 +69,39 @@ class CarriedField(WindEffect):
         scale: float = 1.0,
         tilted: bool = False,
     ) -> None:
-        super().__init__()
         if table.ndim != 4 or table.shape[-1] != 3 or min(table.shape[:3]) < 2:
             raise ValueError(f"Expected `table` of shape (X, Y, Z, 3), at least 2 each, but got {tuple(table.shape)}.")
         self.spacing = check_vector("spacing", spacing)
-        self.origin, self.wraps = check_vector("origin", origin), wraps
-        self.scale, self.tilted = check_vector("scale", [scale], 1)[0], bool(tilted)
-        self.register_buffer("table", table, persistent=False)
-        self.register_buffer("axes", torch.eye(3, dtype=torch.float64), persistent=False)
-        sides = torch.tensor([n * h for n, h in zip(table.shape[:3], self.spacing, strict=True)], dtype=torch.float64)
-        self.register_buffer("sides", sides, persistent=False)
-        step = torch.tensor(self.spacing, dtype=torch.float64)
-        self.register_buffer("step", step, persistent=False)
-        self.register_buffer("place", torch.tensor(self.origin, dtype=torch.float64), persistent=False)
-        found = torch.tensor(check_vector("anchor", anchor), dtype=torch.float64)
-        self.register_buffer("anchor", found, persistent=False)
-        self.register_buffer("start", torch.zeros(3, dtype=torch.float64), persistent=False)
-        self.register_buffer("repeats", torch.tensor(wraps), persistent=False)
-        self.table: Tensor
-        self.axes: Tensor
-        self.sides: Tensor
-        self.step: Tensor
-        self.place: Tensor
-        self.anchor: Tensor
-        self.start: Tensor
-        self.repeats: Tensor
+        self.origin, (self.scale,) = check_vector("origin", origin), check_vector("scale", [scale], 1)
+        self.tilted = bool(tilted)
+        step, place, first = (torch.tensor(v, dtype=torch.float64) for v in (self.spacing, self.origin, anchor))
+        super().__init__(table, step, place, wraps)
+        self.register_buffer("anchor", first, persistent=False)
+        self.register_buffer("start", torch.zeros_like(first), persistent=False)
+
+    anchor: Tensor
+    start: Tensor
 
     def along(self, flow: Tensor) -> WindEffect:
         """The field with its x axis turned into the flow."""
-        return changed(self, axes=box_axes(flow.detach().cpu(), self.sides.tolist(), self.tilted))
+        return changed(self, axes=box_axes(flow.detach().cpu(), (self.sizes * self.step).tolist(), self.tilted))
 
     def in_frame(self, frame: SimFrame) -> WindEffect:
         """The origin in metres."""
         return changed(self, place=torch.tensor(placed(frame, self.origin), dtype=torch.float64))
 
-    def offset(self, carried: Tensor) -> Tensor:
-        """Place of the object's centre in the field, in cells, when the flow has ``carried`` it [m], shape (..., 3).
-
-        It is reduced to the first period along the axes that repeat, so that float32 is precise enough.
-        """
-        place = self.anchor - (self.place + self.start + carried) @ self.axes.T
-        return torch.where(self.repeats.to(place.device), place.remainder(self.sides), place) / self.step
+    def now(self, moment: Moment) -> Tensor:
+        """The place of the object's centre in the field, in its first period where it repeats, and the strength."""
+        place = self.anchor - (self.place + self.start + moment.carried) @ self.axes.T
+        parts = zip(place.unbind(-1), (self.sizes * self.step).unbind(), self.wraps, strict=True)
+        place = torch.stack([x.remainder(side) if wraps else x for x, side, wraps in parts], dim=-1)
+        return torch.cat([place / self.step, torch.zeros_like(place[:, :1]) + self.strength(moment.flow)], dim=-1)
 
     def strength(self, flow: Tensor) -> Tensor | float:
-        """Factor of the velocities in a mean flow [m/s], shape (..., 3); shape (..., 1), or one number."""
+        """Factor of the velocities in a mean flow [m/s], shape (n, 3); shape (n, 1), or one number."""
         return self.scale
 
-    def forward(self, velocity: Tensor, position: Tensor, moment: Moment) -> Tensor:
-        axes = self.axes.to(position)
-        place = position @ (axes / self.step[:, None].to(position)).T + self.offset(moment.carried).to(position)
-        found = trilinear(self.table, place, self.wraps) @ axes
-        strength = self.strength(moment.flow)
-        return velocity.to(found) + (strength.to(found) if isinstance(strength, Tensor) else strength) * found
-
-    def twin(self) -> Twin:
-        from gaussian_swaying.wind.effects_triton import carried_field
-
-        def now(moment: Moment) -> Tensor:
-            place, strength = self.offset(moment.carried), self.strength(moment.flow)
-            return torch.cat([place, torch.zeros_like(place[:, :1]) + strength], dim=-1)
-
-        def numbers() -> Tensor:
-            sizes = self.sides.new_tensor(self.table.shape[:3])
-            return torch.cat([(self.axes / self.step[:, None]).reshape(-1), self.axes.T.reshape(-1), sizes])
-
-        return Twin(
-            carried_field,
-            options=tuple(map(bool, self.wraps)),
-            numbers=Numbers(21, numbers),
-            per_substep=Numbers(4, now),
-            table=Numbers(self.table.numel(), lambda: self.table),
-            sources=(self,),
-        )
+    twin = Tabulated.twin
 
 
 class Turbulence(CarriedField):
@@ -180,8 +131,7 @@ class Turbulence(CarriedField):
         torch.Size([32, 16, 16, 3])
     """
 
-    recordable = True
-    twin = CarriedField.twin
+    twin = Tabulated.twin
 
     def __init__(
         self,

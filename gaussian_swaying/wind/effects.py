@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import math
-from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 from torch import Tensor, nn
@@ -13,11 +13,47 @@ from torch import Tensor, nn
 from gaussian_swaying._checks import check_positive, check_vector
 from gaussian_swaying._fixed import changed
 from gaussian_swaying.geometry.frame import SimFrame
+from gaussian_swaying.kernels.derive import Memory, on_tensors
 from gaussian_swaying.kernels.graphs import Recordable
+from gaussian_swaying.kernels.language import tl, triton
 from gaussian_swaying.mpm.twins import Numbers, Twin, Twinned
 
 SPREAD = 58.0
 """The updraft of a plume falls off as exp(-SPREAD r^2 / z^2)."""
+
+
+@triton.jit
+def log_profile(v, x, numbers, now, table, OPTIONS: tl.constexpr):
+    """``LogProfile``; ``numbers``: height of the ground, roughness, one over the logarithm."""
+    above = tl.maximum(x[2] - numbers[0], numbers[1])
+    factor = tl.log(above / numbers[1]) * numbers[2]
+    return v[0] * factor, v[1] * factor, v[2] * factor
+
+
+@triton.jit
+def power_profile(v, x, numbers, now, table, OPTIONS: tl.constexpr):
+    """``PowerProfile``; ``numbers``: height of the ground, one over the height, exponent."""
+    above = (x[2] - numbers[0]) * numbers[1]
+    factor = tl.exp(numbers[2] * tl.log(tl.where(above > 0, above, 1.0)))
+    factor = tl.where(above > 0, factor, 0.0)
+    return v[0] * factor, v[1] * factor, v[2] * factor
+
+
+@triton.jit
+def plume(v, x, numbers, now, table, OPTIONS: tl.constexpr):
+    """``Plume``; ``numbers``: its source (3), height of the source above the point, speed, spread."""
+    a = x[0] - numbers[0]
+    b = x[1] - numbers[1]
+    above = x[2] - numbers[2]
+    height = tl.maximum(above, 0.0) + numbers[3]
+    off = numbers[5] * (a * a + b * b) / (height * height)
+    fall = tl.exp(-off)
+    series = 1 - off / 2 * (1 - off / 3 * (1 - off / 4 * (1 - off / 5)))
+    share = tl.where(off < 1e-2, series, (1 - fall) / tl.maximum(off, 1e-2))
+    up = numbers[4] * tl.exp(-tl.log(height) / 3)
+    up = tl.where(above >= 0, up, 0.0)
+    drawn = up / height * (fall - 5 / 6 * share)
+    return v[0] + drawn * a, v[1] + drawn * b, v[2] + up * fall
 
 
 @dataclass(frozen=True)
@@ -35,18 +71,17 @@ class Moment:
     carried: Tensor
 
 
-class WindEffect(Recordable, Twinned, nn.Module, ABC):
+class WindEffect(Recordable, Twinned, nn.Module):
     """Base of effects, which change the wind from place to place.
 
-    A subclass has a ``forward``, and sets ``recordable = True`` if that can be recorded in a CUDA graph (see
-    ``Force``). If all effects of a wind have a ``twin`` (:mod:`~gaussian_swaying.mpm.twins`), kernels compute it.
-    Places are in metres, z up, from the centre of the object at rest; in a configuration they are in scene units, and
-    :meth:`in_frame` converts them.
+    A subclass has a ``twin``, one device function (:mod:`~gaussian_swaying.mpm.twins`), or else a ``forward`` in torch,
+    with ``recordable = True`` if that can be recorded in a CUDA graph (see ``Force``). If all effects of a wind have a
+    twin, kernels compute it. Places are in metres, z up, from the centre of the object at rest; in a configuration they
+    are in scene units, and :meth:`in_frame` converts them.
     """
 
-    @abstractmethod
     def forward(self, velocity: Tensor, position: Tensor, moment: Moment) -> Tensor:
-        """Return the changed velocity.
+        """Return the changed velocity: that of the twin, also of a subclass that has none of its own.
 
         Args:
             velocity: Air velocity so far [m/s], broadcastable to (..., P, 3).
@@ -56,6 +91,10 @@ class WindEffect(Recordable, Twinned, nn.Module, ABC):
         Returns:
             Velocity [m/s], broadcastable to (..., P, 3).
         """
+        for kind in type(self).__mro__:
+            if vars(kind).get("twin", Twinned.twin) is not Twinned.twin:
+                return blown(vars(kind)["twin"](self), velocity, position, moment)
+        raise NotImplementedError(f"{type(self).__name__} needs a `forward(velocity, position, moment)` or a `twin`.")
 
     def in_frame(self, frame: SimFrame) -> WindEffect:
         """The same effect with its places converted from scene units to metres, z up; itself if it has none."""
@@ -64,6 +103,20 @@ class WindEffect(Recordable, Twinned, nn.Module, ABC):
     def along(self, flow: Tensor) -> WindEffect:
         """The same effect in a flow at the start [m/s], shape (3,), on the CPU; called when a wind is made."""
         return self
+
+
+def blown(twin: Twin, velocity: Tensor, position: Tensor, moment: Moment) -> Tensor:
+    """The device function of an effect on tensors, as :meth:`WindEffect.forward`."""
+
+    def numbers(given: Any) -> tuple[Any, ...]:
+        return tuple(given.to(position).reshape(-1).unbind()) if isinstance(given, Tensor) else tuple(given)
+
+    once = Moment(moment.time[None], moment.flow[None], moment.carried[None])
+    now = twin.per_substep.take(once) if twin.per_substep.count else ()
+    table = Memory(twin.table.take()) if twin.table.count else None
+    air, place = velocity.to(position).unbind(-1), position.unbind(-1)
+    found = on_tensors(twin.function)(air, place, numbers(twin.numbers.take()), numbers(now), table, twin.options)
+    return torch.stack(torch.broadcast_tensors(*found), dim=-1)
 
 
 def placed(frame: SimFrame, point: Sequence[float]) -> list[float]:
@@ -87,14 +140,6 @@ class Profile(WindEffect):
         check_positive("height", height)
         self.ground, self.height = list(check_vector("ground", ground)), float(height)
 
-    @abstractmethod
-    def factor(self, above: Tensor) -> Tensor:
-        """Speed at heights above the ground [m], per speed at ``height``; the shape of ``above``."""
-
-    def forward(self, velocity: Tensor, position: Tensor, moment: Moment) -> Tensor:
-        """Scale the velocity by :meth:`factor`."""
-        return velocity * self.factor(position[..., 2:] - self.ground[2])
-
     def in_frame(self, frame: SimFrame) -> WindEffect:
         """The ground in metres."""
         return changed(self, ground=placed(frame, self.ground))
@@ -110,10 +155,6 @@ class LogProfile(Profile):
         height: Height above the ground at which the wind is that of the ``flow`` [m].
         roughness: Roughness length z0 [m]: 0.001 for water, 0.01 for a lawn, 0.1 for a field with hedges, 1 for a town.
 
-    Example:
-        >>> profile = LogProfile(height=10.0, roughness=0.1)
-        >>> round(float(profile.factor(torch.tensor(1.0))), 3)
-        0.5
     """
 
     def __init__(
@@ -125,12 +166,7 @@ class LogProfile(Profile):
             raise ValueError(f"Expected `roughness` ({roughness} m) to be below `height` ({height} m): lower it.")
         self.roughness = float(roughness)
 
-    def factor(self, above: Tensor) -> Tensor:
-        return (above.clamp(min=self.roughness) / self.roughness).log() / math.log(self.height / self.roughness)
-
     def twin(self) -> Twin:
-        from gaussian_swaying.wind.effects_triton import log_profile
-
         scale = 1 / math.log(self.height / self.roughness)
         return Twin(log_profile, numbers=Numbers(3, lambda: [self.ground[2], self.roughness, scale]), sources=(self,))
 
@@ -143,10 +179,6 @@ class PowerProfile(Profile):
         height: Height above the ground at which the wind is that of the ``flow`` [m].
         exponent: a: about 0.1 over water, 0.14 over open land, 0.3 in towns.
 
-    Example:
-        >>> profile = PowerProfile(height=10.0, exponent=0.5)
-        >>> round(float(profile.factor(torch.tensor(2.5))), 3)
-        0.5
     """
 
     def __init__(self, ground: Sequence[float] = (0.0, 0.0, 0.0), height: float = 10.0, exponent: float = 0.14) -> None:
@@ -154,12 +186,7 @@ class PowerProfile(Profile):
         check_positive("exponent", exponent)
         self.exponent = float(exponent)
 
-    def factor(self, above: Tensor) -> Tensor:
-        return (above.clamp(min=0.0) / self.height).pow(self.exponent)
-
     def twin(self) -> Twin:
-        from gaussian_swaying.wind.effects_triton import power_profile
-
         numbers = Numbers(3, lambda: [self.ground[2], 1 / self.height, self.exponent])
         return Twin(power_profile, numbers=numbers, sources=(self,))
 
@@ -203,21 +230,10 @@ class Plume(WindEffect):
         """Updraft in the middle times the cube root of the height z [m^(4/3)/s]."""
         return 3.4 * (2 / 7 * 9.81 * self.heat / 101325) ** (1 / 3)
 
-    def forward(self, velocity: Tensor, position: Tensor, moment: Moment) -> Tensor:
-        x, y, above = (part - at for part, at in zip(position.unbind(-1), self.source, strict=True))
-        height = above.clamp(min=0.0) + math.sqrt(SPREAD) * self.radius
-        off = (SPREAD * (x * x + y * y) / height.square()).clamp(min=1e-12)
-        up, fall = self.speed * height.pow(-1 / 3), (-off).exp()
-        drawn = up / height * (fall + 5 / 6 * (-off).expm1() / off)
-        plume = torch.stack([drawn * x, drawn * y, up * fall], dim=-1)
-        return velocity + torch.where(above[..., None] >= 0, plume, 0.0)
-
     def in_frame(self, frame: SimFrame) -> WindEffect:
         """The source in metres."""
         return changed(self, source=placed(frame, self.source), radius=self.radius * frame.metres_per_unit)
 
     def twin(self) -> Twin:
-        from gaussian_swaying.wind.effects_triton import plume
-
         numbers = Numbers(6, lambda: [*self.source, math.sqrt(SPREAD) * self.radius, self.speed, SPREAD])
         return Twin(plume, numbers=numbers, sources=(self,))

@@ -28,7 +28,6 @@ from gaussian_swaying._fixed import Fixed, FixedList, changed, fixed
 from gaussian_swaying.geometry.frame import SimFrame
 from gaussian_swaying.kernels.graphs import Recordable
 from gaussian_swaying.wind.effects import Moment, WindEffect
-from gaussian_swaying.wind.lookup import picked
 from gaussian_swaying.wind.wind_files import read_anemometer
 
 M = TypeVar("M", bound=nn.Module)
@@ -86,6 +85,14 @@ def counter_normal(seed: int | Tensor, stream: int, counter: Tensor, lanes: int)
 def sample_index(time: Tensor, interval: float | Tensor) -> Tensor:
     """Index of the sample at a time [s]; a time less than 1e-6 intervals before the next sample belongs to that one."""
     return torch.floor(time / interval + 1e-6).long()
+
+
+def picked(values: Tensor, index: Tensor) -> Tensor:
+    """Rows of a tensor (N, ...) by integers of any shape, also of none, without making the host wait.
+
+    ``values[index]`` with a scalar on a GPU would read it on the host, which a CUDA graph cannot record.
+    """
+    return values.index_select(0, index.reshape(-1)).reshape((*index.shape, *values.shape[1:]))
 
 
 class Modulation(Recordable, nn.Module, ABC):

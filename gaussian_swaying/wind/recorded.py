@@ -14,7 +14,7 @@ from gaussian_swaying._fixed import changed
 from gaussian_swaying.geometry.frame import SimFrame
 from gaussian_swaying.wind.carried import CarriedField
 from gaussian_swaying.wind.effects import Moment, WindEffect, placed
-from gaussian_swaying.wind.lookup import picked, trilinear
+from gaussian_swaying.wind.tables import Tabulated
 from gaussian_swaying.wind.wind_files import read_bts, read_grid
 
 
@@ -37,8 +37,7 @@ class FrozenWind(CarriedField):
         ValueError: If the file does not fit, or the flow is not that of a .bts.
     """
 
-    recordable = True
-    twin = CarriedField.twin
+    twin = Tabulated.twin
 
     def __init__(
         self, path: str | os.PathLike[str], origin: Sequence[float] = (0.0, 0.0, 0.0), scale: float = 1.0
@@ -78,7 +77,7 @@ class FrozenWind(CarriedField):
         return super().along(flow)
 
 
-class RecordedWind(WindEffect):
+class RecordedWind(Tabulated):
     """Adds a wind that was recorded on a regular grid, over time; linear in time and along each axis.
 
     Outside the grid its outermost values go on. With ``wind.flow: [0, 0, 0]`` it is the whole wind.
@@ -96,7 +95,7 @@ class RecordedWind(WindEffect):
         ValueError: If the file does not fit.
     """
 
-    recordable = True
+    twin = Tabulated.twin
 
     def __init__(
         self,
@@ -106,42 +105,36 @@ class RecordedWind(WindEffect):
         repeat: bool = False,
         scale: float = 1.0,
     ) -> None:
-        super().__init__()
         grid = read_grid(path)
         self.path, self.origin = str(path), list(check_vector("origin", origin))
-        self.scale, self.repeat = check_vector("scale", [scale], 1)[0], bool(repeat)
+        (self.scale,), self.repeat = check_vector("scale", [scale], 1), bool(repeat)
         times = torch.from_numpy(grid.times)
         begin = float(times[0]) if start is None else check_vector("start", [start], 1)[0]
         step = float((times[-1] - times[0]) / (len(times) - 1)) if len(times) > 1 else 1.0
         check_positive("the step of time", step)
         self.period = float(times[-1] - times[0]) + step
-        self.register_buffer("times", times - times[0], persistent=False)
-        self.register_buffer("begin", torch.tensor(begin - float(times[0]), dtype=torch.float64), persistent=False)
-        self.register_buffer("table", torch.from_numpy(grid.velocity), persistent=False)
-        self.register_buffer("first", torch.tensor(grid.first, dtype=torch.float64), persistent=False)
-        self.register_buffer("place", torch.tensor(self.origin, dtype=torch.float64), persistent=False)
-        self.register_buffer("step", torch.tensor(grid.spacing, dtype=torch.float64), persistent=False)
-        self.times: Tensor
-        self.begin: Tensor
-        self.table: Tensor
-        self.first: Tensor
-        self.place: Tensor
-        self.step: Tensor
+        spacing, first, place = (torch.tensor(v, dtype=torch.float64) for v in (grid.spacing, grid.first, self.origin))
+        super().__init__(torch.from_numpy(grid.velocity), spacing, place)
+        begin_at = torch.tensor(begin - float(times[0]), dtype=torch.float64)
+        for name, value in {"times": times - times[0], "begin": begin_at, "first": first}.items():
+            self.register_buffer(name, value, persistent=False)
+
+    times: Tensor
+    begin: Tensor
+    first: Tensor
 
     def in_frame(self, frame: SimFrame) -> WindEffect:
         """The origin in metres, z up."""
         return changed(self, place=torch.tensor(placed(frame, self.origin), dtype=torch.float64))
 
-    def forward(self, velocity: Tensor, position: Tensor, moment: Moment) -> Tensor:
+    def now(self, moment: Moment) -> Tensor:
         last = len(self.times) - 1
         now = moment.time + self.begin
         now = now.remainder(self.period) if self.repeat else now
-        key = (torch.searchsorted(self.times, now.reshape(1), right=True)[0] - 1).clamp(0, last)
+        key = (torch.searchsorted(self.times, now, right=True) - 1).clamp(0, last)
         after = (key + 1).remainder(last + 1) if self.repeat else (key + 1).clamp(max=last)
-        begin, end = picked(self.times, key), picked(self.times, after)
-        length = torch.where(after > key, end - begin, self.period - begin)
-        share = ((now - begin) / length).clamp(0, 1).to(position)
-        shift = (self.place + self.first) / self.step
-        place = position / self.step.to(position) - shift.to(position)
-        found = torch.lerp(trilinear(self.table, place, number=key), trilinear(self.table, place, number=after), share)
-        return velocity.to(found) + self.scale * found
+        begin, end = self.times.index_select(0, key), self.times.index_select(0, after)
+        share = (now - begin) / torch.where(after > key, end - begin, self.period - begin)
+        place = (-(self.place + self.first) / self.step).expand(len(now), 3)
+        rest = torch.stack([torch.full_like(now, self.scale), key, after, share.clamp(0, 1)], dim=-1)
+        return torch.cat([place, rest], dim=-1)

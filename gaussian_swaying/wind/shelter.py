@@ -9,9 +9,8 @@ from gaussian_swaying._checks import check_positive
 from gaussian_swaying._devices import in_double
 from gaussian_swaying._fixed import changed
 from gaussian_swaying.geometry.frame import SimFrame
-from gaussian_swaying.mpm.twins import Numbers, Twin
 from gaussian_swaying.wind.effects import Moment, WindEffect
-from gaussian_swaying.wind.lookup import trilinear
+from gaussian_swaying.wind.tables import Tabulated
 
 
 def extinction(density: Tensor, spacing: Tensor) -> Tensor:
@@ -33,20 +32,6 @@ def extinction(density: Tensor, spacing: Tensor) -> Tensor:
     """
     depth = spacing * (density.cumsum(0) - 0.5 * density)
     return torch.exp(-0.5 * depth)
-
-
-def wind_axes(flow: Tensor) -> Tensor:
-    """Axes with the first along a flow, as rows, shape (3, 3), without making the host wait.
-
-    Args:
-        flow: The flow [m/s], shape (3,); x if it is zero.
-    """
-    speed = torch.linalg.vector_norm(flow)
-    eye = torch.diag(torch.ones_like(flow))
-    x = torch.where(speed > 0, flow / speed.clamp(min=1e-30), eye[0])
-    y = torch.linalg.cross(torch.where(x[2].abs() > 0.99, eye[0], eye[2]), x)
-    y = y / torch.linalg.vector_norm(y)
-    return torch.stack([x, y, torch.linalg.cross(x, y)])
 
 
 def deposited(place: Tensor, amount: Tensor, cells: int) -> Tensor:
@@ -77,7 +62,7 @@ def deposited(place: Tensor, amount: Tensor, cells: int) -> Tensor:
     return (found * unit).to(place).view(cells, cells, cells)
 
 
-class Shelter(WindEffect):
+class Shelter(Tabulated):
     """The body's own patches slow the wind on its way, by the exponential law of :func:`extinction`.
 
     Meant for crowns, hedges and stands of plants: many small leaves to a cell. A single sheet across the wind would
@@ -90,21 +75,15 @@ class Shelter(WindEffect):
         strength: Factor of the drag area, for example for leaves that the splat does not show.
     """
 
-    recordable = True
+    twin = Tabulated.twin
 
     def __init__(self, cells: int = 32, strength: float = 1.0) -> None:
-        super().__init__()
         if isinstance(cells, bool) or not isinstance(cells, int) or not 4 <= cells <= 256:
             raise ValueError(f"Expected `cells` to be a whole number from 4 to 256, but got {cells!r}.")
         check_positive("strength", strength, allow_zero=True)
         self.cells, self.strength = cells, float(strength)
-        self.register_buffer("table", torch.ones(cells, cells, cells), persistent=False)
-        # place in cells: turn @ position + shift
-        self.register_buffer("turn", torch.eye(3, dtype=torch.float64), persistent=False)
-        self.register_buffer("shift", torch.zeros(3, dtype=torch.float64), persistent=False)
-        self.table: Tensor
-        self.turn: Tensor
-        self.shift: Tensor
+        one = torch.ones(3, dtype=torch.float64)
+        super().__init__(torch.ones(cells, cells, cells, 1), one, torch.zeros_like(one))
 
     def in_frame(self, frame: SimFrame) -> WindEffect:
         """A copy, which a simulation refreshes; the given one stays as it is, for the comparison before a resume."""
@@ -124,20 +103,10 @@ class Shelter(WindEffect):
         shift = 0.5 * (self.cells - 1) - 0.5 * (low + high) / side
         amount = self.strength * drag_area.to(position) / side**3
         density = deposited(turned / side + shift, amount, self.cells)
-        self.table.copy_(extinction(density, side))
-        self.turn.copy_(in_double(axes) / in_double(side))
-        self.shift.copy_(in_double(shift))
+        self.table.copy_(extinction(density, side)[..., None])
+        self.axes.copy_(axes)
+        self.step.copy_(side)
+        self.place.copy_(shift)
 
-    def forward(self, velocity: Tensor, position: Tensor, moment: Moment) -> Tensor:
-        """Multiply the velocity by the share that is left."""
-        place = position @ self.turn.to(position).T + self.shift.to(position)
-        return velocity * trilinear(self.table[..., None], place)
-
-    def twin(self) -> Twin:
-        from gaussian_swaying.wind.effects_triton import sheltered
-
-        def numbers() -> Tensor:
-            return torch.cat([self.turn.reshape(-1), self.shift, self.shift.new_full((3,), self.cells)])
-
-        table = Numbers(self.table.numel(), lambda: self.table)
-        return Twin(sheltered, numbers=Numbers(15, numbers), table=table, sources=(self,))
+    def now(self, moment: Moment) -> Tensor:
+        return torch.nn.functional.pad(self.place, (0, 1)).expand(len(moment.time), 4)

@@ -22,7 +22,8 @@ from gaussian_swaying.wind.effects import Moment
 from gaussian_swaying.wind.field import SpatialWind, WindField
 from gaussian_swaying.wind.force import LAWS, AeroForce, capped_area
 from gaussian_swaying.wind.patches import Patches, PatchSums
-from gaussian_swaying.wind.shelter import Shelter, wind_axes
+from gaussian_swaying.wind.shelter import Shelter
+from gaussian_swaying.wind.tables import wind_axes
 
 Wind = WindField | SpatialWind
 

@@ -1,5 +1,8 @@
 """A wind with effects in the kernels against the same wind in torch."""
 
+import tempfile
+from pathlib import Path
+
 import numpy as np
 import pytest
 import torch
@@ -30,39 +33,35 @@ def _field(wraps):
     )
 
 
-OBSTACLES = ("cylinder", "ellipsoid", "wall", "several", "crowded")
 MIDDLE = [0.1, 0.15, 0.1]
 GUSTS = [UniformGust(0.5, interval=2 * DT)]
 TURNING = [FlowKey(0.0, [4.0, 1.0, 0.5]), FlowKey(3 * DT, [-2.0, 3.0, 0.0])]
 
 
+def _recorded():
+    axis = np.linspace(-0.2, 0.5, 5)
+    velocity = np.random.default_rng(0).normal(size=(4, 5, 5, 5, 3))
+    with tempfile.TemporaryDirectory() as folder:
+        np.savez(Path(folder) / "w.npz", time=DT * np.arange(4.0), x=axis, y=axis, z=axis, velocity=velocity)
+        return RecordedWind(Path(folder) / "w.npz", repeat=True)
+
+
 def _wind(name):
     """A wind of its own for every test, as it is moved to a device."""
     low = {"ground": [0.0, 0.0, 0.05], "height": 0.2}
+    turbulence = Turbulence(0.5, 0.1, cells=[8, 6, 4], spacing=0.03)
     effects = {
-        "log": [LogProfile(**low, roughness=0.02)],
-        "power": [PowerProfile(**low, exponent=0.3)],
-        "plume": [Plume([0.13, 0.17, 0.12], 0.05, heat=1e6)],
-        "turbulence": [Turbulence(0.5, 0.1, cells=[8, 6, 4], spacing=0.03)],
-        "all": [Turbulence(0.5, 0.1, cells=[8, 6, 4], spacing=0.03), LogProfile(**low, roughness=0.02)],
-        "sheltered": [Turbulence(0.5, 0.1, cells=[8, 6, 4], spacing=0.03), Shelter(cells=8, strength=20.0)],
-        "half": [PowerProfile(**low), _field((True, False, False))],
-        "held": [_field((False, True, False))],
-        "cylinder": [CylinderObstacle(MIDDLE, 0.05, axis=[0.0, 1.0, 1.0])],
-        "ellipsoid": [EllipsoidObstacle(MIDDLE, [0.03, 0.08, 0.05], turn=20.0, drag=0.0)],
-        "wall": [EllipsoidObstacle(MIDDLE, [0.01, 0.1, 0.05])],
-        "crowded": [
-            *[CylinderObstacle([0.1 * k, 0.3, 0.1], 0.01) for k in range(7)],
-            _field((True,) * 3),
-            _field((True, False, True)),
-        ],
+        "all": [turbulence, LogProfile(**low, roughness=0.02)],
+        "sheltered": [turbulence, Shelter(cells=8, strength=20.0)],
+        "half": [PowerProfile(**low, exponent=0.3), _field((True, False, False))],
         "several": [
             LogProfile(**low, roughness=0.02),
-            CylinderObstacle([0.02, 0.1, 0.1], 0.02),
-            Turbulence(0.5, 0.1, cells=[8, 6, 4], spacing=0.03),
-            CylinderObstacle([0.05, 0.15, 0.1], 0.01),
-            EllipsoidObstacle(MIDDLE, [0.03] * 3, drag=0.0),
-            CylinderObstacle([0.1, 0.1, 0.1], 0.02, axis=[0.0, 1.0, 0.0]),
+            CylinderObstacle(MIDDLE, 0.05, axis=[0.0, 1.0, 1.0]),
+            turbulence,
+            EllipsoidObstacle(MIDDLE, [0.03, 0.08, 0.05], turn=20.0, drag=0.0),
+            Plume([0.13, 0.17, 0.12], 0.05, heat=1e6),
+            EllipsoidObstacle(MIDDLE, [0.01, 0.1, 0.05]),
+            _recorded(),
         ],
     }
     return WindField(schedule=TURNING, interpolation="linear", modulations=GUSTS, effects=effects[name])
@@ -97,26 +96,21 @@ def _same(found, expected):
     assert_close(found.work, expected.work, rtol=1e-4, atol=1e-7)
 
 
-WINDS = ("log", "power", "plume", "turbulence", "all", "sheltered", "half", "held", *OBSTACLES)
+WINDS = ("all", "sheltered", "half", "several")
 
 
-@pytest.mark.parametrize(
-    ("kernel_device", "formulation", "name"),
-    [
-        *(("cpu", "total", name) for name in WINDS),
-        *(("cpu", "updated", name) for name in ("all", "sheltered", "several")),  # the same function blows
-        *(pytest.param("cuda", way, name, marks=pytest.mark.gpu) for way in ("total", "updated") for name in WINDS),
-    ],
-    indirect=["kernel_device"],
-)
+@pytest.mark.parametrize(("formulation", "name"), [("total", "half"), ("total", "several"), ("updated", "sheltered")])
 def test_the_kernels_blow_as_torch_does(kernel_device, formulation, name):
+    """Also at later times: on a GPU the third rollout is replayed."""
     solver, reference, state, load = _pair(kernel_device, formulation, lambda: _wind(name))
     assert load.twin() is not None
     load.refresh(state)
-    found, expected = solver.rollout(state, DT, 6, load), reference.rollout(state, DT, 6, load)
-    _same(found, expected)
+    for _ in range(3):
+        found, expected = solver.rollout(state, DT, 3, load), reference.rollout(state, DT, 3, load)
+        _same(found, expected)
+        before, state = state, expected
     assign(load.wind, effects=torch.nn.ModuleList())
-    bare = reference.rollout(state, DT, 6, load)
+    bare = reference.rollout(before, DT, 3, load)
     change = float((bare.velocity - expected.velocity).abs().max())
     least = 1e-2 * float(expected.velocity.abs().max())
     assert change > least, f"without the effects the velocity differs by {change:.2g} m/s: make them stronger in _wind"
@@ -163,7 +157,7 @@ def test_only_what_has_changed_is_written_again(kernel_device, monkeypatch):
         tables.take([load.twin()], Composed([load.twin()]))
         return list(written)
 
-    turbulence, shelter = [21, 8 * 6 * 4 * 3], [15, 8**3]
+    turbulence, shelter = [21, 8 * 6 * 4 * 3], [21, 8**3]
     assert take() == [*turbulence, *shelter]
     assert take() == []
     load.refresh(state)
@@ -184,29 +178,6 @@ def test_the_last_place_of_a_table_that_repeats(kernel_device):
     _same(solver.rollout(state, DT, 2, load), reference.rollout(state, DT, 2, load))
 
 
-def _recorded(tmp_path):
-    axis = np.linspace(-0.2, 0.5, 5)
-    velocity = np.random.default_rng(0).normal(size=(4, 5, 5, 5, 3))
-    np.savez(tmp_path / "w.npz", time=DT * np.arange(4.0), x=axis, y=axis, z=axis, velocity=velocity)
-    return WindField(effects=[RecordedWind(tmp_path / "w.npz", repeat=True)])
-
-
-@pytest.mark.parametrize("name", ["recorded", "cylinder"])
-def test_winds_at_later_times(kernel_device, name, tmp_path):
-    """On a GPU inside the recorded graphs: the third rollout is replayed. A recorded wind runs in torch."""
-    wind = _recorded(tmp_path) if name == "recorded" else _wind(name)
-    solver, reference, state, load = _pair(kernel_device, "total", lambda: wind)
-    assert (load.twin() is not None) == (name != "recorded")
-    assert load.recordable
-    for _ in range(3):
-        found, expected = solver.rollout(state, DT, 3, load), reference.rollout(state, DT, 3, load)
-        _same(found, expected)
-        state = expected
-    still = WindForce(load.aero, WindField([0.0] * 3).to(kernel_device), load.normal, load.area)
-    bare = reference.rollout(state, DT, 3, still)
-    assert (bare.velocity - reference.rollout(state, DT, 3, load).velocity).abs().max() > 1e-4
-
-
 class _NoReading(TorchDispatchMode):
     """Refuses what a CUDA graph cannot record: to read a number of a tensor, and to make a tensor of numbers."""
 
@@ -216,10 +187,10 @@ class _NoReading(TorchDispatchMode):
         return function(*args, **(kwargs or {}))
 
 
-def test_the_host_reads_nothing_of_a_wind(tmp_path):
+def test_the_host_reads_nothing_of_a_wind():
     """So all of it can be recorded, and the needs of the next frame of a shelter can be measured in a CUDA graph."""
     time, place = torch.tensor(0.003, dtype=torch.float64), torch.rand(20, 3)
-    for wind in (_recorded(tmp_path), *(_wind(name) for name in WINDS if name != "sheltered")):
+    for wind in (_wind(name) for name in WINDS if name != "sheltered"):
         for interpolation in ("step", "linear"):
             wind = WindField(schedule=TURNING, interpolation=interpolation, effects=wind.effects)
             expected = wind.at(time, place)
@@ -233,11 +204,10 @@ def test_the_host_reads_nothing_of_a_wind(tmp_path):
 
 def test_what_the_kernels_do_not_know_runs_in_torch():
     """A subclass does not inherit the twin, nor does a wind have one without those of all effects."""
-    pytest.importorskip("triton", reason="needs triton, which is available on Linux only")
 
     class Doubled(LogProfile):
-        def factor(self, above):
-            return 2 * super().factor(above)
+        def forward(self, velocity, position, moment):
+            return 2 * super().forward(velocity, position, moment)
 
     class Same(LogProfile):
         twin = LogProfile.twin

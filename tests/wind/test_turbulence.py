@@ -11,20 +11,27 @@ import torch
 from shared import double
 from torch.testing import assert_close
 
+from gaussian_swaying.kernels.derive import Memory, on_tensors
 from gaussian_swaying.wind.carried import CarriedField, Turbulence, box_axes
 from gaussian_swaying.wind.effects import Moment
 from gaussian_swaying.wind.field import FlowKey, WindField
-from gaussian_swaying.wind.lookup import trilinear
 from gaussian_swaying.wind.spectra import (
     VON_KARMAN,
     along_spectrum,
     energy_spectrum,
     resolved_share,
 )
+from gaussian_swaying.wind.tables import look_up
 from gaussian_swaying.wind.turbulence_box import sheared_variances, turbulence_box
 
 CELLS, H, L, SEEDS = (128, 64, 64), 0.25, 1.0, 20
 K = math.pi / H
+
+
+def looked_up(table, place, wraps=False):
+    """Values of a table at places in cells (n, 3)."""
+    sizes = tuple(map(float, table.shape[:3]))
+    return torch.stack(on_tensors(look_up)(Memory(table), sizes, place.unbind(-1), (wraps,) * 3 + (3,)), dim=-1)
 
 
 def _bessel_k(order, x):
@@ -210,17 +217,17 @@ def test_interpolation_takes_the_smallest_waves():
     found = 0.0
     for seed in range(SEEDS):
         box = turbulence_box(CELLS, [H] * 3, L, seed=seed)
-        found += float(trilinear(box, place, (True, True, True))[:, 0].square().mean()) / SEEDS
+        found += float(looked_up(box, place, True)[:, 0].square().mean()) / SEEDS
     assert found == pytest.approx(target, rel=0.05)
 
 
-def test_trilinear_is_exact_for_a_linear_field():
+def test_look_ups_are_exact_for_a_linear_field():
     table = torch.cartesian_prod(*[torch.arange(n, dtype=torch.float64) for n in (4, 5, 6)]).reshape(4, 5, 6, 3)
     place = double([[0.3, 3.2, 4.9], [2.99, 0.0, 5.0], [-1.0, 7.0, 2.5]])
     expected = place.clone()
     expected[2] = torch.tensor([0.0, 4.0, 2.5])
-    assert_close(trilinear(table, place), expected)
-    around = trilinear(table, double([[3.5, 0.0, -0.25]]), (True, True, True))
+    assert_close(looked_up(table, place), expected)
+    around = looked_up(table, double([[3.5, 0.0, -0.25]]), True)
     assert_close(around, double([[1.5, 0.0, 1.25]]))
 
 
@@ -229,7 +236,7 @@ def test_places_that_are_no_numbers_stay_in_the_table(wraps):
     """A diverged simulation is reported as such, and does not end with an index out of range."""
     table = torch.ones(4, 5, 6, 3)
     place = torch.tensor([[float("nan"), 1.0, 1.0], [float("inf"), 1.0, 1.0], [1e30, -1e30, 1.0]])
-    found = trilinear(table, place, (wraps,) * 3)
+    found = looked_up(table, place, wraps)
     assert found.shape == (3, 3)
     assert found[0].isnan().all()
 
@@ -317,7 +324,7 @@ def test_turbulence_has_its_intensity_at_places_and_times_anywhere():
         found.append(wind.at(double(1.37 * time), place)[:, 1] - 6.0)
     # one box of 8 x 4 x 4 lengths: its own variance, with its interpolation
     box = wind.effects[0]
-    corners = trilinear(box.table, torch.rand(20_000, 3, dtype=torch.float64, generator=draw) * 128, (True,) * 3)
+    corners = looked_up(box.table, torch.rand(20_000, 3, dtype=torch.float64, generator=draw) * 128, True)
     own = corners @ box.axes
     assert float(torch.cat(found).std()) == pytest.approx(0.2 * 6.0 * float(own[:, 1].std()), rel=0.05)
     assert box.resolved == pytest.approx(0.92, abs=0.01)

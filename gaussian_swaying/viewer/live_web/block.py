@@ -35,6 +35,7 @@ from gaussian_swaying.simulation.simulation import Simulation
 from gaussian_swaying.viewer.film.page import message
 from gaussian_swaying.viewer.live_web.longest import longest_courant
 from gaussian_swaying.wind.carried import Turbulence
+from gaussian_swaying.wind.effects import Moment
 from gaussian_swaying.wind.field import GaussianGust, SineSway, UniformGust, WindField, stream_start
 from gaussian_swaying.wind.force import LAWS as AERO_LAWS
 from gaussian_swaying.wind.wind_force import WindForce
@@ -241,7 +242,7 @@ def _pack_modes(head: dict[str, Any], simulation: Simulation, bound: Modes, node
             "cells": list(effect.table.shape[:3]),
             "axes": effect.axes.tolist(),
             "side": effect.spacing[0],
-            "offset": effect.offset(torch.zeros(3, dtype=torch.float64)).tolist(),
+            "offset": effect.now(Moment(*torch.zeros(3, 1, 3, dtype=torch.float64)))[0, :3].tolist(),
             "scale": effect.scale * unit,
         }
     return _joined(head | {"modes": list(shapes), "period": 2 * math.pi / bound.first, "aero": _aero(force)}, arrays)
