@@ -190,12 +190,12 @@ class ContactStage:
         if not bool(stencil.inside.all()):
             raise ValueError("A contact sample lies outside the material: give samples on the simulated points.")
         basis = stencil.basis  # (C, 4, 27)
-        self.node = stencil.node.reshape(-1, 27)
+        self.node = stencil.node
         self.corner: Tensor | None = None
         if points is not None:
             self.node = self._nodes(stencil.first, *points)
             self.corner = coordinates(stencil.first % grid.node_count, grid)
-        self.first, self.fraction = stencil.first, 1.5 + stencil.factors[1, :, 0] * grid.dx  # position in its cell
+        self.first, self.fraction = stencil.first, stencil.fraction
         self.weight = basis[:, 0] + ((surface.place - surface.read)[:, :, None] * basis[:, 1:4]).sum(1)
         self.reach = self.apart = 0.0
         if self.contact is not None:

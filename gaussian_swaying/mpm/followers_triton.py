@@ -95,7 +95,6 @@ def follow(
     count = len(means)
     fields = displacement.new_zeros(len(displacement), 8)
     fields[:, :3] = displacement
-    fraction = 1.5 + stencil.factors[1, :, 0] * dx  # from the slope of the first weight, (f - 1.5) / dx
     given = [tensor.detach().contiguous() for tensor in (means, covariances, normals)]
     made = [torch.empty_like(tensor) for tensor in given]
     turns = torch.empty_like(given[1]) if rotations else given[1]
@@ -106,8 +105,8 @@ def follow(
     if count > 0:
         with torch.cuda.device_of(fields):
             launch(_follow, (triton.cdiv(count, block),))(
-                fields, stencil.first, table, fraction.contiguous(), fields if arm is None else arm.contiguous(),
-                axes.contiguous(), *given, keeps, *made, turns,
+                fields, stencil.first, table, stencil.fraction.contiguous(),
+                fields if arm is None else arm.contiguous(), axes.contiguous(), *given, keeps, *made, turns,
                 float(max_stretch or 1) ** 2, per_metre, count, *strides, 1 / dx,
                 ARM=arm is not None, TURN=rotations, LIMIT=limit, BLOCK=block, VIRTUAL=stencil.nodes is not None,
             )  # fmt: skip

@@ -12,8 +12,8 @@ from torch import Tensor
 
 from gaussian_swaying.geometry.groups import sums
 from gaussian_swaying.mpm.state import GridSpec
-from gaussian_swaying.mpm.transfer import bspline_weights
-from gaussian_swaying.mpm.virtual_nodes import coordinates, shifts
+from gaussian_swaying.mpm.transfer import bspline_weights, shifts
+from gaussian_swaying.mpm.virtual_nodes import coordinates
 
 MOST_ROWS = 2000
 """Most rows of one scene: its inverse is dense."""

@@ -115,7 +115,7 @@ class Structure:
             return field.detach().reshape(-1, count)[scene].double().cpu().numpy()
 
         self.total, self.scene, self.nodes, self.count = total, scene, nodes, count
-        table = stencil.node.reshape(-1, 27)[own].cpu() - scene * nodes
+        table = stencil.node[own].cpu() - scene * nodes
         basis = stencil.basis[own].double().cpu().numpy()
         self.rest = points.position.detach().reshape(-1, count, 3)[scene].double().cpu().numpy()
         mass, volume = of_scene(points.mass), of_scene(points.volume)

@@ -30,7 +30,6 @@ import torch
 from torch import Tensor
 
 from gaussian_swaying._devices import in_double
-from gaussian_swaying.geometry.groups import equal_rows
 from gaussian_swaying.geometry.linalg import cofactor
 from gaussian_swaying.mpm.state import MaterialPoints
 from gaussian_swaying.mpm.transfer import Stencil, bspline_weights
@@ -198,10 +197,8 @@ def bending_of(points: MaterialPoints, stencil: Stencil, dx: float, softened: Te
     if not len(index):
         return None
     own = own[index] if softened is None else own[index] * softened.reshape(-1)[index]
-    first = stencil.first[index]
-    unit = first if stencil.nodes is None else equal_rows(torch.cat([first[:, None], stencil.nodes.T[index]], 1))
-    cells, cell = torch.unique(unit, return_inverse=True)
-    fraction = 1.5 + stencil.factors[1, :, 0].T[index] * dx
+    cells, cell = torch.unique(stencil.cell[index], return_inverse=True)
+    fraction = stencil.fraction.T[index]
     normal, poisson = points.normal.detach().reshape(-1, 3)[index], points.poisson_ratio.detach().reshape(-1)[index]
     stiffness = own.new_zeros(len(cells), 27, 27)
     for some in torch.arange(len(index), device=index.device).split(_AT_ONCE):
@@ -210,7 +207,7 @@ def bending_of(points: MaterialPoints, stencil: Stencil, dx: float, softened: Te
         part = _outer(a, a + nu * b) + _outer(b, b + nu * a) + _outer(2 * (1 - nu) * twist, twist)
         stiffness = stiffness.index_add(0, cell[some], own[some, None, None] * part.to(own))
     example = torch.full_like(cells, len(points.bending.reshape(-1))).scatter_reduce(0, cell, index, "amin")
-    return Bending(stencil.node.view(-1, 27)[example], stiffness, example)
+    return Bending(stencil.node[example], stiffness, example)
 
 
 def _outer(a: Tensor, b: Tensor) -> Tensor:

@@ -10,6 +10,7 @@ from typing import Any, Literal
 
 import torch
 from torch import Tensor
+from torch.utils.checkpoint import checkpoint as recomputed
 
 from gaussian_swaying._checks import check_positive, check_vector
 from gaussian_swaying._fixed import Fixed, FixedList, assign
@@ -27,7 +28,6 @@ from gaussian_swaying.mpm.formulations.modes import Modes, why_not_modes
 from gaussian_swaying.mpm.formulations.total import Total
 from gaussian_swaying.mpm.guard import check_begin, check_end, check_load, check_rest
 from gaussian_swaying.mpm.protocol import Solver, WatchFunction
-from gaussian_swaying.mpm.recompute import rollout
 from gaussian_swaying.mpm.state import MaterialPoints, MPMState
 from gaussian_swaying.mpm.timestep import check_pace, fixed_substeps, look_marks, substeps_per_frame, work_done
 
@@ -571,11 +571,21 @@ class MPMSolver(Fixed, Solver):
             return fused.rollout(state, dt, steps, acting, watch=watch)[0]
         sources = [force.during(state.time, dt, steps) for force in acting]
 
-        def substep(state: MPMState, k: int) -> MPMState:
-            pairs = zip(sources, acting, strict=True)
-            return self._step(state, dt, *added([split(source(state, k), force, state) for source, force in pairs]))
+        def advance(state: MPMState, first: int, count: int) -> MPMState:
+            for k in range(first, first + count):
+                pairs = zip(sources, acting, strict=True)
+                found = [split(source(state, k), force, state) for source, force in pairs]
+                state = self._step(state, dt, *added(found))
+                if watch is not None and checkpoint <= 0:
+                    watch(k + 1)
+            return state
 
-        return rollout(substep, state, steps, checkpoint, watch)
+        if checkpoint <= 0 or not torch.is_grad_enabled():
+            return advance(state, 0, steps)
+        for first in range(0, steps, checkpoint):
+            count = min(checkpoint, steps - first)
+            state = recomputed(advance, state, first, count, use_reentrant=False, preserve_rng_state=False)
+        return state
 
     def watched_rollout(
         self,

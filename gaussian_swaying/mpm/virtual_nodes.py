@@ -13,7 +13,6 @@ all of those.
 
 from __future__ import annotations
 
-import itertools
 from dataclasses import dataclass
 
 import torch
@@ -21,6 +20,7 @@ from torch import Tensor
 
 from gaussian_swaying.geometry.groups import equal_rows, joined, once
 from gaussian_swaying.mpm.state import GridSpec
+from gaussian_swaying.mpm.transfer import shifts
 
 
 @dataclass(frozen=True, eq=False)
@@ -114,12 +114,6 @@ def first_nodes(place: Tensor, grid: GridSpec) -> Tensor:
     most = torch.tensor(grid.resolution, device=place.device) - 3
     _, ny, nz = grid.resolution
     return (low.clamp(min=0).minimum(most) * torch.tensor([ny * nz, nz, 1], device=place.device)).sum(-1)
-
-
-def shifts(grid: GridSpec) -> Tensor:
-    """Offsets of the 27 nodes of a stencil from the first, shape (27,)."""
-    _, ny, nz = grid.resolution
-    return torch.tensor([(i * ny + j) * nz + k for i, j, k in itertools.product(range(3), repeat=3)])
 
 
 @torch.no_grad()

@@ -27,7 +27,8 @@ from gaussian_swaying.mpm.boundaries.velocity_box import VelocityBox
 from gaussian_swaying.mpm.contact import Surface
 from gaussian_swaying.mpm.followers import GridFollowers, on_material
 from gaussian_swaying.mpm.state import GridSpec
-from gaussian_swaying.mpm.virtual_nodes import coordinates, first_nodes, point_with_nodes, shifts, virtual_nodes
+from gaussian_swaying.mpm.transfer import shifts
+from gaussian_swaying.mpm.virtual_nodes import coordinates, first_nodes, point_with_nodes, virtual_nodes
 from gaussian_swaying.wind.effects import LogProfile
 
 EDGE = Box([None, None, None], [1.0, None, None])

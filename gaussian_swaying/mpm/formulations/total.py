@@ -26,7 +26,7 @@ from gaussian_swaying.mpm.point_holds import POINTS, PointHolds
 from gaussian_swaying.mpm.sheets import bending_of, director_energy, flattened, sheet_pk1
 from gaussian_swaying.mpm.state import GridSpec, MPMState
 from gaussian_swaying.mpm.timestep import kick_time
-from gaussian_swaying.mpm.transfer import bspline_stencil, gather, in_fixed_order, scatter
+from gaussian_swaying.mpm.transfer import bspline_stencil, gather, scatter
 from gaussian_swaying.mpm.virtual_nodes import VirtualNodes, virtual_nodes
 
 
@@ -73,9 +73,7 @@ class Total(Formulation):
         if self.virtual is not None:
             self.grid = replace(self.grid, virtual=self.virtual.original.shape[1])
         nodes = None if self.virtual is None else self.virtual.node
-        self.stencil = bspline_stencil(
-            position, self.grid, False, snap, deterministic=settings.deterministic, fixed=True, nodes=nodes
-        )
+        self.stencil = bspline_stencil(position, self.grid, False, snap, settings.deterministic, nodes)
         self.node_mass = self._summed(points.mass[..., None])[..., 0]
         self.node_inverse_mass = safe_inverse(self.node_mass)
         self.node_damping: Tensor | None = None
@@ -105,8 +103,7 @@ class Total(Formulation):
 
     def _summed(self, values: Tensor) -> Tensor:
         """Sums of values of the particles (..., P, K) by nodes (..., G, K); also on a GPU in a fixed order."""
-        with in_fixed_order(values.is_cuda):
-            return scatter(self.stencil, values[..., None, :])
+        return scatter(self.stencil, values[..., None, :], fixed_order=True)
 
     def _virtual_nodes(self, snap: float) -> VirtualNodes | None:
         points = self.body.points

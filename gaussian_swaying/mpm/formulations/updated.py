@@ -107,12 +107,7 @@ class Updated(Formulation):
             held = (kick * drag)[..., None] * state.velocity
             impulse = held if impulse is None else impulse + held
         nodes = scatter_momentum(
-            points.mass,
-            state.velocity,
-            state.affine,
-            impulse,
-            kick * points.volume[..., None, None] * stress,
-            stencil,
+            points.mass, state.velocity, state.affine, impulse, kick * points.volume[..., None, None] * stress, stencil
         )
         inverse_mass = safe_inverse(nodes[..., 3])[..., None]
         velocity = nodes[..., :3] * inverse_mass
@@ -124,7 +119,7 @@ class Updated(Formulation):
             position = state.grid.node_positions(velocity).expand_as(velocity)
         share = partial(held_share, stencil=stencil, inverse_mass=inverse_mass[..., 0], time=state.time)
         velocity, taken = self.constrain(velocity, nodes[..., 3], share, position, position, state.time, dt)
-        new_velocity, affine, gradient = g2p(velocity, stencil, settings.dx)
+        new_velocity, affine, gradient = g2p(velocity, stencil)
         identity = torch.eye(3, dtype=gradient.dtype, device=gradient.device)
         update = identity + dt * gradient
         F, internal = matmul3(update, F), state.internal

@@ -8,7 +8,6 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from gaussian_swaying.geometry.groups import equal_rows
 from gaussian_swaying.kernels.graphs import RECORDED
 from gaussian_swaying.kernels.language import triton
 from gaussian_swaying.kernels.launch import lanes, launch
@@ -18,10 +17,10 @@ from gaussian_swaying.mpm.formulations.formulation import Formulation
 from gaussian_swaying.mpm.formulations.total import Total
 from gaussian_swaying.mpm.point_holds import DenseHolds
 from gaussian_swaying.mpm.state import MPMState
+from gaussian_swaying.mpm.transfer import shifts
 from gaussian_swaying.mpm.triton import total_kernels as kernels
 from gaussian_swaying.mpm.triton.fused import INTERPRETED, Fused, Part, check_indices
 from gaussian_swaying.mpm.triton.fused_contact import FusedContact
-from gaussian_swaying.mpm.virtual_nodes import shifts
 
 # time per particle for a number of lanes per cell, relative to 32 lanes, on an H200
 _LANE_COST = {4: 1.5, 8: 1.0, 16: 1.0, 32: 1.0, 64: 0.85}
@@ -50,9 +49,8 @@ class FusedTotal(Fused):
         assert isinstance(bound, Total)
         body, points, stencil, grid = bound.body, bound.body.points, bound.stencil, bound.grid
         self.bound, self.grid = bound, grid
-        first = stencil.first
         # with virtual nodes a cell is cut by the copies of its nodes that the particles have
-        unit = first if stencil.nodes is None else equal_rows(torch.cat([first[:, None], stencil.nodes.T], 1))
+        unit = stencil.cell
         order = torch.argsort(unit, stable=True)
         cells, sizes = torch.unique_consecutive(unit[order], return_counts=True)
         self.virtual = stencil.nodes is not None
@@ -60,15 +58,14 @@ class FusedTotal(Fused):
         """The nodes of each cell, shape (27, cells), where they are not those of the lattice."""
         if stencil.nodes is not None:
             example = order[sizes.cumsum(0) - sizes]
-            cells, self.cell_nodes = first[example], stencil.nodes[:, example].int().contiguous()
+            cells, self.cell_nodes = stencil.first[example], stencil.nodes[:, example].int().contiguous()
         self.order, self.cells = order.int(), len(cells)
         ends = sizes.cumsum(0)
         self.cell_start = torch.cat([ends.new_zeros(1), ends]).int()
         self.cell_node = cells.int()
         self.cell_scene = (cells // grid.node_count).int()
         self.particle_cell = torch.repeat_interleave(torch.arange(self.cells, device=self.device), sizes).int()
-        # the position in the cell, from the slope of the first weight, (f - 1.5) / dx
-        self.fraction = (1.5 + stencil.factors[1, :, 0] * grid.dx)[:, order].contiguous()
+        self.fraction = stencil.fraction[:, order].contiguous()
         rows = [points.volume, body.laws.mu, body.laws.lam, points.mass]
         self.material = torch.stack([row.reshape(-1) for row in rows])[:, order].contiguous()
         self.law = self.law[order].contiguous()

@@ -20,7 +20,7 @@ from gaussian_swaying.mpm.forces import Force, tensors_of
 from gaussian_swaying.mpm.formulations.formulation import Formulation
 from gaussian_swaying.mpm.state import MPMState
 from gaussian_swaying.mpm.timestep import kick_time
-from gaussian_swaying.mpm.transfer import Stencil, gather, scatter
+from gaussian_swaying.mpm.transfer import gather
 from gaussian_swaying.mpm.triton import adjoint_kernels as kernels
 from gaussian_swaying.mpm.triton.fused import MAX_STEPS, Adjoint, at_home
 from gaussian_swaying.mpm.triton.fused_total import REGISTERS, FusedTotal
@@ -150,7 +150,7 @@ class TotalAdjoint:
         )  # fmt: skip
         end, run.end = run.end, None
         assert end is not None
-        rows = _Gathered.apply(torch.cat([displacement, velocity], dim=-1), bound.stencil)
+        rows = gather(torch.cat([displacement, velocity], dim=-1), bound.stencil)
         return bound.with_rows(end, displacement, velocity, rows)
 
     def forward(self, run: _Run) -> tuple[Tensor, Tensor]:
@@ -405,20 +405,6 @@ class _Rollout(torch.autograd.Function):
         with at_home(ctx.adjoint.bars):
             found = ctx.adjoint.backward(ctx.run, displacement, velocity, ctx.vectors, ctx.numbers, needs)
         return None, None, *(found.get(name) if needs[name] else None for name in _INPUTS)
-
-
-class _Gathered(torch.autograd.Function):
-    """``transfer.gather`` with a constant stencil: its adjoint is ``scatter``, and nothing is kept."""
-
-    @staticmethod
-    def forward(ctx: Any, fields: Tensor, stencil: Stencil) -> Tensor:
-        ctx.stencil = stencil
-        return gather(fields, stencil)
-
-    @staticmethod
-    @torch.autograd.function.once_differentiable
-    def backward(ctx: Any, grad: Tensor) -> tuple[Tensor, None]:
-        return scatter(ctx.stencil, grad), None
 
 
 def segment(steps: int, checkpoint: int, nodes: int) -> int:

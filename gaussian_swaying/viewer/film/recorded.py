@@ -13,7 +13,6 @@ from torch import Tensor
 
 from gaussian_swaying._devices import in_double
 from gaussian_swaying.gaussians.harmonics import sh_to_color
-from gaussian_swaying.geometry.groups import equal_rows
 from gaussian_swaying.geometry.rotations import quat_multiply, rotation_to_quat
 from gaussian_swaying.mpm.state import GridSpec
 from gaussian_swaying.mpm.transfer import Stencil
@@ -250,14 +249,13 @@ def stencils_of(stencil: Stencil, grid: GridSpec, nodes: Tensor) -> tuple[Tensor
         its stencil, where it is ``floor(place - 0.5)``. The number of the stencil of each, shape (N,), and the rows of
         the 27 nodes of each stencil in ``nodes``, shape (S, 27).
     """
-    reached = stencil.node.reshape(-1, 27)
-    number = equal_rows(stencil.first[:, None] if stencil.nodes is None else reached)
+    number = torch.unique(stencil.cell, return_inverse=True)[1]
     count = int(number.max()) + 1 if len(number) else 0
     example = number.new_zeros(count).index_copy(0, number, torch.arange(len(number), device=number.device))
     low = coordinates(stencil.first, grid).float()
-    place = low + 1.5 + stencil.factors[1, :, 0].T * grid.dx  # from the slope of the first weight, (f - 1.5) / dx
+    place = low + stencil.fraction.T
     last = torch.nextafter(low + 1.5, low)
-    return place.float().clamp(low + 0.5, last), number, torch.searchsorted(nodes, reached[example])
+    return place.float().clamp(low + 0.5, last), number, torch.searchsorted(nodes, stencil.node[example])
 
 
 def _steps(values: Tensor) -> np.ndarray:

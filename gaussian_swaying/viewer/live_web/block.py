@@ -14,7 +14,6 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from gaussian_swaying.geometry.groups import equal_rows
 from gaussian_swaying.mpm.boundaries.ball import BallObstacle
 from gaussian_swaying.mpm.boundaries.block import BoxObstacle
 from gaussian_swaying.mpm.boundaries.boundary import Boundary
@@ -151,8 +150,7 @@ def pack_solver(simulation: Simulation, nodes: Tensor) -> bytes:
         return _pack_modes(head, simulation, bound, nodes)
     force = simulation.stepper.wind_force
     body, points, stencil = bound.body, bound.body.points, bound.stencil
-    reached = stencil.node.reshape(-1, 27)
-    unit = equal_rows(torch.cat([stencil.first[:, None], reached], 1))  # the points of a cell that have the same nodes
+    unit = stencil.cell
     order = torch.argsort(unit, stable=True)
     _, sizes = torch.unique_consecutive(unit[order], return_counts=True)
     active = (bound.node_inverse_mass > 0).nonzero()[:, 0]
@@ -174,8 +172,8 @@ def pack_solver(simulation: Simulation, nodes: Tensor) -> bytes:
     numbers = torch.tensor([LAWS.index(type(one)) for one in points.laws])
     arrays: dict[str, Tensor] = {
         "cellStart": torch.cat([sizes.new_zeros(1), sizes.cumsum(0)]),
-        "cellNodes": row[reached[order[sizes.cumsum(0) - sizes]]],
-        "fraction": (1.5 + stencil.factors[1, :, 0] * bound.grid.dx)[:, order].T,
+        "cellNodes": row[stencil.node[order[sizes.cumsum(0) - sizes]]],
+        "fraction": stencil.fraction[:, order].T,
         "rest": points.position[order],
         "volume": points.volume[order],
         "mass": points.mass[order],
