@@ -22,17 +22,29 @@ from gaussian_swaying.mpm.damping import damped_substep
 from gaussian_swaying.mpm.dispatch import LawDispatch
 from gaussian_swaying.mpm.followers import Followers, GridFollowers
 from gaussian_swaying.mpm.forces import Force, Forces, FunctionForce, added, as_forces, split, tensors_of
-from gaussian_swaying.mpm.formulations import FORMULATIONS
 from gaussian_swaying.mpm.formulations.formulation import Formulation, Settings
 from gaussian_swaying.mpm.formulations.modes import Modes, why_not_modes
 from gaussian_swaying.mpm.formulations.total import Total
+from gaussian_swaying.mpm.formulations.updated import Updated
 from gaussian_swaying.mpm.guard import check_begin, check_end, check_load, check_rest
 from gaussian_swaying.mpm.protocol import Solver, WatchFunction
 from gaussian_swaying.mpm.state import MaterialPoints, MPMState
 from gaussian_swaying.mpm.timestep import check_pace, fixed_substeps, look_marks, substeps_per_frame, work_done
 
+FORMULATIONS: dict[str, type[Formulation]] = {kind.name: kind for kind in (Total, Updated, Modes)}
 Fused = Any
 """A ``mpm.triton.fused.Fused``; not imported even for its type, as the parser resolves types and Triton takes 0.1 s."""
+
+
+def _kernels_of(bound: Formulation) -> Any:
+    """The class that runs a formulation in kernels."""
+    if isinstance(bound, Total):
+        from gaussian_swaying.mpm.triton.fused_total import DifferentiableTotal
+
+        return DifferentiableTotal
+    from gaussian_swaying.mpm.triton.fused_updated import FusedUpdated
+
+    return FusedUpdated
 
 
 class MPMSolver(Fixed, Solver):
@@ -117,7 +129,7 @@ class MPMSolver(Fixed, Solver):
         self._framed: tuple[Boundary, ...] | None = None
         self._bound: Formulation | None = None
         self._fused: Fused = None
-        self._fused_obstacle: str | None = None
+        self._obstacle: str | None = None
 
     # ---- settings
 
@@ -125,11 +137,6 @@ class MPMSolver(Fixed, Solver):
     def dx(self) -> float:
         """Grid spacing [m]."""
         return self.settings.dx
-
-    @property
-    def gravity(self) -> tuple[float, ...]:
-        """Acceleration [m/s²], z up."""
-        return self.settings.gravity
 
     @property
     def damping(self) -> float:
@@ -149,7 +156,7 @@ class MPMSolver(Fixed, Solver):
     @property
     def neighbours_fixed(self) -> bool:  # type: ignore[override]
         """True if particles keep their neighbours from the rest state: they cannot tear, flow or leave the grid."""
-        return FORMULATIONS[self.formulation].neighbours_fixed
+        return self.formulation != "updated"
 
     # ---- the object at rest
 
@@ -222,12 +229,10 @@ class MPMSolver(Fixed, Solver):
             return None
         if bool(((after.node_inverse_mass > 0) & (before.node_inverse_mass == 0)).any()):
             return None
-        assert state.node_displacement is not None
-        assert state.node_velocity is not None
         moved = start.replace(time=state.time, substep=state.substep, work=state.work)
         if isinstance(after, Modes):  # what of the motion its modes can show
             return after.shown(moved, *after.amplitudes(state.replace(modal=None)))
-        return after.read_particles(moved, state.node_displacement, state.node_velocity)
+        return after.read_particles(moved, *state.nodal)
 
     def domain(self, state: MPMState) -> tuple[list[float], list[float]]:
         """Lower and upper corner of the grid [m]."""
@@ -258,7 +263,7 @@ class MPMSolver(Fixed, Solver):
             formulation, why = self._choice(body)
             assign(self, formulation=formulation, why=why)
         bound = FORMULATIONS[self.formulation](body, self.settings)
-        self._fused_obstacle = self._why_not_kernels(bound)
+        self._obstacle = self._why_not_kernels(bound)
         self._bound = bound
 
     def _choice(self, body: Body) -> tuple[Literal["total", "updated", "modes"], str]:
@@ -280,12 +285,9 @@ class MPMSolver(Fixed, Solver):
         """Return the reason why no kernels are used, if so; ValueError if none can be, but ``transfer`` is kernels."""
         if self.transfer == "torch":
             return "`transfer` is torch"
-        try:
-            from gaussian_swaying.mpm.triton.twins import why_not_kernels
-
-            obstacle = why_not_kernels(bound, interpret=self.transfer == "kernels")
-        except ImportError as error:
-            obstacle = f"the kernels cannot be imported ({error})"
+        obstacle = f"the {bound.name} formulation has no kernels"
+        if not isinstance(bound, Modes):
+            obstacle = _kernels_of(bound).unsupported(bound, interpret=self.transfer == "kernels")
         if self.transfer == "kernels" and obstacle is not None:
             raise ValueError(f"`transfer: kernels` cannot be used, because {obstacle}: set it to auto or torch.")
         return obstacle
@@ -298,7 +300,7 @@ class MPMSolver(Fixed, Solver):
     @property
     def has_kernels(self) -> bool:
         """True if the substep of the kernels is used where no gradient is needed."""
-        return self._bound is not None and self._fused_obstacle is None
+        return self._bound is not None and self._obstacle is None
 
     def fused(self, *tensors: Tensor | None) -> Fused:
         """The compiled substep of this material; None if the torch substep is used.
@@ -309,47 +311,28 @@ class MPMSolver(Fixed, Solver):
         Raises:
             ValueError: If ``transfer`` is kernels and a gradient is required.
         """
-        if self._fused_obstacle is not None:
-            return None
-        if self._wanted(*tensors):
-            if self.transfer == "kernels":
-                raise ValueError("`transfer: kernels` has no gradients here: set it to auto or torch.")
-            return None
-        return self._kernels()
+        if self.has_kernels and not self._wanted(*tensors):
+            return self._kernels()
+        if self.transfer == "kernels":
+            raise ValueError("`transfer: kernels` has no gradients here: set it to auto or torch.")
+        return None
 
     def _wanted(self, *tensors: Tensor | None) -> bool:
         """True if the body or one of some tensors requires a gradient, and gradients are enabled."""
         asking = (*self.bound.body.tensors(), *tensors)
         return torch.is_grad_enabled() and any(t is not None and t.requires_grad for t in asking)
 
-    def _kernels(self) -> Fused:
-        if self._fused is None or not self._fused.holds():
-            from gaussian_swaying.mpm.triton.twins import TWINS
+    def _replays(self, state: MPMState, forces: Sequence[Force]) -> bool:
+        """True if kernels run whole rollouts: no gradient is wanted, and the host need not call a force."""
+        wanted = self.has_kernels and self._wanted(*state.tensors(), *tensors_of(forces))
+        return self.has_kernels and not wanted and all(f.recordable or f.twin() is not None for f in forces)
 
+    def _kernels(self) -> Fused:
+        if self._fused is None:
             # ordinary tensors, which can be written inside and outside inference mode
             with torch.inference_mode(False), torch.no_grad():
-                self._fused = TWINS[self.bound.name](self.bound)
+                self._fused = _kernels_of(self.bound)(self.bound)
         return self._fused
-
-    def _adjoint_for(self, state: MPMState, forces: Sequence[Force]) -> Any:
-        """The backward pass in kernels, if a gradient through a rollout is wanted and they can compute it."""
-        if self._fused_obstacle is not None or not torch.is_grad_enabled():
-            return None
-        if not self._wanted(*state.tensors(), *tensors_of(forces)):
-            return None
-        adjoint, why = self._kernels().adjoint(state, forces)
-        if adjoint is None and self.transfer == "kernels":
-            raise ValueError(f"`transfer: kernels` has no gradients here, because {why}: set it to auto or torch.")
-        return adjoint
-
-    def _fused_for(self, state: MPMState, forces: Sequence[Force]) -> Fused:
-        """As :meth:`fused`, for rollouts with forces; also None if the host has to call a force in every substep."""
-        if self._fused_obstacle is not None:
-            return None
-        if not all(force.recordable or force.twin() is not None for force in forces):
-            return None
-        asking = [*state.tensors(), *tensors_of(forces)] if torch.is_grad_enabled() else []
-        return self.fused(*asking)
 
     def init_state(
         self,
@@ -425,13 +408,8 @@ class MPMSolver(Fixed, Solver):
 
     def cells_per_second(self, state: MPMState) -> Tensor:
         """Return the cells that the fastest wave crosses per second, a scalar tensor; in a kernel if there is one."""
-        if self._fused_obstacle is None:
-            from gaussian_swaying.mpm.triton.measures import largest_speed
-
-            cells = largest_speed(self.bound, state)
-            if cells is not None:
-                return self.bound.with_bending(cells)
-        return self.bound.cells_per_second(state)
+        kernels = self.has_kernels and self._kernels().watches
+        return self._kernels().largest_speed(state) if kernels else self.bound.cells_per_second(state)
 
     def fit_grid(self, state: MPMState, horizon: float, margin: int = 0) -> MPMState:
         """Fit the grid of the ``updated`` formulation to the object for the next ``horizon`` seconds.
@@ -563,12 +541,14 @@ class MPMSolver(Fixed, Solver):
         """As :meth:`rollout`, without checks."""
         if isinstance(self.bound, Modes):
             return self.bound.rollout(state, dt, steps, acting, watch)
-        adjoint = self._adjoint_for(state, acting)
-        if adjoint is not None:
-            return adjoint.rollout(state, dt, steps, acting, checkpoint, watch)
-        fused = self._fused_for(state, acting)
-        if fused is not None:
-            return fused.rollout(state, dt, steps, acting, watch=watch)[0]
+        if self._replays(state, acting):
+            return self._kernels().rollout(state, dt, steps, acting, watch=watch)[0]
+        if self.has_kernels and self._wanted(*state.tensors(), *tensors_of(acting)):
+            why = self._kernels().why_no_gradient(state, acting)
+            if why is None:
+                return self._kernels().rollout_with_gradient(state, dt, steps, acting, checkpoint, watch)
+            if self.transfer == "kernels":
+                raise ValueError(f"`transfer: kernels` has no gradients here, because {why}: set it to auto or torch.")
         sources = [force.during(state.time, dt, steps) for force in acting]
 
         def advance(state: MPMState, first: int, count: int) -> MPMState:
@@ -613,9 +593,8 @@ class MPMSolver(Fixed, Solver):
         """
         acting, steps = as_forces(forces), check_begin(self.bound, state, dt, steps, check)
         marks, end, seen = [steps] if self.exact else look_marks(steps, looks), state, []
-        fused = self._fused_for(state, acting) if self.stiffness_damping == 0 else None
-        if fused is not None and fused.watches:
-            end, cells = fused.rollout(state, dt, steps, acting, looks=marks, watch=watch)
+        if self._replays(state, acting) and self.stiffness_damping == 0 and self._kernels().watches:
+            end, cells = self._kernels().rollout(state, dt, steps, acting, looks=marks, watch=watch)
             seen.append(dt * cells)
         else:
             for first, last in pairwise([0, *marks]):
@@ -631,16 +610,11 @@ class MPMSolver(Fixed, Solver):
         known = self.bound.elastic(state)
         if known is not None:
             return known
-        points, laws = self.points, self.laws
-        density = None
-        wanted = torch.is_grad_enabled() and (state.F_elastic.requires_grad or laws.mu.requires_grad)
-        if self._fused_obstacle is None and not wanted:
-            from gaussian_swaying.mpm.triton.measures import elastic_energy
-
-            density = elastic_energy(self.bound.body, state.F_elastic)
+        F, kernels = state.F_elastic, self.has_kernels and not self._wanted(state.F_elastic)
+        density = self._kernels().energy(F) if kernels else None
         if density is None:
-            density = laws.energy(state.F_elastic, state.internal)
-        return (points.volume * density).sum(-1) + self.bound.sheet_energy(state)
+            density = self.laws.energy(F, state.internal)
+        return (self.points.volume * density).sum(-1) + self.bound.sheet_energy(state)
 
     def energies(self, state: MPMState) -> dict[str, Tensor]:
         """Kinetic, elastic and gravitational energy [J], each of shape (...) over the batch."""

@@ -433,6 +433,13 @@ class MPMState(State):
     node_velocity: Tensor | None = None
     modal: Tensor | None = None
 
+    @property
+    def nodal(self) -> tuple[Tensor, Tensor]:
+        """Displacement and velocity of the nodes, which ``updated`` does not have."""
+        assert self.node_displacement is not None
+        assert self.node_velocity is not None
+        return self.node_displacement, self.node_velocity
+
     def state_dict(self) -> dict[str, Any]:
         """See :meth:`State.state_dict`; the box of the grid as a dictionary."""
         box = {name: getattr(self.grid, name) for name in ("dx", "offset", "resolution")}

@@ -10,11 +10,8 @@ from shared import solid
 from torch.testing import assert_close
 
 from gaussian_swaying import Box, MaterialPoints, MPMSolver, PinnedRegion
-from gaussian_swaying._fixed import changed
 from gaussian_swaying.geometry import linalg
 from gaussian_swaying.mpm import dispatch, laws
-from gaussian_swaying.mpm import formulations as known
-from gaussian_swaying.mpm.formulations.formulation import Formulation
 
 FORMULATIONS = ["total", "updated"]
 
@@ -159,68 +156,6 @@ def test_an_elastic_run_computes_no_eigenvectors_and_no_return_map(law, formulat
     solver.energies(state)
     assert state.F_total is state.F_elastic
     assert state.internal is None
-
-
-# ---- a custom formulation
-
-
-class Loose(Formulation):
-    """Particles that do not interact."""
-
-    name = "loose"
-    neighbours_fixed = False
-    viscous_power = 2
-
-    def first_grid(self, margin):
-        return self.bounding_grid(self.body.points.position, margin)
-
-    def fit_grid(self, state, horizon, margin):
-        return state.replace(grid=self.bounding_grid(state.position, margin))
-
-    def step(self, state, dt, force, drag):
-        push = self.gravity.to(state.velocity) + (0.0 if force is None else force / self.body.points.mass[..., None])
-        velocity = self.decay(state.velocity + dt * push, dt)
-        position = state.position + dt * velocity
-        return state.replace(position=position, velocity=velocity, time=state.time + dt, substep=dt)
-
-    def kinetic(self, state):
-        return 0.5 * (self.body.points.mass * state.velocity.square().sum(-1)).sum(-1)
-
-    def momenta(self, state):
-        momentum = self.body.points.mass[..., None] * state.velocity
-        return momentum.sum(-2), torch.linalg.cross(state.position, momentum, dim=-1).sum(-2)
-
-
-def test_a_third_formulation_is_one_class(monkeypatch):
-    """The solver runs it like its own formulations: forces and their work, energies, substeps and grid."""
-    with pytest.raises(ValueError, match=r"`solver.formulation` to be one of .*, but got 'loose'"):
-        MPMSolver(formulation="loose")
-    monkeypatch.setitem(known.FORMULATIONS, "loose", Loose)
-    points = _points((0.2, 0.2, 0.2), 0.05)
-    solver = changed(MPMSolver(0.1), formulation="loose")
-    assert not solver.neighbours_fixed
-    state = solver.init_state(points)
-    dt, mass = 0.01 / solver.substeps(state, 0.01), points.mass[:, None]
-
-    def lift(at):
-        return mass * at.position.new_tensor([0.0, 0.0, 19.8])
-
-    end = solver.fit_grid(solver.rollout(state, dt, 20, lift), dt)
-    height = 10.0 * dt * dt * 20 * 21 / 2
-    rise = torch.tensor([0.0, 0.0, height], dtype=torch.float64).expand_as(points.position)
-    assert_close(end.position - points.position, rise)
-    assert float(end.work) == pytest.approx(float((mass * 19.8).sum()) * 10.0 * dt * dt * 20**2 / 2)
-    growth = {name: float(value - solver.energies(state)[name]) for name, value in solver.energies(end).items()}
-    assert growth["kinetic"] == pytest.approx(0.5 * float(mass.sum()) * (200 * dt) ** 2)
-    assert growth["potential"] == pytest.approx(9.8 * float(mass.sum()) * height)
-    assert float(solver.momenta(end)["linear"][2]) == pytest.approx(float(mass.sum()) * 200 * dt)
-
-
-def test_a_formulation_without_kernels_says_so(monkeypatch):
-    monkeypatch.setitem(known.FORMULATIONS, "loose", Loose)
-    points = _points((0.2, 0.2, 0.2), 0.05)
-    with pytest.raises(ValueError, match="because the loose formulation has no kernels: set it to auto or torch"):
-        changed(MPMSolver(0.1, transfer="kernels"), formulation="loose").init_state(points)
 
 
 @pytest.mark.parametrize("formulation", FORMULATIONS)

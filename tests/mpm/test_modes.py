@@ -297,7 +297,7 @@ def test_a_change_keeps_the_motion_continuous(make_simulation):
 def test_another_pin_keeps_what_of_the_motion_its_modes_can_show():
     points, solver = post(E=1e5), solver_of()
     state = run(solver, pulled(solver, points, 0.5), frames=5)
-    wider = solver_of(pins=[PinnedRegion(Box([None] * 3, [None, None, 0.2]))])
+    wider = solver_of(pins=[PinnedRegion(Box([None] * 3, [None, None, 0.25]))])
     start = wider.init_state(points)
     after = wider.continued(solver, state, start)
     top = points.position[:, 2] > 0.95

@@ -232,8 +232,7 @@ class Modes(Total):
     def first_state(self, velocity: Tensor, margin: int) -> MPMState:
         """The state at time zero; of a first velocity remains what the modes can show."""
         state = super().first_state(velocity, margin)
-        assert state.node_velocity is not None
-        p = self._project(self.node_mass[..., None] * state.node_velocity)
+        p = self._project(self.node_mass[..., None] * state.nodal[1])
         return self.shown(state, torch.zeros_like(p), p)
 
     def shown(self, state: MPMState, q: Tensor, p: Tensor) -> MPMState:
@@ -261,10 +260,8 @@ class Modes(Total):
         if state.modal is not None and state.modal.shape[-1] == self.shape.shape[-1]:
             own = state.modal / self._norm
             return own[..., 0, :], own[..., 1, :]
-        assert state.node_displacement is not None
-        assert state.node_velocity is not None
-        mass = self.node_mass[..., None]
-        return self._project(mass * state.node_displacement), self._project(mass * state.node_velocity)
+        displacement, velocity = (self._project(self.node_mass[..., None] * value) for value in state.nodal)
+        return displacement, velocity
 
     def rollout(
         self,

@@ -342,15 +342,13 @@ class Total(Formulation):
                 "`contact` and obstacles in `total` need the kernels, which have no gradients through contact: leave "
                 "`solver.transfer` on auto, give laws device functions, and on a GPU float32; or leave contact out."
             )
-        displacement = state.node_displacement
-        assert displacement is not None
-        assert state.node_velocity is not None
+        displacement, before = state.nodal
         points, laws, time = self.body.points, self.body.laws, self.settings.stiffness_damping
         F, rate = state.F_elastic, state.affine
         if (
             self.rigid_bodies or self.bending is not None
         ):  # the nodes strain the particles otherwise than the state says
-            raw = self.read_particles(state, displacement, state.node_velocity)
+            raw = self.read_particles(state, displacement, before)
             F, rate = raw.F_elastic, raw.affine
         if self.bending is None:
             stress = laws.pk1(F, None)
@@ -370,7 +368,7 @@ class Total(Formulation):
         if drag is not None:
             resistance = scatter(self.stencil, drag[..., None, None])
             yielding = 1 / (1 + kick * resistance * inverse_mass)
-        velocity = self._accelerate(state.node_velocity, node_force * inverse_mass, kick, yielding)
+        velocity = self._accelerate(before, node_force * inverse_mass, kick, yielding)
         velocity = torch.where(inverse_mass > 0, velocity, 0.0)
         position = lattice = None
         if self.node_rest is not None:
@@ -449,24 +447,22 @@ class Total(Formulation):
         )
 
     def kinetic(self, state: MPMState) -> Tensor:
-        assert state.node_velocity is not None
-        return 0.5 * (self.node_mass * state.node_velocity.square().sum(-1)).sum(-1)
+        return 0.5 * (self.node_mass * state.nodal[1].square().sum(-1)).sum(-1)
 
     def sheet_energy(self, state: MPMState) -> Tensor | float:
         """Energy of bending, and of what F does across sheets, whose membrane is that of the law."""
         if self.bending is None:
             return 0.0
-        assert state.node_displacement is not None
-        F = gather(state.node_displacement, self.stencil)[..., 1:4, :].mT
+        displacement = state.nodal[0]
+        F = gather(displacement, self.stencil)[..., 1:4, :].mT
         F = F + torch.eye(3, dtype=F.dtype, device=F.device)
         own = self.body.points.volume * director_energy(F, self.normal, self.body.laws.mu)
-        return self.bending.energy(state.node_displacement) + own.sum(-1)
+        return self.bending.energy(displacement) + own.sum(-1)
 
     def momenta(self, state: MPMState) -> tuple[Tensor, Tensor]:
-        assert state.node_velocity is not None
-        assert state.node_displacement is not None
-        momentum = self.node_mass[..., None] * state.node_velocity
-        place = self.node_positions(momentum) + state.node_displacement
+        displacement, velocity = state.nodal
+        momentum = self.node_mass[..., None] * velocity
+        place = self.node_positions(momentum) + displacement
         return momentum.sum(-2), torch.linalg.cross(place, momentum, dim=-1).sum(-2)
 
 
@@ -494,9 +490,7 @@ class _RigidNodes:
 
     def in_shape(self, state: MPMState, rest: Tensor) -> MPMState:
         """The state with its nodes and particles in place; ``rest`` are the particles at rest, shape (..., P, 3)."""
-        assert state.node_displacement is not None
-        assert state.node_velocity is not None
-        displacement, velocity = in_double(state.node_displacement), in_double(state.node_velocity)
+        displacement, velocity = map(in_double, state.nodal)
         identity = torch.eye(3, dtype=self.rest.dtype, device=self.rest.device)
         rotation = polar_rotation(identity + fitted_gradient(self.rest, displacement, self.mass))
         rate = fitted_gradient(self.rest, velocity, self.mass)
@@ -511,5 +505,5 @@ class _RigidNodes:
             affine=torch.where(whole, rate.to(rest)[..., None, :, :], state.affine),
             F_elastic=F,
             F_total=F,
-            node_displacement=torch.where((self.mass > 0)[..., None], nodes, state.node_displacement),
+            node_displacement=torch.where((self.mass > 0)[..., None], nodes, state.nodal[0]),
         )

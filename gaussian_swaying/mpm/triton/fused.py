@@ -11,22 +11,21 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
-from typing import Any, ClassVar, Protocol
+from typing import Any, ClassVar
 
 import torch
 from torch import Tensor
 
 from gaussian_swaying.kernels.graphs import Repeater, fingerprint
 from gaussian_swaying.kernels.language import INTERPRETED
-from gaussian_swaying.kernels.launch import call, compiles
-from gaussian_swaying.mpm.body import Body
+from gaussian_swaying.kernels.launch import call, compiles, lanes, launch
 from gaussian_swaying.mpm.forces import MOST_STEPS, Force, added, divide, split, tensors_of
 from gaussian_swaying.mpm.formulations.formulation import Formulation
 from gaussian_swaying.mpm.laws.triton.body import BodyLaws
 from gaussian_swaying.mpm.laws.triton.functions import shared
 from gaussian_swaying.mpm.state import MPMState
 from gaussian_swaying.mpm.timestep import kick_time
-from gaussian_swaying.mpm.triton.shared import SCHEDULE
+from gaussian_swaying.mpm.triton import shared as kernels
 from gaussian_swaying.mpm.twins import Composed, Tables, Twin, Watched
 
 MAX_STEPS = MOST_STEPS
@@ -57,21 +56,6 @@ class Part:
     key: tuple[object, ...] | None
 
 
-class Adjoint(Protocol):
-    """A rollout whose gradients are computed by kernels."""
-
-    def rollout(
-        self,
-        state: MPMState,
-        dt: float,
-        steps: int,
-        forces: Sequence[Force],
-        checkpoint: int,
-        watch: Callable[[int], None] | None,
-    ) -> MPMState:
-        """As ``MPMSolver.rollout``."""
-
-
 class Fused(ABC):
     """Substeps of a formulation bound to its material.
 
@@ -86,8 +70,8 @@ class Fused(ABC):
 
     def __init__(self, bound: Formulation) -> None:
         body, points = bound.body, bound.body.points
-        self.body, self.settings, self._in_shape = body, bound.settings, bound.in_shape
-        self.device, self._made_from = points.position.device, _made_from(body)
+        self.body, self.settings = body, bound.settings
+        self.bound, self.device = bound, points.position.device
         self.particles = points.count
         self.count = points.mass.numel()
         self.scenes = self.count // max(self.particles, 1)
@@ -99,7 +83,7 @@ class Fused(ABC):
         if points.law_index is not None:
             self.law = points.law_index.reshape(-1).int()
         self.first_step = torch.zeros(1, dtype=torch.int32, device=self.device)
-        self.schedule = torch.zeros(MAX_STEPS + 2, SCHEDULE, **self.like)
+        self.schedule = torch.zeros(MAX_STEPS + 2, kernels.SCHEDULE, **self.like)
         self.forces = Composed(())
         """The forces of the current rollout that the kernels compute."""
         self.vectors = torch.zeros(0, **self.like)
@@ -134,7 +118,7 @@ class Fused(ABC):
         points = bound.body.points
         device = points.position.device.type
         if not compiles(device) or (INTERPRETED and not interpret):
-            return "it needs a CUDA device" if device != "cpu" else "llvmlite is not installed"
+            return f"they cannot be compiled for {device}"
         if points.position.dtype != torch.float32 and device == "cuda":
             return f"it computes in float32, but the material is {points.position.dtype}".replace("torch.", "")
         if bound.settings.deterministic and device == "cuda" and not cls.fixed_order:
@@ -144,9 +128,9 @@ class Fused(ABC):
                 return f"the law {type(law).__name__} has no Triton twin"
         return None
 
-    def adjoint(self, state: MPMState, forces: Sequence[Force]) -> tuple[Adjoint | None, str]:
-        """Return the rollouts with gradients in kernels; or None, and the reason why they need torch."""
-        return None, "only the total formulation has backward kernels"
+    def why_no_gradient(self, state: MPMState, forces: Sequence[Force]) -> str | None:
+        """Return the reason why gradients of a rollout need torch's autograd; None if kernels compute them."""
+        return "only the total formulation has backward kernels"
 
     @property
     def recordable(self) -> bool:
@@ -157,10 +141,6 @@ class Fused(ABC):
     @abstractmethod
     def launches(self) -> bool:
         """True if a substep without forces in torch consists of launches alone."""
-
-    def holds(self) -> bool:
-        """True if buffers and graphs are still valid: nothing that they were made from was replaced."""
-        return self._made_from == _made_from(self.body)
 
     def __reduce__(self) -> tuple[Callable[[], None], tuple[()]]:
         """Nothing to copy or pickle: a solver builds its buffers and graphs again."""
@@ -274,13 +254,13 @@ class Fused(ABC):
         changes["impulse"] = state.impulse + changes["impulse"]
         if loaded:
             changes["work"] = state.work + changes["work"]
-        return self._in_shape(state.replace(time=state.time + steps * dt, substep=dt, **changes))
+        return self.bound.in_shape(state.replace(time=state.time + steps * dt, substep=dt, **changes))
 
     def table(self, kick: float, dt: float, steps: int) -> Tensor:
         """The schedule on the host, which can be copied without making it wait."""
         first, other = (math.exp(-self.settings.damping * time) for time in (kick, dt))
         real = self.like["dtype"]
-        table = torch.empty(steps + 2, SCHEDULE, dtype=real, pin_memory=self.device.type == "cuda")
+        table = torch.empty(steps + 2, kernels.SCHEDULE, dtype=real, pin_memory=self.device.type == "cuda")
         table[2:] = torch.tensor([dt, dt, other, 0.0], dtype=real)
         table[:2] = torch.tensor([[0.0, dt, 1.0, kick if steps == 1 else dt], [kick, dt, first, 0.0]], dtype=real)
         return table
@@ -294,6 +274,33 @@ class Fused(ABC):
     def places(self) -> tuple[int, int]:
         """Return the addresses of the numbers of forces, which recorded graphs contain."""
         return self.tables.buffer.data_ptr(), self.vectors.data_ptr()
+
+    # ---- measures, each in one kernel
+
+    def largest_speed(self, state: MPMState) -> Tensor:
+        """Cells per second as ``Formulation.cells_per_second``, if it ``watches``."""
+        points, laws = self.body.points, self.body.laws
+        given = state.F_elastic, points.mass / points.volume, laws.mu, laws.lam, state.velocity
+        out, block = points.position.new_zeros(1), lanes(self.device, 128)
+        with torch.cuda.device_of(out):
+            launch(kernels.largest_speed, (-(-self.count // block),))(
+                *(value.contiguous() for value in given), out, self.count, WAVE=self.wave,
+                SPATIAL=not self.bound.neighbours_fixed, BLOCK=block, num_warps=4,
+            )  # fmt: skip
+        return self.bound.with_bending(out[0] / self.settings.dx)
+
+    def energy(self, F: Tensor) -> Tensor | None:
+        """Energy density [J/m³], shape (..., P); None for laws without a common energy."""
+        energy = shared(self.body.points.laws, "energy")
+        if energy is None:
+            return None
+        out, block, laws = F.new_empty(F.shape[:-2]), lanes(self.device, 128), self.body.laws
+        with torch.cuda.device_of(out):
+            launch(kernels.elastic_energy, (-(-self.count // block),))(
+                F.contiguous(), laws.mu.contiguous(), laws.lam.contiguous(), out, self.count, ENERGY=energy,
+                BLOCK=block, num_warps=4,
+            )  # fmt: skip
+        return out
 
     # ---- forces in torch
 
@@ -388,8 +395,3 @@ def check_indices(entries: int) -> None:
 
 def _nothing() -> None:
     """Return None: the placeholder for a Fused in a copy."""
-
-
-def _made_from(body: Body) -> tuple[object, ...]:
-    """Return the key of the buffers and graphs of a body, without its points; they are invalid once it changes."""
-    return fingerprint(body.boundaries)

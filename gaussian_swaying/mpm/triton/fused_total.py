@@ -1,8 +1,10 @@
-"""Runs the ``total`` substep with its kernels."""
+"""Runs the ``total`` substep and its adjoint with their kernels."""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
 from typing import Any
 
 import torch
@@ -13,13 +15,15 @@ from gaussian_swaying.kernels.language import triton
 from gaussian_swaying.kernels.launch import lanes, launch
 from gaussian_swaying.mpm.boundaries.pinned_points import PinnedPoints
 from gaussian_swaying.mpm.boundaries.pinned_region import PinnedRegion
-from gaussian_swaying.mpm.formulations.formulation import Formulation
+from gaussian_swaying.mpm.forces import Force, divide, tensors_of
 from gaussian_swaying.mpm.formulations.total import Total
 from gaussian_swaying.mpm.point_holds import DenseHolds
 from gaussian_swaying.mpm.state import MPMState
-from gaussian_swaying.mpm.transfer import shifts
+from gaussian_swaying.mpm.timestep import kick_time
+from gaussian_swaying.mpm.transfer import gather, shifts
+from gaussian_swaying.mpm.triton import adjoint_kernels
 from gaussian_swaying.mpm.triton import total_kernels as kernels
-from gaussian_swaying.mpm.triton.fused import INTERPRETED, Fused, Part, check_indices
+from gaussian_swaying.mpm.triton.fused import INTERPRETED, MAX_STEPS, Fused, Part, at_home, check_indices
 from gaussian_swaying.mpm.triton.fused_contact import FusedContact
 
 # time per particle for a number of lanes per cell, relative to 32 lanes, on an H200
@@ -43,12 +47,12 @@ class FusedTotal(Fused):
     """
 
     fixed_order = True
+    bound: Total
 
-    def __init__(self, bound: Formulation) -> None:
+    def __init__(self, bound: Total) -> None:
         super().__init__(bound)
-        assert isinstance(bound, Total)
         body, points, stencil, grid = bound.body, bound.body.points, bound.stencil, bound.grid
-        self.bound, self.grid = bound, grid
+        self.grid = grid
         # with virtual nodes a cell is cut by the copies of its nodes that the particles have
         unit = stencil.cell
         order = torch.argsort(unit, stable=True)
@@ -212,10 +216,8 @@ class FusedTotal(Fused):
             self.time.copy_(state.time)
 
     def _run_once(self, state: MPMState, part: Part) -> dict[str, Any]:
-        assert state.node_displacement is not None
-        assert state.node_velocity is not None
-        self.displacement[:, :3].copy_(state.node_displacement.reshape(-1, 3))
-        self.velocity[:, :3].copy_(state.node_velocity.reshape(-1, 3))
+        for to, value in zip((self.displacement, self.velocity), state.nodal, strict=True):
+            to[:, :3].copy_(value.reshape(-1, 3))
         options = part.options
         if self.touching is not None:
             self.touching.take()
@@ -484,3 +486,365 @@ def _by_scene(nodes: Tensor, scene: Tensor, scenes: int) -> Tensor:
     rank = torch.arange(len(nodes), device=nodes.device) - (counts.cumsum(0) - counts)[scene[nodes]]
     rows[scene[nodes], rank] = nodes
     return rows
+
+
+class DifferentiableTotal(FusedTotal):
+    """Rollouts with gradients: a backward pass in kernels, which shares the buffers and graphs of the substeps.
+
+    The forward pass keeps displacement and velocity of the nodes every so many substeps. The backward pass runs each
+    segment again, now keeping them in every substep, and then its adjoint. What the kernels do not cover is left to
+    torch's autograd, which is the reference.
+    """
+
+    made = 0
+    """Number of times that the buffers of a backward pass were made."""
+
+    def _prepare(self) -> None:
+        """Make the buffers of a backward pass."""
+        self.nodes, self.place = len(self.active), self.active.long()
+        self.force_bar = torch.zeros_like(self.fields)
+        self.bars, self.mass_bar, self.material_bar, self.history, self.shares = (
+            torch.zeros(*shape, **self.like)
+            for shape in ((self.nodes, 8), (self.nodes,), (3, self.count), (0, self.nodes, 8), (0, self.pieces, 8))
+        )
+        self.last = torch.zeros_like(self.first_step)
+        self.made = 1
+        self._take_rows()
+
+    def _take_rows(self) -> None:
+        """The held points as dense matrices: what rows push, and their weights on the nodes that they move."""
+        points = self.points
+        if points is None:
+            return
+        place = torch.full((self.bound.node_mass.numel(),), -1, dtype=torch.int32, device=self.device)
+        place[self.place] = torch.arange(self.nodes, dtype=torch.int32, device=self.device)
+        own = place[points.affected.long()]
+        massive = (own >= 0).nonzero()[:, 0]  # others never move
+        self.affected, self.scene = own[massive].contiguous(), points.scene[massive].contiguous()
+        self.push = points.push[massive].T.contiguous()
+        rows = points.push.shape[1]
+        where = torch.full_like(place, len(massive)).index_copy(
+            0, points.affected.long()[massive], torch.arange(len(massive), dtype=torch.int32, device=self.device)
+        )
+        row = (torch.arange(points.node.shape[1], device=self.device) % rows).expand_as(points.node)
+        weight = torch.zeros(len(massive) + 1, rows, **self.like)
+        weight.index_put_((where[points.node.long()].long(), row), points.weight, accumulate=True)
+        self.weight = weight[:-1].contiguous()
+        self.weight_bar = torch.zeros_like(self.weight)
+        self.entry = (where[points.node.long()].long(), row)
+        self.row_bar = torch.zeros(points.node.shape[1], 4, **self.like)
+        self.multipliers = self.row_history = torch.zeros(0, len(self.row_bar), 4, **self.like)
+
+    # ---- forward
+
+    def why_no_gradient(self, state: MPMState, forces: Sequence[Force]) -> str | None:
+        """Return the reason why gradients of a rollout need torch's autograd; None if the kernels compute them."""
+        bound = self.bound
+        points = bound.body.points
+        if not self.plain or self.touching is not None:
+            return "boundaries other than pins that hold all the time, and contact, have no backward kernels"
+        if self.bent:
+            return "sheets of one layer that bend have no backward kernels"
+        if self.virtual:
+            return "virtual nodes have no backward kernels"
+        if any(derivative is None for derivative in self.laws.adjoints):
+            return "a law has no backward kernel (`LawFunctions.adjoint`)"
+        twin = forces[0].twin() if forces else None
+        if len(forces) > 1 or (forces and twin is None):
+            return "only one force with a Triton twin has a backward kernel"
+        if twin is not None and twin.adjoint is None:
+            return f"this {type(forces[0]).__name__} has no backward kernel"
+        free = [points.mass, points.volume, points.youngs_modulus, points.poisson_ratio]
+        fixed = [t for t in bound.body.tensors() if not any(t is other for other in free)]
+        fixed += [] if twin is None else [t for t in tensors_of(forces) if any(t is source for source in twin.sources)]
+        fixed += [t for law in points.laws for t in (*law.parameters(), *law.buffers())]
+        if any(t.requires_grad for t in fixed):
+            return "a gradient by rest positions, patches, boundaries or numbers of a law needs torch"
+        nodal = (state.node_displacement, state.node_velocity)
+        if any(t is not None and t.requires_grad for t in nodal):
+            return (
+                None if not any(_own(t, nodal) for t in state.tensors()) else "particle fields are inputs of their own"
+            )
+        if any(t.requires_grad for t in state.tensors()):
+            return "particle fields require gradients, but the nodal ones do not"
+        return None
+
+    def rollout_with_gradient(
+        self,
+        state: MPMState,
+        dt: float,
+        steps: int,
+        forces: Sequence[Force],
+        checkpoint: int,
+        watch: Callable[[int], None] | None,
+    ) -> MPMState:
+        """As ``MPMSolver.rollout``; gradients reach nodal fields, stiffness, mass, volume, wind and coefficients."""
+        if steps == 0:
+            return state
+        if not self.made:
+            with torch.inference_mode(False), torch.no_grad():
+                self._prepare()
+        run = _Run(self, state, dt, steps, segment(steps, checkpoint, self.nodes), tuple(forces), watch)
+        vectors = numbers = None
+        if forces:
+            (twin,) = divide(forces)[1]
+            vectors = twin.per_substep.take(state.time, torch.full_like(state.time, dt), steps)
+            numbers = torch.as_tensor(twin.numbers.take())
+        bound = self.bound
+        laws, points, holds = bound.body.laws, bound.body.points, bound.point_holds
+        displacement, velocity = _Rollout.apply(
+            run, *state.nodal, laws.mu, laws.lam, points.volume,
+            bound.node_inverse_mass, None if holds is None else holds.weight, vectors, numbers,
+        )  # fmt: skip
+        end = run.state
+        rows = gather(torch.cat([displacement, velocity], dim=-1), bound.stencil)
+        return bound.with_rows(end, displacement, velocity, rows)
+
+    def forward(self, run: _Run) -> tuple[Tensor, ...]:
+        """Run all segments and keep the state at the start of each; the nodal fields at the end."""
+        for first in range(0, run.steps, run.every):
+            count = min(run.every, run.steps - first)
+            run.starts.append(torch.stack([value.reshape(-1, 3)[self.place] for value in run.state.nodal], dim=1))
+            run.kicks.append(kick_time(run.state, run.dt))
+            run.state = self.rollout(run.state, run.dt, count, run.forces)[0]
+            if run.watch is not None:
+                run.watch(first + count)
+        return tuple(value.clone() for value in run.state.nodal)
+
+    # ---- backward
+
+    def backward(
+        self, run: _Run, bars: Sequence[Tensor], vectors: Tensor | None, numbers: Tensor | None, needs: dict[str, bool]
+    ) -> dict[str, Tensor]:
+        """Gradients by the inputs of :class:`_Rollout`, by name, from those by the nodal fields at the end."""
+        loaded = len(run.forces) > 0
+        self.asked = ()
+        self.options = self.options_for(divide(run.forces)[1])
+        if numbers is not None:
+            self.tables.buffer[: len(numbers)].copy_(numbers)
+        self._make_room(run.every, loaded)
+        self.width = 8 if loaded or self.options["VISCOUS"] else 4
+        self.partial = self.sums(self.cells, self.width, "adjoint")
+        for buffer in (self.bars, self.force_bar, self.mass_bar, self.material_bar, self.partial, self.fields):
+            buffer.zero_()
+        for k, bar in enumerate(bars):
+            self.bars[:, 4 * k : 4 * k + 3] = bar.reshape(-1, 3)[self.place]
+        shares = loaded and (needs["vectors"] or needs["numbers"])
+        material = any(needs[name] for name in ("mu", "lam", "volume"))
+        self.flags = {"MATERIAL": material, "SHARES": shares, "MASS": needs["inverse_mass"], "WEIGHTS": needs["weight"]}
+        if self.points is not None:
+            self.weight_bar.zero_()
+        vector_bars: list[Tensor] = []
+        number_bar = torch.zeros(3, dtype=torch.float64, device=self.device)
+        for n in reversed(range(len(run.starts))):
+            first = n * run.every
+            count = min(run.every, run.steps - first)
+            if vectors is not None:
+                self.write_substeps(0, vectors[first : first + count])
+            self.schedule[: count + 2].copy_(self.table(run.kicks[n], run.dt, count), non_blocking=True)
+            self._segment(run.starts[n], count)
+            if shares:
+                by_vector, by_numbers = self._shared(count)
+                vector_bars.append(by_vector)
+                number_bar += by_numbers
+        self._nodes_back(0, SUM=True, PUSH=False, FINISH=False)
+        bound, found = self.bound, {}
+        for k, (name, bar) in enumerate(zip(_INPUTS, bars, strict=False)):
+            all_nodes = bar.reshape(-1, 3) if k == 0 else torch.zeros_like(bar).reshape(-1, 3)
+            own = self.bars[:, 4 * k : 4 * k + 3].to(bar)
+            found[name] = all_nodes.index_copy(0, self.place, own).reshape(bar.shape)
+        sorted_back = torch.empty_like(self.material_bar)
+        sorted_back[:, self.order.long()] = self.material_bar
+        for name, row in zip(("mu", "lam", "volume"), sorted_back, strict=True):
+            found[name] = row.reshape(bound.body.points.mass.shape)
+        inverse = bound.node_inverse_mass
+        mass = torch.zeros(inverse.numel(), **self.like).index_copy(0, self.place, self.mass_bar)
+        found["inverse_mass"] = mass.reshape(inverse.shape)
+        if self.points is not None and bound.point_holds is not None:
+            padded = torch.nn.functional.pad(self.weight_bar, (0, 0, 0, 1))
+            weight = bound.point_holds.weight
+            found["weight"] = padded[self.entry].T.reshape(weight.shape).to(weight)
+        if vectors is not None and numbers is not None and vector_bars:
+            by_vectors = torch.cat(vector_bars[::-1])
+            by_vectors = by_vectors.reshape(vectors.shape) if vectors.ndim > 2 else by_vectors.sum(1)
+            found["vectors"] = by_vectors.to(vectors)
+            found["numbers"] = torch.nn.functional.pad(number_bar, (0, len(numbers) - 3)).to(numbers)
+        return found
+
+    def _segment(self, start: Tensor, count: int) -> None:
+        self.fields.view(-1, 2, 4)[:, :, :3].index_copy_(0, self.place, start)
+        self.first_step.zero_()
+
+        def again(offset: int) -> None:
+            self._keep(offset)
+            self.substep(offset, self.options)
+
+        def back(offset: int) -> None:
+            self._node_stages(offset)
+            self._particles_back(offset)
+
+        key = (*self.options.values(), *self.flags.values(), self.made)
+        self.repeat(count, ("again", *key), again)
+        self._keep(0)
+        if self.flags["WEIGHTS"]:
+            self._find_multipliers(count)
+        self.last.fill_(count - 1)
+        self.first_step.zero_()
+        self.repeat(count, ("back", *key), back)
+
+    def _make_room(self, every: int, loaded: bool) -> None:
+        """Make the buffers for a segment; recorded graphs contain their addresses, so new buffers are counted."""
+        if len(self.history) < every + 1:
+            self.made += 1
+            self.history = torch.zeros(every + 1, self.nodes, 8, **self.like)
+            if self.points is not None:
+                rows = len(self.row_bar)
+                self.row_history, self.multipliers = (torch.zeros(every + 1, rows, 4, **self.like) for _ in range(2))
+        if loaded and len(self.shares) < every:
+            self.made += 1
+            self.shares = torch.zeros(every, self.pieces, 8, **self.like)
+
+    def _find_multipliers(self, count: int) -> None:
+        holds = self.bound.point_holds
+        assert holds is not None
+        W = holds.whitening[0]
+        rates = self.row_history[1 : count + 1].reshape(count, holds.scenes, holds.rows, 4).double()
+        found = torch.einsum("sij,csjx->csix", W.mT @ W, rates)
+        self.multipliers[:count].copy_(found.reshape(count, -1, 4))
+
+    def _keep(self, offset: int) -> None:
+        block = lanes(self.device, 512)
+        launch(adjoint_kernels.keep_nodes, (triton.cdiv(8 * self.nodes, block),))(
+            self.active, self.nodes, self.fields, self.history, self.first_step, offset, BLOCK=block, num_warps=4
+        )
+        if self.flags["WEIGHTS"]:
+            rows = len(self.row_bar)
+            launch(adjoint_kernels.keep_rows, (triton.cdiv(4 * rows, block),))(
+                self.residual, rows, self.row_history, self.first_step, offset, BLOCK=block, num_warps=4
+            )
+
+    def _node_stages(self, offset: int) -> None:
+        if self.points is None:
+            self._nodes_back(offset, SUM=True, PUSH=True, FINISH=True)
+            return
+        self._nodes_back(offset, SUM=True, PUSH=True, FINISH=False)
+        nodes, rows = len(self.affected), self.push.shape[0]
+        launch(adjoint_kernels.rows_adjoint, (len(self.row_bar),))(
+            self.affected, self.scene, self.push, self.bars, self.row_bar, nodes, rows,
+            BLOCK=lanes(self.device, min(1024, triton.next_power_of_2(nodes))), num_warps=4,
+        )  # fmt: skip
+        block = lanes(self.device, 8, 1)
+        launch(adjoint_kernels.hold_adjoint, (triton.cdiv(nodes, block),))(
+            self.affected, self.scene, self.weight, self.row_bar, nodes, rows, self.bars,
+            self.weight_bar, self.multipliers, len(self.row_bar), self.inverse_mass, self.history, self.nodes,
+            self.first_step, offset, self.last, WEIGHTS=self.flags["WEIGHTS"], BLOCK=block,
+            ROWS=lanes(self.device, 64), num_warps=2,
+        )  # fmt: skip
+        self._nodes_back(offset, SUM=False, PUSH=False, FINISH=True)
+
+    def _nodes_back(self, offset: int, **stages: bool) -> None:
+        block = lanes(self.device, 64, 1)
+        launch(adjoint_kernels.nodes_adjoint, (triton.cdiv(self.nodes, block),))(
+            self.active, self.source, len(self.source), self.inverse_mass, self.rates, self.held, self.nodes,
+            self.partial,
+            self.fields, self.force_bar, self.history, self.bars, self.mass_bar,
+            self.schedule, self.first_step, offset, self.last, *self.gravity,
+            **stages, VELOCITY=self.width == 8, HELD=any(self.bound.on_nodes), MASS=self.flags["MASS"],
+            DAMPED=self.damped, WIDTH=self.width, BLOCK=block,
+            SOURCES=triton.next_power_of_2(len(self.source)), num_warps=4,
+        )  # fmt: skip
+
+    def _particles_back(self, offset: int) -> None:
+        options, flags = self.options, self.flags
+        per_program = lanes(self.device, max(1, 32 // self.lanes), 1)
+        _, ny, nz = self.grid.resolution
+        cut = self.pieces > self.cells
+        to = self.sums(self.pieces, self.width, "adjoint pieces") if cut else self.partial
+        launch(adjoint_kernels.particles_adjoint, (triton.cdiv(self.pieces, per_program),))(
+            self.fraction, self.material, self.law, self.law_table, self.values, self.count,
+            self.piece_start, self.piece_node, self.piece_scene, self.pieces,
+            self.fields, self.force_bar, to, self.material_bar, self.shares,
+            self.vectors, self.scenes, self.tables.buffer, self.first_step, offset, self.last,
+            ny * nz, nz, 1 / self.grid.dx, self.settings.stiffness_damping,
+            LAWS=self.laws, MULTI=options["MULTI"], FORCES=options["FORCES"], VISCOUS=options["VISCOUS"],
+            MATERIAL=flags["MATERIAL"], SHARES=flags["SHARES"], WIDTH=self.width, CELLS=per_program, LANES=self.lanes,
+            num_warps=1, **({"maxnreg": REGISTERS} if self.lanes == 64 else {}),
+        )  # fmt: skip
+        if cut:
+            self.join_pieces(to, self.partial, self.width)
+
+    def _shared(self, count: int) -> tuple[Tensor, Tensor]:
+        """Gradients by the vectors of a segment (count, scenes, 3) and by the numbers (3,), summed over particles."""
+        rows = self.shares[:count]
+        if self.scenes == 1:
+            total = rows.sum(1, keepdim=True, dtype=torch.float64)
+        else:  # pieces are sorted by scene
+            scenes = torch.arange(self.scenes + 1, dtype=torch.int32, device=self.device)
+            border = torch.searchsorted(self.piece_scene, scenes)
+            total = torch.nn.functional.pad(rows.cumsum(1, dtype=torch.float64), (0, 0, 1, 0))
+            total = total[:, border[1:]] - total[:, border[:-1]]
+        return total[..., :3], total[..., 4:7].sum((0, 1))
+
+
+@dataclass
+class _Run:
+    """Data of one rollout that its backward pass needs.
+
+    Attributes:
+        kernels: What computes it.
+        state: The state at its start, and then that at its end, without gradient.
+        dt: Substep [s].
+        steps: Number of substeps.
+        every: Substeps of a segment.
+        forces: The force, if any.
+        watch: See ``MPMSolver.rollout``.
+        starts: Displacement and velocity of the active nodes at the start of each segment, shape (nodes, 2, 3).
+        kicks: Time for which forces act in the first substep of each segment [s].
+    """
+
+    kernels: DifferentiableTotal
+    state: MPMState
+    dt: float
+    steps: int
+    every: int
+    forces: tuple[Force, ...]
+    watch: Callable[[int], None] | None
+    starts: list[Tensor] = field(default_factory=list)
+    kicks: list[float] = field(default_factory=list)
+
+
+_INPUTS = ("displacement", "velocity", "mu", "lam", "volume", "inverse_mass", "weight", "vectors", "numbers")
+
+
+class _Rollout(torch.autograd.Function):
+    """Nodal fields after a rollout, from those before it and from what it depends on."""
+
+    @staticmethod
+    def forward(ctx: Any, run: _Run, *inputs: Tensor | None) -> tuple[Tensor, ...]:
+        ctx.run = run
+        ctx.given = [None if value is None else value.detach() for value in inputs[-2:]]
+        return run.kernels.forward(run)
+
+    @staticmethod
+    @torch.autograd.function.once_differentiable
+    def backward(ctx: Any, *bars: Tensor) -> tuple[Tensor | None, ...]:
+        needs = dict(zip(_INPUTS, ctx.needs_input_grad[1:], strict=True))
+        with at_home(ctx.run.kernels.bars):
+            found = ctx.run.kernels.backward(ctx.run, bars, *ctx.given, needs)
+        return None, *(found.get(name) if needs[name] else None for name in _INPUTS)
+
+
+def segment(steps: int, checkpoint: int, nodes: int) -> int:
+    """Substeps of a segment: as asked for, else about the square root of all, or more if they fit in 128 MiB.
+
+    It is a multiple of what a graph repeats.
+    """
+    if checkpoint > 0:
+        return min(checkpoint, MAX_STEPS, steps)
+    fitting = min(2**22 // nodes, MAX_STEPS)  # 32 bytes for each node and substep
+    return min(16 * max(1, round(steps**0.5 / 16), fitting // 16), MAX_STEPS, steps)
+
+
+def _own(tensor: Tensor, nodal: tuple[Tensor | None, ...]) -> bool:
+    """True if a field of particles is a leaf that requires a gradient, and not a nodal field."""
+    return tensor.requires_grad and tensor.is_leaf and not any(tensor is t for t in nodal)

@@ -50,7 +50,6 @@ class FusedUpdated(Fused):
         self.atomic = lanes(self.device, 32) == 32
         """True if particles are added to the grid atomically; else in a fixed order."""
         points, laws = bound.body.points, bound.body.laws
-        self.bound = bound
         self.plastic = len(self.laws.flows) > 0
         self.internal = laws.initial_internal() is not None
         rows = [points.mass, points.volume, laws.mu, laws.lam, self.law]

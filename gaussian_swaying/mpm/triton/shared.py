@@ -5,7 +5,17 @@ of :mod:`~gaussian_swaying.mpm.formulations`; the kernels follow them and are te
 stay loops in Triton's intermediate code: if they are unrolled, its passes take minutes.
 """
 
-from gaussian_swaying.geometry.linalg_triton import add3, largest, largest_eigenvalue, load3, matmul, read, transpose
+from gaussian_swaying.geometry.linalg_triton import (
+    add3,
+    dot3,
+    largest,
+    largest_eigenvalue,
+    load3,
+    load9,
+    matmul,
+    read,
+    transpose,
+)
 from gaussian_swaying.kernels.language import tl, triton
 
 SCHEDULE = 4
@@ -179,3 +189,31 @@ def keep_largest(out, speed, mask):
     """Write the largest value to ``out``; infinity for NaN, which an atomic maximum would drop."""
     speed = tl.where(mask, tl.where(speed == speed, speed, float("inf")), 0.0)
     tl.atomic_max(out, tl.max(speed), sem="relaxed")
+
+
+@triton.jit(do_not_specialize=VARIES)
+def elastic_energy(F_in, mu_in, lam_in, out, count, ENERGY: tl.constexpr, BLOCK: tl.constexpr):
+    """Energy density of particles [J/m³], as ``ConstitutiveLaw.energy``."""
+    index = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
+    mask = index < count
+    F = load9(F_in, 1, index * 9, mask)
+    mu = tl.load(mu_in + index, mask, 0.0)
+    lam = tl.load(lam_in + index, mask, 0.0)
+    tl.store(out + index, ENERGY(F, mu, lam), mask)
+
+
+@triton.jit(do_not_specialize=VARIES)
+def largest_speed(
+    F_in, density, mu_in, lam_in, velocity, out, count, WAVE: tl.constexpr, SPATIAL: tl.constexpr, BLOCK: tl.constexpr
+):
+    """Largest speed of a wave [m/s] (and of its particle, SPATIAL), into ``out``."""
+    index = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
+    mask = index < count
+    F = load9(F_in, 1, index * 9, mask)
+    mu = tl.load(mu_in + index, mask, 0.0)
+    lam = tl.load(lam_in + index, mask, 0.0)
+    speed = wave_speed(F, tl.load(density + index, mask, 1.0), mu, lam, WAVE, SPATIAL)
+    if SPATIAL:
+        v = load3(velocity, 1, index * 3, mask)
+        speed += tl.sqrt(dot3(v, v))
+    keep_largest(out, speed, mask)
