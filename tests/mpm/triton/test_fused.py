@@ -10,13 +10,12 @@ import pytest
 import torch
 from catalogue import ELASTIC, PLASTIC
 
-from gaussian_swaying import Boundary, Box, MPMSolver, PinnedRegion, WindField, WindForce
+from gaussian_swaying import Boundary, MPMSolver, PinnedRegion, WindField, WindForce
 from gaussian_swaying.geometry.regions import Everything
 from gaussian_swaying.mpm.boundaries.impulse import Impulse
 from gaussian_swaying.mpm.boundaries.plane import Plane
-from gaussian_swaying.mpm.boundaries.velocity_box import VelocityBox
 from gaussian_swaying.mpm.laws.fixed_corotated import FixedCorotated
-from gaussian_swaying.mpm.triton import fused, fused_updated
+from gaussian_swaying.mpm.triton import fused
 
 from .bodies import (
     DT,
@@ -253,38 +252,6 @@ def test_boundaries_of_many_scenes(kernel_device, name):
     assert len(torch.unique(ends[1].impulse.abs().sum((1, 2)))) == 3
 
 
-def test_fast_particles_are_sorted_more_often_and_sheets_less():
-    """At least every 64 substeps, and not so often that a small body waits for the host."""
-    often = [fused_updated.sorted_for(8.0, rate, 1_000_000) for rate in (1e-6, 1e-2, 1e-1, 1.0)]
-    assert often[0] == 64
-    assert often == sorted(often, reverse=True)
-    assert often[-1] == 4
-    assert fused_updated.sorted_for(4.0, 1e-1, 1_000_000) > fused_updated.sorted_for(8.0, 1e-1, 1_000_000)
-    assert fused_updated.sorted_for(100.0, 1e-1, 1_000_000) > fused_updated.sorted_for(8.0, 1e-1, 1_000_000)
-    assert fused_updated.sorted_for(8.0, 1.0, 20_000) == 32
-    axis = (torch.arange(32) + 0.5) * DX / 2
-    assert 7 < fused_updated.crowd_of(torch.cartesian_prod(axis, axis, axis), DX) <= 8
-
-
-def test_a_fast_body_is_sorted_more_often_from_the_second_rollout_on(kernel_device, monkeypatch):
-    """The host does not wait for the speed: it reads that of an earlier rollout."""
-    monkeypatch.setattr(fused_updated, "LEAST", 1)
-    points = make_points(kernel_device, count=48)
-    found = []
-    for speed in (0.01, 10.0):
-        solver = make_solver("kernels", "updated", gravity=(0.0, 0.0, 0.0))
-        state = solver.init_state(points, torch.full_like(points.position, speed))
-        for _ in range(2):
-            state = solver.rollout(state, 1e-3, 2)
-            if kernel_device.type == "cuda":
-                torch.cuda.synchronize()
-        solver.rollout(state, 1e-3, 1)
-        fused = solver.fused()
-        found.append(fused.crossing)
-        assert fused.crossing == pytest.approx(3 * speed * 1e-3 / solver.dx, rel=0.1)
-    assert found[1] > 100 * found[0]
-
-
 @pytest.mark.gpu
 def test_held_points_stay_where_they_are_and_give_the_same_bits():
     """Thousands of substeps in float32, from graphs."""
@@ -303,15 +270,6 @@ def test_held_points_stay_where_they_are_and_give_the_same_bits():
     start = set_going(solver, points, strain=0.02).node_displacement
     before = (holds.weight[0, 0][..., None] * start[holds.node[0, 0]].double()).sum(-2)
     assert float((rows - before).abs().max()) < 1e-5 * DX
-
-
-def test_nodes_without_mass_are_let_go(kernel_device):
-    """Boundaries see them at the origin, and so inside a region around it."""
-    points = make_points(kernel_device, count=12)
-    boundaries = [VelocityBox(Box([-0.1] * 3, [0.1] * 3), [0.0, 1.0, 0.0], end=0.5 * DT)]
-    check_agreement(
-        run_both(points, lambda solver, state: solver.rollout(state, DT, 3), "total", boundaries=boundaries)
-    )
 
 
 def test_nodes_held_in_a_batch_of_winds(kernel_device):

@@ -5,7 +5,7 @@ import dataclasses
 import pytest
 import torch
 
-from gaussian_swaying import MPMSolver, WindField, WindForce
+from gaussian_swaying import WindField, WindForce
 from gaussian_swaying.kernels.launch import lanes
 from gaussian_swaying.mpm.state import GridSpec
 from gaussian_swaying.mpm.triton import fused_total
@@ -62,29 +62,6 @@ def test_every_number_of_lanes(number, monkeypatch):
     pytest.importorskip("triton")
     monkeypatch.setattr(fused_total, "_lanes", lambda sizes: number)
     check_agreement(run_in_wind(make_points("cuda", count=300), "total"))
-
-
-def test_crowded_cells_are_cut_only_where_there_are_few(kernel_device, monkeypatch):
-    """200 particles in a cell and 10 in the next, with 32 lanes; a CPU has no programs to fill."""
-    monkeypatch.setattr(fused_total, "_lanes", lambda sizes: 32)
-    generator = torch.Generator().manual_seed(2)
-    place = 0.52 + 0.96 * torch.rand(210, 3, generator=generator)
-    place[200:, 2] += 1
-    cut = {2048: 7 + 1, 3: 3 + 1} if lanes(kernel_device, 64) == 64 else {2048: 2, 3: 2}
-    for programs, pieces in (cut | {1: 2}).items():
-        monkeypatch.setattr(fused_total, "_PROGRAMS", programs)
-        solver = MPMSolver(DX, formulation="total", transfer="kernels")
-        solver.init_state(make_body((place * DX).to(kernel_device)))
-        assert solver.fused().pieces == pieces
-
-
-def test_the_number_of_lanes_suits_the_cells(monkeypatch):
-    monkeypatch.undo()
-    few, many = (fused_total._lanes(torch.full((100,), size)) for size in (3, 300))
-    assert few < many
-    sizes = torch.tensor([4] * 4000 + [5] * 100)  # no program goes through its cells twice, if all run at once
-    assert fused_total._lanes(sizes) == 8
-    assert fused_total._lanes(sizes.repeat(10)) == 4
 
 
 def test_a_node_adds_only_the_cells_around_it(monkeypatch):
