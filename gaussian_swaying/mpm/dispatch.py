@@ -37,10 +37,6 @@ class LawDispatch:
             self._place[order] = torch.arange(len(order), device=order.device)
         self.plastic = any(law.plastic for law, _ in self._groups)
 
-    @property
-    def plastic_names(self) -> list[str]:
-        return [type(law).__name__ for law, _ in self._groups if law.plastic]
-
     def initial_internal(self) -> Tensor | None:
         """The internal variables at rest, shape (..., P), or None if no law has one."""
         if all(law.internal is None for law, _ in self._groups):

@@ -14,7 +14,7 @@ from torch import Tensor
 
 from gaussian_swaying._checks import check_like, check_positive, check_shape
 from gaussian_swaying.mpm.forces import Force, split
-from gaussian_swaying.mpm.formulations.formulation import Formulation
+from gaussian_swaying.mpm.formulation import Formulation
 from gaussian_swaying.mpm.state import MaterialPoints, MPMState
 from gaussian_swaying.mpm.timestep import check_pace
 
@@ -55,7 +55,7 @@ def check_state(bound: Formulation, state: MPMState) -> None:
     """Raise TypeError or ValueError unless a state is one of this body on this grid; the host does not wait."""
     if not isinstance(state, MPMState):
         raise TypeError(f"Expected `state` to be an MPMState, but got {type(state).__name__}.")
-    points, nodes = bound.body.points, state.node_displacement
+    points, nodes = bound.points, state.node_displacement
     wrong = None
     if state.position.shape != points.position.shape:
         wrong = f"it has positions {tuple(state.position.shape)} instead of {tuple(points.position.shape)}"
@@ -84,7 +84,7 @@ def check_rest(points: MaterialPoints, velocity: Tensor) -> None:
 
 def check_load(bound: Formulation, force: Tensor | None, drag: Tensor | None) -> None:
     """Raise TypeError or ValueError unless a force [N] (..., P, 3) and its resistance (..., P) fit the body."""
-    points = bound.body.points
+    points = bound.points
     if force is not None:
         check_shape("force", force, points.count, 3)
         check_like("force", force, points.position)

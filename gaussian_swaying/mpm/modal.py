@@ -34,7 +34,7 @@ from gaussian_swaying._files import atomic, cache_folder
 from gaussian_swaying.geometry.groups import equal_rows
 
 if TYPE_CHECKING:
-    from gaussian_swaying.mpm.formulations.total import Total
+    from gaussian_swaying.mpm.total import Total
 
 SHIFT = 0.5
 """Frequency of the shift over the first one."""
@@ -107,7 +107,7 @@ class Structure:
     def __init__(self, total: Total, scene: int = 0) -> None:
         import scipy.sparse as sparse
 
-        body, points, stencil = total.body, total.body.points, total.stencil
+        points, stencil = total.points, total.stencil
         count, nodes = points.count, total.grid.node_count
         own = slice(scene * count, (scene + 1) * count)
 
@@ -127,7 +127,7 @@ class Structure:
         self.value, self.slope = rows[0], rows[1:]
         self.mass = self.value.T @ self.point_mass
         self.volume, self._basis = volume, basis[:, 1:]
-        self._lame = [volume * of_scene(field) / self.mean_modulus for field in (body.laws.mu, body.laws.lam)]
+        self._lame = [volume * of_scene(field) / self.mean_modulus for field in (total.laws.mu, total.laws.lam)]
         self.pinned, rows_of = self._pins()
         self.pins = [
             (k, sparse.kron(weight, sparse.identity(3), format="csr"), is_slope) for k, weight, is_slope in rows_of
@@ -209,7 +209,7 @@ class Structure:
         total, scene = self.total, self.scene
         pinned = np.full(self.nodes, -1)
         for k, held in enumerate(total.held):
-            if held is None or not total.on_nodes[k] or k in total.body.rigid:
+            if held is None or not total.on_nodes[k] or k in total.rigid:
                 continue
             assert held.share is not None
             share = held.share.reshape(-1, self.nodes)[scene].detach().cpu().numpy()
@@ -484,7 +484,7 @@ def analysis_of(total: Total, scene: int, most: int, guess: float | None = None)
 
 def _content(total: Total, scene: int, most: int) -> str:
     """A hash of what the modes depend on, but for :func:`_numbers`."""
-    points, digest = total.body.points, hashlib.sha256()
+    points, digest = total.points, hashlib.sha256()
     count = points.count
 
     def add(*values: Any) -> None:
@@ -495,7 +495,7 @@ def _content(total: Total, scene: int, most: int) -> str:
 
     add(_VERSION, SHIFT, LOOSE, CLUSTERS, STIFF_ROW, most, total.grid, points.attached)
     add(points.position.reshape(-1, count, 3)[scene], points.poisson_ratio.reshape(-1, count)[scene])
-    add(total.kinds, total.body.rigid)
+    add(total.kinds, total.rigid)
     for held in total.held:
         if held is not None:
             add(held.mass.reshape(-1, count)[scene] > 0, held.threshold)
@@ -507,10 +507,8 @@ def _content(total: Total, scene: int, most: int) -> str:
 
 def _numbers(total: Total, scene: int) -> np.ndarray:
     """Masses, volumes and stiffnesses of the points over their means, which rounding may change a little, (3, P)."""
-    points = total.body.points
-    own = [
-        field.detach().reshape(-1, points.count)[scene] for field in (points.mass, points.volume, total.body.laws.mu)
-    ]
+    points = total.points
+    own = [field.detach().reshape(-1, points.count)[scene] for field in (points.mass, points.volume, total.laws.mu)]
     return np.stack([(field / field.mean()).float().cpu().numpy() for field in own])
 
 

@@ -29,9 +29,9 @@ import torch
 from torch import Tensor
 
 from gaussian_swaying.geometry.neighbours import nearest_neighbours
-from gaussian_swaying.mpm.body import Body
 from gaussian_swaying.mpm.boundaries.boundary import CLOCK, Boundary
 from gaussian_swaying.mpm.boundaries.pinned_points import PinnedPoints
+from gaussian_swaying.mpm.formulation import Formulation
 from gaussian_swaying.mpm.held_faces import SHEET, face_patches, normals, thickness
 from gaussian_swaying.mpm.held_rows import (
     LEAST_APART,
@@ -106,7 +106,7 @@ class _Site:
     grid: GridSpec
     massive: Tensor
 
-    def rows(self, body: Body, k: int, kind: str, on_face: bool, scene: int, piece: Tensor | None) -> Rows:
+    def rows(self, body: Formulation, k: int, kind: str, on_face: bool, scene: int, piece: Tensor | None) -> Rows:
         """The rows of the ``k``-th boundary in a scene, on a piece of the body or on all of it (None)."""
         boundary, own, least = body.boundaries[k], body.held[k], LEAST_OWN
         count, dx = len(self.points), self.grid.dx
@@ -202,7 +202,7 @@ class PointHolds:
     @_one_thread()
     def __init__(
         self,
-        body: Body,
+        body: Formulation,
         kinds: Sequence[str],
         faces: Sequence[int],
         still: Tensor,
@@ -365,7 +365,7 @@ class PointHolds:
         return goal
 
 
-def _pieces(body: Body, k: int, scene: int) -> list[Tensor | None]:
+def _pieces(body: Formulation, k: int, scene: int) -> list[Tensor | None]:
     """The pieces of which a boundary holds particles in a scene; one of None if all particles are one piece."""
     held = body.held[k]
     if held is None or len(body.pieces) == 1:

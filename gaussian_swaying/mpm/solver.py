@@ -15,21 +15,20 @@ from torch.utils.checkpoint import checkpoint as recomputed
 from gaussian_swaying._checks import check_positive, check_vector
 from gaussian_swaying._fixed import Fixed, FixedList, assign
 from gaussian_swaying.geometry.frame import SimFrame
-from gaussian_swaying.mpm.body import Body
 from gaussian_swaying.mpm.boundaries.boundary import Boundary
 from gaussian_swaying.mpm.contact import Surface
 from gaussian_swaying.mpm.damping import damped_substep
 from gaussian_swaying.mpm.dispatch import LawDispatch
 from gaussian_swaying.mpm.followers import Followers, GridFollowers
 from gaussian_swaying.mpm.forces import Force, Forces, FunctionForce, added, as_forces, split, tensors_of
-from gaussian_swaying.mpm.formulations.formulation import Formulation, Settings
-from gaussian_swaying.mpm.formulations.modes import Modes, why_not_modes
-from gaussian_swaying.mpm.formulations.total import Total
-from gaussian_swaying.mpm.formulations.updated import Updated
+from gaussian_swaying.mpm.formulation import Formulation, Settings, flowing
 from gaussian_swaying.mpm.guard import check_begin, check_end, check_load, check_rest
+from gaussian_swaying.mpm.modes import Modes, why_not_modes
 from gaussian_swaying.mpm.protocol import Solver, WatchFunction
 from gaussian_swaying.mpm.state import MaterialPoints, MPMState
 from gaussian_swaying.mpm.timestep import check_pace, fixed_substeps, look_marks, substeps_per_frame, work_done
+from gaussian_swaying.mpm.total import Total
+from gaussian_swaying.mpm.updated import Updated
 
 FORMULATIONS: dict[str, type[Formulation]] = {kind.name: kind for kind in (Total, Updated, Modes)}
 Fused = Any
@@ -54,7 +53,7 @@ class MPMSolver(Fixed, Solver):
     once; nodal displacement and velocity are the state. Use it for elastic objects whose particles keep their
     neighbours: flags, leaves, cords. It cannot model tearing and has no transfer dissipation.
 
-    ``modes`` (:mod:`~gaussian_swaying.mpm.formulations.modes`): up to 80 modes of ``total`` at rest, warped, each
+    ``modes`` (:mod:`~gaussian_swaying.mpm.modes`): up to 80 modes of ``total`` at rest, warped, each
     stepped exactly. Use it for what is held and sways by less than some 40 % of its size, however stiff: plants, trees,
     lamps. It takes 4 to 16 substeps a frame; nothing may touch or fold.
 
@@ -175,12 +174,12 @@ class MPMSolver(Fixed, Solver):
     @property
     def points(self) -> MaterialPoints:
         """The material given to :meth:`init_state`."""
-        return self.bound.body.points
+        return self.bound.points
 
     @property
     def laws(self) -> LawDispatch:
         """The laws of the material given to :meth:`init_state`, bound to its particles."""
-        return self.bound.body.laws
+        return self.bound.laws
 
     @property
     def identity(self) -> Formulation:
@@ -250,7 +249,8 @@ class MPMSolver(Fixed, Solver):
         for boundary in self._framed or ():
             boundary._apply(fn)
         if self._bound is not None:
-            self._bind(self.points.map(fn), self.bound.body.mapped_surface(fn))
+            surface = self.bound.surface
+            self._bind(self.points.map(fn), None if surface is None else surface.map(fn))
         return self
 
     def _conditions(self) -> list[Boundary]:
@@ -258,18 +258,20 @@ class MPMSolver(Fixed, Solver):
 
     def _bind(self, points: MaterialPoints, surface: Surface | None) -> None:
         self._bound = self._fused = None
-        body = Body(points, self._framed or self._conditions(), surface)
+        boundaries = self._framed or self._conditions()
         if self.may_choose:
-            formulation, why = self._choice(body)
+            formulation, why = self._choice(points, boundaries, surface)
             assign(self, formulation=formulation, why=why)
-        bound = FORMULATIONS[self.formulation](body, self.settings)
+        bound = FORMULATIONS[self.formulation](points, boundaries, self.settings, surface)
         self._obstacle = self._why_not_kernels(bound)
         self._bound = bound
 
-    def _choice(self, body: Body) -> tuple[Literal["total", "updated", "modes"], str]:
-        if body.laws.plastic:
-            return "updated", f"the law {body.laws.plastic_names[0]} flows"
-        why = self._no_modes or why_not_modes(body)
+    def _choice(
+        self, points: MaterialPoints, boundaries: Sequence[Boundary], surface: Surface | None
+    ) -> tuple[Literal["total", "updated", "modes"], str]:
+        if (flows := flowing(points)) is not None:
+            return "updated", f"the law {flows} flows"
+        why = self._no_modes or why_not_modes(points, boundaries, surface)
         return ("modes", "it is held, and nothing touches or folds") if why is None else ("total", why.split(": ")[0])
 
     def choose(self, *, anew: bool) -> None:
@@ -319,7 +321,7 @@ class MPMSolver(Fixed, Solver):
 
     def _wanted(self, *tensors: Tensor | None) -> bool:
         """True if the body or one of some tensors requires a gradient, and gradients are enabled."""
-        asking = (*self.bound.body.tensors(), *tensors)
+        asking = (*self.bound.tensors(), *tensors)
         return torch.is_grad_enabled() and any(t is not None and t.requires_grad for t in asking)
 
     def _replays(self, state: MPMState, forces: Sequence[Force]) -> bool:

@@ -20,12 +20,11 @@ from torch import Tensor
 
 from gaussian_swaying._fixed import changed
 from gaussian_swaying.geometry.groups import equal_rows
-from gaussian_swaying.mpm.body import Body
-from gaussian_swaying.mpm.formulations.modes import MOST_MODES, Modes
-from gaussian_swaying.mpm.formulations.total import Total
 from gaussian_swaying.mpm.modal import SHIFT, Structure, analysis_of, factor, rayleigh
+from gaussian_swaying.mpm.modes import MOST_MODES, Modes
 from gaussian_swaying.mpm.solver import MPMSolver
 from gaussian_swaying.mpm.state import State
+from gaussian_swaying.mpm.total import Total
 from gaussian_swaying.preview.kinds import KINDS, Kind
 from gaussian_swaying.preview.shape import extent, quantile
 from gaussian_swaying.preview.stretch import cloth_motion, linear_motion, rate_for, typical_start
@@ -90,7 +89,7 @@ def natural(simulation: Simulation, kind: Kind, flow: Tensor, intensity: float) 
     scene, setup = simulation.scene, simulation.setup
     solver = simulation.solver
     assert isinstance(solver, MPMSolver)
-    total = Total(Body(setup.points, solver.framed(scene.frame)), setup.solver)
+    total = Total(setup.points, solver.framed(scene.frame), setup.solver)
     structure = Structure(total)
     place = structure.rest
     free = structure.pinned[structure.table].max(1) < 0
@@ -119,7 +118,7 @@ def natural(simulation: Simulation, kind: Kind, flow: Tensor, intensity: float) 
         points = replace(points, mass=points.mass * thicker, volume=points.volume * thicker, youngs_modulus=E)
         simulation.adopt(replace(setup, points=points, aero=aero))
         if used is stiffer:
-            whole = Total(Body(points, solver.framed(scene.frame)), setup.solver)
+            whole = Total(points, solver.framed(scene.frame), setup.solver)
             volume, whole_mass = points.volume.double(), points.mass.double().sum()
             unit = float(whole_mass / ((points.youngs_modulus * volume).sum() / volume.sum()))
             analysis_of(whole, 0, MOST_MODES, unit * (2 * math.pi * frequency) ** 2)  # is in the cache now

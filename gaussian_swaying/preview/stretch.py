@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import torch
 
-from gaussian_swaying.mpm.formulations.modes import Modes
+from gaussian_swaying.mpm.modes import Modes
 from gaussian_swaying.wind.field import WindField
 from gaussian_swaying.wind.wind_force import WindForce
 

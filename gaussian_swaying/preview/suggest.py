@@ -24,8 +24,8 @@ from gaussian_swaying.geometry.frame import SimFrame
 from gaussian_swaying.geometry.neighbours import particle_spacing
 from gaussian_swaying.geometry.patches import smallest_axis_normal
 from gaussian_swaying.geometry.regions import Box, Not, Region, Union
-from gaussian_swaying.mpm.formulations.modes import MOST_LEAN
 from gaussian_swaying.mpm.materials import known_material
+from gaussian_swaying.mpm.modes import MOST_LEAN
 from gaussian_swaying.preview.framing import orbit_frame, whole_box
 from gaussian_swaying.preview.hold import PIN_DEPTH, HoldGuess, end_region, given_hold, guess_hold
 from gaussian_swaying.preview.kinds import KINDS, kind_of, with_materials

@@ -21,8 +21,8 @@ from gaussian_swaying.kernels.graphs import fingerprint, tensors_in
 from gaussian_swaying.mpm.boundaries.impulse import Impulse
 from gaussian_swaying.mpm.boundaries.rigid_region import RigidRegion
 from gaussian_swaying.mpm.forces import Force
-from gaussian_swaying.mpm.formulations.modes import MOST_LEAN, Modes
 from gaussian_swaying.mpm.joints import Joints
+from gaussian_swaying.mpm.modes import MOST_LEAN, Modes
 from gaussian_swaying.mpm.protocol import Solver
 from gaussian_swaying.mpm.solver import MPMSolver
 from gaussian_swaying.mpm.state import MaterialPoints, State
@@ -339,7 +339,7 @@ class Stepper:
         first, flows = self.setup, self.flows().detach()
         strongest = WindField(flows[flows.norm(dim=-1).argmax()])
         state = bound.leaning(WindForce(first.aero, strongest, _repeated(first.scene.patches, len(self.setups))))
-        rest = bound.body.points.position
+        rest = bound.points.position
         side = (rest.amax(-2) - rest.amin(-2)).amax()
         moved = (state.position - rest).norm(dim=-1).flatten()
         return float(moved.topk(max(1, len(moved) // 10)).values.mean() / side)

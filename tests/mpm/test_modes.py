@@ -21,8 +21,8 @@ from gaussian_swaying import (
 from gaussian_swaying.geometry.rotations import rotation_of
 from gaussian_swaying.mpm import modal
 from gaussian_swaying.mpm.damping import decay_rate
-from gaussian_swaying.mpm.formulations.modes import LONGEST, SHORTEST, Modes, warped
 from gaussian_swaying.mpm.laws.sand import Sand
+from gaussian_swaying.mpm.modes import LONGEST, SHORTEST, Modes, warped
 
 FOOT = Box([None] * 3, [None, None, 0.1])
 POINTS = 320

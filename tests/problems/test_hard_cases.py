@@ -469,7 +469,7 @@ def test_a_schedule_that_is_no_number_is_refused():
 @pytest.mark.parametrize("factor", [math.nan, math.inf, 1e30])
 def test_a_modulation_that_breaks_the_wind_is_a_divergence(formulation, drag_step, factor, monkeypatch):
     """The message says that something is NaN or infinite or takes too many substeps, and sends to the wind."""
-    monkeypatch.setattr("gaussian_swaying.mpm.formulations.formulation.MAX_NODES", 100_000)
+    monkeypatch.setattr("gaussian_swaying.mpm.formulation.MAX_NODES", 100_000)
     wind = WindField([1.0, 0.0, 0.0], modulations=[_Broken(factor)])
     points = _points(_lattice(3, 3, 1))
     settings = {"formulation": formulation, "frame_dt": 1e-3}
@@ -576,7 +576,7 @@ def test_a_body_absurdly_far_away_is_reported(formulation):
 
 def test_a_body_that_spreads_beyond_the_largest_grid_is_reported(monkeypatch):
     """Two particles that part at 20 m/s: the span, the nodes and the limit are named."""
-    monkeypatch.setattr("gaussian_swaying.mpm.formulations.formulation.MAX_NODES", 20_000)
+    monkeypatch.setattr("gaussian_swaying.mpm.formulation.MAX_NODES", 20_000)
     points = _points(torch.tensor([[0.0, 0.0, 0.0], [0.2, 0.2, 0.2]]))
     simulation = _simulation(points, formulation="updated")
     with pytest.raises(SimulationDiverged, match=r"span \[\d.*grid nodes at dx = 0.1 m, more than 20,000") as info:

@@ -45,7 +45,7 @@ def test_the_configuration_comes_back_and_changes_are_undone(page, client):
     client.set(controls.restore, True)
     until(lambda: session.yaml() == first)
     until(lambda: controls.stiffness.value == 9e3)
-    assert len(session.simulation.solver.bound.body.boundaries) == 1
+    assert len(session.simulation.solver.bound.boundaries) == 1
     held = controls.holding.places()
     assert len(held) > 5
     assert abs(held[:, 0]).max() < 0.03  # the pole

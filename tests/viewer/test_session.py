@@ -165,7 +165,7 @@ def test_restore_brings_pins_and_material_back(session):
     first, rest, stiffness = session.yaml(), _position(session).clone(), _stiffness(session)
     session.start()
     session.change({"solver.boundaries": []})
-    until(lambda: len(session.simulation.solver.bound.body.boundaries) == 0)
+    until(lambda: len(session.simulation.solver.bound.boundaries) == 0)
     session.change({"material.E": 2e4, "wind.flow": [0.0, 1.0, 0.0], "wind.modulations": [], "shader": None})
     until(lambda: session.settings.material.E == 2e4)
     changed = session.yaml()
@@ -173,7 +173,7 @@ def test_restore_brings_pins_and_material_back(session):
     session.restore()
     until(lambda: session.revision == 1)
     assert session.yaml() == first
-    assert len(session.simulation.solver.bound.body.boundaries) == 1
+    assert len(session.simulation.solver.bound.boundaries) == 1
     assert _stiffness(session) == stiffness
     assert len(session.simulation.wind.modulations) == 2
     assert session.simulation.painter.shader is not None

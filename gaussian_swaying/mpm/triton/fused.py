@@ -20,7 +20,7 @@ from gaussian_swaying.kernels.graphs import Repeater, fingerprint
 from gaussian_swaying.kernels.language import INTERPRETED
 from gaussian_swaying.kernels.launch import call, compiles, lanes, launch
 from gaussian_swaying.mpm.forces import MOST_STEPS, Force, added, divide, split, tensors_of
-from gaussian_swaying.mpm.formulations.formulation import Formulation
+from gaussian_swaying.mpm.formulation import Formulation
 from gaussian_swaying.mpm.laws.triton.body import BodyLaws
 from gaussian_swaying.mpm.laws.triton.functions import shared
 from gaussian_swaying.mpm.state import MPMState
@@ -69,8 +69,8 @@ class Fused(ABC):
     fixed_order: ClassVar[bool]
 
     def __init__(self, bound: Formulation) -> None:
-        body, points = bound.body, bound.body.points
-        self.body, self.settings = body, bound.settings
+        points = bound.points
+        self.settings = bound.settings
         self.bound, self.device = bound, points.position.device
         self.particles = points.count
         self.count = points.mass.numel()
@@ -115,7 +115,7 @@ class Fused(ABC):
             bound: The formulation, bound to the body.
             interpret: Whether Triton's interpreter, if it is on, may run them on a CPU.
         """
-        points = bound.body.points
+        points = bound.points
         device = points.position.device.type
         if not compiles(device) or (INTERPRETED and not interpret):
             return f"they cannot be compiled for {device}"
@@ -135,7 +135,7 @@ class Fused(ABC):
     @property
     def recordable(self) -> bool:
         """True if substeps can be recorded in a CUDA graph."""
-        return all(boundary.recordable for boundary in self.body.boundaries)
+        return all(boundary.recordable for boundary in self.bound.boundaries)
 
     @property
     @abstractmethod
@@ -203,7 +203,7 @@ class Fused(ABC):
         if twins and len(self.vectors) < room:
             self.vectors = torch.zeros(room, **self.like)
         if self._watched.changed([source for twin in twins for source in twin.sources]) or self.forces != before:
-            batch = self.body.points.mass.shape
+            batch = self.bound.points.mass.shape
             values = [twin.per_point.take() for twin in twins if twin.per_point.count]
             if values:
                 rows = [value.expand(*batch, value.shape[-1]).flatten(0, -2) for value in values]
@@ -279,7 +279,7 @@ class Fused(ABC):
 
     def largest_speed(self, state: MPMState) -> Tensor:
         """Cells per second as ``Formulation.cells_per_second``, if it ``watches``."""
-        points, laws = self.body.points, self.body.laws
+        points, laws = self.bound.points, self.bound.laws
         given = state.F_elastic, points.mass / points.volume, laws.mu, laws.lam, state.velocity
         out, block = points.position.new_zeros(1), lanes(self.device, 128)
         with torch.cuda.device_of(out):
@@ -291,10 +291,10 @@ class Fused(ABC):
 
     def energy(self, F: Tensor) -> Tensor | None:
         """Energy density [J/m³], shape (..., P); None for laws without a common energy."""
-        energy = shared(self.body.points.laws, "energy")
+        energy = shared(self.bound.points.laws, "energy")
         if energy is None:
             return None
-        out, block, laws = F.new_empty(F.shape[:-2]), lanes(self.device, 128), self.body.laws
+        out, block, laws = F.new_empty(F.shape[:-2]), lanes(self.device, 128), self.bound.laws
         with torch.cuda.device_of(out):
             launch(kernels.elastic_energy, (-(-self.count // block),))(
                 F.contiguous(), laws.mu.contiguous(), laws.lam.contiguous(), out, self.count, ENERGY=energy,
@@ -305,7 +305,7 @@ class Fused(ABC):
     # ---- forces in torch
 
     def _fill(self, force: Tensor | None, drag: Tensor | None) -> None:
-        points = self.body.points
+        points = self.bound.points
         if force is not None:
             self.force_in[:, :3].copy_(force.expand_as(points.position).reshape(-1, 3))
         if drag is not None:
@@ -354,7 +354,7 @@ class Fused(ABC):
     def _work(self) -> Tensor:
         """Work of the load in each scene [J], shape (...), float64; particles are sorted by scene."""
         work = self.load[0].reshape(self.scenes, self.particles).sum(1, dtype=torch.float64)
-        return work.reshape(self.body.points.mass.shape[:-1])
+        return work.reshape(self.bound.points.mass.shape[:-1])
 
     def pass_time(self) -> None:
         time, dt = self.time, self.dt

@@ -15,7 +15,7 @@ from gaussian_swaying.mpm.triton.fused import INTERPRETED, MAX_INDEX
 from gaussian_swaying.mpm.triton.obstacles import Solids
 
 if TYPE_CHECKING:
-    from gaussian_swaying.mpm.formulations.total import Total
+    from gaussian_swaying.mpm.total import Total
 
 ROOM, SLOTS = 64, 16
 """Initial number of entries for the candidates of a contact sample, and for its constraints."""

@@ -16,10 +16,10 @@ from gaussian_swaying.kernels.launch import lanes, launch
 from gaussian_swaying.mpm.boundaries.pinned_points import PinnedPoints
 from gaussian_swaying.mpm.boundaries.pinned_region import PinnedRegion
 from gaussian_swaying.mpm.forces import Force, divide, tensors_of
-from gaussian_swaying.mpm.formulations.total import Total
 from gaussian_swaying.mpm.point_holds import DenseHolds
 from gaussian_swaying.mpm.state import MPMState
 from gaussian_swaying.mpm.timestep import kick_time
+from gaussian_swaying.mpm.total import Total
 from gaussian_swaying.mpm.transfer import gather, shifts
 from gaussian_swaying.mpm.triton import adjoint_kernels
 from gaussian_swaying.mpm.triton import total_kernels as kernels
@@ -51,7 +51,7 @@ class FusedTotal(Fused):
 
     def __init__(self, bound: Total) -> None:
         super().__init__(bound)
-        body, points, stencil, grid = bound.body, bound.body.points, bound.stencil, bound.grid
+        points, stencil, grid = bound.points, bound.stencil, bound.grid
         self.grid = grid
         # with virtual nodes a cell is cut by the copies of its nodes that the particles have
         unit = stencil.cell
@@ -70,7 +70,7 @@ class FusedTotal(Fused):
         self.cell_scene = (cells // grid.node_count).int()
         self.particle_cell = torch.repeat_interleave(torch.arange(self.cells, device=self.device), sizes).int()
         self.fraction = stencil.fraction[:, order].contiguous()
-        rows = [points.volume, body.laws.mu, body.laws.lam, points.mass]
+        rows = [points.volume, bound.laws.mu, bound.laws.lam, points.mass]
         self.material = torch.stack([row.reshape(-1) for row in rows])[:, order].contiguous()
         self.law = self.law[order].contiguous()
         self.values = torch.zeros(0, self.count, **self.like)
@@ -106,7 +106,7 @@ class FusedTotal(Fused):
         pins = (PinnedRegion, PinnedPoints)
         self.plain = all(
             kind == "surface" or (type(b) in pins and b.start <= 0 and b.end == math.inf)
-            for b, kind in zip(body.boundaries, bound.kinds, strict=True)
+            for b, kind in zip(bound.boundaries, bound.kinds, strict=True)
         )
         """True if the kernels apply all boundaries but obstacles, which are contact."""
         self.position = bound.needs_position
@@ -374,7 +374,7 @@ class FusedTotal(Fused):
     def _fields(self, found: Tensor, taken_and_done: Tensor, part: Part) -> dict[str, Any]:
         """Return the fields that :meth:`_read` wrote, by the names of the state."""
         views, taken = self._views(found), self.impulse.numel()
-        F, work = views["F"], {"work": taken_and_done[taken:].view(self.body.points.mass.shape[:-1])}
+        F, work = views["F"], {"work": taken_and_done[taken:].view(self.bound.points.mass.shape[:-1])}
         return {
             **{name: views[name] for name in ("position", "velocity", "affine", "node_velocity")},
             "node_displacement": views["displacement"],
@@ -399,7 +399,7 @@ class FusedTotal(Fused):
         )  # fmt: skip
 
     def _look_at(self) -> MPMState:
-        shape = self.body.points.position.shape
+        shape = self.bound.points.position.shape
         position, velocity = (self._room(name, *shape) for name in ("position", "velocity"))
         affine, F = (self._room(name, *shape, 3) for name in ("affine", "F"))
         self._read_into(position, velocity, affine, F, self.schedule, False, False)
@@ -540,7 +540,7 @@ class DifferentiableTotal(FusedTotal):
     def why_no_gradient(self, state: MPMState, forces: Sequence[Force]) -> str | None:
         """Return the reason why gradients of a rollout need torch's autograd; None if the kernels compute them."""
         bound = self.bound
-        points = bound.body.points
+        points = bound.points
         if not self.plain or self.touching is not None:
             return "boundaries other than pins that hold all the time, and contact, have no backward kernels"
         if self.bent:
@@ -555,7 +555,7 @@ class DifferentiableTotal(FusedTotal):
         if twin is not None and twin.adjoint is None:
             return f"this {type(forces[0]).__name__} has no backward kernel"
         free = [points.mass, points.volume, points.youngs_modulus, points.poisson_ratio]
-        fixed = [t for t in bound.body.tensors() if not any(t is other for other in free)]
+        fixed = [t for t in bound.tensors() if not any(t is other for other in free)]
         fixed += [] if twin is None else [t for t in tensors_of(forces) if any(t is source for source in twin.sources)]
         fixed += [t for law in points.laws for t in (*law.parameters(), *law.buffers())]
         if any(t.requires_grad for t in fixed):
@@ -591,7 +591,7 @@ class DifferentiableTotal(FusedTotal):
             vectors = twin.per_substep.take(state.time, torch.full_like(state.time, dt), steps)
             numbers = torch.as_tensor(twin.numbers.take())
         bound = self.bound
-        laws, points, holds = bound.body.laws, bound.body.points, bound.point_holds
+        laws, points, holds = bound.laws, bound.points, bound.point_holds
         displacement, velocity = _Rollout.apply(
             run, *state.nodal, laws.mu, laws.lam, points.volume,
             bound.node_inverse_mass, None if holds is None else holds.weight, vectors, numbers,
@@ -656,7 +656,7 @@ class DifferentiableTotal(FusedTotal):
         sorted_back = torch.empty_like(self.material_bar)
         sorted_back[:, self.order.long()] = self.material_bar
         for name, row in zip(("mu", "lam", "volume"), sorted_back, strict=True):
-            found[name] = row.reshape(bound.body.points.mass.shape)
+            found[name] = row.reshape(bound.points.mass.shape)
         inverse = bound.node_inverse_mass
         mass = torch.zeros(inverse.numel(), **self.like).index_copy(0, self.place, self.mass_bar)
         found["inverse_mass"] = mass.reshape(inverse.shape)

@@ -10,10 +10,9 @@ import torch
 from torch import Tensor
 
 from gaussian_swaying.kernels.launch import LANES, lanes, launch, wide
-from gaussian_swaying.mpm.body import Held
 from gaussian_swaying.mpm.boundaries.boundary import Boundary
 from gaussian_swaying.mpm.boundaries.pinned_region import PinnedRegion
-from gaussian_swaying.mpm.formulations.formulation import Formulation
+from gaussian_swaying.mpm.formulation import Formulation, Held
 from gaussian_swaying.mpm.state import GridSpec, MPMState
 from gaussian_swaying.mpm.triton import updated_kernels as kernels
 from gaussian_swaying.mpm.triton.fused import Fused, Part, check_indices
@@ -49,7 +48,7 @@ class FusedUpdated(Fused):
         super().__init__(bound)
         self.atomic = lanes(self.device, 32) == 32
         """True if particles are added to the grid atomically; else in a fixed order."""
-        points, laws = bound.body.points, bound.body.laws
+        points, laws = bound.points, bound.laws
         self.plastic = len(self.laws.flows) > 0
         self.internal = laws.initial_internal() is not None
         rows = [points.mass, points.volume, laws.mu, laws.lam, self.law]
@@ -63,8 +62,8 @@ class FusedUpdated(Fused):
         self.inverse_mass = torch.zeros(0, **self.like)
         self.weight = torch.zeros(0, **self.like)
         self.node_position: Tensor | None = None
-        boundaries = bound.body.boundaries
-        pins = {k: held for k, held in enumerate(bound.body.held) if held and _pins(boundaries[k], held)}
+        boundaries = bound.boundaries
+        pins = {k: held for k, held in enumerate(bound.held) if held and _pins(boundaries[k], held)}
         parts = solids_of(boundaries, pins)
         self.solids = Solids(parts or [], self.law_table)
         pins = pins if parts is not None else {}
@@ -133,7 +132,7 @@ class FusedUpdated(Fused):
             slots = 1 if self.scenes == 1 else self.node_block // grid.node_count + 2
             programs = -(-nodes // self.node_block) if self.turns else 0
             with torch.inference_mode(False):
-                pressed = torch.zeros(programs, slots, len(self.body.boundaries), 3, dtype=torch.float64)
+                pressed = torch.zeros(programs, slots, len(self.bound.boundaries), 3, dtype=torch.float64)
                 self.pressed = pressed.to(self.device)
             if self._acting and (self.bound.needs_position or self.bound.needs_lattice):
                 self.node_position = grid.node_positions(self.velocity)
@@ -196,7 +195,7 @@ class FusedUpdated(Fused):
 
     @property
     def _acting(self) -> bool:
-        return len(self.body.boundaries) > 0 and not self.turns
+        return len(self.bound.boundaries) > 0 and not self.turns
 
     def _pressed(self) -> Tensor:
         """Sum of what the programs of the nodes took, for each scene, shape (scenes, B, 3)."""
@@ -332,7 +331,7 @@ class FusedUpdated(Fused):
             offset, *self.gravity, solids.rows, solids.windows, solids.poses, solids.tables.buffer, self.clock,
             self.pressed, self.pressed.shape[1], self.windows_of_pins, self.marks_of_pins, self.marks_of_pins.shape[1],
             *grid.offset, ny, nz, grid.node_count, grid.dx, IMPLICIT=options["IMPLICIT"], WIDTH=self.momentum.shape[1],
-            KEEP=acting, TURNS=() if acting else self.turns, BOUNDARIES=len(self.body.boundaries),
+            KEEP=acting, TURNS=() if acting else self.turns, BOUNDARIES=len(self.bound.boundaries),
             SOLIDS=solids.twins, KINDS=solids.kinds, MOVES=solids.moves, MOVING=any(solids.moves),
             SCENES=self.scenes > 1, SPARSE=not (self.atomic or acting), BLOCK=block, num_warps=4,
         )  # fmt: skip
@@ -344,7 +343,7 @@ class FusedUpdated(Fused):
     def _constrain(self) -> None:
         grid = self.grid
         nodes = grid.node_count * self.scenes
-        shape = (*self.body.points.position.shape[:-2], grid.node_count)
+        shape = (*self.bound.points.position.shape[:-2], grid.node_count)
         velocity = self.velocity[:nodes, :3].reshape(*shape, 3)
         position = self.node_position
         if position is not None:
@@ -370,7 +369,7 @@ class FusedUpdated(Fused):
 
     def _read(self, room: Callable[..., Tensor]) -> dict[str, Any]:
         """Particle fields, in tensors that ``room`` makes for a name and a shape."""
-        shape = self.body.points.position.shape
+        shape = self.bound.points.position.shape
         fields: dict[str, Any] = {name: room(name, *shape) for name in ("position", "velocity")}
         fields |= {name: room(name, *shape, 3) for name in ("affine", "F_elastic")}
         fields["F_total"] = room("F_total", *shape, 3) if self.plastic else fields["F_elastic"]

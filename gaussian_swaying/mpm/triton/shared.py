@@ -1,7 +1,7 @@
 """Functions shared by the kernels of the formulations: weights, loads and stores, forces and their work.
 
 The references are :mod:`~gaussian_swaying.mpm.transfer`, :mod:`~gaussian_swaying.mpm.timestep` and the torch substeps
-of :mod:`~gaussian_swaying.mpm.formulations`; the kernels follow them and are tested against them. Loops over i and j
+of :mod:`~gaussian_swaying.mpm.formulation`; the kernels follow them and are tested against them. Loops over i and j
 stay loops in Triton's intermediate code: if they are unrolled, its passes take minutes.
 """
 

@@ -1,4 +1,4 @@
-"""Kernels of the ``total`` substep; the reference is :mod:`~gaussian_swaying.mpm.formulations.total`.
+"""Kernels of the ``total`` substep; the reference is :mod:`~gaussian_swaying.mpm.total`.
 
 Stencils do not move, so particles are sorted by cell once. A program handles some cells with up to ``LANES`` particles
 at a time, reads nodal displacements and velocities, and writes 27 sums per cell; each node then gathers the sums of the

@@ -1,4 +1,4 @@
-"""Kernels of the ``updated`` substep; the reference is :mod:`~gaussian_swaying.mpm.formulations.updated`.
+"""Kernels of the ``updated`` substep; the reference is :mod:`~gaussian_swaying.mpm.updated`.
 
 One kernel gathers the end of a substep and scatters the start of the next, so a particle is read and written once.
 Particles are sorted by cell from time to time; up to eight neighbours in that order that share a cell are summed by a

@@ -2,7 +2,7 @@
 
 The block is the length of its head (uint32, little-endian), the head in JSON, and the arrays that the head lists, in
 float32 or whole numbers. The solvers are ``solver.js`` and ``modal.js`` in ``tools/player/live_web``; their definitions
-are :mod:`~gaussian_swaying.mpm.formulations.total` and :mod:`~gaussian_swaying.mpm.formulations.modes`.
+are :mod:`~gaussian_swaying.mpm.total` and :mod:`~gaussian_swaying.mpm.modes`.
 """
 
 from __future__ import annotations
@@ -23,13 +23,13 @@ from gaussian_swaying.mpm.boundaries.obstacle import Obstacle
 from gaussian_swaying.mpm.boundaries.pinned_points import PinnedPoints
 from gaussian_swaying.mpm.boundaries.pinned_region import PinnedRegion
 from gaussian_swaying.mpm.boundaries.plane import Plane
-from gaussian_swaying.mpm.formulations.modes import Modes
-from gaussian_swaying.mpm.formulations.total import Total
 from gaussian_swaying.mpm.laws.fixed_corotated import FixedCorotated
 from gaussian_swaying.mpm.laws.hencky import StVKHencky
 from gaussian_swaying.mpm.laws.neo_hookean import NeoHookean
 from gaussian_swaying.mpm.laws.spring_network import SpringNetwork
+from gaussian_swaying.mpm.modes import Modes
 from gaussian_swaying.mpm.solver import MPMSolver
+from gaussian_swaying.mpm.total import Total
 from gaussian_swaying.simulation.simulation import Simulation
 from gaussian_swaying.viewer.film.page import message
 from gaussian_swaying.viewer.live_web.longest import longest_courant
@@ -149,7 +149,7 @@ def pack_solver(simulation: Simulation, nodes: Tensor) -> bytes:
     if isinstance(bound, Modes):
         return _pack_modes(head, simulation, bound, nodes)
     force = simulation.stepper.wind_force
-    body, points, stencil = bound.body, bound.body.points, bound.stencil
+    points, stencil = bound.points, bound.stencil
     unit = stencil.cell
     order = torch.argsort(unit, stable=True)
     _, sizes = torch.unique_consecutive(unit[order], return_counts=True)
@@ -159,7 +159,7 @@ def pack_solver(simulation: Simulation, nodes: Tensor) -> bytes:
     row[active] = torch.arange(len(active))
     held = torch.zeros_like(bound.node_mass, dtype=torch.bool)
     planes, obstacles = [], []
-    for boundary, own, acts in zip(body.boundaries, bound.held, bound.on_nodes, strict=True):
+    for boundary, own, acts in zip(bound.boundaries, bound.held, bound.on_nodes, strict=True):
         if isinstance(boundary, Plane):
             planes.append(_plane(boundary))
         elif isinstance(boundary, Obstacle):
@@ -177,8 +177,8 @@ def pack_solver(simulation: Simulation, nodes: Tensor) -> bytes:
         "rest": points.position[order],
         "volume": points.volume[order],
         "mass": points.mass[order],
-        "mu": body.laws.mu[order],
-        "lam": body.laws.lam[order],
+        "mu": bound.laws.mu[order],
+        "lam": bound.laws.lam[order],
         "law": numbers[law][order],
         "inverseMass": torch.nn.functional.pad(bound.node_inverse_mass[active], (0, 1)),
         "held": held[active],

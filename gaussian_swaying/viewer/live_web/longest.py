@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import torch
 
-from gaussian_swaying.mpm.formulations.total import Total
 from gaussian_swaying.mpm.timestep import wave_speed
+from gaussian_swaying.mpm.total import Total
 from gaussian_swaying.mpm.transfer import gather, scatter
 
 MARGIN = 0.8
@@ -21,7 +21,7 @@ def longest_courant(bound: Total) -> float:
     Args:
         bound: The body on its grid.
     """
-    wave = float(wave_speed(bound.body.points).max())
+    wave = float(wave_speed(bound.points).max())
     return MARGIN * 2 / fastest_vibration(bound) * wave / bound.settings.dx
 
 
@@ -36,7 +36,7 @@ def fastest_vibration(bound: Total) -> float:
     """
     from scipy.sparse.linalg import LinearOperator, eigsh
 
-    points, laws = bound.body.points, bound.body.laws
+    points, laws = bound.points, bound.laws
     root = bound.node_inverse_mass.double().sqrt()[:, None]
     kind = points.volume.dtype
     mu, lam, volume = (field[:, None, None] for field in (laws.mu, laws.lam, points.volume))

@@ -390,7 +390,7 @@ def test_boxes_mean_the_particles_that_physgaussian_selects(degrees, axes, tmp_p
     soft = ((place - torch.tensor([1, 1, 1.3])).abs() < torch.tensor([1, 0.2, 0.3])).all(-1)
     assert torch.equal(scene.points.youngs_modulus == 3e5, soft)
     solver.init_state(scene.points, frame=scene.frame)
-    pin, handle = (b.particle_mask(scene.points.position) for b in solver.bound.body.boundaries)
+    pin, handle = (b.particle_mask(scene.points.position) for b in solver.bound.boundaries)
     assert torch.equal(pin, ((place - torch.tensor([0.7, 1, 1])).abs() < torch.tensor([0.1, 1, 0.2])).all(-1))
     arm = place - torch.tensor([1.3, 1.1, 0.9])
     assert torch.equal(handle, (arm[:, 1].abs() < 0.15) & (arm[:, [0, 2]].norm(dim=-1) < 0.25))

@@ -13,7 +13,7 @@ def test_what_shakes_grows_only_beyond_the_largest_stable_step(make, law):
     simulation = make(solver=solver, material={"law": {"class_path": law}, "nu": 0.25})
     rest, bound = simulation.start(), simulation.solver.bound
     limit = 2 / fastest_vibration(bound)
-    wave = (bound.body.laws.lam + 2 * bound.body.laws.mu)[0] * rest_volume(bound)
+    wave = (bound.laws.lam + 2 * bound.laws.mu)[0] * rest_volume(bound)
     assert longest_courant(bound) == pytest.approx(MARGIN * limit * float(wave) ** 0.5 / bound.settings.dx, rel=1e-5)
     speed = 1e-4 * torch.randn(rest.node_velocity.shape, generator=torch.Generator().manual_seed(0))
     speed = torch.where(bound.node_inverse_mass[:, None] > 0, speed.to(rest.node_velocity), 0.0)
@@ -30,4 +30,4 @@ def test_what_shakes_grows_only_beyond_the_largest_stable_step(make, law):
 
 def rest_volume(bound):
     """Volume over mass of the first point [m³/kg]."""
-    return float((bound.body.points.volume / bound.body.points.mass)[0])
+    return float((bound.points.volume / bound.points.mass)[0])

@@ -9,10 +9,10 @@ from torch import Tensor
 
 from bench.problems.beams import first_zero
 from bench.problems.settings import Result, Settings, follow
-from gaussian_swaying.mpm.formulations.total import Total
 from gaussian_swaying.mpm.joints import Joints, PointJoint
 from gaussian_swaying.mpm.state import MaterialPoints, MPMState
 from gaussian_swaying.mpm.timestep import stable_limit
+from gaussian_swaying.mpm.total import Total
 
 REACH = 1.0  # points so near to a joint are held by it [cells]
 LAYERS = 4  # through the thickness of a cell

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from abc import ABC, abstractmethod
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import ClassVar, TypeVar
@@ -14,15 +14,17 @@ from torch import Tensor
 
 from gaussian_swaying._checks import check_positive
 from gaussian_swaying._fixed import fixed
+from gaussian_swaying.geometry.groups import joined
 from gaussian_swaying.geometry.linalg import symmetric_eigenvalues
-from gaussian_swaying.mpm.body import Body, Held
-from gaussian_swaying.mpm.boundaries.boundary import Boundary, Nodes
+from gaussian_swaying.mpm.boundaries.boundary import CLOCK, Boundary, Nodes
 from gaussian_swaying.mpm.boundaries.impulse import Impulse
 from gaussian_swaying.mpm.boundaries.obstacle import Obstacle
 from gaussian_swaying.mpm.boundaries.pinned_region import PinnedRegion
 from gaussian_swaying.mpm.boundaries.rigid_region import RigidRegion
+from gaussian_swaying.mpm.contact import Surface
 from gaussian_swaying.mpm.damping import damped_substep
-from gaussian_swaying.mpm.state import GridSpec, MPMState, bounding_grid
+from gaussian_swaying.mpm.dispatch import LawDispatch
+from gaussian_swaying.mpm.state import GridSpec, MaterialPoints, MPMState, bounding_grid
 from gaussian_swaying.mpm.timestep import MAX_CFL, cfl_number, stable_limit, wave_speed
 from gaussian_swaying.mpm.transfer import Stencil, scatter
 
@@ -52,6 +54,32 @@ class Settings:
             object.__setattr__(self, name, float(value))
 
 
+@dataclass(frozen=True, slots=True)
+class Held:
+    """The particles that a boundary holds, and the nodes held through them.
+
+    Attributes:
+        mass: Mass of those particles [kg], zero elsewhere, shape (..., P).
+        total: Mass of all of them [kg], shape (...).
+        release: Time at which each particle is released [s], shape (..., P), or None if they are not released one by
+            one.
+        share: Their share of the mass of each node, shape (..., G), if it is constant, else None.
+        threshold: Share above which a node is held.
+        nodes: The nodes that are held in any scene, shape (K,), if their share is constant, else None.
+    """
+
+    mass: Tensor
+    total: Tensor
+    release: Tensor | None = None
+    share: Tensor | None = None
+    threshold: float = 0.0
+    nodes: Tensor | None = None
+
+    def mass_at(self, time: Tensor) -> Tensor:
+        """Mass of the particles that are held at a time [kg], zero elsewhere, shape (..., P)."""
+        return self.mass if self.release is None else torch.where(self.release > time + CLOCK, self.mass, 0.0)
+
+
 class Formulation(ABC):
     """A body bound to a grid: its first state, its substep in torch, and its limits on substep and grid.
 
@@ -59,8 +87,10 @@ class Formulation(ABC):
     material, device or precision needs a new object.
 
     Args:
-        body: The material with its laws and boundaries.
+        points: The material at rest.
+        boundaries: Boundary conditions in metres, in order.
         settings: Numbers and switches of the solver.
+        surface: Contact samples of its surface; None for the material points, which then touch obstacles only.
 
     Attributes:
         name: Its name in a configuration.
@@ -68,7 +98,9 @@ class Formulation(ABC):
             such a body cannot tear, flow or leave its grid, and its velocity does not count in the Courant number.
         bending_rate: Largest square of a circular frequency of sheets that bend by themselves [1/s²].
         viscous_power: Power of the largest squared stretch with which the viscous stress stiffens.
-        held: As in the body, with the parts that are constant on this grid.
+        laws: The laws of the material, bound to its particles.
+        held: The particles that each boundary holds; None for one that holds none.
+        rigid: The places among the boundaries of those that make a part rigid.
         kinds: Kind of each boundary: ``nodes``, points as ``hinge`` or ``clamp``, or ``surface``
             (``Boundary.hold_kind``).
         on_nodes: Whether each boundary acts on nodes, by its ``forward``; a clamp may do so besides its points.
@@ -81,22 +113,53 @@ class Formulation(ABC):
     viscous_power: ClassVar[int]
     bending_rate: float = 0.0
 
-    def __init__(self, body: Body, settings: Settings) -> None:
-        self.body, self.settings = body, settings
-        self.held: tuple[Held | None, ...] = body.held
-        self.kinds = tuple(self.hold_kind(k) for k in range(len(body.boundaries)))
-        self.on_nodes = tuple(self.acts_on_nodes(k) for k in range(len(body.boundaries)))
-        nodal = [b for b, acts in zip(body.boundaries, self.on_nodes, strict=True) if acts]
+    def __init__(
+        self, points: MaterialPoints, boundaries: Sequence[Boundary], settings: Settings, surface: Surface | None = None
+    ) -> None:
+        self.points, self.boundaries, self.settings, self.surface = points, tuple(boundaries), settings, surface
+        self.laws = LawDispatch(points)
+        self.held = tuple(_held(points, boundary) for boundary in self.boundaries)
+        self.rigid = [k for k, boundary in enumerate(self.boundaries) if isinstance(boundary, RigidRegion)]
+        self.kinds = tuple(self.hold_kind(k) for k in range(len(self.boundaries)))
+        self.on_nodes = tuple(self.acts_on_nodes(k) for k in range(len(self.boundaries)))
+        nodal = [b for b, acts in zip(self.boundaries, self.on_nodes, strict=True) if acts]
         self.needs_position = any(b.needs_position for b in nodal)
         self.needs_lattice = any(b.needs_lattice for b in nodal)
-        device = body.points.position.device
         with torch.inference_mode(False):  # an ordinary tensor, which a gradient may need
             # float64 on the device: no copy in a step, full precision in a float64 run
-            self.gravity = torch.tensor(settings.gravity, dtype=torch.float64, device=device)
+            self.gravity = torch.tensor(settings.gravity, dtype=torch.float64, device=points.mass.device)
+
+    @cached_property
+    def pieces(self) -> list[Tensor | None]:
+        """The points of each connected piece, int64, on the CPU; one entry of None if there is only one."""
+        attached = self.points.attached
+        if attached is None:
+            return [None]
+        attached = attached.cpu()
+        label = attached if attached.dim() == 1 else joined(self.points.count, attached.T)
+        _, of = torch.unique(label, return_inverse=True)
+        many = of.bincount()
+        return [None] if len(many) < 2 else list(of.argsort(stable=True).split(many.tolist()))
+
+    def is_rigid(self) -> Tensor:
+        """The particles of rigid parts, bool, shape (..., P)."""
+        found = torch.zeros_like(self.points.mass, dtype=torch.bool)
+        for k in self.rigid:
+            held = self.held[k]
+            assert held is not None
+            found |= held.mass > 0
+        return found
+
+    def tensors(self) -> list[Tensor]:
+        """Tensors that a substep depends on, besides its state and forces; any of them may require a gradient."""
+        points = self.points
+        own = [points.position, points.mass, points.volume, points.youngs_modulus, points.poisson_ratio]
+        own += [] if points.bending is None else [points.bending]
+        return own + [t for boundary in self.boundaries for t in (*boundary.parameters(), *boundary.buffers())]
 
     def hold_kind(self, k: int) -> str:
         """Return what the ``k``-th boundary acts on, see ``Boundary.hold_kind``."""
-        return self.body.boundaries[k].hold_kind(self.neighbours_fixed)
+        return self.boundaries[k].hold_kind(self.neighbours_fixed)
 
     def acts_on_nodes(self, k: int) -> bool:
         """True if the ``k``-th boundary acts on nodes."""
@@ -115,7 +178,7 @@ class Formulation(ABC):
             velocity: Initial velocity [m/s], shape (..., P, 3).
             margin: Cells around the object in the first grid, if it moves through the grid.
         """
-        position = self.body.points.position
+        position = self.points.position
         identity = torch.eye(3, dtype=position.dtype, device=position.device).repeat(*position.shape[:-1], 1, 1)
         return MPMState(
             position=position,
@@ -126,14 +189,14 @@ class Formulation(ABC):
             lost=torch.zeros(position.shape[:-1], dtype=torch.bool, device=position.device),
             time=torch.zeros((), dtype=torch.float64, device=position.device),
             grid=self.first_grid(margin),
-            internal=self.body.laws.initial_internal(),
+            internal=self.laws.initial_internal(),
             work=torch.zeros(position.shape[:-2], dtype=torch.float64, device=position.device),
             impulse=self.no_impulse(),
         )
 
     def no_impulse(self) -> Tensor:
         """A reaction impulse of zero for each boundary, shape (..., B, 3), float64."""
-        position = self.body.points.position
+        position = self.points.position
         shape = (*position.shape[:-2], len(self.kinds), 3)
         return torch.zeros(shape, dtype=torch.float64, device=position.device)
 
@@ -219,8 +282,8 @@ class Formulation(ABC):
         taken, fixed = list(self.no_impulse().unbind(-2)), None
         acting = [k for k, acts in enumerate(self.on_nodes) if acts]
         # impulses come before conditions that hold nodes, and rigid parts after them, in whatever order they are given
-        for k in sorted(acting, key=lambda k: _turn(self.body.boundaries[k])):
-            boundary, held, before = self.body.boundaries[k], self.held[k], velocity
+        for k in sorted(acting, key=lambda k: _turn(self.boundaries[k])):
+            boundary, held, before = self.boundaries[k], self.held[k], velocity
             if held is None:
                 nodes = Nodes(time, dt, position, lattice)
             else:
@@ -228,7 +291,7 @@ class Formulation(ABC):
                 known = held.threshold, held.total, mass, fixed, held.nodes
                 nodes = Nodes(time, dt, position, lattice, share, *known)
             velocity = boundary(velocity, nodes)
-            if self.body.rigid and isinstance(boundary, PinnedRegion):
+            if self.rigid and isinstance(boundary, PinnedRegion):
                 pinned = nodes.held & boundary.active(time)
                 fixed = pinned if fixed is None else fixed | pinned
             with torch.no_grad():
@@ -265,26 +328,25 @@ class Formulation(ABC):
 
     def stable_substep(self, state: MPMState | None) -> float:
         """Longest substep [s] that is stable for any arrangement of particles (one GPU synchronisation)."""
-        body, dx, spatial = self.body, self.settings.dx, not self.neighbours_fixed
+        dx, spatial = self.settings.dx, not self.neighbours_fixed
         F, internal = (None, None) if state is None else (state.F_elastic.detach(), state.internal)
-        limit = stable_limit(body.points, dx, F, internal, spatial=spatial, laws=body.laws)
+        limit = stable_limit(self.points, dx, F, internal, spatial=spatial, laws=self.laws)
         shortest = (1 / float(limit.detach().amin()) ** 2 + self.bending_rate / 4) ** -0.5
         return damped_substep(shortest, self.viscous_time(state))
 
     @cached_property
     def longest_substep(self) -> float:
         """Substep [s] above which nothing is stable, at rest (one GPU synchronisation, the first time)."""
-        body = self.body
-        identity = torch.eye(3, dtype=body.points.mass.dtype, device=body.points.mass.device)
-        F = identity.expand(*body.points.mass.shape, 3, 3)
-        speed = wave_speed(body.points, F, body.laws.initial_internal(), laws=body.laws).detach()
+        mass = self.points.mass
+        F = torch.eye(3, dtype=mass.dtype, device=mass.device).expand(*mass.shape, 3, 3)
+        speed = wave_speed(self.points, F, self.laws.initial_internal(), laws=self.laws).detach()
         limit = MAX_CFL / self.with_bending(max(float(speed.amax()) / self.settings.dx, 1e-30))
         return damped_substep(limit, self.settings.stiffness_damping)
 
     def cells_per_second(self, state: MPMState) -> Tensor:
         """Return the number of cells that the fastest wave crosses per second, a scalar tensor."""
-        body, spatial, F = self.body, not self.neighbours_fixed, state.F_elastic.detach()
-        speed = wave_speed(body.points, F, state.internal, spatial=spatial, laws=body.laws)
+        spatial, F = not self.neighbours_fixed, state.F_elastic.detach()
+        speed = wave_speed(self.points, F, state.internal, spatial=spatial, laws=self.laws)
         return self.with_bending(cfl_number(1.0, self.settings.dx, speed, state.velocity if spatial else None).detach())
 
     def with_bending(self, cells: _Number) -> _Number:
@@ -301,7 +363,7 @@ class Formulation(ABC):
         Such an obstacle stops the nodes that it meets, and would jump over those between two substeps. The host waits
         if there is one that moves.
         """
-        pairs = zip(self.body.boundaries, self.kinds, strict=True)
+        pairs = zip(self.boundaries, self.kinds, strict=True)
         moving = [b for b, kind in pairs if kind == "nodes" and isinstance(b, Obstacle) and not b.still]
         if not moving:
             return 0.0
@@ -319,6 +381,20 @@ class Formulation(ABC):
         F = state.F_elastic.detach()
         squared = float(symmetric_eigenvalues(F.mT @ F)[..., 0].amax().clamp(min=1.0))
         return time * squared**self.viscous_power
+
+
+def flowing(points: MaterialPoints) -> str | None:
+    """The name of a law that flows; None if there is none."""
+    return next((type(law).__name__ for law in points.laws if law.plastic), None)
+
+
+def _held(points: MaterialPoints, boundary: Boundary) -> Held | None:
+    position = points.position.detach()
+    mask = boundary.particle_mask(position)
+    if mask is None:
+        return None
+    mass = torch.where(mask, points.mass, 0.0)
+    return Held(mass, mass.sum(-1), boundary.release_time(position))
 
 
 def _turn(boundary: Boundary) -> int:

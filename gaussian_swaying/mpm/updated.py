@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from functools import partial
 
 import torch
@@ -11,9 +12,10 @@ from torch import Tensor
 from gaussian_swaying._devices import in_double
 from gaussian_swaying.geometry.linalg import matmul3, polar_rotation
 from gaussian_swaying.geometry.rigid import centre
-from gaussian_swaying.mpm.body import Body
+from gaussian_swaying.mpm.boundaries.boundary import Boundary
+from gaussian_swaying.mpm.contact import Surface
 from gaussian_swaying.mpm.damping import kelvin_voigt_pk1
-from gaussian_swaying.mpm.formulations.formulation import (
+from gaussian_swaying.mpm.formulation import (
     MAX_NODES,
     Formulation,
     Settings,
@@ -21,7 +23,7 @@ from gaussian_swaying.mpm.formulations.formulation import (
     not_finite,
     safe_inverse,
 )
-from gaussian_swaying.mpm.state import GridSpec, MPMState
+from gaussian_swaying.mpm.state import GridSpec, MaterialPoints, MPMState
 from gaussian_swaying.mpm.timestep import kick_time
 from gaussian_swaying.mpm.transfer import bspline_stencil, g2p, scatter, scatter_momentum
 
@@ -30,27 +32,31 @@ class Updated(Formulation):
     """The paper's formulation: APIC (Jiang et al. 2015) on a moving grid.
 
     Args:
-        body: The material with its laws and boundaries.
+        points: See :class:`Formulation`.
+        boundaries: See there.
         settings: Numbers and switches of the solver.
+        surface: See :class:`Formulation`.
     """
 
     name = "updated"
     neighbours_fixed = False
     viscous_power = 2
 
-    def __init__(self, body: Body, settings: Settings) -> None:
-        super().__init__(body, settings)
-        if body.points.damping is not None:
+    def __init__(
+        self, points: MaterialPoints, boundaries: Sequence[Boundary], settings: Settings, surface: Surface | None = None
+    ) -> None:
+        super().__init__(points, boundaries, settings, surface)
+        if points.damping is not None:
             raise ValueError(
                 "`damping` of material points, which `material.damping_ratio` sets, needs `solver.formulation: total`: "
                 "use `solver.damping`, one rate for all of the material."
             )
-        if body.points.bending is not None:
+        if points.bending is not None:
             raise ValueError(
                 "`bending` of material points, which `material.bending` sets, needs `solver.formulation: total`: leave "
                 "it out, or use `scene.layers: 3`."
             )
-        if body.surface is not None and body.surface.contact is not None:
+        if surface is not None and surface.contact is not None:
             raise ValueError(
                 "`contact` needs particles that keep their neighbours, which the updated formulation does not have: "
                 "leave out `contact`, as its material meets itself on the grid, or set `solver.formulation` to total."
@@ -58,7 +64,7 @@ class Updated(Formulation):
 
     def first_grid(self, margin: int) -> GridSpec:
         """The grid around the body at rest; ValueError if rounding would lose the motion of a substep."""
-        position, dx = self.body.points.position, self.settings.dx
+        position, dx = self.points.position, self.settings.dx
         farthest = float(position.detach().abs().amax()) if position.numel() else 0.0
         limit = 1e-3 * dx / torch.finfo(position.dtype).eps
         if farthest > limit:
@@ -89,8 +95,7 @@ class Updated(Formulation):
 
     def step(self, state: MPMState, dt: float, force: Tensor | None, drag: Tensor | None) -> MPMState:
         """One substep: momenta to the nodes, their new velocity, and back to the particles, which move with it."""
-        body, settings = self.body, self.settings
-        points, laws = body.points, body.laws
+        points, laws, settings = self.points, self.laws, self.settings
         stencil = bspline_stencil(state.position, state.grid, deterministic=settings.deterministic)
         F = state.F_elastic
         stress = laws.kirchhoff(F, state.internal)
@@ -143,9 +148,9 @@ class Updated(Formulation):
 
     def in_shape(self, state: MPMState) -> MPMState:
         """The state with the particles of rigid parts exactly where these are: c + R (X - C), with R as their F."""
-        rest = in_double(self.body.points.position)
-        for k in self.body.rigid:
-            held = self.body.held[k]
+        rest = in_double(self.points.position)
+        for k in self.rigid:
+            held = self.held[k]
             assert held is not None
             own, mass = (held.mass > 0)[..., None], in_double(held.mass)
             whole, before = mass.sum(-1)[..., None, None], centre(rest, mass)
@@ -165,10 +170,10 @@ class Updated(Formulation):
     def kinetic(self, state: MPMState) -> Tensor:
         """Energy of the particles; the affine part adds dx²/4 of its square (lumped APIC energy; Jiang et al. 2015)."""
         spread = 0.25 * self.settings.dx**2 * state.affine.square().sum((-1, -2))
-        return 0.5 * (self.body.points.mass * (state.velocity.square().sum(-1) + spread)).sum(-1)
+        return 0.5 * (self.points.mass * (state.velocity.square().sum(-1) + spread)).sum(-1)
 
     def momenta(self, state: MPMState) -> tuple[Tensor, Tensor]:
-        mass = self.body.points.mass
+        mass = self.points.mass
         momentum = mass[..., None] * state.velocity
         # contribution of the affine velocity: the antisymmetric part of m C dx²/4 (Jiang et al. 2015)
         spin = state.affine * (mass * self.settings.dx**2 / 4)[..., None, None]

@@ -25,17 +25,17 @@ from torch import Tensor
 from gaussian_swaying._devices import in_double
 from gaussian_swaying.geometry.rotations import rodrigues, rotation_of
 from gaussian_swaying.kernels.launch import replaces
-from gaussian_swaying.mpm.body import Body
 from gaussian_swaying.mpm.boundaries.boundary import Boundary
 from gaussian_swaying.mpm.boundaries.pinned_points import PinnedPoints
 from gaussian_swaying.mpm.boundaries.pinned_region import PinnedRegion
 from gaussian_swaying.mpm.boundaries.rigid_region import RigidRegion
+from gaussian_swaying.mpm.contact import Surface
 from gaussian_swaying.mpm.damping import decay_rate
 from gaussian_swaying.mpm.forces import Force, split, tensors_of
-from gaussian_swaying.mpm.formulations.formulation import Settings
-from gaussian_swaying.mpm.formulations.total import Total
+from gaussian_swaying.mpm.formulation import Settings, flowing
 from gaussian_swaying.mpm.modal import Analysis, analysis_of
-from gaussian_swaying.mpm.state import MPMState, State
+from gaussian_swaying.mpm.state import MaterialPoints, MPMState, State
+from gaussian_swaying.mpm.total import Total
 from gaussian_swaying.mpm.transfer import gather, scatter
 
 MOST_LEAN = 0.4  # over the longest side, that modes can show
@@ -50,8 +50,10 @@ class Modes(Total):
     """Modes of ``total`` at rest: for a held elastic body that sways by less than some 40 % of its size.
 
     Args:
-        body: The material with its laws and boundaries.
+        points: See :class:`Formulation`.
+        boundaries: See there.
         settings: Numbers and switches of the solver.
+        surface: See :class:`Formulation`.
 
     Attributes:
         square: Squares of the circular frequencies of the modes [1/s²], shape (..., M).
@@ -64,17 +66,19 @@ class Modes(Total):
 
     name = "modes"
 
-    def __init__(self, body: Body, settings: Settings) -> None:
-        why = why_not_modes(body)
+    def __init__(
+        self, points: MaterialPoints, boundaries: Sequence[Boundary], settings: Settings, surface: Surface | None = None
+    ) -> None:
+        why = why_not_modes(points, boundaries, surface)
         if why is not None:
             raise ValueError(f"`solver.formulation: modes` is for a held body that sways about its rest, but {why}.")
-        super().__init__(body, settings)
-        scenes = max(1, math.prod(body.points.mass.shape[:-1]))
+        super().__init__(points, boundaries, settings, surface)
+        scenes = max(1, math.prod(points.mass.shape[:-1]))
         with torch.no_grad():
             self._bind([analysis_of(self, scene, MOST_MODES) for scene in range(scenes)])
 
     def _bind(self, found: Sequence[Analysis]) -> None:
-        points, batch, count = self.body.points, tuple(self.body.points.mass.shape[:-1]), self.body.points.count
+        points, batch, count = self.points, tuple(self.points.mass.shape[:-1]), self.points.count
         modes = min(len(one.square) for one in found)
         like = points.position.detach()
 
@@ -135,7 +139,7 @@ class Modes(Total):
 
         Their derivatives by the stiffness and mass of each point are those of the Rayleigh quotient of each mode.
         """
-        points = self.body.points
+        points = self.points
         square = self._square
         E, mass = points.youngs_modulus, points.mass
         if not torch.is_grad_enabled() or not (E.requires_grad or mass.requires_grad):
@@ -148,7 +152,7 @@ class Modes(Total):
     @property
     def inertia(self) -> Tensor:
         """Generalised masses of the modes, which are one, shape (..., M); with the gradient of the masses."""
-        mass = self.body.points.mass
+        mass = self.points.mass
         one = torch.ones_like(self._square)
         if not torch.is_grad_enabled() or not mass.requires_grad:
             return one
@@ -157,8 +161,7 @@ class Modes(Total):
     @cached_property
     def _shares(self) -> tuple[Tensor, Tensor]:
         """Share of the points in the elastic and the kinetic energy of each mode, shape (..., P, M) each."""
-        body = self.body
-        mu, lam = body.laws.mu.detach(), body.laws.lam.detach()
+        mu, lam, points = self.laws.mu.detach(), self.laws.lam.detach(), self.points
         modes = self.shape.shape[-1]
         field = self._everywhere(self.shape.unflatten(-2, (-1, 3)).flatten(-2))
         slope = gather(field, self.stencil).unflatten(-1, (3, modes))[..., 1:4, :, :]
@@ -166,8 +169,8 @@ class Modes(Total):
         strain = 0.5 * (slope + slope.transpose(-3, -2))
         trace = strain.diagonal(dim1=-3, dim2=-2).sum(-1)
         density = 2 * mu[..., None] * strain.square().sum((-3, -2)) + lam[..., None] * trace.square()
-        stored = in_double(body.points.volume.detach()[..., None] * density)
-        moved = in_double(body.points.mass.detach()[..., None] * speed)
+        stored = in_double(points.volume.detach()[..., None] * density)
+        moved = in_double(points.mass.detach()[..., None] * speed)
         return stored / stored.sum(-2, keepdim=True).clamp(min=1e-300), moved
 
     @cached_property
@@ -175,7 +178,7 @@ class Modes(Total):
         """Damping ratios of the modes, shape (..., M), float64: of the material, and of the solver's two dampings."""
         rate = self.settings.damping / 2 + self._square * (self.settings.stiffness_damping / 2)
         found = rate / self._square.sqrt().clamp(min=1e-12)
-        damping = self.body.points.damping
+        damping = self.points.damping
         if damping is None:
             return found
         own = in_double(damping.detach()) / decay_rate(1.0, 1.0)
@@ -197,13 +200,13 @@ class Modes(Total):
         return known[1]
 
     def _mean_at_sites(self, values: Tensor) -> Tensor:
-        mass = self.body.points.mass.detach()[..., None]
+        mass = self.points.mass.detach()[..., None]
         return self.at_sites(mass * values) / self.site_mass[..., None].clamp(min=torch.finfo(mass.dtype).tiny)
 
     def _kernel(self, state: MPMState, groups: Sequence[Force | None], time: Tensor, dt: float, steps: int) -> Any:
         """The kernel of the forces on the sites, with their numbers; None where torch computes them."""
         twins = [force.twin() for force in groups if force is not None]
-        given = [state.position, *tensors_of([force for force in groups if force is not None]), *self.body.tensors()]
+        given = [state.position, *tensors_of([force for force in groups if force is not None]), *self.tensors()]
         if not twins or None in twins or not replaces((state.position,)):
             return None
         if torch.is_grad_enabled() and any(tensor.requires_grad for tensor in (*state.tensors(), *given)):
@@ -341,7 +344,7 @@ class Modes(Total):
             force: A force that has groups (``Force.on_sites``), such as a steady wind.
             rounds: Iterations, each of which goes half of the way.
         """
-        state = self.first_state(torch.zeros_like(self.body.points.position), 0)
+        state = self.first_state(torch.zeros_like(self.points.position), 0)
         q, p = self.amplitudes(state)
         group, square = self._grouped(force), self.square.to(q)
         assert group is not None
@@ -429,16 +432,16 @@ class Modes(Total):
         return 0.5 * (self.square * self.inertia * in_double(self.amplitudes(state)[0]).square()).sum(-1)
 
 
-def why_not_modes(body: Body) -> str | None:
+def why_not_modes(points: MaterialPoints, boundaries: Sequence[Boundary], surface: Surface | None) -> str | None:
     """Return the reason why a body cannot sway by modes; None if it can."""
-    if body.surface is not None:
+    if surface is not None:
         return "it touches itself or an obstacle: set it to total"
-    if body.points.bending is not None:
+    if points.bending is not None:
         return "`material.bending` makes it a sheet, which folds: set it to total"
-    if body.laws.plastic:
-        return f"the law {body.laws.plastic_names[0]} flows: set it to updated"
+    if (flows := flowing(points)) is not None:
+        return f"the law {flows} flows: set it to updated"
     held = False
-    for boundary in body.boundaries:
+    for boundary in boundaries:
         if isinstance(boundary, RigidRegion):
             continue
         if not _holds_still(boundary):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import warnings
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 
@@ -14,17 +15,17 @@ from gaussian_swaying._devices import in_double
 from gaussian_swaying.geometry.linalg import polar_rotation
 from gaussian_swaying.geometry.neighbours import nearest_neighbours
 from gaussian_swaying.geometry.rigid import centre, fitted_gradient
-from gaussian_swaying.mpm.body import Body, Held
 from gaussian_swaying.mpm.boundaries.boundary import BY_BODY, Boundary
 from gaussian_swaying.mpm.boundaries.pinned_points import PinnedPoints
 from gaussian_swaying.mpm.contact import ContactStage, Surface
 from gaussian_swaying.mpm.damping import kelvin_voigt_pk1
-from gaussian_swaying.mpm.formulations.formulation import Formulation, Settings, held_share, safe_inverse
+from gaussian_swaying.mpm.dispatch import LawDispatch
+from gaussian_swaying.mpm.formulation import Formulation, Held, Settings, flowing, held_share, safe_inverse
 from gaussian_swaying.mpm.held_faces import HELD_ALONE, SHEET, SOFTENED, thickness, width
 from gaussian_swaying.mpm.held_rows import LEAST_APART
 from gaussian_swaying.mpm.point_holds import POINTS, PointHolds
 from gaussian_swaying.mpm.sheets import bending_of, director_energy, flattened, sheet_pk1
-from gaussian_swaying.mpm.state import GridSpec, MPMState
+from gaussian_swaying.mpm.state import GridSpec, MaterialPoints, MPMState
 from gaussian_swaying.mpm.timestep import kick_time
 from gaussian_swaying.mpm.transfer import bspline_stencil, gather, scatter
 from gaussian_swaying.mpm.virtual_nodes import VirtualNodes, virtual_nodes
@@ -34,8 +35,10 @@ class Total(Formulation):
     """Total Lagrangian MPM (de Vaucorbeil, Nguyen & Hutchinson 2020): everything but the nodal fields is constant.
 
     Args:
-        body: The material with its laws and boundaries.
+        points: See :class:`Formulation`.
+        boundaries: See there.
         settings: Numbers and switches of the solver.
+        surface: See :class:`Formulation`.
 
     Attributes:
         grid: The nodes.
@@ -59,12 +62,14 @@ class Total(Formulation):
     neighbours_fixed = True
     viscous_power = 1
 
-    def __init__(self, body: Body, settings: Settings) -> None:
-        super().__init__(body, settings)
-        points, position = body.points, body.points.position
-        if body.laws.plastic:
+    def __init__(
+        self, points: MaterialPoints, boundaries: Sequence[Boundary], settings: Settings, surface: Surface | None = None
+    ) -> None:
+        super().__init__(points, boundaries, settings, surface)
+        position, flows = points.position, flowing(points)
+        if flows is not None:
             raise ValueError(
-                f"The law {body.laws.plastic_names[0]} flows, which the total formulation does not support: set "
+                f"The law {flows} flows, which the total formulation does not support: set "
                 "`solver.formulation` to updated, or choose an elastic law."
             )
         self.grid = self.bounding_grid(position, margin=0)
@@ -86,9 +91,9 @@ class Total(Formulation):
             self.node_rest = first_moment * self.node_inverse_mass[..., None]
         self.held = tuple(
             held if held is None or not self.on_nodes[k] else self._on_nodes(k, held)
-            for k, held in enumerate(body.held)
+            for k, held in enumerate(self.held)
         )
-        self.rigid_bodies = [self._body(k) for k in self.body.rigid]
+        self.rigid_bodies = [self._body(k) for k in self.rigid]
         self._check_bodies()
         softened = self._soften()
         self.bending = bending_of(points, self.stencil, settings.dx, softened)
@@ -106,7 +111,7 @@ class Total(Formulation):
         return scatter(self.stencil, values[..., None, :], fixed_order=True)
 
     def _virtual_nodes(self, snap: float) -> VirtualNodes | None:
-        points = self.body.points
+        points = self.points
         if points.attached is None:
             return None
         first = bspline_stencil(points.position.detach(), self.grid, False, snap).first
@@ -121,7 +126,7 @@ class Total(Formulation):
             return lattice
         more = lattice[self.virtual.original]
         every = torch.cat([lattice.expand(len(more), *lattice.shape), more], 1)
-        return every.reshape(*self.body.points.mass.shape[:-1], *every.shape[1:])
+        return every.reshape(*self.points.mass.shape[:-1], *every.shape[1:])
 
     def hold_kind(self, k: int) -> str:
         """Return what a boundary acts on; a pin without a kind holds a sheet by a hinge, and anything else by a clamp.
@@ -129,14 +134,14 @@ class Total(Formulation):
         Next to a rigid part it holds nodes, as points cannot share nodes with one. Warns if a hinge or a clamped place
         is to hold a part of several cells in thickness, which it cannot, and if a hinge is wider than a line of points.
         """
-        boundary, kind = self.body.boundaries[k], super().hold_kind(k)
+        boundary, kind = self.boundaries[k], super().hold_kind(k)
         given = isinstance(boundary, PinnedPoints)
         if kind == BY_BODY and self._next_to_rigid(k):
             return "nodes"
         if kind == BY_BODY or (kind == "hinge" and not given) or (kind == "clamp" and given):
             thick, sheet = self._thickness(k)
             if kind == BY_BODY:
-                held = self.body.held[k]
+                held = self.held[k]
                 return "hinge" if sheet or (held is not None and held.release is not None) else "clamp"
             if thick > SHEET * self.settings.dx:
                 remedy = "use a PinnedRegion" if given else "set `kind` to clamp, or to null"
@@ -158,15 +163,15 @@ class Total(Formulation):
 
     def _next_to_rigid(self, k: int) -> bool:
         """True if a boundary holds particles that may share nodes with a rigid part."""
-        held = self.body.held[k]
-        if held is None or not self.body.rigid:
+        held = self.held[k]
+        if held is None or not self.rigid:
             return False
         from scipy.spatial import cKDTree
 
         count = held.mass.shape[-1]
         place, own, rigid = (
             field.detach().reshape(-1, count, *field.shape[held.mass.ndim :]).cpu()
-            for field in (self.body.points.position, held.mass > 0, self.body.is_rigid())
+            for field in (self.points.position, held.mass > 0, self.is_rigid())
         )
         reach = 3 * self.settings.dx
         for where, pinned, part in zip(place.double(), own, rigid, strict=True):
@@ -177,7 +182,7 @@ class Total(Formulation):
 
     def _held_width(self, k: int) -> float:
         """The width of the line or patch that a boundary holds [m], the largest of all scenes."""
-        points, held = self.body.points, self.body.held[k]
+        points, held = self.points, self.held[k]
         assert held is not None
         count, found = points.position.shape[-2], [0.0]
         fields = points.position.detach().reshape(-1, count, 3), held.mass.detach().reshape(-1, count)
@@ -189,7 +194,7 @@ class Total(Formulation):
 
     def _thickness(self, k: int) -> tuple[float, bool]:
         """The largest thickness of the body where a boundary holds it [m], and whether all scenes are sheets there."""
-        points, held = self.body.points, self.body.held[k]
+        points, held = self.points, self.held[k]
         count = points.position.shape[-2]
         position, mass = (
             points.position.detach().reshape(-1, count, 3).cpu(),
@@ -197,9 +202,9 @@ class Total(Formulation):
         )
         found = []
         for s, (place, weight) in enumerate(zip(position, mass, strict=True)):
-            for own in self.body.pieces:
+            for own in self.pieces:
                 if held is None:
-                    pins = self.body.boundaries[k]
+                    pins = self.boundaries[k]
                     assert isinstance(pins, PinnedPoints)
                     where = pins.at.detach().cpu().to(place)
                     if own is not None:
@@ -218,7 +223,7 @@ class Total(Formulation):
 
     def has_face(self, k: int) -> bool:
         """True if a boundary clamps a region and never releases its particles one by one."""
-        held = self.body.held[k]
+        held = self.held[k]
         return self.kinds[k] == "clamp" and held is not None and held.release is None
 
     def _soften(self) -> Tensor | None:
@@ -228,13 +233,14 @@ class Total(Formulation):
         """
         masks = [
             held.mass > 0
-            for k, (held, boundary) in enumerate(zip(self.body.held, self.body.boundaries, strict=True))
+            for k, (held, boundary) in enumerate(zip(self.held, self.boundaries, strict=True))
             if held is not None and self.has_face(k) and _always(boundary)
         ]
         if not masks:
             return None
         own = torch.stack(masks).any(0)
-        self.body.soften(own, SOFTENED)
+        E = self.points.youngs_modulus
+        self.laws = LawDispatch(replace(self.points, youngs_modulus=torch.where(own, SOFTENED * E, E)))
         return torch.where(own, SOFTENED, 1.0)
 
     @property
@@ -247,7 +253,7 @@ class Total(Formulation):
 
     def _point_windows(self) -> tuple[tuple[float, float], ...]:
         """The time windows of the boundaries that hold points [s]."""
-        pairs = zip(self.body.boundaries, self.kinds, strict=True)
+        pairs = zip(self.boundaries, self.kinds, strict=True)
         return tuple((boundary.holds_from, boundary.end) for boundary, kind in pairs if kind in POINTS)
 
     def _hold_points(self) -> PointHolds | None:
@@ -260,7 +266,7 @@ class Total(Formulation):
             assert held is not None
             assert held.share is not None
             still |= held.share > held.threshold
-        holds = PointHolds(self.body, self.kinds, faces, still, self.stencil, self.grid, self.node_inverse_mass)
+        holds = PointHolds(self, self.kinds, faces, still, self.stencil, self.grid, self.node_inverse_mass)
         if not holds.rows:
             return None  # a clamp that holds everything has no face
         if any(bool((body.mass.reshape(-1)[holds.affected] > 0).any()) for body in self.rigid_bodies):
@@ -282,26 +288,26 @@ class Total(Formulation):
         for k, body in enumerate(self.rigid_bodies):
             for other, before in enumerate(self.rigid_bodies[:k]):
                 if bool(((body.mass > 0) & (before.mass > 0)).any()):
-                    names = [repr(_region(self.body.boundaries[self.body.rigid[i]])) for i in (other, k)]
+                    names = [repr(_region(self.boundaries[self.rigid[i]])) for i in (other, k)]
                     raise ValueError(
                         f"Two rigid parts touch, and would not hold each other: that {names[0]} and that {names[1]}; "
                         "make them one part, or put soft material between."
                     )
 
     def _contact(self) -> ContactStage | None:
-        body, surface = self.body, self.body.surface
+        surface = self.surface
         if "surface" not in self.kinds and (surface is None or surface.contact is None):
             return None
         if surface is None:
-            surface = Surface.of_points(body.points)
+            surface = Surface.of_points(self.points)
         inverse, nodes = self.node_inverse_mass, None
         if self.virtual is not None:
             nodes = self.stencil.first, self.virtual.node
-        return ContactStage(surface, body.boundaries, self.kinds, self.grid, inverse, nodes)
+        return ContactStage(surface, self.boundaries, self.kinds, self.grid, inverse, nodes)
 
     def _on_nodes(self, k: int, held: Held) -> Held:
         """Return the particles that the ``k``-th boundary holds, with their constant share of the mass of each node."""
-        boundary, face = self.body.boundaries[k], self.has_face(k)
+        boundary, face = self.boundaries[k], self.has_face(k)
         share = self._summed(held.mass[..., None])[..., 0] * self.node_inverse_mass
         threshold = HELD_ALONE if face else boundary.held_share
         if threshold is not None and not face and not bool((share > threshold).any()):
@@ -323,7 +329,7 @@ class Total(Formulation):
     def first_state(self, velocity: Tensor, margin: int) -> MPMState:
         """The state at time zero, with velocities interpolated from the nodes."""
         state = super().first_state(velocity, margin)
-        momentum = self._summed(self.body.points.mass[..., None] * velocity)
+        momentum = self._summed(self.points.mass[..., None] * velocity)
         node_velocity = momentum * self.node_inverse_mass[..., None]
         return self.read_particles(state, torch.zeros_like(node_velocity), node_velocity)
 
@@ -343,7 +349,7 @@ class Total(Formulation):
                 "`solver.transfer` on auto, give laws device functions, and on a GPU float32; or leave contact out."
             )
         displacement, before = state.nodal
-        points, laws, time = self.body.points, self.body.laws, self.settings.stiffness_damping
+        points, laws, time = self.points, self.laws, self.settings.stiffness_damping
         F, rate = state.F_elastic, state.affine
         if (
             self.rigid_bodies or self.bending is not None
@@ -391,10 +397,10 @@ class Total(Formulation):
         Particles at the border of a part have a small share of nodes that are not of it.
         """
         if self.bending is not None:
-            flat = flattened(state.F_elastic, self.normal, self.body.laws.mu, self.body.laws.lam).F
+            flat = flattened(state.F_elastic, self.normal, self.laws.mu, self.laws.lam).F
             state = state.replace(F_elastic=flat, F_total=flat)
         for body in self.rigid_bodies:
-            state = body.in_shape(state, self.body.points.position)
+            state = body.in_shape(state, self.points.position)
         return state
 
     def hold(
@@ -437,7 +443,7 @@ class Total(Formulation):
         """As :meth:`read_particles`, from both fields interpolated, shape (..., P, 4, 6)."""
         F = rows[..., 1:4, :3].mT + torch.eye(3, dtype=rows.dtype, device=rows.device)
         return state.replace(
-            position=self.body.points.position + rows[..., 0, :3],
+            position=self.points.position + rows[..., 0, :3],
             velocity=rows[..., 0, 3:],
             affine=rows[..., 1:4, 3:].mT,
             F_elastic=F,
@@ -456,7 +462,7 @@ class Total(Formulation):
         displacement = state.nodal[0]
         F = gather(displacement, self.stencil)[..., 1:4, :].mT
         F = F + torch.eye(3, dtype=F.dtype, device=F.device)
-        own = self.body.points.volume * director_energy(F, self.normal, self.body.laws.mu)
+        own = self.points.volume * director_energy(F, self.normal, self.laws.mu)
         return self.bending.energy(displacement) + own.sum(-1)
 
     def momenta(self, state: MPMState) -> tuple[Tensor, Tensor]:

@@ -1,1 +1,0 @@
-"""The formulations of the substep in torch, one file each, with all that they need at rest."""
