@@ -74,50 +74,6 @@ def _own_tensors(part: nn.Module) -> list[torch.Tensor]:
     return [t for t in (*values["_parameters"].values(), *values["_buffers"].values()) if t is not None]
 
 
-def record(
-    device: torch.device, work: Callable[[], Any], pool: Any = None, stream: torch.cuda.Stream | None = None
-) -> torch.cuda.CUDAGraph:
-    """Record the kernels that a function launches, without running them.
-
-    All these kernels must have run before, so that nothing is compiled or loaded during the recording. The function
-    must not make the host wait. The tensors that it reads and writes must live as long as the graph.
-
-    Args:
-        device: A CUDA device.
-        work: The function.
-        pool: Memory pool for its allocations, which graphs may share if no two of them run at once; a new pool if None.
-        stream: Stream on which it is recorded; a new one if None. Graphs that share a pool must also share the stream,
-            since memory freed on one stream is not reused on another.
-
-    Returns:
-        The graph; ``replay()`` runs it.
-    """
-    graph, stream = torch.cuda.CUDAGraph(), torch.cuda.Stream(device) if stream is None else stream
-    stream.wait_stream(torch.cuda.current_stream(device))
-    with _RECORDING:
-        collecting = gc.isenabled()
-        gc.disable()  # freeing another graph during the recording would break it
-        try:
-            # tensors that all graphs share get the mode of the first recording; if that was inference mode, they
-            # could not be written outside it
-            with torch.cuda.stream(stream), torch.inference_mode(False), torch.no_grad():
-                # other threads, such as the recorder's, may continue
-                graph.capture_begin(pool=pool, capture_error_mode="thread_local")
-                try:
-                    work()
-                except BaseException:
-                    with suppress(RuntimeError):  # the original error matters more
-                        graph.capture_end()
-                    graph.reset()  # the traceback keeps the graph alive, which would keep its memory
-                    raise
-                graph.capture_end()
-        finally:
-            if collecting:
-                gc.enable()
-    torch.cuda.current_stream(device).wait_stream(stream)
-    return graph
-
-
 class Replayed:
     """Calls a function of tensors, and replays it from a CUDA graph from the second call in a row with the same key on.
 
@@ -126,17 +82,13 @@ class Replayed:
 
     def __init__(self) -> None:
         self._key: Hashable = None
-        self._graph: torch.cuda.CUDAGraph | None = None
+        self._repeater: Repeater | None = None
         self._inputs: list[torch.Tensor] = []
         self._outputs: list[torch.Tensor] = []
 
     def __getstate__(self) -> dict[str, object]:
         """The state without a graph, which cannot be copied."""
         return vars(Replayed())
-
-    @property
-    def recorded(self) -> bool:
-        return self._graph is not None
 
     def __call__(
         self, key: Hashable, function: Callable[..., Sequence[torch.Tensor]], *inputs: torch.Tensor
@@ -151,19 +103,16 @@ class Replayed:
         if not inputs[0].is_cuda or torch.is_grad_enabled():
             return list(function(*inputs))
         whole = (key, *((tensor.shape, tensor.dtype) for tensor in inputs))
-        if whole != self._key:
-            self._key, self._graph = whole, None
-            return list(function(*inputs))  # now all kernels are loaded
-        if self._graph is None:
+        if self._repeater is None or whole != self._key:
+            self._key, self._repeater = whole, Repeater(inputs[0].device)
             with torch.inference_mode(False), torch.no_grad():
                 self._inputs = [tensor.clone() for tensor in inputs]
 
-            def work() -> None:
-                self._outputs = list(function(*self._inputs))
+        def work(_: int) -> None:
+            self._outputs = list(function(*self._inputs))
 
-            self._graph = record(inputs[0].device, work)
         torch._foreach_copy_(self._inputs, list(inputs))
-        self._graph.replay()
+        self._repeater.run(1, whole, work)
         return [tensor.clone() for tensor in self._outputs]
 
 
@@ -242,30 +191,57 @@ class Repeater:
                     graphs[size].replay()
 
     def _recorded(self, several: Callable[[int], None], size: int) -> torch.cuda.CUDAGraph:
+        """Record what a function launches, without running it.
+
+        All its kernels must have run before, so that nothing is compiled or loaded during the recording. It must not
+        make the host wait. The tensors that it reads and writes must live as long as the graph. Graphs that share a
+        pool also share the stream, since memory freed on one stream is not reused on another.
+        """
         if self._stream is None:
             self._stream = torch.cuda.Stream(self.device)
+        graph, stream = torch.cuda.CUDAGraph(), self._stream
         alive = next((graph for graphs in self._graphs.values() for graph in graphs.values()), None)
-        if alive is None:
-            # memory of dropped graphs and cached memory cannot be used during a recording; after a failed recording
-            # PyTorch refuses to give it back
-            with _RECORDING, suppress(RuntimeError):
-                torch.cuda.synchronize(self.device)  # the dropped graphs may still be running
-                torch.cuda.empty_cache()
-        try:
-            return record(self.device, lambda: several(size), None if alive is None else alive.pool(), self._stream)
-        except RuntimeError as error:
-            what = str(error).strip().split("\n")[0].split(" GPU ")[0].rstrip(".")
-            if "out of memory" in what:
-                raise torch.OutOfMemoryError(
-                    f"The GPU has no memory left to record a substep on a grid of this size ({what}): stop particles "
-                    "that fly away with an EnclosingBox or a Plane, or raise `solver.dx`."
+        with _RECORDING:
+            if alive is None:
+                # memory of dropped graphs and cached memory cannot be used during a recording; after a failed recording
+                # PyTorch refuses to give it back
+                with suppress(RuntimeError):
+                    torch.cuda.synchronize(self.device)  # the dropped graphs may still be running
+                    torch.cuda.empty_cache()
+            stream.wait_stream(torch.cuda.current_stream(self.device))
+            collecting = gc.isenabled()
+            gc.disable()  # freeing another graph during the recording would break it
+            try:
+                # tensors that all graphs share get the mode of the first recording; if that was inference mode, they
+                # could not be written outside it; other threads, such as the recorder's, may continue
+                with torch.cuda.stream(stream), torch.inference_mode(False), torch.no_grad():
+                    graph.capture_begin(None if alive is None else alive.pool(), capture_error_mode="thread_local")
+                    try:
+                        several(size)
+                    except BaseException:
+                        with suppress(RuntimeError):  # the original error matters more
+                            graph.capture_end()
+                        graph.reset()  # the traceback keeps the graph alive, which would keep its memory
+                        raise
+                    graph.capture_end()
+            except RuntimeError as error:
+                what = str(error).strip().split("\n")[0].split(" GPU ")[0].rstrip(".")
+                if "out of memory" in what:
+                    raise torch.OutOfMemoryError(
+                        f"The GPU has no memory left to record a substep on a grid of this size ({what}): stop "
+                        "particles that fly away with an EnclosingBox or a Plane, or raise `solver.dx`."
+                    ) from error
+                if "captur" not in str(error):  # not a problem of the recording
+                    raise
+                raise RuntimeError(
+                    f"A substep cannot be recorded in a CUDA graph ({what}): set `recordable` to False on the boundary "
+                    "or force that makes the host wait, or set `transfer` to torch."
                 ) from error
-            if "captur" not in str(error):  # not a problem of the recording
-                raise
-            raise RuntimeError(
-                f"A substep cannot be recorded in a CUDA graph ({what}): set `recordable` to False on the boundary or "
-                "force that makes the host wait, or set `transfer` to torch."
-            ) from error
+            finally:
+                if collecting:
+                    gc.enable()
+        torch.cuda.current_stream(self.device).wait_stream(stream)
+        return graph
 
     def forget(self, key: Hashable | None = None) -> None:
         """Drop the graphs of one key, or all of them."""

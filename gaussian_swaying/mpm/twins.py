@@ -160,26 +160,6 @@ def device_key(function: Any) -> str:
     return str(getattr(function, "cache_key", "")) + repr(function)
 
 
-class Watched:
-    """Tells whether tensors or modules were replaced or written to since it was asked last."""
-
-    def __init__(self) -> None:
-        self._key: object = None
-        self._held: object = ()  # so that no new object gets the id of an old one
-
-    def changed(self, sources: Sequence[Tensor | nn.Module]) -> bool:
-        """True the first time, if there is a change, and if changes cannot be detected (inference tensors)."""
-        modules = [source for source in sources if isinstance(source, nn.Module)]
-        tensors = [source for source in sources if isinstance(source, Tensor)] + tensors_in(modules)
-        key = None
-        if not any(tensor.is_inference() for tensor in tensors):
-            ids = tuple(map(id, (*modules, *tensors)))
-            key = (ids, fingerprint(modules), tuple(tensor._version for tensor in tensors))
-        new = key is None or key != self._key
-        self._key, self._held = key, (modules, tensors)
-        return new
-
-
 class Tables:
     """Numbers and tables of twins in one buffer; those of a twin are written again only if its sources have changed.
 
@@ -195,34 +175,94 @@ class Tables:
     def __init__(self, device: torch.device, dtype: torch.dtype = torch.float32) -> None:
         self.buffer = torch.zeros(1, dtype=dtype, device=device)
         self._layout: Composed | None = None
-        self._watched: list[Watched] = []
+        self._seen: dict[int, tuple[object, object]] = {}
 
-    def take(self, twins: Sequence[Twin], layout: Composed, numbers: bool = False) -> None:
+    def take(self, twins: Sequence[Twin], layout: Composed, numbers: bool = False) -> bool:
         """Bring the buffer up to date.
 
         Args:
             twins: The twins.
             layout: The same twins, composed.
             numbers: Whether to take the ``numbers`` of these twins, too; those of their parts are always taken.
+
+        Returns:
+            True unless all is as it was; always for tensors of inference mode, whose changes cannot be detected.
         """
         if layout.size > len(self.buffer):
             self.buffer = self.buffer.new_zeros(layout.size)
-        pieces = list(_pieces(twins, layout, 0, numbers))
-        if layout != self._layout:
-            self._layout, self._watched = layout, [Watched() for _ in pieces]
-        for watched, (sources, entries) in zip(self._watched, pieces, strict=True):
-            if entries and watched.changed(sources):
+        changed = layout != self._layout
+        if changed:
+            self._layout, self._seen = layout, {}
+        for k, (twin, entries) in enumerate(_pieces(twins, layout, 0, numbers)):
+            modules = [source for source in twin.sources if isinstance(source, nn.Module)]
+            tensors = [source for source in twin.sources if isinstance(source, Tensor)] + tensors_in(modules)
+            key = None
+            if not any(tensor.is_inference() for tensor in tensors):
+                ids = tuple(map(id, (*modules, *tensors)))
+                key = (ids, fingerprint(modules), tuple(tensor._version for tensor in tensors))
+            if key is None or k not in self._seen or key != self._seen[k][0]:
+                changed, self._seen[k] = True, (key, (modules, tensors))  # so that no new object gets an old id
                 for first, values in entries:
-                    found = torch.as_tensor(values.take())
-                    self.buffer[first : first + values.count].copy_(found.reshape(-1))
+                    if values.count:
+                        self.buffer[first : first + values.count].copy_(torch.as_tensor(values.take()).reshape(-1))
+        return changed
 
 
 def _pieces(
     twins: Sequence[Twin], layout: Composed, start: int, numbers: bool
-) -> Iterator[tuple[tuple[Tensor | nn.Module, ...], list[tuple[int, Numbers]]]]:
-    """Yield what each twin reads from a buffer: its sources, and the place of its numbers and of its table."""
+) -> Iterator[tuple[Twin, list[tuple[int, Numbers]]]]:
+    """Yield each twin and its parts with the places of its numbers and of its table in a buffer."""
     for twin, part, (first, _), table in zip(twins, layout.parts, layout.numbers, layout.tables, strict=True):
         yield from _pieces(twin.parts, part, start + table, True)
-        entries = [(start + first, twin.numbers)] if numbers else []
-        entries += [(start + table + part.size, twin.table)]
-        yield twin.sources, [(place, values) for place, values in entries if values.count]
+        yield twin, [(start + first, twin.numbers if numbers else NONE), (start + table + part.size, twin.table)]
+
+
+class Loads:
+    """The numbers of the forces that kernels compute, at addresses that recordings contain.
+
+    Args:
+        batch: Shape of a field of one number for each point, (..., P).
+        like: Type and device of the numbers.
+
+    Attributes:
+        layout: The forces, composed.
+        tables: Their numbers and tables.
+        vectors: Their numbers of each substep and scene.
+    """
+
+    def __init__(self, batch: torch.Size, like: dict[str, Any]) -> None:
+        self.batch, self.scenes, self.like = batch, max(1, batch[:-1].numel()), like
+        self.twins: Sequence[Twin] = ()
+        self.layout, self.tables, self.vectors = Composed(()), Tables(**like), torch.zeros(0, **like)
+
+    def take(self, twins: Sequence[Twin], steps: int) -> Tensor | None:
+        """Take all but the numbers of a rollout; those of the points, shape (N, n), or None if they are as they were.
+
+        Args:
+            twins: The forces.
+            steps: Most substeps of a rollout.
+        """
+        self.twins, self.layout = twins, Composed(twins)
+        room = steps * self.scenes * self.layout.width
+        if twins and len(self.vectors) < room:
+            self.vectors = torch.zeros(room, **self.like)
+        if not self.tables.take(twins, self.layout):
+            return None
+        values = [twin.per_point.take() for twin in twins if twin.per_point.count]
+        rows = [value.expand(*self.batch, value.shape[-1]).flatten(0, -2) for value in values]
+        return torch.cat(rows, dim=-1) if rows else None
+
+    def begin(self, time: Tensor, dt: Tensor, steps: int) -> None:
+        """Take the numbers of a rollout, from a time on [s]."""
+        for k, (twin, (first, many)) in enumerate(zip(self.twins, self.layout.numbers, strict=True)):
+            if many:
+                self.tables.buffer[first : first + many].copy_(torch.as_tensor(twin.numbers.take()))
+            if twin.per_substep.count:
+                self.write(k, torch.as_tensor(twin.per_substep.take(time, dt, steps)))
+
+    def write(self, force: int, rows: Tensor) -> None:
+        """Write the numbers of a force for some substeps, shape (steps, n) or (steps, scenes, 1, n)."""
+        steps, width = len(rows), self.layout.width
+        first, count = self.layout.per_substep[force]
+        to = self.vectors[: steps * self.scenes * width].view(steps, self.scenes, width)
+        to[..., first : first + count].copy_(rows.reshape(steps, -1, count).expand(-1, self.scenes, -1))

@@ -334,7 +334,7 @@ def test_recorded_measurements_are_those_of_the_frame(make_simulation):
             expected = measure(simulation.solver, end, steps, found.cfl, None, state).read()
             assert found.as_dict() == pytest.approx(expected.as_dict(), rel=1e-6)
             state = end
-    assert simulation.stepper._gauge.replayed.recorded
+    assert any(simulation.stepper._gauge.replayed._repeater._graphs.values())
 
 
 @pytest.mark.parametrize("law", ["paper", "projected"])

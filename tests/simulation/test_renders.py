@@ -182,4 +182,4 @@ def test_motion_and_colours_are_those_of_the_scene_in_every_frame(make_simulatio
     assert not torch.equal(kept[3][0], kept[4][0])
     assert not torch.equal(kept[5][0], kept[6][0])
     if device.type == "cuda":
-        assert painter._moved.recorded
+        assert any(painter._moved._repeater._graphs.values())

@@ -138,8 +138,8 @@ def test_a_changed_effect_is_read_again_at_the_same_address(kernel_device):
             assign(load.wind, flows=load.wind.flows.flip(0))
         ends.append(solver.rollout(state, DT, 5, load))
         _same(ends[-1], reference.rollout(state, DT, 5, load))
-        where = where or solver.fused().tables.buffer.data_ptr()
-        assert solver.fused().tables.buffer.data_ptr() == where
+        where = where or solver.fused().loads.tables.buffer.data_ptr()
+        assert solver.fused().loads.tables.buffer.data_ptr() == where
     assert_close(ends[0].position, ends[1].position, rtol=0, atol=1e-6)
     for one, other in ((1, 2), (2, 3)):
         assert (ends[one].velocity - ends[other].velocity).abs().max() > 1e-3

@@ -26,7 +26,7 @@ from gaussian_swaying.mpm.laws.triton.functions import shared
 from gaussian_swaying.mpm.state import MPMState
 from gaussian_swaying.mpm.timestep import kick_time
 from gaussian_swaying.mpm.triton import shared as kernels
-from gaussian_swaying.mpm.twins import Composed, Tables, Twin, Watched
+from gaussian_swaying.mpm.twins import Loads, Twin
 
 MAX_STEPS = MOST_STEPS
 """Number of substeps whose schedule fits in the buffers; longer rollouts are run in parts."""
@@ -84,12 +84,8 @@ class Fused(ABC):
             self.law = points.law_index.reshape(-1).int()
         self.first_step = torch.zeros(1, dtype=torch.int32, device=self.device)
         self.schedule = torch.zeros(MAX_STEPS + 2, kernels.SCHEDULE, **self.like)
-        self.forces = Composed(())
+        self.loads = Loads(points.mass.shape, self.like)
         """The forces of the current rollout that the kernels compute."""
-        self.vectors = torch.zeros(0, **self.like)
-        """Their numbers of each substep and scene."""
-        self.tables = Tables(self.device, points.position.dtype)
-        self._watched = Watched()
         self.load = torch.zeros(8, self.count, **self.like)
         self.force_in = torch.zeros(0, 4, **self.like)
         self.wave = shared(points.laws, "wave")
@@ -196,33 +192,18 @@ class Fused(ABC):
 
     def options_for(self, twins: Sequence[Twin]) -> dict[str, Any]:
         """Constants of the kernels of a substep with some forces alone, whose numbers are copied if they changed."""
-        before, self.forces = self.forces, Composed(twins)
-        check_indices(self.forces.size)
-        self.tables.take(twins, self.forces)
-        room = MAX_STEPS * self.scenes * self.forces.width
-        if twins and len(self.vectors) < room:
-            self.vectors = torch.zeros(room, **self.like)
-        if self._watched.changed([source for twin in twins for source in twin.sources]) or self.forces != before:
-            batch = self.bound.points.mass.shape
-            values = [twin.per_point.take() for twin in twins if twin.per_point.count]
-            if values:
-                rows = [value.expand(*batch, value.shape[-1]).flatten(0, -2) for value in values]
-                self._take_values(torch.cat(rows, dim=-1))
+        values = self.loads.take(twins, MAX_STEPS)
+        check_indices(self.loads.layout.size)
+        if values is not None:
+            self._take_values(values)
         return {
             "LAWS": self.laws,
             "MULTI": len(self.law_table) > 1,
             "VISCOUS": self.settings.stiffness_damping > 0,
-            "FORCES": self.forces,
+            "FORCES": self.loads.layout,
             "FORCE": False,
             "IMPLICIT": any(twin.implicit for twin in twins),
         }
-
-    def write_substeps(self, force: int, rows: Tensor) -> None:
-        """Write the numbers of a force for some substeps, shape (steps, n) or (steps, scenes, 1, n), to the buffer."""
-        steps, width = len(rows), self.forces.width
-        first, count = self.forces.per_substep[force]
-        to = self.vectors[: steps * self.scenes * width].view(steps, self.scenes, width)
-        to[..., first : first + count].copy_(rows.reshape(steps, -1, count).expand(-1, self.scenes, -1))
 
     def _advance(
         self,
@@ -241,11 +222,7 @@ class Fused(ABC):
 
         def begin(count: int) -> None:
             self.first_step.zero_()
-            for k, (twin, (first, many)) in enumerate(zip(twins, self.forces.numbers, strict=True)):
-                if many:
-                    self.tables.buffer[first : first + many].copy_(torch.as_tensor(twin.numbers.take()))
-                if twin.per_substep.count:
-                    self.write_substeps(k, twin.per_substep.take(self.time, self.dt, count))
+            self.loads.begin(self.time, self.dt, count)
             if loaded:
                 self.load.zero_()
 
@@ -269,11 +246,11 @@ class Fused(ABC):
         """Return the key of the recorded numbers of forces with twins; None if they cannot be recorded."""
         here = all(tensor.device == self.device for tensor in tensors_of(forces))
         recordable = here and all(force.recordable for force in forces)
-        return (*forces, self.forces, fingerprint(forces)) if recordable else None
+        return (*forces, self.loads.layout, fingerprint(forces)) if recordable else None
 
     def places(self) -> tuple[int, int]:
         """Return the addresses of the numbers of forces, which recorded graphs contain."""
-        return self.tables.buffer.data_ptr(), self.vectors.data_ptr()
+        return self.loads.tables.buffer.data_ptr(), self.loads.vectors.data_ptr()
 
     # ---- measures, each in one kernel
 

@@ -271,7 +271,7 @@ class FusedTotal(Fused):
             self.fraction, self.material, self.normals, self.law, self.law_table, self.values, self.force_in, self.load,
             self.order, self.count, self.piece_start, self.piece_node, self.piece_scene, self.pieces, self.piece_nodes,
             self.fields, partial,
-            self.schedule, self.vectors, self.scenes, self.tables.buffer, self.first_step, offset,
+            self.schedule, self.loads.vectors, self.scenes, self.loads.tables.buffer, self.first_step, offset,
             ny * nz, nz, *self.grid.offset, self.grid.node_count, self.grid.dx, 1 / self.grid.dx,
             self.settings.stiffness_damping,
             **options, POSITION=self.position, WIDTH=width, CELLS=per_program, LANES=self.lanes,
@@ -621,7 +621,7 @@ class DifferentiableTotal(FusedTotal):
         self.asked = ()
         self.options = self.options_for(divide(run.forces)[1])
         if numbers is not None:
-            self.tables.buffer[: len(numbers)].copy_(numbers)
+            self.loads.tables.buffer[: len(numbers)].copy_(numbers)
         self._make_room(run.every, loaded)
         self.width = 8 if loaded or self.options["VISCOUS"] else 4
         self.partial = self.sums(self.cells, self.width, "adjoint")
@@ -640,7 +640,7 @@ class DifferentiableTotal(FusedTotal):
             first = n * run.every
             count = min(run.every, run.steps - first)
             if vectors is not None:
-                self.write_substeps(0, vectors[first : first + count])
+                self.loads.write(0, vectors[first : first + count])
             self.schedule[: count + 2].copy_(self.table(run.kicks[n], run.dt, count), non_blocking=True)
             self._segment(run.starts[n], count)
             if shares:
@@ -764,7 +764,7 @@ class DifferentiableTotal(FusedTotal):
             self.fraction, self.material, self.law, self.law_table, self.values, self.count,
             self.piece_start, self.piece_node, self.piece_scene, self.pieces,
             self.fields, self.force_bar, to, self.material_bar, self.shares,
-            self.vectors, self.scenes, self.tables.buffer, self.first_step, offset, self.last,
+            self.loads.vectors, self.scenes, self.loads.tables.buffer, self.first_step, offset, self.last,
             ny * nz, nz, 1 / self.grid.dx, self.settings.stiffness_damping,
             LAWS=self.laws, MULTI=options["MULTI"], FORCES=options["FORCES"], VISCOUS=options["VISCOUS"],
             MATERIAL=flags["MATERIAL"], SHARES=flags["SHARES"], WIDTH=self.width, CELLS=per_program, LANES=self.lanes,

@@ -293,7 +293,7 @@ class FusedUpdated(Fused):
         block = lanes(self.device, 32)
         launch(kernels.updated_particles, (-(-self.count // block),))(
             self.moving, self.order, self.load, self.count,
-            self.momentum, self.velocity, self.schedule, self.vectors, self.scenes, self.tables.buffer,
+            self.momentum, self.velocity, self.schedule, self.loads.vectors, self.scenes, self.loads.tables.buffer,
             self.first_step, offset, self.law_table, self.force_in, *grid.offset, *grid.resolution, grid.dx,
             1 / grid.dx, settings.stiffness_damping, self.particles, self.parts, self.part_node,
             **options, PLASTIC=self.plastic, WIDTH=self.momentum.shape[1], GATHER=gather,

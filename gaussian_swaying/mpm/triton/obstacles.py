@@ -13,7 +13,7 @@ from gaussian_swaying.mpm.boundaries.obstacle import Obstacle
 from gaussian_swaying.mpm.boundaries.plane import KINDS, Plane
 from gaussian_swaying.mpm.forces import MOST_STEPS
 from gaussian_swaying.mpm.triton import obstacle_kernels as kernels
-from gaussian_swaying.mpm.twins import Composed, Tables, Watched
+from gaussian_swaying.mpm.twins import Composed, Tables
 
 Solid = Plane | Obstacle
 
@@ -62,12 +62,10 @@ class Solids:
             keys += many
         self.spans = torch.tensor(spans or [[0, 0]], dtype=torch.int32, device=device)
         self.keys = torch.zeros(max(keys, 1), kernels.KEY.value, dtype=torch.float64, device=device)
-        self._watched = Watched()
 
     def take(self) -> None:
         """Fill the tables; again only if one of the solids was changed."""
-        self.tables.take(self._twins, self.twins, numbers=True)
-        if not self.parts or not self._watched.changed([part for part, _ in self.parts]):
+        if not self.tables.take(self._twins, self.twins, numbers=True):
             return
         keys = []
         for m, ((part, boundary), moves) in enumerate(zip(self.parts, self.moves, strict=True)):
