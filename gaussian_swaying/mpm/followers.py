@@ -9,7 +9,7 @@ import torch
 from torch import Tensor, nn
 
 from gaussian_swaying.geometry.frame import SimFrame
-from gaussian_swaying.kernels.launch import replaces
+from gaussian_swaying.kernels.launch import lanes, launch, replaces
 from gaussian_swaying.mpm.state import GridSpec, MaterialPoints, MPMState, State, bounding_grid
 from gaussian_swaying.mpm.transfer import Stencil, bspline_stencil, gather, scatter
 from gaussian_swaying.mpm.virtual_nodes import first_nodes, point_with_nodes, virtual_nodes
@@ -211,22 +211,27 @@ class GridFollowers(Followers):
             return None
         from gaussian_swaying.mpm.followers_triton import follow
 
-        _, ny, nz = state.grid.resolution
-        return follow(
-            displacement,
-            self.stencil(state.grid),
-            (ny * nz, nz),
-            state.grid.dx,
-            self.arm,
-            frame.direction_to_sim(torch.eye(3, device=means.device)).mT,
-            1 / frame.metres_per_unit,
-            means,
-            covariances,
-            normals,
-            rotations,
-            max_stretch,
-            solid,
-        )
+        fields = displacement.new_zeros(len(displacement), 8)
+        fields[:, :3] = displacement
+        axes = frame.direction_to_sim(torch.eye(3, device=means.device)).mT  # from those of the scene to z up
+        given = [tensor.detach().contiguous() for tensor in (means, covariances, normals)]
+        made = [torch.empty_like(tensor) for tensor in given]
+        turns = torch.empty_like(given[1]) if rotations else given[1]
+        limit = max_stretch is not None and solid is not None
+        keeps = fields if solid is None or not limit else solid.contiguous().view(torch.int8)
+        stencil, (_, ny, nz) = self.stencil(state.grid), state.grid.resolution
+        table = stencil.first if stencil.nodes is None else stencil.nodes.contiguous()
+        count, block = len(means), lanes(fields.device, 128)
+        if count > 0:
+            with torch.cuda.device_of(fields):
+                launch(follow, (-(-count // block),))(
+                    fields, stencil.first, table, stencil.fraction.contiguous(),
+                    fields if self.arm is None else self.arm.contiguous(), axes.contiguous(), *given, keeps, *made,
+                    turns, float(max_stretch or 1) ** 2, 1 / frame.metres_per_unit, count, ny * nz, nz,
+                    1 / state.grid.dx, ARM=self.arm is not None, TURN=rotations, LIMIT=limit, BLOCK=block,
+                    VIRTUAL=stencil.nodes is not None,
+                )  # fmt: skip
+        return made[0], made[1], made[2], turns if rotations else None
 
     def velocity(self, state: MPMState) -> Tensor:
         """Velocity of the material [m/s], shape (M, 3)."""

@@ -1,21 +1,14 @@
 """One kernel for the fields of Gaussians that follow the nodes, for a picture; the definitions are in ``followers``."""
 
-from __future__ import annotations
-
-import torch
-from torch import Tensor
-
 from gaussian_swaying.geometry.linalg_triton import load3, load9, matmul, store3, transpose
 from gaussian_swaying.geometry.patches_triton import deform_and_store
 from gaussian_swaying.kernels.language import tl, triton
-from gaussian_swaying.kernels.launch import lanes, launch
-from gaussian_swaying.mpm.transfer import Stencil
 from gaussian_swaying.mpm.triton.shared import VARIES, axis_weights
 from gaussian_swaying.mpm.triton.total_kernels import gather
 
 
 @triton.jit(do_not_specialize=VARIES)
-def _follow(
+def follow(
     fields, first, table, fraction, arm, axes, means, covariance, normal, solid,
     means_out, covariance_out, normal_out, rotation_out, square, per_metre, count, sx, sy, inverse_dx,
     ARM: tl.constexpr, TURN: tl.constexpr, LIMIT: tl.constexpr, BLOCK: tl.constexpr, VIRTUAL: tl.constexpr,
@@ -55,59 +48,3 @@ def _follow(
     deform_and_store(
         F, covariance, normal, solid, covariance_out, normal_out, rotation_out, square, index, mask, TURN, LIMIT
     )
-
-
-def follow(
-    displacement: Tensor,
-    stencil: Stencil,
-    strides: tuple[int, int],
-    dx: float,
-    arm: Tensor | None,
-    axes: Tensor,
-    per_metre: float,
-    means: Tensor,
-    covariances: Tensor,
-    normals: Tensor,
-    rotations: bool,
-    max_stretch: float | None,
-    solid: Tensor | None,
-) -> tuple[Tensor, Tensor, Tensor, Tensor | None]:
-    """Means, covariances, normals and rotations of Gaussians that follow the nodes; float32, without gradients.
-
-    Args:
-        displacement: Nodal displacement [m], shape (G, 3).
-        stencil: Of the places that are read, with gradients.
-        strides: Nodes from one to the next along x and along y.
-        dx: Grid spacing [m].
-        arm: As in ``Followers``, shape (M, 3), or None.
-        axes: Rotation from scene axes to z up, shape (3, 3), on the device.
-        per_metre: Scene units in a metre.
-        means: Centres at rest [scene units], shape (M, 3).
-        covariances: Covariances at rest, shape (M, 3, 3).
-        normals: Unit normals at rest, shape (M, 3).
-        rotations: Whether to compute the rotations.
-        max_stretch: As in ``patches.deform_all``.
-        solid: As there.
-
-    Returns:
-        Shapes (M, 3), (M, 3, 3), (M, 3) and (M, 3, 3) or None.
-    """
-    count = len(means)
-    fields = displacement.new_zeros(len(displacement), 8)
-    fields[:, :3] = displacement
-    given = [tensor.detach().contiguous() for tensor in (means, covariances, normals)]
-    made = [torch.empty_like(tensor) for tensor in given]
-    turns = torch.empty_like(given[1]) if rotations else given[1]
-    limit = max_stretch is not None and solid is not None
-    keeps = fields if solid is None or not limit else solid.contiguous().view(torch.int8)
-    table = stencil.first if stencil.nodes is None else stencil.nodes.contiguous()
-    block = lanes(fields.device, 128)
-    if count > 0:
-        with torch.cuda.device_of(fields):
-            launch(_follow, (triton.cdiv(count, block),))(
-                fields, stencil.first, table, stencil.fraction.contiguous(),
-                fields if arm is None else arm.contiguous(), axes.contiguous(), *given, keeps, *made, turns,
-                float(max_stretch or 1) ** 2, per_metre, count, *strides, 1 / dx,
-                ARM=arm is not None, TURN=rotations, LIMIT=limit, BLOCK=block, VIRTUAL=stencil.nodes is not None,
-            )  # fmt: skip
-    return made[0], made[1], made[2], turns if rotations else None

@@ -24,7 +24,7 @@ from torch import Tensor
 
 from gaussian_swaying._devices import in_double
 from gaussian_swaying.geometry.rotations import rodrigues, rotation_of
-from gaussian_swaying.kernels.launch import replaces
+from gaussian_swaying.kernels.launch import lanes, launch, replaces
 from gaussian_swaying.mpm.boundaries.boundary import Boundary
 from gaussian_swaying.mpm.boundaries.pinned_points import PinnedPoints
 from gaussian_swaying.mpm.boundaries.pinned_region import PinnedRegion
@@ -37,6 +37,7 @@ from gaussian_swaying.mpm.modal import Analysis, analysis_of
 from gaussian_swaying.mpm.state import MaterialPoints, MPMState, State
 from gaussian_swaying.mpm.total import Total
 from gaussian_swaying.mpm.transfer import gather, scatter
+from gaussian_swaying.mpm.twins import Loads, Twin
 
 MOST_LEAN = 0.4  # over the longest side, that modes can show
 MOST_MODES = 80
@@ -212,8 +213,6 @@ class Modes(Total):
         if torch.is_grad_enabled() and any(tensor.requires_grad for tensor in (*state.tensors(), *given)):
             return None
         if self._site_forces is None:
-            from gaussian_swaying.mpm.triton.sites import SiteForces
-
             with torch.inference_mode(False):
                 self._site_forces = SiteForces(self.site_rest)
         with torch.inference_mode(False), torch.no_grad():
@@ -501,3 +500,51 @@ def _oscillation(square: Tensor, alpha: Tensor, dt: float) -> tuple[Tensor, Tens
     sine = torch.where(over, torch.sinh(torch.where(over, angle, 0.0)), torch.sin(angle)) / rate
     cosine = torch.where(over, torch.cosh(torch.where(over, angle, 0.0)), torch.cos(angle))
     return torch.exp(-alpha * dt), sine, cosine
+
+
+class SiteForces:
+    """The buffers of the kernel of a body's sites.
+
+    Args:
+        rest: Places of the sites at rest [m], shape (..., S, 3).
+    """
+
+    def __init__(self, rest: Tensor) -> None:
+        self.rest, self.sites = rest.contiguous(), rest.shape[-2]
+        self.loads = Loads(rest.shape[:-1], {"dtype": rest.dtype, "device": rest.device})
+        self.values = rest.new_zeros(1)
+
+    def prepare(self, twins: Sequence[Twin], time: Tensor, dt: float, steps: int) -> None:
+        """Take the numbers of the forces for some substeps.
+
+        Args:
+            twins: Those of forces on sites.
+            time: Time at which the first one acts [s], scalar float64 tensor.
+            dt: Substep [s].
+            steps: Number of substeps.
+        """
+        values = self.loads.take(twins, steps)
+        if values is not None:
+            self.values = values.to(self.rest).T.contiguous()
+        self.loads.begin(time, torch.full_like(time, dt), steps)
+
+    def __call__(self, moved: Tensor, step: int) -> Tensor:
+        """The forces in a substep: in the axes of a site and in space [N], and the resistance [kg/s].
+
+        Args:
+            moved: Displacements and turns of the sites, and their rates, shape (..., 6 S, 2).
+            step: Number of the substep since :meth:`prepare`.
+
+        Returns:
+            Shape (..., S, 8), the last column unused.
+        """
+        from gaussian_swaying.mpm.triton.site_kernels import site_forces
+
+        loads, count, out = self.loads, self.rest.shape[:-1].numel(), moved.new_empty(*self.rest.shape[:-1], 8)
+        block = lanes(moved.device, 128)
+        with torch.cuda.device_of(out):
+            launch(site_forces, (-(-count // block),))(
+                moved.contiguous(), self.rest, self.values, loads.vectors, loads.tables.buffer, out, count, self.sites,
+                loads.scenes, step, FORCES=loads.layout, BLOCK=block, num_warps=4,
+            )  # fmt: skip
+        return out

@@ -12,7 +12,6 @@ from gaussian_swaying.gaussians.filling import InteriorFilling
 from gaussian_swaying.geometry.patches import deform_all, deform_patch
 from gaussian_swaying.geometry.regions import Box
 from gaussian_swaying.kernels.language import INTERPRETED
-from gaussian_swaying.mpm import followers_triton
 from gaussian_swaying.mpm.laws.neo_hookean import NeoHookean
 from gaussian_swaying.mpm.solver import MPMSolver
 from gaussian_swaying.scenes.leaves import LeavesScene
@@ -259,6 +258,8 @@ def test_the_default_is_the_grid_where_it_is_possible(make_simulation):
 )
 def test_the_kernel_of_followers_is_their_definition(up, kernel_device, make_scene):
     """With arms (of faint ones), rotations and the limit of the stretch, and without."""
+    if INTERPRETED:
+        pytest.skip("the interpreter takes too long to replace torch")
     for region, stretch in ((None, 1.05), (HALF, None)):
         scene = make_scene(
             fine_flag(0.04), dx=0.15, points="grid", up=up, metres_per_unit=0.5, region=region, max_stretch=stretch
@@ -275,20 +276,13 @@ def test_the_kernel_of_followers_is_their_definition(up, kernel_device, make_sce
         rest = (part.double() for part in own[1:])
         shapes = deform_all(F.double(), *rest, True, stretch, solid)
         expected = (own[0] + scene.frame.displacement_to_scene(move), *shapes)
-        _, ny, nz = state.grid.resolution
-        axes = scene.frame.direction_to_sim(torch.eye(3, device=kernel_device)).mT
-        found = followers_triton.follow(
-            state.node_displacement, scene.follow.stencil(state.grid), (ny * nz, nz), 0.15, scene.follow.arm, axes,
-            2.0, *own, True, stretch, solid,
-        )  # fmt: skip
+        found = scene.follow.drawn(state, scene.frame, *own, True, stretch, solid)
         for a, b in zip(found, expected, strict=True):
             torch.testing.assert_close(a.double(), b.double(), rtol=1e-4, atol=2e-5 * float(b.abs().max()))
-        if not INTERPRETED:
-            drawn = scene.deformed(state)
-            torch.testing.assert_close(drawn.means[scene.moving], found[0])
-            torch.testing.assert_close(drawn.covariances[scene.moving], found[1])
-            still = scene.deformed(MPMSolver(dx=0.15).init_state(scene.points))
-            assert torch.equal(still.means, scene.rest().means)
+        drawn, still = scene.deformed(state), scene.deformed(MPMSolver(dx=0.15).init_state(scene.points))
+        torch.testing.assert_close(drawn.means[scene.moving], found[0])
+        torch.testing.assert_close(drawn.covariances[scene.moving], found[1])
+        assert torch.equal(still.means, scene.rest().means)
 
 
 @pytest.mark.parametrize("law", ["paper", "projected", "linear"])
