@@ -201,7 +201,7 @@ class MPMSolver(Fixed, Solver):
             formulation="auto" if self.automatic else self.formulation,
             cfl=self.cfl,
             substep=self.substep,
-            boundaries=self._conditions(),
+            boundaries=self.framed(None),
             transfer=self.transfer,
         )
 
@@ -253,12 +253,9 @@ class MPMSolver(Fixed, Solver):
             self._bind(self.points.map(fn), None if surface is None else surface.map(fn))
         return self
 
-    def _conditions(self) -> list[Boundary]:
-        return [b for b in self.boundaries if isinstance(b, Boundary)]
-
     def _bind(self, points: MaterialPoints, surface: Surface | None) -> None:
         self._bound = self._fused = None
-        boundaries = self._framed or self._conditions()
+        boundaries = self._framed or self.framed(None)
         if self.may_choose:
             formulation, why = self._choice(points, boundaries, surface)
             assign(self, formulation=formulation, why=why)

@@ -102,8 +102,7 @@ class Total(Formulation):
             assert points.normal is not None
             self.normal = torch.where((points.bending.detach() > 0)[..., None], points.normal, 0.0)
             self.bending_rate = self.bending.fastest(self.node_inverse_mass)
-        self._windows = self._point_windows()
-        self._point_holds = self._hold_points()
+        self.point_holds = self._hold_points()
         self.contact = self._contact()
 
     def _summed(self, values: Tensor) -> Tensor:
@@ -242,19 +241,6 @@ class Total(Formulation):
         E = self.points.youngs_modulus
         self.laws = LawDispatch(replace(self.points, youngs_modulus=torch.where(own, SOFTENED * E, E)))
         return torch.where(own, SOFTENED, 1.0)
-
-    @property
-    def point_holds(self) -> PointHolds | None:
-        """The points that boundaries hold, or None; made again if a boundary got another time window."""
-        windows = self._point_windows()
-        if windows != self._windows:
-            self._windows, self._point_holds = windows, self._hold_points()
-        return self._point_holds
-
-    def _point_windows(self) -> tuple[tuple[float, float], ...]:
-        """The time windows of the boundaries that hold points [s]."""
-        pairs = zip(self.boundaries, self.kinds, strict=True)
-        return tuple((boundary.holds_from, boundary.end) for boundary, kind in pairs if kind in POINTS)
 
     def _hold_points(self) -> PointHolds | None:
         if not any(kind in POINTS for kind in self.kinds):
