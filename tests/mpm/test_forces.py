@@ -12,8 +12,7 @@ from shared import solid, unit
 from torch.testing import assert_close
 
 from gaussian_swaying import AeroForce, Box, Force, MPMSolver, PinnedRegion, SpatialWind, WindField, WindForce
-from gaussian_swaying.mpm.forces import FunctionForce, as_forces, divide
-from gaussian_swaying.mpm.twins import Twin
+from gaussian_swaying.mpm.forces import FunctionForce, as_forces
 
 ROOT = Path(__file__).resolve().parents[2]
 PAGE = (ROOT / "docs" / "forces.md").read_text()
@@ -143,17 +142,6 @@ def test_a_force_says_for_itself_whether_it_can_be_recorded():
     assert not Own().recordable
     assert not FunctionForce(_push).recordable
     assert isinstance(as_forces(_push)[0], FunctionForce)
-
-
-def test_all_forces_with_a_twin_are_fused():
-    *_, wind = _setting()
-    spring, other = Spring(), WindForce(wind.aero, wind.wind, wind.normal, 2 * wind.area)
-    fused, twins, asked = divide([spring, wind, other])
-    assert (fused, asked) == ((wind, other), (spring,))
-    assert [twin.function for twin in twins] == [force.twin().function for force in fused]
-    assert divide([spring]) == ((), [], (spring,))
-    assert spring.twin() is None
-    assert isinstance(wind.twin(), Twin)
 
 
 # ---- wind that depends on the place
