@@ -44,7 +44,6 @@ class Part:
         options: Constants of the kernels.
         looks: Numbers of the substeps after which the wave speed is measured.
         loaded: Whether the work of a load is counted.
-        begin: ``begin(n)`` fills what n substeps read besides the state and the schedule.
         key: Key of the data that ``begin`` reads; None if it cannot be recorded.
     """
 
@@ -52,7 +51,6 @@ class Part:
     options: dict[str, Any]
     looks: list[int]
     loaded: bool
-    begin: Callable[[int], None]
     key: tuple[object, ...] | None
 
 
@@ -179,16 +177,28 @@ class Fused(ABC):
                     self.force_in = torch.zeros(self.count, 4, **self.like)
                 self.force_in.zero_()
                 self._fill(force, drag)
+            loaded = len(twins) > 0 or options["FORCE"]
             for first in range(0, steps, MAX_STEPS):
-                part = min(steps - first, MAX_STEPS)
-                marks = [look - first for look in looks if first < look <= first + part]
-                before = state.work
-                state = self._advance(state, dt, part, fused, twins, options, marks)
-                if force is None and not forces:  # the work of a drag alone is not counted
-                    state = state.replace(work=before)
+                count = min(steps - first, MAX_STEPS)
+                marks = [look - first for look in looks if first < look <= first + count]
+                self.schedule[: count + 2].copy_(self.table(kick_time(state, dt), dt, count), non_blocking=True)
+                self.time.copy_(state.time)
+                self.dt.fill_(dt)
+                changes = self._run(state, Part(count, options, marks, loaded, self._key_of(fused)))
+                changes["impulse"] = state.impulse + changes["impulse"]
+                work = changes.pop("work", 0.0) if forces or force is not None else 0.0  # not that of a drag alone
+                changes |= {"work": state.work + work, "time": state.time + count * dt, "substep": dt}
+                state = self.bound.in_shape(state.replace(**changes))
                 if watch is not None:
-                    watch(first + part)
+                    watch(first + count)
             return state, self.speed[0] / self.settings.dx
+
+    def begin(self, steps: int, loaded: bool) -> None:
+        """Fill what some substeps read besides the state and the schedule."""
+        self.first_step.zero_()
+        self.loads.begin(self.time, self.dt, steps)
+        if loaded:
+            self.load.zero_()
 
     def options_for(self, twins: Sequence[Twin]) -> dict[str, Any]:
         """Constants of the kernels of a substep with some forces alone, whose numbers are copied if they changed."""
@@ -204,34 +214,6 @@ class Fused(ABC):
             "FORCE": False,
             "IMPLICIT": any(twin.implicit for twin in twins),
         }
-
-    def _advance(
-        self,
-        state: MPMState,
-        dt: float,
-        steps: int,
-        forces: Sequence[Force],
-        twins: Sequence[Twin],
-        options: dict[str, Any],
-        looks: list[int],
-    ) -> MPMState:
-        self.schedule[: steps + 2].copy_(self.table(kick_time(state, dt), dt, steps), non_blocking=True)
-        self.time.copy_(state.time)
-        self.dt.fill_(dt)
-        loaded = len(twins) > 0 or options["FORCE"]
-
-        def begin(count: int) -> None:
-            self.first_step.zero_()
-            self.loads.begin(self.time, self.dt, count)
-            if loaded:
-                self.load.zero_()
-
-        part = Part(steps, options, looks, loaded, begin, self._key_of(forces))
-        changes = self._run(state, part)
-        changes["impulse"] = state.impulse + changes["impulse"]
-        if loaded:
-            changes["work"] = state.work + changes["work"]
-        return self.bound.in_shape(state.replace(time=state.time + steps * dt, substep=dt, **changes))
 
     def table(self, kick: float, dt: float, steps: int) -> Tensor:
         """The schedule on the host, which can be copied without making it wait."""

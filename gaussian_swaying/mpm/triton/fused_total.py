@@ -205,12 +205,10 @@ class FusedTotal(Fused):
         )
 
     def _run(self, state: MPMState, part: Part) -> dict[str, Any]:
-        if self.touching is None:
-            return self._run_once(state, part)
         fastest = self.speed.clone()
         while True:
             changes = self._run_once(state, part)
-            if self.touching.fits():
+            if self.touching is None or self.touching.fits():
                 return changes
             self.speed.copy_(fastest)  # again, with more room
             self.time.copy_(state.time)
@@ -223,7 +221,7 @@ class FusedTotal(Fused):
             self.touching.take()
 
         def begin(_: int) -> None:
-            part.begin(len(self.schedule) - 2)
+            self.begin(len(self.schedule) - 2, part.loaded)
             more = [] if self.touching is None or not self.touching.walls else [self.touching.pressed_sum]
             for buffer in (self.taken, self.impulse, *more, *([] if self.points is None else [self.residual])):
                 buffer.zero_()

@@ -139,7 +139,7 @@ class FusedUpdated(Fused):
 
     def _run(self, state: MPMState, part: Part) -> dict[str, Any]:
         steps, options, looks, real = part.steps, part.options, part.looks, self.like["dtype"]
-        part.begin(steps)
+        self.begin(steps, part.loaded)
         self._take_grid(state.grid, 8 if options["IMPLICIT"] else 4)
         self.impulse.zero_()
         self.pressed.zero_()
