@@ -108,22 +108,18 @@ class Joints(Force):
         total, turn = (at.new_zeros(len(joints)).index_add(0, owner, part) for part in (easy, light))
         stiffness, turning = (torch.tensor([getattr(j, n) for j in joints]).to(like) for n in ("stiffness", "turning"))
         rigid = longest**2 / SHARE
-        self.register_buffer("stiffness", 1 / (1 / stiffness + rigid * total))
-        self.register_buffer("turning", 1 / (1 / turning + rigid * turn))
-        self.register_buffer("index", index)
-        self.register_buffer("of", of)
-        self.register_buffer("mass", mass)
-        self.register_buffer("arm", arm)
-        self.register_buffer("size", size)
-        self.register_buffer("whole", whole)
-        self.register_buffer("offset", offset)
-        self.register_buffer("extra", extra.to(like))
-        self.register_buffer("owner", owner)
-        self.register_buffer("sign", torch.where(torch.arange(count) < len(joints), 1.0, -1.0).to(like))
         place = torch.ones(len(joints), dtype=torch.bool)
         place[paired] = False
-        self.register_buffer("place", place.to(like.device)[:, None].to(like) * at)
-        self.register_buffer("still", place.to(like.device)[:, None, None].to(like) * eye)
+        still = place.to(like.device)[:, None].to(like)
+        buffers = {
+            "stiffness": 1 / (1 / stiffness + rigid * total),
+            "turning": 1 / (1 / turning + rigid * turn),
+            **{"index": index, "of": of, "mass": mass, "arm": arm, "size": size, "whole": whole, "offset": offset},
+            **{"extra": extra.to(like), "owner": owner, "place": still * at, "still": still[:, None] * eye},
+            "sign": torch.where(torch.arange(count) < len(joints), 1.0, -1.0).to(like),
+        }
+        for name, value in buffers.items():
+            self.register_buffer(name, value)
         self.stiffness: Tensor
         self.turning: Tensor
         self.index: Tensor

@@ -14,10 +14,10 @@ the points that have the same nodes, in the middle of a substep; their drag acts
 from __future__ import annotations
 
 import math
-import weakref
 from collections.abc import Callable, Sequence
 from functools import cached_property
 from typing import Any
+from weakref import WeakKeyDictionary
 
 import torch
 from torch import Tensor
@@ -31,7 +31,7 @@ from gaussian_swaying.mpm.boundaries.pinned_region import PinnedRegion
 from gaussian_swaying.mpm.boundaries.rigid_region import RigidRegion
 from gaussian_swaying.mpm.contact import Surface
 from gaussian_swaying.mpm.damping import decay_rate
-from gaussian_swaying.mpm.forces import Force, split, tensors_of
+from gaussian_swaying.mpm.forces import Force, added, split, tensors_of
 from gaussian_swaying.mpm.formulation import Settings, flowing
 from gaussian_swaying.mpm.modal import Analysis, analysis_of
 from gaussian_swaying.mpm.state import MaterialPoints, MPMState, State
@@ -130,7 +130,7 @@ class Modes(Total):
         self._unlost = torch.zeros(self.site_mass.shape, dtype=torch.bool, device=like.device)
         self.dropped = max(one.dropped for one in found)
         self._site_forces: Any = None
-        self._forces: dict[int, tuple[weakref.ref[Force], Force | None]] = {}
+        self._forces: WeakKeyDictionary[Force, Force | None] = WeakKeyDictionary()
 
     # ---- numbers that may have a gradient
 
@@ -194,11 +194,9 @@ class Modes(Total):
 
     def _grouped(self, force: Force) -> Force | None:
         """A force on the sites, made once; None if it has to see all points."""
-        known = self._forces.get(id(force))
-        if known is None or known[0]() is not force:
-            self._forces = {key: own for key, own in self._forces.items() if own[0]() is not None}
-            known = self._forces[id(force)] = weakref.ref(force), force.on_sites(self.site, self.sites)
-        return known[1]
+        if force not in self._forces:
+            self._forces[force] = force.on_sites(self.site, self.sites)
+        return self._forces[force]
 
     def _mean_at_sites(self, values: Tensor) -> Tensor:
         mass = self.points.mass.detach()[..., None]
@@ -278,7 +276,7 @@ class Modes(Total):
         middle = state.time + 0.5 * dt
         groups = [self._grouped(force) for force in forces]
         kernel = self._kernel(state, groups, middle, dt, steps)
-        sources = [None if one is None or kernel else one.during(middle, dt, steps) for one in groups]
+        acting = [] if kernel else [(one, one.during(middle, dt, steps)) for one in groups if one is not None]
         square, inertia, ratio = self.square, self.inertia, self.ratio
         alpha = ratio * square.sqrt()
         decay, sine, cosine = _oscillation(square, alpha, dt)
@@ -290,7 +288,7 @@ class Modes(Total):
         lagging = self._lagging(state, forces, groups)
         for k in range(steps):
             time = state.time + (k + 0.5) * dt
-            weighs, resistance = any(self.settings.gravity), None
+            weighs = any(self.settings.gravity)
             moved = self.site_modes @ torch.stack([q + 0.5 * dt * p, p], -1)
             seen = None if kernel and not weighs else self._site_state(moved, time)
             if kernel is not None:
@@ -299,14 +297,8 @@ class Modes(Total):
                 outer = self._of_sites(found[..., :3])
             else:
                 assert seen is not None
-                load = torch.zeros_like(seen.velocity)
-                for source, force in zip(sources, groups, strict=True):
-                    if source is not None:
-                        assert force is not None
-                        value, against = split(source(seen, k), force, seen)
-                        load = load + value
-                        if against is not None:
-                            resistance = against if resistance is None else resistance + against
+                given, resistance = added([split(source(seen, k), force, seen) for force, source in acting])
+                load = torch.zeros_like(seen.velocity) if given is None else given
                 outer = self._pull(seen.F_total, load)
             general = None if lagging is None else lagging(q, p, state.time + k * dt)
             if solve is None:
@@ -388,12 +380,7 @@ class Modes(Total):
         def at(q: Tensor, p: Tensor, time: Tensor) -> tuple[Tensor, Tensor | None, Tensor]:
             now = self.shown(state.replace(time=time), q, p)
             turn = self._everywhere(_vectors(self.turn, q[..., None])[..., 0])
-            load, drag = None, None
-            for force in others:
-                value, against = split(force(now), force, now)
-                load = value if load is None else load + value
-                if against is not None:
-                    drag = against if drag is None else drag + against
+            load, drag = added([split(force(now), force, now) for force in others])
             assert load is not None
             pulled = self._project(_turned(rotation_of(-turn), scatter(self.stencil, load[..., None, :])))
             if drag is None:
