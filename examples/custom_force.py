@@ -1,4 +1,4 @@
-"""A force of your own: air that circles a vertical axis in gusts, in torch and inside the compiled kernels.
+"""A force of your own: air that circles a vertical axis in gusts, one function for torch and the compiled kernels.
 
 ``python examples/custom_force.py`` compares the two, and checks the circulation. A YAML names the force as
 ``forces: [{class_path: custom_force.PointVortex, init_args: {center: [0.1, 0.1], circulation: 3.0}}]``.
@@ -11,7 +11,6 @@ from torch import Tensor
 
 from gaussian_swaying import Force, MaterialPoints, MPMSolver
 from gaussian_swaying.kernels.language import tl, triton
-from gaussian_swaying.mpm.state import State
 from gaussian_swaying.mpm.twins import Numbers, Twin
 
 
@@ -32,16 +31,8 @@ class PointVortex(Force):
         """The circulation over two pi at times [s] of any shape."""
         return self.circulation / (2 * math.pi) * (1 + 0.5 * torch.sin(2 * math.pi * time / self.period))
 
-    def forward(self, state: State) -> tuple[Tensor, Tensor]:
-        """Drag and its resistance: the definition."""
-        x, y, core = self.numbers.to(state.position)
-        x, y = state.position[..., 0] - x, state.position[..., 1] - y
-        turn = self.turn(state.time).to(x) / (x * x + y * y + core)
-        drag = self.drag.to(x).expand_as(x)
-        return drag[..., None] * (torch.stack([-turn * y, turn * x, 0 * x], -1) - state.velocity), drag
-
     def twin(self) -> Twin | None:
-        """The same for the kernels: one number per point (zero where there is none), three for all, one per substep."""
+        """One number per point (zero where there is none), three for all, one per substep."""
 
         def turns(time: Tensor, dt: Tensor, steps: int) -> Tensor:
             return self.turn(time + dt * torch.arange(steps, dtype=torch.float64, device=time.device))[:, None]
@@ -52,7 +43,7 @@ class PointVortex(Force):
 
 @triton.jit
 def circling_air(F, velocity, position, point, numbers, now, table, OPTIONS: tl.constexpr):  # noqa: ANN001, ANN201
-    """As ``PointVortex.forward``."""
+    """Drag and its resistance."""
     x, y, drag = position[0] - numbers[0], position[1] - numbers[1], point[0]
     turn = now[0] / (x * x + y * y + numbers[2])
     return (drag * (-turn * y - velocity[0]), drag * (turn * x - velocity[1]), -drag * velocity[2]), drag

@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
-from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
+from typing import Any
 
+import torch
 from torch import Tensor, nn
 
 from gaussian_swaying._checks import check_like, check_shape
 from gaussian_swaying.geometry.frame import SimFrame
+from gaussian_swaying.kernels.derive import Memory, on_tensors
 from gaussian_swaying.kernels.graphs import Recordable, tensors_in
 from gaussian_swaying.mpm.state import State
-from gaussian_swaying.mpm.twins import Twin, Twinned
+from gaussian_swaying.mpm.twins import Composed, Twin, Twinned
 
 MOST_STEPS = 256
 """Largest number of substeps for which the numbers of a twin are taken at once."""
@@ -22,12 +24,13 @@ Given = Tensor | tuple[Tensor, Tensor | None]
 ForceFunction = Callable[[State], Given]
 
 
-class Force(Recordable, Twinned, nn.Module, ABC):
+class Force(Recordable, Twinned, nn.Module):
     """Base class of all forces: computes the force on every particle from the state, in torch.
 
-    A custom force is a subclass with a ``forward``. It may have numbers, tensors (``register_buffer``) and parameters;
-    they receive gradients. Move it to the device of the material, like any module. With a ``twin``, it is computed
-    inside the kernels of the substep (:mod:`~gaussian_swaying.mpm.twins`).
+    A custom force is a subclass with a ``forward`` in torch, or with a ``twin``, one device function, which also runs
+    inside the kernels of the substep (:mod:`~gaussian_swaying.mpm.twins`). It may have numbers, tensors
+    (``register_buffer``) and parameters; they receive gradients. Move it to the device of the material, like any
+    module.
 
     Attributes:
         recordable: Whether ``forward`` may be recorded in a CUDA graph with the substep: it must depend only on the
@@ -44,9 +47,8 @@ class Force(Recordable, Twinned, nn.Module, ABC):
         ...         return 0.1 * state.position.new_tensor([0.0, 0.0, -9.8]).expand_as(state.position)
     """
 
-    @abstractmethod
     def forward(self, state: State) -> Given:
-        """The force at the start of a substep.
+        """The force at the start of a substep: that of the twin, also of a subclass that has none of its own.
 
         Args:
             state: The state at that time.
@@ -56,6 +58,10 @@ class Force(Recordable, Twinned, nn.Module, ABC):
             gained in the substep [kg/s], shape (..., P). A force with a resistance acts at the velocity at the end of
             the substep, so it is stable for particles of any mass.
         """
+        twin = self.nearest_twin()
+        if twin is None:
+            raise NotImplementedError(f"{type(self).__name__} needs a `forward(state)` or a `twin`.")
+        return of_twin(twin, state)
 
     def in_frame(self, frame: SimFrame) -> Force:
         """The same force with its positions converted from scene units to metres, z up; itself if it has none.
@@ -90,6 +96,23 @@ class Force(Recordable, Twinned, nn.Module, ABC):
             A force on a state whose points are the groups.
         """
         return None
+
+
+def of_twin(twin: Twin, state: State) -> Given:
+    """The device function of a force on tensors, as :meth:`Force.forward`."""
+    like = state.position
+
+    def scalars(given: Any) -> tuple[Tensor, ...]:
+        return torch.as_tensor(given).to(like).unbind(-1)
+
+    now = twin.per_substep.take(state.time, torch.zeros_like(state.time), 1)[0] if twin.per_substep.count else ()
+    point, numbers = (scalars(values.take()) for values in (twin.per_point, twin.numbers))
+    F, table = state.F_total.flatten(-2).unbind(-1), Memory(torch.as_tensor(twin.table.take()).to(like))
+    options = (*twin.options, Composed(twin.parts))
+    given = (F, state.velocity.unbind(-1), like.unbind(-1), point, numbers, scalars(now), table, options)
+    force, resistance = on_tensors(twin.function)(*given)
+    value = torch.stack([part.expand(like.shape[:-1]) for part in force], -1)
+    return (value, resistance.expand(like.shape[:-1])) if twin.implicit else value
 
 
 class FunctionForce(Force):

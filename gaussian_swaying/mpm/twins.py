@@ -93,6 +93,12 @@ class Twinned(Fixed):
         """The compiled twin; None for a component that runs in torch only. It is cheap: numbers are taken later."""
         return None
 
+    def nearest_twin(self) -> Twin | None:
+        """The twin, or else that of the nearest base that has one, which is the definition in torch, too."""
+        own = (vars(kind).get("twin", Twinned.twin) for kind in type(self).__mro__)
+        found: Twin | None = next((twin for twin in own if twin is not Twinned.twin), Twinned.twin)(self)
+        return found
+
 
 class Composed:
     """The device functions of several twins, and where each finds its numbers, as one constant of a compiled kernel.

@@ -91,10 +91,12 @@ class WindEffect(Recordable, Twinned, nn.Module):
         Returns:
             Velocity [m/s], broadcastable to (..., P, 3).
         """
-        for kind in type(self).__mro__:
-            if vars(kind).get("twin", Twinned.twin) is not Twinned.twin:
-                return blown(vars(kind)["twin"](self), velocity, position, moment)
-        raise NotImplementedError(f"{type(self).__name__} needs a `forward(velocity, position, moment)` or a `twin`.")
+        twin = self.nearest_twin()
+        if twin is None:
+            raise NotImplementedError(
+                f"{type(self).__name__} needs a `forward(velocity, position, moment)` or a `twin`."
+            )
+        return blown(twin, velocity, position, moment)
 
     def in_frame(self, frame: SimFrame) -> WindEffect:
         """The same effect with its places converted from scene units to metres, z up; itself if it has none."""

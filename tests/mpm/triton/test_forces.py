@@ -186,13 +186,6 @@ class _Toward(Force):
     def along(self, time):
         return torch.stack([300 * time + 9, -5 + 0 * time, 1 + 2000 * time], dim=-1)
 
-    def forward(self, state):
-        scale = self.share[..., 0] * 2.5 * state.F_total[..., 0, 0]
-        force = scale[..., None] * self.along(state.time).to(scale)
-        if not self.resists:
-            return force
-        return force - self.share[..., 1:] * state.velocity, self.share[..., 1]
-
     def twin(self):
         return Twin(
             _toward,
