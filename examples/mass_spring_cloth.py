@@ -15,7 +15,7 @@ from torch import Tensor, nn
 
 from gaussian_swaying import AeroForce, Box, Material, MaterialPoints, MPMSolver, PinnedRegion, Simulation
 from gaussian_swaying.geometry.neighbours import nearest_neighbours
-from gaussian_swaying.mpm.boundaries.boundary import Boundary
+from gaussian_swaying.mpm.boundary import Boundary
 from gaussian_swaying.mpm.forces import as_forces, split
 from gaussian_swaying.mpm.protocol import Solver
 from gaussian_swaying.mpm.state import State

@@ -14,12 +14,12 @@ from .geometry.regions import Cylinder as Cylinder
 from .geometry.regions import Sphere as Sphere
 from .metrics.chamfer import chamfer_distance as chamfer_distance
 from .metrics.frechet_video import frechet_distance as frechet_distance
-from .mpm.boundaries.boundary import Boundary as Boundary
-from .mpm.boundaries.pinned_points import PinnedPoints as PinnedPoints
-from .mpm.boundaries.pinned_region import PinnedRegion as PinnedRegion
+from .mpm.boundary import Boundary as Boundary
 from .mpm.contact import Contact as Contact
 from .mpm.forces import Force as Force
 from .mpm.laws.law import ConstitutiveLaw as ConstitutiveLaw
+from .mpm.pins import PinnedPoints as PinnedPoints
+from .mpm.pins import PinnedRegion as PinnedRegion
 from .mpm.solver import MPMSolver as MPMSolver
 from .mpm.state import MaterialPoints as MaterialPoints
 from .mpm.state import MPMState as MPMState

@@ -5,8 +5,18 @@ from pathlib import Path
 import torch
 
 from gaussian_swaying.geometry.distance import DistanceGrid
-from gaussian_swaying.mpm.boundaries import BOUNDARIES
+from gaussian_swaying.mpm import colliders, pins
+from gaussian_swaying.mpm.boundary import Boundary
 from gaussian_swaying.mpm.laws import LAWS
+
+BOUNDARIES = {
+    name: found
+    for file in (colliders, pins)
+    for name, found in vars(file).items()
+    if getattr(found, "__module__", "") == file.__name__ and isinstance(found, type)
+    if issubclass(found, Boundary) and found is not colliders.Obstacle
+}
+"""The boundary conditions of the package by name."""
 
 MESH = str(Path(__file__).parent / "mpm" / "boundaries" / "octahedron.obj")
 

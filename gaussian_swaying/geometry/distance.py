@@ -1,69 +1,128 @@
-"""Signed distances to solids, with their gradients: formulas, and values on a grid."""
+"""Signed distances to solids and their unit gradients, as device functions: formulas, and values on a grid.
+
+Each gets a place, the numbers of the solid and its table, negative inside. They are those of obstacles, see
+``mpm.twins``.
+"""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 from torch import Tensor
 
+from gaussian_swaying.geometry.linalg_triton import chosen, dot3, matvec, transpose
+from gaussian_swaying.kernels.derive import Memory, on_tensors
+from gaussian_swaying.kernels.language import tl, triton
 
-def _outwards(vector: Tensor, fallback: int) -> tuple[Tensor, Tensor]:
-    """Length (...) and direction (..., 3) of vectors; a zero vector points along the axis ``fallback``."""
-    length = torch.linalg.vector_norm(vector, dim=-1)
-    some = length > torch.finfo(vector.dtype).tiny ** 0.5
-    axis = torch.zeros_like(vector)
-    axis[..., fallback] = 1.0
-    return length, torch.where(some[..., None], vector / torch.where(some, length, 1.0)[..., None], axis)
+LEAST = tl.constexpr(1.0842022e-19)
+"""Length of a vector without a direction: the square root of the smallest normal number."""
 
 
-def ball_distance(place: Tensor, radius: float | Tensor) -> tuple[Tensor, Tensor]:
-    """Signed distance to a ball around the origin, negative inside.
+@triton.jit
+def _outwards(x):
+    """Length and direction of a vector; z for one without a direction."""
+    length = tl.sqrt(dot3(x, x))
+    some = length > LEAST
+    scale = 1 / tl.where(some, length, 1.0)
+    return length, (
+        tl.where(some, x[0] * scale, 0.0), tl.where(some, x[1] * scale, 0.0), tl.where(some, x[2] * scale, 1.0)
+    )  # fmt: skip
 
-    Args:
-        place: Places, shape (..., 3).
-        radius: Its radius.
 
-    Returns:
-        Distances, shape (...), and their gradients, unit vectors (..., 3); z at the centre.
+@triton.jit
+def ball_distance(x, numbers, table, mask, OPTIONS: tl.constexpr):
+    """From a ball around the origin; ``numbers``: radius."""
+    length, direction = _outwards(x)
+    return length - numbers[0], direction
+
+
+@triton.jit
+def capsule_distance(x, numbers, table, mask, OPTIONS: tl.constexpr):
+    """From all places within a radius of a segment around the origin.
+
+    ``numbers``: radius, half of the axis (3), one over the square of that.
     """
-    length, direction = _outwards(place, 2)
-    return length - radius, direction
+    half = (numbers[1], numbers[2], numbers[3])
+    along = dot3(x, half) * numbers[4]
+    along = tl.minimum(tl.maximum(along, -1.0), 1.0)
+    x = (x[0] - along * half[0], x[1] - along * half[1], x[2] - along * half[2])
+    return ball_distance(x, numbers, table, mask, OPTIONS)
 
 
-def capsule_distance(place: Tensor, half: Tensor, radius: float | Tensor) -> tuple[Tensor, Tensor]:
-    """Signed distance to a capsule: all places within a radius of the segment from ``-half`` to ``half``.
-
-    Args:
-        place: Places, shape (..., 3).
-        half: Half of its axis, shape (3,); zero for a ball.
-        radius: Its radius.
-
-    Returns:
-        Distances, shape (...), and their gradients, unit vectors (..., 3).
-    """
-    squared = (half * half).sum().clamp(min=torch.finfo(half.dtype).tiny)
-    along = ((place * half).sum(-1) / squared).clamp(-1.0, 1.0)
-    return ball_distance(place - along[..., None] * half, radius)
-
-
-def box_distance(place: Tensor, half: Tensor) -> tuple[Tensor, Tensor]:
-    """Signed distance to a box around the origin with sides along the axes.
-
-    Args:
-        place: Places, shape (..., 3).
-        half: Half of its sides, shape (3,).
-
-    Returns:
-        Distances, shape (...), and their gradients, unit vectors (..., 3): of the nearest face inside the box.
-    """
-    beyond = place.abs() - half
-    sign = torch.where(place < 0, -1.0, 1.0).to(place)
-    outside, away = _outwards(beyond.clamp(min=0.0), 2)
-    deepest, axis = beyond.max(-1)
-    face = torch.nn.functional.one_hot(axis, 3).to(place)
+@triton.jit
+def box_distance(x, numbers, table, mask, OPTIONS: tl.constexpr):
+    """From a box around the origin; ``numbers``: half of the sides (3), axes in columns (9)."""
+    axes = chosen(numbers, 3, 9)
+    x = matvec(transpose(axes), x)
+    b = (tl.abs(x[0]) - numbers[0], tl.abs(x[1]) - numbers[1], tl.abs(x[2]) - numbers[2])
+    outside, away = _outwards((tl.maximum(b[0], 0.0), tl.maximum(b[1], 0.0), tl.maximum(b[2], 0.0)))
+    deepest = tl.maximum(tl.maximum(b[0], b[1]), b[2])
     within = deepest <= 0
-    return torch.where(within, deepest, outside), sign * torch.where(within[..., None], face, away)
+    first = b[0] == deepest
+    second = (b[1] == deepest) & (b[0] != deepest)
+    n0 = tl.where(within, first.to(tl.float32), away[0])
+    n1 = tl.where(within, second.to(tl.float32), away[1])
+    n2 = tl.where(within, 1 - (first | second).to(tl.float32), away[2])
+    n = (tl.where(x[0] < 0, -n0, n0), tl.where(x[1] < 0, -n1, n1), tl.where(x[2] < 0, -n2, n2))
+    return tl.where(within, deepest, outside), matvec(axes, n)
+
+
+@triton.jit
+def half_space_distance(x, numbers, table, mask, OPTIONS: tl.constexpr):
+    """From a plane through the origin; ``numbers``: its normal."""
+    zero = x[0] * 0
+    return dot3(x, numbers), (numbers[0] + zero, numbers[1] + zero, numbers[2] + zero)
+
+
+@triton.jit
+def _low(x, n):
+    """Return the node below a place along an axis of n nodes, within the grid, and the distance beyond it."""
+    inside = tl.minimum(tl.maximum(x, 0.0), (n - 1).to(tl.float32))
+    first = tl.maximum(tl.minimum(tl.floor(inside), (n - 2).to(tl.float32)), 0.0)
+    return first.to(tl.int32), inside - first, x - inside
+
+
+@triton.jit
+def grid_distance(x, numbers, table, mask, OPTIONS: tl.constexpr):
+    """Trilinear interpolation; beyond the grid, the value at its border plus the distance to it.
+
+    ``numbers``: first node (3), axes in columns (9), spacing, nodes along each axis (3). ``table``: the distances.
+    """
+    axes = chosen(numbers, 3, 9)
+    spacing = numbers[12]
+    ny = numbers[14].to(tl.int32)
+    nz = numbers[15].to(tl.int32)
+    x = matvec(transpose(axes), x)
+    x0, f0, o0 = _low((x[0] - numbers[0]) / spacing, numbers[13].to(tl.int32))
+    x1, f1, o1 = _low((x[1] - numbers[1]) / spacing, ny)
+    x2, f2, o2 = _low((x[2] - numbers[2]) / spacing, nz)
+    zero = f0 * 0
+    distance, s0, s1, s2 = zero, zero, zero, zero
+    for i in tl.static_range(2):
+        for j in tl.static_range(2):
+            line = ((x0 + i) * ny + x1 + j) * nz + x2
+            low = tl.load(table + line, mask, 0.0)
+            high = tl.load(table + line + 1, mask, 0.0)
+            if i == 0:
+                w0 = 1 - f0
+            else:
+                w0 = f0
+            if j == 0:
+                w1 = 1 - f1
+            else:
+                w1 = f1
+            between = low + f2 * (high - low)
+            distance += w0 * w1 * between
+            s0 += (2 * i - 1) * w1 * between
+            s1 += (2 * j - 1) * w0 * between
+            s2 += w0 * w1 * (high - low)
+    far, away = _outwards((o0 * spacing, o1 * spacing, o2 * spacing))
+    _length, n = _outwards((s0, s1, s2))
+    out = far > 0
+    n = (tl.where(out, away[0], n[0]), tl.where(out, away[1], n[1]), tl.where(out, away[2], n[2]))
+    return distance + far, matvec(axes, n)
 
 
 @dataclass(frozen=True, slots=True)
@@ -80,42 +139,18 @@ class DistanceGrid:
     origin: Tensor
     spacing: float
 
+    def numbers(self, axes: Tensor) -> Tensor:
+        """Those of :func:`grid_distance`, shape (16,), with the axes in columns."""
+        sizes = [self.origin.new_full((1,), size) for size in (self.spacing, *self.values.shape)]
+        return torch.cat([self.origin, axes.to(self.origin).reshape(-1), *sizes])
+
     def at(self, place: Tensor) -> tuple[Tensor, Tensor]:
-        """Trilinear interpolation; beyond the grid, the value at its border plus the distance to it.
-
-        Args:
-            place: Places [m], shape (..., 3).
-
-        Returns:
-            Distances [m], shape (...), and unit gradients, shape (..., 3).
-        """
-        return grid_distance(place, self.values, self.origin, self.spacing)
+        """Distances [m], shape (...), and unit gradients at places [m], shape (..., 3)."""
+        return distance_at(grid_distance, place, self.numbers(torch.eye(3)), self.values)
 
 
-def grid_distance(place: Tensor, values: Tensor, origin: Tensor, spacing: float) -> tuple[Tensor, Tensor]:
-    """:meth:`DistanceGrid.at` from its tensors."""
-    values, size = values.to(place), [n - 1 for n in values.shape]
-    most = torch.stack([(place[..., 0] * 0 + n) for n in size], dim=-1)
-    lattice = (place - origin.to(place)) / spacing
-    inside = lattice.clamp(min=0.0).minimum(most)
-    first = inside.detach().floor().minimum(most - 1).clamp(min=0.0)
-    f = inside - first
-    x, y, z = first.long().unbind(-1)
-    _, ny, nz = values.shape
-    flat = values.reshape(-1)
-    distance = torch.zeros_like(f[..., 0])
-    slope = [torch.zeros_like(distance) for _ in range(3)]
-    for i in range(2):
-        for j in range(2):
-            for k in range(2):
-                corner = flat[((x + i) * ny + y + j) * nz + z + k]
-                w = [f[..., a] if bit else 1 - f[..., a] for a, bit in enumerate((i, j, k))]
-                distance = distance + w[0] * w[1] * w[2] * corner
-                for a, bit in enumerate((i, j, k)):
-                    other = w[(a + 1) % 3] * w[(a + 2) % 3]
-                    slope[a] = slope[a] + (corner if bit else -corner) * other
-    beyond = (lattice - inside) * spacing
-    far, away = _outwards(beyond, 2)
-    _, direction = _outwards(torch.stack(slope, dim=-1), 2)
-    out = (far > 0)[..., None]
-    return distance + far, torch.where(out, away, direction)
+def distance_at(function: Any, place: Tensor, numbers: Tensor, table: Tensor) -> tuple[Tensor, Tensor]:
+    """A device function of this file on tensors: distances (...) and unit gradients (..., 3) at places (..., 3)."""
+    known = tuple(numbers.to(place).reshape(-1).unbind())
+    distance, normal = on_tensors(function)(place.unbind(-1), known, Memory(table.to(place)), None, ())
+    return distance, torch.stack(torch.broadcast_tensors(*normal), -1)

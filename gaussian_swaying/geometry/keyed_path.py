@@ -85,11 +85,11 @@ def fastest(times: Tensor, values: Tensor, start: float = -math.inf, end: float 
 
 
 def between(times: Tensor, values: Tensor, time: Tensor) -> Tensor:
-    """Values (K, 3) at a time, linear between the keys and constant before and after; the host does not wait."""
+    """Values (K, 3) at times (...), linear between the keys and constant before and after, shape (..., 3)."""
     if len(times) == 1:
-        return values[0]
+        return values[0].expand(*time.shape, 3)
     time = time.to(times)
-    last = (torch.searchsorted(times, time.reshape(1), right=True) - 1).clamp(0, len(times) - 2)
+    last = (torch.searchsorted(times, time.reshape(-1), right=True) - 1).clamp(0, len(times) - 2).reshape(time.shape)
     start, end = times[last], times[last + 1]
-    f = ((time - start) / (end - start)).clamp(0.0, 1.0)
-    return (values[last] + f * (values[last + 1] - values[last]))[0]
+    f = ((time - start) / (end - start)).clamp(0.0, 1.0)[..., None]
+    return values[last] + f * (values[last + 1] - values[last])

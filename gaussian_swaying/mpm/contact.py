@@ -47,8 +47,8 @@ from torch import Tensor
 
 from gaussian_swaying._checks import check_positive, check_shape
 from gaussian_swaying._fixed import fixed
-from gaussian_swaying.mpm.boundaries.boundary import Boundary
-from gaussian_swaying.mpm.boundaries.obstacle import Obstacle
+from gaussian_swaying.mpm.boundary import Boundary
+from gaussian_swaying.mpm.colliders import Obstacle
 from gaussian_swaying.mpm.state import GridSpec, MaterialPoints
 from gaussian_swaying.mpm.transfer import bspline_stencil
 from gaussian_swaying.mpm.virtual_nodes import coordinates, point_with_nodes

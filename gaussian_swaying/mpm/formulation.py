@@ -16,14 +16,12 @@ from gaussian_swaying._checks import check_positive
 from gaussian_swaying._fixed import fixed
 from gaussian_swaying.geometry.groups import joined
 from gaussian_swaying.geometry.linalg import symmetric_eigenvalues
-from gaussian_swaying.mpm.boundaries.boundary import CLOCK, Boundary, Nodes
-from gaussian_swaying.mpm.boundaries.impulse import Impulse
-from gaussian_swaying.mpm.boundaries.obstacle import Obstacle
-from gaussian_swaying.mpm.boundaries.pinned_region import PinnedRegion
-from gaussian_swaying.mpm.boundaries.rigid_region import RigidRegion
+from gaussian_swaying.mpm.boundary import CLOCK, Boundary, Nodes
+from gaussian_swaying.mpm.colliders import Obstacle
 from gaussian_swaying.mpm.contact import Surface
 from gaussian_swaying.mpm.damping import damped_substep
 from gaussian_swaying.mpm.dispatch import LawDispatch
+from gaussian_swaying.mpm.pins import Impulse, PinnedRegion, RigidRegion
 from gaussian_swaying.mpm.state import GridSpec, MaterialPoints, MPMState, bounding_grid
 from gaussian_swaying.mpm.timestep import MAX_CFL, cfl_number, stable_limit, wave_speed
 from gaussian_swaying.mpm.transfer import Stencil, scatter

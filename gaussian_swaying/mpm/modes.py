@@ -25,15 +25,13 @@ from torch import Tensor
 from gaussian_swaying._devices import in_double
 from gaussian_swaying.geometry.rotations import rodrigues, rotation_of
 from gaussian_swaying.kernels.launch import lanes, launch, replaces
-from gaussian_swaying.mpm.boundaries.boundary import Boundary
-from gaussian_swaying.mpm.boundaries.pinned_points import PinnedPoints
-from gaussian_swaying.mpm.boundaries.pinned_region import PinnedRegion
-from gaussian_swaying.mpm.boundaries.rigid_region import RigidRegion
+from gaussian_swaying.mpm.boundary import Boundary
 from gaussian_swaying.mpm.contact import Surface
 from gaussian_swaying.mpm.damping import decay_rate
 from gaussian_swaying.mpm.forces import Force, added, split, tensors_of
 from gaussian_swaying.mpm.formulation import Settings, flowing
 from gaussian_swaying.mpm.modal import Analysis, analysis_of
+from gaussian_swaying.mpm.pins import PinnedPoints, PinnedRegion, RigidRegion
 from gaussian_swaying.mpm.state import MaterialPoints, MPMState, State
 from gaussian_swaying.mpm.total import Total
 from gaussian_swaying.mpm.transfer import gather, scatter

@@ -29,8 +29,7 @@ import torch
 from torch import Tensor
 
 from gaussian_swaying.geometry.neighbours import nearest_neighbours
-from gaussian_swaying.mpm.boundaries.boundary import CLOCK, Boundary
-from gaussian_swaying.mpm.boundaries.pinned_points import PinnedPoints
+from gaussian_swaying.mpm.boundary import CLOCK, Boundary
 from gaussian_swaying.mpm.formulation import Formulation
 from gaussian_swaying.mpm.held_faces import SHEET, face_patches, normals, thickness
 from gaussian_swaying.mpm.held_rows import (
@@ -48,6 +47,7 @@ from gaussian_swaying.mpm.held_rows import (
     ranks,
     rows_at,
 )
+from gaussian_swaying.mpm.pins import PinnedPoints
 from gaussian_swaying.mpm.state import GridSpec
 from gaussian_swaying.mpm.transfer import Stencil
 from gaussian_swaying.mpm.virtual_nodes import first_nodes, point_with_nodes

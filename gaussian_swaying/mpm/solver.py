@@ -15,7 +15,7 @@ from torch.utils.checkpoint import checkpoint as recomputed
 from gaussian_swaying._checks import check_positive, check_vector
 from gaussian_swaying._fixed import Fixed, FixedList, assign
 from gaussian_swaying.geometry.frame import SimFrame
-from gaussian_swaying.mpm.boundaries.boundary import Boundary
+from gaussian_swaying.mpm.boundary import Boundary
 from gaussian_swaying.mpm.contact import Surface
 from gaussian_swaying.mpm.damping import damped_substep
 from gaussian_swaying.mpm.dispatch import LawDispatch

@@ -15,14 +15,14 @@ from gaussian_swaying._devices import in_double
 from gaussian_swaying.geometry.linalg import polar_rotation
 from gaussian_swaying.geometry.neighbours import nearest_neighbours
 from gaussian_swaying.geometry.rigid import centre, fitted_gradient
-from gaussian_swaying.mpm.boundaries.boundary import BY_BODY, Boundary
-from gaussian_swaying.mpm.boundaries.pinned_points import PinnedPoints
+from gaussian_swaying.mpm.boundary import BY_BODY, Boundary
 from gaussian_swaying.mpm.contact import ContactStage, Surface
 from gaussian_swaying.mpm.damping import kelvin_voigt_pk1
 from gaussian_swaying.mpm.dispatch import LawDispatch
 from gaussian_swaying.mpm.formulation import Formulation, Held, Settings, flowing, held_share, safe_inverse
 from gaussian_swaying.mpm.held_faces import HELD_ALONE, SHEET, SOFTENED, thickness, width
 from gaussian_swaying.mpm.held_rows import LEAST_APART
+from gaussian_swaying.mpm.pins import PinnedPoints
 from gaussian_swaying.mpm.point_holds import POINTS, PointHolds
 from gaussian_swaying.mpm.sheets import bending_of, director_energy, flattened, sheet_pk1
 from gaussian_swaying.mpm.state import GridSpec, MaterialPoints, MPMState

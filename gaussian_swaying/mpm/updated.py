@@ -12,7 +12,7 @@ from torch import Tensor
 from gaussian_swaying._devices import in_double
 from gaussian_swaying.geometry.linalg import matmul3, polar_rotation
 from gaussian_swaying.geometry.rigid import centre
-from gaussian_swaying.mpm.boundaries.boundary import Boundary
+from gaussian_swaying.mpm.boundary import Boundary
 from gaussian_swaying.mpm.contact import Surface
 from gaussian_swaying.mpm.damping import kelvin_voigt_pk1
 from gaussian_swaying.mpm.formulation import (

@@ -12,8 +12,7 @@ from torch import Tensor, nn
 from gaussian_swaying._checks import check_vector, check_whole
 from gaussian_swaying._devices import in_double
 from gaussian_swaying._fixed import fixed
-from gaussian_swaying.mpm.boundaries.pinned_points import PinnedPoints
-from gaussian_swaying.mpm.boundaries.pinned_region import PinnedRegion
+from gaussian_swaying.mpm.pins import PinnedPoints, PinnedRegion
 from gaussian_swaying.mpm.protocol import Solver
 from gaussian_swaying.recording.recorder import Recorder
 from gaussian_swaying.simulation.parameters import Setup

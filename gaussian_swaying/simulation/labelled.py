@@ -7,9 +7,8 @@ import dataclasses
 from gaussian_swaying._fixed import FixedList, changed
 from gaussian_swaying.gaussians.cloud import GaussianCloud
 from gaussian_swaying.gaussians.parts import NUMBERS, PartRegion
-from gaussian_swaying.mpm.boundaries.boundary import Boundary
-from gaussian_swaying.mpm.boundaries.pinned_region import PinnedRegion
-from gaussian_swaying.mpm.boundaries.rigid_region import RigidRegion
+from gaussian_swaying.mpm.boundary import Boundary
+from gaussian_swaying.mpm.pins import PinnedRegion, RigidRegion
 from gaussian_swaying.mpm.protocol import Solver
 from gaussian_swaying.simulation.material import Material, MaterialRegion
 from gaussian_swaying.simulation.scene import Scene

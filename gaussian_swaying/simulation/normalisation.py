@@ -19,7 +19,7 @@ from gaussian_swaying.geometry.frame import SimFrame
 from gaussian_swaying.geometry.regions import RegionInFrame
 from gaussian_swaying.interop.physgaussian.camera import PhysGaussianCamera
 from gaussian_swaying.interop.physgaussian.space import CENTER, rotation_matrix
-from gaussian_swaying.mpm.boundaries.boundary import Boundary
+from gaussian_swaying.mpm.boundary import Boundary
 from gaussian_swaying.mpm.protocol import Solver
 from gaussian_swaying.rendering.cameras.camera_path import CameraPath
 from gaussian_swaying.simulation.edits import Edit

@@ -19,8 +19,7 @@ from gaussian_swaying.geometry.neighbours import nearest_neighbours
 from gaussian_swaying.geometry.patches import deform_all
 from gaussian_swaying.geometry.regions import Region
 from gaussian_swaying.geometry.surface_normals import neighbour_normals
-from gaussian_swaying.mpm.boundaries.obstacle import Obstacle
-from gaussian_swaying.mpm.boundaries.still_gaussians import StillGaussians
+from gaussian_swaying.mpm.colliders import Obstacle, StillGaussians
 from gaussian_swaying.mpm.contact import Contact, Surface
 from gaussian_swaying.mpm.followers import Followers, GridFollowers, PointFollowers, on_material
 from gaussian_swaying.mpm.joints import PointJoint

@@ -29,7 +29,7 @@ from gaussian_swaying.config.parser import (
 from gaussian_swaying.gaussians.cloud import GaussianCloud
 from gaussian_swaying.geometry.regions import Region
 from gaussian_swaying.kernels.graphs import tensors_in
-from gaussian_swaying.mpm.boundaries.obstacle import Obstacle
+from gaussian_swaying.mpm.colliders import Obstacle
 from gaussian_swaying.mpm.contact import Contact
 from gaussian_swaying.mpm.forces import Force, as_forces
 from gaussian_swaying.mpm.materials import known_material

@@ -18,11 +18,10 @@ from gaussian_swaying._fixed import assign
 from gaussian_swaying._turns import Turn, in_turn
 from gaussian_swaying.geometry.patches import deform_patch
 from gaussian_swaying.kernels.graphs import fingerprint, tensors_in
-from gaussian_swaying.mpm.boundaries.impulse import Impulse
-from gaussian_swaying.mpm.boundaries.rigid_region import RigidRegion
 from gaussian_swaying.mpm.forces import Force
 from gaussian_swaying.mpm.joints import Joints
 from gaussian_swaying.mpm.modes import MOST_LEAN, Modes
+from gaussian_swaying.mpm.pins import Impulse, RigidRegion
 from gaussian_swaying.mpm.protocol import Solver
 from gaussian_swaying.mpm.solver import MPMSolver
 from gaussian_swaying.mpm.state import MaterialPoints, State

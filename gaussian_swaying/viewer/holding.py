@@ -9,7 +9,7 @@ import torch
 import yaml
 
 from gaussian_swaying._devices import in_double
-from gaussian_swaying.mpm.boundaries.pinned_region import PinnedRegion
+from gaussian_swaying.mpm.pins import PinnedRegion
 from gaussian_swaying.viewer.pictures import under_cursor
 from gaussian_swaying.viewer.screen import Panel
 

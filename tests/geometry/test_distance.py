@@ -14,18 +14,26 @@ from gaussian_swaying.geometry.distance import (
     ball_distance,
     box_distance,
     capsule_distance,
-    grid_distance,
+    distance_at,
 )
 from gaussian_swaying.geometry.keyed_path import KeyedPath, between
 from gaussian_swaying.geometry.meshes import mesh_distance, read_mesh, triangle_distance
 from gaussian_swaying.geometry.rotations import rotation_of
 
 HALF = double([0.3, 0.2, 0.5])
+EYE = torch.eye(3, dtype=torch.float64).reshape(-1)
+
+
+def _asked(function, *numbers):
+    given = torch.cat([torch.as_tensor(number, dtype=torch.float64).reshape(-1) for number in numbers])
+    return lambda place: distance_at(function, place, given, place.new_zeros(1))
+
+
 SOLIDS = {
-    "ball": lambda x: ball_distance(x, 0.4),
-    "capsule": lambda x: capsule_distance(x, HALF, 0.1),
-    "point capsule": lambda x: capsule_distance(x, 0 * HALF, 0.1),
-    "box": lambda x: box_distance(x, HALF),
+    "ball": _asked(ball_distance, 0.4),
+    "capsule": _asked(capsule_distance, 0.1, HALF, 1 / HALF.square().sum()),
+    "point capsule": _asked(capsule_distance, 0.1, 0 * HALF, 0.0),
+    "box": _asked(box_distance, HALF, EYE),
 }
 
 
@@ -64,7 +72,7 @@ def test_a_grid_interpolates_and_extends():
     assert_close(distance, place @ direction)
     assert_close(normal, direction.expand_as(normal))
     beyond = double([[3.5, 0.1, 0.1]])
-    distance, normal = grid_distance(beyond, grid.values, grid.origin, 0.25)
+    distance, normal = grid.at(beyond)
     edge = double([0.5, 0.1, 0.1])
     assert_close(distance, (edge @ direction)[None] + 3.0)
     assert_close(normal, double([[1.0, 0, 0]]))
@@ -101,7 +109,7 @@ def test_a_mesh_has_the_distance_of_the_box_that_it_is(tmp_path):
     nodes = torch.cartesian_prod(
         *(grid.origin[k] + grid.spacing * torch.arange(n, dtype=torch.float64) for k, n in enumerate(grid.values.shape))
     )
-    exact = box_distance(nodes, torch.ones(3, dtype=torch.float64))[0]
+    exact = _asked(box_distance, torch.ones(3), EYE)(nodes)[0]
     assert_close(grid.values.reshape(-1), exact, atol=1e-12, rtol=0)
 
 

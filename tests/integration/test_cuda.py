@@ -10,13 +10,8 @@ from shared import without_waits
 from gaussian_swaying.cli.simulate import main
 from gaussian_swaying.geometry.frame import SimFrame
 from gaussian_swaying.geometry.regions import Box, Cylinder, Everything, Not, Sphere, Union
-from gaussian_swaying.mpm.boundaries.enclosing_box import EnclosingBox
-from gaussian_swaying.mpm.boundaries.handle import Handle
-from gaussian_swaying.mpm.boundaries.impulse import Impulse
-from gaussian_swaying.mpm.boundaries.pinned_region import PinnedRegion
-from gaussian_swaying.mpm.boundaries.plane import Plane
-from gaussian_swaying.mpm.boundaries.sequential_release import SequentialRelease
-from gaussian_swaying.mpm.boundaries.velocity_box import VelocityBox
+from gaussian_swaying.mpm.colliders import EnclosingBox, Plane, VelocityBox
+from gaussian_swaying.mpm.pins import Handle, Impulse, PinnedRegion, SequentialRelease
 from gaussian_swaying.mpm.solver import MPMSolver
 from gaussian_swaying.mpm.state import MaterialPoints
 from gaussian_swaying.recording.trajectory import load_trajectory

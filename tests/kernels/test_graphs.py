@@ -2,13 +2,13 @@
 
 import pytest
 import torch
+from catalogue import BOUNDARIES
 from torch import nn
 
 from gaussian_swaying import Boundary, Box, GaussianGust, PinnedRegion, SineSway, UniformGust, WindField
 from gaussian_swaying.geometry.regions import Everything, Not, Union
 from gaussian_swaying.kernels.graphs import Repeater, Replayed, tensors_in
-from gaussian_swaying.mpm.boundaries import BOUNDARIES
-from gaussian_swaying.mpm.boundaries.velocity_box import VelocityBox
+from gaussian_swaying.mpm.colliders import VelocityBox
 from gaussian_swaying.wind.field import Modulation
 
 

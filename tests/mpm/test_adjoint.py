@@ -17,8 +17,7 @@ from gaussian_swaying import (
     WindField,
     WindForce,
 )
-from gaussian_swaying.mpm.boundaries.ball import BallObstacle
-from gaussian_swaying.mpm.boundaries.plane import Plane
+from gaussian_swaying.mpm.colliders import BallObstacle, Plane
 from gaussian_swaying.mpm.triton import fused_total
 from gaussian_swaying.wind.force import LAWS as WIND_LAWS
 from gaussian_swaying.wind.patches import Patches

@@ -9,8 +9,8 @@ from gaussian_swaying import SimFrame
 from gaussian_swaying.geometry.keyed_path import KeyedPath
 from gaussian_swaying.geometry.rotations import rotation_from_z
 from gaussian_swaying.kernels.launch import lanes, launch
-from gaussian_swaying.mpm.triton import obstacle_kernels as kernels
-from gaussian_swaying.mpm.triton.obstacles import Solids
+from gaussian_swaying.mpm.colliders import Solids
+from gaussian_swaying.mpm.triton import contact_kernels as kernels
 
 DT = 1e-3
 
@@ -22,7 +22,7 @@ def _path():
 
 def _ask_kernel(obstacle, place, time, device):
     """Gap, normal, velocity, whether it counts and whether one is within 1 cm, at places in the kernel of ``total``."""
-    solids = Solids([(obstacle.to(device), 0)], place, steps=1)
+    solids = Solids([(obstacle.to(device), 0)], place)
     solids.take()
     solids.prepare(time, torch.full_like(time, DT), 1)
     count = len(place)
@@ -33,7 +33,7 @@ def _ask_kernel(obstacle, place, time, device):
     launch(kernels.obstacle_places, (-(-count // block),))(
         place, torch.zeros(count, 4, device=device), torch.full_like(gap, 0.02), gap, facing, drive, valid, within,
         count, solids.rows, solids.windows, solids.poses, solids.tables.buffer, time, torch.full_like(time, DT), 0.01,
-        SOLIDS=solids.twins, MOVES=solids.moves[0], BLOCK=block,
+        torch.zeros(1, dtype=torch.int32, device=device), 0, SOLIDS=solids.twins, MOVES=solids.moves[0], BLOCK=block,
     )  # fmt: skip
     return gap, facing, drive, valid, int(within)
 

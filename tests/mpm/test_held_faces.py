@@ -10,9 +10,9 @@ from torch.testing import assert_close
 
 from gaussian_swaying import Box, MPMSolver, PinnedPoints, PinnedRegion
 from gaussian_swaying.geometry.regions import Everything
-from gaussian_swaying.mpm.boundaries.handle import Handle
 from gaussian_swaying.mpm.held_faces import SOFTENED, along_face, face, thickness
 from gaussian_swaying.mpm.held_rows import MOST_ROWS
+from gaussian_swaying.mpm.pins import Handle
 
 DX = 0.1
 

@@ -10,11 +10,11 @@ from torch.testing import assert_close
 
 from gaussian_swaying import Box, MPMSolver, PinnedRegion
 from gaussian_swaying.mpm import modal
-from gaussian_swaying.mpm.boundaries.rigid_region import RigidRegion
 from gaussian_swaying.mpm.laws.fixed_corotated import FixedCorotated
 from gaussian_swaying.mpm.laws.hencky import StVKHencky
 from gaussian_swaying.mpm.laws.neo_hookean import NeoHookean
 from gaussian_swaying.mpm.modal import LOOSE, Structure, analysis_of
+from gaussian_swaying.mpm.pins import RigidRegion
 
 FOOT = Box([None] * 3, [None, None, 0.1])
 

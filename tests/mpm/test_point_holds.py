@@ -21,10 +21,8 @@ from gaussian_swaying import (
 from gaussian_swaying.geometry.keyed_path import KeyedPath
 from gaussian_swaying.geometry.regions import Everything
 from gaussian_swaying.mpm import held_rows, point_holds
-from gaussian_swaying.mpm.boundaries.ball import BallObstacle
-from gaussian_swaying.mpm.boundaries.handle import Handle
-from gaussian_swaying.mpm.boundaries.plane import Plane
-from gaussian_swaying.mpm.boundaries.sequential_release import SequentialRelease
+from gaussian_swaying.mpm.colliders import BallObstacle, Plane
+from gaussian_swaying.mpm.pins import Handle, SequentialRelease
 from gaussian_swaying.mpm.state import GridSpec
 from gaussian_swaying.mpm.transfer import bspline_stencil, gather
 

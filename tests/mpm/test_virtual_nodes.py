@@ -19,13 +19,10 @@ from gaussian_swaying import (
     WindForce,
 )
 from gaussian_swaying.geometry.linalg import polar_rotation
-from gaussian_swaying.mpm.boundaries.ball import BallObstacle
-from gaussian_swaying.mpm.boundaries.handle import Handle
-from gaussian_swaying.mpm.boundaries.plane import Plane
-from gaussian_swaying.mpm.boundaries.rigid_region import RigidRegion
-from gaussian_swaying.mpm.boundaries.velocity_box import VelocityBox
+from gaussian_swaying.mpm.colliders import BallObstacle, Plane, VelocityBox
 from gaussian_swaying.mpm.contact import Surface
 from gaussian_swaying.mpm.followers import GridFollowers, on_material
+from gaussian_swaying.mpm.pins import Handle, RigidRegion
 from gaussian_swaying.mpm.state import GridSpec
 from gaussian_swaying.mpm.transfer import shifts
 from gaussian_swaying.mpm.virtual_nodes import coordinates, first_nodes, point_with_nodes, virtual_nodes

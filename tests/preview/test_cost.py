@@ -11,7 +11,7 @@ from small_scenes import run_cost
 from gaussian_swaying.geometry.regions import Box
 from gaussian_swaying.kernels import cpu
 from gaussian_swaying.kernels.language import INTERPRETED
-from gaussian_swaying.mpm.boundaries.pinned_region import PinnedRegion
+from gaussian_swaying.mpm.pins import PinnedRegion
 from gaussian_swaying.mpm.solver import MPMSolver
 from gaussian_swaying.preview import cost as cost_module
 from gaussian_swaying.preview.cost import estimate_cost, finest_within, scaled_seconds, with_whole

@@ -9,9 +9,8 @@ import yaml
 
 from gaussian_swaying.gaussians.ply import write_ply
 from gaussian_swaying.geometry.regions import Box, Cylinder, Everything, Not, Sphere, Union
-from gaussian_swaying.mpm.boundaries.impulse import Impulse
-from gaussian_swaying.mpm.boundaries.pinned_region import PinnedRegion
-from gaussian_swaying.mpm.boundaries.plane import Plane
+from gaussian_swaying.mpm.colliders import Plane
+from gaussian_swaying.mpm.pins import Impulse, PinnedRegion
 from gaussian_swaying.preview.picture import (
     PINNED,
     PUSHED,

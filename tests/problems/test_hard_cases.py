@@ -30,11 +30,9 @@ from gaussian_swaying import (
     WindField,
 )
 from gaussian_swaying.geometry.linalg import determinant, matmul3
-from gaussian_swaying.mpm.boundaries.enclosing_box import EnclosingBox
-from gaussian_swaying.mpm.boundaries.handle import Handle
-from gaussian_swaying.mpm.boundaries.plane import Plane
-from gaussian_swaying.mpm.boundaries.velocity_box import VelocityBox
+from gaussian_swaying.mpm.colliders import EnclosingBox, Plane, VelocityBox
 from gaussian_swaying.mpm.laws import LAWS as KINDS
+from gaussian_swaying.mpm.pins import Handle
 from gaussian_swaying.scenes.procedural import FlagScene, GivenScene
 from gaussian_swaying.simulation.diagnostics import measure
 from gaussian_swaying.wind.field import FlowKey, Modulation

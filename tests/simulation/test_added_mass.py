@@ -8,7 +8,7 @@ import torch
 from shared import advanced
 
 from gaussian_swaying.geometry.regions import Box
-from gaussian_swaying.mpm.boundaries.pinned_region import PinnedRegion
+from gaussian_swaying.mpm.pins import PinnedRegion
 from gaussian_swaying.simulation.batch import batch_of
 from gaussian_swaying.simulation.edits import Edit
 from gaussian_swaying.simulation.material import Material

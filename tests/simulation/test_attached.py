@@ -9,7 +9,7 @@ from small_scenes import together
 
 from gaussian_swaying.gaussians.parts import Part, Parts
 from gaussian_swaying.geometry.regions import Box
-from gaussian_swaying.mpm.boundaries.pinned_region import PinnedRegion
+from gaussian_swaying.mpm.pins import PinnedRegion
 from gaussian_swaying.mpm.solver import MPMSolver
 from gaussian_swaying.preview.apart import why_apart
 from gaussian_swaying.scenes.procedural import FlagScene, GivenScene

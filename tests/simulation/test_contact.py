@@ -10,8 +10,7 @@ from small_scenes import together
 
 from gaussian_swaying.gaussians.model import GaussianSurfaceModel
 from gaussian_swaying.geometry.regions import Box
-from gaussian_swaying.mpm.boundaries.ball import BallObstacle
-from gaussian_swaying.mpm.boundaries.still_gaussians import StillGaussians
+from gaussian_swaying.mpm.colliders import BallObstacle, StillGaussians
 from gaussian_swaying.mpm.contact import Contact
 from gaussian_swaying.mpm.solver import MPMSolver
 from gaussian_swaying.scenes.cloths import ClothScene

@@ -9,7 +9,7 @@ import torch
 
 from gaussian_swaying.gaussians.filling import InteriorFilling
 from gaussian_swaying.geometry.regions import Box, Not, Sphere
-from gaussian_swaying.mpm.boundaries.pinned_region import PinnedRegion
+from gaussian_swaying.mpm.pins import PinnedRegion
 from gaussian_swaying.mpm.solver import MPMSolver
 from gaussian_swaying.recording.recorder import Recorder
 from gaussian_swaying.rendering.cameras.camera_path import OrbitCamera

@@ -8,6 +8,7 @@ pair is kept at both of its samples; the sums at samples and nodes have the same
 
 from gaussian_swaying.geometry.linalg_triton import add3, dot3, load3
 from gaussian_swaying.kernels.language import ON_GPU, tl, triton
+from gaussian_swaying.mpm.touch import POSE, acts, touch
 from gaussian_swaying.mpm.triton.shared import VARIES, axis_weights, node_weight, vector
 
 CHANGES = (*VARIES, "places", "touched_nodes", "active_nodes", "last", "iterations")
@@ -733,3 +734,36 @@ def contact_solve(
                             tl.store(pressed_sum + at, sum_, mask)
             if pid == 0:
                 tl.store(status + ROUNDS, tl.load(status + ROUNDS) + k)
+
+
+@triton.jit(do_not_specialize=VARIES)
+def obstacle_places(
+    position, moving, thickness, gap, facing, drive, valid, within, places, row, window, pose, numbers, time, dt, slack,
+    first_step, step_offset, SOLIDS: tl.constexpr, MOVES: tl.constexpr, BLOCK: tl.constexpr,
+):  # fmt: skip
+    """Constraints of all contact samples with the first obstacle in ``total``: gap, normal, velocity, and if it acts.
+
+    ``within`` becomes one if a sample is closer than ``slack``, now or after a substep with its velocity ``moving``.
+    """
+    k = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
+    mask = k < places
+    at = position + k * 3
+    if MOVES:
+        pose += (tl.load(first_step) + step_offset) * POSE
+    x = (tl.load(at, mask, 0.0), tl.load(at + 1, mask, 0.0), tl.load(at + 2, mask, 0.0))
+    distance, normal, own = touch(x, row, pose, numbers, mask, SOLIDS, 0, MOVES)
+    distance -= 0.5 * tl.load(thickness + k, mask, 0.0)
+    on = tl.where(acts(window, tl.load(time)), 1.0, 0.0) + tl.zeros_like(distance)
+    v = moving + k * 4
+    v0 = tl.load(v, mask, 0.0) - own[0]
+    v1 = tl.load(v + 1, mask, 0.0) - own[1]
+    v2 = tl.load(v + 2, mask, 0.0) - own[2]
+    ahead = distance + tl.load(dt).to(tl.float32) * (v0 * normal[0] + v1 * normal[1] + v2 * normal[2])
+    close = mask & (tl.minimum(distance, ahead) < slack)
+    if tl.max(tl.where(close, on, 0.0)) > 0:
+        tl.store(within, 1)
+    tl.store(gap + k, distance, mask)
+    tl.store(valid + k, on, mask)
+    for c in tl.static_range(3):
+        tl.store(facing + k * 3 + c, normal[c], mask)
+        tl.store(drive + k * 3 + c, own[c], mask)

@@ -8,11 +8,10 @@ import torch
 from torch import Tensor
 
 from gaussian_swaying.kernels.launch import lanes, launch
+from gaussian_swaying.mpm.colliders import Solids
 from gaussian_swaying.mpm.contact import ContactStage
 from gaussian_swaying.mpm.triton import contact_kernels as kernels
-from gaussian_swaying.mpm.triton import obstacle_kernels
 from gaussian_swaying.mpm.triton.fused import INTERPRETED, MAX_INDEX
-from gaussian_swaying.mpm.triton.obstacles import Solids
 
 if TYPE_CHECKING:
     from gaussian_swaying.mpm.total import Total
@@ -116,8 +115,7 @@ class FusedContact:
         self.within = self.status[int(kernels.WITHIN.value)]
         self.friction = fields.new_tensor([float(b.friction) for _, b in stage.obstacles] or [0.0])
         self.solids = [
-            None if obstacle.twin() is None else Solids([(obstacle, 0)], fields, steps=1)
-            for _, obstacle in stage.obstacles
+            None if obstacle.twin() is None else Solids([(obstacle, 0)], fields) for _, obstacle in stage.obstacles
         ]
         """For each obstacle its tables; None for one that runs in torch."""
         self.programs = self._programs()
@@ -216,12 +214,19 @@ class FusedContact:
             self.status, ny * nz, nz, 1 / stage.dx, ARMS=self.arms, VIRTUAL=self.virtual, BLOCK=block, num_warps=4,
         )  # fmt: skip
 
-    def take(self) -> None:
-        """Begin a rollout: bring the tables of the obstacles up to date; not recorded."""
+    def take(self, time: Tensor, dt: Tensor, steps: int) -> None:
+        """Begin a rollout: bring the tables of the obstacles up to date; not recorded.
+
+        Args:
+            time: Time at its start [s], scalar float64 tensor.
+            dt: Substep [s], scalar float64 tensor.
+            steps: Number of substeps.
+        """
         self.motion.zero_()
         for solid in self.solids:
             if solid is not None:
                 solid.take()
+                solid.prepare(time, dt, steps)
 
     def add_taken(self, taken: Tensor) -> None:
         """Add what each boundary took since ``pressed_sum`` was zero [N s], to (scenes, B, 3), float64."""
@@ -257,11 +262,10 @@ class FusedContact:
             self._read()
             for k, (solid, (_, obstacle)) in enumerate(zip(self.solids, stage.obstacles, strict=True)):
                 if solid is not None:
-                    solid.prepare(time, dt, 1)
-                    launch(obstacle_kernels.obstacle_places, (-(-self.places // one),))(
+                    launch(kernels.obstacle_places, (-(-self.places // one),))(
                         self.position, self.moving, self.thickness, self.wall_gap[k], self.wall_normal[k],
                         self.wall_drive[k], self.wall_valid[k], self.within, self.places, solid.rows, solid.windows,
-                        solid.poses, solid.tables.buffer, time, dt, SLACK * dx, SOLIDS=solid.twins,
+                        solid.poses, solid.tables.buffer, time, dt, SLACK * dx, first_step, offset, SOLIDS=solid.twins,
                         MOVES=solid.moves[0], BLOCK=one, num_warps=4,
                     )  # fmt: skip
                     continue

@@ -13,9 +13,8 @@ from torch import Tensor
 from gaussian_swaying.kernels.graphs import RECORDED
 from gaussian_swaying.kernels.language import triton
 from gaussian_swaying.kernels.launch import lanes, launch
-from gaussian_swaying.mpm.boundaries.pinned_points import PinnedPoints
-from gaussian_swaying.mpm.boundaries.pinned_region import PinnedRegion
 from gaussian_swaying.mpm.forces import Force, divide, tensors_of
+from gaussian_swaying.mpm.pins import PinnedPoints, PinnedRegion
 from gaussian_swaying.mpm.point_holds import DenseHolds
 from gaussian_swaying.mpm.state import MPMState
 from gaussian_swaying.mpm.timestep import kick_time
@@ -218,7 +217,7 @@ class FusedTotal(Fused):
             to[:, :3].copy_(value.reshape(-1, 3))
         options = part.options
         if self.touching is not None:
-            self.touching.take()
+            self.touching.take(self.time, self.dt, part.steps)
 
         def begin(_: int) -> None:
             self.begin(len(self.schedule) - 2, part.loaded)

@@ -23,9 +23,9 @@ from gaussian_swaying.geometry.linalg_triton import (
 )
 from gaussian_swaying.kernels.language import tl, triton
 from gaussian_swaying.mpm.laws.triton.body import ROW, kirchhoff
+from gaussian_swaying.mpm.touch import POSE, acts, stop_nodes
+from gaussian_swaying.mpm.touch import ROW as SOLID_ROW
 from gaussian_swaying.mpm.triton.damping import kelvin_voigt_pk1
-from gaussian_swaying.mpm.triton.obstacle_kernels import POSE, acts, stop_nodes
-from gaussian_swaying.mpm.triton.obstacle_kernels import ROW as SOLID_ROW
 from gaussian_swaying.mpm.triton.shared import (
     VARIES,
     account,
@@ -406,7 +406,7 @@ def updated_nodes(
     """``updated``: nodal velocities from momenta and masses, set back to zero unless SPARSE; KEEP for boundaries.
 
     All TURNS are applied here, in order: each is the number of a boundary, and that of one of the SOLIDS (see
-    :mod:`~gaussian_swaying.mpm.triton.obstacle_kernels`), or -1 less that of a pin. KINDS and MOVES say of each solid
+    :mod:`~gaussian_swaying.mpm.touch`), or -1 less that of a pin. KINDS and MOVES say of each solid
     how it stops and whether it moves. With MOVING there are poses for every substep. ``marks`` (pins, room) is the last
     substep in which each pin held a node, counted from 1. ``clock`` has the time at step 0 and the substep [s],
     float64; ``impulse`` (programs, slots, B, 3), float64, collects the reaction impulses on nodes of the first scene of

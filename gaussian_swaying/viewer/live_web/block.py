@@ -14,20 +14,21 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from gaussian_swaying.mpm.boundaries.ball import BallObstacle
-from gaussian_swaying.mpm.boundaries.block import BoxObstacle
-from gaussian_swaying.mpm.boundaries.boundary import Boundary
-from gaussian_swaying.mpm.boundaries.capsule import CapsuleObstacle
-from gaussian_swaying.mpm.boundaries.half_space import HalfSpaceObstacle
-from gaussian_swaying.mpm.boundaries.obstacle import Obstacle
-from gaussian_swaying.mpm.boundaries.pinned_points import PinnedPoints
-from gaussian_swaying.mpm.boundaries.pinned_region import PinnedRegion
-from gaussian_swaying.mpm.boundaries.plane import Plane
+from gaussian_swaying.mpm.boundary import Boundary
+from gaussian_swaying.mpm.colliders import (
+    BallObstacle,
+    BoxObstacle,
+    CapsuleObstacle,
+    HalfSpaceObstacle,
+    Obstacle,
+    Plane,
+)
 from gaussian_swaying.mpm.laws.fixed_corotated import FixedCorotated
 from gaussian_swaying.mpm.laws.hencky import StVKHencky
 from gaussian_swaying.mpm.laws.neo_hookean import NeoHookean
 from gaussian_swaying.mpm.laws.spring_network import SpringNetwork
 from gaussian_swaying.mpm.modes import Modes
+from gaussian_swaying.mpm.pins import PinnedPoints, PinnedRegion
 from gaussian_swaying.mpm.solver import MPMSolver
 from gaussian_swaying.mpm.total import Total
 from gaussian_swaying.simulation.simulation import Simulation

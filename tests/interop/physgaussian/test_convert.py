@@ -19,18 +19,14 @@ from gaussian_swaying.geometry.regions import Box
 from gaussian_swaying.interop.physgaussian.camera import PhysGaussianCamera, read_model_camera
 from gaussian_swaying.interop.physgaussian.convert import convert, to_yaml
 from gaussian_swaying.interop.physgaussian.space import heading, rotation_matrix
-from gaussian_swaying.mpm.boundaries.enclosing_box import EnclosingBox
-from gaussian_swaying.mpm.boundaries.handle import Handle
-from gaussian_swaying.mpm.boundaries.pinned_region import PinnedRegion
-from gaussian_swaying.mpm.boundaries.plane import Plane
-from gaussian_swaying.mpm.boundaries.sequential_release import SequentialRelease
-from gaussian_swaying.mpm.boundaries.velocity_box import VelocityBox
+from gaussian_swaying.mpm.colliders import EnclosingBox, Plane, VelocityBox
 from gaussian_swaying.mpm.laws.foam import Foam
 from gaussian_swaying.mpm.laws.metal import Metal
 from gaussian_swaying.mpm.laws.plasticine import Plasticine
 from gaussian_swaying.mpm.laws.sand import Sand
 from gaussian_swaying.mpm.laws.shared import lame_parameters
 from gaussian_swaying.mpm.laws.snow import Snow
+from gaussian_swaying.mpm.pins import Handle, PinnedRegion, SequentialRelease
 from gaussian_swaying.scenes.procedural import FlagScene
 from gaussian_swaying.simulation.normalisation import Normalisation
 from gaussian_swaying.simulation.simulation import Simulation

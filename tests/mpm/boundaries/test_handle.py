@@ -9,7 +9,7 @@ from shared import solid
 from torch.testing import assert_close
 
 from gaussian_swaying import Box, MPMSolver, PinnedRegion, SimFrame, Sphere
-from gaussian_swaying.mpm.boundaries.handle import Handle
+from gaussian_swaying.mpm.pins import Handle
 
 from .bodies import block, march, run_for
 

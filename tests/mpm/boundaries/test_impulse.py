@@ -9,7 +9,7 @@ from shared import solid
 from torch.testing import assert_close
 
 from gaussian_swaying import Box, MaterialPoints, MPMSolver, PinnedRegion
-from gaussian_swaying.mpm.boundaries.impulse import Impulse
+from gaussian_swaying.mpm.pins import Impulse
 
 from .bodies import block, lone, march, run_for
 

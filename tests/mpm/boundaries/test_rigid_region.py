@@ -11,9 +11,8 @@ from torch.testing import assert_close
 
 from gaussian_swaying import Box, MaterialPoints, MPMSolver, PinnedPoints, PinnedRegion
 from gaussian_swaying.geometry.regions import Everything, Union
-from gaussian_swaying.mpm.boundaries.half_space import HalfSpaceObstacle
-from gaussian_swaying.mpm.boundaries.handle import Handle
-from gaussian_swaying.mpm.boundaries.rigid_region import RigidRegion
+from gaussian_swaying.mpm.colliders import HalfSpaceObstacle
+from gaussian_swaying.mpm.pins import Handle, RigidRegion
 
 FORMULATIONS = ["total", "updated"]
 RIGHT = Box([0.2, None, None], [None] * 3)

@@ -6,8 +6,7 @@ from shared import solid
 from torch.testing import assert_close
 
 from gaussian_swaying import Box, MPMSolver, SimFrame, Sphere
-from gaussian_swaying.mpm.boundaries.impulse import Impulse
-from gaussian_swaying.mpm.boundaries.sequential_release import SequentialRelease
+from gaussian_swaying.mpm.pins import Impulse, SequentialRelease
 
 from .bodies import block, lone, march
 

@@ -8,7 +8,7 @@ from contacts import crossings, gaps, sheet_triangles
 from torch.testing import assert_close
 
 from gaussian_swaying import Contact, MaterialPoints, MPMSolver, PinnedPoints
-from gaussian_swaying.mpm.boundaries.half_space import HalfSpaceObstacle
+from gaussian_swaying.mpm.colliders import HalfSpaceObstacle
 from gaussian_swaying.mpm.contact import Surface
 
 from .bodies import layers, march, scene, sheet

@@ -7,8 +7,7 @@ from torch.testing import assert_close
 
 from gaussian_swaying import Contact, MaterialPoints, PinnedPoints
 from gaussian_swaying.kernels.derive import on_tensors
-from gaussian_swaying.mpm.boundaries.ball import BallObstacle
-from gaussian_swaying.mpm.boundaries.half_space import HalfSpaceObstacle
+from gaussian_swaying.mpm.colliders import BallObstacle, HalfSpaceObstacle
 from gaussian_swaying.mpm.triton import contact_kernels, fused_contact
 
 from .bodies import scene, sheet

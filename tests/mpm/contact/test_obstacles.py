@@ -8,10 +8,7 @@ from shared import solid
 
 from gaussian_swaying import MPMSolver
 from gaussian_swaying.geometry.keyed_path import KeyedPath
-from gaussian_swaying.mpm.boundaries.ball import BallObstacle
-from gaussian_swaying.mpm.boundaries.block import BoxObstacle
-from gaussian_swaying.mpm.boundaries.capsule import CapsuleObstacle
-from gaussian_swaying.mpm.boundaries.half_space import HalfSpaceObstacle
+from gaussian_swaying.mpm.colliders import BallObstacle, BoxObstacle, CapsuleObstacle, HalfSpaceObstacle
 
 from .bodies import march, scene, sheet
 

@@ -8,13 +8,13 @@ import dataclasses
 
 import pytest
 import torch
+from catalogue import BOUNDARIES as KINDS
 from catalogue import ELASTIC, MESH, PLASTIC, conditions, made
 
 from gaussian_swaying import AeroForce, WindField, WindForce
 from gaussian_swaying.geometry.keyed_path import KeyedPath
 from gaussian_swaying.geometry.regions import Everything
 from gaussian_swaying.kernels.launch import lanes
-from gaussian_swaying.mpm.boundaries import BOUNDARIES as KINDS
 from gaussian_swaying.mpm.state import GridSpec
 from gaussian_swaying.mpm.triton import fused_total
 from gaussian_swaying.wind.field import FlowKey

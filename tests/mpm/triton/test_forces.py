@@ -6,7 +6,7 @@ from catalogue import ELASTIC, PLASTIC
 
 from gaussian_swaying import Force, PinnedRegion, WindField
 from gaussian_swaying.kernels.language import tl, triton
-from gaussian_swaying.mpm.boundaries.plane import Plane
+from gaussian_swaying.mpm.colliders import Plane
 from gaussian_swaying.mpm.triton import fused, fused_updated
 from gaussian_swaying.mpm.twins import Numbers, Twin
 

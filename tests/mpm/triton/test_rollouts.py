@@ -19,12 +19,9 @@ from gaussian_swaying import (
     WindField,
 )
 from gaussian_swaying._fixed import assign
-from gaussian_swaying.mpm.boundaries.ball import BallObstacle
-from gaussian_swaying.mpm.boundaries.enclosing_box import EnclosingBox
-from gaussian_swaying.mpm.boundaries.handle import Handle
-from gaussian_swaying.mpm.boundaries.plane import Plane
-from gaussian_swaying.mpm.boundaries.velocity_box import VelocityBox
+from gaussian_swaying.mpm.colliders import BallObstacle, EnclosingBox, Plane, VelocityBox
 from gaussian_swaying.mpm.laws.sand import Sand
+from gaussian_swaying.mpm.pins import Handle
 from gaussian_swaying.mpm.state import GridSpec
 from gaussian_swaying.mpm.triton import fused, fused_total, fused_updated
 from gaussian_swaying.simulation.diagnostics import measure

@@ -5,8 +5,8 @@ import torch
 from shared import solid, unit
 
 from gaussian_swaying import AeroForce, Box, MaterialPoints, MPMSolver, WindField, WindForce
-from gaussian_swaying.mpm.boundaries.pinned_region import PinnedRegion
 from gaussian_swaying.mpm.modes import Modes
+from gaussian_swaying.mpm.pins import PinnedRegion
 from gaussian_swaying.wind.effects import LogProfile
 from gaussian_swaying.wind.looks import look
 from gaussian_swaying.wind.patches import Patches

@@ -16,7 +16,7 @@ from gaussian_swaying.air.immersed import exchange
 from gaussian_swaying.air.lattice import LatticeUnits
 from gaussian_swaying.geometry.regions import Box
 from gaussian_swaying.kernels.graphs import Replayed
-from gaussian_swaying.mpm.boundaries.pinned_region import PinnedRegion
+from gaussian_swaying.mpm.pins import PinnedRegion
 from gaussian_swaying.mpm.solver import MPMSolver
 from gaussian_swaying.scenes.procedural import FlagScene
 from gaussian_swaying.simulation.material import Material

@@ -15,9 +15,8 @@ from torch import Tensor
 
 from bench.problems.settings import Axial, Result, Settings, block, fit_sinusoid, follow
 from gaussian_swaying.geometry.regions import Box
-from gaussian_swaying.mpm.boundaries.boundary import Boundary
-from gaussian_swaying.mpm.boundaries.pinned_points import PinnedPoints
-from gaussian_swaying.mpm.boundaries.pinned_region import PinnedRegion
+from gaussian_swaying.mpm.boundary import Boundary
+from gaussian_swaying.mpm.pins import PinnedPoints, PinnedRegion
 from gaussian_swaying.mpm.state import MaterialPoints, MPMState
 
 LENGTH, YOUNG, DENSITY = 25.0, 100.0, 1.0  # [m], [Pa], [kg/m³]: the vibrating bar of Buzzi et al. 2008, c = 10 m/s

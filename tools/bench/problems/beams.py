@@ -9,7 +9,7 @@ import torch
 
 from bench.problems.settings import Axial, Result, Settings, block, follow
 from gaussian_swaying.geometry.regions import Region
-from gaussian_swaying.mpm.boundaries.pinned_region import PinnedRegion
+from gaussian_swaying.mpm.pins import PinnedRegion
 from gaussian_swaying.mpm.state import MaterialPoints
 
 HEIGHT, YOUNG, DENSITY = 1.0, 1e4, 1.0  # thickness [m], [Pa], [kg/m³]; the result depends only on b and L / h

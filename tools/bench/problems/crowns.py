@@ -18,7 +18,7 @@ import torch
 from bench.problems.beams import Chosen
 from bench.problems.rods import section
 from bench.problems.settings import Result, Settings, follow
-from gaussian_swaying.mpm.boundaries.pinned_region import PinnedRegion
+from gaussian_swaying.mpm.pins import PinnedRegion
 from gaussian_swaying.mpm.state import MaterialPoints, MPMState
 from gaussian_swaying.wind.field import WindField
 from gaussian_swaying.wind.force import AeroForce

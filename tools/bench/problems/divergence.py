@@ -14,7 +14,7 @@ import torch
 
 from bench.problems.reconfiguration import AIR, HELD, LENGTH, YOUNG, plate
 from bench.problems.settings import Result, Settings, follow
-from gaussian_swaying.mpm.boundaries.pinned_region import PinnedRegion
+from gaussian_swaying.mpm.pins import PinnedRegion
 from gaussian_swaying.mpm.state import MPMState
 from gaussian_swaying.wind.field import WindField
 from gaussian_swaying.wind.force import AeroForce

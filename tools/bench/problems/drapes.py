@@ -17,7 +17,7 @@ from bench.problems.fabrics import FABRICS, GRAVITY, THICK
 from bench.problems.settings import Result, Settings, follow
 from gaussian_swaying.gaussians.cloud import GaussianCloud
 from gaussian_swaying.geometry.regions import Cylinder
-from gaussian_swaying.mpm.boundaries.pinned_region import PinnedRegion
+from gaussian_swaying.mpm.pins import PinnedRegion
 from gaussian_swaying.mpm.solver import MPMSolver
 from gaussian_swaying.scenes.patches import sheet, to_cloud
 from gaussian_swaying.scenes.procedural import ProceduralScene

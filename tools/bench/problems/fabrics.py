@@ -13,7 +13,7 @@ import torch
 from bench.problems.beams import elastica
 from bench.problems.settings import Axial, Result, Settings, follow
 from gaussian_swaying.geometry.regions import Box
-from gaussian_swaying.mpm.boundaries.pinned_region import PinnedRegion
+from gaussian_swaying.mpm.pins import PinnedRegion
 from gaussian_swaying.mpm.solver import MPMSolver
 from gaussian_swaying.scenes.procedural import FlagScene
 from gaussian_swaying.simulation.material import Material

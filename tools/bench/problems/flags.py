@@ -8,7 +8,7 @@ from torch import Tensor
 from bench.problems.settings import Result, Run, Settings, follow
 from gaussian_swaying.geometry.patches import deform_patch
 from gaussian_swaying.geometry.regions import Box
-from gaussian_swaying.mpm.boundaries.pinned_region import PinnedRegion
+from gaussian_swaying.mpm.pins import PinnedRegion
 from gaussian_swaying.mpm.state import MaterialPoints, MPMState
 from gaussian_swaying.simulation.diagnostics import TearingGauge
 from gaussian_swaying.wind.field import SineSway, WindField

@@ -9,7 +9,7 @@ from torch import Tensor
 
 from bench.problems.settings import Axial, Result, Settings, follow, lattice
 from gaussian_swaying.geometry.patches import deform_patch
-from gaussian_swaying.mpm.boundaries.boundary import Boundary, Nodes
+from gaussian_swaying.mpm.boundary import Boundary, Nodes
 from gaussian_swaying.mpm.state import MaterialPoints, MPMState
 from gaussian_swaying.wind.force import AeroForce
 

@@ -9,7 +9,7 @@ from torch import Tensor
 
 from bench.problems.beams import Chosen, first_zero, timoshenko_mode
 from bench.problems.settings import Result, Settings, follow
-from gaussian_swaying.mpm.boundaries.pinned_region import PinnedRegion
+from gaussian_swaying.mpm.pins import PinnedRegion
 from gaussian_swaying.mpm.state import MaterialPoints, MPMState
 
 

@@ -11,7 +11,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from gaussian_swaying.mpm.boundaries.boundary import Boundary, Nodes
+from gaussian_swaying.mpm.boundary import Boundary, Nodes
 from gaussian_swaying.mpm.forces import ForceFunction
 from gaussian_swaying.mpm.solver import MPMSolver
 from gaussian_swaying.mpm.state import MaterialPoints, MPMState

@@ -8,9 +8,8 @@ import torch
 
 from bench.problems.settings import Axial, Result, Settings, follow
 from gaussian_swaying.geometry.regions import Box
-from gaussian_swaying.mpm.boundaries.boundary import Boundary
-from gaussian_swaying.mpm.boundaries.pinned_points import PinnedPoints
-from gaussian_swaying.mpm.boundaries.pinned_region import PinnedRegion
+from gaussian_swaying.mpm.boundary import Boundary
+from gaussian_swaying.mpm.pins import PinnedPoints, PinnedRegion
 from gaussian_swaying.mpm.state import MaterialPoints
 
 LENGTH, YOUNG, DENSITY = 1.0, 1e4, 1.0  # [m], [Pa], [kg/m³]; the result depends only on L / h and the deflection

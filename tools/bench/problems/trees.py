@@ -18,7 +18,7 @@ from bench.problems.beams import first_zero
 from bench.problems.rods import section
 from bench.problems.settings import Result, Settings, fit_sinusoid, follow
 from gaussian_swaying.geometry.regions import Box
-from gaussian_swaying.mpm.boundaries.pinned_region import PinnedRegion
+from gaussian_swaying.mpm.pins import PinnedRegion
 from gaussian_swaying.mpm.state import MaterialPoints, MPMState
 from gaussian_swaying.wind.field import WindField
 from gaussian_swaying.wind.force import AeroForce

@@ -20,9 +20,8 @@ from torch import Tensor
 
 from bench.problems.settings import Result, Settings, follow
 from gaussian_swaying.geometry.regions import Box
-from gaussian_swaying.mpm.boundaries.boundary import Boundary
-from gaussian_swaying.mpm.boundaries.handle import Handle
-from gaussian_swaying.mpm.boundaries.pinned_region import PinnedRegion
+from gaussian_swaying.mpm.boundary import Boundary
+from gaussian_swaying.mpm.pins import Handle, PinnedRegion
 from gaussian_swaying.mpm.solver import MPMSolver
 from gaussian_swaying.mpm.state import MPMState
 from gaussian_swaying.scenes.procedural import FlagScene

@@ -10,7 +10,7 @@ from torch import Tensor
 from bench.runner import Row, study
 from bench.speed.timing import load, seconds, sheet, timed, waves, wind
 from gaussian_swaying.geometry.regions import Box
-from gaussian_swaying.mpm.boundaries.pinned_region import PinnedRegion
+from gaussian_swaying.mpm.pins import PinnedRegion
 from gaussian_swaying.mpm.solver import MPMSolver
 from gaussian_swaying.mpm.state import MPMState
 

@@ -353,7 +353,7 @@ export class Solver extends Body {
     return now >= start && (end === null || now < end);
   }
 
-  /** Stops the nodes at or behind a plane, as plane_velocity in mpm/boundaries/plane.py. */
+  /** Stops the nodes at or behind a plane, as plane_velocity in mpm/colliders.py. */
   stop(plane) {
     if (!this.acts(plane)) return;
     const { point, normal: [n0, n1, n2], kind, friction } = plane;

@@ -1,4 +1,4 @@
-"""Base class of the boundary conditions: they hold, stop or drive grid nodes within a time window.
+"""Base classes of the boundary conditions: they hold, stop or drive grid nodes within a time window.
 
 A condition changes nodal velocities after the momentum update. The position of a node depends on the formulation: the
 lattice point in ``updated``, the centre of the mass that it carries in ``total``.

@@ -1,0 +1,683 @@
+"""What the material cannot enter or leave: planes, boxes, and rigid obstacles that may move.
+
+The distance from a solid is one device function (:mod:`~gaussian_swaying.geometry.distance`), which torch runs on
+tensors and the kernels call (:class:`Solids`).
+"""
+
+from __future__ import annotations
+
+import copy
+import math
+from collections.abc import Container, Sequence
+
+import torch
+from torch import Tensor
+
+from gaussian_swaying._checks import check_choice, check_positive, check_vector
+from gaussian_swaying._fixed import FixedList, assign, changed
+from gaussian_swaying.geometry.distance import (
+    DistanceGrid,
+    ball_distance,
+    box_distance,
+    capsule_distance,
+    distance_at,
+    grid_distance,
+    half_space_distance,
+)
+from gaussian_swaying.geometry.frame import SimFrame
+from gaussian_swaying.geometry.keyed_path import KeyedPath, between, fastest
+from gaussian_swaying.geometry.meshes import mesh_distance, read_mesh
+from gaussian_swaying.geometry.regions import Region
+from gaussian_swaying.geometry.rotations import rotation_of
+from gaussian_swaying.kernels.derive import on_tensors
+from gaussian_swaying.mpm.boundary import Boundary, Nodes
+from gaussian_swaying.mpm.forces import MOST_STEPS
+from gaussian_swaying.mpm.touch import POSE, ROW, stopped
+from gaussian_swaying.mpm.twins import Composed, Numbers, Tables, Twin
+
+KINDS = ("sticky", "slip", "separate")
+
+
+def plane_velocity(velocity: Tensor, normal: Tensor, kind: str, friction: float) -> Tensor:
+    """Velocity of nodes in contact with a plane at rest.
+
+    Args:
+        velocity: Node velocity [m/s], shape (..., 3).
+        normal: Unit normal, pointing to the free side, shape (..., 3).
+        kind: ``sticky`` (no motion), ``slip`` (no motion along the normal), ``separate`` (no motion into the plane).
+        friction: Coulomb coefficient: the tangential speed falls by at most ``friction`` times the normal speed that
+            the contact removes.
+
+    Returns:
+        Shape (..., 3).
+    """
+    v, n = velocity.unbind(-1), normal.to(velocity).unbind(-1)
+    return torch.stack(on_tensors(stopped)(v, n, KINDS.index(kind), friction), -1)
+
+
+class Plane(Boundary):
+    """A half space that particles cannot enter.
+
+    Args:
+        point: A point of the plane, in scene units.
+        normal: Normal towards the free side, in scene axes.
+        kind: ``sticky``, ``slip`` or ``separate`` (see :func:`plane_velocity`).
+        friction: Coulomb friction coefficient of ``slip`` and ``separate``.
+        start: Time from which it acts [s].
+        end: Time from which it no longer acts [s]; None for never.
+    """
+
+    needs_position = True
+    recordable = True
+
+    def __init__(
+        self,
+        point: Sequence[float],
+        normal: Sequence[float],
+        kind: str = "separate",
+        friction: float = 0.0,
+        start: float = 0.0,
+        end: float | None = None,
+    ) -> None:
+        super().__init__(start, end)
+        check_choice("kind", kind, KINDS)
+        check_positive("friction", friction, allow_zero=True)
+        self.kind, self.friction = kind, float(friction)
+        n = torch.tensor(check_vector("normal", normal), dtype=torch.float64)
+        if float(n.norm()) == 0:
+            raise ValueError("Expected `normal` of the plane not to be zero.")
+        self.register_buffer("point", torch.tensor(check_vector("point", point), dtype=torch.float64))
+        self.register_buffer("normal", n / n.norm())
+        self.point: Tensor
+        self.normal: Tensor
+
+    def in_frame(self, frame: SimFrame) -> Plane:
+        """The plane in metres, z up."""
+        normal = frame.direction_to_sim(self.normal).clone()
+        return self.copy_in(frame, point=frame.point_to_sim(self.point), normal=normal)
+
+    def forward(self, velocity: Tensor, nodes: Nodes) -> Tensor:
+        assert nodes.position is not None
+        behind = ((nodes.position - self.point.to(velocity)) * self.normal.to(velocity)).sum(-1) <= 0
+        stopped = plane_velocity(velocity, self.normal, self.kind, self.friction)
+        return torch.where((behind & self.active(nodes.time))[..., None], stopped, velocity)
+
+    def twin(self) -> Twin:
+        return Twin(half_space_distance, numbers=Numbers(3, lambda: self.normal), sources=(self,))
+
+
+class EnclosingBox(Boundary):
+    """Six planes that keep the particles inside an axis-aligned box.
+
+    Args:
+        min: Smallest corner, in scene units.
+        max: Largest corner, in scene units.
+        kind: ``sticky``, ``slip`` or ``separate``.
+        friction: Coulomb friction coefficient of ``slip`` and ``separate``.
+        start: Time from which it acts [s].
+        end: Time from which it no longer acts [s]; None for never.
+    """
+
+    needs_position = True
+    recordable = True
+
+    def __init__(
+        self,
+        min: Sequence[float],
+        max: Sequence[float],
+        kind: str = "separate",
+        friction: float = 0.0,
+        start: float = 0.0,
+        end: float | None = None,
+    ) -> None:
+        super().__init__(start, end)
+        low, high = check_vector("min", min), check_vector("max", max)
+        if any(a >= b for a, b in zip(low, high, strict=True)):
+            raise ValueError(f"Expected `min` of the box to be below `max` on every axis, but got {low} and {high}.")
+        planes = []
+        for axis in range(3):
+            direction = [0.0, 0.0, 0.0]
+            direction[axis] = 1.0
+            planes.append(Plane(low, direction, kind, friction, start, end))
+            planes.append(Plane(high, [-d for d in direction], kind, friction, start, end))
+        self.planes = FixedList(planes)
+
+    def in_frame(self, frame: SimFrame) -> EnclosingBox:
+        """The box in metres, z up."""
+        return changed(self, planes=FixedList(p.in_frame(frame) for p in self.planes))  # type: ignore[operator]
+
+    def forward(self, velocity: Tensor, nodes: Nodes) -> Tensor:
+        for plane in self.planes:
+            velocity = plane(velocity, nodes)
+        return velocity
+
+    def twin(self) -> Twin:
+        """Nothing but that of each plane."""
+        return Twin(None, parts=tuple(plane.twin() for plane in self.planes))  # type: ignore[operator]
+
+
+class VelocityBox(Boundary):
+    """Gives the nodes inside a region a prescribed velocity.
+
+    Args:
+        region: Region in which the nodes are driven, in scene units.
+        velocity: Velocity [m/s], z up.
+        start: Time from which it acts [s].
+        end: Time from which it no longer acts [s]; None for never.
+        travels: Whether the region moves with ``velocity`` from ``start`` on; otherwise it stays where it is.
+    """
+
+    needs_position = True
+
+    def __init__(
+        self,
+        region: Region,
+        velocity: Sequence[float],
+        start: float = 0.0,
+        end: float | None = None,
+        travels: bool = False,
+    ) -> None:
+        super().__init__(start, end)
+        self.region, self.recordable, self.travels = region, region.recordable, bool(travels)
+        self.register_buffer("velocity", torch.tensor(check_vector("velocity", velocity), dtype=torch.float64))
+        self.velocity: Tensor
+
+    def in_frame(self, frame: SimFrame) -> VelocityBox:
+        """The box with its region evaluated in metres."""
+        return self.copy_in(frame)
+
+    def forward(self, velocity: Tensor, nodes: Nodes) -> Tensor:
+        assert nodes.position is not None
+        where = nodes.position
+        if self.travels:
+            where = where - (self.velocity * (nodes.time - self.start)).to(where)
+        inside = self.region.contains(where) & self.active(nodes.time)
+        return torch.where(inside[..., None], self.velocity.to(velocity), velocity)
+
+
+class Obstacle(Boundary):
+    """A rigid body, fixed or moving, that the material cannot enter, with Coulomb friction.
+
+    In ``total`` it stops contact samples of the body's surface, at the obstacle's own surface
+    (:mod:`~gaussian_swaying.mpm.contact`). In ``updated`` it stops grid nodes, as a ``Plane`` does, so the gap is up to
+    a cell wide.
+
+    Args:
+        center: Origin of its own axes at rest, in scene units.
+        friction: Coulomb coefficient.
+        gap: Distance that the material keeps from it [m].
+        path: Motion of the obstacle; None for one at rest.
+        start: Time from which it acts [s].
+        end: Time from which it no longer acts [s]; None for never.
+    """
+
+    needs_position = True
+    recordable = True
+
+    def __init__(
+        self,
+        center: tuple[float, ...],
+        friction: float = 0.3,
+        gap: float = 0.0,
+        path: KeyedPath | None = None,
+        start: float = 0.0,
+        end: float | None = None,
+    ) -> None:
+        super().__init__(start, end)
+        check_positive("friction", friction, allow_zero=True)
+        check_positive("gap", gap, allow_zero=True)
+        self.friction, self.gap, self.path = float(friction), float(gap), path
+        self.register_buffer("center", torch.tensor(center, dtype=torch.float64))
+        times, moves, turns = KeyedPath([0.0]).keys() if path is None else path.keys()
+        for name, value in (("times", times), ("shifts", moves), ("turns", turns)):
+            self.register_buffer(name, value)
+        self.center: Tensor
+        self.times: Tensor
+        self.shifts: Tensor
+        self.turns: Tensor
+
+    def in_metres(self, frame: SimFrame, **tensors: Tensor) -> Obstacle:
+        """A copy with its centre and path in metres, and with some tensors replaced."""
+        if self.path is not None:
+            _, moves, turns = self.path.keys(frame)
+            tensors |= {"shifts": moves, "turns": turns}
+        return self.copy_in(frame, center=frame.point_to_sim(self.center), **tensors)
+
+    def hold_kind(self, neighbours_fixed: bool) -> str:
+        """``surface``: it acts on the surface where particles keep their neighbours, otherwise on ``nodes``."""
+        return "surface" if neighbours_fixed else "nodes"
+
+    def solid(self) -> Twin:
+        """The device function of its distance at rest, and its numbers; a subclass has this or :meth:`distance`."""
+        raise NotImplementedError(f"{type(self).__name__} has neither `solid` nor `distance`.")
+
+    def twin(self) -> Twin | None:
+        return self.solid()
+
+    def distance(self, place: Tensor) -> tuple[Tensor, Tensor]:
+        """Signed distance from its surface and the gradient of it, at rest; in torch.
+
+        Args:
+            place: Places relative to its centre [m], shape (..., 3).
+
+        Returns:
+            Distances [m], negative inside, shape (...), and unit vectors (..., 3).
+        """
+        solid = self.solid()
+        table = solid.table.take() if solid.table.count else place.new_zeros(1)
+        return distance_at(solid.function, place, solid.numbers.take(), table)
+
+    @property
+    def still(self) -> bool:
+        """True if it never moves."""
+        return self.path is None
+
+    def fastest(self, farthest: float, start: float = -math.inf, end: float = math.inf) -> float:
+        """Bound of its speed [m/s] at places up to ``farthest`` [m] from its centre, between two times [s]."""
+        start, end = max(start, self.start), min(end, self.end)
+        if not start < end:
+            return 0.0
+        turning = fastest(self.times, self.turns, start, end)
+        return fastest(self.times, self.shifts, start, end) + (turning * farthest if turning else 0.0)
+
+    def pose(self, time: Tensor) -> tuple[Tensor, Tensor]:
+        """Its centre [m], shape (..., 3), and its rotation, shape (..., 3, 3), at times [s]; float64."""
+        return self.center + between(self.times, self.shifts, time), rotation_of(between(self.times, self.turns, time))
+
+    def motion(self, time: Tensor, dt: float | Tensor) -> tuple[Tensor, ...]:
+        """Its pose, and the velocity of what is at an offset from the centre.
+
+        The velocity [m/s] is a matrix (..., 3, 3) times the offset, and that of the centre (..., 3). It takes each
+        place of the obstacle to where it is ``dt`` later.
+        """
+        (here, turn), (there, turned) = self.pose(time), self.pose(time + dt)
+        identity = torch.eye(3, dtype=turn.dtype, device=turn.device)
+        return here, turn, (turned @ turn.mT - identity) / dt, (there - here) / dt
+
+    def touch(self, place: Tensor, time: Tensor, dt: float | Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Distance from the obstacle, its normal, and its velocity at places.
+
+        Args:
+            place: Places [m], shape (..., 3).
+            time: Time now [s], scalar float64 tensor.
+            dt: Substep [s]; the velocity takes each place of the obstacle to where it is ``dt`` later.
+
+        Returns:
+            Distance less the ``gap`` [m], shape (...), normal out of the obstacle and velocity [m/s], shape (..., 3).
+        """
+        here, turn, spin, speed = (part.to(place) for part in self.motion(time, dt))
+        arm = place - here
+        distance, normal = self.distance(arm @ turn)
+        return distance - self.gap, normal @ turn.mT, arm @ spin.mT + speed
+
+    def forward(self, velocity: Tensor, nodes: Nodes) -> Tensor:
+        assert nodes.position is not None
+        distance, normal, own = self.touch(nodes.position, nodes.time, nodes.dt)
+        stopped = own + plane_velocity(velocity - own, normal, "separate", self.friction)
+        return torch.where(((distance <= 0) & self.active(nodes.time))[..., None], stopped, velocity)
+
+
+def grid_twin(obstacle: Obstacle, grid: DistanceGrid, axes: Tensor) -> Twin:
+    """The twin of an obstacle whose distances [m] are on a grid; its axes are columns."""
+    table = Numbers(grid.values.numel(), lambda: grid.values)
+    return Twin(grid_distance, numbers=Numbers(16, lambda: grid.numbers(axes)), table=table, sources=(obstacle,))
+
+
+class BallObstacle(Obstacle):
+    """A ball that the material cannot enter.
+
+    Args:
+        center: Its centre, in scene units.
+        radius: Its radius, in scene units.
+        friction: Coulomb coefficient.
+        gap: Distance that the material keeps from it [m].
+        path: Motion of the obstacle; None for one at rest.
+        start: Time from which it acts [s].
+        end: Time from which it no longer acts [s]; None for never.
+    """
+
+    def __init__(
+        self,
+        center: Sequence[float],
+        radius: float,
+        friction: float = 0.3,
+        gap: float = 0.0,
+        path: KeyedPath | None = None,
+        start: float = 0.0,
+        end: float | None = None,
+    ) -> None:
+        super().__init__(check_vector("center", center), friction, gap, path, start, end)
+        check_positive("radius", radius)
+        self.register_buffer("radius", torch.tensor(float(radius), dtype=torch.float64))
+        self.radius: Tensor
+
+    def in_frame(self, frame: SimFrame) -> Obstacle:
+        """The ball in metres, z up."""
+        return self.in_metres(frame, radius=self.radius * frame.metres_per_unit)
+
+    twin = Obstacle.twin
+
+    def solid(self) -> Twin:
+        return Twin(ball_distance, numbers=Numbers(1, lambda: self.radius), sources=(self,))
+
+
+class BoxObstacle(Obstacle):
+    """A box that the material cannot enter: a table, a step; an ``EnclosingBox`` is one that it cannot leave.
+
+    Args:
+        min: Smallest corner before it is turned, in scene units.
+        max: Largest corner.
+        turn: Rotation about its centre, as axis times angle [degrees], in scene axes.
+        friction: Coulomb coefficient.
+        gap: Distance that the material keeps from it [m].
+        path: Motion of the obstacle; None for one at rest.
+        start: Time from which it acts [s].
+        end: Time from which it no longer acts [s]; None for never.
+    """
+
+    def __init__(
+        self,
+        min: Sequence[float],
+        max: Sequence[float],
+        turn: Sequence[float] = (0.0, 0.0, 0.0),
+        friction: float = 0.3,
+        gap: float = 0.0,
+        path: KeyedPath | None = None,
+        start: float = 0.0,
+        end: float | None = None,
+    ) -> None:
+        low, high = check_vector("min", min), check_vector("max", max)
+        if any(a >= b for a, b in zip(low, high, strict=True)):
+            raise ValueError(f"Expected `min` of the box to be below `max` on every axis, but got {low} and {high}.")
+        middle = tuple(0.5 * (a + b) for a, b in zip(low, high, strict=True))
+        super().__init__(middle, friction, gap, path, start, end)
+        half = [0.5 * (b - a) for a, b in zip(low, high, strict=True)]
+        angle = torch.deg2rad(torch.tensor(check_vector("turn", turn), dtype=torch.float64))
+        self.register_buffer("half_sides", torch.tensor(half, dtype=torch.float64))
+        self.register_buffer("axes", rotation_of(angle))
+        self.half_sides: Tensor
+        self.axes: Tensor
+
+    def in_frame(self, frame: SimFrame) -> Obstacle:
+        """The box in metres, z up."""
+        axes = frame.direction_to_sim(self.axes.T.contiguous()).T.contiguous()
+        return self.in_metres(frame, half_sides=self.half_sides * frame.metres_per_unit, axes=axes)
+
+    twin = Obstacle.twin
+
+    def solid(self) -> Twin:
+        numbers = Numbers(12, lambda: torch.cat([self.half_sides, self.axes.reshape(-1)]))
+        return Twin(box_distance, numbers=numbers, sources=(self,))
+
+
+class CapsuleObstacle(Obstacle):
+    """A rod with round ends that the material cannot enter: a pole, an arm. It turns about its middle.
+
+    Args:
+        first: One end of its axis, in scene units.
+        second: The other end.
+        radius: Its radius, in scene units.
+        friction: Coulomb coefficient.
+        gap: Distance that the material keeps from it [m].
+        path: Motion of the obstacle; None for one at rest.
+        start: Time from which it acts [s].
+        end: Time from which it no longer acts [s]; None for never.
+    """
+
+    def __init__(
+        self,
+        first: Sequence[float],
+        second: Sequence[float],
+        radius: float,
+        friction: float = 0.3,
+        gap: float = 0.0,
+        path: KeyedPath | None = None,
+        start: float = 0.0,
+        end: float | None = None,
+    ) -> None:
+        a, b = check_vector("first", first), check_vector("second", second)
+        middle = tuple(0.5 * (p + q) for p, q in zip(a, b, strict=True))
+        super().__init__(middle, friction, gap, path, start, end)
+        check_positive("radius", radius)
+        self.register_buffer("radius", torch.tensor(float(radius), dtype=torch.float64))
+        half = [0.5 * (q - p) for p, q in zip(a, b, strict=True)]
+        self.register_buffer("half_axis", torch.tensor(half, dtype=torch.float64))
+        self.radius: Tensor
+        self.half_axis: Tensor
+
+    def in_frame(self, frame: SimFrame) -> Obstacle:
+        """The rod in metres, z up."""
+        half = frame.direction_to_sim(self.half_axis) * frame.metres_per_unit
+        return self.in_metres(frame, radius=self.radius * frame.metres_per_unit, half_axis=half)
+
+    twin = Obstacle.twin
+
+    def solid(self) -> Twin:
+        def numbers() -> Tensor:
+            squared = self.half_axis.square().sum()
+            inverse = torch.where(squared > 0, 1 / squared, 0.0)
+            return torch.cat([self.radius[None], self.half_axis, inverse[None]])
+
+        return Twin(capsule_distance, numbers=Numbers(5, numbers), sources=(self,))
+
+
+class HalfSpaceObstacle(Obstacle):
+    """All space behind a plane: a floor, a wall. Unlike a ``Plane``, in ``total`` it is sharp, and it can move.
+
+    Args:
+        point: A point of the plane, in scene units; it turns about this point.
+        normal: Normal towards the free side, in scene axes.
+        friction: Coulomb coefficient.
+        gap: Distance that the material keeps from it [m].
+        path: Motion of the obstacle; None for one at rest.
+        start: Time from which it acts [s].
+        end: Time from which it no longer acts [s]; None for never.
+    """
+
+    def __init__(
+        self,
+        point: Sequence[float],
+        normal: Sequence[float],
+        friction: float = 0.3,
+        gap: float = 0.0,
+        path: KeyedPath | None = None,
+        start: float = 0.0,
+        end: float | None = None,
+    ) -> None:
+        super().__init__(check_vector("point", point), friction, gap, path, start, end)
+        n = torch.tensor(check_vector("normal", normal), dtype=torch.float64)
+        if float(n.norm()) == 0:
+            raise ValueError("Expected `normal` of the half space not to be zero.")
+        self.register_buffer("normal", n / n.norm())
+        self.normal: Tensor
+
+    def in_frame(self, frame: SimFrame) -> Obstacle:
+        """The half space in metres, z up."""
+        return self.in_metres(frame, normal=frame.direction_to_sim(self.normal).clone())
+
+    twin = Obstacle.twin
+
+    def solid(self) -> Twin:
+        return Twin(half_space_distance, numbers=Numbers(3, lambda: self.normal), sources=(self,))
+
+
+class MeshObstacle(Obstacle):
+    """A closed triangle mesh that the material cannot enter.
+
+    Its signed distance is computed on a grid once, so details smaller than a cell of that grid are rounded off. It
+    turns about the origin of the mesh.
+
+    Args:
+        mesh: A .ply or .obj file, in scene units and axes.
+        cells: Cells of the grid along the longest side of the mesh.
+        center: Position of the mesh's origin, in scene units.
+        friction: Coulomb coefficient.
+        gap: Distance that the material keeps from it [m].
+        path: Motion of the obstacle; None for one at rest.
+        start: Time from which it acts [s].
+        end: Time from which it no longer acts [s]; None for never.
+
+    Raises:
+        ValueError: If the file is no closed mesh.
+    """
+
+    def __init__(
+        self,
+        mesh: str,
+        cells: int = 48,
+        center: Sequence[float] = (0.0, 0.0, 0.0),
+        friction: float = 0.3,
+        gap: float = 0.0,
+        path: KeyedPath | None = None,
+        start: float = 0.0,
+        end: float | None = None,
+    ) -> None:
+        super().__init__(check_vector("center", center), friction, gap, path, start, end)
+        if cells < 4:
+            raise ValueError(f"Expected `cells` of the mesh to be at least 4, but got {cells}.")
+        self.mesh, self.cells = mesh, int(cells)
+        found = mesh_distance(*read_mesh(mesh), cells)
+        self.register_buffer("values", found.values)
+        self.register_buffer("corner", found.origin)
+        self.register_buffer("axes", torch.eye(3, dtype=torch.float64))
+        self.values: Tensor
+        self.corner: Tensor
+        self.axes: Tensor
+        self.spacing = found.spacing
+
+    def in_frame(self, frame: SimFrame) -> Obstacle:
+        """The mesh in metres, z up."""
+        unit = frame.metres_per_unit
+        axes = frame.direction_to_sim(torch.eye(3, dtype=torch.float64)).T.contiguous()
+        moved = self.in_metres(frame, values=self.values * unit, corner=self.corner * unit, axes=axes)
+        return changed(moved, spacing=self.spacing * unit)
+
+    twin = Obstacle.twin
+
+    def solid(self) -> Twin:
+        return grid_twin(self, DistanceGrid(self.values, self.corner, self.spacing), self.axes)
+
+
+class StillGaussians(Obstacle):
+    """Everything in the scene that does not move: a curtain falls over a captured table.
+
+    Their surface is where the density of the Gaussians passes a level, on a grid around the object that a
+    ``Simulation`` makes once. Details smaller than a cell are rounded off.
+
+    Args:
+        cells: Cells of the grid along its longest side.
+        level: Density of the surface, from 0 to 1.
+        margin: Distance by which the grid reaches beyond the object at rest, in lengths of its longest side.
+        friction: Coulomb coefficient.
+        gap: Distance that the material keeps from it [m].
+        start: Time from which it acts [s].
+        end: Time from which it no longer acts [s]; None for never.
+    """
+
+    def __init__(
+        self,
+        cells: int = 96,
+        level: float = 0.5,
+        margin: float = 1.0,
+        friction: float = 0.3,
+        gap: float = 0.0,
+        start: float = 0.0,
+        end: float | None = None,
+    ) -> None:
+        super().__init__((0.0, 0.0, 0.0), friction, gap, None, start, end)
+        check_positive("margin", margin)
+        if not 0 < level < 1 or cells < 8:
+            raise ValueError(
+                f"Expected `level` between 0 and 1 and `cells` of at least 8, but got {level:g} and {cells}."
+            )
+        self.cells, self.level, self.margin, self.spacing = int(cells), float(level), float(margin), 0.0
+        self.register_buffer("values", torch.zeros(2, 2, 2, dtype=torch.float64), persistent=False)
+        self.register_buffer("corner", torch.zeros(3, dtype=torch.float64), persistent=False)
+        self.values: Tensor
+        self.corner: Tensor
+
+    def take(self, found: DistanceGrid) -> None:
+        """Set the grid of distances from the Gaussians, in metres, z up."""
+        assign(self, values=found.values, corner=found.origin, spacing=found.spacing)
+
+    def in_frame(self, frame: SimFrame) -> Obstacle:
+        """Itself: it is in metres."""
+        return copy.copy(self)
+
+    def solid(self) -> Twin:
+        """The interpolation of the grid; RuntimeError if none was set."""
+        if self.spacing == 0:
+            raise RuntimeError(
+                "The StillGaussians have no Gaussians: give them to a Simulation, which knows the scene."
+            )
+        return grid_twin(
+            self, DistanceGrid(self.values, self.corner, self.spacing), torch.eye(3, device=self.corner.device)
+        )
+
+    def twin(self) -> Twin | None:
+        return None if self.spacing == 0 else self.solid()
+
+
+Solid = Plane | Obstacle
+
+
+def solids_of(boundaries: Sequence[Boundary], pins: Container[int] = ()) -> list[tuple[Solid, int]] | None:
+    """All solids, each with the number of its boundary; None if a boundary has no twin.
+
+    Args:
+        boundaries: The boundary conditions of a body.
+        pins: Numbers of those that are no solids.
+    """
+    others = [(one, k) for k, one in enumerate(boundaries) if k not in pins]
+    if any(boundary.twin() is None for boundary, _ in others):
+        return None
+    return [(part, k) for one, k in others for part in one.modules() if isinstance(part, Solid)]
+
+
+class Solids:
+    """Tables of solids at fixed addresses, which recorded graphs contain.
+
+    Args:
+        parts: The solids, each with the number of its boundary.
+        like: A tensor of the type and device of the tables.
+
+    Attributes:
+        twins: Their device functions.
+        kinds: For each, its kind of contact in :data:`KINDS`.
+        moves: For each, whether it moves.
+    """
+
+    def __init__(self, parts: Sequence[tuple[Solid, int]], like: Tensor) -> None:
+        self.parts, device = list(parts), like.device
+        count, found = len(self.parts), [part.twin() for part, _ in self.parts]
+        self._twins = [twin for twin in found if twin is not None]
+        self.twins, self.tables = Composed(self._twins), Tables(device, like.dtype)
+        self.kinds = tuple(KINDS.index(part.kind if isinstance(part, Plane) else "separate") for part, _ in self.parts)
+        self.moves = tuple(isinstance(part, Obstacle) and not part.still for part, _ in self.parts)
+        self.rows = like.new_zeros(count, ROW.value)
+        self.windows = torch.zeros(count, 2, dtype=torch.float64, device=device)
+        self.poses = like.new_zeros(MOST_STEPS if any(self.moves) else min(count, 1), count, POSE.value)
+
+    def take(self) -> None:
+        """Fill the tables; again only if one of the solids was changed."""
+        if not self.tables.take(self._twins, self.twins, numbers=True):
+            return
+        for m, (part, boundary) in enumerate(self.parts):
+            gap, center = (0.0, part.point) if isinstance(part, Plane) else (part.gap, part.center)
+            self.rows[m, :3].copy_(torch.tensor([gap, part.friction, float(boundary)]))
+            self.windows[m].copy_(torch.tensor([part.start, part.end], dtype=torch.float64))
+            self.poses[:, m, :3] = center.to(self.poses)
+
+    def prepare(self, time: Tensor, dt: Tensor, steps: int) -> None:
+        """Compute the poses of some substeps.
+
+        Args:
+            time: Time of the first [s], scalar float64 tensor on the device.
+            dt: Substep [s], as ``time``.
+            steps: Number of substeps.
+        """
+        for m, (part, _) in enumerate(self.parts):
+            if self.moves[m] and isinstance(part, Obstacle):
+                found = part.motion(time + dt * torch.arange(steps, device=time.device), dt)
+                rows = torch.cat([each.reshape(steps, -1) for each in found], 1)
+                self.poses[:steps, m].copy_(rows)
