@@ -2,13 +2,116 @@
 
 from __future__ import annotations
 
+import math
+
 import torch
 from torch import Tensor
 
 from gaussian_swaying.geometry.covariances import deform_covariance, limit_deformed
-from gaussian_swaying.geometry.linalg import cofactor, determinant, polar_rotation
+from gaussian_swaying.geometry.linalg import polar_rotation
+from gaussian_swaying.geometry.linalg_triton import (
+    axpy9,
+    cofactor,
+    determinant,
+    dot3,
+    load3,
+    load9,
+    matmul,
+    matvec,
+    scale3,
+    store3,
+    store9,
+    transpose,
+    where3,
+    where9,
+)
+from gaussian_swaying.geometry.linalg_triton import (
+    polar_rotation as polar,
+)
 from gaussian_swaying.geometry.rotations import quat_to_rotation
-from gaussian_swaying.kernels.launch import replaces
+from gaussian_swaying.kernels.derive import on_tensors
+from gaussian_swaying.kernels.language import tl, triton
+from gaussian_swaying.kernels.launch import lanes, launch, replaces
+
+BLOCK = 128
+
+
+@triton.jit
+def area_vector(F, n):
+    """cof(F) N, which is as long as the area has grown (Nanson's formula), and det F."""
+    c = cofactor(F)
+    return matvec(c, n), determinant(F, c)
+
+
+@triton.jit
+def deformed_patch(F, n, area, max_ratio):
+    """Unit normal and area after a deformation, from one cofactor matrix; no area grows beyond ``max_ratio``.
+
+    Where cof(F) N is zero, because F flattens the patch to a line, the normal at rest stays.
+    """
+    vector, det = area_vector(F, n)
+    size = tl.sqrt(dot3(vector, vector))
+    flat = size == 0
+    scale = tl.where(det < 0, -1.0, 1.0) / tl.where(flat, 1.0, size)
+    normal = where3(flat, n, scale3(scale, vector))
+    return normal, tl.minimum(size, max_ratio) * area
+
+
+@triton.jit
+def deformed_normal(F, n):
+    """The normal of :func:`deformed_patch`, scaled so that squares cannot underflow."""
+    v, det = area_vector(F, n)
+    largest = tl.maximum(tl.abs(v[0]), tl.maximum(tl.abs(v[1]), tl.abs(v[2])))
+    flat = largest == 0
+    scale = tl.where(flat, 1.0, largest)
+    scale = tl.where(det < 0, -scale, scale)
+    v = where3(flat, n, (v[0] / scale, v[1] / scale, v[2] / scale))
+    size = tl.sqrt(dot3(v, v))
+    return v[0] / size, v[1] / size, v[2] / size
+
+
+@triton.jit
+def _limited(drawn, rest, turn, solid, square):
+    """See ``covariances.limit_deformed``; ``square`` is that of the largest stretch."""
+    size = rest[0] + rest[4] + rest[8]
+    excess = (square - 1) * size
+    over = drawn[0] + drawn[4] + drawn[8] - size
+    weight = excess / tl.maximum(tl.maximum(over, excess), 1e-37)
+    ball, nil = size / 3, 0.0 * size
+    shape = matmul(matmul(turn, rest), transpose(turn))
+    shape = where9(solid, shape, (ball, nil, nil, nil, ball, nil, nil, nil, ball))
+    return where9(over > excess, axpy9(weight, drawn, 1 - weight, shape), drawn)
+
+
+@triton.jit
+def deform_and_store(
+    f, covariance, normal, solid, covariance_out, normal_out, rotation_out, square, index, mask,
+    TURN: tl.constexpr, LIMIT: tl.constexpr,
+):  # fmt: skip
+    """Covariance, normal and rotation of some patches after a deformation ``f``, as :func:`deform_all`."""
+    a = load9(covariance, 1, 9 * index, mask)
+    drawn = matmul(matmul(f, a), transpose(f))
+    if LIMIT:
+        drawn = _limited(drawn, a, polar(f), tl.load(solid + index, mask, 1) != 0, square)
+    store9(covariance_out, 1, 9 * index, drawn, mask)
+    n = load3(normal, 1, 3 * index, mask)
+    store3(normal_out, 1, 3 * index, deformed_normal(f, n), mask)
+    if TURN:
+        store9(rotation_out, 1, 9 * index, polar(f), mask)
+
+
+@triton.jit
+def _deform(
+    F, covariance, normal, solid, covariance_out, normal_out, rotation_out, square, count,
+    TURN: tl.constexpr, LIMIT: tl.constexpr, BLOCK: tl.constexpr,
+):  # fmt: skip
+    """One patch per lane."""
+    index = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
+    mask = index < count
+    f = load9(F, 1, 9 * index, mask)
+    deform_and_store(
+        f, covariance, normal, solid, covariance_out, normal_out, rotation_out, square, index, mask, TURN, LIMIT
+    )
 
 
 def smallest_axis_normal(quats: Tensor, log_scales: Tensor) -> Tensor:
@@ -41,8 +144,8 @@ def deform_normal(deformation_gradient: Tensor, normals: Tensor) -> Tensor:
     Returns:
         Shape (..., 3).
     """
-    cof, vector = _cofactor_times(deformation_gradient, normals)
-    return _unit_normal(vector, determinant(deformation_gradient, cof), normals)
+    found = on_tensors(deformed_normal)(components(deformation_gradient), normals.unbind(-1))
+    return torch.stack(torch.broadcast_tensors(*found), dim=-1)
 
 
 def deform_patch(deformation_gradient: Tensor, normals: Tensor, areas: Tensor) -> tuple[Tensor, Tensor]:
@@ -58,25 +161,14 @@ def deform_patch(deformation_gradient: Tensor, normals: Tensor, areas: Tensor) -
     Returns:
         Shapes (..., 3) and (...).
     """
-    cof, vector = _cofactor_times(deformation_gradient, normals)
-    normal = _unit_normal(vector, determinant(deformation_gradient, cof), normals)
-    return normal, vector.norm(dim=-1) * areas
+    given = components(deformation_gradient), normals.unbind(-1), areas
+    normal, area = on_tensors(deformed_patch)(*given, math.inf)
+    return torch.stack(torch.broadcast_tensors(*normal), dim=-1), area
 
 
-def _unit_normal(vector: Tensor, determinants: Tensor, normals: Tensor) -> Tensor:
-    """F^-T N made unit from cof(F) N (..., 3) and det F (...); the normals at rest where that is zero."""
-    largest = torch.linalg.vector_norm(vector.detach(), float("inf"), dim=-1, keepdim=True)
-    flat = largest == 0
-    # + 0.0, as the sign of a negative zero is no reflection
-    scale = torch.where(flat, 1, largest).copysign(determinants.detach()[..., None] + 0.0)
-    vector = torch.where(flat, normals, vector / scale)  # scaled: squares cannot underflow
-    return vector / vector.square().sum(-1, keepdim=True).sqrt()
-
-
-def _cofactor_times(deformation_gradient: Tensor, normals: Tensor) -> tuple[Tensor, Tensor]:
-    """The cofactors of F (..., 3, 3) and their product with N (..., 3)."""
-    cof = cofactor(deformation_gradient)
-    return cof, (cof * normals[..., None, :]).sum(-1)
+def components(matrices: Tensor) -> tuple[Tensor, ...]:
+    """The nine numbers of matrices (..., 3, 3), as device functions take them."""
+    return matrices.reshape(*matrices.shape[:-2], 9).unbind(-1)
 
 
 def deform_all(
@@ -103,11 +195,35 @@ def deform_all(
     """
     tensors = (deformation_gradient, covariances, normals)
     if replaces(tensors):
-        from gaussian_swaying.geometry import patches_triton
-
-        return patches_triton.deform_all(*tensors, rotations, max_stretch, solid)
+        return _deform_all(*tensors, rotations, max_stretch, solid)
     drawn = deform_covariance(deformation_gradient, covariances)
     turns = polar_rotation(deformation_gradient) if rotations else None
     if max_stretch is not None and solid is not None:
         drawn = limit_deformed(deformation_gradient, drawn, covariances, max_stretch, solid, turns)
     return drawn, deform_normal(deformation_gradient, normals), turns
+
+
+def _deform_all(
+    deformation_gradient: Tensor,
+    covariances: Tensor,
+    normals: Tensor,
+    rotations: bool,
+    max_stretch: float | None = None,
+    solid: Tensor | None = None,
+) -> tuple[Tensor, Tensor, Tensor | None]:
+    """:func:`deform_all` in one kernel; float32, without gradient."""
+    shape = deformation_gradient.shape[:-2]
+    count = shape.numel()
+    given = [deformation_gradient, covariances.expand(*shape, 3, 3), normals.expand(*shape, 3)]
+    F, covariance, normal = (tensor.detach().contiguous() for tensor in given)
+    made = [torch.empty_like(F), torch.empty_like(normal), torch.empty_like(F) if rotations else F]
+    limit = max_stretch is not None and solid is not None
+    keeps = F if solid is None or not limit else solid.contiguous().view(torch.int8)
+    block = lanes(F.device, BLOCK)
+    if count > 0:
+        with torch.cuda.device_of(F):
+            launch(_deform, (triton.cdiv(count, block),))(
+                F, covariance, normal, keeps, *made, float(max_stretch or 1) ** 2, count,
+                TURN=rotations, LIMIT=limit, BLOCK=block,
+            )  # fmt: skip
+    return made[0], made[1], made[2] if rotations else None

@@ -1,7 +1,7 @@
 """One kernel for the fields of Gaussians that follow the nodes, for a picture; the definitions are in ``followers``."""
 
 from gaussian_swaying.geometry.linalg_triton import load3, load9, matmul, store3, transpose
-from gaussian_swaying.geometry.patches_triton import deform_and_store
+from gaussian_swaying.geometry.patches import deform_and_store
 from gaussian_swaying.kernels.language import tl, triton
 from gaussian_swaying.mpm.triton.shared import VARIES, axis_weights
 from gaussian_swaying.mpm.triton.total_kernels import gather

@@ -59,7 +59,7 @@ class Twin:
         sources: Tensors and modules; ``per_point``, ``table`` and, except of a force, ``numbers`` are taken again when
             one of them was replaced or written to.
         implicit: Whether a force has a resistance, so that it acts at the velocity at the end of the substep.
-        adjoint: Of a force, a device function ``(F, velocity, point, numbers, now, table, a, OPTIONS)`` that returns
+        adjoint: Of a force, a device function ``(F, velocity, point, numbers, now, table, a)`` that returns
             the gradients of a . force, with three numbers a: by F (nine), by the velocity (three), by the first three
             numbers of the substep and by the first three of ``numbers``. No other input of the force may require a
             gradient then. None for a force whose gradients need torch.

@@ -15,11 +15,18 @@ import torch
 from torch import Tensor
 
 from gaussian_swaying._devices import in_double
+from gaussian_swaying.kernels.language import tl, triton
 from gaussian_swaying.mpm.forces import Force
 from gaussian_swaying.mpm.state import MaterialPoints, State
 from gaussian_swaying.mpm.twins import Numbers, Twin
 from gaussian_swaying.wind.force import AeroForce
 from gaussian_swaying.wind.patches import Patches
+
+
+@triton.jit
+def steady_force(F, velocity, position, point, numbers, now, table, OPTIONS: tl.constexpr):
+    """``AirLift``: the numbers of a point are its force; no resistance."""
+    return (point[0], point[1], point[2]), point[0] * 0
 
 
 def carried_mass(patches: Patches, aero: AeroForce) -> Tensor:
@@ -72,6 +79,4 @@ class AirLift(Force):
         return -(in_double(self.force) * in_double(state.position)).sum((-2, -1))
 
     def twin(self) -> Twin | None:
-        from gaussian_swaying.wind.force_triton import steady_force
-
         return Twin(steady_force, per_point=Numbers(3, lambda: self.force), sources=(self.force,))

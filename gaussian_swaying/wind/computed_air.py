@@ -21,6 +21,7 @@ from gaussian_swaying.geometry.distance import DistanceGrid
 from gaussian_swaying.geometry.frame import SimFrame
 from gaussian_swaying.geometry.regions import Region
 from gaussian_swaying.kernels.graphs import Replayed
+from gaussian_swaying.kernels.language import tl, triton
 from gaussian_swaying.mpm.forces import Force
 from gaussian_swaying.mpm.protocol import Solver
 from gaussian_swaying.mpm.state import State
@@ -108,6 +109,16 @@ class ComputedAir(Fixed, nn.Module):
         return sides[0], sides[1], sides[2] + self.ground
 
 
+@triton.jit
+def air_push(F, velocity, position, point, numbers, now, table, OPTIONS: tl.constexpr):
+    """``AirPush``; ``point``: the force at rest (three numbers), and its decrease per velocity."""
+    rate = point[3]
+    return (
+        (point[0] - rate * velocity[0], point[1] - rate * velocity[1], point[2] - rate * velocity[2]),
+        rate * 0.0,
+    )
+
+
 class AirPush(Force):
     r"""The force of computed air on the points in the substeps of a step of the air, :math:`\mathbf a - r \mathbf v`.
 
@@ -159,8 +170,6 @@ class AirPush(Force):
         return self.numbers[:, :3] - self.numbers[:, 3:] * state.velocity
 
     def twin(self) -> Twin:
-        from gaussian_swaying.wind.computed_air_triton import air_push
-
         return Twin(air_push, per_point=Numbers(4, lambda: self.numbers), sources=(self.numbers,))
 
 

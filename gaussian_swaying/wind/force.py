@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from functools import cache
 from typing import Any, Literal
 
 import torch
@@ -19,69 +20,265 @@ from gaussian_swaying._checks import (
 )
 from gaussian_swaying._fixed import Fixed
 from gaussian_swaying.geometry.groups import sums
-from gaussian_swaying.geometry.linalg import cofactor
+from gaussian_swaying.geometry.linalg_triton import (
+    add3,
+    axpy3,
+    chosen,
+    cofactor,
+    cross3,
+    dot3,
+    dot9,
+    load3,
+    matmul,
+    matvec,
+    read,
+    scale3,
+    transpose,
+)
+from gaussian_swaying.geometry.patches import components, deformed_patch
+from gaussian_swaying.kernels.derive import device_function, gradient, on_tensors, primitive
+from gaussian_swaying.kernels.language import tl, triton
 from gaussian_swaying.wind.patches import PatchSums
 
 LAWS = ("paper", "projected", "linear", "cross_flow")
 
 
-Product = tuple[Tensor | float, Tensor | float]
-"""A vector as a product of two factors, which multiply a coefficient one after the other."""
+@triton.jit
+def drag_speed(air, relative, LAW: tl.constexpr):
+    """Speed that the drag is proportional to, besides that of the flow along a patch: that of the wind if linear."""
+    found = dot3(relative, relative)
+    if LAW == 2:
+        found = dot3(air, air)
+    return tl.sqrt(found)
 
 
-def drag_speed(wind: Tensor, speed: Tensor, law: str) -> Tensor:
-    """Speed that the drag is proportional to, besides that of the flow along a patch: that of the wind if ``linear``.
-
-    Args:
-        wind: Air velocity [m/s], broadcastable to (..., P, 3).
-        speed: Relative speed [m/s], shape (..., P).
-        law: One of :data:`LAWS`; with ``cross_flow`` it is a bound.
-    """
-    return torch.linalg.vector_norm(wind, dim=-1).expand_as(speed) if law == "linear" else speed
+@triton.jit
+def yielding(air, relative, numbers, LAW: tl.constexpr):
+    """Resistance per half density and area, see ``AeroForce.resistance``."""
+    speed = tl.sqrt(dot3(relative, relative))
+    return numbers[0] * drag_speed(air, relative, LAW) + (numbers[1] + tl.abs(numbers[2])) * speed
 
 
-def wind_terms(
-    wind: Tensor,
-    relative: Tensor,
-    facing: Product,
-    across: Product,
-    pressed: Tensor,
-    tangent: Tensor,
-    *,
-    drag: Tensor | float,
-    friction: Tensor | float,
-    lift: Tensor | float,
-    law: str,
-) -> Tensor:
+@triton.jit
+def wind_terms(air, relative, facing, across, through, tangent, numbers, LAW: tl.constexpr):
     r"""Drag, friction and lift per half density: the law of the force, of one patch or of a sum over patches.
 
     Each term is :math:`v_r^2` times that of :func:`aero_force`, without ever dividing by :math:`v_r`.
 
-    Args:
-        wind: Air velocity u [m/s], broadcastable to (..., P, 3).
-        relative: Relative wind [m/s], shape (..., P, 3).
-        facing: Area vector s on the side that meets the flow; per area for one patch, (..., P, 3).
-        across: The part of the flow through the patch, :math:`A\, (\mathbf{v}_r \cdot \mathbf{n})\, \mathbf{n}`.
-        pressed: The same times the size of the flow through the patch,
-            :math:`A\, |\mathbf{v}_r \cdot \mathbf{n}| (\mathbf{v}_r \cdot \mathbf{n})\, \mathbf{n}`.
-        tangent: The part along it.
-        drag: C_D.
-        friction: C_F.
-        lift: C_L.
-        law: See :func:`aero_force`.
-
-    Returns:
-        Shape (..., P, 3).
+    ``facing``: area vector s on the side that meets the flow; per area for one patch. ``across``: the part of the flow
+    through the patch, :math:`A\, (\mathbf{v}_r \cdot \mathbf{n})\, \mathbf{n}`. ``through``: the same times the size
+    of the flow through the patch. ``tangent``: the part along it. ``numbers``: C_D, C_F and C_L.
     """
-    speed = torch.linalg.vector_norm(relative, dim=-1, keepdim=True)
-    if law == "paper":
-        pressure = drag * (speed * speed * facing[0]) * facing[1]
-    elif law == "cross_flow":
-        pressure = drag * pressed
+    speed = tl.sqrt(dot3(relative, relative))
+    pressed = across
+    pressure = numbers[0]
+    if LAW == 3:
+        pressed = through
+    elif LAW == 0:
+        pressed = facing
+        pressure = pressure * speed * speed
     else:
-        pressure = drag * (drag_speed(wind, speed[..., 0], law)[..., None] * across[0]) * across[1]
-    side = torch.linalg.cross(relative, facing[0] * facing[1], dim=-1)
-    return pressure + friction * speed * tangent + lift * (speed * side)
+        pressure = pressure * drag_speed(air, relative, LAW)
+    side = cross3(relative, facing)
+    return add3(axpy3(pressure, pressed, numbers[1] * speed, tangent), numbers[2] * speed, side)
+
+
+@triton.jit
+def patch_force(air, velocity, normal, area, numbers, LAW: tl.constexpr):
+    """:func:`aero_force`; ``numbers``: C_D, C_F, C_L, half the density of the air."""
+    relative = add3(air, -1.0, velocity)
+    along = dot3(relative, normal)
+    sign = tl.where(along < 0, -1.0, 1.0)
+    tangent = add3(relative, -along, normal)
+    force = wind_terms(
+        air, relative, scale3(sign, normal), scale3(along, normal), scale3(sign * along * along, normal), tangent,
+        numbers, LAW,
+    )  # fmt: skip
+    return scale3(numbers[3] * area, force)
+
+
+@triton.jit
+def force_on_patch(F, velocity, patch, numbers, air, table, LAW: tl.constexpr):
+    """Force on a deformed patch (normal and area at rest), and its area in the wind.
+
+    ``numbers``: as for :func:`patch_force`, and the largest ratio of areas.
+    """
+    normal, area = deformed_patch(F, (patch[0], patch[1], patch[2]), patch[3], numbers[4])
+    return patch_force(air, velocity, normal, area, numbers, LAW), area
+
+
+@triton.jit
+def _changed_wind(m: tl.constexpr, EFFECTS: tl.constexpr, v, position, now, table):
+    OPTIONS: tl.constexpr = EFFECTS.options[m]
+    numbers = read(table, EFFECTS.numbers[m][0], EFFECTS.numbers[m][1])
+    own = chosen(now, 3 + EFFECTS.per_substep[m][0], EFFECTS.per_substep[m][1])
+    return EFFECTS.functions[m](v, position, numbers, own, table + EFFECTS.tables[m], OPTIONS)
+
+
+@triton.jit
+def shaped_wind(position, now, table, EFFECTS: tl.constexpr):
+    """``WindField.shaped``: the wind with its effects, of which ``now`` has the velocity without them first."""
+    v = (now[0], now[1], now[2])
+    if len(EFFECTS.functions) > 0:
+        zero = position[0] * 0
+        v = (v[0] + zero, v[1] + zero, v[2] + zero)
+    for m in tl.static_range(len(EFFECTS.functions)):
+        v = _changed_wind(m, EFFECTS, v, position, now, table)
+    return v
+
+
+@triton.jit
+def _resisted(force, area, air, velocity, numbers, LAW: tl.constexpr, IMPLICIT: tl.constexpr):
+    """A force with its resistance [kg/s], zero if the drag is explicit."""
+    resistance = area * 0
+    if IMPLICIT:
+        resistance = numbers[3] * area * yielding(air, add3(air, -1.0, velocity), numbers, LAW)
+    return force, resistance
+
+
+@triton.jit
+def wind_force(F, velocity, position, patch, numbers, now, table, OPTIONS: tl.constexpr):
+    """``WindForce`` on patches.
+
+    ``now``: velocity without effects, and the numbers of each effect. ``OPTIONS``: place of the law in :data:`LAWS`,
+    semi-implicit drag, effects.
+    """
+    air = shaped_wind(position, now, table, OPTIONS[2])
+    force, area = force_on_patch(F, velocity, patch, numbers, air, table, OPTIONS[0])
+    return _resisted(force, area, air, velocity, numbers, OPTIONS[0], OPTIONS[1])
+
+
+@triton.jit
+def add_direction(s, q, b, w, LAW: tl.constexpr):
+    """Add the area vector b to two sums.
+
+    They are those of signed vectors, and (LAW 3) of b times the flow through it per
+    area, times the size of that flow.
+    """
+    along = dot3(b, w)
+    sign = tl.where(along < 0, -1.0, 1.0)
+    s = (s[0] + sign * b[0], s[1] + sign * b[1], s[2] + sign * b[2])
+    if LAW == 3:
+        flow = sign * along * along / tl.maximum(dot3(b, b), 1.2e-38)
+        q = (q[0] + flow * b[0], q[1] + flow * b[1], q[2] + flow * b[2])
+    return s, q
+
+
+@triton.jit
+def sums_over_patches(table, place, w, LAW: tl.constexpr):
+    """The sums over the patches of each point: tensor and its trace, and the sums of :func:`add_direction`.
+
+    ``place``: first row in the table of ``PatchSums``, and number of vectors there.
+    """
+    first = 4 * place[0].to(tl.int32)
+    count = place[1].to(tl.int32)
+    real = count > 0
+    t0 = tl.load(table + first, real, 0.0)
+    t1 = tl.load(table + first + 1, real, 0.0)
+    t2 = tl.load(table + first + 2, real, 0.0)
+    t3 = tl.load(table + first + 3, real, 0.0)
+    t4 = tl.load(table + first + 4, real, 0.0)
+    t5 = tl.load(table + first + 5, real, 0.0)
+    tensor = (t0, t1, t2, t1, t3, t4, t2, t4, t5)
+    rest = t0 + t3 + t5
+    zero = rest * 0
+    s = (zero, zero, zero)
+    q = (zero, zero, zero)
+    for k in range(0, tl.max(count), 4):  # four rows at once
+        row = first + 8 + 4 * k
+        b0 = load3(table, 1, row, k < count)
+        b1 = load3(table, 1, row + 4, k + 1 < count)
+        b2 = load3(table, 1, row + 8, k + 2 < count)
+        b3 = load3(table, 1, row + 12, k + 3 < count)
+        s, q = add_direction(s, q, b0, w, LAW)
+        s, q = add_direction(s, q, b1, w, LAW)
+        s, q = add_direction(s, q, b2, w, LAW)
+        s, q = add_direction(s, q, b3, w, LAW)
+    return tensor, rest, s, q
+
+
+@triton.jit
+def flow_adjoint(table, place, w, by_q):
+    """Gradient by w of the last sum of :func:`sums_over_patches` times a vector."""
+    first = 4 * place[0].to(tl.int32)
+    count = place[1].to(tl.int32)
+    zero = w[0] * 0
+    by_w = (zero, zero, zero)
+    for k in range(0, tl.max(count)):
+        known = k < count
+        b = load3(table, 1, first + 8 + 4 * k, known)
+        share = 2 * tl.abs(dot3(b, w)) * dot3(b, by_q) / tl.maximum(dot3(b, b), 1.2e-38)
+        by_w = add3(by_w, tl.where(known, share, 0.0), b)
+    return by_w
+
+
+def _sums(patches: PatchSums, place: Any, w: tuple[Tensor, ...], LAW: int) -> Any:
+    """:func:`sums_over_patches` of tensors (P,)."""
+    b, point, count = patches.vector, patches.point, len(patches.tensor)
+    along = (b * torch.stack(torch.broadcast_tensors(*w), dim=-1)[point]).sum(-1, keepdim=True)
+    s = sums(torch.where(along < 0, -1.0, 1.0) * b, point, count).unbind(-1)
+    flow = along * along.abs() / b.square().sum(-1, keepdim=True)
+    return components(patches.tensor), patches.area, s, sums(flow * b, point, count).unbind(-1) if LAW == 3 else s
+
+
+def _sums_adjoint(given: Any, result: Any, bars: Any) -> Any:
+    table, place, w, law = given
+    by_w = on_tensors(flow_adjoint)(table, place, w, bars[3]) if law == 3 else (0.0, 0.0, 0.0)
+    return 0.0, (0.0, 0.0), by_w, 0.0
+
+
+primitive(flow_adjoint, outputs=3)
+primitive(sums_over_patches, outputs=(9, 0, 3, 3), on_tensors=_sums, vjp=_sums_adjoint)
+
+
+@triton.jit
+def force_on_group(F, velocity, place, numbers, air, table, LAW: tl.constexpr):
+    """Force on a group of patches, see :mod:`~gaussian_swaying.wind.patches`, and their area in the wind.
+
+    ``place``: as for :func:`sums_over_patches`. The rest is as for :func:`force_on_patch`.
+    """
+    relative = add3(air, -1.0, velocity)
+    c = cofactor(F)
+    w = matvec(transpose(c), relative)
+    tensor, rest, s, q = sums_over_patches(table, place, w, LAW)
+    turned = matmul(c, tensor)
+    growth = tl.sqrt(tl.maximum(dot9(turned, c) / tl.maximum(rest, 1.2e-38), 1.2e-38))
+    across = scale3(1.0 / growth, matvec(turned, w))
+    area = growth * rest
+    through = across
+    if LAW == 3:
+        through = scale3(1.0 / (growth * growth), matvec(c, q))
+    tangent = axpy3(area, relative, -1.0, across)
+    force = wind_terms(air, relative, matvec(c, s), across, through, tangent, numbers, LAW)
+    cap = tl.where(rest > 0, tl.minimum(numbers[4], growth) / growth, 0.0)
+    return scale3(numbers[3] * cap, force), cap * area
+
+
+@triton.jit
+def wind_on_groups(F, velocity, position, place, numbers, now, table, OPTIONS: tl.constexpr):
+    """``WindForce`` on groups of patches, whose table follows that of the effects; the rest as :func:`wind_force`."""
+    EFFECTS: tl.constexpr = OPTIONS[2]
+    air = shaped_wind(position, now, table, EFFECTS)
+    force, area = force_on_group(F, velocity, place, numbers, air, table + EFFECTS.size, OPTIONS[0])
+    return _resisted(force, area, air, velocity, numbers, OPTIONS[0], OPTIONS[1])
+
+
+@cache
+def force_adjoint(function: Any, width: int, law: int) -> Any:
+    """The gradients of a . f of a force by F, velocity, wind and coefficients, as ``Twin.adjoint``.
+
+    Args:
+        function: :func:`force_on_patch` or :func:`force_on_group`.
+        width: Numbers of a point.
+        law: Place in :data:`LAWS`.
+    """
+
+    def formula(F: Any, velocity: Any, point: Any, numbers: Any, air: Any, table: Any, a: Any) -> Any:
+        force, _ = on_tensors(function)(F, velocity, point, numbers, air, table, law)
+        return gradient(force, (F, velocity, air, numbers[:3]), a)
+
+    shapes = {"F": 9, "velocity": 3, "point": width, "numbers": 5, "now": 3, "table": 0, "a": 3}
+    return device_function(f"{function.__name__}_adjoint", shapes, formula)
 
 
 def aero_force(
@@ -137,88 +334,9 @@ def aero_force(
     check_shape("normal", normal, patches, 3)
     check_shape("area", area, patches)
     check_shape("wind", wind, 3)
-    wind = wind.to(velocity)
-    relative = wind - velocity
-    along = (relative * normal).sum(-1, keepdim=True)
-    sign = torch.where(along < 0, -1.0, 1.0)
-    oriented = sign * normal
-    tangent = relative - along * normal
-    terms = wind_terms(
-        wind, relative, (1.0, oriented), (sign * along, oriented), along * along * oriented, tangent, drag=drag,
-        friction=friction, lift=lift, law=law,
-    )  # fmt: skip
-    return (0.5 * air_density) * area[..., None] * terms
-
-
-def grouped_force(
-    wind: Tensor,
-    velocity: Tensor,
-    deformation_gradient: Tensor,
-    patches: PatchSums,
-    *,
-    drag: Tensor | float,
-    friction: Tensor | float,
-    lift: Tensor | float,
-    air_density: float = 1.225,
-    law: str = "paper",
-    max_area_ratio: float = math.inf,
-) -> tuple[Tensor, Tensor]:
-    r"""Force on the patches of each point, see :mod:`~gaussian_swaying.wind.patches`, and their area now.
-
-    Args:
-        wind: Air velocity [m/s], broadcastable to (P, 3).
-        velocity: Velocity of the points [m/s], shape (P, 3).
-        deformation_gradient: Total deformation gradient of the points, shape (P, 3, 3).
-        patches: The sums over the patches.
-        drag: C_D.
-        friction: C_F.
-        lift: C_L.
-        air_density: Density of the air [kg/m³].
-        law: As in :func:`aero_force`.
-        max_area_ratio: Largest ratio of the area to that at rest (see
-            :func:`capped_area`).
-
-    Returns:
-        Force [N], shape (P, 3), and area [m²], shape (P,).
-    """
-    wind = wind.to(velocity)
-    relative = wind - velocity
-    cof = cofactor(deformation_gradient)
-    pulled = (cof * relative[..., None]).sum(-2)  # w
-    turned = (cof[..., :, :, None] * patches.tensor[..., None, :, :]).sum(-2)  # cof(F) A N N^T
-    rest = patches.area
-    grown = ((turned * cof).sum((-2, -1)) / rest.clamp(min=torch.finfo(rest.dtype).tiny)).clamp(min=0)
-    growth = grown.clamp(min=torch.finfo(rest.dtype).tiny).sqrt()
-    across = (turned * pulled[..., None, :]).sum(-1) / growth[..., None]  # T v_r
-    facing = torch.zeros_like(across)
-    if law in ("paper", "cross_flow") or not _is_zero(lift):
-        dots = (patches.vector * pulled[patches.point]).sum(-1, keepdim=True)
-        sign = torch.where(dots < 0, -1.0, 1.0)
-        signed = sums(sign * patches.vector, patches.point, len(relative))
-        facing = (cof * signed[..., None, :]).sum(-1)  # s
-    area = growth * rest
-    pressed = torch.zeros_like(across)
-    if law == "cross_flow":
-        flow = dots * dots.abs() / patches.vector.square().sum(-1, keepdim=True)
-        pressed = (cof * sums(flow * patches.vector, patches.point, len(relative))[..., None, :]).sum(-1)
-        pressed = pressed / growth.square()[..., None]
-    tangent = area[..., None] * relative - across
-    terms = wind_terms(
-        wind, relative, (facing, 1.0), (across, 1.0), pressed, tangent, drag=drag, friction=friction, lift=lift,
-        law=law,
-    )  # fmt: skip
-    scale = 0.5 * air_density * (rest > 0).to(rest)
-    if max_area_ratio < math.inf:
-        cap = (max_area_ratio / growth).clamp(max=1.0)
-        scale, area = scale * cap, area * cap
-    return scale[..., None] * terms, area
-
-
-def _is_zero(coefficient: Tensor | float) -> bool:
-    """True for a coefficient that is known to be zero without waiting for a GPU."""
-    if isinstance(coefficient, Tensor):
-        return not (coefficient.is_cuda or coefficient.requires_grad) and float(coefficient) == 0
-    return coefficient == 0
+    numbers = tuple(part.to(velocity) if isinstance(part, Tensor) else part for part in (drag, friction, lift))
+    given = wind.to(velocity).unbind(-1), velocity.unbind(-1), normal.unbind(-1), area, (*numbers, 0.5 * air_density)
+    return torch.stack(torch.broadcast_tensors(*on_tensors(patch_force)(*given, LAWS.index(law))), dim=-1)
 
 
 def drag_rate(speed: Tensor, area: Tensor, mass: Tensor, coefficient: Tensor | float, air_density: float) -> Tensor:
@@ -235,24 +353,6 @@ def drag_rate(speed: Tensor, area: Tensor, mass: Tensor, coefficient: Tensor | f
         Shape (..., P).
     """
     return air_density * coefficient * area * speed / mass
-
-
-def capped_area(area: Tensor, rest_area: Tensor, max_ratio: float) -> Tensor:
-    r"""Area that the wind acts on, :math:`\min(A, r_{max} A_0)`.
-
-    The total deformation gradient of a plastic material grows without bound, and so does the area from Nanson's
-    formula. But a patch of grains catches no more wind than its grains do. Without a cap, wind and area would amplify
-    each other.
-
-    Args:
-        area: Current patch area [m²], shape (..., P).
-        rest_area: Patch area at rest [m²], shape (..., P).
-        max_ratio: Largest allowed ratio of the two; infinite for no cap.
-
-    Returns:
-        Shape (..., P). The gradient with respect to ``area`` is zero where the cap applies.
-    """
-    return area if max_ratio == math.inf else torch.minimum(area, max_ratio * rest_area)
 
 
 def added_mass_per_area(breadth: float, air_density: float) -> float:
@@ -290,8 +390,9 @@ class AeroForce(Fixed, nn.Module):
         law: ``paper``, ``projected``, ``linear`` or ``cross_flow``.
         drag_step: ``explicit``, or ``semi_implicit``: the solver evaluates the drag at the velocity at the end of the
             substep (see :meth:`resistance`), so that very light objects in strong wind need no shorter substeps.
-        max_area_ratio: Largest ratio of a patch's area in the wind to its area at rest (see :func:`capped_area`); null
-            for no cap, which suits elastic materials. Plastic materials need a cap, for example 1.
+        max_area_ratio: Largest ratio of a patch's area in the wind to its area at rest; null for no cap, which suits
+            elastic materials. Plastic materials need one, for example 1: their total deformation gradient grows without
+            bound, and so does the area from Nanson's formula, but grains catch no more wind than they do at rest.
         added_mass: Breadth b [m] of a thin, wide thing (laundry, a curtain, a leaf), for the air that it carries along:
             :func:`added_mass_per_area` more inertia per area of its patches at rest, and no more weight. It acts in all
             directions: that along the sheet is overestimated, which hardly moves for a sheet. In a simulation it is
@@ -386,11 +487,9 @@ class AeroForce(Fixed, nn.Module):
         """
         if self.drag_step == "explicit":
             return None
-        wind = wind.to(velocity)
-        speed = torch.linalg.vector_norm(wind - velocity, dim=-1)
-        blow = drag_speed(wind, speed, self.law)
-        drag, rest = (c.to(speed.dtype) for c in (self.C_D, self.C_F + self.C_L.abs()))
-        return 0.5 * self.air_density * area * (drag * blow + rest * speed)
+        wind, numbers = wind.to(velocity), self.numbers().to(velocity).unbind()
+        rate = on_tensors(yielding)(wind.unbind(-1), (wind - velocity).unbind(-1), numbers, LAWS.index(self.law))
+        return numbers[3] * area * rate
 
     def forward(self, wind: Tensor, velocity: Tensor, normal: Tensor, area: Tensor) -> Tensor:
         """Force on each patch [N].
@@ -404,25 +503,34 @@ class AeroForce(Fixed, nn.Module):
         Returns:
             Shape (..., P, 3).
         """
-        return aero_force(wind, velocity, normal, area, **self._numbers)
+        return aero_force(
+            wind, velocity, normal, area, drag=self.C_D, friction=self.C_F, lift=self.C_L,
+            air_density=self.air_density, law=self.law,
+        )  # fmt: skip
 
-    def on_groups(
-        self, wind: Tensor, velocity: Tensor, deformation_gradient: Tensor, patches: PatchSums
+    def numbers(self) -> Tensor:
+        """The coefficients, half the density of the air, and the largest ratio of areas, shape (5,), float64."""
+        half, widest = (torch.full_like(self.C_D, value) for value in (0.5 * self.air_density, self.max_area_ratio))
+        return torch.stack([self.C_D, self.C_F, self.C_L, half, widest])
+
+    def on_patches(
+        self, wind: Tensor, velocity: Tensor, deformation_gradient: Tensor, patches: PatchSums | tuple[Tensor, Tensor]
     ) -> tuple[Tensor, Tensor]:
-        """The result of :func:`grouped_force` with the numbers of this component."""
-        return grouped_force(
-            wind, velocity, deformation_gradient, patches, **self._numbers, max_area_ratio=self.max_area_ratio
-        )
+        """Force on the patches of each point [N], shape (..., P, 3), and their area in the wind [m²], shape (..., P).
 
-    @property
-    def _numbers(self) -> dict[str, Any]:
-        return {
-            "drag": self.C_D,
-            "friction": self.C_F,
-            "lift": self.C_L,
-            "air_density": self.air_density,
-            "law": self.law,
-        }
+        Args:
+            wind: Air velocity [m/s], broadcastable to (..., P, 3).
+            velocity: Velocity of the points [m/s], shape (..., P, 3).
+            deformation_gradient: Total deformation gradient of the points, shape (..., P, 3, 3).
+            patches: The sums over the patches, or one unit normal and area at rest of each point.
+        """
+        groups = isinstance(patches, PatchSums)
+        point = (0.0, 0.0) if isinstance(patches, PatchSums) else (*patches[0].unbind(-1), patches[1])
+        force, area = on_tensors(force_on_group if groups else force_on_patch)(
+            components(deformation_gradient), velocity.unbind(-1), point, self.numbers().to(velocity).unbind(),
+            wind.to(velocity).unbind(-1), patches if groups else None, LAWS.index(self.law),
+        )  # fmt: skip
+        return torch.stack(torch.broadcast_tensors(*force), dim=-1), area
 
     def extra_repr(self) -> str:
         """The settings, for printing."""

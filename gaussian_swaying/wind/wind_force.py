@@ -12,7 +12,6 @@ from torch import Tensor, nn
 
 from gaussian_swaying._checks import check_shape
 from gaussian_swaying._fixed import FixedList, changed
-from gaussian_swaying.geometry.patches import deform_patch
 from gaussian_swaying.kernels.graphs import tensors_in
 from gaussian_swaying.kernels.launch import replaces
 from gaussian_swaying.mpm.forces import Force, Given
@@ -20,7 +19,15 @@ from gaussian_swaying.mpm.state import State
 from gaussian_swaying.mpm.twins import Numbers, Twin
 from gaussian_swaying.wind.effects import Moment
 from gaussian_swaying.wind.field import SpatialWind, WindField
-from gaussian_swaying.wind.force import LAWS, AeroForce, capped_area
+from gaussian_swaying.wind.force import (
+    LAWS,
+    AeroForce,
+    force_adjoint,
+    force_on_group,
+    force_on_patch,
+    wind_force,
+    wind_on_groups,
+)
 from gaussian_swaying.wind.patches import Patches, PatchSums
 from gaussian_swaying.wind.shelter import Shelter
 from gaussian_swaying.wind.tables import wind_axes
@@ -191,16 +198,14 @@ class WindForce(Force):
             state: The state at the start of the substep.
             wind: Air velocity [m/s], broadcastable to (..., P, 3).
         """
-        if self.sums is not None:
-            shape = state.velocity.shape
-            flat, F = state.velocity.reshape(-1, 3), state.F_total.reshape(-1, 3, 3)
-            blown = wind if wind.ndim == 1 else wind.expand(shape).reshape(-1, 3)
-            force, area = self.aero.on_groups(blown, flat, F, self.sums)
-            resistance = self.aero.resistance(blown, flat, area)
-            return force.reshape(shape), None if resistance is None else resistance.reshape(shape[:-1])
-        normal, area = deform_patch(state.F_total, self.normal, self.area)
-        area = capped_area(area, self.area, self.aero.max_area_ratio)
-        return self.aero(wind, state.velocity, normal, area), self.aero.resistance(wind, state.velocity, area)
+        velocity, F, shape = state.velocity, state.F_total, state.velocity.shape
+        if self.sums is None:
+            force, area = self.aero.on_patches(wind, velocity, F, (self.normal, self.area))
+        else:
+            given = wind.expand(shape).reshape(-1, 3), velocity.reshape(-1, 3), F.reshape(-1, 3, 3)
+            force, area = self.aero.on_patches(*given, self.sums)
+            force, area = force.reshape(shape), area.reshape(shape[:-1])
+        return force, self.aero.resistance(wind, velocity, area)
 
     def forward(self, state: State) -> tuple[Tensor, Tensor | None]:
         """:meth:`force` in the wind of ``state.time``."""
@@ -295,13 +300,6 @@ class WindForce(Force):
             parts = tuple(part for part in found if part is not None)
             if len(parts) < len(found):
                 return None
-        from gaussian_swaying.wind.force_adjoint_triton import wind_force_adjoint, wind_on_groups_adjoint
-        from gaussian_swaying.wind.force_triton import wind_force, wind_on_groups
-
-        def numbers() -> Tensor:
-            half, widest = (torch.full_like(aero.C_D, v) for v in (0.5 * aero.air_density, aero.max_area_ratio))
-            return torch.stack([aero.C_D, aero.C_F, aero.C_L, half, widest])
-
         implicit = aero.drag_step == "semi_implicit"
         smooth = self.uniform and not implicit
         width = 3 + sum(part.per_substep.count for part in parts)
@@ -311,7 +309,7 @@ class WindForce(Force):
                 4, lambda: torch.cat([self.normal.expand(*self.area.shape, 3), self.area[..., None]], dim=-1)
             ),
             "sources": (self.normal, self.area),
-            "adjoint": wind_force_adjoint if smooth else None,
+            "adjoint": force_adjoint(force_on_patch, 4, LAWS.index(aero.law)) if smooth else None,
         }
         if sums is not None:
             patches = {
@@ -319,11 +317,11 @@ class WindForce(Force):
                 "per_point": Numbers(2, lambda: sums.lists().reshape(*self.area.shape, 2)),
                 "table": Numbers(4 * sums.rows, sums.table),
                 "sources": (sums.tensor, sums.vector),
-                "adjoint": wind_on_groups_adjoint if smooth else None,
+                "adjoint": force_adjoint(force_on_group, 2, LAWS.index(aero.law)) if smooth else None,
             }
         return Twin(
             options=(LAWS.index(aero.law), implicit),
-            numbers=Numbers(5, numbers),
+            numbers=Numbers(5, aero.numbers),
             per_substep=Numbers(width, partial(self._with_effects, parts) if parts else self.winds),
             implicit=implicit,
             parts=parts,

@@ -8,7 +8,7 @@ from shared import unit
 from torch.testing import assert_close
 
 from gaussian_swaying import AeroForce, aero_force
-from gaussian_swaying.wind.force import LAWS, added_mass_per_area, capped_area
+from gaussian_swaying.wind.force import LAWS, added_mass_per_area
 
 RHO = 1.225
 
@@ -179,9 +179,11 @@ def test_a_plate_carries_the_air_of_a_cylinder_of_its_breadth():
 
 def test_the_area_in_the_wind_is_capped():
     """At so many times that at rest; below, and without a cap, it is what it is."""
-    rest, area = torch.tensor([1.0, 2.0, 0.0, 3.0]), torch.tensor([1.5, 9.0, 0.0, 0.1])
-    assert capped_area(area, rest, 2.0).tolist() == pytest.approx([1.5, 4.0, 0.0, 0.1])
-    assert torch.equal(capped_area(area, rest, math.inf), area)
+    F = torch.diag(_vector(3, 3, 1)) * _vector(1, 0.5, 0, 0.1).sqrt()[:, None, None]
+    patch, still = (_vector(0, 0, 1).expand(4, 3), _vector(1, 2, 1, 3)), torch.zeros(4, 3).double()
+    for cap, expected in ((2.0, [2, 4, 0, 2.7]), (None, [9, 9, 0, 2.7])):
+        area = AeroForce(max_area_ratio=cap).on_patches(still, still, F * _vector(1, 1, 1), patch)[1]
+        assert area.tolist() == pytest.approx(expected)
     assert AeroForce().max_area_ratio == AeroForce(max_area_ratio=None).max_area_ratio == math.inf
     assert AeroForce(max_area_ratio=1).max_area_ratio == 1.0
 

@@ -10,7 +10,6 @@ from torch.testing import assert_close
 from gaussian_swaying import AeroForce, WindField, WindForce, aero_force
 from gaussian_swaying.geometry.patches import deform_patch
 from gaussian_swaying.geometry.rotations import quat_to_rotation
-from gaussian_swaying.wind.force import capped_area, grouped_force
 from gaussian_swaying.wind.patches import MOST, Patches, PatchSums
 
 LAWS = {
@@ -39,8 +38,14 @@ def random_patches(spread, each=30, seed=0):
 def each_patch(wind, velocity, F, normal, area, point, cap=math.inf, **law):
     """The definition: the force of ``aero_force`` on every patch, summed."""
     now, grown = deform_patch(F[point], normal, area)
-    force = aero_force(wind, velocity[point], now, capped_area(grown, area, cap), **law)
+    force = aero_force(wind, velocity[point], now, torch.minimum(grown, cap * area), **law)
     return torch.zeros_like(velocity).index_add(0, point, force)
+
+
+def grouped_force(wind, velocity, F, patches, drag, friction, lift, law, cap=None):
+    """Force on groups of patches, and their area."""
+    aero = AeroForce(drag, friction, C_L=lift, law=law, max_area_ratio=cap)
+    return aero.on_patches(wind, velocity, F, patches)
 
 
 def off(found, expected):
@@ -124,7 +129,7 @@ def test_the_area_is_capped_and_resists():
     velocity, wind = torch.zeros(POINTS, 3, dtype=torch.float64), double([4.0, 0.0, 0.0])
     sums = PatchSums(Patches(normal, area, point, POINTS))
     expected = each_patch(wind, velocity, F, normal, area, point, cap=1.5, **LAWS["paper"])
-    found, now = grouped_force(wind, velocity, F, sums, max_area_ratio=1.5, **LAWS["paper"])
+    found, now = grouped_force(wind, velocity, F, sums, cap=1.5, **LAWS["paper"])
     assert_close(found, expected)
     assert_close(now, 1.5 * sums.area)
 

@@ -63,7 +63,6 @@ def particles_adjoint(
     substep and cell.
     """
     LOADED: tl.constexpr = len(FORCES.functions) > 0
-    OPTIONS: tl.constexpr = FORCES.options[0] if LOADED else ()
     step = tl.load(last) - tl.load(first_step) - step_offset
     cell, real, start, end, node, scene, longest = cells_of(cell_start, cell_node, cell_scene, cells, CELLS)
     lane = tl.arange(0, LANES)[None, :]
@@ -93,9 +92,7 @@ def particles_adjoint(
         by_F = scale9(-volume, by_F)
         if LOADED:
             point, own, now = twin_data(0, FORCES, index, mask, scene, values, count, vectors, scenes, step, numbers)
-            more, by_v, by_vector, by_numbers = FORCES.adjoints[0](
-                F, v, point, own, now, numbers + FORCES.tables[0], a, OPTIONS
-            )
+            more, by_v, by_vector, by_numbers = FORCES.adjoints[0](F, v, point, own, now, numbers + FORCES.tables[0], a)
             by_F = axpy9(1.0, by_F, 1.0, more)
             if SHARES:
                 to = shares + (step.to(tl.int64) * cells + cell) * 8
