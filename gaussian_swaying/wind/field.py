@@ -6,12 +6,11 @@ so they do not depend on the substep, on the device, or on where a run was resum
 
 from __future__ import annotations
 
-import math
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
-from typing import Literal, TypeVar
+from typing import Any, Literal, TypeVar
 
 import torch
 from torch import Tensor, nn
@@ -26,7 +25,11 @@ from gaussian_swaying._checks import (
 )
 from gaussian_swaying._fixed import Fixed, FixedList, changed, fixed
 from gaussian_swaying.geometry.frame import SimFrame
+from gaussian_swaying.geometry.linalg_triton import add3, load3, scale3, store3
+from gaussian_swaying.kernels.derive import on_tensors
 from gaussian_swaying.kernels.graphs import Recordable
+from gaussian_swaying.kernels.language import tl, triton
+from gaussian_swaying.kernels.launch import lanes, launch, replaces
 from gaussian_swaying.wind.effects import Moment, WindEffect
 from gaussian_swaying.wind.wind_files import read_anemometer
 
@@ -39,52 +42,93 @@ def _signed(value: int) -> int:
     return value - (1 << 64) if value >= 1 << 63 else value
 
 
-def _mix(x: Tensor) -> Tensor:
-    """Finaliser of SplitMix64 (Steele, Lea & Flood 2014) on int64 tensors, with wrap-around arithmetic."""
-    x = (x ^ ((x >> 30) & ((1 << 34) - 1))) * _signed(0xBF58476D1CE4E5B9)
-    x = (x ^ ((x >> 27) & ((1 << 37) - 1))) * _signed(0x94D049BB133111EB)
+def stream_start(seed: int | Tensor, stream: int, device: torch.device | str = "cpu") -> Tensor:
+    """The first value of a generator's counter, int64, made on the device, so that a CUDA graph can record it."""
+    if isinstance(seed, Tensor):
+        return seed * _signed(0x9E3779B97F4A7C15) + (stream + 1)
+    start = _signed(seed * 0x9E3779B97F4A7C15 + stream + 1)
+    return torch.full((), start, dtype=torch.int64, device=device)
+
+
+@triton.jit
+def _mix(x):
+    """Finaliser of SplitMix64 (Steele, Lea & Flood 2014), with wrap-around arithmetic."""
+    x = (x ^ ((x >> 30) & ((1 << 34) - 1))) * -4658895280553007687  # 0xBF58476D1CE4E5B9
+    x = (x ^ ((x >> 27) & ((1 << 37) - 1))) * -7723592293110705685  # 0x94D049BB133111EB
     return x ^ ((x >> 31) & ((1 << 33) - 1))
 
 
-def stream_start(seed: int, stream: int) -> int:
-    """Return the first value of a generator's counter, as a signed 64-bit number."""
-    return _signed(seed * 0x9E3779B97F4A7C15 + stream + 1)
+@triton.jit
+def counter_uniform(start, counter, lane):
+    """Uniform numbers in (0, 1), float64, that depend only on the start of a stream, the counter and the lane."""
+    wide = start * 0 + lane  # 64 bits, so that the product wraps around
+    bits = _mix(_mix(_mix(start) + counter * -7046029254386353131) + wide * -3335678366873096957)
+    return (((bits >> 11) & ((1 << 53) - 1)).to(tl.float64) + 0.5) / 9007199254740992.0
 
 
-def _stream_key(seed: int | Tensor, stream: int, device: torch.device) -> Tensor:
-    """Return the first values of the counters, made on the device, so that a CUDA graph can record it."""
-    if isinstance(seed, Tensor):
-        return (seed * _signed(0x9E3779B97F4A7C15) + (stream + 1))[..., None]
-    return torch.full((), stream_start(seed, stream), dtype=torch.int64, device=device)
+@triton.jit
+def counter_normal(start, counter, lane):
+    """Standard normal numbers by Box-Muller from :func:`counter_uniform`; of the lanes 0 to 2."""
+    first = tl.sqrt(-2 * tl.log(counter_uniform(start, counter, lane)))
+    return first * tl.cos(6.283185307179586 * counter_uniform(start, counter, lane + 3))
 
 
-def counter_uniform(seed: int | Tensor, stream: int, counter: Tensor, lanes: int) -> Tensor:
-    """Uniform numbers in (0, 1) that depend only on seed, stream, counter and lane.
-
-    Args:
-        seed: Seed of the run; or of each of several runs, int64, shape (B,), for counters of shape (..., B).
-        stream: Number of the generator within the run.
-        counter: Integers, shape (...), int64.
-        lanes: Independent numbers per counter.
-
-    Returns:
-        float64, shape (..., lanes).
-    """
-    key = _mix(_stream_key(seed, stream, counter.device))
-    lane = torch.arange(lanes, device=counter.device)
-    bits = _mix(_mix(key + counter[..., None] * _signed(0x9E3779B97F4A7C15)) + lane * _signed(0xD1B54A32D192ED03))
-    return (((bits >> 11) & ((1 << 53) - 1)).double() + 0.5) / float(1 << 53)
-
-
-def counter_normal(seed: int | Tensor, stream: int, counter: Tensor, lanes: int) -> Tensor:
-    """Standard normal numbers, shape (..., lanes), float64, by Box-Muller from :func:`counter_uniform`."""
-    u = counter_uniform(seed, stream, counter, 2 * lanes)
-    return (-2 * u[..., :lanes].log()).sqrt() * (2 * math.pi * u[..., lanes:]).cos()
-
-
-def sample_index(time: Tensor, interval: float | Tensor) -> Tensor:
+@triton.jit
+def _sample(time, interval):
     """Index of the sample at a time [s]; a time less than 1e-6 intervals before the next sample belongs to that one."""
-    return torch.floor(time / interval + 1e-6).long()
+    return tl.floor(time / interval + 1e-6).to(tl.int64)
+
+
+@triton.jit
+def swayed(v, time, numbers, start):
+    """``SineSway``; as the others, of a velocity, the time, its numbers and the start of its stream."""
+    sway = 1 + numbers[0] * tl.sin(6.283185307179586 * time / numbers[1] + numbers[2])
+    first = (tl.abs(v[0]) >= tl.abs(v[1])) & (tl.abs(v[0]) >= tl.abs(v[2]))
+    second = tl.abs(v[1]) >= tl.abs(v[2])
+    return (
+        v[0] * tl.where(first, sway, 1.0),
+        v[1] * tl.where(first, 1.0, tl.where(second, sway, 1.0)),
+        v[2] * tl.where(first, 1.0, tl.where(second, 1.0, sway)),
+    )
+
+
+@triton.jit
+def scaled(v, time, numbers, start):
+    """``UniformGust``."""
+    gust = 1 + numbers[0] * (2 * counter_uniform(start, _sample(time, numbers[1]), 0) - 1)
+    return scale3(gust, v)
+
+
+@triton.jit
+def shaken(v, time, numbers, start):
+    """``GaussianGust``."""
+    counter = _sample(time, numbers[1])
+    x = counter_normal(start, counter, 0)
+    y = counter_normal(start, counter, 1)
+    return add3(v, numbers[0], (x, y, counter_normal(start, counter, 2)))
+
+
+@triton.jit(do_not_specialize=("count", "scenes"))
+def _modulate(
+    velocity, times, numbers, starts, count, scenes, KINDS: tl.constexpr, MODULATIONS: tl.constexpr,
+    BLOCK: tl.constexpr,
+):  # fmt: skip
+    """Change velocities (count, 3) of winds of several scenes, one after the other, in place."""
+    index = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
+    mask = index < count
+    time = tl.load(times + index, mask, 0.0)
+    v = load3(velocity, 1, 3 * index, mask)
+    for m in tl.static_range(MODULATIONS):
+        row = (index % scenes) * MODULATIONS + m
+        own = load3(numbers, 1, 3 * row, mask)
+        start = tl.load(starts + row, mask, 0)
+        if KINDS[m] == 0:
+            v = swayed(v, time, own, start)
+        elif KINDS[m] == 1:
+            v = scaled(v, time, (own[0], tl.where(mask, own[1], 1.0)), start)
+        else:
+            v = shaken(v, time, (own[0], tl.where(mask, own[1], 1.0)), start)
+    store3(velocity, 1, 3 * index, v, mask)
 
 
 def picked(values: Tensor, index: Tensor) -> Tensor:
@@ -100,11 +144,11 @@ class Modulation(Recordable, nn.Module, ABC):
 
     live_as = "wind.modulations.*"
     numbers: tuple[str, ...] = ()
-    """Names of its numbers, if those of several scenes can be tensors of shape (B,)."""
+    """Names of its numbers, if it has a device function; those of several scenes can be tensors of shape (B,)."""
+    function: Any = None
 
-    @abstractmethod
     def forward(self, velocity: Tensor, time: Tensor, seed: int | Tensor, stream: int) -> Tensor:
-        """Return the modulated velocity.
+        """Return the modulated velocity, that of the device function; one of your own replaces this.
 
         Args:
             velocity: Air velocity [m/s], shape (..., 3), float64.
@@ -112,6 +156,9 @@ class Modulation(Recordable, nn.Module, ABC):
             seed: Seed of the run; of several scenes, one for each, shape (B,).
             stream: Position of this modulation in the list of its WindField.
         """
+        numbers = tuple(getattr(self, name) for name in self.numbers)
+        given = velocity.unbind(-1), time, numbers, stream_start(seed, stream, velocity.device)
+        return torch.stack(torch.broadcast_tensors(*on_tensors(self.function)(*given)), dim=-1)
 
 
 class SineSway(Modulation):
@@ -125,6 +172,7 @@ class SineSway(Modulation):
 
     recordable = True
     numbers = ("amplitude", "period", "phase")
+    function = swayed
 
     def __init__(self, amplitude: float = 0.5, period: float = 2.0, phase: float = 0.0) -> None:
         super().__init__()
@@ -132,12 +180,6 @@ class SineSway(Modulation):
         check_positive("period", period)
         check_vector("phase", [phase], 1)
         self.amplitude, self.period, self.phase = float(amplitude), float(period), float(phase)
-
-    def forward(self, velocity: Tensor, time: Tensor, seed: int | Tensor, stream: int) -> Tensor:
-        """Scale the largest component by ``1 + amplitude sin(2 pi t / period + phase)``."""
-        largest = nn.functional.one_hot(velocity.detach().abs().argmax(-1), 3)
-        sway = self.amplitude * torch.sin(2 * math.pi * time / self.period + self.phase)
-        return velocity * (1 + largest * sway[..., None])
 
 
 class UniformGust(Modulation):
@@ -150,17 +192,13 @@ class UniformGust(Modulation):
 
     recordable = True
     numbers = ("delta", "interval")
+    function = scaled
 
     def __init__(self, delta: float = 0.3, interval: float = 0.04) -> None:
         super().__init__()
         check_positive("delta", delta, allow_zero=True)
         check_positive("interval", interval)
         self.delta, self.interval = float(delta), float(interval)
-
-    def forward(self, velocity: Tensor, time: Tensor, seed: int | Tensor, stream: int) -> Tensor:
-        """Scale all components by one random factor."""
-        u = counter_uniform(seed, stream, sample_index(time, self.interval), 1)[..., 0]
-        return velocity * (1 + self.delta * (2 * u - 1))[..., None]
 
 
 class GaussianGust(Modulation):
@@ -174,6 +212,7 @@ class GaussianGust(Modulation):
 
     recordable = True
     numbers = ("std", "interval")
+    function = shaken
 
     def __init__(self, std: float = 0.3, interval: float = 0.04) -> None:
         super().__init__()
@@ -181,10 +220,8 @@ class GaussianGust(Modulation):
         check_positive("interval", interval)
         self.std, self.interval = float(std), float(interval)
 
-    def forward(self, velocity: Tensor, time: Tensor, seed: int | Tensor, stream: int) -> Tensor:
-        """Add independent noise to the three components."""
-        noise = counter_normal(seed, stream, sample_index(time, self.interval), 3)
-        return velocity + (self.std * noise.movedim(-1, 0)).movedim(0, -1)
+
+KINDS = (SineSway, UniformGust, GaussianGust)
 
 
 @fixed
@@ -299,6 +336,9 @@ class WindField(Fixed, nn.Module):
         self.interpolation = interpolation
         self.seed: int | Tensor = int(seed)
         self.modulations = FixedList(modulations)
+        self._rows: tuple[Any, Any, Tensor, Tensor] | None = (
+            None  # numbers of the modulations, with what they are made from
+        )
         self._in_metres = False  # whether `in_frame` made it
         moving = [row.detach() for row in flows if bool(row.any())]
         first = moving[0] if moving else torch.zeros(3, dtype=torch.float64)
@@ -464,9 +504,52 @@ class WindField(Fixed, nn.Module):
         time = torch.as_tensor(time, dtype=torch.float64, device=self.times.device)
         velocity = self.mean_flow(time)
         time = self._wide(time)[..., 0].expand(velocity.shape[:-1])
+        if time.is_cuda and self._known_rows(time) and replaces((velocity,), dtype=None):
+            return self.modulated(velocity, time)
         for stream, modulation in enumerate(self.modulations):
             velocity = modulation(velocity, time, self.seed, stream)
         return velocity
+
+    def _known_rows(self, time: Tensor) -> bool:
+        """Whether a kernel knows all modulations; not while a graph is recorded, if their numbers are not there yet."""
+        parts = all("function" in vars(type(part)) for part in self.modulations)
+        if not (len(self.modulations) and parts and type(self) is WindField and self.flows.dtype == torch.float64):
+            return False
+        numbers = [getattr(part, name) for part in self.modulations for name in part.numbers]  # type: ignore[union-attr]
+        made = (self.seed, *numbers)
+        key = (time.device, *(id(value) if isinstance(value, Tensor) else value for value in made))
+        if self._rows is None or self._rows[0] != key:
+            if time.is_cuda and torch.cuda.is_current_stream_capturing():
+                return False
+            with torch.inference_mode(False):  # they outlive the call
+                self._rows = (key, made, *self._made_rows(time.device))
+        return True
+
+    def _made_rows(self, device: torch.device) -> tuple[Tensor, Tensor]:
+        """Numbers (B, M, 3) and starts (B, M) of the modulations, for one scene or all, on a device."""
+        rows, starts = [], []
+        for stream, part in enumerate(self.modulations):
+            own = [getattr(part, name) for name in part.numbers]  # type: ignore[union-attr]
+            rows += [torch.as_tensor(value, dtype=torch.float64, device=device) for value in (own + [0.0])[:3]]
+            starts.append(stream_start(self.seed, stream, device))
+        count = len(self.modulations)
+        many = torch.broadcast_tensors(*rows, starts[0])[0].reshape(-1).shape
+        return torch.stack([row.expand(many) for row in rows], -1).reshape(-1, count, 3), torch.stack(
+            [start.expand(many) for start in starts], -1
+        )
+
+    def modulated(self, velocity: Tensor, time: Tensor) -> Tensor:
+        """Velocities (..., 3) at times (...) with all modulations, in one kernel; in torch they take some seventy."""
+        assert self._rows is not None
+        *_, numbers, starts = self._rows
+        found, block = velocity.contiguous().clone(), lanes(velocity.device, 64)
+        kinds = tuple(KINDS.index(type(part)) for part in self.modulations)
+        with torch.cuda.device_of(found):
+            launch(_modulate, (triton.cdiv(time.numel(), block),))(
+                found, time.contiguous(), numbers, starts, time.numel(), len(starts), KINDS=kinds,
+                MODULATIONS=len(kinds), BLOCK=block, num_warps=2,
+            )  # fmt: skip
+        return found
 
 
 def _seeds(seeds: Sequence[int], like: Tensor) -> Tensor:

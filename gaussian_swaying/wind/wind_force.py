@@ -13,7 +13,6 @@ from torch import Tensor, nn
 from gaussian_swaying._checks import check_shape
 from gaussian_swaying._fixed import FixedList, changed
 from gaussian_swaying.kernels.graphs import tensors_in
-from gaussian_swaying.kernels.launch import replaces
 from gaussian_swaying.mpm.forces import Force, Given
 from gaussian_swaying.mpm.state import State
 from gaussian_swaying.mpm.twins import Numbers, Twin
@@ -347,15 +346,6 @@ def _air(wind: nn.Module, time: Tensor, position: Tensor) -> Tensor:
 
 
 def _blow(wind: nn.Module, times: Tensor) -> Tensor:
-    """Velocity of a uniform wind at times (n,) [s], on their device; on a GPU in one kernel. Shape (n, 3).
-
-    A CPU saves little by it, and a batch of winds has the bits of each wind.
-    """
-    if times.is_cuda and replaces((times, *tensors_in([wind])), dtype=None):
-        from gaussian_swaying.wind.wind_triton import blow
-
-        found = blow(wind, times)
-        if found is not None:
-            return found
+    """Velocity of a uniform wind at times [s], on their device."""
     velocity: Tensor = wind(times)
     return velocity.to(times.device)

@@ -8,33 +8,40 @@ from shared import double
 from torch.testing import assert_close
 
 from gaussian_swaying import GaussianGust, SineSway, UniformGust, WindField
-from gaussian_swaying._fixed import assign
+from gaussian_swaying._fixed import assign, changed
+from gaussian_swaying.kernels.derive import on_tensors
 from gaussian_swaying.wind.effects import LogProfile
-from gaussian_swaying.wind.field import FlowKey, counter_normal, counter_uniform
+from gaussian_swaying.wind.field import FlowKey, counter_normal, counter_uniform, stream_start
 
 COUNT = 20000
 # five standard errors
 FIVE = 5 / math.sqrt(COUNT)
 
 
+def drawn(function, seed, stream, counter, lanes):
+    """Numbers of a generator, shape (n, lanes)."""
+    start = stream_start(seed, stream)
+    return torch.stack([on_tensors(function)(start, counter, lane) for lane in range(lanes)], dim=-1)
+
+
 def test_counter_generator_statistics():
     counter = torch.arange(COUNT)
-    u = counter_uniform(7, 0, counter, 2)
+    u = drawn(counter_uniform, 7, 0, counter, 2)
     assert u.min() > 0
     assert u.max() < 1
     assert_close(u.mean(0), torch.full((2,), 0.5).double(), rtol=0, atol=FIVE * math.sqrt(1 / 12))
-    z = counter_normal(7, 0, counter, 3)
+    z = drawn(counter_normal, 7, 0, counter, 3)
     assert_close(z.mean(0), torch.zeros(3).double(), rtol=0, atol=FIVE)
     assert_close(z.var(0), torch.ones(3).double(), rtol=0, atol=FIVE * math.sqrt(2))
     # no correlation between lanes, neighbours in time, streams or seeds
-    others = [counter_normal(7, 1, counter, 3), counter_normal(8, 0, counter, 3), z.roll(1, 0), z.roll(1, 1)]
-    for other in others:
+    others = [drawn(counter_normal, *other, counter, 3) for other in ((7, 1), (8, 0))]
+    for other in (*others, z.roll(1, 0), z.roll(1, 1)):
         assert (z * other).mean(0).abs().max() < FIVE
 
 
 def test_counter_generator_is_pinned():
     """The gusts of a recorded run must not change with a refactoring."""
-    numbers = counter_uniform(0, 0, torch.arange(3), 1)[:, 0].tolist()
+    numbers = drawn(counter_uniform, 0, 0, torch.arange(3), 1)[:, 0].tolist()
     assert numbers == pytest.approx(PINNED, abs=1e-15)
 
 
@@ -76,52 +83,6 @@ def test_modulations_compose_in_order():
     assert (both - 1.5 * flow).abs().max() > 1e-3
 
 
-KEYS = [FlowKey(0.1, [1.0, 0.0, -1.5]), FlowKey(0.5, [0.0, 3.0, 1.5]), FlowKey(1.3, [-2.0, 0.5, 0.5])]
-GUSTS = [SineSway(period=0.7, phase=0.3), UniformGust(0.2, interval=0.05), GaussianGust(0.4, interval=0.07)]
-BLOWN = {
-    "steady": lambda: WindField([2.0, -1.0, 0.5]),
-    "gusts": lambda: WindField([2.0, -1.0, 0.5], modulations=GUSTS, seed=7),
-    "in another order": lambda: WindField([0.0, -1.0, 1.0], modulations=[*GUSTS[::-1], SineSway()], seed=-3),
-    "steps": lambda: WindField(schedule=KEYS, modulations=GUSTS[2:]),
-    "ramps": lambda: WindField(schedule=KEYS, interpolation="linear", modulations=GUSTS, seed=2**70),
-    "still air": lambda: WindField(modulations=GUSTS),
-}
-
-
-@pytest.fixture
-def blow(kernel_device):
-    """The kernel, and where it runs."""
-    from gaussian_swaying.wind.wind_triton import blow
-
-    return blow, kernel_device
-
-
-@pytest.mark.parametrize("case", BLOWN)
-def test_the_kernel_of_the_wind_is_its_definition(blow, case):
-    kernel, device = blow
-    wind = BLOWN[case]().to(device)
-    times = torch.cat([torch.linspace(-0.2, 3, 90), torch.tensor([0.05, 0.1, 0.5, 1.3, 1e4])]).double().to(device)
-    for _ in range(2):
-        assert_close(kernel(wind, times), wind(times), rtol=1e-11, atol=1e-12)
-        assign(wind, seed=wind.seed + 1)
-        wind.flows *= 1.5
-        for part in wind.modulations[:1]:
-            assign(part, amplitude=0.1, delta=0.1, std=0.1)
-
-
-def test_the_kernel_refuses_a_wind_that_it_does_not_know(blow):
-    class Own(UniformGust):
-        pass
-
-    class Other(WindField):
-        pass
-
-    kernel, device = blow
-    times = torch.zeros(3, dtype=torch.float64, device=device)
-    for wind in (WindField([1.0, 0, 0], modulations=[Own()]), Other([1.0, 0, 0]), WindField([1.0, 0, 0]).float()):
-        assert kernel(wind.to(device), times) is None
-
-
 def _gusty(k):
     modulations = [
         SineSway(0.3 + 0.1 * k, 1.0 + k, 0.2 * k),
@@ -153,6 +114,34 @@ def test_winds_of_several_scenes_together(winds):
     assert_close(both(times), torch.stack([wind(times) for wind in winds], dim=1), rtol=0, atol=1e-14)
     assert_close(both.carried(times), torch.stack([wind.carried(times) for wind in winds], dim=1), rtol=0, atol=1e-14)
     assert both.scenes == len(winds)
+
+
+def test_the_kernel_modulates_as_torch_does(kernel_device):
+    """Also of several scenes, and after its numbers were changed."""
+    times = torch.cat([torch.linspace(-0.2, 3, 90), torch.tensor([0.05, 0.1, 0.5, 1.3, 1e4])]).double()
+    for wind in (_gusty(2), WindField.together([_gusty(k) for k in range(1, 4)]), _scheduled(2, "linear")):
+        moved, expected = changed(wind).to(kernel_device), wind(times)
+        for _ in range(2):
+            flow, at = moved.mean_flow(times.to(kernel_device)), times.to(kernel_device)
+            at = at.reshape(-1, *[1] * (flow.ndim - 2)).expand(flow.shape[:-1])
+            assert moved._known_rows(at)
+            assert_close(moved.modulated(flow, at).cpu(), expected, rtol=1e-11, atol=1e-12)
+            assert_close(moved(times.to(kernel_device)).cpu(), expected, rtol=1e-11, atol=1e-12)
+            if wind.scenes is None:
+                assign(moved, seed=5)
+                expected = changed(wind, seed=5)(times)
+
+
+def test_the_kernel_refuses_a_wind_that_it_does_not_know():
+    class Own(UniformGust):
+        pass
+
+    class Other(WindField):
+        pass
+
+    gust = UniformGust()
+    for wind in (WindField(modulations=[Own()]), Other(modulations=[gust]), WindField(modulations=[gust]).float()):
+        assert not wind._known_rows(torch.zeros(3).double())
 
 
 def test_winds_of_other_kinds_are_not_joined():

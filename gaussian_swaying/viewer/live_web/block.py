@@ -333,7 +333,7 @@ def _wind_arrays(force: WindForce, order: Tensor) -> dict[str, Tensor]:
 def _wind(wind: Any) -> dict[str, Any]:
     parts: list[dict[str, Any]] = []
     for stream, part in enumerate(wind.modulations):
-        start = str(stream_start(wind.seed, stream))  # of 64 bits
+        start = str(int(stream_start(wind.seed, stream)))  # of 64 bits
         if isinstance(part, SineSway):
             parts.append({"kind": "sway", "amplitude": part.amplitude, "period": part.period, "phase": part.phase})
         elif isinstance(part, UniformGust):
