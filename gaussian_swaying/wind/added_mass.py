@@ -70,10 +70,6 @@ class AirLift(Force):
         self.register_buffer("force", mass.detach()[..., None] * -down)
         self.force: Tensor
 
-    def forward(self, state: State) -> Tensor:
-        """Force on each point [N], shape (..., P, 3)."""
-        return self.force.expand_as(state.position)
-
     def potential(self, state: State) -> Tensor:
         """Potential energy of the force [J], shape (...) over the batch, float64."""
         return -(in_double(self.force) * in_double(state.position)).sum((-2, -1))

@@ -165,10 +165,6 @@ class AirPush(Force):
         way = way - dt * faster
         return substeps * dt * self.numbers[:, :3] - self.numbers[:, 3:] * way
 
-    def forward(self, state: State) -> Tensor:
-        """Force [N], shape (P, 3)."""
-        return self.numbers[:, :3] - self.numbers[:, 3:] * state.velocity
-
     def twin(self) -> Twin:
         return Twin(air_push, per_point=Numbers(4, lambda: self.numbers), sources=(self.numbers,))
 
