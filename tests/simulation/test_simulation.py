@@ -27,7 +27,6 @@ from gaussian_swaying.simulation.material import Material
 from gaussian_swaying.simulation.scene import Scene
 from gaussian_swaying.simulation.simulation import Simulation
 from gaussian_swaying.wind.field import GaussianGust, SineSway, WindField
-from gaussian_swaying.mpm import forces
 from gaussian_swaying.wind.force import AeroForce
 
 # ---- time
@@ -75,8 +74,8 @@ def test_strong_drag_on_light_patches_shortens_the_substep(make_simulation):
 
 def test_aerodynamics_are_asked_only_where_they_can_push(make_simulation, monkeypatch):
     calls = []
-    found = forces.split
-    monkeypatch.setattr(forces, "split", lambda given, force, state: calls.append(1) or found(given, force, state))
+    on_patches = AeroForce.on_patches
+    monkeypatch.setattr(AeroForce, "on_patches", lambda self, *a: calls.append(1) or on_patches(self, *a))
     for aero in (AeroForce(C_D=0.0, C_F=0.0, C_L=0.0), AeroForce(air_density=0.0)):
         assert aero.idle
         _, (health,) = advanced(make_simulation(aero=aero, transfer="torch"), 1)
