@@ -84,12 +84,21 @@ def fastest(times: Tensor, values: Tensor, start: float = -math.inf, end: float 
     return float(torch.where(meets, rate, 0.0).amax())
 
 
+def picked(values: Tensor, index: Tensor) -> Tensor:
+    """Rows of a tensor (N, ...) by integers of any shape, also of none, without making the host wait.
+
+    ``values[index]`` with a scalar on a GPU would read it on the host, which a CUDA graph cannot record.
+    """
+    return values.index_select(0, index.reshape(-1)).reshape((*index.shape, *values.shape[1:]))
+
+
 def between(times: Tensor, values: Tensor, time: Tensor) -> Tensor:
     """Values (K, 3) at times (...), linear between the keys and constant before and after, shape (..., 3)."""
     if len(times) == 1:
         return values[0].expand(*time.shape, 3)
     time = time.to(times)
     last = (torch.searchsorted(times, time.reshape(-1), right=True) - 1).clamp(0, len(times) - 2).reshape(time.shape)
-    start, end = times[last], times[last + 1]
+    start, end = picked(times, last), picked(times, last + 1)
     f = ((time - start) / (end - start)).clamp(0.0, 1.0)[..., None]
-    return values[last] + f * (values[last + 1] - values[last])
+    low = picked(values, last)
+    return low + f * (picked(values, last + 1) - low)

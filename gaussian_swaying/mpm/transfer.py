@@ -139,7 +139,7 @@ def _grid_constants(grid: GridSpec, device: torch.device) -> tuple[Tensor, Tenso
         columns = torch.tensor([grid.offset, (nx - 3, ny - 3, nz - 3), (ny * nz, nz, 1)], device=device)
         offset, limit, strides = columns[:, :, None]
         reach = torch.arange(3, device=device)
-        return offset, limit, strides, torch.cartesian_prod(reach, reach, reach) @ strides[:, 0]
+        return offset, limit, strides, (torch.cartesian_prod(reach, reach, reach) * strides[:, 0]).sum(-1)
 
 
 def shifts(grid: GridSpec) -> Tensor:

@@ -25,6 +25,7 @@ from gaussian_swaying._checks import (
 )
 from gaussian_swaying._fixed import Fixed, FixedList, changed, fixed
 from gaussian_swaying.geometry.frame import SimFrame
+from gaussian_swaying.geometry.keyed_path import picked
 from gaussian_swaying.geometry.linalg_triton import add3, load3, scale3, store3
 from gaussian_swaying.kernels.derive import on_tensors
 from gaussian_swaying.kernels.graphs import Recordable
@@ -129,14 +130,6 @@ def _modulate(
         else:
             v = shaken(v, time, (own[0], tl.where(mask, own[1], 1.0)), start)
     store3(velocity, 1, 3 * index, v, mask)
-
-
-def picked(values: Tensor, index: Tensor) -> Tensor:
-    """Rows of a tensor (N, ...) by integers of any shape, also of none, without making the host wait.
-
-    ``values[index]`` with a scalar on a GPU would read it on the host, which a CUDA graph cannot record.
-    """
-    return values.index_select(0, index.reshape(-1)).reshape((*index.shape, *values.shape[1:]))
 
 
 class Modulation(Recordable, nn.Module, ABC):

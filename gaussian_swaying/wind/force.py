@@ -143,7 +143,8 @@ def wind_force(F, velocity, position, patch, numbers, now, table, OPTIONS: tl.co
     ``now``: velocity without effects, and the numbers of each effect. ``OPTIONS``: place of the law in :data:`LAWS`,
     semi-implicit drag, effects.
     """
-    air = shaped_wind(position, now, table, OPTIONS[2])
+    EFFECTS: tl.constexpr = OPTIONS[2]  # Triton passes an object only by a name
+    air = shaped_wind(position, now, table, EFFECTS)
     force, area = force_on_patch(F, velocity, patch, numbers, air, table, OPTIONS[0])
     return _resisted(force, area, air, velocity, numbers, OPTIONS[0], OPTIONS[1])
 
