@@ -1,13 +1,18 @@
-"""Batched 3x3 matrices: cofactor, determinant, polar rotation, eigenvectors, singular value decomposition."""
+"""Batched 3x3 matrices: cofactor, determinant, polar rotation, singular value decomposition.
+
+The decompositions are those of :mod:`~gaussian_swaying.geometry.linalg_triton`, with exact derivatives.
+"""
 
 from __future__ import annotations
 
-import math
-from collections.abc import Callable
-from typing import NamedTuple
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
+
+from gaussian_swaying.geometry import linalg_triton as device
+from gaussian_swaying.kernels.derive import on_tensors, primitive
 
 
 def cofactor(matrix: Tensor) -> Tensor:
@@ -33,14 +38,50 @@ def determinant(matrix: Tensor, cofactors: Tensor | None = None) -> Tensor:
     return (matrix[..., 0, :] * cofactors[..., 0, :]).sum(-1)
 
 
+def entries(matrix: Tensor) -> tuple[Tensor, ...]:
+    """The nine entries (...) of matrices (..., 3, 3), row by row, as device functions take them."""
+    return matrix.flatten(-2).unbind(-1)
+
+
+def matrix(entries: Sequence[Tensor]) -> Tensor:
+    """Matrices (..., 3, 3) of nine entries (...)."""
+    return torch.stack(torch.broadcast_tensors(*entries), -1).unflatten(-1, (3, 3))
+
+
+class _Polar(torch.autograd.Function):
+    generate_vmap_rule = True
+
+    @staticmethod
+    def forward(F: Tensor, iterations: int) -> Tensor:
+        x = entries(F)
+        for _ in range(iterations):
+            x = on_tensors(device.polar_step)(x)
+        rotation = matrix(x)
+        reflected = (determinant(rotation) < 0)[..., None, None]
+        # asking a GPU would make the host wait
+        if F.device.type == "cpu" and not bool(reflected.any()):
+            return rotation
+        left, axes = _singular_vectors(F)
+        return torch.where(reflected, matmul3(left, axes.mT), rotation)
+
+    @staticmethod
+    def setup_context(ctx: Any, inputs: tuple[Tensor, int], output: Tensor) -> None:
+        ctx.save_for_backward(inputs[0], output)
+
+    @staticmethod
+    def backward(ctx: Any, bar: Tensor) -> tuple[Tensor, None]:
+        F, rotation = ctx.saved_tensors
+        return matrix(on_tensors(device.polar_change)(entries(F), entries(rotation), entries(bar))), None
+
+
 def polar_rotation(matrix: Tensor, iterations: int | None = None) -> Tensor:
     r"""The rotation nearest to F: the factor R of the polar decomposition F = R S, by the scaled Newton iteration.
 
     :math:`X_{k+1} = \tfrac12 (\zeta_k X_k + \zeta_k^{-1} X_k^{-T})` with
     :math:`\zeta_k = (\lVert X_k^{-1} \rVert_F / \lVert X_k \rVert_F)^{1/2}` (Higham 1986, "Computing the polar
     decomposition - with applications"). It converges quadratically to the nearest orthogonal matrix. Where that is a
-    reflection (an inverted element), its axis of smallest stretch is reversed, which gives the nearest rotation
-    (Irving, Teran & Fedkiw 2004).
+    reflection (an inverted element), the nearest rotation reverses its axis of smallest stretch (Irving, Teran &
+    Fedkiw 2004).
 
     The first derivative is the exact one of the limit, :math:`dR = R \Omega` with
     :math:`\Omega S + S \Omega = R^T dF - dF^T R`, not that of the iteration: it is finite for every F, while that of an
@@ -55,142 +96,17 @@ def polar_rotation(matrix: Tensor, iterations: int | None = None) -> Tensor:
     Returns:
         Shape (..., 3, 3).
     """
-    with torch.no_grad():
-        constant = matrix.detach()
-        rotation = _nearest_rotation(constant, iterations or (8 if matrix.dtype == torch.float64 else 5))
-    if not (torch.is_grad_enabled() and matrix.requires_grad):
-        return rotation
-    with torch.no_grad():
-        # for the axial vectors of Omega and of the right-hand side: (tr(S) I - S) omega = k
-        stretch = matmul3(rotation.mT, constant)
-        trace = stretch.diagonal(dim1=-2, dim2=-1).sum(-1)[..., None, None]
-        system = trace * torch.eye(3, dtype=matrix.dtype, device=matrix.device) - 0.5 * (stretch + stretch.mT)
-        cof = cofactor(system)
-        finfo = torch.finfo(matrix.dtype)
-        least = finfo.eps**0.5 * system.abs().amax((-1, -2)).pow(3).clamp(min=finfo.tiny**0.5)
-        inverse = cof / torch.maximum(determinant(system, cof), least)[..., None, None]
-    change = matmul3(rotation.mT, matrix - constant)
-    skew = change - change.mT
-    axial = torch.stack([skew[..., 2, 1], skew[..., 0, 2], skew[..., 1, 0]], dim=-1)
-    spin = (inverse * axial[..., None, :]).sum(-1)
-    # rows of R times Omega
-    return rotation + torch.linalg.cross(rotation, spin[..., None, :].expand_as(rotation), dim=-1)
+    found: Tensor = _Polar.apply(matrix, iterations or (8 if matrix.dtype == torch.float64 else 5))
+    return found
 
 
-def _nearest_rotation(matrix: Tensor, iterations: int) -> Tensor:
-    """Value of :func:`polar_rotation`."""
-    tiny = torch.finfo(matrix.dtype).tiny ** 0.25
-    x = matrix
-    for _ in range(iterations):
-        cof = cofactor(x)
-        det = determinant(x, cof)
-        det = det.abs().clamp(min=tiny).copysign(det)[..., None, None]
-        inverse_transpose = cof / det
-        ratio = inverse_transpose.square().sum((-1, -2), keepdim=True) / x.square().sum((-1, -2), keepdim=True).clamp(
-            min=tiny
-        )
-        zeta = ratio.clamp(min=torch.finfo(x.dtype).tiny).pow(0.25)
-        x = 0.5 * (zeta * x + inverse_transpose / zeta)
-    reflected = (determinant(x) < 0)[..., None, None]
-    # asking a GPU would make the host wait
-    if x.device.type == "cpu" and not bool(reflected.any()):
-        return x
-    stretch = matmul3(x.mT, matrix)
-    axis = _weakest_axis(0.5 * (stretch + stretch.mT))
-    turned = x - 2 * (x * axis[..., None, :]).sum(-1, keepdim=True) * axis[..., None, :]
-    return torch.where(reflected, turned, x)
-
-
-def _weakest_axis(stretch: Tensor) -> Tensor:
-    """Unit eigenvector (..., 3) of the smallest eigenvalue of positive semidefinite matrices (..., 3, 3)."""
-    eye = torch.eye(3, dtype=stretch.dtype, device=stretch.device)
-    shifted = stretch - symmetric_eigenvalues(stretch)[..., 2, None, None] * eye
-    tiny = torch.finfo(stretch.dtype).eps * (1 + stretch.abs().amax((-1, -2)))[..., None]
-    # the cofactors of a matrix of rank two are the outer product of its null vector; at rank one or less, where the
-    # eigenvalue is repeated, any vector orthogonal to the largest row will do
-    vector = _largest_row(cofactor(shifted))
-    row = _largest_row(shifted)
-    across = torch.linalg.cross(row, eye[row.abs().argmin(-1)], dim=-1)
-    size, width = (torch.linalg.vector_norm(v, dim=-1, keepdim=True) for v in (vector, across))
-    fallback = torch.where(width > tiny, across / width.clamp(min=tiny), eye[2])
-    return torch.where(size > tiny * row.abs().amax(-1, keepdim=True), vector / size.clamp(min=tiny * tiny), fallback)
-
-
-def _largest_row(matrix: Tensor) -> Tensor:
-    """The row (..., 3) of largest norm."""
-    index = matrix.square().sum(-1).argmax(-1)[..., None, None].expand(*matrix.shape[:-2], 1, 3)
-    return matrix.gather(-2, index).squeeze(-2)
-
-
-def symmetric_eigenvalues(matrix: Tensor) -> Tensor:
-    """Eigenvalues of symmetric 3x3 matrices in closed form (Smith 1961), largest first; for diagnostics.
-
-    Args:
-        matrix: Symmetric, shape (..., 3, 3). Absolute accuracy is about 1e-8 of the largest in float64.
-
-    Returns:
-        Shape (..., 3).
-    """
-    mean = matrix.diagonal(dim1=-2, dim2=-1).mean(-1)
-    deviator = matrix - mean[..., None, None] * torch.eye(3, dtype=matrix.dtype, device=matrix.device)
-    radius = (deviator.square().sum((-1, -2)) / 6).sqrt()
-    scaled = deviator / radius.clamp(min=torch.finfo(matrix.dtype).tiny ** 0.5)[..., None, None]
-    angle = (determinant(scaled) / 2).clamp(-1, 1).acos() / 3
-    first = mean + 2 * radius * angle.cos()
-    last = mean + 2 * radius * (angle + 2 * math.pi / 3).cos()
-    return torch.stack([first, 3 * mean - first - last, last], dim=-1)
+def largest_eigenvalue(matrix: Tensor) -> Tensor:
+    """Largest eigenvalue (...) of symmetric matrices (..., 3, 3)."""
+    found: Tensor = on_tensors(device.largest_eigenvalue)(entries(matrix))
+    return found
 
 
 _PAIRS = ((0, 1, 2), (0, 2, 1), (1, 2, 0))  # two axes and the third
-
-
-def _dot(a: Tensor, b: Tensor) -> Tensor:
-    """Product of vectors whose components come first, (3, N); shape (N,)."""
-    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
-
-
-def _jacobi_angle(app: Tensor, aqq: Tensor, apq: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Tangent, cosine and sine of the smaller rotation that annihilates ``apq`` (Golub & Van Loan, section 8.5)."""
-    gap, twice = aqq - app, 2 * apq
-    # the squares may underflow; the root is at least as long as either side, and the tangent at most one
-    root = torch.maximum((gap.square() + twice.square()).sqrt(), twice.abs()) + torch.finfo(app.dtype).tiny
-    tangent = torch.where(gap < 0, -twice, twice) / (gap.abs() + root)
-    cosine = (1 + tangent.square()).rsqrt()
-    return tangent, cosine, cosine * tangent
-
-
-def _jacobi(entries: dict[tuple[int, int], Tensor]) -> tuple[list[Tensor], list[Tensor]]:
-    """Eigenvalues (N,) and eigenvectors (3, N), unsorted, from the upper triangle of symmetric matrices."""
-    a = entries
-    one, zero = torch.ones_like(a[0, 0]), torch.zeros_like(a[0, 0])
-    v = [torch.stack([one if row == column else zero for row in range(3)]) for column in range(3)]
-    # convergence is quadratic; of 1e5 matrices of all condition numbers, all converged at least one sweep earlier
-    for _ in range(5 if one.dtype == torch.float64 else 4):
-        for p, q, r in _PAIRS:
-            rp, rq = (min(r, p), max(r, p)), (min(r, q), max(r, q))
-            t, c, s = _jacobi_angle(a[p, p], a[q, q], a[p, q])
-            shift = t * a[p, q]
-            a[p, p], a[q, q], a[p, q] = a[p, p] - shift, a[q, q] + shift, zero
-            a[rp], a[rq] = c * a[rp] - s * a[rq], s * a[rp] + c * a[rq]
-            v[p], v[q] = c * v[p] - s * v[q], s * v[p] + c * v[q]
-    return [a[0, 0], a[1, 1], a[2, 2]], v
-
-
-def _sort(keys: list[Tensor], *columns: list[Tensor]) -> None:
-    """Sort in place, largest key (N,) first; swapping two columns (3, N) negates one, to keep determinants."""
-    for p, q in ((0, 1), (0, 2), (1, 2)):
-        swap = keys[p] < keys[q]
-        keys[p], keys[q] = torch.maximum(keys[p], keys[q]), torch.minimum(keys[p], keys[q])
-        for column in columns:
-            column[p], column[q] = (
-                torch.where(swap, column[q], column[p]),
-                torch.where(swap, -column[p], column[q]),
-            )
-
-
-def _matrix(columns: list[Tensor], shape: torch.Size) -> Tensor:
-    """Columns (3, N) to matrices of a shape (..., 3, 3)."""
-    return torch.stack(columns, dim=-1).transpose(0, 1).reshape(shape)
 
 
 class Spectrum(NamedTuple):
@@ -256,30 +172,8 @@ def spectrum(F: Tensor) -> Spectrum:
 
 def _singular_vectors(F: Tensor) -> tuple[Tensor, Tensor]:
     """Rotations U and V with U^T F V diagonal, sorted by size, all but the last entry not negative."""
-    columns = F.reshape(-1, 3, 3).permute(2, 1, 0).contiguous()  # column, component, matrix
-    _, v = _jacobi({(i, j): _dot(columns[i], columns[j]) for i in range(3) for j in range(i, 3)})
-    b = [axis[0] * columns[0] + axis[1] * columns[1] + axis[2] * columns[2] for axis in v]
-    for _ in range(2):
-        for p, q, _r in _PAIRS:
-            _, c, s = _jacobi_angle(_dot(b[p], b[p]), _dot(b[q], b[q]), _dot(b[p], b[q]))
-            b[p], b[q] = c * b[p] - s * b[q], s * b[p] + c * b[q]
-            v[p], v[q] = c * v[p] - s * v[q], s * v[p] + c * v[q]
-    _sort([_dot(column, column) for column in b], b, v)
-    first = _unit(b[0], v[0])
-    # second column: what is left of it across the first, or any direction across the first
-    component = torch.where(first[0].abs() < 0.8, 1.0, 0.0).to(F.dtype)
-    other = torch.stack([component, 1 - component, torch.zeros_like(component)])
-    second = _unit(b[1] - _dot(first, b[1]) * first, _unit(other - _dot(first, other) * first, other))
-    second = _unit(second - _dot(first, second) * first, second)
-    third = torch.linalg.cross(first, second, dim=0)
-    return _matrix([first, second, third], F.shape), _matrix(v, F.shape)
-
-
-def _unit(vector: Tensor, fallback: Tensor) -> Tensor:
-    """Vectors (3, N) of length one; the fallback where a vector is zero."""
-    squared = _dot(vector, vector)
-    tiny = torch.finfo(vector.dtype).tiny * 1e6
-    return torch.where(squared > tiny, vector * squared.clamp(min=tiny).rsqrt(), fallback)
+    left, _, axes = on_tensors(device.svd3, look_in=True)(entries(F))
+    return matrix(left), matrix(axes)
 
 
 def divided_differences(stretch: Tensor, function: Callable[[Tensor], Tensor]) -> Tensor:
@@ -356,3 +250,20 @@ def svd3(F: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """
     parts = spectrum(F)
     return parts.left, parts.stretch, parts.axes
+
+
+primitive(device.polar_change, outputs=9)
+primitive(
+    device.polar_rotation,
+    outputs=9,
+    on_tensors=lambda F: entries(polar_rotation(matrix(torch.broadcast_tensors(*F)))),
+    vjp=lambda given, R, bar: (on_tensors(device.polar_change)(given[0], R, bar),),
+)
+
+
+def _svd3_of_entries(F: Sequence[Tensor]) -> tuple[tuple[Tensor, ...], ...]:
+    left, stretch, axes = svd3(matrix(F))
+    return entries(left), stretch.unbind(-1), entries(axes)
+
+
+primitive(device.svd3, outputs=(9, 3, 9), on_tensors=_svd3_of_entries)

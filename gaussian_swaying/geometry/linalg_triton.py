@@ -153,14 +153,8 @@ def dot9(a, b):
 
 @triton.jit
 def dot3(a, b):
-    """Product of two vectors."""
+    """Product of two vectors; of a matrix and its cofactor matrix, which begin with their first rows, the determinant."""
     return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
-
-
-@triton.jit
-def determinant(a, cof):
-    """The determinant of a matrix with this cofactor matrix."""
-    return dot3(a, cof)
 
 
 @triton.jit
@@ -236,10 +230,10 @@ def scaled_product(u, d, v):
 
 
 @triton.jit
-def _polar_step(x):
+def polar_step(x):
     """A step of Newton's iteration with Higham's scaling."""
     cof = cofactor(x)
-    det = determinant(x, cof)
+    det = dot3(x, cof)
     size = tl.maximum(tl.abs(det), 1e-9)
     inverse = 1.0 / tl.where(det < 0, -size, size)
     ratio = dot9(cof, cof) * inverse * inverse / tl.maximum(dot9(x, x), 1e-9)
@@ -249,21 +243,21 @@ def _polar_step(x):
 
 @triton.jit
 def polar_rotation(F):
-    """The nearest rotation, as ``linalg.polar_rotation``."""
+    """The nearest rotation, see ``linalg.polar_rotation``."""
     x = F
     if GPU:
         for _ in range(5):
-            x = _polar_step(x)
+            x = polar_step(x)
     else:
         settled = 1e-16 if x[0].dtype == tl.float64 else 1e-8  # then the next change is below epsilon
         k = 0
         while k < 5:
             last = x
-            x = _polar_step(x)
+            x = polar_step(x)
             change = axpy9(1.0, x, -1.0, last)
             k = tl.where(tl.max(dot9(change, change)) > settled, k + 1, 5)  # changes square
     cof = cofactor(x)
-    reflected = determinant(x, cof) < 0
+    reflected = dot3(x, cof) < 0
     if tl.max(reflected.to(tl.int32)) > 0:
         u, _a, v = svd3(F)
         x = where9(reflected, matmul(u, transpose(v)), x)
@@ -282,8 +276,8 @@ def polar_change(F, R, x):
     cof = cofactor(system)
     size = tl.maximum(tl.abs(system[0]), tl.maximum(tl.abs(system[4]), tl.abs(system[8])))
     size = tl.maximum(size, tl.maximum(tl.abs(m01), tl.maximum(tl.abs(m02), tl.abs(m12))))
-    least = 3.4526698e-4 * tl.maximum(size * size * size, 1.0842022e-19)  # as in the reference
-    scale = 1.0 / tl.maximum(determinant(system, cof), least)
+    least = 3.4526698e-4 * tl.maximum(size * size * size, 1.0842022e-19)
+    scale = 1.0 / tl.maximum(dot3(system, cof), least)
     turn = matmul(transpose(R), x)
     k = (turn[7] - turn[5], turn[2] - turn[6], turn[3] - turn[1])
     spin = scale3(scale, matvec(cof, k))
@@ -422,13 +416,13 @@ def largest(x, y):
 
 @triton.jit
 def largest_eigenvalue(m):
-    """Largest eigenvalue of a symmetric matrix, as ``linalg.symmetric_eigenvalues``."""
+    """Largest eigenvalue of a symmetric matrix, in closed form (Smith 1961)."""
     mean = (m[0] + m[4] + m[8]) / 3
     d = (m[0] - mean, m[1], m[2], m[3], m[4] - mean, m[5], m[6], m[7], m[8] - mean)
     radius = tl.sqrt(dot9(d, d) / 6)
     cof = cofactor(d)
     scale = 1.0 / tl.maximum(radius, 1e-19)
-    half = 0.5 * determinant(d, cof) * scale * scale * scale
+    half = 0.5 * dot3(d, cof) * scale * scale * scale
     # 2 cos(acos(h) / 3) = 1 + e with e² (3 + e) = 2 (1 + h): Newton from above, good to round-off at a double root too
     target = 2 * (1 + clamp(half, -1.0, 1.0))
     e = tl.sqrt(target / 3)

@@ -23,7 +23,7 @@ import textwrap
 from collections.abc import Callable, Sequence
 from contextvars import ContextVar
 from dataclasses import dataclass
-from functools import cache
+from functools import cache, partial
 from typing import Any
 
 import torch
@@ -86,10 +86,14 @@ def primitive(function: Any, outputs: Any = 0, **known: Any) -> None:
 # ---- running a device function
 
 
-def on_tensors(function: Any) -> Callable[..., Any]:
+def on_tensors(function: Any, look_in: bool = False) -> Callable[..., Any]:
     """The Python function of a device function: takes and returns tensors, numbers or symbols, and tuples of them.
 
     Constants are plain numbers and tuples. Tensors must broadcast; results have their type, device and gradient.
+
+    Args:
+        function: The device function.
+        look_in: Whether to run the text of a primitive, too.
 
     Raises:
         TraceError: When it is called, if the function loads from memory or branches on a value.
@@ -100,7 +104,7 @@ def on_tensors(function: Any) -> Callable[..., Any]:
         real = next((kind for kind in found if kind.is_floating_point), None)
         before = None if real is None else _REAL.set(real)
         try:
-            return _call(function, *given, **named)
+            return (_python if look_in else partial(partial, _call))(function)(*given, **named)
         finally:
             if before is not None:
                 _REAL.reset(before)
@@ -359,6 +363,10 @@ def _number(value: Any) -> bool:
     return isinstance(value, (bool, int, float))
 
 
+def _opposite(x: Any, y: Any) -> bool:
+    return isinstance(x, Symbol) and x.op == "*" and _key(x.args[0]) == _key(-1.0) and _same(x.args[1], y)
+
+
 def _zero(value: Any) -> bool:
     return _number(value) and value == 0
 
@@ -388,8 +396,14 @@ def _simplified(op: str, args: tuple[Any, ...]) -> Any:
     x, y = args
     zero, one = (_zero(x), _zero(y)), (_number(x) and x == 1, _number(y) and y == 1)
     match op:
+        case "*" if _number(x) and isinstance(y, Symbol) and y.op == "*" and _number(y.args[0]):
+            return y.graph.make("*", x * y.args[0], y.args[1])
         case "+" if any(zero):
             return y if zero[0] else x
+        case "+" if any(
+            _key(u) == _key(-1.0 * v) for u, v in ((x, y), (y, x)) if isinstance(u, Symbol) and u.op == "*"
+        ):
+            return 0.0
         case "-" if zero[1]:
             return x
         case "-" if _same(x, y):
@@ -418,19 +432,22 @@ def gradient(outputs: Sequence[Any], inputs: Any, bars: Sequence[Any] | None = N
         if isinstance(to, Symbol) and not _zero(value):
             bar[to.index] = bar[to.index] + value if to.index in bar else value
 
+    wanted = {leaf.index for leaf in _leaves(inputs) if isinstance(leaf, Symbol)}
     for output, own in zip(outputs, [1.0] * len(outputs) if bars is None else bars, strict=True):
         add(output, own)
     for node in reversed(order):
         if node.op == "call":
             _pull_call(node, calls.get(node, {}), add)
-        elif node.index in bar:
+        elif node.index in bar and node.index not in wanted:
             if node.op == "part":
                 calls.setdefault(node.args[0], {})[node.args[1]] = bar[node.index]
             else:
                 _pull(node, bar[node.index], add)
 
-    def found(wanted: Any) -> Any:
-        return tuple(map(found, wanted)) if isinstance(wanted, tuple) else bar.get(wanted.index, 0.0)
+    def found(value: Any) -> Any:
+        if isinstance(value, tuple):
+            return tuple(map(found, value))
+        return bar.get(value.index, 0.0) if isinstance(value, Symbol) else 0.0
 
     return found(inputs)
 
@@ -521,19 +538,20 @@ def tangent(outputs: Sequence[Any], inputs: Sequence[Any], directions: Sequence[
     return gradient(by, tuple(bars), directions)
 
 
-def difference(output: Any, inputs: Sequence[Symbol], others: Sequence[Any], gap: Any) -> Any:
+def difference(output: Any, inputs: Sequence[Symbol], others: Sequence[Any], steps: Sequence[float], gap: Any) -> Any:
     """(f(x) - f(y)) / gap without cancellation, from f(x) and y.
 
     Args:
         output: f(x).
         inputs: x.
-        others: y, so that each entry of x - y is a constant multiple of the gap: 1, -1 or 0.
-        gap: Pairs of the multiple, of each input.
+        others: y.
+        steps: The entries of x - y as multiples of the gap.
+        gap: The gap.
     """
     order = _order([output])
     there: dict[int, Any] = {}
     change: dict[int, Any] = {}
-    for x, y, step in zip(inputs, others, gap, strict=True):
+    for x, y, step in zip(inputs, others, steps, strict=True):
         there[x.index], change[x.index] = y, step
 
     def at(value: Any) -> Any:
@@ -558,14 +576,17 @@ def difference(output: Any, inputs: Sequence[Symbol], others: Sequence[Any], gap
             change[node.index] = by(given[0]) * known.difference(given[0], at(given[0]))
             continue
         moves = [by(value) for value in node.args]
-        if all(map(_zero, moves)):
+        compared = node.op in ("<", "<=", ">", ">=", "==", "!=", "&", "|")
+        if all(map(_zero, moves)) and all(_same(value, at(value)) for value in node.args):
             continue
         there[node.index] = node.graph.make(node.op, *map(at, node.args))
-        change[node.index] = _moved(node, moves, at, there[node.index])
+        if compared or _same(there[node.index], node):  # symmetric
+            continue
+        change[node.index] = _moved(node, moves, at, there[node.index], gap)
     return by(output)
 
 
-def _moved(node: Symbol, moves: list[Any], at: Callable[[Any], Any], end: Any) -> Any:
+def _moved(node: Symbol, moves: list[Any], at: Callable[[Any], Any], end: Any, gap: Any) -> Any:
     x, y = (*node.args, None)[:2]
     make = node.graph.make
     match node.op:
@@ -585,6 +606,21 @@ def _moved(node: Symbol, moves: list[Any], at: Callable[[Any], Any], end: Any) -
         case "maximum" | "minimum" if _number(x) or _same(at(x), x):
             share = _share_above(y, at(y), x)
             return moves[1] * (share if node.op == "maximum" else 1.0 - share)
+        case "log" | "exp":
+            d = x - at(x)
+            if node.op == "log":  # 2 artanh of the ratio
+                ratio = d / (x + at(x))
+                w = ratio * ratio
+                near = w < 0.04
+                series = 2 * (1 + w * (1 / 3 + w * (1 / 5 + w * (1 / 7 + w * (1 / 9 + w / 11))))) / (x + at(x))
+            else:
+                near = make("abs", d) < 0.1
+                series = end * (1 + d * (1 / 2 + d * (1 / 6 + d * (1 / 24 + d * (1 / 120 + d / 720)))))
+            return moves[0] * make("where", near, series, (node - end) / make("where", near, 1.0, d))
+        case "where":
+            one = make("where", x, moves[1], moves[2])
+            jump = (node - end) / make("where", make("==", gap, 0.0), 1.0, gap)
+            return make("where", make("==", x, at(x)), one, jump)
         case "abs":
             return moves[0] * (x + at(x)) / make("maximum", node + end, 1e-30)
     raise TraceError(f"`{node.op}` has no divided difference")
@@ -611,8 +647,22 @@ def device_function(name: str, shapes: dict[str, Shape], formula: Callable[..., 
     """
     graph = Graph()
     result = formula(*(graph.argument(key, shape) for key, shape in shapes.items()))
+    body, known = _body(result)
+    arguments = ", ".join(shapes)
+    called = sorted((key, value.fn.__module__) for key, value in known.items())
+    full = f"{name}_{hashlib.sha256(repr((arguments, body, called)).encode()).hexdigest()[:12]}"
+    source = f"@triton.jit\ndef {full}({arguments}):\n{body}\n"
+    file = f"<{__name__}.{full}>"
+    linecache.cache[file] = (len(source), None, source.splitlines(True), file)
+    scope = {"tl": tl, "triton": triton, **known, "__name__": __name__}
+    exec(compile(source, file, "exec"), scope)
+    return scope[full]
+
+
+def _body(result: Any) -> tuple[str, dict[str, Any]]:
+    """The statements that compute a result, and the functions that they call."""
     names: dict[int, str] = {}
-    known: dict[str, Any] = {"tl": tl, "triton": triton}
+    known: dict[str, Any] = {}
     lines: list[str] = []
 
     def text(value: Any) -> str:
@@ -631,23 +681,16 @@ def device_function(name: str, shapes: dict[str, Shape], formula: Callable[..., 
             continue
         names[node.index] = f"t{len(lines)}"
         lines.append(f"    t{len(lines)} = {_written(node, text, known)}")
-    body = "\n".join([*lines, f"    return {text(result)}"])
-    arguments = ", ".join(shapes)
-    called = sorted((key, value.fn.__module__) for key, value in known.items() if hasattr(value, "fn"))
-    full = f"{name}_{hashlib.sha256(repr((arguments, body, called)).encode()).hexdigest()[:12]}"
-    source = f"@triton.jit\ndef {full}({arguments}):\n{body}\n"
-    file = f"<{__name__}.{full}>"
-    linecache.cache[file] = (len(source), None, source.splitlines(True), file)
-    scope = {**known, "__name__": __name__}
-    exec(compile(source, file, "exec"), scope)
-    return scope[full]
+    return "\n".join([*lines, f"    return {text(result)}"]), known
 
 
 def _written(node: Symbol, text: Callable[[Any], str], known: dict[str, Any]) -> str:
     if node.op == "call":
         function, given = node.args
-        known[function.fn.__name__] = function
-        return f"{function.fn.__name__}({', '.join(map(text, given))})"
+        name = function.fn.__name__
+        while known.setdefault(name, function) is not function:
+            name += "_"
+        return f"{name}({', '.join(map(text, given))})"
     values = [text(value) for value in node.args]
     if node.op == "-" and _zero(node.args[0]):
         return f"-{values[1]}"
@@ -686,13 +729,46 @@ def vjp(function: Any, shapes: dict[str, Shape], by: Sequence[str], constants: d
     return device_function(f"{function.fn.__name__}_adjoint", {**shapes, "bar": 0 if single else many}, formula)
 
 
+def uses(function: Any, shapes: dict[str, Shape]) -> set[str]:
+    """Names of the arguments that the result of a device function depends on."""
+    graph = Graph()
+    result = on_tensors(function)(**{key: graph.argument(key, shape) for key, shape in shapes.items()})
+    return {node.args[0].split("[")[0] for node in _order([result]) if node.op == "argument"}
+
+
+class _Unknown(Symbol):
+    """An argument that may be a number or a tuple."""
+
+    __slots__ = ()
+
+    def __getitem__(self, k: int) -> Any:
+        return self.graph.make("argument", f"{self.args[0]}[{k}]")
+
+    def __iter__(self) -> Any:
+        raise TraceError("how many numbers an argument has is not known")
+
+
+def canonical(function: Any) -> str:
+    """What a device function computes, with its arguments by number: the same text for the same formula.
+
+    Raises:
+        TraceError: If it cannot be traced.
+    """
+    graph = Graph()
+    names = inspect.signature(function.fn).parameters
+    given = [_Unknown(graph, "argument", (f"argument {k}",), -1 - k) for k in range(len(names))]
+    try:
+        return _body(on_tensors(function, look_in=True)(*given))[0]
+    except (TypeError, AttributeError) as error:
+        raise TraceError(str(error)) from error
+
+
 def text_of(function: Any) -> str:
     """The source of a device function, derived ones too."""
     return "".join(inspect.getsourcelines(function.fn)[0])
 
 
 __all__ = [
-    "Memory", "Primitive", "Symbol", "TraceError", "device_function", "difference", "gradient", "on_tensors",
-    "primitive",
-    "tangent", "text_of", "vjp",
+    "Memory", "Primitive", "Symbol", "TraceError", "canonical", "device_function", "difference", "gradient",
+    "on_tensors", "primitive", "tangent", "text_of", "uses", "vjp",
 ]  # fmt: skip

@@ -2,10 +2,12 @@
 
 import math
 
-import torch
 from torch import Tensor
 
-from gaussian_swaying.geometry.linalg import matmul3
+from gaussian_swaying.geometry.linalg import entries, matrix
+from gaussian_swaying.geometry.linalg_triton import matmul, scale9, transpose
+from gaussian_swaying.kernels.derive import on_tensors
+from gaussian_swaying.kernels.language import triton
 
 
 def decay_rate(ratio: float, frequency: float) -> float:
@@ -19,6 +21,21 @@ def decay_rate(ratio: float, frequency: float) -> float:
         frequency: f [Hz].
     """
     return 4 * math.pi * frequency * ratio
+
+
+@triton.jit
+def kelvin_voigt(F, rate, mu, lam, time):
+    """Entries of :func:`kelvin_voigt_pk1`."""
+    product = matmul(transpose(F), rate)
+    trace = lam * (product[0] + product[4] + product[8])
+    s01 = mu * (product[1] + product[3])
+    s02 = mu * (product[2] + product[6])
+    s12 = mu * (product[5] + product[7])
+    stress = (
+        2 * mu * product[0] + trace, s01, s02, s01, 2 * mu * product[4] + trace, s12, s02, s12,
+        2 * mu * product[8] + trace,
+    )  # fmt: skip
+    return scale9(time, matmul(F, stress))
 
 
 def kelvin_voigt_pk1(F: Tensor, F_rate: Tensor, mu: Tensor, lam: Tensor, time: float) -> Tensor:
@@ -38,12 +55,7 @@ def kelvin_voigt_pk1(F: Tensor, F_rate: Tensor, mu: Tensor, lam: Tensor, time: f
     Returns:
         Shape (..., 3, 3).
     """
-    product = matmul3(F.mT, F_rate)
-    rate = 0.5 * (product + product.mT)
-    eye = torch.eye(3, dtype=F.dtype, device=F.device)
-    trace = rate.diagonal(dim1=-2, dim2=-1).sum(-1)
-    stress = 2 * mu[..., None, None] * rate + (lam * trace)[..., None, None] * eye
-    return time * matmul3(F, stress)
+    return matrix(on_tensors(kelvin_voigt)(entries(F), entries(F_rate), mu, lam, time))
 
 
 def damped_substep(limit: float, time: float) -> float:

@@ -15,7 +15,7 @@ from torch import Tensor
 from gaussian_swaying._checks import check_positive
 from gaussian_swaying._fixed import fixed
 from gaussian_swaying.geometry.groups import joined
-from gaussian_swaying.geometry.linalg import symmetric_eigenvalues
+from gaussian_swaying.geometry.linalg import largest_eigenvalue
 from gaussian_swaying.mpm.boundary import CLOCK, Boundary, Nodes
 from gaussian_swaying.mpm.colliders import Obstacle
 from gaussian_swaying.mpm.contact import Surface
@@ -377,7 +377,7 @@ class Formulation(ABC):
         if time == 0 or state is None:
             return time
         F = state.F_elastic.detach()
-        squared = float(symmetric_eigenvalues(F.mT @ F)[..., 0].amax().clamp(min=1.0))
+        squared = float(largest_eigenvalue(F.mT @ F).amax().clamp(min=1.0))
         return time * squared**self.viscous_power
 
 

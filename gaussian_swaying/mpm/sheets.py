@@ -30,7 +30,22 @@ import torch
 from torch import Tensor
 
 from gaussian_swaying._devices import in_double
-from gaussian_swaying.geometry.linalg import cofactor
+from gaussian_swaying.geometry.linalg import entries, matrix
+from gaussian_swaying.geometry.linalg_triton import (
+    add3,
+    axpy3,
+    axpy9,
+    cofactor,
+    dot3,
+    matvec,
+    outer3,
+    scale3,
+    scale9,
+    transpose,
+)
+from gaussian_swaying.kernels.derive import on_tensors
+from gaussian_swaying.kernels.language import tl, triton
+from gaussian_swaying.mpm.dispatch import pk1
 from gaussian_swaying.mpm.state import MaterialPoints
 from gaussian_swaying.mpm.transfer import Stencil, bspline_weights
 
@@ -40,59 +55,94 @@ DIRECTOR = 0.01
 LEAST = 1e-6
 """Least area of a sheet over that at rest."""
 
+_DIRECTOR, _LEAST = tl.constexpr(DIRECTOR), tl.constexpr(LEAST)
 _AT_ONCE = 4096  # points or cells; a GPU has a limit
 _ROUNDS = 60  # of the power iteration
 
 
-@dataclass(frozen=True)
-class Flattened:
-    """Deformation gradients whose part across the sheet is that of plane stress.
-
-    Attributes:
-        F: Them, shape (..., 3, 3).
-        direction: Unit normal of the sheet now, shape (..., 3, 1); zero where there is no sheet.
-        area: Area now over that at rest, shape (..., 1, 1).
-        thickness: Thickness now over that at rest, shape (..., 1, 1).
-        thinning: Its derivative by the area, shape (..., 1, 1).
-    """
-
-    F: Tensor
-    direction: Tensor
-    area: Tensor
-    thickness: Tensor
-    thinning: Tensor
-
-
-def flattened(F: Tensor, normal: Tensor, mu: Tensor, lam: Tensor) -> Flattened:
-    r"""Deformation gradients in plane stress, :math:`\hat F = F (I - n n^T) + h\,m\,n^T`.
+@triton.jit
+def flattened(F, n, mu, lam):
+    r"""Deformation gradient in plane stress, :math:`\hat F = F (I - n n^T) + h\,m\,n^T`.
 
     The sheet has the unit normal m, along cof(F) n, and the area ratio a, its length. The thickness ratio h has no
     stress across the sheet for fixed corotated elasticity, :math:`h = (2 \mu + \lambda a) / (2 \mu + \lambda a^2)`, and
     to first order for other laws.
 
     Args:
-        F: Deformation gradients, shape (..., 3, 3).
-        normal: Unit normals at rest, zero where there is no sheet, shape (..., 3).
-        mu: Shear moduli [Pa], shape (...).
-        lam: First Lamé parameters [Pa], shape (...).
+        F: Deformation gradient.
+        n: Unit normal at rest, zero where there is no sheet.
+        mu: Shear modulus [Pa].
+        lam: First Lamé parameter [Pa].
+
+    Returns:
+        :math:`\hat F`, m, a, h and h'(a).
     """
-    n, mu, lam = normal[..., None], mu[..., None, None], lam.clamp(min=0)[..., None, None]
-    turned = cofactor(F) @ n
-    area = turned.square().sum(-2, keepdim=True).clamp(min=LEAST**2).sqrt()
-    below = 2 * mu + lam * area.square()
-    thickness = (2 * mu + lam * area) / below
-    thinning = lam * (1 - 2 * area * thickness) / below
-    direction = turned / area
-    return Flattened(F + (thickness * direction - F @ n) @ n.mT, direction, area, thickness, thinning)
+    turned = matvec(cofactor(F), n)
+    area = tl.sqrt(tl.maximum(dot3(turned, turned), _LEAST * _LEAST))
+    bulk = tl.maximum(lam, 0.0)
+    below = tl.maximum(2 * mu + bulk * area * area, 1e-30)  # a lane without a particle has no stiffness
+    thickness = (2 * mu + bulk * area) / below
+    thinning = bulk * (1 - 2 * area * thickness) / below
+    m = scale3(1 / area, turned)
+    across = axpy3(thickness, m, -1.0, matvec(F, n))
+    return axpy9(1.0, F, 1.0, outer3(across, n)), m, area, thickness, thinning
 
 
-def sheet_pk1(F: Tensor, normal: Tensor, mu: Tensor, lam: Tensor, pk1: Callable[[Tensor], Tensor]) -> Tensor:
-    r"""First Piola-Kirchhoff stress of :math:`\Psi(\hat F) + W(F)` [Pa], shape (..., 3, 3).
+@triton.jit
+def without_normal(a, n):
+    """A matrix A (I - n n^T)."""
+    return axpy9(1.0, a, -1.0, outer3(matvec(a, n), n))
+
+
+@triton.jit
+def sheet_stress(F, n, mu, P, flat, m, area, thickness, thinning):
+    r"""First Piola-Kirchhoff stress of :math:`\Psi(\hat F) + W(F)` [Pa].
 
     With :math:`P = \partial \Psi / \partial \hat F`, its normal part q = P n and the dual tangents
     :math:`G = \hat F^{-T}`, the chain rule through m and h gives
 
     .. math:: (P + h' a\,(q \cdot m)\,G)(I - n n^T) - h\,m\,(G^T q)^T (I - n n^T) .
+    """
+    q = matvec(P, n)
+    volume = tl.where(dot3(n, n) > 0, area * thickness, 1.0)
+    G = scale9(1 / volume, cofactor(flat))
+    dual = matvec(transpose(G), q)
+    P = axpy9(1.0, P, thinning * area * dot3(q, m), G)
+    P = without_normal(axpy9(1.0, P, -thickness, outer3(m, dual)), n)
+    out = matvec(F, n)
+    c = matvec(transpose(F), out)
+    along = dot3(n, c)
+    shear = add3(c, -along, n)
+    side = add3(matvec(F, shear), along - 1, out)
+    own = axpy9(1.0, outer3(out, shear), 1.0, outer3(side, n))
+    return axpy9(1.0, P, _DIRECTOR * mu, own)
+
+
+@triton.jit
+def sheet_pk1(F, n, mu, lam, row, LAWS: tl.constexpr):
+    """The stress of a sheet of a law, ``row`` as for ``dispatch.pk1``, and F in plane stress."""
+    flat, m, area, thickness, thinning = flattened(F, n, mu, lam)
+    P = pk1(flat, mu, lam, row, LAWS)
+    return sheet_stress(F, n, mu, P, flat, m, area, thickness, thinning), flat
+
+
+@triton.jit
+def _director_energy(F, n, mu):
+    out = matvec(F, n)
+    c = matvec(transpose(F), out)
+    along = dot3(n, c)
+    shear = add3(c, -along, n)
+    thick = along - dot3(n, n)
+    return _DIRECTOR * mu * (0.5 * dot3(shear, shear) + 0.25 * thick * thick)
+
+
+def in_plane_stress(F: Tensor, normal: Tensor, mu: Tensor, lam: Tensor) -> Tensor:
+    """Deformation gradients (..., 3, 3) in plane stress, see :func:`flattened`; normals (..., 3), moduli (...)."""
+    return matrix(on_tensors(flattened)(entries(F), normal.unbind(-1), mu, lam)[0])
+
+
+def stress_of_sheets(F: Tensor, normal: Tensor, mu: Tensor, lam: Tensor, pk1: Callable[[Tensor], Tensor]) -> Tensor:
+    """See :func:`sheet_stress`.
 
     Args:
         F: Deformation gradients, shape (..., 3, 3).
@@ -100,34 +150,22 @@ def sheet_pk1(F: Tensor, normal: Tensor, mu: Tensor, lam: Tensor, pk1: Callable[
         mu: Shear moduli [Pa], shape (...).
         lam: First Lamé parameters [Pa], shape (...).
         pk1: The stress of the law at a deformation gradient.
+
+    Returns:
+        Shape (..., 3, 3).
     """
-    flat, n = flattened(F, normal, mu, lam), normal[..., None]
-    P = pk1(flat.F)
-    q, across = P @ n, n @ n.mT
-    volume = torch.where(
-        across.diagonal(dim1=-2, dim2=-1).sum(-1)[..., None, None] > 0, flat.area * flat.thickness, 1.0
-    )
-    G = cofactor(flat.F) / volume
-    P = P + flat.thinning * flat.area * (q.mT @ flat.direction) * G - flat.thickness * flat.direction @ (G.mT @ q).mT
-    stress = P - P @ across
-    C = F.mT @ F
-    shear = C @ n - (n.mT @ C @ n) * n
-    out = F @ n
-    thick = n.mT @ C @ n - 1
-    own = out @ shear.mT + (F @ shear + thick * out) @ n.mT
-    return stress + (DIRECTOR * mu)[..., None, None] * own
+    own, n = entries(F), normal.unbind(-1)
+    flat, *parts = on_tensors(flattened)(own, n, mu, lam)
+    return matrix(on_tensors(sheet_stress)(own, n, mu, entries(pk1(matrix(flat))), flat, *parts))
 
 
 def director_energy(F: Tensor, normal: Tensor, mu: Tensor) -> Tensor:
-    """Energy density W of what F does across sheets [J/m³], shape (...); the arguments are those of :func:`sheet_pk1`.
+    """Energy density W of what F does across sheets [J/m³], shape (...); the arguments are those of a sheet's stress.
 
     It is :data:`DIRECTOR` times mu times half the square of the shear and a quarter of that of n C n - 1.
     """
-    C, n = F.mT @ F, normal[..., None]
-    along = n.mT @ C @ n
-    shear = C @ n - along * n
-    thick = along - n.mT @ n
-    return DIRECTOR * mu * (0.5 * shear.square().sum((-2, -1)) + 0.25 * thick.square().sum((-2, -1)))
+    found: Tensor = on_tensors(_director_energy)(entries(F), normal.unbind(-1), mu)
+    return found
 
 
 @dataclass(frozen=True)

@@ -14,7 +14,7 @@ from torch import Tensor
 from gaussian_swaying._arguments import checked
 from gaussian_swaying._checks import check_finite, check_shape
 from gaussian_swaying._fixed import fixed
-from gaussian_swaying.mpm.laws.fixed_corotated import FixedCorotated
+from gaussian_swaying.mpm.laws.elastic import FixedCorotated
 from gaussian_swaying.mpm.laws.law import ConstitutiveLaw
 
 if TYPE_CHECKING:
@@ -208,7 +208,7 @@ class MaterialPoints:
             ValueError: If a value lies outside its physical range.
 
         Example:
-            >>> from gaussian_swaying.mpm.laws.sand import Sand
+            >>> from gaussian_swaying.mpm.laws.plastic import Sand
             >>> sand = MaterialPoints.create(torch.rand(10, 3), volume=1e-6, density=1600.0, youngs_modulus=1e6,
             ...                              poisson_ratio=0.3, law=Sand(friction_angle=30.0))
         """

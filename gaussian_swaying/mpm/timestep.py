@@ -11,10 +11,10 @@ import math
 import torch
 from torch import Tensor
 
-from gaussian_swaying.geometry.linalg import symmetric_eigenvalues
+from gaussian_swaying.geometry.linalg import largest_eigenvalue
 from gaussian_swaying.kernels.graphs import Repeater
 from gaussian_swaying.mpm.dispatch import LawDispatch
-from gaussian_swaying.mpm.laws.shared import lame_parameters
+from gaussian_swaying.mpm.laws.law import lame_parameters
 from gaussian_swaying.mpm.state import MaterialPoints, MPMState
 
 MAX_CFL = 2.0
@@ -53,7 +53,7 @@ def wave_speed(
         return ((lam + 2 * mu) / density).sqrt()
     squared = (laws or LawDispatch(points)).moduli(F, internal)[0] / density
     if spatial:
-        squared = squared * symmetric_eigenvalues(F.mT @ F)[..., 0].clamp(min=1.0)
+        squared = squared * largest_eigenvalue(F.mT @ F).clamp(min=1.0)
     return squared.sqrt()
 
 

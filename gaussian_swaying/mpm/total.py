@@ -24,7 +24,7 @@ from gaussian_swaying.mpm.held_faces import HELD_ALONE, SHEET, SOFTENED, thickne
 from gaussian_swaying.mpm.held_rows import LEAST_APART
 from gaussian_swaying.mpm.pins import PinnedPoints
 from gaussian_swaying.mpm.point_holds import POINTS, PointHolds
-from gaussian_swaying.mpm.sheets import bending_of, director_energy, flattened, sheet_pk1
+from gaussian_swaying.mpm.sheets import bending_of, director_energy, in_plane_stress, stress_of_sheets
 from gaussian_swaying.mpm.state import GridSpec, MaterialPoints, MPMState
 from gaussian_swaying.mpm.timestep import kick_time
 from gaussian_swaying.mpm.transfer import bspline_stencil, gather, scatter
@@ -345,8 +345,8 @@ class Total(Formulation):
         if self.bending is None:
             stress = laws.pk1(F, None)
         else:
-            stress = sheet_pk1(F, self.normal, laws.mu, laws.lam, partial(laws.pk1, internal=None))
-            F, rate = flattened(F, self.normal, laws.mu, laws.lam).F, self._along(rate)
+            stress = stress_of_sheets(F, self.normal, laws.mu, laws.lam, partial(laws.pk1, internal=None))
+            F, rate = in_plane_stress(F, self.normal, laws.mu, laws.lam), self._along(rate)
         if time > 0:
             viscous = kelvin_voigt_pk1(F, rate, laws.mu, laws.lam, time)
             stress = stress + (viscous if self.bending is None else self._along(viscous))
@@ -383,7 +383,7 @@ class Total(Formulation):
         Particles at the border of a part have a small share of nodes that are not of it.
         """
         if self.bending is not None:
-            flat = flattened(state.F_elastic, self.normal, self.laws.mu, self.laws.lam).F
+            flat = in_plane_stress(state.F_elastic, self.normal, self.laws.mu, self.laws.lam)
             state = state.replace(F_elastic=flat, F_total=flat)
         for body in self.rigid_bodies:
             state = body.in_shape(state, self.points.position)

@@ -12,8 +12,6 @@ for which the function is compiled; the last of them is the twin's parts, a :cla
 - Boundary: a solid. ``(place, numbers, table, mask, OPTIONS)`` returns the signed distance from it, at rest, and its
   normal at places from its centre; ``mask`` is for loads. Motion, gap, friction and time window are those of every
   ``Obstacle`` or ``Plane``.
-- Law: several functions, see :class:`~gaussian_swaying.mpm.laws.triton.functions.LawFunctions`; they get ``numbers`` as
-  four scalars, padded with zeros.
 """
 
 from __future__ import annotations

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 
-from gaussian_swaying.geometry.linalg_triton import load3, load9
+from gaussian_swaying.geometry.linalg_triton import clamp, dot3, load3, load9
 from gaussian_swaying.kernels.language import tl, triton
 from gaussian_swaying.rendering.protocol import MAX_ALPHA, MIN_ALPHA, MIN_TRANSMITTANCE, SLACK
 from gaussian_swaying.rendering.thinning import FEWEST, GOLDEN
@@ -31,11 +31,6 @@ _LOOK = tl.constexpr(32)  # Gaussians between two looks whether a tile is full
 
 
 @triton.jit
-def _times(a, b):
-    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
-
-
-@triton.jit
 def _doubles(values):
     found = ()
     for k in tl.static_range(len(values)):
@@ -49,11 +44,6 @@ def _times_each(values, factor):
     for k in tl.static_range(len(values)):
         found = found + (values[k] * factor,)
     return found
-
-
-@triton.jit
-def _clamp(x, low, high):
-    return tl.minimum(tl.maximum(x, low), high)
 
 
 @triton.jit
@@ -96,7 +86,7 @@ def project(
     ahead = (tl.load(camera + 8) + zero, tl.load(camera + 9) + zero, tl.load(camera + 10) + zero)
     fx, cx = tl.load(camera + 16), tl.load(camera + 18)
     fy, cy = tl.load(camera + 20), tl.load(camera + 21)
-    z = _times(ahead, x) + tl.load(camera + 11)
+    z = dot3(ahead, x) + tl.load(camera + 11)
     keep = mask & (size < _INFINITE) & (z >= tl.load(camera + 25)) & (opacity >= _MIN)
     depth = tl.where(keep, z, 1.0)
     # thinned: some of those smaller than the detail stand for all
@@ -107,7 +97,7 @@ def project(
         square += C[k] * C[k]
     focal = tl.maximum(fx, fy) / depth
     size2 = tl.sqrt(tl.where(keep, square, 0.0)) * focal * focal
-    share = tl.where(detail2 + zero > 0, _clamp(size2 / tl.maximum(detail2 + zero, 1e-30), _FEWEST, 1.0), 1.0)
+    share = tl.where(detail2 + zero > 0, clamp(size2 / tl.maximum(detail2 + zero, 1e-30), _FEWEST, 1.0), 1.0)
     turns = index.to(tl.float64) * _GOLDEN
     keep = keep & ((turns - tl.floor(turns) < share) | (share >= 1))
     grown = (blur + size2 / share + 1e-30) / (blur + size2 + 1e-30)
@@ -115,11 +105,11 @@ def project(
     covered = 1 - tl.exp(power * tl.log(tl.maximum(1 - tl.where(keep, opacity, 0.0), 1e-7)))
     opacity = tl.where(share < 1, covered, opacity)
     C = _times_each(C, 1 / share)
-    x_ratio = (_times(right, x) + tl.load(camera + 3)) / depth
-    y_ratio = (_times(down, x) + tl.load(camera + 7)) / depth
+    x_ratio = (dot3(right, x) + tl.load(camera + 3)) / depth
+    y_ratio = (dot3(down, x) + tl.load(camera + 7)) / depth
     wide_x, wide_y = width.to(tl.float64), height.to(tl.float64)
-    x_hat = _clamp(x_ratio, (-cx - 0.15 * wide_x) / fx, (1.15 * wide_x - cx) / fx)
-    y_hat = _clamp(y_ratio, (-cy - 0.15 * wide_y) / fy, (1.15 * wide_y - cy) / fy)
+    x_hat = clamp(x_ratio, (-cx - 0.15 * wide_x) / fx, (1.15 * wide_x - cx) / fx)
+    y_hat = clamp(y_ratio, (-cy - 0.15 * wide_y) / fy, (1.15 * wide_y - cy) / fy)
     across = fx / depth
     along = fy / depth
     row_x = (
@@ -132,11 +122,11 @@ def project(
         along * (down[1] - y_hat * ahead[1]),
         along * (down[2] - y_hat * ahead[2]),
     )
-    sigma_x = (_times((C[0], C[1], C[2]), row_x), _times((C[3], C[4], C[5]), row_x), _times((C[6], C[7], C[8]), row_x))
-    sigma_y = (_times((C[0], C[1], C[2]), row_y), _times((C[3], C[4], C[5]), row_y), _times((C[6], C[7], C[8]), row_y))
-    xx = _times(row_x, sigma_x) + tl.load(camera + 26)
-    xy = _times(row_x, sigma_y)
-    yy = _times(row_y, sigma_y) + tl.load(camera + 26)
+    sigma_x = (dot3((C[0], C[1], C[2]), row_x), dot3((C[3], C[4], C[5]), row_x), dot3((C[6], C[7], C[8]), row_x))
+    sigma_y = (dot3((C[0], C[1], C[2]), row_y), dot3((C[3], C[4], C[5]), row_y), dot3((C[6], C[7], C[8]), row_y))
+    xx = dot3(row_x, sigma_x) + tl.load(camera + 26)
+    xy = dot3(row_x, sigma_y)
+    yy = dot3(row_y, sigma_y) + tl.load(camera + 26)
     determinant = xx * yy - xy * xy
     keep = keep & (determinant > 0) & (determinant < _INFINITE) & (yy > 0)
     mean_x = fx * x_ratio + cx
@@ -145,10 +135,10 @@ def project(
     reach = 2 * tl.maximum(peak - _LOG_MIN, 0.0).to(tl.float64)
     half_x = tl.sqrt(tl.where(keep, reach * xx, 0.0)) + _SLACK
     half_y = tl.sqrt(tl.where(keep, reach * yy, 0.0)) + _SLACK
-    left = _clamp(-tl.floor(half_x - mean_x + 0.5), 0.0, wide_x)
-    last_x = _clamp(tl.floor(mean_x - 0.5 + half_x), -1.0, wide_x - 1)
-    top = _clamp(-tl.floor(half_y - mean_y + 0.5), 0.0, wide_y)
-    last_y = _clamp(tl.floor(mean_y - 0.5 + half_y), -1.0, wide_y - 1)
+    left = clamp(-tl.floor(half_x - mean_x + 0.5), 0.0, wide_x)
+    last_x = clamp(tl.floor(mean_x - 0.5 + half_x), -1.0, wide_x - 1)
+    top = clamp(-tl.floor(half_y - mean_y + 0.5), 0.0, wide_y)
+    last_y = clamp(tl.floor(mean_y - 0.5 + half_y), -1.0, wide_y - 1)
     keep = keep & (left <= last_x) & (top <= last_y)
     tl.store(depths + index, tl.where(keep, z, _INFINITE), mask)
     box = boxes + 4 * index

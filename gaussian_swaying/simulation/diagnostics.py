@@ -13,7 +13,7 @@ from torch import Tensor
 
 from gaussian_swaying._devices import in_double
 from gaussian_swaying._fixed import fixed
-from gaussian_swaying.geometry.linalg import determinant, matmul3, symmetric_eigenvalues
+from gaussian_swaying.geometry.linalg import determinant, svd3
 from gaussian_swaying.geometry.neighbours import nearest_neighbours
 from gaussian_swaying.kernels.graphs import RECORDED, Replayed
 from gaussian_swaying.mpm.protocol import Solver
@@ -282,7 +282,7 @@ def measure(
         work = work + (lifted - lift.potential(start)).to(work.device)
     J = determinant(state.F_total)
     F = in_double(state.F_total)
-    squares = symmetric_eigenvalues(matmul3(F.mT, F))
+    squares = svd3(F)[1].square()
     columns = {
         **energies,
         "wind_work": work,

@@ -18,7 +18,7 @@ from gaussian_swaying.geometry.frame import SimFrame
 from gaussian_swaying.geometry.groups import equal_rows, sums
 from gaussian_swaying.geometry.regions import Region, whereabouts
 from gaussian_swaying.mpm.damping import decay_rate
-from gaussian_swaying.mpm.laws.fixed_corotated import FixedCorotated
+from gaussian_swaying.mpm.laws.elastic import FixedCorotated
 from gaussian_swaying.mpm.laws.law import ConstitutiveLaw
 from gaussian_swaying.mpm.state import MaterialPoints
 from gaussian_swaying.simulation.material import PLATE, Material, layer_distance, plate_stiffness

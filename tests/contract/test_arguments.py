@@ -39,7 +39,7 @@ from gaussian_swaying import (
     WindForce,
 )
 from gaussian_swaying.gaussians.parts import Part, Parts
-from gaussian_swaying.mpm.laws.sand import Sand
+from gaussian_swaying.mpm.laws.plastic import Sand
 from gaussian_swaying.scenes.procedural import FlagScene
 from gaussian_swaying.simulation.material import MaterialRegion
 from gaussian_swaying.wind.carried import Turbulence

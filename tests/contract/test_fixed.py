@@ -37,7 +37,7 @@ from gaussian_swaying import (
 from gaussian_swaying._fixed import fields_of
 from gaussian_swaying.gaussians.filling import InteriorFilling
 from gaussian_swaying.gaussians.parts import Part, Parts
-from gaussian_swaying.mpm.laws.sand import Sand
+from gaussian_swaying.mpm.laws.plastic import Sand
 from gaussian_swaying.mpm.pins import Impulse
 from gaussian_swaying.scenes.procedural import FlagScene
 from gaussian_swaying.simulation.material import MaterialRegion

@@ -7,9 +7,8 @@ import torch
 from gaussian_swaying import Box, Copy, Edit, Material, PinnedRegion, Recorder, Simulation, WindField
 from gaussian_swaying.gaussians.filling import InteriorFilling
 from gaussian_swaying.gaussians.parts import Part, Parts
-from gaussian_swaying.mpm.laws.neo_hookean import NeoHookean
-from gaussian_swaying.mpm.laws.sand import Sand
-from gaussian_swaying.mpm.laws.snow import Snow
+from gaussian_swaying.mpm.laws.elastic import NeoHookean
+from gaussian_swaying.mpm.laws.plastic import Sand, Snow
 from gaussian_swaying.mpm.solver import MPMSolver
 from gaussian_swaying.scenes import FlagScene, GivenScene, SolidScene
 from gaussian_swaying.simulation.scene import Scene

@@ -14,11 +14,10 @@ from gaussian_swaying.geometry import linalg
 from gaussian_swaying.geometry.linalg_triton import polar_rotation, svd3
 from gaussian_swaying.kernels.language import tl, triton
 from gaussian_swaying.kernels.launch import lanes, launch
+from gaussian_swaying.mpm.dispatch import BodyLaws, in_common, kirchhoff, pk1
 from gaussian_swaying.mpm.laws import LAWS as KINDS
-from gaussian_swaying.mpm.laws.neo_hookean import NeoHookean
-from gaussian_swaying.mpm.laws.triton.body import BodyLaws, kirchhoff, pk1
-from gaussian_swaying.mpm.laws.triton.functions import LawFunctions, functions_of, shared
-from gaussian_swaying.mpm.twins import Numbers, Twin
+from gaussian_swaying.mpm.laws.elastic import NeoHookean
+from gaussian_swaying.mpm.laws.law import ConstitutiveLaw, DeviceLaw
 
 MU, LAM, DT = 4e3, 6e3, 1e-3
 
@@ -214,8 +213,8 @@ def test_flow_and_stress(kernel_device, name):
     assert float((F_out - F).abs().max()) > 1e-2
 
 
-ENERGIES = [ELASTIC[name] for name in ("corotated", "springs", "hencky")]
-HENCKY = type(ENERGIES[2])
+ENERGIES = list(ELASTIC.values())
+HENCKY = KINDS["StVKHencky"]
 LAME = {"equal": (4e3, 4e3), "mu": (6e3, 2e3), "lambda": (2e3, 8e3), "auxetic": (5e3, -1e3), "steel": (8e10, 1.2e11)}
 
 
@@ -234,12 +233,12 @@ def _strained(device):
     return _turned(stretch, generator, device)
 
 
-CASES = [(law, ratio) for law in ENERGIES for ratio in LAME if (law, ratio) != (ENERGIES[0], "auxetic")]
+CASES = [(law, ratio) for law in ENERGIES for ratio in LAME if law.least_nu < 0 or ratio != "auxetic"]
 
 
 def _wave_and_energy(law, F, mu, lam):
-    found, functions = F.new_empty(2, len(F)), functions_of(law)
-    _launch(_scalars, len(F), F, *found, mu, lam, WAVE=functions.wave, ENERGY=functions.energy)
+    found = F.new_empty(2, len(F))
+    _launch(_scalars, len(F), F, *found, mu, lam, WAVE=in_common([law], "wave"), ENERGY=in_common([law], "energy"))
     return found
 
 
@@ -267,7 +266,8 @@ def test_wave_modulus_and_energy(kernel_device, law, ratio):
         assert int((expected > 1.01 * (2 * mu + lam)).sum()) > 500
     exact = law.energy(wide, *parameters)
     slope = (exact * expected).sqrt()
-    error = (energy - exact).abs() / (exact + slope + 1e-6 * expected)
+    least = 0.3 if isinstance(law, NeoHookean) else 1e-6  # at small strain it is the difference of numbers near one
+    error = (energy - exact).abs() / (exact + slope + least * expected)
     assert bool((error <= 3e-6).all()), f"{float(error.max()):.1e}"
 
 
@@ -282,27 +282,22 @@ def test_what_is_not_finite_has_no_modulus(kernel_device, law):
 
 def test_which_energy_holds_for_a_body():
     """One kernel per energy: all laws based on Hencky's share it, with any plastic flow."""
-    snow, fluid = PLASTIC["snow"], PLASTIC["fluid"]
+    snow = PLASTIC["snow"]
+    on_hencky = [KINDS["StVKHencky"](), *(law for name, law in FLOWING.items() if name not in ("snow", "fluid"))]
     for name in ("energy", "wave"):
-        corotated, network, hencky = (shared([law], name) for law in ENERGIES)
-        assert None is not corotated is not network is not hencky is not corotated
-        on_hencky = [law for law in (ELASTIC | FLOWING).values() if isinstance(law, HENCKY)]
-        assert {type(law).__name__ for law in on_hencky} == {"StVKHencky", "Sand", "Metal", "Plasticine", "Foam"}
-        assert shared(on_hencky, name) is hencky
-        assert shared([type(ENERGIES[1])() for _ in range(2)], name) is network
-        others = [ENERGIES[:2], ENERGIES[1:], [snow], [fluid], [ELASTIC["neo-hookean"]]]
-        for body in [*others, [OwnLaw()], [OwnLaw(), ENERGIES[0]]]:
-            assert shared(body, name) is None
+        found = [in_common([law], name) for law in ENERGIES]
+        assert None not in found
+        assert len(set(found)) == len(ENERGIES)
+        assert in_common(on_hencky, name) is in_common(on_hencky[:1], name)
+        for body in [ENERGIES[:2], [snow], [PLASTIC["fluid"]], [OwnLaw()], [OwnLaw(), ENERGIES[0]]]:
+            assert in_common(body, name) is None
 
 
 class OwnLaw(NeoHookean):
-    """It may have another stress than the law that it is derived from."""
+    """It has another stress than the law that it is derived from."""
 
-
-def test_laws_of_the_package_have_twins_and_others_have_none():
-    for law in (ELASTIC | FLOWING).values():
-        assert (functions_of(law).flow is not None) == law.plastic
-    assert functions_of(OwnLaw()) is None
+    def pk1(self, F, mu, lam, internal=None):
+        return 2 * super().pk1(F, mu, lam, internal)
 
 
 def test_what_a_body_asks_of_a_kernel():
@@ -326,18 +321,16 @@ def test_what_a_body_asks_of_a_kernel():
     assert repr(BodyLaws([KINDS["Fluid"](3.0)])) == repr(body("fluid"))
 
 
-def test_a_twin_needs_a_stress():
+def test_a_law_is_whole():
     function = object()
-    for given in ({}, {"flow": function}, {"kirchhoff": function}, {"pk1": function}):
-        with pytest.raises(ValueError, match="give `principal`, or `kirchhoff` and"):
-            LawFunctions(**given)
-    LawFunctions(kirchhoff=function, flow=function)
+    for given in ({}, {"flow": function}, {"strain_energy": function}, {"moduli": function}):
+        with pytest.raises(ValueError, match="have `energy`, or `strain_energy` and `moduli`"):
+            DeviceLaw(**given)
 
-
-def test_a_table_row_has_room_for_four_numbers():
     class Many(KINDS["Sand"]):
-        def twin(self):
-            return Twin(functions_of(PLASTIC["sand"]), numbers=Numbers(5, lambda: (1.0, 2.0, 3.0, 4.0, 5.0)))
+        numbers = (1.0, 2.0, 3.0, 4.0, 5.0)
 
     with pytest.raises(ValueError, match="at most four `numbers` of Many, but got 5"):
         BodyLaws([Many()])
+    with pytest.raises(NotImplementedError, match="Bare needs `device`, or energy, pk1 and moduli"):
+        type("Bare", (ConstitutiveLaw,), {})().energy(*torch.ones(3, 1, 3, 3))

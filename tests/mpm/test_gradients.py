@@ -7,8 +7,7 @@ from torch.testing import assert_close
 
 from gaussian_swaying import Box, MPMSolver, PinnedRegion, aero_force
 from gaussian_swaying.geometry.patches import deform_patch
-from gaussian_swaying.mpm.laws.fixed_corotated import FixedCorotated
-from gaussian_swaying.mpm.laws.neo_hookean import NeoHookean
+from gaussian_swaying.mpm.laws.elastic import FixedCorotated, NeoHookean
 from gaussian_swaying.mpm.transfer import bspline_stencil, scatter
 
 STEPS, DT, DX, COUNT = 5, 8e-3, 0.15, 15

@@ -10,9 +10,7 @@ from torch.testing import assert_close
 
 from gaussian_swaying import Box, MPMSolver, PinnedRegion
 from gaussian_swaying.mpm import modal
-from gaussian_swaying.mpm.laws.fixed_corotated import FixedCorotated
-from gaussian_swaying.mpm.laws.hencky import StVKHencky
-from gaussian_swaying.mpm.laws.neo_hookean import NeoHookean
+from gaussian_swaying.mpm.laws.elastic import FixedCorotated, NeoHookean, StVKHencky
 from gaussian_swaying.mpm.modal import LOOSE, Structure, analysis_of
 from gaussian_swaying.mpm.pins import RigidRegion
 

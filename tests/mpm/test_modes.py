@@ -21,7 +21,7 @@ from gaussian_swaying import (
 from gaussian_swaying.geometry.rotations import rotation_of
 from gaussian_swaying.mpm import modal
 from gaussian_swaying.mpm.damping import decay_rate
-from gaussian_swaying.mpm.laws.sand import Sand
+from gaussian_swaying.mpm.laws.plastic import Sand
 from gaussian_swaying.mpm.modes import LONGEST, SHORTEST, Modes, warped
 
 FOOT = Box([None] * 3, [None, None, 0.1])

@@ -17,7 +17,7 @@ from bench.problems.vortex import body_force, placement
 from bench.problems.wrinkles import wavelength
 from torch.func import jacrev, vmap
 
-from gaussian_swaying.mpm.laws.fixed_corotated import fixed_corotated_pk1
+from gaussian_swaying.mpm.laws.elastic import fixed_corotated_pk1
 
 pytestmark = pytest.mark.slow
 

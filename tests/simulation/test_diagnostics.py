@@ -9,8 +9,8 @@ from shared import waits
 
 from gaussian_swaying.geometry.regions import Box
 from gaussian_swaying.mpm.colliders import Plane
-from gaussian_swaying.mpm.laws.fixed_corotated import FixedCorotated
-from gaussian_swaying.mpm.laws.sand import Sand
+from gaussian_swaying.mpm.laws.elastic import FixedCorotated
+from gaussian_swaying.mpm.laws.plastic import Sand
 from gaussian_swaying.mpm.pins import PinnedRegion
 from gaussian_swaying.mpm.solver import MPMSolver
 from gaussian_swaying.mpm.state import MaterialPoints

@@ -8,11 +8,8 @@ import torch
 
 from gaussian_swaying.gaussians.harmonics import SH_DC
 from gaussian_swaying.geometry.regions import Box
-from gaussian_swaying.mpm.laws.fixed_corotated import FixedCorotated
-from gaussian_swaying.mpm.laws.foam import Foam
-from gaussian_swaying.mpm.laws.neo_hookean import NeoHookean
-from gaussian_swaying.mpm.laws.plasticine import Plasticine
-from gaussian_swaying.mpm.laws.sand import Sand
+from gaussian_swaying.mpm.laws.elastic import FixedCorotated, NeoHookean
+from gaussian_swaying.mpm.laws.plastic import Foam, Plasticine, Sand
 from gaussian_swaying.mpm.state import MaterialPoints
 from gaussian_swaying.recording.recorder import Recorder
 from gaussian_swaying.simulation.edits import Edit, edited_points, recolored

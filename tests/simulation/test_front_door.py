@@ -32,7 +32,7 @@ from gaussian_swaying import (
 from gaussian_swaying.config.parser import CUSTOM, PYTHON_ONLY, arguments_of
 from gaussian_swaying.gaussians.parts import Part, Parts
 from gaussian_swaying.mpm.colliders import HalfSpaceObstacle
-from gaussian_swaying.mpm.laws.sand import Sand
+from gaussian_swaying.mpm.laws.plastic import Sand
 from gaussian_swaying.mpm.pins import Impulse
 from gaussian_swaying.scenes import FlagScene
 from gaussian_swaying.simulation.normalisation import Normalisation

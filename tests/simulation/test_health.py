@@ -5,7 +5,7 @@ import json
 import pytest
 import torch
 
-from gaussian_swaying.mpm.laws.sand import Sand
+from gaussian_swaying.mpm.laws.plastic import Sand
 from gaussian_swaying.recording.recorder import Recorder
 from gaussian_swaying.simulation.health import advice, extremes
 from gaussian_swaying.simulation.material import Material

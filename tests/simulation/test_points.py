@@ -12,7 +12,7 @@ from gaussian_swaying.gaussians.filling import InteriorFilling
 from gaussian_swaying.geometry.patches import deform_all, deform_patch
 from gaussian_swaying.geometry.regions import Box
 from gaussian_swaying.kernels.language import INTERPRETED
-from gaussian_swaying.mpm.laws.neo_hookean import NeoHookean
+from gaussian_swaying.mpm.laws.elastic import NeoHookean
 from gaussian_swaying.mpm.solver import MPMSolver
 from gaussian_swaying.scenes.leaves import LeavesScene
 from gaussian_swaying.scenes.procedural import FlagScene, GivenScene

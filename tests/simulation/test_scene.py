@@ -12,10 +12,8 @@ from gaussian_swaying.gaussians.filling import InteriorFilling
 from gaussian_swaying.geometry.linalg import polar_rotation
 from gaussian_swaying.geometry.regions import Box
 from gaussian_swaying.geometry.rotations import quat_to_rotation, rotation_from_z, rotation_to_quat
-from gaussian_swaying.mpm.laws.fixed_corotated import FixedCorotated
-from gaussian_swaying.mpm.laws.hencky import StVKHencky
-from gaussian_swaying.mpm.laws.neo_hookean import NeoHookean
-from gaussian_swaying.mpm.laws.sand import Sand
+from gaussian_swaying.mpm.laws.elastic import FixedCorotated, NeoHookean, StVKHencky
+from gaussian_swaying.mpm.laws.plastic import Sand
 from gaussian_swaying.mpm.pins import PinnedRegion
 from gaussian_swaying.mpm.solver import MPMSolver
 from gaussian_swaying.scenes.procedural import FlagScene

@@ -48,7 +48,7 @@ from bench.problems.granular.deposit import lube
 from bench.problems.granular.layers import angle_of_repose, inclined_layer, tossed_layer
 from bench.problems.settings import Settings
 from bench.runner import Row, study
-from gaussian_swaying.mpm.laws.sand import Sand
+from gaussian_swaying.mpm.laws.plastic import Sand
 
 VARIANTS = {
     "total": Settings(),

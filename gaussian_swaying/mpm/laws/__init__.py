@@ -1,7 +1,7 @@
-"""Constitutive laws, one file each.
+"""Constitutive laws.
 
 Every file in this folder is imported automatically, so a law can be used by its name (``class_path: Sand``) as soon as
-its file is here. ``LAWS`` lists the classes by name.
+it is in one of them. ``LAWS`` lists the classes by name.
 """
 
 from __future__ import annotations
@@ -9,5 +9,7 @@ from __future__ import annotations
 from gaussian_swaying._folders import classes_of
 from gaussian_swaying.mpm.laws.law import ConstitutiveLaw
 
-LAWS: dict[str, type[ConstitutiveLaw]] = classes_of(__name__, __path__, ConstitutiveLaw)
+LAWS: dict[str, type[ConstitutiveLaw]] = {
+    name: law for name, law in classes_of(__name__, __path__, ConstitutiveLaw).items() if law.device is not None
+}
 """The laws of this package by name."""

@@ -10,11 +10,14 @@ each in four columns of eight. Rows of ``history``: displacement and velocity at
 """
 
 from gaussian_swaying.geometry.linalg_triton import add3, axpy9, dot3, scale3, scale9, store3
+from gaussian_swaying.kernels.derive import vjp
 from gaussian_swaying.kernels.language import tl, triton
-from gaussian_swaying.mpm.laws.triton.body import pk1_adjoint
-from gaussian_swaying.mpm.triton.damping import kelvin_voigt_adjoint
+from gaussian_swaying.mpm.damping import kelvin_voigt
+from gaussian_swaying.mpm.dispatch import pk1_adjoint
 from gaussian_swaying.mpm.triton.shared import VARIES, axis_weights, node_weight, sums, twin_data, vector
 from gaussian_swaying.mpm.triton.total_kernels import cells_of, gather, law_row, load_particles, motion
+
+kelvin_voigt_adjoint = vjp(kelvin_voigt, {"F": 9, "rate": 9, "mu": 0, "lam": 0, "time": 0}, ("F", "rate", "mu", "lam"))
 
 
 @triton.jit(do_not_specialize=VARIES)
@@ -77,7 +80,7 @@ def particles_adjoint(
         row = law_row(law, law_table, index, mask, MULTI)
         by_F, by_mu, by_lam = pk1_adjoint(F, Q, mu, lam, row, LAWS)
         if VISCOUS:
-            more, by_rate, one, two = kelvin_voigt_adjoint(F, rate, Q, mu, lam, viscous_time)
+            more, by_rate, one, two = kelvin_voigt_adjoint(F, rate, mu, lam, viscous_time, Q)
             by_F = axpy9(1.0, by_F, 1.0, more)
             by_mu += one
             by_lam += two

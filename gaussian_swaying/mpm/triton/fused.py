@@ -19,10 +19,9 @@ from torch import Tensor
 from gaussian_swaying.kernels.graphs import Repeater, fingerprint
 from gaussian_swaying.kernels.language import INTERPRETED
 from gaussian_swaying.kernels.launch import call, compiles, lanes, launch
+from gaussian_swaying.mpm.dispatch import BodyLaws, in_common
 from gaussian_swaying.mpm.forces import MOST_STEPS, Force, added, divide, split, tensors_of
 from gaussian_swaying.mpm.formulation import Formulation
-from gaussian_swaying.mpm.laws.triton.body import BodyLaws
-from gaussian_swaying.mpm.laws.triton.functions import shared
 from gaussian_swaying.mpm.state import MPMState
 from gaussian_swaying.mpm.timestep import kick_time
 from gaussian_swaying.mpm.triton import shared as kernels
@@ -86,7 +85,7 @@ class Fused(ABC):
         """The forces of the current rollout that the kernels compute."""
         self.load = torch.zeros(8, self.count, **self.like)
         self.force_in = torch.zeros(0, 4, **self.like)
-        self.wave = shared(points.laws, "wave")
+        self.wave = in_common(points.laws, "wave")
         self.watches = self.wave is not None
         """True if rollouts can measure the wave speed."""
         self.speed = torch.zeros(1, **self.like)
@@ -118,8 +117,8 @@ class Fused(ABC):
         if bound.settings.deterministic and device == "cuda" and not cls.fixed_order:
             return f"its sums have no fixed order in the {bound.name} formulation, but `deterministic` is set"
         for law in points.laws:
-            if law.twin() is None:
-                return f"the law {type(law).__name__} has no Triton twin"
+            if law.device is None:
+                return f"the law {type(law).__name__} has no device functions"
         return None
 
     def why_no_gradient(self, state: MPMState, forces: Sequence[Force]) -> str | None:
@@ -250,7 +249,7 @@ class Fused(ABC):
 
     def energy(self, F: Tensor) -> Tensor | None:
         """Energy density [J/m³], shape (..., P); None for laws without a common energy."""
-        energy = shared(self.bound.points.laws, "energy")
+        energy = in_common(self.bound.points.laws, "energy")
         if energy is None:
             return None
         out, block, laws = F.new_empty(F.shape[:-2]), lanes(self.device, 128), self.bound.laws

@@ -11,8 +11,9 @@ columns, or eight if boundaries need positions.
 
 from gaussian_swaying.geometry.linalg_triton import add3, axpy9, columns9, load3, scale3, scale9, store3, where3
 from gaussian_swaying.kernels.language import tl, triton
-from gaussian_swaying.mpm.laws.triton.body import ROW, pk1
-from gaussian_swaying.mpm.triton.damping import kelvin_voigt_pk1
+from gaussian_swaying.mpm.damping import kelvin_voigt
+from gaussian_swaying.mpm.dispatch import ROW, pk1
+from gaussian_swaying.mpm.sheets import flattened, sheet_pk1, without_normal
 from gaussian_swaying.mpm.triton.shared import (
     VARIES,
     account,
@@ -26,7 +27,6 @@ from gaussian_swaying.mpm.triton.shared import (
     vector,
     wave_speed,
 )
-from gaussian_swaying.mpm.triton.sheets import flattened, sheet_pk1, without_normal
 
 
 @triton.jit
@@ -167,12 +167,12 @@ def total_particles(
             n = load3(normals, count, index, mask)
             stress, F = sheet_pk1(F, n, mu, lam, row, LAWS)
             if VISCOUS:
-                viscous = kelvin_voigt_pk1(F, without_normal(rate, n), mu, lam, viscous_time)
+                viscous = kelvin_voigt(F, without_normal(rate, n), mu, lam, viscous_time)
                 stress = axpy9(1.0, stress, 1.0, without_normal(viscous, n))
         else:
             stress = pk1(F, mu, lam, row, LAWS)
             if VISCOUS:
-                stress = axpy9(1.0, stress, 1.0, kelvin_voigt_pk1(F, rate, mu, lam, viscous_time))
+                stress = axpy9(1.0, stress, 1.0, kelvin_voigt(F, rate, mu, lam, viscous_time))
         stress = scale9(-volume, stress)
         zero = volume * 0
         value = (zero, zero, zero)

@@ -22,10 +22,10 @@ from gaussian_swaying.geometry.linalg_triton import (
     transpose,
 )
 from gaussian_swaying.kernels.language import tl, triton
-from gaussian_swaying.mpm.laws.triton.body import ROW, kirchhoff
+from gaussian_swaying.mpm.damping import kelvin_voigt
+from gaussian_swaying.mpm.dispatch import ROW, kirchhoff
 from gaussian_swaying.mpm.touch import POSE, acts, stop_nodes
 from gaussian_swaying.mpm.touch import ROW as SOLID_ROW
-from gaussian_swaying.mpm.triton.damping import kelvin_voigt_pk1
 from gaussian_swaying.mpm.triton.shared import (
     VARIES,
     account,
@@ -205,7 +205,7 @@ def updated_particles(
         mass = tl.load(moving + 26 * count + index, mask, 0.0)
         volume = tl.load(moving + 27 * count + index, mask, 0.0)
         if VISCOUS:
-            viscous = kelvin_voigt_pk1(F, matmul(C, F), mu, lam, viscous_time)
+            viscous = kelvin_voigt(F, matmul(C, F), mu, lam, viscous_time)
             stress = axpy9(1.0, stress, 1.0, matmul(viscous, transpose(F)))
         first, fx, fy, fz, inside = _stencil(x, mask, scene, ox, oy, oz, nx, ny, nz, dx)
         node = tl.where(inside, first, -1)

@@ -23,10 +23,7 @@ from gaussian_swaying.mpm.colliders import (
     Obstacle,
     Plane,
 )
-from gaussian_swaying.mpm.laws.fixed_corotated import FixedCorotated
-from gaussian_swaying.mpm.laws.hencky import StVKHencky
-from gaussian_swaying.mpm.laws.neo_hookean import NeoHookean
-from gaussian_swaying.mpm.laws.spring_network import SpringNetwork
+from gaussian_swaying.mpm.laws.elastic import FixedCorotated, NeoHookean, SpringNetwork, StVKHencky
 from gaussian_swaying.mpm.modes import Modes
 from gaussian_swaying.mpm.pins import PinnedPoints, PinnedRegion
 from gaussian_swaying.mpm.solver import MPMSolver

@@ -20,12 +20,8 @@ from gaussian_swaying.interop.physgaussian.camera import PhysGaussianCamera, rea
 from gaussian_swaying.interop.physgaussian.convert import convert, to_yaml
 from gaussian_swaying.interop.physgaussian.space import heading, rotation_matrix
 from gaussian_swaying.mpm.colliders import EnclosingBox, Plane, VelocityBox
-from gaussian_swaying.mpm.laws.foam import Foam
-from gaussian_swaying.mpm.laws.metal import Metal
-from gaussian_swaying.mpm.laws.plasticine import Plasticine
-from gaussian_swaying.mpm.laws.sand import Sand
-from gaussian_swaying.mpm.laws.shared import lame_parameters
-from gaussian_swaying.mpm.laws.snow import Snow
+from gaussian_swaying.mpm.laws.law import lame_parameters
+from gaussian_swaying.mpm.laws.plastic import Foam, Metal, Plasticine, Sand, Snow
 from gaussian_swaying.mpm.pins import Handle, PinnedRegion, SequentialRelease
 from gaussian_swaying.scenes.procedural import FlagScene
 from gaussian_swaying.simulation.normalisation import Normalisation

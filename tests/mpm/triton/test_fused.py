@@ -13,7 +13,7 @@ from catalogue import ELASTIC, PLASTIC
 from gaussian_swaying import Boundary, MPMSolver, PinnedRegion, WindField, WindForce
 from gaussian_swaying.geometry.regions import Everything
 from gaussian_swaying.mpm.colliders import Plane
-from gaussian_swaying.mpm.laws.fixed_corotated import FixedCorotated
+from gaussian_swaying.mpm.laws.elastic import FixedCorotated
 from gaussian_swaying.mpm.pins import Impulse
 from gaussian_swaying.mpm.triton import fused
 

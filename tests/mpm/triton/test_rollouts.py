@@ -20,7 +20,7 @@ from gaussian_swaying import (
 )
 from gaussian_swaying._fixed import assign
 from gaussian_swaying.mpm.colliders import BallObstacle, EnclosingBox, Plane, VelocityBox
-from gaussian_swaying.mpm.laws.sand import Sand
+from gaussian_swaying.mpm.laws.plastic import Sand
 from gaussian_swaying.mpm.pins import Handle
 from gaussian_swaying.mpm.state import GridSpec
 from gaussian_swaying.mpm.triton import fused, fused_total, fused_updated

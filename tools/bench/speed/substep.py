@@ -11,7 +11,7 @@ from torch import Tensor
 from bench.runner import Row, study
 from bench.speed.timing import CUBE, DT, STEPS, load, sheet, timed, waves, wind
 from gaussian_swaying.mpm.colliders import EnclosingBox
-from gaussian_swaying.mpm.laws.sand import Sand
+from gaussian_swaying.mpm.laws.plastic import Sand
 from gaussian_swaying.mpm.solver import MPMSolver
 from gaussian_swaying.mpm.state import MaterialPoints
 

@@ -14,8 +14,7 @@ import torch
 from torch import Tensor
 
 from bench.problems.granular.shared import POISSON
-from gaussian_swaying.mpm.laws.law import ConstitutiveLaw
-from gaussian_swaying.mpm.laws.shared import lame_parameters
+from gaussian_swaying.mpm.laws.law import ConstitutiveLaw, lame_parameters
 
 
 def _steady(law: ConstitutiveLaw, gradient: Sequence[Sequence[float]], steps: int, pressure: float) -> Tensor:

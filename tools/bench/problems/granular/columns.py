@@ -24,8 +24,8 @@ from bench.problems.granular.shared import (
 from bench.problems.settings import Axial, Result, Settings, follow, lattice
 from gaussian_swaying.mpm.boundary import Boundary
 from gaussian_swaying.mpm.colliders import Plane
-from gaussian_swaying.mpm.laws.sand import Sand
-from gaussian_swaying.mpm.laws.shared import lame_parameters
+from gaussian_swaying.mpm.laws.law import lame_parameters
+from gaussian_swaying.mpm.laws.plastic import Sand
 from gaussian_swaying.mpm.solver import MPMSolver
 from gaussian_swaying.mpm.state import MaterialPoints, MPMState
 

@@ -24,7 +24,7 @@ from bench.problems.granular.shared import (
 from bench.problems.settings import Result, Settings, follow, lattice
 from gaussian_swaying.mpm.boundary import Boundary, Nodes
 from gaussian_swaying.mpm.colliders import Plane
-from gaussian_swaying.mpm.laws.sand import Sand
+from gaussian_swaying.mpm.laws.plastic import Sand
 from gaussian_swaying.mpm.solver import MPMSolver
 from gaussian_swaying.mpm.state import MaterialPoints, MPMState
 

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from bench.problems.settings import Settings
-from gaussian_swaying.mpm.laws.shared import lame_parameters
+from gaussian_swaying.mpm.laws.law import lame_parameters
 from gaussian_swaying.mpm.state import MaterialPoints, MPMState
 
 GRAVITY, DENSITY, POISSON = 9.81, 1600.0, 0.3
