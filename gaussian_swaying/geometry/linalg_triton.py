@@ -153,7 +153,7 @@ def dot9(a, b):
 
 @triton.jit
 def dot3(a, b):
-    """Product of two vectors; of a matrix and its cofactor matrix, which begin with their first rows, the determinant."""
+    """Product of two vectors; of the first rows of a matrix and of its cofactor matrix, the determinant."""
     return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 
 

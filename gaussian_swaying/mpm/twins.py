@@ -1,4 +1,4 @@
-"""One way to declare a compiled twin: laws, forces, effects of the wind and boundaries return a :class:`Twin`.
+"""One way to declare a compiled twin: forces, effects of the wind and boundaries return a :class:`Twin`.
 
 The torch methods of a component are its definition. A twin is the same in a device function: scalars in, scalars out.
 The kernel loads the numbers that the function gets, so the function itself only loads from its ``table``, as
