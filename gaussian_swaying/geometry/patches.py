@@ -12,7 +12,6 @@ from gaussian_swaying.geometry.linalg import polar_rotation
 from gaussian_swaying.geometry.linalg_triton import (
     axpy9,
     cofactor,
-    determinant,
     dot3,
     load3,
     load9,
@@ -40,7 +39,7 @@ BLOCK = 128
 def area_vector(F, n):
     """cof(F) N, which is as long as the area has grown (Nanson's formula), and det F."""
     c = cofactor(F)
-    return matvec(c, n), determinant(F, c)
+    return matvec(c, n), dot3(F, c)
 
 
 @triton.jit

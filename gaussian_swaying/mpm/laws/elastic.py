@@ -63,14 +63,14 @@ class NeoHookean(ConstitutiveLaw):
 
 
 @triton.jit
-def fixed_corotated_energy(a, mu, lam, internal, p):
+def fixed_corotated_energy(F, mu, lam, internal, p):
     r"""Energy density :math:`\mu \lVert F - R \rVert^2 + \tfrac{\lambda}{2} (J - 1)^2` [J/m³].
 
     Stomakhin et al. 2012, "Energetically consistent invertible elasticity".
     """
-    d = (a[0] - 1, a[1] - 1, a[2] - 1)
-    change = a[0] * a[1] * a[2] - 1
-    return mu * dot3(d, d) + 0.5 * lam * (change * change)
+    d = axpy9(1.0, F, -1.0, polar_rotation(F))
+    change = dot3(F, cofactor(F)) - 1
+    return mu * dot9(d, d) + 0.5 * lam * (change * change)
 
 
 @triton.jit
@@ -100,7 +100,7 @@ def fixed_corotated_moduli(F, mu, lam, internal, p):
 class FixedCorotated(ConstitutiveLaw):
     """Elastic solid that stays defined when crushed or inverted: foliage, cloth, rubber at moderate strain."""
 
-    device = DeviceLaw(energy=fixed_corotated_energy, pk1=fixed_corotated_pk1, moduli=fixed_corotated_moduli)
+    device = DeviceLaw(strain_energy=fixed_corotated_energy, pk1=fixed_corotated_pk1, moduli=fixed_corotated_moduli)
     least_nu = 0.0
 
 

@@ -295,6 +295,8 @@ class ConstitutiveLaw(Fixed, nn.Module, ABC):
     """
 
     device: ClassVar[DeviceLaw | None] = None
+    formulas: ClassVar[DeviceLaw | None] = None
+    """``device`` of the class, or of the nearest base that has one: for the methods that are not overridden."""
     plastic: bool = False
     internal: float | None = None
     least_nu: float = -1.0
@@ -302,7 +304,9 @@ class ConstitutiveLaw(Fixed, nn.Module, ABC):
     def __init_subclass__(cls, **options: Any) -> None:
         super().__init_subclass__(**options)
         own = {"energy", "pk1", "kirchhoff", "moduli", "return_map", "flow"} & vars(cls).keys()
-        if own and "device" not in vars(cls):
+        if "device" in vars(cls):
+            cls.formulas = cls.device
+        elif own:
             cls.device = None
 
     @property
@@ -312,11 +316,11 @@ class ConstitutiveLaw(Fixed, nn.Module, ABC):
 
     def _run(self, name: str, x: Any, mu: Any, lam: Any, internal: Any, *more: Any) -> Any:
         """Run a device function on tensors."""
-        if self.device is None:
+        if self.formulas is None:
             raise NotImplementedError(f"{type(self).__name__} needs `device`, or energy, pk1 and moduli of tensors")
         if internal is None:
             internal = 0.0 if self.internal is None else self.internal
-        return on_tensors(getattr(self.device, name))(x, mu, lam, internal, self.row, *more)
+        return on_tensors(getattr(self.formulas, name))(x, mu, lam, internal, self.row, *more)
 
     @property
     def row(self) -> tuple[float, ...]:
@@ -342,13 +346,13 @@ class ConstitutiveLaw(Fixed, nn.Module, ABC):
         Returns:
             Shape (...).
         """
-        if self.device is not None and self.device.energy:
+        if self.formulas is not None and self.formulas.energy:
             return self._run("energy", spectrum(F).stretch.unbind(-1), mu, lam, internal)
         return self._run("strain_energy", entries(F), mu, lam, internal)
 
     def pk1(self, F: Tensor, mu: Tensor, lam: Tensor, internal: Tensor | None = None) -> Tensor:
         """First Piola-Kirchhoff stress [Pa], shape (..., 3, 3); arguments as :meth:`energy`."""
-        if self.device is None or self.device.stress:
+        if self.formulas is None or self.formulas.stress:
             return matrix(self._run("stress", entries(F), mu, lam, internal))
 
         def principal(a: Tensor) -> Tensor:

@@ -13,7 +13,7 @@ import math
 from gaussian_swaying._checks import check_positive
 from gaussian_swaying.geometry.linalg_triton import clamp, dot3, where3
 from gaussian_swaying.kernels.language import tl, triton
-from gaussian_swaying.mpm.laws.elastic import fixed_corotated_energy, hencky_energy
+from gaussian_swaying.mpm.laws.elastic import hencky_energy
 from gaussian_swaying.mpm.laws.law import LOG_FLOOR, LOG_LIMIT, DeviceLaw, PlasticLaw, log
 
 ROOT = tl.constexpr(math.sqrt(2 / 3))  # norm of the deviator of a unit stress in uniaxial tension
@@ -253,7 +253,9 @@ def snow_energy(a, mu, lam, internal, p):
     0.6 count as 0.6. The third number is the hardening xi.
     """
     factor = tl.exp(p[2] * (1 - clamp(internal, _SNOW_LOW, _SNOW_HIGH)))
-    return fixed_corotated_energy(a, mu * factor, lam * factor, internal, p)
+    d = (a[0] - 1, a[1] - 1, a[2] - 1)
+    change = a[0] * a[1] * a[2] - 1
+    return factor * (mu * dot3(d, d) + 0.5 * lam * (change * change))
 
 
 @triton.jit
