@@ -1,7 +1,26 @@
-"""A lattice Boltzmann flow in a box: inflow, outflow, ground and still walls."""
+r"""A lattice Boltzmann flow in a box: inflow, outflow, ground and still walls.
+
+The collision is regularised, with a Smagorinsky model of what the cells do not resolve. After it the 27 populations of
+a cell follow from ten moments, so only these are kept:
+
+.. math:: \delta\rho = \rho - 1, \quad \mathbf u, \quad N = \Pi^{neq} \text{ after the collision},
+
+as ``moments`` of shape (10, ...): density, velocity (x, y, z), and xx, yy, zz, xy, xz, yz of N, in units of the
+lattice. The populations are the Hermite series up to third order with the recursive coefficients of Malaspinas (2015,
+arXiv:1505.06900),
+
+.. math:: f_i = w_i \Bigl(\rho + 3\,\mathbf c_i\cdot\rho\mathbf u
+    + \tfrac92 \mathcal H^{(2)}_i : (\rho\mathbf{uu} + N) + \tfrac{27}{6} \mathcal H^{(3)}_i \vdots\, a^{(3)}\Bigr),
+    \qquad a^{(3)}_{abc} = \rho u_a u_b u_c + u_a N_{bc} + u_b N_{ac} + u_c N_{ab}
+
+A cell reads ten moments of each neighbour and makes of them the population that arrives, so that 40 bytes are kept for
+a cell instead of 108 for its populations.
+"""
 
 from __future__ import annotations
 
+import itertools
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Literal
@@ -9,9 +28,21 @@ from typing import Literal
 import torch
 from torch import Tensor, nn
 
-from gaussian_swaying.air.collision import MOMENTS, collide, population, sums
-from gaussian_swaying.air.lattice import DIRECTIONS, OPPOSITE, SOUND, WEIGHTS, LatticeUnits
-from gaussian_swaying.kernels.launch import replaces
+from gaussian_swaying.kernels.derive import on_tensors
+from gaussian_swaying.kernels.language import tl, triton
+from gaussian_swaying.kernels.launch import lanes, launch
+
+DIRECTIONS: tuple[tuple[int, int, int], ...] = tuple(itertools.product((0, 1, -1), (0, 1, -1), (0, 1, -1)))
+"""The velocities [cells per step] of the lattice D3Q27, the one at rest first."""
+
+SOUND = 1 / math.sqrt(3)
+"""Speed of sound [cells per step]."""
+
+FASTEST = 0.3
+"""Largest speed [cells per step] at which the error of compressibility, some u² / c², may be called small."""
+
+MOMENTS = 10
+"""Numbers that are kept for a cell."""
 
 FLUID, WALL, HELD = range(3)
 MOST_CELLS = 2**31 // MOMENTS
@@ -20,12 +51,253 @@ MOST_CELLS = 2**31 // MOMENTS
 Face = Literal["periodic", "wall", "open"]
 
 
+BLOCK = 128
+CPU_BLOCK = 16
+
+
+@triton.jit
+def _load_moments(moments, at, count, mask):
+    return (
+        tl.load(moments + at, mask, 0.0),
+        tl.load(moments + count + at, mask, 0.0),
+        tl.load(moments + 2 * count + at, mask, 0.0),
+        tl.load(moments + 3 * count + at, mask, 0.0),
+        tl.load(moments + 4 * count + at, mask, 0.0),
+        tl.load(moments + 5 * count + at, mask, 0.0),
+        tl.load(moments + 6 * count + at, mask, 0.0),
+        tl.load(moments + 7 * count + at, mask, 0.0),
+        tl.load(moments + 8 * count + at, mask, 0.0),
+        tl.load(moments + 9 * count + at, mask, 0.0),
+    )
+
+
+@triton.jit
+def weight(x, y, z):
+    """36 times the weight of the velocity (x, y, z) of the lattice over its value at rest."""
+    return (4.0 - 3.0 * x * x) * (4.0 - 3.0 * y * y) * (4.0 - 3.0 * z * z) * 0.027777777777777776
+
+
+@triton.jit
+def population(m, cx, cy, cz):
+    """The population of one velocity, less its weight, so that small differences keep their digits."""
+    rho = 1.0 + m[0]
+    x = m[1]
+    y = m[2]
+    z = m[3]
+    xx = rho * x * x + m[4]
+    yy = rho * y * y + m[5]
+    zz = rho * z * z + m[6]
+    hx = 4.5 * (cx * cx) - 1.5
+    hy = 4.5 * (cy * cy) - 1.5
+    hz = 4.5 * (cz * cz) - 1.5
+    total = m[0] + hx * xx + hy * yy + hz * zz + 3.0 * rho * (cx * x + cy * y + cz * z)
+    total += 3.0 * cx * (hy * (x * yy + 2.0 * y * m[7]) + hz * (x * zz + 2.0 * z * m[8]))
+    total += 3.0 * cy * (hx * (y * xx + 2.0 * x * m[7]) + hz * (y * zz + 2.0 * z * m[9]))
+    total += 3.0 * cz * (hx * (z * xx + 2.0 * x * m[8]) + hy * (z * yy + 2.0 * y * m[9]))
+    total += 9.0 * (cx * cy * (rho * x * y + m[7]) + cx * cz * (rho * x * z + m[8]) + cy * cz * (rho * y * z + m[9]))
+    total += 27.0 * (cx * cy * cz) * (rho * x * y * z + x * m[9] + y * m[8] + z * m[7])
+    return 0.16666666666666666 * weight(cx, cy, cz) * total
+
+
+@triton.jit
+def returned(own, beyond, wall, gap, cx, cy, cz, CURVED: tl.constexpr):
+    """The population that comes back from a wall, at a share of the way to its cell if that is ``CURVED``."""
+    pushed = weight(cx, cy, cz) * (cx * wall[1] + cy * wall[2] + cz * wall[3])
+    back = population(own, -cx, -cy, -cz) + pushed
+    if CURVED:
+        near = 2.0 * gap * (back - pushed) + (1.0 - 2.0 * gap) * population(beyond, -cx, -cy, -cz) + pushed
+        far = (back + (2.0 * gap - 1.0) * population(own, cx, cy, cz)) / (2.0 * tl.maximum(gap, 0.25))
+        back = tl.where(gap < 0.5, near, far)
+    return back
+
+
+@triton.jit
+def gather(s, f, cx, cy, cz):
+    """Add a population to the sums: density, momentum and second moment, less those at rest."""
+    a, x, y, z, xx, yy, zz, xy, xz, yz = s
+    fx = cx * f
+    fy = cy * f
+    fz = cz * f
+    return (
+        a + f, x + fx, y + fy, z + fz, xx + cx * fx, yy + cy * fy, zz + cz * fz, xy + cy * fx, xz + cz * fx,
+        yz + cz * fy,
+    )  # fmt: skip
+
+
+@triton.jit
+def collide(s, relaxation, smagorinsky, px, py, pz):
+    r"""The moments after a collision, from the sums of the populations that arrived; mass and momentum are kept.
+
+    The eddy viscosity of Smagorinsky is :math:`\nu_t = (C_s h)^2 |S|`. Its strain rate follows from the stress before
+    the collision, :math:`S = -\tfrac{3}{2\rho\tau}\Pi^{neq}`, which gives a quadratic equation for the relaxation time
+    (Hou and others 1996):
+
+    .. math:: \tau = \tfrac12 \Bigl(\tau_0 + \sqrt{\tau_0^2 + 18\sqrt2\, C_s^2 \sqrt{\Pi^{neq}:\Pi^{neq}} / \rho}\Bigr)
+
+    ``relaxation`` is that of the molecular viscosity [steps], ``smagorinsky`` is 18 sqrt(2) C². The push of a force is
+    added to the velocity of the equilibrium (exact difference, Kupershtokh 2004); the velocity at the time of the step
+    has half of it.
+    """
+    rho = 1.0 + s[0]
+    x = s[1] / rho
+    y = s[2] / rho
+    z = s[3] / rho
+    rest = s[0] * 0.3333333333333333
+    xx = s[4] - rho * x * x - rest
+    yy = s[5] - rho * y * y - rest
+    zz = s[6] - rho * z * z - rest
+    xy = s[7] - rho * x * y
+    xz = s[8] - rho * x * z
+    yz = s[9] - rho * y * z
+    square = xx * xx + yy * yy + zz * zz + 2.0 * (xy * xy + xz * xz + yz * yz)
+    time = 0.5 * (relaxation + tl.sqrt(relaxation * relaxation + smagorinsky * tl.sqrt(square) / rho))
+    kept = 1.0 - 1.0 / time
+    return (s[0], x + px, y + py, z + pz, kept * xx, kept * yy, kept * zz, kept * xy, kept * xz, kept * yz)
+
+
+@triton.jit
+def flow_step(
+    moments, out, kind, count, sx, sy, sz, relaxation, smagorinsky, px, py, pz, BLOCK: tl.constexpr,
+):  # fmt: skip
+    """Stream and collide, one cell per lane. Cells at faces and beside walls get wrong numbers, to be replaced."""
+    at = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
+    mask = at < count
+    zero = tl.zeros((BLOCK,), tl.float32)
+    s = (zero, zero, zero, zero, zero, zero, zero, zero, zero, zero)
+    for i in range(3):  # only the last loop is unrolled: a kernel for all 27 directions compiles for minutes
+        for j in range(3):
+            for k in tl.static_range(3):
+                source = at - ((i - 1) * sx + (j - 1) * sy + (k - 1) * sz)
+                m = _load_moments(moments, source, count, mask & (source >= 0) & (source < count))
+                cx = 1.0 * i - 1.0
+                cy = 1.0 * j - 1.0
+                cz = 1.0 * k - 1.0
+                s = gather(s, population(m, cx, cy, cz), cx, cy, cz)
+    s = collide(s, relaxation, smagorinsky, px, py, pz)
+    own = _load_moments(moments, at, count, mask)
+    wall = tl.load(kind + at, mask, 1) == 1
+    for q in tl.static_range(10):
+        tl.store(out + q * count + at, tl.where(wall, own[q], s[q]), mask)
+
+
+@triton.jit
+def _wrapped(x, n):
+    return tl.where(x < 0, x + n, tl.where(x >= n, x - n, x))
+
+
+@triton.jit
+def special_step(
+    moments, out, kind, special, gaps, specials, count, nx, ny, nz, relaxation, smagorinsky, px, py, pz,
+    CURVED: tl.constexpr, BLOCK: tl.constexpr,
+):  # fmt: skip
+    """As :func:`flow_step`, for cells with a neighbour that is a wall or lies behind a periodic face."""
+    lane = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
+    mask = lane < specials
+    at = tl.load(special + lane, mask, 0)
+    x = at // (ny * nz)
+    y = (at // nz) % ny
+    z = at % nz
+    own = _load_moments(moments, at, count, mask)
+    zero = tl.zeros((BLOCK,), tl.float32)
+    s = (zero, zero, zero, zero, zero, zero, zero, zero, zero, zero)
+    for i in range(3):
+        for j in range(3):
+            for k in tl.static_range(3):
+                cx = 1.0 * i - 1.0
+                cy = 1.0 * j - 1.0
+                cz = 1.0 * k - 1.0
+                source = (_wrapped(x - (i - 1), nx) * ny + _wrapped(y - (j - 1), ny)) * nz + _wrapped(z - (k - 1), nz)
+                wall = tl.load(kind + source, mask, 0) == 1
+                m = _load_moments(moments, source, count, mask)
+                beyond = own
+                gap = 0.5
+                if CURVED:
+                    away = (_wrapped(x + (i - 1), nx) * ny + _wrapped(y + (j - 1), ny)) * nz + _wrapped(z + (k - 1), nz)
+                    beyond = _load_moments(moments, away, count, mask)
+                    row = 9 * ((i + 2) % 3) + 3 * ((j + 2) % 3) + (k + 2) % 3  # as in DIRECTIONS
+                    gap = tl.load(gaps + row * specials + lane, mask, 0.5)
+                back = returned(own, beyond, m, gap, cx, cy, cz, CURVED)
+                f = tl.where(wall, back, population(m, cx, cy, cz))
+                s = gather(s, f, cx, cy, cz)
+    s = collide(s, relaxation, smagorinsky, px, py, pz)
+    for q in tl.static_range(10):
+        tl.store(out + q * count + at, s[q], mask)
+
+
+@triton.jit
+def hold_faces(moments, held, behind, outward, wind, cells, count, BLOCK: tl.constexpr):
+    r"""Set the cells of open faces, one per lane.
+
+    Where the wind does not blow out, they have its velocity and what lets sound leave: a wave that arrives with a
+    pressure p has the velocity :math:`p / (\rho c)`, which is added along the outward normal (c is the speed of sound).
+    At low Mach numbers this is small beside the wind, and without it sound would go to and fro between the faces.
+    """
+    lane = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
+    mask = lane < cells
+    at = tl.load(held + lane, mask, 0)
+    near = _load_moments(moments, tl.load(behind + lane, mask, 0), count, mask)
+    ox = tl.load(outward + 3 * lane, mask, 1.0)
+    oy = tl.load(outward + 3 * lane + 1, mask, 0.0)
+    oz = tl.load(outward + 3 * lane + 2, mask, 0.0)
+    x = tl.load(wind + 3 * lane, mask, 0.0)
+    y = tl.load(wind + 3 * lane + 1, mask, 0.0)
+    z = tl.load(wind + 3 * lane + 2, mask, 0.0)
+    out = x * ox + y * oy + z * oz > 1e-6
+    into = tl.minimum(near[1] * ox + near[2] * oy + near[3] * oz, 0.0) / (ox * ox + oy * oy + oz * oz)
+    tl.store(moments + at, tl.where(out, 0.0, near[0]), mask)
+    sound = 0.5773502691896258 * near[0] / tl.sqrt(ox * ox + oy * oy + oz * oz)
+    tl.store(moments + count + at, tl.where(out, near[1] - into * ox, x + sound * ox), mask)
+    tl.store(moments + 2 * count + at, tl.where(out, near[2] - into * oy, y + sound * oy), mask)
+    tl.store(moments + 3 * count + at, tl.where(out, near[3] - into * oz, z + sound * oz), mask)
+    for q in tl.static_range(4, 10):
+        tl.store(moments + q * count + at, near[q], mask)
+
+
+@dataclass(frozen=True)
+class LatticeUnits:
+    """Metres and seconds on a lattice.
+
+    Attributes:
+        spacing: Side of a cell [m].
+        dt: Time step [s].
+        viscosity: Kinematic viscosity of the fluid [m²/s].
+        density: Its density [kg/m³].
+    """
+
+    spacing: float
+    dt: float
+    viscosity: float
+    density: float
+
+    @classmethod
+    def at_speed(
+        cls, spacing: float, speed: float, *, lattice_speed: float = 0.1, viscosity: float, density: float
+    ) -> LatticeUnits:
+        """Units in which a speed [m/s] is ``lattice_speed`` cells per step."""
+        return cls(float(spacing), lattice_speed * spacing / speed, float(viscosity), float(density))
+
+    @property
+    def speed(self) -> float:
+        """One cell per step [m/s]."""
+        return self.spacing / self.dt
+
+    @property
+    def relaxation(self) -> float:
+        """Relaxation time of the molecular viscosity [steps], 1/2 + 3 nu dt / h²."""
+        return 0.5 + 3 * self.viscosity * self.dt / self.spacing**2
+
+    @property
+    def cell_mass(self) -> float:
+        """Mass of the air in a cell [kg]."""
+        return self.density * self.spacing**3
+
+
 @dataclass(frozen=True, slots=True)
 class FlowState:
     """The part of a flow that changes.
 
     Attributes:
-        moments: Ten numbers for each cell after its collision, in units of the lattice (see :mod:`collision`), shape
+        moments: Ten numbers for each cell after its collision, in units of the lattice (see above), shape
             (10, X, Y, Z).
     """
 
@@ -39,8 +311,8 @@ class LatticeFlow(nn.Module):
     as a function, where it is (interpolated bounce-back of Bouzidi, Firdaouss and Lallemand 2001, Phys. Fluids 13); it
     may move along its surface. The outermost cells of a ``wall`` face are wall cells. Those of an ``open`` face have
     the velocity of the wind and the pressure of their neighbour where the wind blows in or along the face (sound may
-    leave, see :func:`hold`), and the pressure at rest and the velocity of their neighbour where it blows out. In
-    float32 the step runs as compiled kernels on a GPU and on a CPU; :meth:`step` in float64 is their definition.
+    leave, see :func:`hold_faces`), and the pressure at rest and the velocity of their neighbour where it blows out. Its
+    kernels take float32, and on a CPU also float64.
 
     Args:
         cells: Cells along x, y and z. With one cell along an axis, which must be periodic, the flow is two-dimensional.
@@ -120,10 +392,6 @@ class LatticeFlow(nn.Module):
         if solid is not None:
             self.gaps = _gaps(kind, self.special.long(), solid)
 
-    @property
-    def has_walls(self) -> bool:
-        return bool((self.kind == WALL).any())
-
     def start(
         self,
         velocity: Sequence[float] | Tensor = (0.0, 0.0, 0.0),
@@ -135,7 +403,7 @@ class LatticeFlow(nn.Module):
         Args:
             velocity: Of the air [m/s], three numbers or broadcastable to (3, X, Y, Z).
             wall_velocity: Of the walls [m/s], along their surface, shape (3, X, Y, Z); still if None.
-            dtype: Precision; kernels take float32.
+            dtype: Precision; float64 on a CPU alone.
         """
         moments = torch.zeros(MOMENTS, *self.cells, dtype=dtype, device=self.kind.device)
         given = torch.as_tensor(velocity, dtype=dtype, device=self.kind.device)
@@ -173,31 +441,17 @@ class LatticeFlow(nn.Module):
             part: The wall cells, bool, shape (X, Y, Z), away from the faces: the pressure at rest is left out, which
                 pushes a closed surface nowhere.
         """
-        flat = state.moments.reshape(MOMENTS, -1)
-
-        def sent(number: int, cells: Tensor) -> Tensor:
-            return population(flat[:, cells], number)
-
+        flat, special, curved = state.moments.reshape(MOMENTS, -1), self.special.long(), len(self.gaps) > 0
         total = [torch.zeros((), dtype=torch.float64, device=part.device)] * 3
         for number, c in enumerate(DIRECTIONS):
-            arrived, source = self._arrived(state.moments, number, sent)
-            back = sent(OPPOSITE[number], self.special.long())
-            given = ((back + arrived) * part.reshape(-1)[source]).double().sum()
-            total = [t - a * given for t, a in zip(total, c, strict=True)]
+            back = tuple(-a for a in c)
+            source, away = (_neighbour(special, self.cells, step) for step in (back, c))
+            own, wall, beyond = (flat[:, cells].unbind() for cells in (special, source, away))
+            gap = self.gaps[number].to(flat) if curved else 0.5
+            arrived = on_tensors(returned)(own, beyond, wall, gap, *c, curved)
+            given = (on_tensors(population)(own, *back) + arrived) * part.reshape(-1)[source]
+            total = [t - a * given.double().sum() for t, a in zip(total, c, strict=True)]
         return torch.stack(total) * self.units.cell_mass * self.units.speed / self.units.dt
-
-    def _arrived(self, moments: Tensor, number: int, sent: Callable[[int, Tensor], Tensor]) -> tuple[Tensor, Tensor]:
-        """A population that arrives at special cells, and the flat index of the cells that it comes from, (S,) each."""
-        flat, special, c = moments.reshape(MOMENTS, -1), self.special.long(), DIRECTIONS[number]
-        source, away = (_neighbour(special, self.cells, step) for step in (tuple(-a for a in c), c))
-        pushed = 6 * WEIGHTS[number] * sum(a * flat[1 + k, source] for k, a in enumerate(c))
-        back = sent(OPPOSITE[number], special) + pushed
-        if len(self.gaps):
-            gap = self.gaps[number].to(moments)
-            near = 2 * gap * (back - pushed) + (1 - 2 * gap) * sent(OPPOSITE[number], away) + pushed
-            far = (back + (2 * gap - 1) * sent(number, special)) / (2 * gap)
-            back = torch.where(gap < 0.5, near, far)
-        return torch.where(self.kind.reshape(-1)[source] == WALL, back, sent(number, source)), source
 
     def step(
         self, state: FlowState, wind: Tensor | None = None, acceleration: Sequence[float] = (0.0, 0.0, 0.0)
@@ -217,61 +471,29 @@ class LatticeFlow(nn.Module):
         self, moments: Tensor, out: Tensor, wind: Tensor | None = None, acceleration: Sequence[float] = (0.0, 0.0, 0.0)
     ) -> None:
         """As :meth:`step`, into a given tensor."""
+        block = lanes(moments.device, BLOCK, CPU_BLOCK)
+        nx, ny, nz = self.cells
+        count = nx * ny * nz
         push = [a * self.units.dt / self.units.speed for a in acceleration]
-        held = self._held(wind, moments)
-        if replaces([moments]):
-            from gaussian_swaying.air.flow_kernels import step
+        numbers = (self.units.relaxation, 18 * 2**0.5 * self.smagorinsky**2, *push)
+        strides = (ny * nz if nx > 1 else 0, nz if ny > 1 else 0, 1 if nz > 1 else 0)
+        launch(flow_step, (triton.cdiv(count, block),))(moments, out, self.kind, count, *strides, *numbers, BLOCK=block)
+        if len(self.special):
+            launch(special_step, (triton.cdiv(len(self.special), block),))(
+                moments, out, self.kind, self.special, self.gaps.to(moments), len(self.special), count, nx, ny, nz,
+                *numbers, CURVED=len(self.gaps) > 0, BLOCK=block,
+            )  # fmt: skip
+        self.hold(out, wind)
 
-            step(self, moments, out, held, push)
-            return
-        self._step(moments, out, push)
+    def hold(self, moments: Tensor, wind: Tensor | None = None) -> None:
+        """Set the cells of open faces in a wind [m/s], in place."""
         if len(self.held):
-            hold(out, self.held.long(), self.behind.long(), self.outward, held)
-
-    def _held(self, wind: Tensor | None, like: Tensor) -> Tensor:
-        """The wind at the cells of open faces in lattice units, shape (H, 3)."""
-        given = like.new_zeros(3) if wind is None else wind.to(like) / self.units.speed
-        return given.expand(len(self.held), 3).contiguous()
-
-    def _step(self, moments: Tensor, out: Tensor, push: list[float]) -> None:
-        wall = self.kind == WALL
-        special, arrived = self.special.long(), []
-        populations = [population(moments, number) for number in range(len(DIRECTIONS))]
-        for number, c in enumerate(DIRECTIONS):
-            moved = torch.roll(populations[number], c, (0, 1, 2))
-            if self.has_walls:
-                come, _ = self._arrived(moments, number, lambda k, cells: populations[k].reshape(-1)[cells])
-                moved.reshape(-1)[special] = come
-            arrived.append(moved)
-        given = moments.new_tensor(push)[:, None, None, None] if any(push) else None
-        out.copy_(collide(*sums(arrived), self.units.relaxation, self.smagorinsky, given))
-        out.copy_(torch.where(wall, moments, out))
-
-
-def hold(moments: Tensor, held: Tensor, behind: Tensor, outward: Tensor, wind: Tensor) -> None:
-    r"""Set the cells of open faces, in place.
-
-    Where the wind does not blow out, they have its velocity and what lets sound leave: a wave that arrives with a
-    pressure p has the velocity :math:`p / (\rho c)`, which is added along the outward normal (c is the speed of sound).
-    At low Mach numbers this is small beside the wind, and without it sound would go to and fro between the faces.
-
-    Args:
-        moments: Shape (10, X, Y, Z).
-        held: Flat index of the cells, shape (H,).
-        behind: Flat index of the cells behind them in the box, shape (H,).
-        outward: From there to them [cells], shape (H, 3).
-        wind: Velocity of the wind [cells per step], shape (H, 3).
-    """
-    flat = moments.reshape(MOMENTS, -1)
-    near = flat[:, behind]
-    out = (wind * outward.to(wind)).sum(-1) > 1e-6
-    leaving = near[1:4].T
-    into = (leaving * outward.to(wind)).sum(-1, keepdim=True).clamp(max=0)  # nothing flows back in
-    leaving = leaving - into * outward.to(wind) / outward.to(wind).square().sum(-1, keepdim=True)
-    flat[0, held] = torch.where(out, 0.0, near[0])
-    normal = outward.to(wind) / outward.to(wind).square().sum(-1, keepdim=True).sqrt()
-    flat[1:4, held] = torch.where(out[:, None], leaving, wind + SOUND * near[0][:, None] * normal).T
-    flat[4:, held] = near[4:]
+            block = lanes(moments.device, BLOCK, CPU_BLOCK)
+            given = moments.new_zeros(3) if wind is None else wind.to(moments) / self.units.speed
+            launch(hold_faces, (triton.cdiv(len(self.held), block),))(
+                moments, self.held, self.behind, self.outward.to(moments), given.expand(len(self.held), 3).contiguous(),
+                len(self.held), self.kind.numel(), BLOCK=block,
+            )  # fmt: skip
 
 
 def _neighbour(cell: Tensor, cells: tuple[int, int, int], step: Sequence[int]) -> Tensor:

@@ -16,80 +16,139 @@ The force on the point is :math:`\beta (\mathbf u - \mathbf v) / \Delta t` in ea
 the start of the step. So it is a drag, and air and point together lose the energy
 :math:`\tfrac12\beta(u - \bar v)^2` or more. A force that stayed the same in all substeps would feed vibrations that are
 faster than the step.
+
+Sums over points are atomic on a GPU, so their order is not fixed. On a CPU one program adds point after point.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from typing import Any
 
 import torch
 from torch import Tensor
 
-from gaussian_swaying.air.collision import MOMENTS
-from gaussian_swaying.air.flow import FLUID
-from gaussian_swaying.kernels.launch import replaces
-from gaussian_swaying.mpm.transfer import bspline_weights
+from gaussian_swaying.kernels.language import INTERPRETED, tl, triton
+from gaussian_swaying.kernels.launch import lanes, launch
+
+BLOCK = 64
+CPU_BLOCK = 16
 
 
-@dataclass(frozen=True, slots=True)
-class Reach:
-    """The 27 cells around each point, and their weights.
-
-    Attributes:
-        cell: Flat index, int64, shape (27, P).
-        weight: Their sum is 1; 0 for cells that are no air, and for points without air, shape (27, P).
-    """
-
-    cell: Tensor
-    weight: Tensor
-
-    @classmethod
-    def around(cls, place: Tensor, kind: Tensor) -> Reach:
-        """The cells around places.
-
-        Args:
-            place: In cells from the centre of the first cell, shape (P, 3).
-            kind: What the cells are, see ``LatticeFlow``, shape (X, Y, Z); an axis of one cell repeats.
-        """
-        lattice = place.T
-        base = torch.floor(lattice - 0.5)
-        weight, _ = bspline_weights(lattice - base)  # (3 axes, 3, P)
-        first = base.long()
-        flat = torch.zeros((), dtype=torch.long, device=place.device)
-        share = torch.ones((), dtype=place.dtype, device=place.device)
-        for axis, count in enumerate(kind.shape):
-            shape = [1, 1, 1, -1]
-            shape[axis] = 3
-            cell = first[axis] + torch.arange(3, device=place.device)[:, None]
-            within = (cell >= 0) & (cell < count) if count > 1 else torch.ones_like(cell, dtype=torch.bool)
-            cell = cell.clamp(0, count - 1)
-            flat = flat * count + cell.reshape(shape)
-            share = share * (weight[axis] * within).reshape(shape)
-        flat, share = flat.reshape(27, -1), share.reshape(27, -1)
-        share = share * (kind.reshape(-1)[flat] == FLUID)
-        total = share.sum(0)
-        return cls(flat, torch.where(total > 0, share / total.clamp(min=1e-30), 0.0))
-
-    def read(self, field: Tensor) -> Tensor:
-        """Values at the points, of a field with a row for each cell, shape (cells, C); returns shape (P, C)."""
-        found = field.index_select(0, self.cell.reshape(-1)).view(27, -1, field.shape[-1])
-        return (self.weight[..., None] * found).sum(0)
-
-    def spread(self, amount: Tensor, cells: int) -> Tensor:
-        """Amounts of the points, shape (P, C), shared among the cells; returns shape (cells, C)."""
-        shares = (self.weight[..., None] * amount).reshape(-1, amount.shape[-1])
-        return shares.new_zeros(cells, amount.shape[-1]).index_add_(0, self.cell.reshape(-1), shares)
+@triton.jit
+def _axis(x):
+    """First of the three cells around a place on one axis, and their weights."""
+    low = tl.floor(x - 0.5)
+    f = x - low
+    return low.to(tl.int32), (0.5 * (1.5 - f) * (1.5 - f), 0.75 - (f - 1.0) * (f - 1.0), 0.5 * (f - 0.5) * (f - 0.5))
 
 
-def velocity_at(moments: Tensor, reach: Reach) -> Tensor:
-    """Velocity of the air at points [cells per step], shape (P, 3)."""
-    return reach.read(moments[1:4].reshape(3, -1).T)
+@triton.jit
+def _inside(x, n):
+    return ((x >= 0) & (x < n)) | (n == 1)
+
+
+@triton.jit
+def _clamped(x, n):
+    return tl.minimum(tl.maximum(x, 0), n - 1)
+
+
+@triton.jit
+def _cell(reach, kind, nx, ny, nz, mask, X: tl.constexpr, Y: tl.constexpr, Z: tl.constexpr):
+    """Index of one of the 27 cells, and its weight before they are made to add up to one."""
+    bx, wx, by, wy, bz, wz = reach
+    at = (_clamped(bx + X, nx) * ny + _clamped(by + Y, ny)) * nz + _clamped(bz + Z, nz)
+    ok = mask & _inside(bx + X, nx) & _inside(by + Y, ny) & _inside(bz + Z, nz)
+    air = tl.load(kind + at, mask, 1) == 0
+    return at, tl.where(ok & air, wx[X] * wy[Y] * wz[Z], 0.0)
+
+
+@triton.jit
+def _reach(place, p, kind, nx, ny, nz, mask):
+    """The cells around points, and a factor with which the weights of those of air add up to one."""
+    bx, wx = _axis(tl.load(place + 3 * p, mask, 0.0))
+    by, wy = _axis(tl.load(place + 3 * p + 1, mask, 0.0))
+    bz, wz = _axis(tl.load(place + 3 * p + 2, mask, 0.0))
+    reach = (bx, wx, by, wy, bz, wz)
+    total = wx[0] * 0.0
+    for i in tl.static_range(3):
+        for j in tl.static_range(3):
+            for k in tl.static_range(3):
+                _at, w = _cell(reach, kind, nx, ny, nz, mask, i, j, k)
+                total += w
+    return reach, tl.where(total > 0, 1.0 / tl.maximum(total, 1e-30), 0.0)
+
+
+@triton.jit
+def _add(pointer, value, mask, ATOMIC: tl.constexpr):
+    if ATOMIC:
+        tl.atomic_add(pointer, value, mask, sem="relaxed")
+    else:
+        tl.store(pointer, tl.load(pointer, mask, 0.0) + value, mask)
+
+
+@triton.jit
+def cover(place, area, sums, kind, nx, ny, nz, count, rounds, ATOMIC: tl.constexpr, BLOCK: tl.constexpr):
+    """The area of points shared among the cells."""
+    for turn in range(rounds):
+        p = (tl.program_id(0) * rounds + turn) * BLOCK + tl.arange(0, BLOCK)
+        mask = p < count
+        reach, scale = _reach(place, p, kind, nx, ny, nz, mask)
+        share = scale * tl.load(area + p, mask, 0.0)
+        for i in tl.static_range(3):
+            for j in tl.static_range(3):
+                for k in tl.static_range(3):
+                    at, w = _cell(reach, kind, nx, ny, nz, mask, i, j, k)
+                    _add(sums + at, w * share, mask, ATOMIC)
+
+
+@triton.jit
+def read(place, area, field, sums, values, layer, kind, nx, ny, nz, cells, count, BLOCK: tl.constexpr):
+    """Three values of the air at points, and the mass of the layer at each."""
+    p = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
+    mask = p < count
+    reach, scale = _reach(place, p, kind, nx, ny, nz, mask)
+    covered = scale * 0.0
+    x = scale * 0.0
+    y = scale * 0.0
+    z = scale * 0.0
+    for i in tl.static_range(3):
+        for j in tl.static_range(3):
+            for k in tl.static_range(3):
+                at, w = _cell(reach, kind, nx, ny, nz, mask, i, j, k)
+                covered += w * tl.load(sums + at, mask, 0.0)
+                x += w * tl.load(field + at, mask, 0.0)
+                y += w * tl.load(field + cells + at, mask, 0.0)
+                z += w * tl.load(field + 2 * cells + at, mask, 0.0)
+    covered = covered * scale
+    mass = tl.where(covered > 0, tl.load(area + p, mask, 0.0) / tl.maximum(covered, 1e-30), 0.0)
+    tl.store(layer + p, mass, mask)
+    tl.store(values + 3 * p, x * scale, mask)
+    tl.store(values + 3 * p + 1, y * scale, mask)
+    tl.store(values + 3 * p + 2, z * scale, mask)
+
+
+@triton.jit
+def subtract(place, taken, moments, kind, nx, ny, nz, cells, count, rounds, ATOMIC: tl.constexpr, BLOCK: tl.constexpr):
+    """Take the momentum of points out of the air."""
+    for turn in range(rounds):
+        p = (tl.program_id(0) * rounds + turn) * BLOCK + tl.arange(0, BLOCK)
+        mask = p < count
+        reach, scale = _reach(place, p, kind, nx, ny, nz, mask)
+        x = scale * tl.load(taken + 3 * p, mask, 0.0)
+        y = scale * tl.load(taken + 3 * p + 1, mask, 0.0)
+        z = scale * tl.load(taken + 3 * p + 2, mask, 0.0)
+        for i in tl.static_range(3):
+            for j in tl.static_range(3):
+                for k in tl.static_range(3):
+                    at, w = _cell(reach, kind, nx, ny, nz, mask, i, j, k)
+                    w = -w / (1.0 + tl.load(moments + at, mask, 0.0))
+                    _add(moments + cells + at, w * x, mask, ATOMIC)
+                    _add(moments + 2 * cells + at, w * y, mask, ATOMIC)
+                    _add(moments + 3 * cells + at, w * z, mask, ATOMIC)
 
 
 def look(moments: Tensor, area: Tensor, place: Tensor, kind: Tensor) -> tuple[Tensor, Tensor]:
     r"""Velocity of the air at points, and the mass of the layer of air at each, :math:`A_p / c_p`.
-
-    In float32 it runs as kernels. On a GPU the order of their sums is not fixed.
 
     Args:
         moments: Of the flow, shape (10, X, Y, Z).
@@ -100,14 +159,23 @@ def look(moments: Tensor, area: Tensor, place: Tensor, kind: Tensor) -> tuple[Te
     Returns:
         Shape (P, 3) [cells per step], and shape (P,) in units of the air in a cell; 0 for points without air.
     """
-    if replaces([moments, area, place]):
-        from gaussian_swaying.air import immersed_kernels
+    sums, (programs, options) = moments.new_zeros(kind.numel()), _scatter(place)
+    launch(cover, (programs,))(place.contiguous(), area, sums, kind, *kind.shape, len(place), **options)
+    return _read(moments[1:4], area, sums, place, kind)
 
-        found: tuple[Tensor, Tensor] = immersed_kernels.look(moments, area, place, kind)
-        return found
-    reach = Reach.around(place, kind)
-    cover = reach.read(reach.spread(area[:, None], kind.numel()))[:, 0]
-    return velocity_at(moments, reach), torch.where(cover > 0, area / cover.clamp(min=1e-30), 0.0)
+
+def values_at(field: Tensor, place: Tensor, kind: Tensor) -> Tensor:
+    """Values at points of a field of three numbers for each cell, (3, X, Y, Z), as :func:`look`; shape (P, 3)."""
+    return _read(field, field.new_zeros(len(place)), field.new_zeros(kind.numel()), place, kind)[0]
+
+
+def _read(field: Tensor, area: Tensor, sums: Tensor, place: Tensor, kind: Tensor) -> tuple[Tensor, Tensor]:
+    place, block = place.contiguous(), lanes(place.device, BLOCK, CPU_BLOCK)
+    values, layer = torch.empty_like(place), torch.empty_like(area)
+    launch(read, (triton.cdiv(len(place), block),))(
+        place, area, field, sums, values, layer, kind, *kind.shape, kind.numel(), len(place), BLOCK=block
+    )
+    return values, layer
 
 
 def give(moments: Tensor, taken: Tensor, place: Tensor, kind: Tensor) -> None:
@@ -119,14 +187,19 @@ def give(moments: Tensor, taken: Tensor, place: Tensor, kind: Tensor) -> None:
         place: See :func:`look`.
         kind: See :func:`look`.
     """
-    if replaces([moments, taken, place]):
-        from gaussian_swaying.air import immersed_kernels
+    programs, options = _scatter(place)
+    launch(subtract, (programs,))(
+        place.contiguous(), taken.contiguous(), moments, kind, *kind.shape, kind.numel(), len(place), **options
+    )
 
-        immersed_kernels.give(moments, taken, place, kind)
-        return
-    flat = moments.reshape(MOMENTS, -1)
-    loss = Reach.around(place, kind).spread(taken, flat.shape[1]).T
-    flat[1:4] -= loss / (1 + flat[0])
+
+def _scatter(place: Tensor) -> tuple[int, dict[str, Any]]:
+    """The number of programs that add up, and their options."""
+    atomic = place.device.type == "cuda" or INTERPRETED
+    block = BLOCK if atomic else 1
+    blocks = triton.cdiv(len(place), block)
+    programs = blocks if atomic else 1
+    return programs, {"rounds": blocks // max(programs, 1), "ATOMIC": atomic, "BLOCK": block}
 
 
 def together(mass: Tensor, layer: Tensor) -> Tensor:

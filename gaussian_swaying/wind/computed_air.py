@@ -13,10 +13,18 @@ from torch import Tensor, nn
 
 from gaussian_swaying._checks import check_positive, check_vector, check_whole
 from gaussian_swaying._fixed import Fixed
-from gaussian_swaying.air.collision import MOMENTS
-from gaussian_swaying.air.flow import FLUID, MOST_CELLS, WALL, Face, FlowState, LatticeFlow
-from gaussian_swaying.air.immersed import Reach, give, look, together, velocity_at
-from gaussian_swaying.air.lattice import FASTEST, LatticeUnits
+from gaussian_swaying.air.flow import (
+    FASTEST,
+    FLUID,
+    MOMENTS,
+    MOST_CELLS,
+    WALL,
+    Face,
+    FlowState,
+    LatticeFlow,
+    LatticeUnits,
+)
+from gaussian_swaying.air.immersed import give, look, together, values_at
 from gaussian_swaying.geometry.distance import DistanceGrid
 from gaussian_swaying.geometry.frame import SimFrame
 from gaussian_swaying.geometry.regions import Region
@@ -351,9 +359,6 @@ class AirInBox:
                 "the force of the air is no longer right: raise `air.cells` or `material.density`."
             )
 
-    def _reach(self, position: Tensor) -> Reach:
-        return Reach.around(self._place(position), self.flow.kind)
-
     def _place(self, position: Tensor) -> Tensor:
         """Positions [m] in cells from the centre of the first cell, float32."""
         return ((position.detach() - self._origin.to(position)) / self.settings.spacing - 0.5).float()
@@ -371,14 +376,14 @@ class AirInBox:
         low = self.origin.to(flat)
         high = low + self.settings.spacing * torch.tensor(self.flow.cells, device=flat.device)
         edge = 2 * self.settings.spacing
-        found = velocity_at(moments, self._reach(torch.minimum(torch.maximum(flat, low + edge), high - edge)))
-        return (found * self.flow.units.speed).to(place).reshape(place.shape)
+        inside = self._place(torch.minimum(torch.maximum(flat, low + edge), high - edge))
+        found = values_at(moments[1:4], inside, self.flow.kind) * self.flow.units.speed
+        return found.to(place).reshape(place.shape)
 
     def vorticity_at(self, moments: Tensor, place: Tensor) -> Tensor:
         """Vorticity of the air at places [1/s], shape (..., 3); 0 in walls and outside of the box."""
-        flat = place.reshape(-1, 3)
-        field = self.flow.vorticity(FlowState(moments)).reshape(3, -1).T
-        return self._reach(flat).read(field).to(place).reshape(place.shape)
+        field = self.flow.vorticity(FlowState(moments))
+        return values_at(field, self._place(place.reshape(-1, 3)), self.flow.kind).to(place).reshape(place.shape)
 
     def take(self, load: WindForce) -> None:
         self.load = load

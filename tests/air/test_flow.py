@@ -1,4 +1,4 @@
-"""The flow against exact and published ones, and its kernels against torch.
+"""The flow: its lattice and collision by what they conserve, exact and published flows.
 
 The problems are those of tools/bench/problems/air.py; the bench records finer ones.
 """
@@ -8,16 +8,98 @@ import torch
 from shared import double
 from torch.testing import assert_close
 
-from gaussian_swaying.air.flow import HELD, WALL, FlowState, LatticeFlow, hold
-from gaussian_swaying.air.lattice import LatticeUnits
+from gaussian_swaying.air import flow as kernels
+from gaussian_swaying.air.flow import DIRECTIONS, HELD, WALL, FlowState, LatticeFlow, LatticeUnits
+from gaussian_swaying.kernels.derive import on_tensors
 
 UNITS = LatticeUnits.at_speed(0.1, 1.0, viscosity=1e-3, density=1.2)
+C = double(DIRECTIONS)
+W = double([on_tensors(kernels.weight)(*c) for c in DIRECTIONS]) / 6  # population has the other factor
 BOXES = {
     "wind over ground": ((12, 10, 9), ("open", "periodic", ("wall", "open"))),
     "slab": ((12, 1, 9), ("open", "periodic", "open")),
     "periodic": ((7, 6, 8), ("periodic",) * 3),
     "flat": ((6, 8, 1), ("open", "wall", "periodic")),
 }
+
+
+@pytest.fixture
+def moments():
+    return 0.05 * torch.randn(10, 50, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
+
+
+def _populations(moments):
+    return torch.stack([on_tensors(kernels.population)(moments.unbind(), *c) for c in DIRECTIONS])
+
+
+def _collided(moments, relaxation=0.8, smagorinsky=0.0, push=(0.0, 0.0, 0.0)):
+    """The sums of the populations, and the moments after a collision."""
+    sums = (torch.zeros(50, dtype=torch.float64),) * 10
+    for c, f in zip(DIRECTIONS, _populations(moments), strict=True):
+        sums = on_tensors(kernels.gather)(sums, f, *c)
+    return torch.stack(sums), torch.stack(on_tensors(kernels.collide)(sums, relaxation, smagorinsky, *push))
+
+
+def test_moments_of_the_weights_are_those_of_a_gas_at_rest():
+    """Up to the fourth: sums of w c c = I / 3, and of w c c c c = (I I) / 9, without which viscosity has directions."""
+    eye = torch.eye(3, dtype=torch.float64)
+    assert_close(W.sum(), double(1.0))
+    assert_close(torch.einsum("i,ia,ib->ab", W, C, C), eye / 3)
+    fourth = sum(torch.einsum(f"{a},{b}->abcd", eye, eye) for a, b in (("ab", "cd"), ("ac", "bd"), ("ad", "bc")))
+    assert_close(torch.einsum("i,ia,ib,ic,id->abcd", W, C, C, C, C), fourth / 9)
+    assert_close(torch.einsum("i,ia,ib,ic->abc", W, C, C, C), torch.zeros(3, 3, 3, dtype=torch.float64))
+
+
+def test_populations_have_the_moments_that_made_them_and_third_ones_by_recursion(moments):
+    found, _ = _collided(moments)
+    rho, u = 1 + moments[0], moments[1:4]
+    pairs = [(0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2)]
+    second = [rho * u[a] * u[b] + moments[4 + k] + (a == b) * moments[0] / 3 for k, (a, b) in enumerate(pairs)]
+    assert_close(found, torch.stack([moments[0], *rho * u, *second]))
+    third = torch.einsum("ia,ib,ic,in->abcn", C, C, C, _populations(moments))
+    xxy = rho * u[0] ** 2 * u[1] + u[1] * moments[4] + 2 * u[0] * moments[7]
+    assert_close(third[0, 0, 1] - rho * u[1] / 3, xxy)
+    assert_close(third[0, 1, 2], rho * u.prod(0) + u[0] * moments[9] + u[1] * moments[8] + u[2] * moments[7])
+
+
+def test_a_collision_keeps_mass_and_momentum_adds_a_push_and_relaxes_the_stress(moments):
+    push = [0.01, 0.02, -0.03]
+    _, after = _collided(moments, push=push)
+    expected = moments.clone()
+    expected[1:4] += double(push)[:, None]
+    expected[4:] *= 1 - 1 / 0.8
+    assert_close(after, expected)
+
+
+def test_eddies_have_the_viscosity_of_smagorinsky(moments):
+    """nu_t = C² |S|, with the strain rate that the stress and the whole relaxation time give."""
+    constant, tau0 = 0.15, 0.505
+    _, after = _collided(moments, tau0, 18 * 2**0.5 * constant**2)
+    stress = moments[4:]
+    tau = 1 / (1 - after[4] / stress[0])
+    strain = -1.5 / (tau * (1 + moments[0])) * stress
+    size = (2 * (strain[:3].square().sum(0) + 2 * strain[3:].square().sum(0))).sqrt()
+    assert_close((tau - tau0) / 3, constant**2 * size)
+
+
+def test_units_of_a_speed():
+    units = LatticeUnits.at_speed(0.1, 5.0, lattice_speed=0.05, viscosity=1e-3, density=1.2)
+    found = units.dt, units.speed, units.relaxation, units.cell_mass
+    assert found == pytest.approx((0.001, 100.0, 0.5 + 3 * 1e-3 * 0.001 / 0.01, 1.2e-3))
+
+
+@pytest.mark.parametrize("cell", [(3, 2, 4), (0, 5, 7)])
+def test_air_that_is_too_dense_goes_to_all_neighbours(cell):
+    """From inside and from a corner of a periodic box: the population of a direction has its weight, and its way."""
+    flow = LatticeFlow((7, 6, 8), UNITS, faces=("periodic",) * 3)
+    state = flow.start(dtype=torch.float64)
+    state.moments[0][cell] = 1e-3
+    after = flow.step(state).moments
+    for c, weight in zip(DIRECTIONS, W, strict=True):
+        there = (slice(None), *((x + s) % n for x, s, n in zip(cell, c, flow.cells, strict=True)))
+        sent = 1e-3 * weight
+        assert_close(after[there][:4], torch.stack([sent, *(sent * double(c) / (1 + sent))]))
+    assert_close(after[0].sum(), double(1e-3))
 
 
 def _random(flow, seed=0):
@@ -40,7 +122,7 @@ def _ball(place):
 @pytest.mark.parametrize(
     ("name", "walls"), [*((name, walls) for name in BOXES for walls in ("none", "some")), ("wind over ground", "ball")]
 )
-def test_kernels_compute_the_step(name, walls, kernel_device):
+def test_a_step_of_float32_is_that_of_float64(name, walls, kernel_device):
     """With interpolated bounce-back at a ball."""
     cells, faces = BOXES[name]
     solid = {"some": torch.rand(cells, generator=torch.Generator().manual_seed(1)) < 0.05, "ball": _ball}.get(walls)
@@ -59,8 +141,8 @@ def test_nothing_flows_back_in_where_the_wind_blows_out():
     """At an open face the air behind it goes on, along the face in any case and across it outwards alone."""
     flow = LatticeFlow((6, 5, 4), UNITS)
     state, _ = _random(flow)
-    moments, wind = state.moments.clone(), 0.01 * flow.outward
-    hold(moments, flow.held, flow.behind, flow.outward, wind)
+    moments = state.moments.clone()
+    flow.hold(moments, 0.01 * UNITS.speed * flow.outward)
     before, after = (given[1:4].reshape(3, -1).T for given in (state.moments, moments))
     across = flow.outward / flow.outward.norm(dim=-1, keepdim=True)
     came, left = ((part[index.long()] * across).sum(-1) for part, index in ((before, flow.behind), (after, flow.held)))
@@ -145,7 +227,6 @@ def test_kinds_of_cells():
     assert (flow.kind[:, :, 0] == WALL).all()
     assert int(flow.kind[2, 2, 2]) == WALL
     assert (flow.kind[0, :, 1:] == HELD).all()
-    assert flow.has_walls
     assert set(flow.kind.reshape(-1)[flow.held.long()].tolist()) == {HELD}
 
 

@@ -11,9 +11,8 @@ import math
 import torch
 from torch import Tensor
 
-from gaussian_swaying.air.flow import WALL, FlowState, LatticeFlow
+from gaussian_swaying.air.flow import WALL, FlowState, LatticeFlow, LatticeUnits
 from gaussian_swaying.air.immersed import exchange
-from gaussian_swaying.air.lattice import LatticeUnits
 from gaussian_swaying.geometry.regions import Box
 from gaussian_swaying.kernels.graphs import Replayed
 from gaussian_swaying.mpm.pins import PinnedRegion
