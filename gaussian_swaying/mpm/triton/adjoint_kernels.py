@@ -9,11 +9,12 @@ number of substeps that it has done. Rows of ``bars``, one per active node: grad
 each in four columns of eight. Rows of ``history``: displacement and velocity at the start of each substep, likewise.
 """
 
-from gaussian_swaying.geometry.linalg_triton import add3, axpy9, dot3, scale3, scale9, store3
+from gaussian_swaying.geometry.linalg_triton import add3, axpy9, dot3, load3, scale3, scale9, store3
 from gaussian_swaying.kernels.derive import vjp
 from gaussian_swaying.kernels.language import tl, triton
 from gaussian_swaying.mpm.damping import kelvin_voigt
-from gaussian_swaying.mpm.dispatch import pk1_adjoint
+from gaussian_swaying.mpm.dispatch import pk1, pk1_adjoint
+from gaussian_swaying.mpm.sheets import flattened, flattened_adjoint, sheet_stress_adjoint, without_normal
 from gaussian_swaying.mpm.triton.shared import VARIES, axis_weights, node_weight, sums, twin_data, vector
 from gaussian_swaying.mpm.triton.total_kernels import cells_of, gather, law_row, load_particles, motion
 
@@ -51,13 +52,14 @@ def _add(to, value, real, chunk):
 
 @triton.jit(do_not_specialize=VARIES)
 def particles_adjoint(
-    fraction, material, law, law_table, values, count,
-    cell_start, cell_node, cell_scene, cells,
+    fraction, material, normals, law, law_table, values, count,
+    cell_start, cell_node, cell_scene, cells, cell_nodes,
     fields, force_bar, partial, found, shares,
     vectors, scenes, numbers, first_step, step_offset, last,
     sx, sy, inverse_dx, viscous_time,
     LAWS: tl.constexpr, MULTI: tl.constexpr, FORCES: tl.constexpr, VISCOUS: tl.constexpr, MATERIAL: tl.constexpr,
     SHARES: tl.constexpr, WIDTH: tl.constexpr, CELLS: tl.constexpr, LANES: tl.constexpr,
+    VIRTUAL: tl.constexpr, SHEETS: tl.constexpr,
 ):  # fmt: skip
     """Gradients by the nodal displacements (columns 0 to 2 of ``partial``) and velocities (4 to 6), summed by cells.
 
@@ -75,24 +77,41 @@ def particles_adjoint(
         mask = index < end[:, None]
         f, volume, mu, lam = load_particles(fraction, material, count, index, mask)
         wz, gz = axis_weights(f[2], inverse_dx)
-        _u, F, v, rate = motion(fields, node, sx, sy, f, wz, gz, inverse_dx, known, VISCOUS, LOADED)
-        a, Q, _v = gather(force_bar, node, sx, sy, f, wz, gz, inverse_dx, known, False)
+        if VIRTUAL:
+            place = tl.minimum(cell, cells - 1)[:, None]
+        else:
+            place = node
+        _u, F, v, rate = motion(
+            fields, place, sx, sy, f, wz, gz, inverse_dx, known, VISCOUS, LOADED, cell_nodes, cells, VIRTUAL
+        )
+        a, Q, _v = gather(force_bar, place, sx, sy, f, wz, gz, inverse_dx, known, False, cell_nodes, cells, VIRTUAL)
         row = law_row(law, law_table, index, mask, MULTI)
-        by_F, by_mu, by_lam = pk1_adjoint(F, Q, mu, lam, row, LAWS)
+        if SHEETS:
+            bent = F
+            n = load3(normals, count, index, mask)
+            F, m, area, thickness, thinning = flattened(bent, n, mu, lam)
+            P = pk1(F, mu, lam, row, LAWS)
+            by_bent, more_mu, by_P, by_shape, by_m, by_area, by_thickness, by_thinning = sheet_stress_adjoint(
+                bent, n, mu, P, F, m, area, thickness, thinning, Q
+            )
+            by_F, by_mu, by_lam = pk1_adjoint(F, by_P, mu, lam, row, LAWS)
+            by_F = axpy9(1.0, by_F, 1.0, by_shape)
+            by_mu += more_mu
+            rate = without_normal(rate, n)
+            Q = without_normal(Q, n)
+        else:
+            by_F, by_mu, by_lam = pk1_adjoint(F, Q, mu, lam, row, LAWS)
         if VISCOUS:
             more, by_rate, one, two = kelvin_voigt_adjoint(F, rate, mu, lam, viscous_time, Q)
             by_F = axpy9(1.0, by_F, 1.0, more)
             by_mu += one
             by_lam += two
+            if SHEETS:
+                by_rate = without_normal(by_rate, n)
             by_rate = scale9(-volume, by_rate)
-        if MATERIAL:
-            to = found + index
-            tl.store(to, tl.load(to, mask, 0.0) - volume * by_mu, mask)
-            tl.store(to + count, tl.load(to + count, mask, 0.0) - volume * by_lam, mask)
-            # the stress is homogeneous in mu and lambda, so Q : P follows from its derivatives
-            to = found + 2 * count + index
-            tl.store(to, tl.load(to, mask, 0.0) - mu * by_mu - lam * by_lam, mask)
         by_F = scale9(-volume, by_F)
+        by_mu *= -volume
+        by_lam *= -volume
         if LOADED:
             point, own, now = twin_data(0, FORCES, index, mask, scene, values, count, vectors, scenes, step, numbers)
             more, by_v, by_vector, by_numbers = FORCES.adjoints[0](F, v, point, own, now, numbers + FORCES.tables[0], a)
@@ -102,6 +121,20 @@ def particles_adjoint(
                 for c in tl.static_range(3):
                     _add(to + c, tl.sum(tl.where(mask, by_vector[c], 0.0), 1), real, chunk)
                     _add(to + 4 + c, tl.sum(tl.where(mask, by_numbers[c], 0.0), 1), real, chunk)
+        if SHEETS:
+            bars = scale3(-volume, by_m) + (-volume * by_area, -volume * by_thickness, -volume * by_thinning)
+            by_F, one, two = flattened_adjoint(bent, n, mu, lam, by_F + bars)
+            by_F = axpy9(1.0, by_F, -volume, by_bent)
+            by_mu += one
+            by_lam += two
+        if MATERIAL:
+            to = found + index
+            tl.store(to, tl.load(to, mask, 0.0) + by_mu, mask)
+            tl.store(to + count, tl.load(to + count, mask, 0.0) + by_lam, mask)
+            # the stress is homogeneous in mu and lambda, so Q : P follows from its derivatives
+            to = found + 2 * count + index
+            work = (mu * by_mu + lam * by_lam) / tl.where(mask, volume, 1.0)
+            tl.store(to, tl.load(to, mask, 0.0) + work, mask)
         for i in range(3):
             wx, gx = node_weight(f[0], i, inverse_dx)
             for j in range(3):
@@ -123,6 +156,17 @@ def particles_adjoint(
                             _add(out + 4 + c, tl.sum(wz[k] * b[c] + gw * by_rate[3 * c + 2], 1), real, chunk)
                         elif LOADED:
                             _add(out + 4 + c, tl.sum(wz[k] * w * by_v[c], 1), real, chunk)
+
+
+@triton.jit
+def bend_adjoint(bent_node, fields, force_bar, found):
+    """Add the gradient by a row of the matrix of a cell that bends, 32 columns of which 27 count, in a substep."""
+    row = tl.program_id(0) * 27 + tl.program_id(1)
+    o = tl.arange(0, 32)
+    a = vector(force_bar + tl.load(bent_node + row) * 8, True)
+    u = vector(fields + tl.load(bent_node + tl.program_id(0) * 27 + o, o < 27, 0) * 8, o < 27)
+    to = found + row * 32 + o
+    tl.store(to, tl.load(to) - (a[0] * u[0] + a[1] * u[1] + a[2] * u[2]))
 
 
 @triton.jit

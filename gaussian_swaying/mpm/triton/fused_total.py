@@ -143,10 +143,10 @@ class FusedTotal(Fused):
         self.rank, self.curving = rows.shape[1], rows.contiguous()
         check_indices(self.curving.numel())
 
-    def _bend(self, partial: Tensor, width: int) -> None:
+    def _bend(self, fields: Tensor, partial: Tensor, width: int) -> None:
         block = lanes(self.device, _BENT, 1)
         launch(kernels.total_bend, (-(-self.bent // block),))(
-            self.bent_cell, self.bent_node, self.curving, self.fields, partial, self.bent, self.cells,
+            self.bent_cell, self.bent_node, self.curving, fields, partial, self.bent, self.cells,
             WIDTH=width, RANK=self.rank, BLOCK=block, num_warps=1,
         )  # fmt: skip
 
@@ -279,7 +279,7 @@ class FusedTotal(Fused):
             pieces, partial = partial, self.sums(self.cells, width)
             self.join_pieces(pieces, partial, width)
         if self.bent:
-            self._bend(partial, width)
+            self._bend(self.fields, partial, width)
         nodes, block = len(self.active), lanes(self.device, 16, 1)
         source, sources = self.source, len(self.source)
         if block == 1:
@@ -504,6 +504,7 @@ class DifferentiableTotal(FusedTotal):
             torch.zeros(*shape, **self.like)
             for shape in ((self.nodes, 8), (self.nodes,), (3, self.count), (0, self.nodes, 8), (0, self.pieces, 8))
         )
+        self.stiffness_bar = torch.zeros(self.bent, 27, 32, **self.like)
         self.last = torch.zeros_like(self.first_step)
         self.made = 1
         self._take_rows()
@@ -540,18 +541,12 @@ class DifferentiableTotal(FusedTotal):
         points = bound.points
         if not self.plain or self.touching is not None:
             return "boundaries other than pins that hold all the time, and contact, have no backward kernels"
-        if self.bent:
-            return "sheets of one layer that bend have no backward kernels"
-        if self.virtual:
-            return "virtual nodes have no backward kernels"
-        if any(derivative is None for derivative in self.laws.adjoints):
-            return "a law has no backward kernel (`LawFunctions.adjoint`)"
         twin = forces[0].twin() if forces else None
         if len(forces) > 1 or (forces and twin is None):
             return "only one force with a Triton twin has a backward kernel"
         if twin is not None and twin.adjoint is None:
             return f"this {type(forces[0]).__name__} has no backward kernel"
-        free = [points.mass, points.volume, points.youngs_modulus, points.poisson_ratio]
+        free = [points.mass, points.volume, points.youngs_modulus, points.poisson_ratio, points.bending]
         fixed = [t for t in bound.tensors() if not any(t is other for other in free)]
         fixed += [] if twin is None else [t for t in tensors_of(forces) if any(t is source for source in twin.sources)]
         fixed += [t for law in points.laws for t in (*law.parameters(), *law.buffers())]
@@ -591,11 +586,12 @@ class DifferentiableTotal(FusedTotal):
         laws, points, holds = bound.laws, bound.points, bound.point_holds
         displacement, velocity = _Rollout.apply(
             run, *state.nodal, laws.mu, laws.lam, points.volume,
-            bound.node_inverse_mass, None if holds is None else holds.weight, vectors, numbers,
+            bound.node_inverse_mass, None if holds is None else holds.weight,
+            None if bound.bending is None else bound.bending.stiffness, vectors, numbers,
         )  # fmt: skip
         end = run.state
         rows = gather(torch.cat([displacement, velocity], dim=-1), bound.stencil)
-        return bound.with_rows(end, displacement, velocity, rows)
+        return bound.in_shape(bound.with_rows(end, displacement, velocity, rows))
 
     def forward(self, run: _Run) -> tuple[Tensor, ...]:
         """Run all segments and keep the state at the start of each; the nodal fields at the end."""
@@ -622,13 +618,22 @@ class DifferentiableTotal(FusedTotal):
         self._make_room(run.every, loaded)
         self.width = 8 if loaded or self.options["VISCOUS"] else 4
         self.partial = self.sums(self.cells, self.width, "adjoint")
-        for buffer in (self.bars, self.force_bar, self.mass_bar, self.material_bar, self.partial, self.fields):
+        for buffer in (
+            self.bars,
+            self.force_bar,
+            self.mass_bar,
+            self.material_bar,
+            self.stiffness_bar,
+            self.partial,
+            self.fields,
+        ):
             buffer.zero_()
         for k, bar in enumerate(bars):
             self.bars[:, 4 * k : 4 * k + 3] = bar.reshape(-1, 3)[self.place]
         shares = loaded and (needs["vectors"] or needs["numbers"])
         material = any(needs[name] for name in ("mu", "lam", "volume"))
         self.flags = {"MATERIAL": material, "SHARES": shares, "MASS": needs["inverse_mass"], "WEIGHTS": needs["weight"]}
+        self.flags["BENDING"] = needs["stiffness"]
         if self.points is not None:
             self.weight_bar.zero_()
         vector_bars: list[Tensor] = []
@@ -657,6 +662,7 @@ class DifferentiableTotal(FusedTotal):
         inverse = bound.node_inverse_mass
         mass = torch.zeros(inverse.numel(), **self.like).index_copy(0, self.place, self.mass_bar)
         found["inverse_mass"] = mass.reshape(inverse.shape)
+        found["stiffness"] = self.stiffness_bar[:, :, :27]
         if self.points is not None and bound.point_holds is not None:
             padded = torch.nn.functional.pad(self.weight_bar, (0, 0, 0, 1))
             weight = bound.point_holds.weight
@@ -758,17 +764,24 @@ class DifferentiableTotal(FusedTotal):
         cut = self.pieces > self.cells
         to = self.sums(self.pieces, self.width, "adjoint pieces") if cut else self.partial
         launch(adjoint_kernels.particles_adjoint, (triton.cdiv(self.pieces, per_program),))(
-            self.fraction, self.material, self.law, self.law_table, self.values, self.count,
-            self.piece_start, self.piece_node, self.piece_scene, self.pieces,
+            self.fraction, self.material, self.normals, self.law, self.law_table, self.values, self.count,
+            self.piece_start, self.piece_node, self.piece_scene, self.pieces, self.piece_nodes,
             self.fields, self.force_bar, to, self.material_bar, self.shares,
             self.loads.vectors, self.scenes, self.loads.tables.buffer, self.first_step, offset, self.last,
             ny * nz, nz, 1 / self.grid.dx, self.settings.stiffness_damping,
             LAWS=self.laws, MULTI=options["MULTI"], FORCES=options["FORCES"], VISCOUS=options["VISCOUS"],
             MATERIAL=flags["MATERIAL"], SHARES=flags["SHARES"], WIDTH=self.width, CELLS=per_program, LANES=self.lanes,
-            num_warps=1, **({"maxnreg": REGISTERS} if self.lanes == 64 else {}),
+            VIRTUAL=self.virtual, SHEETS=self.bent > 0, num_warps=1,
+            **({"maxnreg": REGISTERS} if self.lanes == 64 else {}),
         )  # fmt: skip
         if cut:
             self.join_pieces(to, self.partial, self.width)
+        if self.bent:
+            self._bend(self.force_bar, self.partial, self.width)  # its matrix is symmetric
+            if flags["BENDING"]:
+                launch(adjoint_kernels.bend_adjoint, (self.bent, 27))(
+                    self.bent_node, self.fields, self.force_bar, self.stiffness_bar, num_warps=1
+                )
 
     def _shared(self, count: int) -> tuple[Tensor, Tensor]:
         """Gradients by the vectors of a segment (count, scenes, 3) and by the numbers (3,), summed over particles."""
@@ -810,7 +823,18 @@ class _Run:
     kicks: list[float] = field(default_factory=list)
 
 
-_INPUTS = ("displacement", "velocity", "mu", "lam", "volume", "inverse_mass", "weight", "vectors", "numbers")
+_INPUTS = (
+    "displacement",
+    "velocity",
+    "mu",
+    "lam",
+    "volume",
+    "inverse_mass",
+    "weight",
+    "stiffness",
+    "vectors",
+    "numbers",
+)
 
 
 class _Rollout(torch.autograd.Function):
