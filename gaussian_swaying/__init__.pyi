@@ -46,7 +46,7 @@ from .wind.field import SpatialWind as SpatialWind
 from .wind.field import UniformGust as UniformGust
 from .wind.field import WindField as WindField
 from .wind.force import AeroForce as AeroForce
+from .wind.force import WindForce as WindForce
 from .wind.force import aero_force as aero_force
-from .wind.wind_force import WindForce as WindForce
 
 __version__: str

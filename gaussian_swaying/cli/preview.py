@@ -64,7 +64,7 @@ from gaussian_swaying.preview.suggest import (
 from gaussian_swaying.simulation.progress import duration
 from gaussian_swaying.simulation.roles import classify
 from gaussian_swaying.simulation.simulation import Simulation
-from gaussian_swaying.wind.looks import LOOKS
+from gaussian_swaying.wind.turbulence import LOOKS
 
 LARGE = 256_000_000  # bytes of a file of which only the constant colours are read
 LOADED = time.process_time()  # s; for the interpreter and the imports so far, which a run needs too

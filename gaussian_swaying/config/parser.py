@@ -28,11 +28,10 @@ from gaussian_swaying.config.material_names import NAMES, with_material_option, 
 from gaussian_swaying.interop.physgaussian.convert import convert, read_config, to_yaml
 from gaussian_swaying.mpm.protocol import Solver
 from gaussian_swaying.rendering.cameras.keyframes import KeyframedCamera
-from gaussian_swaying.wind.carried import Turbulence
+from gaussian_swaying.wind.effects import CylinderObstacle, EllipsoidObstacle
 from gaussian_swaying.wind.field import SpatialWind
-from gaussian_swaying.wind.obstacles import CylinderObstacle, EllipsoidObstacle
-from gaussian_swaying.wind.recorded import FrozenWind
-from gaussian_swaying.wind.shelter import Shelter
+from gaussian_swaying.wind.tables import FrozenWind, Shelter
+from gaussian_swaying.wind.turbulence import Turbulence
 
 if TYPE_CHECKING:
     from jsonargparse import ArgumentParser, Namespace

@@ -17,8 +17,8 @@ from gaussian_swaying.simulation.diagnostics import SimulationDiverged
 from gaussian_swaying.simulation.parameters import Setup, parameter, with_values
 from gaussian_swaying.simulation.simulation import Simulation
 from gaussian_swaying.simulation.stepper import Stepper, why_not_batched
-from gaussian_swaying.wind.added_mass import with_added_mass
 from gaussian_swaying.wind.field import WindField
+from gaussian_swaying.wind.force import with_added_mass
 
 Values = Mapping[str, float]
 

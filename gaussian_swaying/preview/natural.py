@@ -31,8 +31,7 @@ from gaussian_swaying.preview.stretch import cloth_motion, linear_motion, rate_f
 from gaussian_swaying.simulation.simulated_scene import SimulatedScene
 from gaussian_swaying.simulation.simulation import Simulation
 from gaussian_swaying.wind.field import WindField
-from gaussian_swaying.wind.force import AeroForce, added_mass_per_area
-from gaussian_swaying.wind.wind_force import WindForce
+from gaussian_swaying.wind.force import AeroForce, WindForce, added_mass_per_area
 
 FLAPS, HANGS, CLOTH_RATIO = 0.35, 0.6, 0.3
 """Frequency of a flag times its length over the wind; of a hanging sheet times the root of its length; damping."""

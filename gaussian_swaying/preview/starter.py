@@ -14,7 +14,7 @@ from gaussian_swaying.mpm.materials import known_material
 from gaussian_swaying.preview.kinds import KINDS
 from gaussian_swaying.preview.suggest import Suggestion
 from gaussian_swaying.preview.up import wind_words
-from gaussian_swaying.wind.looks import CELLS, LOOKS, turbulence_length
+from gaussian_swaying.wind.turbulence import CELLS, LOOKS, turbulence_length
 
 PICTURE = (960, 540)
 FRAME_DT = 0.04  # s

@@ -15,7 +15,7 @@ import torch
 
 from gaussian_swaying.mpm.modes import Modes
 from gaussian_swaying.wind.field import WindField
-from gaussian_swaying.wind.wind_force import WindForce
+from gaussian_swaying.wind.force import WindForce
 
 SAMPLES, RATE, LEAST_RATE, PER_PERIOD = 60_000, 25.0, 6.0, 10.0  # of a record; in a second; in a period
 PLACES, LINES, BLOCK = 96, 20, 12  # at which the wind is taken; lines along it on which they lie; added at once

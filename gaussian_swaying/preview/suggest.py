@@ -50,7 +50,7 @@ from gaussian_swaying.preview.up import UpGuess, given_up, guess_up
 from gaussian_swaying.simulation.extent import suggest_spacing
 from gaussian_swaying.simulation.simulation import Simulation
 from gaussian_swaying.wind.field import WindField
-from gaussian_swaying.wind.looks import LOOKS
+from gaussian_swaying.wind.turbulence import LOOKS
 
 QUALITIES = {"draft": 16, "normal": 24, "fine": 48}  # cells along the longest side; normal is enough for bending
 CELLS = QUALITIES["normal"]
@@ -149,7 +149,7 @@ class Suggestion:
         azimuth: Azimuth of a camera that sees the broad side, or the side seen in photos [degrees].
         flow: Wind across the picture, or along a sheet from its held side [m/s], z up.
         start: Time at which a typical stretch of the turbulence begins [s].
-        look: The name of the wind, one of :data:`~gaussian_swaying.wind.looks.LOOKS`.
+        look: The name of the wind, one of :data:`~gaussian_swaying.wind.turbulence.LOOKS`.
         kind: What it is, one of :data:`~gaussian_swaying.preview.kinds.KINDS`.
         kind_reason: Why, in words.
         material: The known material of its surface, of the kind or as it was given.

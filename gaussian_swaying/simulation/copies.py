@@ -18,8 +18,8 @@ from gaussian_swaying.recording.recorder import Recorder
 from gaussian_swaying.simulation.parameters import Setup
 from gaussian_swaying.simulation.simulated_scene import SimulatedScene
 from gaussian_swaying.wind.field import WindField
-from gaussian_swaying.wind.shelter import Shelter
-from gaussian_swaying.wind.wind_force import Places, Wind
+from gaussian_swaying.wind.force import Places, Wind
+from gaussian_swaying.wind.tables import Shelter
 
 RENDERS = ("color", "depth", "normal")
 """Renders of a run with copies."""

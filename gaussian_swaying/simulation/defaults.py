@@ -35,7 +35,7 @@ from gaussian_swaying.simulation.scene import Scene
 from gaussian_swaying.simulation.simulated_scene import SimulatedScene
 from gaussian_swaying.wind.field import SpatialWind, WindField, flow_rows
 from gaussian_swaying.wind.force import AeroForce
-from gaussian_swaying.wind.looks import LOOKS, look
+from gaussian_swaying.wind.turbulence import LOOKS, look
 
 if TYPE_CHECKING:
     SceneLike = Scene | ProceduralScene | GaussianCloud | str | os.PathLike[str]

@@ -18,7 +18,7 @@ from gaussian_swaying.geometry.neighbours import nearest_neighbours
 from gaussian_swaying.kernels.graphs import RECORDED, Replayed
 from gaussian_swaying.mpm.protocol import Solver
 from gaussian_swaying.mpm.state import State, support_force
-from gaussian_swaying.wind.added_mass import AirLift
+from gaussian_swaying.wind.force import AirLift
 
 _PARTICLES = ("moved_particle", "compressed_particle", "stretched_particle")
 _SAMPLE = 4096  # particles whose nearest neighbour is searched

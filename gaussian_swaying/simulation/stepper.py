@@ -39,12 +39,11 @@ from gaussian_swaying.simulation.diagnostics import (
 from gaussian_swaying.simulation.parameters import Setup
 from gaussian_swaying.simulation.progress import RunProgress
 from gaussian_swaying.simulation.simulated_scene import SimulatedScene
-from gaussian_swaying.wind.added_mass import AirLift, carried_mass, with_added_mass
 from gaussian_swaying.wind.computed_air import AirInBox
 from gaussian_swaying.wind.field import WindField
+from gaussian_swaying.wind.force import AirLift, Wind, WindForce, carried_mass, with_added_mass
 from gaussian_swaying.wind.patches import Patches
-from gaussian_swaying.wind.shelter import Shelter
-from gaussian_swaying.wind.wind_force import Wind, WindForce
+from gaussian_swaying.wind.tables import Shelter
 
 CFL_SAMPLES = 8  # checks per frame, as material may stiffen and soften again within it
 MAX_WIND = 1e6  # m/s; anything above is a mistake and would overflow positions

@@ -35,10 +35,10 @@ from gaussian_swaying.mpm.protocol import Solver
 from gaussian_swaying.mpm.state import State
 from gaussian_swaying.mpm.timestep import look_marks
 from gaussian_swaying.mpm.twins import Numbers, Twin
+from gaussian_swaying.wind.effects import Obstacle
 from gaussian_swaying.wind.field import WindField
-from gaussian_swaying.wind.obstacles import Obstacle
-from gaussian_swaying.wind.shelter import Shelter
-from gaussian_swaying.wind.wind_force import WindForce
+from gaussian_swaying.wind.force import WindForce
+from gaussian_swaying.wind.tables import Shelter
 
 LEAST_CELLS = 8
 """Cells along the longest side of the body: with fewer, no wake of it is resolved."""

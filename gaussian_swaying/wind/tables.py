@@ -1,16 +1,27 @@
-"""Effects that are looked up in a table, by linear interpolation between its corners."""
+"""Effects that are looked up in a table, by linear interpolation between its corners.
+
+Fields that the mean wind carries, winds from files, and the shelter that a body gives itself.
+"""
 
 from __future__ import annotations
 
+import os
 from abc import abstractmethod
+from collections.abc import Sequence
+from pathlib import Path
 
 import torch
 from torch import Tensor
 
+from gaussian_swaying._checks import check_positive, check_vector
+from gaussian_swaying._devices import in_double
+from gaussian_swaying._fixed import changed
+from gaussian_swaying.geometry.frame import SimFrame
 from gaussian_swaying.geometry.linalg_triton import add3, chosen, matvec, scale3
 from gaussian_swaying.kernels.language import tl, triton
 from gaussian_swaying.mpm.twins import Numbers, Twin
-from gaussian_swaying.wind.effects import Moment, WindEffect
+from gaussian_swaying.wind.effects import Moment, WindEffect, placed
+from gaussian_swaying.wind.wind_files import read_bts, read_grid
 
 
 @triton.jit
@@ -154,3 +165,310 @@ class Tabulated(WindEffect):
             table=Numbers(self.table.numel(), lambda: self.table),
             sources=(self,),
         )
+
+
+def box_axes(flow: Tensor, sides: Sequence[float], tilted: bool) -> Tensor:
+    r"""Axes of a box that a flow carries along its x axis, as rows; y is horizontal.
+
+    A periodic box repeats after one length. With ``tilted``, it is turned against the flow, so that each length later a
+    point meets the box 0.382 of its width and 0.236 of its height further on, and only after many lengths close to the
+    first place. The turn does not change isotropic turbulence.
+
+    Args:
+        flow: The flow [m/s], shape (3,); x if it is zero.
+        sides: Lengths of the box along its axes [m].
+        tilted: Whether to turn it.
+
+    Returns:
+        Orthonormal, shape (3, 3), float64.
+    """
+    axes = wind_axes(flow.double())
+    if not tilted:
+        return axes
+    first = torch.tensor([sides[0], 0.382 * sides[1], 0.236 * sides[2]], dtype=torch.float64)
+    first = first / first.norm()  # the direction of the flow along the axes of the box
+    second = torch.nn.functional.normalize(torch.tensor([-first[1], first[0], 0.0], dtype=torch.float64), dim=0)
+    turn = torch.stack([first, second, torch.linalg.cross(first, second)])  # rows: x, y, z of the flow in the box
+    return turn.T @ axes
+
+
+class CarriedField(Tabulated):
+    """Adds a frozen field that the mean flow carries along (Taylor 1938), by linear interpolation.
+
+    Args:
+        table: Velocities at the corners of its cells, along its own axes, shape (X, Y, Z, 3), float32.
+        spacing: Sides of a cell [m].
+        origin: A point in scene units; in Python [m], z up, from the object's centre.
+        anchor: Position of that point in the field at time zero, from its first corner, along its axes [m].
+        wraps: Whether it repeats along each axis; if not, its outermost values go on outside.
+        scale: Factor of the velocities.
+        tilted: See :func:`box_axes`.
+
+    Raises:
+        ValueError: If the table has the wrong shape.
+    """
+
+    def __init__(
+        self,
+        table: Tensor,
+        spacing: Sequence[float],
+        origin: Sequence[float] = (0.0, 0.0, 0.0),
+        anchor: Sequence[float] = (0.0, 0.0, 0.0),
+        wraps: tuple[bool, bool, bool] = (True, True, True),
+        scale: float = 1.0,
+        tilted: bool = False,
+    ) -> None:
+        if table.ndim != 4 or table.shape[-1] != 3 or min(table.shape[:3]) < 2:
+            raise ValueError(f"Expected `table` of shape (X, Y, Z, 3), at least 2 each, but got {tuple(table.shape)}.")
+        self.spacing = check_vector("spacing", spacing)
+        self.origin, (self.scale,) = check_vector("origin", origin), check_vector("scale", [scale], 1)
+        self.tilted = bool(tilted)
+        step, place, first = (torch.tensor(v, dtype=torch.float64) for v in (self.spacing, self.origin, anchor))
+        super().__init__(table, step, place, wraps)
+        self.register_buffer("anchor", first, persistent=False)
+        self.register_buffer("start", torch.zeros_like(first), persistent=False)
+
+    anchor: Tensor
+    start: Tensor
+
+    def along(self, flow: Tensor) -> WindEffect:
+        """The field with its x axis turned into the flow."""
+        return changed(self, axes=box_axes(flow.detach().cpu(), (self.sizes * self.step).tolist(), self.tilted))
+
+    def in_frame(self, frame: SimFrame) -> WindEffect:
+        """The origin in metres."""
+        return changed(self, place=torch.tensor(placed(frame, self.origin), dtype=torch.float64))
+
+    def now(self, moment: Moment) -> Tensor:
+        """The place of the object's centre in the field, in its first period where it repeats, and the strength."""
+        place = self.anchor - (self.place + self.start + moment.carried) @ self.axes.T
+        parts = zip(place.unbind(-1), (self.sizes * self.step).unbind(), self.wraps, strict=True)
+        place = torch.stack([x.remainder(side) if wraps else x for x, side, wraps in parts], dim=-1)
+        return torch.cat([place / self.step, torch.zeros_like(place[:, :1]) + self.strength(moment.flow)], dim=-1)
+
+    def strength(self, flow: Tensor) -> Tensor | float:
+        """Factor of the velocities in a mean flow [m/s], shape (n, 3); shape (n, 1), or one number."""
+        return self.scale
+
+    twin = Tabulated.twin
+
+
+class FrozenWind(CarriedField):
+    """Adds a frozen field from a file, carried by the mean flow: TurbSim's .bts, hipersim's .nc, or a .npz.
+
+    The x axis of the file points along the flow, y to its left, z up. Along the wind it starts again at its end; across
+    and up its outermost values go on outside.
+
+    A .bts contains the mean wind as well. The mean at the hub is subtracted, since ``wind.flow`` has it and must have
+    the same speed; the turbulence and the profile of the mean are left. Other files contain deviations from the mean.
+
+    Args:
+        path: The file; for .nc and .npz see :func:`~gaussian_swaying.wind.wind_files.read_grid`.
+        origin: The point, in scene units, that passes the first plane of the file at time zero: in the middle of its
+            width, and on the ground for a .bts, at z = 0 of the file otherwise.
+        scale: Factor of the velocities.
+
+    Raises:
+        ValueError: If the file does not fit, or the flow is not that of a .bts.
+    """
+
+    twin = Tabulated.twin
+
+    def __init__(
+        self, path: str | os.PathLike[str], origin: Sequence[float] = (0.0, 0.0, 0.0), scale: float = 1.0
+    ) -> None:
+        self.path, self.speed = str(path), None
+        if Path(path).suffix == ".bts":
+            found = read_bts(path)
+            speed = found.speed
+            velocity = torch.from_numpy(found.velocity).clone()
+            velocity[..., 0] -= speed
+            table = velocity.roll(-1, 0).flip(0)  # later planes are further upwind
+            if table.shape[2] == 1:
+                table = table.expand(-1, -1, 2, -1)
+            spacing = (speed * found.dt, *found.spacing)
+            middle = 0.5 * (table.shape[1] - 1) * spacing[1]
+            super().__init__(
+                table.contiguous(), spacing, origin, (0.0, middle, -found.bottom), (True, False, False), scale
+            )
+            self.speed = speed
+            return
+        grid = read_grid(path)
+        if len(grid.times) > 1:
+            raise ValueError(f"{path} changes over time: use RecordedWind.")
+        table = torch.from_numpy(grid.velocity)[0]
+        middle = 0.5 * (table.shape[1] - 1) * grid.spacing[1]
+        anchor = (0.0, middle, -grid.first[2])
+        super().__init__(table.contiguous(), grid.spacing, origin, anchor, (True, False, False), scale)
+
+    def along(self, flow: Tensor) -> WindEffect:
+        """The field with its x axis turned into the flow, which must be that of the file."""
+        speed = float(flow.norm())
+        if self.speed is not None and abs(speed - self.speed) > 0.01 * self.speed:
+            raise ValueError(
+                f"The mean wind of {self.path} is {self.speed:.4g} m/s, but `wind.flow` has {speed:.4g} m/s: set it to "
+                f"{self.speed:.4g} m/s in the direction that you want."
+            )
+        return super().along(flow)
+
+
+class RecordedWind(Tabulated):
+    """Adds a wind that was recorded on a regular grid, over time; linear in time and along each axis.
+
+    Outside the grid its outermost values go on. With ``wind.flow: [0, 0, 0]`` it is the whole wind.
+
+    Args:
+        path: A .npz or .nc file, see :func:`~gaussian_swaying.wind.wind_files.read_grid`; places in m and velocities in
+            m/s, z up.
+        origin: The point x = y = z = 0 of the file, in scene units.
+        start: Time of the file at time zero of the run [s]; its first time if null.
+        repeat: Whether it starts again after its last time, which is then followed by the first as by any other; if
+            not, the last field stays.
+        scale: Factor of the velocities.
+
+    Raises:
+        ValueError: If the file does not fit.
+    """
+
+    twin = Tabulated.twin
+
+    def __init__(
+        self,
+        path: str | os.PathLike[str],
+        origin: Sequence[float] = (0.0, 0.0, 0.0),
+        start: float | None = None,
+        repeat: bool = False,
+        scale: float = 1.0,
+    ) -> None:
+        grid = read_grid(path)
+        self.path, self.origin = str(path), list(check_vector("origin", origin))
+        (self.scale,), self.repeat = check_vector("scale", [scale], 1), bool(repeat)
+        times = torch.from_numpy(grid.times)
+        begin = float(times[0]) if start is None else check_vector("start", [start], 1)[0]
+        step = float((times[-1] - times[0]) / (len(times) - 1)) if len(times) > 1 else 1.0
+        check_positive("the step of time", step)
+        self.period = float(times[-1] - times[0]) + step
+        spacing, first, place = (torch.tensor(v, dtype=torch.float64) for v in (grid.spacing, grid.first, self.origin))
+        super().__init__(torch.from_numpy(grid.velocity), spacing, place)
+        begin_at = torch.tensor(begin - float(times[0]), dtype=torch.float64)
+        for name, value in {"times": times - times[0], "begin": begin_at, "first": first}.items():
+            self.register_buffer(name, value, persistent=False)
+
+    times: Tensor
+    begin: Tensor
+    first: Tensor
+
+    def in_frame(self, frame: SimFrame) -> WindEffect:
+        """The origin in metres, z up."""
+        return changed(self, place=torch.tensor(placed(frame, self.origin), dtype=torch.float64))
+
+    def now(self, moment: Moment) -> Tensor:
+        last = len(self.times) - 1
+        now = moment.time + self.begin
+        now = now.remainder(self.period) if self.repeat else now
+        key = (torch.searchsorted(self.times, now, right=True) - 1).clamp(0, last)
+        after = (key + 1).remainder(last + 1) if self.repeat else (key + 1).clamp(max=last)
+        begin, end = self.times.index_select(0, key), self.times.index_select(0, after)
+        share = (now - begin) / torch.where(after > key, end - begin, self.period - begin)
+        place = (-(self.place + self.first) / self.step).expand(len(now), 3)
+        rest = torch.stack([torch.full_like(now, self.scale), key, after, share.clamp(0, 1)], dim=-1)
+        return torch.cat([place, rest], dim=-1)
+
+
+def extinction(density: Tensor, spacing: Tensor) -> Tensor:
+    r"""Share of the wind that is left on its way along the first axis of a grid.
+
+    Leaves of a drag area per volume a take the momentum :math:`\tfrac12 \rho a u^2` from the air, so that
+
+    .. math:: \frac{du}{ds} = -\tfrac12 a u, \qquad u = u_0 \exp\Bigl(-\tfrac12 \int a\, ds\Bigr)
+
+    as inside plant canopies (Cionco 1965, J. Appl. Meteorol. 4; here without mixing from above). The integral is summed
+    by the trapezoidal rule.
+
+    Args:
+        density: Drag area (C_D A) per volume at the corners of the cells [1/m], shape (X, Y, Z).
+        spacing: Side of a cell along the wind [m], scalar.
+
+    Returns:
+        Shape (X, Y, Z).
+    """
+    depth = spacing * (density.cumsum(0) - 0.5 * density)
+    return torch.exp(-0.5 * depth)
+
+
+def deposited(place: Tensor, amount: Tensor, cells: int) -> Tensor:
+    """Amounts shared among the eight corners around each place, by the weights of trilinear interpolation.
+
+    They are summed as whole numbers of 2^-40 of the largest, so that the sum does not depend on its order.
+
+    Args:
+        place: Places in cells from the first corner, shape (P, 3); within the grid.
+        amount: Shape (P,).
+        cells: Corners along each axis.
+
+    Returns:
+        Shape (cells, cells, cells).
+    """
+    place = place.nan_to_num(0.0)
+    low = place.floor().clamp(0, cells - 2)
+    share = place - low
+    unit = in_double(amount).amax().clamp(min=1e-300) * 2.0**-40
+    found = torch.zeros(cells**3, dtype=torch.long, device=unit.device)
+    for corner in range(8):
+        bits = [(corner >> axis) & 1 for axis in range(3)]
+        weight, row = amount, torch.zeros_like(low[:, 0], dtype=torch.long)
+        for axis, bit in enumerate(bits):
+            weight = weight * (share[:, axis] if bit else 1 - share[:, axis])
+            row = row * cells + low[:, axis].long() + bit
+        found = found.index_add(0, row.to(unit.device), (in_double(weight) / unit).round().long())
+    return (found * unit).to(place).view(cells, cells, cells)
+
+
+class Shelter(Tabulated):
+    """The body's own patches slow the wind on its way, by the exponential law of :func:`extinction`.
+
+    Meant for crowns, hedges and stands of plants: many small leaves to a cell. A single sheet across the wind would
+    shelter itself, since the cells do not know that its patches lie side by side. It is computed again at the start of
+    every frame, from the shape of the body then, in the direction of the mean flow. Place it last in the list.
+
+    Args:
+        cells: Corners of the grid along each axis; its side is the longest of the body's box. A cell should contain
+            several leaves.
+        strength: Factor of the drag area, for example for leaves that the splat does not show.
+    """
+
+    twin = Tabulated.twin
+
+    def __init__(self, cells: int = 32, strength: float = 1.0) -> None:
+        if isinstance(cells, bool) or not isinstance(cells, int) or not 4 <= cells <= 256:
+            raise ValueError(f"Expected `cells` to be a whole number from 4 to 256, but got {cells!r}.")
+        check_positive("strength", strength, allow_zero=True)
+        self.cells, self.strength = cells, float(strength)
+        one = torch.ones(3, dtype=torch.float64)
+        super().__init__(torch.ones(cells, cells, cells, 1), one, torch.zeros_like(one))
+
+    def in_frame(self, frame: SimFrame) -> WindEffect:
+        """A copy, which a simulation refreshes; the given one stays as it is, for the comparison before a resume."""
+        return changed(self, **{name: held.clone() for name, held in self.named_buffers()})
+
+    def refresh(self, position: Tensor, drag_area: Tensor, axes: Tensor) -> None:
+        """Compute the share of the wind that is left, from the present shape of the body.
+
+        Args:
+            position: Of the particles [m], shape (P, 3).
+            drag_area: C_D A of each [m²], shape (P,).
+            axes: Axes of the grid, the wind first, as rows, shape (3, 3).
+        """
+        turned = position @ axes.to(position).T
+        low, high = turned.amin(0), turned.amax(0)
+        side = ((high - low).amax() / (self.cells - 3)).clamp(min=1e-9)
+        shift = 0.5 * (self.cells - 1) - 0.5 * (low + high) / side
+        amount = self.strength * drag_area.to(position) / side**3
+        density = deposited(turned / side + shift, amount, self.cells)
+        self.table.copy_(extinction(density, side)[..., None])
+        self.axes.copy_(axes)
+        self.step.copy_(side)
+        self.place.copy_(shift)
+
+    def now(self, moment: Moment) -> Tensor:
+        return torch.nn.functional.pad(self.place, (0, 1)).expand(len(moment.time), 4)

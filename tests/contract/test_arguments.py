@@ -42,8 +42,8 @@ from gaussian_swaying.gaussians.parts import Part, Parts
 from gaussian_swaying.mpm.laws.plastic import Sand
 from gaussian_swaying.scenes.procedural import FlagScene
 from gaussian_swaying.simulation.material import MaterialRegion
-from gaussian_swaying.wind.carried import Turbulence
 from gaussian_swaying.wind.computed_air import ComputedAir
+from gaussian_swaying.wind.turbulence import Turbulence
 
 FLAG, ZERO, UNIT = FlagScene(spacing=0.1), [0.0, 0.0, 0.0], [1.0, 1.0, 1.0]
 BOX, CLOUD = Box(ZERO, UNIT), FLAG.generate()

@@ -41,9 +41,9 @@ from gaussian_swaying.mpm.laws.plastic import Sand
 from gaussian_swaying.mpm.pins import Impulse
 from gaussian_swaying.scenes.procedural import FlagScene
 from gaussian_swaying.simulation.material import MaterialRegion
-from gaussian_swaying.wind.carried import Turbulence
 from gaussian_swaying.wind.computed_air import ComputedAir
-from gaussian_swaying.wind.shelter import Shelter
+from gaussian_swaying.wind.tables import Shelter
+from gaussian_swaying.wind.turbulence import Turbulence
 
 POLE = Box([None] * 3, [0.11, None, None])
 FLAG = FlagScene(spacing=0.1)

@@ -12,10 +12,10 @@ from gaussian_swaying.mpm.laws.plastic import Sand, Snow
 from gaussian_swaying.mpm.solver import MPMSolver
 from gaussian_swaying.scenes import FlagScene, GivenScene, SolidScene
 from gaussian_swaying.simulation.scene import Scene
-from gaussian_swaying.wind.carried import Turbulence
 from gaussian_swaying.wind.computed_air import ComputedAir
 from gaussian_swaying.wind.field import GaussianGust, SineSway
-from gaussian_swaying.wind.shelter import Shelter
+from gaussian_swaying.wind.tables import Shelter
+from gaussian_swaying.wind.turbulence import Turbulence
 
 FLAG = FlagScene(spacing=0.1).generate()
 PIN = PinnedRegion(Box([None] * 3, [0.11, None, None]))

@@ -12,9 +12,8 @@ from gaussian_swaying.mpm.state import MaterialPoints
 from gaussian_swaying.scenes.procedural import FlagScene
 from gaussian_swaying.simulation import stepper
 from gaussian_swaying.wind.field import WindField
-from gaussian_swaying.wind.force import AeroForce
+from gaussian_swaying.wind.force import AeroForce, WindForce
 from gaussian_swaying.wind.patches import Patches
-from gaussian_swaying.wind.wind_force import WindForce
 
 TIMES = [0.0, 1 / 24, 2 / 24, 4 / 24]
 

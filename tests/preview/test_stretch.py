@@ -8,7 +8,7 @@ import torch
 
 from gaussian_swaying.preview import stretch
 from gaussian_swaying.preview.stretch import cloth_motion, rate_for, typical_start
-from gaussian_swaying.wind.looks import look
+from gaussian_swaying.wind.turbulence import look
 
 
 @pytest.mark.parametrize(("frequency", "ratio"), [(0.8, 0.08), (2.0, 0.1), (5.0, 0.05)])

@@ -40,7 +40,7 @@ from gaussian_swaying.scenes.leaves import LeavesScene
 from gaussian_swaying.scenes.procedural import FlagScene
 from gaussian_swaying.simulation.extent import suggest_spacing
 from gaussian_swaying.simulation.simulation import Simulation
-from gaussian_swaying.wind.looks import LOOKS
+from gaussian_swaying.wind.turbulence import LOOKS
 
 VISIBLE = math.log(9.0)
 """Logit of an opacity of 0.9."""

@@ -30,7 +30,7 @@ from gaussian_swaying.simulation.material import Material
 from gaussian_swaying.simulation.scene import Scene
 from gaussian_swaying.simulation.simulation import Simulation
 from gaussian_swaying.wind.field import FlowKey, GaussianGust, SpatialWind, UniformGust, WindField
-from gaussian_swaying.wind.shelter import Shelter
+from gaussian_swaying.wind.tables import Shelter
 
 POLE = Box([None, None, None], [0.11, None, None])
 AXIS = FlagScene(spacing=0.1).generate().means[0]  # the middle of the particles that POLE holds; only x and y count

@@ -24,8 +24,7 @@ from gaussian_swaying.simulation.sampling import matched_points
 from gaussian_swaying.simulation.scene import Scene
 from gaussian_swaying.simulation.simulated_scene import SimulatedScene
 from gaussian_swaying.wind.field import WindField
-from gaussian_swaying.wind.force import AeroForce
-from gaussian_swaying.wind.wind_force import WindForce
+from gaussian_swaying.wind.force import AeroForce, WindForce
 
 HALF = Box([0.0451, None, None], [None] * 3)
 

@@ -6,11 +6,10 @@ from shared import waits
 
 from gaussian_swaying.simulation.simulation import Simulation
 from gaussian_swaying.simulation.stepper import parts_of
-from gaussian_swaying.wind.carried import Turbulence
-from gaussian_swaying.wind.effects import LogProfile
+from gaussian_swaying.wind.effects import EllipsoidObstacle, LogProfile
 from gaussian_swaying.wind.field import WindField
-from gaussian_swaying.wind.obstacles import EllipsoidObstacle
-from gaussian_swaying.wind.shelter import Shelter
+from gaussian_swaying.wind.tables import Shelter
+from gaussian_swaying.wind.turbulence import Turbulence
 
 
 def _wind():

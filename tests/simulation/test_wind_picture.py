@@ -13,8 +13,8 @@ from gaussian_swaying.scenes.procedural import FlagScene
 from gaussian_swaying.simulation.simulation import Simulation
 from gaussian_swaying.simulation.wind_picture import STEPS, draw_vorticity, draw_wind, streaks
 from gaussian_swaying.wind.computed_air import ComputedAir
+from gaussian_swaying.wind.effects import EllipsoidObstacle
 from gaussian_swaying.wind.field import WindField
-from gaussian_swaying.wind.obstacles import EllipsoidObstacle
 
 
 def test_streaks_follow_the_wind(make_simulation):

@@ -14,9 +14,8 @@ from gaussian_swaying.kernels.graphs import Replayed
 from gaussian_swaying.scenes.procedural import FlagScene, GivenScene, both
 from gaussian_swaying.simulation.stepper import why_not_batched
 from gaussian_swaying.wind.computed_air import BYTES, ComputedAir, resolution
-from gaussian_swaying.wind.effects import LogProfile
+from gaussian_swaying.wind.effects import EllipsoidObstacle, LogProfile
 from gaussian_swaying.wind.field import FlowKey
-from gaussian_swaying.wind.obstacles import EllipsoidObstacle
 
 LOW, HIGH = [-1.2, -0.9, -0.9], [1.5, 0.9, 0.9]
 

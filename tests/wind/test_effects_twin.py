@@ -13,13 +13,11 @@ from torch.utils._python_dispatch import TorchDispatchMode
 from gaussian_swaying import AeroForce, MPMSolver, UniformGust, WindField, WindForce
 from gaussian_swaying._fixed import assign
 from gaussian_swaying.mpm.twins import Composed, Tables
-from gaussian_swaying.wind.carried import CarriedField, Turbulence
-from gaussian_swaying.wind.effects import LogProfile, Plume, PowerProfile
+from gaussian_swaying.wind.effects import CylinderObstacle, EllipsoidObstacle, LogProfile, Plume, PowerProfile
 from gaussian_swaying.wind.field import FlowKey
-from gaussian_swaying.wind.obstacles import CylinderObstacle, EllipsoidObstacle
 from gaussian_swaying.wind.patches import Patches
-from gaussian_swaying.wind.recorded import RecordedWind
-from gaussian_swaying.wind.shelter import Shelter
+from gaussian_swaying.wind.tables import CarriedField, RecordedWind, Shelter
+from gaussian_swaying.wind.turbulence import Turbulence
 
 DX, DT = 0.1, 1e-3
 TOLERANCE = 2e-5

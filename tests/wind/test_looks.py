@@ -7,9 +7,8 @@ import pytest
 import torch
 from shared import double
 
-from gaussian_swaying.wind.carried import Turbulence
 from gaussian_swaying.wind.field import WindField
-from gaussian_swaying.wind.looks import CELLS, LOOKS, look, turbulence_length
+from gaussian_swaying.wind.turbulence import CELLS, LOOKS, Turbulence, look, turbulence_length
 
 SECONDS, SEEDS = 400.0, 6
 

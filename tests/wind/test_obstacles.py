@@ -9,25 +9,24 @@ from torch.testing import assert_close
 
 from gaussian_swaying import SimFrame, WindField
 from gaussian_swaying.kernels.derive import on_tensors
-from gaussian_swaying.wind import obstacles
-from gaussian_swaying.wind.effects import Moment
-from gaussian_swaying.wind.obstacles import CylinderObstacle, EllipsoidObstacle, wake_start
+from gaussian_swaying.wind import effects
+from gaussian_swaying.wind.effects import CylinderObstacle, EllipsoidObstacle, Moment, wake_start
 
 DOUBLE = torch.float64
 FLOW = double([2.0, -0.7, 0.4])
 AXIS = torch.nn.functional.normalize(double([0.3, 0.1, 1.0]), dim=0)
 RADII = (0.7, 1.3, 0.4)
-plane_wake = on_tensors(obstacles.plane_wake)
+plane_wake = on_tensors(effects.plane_wake)
 
 
 def round_wake(behind, aside, width, drag):
     """The wake of a body with a drag below one."""
-    return on_tensors(obstacles.round_wake)(behind, aside, width, drag, wake_start(drag))
+    return on_tensors(effects.round_wake)(behind, aside, width, drag, wake_start(drag))
 
 
 def carlson_rd(x, y, z):
     """Carlson's integral in double precision."""
-    return on_tensors(obstacles.carlson_rd)(x, y, z, 9)
+    return on_tensors(effects.carlson_rd)(x, y, z, 9)
 
 
 def around(obstacle, flow, place):

@@ -11,7 +11,7 @@ from torch.testing import assert_close
 
 from gaussian_swaying import SimFrame, WindField
 from gaussian_swaying.wind.effects import Moment
-from gaussian_swaying.wind.recorded import FrozenWind, RecordedWind
+from gaussian_swaying.wind.tables import FrozenWind, RecordedWind
 from gaussian_swaying.wind.wind_files import read_anemometer, read_bts, read_grid
 
 DOUBLE = torch.float64

@@ -10,8 +10,7 @@ from torch.testing import assert_close
 from gaussian_swaying import AeroForce, MPMSolver, WindField, WindForce
 from gaussian_swaying._fixed import assign
 from gaussian_swaying.wind.effects import Moment
-from gaussian_swaying.wind.shelter import Shelter, deposited, extinction
-from gaussian_swaying.wind.tables import wind_axes
+from gaussian_swaying.wind.tables import Shelter, deposited, extinction, wind_axes
 
 DOUBLE = torch.float64
 

@@ -13,7 +13,7 @@ import torch
 from shared import double, solid
 
 from gaussian_swaying import AeroForce, Box, MPMSolver, PinnedRegion, WindField, WindForce
-from gaussian_swaying.wind.carried import Turbulence
+from gaussian_swaying.wind.turbulence import Turbulence
 
 DOUBLE = torch.float64
 SPEED, DRAG, AREA, DAMPING, AIR = 8.0, 1.2, 0.15, 1.0, 1.225

@@ -12,17 +12,18 @@ from shared import double
 from torch.testing import assert_close
 
 from gaussian_swaying.kernels.derive import Memory, on_tensors
-from gaussian_swaying.wind.carried import CarriedField, Turbulence, box_axes
 from gaussian_swaying.wind.effects import Moment
 from gaussian_swaying.wind.field import FlowKey, WindField
-from gaussian_swaying.wind.spectra import (
+from gaussian_swaying.wind.tables import CarriedField, box_axes, look_up
+from gaussian_swaying.wind.turbulence import (
     VON_KARMAN,
+    Turbulence,
     along_spectrum,
     energy_spectrum,
     resolved_share,
+    sheared_variances,
+    turbulence_box,
 )
-from gaussian_swaying.wind.tables import look_up
-from gaussian_swaying.wind.turbulence_box import sheared_variances, turbulence_box
 
 CELLS, H, L, SEEDS = (128, 64, 64), 0.25, 1.0, 20
 K = math.pi / H

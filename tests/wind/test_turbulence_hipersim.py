@@ -5,8 +5,7 @@ import math
 import pytest
 import torch
 
-from gaussian_swaying.wind.spectra import VON_KARMAN
-from gaussian_swaying.wind.turbulence_box import turbulence_box
+from gaussian_swaying.wind.turbulence import VON_KARMAN, turbulence_box
 
 mann = pytest.importorskip("hipersim.mann_turbulence", reason="needs hipersim")
 

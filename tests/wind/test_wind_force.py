@@ -17,10 +17,10 @@ from gaussian_swaying import (
 )
 from gaussian_swaying._fixed import changed
 from gaussian_swaying.geometry.patches import deform_patch
-from gaussian_swaying.wind.carried import Turbulence
 from gaussian_swaying.wind.effects import PowerProfile
 from gaussian_swaying.wind.field import FlowKey
-from gaussian_swaying.wind.wind_force import Places
+from gaussian_swaying.wind.force import Places
+from gaussian_swaying.wind.turbulence import Turbulence
 
 DT = 1e-3
 GUSTS = WindField([3.0, 1.0, 0.0], modulations=[UniformGust(0.5, interval=1.5 * DT)])

@@ -31,11 +31,11 @@ from gaussian_swaying.mpm.total import Total
 from gaussian_swaying.simulation.simulation import Simulation
 from gaussian_swaying.viewer.film.page import message
 from gaussian_swaying.viewer.live_web.longest import longest_courant
-from gaussian_swaying.wind.carried import Turbulence
 from gaussian_swaying.wind.effects import Moment
 from gaussian_swaying.wind.field import GaussianGust, SineSway, UniformGust, WindField, stream_start
 from gaussian_swaying.wind.force import LAWS as AERO_LAWS
-from gaussian_swaying.wind.wind_force import WindForce
+from gaussian_swaying.wind.force import WindForce
+from gaussian_swaying.wind.turbulence import Turbulence
 
 LAWS = (FixedCorotated, NeoHookean, StVKHencky, SpringNetwork)
 """The laws that a browser knows, by their number in the block."""

@@ -8,8 +8,8 @@ from gaussian_swaying import AeroForce, Box, MaterialPoints, MPMSolver, WindFiel
 from gaussian_swaying.mpm.modes import Modes
 from gaussian_swaying.mpm.pins import PinnedRegion
 from gaussian_swaying.wind.effects import LogProfile
-from gaussian_swaying.wind.looks import look
 from gaussian_swaying.wind.patches import Patches
+from gaussian_swaying.wind.turbulence import look
 
 DT, STEPS = 0.01, 4
 

@@ -21,8 +21,7 @@ from bench.problems.settings import Result, Settings, follow
 from gaussian_swaying.mpm.pins import PinnedRegion
 from gaussian_swaying.mpm.state import MaterialPoints, MPMState
 from gaussian_swaying.wind.field import WindField
-from gaussian_swaying.wind.force import AeroForce
-from gaussian_swaying.wind.wind_force import WindForce
+from gaussian_swaying.wind.force import AeroForce, WindForce
 
 AIR, C_D = 1.225, 1.0  # kg/m³
 WOOD_E = 8e9  # Pa; green wood

@@ -17,8 +17,7 @@ from bench.problems.settings import Result, Settings, follow
 from gaussian_swaying.mpm.pins import PinnedRegion
 from gaussian_swaying.mpm.state import MPMState
 from gaussian_swaying.wind.field import WindField
-from gaussian_swaying.wind.force import AeroForce
-from gaussian_swaying.wind.wind_force import WindForce
+from gaussian_swaying.wind.force import AeroForce, WindForce
 
 BESIDE = 0.1
 """The plate is watched in winds whose pressure is so much below and above that at which it should diverge, relative."""

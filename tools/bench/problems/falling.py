@@ -15,8 +15,7 @@ import torch
 from bench.problems.settings import Result, Settings, block, follow
 from gaussian_swaying.mpm.state import MPMState
 from gaussian_swaying.wind.field import WindField
-from gaussian_swaying.wind.force import AeroForce
-from gaussian_swaying.wind.wind_force import WindForce
+from gaussian_swaying.wind.force import AeroForce, WindForce
 
 AIR, C_D, GRAVITY = 1.225, 1.2, 9.81  # kg/m³, flat plate, m/s²
 SIDE, MASS = 0.2, 0.3  # m, kg/m²

@@ -18,8 +18,7 @@ from gaussian_swaying.geometry.regions import Box
 from gaussian_swaying.mpm.pins import PinnedRegion
 from gaussian_swaying.mpm.state import MaterialPoints, MPMState
 from gaussian_swaying.wind.field import WindField
-from gaussian_swaying.wind.force import AeroForce
-from gaussian_swaying.wind.wind_force import WindForce
+from gaussian_swaying.wind.force import AeroForce, WindForce
 
 LENGTH, WIDTH, YOUNG, AIR = 1.0, 0.125, 1e4, 1.225  # m, m, Pa, kg/m³; a plate of a single cell's width twists
 BEHIND = 2

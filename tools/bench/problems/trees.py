@@ -21,8 +21,7 @@ from gaussian_swaying.geometry.regions import Box
 from gaussian_swaying.mpm.pins import PinnedRegion
 from gaussian_swaying.mpm.state import MaterialPoints, MPMState
 from gaussian_swaying.wind.field import WindField
-from gaussian_swaying.wind.force import AeroForce
-from gaussian_swaying.wind.wind_force import WindForce
+from gaussian_swaying.wind.force import AeroForce, WindForce
 
 WOOD_E, WOOD_DENSITY = 8e9, 900.0  # Pa, kg/m³; green wood
 AIR, C_D = 1.225, 1.2  # kg/m³; of a flat plate across the flow

@@ -13,8 +13,7 @@ from torch import Tensor
 from bench.runner import Row
 from gaussian_swaying.mpm.state import GridSpec, MaterialPoints
 from gaussian_swaying.wind.field import UniformGust, WindField
-from gaussian_swaying.wind.force import AeroForce
-from gaussian_swaying.wind.wind_force import WindForce
+from gaussian_swaying.wind.force import AeroForce, WindForce
 
 CUBE = GridSpec(0.01, (0, 0, 0), (100, 100, 100))
 """Grid of ``updated`` around the sheet."""

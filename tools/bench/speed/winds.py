@@ -9,11 +9,10 @@ import torch
 from bench.runner import Row, study
 from bench.speed.timing import CUBE, DT, STEPS, in_turns, load, sheet, timed, waves, wind
 from gaussian_swaying.mpm.solver import MPMSolver
-from gaussian_swaying.wind.carried import Turbulence
-from gaussian_swaying.wind.effects import LogProfile, WindEffect
+from gaussian_swaying.wind.effects import CylinderObstacle, LogProfile, WindEffect
 from gaussian_swaying.wind.field import UniformGust, WindField
-from gaussian_swaying.wind.obstacles import CylinderObstacle
-from gaussian_swaying.wind.shelter import Shelter
+from gaussian_swaying.wind.tables import Shelter
+from gaussian_swaying.wind.turbulence import Turbulence
 
 
 def effects() -> dict[str, list[WindEffect]]:
