@@ -14,12 +14,6 @@ from gaussian_swaying.wind.effects import Moment
 from gaussian_swaying.wind.tables import FrozenWind, RecordedWind
 from gaussian_swaying.wind.wind_files import read_anemometer, read_bts, read_grid
 
-DOUBLE = torch.float64
-
-
-def _at(time):
-    return double(time)
-
 
 def _linear(t, x, y, z):
     """Linear in time and place, so that interpolation is exact."""
@@ -46,10 +40,9 @@ def test_a_recorded_wind_is_exact_where_it_is_linear(tmp_path):
     for time in (0.0, 0.4, 1.0, 2.5, 3.0):
         x, y, z = (place - torch.tensor([10.0, 0.0, 0.0])).unbind(-1)
         expected = _linear(5 + time, x.numpy(), y.numpy(), z.numpy())
-        np.testing.assert_allclose(wind.at(_at(time), place).numpy(), expected, atol=2e-6)  # the table is float32
-    held = wind.at(_at(100.0), place)
-    assert_close(held, wind.at(_at(3.0), place))
-    outside = wind.at(_at(1.0), double([[50.0, -7.0, 9.0]]))
+        np.testing.assert_allclose(wind.at(double(time), place).numpy(), expected, atol=2e-6)  # the table is float32
+    assert_close(wind.at(double(100.0), place), wind.at(double(3.0), place))
+    outside = wind.at(double(1.0), double([[50.0, -7.0, 9.0]]))
     np.testing.assert_allclose(outside[0].numpy(), _linear(6.0, 2.0, 0.0, 2.0), atol=2e-6)
 
 
@@ -59,15 +52,15 @@ def test_a_recorded_wind_repeats(tmp_path):
     wind = WindField(effects=[effect])
     place = double([[0.3, 0.2, 1.7]])
     assert effect.period == pytest.approx(4.5)
-    assert_close(wind.at(_at(0.7 + 4.5), place), wind.at(_at(0.7), place))
-    between = wind.at(_at(2.75), place)  # 8.75: in the middle of the last step
-    assert_close(between, 0.5 * (wind.at(_at(2.0), place) + wind.at(_at(3.5), place)))
+    assert_close(wind.at(double(0.7 + 4.5), place), wind.at(double(0.7), place))
+    between = wind.at(double(2.75), place)  # 8.75: in the middle of the last step
+    assert_close(between, 0.5 * (wind.at(double(2.0), place) + wind.at(double(3.5), place)))
 
 
 def test_places_of_the_file_are_in_metres_and_its_origin_in_scene_units(tmp_path):
-    frame = SimFrame(double([1.0, 0.0, 0.0]), torch.eye(3, dtype=DOUBLE), 2.0)
+    frame = SimFrame(double([1.0, 0.0, 0.0]), torch.eye(3, dtype=torch.float64), 2.0)
     moved = RecordedWind(_npz(tmp_path / "w.npz"), origin=[2.0, 0.5, 0.0]).in_frame(frame)
-    moment = Moment(_at(0.0), _at([0.0] * 3), _at([0.0] * 3))
+    moment = Moment(double(0.0), double([0.0] * 3), double([0.0] * 3))
     found = moved(torch.zeros(3), double([[2.5, 1.2, 0.4]]), moment)
     np.testing.assert_allclose(found[0].numpy(), _linear(5.0, 0.5, 0.2, 0.4), atol=2e-6)
 
@@ -98,28 +91,21 @@ def test_a_grid_that_does_not_fit_is_refused(tmp_path, changes, words):
         read_grid(_npz(tmp_path / "w.npz", **changes))
 
 
-@pytest.mark.parametrize("value", [math.nan, math.inf])
-def test_numbers_of_a_recorded_wind_are_finite(tmp_path, value):
-    path = _npz(tmp_path / "w.npz")
-    with pytest.raises(ValueError, match="`scale` to be finite, but got"):
-        RecordedWind(path, scale=value)
-    with pytest.raises(ValueError, match="`start` to be finite, but got"):
-        RecordedWind(path, start=value)
-    with pytest.raises(ValueError, match="`scale` to be finite, but got"):
-        FrozenWind(_bts(tmp_path / "w.bts")[0], scale=value)
-
-
-def test_other_files_are_refused(tmp_path):
+def test_other_files_and_numbers_are_refused(tmp_path):
     (tmp_path / "w.txt").write_text("wind")
-    with pytest.raises(ValueError, match=r"give a \.npz, \.nc or \.bts file"):
-        read_grid(tmp_path / "w.txt")
-    with pytest.raises(FileNotFoundError, match="does not exist"):
-        read_grid(tmp_path / "none.npz")
     np.savez(tmp_path / "empty.npz", x=np.zeros(2))
-    with pytest.raises(ValueError, match="has no array `y`"):
-        read_grid(tmp_path / "empty.npz")
-    with pytest.raises(ValueError, match="changes over time: use RecordedWind"):
-        FrozenWind(_npz(tmp_path / "w.npz"))
+    path, turbsim = _npz(tmp_path / "w.npz"), _bts(tmp_path / "w.bts")[0]
+    for kind, name, given, words in (
+        (RecordedWind, tmp_path / "w.txt", {}, r"give a \.npz, \.nc or \.bts file"),
+        (RecordedWind, tmp_path / "none.npz", {}, "does not exist"),
+        (RecordedWind, tmp_path / "empty.npz", {}, "has no array `y`"),
+        (FrozenWind, path, {}, "changes over time: use RecordedWind"),
+        (RecordedWind, path, {"scale": math.nan}, "`scale` to be finite, but got"),
+        (RecordedWind, path, {"start": math.inf}, "`start` to be finite, but got"),
+        (FrozenWind, turbsim, {"scale": math.inf}, "`scale` to be finite, but got"),
+    ):
+        with pytest.raises((ValueError, FileNotFoundError), match=words):
+            kind(name, **given)
 
 
 @pytest.mark.parametrize("engine", ["netCDF4", "scipy.io"])
@@ -162,17 +148,15 @@ def test_without_netcdf4_a_file_that_scipy_cannot_read_names_the_extra(tmp_path,
         read_grid(tmp_path / "w.nc")
 
 
-def test_a_box_of_hipersim(tmp_path):
-    mann = pytest.importorskip("hipersim.mann_turbulence", reason="needs hipersim")
-    pytest.importorskip("netCDF4")
-    box = mann.MannTurbulenceField.generate(Nxyz=(16, 8, 4), dxyz=(2.0, 3.0, 4.0), double_xyz=(False,) * 3)
-    box.to_netcdf(str(tmp_path), "box.nc")
-    effect = FrozenWind(tmp_path / "box.nc", scale=0.5)
-    wind = WindField([0.0, 5.0, 0.0], effects=[effect])  # its x axis is our y, its y is our -x
-    middle = 0.5 * 7 * 3.0
-    place = double([[middle - 2 * 3.0, 4 * 2.0, 3 * 4.0]])
-    u, v, w = box.uvw[:, 4, 2, 3]
-    found = wind.at(_at(0.0), place)[0]
+def test_a_frozen_box(tmp_path):
+    """As hipersim writes it: x along the wind, y to its left."""
+    axes = {name: step * np.arange(n) for name, n, step in (("x", 16, 2.0), ("y", 8, 3.0), ("z", 4, 4.0))}
+    velocity = np.random.default_rng(0).normal(size=(16, 8, 4, 3))
+    np.savez(tmp_path / "box.npz", velocity=velocity, **axes)
+    wind = WindField([0.0, 5.0, 0.0], effects=[FrozenWind(tmp_path / "box.npz", scale=0.5)])
+    middle = 0.5 * 7 * 3.0  # its x axis is our y, its y is our -x
+    u, v, w = velocity[4, 2, 3]
+    found = wind.at(double(0.0), double([[middle - 2 * 3.0, 4 * 2.0, 3 * 4.0]]))[0]
     np.testing.assert_allclose(found.numpy(), [-0.5 * v, 5 + 0.5 * u, 0.5 * w], atol=1e-5)
 
 
@@ -244,7 +228,7 @@ def test_planes_of_turbsim_pass_one_after_the_other(tmp_path):
     wind = WindField([0.0, -8.0, 0.0], effects=[FrozenWind(path, origin=[1.0, 2.0, 3.0])])
     for time in range(6):
         # one metre to the left of the flow, -y, is +x; 11 m above the ground
-        found = wind.at(_at(0.5 * time), double([[2.0, 2.0, 14.0]]))[0]
+        found = wind.at(double(0.5 * time), double([[2.0, 2.0, 14.0]]))[0]
         u, v, w = velocity[time % 4, 2, 1]
         np.testing.assert_allclose(found.numpy(), [v, -u, w], atol=1e-3)
 

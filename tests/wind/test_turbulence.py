@@ -5,6 +5,7 @@ closed form of endless turbulence, where what is left out does not matter, and t
 """
 
 import math
+from itertools import pairwise
 
 import pytest
 import torch
@@ -16,13 +17,19 @@ from gaussian_swaying.wind.effects import Moment
 from gaussian_swaying.wind.field import FlowKey, WindField
 from gaussian_swaying.wind.tables import CarriedField, box_axes, look_up
 from gaussian_swaying.wind.turbulence import (
+    CELLS as LOOK_CELLS,
+)
+from gaussian_swaying.wind.turbulence import (
+    LOOKS,
     VON_KARMAN,
     Turbulence,
     along_spectrum,
     energy_spectrum,
+    look,
     resolved_share,
     sheared_variances,
     turbulence_box,
+    turbulence_length,
 )
 
 CELLS, H, L, SEEDS = (128, 64, 64), 0.25, 1.0, 20
@@ -89,7 +96,7 @@ def test_the_resolved_share_is_that_of_the_waves_of_a_box():
     _, share = _waves((64, 64, 64), 0.25)
     # waves of exactly two cells are left out of the box: a 64th of each axis at its far end
     assert resolved_share(L, (0.25,) * 3) == pytest.approx(float(share.sum()), abs=0.01)
-    assert resolved_share(L, (0.01,) * 3) > 0.96
+    assert resolved_share(L, (L / 16,) * 3) == pytest.approx(0.92, abs=0.01)
     assert resolved_share(L, (0.25, 0.25, 1.0)) < resolved_share(L, (0.25,) * 3)
 
 
@@ -125,21 +132,6 @@ def test_correlation_and_integral_length_are_von_karmans(measured):
     correlation[0] = 1.0
     length = float(torch.trapezoid(correlation, dx=H))
     assert length == pytest.approx(L, rel=0.05)
-
-
-@pytest.mark.slow
-def test_spectrum_falls_with_the_power_five_thirds():
-    """A box of fine cells: von Karman's own slope is within 3 % of 5/3 from k L = 5 on, its cells hold up to 12."""
-    cells, spacing = (512, 64, 64), L / 32
-    found = 0
-    for seed in range(SEEDS):
-        wave = torch.fft.fft(turbulence_box(cells, [spacing] * 3, L, seed=seed)[..., 0].double(), dim=0)
-        found = found + wave.abs().square().mean((1, 2))
-    k1 = 2 * math.pi * torch.fft.fftfreq(cells[0], spacing, dtype=torch.float64)
-    band = (k1 * L > 5) & (k1 * L < 12)
-    x, y = k1[band].log(), found[band].log()
-    slope = float(((x - x.mean()) * (y - y.mean())).sum() / (x - x.mean()).square().sum())
-    assert slope == pytest.approx(-5 / 3, rel=0.05)
 
 
 def _closed_coherence(k1, distance):
@@ -240,6 +232,8 @@ def test_places_that_are_no_numbers_stay_in_the_table(wraps):
     found = looked_up(table, place, wraps)
     assert found.shape == (3, 3)
     assert found[0].isnan().all()
+    table = torch.arange(4.0).repeat_interleave(12).reshape(4, 2, 2, 3)  # just below zero rounds up to its length
+    assert looked_up(table, torch.tensor([[-1e-9, 0.0, 0.0]]), wraps).tolist() == [[0.0] * 3]
 
 
 def test_shear_has_the_variances_of_the_standard():
@@ -266,18 +260,14 @@ def test_shear_makes_gusts_down_the_wind_and_stress():
     assert abs(float(found[0, 1])) < 0.15 * float(found[0, 0])
 
 
-def test_a_seed_is_a_turbulence():
-    one = turbulence_box((16, 8, 8), [0.5] * 3, L, seed=5)
-    assert torch.equal(one, turbulence_box((16, 8, 8), [0.5] * 3, L, seed=5))
-    assert (one - turbulence_box((16, 8, 8), [0.5] * 3, L, seed=6)).abs().max() > 0.5
-
-
-@pytest.mark.gpu
-def test_a_box_is_the_same_on_every_device():
-    here = turbulence_box((64, 32, 32), [0.25] * 3, L, gamma=2.0, seed=5)
-    there = turbulence_box((64, 32, 32), [0.25] * 3, L, gamma=2.0, seed=5, device="cuda")
-    # transforms of 2^16 float32 numbers differ by some 1e-6 of their size
-    assert_close(there.cpu(), here, rtol=0, atol=2e-5)
+def test_a_seed_is_a_turbulence(device):
+    """On every device: transforms of 2^13 float32 numbers differ by some 1e-6 of their size."""
+    one, same, other = (
+        turbulence_box((32, 16, 16), [0.25] * 3, L, gamma=2.0, seed=seed, device=where)
+        for seed, where in ((5, "cpu"), (5, device), (6, "cpu"))
+    )
+    assert_close(same.cpu(), one, rtol=0, atol=0 if one.device == same.device else 2e-5)
+    assert (one - other).abs().max() > 0.5
 
 
 @pytest.mark.parametrize(
@@ -314,21 +304,6 @@ def test_turbulence_is_carried_by_the_mean_wind():
     twice = wind.effects[0](torch.zeros(3), place, Moment(now, 2 * flow, wind.carried(now)))
     assert_close(first, flow + still)
     assert_close(twice, 2 * still)
-
-
-def test_turbulence_has_its_intensity_at_places_and_times_anywhere():
-    wind = WindField([0.0, 6.0, 0.0], effects=[_gusts(cells=[128, 64, 64], spacing=L / 16, length=L)])
-    draw = torch.Generator().manual_seed(4)
-    found = []
-    for time in range(40):
-        place = 8 * torch.rand(500, 3, dtype=torch.float64, generator=draw)
-        found.append(wind.at(double(1.37 * time), place)[:, 1] - 6.0)
-    # one box of 8 x 4 x 4 lengths: its own variance, with its interpolation
-    box = wind.effects[0]
-    corners = looked_up(box.table, torch.rand(20_000, 3, dtype=torch.float64, generator=draw) * 128, True)
-    own = corners @ box.axes
-    assert float(torch.cat(found).std()) == pytest.approx(0.2 * 6.0 * float(own[:, 1].std()), rel=0.05)
-    assert box.resolved == pytest.approx(0.92, abs=0.01)
 
 
 def test_the_box_comes_back_at_another_place():
@@ -371,3 +346,151 @@ def test_a_field_that_does_not_repeat_goes_on_outside():
     assert_close(found[:, 0], double([1.0, 3.0, 5.0]))
     with pytest.raises(ValueError, match="Expected `table` of shape"):
         CarriedField(torch.zeros(4, 2, 2), [1.0] * 3)
+
+
+SECONDS, RECORDS = 400.0, 6
+
+
+def record(wind, places, step=0.2, seconds=SECONDS):
+    """Wind at places (K, 3), shape (T, K, 3); the field is carried, so a later time is a place upstream."""
+    times = torch.arange(round(seconds / step), dtype=torch.float64) * step
+    where = torch.as_tensor(places, dtype=torch.float64) - times[:, None, None] * wind.flows[0].double()
+    return wind.at(times[0], where.reshape(-1, 3)).double().reshape(len(times), -1, 3)
+
+
+@pytest.mark.parametrize("name", LOOKS)
+def test_a_long_record_has_the_mean_and_the_intensity(name):
+    """Within the sampling error, but for the waves that the box leaves out.
+
+    A record of T seconds has T U / 2 L independent values of u, of the integral length L along the wind, and a box no
+    more than its 8 x 4 x 4 cubic lengths. The error of the mean is sigma over the root of their number.
+
+    The cells of L / 16 resolve 92 % of the variance and their interpolation takes 3 %; waves longer than the sides of
+    8, 4 and 4 L are missing, some 15 % of it. So sigma is 0.87 of the closed form, and varies by 5 % with the seed.
+    """
+    given, height = LOOKS[name], 0.5
+    records = [
+        record(look(name, (0.0, 2.0, 0.0), height=height, seed=seed), [[0.0, 0.0, 0.0]]) for seed in range(RECORDS)
+    ]
+    air = torch.cat(records)[:, 0]
+    count = RECORDS * min(SECONDS * given.speed / (2 * turbulence_length(height)), math.prod(LOOK_CELLS) / 16**3)
+    sigma = given.intensity * given.speed
+    flow = double([0.0, given.speed, 0.0])
+    assert ((air.mean(0) - flow).abs() < 3 * sigma / math.sqrt(count)).all()
+    for spread in air.std(0).tolist():  # isotropic
+        assert spread == pytest.approx(0.87 * sigma, rel=3 * 0.05 / math.sqrt(RECORDS) + 0.05)
+
+
+def test_it_is_coherent_in_space():
+    """The correlation falls with the distance, and parts of a plant get nearly the same wind."""
+    apart = [0.0, 0.1, 0.4, 1.0, 3.0]
+    wind = look("gusts", height=0.5, seed=3)
+    air = record(wind, [[0.0, d, 0.0] for d in apart])[..., 0]
+    found = torch.corrcoef(air.T)[0].tolist()
+    assert found[0] == pytest.approx(1.0)
+    assert all(a > b for a, b in pairwise(found))
+    assert found[1] > 0.8
+    assert found[-1] < 0.3
+
+
+def test_two_heights_have_two_lengths():
+    """Of 3.2 heights, so that the slow part of the spectrum is stronger; 1.5 m at least."""
+    assert turbulence_length(0.1) == 1.5
+    assert turbulence_length(4.0) == pytest.approx(12.8)
+    air = [record(look("gusts", height=h), [[0.0, 0.0, 0.0]], step=0.02, seconds=200)[:, 0, 0] for h in (0.5, 4.0)]
+    slopes = [float((line[1:] - line[:-1]).square().mean() / line.var()) for line in air]
+    assert slopes[1] < 0.5 * slopes[0]
+
+
+def test_direction_and_speed_may_be_given():
+    wind = look("storm", (3.0, 4.0, 0.0), speed=5.0)
+    assert wind.flows[0].tolist() == pytest.approx([3.0, 4.0, 0.0])
+    assert not wind.uniform
+    places = torch.zeros(1, 3, dtype=torch.float64)
+    first, other = (look("storm", seed=seed).at(torch.zeros((), dtype=torch.float64), places) for seed in (0, 1))
+    assert not torch.equal(first, other)
+    assert look("breeze", speed=0.0).flows[0].tolist() == [0.0, 0.0, 0.0]
+
+
+@pytest.mark.parametrize(
+    ("given", "words"),
+    [
+        ({"name": "hurricane"}, "`look` to be one of breeze, gusts, storm"),
+        ({"height": 0.0}, "`height`"),
+        ({"height": math.nan}, "`height`"),
+        ({"direction": (0.0, 0.0, 0.0)}, "say where it blows to"),
+        ({"direction": (1.0, 0.0)}, "`direction`"),
+        ({"speed": -1.0}, "`speed`"),
+        ({"speed": math.inf}, "`speed`"),
+    ],
+)
+def test_bad_input_is_refused(given, words):
+    with pytest.raises(ValueError, match=words):
+        look(**{"name": "breeze"} | given)
+
+
+def test_a_simulation_takes_a_look_by_its_name(make_simulation):
+    wind = make_simulation(wind="gusts").wind
+    assert isinstance(wind, WindField)
+    assert wind.flows[0].tolist() == pytest.approx([LOOKS["gusts"].speed, 0.0, 0.0])
+    assert [type(effect) for effect in wind.effects] == [Turbulence]
+    assert wind.effects[0].intensity == LOOKS["gusts"].intensity
+    with pytest.raises(ValueError, match="one of breeze, gusts, storm"):
+        make_simulation(wind="gales")
+
+
+def test_a_start_is_a_later_time():
+    """The air has come the start's way: U t."""
+    flow, places = [6.0, 2.0, 0.0], torch.randn(20, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    plain = WindField(flow, effects=[Turbulence(0.3, 1.5)])
+    later = WindField(flow, effects=[Turbulence(0.3, 1.5, start=[7.0 * c for c in flow])])
+    for time in (0.0, 1.3):
+        found, expected = (wind.at(double(t), places) for wind, t in ((later, time), (plain, time + 7.0)))
+        assert_close(found, expected, rtol=0, atol=1e-4)  # places of float32 in a box of some 100 cells
+    assert not torch.allclose(found, plain.at(double(1.3), places), atol=0.1)
+
+
+def _theirs(mann, cells, spacing, gamma, seed):
+    """A box of unit variance without shear: alpha epsilon^(2/3) is that of von Karman's spectrum."""
+    a = VON_KARMAN * L
+    level = 55 / (9 * math.sqrt(math.pi)) * math.gamma(5 / 6) / math.gamma(1 / 3) * a ** (-2 / 3)
+    box = mann.MannTurbulenceField.generate(
+        alphaepsilon=level, L=a, Gamma=gamma, Nxyz=cells, dxyz=(spacing,) * 3, seed=seed, double_xyz=(False,) * 3
+    )
+    return torch.tensor(box.uvw).permute(1, 2, 3, 0).double()
+
+
+def _measures(box):
+    """Variances, spectra in three bands, and coherence at two distances in two bands, of the component along x."""
+    wave = torch.fft.rfft(box, dim=0)
+    power = wave.abs().square().mean((1, 2))
+    bands = ((1, 3), (3, 8), (8, 20))
+    spectra = torch.stack([power[a:b].mean(0) for a, b in bands])
+    u = wave[..., 0]
+    cross = [(u * u.roll(-j, 1).conj()).real.mean((1, 2)) for j in (2, 4)]
+    return box.square().mean((0, 1, 2)), spectra, torch.stack([c[a:b].mean() for c in cross for a, b in bands[:2]])
+
+
+@pytest.mark.parametrize(("gamma", "cells", "spacing"), [(0.0, (128, 32, 32), 0.25), (3.9, (128, 64, 64), 0.5)])
+def test_statistics_are_those_of_hipersim(gamma, cells, spacing):
+    """The first band of the spectrum has two waves, so its scatter is larger, and it gets no verdict.
+
+    With shear, hipersim averages the spectrum over the cells of the longest waves, and we take their middle: the box is
+    32 lengths wide, so that this makes no difference.
+    """
+    mann = pytest.importorskip("hipersim.mann_turbulence", reason="needs hipersim")
+    # the limit of its tensor for no shear is a division by zero
+    theirs = [_measures(_theirs(mann, cells, spacing, max(gamma, 1e-3), seed)) for seed in range(1, SEEDS + 1)]
+    boxes = (turbulence_box(cells, [spacing] * 3, L, gamma=gamma, seed=seed) for seed in range(SEEDS))
+    ours = [_measures(box.double()) for box in boxes]
+    for kind in (0, 1):
+        a, b = (torch.stack([one[kind] for one in several]).mean(0) for several in (ours, theirs))
+        ratio = a / b if kind == 0 else (a / b)[1:]
+        assert ratio.flatten().tolist() == pytest.approx([1.0] * ratio.numel(), abs=0.1)
+    a, b = (
+        torch.stack([one[2] for one in several]).mean(0)
+        / torch.stack([one[1] for one in several]).mean(0)[[0, 1, 0, 1], 0]
+        for several in (ours, theirs)
+    )
+    for one, other in zip(a.tolist(), b.tolist(), strict=True):
+        assert one == pytest.approx(other, rel=0.1) if other > 0.2 else one == pytest.approx(other, abs=0.02)

@@ -1,127 +1,108 @@
-"""The wind as a load: what it gives at each substep, and that a rollout in it is the one with its forces."""
+"""The wind as a load: what it gives at each substep, and rollouts in it, in torch and in kernels."""
 
 import math
+import tempfile
+from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 from shared import double, solid, unit
 from torch.testing import assert_close
+from torch.utils._python_dispatch import TorchDispatchMode
 
-from gaussian_swaying import (
-    AeroForce,
-    MPMSolver,
-    SpatialWind,
-    UniformGust,
-    WindField,
-    WindForce,
-)
-from gaussian_swaying._fixed import changed
+from gaussian_swaying import AeroForce, MPMSolver, SpatialWind, UniformGust, WindField, WindForce
+from gaussian_swaying._fixed import assign, changed
 from gaussian_swaying.geometry.patches import deform_patch
-from gaussian_swaying.wind.effects import PowerProfile
+from gaussian_swaying.mpm.twins import Composed, Tables
+from gaussian_swaying.wind.effects import CylinderObstacle, EllipsoidObstacle, LogProfile, Plume, PowerProfile
 from gaussian_swaying.wind.field import FlowKey
 from gaussian_swaying.wind.force import Places
+from gaussian_swaying.wind.patches import Patches
+from gaussian_swaying.wind.tables import CarriedField, RecordedWind, Shelter
 from gaussian_swaying.wind.turbulence import Turbulence
 
 DT = 1e-3
+TOLERANCE = 2e-5
+"""Of kernels, relative to the largest value of a field, as in tests/mpm/triton/bodies.py."""
 GUSTS = WindField([3.0, 1.0, 0.0], modulations=[UniformGust(0.5, interval=1.5 * DT)])
 RISING = WindField(schedule=[FlowKey(0.0, [0.0] * 3), FlowKey(4 * DT, [0.0, 20.0, 0.0])], interpolation="linear")
+TURNING = [FlowKey(0.0, [4.0, 1.0, 0.5]), FlowKey(3 * DT, [-2.0, 3.0, 0.0])]
+MIDDLE = [0.1, 0.15, 0.1]
+ZERO = double(0.0)
 
 
-def _setting(batch=(), wind=GUSTS, formulation="total", **settings):
-    generator = torch.Generator().manual_seed(0)
-    position = 0.3 * torch.rand(*batch, 20, 3, dtype=torch.float64, generator=generator)
-    normal = unit(*batch, 20, 3, generator=generator)
-    area = 0.02 * torch.rand(*batch, 20, dtype=torch.float64, generator=generator)
-    points = solid(position, 1e-4, 50.0)
-    solver = MPMSolver(dx=0.1, formulation=formulation, transfer="torch")
-    velocity = torch.randn(*batch, 20, 3, dtype=torch.float64, generator=generator)
-    state = solver.init_state(points, velocity)
-    return solver, solver.rollout(state, DT, 2), WindForce(AeroForce(**settings), wind, normal, area)
+def _setting(wind=GUSTS, batch=(), formulation="total", transfer="torch", like=ZERO, groups=False, **aero):
+    """A solver, a state that has moved a little, and the load; two patches on each particle with ``groups``."""
+    draw = torch.Generator().manual_seed(0)
+    position, velocity, area = (
+        make(*batch, 20, n, dtype=torch.float64, generator=draw).to(like)
+        for make, n in ((torch.rand, 3), (torch.randn, 3), (torch.rand, 1))
+    )
+    normal, area = unit(*batch, 20, 3, generator=draw).to(like), 0.02 * area[..., 0]
+    patches = (normal, area)
+    if groups:
+        owner = torch.arange(20, device=like.device).repeat(2)
+        patches = (Patches(torch.cat([normal, normal.roll(1, 0)]), area.repeat(2), owner, 20),)
+    wind = wind.to(like.device) if isinstance(wind, torch.nn.Module) else wind
+    load = WindForce(AeroForce(**aero).to(like.device), wind, *patches)
+    solver, plain = (MPMSolver(dx=0.1, formulation=formulation, transfer=kind) for kind in (transfer, "torch"))
+    points = solid(0.06 + 0.2 * position, 1e-4, 50.0)
+    solver.init_state(points, velocity)
+    return solver, plain.rollout(plain.init_state(points, velocity), DT, 2), load
 
 
 def test_winds_are_those_of_the_start_of_each_substep():
-    *_, load = _setting()
+    """One wind for all scenes, or one for each."""
     time = double(0.01)
-    winds = load.winds(time, DT, 5)
-    assert winds.shape == (5, 3)
-    assert winds.dtype == torch.float64
-    for k in range(5):
-        assert torch.equal(winds[k], GUSTS(time + k * DT))
+    times = time + DT * torch.arange(5)
+    winds = _setting()[2].winds(time, DT, 5)
+    assert torch.equal(winds, GUSTS(times))
     assert len(set(winds[:, 0].tolist())) > 1
+    winds = _setting([GUSTS, RISING], (2,))[2].winds(time, DT, 5)
+    assert torch.equal(winds[:, :, 0], torch.stack([GUSTS(times), RISING(times)], 1))
 
 
-def test_each_scene_has_its_own_wind():
-    *_, load = _setting(batch=(2,), wind=[GUSTS, RISING])
-    time = double(DT)
-    winds = load.winds(time, DT, 3)
-    assert winds.shape == (3, 2, 1, 3)
-    assert torch.equal(winds[:, 1, 0], torch.stack([RISING(time + k * DT) for k in range(3)]))
-
-
+@pytest.mark.parametrize("cap", [None, 1.5])
 @pytest.mark.parametrize("drag_step", ["explicit", "semi_implicit"])
-def test_force_is_that_on_the_deformed_patches(drag_step):
-    _, state, load = _setting(drag_step=drag_step, C_L=0.4)
-    wind = double([5.0, 0.0, 1.0])
+def test_force_is_that_on_the_deformed_patches(drag_step, cap):
+    """Sheared without end, the normal turns, and the area is at most so many times that at rest."""
+    _, state, load = _setting(drag_step=drag_step, C_L=0.4, max_area_ratio=cap)
+    wind, F = double([5.0, 0.0, 1.0]), state.F_total.clone()
+    F[:10, 0, 1] = 3e4
+    state = state.replace(F_total=F)
+    normal, area = deform_patch(F, load.normal, load.area)
+    assert (area[:10] / load.area[:10]).min() > 1.5 > (area[10:] / load.area[10:]).max() > 1 + 1e-4
+    area = torch.minimum(area, (cap or math.inf) * load.area)
     force, resistance = load.force(state, wind)
-    normal, area = deform_patch(state.F_total, load.normal, load.area)
-    assert (area / load.area - 1).abs().max() > 1e-4
     assert_close(force, load.aero(wind, state.velocity, normal, area))
     if drag_step == "explicit":
         assert resistance is None
     else:
-        assert torch.equal(resistance, load.aero.resistance(wind, state.velocity, area))
-    now, _ = load(state)
-    assert torch.equal(now, load.force(state, GUSTS(state.time))[0])
-
-
-@pytest.mark.parametrize("drag_step", ["explicit", "semi_implicit"])
-def test_the_area_of_what_has_flowed_is_capped(drag_step):
-    """Shear without end: the normal turns, the force stays that on so many times the area at rest."""
-    _, state, free = _setting(drag_step=drag_step)
-    load = WindForce(AeroForce(drag_step=drag_step, max_area_ratio=1.5), GUSTS, free.normal, free.area)
-    wind = double([5.0, 0.0, 1.0])
-    F = torch.eye(3, dtype=torch.float64).repeat(20, 1, 1)
-    F[:10, 0, 1] = 3e4
-    F[10:15, 0, 0] = 1.2
-    state = state.replace(F_total=F)
-    normal, area = deform_patch(F, free.normal, free.area)
-    growth = area / free.area
-    assert growth[:10].min() > 1.5 > growth[10:].max()
-    force, resistance = load.force(state, wind)
-    capped = torch.cat([1.5 * free.area[:10], area[10:]])
-    assert_close(force, load.aero(wind, state.velocity, normal, capped))
-    if drag_step == "semi_implicit":
-        assert_close(resistance, load.aero.resistance(wind, state.velocity, capped))
-    assert_close(force[10:], free.force(state, wind)[0][10:])
-    assert (force[:10] - free.force(state, wind)[0][:10]).abs().max() > 1.0
+        assert_close(resistance, load.aero.resistance(wind, state.velocity, area))
+    assert torch.equal(load(state)[0], load.force(state, GUSTS(state.time))[0])
 
 
 def test_gradients_through_a_capped_area_are_finite():
-    """Also where the patch stands exactly at the cap; in F only the direction of the normal is left above it."""
-    _, state, free = _setting()
-    load = WindForce(AeroForce(max_area_ratio=1.0), GUSTS, free.normal, free.area)
+    """Also where the patch stands exactly at the cap; above it only the direction of the normal is left in F."""
+    _, state, load = _setting(max_area_ratio=1.0)
     F = torch.eye(3, dtype=torch.float64).repeat(20, 1, 1)
     F[:10, 0, 1] = 3e4
-    F.requires_grad_()
-    force, _ = load.force(state.replace(F_total=F), double([5.0, 0.0, 1.0]))
-    (found,) = torch.autograd.grad(force.square().sum(), F)
-    assert torch.isfinite(found).all()
-    assert found.abs().amax() > 0
-    scaled = F.detach()[:10].requires_grad_()
-    size = load.force(state.replace(F_total=torch.cat([scaled, F.detach()[10:]])), load.winds(state.time, 0.0, 1)[0])
-    (slope,) = torch.autograd.grad(size[0][:10].square().sum(), scaled)
+    force, _ = load.force(state.replace(F_total=F.requires_grad_()), double([5.0, 0.0, 1.0]))
+    (slope,) = torch.autograd.grad(force.square().sum(), F)
+    assert torch.isfinite(slope).all()
+    assert slope.abs().amax() > 0
     # growth of F as a whole turns no normal, so the force does not see it
-    assert (slope * scaled.detach()).sum((-1, -2)).abs().max() < 1e-9 * 3e4 * float(slope.abs().max())
+    assert (slope * F.detach())[:10].sum((-1, -2)).abs().max() < 1e-9 * 3e4 * float(slope[:10].abs().max())
 
 
 @pytest.mark.parametrize("formulation", ["total", "updated"])
 def test_a_batch_is_each_scene_by_itself(formulation):
-    solver, state, load = _setting(batch=(2,), wind=[GUSTS, RISING], formulation=formulation)
+    solver, state, load = _setting([GUSTS, RISING], (2,), formulation)
     force, _ = load(state)
     for k, wind in enumerate(load.wind):
         normal, area = deform_patch(state.F_total[k], load.normal[k], load.area[k])
-        expected = load.aero(wind(state.time), state.velocity[k], normal, area)
-        assert_close(force[k], expected)
+        assert_close(force[k], load.aero(wind(state.time), state.velocity[k], normal, area))
     assert solver.rollout(state, DT, 2, load).work.shape == (2,)
 
 
@@ -137,28 +118,28 @@ def test_gradients_reach_the_patches_and_the_coefficients():
 @pytest.mark.parametrize("name", ["area", "normal", "C_D", "flows"])
 def test_what_asks_for_a_gradient_is_not_left_to_the_kernels(name, monkeypatch):
     """The rollout as a whole is asked about it, before any substep."""
-    solver, state, load = _setting(wind=WindField([3.0, 0.0, 0.0]))
+    solver, state, load = _setting(WindField([3.0, 0.0, 0.0]))
     owner = {"C_D": load.aero, "flows": load.wind}.get(name, load)
     getattr(owner, name).requires_grad_()
     asked = []
     monkeypatch.setattr(MPMSolver, "fused", lambda solver, *tensors: asked.append(tensors))
-    solver.rollout(state, DT, 1, load)
-    assert any(tensor.requires_grad for tensor in asked[0])
-    asked.clear()
-    solver.watched_rollout(state, DT, 1, load)
-    assert any(tensor.requires_grad for tensor in asked[0])
+    for roll in (solver.rollout, solver.watched_rollout):
+        asked.clear()
+        roll(state, DT, 1, load)
+        assert any(tensor.requires_grad for tensor in asked[0])
 
 
 def test_shapes_are_checked():
-    up = torch.tensor([[0.0, 0.0, 1.0]]).expand(4, 3)
-    with pytest.raises(ValueError, match="normal"):
-        WindForce(AeroForce(), GUSTS, torch.zeros(4), torch.ones(4))
-    with pytest.raises(ValueError, match="area"):
-        WindForce(AeroForce(), GUSTS, up, torch.ones(3))
-    with pytest.raises(ValueError, match=r"one `wind` for each of the \(2,\) scenes, but got 3"):
-        WindForce(AeroForce(), [GUSTS] * 3, up.expand(2, 4, 3), torch.ones(2, 4))
-    with pytest.raises(ValueError, match=r"one `wind` for each of the \(3,\) scenes, but got 1"):
-        WindForce(AeroForce(), WindField.together([GUSTS]), torch.ones(3, 5, 3), torch.ones(3, 5))
+    up, one = double([0.0, 0.0, 1.0]), torch.ones
+    for words, wind, *patches in (
+        ("normal", GUSTS, torch.zeros(4), one(4)),
+        ("`area`", GUSTS, up.expand(4, 3), one(3)),
+        ("`area` of the patches", GUSTS, up.expand(4, 3)),
+        (r"one `wind` for each of the \(2,\) scenes, but got 3", [GUSTS] * 3, up.expand(2, 4, 3), one(2, 4)),
+        (r"one `wind` for each of the \(3,\) scenes, but got 1", WindField.together([GUSTS]), one(3, 5, 3), one(3, 5)),
+    ):
+        with pytest.raises(ValueError, match=words):
+            WindForce(AeroForce(), wind, *patches)
 
 
 def _turn(degrees):
@@ -214,17 +195,12 @@ def test_a_force_in_many_winds():
     assert batch.twin() is not None
 
 
-def _shaped():
-    effects = [PowerProfile([0.0, 0.0, -1.0], height=2.0), Turbulence(0.3, 0.2, cells=[16, 8, 8])]
-    return WindField([3.0, 1.0, 0.0], modulations=[UniformGust(0.5, interval=4 * DT)], effects=effects)
-
-
 @pytest.mark.parametrize("batch", [(), (2,)])
 def test_a_wind_with_effects_is_asked_where_the_particles_are(batch):
     """For all substeps at once or one by one; a batch takes winds with and without."""
-    shaped = _shaped()
-    wind = [shaped, GUSTS] if batch else shaped
-    _, state, load = _setting(batch=batch, wind=wind)
+    effects = [PowerProfile([0.0, 0.0, -1.0], height=2.0), Turbulence(0.3, 0.2, cells=[16, 8, 8])]
+    shaped = WindField([3.0, 1.0, 0.0], modulations=[UniformGust(0.5, interval=4 * DT)], effects=effects)
+    _, state, load = _setting([shaped, GUSTS] if batch else shaped, batch)
     assert not load.uniform
     assert load.twin() is None or not batch
     assert load.recordable
@@ -244,9 +220,10 @@ def test_turbulence_does_not_depend_on_the_substep():
     """The impulse of 0.2 s on patches that stand still, from substeps of 4, 2 and 1 ms.
 
     The wind at a common time is the same, so that the sums differ only by their rule: of first order in the substep.
+    This law has no jump where a patch turns its other side to the wind.
     """
     wind = WindField([2.0, 0.0, 0.0], effects=[Turbulence(0.5, 1.0, cells=[16] * 3)])
-    _, state, load = _setting(wind=wind)
+    _, state, load = _setting(wind, law="linear", C_L=0.0)
     state = state.replace(velocity=torch.zeros_like(state.velocity), time=torch.zeros_like(state.time))
     found, kept = [], []
     for dt in (4e-3, 2e-3, 1e-3):
@@ -261,4 +238,168 @@ def test_turbulence_does_not_depend_on_the_substep():
     size = float(found[2].abs().max())
     coarse, fine = (float((one - found[2]).abs().max()) / size for one in found[:2])
     assert coarse < 0.02
-    assert fine < 0.6 * coarse  # a third, where no patch turns its other side to the wind meanwhile
+    assert fine < 0.4 * coarse  # a third
+
+
+def _field():
+    table = 2 * torch.randn(6, 5, 4, 3, generator=torch.Generator().manual_seed(3))
+    return CarriedField(
+        table, [0.05, 0.07, 0.06], origin=[0.1, 0.0, 0.1], anchor=[0.1, 0.2, 0.05], wraps=(True, False, False), scale=2
+    )
+
+
+def _recorded():
+    axis = np.linspace(-0.2, 0.5, 5)
+    velocity = np.random.default_rng(0).normal(size=(4, 5, 5, 5, 3))
+    with tempfile.TemporaryDirectory() as folder:
+        np.savez(Path(folder) / "w.npz", time=DT * np.arange(4.0), x=axis, y=axis, z=axis, velocity=velocity)
+        return RecordedWind(Path(folder) / "w.npz", repeat=True)
+
+
+def _wind(name):
+    """A wind of its own for every test, as it is moved to a device."""
+    low = {"ground": [0.0, 0.0, 0.05], "height": 0.2}
+    gusts = [UniformGust(0.5, interval=2 * DT)]
+    turbulence = Turbulence(0.5, 0.1, cells=[8, 6, 4], spacing=0.03)
+    effects = {
+        "all": [turbulence, LogProfile(**low, roughness=0.02)],
+        "sheltered": [turbulence, Shelter(cells=8, strength=20.0)],
+        "half": [PowerProfile(**low, exponent=0.3), _field()],
+        "several": [
+            LogProfile(**low, roughness=0.02),
+            CylinderObstacle(MIDDLE, 0.05, axis=[0.0, 1.0, 1.0]),
+            turbulence,
+            EllipsoidObstacle(MIDDLE, [0.03, 0.08, 0.05], turn=20.0, drag=0.0),
+            Plume([0.13, 0.17, 0.12], 0.05, heat=1e6),
+            EllipsoidObstacle(MIDDLE, [0.01, 0.1, 0.05]),
+            _recorded(),
+        ],
+    }
+    return WindField(schedule=TURNING, interpolation="linear", modulations=gusts, effects=effects[name])
+
+
+def _pair(device, make, formulation="total", **options):
+    """The solver with kernels and that in torch, a state, and the load of a wind that a function makes."""
+    options |= {"formulation": formulation, "like": torch.zeros((), device=device)}
+    solver, state, load = _setting(make(), transfer="kernels", **options)
+    return solver, _setting(make(), **options)[0], state, load
+
+
+def _same(found, expected):
+    for name in ("position", "velocity", "F_total"):
+        a, b = getattr(found, name), getattr(expected, name)
+        assert_close(a, b, rtol=0, atol=TOLERANCE * float(b.abs().max()))
+    assert_close(found.work, expected.work, rtol=1e-4, atol=1e-7)
+
+
+SOFT = {"drag_step": "semi_implicit"}
+
+
+@pytest.mark.parametrize(
+    ("formulation", "name", "options"),
+    [
+        ("total", "several", {}),
+        ("updated", "sheltered", {}),
+        ("updated", "all", SOFT | {"groups": True}),
+        ("total", "all", SOFT | {"batch": (2,)}),
+    ],
+)
+def test_the_kernels_blow_as_torch_does(kernel_device, formulation, name, options):
+    """Also at later times: on a GPU the third rollout is replayed."""
+    solver, reference, state, load = _pair(kernel_device, lambda: _wind(name), formulation, **options)
+    assert load.twin() is not None
+    assert (load.sums is not None) == ("groups" in options)
+    load.refresh(state)
+    for _ in range(3):
+        found, expected = solver.rollout(state, DT, 3, load), reference.rollout(state, DT, 3, load)
+        _same(found, expected)
+        before, state = state, expected
+    assign(load.wind, effects=torch.nn.ModuleList())
+    bare = reference.rollout(before, DT, 3, load)
+    change = float((bare.velocity - expected.velocity).abs().max())
+    least = 1e-2 * float(expected.velocity.abs().max())
+    assert change > least, f"without the effects the velocity differs by {change:.2g} m/s: make them stronger in _wind"
+
+
+def test_a_changed_effect_is_read_again_at_the_same_address(kernel_device):
+    """A table changed in place, another flow, and rollouts that are replayed from graphs on a GPU."""
+    solver, reference, state, load = _pair(kernel_device, lambda: _wind("half"))
+    ends, where = [], None
+    for change in range(4):
+        if change == 2:
+            load.wind.effects[1].table.mul_(-3.0)
+        if change == 3:
+            assign(load.wind, flows=load.wind.flows.flip(0))
+        ends.append(solver.rollout(state, DT, 5, load))
+        _same(ends[-1], reference.rollout(state, DT, 5, load))
+        where = where or solver.fused().loads.tables.buffer.data_ptr()
+        assert solver.fused().loads.tables.buffer.data_ptr() == where
+    assert_close(ends[0].position, ends[1].position, rtol=0, atol=1e-6)
+    for one, other in ((1, 2), (2, 3)):
+        assert (ends[one].velocity - ends[other].velocity).abs().max() > 1e-3
+
+
+def test_only_what_has_changed_is_written_again(kernel_device, monkeypatch):
+    """A shelter is refreshed in every frame; the turbulence before it has fifty megabytes in its full size."""
+    _, state, load = _setting(_wind("sheltered"), like=torch.zeros((), device=kernel_device))
+    written, tables = [], Tables(torch.device(kernel_device))
+    plain = torch.Tensor.copy_
+    monkeypatch.setattr(torch.Tensor, "copy_", lambda to, what: written.append(to.numel()) or plain(to, what))
+
+    def take():
+        written.clear()
+        tables.take([load.twin()], Composed([load.twin()]))
+        return list(written)
+
+    turbulence, shelter = [21, 8 * 6 * 4 * 3], [21, 8**3]
+    assert take() == [*turbulence, *shelter]
+    assert take() == []
+    load.refresh(state)
+    assert take() == shelter
+    load.wind.effects[0].table.mul_(2.0)
+    assert take() == turbulence
+    buffer = tables.buffer.clone()
+    tables = Tables(torch.device(kernel_device))
+    assert take() == [*turbulence, *shelter]
+    assert torch.equal(tables.buffer, buffer)
+
+
+class _NoReading(TorchDispatchMode):
+    """Refuses what a CUDA graph cannot record: to read a number of a tensor, and to make a tensor of numbers."""
+
+    def __torch_dispatch__(self, function, types, args=(), kwargs=None):
+        assert function is not torch.ops.aten._local_scalar_dense.default, "the host reads a number of a tensor"
+        assert function is not torch.ops.aten.lift_fresh.default, "`forward` makes a tensor: register a buffer instead"
+        return function(*args, **(kwargs or {}))
+
+
+def test_the_host_reads_nothing_of_a_wind():
+    """So all of it can be recorded, and the needs of the next frame of a shelter can be measured in a CUDA graph."""
+    time, place = torch.tensor(0.003, dtype=torch.float64), torch.rand(20, 3)
+    for wind in map(_wind, ("all", "half", "several")):
+        for interpolation in ("step", "linear"):
+            wind = WindField(schedule=TURNING, interpolation=interpolation, effects=wind.effects)
+            expected = wind.at(time, place)
+            with _NoReading():
+                found = wind.at(time, place)
+            assert torch.equal(found, expected)
+    _, state, load = _setting(_wind("sheltered"))
+    with _NoReading():
+        load.foreseen(state).samples(state, DT, 5)
+
+
+def test_what_the_kernels_do_not_know_runs_in_torch():
+    """A subclass does not inherit the twin, nor does a wind have one without those of all effects."""
+
+    class Doubled(LogProfile):
+        def forward(self, velocity, position, moment):
+            return 2 * super().forward(velocity, position, moment)
+
+    class Same(LogProfile):
+        twin = LogProfile.twin
+
+    assert Doubled().twin() is None
+    assert Same().twin().function is LogProfile().twin().function
+    for effects in ([Doubled()], [Same(), Doubled(), EllipsoidObstacle(MIDDLE, [0.05] * 3)]):
+        wind = WindField([1.0, 0.0, 0.0], effects=effects)
+        assert _setting(wind)[2].twin() is None
