@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 
 from gaussian_swaying._devices import in_double
-from gaussian_swaying.geometry.linalg import matmul3, polar_rotation
+from gaussian_swaying.geometry.linalg import matmul3
 from gaussian_swaying.geometry.rotations import quat_to_rotation, rotation_to_quat
 
 
@@ -57,80 +57,3 @@ def deform_covariance(deformation_gradient: Tensor, covariances: Tensor) -> Tens
         Shape (..., 3, 3).
     """
     return matmul3(matmul3(deformation_gradient, covariances), deformation_gradient.mT)
-
-
-def limit_stretch(covariances: Tensor, rest: Tensor, max_stretch: float, shape: Tensor | None = None) -> Tensor:
-    r"""Limit the size of Gaussians that are stretched too far, and blend them towards a given shape.
-
-    The size of a Gaussian is :math:`\sqrt{\operatorname{tr} a}`. Where it is :math:`r` times that at rest and
-    :math:`r > r_{max}`, the covariance becomes
-
-    .. math::
-        w\, a + (1 - w)\, B, \qquad w = \frac{r_{max}^2 - 1}{r^2 - 1},
-
-    whose size is :math:`r_{max}` times that at rest: a slightly stretched B instead of a streak. Gaussians below the
-    limit do not change, and the result is continuous at the limit.
-
-    Args:
-        covariances: Covariances a [scene units^2], shape (..., 3, 3).
-        rest: Covariances A at rest [scene units^2], shape (..., 3, 3).
-        max_stretch: Largest ratio of the sizes, above 1.
-        shape: Covariances B [scene units^2] with the trace of A, shape (..., 3, 3); None for a ball, as for a grain
-            that has lost its shape.
-
-    Returns:
-        Shape (..., 3, 3).
-    """
-    size, size_at_rest = _trace(covariances)[..., None, None], _trace(rest)[..., None, None]
-    excess = (max_stretch**2 - 1) * size_at_rest
-    over = size - size_at_rest
-    weight = excess / torch.maximum(over, excess)
-    if shape is None:
-        shape = torch.eye(3, dtype=rest.dtype, device=rest.device) * (size_at_rest / 3)
-    return torch.where(over > excess, weight * covariances + (1 - weight) * shape, covariances)
-
-
-def limit_deformed(
-    deformation_gradient: Tensor,
-    covariances: Tensor,
-    rest: Tensor,
-    max_stretch: float,
-    solid: Tensor,
-    rotations: Tensor | None = None,
-) -> Tensor:
-    """:func:`limit_stretch` with the shape that suits the material: the shape at rest for solids, else a ball.
-
-    A Gaussian of a solid returns towards its shape at rest, rotated with the material. A Gaussian of a plastic material
-    becomes rounder. On a CPU only Gaussians beyond the limit are computed. On a GPU all are, so that the host does not
-    have to wait.
-
-    Args:
-        deformation_gradient: Total deformation gradient F, shape (N, 3, 3).
-        covariances: Covariances F A F^T [scene units^2], shape (N, 3, 3).
-        rest: Covariances A at rest [scene units^2], shape (N, 3, 3).
-        max_stretch: Largest ratio of the sizes, above 1.
-        solid: Which Gaussians are solid, bool, shape (N,).
-        rotations: Polar factors of F, shape (N, 3, 3), if they are known.
-
-    Returns:
-        Shape (N, 3, 3).
-    """
-    if covariances.device.type == "cpu":
-        beyond = (_trace(covariances) > max_stretch**2 * _trace(rest)).nonzero()[:, 0]
-        if len(beyond) == 0:
-            return covariances
-        turn = polar_rotation(deformation_gradient[beyond]) if rotations is None else rotations[beyond]
-        part = (covariances[beyond], rest[beyond])
-        return covariances.index_copy(0, beyond, limit_stretch(*part, max_stretch, _own(part[1], turn, solid[beyond])))
-    turn = polar_rotation(deformation_gradient) if rotations is None else rotations
-    return limit_stretch(covariances, rest, max_stretch, _own(rest, turn, solid))
-
-
-def _own(rest: Tensor, turn: Tensor, solid: Tensor) -> Tensor:
-    """The rotated shape at rest for solids, else the ball with the same trace."""
-    ball = torch.eye(3, dtype=rest.dtype, device=rest.device) * (_trace(rest)[:, None, None] / 3)
-    return torch.where(solid[:, None, None], matmul3(matmul3(turn, rest), turn.mT), ball)
-
-
-def _trace(matrices: Tensor) -> Tensor:
-    return matrices.diagonal(dim1=-2, dim2=-1).sum(-1)

@@ -7,7 +7,7 @@ import math
 import torch
 from torch import Tensor
 
-from gaussian_swaying.geometry.covariances import deform_covariance, limit_deformed
+from gaussian_swaying.geometry.covariances import deform_covariance
 from gaussian_swaying.geometry.linalg import polar_rotation
 from gaussian_swaying.geometry.linalg_triton import (
     axpy9,
@@ -71,7 +71,18 @@ def deformed_normal(F, n):
 
 @triton.jit
 def _limited(drawn, rest, turn, solid, square):
-    """See ``covariances.limit_deformed``; ``square`` is that of the largest stretch."""
+    r"""Covariance of a Gaussian that is not stretched too far; ``square`` is that of the largest stretch.
+
+    The size of a Gaussian is :math:`\sqrt{\operatorname{tr} a}`. Where it is :math:`r` times that at rest and
+    :math:`r > r_{max}`, the covariance becomes
+
+    .. math::
+        w\, a + (1 - w)\, B, \qquad w = \frac{r_{max}^2 - 1}{r^2 - 1},
+
+    whose size is :math:`r_{max}` times that at rest: a slightly stretched B instead of a streak. For a solid, B is the
+    shape at rest, turned with the material; for a grain, which has lost its shape, a ball. Gaussians below the limit do
+    not change, and the result is continuous at the limit.
+    """
     size = rest[0] + rest[4] + rest[8]
     excess = (square - 1) * size
     over = drawn[0] + drawn[4] + drawn[8] - size
@@ -185,7 +196,7 @@ def deform_all(
         covariances: Covariances A at rest [scene units^2], shape (N, 3, 3).
         normals: Unit normals N at rest, shape (N, 3).
         rotations: Whether to compute the rotations.
-        max_stretch: Limit of :func:`limit_deformed`, above 1; None for none.
+        max_stretch: Largest ratio of the sizes, above 1; None for none.
         solid: Which Gaussians are solid, bool, shape (N,); needed with ``max_stretch``.
 
     Returns:
@@ -196,10 +207,12 @@ def deform_all(
     if replaces(tensors):
         return _deform_all(*tensors, rotations, max_stretch, solid)
     drawn = deform_covariance(deformation_gradient, covariances)
-    turns = polar_rotation(deformation_gradient) if rotations else None
-    if max_stretch is not None and solid is not None:
-        drawn = limit_deformed(deformation_gradient, drawn, covariances, max_stretch, solid, turns)
-    return drawn, deform_normal(deformation_gradient, normals), turns
+    turns = None if not rotations and max_stretch is None else polar_rotation(deformation_gradient)
+    if max_stretch is not None and solid is not None and turns is not None:
+        given = (components(part) for part in (drawn, covariances, turns))
+        found = on_tensors(_limited)(*given, solid, max_stretch**2)
+        drawn = torch.stack(torch.broadcast_tensors(*found), dim=-1).reshape(drawn.shape)
+    return drawn, deform_normal(deformation_gradient, normals), turns if rotations else None
 
 
 def _deform_all(

@@ -208,7 +208,9 @@ class Tables:
                 changed, self._seen[k] = True, (key, (modules, tensors))  # so that no new object gets an old id
                 for first, values in entries:
                     if values.count:
-                        self.buffer[first : first + values.count].copy_(torch.as_tensor(values.take()).reshape(-1))
+                        given = values.take()
+                        given = given if isinstance(given, Tensor) else torch.tensor(given, dtype=torch.float64)
+                        self.buffer[first : first + values.count].copy_(given.reshape(-1))
         return changed
 
 

@@ -57,7 +57,7 @@ class Scene(Fixed):
         wind_on: The simulated Gaussians that feel the wind: ``surface`` (those in contact with open air) or ``all``
             (also those inside the solid that ``filling`` finds). Without ``filling``, all are on the surface.
         max_stretch: Largest size at which a Gaussian is drawn, as a multiple of its size at rest (see
-            :func:`~gaussian_swaying.geometry.covariances.limit_deformed`), in pictures and exports; null for no limit.
+            :func:`~gaussian_swaying.geometry.patches.deform_all`), in pictures and exports; null for no limit.
             Nothing changes below the limit. Above it a Gaussian would look like a streak: two parts of the object that
             share cells of the grid were pulled apart, or a material flowed.
         layers: Layers of material points through the thickness: 1 is a membrane that folds without resistance, or with

@@ -29,7 +29,6 @@ from gaussian_swaying.geometry.distance import DistanceGrid
 from gaussian_swaying.geometry.frame import SimFrame
 from gaussian_swaying.geometry.regions import Region
 from gaussian_swaying.kernels.graphs import Replayed
-from gaussian_swaying.kernels.language import tl, triton
 from gaussian_swaying.mpm.forces import Force
 from gaussian_swaying.mpm.protocol import Solver
 from gaussian_swaying.mpm.state import State
@@ -37,7 +36,7 @@ from gaussian_swaying.mpm.timestep import look_marks
 from gaussian_swaying.mpm.twins import Numbers, Twin
 from gaussian_swaying.wind.effects import Obstacle
 from gaussian_swaying.wind.field import WindField
-from gaussian_swaying.wind.force import WindForce
+from gaussian_swaying.wind.force import WindForce, air_push
 from gaussian_swaying.wind.tables import Shelter
 
 LEAST_CELLS = 8
@@ -115,16 +114,6 @@ class ComputedAir(Fixed, nn.Module):
         """Cells along x, y and z, with those within the ground."""
         sides = [math.ceil((b - a) / self.spacing - 1e-6) for a, b in zip(self.low, self.high, strict=True)]
         return sides[0], sides[1], sides[2] + self.ground
-
-
-@triton.jit
-def air_push(F, velocity, position, point, numbers, now, table, OPTIONS: tl.constexpr):
-    """``AirPush``; ``point``: the force at rest (three numbers), and its decrease per velocity."""
-    rate = point[3]
-    return (
-        (point[0] - rate * velocity[0], point[1] - rate * velocity[1], point[2] - rate * velocity[2]),
-        rate * 0.0,
-    )
 
 
 class AirPush(Force):

@@ -9,7 +9,8 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import Any, TypeVar
+from itertools import chain
+from typing import Any
 
 import torch
 from torch import Tensor, nn
@@ -451,9 +452,6 @@ def wake_start(drag: float) -> float:
     return 0.25 * math.sqrt(0.5 * (1 + root) / root)
 
 
-AnyObstacle = TypeVar("AnyObstacle", bound="Obstacle")
-
-
 class Obstacle(WindEffect):
     """Base of bodies in the wind: potential flow round them, and a wake behind them.
 
@@ -462,22 +460,16 @@ class Obstacle(WindEffect):
     """
 
     recordable = True
-    middle: Tensor
 
     def __init__(self, center: Sequence[float], drag: float) -> None:
         super().__init__()
         check_positive("drag", drag, allow_zero=True)
-        self.center, self.drag = list(check_vector("center", center)), float(drag)
-        self.register_buffer("middle", torch.tensor(self.center, dtype=torch.float64), persistent=False)
-
-    def moved(self: AnyObstacle, frame: SimFrame, **values: Any) -> AnyObstacle:
-        """A copy with its centre in metres, z up, and other values."""
-        return changed(self, middle=torch.tensor(placed(frame, self.center), dtype=torch.float64), **values)
+        self.center, self.drag = check_vector("center", center), float(drag)
 
 
-def _filled(like: Tensor, *values: float) -> list[Tensor]:
-    """Numbers as tensors of one, made on the device."""
-    return [torch.full_like(like[:1], value) for value in values]
+def _turned(frame: SimFrame, axes: Any) -> Any:
+    """Directions, as lists, in the axes of a simulation."""
+    return frame.direction_to_sim(torch.tensor(axes, dtype=torch.float64)).tolist()
 
 
 class CylinderObstacle(Obstacle):
@@ -500,26 +492,24 @@ class CylinderObstacle(Obstacle):
         super().__init__(center, drag)
         check_positive("radius", radius)
         self.radius = float(radius)
-        given = torch.tensor(check_vector("axis", axis), dtype=torch.float64)
-        if not float(given.norm()) > 0:
+        length = math.hypot(*check_vector("axis", axis))
+        if not length > 0:
             raise ValueError("Expected `axis` to have a direction, but it is zero.")
-        self.register_buffer("axis", given / given.norm(), persistent=False)
-        self.axis: Tensor
+        self.axis = [part / length for part in axis]
 
     def twin(self) -> Twin:
         return Twin(
             past_cylinder,
             options=(self.drag > 0,),
-            numbers=Numbers(
-                8, lambda: torch.cat([self.middle, self.axis, *_filled(self.middle, self.radius, self.drag)])
-            ),
+            numbers=Numbers(8, lambda: [*self.center, *self.axis, self.radius, self.drag]),
             per_substep=Numbers(3, lambda moment: moment.flow),
             sources=(self,),
         )
 
     def in_frame(self, frame: SimFrame) -> WindEffect:
         """In metres, z up."""
-        return self.moved(frame, radius=self.radius * frame.metres_per_unit, axis=frame.direction_to_sim(self.axis))
+        radius = self.radius * frame.metres_per_unit
+        return changed(self, center=placed(frame, self.center), radius=radius, axis=_turned(frame, self.axis))
 
 
 class EllipsoidObstacle(Obstacle):
@@ -539,11 +529,8 @@ class EllipsoidObstacle(Obstacle):
             check_positive("radii", radius)
         if not drag < 1:
             raise ValueError(f"Expected `drag` of an ellipsoid to be below 1, but got {drag}: a wall has 0.9.")
-        angle = torch.tensor(float(turn), dtype=torch.float64).deg2rad()
-        cos, sin, zero = angle.cos(), angle.sin(), torch.zeros((), dtype=torch.float64)
-        rows = [torch.stack([cos, sin, zero]), torch.stack([-sin, cos, zero]), torch.stack([zero, zero, zero + 1])]
-        self.register_buffer("axes", torch.stack(rows), persistent=False)
-        self.axes: Tensor
+        cos, sin = math.cos(math.radians(turn)), math.sin(math.radians(turn))
+        self.axes = [[cos, sin, 0.0], [-sin, cos, 0.0], [0.0, 0.0, 1.0]]
 
     def forward(self, velocity: Tensor, position: Tensor, moment: Moment) -> Tensor:
         return blown(self._twin(12, 9) if position.dtype == torch.float64 else self.twin(), velocity, position, moment)
@@ -552,12 +539,10 @@ class EllipsoidObstacle(Obstacle):
         return self._twin(7, 5)  # from two thirds of the distance to the root, to float32
 
     def _twin(self, newton: int, duplications: int) -> Twin:
-        def numbers() -> Tensor:
-            radii = tuple(map(float, self.radii))
-            size = max(radii)
-            shape = [*(radius / size for radius in radii), *ellipsoid_strength(radii)]
-            rest = _filled(self.middle, size, self.drag, wake_start(self.drag), *shape)
-            return torch.cat([self.middle, self.axes.reshape(-1), *rest])
+        def numbers() -> list[float]:
+            size = max(self.radii)
+            shape = [*(radius / size for radius in self.radii), *ellipsoid_strength(tuple(self.radii))]
+            return [*self.center, *chain(*self.axes), size, self.drag, wake_start(self.drag), *shape]
 
         return Twin(
             past_ellipsoid,
@@ -570,4 +555,4 @@ class EllipsoidObstacle(Obstacle):
     def in_frame(self, frame: SimFrame) -> WindEffect:
         """In metres, z up."""
         radii = [radius * frame.metres_per_unit for radius in self.radii]
-        return self.moved(frame, radii=radii, axes=frame.direction_to_sim(self.axes))
+        return changed(self, center=placed(frame, self.center), radii=radii, axes=_turned(frame, self.axes))

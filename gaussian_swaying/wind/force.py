@@ -550,9 +550,9 @@ class AeroForce(Fixed, nn.Module):
 
 
 @triton.jit
-def steady_force(F, velocity, position, point, numbers, now, table, OPTIONS: tl.constexpr):
-    """``AirLift``: the numbers of a point are its force; no resistance."""
-    return (point[0], point[1], point[2]), point[0] * 0
+def air_push(F, velocity, position, point, numbers, now, table, OPTIONS: tl.constexpr):
+    """A force at rest less a rate times the velocity; ``point``: the force (3) and the rate."""
+    return add3(point, -point[3], velocity), point[3] * 0.0
 
 
 def carried_mass(patches: Patches, aero: AeroForce) -> Tensor:
@@ -601,7 +601,8 @@ class AirLift(Force):
         return -(in_double(self.force) * in_double(state.position)).sum((-2, -1))
 
     def twin(self) -> Twin | None:
-        return Twin(steady_force, per_point=Numbers(3, lambda: self.force), sources=(self.force,))
+        numbers = Numbers(4, lambda: torch.nn.functional.pad(self.force, (0, 1)))
+        return Twin(air_push, per_point=numbers, sources=(self.force,))
 
 
 Wind = WindField | SpatialWind

@@ -18,8 +18,6 @@ of the area :math:`\kappa` stands for that of each patch.
 
 from __future__ import annotations
 
-from copy import copy
-
 import torch
 from torch import Tensor, nn
 
@@ -66,6 +64,7 @@ class PatchSums(nn.Module):
         patches: The patches.
         coarse: Whether directions up to 0.25 rad from their mean may be joined: for laws in which only the
             lift depends on the sum of signs.
+        tensor: Sum of A N N^T, if it is known better than from joined patches.
 
     Attributes:
         tensor: Sum of A N N^T [m²], shape (P, 3, 3).
@@ -74,13 +73,14 @@ class PatchSums(nn.Module):
         single: Whether no point has patches of more than one direction.
     """
 
-    def __init__(self, patches: Patches, coarse: bool = False) -> None:
+    def __init__(self, patches: Patches, coarse: bool = False, tensor: Tensor | None = None) -> None:
         super().__init__()
+        like = patches.area
         with torch.no_grad():
             normal, area, point = patches.normal.cpu().double(), patches.area.cpu().double(), patches.point.cpu()
-            tensor = second_moments(normal, area, point, patches.count)
-            vector, owner = joined_directions(normal, area, point, tensor, coarse)
-        like = patches.area
+            if tensor is None:
+                tensor = second_moments(normal, area, point, patches.count)
+            vector, owner = joined_directions(normal, area, point, tensor.cpu().double(), coarse)
         self.register_buffer("tensor", tensor.to(like), persistent=False)
         self.register_buffer("vector", vector.to(like), persistent=False)
         self.register_buffer("point", owner.to(like.device), persistent=False)
@@ -97,15 +97,10 @@ class PatchSums(nn.Module):
             count: Number of groups.
             coarse: As in the constructor.
         """
-        other = copy(self)
-        other._buffers = dict(self._buffers)
-        tensor, length = sums(self.tensor, group, count), self.vector.norm(dim=-1)
+        length = self.vector.norm(dim=-1)
         normal = self.vector / length[:, None].clamp(min=torch.finfo(length.dtype).tiny)
-        vector, owner = joined_directions(
-            normal.double().cpu(), length.double().cpu(), group[self.point].cpu(), tensor.double().cpu(), coarse
-        )
-        other.tensor, other.vector, other.point = tensor, vector.to(self.vector), owner.to(self.point.device)
-        return other
+        patches = Patches(normal, length, group[self.point], count)
+        return PatchSums(patches, coarse, sums(self.tensor, group, count))
 
     @property
     def area(self) -> Tensor:

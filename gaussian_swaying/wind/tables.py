@@ -127,7 +127,7 @@ class Tabulated(WindEffect):
         table: Values at the corners of its cells, along its own axes, shape (X, Y, Z, 3), or (X, Y, Z, 1) for shares;
             for each of several times (T, X, Y, Z, 3).
         step: Sides of a cell [m], shape (3,), float64.
-        place: Where its first corner is, or a point that the subclass knows [m], shape (3,), float64.
+        origin: Where its first corner is, or a point that the subclass knows, in scene units; in Python [m], z up.
         wraps: Whether it repeats along each axis; if not, its outermost values go on outside.
     """
 
@@ -139,13 +139,22 @@ class Tabulated(WindEffect):
     place: Tensor
 
     def __init__(
-        self, table: Tensor, step: Tensor, place: Tensor, wraps: tuple[bool, bool, bool] = (False, False, False)
+        self,
+        table: Tensor,
+        step: Tensor,
+        origin: Sequence[float] = (0.0, 0.0, 0.0),
+        wraps: tuple[bool, bool, bool] = (False, False, False),
     ) -> None:
         super().__init__()
-        self.wraps = wraps
+        self.wraps, self.origin = wraps, check_vector("origin", origin)
+        place = torch.tensor(self.origin, dtype=torch.float64)
         sizes, eye = torch.tensor(table.shape[-4:-1], dtype=torch.float64), torch.eye(3, dtype=torch.float64)
         for name, value in {"table": table, "sizes": sizes, "axes": eye, "step": step, "place": place}.items():
             self.register_buffer(name, value, persistent=False)
+
+    def in_frame(self, frame: SimFrame) -> WindEffect:
+        """The origin in metres."""
+        return changed(self, place=torch.tensor(placed(frame, self.origin), dtype=torch.float64))
 
     @abstractmethod
     def now(self, moment: Moment) -> Tensor:
@@ -221,10 +230,9 @@ class CarriedField(Tabulated):
         if table.ndim != 4 or table.shape[-1] != 3 or min(table.shape[:3]) < 2:
             raise ValueError(f"Expected `table` of shape (X, Y, Z, 3), at least 2 each, but got {tuple(table.shape)}.")
         self.spacing = check_vector("spacing", spacing)
-        self.origin, (self.scale,) = check_vector("origin", origin), check_vector("scale", [scale], 1)
-        self.tilted = bool(tilted)
-        step, place, first = (torch.tensor(v, dtype=torch.float64) for v in (self.spacing, self.origin, anchor))
-        super().__init__(table, step, place, wraps)
+        (self.scale,), self.tilted = check_vector("scale", [scale], 1), bool(tilted)
+        step, first = (torch.tensor(v, dtype=torch.float64) for v in (self.spacing, anchor))
+        super().__init__(table, step, origin, wraps)
         self.register_buffer("anchor", first, persistent=False)
         self.register_buffer("start", torch.zeros_like(first), persistent=False)
 
@@ -234,10 +242,6 @@ class CarriedField(Tabulated):
     def along(self, flow: Tensor) -> WindEffect:
         """The field with its x axis turned into the flow."""
         return changed(self, axes=box_axes(flow.detach().cpu(), (self.sizes * self.step).tolist(), self.tilted))
-
-    def in_frame(self, frame: SimFrame) -> WindEffect:
-        """The origin in metres."""
-        return changed(self, place=torch.tensor(placed(frame, self.origin), dtype=torch.float64))
 
     def now(self, moment: Moment) -> Tensor:
         """The place of the object's centre in the field, in its first period where it repeats, and the strength."""
@@ -341,15 +345,14 @@ class RecordedWind(Tabulated):
         scale: float = 1.0,
     ) -> None:
         grid = read_grid(path)
-        self.path, self.origin = str(path), list(check_vector("origin", origin))
-        (self.scale,), self.repeat = check_vector("scale", [scale], 1), bool(repeat)
+        (self.scale,), self.repeat, self.path = check_vector("scale", [scale], 1), bool(repeat), str(path)
         times = torch.from_numpy(grid.times)
         begin = float(times[0]) if start is None else check_vector("start", [start], 1)[0]
         step = float((times[-1] - times[0]) / (len(times) - 1)) if len(times) > 1 else 1.0
         check_positive("the step of time", step)
         self.period = float(times[-1] - times[0]) + step
-        spacing, first, place = (torch.tensor(v, dtype=torch.float64) for v in (grid.spacing, grid.first, self.origin))
-        super().__init__(torch.from_numpy(grid.velocity), spacing, place)
+        spacing, first = (torch.tensor(v, dtype=torch.float64) for v in (grid.spacing, grid.first))
+        super().__init__(torch.from_numpy(grid.velocity), spacing, origin)
         begin_at = torch.tensor(begin - float(times[0]), dtype=torch.float64)
         for name, value in {"times": times - times[0], "begin": begin_at, "first": first}.items():
             self.register_buffer(name, value, persistent=False)
@@ -357,10 +360,6 @@ class RecordedWind(Tabulated):
     times: Tensor
     begin: Tensor
     first: Tensor
-
-    def in_frame(self, frame: SimFrame) -> WindEffect:
-        """The origin in metres, z up."""
-        return changed(self, place=torch.tensor(placed(frame, self.origin), dtype=torch.float64))
 
     def now(self, moment: Moment) -> Tensor:
         last = len(self.times) - 1
@@ -444,8 +443,7 @@ class Shelter(Tabulated):
             raise ValueError(f"Expected `cells` to be a whole number from 4 to 256, but got {cells!r}.")
         check_positive("strength", strength, allow_zero=True)
         self.cells, self.strength = cells, float(strength)
-        one = torch.ones(3, dtype=torch.float64)
-        super().__init__(torch.ones(cells, cells, cells, 1), one, torch.zeros_like(one))
+        super().__init__(torch.ones(cells, cells, cells, 1), torch.ones(3, dtype=torch.float64))
 
     def in_frame(self, frame: SimFrame) -> WindEffect:
         """A copy, which a simulation refreshes; the given one stays as it is, for the comparison before a resume."""

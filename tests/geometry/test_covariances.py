@@ -9,10 +9,8 @@ from gaussian_swaying.geometry.covariances import (
     covariance,
     covariance_to_quat_scale,
     deform_covariance,
-    limit_deformed,
-    limit_stretch,
 )
-from gaussian_swaying.geometry.linalg import polar_rotation
+from gaussian_swaying.geometry.patches import deform_all
 from gaussian_swaying.geometry.rotations import quat_to_rotation
 
 
@@ -63,6 +61,12 @@ def test_deformed_covariance_is_that_of_mapped_samples(device, dtype):
     assert_close(deform_covariance(f, covariance(quats, scales)), mapped @ mapped.mT)
 
 
+def _drawn(f, rest, limit=2.0, solid=None):
+    """Covariances after a deformation; of grains."""
+    solid = torch.zeros(len(f), dtype=torch.bool, device=f.device) if solid is None else solid
+    return deform_all(f, rest, torch.ones_like(f[:, 0]), False, limit, solid)[0]
+
+
 def test_gaussians_are_drawn_out_to_a_limit(device, dtype):
     """Those below it keep their bits; those above have that size, and stay proper covariances."""
     rest = torch.diag(torch.tensor([4.0, 1.0, 0.01])).expand(6, 3, 3).to(device, dtype)
@@ -72,8 +76,7 @@ def test_gaussians_are_drawn_out_to_a_limit(device, dtype):
     f[3, 1, 0] = 1e4
     f[4] = 50 * torch.eye(3)
     f[5] = 0.0
-    covariances = deform_covariance(f, rest)
-    limited = limit_stretch(covariances, rest, 2.0)
+    covariances, limited = (_drawn(f, rest, limit) for limit in (None, 2.0))
     assert torch.equal(limited[[0, 1, 5]], covariances[[0, 1, 5]])
     size = limited.diagonal(dim1=-2, dim2=-1).sum(-1)
     assert_close(size[2:5], 4 * rest.diagonal(dim1=-2, dim2=-1).sum(-1)[2:5])
@@ -87,7 +90,7 @@ def test_gaussians_are_drawn_out_to_a_limit(device, dtype):
 
 def test_the_limit_on_stretch_is_reached_without_a_jump():
     rest = torch.eye(3, dtype=torch.float64)
-    close = [limit_stretch(torch.diag(double([a, 1.0, 1.0])), rest, 2.0) for a in (10.0 - 1e-9, 10.0 + 1e-9)]
+    close = [_drawn(torch.diag(double([a**0.5, 1.0, 1.0]))[None], rest[None]) for a in (10.0 - 1e-9, 10.0 + 1e-9)]
     assert_close(close[0], close[1], rtol=0, atol=1e-7)
 
 
@@ -97,12 +100,11 @@ def test_a_solid_beyond_the_limit_goes_back_to_its_own_shape(device, dtype):
     turn = torch.tensor([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]], device=device, dtype=dtype)
     stretch = torch.tensor([[1.9, 1.0, 1.0], [1.0, 1e3, 1.0], [1.0, 1e3, 1.0], [3.0, 3.0, 3.0]]).to(rest)
     f = turn * stretch[:, None, :]
-    drawn = deform_covariance(f, rest)
+    drawn = _drawn(f, rest, None)
     solid = torch.tensor([True, True, False, True], device=device)
-    kept = limit_deformed(f, drawn, rest, 2.0, solid)
+    kept = _drawn(f, rest, solid=solid)
     assert torch.equal(kept[0], drawn[0])
-    assert torch.equal(limit_deformed(f, drawn, rest, 2.0, ~solid)[2], kept[1])
-    assert_close(limit_deformed(f, drawn, rest, 2.0, solid, polar_rotation(f)), kept)
+    assert torch.equal(_drawn(f, rest, solid=~solid)[2], kept[1])
     size, size_at_rest = kept.diagonal(dim1=-2, dim2=-1).sum(-1), rest.diagonal(dim1=-2, dim2=-1).sum(-1)
     assert_close(size[1:], 4 * size_at_rest[1:])
     # turned, x and y change places; the thin axis stays thin, and what was torn out is 3 sizes long, not a thousand
@@ -110,7 +112,7 @@ def test_a_solid_beyond_the_limit_goes_back_to_its_own_shape(device, dtype):
     assert_close(own, double([3 * 5.01 + 1.0, 4.0, 0.01]), rtol=1e-3, atol=1e-4)
     assert_close(grain, double([3 * 5.01 + 1.67, 1.67, 1.67]), rtol=1e-3, atol=1e-4)
     assert_close(kept[3], 4 * turn @ rest[3] @ turn.T, rtol=1e-5, atol=1e-6)
-    assert torch.equal(limit_deformed(f[:0], drawn[:0], rest[:0], 2.0, solid[:0]), drawn[:0])
+    assert _drawn(f[:0], rest[:0]).shape == (0, 3, 3)
 
 
 def test_gradcheck(device):

@@ -28,7 +28,7 @@ def test_places_are_converted_once(make_simulation):
     expected = 2.0 * (torch.tensor([1.0, 2.0, 3.0], dtype=torch.float64) - frame.origin)
     for _ in range(2):
         sphere, profile = simulation.wind.effects
-        torch.testing.assert_close(sphere.middle, expected)
+        assert sphere.center == pytest.approx(expected.tolist())
         assert list(sphere.radii) == [1.0] * 3
         assert profile.ground[2] == pytest.approx(2.0 * (-1.0 - float(frame.origin[2])))
         simulation.wind = simulation.wind

@@ -151,7 +151,7 @@ def test_obstacles_in_a_frame_are_those_of_the_scene(turn):
         found = moved(flow @ rotation.T, frame.point_to_sim(scene), there) @ rotation
         assert_close(found, expected)
         assert (expected - flow).abs().max() > 0.05
-        assert torch.equal(obstacle.middle, double([1.0, 2.5, 3.0]))
+        assert list(obstacle.center) == [1.0, 2.5, 3.0]
 
 
 def test_a_wall_shelters_what_is_behind_it():
