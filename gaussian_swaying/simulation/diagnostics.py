@@ -13,7 +13,7 @@ from torch import Tensor
 
 from gaussian_swaying._devices import in_double
 from gaussian_swaying._fixed import fixed
-from gaussian_swaying.geometry.linalg import determinant, svd3
+from gaussian_swaying.geometry.linalg import determinant, largest_eigenvalue, matmul3
 from gaussian_swaying.geometry.neighbours import nearest_neighbours
 from gaussian_swaying.kernels.graphs import RECORDED, Replayed
 from gaussian_swaying.mpm.protocol import Solver
@@ -282,7 +282,8 @@ def measure(
         work = work + (lifted - lift.potential(start)).to(work.device)
     J = determinant(state.F_total)
     F = in_double(state.F_total)
-    squares = svd3(F)[1].square()
+    C = matmul3(F.mT, F)
+    longest, shortest = largest_eigenvalue(torch.stack([C, -C])).abs().sqrt().unbind()
     columns = {
         **energies,
         "wind_work": work,
@@ -292,13 +293,13 @@ def measure(
         "torn": torch.zeros_like(moved[..., 0]) if tearing is None else tearing(state.position).sum(-1),
         "J_min": J.amin(-1),
         "J_max": J.amax(-1),
-        "stretch_min": squares[..., -1].amin(-1).clamp(min=0).sqrt(),
-        "stretch_max": squares[..., 0].amax(-1).clamp(min=0).sqrt(),
+        "stretch_min": shortest.amin(-1),
+        "stretch_max": longest.amax(-1),
         "displacement_mean": moved.mean(-1),
         "displacement_max": moved.amax(-1),
         "moved_particle": moved.argmax(-1),
-        "compressed_particle": squares[..., -1].argmin(-1),
-        "stretched_particle": squares[..., 0].argmax(-1),
+        "compressed_particle": shortest.argmin(-1),
+        "stretched_particle": longest.argmax(-1),
     }
     scenes = moved.shape[:-1].numel()
     support = support_force(start, state)

@@ -497,7 +497,7 @@ class WindField(Fixed, nn.Module):
         time = torch.as_tensor(time, dtype=torch.float64, device=self.times.device)
         velocity = self.mean_flow(time)
         time = self._wide(time)[..., 0].expand(velocity.shape[:-1])
-        if time.is_cuda and self._known_rows(time) and replaces((velocity,), dtype=None):
+        if self._known_rows(time) and replaces((velocity,), dtype=None):
             return self.modulated(velocity, time)
         for stream, modulation in enumerate(self.modulations):
             velocity = modulation(velocity, time, self.seed, stream)
