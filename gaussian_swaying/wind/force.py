@@ -139,28 +139,6 @@ def shaped_wind(position, now, table, EFFECTS: tl.constexpr):
 
 
 @triton.jit
-def _resisted(force, area, air, velocity, numbers, LAW: tl.constexpr, IMPLICIT: tl.constexpr):
-    """A force with its resistance [kg/s], zero if the drag is explicit."""
-    resistance = area * 0
-    if IMPLICIT:
-        resistance = numbers[3] * area * yielding(air, add3(air, -1.0, velocity), numbers, LAW)
-    return force, resistance
-
-
-@triton.jit
-def wind_force(F, velocity, position, patch, numbers, now, table, OPTIONS: tl.constexpr):
-    """``WindForce`` on patches.
-
-    ``now``: velocity without effects, and the numbers of each effect. ``OPTIONS``: place of the law in :data:`LAWS`,
-    semi-implicit drag, effects.
-    """
-    EFFECTS: tl.constexpr = OPTIONS[2]  # Triton passes an object only by a name
-    air = shaped_wind(position, now, table, EFFECTS)
-    force, area = force_on_patch(F, velocity, patch, numbers, air, table, OPTIONS[0])
-    return _resisted(force, area, air, velocity, numbers, OPTIONS[0], OPTIONS[1])
-
-
-@triton.jit
 def add_direction(s, q, b, w, LAW: tl.constexpr):
     """Add the area vector b to two sums.
 
@@ -267,29 +245,39 @@ def force_on_group(F, velocity, place, numbers, air, table, LAW: tl.constexpr):
 
 
 @triton.jit
-def wind_on_groups(F, velocity, position, place, numbers, now, table, OPTIONS: tl.constexpr):
-    """``WindForce`` on groups of patches, whose table follows that of the effects; the rest as :func:`wind_force`."""
-    EFFECTS: tl.constexpr = OPTIONS[2]
+def wind_force(F, velocity, position, point, numbers, now, table, OPTIONS: tl.constexpr):
+    """``WindForce`` on patches, or on groups of them, whose table follows that of the effects.
+
+    ``now``: velocity without effects, and the numbers of each effect. ``OPTIONS``: place of the law in :data:`LAWS`,
+    semi-implicit drag, groups, effects.
+    """
+    EFFECTS: tl.constexpr = OPTIONS[3]  # Triton passes an object only by a name
     air = shaped_wind(position, now, table, EFFECTS)
-    force, area = force_on_group(F, velocity, place, numbers, air, table + EFFECTS.size, OPTIONS[0])
-    return _resisted(force, area, air, velocity, numbers, OPTIONS[0], OPTIONS[1])
+    if OPTIONS[2]:
+        force, area = force_on_group(F, velocity, point, numbers, air, table + EFFECTS.size, OPTIONS[0])
+    else:
+        force, area = force_on_patch(F, velocity, point, numbers, air, table, OPTIONS[0])
+    resistance = area * 0
+    if OPTIONS[1]:
+        resistance = numbers[3] * area * yielding(air, add3(air, -1.0, velocity), numbers, OPTIONS[0])
+    return force, resistance
 
 
 @cache
-def force_adjoint(function: Any, width: int, law: int) -> Any:
+def force_adjoint(groups: bool, law: int) -> Any:
     """The gradients of a . f of a force by F, velocity, wind and coefficients, as ``Twin.adjoint``.
 
     Args:
-        function: :func:`force_on_patch` or :func:`force_on_group`.
-        width: Numbers of a point.
+        groups: Whether it is that of :func:`force_on_group`, or else of :func:`force_on_patch`.
         law: Place in :data:`LAWS`.
     """
+    function = force_on_group if groups else force_on_patch
 
     def formula(F: Any, velocity: Any, point: Any, numbers: Any, air: Any, table: Any, a: Any) -> Any:
         force, _ = on_tensors(function)(F, velocity, point, numbers, air, table, law)
         return gradient(force, (F, velocity, air, numbers[:3]), a)
 
-    shapes = {"F": 9, "velocity": 3, "point": width, "numbers": 5, "now": 3, "table": 0, "a": 3}
+    shapes = {"F": 9, "velocity": 3, "point": 2 if groups else 4, "numbers": 5, "now": 3, "table": 0, "a": 3}
     return device_function(f"{function.__name__}_adjoint", shapes, formula)
 
 
@@ -349,22 +337,6 @@ def aero_force(
     numbers = tuple(part.to(velocity) if isinstance(part, Tensor) else part for part in (drag, friction, lift))
     given = wind.to(velocity).unbind(-1), velocity.unbind(-1), normal.unbind(-1), area, (*numbers, 0.5 * air_density)
     return torch.stack(torch.broadcast_tensors(*on_tensors(patch_force)(*given, LAWS.index(law))), dim=-1)
-
-
-def drag_rate(speed: Tensor, area: Tensor, mass: Tensor, coefficient: Tensor | float, air_density: float) -> Tensor:
-    r"""Rate :math:`\rho A C v_r / m` [1/s] at which drag changes a patch's velocity; explicit steps need dt < 2 / rate.
-
-    Args:
-        speed: Relative speed [m/s], shape (..., P).
-        area: Patch area [m²], shape (..., P).
-        mass: Mass [kg], shape (..., P).
-        coefficient: Sum of the coefficients.
-        air_density: Density of the air [kg/m³].
-
-    Returns:
-        Shape (..., P).
-    """
-    return air_density * coefficient * area * speed / mass
 
 
 def added_mass_per_area(breadth: float, air_density: float) -> float:
@@ -473,14 +445,22 @@ class AeroForce(Fixed, nn.Module):
         return self.law in ("projected", "linear") and sided < 0.05
 
     def rate(self, speed: Tensor, area: Tensor, mass: Tensor) -> Tensor:
-        """:func:`drag_rate` [1/s], shape (..., P), with the coefficients of this component.
+        r"""Rate :math:`\rho A C v_r / m` [1/s] at which drag changes velocities; explicit steps need dt < 2 / rate.
 
         The drag of the ``linear`` law changes half as fast as a quadratic one: its slope is rho A C_D U / 2. For a
         bound, ``speed`` must then be no less than the speed U of the wind.
+
+        Args:
+            speed: Relative speed [m/s], shape (..., P).
+            area: Patch area [m²], shape (..., P).
+            mass: Mass [kg], shape (..., P).
+
+        Returns:
+            Shape (..., P).
         """
         drag = 0.5 * self.C_D if self.law == "linear" else self.C_D
         coefficient = (drag + self.C_F + self.C_L.abs()).to(speed.dtype)
-        return drag_rate(speed, area, mass, coefficient, self.air_density)
+        return self.air_density * coefficient * area * speed / mass
 
     def resistance(self, wind: Tensor, velocity: Tensor, area: Tensor) -> Tensor | None:
         r"""Decrease of the force per velocity that the patch gains [kg/s], for ``MPMSolver.step(drag=...)``.
@@ -873,31 +853,25 @@ class WindForce(Force):
             parts = tuple(part for part in found if part is not None)
             if len(parts) < len(found):
                 return None
-        implicit = aero.drag_step == "semi_implicit"
-        smooth = self.uniform and not implicit
+        implicit, groups, law = aero.drag_step == "semi_implicit", sums is not None, LAWS.index(aero.law)
         width = 3 + sum(part.per_substep.count for part in parts)
-        patches: dict[str, Any] = {
-            "function": wind_force,
-            "per_point": Numbers(
-                4, lambda: torch.cat([self.normal.expand(*self.area.shape, 3), self.area[..., None]], dim=-1)
-            ),
-            "sources": (self.normal, self.area),
-            "adjoint": force_adjoint(force_on_patch, 4, LAWS.index(aero.law)) if smooth else None,
-        }
-        if sums is not None:
-            patches = {
-                "function": wind_on_groups,
-                "per_point": Numbers(2, lambda: sums.lists().reshape(*self.area.shape, 2)),
-                "table": Numbers(4 * sums.rows, sums.table),
-                "sources": (sums.tensor, sums.vector),
-                "adjoint": force_adjoint(force_on_group, 2, LAWS.index(aero.law)) if smooth else None,
-            }
+        if sums is None:
+            patch = Numbers(4, lambda: torch.cat([self.normal.expand(*self.area.shape, 3), self.area[..., None]], -1))
+            patches: dict[str, Any] = {"per_point": patch, "sources": (self.normal, self.area)}
+        else:
+            point, table = (
+                Numbers(2, lambda: sums.lists().reshape(*self.area.shape, 2)),
+                Numbers(4 * sums.rows, sums.table),
+            )
+            patches = {"per_point": point, "table": table, "sources": (sums.tensor, sums.vector)}
         return Twin(
-            options=(LAWS.index(aero.law), implicit),
+            wind_force,
+            options=(law, implicit, groups),
             numbers=Numbers(5, aero.numbers),
             per_substep=Numbers(width, partial(self._with_effects, parts) if parts else self.winds),
             implicit=implicit,
             parts=parts,
+            adjoint=force_adjoint(groups, law) if self.uniform and not implicit else None,
             **patches,
         )
 
