@@ -53,8 +53,11 @@ def _clamped(x, n):
 
 
 @triton.jit
-def _cell(reach, kind, nx, ny, nz, mask, X: tl.constexpr, Y: tl.constexpr, Z: tl.constexpr):
+def _cell(reach, kind, nx, ny, nz, mask, Q: tl.constexpr):
     """Index of one of the 27 cells, and its weight before they are made to add up to one."""
+    X: tl.constexpr = Q // 9
+    Y: tl.constexpr = Q // 3 % 3
+    Z: tl.constexpr = Q % 3
     bx, wx, by, wy, bz, wz = reach
     at = (_clamped(bx + X, nx) * ny + _clamped(by + Y, ny)) * nz + _clamped(bz + Z, nz)
     ok = mask & _inside(bx + X, nx) & _inside(by + Y, ny) & _inside(bz + Z, nz)
@@ -70,11 +73,9 @@ def _reach(place, p, kind, nx, ny, nz, mask):
     bz, wz = _axis(tl.load(place + 3 * p + 2, mask, 0.0))
     reach = (bx, wx, by, wy, bz, wz)
     total = wx[0] * 0.0
-    for i in tl.static_range(3):
-        for j in tl.static_range(3):
-            for k in tl.static_range(3):
-                _at, w = _cell(reach, kind, nx, ny, nz, mask, i, j, k)
-                total += w
+    for q in tl.static_range(27):
+        _at, w = _cell(reach, kind, nx, ny, nz, mask, q)
+        total += w
     return reach, tl.where(total > 0, 1.0 / tl.maximum(total, 1e-30), 0.0)
 
 
@@ -94,11 +95,9 @@ def cover(place, area, sums, kind, nx, ny, nz, count, rounds, ATOMIC: tl.constex
         mask = p < count
         reach, scale = _reach(place, p, kind, nx, ny, nz, mask)
         share = scale * tl.load(area + p, mask, 0.0)
-        for i in tl.static_range(3):
-            for j in tl.static_range(3):
-                for k in tl.static_range(3):
-                    at, w = _cell(reach, kind, nx, ny, nz, mask, i, j, k)
-                    _add(sums + at, w * share, mask, ATOMIC)
+        for q in tl.static_range(27):
+            at, w = _cell(reach, kind, nx, ny, nz, mask, q)
+            _add(sums + at, w * share, mask, ATOMIC)
 
 
 @triton.jit
@@ -111,14 +110,12 @@ def read(place, area, field, sums, values, layer, kind, nx, ny, nz, cells, count
     x = scale * 0.0
     y = scale * 0.0
     z = scale * 0.0
-    for i in tl.static_range(3):
-        for j in tl.static_range(3):
-            for k in tl.static_range(3):
-                at, w = _cell(reach, kind, nx, ny, nz, mask, i, j, k)
-                covered += w * tl.load(sums + at, mask, 0.0)
-                x += w * tl.load(field + at, mask, 0.0)
-                y += w * tl.load(field + cells + at, mask, 0.0)
-                z += w * tl.load(field + 2 * cells + at, mask, 0.0)
+    for q in tl.static_range(27):
+        at, w = _cell(reach, kind, nx, ny, nz, mask, q)
+        covered += w * tl.load(sums + at, mask, 0.0)
+        x += w * tl.load(field + at, mask, 0.0)
+        y += w * tl.load(field + cells + at, mask, 0.0)
+        z += w * tl.load(field + 2 * cells + at, mask, 0.0)
     covered = covered * scale
     mass = tl.where(covered > 0, tl.load(area + p, mask, 0.0) / tl.maximum(covered, 1e-30), 0.0)
     tl.store(layer + p, mass, mask)
@@ -137,14 +134,12 @@ def subtract(place, taken, moments, kind, nx, ny, nz, cells, count, rounds, ATOM
         x = scale * tl.load(taken + 3 * p, mask, 0.0)
         y = scale * tl.load(taken + 3 * p + 1, mask, 0.0)
         z = scale * tl.load(taken + 3 * p + 2, mask, 0.0)
-        for i in tl.static_range(3):
-            for j in tl.static_range(3):
-                for k in tl.static_range(3):
-                    at, w = _cell(reach, kind, nx, ny, nz, mask, i, j, k)
-                    w = -w / (1.0 + tl.load(moments + at, mask, 0.0))
-                    _add(moments + cells + at, w * x, mask, ATOMIC)
-                    _add(moments + 2 * cells + at, w * y, mask, ATOMIC)
-                    _add(moments + 3 * cells + at, w * z, mask, ATOMIC)
+        for q in tl.static_range(27):
+            at, w = _cell(reach, kind, nx, ny, nz, mask, q)
+            w = -w / (1.0 + tl.load(moments + at, mask, 0.0))
+            _add(moments + cells + at, w * x, mask, ATOMIC)
+            _add(moments + 2 * cells + at, w * y, mask, ATOMIC)
+            _add(moments + 3 * cells + at, w * z, mask, ATOMIC)
 
 
 def look(moments: Tensor, area: Tensor, place: Tensor, kind: Tensor) -> tuple[Tensor, Tensor]:

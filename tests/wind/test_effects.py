@@ -1,4 +1,4 @@
-"""Mean winds that grow with the height and plumes, against their formulas and measurements."""
+"""Profiles, plumes, flow round bodies and shelter, against closed forms and measurements."""
 
 import math
 import re
@@ -8,11 +8,26 @@ from pkgutil import iter_modules
 
 import pytest
 import torch
-from shared import double
+from shared import double, solid
+from torch.testing import assert_close
 
-from gaussian_swaying import SimFrame, WindField, wind
-from gaussian_swaying.wind.effects import LogProfile, Moment, Plume, PowerProfile, WindEffect
+from gaussian_swaying import AeroForce, MPMSolver, SimFrame, WindField, WindForce, wind
+from gaussian_swaying._fixed import assign
+from gaussian_swaying.kernels.derive import on_tensors
+from gaussian_swaying.wind import effects
+from gaussian_swaying.wind.effects import (
+    CylinderObstacle,
+    EllipsoidObstacle,
+    LogProfile,
+    Moment,
+    Plume,
+    PowerProfile,
+    WindEffect,
+    wake_start,
+)
+from gaussian_swaying.wind.tables import Shelter, deposited, extinction, wind_axes
 
+DOUBLE = torch.float64
 NOW = Moment(torch.zeros((), dtype=torch.float64), torch.zeros(3).double(), torch.zeros(3).double())
 
 
@@ -116,10 +131,330 @@ def test_a_plume_in_scene_units():
     frame = SimFrame(double([1.0, 0.0, 0.0]), torch.eye(3).double(), 2.0)
     moved = Plume(source=(1.5, 0.0, 0.0), radius=0.1, heat=500.0).in_frame(frame)
     place = [[1.1, 0.2, 0.7]]
-    torch.testing.assert_close(plume_at(moved, place), plume_at(Plume((1.0, 0.0, 0.0), 0.2, 500.0), place))
+    assert_close(plume_at(moved, place), plume_at(Plume((1.0, 0.0, 0.0), 0.2, 500.0), place))
 
 
 @pytest.mark.parametrize("name", ["radius", "heat"])
 def test_a_plume_without_heat_or_width_is_refused(name):
     with pytest.raises(ValueError, match=f"Expected `{name}` to be positive"):
         Plume(**{name: 0.0})
+
+
+FLOW = double([2.0, -0.7, 0.4])
+AXIS = torch.nn.functional.normalize(double([0.3, 0.1, 1.0]), dim=0)
+RADII = (0.7, 1.3, 0.4)
+plane_wake = on_tensors(effects.plane_wake)
+
+
+def round_wake(behind, aside, width, drag):
+    """The wake of a body with a drag below one."""
+    return on_tensors(effects.round_wake)(behind, aside, width, drag, wake_start(drag))
+
+
+def carlson_rd(x, y, z):
+    """Carlson's integral in double precision."""
+    return on_tensors(effects.carlson_rd)(x, y, z, 9)
+
+
+def around(obstacle, flow, place):
+    """The flow of a wind round an obstacle without a wake."""
+    return obstacle(flow, place, Moment(flow[0], flow, flow))
+
+
+def cylinder(axis, radius):
+    """A cylinder through the origin."""
+    return CylinderObstacle([0.0] * 3, radius, axis=axis.tolist(), drag=0.0)
+
+
+def ellipsoid(radii):
+    """An ellipsoid at the origin."""
+    return EllipsoidObstacle([0.0] * 3, list(radii), drag=0.0)
+
+
+FLOWS = {
+    "cylinder": lambda x: around(cylinder(AXIS, 0.8), FLOW, x),
+    "ellipsoid": lambda x: around(ellipsoid(RADII), FLOW, x),
+}
+
+
+def _directions(count=40):
+    draw = torch.randn(count, 3, dtype=DOUBLE, generator=torch.Generator().manual_seed(0))
+    return torch.nn.functional.normalize(draw, dim=-1)
+
+
+def _surface(name):
+    """Points of a surface just outside of it, and its normals."""
+    direction = _directions()
+    if name == "ellipsoid":
+        x = direction * double(RADII)
+        return x * (1 + 1e-15), torch.nn.functional.normalize(direction / double(RADII), dim=-1)
+    direction = torch.nn.functional.normalize(direction - (direction @ AXIS)[:, None] * AXIS, dim=-1)
+    return 0.8 * direction * (1 + 1e-15) + 3 * AXIS, direction
+
+
+@pytest.mark.parametrize("name", FLOWS)
+def test_the_flow_is_a_potential_one_round_the_body(name):
+    """Neither divergence nor rotation, nothing through the surface, the wind far away and still air inside."""
+    flow = FLOWS[name]
+    place = 1.5 * _directions() * torch.linspace(1, 3, 40, dtype=DOUBLE)[:, None]
+    slope = torch.func.vmap(torch.func.jacrev(lambda x: flow(x[None])[0]))(place)
+    assert slope.abs().max() > 0.1
+    assert torch.einsum("nii->n", slope).abs().max() < 1e-12
+    assert (slope - slope.mT).abs().max() < 1e-12
+    place, normal = _surface(name)
+    found = flow(place + 1e-13 * normal)
+    assert found.norm(dim=-1).max() > 1.0  # it is outside
+    assert (found * normal).sum(-1).abs().max() < 1e-11
+    assert_close(flow(1e4 * (_directions() + double([2.0, 0.0, 0.0]))), FLOW.expand(40, 3), rtol=0, atol=1e-6)
+    assert flow(0.1 * _directions()).abs().max() == 0.0
+
+
+def test_closed_forms():
+    """Lamb: twice the flow at the side of a cylinder."""
+    x, y = torch.eye(3, dtype=DOUBLE)[:2]
+    z = double([0.0, 0.0, 1.0])
+    assert_close(around(cylinder(z, 1.0), x + z, 1.0 * y), 2 * x + z)
+    assert_close(around(cylinder(z, 1.0), x + z, -2.0 * x), 0.75 * x + z)
+
+
+def test_ellipsoids_become_spheres_and_cylinders():
+    """The sphere's flow is v + (R / r)^3 / 2 (v - 3 (v n) n) (Lamb 92)."""
+    place, normal = 1.2 * _directions(), _directions()
+    sphere = FLOW + 0.5 * (0.8 / 1.2) ** 3 * (FLOW - 3 * (normal @ FLOW)[:, None] * normal)
+    assert_close(around(ellipsoid((0.8,) * 3), FLOW, place), sphere, rtol=0, atol=1e-13)
+    z = double([0.0, 0.0, 1.0])
+    long = around(ellipsoid((0.8, 0.8, 8e5)), FLOW, place)
+    assert_close(long, around(cylinder(z, 0.8), FLOW, place), rtol=0, atol=1e-9)
+
+
+def test_the_side_of_a_spheroid():
+    """Lamb 104: virtual mass of a prolate spheroid along its axis; the flow at its side is 1 + k times the wind."""
+    e = math.sqrt(1 - 0.25)
+    alpha = 2 * (1 - e * e) / e**3 * (0.5 * math.log((1 + e) / (1 - e)) - e)
+    k = alpha / (2 - alpha)
+    found = around(ellipsoid((1, 0.5, 0.5)), double([1.0, 0, 0]), double([[0.0, 0.5 + 1e-13, 0.0]]))
+    assert found[0].tolist() == pytest.approx([1 + k, 0.0, 0.0], abs=1e-11)
+
+
+def test_carlsons_integral():
+    """Values of the paper."""
+    x, y, z = (double(v) for v in (1e-300, 2.0, 1.0))
+    assert float(carlson_rd(x, y, z)) == pytest.approx(1.7972103521033883, rel=1e-12)
+    x, y, z = (double(v) for v in (2.0, 3.0, 4.0))
+    assert float(carlson_rd(x, y, z)) == pytest.approx(0.16510527294261053, rel=1e-13)
+
+
+def test_wakes_take_the_momentum_of_the_drag():
+    """The integral of u (U - u) is half of C_D times the width, or the disc, wherever the wake is developed.
+
+    The least wide plane wake, right behind the body, takes it with its largest depth.
+    """
+    y = torch.linspace(-40, 40, 400001, dtype=DOUBLE)
+    for behind in (1e-3, 0.1, 0.5, 10.0, 40.0, 100.0):
+        share = plane_wake(torch.full_like(y, behind), y, 0.5, 1.2)
+        assert float(torch.trapezoid(share * (1 - share), y)) == pytest.approx(0.5 * 1.2 * 0.5, rel=1e-6)
+        assert behind > 0.5 or float(share.max()) == pytest.approx(math.sqrt(0.5))
+        if behind < 10:
+            continue
+        r = y[200000:]
+        share = round_wake(torch.full_like(r, behind), r, 0.5, 0.47)
+        lost = float(torch.trapezoid(2 * math.pi * r * share * (1 - share), r))
+        assert lost == pytest.approx(0.5 * 0.47 * math.pi * 0.25**2, rel=1e-6)
+    for wake in (lambda x: plane_wake(x, 0 * x, 0.5, 1.2), lambda x: round_wake(x, 0 * x, 0.5, 0.47)):
+        share = wake(torch.linspace(-3, 60, 500, dtype=DOUBLE))
+        assert share[:20].abs().max() == 0.0
+        assert 0.3 < share.max() < 1
+        assert (share[100:].diff() < 0).all()
+
+
+@pytest.mark.parametrize("turn", [0.0, 30.0])
+def test_obstacles_in_a_frame_are_those_of_the_scene(turn):
+    """Scaled by two, turned by a quarter about x and moved."""
+    rotation = double([[1.0, 0, 0], [0, 0, -1.0], [0, 1.0, 0]])
+    frame = SimFrame(double([1.0, 2.0, 3.0]), rotation, 2.0)
+    scene = double([[1.9, 2.6, 3.2], [0.4, 1.2, 2.4]])
+    flow = double([1.0, 0.3, -0.2])
+    here, there = Moment(flow[0], flow, flow), Moment(flow[0], flow @ rotation.T, 2 * flow @ rotation.T)
+    for obstacle in (
+        CylinderObstacle([1.0, 2.5, 3.0], 0.4, axis=[0.0, 1.0, 1.0]),
+        EllipsoidObstacle([1.0, 2.5, 3.0], [0.2, 0.5, 0.4], turn=turn, drag=0.0),
+    ):
+        expected = obstacle(flow, scene, here)
+        moved = obstacle.in_frame(frame)
+        found = moved(flow @ rotation.T, frame.point_to_sim(scene), there) @ rotation
+        assert_close(found, expected)
+        assert (expected - flow).abs().max() > 0.05
+        assert list(obstacle.center) == [1.0, 2.5, 3.0]
+
+
+def test_a_wall_shelters_what_is_behind_it():
+    wall = EllipsoidObstacle([0.0, 0.0, 0.0], [0.1, 1.0, 0.8], drag=0.9)
+    wind = WindField([4.0, 0.0, 0.0], effects=[wall])
+    place = torch.tensor([[-5.0, 0.0, 0.0], [1.5, 0.0, 0.0], [1.5, 4.0, 0.0], [0.0, 1.1, 0.0]])
+    front, behind, aside, edge = wind.at(torch.zeros((), dtype=DOUBLE), place)[:, 0].tolist()
+    assert front == pytest.approx(4.0, rel=0.05)
+    assert behind < 2.2
+    assert aside == pytest.approx(4.0, rel=0.1)
+    assert edge > 5.0
+
+
+def test_still_air_stays_still():
+    for obstacle in (
+        CylinderObstacle([0.0] * 3, 0.5),
+        EllipsoidObstacle([0.0] * 3, [1, 1, 2]),
+    ):
+        wind = WindField([0.0, 0.0, 0.0], effects=[obstacle])
+        found = wind.at(double(1.0), 2 * _directions())
+        assert torch.equal(found, torch.zeros_like(found))
+
+
+@pytest.mark.parametrize(
+    ("make", "words"),
+    [
+        (lambda: CylinderObstacle([0.0] * 3, -1.0), "`radius` to be positive"),
+        (lambda: EllipsoidObstacle([0.0] * 3, [1.0] * 3, drag=1.2), "`drag` of an ellipsoid to be below 1"),
+        (lambda: CylinderObstacle([0.0] * 3, 1.0, axis=[0.0] * 3), "`axis` to have a direction"),
+        (lambda: EllipsoidObstacle([0.0] * 3, [1.0, 2.0]), "`radii` to have 3 numbers"),
+    ],
+)
+def test_impossible_obstacles_are_refused(make, words):
+    with pytest.raises(ValueError, match=words):
+        make()
+
+
+def test_a_plane_wake_has_half_of_its_depth_where_it_was_measured():
+    """Wygnanski and others: at 0.29 sqrt(theta x) from its middle."""
+    width, drag = 0.3, 1.1
+    theta = 0.5 * drag * width
+    behind = double([4.0, 9.0, 30.0])
+    middle = plane_wake(behind, torch.zeros_like(behind), width, drag)
+    edge = plane_wake(behind, 0.29 * (theta * behind).sqrt(), width, drag)
+    assert_close(edge / middle, torch.full_like(behind, 0.5), rtol=0, atol=1e-14)
+
+
+def test_a_round_wake_widens_by_a_twentieth():
+    """Bastankhah & Porté-Agel in gusty wind; its standard deviation from its value at a place and in its middle."""
+    behind, aside = double([2.0, 6.0, 12.0]), double(0.3)
+    ratio = round_wake(behind, aside, 0.5, 0.47) / round_wake(behind, 0 * aside, 0.5, 0.47)
+    sigma = aside / (-2 * ratio.log()).sqrt()
+    assert_close(sigma.diff() / behind.diff(), double([0.05, 0.05]))
+
+
+@pytest.mark.parametrize(("apart", "error"), [(0.5, 1e-14), (10, 1e-14), (1e12, 1e-14), (1e40, 1e-12)])
+def test_carlsons_integral_of_two_equal_arguments(apart, error):
+    """R_D(x, x, z) in closed form (DLMF 19.20.20, 19.2.18), with z = 1 + apart in units of x.
+
+    To some roundings; at 1e40 the first two terms of the series are 2.5e-8 and 2.2e-11, those left out 3.2e-13.
+    """
+    x = double(0.7)
+    found = float(carlson_rd(x, x, x * (1 + apart))) * 0.7**1.5
+    root = math.sqrt(apart)
+    expected = 3 * (math.asinh(root) / root - 1 / math.sqrt(1 + apart)) / apart
+    assert found == pytest.approx(expected, rel=error, abs=0)
+
+
+def _slab(depth, drag, direction, cells=32):
+    """A slab of leaves that all face the wind, 1 m deep and 0.8 m wide, of an optical depth; and its particles."""
+    side = 40
+    axis = (torch.arange(side, dtype=DOUBLE) + 0.5) / side
+    place = torch.cartesian_prod(axis, axis, axis) * torch.tensor([1.0, 0.8, 0.8])
+    axes = wind_axes(direction)
+    place = place @ axes
+    area = 2 * depth / drag * 0.64 / len(place)  # exp(-depth) behind: a half of C_D A per cross section
+    points = solid(place, 1e-6)
+    solver = MPMSolver(dx=0.2, transfer="torch")
+    wind = WindField((5 * direction).tolist(), effects=[Shelter(cells)])
+    normal = axes[0].expand(len(place), 3)
+    aero = AeroForce(C_D=drag, C_F=0.0, C_L=0.0, law="projected")
+    load = WindForce(aero, wind, normal, torch.full((len(place),), area, dtype=DOUBLE))
+    state = solver.init_state(points, torch.ones_like(place))  # however it moves
+    load.refresh(state)
+    return load, state, axes
+
+
+def _speed(load, state, *place):
+    """Speed of the wind at a place, once it has been sheltered anew."""
+    load.refresh(state)
+    return float(load.wind.at(state.time, double([place]))[0].norm())
+
+
+@pytest.mark.slow(gate=["direction0-0.2", "direction1-1.0", "direction2-3.0"])
+@pytest.mark.parametrize("depth", [0.2, 1.0, 3.0])
+@pytest.mark.parametrize("direction", [[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.6, -0.64, 0.48]])
+def test_a_slab_of_leaves_follows_the_exponential_law(depth, direction):
+    """Within 3 % of the undisturbed wind, two cells or more from its sides, and exactly behind it."""
+    load, state, axes = _slab(depth, 1.3, double(direction))
+    along = torch.linspace(-0.3, 1.3, 33, dtype=DOUBLE)
+    line = torch.stack([along, torch.full_like(along, 0.37), torch.full_like(along, 0.43)], dim=-1) @ axes
+    air = load.wind.at(state.time, line)
+    assert_close(air - (air @ axes[0])[:, None] * axes[0], torch.zeros_like(air), rtol=0, atol=1e-12)
+    share = (air @ axes[0]) / 5
+    expected = torch.exp(-depth * along.clamp(0, 1))
+    assert (share - expected).abs().max() < 0.03
+    assert float(share[:6].min()) == pytest.approx(1.0, abs=1e-12)
+    assert float(share[-1]) == pytest.approx(math.exp(-depth), rel=0.03)
+
+
+def test_the_drag_area_is_that_of_the_force():
+    """Leaves edge-on take nothing with the projected law, and the wake of twice the leaves is the square."""
+    load, state, _ = _slab(0.7, 1.0, double([1.0, 0.0, 0.0]))
+    behind = 1.2, 0.4, 0.4
+    once = _speed(load, state, *behind) / 5
+    assign(load.wind.effects[0], strength=2.0)
+    assert _speed(load, state, *behind) / 5 == pytest.approx(once**2, rel=1e-6)
+    assign(load, normal=double([0.0, 1.0, 0.0]).expand_as(load.normal))
+    assert _speed(load, state, *behind) == pytest.approx(5.0, rel=1e-7)
+
+
+def test_the_wake_follows_the_body_and_the_wind():
+    load, state, _ = _slab(1.0, 1.0, double([1.0, 0.0, 0.0]))
+    moved = state.replace(position=state.position + torch.tensor([0.0, 0.0, 5.0]))
+    assert _speed(load, moved, 1.2, 0.4, 0.4) == pytest.approx(5.0)
+    assign(load.wind, flows=double([[0.0, 5.0, 0.0]]))
+    assign(load, normal=double([0.0, 1.0, 0.0]).expand_as(load.normal))
+    assert _speed(load, state, 1.2, 0.4, 0.4) == pytest.approx(5.0)
+    assert _speed(load, state, 0.5, 1.2, 0.4) < 3.2
+    assign(load.wind, flows=torch.zeros(1, 3, dtype=DOUBLE))
+    load.refresh(state)
+    assert (load.wind.effects[0].table - 1).abs().max() == 0.0
+
+
+def test_deposits_are_shared_and_do_not_depend_on_the_order():
+    draw = torch.Generator().manual_seed(0)
+    place = 5 * torch.rand(5000, 3, generator=draw)
+    amount = torch.rand(5000, generator=draw)
+    found = deposited(place, amount, 6)
+    assert float(found.double().sum()) == pytest.approx(float(amount.double().sum()), rel=1e-5)
+    order = torch.randperm(5000, generator=draw)
+    assert torch.equal(found, deposited(place[order], amount[order], 6))
+    single = deposited(torch.tensor([[1.25, 2.0, 4.0]]), torch.tensor([8.0]), 6)
+    assert single[1, 2, 4] == 6.0
+    assert single[2, 2, 4] == 2.0
+    assert deposited(place, torch.zeros(5000), 6).abs().max() == 0.0
+
+
+def test_extinction_is_the_trapezoidal_sum():
+    density = double([1.0, 3.0, 0.0, 2.0]).reshape(4, 1, 1)
+    depth = 0.5 * double([0.5, 2.5, 4.0, 5.0])  # spacing 1
+    assert_close(extinction(density, torch.tensor(1.0)).flatten(), torch.exp(-depth))
+
+
+def test_axes_of_a_wind():
+    for flow in ([0.0, 0.0, 0.0], [0.0, 0.0, 3.0], [1.0, -2.0, 0.3]):
+        flow = double(flow)
+        axes = wind_axes(flow)
+        assert_close(axes @ axes.T, torch.eye(3, dtype=DOUBLE))
+        if float(flow.norm()) > 0:
+            assert_close(axes[0], flow / flow.norm())
+
+
+@pytest.mark.parametrize("cells", [3, 300, 8.0])
+def test_impossible_grids_are_refused(cells):
+    with pytest.raises(ValueError, match="`cells` to be a whole number from 4 to 256"):
+        Shelter(cells)
+
+
+def test_a_shelter_that_was_not_refreshed_changes_nothing():
+    velocity = torch.tensor([[1.0, 2.0, 3.0]])
+    found = Shelter(4)(velocity, torch.rand(5, 3), NOW)
+    assert_close(found, velocity.expand(5, 3))
